@@ -10,7 +10,7 @@ import numpy as np
 
 from hyrfpack.format.arrays import MODEL_RULES, group_shapes, parse_config
 from hyrfpack.quant.integers import encode_integers
-from tools.safety.fuzz_mutate import Part, assemble
+from tools.safety.fuzz_mutate import RawSection, assemble
 
 FREE = 3 << 24  # bytes that a file of any length may decode to
 GAUSSIANS = 1 << 18  # that it may have
@@ -48,10 +48,10 @@ def metadata(count: int, provenance: dict | None = None, **config: object) -> di
 
 def with_text(text: bytes, payloads: Payloads, shapes: dict[str, tuple[int, int]], deflated: bytes = b"") -> bytes:
     """A file with this text as metadata, deflated if it is given so, and (codec, bytes) by section."""
-    parts = [Part(b"META", 5 if deflated else 0, 1, deflated or text, len(text))]
+    parts = [RawSection(b"META", 5 if deflated else 0, 1, deflated or text, len(text))]
     for group, (rows, columns) in shapes.items():
         codec, data = payloads[group]
-        parts.append(Part(group.encode(), codec, 1, data, 4 * rows * columns))
+        parts.append(RawSection(group.encode(), codec, 1, data, 4 * rows * columns))
     return assemble(parts)
 
 

@@ -14,7 +14,7 @@ import torch
 
 from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians
-from tools.safety.plans import encode
+from tools.safety.synthetic_encoding import encode
 
 RECORDED_SIZES_PATH = Path(__file__).parent / "golden" / "sizes.json"
 PROFILES = ("raw", "paper", "compact")

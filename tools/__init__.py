@@ -1,5 +1,6 @@
-"""What maintainers run, from the repository's root: `python -m tools.<wing>.<name> --help`.
+"""Programs for maintainers; run them from the repository's root as `python -m tools.<wing>.<name> --help`.
 
-gpu/ checks and measures the GPU kernels, bench/ times operations against references, studies/ are the experiments
-behind the documentation's tables, safety/ is what is done to files, readers, processes and versions on purpose.
+gpu/ checks and measures the GPU kernels, and bench/ times operations against their references. studies/ holds the
+experiments behind the documentation's tables. safety/ attacks files, readers and processes on purpose, and tests
+other versions of the dependencies. browser/ drives browsers and minifies the web player.
 """

@@ -1,22 +1,28 @@
-"""Rows as tables: what all tools print their results with."""
+"""Format rows as Markdown tables; all tools print their results with these functions."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 
-def line(cells: Sequence[str]) -> str:
-    """One row of a Markdown table."""
+def markdown_row(cells: Sequence[str]) -> str:
+    """Return one row of a Markdown table."""
     return "| " + " | ".join(cells) + " |"
 
 
-def markdown(columns: Sequence[str], rows: Sequence[Sequence[str]], ruler: Sequence[str] | None = None) -> str:
-    """A Markdown table; `ruler` says which columns are aligned how ("--:" to the right)."""
-    return "\n".join(map(line, (columns, ruler or ["---"] * len(columns), *rows)))
+def markdown_table(columns: Sequence[str], rows: Sequence[Sequence[str]], ruler: Sequence[str] | None = None) -> str:
+    """Return a Markdown table.
+
+    Args:
+        columns: the column titles.
+        rows: the cells of each row.
+        ruler: one alignment marker for each column, such as "--:" for right-aligned; left-aligned without it.
+    """
+    return "\n".join(map(markdown_row, (columns, ruler or ["---"] * len(columns), *rows)))
 
 
-def cell(value: object) -> str:
-    """A number or words in few characters; nothing for None."""
+def format_cell(value: object) -> str:
+    """Return a number or text in few characters: floats with 3 digits, None as an empty string."""
     if value is None:
         return ""
     if isinstance(value, float):

@@ -14,7 +14,7 @@ from hyrfpack.compress import plan
 from hyrfpack.format import describe, load
 from hyrfpack.format.arrays import to_arrays
 from hyrfpack.format.container import read_container
-from tools.safety.plans import encode
+from tools.safety.synthetic_encoding import encode
 
 PROVENANCE = {"preset": "standard"}
 

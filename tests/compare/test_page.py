@@ -78,7 +78,7 @@ def test_pictures_are_chosen_cut_by_keys_and_pointer_and_their_difference_drawn(
 
         browser.evaluate("view.value = 1, view.dispatchEvent(new Event('change'))")
         until(browser, f"{told}.includes('is 0.00 levels')")
-        assert browser.complaints() == []
+        assert browser.list_errors() == []
 
 
 def test_the_script_is_one_that_node_reads_and_a_page_can_hold(tmp_path: Path):

@@ -17,7 +17,7 @@ from scenes import small_model
 from hyrfpack.compress.quantize import quantize
 from hyrfpack.format import encode_model
 from hyrfpack.model import HybridModel
-from tools.safety.plans import drawn, drawn_sensitivity, encode
+from tools.safety.synthetic_encoding import draw_sensitivity, encode, quantize_with_drawn_sensitivity
 
 ROOT = Path(__file__).parents[2]
 COUNT = 3000
@@ -58,8 +58,8 @@ print(digest(encode_model(model, "compact", quantized=quantize(plan.apply(model)
 @pytest.mark.parametrize("blocked", [False, True], ids=["compiled", "numpy"])
 def test_compiled_kernels_and_numpy_write_the_same_bytes(blocked, tmp_path):
     model = a_model()
-    quantized = drawn(model, layered=True)
-    (tmp_path / "plan").write_bytes(pickle.dumps((quantized.plan, drawn_sensitivity(model))))
+    quantized = quantize_with_drawn_sensitivity(model, layered=True)
+    (tmp_path / "plan").write_bytes(pickle.dumps((quantized.plan, draw_sensitivity(model))))
     paths = [str(Path(__file__).parent), str(ROOT / "tests"), str(ROOT)]
     script = SCRIPT.format(paths=paths, blocked=blocked, plan=str(tmp_path / "plan"))
 
@@ -84,9 +84,9 @@ def test_gaussians_in_another_order_give_the_same_file():
     order = np.random.default_rng(1).permutation(COUNT)
     for name in other.gaussians.PARAMETER_NAMES:
         getattr(other.gaussians, name).data = getattr(model.gaussians, name).data[order]
-    quantized = drawn(model, prune=False)
+    quantized = quantize_with_drawn_sensitivity(model, prune=False)
     moved = dataclasses.replace(quantized.plan, kept=np.argsort(order)[quantized.plan.kept])
 
-    again = quantize(moved.apply(other), moved, drawn_sensitivity(model).subset(order))
+    again = quantize(moved.apply(other), moved, draw_sensitivity(model).subset(order))
 
     assert encode_model(other, "compact", quantized=again) == encode_model(model, "compact", quantized=quantized)

@@ -20,7 +20,7 @@ from hyrfpack.format import decode_model, describe, encode_model, load, repack, 
 from hyrfpack.format.container import MINOR_VERSION, Section, read_container, write_container
 from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians
-from tools.safety.plans import drawn, encode
+from tools.safety.synthetic_encoding import encode, quantize_with_drawn_sensitivity
 
 PROFILES = ("raw", "paper", "compact")
 
@@ -199,7 +199,7 @@ def test_encoding_leaves_model_and_random_state_alone(profile):
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_save_refuses_numbers_that_are_not_finite_and_names_the_group(tmp_path, profile, parameter, holds, value):
     model = make_model()
-    planned = drawn(model).plan.apply if profile == "compact" else None
+    planned = quantize_with_drawn_sensitivity(model).plan.apply if profile == "compact" else None
     with torch.no_grad():
         model.state_dict()[parameter].view(-1)[-1] = value
 

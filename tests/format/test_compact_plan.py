@@ -22,7 +22,7 @@ from hyrfpack.ops.hash_encode.reference import cells as reference_cells
 from hyrfpack.ops.hash_encode.reference import corner_rows
 from hyrfpack.quant import DamagedDataError
 from hyrfpack.quant.points import LatticePoints
-from tools.safety.plans import drawn
+from tools.safety.synthetic_encoding import quantize_with_drawn_sensitivity
 
 
 def a_model(count: int) -> HybridModel:
@@ -150,4 +150,7 @@ def test_damage_is_refused_or_yields_finite_numbers(data: st.DataObject) -> None
 
 
 MODEL = a_model(40)
-CODED = {section.type: (section.codec, section.data) for section in encode(MODEL, drawn(MODEL, prune=False))[0]}
+CODED = {
+    section.type: (section.codec, section.data)
+    for section in encode(MODEL, quantize_with_drawn_sensitivity(MODEL, prune=False))[0]
+}

@@ -17,7 +17,7 @@ from hyrfpack.format.exposure import decode_exposure, encode_exposure
 from hyrfpack.format.exposure_header import CODEC_EXPOSURE
 from hyrfpack.format.sections import EXPOSURE
 from hyrfpack.model.exposure import MAX_CENTERS
-from tools.safety.plans import encode
+from tools.safety.synthetic_encoding import encode
 
 SEEDS = st.integers(0, 2**32 - 1)
 

@@ -23,7 +23,7 @@ from hyrfpack.format import decode_model, describe, load, repack, save
 from hyrfpack.format.container import MINOR_VERSION, read_container, write_container
 from hyrfpack.format.min_file_size import check_target_bytes, min_file_bytes
 from hyrfpack.model import HybridModel
-from tools.safety.plans import drawn, encode
+from tools.safety.synthetic_encoding import encode, quantize_with_drawn_sensitivity
 
 EXPOSURE = random_map(11, 17)
 EXPOSURE_BYTES = 84 + 12 * 17
@@ -86,7 +86,7 @@ def test_a_model_that_is_moved_keeps_its_map(target):
 
 def test_a_planned_model_keeps_its_map_also_after_its_gaussians_have_moved():
     model = exposed_model()
-    decided = drawn(model).plan
+    decided = quantize_with_drawn_sensitivity(model).plan
     planned = decided.apply(model)
 
     assert maps_equal(planned.exposure, EXPOSURE)

@@ -11,9 +11,8 @@ from hyrfpack.choices import CONSISTENT_EXPOSURE
 from hyrfpack.format import describe, load, metadata
 from hyrfpack.model import Frame, HashGridConfig, ModelConfig
 from hyrfpack.render import RenderSettings, render
-from tools.safety.make_golden import FILES as GOLDEN_FILES
-from tools.safety.make_golden import golden_camera
-from tools.safety.plans import encode
+from tools.safety.make_golden import GOLDEN_FILES, make_golden_camera
+from tools.safety.synthetic_encoding import encode
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 FILES = sorted(GOLDEN.glob("*.hyrf"))
@@ -79,7 +78,7 @@ def test_golden_exposure_map_gives_the_recorded_log_gains(name):
 @pytest.mark.parametrize("name", WITH_EXPOSURE)
 def test_golden_file_with_an_exposure_map_renders_the_recorded_picture(name):
     recorded = np.load(GOLDEN / f"{name}.npz")["exposure.picture"]
-    model, camera = load(GOLDEN / f"{name}.hyrf"), golden_camera()
+    model, camera = load(GOLDEN / f"{name}.hyrf"), make_golden_camera()
 
     picture = render(model, camera).rgb.numpy()
 

@@ -24,7 +24,7 @@ from hyrfpack.format.exposure import decode_exposure, encode_exposure
 from hyrfpack.model import ExposureMap
 from hyrfpack.quant.integers import encode_integers
 from tools.safety import minimal_reader
-from tools.safety.plans import encode
+from tools.safety.synthetic_encoding import encode
 
 GOLDEN = sorted((Path(__file__).parents[1] / "golden").glob("*.hyrf"))
 PROFILES = ("raw", "paper", "compact")

@@ -22,7 +22,7 @@ from hyrfpack.format.codec import repack
 from hyrfpack.format.container import MINOR_VERSION, Container, Section, read_container, write_container
 from hyrfpack.format.metadata import Metadata, read_metadata
 from hyrfpack.model import HybridModel
-from tools.safety.plans import encode
+from tools.safety.synthetic_encoding import encode
 
 GROUPS = ("POSI", "COLO", "SCAL", "OPAC")
 FIELDS = ("GTAB", "RTAB", "GMLP", "RMLP")

@@ -25,9 +25,16 @@ from hyrfpack.errors import HyrfError
 from hyrfpack.format import encode_model, repack
 from hyrfpack.format.codec import EXTRA_GAUSSIANS_PER_FILE, gaussian_limit
 from hyrfpack.format.sections import SECTION_CONTENTS
-from tools.safety.fuzz import allowance, check_file, check_model, decode, pattern
-from tools.safety.fuzz_mutate import GROUPS, KINDS, assemble, disassemble, mutant, seeds
-from tools.safety.plans import even
+from tools.safety.fuzz import allowed_bytes, check_file, check_model, decode, message_pattern
+from tools.safety.fuzz_mutate import (
+    INPUT_KINDS,
+    SECTION_GROUPS,
+    assemble,
+    disassemble,
+    load_seed_files,
+    make_hostile_file,
+)
+from tools.safety.synthetic_encoding import quantize_uniformly
 
 CORPUS = Path(__file__).parent / "corpus"
 
@@ -92,27 +99,27 @@ def test_a_forged_file_is_refused_with_the_sentence_it_is_named_after(name):
 def test_mutants_are_decoded_or_refused_in_one_line():
     outcomes = Counter()
     for number in range(2000):
-        kind, data = mutant(number)
+        kind, data = make_hostile_file(number)
         outcome = decode(data)
         outcomes[kind, isinstance(outcome, str)] += 1
         if not isinstance(outcome, str) and number % 10 == 0:
             check_model(outcome)
 
-    assert {kind for kind, _ in outcomes} == set(KINDS)
+    assert {kind for kind, _ in outcomes} == set(INPUT_KINDS)
     # Forged content gets past the checksums, to where it is decoded; damage does not.
-    for kind in KINDS:
+    for kind in INPUT_KINDS:
         assert (outcomes[kind, False] > 10) == kind.startswith("forged"), kind
 
 
 def test_mutants_depend_on_nothing_but_their_numbers():
-    first = [mutant(number, 7) for number in range(500)]
+    first = [make_hostile_file(number, 7) for number in range(500)]
 
-    assert [mutant(number, 7) for number in reversed(range(500))] == first[::-1]
-    assert [mutant(number, 8) for number in range(50)] != first
+    assert [make_hostile_file(number, 7) for number in reversed(range(500))] == first[::-1]
+    assert [make_hostile_file(number, 8) for number in range(50)] != first
 
 
 def test_what_is_taken_apart_is_put_together_the_same():
-    for data in seeds()[0]:
+    for data in load_seed_files()[0]:
         assert assemble(disassemble(data)) == data
 
 
@@ -138,14 +145,14 @@ def test_a_file_that_readers_would_not_unpack_is_not_written():
     model = small_model(np.zeros((EXTRA_GAUSSIANS_PER_FILE + 200_000, 3)))
 
     with pytest.raises(HyrfError, match="nearly all alike.*keep this model as profile raw"):
-        encode_model(model, "compact", quantized=even(model, 1.0))
+        encode_model(model, "compact", quantized=quantize_uniformly(model, 1.0))
 
 
 @pytest.mark.parametrize("codec", [1, 2, 3, 4, 6, 7, 8])
 @pytest.mark.parametrize("kept", [0, 40, 4000])
 def test_a_small_file_that_declares_a_huge_model_takes_little_memory(codec, kept):
     """All that the limits allow for so small a file and none of it there."""
-    parts = disassemble(encode_model(decode(seeds()[0][0]), "raw"))
+    parts = disassemble(encode_model(decode(load_seed_files()[0][0]), "raw"))
     count = EXTRA_GAUSSIANS_PER_FILE - 1000
     metadata = json.loads(parts[0].data) | {"gaussians": count}
     parts[0].data = json.dumps(metadata).encode()
@@ -154,7 +161,7 @@ def test_a_small_file_that_declares_a_huge_model_takes_little_memory(codec, kept
         part.raw_length, part.codec = 4 * width * count, codec
         part.data = bytes([1, width, 1, 0])[: kept or None] * (kept // 4)
     data = assemble(parts)
-    assert allowance(data) > 9 << 23  # within what the container allows
+    assert allowed_bytes(data) > 9 << 23  # within what the container allows
 
     tracemalloc.start()
     outcome = decode(data)
@@ -169,7 +176,7 @@ def test_gaussians_that_are_all_alike_take_next_to_no_bytes_and_little_memory():
     """Equal symbols are free in codecs 6 to 8: what bounds their number is what a file of its length may declare."""
     count = 200_000
     model = small_model(np.zeros((count, 3)))
-    data = encode_model(model, "compact", quantized=even(model, 0.01))
+    data = encode_model(model, "compact", quantized=quantize_uniformly(model, 0.01))
     assert len(data) < 5000
 
     tracemalloc.start()
@@ -183,7 +190,7 @@ def test_gaussians_that_are_all_alike_take_next_to_no_bytes_and_little_memory():
 
 def test_provenance_that_grows_in_writing_is_refused_in_one_line(tmp_path):
     """2 bytes of UTF-8 become 6 of ASCII: what may be read may not be written again."""
-    parts = disassemble(seeds()[0][2])
+    parts = disassemble(load_seed_files()[0][2])
     metadata = json.loads(parts[0].data) | {"provenance": {"name": "\u00e9" * 400_000}}
     parts[0].data = json.dumps(metadata, ensure_ascii=False).encode()
     parts[0].raw_length = len(parts[0].data)
@@ -196,7 +203,7 @@ def test_provenance_that_grows_in_writing_is_refused_in_one_line(tmp_path):
 
 
 def test_what_a_writer_nests_too_deep_to_be_read_is_not_written():
-    model = decode(seeds()[0][2])
+    model = decode(load_seed_files()[0][2])
     deep: list = []
     for _ in range(62):  # within the list, `provenance` and the metadata
         deep = [deep]
@@ -207,13 +214,13 @@ def test_what_a_writer_nests_too_deep_to_be_read_is_not_written():
 
 
 def test_seeds_reach_every_group_and_codec():
-    met = {(part.tag.decode(), part.codec) for data in seeds()[0] for part in disassemble(data)[1:]}
+    met = {(part.tag.decode(), part.codec) for data in load_seed_files()[0] for part in disassemble(data)[1:]}
 
     groups = {group for group, _ in met}
-    assert groups >= {*GROUPS, "POS1", "COL1", "SCA1", "OPA2", "EXPO"} and groups < set(SECTION_CONTENTS)
+    assert groups >= {*SECTION_GROUPS, "POS1", "COL1", "SCA1", "OPA2", "EXPO"} and groups < set(SECTION_CONTENTS)
     assert {codec for _, codec in met} == {1, 2, 3, 4, 6, 7, 8, 9}
-    assert {disassemble(data)[0].codec for data in seeds()[0]} == {0, 5}
-    assert all(not isinstance(decode(data), str) for data in seeds()[0])
+    assert {disassemble(data)[0].codec for data in load_seed_files()[0]} == {0, 5}
+    assert all(not isinstance(decode(data), str) for data in load_seed_files()[0])
 
 
 def test_info_shows_what_a_file_says_without_acting_on_it():
@@ -226,7 +233,7 @@ def test_info_shows_what_a_file_says_without_acting_on_it():
 
 def test_every_group_may_have_stages_up_to_the_limit_and_not_one_more():
     """Each stage costs milliseconds whatever it holds, so that 255 of them in 8 groups were 13 seconds from 300 kB."""
-    model = decode(seeds()[0][2])
+    model = decode(load_seed_files()[0][2])
     data = encode_model(model, "paper", color=(16, 2))
 
     assert torch.isfinite(decode(data).gaussians.color_logits).all()
@@ -238,13 +245,13 @@ def test_forged_exposure_maps_meet_every_check_of_the_reader():
     """Each sentence of the readers of codec 9, and maps that are decoded."""
     outcomes = Counter()
     for number in range(500):
-        outcome = decode(KINDS["forged exposure map"][1](Random(number)))
+        outcome = decode(INPUT_KINDS["forged exposure map"][1](Random(number)))
         if isinstance(outcome, str):
             assert "section 'EXPO'" in outcome or "decode to" in outcome, outcome
         else:
             check_model(outcome)
             assert outcome.exposure is not None
-        outcomes[pattern(outcome) if isinstance(outcome, str) else "decoded"] += 1
+        outcomes[message_pattern(outcome) if isinstance(outcome, str) else "decoded"] += 1
 
     assert outcomes["decoded"] > 50
     sentences = " | ".join(outcomes)

@@ -34,7 +34,7 @@ from hyrfpack.data import load_scene
 from hyrfpack.data.pictures import read_header, read_pixels
 from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.train.checkpoint import load_checkpoint, save_checkpoint
-from tools.safety.fuzz_mutate import EXTREMES, HOSTILE_JSON, edit_bytes, places
+from tools.safety.fuzz_mutate import EXTREME_INTEGERS, HOSTILE_JSON, edit_bytes, iterate_json_values
 
 numbers = st.integers(0, 2**32 - 1).map(Random)  # hypothesis chooses the seed: mutants are cheap, and small already
 search = settings(max_examples=150, deadline=None)
@@ -63,7 +63,7 @@ def forge_json(values: dict | list, rng: Random) -> bytes:
     """Values with one or two places deleted, doubled or replaced, as text; now and then the text is damaged too."""
     values = json.loads(json.dumps(values))
     for _ in range(rng.randint(1, 2)):
-        node, key = rng.choice(places(values))
+        node, key = rng.choice(iterate_json_values(values))
         kind = rng.randrange(4)
         if kind == 0:
             del node[key]
@@ -176,7 +176,7 @@ def test_forged_colmap_binary_tables_with_rigs_are_read_or_refused(colmap, rng):
         name = rng.choice(["rigs.bin", "frames.bin", *tables])
         content = bytearray(forged[name])
         width, at = rng.choice((4, 8)), rng.randrange(len(content) + 1)
-        value = rng.choice((*EXTREMES, *struct.unpack("<2Q", struct.pack("<2d", math.nan, 1e300))))
+        value = rng.choice((*EXTREME_INTEGERS, *struct.unpack("<2Q", struct.pack("<2d", math.nan, 1e300))))
         content[at : at + width] = (value % 256**width).to_bytes(width, "little")
         forged[name] = bytes(content)
     write_tables(model, forged)
@@ -265,7 +265,7 @@ def test_what_a_camera_file_says_is_quoted_in_short(tmp_path):
 @given(rng=numbers)
 def test_a_forged_viewpoint_is_followed_or_refused(rng):
     viewpoint = json.loads(json.dumps(Viewpoint.from_frame((0, 0, 0), 1.0).to_json()))
-    node, key = rng.choice(places(viewpoint))
+    node, key = rng.choice(iterate_json_values(viewpoint))
     node[key] = rng.choice((*HOSTILE_JSON, 1e160, [1e200] * 3, [5e-324] * 3))
 
     facts = {"provenance": {"viewpoint": viewpoint}, "config": {"frame": None}}

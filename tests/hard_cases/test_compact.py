@@ -13,7 +13,7 @@ from hyrfpack.format import decode_model, encode_model
 from hyrfpack.format.compact.quantized import QuantizedModel
 from hyrfpack.format.container import read_container
 from hyrfpack.model import HybridModel
-from tools.safety.plans import drawn, even
+from tools.safety.synthetic_encoding import quantize_uniformly, quantize_with_drawn_sensitivity
 
 STEP = 2.0**-10
 WIDEST = STEP * 16 / 15  # of the steps that `even` may come to
@@ -40,7 +40,7 @@ def normal(*shape: int) -> torch.Tensor:
 def test_coincident_gaussians_keep_their_own_numbers_and_one_place():
     colors, sizes = normal(1000, 3), normal(1000, 1)
     model = small_model(np.tile([0.3, -0.4, 0.2], (1000, 1)), color_logits=colors, scale_logits=sizes)
-    quantized = even(model, STEP)
+    quantized = quantize_uniformly(model, STEP)
     plan = quantized.plan
 
     data = encode_model(model, "compact", quantized=quantized)
@@ -60,7 +60,7 @@ def test_gaussians_far_out_keep_their_direction_and_cost_the_others_nothing(dist
     inner = ball_points(100)[0]
     outer = distance * np.array([[1.0, 0.0, 0.0], [-1.0, 1.0, -1.0], [0.0, -0.5, 1.0]])
     model = small_model(np.vstack([inner, outer]))
-    quantized = even(model, STEP)
+    quantized = quantize_uniformly(model, STEP)
     plan = quantized.plan
 
     decoded = through(model, quantized)
@@ -77,7 +77,7 @@ def test_gaussians_far_out_keep_their_direction_and_cost_the_others_nothing(dist
 def test_constant_channels_are_exact_and_take_no_bytes():
     model = small_model(ball_points(5000)[0], color_logits=0.3, scale_logits=-3.3, opacity_logits=1.7)
 
-    data = encode_model(model, "compact", quantized=even(model, STEP))
+    data = encode_model(model, "compact", quantized=quantize_uniformly(model, STEP))
     decoded = decode_model(data).gaussians
 
     for section, bytes_of_all in (("COLO", 200), ("SCAL", 60), ("OPAC", 60)):
@@ -93,7 +93,7 @@ def test_tables_and_decoders_of_one_value_keep_it():
             if not name.startswith("gaussians"):
                 parameter.fill_(-0.7)
 
-    decoded = through(model, even(model, STEP))
+    decoded = through(model, quantize_uniformly(model, STEP))
 
     for name, parameter in decoded.named_parameters():
         if not name.startswith("gaussians"):
@@ -105,7 +105,7 @@ def test_saturated_opacities_and_colours_stay_saturated(size):
     """Logits beyond 4096 are cut, and opacities earlier; what they look like does not change."""
     signs = normal(400, 1).sign()
     model = small_model(ball_points(400)[0], opacity_logits=signs * size, color_logits=signs * size, fields=0.3)
-    quantized = even(model, STEP)
+    quantized = quantize_uniformly(model, STEP)
     plan = quantized.plan
 
     decoded = through(model, quantized)
@@ -119,7 +119,7 @@ def test_saturated_opacities_and_colours_stay_saturated(size):
 def test_no_gaussian_gives_a_file_of_none(prune):
     model = small_model(np.zeros((0, 3)), background=True)
 
-    decoded = through(model, drawn(model, prune=prune))
+    decoded = through(model, quantize_with_drawn_sensitivity(model, prune=prune))
 
     assert len(decoded) == 0 and decoded.config == model.config
 

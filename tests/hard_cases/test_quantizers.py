@@ -33,7 +33,7 @@ from hyrfpack.quant import (
 )
 from hyrfpack.quant.huffman import MAX_CODE_BITS
 from hyrfpack.render import render
-from tools.safety.plans import even
+from tools.safety.synthetic_encoding import quantize_uniformly
 
 LARGEST = float(np.finfo(np.float32).max)
 SMALLEST = 2.0**-149
@@ -342,7 +342,7 @@ def test_models_of_hardly_any_gaussians_survive_and_render(profile, fill, count)
     model = small_model(np.random.default_rng(count).normal(size=(count, 3)), fields=1.0, background=True)
     with torch.no_grad():
         FILLS[fill](model)
-    settings = {"quantized": even(model, STEP)} if profile == "compact" else {}
+    settings = {"quantized": quantize_uniformly(model, STEP)} if profile == "compact" else {}
 
     data = encode_model(model, profile, **settings)
     decoded = decode_model(data)
@@ -369,7 +369,11 @@ def test_models_of_hardly_any_gaussians_survive_and_render(profile, fill, count)
 def test_one_number_that_is_not_finite_is_rejected_in_every_group(profile, value):
     for name in small_model(np.zeros((2, 3))).state_dict():
         model = small_model(np.zeros((2, 3)))
-        write = even(model, STEP).plan.apply if profile == "compact" else partial(encode_model, profile=profile)
+        write = (
+            quantize_uniformly(model, STEP).plan.apply
+            if profile == "compact"
+            else partial(encode_model, profile=profile)
+        )
         with torch.no_grad():
             model.state_dict()[name].view(-1)[-1] = value
 

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from made_up_photos import FOCAL_PIXELS, PHOTO_SIZE, write_photos
 
-from tools.safety.run_docs import PAGES, python_of, run
+from tools.safety.run_docs import DOCUMENTED_PAGES, extract_python, run_page
 
 
 def test_the_python_of_a_page_is_its_blocks_each_line_where_it_stands():
     fenced = "Words\n\n```python\nimport hyrfpack\n\nx = 1\n```\n"
     indented = "\n    hyrfpack train a -o b\n\nMore words:\n\n    import hyrfpack\n    y = 2\n\nEnd\n"
-    lines = python_of(fenced + indented).split("\n")
+    lines = extract_python(fenced + indented).split("\n")
     assert {number: line for number, line in enumerate(lines, start=1) if line} == {
         4: "import hyrfpack",
         6: "x = 1",
@@ -49,12 +49,12 @@ def opengl(pose: np.ndarray) -> np.ndarray:
 
 @pytest.mark.slow
 def test_every_page_runs_as_written(photos, capfd):
-    assert all(run(page, photos, 2) for page in PAGES), capfd.readouterr().err
+    assert all(run_page(page, photos, 2) for page in DOCUMENTED_PAGES), capfd.readouterr().err
 
 
 def test_a_page_that_breaks_is_noticed(tmp_path, data):
     page = tmp_path / "page.md"
     page.write_text("```python\nimport hyrfpack\nhyrfpack.load('missing.hyrf')\n```\n")
-    assert not run(page, data, None)
+    assert not run_page(page, data, None)
     page.write_text("No Python.\n")
-    assert not run(page, data, None)
+    assert not run_page(page, data, None)

@@ -27,11 +27,11 @@ from tools.gpu import roofline as gpu_roofline
 from tools.gpu import suite as gpu_suite
 from tools.gpu import tests as gpu_tests
 from tools.gpu import timing as gpu_timing
-from tools.gpu.compare import checked
-from tools.gpu.rows import goal
-from tools.gpu.scene import TIDY, TRAINED, Look, make_cameras, make_model, splats_of
-from tools.gpu.setup import Setup, find_set
-from tools.gpu.worker import failure, missing_package, run_items
+from tools.gpu.compare import check_call
+from tools.gpu.rows import goal_row
+from tools.gpu.scene import TIDY_LOOK, TRAINED_LOOK, Look, decode_splats, make_cameras, make_model
+from tools.gpu.setup import Setup, find_dataset
+from tools.gpu.worker import failure_row, find_missing_package, run_in_children
 
 CUDA = torch.cuda.is_available()
 GPU = "gpu" if has_triton() else "cpu"
@@ -58,7 +58,7 @@ RATES = gpu_timing.Rates(copy=1e12, bf16=4e14, fp32=2e13)
 # One child of gpu_worker for the tests: items that print a row, raise, die, hang, or leave the device unusable.
 CHILD = f"""
 import sys
-sys.path.insert(0, {str(gpu_check.ROOT)!r})
+sys.path.insert(0, {str(gpu_check.REPOSITORY_ROOT)!r})
 import os, time
 from tools.gpu import worker as gpu_worker
 usable = True
@@ -80,13 +80,13 @@ def run(item):
     if item == "hangs in a test":
         print("test_loop", flush=True)
         time.sleep(60)
-sys.exit(gpu_worker.work(run, sys.argv[1:], lambda: usable))
+sys.exit(gpu_worker.run_child(run, sys.argv[1:], lambda: usable))
 """
 
 
 def run_children(*items: str, seconds: float = 20.0) -> dict[str, list[str]]:
     """What rows say of each item: "fine", or the status and its reason."""
-    rows = run_items(lambda left: [sys.executable, "-c", CHILD, *left], items, seconds)
+    rows = run_in_children(lambda left: [sys.executable, "-c", CHILD, *left], items, seconds)
     told: dict[str, list[str]] = {}
     for row in rows:
         told.setdefault(row["item"], []).append(f"{row['status']}: {row['note']}" if "status" in row else "fine")
@@ -94,56 +94,56 @@ def run_children(*items: str, seconds: float = 20.0) -> dict[str, list[str]]:
 
 
 def test_work_of_the_rasteriser_is_that_counted_by_hand() -> None:
-    assert gpu_roofline.project(10).bytes == 10 * 4 * (3 + 4 + 3 + 1 + 2 + 3 + 1 + 1)
+    assert gpu_roofline.count_project(10).bytes == 10 * 4 * (3 + 4 + 3 + 1 + 2 + 3 + 1 + 1)
     # 3 Gaussians sorted by 4 bytes, 5 pairs by the 13 bits of 8,160 tiles: 4 and 2 passes of 8 bytes there and back.
     sorting = 3 * 4 * 16 + 5 * 2 * 16
-    assert gpu_roofline.bin_pairs(3, 5, 8160).bytes == 3 * 28 + 5 * 8 + sorting
-    work = gpu_roofline.blend(pairs=6, pixels=512, reached=0.5, blended=2.0)
+    assert gpu_roofline.count_bin_pairs(3, 5, 8160).bytes == 3 * 28 + 5 * 8 + sorting
+    work = gpu_roofline.count_blend(pairs=6, pixels=512, reached=0.5, blended=2.0)
     assert work.bytes == 3 * 40 + 512 * 16
     assert work.flops == 3 * 256 * 12 + 2 * 512 * 10
-    work = gpu_roofline.blend_backward(pairs=6, pixels=512, reached=0.5, blended=2.0)
+    work = gpu_roofline.count_blend_backward(pairs=6, pixels=512, reached=0.5, blended=2.0)
     assert work.bytes == 3 * (40 + 44) + 512 * 20
     assert work.flops == 3 * 256 * 12 + 2 * 512 * 40
 
 
 def test_work_of_the_fields_is_that_counted_by_hand() -> None:
     # 100 points, 16 levels of 2 features; 12,800 corners, so that all of 5,000 rows may be needed.
-    assert gpu_roofline.hash_encode(100, 16, 5000).bytes == 100 * 3 * 4 + 100 * 32 * 4 + 5000 * 8
-    assert gpu_roofline.hash_encode(100, 16, 50_000).bytes == 100 * 3 * 4 + 100 * 32 * 4 + 12_800 * 8
-    assert gpu_roofline.hash_encode_backward(100, 16, 50_000).bytes == 100 * 3 * 4 + 100 * 32 * 4 + 50_000 * 8
+    assert gpu_roofline.count_hash_encode(100, 16, 5000).bytes == 100 * 3 * 4 + 100 * 32 * 4 + 5000 * 8
+    assert gpu_roofline.count_hash_encode(100, 16, 50_000).bytes == 100 * 3 * 4 + 100 * 32 * 4 + 12_800 * 8
+    assert gpu_roofline.count_hash_encode_backward(100, 16, 50_000).bytes == 100 * 3 * 4 + 100 * 32 * 4 + 50_000 * 8
     weights = 32 * 64 + 64 * 64 + 64 * 8
-    work = gpu_roofline.decode(100, (32, 64, 64, 8), 16, 5000, mixed=True)
+    work = gpu_roofline.count_decode(100, (32, 64, 64, 8), 16, 5000, mixed=True)
     assert work.bytes == 100 * 3 * 4 + 5000 * 8 + 100 * 8 * (4 + 4) and work.unit == "bf16"
     assert work.flops == 100 * (16 * (49 + 32) + 2 * weights + 10 * 8)
-    work = gpu_roofline.mlp(100, (32, 64, 64, 8), mixed=True)
+    work = gpu_roofline.count_mlp(100, (32, 64, 64, 8), mixed=True)
     assert (work.bytes, work.flops, work.unit) == (100 * 40 * 4 + weights * 4, 100 * weights * 2, "bf16")
-    work = gpu_roofline.shade(100, (24, 64, 64, 3), mixed=True)
+    work = gpu_roofline.count_shade(100, (24, 64, 64, 3), mixed=True)
     assert work.bytes == 100 * ((3 + 3 + 3) * 4 + 64 * 2)
     assert work.flops == 100 * (2 * (24 * 64 + 64 * 64 + 64 * 3) + 60)
     # Of 500 Gaussians 100 are drawn, whose positions are read once.
-    fused = gpu_roofline.project_shaded(500, 100, (24, 64, 64, 3), mixed=True)
+    fused = gpu_roofline.count_project_shaded(500, 100, (24, 64, 64, 3), mixed=True)
     assert fused.bytes == 500 * 72 + 100 * ((3 + 3) * 4 + 64 * 2)
     assert (fused.flops, fused.unit) == (work.flops, "bf16")
     # 100 of 180 nodes are needed; their 12,800 corners may be all of 5,000 rows.
-    work = gpu_roofline.background(700, 180, 100, (56, 64, 64, 3), 16, 5000, mixed=False)
+    work = gpu_roofline.count_background(700, 180, 100, (56, 64, 64, 3), 16, 5000, mixed=False)
     assert work.bytes == 700 * 4 + 180 * 3 * 4 + 5000 * 8 and work.unit == "fp32"
     assert work.flops == 100 * (16 * (49 + 32) + 2 * (56 * 64 + 64 * 64 + 64 * 3) + 130)
-    work = gpu_roofline.mlp_backward(100, (32, 64, 64, 8), mixed=False)
+    work = gpu_roofline.count_mlp_backward(100, (32, 64, 64, 8), mixed=False)
     assert work.flops == 2 * 100 * (2 * weights + 32 * 64 + 64 * 64) and work.unit == "fp32"
 
 
 def test_work_of_loss_and_optimiser_is_that_counted_by_hand() -> None:
-    assert gpu_roofline.photometric_loss(10).bytes == 10 * 3 * 3 * 4
-    assert gpu_roofline.photometric_loss(10).flops == 10 * 3 * (8 * 2 * 11 * 2 + 40)
-    assert gpu_roofline.adam(10).bytes == 10 * (4 + 3) * 4
+    assert gpu_roofline.count_photometric_loss(10).bytes == 10 * 3 * 3 * 4
+    assert gpu_roofline.count_photometric_loss(10).flops == 10 * 3 * (8 * 2 * 11 * 2 + 40)
+    assert gpu_roofline.count_adam(10).bytes == 10 * (4 + 3) * 4
 
 
 def test_roofline_is_the_slower_of_memory_and_arithmetic() -> None:
     memory, arithmetic = gpu_roofline.Work(2e9, 2e10), gpu_roofline.Work(2e9, 8e11, "bf16")
-    assert memory.least_ms(RATES) == pytest.approx(2.0)
-    assert arithmetic.least_ms(RATES) == pytest.approx(2.0)
+    assert memory.min_ms(RATES) == pytest.approx(2.0)
+    assert arithmetic.min_ms(RATES) == pytest.approx(2.0)
     assert memory.shares(4.0, RATES) == pytest.approx((0.5, 0.25))
-    assert gpu_roofline.Work(1e9, 8e12, "bf16").least_ms(RATES) == pytest.approx(20.0)
+    assert gpu_roofline.Work(1e9, 8e12, "bf16").min_ms(RATES) == pytest.approx(20.0)
 
 
 def test_kernels_of_the_profiler_are_added_up_and_grouped_by_stage() -> None:
@@ -161,16 +161,16 @@ def test_kernels_of_the_profiler_are_added_up_and_grouped_by_stage() -> None:
         Event("DeviceRadixSortKernel", 1000, 8),
         Event("memset", 500, 2),
     ]
-    profile = gpu_timing.sum_up(events, runs=2)
+    profile = gpu_timing.summarize_events(events, runs=2)
     assert list(profile.times) == ["blend_kernel", "project_kernel", "DeviceRadixSortKernel", "memset"]
     assert (profile.launches, profile.waits) == (7, 3)
-    stages = gpu_timing.group_kernels(profile.times, gpu_kernels.STAGES, "bin")
+    stages = gpu_timing.group_kernels(profile.times, gpu_kernels.STAGE_KERNEL_WORDS, "bin")
     assert stages == {"project": 1.0, "blend": 3.0, "bin": 0.75}
 
 
 def test_count_of_blended_gaussians_matches_a_walk_from_pixel_to_pixel() -> None:
-    whole = splats_of(make_model(2000, torch.device("cpu")), make_cameras(4, 128, 128)[1])
-    splats = gpu_kernels.cropped(whole, 16)
+    whole = decode_splats(make_model(2000, torch.device("cpu")), make_cameras(4, 128, 128)[1])
+    splats = gpu_kernels.crop_splats(whole, 16)
     splats.inputs["opacities"].fill_(0.97)  # so that all pixels are finished before the last
     values = [splats.inputs[name] for name in ("means", "quats", "scales", "opacities")]
     seen = project(*values, *splats.view, 0.01, False)
@@ -201,7 +201,7 @@ def test_errors_beyond_their_bounds_fail_a_row() -> None:
         return x * (2.0 if implementation == "reference" else 2.001)
 
     call = OperationCall(double, {"x": torch.linspace(1, 2, 5)}, ("x",), (1e-2, 1e-4))
-    row = checked(call, "gpu")
+    row = check_call(call, "gpu")
     assert row["value error"] == pytest.approx(5e-4, rel=1e-2)
     assert row["status"] == "failed" and "beyond 1e-04" in row["note"]
 
@@ -209,7 +209,7 @@ def test_errors_beyond_their_bounds_fail_a_row() -> None:
 def test_numbers_that_are_not_finite_fail_a_row() -> None:
     call = OperationCall(lambda implementation, x: x if implementation == "reference" else x * float("nan"), {}, ())
     call = OperationCall(call.run, {"x": torch.ones(3)}, ("x",))
-    assert checked(call, "gpu")["status"] == "failed"
+    assert check_call(call, "gpu")["status"] == "failed"
 
 
 def test_an_item_that_raises_dies_or_breaks_the_device_leaves_the_others() -> None:
@@ -229,19 +229,21 @@ def test_an_item_that_hangs_is_killed_at_the_time_limit_and_the_rest_is_named() 
 
 def test_what_hung_is_reported_by_what_it_printed_last() -> None:
     told = run_children("hangs in a test", "two", seconds=1.5)
-    assert told["hangs in a test"][-1] == "failed: not done within the part's 2 s; last words: test_loop"
+    assert told["hangs in a test"][-1] == "failed: not done within the part's 2 s; last output: test_loop"
     assert told["two"] == ["failed: not done within the part's 2 s"]
 
 
 def test_packages_of_others_are_told_from_our_modules_by_the_error_and_not_by_its_words() -> None:
     lacks = ModuleNotFoundError("in /tmp/hyrfpack-gpu-1/", name="trimesh.path")
-    assert missing_package(lacks) == "trimesh"
-    assert missing_package(ModuleNotFoundError(name="PIL.Image")) == "pillow"
-    assert missing_package(ModuleNotFoundError("trimesh", name="hyrfpack.made_up")) is None
-    assert missing_package(ModuleNotFoundError("no name")) is missing_package(ImportError(name="scipy")) is None
+    assert find_missing_package(lacks) == "trimesh"
+    assert find_missing_package(ModuleNotFoundError(name="PIL.Image")) == "pillow"
+    assert find_missing_package(ModuleNotFoundError("trimesh", name="hyrfpack.made_up")) is None
+    assert (
+        find_missing_package(ModuleNotFoundError("no name")) is find_missing_package(ImportError(name="scipy")) is None
+    )
     with pytest.raises(HyrfError) as caught, needs_package("trimesh", "hyrfpack/a.ply: reading points"):
         raise lacks
-    assert failure(caught.value) == {"status": "left out", "note": "it needs trimesh, which is not installed here"}
+    assert failure_row(caught.value) == {"status": "left out", "note": "it needs trimesh, which is not installed here"}
 
 
 @pytest.mark.parametrize(("module", "package"), [("PIL", "pillow"), ("rich", "rich"), ("scipy", "scipy")])
@@ -251,10 +253,10 @@ import sys
 sys.modules[{module!r}] = None
 from tools.gpu import quality
 from tools.gpu.setup import Setup
-from tools.gpu.worker import work
-work(lambda item: quality.run(item, Setup.from_json({TINY.to_json()!r})), ["demo"], lambda: True)
+from tools.gpu.worker import run_child
+run_child(lambda item: quality.run(item, Setup.from_json({TINY.to_json()!r})), ["demo"], lambda: True)
 """
-    (row,) = run_items(lambda left: [sys.executable, "-c", code], ["demo"], 60.0)
+    (row,) = run_in_children(lambda left: [sys.executable, "-c", code], ["demo"], 60.0)
     assert row == {"item": "demo", "status": "left out", "note": f"it needs {package}, which is not installed here"}
 
 
@@ -268,26 +270,26 @@ def test_frames_are_drawn_where_training_lacks_a_package(monkeypatch: pytest.Mon
     monkeypatch.setitem(sys.modules, "tools.gpu.training", None)
     with pytest.raises(ModuleNotFoundError):  # a module of ours is no package that is missing
         list(gpu_frames.run("200", TINY))
-    monkeypatch.setattr(gpu_frames, "failure", lambda error: {"status": "left out", "note": "it needs rich"})
+    monkeypatch.setattr(gpu_frames, "failure_row", lambda error: {"status": "left out", "note": "it needs rich"})
     rows = list(gpu_frames.run("200", TINY))
     assert [row["table"] for row in rows if row.get("note") == "it needs rich"] == ["Training"]
     assert "Frames, 16 x 16" in {row["table"] for row in rows}
 
 
 def test_a_part_that_lacks_a_package_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(gpu_check.PARTS, "poor", ("no_such_package.part", 5.0))
+    monkeypatch.setitem(gpu_check.CHECK_PARTS, "poor", ("no_such_package.part", 5.0))
     rows = gpu_check.check(["poor"], TINY)
     assert rows[0]["status"] == "left out" and "no_such_package" in rows[0]["note"]
 
 
 def test_a_child_that_cannot_start_fails_each_item_once() -> None:
-    rows = list(run_items(lambda left: [sys.executable, "-c", "raise SystemExit('no')"], ["a", "b"], 20.0))
+    rows = list(run_in_children(lambda left: [sys.executable, "-c", "raise SystemExit('no')"], ["a", "b"], 20.0))
     assert [row["item"] for row in rows] == ["a", "b"]
     assert all("its process ended: no" in row["note"] for row in rows)
 
 
 def test_a_part_whose_module_is_broken_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(gpu_check.PARTS, "broken", ("tools.gpu.no_such_module", 5.0))
+    monkeypatch.setitem(gpu_check.CHECK_PARTS, "broken", ("tools.gpu.no_such_module", 5.0))
     rows = gpu_check.check(["broken"], TINY)
     assert rows[0]["status"] == "failed" and "tools.gpu.no_such_module" in rows[0]["note"]
 
@@ -296,10 +298,10 @@ def test_page_has_goals_failures_and_a_table_for_each_kind(tmp_path: Path) -> No
     rows = [
         {"part": "kernels", "item": "a", "table": "Kernels", "kernel": "a|b", "ms": 0.5, "pairs": 1_234_567},
         {"part": "kernels", "item": "b", "status": "failed", "note": "RuntimeError: no"},
-        {"part": "frames", "item": "1", **goal("frames", 312.0, 300.0, "frames/s", at_least=True)},
-        {"part": "frames", "item": "1", **goal("steps", 12.0, 10.0, "min", at_least=False)},
+        {"part": "frames", "item": "1", **goal_row("frames", 312.0, 300.0, "frames/s", at_least=True)},
+        {"part": "frames", "item": "1", **goal_row("steps", 12.0, 10.0, "min", at_least=False)},
     ]
-    page = gpu_report.write(tmp_path / "new", {"device": "NVIDIA H200", "torch": "2.11"}, {"width": 1920}, rows)
+    page = gpu_report.write_report(tmp_path / "new", {"device": "NVIDIA H200", "torch": "2.11"}, {"width": 1920}, rows)
     assert page.name == "nvidia-h200.md"
     text = page.read_text()
     assert "# NVIDIA H200\n" in text and "torch 2.11" in text
@@ -318,9 +320,9 @@ def test_settings_survive_the_way_to_a_child() -> None:
 def test_set_is_the_one_asked_for_or_one_of_the_data_folder(tmp_path: Path) -> None:
     for name in ("b", "a"):
         (tmp_path / name / "sparse").mkdir(parents=True)
-    assert find_set(tmp_path / "b", None, tmp_path) == tmp_path / "b"
-    assert find_set(None, str(tmp_path), Path("/nowhere")) == tmp_path / "a"
-    assert find_set(None, None, tmp_path / "nowhere") is None
+    assert find_dataset(tmp_path / "b", None, tmp_path) == tmp_path / "b"
+    assert find_dataset(None, str(tmp_path), Path("/nowhere")) == tmp_path / "a"
+    assert find_dataset(None, None, tmp_path / "nowhere") is None
 
 
 @pytest.mark.skipif(CUDA, reason="there is a GPU")
@@ -333,7 +335,7 @@ def test_it_starts_from_the_repository_root_without_an_installed_hyrfpack() -> N
     # -S leaves out the environment's packages, and with them an installed hyrfpack; torch is found where it is.
     environment = {**os.environ, "PYTHONPATH": str(Path(torch.__file__).parents[1])}
     command = [sys.executable, "-S", "-m", "tools.gpu.check", "--help"]
-    done = subprocess.run(command, cwd=gpu_check.ROOT, env=environment, capture_output=True, text=True)
+    done = subprocess.run(command, cwd=gpu_check.REPOSITORY_ROOT, env=environment, capture_output=True, text=True)
     assert done.returncode == 0 and "--parts" in done.stdout, done.stderr
 
 
@@ -394,27 +396,38 @@ def test_tests_are_left_out_where_there_is_no_pytest(monkeypatch: pytest.MonkeyP
     monkeypatch.setitem(sys.modules, "pytest", None)
     with pytest.raises(ModuleNotFoundError) as caught:
         list(gpu_tests.run("pytest", TINY))
-    assert failure(caught.value)["status"] == "left out"
+    assert failure_row(caught.value)["status"] == "left out"
 
 
 def test_every_test_of_kernels_and_of_the_whole_path_is_chosen() -> None:
-    command = [sys.executable, "-m", "pytest", "-q", "--collect-only", *gpu_suite.LENIENT, "-m", gpu_suite.CHOSEN]
-    done = subprocess.run([*command, *gpu_suite.PLACES], cwd=gpu_check.ROOT, capture_output=True, text=True)
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "--collect-only",
+        *gpu_suite.PYTEST_OVERRIDES,
+        "-m",
+        gpu_suite.GPU_MARKER,
+    ]
+    done = subprocess.run(
+        [*command, *gpu_suite.TEST_PATHS], cwd=gpu_check.REPOSITORY_ROOT, capture_output=True, text=True
+    )
     chosen = {line.partition("[")[0] for line in done.stdout.splitlines() if "::" in line}
     for file in ("tests/ops/test_shaded.py", "tests/test_gpu_path.py"):
-        names = re.findall(r"^def (test_\w+)", (gpu_check.ROOT / file).read_text(), re.MULTILINE)
+        names = re.findall(r"^def (test_\w+)", (gpu_check.REPOSITORY_ROOT / file).read_text(), re.MULTILINE)
         assert names and {f"{file}::{name}" for name in names} <= chosen
-    kernels = {path.parent.name for path in gpu_check.ROOT.glob("hyrfpack/ops/*/gpu.py")}
+    kernels = {path.parent.name for path in gpu_check.REPOSITORY_ROOT.glob("hyrfpack/ops/*/gpu.py")}
     assert len(kernels) > 5 and kernels <= {re.search(r"test_(\w+)\.py", name)[1] for name in chosen}
 
 
 def test_a_room_as_trained_has_three_to_five_times_the_pairs() -> None:
     @torch.no_grad()
     def pairs(look: Look) -> int:
-        splats = splats_of(make_model(60_000, torch.device("cpu"), look), make_cameras(4, 480, 270)[1])
+        splats = decode_splats(make_model(60_000, torch.device("cpu"), look), make_cameras(4, 480, 270)[1])
         return int(rasterize(*splats.inputs.values(), *splats.view).pairs)
 
-    assert 3 <= pairs(TRAINED) / pairs(TIDY) <= 5
+    assert 3 <= pairs(TRAINED_LOOK) / pairs(TIDY_LOOK) <= 5
 
 
 @pytest.mark.parametrize("item", gpu_frames.items(TINY))

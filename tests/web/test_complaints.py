@@ -14,5 +14,5 @@ console.error("an error of the page"); setTimeout(() => { throw new Error("throw
 def test_errors_of_a_page_are_told(browser: Browser, tmp_path: Path) -> None:
     (tmp_path / "page.html").write_text(PAGE)
     browser.open((tmp_path / "page.html").as_uri())
-    said = " ".join(browser.complaints())
+    said = " ".join(browser.list_errors())
     assert "an error of the page" in said and "thrown" in said

@@ -37,7 +37,7 @@ from hyrfpack.model.exposure import ExposureMap
 from hyrfpack.render import render
 from hyrfpack.scene import Camera
 from hyrfpack.web.player import encode_element_script, encode_player
-from tools.safety.plans import encode
+from tools.safety.synthetic_encoding import encode
 
 LARGEST_LOG_GAIN = 1.0
 PRESSED = "document.getElementById('exposure').getAttribute('aria-pressed')"
@@ -100,7 +100,7 @@ def test_both_exposures_look_as_hyrfpack_renders_them(browser: Browser, tmp_path
         assert min(scores) > 45, (exposure, scores)
     apart = [psnr(one.astype(float), other) for one, other in zip(*pictures.values(), strict=True)]
     assert max(apart) < 25, "the map of this test changes too little"
-    assert browser.complaints() == []
+    assert browser.list_errors() == []
 
 
 @pytest.mark.in_turn

@@ -23,7 +23,7 @@ def test_pictures_are_those_of_our_rasterizer(browser: Browser, tmp_path: Path):
         picture = shown(browser, at)
         assert psnr(picture, drawn(decode_splats_page(page, "page")[0], at, sky_seen(at))) > 45, case
         assert psnr(picture, drawn(splats, at, sky_seen(at))) > 38, case
-    assert browser.complaints() == []
+    assert browser.list_errors() == []
 
 
 def test_a_scene_of_another_program_looks_as_our_rasterizer_draws_it(

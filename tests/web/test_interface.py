@@ -187,7 +187,7 @@ def test_every_bad_camera_is_one_sentence_and_the_scene_is_there(browser: Browse
         browser.press("Escape")
         until(browser, "document.getElementById('message').hidden")
         np.testing.assert_array_equal(eye(browser).camera_from_world, home.camera_from_world)
-    assert browser.complaints() == []
+    assert browser.list_errors() == []
 
 
 # ---- the address, there and back
@@ -214,7 +214,7 @@ def test_a_shared_link_leads_back_to_the_same_view(browser: Browser, tmp_path: P
     opened(browser, tmp_path, page_of(cloud()), "#camera=" + json_of(before))
     browser.drag(*turned)
     assert np.linalg.norm(there.position - eye(browser).position) < 0.5
-    assert browser.complaints() == []
+    assert browser.list_errors() == []
 
 
 def test_links_are_as_exact_in_any_unit_and_however_a_camera_is_turned(tmp_path: Path):
@@ -370,7 +370,7 @@ def test_a_page_without_storage_works(browser: Browser, tmp_path: Path):
         assert not hidden(browser, "hint")
         browser.drag((120, 90), (125, 90))
         until(browser, "document.getElementById('hint').hidden")
-    assert browser.complaints() == []
+    assert browser.list_errors() == []
 
 
 # ---- keys alone, and ears alone

@@ -19,7 +19,7 @@ from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.render import RenderSettings, render
 from hyrfpack.scene import Camera
 from hyrfpack.web.html import encode_model_page
-from tools.safety.plans import encode
+from tools.safety.synthetic_encoding import encode
 
 FRAME = Frame((10.0, -20.0, 5.0), 7.0, (1.0, 0.5, 0.8))
 EXACT = RenderSettings(background_threshold=0.0, background_stride=1)
@@ -131,7 +131,7 @@ def test_pictures_geometry_and_colours_are_those_of_the_model(browser: Browser, 
     shown(browser, camera)
     check_geometry_and_colours(browser, model, camera)
     scores = [psnr(shown(browser, camera), rendered(model, camera)) for camera in cameras()]
-    assert min(scores) > 45 and browser.complaints() == [], scores
+    assert min(scores) > 45 and browser.list_errors() == [], scores
 
 
 def check_geometry_and_colours(browser: Browser, model: HybridModel, camera: Camera) -> None:
@@ -298,7 +298,7 @@ def test_a_weak_device_draws_fitted_harmonics(browser: Browser, tmp_path: Path, 
             assert browser.evaluate("said").startswith("Drawn with harmonics: ")
         assert browser.evaluate("Boolean(hyrfpack.player.renderer.content.harmonics)")
         scores = [psnr(shown(browser, camera), rendered(model, camera)) for camera in cameras()]
-    assert min(scores) > 28 and browser.complaints() == [], scores
+    assert min(scores) > 28 and browser.list_errors() == [], scores
 
 
 @pytest.mark.in_turn
@@ -350,7 +350,7 @@ def test_scripts_may_dispose_of_a_player(browser: Browser, tmp_path: Path):
     loaded(browser, tmp_path, page_of(made_up(50)))
     browser.evaluate("hyrfpack.player.dispose()")
     assert browser.evaluate("hyrfpack.player.renderer.gl.isContextLost()")
-    assert browser.complaints() == []
+    assert browser.list_errors() == []
 
 
 @pytest.mark.in_turn

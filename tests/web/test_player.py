@@ -84,7 +84,7 @@ def test_mouse_and_keys_move_the_eye(browser: Browser, tmp_path: Path):
     assert browser.evaluate(hidden)  # in a window so small
     browser.press("h")
     assert not browser.evaluate(hidden)
-    assert browser.complaints() == []
+    assert browser.list_errors() == []
 
 
 def test_the_scene_follows_the_pointer_where_the_camera_stands_on_its_head(browser: Browser, tmp_path: Path):
@@ -307,7 +307,7 @@ def test_keys_zoom_orbit_and_choose_the_middle(browser: Browser, tmp_path: Path)
     browser.press("r")
     rested(browser).press("o")
     until(browser, "!document.getElementById('ring').hidden")
-    assert browser.complaints() == []
+    assert browser.list_errors() == []
 
 
 def test_a_short_press_moves_however_slow_the_frames_are(browser: Browser, tmp_path: Path):

@@ -121,7 +121,7 @@ def test_the_address_names_the_file(browser: Browser, host: Site):
     browser.evaluate("hyrfpack.ready")
     assert browser.evaluate("hyrfpack.player.scene.kind") == "splats"
     assert np.linalg.norm(np.array(browser.evaluate("hyrfpack.player.scene.target")) - CENTER) < 0.3
-    assert browser.complaints() == []
+    assert browser.list_errors() == []
 
 
 def test_a_file_beside_the_player_is_the_default(browser: Browser, host: Site):
@@ -228,7 +228,7 @@ def test_an_empty_player_asks_for_a_file_and_takes_what_is_dropped(browser: Brow
     drop(browser, GOLDEN, "model.hyrf")
     until(browser, "hyrfpack.player.scene.kind === 'hyrf'")
     until(browser, "document.getElementById('count').textContent.startsWith('hybrid field, ')")
-    assert browser.complaints() == []
+    assert browser.list_errors() == []
 
 
 def test_a_bad_file_leaves_the_scene_and_says_so(browser: Browser, host: Site):

@@ -68,7 +68,7 @@ def test_the_page_waits_for_the_first_step_and_says_so(browser: Browser):
         training.show(snapshot(20), 1)
         until(browser, f"{COUNT} === 20")
         until(browser, "document.title === 'fern, step 1 of 3,000'")
-        assert browser.evaluate(REMARK) == "" and browser.complaints() == []
+        assert browser.evaluate(REMARK) == "" and browser.list_errors() == []
 
 
 def test_a_newer_snapshot_takes_the_place_of_the_one_before_and_the_camera_stays(browser: Browser):
@@ -90,7 +90,7 @@ def test_a_newer_snapshot_takes_the_place_of_the_one_before_and_the_camera_stays
         assert browser.evaluate("document.getElementById('count').textContent") == "hybrid field, 60 Gaussians"
         assert browser.screenshot() != picture
         assert browser.evaluate("window.seen") == []  # no progress bar comes and goes
-        assert browser.complaints() == []
+        assert browser.list_errors() == []
     browser.prefer()
 
 

@@ -1,8 +1,8 @@
-"""Speed, size and memory of `compact` files, with and without Numba, beside `raw` files of the same models.
+"""Measure speed, size and memory of `compact` files, with and without Numba, against `raw` files of the same models.
 
-The models are drawn: points near a wavy surface, logits that vary slowly with some noise on top, and sensitivities
-that spread over decades as those of trained models do. What a trained model loses is for `bench/` to say; here the
-error is that of the explicit logits, against the model that was coded.
+The models are random: points near a wavy surface, logits that vary slowly with added noise, and sensitivities that
+spread over decades as those of trained models do. The error is that of the explicit logits against the encoded model;
+`hyrfpack bench` measures what a trained model loses in pictures.
 """
 
 from __future__ import annotations
@@ -25,15 +25,16 @@ from hyrfpack.measure.timing import time_alternately
 from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.parallel import has_numba
-from tools.safety.plans import drawn_sensitivity
+from tools.safety.synthetic_encoding import draw_sensitivity
 
-SIZES = ((100_000, 14), (1_000_000, 17))  # Gaussians, log2 of the radiance table; that of geometry is half as large
-REPEATS = 3
-DISTORTION = 2e-6
+# Number of Gaussians and log2_table_size of the radiance grid; the geometry grid's table is half as large.
+MODEL_SIZES = ((100_000, 14), (1_000_000, 17))
+TIMING_REPEATS = 3
+TARGET_DISTORTION = 2e-6
 
 
-def drawn_model(count: int, log2_table_size: int) -> HybridModel:
-    """A model with `count` Gaussians."""
+def make_random_model(count: int, log2_table_size: int) -> HybridModel:
+    """Return a random model with `count` Gaussians and a radiance table of at most 2^log2_table_size rows a level."""
     rng = np.random.default_rng(0)
     frame = Frame((0.0, 0.0, 0.0), 1.0, (1.0, 1.0, 1.0))
     config = ModelConfig(frame, HashGridConfig(log2_table_size - 1), HashGridConfig(log2_table_size))
@@ -50,32 +51,35 @@ def drawn_model(count: int, log2_table_size: int) -> HybridModel:
 
 
 def bench() -> list[dict]:
-    """Time all ways, interleaved; medians.
+    """Time encoding and decoding with each profile and implementation in alternation; times are medians.
 
     Returns:
-        A row for each size and way: bytes, times, the largest root mean square error of an explicit logit, and the
-        peak of what numpy holds while decoding, over the decoded model.
+        A row for each model size and profile: bytes, times in ms, the largest root mean square error of a group of
+        explicit logits, and numpy's peak memory while decoding as a multiple of the decoded model's size.
     """
-    return [row for size in SIZES for row in _bench_model(*size)]
+    return [row for size in MODEL_SIZES for row in _bench_model(*size)]
 
 
 def _bench_model(count: int, log2_table_size: int) -> list[dict]:
-    model = drawn_model(count, log2_table_size)
-    sensitivity = drawn_sensitivity(model)
-    make = partial(make_plan, model, sensitivity, DISTORTION, prune=False)
+    model = make_random_model(count, log2_table_size)
+    sensitivity = draw_sensitivity(model)
+    make = partial(make_plan, model, sensitivity, TARGET_DISTORTION, prune=False)
     plan = make()
     ways = {"compact (cpu)": True, "compact (numpy)": False} if has_numba() else {"compact (numpy)": False}
 
     def encode() -> bytes:
         return encode_model(model, "compact", quantized=quantize(plan.apply(model), plan, sensitivity))
 
-    planning, _ = time_alternately({"plan": make}, REPEATS)
-    encoders = {"raw": partial(encode_model, model), **{way: _with_numba(fast, encode) for way, fast in ways.items()}}
-    encoding, files = time_alternately(encoders, REPEATS)
+    planning, _ = time_alternately({"plan": make}, TIMING_REPEATS)
+    encoders = {
+        "raw": partial(encode_model, model),
+        **{way: _with_numba(use_numba, encode) for way, use_numba in ways.items()},
+    }
+    encoding, files = time_alternately(encoders, TIMING_REPEATS)
     if len({files[way] for way in ways}) > 1:
         raise AssertionError("the bytes depend on whether there is Numba")
     decoders = {way: _with_numba(ways.get(way, True), partial(decode_model, data)) for way, data in files.items()}
-    decoding, models = time_alternately(decoders, REPEATS)
+    decoding, models = time_alternately(decoders, TIMING_REPEATS)
     return [
         {
             "gaussians": count,
@@ -86,25 +90,25 @@ def _bench_model(count: int, log2_table_size: int) -> list[dict]:
             "decode_ms": decoding[way].ms,
             "decode_over_raw": decoding[way].ratio_to(decoding["raw"]).wall,
             "decode_work_ms": decoding[way].work_ms,
-            "peak_over_model": _peak(decoders[way]) / sum(4 * p.numel() for p in model.parameters()),
-            "rms_error": _error(models[way], model, plan if way in ways else None),
+            "peak_over_model": _measure_peak_bytes(decoders[way]) / sum(4 * p.numel() for p in model.parameters()),
+            "rms_error": _measure_logit_error(models[way], model, plan if way in ways else None),
         }
         for way, data in files.items()
     ]
 
 
-def _with_numba(fast: bool, task: Callable[[], object]) -> Callable[[], object]:
-    """The task with compiled kernels, or as it is where Numba is missing."""
+def _with_numba(use_numba: bool, task: Callable[[], object]) -> Callable[[], object]:
+    """Return the task so that it runs with Numba's kernels, or as it does where Numba is missing."""
 
     def run() -> object:
-        with mock.patch("hyrfpack.quant.rans.has_numba", lambda: fast):
+        with mock.patch("hyrfpack.quant.rans.has_numba", lambda: use_numba):
             return task()
 
     return run
 
 
-def _peak(task: Callable[[], object]) -> float:
-    """Most bytes that numpy holds at once during a task."""
+def _measure_peak_bytes(task: Callable[[], object]) -> float:
+    """Return the most bytes that numpy holds at once during a task."""
     tracemalloc.start()
     try:
         task()
@@ -113,15 +117,15 @@ def _peak(task: Callable[[], object]) -> float:
         tracemalloc.stop()
 
 
-def _error(decoded: HybridModel, model: HybridModel, plan: Plan | None) -> float:
-    """Root mean square error of the explicit logits, of the worst group."""
+def _measure_logit_error(decoded: HybridModel, model: HybridModel, plan: Plan | None) -> float:
+    """Return the root mean square error of the worst group of explicit logits."""
     order = slice(None) if plan is None else plan.kept
     after, before = to_arrays(decoded), to_arrays(model)
     return max(float(np.sqrt(np.square(after[group] - before[group][order]).mean())) for group in LOGIT_SECTIONS)
 
 
 def main() -> None:
-    """Print the rows."""
+    """Print one dictionary for each row."""
     for row in bench():
         print(row)
 

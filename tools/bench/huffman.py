@@ -1,4 +1,4 @@
-"""Speed of the Huffman coder on hash-table symbols, beside dahuffman in the same run."""
+"""Measure the speed of the Huffman coder on hash-table symbols against dahuffman's in the same run."""
 
 from __future__ import annotations
 
@@ -8,13 +8,16 @@ from dahuffman import HuffmanCodec
 from hyrfpack.measure.timing import time_alternately
 from hyrfpack.quant import MinMaxQuantizer, huffman_decode, huffman_encode
 
-COUNT = 3_400_000
-PEER_COUNT = 100_000  # dahuffman is slow and linear: a slice gives its rate
-REPEATS = 5
+SYMBOL_COUNT = 3_400_000
+PEER_SYMBOL_COUNT = 100_000  # dahuffman is slow and its time is linear in the count, so a part gives its rate
+TIMING_REPEATS = 5
 
 
-def table_symbols(count: int = COUNT) -> np.ndarray:
-    """8-bit min-max codes of values like a trained hash table's: per level Gaussian, heavy-tailed over all levels."""
+def make_table_symbols(count: int = SYMBOL_COUNT) -> np.ndarray:
+    """Return 8-bit min-max codes of values like a trained hash table's.
+
+    The values are Gaussian within a level and heavy-tailed over all levels.
+    """
     rng = np.random.default_rng(0)
     spread = np.repeat(np.geomspace(0.3, 1.0, 16), -(-count // 16))[:count]
     values = rng.laplace(scale=spread) * 0.5 + rng.normal(scale=spread)
@@ -22,42 +25,42 @@ def table_symbols(count: int = COUNT) -> np.ndarray:
 
 
 def entropy_bits(symbols: np.ndarray) -> float:
-    """Zeroth-order entropy in bits a symbol."""
+    """Return the zeroth-order entropy in bits a symbol."""
     shares = np.bincount(symbols)[np.unique(symbols)] / len(symbols)
     return float(-(shares * np.log2(shares)).sum())
 
 
 def bench() -> list[dict]:
-    """Time both coders, interleaved; medians.
+    """Time both coders in alternation; times are medians.
 
     Returns:
-        One row for encoding and one for decoding: our and dahuffman's million symbols a second and their ratio, and
-        what the stream takes: bits a symbol of the payload, of the whole stream, and the entropy.
+        One row for encoding and one for decoding: million symbols a second of our coder and of dahuffman, their ratio,
+        and the bits a symbol of the payload, of the whole stream and of the entropy.
     """
-    symbols = table_symbols()
+    symbols = make_table_symbols()
     stream = huffman_encode(symbols)
-    head = symbols[:: COUNT // PEER_COUNT].tolist()
+    head = symbols[:: SYMBOL_COUNT // PEER_SYMBOL_COUNT].tolist()
     peer = HuffmanCodec.from_frequencies(dict(enumerate(np.bincount(symbols).tolist())))
     peer_bytes = peer.encode(head)
     if peer.decode(peer_bytes)[: len(head)] != head or not np.array_equal(huffman_decode(stream), symbols):
-        raise AssertionError("a coder does not give back what it was given")
+        raise AssertionError("a coder does not decode its stream to the symbols that it encoded")
     tasks = {
         "encode": (lambda: huffman_encode(symbols), lambda: peer.encode(head)),
         "decode": (lambda: huffman_decode(stream), lambda: peer.decode(peer_bytes)),
     }
     rows = []
     for name, (ours, theirs) in tasks.items():
-        times, _ = time_alternately({"ours": ours, "dahuffman": theirs}, REPEATS)
-        our_rate, peer_rate = COUNT / times["ours"].ms / 1e3, len(head) / times["dahuffman"].ms / 1e3
+        times, _ = time_alternately({"ours": ours, "dahuffman": theirs}, TIMING_REPEATS)
+        our_rate, peer_rate = SYMBOL_COUNT / times["ours"].ms / 1e3, len(head) / times["dahuffman"].ms / 1e3
         rows.append(
             {
                 "operation": name,
-                "symbols": COUNT,
+                "symbols": SYMBOL_COUNT,
                 "ours_msymbols_per_s": our_rate,
                 "dahuffman_msymbols_per_s": peer_rate,
                 "ratio": our_rate / peer_rate,
-                "payload_bits_per_symbol": 8 * len(stream.payload) / COUNT,
-                "stream_bits_per_symbol": 8 * len(stream.to_bytes()) / COUNT,
+                "payload_bits_per_symbol": 8 * len(stream.payload) / SYMBOL_COUNT,
+                "stream_bits_per_symbol": 8 * len(stream.to_bytes()) / SYMBOL_COUNT,
                 "entropy_bits_per_symbol": entropy_bits(symbols),
             }
         )
@@ -65,9 +68,9 @@ def bench() -> list[dict]:
 
 
 def main() -> None:
-    """Print the table."""
+    """Print the table: million symbols a second and bits a symbol."""
     rows = bench()
-    print(f"{COUNT:,} symbols; medians of {REPEATS}; million symbols a second")
+    print(f"{SYMBOL_COUNT:,} symbols; medians of {TIMING_REPEATS}; million symbols a second")
     print(f"{'':8}{'ours':>10}{'dahuffman':>12}{'ratio':>8}")
     for row in rows:
         ours, peer = row["ours_msymbols_per_s"], row["dahuffman_msymbols_per_s"]

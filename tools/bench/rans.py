@@ -1,7 +1,7 @@
-"""Speed and size of the integer coder beside zstd, constriction and our Huffman coder in the same run.
+"""Measure speed and size of the rANS integer coder against zstd, constriction and our Huffman coder in the same run.
 
-constriction and Huffman code the same tokens as we do, and their sizes count the extra bits as they are; what splits
-values into tokens is not in their times. zstd codes the values as bytes.
+constriction and Huffman encode the same tokens as our rANS coder. Their sizes include the uncompressed extra bits, and
+their times leave out the split of values into tokens. zstd encodes the values as bytes.
 """
 
 from __future__ import annotations
@@ -26,21 +26,21 @@ try:
 except ImportError:
     constriction = None
 
-COUNTS = (3_400_000, 30_000)
-REPEATS = 3
+SYMBOL_COUNTS = (3_400_000, 30_000)
+TIMING_REPEATS = 3
 
-Coder = tuple[Callable[[], bytes], Callable[[bytes], np.ndarray], int]
+Coder = tuple[Callable[[], bytes], Callable[[bytes], np.ndarray], int]  # encode, decode, bits beside the bytes
 
 
-def laplace_with_contexts(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals of eight known scales from 0.3 to 10 steps."""
+def make_laplace_with_contexts(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return Laplace residuals of eight scales from 0.3 to 10 steps, and the index of each one's scale as context."""
     rng = np.random.default_rng(0)
     contexts = rng.integers(0, 8, count).astype(np.uint8)
     return np.rint(rng.laplace(scale=np.geomspace(0.3, 10, 8)[contexts])).astype(np.int32), contexts
 
 
-def morton_gaps(count: int) -> tuple[np.ndarray, None]:
-    """Gaps along the Morton curve between points near a surface, on a grid of 2^14 an axis."""
+def make_morton_gaps(count: int) -> tuple[np.ndarray, None]:
+    """Return the gaps along the Morton curve between points near a surface, on a grid of 2^14 cells an axis."""
     rng = np.random.default_rng(0)
     plane = rng.integers(0, 1 << 14, (count + 1, 2))
     height = 8000 + 2000 * np.sin(plane[:, 0] / 2000) + rng.normal(0, 20, count + 1)
@@ -51,25 +51,37 @@ def morton_gaps(count: int) -> tuple[np.ndarray, None]:
     return np.diff(np.sort(code)), None
 
 
-def mostly_zero(count: int) -> tuple[np.ndarray, None]:
-    """Residuals that are 0 in nine cases out of ten."""
+def make_mostly_zero(count: int) -> tuple[np.ndarray, None]:
+    """Return Laplace residuals of which nine in ten are zero."""
     return np.rint(np.random.default_rng(0).laplace(scale=0.22, size=count)).astype(np.int32), None
 
 
-SETS = {"laplace, 8 contexts": laplace_with_contexts, "Morton gaps": morton_gaps, "mostly zero": mostly_zero}
+VALUE_SOURCES = {
+    "laplace, 8 contexts": make_laplace_with_contexts,
+    "Morton gaps": make_morton_gaps,
+    "mostly zero": make_mostly_zero,
+}
 
 
 def bench() -> list[dict]:
-    """Time all coders, interleaved; medians.
+    """Time all coders in alternation; times are medians.
 
     Returns:
-        A row for each set, size and coder: bits a symbol, how much that is above the entropy (of each context's tokens,
-        plus the extra bits), and million symbols a second. All coders are exact, which is checked.
+        A row for each source, count and coder: bits a symbol, the excess over the entropy in percent, and million
+        symbols a second. The entropy is that of each context's tokens plus the extra bits.
+
+    Raises:
+        AssertionError: a coder does not decode to the values that it encoded.
     """
-    return [row for name, make in SETS.items() for count in COUNTS for row in _bench_set(name, *make(count))]
+    return [
+        row
+        for name, make in VALUE_SOURCES.items()
+        for count in SYMBOL_COUNTS
+        for row in _bench_source(name, *make(count))
+    ]
 
 
-def _bench_set(name: str, values: np.ndarray, contexts: np.ndarray | None) -> list[dict]:
+def _bench_source(name: str, values: np.ndarray, contexts: np.ndarray | None) -> list[dict]:
     count, signed = len(values), bool(values.min() < 0)
     tokens = decode_tokens(encode_integers(values, contexts, signed=signed), count, contexts).tokens
     groups = np.zeros(count, np.uint8) if contexts is None else contexts
@@ -80,19 +92,21 @@ def _bench_set(name: str, values: np.ndarray, contexts: np.ndarray | None) -> li
 
     coders = {}
     for implementation in ("cpu", "numpy") if has_numba() else ("numpy",):
-        coders[f"ours ({implementation})"] = _ours(values, contexts, signed, implementation)
-    coders["ours, Huffman"] = _huffman(tokens, extra)
+        coders[f"ours ({implementation})"] = _rans_coder(values, contexts, signed, implementation)
+    coders["ours, Huffman"] = _huffman_coder(tokens, extra)
     if constriction:
-        coders["constriction"] = _constriction(tokens, groups, shares, extra)
+        coders["constriction"] = _constriction_coder(tokens, groups, shares, extra)
     if zstandard:
-        coders["zstd-19"] = _zstd(values)
+        coders["zstd-19"] = _zstd_coder(values)
 
-    encoding, blobs = time_alternately({coder: encode for coder, (encode, _, _) in coders.items()}, REPEATS)
+    encoding, blobs = time_alternately({coder: encode for coder, (encode, _, _) in coders.items()}, TIMING_REPEATS)
     for coder, (_, decode, _) in coders.items():
         expected = values if coder.startswith(("ours (", "zstd")) else tokens
         if not np.array_equal(decode(blobs[coder]), expected):
-            raise AssertionError(f"{coder} does not give back what it was given")
-    decoding, _ = time_alternately({c: partial(decode, blobs[c]) for c, (_, decode, _) in coders.items()}, REPEATS)
+            raise AssertionError(f"{coder} does not decode its bytes to the values that it encoded")
+    decoding, _ = time_alternately(
+        {c: partial(decode, blobs[c]) for c, (_, decode, _) in coders.items()}, TIMING_REPEATS
+    )
     rows = [{"set": name, "symbols": count, "coder": "entropy", "bits_per_symbol": entropy, "above_entropy_%": 0.0}]
     for coder, (_, _, more_bits) in coders.items():
         bits = (8 * len(blobs[coder]) + more_bits) / count
@@ -110,13 +124,13 @@ def _bench_set(name: str, values: np.ndarray, contexts: np.ndarray | None) -> li
     return rows
 
 
-def _ours(values: np.ndarray, contexts: np.ndarray | None, signed: bool, implementation: str) -> Coder:
+def _rans_coder(values: np.ndarray, contexts: np.ndarray | None, signed: bool, implementation: str) -> Coder:
     options = {"signed": signed, "implementation": implementation}
     encode = partial(encode_integers, values, contexts, **options)
     return encode, lambda data: decode_integers(data, len(values), contexts, **options), 0
 
 
-def _huffman(tokens: np.ndarray, extra: int) -> Coder:
+def _huffman_coder(tokens: np.ndarray, extra: int) -> Coder:
     return (
         lambda: huffman_encode(tokens).to_bytes(),
         lambda data: huffman_decode(HuffmanStream.from_bytes(data)),
@@ -124,8 +138,8 @@ def _huffman(tokens: np.ndarray, extra: int) -> Coder:
     )
 
 
-def _constriction(tokens: np.ndarray, groups: np.ndarray, shares: np.ndarray, extra: int) -> Coder:
-    """One range coder, the contexts one after another; its models are taken as known and not counted."""
+def _constriction_coder(tokens: np.ndarray, groups: np.ndarray, shares: np.ndarray, extra: int) -> Coder:
+    """Return a range coder that encodes one context after another; the size of its models is not counted."""
     places = [np.flatnonzero(groups == group) for group in range(len(shares))]
     models = [constriction.stream.model.Categorical(row.astype(np.float64), perfect=False) for row in shares]
 
@@ -144,7 +158,7 @@ def _constriction(tokens: np.ndarray, groups: np.ndarray, shares: np.ndarray, ex
     return encode, decode, extra
 
 
-def _zstd(values: np.ndarray) -> Coder:
+def _zstd_coder(values: np.ndarray) -> Coder:
     dtype = np.result_type(np.min_scalar_type(values.min()), np.min_scalar_type(values.max()))
     raw = values.astype(dtype).tobytes()
     encode = partial(zstandard.ZstdCompressor(level=19).compress, raw)
@@ -152,11 +166,11 @@ def _zstd(values: np.ndarray) -> Coder:
 
 
 def main() -> None:
-    """Print the table."""
+    """Print the table: bits a symbol, percent above the entropy and million symbols a second."""
     for module, name in ((zstandard, "zstandard"), (constriction, "constriction")):
         if module is None:
-            print(f"{name} is not installed and left out")
-    print(f"medians of {REPEATS}; bits a symbol, above the entropy, million symbols a second")
+            print(f"{name} is not installed, so it is left out")
+    print(f"bits a symbol, excess over the entropy, million symbols a second (medians of {TIMING_REPEATS} repeats)")
     print(f"{'':52}{'bits':>9}{'above':>9}{'encode':>9}{'decode':>9}")
     for row in bench():
         head = f"{row['set']:22}{row['symbols']:>12,}  {row['coder']:16}"

@@ -1,10 +1,10 @@
-"""Times rasterising, stage by stage, against the torch reference and beside its error.
+"""Time each stage of the rasteriser, compare its speed with the torch reference, and measure its error.
 
     python -m tools.bench.rasterize
 
-Workload A is 50,000 Gaussians at 320 x 240, B 200,000 at 800 x 800, drawn from a fixed seed. Times are medians over
-repeats in which the contenders take turns. The reference runs on A alone, and on one thread: how many times faster is
-told in processor time summed over threads, which a busy machine distorts least.
+Workload A has 50,000 Gaussians at 320 x 240 pixels, B has 200,000 at 800 x 800; both come from a fixed seed. Times are
+medians in ms over alternating repeats. The reference runs only on A and on one thread. The speed ratio compares CPU
+time summed over threads, because other load on the machine affects it least.
 """
 
 from __future__ import annotations
@@ -20,15 +20,16 @@ from hyrfpack.model.operation_calls import random_cotangent, rasterize_call
 from hyrfpack.ops.rasterize import INPUT_SHAPES, rasterize
 from hyrfpack.parallel.pool import thread_count
 
-WORKLOADS = {"A": (50_000, 320, 240, 1.75), "B": (200_000, 800, 800, 2.6)}  # Gaussians, width, height, sigma in px
-REPEATS = 7
-REFERENCE_TURNS = (1, 4)  # enough for what takes seconds
-STAGES = ("project", "sort", "bin", "blend", "forward", "backward")
+# Number of Gaussians, width and height in pixels, and standard deviation of a Gaussian in pixels.
+WORKLOAD_SIZES = {"A": (50_000, 320, 240, 1.75), "B": (200_000, 800, 800, 2.6)}
+TIMING_REPEATS = 7
+REFERENCE_REPEATS = (1, 4)  # the reference runs in two of the repeats only, because it takes seconds
+TIMED_STAGES = ("project", "sort", "bin", "blend", "forward", "backward")
 
 
-def workload(name: str) -> tuple[dict[str, Tensor], tuple]:
-    """Gaussians as `rasterize` takes them, spread over the picture at depths 2 to 8, and the camera."""
-    count, width, height, sigma = WORKLOADS[name]
+def make_workload(name: str) -> tuple[dict[str, Tensor], tuple]:
+    """Return the inputs of `rasterize`, spread over the picture at depths 2 to 8, and its camera arguments."""
+    count, width, height, sigma = WORKLOAD_SIZES[name]
     generator = torch.Generator().manual_seed(0)
     focal = 1.2 * width
     size = torch.tensor([width, height])
@@ -43,8 +44,8 @@ def workload(name: str) -> tuple[dict[str, Tensor], tuple]:
     return dict(zip(INPUT_SHAPES, (means, quats, scales, opacities, colors), strict=True)), camera
 
 
-def run(inputs: dict[str, Tensor], camera: tuple, implementation: str) -> dict[str, float]:
-    """Milliseconds of each stage of one forward and one backward pass, and of processor time."""
+def time_stages(inputs: dict[str, Tensor], camera: tuple, implementation: str) -> dict[str, float]:
+    """Run one forward and one backward pass; return the pairs, and the ms of each stage and of CPU time ("_work")."""
     leaves = [tensor.detach().clone().requires_grad_() for tensor in inputs.values()]
     absgrad = torch.zeros(len(leaves[0]), 2)
     width, height = camera[2:]
@@ -59,39 +60,40 @@ def run(inputs: dict[str, Tensor], camera: tuple, implementation: str) -> dict[s
 
 
 def bench() -> list[dict]:
-    """One row for each workload: medians in ms, ns a pair, times faster than the reference, and error."""
-    calls = {(name, "cpu"): workload(name) for name in WORKLOADS}
-    calls["A", "reference"] = workload("A")
-    run(*calls["B", "cpu"], "cpu")  # compiles
+    """Return one row for each workload: medians in ms, ns a pair, and for A the speed ratio and the errors."""
+    calls = {(name, "cpu"): make_workload(name) for name in WORKLOAD_SIZES}
+    calls["A", "reference"] = make_workload("A")
+    time_stages(*calls["B", "cpu"], "cpu")  # the first call compiles the kernels
     times = {key: [] for key in calls}
-    for turn in range(REPEATS):
+    for repeat in range(TIMING_REPEATS):
         for key, call in calls.items():
             if key[1] == "cpu":
-                times[key].append(run(*call, "cpu"))
-            elif turn in REFERENCE_TURNS:
+                times[key].append(time_stages(*call, "cpu"))
+            elif repeat in REFERENCE_REPEATS:
                 threads = torch.get_num_threads()
                 torch.set_num_threads(1)
-                times[key].append(run(*call, "reference"))
+                times[key].append(time_stages(*call, "reference"))
                 torch.set_num_threads(threads)
 
     rows = []
-    for name in WORKLOADS:
+    for name in WORKLOAD_SIZES:
         here = times[name, "cpu"]
         row = {"workload": name, "threads": thread_count(), "pairs": here[0]["pairs"]}
-        row |= {f"{stage}_ms": median(time[stage] for time in here) for stage in STAGES}
+        row |= {f"{stage}_ms": median(time[stage] for time in here) for stage in TIMED_STAGES}
         row |= {f"{way}_ns_a_pair": 1e6 * row[f"{way}_ms"] / row["pairs"] for way in ("forward", "backward")}
         rows.append(row)
     for way in ("forward", "backward"):
         ours, slow = (median(time[f"{way}_work"] for time in times["A", who]) for who in ("cpu", "reference"))
         rows[0][f"{way}_times_faster"] = slow / ours
-    return [rows[0] | errors(*calls["A", "cpu"]), *rows[1:]]
+    return [rows[0] | measure_errors(*calls["A", "cpu"]), *rows[1:]]
 
 
-def errors(inputs: dict[str, Tensor], camera: tuple) -> dict[str, float]:
-    """Of picture and transmittance, at most; and of the gradients, relative to their rms, the worst of the five.
+def measure_errors(inputs: dict[str, Tensor], camera: tuple) -> dict[str, float]:
+    """Return the errors against the float64 reference.
 
-    A few pixels are off by more than rounding, where alpha or T falls on the other side of its threshold; the share of
-    those beyond 1e-5 is told apart.
+    `value_error` is the largest error of picture and transmittance. `gradient_error` is the largest rms error of the
+    five gradients, relative to each gradient's rms. Where alpha or T falls on the other side of its threshold, a few
+    pixels differ by more than rounding; `share_beyond_1e-5` is the share of values that differ by more than 1e-5.
     """
     call = rasterize_call(inputs, *camera)
     (values, gradients), (exact, slopes) = (
@@ -109,6 +111,7 @@ def errors(inputs: dict[str, Tensor], camera: tuple) -> dict[str, float]:
 
 
 def main() -> None:
+    """Print one dictionary for each row."""
     for row in bench():
         print(row)
 

@@ -1,4 +1,4 @@
-"""Speed and error of the photometric loss with its gradient, beside its torch reference in the same run."""
+"""Measure speed and error of the photometric loss and its gradient against the torch reference in the same run."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from hyrfpack.measure.error import measure_error, measure_relative_error
 from hyrfpack.measure.timing import time_alternately
 from hyrfpack.model.operation_calls import loss_call
 
-REPEATS = 7
-SIZES = ((200, 200), (240, 320), (800, 800))  # height, width
+TIMING_REPEATS = 7
+PICTURE_SIZES = ((200, 200), (240, 320), (800, 800))  # height and width in pixels
 
 
-def pictures(height: int, width: int) -> tuple[Tensor, Tensor]:
-    """A smooth picture and the same with noise, (H, W, 3) in [0, 1]."""
+def make_pictures(height: int, width: int) -> tuple[Tensor, Tensor]:
+    """Return a noisy and a smooth version of one picture, each (H, W, 3) in [0, 1]."""
     random = torch.Generator().manual_seed(0)
     small = torch.rand(1, 3, height // 10, width // 10, generator=random)
     smooth = torch.nn.functional.interpolate(small, size=(height, width), mode="bilinear")[0].permute(1, 2, 0)
@@ -23,9 +23,14 @@ def pictures(height: int, width: int) -> tuple[Tensor, Tensor]:
 
 
 def compare(image: Tensor, target: Tensor, mask: Tensor | None) -> dict[str, float]:
-    """Times of loss and gradient together, and errors against float64 (the gradient's over its largest value)."""
+    """Return the time of loss and gradient together, and the errors against float64.
+
+    The gradient's error is relative to its largest value.
+    """
     call = loss_call(image, target, mask)
-    times, results = time_alternately({way: call.forward_backward_task(way) for way in ("cpu", "reference")}, REPEATS)
+    times, results = time_alternately(
+        {way: call.forward_backward_task(way) for way in ("cpu", "reference")}, TIMING_REPEATS
+    )
     (value, gradients), (exact, slopes) = results["cpu"], call.forward_backward_task("reference", torch.float64)()
     return {
         "ms": times["cpu"].ms,
@@ -38,10 +43,10 @@ def compare(image: Tensor, target: Tensor, mask: Tensor | None) -> dict[str, flo
 
 
 def bench() -> list[dict]:
-    """Time the loss with its gradient and the reference, interleaved; medians."""
+    """Time the loss with its gradient and the reference in alternation; times are medians."""
     rows = []
-    for height, width in SIZES:
-        image, target = pictures(height, width)
+    for height, width in PICTURE_SIZES:
+        image, target = make_pictures(height, width)
         half = torch.rand(height, width, generator=torch.Generator().manual_seed(1)) < 0.5
         for name, mask in (("none", None), ("half", half)):
             rows.append({"picture": f"{width}x{height}x3", "mask": name, **compare(image, target, mask)})
@@ -49,6 +54,7 @@ def bench() -> list[dict]:
 
 
 def main() -> None:
+    """Print one dictionary for each row."""
     for row in bench():
         print(row)
 

@@ -1,4 +1,4 @@
-"""A headless Chromium, driven over a pipe with the DevTools protocol: no package is needed."""
+"""Drive a headless Chromium over a pipe with the DevTools protocol, without any Python package."""
 
 from __future__ import annotations
 
@@ -16,30 +16,30 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
-FLAGS = (
+PROGRAM_NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
+LAUNCH_FLAGS = (
     "--headless --no-sandbox --disable-quic --no-first-run --disable-background-networking --disable-component-update "
     "--disable-sync --disable-extensions --disable-default-apps --hide-scrollbars --mute-audio --disable-dev-shm-usage "
     "--remote-debugging-pipe"
 ).split()
-# What the browser itself does with keys hangs on these.
-NUMBERS = {"Tab": 9, "Enter": 13, "Escape": 27, "End": 35}
-SHIFT = 8
-TEXTS = {"Enter": {"text": "\r"}}
-SECONDS = 30.0  # that an answer may take
+# The browser's own reactions to keys depend on these codes.
+WINDOWS_KEY_CODES = {"Tab": 9, "Enter": 13, "Escape": 27, "End": 35}
+SHIFT_MODIFIER = 8
+KEY_TEXTS = {"Enter": {"text": "\r"}}
+TIMEOUT_SECONDS = 30.0  # time limit for each answer of the browser
 
 
 def find() -> str | None:
-    """The program, None where there is none."""
-    return next(filter(None, map(shutil.which, NAMES)), None)
+    """Return the path of the installed program, or None."""
+    return next(filter(None, map(shutil.which, PROGRAM_NAMES)), None)
 
 
 class Chromium:
-    """A browser with one page.
+    """A running browser with one page.
 
     Args:
-        profile: an empty folder for it.
-        flags: further ones.
+        profile: an empty folder for the browser's profile.
+        flags: further command-line flags.
     """
 
     name = "chromium"
@@ -53,7 +53,7 @@ class Chromium:
         self._in, from_browser = os.pipe()
         redirected = f'exec "$0" "$@" 3<&{to_browser} 4>&{from_browser}'
         self._process = subprocess.Popen(
-            ["bash", "-c", redirected, find(), *FLAGS, f"--user-data-dir={profile}", *flags, "about:blank"],
+            ["bash", "-c", redirected, find(), *LAUNCH_FLAGS, f"--user-data-dir={profile}", *flags, "about:blank"],
             pass_fds=(to_browser, from_browser),
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
@@ -81,25 +81,25 @@ class Chromium:
         os.close(self._in)
 
     def _page(self) -> str:
-        """The tab that it starts with, once it is there."""
-        ends = time.monotonic() + SECONDS
-        while time.monotonic() < ends:
+        """Wait for the browser's first tab and return its target id."""
+        deadline = time.monotonic() + TIMEOUT_SECONDS
+        while time.monotonic() < deadline:
             for target in self.call("Target.getTargets")["targetInfos"]:
                 if target["type"] == "page":
                     return target["targetId"]
             time.sleep(0.05)
-        raise TimeoutError("the browser opens no tab")
+        raise TimeoutError("the browser did not open a tab in time")
 
     def call(self, method: str, **arguments: Any) -> dict:
-        """One command of the protocol and its answer; events that come meanwhile are kept in `events`."""
+        """Send one command of the protocol and return its result; events before the answer go to `events`."""
         self._number += 1
         message = {"id": self._number, "method": method, "params": arguments}
         if self._session:
             message["sessionId"] = self._session
         os.write(self._out, json.dumps(message).encode() + b"\0")
-        ends = time.monotonic() + SECONDS
+        deadline = time.monotonic() + TIMEOUT_SECONDS
         while True:
-            answer = self._receive(ends)
+            answer = self._receive(deadline)
             if answer.get("id") != self._number:
                 self.events.append(answer)
             elif "error" in answer:
@@ -107,10 +107,10 @@ class Chromium:
             else:
                 return answer["result"]
 
-    def _receive(self, ends: float) -> dict:
+    def _receive(self, deadline: float) -> dict:
         while b"\0" not in self._received:
-            if not select.select([self._in], [], [], max(0.0, ends - time.monotonic()))[0]:
-                raise TimeoutError("the browser does not answer")
+            if not select.select([self._in], [], [], max(0.0, deadline - time.monotonic()))[0]:
+                raise TimeoutError("the browser did not answer in time")
             data = os.read(self._in, 1 << 20)
             if not data:
                 raise RuntimeError("the browser has ended")
@@ -119,18 +119,22 @@ class Chromium:
         return json.loads(message)
 
     def open(self, address: str) -> None:
-        """Go to an address and wait until its document is there."""
+        """Open an address and wait until its document is loaded."""
         self.events.clear()
-        self.call("Page.navigate", url="about:blank")  # else a mere change of #... loads nothing
+        self.call("Page.navigate", url="about:blank")  # otherwise a change of only #... does not reload the page
         self.call("Page.navigate", url=address)
-        ends = time.monotonic() + SECONDS
+        deadline = time.monotonic() + TIMEOUT_SECONDS
         while self.evaluate("location.href === 'about:blank' || document.readyState !== 'complete'"):
-            if time.monotonic() > ends:
-                raise TimeoutError(f"{address} does not load")
+            if time.monotonic() > deadline:
+                raise TimeoutError(f"{address} did not load in time")
             time.sleep(0.02)
 
     def evaluate(self, expression: str) -> Any:
-        """The value of JavaScript; a promise's when it is fulfilled. Raises RuntimeError with what it throws."""
+        """Evaluate JavaScript and return its value, that of a promise when it is fulfilled.
+
+        Raises:
+            RuntimeError: the script throws an exception, whose text is the message.
+        """
         answer = self.call(
             "Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True, userGesture=True
         )
@@ -140,18 +144,18 @@ class Chromium:
         return answer["result"].get("value")
 
     def resize(self, width: int, height: int, *, dense: float = 1.0, phone: bool = False) -> None:
-        """Give the window a size in CSS pixels."""
+        """Set the window's size in CSS pixels; `dense` is the device pixel ratio, `phone` emulates a touch screen."""
         self.call(
             "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=dense, mobile=phone
         )
         self.call("Emulation.setTouchEmulationEnabled", enabled=phone)
 
     def mouse(self, kind: str, x: float, y: float, **more: Any) -> None:
-        """A mouse event: mousePressed, mouseReleased, mouseMoved or mouseWheel."""
+        """Send a mouse event: mousePressed, mouseReleased, mouseMoved or mouseWheel."""
         self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, **more)
 
     def drag(self, start: tuple[float, float], end: tuple[float, float], button: str = "left", steps: int = 4) -> None:
-        """Drag from one place to another."""
+        """Drag the mouse from one point to another, in CSS pixels."""
         buttons = {"left": 1, "right": 2}[button]
         self.mouse("mousePressed", *start, button=button, buttons=buttons, clickCount=1)
         for step in range(1, steps + 1):
@@ -160,26 +164,26 @@ class Chromium:
         self.mouse("mouseReleased", *end, button=button, clickCount=1)
 
     def touch(self, kind: str, *points: tuple[float, float]) -> None:
-        """A touch event: touchStart, touchMove or touchEnd, with all fingers that are down."""
+        """Send a touch event (touchStart, touchMove or touchEnd) with the points of all fingers that are down."""
         fingers = [{"x": x, "y": y, "id": number} for number, (x, y) in enumerate(points)]
         self.call("Input.dispatchTouchEvent", type=kind, touchPoints=fingers)
 
     def prefer(self, scheme: str = "light", *, less_motion: bool = False) -> None:
-        """What the person's system asks of pages: a colour scheme, and movement or not."""
+        """Emulate the user's preferences for a colour scheme and for reduced motion."""
         motion = "reduce" if less_motion else "no-preference"
         wishes = {"prefers-color-scheme": scheme, "prefers-reduced-motion": motion}
         features = [{"name": name, "value": value} for name, value in wishes.items()]
         self.call("Emulation.setEmulatedMedia", features=features)
 
     def press(self, key: str, seconds: float = 0.0, *, shift: bool = False) -> None:
-        """Press a key, letter or name, for so long."""
+        """Press a key, given as a letter or a key name, and release it after `seconds`."""
         code = f"Key{key.upper()}" if len(key) == 1 and key.isalpha() else key
-        number = NUMBERS.get(key, ord(key.upper()) if len(key) == 1 else 0)
-        which = {"key": key, "code": code, "windowsVirtualKeyCode": number, **TEXTS.get(key, {})}
-        which["modifiers"] = SHIFT if shift else 0
+        number = WINDOWS_KEY_CODES.get(key, ord(key.upper()) if len(key) == 1 else 0)
+        which = {"key": key, "code": code, "windowsVirtualKeyCode": number, **KEY_TEXTS.get(key, {})}
+        which["modifiers"] = SHIFT_MODIFIER if shift else 0
         held = {"key": "Shift", "code": "ShiftLeft", "windowsVirtualKeyCode": 16}
         if shift:
-            self.call("Input.dispatchKeyEvent", type="keyDown", **held, modifiers=SHIFT)
+            self.call("Input.dispatchKeyEvent", type="keyDown", **held, modifiers=SHIFT_MODIFIER)
         self.call("Input.dispatchKeyEvent", type="keyDown", **which)
         time.sleep(seconds)
         self.call("Input.dispatchKeyEvent", type="keyUp", **which)
@@ -188,7 +192,7 @@ class Chromium:
 
     @contextlib.contextmanager
     def before_every_page(self, script: str) -> Iterator[None]:
-        """Inside, a script runs before those of the pages that are opened; its names are its own."""
+        """Within this context, run a script before the scripts of every opened page; its names are local."""
         added = self.call("Page.addScriptToEvaluateOnNewDocument", source=f"{{{script}\n}}")["identifier"]
         try:
             yield
@@ -196,12 +200,12 @@ class Chromium:
             self.call("Page.removeScriptToEvaluateOnNewDocument", identifier=added)
 
     def screenshot(self) -> bytes:
-        """PNG of the window."""
+        """Return a PNG of the window."""
         return base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
 
-    def complaints(self) -> list[str]:
-        """What the page has complained about since it was opened: errors, refused loads, exceptions."""
-        self.call("Runtime.evaluate", expression="0")  # what came before this has arrived
+    def list_errors(self) -> list[str]:
+        """Return the errors of the page since it was opened: console errors and warnings, refused loads, exceptions."""
+        self.call("Runtime.evaluate", expression="0")  # all earlier events arrive before this answer
         found = []
         for event in self.events:
             details = event.get("params", {})

@@ -1,6 +1,6 @@
-"""A Firefox without a screen, driven by its Marionette protocol over a local socket: no Python package is needed.
+"""Drive a Firefox without a screen by its Marionette protocol over a local socket, without any Python package.
 
-Its own headless mode has no WebGL, so it runs on a display of memory (Debian's `xvfb`) and draws in software.
+Firefox's headless mode has no WebGL, so it runs on a virtual display (Debian's `xvfb`) and renders in software.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-NAMES = ("firefox-esr", "firefox")
-PREFERENCES = {
-    "marionette.port": 0,  # any free one; the browser writes into its profile which it took
+PROGRAM_NAMES = ("firefox-esr", "firefox")
+DEFAULT_PREFERENCES = {
+    "marionette.port": 0,  # any free port; the browser writes the chosen one into its profile
     "app.update.enabled": False,
     "app.normandy.enabled": False,
     "browser.shell.checkDefaultBrowser": False,
@@ -35,25 +35,25 @@ PREFERENCES = {
     "network.connectivity-service.enabled": False,
     "network.proxy.type": 0,
     "remote.prefs.recommended": True,
-    "security.fileuri.strict_origin_policy": False,  # as Chromium, which lets a page of a file make workers of blobs
+    "security.fileuri.strict_origin_policy": False,  # as in Chromium, a page from a file may start workers from blobs
     "toolkit.telemetry.enabled": False,
     "webgl.force-enabled": True,
     "webgl.disable-fail-if-major-performance-caveat": True,
 }
-SECONDS = 60.0  # that an answer may take
-KEYS = {
+TIMEOUT_SECONDS = 60.0  # time limit for each answer of the browser
+WEBDRIVER_KEYS = {
     "Shift": "\ue008", "Enter": "\ue007", "Escape": "\ue00c", "Tab": "\ue004", "ArrowLeft": "\ue012",
     "ArrowUp": "\ue013", "ArrowRight": "\ue014", "ArrowDown": "\ue015", "Space": " ",
 }  # fmt: skip
 
 
 def find() -> str | None:
-    """The program, None where it or the display that it needs is missing."""
-    return next(filter(None, map(shutil.which, NAMES)), None) if shutil.which("Xvfb") else None
+    """Return the path of the installed program; None if it or Xvfb is missing."""
+    return next(filter(None, map(shutil.which, PROGRAM_NAMES)), None) if shutil.which("Xvfb") else None
 
 
-def _display() -> tuple[subprocess.Popen, int]:
-    """A display of memory, and its number."""
+def _start_display() -> tuple[subprocess.Popen, int]:
+    """Start a virtual display; return its process and its number."""
     reads, writes = os.pipe()
     command = ["Xvfb", "-displayfd", str(writes), "-screen", "0", "1600x1200x24", "-nolisten", "tcp"]
     process = subprocess.Popen(command, pass_fds=(writes,), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -67,25 +67,25 @@ def _script_address(script: str) -> str:
 
 
 class Firefox:
-    """A browser with one page, with the same methods as `Chromium`.
+    """A running browser with one page, with the same methods as `Chromium`.
 
     Args:
-        profile: an empty folder for it.
-        preferences: further ones, or other values of those above.
+        profile: an empty folder for the browser's profile.
+        preferences: preferences that add to or replace DEFAULT_PREFERENCES; "__" in a name stands for ".".
     """
 
     name = "firefox"
 
     def __init__(self, profile: Path, **preferences: bool | int | str) -> None:
-        told = {**PREFERENCES, **{name.replace("__", "."): value for name, value in preferences.items()}}
-        lines = (f"user_pref({json.dumps(name)}, {json.dumps(value)});\n" for name, value in told.items())
+        merged = {**DEFAULT_PREFERENCES, **{name.replace("__", "."): value for name, value in preferences.items()}}
+        lines = (f"user_pref({json.dumps(name)}, {json.dumps(value)});\n" for name, value in merged.items())
         (profile / "user.js").write_text("".join(lines))
         self._fingers: list[tuple[float, float]] = []
         self._number = 0
         self._received = b""
         program = find()
         assert program
-        self._display, number = _display()
+        self._display, number = _start_display()
         environment = {"HOME": str(profile), "DISPLAY": f":{number}", "LIBGL_ALWAYS_SOFTWARE": "1"}
         self._process = subprocess.Popen(
             [program, "--no-remote", "--marionette", "--remote-allow-system-access", "--profile", profile],
@@ -95,10 +95,10 @@ class Firefox:
         )
         try:
             self._socket = self._connect(profile / "MarionetteActivePort")
-            self._receive()  # its greeting
+            self._receive()  # the browser's greeting
             self.call("WebDriver:NewSession", strictFileInteractability=False)
-            self._listen()
-            self.call("WebDriver:SetTimeouts", script=int(SECONDS * 1000), pageLoad=int(SECONDS * 1000))
+            self._forward_console()
+            self.call("WebDriver:SetTimeouts", script=int(TIMEOUT_SECONDS * 1000), pageLoad=int(TIMEOUT_SECONDS * 1000))
         except BaseException:
             self._process.kill()
             self._display.kill()
@@ -118,17 +118,17 @@ class Firefox:
             process.wait()
 
     def _connect(self, file: Path) -> socket.socket:
-        ends = time.monotonic() + SECONDS
-        while time.monotonic() < ends and self._process.poll() is None:
+        deadline = time.monotonic() + TIMEOUT_SECONDS
+        while time.monotonic() < deadline and self._process.poll() is None:
             with contextlib.suppress(OSError, ValueError):
-                return socket.create_connection(("127.0.0.1", int(file.read_text())), timeout=SECONDS)
+                return socket.create_connection(("127.0.0.1", int(file.read_text())), timeout=TIMEOUT_SECONDS)
             time.sleep(0.05)
-        raise TimeoutError("Firefox opens no port to be driven by")
+        raise TimeoutError("Firefox did not open its Marionette port in time")
 
-    # ---- the protocol: messages are JSON with their length before them
+    # ---- The protocol: each message is JSON after its length in bytes and a colon.
 
     def call(self, method: str, **arguments: Any) -> Any:
-        """One command of the protocol and its answer."""
+        """Send one command of the protocol and return its result."""
         self._number += 1
         message = json.dumps([0, self._number, method, arguments]).encode()
         self._socket.sendall(b"%d:%b" % (len(message), message))
@@ -142,29 +142,29 @@ class Firefox:
 
     def _receive(self) -> Any:
         while b":" not in self._received:
-            self._more()
+            self._receive_bytes()
         length, _, self._received = self._received.partition(b":")
         while len(self._received) < int(length):
-            self._more()
+            self._receive_bytes()
         message, self._received = self._received[: int(length)], self._received[int(length) :]
         return json.loads(message)
 
-    def _more(self) -> None:
+    def _receive_bytes(self) -> None:
         data = self._socket.recv(1 << 20)
         if not data:
             raise RuntimeError("the browser has ended")
         self._received += data
 
     def _privileged(self, script: str, *arguments: Any) -> Any:
-        """What a function body in the browser's own window returns."""
+        """Run a function body in the browser's own window and return its result."""
         self.call("Marionette:SetContext", value="chrome")
         try:
             return self.call("WebDriver:ExecuteScript", script=script, args=arguments)["value"]
         finally:
             self.call("Marionette:SetContext", value="content")
 
-    def _listen(self) -> None:
-        """Have pages' console.error and console.warn, which stay in their processes, told to the browser's window."""
+    def _forward_console(self) -> None:
+        """Forward console.error and console.warn from the pages' processes to the browser's window."""
         script = (
             "{const tell = ({ wrappedJSObject: { level, innerID, arguments: said } }) => {"
             '  if (typeof innerID !== "number") return;'  # a module of Firefox itself
@@ -181,16 +181,20 @@ class Firefox:
             _script_address(script),
         )
 
-    # ---- as `Chromium` has it
+    # ---- The same interface as `Chromium`.
 
     def open(self, address: str) -> None:
-        """Go to an address and wait until its document is there."""
-        self.call("WebDriver:Navigate", url="about:blank")  # else a mere change of #... loads nothing
+        """Open an address and wait until its document is loaded."""
+        self.call("WebDriver:Navigate", url="about:blank")  # otherwise a change of only #... does not reload the page
         self._privileged("Services.console.reset(); window.said = [];")
         self.call("WebDriver:Navigate", url=address)
 
     def evaluate(self, expression: str) -> Any:
-        """The value of JavaScript; a promise's when it is fulfilled. Raises RuntimeError with what it throws."""
+        """Evaluate JavaScript and return its value, that of a promise when it is fulfilled.
+
+        Raises:
+            RuntimeError: the script throws an exception, whose text is the message.
+        """
         script = (
             "const done = arguments[0];"
             "(async () => {return (" + expression + "\n);})()"
@@ -202,7 +206,7 @@ class Firefox:
         return answer.get("value")
 
     def resize(self, width: int, height: int, *, dense: float = 1.0, phone: bool = False) -> None:
-        """Give the window a size in CSS pixels."""
+        """Set the window's size in CSS pixels; `dense` is the device pixel ratio, `phone` emulates a touch screen."""
         self._privileged(
             "const [width, height, dense, phone] = arguments, browser = gBrowser.selectedBrowser;"
             "for (const [name, value] of Object.entries({width, height})) {"
@@ -212,23 +216,23 @@ class Firefox:
             "context.inRDMPane = true;"
             "context.overrideDPPX = dense;"
             'context.touchEventsOverride = phone ? "enabled" : "disabled";'
-            # 1: coarse; 2 | 4: fine, hovers
+            # The pointer's capabilities are 1 for coarse, and 2 | 4 for fine with hover.
             'for (const which of ["primary", "all"]) {'
             "  Services.prefs.setIntPref(`ui.${which}PointerCapabilities`, phone ? 1 : 6);"
             "}",
             width, height, dense, phone,
         )  # fmt: skip
-        # A page that says nothing of its viewport is laid out for a larger window, as on phones.
+        # Without a viewport element a page gets the layout of a larger window, as on phones.
         seen = "document.querySelector('meta[name=viewport]') ? [innerWidth, innerHeight] : [outerWidth, outerHeight]"
-        ends = time.monotonic() + 5
-        while self.evaluate(seen) != [width, height] and time.monotonic() < ends:
+        deadline = time.monotonic() + 5
+        while self.evaluate(seen) != [width, height] and time.monotonic() < deadline:
             time.sleep(0.02)
 
     def _act(self, *sources: dict) -> None:
         self.call("WebDriver:PerformActions", actions=list(sources))
 
     def mouse(self, kind: str, x: float, y: float, **more: Any) -> None:
-        """A mouse event: mousePressed, mouseReleased, mouseMoved or mouseWheel."""
+        """Send a mouse event: mousePressed, mouseReleased, mouseMoved or mouseWheel."""
         place = {"x": x, "y": y, "duration": 0, "origin": "viewport"}
         if kind == "mouseWheel":
             by = {"deltaX": more["deltaX"], "deltaY": more["deltaY"]}
@@ -243,14 +247,14 @@ class Firefox:
         self._act({"type": "pointer", "id": "mouse", "parameters": {"pointerType": "mouse"}, "actions": actions})
 
     def drag(self, start: tuple[float, float], end: tuple[float, float], button: str = "left", steps: int = 4) -> None:
-        """Drag from one place to another."""
+        """Drag the mouse from one point to another, in CSS pixels."""
         self.mouse("mousePressed", *start, button=button)
         for step in range(1, steps + 1):
             self.mouse("mouseMoved", *(a + (b - a) * step / steps for a, b in zip(start, end, strict=True)))
         self.mouse("mouseReleased", *end, button=button)
 
     def touch(self, kind: str, *points: tuple[float, float]) -> None:
-        """A touch event: touchStart, touchMove or touchEnd, with all fingers that are down."""
+        """Send a touch event (touchStart, touchMove or touchEnd) with the points of all fingers that are down."""
         sources = []
         for number in range(max(len(points), len(self._fingers))):
             actions: list[dict] = []
@@ -267,7 +271,7 @@ class Firefox:
         self._act(*sources)
 
     def prefer(self, scheme: str = "light", *, less_motion: bool = False) -> None:
-        """What the person's system asks of pages: a colour scheme, and movement or not."""
+        """Emulate the user's preferences for a colour scheme and for reduced motion."""
         self._privileged(
             'Services.prefs.setIntPref("layout.css.prefers-color-scheme.content-override", arguments[0]);'
             'Services.prefs.setIntPref("ui.prefersReducedMotion", arguments[1]);',
@@ -275,8 +279,8 @@ class Firefox:
         )  # fmt: skip
 
     def press(self, key: str, seconds: float = 0.0, *, shift: bool = False) -> None:
-        """Press a key, letter or name, for so long."""
-        values = [*([KEYS["Shift"]] if shift else []), KEYS.get(key, key)]
+        """Press a key, given as a letter or a key name, and release it after `seconds`."""
+        values = [*([WEBDRIVER_KEYS["Shift"]] if shift else []), WEBDRIVER_KEYS.get(key, key)]
         for kind in ("keyDown", "keyUp"):
             actions = [{"type": kind, "value": value} for value in values[:: 1 if kind == "keyDown" else -1]]
             self._act({"type": "key", "id": "keys", "actions": actions})
@@ -284,7 +288,7 @@ class Firefox:
 
     @contextlib.contextmanager
     def before_every_page(self, script: str) -> Iterator[None]:
-        """Inside, a script runs before those of the pages that are opened; its names are its own."""
+        """Within this context, run a script before the scripts of every opened page; its names are local."""
         text = (
             "{let on = true;"
             f'addMessageListener("forget {self._number}", () => {{ on = false; }});'
@@ -304,16 +308,16 @@ class Firefox:
             self._privileged(frames + remove, address, forget)
 
     def screenshot(self) -> bytes:
-        """PNG of the window."""
+        """Return a PNG of the window."""
         return base64.b64decode(self.call("WebDriver:TakeScreenshot", full=False)["value"])
 
-    def complaints(self) -> list[str]:
-        """What the page has complained about since it was opened: errors, refused loads, exceptions."""
-        self.evaluate("new Promise((done) => setTimeout(done, 50))")  # what came before this has arrived
+    def list_errors(self) -> list[str]:
+        """Return the errors of the page since it was opened: console errors and warnings, refused loads, exceptions."""
+        self.evaluate("new Promise((done) => setTimeout(done, 50))")  # earlier messages arrive within this time
         return self._privileged(
             "const found = Services.console.getMessageArray().filter((message) =>"
             "  message instanceof Ci.nsIScriptError && !(message.flags & 1) &&"
-            # Errors that are thrown later, as of timers, know no window.
+            # Errors that are thrown later, for example by timers, have no window id.
             '  (message.innerWindowID || message.category === "content javascript"));'
             "return [...found.map(({ errorMessage }) => errorMessage), ...window.said];"
         )

@@ -1,4 +1,4 @@
-// Scripts with short names: a JSON object of texts in, the same out, by terser.
+// Minifies scripts with terser: reads a JSON object of scripts by name from stdin, writes the same with minified scripts.
 
 import { text } from "node:stream/consumers";
 

@@ -1,9 +1,10 @@
-"""Gives the player's scripts short names, so that pages are small: writes hyrfpack/web/shortened.json.
+"""Minify the web player's scripts into hyrfpack/web/shortened.json, so that exported pages are small.
 
     python -m tools.browser.shorten            needs node, and terser in tests/node
 
-Pages carry what it holds as long as it was made of the scripts as they are, else the scripts themselves: the player
-works either way, and `tests/web/test_shortened.py` fails until this has been run again.
+It prints each script's length in characters before and after. Pages use a minified script only if its source has not
+changed since; otherwise they use the source. The player works either way, and `tests/web/test_shortened.py` fails until
+this program has run again.
 """
 
 from __future__ import annotations
@@ -16,18 +17,20 @@ from hyrfpack.atomic import write_atomic
 from hyrfpack.web.bundle import bundle, script_digest
 from hyrfpack.web.player import SCRIPT_NAMES
 
-ROOT = Path(__file__).parents[2]
-SHORTENED = ROOT / "hyrfpack" / "web" / "shortened.json"
+REPOSITORY_ROOT = Path(__file__).parents[2]
+SHORTENED_SCRIPTS_FILE = REPOSITORY_ROOT / "hyrfpack" / "web" / "shortened.json"
 
 
 def main() -> None:
     bundle.cache_clear()
     scripts = {name: bundle(f"viewer/{name}") for name in SCRIPT_NAMES}
     node = ["node", str(Path(__file__).with_name("minify.mjs"))]
-    done = subprocess.run(node, input=json.dumps(scripts), capture_output=True, text=True, check=True, cwd=ROOT)
+    done = subprocess.run(
+        node, input=json.dumps(scripts), capture_output=True, text=True, check=True, cwd=REPOSITORY_ROOT
+    )
     short = json.loads(done.stdout)
     entries = {name: {"of": script_digest(scripts[name]), "script": short[name]} for name in SCRIPT_NAMES}
-    write_atomic(SHORTENED, json.dumps(entries, indent=0).encode() + b"\n")
+    write_atomic(SHORTENED_SCRIPTS_FILE, json.dumps(entries, indent=0).encode() + b"\n")
     for name in SCRIPT_NAMES:
         print(f"{name}: {len(scripts[name]):,} to {len(short[name]):,} characters")
 

@@ -1,11 +1,12 @@
-"""Builds every Triton kernel of hyrfpack.ops for several GPUs, needing none, and tells what each takes.
+"""Build every Triton kernel of hyrfpack.ops for several GPU types without a GPU, and report the kernels' resources.
 
-    python -m tools.gpu.build                  a table: registers, shared memory and spills of each kernel and target
-    python -m tools.gpu.build --json           the same for programs; tests/tools/test_gpu_build.py reads it
+    python -m tools.gpu.build                  a table for each kernel and target: registers a thread, shared memory
+                                               in bytes a program, spills in bytes (NVIDIA) or registers (AMD)
+    python -m tools.gpu.build --json           the same as JSON; tests/tools/test_gpu_build.py reads it
 
-The operations run as ever, on small tensors of the CPU, but each launch of a kernel only builds it: for a driver that
-names the target, with the types, constants, alignment and options that the launch has. So no list of kernels and
-signatures is kept here, and a kernel that no operation below launches is told of.
+The operations run as usual on small CPU tensors, but each launch of a kernel only builds it, for a driver that names
+the target, with the types, constants, alignment and options of the launch. Therefore this file needs no list of kernels
+and signatures. It reports kernels that no operation launches.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from unittest import mock
 
-os.environ.pop("TRITON_INTERPRET", None)  # read when kernels are defined
+os.environ.pop("TRITON_INTERPRET", None)  # Triton reads it when kernels are defined
 
 import torch
 import triton
@@ -41,13 +42,13 @@ from torch.overrides import TorchFunctionMode
 from triton.backends.compiler import GPUTarget
 from triton.runtime.jit import JITFunction
 
-TARGETS = {
+GPU_TARGETS = {
     "sm_90": GPUTarget("cuda", 90, 32),
     "sm_80": GPUTarget("cuda", 80, 32),
     "sm_100": GPUTarget("cuda", 100, 32),
     "gfx942": GPUTarget("hip", "gfx942", 64),
 }
-PROCESSES = 2
+BUILD_PROCESSES = 2
 Run = Callable[[], object]
 
 
@@ -56,14 +57,14 @@ class Build:
     """One kernel built for one target.
 
     Attributes:
-        kernel: its module and name.
-        target: a key of TARGETS.
-        constants: what it was built for: constexprs and arguments that are 1 or None, and what is a multiple of 16.
-        warps: in a program.
-        registers: of a thread; of AMD's vector registers.
-        shared: bytes of a program.
-        spills: bytes of local memory a thread (NVIDIA) or registers (AMD) that did not fit.
-        error: why it could not be built; empty where it was.
+        kernel: the kernel's module and name.
+        target: a key of GPU_TARGETS.
+        constants: the specialisation: constexprs, arguments that are 1 or None, and multiples of 16.
+        warps: warps in a program.
+        registers: registers of a thread (AMD: vector registers).
+        shared: shared memory of a program in bytes.
+        spills: bytes of local memory a thread (NVIDIA), or spilled registers (AMD).
+        error: why the build failed; empty if it succeeded.
     """
 
     kernel: str
@@ -76,7 +77,8 @@ class Build:
     error: str = ""
 
 
-# What is run. A launch builds a kernel anew for sizes that are multiples of 16, that are not, and that are 1.
+# The runs of each operation. Triton builds a kernel separately for sizes that are multiples of 16, for other sizes, and
+# for size 1.
 
 
 def ssim_runs(count: int, width: int, height: int) -> Iterator[Run]:
@@ -91,11 +93,11 @@ def hash_encode_runs(count: int, width: int, height: int) -> Iterator[Run]:
     from hyrfpack.model.hash_grid import HashGridConfig
     from hyrfpack.ops.hash_encode import hash_encode, level_offsets
 
-    # So coarse a level has copies of its gradient for so few points.
+    # A level this coarse uses several copies of its gradient even for few points.
     resolutions, size = HashGridConfig(log2_table_size=10, base=4).resolutions, 10
     table = torch.rand(level_offsets(resolutions, size)[-1], 2, requires_grad=True)
     coords = torch.rand(count, 3, requires_grad=True)
-    # By columns as `mlp` hands gradients on, and by rows.
+    # The gradient is stored by columns, as `mlp` returns it, and by rows.
     for grad in (torch.ones(2 * len(resolutions), count).T, torch.ones(count, 2 * len(resolutions))):
         yield lambda grad=grad: hash_encode(coords, table, resolutions, size).backward(grad)
 
@@ -241,7 +243,7 @@ def composite_runs(count: int, width: int, height: int) -> Iterator[Run]:
         yield partial(run, stride)
 
 
-OPERATIONS = {
+OPERATION_RUNS = {
     "mlp": mlp_runs,
     "shade": shade_runs,
     "background": background_runs,
@@ -255,14 +257,15 @@ OPERATIONS = {
     "cull": cull_runs,
     "composite": composite_runs,
 }
-# All sizes (points, width, height) and runs on the first target; on the others those that take most registers.
-SIZES = (1003, 101, 67), (1024, 128, 96), (1, 1, 1)
-FIRST = 2
+# (points, width, height). The first target builds for all sizes and runs. The others build for the first size and the
+# first two runs of each operation, which take the most registers.
+LAUNCH_SIZES = (1003, 101, 67), (1024, 128, 96), (1, 1, 1)
+RUNS_ON_OTHER_TARGETS = 2
 
 
 @triton.jit
-def _hungry(numbers, COUNT: tl.constexpr):
-    """Takes more registers than there are: can this target be built for, and are spills seen?"""
+def _spilling_kernel(numbers, COUNT: tl.constexpr):
+    """Need more registers than there are, to test whether Triton builds for a target and reports spills."""
     at = tl.arange(0, COUNT)
     a = tl.load(numbers + at)
     b = tl.load(numbers + COUNT + at)
@@ -271,8 +274,8 @@ def _hungry(numbers, COUNT: tl.constexpr):
     tl.store(numbers + COUNT + at, b + total)
 
 
-class _Driver:
-    """In place of the driver of a GPU: only names it."""
+class _TargetDriver:
+    """Stand-in for a GPU driver that only names its target."""
 
     def __init__(self, target: GPUTarget) -> None:
         self.get_current_target = lambda: target
@@ -280,8 +283,8 @@ class _Driver:
         self.get_current_stream = lambda device: 0
 
 
-class _Filled(TorchFunctionMode):
-    """New memory holds ones, where a kernel would have written: sizes that the host reads of it stay small."""
+class _FillNewTensors(TorchFunctionMode):
+    """Fill new tensors with ones in place of a kernel's output, so that the host reads only small sizes from them."""
 
     def __torch_function__(self, func, types, args=(), kwargs=None):
         result = func(*args, **(kwargs or {}))
@@ -289,72 +292,72 @@ class _Filled(TorchFunctionMode):
 
 
 def build(task: tuple[str, str]) -> list[Build]:
-    """Run one operation as on one target; what was built, and what went wrong."""
+    """Run one operation as if on one target; return its builds, including the failed ones."""
     operation, name = task
-    target, builds = TARGETS[name], {}
+    target, builds = GPU_TARGETS[name], {}
     launch = JITFunction.run
 
     def record(kernel: JITFunction, *args: object, grid: object, warmup: bool, **options: object) -> None:
         try:
             built = launch(kernel, *args, grid=grid, warmup=True, **options)
             if built.hash not in builds:
-                builds[built.hash] = _describe(kernel, name, built)
-        except Exception as error:  # of the compilers, of many kinds
-            builds[str(error)] = Build(_name(kernel), name, error=_say(error))
+                builds[built.hash] = _describe_build(kernel, name, built)
+        except Exception as error:  # the compilers raise many types
+            builds[str(error)] = Build(_kernel_name(kernel), name, error=_format_error(error))
 
     with ExitStack() as stack:
-        for change in _pretend(name):
+        for change in _patches_for(name):
             stack.enter_context(change)
-        triton.runtime.driver.set_active(_Driver(target))
+        triton.runtime.driver.set_active(_TargetDriver(target))
         stack.enter_context(mock.patch.object(JITFunction, "run", record))
         try:
             if operation == "probe":
                 numbers = 256 * target.warp_size
-                _hungry[(1,)](torch.empty(2 * numbers), COUNT=numbers, num_warps=1)
+                _spilling_kernel[(1,)](torch.empty(2 * numbers), COUNT=numbers, num_warps=1)
             else:
-                whole = name == next(iter(TARGETS))
-                for sizes in SIZES if whole else SIZES[:1]:
-                    for run in islice(OPERATIONS[operation](*sizes), None if whole else FIRST):
+                whole = name == next(iter(GPU_TARGETS))
+                for sizes in LAUNCH_SIZES if whole else LAUNCH_SIZES[:1]:
+                    for run in islice(OPERATION_RUNS[operation](*sizes), None if whole else RUNS_ON_OTHER_TARGETS):
                         run()
-        except Exception as error:  # of the host's part; the other operations go on
+        except Exception as error:  # if the host code fails, the other operations still run
             last = traceback.extract_tb(error.__traceback__)[-1]
-            builds[""] = Build(operation, name, error=f"{_say(error)} ({last.filename}:{last.lineno})")
+            builds[""] = Build(operation, name, error=f"{_format_error(error)} ({last.filename}:{last.lineno})")
     return list(builds.values())
 
 
-def _pretend(name: str) -> Iterator[object]:
-    """What makes the operations launch on tensors of the CPU what they would launch on this target."""
+def _patches_for(name: str) -> Iterator[object]:
+    """Yield the patches that make operations on CPU tensors launch the same kernels as on a target."""
     from hyrfpack.ops import dispatch
 
     def choose(implementation: str, available: tuple[str, ...], *tensors: Tensor) -> str:
         return "gpu" if "gpu" in available else "reference"
 
-    target = TARGETS[name]
+    target = GPU_TARGETS[name]
     capability = (9, 4) if target.backend == "hip" else divmod(target.arch, 10)
     properties = SimpleNamespace(multi_processor_count=132, name=name)
-    yield mock.patch.object(dispatch, "choose_implementation", choose)  # before an operation takes it
+    yield mock.patch.object(dispatch, "choose_implementation", choose)  # must precede the import of an operation
     yield mock.patch.object(torch.version, "hip", "6.4" if target.backend == "hip" else None)
     yield mock.patch.object(torch.cuda, "get_device_properties", lambda *_: properties)
     yield mock.patch.object(torch.cuda, "get_device_capability", lambda *_: capability)
-    yield _Filled()
+    yield _FillNewTensors()
 
 
-def _say(error: Exception) -> str:
+def _format_error(error: Exception) -> str:
     return f"{type(error).__name__}: {error}"
 
 
-def _describe(kernel: JITFunction, target: str, built: object) -> Build:
+def _describe_build(kernel: JITFunction, target: str, built: object) -> Build:
     source = built.src
     constants = [f"{source.fn.arg_names[path[0]]}={value}" for path, value in source.constants.items()]
     aligned = [source.fn.arg_names[path[0]] for path in source.attrs]
-    registers, spills = _resources(built)
+    registers, spills = _read_resources(built)
     metadata = built.metadata
     described = " ".join(constants) + " /16: " + " ".join(aligned)
-    return Build(_name(kernel), target, described, metadata.num_warps, registers, metadata.shared, spills)
+    return Build(_kernel_name(kernel), target, described, metadata.num_warps, registers, metadata.shared, spills)
 
 
-def _resources(built: object) -> tuple[int, int]:
-    """Registers and spills of a kernel."""
+def _read_resources(built: object) -> tuple[int, int]:
+    """Return the registers and spills of a built kernel."""
     if "amdgcn" in built.asm:
         counts = dict(re.findall(r"\.(\w+_count):\s*(\d+)", built.asm["amdgcn"]))
         return int(counts["vgpr_count"]), int(counts["vgpr_spill_count"]) + int(counts["sgpr_spill_count"])
@@ -369,7 +372,7 @@ def _resources(built: object) -> tuple[int, int]:
 
 
 def list_kernels(_: object = None) -> list[str]:
-    """Names of the kernels of hyrfpack.ops: of what returns nothing and is called by no other."""
+    """Return the names of the kernels of hyrfpack.ops: Triton functions that return nothing and that no other calls."""
     import hyrfpack.ops
 
     for module in pkgutil.walk_packages(hyrfpack.ops.__path__, "hyrfpack.ops."):
@@ -377,20 +380,20 @@ def list_kernels(_: object = None) -> list[str]:
             importlib.import_module(module.name)
     modules = [module for name, module in sys.modules.items() if name.startswith("hyrfpack.ops.")]
     found = {value for module in modules for value in vars(module).values() if isinstance(value, JITFunction)}
-    called = {other for function in found for other in _called(function)}
-    return sorted(_name(function) for function in found - called if not _returns(function))
+    called = {other for function in found for other in _iterate_called_functions(function)}
+    return sorted(_kernel_name(function) for function in found - called if not _returns_value(function))
 
 
-def _name(function: JITFunction) -> str:
+def _kernel_name(function: JITFunction) -> str:
     return f"{function.module.removeprefix('hyrfpack.ops.')}.{function.fn.__name__}"
 
 
-def _returns(function: JITFunction) -> bool:
+def _returns_value(function: JITFunction) -> bool:
     return any(isinstance(node, ast.Return) and node.value is not None for node in ast.walk(function.parse()))
 
 
-def _called(function: JITFunction) -> Iterator[object]:
-    """What a function's code may name: globals, and what lies in modules among them."""
+def _iterate_called_functions(function: JITFunction) -> Iterator[object]:
+    """Yield the Triton functions and module members that a function's code can name."""
     names = function.fn.__code__.co_names
     for value in (function.fn.__globals__.get(name) for name in names):
         if isinstance(value, ModuleType):
@@ -400,29 +403,29 @@ def _called(function: JITFunction) -> Iterator[object]:
 
 
 def build_all() -> dict[str, list]:
-    """Build all for all targets.
+    """Build all kernels for all targets.
 
     Returns:
-        "builds": a row for each; "probes": one row a target of a kernel that must spill; "left_out": kernels that
-        nothing launched.
+        "builds": one row for each build. "probes": for each target, one row of a kernel that must spill. "left_out":
+        the kernels that no operation launched.
     """
-    # Each task has a process of its own, as what operations choose when they are imported depends on the target. What
-    # does not depend on it, each inherits: reading all of Triton for its digest takes longer than most tasks.
+    # Each task runs in its own process, because operations make choices at import that depend on the target. Processes
+    # inherit Triton's digest of its own sources, because computing it takes longer than most tasks.
     importlib.import_module("triton.experimental.gluon")
     getattr(triton.runtime.cache, "triton_key", lambda: None)()
-    with multiprocessing.get_context("fork").Pool(PROCESSES, maxtasksperchild=1) as pool:
+    with multiprocessing.get_context("fork").Pool(BUILD_PROCESSES, maxtasksperchild=1) as pool:
         kernels = pool.apply_async(list_kernels)
-        probes = sum(pool.map(build, [("probe", name) for name in TARGETS], chunksize=1), [])
-        able = [probe.target for probe in probes if not probe.error]
-        tasks = [(operation, name) for operation in OPERATIONS for name in able]
+        probes = sum(pool.map(build, [("probe", name) for name in GPU_TARGETS], chunksize=1), [])
+        buildable = [probe.target for probe in probes if not probe.error]
+        tasks = [(operation, name) for operation in OPERATION_RUNS for name in buildable]
         builds = sum(pool.map(build, tasks, chunksize=1), [])
         launched = {build.kernel for build in builds}
         left_out = [kernel for kernel in kernels.get() if kernel not in launched]
     return {"builds": list(map(asdict, builds)), "probes": list(map(asdict, probes)), "left_out": left_out}
 
 
-def table(report: dict[str, list]) -> Iterator[str]:
-    """Lines of a table: of each kernel and target the most of all its builds."""
+def format_table(report: dict[str, list]) -> Iterator[str]:
+    """Yield the lines of a table with the largest values over all builds of each kernel and target, and all errors."""
     rows: dict[tuple[str, str, int], list[dict]] = {}
     for row in report["builds"]:
         if not row["error"]:
@@ -436,17 +439,17 @@ def table(report: dict[str, list]) -> Iterator[str]:
             yield f"{row['kernel']} on {row['target']}: {row['error'] or 'spills'} {row['constants']}"
     for row in report["probes"]:
         if row["error"]:
-            yield f"{row['target']} cannot be built for: {row['error']}"
+            yield f"{row['target']}: Triton cannot build for this target: {row['error']}"
     for kernel in report["left_out"]:
-        yield f"{kernel}: nothing launched it"
+        yield f"{kernel}: no operation launches it"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--json", action="store_true", help="for programs")
+    parser.add_argument("--json", action="store_true", help="print JSON")
     as_json = parser.parse_args().json
     report = build_all()
-    print(json.dumps(report) if as_json else "\n".join(table(report)))
+    print(json.dumps(report) if as_json else "\n".join(format_table(report)))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""How far a kernel's values and gradients are from the float64 reference's, and whether that is too far."""
+"""Measure the errors of a kernel's values and gradients against float64, and compare them with their bounds."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from hyrfpack.measure.error import measure_relative_error
 from hyrfpack.model.operation_calls import OperationCall
 
 
-def checked(call: OperationCall, implementation: str) -> dict[str, object]:
-    """The errors of a call's values and of its gradients, the worst of them, as cells of a row with its status."""
+def check_call(call: OperationCall, implementation: str) -> dict[str, object]:
+    """Return the error of a call's values and the largest error of its gradients as cells, with the row's status."""
     exact, exact_gradients = call.forward_backward_task("reference", torch.float64)()
-    found, gradients = call.forward_backward_task(implementation)()
-    values = relative_error(found, exact)
+    measured, gradients = call.forward_backward_task(implementation)()
+    values = relative_error(measured, exact)
     worst = max((relative_error(a, b) for a, b in zip(gradients, exact_gradients, strict=True)), default=0.0)
     row: dict[str, object] = {"value error": values, "gradient error": worst}
-    return row | within(values, call.error_bounds[0]) | within(worst, call.error_bounds[1])
+    return row | status_beyond(values, call.error_bounds[0]) | status_beyond(worst, call.error_bounds[1])
 
 
-def within(error: float, bound: float) -> dict[str, object]:
-    """Nothing, or the status of a row whose error is beyond its bound."""
+def status_beyond(error: float, bound: float) -> dict[str, object]:
+    """Return the "failed" status of a row whose error exceeds its bound, otherwise an empty dictionary."""
     if error <= bound:
         return {}
-    return {"status": "failed", "note": f"{error:.1e} off the float64 reference, beyond {bound:.0e}"}
+    return {"status": "failed", "note": f"the error against the float64 reference is {error:.1e}, beyond {bound:.0e}"}
 
 
 def relative_error(values: Tensor, exact: Tensor) -> float:
-    """The rms of the difference over that of the exact numbers; infinity where a number is not finite."""
+    """Return the rms of the difference over the rms of the exact values; infinity if a value is not finite."""
     try:
         return measure_relative_error(values, exact, "").rms
     except HyrfError:

@@ -1,4 +1,4 @@
-"""Whole frames and whole training steps of a made-up room, beside gsplat where that is installed."""
+"""Time whole frames and training steps of a synthetic room, and compare the rasteriser with gsplat's if installed."""
 
 from __future__ import annotations
 
@@ -14,61 +14,63 @@ from hyrfpack.model.operation_calls import OperationCall
 from hyrfpack.ops.rasterize import rasterize
 from hyrfpack.render import render
 from hyrfpack.scene import Camera
-from tools.gpu.rows import Row, goal, kernel_rows
+from tools.gpu.rows import Row, goal_row, kernel_rows
 from tools.gpu.scene import (
-    TIDY,
-    TRAINED,
+    TIDY_LOOK,
+    TRAINED_LOOK,
     Splats,
     count_blended,
-    disturb,
+    decode_splats,
     make_cameras,
     make_model,
     make_scene,
-    splats_of,
+    perturb,
 )
-from tools.gpu.setup import GOAL_ROOM, Setup
-from tools.gpu.timing import median_ms, peak_mb, profiled, reset_peak, synchronize
-from tools.gpu.worker import failure
+from tools.gpu.setup import GOAL_ROOM_NAME, Setup
+from tools.gpu.timing import median_ms, profile_task, read_peak_memory_mb, reset_peak_memory, synchronize
+from tools.gpu.worker import failure_row
 
-GOAL_FRAMES, GOAL_SPEED = 300.0, 0.8
-AS_TRAINED = ", as trained"  # what ends the name of a room of that look
-GSPLAT_TRANSMITTANCE_MIN = 1e-4  # where gsplat finishes a pixel; ours goes on as far when the two are compared
+GOAL_FRAMES_PER_SECOND, GOAL_GSPLAT_SPEED_RATIO = 300.0, 0.8
+AS_TRAINED_SUFFIX = ", as trained"  # the end of the names of rooms with TRAINED_LOOK
+# gsplat finishes a pixel at this transmittance; for the comparison our rasteriser uses the same value.
+GSPLAT_TRANSMITTANCE_MIN = 1e-4
 
 
 def items(setup: Setup) -> list[str]:
-    """One for each number of Gaussians, and those of rooms that are as training leaves them."""
+    """Return one item for each number of Gaussians, and one for each room with Gaussians as trained."""
     return [f"{count:,}" for count in setup.frame_gaussians] + [
-        f"{count:,}{AS_TRAINED}" for count in setup.trained_gaussians
+        f"{count:,}{AS_TRAINED_SUFFIX}" for count in setup.trained_gaussians
     ]
 
 
 def run(item: str, setup: Setup) -> Iterator[Row]:
-    """Statistics, frames, rasteriser and training of that many Gaussians, trained a little first."""
-    number, look = item.removesuffix(AS_TRAINED), TRAINED if item.endswith(AS_TRAINED) else TIDY
+    """Yield the rows of one room: statistics, training, frames and rasteriser; the model is trained a little first."""
+    number, look = item.removesuffix(AS_TRAINED_SUFFIX), TRAINED_LOOK if item.endswith(AS_TRAINED_SUFFIX) else TIDY_LOOK
     count, device = int(number.replace(",", "")), setup.torch_device
     cameras = make_cameras(setup.views, setup.width, setup.height)
     truth = make_model(count, device, look)
     scene = make_scene(truth, cameras)
     model, training = truth, None
     try:
-        from tools.gpu.training import timed_training
+        from tools.gpu.training import time_training
 
-        training = timed_training(item, scene, disturb(truth), setup)
+        training = time_training(item, scene, perturb(truth), setup)
         model = training.model
     except ModuleNotFoundError as error:  # the trainer needs more packages than rendering
-        reason = failure(error)
+        reason = failure_row(error)
         if reason["status"] == "failed":
             raise
         yield {"table": "Training", "Gaussians": item, **reason}
-    splats = splats_of(model, cameras[1])
-    yield _statistics(item, splats, model)
+    splats = decode_splats(model, cameras[1])
+    yield _statistics_row(item, splats, model)
     if training:
         yield from training.rows()
-    yield from _frames(item, model, cameras, setup)
-    yield from _rasterizer(item, splats, setup)  # last: gsplat may build an extension first, and take all the time
+    yield from _frame_rows(item, model, cameras, setup)
+    # gsplat may build an extension first, which can use up the time limit, so this comes last.
+    yield from _rasterizer_rows(item, splats, setup)
 
 
-def _statistics(room: str, splats: Splats, model: HybridModel) -> Row:
+def _statistics_row(room: str, splats: Splats, model: HybridModel) -> Row:
     with torch.no_grad():
         drawn = rasterize(*splats.inputs.values(), *splats.view)
     pixels = drawn.transmittance.numel()
@@ -87,10 +89,10 @@ def _statistics(room: str, splats: Splats, model: HybridModel) -> Row:
     }
 
 
-def _frames(room: str, model: HybridModel, cameras: list[Camera], setup: Setup) -> Iterator[Row]:
-    """Frames a second over all cameras, by the wall clock with the device waited for at the end."""
+def _frame_rows(room: str, model: HybridModel, cameras: list[Camera], setup: Setup) -> Iterator[Row]:
+    """Yield the frames a second over all cameras; the wall-clock time includes a final wait for the device."""
     device = setup.torch_device
-    reset_peak(device)
+    reset_peak_memory(device)
     with torch.no_grad():
         decoded = model.decode()
         ways: dict[str, Callable[[Camera], object]] = {
@@ -105,11 +107,13 @@ def _frames(room: str, model: HybridModel, cameras: list[Camera], setup: Setup) 
                 "model": name,
                 "frames/s": 1e3 / ms,
                 "ms": ms,
-                "peak MB": peak_mb(device),
+                "peak MB": read_peak_memory_mb(device),
             }
-            if name == "decoded once" and room == GOAL_ROOM:
-                yield goal(f"frames of {room} Gaussians", 1e3 / ms, GOAL_FRAMES, "frames/s", at_least=True)
-        times = profiled(lambda: render(model, cameras[1], decoded=decoded), 5, device).times
+            if name == "decoded once" and room == GOAL_ROOM_NAME:
+                yield goal_row(
+                    f"frames of {room} Gaussians", 1e3 / ms, GOAL_FRAMES_PER_SECOND, "frames/s", at_least=True
+                )
+        times = profile_task(lambda: render(model, cameras[1], decoded=decoded), 5, device).times
     yield from kernel_rows(times, f"A frame of {room} Gaussians: kernels on the device")
 
 
@@ -128,13 +132,13 @@ def _frame_ms(draw: Callable[[Camera], object], cameras: list[Camera], setup: Se
     return 1e3 * (time.perf_counter() - start) / frames
 
 
-def _rasterizer(room: str, splats: Splats, setup: Setup) -> Iterator[Row]:
-    """The rasteriser alone, and gsplat's on the same Gaussians; forward alone and with all gradients."""
-    draws = {"hyrfpack": partial(_ours, splats)}
+def _rasterizer_rows(room: str, splats: Splats, setup: Setup) -> Iterator[Row]:
+    """Time our rasteriser and gsplat's on the same Gaussians, forward only and with all gradients."""
+    draws = {"hyrfpack": partial(_draw_with_hyrfpack, splats)}
     row = {"table": "Rasterising against gsplat", "Gaussians": room}
     try:
-        draws["gsplat"] = _gsplat(splats)
-    except Exception as error:  # not there, or not for this torch: whatever it is, ours is measured
+        draws["gsplat"] = _make_gsplat_draw(splats)
+    except Exception as error:  # gsplat may be missing or not fit this torch; our rasteriser is still measured
         yield {**row, "status": "left out", "note": f"gsplat's rasteriser cannot be compared: {str(error)[:200]}"}
     calls = {name: OperationCall(draw, splats.inputs, tuple(splats.inputs)) for name, draw in draws.items()}
     tasks = {f"{name} forward": call.forward_task("auto") for name, call in calls.items()}
@@ -144,17 +148,19 @@ def _rasterizer(room: str, splats: Splats, setup: Setup) -> Iterator[Row]:
         ours, theirs = times[f"hyrfpack {way}"], times.get(f"gsplat {way}")
         cells = {"pass": way, "ms": ours, "gsplat ms": theirs}
         yield row | cells | ({"speed over gsplat's": theirs / ours} if theirs else {})
-        if theirs and room == GOAL_ROOM:
-            yield goal(f"rasterising {room}, {way}", theirs / ours, GOAL_SPEED, "of gsplat's speed", at_least=True)
+        if theirs and room == GOAL_ROOM_NAME:
+            yield goal_row(
+                f"rasterising {room}, {way}", theirs / ours, GOAL_GSPLAT_SPEED_RATIO, "of gsplat's speed", at_least=True
+            )
 
 
-def _ours(splats: Splats, implementation: str, **inputs: Tensor) -> Tensor:
+def _draw_with_hyrfpack(splats: Splats, implementation: str, **inputs: Tensor) -> Tensor:
     how = {"transmittance_min": GSPLAT_TRANSMITTANCE_MIN, "implementation": implementation}
     return rasterize(*inputs.values(), *splats.view, **how).rgb
 
 
-def _gsplat(splats: Splats) -> Callable[..., Tensor]:
-    """gsplat's rasteriser with the rules of ours, as far as it has them."""
+def _make_gsplat_draw(splats: Splats) -> Callable[..., Tensor]:
+    """Return gsplat's rasteriser as a draw function, with settings as close to ours as it allows."""
     from gsplat import rasterization
 
     fx, fy, cx, cy = splats.camera.intrinsics
@@ -165,5 +171,5 @@ def _gsplat(splats: Splats) -> Callable[..., Tensor]:
     def draw(implementation: str, **inputs: Tensor) -> Tensor:
         return rasterization(*inputs.values(), view, intrinsics, *size, near_plane=0.01, packed=False)[0]
 
-    draw("auto", **splats.inputs)  # builds its extension, or fails here
+    draw("auto", **splats.inputs)  # the first call builds gsplat's extension, or raises
     return draw

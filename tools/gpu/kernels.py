@@ -1,4 +1,4 @@
-"""Each operation by itself: time against the roofline, and error against the float64 reference."""
+"""Measure each operation alone: its time against the roofline, and its error against the float64 reference."""
 
 from __future__ import annotations
 
@@ -27,32 +27,41 @@ from hyrfpack.ops.rasterize.shaded import rasterize_shaded
 from hyrfpack.ops.shade import Shading, shade
 from hyrfpack.render import RenderSettings
 from tools.gpu import roofline
-from tools.gpu.compare import checked, relative_error, within
+from tools.gpu.compare import check_call, relative_error, status_beyond
 from tools.gpu.roofline import Work
 from tools.gpu.rows import Row
-from tools.gpu.scene import TIDY, TRAINED, Look, Splats, count_blended, make_cameras, make_model, splats_of
+from tools.gpu.scene import (
+    TIDY_LOOK,
+    TRAINED_LOOK,
+    Look,
+    Splats,
+    count_blended,
+    decode_splats,
+    make_cameras,
+    make_model,
+)
 from tools.gpu.setup import Setup
-from tools.gpu.timing import group_kernels, measure_rates, median_ms, profiled
+from tools.gpu.timing import group_kernels, measure_rates, median_ms, profile_task
 
-TABLE = "Kernels"
-# Words in the names of the GPU's kernels that tell which stage of the rasteriser they are; the rest of a forward pass,
-# with torch's own sorts and prefix sums, is binning.
-STAGES = {"project": ("project",), "blend": ("blend", "sum_rows")}
+TABLE_NAME = "Kernels"
+# Words in the kernels' names that identify their stage of the rasteriser. All other kernels of a forward pass, such as
+# torch's sorts and prefix sums, belong to binning.
+STAGE_KERNEL_WORDS = {"project": ("project",), "blend": ("blend", "sum_rows")}
 Works = tuple[Work, Work]  # forward, backward
 
 
 def items(setup: Setup) -> list[str]:
-    """The operations, in the order in which they are measured."""
-    return list(ITEMS)
+    """Return the names of the operations, in the order in which they are measured."""
+    return list(ITEM_ROW_GENERATORS)
 
 
 def run(item: str, setup: Setup) -> Iterator[Row]:
-    """Rows of one operation."""
-    yield from ITEMS[item](setup)
+    """Yield the rows of one operation."""
+    yield from ITEM_ROW_GENERATORS[item](setup)
 
 
 def rates_rows(setup: Setup) -> Iterator[Row]:
-    """What the others' shares are of."""
+    """Yield the device's measured peak rates, to which the shares in the other rows refer."""
     rates = measure_rates(setup.torch_device)
     yield {"table": "Measured rates", "rate": "copy, bytes read and written", "value": f"{rates.copy / 1e12:.3f} TB/s"}
     yield {"table": "Measured rates", "rate": "bf16 matrix product", "value": f"{rates.bf16 / 1e12:.1f} TFLOP/s"}
@@ -60,9 +69,12 @@ def rates_rows(setup: Setup) -> Iterator[Row]:
 
 
 def rasterize_rows(name: str, look: Look, setup: Setup) -> Iterator[Row]:
-    """The whole rasteriser, forward and backward; the error is that of a part of the picture."""
+    """Measure the whole rasteriser and its stages, forward and backward; the error is that of a crop of the picture."""
     splats = _splats(setup, look)
-    call, crop = (rasterize_call(some.inputs, *some.view) for some in (splats, cropped(splats, setup.crop)))
+    call, crop = (
+        rasterize_call(view_splats.inputs, *view_splats.view)
+        for view_splats in (splats, crop_splats(splats, setup.crop))
+    )
     drawn = rasterize(*splats.inputs.values(), *splats.view, implementation=setup.implementation)
     pairs, pixels, count = int(drawn.pairs), setup.width * setup.height, len(splats.inputs["means"])
     blended, reached = count_blended(splats)
@@ -70,24 +82,24 @@ def rasterize_rows(name: str, look: Look, setup: Setup) -> Iterator[Row]:
     seen = int(drawn.visible.sum())
     size = f"{count:,} Gaussians, {seen:,} visible, {pairs:,} pairs, {setup.width} x {setup.height}"
     works = {
-        "project": roofline.project(count),
-        "bin": roofline.bin_pairs(seen, pairs, tiles),
-        "blend": roofline.blend(pairs, pixels, reached, blended),
+        "project": roofline.count_project(count),
+        "bin": roofline.count_bin_pairs(seen, pairs, tiles),
+        "blend": roofline.count_blend(pairs, pixels, reached, blended),
     }
-    back = {
-        "project": roofline.project_backward(seen),
-        "blend": roofline.blend_backward(pairs, pixels, reached, blended),
+    backward_works = {
+        "project": roofline.count_project_backward(seen),
+        "blend": roofline.count_blend_backward(pairs, pixels, reached, blended),
     }
-    totals = (sum(works.values(), Work(0, 0)), sum(back.values(), Work(0, 0)))
-    yield from _timed(name, size, call, totals, setup, crop)
+    totals = (sum(works.values(), Work(0, 0)), sum(backward_works.values(), Work(0, 0)))
+    yield from _timed_rows(name, size, call, totals, setup, crop)
     forward, backward = call.separate_tasks(setup.implementation)
-    for way, task, parts in (("forward", forward, works), ("backward", backward, back)):
-        measured = profiled(task, 5, setup.torch_device).times
-        for stage, ms in group_kernels(measured, STAGES, "bin" if way == "forward" else "other").items():
+    for way, task, parts in (("forward", forward, works), ("backward", backward, backward_works)):
+        measured = profile_task(task, 5, setup.torch_device).times
+        for stage, ms in group_kernels(measured, STAGE_KERNEL_WORDS, "bin" if way == "forward" else "other").items():
             if stage in parts and ms:
                 yield _row(f"- {stage}", way, size, ms, parts[stage], setup)
             elif ms:
-                yield {"table": TABLE, "kernel": f"- {stage}", "pass": way, "size": size, "ms": ms}
+                yield {"table": TABLE_NAME, "kernel": f"- {stage}", "pass": way, "size": size, "ms": ms}
         for kernel, ms in list(measured.items())[:12]:
             yield {
                 "table": "Rasteriser's kernels on the device",
@@ -99,44 +111,44 @@ def rasterize_rows(name: str, look: Look, setup: Setup) -> Iterator[Row]:
 
 
 def hash_encode_rows(setup: Setup) -> Iterator[Row]:
-    """Both fields' features of all Gaussians; gradients reach the table, as in training."""
+    """Measure the hash encoding of both fields for all Gaussians; gradients go to the table, as in training."""
     model = _model(setup)
     coords = model.cube_coords(model.gaussians.positions).detach()
     for name, field in named_fields(model):
         grid = field.grid.config
-        # The table as trained ones are: numbers about 0.1, not the 1e-4 that training starts from.
+        # A trained table has values of about 0.1; the initial values of training are about 1e-4.
         numbers = 1e3 * field.grid.table.detach(), grid.resolutions, grid.log2_table_size
         call, part = (hash_encode_call(points, *numbers) for points in (coords, _sample(coords, setup)))
         sizes = len(coords), grid.levels, grid.rows
-        works = roofline.hash_encode(*sizes), roofline.hash_encode_backward(*sizes)
+        works = roofline.count_hash_encode(*sizes), roofline.count_hash_encode_backward(*sizes)
         size = f"{len(coords):,} points, {grid.levels} levels, {grid.rows:,} rows"
-        yield from _timed(f"hash encode, {name}", size, call, works, setup, part)
+        yield from _timed_rows(f"hash encode, {name}", size, call, works, setup, part)
 
 
 def mlp_rows(mixed: bool, setup: Setup) -> Iterator[Row]:
-    """Both fields' decoders on all Gaussians."""
+    """Measure the decoders of both fields on all Gaussians."""
     for name, field, x in decoder_inputs(_model(setup), torch.zeros(3)):
         x += 0.5 * torch.randn(x.shape, generator=torch.Generator().manual_seed(0)).to(x.device)
         call, part = (mlp_call(rows, field.weights, field.biases, mixed) for rows in (x, _sample(x, setup)))
         widths = [x.shape[1], *(weight.shape[0] for weight in field.weights)]
-        works = roofline.mlp(len(x), widths, mixed), roofline.mlp_backward(len(x), widths, mixed)
+        works = roofline.count_mlp(len(x), widths, mixed), roofline.count_mlp_backward(len(x), widths, mixed)
         precision = "mixed" if mixed else "float32"
         size = f"{len(x):,} rows, {'-'.join(map(str, widths))}"
-        yield from _timed(f"mlp, {name}, {precision}", size, call, works, setup, part)
+        yield from _timed_rows(f"mlp, {name}, {precision}", size, call, works, setup, part)
 
 
 @torch.no_grad()
 def decode_rows(setup: Setup) -> Iterator[Row]:
-    """All Gaussians' geometry and colours, as a frame asks for them; the error is of what rounding comes to in all."""
+    """Measure the decoding of all Gaussians' geometry and colours for a frame; the error is that of all rounding."""
     model, camera = _model(setup), make_cameras(1, setup.width, setup.height)[0]
     viewpoint = torch.as_tensor(camera.position, dtype=torch.float32, device=setup.torch_device)
-    some = _sample(torch.arange(len(model), device=setup.torch_device), setup)
+    sample = _sample(torch.arange(len(model), device=setup.torch_device), setup)
     exact = copy.deepcopy(model).double()
     exact.precision = "float32"  # no factor of the reference's products is rounded to bfloat16
-    colors = (model.decode_colors(viewpoint, some), exact.decode_colors(viewpoint.double(), some))
+    colors = (model.decode_colors(viewpoint, sample), exact.decode_colors(viewpoint.double(), sample))
     geometry = [
         torch.cat((part.scales, part.quats, part.opacities[:, None]), 1)
-        for part in (model.decode_geometry(some), exact.decode_geometry(some))
+        for part in (model.decode_geometry(sample), exact.decode_geometry(sample))
     ]
     tasks = {
         "geometry": lambda: model.decode_geometry(),
@@ -146,15 +158,15 @@ def decode_rows(setup: Setup) -> Iterator[Row]:
     for (name, field), (values, reference) in zip(named_fields(model), (geometry, colors), strict=True):
         widths = [field.weights[0].shape[1], *(weight.shape[0] for weight in field.weights)]
         mixed = model.precision == "mixed"
-        work = roofline.decode(len(model), widths, field.grid.config.levels, field.grid.config.rows, mixed)
+        work = roofline.count_decode(len(model), widths, field.grid.config.levels, field.grid.config.rows, mixed)
         row = _row(f"decode {name}", "forward", f"{len(model):,} Gaussians", times[name], work, setup)
         error = relative_error(values, reference)
-        yield row | {"value error": error} | within(error, 1e-2)
+        yield row | {"value error": error} | status_beyond(error, 1e-2)
 
 
 @torch.no_grad()
 def shade_rows(setup: Setup) -> Iterator[Row]:
-    """Colours of all Gaussians for a view, with what does not depend on it worked out before."""
+    """Measure the colours of all Gaussians for a view, with the view-independent part computed beforehand."""
     model, camera = _model(setup), make_cameras(1, setup.width, setup.height)[0]
     positions = model.gaussians.positions.detach()
     viewpoint = torch.as_tensor(camera.position, dtype=torch.float32, device=setup.torch_device)
@@ -163,20 +175,20 @@ def shade_rows(setup: Setup) -> Iterator[Row]:
         task = {"shade": lambda shading=shading: shade(positions, viewpoint, shading, implementation=ours)}
         ms = median_ms(task, setup.repeats, setup.torch_device)["shade"]
         part, exact = _shading_sample(shading, setup), _shading_sample(shading, setup, torch.float64)
-        some = _sample(positions, setup)
+        sample = _sample(positions, setup)
         error = relative_error(
-            shade(some, viewpoint, part, implementation=ours),
-            shade(some.double(), viewpoint.double(), exact, implementation="reference"),
+            shade(sample, viewpoint, part, implementation=ours),
+            shade(sample.double(), viewpoint.double(), exact, implementation="reference"),
         )
-        work = roofline.shade(len(positions), _widths(shading), shading.mixed)
+        work = roofline.count_shade(len(positions), _widths(shading), shading.mixed)
         row = _row(f"shade, {precision}", "forward", f"{len(positions):,} Gaussians", ms, work, setup)
-        yield row | {"value error": error} | within(error, 3e-3 if shading.mixed else 1e-4)
+        yield row | {"value error": error} | status_beyond(error, 3e-3 if shading.mixed else 1e-4)
 
 
 def _shadings(model: HybridModel) -> dict[str, Shading]:
-    """The model's shading by its precision; on a CPU the two are one."""
+    """Return the model's shading in each precision; on a CPU both are the same."""
     shadings = {}
-    for precision in ("float32", "mixed"):  # the second is the default: the model is left as it was
+    for precision in ("float32", "mixed"):  # "mixed" is the default, so the model ends in its initial precision
         model.precision = precision
         shading = model.shading()
         shadings["mixed" if shading.mixed else "float32"] = shading
@@ -184,18 +196,18 @@ def _shadings(model: HybridModel) -> dict[str, Shading]:
 
 
 def _widths(shading: Shading) -> list[int]:
-    """Of the encoded direction, the hidden layers and the colours."""
+    """Return the widths of the encoded direction, the hidden layers and the colours."""
     return [shading.direction_weight.shape[1], *(len(bias) for bias in (shading.first_layer[0], *shading.biases))]
 
 
 def _shading_sample(shading: Shading, setup: Setup, dtype: torch.dtype | None = None) -> Shading:
-    """The rows whose error is measured; numbers as they are, or all of one precision."""
+    """Return the rows whose error is measured, converted to `dtype` if it is given."""
     rows = {name: _sample(getattr(shading, name), setup) for name in ("first_layer", "color_logits")}
     return _cast(replace(shading, **rows), dtype)
 
 
 def _cast(shading: Shading, dtype: torch.dtype | None) -> Shading:
-    """The same shading, contiguous and in one precision, or in those it has."""
+    """Return the shading with contiguous tensors, converted to `dtype` if it is given."""
 
     def cast(tensor: Tensor) -> Tensor:
         return (tensor if dtype is None else tensor.to(dtype)).contiguous()
@@ -212,8 +224,10 @@ def _cast(shading: Shading, dtype: torch.dtype | None) -> Shading:
 
 @torch.no_grad()
 def rasterize_shaded_rows(setup: Setup) -> Iterator[Row]:
-    """Culling, shading and rasterising in one, as a frame of a model that does not change asks for it; the error is
-    that of a part of the picture."""
+    """Measure culling, shading and rasterising in one call, as for frames of a fixed model.
+
+    The error is that of a crop of the picture.
+    """
     model, splats = _model(setup), _splats(setup)
     explicit = [splats.inputs[name] for name in ("means", "quats", "scales", "opacities")]
     exact = [tensor.double() for tensor in explicit]
@@ -228,51 +242,51 @@ def rasterize_shaded_rows(setup: Setup) -> Iterator[Row]:
         drawn = draw()
         pairs, seen = int(drawn.pairs), int(drawn.visible.sum())
         ms = median_ms({"draw": draw}, setup.repeats, setup.torch_device)["draw"]
-        project = roofline.project_shaded(len(model), seen, _widths(shading), shading.mixed)
-        # The decoder's arithmetic is left to the row of its stage: it is of other units than the blending's.
-        whole = Work(project.bytes, 0) + roofline.bin_pairs(seen, pairs, tiles)
-        whole += roofline.blend(pairs, pixels, reached, blended)
-        view = cropped(splats, setup.crop).view
+        project = roofline.count_project_shaded(len(model), seen, _widths(shading), shading.mixed)
+        # The decoder's arithmetic runs on other units than the blending's, so only its own stage's row counts it.
+        whole = Work(project.bytes, 0) + roofline.count_bin_pairs(seen, pairs, tiles)
+        whole += roofline.count_blend(pairs, pixels, reached, blended)
+        view = crop_splats(splats, setup.crop).view
         wanted = rasterize_shaded(*exact, _cast(shading, torch.float64), *view, implementation="reference")
         error = relative_error(join_color_and_transmittance(draw(view)), join_color_and_transmittance(wanted))
         size = f"{len(model):,} Gaussians, {seen:,} visible, {pairs:,} pairs, {setup.width} x {setup.height}"
         row = _row(f"rasterize shaded, {precision}", "forward", size, ms, whole, setup)
-        yield row | {"value error": error} | within(error, 3e-3 if shading.mixed else 1e-3)
-        stages = group_kernels(profiled(draw, 5, setup.torch_device).times, STAGES, "bin")
+        yield row | {"value error": error} | status_beyond(error, 3e-3 if shading.mixed else 1e-3)
+        stages = group_kernels(profile_task(draw, 5, setup.torch_device).times, STAGE_KERNEL_WORDS, "bin")
         if stages["project"]:
             yield _row("- project and shade", "forward", size, stages["project"], project, setup)
 
 
 @torch.no_grad()
 def background_rows(setup: Setup) -> Iterator[Row]:
-    """The background's grid at the window, as a frame asks for it; the error is of what rounding comes to in all."""
+    """Measure the background's grid at the window for a frame; the error is that of all rounding."""
     model, camera = _model(setup), make_cameras(setup.views, setup.width, setup.height)[0]
-    splats, defaults = splats_of(model, camera), RenderSettings()
+    splats, defaults = decode_splats(model, camera), RenderSettings()
     light = rasterize(*splats.inputs.values(), *splats.view).transmittance
-    how = {"threshold": defaults.background_threshold, "stride": defaults.background_stride}
+    options = {"threshold": defaults.background_threshold, "stride": defaults.background_stride}
     view = camera.intrinsics, splats.pose
     exact = copy.deepcopy(model).double()
     exact.precision = "float32"  # no factor of the reference's products is rounded to bfloat16
-    wanted = exact.background_grid(light.double(), *view, **how)
+    wanted = exact.background_grid(light.double(), *view, **options)
     on_gpu = setup.torch_device.type == "cuda"
     field, grid = model.radiance, model.radiance.grid.config
     widths = [field.weights[0].shape[1], *(weight.shape[0] for weight in field.weights)]
     nodes, needed = wanted[..., 0].numel(), int((wanted > 0).any(-1).sum())
     size = f"{needed:,} of {nodes:,} nodes, {setup.width} x {setup.height}"
-    for precision in ("float32", "mixed") if on_gpu else ("mixed",):  # on a CPU they are one
-        model.precision = precision  # the second is the default: the model is left as it was
+    for precision in ("float32", "mixed") if on_gpu else ("mixed",):  # on a CPU both precisions are the same
+        model.precision = precision  # "mixed" is the default, so the model ends in its initial precision
         mixed = on_gpu and precision == "mixed"
-        found = model.background_grid(light, *view, **how)
-        task = {"grid": lambda: model.background_grid(light, *view, **how)}
+        found = model.background_grid(light, *view, **options)
+        task = {"grid": lambda: model.background_grid(light, *view, **options)}
         ms = median_ms(task, setup.repeats, setup.torch_device)["grid"]
-        work = roofline.background(light.numel(), nodes, needed, widths, grid.levels, grid.rows, mixed)
+        work = roofline.count_background(light.numel(), nodes, needed, widths, grid.levels, grid.rows, mixed)
         error = relative_error(found, wanted)
         row = _row(f"background, {'mixed' if mixed else 'float32'}", "forward", size, ms, work, setup)
-        yield row | {"value error": error} | within(error, 1e-2 if mixed else 1e-3)
+        yield row | {"value error": error} | status_beyond(error, 1e-2 if mixed else 1e-3)
 
 
 def ssim_rows(setup: Setup) -> Iterator[Row]:
-    """Loss and gradient of a whole picture."""
+    """Measure the photometric loss and its gradient for a whole picture."""
     generator = torch.Generator().manual_seed(0)
     small = torch.rand(1, 3, max(1, setup.height // 20), max(1, setup.width // 20), generator=generator)
     size = (setup.height, setup.width)
@@ -284,13 +298,13 @@ def ssim_rows(setup: Setup) -> Iterator[Row]:
     ms = median_ms({"both": call.forward_backward_task(setup.implementation)}, setup.repeats, setup.torch_device)[
         "both"
     ]
-    words = f"{setup.width} x {setup.height}"
-    work = roofline.photometric_loss(setup.width * setup.height)
-    yield _row("SSIM and L1 loss", "both", words, ms, work, setup) | checked(call, setup.implementation)
+    size_text = f"{setup.width} x {setup.height}"
+    work = roofline.count_photometric_loss(setup.width * setup.height)
+    yield _row("SSIM and L1 loss", "both", size_text, ms, work, setup) | check_call(call, setup.implementation)
 
 
 def adam_rows(setup: Setup) -> Iterator[Row]:
-    """One step of as many numbers as the Gaussians have."""
+    """Measure one Adam step for as many parameters as the Gaussians have."""
     count = 8 * setup.kernel_gaussians
     generator = torch.Generator().manual_seed(0)
     states = [0.1 * torch.randn(count, generator=generator) for _ in range(3)]
@@ -305,15 +319,17 @@ def adam_rows(setup: Setup) -> Iterator[Row]:
     groups = [[state.to(setup.device)] for state in states]
     task = {"step": lambda: adam_step(*groups, **settings, implementation=setup.implementation)}
     ms = median_ms(task, setup.repeats, setup.torch_device)["step"]
-    row = _row("Adam", "step", f"{count:,} numbers", ms, roofline.adam(count), setup)
-    yield row | {"value error": error} | within(error, 1e-5)
+    row = _row("Adam", "step", f"{count:,} numbers", ms, roofline.count_adam(count), setup)
+    yield row | {"value error": error} | status_beyond(error, 1e-5)
 
 
-def _timed(name: str, size: str, call: OperationCall, works: Works, setup: Setup, part: OperationCall) -> Iterator[Row]:
-    """Rows of both passes of a call; the error is that of `part`."""
+def _timed_rows(
+    name: str, size: str, call: OperationCall, works: Works, setup: Setup, part: OperationCall
+) -> Iterator[Row]:
+    """Yield the rows of both passes of a call; the errors are those of `part`, a smaller call."""
     tasks = dict(zip(("forward", "backward"), call.separate_tasks(setup.implementation), strict=True))
     times = median_ms(tasks, setup.repeats, setup.torch_device)
-    found = checked(part, setup.implementation)
+    found = check_call(part, setup.implementation)
     values, gradients = found.pop("value error"), found.pop("gradient error")
     yield _row(name, "forward", size, times["forward"], works[0], setup) | {"value error": values} | found
     yield _row(name, "backward", size, times["backward"], works[1], setup) | {"gradient error": gradients} | found
@@ -322,9 +338,9 @@ def _timed(name: str, size: str, call: OperationCall, works: Works, setup: Setup
 def _row(name: str, way: str, size: str, ms: float, work: Work, setup: Setup) -> Row:
     rates = measure_rates(setup.torch_device)
     copy, arithmetic = work.shares(ms, rates)
-    least = work.least_ms(rates)
+    least = work.min_ms(rates)
     return {
-        "table": TABLE,
+        "table": TABLE_NAME,
         "kernel": name,
         "pass": way,
         "size": size,
@@ -338,8 +354,8 @@ def _row(name: str, way: str, size: str, ms: float, work: Work, setup: Setup) ->
     }
 
 
-def cropped(splats: Splats, side: int) -> Splats:
-    """The middle of the picture, at most side x side pixels."""
+def crop_splats(splats: Splats, side: int) -> Splats:
+    """Return the same Gaussians with a camera for the middle of the picture, at most side x side pixels."""
     camera = splats.camera
     width, height = min(side, camera.width), min(side, camera.height)
     middle = (camera.width - width) / 2, (camera.height - height) / 2
@@ -350,22 +366,22 @@ def cropped(splats: Splats, side: int) -> Splats:
 
 
 @cache
-def _model(setup: Setup, look: Look = TIDY) -> HybridModel:
+def _model(setup: Setup, look: Look = TIDY_LOOK) -> HybridModel:
     return make_model(setup.kernel_gaussians, setup.torch_device, look)
 
 
-def _splats(setup: Setup, look: Look = TIDY) -> Splats:
-    return splats_of(_model(setup, look), make_cameras(setup.views, setup.width, setup.height)[1])
+def _splats(setup: Setup, look: Look = TIDY_LOOK) -> Splats:
+    return decode_splats(_model(setup, look), make_cameras(setup.views, setup.width, setup.height)[1])
 
 
 def _sample(rows: Tensor, setup: Setup) -> Tensor:
     return rows[:: max(1, len(rows) // setup.error_rows)]
 
 
-ITEMS: dict[str, Callable[[Setup], Iterator[Row]]] = {
+ITEM_ROW_GENERATORS: dict[str, Callable[[Setup], Iterator[Row]]] = {
     "rates": rates_rows,
-    "rasterize": partial(rasterize_rows, "rasterize", TIDY),
-    "rasterize, as trained": partial(rasterize_rows, "rasterize, as trained", TRAINED),
+    "rasterize": partial(rasterize_rows, "rasterize", TIDY_LOOK),
+    "rasterize, as trained": partial(rasterize_rows, "rasterize, as trained", TRAINED_LOOK),
     "hash encode": hash_encode_rows,
     "mlp mixed": lambda setup: mlp_rows(True, setup),
     "mlp float32": lambda setup: mlp_rows(False, setup),

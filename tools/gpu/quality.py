@@ -1,4 +1,4 @@
-"""The same training on the GPU, in each precision, and on the CPU: what held-out photos say of each."""
+"""Compare PSNR on held-out photos of the same training run on the CPU and on the GPU, in each precision."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from tools.gpu.rows import Row
 from tools.gpu.setup import Setup
 from tools.gpu.timing import synchronize
 
-PROBE_STEPS = 25  # on the CPU, to see how many it has time for
-LATER_STEPS = 2.0  # times what a first step takes: there are more Gaussians then
-LEAST_STEPS = 100
-# Rounding alone decides here and there which Gaussian is split, so that two runs of one kind differ by tenths of a dB.
-BOUND = 0.3
+PROBE_STEPS = 25  # timed on the CPU, to estimate how many steps its time limit allows
+LATE_STEP_TIME_RATIO = 2.0  # late steps take about twice as long as the first ones, because there are more Gaussians
+MIN_STEPS = 100
+# Rounding alone can decide which Gaussian is split, so that two equal runs differ by tenths of a dB.
+MAX_PSNR_LOSS_DB = 0.3
 
 
 def items(setup: Setup) -> list[str]:
-    """The built-in scene, and the real set where there is one."""
+    """Return the items: the built-in scene, and the folder of the real data set if there is one."""
     return ["demo", *([setup.data] if setup.data else [])]
 
 
 def run(item: str, setup: Setup) -> Iterator[Row]:
-    """Rows of one set: the CPU's run, then the GPU's in both precisions."""
+    """Yield the rows of one data set: the CPU's run, then the GPU's run in each precision."""
     if not has_numba():
-        note = "it needs Numba, for the CPU's run that the GPU's are compared with takes too long without it"
+        note = "it needs Numba, because the CPU's training run takes too long without it"
         yield {"table": "Quality", "set": item, "status": "left out", "note": note}
         return
     from hyrfpack.data import load_scene
@@ -41,10 +41,10 @@ def run(item: str, setup: Setup) -> Iterator[Row]:
             write_demo_scene(folder, views=setup.demo_views, size=setup.demo_size)
         scene = load_scene(folder if item == "demo" else item)
         name = "built-in" if item == "demo" else Path(item).name
-        yield from _compare(name, scene, setup)
+        yield from _compare_devices(name, scene, setup)
 
 
-def _compare(name: str, scene: Scene, setup: Setup) -> Iterator[Row]:
+def _compare_devices(name: str, scene: Scene, setup: Setup) -> Iterator[Row]:
     cpu = torch.device("cpu")
     steps = _affordable_steps(scene, setup)
     baseline, row = _train(scene, steps, "float32", cpu)
@@ -53,21 +53,21 @@ def _compare(name: str, scene: Scene, setup: Setup) -> Iterator[Row]:
         psnr, row = _train(scene, steps, precision, setup.torch_device)
         row = {"table": "Quality", "set": name, "steps": steps, "run": f"GPU, {precision}", **row}
         row["against the CPU"] = f"{psnr - baseline:+.3f} dB"
-        if not psnr >= baseline - BOUND:
-            row |= {"status": "failed", "note": f"more than {BOUND} dB below the CPU's"}
+        if not psnr >= baseline - MAX_PSNR_LOSS_DB:
+            row |= {"status": "failed", "note": f"its PSNR is more than {MAX_PSNR_LOSS_DB} dB below the CPU's"}
         yield row
 
 
 def _affordable_steps(scene: Scene, setup: Setup) -> int:
-    """As many steps as asked for, or as the CPU has time for."""
-    _train(scene, 2, "float32", torch.device("cpu"))  # compiles the kernels
+    """Return the number of steps: `quality_steps`, or as many as the CPU can take in `quality_seconds`."""
+    _train(scene, 2, "float32", torch.device("cpu"))  # the first run compiles the kernels
     _, row = _train(scene, PROBE_STEPS, "float32", torch.device("cpu"))
-    each = LATER_STEPS * row["seconds"] / PROBE_STEPS
-    return min(setup.quality_steps, max(LEAST_STEPS, int(setup.quality_seconds / each)))
+    each = LATE_STEP_TIME_RATIO * row["seconds"] / PROBE_STEPS
+    return min(setup.quality_steps, max(MIN_STEPS, int(setup.quality_seconds / each)))
 
 
 def _train(scene: Scene, steps: int, precision: str, device: torch.device) -> tuple[float, Row]:
-    """Held-out PSNR in dB after training, and cells of the row."""
+    """Train a model; return its PSNR on held-out photos in dB, and the cells of its row."""
     from hyrfpack.evaluate import evaluate
     from hyrfpack.train import TrainConfig, Trainer
 

@@ -1,4 +1,4 @@
-"""The results as a JSON file and as a Markdown page, and what machine they belong to."""
+"""Write the results as a JSON file and as a Markdown page, with a description of the machine."""
 
 from __future__ import annotations
 
@@ -14,86 +14,88 @@ import torch
 
 from hyrfpack.measure.machine import format_machine, package_versions
 from tools.gpu.rows import Row
-from tools.tables import cell, markdown
+from tools.tables import format_cell, markdown_table
 
-ROOT = Path(__file__).parents[2]
-HIDDEN = ("table", "part", "item", "status", "note")
-FIRST = ("Goals", "Failed and left out")
-WORDS_TOLD = 2  # of a row that failed: enough to say which it is
+REPOSITORY_ROOT = Path(__file__).parents[2]
+HIDDEN_KEYS = ("table", "part", "item", "status", "note")
+LEADING_TABLES = ("Goals", "Failed and left out")
+FAILURE_LABEL_CELLS = 2  # the first two text cells are enough to identify a failed row
 
 
-def machine(device: torch.device) -> dict[str, object]:
-    """What the numbers belong to: the card and its driver, package_versions, the commit, the day."""
-    facts: dict[str, object] = {"device": machine_name(device)}
+def describe_gpu_machine(device: torch.device) -> dict[str, object]:
+    """Return the facts that the numbers depend on: GPU, driver, package versions, commit and date."""
+    facts: dict[str, object] = {"device": device_name(device)}
     if device.type == "cuda":
         properties = torch.cuda.get_device_properties(device)
         facts["memory GB"] = round(properties.total_memory / 1e9, 1)
         facts["multiprocessors"] = properties.multi_processor_count
-        facts["driver"] = _output("nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader")
+        facts["driver"] = _first_output_line("nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader")
         facts["cuda or rocm"] = torch.version.cuda or torch.version.hip
     facts |= {"python": platform.python_version(), "torch": torch.__version__}
     facts |= package_versions("triton", "numpy", "numba", "gsplat")
-    facts["commit"] = _output("git", "-C", str(ROOT), "describe", "--always", "--dirty", "--abbrev=12")
+    facts["commit"] = _first_output_line(
+        "git", "-C", str(REPOSITORY_ROOT), "describe", "--always", "--dirty", "--abbrev=12"
+    )
     facts["date"] = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
     return facts
 
 
-def machine_name(device: torch.device) -> str:
-    """The card as its driver calls it."""
+def device_name(device: torch.device) -> str:
+    """Return the driver's name of the GPU, or the processor type for a CPU."""
     return torch.cuda.get_device_name(device) if device.type == "cuda" else f"{platform.machine()} CPU"
 
 
 def file_name(name: str) -> str:
-    """A machine's name as that of a file: "NVIDIA H200" becomes "nvidia-h200"."""
+    """Return a device's name as a file name without ending: "NVIDIA H200" becomes "nvidia-h200"."""
     return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")
 
 
-def write(folder: Path, facts: dict[str, object], settings: dict[str, object], rows: Sequence[Row]) -> Path:
-    """Write `<machine>.json` and `<machine>.md`; returns the path of the page."""
+def write_report(folder: Path, facts: dict[str, object], settings: dict[str, object], rows: Sequence[Row]) -> Path:
+    """Write `<machine>.json` and `<machine>.md` into a folder; return the path of the page."""
     folder.mkdir(parents=True, exist_ok=True)
     page = folder / f"{file_name(str(facts['device']))}.md"
     content = {"machine": facts, "settings": settings, "rows": list(rows)}
     page.with_suffix(".json").write_text(json.dumps(content, indent=1) + "\n")
-    page.write_text(text(facts, rows))
+    page.write_text(format_page(facts, rows))
     return page
 
 
-def text(facts: dict[str, object], rows: Sequence[Row]) -> str:
-    """The page: the machine, the goals, what failed, then a table for each kind of row."""
-    told = format_machine({key: value for key, value in facts.items() if key != "device" and value is not None})
-    lines = [f"# {facts['device']}", "", f"Written by `python -m tools.gpu.check`: {told}.", ""]
+def format_page(facts: dict[str, object], rows: Sequence[Row]) -> str:
+    """Format the Markdown page: the machine, the goals, the failed rows, then one table for each kind of row."""
+    machine_line = format_machine({key: value for key, value in facts.items() if key != "device" and value is not None})
+    lines = [f"# {facts['device']}", "", f"Written by `python -m tools.gpu.check`: {machine_line}.", ""]
     lines += ["How to read it: [README.md](README.md).", ""]
-    tables: dict[str, list[Row]] = {name: [] for name in FIRST}
+    tables: dict[str, list[Row]] = {name: [] for name in LEADING_TABLES}
     for row in rows:
         if row.get("status"):
-            words = [value for key, value in row.items() if key not in HIDDEN and isinstance(value, str)]
-            what = ", ".join(words[:WORDS_TOLD])
+            labels = [value for key, value in row.items() if key not in HIDDEN_KEYS and isinstance(value, str)]
+            what = ", ".join(labels[:FAILURE_LABEL_CELLS])
             where = f"{row.get('part', '')}: {row.get('item', '')}"
-            told_row = {"where": where, "what": what, "status": row["status"], "reason": row.get("note", "")}
-            tables["Failed and left out"].append(told_row)
-        if "table" in row and row.get("status") != "left out" and any(key not in HIDDEN for key in row):
+            failure_row = {"where": where, "what": what, "status": row["status"], "reason": row.get("note", "")}
+            tables["Failed and left out"].append(failure_row)
+        if "table" in row and row.get("status") != "left out" and any(key not in HIDDEN_KEYS for key in row):
             tables.setdefault(str(row["table"]), []).append(row)
-    for name, here in tables.items():
-        if here:
-            lines += [f"## {name}", "", table(here), ""]
+    for name, table_rows in tables.items():
+        if table_rows:
+            lines += [f"## {name}", "", format_table(table_rows), ""]
         elif name == "Failed and left out":
-            lines += ["Nothing failed, nothing was left out.", ""]
+            lines += ["Nothing failed and nothing was left out.", ""]
     return "\n".join(lines)
 
 
-def table(rows: Sequence[Row]) -> str:
-    """Rows as a Markdown table: a column for each key, in order of appearance; numbers to the right."""
-    hidden = set(HIDDEN) - ({"status"} if any("where" in row for row in rows) else set())
+def format_table(rows: Sequence[Row]) -> str:
+    """Format rows as a Markdown table: one column for each key, in order of appearance; numbers to the right."""
+    hidden = set(HIDDEN_KEYS) - ({"status"} if any("where" in row for row in rows) else set())
     keys = list(dict.fromkeys(key for row in rows for key in row if key not in hidden))
     keys = [key for key in keys if any(row.get(key) is not None for row in rows)]
     if any(row.get("status") for row in rows) and "status" not in keys:
         keys.append("status")
     ruler = ["--:" if any(isinstance(row.get(key), (int, float)) for row in rows) else "---" for key in keys]
-    cells = [[cell(row.get(key)).replace("|", "\\|").replace("\n", " ") for key in keys] for row in rows]
-    return markdown(keys, cells, ruler)
+    cells = [[format_cell(row.get(key)).replace("|", "\\|").replace("\n", " ") for key in keys] for row in rows]
+    return markdown_table(keys, cells, ruler)
 
 
-def _output(*command: str) -> str | None:
+def _first_output_line(*command: str) -> str | None:
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=20)
     except (OSError, subprocess.TimeoutExpired):

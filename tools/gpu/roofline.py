@@ -1,7 +1,7 @@
-"""The least work of each operation, counted from the sizes of a call: bytes through memory and arithmetic.
+"""Count the least work of each operation from the sizes of a call: bytes moved through memory, and arithmetic.
 
-Bytes: every input read once and every output written once, float32 unless said otherwise; what an implementation
-reads again, or keeps between its kernels, is its own affair and shows as a lower share of the roofline. Operations:
+Bytes: every input is read once and every output is written once, in float32 unless stated otherwise. If an
+implementation reads data again or stores data between its kernels, its share of the roofline is lower. Operations:
 one for each addition, multiplication, comparison and special function, two for a multiply-add.
 """
 
@@ -13,17 +13,18 @@ from dataclasses import dataclass
 from tools.gpu.timing import Rates
 
 TILE_PIXELS = 16 * 16
-RADIX_BITS = 8  # of a key that one pass of a radix sort settles
-TAPS = 11  # of the SSIM window
+RADIX_BITS_PER_PASS = 8
+SSIM_WINDOW_TAPS = 11
 
 
 @dataclass(frozen=True)
 class Work:
-    """Bytes moved and operations done by one call.
+    """Bytes and operations of one call.
 
     Attributes:
-        bytes, flops: the counts.
-        unit: which rate of `Rates` the arithmetic is held against, "fp32" or "bf16".
+        bytes: bytes read and written.
+        flops: floating point operations.
+        unit: the attribute of `Rates` that limits the arithmetic, "fp32" or "bf16".
     """
 
     bytes: float
@@ -34,154 +35,176 @@ class Work:
         return Work(self.bytes + other.bytes, self.flops + other.flops, self.unit)
 
     def shares(self, ms: float, rates: Rates) -> tuple[float, float]:
-        """Fractions of the measured copy bandwidth and of the measured arithmetic rate that a time comes to."""
+        """Return the fractions of the measured copy rate and arithmetic rate that a call of `ms` reaches."""
         seconds = 1e-3 * ms
         return self.bytes / seconds / rates.copy, self.flops / seconds / getattr(rates, self.unit)
 
-    def least_ms(self, rates: Rates) -> float:
-        """The roofline: no call can be faster."""
+    def min_ms(self, rates: Rates) -> float:
+        """Return the roofline time in ms, below which no call can be."""
         return 1e3 * max(self.bytes / rates.copy, self.flops / getattr(rates, self.unit))
 
 
-def project(gaussians: int) -> Work:
-    """Reads mean 3, quaternion 4, scale 3, opacity 1; writes mean2d 2, conic 3, depth 1, opacity 1 (44 + 28 bytes).
+def count_project(gaussians: int) -> Work:
+    """Count the projection.
 
-    To the camera 18, rotation matrix 30, J R Q S 45, covariance 18, determinant and inverse 20, the rest 15: 146.
+    It reads mean 3, quaternion 4, scale 3, opacity 1 and writes mean2d 2, conic 3, depth 1, opacity 1 (44 + 28 bytes).
+    The operations are: to the camera 18, rotation matrix 30, J R Q S 45, covariance 18, determinant and inverse 20,
+    the rest 15; in total 146.
     """
     return Work(72 * gaussians, 146 * gaussians)
 
 
-def project_backward(gaussians: int) -> Work:
-    """Reads the same 11 numbers and gradients of mean2d 2, conic 3, opacity 1; writes 11. Twice the arithmetic."""
+def count_project_backward(gaussians: int) -> Work:
+    """Count the projection's backward pass.
+
+    It reads the same 11 numbers and the gradients of mean2d 2, conic 3 and opacity 1, and writes 11. The arithmetic is
+    twice that of the forward pass.
+    """
     return Work(112 * gaussians, 292 * gaussians)
 
 
-def sort_bytes(items: int, key_bits: int) -> int:
-    """Bytes that a radix sort of 4-byte keys with 4-byte values moves: a read and a write of both in each pass."""
-    return 16 * items * -(-key_bits // RADIX_BITS)
+def count_sort_bytes(items: int, key_bits: int) -> int:
+    """Count the bytes of a radix sort of 4-byte keys with 4-byte values: each pass reads and writes both once."""
+    return 16 * items * -(-key_bits // RADIX_BITS_PER_PASS)
 
 
-def bin_pairs(gaussians: int, pairs: int, tiles: int) -> Work:
-    """Order Gaussians by depth (32 bits), write a tile and an index for each pair, order pairs by tile.
+def count_bin_pairs(gaussians: int, pairs: int, tiles: int) -> Work:
+    """Count the binning.
 
-    Reads 7 numbers a Gaussian. Arithmetic is nothing beside it: 20 operations a Gaussian, 10 a pair.
+    It sorts Gaussians by depth (32 bits), writes a tile and an index for each pair, and sorts the pairs by tile. It
+    reads 7 numbers a Gaussian. The arithmetic is negligible: 20 operations a Gaussian and 10 a pair.
     """
-    sorting = sort_bytes(gaussians, 32) + sort_bytes(pairs, max(1, (tiles - 1).bit_length()))
+    sorting = count_sort_bytes(gaussians, 32) + count_sort_bytes(pairs, max(1, (tiles - 1).bit_length()))
     return Work(28 * gaussians + 8 * pairs + sorting, 20 * gaussians + 10 * pairs)
 
 
-def blend(pairs: int, pixels: int, reached: float, blended: float) -> Work:
-    """Reads index 1, mean2d 2, conic 3, opacity 1, colour 3 of each pair (40 bytes); writes rgb and T (16 a pixel).
+def count_blend(pairs: int, pixels: int, reached: float, blended: float) -> Work:
+    """Count the blending.
+
+    It reads index 1, mean2d 2, conic 3, opacity 1 and colour 3 of each reached pair (40 bytes), and writes rgb and T
+    (16 bytes a pixel). A reached pair costs 12 operations at each of 256 pixels (offset 2, exponent 8, exp 1,
+    opacity 1), and a blended one 10 more (threshold, clamp, weight, three multiply-adds, T).
 
     Args:
-        reached: mean share of a tile's pairs that come before all its pixels are finished.
-        blended: mean number of Gaussians that add to a pixel.
-
-    A pair reached costs 12 operations at each of 256 pixels (offset 2, exponent 8, exp 1, opacity 1), one that is
-    blended 10 more (threshold, cut, weight, three multiply-adds, T).
+        pairs: number of Gaussian-tile pairs.
+        pixels: number of pixels.
+        reached: mean share of a tile's pairs that are processed before all its pixels are finished.
+        blended: mean number of Gaussians that contribute to a pixel.
     """
     evaluations = reached * pairs * TILE_PIXELS
     return Work(40 * reached * pairs + 16 * pixels, 12 * evaluations + 10 * blended * pixels)
 
 
-def blend_backward(pairs: int, pixels: int, reached: float, blended: float) -> Work:
-    """Reads the pairs again (40 bytes), T and gradients of rgb and T (20 a pixel); writes 11 sums a pair (44 bytes).
+def count_blend_backward(pairs: int, pixels: int, reached: float, blended: float) -> Work:
+    """Count the blending's backward pass; the arguments are those of `count_blend`.
 
-    12 operations an evaluation as before; one that is blended costs 40 more (alpha's gradient 12, conic, mean and
-    opacity 17, 11 sums over pixels).
+    It reads the pairs again (40 bytes), and T and the gradients of rgb and T (20 bytes a pixel). It writes 11 sums a
+    pair (44 bytes). An evaluation costs 12 operations as before, and a blended one 40 more (alpha's gradient 12; conic,
+    mean and opacity 17; 11 sums over pixels).
     """
     evaluations = reached * pairs * TILE_PIXELS
     return Work(84 * reached * pairs + 20 * pixels, 12 * evaluations + 40 * blended * pixels)
 
 
-def hash_encode(points: int, levels: int, rows: int, features: int = 2) -> Work:
-    """Reads 3 coordinates a point and the table rows that it can need; writes the features.
+def count_hash_encode(points: int, levels: int, rows: int, features: int = 2) -> Work:
+    """Count the hash encoding.
 
-    The table is counted once, at most 8 rows a point and level. A point and level costs 9 for the cell, 16 for the
-    weights, 24 for the rows' hashes and a multiply-add for each feature of 8 corners.
+    It reads 3 coordinates a point and the table rows that the points can need, and writes the features. The table is
+    read once, with at most 8 rows a point and level. The operations for a point and level are 9 for the cell, 16 for
+    the weights, 24 for the rows' hashes, and a multiply-add for each feature of 8 corners.
     """
     table = 4 * features * min(rows, 8 * points * levels)
     return Work(12 * points + 4 * features * levels * points + table, points * levels * (49 + 16 * features))
 
 
-def hash_encode_backward(points: int, levels: int, rows: int, features: int = 2) -> Work:
-    """Reads coordinates and the gradient of the features; writes the whole table's gradient."""
-    work = hash_encode(points, levels, 0, features)
+def count_hash_encode_backward(points: int, levels: int, rows: int, features: int = 2) -> Work:
+    """Count the hash encoding's backward pass: reads coordinates and feature gradients, writes the table's gradient."""
+    work = count_hash_encode(points, levels, 0, features)
     return Work(work.bytes + 4 * features * rows, work.flops)
 
 
-def mlp(rows: int, widths: Sequence[int], mixed: bool) -> Work:
-    """Reads x, writes y; weights are nothing beside them. A multiply-add for each row and weight."""
+def count_mlp(rows: int, widths: Sequence[int], mixed: bool) -> Work:
+    """Count an MLP: reads x and the weights, writes y; one multiply-add for each row and weight."""
     weights = sum(i * o for i, o in zip(widths, widths[1:], strict=False))
     return Work(4 * rows * (widths[0] + widths[-1]) + 4 * weights, 2 * rows * weights, "bf16" if mixed else "fp32")
 
 
-def mlp_backward(rows: int, widths: Sequence[int], mixed: bool) -> Work:
-    """Reads x and the gradient of y, writes that of x; the hidden layers again, then two products a layer."""
-    forward = mlp(rows, widths, mixed)
-    hidden = mlp(rows, widths[:-1], mixed)
+def count_mlp_backward(rows: int, widths: Sequence[int], mixed: bool) -> Work:
+    """Count an MLP's backward pass: reads x and y's gradient, writes x's gradient.
+
+    The arithmetic is the hidden layers once more, then two products a layer.
+    """
+    forward = count_mlp(rows, widths, mixed)
+    hidden = count_mlp(rows, widths[:-1], mixed)
     return Work(forward.bytes + 4 * rows * widths[0], 2 * forward.flops + hidden.flops, forward.unit)
 
 
-def photometric_loss(pixels: int) -> Work:
-    """Loss and gradient: reads two pictures, writes one, 3 float32 a pixel each.
+def count_photometric_loss(pixels: int) -> Work:
+    """Count the loss and its gradient: reads two pictures and writes one, with 3 float32 a pixel each.
 
-    A channel takes 5 blurs, and 3 more for the gradient, each two passes of 11 multiply-adds; and 40 operations.
+    A channel takes 5 blurs and 3 more for the gradient, each two passes of 11 multiply-adds, and 40 other operations.
     """
-    return Work(36 * pixels, 3 * pixels * (8 * 2 * 2 * TAPS + 40))
+    return Work(36 * pixels, 3 * pixels * (8 * 2 * 2 * SSIM_WINDOW_TAPS + 40))
 
 
-def adam(parameters: int) -> Work:
-    """Reads value, gradient and both moments, writes all but the gradient; 14 operations."""
+def count_adam(parameters: int) -> Work:
+    """Count an Adam step: reads value, gradient and both moments, writes all but the gradient; 14 operations each."""
     return Work(28 * parameters, 14 * parameters)
 
 
-def decode(gaussians: int, widths: Sequence[int], levels: int, rows: int, mixed: bool) -> Work:
-    """Positions and explicit logits to activated values, with the field in between: no feature need reach memory.
+def count_decode(gaussians: int, widths: Sequence[int], levels: int, rows: int, mixed: bool) -> Work:
+    """Count the decoding of positions and explicit logits to activated values.
 
-    Reads 3 coordinates, the table once and one logit for each output or fewer; writes the outputs. The arithmetic is
-    that of the encoding, the decoder, and 10 operations for each output.
+    It reads 3 coordinates, the table once, and at most one logit for each output; it writes the outputs. The features
+    need not go through memory. The arithmetic is that of the encoding, the decoder, and 10 operations for each output.
     """
-    encoding, decoder = hash_encode(gaussians, levels, rows), mlp(gaussians, widths, mixed)
+    encoding, decoder = count_hash_encode(gaussians, levels, rows), count_mlp(gaussians, widths, mixed)
     features = 4 * 2 * levels * gaussians
     outputs = gaussians * widths[-1]
     bytes_moved = encoding.bytes - features + 8 * outputs
     return Work(bytes_moved, encoding.flops + decoder.flops + 10 * outputs, decoder.unit)
 
 
-def shade(gaussians: int, widths: Sequence[int], mixed: bool) -> Work:
-    """Reads position 3, colour logits 3 and the first layer as far as the place decides it; writes 3 colours.
+def count_shade(gaussians: int, widths: Sequence[int], mixed: bool) -> Work:
+    """Count the shading.
 
-    The arithmetic is the decoder's on the encoded direction, and 60 operations for that and the sigmoids.
+    It reads position 3, colour logits 3 and the position's part of the first layer, and writes 3 colours. The
+    arithmetic is the decoder's on the encoded direction, and 60 operations for the encoding and the sigmoids.
 
     Args:
-        widths: encoded direction, hidden layers, 3.
+        gaussians: number of Gaussians.
+        widths: widths of the encoded direction, the hidden layers and the colours (3).
+        mixed: whether the products run in bfloat16.
     """
-    decoder = mlp(gaussians, widths, mixed)
+    decoder = count_mlp(gaussians, widths, mixed)
     bytes_moved = gaussians * (4 * 9 + (2 if mixed else 4) * widths[1])
     return Work(bytes_moved, decoder.flops + 60 * gaussians, decoder.unit)
 
 
-def project_shaded(gaussians: int, drawn: int, widths: Sequence[int], mixed: bool) -> Work:
-    """Moves what `project` does of all Gaussians, and what `shade` does, but for the position, of those that are drawn.
+def count_project_shaded(gaussians: int, drawn: int, widths: Sequence[int], mixed: bool) -> Work:
+    """Count projection and shading in one: bytes of `count_project` for all Gaussians, of `count_shade` for drawn ones.
 
-    The arithmetic is the shading's: that of the projection, a few hundredths of it, runs beside it on other units.
+    The positions are read once. The arithmetic is that of the shading, because the projection's is a few hundredths of
+    it and runs on other units at the same time.
 
     Args:
-        widths: as for `shade`.
+        gaussians: number of Gaussians.
+        drawn: number of Gaussians that are drawn.
+        widths, mixed: as for `count_shade`.
     """
-    shading = shade(drawn, widths, mixed)
-    return Work(project(gaussians).bytes + shading.bytes - 12 * drawn, shading.flops, shading.unit)
+    shading = count_shade(drawn, widths, mixed)
+    return Work(count_project(gaussians).bytes + shading.bytes - 12 * drawn, shading.flops, shading.unit)
 
 
-def background(
+def count_background(
     pixels: int, nodes: int, needed: int, widths: Sequence[int], levels: int, rows: int, mixed: bool
 ) -> Work:
-    """Reads T of each pixel and the table rows that needed nodes can ask for; writes 3 colours of each node.
+    """Count the background's grid.
 
-    The arithmetic is that of the encoding and the decoder at needed nodes, and there 130 operations: the ray, its point
-    on the sphere and the contraction 70, the encoded direction and the sigmoids 60.
+    It reads T of each pixel and the table rows that the needed nodes can use, and writes 3 colours of each node. The
+    arithmetic is that of the encoding and the decoder at needed nodes, and 130 operations each: the ray, its point on
+    the sphere and the contraction 70, the encoded direction and the sigmoids 60.
     """
-    encoding, decoder = hash_encode(needed, levels, rows), mlp(needed, widths, mixed)
+    encoding, decoder = count_hash_encode(needed, levels, rows), count_mlp(needed, widths, mixed)
     table = encoding.bytes - needed * (12 + 8 * levels)
     return Work(4 * pixels + 12 * nodes + table, encoding.flops + decoder.flops + 130 * needed, decoder.unit)

@@ -1,7 +1,7 @@
-"""Rows of the results: plain dictionaries, one for each line of a table.
+"""Make rows of the results: plain dictionaries, one for each row of a table.
 
-"table" names the table that a row belongs to, "status" is "failed" or "left out" unless all is well, with the reason
-under "note". All other keys are columns.
+"table" names the table that a row belongs to. "status" is "failed" or "left out", with the reason under "note"; a row
+without "status" passed. All other keys are columns.
 """
 
 from __future__ import annotations
@@ -10,19 +10,19 @@ from collections.abc import Iterator, Mapping
 
 Row = dict[str, object]
 
-KERNELS_TOLD = 15
+MAX_KERNEL_ROWS = 15
 
 
-def goal(name: str, measured: float, wanted: float, unit: str, *, at_least: bool) -> Row:
-    """A measured number beside what is aimed at. To miss it is no failure of the check."""
-    met = measured >= wanted if at_least else measured <= wanted
+def goal_row(name: str, measured: float, target: float, unit: str, *, at_least: bool) -> Row:
+    """Return a row that compares a measured number with its goal; a missed goal does not fail the check."""
+    met = measured >= target if at_least else measured <= target
     sign = "at least" if at_least else "at most"
-    row: Row = {"table": "Goals", "goal": f"{name}: {sign} {wanted:g} {unit}", "measured": f"{measured:.3g} {unit}"}
+    row: Row = {"table": "Goals", "goal": f"{name}: {sign} {target:g} {unit}", "measured": f"{measured:.3g} {unit}"}
     return row | {"met": "yes" if met else "no"}
 
 
 def kernel_rows(times: Mapping[str, float], table: str) -> Iterator[Row]:
-    """The longest of the device's kernels, in milliseconds, with their shares of all."""
+    """Yield rows of the kernels that take longest on the device: milliseconds and share of the total."""
     total = sum(times.values())
-    for name, ms in list(times.items())[:KERNELS_TOLD]:
+    for name, ms in list(times.items())[:MAX_KERNEL_ROWS]:
         yield {"table": table, "kernel": name[:90], "ms": ms, "share": f"{ms / total:.1%}"}

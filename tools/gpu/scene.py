@@ -1,8 +1,8 @@
-"""A made-up room of any number of Gaussians, for measurements of speed: not trained, yet shaped like what is.
+"""Make a synthetic room of any number of Gaussians for measurements of speed, similar to a trained model.
 
-Gaussians lie on surfaces (floor, ceiling, walls, boxes, spheres), as large as the gaps between them, with a share in
-the leaves of two plants. Most are opaque, a fifth is faint. One wall has a window; behind it is nothing but the
-background sphere. What is measured is drawn from the same numbers on every machine.
+Gaussians lie on surfaces (floor, ceiling, walls, boxes, spheres) and are as large as the gaps between them; a share of
+them fills two plants. Most are opaque, and a fifth is nearly transparent. One wall has a window that shows only the
+background sphere. The random seed is fixed, so the room is the same on every machine.
 """
 
 from __future__ import annotations
@@ -24,39 +24,44 @@ from hyrfpack.ops.rasterize.reference import ALPHA_MAX, ALPHA_MIN, TILE_SIZE, TR
 from hyrfpack.render import render
 from hyrfpack.scene import Camera, Picture, Scene, View
 
-ROOM = (1.5, 1.1, 0.6)  # half-extents, local units; z is up
-WINDOW = ((-0.6, 0.5), (-0.25, 0.4))  # y and z of the opening in the wall at x = +1.5
-BOXES = (((0.5, 0.45, -0.4), (0.3, 0.2, 0.2)), ((-0.7, -0.6, -0.35), (0.2, 0.3, 0.25)), ((0.1, -0.2, -0.5), (0.1,) * 3))
-SPHERES = (((0.5, 0.45, -0.08), 0.12), ((-0.2, 0.55, -0.42), 0.18), ((-0.65, -0.6, 0.03), 0.13))
-PLANTS = (((-1.1, 0.6, -0.1), 0.28), ((0.9, -0.6, -0.2), 0.24))
-LEAVES = 0.2  # share of the Gaussians that are in plants
-GAUSSIANS_PER_ROW = 20  # as training sizes the hash tables
-FOCAL = 0.75  # in picture widths
+# All lengths are in local units, and z is up.
+ROOM_HALF_EXTENTS = (1.5, 1.1, 0.6)
+WINDOW_YZ_RANGES = ((-0.6, 0.5), (-0.25, 0.4))  # the window is in the wall at x = +1.5
+BOX_CENTERS_AND_HALF_EXTENTS = (
+    ((0.5, 0.45, -0.4), (0.3, 0.2, 0.2)),
+    ((-0.7, -0.6, -0.35), (0.2, 0.3, 0.25)),
+    ((0.1, -0.2, -0.5), (0.1,) * 3),
+)
+SPHERE_CENTERS_AND_RADII = (((0.5, 0.45, -0.08), 0.12), ((-0.2, 0.55, -0.42), 0.18), ((-0.65, -0.6, 0.03), 0.13))
+PLANT_CENTERS_AND_RADII = (((-1.1, 0.6, -0.1), 0.28), ((0.9, -0.6, -0.2), 0.24))
+PLANT_GAUSSIAN_RATIO = 0.2
+GAUSSIANS_PER_ROW = 20  # training sizes its hash tables by the same ratio
+FOCAL_LENGTH_TO_WIDTH_RATIO = 0.75
 
 
 @dataclass(frozen=True)
 class Look:
-    """What the Gaussians of a room are like.
+    """Size and transparency of a room's Gaussians.
 
     Attributes:
-        size: how large they are, as a multiple of the gaps between them.
-        faint: share that is nearly transparent.
+        size: size of a Gaussian as a multiple of the gaps between Gaussians.
+        faint: share of the Gaussians that are nearly transparent.
     """
 
     size: float = 1.0
     faint: float = 0.2
 
 
-TIDY = Look()
-# As training on photos leaves them: larger than the gaps, most of them faint, many over each other. Three to five times
-# as many Gaussian-tile pairs as in the tidy room.
-TRAINED = Look(size=3.0, faint=0.7)
+TIDY_LOOK = Look()
+# After training on photos, Gaussians are larger than the gaps, most are nearly transparent, and many overlap. This room
+# has three to five times as many Gaussian-tile pairs as the tidy one.
+TRAINED_LOOK = Look(size=3.0, faint=0.7)
 
 
-def make_model(gaussians: int, device: torch.device, look: Look = TIDY, seed: int = 0) -> HybridModel:
-    """The room as a model of that many Gaussians, on a device."""
+def make_model(gaussians: int, device: torch.device, look: Look = TIDY_LOOK, seed: int = 0) -> HybridModel:
+    """Return the room as a model with the given number of Gaussians, on a device."""
     generator = torch.Generator().manual_seed(seed)
-    points, colors, sizes, opacities = _scatter(gaussians, look, generator)
+    points, colors, sizes, opacities = _draw_gaussians(gaussians, look, generator)
     log2 = min(21, max(8, round(math.log2(max(1, gaussians / GAUSSIANS_PER_ROW)))))
     frame = Frame((0.0, 0.0, 0.0), 1.0, (1.0, 1.0, 1.0))
     config = ModelConfig(frame=frame, geometry=HashGridConfig(log2 - 1), radiance=HashGridConfig(log2))
@@ -66,7 +71,7 @@ def make_model(gaussians: int, device: torch.device, look: Look = TIDY, seed: in
 
 
 def make_cameras(count: int, width: int, height: int) -> list[Camera]:
-    """Cameras on an ellipse inside the room, each looking across it and a little down; every fourth at the window."""
+    """Return cameras on an ellipse inside the room that look across it; every fourth looks at the window."""
     cameras = []
     for number in range(count):
         angle = 2 * math.pi * (number + 0.25) / count
@@ -74,28 +79,29 @@ def make_cameras(count: int, width: int, height: int) -> list[Camera]:
         target = np.array([-0.5 * math.cos(angle + 0.5), -0.4 * math.sin(angle + 0.5), -0.2])
         if number % 4 == 0:
             position, target = np.array([-0.9, 0.1 * number / count, 0.1]), np.array([1.5, -0.05, 0.05])
-        cameras.append(_camera(position, target, width, height))
+        cameras.append(_make_camera(position, target, width, height))
     return cameras
 
 
 def make_scene(truth: HybridModel, cameras: list[Camera]) -> Scene:
-    """Photos of the model from the cameras, kept in memory, and a few of its points to start from."""
+    """Render photos of the model; return them as a scene in memory, with some of the model's points."""
     views = []
     for number, camera in enumerate(cameras):
         with torch.no_grad():
             rgb = (255 * render(truth, camera).rgb.clamp(0, 1)).round().byte().cpu().numpy()
-        views.append(View(f"{number:04d}", camera, _keep(Picture(rgb))))
-    some = truth.gaussians.positions.detach()[:: max(1, len(truth) // 500)].double().cpu().numpy()
-    return Scene("a made-up room", "nerfstudio", views[1:], views[:1], some, np.full(some.shape, 0.5, np.float32))
+        views.append(View(f"{number:04d}", camera, _picture_loader(Picture(rgb))))
+    points = truth.gaussians.positions.detach()[:: max(1, len(truth) // 500)].double().cpu().numpy()
+    colors = np.full(points.shape, 0.5, np.float32)
+    return Scene("a made-up room", "nerfstudio", views[1:], views[:1], points, colors)
 
 
-def _keep(picture: Picture) -> Callable[[], Picture]:
+def _picture_loader(picture: Picture) -> Callable[[], Picture]:
     return lambda: picture
 
 
 @torch.no_grad()
-def disturb(model: HybridModel, seed: int = 1) -> HybridModel:
-    """Move the model's colours, sizes and opacities away from what they should be, so that training has work."""
+def perturb(model: HybridModel, seed: int = 1) -> HybridModel:
+    """Add noise to the model's colours, sizes and opacities, in place, so that training has something to improve."""
     generator = torch.Generator().manual_seed(seed)
     explicit = model.gaussians
     for values, size in ((explicit.color_logits, 0.5), (explicit.scale_logits, 0.15), (explicit.opacity_logits, 0.3)):
@@ -105,9 +111,12 @@ def disturb(model: HybridModel, seed: int = 1) -> HybridModel:
 
 @dataclass(frozen=True)
 class Splats:
-    """What the rasteriser gets of a model for one view: `inputs` in the order of its arguments, and the view.
+    """Arguments of the rasteriser for one view of a model.
 
-    The pose is on the CPU, where the rasteriser wants it.
+    Attributes:
+        inputs: means, quaternions, scales, opacities and colours, in the order of the rasteriser's arguments.
+        pose: camera_from_world on the CPU, where the rasteriser expects it.
+        camera: the camera.
     """
 
     inputs: dict[str, Tensor]
@@ -116,12 +125,12 @@ class Splats:
 
     @property
     def view(self) -> tuple[Tensor, tuple[float, float, float, float], int, int]:
-        """The arguments that follow the inputs."""
+        """The arguments of the rasteriser that follow the inputs."""
         return self.pose, self.camera.intrinsics, self.camera.width, self.camera.height
 
 
-def splats_of(model: HybridModel, camera: Camera) -> Splats:
-    """All Gaussians of the model, decoded for one view."""
+def decode_splats(model: HybridModel, camera: Camera) -> Splats:
+    """Decode all Gaussians of the model for one view."""
     pose = torch.as_tensor(model.config.frame.local_pose(camera))
     inputs = splat_inputs(model, camera_center(pose))
     return Splats({name: tensor.contiguous() for name, tensor in inputs.items()}, pose, camera)
@@ -129,11 +138,11 @@ def splats_of(model: HybridModel, camera: Camera) -> Splats:
 
 @torch.no_grad()
 def count_blended(splats: Splats, tiles: int = 48, near: float = 0.01) -> tuple[float, float]:
-    """What the blending comes to, from some of the picture's tiles, evenly spread.
+    """Estimate the work of blending from up to `tiles` of the picture's tiles, evenly spread.
 
     Returns:
-        The mean number of Gaussians that add to a pixel, and the mean share of a tile's Gaussians that come before
-        all its pixels are finished.
+        The mean number of Gaussians that contribute to a pixel, and the mean share of a tile's Gaussians that are
+        processed before all its pixels are finished.
     """
     camera = splats.camera
     values = [splats.inputs[name] for name in ("means", "quats", "scales", "opacities")]
@@ -167,50 +176,55 @@ def count_blended(splats: Splats, tiles: int = 48, near: float = 0.01) -> tuple[
     return added / len(places), reached / max(1.0, pairs)
 
 
-def _scatter(count: int, look: Look, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Positions (N, 3), colours (N, 3) in (0, 1), sizes (N, 1) in local units and opacities (N, 1)."""
-    leaves = int(LEAVES * count)
-    surface, area = _surfaces(count - leaves, generator)
+def _draw_gaussians(count: int, look: Look, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Draw positions (N, 3), colours (N, 3) in (0, 1), sizes (N, 1) in local units and opacities (N, 1)."""
+    leaves = int(PLANT_GAUSSIAN_RATIO * count)
+    surface, area = _draw_surface_points(count - leaves, generator)
     spacing = math.sqrt(area / max(1, len(surface)))
     groups = [surface]
     sizes = [torch.full((len(surface), 1), 0.6 * spacing)]
-    for number, (center, radius) in enumerate(PLANTS):
-        some = leaves // len(PLANTS) + (number < leaves % len(PLANTS))
-        radii = radius * torch.rand(some, 1, generator=generator) ** (1 / 3)
-        groups.append(torch.tensor(center) + radii * _unit(some, generator))
-        gap = (4 / 3 * math.pi * radius**3 / max(1, some)) ** (1 / 3)
-        sizes.append(torch.full((some, 1), 0.35 * gap))
+    for number, (center, radius) in enumerate(PLANT_CENTERS_AND_RADII):
+        count_here = leaves // len(PLANT_CENTERS_AND_RADII) + (number < leaves % len(PLANT_CENTERS_AND_RADII))
+        radii = radius * torch.rand(count_here, 1, generator=generator) ** (1 / 3)
+        groups.append(torch.tensor(center) + radii * _draw_unit_vectors(count_here, generator))
+        gap = (4 / 3 * math.pi * radius**3 / max(1, count_here)) ** (1 / 3)
+        sizes.append(torch.full((count_here, 1), 0.35 * gap))
     points = torch.cat(groups)
     size = look.size * torch.cat(sizes) * torch.exp(0.5 * torch.randn(count, 1, generator=generator))
-    faint = torch.rand(count, 1, generator=generator) < look.faint
+    is_faint = torch.rand(count, 1, generator=generator) < look.faint
     draw = torch.rand(count, 1, generator=generator)
-    opacities = torch.where(faint, 0.01 + 0.2 * draw, 0.6 + 0.38 * draw)
-    # Stripes and checks of several sizes: something for the radiance to vary over.
+    opacities = torch.where(is_faint, 0.01 + 0.2 * draw, 0.6 + 0.38 * draw)
+    # The colours are stripes and checks of several sizes, so that the radiance varies.
     phases = points @ (8 * torch.randn(3, 6, generator=generator))
     colors = 0.5 + 0.4 * torch.sin(phases[:, :3]) * torch.cos(0.4 * phases[:, 3:])
     order = torch.randperm(count, generator=generator)
     return points[order], colors[order], size[order], opacities[order]
 
 
-def _surfaces(count: int, generator: torch.Generator) -> tuple[Tensor, float]:
-    """Points spread evenly over all surfaces but the window, and how large the surfaces are."""
-    boxes = [((0.0, 0.0, 0.0), ROOM), *BOXES]
-    areas = [8 * (x * y + y * z + x * z) for _, (x, y, z) in boxes] + [4 * math.pi * r * r for _, r in SPHERES]
+def _draw_surface_points(count: int, generator: torch.Generator) -> tuple[Tensor, float]:
+    """Draw points evenly over all surfaces except the window; return them and the area of the surfaces."""
+    boxes = [((0.0, 0.0, 0.0), ROOM_HALF_EXTENTS), *BOX_CENTERS_AND_HALF_EXTENTS]
+    areas = [8 * (x * y + y * z + x * z) for _, (x, y, z) in boxes] + [
+        4 * math.pi * r * r for _, r in SPHERE_CENTERS_AND_RADII
+    ]
     counts = [int(count * area / sum(areas)) for area in areas]
     counts[0] += count - sum(counts)
-    parts = [_box(some, center, half, generator) for some, (center, half) in zip(counts, boxes, strict=False)]
-    for some, (center, radius) in zip(counts[len(boxes) :], SPHERES, strict=True):
-        parts.append(torch.tensor(center) + radius * _unit(some, generator))
+    parts = [
+        _draw_box_points(count_here, center, half, generator)
+        for count_here, (center, half) in zip(counts, boxes, strict=False)
+    ]
+    for count_here, (center, radius) in zip(counts[len(boxes) :], SPHERE_CENTERS_AND_RADII, strict=True):
+        parts.append(torch.tensor(center) + radius * _draw_unit_vectors(count_here, generator))
     points = torch.cat(parts)
-    (low_y, high_y), (low_z, high_z) = WINDOW
+    (low_y, high_y), (low_z, high_z) = WINDOW_YZ_RANGES
     _, y, z = points.unbind(-1)
-    glass = (points[:, 0] >= ROOM[0]) & (y > low_y) & (y < high_y) & (z > low_z) & (z < high_z)
-    points[glass, 0] = -ROOM[0]  # what would lie in the window thickens the wall across
+    glass = (points[:, 0] >= ROOM_HALF_EXTENTS[0]) & (y > low_y) & (y < high_y) & (z > low_z) & (z < high_z)
+    points[glass, 0] = -ROOM_HALF_EXTENTS[0]  # points inside the window move to the opposite wall
     return points, sum(areas)
 
 
-def _box(count: int, center: tuple, half: tuple, generator: torch.Generator) -> Tensor:
-    """Points on the faces of a box, in proportion to their areas."""
+def _draw_box_points(count: int, center: tuple, half: tuple, generator: torch.Generator) -> Tensor:
+    """Draw points on the faces of a box, in proportion to the faces' areas."""
     x, y, z = half
     axis = torch.multinomial(torch.tensor([y * z, x * z, x * y]), max(1, count), True, generator=generator)[:count]
     points = 2 * torch.rand(count, 3, generator=generator) - 1
@@ -219,10 +233,18 @@ def _box(count: int, center: tuple, half: tuple, generator: torch.Generator) -> 
     return torch.tensor(center) + points * torch.tensor(half)
 
 
-def _unit(count: int, generator: torch.Generator) -> Tensor:
+def _draw_unit_vectors(count: int, generator: torch.Generator) -> Tensor:
     return torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
 
 
-def _camera(position: np.ndarray, target: np.ndarray, width: int, height: int) -> Camera:
+def _make_camera(position: np.ndarray, target: np.ndarray, width: int, height: int) -> Camera:
     pose = look_at(position, target, np.array([0.0, 0.0, 1.0]))
-    return Camera(width, height, FOCAL * width, FOCAL * width, width / 2, height / 2, pose)
+    return Camera(
+        width,
+        height,
+        FOCAL_LENGTH_TO_WIDTH_RATIO * width,
+        FOCAL_LENGTH_TO_WIDTH_RATIO * width,
+        width / 2,
+        height / 2,
+        pose,
+    )

@@ -1,4 +1,4 @@
-"""What a check runs on and how much of everything: the sizes of all parts, in one place."""
+"""Settings of a GPU check: the device, and the sizes and repeats of all its parts."""
 
 from __future__ import annotations
 
@@ -8,30 +8,31 @@ from pathlib import Path
 
 import torch
 
-GOAL_ROOM = "1,000,000"  # what the goals are about
+GOAL_ROOM_NAME = "1,000,000"  # the goals hold for the room with this many Gaussians
 
 
 @dataclass(frozen=True)
 class Setup:
-    """Sizes and devices.
+    """Device, sizes and time limits of a check.
 
     Attributes:
-        device: of the kernels, as torch names it.
-        implementation: of the operations, as they name it.
-        width, height: of pictures.
-        kernel_gaussians: how many the single kernels are timed with.
-        frame_gaussians: how many whole frames and training steps are timed with, one after the other.
-        trained_gaussians: the same for rooms whose Gaussians are as training on photos leaves them.
-        error_rows: most points and rows of a subsample whose error is measured.
-        crop: side in pixels of the part of the picture whose error is measured.
-        repeats: turns of each measurement.
-        views: cameras in the room.
-        warm_steps: training steps before those that are timed, in a third of their time at most.
-        steps, step_seconds: most steps that are timed, and for how long at most.
-        demo_views, demo_size: photos of the built-in scene and their side in pixels.
-        quality_steps: most steps of each training that is compared.
-        quality_seconds: how long the comparison on the CPU may take; fewer steps are made if it would take longer.
-        data: folder of a real set, if there is one.
+        device: the device of the kernels, as torch names it.
+        implementation: the implementation of the operations, such as "gpu".
+        width, height: size of the pictures in pixels.
+        kernel_gaussians: number of Gaussians with which single kernels are timed.
+        frame_gaussians: numbers of Gaussians with which whole frames and training steps are timed.
+        trained_gaussians: the same for rooms whose Gaussians look as if trained on photos.
+        error_rows: the error is measured on a sample of at most about this many points or rows.
+        crop: side in pixels of the crop of the picture whose error is measured.
+        repeats: number of repeats of each measurement.
+        views: number of cameras in the room.
+        warm_steps: training steps before the timed ones; they take at most a third of `step_seconds`.
+        steps: largest number of training steps that are timed.
+        step_seconds: time limit in seconds for the timed training steps.
+        demo_views, demo_size: number of photos of the built-in scene, and their side in pixels.
+        quality_steps: largest number of steps of each training run of the quality comparison.
+        quality_seconds: time limit in seconds for the CPU's training run; the number of steps is reduced to keep it.
+        data: folder of a real data set, or None.
     """
 
     device: str = "cuda"
@@ -67,24 +68,26 @@ class Setup:
         return cls(**{name: tuple(value) if isinstance(value, list) else value for name, value in values.items()})
 
 
-def find_set(folder: Path | None, environment: str | None, beside: Path) -> Path | None:
-    """The real set to train on: the folder asked for, or the smallest set of the first data folder that is there.
+def find_dataset(folder: Path | None, environment: str | None, default: Path) -> Path | None:
+    """Return the real data set to train on, from the first of three folders that exists and has one; None without.
+
+    Of a folder with several data sets it returns mipnerf360_bonsai, otherwise the first by name.
 
     Args:
-        folder: a set, or a folder of sets; asked for by name.
-        environment: HYRFPACK_DATA.
-        beside: where sets lie beside the repository.
+        folder: a data set or a folder of data sets, from the command line.
+        environment: the value of HYRFPACK_DATA.
+        default: the folder of data sets beside the repository.
     """
-    for place in (folder, Path(environment) if environment else None, beside):
+    for place in (folder, Path(environment) if environment else None, default):
         if place is None or not place.is_dir():
             continue
-        if _is_set(place):
+        if _is_dataset(place):
             return place
-        sets = sorted(part for part in place.iterdir() if part.is_dir() and _is_set(part))
+        sets = sorted(part for part in place.iterdir() if part.is_dir() and _is_dataset(part))
         if sets:
             return next((part for part in sets if part.name == "mipnerf360_bonsai"), sets[0])
     return None
 
 
-def _is_set(folder: Path) -> bool:
+def _is_dataset(folder: Path) -> bool:
     return any((folder / name).exists() for name in ("sparse", "colmap", "transforms.json", "transforms_train.json"))

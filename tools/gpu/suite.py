@@ -1,4 +1,4 @@
-"""The tests that run on a GPU where there is one, by pytest: all in one process, a row for each file."""
+"""Run the repository's tests marked `gpu` with pytest, all in one process, and make one row for each file."""
 
 from __future__ import annotations
 
@@ -12,63 +12,73 @@ from pathlib import Path
 
 from tools.gpu.rows import Row
 
-ROOT = Path(__file__).parents[2]
-PLACES = ("tests/ops", "tests/test_gpu_path.py")  # those of kernels, and of the whole way from photos to pictures
-CHOSEN = "gpu"  # the marker of tests/conftest.py
-# Not strict: a GPU's machine may lack the plugins that pyproject.toml has settings of.
-LENIENT = ("-o", "addopts=--import-mode=importlib", "-p", "no:cacheprovider")
-_TEST = re.compile(r"(\S+\.py)::.* (PASSED|FAILED|ERROR|SKIPPED|XFAIL|XPASS)(?: \(.*\))?\s+\[ *\d+%\]\s*")
-_WORDS = {"PASSED": "passed", "FAILED": "failed", "ERROR": "errors", "SKIPPED": "skipped", "XFAIL": "xfailed"}
-_BROKEN = ("FAILED", "ERROR")
+REPOSITORY_ROOT = Path(__file__).parents[2]
+TEST_PATHS = ("tests/ops", "tests/test_gpu_path.py")  # the kernels alone, and the pipeline from photos to pictures
+GPU_MARKER = "gpu"  # the marker that pyproject.toml declares
+# pyproject.toml asks for strict settings; these are not strict, because a GPU machine may lack pytest's plugins.
+PYTEST_OVERRIDES = ("-o", "addopts=--import-mode=importlib", "-p", "no:cacheprovider")
+_TEST_LINE = re.compile(r"(\S+\.py)::.* (PASSED|FAILED|ERROR|SKIPPED|XFAIL|XPASS)(?: \(.*\))?\s+\[ *\d+%\]\s*")
+_OUTCOME_LABELS = {"PASSED": "passed", "FAILED": "failed", "ERROR": "errors", "SKIPPED": "skipped", "XFAIL": "xfailed"}
+_FAILED_OUTCOMES = ("FAILED", "ERROR")
 
 
-def run_suite(places: Sequence[str] = PLACES) -> Iterator[Row]:
-    """Run the tests marked `gpu`; yields what came of each file, and what ended pytest where that was none of them.
+def run_suite(paths: Sequence[str] = TEST_PATHS) -> Iterator[Row]:
+    """Run the tests marked `gpu`; yield one row for each file, and one more if pytest failed outside of a test.
 
-    A file has its row as soon as the next begins, or, with the first reason, at the end where a test of it failed.
-    Each test is printed as it ends: where one hangs, the last is that before it.
+    The row of a file without failures comes when the next file begins; that of a file with failures comes at the end,
+    with the first reason. Each test's line is printed when the test ends, so the last line precedes a test that hangs.
 
     Raises:
-        ModuleNotFoundError: there is no pytest.
+        ModuleNotFoundError: pytest is not installed.
     """
     import pytest
 
-    command = [sys.executable, "-m", "pytest", "-v", "--no-header", *LENIENT, "-m", CHOSEN, *places]
-    wide = {**os.environ, "COLUMNS": "400", "PYTHONUNBUFFERED": "1"}  # as long as the sentence of a failed test
+    command = [sys.executable, "-m", "pytest", "-v", "--no-header", *PYTEST_OVERRIDES, "-m", GPU_MARKER, *paths]
+    # The lines must be wide enough for the message of a failed test.
+    environment = {**os.environ, "COLUMNS": "400", "PYTHONUNBUFFERED": "1"}
     child = subprocess.Popen(
-        command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace", env=wide
+        command,
+        cwd=REPOSITORY_ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        errors="replace",
+        env=environment,
     )
     counts: dict[str, Counter[str]] = {}
-    last, reasons = "", dict[str, str]()
-    told = set[str]()
+    last_line, reasons = "", dict[str, str]()
+    reported = set[str]()
     assert child.stdout is not None
     for line in child.stdout:
-        last = " ".join(line.split()) or last
-        if test := _TEST.fullmatch(line):
-            print(last, flush=True)
+        last_line = " ".join(line.split()) or last_line
+        if test := _TEST_LINE.fullmatch(line):
+            print(last_line, flush=True)
             file, outcome = test.groups()
-            for other in [name for name in counts if name not in {file, *told} and not _is_broken(counts[name])]:
-                told.add(other)
+            for other in [name for name in counts if name not in {file, *reported} and not _has_failed(counts[name])]:
+                reported.add(other)
                 yield _row(other, counts[other])
             counts.setdefault(file, Counter())[outcome] += 1
-        elif line.startswith(_BROKEN):  # of the summary at the end
-            reasons.setdefault(line.partition(" ")[2].partition("::")[0], last)
+        elif line.startswith(_FAILED_OUTCOMES):  # a line of pytest's summary
+            reasons.setdefault(line.partition(" ")[2].partition("::")[0], last_line)
     code = child.wait()
-    for file in [name for name in counts if name not in told]:
+    for file in [name for name in counts if name not in reported]:
         row = _row(file, counts[file])
-        if _is_broken(counts[file]):
-            row |= {"status": "failed", "note": reasons.get(file, last)}
+        if _has_failed(counts[file]):
+            row |= {"status": "failed", "note": reasons.get(file, last_line)}
         yield row
     if not counts and code == pytest.ExitCode.NO_TESTS_COLLECTED:
-        yield {"case": "pytest", "status": "failed", "note": f"no test is marked '{CHOSEN}' in {' '.join(places)}"}
-    elif code and not any(map(_is_broken, counts.values())):
-        note = next(iter(reasons.values()), last)
-        yield {"case": "pytest", "status": "failed", "note": f"it ended with exit code {code}: {note}"}
+        yield {"case": "pytest", "status": "failed", "note": f"no test is marked '{GPU_MARKER}' in {' '.join(paths)}"}
+    elif code and not any(map(_has_failed, counts.values())):
+        note = next(iter(reasons.values()), last_line)
+        yield {"case": "pytest", "status": "failed", "note": f"pytest ended with exit code {code}: {note}"}
 
 
-def _is_broken(outcomes: Counter[str]) -> bool:
-    return any(outcomes[name] for name in _BROKEN)
+def _has_failed(outcomes: Counter[str]) -> bool:
+    return any(outcomes[name] for name in _FAILED_OUTCOMES)
 
 
 def _row(file: str, outcomes: Counter[str]) -> Row:
-    return {"case": file, "result": ", ".join(f"{count} {_WORDS.get(name, name)}" for name, count in outcomes.items())}
+    return {
+        "case": file,
+        "result": ", ".join(f"{count} {_OUTCOME_LABELS.get(name, name)}" for name, count in outcomes.items()),
+    }

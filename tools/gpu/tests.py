@@ -1,4 +1,4 @@
-"""Are the kernels right on this device: a matrix of our own, and the tests of the repository where pytest is there."""
+"""Check that the kernels are correct on this device: random calls against float64, and the tests marked `gpu`."""
 
 from __future__ import annotations
 
@@ -9,29 +9,33 @@ from torch import Tensor
 
 from hyrfpack.model.operation_calls import OperationCall, hash_encode_call, loss_call, mlp_call, rasterize_call
 from hyrfpack.ops.hash_encode import level_offsets, level_resolutions
-from tools.gpu.compare import checked
+from tools.gpu.compare import check_call
 from tools.gpu.rows import Row
 from tools.gpu.setup import Setup
 from tools.gpu.suite import run_suite
 
-TABLE = "Right on this device"
-PYTEST = "pytest"
+TABLE_NAME = "Right on this device"
+PYTEST_ITEM = "pytest"
 
 
 def items(setup: Setup) -> list[str]:
-    """The cases of the matrix, then pytest, once for all: what it builds for one test, the next ones have."""
-    return [*CASES, PYTEST]
+    """Return the names of the random calls, then one item for all of pytest, whose tests share the built kernels."""
+    return [*CALL_FACTORIES, PYTEST_ITEM]
 
 
 def run(item: str, setup: Setup) -> Iterator[Row]:
-    """One case, or what came of each file of tests."""
-    if item == PYTEST:
-        yield from ({"table": TABLE, **row} for row in run_suite())
+    """Yield the row of one random call, or for pytest one row for each test file."""
+    if item == PYTEST_ITEM:
+        yield from ({"table": TABLE_NAME, **row} for row in run_suite())
     else:
-        yield {"table": TABLE, "case": item, **checked(CASES[item](setup.torch_device), setup.implementation)}
+        yield {
+            "table": TABLE_NAME,
+            "case": item,
+            **check_call(CALL_FACTORIES[item](setup.torch_device), setup.implementation),
+        }
 
 
-def _normal(seed: int, *shape: int) -> Tensor:
+def _random_normal(seed: int, *shape: int) -> Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
 
 
@@ -40,11 +44,11 @@ def _rasterize(
 ) -> Callable[[torch.device], OperationCall]:
     def make(device: torch.device) -> OperationCall:
         inputs = {
-            "means": _normal(0, count, 3) * 0.8 + torch.tensor([0.0, 0.0, 4.0]),
-            "quats": _normal(1, count, 4),
-            "scales": size * torch.exp(0.5 * _normal(2, count, 3)),
-            "opacities": torch.sigmoid(1.5 * _normal(3, count)),
-            "colors": torch.sigmoid(_normal(4, count, 3)),
+            "means": _random_normal(0, count, 3) * 0.8 + torch.tensor([0.0, 0.0, 4.0]),
+            "quats": _random_normal(1, count, 4),
+            "scales": size * torch.exp(0.5 * _random_normal(2, count, 3)),
+            "opacities": torch.sigmoid(1.5 * _random_normal(3, count)),
+            "colors": torch.sigmoid(_random_normal(4, count, 3)),
         }
         view = (torch.eye(4, dtype=torch.float64), (width, width, width / 2, height / 2), width, height)
         return rasterize_call({name: tensor.to(device) for name, tensor in inputs.items()}, *view, **options)
@@ -55,9 +59,9 @@ def _rasterize(
 def _hash_encode(points: int, log2: int, wanted: tuple[str, ...]) -> Callable[[torch.device], OperationCall]:
     def make(device: torch.device) -> OperationCall:
         resolutions = level_resolutions(16, 8, 512)
-        # Numbers of 16 bits: a point lies in the same cell, at the same place, in every precision.
+        # Coordinates have 16 bits, so that a point has the same cell and offset in every precision.
         coords = torch.randint(0, 1 << 16, (points, 3), generator=torch.Generator().manual_seed(0)) / (1 << 16)
-        table = _normal(1, level_offsets(resolutions, log2)[-1], 2)
+        table = _random_normal(1, level_offsets(resolutions, log2)[-1], 2)
         return hash_encode_call(coords.to(device), table.to(device), resolutions, log2, wanted)
 
     return make
@@ -65,10 +69,10 @@ def _hash_encode(points: int, log2: int, wanted: tuple[str, ...]) -> Callable[[t
 
 def _mlp(rows: int, widths: tuple[int, ...], mixed: bool) -> Callable[[torch.device], OperationCall]:
     def make(device: torch.device) -> OperationCall:
-        x = _normal(0, rows, widths[0]).to(device)
+        x = _random_normal(0, rows, widths[0]).to(device)
         shapes = enumerate(zip(widths[1:], widths, strict=False))
-        weights = [(_normal(layer + 1, o, i) / i**0.5).to(device) for layer, (o, i) in shapes]
-        biases = [(0.1 * _normal(layer + 9, width)).to(device) for layer, width in enumerate(widths[1:])]
+        weights = [(_random_normal(layer + 1, o, i) / i**0.5).to(device) for layer, (o, i) in shapes]
+        biases = [(0.1 * _random_normal(layer + 9, width)).to(device) for layer, width in enumerate(widths[1:])]
         return mlp_call(x, weights, biases, mixed)
 
     return make
@@ -76,15 +80,15 @@ def _mlp(rows: int, widths: tuple[int, ...], mixed: bool) -> Callable[[torch.dev
 
 def _loss(height: int, width: int, share: float | None) -> Callable[[torch.device], OperationCall]:
     def make(device: torch.device) -> OperationCall:
-        target = torch.sigmoid(_normal(0, height, width, 3))
-        image = (target + 0.1 * _normal(1, height, width, 3)).clamp(0, 1)
-        mask = None if share is None else (_normal(2, height, width).sigmoid() < share).to(device)
+        target = torch.sigmoid(_random_normal(0, height, width, 3))
+        image = (target + 0.1 * _random_normal(1, height, width, 3)).clamp(0, 1)
+        mask = None if share is None else (_random_normal(2, height, width).sigmoid() < share).to(device)
         return loss_call(image.to(device), target.to(device), mask)
 
     return make
 
 
-CASES: dict[str, Callable[[torch.device], OperationCall]] = {
+CALL_FACTORIES: dict[str, Callable[[torch.device], OperationCall]] = {
     "rasterize, 400 Gaussians, 45 x 37": _rasterize(400, 45, 37, 0.1),
     "rasterize, 3,000 small Gaussians, 64 x 48": _rasterize(3000, 64, 48, 0.02),
     "rasterize, antialiased": _rasterize(300, 48, 32, 0.03, antialiased=True),

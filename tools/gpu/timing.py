@@ -1,4 +1,4 @@
-"""Times of tasks on a device, and what the device can do at best: copied bytes and multiplied numbers a second."""
+"""Time tasks on a device, and measure the device's peak rates: copied bytes and matrix operations a second."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ import torch
 
 from hyrfpack.measure.timing import Clock, time_alternately
 
-# Written before each measurement: more than any L2 cache holds, so that each starts cold, and so much that the host has
-# queued a short task before it begins.
-FLUSHED_BYTES = 1 << 30
+# This buffer is written before each measurement. It is larger than any L2 cache, so that each task starts with a cold
+# cache, and writing it takes so long that the host has queued a short task before the task starts.
+FLUSH_BYTES = 1 << 30
 WARM_RUNS = 3
-# What torch calls to read a number from the device. It ends a profile by waiting for all of the device.
-WAITS = ("cudaStreamSynchronize", "hipStreamSynchronize")
+# torch calls these to read a number from the device. The end of a profile waits by another call, which is not counted.
+WAIT_CALL_NAMES = ("cudaStreamSynchronize", "hipStreamSynchronize")
 
 
 @dataclass(frozen=True)
 class Rates:
-    """What was measured on this very device.
+    """Peak rates that were measured on this device.
 
     Attributes:
-        copy: bytes a second of a large copy, those read and those written.
-        bf16, fp32: floating point operations a second of a large matrix product; fp32 without TF32.
+        copy: bytes read plus bytes written a second in a large copy.
+        bf16, fp32: floating point operations a second in a large matrix product; fp32 without TF32.
     """
 
     copy: float
@@ -35,27 +35,28 @@ class Rates:
 
 
 def synchronize(device: torch.device) -> None:
-    """Wait until the device has done what it was given."""
+    """Wait until the device has finished all queued work."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
 
 
 def median_ms(tasks: Mapping[str, Callable[[], object]], repeats: int, device: torch.device) -> dict[str, float]:
-    """Median milliseconds of each task; they take turns.
+    """Return the median milliseconds of each task; the tasks alternate.
 
-    On a GPU between two events of the stream, warm and each after a cache flush; elsewhere by the processor's clocks.
+    On a GPU the time is that between two CUDA events, after warm-up runs and each time after a cache flush. On a CPU it
+    is wall-clock time.
     """
     clock = None
     if device.type == "cuda":
-        clock = event_clock(device)
-        for task in WARM_RUNS * list(tasks.values()):  # the first builds kernels
+        clock = make_event_clock(device)
+        for task in WARM_RUNS * list(tasks.values()):  # the first run builds the kernels
             task()
     return {name: time.ms for name, time in time_alternately(tasks, repeats, clock)[0].items()}
 
 
-def event_clock(device: torch.device) -> Clock:
-    """What times a task on a GPU by events."""
-    flushed = torch.empty(FLUSHED_BYTES, dtype=torch.uint8, device=device)
+def make_event_clock(device: torch.device) -> Clock:
+    """Return a clock that times a task on a GPU by CUDA events."""
+    flushed = torch.empty(FLUSH_BYTES, dtype=torch.uint8, device=device)
 
     def measure(task: Callable[[], object]) -> tuple[None, float, float]:
         start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
@@ -69,21 +70,21 @@ def event_clock(device: torch.device) -> Clock:
     return measure
 
 
-def reset_peak(device: torch.device) -> None:
-    """Let `peak_mb` begin anew."""
-    gc.collect()  # what training held
+def reset_peak_memory(device: torch.device) -> None:
+    """Reset the peak that `read_peak_memory_mb` reports."""
+    gc.collect()  # frees the tensors of a finished training run
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
 
 
-def peak_mb(device: torch.device) -> float | None:
-    """Most memory that tensors took since `reset_peak`, in MB; None where nobody counts it."""
+def read_peak_memory_mb(device: torch.device) -> float | None:
+    """Return the peak memory of tensors since `reset_peak_memory` in MB; None on a CPU, where it is not counted."""
     return torch.cuda.max_memory_allocated(device) / 1e6 if device.type == "cuda" else None
 
 
 @cache
 def measure_rates(device: torch.device) -> Rates:
-    """Best of several: a copy of 1 GiB and products of 8192 x 8192 random matrices; small ones on a CPU."""
+    """Measure the peak rates: medians of copying 1 GiB and of multiplying 8192 x 8192 matrices; smaller on a CPU."""
     large = device.type == "cuda"
     count, side = (1 << 28, 8192) if large else (1 << 18, 128)
     source = torch.rand(count, device=device)
@@ -113,12 +114,12 @@ def measure_rates(device: torch.device) -> Rates:
 
 @dataclass(frozen=True)
 class Profile:
-    """What one run of a task asks of a GPU.
+    """Kernels, launches and waits of one run of a task on a GPU.
 
     Attributes:
-        times: milliseconds in each kernel, by name, longest first; copies and fills are among them.
-        launches: how many there are.
-        waits: how often the host waits for the device.
+        times: milliseconds in each kernel by name, longest first, including copies and fills.
+        launches: number of kernel launches.
+        waits: number of times that the host waits for the device.
     """
 
     times: dict[str, float]
@@ -126,8 +127,8 @@ class Profile:
     waits: float
 
 
-def profiled(task: Callable[[], object], runs: int, device: torch.device) -> Profile:
-    """One run of a task, by torch's profiler; nothing where there is no GPU."""
+def profile_task(task: Callable[[], object], runs: int, device: torch.device) -> Profile:
+    """Profile a task with torch's profiler; return the mean of `runs` runs, or an empty profile without a GPU."""
     if device.type != "cuda":
         return Profile({}, 0.0, 0.0)
     from torch.profiler import ProfilerActivity, profile
@@ -138,18 +139,18 @@ def profiled(task: Callable[[], object], runs: int, device: torch.device) -> Pro
         for _ in range(runs):
             task()
         synchronize(device)
-    return sum_up(profiler.key_averages(), runs)
+    return summarize_events(profiler.key_averages(), runs)
 
 
-def sum_up(events: Iterable[Any], runs: int) -> Profile:
-    """One run's profile, from the averages of torch's profiler over so many runs."""
+def summarize_events(events: Iterable[Any], runs: int) -> Profile:
+    """Return the profile of one run from the sums that torch's profiler reports over `runs` runs."""
     times: dict[str, float] = {}
     launches = waits = 0.0
     for event in events:
         if str(event.device_type).endswith("CUDA") and event.self_device_time_total:
             times[event.key] = times.get(event.key, 0.0) + 1e-3 * event.self_device_time_total / runs
             launches += event.count / runs
-        elif event.key in WAITS:
+        elif event.key in WAIT_CALL_NAMES:
             waits += event.count / runs
     return Profile(dict(sorted(times.items(), key=lambda item: -item[1])), launches, waits)
 
@@ -157,9 +158,12 @@ def sum_up(events: Iterable[Any], runs: int) -> Profile:
 def group_kernels(
     times: Mapping[str, float], groups: Mapping[str, tuple[str, ...]], rest: str = "other"
 ) -> dict[str, float]:
-    """Milliseconds of each group of kernels; a kernel belongs to the first group one of whose words is in its name.
+    """Return the milliseconds of each group of kernels.
 
-    Those that belong to none are under `rest`.
+    Args:
+        times: milliseconds by kernel name.
+        groups: the words of each group; a kernel belongs to the first group that has a word of the kernel's name.
+        rest: the name of the group for all other kernels.
     """
     grouped = dict.fromkeys((*groups, rest), 0.0)
     for name, ms in times.items():

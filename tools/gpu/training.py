@@ -1,4 +1,4 @@
-"""Training steps of a model that is given, timed as a user would wait for them."""
+"""Time training steps of a given model by the wall clock."""
 
 from __future__ import annotations
 
@@ -12,17 +12,28 @@ from hyrfpack.model import HybridModel
 from hyrfpack.scene import Scene
 from hyrfpack.train import TrainConfig, Trainer
 from hyrfpack.train.config import FULL_STEPS
-from tools.gpu.rows import Row, goal, kernel_rows
-from tools.gpu.setup import GOAL_ROOM, Setup
-from tools.gpu.timing import Profile, peak_mb, profiled, reset_peak, synchronize
+from tools.gpu.rows import Row, goal_row, kernel_rows
+from tools.gpu.setup import GOAL_ROOM_NAME, Setup
+from tools.gpu.timing import Profile, profile_task, read_peak_memory_mb, reset_peak_memory, synchronize
 
 GOAL_MINUTES = 10.0
 PROFILED_STEPS = 5
 
 
 @dataclass(frozen=True)
-class Training:
-    """What a timed run in a room of that name came to; `profile` is of PROFILED_STEPS steps."""
+class TimedTraining:
+    """Result of a timed training run.
+
+    Attributes:
+        room: name of the room, such as "1,000,000".
+        model: the trained model.
+        steps: number of timed steps.
+        seconds: wall-clock time of these steps.
+        psnr: PSNR in dB on training photos, at the beginning and at the end.
+        stages: seconds of each stage as the host measures them, longest first.
+        peak: peak memory of tensors in MB; None on a CPU.
+        profile: kernels of PROFILED_STEPS steps together.
+    """
 
     room: str
     model: HybridModel
@@ -34,7 +45,7 @@ class Training:
     profile: Profile
 
     def rows(self) -> Iterator[Row]:
-        """The run, its stages as the host saw them, and its kernels."""
+        """Yield the row of the run, its goal if it has one, and the rows of its kernels."""
         rate = self.steps / self.seconds
         minutes = FULL_STEPS / rate / 60
         full = f"{minutes:.1f} min" if minutes < 120 else f"{minutes / 60:.1f} h"
@@ -47,35 +58,35 @@ class Training:
             "30,000 steps": full,
             "PSNR before, after": f"{self.psnr[0]:.1f}, {self.psnr[1]:.1f} dB",
             "peak MB": self.peak,
-            "launches, waits a step": self._asked(),
+            "launches, waits a step": self._format_launches(),
             "host's time": ", ".join(f"{stage} {seconds / total:.0%}" for stage, seconds in self.stages.items()),
         }
-        if self.room == GOAL_ROOM:
-            yield goal(f"30,000 steps of {self.room} Gaussians", minutes, GOAL_MINUTES, "min", at_least=False)
+        if self.room == GOAL_ROOM_NAME:
+            yield goal_row(f"30,000 steps of {self.room} Gaussians", minutes, GOAL_MINUTES, "min", at_least=False)
         kernels = {name: ms / PROFILED_STEPS for name, ms in self.profile.times.items()}
         yield from kernel_rows(kernels, f"A training step of {self.room} Gaussians: kernels on the device")
 
-    def _asked(self) -> str | None:
+    def _format_launches(self) -> str | None:
         if not self.profile.times:
             return None
         return f"{self.profile.launches / PROFILED_STEPS:.0f}, {self.profile.waits / PROFILED_STEPS:.1f}"
 
 
-def timed_training(room: str, scene: Scene, model: HybridModel, setup: Setup) -> Training:
-    """Train `model` on the scene for a while: warm-up, timed steps, then a few under the profiler."""
+def time_training(room: str, scene: Scene, model: HybridModel, setup: Setup) -> TimedTraining:
+    """Train `model` on the scene: first warm-up steps, then timed steps, then a few steps under the profiler."""
     device, count = setup.torch_device, len(model)
     trainer = Trainer(scene, TrainConfig(steps=FULL_STEPS, max_gaussians=count), device=device, model=model)
     errors: list[float] = []
     advance(trainer, setup.warm_steps, setup.step_seconds / 3, errors)
-    reset_peak(device)
+    reset_peak_memory(device)
     synchronize(device)
-    first, start, stages = trainer.step, time.perf_counter(), dict(trainer.seconds)
+    first_step, start, stages = trainer.step, time.perf_counter(), dict(trainer.seconds)
     advance(trainer, setup.steps, setup.step_seconds, errors)
     synchronize(device)
-    seconds, steps, peak = time.perf_counter() - start, trainer.step - first, peak_mb(device)
+    seconds, steps, peak = time.perf_counter() - start, trainer.step - first_step, read_peak_memory_mb(device)
     stages = {name: value - stages.get(name, 0.0) for name, value in trainer.seconds.items()}
-    profile = profiled(lambda: advance(trainer, PROFILED_STEPS, setup.step_seconds, []), 1, device)
-    return Training(
+    profile = profile_task(lambda: advance(trainer, PROFILED_STEPS, setup.step_seconds, []), 1, device)
+    return TimedTraining(
         room=room,
         model=trainer.model,
         steps=steps,
@@ -88,7 +99,7 @@ def timed_training(room: str, scene: Scene, model: HybridModel, setup: Setup) ->
 
 
 def advance(trainer: Trainer, steps: int, seconds: float, errors: list[float]) -> None:
-    """Take that many steps, or as many as the time allows; mean squared errors are appended to `errors`."""
+    """Take `steps` steps, or as many as fit into `seconds`; append each step's mean squared error to `errors`."""
     last, end = trainer.step + steps, time.perf_counter() + seconds
     trainer.run(
         report=lambda trainer, loss, mse: errors.append(mse),

@@ -1,8 +1,8 @@
-"""Runs one part of the check in a process of its own, so that nothing that breaks there ends the rest.
+"""Run one part of the check in child processes, so that a failure there does not end the other parts.
 
-A kernel that reads where it may not leaves the whole process without a usable GPU, and one that never ends can only be
-killed from outside. The child prints a line for each row and for each item done; when it ends early, the item that it
-was at has failed, and another child goes on with the next.
+A kernel with an illegal memory access leaves its whole process without a usable GPU, and a kernel that hangs can only
+be killed from another process. The child prints one line for each row and for each finished item. If the child ends
+early, its current item has failed, and a new child runs the remaining items.
 """
 
 from __future__ import annotations
@@ -19,86 +19,96 @@ from contextlib import suppress
 
 from tools.gpu.rows import Row
 
-OURS = ("hyrfpack", "tools", "tests")
-PIP_NAMES = {"PIL": "pillow"}  # of modules that are called otherwise
-ROW, BEGUN, DONE = "@row ", "@begun ", "@done "  # what lines of a child begin with
+OWN_PACKAGES = ("hyrfpack", "tools", "tests")
+PIP_NAME_BY_MODULE = {"PIL": "pillow"}  # modules whose package has another name
+# Prefixes of the lines by which a child reports to its parent.
+ROW_PREFIX, BEGUN_PREFIX, DONE_PREFIX = "@row ", "@begun ", "@done "
 
 
-def work(run: Callable[[str], Iterator[Row]], items: Sequence[str], is_usable: Callable[[], bool]) -> int:
-    """In the child: go through the items and print what comes; returns the exit code.
+def run_child(run: Callable[[str], Iterator[Row]], items: Sequence[str], is_usable: Callable[[], bool]) -> int:
+    """Run the items in the child process and print their rows; return the exit code.
 
     Args:
         run: yields the rows of an item.
-        is_usable: asked after an item that failed; where it says no, the rest is left to another process.
+        items: the names of the items.
+        is_usable: called after a failed item; if it returns False, the child ends with code 3 and leaves the remaining
+            items to another child.
     """
     for item in items:
-        _print(BEGUN + item)
+        _print(BEGUN_PREFIX + item)
         try:
             for row in run(item):
-                _print(ROW + json.dumps({"item": item, **row}))
+                _print(ROW_PREFIX + json.dumps({"item": item, **row}))
         except Exception as error:
-            _print(ROW + json.dumps({"item": item, **failure(error)}))
-            _print(DONE + item)
+            _print(ROW_PREFIX + json.dumps({"item": item, **failure_row(error)}))
+            _print(DONE_PREFIX + item)
             if not is_usable():
                 return 3
         else:
-            _print(DONE + item)
+            _print(DONE_PREFIX + item)
     return 0
 
 
-def failure(error: Exception) -> Row:
-    """The row of an item that raised."""
-    package = missing_package(error)
+def failure_row(error: Exception) -> Row:
+    """Return the row of an item that raised: "left out" if a package is missing, otherwise "failed"."""
+    package = find_missing_package(error)
     if package:
         return {"status": "left out", "note": f"it needs {package}, which is not installed here"}
-    words = " ".join(str(error).split()) or "no message"
-    return {"status": "failed", "note": f"{type(error).__name__}: {words[:300]}"}
+    message = " ".join(str(error).split()) or "no message"
+    return {"status": "failed", "note": f"{type(error).__name__}: {message[:300]}"}
 
 
-def missing_package(error: BaseException | None) -> str | None:
-    """What pip calls the package of others for want of which this was raised; None where it was raised for another
-    reason, or for want of a module of ours."""
+def find_missing_package(error: BaseException | None) -> str | None:
+    """Return the pip name of the missing third-party package that caused an error.
+
+    It returns None if the error has another cause, or if the missing module is one of this repository.
+    """
     while error is not None and not isinstance(error, ModuleNotFoundError):
         error = error.__cause__
-    top = (error.name or "").partition(".")[0] if error else ""
-    return None if top in ("", *OURS) else PIP_NAMES.get(top, top)
+    module = (error.name or "").partition(".")[0] if error else ""
+    return None if module in ("", *OWN_PACKAGES) else PIP_NAME_BY_MODULE.get(module, module)
 
 
-def run_items(command: Callable[[list[str]], list[str]], items: Sequence[str], seconds: float) -> Iterator[Row]:
-    """In the parent: rows of all items, from as many children as it takes.
+def run_in_children(command: Callable[[list[str]], list[str]], items: Sequence[str], seconds: float) -> Iterator[Row]:
+    """Run the items in one or more child processes, called from the parent; yield the rows of all items.
 
     Args:
-        command: of a child that does the items it is given.
-        seconds: for all of them; what is not done by then has failed.
+        command: returns the command of a child that runs the items it is given.
+        items: the names of the items.
+        seconds: time limit for all items together; unfinished items have failed.
     """
-    left, end = list(items), time.monotonic() + seconds
-    while left:
-        before, at, last = len(left), None, ""
-        for line in _lines(command(left), end - time.monotonic()):
+    remaining, end = list(items), time.monotonic() + seconds
+    while remaining:
+        remaining_before, current, last_line = len(remaining), None, ""
+        for line in _lines(command(remaining), end - time.monotonic()):
             kind, _, rest = line.partition(" ")
-            if kind + " " == ROW:
+            if kind + " " == ROW_PREFIX:
                 yield json.loads(rest)
-            elif kind + " " == BEGUN:
-                at, last = rest, ""
-            elif kind + " " == DONE:
-                left.remove(rest)
-                at = None
+            elif kind + " " == BEGUN_PREFIX:
+                current, last_line = rest, ""
+            elif kind + " " == DONE_PREFIX:
+                remaining.remove(rest)
+                current = None
             else:
-                last = line.strip() or last
-        if left and time.monotonic() >= end:
-            for item in left:
+                last_line = line.strip() or last_line
+        if remaining and time.monotonic() >= end:
+            for item in remaining:
                 note = f"not done within the part's {seconds:.0f} s"
-                note += f"; last words: {last[:300]}" if item == at and last else ""
+                note += f"; last output: {last_line[:300]}" if item == current and last_line else ""
                 yield {"item": item, "status": "failed", "note": note}
             return
-        if at or len(left) == before:  # it broke off within an item, or did not even begin
-            broken = at or left[0]
-            left.remove(broken)
-            yield {"item": broken, "status": "failed", "note": f"its process ended: {last[:300] or 'without a word'}"}
+        if current or len(remaining) == remaining_before:  # the child ended within an item, or before its first one
+            failed_item = current or remaining[0]
+            remaining.remove(failed_item)
+            yield {
+                "item": failed_item,
+                "status": "failed",
+                "note": f"its process ended: {last_line[:300] or 'no output'}",
+            }
 
 
 def _lines(command: list[str], seconds: float) -> Iterator[str]:
-    """Lines that a command prints, until it ends or its time is over; then it is killed with all that it started."""
+    """Yield the lines that a command prints until it ends or its time is over; then kill its process group."""
     child = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace", start_new_session=True
     )

@@ -1,17 +1,19 @@
-"""Feed the `.hyrf` reader hostile files and see that each is decoded or refused in one sentence, in time and in memory.
+"""Feed hostile files to the `.hyrf` reader and check that it decodes or refuses each within its time and memory limits.
 
     python -m tools.safety.fuzz --count 1000000 --jobs 2 --out runs/fuzz
 
-For each input of `fuzz_mutate.mutant` the reader must either decode it - every number finite, and the model written
-as profile raw decodes to itself - or raise HyrfFormatError with one printable line. What else happens is a failure,
-saved with the numbers that make it again: another exception, a warning, the death of the process, more than SECONDS of
-processor time, more than SPACE of address space, or (traced, for one input in TRACED) more memory at once than
+It prints a summary with counts, seconds of CPU time and MB of memory, saves it in --out, and exits with 1 after a
+failure. For each input of `fuzz_mutate.make_hostile_file` the reader must do one of two things. It decodes the input:
+all numbers are finite, and the model survives a round trip through profile raw. Or it raises HyrfFormatError with one
+printable line. Anything else is a failure, and the input is saved with the seed and number that reproduce it: another
+exception, a warning, the death of the process, more than MAX_CPU_SECONDS of CPU time, more than
+MAX_EXTRA_ADDRESS_SPACE_BYTES of address space, or (for one input in TRACE_EVERY) a peak of allocated memory above
 
-    10 x (bytes that the table of contents says the sections decode to, within the format's own limit, + bytes of the
-    file) + SLACK
+    10 x (decoded bytes of the sections by the table of contents, within the format's limit, + bytes of the file)
+    + ALLOWED_BASE_BYTES
 
-One input in FILED also goes through a file: `load` and `describe` must agree with the decoder, and `hyrfpack info` must
-print it. One decoded model in RENDERED is rendered. Workers are processes of their own and are replaced when they die.
+For one input in FILE_CHECK_EVERY, `load` and `describe` of a file must agree with the decoder, and `hyrfpack info` must
+print it. One decoded model in RENDER_EVERY is rendered. Inputs run in worker processes, which are replaced if they die.
 """
 
 from __future__ import annotations
@@ -52,28 +54,42 @@ from hyrfpack.format.exposure import encode_exposure
 from hyrfpack.model import HybridModel
 from hyrfpack.model.exposure import MAX_LOG_GAIN
 from hyrfpack.render.renderer import render
-from tools.safety.fuzz_mutate import mutant, seeds
+from tools.safety.fuzz_mutate import load_seed_files, make_hostile_file
 
-SECONDS = 2.0
-SPACE = 1 << 30
-SLACK = 16 << 20
-TRACED, FILED, RENDERED = 100, 100, 20
-LONGEST = 1000  # characters of a sentence
-BATCH = 1000
-NEVER_ANSWERS = 300  # seconds of silence after which a worker is taken for stuck where no signal reaches
+MAX_CPU_SECONDS = 2.0
+MAX_EXTRA_ADDRESS_SPACE_BYTES = 1 << 30
+ALLOWED_BASE_BYTES = 16 << 20
+# One input in this many has its memory traced, is read from a file, or is rendered after decoding.
+TRACE_EVERY, FILE_CHECK_EVERY, RENDER_EVERY = 100, 100, 20
+MAX_MESSAGE_CHARACTERS = 1000
+INPUTS_PER_BATCH = 1000
+STUCK_WORKER_SECONDS = (
+    300  # compiled code may not react to the CPU time signal, so a silent worker is killed after this
+)
 
 
 class Failure(Exception):
-    """The reader did what it must not."""
+    """The reader broke one of the rules."""
 
 
-class TooLong(BaseException):
-    """The processor time is used up. No Exception, so that no reader takes it for one of its own."""
+class CpuTimeExceeded(BaseException):
+    """The CPU time is used up; this is no Exception, so that no reader catches it as one of its own."""
 
 
 @dataclass
 class Tally:
-    """What a run has seen."""
+    """Counts and extremes of a run.
+
+    Attributes:
+        kinds: number of inputs by kind.
+        decoded: number of decoded inputs by kind.
+        refused: number of refused inputs by message pattern.
+        traced, filed, rendered: number of inputs with traced memory, read from a file, and rendered.
+        slowest: most seconds of CPU time, and the number of the input.
+        largest: most bytes allocated at once, and the number of the input.
+        closest: largest share of the allowed bytes, and the number of the input.
+        failures: description of each failure by the number of its input.
+    """
 
     kinds: Counter = field(default_factory=Counter)
     decoded: Counter = field(default_factory=Counter)
@@ -98,25 +114,29 @@ class Tally:
 # --- one input ---
 
 
-def allowance(data: bytes) -> int:
-    """Most bytes that decoding may have allocated at once."""
+def allowed_bytes(data: bytes) -> int:
+    """Return the number of bytes that decoding may have allocated at once."""
     declared = 0
     if len(data) >= 48:
         (count,) = struct.unpack_from("<I", data, 36)
         entries = range(72, min(48 + 40 * count, len(data) - 8), 40)
         declared = sum(struct.unpack_from("<Q", data, at)[0] for at in entries)
-    return 10 * (min(declared, raw_bytes_limit(len(data))) + len(data)) + SLACK
+    return 10 * (min(declared, raw_bytes_limit(len(data))) + len(data)) + ALLOWED_BASE_BYTES
 
 
 def decode(data: bytes) -> HybridModel | str:
-    """The model, or the sentence it was refused with. Raises Failure where that is no sentence."""
+    """Return the decoded model, or the message of its refusal.
+
+    Raises:
+        Failure: the message is not one printable line of reasonable length.
+    """
     try:
         return decode_model(data)
     except HyrfFormatError as error:
-        sentence = str(error)
-        if not sentence.isprintable() or not 10 < len(sentence) < LONGEST:
-            raise Failure(f"no sentence: {sentence[:200]!r}") from error
-        return sentence
+        message = str(error)
+        if not message.isprintable() or not 10 < len(message) < MAX_MESSAGE_CHARACTERS:
+            raise Failure(f"the message is empty, too long or not printable: {message[:200]!r}") from error
+        return message
 
 
 def check_model(model: HybridModel) -> None:
@@ -128,35 +148,35 @@ def check_model(model: HybridModel) -> None:
         if not torch.isfinite(values).all():
             raise Failure(f"{name} is not finite")
         if not torch.equal(values, again_values[name]):
-            raise Failure(f"{name} does not survive")
+            raise Failure(f"{name} differs after a round trip through profile raw")
     if model.exposure is None:
         return
     if again.exposure is None or encode_exposure(again.exposure) != encode_exposure(model.exposure):
-        raise Failure("the exposure map does not survive")
+        raise Failure("the exposure map differs after a round trip through profile raw")
     for position in (np.zeros(3), np.full(3, 1e30)):
         gains = model.exposure.predict_log_gains(position, np.array([0.0, 0.0, 1.0]))
         if not (np.abs(gains) <= MAX_LOG_GAIN).all():
-            raise Failure(f"the exposure map gives the log gains {gains}")
+            raise Failure(f"the exposure map predicts log gains out of range: {gains}")
 
 
-def check_trace(data: bytes) -> tuple[int, float]:
-    """Most bytes allocated at once in decoding, and as a share of what is allowed; Failure if that is more than 1."""
+def check_memory(data: bytes) -> tuple[int, float]:
+    """Return the peak of allocated bytes in decoding, and its share of the allowed bytes; raise Failure above 1."""
     tracemalloc.start()
     try:
         outcome = decode(data)
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
-    if isinstance(outcome, HybridModel):  # torch's own memory is not traced
+    if isinstance(outcome, HybridModel):  # tracemalloc does not see torch's memory
         peak += sum(4 * values.numel() for values in outcome.state_dict().values())
-    allowed = allowance(data)
+    allowed = allowed_bytes(data)
     if peak > allowed:
         raise Failure(f"{peak:,} bytes were allocated at once, and {allowed:,} are allowed")
     return peak, peak / allowed
 
 
 def check_file(data: bytes, outcome: HybridModel | str, folder: Path) -> None:
-    """Raise Failure unless the file at a path is read as its bytes are, described, and shown."""
+    """Raise Failure unless a file with these bytes gives the same outcome, and is described and printed by `info`."""
     path = folder / "model.hyrf"
     path.write_bytes(data)
     try:
@@ -165,7 +185,7 @@ def check_file(data: bytes, outcome: HybridModel | str, folder: Path) -> None:
     except HyrfFormatError as error:
         refused = str(error).replace(str(path), "the data")
     if refused != (outcome if isinstance(outcome, str) else None):
-        raise Failure(f"the file says {refused!r} and its bytes {outcome!r:.200}")
+        raise Failure(f"reading the file gives {refused!r}, decoding its bytes gives {outcome!r:.200}")
     shown = io.TextIOWrapper(io.BytesIO(), encoding="utf-8")
     try:
         describe(path)
@@ -174,105 +194,105 @@ def check_file(data: bytes, outcome: HybridModel | str, folder: Path) -> None:
             info.callback(path, True)
     except HyrfFormatError as error:
         if not isinstance(outcome, str):
-            raise Failure(f"a decoded file is not described: {error}") from error
+            raise Failure(f"the decoder accepts the file, but `describe` refuses it: {error}") from error
     shown.seek(0)
     if not shown.read().replace("\n", "").isprintable():
-        raise Failure("what is shown of the file is not printable")
+        raise Failure("`hyrfpack info` prints unprintable characters")
 
 
-def check_picture(model: HybridModel) -> None:
-    """Render; a frame that no camera can be placed by, and numbers that overflow, are refused in a sentence."""
+def check_rendering(model: HybridModel) -> None:
+    """Render a small picture; a HyrfError is allowed, because a hostile frame may fit no camera."""
     with contextlib.suppress(HyrfError), torch.no_grad():
         facts = {"provenance": {}, "config": {"frame": vars(model.config.frame)}}
         (camera,) = orbit(Capture(facts).viewpoint, 1)
         render(model, shrink_camera(camera, 16))
 
 
-def examine(number: int, seed: int, tally: Tally, folder: Path) -> None:
-    """One input of a run, from making it to the verdict."""
-    kind, data = mutant(number, seed)
+def examine_input(number: int, seed: int, tally: Tally, folder: Path) -> None:
+    """Make input `number` of a run, check it, and add the result to the tally."""
+    kind, data = make_hostile_file(number, seed)
     tally.kinds[kind] += 1
     try:
-        signal.setitimer(signal.ITIMER_PROF, SECONDS)
+        signal.setitimer(signal.ITIMER_PROF, MAX_CPU_SECONDS)
         start = time.process_time()
         outcome = decode(data)
         taken = time.process_time() - start
         signal.setitimer(signal.ITIMER_PROF, 0)
         tally.slowest = max(tally.slowest, (taken, number))
         if isinstance(outcome, str):
-            tally.refused[pattern(outcome)] += 1
+            tally.refused[message_pattern(outcome)] += 1
         else:
             tally.decoded[kind] += 1
             check_model(outcome)
-            if number % RENDERED == 0:
+            if number % RENDER_EVERY == 0:
                 tally.rendered += 1
                 with warnings.catch_warnings():
-                    warnings.simplefilter("ignore")  # senseless models overflow
-                    check_picture(outcome)
-        if number % TRACED == 0:
-            peak, share = check_trace(data)
+                    warnings.simplefilter("ignore")  # models without meaning may overflow
+                    check_rendering(outcome)
+        if number % TRACE_EVERY == 0:
+            peak, share = check_memory(data)
             tally.traced += 1
             tally.largest, tally.closest = max(tally.largest, (peak, number)), max(tally.closest, (share, number))
-        if number % FILED == 0:
+        if number % FILE_CHECK_EVERY == 0:
             tally.filed += 1
             check_file(data, outcome, folder)
-    except TooLong:
-        tally.failures[number] = f"{kind}: more than {SECONDS} s of processor time\n{traceback.format_exc()}"
+    except CpuTimeExceeded:
+        tally.failures[number] = f"{kind}: more than {MAX_CPU_SECONDS} s of CPU time\n{traceback.format_exc()}"
     except Exception as error:
         tally.failures[number] = f"{kind}: {type(error).__name__}: {error}\n{traceback.format_exc()}"
     finally:
         signal.setitimer(signal.ITIMER_PROF, 0)
 
 
-def pattern(sentence: str) -> str:
-    """A sentence without what it says of this one file, so that the same complaints count together."""
-    sentence = sentence.removeprefix("the data: ")
-    sentence = re.sub(r"(?<=section )'(\w{4})'", r"<\1>", sentence)
-    sentence = re.sub(r"^rule .* and this", "rule '...' and this", sentence)
-    sentence = re.sub(r"(?<!\w)b?'.*('(?!\w)|$)|\"[^\"]*\"", "'...'", sentence)
-    sentence = re.sub(r"0x[\da-f]+|-?\d[\d,.e+-]*", "#", sentence)
-    return re.sub(r"<[\w#]{4}>", "<....>", sentence).split(";")[0][:110]
+def message_pattern(message: str) -> str:
+    """Replace the names and numbers of one file in a message, so that equal refusals are counted together."""
+    message = message.removeprefix("the data: ")
+    message = re.sub(r"(?<=section )'(\w{4})'", r"<\1>", message)
+    message = re.sub(r"^rule .* and this", "rule '...' and this", message)
+    message = re.sub(r"(?<!\w)b?'.*('(?!\w)|$)|\"[^\"]*\"", "'...'", message)
+    message = re.sub(r"0x[\da-f]+|-?\d[\d,.e+-]*", "#", message)
+    return re.sub(r"<[\w#]{4}>", "<....>", message).split(";")[0][:110]
 
 
 # --- many ---
 
 
-def work(pipe: Connection, current: multiprocessing.Value, seed: int) -> None:
-    """The loop of a worker: batches (numbers to examine) come in, tallies go out."""
+def run_worker(pipe: Connection, current: multiprocessing.Value, seed: int) -> None:
+    """Run a worker's loop: receive batches of input numbers, send back tallies and the peak resident size in bytes."""
 
     def stop(*_: object) -> None:
-        raise TooLong
+        raise CpuTimeExceeded
 
     torch.set_num_threads(1)
-    os.environ["HYRFPACK_THREADS"] = "1"  # what is refused first, and how much memory it takes, is no matter of luck
+    os.environ["HYRFPACK_THREADS"] = "1"  # with one thread, the first error and the memory are reproducible
     signal.signal(signal.SIGPROF, stop)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     warnings.simplefilter("error")
     with tempfile.TemporaryDirectory() as folder:
-        for data in seeds()[0]:  # everything is loaded and compiled before the limit is set
+        for data in load_seed_files()[0]:  # load and compile everything before the memory limit is set
             model = decode(data)
             check_file(data, model, Path(folder))
-            check_picture(model)
+            check_rendering(model)
         size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-        resource.setrlimit(resource.RLIMIT_AS, (size + SPACE, resource.RLIM_INFINITY))
+        resource.setrlimit(resource.RLIMIT_AS, (size + MAX_EXTRA_ADDRESS_SPACE_BYTES, resource.RLIM_INFINITY))
         while (numbers := pipe.recv()) is not None:
             tally = Tally()
             for number in numbers:
                 current.value = number
-                examine(number, seed, tally, Path(folder))
+                examine_input(number, seed, tally, Path(folder))
             pipe.send((tally, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss << 10))
 
 
-class Run:
-    """Hands batches to workers until `count` inputs are examined; replaces workers that die."""
+class FuzzRun:
+    """A run that hands batches to workers until `count` inputs are examined, and replaces workers that die."""
 
     def __init__(self, count: int, seed: int, jobs: int) -> None:
         self.count, self.seed, self.jobs = count, seed, jobs
-        self.batches = itertools.count(0, BATCH)
+        self.batches = itertools.count(0, INPUTS_PER_BATCH)
         self.tally, self.resident = Tally(), 0
         self.lock = threading.Lock()
 
-    def start(self) -> Tally:
+    def run(self) -> Tally:
         threads = [threading.Thread(target=self._serve, daemon=True) for _ in range(self.jobs)]
         for thread in threads:
             thread.start()
@@ -283,14 +303,14 @@ class Run:
     def _serve(self) -> None:
         worker = _Worker(self.seed)
         while (first := next(self.batches)) < self.count:
-            numbers = list(range(first, min(first + BATCH, self.count)))
+            numbers = list(range(first, min(first + INPUTS_PER_BATCH, self.count)))
             while numbers:
                 answer = worker.ask(numbers)
                 if answer is None:
                     killer = worker.current.value
                     with self.lock:
                         self.tally.failures[killer] = f"the worker died: exit code {worker.process.exitcode}"
-                    if killer not in numbers:  # it never came to work
+                    if killer not in numbers:  # the worker died before its first input
                         return
                     numbers.remove(killer)
                     worker = _Worker(self.seed)
@@ -315,16 +335,16 @@ class _Worker:
         context = multiprocessing.get_context("spawn")
         self.pipe, end = context.Pipe()
         self.current = context.Value("q", -1, lock=False)
-        self.process = context.Process(target=work, args=(end, self.current, seed), daemon=True)
+        self.process = context.Process(target=run_worker, args=(end, self.current, seed), daemon=True)
         self.process.start()
         end.close()
 
     def ask(self, numbers: list[int]) -> tuple[Tally, int] | None:
-        """The tally of these inputs and the worker's largest resident size; None when it died of one."""
+        """Return the tally of these inputs and the worker's largest resident size in bytes; None if it died."""
         try:
             self.pipe.send(numbers)
             before = -1
-            while not self.pipe.poll(NEVER_ANSWERS):
+            while not self.pipe.poll(STUCK_WORKER_SECONDS):
                 if self.current.value == before:
                     self.process.kill()
                 before = self.current.value
@@ -335,48 +355,53 @@ class _Worker:
 
 
 def report(tally: Tally, resident: int, seconds: float) -> str:
-    """The summary of a run."""
+    """Format the summary of a run; `resident` is the largest resident size of a worker in bytes."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     cores = used.ru_utime + used.ru_stime
     total, decoded = tally.kinds.total(), tally.decoded.total()
     lines = [
-        f"{total:,} inputs in {seconds:.0f} s ({total / seconds:.0f}/s, {total / cores:.0f} a "
-        f"second of processor time), {len(tally.failures)} failures",
-        f"{decoded:,} decoded, {tally.refused.total():,} refused; {tally.traced:,} traced, {tally.filed:,} through a "
-        f"file, {tally.rendered:,} rendered",
-        f"slowest {tally.slowest[0]:.3f} s of processor time (input {tally.slowest[1]})",
-        f"most allocated at once {tally.largest[0] / 1e6:.1f} MB (input {tally.largest[1]}); at most "
-        f"{tally.closest[0]:.0%} of what is allowed (input {tally.closest[1]}); largest worker {resident / 1e6:.0f} MB",
-        "\nmade by                  inputs   decoded",
+        f"{total:,} inputs in {seconds:.0f} s ({total / seconds:.0f}/s, {total / cores:.0f} per "
+        f"second of CPU time), {len(tally.failures)} failures",
+        f"{decoded:,} decoded, {tally.refused.total():,} refused; memory of {tally.traced:,} traced, {tally.filed:,} "
+        f"read from a file, {tally.rendered:,} rendered",
+        f"slowest input: {tally.slowest[0]:.3f} s of CPU time (input {tally.slowest[1]})",
+        f"peak of allocated memory: {tally.largest[0] / 1e6:.1f} MB (input {tally.largest[1]}); at most "
+        f"{tally.closest[0]:.0%} of the allowed bytes (input {tally.closest[1]}); "
+        f"largest worker {resident / 1e6:.0f} MB",
+        "\nkind of input            inputs   decoded",
         *(f"  {kind:<20} {count:>9,} {tally.decoded[kind]:>9,}" for kind, count in tally.kinds.most_common()),
-        "\nrefused with",
-        *(f"  {count:>9,}  {sentence}" for sentence, count in tally.refused.most_common()),
+        "\nmessages of refused inputs",
+        *(f"  {count:>9,}  {message}" for message, count in tally.refused.most_common()),
     ]
     return "\n".join(lines)
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--count", type=int, default=1_000_000, help="inputs (1,000,000)")
-    parser.add_argument("--seed", type=int, default=0, help="another seed, other inputs (0)")
-    parser.add_argument("--jobs", type=int, default=multiprocessing.cpu_count(), help="processes (one a core)")
-    parser.add_argument("--out", type=Path, default=Path("runs/fuzz"), help="folder for failures (runs/fuzz)")
-    parser.add_argument("--only", type=int, help="examine this one input of the run and show what goes wrong")
+    parser.add_argument("--count", type=int, default=1_000_000, help="number of inputs (1,000,000)")
+    parser.add_argument("--seed", type=int, default=0, help="random seed of the inputs (0)")
+    parser.add_argument(
+        "--jobs", type=int, default=multiprocessing.cpu_count(), help="number of worker processes (one per core)"
+    )
+    parser.add_argument(
+        "--out", type=Path, default=Path("runs/fuzz"), help="folder for the report and failed inputs (runs/fuzz)"
+    )
+    parser.add_argument("--only", type=int, help="decode only the input with this number and print the result")
     options = parser.parse_args()
     if options.only is not None:
-        kind, data = mutant(options.only, options.seed)
+        kind, data = make_hostile_file(options.only, options.seed)
         print(f"{kind}, {len(data)} bytes: {decode(data)!r:.2000}")
         return 0
     start = time.monotonic()
-    run = Run(options.count, options.seed, options.jobs)
-    tally = run.start()
+    fuzz_run = FuzzRun(options.count, options.seed, options.jobs)
+    tally = fuzz_run.run()
     options.out.mkdir(parents=True, exist_ok=True)
-    text = report(tally, run.resident, time.monotonic() - start)
+    text = report(tally, fuzz_run.resident, time.monotonic() - start)
     (options.out / f"report-{options.seed}.txt").write_text(text + "\n")
     print("\n" + text)
     for number, story in sorted(tally.failures.items()):
         name = options.out / f"{options.seed}-{number}"
-        name.with_suffix(".hyrf").write_bytes(mutant(number, options.seed)[1])
+        name.with_suffix(".hyrf").write_bytes(make_hostile_file(number, options.seed)[1])
         name.with_suffix(".txt").write_text(f"--seed {options.seed} --only {number}\n{story}")
         print(f"FAILED {name}.hyrf: {story.splitlines()[0][:200]}")
     return 1 if tally.failures else 0

@@ -1,12 +1,12 @@
-"""Feed hostile `.hyrf` files to the readers in Python and in JavaScript and see that they say the same of each.
+"""Feed hostile `.hyrf` files to the readers in Python and in JavaScript, and check that both give the same results.
 
     python -m tools.safety.fuzz_browser --count 20000 --jobs 2 --out runs/fuzz_browser
 
-The inputs are those of `fuzz_mutate.mutant`, as whole files and every fourth as the start of one. Both readers must
-accept or both refuse; what both accept must be the same numbers, bit for bit; a refusal must be one printable
-sentence; and no file may take the reader in JavaScript more processor time than MIN_LIMIT_SECONDS and
-MAX_JAVASCRIPT_RATIO times what it takes the reader in Python. What else happens is a
-failure, saved with the numbers that make it again.
+The inputs are those of `fuzz_mutate.make_hostile_file`. Every fourth input is read as the start of a file, the others
+as whole files. Both readers must accept an input, or both must refuse it. Accepted numbers must be equal bit for bit. A
+refusal must be one printable line. The reader in JavaScript may take MIN_LIMIT_SECONDS of CPU time plus
+MAX_JAVASCRIPT_RATIO times that of the reader in Python. Anything else is a failure, and the input is saved with its
+seed and number. It prints a summary with counts and seconds of CPU time, and exits with 1 after a failure.
 """
 
 from __future__ import annotations
@@ -33,27 +33,28 @@ import torch
 from hyrfpack.errors import HyrfFormatError
 from hyrfpack.format import decode_model
 from hyrfpack.format.arrays import to_arrays
-from tools.safety.fuzz import LONGEST, pattern
-from tools.safety.fuzz_mutate import mutant
+from tools.safety.fuzz import MAX_MESSAGE_CHARACTERS, message_pattern
+from tools.safety.fuzz_mutate import make_hostile_file
 
-READER = Path(__file__).parent / "read_many.mjs"
+READER_SCRIPT = Path(__file__).parent / "read_many.mjs"
 MIN_LIMIT_SECONDS, MAX_JAVASCRIPT_RATIO = 0.5, 20.0
-NEVER_ANSWERS = 600  # seconds of a batch after which node is taken for stuck
-BATCH = 500
-CUT_EVERY = 4  # inputs, one of which is read as the start of a file
+NODE_TIMEOUT_SECONDS = 600  # time limit of one batch
+INPUTS_PER_BATCH = 500
+PARTIAL_EVERY = 4  # one input in this many is read as the start of a file
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a reader says of a file.
+    """Result of reading one file.
 
     Attributes:
-        groups: SHA-256 of each group's numbers as float32, by section; empty if it is refused.
-        refused: the sentence it is refused with, else empty.
-        failed: what should not have happened, else empty.
-        seconds: of processor time that it took.
-        layers, whole, peak: of an accepted file, in JavaScript: Gaussians of the layers that were read, whether all
-            layers were, and the most bytes of memory up to then.
+        groups: SHA-256 of each group's numbers as float32, by section; empty if the file is refused.
+        refused: the message of the refusal, else empty.
+        failed: an unexpected error, else empty.
+        seconds: CPU time.
+        layers: number of Gaussians of each layer that was read (JavaScript, accepted files).
+        whole: whether all layers were read (JavaScript, accepted files).
+        peak: peak memory of the process up to now in bytes (JavaScript, accepted files).
     """
 
     groups: dict[str, str] = field(default_factory=dict)
@@ -65,30 +66,35 @@ class Verdict:
     peak: int = 0
 
 
-def in_python(data: bytes, cut: bool = False) -> Verdict:
-    """What hyrfpack says of a file, or, if `cut`, of the start of one."""
+def read_in_python(data: bytes, is_start: bool = False) -> Verdict:
+    """Read a file with hyrfpack, or, with `is_start`, the start of a file."""
     start = time.process_time()
     try:
-        groups = to_arrays(decode_model(data, fraction=1 if cut else None))
+        groups = to_arrays(decode_model(data, fraction=1 if is_start else None))
     except HyrfFormatError as error:
         return Verdict(refused=str(error), seconds=time.process_time() - start)
     hashes = {group: hashlib.sha256(values.tobytes()).hexdigest() for group, values in groups.items()}
     return Verdict(hashes, seconds=time.process_time() - start)
 
 
-def in_javascript(files: Sequence[tuple[bytes, bool]]) -> list[Verdict]:
-    """What the decoder under node says of files; the second of each pair is as `cut` of `in_python`.
+def read_in_javascript(files: Sequence[tuple[bytes, bool]]) -> list[Verdict]:
+    """Read files with the JavaScript decoder under node.
+
+    Args:
+        files: the bytes of each file, and whether it is the start of a file.
 
     Raises:
-        RuntimeError: node died, of the file whose number the message tells.
+        RuntimeError: node ended early; the message has the number of the file.
     """
     with tempfile.TemporaryDirectory() as folder:
         batch = Path(folder) / "files"
-        batch.write_bytes(b"".join(struct.pack("<IB", len(data), cut) + data for data, cut in files))
-        run = subprocess.run(["node", str(READER), str(batch)], capture_output=True, text=True, timeout=NEVER_ANSWERS)
+        batch.write_bytes(b"".join(struct.pack("<IB", len(data), is_start) + data for data, is_start in files))
+        run = subprocess.run(
+            ["node", str(READER_SCRIPT), str(batch)], capture_output=True, text=True, timeout=NODE_TIMEOUT_SECONDS
+        )
     answers = [json.loads(line) for line in run.stdout.splitlines()]
     if run.returncode or len(answers) != len(files):
-        raise RuntimeError(f"node died of file {len(answers)}: {run.stderr[-2000:]}")
+        raise RuntimeError(f"node ended at file {len(answers)}: {run.stderr[-2000:]}")
     return [
         Verdict(
             answer.get("groups", {}),
@@ -103,16 +109,18 @@ def in_javascript(files: Sequence[tuple[bytes, bool]]) -> list[Verdict]:
     ]
 
 
-def disagreement(python: Verdict, javascript: Verdict) -> str:
-    """What is wrong with two verdicts on one file; empty if nothing is."""
+def find_disagreement(python: Verdict, javascript: Verdict) -> str:
+    """Return how two results of one file disagree, or which rule they break; an empty string if all is well."""
     if javascript.failed:
         return f"JavaScript fails: {javascript.failed}"
     if bool(python.refused) != bool(javascript.refused):
         return f"Python: {python.refused or 'accepted'!r:.500}; JavaScript: {javascript.refused or 'accepted'!r:.500}"
     if wrong := [group for group, digest in python.groups.items() if javascript.groups[group] != digest]:
-        return f"other numbers in {', '.join(wrong)}"
-    if javascript.refused and not (javascript.refused.isprintable() and 10 < len(javascript.refused) < LONGEST):
-        return f"no sentence: {javascript.refused[:200]!r}"
+        return f"different numbers in {', '.join(wrong)}"
+    if javascript.refused and not (
+        javascript.refused.isprintable() and 10 < len(javascript.refused) < MAX_MESSAGE_CHARACTERS
+    ):
+        return f"the message is empty, too long or not printable: {javascript.refused[:200]!r}"
     if javascript.seconds > MIN_LIMIT_SECONDS + MAX_JAVASCRIPT_RATIO * python.seconds:
         return f"JavaScript takes {javascript.seconds:.2f} s (Python {python.seconds:.2f} s)"
     return ""
@@ -120,7 +128,15 @@ def disagreement(python: Verdict, javascript: Verdict) -> str:
 
 @dataclass
 class Tally:
-    """What a run has seen."""
+    """Counts of a run.
+
+    Attributes:
+        kinds: number of inputs by kind.
+        accepted: number of accepted inputs by kind.
+        refused: number of refused inputs by message pattern.
+        slowest: most seconds of CPU time in JavaScript, and the number of the input.
+        failures: description of each failure by the number of its input.
+    """
 
     kinds: Counter = field(default_factory=Counter)
     accepted: Counter = field(default_factory=Counter)
@@ -135,34 +151,34 @@ class Tally:
 
 
 def compare(numbers: Sequence[int], seed: int = 0) -> Tally:
-    """Both readers on these inputs of a run."""
+    """Read the inputs with these numbers with both readers, and return the tally."""
     torch.set_num_threads(1)
     os.environ["HYRFPACK_THREADS"] = "1"
-    made = {number: mutant(number, seed) for number in numbers}
-    files = [(data, number % CUT_EVERY == 0) for number, (_, data) in made.items()]
+    inputs = {number: make_hostile_file(number, seed) for number in numbers}
+    files = [(data, number % PARTIAL_EVERY == 0) for number, (_, data) in inputs.items()]
     tally = Tally()
-    for number, (data, cut), javascript in zip(numbers, files, in_javascript(files), strict=True):
-        kind, python = made[number][0], in_python(data, cut)
+    for number, (data, is_start), javascript in zip(numbers, files, read_in_javascript(files), strict=True):
+        kind, python = inputs[number][0], read_in_python(data, is_start)
         tally.kinds[kind] += 1
         if javascript.refused:
-            tally.refused[pattern(javascript.refused)] += 1
+            tally.refused[message_pattern(javascript.refused)] += 1
         else:
             tally.accepted[kind] += 1
         tally.slowest = max(tally.slowest, (javascript.seconds, number))
-        if wrong := disagreement(python, javascript):
+        if wrong := find_disagreement(python, javascript):
             tally.failures[number] = f"{kind}: {wrong}"
     return tally
 
 
 def report(tally: Tally, seconds: float) -> str:
-    """The summary of a run."""
+    """Format the summary of a run."""
     total = tally.kinds.total()
     lines = [
         f"{total:,} inputs in {seconds:.0f} s, {len(tally.failures)} failures; {tally.accepted.total():,} accepted, "
         f"{tally.refused.total():,} refused; slowest {tally.slowest[0]:.3f} s (input {tally.slowest[1]})",
-        "\nmade by                  inputs  accepted",
+        "\nkind of input            inputs  accepted",
         *(f"  {kind:<20} {count:>9,} {tally.accepted[kind]:>9,}" for kind, count in tally.kinds.most_common()),
-        "\nrefused in JavaScript with",
+        "\nmessages of refused inputs (JavaScript)",
         *(f"  {count:>9,}  {sentence}" for sentence, count in tally.refused.most_common()),
     ]
     return "\n".join(lines)
@@ -170,15 +186,25 @@ def report(tally: Tally, seconds: float) -> str:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--count", type=int, default=20_000, help="inputs (20,000)")
-    parser.add_argument("--seed", type=int, default=0, help="another seed, other inputs (0)")
-    parser.add_argument("--jobs", type=int, default=multiprocessing.cpu_count(), help="processes (one a core)")
-    parser.add_argument("--out", type=Path, default=Path("runs/fuzz_browser"), help="folder for failures")
+    parser.add_argument("--count", type=int, default=20_000, help="number of inputs (20,000)")
+    parser.add_argument("--seed", type=int, default=0, help="random seed of the inputs (0)")
+    parser.add_argument(
+        "--jobs", type=int, default=multiprocessing.cpu_count(), help="number of worker processes (one per core)"
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("runs/fuzz_browser"),
+        help="folder for the report and failures (runs/fuzz_browser)",
+    )
     options = parser.parse_args()
     if not shutil.which("node"):
-        parser.error("node is not here; install Node.js 20 or newer")
+        parser.error("node is not installed; install Node.js 20 or newer")
     start, tally = time.monotonic(), Tally()
-    batches = [range(first, min(first + BATCH, options.count)) for first in range(0, options.count, BATCH)]
+    batches = [
+        range(first, min(first + INPUTS_PER_BATCH, options.count))
+        for first in range(0, options.count, INPUTS_PER_BATCH)
+    ]
     with multiprocessing.get_context("spawn").Pool(options.jobs) as pool:
         for part in pool.imap_unordered(partial(compare, seed=options.seed), batches):
             tally.add(part)
@@ -190,7 +216,7 @@ def main() -> int:
     print("\n" + text)
     for number, story in sorted(tally.failures.items()):
         path = options.out / f"{options.seed}-{number}.hyrf"
-        path.write_bytes(mutant(number, options.seed)[1])
+        path.write_bytes(make_hostile_file(number, options.seed)[1])
         print(f"FAILED {path}: {story[:600]}")
     return 1 if tally.failures else 0
 

@@ -1,8 +1,8 @@
-"""Hostile `.hyrf` files: small valid ones, and what a forger makes of them with a hex editor or the specification.
+"""Make hostile `.hyrf` files from small valid ones, by random damage and by forged fields.
 
-`mutant(number, seed)` is a pure function, so a number is all that is needed to make an input again. Half of the inputs
-are damaged without repair and stop at a checksum; for the other half all checksums and lengths are right again, so that
-what was forged reaches the decoder it was meant for.
+`make_hostile_file(number, seed)` is a pure function, so the two numbers reproduce an input. About half of the inputs
+are damaged without repair, and a checksum stops most of them. In the others all checksums and lengths are repaired, so
+that the forged values reach their decoder.
 """
 
 from __future__ import annotations
@@ -28,24 +28,31 @@ from hyrfpack.format.exposure import encode_exposure
 from hyrfpack.model import ExposureMap, Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.quant import HuffmanCode, MinMaxQuantizer, ResidualVectorQuantizer, huffman_encode
-from tools.safety.plans import encode
+from tools.safety.synthetic_encoding import encode
 
-GOLDEN = Path(__file__).parents[2] / "tests" / "golden"
-GROUPS = ("POSI", "COLO", "SCAL", "OPAC", "GTAB", "GMLP", "RTAB", "RMLP")
-EXTREMES = (0, 1, 2, 3, 7, 8, 16, 57, 58, 127, 128, 255, 256, 257, 1023, 1024, 1025, 65535, 65536, 65537)
-EXTREMES += tuple(2**power + step for power in (20, 28, 31, 32, 34, 40, 48, 60, 63, 64) for step in (-1, 0, 1))
+GOLDEN_FOLDER = Path(__file__).parents[2] / "tests" / "golden"
+SECTION_GROUPS = ("POSI", "COLO", "SCAL", "OPAC", "GTAB", "GMLP", "RTAB", "RMLP")
+EXTREME_INTEGERS = (0, 1, 2, 3, 7, 8, 16, 57, 58, 127, 128, 255, 256, 257, 1023, 1024, 1025, 65535, 65536, 65537)
+EXTREME_INTEGERS += tuple(2**power + step for power in (20, 28, 31, 32, 34, 40, 48, 60, 63, 64) for step in (-1, 0, 1))
 HOSTILE_TEXT = ("", "\n", "\x1b[2J", "\ud800", "\0", "a" * 3000, "__class__", "../../x", "\u202e", "NaN", "sum", "sh")
 HOSTILE_JSON = (None, True, False, 0, 1, -1, 0.5, -0.0, 5e-324, 1e-300, 1e308, -1e308, 10**18, 2**63, 10**400, [], {})
 HOSTILE_JSON += (*HOSTILE_TEXT, [0, 0, 0], [1e308] * 3, [[[]]], {"a": 1})
-# As the bits of float32: signed zeros, denormals, bounds of log gains and what lies beyond, the largest, infinity, NaN.
+# Bits of float32 values: signed zeros, denormals, the bounds of log gains and values beyond, the largest values,
+# infinities and NaNs.
 HOSTILE_FLOAT_BITS = (0, 1 << 31, 1, 0x007FFFFF, 0x40FFFFFF, 0x41000000, 0x41000001, 0xC1000000, 0xC1000001)
 HOSTILE_FLOAT_BITS += (0x3F800000, 0x7F7FFFFF, 0xFF7FFFFF, 0x7F800000, 0xFF800000, 0x7FC00000, 0x7F800001)
-RANGES = {"log2_table_size": (3, 25), "levels": (0, 33), "base": (1, 70), "finest": (1, 70), "hidden": (0, 70)}
+CONFIG_RANGES = {"log2_table_size": (3, 25), "levels": (0, 33), "base": (1, 70), "finest": (1, 70), "hidden": (0, 70)}
 
 
 @dataclass
-class Part:
-    """A section to be written: fields of its line in the table of contents, and its bytes."""
+class RawSection:
+    """A section to be written: its entry in the table of contents, and its bytes.
+
+    Attributes:
+        tag: the four bytes of the section's type.
+        codec, flags, raw_length: fields of the entry.
+        data: the stored bytes.
+    """
 
     tag: bytes
     codec: int
@@ -54,11 +61,11 @@ class Part:
     raw_length: int
 
 
-# --- bytes of a file, whatever they say ---
+# --- The container of a file, with any content ---
 
 
-def assemble(parts: list[Part]) -> bytes:
-    """A file of these sections with all places, lengths and checksums right, whatever the sections say."""
+def assemble(parts: list[RawSection]) -> bytes:
+    """Return a file of these sections with correct offsets, lengths and checksums, whatever the sections contain."""
     minor = 2 if any(part.codec == 9 for part in parts) else int(any(5 <= part.codec <= 8 for part in parts))
     offset = 48 + 40 * len(parts)
     toc, payloads = [], []
@@ -75,27 +82,27 @@ def assemble(parts: list[Part]) -> bytes:
     return b"".join((header, struct.pack("<I", zlib.crc32(header)), table, *payloads))
 
 
-def disassemble(data: bytes) -> list[Part]:
-    """The sections of a valid file."""
+def disassemble(data: bytes) -> list[RawSection]:
+    """Return the sections of a valid file."""
     container = read_container(data)
     return [
-        Part(section.type.encode(), section.codec, int(section.required), bytes(section.data), section.raw_length)
+        RawSection(section.type.encode(), section.codec, int(section.required), bytes(section.data), section.raw_length)
         for section in container.sections
     ]
 
 
-def resealed(data: bytearray) -> bytes:
-    """The file with the checksums of its header and of its table of contents right."""
+def repair_checksums(data: bytearray) -> bytes:
+    """Return the file with correct checksums of its header and its table of contents."""
     (length,) = struct.unpack_from("<I", data, 32)
     struct.pack_into("<I", data, 40, zlib.crc32(data[48 : 48 + length]))
     struct.pack_into("<I", data, 44, zlib.crc32(data[:44]))
     return bytes(data)
 
 
-# --- valid files to start from ---
+# --- Valid files as seeds ---
 
 
-def _model(count: int, hidden: int = 3, background: bool = True, **config: object) -> HybridModel:
+def _make_model(count: int, hidden: int = 3, background: bool = True, **config: object) -> HybridModel:
     rng = np.random.default_rng(count)
     shape = ModelConfig(
         frame=Frame(center=(1.5, -0.1, 3.0), scale=12.5, half_extent=(1.0, 0.75, 0.25)),
@@ -113,8 +120,8 @@ def _model(count: int, hidden: int = 3, background: bool = True, **config: objec
     return model
 
 
-def _codec(values: np.ndarray, codec: int, rng: Random) -> bytes:
-    """A matrix in any of the codecs that need no other section."""
+def _encode_in_codec(values: np.ndarray, codec: int, rng: Random) -> bytes:
+    """Encode a matrix in one of the codecs that need no other section (1 to 4)."""
     if codec in (1, 2):
         return values.astype(f"<f{4 // codec}").tobytes()
     if codec == 3:
@@ -124,7 +131,7 @@ def _codec(values: np.ndarray, codec: int, rng: Random) -> bytes:
         streams = [huffman_encode(np.ascontiguousarray(stage)).to_bytes() for stage in indices.T]
         return head + b"".join(struct.pack("<Q", len(stream)) + stream for stream in streams)
     codes, params = MinMaxQuantizer(rng.choice((1, 3, 8, 8, 11, 16))).encode(values)
-    # A code far deeper than the symbols need: long codes are read another way.
+    # This code is far deeper than the symbols need, because the decoder reads long codes in another way.
     symbols = np.unique(codes)
     deep = None
     if 2 <= len(symbols) <= 57 and rng.random() < 0.5:
@@ -134,40 +141,46 @@ def _codec(values: np.ndarray, codec: int, rng: Random) -> bytes:
 
 
 @lru_cache
-def seeds() -> tuple[tuple[bytes, ...], tuple[float, ...]]:
-    """Valid files, and how often each is taken: the small ones, which decode faster, more often.
+def load_seed_files() -> tuple[tuple[bytes, ...], tuple[float, ...]]:
+    """Return valid files and their weights; small files, which decode faster, have larger weights.
 
-    Each profile with 0, 1, 20 and 200 Gaussians, with and without background; the golden files; Gaussians in layers;
-    groups in codecs that no profile gives them; and exposure maps of up to 64 centers in each profile.
+    The files are: each profile with 0, 1, 20 and 200 Gaussians, with and without background; the golden files;
+    Gaussians in layers; groups in codecs that no profile uses for them; and exposure maps of up to 64 centers in each
+    profile.
     """
     rng = Random(0)
-    models = [_model(0), _model(1, background=False), _model(20, direction_encoding="sh"), _model(200, hidden=2)]
+    models = [
+        _make_model(0),
+        _make_model(1, background=False),
+        _make_model(20, direction_encoding="sh"),
+        _make_model(200, hidden=2),
+    ]
     files = [(encode(model, profile), 1 if len(model) == 200 else 10) for profile in PROFILES for model in models]
-    files += [(file.read_bytes(), 10) for file in sorted(GOLDEN.glob("*.hyrf"))]
+    files += [(file.read_bytes(), 10) for file in sorted(GOLDEN_FOLDER.glob("*.hyrf"))]
     files.append((encode_model(models[2], "paper", color=(3, 8), scale=(2, 4), opacity=(1, 16)), 10))
     files.append((encode(models[3], "compact", distortion=1e-9, prune=False), 2))
-    files.append((encode(_alike(models[3]), "compact", prune=False), 10))
-    files += [(encode(model, "compact", prune=False, layered=True), 10) for model in (models[2], _model(40))]
-    mixed = [models[1], _model(5), _model(6), models[2], models[3], _model(2500)]
+    files.append((encode(_make_equal_gaussians(models[3]), "compact", prune=False), 10))
+    files += [(encode(model, "compact", prune=False, layered=True), 10) for model in (models[2], _make_model(40))]
+    mixed = [models[1], _make_model(5), _make_model(6), models[2], models[3], _make_model(2500)]
     for model in mixed:
         weight = {200: 0.5, 2500: 0.1}.get(len(model), 10)
         for profile, exchanged in (("raw", 1.0), ("compact", 0.4)):
             data = encode(model, profile)
             arrays, parts = to_arrays(decode_model(data)), disassemble(data)
             for part in parts[1:]:
-                # Other sections need the lattice of codec 6.
+                # In profile compact other sections need the lattice of codec 6, so the positions keep it.
                 if rng.random() < exchanged and (profile == "raw" or part.tag != b"POSI"):
                     part.codec = rng.choice((2, 3, 3, 4, 4))
-                    part.data = _codec(arrays[part.tag.decode()], part.codec, rng)
+                    part.data = _encode_in_codec(arrays[part.tag.decode()], part.codec, rng)
             files.append((assemble(parts), weight))
     for profile, centers in zip(PROFILES, (0, 3, 64), strict=True):
-        exposed = _model(20, background=False)
-        exposed.exposure = _exposure(centers)
+        exposed = _make_model(20, background=False)
+        exposed.exposure = _make_exposure_map(centers)
         files.append((encode(exposed, profile), 10))
     return tuple(zip(*files, strict=True))
 
 
-def _exposure(centers: int) -> ExposureMap:
+def _make_exposure_map(centers: int) -> ExposureMap:
     rng = np.random.default_rng(centers)
     return ExposureMap(
         box=np.sort(rng.normal(size=(2, 3)), 0).astype(np.float32),
@@ -181,30 +194,30 @@ def _exposure(centers: int) -> ExposureMap:
     )
 
 
-def _alike(model: HybridModel) -> HybridModel:
-    """Gaussians that are all the same: their streams have one symbol, which takes no bytes however many there are."""
+def _make_equal_gaussians(model: HybridModel) -> HybridModel:
+    """Make all Gaussians equal, so that their streams have one symbol and take no bytes, whatever their number."""
     with torch.no_grad():
         for parameter in model.gaussians.parameters():
             parameter.copy_(parameter[:1].expand_as(parameter))
     return model
 
 
-def _seed(rng: Random) -> bytes:
-    return rng.choices(*seeds())[0]
+def _choose_seed_file(rng: Random) -> bytes:
+    return rng.choices(*load_seed_files())[0]
 
 
 @lru_cache
-def _disassembled(data: bytes) -> tuple[Part, ...]:
+def _disassemble_cached(data: bytes) -> tuple[RawSection, ...]:
     return tuple(disassemble(data))
 
 
-# --- damage without repair ---
+# --- Damage without repaired checksums ---
 
 
-def edit_bytes(data: bytes, rng: Random, most: int = 4) -> bytes:
-    """A few edits of any kind, anywhere."""
+def edit_bytes(data: bytes, rng: Random, max_edits: int = 4) -> bytes:
+    """Return the bytes after 1 to `max_edits` random edits: changes, deletions, insertions and copies."""
     edited = bytearray(data)
-    for _ in range(rng.randint(1, most)):
+    for _ in range(rng.randint(1, max_edits)):
         at = rng.randrange(len(edited) + 1)
         kind = rng.randrange(7)
         if kind == 0 and at < len(edited):
@@ -213,7 +226,7 @@ def edit_bytes(data: bytes, rng: Random, most: int = 4) -> bytes:
             edited[at] = rng.choice((0, 1, 0x7F, 0x80, 0xFE, 0xFF, rng.randrange(256)))
         elif kind == 2:
             width = rng.choice((1, 2, 4, 8))
-            edited[at : at + width] = (rng.choice(EXTREMES) % 256**width).to_bytes(width, "little")
+            edited[at : at + width] = (rng.choice(EXTREME_INTEGERS) % 256**width).to_bytes(width, "little")
         elif kind == 3:
             del edited[at : at + rng.randint(1, 16)]
         elif kind == 4:
@@ -227,52 +240,54 @@ def edit_bytes(data: bytes, rng: Random, most: int = 4) -> bytes:
 
 
 def _flip_bits(rng: Random) -> bytes:
-    data = bytearray(_seed(rng))
+    data = bytearray(_choose_seed_file(rng))
     for _ in range(rng.choice((1, 1, 2, 8))):
         data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
     return bytes(data)
 
 
 def _damage_bytes(rng: Random) -> bytes:
-    return edit_bytes(_seed(rng), rng)
+    return edit_bytes(_choose_seed_file(rng), rng)
 
 
 def _truncate(rng: Random) -> bytes:
-    data = _seed(rng)
+    data = _choose_seed_file(rng)
     return data[: rng.choice((rng.randrange(len(data)), rng.randrange(500), len(data) - rng.randint(1, 9)))]
 
 
 def _extend(rng: Random) -> bytes:
-    return _seed(rng) + rng.choice((bytes, rng.randbytes))(rng.randint(1, 100))
+    return _choose_seed_file(rng) + rng.choice((bytes, rng.randbytes))(rng.randint(1, 100))
 
 
 def _splice(rng: Random) -> bytes:
-    first, second = _seed(rng), _seed(rng)
+    first, second = _choose_seed_file(rng), _choose_seed_file(rng)
     return first[: rng.randrange(len(first))] + second[rng.randrange(len(second)) :]
 
 
-# --- a forger who repairs checksums ---
+# --- Forged values with repaired checksums ---
 
 
 def _forge_header(rng: Random) -> bytes:
-    """Numbers of the header and of the table of contents at their extremes."""
-    data = bytearray(_seed(rng))
+    """Set numbers of the header and of the table of contents to extreme values."""
+    data = bytearray(_choose_seed_file(rng))
     (count,) = struct.unpack_from("<I", data, 36)
     for _ in range(rng.randint(1, 2)):
         entry = 48 + 40 * rng.randrange(count)
-        places = (8, 2), (10, 2), (12, 4), (16, 8), (24, 8), (32, 4), (36, 4)
+        iterate_json_values = (8, 2), (10, 2), (12, 4), (16, 8), (24, 8), (32, 4), (36, 4)
         columns = (0, 4), (4, 2), (6, 2), (8, 8), (16, 8), (24, 8), (32, 4), (36, 4)
-        at, width = rng.choice(places) if rng.random() < 0.4 else rng.choice(columns)
-        at += entry if (at, width) in columns and (at, width) not in places else 0
+        at, width = rng.choice(iterate_json_values) if rng.random() < 0.4 else rng.choice(columns)
+        at += entry if (at, width) in columns and (at, width) not in iterate_json_values else 0
         old = int.from_bytes(data[at : at + width], "little")
-        new = rng.choice((rng.choice(EXTREMES), old + rng.choice((-8, -1, 1, 8)), len(data), rng.getrandbits(64)))
+        new = rng.choice(
+            (rng.choice(EXTREME_INTEGERS), old + rng.choice((-8, -1, 1, 8)), len(data), rng.getrandbits(64))
+        )
         data[at : at + width] = (new % 256**width).to_bytes(width, "little")
-    return resealed(data)
+    return repair_checksums(data)
 
 
 def _forge_sections(rng: Random) -> bytes:
-    """Sections dropped, doubled, moved, swapped, borrowed, renamed, and said to be what they are not."""
-    parts = [replace(part) for part in _pick(rng)]
+    """Drop, duplicate, move, swap and rename sections, and forge their data, codecs, lengths and flags."""
+    parts = [replace(part) for part in _choose_sections(rng)]
     for _ in range(rng.randint(1, 2)):
         one, other = rng.randrange(len(parts)), rng.randrange(len(parts))
         kind = rng.randrange(9)
@@ -285,12 +300,12 @@ def _forge_sections(rng: Random) -> bytes:
         elif kind == 3:
             parts[one].data, parts[other].data = parts[other].data, parts[one].data
         elif kind == 4:
-            borrowed = rng.choice(_pick(rng))
+            borrowed = rng.choice(_choose_sections(rng))
             parts[one].data, parts[one].codec = borrowed.data, borrowed.codec
         elif kind == 5:
             parts[one].codec = rng.choice((*range(11), 65535))
         elif kind == 6:
-            parts[one].raw_length = rng.choice((*EXTREMES, parts[one].raw_length + 4))
+            parts[one].raw_length = rng.choice((*EXTREME_INTEGERS, parts[one].raw_length + 4))
         elif kind == 7:
             parts[one].flags = rng.choice((0, 1, 2, 65535))
         else:
@@ -301,8 +316,8 @@ def _forge_sections(rng: Random) -> bytes:
 
 
 def _forge_payload(rng: Random) -> bytes:
-    """Any bytes of a section."""
-    parts = [replace(part) for part in _pick(rng)]
+    """Edit any bytes of a section."""
+    parts = [replace(part) for part in _choose_sections(rng)]
     part = rng.choice(parts)
     part.data = edit_bytes(part.data, rng)
     if (part.tag == b"META" and part.codec == 0) or part.codec == 9:
@@ -311,23 +326,23 @@ def _forge_payload(rng: Random) -> bytes:
 
 
 def _forge_metadata(rng: Random) -> bytes:
-    """Metadata with other values, keys, nesting or text; often with the raw lengths that it then asks for."""
-    parts = [replace(part) for part in _pick(rng)]
+    """Forge the metadata's values, keys, nesting or text, often with raw lengths that match the forged metadata."""
+    parts = [replace(part) for part in _choose_sections(rng)]
     values = json.loads(zlib.decompress(parts[0].data) if parts[0].codec == 5 else parts[0].data)
     for _ in range(rng.choice((1, 1, 2))):
         kind = rng.randrange(8)
-        everywhere = places(values)
-        sizes = [(node, key) for node, key in everywhere if key in RANGES]
+        all_values = iterate_json_values(values)
+        sizes = [(node, key) for node, key in all_values if key in CONFIG_RANGES]
         if kind < 3 and sizes:
             node, key = rng.choice(sizes)
-            node[key] = rng.choice((rng.randint(*RANGES[key]), rng.choice(EXTREMES)))
+            node[key] = rng.choice((rng.randint(*CONFIG_RANGES[key]), rng.choice(EXTREME_INTEGERS)))
         elif kind == 3:
-            values["gaussians"] = rng.choice((rng.randrange(3000), rng.choice(EXTREMES), 8_000_000))
+            values["gaussians"] = rng.choice((rng.randrange(3000), rng.choice(EXTREME_INTEGERS), 8_000_000))
             if rng.random() < 0.3:
                 first = rng.randint(0, min(values["gaussians"], 50))
                 values["layers"] = rng.choice(([first, values["gaussians"] - first], [values["gaussians"]], [0] * 9))
         else:
-            node, key = rng.choice(everywhere)
+            node, key = rng.choice(all_values)
             if kind == 4 and isinstance(node, dict):
                 del node[key]
             elif kind == 5 and isinstance(node, dict):
@@ -352,13 +367,13 @@ def _forge_metadata(rng: Random) -> bytes:
                 if part.tag != b"EXPO":
                     rows, columns = shapes[part.tag.decode()]
                     part.raw_length = 4 * rows * columns
-        except Exception:  # the metadata is no longer sane, and need not be
+        except Exception:  # forged metadata may have no valid shapes
             pass
     return assemble(parts)
 
 
-def _deflate(part: Part, rng: Random) -> None:
-    """The metadata as codec 5 has it; now and then not quite."""
+def _deflate(part: RawSection, rng: Random) -> None:
+    """Compress the metadata with codec 5, in some cases with damage or a huge decompressed size."""
     part.codec, text = 5, part.data
     kind = rng.randrange(12)
     part.data = zlib.compress(text + b" " * (50_000_000 if kind == 0 and rng.random() < 0.1 else 0), rng.choice((0, 9)))
@@ -372,31 +387,31 @@ def _deflate(part: Part, rng: Random) -> None:
         part.data = edit_bytes(part.data, rng)
 
 
-def places(node: dict | list) -> list[tuple[dict | list, str | int]]:
-    """Every value inside nested JSON, as (what holds it, its key)."""
+def iterate_json_values(node: dict | list) -> list[tuple[dict | list, str | int]]:
+    """Return every value inside nested JSON as (its container, its key)."""
     keys = list(node) if isinstance(node, dict) else range(len(node))
     found = [(node, key) for key in keys]
     for key in keys:
         if isinstance(node[key], (dict, list)):
-            found += places(node[key])
+            found += iterate_json_values(node[key])
     return found
 
 
 def _forge_fields(rng: Random) -> bytes:
-    """One field of a codec forged, and the lengths around it repaired."""
-    parts = [replace(part) for part in _pick(rng)]
+    """Forge one or two fields of a section's codec, mostly with repaired lengths around them."""
+    parts = [replace(part) for part in _choose_sections(rng)]
     coded = [part for part in parts[1:] if part.codec in (3, 4, 6, 7, 8)] or parts[1:]
     part = rng.choice(coded)
-    fields = _fields(part)
+    fields = _split_fields(part)
     for _ in range(rng.choice((1, 1, 2))):
         name = rng.choice(list(fields))
         value = fields[name]
         if isinstance(value, tuple):
             number, width = value
-            new = rng.choice((number + rng.choice((-1, 1)), rng.choice(EXTREMES), rng.getrandbits(8)))
+            new = rng.choice((number + rng.choice((-1, 1)), rng.choice(EXTREME_INTEGERS), rng.getrandbits(8)))
             fields[name] = (new % 256**width, width)
         elif name.startswith("chunks") and len(value) >= 4 and rng.random() < 0.5:
-            # Bits moved from one chunk to another: the sum, and with it the length, stays right.
+            # Bits move from one chunk to another, so that the sum of the sizes, and the length, stay correct.
             sizes = np.frombuffer(value[: len(value) // 2 * 2], "<u2").astype(np.int64)
             one, other, moved = rng.randrange(len(sizes)), rng.randrange(len(sizes)), rng.randint(1, 9)
             sizes[one] -= min(moved, sizes[one])
@@ -405,7 +420,7 @@ def _forge_fields(rng: Random) -> bytes:
         else:
             fields[name] = edit_bytes(value, rng, 2)
     if rng.random() < 0.8:
-        _repair(fields)
+        _repair_lengths(fields)
     part.data = b"".join(
         value[0].to_bytes(value[1], "little") if isinstance(value, tuple) else value for value in fields.values()
     )
@@ -413,12 +428,12 @@ def _forge_fields(rng: Random) -> bytes:
 
 
 def _forge_exposure(rng: Random) -> bytes:
-    """An exposure map with other numbers, centers or lengths, also in files without one; often of the right length."""
-    parts = [replace(part) for part in _pick(rng)]
+    """Forge an exposure map's numbers, centers or length; add a map if there is none."""
+    parts = [replace(part) for part in _choose_sections(rng)]
     place = next((index for index, part in enumerate(parts) if part.tag == b"EXPO"), None)
     if place is None:
-        section, place = encode_exposure(_exposure(rng.choice((0, 1, 5, 64)))), 1
-        parts.insert(place, Part(section.type.encode(), section.codec, 0, section.data, section.raw_length))
+        section, place = encode_exposure(_make_exposure_map(rng.choice((0, 1, 5, 64)))), 1
+        parts.insert(place, RawSection(section.type.encode(), section.codec, 0, section.data, section.raw_length))
     data = bytearray(parts[place].data)
     for _ in range(rng.choice((1, 1, 2))):
         kind = rng.randrange(4)
@@ -432,24 +447,24 @@ def _forge_exposure(rng: Random) -> bytes:
         del data[84 + (len(data) - 84) // 12 * 12 :]
         data[0] = (len(data) - 84) // 12 % 256
     parts[place].data = bytes(data)
-    parts[place].raw_length = len(data) if rng.random() < 0.9 else rng.choice((*EXTREMES, len(data) + 4))
+    parts[place].raw_length = len(data) if rng.random() < 0.9 else rng.choice((*EXTREME_INTEGERS, len(data) + 4))
     return assemble(parts)
 
 
-def _fields(part: Part) -> dict[str, bytes | tuple[int, int]]:
-    """The payload of a valid section by field, in order: (number, bytes it takes), or bytes.
+def _split_fields(part: RawSection) -> dict[str, bytes | tuple[int, int]]:
+    """Split the payload of a valid section into fields in order; a field is (number, its width in bytes), or bytes.
 
-    A field "size of NAME" holds the bytes of all fields whose names start with NAME.
+    A field "size of NAME" is the number of bytes of all fields whose names start with NAME.
     """
     if part.codec == 6:
-        return _points_fields(part.data)
+        return _split_points_fields(part.data)
     if part.codec == 7:
-        return _channels_fields(part.data, 3 if part.tag[:3] == b"COL" else 1)
+        return _split_channels_fields(part.data, 3 if part.tag[:3] == b"COL" else 1)
     if part.codec == 8:
-        return _groups_fields(part.data)
+        return _split_groups_fields(part.data)
     if part.codec == 4:
         names = {"minimum": part.data[:4], "maximum": part.data[4:8], "bits": (part.data[8], 1)}
-        return names | _stream_fields(part.data[9:], "")
+        return names | _split_stream_fields(part.data[9:], "")
     if part.codec != 3:
         return {"numbers": part.data}
     stages, columns, size = struct.unpack_from("<BBH", part.data)
@@ -458,23 +473,23 @@ def _fields(part: Part) -> dict[str, bytes | tuple[int, int]]:
     for stage in range(stages):
         (length,) = struct.unpack_from("<Q", part.data, end)
         fields[f"length {stage}"] = (length, 8)
-        fields |= _stream_fields(part.data[end + 8 : end + 8 + length], f" {stage}")
+        fields |= _split_stream_fields(part.data[end + 8 : end + 8 + length], f" {stage}")
         end += 8 + length
     return fields
 
 
-def _points_fields(data: bytes) -> dict[str, bytes | tuple[int, int]]:
+def _split_points_fields(data: bytes) -> dict[str, bytes | tuple[int, int]]:
     base, kinds, *sizes = struct.unpack_from("<BBII", data)
     fields = {"base": (base, 1), "size of bits": (kinds, 1), "size of gaps": (sizes[0], 4)}
     fields |= {"size of classes": (sizes[1], 4), "bits": data[10 : 10 + kinds]}
     start = 10 + kinds
     for name, size in zip(("gaps", "classes"), sizes, strict=True):
-        fields |= _integers_fields(data[start : start + size], name)
+        fields |= _split_integers_fields(data[start : start + size], name)
         start += size
     return fields | {"tails": data[start:]}
 
 
-def _channels_fields(data: bytes, columns: int) -> dict[str, bytes | tuple[int, int]]:
+def _split_channels_fields(data: bytes, columns: int) -> dict[str, bytes | tuple[int, int]]:
     fields = {"basis": data[:36]} if columns == 3 else {}
     start = len(fields) * 36
     for column in range(columns):
@@ -483,27 +498,27 @@ def _channels_fields(data: bytes, columns: int) -> dict[str, bytes | tuple[int, 
         fields |= {f"size of stream {column}": (size, 4), f"size of steps {column}": (kinds, 1)}
         start += 10 + kinds
         fields[f"steps {column}"] = data[start - kinds : start]
-        fields |= _integers_fields(data[start : start + size], f"stream {column}")
+        fields |= _split_integers_fields(data[start : start + size], f"stream {column}")
         start += size
     return fields
 
 
-def _groups_fields(data: bytes) -> dict[str, bytes | tuple[int, int]]:
+def _split_groups_fields(data: bytes) -> dict[str, bytes | tuple[int, int]]:
     first, second = struct.unpack_from("<II", data)
     fields = {"size of steps": (first, 4), "size of models": (second, 4)}
-    fields |= _integers_fields(data[8 : 8 + first], "steps")
-    fields |= _integers_fields(data[8 + first : 8 + first + second], "models")
-    return fields | _integers_fields(data[8 + first + second :], "symbols")
+    fields |= _split_integers_fields(data[8 : 8 + first], "steps")
+    fields |= _split_integers_fields(data[8 + first : 8 + first + second], "models")
+    return fields | _split_integers_fields(data[8 + first + second :], "symbols")
 
 
-def _integers_fields(data: bytes, name: str) -> dict[str, bytes | tuple[int, int]]:
-    """A stream of integers: its first two numbers, and what they decide about."""
+def _split_integers_fields(data: bytes, name: str) -> dict[str, bytes | tuple[int, int]]:
+    """Split a stream of integers into its first two numbers and the rest."""
     if len(data) < 2:
         return {f"{name} rest": data}
     return {f"{name} lanes": (data[0], 1), f"{name} alphabet": (data[1], 1), f"{name} rest": data[2:]}
 
 
-def _stream_fields(data: bytes, suffix: str) -> dict[str, bytes | tuple[int, int]]:
+def _split_stream_fields(data: bytes, suffix: str) -> dict[str, bytes | tuple[int, int]]:
     names = {"count": 8, "packed": 8, "leaves": 4, "end": 4, "width": 1, "wide": 1}
     count, packed, leaves, _, width, wide = numbers = struct.unpack_from("<QQIIBB", data)
     sizes = {"lengths": leaves, "symbols": max(leaves - 1, 0) * width}
@@ -516,8 +531,8 @@ def _stream_fields(data: bytes, suffix: str) -> dict[str, bytes | tuple[int, int
     return fields
 
 
-def _repair(fields: dict) -> None:
-    """Make the lengths in the fields what the bytes beside them are."""
+def _repair_lengths(fields: dict) -> None:
+    """Set the length fields to the lengths of the forged bytes, in place."""
     for name, value in fields.items():
         if name.startswith("codes"):
             fields["packed" + name[5:]] = (len(value), 8)
@@ -533,12 +548,12 @@ def _repair(fields: dict) -> None:
             fields[name] = (total % 256 ** value[1], value[1])
 
 
-def _pick(rng: Random) -> tuple[Part, ...]:
-    return _disassembled(_seed(rng))
+def _choose_sections(rng: Random) -> tuple[RawSection, ...]:
+    return _disassemble_cached(_choose_seed_file(rng))
 
 
-# How inputs are made, and how often.
-KINDS: dict[str, tuple[int, Callable[[Random], bytes]]] = {
+# Each kind of input has a weight and a function that makes such an input.
+INPUT_KINDS: dict[str, tuple[int, Callable[[Random], bytes]]] = {
     "flipped bits": (10, _flip_bits),
     "damaged bytes": (10, _damage_bytes),
     "truncated": (8, _truncate),
@@ -553,8 +568,8 @@ KINDS: dict[str, tuple[int, Callable[[Random], bytes]]] = {
 }
 
 
-def mutant(number: int, seed: int = 0) -> tuple[str, bytes]:
-    """The kind of input `number` of the run with this seed, and its bytes. Same numbers, same bytes."""
+def make_hostile_file(number: int, seed: int = 0) -> tuple[str, bytes]:
+    """Return the kind and the bytes of input `number` of the run with this seed; the result is deterministic."""
     rng = Random(f"{seed}:{number}")
-    kind = rng.choices(list(KINDS), [weight for weight, _ in KINDS.values()])[0]
-    return kind, KINDS[kind][1](rng)
+    kind = rng.choices(list(INPUT_KINDS), [weight for weight, _ in INPUT_KINDS.values()])[0]
+    return kind, INPUT_KINDS[kind][1](rng)

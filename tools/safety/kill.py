@@ -1,14 +1,17 @@
-"""Kills train, compress, decompress, render and make at random moments and checks what is left on the disk.
+"""Kill train, compress, decompress, render and make at random moments, and check the files that they leave.
 
     python -m tools.safety.kill                                   50 kills of each command (25 minutes on two cores)
     python -m tools.safety.kill --kills 10 --commands compress decompress --seed 3
 
-Each trial starts the real command line over what an earlier run with another seed left, and ends it with SIGKILL: half
-of the trials at a moment drawn evenly from the command's time, half up to 2 ms after the k-th temporary file appears.
-Then every file must hold its old bytes or the whole new ones, and nothing else may be there but temporary files. Where
-there are such, and in every fifth trial, the command is run again (train with --resume where there is a checkpoint): it
-must end with the bytes of an uninterrupted run and leave no temporary file. In the work folder of make, what is made
-anew may be gone. Exits with 1 on a violation.
+Each trial starts the real command in a folder with the results of an earlier run with another seed, and ends it with
+SIGKILL. In half of the trials the moment is uniform over the command's duration; in the other half it is at most 2 ms
+after the k-th temporary file appears. Afterwards every file must hold its old bytes or the complete new ones, and there
+may be no further files except temporary ones. If there are temporary files, and in every fifth trial, the command runs
+again (train with --resume if there is a checkpoint). That run must leave the bytes of an uninterrupted run and no
+temporary file. In the work folder of make, products that are being replaced may be missing.
+
+It prints one line for each command: seconds of a run, kills, the moments of the kills, temporary files, reruns and
+violations. It exits with 1 after a violation.
 """
 
 from __future__ import annotations
@@ -42,70 +45,95 @@ from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
 from hyrfpack.make.state import RECORD_NAME as RECORD
 from hyrfpack.train.checkpoint import DIGEST_BYTES
 
-ENVIRONMENT = {**os.environ, "HYRFPACK_THREADS": "1", "OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE"}
-COMMANDS = ("train", "compress", "decompress", "render", "make")  # each works on what those before it made
-MOMENTS = ("before", "while writing", "between or after", "too late")
-DRAFT = ["--quality", "draft"]
-TRAINING = ["--steps", "60", "--log2-table-size", "13"]
-FRAMES = 6
-WORK = "out.work"  # of make
-PLACES = ("", "views", WORK, f"{WORK}/run", f"{WORK}/run/views", f"{WORK}/export")  # where files are written
-POLL = 2e-4  # seconds between looks for a temporary file
-AIM = 2e-3  # seconds: the most between the sight of a temporary file and the kill
+COMMAND_ENVIRONMENT = {**os.environ, "HYRFPACK_THREADS": "1", "OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE"}
+COMMAND_NAMES = ("train", "compress", "decompress", "render", "make")  # the inputs of each come from those before it
+KILL_MOMENTS = ("before", "while writing", "between or after", "too late")
+MAKE_OPTIONS = ["--quality", "draft"]
+TRAIN_OPTIONS = ["--steps", "60", "--log2-table-size", "13"]
+ORBIT_FRAMES = 6
+WORK_FOLDER_NAME = "out.work"  # the work folder of make
+# The folders of an output in which the commands write files.
+WRITTEN_FOLDERS = (
+    "",
+    "views",
+    WORK_FOLDER_NAME,
+    f"{WORK_FOLDER_NAME}/run",
+    f"{WORK_FOLDER_NAME}/run/views",
+    f"{WORK_FOLDER_NAME}/export",
+)
+POLL_SECONDS = 2e-4  # interval of looking for temporary files
+MAX_KILL_DELAY_SECONDS = 2e-3  # longest delay of the kill after a temporary file appears
 RERUN_EVERY = 5
 
 
 @dataclass
 class Case:
-    """One command: its arguments for an output folder, and what it writes there over what is there already."""
+    """One command, with its old and its new files.
+
+    Attributes:
+        name: the command.
+        arguments: returns the command line for an output folder.
+        old: the files before the command runs, by path.
+        new: the files that an uninterrupted run writes, by path.
+        seconds: duration of an uninterrupted run.
+        writes: number of temporary files that appear during this run.
+    """
 
     name: str
     arguments: Callable[[Path], list[str]]
     old: dict[str, bytes] = field(default_factory=dict)
     new: dict[str, bytes] = field(default_factory=dict)
-    seconds: float = 0.0  # of an uninterrupted run
-    writes: int = 0  # temporary files seen meanwhile
+    seconds: float = 0.0
+    writes: int = 0
 
 
 @dataclass
 class Outcome:
-    """One trial: where the kill came, and what is wrong."""
+    """Result of one trial.
+
+    Attributes:
+        moment: one of KILL_MOMENTS.
+        temporary_files: number of temporary files that the kill left.
+        was_rerun: whether the command ran again.
+        faults: descriptions of the violations.
+    """
 
     moment: str
-    strays: int
-    rerun: bool
-    wrong: list[str]
+    temporary_files: int
+    was_rerun: bool
+    faults: list[str]
 
 
-def start(arguments: list[str]) -> subprocess.Popen:
-    """The command line in a process of its own."""
+def start_command(arguments: list[str]) -> subprocess.Popen:
+    """Start a hyrfpack command as a child process."""
     command = [sys.executable, "-m", "hyrfpack", *arguments]
-    return subprocess.Popen(command, env=ENVIRONMENT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    return subprocess.Popen(command, env=COMMAND_ENVIRONMENT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
 
 
-def is_stray(name: str) -> bool:
+def is_temporary_file(name: str) -> bool:
+    """Return whether a path has the name of a temporary file of `hyrfpack.atomic`."""
     base = os.path.basename(name)
     return base.startswith(TEMPORARY_PREFIX) and base.endswith(TEMPORARY_SUFFIX)
 
 
-def contents(folder: Path) -> dict[str, bytes]:
-    """Files below a folder, by their path in it."""
+def read_files(folder: Path) -> dict[str, bytes]:
+    """Return the bytes of all files below a folder, by their path in it."""
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
-def watch(process: subprocess.Popen, folder: Path, enough: int | None = None) -> int:
-    """Wait until `enough` temporary files have been seen, or the process has ended; returns how many were seen."""
+def wait_for_temporary_files(process: subprocess.Popen, folder: Path, count: int | None = None) -> int:
+    """Wait until `count` temporary files have appeared, or the process has ended; return how many appeared."""
     seen: set[str] = set()
-    while process.poll() is None and (enough is None or len(seen) < enough):
-        for place in (folder / name for name in PLACES):
-            if place.is_dir():
-                seen.update(name for name in os.listdir(place) if is_stray(name))
-        time.sleep(POLL)
+    while process.poll() is None and (count is None or len(seen) < count):
+        for folder_path in (folder / name for name in WRITTEN_FOLDERS):
+            if folder_path.is_dir():
+                seen.update(name for name in os.listdir(folder_path) if is_temporary_file(name))
+        time.sleep(POLL_SECONDS)
     return len(seen)
 
 
-def untimed(metrics: bytes) -> dict:
-    """A run's metrics without what the clock says."""
+def drop_times(metrics: bytes) -> dict:
+    """Return a run's metrics without the measured times."""
     values = json.loads(metrics)
     for key in ("seconds", "steps_per_second", "stage_seconds"):
         del values[key]
@@ -113,19 +141,19 @@ def untimed(metrics: bytes) -> dict:
     return values
 
 
-def fault(name: str, data: bytes, case: Case) -> str | None:
-    """What is wrong with a file under its final name; None for the old bytes and for the whole new ones."""
+def find_file_fault(name: str, data: bytes, case: Case) -> str | None:
+    """Return what is wrong with a file under its final name; None if it has the old or the complete new bytes."""
     if data == case.old.get(name):
         return None
     base = os.path.basename(name)
     if base != CHECKPOINT_FILE and name not in case.new:
-        return "nobody asked for this file"
+        return "the command does not write this file"
     try:
         if base == CHECKPOINT_FILE:
             same = hashlib.sha256(data[:-DIGEST_BYTES]).digest() == data[-DIGEST_BYTES:]
             torch.load(io.BytesIO(data[:-DIGEST_BYTES]), weights_only=True)
         elif base == METRICS_FILE:
-            same = untimed(data) == untimed(case.new[name])
+            same = drop_times(data) == drop_times(case.new[name])
         elif base == RECORD:
             same = set(json.loads(data)["stages"]) <= set(json.loads(case.new[name])["stages"])
         else:
@@ -136,77 +164,86 @@ def fault(name: str, data: bytes, case: Case) -> str | None:
                 Image.open(io.BytesIO(data)).load()
     except Exception as error:
         return f"it cannot be read ({error!r})"
-    return None if same else "neither the old bytes nor the new ones"
+    return None if same else "it has neither the old bytes nor the new ones"
 
 
-def faults(found: dict[str, bytes], case: Case) -> list[str]:
-    """What is wrong with a folder after a kill."""
-    wrong = [f"{name} is gone" for name in case.old if name not in found and not name.startswith(f"{WORK}/")]
+def find_faults(found: dict[str, bytes], case: Case) -> list[str]:
+    """Return descriptions of all faults in a folder after a kill."""
+    faults = [
+        f"{name} is missing" for name in case.old if name not in found and not name.startswith(f"{WORK_FOLDER_NAME}/")
+    ]
     for name, data in found.items():
-        if not is_stray(name) and (reason := fault(name, data, case)):
-            wrong.append(f"{name}: {reason}")
-    return wrong
+        if not is_temporary_file(name) and (reason := find_file_fault(name, data, case)):
+            faults.append(f"{name}: {reason}")
+    return faults
 
 
-def moment(found: dict[str, bytes], case: Case, killed: bool) -> str:
-    """Where in the command the kill came, by what it left."""
+def classify_moment(found: dict[str, bytes], case: Case, killed: bool) -> str:
+    """Return the moment of the kill, one of KILL_MOMENTS, judged by the files that are left."""
     if not killed:
         return "too late"
-    if any(map(is_stray, found)):
+    if any(map(is_temporary_file, found)):
         return "while writing"
     return "before" if found == case.old else "between or after"
 
 
-def rerun(case: Case, out: Path) -> list[str]:
-    """Run the command again after a kill: it must end as if nothing had happened."""
+def check_rerun(case: Case, out: Path) -> list[str]:
+    """Run the command again after a kill; return the differences from an uninterrupted run."""
     arguments = case.arguments(out)
     if (out / CHECKPOINT_FILE).exists():
         arguments = [argument if argument != "--overwrite" else "--resume" for argument in arguments]
-    process = start(arguments)
-    _, complaint = process.communicate()
+    process = start_command(arguments)
+    _, stderr_text = process.communicate()
     if process.returncode:
-        return [f"run again, it exits with {process.returncode}: {complaint.decode()[-300:]}"]
-    after = contents(out)
-    wrong = [f"run again: {sentence}" for sentence in faults(after, case)]
-    wrong += [f"run again: {name} is left" for name in after if is_stray(name) or name.endswith(CHECKPOINT_FILE)]
-    wrong += [
+        return [f"run again, it exits with {process.returncode}: {stderr_text.decode()[-300:]}"]
+    after = read_files(out)
+    faults = [f"run again: {sentence}" for sentence in find_faults(after, case)]
+    faults += [
+        f"run again: {name} is left" for name in after if is_temporary_file(name) or name.endswith(CHECKPOINT_FILE)
+    ]
+    faults += [
         f"run again: {name} is missing or still the old one"
         for name in case.new
         if after.get(name) == case.old[name] or name not in after
     ]
-    return wrong
+    return faults
 
 
-def attempt(case: Case, number: int, seed: int, out: Path) -> Outcome:
-    """One trial in a folder of its own, which stays when something is wrong."""
-    draw = random.Random(f"{seed} {case.name} {number}")
+def run_trial(case: Case, number: int, seed: int, out: Path) -> Outcome:
+    """Run one trial in its own folder, which is kept if there are faults."""
+    random_source = random.Random(f"{seed} {case.name} {number}")
     for name, data in case.old.items():
         (out / name).parent.mkdir(parents=True, exist_ok=True)
         (out / name).write_bytes(data)
-    process = start(case.arguments(out))
+    process = start_command(case.arguments(out))
     if number % 2:
-        watch(process, out, draw.randint(1, case.writes))
-        time.sleep(draw.uniform(0, AIM))
+        wait_for_temporary_files(process, out, random_source.randint(1, case.writes))
+        time.sleep(random_source.uniform(0, MAX_KILL_DELAY_SECONDS))
     else:
         with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(draw.uniform(0, case.seconds))
+            process.wait(random_source.uniform(0, case.seconds))
     process.kill()
-    _, complaint = process.communicate()
-    found = contents(out)
-    strays = sum(map(is_stray, found))
-    outcome = Outcome(moment(found, case, process.returncode == -signal.SIGKILL), strays, False, faults(found, case))
+    _, stderr_text = process.communicate()
+    found = read_files(out)
+    temporary_files = sum(map(is_temporary_file, found))
+    outcome = Outcome(
+        classify_moment(found, case, process.returncode == -signal.SIGKILL),
+        temporary_files,
+        False,
+        find_faults(found, case),
+    )
     if process.returncode not in (0, -signal.SIGKILL):
-        outcome.wrong.append(f"it ended by itself with {process.returncode}: {complaint.decode()[-300:]}")
-    if strays or number % RERUN_EVERY == 0:
-        outcome.rerun = True
-        outcome.wrong += rerun(case, out)
-    if not outcome.wrong:
+        outcome.faults.append(f"it ended by itself with {process.returncode}: {stderr_text.decode()[-300:]}")
+    if temporary_files or number % RERUN_EVERY == 0:
+        outcome.was_rerun = True
+        outcome.faults += check_rerun(case, out)
+    if not outcome.faults:
         shutil.rmtree(out)
     return outcome
 
 
 def prepare(work: Path, names: Sequence[str]) -> list[Case]:
-    """Make the inputs, run the commands to their ends twice (old and new), and measure the second time."""
+    """Make the inputs, run each command twice without a kill for its old and new files, and time the second run."""
     scene = write_demo_scene(work / "scene", views=10, size=48)
     cases = []
     for name in names:
@@ -214,53 +251,74 @@ def prepare(work: Path, names: Sequence[str]) -> list[Case]:
         def arguments(out: Path, seed: int = 0, name: str = name) -> list[str]:
             model, packed = work / f"train-{seed}" / MODEL_FILE, work / f"compress-{seed}" / "out.hyrf"
             return {
-                "train": ["train", str(scene), "-o", str(out), "--overwrite", "--seed", str(seed), *TRAINING],
+                "train": ["train", str(scene), "-o", str(out), "--overwrite", "--seed", str(seed), *TRAIN_OPTIONS],
                 "compress": ["compress", str(model), "-o", str(out / "out.hyrf"), "--overwrite"],
                 "decompress": ["decompress", str(packed), "-o", str(out / "out.hyrf"), "--overwrite"],
-                "render": ["render", str(packed), "-o", str(out), "--orbit", str(FRAMES), "--overwrite"],
-                "make": ["make", str(scene), "-o", str(out / "out.hyrf"), "--overwrite", "--seed", str(seed), *DRAFT],
+                "render": ["render", str(packed), "-o", str(out), "--orbit", str(ORBIT_FRAMES), "--overwrite"],
+                "make": [
+                    "make",
+                    str(scene),
+                    "-o",
+                    str(out / "out.hyrf"),
+                    "--overwrite",
+                    "--seed",
+                    str(seed),
+                    *MAKE_OPTIONS,
+                ],
             }[name]
 
         case = Case(name, arguments)
         for seed in (1, 0):
             out = work / f"{name}-{seed}"
             out.mkdir()
-            process, began = start(arguments(out, seed)), time.perf_counter()
-            case.writes = max(1, watch(process, out))
-            case.seconds = time.perf_counter() - began
+            process, started = start_command(arguments(out, seed)), time.perf_counter()
+            case.writes = max(1, wait_for_temporary_files(process, out))
+            case.seconds = time.perf_counter() - started
             if process.returncode:
-                complaint = process.stderr.read().decode()
-                raise SystemExit(f"{' '.join(process.args)}: exit {process.returncode}\n{complaint}")
-        case.old, case.new = contents(work / f"{name}-1"), contents(work / f"{name}-0")
+                stderr_text = process.stderr.read().decode()
+                raise SystemExit(f"{' '.join(process.args)}: exit {process.returncode}\n{stderr_text}")
+        case.old, case.new = read_files(work / f"{name}-1"), read_files(work / f"{name}-0")
         cases.append(case)
     return cases
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--kills", type=int, default=50, help="of each command (50)")
-    parser.add_argument("--commands", nargs="+", choices=COMMANDS, default=COMMANDS, help="which to kill (all)")
-    parser.add_argument("--seed", type=int, default=0, help="of the moments (0)")
-    parser.add_argument("--jobs", type=int, default=2, help="trials at once (2)")
+    parser.add_argument("--kills", type=int, default=50, help="number of kills of each command (50)")
+    parser.add_argument(
+        "--commands", nargs="+", choices=COMMAND_NAMES, default=COMMAND_NAMES, help="commands to kill (all)"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="random seed of the moments (0)")
+    parser.add_argument("--jobs", type=int, default=2, help="number of trials at the same time (2)")
     args = parser.parse_args()
     work = Path(tempfile.mkdtemp(prefix="hyrfpack-kill-"))
-    header = ("command", "seconds", "kills", *MOMENTS, "temporary files", "run again", "violations")
+    header = ("command", "seconds", "kills", *KILL_MOMENTS, "temporary files", "run again", "violations")
     print(" | ".join(header), flush=True)
-    bad = []
-    for case in prepare(work, COMMANDS[: 1 + max(map(COMMANDS.index, args.commands))]):
+    violations = []
+    for case in prepare(work, COMMAND_NAMES[: 1 + max(map(COMMAND_NAMES.index, args.commands))]):
         if case.name not in args.commands:
             continue
-        places = [work / f"{case.name}-trial-{number}" for number in range(args.kills)]
+        folders = [work / f"{case.name}-trial-{number}" for number in range(args.kills)]
         with ThreadPoolExecutor(args.jobs) as pool:
-            outcomes = list(pool.map(attempt, [case] * args.kills, range(args.kills), [args.seed] * args.kills, places))
+            outcomes = list(
+                pool.map(run_trial, [case] * args.kills, range(args.kills), [args.seed] * args.kills, folders)
+            )
         count = Counter(outcome.moment for outcome in outcomes)
-        wrong = [f"{place.name}: {text}" for place, o in zip(places, outcomes, strict=True) for text in o.wrong]
-        strays, again = sum(o.strays for o in outcomes), sum(o.rerun for o in outcomes)
-        row = (case.name, f"{case.seconds:.1f}", args.kills, *(count[m] for m in MOMENTS), strays, again, len(wrong))
+        faults = [f"{folder.name}: {text}" for folder, o in zip(folders, outcomes, strict=True) for text in o.faults]
+        temporary_files, reruns = sum(o.temporary_files for o in outcomes), sum(o.was_rerun for o in outcomes)
+        row = (
+            case.name,
+            f"{case.seconds:.1f}",
+            args.kills,
+            *(count[m] for m in KILL_MOMENTS),
+            temporary_files,
+            reruns,
+            len(faults),
+        )
         print(" | ".join(f"{value:>{len(title)}}" for title, value in zip(header, row, strict=True)), flush=True)
-        bad += wrong
-    if bad:
-        print("\n".join(bad), f"what the trials left is in {work}", sep="\n")
+        violations += faults
+    if violations:
+        print("\n".join(violations), f"the files of the failed trials are in {work}", sep="\n")
         sys.exit(1)
     shutil.rmtree(work)
 

@@ -1,8 +1,9 @@
-"""Make the golden files under tests/golden: what this version of the format writes, for all later ones to read.
+"""Write the golden files in tests/golden: files of the current format that all later versions must be able to read.
 
     python -m tools.safety.make_golden
 
-A golden file is never made again once a release has written such files: delete it by hand to replace it before.
+It prints one line for each file and keeps existing files. Golden files of a released format version never change. To
+replace one before the release, delete it by hand first.
 """
 
 from __future__ import annotations
@@ -21,13 +22,17 @@ from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.render import RenderSettings, render
 from hyrfpack.scene import Camera
 from tools.safety import minimal_reader
-from tools.safety.plans import encode
+from tools.safety.synthetic_encoding import encode
 
-TESTS = Path(__file__).parents[2] / "tests"
-FOLDER = TESTS / "golden"
-PROVENANCE = {"preset": "standard", "steps": 100, "why": {"geometry": "one entry a Gaussian", "name": "caf\u00e9"}}
-# The smallest and the largest codes of centers, and limits that are reached.
-EXPOSURE = ExposureMap(
+TESTS_FOLDER = Path(__file__).parents[2] / "tests"
+GOLDEN_FOLDER = TESTS_FOLDER / "golden"
+GOLDEN_PROVENANCE = {
+    "preset": "standard",
+    "steps": 100,
+    "why": {"geometry": "one entry a Gaussian", "name": "caf\u00e9"},
+}
+# The map has the smallest and the largest codes of centers, and limits that are reached.
+GOLDEN_EXPOSURE_MAP = ExposureMap(
     box=np.array([[-0.5, -0.25, -1.0], [0.75, -0.25, 2.0]], np.float32),
     lengths=np.array([0.7, 1.3], np.float32),
     mean=np.array([0.1, 0.0, -0.05], np.float32),
@@ -37,18 +42,18 @@ EXPOSURE = ExposureMap(
     directions=np.array([[0, 0, 127], [-128, 0, 0], [90, -90, 5], [-60, 1, 111]], np.int8),
     weights=np.array([[32767, -20000, 1], [-32768, 9000, 250], [15000, 30000, -12000], [0, -1, 22222]], np.int16),
 )
-# File -> profile, settings and exposure map.
-FILES: dict[str, tuple[str, dict[str, Any], ExposureMap | None]] = {
+# Profile, settings and exposure map of each file.
+GOLDEN_FILES: dict[str, tuple[str, dict[str, Any], ExposureMap | None]] = {
     "v1.0_raw": ("raw", {}, None),
     "v1.0_paper": ("paper", {"color": (3, 8), "scale": (2, 4), "opacity": (1, 16)}, None),
     "v1.1_compact": ("compact", {"distortion": 5e-4}, None),
     "v1.1_compact_layers": ("compact", {"distortion": 1e-5, "layered": True}, None),
-    "v1.2_compact_exposure": ("compact", {"distortion": 5e-4}, EXPOSURE),
+    "v1.2_compact_exposure": ("compact", {"distortion": 5e-4}, GOLDEN_EXPOSURE_MAP),
 }
 
 
-def golden_model() -> HybridModel:
-    """A model of 20 Gaussians with one dense and one hashed level in each grid, and no two sizes alike."""
+def make_golden_model() -> HybridModel:
+    """Return a model of 20 Gaussians with one dense and one hashed level in each grid, and no two equal sizes."""
     rng = np.random.default_rng(20)
     config = ModelConfig(
         frame=Frame(center=(1e6, -0.1, 3.0), scale=12.5, half_extent=(1.0, 0.75, 0.25)),
@@ -72,8 +77,8 @@ def golden_model() -> HybridModel:
     return model
 
 
-def expected(model: HybridModel, name: str) -> np.ndarray:
-    """A parameter as the paper profile must give it back, from the original by the profile's definition."""
+def expect_parameter(model: HybridModel, name: str) -> np.ndarray:
+    """Return a parameter as profile paper must decode it, computed from the original by the profile's definition."""
     values = model.state_dict()[name].numpy()
     if name.endswith("grid.table"):
         low, high = values.min().astype(np.float64), values.max().astype(np.float64)
@@ -82,46 +87,46 @@ def expected(model: HybridModel, name: str) -> np.ndarray:
     return values.astype(np.float16).astype(np.float32)
 
 
-def recorded(model: HybridModel, profile: str, data: bytes) -> dict[str, np.ndarray]:
-    """What the file must decode to, by parameter."""
+def expect_values(model: HybridModel, profile: str, data: bytes) -> dict[str, np.ndarray]:
+    """Return the values that the file must decode to, by parameter."""
     _, groups, exposure = minimal_reader.read(data)
-    gains = {} if exposure is None else recorded_gains(exposure, decode_model(data))
+    gains = {} if exposure is None else expect_exposure(exposure, decode_model(data))
     if profile == "compact":
-        # What is kept and how finely is the encoder's choice, so these come from the minimal reader.
+        # The encoder chooses what to keep and how finely, so these values are checked against the minimal reader.
         decoded = decode_model(data)
         for group, values in to_arrays(decoded).items():
             assert np.array_equal(values.view(np.uint32), groups[group].view(np.uint32)), group
         return {name: value.numpy() for name, value in decoded.state_dict().items()} | gains
     original = {name: value.numpy() for name, value in model.state_dict().items()}
-    values = dict(original) if profile == "raw" else {name: expected(model, name) for name in original}
+    values = dict(original) if profile == "raw" else {name: expect_parameter(model, name) for name in original}
     for group, name in {"COLO": "color_logits", "SCAL": "scale_logits", "OPAC": "opacity_logits"}.items():
         before = original[f"gaussians.{name}"]
         after = groups[group]
-        # Codebooks depend on k-means, so these come from the minimal reader, and are near the original.
+        # Codebooks depend on k-means, so these values come from the minimal reader; they must be near the original.
         assert np.abs(after - before).max() < 0.5 * before.std()
         values[f"gaussians.{name}"] = after
     return values | gains
 
 
-def golden_camera() -> Camera:
-    """A camera that sees the golden model from inside the box of the exposure map."""
-    config = golden_model().config
+def make_golden_camera() -> Camera:
+    """Return a camera that sees the golden model from inside the box of the exposure map."""
+    config = make_golden_model().config
     pose = np.eye(4)
     pose[:3, 3] = config.frame.scale * np.array([0.1, 0.2, 1.0]) - np.array(config.frame.center)
     return Camera(16, 12, 20.0, 20.0, 8.0, 6.0, pose)
 
 
-def recorded_gains(exposure: minimal_reader.Exposure, model: HybridModel) -> dict[str, np.ndarray]:
-    """Log gains (20, 3) at 20 viewpoints and a picture as photographed, (12, 16, 3), by the equations of the page.
+def expect_exposure(exposure: minimal_reader.Exposure, model: HybridModel) -> dict[str, np.ndarray]:
+    """Return log gains (20, 3) at 20 viewpoints and one exposed picture (12, 16, 3), by the equations of the format.
 
-    Positions are in local units, inside and outside the box; the first viewpoint is that of `golden_camera`.
+    Positions are in local units, inside and outside the box. The first viewpoint is that of `make_golden_camera`.
     """
     rng = np.random.default_rng(0)
     positions, directions = rng.uniform(-2, 3, (20, 3)), rng.normal(size=(20, 3))
     positions[0], directions[0] = (-0.1, -0.2, -1.0), (0.0, 0.0, 1.0)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     logs = np.array([minimal_reader.log_gains(exposure, *view) for view in zip(positions, directions, strict=True)])
-    consistent = render(model, golden_camera(), RenderSettings(exposure=CONSISTENT_EXPOSURE)).rgb.double().numpy()
+    consistent = render(model, make_golden_camera(), RenderSettings(exposure=CONSISTENT_EXPOSURE)).rgb.double().numpy()
     return {
         "exposure.positions": positions,
         "exposure.directions": directions,
@@ -131,16 +136,16 @@ def recorded_gains(exposure: minimal_reader.Exposure, model: HybridModel) -> dic
 
 
 def main() -> None:
-    model = golden_model()
-    for name, (profile, settings, exposure) in FILES.items():
-        target = FOLDER / f"{name}.hyrf"
+    model = make_golden_model()
+    for name, (profile, settings, exposure) in GOLDEN_FILES.items():
+        target = GOLDEN_FOLDER / f"{name}.hyrf"
         if target.exists():
-            print(f"{target} is there already and is kept")
+            print(f"{target} exists and is kept")
             continue
         model.exposure = exposure
-        data = encode(model, profile, PROVENANCE, **settings)
-        values = recorded(model, profile, data)
-        FOLDER.mkdir(exist_ok=True)
+        data = encode(model, profile, GOLDEN_PROVENANCE, **settings)
+        values = expect_values(model, profile, data)
+        GOLDEN_FOLDER.mkdir(exist_ok=True)
         target.write_bytes(data)
         np.savez_compressed(target.with_suffix(".npz"), **values)
         print(f"{target}: {len(data)} bytes")

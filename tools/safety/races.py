@@ -1,17 +1,19 @@
-"""Starts commands at the same time, or creates a file where they are about to write, and checks that nothing is lost.
+"""Run two commands with one output at the same time, or create a file at a command's output, and check for data loss.
 
     python -m tools.safety.races                                   50 rounds of each race (ten minutes on two cores)
     python -m tools.safety.races --rounds 10 --races train export --seed 3
 
-Races of two commands: `train` with two seeds into one folder, and `compress` with and without pruning to one file. In
-every other round both start together; otherwise the second one starts at a random moment of the first one's work.
-Races with a file of another program, which is created at the output while the command works: `export` and `make`. The
-file is created at a random moment, or in every other round as soon as the command's temporary file is there.
+There are two races of two commands: `train` with two seeds into one folder, and `compress` with and without pruning to
+one file. In every other round both start together; otherwise the second starts at a random moment of the first one's
+run. There are two races with a file of another program, which is created at the output while the command runs: `export`
+and `make`. The file is created at a random moment, or in every other round when the command's temporary file appears.
 
-Each command runs in a process of its own, forked from this one, which has loaded all modules: commands that start
-together then also work at the same time. Every command that ends with exit code 0 must have left the bytes of an
-undisturbed run in the file that it names. Every other one must end with exit code 2 and one sentence. A file of another
-program must stay as it is, and no temporary file may be left. Exits with 1 on a violation.
+Each command runs in a process forked from this one, which has loaded all modules, so that commands that start together
+also run at the same time. A command with exit code 0 must have left the bytes of an undisturbed run in the file that it
+reports. Every other command must end with exit code 2 and one error message. A file of another program must stay
+unchanged, and no temporary file may be left.
+
+It prints one line for each race with the number of rounds by outcome, and exits with 1 after a violation.
 """
 
 from __future__ import annotations
@@ -39,23 +41,24 @@ import hyrfpack.make  # noqa: F401 - these three are loaded before processes are
 from hyrfpack.cli import main as cli
 from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.format.run_folder import METRICS_FILE, MODEL_FILE
-from tools.safety.kill import ENVIRONMENT, is_stray
+from tools.safety.kill import COMMAND_ENVIRONMENT, is_temporary_file
 
-FOREIGN = b"of another program"
-POLL_SECONDS = 2e-4  # between looks for a temporary file
-TRAINING = ["--steps", "30", "--max-gaussians", "200", "--log2-table-size", "10"]
-FORK = get_context("fork")
-BUSY, EXISTS = "is at work in this folder", "--overwrite"  # in the sentences of refusals
+FOREIGN_BYTES = b"of another program"
+POLL_SECONDS = 2e-4  # interval of looking for temporary files
+TRAIN_OPTIONS = ["--steps", "30", "--max-gaussians", "200", "--log2-table-size", "10"]
+FORK_CONTEXT = get_context("fork")
+# Each error message of a refused command has one of these texts.
+FOLDER_BUSY_TEXT, OUTPUT_EXISTS_TEXT = "is at work in this folder", "--overwrite"
 
 
 @dataclass
 class Command:
-    """One command line.
+    """One command.
 
     Attributes:
-        arguments: for an output.
-        expected: the bytes that an undisturbed run leaves.
-        seconds: that an undisturbed run takes.
+        arguments: returns the command line for an output.
+        expected: the bytes that an undisturbed run writes.
+        seconds: duration of an undisturbed run.
     """
 
     arguments: Callable[[Path], list[str]]
@@ -65,10 +68,10 @@ class Command:
 
 @dataclass
 class Race:
-    """What happens at the same time.
+    """Commands that run at the same time.
 
     Attributes:
-        commands: two, or one that a file of another program gets in the way of.
+        commands: two commands, or one whose output a file of another program occupies.
         output: the name of the output in the folder of a round.
     """
 
@@ -78,14 +81,14 @@ class Race:
 
 @dataclass
 class Outcome:
-    """One round: what came of it, in words, and what is wrong."""
+    """Result of one round: a label for counting, and the faults."""
 
-    words: str
-    wrong: list[str] = field(default_factory=list)
+    label: str
+    faults: list[str] = field(default_factory=list)
 
 
-class Running:
-    """A command line in a process of its own.
+class RunningCommand:
+    """A hyrfpack command that runs in its own process.
 
     Attributes:
         process: the process.
@@ -93,113 +96,113 @@ class Running:
 
     def __init__(self, arguments: list[str]) -> None:
         self._logs = [tempfile.TemporaryFile("w+") for _ in range(2)]  # standard output and standard error
-        self.process = FORK.Process(target=self._work, args=(arguments,))
+        self.process = FORK_CONTEXT.Process(target=self._work, args=(arguments,))
         self.process.start()
 
     def _work(self, arguments: list[str]) -> None:
         for log, descriptor in zip(self._logs, (1, 2), strict=True):
             os.dup2(log.fileno(), descriptor)
-        os.environ.update(ENVIRONMENT)
+        os.environ.update(COMMAND_ENVIRONMENT)
         torch.set_num_threads(1)
         cli(arguments, prog_name="hyrfpack")
 
-    def end(self) -> tuple[int, str, str]:
-        """Wait for the end; returns the exit code, and what was printed on standard output and standard error."""
+    def wait(self) -> tuple[int, str, str]:
+        """Wait for the command to end; return its exit code, standard output and standard error."""
         self.process.join()
-        said = []
+        outputs = []
         for log in self._logs:
             log.seek(0)
-            said.append(log.read())
+            outputs.append(log.read())
             log.close()
         code = self.process.exitcode
         assert code is not None  # it has ended
-        return code, said[0], said[1]
+        return code, outputs[0], outputs[1]
 
 
-def start(command: Command, output: Path) -> Running:
-    """The command, its results as JSON."""
-    return Running([*command.arguments(output), "--json"])
+def start_command(command: Command, output: Path) -> RunningCommand:
+    """Start a command with --json."""
+    return RunningCommand([*command.arguments(output), "--json"])
 
 
-def written_by(output: Path, said: str) -> Path:
-    """The file that a command says it has written."""
-    facts = json.loads(said)
+def find_written_file(output: Path, stdout_text: str) -> Path:
+    """Return the file that a command reports as written in its JSON output."""
+    facts = json.loads(stdout_text)
     if "complete" in facts:
         return output / MODEL_FILE
     return Path(facts.get("file") or facts["output"])
 
 
-def judge(command: Command, output: Path, running: Running) -> Outcome:
-    """What one command came to."""
-    code, said, complaint = running.end()
+def check_command(command: Command, output: Path, running: RunningCommand) -> Outcome:
+    """Wait for a command and check its exit code, its output file and its error message."""
+    code, stdout_text, stderr_text = running.wait()
     if code == 0:
-        written = written_by(output, said)
+        written = find_written_file(output, stdout_text)
         beside = written.name != (MODEL_FILE if output.is_dir() else output.name)
         data = written.read_bytes() if written.is_file() else b""
-        wrong = [] if data == command.expected else [f"exit code 0, and {written.name} does not hold its result"]
-        return Outcome("beside" if beside else "written", wrong)
-    errors = [line for line in complaint.splitlines() if line.startswith("Error: ")]
-    known = len(errors) == 1 and (BUSY in errors[0] or EXISTS in errors[0])
-    wrong = [] if code == 2 and known else [f"exit code {code}: {complaint[-300:]}"]
-    return Outcome("refused, busy" if errors and BUSY in errors[0] else "refused, exists", wrong)
+        faults = [] if data == command.expected else [f"exit code 0, and {written.name} does not hold its result"]
+        return Outcome("beside" if beside else "written", faults)
+    errors = [line for line in stderr_text.splitlines() if line.startswith("Error: ")]
+    known = len(errors) == 1 and (FOLDER_BUSY_TEXT in errors[0] or OUTPUT_EXISTS_TEXT in errors[0])
+    faults = [] if code == 2 and known else [f"exit code {code}: {stderr_text[-300:]}"]
+    return Outcome("refused, busy" if errors and FOLDER_BUSY_TEXT in errors[0] else "refused, exists", faults)
 
 
-def race_two(race: Race, folder: Path, draw: random.Random, together: bool) -> Outcome:
-    """Two commands with one output."""
+def race_commands(race: Race, folder: Path, random_source: random.Random, together: bool) -> Outcome:
+    """Run one round with two commands and one output."""
     output = folder / race.output
-    order = draw.sample(race.commands, 2)
-    running = [start(order[0], output)]
+    order = random_source.sample(race.commands, 2)
+    running = [start_command(order[0], output)]
     if not together:
-        time.sleep(draw.uniform(0, order[0].seconds))
-    running.append(start(order[1], output))
-    ends = [judge(command, output, one) for command, one in zip(order, running, strict=True)]
-    wrong = [sentence for end in ends for sentence in end.wrong]
-    if not any(end.words == "written" for end in ends):
-        wrong.append("none of them has written its output")
-    if output.is_dir() and not wrong:
-        winner = next(number for number, end in enumerate(ends) if end.words == "written")
+        time.sleep(random_source.uniform(0, order[0].seconds))
+    running.append(start_command(order[1], output))
+    ends = [check_command(command, output, one) for command, one in zip(order, running, strict=True)]
+    faults = [sentence for end in ends for sentence in end.faults]
+    if not any(end.label == "written" for end in ends):
+        faults.append("none of them has written its output")
+    if output.is_dir() and not faults:
+        winner = next(number for number, end in enumerate(ends) if end.label == "written")
         seed = json.loads((output / METRICS_FILE).read_text())["settings"]["seed"]
         if order[winner] is not race.commands[seed]:
-            wrong.append(f"the metrics are of seed {seed}, and the model is not")
-    return Outcome(" + ".join(sorted(end.words for end in ends)), wrong)
+            faults.append(f"the metrics are of seed {seed}, and the model is not")
+    return Outcome(" + ".join(sorted(end.label for end in ends)), faults)
 
 
-def race_file(race: Race, folder: Path, draw: random.Random, together: bool) -> Outcome:
-    """A command, and a file of another program at its output."""
+def race_with_file(race: Race, folder: Path, random_source: random.Random, together: bool) -> Outcome:
+    """Run one round with a command and a file of another program at its output."""
     (command,), output = race.commands, folder / race.output
-    running, began = start(command, output), time.perf_counter()
-    moment = draw.uniform(0, command.seconds)
+    running, started = start_command(command, output), time.perf_counter()
+    moment = random_source.uniform(0, command.seconds)
     while running.process.is_alive():
-        if any(map(is_stray, os.listdir(folder))) if together else time.perf_counter() - began >= moment:
+        if any(map(is_temporary_file, os.listdir(folder))) if together else time.perf_counter() - started >= moment:
             break
         time.sleep(POLL_SECONDS)
     created = False
     with contextlib.suppress(FileExistsError), open(output, "xb") as file:
-        file.write(FOREIGN)
+        file.write(FOREIGN_BYTES)
         created = True
-    end = judge(command, output, running)
-    if created and output.read_bytes() != FOREIGN:
-        end.wrong.append("the file of another program was replaced")
-    return Outcome(end.words if created else "written before the file was created", end.wrong)
+    end = check_command(command, output, running)
+    if created and output.read_bytes() != FOREIGN_BYTES:
+        end.faults.append("the file of another program was replaced")
+    return Outcome(end.label if created else "written before the file was created", end.faults)
 
 
-def finish(running: Running) -> str:
-    """What a command that must succeed prints."""
-    code, said, complaint = running.end()
+def wait_for_success(running: RunningCommand) -> str:
+    """Wait for a command that must succeed; return its standard output."""
+    code, stdout_text, stderr_text = running.wait()
     if code:
-        raise SystemExit(f"exit code {code}\n{complaint}")
-    return said
+        raise SystemExit(f"exit code {code}\n{stderr_text}")
+    return stdout_text
 
 
 def prepare(work: Path) -> dict[str, Race]:
-    """Make the inputs, and run every command once without a disturbance."""
+    """Make the inputs, and run every command once undisturbed for its expected bytes and duration."""
     scene, run = write_demo_scene(work / "scene", views=10, size=48), work / "run"
     model, packed = str(run / MODEL_FILE), str(work / "packed.hyrf")
-    finish(Running(["train", str(scene), "-o", str(run), *TRAINING]))
-    finish(Running(["compress", model, "-o", packed, "--profile", "paper"]))
+    wait_for_success(RunningCommand(["train", str(scene), "-o", str(run), *TRAIN_OPTIONS]))
+    wait_for_success(RunningCommand(["compress", model, "-o", packed, "--profile", "paper"]))
 
     def train(seed: int) -> Command:
-        return Command(lambda out: ["train", str(scene), "-o", str(out), "--seed", str(seed), *TRAINING])
+        return Command(lambda out: ["train", str(scene), "-o", str(out), "--seed", str(seed), *TRAIN_OPTIONS])
 
     def compress(pruning: str) -> Command:
         return Command(lambda out: ["compress", model, "-o", str(out), pruning])
@@ -216,22 +219,22 @@ def prepare(work: Path) -> dict[str, Race]:
         for number, command in enumerate(race.commands):
             output = work / f"{name}-{number}" / race.output
             output.parent.mkdir()
-            began = time.perf_counter()
-            said = finish(start(command, output))
-            command.seconds = time.perf_counter() - began
-            command.expected = written_by(output, said).read_bytes()
+            started = time.perf_counter()
+            stdout_text = wait_for_success(start_command(command, output))
+            command.seconds = time.perf_counter() - started
+            command.expected = find_written_file(output, stdout_text).read_bytes()
     return races
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     names = ("train", "compress", "export", "make")
-    parser.add_argument("--rounds", type=int, default=50, help="of each race (50)")
-    parser.add_argument("--races", nargs="+", choices=names, default=names, help="which (all)")
-    parser.add_argument("--seed", type=int, default=0, help="of the moments (0)")
+    parser.add_argument("--rounds", type=int, default=50, help="number of rounds of each race (50)")
+    parser.add_argument("--races", nargs="+", choices=names, default=names, help="races to run (all)")
+    parser.add_argument("--seed", type=int, default=0, help="random seed of the moments (0)")
     args = parser.parse_args()
     work = Path(tempfile.mkdtemp(prefix="hyrfpack-races-"))
-    bad = []
+    violations = []
     for name, race in prepare(work).items():
         if name not in args.races:
             continue
@@ -239,18 +242,18 @@ def main() -> None:
         for number in range(args.rounds):
             folder = work / f"{name}-round-{number}"
             folder.mkdir()
-            run = race_two if len(race.commands) == 2 else race_file
+            run = race_commands if len(race.commands) == 2 else race_with_file
             outcome = run(race, folder, random.Random(f"{args.seed} {name} {number}"), number % 2 == 0)
-            outcome.wrong += [f"{path.name} is left" for path in folder.rglob("*") if is_stray(path.name)]
-            counts[outcome.words] += 1
-            bad += [f"{folder.name}: {sentence}" for sentence in outcome.wrong]
-            if not outcome.wrong:
+            outcome.faults += [f"{path.name} is left" for path in folder.rglob("*") if is_temporary_file(path.name)]
+            counts[outcome.label] += 1
+            violations += [f"{folder.name}: {sentence}" for sentence in outcome.faults]
+            if not outcome.faults:
                 shutil.rmtree(folder)
-        told = "; ".join(f"{count} {words}" for words, count in sorted(counts.items()))
-        print(f"{name}, {args.rounds} rounds: {told}", flush=True)
-    print(f"violations: {len(bad)}")
-    if bad:
-        print("\n".join(bad), f"what the rounds left is in {work}", sep="\n")
+        summary = "; ".join(f"{count} {label}" for label, count in sorted(counts.items()))
+        print(f"{name}, {args.rounds} rounds: {summary}", flush=True)
+    print(f"violations: {len(violations)}")
+    if violations:
+        print("\n".join(violations), f"the files of the failed rounds are in {work}", sep="\n")
         sys.exit(1)
     shutil.rmtree(work)
 

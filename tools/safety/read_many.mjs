@@ -1,11 +1,11 @@
-// Read many files with the decoder in JavaScript, for tools/safety/fuzz_browser.py and the tests.
+// Reads many files with the decoder in JavaScript, for tools/safety/fuzz_browser.py and the tests.
 //
 //   node read_many.mjs FILES
 //
-// FILES: for each file u32 length, u8 1 if its start will do, its bytes. Printed is a line of JSON for each, with the
-// milliseconds of processor time that it took: {ms, layers, whole, groups, peak} with a hash of each group's float32
-// numbers and the most bytes of memory up to then, {ms, refused} with the sentence, or {ms, failed} with an error that
-// should not be.
+// FILES holds for each file its length (u32), 1 if it is the start of a file and 0 otherwise (u8), and its bytes. The
+// program prints one line of JSON for each file, where `ms` is the CPU time in milliseconds: {ms, layers, whole, groups,
+// peak} with a hash of each group's float32 numbers and the peak memory up to now in bytes, {ms, refused} with the
+// message of the refusal, or {ms, failed} with an unexpected error.
 import { createHash } from "node:crypto";
 import { readFileSync } from "node:fs";
 
@@ -17,7 +17,7 @@ const hashOf = (numbers) => {
   return createHash("sha256").update(bytes).digest("hex");
 };
 
-// Of this program alone: what `resourceUsage` tells may be that of the one that started it.
+// Reads the peak memory of this process, because `resourceUsage` may include that of the parent process.
 const peakBytes = () => {
   try {
     return 1024 * Number(/VmHWM:\s+(\d+) kB/.exec(readFileSync("/proc/self/status", "utf8"))[1]);
@@ -26,7 +26,7 @@ const peakBytes = () => {
   }
 };
 
-const verdictOn = async (bytes, partial) => {
+const readVerdict = async (bytes, partial) => {
   const start = process.cpuUsage();
   const spent = () => {
     const { user, system } = process.cpuUsage(start);
@@ -52,6 +52,6 @@ const all = readFileSync(process.argv[2]);
 for (let at = 0; at < all.length; ) {
   const length = all.readUInt32LE(at), partial = all[at + 4] === 1;
   const bytes = new Uint8Array(all.subarray(at + 5, at + 5 + length));
-  console.log(JSON.stringify(await verdictOn(bytes, partial)));
+  console.log(JSON.stringify(await readVerdict(bytes, partial)));
   at += 5 + length;
 }

@@ -1,10 +1,11 @@
-"""Runs the Python of the documentation as written: each page from top to bottom, in a fresh interpreter and folder.
+"""Run the Python code of the documentation as written: each page from top to bottom, in a new process and folder.
 
     python -m tools.safety.run_docs                                docs/python-api.md and the README, all training steps
     python -m tools.safety.run_docs --steps 20 docs/python-api.md  fewer steps: quick, worse pictures and times
 
-The folder has photos in photos/bonsai: those of --data (default mipnerf360_bonsai among the real sets), or a made-up
-scene where there are none. Pages' Python is what stands in blocks marked so, and in indented ones that import hyrfpack.
+The folder has photos in photos/bonsai: those of --data (default: the real data set mipnerf360_bonsai), or a synthetic
+scene if there are none. The code of a page is that of its ```python blocks, and of indented blocks that import
+hyrfpack. It prints for each page whether it ran to its end and the seconds it took, and exits with 1 after a failure.
 """
 
 from __future__ import annotations
@@ -23,11 +24,15 @@ from pathlib import Path
 
 from hyrfpack.demo.scene import write_demo_scene
 
-ROOT = Path(__file__).parents[2]
-PAGES = (ROOT / "docs" / "python-api.md", ROOT / "README.md")
-DATA = Path(os.environ.get("HYRFPACK_DATA") or ROOT.parent / "shared" / "data") / "mipnerf360_bonsai"
-BLOCK = re.compile(r"^```python\n(?P<fenced>.*?)^```$|(?P<indented>(?:^    [^\n]*\n|^\n)+)", re.MULTILINE | re.DOTALL)
-FEWER = """
+REPOSITORY_ROOT = Path(__file__).parents[2]
+DOCUMENTED_PAGES = (REPOSITORY_ROOT / "docs" / "python-api.md", REPOSITORY_ROOT / "README.md")
+DEFAULT_PHOTOS_FOLDER = (
+    Path(os.environ.get("HYRFPACK_DATA") or REPOSITORY_ROOT.parent / "shared" / "data") / "mipnerf360_bonsai"
+)
+PYTHON_BLOCK_PATTERN = re.compile(
+    r"^```python\n(?P<fenced>.*?)^```$|(?P<indented>(?:^    [^\n]*\n|^\n)+)", re.MULTILINE | re.DOTALL
+)
+FEWER_STEPS_SCRIPT = """
 import runpy, sys
 from hyrfpack.distill import DistillConfig, initialize
 from hyrfpack.measure import timing
@@ -46,10 +51,10 @@ runpy.run_path(sys.argv[1], run_name="__main__")
 """
 
 
-def python_of(page: str) -> str:
-    """A page's Python, each line where it stands on the page, so that an error names the page's line."""
+def extract_python(page: str) -> str:
+    """Return a page's Python code with each line at its line number on the page, so that errors name that line."""
     lines = [""] * (page.count("\n") + 1)
-    for block in BLOCK.finditer(page):
+    for block in PYTHON_BLOCK_PATTERN.finditer(page):
         if block["fenced"] is None and "import hyrfpack" not in block["indented"]:
             continue
         kind = "fenced" if block["fenced"] is not None else "indented"
@@ -59,11 +64,11 @@ def python_of(page: str) -> str:
     return "\n".join(lines)
 
 
-def run(page: Path, data: Path, steps: int | None) -> bool:
-    """Run one page; whether it ran to its end."""
-    code = python_of(page.read_text(encoding="utf-8"))
+def run_page(page: Path, data: Path, steps: int | None) -> bool:
+    """Run one page; return whether it ran to its end."""
+    code = extract_python(page.read_text(encoding="utf-8"))
     if not code.strip():
-        print(f"{page}: there is no Python on it")
+        print(f"{page}: the page has no Python code")
         return False
     with tempfile.TemporaryDirectory(prefix="hyrfpack-docs-") as folder:
         photos, script = Path(folder, "photos", "bonsai"), Path(folder, page.name)
@@ -72,27 +77,27 @@ def run(page: Path, data: Path, steps: int | None) -> bool:
         else:
             write_demo_scene(photos)
         script.write_text(code, encoding="utf-8")
-        fewer = [] if steps is None else ["-c", FEWER.format(steps=steps)]
+        fewer = [] if steps is None else ["-c", FEWER_STEPS_SCRIPT.format(steps=steps)]
         return subprocess.run([sys.executable, *fewer, script], cwd=folder).returncode == 0
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("pages", nargs="*", type=Path, default=PAGES)
-    parser.add_argument("--data", type=Path, default=DATA, help="a folder of photos and poses")
-    parser.add_argument("--steps", type=int, help="training steps at most; as the pages say when left out")
+    parser.add_argument("pages", nargs="*", type=Path, default=DOCUMENTED_PAGES)
+    parser.add_argument("--data", type=Path, default=DEFAULT_PHOTOS_FOLDER, help="a folder of photos and poses")
+    parser.add_argument("--steps", type=int, help="limit of training steps (as written on the pages)")
     args = parser.parse_args()
     packages = ", ".join(f"{name} {version(name)}" for name in ("numpy", "torch", "pycolmap"))
-    photos = args.data if args.data.is_dir() else f"a made-up scene, for there is no {args.data}"
+    photos = args.data if args.data.is_dir() else f"a synthetic scene, because {args.data} does not exist"
     steps = "as many steps as written" if args.steps is None else f"at most {args.steps} steps"
     print(f"Python {platform.python_version()}, {packages}; {photos}; {steps}", flush=True)
     broken = 0
     for page in args.pages:
         print(f"== {page}", flush=True)
-        began = time.perf_counter()
-        done = run(page, args.data, args.steps)
+        started = time.perf_counter()
+        done = run_page(page, args.data, args.steps)
         broken += not done
-        print(f"== {page}: {'ran as written' if done else 'FAILED'}, {time.perf_counter() - began:.0f} s", flush=True)
+        print(f"== {page}: {'ran as written' if done else 'FAILED'}, {time.perf_counter() - started:.0f} s", flush=True)
     return min(broken, 1)
 
 

@@ -33,7 +33,7 @@ from hyrfpack.scene import Scene, View, evenly_spaced
 from hyrfpack.train import TrainConfig
 from tools.studies.ablation_models import FULL, NO_CULLING, TRAINED, Variant, build_trainer
 from tools.studies.train_sets import study_arguments
-from tools.tables import markdown
+from tools.tables import markdown_table
 
 SETS = ("mipnerf360_bonsai", "gerrard_hall", "drone_caliterra")
 ROWS = (*TRAINED, NO_CULLING)
@@ -144,7 +144,7 @@ def quality_table(results: Results, sets: Sequence[str], variants: Sequence[Vari
         paper = "" if variant.paper_psnr is None else f"{variant.paper_psnr:+.2f}"
         mean = f"{fmean(means):+.2f}" if means else ""
         rows.append((variant.name, paper, *cells, mean, f"{sum(m < 0 for m in means)} of {len(means)}"))
-    return markdown(columns, rows)
+    return markdown_table(columns, rows)
 
 
 def cost_table(results: Results, sets: Sequence[str], variants: Sequence[Variant]) -> str:
@@ -163,7 +163,7 @@ def cost_table(results: Results, sets: Sequence[str], variants: Sequence[Variant
         size, speed = (f"{part:.2f}" if part else "" for part in (variant.paper_size, variant.paper_frames))
         steps = ratio(variant, "steps_per_second", "steps_per_second")
         rows.append((variant.name, size, ratio(variant, "bytes", "bytes"), speed, frames, steps))
-    return markdown(columns, rows)
+    return markdown_table(columns, rows)
 
 
 def details_table(results: Results, name: str, variants: Sequence[Variant]) -> str:
@@ -184,7 +184,7 @@ def details_table(results: Results, name: str, variants: Sequence[Variant]) -> s
         values = {key: [r[key] for r in trained if r.get(key) is not None] for key in formats}
         cells = [format(fmean(values[key]), form) if values[key] else "" for key, form in formats.items()]
         rows.append((variant.name, *(cells if trained else ("did not train", *cells[1:]))))
-    return markdown(columns, rows)
+    return markdown_table(columns, rows)
 
 
 def _pairs(results: Results, variant: Variant, name: str) -> list[tuple[dict, dict]]:

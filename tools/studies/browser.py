@@ -26,7 +26,7 @@ from hyrfpack.cameras.files import camera_to_json
 from hyrfpack.scene import Camera, Scene, evenly_spaced
 from tools.browser import chromium
 from tools.browser.chromium import Chromium
-from tools.tables import markdown
+from tools.tables import markdown_table
 
 VIEWS = 8
 WINDOW = (1280, 800)
@@ -132,7 +132,7 @@ def main() -> None:
     parser.add_argument("--large", type=Path, nargs="*", default=[], help="models to time")
     parser.add_argument("--repeats", type=int, default=3, help="of each time (3)")
     arguments = parser.parse_args()
-    chromium.SECONDS = PATIENCE
+    chromium.TIMEOUT_SECONDS = PATIENCE
     with tempfile.TemporaryDirectory() as folder:
         if arguments.runs:
             runs = [arguments.runs / name for name in arguments.sets or []] or sorted(
@@ -142,10 +142,10 @@ def main() -> None:
             columns = [
                 f"{name} {what}" for name in ("native", "baked") for what in ("bytes", "dB", "worst", "photos dB")
             ]
-            print(markdown(["set", ".hyrf bytes", *columns], rows))
+            print(markdown_table(["set", ".hyrf bytes", *columns], rows))
         rows = [row for model in arguments.large for row in times(model, Path(folder), arguments.repeats)]
         if rows:
-            print(markdown(["Gaussians", "page", "bytes", "first s", "complete s", "frame ms"], rows))
+            print(markdown_table(["Gaussians", "page", "bytes", "first s", "complete s", "frame ms"], rows))
 
 
 if __name__ == "__main__":

@@ -29,7 +29,7 @@ from hyrfpack.format.codec import load_with_provenance
 from hyrfpack.model import HybridModel
 from hyrfpack.scene import evenly_spaced
 from tools.studies.train_sets import DATA
-from tools.tables import markdown
+from tools.tables import markdown_table
 
 ENDS = (1e-7, 1e-2)
 HELD_OUT = 12  # cameras at most that the error foretold is compared at
@@ -134,7 +134,7 @@ def table(rows: list[dict]) -> str:
         cells.append(f"{default['found'] / default['foretold']:.2f}")
         cells.append(f"{row['measuring']:.1f} + {default['seconds']:.1f}")
         lines.append(cells)
-    return markdown([*columns, "found / foretold", "seconds"], lines)
+    return markdown_table([*columns, "found / foretold", "seconds"], lines)
 
 
 def main() -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from hyrfpack.train import TrainConfig
 from tools.studies.train_sets import measure, study_arguments
-from tools.tables import line, markdown
+from tools.tables import markdown_row, markdown_table
 
 VARIANTS: dict[str, dict] = {
     "default": {},
@@ -32,7 +32,7 @@ def main() -> None:
     args = study_arguments(
         __doc__, steps=2000, sets=["mipnerf360_bonsai", "gerrard_hall"], out=Path("runs/design")
     ).parse_args()
-    print(markdown(("variant", "set", "PSNR", "spread", "SSIM", "Gaussians", "bytes", "steps/s"), []))
+    print(markdown_table(("variant", "set", "PSNR", "spread", "SSIM", "Gaussians", "bytes", "steps/s"), []))
     for number, (variant, changes) in enumerate(VARIANTS.items()):
         if args.only and not any(part in variant for part in args.only):
             continue
@@ -52,7 +52,7 @@ def main() -> None:
             }
             cells = [f"{mean['psnr_paper']:.2f}", f"{max(scores) - min(scores):.2f}", f"{mean['ssim_paper']:.3f}"]
             cells += [f"{mean['gaussians']:,.0f}", f"{mean['bytes_paper']:,.0f}", f"{mean['steps_per_second']:.1f}"]
-            print(line([variant, name, *cells]), flush=True)
+            print(markdown_row([variant, name, *cells]), flush=True)
 
 
 if __name__ == "__main__":

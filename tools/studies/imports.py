@@ -34,7 +34,7 @@ from hyrfpack.splats.draw import Drawable, draw
 from hyrfpack.splats.files import read_splats
 from hyrfpack.splats.formats import ply
 from hyrfpack.splats.splats import Splats
-from tools.tables import markdown
+from tools.tables import markdown_table
 
 NODE = Path(__file__).parents[2] / "tests" / "node"
 ASKED = (30, 32, 34, 36, 38, 40, 42)  # dB
@@ -146,7 +146,7 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as folder:
             others = list(theirs(splats, taught, Path(folder)))
         columns = ["encoder", "setting", "bytes", "dB, mean", "worst", "s"]
-        print(markdown(columns, [point.row() for point in (*mine, *others)]), flush=True)
+        print(markdown_table(columns, [point.row() for point in (*mine, *others)]), flush=True)
         print("\nAt equal dB:\n", *at_equal(mine, others), sep="\n", flush=True)
 
 

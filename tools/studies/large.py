@@ -28,7 +28,7 @@ from hyrfpack.model import HybridModel
 from hyrfpack.scene import Camera, Picture, Scene, View
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer
 from hyrfpack.train.log import peak_memory
-from tools.tables import markdown
+from tools.tables import markdown_table
 
 PHOTOS = 8  # that are taken of the set
 
@@ -106,7 +106,7 @@ def main(arguments: list[str] | None = None) -> None:
                 f"{found['added'] / count:,.0f}",
             ]
         )
-    print(markdown(["Gaussians", "s a step", "with a round", "peak, MB", "bytes a Gaussian added"], rows))
+    print(markdown_table(["Gaussians", "s a step", "with a round", "peak, MB", "bytes a Gaussian added"], rows))
 
 
 if __name__ == "__main__":

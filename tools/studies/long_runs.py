@@ -26,7 +26,7 @@ from hyrfpack.scene import Scene, evenly_spaced
 from hyrfpack.train import TrainConfig
 from tools.studies.train_sets import DATA
 from tools.studies.variants import load_variant
-from tools.tables import markdown
+from tools.tables import markdown_table
 
 MEASURED = "measured.json"
 MAX_TRAINING_VIEWS_SCORED = 16
@@ -122,7 +122,7 @@ def table(rows: list[dict]) -> str:
                 f"{row['seconds']:.0f}",
             ]
         )
-    return markdown(COLUMNS, lines)
+    return markdown_table(COLUMNS, lines)
 
 
 def main() -> None:

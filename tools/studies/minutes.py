@@ -18,7 +18,7 @@ import time
 from pathlib import Path
 
 from tools.studies.train_sets import DATA
-from tools.tables import line, markdown
+from tools.tables import markdown_row, markdown_table
 
 SETS = ("mipnerf360_bonsai", "gerrard_hall", "llff_fern", "indoor_room")
 COLUMNS = ("set", "minutes asked", "minutes taken", "off", "steps", "longest side", "PSNR", "seconds of each stage")
@@ -48,11 +48,11 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=DATA, help=f"where the sets are ({DATA})")
     parser.add_argument("--bare", action="store_true", help="take the photos alone, so that poses are estimated")
     args = parser.parse_args()
-    print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}\n\n{markdown(COLUMNS, [])}", flush=True)
+    print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}\n\n{markdown_table(COLUMNS, [])}", flush=True)
     for name in args.sets:
         with tempfile.TemporaryDirectory(prefix="hyrfpack-minutes-") as folder:
             photos = args.data / name / "images" if args.bare else args.data / name
-            print(line(measure(photos, args.minutes, Path(folder))), flush=True)
+            print(markdown_row(measure(photos, args.minutes, Path(folder))), flush=True)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from pathlib import Path, PurePosixPath
 import hyrfpack
 from hyrfpack.scene import Scene
 from tools.studies.train_sets import DATA
-from tools.tables import markdown
+from tools.tables import markdown_table
 
 TEST_EVERY = 8
 
@@ -69,7 +69,9 @@ def table(rows: list[dict]) -> str:
         counts = [str(row["photos"]), str(row["lacking"])]
         lines.append([row["set"], *counts, f"{given:.2f}", f"{own:.2f}", f"{losses[-1]:+.2f}"])
     lines.append(["mean", "", "", "", "", f"{statistics.mean(losses):+.2f}"])
-    return markdown(["set", "photos", "without a pose of ours", "given poses, dB", "our poses, dB", "loss, dB"], lines)
+    return markdown_table(
+        ["set", "photos", "without a pose of ours", "given poses, dB", "our poses, dB", "loss, dB"], lines
+    )
 
 
 def main() -> None:

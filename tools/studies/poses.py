@@ -22,7 +22,7 @@ import hyrfpack
 from hyrfpack.poses.alignment import Poses, align_poses
 from hyrfpack.poses.job import Job
 from hyrfpack.poses.mapping import read_pieces
-from tools.tables import markdown
+from tools.tables import markdown_table
 
 DATA = Path(os.environ.get("HYRFPACK_DATA") or Path(__file__).parents[3] / "shared" / "data")
 
@@ -92,7 +92,7 @@ def table(rows: list[dict]) -> str:
         cells = [row[key] for key in ("set", "photos", "registered", "right", "sure")]
         cells += [f"{row['seconds']:.0f}", row["mapper"], row["why"], row["alone"].get("global", "none")]
         lines.append([*cells, row["alone"].get("incremental", "none")])
-    return markdown(header, [[str(cell) for cell in line] for line in lines])
+    return markdown_table(header, [[str(cell) for cell in line] for line in lines])
 
 
 def main() -> None:

@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from tools.studies.train_sets import DATA
-from tools.tables import markdown
+from tools.tables import markdown_table
 
 
 def trained(data: Path, out: Path, processes: int, options: Sequence[str]) -> dict:
@@ -68,7 +68,7 @@ def main(arguments: list[str] | None = None) -> None:
         rows += [row(name, count, metrics, runs[options.processes[0]]) for count, metrics in runs.items()]
         print(" | ".join(rows[-1]), file=sys.stderr)
     header = ["set", "processes", "Gaussians", "PSNR", "SSIM", "seconds", "waiting for others", "of the ideal"]
-    print(markdown(header, rows))
+    print(markdown_table(header, rows))
 
 
 if __name__ == "__main__":

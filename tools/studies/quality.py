@@ -30,7 +30,7 @@ from hyrfpack.scene import Scene
 from hyrfpack.train import TrainConfig
 from hyrfpack.train.setup import budget_for
 from tools.studies.train_sets import study_arguments
-from tools.tables import markdown
+from tools.tables import markdown_table
 
 HERE = Path(__file__).parents[2]
 SETS = (
@@ -168,8 +168,8 @@ def main() -> None:
                     seeds.append(run(folder, scene, args.steps, gaussians, seed, out))
                 points[version].append(mean_over_seeds(seeds))
         rows.append(row(name, points["now"], points["before"]))
-        print(markdown(_HEADER, rows[-1:]).splitlines()[-1], flush=True)
-    print("\n" + markdown(_HEADER, rows))
+        print(markdown_table(_HEADER, rows[-1:]).splitlines()[-1], flush=True)
+    print("\n" + markdown_table(_HEADER, rows))
 
 
 if __name__ == "__main__":

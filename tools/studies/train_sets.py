@@ -22,7 +22,7 @@ from pathlib import Path
 import hyrfpack
 from hyrfpack.train import TrainConfig
 from tools.studies.variants import load_variant
-from tools.tables import markdown
+from tools.tables import markdown_table
 
 PROFILES = ("paper", "compact")
 DATA = Path(os.environ.get("HYRFPACK_DATA") or Path(__file__).parents[3] / "shared" / "data")
@@ -76,7 +76,7 @@ def table(rows: list[dict]) -> str:
         cells += [f"{r['bytes_compact'] / r['bytes_paper']:.2f}", f"{r['steps_per_second']:.1f}"]
         cells += [f"{r['seconds']:.0f}", f"{r['frame_ms']:.1f}"]
         lines.append(cells)
-    return markdown(header, lines)
+    return markdown_table(header, lines)
 
 
 def study_arguments(

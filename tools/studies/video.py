@@ -29,7 +29,7 @@ from hyrfpack.poses.frames import RECORD_NAME, FrameReport, choose_frames
 from hyrfpack.scene import Picture, View
 from hyrfpack.train import TrainConfig
 from tools.studies.train_sets import DATA
-from tools.tables import markdown
+from tools.tables import markdown_table
 
 SETS = ("ngp_fox", "drone_caliterra", "gerrard_hall")
 RATE = 10  # frames a second
@@ -60,7 +60,7 @@ def main() -> None:
             taken = score(out / "clip.mp4", out / "video", args.steps, shows)
             rows[-1] += [f"{given:.2f}", f"{taken:.2f}", f"{taken - given:+.2f}"]
     header = ["set", "frames", "photos taken", "blurred taken", "repeated taken", "called blurred", "repeated", "s"]
-    print(markdown(header + (["dB, photos", "dB, video", "difference"] if args.train else []), rows))
+    print(markdown_table(header + (["dB, photos", "dB, video", "difference"] if args.train else []), rows))
 
 
 def write_video(path: Path, photos: list[Path], lengths: tuple[float, float], quality: int, seed: int) -> list[str]:

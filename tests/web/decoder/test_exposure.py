@@ -19,8 +19,8 @@ from hyrfpack.format.exposure import encode_exposure
 from hyrfpack.format.sections import EXPOSURE
 from hyrfpack.model import HybridModel
 from hyrfpack.model.exposure import MAX_CENTERS, ExposureMap
-from tools.safety.fuzz_browser import disagreement, in_javascript, in_python
-from tools.safety.plans import encode
+from tools.safety.fuzz_browser import find_disagreement, read_in_javascript, read_in_python
+from tools.safety.synthetic_encoding import encode
 
 SCRIPT = Path(__file__).with_name("log_gains.mjs")
 VIEWPOINTS = 40
@@ -120,7 +120,7 @@ DAMAGED = {
 
 @pytest.fixture(scope="module")
 def refusals() -> dict[str, str]:
-    verdicts = in_javascript([(data, False) for data in DAMAGED.values()])
+    verdicts = read_in_javascript([(data, False) for data in DAMAGED.values()])
     assert not any(verdict.failed for verdict in verdicts), verdicts
     return {name: verdict.refused for name, verdict in zip(DAMAGED, verdicts, strict=True)}
 
@@ -128,22 +128,22 @@ def refusals() -> dict[str, str]:
 @pytest.mark.parametrize("case", DAMAGED)
 def test_a_damaged_map_is_refused_with_the_name_of_its_section(refusals: dict[str, str], case: str):
     assert "ection 'EXPO'" in refusals[case]
-    assert "EXPO" in in_python(DAMAGED[case]).refused
+    assert "EXPO" in read_in_python(DAMAGED[case]).refused
 
 
 def test_a_file_that_requires_its_map_is_read():
     data = file_with(STORED, required=True)
 
-    (verdict,) = in_javascript([(data, False)])
+    (verdict,) = read_in_javascript([(data, False)])
 
-    assert not disagreement(in_python(data), verdict) and not verdict.refused
+    assert not find_disagreement(read_in_python(data), verdict) and not verdict.refused
 
 
 def test_a_map_whose_bytes_changed_on_the_way_is_refused():
     data = bytearray(file_with(STORED))
     data[data.index(STORED) + 40] ^= 4
 
-    (verdict,) = in_javascript([(bytes(data), False)])
+    (verdict,) = read_in_javascript([(bytes(data), False)])
 
     assert "checksum of section 'EXPO'" in verdict.refused
 
@@ -156,7 +156,9 @@ def test_both_readers_refuse_the_same_maps():
             stored[place] = rng.integers(256)
         files.append(file_with(bytes(stored)))
 
-    verdicts = in_javascript([(data, False) for data in files])
+    verdicts = read_in_javascript([(data, False) for data in files])
 
-    assert [disagreement(in_python(data), verdict) for data, verdict in zip(files, verdicts, strict=True)] == [""] * 300
+    assert [
+        find_disagreement(read_in_python(data), verdict) for data, verdict in zip(files, verdicts, strict=True)
+    ] == [""] * 300
     assert {bool(verdict.refused) for verdict in verdicts} == {True, False}

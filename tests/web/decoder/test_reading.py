@@ -42,9 +42,9 @@ from hyrfpack.quant import huffman_encode, rans_lanes
 from hyrfpack.quant.bits import pack_bits
 from hyrfpack.quant.integers import encode_integers
 from hyrfpack.quant.rans_models import adaptive_frequencies, iter_update_ranges
-from tools.safety.fuzz_browser import compare, disagreement, in_javascript, in_python
-from tools.safety.fuzz_mutate import KINDS, Part, assemble, disassemble, seeds
-from tools.safety.plans import encode
+from tools.safety.fuzz_browser import compare, find_disagreement, read_in_javascript, read_in_python
+from tools.safety.fuzz_mutate import INPUT_KINDS, RawSection, assemble, disassemble, load_seed_files
+from tools.safety.synthetic_encoding import encode
 
 TESTS = Path(__file__).parents[2]
 GOLDEN = sorted((TESTS / "golden").glob("*.hyrf"))
@@ -56,9 +56,9 @@ def check_alike(files: dict[str, bytes], cut: bool = False) -> tuple[list[str], 
     accepted: list[str] = []
     refused: list[str] = []
     for (name, data), verdict in zip(
-        files.items(), in_javascript([(data, cut) for data in files.values()]), strict=True
+        files.items(), read_in_javascript([(data, cut) for data in files.values()]), strict=True
     ):
-        assert not disagreement(in_python(data, cut), verdict), name
+        assert not find_disagreement(read_in_python(data, cut), verdict), name
         (refused if verdict.refused else accepted).append(name)
     return accepted, refused
 
@@ -95,7 +95,7 @@ def made_up_model(seed: int, count: int) -> HybridModel:
 def test_golden_files_decode_to_the_recorded_numbers(file):
     recorded = np.load(file.with_suffix(".npz"))
 
-    (verdict,) = in_javascript([(file.read_bytes(), False)])
+    (verdict,) = read_in_javascript([(file.read_bytes(), False)])
 
     assert verdict.whole and sum(verdict.layers) == len(recorded["gaussians.positions"])
     for group, names in SECTION_PARAMETERS.items():
@@ -117,7 +117,7 @@ def test_models_of_any_configuration_decode_to_the_same_numbers():
 
 
 def test_every_group_in_every_codec_decodes_to_the_same_numbers():
-    files = {str(number): data for number, data in enumerate(seeds()[0])}
+    files = {str(number): data for number, data in enumerate(load_seed_files()[0])}
 
     accepted, _ = check_alike(files)
 
@@ -240,13 +240,13 @@ def _further_layers() -> set[str]:
 
 
 def test_what_was_read_of_a_file_is_told(layered):
-    whole, most = in_javascript([(layered, False), (layered[:-8], True)])
+    whole, most = read_in_javascript([(layered, False), (layered[:-8], True)])
 
     assert whole.whole and not most.whole and most.layers == whole.layers[:-1]
 
 
 def test_the_start_of_a_file_is_refused_where_the_whole_was_asked_for(layered):
-    (verdict,) = in_javascript([(layered[:-8], False)])
+    (verdict,) = read_in_javascript([(layered[:-8], False)])
 
     assert verdict.refused.startswith("The file is truncated: its header says ")
 
@@ -506,10 +506,10 @@ def test_what_sections_may_decode_to_is_bounded(count, a_byte, words):
     for _ in range(3):  # a longer number makes a longer file
         count += file_and_slack(count)[1]
     files = [file_and_slack(count + step)[0] for step in (0, 1)]
-    at, beyond = in_javascript([(data, False) for data in files])
+    at, beyond = read_in_javascript([(data, False) for data in files])
 
-    assert at.refused.startswith("Section 'POSI'") and "'POSI'" in in_python(files[0]).refused
-    assert words in beyond.refused and words in in_python(files[1]).refused
+    assert at.refused.startswith("Section 'POSI'") and "'POSI'" in read_in_python(files[0]).refused
+    assert words in beyond.refused and words in read_in_python(files[1]).refused
     assert "'POSI'" not in beyond.refused
 
 
@@ -517,8 +517,8 @@ def test_what_is_not_there_may_promise_anything():
     meta = metadata(1 << 39) | {"layers": [0, 1 << 39]}
     tags = {layer_section(group, 1): 1 << 39 for group in LAYERED_SECTIONS}
     parts = disassemble(file_of(metadata(0), plain(metadata(0))))
-    parts[0] = Part(b"META", 0, 1, text_of(meta), len(text_of(meta)))
-    parts += [Part(tag.encode(), 1, 1, b"12345678", 4 * (3, 3, 1, 1)[k] << 39) for k, tag in enumerate(tags)]
+    parts[0] = RawSection(b"META", 0, 1, text_of(meta), len(text_of(meta)))
+    parts += [RawSection(tag.encode(), 1, 1, b"12345678", 4 * (3, 3, 1, 1)[k] << 39) for k, tag in enumerate(tags)]
     data = assemble(parts)
 
     assert check_alike({"start": data[:-32]}, cut=True) == (["start"], [])
@@ -529,7 +529,7 @@ def test_hostile_files_get_the_same_verdict():
     tally = compare(range(100_000, 100_800), seed=3)
 
     assert not tally.failures
-    assert set(tally.kinds) == set(KINDS) and tally.accepted.total() > 20
+    assert set(tally.kinds) == set(INPUT_KINDS) and tally.accepted.total() > 20
 
 
 @pytest.mark.parametrize("name", SMALL)
@@ -537,15 +537,15 @@ def test_a_file_of_a_kilobyte_takes_no_time(name):
     data = SMALL[name]()
     assert len(data) < 3000
 
-    (verdict,) = in_javascript([(data, False)])
+    (verdict,) = read_in_javascript([(data, False)])
 
-    assert bool(verdict.refused) == bool(in_python(data).refused)
+    assert bool(verdict.refused) == bool(read_in_python(data).refused)
     assert verdict.seconds < 0.5 and not verdict.failed
 
 
 @pytest.mark.parametrize("make", [most_gaussians, largest_tables], ids=lambda make: make.__name__)
 def test_a_kilobyte_that_is_worth_all_that_the_format_allows_is_read_in_bounded_memory(make):
-    small, largest = in_javascript([(GOLDEN[0].read_bytes(), False), (make(), False)])
+    small, largest = read_in_javascript([(GOLDEN[0].read_bytes(), False), (make(), False)])
 
     assert largest.groups and largest.seconds < 10
     assert largest.peak - small.peak < 4 * FREE  # node itself takes more on one machine than on another
@@ -553,7 +553,7 @@ def test_a_kilobyte_that_is_worth_all_that_the_format_allows_is_read_in_bounded_
 
 def test_a_section_that_promises_nothing_and_an_unknown_one_change_nothing():
     raw = encode_model(made_up_model(2, 5), "raw")
-    files = {"optional": assemble([*disassemble(raw), Part(b"NEW_", 99, 0, b"abc", 0)])}
-    files["required"] = assemble([*disassemble(raw), Part(b"NEW_", 99, 1, b"abc", 0)])
+    files = {"optional": assemble([*disassemble(raw), RawSection(b"NEW_", 99, 0, b"abc", 0)])}
+    files["required"] = assemble([*disassemble(raw), RawSection(b"NEW_", 99, 1, b"abc", 0)])
 
     assert check_alike(files) == (["optional"], ["required"])

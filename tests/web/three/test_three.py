@@ -146,11 +146,11 @@ def test_the_page_shows_what_is_rendered_here(folder: Path, tmp_path: Path) -> N
         while (said := browser.evaluate("document.getElementById('said').textContent")) != "" or browser.evaluate(
             "!document.querySelector('canvas')"
         ):
-            assert time.monotonic() < ends, (said, browser.complaints())
+            assert time.monotonic() < ends, (said, browser.list_errors())
             time.sleep(0.2)
         time.sleep(1.5)  # some frames
         picture = np.array(Image.open(io.BytesIO(browser.screenshot())).convert("RGB"), np.float32) / 255
-        complaints = browser.complaints()
+        complaints = browser.list_errors()
 
     own = render(model_of(), cameras_about(10)[0]).rgb.detach()
     assert not [line for line in complaints if "WebGPU" not in line], json.dumps(complaints)
