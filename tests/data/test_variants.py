@@ -14,13 +14,13 @@ from scenes import ball_points, photograph, ring
 from hyrfpack.data import load_scene
 from hyrfpack.scene import Camera, Scene
 from hyrfpack.splats.splats import quaternion_from_matrix
-from tools.safety.variants.attempt import try_variant
-from tools.safety.variants.catalog import VARIANTS
+from tools.safety.variants.catalog import ALL_VARIANTS
+from tools.safety.variants.check import check_variant
 from tools.safety.variants.working_set import WorkingSet
 
 WIDTH, HEIGHT = 64, 40
 # Each variant in one of its layouts, by turns; `tools/safety/variants/` tries all of them on real sets.
-CASES = [(variant, variant.layouts[number % len(variant.layouts)]) for number, variant in enumerate(VARIANTS)]
+CASES = [(variant, variant.layouts[number % len(variant.layouts)]) for number, variant in enumerate(ALL_VARIANTS)]
 NEEDS = {".avif": "avif", ".jp2": "jpg_2000", ".webp": "webp"}
 
 
@@ -106,6 +106,6 @@ def test_a_variant_reads_as_the_set_itself_or_is_rejected(variant, layout, sourc
         pytest.importorskip("pillow_heif")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
-    outcome = try_variant(variant, sources[layout], layout, tmp_path / "variant", plain[layout])
+    outcome = check_variant(variant, sources[layout], layout, tmp_path / "variant", plain[layout])
 
-    assert outcome.kind == ("refused" if variant.expect else "read"), outcome.said
+    assert outcome.kind == ("refused" if variant.expect else "read"), outcome.message

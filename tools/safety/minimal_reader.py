@@ -1,7 +1,7 @@
-"""A reader of `.hyrf` files, version 1.0 to 1.2, written from docs/format.md alone: numpy and the standard library.
+"""Read `.hyrf` files of versions 1.0 to 1.2, by code written only from docs/format.md, with numpy alone.
 
-It shares no code with hyrfpack, and so tells whether the page says enough and whether hyrfpack does what the page says.
-Plain rather than fast: a file of 30,000 Gaussians takes some seconds. Section numbers are those of the page.
+This reader shares no code with hyrfpack. So it tests whether the page is complete and whether hyrfpack conforms to it.
+It is simple, not fast: a file of 30,000 Gaussians takes some seconds. Section numbers are those of the page.
 
     metadata, groups, exposure = read(Path("scene.hyrf").read_bytes())
     groups["POSI"]      # float32 (N, 3), the Gaussians of all layers
@@ -32,9 +32,9 @@ MATRIX_CODECS = {
     "GMLP": {1, 2, 3, 4, 8},
     "RMLP": {1, 2, 3, 4, 8},
 }
-LAYERED = ("POSI", "COLO", "SCAL", "OPAC")
-FIELDS = ("GTAB", "RTAB", "GMLP", "RMLP")
-RULES = {
+LAYERED_GROUPS = ("POSI", "COLO", "SCAL", "OPAC")
+FIELD_GROUPS = ("GTAB", "RTAB", "GMLP", "RMLP")
+REQUIRED_RULES = {
     "activations": "sigmoid",
     "background_radius": 100.0,
     "contraction": "l2",
@@ -42,7 +42,7 @@ RULES = {
     "hash": "instant-ngp",
     "rotation": "identity-offset",
 }
-KEYS = {"gaussians", "config", "rules", "profile", "settings", "provenance", "writer"}
+METADATA_KEYS = {"gaussians", "config", "rules", "profile", "settings", "provenance", "writer"}
 CONFIG_KEYS = {
     *("frame", "geometry", "radiance", "hidden", "background", "solid"),
     *("scale_rule", "scale_grows", "direction_encoding", "antialiased", "position_gradients"),
@@ -52,31 +52,42 @@ GRID_KEYS = {"log2_table_size", "levels", "base", "finest"}
 
 
 def read(data: bytes, part: bool = False) -> tuple[dict[str, Any], dict[str, np.ndarray], Exposure | None]:
-    """Metadata, the eight groups of part 2, by type of the first layer, as float32 matrices (rows, columns), and the
-    exposure map, None where the file has none.
+    """Read a file.
 
-    With `part`, `data` may be the start of a file: layers that are not whole, and what follows them, are left out.
-    Raises ValueError for files that the page tells a reader to refuse (zlib.error where a deflate stream is damaged).
+    Args:
+        data: the bytes of a file.
+        part: whether `data` may be the start of a file; incomplete layers, and all layers after them, are left out.
+
+    Returns:
+        The metadata; the eight groups of section 2, by the type of their first layer, as float32 matrices (rows,
+        columns); and the exposure map, None without one.
+
+    Raises:
+        ValueError: the page tells a reader to refuse the file.
+        zlib.error: a deflate stream is damaged.
     """
     sections = read_container(data, part)
-    need("META" in sections, "a section is missing")
+    require("META" in sections, "a section is missing")
     metadata = read_metadata(sections["META"])
     config, layers = metadata["config"], metadata.get("layers") or [metadata["gaussians"]]
     shapes = matrix_shapes(config, layers)
     for (group, layer), (rows, columns) in shapes.items():
         name = section_type(group, layer)
-        need(name in sections, f"{name}: the section is missing")
-        need(sections[name].raw_length == 4 * rows * columns, f"{name}: wrong raw length")
-        need(sections[name].codec in MATRIX_CODECS[group], f"{name}: codec not allowed here")
-    used = 1
-    while used < len(layers) and all(sections[section_type(group, used)].whole for group in LAYERED):
-        used += 1
-    need(sum(layers[:used]) <= 32 * len(data) + 2**18, "META: too many Gaussians for so few bytes")
+        require(name in sections, f"{name}: the section is missing")
+        require(sections[name].raw_length == 4 * rows * columns, f"{name}: wrong raw length")
+        require(sections[name].codec in MATRIX_CODECS[group], f"{name}: codec not allowed here")
+    used_layers = 1
+    while used_layers < len(layers) and all(
+        sections[section_type(group, used_layers)].whole for group in LAYERED_GROUPS
+    ):
+        used_layers += 1
+    require(sum(layers[:used_layers]) <= 32 * len(data) + 2**18, "META: too many Gaussians for so few bytes")
 
     matrices: dict[str, list[np.ndarray]] = {group: [] for group in MATRIX_CODECS}
     points: dict[int, Points] = {}
-    for (group, layer), (rows, columns) in shapes.items():  # POSI is the first of a layer: others lean on it
-        if layer >= used:
+    # POSI comes first in a layer, because other sections depend on it.
+    for (group, layer), (rows, columns) in shapes.items():
+        if layer >= used_layers:
             continue
         section = sections[section_type(group, layer)]
         codec, source = section.codec, Cursor(section.read())
@@ -88,20 +99,20 @@ def read(data: bytes, part: bool = False) -> tuple[dict[str, Any], dict[str, np.
             numbers = read_min_max(source, rows * columns)
         elif codec == 6:
             points[layer] = read_points(source, rows)
-            numbers = positions(points[layer], config["frame"]["half_extent"])
+            numbers = decode_positions(points[layer], config["frame"]["half_extent"])
         elif codec == 7:
-            need(layer in points, f"{group}: codec 7 without lattice points in layer {layer}")
+            require(layer in points, f"{group}: codec 7 without lattice points in layer {layer}")
             numbers = read_channels(source, columns, points[layer].classes)
         elif group in ("GMLP", "RMLP"):
             numbers = read_numbers(source, decoder_groups(decoder_layers(config, group)))
         else:
-            need(0 in points, f"{group}: codec 8 without lattice points")
+            require(0 in points, f"{group}: codec 8 without lattice points")
             grid = config["geometry" if group == "GTAB" else "radiance"]
             numbers = read_numbers(source, (np.repeat(table_groups(grid, points[0].m), 2), 16 * grid["levels"]))
         source.end()
-        need(numbers.size == rows * columns, f"{group}: {numbers.size} numbers")
+        require(numbers.size == rows * columns, f"{group}: {numbers.size} numbers")
         matrices[group].append(numbers.astype(np.float32).reshape(rows, columns))
-        need(bool(np.isfinite(matrices[group][-1]).all()), f"{group}: NaN or infinite")
+        require(bool(np.isfinite(matrices[group][-1]).all()), f"{group}: NaN or infinite")
     exposure = read_exposure(sections["EXPO"]) if "EXPO" in sections and sections["EXPO"].whole else None
     return metadata, {group: np.concatenate(parts) for group, parts in matrices.items()}, exposure
 
@@ -109,19 +120,19 @@ def read(data: bytes, part: bool = False) -> tuple[dict[str, Any], dict[str, np.
 # Bytes
 
 
-def need(condition: bool, message: str) -> None:
+def require(condition: bool, message: str) -> None:
     if not condition:
         raise ValueError(message)
 
 
 class Cursor:
-    """A place in bytes, which moves as they are taken; bytes that end too early or are left over are damage."""
+    """A position in bytes that advances as they are taken; it raises ValueError if bytes are missing or left over."""
 
     def __init__(self, data: bytes) -> None:
         self.data, self.at = data, 0
 
     def take(self, count: int) -> bytes:
-        need(self.at + count <= len(self.data), "bytes end too early")
+        require(self.at + count <= len(self.data), "bytes end too early")
         self.at += count
         return self.data[self.at - count : self.at]
 
@@ -135,15 +146,15 @@ class Cursor:
         return self.take(len(self.data) - self.at)
 
     def end(self) -> None:
-        need(self.at == len(self.data), "bytes left over")
+        require(self.at == len(self.data), "bytes left over")
 
 
 def read_bits(data: bytes, widths: np.ndarray) -> np.ndarray:
-    """Numbers of so many bits each, lowest bit first from the lowest bit of the first byte on (3.1, extra bits)."""
+    """Read one number for each width in bits, lowest bit first, from the lowest bit of the first byte (3.1)."""
     total = int(widths.sum())
-    need(len(data) == -(-total // 8), "wrong number of bits")
+    require(len(data) == -(-total // 8), "wrong number of bits")
     bits = np.unpackbits(np.frombuffer(data, np.uint8), bitorder="little").astype(np.int64)
-    need(not bits[total:].any(), "bits left in the last byte are not zero")
+    require(not bits[total:].any(), "bits left in the last byte are not zero")
     starts = np.cumsum(widths) - widths
     numbers = np.zeros(len(widths), np.int64)
     for k in range(int(widths.max(initial=0))):
@@ -162,52 +173,57 @@ class Section:
     raw_length: int
     stored_length: int
     crc: int
-    padded: bytes  # stored bytes and padding; fewer of them where the data ends before
+    padded: bytes  # stored bytes and padding; incomplete if the data ends before them
     whole: bool
 
     def read(self) -> bytes:
-        """The stored bytes, checked as step 7 of 1.3 says."""
-        need(self.whole, f"{self.name}: not all of it is there")
+        """Return the stored bytes after the checks of step 7 of 1.3."""
+        require(self.whole, f"{self.name}: the section is incomplete")
         stored, padding = self.padded[: self.stored_length], self.padded[self.stored_length :]
-        need(zlib.crc32(stored) == self.crc and not any(padding), f"{self.name}: damaged")
+        require(zlib.crc32(stored) == self.crc and not any(padding), f"{self.name}: damaged")
         return stored
 
 
 def section_type(group: str, layer: int) -> str:
-    """POSI, then POS1, POS2, ... (2)."""
+    """Return the type of a group's section in a layer: POSI, then POS1, POS2, ... (2)."""
     return f"{group[:3]}{layer}" if layer else group
 
 
-KNOWN = {"META", "EXPO", *FIELDS, *(section_type(group, layer) for group in LAYERED for layer in range(8))}
+KNOWN_SECTION_TYPES = {
+    "META",
+    "EXPO",
+    *FIELD_GROUPS,
+    *(section_type(group, layer) for group in LAYERED_GROUPS for layer in range(8)),
+}
 
 
 def read_container(data: bytes, part: bool = False) -> dict[str, Section]:
-    """The sections by type, checked as steps 1 to 6 of 1.3 say."""
-    need(data[:8] == b"\x89HYRF\r\n\n", "not a .hyrf file")
+    """Return the sections by type after the checks of steps 1 to 6 of 1.3."""
+    require(data[:8] == b"\x89HYRF\r\n\n", "not a .hyrf file")
     header = Cursor(data)
     _, major, _, flags, length, toc_at, toc_length, count, toc_crc, header_crc = header.unpack("8sHHIQQIIII")
-    need(major == 1, f"major version {major}")
-    need(zlib.crc32(data[:44]) == header_crc and flags == 0, "damaged header")
-    need(length == len(data) or (part and length > len(data)), "wrong file length")
-    need(length <= 2**34, "file too long")
-    need(count <= 1024 and toc_at == 48 and toc_length == 40 * count, "table of contents in the wrong place")
+    require(major == 1, f"major version {major}")
+    require(zlib.crc32(data[:44]) == header_crc and flags == 0, "damaged header")
+    require(length == len(data) or (part and length > len(data)), "wrong file length")
+    require(length <= 2**34, "file too long")
+    require(count <= 1024 and toc_at == 48 and toc_length == 40 * count, "table of contents in the wrong place")
     toc = Cursor(header.take(toc_length))
-    need(zlib.crc32(toc.data) == toc_crc, "damaged table of contents")
+    require(zlib.crc32(toc.data) == toc_crc, "damaged table of contents")
 
     sections, expected, raw_total = {}, 48 + toc_length, 0
     for _ in range(count):
         kind, codec, flags, offset, stored_length, raw_length, crc, reserved = toc.unpack("4sHHQQQII")
         name = kind.decode("latin-1")
-        need(name.isascii() and name.replace("_", "0").isalnum() and name not in sections, f"bad type {name!r}")
-        need(flags <= 1 and reserved == 0, f"{name}: reserved bit")
-        need(flags == 0 or name in KNOWN, f"{name}: required but unknown")
+        require(name.isascii() and name.replace("_", "0").isalnum() and name not in sections, f"bad type {name!r}")
+        require(flags <= 1 and reserved == 0, f"{name}: reserved bit")
+        require(flags == 0 or name in KNOWN_SECTION_TYPES, f"{name}: required but unknown")
         end = offset + stored_length
         padded = -(-end // 8) * 8
-        need(offset == expected and padded <= length, f"{name}: in the wrong place")
+        require(offset == expected and padded <= length, f"{name}: in the wrong place")
         sections[name] = Section(name, codec, raw_length, stored_length, crc, data[offset:padded], padded <= len(data))
         expected, raw_total = padded, raw_total + raw_length * sections[name].whole
-    need(expected == length, "bytes after the last section")
-    need(raw_total <= min(1024 * len(data) + 3 * 2**24, 2**34), "sections too large")
+    require(expected == length, "bytes after the last section")
+    require(raw_total <= min(1024 * len(data) + 3 * 2**24, 2**34), "sections too large")
     return sections
 
 
@@ -215,56 +231,61 @@ def read_container(data: bytes, part: bool = False) -> dict[str, Section]:
 
 
 def read_metadata(section: Section) -> dict[str, Any]:
-    need(section.codec in (0, 5) and section.raw_length <= 2**20, "META: unknown codec or too long")
+    require(section.codec in (0, 5) and section.raw_length <= 2**20, "META: unknown codec or too long")
     text = section.read()
     if section.codec == 5:
         inflate = zlib.decompressobj()
         text = inflate.decompress(text, section.raw_length + 1)
-        need(inflate.eof and not inflate.unused_data, "META: bad deflate stream")
-    need(len(text) == section.raw_length, "META: wrong raw length")
+        require(inflate.eof and not inflate.unused_data, "META: bad deflate stream")
+    require(len(text) == section.raw_length, "META: wrong raw length")
     metadata = json.loads(text.decode("utf-8"))
-    need(isinstance(metadata, dict) and depth(metadata) <= 64, "META: not an object or too deep")
-    need(all(map(math.isfinite, floats(metadata))), "META: NaN or infinity")
-    need(KEYS <= metadata.keys(), "META: a key is missing")
-    need(metadata["rules"] == RULES, "META: other rules")
+    require(isinstance(metadata, dict) and nesting_depth(metadata) <= 64, "META: not an object or too deep")
+    require(all(map(math.isfinite, list_floats(metadata))), "META: NaN or infinity")
+    require(METADATA_KEYS <= metadata.keys(), "META: a key is missing")
+    require(metadata["rules"] == REQUIRED_RULES, "META: other rules")
     config = metadata["config"]
-    need(set(config) == CONFIG_KEYS and set(config["frame"]) == FRAME_KEYS, "META: unknown or missing keys in config")
-    whole(metadata["gaussians"], 0, 2**40 - 1)
+    require(
+        set(config) == CONFIG_KEYS and set(config["frame"]) == FRAME_KEYS, "META: unknown or missing keys in config"
+    )
+    check_integer(metadata["gaussians"], 0, 2**40 - 1)
     layers = metadata.get("layers", [])
-    need(isinstance(layers, list) and len(layers) <= 8, "META: layers")
-    need(not layers or sum(whole(n, 0, 2**40) for n in layers) == metadata["gaussians"], "META: layers do not add up")
-    whole(config["hidden"], 1, 1024)
+    require(isinstance(layers, list) and len(layers) <= 8, "META: layers")
+    require(
+        not layers or sum(check_integer(n, 0, 2**40) for n in layers) == metadata["gaussians"],
+        "META: layers do not add up",
+    )
+    check_integer(config["hidden"], 1, 1024)
     for grid in (config["geometry"], config["radiance"]):
-        need(set(grid) == GRID_KEYS, "META: unknown or missing keys in a grid")
-        whole(grid["log2_table_size"], 4, 24)
-        whole(grid["levels"], 1, 32)
-        whole(grid["finest"], whole(grid["base"], 2, 65536), 65536)
-    need(config["direction_encoding"] in ("sh", "frequency"), "META: direction_encoding")
-    need(config["scale_rule"] in ("sum", "product"), "META: scale_rule")
-    need(config["frame"]["scale"] > 0 and min(config["frame"]["half_extent"]) > 0, "META: frame")
+        require(set(grid) == GRID_KEYS, "META: unknown or missing keys in a grid")
+        check_integer(grid["log2_table_size"], 4, 24)
+        check_integer(grid["levels"], 1, 32)
+        check_integer(grid["finest"], check_integer(grid["base"], 2, 65536), 65536)
+    require(config["direction_encoding"] in ("sh", "frequency"), "META: direction_encoding")
+    require(config["scale_rule"] in ("sum", "product"), "META: scale_rule")
+    require(config["frame"]["scale"] > 0 and min(config["frame"]["half_extent"]) > 0, "META: frame")
     return metadata
 
 
-def depth(value: Any) -> int:
+def nesting_depth(value: Any) -> int:
     inner = value.values() if isinstance(value, dict) else value if isinstance(value, list) else None
-    return 0 if inner is None else 1 + max(map(depth, inner), default=0)
+    return 0 if inner is None else 1 + max(map(nesting_depth, inner), default=0)
 
 
-def floats(value: Any) -> list[float]:
+def list_floats(value: Any) -> list[float]:
     inner = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
-    return [value] if isinstance(value, float) else [number for item in inner for number in floats(item)]
+    return [value] if isinstance(value, float) else [number for item in inner for number in list_floats(item)]
 
 
-def whole(value: Any, low: int, high: int) -> int:
-    need(type(value) is int and low <= value <= high, f"META: {value!r} is not an integer from {low} to {high}")
+def check_integer(value: Any, low: int, high: int) -> int:
+    require(type(value) is int and low <= value <= high, f"META: {value!r} is not an integer from {low} to {high}")
     return value
 
 
 def matrix_shapes(config: dict[str, Any], layers: list[int]) -> dict[tuple[str, int], tuple[int, int]]:
-    """Rows and columns of each group, those of Gaussians for each layer (2)."""
+    """Return the rows and columns of each (group, layer); field groups have layer 0 only (2)."""
     shapes = {}
     for layer, n in enumerate(layers):
-        shapes |= {(group, layer): (n, columns) for group, columns in zip(LAYERED, (3, 3, 1, 1), strict=True)}
+        shapes |= {(group, layer): (n, columns) for group, columns in zip(LAYERED_GROUPS, (3, 3, 1, 1), strict=True)}
     for name, grid in (("GTAB", config["geometry"]), ("RTAB", config["radiance"])):
         shapes[name, 0] = (sum(rows for _, rows in grid_levels(grid)), 2)
     for name in ("GMLP", "RMLP"):
@@ -273,14 +294,14 @@ def matrix_shapes(config: dict[str, Any], layers: list[int]) -> dict[tuple[str, 
 
 
 def grid_levels(grid: dict[str, int]) -> list[tuple[int, int]]:
-    """(vertices an axis, rows) of each level of a hash grid (2.3)."""
+    """Return (vertices an axis, rows) of each level of a hash grid (2.3)."""
     growth = (grid["finest"] / grid["base"]) ** (1 / max(grid["levels"] - 1, 1))
     vertices = [math.ceil(grid["base"] * growth**level - 1e-6) for level in range(grid["levels"])]
     return [(r, min(r**3, 2 ** grid["log2_table_size"])) for r in vertices]
 
 
 def decoder_layers(config: dict[str, Any], name: str) -> list[tuple[int, int]]:
-    """(inputs, outputs) of the three layers of a decoder (2.4)."""
+    """Return (inputs, outputs) of the three layers of a decoder (2.4)."""
     if name == "GMLP":
         inputs, outputs = 2 * config["geometry"]["levels"], 8
     else:
@@ -293,48 +314,48 @@ def decoder_layers(config: dict[str, Any], name: str) -> list[tuple[int, int]]:
 
 def read_codebooks(source: Cursor, rows: int, columns: int) -> np.ndarray:
     stages, width, words = source.unpack("BBH")
-    need(1 <= stages <= 16 and width == columns and words >= 1, "codec 3: bad sizes")
-    books = np.array(source.numbers("<f2", stages * words * width), np.float32).reshape(stages, words, width)
-    need(bool(np.isfinite(books).all()), "codec 3: NaN or infinite")
+    require(1 <= stages <= 16 and width == columns and words >= 1, "codec 3: bad sizes")
+    codebooks = np.array(source.numbers("<f2", stages * words * width), np.float32).reshape(stages, words, width)
+    require(bool(np.isfinite(codebooks).all()), "codec 3: NaN or infinite")
     total = np.zeros((rows, width), np.float32)
-    for book in books:
+    for book in codebooks:
         stream = Cursor(source.take(source.unpack("Q")[0]))
         indices = read_huffman(stream, rows)
         stream.end()
-        need(bool((indices < words).all()), "codec 3: index out of range")
+        require(bool((indices < words).all()), "codec 3: index out of range")
         total += book[indices]
     return total
 
 
 def read_min_max(source: Cursor, count: int) -> np.ndarray:
     low, high, bits = source.unpack("ffB")
-    need(math.isfinite(low) and math.isfinite(high) and low <= high and 1 <= bits <= 16, "codec 4: bad range")
+    require(math.isfinite(low) and math.isfinite(high) and low <= high and 1 <= bits <= 16, "codec 4: bad range")
     top, q = 2**bits - 1, read_huffman(source, count)
-    need(bool((q <= top).all()), "codec 4: code out of range")
+    require(bool((q <= top).all()), "codec 4: code out of range")
     return ((top - q) * low + q * high) / top
 
 
 def read_huffman(source: Cursor, count: int) -> np.ndarray:
     symbol_count, packed_bytes, leaves, end_mark, symbol_bytes, size_bytes = source.unpack("QQIIBB")
-    need(symbol_count == count <= 8 * packed_bytes, "Huffman: wrong number of symbols")
-    need(symbol_bytes in (1, 2) and size_bytes in (2, 4), "Huffman: bad header")
-    need(end_mark < leaves or leaves == end_mark == count == 0, "Huffman: no end mark")
+    require(symbol_count == count <= 8 * packed_bytes, "Huffman: wrong number of symbols")
+    require(symbol_bytes in (1, 2) and size_bytes in (2, 4), "Huffman: bad header")
+    require(end_mark < leaves or leaves == end_mark == count == 0, "Huffman: no end mark")
     lengths = list(source.take(leaves))
     symbols: list[Any] = source.numbers(f"<u{symbol_bytes}", max(leaves - 1, 0))
     chunk = max(1024, 2 * -(-count // 2048))
     sizes = source.numbers(f"<u{size_bytes}", -(-count // chunk))
     packed = source.take(packed_bytes)
-    need(packed_bytes == -(-sum(sizes) // 8), "Huffman: sizes do not add up")
-    need(all(1 <= length <= 57 for length in lengths), "Huffman: length out of range")
-    need(len(set(symbols)) == len(symbols), "Huffman: a symbol occurs twice")
+    require(packed_bytes == -(-sum(sizes) // 8), "Huffman: sizes do not add up")
+    require(all(1 <= length <= 57 for length in lengths), "Huffman: length out of range")
+    require(len(set(symbols)) == len(symbols), "Huffman: a symbol occurs twice")
     symbols.insert(end_mark, None)
 
     codes, code = [], 0
     for length in lengths:
-        need(code % 2 ** (64 - length) == 0, "Huffman: bad code")
+        require(code % 2 ** (64 - length) == 0, "Huffman: bad code")
         codes.append(code)
         code += 2 ** (64 - length)
-    need(code == (2**64 if leaves else 0), "Huffman: code is not complete")
+    require(code == (2**64 if leaves else 0), "Huffman: code is not complete")
 
     packed += bytes(9)
     decoded, at = [], 0
@@ -343,10 +364,10 @@ def read_huffman(source: Cursor, count: int) -> np.ndarray:
         for _ in range(first, min(first + chunk, count)):
             next_bits = int.from_bytes(packed[at // 8 : at // 8 + 9], "big") >> (8 - at % 8) & (2**64 - 1)
             leaf = bisect_right(codes, next_bits) - 1
-            need(leaf != end_mark, "Huffman: the end mark comes too early")
+            require(leaf != end_mark, "Huffman: the end mark comes too early")
             decoded.append(symbols[leaf])
             at += lengths[leaf]
-        need(at == stop, "Huffman: a chunk ends elsewhere than its size says")
+        require(at == stop, "Huffman: a chunk ends elsewhere than its size says")
     return np.array(decoded, np.int64)
 
 
@@ -354,47 +375,49 @@ def read_huffman(source: Cursor, count: int) -> np.ndarray:
 
 
 def read_integers(data: bytes, contexts: np.ndarray, signed: bool = False) -> np.ndarray:
-    """The integers that fill `data`, one for each context."""
+    """Read one integer for each context; the integers must fill `data`."""
     source = Cursor(data)
     tokens = np.array(read_tokens(source, contexts.tolist()), np.int64)
     n = np.where(tokens < 28, tokens // 4, (tokens - 14) // 2)  # floor(log2 v); only for tokens of 16 and more
-    leading = np.where(tokens < 28, 4 + tokens % 4, 2 + tokens % 2)  # the highest bits of v, 3 or 2 of them
+    leading = np.where(tokens < 28, 4 + tokens % 4, 2 + tokens % 2)  # the 3 or 2 highest bits of v
     widths = np.where(tokens < 16, 0, np.where(tokens < 28, n - 2, n - 1))
     v = np.where(tokens < 16, tokens, leading << widths) + read_bits(source.rest(), widths)
     return (v >> 1) ^ -(v & 1) if signed else v
 
 
 def read_tokens(source: Cursor, contexts: Sequence[int]) -> list[int]:
-    """One token for each context: interleaved rANS."""
+    """Read one token for each context from an interleaved rANS stream."""
     count = len(contexts)
     if count == 0:
         return []
     head, alphabet = source.unpack("BB")
     lanes, classes, static = 1 << (head & 15), (head >> 4 & 7) + 1, head >> 7
-    need(alphabet <= 126, "tokens: alphabet too large")
+    require(alphabet <= 126, "tokens: alphabet too large")
     if alphabet == 0:
         only = source.take(max(contexts) + 1)
-        need(head == 0 and max(only) < 126, "tokens: bad constant stream")
+        require(head == 0 and max(only) < 126, "tokens: bad constant stream")
         return [only[context] for context in contexts]
-    need(lanes <= 8192 and (lanes == 8192 or count <= 65536 * lanes), "tokens: too many for the lanes")
+    require(lanes <= 8192 and (lanes == 8192 or count <= 65536 * lanes), "tokens: too many for the lanes")
     thresholds = list(source.take(classes - 1))
-    need(all(a < b for a, b in zip([0, *thresholds], [*thresholds, alphabet], strict=True)), "tokens: bad thresholds")
+    require(
+        all(a < b for a, b in zip([0, *thresholds], [*thresholds, alphabet], strict=True)), "tokens: bad thresholds"
+    )
     class_after = [bisect_right(thresholds, token) for token in range(alphabet)]
     models = (max(contexts) + 1) * classes
-    need(models <= 1024, "tokens: too many models")
+    require(models <= 1024, "tokens: too many models")
     if static:
-        sums = cumulative(read_weights(source, models, alphabet))
+        sums = cumulative_frequencies(read_weights(source, models, alphabet))
 
     per_lane = -(-count // lanes)
     per_lane += per_lane % 2 == 0
-    used = -(-count // per_lane)
-    states = list(source.unpack(f"{used}I"))
+    used_lanes = -(-count // per_lane)
+    states = list(source.unpack(f"{used_lanes}I"))
     words, taken = np.frombuffer(source.data[source.at :][: (len(source.data) - source.at) // 2 * 2], "<u2").tolist(), 0
-    tokens, lane_class = [0] * count, [0] * used
+    tokens, lane_class = [0] * count, [0] * used_lanes
     seen, change = [[0] * alphabet for _ in range(models)], 0
     for step in range(per_lane):
         if step == change and not static:
-            sums, change = cumulative(adaptive_weights(np.array(seen))), change + 1 + change // 8
+            sums, change = cumulative_frequencies(adaptive_weights(np.array(seen))), change + 1 + change // 8
         for lane in range(-(-(count - step) // per_lane)):
             place, x = lane * per_lane + step, states[lane]
             model = classes * contexts[place] + lane_class[lane]
@@ -402,18 +425,18 @@ def read_tokens(source: Cursor, contexts: Sequence[int]) -> list[int]:
             token = bisect_right(sums[model], low) - 1
             x = (sums[model][token + 1] - sums[model][token]) * (x // 4096) + low - sums[model][token]
             if x < 65536:
-                need(taken < len(words), "tokens: words run out")
+                require(taken < len(words), "tokens: words run out")
                 x, taken = 65536 * x + words[taken], taken + 1
             states[lane], tokens[place], lane_class[lane] = x, token, class_after[token]
             seen[model][token] += 1
-    need(all(x == 65536 for x in states), "tokens: wrong last state")
+    require(all(x == 65536 for x in states), "tokens: wrong last state")
     source.take(2 * taken)
     return tokens
 
 
-def cumulative(weights: np.ndarray) -> list[list[int]]:
-    """0, f_0, f_0 + f_1, ..., 4096 for each row of weights."""
-    need(bool(weights.any(axis=1).all()), "tokens: a model without weights")
+def cumulative_frequencies(weights: np.ndarray) -> list[list[int]]:
+    """Return 0, f_0, f_0 + f_1, ..., 4096 for each row of weights."""
+    require(bool(weights.any(axis=1).all()), "tokens: a model without weights")
     f = np.where(weights > 0, np.maximum(1, 4096 * weights // weights.sum(axis=1, keepdims=True)), 0)
     f[np.arange(len(f)), weights.argmax(axis=1)] += 4096 - f.sum(axis=1)
     return np.pad(f.cumsum(axis=1), ((0, 0), (1, 0))).tolist()
@@ -425,18 +448,18 @@ def adaptive_weights(seen: np.ndarray) -> np.ndarray:
 
 
 def read_weights(source: Cursor, models: int, alphabet: int) -> np.ndarray:
-    """Weights of static models."""
-    need(source.data[source.at : source.at + 1] < b"\x80", "tokens: levels with static models")
+    """Read the weights of static models."""
+    require(source.data[source.at : source.at + 1] < b"\x80", "tokens: levels with static models")
     folded = np.array(read_tokens(source, [0] * (models * alphabet)), np.int64).reshape(models, alphabet)
     levels = (folded >> 1) ^ -(folded & 1)
     levels[0] = levels[0].cumsum()
     levels = levels.cumsum(axis=0)
-    need(0 <= levels.min() and levels.max() <= 49, "tokens: level out of range")
+    require(0 <= levels.min() and levels.max() <= 49, "tokens: level out of range")
     return np.where(levels > 0, (4 + (levels - 1) % 4) << np.maximum(levels - 1, 0) // 4, 0)
 
 
-def steps_of(codes: Sequence[int]) -> np.ndarray:
-    """Step sizes in units of 2^-24 (3.2)."""
+def decode_step_sizes(codes: Sequence[int]) -> np.ndarray:
+    """Return step sizes in units of 2^-24 from their codes (3.2)."""
     return np.array([(8 + e % 8) << e // 8 for e in codes], np.int64)
 
 
@@ -451,13 +474,13 @@ class Points:
 
 def read_points(source: Cursor, count: int) -> Points:
     g, class_count, gap_bytes, class_bytes = source.unpack("BBII")
-    need(1 <= g <= 18 and 1 <= class_count <= 16, "codec 6: bad header")
+    require(1 <= g <= 18 and 1 <= class_count <= 16, "codec 6: bad header")
     bits_of_class = np.array(list(source.take(class_count)))
-    need(bool((g <= bits_of_class).all() and (bits_of_class <= 18).all()), "codec 6: bits out of range")
+    require(bool((g <= bits_of_class).all() and (bits_of_class <= 18).all()), "codec 6: bits out of range")
     gaps = read_integers(source.take(gap_bytes), np.zeros(count, np.int64))
-    need(sum(gaps.tolist()) < 2 ** (3 * g), "codec 6: a point outside the cube")
+    require(sum(gaps.tolist()) < 2 ** (3 * g), "codec 6: a point outside the cube")
     classes = read_integers(source.take(class_bytes), (gaps == 0).astype(np.int64))
-    need(bool((classes < class_count).all()), "codec 6: class out of range")
+    require(bool((classes < class_count).all()), "codec 6: class out of range")
     bits = bits_of_class[classes][:, None]
     lower = read_bits(source.rest(), 3 * (bits[:, 0] - g))
     q = (from_morton(np.cumsum(gaps), g) << (bits - g)) + from_morton(lower, 18 - g)
@@ -469,7 +492,7 @@ def from_morton(codes: np.ndarray, bits: int) -> np.ndarray:
     return np.stack(axes, axis=1)
 
 
-def positions(points: Points, half_extent: Sequence[float]) -> np.ndarray:
+def decode_positions(points: Points, half_extent: Sequence[float]) -> np.ndarray:
     y = (points.m - 2**18) / 2**17
     radius = np.maximum(np.sqrt((y * y).sum(axis=1, keepdims=True)), 1)
     return y / (radius * (2 - np.minimum(radius, 2 - 2**-20))) * np.array(half_extent, np.float64)
@@ -482,24 +505,24 @@ def read_channels(source: Cursor, columns: int, classes: np.ndarray) -> np.ndarr
     if columns == 1:
         return read_channel(source, classes)
     basis = np.array(source.unpack("9f")).reshape(3, 3)
-    need(bool((np.abs(basis) <= 1 + 2**-10).all()), "codec 7: basis out of range")
+    require(bool((np.abs(basis) <= 1 + 2**-10).all()), "codec 7: basis out of range")
     n = [read_channel(source, classes) for _ in range(3)]
     return np.stack([(n[0] * row[0] + n[1] * row[1]) + n[2] * row[2] for row in basis], axis=1)
 
 
 def read_channel(source: Cursor, classes: np.ndarray) -> np.ndarray:
     mean, weight, difference_bytes, class_count = source.unpack("fBIB")
-    need(abs(mean) <= 4096 and weight <= 16, "codec 7: bad channel")
-    need(class_count > classes.max(initial=0), "codec 7: classes without a step size")
-    d = steps_of(source.take(class_count))[classes]
+    require(abs(mean) <= 4096 and weight <= 16, "codec 7: bad channel")
+    require(class_count > classes.max(initial=0), "codec 7: classes without a step size")
+    d = decode_step_sizes(source.take(class_count))[classes]
     s = read_integers(source.take(difference_bytes), classes, signed=True)
-    need(bool((np.abs(s) <= np.minimum(2**39 // d, 2**30)).all()), "codec 7: difference out of range")
+    require(bool((np.abs(s) <= np.minimum(2**39 // d, 2**30)).all()), "codec 7: difference out of range")
     v, count = d * s, len(s)
     for distance in (1 << k for k in reversed(range(count.bit_length()))):
         i = np.arange(distance, count, 2 * distance)
         right = np.where(i + distance < count, i + distance, i - distance)
         v[i] += weight * (v[i - distance] + v[right]) // 32
-        need(bool((np.abs(v) < 2**45).all()), "codec 7: value out of range")
+        require(bool((np.abs(v) < 2**45).all()), "codec 7: value out of range")
     return v / 2**24 + mean
 
 
@@ -507,19 +530,19 @@ def read_channel(source: Cursor, classes: np.ndarray) -> np.ndarray:
 
 
 def read_numbers(source: Cursor, groups: tuple[np.ndarray, int]) -> np.ndarray:
-    """Numbers from the group of each number and the count of all groups."""
+    """Read numbers; `groups` has the group of each number and the number of groups."""
     group, group_count = groups
     step_bytes, model_bytes = source.unpack("II")
     codes = read_integers(source.take(step_bytes), np.zeros(group_count, np.int64))
-    need(bool((codes <= 255).all()), "codec 8: step size out of range")
+    require(bool((codes <= 255).all()), "codec 8: step size out of range")
     models = np.zeros(group_count, np.int64)
     models[codes > 0] = read_integers(source.take(model_bytes), np.zeros(int((codes > 0).sum()), np.int64))
-    need(bool((models < 8).all()), "codec 8: model out of range")
+    require(bool((models < 8).all()), "codec 8: model out of range")
     stored = codes[group] > 0
     s = read_integers(source.rest(), models[group[stored]], signed=True)
-    need(bool((np.abs(s) <= 2**24).all()), "codec 8: symbol out of range")
+    require(bool((np.abs(s) <= 2**24).all()), "codec 8: symbol out of range")
     numbers = np.zeros(len(group))
-    numbers[stored] = s * steps_of(codes.tolist())[group[stored]] / 2**24
+    numbers[stored] = s * decode_step_sizes(codes.tolist())[group[stored]] / 2**24
     return numbers
 
 
@@ -529,7 +552,7 @@ def decoder_groups(layers: list[tuple[int, int]]) -> tuple[np.ndarray, int]:
 
 
 def table_groups(grid: dict[str, int], m: np.ndarray) -> np.ndarray:
-    """The group of each row of a hash table: 16 level + u."""
+    """Return the group of each row of a hash table: 16 level + u."""
     groups, m = [], m[:: max(1, -(-len(m) // 65536))]
     for level, (r, rows) in enumerate(grid_levels(grid)):
         cells, use = m * (r - 1) // 2**19, np.zeros(rows, np.int64)
@@ -567,18 +590,18 @@ class Exposure:
 
 
 def read_exposure(section: Section) -> Exposure:
-    need(section.codec == 9, "EXPO: unknown codec")
-    need(section.raw_length == section.stored_length, "EXPO: wrong raw length")
+    require(section.codec == 9, "EXPO: unknown codec")
+    require(section.raw_length == section.stored_length, "EXPO: wrong raw length")
     source = Cursor(section.read())
     count, *reserved = source.unpack("BBBB")
-    need(count <= 64 and not any(reserved), "EXPO: too many centers or reserved bytes")
+    require(count <= 64 and not any(reserved), "EXPO: too many centers or reserved bytes")
     position_length, direction_length, *rest = source.unpack("20f")
-    need(all(map(math.isfinite, (position_length, direction_length, *rest))), "EXPO: NaN or infinite")
+    require(all(map(math.isfinite, (position_length, direction_length, *rest))), "EXPO: NaN or infinite")
     least, largest, mean, lowest, highest, steps = (rest[at : at + 3] for at in range(0, 18, 3))
-    need(position_length > 0 and direction_length > 0, "EXPO: lengths must be positive")
-    need(all(low <= high for low, high in zip(least, largest, strict=True)), "EXPO: the box is not in order")
+    require(position_length > 0 and direction_length > 0, "EXPO: lengths must be positive")
+    require(all(low <= high for low, high in zip(least, largest, strict=True)), "EXPO: the box is not in order")
     limits_in_order = all(-8 <= low <= high <= 8 for low, high in zip(lowest, highest, strict=True))
-    need(limits_in_order, "EXPO: limits out of range")
+    require(limits_in_order, "EXPO: limits out of range")
     centers = []
     for _ in range(count):
         x, f, w = source.unpack("3B"), source.unpack("3b"), source.unpack("3h")
@@ -590,7 +613,7 @@ def read_exposure(section: Section) -> Exposure:
 
 
 def log_gains(exposure: Exposure, position: Sequence[float], direction: Sequence[float]) -> list[float]:
-    """Log gains (red, green, blue) at a viewpoint: position in local units, unit viewing direction."""
+    """Return the log gains (red, green, blue) at a position in local units with a unit viewing direction."""
     box = zip(position, exposure.least, exposure.largest, strict=True)
     inside = [min(max(value, low), high) for value, low, high in box]
     gains = list(exposure.mean)
@@ -605,5 +628,5 @@ def log_gains(exposure: Exposure, position: Sequence[float], direction: Sequence
 
 
 def expose(rgb: np.ndarray, gains: np.ndarray) -> np.ndarray:
-    """A picture (..., 3) in [0, 1] at the exposure of the gains (3,)."""
+    """Return a picture (..., 3) in [0, 1] at the exposure of the gains (3,)."""
     return gains * rgb / (1 + (gains - 1) * rgb)

@@ -1,10 +1,11 @@
-"""Sets of photos as people have them: about a hundred variants of a given set, and what reading each of them gives.
+"""Read about a hundred variants of a data set, as users may have them, and check the result of each.
 
     python -m tools.safety.variants SET [SET ...] [--only WORD]
 
-Each is built in a temporary folder out of links to the set's files, and read. A table says of each whether it was read,
-with the same cameras and pictures as the set itself; refused, with which sentence; or WRONG: read with others, refused
-where it should be read, read where it should be refused, or not even a sentence. Exits with 1 if one is.
+Each variant is built in a temporary folder from links to the set's files, and read. The program prints one line for
+each: "read" with the notes, if cameras and pictures equal those of the set; "refused" with the error message; or
+"WRONG" if the pictures or cameras differ, if the variant should be refused but is read or the other way round, or if
+reading raises anything but a HyrfError. It exits with 1 if a variant is WRONG.
 """
 
 from __future__ import annotations
@@ -18,36 +19,36 @@ from collections import Counter
 from pathlib import Path
 
 from hyrfpack.data import load_scene
-from tools.safety.variants.attempt import try_variant
-from tools.safety.variants.catalog import VARIANTS
+from tools.safety.variants.catalog import ALL_VARIANTS
+from tools.safety.variants.check import check_variant
 from tools.safety.variants.working_set import WorkingSet
 
 
 def layouts_of(source: Path) -> list[str]:
-    """The layouts that a set can be read as."""
-    there = {"colmap": "sparse", "nerfstudio": "transforms.json", "blender": "transforms_train.json"}
-    return [layout for layout, sign in there.items() if (source / sign).exists()]
+    """Return the layouts as which a data set can be read."""
+    marker_files = {"colmap": "sparse", "nerfstudio": "transforms.json", "blender": "transforms_train.json"}
+    return [layout for layout, marker in marker_files.items() if (source / marker).exists()]
 
 
 def main() -> int:
     parser = argparse.ArgumentParser("python -m tools.safety.variants", description=__doc__.split("\n")[0])
     parser.add_argument("sets", nargs="+", type=Path, metavar="SET")
-    parser.add_argument("--only", default="", metavar="WORD", help="variants with this in their names")
+    parser.add_argument("--only", default="", metavar="WORD", help="only variants with this word in their names")
     options = parser.parse_args()
     counts: Counter[str] = Counter()
     with tempfile.TemporaryDirectory(prefix="variants-") as folder:
         os.environ["XDG_CACHE_HOME"] = os.path.join(folder, "cache")
         for source in options.sets:
             for layout in layouts_of(source):
-                plain_set = WorkingSet(source, Path(folder, "plain"), layout)
-                plain = load_scene(plain_set.root)
-                print(f"\n{source.name} as {layout}: {len(plain.views)} photos")
-                for number, variant in enumerate(VARIANTS):
+                original_set = WorkingSet(source, Path(folder, "plain"), layout)
+                original_scene = load_scene(original_set.root)
+                print(f"\n{source.name} as {layout}: {len(original_scene.views)} photos")
+                for number, variant in enumerate(ALL_VARIANTS):
                     if layout in variant.layouts and options.only in variant.name:
-                        outcome = try_variant(variant, source, layout, Path(folder, str(number)), plain)
+                        outcome = check_variant(variant, source, layout, Path(folder, str(number)), original_scene)
                         counts[outcome.kind] += 1
                         print(f"  {outcome.kind:8}{variant.name:58}{outcome.said[:200]}", flush=True)
-                shutil.rmtree(plain_set.root)
+                shutil.rmtree(original_set.root)
     print("\n" + ", ".join(f"{kind}: {count}" for kind, count in sorted(counts.items())))
     return 1 if counts["WRONG"] else 0
 

@@ -1,8 +1,8 @@
-"""All variants, family by family."""
+"""List all variants, module by module."""
 
 from __future__ import annotations
 
-from tools.safety.variants import archives, folders, masks, models, names, turned
+from tools.safety.variants import archives, folders, masks, models, names, orientations
 
-FAMILIES = (names, folders, models, turned, masks, archives)
-VARIANTS = tuple(variant for family in FAMILIES for variant in family.variants())
+VARIANT_MODULES = (names, folders, models, orientations, masks, archives)
+ALL_VARIANTS = tuple(variant for family in VARIANT_MODULES for variant in family.variants())

@@ -1,4 +1,4 @@
-"""Photos, models and whole sets in other folders, smaller photos beside them, and folders that are missing."""
+"""Variants with photos, models or whole sets in other folders, with smaller photos, and with missing folders."""
 
 from __future__ import annotations
 
@@ -7,35 +7,37 @@ from collections.abc import Callable, Iterator
 
 from PIL import Image
 
-from tools.safety.variants.variant import ALL, Variant
+from tools.safety.variants.variant import ALL_LAYOUTS, Variant
 from tools.safety.variants.working_set import WorkingSet
 
 
 def variants() -> Iterator[Variant]:
-    def moved(*moves: tuple[str, str]) -> Callable[[WorkingSet], None]:
+    """Yield the variants of this module."""
+
+    def move_folders(*moves: tuple[str, str]) -> Callable[[WorkingSet], None]:
         def make(s: WorkingSet) -> None:
             for old, new in moves:
-                there = s.root.with_name("there")
-                (s.root / old).rename(there)
+                temporary = s.root.with_name("temporary")
+                (s.root / old).rename(temporary)
                 (s.root / new).parent.mkdir(parents=True, exist_ok=True)
                 if new == ".":
-                    for entry in list(there.iterdir()):
+                    for entry in list(temporary.iterdir()):
                         entry.rename(s.root / entry.name)
-                    there.rmdir()
+                    temporary.rmdir()
                 else:
-                    there.rename(s.root / new)
+                    temporary.rename(s.root / new)
 
         return make
 
     flat = ("sparse/0", ".")
     for name in ("Images", "IMAGES", "image", "input", "rgb", "photos", "pictures", "frames", "imgs", "kitchen"):
-        yield Variant(f"folders: photos in {name}", moved(("images", name)))
-    yield Variant("folders: model beside photos", moved(("images", "."), flat))
-    yield Variant("folders: model in the root", moved(flat))
-    yield Variant("folders: photos in the root", moved(("images", ".")))
+        yield Variant(f"folders: photos in {name}", move_folders(("images", name)))
+    yield Variant("folders: model beside photos", move_folders(("images", "."), flat))
+    yield Variant("folders: model in the root", move_folders(flat))
+    yield Variant("folders: photos in the root", move_folders(("images", ".")))
     yield Variant(
         "folders: images empty, photos in the root",
-        lambda s: (moved(("images", "."))(s), (s.root / "images").mkdir()),
+        lambda s: (move_folders(("images", "."))(s), (s.root / "images").mkdir()),
     )
     for place in (
         "sparse/1",
@@ -48,16 +50,17 @@ def variants() -> Iterator[Variant]:
         "undistorted/sparse",
         "distorted/sparse/0",
     ):
-        yield Variant(f"folders: model in {place}", moved(("sparse/0", "taken"), ("taken", place)))
+        yield Variant(f"folders: model in {place}", move_folders(("sparse/0", "taken"), ("taken", place)))
     yield Variant(
-        "folders: dense/", moved(("sparse/0", "taken"), ("taken", "dense/sparse"), ("images", "dense/images"))
+        "folders: dense/", move_folders(("sparse/0", "taken"), ("taken", "dense/sparse"), ("images", "dense/images"))
     )
     yield Variant(
-        "folders: dense/0/", moved(("sparse/0", "taken"), ("taken", "dense/0/sparse"), ("images", "dense/0/images"))
+        "folders: dense/0/",
+        move_folders(("sparse/0", "taken"), ("taken", "dense/0/sparse"), ("images", "dense/0/images")),
     )
     yield Variant(
         "folders: dense/ beside sparse/ without photos",
-        lambda s: (shutil.copytree(s.model, s.root / "dense" / "sparse"), moved(("images", "dense/images"))(s)),
+        lambda s: (shutil.copytree(s.model, s.root / "dense" / "sparse"), move_folders(("images", "dense/images"))(s)),
     )
     yield Variant(
         "folders: convert.py's input/ and distorted/",
@@ -68,34 +71,36 @@ def variants() -> Iterator[Variant]:
         ),
     )
     for depth in ("set", "a/set", "a/b/set"):
-        yield Variant(f"folders: all of it in {depth}", lambda s, d=depth: _nested(s, d), layouts=ALL, note="was taken")
-    yield Variant("folders: four deep", lambda s: _nested(s, "a/b/c/set"), "no poses found", layouts=ALL)
+        yield Variant(
+            f"folders: all of it in {depth}", lambda s, d=depth: _nest_set(s, d), layouts=ALL_LAYOUTS, note="was taken"
+        )
+    yield Variant("folders: four deep", lambda s: _nest_set(s, "a/b/c/set"), "no poses found", layouts=ALL_LAYOUTS)
     yield Variant(
         "folders: two sets",
-        lambda s: (_nested(s, "a"), shutil.copytree(s.root / "a", s.root / "b", symlinks=True)),
+        lambda s: (_nest_set(s, "a"), shutil.copytree(s.root / "a", s.root / "b", symlinks=True)),
         "holds 2 sets",
-        layouts=ALL,
+        layouts=ALL_LAYOUTS,
     )
     for number in (2, 4, 8):
         yield Variant(
             f"folders: images_{number} alone",
-            lambda s, n=number: _smaller(s, n),
+            lambda s, n=number: _shrink_photos(s, n),
             layouts=("colmap", "nerfstudio"),
             note=f"images_{number}",
         )
     yield Variant(
         "folders: images empty, images_4 not",
-        lambda s: (_smaller(s, 4), (s.root / "images").mkdir(exist_ok=True)),
+        lambda s: (_shrink_photos(s, 4), (s.root / "images").mkdir(exist_ok=True)),
         layouts=("colmap", "nerfstudio"),
     )
     yield Variant(
         "folders: images_2 and images_4",
-        lambda s: (_smaller(s, 4), shutil.copytree(s.root / "images_4", s.root / "images_2")),
+        lambda s: (_shrink_photos(s, 4), shutil.copytree(s.root / "images_4", s.root / "images_2")),
         note="images_2",
     )
     yield Variant(
         "folders: two that might be",
-        lambda s: (shutil.copytree(s.root / "images", s.root / "a", symlinks=True), moved(("images", "b"))(s)),
+        lambda s: (shutil.copytree(s.root / "images", s.root / "a", symlinks=True), move_folders(("images", "b"))(s)),
         "there are the folders a, b, sparse",
     )
     yield Variant(
@@ -108,14 +113,14 @@ def variants() -> Iterator[Variant]:
     yield Variant("folders: the model's given", lambda s: setattr(s, "given", s.model), "no photo folder")
 
 
-def _nested(s: WorkingSet, place: str) -> None:
+def _nest_set(s: WorkingSet, place: str) -> None:
     away = s.root.with_name("away")
     s.root.rename(away)
     (s.root / place).parent.mkdir(parents=True)
     away.rename(s.root / place)
 
 
-def _smaller(s: WorkingSet, divisor: int) -> None:
+def _shrink_photos(s: WorkingSet, divisor: int) -> None:
     for file in s.photos:
         with Image.open(file) as image:
             picture = image.convert("RGB").resize([max(1, round(side / divisor)) for side in image.size])

@@ -1,4 +1,4 @@
-"""Masks of each photo or one for all, under the names that people give them, and masks that fit no photo."""
+"""Variants with one mask per photo or one mask for all, under common names, and with masks that fit no photo."""
 
 from __future__ import annotations
 
@@ -11,34 +11,39 @@ from tools.safety.variants.working_set import WorkingSet
 
 
 def variants() -> Iterator[Variant]:
-    have = "have a mask"
-    yield Variant("masks: of the photos' names", lambda s: s.masks(lambda f: f"masks/{f.stem}.png"), note=have)
-    yield Variant("masks: .png added", lambda s: s.masks(lambda f: f"masks/{f.name}.png"), note=have)
+    """Yield the variants of this module."""
+    note = "have a mask"
+    yield Variant("masks: of the photos' names", lambda s: s.write_masks(lambda f: f"masks/{f.stem}.png"), note=note)
+    yield Variant("masks: .png added", lambda s: s.write_masks(lambda f: f"masks/{f.name}.png"), note=note)
     yield Variant(
-        "masks: of the photos' names in capitals", lambda s: s.masks(lambda f: f"masks/{f.stem.upper()}.PNG"), note=have
+        "masks: of the photos' names in capitals",
+        lambda s: s.write_masks(lambda f: f"masks/{f.stem.upper()}.PNG"),
+        note=note,
     )
-    yield Variant("masks: in a folder", lambda s: s.masks(lambda f: f"masks/left/{f.stem}.webp"), note=have)
-    yield Variant("masks: half as large", lambda s: _half_masks(s), note=have)
-    yield Variant("masks: one, mask.png", lambda s: s.masks(lambda f: "mask.png"), note="taken for all")
-    yield Variant("masks: one in the folder", lambda s: s.masks(lambda f: "masks/camera.png"), note="taken for all")
+    yield Variant("masks: in a folder", lambda s: s.write_masks(lambda f: f"masks/left/{f.stem}.webp"), note=note)
+    yield Variant("masks: half as large", lambda s: _write_half_size_masks(s), note=note)
+    yield Variant("masks: one, mask.png", lambda s: s.write_masks(lambda f: "mask.png"), note="taken for all")
+    yield Variant(
+        "masks: one in the folder", lambda s: s.write_masks(lambda f: "masks/camera.png"), note="taken for all"
+    )
     yield Variant(
         "masks: one of another shape",
-        lambda s: (s.masks(lambda f: "masks/camera.png", (50, 13)), setattr(s, "masked", 0.0)),
+        lambda s: (s.write_masks(lambda f: "masks/camera.png", (50, 13)), setattr(s, "masked", 0.0)),
         note="not the shape",
     )
     yield Variant(
         "masks: of no photo",
-        lambda s: (s.masks(lambda f: f"masks/{f.stem}_mask.png"), setattr(s, "masked", 0.0)),
+        lambda s: (s.write_masks(lambda f: f"masks/{f.stem}_mask.png"), setattr(s, "masked", 0.0)),
         note="of no posed photo",
     )
     yield Variant(
         "masks: in mask/",
-        lambda s: (s.masks(lambda f: f"mask/{f.stem}.png"), setattr(s, "masked", 0.0)),
+        lambda s: (s.write_masks(lambda f: f"mask/{f.stem}.png"), setattr(s, "masked", 0.0)),
         note="folder mask is not read",
     )
 
 
-def _half_masks(s: WorkingSet) -> None:
+def _write_half_size_masks(s: WorkingSet) -> None:
     with Image.open(s.photos[0]) as image:
         size = image.width // 2, image.height // 2
-    s.masks(lambda f: f"masks/{f.stem}.png", size)
+    s.write_masks(lambda f: f"masks/{f.stem}.png", size)

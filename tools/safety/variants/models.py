@@ -1,4 +1,4 @@
-"""COLMAP models as other versions, editors and hands write them, and models of which a part is missing."""
+"""Variants with COLMAP models as other versions and text editors write them, and with incomplete models."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from tools.safety.variants.working_set import WorkingSet
 
 
 def variants() -> Iterator[Variant]:
+    """Yield the variants of this module."""
+
     def text(change: Callable[[str, bytes], bytes | None]) -> Callable[[WorkingSet], None]:
         def make(s: WorkingSet) -> None:
             s.write_model(text=True)
@@ -22,7 +24,7 @@ def variants() -> Iterator[Variant]:
     def without_points(table: str, content: bytes) -> bytes | None:
         return None if table == "points3D" else content
 
-    pointless = "no points"
+    note = "no points"
     yield Variant("model: text", text(lambda t, b: b))
     yield Variant("model: text, CRLF", text(lambda t, b: b.replace(b"\n", b"\r\n")))
     yield Variant("model: text, BOM", text(lambda t, b: b"\xef\xbb\xbf" + b))
@@ -30,9 +32,9 @@ def variants() -> Iterator[Variant]:
     yield Variant("model: text without comments", text(lambda t, b: re.sub(rb"(?m)^#.*\n", b"", b)))
     yield Variant("model: text with more comments", text(lambda t, b: b"# by hand\n\n" + b))
     yield Variant("model: text, empty lines at the end", text(lambda t, b: b + b"\n\n"))
-    yield Variant("model: text without points3D", text(without_points), note=pointless)
-    yield Variant("model: text with empty points3D", text(lambda t, b: b"" if t == "points3D" else b), note=pointless)
-    yield Variant("model: binary without points3D", lambda s: (s.model / "points3D.bin").unlink(), note=pointless)
+    yield Variant("model: text without points3D", text(without_points), note=note)
+    yield Variant("model: text with empty points3D", text(lambda t, b: b"" if t == "points3D" else b), note=note)
+    yield Variant("model: binary without points3D", lambda s: (s.model / "points3D.bin").unlink(), note=note)
     yield Variant("model: points3D.ply alone", _ply_points)
     yield Variant("model: text and points3D.ply", lambda s: (s.write_model(text=True), _ply_points(s)))
     yield Variant("model: with rigs and frames", lambda s: s.reconstruction().write_binary(str(s.model)))

@@ -1,4 +1,4 @@
-"""What a variant is: a name, a change to a working set, and what reading it should give."""
+"""Define a variant: a name, a change to a working set, and the expected result of reading it."""
 
 from __future__ import annotations
 
@@ -7,22 +7,24 @@ from dataclasses import dataclass
 
 from tools.safety.variants.working_set import WorkingSet
 
-READ = ""  # what a variant should be: read; any other text is what the refusal has to say
-ALL = ("colmap", "nerfstudio", "blender")  # layouts
+EXPECT_READ = ""  # `Variant.expect` of variants that must be readable
+ALL_LAYOUTS = ("colmap", "nerfstudio", "blender")
 
 
 @dataclass(frozen=True)
 class Variant:
-    """Attributes:
-    name: in the table.
-    make: changes a working set.
-    expect: READ, or what the sentence has to say, as a pattern.
-    layouts: that it is of.
-    note: a pattern that one of the notes has to have.
+    """One variant of a data set.
+
+    Attributes:
+        name: the name in the table.
+        make: changes a working set in place.
+        expect: EXPECT_READ, or a pattern that the error message must match.
+        layouts: the layouts that have this variant.
+        note: a pattern that the notes must match if the variant is read.
     """
 
     name: str
     make: Callable[[WorkingSet], object]
-    expect: str = READ
+    expect: str = EXPECT_READ
     layouts: tuple[str, ...] = ("colmap",)
     note: str = ""

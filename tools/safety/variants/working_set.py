@@ -1,4 +1,4 @@
-"""The copy of a set that a variant changes: its photos, its poses, its model and its masks."""
+"""Make the copy of a set that a variant changes: its photos, poses, model and masks."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from PIL import Image
 
-POSES = ("transforms.json", "transforms_train.json", "transforms_test.json", "transforms_val.json")
+TRANSFORMS_FILE_NAMES = ("transforms.json", "transforms_train.json", "transforms_test.json", "transforms_val.json")
 
 
 class WorkingSet:
-    """A copy of a set to be changed: links to its photos, poses of its own.
+    """A copy of a data set to be changed, with links to the photos and copies of the poses.
 
     Attributes:
-        root: its folder.
-        given: what to read, the folder unless a variant says otherwise.
+        root: the folder of the copy.
+        given: the path to read; it is `root` unless a variant changes it.
         layout: "colmap", "nerfstudio" or "blender".
-        masked: pixels of each photo that a mask of the variant takes away, as a share; None without masks.
+        masked: share of each photo that a mask of the variant removes; None without masks.
     """
 
     def __init__(self, source: Path, root: Path, layout: str) -> None:
@@ -43,33 +43,33 @@ class WorkingSet:
         return self.root / "sparse" / "0"
 
     def reconstruction(self):
-        """The COLMAP model, as pycolmap reads it."""
+        """Return the COLMAP model as a pycolmap reconstruction."""
         import pycolmap
 
         return pycolmap.Reconstruction(str(self.model))
 
     @property
     def photos(self) -> list[Path]:
-        """Files that poses are of, while they are where the set has them."""
-        there = (path for path in sorted(self.root.rglob("*")) if path.is_file() or path.is_symlink())
-        listed = {PurePosixPath(name).with_suffix("").as_posix() for name in self.listed()}
+        """The photo files with poses, as long as they have their original folder and name; endings may differ."""
+        files = (path for path in sorted(self.root.rglob("*")) if path.is_file() or path.is_symlink())
+        pose_names = {PurePosixPath(name).with_suffix("").as_posix() for name in self.list_pose_names()}
         top = self.root / "images" if self.layout == "colmap" else self.root
         return [
             path
-            for path in there
-            if path.is_relative_to(top) and path.relative_to(top).with_suffix("").as_posix() in listed
+            for path in files
+            if path.is_relative_to(top) and path.relative_to(top).with_suffix("").as_posix() in pose_names
         ]
 
-    def listed(self) -> list[str]:
-        """The names that poses give photos."""
+    def list_pose_names(self) -> list[str]:
+        """Return the names of the photos in the poses."""
         if self.layout == "colmap":
             return [image.name for image in self.reconstruction().images.values()]
         return [
             str(frame["file_path"]) for file in self._transforms() for frame in json.loads(file.read_text())["frames"]
         ]
 
-    def relist(self, change: Callable[[str], str], *, text: bool = False) -> None:
-        """Give photos other names in the poses."""
+    def rename_in_poses(self, change: Callable[[str], str], *, text: bool = False) -> None:
+        """Change the names of the photos in the poses."""
         if self.layout == "colmap":
             model = self.reconstruction()
             for image in model.images.values():
@@ -83,7 +83,7 @@ class WorkingSet:
             file.write_text(json.dumps(content))
 
     def write_model(self, model=None, *, text: bool = False) -> None:
-        """The COLMAP model anew, as text or not, without tables that older versions did not have."""
+        """Write the COLMAP model as text or binary, without the tables that older versions lack."""
         model = model or self.reconstruction()
         for old in self.model.iterdir():
             old.unlink()
@@ -92,7 +92,7 @@ class WorkingSet:
             (self.model / f"{table}{'.txt' if text else '.bin'}").unlink(missing_ok=True)
 
     def encode(self, ending: str, **options) -> None:
-        """Replace photo files by re-encoded ones."""
+        """Re-encode the photo files with another ending."""
         for file in self.photos:
             with Image.open(file) as image:
                 picture = image.convert("RGBA" if "A" in image.getbands() else "RGB")
@@ -105,18 +105,18 @@ class WorkingSet:
                 pillow_heif.register_heif_opener()
             picture.save(file.with_suffix(ending), **options)
 
-    def masks(self, name: Callable[[PurePosixPath], str], size: tuple[int, int] | None = None) -> None:
-        """Masks that take away the upper quarter, each under the name that its photo's path gives."""
+    def write_masks(self, name: Callable[[PurePosixPath], str], size: tuple[int, int] | None = None) -> None:
+        """Write masks that remove the upper quarter; `name` returns a mask's path from its photo's path."""
         self.masked = 0.25
         for file in self.photos:
             with Image.open(file) as image:
                 width, height = size or image.size
-            below = PurePosixPath(file.relative_to(self.root))
-            target = self.root / name(below)
+            photo_path = PurePosixPath(file.relative_to(self.root))
+            target = self.root / name(photo_path)
             target.parent.mkdir(parents=True, exist_ok=True)
             mask = np.full((height, width), 255, np.uint8)
             mask[: height // 4] = 0
             Image.fromarray(mask).save(target)
 
     def _transforms(self) -> Iterator[Path]:
-        return (self.root / name for name in POSES if (self.root / name).is_file())
+        return (self.root / name for name in TRANSFORMS_FILE_NAMES if (self.root / name).is_file())
