@@ -16,7 +16,7 @@ from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.model.hash_grid import FEATURES_PER_LEVEL, HashGridConfig
 from hyrfpack.model.hybrid import HybridModel
 
-# Equations that every model of this version uses and that no setting changes; `docs/format.md` defines each name.
+# Equations of every model of this version, which no setting changes; `docs/reference/format.md` defines the names.
 MODEL_RULES = {
     "activations": "sigmoid",
     "background_radius": BACKGROUND_RADIUS,

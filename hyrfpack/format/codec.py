@@ -1,4 +1,4 @@
-"""Encoding of a HybridModel to the bytes of a `.hyrf` file, and back; `docs/format.md` specifies each byte."""
+"""Encoding of a HybridModel to the bytes of a `.hyrf` file and back; `docs/reference/format.md` specifies each byte."""
 
 from __future__ import annotations
 

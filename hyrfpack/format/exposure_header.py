@@ -1,4 +1,4 @@
-"""Header of section `EXPO`: all of an exposure map but its centres. `docs/format.md` specifies its layout.
+"""Header of section `EXPO`: all of an exposure map but its centres. `docs/reference/format.md` specifies its layout.
 
 It is read without numpy, because importing numpy would make `describe` slow.
 """

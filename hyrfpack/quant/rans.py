@@ -13,7 +13,7 @@ in 4096ths. It codes the array on many parallel lanes, which is fast in numpy an
     u32 for each used lane    its state
     u16 ...                   words
 
-docs/format.md specifies the meaning of each field.
+docs/reference/format.md specifies the meaning of each field.
 """
 
 from __future__ import annotations

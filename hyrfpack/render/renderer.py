@@ -33,7 +33,7 @@ from hyrfpack.scene import Camera
 
 @dataclass(frozen=True)
 class RenderSettings:
-    """Settings of accuracy against speed. `docs/speed-and-accuracy.md` lists error and time of each default.
+    """Settings of accuracy against speed. `docs/research/speed-and-accuracy.md` lists error and time of each default.
 
     Attributes:
         near: Gaussians nearer than this are culled, in local units (the frame's longest half-axis is 1).

@@ -25,7 +25,7 @@ from hyrfpack.format.container import (
     write_container,
 )
 
-# Places of header fields and table columns, from docs/format.md and not from the code.
+# Places of header fields and table columns, from docs/reference/format.md and not from the code.
 HEADER = {"major": (8, "<H"), "minor": (10, "<H"), "flags": (12, "<I"), "file_length": (16, "<Q")}
 HEADER |= {"toc_offset": (24, "<Q"), "toc_length": (32, "<I"), "count": (36, "<I"), "toc_checksum": (40, "<I")}
 ENTRY = {"type": (0, "<4s"), "codec": (4, "<H"), "flags": (6, "<H"), "offset": (8, "<Q"), "length": (16, "<Q")}
@@ -94,7 +94,7 @@ def test_same_sections_give_same_bytes_and_rewriting_what_was_read_changes_nothi
 
 
 def test_bytes_are_those_of_the_specification():
-    # Built by hand from docs/format.md.
+    # Built by hand from docs/reference/format.md.
     payload = b"hello"
     entry = b"TEXT" + struct.pack("<HHQQQII", 3, 1, 88, 5, 10, zlib.crc32(payload), 0)
     header = b"\x89HYRF\r\n\n" + struct.pack("<HHIQQIII", 1, 2, 0, 96, 48, 40, 1, zlib.crc32(entry))

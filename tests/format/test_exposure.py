@@ -59,7 +59,7 @@ def test_bytes_that_do_not_fit_are_refused(change):
         decode_exposure(CODEC_EXPOSURE, memoryview(data), raw_length)
 
 
-HEAD = "<BBBB2f6f3f6f3f"  # by docs/format.md
+HEAD = "<BBBB2f6f3f6f3f"  # by docs/reference/format.md
 
 
 @pytest.mark.parametrize(

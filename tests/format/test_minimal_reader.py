@@ -1,4 +1,4 @@
-"""docs/format.md is enough: a reader written from it alone gives the same bits as hyrfpack, and refuses the same."""
+"""A reader written from docs/reference/format.md alone decodes the same bits as hyrfpack and refuses the same files."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ def drawn_model(count: int = COUNT) -> HybridModel:
 
 
 def names(layer: int) -> list[str]:
-    """Types of a layer's sections, as docs/format.md has them."""
+    """Types of a layer's sections, as docs/reference/format.md has them."""
     return [group[:3] + str(layer) if layer else group for group in GROUPS]
 
 

@@ -1,4 +1,4 @@
-"""docs/numerics.md and the tests: what it cites exists, and it cites every hard case.
+"""docs/explanation/numerics.md and the tests: what it cites exists, and it cites every hard case.
 
 Hard cases lie together in this folder, not each with the module that it strains, because together they are what that
 page promises: every test here is one of its rows, and what one row asks for often runs through several rooms.
@@ -34,7 +34,7 @@ def _strings(path: str) -> set[str]:
 
 
 def _citations() -> list[tuple[str, str, str]]:
-    return CITATION.findall((ROOT / "docs" / "numerics.md").read_text(encoding="utf-8"))
+    return CITATION.findall((ROOT / "docs" / "explanation" / "numerics.md").read_text(encoding="utf-8"))
 
 
 def test_every_cited_test_exists() -> None:

@@ -1,5 +1,5 @@
 """Hard cases of what decodes a Gaussian: contraction, hash encoding, decoder, background sphere, activations. The
-bounds are those that `docs/numerics.md` states."""
+bounds are those that `docs/explanation/numerics.md` states."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 """Hard cases of projecting and blending: central differences in float64, the float32 implementations against the
-float64 reference, closed forms, and a search. The bounds are those that `docs/numerics.md` states."""
+float64 reference, closed forms, and a search. The bounds are those that `docs/explanation/numerics.md` states."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 """Hard cases of the whole chain from model and camera to picture, and the doors where NaN is refused. The bounds are
-those that `docs/numerics.md` states."""
+those that `docs/explanation/numerics.md` states."""
 
 from __future__ import annotations
 

@@ -86,7 +86,7 @@ def test_every_ending_has_one_row_and_no_name_could_be_two():
 
 def endings_in(page: str, start: str, stop: str) -> set[str]:
     """Endings that the first cells of a table of docs name."""
-    text = (Path(__file__).parents[2] / "docs" / page).read_text(encoding="utf-8")
+    text = (Path(__file__).parents[2] / "docs" / "how-to" / page).read_text(encoding="utf-8")
     rows = text[text.index(start) :].partition(stop)[0]
     return {ending for line in rows.splitlines() for ending in re.findall(r"`(\.[\w.]+)`", line.split("|")[1])}
 

@@ -1,7 +1,7 @@
 """Run the Python code of the documentation as written: each page from top to bottom, in a new process and folder.
 
-    python -m tools.safety.run_docs                                docs/python-api.md and the README, all training steps
-    python -m tools.safety.run_docs --steps 20 docs/python-api.md  fewer steps: quick, worse pictures and times
+    python -m tools.safety.run_docs                       the Python API page and the README, all training steps
+    python -m tools.safety.run_docs --steps 20 README.md  fewer steps: quick, worse pictures and times
 
 The folder has photos in photos/bonsai: those of --data (default: the real data set mipnerf360_bonsai), or a synthetic
 scene if there are none. The code of a page is that of its ```python blocks, and of indented blocks that import

@@ -1,6 +1,6 @@
 """The HyRF paper's ablations on real sets: what each part of the model is worth, beside what the paper says.
 
-    python -m tools.studies.ablations            trains every variant and prints the tables of docs/ablations.md
+    python -m tools.studies.ablations            trains every variant, prints the tables of docs/research/ablations.md
     python -m tools.studies.ablations --reuse    trains only what --out does not hold yet
 
 Scores are on held-out views of the model as trained, not compressed. Frames are timed in turns with the full model's,
@@ -122,7 +122,7 @@ def culling(variant: Variant) -> AbstractContextManager:
 
 
 def report(results: Results, sets: Sequence[str], variants: Sequence[Variant]) -> str:
-    """The tables of docs/ablations.md; the full model must be among the results."""
+    """The tables of docs/research/ablations.md; the full model must be among the results."""
     others = [variant for variant in variants if variant is not FULL]
     parts = [quality_table(results, sets, others), cost_table(results, sets, others)]
     return "\n\n".join(parts + [f"`{name}`\n\n{details_table(results, name, variants)}" for name in sets])

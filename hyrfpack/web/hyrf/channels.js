@@ -1,4 +1,4 @@
-// Codec 7 (docs/format.md 3.4): channels of numbers in the order of the Gaussians. Each number is predicted from
+// Codec 7 (docs/reference/format.md 3.4): channels of numbers in the order of the Gaussians. Each number is predicted from
 // numbers of the same channel that were decoded before it.
 
 import { assertValid } from "./errors.js";

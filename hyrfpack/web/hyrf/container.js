@@ -1,4 +1,4 @@
-// The container of a `.hyrf` file (docs/format.md, part 1): a header, a table of contents and named sections.
+// The container of a `.hyrf` file (docs/reference/format.md, part 1): a header, a table of contents and named sections.
 
 import { crc32 } from "./crc.js";
 import { HyrfFormatError, groupedDigits, quotedText, rejectDamaged, rejectNewer } from "./errors.js";
@@ -86,7 +86,7 @@ export class Container {
   }
 
   /**
-   * Checks the header, by steps 1 to 3 of docs/format.md 1.3.
+   * Checks the header, by steps 1 to 3 of docs/reference/format.md 1.3.
    * @param {boolean} partial
    * @returns {DataView} the table of contents
    */
@@ -134,7 +134,7 @@ export class Container {
   }
 
   /**
-   * Checks the table of contents and fills `entries`, by steps 4 to 6 of docs/format.md 1.3.
+   * Checks the table of contents and fills `entries`, by steps 4 to 6 of docs/reference/format.md 1.3.
    * @param {DataView} table
    */
   checkEntries(table) {

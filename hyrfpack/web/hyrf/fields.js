@@ -1,4 +1,4 @@
-// Evaluates the two fields of a model on the CPU: hash grids with small decoders (docs/format.md 2.3, 2.4, 2.7).
+// Evaluates the two fields of a model on the CPU: hash grids with small decoders (docs/reference/format.md 2.3, 2.4, 2.7).
 // Inputs and outputs are float32; all sums are computed in float64.
 
 import { HASH_FACTOR_Y, HASH_FACTOR_Z, decoderLayout, gridLevels } from "./grids.js";
@@ -233,7 +233,7 @@ function packLayer(decoder, { inputs, outputs, matrix, bias }, from, to, biased)
 // --- positions -------------------------------------------------------------------------------------------------------
 
 /**
- * Maps local positions into the unit cube of the hash grids (the contraction of docs/format.md 2.3).
+ * Maps local positions into the unit cube of the hash grids (the contraction of docs/reference/format.md 2.3).
  * @param {Model} model
  * @param {Float32Array} positions
  * @param {number} first

@@ -1,4 +1,4 @@
-// Computes the shapes of hash grids (docs/format.md 2.3) and decoders (2.4) from a model's configuration.
+// Computes the shapes of hash grids (docs/reference/format.md 2.3) and decoders (2.4) from a model's configuration.
 
 /**
  * A hash grid, as the metadata has it.

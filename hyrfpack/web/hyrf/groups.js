@@ -1,4 +1,4 @@
-// Codec 8 (docs/format.md 3.5): numbers in groups that share a quantisation step. The groups follow from the
+// Codec 8 (docs/reference/format.md 3.5): numbers in groups that share a quantisation step. The groups follow from the
 // configuration and the positions, so that they are not stored.
 
 import { assertValid } from "./errors.js";

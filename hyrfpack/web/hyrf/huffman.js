@@ -1,4 +1,4 @@
-// Decodes Huffman streams (docs/format.md 2.5).
+// Decodes Huffman streams (docs/reference/format.md 2.5).
 
 import { readUint64 } from "./container.js";
 import { assertValid } from "./errors.js";

@@ -1,4 +1,4 @@
-// Decodes streams of integers (docs/format.md 3.1): a token gives the size of each, extra bits its lower digits.
+// Decodes streams of integers (docs/reference/format.md 3.1): a token gives the size of each, extra bits its lower digits.
 
 import { BitReader, MAX_BITS_PER_READ } from "./bits.js";
 import { assertValid } from "./errors.js";

@@ -1,4 +1,4 @@
-// Parses JSON by the rules of docs/format.md 2.1. Unlike JSON.parse, it distinguishes 1 from 1.0 and limits the
+// Parses JSON by the rules of docs/reference/format.md 2.1. Unlike JSON.parse, it distinguishes 1 from 1.0 and limits the
 // nesting.
 
 import { assertValid } from "./errors.js";

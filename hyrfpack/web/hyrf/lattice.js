@@ -1,4 +1,4 @@
-// Codec 6 (docs/format.md 3.3): points on a lattice in the contracted cube, stored in Morton order.
+// Codec 6 (docs/reference/format.md 3.3): points on a lattice in the contracted cube, stored in Morton order.
 
 import { BitReader } from "./bits.js";
 import { assertValid } from "./errors.js";

@@ -1,4 +1,4 @@
-// Reads the section META (docs/format.md 2.1), which is needed to decode the others.
+// Reads the section META (docs/reference/format.md 2.1), which is needed to decode the others.
 
 import { MAX_LAYERS, rejectIncomplete } from "./container.js";
 import { DamagedData, HyrfFormatError, assertValid, quotedText, rejectDamaged, rejectNewer } from "./errors.js";

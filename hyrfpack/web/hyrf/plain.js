@@ -1,4 +1,4 @@
-// Codecs 1 to 4 (docs/format.md 2.2): plain float32 and float16 numbers, and the two quantisers of the profile `paper`.
+// Codecs 1 to 4 (docs/reference/format.md 2.2): plain float32 and float16 numbers, and the two quantisers of the profile `paper`.
 
 import { readUint64 } from "./container.js";
 import { assertValid } from "./errors.js";

@@ -1,4 +1,4 @@
-// Decodes streams of tokens (docs/format.md 3.1), which are coded by interleaved rANS.
+// Decodes streams of tokens (docs/reference/format.md 3.1), which are coded by interleaved rANS.
 
 import { assertValid } from "./errors.js";
 

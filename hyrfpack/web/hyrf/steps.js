@@ -1,4 +1,4 @@
-// Quantisation steps (docs/format.md 3.2).
+// Quantisation steps (docs/reference/format.md 3.2).
 
 /** The number 1 in fixed point: its unit is 1 / FIXED_POINT_ONE. */
 export const FIXED_POINT_ONE = 2 ** 24;

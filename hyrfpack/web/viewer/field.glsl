@@ -1,4 +1,4 @@
-// What all passes over the fields share: hash grids and decoders for one fragment (docs/format.md 2.3, 2.4, 2.7).
+// What all passes over the fields share: hash grids and decoders for one fragment (docs/reference/format.md 2.3, 2.4, 2.7).
 // A line with EACH in front stands once for every cell of 8 hidden units, with the cell's number in place of $.
 precision highp float;
 precision highp int;

@@ -204,10 +204,10 @@ def test_a_file_is_read_in_a_worker():
 
 
 def test_the_documentation_and_the_readme_name_the_package_and_the_three_js_loader():
-    page, readme = ((ROOT / path).read_text() for path in ("docs/web.md", "README.md"))
+    page, readme = ((ROOT / path).read_text() for path in ("docs/how-to/web.md", "README.md"))
 
     for place in ("hyrfpack/web/hyrf", "examples/three"):
         assert place in page and (ROOT / place / "README.md").exists()
     assert "npm install ./hyrfpack/web/hyrf" in page and "loadHyrf" in page
-    assert "hyrf.js" in readme and "three.js" in readme and "docs/web.md#in-your-own-javascript" in readme
+    assert "hyrf.js" in readme and "three.js" in readme and "docs/how-to/web.md#in-your-own-javascript" in readme
     assert "\n## In your own JavaScript\n" in page

@@ -1,7 +1,7 @@
 """The decoder in JavaScript gives the numbers that hyrfpack gives, bit for bit, and refuses what hyrfpack refuses.
 
 Every number of every codec is exact: integers decide, and floats are float32 results of float64 operations that
-docs/format.md prescribes one by one. So arrays are compared by hash, without a tolerance.
+docs/reference/format.md prescribes one by one. So arrays are compared by hash, without a tolerance.
 """
 
 from __future__ import annotations
