@@ -31,15 +31,15 @@ def main() -> None:
     args = parser.parse_args()
 
     config = hyrfpack.DistillConfig(steps=args.steps, psnr=args.psnr, size=args.size)
-    report = hyrfpack.distill(args.splats, args.model, config, say=print)
+    report = hyrfpack.import_splats(args.splats, args.model, config, say=print)
     print(f"{report.bytes_source:,} -> {report.bytes_after:,} bytes, {report.psnr:.1f} dB against the Gaussians")
 
-    model = hyrfpack.load(args.model)
+    model = hyrfpack.load_model(args.model)
     original = Drawable.from_splats(read_splats(args.splats), model.config.frame)
     rows = []
     with torch.no_grad():
-        for camera in orbit(Capture(hyrfpack.describe(args.model)).viewpoint, VIEWS):
-            pair = draw(original, camera).rgb, hyrfpack.render(model, camera, background=False).rgb
+        for camera in orbit(Capture(hyrfpack.describe_file(args.model)).viewpoint, VIEWS):
+            pair = draw(original, camera).rgb, hyrfpack.render_view(model, camera, background=False).rgb
             rows.append(np.concatenate([picture.clamp(0, 1).numpy() for picture in pair], axis=1))
     Image.fromarray((np.concatenate(rows) * 255).round().astype(np.uint8)).save(args.picture)
     print(f"{args.picture}: {VIEWS} views, left the Gaussians, right the model")

@@ -21,13 +21,13 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=24)
     args = parser.parse_args()
 
-    cameras = orbit(Capture(hyrfpack.describe(args.model)).viewpoint, args.frames)
-    model = hyrfpack.load(args.model)
+    cameras = orbit(Capture(hyrfpack.describe_file(args.model)).viewpoint, args.frames)
+    model = hyrfpack.load_model(args.model)
     args.out.mkdir(parents=True, exist_ok=True)
     with torch.no_grad():
         decoded = model.decode()  # the same from everywhere: once for all frames
         for number, camera in enumerate(cameras):
-            rgb = hyrfpack.render(model, camera, decoded=decoded).rgb
+            rgb = hyrfpack.render_view(model, camera, decoded=decoded).rgb
             Image.fromarray((rgb.clamp(0, 1) * 255).round().byte().numpy()).save(args.out / f"{number:04d}.png")
     print(f"{args.out}: {len(cameras)} pictures of {len(model):,} Gaussians")
 

@@ -18,15 +18,15 @@ def main() -> None:
 
     scene = hyrfpack.load_scene(args.photos)
     print(f"{len(scene.train)} photos to train on, {len(scene.test)} held out")
-    trained = hyrfpack.train(scene, args.out, hyrfpack.TrainConfig(steps=args.steps), overwrite=True)
+    trained = hyrfpack.train_model(scene, args.out, hyrfpack.TrainConfig(steps=args.steps), overwrite=True)
     if trained.model is None:
         raise SystemExit(f"interrupted after {trained.step} steps; hyrfpack train --resume goes on")
 
     small = args.out / "small.hyrf"
-    hyrfpack.compress(trained.model, small, data=scene)
+    hyrfpack.compress_model(trained.model, small, data=scene)
     for path in (trained.model, small):
-        scores = hyrfpack.evaluate(hyrfpack.load(path), scene.test)
-        size = hyrfpack.describe(path)["bytes"]
+        scores = hyrfpack.evaluate_model(hyrfpack.load_model(path), scene.test)
+        size = hyrfpack.describe_file(path)["bytes"]
         print(f"{path}: {size:,} bytes, PSNR {scores.psnr:.2f} dB, SSIM {scores.ssim:.3f} on held-out photos")
 
 

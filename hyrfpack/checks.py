@@ -70,7 +70,7 @@ def check_pair(name: str, value: Any) -> None:
 # How to get an argument of the type that a call needs, by the name of the type.
 _REMEDIES = {
     "Camera": "a View has one: view.camera",
-    "HybridModel": "hyrfpack.load reads it from a file",
+    "HybridModel": "hyrfpack.load_model reads it from a file",
     "Scene": "hyrfpack.load_scene reads it from a folder",
     "View": "a Scene has lists of them: scene.test",
     **{name: f"make one: hyrfpack.{name}(...)" for name in ("DistillConfig", "RenderSettings", "TrainConfig")},

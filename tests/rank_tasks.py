@@ -17,7 +17,7 @@ from scenes import alternating_gains, ball_scene, exposed_scene
 from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.parallel.ranks import Ranks, join_processes
 from hyrfpack.scene import Picture, Scene
-from hyrfpack.train import DensityConfig, TrainConfig, Trainer, train
+from hyrfpack.train import DensityConfig, TrainConfig, Trainer, train_model
 from hyrfpack.train import trainer as trainers
 from hyrfpack.train.distributed import average_gradients, digest
 
@@ -133,7 +133,7 @@ def report_nothing(step: int, loss: float, error: float, gaussians: int) -> None
 
 
 def train_run(ranks: Ranks, out: Path, resume: bool = False, overwrite: bool = False) -> tuple[bool, int, bool]:
-    result = train(
+    result = train_model(
         held_out_scene(),
         out,
         RUN_CONFIG,
@@ -148,7 +148,7 @@ def train_run(ranks: Ranks, out: Path, resume: bool = False, overwrite: bool = F
 
 def train_and_kill(ranks: Ranks, out: Path, who: int, step: int) -> None:
     report = signal_at_step(signal.SIGKILL, step) if ranks.rank == who else report_nothing
-    train(held_out_scene(), out, RUN_CONFIG, ranks=ranks, device="cpu", report=report)
+    train_model(held_out_scene(), out, RUN_CONFIG, ranks=ranks, device="cpu", report=report)
 
 
 def stop_and_resume(ranks: Ranks, whole: Path, parts: Path, alone: Path) -> dict:
@@ -163,7 +163,7 @@ def stop_and_resume(ranks: Ranks, whole: Path, parts: Path, alone: Path) -> dict
     # All ranks receive the stop with the next step: before the first regular checkpoint, and between density rounds.
     for name, step in (("first", 2), ("second", 16)):
         report = signal_at_step(signal.SIGTERM, step) if ranks.rank == 1 else report_nothing
-        result = train(
+        result = train_model(
             held_out_scene(), parts, RUN_CONFIG, ranks=ranks, resume=name == "second", device="cpu", report=report
         )
         said[name] = result.complete, result.step, bool(result.metrics)
@@ -177,7 +177,7 @@ def train_after_restart(ranks: Ranks, out: Path) -> list[tuple[bool, int, bool]]
     """Train as after a restart by torchrun, first in an empty folder, then in one with a checkpoint."""
     again = dataclasses.replace(ranks, restarts=1)
     steps: list[int] = []
-    first = train(
+    first = train_model(
         held_out_scene(),
         out / "none",
         dataclasses.replace(RUN_CONFIG, steps=4),
@@ -185,7 +185,7 @@ def train_after_restart(ranks: Ranks, out: Path) -> list[tuple[bool, int, bool]]
         device="cpu",
         report=report_nothing,
     )
-    train(
+    train_model(
         held_out_scene(),
         out / "some",
         RUN_CONFIG,
@@ -243,11 +243,11 @@ def collect_setup_errors(ranks: Ranks, out: Path) -> dict[str, str | None]:
     bad = dataclasses.replace(scene, test=held_out)
     return {
         "held out": error_message(
-            lambda: train(bad, out, RUN_CONFIG, ranks=ranks, device="cpu", report=report_nothing)
+            lambda: train_model(bad, out, RUN_CONFIG, ranks=ranks, device="cpu", report=report_nothing)
         ),
         "nothing to resume": error_message(lambda: train_run(ranks, out, resume=True)),
         "device": error_message(
-            lambda: train(
+            lambda: train_model(
                 held_out_scene(),
                 out,
                 RUN_CONFIG,

@@ -1,4 +1,4 @@
-"""Every import of the package runs downwards through the layers that docs/architecture.md lists."""
+"""Every import of the package runs downwards through the layers that docs/explanation/architecture.md lists."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 REPOSITORY_ROOT = Path(__file__).parents[1]
 PACKAGE = REPOSITORY_ROOT / "hyrfpack"
-ARCHITECTURE_PAGE = REPOSITORY_ROOT / "docs" / "architecture.md"
+ARCHITECTURE_PAGE = REPOSITORY_ROOT / "docs" / "explanation" / "architecture.md"
 
 
 def read_layers() -> list[list[str]]:

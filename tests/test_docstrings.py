@@ -31,7 +31,7 @@ def list_public_functions() -> Iterator[tuple[str, object]]:
         if inspect.isfunction(getattr(hyrfpack, name)):
             yield f"hyrfpack.{name}", getattr(hyrfpack, name)
     for name in ("gallery", "player"):
-        yield f"hyrfpack.export.{name}", getattr(hyrfpack.export, name)
+        yield f"hyrfpack.export.{name}", getattr(hyrfpack.export_model, name)
     yield "hyrfpack.train.photos_of", hyrfpack.train.photos_of
     modules = [importlib.import_module(f"hyrfpack.ops.{name}") for name in DOCUMENTED_OPERATIONS]
     operations = {f"{m.__name__}.{name}": value for m in modules for name, value in vars(m).items()}
@@ -54,10 +54,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory, data: Path) -> Path:
     (root / "photos" / "bonsai").symlink_to(data)
     write_photos(root / "photos" / "corner", 5)
     scene = hyrfpack.load_scene(data)
-    hyrfpack.train(scene, root / "runs" / "bonsai", hyrfpack.TrainConfig(steps=20, max_gaussians=300), quiet=True)
+    hyrfpack.train_model(scene, root / "runs" / "bonsai", hyrfpack.TrainConfig(steps=20, max_gaussians=300), quiet=True)
     shutil.copytree(root / "runs" / "bonsai", root / "runs" / "again")
-    hyrfpack.compress(root / "runs" / "bonsai" / "model.hyrf", root / "bonsai.hyrf")
-    hyrfpack.export(root / "bonsai.hyrf", root / "bonsai.ply", degree=0, background=False)
+    hyrfpack.compress_model(root / "runs" / "bonsai" / "model.hyrf", root / "bonsai.hyrf")
+    hyrfpack.export_model(root / "bonsai.hyrf", root / "bonsai.ply", degree=0, background=False)
     return root
 
 

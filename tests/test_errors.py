@@ -16,7 +16,7 @@ import hyrfpack
 from hyrfpack.data import load_scene
 from hyrfpack.errors import HyrfDataError, HyrfError, HyrfSizeError, needs_package, strip_path
 from hyrfpack.evaluate.figures import draw_training_curve
-from hyrfpack.format import save
+from hyrfpack.format import save_model
 
 LIBRARY = Path(hyrfpack.__file__).parent
 
@@ -96,7 +96,7 @@ def test_profile_paper_without_dahuffman_writes_nothing(hide_package, tmp_path):
     hide_package("dahuffman")
 
     with pytest.raises(HyrfError, match="profile 'paper' needs dahuffman; run 'pip install dahuffman'"):
-        save(small_model([(0, 0, 0)]), tmp_path / "model.hyrf", "paper")
+        save_model(small_model([(0, 0, 0)]), tmp_path / "model.hyrf", "paper")
 
     assert not list(tmp_path.iterdir())
 

@@ -10,7 +10,7 @@ import pytest
 from explicit_balls import ball_splats
 from PIL import Image
 
-from hyrfpack.format import describe
+from hyrfpack.format import describe_file
 from hyrfpack.splats.formats import ply
 
 REPOSITORY_ROOT = Path(__file__).parents[1]
@@ -39,7 +39,7 @@ def test_the_example_scripts_train_compress_render_and_import(folder, data, monk
     files = ("scene.ply", "scene.hyrf", "compare.png")
     run("import_and_compare.py", *files, "--steps", 4, "--psnr", 15, "--size", 48)
     width, height = Image.open(folder / "compare.png").size
-    assert describe(folder / "scene.hyrf")["gaussians"] > 0 and (width, height) == (2 * 48, 3 * 48)
+    assert describe_file(folder / "scene.hyrf")["gaussians"] > 0 and (width, height) == (2 * 48, 3 * 48)
 
 
 def test_every_script_states_its_usage():

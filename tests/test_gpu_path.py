@@ -22,7 +22,7 @@ from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.distill import DistillConfig, distill_splats
 from hyrfpack.distill.pack import pack
 from hyrfpack.model import HashGridConfig
-from hyrfpack.render import render
+from hyrfpack.render import render_view
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer
 
 pytestmark = needs_triton
@@ -113,9 +113,9 @@ def test_renders_agree_with_the_cpu(gpu, kept, encoding):
     model = make_model(background=True, direction_encoding=encoding)
     model.precision = "float32"
     with torch.no_grad():
-        expected = render(model, camera, depth=True)
+        expected = render_view(model, camera, depth=True)
         model = model.to(gpu)
-        found = render(model, camera, decoded=model.decode() if kept else None, depth=True)
+        found = render_view(model, camera, decoded=model.decode() if kept else None, depth=True)
 
     torch.testing.assert_close(found.rgb.cpu(), expected.rgb, rtol=0, atol=1e-4)
     torch.testing.assert_close(found.alpha.cpu(), expected.alpha, rtol=0, atol=1e-4)
@@ -138,7 +138,7 @@ def test_numbers_that_are_not_finite_are_rejected(gpu, part, kept):
         model = model.to(gpu)
         decoded = model.decode() if kept else None
         with pytest.raises(hyrfpack.HyrfError, match="NaN or infinity"):
-            render(model, camera_at((0.3, -2.2, 0.6), width=16, height=16), decoded=decoded)
+            render_view(model, camera_at((0.3, -2.2, 0.6), width=16, height=16), decoded=decoded)
 
 
 def test_the_command_line_trains_and_renders_on_a_gpu(gpu, tmp_path):
@@ -160,11 +160,11 @@ def few_pictures(monkeypatch):
 def test_a_model_is_measured_packed_and_fine_tuned_on_a_gpu(gpu, few_pictures, tmp_path):
     scene = ball_scene(views=2, points=12, side=8)
     config = TrainConfig(steps=1, max_gaussians=12, log2_table_size=4, background=False)
-    model = hyrfpack.train(scene, tmp_path / "run", config, quiet=True, device="cpu").model
+    model = hyrfpack.train_model(scene, tmp_path / "run", config, quiet=True, device="cpu").model
     sizes = {}
     for device in ("cpu", "cuda"):
         target = tmp_path / f"{device}.hyrf"
-        sizes[device] = hyrfpack.compress(model, target, data=scene, finetune_steps=1, device=device).bytes_after
+        sizes[device] = hyrfpack.compress_model(model, target, data=scene, finetune_steps=1, device=device).bytes_after
     assert sizes["cuda"] == pytest.approx(sizes["cpu"], rel=0.02)
 
 

@@ -29,7 +29,7 @@ def test_the_library_prints_no_note_about_the_cache(tmp_path):
         "from numba.core.caching import CompileResultCacheImpl\n"
         "CompileResultCacheImpl._locator_classes = []\n"
         "import hyrfpack\n"
-        f"hyrfpack.load({str(COMPACT_GOLDEN_FILE)!r})\n"
+        f"hyrfpack.load_model({str(COMPACT_GOLDEN_FILE)!r})\n"
         "from hyrfpack.evaluate.figures import draw_training_curve\n"
         "draw_training_curve([{'step': 1, 'psnr': 20.0, 'loss': 0.1, 'gaussians': 1}], 'curve.png')\n"
         "assert logging.getLogger('matplotlib').getEffectiveLevel() == logging.WARNING"

@@ -12,7 +12,7 @@ from hyrfpack.data import load_scene
 from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.errors import HyrfError
 from hyrfpack.outputs import Outputs
-from hyrfpack.train import TrainConfig, train
+from hyrfpack.train import TrainConfig, train_model
 
 TINY_TRAIN_CONFIG = TrainConfig(steps=2, max_gaussians=50)
 
@@ -173,7 +173,7 @@ def test_training_never_writes_into_the_folder_of_its_photos(overwrite, photos):
 
     for place in (photos, photos / "images"):
         with pytest.raises(HyrfError, match="the same command reads"):
-            train(scene, place, TINY_TRAIN_CONFIG, overwrite=overwrite, quiet=True)
+            train_model(scene, place, TINY_TRAIN_CONFIG, overwrite=overwrite, quiet=True)
 
     assert {path: path.read_bytes() for path in photos.rglob("*") if path.is_file()} == before
 
@@ -184,7 +184,7 @@ def test_training_never_replaces_photos_in_its_output_folder(photos):
     poses.write_text(poses.read_text().replace("images/", "views/"))
 
     with pytest.raises(HyrfError, match="the same command reads"):
-        train(load_scene(photos, test_every=2), photos, TINY_TRAIN_CONFIG, overwrite=True, quiet=True)
+        train_model(load_scene(photos, test_every=2), photos, TINY_TRAIN_CONFIG, overwrite=True, quiet=True)
 
 
 def test_training_keeps_a_foreign_metrics_json_without_overwrite(photos, tmp_path):
@@ -194,8 +194,8 @@ def test_training_keeps_a_foreign_metrics_json_without_overwrite(photos, tmp_pat
     scene = dataclasses.replace(load_scene(photos), test=[])
 
     with pytest.raises(HyrfError, match="metrics.json of the files to be written is there"):
-        train(scene, out, TINY_TRAIN_CONFIG, quiet=True)
+        train_model(scene, out, TINY_TRAIN_CONFIG, quiet=True)
     assert (out / "metrics.json").read_text() == "mine"
 
-    train(scene, out, TINY_TRAIN_CONFIG, overwrite=True, quiet=True)
+    train_model(scene, out, TINY_TRAIN_CONFIG, overwrite=True, quiet=True)
     assert (out / "metrics.json").read_text() != "mine"

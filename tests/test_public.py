@@ -29,12 +29,12 @@ REJECTED_ARGUMENTS = {
     "convert": ("missing.ply", "out.spz"),
     "describe": ("missing.hyrf",),
     "describe_photos": ("missing",),
-    "distill": ("missing.ply", "out.hyrf"),
+    "import_splats": ("missing.ply", "out.hyrf"),
     "estimate_poses": ("missing", "out"),
-    "export": ("missing.hyrf", "out.spz"),
-    "load": ("missing.hyrf",),
+    "export_model": ("missing.hyrf", "out.spz"),
+    "load_model": ("missing.hyrf",),
     "load_scene": ("missing",),
-    "make": ("missing", "out.html"),
+    "make_scene": ("missing", "out.html"),
 }
 
 
@@ -67,18 +67,18 @@ def test_functions_can_be_called_in_processes_that_are_spawned():
         calls = {
             name: pool.submit(getattr(hyrfpack, name), *arguments) for name, arguments in REJECTED_ARGUMENTS.items()
         }
-        calls["evaluate"] = pool.submit(hyrfpack.evaluate, None, [])
+        calls["evaluate"] = pool.submit(hyrfpack.evaluate_model, None, [])
         for name, call in calls.items():
             assert isinstance(call.exception(), (hyrfpack.HyrfError, TypeError)), name
 
 
 def test_sub_packages_support_every_form_of_import():
     code = (
-        "import hyrfpack.train.progress as progress, hyrfpack.train as t, hyrfpack.evaluate\n"
+        "import hyrfpack.train.progress as progress, hyrfpack.train_model as t, hyrfpack.evaluate\n"
         "from hyrfpack.train import Trainer, progress as again\n"
         "import hyrfpack.cameras.paths, sys\n"
         "assert progress is again is sys.modules['hyrfpack.train.progress'] is hyrfpack.train.progress\n"
-        "assert t is hyrfpack.train is sys.modules['hyrfpack.train'].train\n"
+        "assert t is hyrfpack.train_model is sys.modules['hyrfpack.train'].train\n"
         "assert t.Trainer is Trainer and hyrfpack.cameras.paths.orbit\n"
         "progress.LOG_INTERVAL_SECONDS = 7\n"
         "assert hyrfpack.train.progress.LOG_INTERVAL_SECONDS == 7\n"
@@ -90,21 +90,27 @@ def test_sub_packages_support_every_form_of_import():
 
 # A mistaken call, and its error message.
 MISTAKEN_CALLS = [
-    (lambda model, scene: hyrfpack.train("photos", "run"), "scene must be a Scene, not a str; .*load_scene"),
-    (lambda model, scene: hyrfpack.train(scene, "run", {"steps": 3}), "config must be a TrainConfig, not a dict"),
-    (lambda model, scene: hyrfpack.compress("m.hyrf", "a.hyrf", data="photos"), "data must be a Scene.*load_scene"),
-    (lambda model, scene: hyrfpack.compress(model, "a.hyrf"), "str.*not HybridModel"),
-    (lambda model, scene: hyrfpack.export("m.hyrf", "a.ply", data="photos"), "data must be a Scene.*load_scene"),
-    (lambda model, scene: hyrfpack.bench("m.hyrf", "photos"), "scene must be a Scene.*load_scene"),
-    (lambda model, scene: hyrfpack.evaluate("m.hyrf", scene.train), "model must be a HybridModel.*hyrfpack.load"),
-    (lambda model, scene: hyrfpack.evaluate(model, "photos"), "views must be a View, not a str; .*scene.test"),
-    (lambda model, scene: hyrfpack.evaluate(model, scene), "views must be a View, not a Scene; .*scene.test"),
-    (lambda model, scene: hyrfpack.render(model, scene.train[0]), "camera must be a Camera, not a View; .*view.camera"),
-    (lambda model, scene: hyrfpack.render("m.hyrf", scene.train[0].camera), "model must be a HybridModel"),
-    (lambda model, scene: hyrfpack.render(model, scene.train[0].camera, 0.1), "settings must be a RenderSettings"),
-    (lambda model, scene: hyrfpack.save("m.hyrf", "a.hyrf"), "model must be a HybridModel"),
-    (lambda model, scene: hyrfpack.distill("a.ply", "a.hyrf", 500), "config must be a DistillConfig"),
-    (lambda model, scene: hyrfpack.distill("a.ply", "a.hyrf", cameras=scene.train), "cameras must be a Camera"),
+    (lambda model, scene: hyrfpack.train_model("photos", "run"), "scene must be a Scene, not a str; .*load_scene"),
+    (lambda model, scene: hyrfpack.train_model(scene, "run", {"steps": 3}), "config must be a TrainConfig, not a dict"),
+    (
+        lambda model, scene: hyrfpack.compress_model("m.hyrf", "a.hyrf", data="photos"),
+        "data must be a Scene.*load_scene",
+    ),
+    (lambda model, scene: hyrfpack.compress_model(model, "a.hyrf"), "str.*not HybridModel"),
+    (lambda model, scene: hyrfpack.export_model("m.hyrf", "a.ply", data="photos"), "data must be a Scene.*load_scene"),
+    (lambda model, scene: hyrfpack.benchmark_model("m.hyrf", "photos"), "scene must be a Scene.*load_scene"),
+    (lambda model, scene: hyrfpack.evaluate_model("m.hyrf", scene.train), "model must be a HybridModel.*hyrfpack.load"),
+    (lambda model, scene: hyrfpack.evaluate_model(model, "photos"), "views must be a View, not a str; .*scene.test"),
+    (lambda model, scene: hyrfpack.evaluate_model(model, scene), "views must be a View, not a Scene; .*scene.test"),
+    (
+        lambda model, scene: hyrfpack.render_view(model, scene.train[0]),
+        "camera must be a Camera, not a View; .*view.camera",
+    ),
+    (lambda model, scene: hyrfpack.render_view("m.hyrf", scene.train[0].camera), "model must be a HybridModel"),
+    (lambda model, scene: hyrfpack.render_view(model, scene.train[0].camera, 0.1), "settings must be a RenderSettings"),
+    (lambda model, scene: hyrfpack.save_model("m.hyrf", "a.hyrf"), "model must be a HybridModel"),
+    (lambda model, scene: hyrfpack.import_splats("a.ply", "a.hyrf", 500), "config must be a DistillConfig"),
+    (lambda model, scene: hyrfpack.import_splats("a.ply", "a.hyrf", cameras=scene.train), "cameras must be a Camera"),
 ]
 
 
@@ -118,16 +124,16 @@ def test_a_mistaken_call_is_a_type_error_that_says_what_to_do(call, sentence, tm
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_loading_to_a_missing_device_is_a_clear_error(tmp_path):
-    hyrfpack.save(small_model([(0, 0, 0)]), tmp_path / "model.hyrf")
+    hyrfpack.save_model(small_model([(0, 0, 0)]), tmp_path / "model.hyrf")
     with pytest.raises(hyrfpack.HyrfError, match="'cuda' is not there"):
-        hyrfpack.load(tmp_path / "model.hyrf", device="cuda")
+        hyrfpack.load_model(tmp_path / "model.hyrf", device="cuda")
 
 
 def test_a_render_of_a_loaded_model_converts_to_numpy(tmp_path):
-    hyrfpack.save(small_model([(0, 0, 0)]), tmp_path / "model.hyrf")
-    model, (view, _) = hyrfpack.load(tmp_path / "model.hyrf"), ball_scene(2, side=8).train
-    assert hyrfpack.render(model, view.camera).rgb.numpy().shape == (8, 8, 3)
-    assert hyrfpack.render(model.requires_grad_(), view.camera).rgb.requires_grad
+    hyrfpack.save_model(small_model([(0, 0, 0)]), tmp_path / "model.hyrf")
+    model, (view, _) = hyrfpack.load_model(tmp_path / "model.hyrf"), ball_scene(2, side=8).train
+    assert hyrfpack.render_view(model, view.camera).rgb.numpy().shape == (8, 8, 3)
+    assert hyrfpack.render_view(model.requires_grad_(), view.camera).rgb.requires_grad
 
 
 def test_type_checkers_see_the_public_names_and_nothing_else():

@@ -17,7 +17,7 @@ from PIL import Image
 from scenes import BALL_CENTERS, ball_scene, small_model
 
 from hyrfpack.cameras.capture import provenance_cameras
-from hyrfpack.format import save
+from hyrfpack.format import save_model
 from hyrfpack.splats.splats import quaternion_from_matrix
 
 CHECK_IMPORT_ORDER_CODE = """
@@ -33,20 +33,21 @@ sys.meta_path.insert(0, Watch())
 READ_SCENE_CODE = "import hyrfpack\nscene = hyrfpack.load_scene('scene')\n"
 CODE_BY_CALL = {
     "load_scene": "import zlib\nassert zlib.decompress(zlib.compress(bytes(10**6))) == bytes(10**6)",
-    "train": "assert hyrfpack.train(scene, 'run', hyrfpack.TrainConfig(steps=3), quiet=True).complete",
-    "compress": "hyrfpack.compress('model.hyrf', 'a.hyrf', data=scene)",
-    "evaluate, render, save": "hyrfpack.evaluate(hyrfpack.load('model.hyrf'), scene.test, pictures='views')\n"
+    "train": "assert hyrfpack.train_model(scene, 'run', hyrfpack.TrainConfig(steps=3), quiet=True).complete",
+    "compress": "hyrfpack.compress_model('model.hyrf', 'a.hyrf', data=scene)",
+    "evaluate, render, save": "model = hyrfpack.load_model('model.hyrf')\n"
+    "hyrfpack.evaluate_model(model, scene.test, pictures='views')\n"
     "from hyrfpack.render.files import save_picture, to_image\nimport torch\nwith torch.no_grad():\n"
-    "    picture = hyrfpack.render(hyrfpack.load('model.hyrf'), scene.test[0].camera).rgb\n"
+    "    picture = hyrfpack.render_view(model, scene.test[0].camera).rgb\n"
     "save_picture('a.png', to_image(picture))\n"
-    "hyrfpack.save(hyrfpack.load('model.hyrf'), 'a.hyrf', provenance=hyrfpack.describe('model.hyrf'))",
+    "hyrfpack.save_model(hyrfpack.load_model('model.hyrf'), 'a.hyrf', provenance=hyrfpack.describe_file('model.hyrf'))",
     "export": "for name in ('a.spz', 'a.ply', 'a.sog', 'a.html'):\n"
-    "    hyrfpack.export('model.hyrf', name, data=scene)\n"
-    "hyrfpack.export('model.hyrf', 'colmap', data=scene, colmap=True)",
+    "    hyrfpack.export_model('model.hyrf', name, data=scene)\n"
+    "hyrfpack.export_model('model.hyrf', 'colmap', data=scene, colmap=True)",
     "bench": "from hyrfpack.measure import timing\ntiming.WARM_UP_SECONDS = 0\n"
-    "hyrfpack.bench('model.hyrf', scene, repeats=1, only=['codec'])",
-    "distill": "hyrfpack.export('model.hyrf', 'a.ply', data=scene, background=False)\n"
-    "hyrfpack.distill('a.ply', 'a.hyrf', hyrfpack.DistillConfig(1, 10, 16, 4, 2))",
+    "hyrfpack.benchmark_model('model.hyrf', scene, repeats=1, only=['codec'])",
+    "distill": "hyrfpack.export_model('model.hyrf', 'a.ply', data=scene, background=False)\n"
+    "hyrfpack.import_splats('a.ply', 'a.hyrf', hyrfpack.DistillConfig(1, 10, 16, 4, 2))",
 }
 
 
@@ -68,7 +69,7 @@ def folder(tmp_path_factory) -> Path:
     points = [(number, *point, 255, 128, 0, 0) for number, point in enumerate(scene.points, start=1)]
     (tables / "points3D.txt").write_text("".join(" ".join(map(str, point)) + "\n" for point in points))
     cameras = provenance_cameras([view.camera for view in scene.train])
-    save(small_model(BALL_CENTERS, scale_logits=0.0), folder / "model.hyrf", provenance={"cameras": cameras})
+    save_model(small_model(BALL_CENTERS, scale_logits=0.0), folder / "model.hyrf", provenance={"cameras": cameras})
     return folder
 
 

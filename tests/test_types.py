@@ -16,29 +16,29 @@ import numpy as np
 import hyrfpack
 
 scene = hyrfpack.load_scene("photos")
-result: hyrfpack.TrainResult = hyrfpack.train(scene, "run", hyrfpack.TrainConfig(steps=10))
-report = hyrfpack.compress("run/model.hyrf", "small.hyrf", data=scene)
+result: hyrfpack.TrainResult = hyrfpack.train_model(scene, "run", hyrfpack.TrainConfig(steps=10))
+report = hyrfpack.compress_model("run/model.hyrf", "small.hyrf", data=scene)
 size: int = report.bytes_after
-model: hyrfpack.HybridModel = hyrfpack.load("small.hyrf")
-rgb = hyrfpack.render(model, scene.test[0].camera).rgb.numpy()
-mean: float = hyrfpack.evaluate(model, scene.test).psnr
-written = hyrfpack.export("small.hyrf", "small.spz", degree=2).bytes
-imported: float = hyrfpack.distill("a.ply", "a.hyrf", hyrfpack.DistillConfig(steps=5)).psnr
-rows = hyrfpack.bench("small.hyrf").rows
+model: hyrfpack.HybridModel = hyrfpack.load_model("small.hyrf")
+rgb = hyrfpack.render_view(model, scene.test[0].camera).rgb.numpy()
+mean: float = hyrfpack.evaluate_model(model, scene.test).psnr
+written = hyrfpack.export_model("small.hyrf", "small.spz", degree=2).bytes
+imported: float = hyrfpack.import_splats("a.ply", "a.hyrf", hyrfpack.DistillConfig(steps=5)).psnr
+rows = hyrfpack.benchmark_model("small.hyrf").rows
 camera = hyrfpack.Camera(640, 480, 500.0, 500.0, 320.0, 240.0, np.eye(4))
-facts = hyrfpack.describe("small.hyrf")["profile"]
-hyrfpack.save(model, "copy.hyrf")
+facts = hyrfpack.describe_file("small.hyrf")["profile"]
+hyrfpack.save_model(model, "copy.hyrf")
 """
 # Each line has one mistake, with the error code that the checker must report.
 ERROR_CODES_BY_LINE = {
     'hyrfpack.load_scene("photos", every=8)': "call-arg",
-    'hyrfpack.train("photos", "run")': "arg-type",
+    'hyrfpack.train_model("photos", "run")': "arg-type",
     "hyrfpack.TrainConfig(step=10)": "call-arg",
-    'hyrfpack.load("a.hyrf", frction=0.5)': "call-arg",
-    'hyrfpack.render(hyrfpack.load("a.hyrf"), "camera")': "arg-type",
-    'hyrfpack.compress("a.hyrf", "b.hyrf").bytes': "attr-defined",
-    'hyrfpack.evaluate(hyrfpack.load("a.hyrf"), "photos").psnr': "arg-type",
-    'size: str = hyrfpack.export("a.hyrf", "a.ply").bytes': "assignment",
+    'hyrfpack.load_model("a.hyrf", frction=0.5)': "call-arg",
+    'hyrfpack.render_view(hyrfpack.load_model("a.hyrf"), "camera")': "arg-type",
+    'hyrfpack.compress_model("a.hyrf", "b.hyrf").bytes': "attr-defined",
+    'hyrfpack.evaluate_model(hyrfpack.load_model("a.hyrf"), "photos").psnr': "arg-type",
+    'size: str = hyrfpack.export_model("a.hyrf", "a.ply").bytes': "assignment",
     "hyrfpack.redner": "attr-defined",
 }
 

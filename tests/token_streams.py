@@ -1,4 +1,4 @@
-"""Reference decoders of token and integer streams, written from docs/format.md alone, and tokens to encode."""
+"""Reference decoders of token and integer streams from docs/reference/format.md alone, and tokens to encode."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ from hyrfpack.format.sections import LAYERED_SECTIONS, POSITIONS, SECTION_CONTEN
 from hyrfpack.measure.error import Error, measure_error
 from hyrfpack.measure.timing import time_alternately
 from hyrfpack.model import HybridModel
-from hyrfpack.render import render
+from hyrfpack.render import render_view
 
 # Values that are measured for each setting of a profile, one setting at a time, in addition to the profile's default.
 # A `seed` is not a setting. The values of `distortion` are multiples of the default, because that depends on the model.
@@ -187,4 +187,4 @@ def _format_value(value: object) -> str:
 def _render_views(subject: Subject, model: HybridModel) -> list[Tensor]:
     """Render a model from each camera of the subject."""
     decoded = model.decode()
-    return [render(model, camera, decoded=decoded).rgb for camera in subject.cameras]
+    return [render_view(model, camera, decoded=decoded).rgb for camera in subject.cameras]

@@ -15,7 +15,7 @@ from hyrfpack.bench.rows import Row, format_value
 from hyrfpack.bench.subject import Subject
 from hyrfpack.measure.timing import time_alternately
 from hyrfpack.model import HybridModel
-from hyrfpack.render import RenderSettings, render
+from hyrfpack.render import RenderSettings, render_view
 
 # Values that are measured for each setting, the exact value first. `near` is left out, because it decides what belongs
 # to the picture. The exact `cull_tolerance` is not infinity: EWA projection is linearised about a centre and smears
@@ -44,7 +44,7 @@ def render_rows(subject: Subject, repeats: int, note: Callable[[str], None]) -> 
 
     def render_task(settings: RenderSettings, model: HybridModel = model, reuse_decoded: bool = True) -> RenderTask:
         reused = decoded if reuse_decoded else None
-        return lambda: [render(model, camera, settings, decoded=reused).rgb for camera in subject.cameras]
+        return lambda: [render_view(model, camera, settings, decoded=reused).rgb for camera in subject.cameras]
 
     render_task(defaults)()  # compiles kernels that are not cached, which must not count as a slow first run
     for name, values in RENDER_SETTING_VALUES.items():

@@ -22,11 +22,11 @@ from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.device import upload
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate.metrics import psnr, ssim, to_8bit
-from hyrfpack.format import describe, load
+from hyrfpack.format import describe_file, load_model
 from hyrfpack.measure.error import measure_error
 from hyrfpack.model import HybridModel
 from hyrfpack.scene import Camera, Scene, View, evenly_spaced
-from hyrfpack.train import TrainConfig, train
+from hyrfpack.train import TrainConfig, train_model
 
 MAX_VIEWS = 6
 # Training of the built-in model.
@@ -103,7 +103,7 @@ def read_subject(path: str | os.PathLike[str], scene: Scene | None) -> Subject:
     Raises:
         HyrfError: the file cannot be read, has no Gaussians or no usable viewpoint, or no held-out photo can be scored.
     """
-    facts, model = describe(path), load(path)
+    facts, model = describe_file(path), load_model(path)
     if len(model) == 0:
         raise HyrfError(f"{path}: the model has no Gaussians, so there is nothing to measure", fix="name another")
     capture = Capture(facts, scene)
@@ -134,7 +134,7 @@ def built_in_subject(say: Callable[[str], None]) -> Subject:
         scene = load_scene(
             write_demo_scene(Path(folder) / "scene", views=BUILT_IN_PHOTOS, size=BUILT_IN_PHOTO_SIDE_PIXELS)
         )
-        trained = train(scene, Path(folder) / "run", TrainConfig(steps=BUILT_IN_STEPS), quiet=True)
+        trained = train_model(scene, Path(folder) / "run", TrainConfig(steps=BUILT_IN_STEPS), quiet=True)
         if trained.model is None:  # training treats Ctrl-C as a request to stop
             raise KeyboardInterrupt
         subject = read_subject(trained.model, scene)

@@ -49,7 +49,7 @@ class BenchReport:
         return asdict(self)
 
 
-def bench(
+def benchmark_model(
     model: str | os.PathLike[str] | None = None,
     scene: Scene | None = None,
     *,
@@ -80,7 +80,7 @@ def bench(
 
     Example:
         >>> import hyrfpack
-        >>> report = hyrfpack.bench("bonsai.hyrf", repeats=1, only=["mlp"])
+        >>> report = hyrfpack.benchmark_model("bonsai.hyrf", repeats=1, only=["mlp"])
         >>> sorted({row.group for row in report.rows})
         ['mlp']
     """

@@ -92,7 +92,7 @@ class Capture:
     Values are read from the provenance only when a property is asked for.
 
     Attributes:
-        facts: the result of `hyrfpack.describe`. The caller passes it, because this module cannot import that one.
+        facts: the result of `hyrfpack.describe_file`. The caller passes it, because this module cannot import that one.
         scene: the photos of the model, if there are any. It is ignored if it has no training views.
     """
 

@@ -68,15 +68,15 @@ def bench(
     # The references run on torch's own threads, which would keep spinning on the cores of the kernels timed next.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     from hyrfpack.atomic import write_atomic
-    from hyrfpack.bench import bench as measure
+    from hyrfpack.bench import benchmark_model as measure
     from hyrfpack.bench import tables
     from hyrfpack.bench.figure import plot, plot_format
-    from hyrfpack.format import describe
+    from hyrfpack.format import describe_file
     from hyrfpack.measure.machine import format_machine
 
     model = None if model is None else resolve_model_file(model)
     plot_format(output)
-    scene = None if data is None or model is None else read_scene(data, reader_options, describe(model))
+    scene = None if data is None or model is None else read_scene(data, reader_options, describe_file(model))
     outputs = Outputs(model, scene=scene, overwrite=overwrite)
     outputs.file(output)
     page = _read_page(markdown)

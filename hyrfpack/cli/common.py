@@ -185,8 +185,8 @@ def read_scene(path: Path, reader_options: dict[str, Any], model: dict | None = 
     Args:
         path: the folder, or an archive of it.
         reader_options: values of the options of `scene_options`.
-        model: description (`hyrfpack.describe`) of the model file that belongs to the photos, if any. It gives the size
-            of the photos where --max-size does not.
+        model: description (`hyrfpack.describe_file`) of the model file that belongs to the photos, if any. It gives the
+            size of the photos where --max-size does not.
 
     Raises:
         HyrfError: as `hyrfpack.load_scene`.

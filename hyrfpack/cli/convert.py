@@ -51,7 +51,7 @@ def convert(
       hyrfpack convert scene.ply small.sog --sh-degree 1 --min-opacity 0.02
       hyrfpack convert scene.spz table.ply --crop -1,-1,-1,1,1,1
     """
-    from hyrfpack.export.conversion import convert as run
+    from hyrfpack.export.conversion import convert_splats as run
     from hyrfpack.export.conversion import find_target_format
     from hyrfpack.splats.names import sog_folder
 

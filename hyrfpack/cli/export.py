@@ -147,10 +147,10 @@ def export(
       hyrfpack export bonsai.hyrf -o bonsai.ply --data photos/bonsai --min-opacity 0.02
       hyrfpack export bonsai.hyrf -o table.glb --crop -1,-1,-1,1,1,1
     """
-    from hyrfpack.export import export as write
+    from hyrfpack.export import export_model as write
     from hyrfpack.export.folder import check_folder, gallery, player
     from hyrfpack.export.kinds import PLAYER_FOLDER, check_place, check_request, find_file_kind
-    from hyrfpack.format import describe, find_model
+    from hyrfpack.format import describe_file, find_model
     from hyrfpack.splats.names import is_splats
 
     kind = find_file_kind(output, colmap)
@@ -169,7 +169,7 @@ def export(
             fix="give it once for each, or not",
         )
     check_request(kind, output, degree, crop, min_opacity, background, baked, exposure)
-    scenes = [read_scene(path, reader_options, describe(model)) for path, model in zip(data, files, strict=False)]
+    scenes = [read_scene(path, reader_options, describe_file(model)) for path, model in zip(data, files, strict=False)]
     if kind is PLAYER_FOLDER:
         check_folder(output, models, scenes, overwrite=overwrite, is_gallery=len(models) > 1)
     else:

@@ -119,16 +119,16 @@ def compress(
     """
     if data is not None and no_data:
         raise click.UsageError("--data names photos and --no-data wants none; give one of them")
-    from hyrfpack.compress import compress as pack
+    from hyrfpack.compress import compress_model as pack
     from hyrfpack.compress.report_page import REPORT_FILES
-    from hyrfpack.format import describe
+    from hyrfpack.format import describe_file
 
     model = resolve_model_file(model)
     torch_device = choose_command_device(device, ranks)
 
     def read() -> Scene | None:
         if data is not None:
-            scene: Scene | None = read_scene(data, reader_options, describe(model))
+            scene: Scene | None = read_scene(data, reader_options, describe_file(model))
         else:
             scene = None if no_data or profile != DEFAULT_PROFILE else _load_training_photos(model)
         outputs = Outputs(model, scene=scene, overwrite=overwrite)
@@ -249,11 +249,11 @@ def _print_photos(path: Path, as_json: bool) -> None:
 
 
 def _print_run(folder: Path, as_json: bool) -> None:
-    from hyrfpack.format import describe, read_run_status
+    from hyrfpack.format import describe_file, read_run_status
     from hyrfpack.format.run_folder import FINISH_RUN_ADVICE, MODEL_FILE, describe_unfinished_run
 
     run = read_run_status(folder)
-    facts = describe(folder) if (folder / MODEL_FILE).is_file() else {}
+    facts = describe_file(folder) if (folder / MODEL_FILE).is_file() else {}
     if as_json:
         print_json({**facts, "run": asdict(run)})
         return
@@ -295,9 +295,9 @@ def _print_splats(path: Path, as_json: bool) -> None:
 
 
 def _print_model(file: Path, as_json: bool) -> None:
-    from hyrfpack.format import describe
+    from hyrfpack.format import describe_file
 
-    facts = describe(file)
+    facts = describe_file(file)
     if as_json:
         print_json(facts)
     else:
@@ -370,11 +370,11 @@ def _score_both_files(before: Path, after: Path, scene: Scene | None, report: Re
     """Return mean PSNR and SSIM of both files on the held-out photos; empty if there are none."""
     if scene is None or not scene.test:
         return {}
-    from hyrfpack.evaluate import evaluate
-    from hyrfpack.format import load
+    from hyrfpack.evaluate import evaluate_model
+    from hyrfpack.format import load_model
 
-    old = evaluate(load(before), scene.test, report=report_part(report, 0.0, 0.5))
-    new = evaluate(load(after), scene.test, report=report_part(report, 0.5, 1.0))
+    old = evaluate_model(load_model(before), scene.test, report=report_part(report, 0.0, 0.5))
+    new = evaluate_model(load_model(after), scene.test, report=report_part(report, 0.5, 1.0))
     return {"psnr_before": old.psnr, "psnr": new.psnr, "ssim_before": old.ssim, "ssim": new.ssim}
 
 

@@ -87,14 +87,14 @@ def import_(
     """
     folder = source.parent if source.name == "meta.json" else source  # a SOG may be a folder that holds meta.json
     Outputs(source, cameras, folder=folder, overwrite=overwrite).file(output, ".hyrf")
-    from hyrfpack.distill import DistillConfig, distill
+    from hyrfpack.distill import DistillConfig, import_splats
 
     cameras = cameras or _find_training_cameras(source)
     given = None if cameras is None else _read_cameras(cameras)
     torch_device = choose_command_device(device)
     config = DistillConfig(steps=steps, psnr=psnr, size=size, seed=seed)
     with show_progress("import") as progress:
-        report = distill(
+        report = import_splats(
             source, output, config, cameras=given, overwrite=overwrite, device=torch_device, say=note, report=progress
         )
     written = note_rename(output, report.file)

@@ -117,7 +117,7 @@ def make(
         raise click.UsageError("--max-gaussians and --target-size each decide how large the model is; give one of them")
     from hyrfpack.cli.progress import create_command_display
     from hyrfpack.make import Stopped
-    from hyrfpack.make import make as run
+    from hyrfpack.make import make_scene as run
 
     torch_device = choose_command_device(device)
     try:

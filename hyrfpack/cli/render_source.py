@@ -13,7 +13,7 @@ import torch
 from hyrfpack.cameras.capture import Capture
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.errors import HyrfError
-from hyrfpack.format import describe, find_model, load
+from hyrfpack.format import describe_file, find_model, load_model
 from hyrfpack.model import HybridModel
 from hyrfpack.splats.draw import Drawable
 from hyrfpack.splats.files import read_splats
@@ -28,8 +28,8 @@ class RenderSource:
     Attributes:
         path: path of the file; of a run, that of its model.
         device, precision: device and precision of drawing; splats are drawn in float32.
-        fraction: share of the file that must exist, see `hyrfpack.load`.
-        facts: description of a model, see `hyrfpack.describe`; None for splats.
+        fraction: share of the file that must exist, see `hyrfpack.load_model`.
+        facts: description of a model, see `hyrfpack.describe_file`; None for splats.
         splats: the splats, ready to be drawn; None for a model, which `load` reads.
     """
 
@@ -54,13 +54,13 @@ class RenderSource:
             drawable = Drawable.from_splats(splats, WeightedSplats.from_splats(splats, str(path)).frame, device)
             return cls(path, device, precision, None, splats=drawable)
         model, fraction = find_model(path), 1.0 if allow_partial else None
-        return cls(model, device, precision, fraction, facts=describe(model, fraction))
+        return cls(model, device, precision, fraction, facts=describe_file(model, fraction))
 
     def load(self) -> HybridModel | Drawable:
         """Return the model or the splats on the device."""
         if self.splats is not None:
             return self.splats
-        model = load(self.path, self.device, self.fraction)
+        model = load_model(self.path, self.device, self.fraction)
         model.precision = self.precision
         return model
 

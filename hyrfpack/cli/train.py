@@ -130,7 +130,7 @@ def train(
     from hyrfpack.device import describe_device
     from hyrfpack.format.run_folder import MODEL_FILE
     from hyrfpack.train import TrainConfig
-    from hyrfpack.train import train as run
+    from hyrfpack.train import train_model as run
     from hyrfpack.train.run import is_begun, resuming
 
     torch_device = choose_command_device(device, ranks)

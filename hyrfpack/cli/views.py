@@ -206,7 +206,7 @@ def evaluate(
       hyrfpack evaluate bonsai.ply --data photos/bonsai
     """
     from hyrfpack.cli.render_source import RenderSource
-    from hyrfpack.evaluate import evaluate as score
+    from hyrfpack.evaluate import evaluate_model as score
     from hyrfpack.evaluate import picture_names
     from hyrfpack.render import RenderSettings
 

@@ -36,7 +36,7 @@ class ComparisonReport:
     doubts: list[str]
 
 
-def compare(runs: Sequence[StrPath], out: StrPath, *, overwrite: bool = False) -> ComparisonReport:
+def compare_runs(runs: Sequence[StrPath], out: StrPath, *, overwrite: bool = False) -> ComparisonReport:
     """Write one page that shows finished training runs side by side.
 
     The page has a table of scores, sizes, times and of all settings and choices that differ; the training curves; and
@@ -44,7 +44,7 @@ def compare(runs: Sequence[StrPath], out: StrPath, *, overwrite: bool = False) -
     fetches nothing. Its pictures come from the folders of the runs, so neither photos nor rendering are needed.
 
     Args:
-        runs: folders that `hyrfpack.train` wrote to, two or more.
+        runs: folders that `hyrfpack.train_model` wrote to, two or more.
         out: the page to write, an .html file.
         overwrite: replace an existing file. If False, an existing file is an error. A file that appears in the meantime
             is kept, and the page is written beside it under a free name, which the report names.
@@ -56,7 +56,7 @@ def compare(runs: Sequence[StrPath], out: StrPath, *, overwrite: bool = False) -
 
     Example:
         >>> import hyrfpack
-        >>> report = hyrfpack.compare(["runs/bonsai", "runs/again"], "comparison.html", overwrite=True)
+        >>> report = hyrfpack.compare_runs(["runs/bonsai", "runs/again"], "comparison.html", overwrite=True)
         >>> report.runs, report.views, report.doubts
         (['bonsai', 'again'], ['0000.png', '0008.png'], [])
     """

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from hyrfpack.errors import HyrfDataError
-from hyrfpack.format import describe
+from hyrfpack.format import describe_file
 from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
 from hyrfpack.outputs import StrPath
 from hyrfpack.render.files import unique_stems
@@ -161,7 +161,7 @@ def _parse_run(folder: Path, metrics: Any) -> Run:
         scores=scores,
         skipped=skipped,
         pictures=_existing_pictures(folder, [*(score.name for score in scores), *skipped]),
-        cameras=describe(folder / MODEL_FILE)["provenance"].get("cameras"),
+        cameras=describe_file(folder / MODEL_FILE)["provenance"].get("cameras"),
     )
 
 

@@ -1,5 +1,5 @@
 """Rate-distortion compression: bits go to the numbers that change rendered pictures most."""
 
-from hyrfpack.compress.packer import compress
+from hyrfpack.compress.packer import compress_model
 
-__all__ = ["compress"]
+__all__ = ["compress_model"]

@@ -43,7 +43,7 @@ from hyrfpack.format.sections import (
 from hyrfpack.model import Decoded, HybridModel
 from hyrfpack.parallel.pool import parallel_map
 from hyrfpack.progress import Report, no_report, report_part, report_round
-from hyrfpack.render import render
+from hyrfpack.render import render_view
 from hyrfpack.scene import Camera
 
 # The number of views of one comparison is chosen so that about this many Gaussians are drawn in all of them together.
@@ -341,6 +341,6 @@ def _render_views(model: HybridModel, cameras: Sequence[Camera], decoded: Decode
 
     @torch.no_grad()  # gradient mode is kept per thread
     def picture(camera: Camera) -> Tensor:
-        return render(model, camera, decoded=decoded).rgb
+        return render_view(model, camera, decoded=decoded).rgb
 
     return parallel_map(picture, cameras, model.gaussians.positions.device)

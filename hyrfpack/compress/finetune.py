@@ -28,7 +28,7 @@ from hyrfpack.ops.ssim import photometric_loss
 from hyrfpack.parallel.pool import keep_freed_memory, torch_on_one_thread
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.quant.steps import FIXED_POINT_ONE, decode_step
-from hyrfpack.render import render
+from hyrfpack.render import render_view
 from hyrfpack.scene import Picture, View
 from hyrfpack.train.config import LearningRates
 from hyrfpack.train.distributed import average_gradients
@@ -143,7 +143,7 @@ def _backpropagate_view(
     """Backpropagate the photometric loss of a view and return the loss, a detached scalar."""
     solid = None if model.config.background else np.array(model.config.solid, np.float32)
     target, mask = photos.get(view.name, picture, solid)
-    image = render(model, view.camera).rgb
+    image = render_view(model, view.camera).rgb
     if gains is not None:
         image = apply_exposure_gains(image, gains[view.name])
     loss = photometric_loss(image, target, mask)
@@ -175,7 +175,7 @@ def fit_residual_gains(
     with closing((cache or PictureCache()).stream(views)) as pictures, torch_on_one_thread():
         for view, picture in pictures:
             photo, mask = upload(picture, solid, device)
-            fitted = fit_gains(render(model, view.camera, decoded=decoded).rgb, photo, mask)
+            fitted = fit_gains(render_view(model, view.camera, decoded=decoded).rgb, photo, mask)
             gains[view.name] = torch.from_numpy(fitted).float().to(device)
     return gains
 

@@ -25,7 +25,7 @@ from hyrfpack.compress.sensitivity import Sensitivity
 from hyrfpack.data import PictureCache
 from hyrfpack.device import choose_own_device
 from hyrfpack.errors import HyrfError, HyrfSizeError
-from hyrfpack.evaluate import evaluate
+from hyrfpack.evaluate import evaluate_model
 from hyrfpack.format.codec import (
     DEFAULT_PROFILE,
     CompressionReport,
@@ -35,7 +35,7 @@ from hyrfpack.format.codec import (
     repack,
     write_model,
 )
-from hyrfpack.format.info import describe
+from hyrfpack.format.info import describe_file
 from hyrfpack.format.min_file_size import check_target_bytes
 from hyrfpack.format.run_folder import find_model
 from hyrfpack.model import HybridModel
@@ -78,7 +78,7 @@ class EncodedCandidate:
     psnr_drop: float = 0.0
 
 
-def compress(
+def compress_model(
     source: str | os.PathLike[str],
     target: str | os.PathLike[str],
     profile: str = DEFAULT_PROFILE,
@@ -130,7 +130,7 @@ def compress(
 
     Example:
         >>> import hyrfpack
-        >>> report = hyrfpack.compress("runs/bonsai", "small.hyrf")
+        >>> report = hyrfpack.compress_model("runs/bonsai", "small.hyrf")
         >>> report.profile, report.bytes_after < report.bytes_before
         ('compact', True)
     """
@@ -178,7 +178,7 @@ def compress(
             f"{source}: there is no Gaussian in it, so there is nothing to measure",
             fix="use profile 'paper'",
         )
-    cameras = Capture(describe(source), data).cameras
+    cameras = Capture(describe_file(source), data).cameras
     say(f"measuring what each number does to pictures, at {len(cameras)} cameras and between them")
     start = distortion or default_distortion(provenance, finetune_steps)
     encoding_start = (
@@ -286,10 +286,10 @@ class Packer:
         candidate, distortion = self._encode_to_distortion(target, references, report_part(self.report, 0.0, 0.3))
         views = evenly_spaced(self.scene.train, PSNR_DROP_VIEWS)
         try:
-            before = evaluate(self.model, views, report=report_part(self.report, 0.3, 0.6)).psnr
+            before = evaluate_model(self.model, views, report=report_part(self.report, 0.3, 0.6)).psnr
             for number in range(MAX_CORRECTIONS):
                 report = report_round(report_part(self.report, 0.6, 1.0), number)
-                psnr_drop = before - evaluate(self.decode(candidate), views, report=report).psnr
+                psnr_drop = before - evaluate_model(self.decode(candidate), views, report=report).psnr
                 if psnr_drop <= PSNR_DROP_TOLERANCE_RATIO * target_drop:
                     break
                 distortion *= max(target_drop / psnr_drop, 1 / MAX_REFINING_RATIO)
@@ -376,14 +376,14 @@ class Packer:
         assert self.scene is not None
         views = self.scene.test or self.scene.train
         self.report("scoring the model", 0.0)
-        before = evaluate(self.model, views).psnr
+        before = evaluate_model(self.model, views).psnr
         rounds = count()
 
         def attempt(distortion: float) -> EncodedCandidate:
             report = report_round(self.report, next(rounds))
             candidate = self.encode(distortion, report_part(report, 0.0, 0.7))
             report("scoring the file", 0.7)
-            psnr_drop = before - evaluate(self.decode(candidate), views).psnr
+            psnr_drop = before - evaluate_model(self.decode(candidate), views).psnr
             candidate = dataclasses.replace(candidate, psnr_drop=psnr_drop)
             self.say(f"distortion {distortion:.2g}: {len(candidate.data):,} bytes, {psnr_drop:+.3f} dB lost")
             return candidate

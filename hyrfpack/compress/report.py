@@ -32,7 +32,7 @@ from hyrfpack.compress.report_page import (
 from hyrfpack.compress.report_plot import draw_plot
 from hyrfpack.compress.sensitivity import Sensitivity
 from hyrfpack.errors import HyrfError
-from hyrfpack.evaluate import Evaluation, evaluate
+from hyrfpack.evaluate import Evaluation, evaluate_model
 from hyrfpack.evaluate.metrics import psnr, to_8bit
 from hyrfpack.format.codec import (
     CompressionReport,
@@ -40,13 +40,13 @@ from hyrfpack.format.codec import (
     encode_model,
     load_with_provenance,
 )
-from hyrfpack.format.info import describe
+from hyrfpack.format.info import describe_file
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.measure.machine import describe_machine, format_machine
 from hyrfpack.measure.timing import time_alternately
 from hyrfpack.model import HybridModel
 from hyrfpack.outputs import Outputs
-from hyrfpack.render import render
+from hyrfpack.render import render_view
 from hyrfpack.render.files import save_picture, to_image
 from hyrfpack.scene import Picture, Scene, View, evenly_spaced
 
@@ -84,7 +84,7 @@ def write_report(
         folder: folder of the report; created if missing.
         source: the file that was compressed.
         packed: the compressed file.
-        report: the result of `hyrfpack.compress`.
+        report: the result of `hyrfpack.compress_model`.
         scene: photos of the scene.
         command: command line shown on the page as the way to make the file again.
         overwrite: replace files of an earlier page; if False, they are an error.
@@ -117,8 +117,8 @@ def _write_report(
     model, provenance = load_with_provenance(source)
     views, views_in_words = _views_to_score(model, source, scene)
     say(f"comparing pictures with {views_in_words}, for the page")
-    before = evaluate(model, views)
-    facts, data = describe(packed), _read_bytes(packed)
+    before = evaluate_model(model, views)
+    facts, data = describe_file(packed), _read_bytes(packed)
     scored = [view for view in views if view.name not in before.skipped]
 
     profiles = _encode_other_profiles(model, provenance, report.profile)
@@ -127,7 +127,9 @@ def _write_report(
         distortion = _distortion_of_file(facts, model, provenance)
         sensitivity = report.sensitivity
         if sensitivity is None:
-            sensitivity, _ = measure_calibrated_sensitivity(model, Capture(describe(source), scene).cameras, distortion)
+            sensitivity, _ = measure_calibrated_sensitivity(
+                model, Capture(describe_file(source), scene).cameras, distortion
+            )
         # The written file is the curve's point at its distortion, unless fine-tuning moved it off the curve.
         written_file = data if report.profile == "compact" and not report.finetuned else None
         curve = _encode_curve(model, provenance, sensitivity, distortion, written_file)
@@ -166,8 +168,8 @@ def _views_to_score(model: HybridModel, source: Path, scene: Scene | None) -> tu
     if scene is None:
         with torch.no_grad():
             decoded = model.decode()
-            cameras = evenly_spaced(Capture(describe(source)).cameras, MAX_SCORED_VIEWPOINTS)
-            renders = [to_image(render(model, camera, decoded=decoded).rgb) for camera in cameras]
+            cameras = evenly_spaced(Capture(describe_file(source)).cameras, MAX_SCORED_VIEWPOINTS)
+            renders = [to_image(render_view(model, camera, decoded=decoded).rgb) for camera in cameras]
         views = [
             View(f"viewpoint {number}", camera, partial(Picture, np.asarray(picture)))
             for number, (camera, picture) in enumerate(zip(cameras, renders, strict=True), 1)
@@ -227,7 +229,7 @@ def _measure_files(
         {name: partial(decode_model, data) for name, data in files.items()}, DECODE_TIMING_TURNS
     )
     points = {
-        name: MeasuredFile(name, len(data), evaluate(decoded[name], views), times[name].ms)
+        name: MeasuredFile(name, len(data), evaluate_model(decoded[name], views), times[name].ms)
         for name, data in files.items()
     }
     return points, decoded
@@ -253,8 +255,8 @@ def _write_pictures(
     decoded_models = model.decode(), packed.decode()
     pairs = [
         (
-            to_8bit(render(model, view.camera, decoded=decoded_models[0]).rgb),
-            to_8bit(render(packed, view.camera, decoded=decoded_models[1]).rgb),
+            to_8bit(render_view(model, view.camera, decoded=decoded_models[0]).rgb),
+            to_8bit(render_view(packed, view.camera, decoded=decoded_models[1]).rgb),
         )
         for view, *_ in chosen
     ]

@@ -13,7 +13,7 @@ from hyrfpack.format.arrays import SECTION_PARAMETERS
 from hyrfpack.format.sections import COLORS, DECODER_SECTIONS, OPACITIES, POSITIONS, SCALES, TABLE_SECTIONS
 from hyrfpack.model import Geometry, HybridModel, expand
 from hyrfpack.progress import Report, no_report
-from hyrfpack.render import render
+from hyrfpack.render import render_view
 from hyrfpack.scene import Camera
 
 # The number of views is chosen so that about this many Gaussians are drawn in all views together.
@@ -117,7 +117,7 @@ def measure_sensitivity(
         for name, parameter in model.named_parameters():
             parameter.requires_grad_(with_fields or name.startswith("gaussians"))
             parameter.grad = None
-        rgb = render(model, camera).rgb
+        rgb = render_view(model, camera).rgb
         signs = torch.randint(0, 2, rgb.shape, generator=generator).to(rgb) * 2 - 1
         if rgb.requires_grad:
             (rgb * signs).sum().backward()

@@ -14,21 +14,21 @@ import numpy as np
 import torch
 from PIL import Image
 
-from hyrfpack.compress import compress
+from hyrfpack.compress import compress_model
 from hyrfpack.data import load_scene
 from hyrfpack.demo.scene import write_demo_scene
-from hyrfpack.evaluate import evaluate
+from hyrfpack.evaluate import evaluate_model
 from hyrfpack.evaluate.figures import draw_comparison, draw_contact_sheet
 from hyrfpack.evaluate.metrics import psnr, to_8bit
-from hyrfpack.export import ExportReport, export
-from hyrfpack.format import CompressionReport, load, repack
+from hyrfpack.export import ExportReport, export_model
+from hyrfpack.format import CompressionReport, load_model, repack
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.model import HybridModel
 from hyrfpack.outputs import Outputs
-from hyrfpack.render import render
+from hyrfpack.render import render_view
 from hyrfpack.render.files import render_files, save_picture
 from hyrfpack.scene import Scene, evenly_spaced
-from hyrfpack.train import TrainConfig, train
+from hyrfpack.train import TrainConfig, train_model
 
 DRAWN_VIEW_COUNT = 4
 SCENE_FOLDER = "scene"
@@ -149,7 +149,7 @@ def _run_demo(
     write_demo_scene(folder / SCENE_FOLDER, views=views, size=size, overwrite=overwrite)
     scene = load_scene(folder / SCENE_FOLDER)
     say(f"training {steps:,} steps on {len(scene.train)} photos, {len(scene.test)} held out")
-    trained = train(scene, folder / RUN_FOLDER, TrainConfig(steps=steps), overwrite=overwrite)
+    trained = train_model(scene, folder / RUN_FOLDER, TrainConfig(steps=steps), overwrite=overwrite)
     if trained.model is None:
         raise KeyboardInterrupt
 
@@ -159,22 +159,22 @@ def _run_demo(
         path, compress_seconds = trained.model, None
         if profile != "raw":
             packed, compress_seconds = _timed(
-                partial(compress, trained.model, folder / PACKED_FILES[profile], profile, overwrite=overwrite)
+                partial(compress_model, trained.model, folder / PACKED_FILES[profile], profile, overwrite=overwrite)
             )
             path = Path(packed.file)
         unpacked, decompress_seconds = _timed(partial(repack, path, unpacked_path, overwrite=replace))
         unpacked_path, replace = Path(unpacked.file), True  # this call has written the file and may replace it
-        scores = evaluate(load(unpacked_path), scene.test)
+        scores = evaluate_model(load_model(unpacked_path), scene.test)
         stored = path.stat().st_size
         profiles.append(ProfileResult(profile, scores.psnr, scores.ssim, stored, compress_seconds, decompress_seconds))
 
     say("rendering held-out views")
-    model = load(path)
+    model = load_model(path)
     held_out = [(view.name, view.camera) for view in scene.test]
     for _ in render_files(model, held_out, folder / RENDERS_FOLDER, overwrite=overwrite):
         pass
     say("making a page for the browser")
-    page = export(path, folder / PAGE_FILE, data=scene, overwrite=overwrite)
+    page = export_model(path, folder / PAGE_FILE, data=scene, overwrite=overwrite)
     result = DemoResult(
         steps=steps,
         gaussians=len(model),
@@ -196,7 +196,7 @@ def _draw(model: HybridModel, scene: Scene, result: DemoResult) -> Image.Image:
     rows = []
     for view in evenly_spaced(scene.test, DRAWN_VIEW_COUNT):
         photo = torch.from_numpy(view.load().composite(solid))
-        image = to_8bit(render(model, view.camera, decoded=decoded).rgb)
+        image = to_8bit(render_view(model, view.camera, decoded=decoded).rgb)
         rows.append(draw_comparison(photo, image, caption=f"{view.name}   {psnr(image, photo):.2f} dB"))
     title = f"hyrfpack demo: {result.gaussians:,} Gaussians, {result.steps:,} steps in {result.train_seconds:.0f} s"
     return draw_contact_sheet(rows, title, result.table())

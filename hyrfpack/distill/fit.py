@@ -66,7 +66,7 @@ class DistillReport:
         return asdict(self)
 
 
-def distill(
+def import_splats(
     source: str | os.PathLike[str],
     target: str | os.PathLike[str],
     config: DistillConfig = DistillConfig(),  # noqa: B008 - frozen
@@ -89,7 +89,7 @@ def distill(
     Example:
         >>> import hyrfpack
         >>> quick = hyrfpack.DistillConfig(steps=4, psnr=15, size=32, train_views=6, test_views=2)
-        >>> report = hyrfpack.distill("bonsai.ply", "again.hyrf", quick)
+        >>> report = hyrfpack.import_splats("bonsai.ply", "again.hyrf", quick)
         >>> report.bytes_after < report.bytes_source
         True
     """
@@ -153,7 +153,7 @@ def distill_splats(
     data = pack(distilled, config.psnr, provenance, say, report_part(report, 0.7, 0.97))
     written = write_atomic(target, data, overwrite=overwrite)  # written last, so an interrupt keeps the old file
     report("scoring the file", 0.97)
-    decoded = hyrf_format.load(written).to(torch_device)
+    decoded = hyrf_format.load_model(written).to(torch_device)
     decoded.precision = distilled.model.precision
     scores = distilled.test.psnr_per_view(decoded)
     reached_psnr = float(np.mean(scores))

@@ -16,7 +16,7 @@ from hyrfpack.model import HybridModel
 from hyrfpack.ops.rasterize.blend_weights import sum_blend_weights
 from hyrfpack.ops.rasterize.cull import frustum_cull
 from hyrfpack.parallel.pool import parallel_map, torch_on_one_thread
-from hyrfpack.render import RenderSettings, render
+from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.scene import Camera, Picture, Scene, View
 from hyrfpack.splats.draw import Drawable, draw
 
@@ -97,7 +97,7 @@ class ReferenceViews:
 
         @torch.no_grad()  # gradient mode is kept per thread
         def score(index: int) -> float:
-            rendered = render(model, self.cameras[index], decoded=decoded).rgb
+            rendered = render_view(model, self.cameras[index], decoded=decoded).rgb
             return psnr(rendered.clamp(0, 1), self.pictures[index])
 
         return parallel_map(score, range(len(self.cameras)), model.gaussians.positions.device)

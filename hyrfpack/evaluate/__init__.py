@@ -25,7 +25,7 @@ from hyrfpack.lock import exclusive_folder
 from hyrfpack.model import HybridModel
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.progress import Report, no_report
-from hyrfpack.render import RenderSettings, apply_exposure_map, render
+from hyrfpack.render import RenderSettings, apply_exposure_map, render_view
 from hyrfpack.render.files import save_picture, unique_stems
 from hyrfpack.scene import Camera, View, evenly_spaced
 from hyrfpack.splats.draw import Drawable, draw
@@ -55,8 +55,8 @@ class Evaluation:
 
     Attributes:
         psnr: PSNR in dB, from the squared error pooled over the pixels and channels of each view, averaged over views.
-            Renders are at the exposure as photographed, like those of `hyrfpack.render`, unless `settings` ask for the
-            consistent exposure.
+            Renders are at the exposure as photographed, like those of `hyrfpack.render_view`, unless `settings` ask for
+            the consistent exposure.
         psnr_consistent: PSNR of renders at the model's consistent exposure; None for splats and for models without an
             exposure map.
         psnr_corrected: PSNR of renders after an affine colour correction to the photo that they are scored against, see
@@ -88,7 +88,7 @@ class Evaluation:
 
 
 @torch.no_grad()
-def evaluate(
+def evaluate_model(
     model: HybridModel | Drawable,
     views: Sequence[View],
     *,
@@ -128,7 +128,8 @@ def evaluate(
 
     Example:
         >>> import hyrfpack
-        >>> scores = hyrfpack.evaluate(hyrfpack.load("bonsai.hyrf"), hyrfpack.load_scene("photos/bonsai").test)
+        >>> model = hyrfpack.load_model("bonsai.hyrf")
+        >>> scores = hyrfpack.evaluate_model(model, hyrfpack.load_scene("photos/bonsai").test)
         >>> len(scores.views), scores.psnr > 10, scores.lpips is None
         (2, True, True)
     """
@@ -221,7 +222,7 @@ def _color_renderer(
     decoded, at_one_exposure = model.decode(), replace(settings, exposure=CONSISTENT_EXPOSURE)
 
     def draw_colors(camera: Camera) -> tuple[torch.Tensor, torch.Tensor | None]:
-        rgb = render(model, camera, at_one_exposure, decoded=decoded).rgb
+        rgb = render_view(model, camera, at_one_exposure, decoded=decoded).rgb
         if model.exposure is None:
             return rgb, None
         return apply_exposure_map(model, camera, rgb) if settings.exposure == AS_PHOTOGRAPHED else rgb, rgb

@@ -60,7 +60,7 @@ class ConversionReport:
         return asdict(self)
 
 
-def convert(
+def convert_splats(
     source: str | os.PathLike[str],
     target: str | os.PathLike[str],
     *,
@@ -91,7 +91,7 @@ def convert(
 
     Example:
         >>> import hyrfpack
-        >>> result = hyrfpack.convert("bonsai.ply", "bonsai.splat")
+        >>> result = hyrfpack.convert_splats("bonsai.ply", "bonsai.splat")
         >>> result.degree_after, result.bytes_after == 32 * result.gaussians_after, result.psnr > 20
         (0, True, True)
     """

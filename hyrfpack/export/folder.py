@@ -14,13 +14,13 @@ from PIL import Image
 
 from hyrfpack.atomic import pending_file, write_atomic
 from hyrfpack.checks import check_type
-from hyrfpack.evaluate import evaluate
+from hyrfpack.evaluate import evaluate_model
 from hyrfpack.evaluate.metrics import IDENTICAL_PSNR
 from hyrfpack.export.pages import page_cameras, suggest_compression
 from hyrfpack.export.poster import encode_poster, render_model_poster, render_splats_poster
 from hyrfpack.export.report import ExportReport
 from hyrfpack.export.source import Source
-from hyrfpack.format import describe
+from hyrfpack.format import describe_file
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.model import HybridModel
 from hyrfpack.outputs import Outputs
@@ -244,9 +244,9 @@ def _describe_quality(path: StrPath, model: HybridModel, data: Scene | None, say
     """Describe the quality of a model in words, on held-out photos if there are any, else as stated in its file."""
     if data is not None and data.test:
         say(f"scoring on {_format_photo_count(len(data.test))}")
-        scores = evaluate(model, data.test)
+        scores = evaluate_model(model, data.test)
         return f"{scores.psnr:.2f} dB on {_format_photo_count(len(scores.views))}"
-    provenance = describe(path)["provenance"]
+    provenance = describe_file(path)["provenance"]
     stated, choices = provenance.get("psnr"), provenance.get("choices")
     if not isinstance(stated, float) or not 0 < stated < IDENTICAL_PSNR:
         return ""

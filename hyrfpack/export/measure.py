@@ -15,7 +15,7 @@ from hyrfpack.model import HybridModel
 from hyrfpack.ops.background import pixel_directions
 from hyrfpack.parallel.pool import parallel_map
 from hyrfpack.progress import Report, no_report, report_each_call
-from hyrfpack.render import render
+from hyrfpack.render import render_view
 from hyrfpack.scene import Camera, View
 from hyrfpack.splats.draw import Drawable, draw
 from hyrfpack.splats.splats import Splats
@@ -65,7 +65,7 @@ def measure_psnr(
     @torch.no_grad()  # because the setting is per thread
     def scores_at(viewpoint: tuple[Camera, View | None]) -> dict[str, tuple[float, float | None]]:
         camera, view = viewpoint
-        own = to_8bit(render(model, camera, decoded=decoded, background=sphere).rgb)
+        own = to_8bit(render_view(model, camera, decoded=decoded, background=sphere).rgb)
         pictures = {"model": own}
         for name, (drawable, behind) in drawables.items():
             raster = draw(drawable, camera)

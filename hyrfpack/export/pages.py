@@ -13,7 +13,7 @@ from hyrfpack.atomic import write_atomic
 from hyrfpack.export.poster import encode_poster, render_model_poster
 from hyrfpack.export.report import ExportReport
 from hyrfpack.export.source import Source
-from hyrfpack.format import describe
+from hyrfpack.format import describe_file
 from hyrfpack.model import BACKGROUND_RADIUS
 from hyrfpack.render import RenderSettings
 from hyrfpack.scene import Camera, evenly_spaced
@@ -80,7 +80,7 @@ def write_native_page(
 
 def suggest_compression(source: str | os.PathLike[str], length: int, say: Callable[[str], None]) -> None:
     """Suggest `hyrfpack compress` with `say` if a model file of `length` bytes is large or uncompressed."""
-    if length > LARGE_FILE_BYTES or describe(source)["profile"] == "raw":
+    if length > LARGE_FILE_BYTES or describe_file(source)["profile"] == "raw":
         say(f"{source} goes along as it is, {length:,} bytes; 'hyrfpack compress' makes it smaller")
 
 

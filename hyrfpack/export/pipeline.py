@@ -54,7 +54,7 @@ MIN_REPORTED_COST_DB = 1.0
 Say = Callable[[str], None]
 
 
-def export(
+def export_model(
     source: str | os.PathLike[str],
     target: str | os.PathLike[str],
     *,
@@ -114,7 +114,7 @@ def export(
 
     Example:
         >>> import hyrfpack
-        >>> report = hyrfpack.export("bonsai.hyrf", "bonsai.spz", degree=1, background=False)
+        >>> report = hyrfpack.export_model("bonsai.hyrf", "bonsai.spz", degree=1, background=False)
         >>> report.degree, report.bytes > 0, report.psnr > 10
         (1, True, True)
     """

@@ -11,7 +11,7 @@ from hyrfpack.cameras.paths import Viewpoint, orbit
 from hyrfpack.cameras.view_sampling import shrink_camera
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.model import Frame, HybridModel
-from hyrfpack.render import render
+from hyrfpack.render import render_view
 from hyrfpack.render.files import to_image
 from hyrfpack.scene import Camera
 from hyrfpack.splats.draw import Drawable, draw
@@ -23,7 +23,7 @@ FRAME_PERCENTILES = (1, 99)
 
 def render_model_poster(model: HybridModel, camera: Camera, longest_side: int) -> Image.Image:
     """Render a model from a camera, in a picture of at most `longest_side` pixels a side."""
-    return to_image(render(model, shrink_camera(camera, longest_side)).rgb)
+    return to_image(render_view(model, shrink_camera(camera, longest_side)).rgb)
 
 
 def render_splats_poster(splats: Splats, longest_side: int) -> Image.Image | None:

@@ -13,7 +13,7 @@ from hyrfpack.cameras.paths import Viewpoint, common_direction, look_at, orbit
 from hyrfpack.cameras.view_sampling import interpolate_views
 from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.evaluate.metrics import provenance_mse
-from hyrfpack.format import describe, load
+from hyrfpack.format import describe_file, load_model
 from hyrfpack.model import HybridModel
 from hyrfpack.scene import Camera, Scene, View, evenly_spaced
 
@@ -60,7 +60,7 @@ class Source:
         Raises:
             HyrfError: the file cannot be read or holds no Gaussian.
         """
-        facts, model = describe(path), load(path)
+        facts, model = describe_file(path), load_model(path)
         if not len(model):
             raise HyrfError(f"{path}: there is no Gaussian in it, so there is nothing to export", fix="train it again")
         capture = Capture(facts, data)

@@ -8,24 +8,24 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from hyrfpack.format.info import SectionSize, describe
+from hyrfpack.format.info import SectionSize, describe_file
 from hyrfpack.format.run_folder import RunStatus, find_model, read_run_status
 
 if TYPE_CHECKING:
-    from hyrfpack.format.codec import CompressionReport, decode_model, encode_model, load, repack, save
+    from hyrfpack.format.codec import CompressionReport, decode_model, encode_model, load_model, repack, save_model
 
 __all__ = [
     "CompressionReport",
     "RunStatus",
     "SectionSize",
     "decode_model",
-    "describe",
+    "describe_file",
     "encode_model",
     "find_model",
-    "load",
+    "load_model",
     "read_run_status",
     "repack",
-    "save",
+    "save_model",
 ]
 
 

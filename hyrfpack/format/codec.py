@@ -42,7 +42,7 @@ PROFILES: dict[str, Callable[..., tuple[list[Section], dict]]] = {
     "paper": paper.encode,
     "compact": compact.encode,
 }
-DEFAULT_PROFILE = "compact"  # `hyrfpack.compress` and the command line use it where no profile is named
+DEFAULT_PROFILE = "compact"  # `hyrfpack.compress_model` and the command line use it where no profile is named
 # A file may declare a number of Gaussians for each of its bytes. The extra ones are needed because Gaussians that are
 # all equal take no bytes.
 MAX_GAUSSIANS_PER_FILE_BYTE = 32
@@ -100,7 +100,7 @@ def encode_model(model: HybridModel, profile: str = "raw", provenance: dict | No
         profile: "raw" (float32, exact), "paper" (see `hyrfpack.format.paper`) or "compact" (`hyrfpack.format.compact`).
         provenance: any JSON object that says where the model comes from; stored for people to read.
         settings: settings of the profile: for "paper" the fields of `paper.PaperSettings`, for "compact" the
-            `quantized` numbers from `hyrfpack.compress`; "raw" has none.
+            `quantized` numbers from `hyrfpack.compress_model`; "raw" has none.
 
     Raises:
         HyrfError: the profile does not exist, or a parameter is NaN, infinite or too large for the profile.
@@ -162,7 +162,7 @@ def decode_model(
     return _decode(read_container(data, SECTION_CONTENTS, name, fraction)).to(device)
 
 
-def save(
+def save_model(
     model: HybridModel,
     path: str | os.PathLike[str],
     profile: str = "raw",
@@ -184,8 +184,8 @@ def save(
 
     Example:
         >>> import hyrfpack
-        >>> model = hyrfpack.load("bonsai.hyrf")
-        >>> report = hyrfpack.save(model, "copy.hyrf", provenance={"note": "by hand"})
+        >>> model = hyrfpack.load_model("bonsai.hyrf")
+        >>> report = hyrfpack.save_model(model, "copy.hyrf", provenance={"note": "by hand"})
         >>> report.profile, report.gaussians == len(model)
         ('raw', True)
     """
@@ -205,7 +205,7 @@ def write_model(data: bytes, path: str | os.PathLike[str], *, overwrite: bool = 
     return CompressionReport(metadata.profile, metadata.gaussians, before, len(data), sizes, file=str(written))
 
 
-def load(
+def load_model(
     path: str | os.PathLike[str], device: str | torch.device = "cpu", fraction: float | None = None
 ) -> HybridModel:
     """Read a model from a `.hyrf` file, or from the folder of a training run.
@@ -220,7 +220,7 @@ def load(
 
     Example:
         >>> import hyrfpack
-        >>> model = hyrfpack.load("bonsai.hyrf")
+        >>> model = hyrfpack.load_model("bonsai.hyrf")
         >>> model.gaussians.positions.shape[1], model.gaussians.positions.requires_grad
         (3, False)
     """
@@ -251,7 +251,7 @@ def repack(
     Outputs(source, overwrite=overwrite).file(target)
     model, provenance = load_with_provenance(source, fraction)
     kept = provenance if profile == "raw" else quantized_provenance(provenance, model.config.frame.scale)
-    return save(model, target, profile, kept, overwrite=overwrite, **settings)
+    return save_model(model, target, profile, kept, overwrite=overwrite, **settings)
 
 
 def load_with_provenance(path: str | os.PathLike[str], fraction: float | None = None) -> tuple[HybridModel, dict]:

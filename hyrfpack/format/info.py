@@ -37,12 +37,12 @@ def section_sizes(container: Container) -> list[SectionSize]:
     ]
 
 
-def describe(path: str | os.PathLike[str], fraction: float | None = None) -> dict:
+def describe_file(path: str | os.PathLike[str], fraction: float | None = None) -> dict:
     """Describe a `.hyrf` file from its header, table of contents, metadata and exposure, without decoding the model.
 
     Args:
         path: the file, or the folder of a training run, see `hyrfpack.format.find_model`.
-        fraction: fraction of the file that must exist, see `hyrfpack.load`; None for the whole file.
+        fraction: fraction of the file that must exist, see `hyrfpack.load_model`; None for the whole file.
 
     Returns:
         A dictionary ready for JSON: `bytes` (of the file), `version` ("1.0"), and the metadata's `writer`, `profile`,
@@ -57,7 +57,7 @@ def describe(path: str | os.PathLike[str], fraction: float | None = None) -> dic
 
     Example:
         >>> import hyrfpack
-        >>> facts = hyrfpack.describe("bonsai.hyrf")
+        >>> facts = hyrfpack.describe_file("bonsai.hyrf")
         >>> facts["profile"], facts["version"], facts["sections"][0]["type"]
         ('compact', '1.1', 'META')
     """

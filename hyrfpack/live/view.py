@@ -87,7 +87,7 @@ def live_view(title: str, *, port: int = 0, say: Callable[[str], None]) -> Itera
 
     Example:
         >>> with live_view("bonsai", say=print) as view:
-        ...     hyrfpack.train(scene, "runs/bonsai", observer=view.observe)
+        ...     hyrfpack.train_model(scene, "runs/bonsai", observer=view.observe)
     """
     view = LiveView()
     page = encode_player(title, content=SCENE_NAME, updates=UPDATES_NAME, fetches="'self'")

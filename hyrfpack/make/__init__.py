@@ -2,7 +2,7 @@
 
 from hyrfpack.make.plan import QUALITIES
 from hyrfpack.make.progress import Progress
-from hyrfpack.make.run import MakeResult, Stopped, make
+from hyrfpack.make.run import MakeResult, Stopped, make_scene
 from hyrfpack.make.survey import PhotoSurvey, describe_photos
 
-__all__ = ["QUALITIES", "MakeResult", "PhotoSurvey", "Progress", "Stopped", "describe_photos", "make"]
+__all__ = ["QUALITIES", "MakeResult", "PhotoSurvey", "Progress", "Stopped", "describe_photos", "make_scene"]

@@ -25,7 +25,7 @@ from hyrfpack.make.progress import Reporter
 from hyrfpack.make.source import LoadSettings
 from hyrfpack.make.stage_cache import Say
 from hyrfpack.model import HybridModel
-from hyrfpack.render import render
+from hyrfpack.render import render_view
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Camera, Scene, evenly_spaced
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer
 from hyrfpack.train.config import FULL_STEPS
@@ -261,7 +261,7 @@ def _measure_cpu_pass(model: HybridModel, cameras: Sequence[Camera]) -> float:
     times = []
     for camera in cameras:
         began = perf_counter()
-        render(model, camera).rgb.sum().backward()
+        render_view(model, camera).rgb.sum().backward()
         times.append(perf_counter() - began)
     return statistics.median(times[1:] or times)
 

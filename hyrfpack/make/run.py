@@ -15,7 +15,7 @@ from hyrfpack.checks import check_choice, check_float, check_int
 from hyrfpack.data import PictureCache
 from hyrfpack.data.folder import first_readable_photo, list_photos
 from hyrfpack.device import choose_device
-from hyrfpack.format import describe
+from hyrfpack.format import describe_file
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.make import stages
 from hyrfpack.make.held_out import score_note
@@ -33,7 +33,7 @@ from hyrfpack.train.config import LARGEST_SEED, PRESETS
 
 MEASUREMENT_TIME_RATIO = 0.15  # probes and pilot runs take about this ratio of the remaining time
 
-__all__ = ["MakeResult", "Stopped", "make"]
+__all__ = ["MakeResult", "Stopped", "make_scene"]
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class MakeResult:
         psnr_consistent: mean score as in `hyrfpack.Evaluation`; None also if the model has no exposure map.
         poses: report of `hyrfpack.estimate_poses`; empty if the photos had poses.
         training: steps, Gaussians, bytes and decisions of the training; empty if there was none.
-        export: report of `hyrfpack.export`; for splats, it has the report of `hyrfpack.distill` under "import".
+        export: report of `hyrfpack.export_model`; for splats, it has that of `hyrfpack.import_splats` under "import".
         seconds: time of each stage in all calls together, interrupted and killed ones included.
         total_seconds: sum of these times.
         kept: names of stages whose products of an earlier call were reused.
@@ -80,7 +80,7 @@ class MakeResult:
         return {**asdict(self), "output": str(self.output), "model": str(self.model), "work": str(self.work)}
 
 
-def make(
+def make_scene(
     photos: StrPath,
     output: StrPath,
     *,
@@ -109,8 +109,8 @@ def make(
 
     Args:
         photos: a folder of photos without poses, any path that `load_scene` reads, a video, a file of splats of
-            another program (see `hyrfpack.distill`), or a `.hyrf` file to export.
-        output: path of the output, whose ending selects the format (".hyrf", or one of `hyrfpack.export`).
+            another program (see `hyrfpack.import_splats`), or a `.hyrf` file to export.
+        output: path of the output, whose ending selects the format (".hyrf", or one of `hyrfpack.export_model`).
         quality: a key of QUALITIES.
         minutes: time that the call may take, instead of a quality. The number of steps and the size of the photos are
             chosen by a measurement.
@@ -128,7 +128,7 @@ def make(
             file then gets a free name beside it, which the result reports; a folder is an error.
         report: called with the progress.
         say: called with sentences for the user.
-        observer: observer of the training, see `hyrfpack.train`.
+        observer: observer of the training, see `hyrfpack.train_model`.
 
     Returns:
         The output, the scores, and the reports of the stages.
@@ -141,7 +141,7 @@ def make(
 
     Example:
         >>> import hyrfpack
-        >>> result = hyrfpack.make("bonsai.hyrf", "made/bonsai.html")
+        >>> result = hyrfpack.make_scene("bonsai.hyrf", "made/bonsai.html")
         >>> result.output.name, result.bytes > 0, sorted(path.name for path in result.work.iterdir())
         ('bonsai.html', True, ['export', 'make.json'])
     """
@@ -325,7 +325,7 @@ class _Pipeline:
         return MakeResult(
             output=output,
             bytes=exported["bytes"],
-            gaussians=describe(model)["gaussians"],
+            gaussians=describe_file(model)["gaussians"],
             model=model,
             work=stage_cache.folder,
             views=scores["views"],

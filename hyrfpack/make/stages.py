@@ -14,15 +14,15 @@ from typing import Any
 import torch
 
 from hyrfpack.atomic import pending_file
-from hyrfpack.compress import compress
+from hyrfpack.compress import compress_model
 from hyrfpack.data import PictureCache
 from hyrfpack.device import describe_device
-from hyrfpack.distill import DistillConfig, distill
+from hyrfpack.distill import DistillConfig, import_splats
 from hyrfpack.errors import HyrfError, HyrfSizeError
-from hyrfpack.evaluate import evaluate
+from hyrfpack.evaluate import evaluate_model
 from hyrfpack.evaluate.metrics import psnr_from_mse
-from hyrfpack.export import export
-from hyrfpack.format import describe, load
+from hyrfpack.export import export_model
+from hyrfpack.format import describe_file, load_model
 from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
 from hyrfpack.make.plan import Plan
 from hyrfpack.make.progress import Reporter
@@ -30,7 +30,7 @@ from hyrfpack.make.stage_cache import PRODUCT_NAMES, StageCache
 from hyrfpack.make.state import file_digest, files_digest
 from hyrfpack.outputs import Outputs
 from hyrfpack.scene import Scene
-from hyrfpack.train import Trainer, train
+from hyrfpack.train import Trainer, train_model
 from hyrfpack.train.decisions import max_pilot_steps
 from hyrfpack.train.progress import RUNNING_MEAN_WEIGHT
 from hyrfpack.train.run import is_begun
@@ -118,7 +118,7 @@ def run_training_stage(
             resume = resuming and is_begun(run)
             progress = _TrainingProgress(stage_cache.reporter, plan.steps, max_pilot_steps(scene, config))
             try:
-                trained = train(
+                trained = train_model(
                     scene, run, config, resume=resume, overwrite=True, cache=picture_cache, device=device, quiet=True,
                     report=progress.step, phase=progress.phase, observer=observer,
                 )  # fmt: skip
@@ -130,7 +130,7 @@ def run_training_stage(
                 raise HyrfError(trained.missing, fix="run it again, which writes what is missing")
         metrics = json.loads((run / METRICS_FILE).read_bytes())
         facts = {key: metrics[key] for key in ("gaussians", "bytes", "choices", "device")}
-        psnr = describe(run / MODEL_FILE)["provenance"]["psnr"]
+        psnr = describe_file(run / MODEL_FILE)["provenance"]["psnr"]
         facts |= {"steps": plan.steps, "target_bytes": config.target_bytes, "psnr": psnr}
         return facts, [f"{RUN_FOLDER}/{name}" for name in (MODEL_FILE, METRICS_FILE)]
 
@@ -162,7 +162,7 @@ class _TrainingProgress:
         self._part, self._pilot_steps, self._mse = "pilots", 0, math.nan
 
     def step(self, step: int, loss: float, mse: float, gaussians: int) -> None:
-        """Report a step, as the `report` argument of `hyrfpack.train`; its number is 0 during pilot runs."""
+        """Report a step, as the `report` argument of `hyrfpack.train_model`; its number is 0 during pilot runs."""
         if step == 0:
             self._pilot_steps += 1
             self._reporter.update(min(1.0, self._pilot_steps / max(self._max_pilot_steps, 1)), "pilot runs")
@@ -177,7 +177,7 @@ class _TrainingProgress:
             self._begin("results")
 
     def phase(self, what: str, done: int, total: int) -> None:
-        """Report other work, as the `phase` argument of `hyrfpack.train`; after the last step it sets the progress."""
+        """Report other work, as the `phase` argument of `train_model`; after the last step it sets the progress."""
         if self._part == "results" and total:
             self._reporter.update(done / total, what, f"{done:,}/{total:,}")
         else:
@@ -198,7 +198,7 @@ def run_compression_stage(stage_cache: StageCache, scene: Scene, plan: Plan, dev
     def execute(resuming: bool) -> tuple[dict, list[str]]:
         source, target = stage_cache.folder / RUN_FOLDER / MODEL_FILE, stage_cache.folder / PACKED_MODEL
         try:
-            report = compress(
+            report = compress_model(
                 source, target, data=scene, finetune_steps=plan.finetune_steps, target_bytes=plan.target_bytes,
                 device=device, say=stage_cache.reporter.say, report=stage_cache.reporter.report_share,
             )  # fmt: skip
@@ -222,14 +222,14 @@ def run_compression_stage(stage_cache: StageCache, scene: Scene, plan: Plan, dev
 
 
 def run_import_stage(stage_cache: StageCache, source: Path, steps: int, seed: int) -> dict[str, Any]:
-    """Distil splats of another program into `model.hyrf`; return the report of `hyrfpack.distill`."""
+    """Distil splats of another program into `model.hyrf`; return the report of `hyrfpack.import_splats`."""
     files = sorted(p for p in source.parent.iterdir() if p.is_file()) if source.name == "meta.json" else [source]
     if source.is_dir():
         files = sorted(p for p in source.iterdir() if p.is_file())
     config = DistillConfig(steps=steps, seed=seed)
 
     def execute(resuming: bool) -> tuple[dict, list[str]]:
-        report = distill(
+        report = import_splats(
             source,
             stage_cache.folder / PACKED_MODEL,
             config,
@@ -256,7 +256,7 @@ def run_export_stage(
             copy_file(model, target)
             report: dict[str, Any] = {"bytes": target.stat().st_size}
         else:
-            made = export(
+            made = export_model(
                 model, target, data=scene, say=stage_cache.reporter.say, report=stage_cache.reporter.report_share
             )
             report = {**asdict(made), "file": name, "chosen_by": {}}
@@ -276,7 +276,7 @@ def run_scoring_stage(stage_cache: StageCache, scene: Scene, device: torch.devic
     def execute(resuming: bool) -> tuple[dict, list[str]]:
         if not scene.test:
             return {"views": 0}, []
-        scores = evaluate(load(model, device), scene.test, report=stage_cache.reporter.report_share)
+        scores = evaluate_model(load_model(model, device), scene.test, report=stage_cache.reporter.report_share)
         means = {name: getattr(scores, name) for name in ("psnr", "psnr_consistent", "ssim")}
         return {"views": len(scores.views), **means}, []
 

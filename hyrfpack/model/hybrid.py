@@ -77,7 +77,8 @@ class HybridModel(nn.Module):
     Attributes:
         precision: precision of the decoders' products in GPU kernels, not stored in files: "mixed" rounds factors to
             bfloat16 and adds up in float32, "float32" rounds nothing. The CPU always computes in float32.
-        exposure: the exposure map; None for a model of one exposure. `hyrfpack.render` and `hyrfpack.export` apply it.
+        exposure: the exposure map; None for a model of one exposure. `hyrfpack.render_view` and
+            `hyrfpack.export_model` apply it.
     """
 
     def __init__(self, config: ModelConfig, gaussians: Gaussians, generator: torch.Generator | None = None) -> None:

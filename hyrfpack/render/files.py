@@ -18,7 +18,7 @@ from hyrfpack.lock import exclusive_folder
 from hyrfpack.model import HybridModel
 from hyrfpack.outputs import PICTURE_SUFFIXES
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
-from hyrfpack.render.renderer import RenderSettings, render
+from hyrfpack.render.renderer import RenderSettings, render_view
 from hyrfpack.scene import Camera
 
 
@@ -74,7 +74,7 @@ def make_renderer(
     """Decode a model once, and return a function that renders it from a camera. Arguments as in `render_files`."""
     with torch.no_grad():
         decoded = model.decode()
-    return partial(render, model, settings=settings, decoded=decoded, depth=depth)
+    return partial(render_view, model, settings=settings, decoded=decoded, depth=depth)
 
 
 def write_pictures(

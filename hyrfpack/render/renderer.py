@@ -92,7 +92,7 @@ class Rendering:
 
 
 @torch_on_one_thread()
-def render(
+def render_view(
     model: HybridModel,
     camera: Camera,
     settings: RenderSettings = RenderSettings(),
@@ -123,9 +123,9 @@ def render(
 
     Example:
         >>> import hyrfpack
-        >>> model = hyrfpack.load("bonsai.hyrf")
+        >>> model = hyrfpack.load_model("bonsai.hyrf")
         >>> camera = hyrfpack.load_scene("photos/bonsai").test[0].camera
-        >>> hyrfpack.render(model, camera).rgb.shape
+        >>> hyrfpack.render_view(model, camera).rgb.shape
         torch.Size([48, 48, 3])
     """
     check_type("model", model, HybridModel)

@@ -1,4 +1,4 @@
-"""Rendering of splats from other programs' files with our own rasteriser, as `hyrfpack.render` renders models."""
+"""Rendering of splats from other programs' files with our own rasteriser, as `hyrfpack.render_view` renders models."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def draw(
     Args:
         drawable: the splats.
         camera: a camera in world units.
-        settings: near plane (local units), culling and transmittance, as in `hyrfpack.render`.
+        settings: near plane (local units), culling and transmittance, as in `hyrfpack.render_view`.
         black: draw all splats black, which is faster where only the transmittance is needed.
         depth: also return the depth, (H, W) in world units.
     """

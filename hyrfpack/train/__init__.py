@@ -3,7 +3,7 @@
 from hyrfpack.train.config import PRESETS, DensityConfig, LearningRates, TrainConfig
 from hyrfpack.train.density import DensityControl
 from hyrfpack.train.photos import photos_of
-from hyrfpack.train.run import TrainResult, train
+from hyrfpack.train.run import TrainResult, train_model
 from hyrfpack.train.strategy import Strategy
 from hyrfpack.train.trainer import Trainer
 
@@ -17,5 +17,5 @@ __all__ = [
     "TrainResult",
     "Trainer",
     "photos_of",
-    "train",
+    "train_model",
 ]

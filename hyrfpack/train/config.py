@@ -110,7 +110,7 @@ class TrainConfig:
         max_gaussians: budget, the most that a run ends with; on the way it is exceeded by `DensityConfig.excess`.
             None chooses from the pictures' pixels, the steps, `target_bytes` and `budget_factor`.
         budget_factor: the budget as a multiple of what pixels and steps suggest, instead of `max_gaussians`. None is 1,
-            but `hyrfpack.train` measures it before a run of at least 2,000 steps on at least eight photos, see
+            but `hyrfpack.train_model` measures it before a run of at least 2,000 steps on at least eight photos, see
             `hyrfpack.train.budget_pilots`.
         target_bytes: the size of the packed file to train for, instead of `max_gaussians`; None for no limit.
         log2_table_size: rows per level of the radiance grid as a power of two (the geometry grid has half);

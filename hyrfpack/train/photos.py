@@ -16,7 +16,7 @@ def photos_of(model: str | os.PathLike[str]) -> Scene | None:
     """Read the photos that the model of a run's folder was trained on, with the same split.
 
     Args:
-        model: the folder that `hyrfpack.train` wrote, or `model.hyrf` in it.
+        model: the folder that `hyrfpack.train_model` wrote, or `model.hyrf` in it.
 
     Returns:
         The photos, or None for a file outside a run's folder, or a run without a record of its photos.

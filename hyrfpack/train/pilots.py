@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import torch
 
 from hyrfpack.data import PictureCache
-from hyrfpack.evaluate import Evaluation, evaluate
+from hyrfpack.evaluate import Evaluation, evaluate_model
 from hyrfpack.scene import Picture, Scene, View, evenly_spaced
 from hyrfpack.train.config import TrainConfig
 from hyrfpack.train.setup import budget_for
@@ -159,7 +159,7 @@ class ScenePilots:
         if self._stop():
             raise PilotsStopped
         count = len(fold.validation)
-        result: Evaluation = evaluate(
+        result: Evaluation = evaluate_model(
             trainer.model,
             fold.validation,
             report=lambda _, share: self._phase(f"{name}: scoring", round(share * count), count),

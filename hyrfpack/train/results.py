@@ -24,12 +24,12 @@ from hyrfpack.atomic import write_atomic
 from hyrfpack.cameras.capture import scene_provenance
 from hyrfpack.device import describe_device
 from hyrfpack.errors import HyrfError, HyrfTrainingError
-from hyrfpack.evaluate import evaluate, picture_names
+from hyrfpack.evaluate import evaluate_model, picture_names
 from hyrfpack.evaluate.figures import draw_training_curve
 from hyrfpack.format.codec import write_model
 from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
 from hyrfpack.model import HybridModel
-from hyrfpack.render import render
+from hyrfpack.render import render_view
 from hyrfpack.scene import Scene, evenly_spaced
 from hyrfpack.train.config import TrainConfig
 from hyrfpack.train.decisions import is_budget_open
@@ -222,9 +222,9 @@ def write_results(
         photos = len(scene.test)
         try:
             # Scores are those of the written file, not of the model in memory.
-            model = hyrf_format.load(out / record.model, device)
+            model = hyrf_format.load_model(out / record.model, device)
             model.precision = config.precision
-            scores = evaluate(
+            scores = evaluate_model(
                 model,
                 scene.test,
                 pictures=out / VIEWS_FOLDER,
@@ -284,7 +284,7 @@ def _drop_unseen_background(trainer: Trainer, phase: Phase) -> HybridModel:
     seen = 0.0
     for done, view in enumerate(views):
         phase("measuring the light from the background", done, len(views))
-        seen = max(seen, float((1 - render(model, view.camera, background=False).alpha).mean()))
+        seen = max(seen, float((1 - render_view(model, view.camera, background=False).alpha).mean()))
     if seen >= MIN_BACKGROUND_LIGHT_SHARE:
         trainer.choices["background"] += f"; up to {seen:.1%} of a view's light comes from it"
         return model

@@ -52,7 +52,7 @@ from hyrfpack.train.results import (
 from hyrfpack.train.setup import check_target
 from hyrfpack.train.trainer import Trainer
 
-__all__ = ["VIEWS_FOLDER", "TrainResult", "is_begun", "resuming", "train"]
+__all__ = ["VIEWS_FOLDER", "TrainResult", "is_begun", "resuming", "train_model"]
 
 # These signals end a run early. Windows has no SIGHUP.
 STOP_SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
@@ -80,7 +80,7 @@ class TrainResult:
     missing: str = ""
 
 
-def train(
+def train_model(
     scene: Scene,
     out: Path | str,
     config: TrainConfig | None = None,
@@ -141,7 +141,7 @@ def train(
     Example:
         >>> import hyrfpack
         >>> scene = hyrfpack.load_scene("photos/bonsai")
-        >>> result = hyrfpack.train(scene, "runs/first", hyrfpack.TrainConfig(steps=10), quiet=True)
+        >>> result = hyrfpack.train_model(scene, "runs/first", hyrfpack.TrainConfig(steps=10), quiet=True)
         >>> result.complete, result.step, result.model.name
         (True, 10, 'model.hyrf')
     """

@@ -25,7 +25,7 @@ from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.ops.ssim import photometric_loss
 from hyrfpack.parallel.pool import keep_freed_memory, torch_on_one_thread
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
-from hyrfpack.render import RenderSettings, render
+from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.scene import Picture, Scene, View
 from hyrfpack.train.checkpoint import load_checkpoint, save_checkpoint
 from hyrfpack.train.config import TrainConfig
@@ -239,7 +239,7 @@ class Trainer:
             solid = self._solid()
             target, mask = self.photos.get(view.name, picture, solid)
         try:
-            rendering = render(
+            rendering = render_view(
                 self.model,
                 view.camera,
                 RenderSettings(exposure=CONSISTENT_EXPOSURE),  # the photo's own gains come after

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from hyrfpack.errors import HyrfDataError
-from hyrfpack.format import describe, find_model
+from hyrfpack.format import describe_file, find_model
 from hyrfpack.splats.names import is_splats, sog_folder
 from hyrfpack.web.player import MODEL_SUFFIX, SPLATS_SUFFIXES, encode_player
 from hyrfpack.web.serve import LOCAL_HOST, serve
@@ -37,7 +37,7 @@ def view(
         _check_readable(path)
     else:
         suffix = MODEL_SUFFIX
-        describe(path)
+        describe_file(path)
     name = f"scene{suffix}"
     page = encode_player(title, content=name, fetches="'self'")
     serve(page, {name: path}, host=host, port=port, open_browser=open_browser, say=say)

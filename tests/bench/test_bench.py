@@ -11,13 +11,13 @@ import torch
 from scenes import ball_points, ball_scene, ring, small_model
 
 import hyrfpack
-from hyrfpack.bench import GROUPS, bench, rendering, subject
+from hyrfpack.bench import GROUPS, benchmark_model, rendering, subject
 from hyrfpack.bench.codec import PROFILE_SETTING_VALUES, codec_rows, parameter_errors
 from hyrfpack.bench.operations import hash_encode_rows, mlp_rows, rasterize_rows
 from hyrfpack.bench.rendering import EXACT_SETTINGS, RENDER_SETTING_VALUES, render_rows
 from hyrfpack.bench.subject import Subject
 from hyrfpack.errors import HyrfError
-from hyrfpack.format import encode_model, save
+from hyrfpack.format import encode_model, save_model
 from hyrfpack.format.arrays import to_arrays
 from hyrfpack.format.codec import PROFILES
 from hyrfpack.format.paper import PaperSettings
@@ -26,7 +26,7 @@ from hyrfpack.model import HybridModel, operation_calls
 from hyrfpack.ops.hash_encode import hash_encode
 from hyrfpack.ops.mlp import mlp
 from hyrfpack.ops.rasterize import rasterize
-from hyrfpack.render import RenderSettings, render
+from hyrfpack.render import RenderSettings, render_view
 
 CAMERAS = ring(3, width=24, height=24)
 DISTORTION = 1e-5
@@ -54,7 +54,7 @@ def by_setting(rows) -> dict[str, dict]:
 
 def pictures(model, settings=RenderSettings()) -> torch.Tensor:  # noqa: B008 - frozen
     with torch.no_grad():
-        return torch.stack([render(model, camera, settings).rgb for camera in CAMERAS])
+        return torch.stack([render_view(model, camera, settings).rgb for camera in CAMERAS])
 
 
 def rms(values) -> float:
@@ -168,7 +168,7 @@ def test_quality_drops_are_differences_of_what_evaluate_scores():
     tested = dataclasses.replace(subject_of(model, photos), cameras=[view.camera for view in views])
     row = by_setting(render_rows(tested, 1, ignore))["background_threshold"]["0.3"]
     exact, cut = (
-        hyrfpack.evaluate(model, views, settings=RenderSettings(background_threshold=tau)) for tau in (0, 0.3)
+        hyrfpack.evaluate_model(model, views, settings=RenderSettings(background_threshold=tau)) for tau in (0, 0.3)
     )
     assert row.psnr == pytest.approx(cut.psnr, abs=1e-4)
     assert abs(row.psnr_drop) > 0.001 and row.psnr_drop == pytest.approx(exact.psnr - cut.psnr, abs=1e-4)
@@ -282,7 +282,7 @@ def test_a_result_that_is_not_finite_stops_the_measurement():
 
 @pytest.mark.parametrize(
     ("measure", "module", "operation"),
-    [(hash_encode_rows, operation_calls, "hash_encode"), (render_rows, rendering, "render")],
+    [(hash_encode_rows, operation_calls, "hash_encode"), (render_rows, rendering, "render_view")],
 )
 def test_time_to_compile_kernels_is_nobodys_time(monkeypatch, measure, module, operation):
     now, compiled, run = [0.0], [], getattr(module, operation)
@@ -303,13 +303,13 @@ def test_time_to_compile_kernels_is_nobodys_time(monkeypatch, measure, module, o
 def test_without_numba_there_is_a_clear_error(monkeypatch):
     monkeypatch.setitem(sys.modules, "numba", None)
     with pytest.raises(HyrfError, match="pip install numba"):
-        bench()
+        benchmark_model()
 
 
 def test_a_file_is_measured_from_an_orbit_and_the_report_survives_json(tmp_path):
-    save(model_of(), tmp_path / "tiny.hyrf")
+    save_model(model_of(), tmp_path / "tiny.hyrf")
     said = []
-    report = bench(tmp_path / "tiny.hyrf", repeats=1, only=["mlp"], say=said.append)
+    report = benchmark_model(tmp_path / "tiny.hyrf", repeats=1, only=["mlp"], say=said.append)
     assert {row.group for row in report.rows} == {"mlp"} and said == ["measuring mlp"]
     assert "60 Gaussians" in report.subject and "6 viewpoints" in report.subject
     assert {"cpu", "cores", "torch"} <= set(report.machine)
@@ -322,13 +322,13 @@ def test_the_built_in_model_brings_its_own_photos(monkeypatch):
     monkeypatch.setattr(subject, "BUILT_IN_PHOTOS", 9)
     monkeypatch.setattr(subject, "BUILT_IN_PHOTO_SIDE_PIXELS", 32)
     said = []
-    report = bench(only=["mlp"], repeats=1, say=said.append)
+    report = benchmark_model(only=["mlp"], repeats=1, say=said.append)
     assert "built-in" in report.subject and "2 held-out photos" in report.subject
     assert "2 steps" in said[0] and "minute" in said[0]
 
 
 def test_coding_a_quantised_model_again_is_remarked(tmp_path):
-    save(model_of(), tmp_path / "tiny.hyrf", "paper")
+    save_model(model_of(), tmp_path / "tiny.hyrf", "paper")
     read = subject.read_subject(tmp_path / "tiny.hyrf", None)
     notes = []
     next(iter(codec_rows(dataclasses.replace(read, cameras=CAMERAS, capture=CAMERAS), 1, notes.append)))
@@ -336,22 +336,28 @@ def test_coding_a_quantised_model_again_is_remarked(tmp_path):
 
 
 def test_a_model_without_gaussians_is_rejected(tmp_path):
-    save(small_model(np.zeros((0, 3))), tmp_path / "empty.hyrf")
+    save_model(small_model(np.zeros((0, 3))), tmp_path / "empty.hyrf")
     with pytest.raises(HyrfError, match="no Gaussians"):
-        bench(tmp_path / "empty.hyrf")
+        benchmark_model(tmp_path / "empty.hyrf")
 
 
 def test_a_scene_without_held_out_photos_is_rejected(tmp_path):
-    save(model_of(), tmp_path / "tiny.hyrf")
+    save_model(model_of(), tmp_path / "tiny.hyrf")
     with pytest.raises(HyrfError, match="balls: no held-out photo"):
-        bench(tmp_path / "tiny.hyrf", ball_scene(views=2))
+        benchmark_model(tmp_path / "tiny.hyrf", ball_scene(views=2))
 
 
 def test_wrong_calls_are_value_errors():
     with pytest.raises(ValueError, match="no group 'nothing'.*rasterize"):
-        bench(only=["nothing"])
+        benchmark_model(only=["nothing"])
     with pytest.raises(ValueError, match="repeats is 0"):
-        bench(repeats=0)
+        benchmark_model(repeats=0)
     with pytest.raises(ValueError, match="without the model"):
-        bench(scene=ball_scene(views=2))
-    assert callable(hyrfpack.bench) and tuple(GROUPS) == ("rasterize", "hash_encode", "mlp", "render", "codec")
+        benchmark_model(scene=ball_scene(views=2))
+    assert callable(hyrfpack.benchmark_model) and tuple(GROUPS) == (
+        "rasterize",
+        "hash_encode",
+        "mlp",
+        "render",
+        "codec",
+    )

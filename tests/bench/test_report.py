@@ -15,7 +15,7 @@ from hyrfpack.bench.figure import build_panels, plot
 from hyrfpack.bench.tables import build_tables, fill_page, format_markdown
 from hyrfpack.cli.bench import GROUPS as CHOICES
 from hyrfpack.errors import HyrfError
-from hyrfpack.format import save
+from hyrfpack.format import save_model
 from hyrfpack.measure.timing import Ratio, Timing
 
 
@@ -46,7 +46,7 @@ def report() -> BenchReport:
 @pytest.fixture(scope="module")
 def model(tmp_path_factory):
     path = tmp_path_factory.mktemp("model") / "tiny.hyrf"
-    save(small_model(ball_points(50)[0], background=True, fields=0.3), path)
+    save_model(small_model(ball_points(50)[0], background=True, fields=0.3), path)
     return path
 
 

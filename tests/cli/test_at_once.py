@@ -25,7 +25,7 @@ from hyrfpack.compress.report import write_report
 from hyrfpack.data import load_scene
 from hyrfpack.demo.run import run_demo
 from hyrfpack.errors import HyrfError
-from hyrfpack.format import CompressionReport, load, repack
+from hyrfpack.format import CompressionReport, load_model, repack
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.make.auto_pose import auto_pose
 from hyrfpack.render.files import render_files
@@ -127,7 +127,7 @@ def test_a_file_that_appears_meanwhile_is_kept_and_the_result_is_beside_it(comma
     )
     assert result.stderr.count(sentence) == 1
     if beside.endswith(".hyrf"):
-        assert len(load(beside))
+        assert len(load_model(beside))
     if "out/" not in beside:
         assert beside in result.stdout and asked not in result.stdout
 
@@ -161,7 +161,7 @@ def test_json_of_render_names_the_pictures_that_were_really_written(world, monke
 
 def test_bench_keeps_files_that_appear_meanwhile_and_fills_the_page_as_it_is_then(world, monkeypatch):
     words = import_module("hyrfpack.bench.tables")
-    measure = import_module("hyrfpack.bench").bench
+    measure = import_module("hyrfpack.bench").benchmark_model
     Path("page.md").write_text(words.empty_page({"machine": "", "codec": ""}))
 
     def edited_meanwhile(*arguments, **options):
@@ -169,7 +169,7 @@ def test_bench_keeps_files_that_appear_meanwhile_and_fills_the_page_as_it_is_the
         Path("out.png").write_bytes(FOREIGN)
         return measure(*arguments, **options)
 
-    monkeypatch.setattr(import_module("hyrfpack.bench"), "bench", edited_meanwhile)
+    monkeypatch.setattr(import_module("hyrfpack.bench"), "benchmark_model", edited_meanwhile)
     options = "--only codec --repeats 1 -o out.png --markdown page.md"
     result = succeeded("bench", "packed.hyrf", *options.split())
 
@@ -232,12 +232,14 @@ def refused_at_last(command: str) -> str:
 
 
 WRITERS = {  # functions of the library that write one file
-    "save": lambda out: hyrfpack.save(load("model.hyrf"), out, overwrite=False),
+    "save": lambda out: hyrfpack.save_model(load_model("model.hyrf"), out, overwrite=False),
     "repack": lambda out: repack("packed.hyrf", out, overwrite=False),
-    "compress": lambda out: hyrfpack.compress("model.hyrf", out, "paper", overwrite=False),
-    "distill": lambda out: hyrfpack.distill("ball.ply", out, hyrfpack.DistillConfig(steps=1, size=16), overwrite=False),
-    "export": lambda out: hyrfpack.export("model.hyrf", out, degree=0, overwrite=False),
-    "compare": lambda out: hyrfpack.compare(["first", "second"], out),
+    "compress": lambda out: hyrfpack.compress_model("model.hyrf", out, "paper", overwrite=False),
+    "distill": lambda out: hyrfpack.import_splats(
+        "ball.ply", out, hyrfpack.DistillConfig(steps=1, size=16), overwrite=False
+    ),
+    "export": lambda out: hyrfpack.export_model("model.hyrf", out, degree=0, overwrite=False),
+    "compare": lambda out: hyrfpack.compare_runs(["first", "second"], out),
 }
 
 
@@ -293,16 +295,16 @@ def test_a_command_is_rejected_where_another_one_is_at_work_and_nothing_changes(
 
 
 CALLS = {  # functions of the library that write into a folder
-    "train": lambda: hyrfpack.train(load_scene("data"), "out", TrainConfig(steps=2), quiet=True),
+    "train": lambda: hyrfpack.train_model(load_scene("data"), "out", TrainConfig(steps=2), quiet=True),
     "estimate_poses": lambda: hyrfpack.estimate_poses("photos", "out"),
-    "evaluate": lambda: hyrfpack.evaluate(load("model.hyrf"), load_scene("data").test, pictures="out"),
-    "export": lambda: hyrfpack.export("model.hyrf", "out"),
-    "export colmap": lambda: hyrfpack.export("model.hyrf", "out", colmap=True),
+    "evaluate": lambda: hyrfpack.evaluate_model(load_model("model.hyrf"), load_scene("data").test, pictures="out"),
+    "export": lambda: hyrfpack.export_model("model.hyrf", "out"),
+    "export colmap": lambda: hyrfpack.export_model("model.hyrf", "out", colmap=True),
     "player": lambda: hyrfpack.export.player(None, "out"),
     "gallery": lambda: hyrfpack.export.gallery(["model.hyrf"], "out"),
-    "make": lambda: hyrfpack.make("packed.hyrf", "out", work="made"),
-    "make work": lambda: hyrfpack.make("packed.hyrf", "new.html", work="out"),
-    "render_files": lambda: list(render_files(load("model.hyrf"), ring_of_two(), "out")),
+    "make": lambda: hyrfpack.make_scene("packed.hyrf", "out", work="made"),
+    "make work": lambda: hyrfpack.make_scene("packed.hyrf", "new.html", work="out"),
+    "render_files": lambda: list(render_files(load_model("model.hyrf"), ring_of_two(), "out")),
     "write_report": lambda: write_report("out", "model.hyrf", "packed.hyrf", CompressionReport("paper", 1, 1, 1, [])),
     "run_demo": lambda: run_demo("out", steps=1),
     "posed": lambda: auto_pose(Path("photos"), Path("out")),
@@ -370,7 +372,7 @@ def test_two_trainings_that_start_at_once_in_one_folder_end_with_one_result_and_
     assert sorted(process.returncode for process in both) == [0, 2], said
     winner = 0 if both[0].returncode == 0 else 1
     assert json.loads(Path("out/metrics.json").read_text())["settings"]["seed"] == winner + 1
-    assert len(load("out/model.hyrf")) and said[winner][0].startswith("out/model.hyrf: ")
+    assert len(load_model("out/model.hyrf")) and said[winner][0].startswith("out/model.hyrf: ")
     (sentence,) = [line for line in said[1 - winner][1].splitlines() if line.startswith("Error: ")]
     assert BUSY in sentence or "the folder holds an earlier run" in sentence
 

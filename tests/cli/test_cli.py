@@ -18,7 +18,7 @@ from PIL import Image
 from hyrfpack.cli.files import DEFAULT_PROFILE, PROFILES
 from hyrfpack.cli.train import PRESETS, train
 from hyrfpack.demo.scene import write_demo_scene
-from hyrfpack.format import load
+from hyrfpack.format import load_model
 from hyrfpack.train import Trainer
 from hyrfpack.train.decisions import decide
 
@@ -137,7 +137,7 @@ def test_compress_keeps_to_a_target_size(run, tmp_path):
 def test_compress_fits_the_quantised_model_to_the_photos_and_keeps_every_gaussian_if_told(run, data, tmp_path):
     arguments = ("compress", run / "model.hyrf", "-o", tmp_path / "p.hyrf", "--data", data, "--json")
     report = json.loads(succeeded(*arguments, "--finetune", 3, "--no-prune").stdout)
-    assert report["gaussians"] == len(load(run / "model.hyrf"))
+    assert report["gaussians"] == len(load_model(run / "model.hyrf"))
     assert report["psnr"] > 12
 
 
@@ -283,11 +283,13 @@ def test_demo_ends_with_a_table_and_a_picture(tmp_path):
     assert [profile.bytes for profile in result.profiles] == [
         (tmp_path / name).stat().st_size for name in ("run/model.hyrf", "paper.hyrf", "compact.hyrf")
     ]
-    assert result.gaussians == len(load(tmp_path / "compact.hyrf"))
+    assert result.gaussians == len(load_model(tmp_path / "compact.hyrf"))
     assert all(
         torch.equal(a, b)
         for a, b in zip(
-            load(tmp_path / "back.hyrf").parameters(), load(tmp_path / "compact.hyrf").parameters(), strict=True
+            load_model(tmp_path / "back.hyrf").parameters(),
+            load_model(tmp_path / "compact.hyrf").parameters(),
+            strict=True,
         )
     )
     json.dumps(result.to_dict(), allow_nan=False)
@@ -433,7 +435,7 @@ def test_a_bug_of_ours_keeps_its_traceback(packed, monkeypatch):
     def broken(path):
         raise ValueError("a bug")
 
-    monkeypatch.setattr("hyrfpack.format.describe", broken)
+    monkeypatch.setattr("hyrfpack.format.describe_file", broken)
     result = hyrfpack("info", packed)
     assert result.exit_code == 1
     assert isinstance(result.exception, ValueError) and result.exc_info[2] is not None

@@ -20,7 +20,7 @@ from scenes import small_model
 from hyrfpack.cli import main
 from hyrfpack.cli.common import format_table, note
 from hyrfpack.cli.files import _command_as_typed
-from hyrfpack.format import describe, save
+from hyrfpack.format import describe_file, save_model
 
 ROOT = Path(__file__).parents[2]
 TINY = ("--steps", 3, "--max-gaussians", 50)
@@ -29,7 +29,7 @@ TINY = ("--steps", 3, "--max-gaussians", 50)
 @pytest.fixture(scope="module")
 def model(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("models") / "model.hyrf"
-    save(small_model([[0.0, 0, 0]]), path, profile="raw")
+    save_model(small_model([[0.0, 0, 0]]), path, profile="raw")
     return path
 
 
@@ -71,9 +71,9 @@ def test_quiet_holds_for_whatever_speaks_and_only_as_long_as_the_command_runs(mo
         print("a library", file=sys.stderr)
         with click.progressbar(range(3), label="a bar", file=sys.stderr) as numbers:
             list(numbers)
-        return describe(path)
+        return describe_file(path)
 
-    monkeypatch.setattr("hyrfpack.format.describe", talkative)
+    monkeypatch.setattr("hyrfpack.format.describe_file", talkative)
     before = sys.stderr
     assert succeeded("info", model, "--quiet").stderr == ""
     assert sys.stderr is before
@@ -139,7 +139,7 @@ def test_the_command_that_a_report_shows_is_without_them(model):
 @pytest.mark.skipif(os.name == "nt", reason="a shell of Unix closes them")
 def test_training_runs_to_its_end_where_standard_error_is_closed(data, tmp_path):
     done = program("2>&-", "train", data, "-o", tmp_path, *TINY)
-    assert done.returncode == 0 and describe(tmp_path / "model.hyrf")["gaussians"] > 0
+    assert done.returncode == 0 and describe_file(tmp_path / "model.hyrf")["gaussians"] > 0
     assert done.stdout.startswith(str(tmp_path / "model.hyrf")) and "step 3/3" not in done.stdout
 
 

@@ -28,7 +28,7 @@ from scenes import ball_scene
 from hyrfpack import format as hyrf_format
 from hyrfpack.data import PictureCache
 from hyrfpack.errors import HyrfError
-from hyrfpack.train import TrainConfig, Trainer, train
+from hyrfpack.train import TrainConfig, Trainer, train_model
 
 resource = pytest.importorskip("resource", reason="limits and mounts are of Unix")
 STEPS = ("--steps", 20, "--max-gaussians", 500)
@@ -225,13 +225,13 @@ def test_disk_that_fills_in_training_keeps_the_checkpoint_and_resumes_to_the_sam
 
     kept = r"checkpoint of step \d+ is kept, the same command with `resume=True` instead of `overwrite=True` continues"
     with pytest.raises(HyrfError, match=rf"model.hyrf: the disk is full.*{kept}") as e:
-        train(balls(fill_from_the_30th), out, CONFIG, overwrite=True, cache=PictureCache(0), quiet=True)
+        train_model(balls(fill_from_the_30th), out, CONFIG, overwrite=True, cache=PictureCache(0), quiet=True)
 
     assert files_in(out).keys() == {"model.hyrf", "checkpoint.pt"} and (out / "model.hyrf").read_bytes() == b"old"
     assert 10 <= int(re.search(r"checkpoint of step (\d+)", str(e.value))[1]) <= 30
     (disk / "ballast").unlink()
-    result = train(balls(), out, CONFIG, resume=True, quiet=True)
-    for name, parameter in hyrf_format.load(result.model).named_parameters():
+    result = train_model(balls(), out, CONFIG, resume=True, quiet=True)
+    for name, parameter in hyrf_format.load_model(result.model).named_parameters():
         np.testing.assert_array_equal(parameter.detach(), dict(whole.model.named_parameters())[name].detach())
 
 
@@ -261,9 +261,9 @@ def test_folder_removed_while_training_is_made_again_for_the_model(tmp_path):
     out = tmp_path / "run"
     scene = balls(lambda count: shutil.rmtree(out, ignore_errors=True) if count >= 20 else None)
 
-    result = train(scene, out, CONFIG, cache=PictureCache(0), quiet=True)
+    result = train_model(scene, out, CONFIG, cache=PictureCache(0), quiet=True)
 
-    assert result.complete and hyrf_format.load(out / "model.hyrf") is not None
+    assert result.complete and hyrf_format.load_model(out / "model.hyrf") is not None
     assert json.loads((out / "metrics.json").read_text())["settings"]["seed"] == 1
 
 
@@ -293,6 +293,6 @@ def test_log_on_a_full_disk_does_not_end_the_training(monkeypatch, tmp_path):
     monkeypatch.setattr("hyrfpack.train.progress.LOG_INTERVAL_SECONDS", 0.0)
     monkeypatch.setattr("sys.stderr", FullLog())
 
-    result = train(balls(), tmp_path, dataclasses.replace(CONFIG, steps=2))
+    result = train_model(balls(), tmp_path, dataclasses.replace(CONFIG, steps=2))
 
     assert result.complete and FullLog.written >= 2

@@ -334,7 +334,7 @@ def _replace_work(patch: pytest.MonkeyPatch) -> None:
     def begin(*arguments: object, **options: object) -> None:
         raise HyrfError(WORK_BEGAN, fix=WORK_ENDS)
 
-    patch.setattr(import_module("hyrfpack.bench"), "bench", begin)
+    patch.setattr(import_module("hyrfpack.bench"), "benchmark_model", begin)
     patch.setattr(import_module("hyrfpack.demo.run"), "run_demo", begin)
 
 

@@ -22,7 +22,7 @@ from scenes import ring, small_model
 from hyrfpack.cameras.capture import provenance_cameras
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.cli import main
-from hyrfpack.format import save
+from hyrfpack.format import save_model
 from hyrfpack.splats.files import read_splats
 
 POSITIONS = np.random.default_rng(0).uniform(-0.6, 0.6, (40, 3))
@@ -33,7 +33,7 @@ def model(tmp_path_factory):
     """Forty Gaussians before a background sphere, and four cameras around them."""
     path, cameras = tmp_path_factory.mktemp("models") / "model.hyrf", ring(4)
     kept = {"cameras": provenance_cameras(cameras), "viewpoint": Viewpoint.from_cameras(cameras).to_json()}
-    save(small_model(POSITIONS, fields=2.0, background=True), path, provenance=kept)
+    save_model(small_model(POSITIONS, fields=2.0, background=True), path, provenance=kept)
     return path
 
 
@@ -60,7 +60,7 @@ def test_the_report_is_one_json_object(model, tmp_path):
 
 def test_identical_pictures_are_json_too(tmp_path):
     provenance = {"cameras": provenance_cameras(ring(1))}
-    save(small_model([[0, 0, 0]], opacity_logits=-80.0), tmp_path / "unseen.hyrf", provenance=provenance)
+    save_model(small_model([[0, 0, 0]], opacity_logits=-80.0), tmp_path / "unseen.hyrf", provenance=provenance)
     report = json.loads(succeeded("export", tmp_path / "unseen.hyrf", "-o", tmp_path / "a.ply", "--json").stdout)
     assert report["psnr"] == report["psnr_baked"] == report["chosen_by"]["3"] == 100
 
@@ -77,7 +77,7 @@ def test_both_exposures_are_printed_and_the_one_in_the_file_is_marked(data, tmp_
     mapped, cameras = small_model(POSITIONS), ring(4)
     mapped.exposure = random_map(0, centers=4)
     kept = {"cameras": provenance_cameras(cameras), "viewpoint": Viewpoint.from_cameras(cameras).to_json()}
-    save(mapped, tmp_path / "mapped.hyrf", provenance=kept)
+    save_model(mapped, tmp_path / "mapped.hyrf", provenance=kept)
     arguments = ("export", tmp_path / "mapped.hyrf", "-o", tmp_path / "a.ply", "--overwrite", "--sh-degree", 1)
     printed = succeeded(*arguments, "--exposure", "consistent").stdout
     report = json.loads(succeeded(*arguments, "--json").stdout)

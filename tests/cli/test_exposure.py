@@ -15,10 +15,10 @@ from PIL import Image
 from hyrfpack import format as hyrf_format
 from hyrfpack.cli.make import _print_result as print_result
 from hyrfpack.data import load_scene
-from hyrfpack.format import load
+from hyrfpack.format import load_model
 from hyrfpack.format.codec import load_with_provenance
 from hyrfpack.make import MakeResult
-from hyrfpack.render import render
+from hyrfpack.render import render_view
 from hyrfpack.render.files import to_image
 
 BOTH = ("as-photographed", "consistent")
@@ -38,7 +38,7 @@ def mapped(run, tmp_path_factory) -> Path:
     model, provenance = load_with_provenance(run / "model.hyrf")
     model.exposure = random_map(3, centers=6)
     path = tmp_path_factory.mktemp("mapped") / "mapped.hyrf"
-    hyrf_format.save(model, path, provenance=provenance)
+    hyrf_format.save_model(model, path, provenance=provenance)
     return path
 
 
@@ -57,10 +57,10 @@ def test_render_writes_views_as_photographed_and_with_exposure_consistent_those_
     run, mapped, data, tmp_path
 ):
     views = load_scene(data).test
-    for exposure, model in (("as-photographed", load(mapped)), ("consistent", load(run / "model.hyrf"))):
+    for exposure, model in (("as-photographed", load_model(mapped)), ("consistent", load_model(run / "model.hyrf"))):
         out = tmp_path / exposure
         succeeded("render", mapped, "-o", out, "--data", data, "--exposure", exposure)
-        expected = [np.asarray(to_image(render(model, view.camera).rgb)) for view in views]
+        expected = [np.asarray(to_image(render_view(model, view.camera).rgb)) for view in views]
         np.testing.assert_array_equal(pictures(out), expected)
     succeeded("render", mapped, "-o", tmp_path / "default", "--data", data)
     np.testing.assert_array_equal(pictures(tmp_path / "default"), pictures(tmp_path / "as-photographed"))
@@ -107,11 +107,11 @@ def test_train_and_info_of_its_run_print_the_score_at_one_exposure_where_the_mod
     data, tmp_path, monkeypatch
 ):
     def with_map(*arguments):
-        model = load(*arguments)
+        model = load_model(*arguments)
         model.exposure = random_map(3, centers=6)
         return model
 
-    monkeypatch.setattr(hyrf_format, "load", with_map)  # stands for a run that learnt gains
+    monkeypatch.setattr(hyrf_format, "load_model", with_map)  # stands for a run that learnt gains
     printed = succeeded("train", data, "-o", tmp_path / "run", "--steps", 3, "--max-gaussians", 60).stdout
     monkeypatch.undo()
     scores = json.loads((tmp_path / "run" / "metrics.json").read_text())["evaluation"]

@@ -19,7 +19,7 @@ SENTENCE = "another coordinate frame; name the photos and poses that it was trai
 @pytest.fixture
 def model(data, tmp_path) -> Path:
     """A file that says that it was trained on the set of the fixture `data`."""
-    hyrfpack.save(
+    hyrfpack.save_model(
         small_model([[0.0, 0.0, 0.0]]), tmp_path / "model.hyrf", provenance=scene_provenance(hyrfpack.load_scene(data))
     )
     return tmp_path / "model.hyrf"

@@ -11,7 +11,7 @@ from commands import hyrfpack, refused, succeeded
 from scenes import small_model
 
 from hyrfpack.compress import plan
-from hyrfpack.format import describe, load
+from hyrfpack.format import describe_file, load_model
 from hyrfpack.format.arrays import to_arrays
 from hyrfpack.format.container import read_container
 from tools.safety.synthetic_encoding import encode
@@ -56,12 +56,12 @@ def end_of(path: Path, type: str) -> int:
 
 def first_layers(path: Path, count: int) -> int:
     """How many Gaussians they have."""
-    return sum(describe(path)["layers"][:count])
+    return sum(describe_file(path)["layers"][:count])
 
 
 def assert_first_of(part: Path, whole: Path, count: int) -> None:
     """The model in `part` has the first Gaussians of the one in `whole`, and all else of it."""
-    got, expected = to_arrays(load(part)), to_arrays(load(whole))
+    got, expected = to_arrays(load_model(part)), to_arrays(load_model(whole))
     for group in ("POSI", "COLO", "SCAL", "OPAC"):
         expected[group] = expected[group][:count]
     assert all(np.array_equal(got[group], expected[group]) for group in expected)
@@ -78,7 +78,7 @@ def test_decompress_unpacks_a_fraction(whole, tmp_path):
     count = first_layers(whole, 2)
     assert report["profile"] == "raw" and report["gaussians"] == count < first_layers(whole, 8) == 600
     assert_first_of(tmp_path / "back.hyrf", whole, count)
-    facts = describe(tmp_path / "back.hyrf")
+    facts = describe_file(tmp_path / "back.hyrf")
     assert (facts["layers"], facts["provenance"]) == ([], PROVENANCE)
 
 

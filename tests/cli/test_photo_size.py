@@ -10,7 +10,7 @@ from commands import hyrfpack, succeeded
 from PIL import Image
 
 from hyrfpack.cameras.capture import Capture
-from hyrfpack.format import describe
+from hyrfpack.format import describe_file
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +25,7 @@ def test_a_model_says_at_which_size_it_was_trained(shrunk_run, tmp_path):
     packed = tmp_path / "packed.hyrf"
     succeeded("compress", shrunk_run / "model.hyrf", "-o", packed, "--profile", "paper")
     for file in (shrunk_run / "model.hyrf", packed):
-        assert describe(file)["provenance"]["max_size"] == 24
+        assert describe_file(file)["provenance"]["max_size"] == 24
     metrics = json.loads((shrunk_run / "metrics.json").read_text())
     assert metrics["scene"]["max_size"] == 24
     assert any("shrunk from up to 48 x 48 to 24 pixels" in note for note in metrics["notes"])
@@ -66,13 +66,13 @@ def test_every_command_with_photos_reads_them_at_the_models_size(shrunk_run, dat
 def test_small_photos_leave_no_word_of_their_size(data, tmp_path):
     """A model of them is the same, byte for byte, as without a limit."""
     succeeded("train", data, "-o", tmp_path, "--steps", 2, "--max-gaussians", 50)
-    assert "max_size" not in describe(tmp_path / "model.hyrf")["provenance"]
+    assert "max_size" not in describe_file(tmp_path / "model.hyrf")["provenance"]
     assert json.loads((tmp_path / "metrics.json").read_text())["scene"]["max_size"] == 1600
 
 
 def test_photos_kept_as_they_are_leave_a_word(data, tmp_path):
     succeeded("train", data, "-o", tmp_path, "--steps", 2, "--max-gaussians", 50, "--max-size", 0)
-    assert describe(tmp_path / "model.hyrf")["provenance"]["max_size"] == 0
+    assert describe_file(tmp_path / "model.hyrf")["provenance"]["max_size"] == 0
 
 
 @pytest.mark.parametrize("stored", [None, -1, True, 1.5, "800", [800], {}])

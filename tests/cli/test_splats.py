@@ -17,7 +17,7 @@ from scenes import ring, small_model
 from hyrfpack.cameras.capture import provenance_cameras
 from hyrfpack.cameras.files import cameras_to_json
 from hyrfpack.cameras.paths import Viewpoint
-from hyrfpack.format import save
+from hyrfpack.format import save_model
 from hyrfpack.splats.files import READABLE_ENDINGS
 from hyrfpack.splats.formats import sog
 from hyrfpack.splats.formats.hints import NO_HINTS
@@ -98,7 +98,7 @@ def test_an_exported_file_scores_what_the_export_said(data, tmp_path):
     cameras = ring(4)
     positions = np.random.default_rng(0).uniform(-0.6, 0.6, (40, 3))
     kept = {"cameras": provenance_cameras(cameras), "viewpoint": Viewpoint.from_cameras(cameras).to_json()}
-    save(small_model(positions, fields=2.0, background=True), tmp_path / "model.hyrf", provenance=kept)
+    save_model(small_model(positions, fields=2.0, background=True), tmp_path / "model.hyrf", provenance=kept)
     export = ("export", tmp_path / "model.hyrf", "-o", tmp_path / "a.ply", "--data", data, "--sh-degree", 1, "--json")
     told = json.loads(succeeded(*export).stdout)
     scored = {

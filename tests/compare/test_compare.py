@@ -35,7 +35,7 @@ def scene(**options) -> Scene:
 
 
 def trained(folder: Path, of: Scene | None = None, **settings) -> Path:
-    hyrfpack.train(of or scene(), folder, TrainConfig(steps=12, max_gaussians=60, **settings), quiet=True)
+    hyrfpack.train_model(of or scene(), folder, TrainConfig(steps=12, max_gaussians=60, **settings), quiet=True)
     return folder
 
 
@@ -103,7 +103,7 @@ class Page(HTMLParser):
 
 def test_the_page_has_the_numbers_of_all_runs_and_only_the_settings_that_differ(runs, tmp_path):
     (runs[1] / "small.hyrf").write_bytes(b"x" * 1234)
-    report = hyrfpack.compare(runs, tmp_path / "page.html")
+    report = hyrfpack.compare_runs(runs, tmp_path / "page.html")
     page, (a, b) = Page(tmp_path / "page.html"), map(metrics, runs)
     assert page.rows["held-out PSNR (dB)"] == [f"{run['evaluation']['psnr']:.2f}" for run in (a, b)]
     assert page.rows["held-out SSIM"] == [f"{run['evaluation']['ssim']:.4f}" for run in (a, b)]
@@ -125,32 +125,32 @@ def test_the_best_score_stands_out_unless_scores_cannot_be_compared(runs, tmp_pa
     for run, psnr in zip(runs, (20.0, 21.0), strict=True):
         scores = {"psnr": psnr, "ssim": 0.8 - psnr / 100}
         changed(run, lambda values, scores=scores: values["evaluation"].update(scores))
-    hyrfpack.compare(runs, tmp_path / "page.html")
+    hyrfpack.compare_runs(runs, tmp_path / "page.html")
     text = (tmp_path / "page.html").read_text()
     assert '<td class="best">21.00</td>' in text and '<td class="best">0.6000</td>' in text
     assert best(Page(tmp_path / "page.html")) == ["td", "td"]
     repaint(runs[1] / "views" / "000.png")
-    hyrfpack.compare(runs, tmp_path / "page.html", overwrite=True)
+    hyrfpack.compare_runs(runs, tmp_path / "page.html", overwrite=True)
     assert best(Page(tmp_path / "page.html")) == []
 
 
 def test_scores_at_a_predicted_exposure_of_runs_of_earlier_versions_are_left_out(runs, tmp_path):
     for run in runs:
         changed(run, lambda values: values["evaluation"].update(psnr_predicted=12.34, ssim_predicted="none"))
-    hyrfpack.compare(runs, tmp_path / "page.html")
+    hyrfpack.compare_runs(runs, tmp_path / "page.html")
     page = Page(tmp_path / "page.html")
     assert "12.34" not in page.words and not [name for name in page.rows if "predicted" in name]
 
 
 def test_views_are_the_photo_and_each_render_with_their_scores(runs, tmp_path):
-    hyrfpack.compare(runs, tmp_path / "page.html")
+    hyrfpack.compare_runs(runs, tmp_path / "page.html")
     page = Page(tmp_path / "page.html")
     assert page.given["runs"] == ["a", "b"] and [view["name"] for view in page.given["views"]] == ["000.png", "001.png"]
     held_out = scene().test[1]
     times = 400 // 24  # small pictures are enlarged so many times
     assert (page.picture(1, 0)[::times, ::times] == held_out.load().rgb).all()
     for number, run in enumerate(runs):
-        drawn = hyrfpack.render(hyrfpack.load(run / "model.hyrf"), held_out.camera).rgb.clamp(0, 1)
+        drawn = hyrfpack.render_view(hyrfpack.load_model(run / "model.hyrf"), held_out.camera).rgb.clamp(0, 1)
         assert (page.picture(1, 1 + number)[::times, ::times] == (drawn * 255).round().numpy()).all()
         score = metrics(run)["evaluation"]["views"][1]
         assert page.given["views"][1]["scores"][number] == [score["psnr"], score["ssim"], None]
@@ -158,26 +158,26 @@ def test_views_are_the_photo_and_each_render_with_their_scores(runs, tmp_path):
 
 def test_only_views_that_all_runs_have_pictures_of_are_shown(runs, tmp_path):
     (runs[1] / "views" / "000.png").unlink()
-    assert hyrfpack.compare(runs, tmp_path / "page.html").views == ["001.png"]
+    assert hyrfpack.compare_runs(runs, tmp_path / "page.html").views == ["001.png"]
     shutil.rmtree(runs[0] / "views")
-    assert hyrfpack.compare(runs, tmp_path / "bare.html").views == []
+    assert hyrfpack.compare_runs(runs, tmp_path / "bare.html").views == []
     assert 'id="views"' not in (tmp_path / "bare.html").read_text()
 
 
 def test_a_curve_knows_its_seconds_and_one_of_an_earlier_version_is_said_to_have_none(runs, tmp_path):
     first = metrics(runs[0])["curve"]
     assert [record.seconds for record in read_run(runs[0]).curve] == [record["seconds"] for record in first]
-    hyrfpack.compare(runs, tmp_path / "page.html")
+    hyrfpack.compare_runs(runs, tmp_path / "page.html")
     assert "spread evenly" not in Page(tmp_path / "page.html").words
     changed(runs[1], lambda values: [record.pop("seconds") for record in values["curve"]])
-    hyrfpack.compare(runs, tmp_path / "page.html", overwrite=True)
+    hyrfpack.compare_runs(runs, tmp_path / "page.html", overwrite=True)
     assert "No times of single steps were kept of b" in Page(tmp_path / "page.html").words
 
 
 def test_the_same_runs_give_the_same_bytes_and_a_page_fetches_nothing(runs, tmp_path):
     pages = [tmp_path / "one.html", tmp_path / "two.html"]
     for page in pages:
-        hyrfpack.compare(runs, page)
+        hyrfpack.compare_runs(runs, page)
     text = pages[0].read_text()
     assert text == pages[1].read_text()
     assert "default-src 'none'" in text and "unsafe" not in text
@@ -187,7 +187,7 @@ def test_the_same_runs_give_the_same_bytes_and_a_page_fetches_nothing(runs, tmp_
 
 
 def test_nothing_out_of_files_is_taken_for_html(runs, tmp_path):
-    plain = [name for name, _ in Page(Path(hyrfpack.compare(runs, tmp_path / "plain.html").file)).tags]
+    plain = [name for name, _ in Page(Path(hyrfpack.compare_runs(runs, tmp_path / "plain.html").file)).tags]
     hostile = runs[1].rename(tmp_path / HOSTILE.replace("/", ":"))
     for run in (runs[0], hostile):
         (run / "views" / "000.png").rename(run / "views" / f"{HOSTILE.replace('/', '_')}.png")
@@ -201,7 +201,7 @@ def test_nothing_out_of_files_is_taken_for_html(runs, tmp_path):
 
         changed(run, poison)
     (hostile / f"{HOSTILE.replace('/', '_')}.hyrf").write_bytes(b"")
-    hyrfpack.compare([runs[0], hostile], tmp_path / "page.html")
+    hyrfpack.compare_runs([runs[0], hostile], tmp_path / "page.html")
     page = Page(tmp_path / "page.html")
     assert {name for name, _ in page.tags} == set(plain)
     assert [name for name, _ in page.tags].count("script") == plain.count("script") == 2
@@ -221,7 +221,7 @@ def repaint(sheet: Path) -> None:
 
 def test_other_photos_of_the_same_names_are_said_and_not_shown(runs, originals, tmp_path):
     repaint(runs[1] / "views" / "001.png")
-    report = hyrfpack.compare(runs, tmp_path / "page.html")
+    report = hyrfpack.compare_runs(runs, tmp_path / "page.html")
     (sentence,) = report.doubts
     assert "'001.png' for one" in sentence and sentence in Page(tmp_path / "page.html").words
     assert report.views == ["000.png"]
@@ -229,7 +229,7 @@ def test_other_photos_of_the_same_names_are_said_and_not_shown(runs, originals, 
 
 def test_other_cameras_are_said(runs, originals, tmp_path):
     shutil.rmtree(runs[0] / "views")
-    report = hyrfpack.compare([runs[0], originals / "far"], tmp_path / "page.html")
+    report = hyrfpack.compare_runs([runs[0], originals / "far"], tmp_path / "page.html")
     assert len(report.doubts) == 1 and "trained from different cameras" in report.doubts[0]
 
 
@@ -237,7 +237,7 @@ def test_other_cameras_are_said(runs, originals, tmp_path):
 def test_runs_without_held_out_photos_are_compared_by_the_rest(which, runs, tmp_path):
     for number in which:
         changed(runs[number], lambda values: values.pop("evaluation"))
-    report = hyrfpack.compare(runs, tmp_path / "page.html")
+    report = hyrfpack.compare_runs(runs, tmp_path / "page.html")
     page = Page(tmp_path / "page.html")
     assert report.views == [] and len(report.doubts) == 1 and "o photo is held out of" in report.doubts[0]
     assert ("held-out PSNR (dB)" in page.rows) == (len(which) == 1)
@@ -247,7 +247,7 @@ def test_runs_without_held_out_photos_are_compared_by_the_rest(which, runs, tmp_
 def test_other_held_out_photos_are_rejected(runs, tmp_path):
     changed(runs[1], lambda values: values["evaluation"]["views"].pop())
     with pytest.raises(HyrfError, match=r"held out of 'b' \(1\) than of 'a' \(2; '001.png' of one of them alone\)"):
-        hyrfpack.compare(runs, tmp_path / "page.html")
+        hyrfpack.compare_runs(runs, tmp_path / "page.html")
     assert not (tmp_path / "page.html").exists()
 
 
@@ -307,7 +307,7 @@ def test_what_is_no_finished_run_is_rejected_with_what_to_do(runs, tmp_path):
     assert "there is no model.hyrf" in refused("compare", *runs, "-o", page)
     assert not page.exists()
     with pytest.raises(TypeError, match="give a list"):
-        hyrfpack.compare(str(runs[0]), page)
+        hyrfpack.compare_runs(str(runs[0]), page)
 
 
 def test_the_command_says_what_it_wrote_and_what_is_doubtful(runs, tmp_path):

@@ -12,13 +12,13 @@ from exposures import maps_equal, random_map
 from scenes import ball_points, ball_scene, small_model, view_of
 
 from hyrfpack.choices import CONSISTENT_EXPOSURE
-from hyrfpack.compress import compress
+from hyrfpack.compress import compress_model
 from hyrfpack.errors import HyrfError
-from hyrfpack.evaluate import evaluate
-from hyrfpack.format import describe, load, save
+from hyrfpack.evaluate import evaluate_model
+from hyrfpack.format import describe_file, load_model, save_model
 from hyrfpack.format.min_file_size import min_file_bytes
 from hyrfpack.model import ExposureMap, HybridModel
-from hyrfpack.render import RenderSettings, render
+from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.scene import Picture, Scene
 
 LOG_GAIN = 2.0  # of every viewpoint; 0.5 is shown as 0.88
@@ -43,7 +43,7 @@ def scene(model) -> Scene:
     """Photos that show what the model's renders as photographed show, and noise of about 33 dB."""
     rng, views = np.random.default_rng(0), []
     for view in ball_scene(8).train:
-        rgb = 255 * render(model, view.camera).rgb.numpy() + rng.normal(0, 6, (32, 32, 3))
+        rgb = 255 * render_view(model, view.camera).rgb.numpy() + rng.normal(0, 6, (32, 32, 3))
         views.append(view_of(view.name, view.camera, Picture(rgb.round().clip(0, 255).astype(np.uint8))))
     return dataclasses.replace(ball_scene(8), train=views[1:], test=views[:1])
 
@@ -51,7 +51,7 @@ def scene(model) -> Scene:
 @pytest.fixture(scope="module")
 def source(model, tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("source") / "model.hyrf"
-    save(model, path)
+    save_model(model, path)
     return path
 
 
@@ -71,21 +71,23 @@ def source(model, tmp_path_factory) -> Path:
 )
 def test_a_packed_file_keeps_the_map(options, source, scene, tmp_path):
     data = None if "profile" in options else scene
-    report = compress(source, tmp_path / "small.hyrf", data=data, **options)
+    report = compress_model(source, tmp_path / "small.hyrf", data=data, **options)
 
-    assert maps_equal(load(tmp_path / "small.hyrf").exposure, bright())
-    assert describe(tmp_path / "small.hyrf")["version"] == "1.2"
+    assert maps_equal(load_model(tmp_path / "small.hyrf").exposure, bright())
+    assert describe_file(tmp_path / "small.hyrf")["version"] == "1.2"
     assert "EXPO" in {section.type for section in report.sections}
 
 
 def test_the_error_is_measured_on_renders_as_photographed(model, source, scene, tmp_path):
-    report = compress(source, tmp_path / "small.hyrf", data=scene, distortion=3e-5)
+    report = compress_model(source, tmp_path / "small.hyrf", data=scene, distortion=3e-5)
 
-    packed, errors = load(tmp_path / "small.hyrf"), {}
+    packed, errors = load_model(tmp_path / "small.hyrf"), {}
     for exposure in ("as-photographed", CONSISTENT_EXPOSURE):
         settings = RenderSettings(exposure=exposure)
         differences = [
-            (render(model, view.camera, settings).rgb - render(packed, view.camera, settings).rgb).square().mean()
+            (render_view(model, view.camera, settings).rgb - render_view(packed, view.camera, settings).rgb)
+            .square()
+            .mean()
             for view in scene.train
         ]
         errors[exposure] = float(torch.stack(differences).mean())
@@ -96,18 +98,18 @@ def test_the_error_is_measured_on_renders_as_photographed(model, source, scene, 
 
 
 def test_fine_tuning_fits_renders_as_photographed_and_leaves_the_exposure_to_the_map(model, source, scene, tmp_path):
-    compress(source, tmp_path / "tuned.hyrf", data=scene, finetune_steps=40)
+    compress_model(source, tmp_path / "tuned.hyrf", data=scene, finetune_steps=40)
 
-    tuned = load(tmp_path / "tuned.hyrf")
-    assert evaluate(tuned, scene.train).psnr > 28
+    tuned = load_model(tmp_path / "tuned.hyrf")
+    assert evaluate_model(tuned, scene.train).psnr > 28
     consistent = RenderSettings(exposure=CONSISTENT_EXPOSURE)
     for view in scene.test:
-        shown, expected = (render(each, view.camera, consistent).rgb.mean() for each in (tuned, model))
+        shown, expected = (render_view(each, view.camera, consistent).rgb.mean() for each in (tuned, model))
         assert float(shown) == pytest.approx(float(expected), abs=0.02)
 
 
 def test_a_target_size_below_the_smallest_file_with_a_map_is_refused(source, tmp_path):
     assert min_file_bytes(exposure=bright()) > min_file_bytes() + 84
     with pytest.raises(HyrfError, match=f"about {min_file_bytes(exposure=bright()):,} bytes"):
-        compress(source, tmp_path / "small.hyrf", target_bytes=min_file_bytes() + 1)
+        compress_model(source, tmp_path / "small.hyrf", target_bytes=min_file_bytes() + 1)
     assert not (tmp_path / "small.hyrf").exists()

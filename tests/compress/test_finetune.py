@@ -15,7 +15,7 @@ from hyrfpack.compress.quantize import decide, quantize
 from hyrfpack.compress.sensitivity import Sensitivity, measure_sensitivity
 from hyrfpack.data import PictureCache
 from hyrfpack.errors import HyrfTrainingError
-from hyrfpack.evaluate import evaluate
+from hyrfpack.evaluate import evaluate_model
 from hyrfpack.format import decode_model, encode_model
 from hyrfpack.format.compact.plan import Plan
 from hyrfpack.model import HybridModel
@@ -55,7 +55,7 @@ def decoded(tuned: HybridModel, plan: Plan, sensitivity: Sensitivity, reach: int
 
 def test_fine_tuning_is_worth_more_than_the_same_bytes_of_finer_steps(trained, plan, sensitivity, scene):
     finer = encode_model(trained, "compact", quantized=decide(trained, sensitivity, DISTORTION / 3))
-    without = evaluate(decode_model(finer), scene.train).psnr
+    without = evaluate_model(decode_model(finer), scene.train).psnr
     steps = []
 
     tuned, moved = finetune(
@@ -63,7 +63,7 @@ def test_fine_tuning_is_worth_more_than_the_same_bytes_of_finer_steps(trained, p
     )
 
     model, size = decoded(tuned, moved, sensitivity)
-    after = evaluate(model, scene.train).psnr
+    after = evaluate_model(model, scene.train).psnr
     assert size < len(finer)
     assert after > without + 0.5
     assert [step for step, _ in steps] == list(range(1, 151))

@@ -14,15 +14,15 @@ from scenes import ball_points, small_model
 
 import hyrfpack
 from hyrfpack.cameras.capture import MAX_COARSE_CAMERAS, quantized_provenance
-from hyrfpack.compress import compress
+from hyrfpack.compress import compress_model
 from hyrfpack.compress import packer as running
 from hyrfpack.compress.distortion import default_distortion
 from hyrfpack.errors import HyrfError
-from hyrfpack.evaluate import evaluate
-from hyrfpack.format import describe, load, save
-from hyrfpack.render import render
+from hyrfpack.evaluate import evaluate_model
+from hyrfpack.format import describe_file, load_model, save_model
+from hyrfpack.render import render_view
 from hyrfpack.scene import Scene
-from hyrfpack.train import TrainConfig, train
+from hyrfpack.train import TrainConfig, train_model
 
 SIZES = Path(__file__).parents[1] / "golden" / "trained_sizes.json"
 
@@ -35,39 +35,39 @@ def scene(data) -> Scene:
 @pytest.fixture(scope="module")
 def trained(scene, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("runs") / "small"
-    return train(scene, folder, TrainConfig(steps=250, max_gaussians=1500), quiet=True).model
+    return train_model(scene, folder, TrainConfig(steps=250, max_gaussians=1500), quiet=True).model
 
 
 @pytest.fixture(scope="module")
 def paper(trained, tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("packed") / "paper.hyrf"
-    compress(trained, path, "paper")
+    compress_model(trained, path, "paper")
     return path
 
 
 @pytest.fixture(scope="module")
 def compact(trained, scene, tmp_path_factory) -> tuple[Path, object]:
     path = tmp_path_factory.mktemp("packed") / "compact.hyrf"
-    return path, compress(trained, path, data=scene)
+    return path, compress_model(trained, path, data=scene)
 
 
 @pytest.fixture(scope="module")
 def tuned(trained, scene, tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("packed") / "tuned.hyrf"
-    compress(trained, path, data=scene, finetune_steps=60)
+    compress_model(trained, path, data=scene, finetune_steps=60)
     return path
 
 
 def psnr(path: Path, scene: Scene) -> float:
-    return evaluate(load(path), scene.test).psnr
+    return evaluate_model(load_model(path), scene.test).psnr
 
 
 def squared_error(first: Path, second: Path, cameras) -> float:
     """Between pictures of two files, mean over all."""
     with torch.no_grad():
         pictures = [
-            torch.cat([render(model, camera).rgb.flatten() for camera in cameras])
-            for model in (load(first), load(second))
+            torch.cat([render_view(model, camera).rgb.flatten() for camera in cameras])
+            for model in (load_model(first), load_model(second))
         ]
     return float((pictures[0] - pictures[1]).double().square().mean())
 
@@ -87,7 +87,7 @@ def test_with_a_limit_on_the_loss_it_loses_no_more_than_the_paper_profile_and_is
 ):
     allowed = max(psnr(trained, scene) - psnr(paper, scene), 0.0) + 0.02
 
-    report = compress(trained, tmp_path / "small.hyrf", data=scene, max_psnr_drop=allowed)
+    report = compress_model(trained, tmp_path / "small.hyrf", data=scene, max_psnr_drop=allowed)
 
     assert psnr(trained, scene) - psnr(tmp_path / "small.hyrf", scene) <= allowed + 1e-6
     assert report.bytes_after < 0.7 * paper.stat().st_size
@@ -97,9 +97,9 @@ def test_with_a_limit_on_the_loss_it_loses_no_more_than_the_paper_profile_and_is
 def test_the_report_is_of_the_file_and_its_estimate_of_the_pictures(trained, compact, scene):
     path, report = compact
 
-    assert report.profile == "compact" == describe(path)["profile"]
+    assert report.profile == "compact" == describe_file(path)["profile"]
     assert report.bytes_after == path.stat().st_size
-    assert report.gaussians == len(load(path))
+    assert report.gaussians == len(load_model(path))
     assert sum(report.shares.values()) == pytest.approx(1) and min(report.shares.values()) >= 0
     assert set(report.shares) == {"pruned", "POSI", "COLO", "SCAL", "OPAC", "GTAB", "GMLP", "RTAB", "RMLP"}
     measured = squared_error(trained, path, [view.camera for view in scene.train])
@@ -110,7 +110,7 @@ def test_the_distortion_that_is_asked_for_is_about_what_pictures_get(trained, sc
     cameras = [view.camera for view in scene.train]
     sizes, errors = [], []
     for distortion in (1e-4, 1e-5, 1e-6):
-        report = compress(trained, tmp_path / "small.hyrf", data=scene, distortion=distortion)
+        report = compress_model(trained, tmp_path / "small.hyrf", data=scene, distortion=distortion)
         errors.append(squared_error(trained, tmp_path / "small.hyrf", cameras))
         sizes.append(report.bytes_after)
         assert distortion / 1.75 < errors[-1] < 1.75 * distortion
@@ -122,23 +122,23 @@ def test_the_distortion_that_is_asked_for_is_about_what_pictures_get(trained, sc
 def test_a_target_size_is_met_and_nearly_used_up(share, trained, compact, scene, tmp_path):
     target = int(share * compact[1].bytes_after)
 
-    report = compress(trained, tmp_path / "small.hyrf", data=scene, target_bytes=target)
+    report = compress_model(trained, tmp_path / "small.hyrf", data=scene, target_bytes=target)
 
     assert 0.9 * target < (tmp_path / "small.hyrf").stat().st_size <= target
     assert f"of {target:,} bytes" in report.found
 
 
 def test_fine_tuning_fits_the_photos_better_in_the_same_bytes(trained, tuned, scene, tmp_path):
-    compress(trained, tmp_path / "plain.hyrf", data=scene, target_bytes=tuned.stat().st_size)
+    compress_model(trained, tmp_path / "plain.hyrf", data=scene, target_bytes=tuned.stat().st_size)
 
-    fits = [evaluate(load(path), scene.train).psnr for path in (tuned, tmp_path / "plain.hyrf")]
+    fits = [evaluate_model(load_model(path), scene.train).psnr for path in (tuned, tmp_path / "plain.hyrf")]
     assert fits[0] > fits[1] + 0.1
 
 
 def test_what_is_trained_measured_fine_tuned_and_exported_keeps_its_size(trained, paper, compact, tuned, tmp_path):
     """On the real way from photos on; where a change is meant to change sizes, what it says here is recorded anew."""
     exported = tmp_path / "small.spz"
-    hyrfpack.export(compact[0], exported, degree=1)
+    hyrfpack.export_model(compact[0], exported, degree=1)
     files = {"raw": trained, "paper": paper, "compact": compact[0], "fine-tuned": tuned, "exported": exported}
 
     sizes = {name: path.stat().st_size for name, path in files.items()}
@@ -149,14 +149,14 @@ def test_what_is_trained_measured_fine_tuned_and_exported_keeps_its_size(trained
 def test_any_number_of_threads_measures_and_writes_the_same(trained, compact, scene, tmp_path, monkeypatch):
     for threads in ("1", "3"):
         monkeypatch.setenv("HYRFPACK_THREADS", threads)
-        compress(trained, tmp_path / "small.hyrf", data=scene)
+        compress_model(trained, tmp_path / "small.hyrf", data=scene)
 
         assert (tmp_path / "small.hyrf").read_bytes() == compact[0].read_bytes()
 
 
 @pytest.mark.parametrize("limit", [{"target_bytes": 9000}, {"max_psnr_drop": 0.3}], ids=["size", "loss"])
 def test_fine_tuning_keeps_to_limits(limit, trained, scene, tmp_path):
-    report = compress(trained, tmp_path / "small.hyrf", data=scene, finetune_steps=20, **limit)
+    report = compress_model(trained, tmp_path / "small.hyrf", data=scene, finetune_steps=20, **limit)
 
     if "target_bytes" in limit:
         assert 0.6 * 9000 < report.bytes_after <= 9000
@@ -165,14 +165,14 @@ def test_fine_tuning_keeps_to_limits(limit, trained, scene, tmp_path):
 
 
 def test_pruning_leaves_out_gaussians_and_bytes_and_not_pruning_keeps_all(trained, scene, tmp_path):
-    model = load(trained)
+    model = load_model(trained)
     every = len(model)
     with torch.no_grad():
         model.gaussians.opacity_logits[: every // 3] -= 20  # hardly to be seen
-    save(model, tmp_path / "some.hyrf")
+    save_model(model, tmp_path / "some.hyrf")
 
-    kept = compress(tmp_path / "some.hyrf", tmp_path / "all.hyrf", data=scene, distortion=1e-4, prune=False)
-    pruned = compress(tmp_path / "some.hyrf", tmp_path / "fewer.hyrf", data=scene, distortion=1e-4)
+    kept = compress_model(tmp_path / "some.hyrf", tmp_path / "all.hyrf", data=scene, distortion=1e-4, prune=False)
+    pruned = compress_model(tmp_path / "some.hyrf", tmp_path / "fewer.hyrf", data=scene, distortion=1e-4)
 
     assert kept.gaussians == every > every - every // 3 >= pruned.gaussians > every / 4
     assert pruned.bytes_after < kept.bytes_after
@@ -248,7 +248,7 @@ def test_photos_that_cannot_be_read_do_not_end_the_work(monkeypatch):
     def fail(shown, views, report):
         raise HyrfError("a.png: the file is gone", fix="copy it again")
 
-    monkeypatch.setattr(running, "evaluate", fail)
+    monkeypatch.setattr(running, "evaluate_model", fail)
     assert (
         packer.encode_to_distortion(1e-3, SimpleNamespace(measure_error=lambda distortion: distortion), 0.1).data
         == 1e-3
@@ -259,43 +259,43 @@ def test_photos_that_cannot_be_read_do_not_end_the_work(monkeypatch):
 def test_without_photos_it_looks_from_the_cameras_that_the_file_keeps(trained, scene, tmp_path):
     """They are those of the photos, to nine digits."""
     said = []
-    wanted = default_distortion(hyrfpack.describe(trained)["provenance"])
+    wanted = default_distortion(hyrfpack.describe_file(trained)["provenance"])
 
-    report = compress(trained, tmp_path / "small.hyrf", say=said.append)
-    beside = compress(trained, tmp_path / "beside.hyrf", data=scene, distortion=wanted)
+    report = compress_model(trained, tmp_path / "small.hyrf", say=said.append)
+    beside = compress_model(trained, tmp_path / "beside.hyrf", data=scene, distortion=wanted)
 
     assert f"at {len(scene.train)} cameras" in said[0]
     assert report.bytes_after == pytest.approx(beside.bytes_after, rel=0.02)
 
 
 def test_without_photos_and_cameras_it_goes_around_the_scene(trained, compact, scene, tmp_path):
-    provenance = describe(trained)["provenance"]
+    provenance = describe_file(trained)["provenance"]
     del provenance["cameras"]
-    save(load(trained), tmp_path / "bare.hyrf", "raw", provenance)
+    save_model(load_model(trained), tmp_path / "bare.hyrf", "raw", provenance)
 
-    report = compress(tmp_path / "bare.hyrf", tmp_path / "small.hyrf")
+    report = compress_model(tmp_path / "bare.hyrf", tmp_path / "small.hyrf")
 
     assert report.bytes_after < 2 * compact[1].bytes_after
     assert psnr(tmp_path / "small.hyrf", scene) > psnr(trained, scene) - 1
 
 
 def test_provenance_goes_along_with_some_cameras(trained, compact, paper):
-    before, after = describe(trained)["provenance"], describe(compact[0])["provenance"]
+    before, after = describe_file(trained)["provenance"], describe_file(compact[0])["provenance"]
 
     assert (
         after
-        == describe(paper)["provenance"]
-        == quantized_provenance(before, describe(trained)["config"]["frame"]["scale"])
+        == describe_file(paper)["provenance"]
+        == quantized_provenance(before, describe_file(trained)["config"]["frame"]["scale"])
     )
     assert 0 < len(after["coarse_cameras"]) <= MAX_COARSE_CAMERAS and "cameras" in before and "cameras" not in after
 
 
 def test_a_compressed_file_can_be_compressed_again_and_unpacked_exactly(paper, compact, scene, tmp_path):
-    from_paper = compress(paper, tmp_path / "small.hyrf", data=scene)
-    compress(compact[0], tmp_path / "back.hyrf", "raw")
+    from_paper = compress_model(paper, tmp_path / "small.hyrf", data=scene)
+    compress_model(compact[0], tmp_path / "back.hyrf", "raw")
 
     assert from_paper.bytes_after < paper.stat().st_size
-    pairs = zip(load(compact[0]).parameters(), load(tmp_path / "back.hyrf").parameters(), strict=True)
+    pairs = zip(load_model(compact[0]).parameters(), load_model(tmp_path / "back.hyrf").parameters(), strict=True)
     assert all(torch.equal(a, b) for a, b in pairs)
 
 
@@ -309,9 +309,9 @@ def test_by_itself_it_aims_at_a_tenth_of_a_dB(told, expected):
 
 
 def test_the_old_word_for_distortion_is_taken_with_a_warning(trained, tmp_path):
-    compress(trained, tmp_path / "new.hyrf", distortion=1e-4)
+    compress_model(trained, tmp_path / "new.hyrf", distortion=1e-4)
     with pytest.warns(DeprecationWarning, match="distortion"):
-        compress(trained, tmp_path / "old.hyrf", noise=1e-4)
+        compress_model(trained, tmp_path / "old.hyrf", noise=1e-4)
 
     assert (tmp_path / "old.hyrf").read_bytes() == (tmp_path / "new.hyrf").read_bytes()
 
@@ -334,7 +334,7 @@ def test_the_old_word_for_distortion_is_taken_with_a_warning(trained, tmp_path):
 )
 def test_options_that_do_not_go_together_are_refused_and_nothing_is_written(options, words, trained, tmp_path):
     with pytest.raises(HyrfError, match=words):
-        compress(trained, tmp_path / "small.hyrf", **options)
+        compress_model(trained, tmp_path / "small.hyrf", **options)
 
     assert not list(tmp_path.iterdir())
 
@@ -347,10 +347,10 @@ def test_a_loss_that_even_the_finest_file_exceeds_is_refused(trained, scene, tmp
         return dataclasses.replace(scored(model, views, **options), psnr=30.0 - worse_each_time.calls)
 
     worse_each_time.calls = 0
-    monkeypatch.setattr(running, "evaluate", worse_each_time)
+    monkeypatch.setattr(running, "evaluate_model", worse_each_time)
 
     with pytest.raises(HyrfError, match="even the finest file loses more than 0.5 dB of PSNR"):
-        compress(trained, tmp_path / "small.hyrf", data=scene, max_psnr_drop=0.5)
+        compress_model(trained, tmp_path / "small.hyrf", data=scene, max_psnr_drop=0.5)
 
     assert not list(tmp_path.iterdir())
 
@@ -361,15 +361,15 @@ def test_photos_that_are_all_held_out_are_refused_or_measured_on(options, traine
     held_out = dataclasses.replace(scene, train=[], test=scene.train)
 
     with pytest.raises(HyrfError):
-        compress(trained, tmp_path / "small.hyrf", data=held_out, **options)
+        compress_model(trained, tmp_path / "small.hyrf", data=held_out, **options)
 
 
 def test_a_model_that_nobody_sees_is_compressed_all_the_same(tmp_path, scene):
     """All Gaussians lie behind the cameras, and there is no background: every slope is zero."""
     positions = ball_points(30)[0] * 0.1 + np.array([0.0, 0.0, 500.0])
-    save(small_model(positions), tmp_path / "behind.hyrf", "raw")
+    save_model(small_model(positions), tmp_path / "behind.hyrf", "raw")
 
-    report = compress(tmp_path / "behind.hyrf", tmp_path / "small.hyrf", data=scene)
+    report = compress_model(tmp_path / "behind.hyrf", tmp_path / "small.hyrf", data=scene)
 
     assert report.bytes_after < (tmp_path / "behind.hyrf").stat().st_size
-    assert all(torch.isfinite(parameter).all() for parameter in load(tmp_path / "small.hyrf").parameters())
+    assert all(torch.isfinite(parameter).all() for parameter in load_model(tmp_path / "small.hyrf").parameters())

@@ -14,13 +14,13 @@ from PIL import Image
 from scenes import ball_points, ball_scene, ring, small_model
 
 from hyrfpack.cameras.capture import provenance_cameras
-from hyrfpack.compress import compress
+from hyrfpack.compress import compress_model
 from hyrfpack.compress.calibrate import measure_calibrated_sensitivity
 from hyrfpack.compress.report import amplification, write_report
 from hyrfpack.compress.report_page import size_in_words
 from hyrfpack.errors import HyrfError
-from hyrfpack.evaluate import evaluate
-from hyrfpack.format import CompressionReport, load, save
+from hyrfpack.evaluate import evaluate_model
+from hyrfpack.format import CompressionReport, load_model, save_model
 from hyrfpack.scene import Scene
 
 MARKUP = "<script>alert(1)</script>&amp;.png"
@@ -90,7 +90,7 @@ def source(scene, tmp_path_factory) -> Path:
     model = small_model(positions, color_logits=torch.from_numpy(colors) * 4 - 2, scale_logits=-2.5, fields=0.2)
     folder = tmp_path_factory.mktemp("<img src=x onerror=alert(1)>")
     path = folder / "model.hyrf"
-    save(model, path, provenance={"cameras": provenance_cameras([view.camera for view in scene.train])})
+    save_model(model, path, provenance={"cameras": provenance_cameras([view.camera for view in scene.train])})
     return path
 
 
@@ -99,7 +99,7 @@ def reported(
 ) -> tuple[Path, CompressionReport, Page]:
     """Compress and write a page about it: the packed file, the report and the page."""
     packed = folder / "packed.hyrf"
-    report = compress(source, packed, profile, data=scene, **options)
+    report = compress_model(source, packed, profile, data=scene, **options)
     return (
         packed,
         report,
@@ -170,7 +170,7 @@ def test_page_appears_only_after_its_pictures(source, tmp_path, monkeypatch):
 
 def test_headline_tells_the_bytes_on_disk_and_the_psnr_lost_on_held_out_photos(with_photos, source, scene):
     packed, report, page = with_photos
-    lost = evaluate(load(source), scene.test).psnr - evaluate(load(packed), scene.test).psnr
+    lost = evaluate_model(load_model(source), scene.test).psnr - evaluate_model(load_model(packed), scene.test).psnr
     ratio = report.bytes_before / packed.stat().st_size
     size = f"{packed.stat().st_size / 1000:.3g} kB"
     words = f"{abs(lost):.2f} dB {'lost' if lost > 0 else 'gained'}" if abs(lost) >= 0.005 else "less than 0.01 dB lost"
@@ -238,7 +238,7 @@ def test_difference_pictures_are_amplified_as_the_page_says(with_photos):
 
 def test_views_go_from_the_one_that_loses_most_to_the_one_that_loses_least(with_photos, source, scene):
     packed, _, page = with_photos
-    old, new = (evaluate(load(path), scene.test).views for path in (source, packed))
+    old, new = (evaluate_model(load_model(path), scene.test).views for path in (source, packed))
     lost = {before.name: before.psnr - after.psnr for before, after in zip(old, new, strict=True)}
     expected = sorted(lost, key=lost.get, reverse=True)
     captions = [text for text in page.texts["figcaption"] if "against the photo" in text]
@@ -265,7 +265,9 @@ def test_a_raw_file_has_lost_nothing(source, tmp_path):
 
 
 def test_a_model_without_gaussians_has_a_page_without_a_curve(tmp_path):
-    save(small_model(np.zeros((0, 3))), tmp_path / "empty.hyrf", provenance={"cameras": provenance_cameras(ring(2))})
+    save_model(
+        small_model(np.zeros((0, 3))), tmp_path / "empty.hyrf", provenance={"cameras": provenance_cameras(ring(2))}
+    )
     _, _, page = reported(tmp_path / "empty.hyrf", tmp_path, "paper")
     assert sorted(row[0] for row in page.tables[1][1:]) == ["raw", "this file"]
 
@@ -275,7 +277,7 @@ def test_a_model_that_half_precision_cannot_hold_has_a_page_without_paper(tmp_pa
     model = small_model(positions)
     with torch.no_grad():
         model.gaussians.positions[0, 0] = 1e5
-    save(model, tmp_path / "far.hyrf", provenance={"cameras": provenance_cameras(ring(2))})
+    save_model(model, tmp_path / "far.hyrf", provenance={"cameras": provenance_cameras(ring(2))})
     _, _, page = reported(tmp_path / "far.hyrf", tmp_path, distortion=1e-4)
     assert "paper" not in [row[0] for row in page.tables[1]]
 

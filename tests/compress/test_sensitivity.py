@@ -14,7 +14,7 @@ from hyrfpack.format import decode_model, encode_model
 from hyrfpack.format.arrays import SECTION_PARAMETERS
 from hyrfpack.model import HybridModel
 from hyrfpack.ops.contraction import contract, expand
-from hyrfpack.render import render
+from hyrfpack.render import render_view
 from hyrfpack.scene import Camera
 
 CAMERAS = ring(48, elevation=1.2, width=16, height=16)
@@ -34,7 +34,7 @@ def looked_at_from(cameras: list[Camera]) -> list[Camera]:
 @torch.no_grad()
 def pictures(model: HybridModel, views: list[Camera]) -> np.ndarray:
     decoded = model.decode()
-    return np.concatenate([render(model, view, decoded=decoded).rgb.double().numpy().ravel() for view in views])
+    return np.concatenate([render_view(model, view, decoded=decoded).rgb.double().numpy().ravel() for view in views])
 
 
 def slope(model: HybridModel, views: list[Camera], parameter: torch.Tensor, place: int, step: float) -> float:

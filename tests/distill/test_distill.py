@@ -22,7 +22,7 @@ from hyrfpack.splats.viewpoints import WeightedSplats, sample_viewpoints
 def test_report_says_what_is_in_the_file(tmp_path: Path) -> None:
     splats, target = ball_splats(200), tmp_path / "ball.hyrf"
     report = distill_splats(splats, target, TINY_DISTILL_CONFIG)
-    model = hyrfpack.load(target)
+    model = hyrfpack.load_model(target)
     weighted = WeightedSplats.from_splats(splats, "ball")
     original = Drawable.from_splats(splats, weighted.frame)
     held_out = sample_viewpoints(weighted, original, TINY_DISTILL_CONFIG.test_views, TINY_DISTILL_CONFIG.size, 1)
@@ -31,7 +31,7 @@ def test_report_says_what_is_in_the_file(tmp_path: Path) -> None:
     assert (report.gaussians_before, report.gaussians_after) == (200, len(model))
     assert report.bytes_after == target.stat().st_size
     assert report.bytes_ply == 200 * 4 * (3 + 3 + 3 + 9 + 1 + 3 + 4)
-    assert hyrfpack.describe(target)["profile"] == "compact"
+    assert hyrfpack.describe_file(target)["profile"] == "compact"
 
 
 def test_more_steps_bring_the_pictures_nearer(tmp_path: Path) -> None:
@@ -51,7 +51,7 @@ def test_same_splats_and_seed_give_the_same_bytes(tmp_path: Path) -> None:
 
 def test_the_largest_seed_is_as_good_as_any(tmp_path: Path) -> None:
     report = distill_splats(ball_splats(40), tmp_path / "x.hyrf", replace(TINY_DISTILL_CONFIG, seed=2**64 - 1, steps=2))
-    assert hyrfpack.describe(tmp_path / "x.hyrf")["provenance"]["seed"] == 2**64 - 1 and report.psnr > 10
+    assert hyrfpack.describe_file(tmp_path / "x.hyrf")["provenance"]["seed"] == 2**64 - 1 and report.psnr > 10
 
 
 @pytest.mark.parametrize("unit, offset", [(1, 1e6), (1e-6, 0)])
@@ -60,7 +60,7 @@ def test_neither_origin_nor_unit_matters(tmp_path: Path, unit: float, offset: fl
     moved = replace(splats, positions=splats.positions * unit + offset, scales=splats.scales * np.float32(unit))
     here, there = (distill_splats(some, tmp_path / "x.hyrf", TINY_DISTILL_CONFIG) for some in (splats, moved))
     assert abs(here.psnr_unpacked - there.psnr_unpacked) < 0.05
-    frame = hyrfpack.load(tmp_path / "x.hyrf").config.frame
+    frame = hyrfpack.load_model(tmp_path / "x.hyrf").config.frame
     np.testing.assert_allclose(
         frame.to_local(moved.positions),
         WeightedSplats.from_splats(splats, "").frame.to_local(splats.positions),
@@ -70,7 +70,7 @@ def test_neither_origin_nor_unit_matters(tmp_path: Path, unit: float, offset: fl
 
 def test_model_of_degree_0_has_no_colours_by_direction(tmp_path: Path) -> None:
     distill_splats(ball_splats(100, degree=0), tmp_path / "x.hyrf", TINY_DISTILL_CONFIG)
-    assert {s["type"]: s["after"] for s in hyrfpack.describe(tmp_path / "x.hyrf")["sections"]}["RTAB"] < 32
+    assert {s["type"]: s["after"] for s in hyrfpack.describe_file(tmp_path / "x.hyrf")["sections"]}["RTAB"] < 32
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter
 from torch import nn
 
 from hyrfpack.errors import HyrfError
-from hyrfpack.evaluate import evaluate
+from hyrfpack.evaluate import evaluate_model
 from hyrfpack.evaluate.figures import (
     ERROR_LIMIT,
     draw_comparison,
@@ -235,7 +235,7 @@ def test_lpips_names_a_missing_file(tmp_path):
 
 def test_scores_are_those_of_the_saved_pictures(tmp_path):
     model, scene = ball_model(), ball_scene(views=3)
-    scores = evaluate(model, scene.train)
+    scores = evaluate_model(model, scene.train)
     paths = list(render_files(model, [(view.name, view.camera) for view in scene.train], tmp_path))
     for path, view, score in zip(paths, scene.train, scores.views, strict=True):
         saved, photo = np.asarray(Image.open(path)), view.load().rgb
@@ -249,7 +249,7 @@ def test_scores_are_those_of_the_saved_pictures(tmp_path):
 
 
 def test_scores_are_strict_json_with_a_reason_for_missing_lpips():
-    scores = evaluate(ball_model(), ball_scene(views=2).train)
+    scores = evaluate_model(ball_model(), ball_scene(views=2).train)
     values = json.loads(json.dumps(scores.to_dict(), allow_nan=False))
     assert {"psnr", "ssim", "lpips", "gaussians", "views", "seconds_per_frame"} <= set(values)
     assert values["lpips"] is None and "lpips" in values["lpips_reason"]
@@ -258,7 +258,7 @@ def test_scores_are_strict_json_with_a_reason_for_missing_lpips():
 
 def test_lpips_is_the_mean_over_views_when_there_are_weights(tmp_path):
     torch.save(lpips_network("alex").state_dict(), tmp_path / "weights.pt")
-    scores = evaluate(ball_model(), ball_scene(views=2).train, lpips_weights=tmp_path / "weights.pt")
+    scores = evaluate_model(ball_model(), ball_scene(views=2).train, lpips_weights=tmp_path / "weights.pt")
     assert scores.lpips == pytest.approx(np.mean([score.lpips for score in scores.views]))
     assert scores.lpips > 0 and scores.lpips_reason == "network alex"
 
@@ -267,7 +267,7 @@ def test_transparent_photos_are_laid_over_the_models_solid_colour():
     model = small_model(np.zeros((0, 3)), solid=(0.2, 0.6, 1.0))
     clear = Picture(np.full((32, 32, 3), 99, np.uint8), np.zeros((32, 32), np.uint8))
     view = dataclasses.replace(ball_scene(views=1).train[0], load=lambda: clear)
-    assert evaluate(model, [view]).psnr == IDENTICAL_PSNR
+    assert evaluate_model(model, [view]).psnr == IDENTICAL_PSNR
 
 
 def masked(view: View, mask: np.ndarray) -> View:
@@ -277,20 +277,20 @@ def masked(view: View, mask: np.ndarray) -> View:
 
 def test_views_without_a_usable_pixel_are_named_and_left_out():
     first, second = ball_scene(views=2).train
-    scores = evaluate(ball_model(), [masked(first, np.zeros((32, 32), bool)), second])
+    scores = evaluate_model(ball_model(), [masked(first, np.zeros((32, 32), bool)), second])
     assert scores.skipped == [first.name]
     assert [score.name for score in scores.views] == [second.name]
     with pytest.raises(HyrfError, match="masks"):
-        evaluate(ball_model(), [masked(first, np.zeros((32, 32), bool))])
+        evaluate_model(ball_model(), [masked(first, np.zeros((32, 32), bool))])
 
 
 def test_no_view_is_an_error_of_the_users():
     with pytest.raises(HyrfError, match="no view to score"):
-        evaluate(ball_model(), [])
+        evaluate_model(ball_model(), [])
 
 
 def test_pictures_are_written_for_some_views_spread_over_all(tmp_path):
-    evaluate(ball_model(), ball_scene(views=7).train, pictures=tmp_path / "new" / "folder", picture_count=3)
+    evaluate_model(ball_model(), ball_scene(views=7).train, pictures=tmp_path / "new" / "folder", picture_count=3)
     assert [path.name for path in sorted((tmp_path / "new" / "folder").iterdir())] == ["000.png", "003.png", "006.png"]
 
 

@@ -10,12 +10,12 @@ import torch
 from exposures import random_map
 from scenes import ball_points, ball_scene, small_model
 
-from hyrfpack.evaluate import evaluate
+from hyrfpack.evaluate import evaluate_model
 from hyrfpack.evaluate.exposure import correct_colors, fit_gains
 from hyrfpack.evaluate.metrics import IDENTICAL_PSNR, psnr, ssim, to_8bit
 from hyrfpack.model import HybridModel
 from hyrfpack.model.exposure import apply_exposure_gains
-from hyrfpack.render import RenderSettings, render
+from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.scene import Picture, View
 
 GAINS = np.array([0.8, 1.0, 1.3])
@@ -101,11 +101,11 @@ def mapped(plain) -> HybridModel:
 def test_psnr_is_of_renders_as_photographed_and_psnr_consistent_of_those_at_one_exposure(plain, mapped):
     views = ball_scene(4).train
 
-    scores = evaluate(mapped, views)
+    scores = evaluate_model(mapped, views)
 
     for view, score in zip(views, scores.views, strict=True):
         photo = view.load().rgb / 255
-        image = render(plain, view.camera).rgb.detach()
+        image = render_view(plain, view.camera).rgb.detach()
         gains = mapped.exposure.predict_gains(plain.config.frame.local_pose(view.camera))
         assert np.abs(np.log(gains)).max() > 0.1
         for told, drawn in ((score.psnr, gains), (score.psnr_consistent, np.ones(3))):
@@ -120,38 +120,38 @@ def test_the_scores_are_of_the_very_pictures_that_render_shows_at_each_exposure(
     photos = [torch.from_numpy(view.load().rgb) / 255 for view in views]
 
     for exposure, model in (("as-photographed", mapped), ("consistent", plain)):
-        scores = evaluate(mapped, views, settings=RenderSettings(exposure=exposure))
-        images = [to_8bit(render(mapped, view.camera, RenderSettings(exposure=exposure)).rgb) for view in views]
+        scores = evaluate_model(mapped, views, settings=RenderSettings(exposure=exposure))
+        images = [to_8bit(render_view(mapped, view.camera, RenderSettings(exposure=exposure)).rgb) for view in views]
         pairs = list(zip(images, photos, strict=True))
         assert [score.psnr for score in scores.views] == pytest.approx([psnr(*pair) for pair in pairs], abs=1e-6)
         assert [score.ssim for score in scores.views] == pytest.approx([ssim(*pair) for pair in pairs], abs=1e-6)
-        assert scores.psnr_consistent == evaluate(plain, views).psnr
+        assert scores.psnr_consistent == evaluate_model(plain, views).psnr
         for image, view in zip(images, views, strict=True):
-            assert torch.equal(image, to_8bit(render(model, view.camera).rgb))
+            assert torch.equal(image, to_8bit(render_view(model, view.camera).rgb))
 
 
 def test_a_map_of_the_photos_gains_scores_what_the_model_without_it_scores_on_unexposed_photos(plain, mapped):
     cameras = [view.camera for view in ball_scene(4).train]
     unexposed, exposed = [], []
     for number, camera in enumerate(cameras):
-        image = render(plain, camera).rgb.detach()
+        image = render_view(plain, camera).rgb.detach()
         gains = mapped.exposure.predict_gains(plain.config.frame.local_pose(camera))
         for views, by in ((unexposed, np.ones(3)), (exposed, gains)):
             pixels = (255 * exposed_by_formula(image, by)).round().astype(np.uint8)
             views.append(View(str(number), camera, lambda pixels=pixels: Picture(pixels)))
 
-    scores = evaluate(mapped, exposed)
+    scores = evaluate_model(mapped, exposed)
 
-    assert evaluate(plain, unexposed).psnr == IDENTICAL_PSNR
+    assert evaluate_model(plain, unexposed).psnr == IDENTICAL_PSNR
     assert scores.psnr > 70  # a few values round to the other of two levels
-    assert scores.psnr_consistent == evaluate(plain, exposed).psnr < 35
+    assert scores.psnr_consistent == evaluate_model(plain, exposed).psnr < 35
 
 
 def test_without_an_exposure_map_nothing_is_said_of_one_exposure_and_both_exposures_score_alike(plain):
     views = ball_scene(2).train
 
-    scores = evaluate(plain, views)
+    scores = evaluate_model(plain, views)
 
     assert scores.psnr_consistent is None and {score.psnr_consistent for score in scores.views} == {None}
-    consistent = evaluate(plain, views, settings=RenderSettings(exposure="consistent"))
+    consistent = evaluate_model(plain, views, settings=RenderSettings(exposure="consistent"))
     assert (scores.psnr, scores.ssim) == (consistent.psnr, consistent.ssim)

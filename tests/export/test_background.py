@@ -9,7 +9,7 @@ from hyrfpack.errors import HyrfError
 from hyrfpack.export.background import background_picture, background_splats, cell_centers, find_cells
 from hyrfpack.export.bake import bake
 from hyrfpack.model import BACKGROUND_RADIUS, Frame
-from hyrfpack.render import RenderSettings, render
+from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.scene import Camera
 from hyrfpack.splats.draw import Drawable, draw
 from hyrfpack.splats.splats import concatenate
@@ -47,7 +47,7 @@ def test_baked_splats_and_background_look_like_the_model():
     cameras = [camera_at(4 * c.position + frame.center, frame.center, width=48, height=48) for c in ring(6)]
     whole = Drawable.from_splats(concatenate((bake(model, cameras)[3], background_splats(model, cameras))), frame)
     with torch.no_grad():
-        errors = [(draw(whole, camera).rgb - render(model, camera).rgb).square().mean() for camera in cameras]
+        errors = [(draw(whole, camera).rgb - render_view(model, camera).rgb).square().mean() for camera in cameras]
     assert math.sqrt(sum(errors) / len(errors)) < 0.02
 
 
@@ -94,7 +94,7 @@ def test_the_picture_looks_along_z_in_the_middle_up_at_the_top_and_along_x_to_th
     camera = Camera(3, 3, 1.0, 1.0, 1.5, 1.5, pose)  # rays at 45 degrees
     with torch.no_grad():
         model.gaussians.opacity_logits.fill_(-30)
-        seen = render(model, camera, RenderSettings(background_stride=1)).rgb.numpy()
+        seen = render_view(model, camera, RenderSettings(background_stride=1)).rgb.numpy()
     assert np.allclose(picture[127:129, 255:257].mean((0, 1)), seen[1, 1], atol=5e-3)
     assert np.allclose(picture[127:129, 319:321].mean((0, 1)), seen[1, 2], atol=5e-3)
     assert np.allclose(picture[63:65, 255:257].mean((0, 1)), seen[0, 1], atol=5e-3)

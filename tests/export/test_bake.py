@@ -10,7 +10,7 @@ from scenes import camera_at, ring, small_model
 from hyrfpack.errors import HyrfError
 from hyrfpack.export.bake import bake
 from hyrfpack.model import Frame
-from hyrfpack.render import RenderSettings, render
+from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.splats.draw import Drawable, draw
 from hyrfpack.splats.harmonics import SH_C0, harmonics_basis
 
@@ -27,7 +27,7 @@ def error(model, splats, cameras, how=ALL, truth=None) -> float:
     """Root mean square of what the pictures differ by."""
     drawable = Drawable.from_splats(splats, model.config.frame)
     with torch.no_grad():
-        pairs = [(draw(drawable, c, how).rgb, render(truth or model, c).rgb) for c in cameras]
+        pairs = [(draw(drawable, c, how).rgb, render_view(truth or model, c).rgb) for c in cameras]
     return float(torch.stack([(a - b).square().mean() for a, b in pairs]).mean().sqrt())
 
 

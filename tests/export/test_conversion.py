@@ -39,7 +39,7 @@ def test_every_pair_of_formats_keeps_places_and_looks(before, after, tmp_path):
     if FORMATS[after].package:
         pytest.importorskip(FORMATS[after].package[0])
     source, target = written(tmp_path, before, ball_splats(COUNT)), tmp_path / f"after{after}"
-    report = hyrfpack.convert(source, target)
+    report = hyrfpack.convert_splats(source, target)
     kept, back = FORMATS[before].decode(source.read_bytes(), "it"), FORMATS[after].decode(target.read_bytes(), "it")
     assert (report.bytes_before, report.bytes_after) == (source.stat().st_size, target.stat().st_size)
     assert report.gaussians_before == report.gaussians_after == len(back) == COUNT
@@ -53,7 +53,7 @@ def test_every_pair_of_formats_keeps_places_and_looks(before, after, tmp_path):
 
 
 def test_a_format_that_holds_all_loses_nothing(tmp_path):
-    report = hyrfpack.convert(written(tmp_path, ".ply", ball_splats(COUNT)), tmp_path / "after.usdc")
+    report = hyrfpack.convert_splats(written(tmp_path, ".ply", ball_splats(COUNT)), tmp_path / "after.usdc")
     assert report.psnr == report.psnr_worst == 100
 
 
@@ -62,16 +62,16 @@ def test_a_loose_sog_is_bundled_and_all_its_bytes_are_counted(tmp_path):
     folder.mkdir()
     for name, data in sog.encode_files(ball_splats(COUNT)).items():
         (folder / name).write_bytes(data)
-    report = hyrfpack.convert(folder, tmp_path / "bundled.sog")
+    report = hyrfpack.convert_splats(folder, tmp_path / "bundled.sog")
     assert report.bytes_before == sum(path.stat().st_size for path in folder.iterdir())
-    assert hyrfpack.convert(folder / "meta.json", tmp_path / "again.sog").bytes_before == report.bytes_before
+    assert hyrfpack.convert_splats(folder / "meta.json", tmp_path / "again.sog").bytes_before == report.bytes_before
 
 
 def test_choices_leave_out_gaussians_and_harmonics(tmp_path):
     splats = ball_splats(COUNT, degree=2)
     source = written(tmp_path, ".ply", splats)
     box = (-9, -9, -9, 9, 9, 0)
-    report = hyrfpack.convert(source, tmp_path / "a.ply", degree=1, crop=box, min_opacity=0.6)
+    report = hyrfpack.convert_splats(source, tmp_path / "a.ply", degree=1, crop=box, min_opacity=0.6)
     back = read_splats(tmp_path / "a.ply")
     assert len(back) == ((splats.positions[:, 2] <= 0) & (splats.opacities >= 0.6)).sum()
     assert (report.gaussians_before, report.gaussians_after) == (COUNT, len(back))
@@ -80,21 +80,23 @@ def test_choices_leave_out_gaussians_and_harmonics(tmp_path):
 
 def test_a_crop_alone_is_no_loss_and_what_is_left_out_by_opacity_is(tmp_path):
     source = written(tmp_path, ".ply", ball_splats(COUNT))
-    cropped = hyrfpack.convert(source, tmp_path / "a.ply", crop=(-9, -9, -9, 9, 9, 0))
-    thinned = hyrfpack.convert(source, tmp_path / "b.ply", min_opacity=0.6)
+    cropped = hyrfpack.convert_splats(source, tmp_path / "a.ply", crop=(-9, -9, -9, 9, 9, 0))
+    thinned = hyrfpack.convert_splats(source, tmp_path / "b.ply", min_opacity=0.6)
     assert cropped.psnr == 100 and thinned.psnr < 40
 
 
 def test_what_the_format_cannot_hold_is_told(tmp_path):
     told: list[str] = []
-    hyrfpack.convert(written(tmp_path, ".ply", ball_splats(COUNT, degree=3)), tmp_path / "a.splat", say=told.append)
+    hyrfpack.convert_splats(
+        written(tmp_path, ".ply", ball_splats(COUNT, degree=3)), tmp_path / "a.splat", say=told.append
+    )
     assert told == [".splat holds no harmonics above degree 0; those of degree 3 are lost"]
 
 
 def test_progress_is_reported_in_order(tmp_path):
     told: list[tuple[str, float]] = []
     source = written(tmp_path, ".ply", ball_splats(COUNT))
-    hyrfpack.convert(source, tmp_path / "a.spz", report=lambda *said: told.append(said))
+    hyrfpack.convert_splats(source, tmp_path / "a.spz", report=lambda *said: told.append(said))
     shares = [share for _, share in told]
     assert shares == sorted(shares) and 0 <= shares[0] and shares[-1] <= 1
     assert told[0][0] == "reading before.ply" and told[-1][0] == "comparing view 2 of 2"
@@ -115,14 +117,14 @@ def test_what_cannot_be_converted_is_refused_with_what_to_do(source, target, sen
     monkeypatch.chdir(tmp_path)
     written(tmp_path, ".ply", ball_splats(5)).rename("a.ply")
     with pytest.raises(HyrfError, match="(?s)" + sentence.replace("(", r"\(")):
-        hyrfpack.convert(source, target)
+        hyrfpack.convert_splats(source, target)
     assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
 
 
 def test_the_source_is_never_replaced(tmp_path):
     source = written(tmp_path, ".ply", ball_splats(5))
     with pytest.raises(HyrfError, match="the output is an input itself"):
-        hyrfpack.convert(source, source)
+        hyrfpack.convert_splats(source, source)
 
 
 def test_splats_that_a_format_cannot_reach_are_refused_before_anything_is_written(tmp_path):
@@ -130,7 +132,7 @@ def test_splats_that_a_format_cannot_reach_are_refused_before_anything_is_writte
     positions = splats.positions + [2 * FORMATS[".spz"].max_coordinate, 0, 0]
     far = Splats(positions, splats.scales, splats.quats, splats.opacities, splats.harmonics)
     with pytest.raises(HyrfError, match="name another format"):
-        hyrfpack.convert(written(tmp_path, ".ply", far), tmp_path / "a.spz")
+        hyrfpack.convert_splats(written(tmp_path, ".ply", far), tmp_path / "a.spz")
     assert not (tmp_path / "a.spz").exists()
 
 
@@ -138,4 +140,4 @@ def test_splats_that_cannot_be_seen_are_refused(tmp_path):
     splats = ball_splats(5)
     unseen = Splats(splats.positions, splats.scales * 0, splats.quats, splats.opacities, splats.harmonics)
     with pytest.raises(HyrfDataError, match="no Gaussian in it that could be seen"):
-        hyrfpack.convert(written(tmp_path, ".splat", unseen), tmp_path / "a.spz")
+        hyrfpack.convert_splats(written(tmp_path, ".splat", unseen), tmp_path / "a.spz")

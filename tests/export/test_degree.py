@@ -10,11 +10,11 @@ from hyrfpack.cameras.capture import provenance_cameras
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.errors import HyrfError
 from hyrfpack.export import degree as degrees
-from hyrfpack.export import export, pipeline
+from hyrfpack.export import export_model, pipeline
 from hyrfpack.export.bake import compute_visibility
 from hyrfpack.export.degree import choose_degree, lowest_degree_within_tolerance
 from hyrfpack.export.source import Source
-from hyrfpack.format import save
+from hyrfpack.format import save_model
 from hyrfpack.splats.files import read_splats
 
 POSITIONS = [[0.1, 0.2, 0.3], [-0.4, 0.1, 0.0], [0.2, -0.5, 0.1], [0.0, 0.4, -0.3]]
@@ -23,7 +23,7 @@ POSITIONS = [[0.1, 0.2, 0.3], [-0.4, 0.1, 0.0], [0.2, -0.5, 0.1], [0.0, 0.4, -0.
 def written(path, fields: float, cameras):
     """A model whose colours follow the direction if `fields` is not 0."""
     model = small_model(POSITIONS, fields=fields, direction_encoding="sh")
-    save(
+    save_model(
         model,
         path,
         provenance={"cameras": provenance_cameras(cameras), "viewpoint": Viewpoint.from_cameras(cameras).to_json()},
@@ -33,14 +33,14 @@ def written(path, fields: float, cameras):
 
 def test_colours_that_follow_no_direction_take_degree_0(tmp_path):
     source = written(tmp_path / "m.hyrf", 0.0, ring(20))
-    report = export(source, tmp_path / "a.spz")
+    report = export_model(source, tmp_path / "a.spz")
     assert report.degree == read_splats(tmp_path / "a.spz").degree == 0
     assert list(report.chosen_by) == [0, 1, 2, 3]
 
 
 def test_colours_that_follow_the_direction_take_more_and_the_reason_is_told(tmp_path):
     source, said = written(tmp_path / "m.hyrf", 4.0, ring(40)), []
-    report = export(source, tmp_path / "a.ply", say=said.append)
+    report = export_model(source, tmp_path / "a.ply", say=said.append)
     assert report.degree >= 2 and report.degree == lowest_degree_within_tolerance(report.chosen_by)
     told = f"degree {report.degree} it is: {', '.join(f'{score:.2f}' for score in report.chosen_by.values())} dB"
     assert any(sentence.startswith(told) for sentence in said)
@@ -49,9 +49,12 @@ def test_colours_that_follow_the_direction_take_more_and_the_reason_is_told(tmp_
 def test_a_degree_that_is_given_is_not_questioned(tmp_path, monkeypatch):
     monkeypatch.setattr(pipeline, "choose_degree", lambda *arguments: pytest.fail("it was chosen"))
     source = written(tmp_path / "m.hyrf", 0.0, ring(20))
-    assert (export(source, tmp_path / "a.ply", degree=2).degree, export(source, tmp_path / "a.splat").degree) == (2, 0)
+    assert (
+        export_model(source, tmp_path / "a.ply", degree=2).degree,
+        export_model(source, tmp_path / "a.splat").degree,
+    ) == (2, 0)
     with pytest.raises(HyrfError, match="degree 4"):
-        export(source, tmp_path / "a.ply", degree=4)
+        export_model(source, tmp_path / "a.ply", degree=4)
 
 
 @pytest.mark.parametrize(("scores", "lowest"), [
@@ -110,5 +113,8 @@ def test_of_many_gaussians_some_are_chosen_by(monkeypatch):
 
 def test_a_crop_is_of_the_degree_of_the_whole(tmp_path):
     source = written(tmp_path / "m.hyrf", 4.0, ring(40))
-    whole, part = export(source, tmp_path / "a.ply"), export(source, tmp_path / "b.ply", crop=(-9, -9, -9, -0.1, 9, 9))
+    whole, part = (
+        export_model(source, tmp_path / "a.ply"),
+        export_model(source, tmp_path / "b.ply", crop=(-9, -9, -9, -0.1, 9, 9)),
+    )
     assert part.degree == whole.degree and part.gaussians == 1 and part.chosen_by == whole.chosen_by

@@ -18,9 +18,9 @@ from hyrfpack.export.background import BackgroundGains, background_picture, back
 from hyrfpack.export.bake import bake
 from hyrfpack.export.exposure import SMOOTHING_NEIGHBORS, smooth_log_gains
 from hyrfpack.export.poster import render_model_poster
-from hyrfpack.format import load, save
+from hyrfpack.format import load_model, save_model
 from hyrfpack.model.exposure import ExposureMap
-from hyrfpack.render import RenderSettings, render
+from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.splats.files import read_splats
 from hyrfpack.splats.harmonics import SH_C0, harmonics_basis
 
@@ -70,7 +70,7 @@ def base_colors(splats) -> np.ndarray:
 
 
 def write(path, model, cameras):
-    save(
+    save_model(
         model,
         path,
         provenance={"cameras": provenance_cameras(cameras), "viewpoint": Viewpoint.from_cameras(cameras).to_json()},
@@ -190,18 +190,18 @@ def test_an_identity_map_changes_no_byte(ending, tmp_path):
         source = write(tmp_path / f"{name}.hyrf", model, [LEFT_CAMERA, RIGHT_CAMERA])
         target = tmp_path / name / f"out{ending}"
         target.parent.mkdir()
-        hyrfpack.export(source, target, baked=ending == ".html")
+        hyrfpack.export_model(source, target, baked=ending == ".html")
         files.append(target.read_bytes())
     assert files[0] == files[1]
 
 
 def test_consistent_splats_are_those_of_the_model_without_its_map(written, tmp_path):
-    plain = load(written)
+    plain = load_model(written)
     plain.exposure = None
     bare = write(tmp_path / "plain.hyrf", plain, [LEFT_CAMERA, RIGHT_CAMERA])
-    hyrfpack.export(bare, tmp_path / "plain.ply")
-    hyrfpack.export(written, tmp_path / "consistent.ply", exposure="consistent")
-    hyrfpack.export(written, tmp_path / "local.ply")
+    hyrfpack.export_model(bare, tmp_path / "plain.ply")
+    hyrfpack.export_model(written, tmp_path / "consistent.ply", exposure="consistent")
+    hyrfpack.export_model(written, tmp_path / "local.ply")
     files = [(tmp_path / f"{name}.ply").read_bytes() for name in ("plain", "consistent", "local")]
     assert files[0] == files[1] != files[2]
 
@@ -209,7 +209,7 @@ def test_consistent_splats_are_those_of_the_model_without_its_map(written, tmp_p
 @pytest.mark.parametrize("ending", [".ply", ".html"])
 def test_the_report_has_the_loss_of_both_exposures_whichever_is_written(ending, written, tmp_path):
     reports = [
-        hyrfpack.export(written, tmp_path / f"{word}{ending}", exposure=word, degree=1, baked=ending == ".html")
+        hyrfpack.export_model(written, tmp_path / f"{word}{ending}", exposure=word, degree=1, baked=ending == ".html")
         for word in ("local", "consistent")
     ]
     local, consistent = reports
@@ -224,7 +224,7 @@ def test_the_report_has_the_loss_of_both_exposures_whichever_is_written(ending, 
 
 def test_photos_score_both_exposures(written, tmp_path):
     scene = ball_scene(4)
-    report = hyrfpack.export(
+    report = hyrfpack.export_model(
         written, tmp_path / "a.ply", degree=0, data=replace(scene, train=scene.train[1:], test=scene.train[:1])
     )
     assert list(report.photos_by_exposure) == ["local", "consistent"]
@@ -233,26 +233,26 @@ def test_photos_score_both_exposures(written, tmp_path):
 
 def test_a_model_without_a_map_has_no_exposure_to_report(tmp_path):
     source = write(tmp_path / "plain.hyrf", small_model(LEFT), [LEFT_CAMERA])
-    report = hyrfpack.export(source, tmp_path / "a.ply", degree=0)
+    report = hyrfpack.export_model(source, tmp_path / "a.ply", degree=0)
     assert (report.exposure, report.psnr_by_exposure, report.photos_by_exposure) == (None, {}, {})
 
 
 def test_a_file_without_cameras_gets_finite_splats(tmp_path):
-    save(half_bright(), tmp_path / "bare.hyrf")
-    report = hyrfpack.export(tmp_path / "bare.hyrf", tmp_path / "a.ply")
+    save_model(half_bright(), tmp_path / "bare.hyrf")
+    report = hyrfpack.export_model(tmp_path / "bare.hyrf", tmp_path / "a.ply")
     assert np.isfinite(read_splats(tmp_path / "a.ply").harmonics).all() and report.exposure == "local"
 
 
 @pytest.mark.parametrize("target", ["page.html", "player"])
 def test_what_holds_the_model_itself_refuses_another_exposure(target, written, tmp_path):
     with pytest.raises(HyrfError, match="exposure='consistent'"):
-        hyrfpack.export(written, tmp_path / target, exposure="consistent")
+        hyrfpack.export_model(written, tmp_path / target, exposure="consistent")
     assert not (tmp_path / target).exists()
 
 
 def test_an_unknown_exposure_is_rejected(written, tmp_path):
     with pytest.raises(ValueError, match="local"):
-        hyrfpack.export(written, tmp_path / "a.ply", exposure="mean")
+        hyrfpack.export_model(written, tmp_path / "a.ply", exposure="mean")
 
 
 def test_posters_show_the_scene_as_photographed():
@@ -260,7 +260,7 @@ def test_posters_show_the_scene_as_photographed():
     poster = np.asarray(render_model_poster(model, RIGHT_CAMERA, 32)) / 255
     with torch.no_grad():
         own, consistent = (
-            render(model, RIGHT_CAMERA, RenderSettings(exposure=word)).rgb.numpy()
+            render_view(model, RIGHT_CAMERA, RenderSettings(exposure=word)).rgb.numpy()
             for word in ("as-photographed", "consistent")
         )
     assert np.abs(poster - own).max() < 0.01 < np.abs(poster - consistent).max()

@@ -15,9 +15,9 @@ import hyrfpack
 from hyrfpack.cameras.capture import provenance_cameras
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.errors import HyrfError
-from hyrfpack.evaluate import evaluate
-from hyrfpack.export import ExportReport, export, gallery, player
-from hyrfpack.format import load, save
+from hyrfpack.evaluate import evaluate_model
+from hyrfpack.export import ExportReport, export_model, gallery, player
+from hyrfpack.format import load_model, save_model
 
 POSITIONS = np.random.default_rng(0).uniform(-0.6, 0.6, (40, 3))
 PLAYER = {"README.txt", "hyrf-viewer.js", "index.html"}
@@ -31,7 +31,7 @@ def write(path: Path, **provenance) -> Path:
         **provenance,
     }
     path.parent.mkdir(parents=True, exist_ok=True)
-    save(small_model(POSITIONS, fields=2.0), path, provenance=kept)
+    save_model(small_model(POSITIONS, fields=2.0), path, provenance=kept)
     return path
 
 
@@ -42,7 +42,7 @@ def model(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def splats(model) -> Path:
-    export(model, model.parent / "cloud.ply", degree=1)
+    export_model(model, model.parent / "cloud.ply", degree=1)
     return model.parent / "cloud.ply"
 
 
@@ -60,7 +60,7 @@ def content_of(page: Path) -> dict:
 
 def test_a_player_is_a_page_the_file_its_picture_and_what_others_need(model, tmp_path):
     folder = tmp_path / "player"
-    report = export(model, folder)
+    report = export_model(model, folder)
     assert names(folder) == PLAYER | {"scene.hyrf", "poster.jpg"}
     assert (folder / "scene.hyrf").read_bytes() == model.read_bytes()
     told = content_of(folder / "index.html")
@@ -92,16 +92,16 @@ def test_a_player_without_a_scene_waits_for_one(tmp_path):
 def test_what_else_is_in_the_folder_stays(model, tmp_path):
     (tmp_path / "mine.txt").write_text("mine")
     for _ in range(2):
-        export(model, tmp_path)
+        export_model(model, tmp_path)
         assert (tmp_path / "mine.txt").read_text() == "mine"
     assert names(tmp_path) == PLAYER | {"scene.hyrf", "poster.jpg", "mine.txt"}
 
 
 def test_a_file_never_replaces_itself(model, tmp_path):
-    export(model, tmp_path)
+    export_model(model, tmp_path)
     before = (tmp_path / "scene.hyrf").read_bytes()
     with pytest.raises(HyrfError, match=r"scene\.hyrf: the output is an input itself"):
-        export(tmp_path / "scene.hyrf", tmp_path)
+        export_model(tmp_path / "scene.hyrf", tmp_path)
     assert (tmp_path / "scene.hyrf").read_bytes() == before
 
 
@@ -117,13 +117,13 @@ def test_a_disk_that_fills_up_leaves_no_half_file(model, tmp_path, monkeypatch):
 
     monkeypatch.setattr("hyrfpack.atomic.os.replace", fail)
     with pytest.raises(HyrfError, match=r"scene\.hyrf: the disk is full"):
-        export(model, tmp_path / "p")
+        export_model(model, tmp_path / "p")
     assert not (tmp_path / "p").exists()
 
 
 def test_splats_at_one_place_have_no_picture(tmp_path):
-    save(small_model(np.zeros((3, 3))), tmp_path / "m.hyrf", provenance={"cameras": provenance_cameras(ring(2))})
-    export(tmp_path / "m.hyrf", tmp_path / "a.ply", degree=0)
+    save_model(small_model(np.zeros((3, 3))), tmp_path / "m.hyrf", provenance={"cameras": provenance_cameras(ring(2))})
+    export_model(tmp_path / "m.hyrf", tmp_path / "a.ply", degree=0)
     player(tmp_path / "a.ply", tmp_path / "p")
     assert names(tmp_path / "p") == PLAYER | {"scene.ply"} and "poster" not in content_of(tmp_path / "p" / "index.html")
 
@@ -149,7 +149,7 @@ def test_held_out_photos_score_a_scene(model, tmp_path):
     photos = ball_scene(8)
     photos = type(photos)(**{**vars(photos), "train": photos.train[1:], "test": photos.train[:1]})
     gallery([model], tmp_path / "g", data=[photos])
-    score = evaluate(load(model), photos.test).psnr
+    score = evaluate_model(load_model(model), photos.test).psnr
     assert f"{score:.2f} dB on 1 held-out photo<" in (tmp_path / "g" / "index.html").read_text()
 
 

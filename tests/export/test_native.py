@@ -15,11 +15,11 @@ import hyrfpack
 from hyrfpack.cameras.capture import provenance_cameras
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.errors import HyrfError, HyrfFormatError
-from hyrfpack.export import export
+from hyrfpack.export import export_model
 from hyrfpack.export.pages import MAX_POSTER_BYTES
 from hyrfpack.export.poster import encode_poster
-from hyrfpack.format import load, save
-from hyrfpack.render import render
+from hyrfpack.format import load_model, save_model
+from hyrfpack.render import render_view
 from hyrfpack.web.html import extract_payload
 
 POSITIONS = np.random.default_rng(0).uniform(-0.6, 0.6, (40, 3))
@@ -30,23 +30,23 @@ def model(tmp_path_factory):
     """Forty Gaussians before a background sphere, and twenty cameras around them."""
     path, cameras = tmp_path_factory.mktemp("models") / "model.hyrf", ring(20, width=96, height=64)
     kept = {"cameras": provenance_cameras(cameras), "viewpoint": Viewpoint.from_cameras(cameras).to_json()}
-    save(small_model(POSITIONS, fields=2.0, background=True, solid=(0.1, 0.2, 0.3)), path, provenance=kept)
+    save_model(small_model(POSITIONS, fields=2.0, background=True, solid=(0.1, 0.2, 0.3)), path, provenance=kept)
     return path
 
 
 @pytest.fixture(scope="module")
 def compact(model, tmp_path_factory):
     path = tmp_path_factory.mktemp("compact") / "compact.hyrf"
-    hyrfpack.compress(model, path)
+    hyrfpack.compress_model(model, path)
     return path
 
 
 def test_the_page_holds_the_file_and_what_is_known_of_it(model, tmp_path):
-    report = export(model, tmp_path / "room.html")
+    report = export_model(model, tmp_path / "room.html")
     page = (tmp_path / "room.html").read_bytes()
     scene, inside = extract_payload(page, "page")
     assert inside == model.read_bytes() and b"<title>room</title>" in page
-    frame = load(model).config.frame
+    frame = load_model(model).config.frame
     assert (scene["kind"], scene["title"], scene["count"]) == ("hyrf", "room", 40)
     assert (scene["center"], scene["unit"], scene["solid"]) == (list(frame.center), frame.scale, [0.1, 0.2, 0.3])
     first = np.array(scene["cameras"][0]["camera_from_world"])
@@ -58,17 +58,17 @@ def test_the_page_holds_the_file_and_what_is_known_of_it(model, tmp_path):
 def test_the_same_export_gives_the_same_bytes(model, tmp_path):
     (tmp_path / "again").mkdir()
     for path in (tmp_path / "a.html", tmp_path / "again" / "a.html"):
-        export(model, path)
+        export_model(model, path)
     assert (tmp_path / "a.html").read_bytes() == (tmp_path / "again" / "a.html").read_bytes()
 
 
 def test_the_poster_is_what_the_first_camera_sees(model, tmp_path):
-    export(model, tmp_path / "a.html")
+    export_model(model, tmp_path / "a.html")
     (data,) = re.findall(
         rb'id="poster" alt="" src="data:image/webp;base64,([^"]*)"', (tmp_path / "a.html").read_bytes()
     )
     poster = Image.open(io.BytesIO(base64.b64decode(data)))
-    seen = render(load(model), ring(20, width=96, height=64)[0]).rgb.numpy().clip(0, 1)
+    seen = render_view(load_model(model), ring(20, width=96, height=64)[0]).rgb.numpy().clip(0, 1)
     assert poster.size == (96, 64) and np.abs(np.asarray(poster) / 255 - seen).mean() < 0.03
 
 
@@ -82,8 +82,8 @@ def test_a_poster_takes_no_more_bytes_than_it_may(form, most):
 
 
 def test_a_file_that_keeps_no_cameras_is_seen_from_around_or_from_its_photos(compact, tmp_path):
-    export(compact, tmp_path / "a.html")
-    export(compact, tmp_path / "b.html", data=ball_scene(5))
+    export_model(compact, tmp_path / "a.html")
+    export_model(compact, tmp_path / "b.html", data=ball_scene(5))
     made_up, photos = (extract_payload((tmp_path / name).read_bytes(), name)[0] for name in ("a.html", "b.html"))
     assert len(made_up["cameras"]) == 12 and len(photos["cameras"]) == 5
     assert np.allclose(photos["cameras"][0]["camera_from_world"], ball_scene(5).train[0].camera.camera_from_world)
@@ -91,9 +91,9 @@ def test_a_file_that_keeps_no_cameras_is_seen_from_around_or_from_its_photos(com
 
 def test_a_file_that_could_be_smaller_goes_along_and_that_is_said(model, compact, tmp_path):
     said = []
-    export(compact, tmp_path / "a.html", say=said.append)
+    export_model(compact, tmp_path / "a.html", say=said.append)
     assert said == []
-    export(model, tmp_path / "a.html", say=said.append)
+    export_model(model, tmp_path / "a.html", say=said.append)
     size = model.stat().st_size
     assert said == [f"{model} goes along as it is, {size:,} bytes; 'hyrfpack compress' makes it smaller"]
 
@@ -111,13 +111,13 @@ def test_a_file_that_could_be_smaller_goes_along_and_that_is_said(model, compact
 )
 def test_what_would_change_the_model_is_refused_and_baked_is_named(target, options, name, model, tmp_path):
     with pytest.raises(HyrfError, match=rf"^[^\n]*{target}: [^\n]* {name}, [^\n]*`baked=True`$"):
-        export(model, tmp_path / target, **options)
+        export_model(model, tmp_path / target, **options)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_baked_player_folder_is_refused(model, tmp_path):
     with pytest.raises(HyrfError, match=r"player: [^\n]*`baked=True`[^\n]*\.html$"):
-        export(model, tmp_path / "player", baked=True)
+        export_model(model, tmp_path / "player", baked=True)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -129,5 +129,5 @@ def test_files_that_cannot_be_loaded_go_nowhere(target, compact, tmp_path):
     for bad in (bytes(damaged), data[: len(data) // 2], b"", b"\x89PNG"):
         (tmp_path / "bad.hyrf").write_bytes(bad)
         with pytest.raises(HyrfFormatError, match=r"^[^\n]*bad\.hyrf: [^\n]*$"):
-            export(tmp_path / "bad.hyrf", tmp_path / target)
+            export_model(tmp_path / "bad.hyrf", tmp_path / target)
         assert [path.name for path in tmp_path.iterdir()] == ["bad.hyrf"]

@@ -17,16 +17,16 @@ import hyrfpack
 from hyrfpack.cameras.capture import provenance_cameras
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.errors import HyrfError
-from hyrfpack.evaluate import evaluate
+from hyrfpack.evaluate import evaluate_model
 from hyrfpack.export import ExportReport, pipeline
 from hyrfpack.export.bake import bake
 from hyrfpack.export.kinds import COLMAP_FOLDER, ENDINGS, PLAYER_FOLDER, find_file_kind, select_splats
 from hyrfpack.export.measure import measure_psnr
 from hyrfpack.export.source import Source
-from hyrfpack.format import load, save
+from hyrfpack.format import load_model, save_model
 from hyrfpack.format.codec import load_with_provenance
 from hyrfpack.model import Frame
-from hyrfpack.render import render
+from hyrfpack.render import render_view
 from hyrfpack.scene import Camera, Picture, Scene
 from hyrfpack.splats.table import FORMATS
 from hyrfpack.web.html import decode_splats_page
@@ -40,7 +40,7 @@ SPLATS = (*FORMATS, ".html")
 def export(source, target, **options) -> ExportReport:
     """With colours of degree 3 and pages of splats, where nothing else is said; a name without ending is for COLMAP."""
     kind = {"baked": str(target).endswith(".html"), "colmap": str(target).endswith("colmap")}
-    return hyrfpack.export(source, target, **{"degree": 3, **kind, **options})
+    return hyrfpack.export_model(source, target, **{"degree": 3, **kind, **options})
 
 
 def moved(camera: Camera, unit: float, center) -> Camera:
@@ -52,7 +52,7 @@ def moved(camera: Camera, unit: float, center) -> Camera:
 def write(path, model=None, cameras=FOUR, **options):
     """A model, as training would leave it; returns its path."""
     kept = {"cameras": provenance_cameras(cameras), "viewpoint": Viewpoint.from_cameras(cameras).to_json()}
-    save(model or small_model(POSITIONS, **{"fields": 2.0, **options}), path, provenance=kept)
+    save_model(model or small_model(POSITIONS, **{"fields": 2.0, **options}), path, provenance=kept)
     return path
 
 
@@ -117,7 +117,7 @@ def test_one_gaussian_alone_is_enough(ending, tmp_path):
 def test_points_are_the_centres_and_the_cameras(plain, tmp_path):
     report = export(plain, tmp_path / "a.points.ply")
     cloud = trimesh.load(tmp_path / "a.points.ply")
-    assert np.allclose(cloud.vertices[:40], load(plain).gaussians.positions.detach(), atol=1e-6)
+    assert np.allclose(cloud.vertices[:40], load_model(plain).gaussians.positions.detach(), atol=1e-6)
     assert (report.gaussians, report.cameras) == (40, 4) and len(cloud.vertices) > 40
     export(plain, tmp_path / "a.points.glb")
     assert set(trimesh.load(tmp_path / "a.points.glb").geometry) == {"gaussians", "cameras"}
@@ -165,7 +165,10 @@ def inside(points: np.ndarray) -> np.ndarray:
 def test_a_crop_keeps_exactly_what_is_inside_and_leaves_the_background_out(ending, sphere, tmp_path):
     said = []
     report = export(sphere, tmp_path / f"part{ending}", crop=CROP, say=said.append)
-    expected, back = inside(load(sphere).gaussians.positions.detach().numpy()), read_back(tmp_path / f"part{ending}")
+    expected, back = (
+        inside(load_model(sphere).gaussians.positions.detach().numpy()),
+        read_back(tmp_path / f"part{ending}"),
+    )
     assert 3 < len(expected) < 40 and len(back) == report.gaussians == len(expected) and report.background == 0
     assert nearest(expected, back.positions).max() < 1e-3
     assert (report.views, report.psnr, report.psnr_baked) == (0, None, None)
@@ -220,7 +223,9 @@ def test_psnr_rises_with_the_degree_where_colour_depends_on_the_direction(tmp_pa
 def test_the_psnr_is_that_of_the_file(ending, plain, tmp_path):
     report = export(plain, tmp_path / f"a{ending}", degree=2)
     views = [(camera, None) for camera in Source.read(plain).fit_cameras]
-    file = measure_psnr(load(plain), {"file": (read_back(tmp_path / f"a{ending}"), None)}, views, sphere=False)["file"]
+    file = measure_psnr(load_model(plain), {"file": (read_back(tmp_path / f"a{ending}"), None)}, views, sphere=False)[
+        "file"
+    ]
     assert report.psnr == pytest.approx(file.model, abs=1e-3)
     assert (report.psnr == pytest.approx(report.psnr_baked, abs=1e-3)) == (ending == ".ply")
 
@@ -246,7 +251,7 @@ def photographed(model, cameras) -> Scene:
     rng = np.random.default_rng(0)
     views = []
     for number, camera in enumerate(cameras):
-        rgb = render(model, camera).rgb.detach().numpy() + rng.normal(scale=0.03, size=(32, 32, 3))
+        rgb = render_view(model, camera).rgb.detach().numpy() + rng.normal(scale=0.03, size=(32, 32, 3))
         picture = Picture((rgb.clip(0, 1) * 255).round().astype(np.uint8))
         views.append(view_of(f"{number}.png", camera, picture))
     return Scene("made up", "colmap", views[::2], views[1::2], np.zeros((0, 3)), np.zeros((0, 3), np.float32))
@@ -255,7 +260,7 @@ def photographed(model, cameras) -> Scene:
 def without_cameras(source: Path, target: Path) -> Path:
     """A copy of a model's file that does not say where its photos were taken."""
     model, provenance = load_with_provenance(source)
-    save(model, target, provenance={name: value for name, value in provenance.items() if name != "cameras"})
+    save_model(model, target, provenance={name: value for name, value in provenance.items() if name != "cameras"})
     return target
 
 
@@ -307,7 +312,7 @@ def test_held_out_photos_score_the_model_and_the_file_and_are_not_fitted(plain, 
     )
     report = export(plain, tmp_path / "a.ply", data=scene)
     assert fitted == [view.camera for view in scene.train] and report.views == 4
-    assert report.photos_model == pytest.approx(evaluate(load(plain), scene.test).psnr, abs=1e-6)
+    assert report.photos_model == pytest.approx(evaluate_model(load_model(plain), scene.test).psnr, abs=1e-6)
     assert report.photos_file == pytest.approx(report.photos_model, abs=0.5)
 
 
@@ -333,7 +338,7 @@ def test_masks_that_leave_nothing_leave_the_score_out(plain, tmp_path):
 @pytest.fixture(scope="module")
 def compact(plain, tmp_path_factory):
     path = tmp_path_factory.mktemp("compact") / "compact.hyrf"
-    hyrfpack.compress(plain, path)
+    hyrfpack.compress_model(plain, path)
     return path
 
 
@@ -472,11 +477,11 @@ def test_a_disk_that_fails_leaves_the_old_file_as_it_was(plain, tmp_path, monkey
 
 
 def test_export_is_one_call_on_the_package(plain, tmp_path):
-    report = hyrfpack.export(plain, tmp_path / "a.ply", degree=0)
+    report = hyrfpack.export_model(plain, tmp_path / "a.ply", degree=0)
     assert isinstance(report, hyrfpack.ExportReport) and hyrfpack.ExportReport is ExportReport
     assert {"export", "ExportReport"} <= set(hyrfpack.__all__)
 
 
 def test_choosing_all_copies_nothing(plain):
-    splats = bake(load(plain), [], (0,))[0]
+    splats = bake(load_model(plain), [], (0,))[0]
     assert select_splats(splats) is splats

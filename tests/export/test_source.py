@@ -12,7 +12,7 @@ from hyrfpack.cameras.capture import provenance_cameras
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.errors import HyrfError
 from hyrfpack.export.source import MAX_MEASURED_VIEWS, MIN_CAMERAS_TO_HOLD_OUT, Source
-from hyrfpack.format import save
+from hyrfpack.format import save_model
 from hyrfpack.scene import Camera, Scene
 
 POSITIONS = np.random.default_rng(0).uniform(-0.6, 0.6, (20, 3))
@@ -24,7 +24,7 @@ def written(tmp_path):
 
     def write(provenance=None, positions=POSITIONS):
         path = tmp_path / "model.hyrf"
-        save(small_model(positions), path, provenance=provenance)
+        save_model(small_model(positions), path, provenance=provenance)
         return path
 
     return write

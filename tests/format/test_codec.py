@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hyrfpack.errors import HyrfError, HyrfFormatError
-from hyrfpack.format import decode_model, describe, encode_model, load, repack, save
+from hyrfpack.format import decode_model, describe_file, encode_model, load_model, repack, save_model
 from hyrfpack.format.container import MINOR_VERSION, Section, read_container, write_container
 from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians
@@ -204,7 +204,7 @@ def test_save_refuses_numbers_that_are_not_finite_and_names_the_group(tmp_path, 
         model.state_dict()[parameter].view(-1)[-1] = value
 
     with pytest.raises(HyrfError, match=f"1 of [0-9]+ numbers in the model's {holds} "):
-        save(model, tmp_path / "model.hyrf", profile) if planned is None else planned(model)
+        save_model(model, tmp_path / "model.hyrf", profile) if planned is None else planned(model)
 
     assert not list(tmp_path.iterdir())
 
@@ -247,7 +247,7 @@ def test_report_adds_up_to_the_file(tmp_path):
     path = tmp_path / "model.hyrf"
     model = make_model(500)
 
-    report = save(model, path, "paper")
+    report = save_model(model, path, "paper")
 
     assert report.bytes_after == path.stat().st_size
     assert report.bytes_before == 4 * sum(parameter.numel() for parameter in model.parameters())
@@ -260,21 +260,21 @@ def test_report_adds_up_to_the_file(tmp_path):
 
 def test_repacking_keeps_configuration_and_provenance(tmp_path):
     model = make_model(100)
-    save(model, tmp_path / "raw.hyrf", "raw", {"steps": 7})
+    save_model(model, tmp_path / "raw.hyrf", "raw", {"steps": 7})
 
     report = repack(tmp_path / "raw.hyrf", tmp_path / "paper.hyrf", "paper", color=(3, 16))
     repack(tmp_path / "paper.hyrf", tmp_path / "back.hyrf", "raw")
 
     assert (tmp_path / "paper.hyrf").read_bytes() == encode_model(model, "paper", {"steps": 7}, color=(3, 16))
     assert report.profile == "paper"
-    back, once = load(tmp_path / "back.hyrf"), load(tmp_path / "paper.hyrf")
+    back, once = load_model(tmp_path / "back.hyrf"), load_model(tmp_path / "paper.hyrf")
     assert all(torch.equal(a, b) for a, b in zip(back.parameters(), once.parameters(), strict=True))
-    assert describe(tmp_path / "back.hyrf")["provenance"] == {"steps": 7}
+    assert describe_file(tmp_path / "back.hyrf")["provenance"] == {"steps": 7}
 
 
 def test_describe_tells_what_is_inside_without_torch_and_numpy(tmp_path):
     path = tmp_path / "model.hyrf"
-    save(make_model(500), path, "paper", {"steps": 30})
+    save_model(make_model(500), path, "paper", {"steps": 30})
     program = (
         "import sys, json; from hyrfpack.format import describe; info = describe(sys.argv[1]);"
         "print(json.dumps([info, [name for name in ('torch', 'numpy', 'dahuffman') if name in sys.modules]]))"
@@ -301,17 +301,17 @@ def test_describe_reads_deflated_metadata(tmp_path):
     model = make_model(500)
     (tmp_path / "model.hyrf").write_bytes(encode(model, "compact", {"steps": 30}))
 
-    facts = describe(tmp_path / "model.hyrf")
+    facts = describe_file(tmp_path / "model.hyrf")
 
     assert facts["profile"] == "compact" and facts["provenance"] == {"steps": 30} and facts["version"] == "1.1"
-    assert facts["gaussians"] == len(load(tmp_path / "model.hyrf")) < facts["settings"]["gaussians_before"] == 500
+    assert facts["gaussians"] == len(load_model(tmp_path / "model.hyrf")) < facts["settings"]["gaussians_before"] == 500
     assert facts["config"] == json.loads(json.dumps(model.config.to_dict()))
 
 
 def test_describe_of_no_gaussians_has_no_bits_per_gaussian(tmp_path):
-    save(make_model(0), tmp_path / "empty.hyrf")
+    save_model(make_model(0), tmp_path / "empty.hyrf")
 
-    assert describe(tmp_path / "empty.hyrf")["bits_per_gaussian"] is None
+    assert describe_file(tmp_path / "empty.hyrf")["bits_per_gaussian"] is None
 
 
 @pytest.mark.parametrize("profile", PROFILES)
@@ -353,7 +353,7 @@ def test_error_names_the_file_and_the_section(tmp_path):
     path.write_bytes(data)
 
     with pytest.raises(HyrfFormatError, match="model.hyrf.*'GTAB'"):
-        load(path)
+        load_model(path)
 
 
 @pytest.mark.parametrize("profile", PROFILES)
@@ -454,7 +454,7 @@ def test_describe_refuses_a_configuration_of_wrong_types(tmp_path, key):
     (tmp_path / "model.hyrf").write_bytes(rewrite(data, META=json.dumps(metadata).encode()))
 
     with pytest.raises(HyrfFormatError, match=f"model.hyrf.*config.{key}"):
-        describe(tmp_path / "model.hyrf")
+        describe_file(tmp_path / "model.hyrf")
 
 
 @pytest.mark.parametrize(
@@ -475,7 +475,7 @@ def test_metadata_that_is_not_json_is_refused(tmp_path, text):
     path.write_bytes(rewrite(encode_model(make_model()), META=text))
 
     with pytest.raises(HyrfFormatError, match="model.hyrf.*metadata"):
-        describe(path)
+        describe_file(path)
 
 
 DEFLATED_FORGERIES = {

@@ -19,7 +19,7 @@ from scenes import ball_points, small_model
 from hyrfpack.compress import plan
 from hyrfpack.compress.plan import replan_moved
 from hyrfpack.errors import HyrfError, HyrfFormatError
-from hyrfpack.format import decode_model, describe, load, repack, save
+from hyrfpack.format import decode_model, describe_file, load_model, repack, save_model
 from hyrfpack.format.container import MINOR_VERSION, read_container, write_container
 from hyrfpack.format.min_file_size import check_target_bytes, min_file_bytes
 from hyrfpack.model import HybridModel
@@ -38,7 +38,7 @@ def exposed_model(count: int = 50) -> HybridModel:
 @pytest.fixture
 def raw(tmp_path) -> Path:
     path = tmp_path / "raw.hyrf"
-    save(exposed_model(), path)
+    save_model(exposed_model(), path)
     return path
 
 
@@ -101,7 +101,7 @@ def test_repacking_from_profile_to_profile_keeps_the_map(raw, tmp_path):
     repack(raw, tmp_path / "paper.hyrf", "paper")
     for name in ("compact", "paper"):
         repack(tmp_path / f"{name}.hyrf", tmp_path / "again.hyrf", "raw")
-        assert maps_equal(load(tmp_path / "again.hyrf").exposure, EXPOSURE)
+        assert maps_equal(load_model(tmp_path / "again.hyrf").exposure, EXPOSURE)
 
 
 @pytest.mark.parametrize("profile", ["raw", "paper"])
@@ -109,7 +109,7 @@ def test_compress_and_decompress_keep_the_map(profile, raw, tmp_path):
     succeeded("compress", raw, "-o", tmp_path / "packed.hyrf", "--profile", profile)
     succeeded("decompress", tmp_path / "packed.hyrf", "-o", tmp_path / "unpacked.hyrf")
 
-    assert maps_equal(load(tmp_path / "unpacked.hyrf").exposure, EXPOSURE)
+    assert maps_equal(load_model(tmp_path / "unpacked.hyrf").exposure, EXPOSURE)
 
 
 def test_the_start_of_a_file_that_makes_a_model_has_the_map(in_layers, tmp_path):
@@ -117,7 +117,7 @@ def test_the_start_of_a_file_that_makes_a_model_has_the_map(in_layers, tmp_path)
     (tmp_path / "first.hyrf").write_bytes(first)
 
     assert maps_equal(decode_model(first, fraction=1.0).exposure, EXPOSURE)
-    model = load(tmp_path / "first.hyrf", fraction=1.0)
+    model = load_model(tmp_path / "first.hyrf", fraction=1.0)
     assert maps_equal(model.exposure, EXPOSURE) and len(model) < 600
     assert maps_equal(decode_model(in_layers, fraction=1.0).exposure, EXPOSURE)
 
@@ -128,15 +128,15 @@ def test_the_start_of_a_file_without_the_bytes_of_the_map_is_a_model_without_one
     (tmp_path / "cut.hyrf").write_bytes(data[:-1])
 
     assert maps_equal(decode_model(data).exposure, EXPOSURE)
-    model = load(tmp_path / "cut.hyrf", fraction=1.0)
+    model = load_model(tmp_path / "cut.hyrf", fraction=1.0)
     assert model.exposure is None and len(model) == len(decode_model(data))
-    assert describe(tmp_path / "cut.hyrf", fraction=1.0)["exposure"] is None
-    assert describe(tmp_path / "whole.hyrf")["exposure"]["centers"] == 17
+    assert describe_file(tmp_path / "cut.hyrf", fraction=1.0)["exposure"] is None
+    assert describe_file(tmp_path / "whole.hyrf")["exposure"]["centers"] == 17
 
 
 def test_bytes_of_parameters_do_not_count_the_map(tmp_path):
     model = exposed_model()
-    report = save(model, tmp_path / "raw.hyrf")
+    report = save_model(model, tmp_path / "raw.hyrf")
 
     assert report.bytes_before == 4 * sum(parameter.numel() for parameter in model.parameters())
 
@@ -174,13 +174,13 @@ def test_describe_reads_the_map_and_no_parameters(raw):
     entries = read_container(raw.read_bytes()).entries
     raw.write_bytes(raw.read_bytes()[: entries["EXPO"].end])
 
-    assert describe(raw, fraction=1.0)["exposure"]["centers"] == 17
+    assert describe_file(raw, fraction=1.0)["exposure"]["centers"] == 17
 
 
 def test_describe_of_a_file_without_a_map_says_none(tmp_path):
-    save(small_model(ball_points(5)[0]), tmp_path / "plain.hyrf")
+    save_model(small_model(ball_points(5)[0]), tmp_path / "plain.hyrf")
 
-    assert describe(tmp_path / "plain.hyrf")["exposure"] is None
+    assert describe_file(tmp_path / "plain.hyrf")["exposure"] is None
     assert "exposure" not in succeeded("info", tmp_path / "plain.hyrf").stdout
 
 
@@ -198,7 +198,7 @@ def test_a_damaged_map_is_one_sentence_that_names_file_and_section(raw):
     raw.write_bytes(damaged(raw.read_bytes()))
 
     with pytest.raises(HyrfFormatError, match="raw.hyrf: section 'EXPO': .* damaged"):
-        describe(raw)
+        describe_file(raw)
     with pytest.raises(HyrfFormatError, match="raw.hyrf: section 'EXPO': .* damaged"):
-        load(raw)
+        load_model(raw)
     assert "section 'EXPO'" in refused("info", raw)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hyrfpack.choices import CONSISTENT_EXPOSURE
-from hyrfpack.format import describe, load, metadata
+from hyrfpack.format import describe_file, load_model, metadata
 from hyrfpack.model import Frame, HashGridConfig, ModelConfig
 from hyrfpack.render import RenderSettings, render
 from tools.safety.make_golden import GOLDEN_FILES, make_golden_camera
@@ -26,7 +26,7 @@ def test_golden_files_are_there():
 def test_golden_file_decodes_to_the_recorded_numbers(file):
     recorded = np.load(file.with_suffix(".npz"))
 
-    decoded = {name: value.numpy() for name, value in load(file).state_dict().items()}
+    decoded = {name: value.numpy() for name, value in load_model(file).state_dict().items()}
 
     assert sorted(decoded) == sorted(name for name in recorded.files if not name.startswith("exposure."))
     for name, values in decoded.items():
@@ -36,7 +36,7 @@ def test_golden_file_decodes_to_the_recorded_numbers(file):
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
 def test_golden_file_has_the_recorded_configuration(file):
-    config = load(file).config
+    config = load_model(file).config
 
     assert config == ModelConfig(
         frame=Frame(center=(1e6, -0.1, 3.0), scale=12.5, half_extent=(1.0, 0.75, 0.25)),
@@ -59,13 +59,13 @@ WITH_EXPOSURE = sorted(name for name, (_, _, exposure) in GOLDEN_FILES.items() i
 def test_golden_files_have_an_exposure_map_from_version_1_2_on():
     assert WITH_EXPOSURE == ["v1.2_compact_exposure"]
     for file in FILES:
-        assert (load(file).exposure is not None) == (file.stem in WITH_EXPOSURE)
+        assert (load_model(file).exposure is not None) == (file.stem in WITH_EXPOSURE)
 
 
 @pytest.mark.parametrize("name", WITH_EXPOSURE)
 def test_golden_exposure_map_gives_the_recorded_log_gains(name):
     recorded = np.load(GOLDEN / f"{name}.npz")
-    exposure = load(GOLDEN / f"{name}.hyrf").exposure
+    exposure = load_model(GOLDEN / f"{name}.hyrf").exposure
     lowest, highest = exposure.limits
 
     gains = exposure.predict_log_gains(recorded["exposure.positions"], recorded["exposure.directions"])
@@ -80,20 +80,21 @@ def test_golden_file_with_an_exposure_map_renders_the_recorded_picture(name):
     recorded = np.load(GOLDEN / f"{name}.npz")["exposure.picture"]
     model, camera = load(GOLDEN / f"{name}.hyrf"), make_golden_camera()
 
-    picture = render(model, camera).rgb.numpy()
+    picture = render_view(model, camera).rgb.numpy()
 
     np.testing.assert_allclose(picture, recorded, rtol=0, atol=2e-3)
     assert (
-        np.abs(render(model, camera, RenderSettings(exposure=CONSISTENT_EXPOSURE)).rgb.numpy() - recorded).max() > 0.02
+        np.abs(render_view(model, camera, RenderSettings(exposure=CONSISTENT_EXPOSURE)).rgb.numpy() - recorded).max()
+        > 0.02
     )
 
 
 @pytest.mark.parametrize("name", GOLDEN_FILES)
 def test_golden_model_encodes_to_the_same_bytes(name, monkeypatch):
     golden = (GOLDEN / f"{name}.hyrf").read_bytes()
-    info, (profile, settings, exposure) = describe(GOLDEN / f"{name}.hyrf"), GOLDEN_FILES[name]
+    info, (profile, settings, exposure) = describe_file(GOLDEN / f"{name}.hyrf"), GOLDEN_FILES[name]
     monkeypatch.setattr(metadata, "writer_name", lambda: info["writer"])
-    model = load(GOLDEN / "v1.0_raw.hyrf")
+    model = load_model(GOLDEN / "v1.0_raw.hyrf")
     model.exposure = exposure
 
     data = encode(model, profile, info["provenance"], **settings)

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from scenes import ball_scene
 
-from hyrfpack import compress
+from hyrfpack import compress_model
 from hyrfpack.cameras.capture import quantized_provenance
 from hyrfpack.compress.distortion import DISTORTION_RANGE
 from hyrfpack.errors import HyrfError
 from hyrfpack.format.codec import load_with_provenance
 from hyrfpack.format.min_file_size import check_target_bytes, min_file_bytes
-from hyrfpack.train import TrainConfig, train
+from hyrfpack.train import TrainConfig, train_model
 
 
 @pytest.fixture(scope="module")
@@ -22,8 +22,8 @@ def tiny(tmp_path_factory):
     """A model of few Gaussians, packed as coarsely as can be: its file and the provenance that this carries."""
     folder = tmp_path_factory.mktemp("tiny")
     scene = ball_scene(6)
-    train(scene, folder, TrainConfig(steps=3, max_gaussians=20), quiet=True)
-    compress(folder / "model.hyrf", folder / "small.hyrf", data=scene, distortion=DISTORTION_RANGE[1])
+    train_model(scene, folder, TrainConfig(steps=3, max_gaussians=20), quiet=True)
+    compress_model(folder / "model.hyrf", folder / "small.hyrf", data=scene, distortion=DISTORTION_RANGE[1])
     model, provenance = load_with_provenance(folder / "model.hyrf")
     return folder / "small.hyrf", quantized_provenance(provenance, model.config.frame.scale)
 
@@ -60,7 +60,7 @@ def test_the_bound_itself_is_allowed():
 def test_training_for_a_size_that_no_file_of_the_scene_can_have_is_refused_before_anything_is_written(tiny, tmp_path):
     scene = dataclasses.replace(ball_scene(6), points=np.zeros((0, 3)), point_colors=np.zeros((0, 3), np.float32))
     with pytest.raises(HyrfError, match="did you mean 10MB"):
-        train(scene, tmp_path / "run", TrainConfig(steps=3, target_bytes=10), quiet=True)
+        train_model(scene, tmp_path / "run", TrainConfig(steps=3, target_bytes=10), quiet=True)
     assert not (tmp_path / "run").exists()
     with pytest.raises(HyrfError, match="below the smallest possible file"):  # which carries cameras, too
-        train(scene, tmp_path / "run", TrainConfig(steps=3, target_bytes=min_file_bytes() + 1), quiet=True)
+        train_model(scene, tmp_path / "run", TrainConfig(steps=3, target_bytes=min_file_bytes() + 1), quiet=True)

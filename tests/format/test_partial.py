@@ -16,7 +16,7 @@ from scenes import small_model
 
 from hyrfpack.compress import plan
 from hyrfpack.errors import HyrfFormatError
-from hyrfpack.format import decode_model, describe, load
+from hyrfpack.format import decode_model, describe_file, load_model
 from hyrfpack.format.arrays import MODEL_RULES, to_arrays
 from hyrfpack.format.codec import repack
 from hyrfpack.format.container import MINOR_VERSION, Container, Section, read_container, write_container
@@ -184,16 +184,16 @@ def test_files_cut_short_are_loaded_described_and_repacked(tmp_path):
 
     report = repack(tmp_path / "cut.hyrf", tmp_path / "raw.hyrf", fraction=1.0)
 
-    assert_same_bits(load(tmp_path / "cut.hyrf", fraction=1.0), expected)
-    assert_same_bits(load(tmp_path / "raw.hyrf"), expected)
-    assert report.gaussians == describe(tmp_path / "raw.hyrf")["gaussians"] == sum(LAYERS[:2])
-    facts = describe(tmp_path / "cut.hyrf", 1.0)
+    assert_same_bits(load_model(tmp_path / "cut.hyrf", fraction=1.0), expected)
+    assert_same_bits(load_model(tmp_path / "raw.hyrf"), expected)
+    assert report.gaussians == describe_file(tmp_path / "raw.hyrf")["gaussians"] == sum(LAYERS[:2])
+    facts = describe_file(tmp_path / "cut.hyrf", 1.0)
     assert (facts["layers"], facts["bytes"]) == (LAYERS, len(COMPACT))
 
 
 def test_without_a_fraction_the_file_must_be_whole(tmp_path):
     (tmp_path / "cut.hyrf").write_bytes(COMPACT[:-1])
-    for read in (load, describe):
+    for read in (load_model, describe_file):
         with pytest.raises(HyrfFormatError, match="cut.hyrf: .* is truncated"):
             read(tmp_path / "cut.hyrf")
 

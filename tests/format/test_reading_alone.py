@@ -21,13 +21,13 @@ import hyrfpack
 from hyrfpack.format import decode_model
 
 def picture(path):
-    facts = hyrfpack.describe(path)
+    facts = hyrfpack.describe_file(path)
     pose = np.eye(4)
     pose[:3, 3] = -np.array(facts["config"]["frame"]["center"])
     pose[2, 3] += 2 * facts["config"]["frame"]["scale"]
-    model, data = hyrfpack.load(path), open(path, "rb").read()
+    model, data = hyrfpack.load_model(path), open(path, "rb").read()
     assert len(model) == len(decode_model(data)) == facts["gaussians"]
-    return hyrfpack.render(model, hyrfpack.Camera(16, 12, 20.0, 20.0, 8.0, 6.0, pose)).rgb.numpy()
+    return hyrfpack.render_view(model, hyrfpack.Camera(16, 12, 20.0, 20.0, 8.0, 6.0, pose)).rgb.numpy()
 """
 ALONE = """
 import sys
@@ -40,7 +40,7 @@ class Bare:
 sys.meta_path = [Bare if finder is PathFinder else finder for finder in sys.meta_path]
 sys.path.insert(0, {root!r})
 {pictures}
-hyrfpack.load({files!r}[0])
+hyrfpack.load_model({files!r}[0])
 print(*sys.modules)
 np.savez({out!r}, **{{path: picture(path) for path in {files!r}}})
 print(*sys.modules)

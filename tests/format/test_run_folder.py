@@ -22,7 +22,7 @@ POSITIONS = [[0.0, 0, 0], [0.3, 0, 0]]
 def run(tmp_path: Path) -> Path:
     """The folder of a finished run of 1,200 steps, by what metrics.json of `hyrfpack train` holds."""
     folder = tmp_path / "bonsai"
-    hyrfpack.save(small_model(POSITIONS), folder / "model.hyrf")
+    hyrfpack.save_model(small_model(POSITIONS), folder / "model.hyrf")
     metrics = {
         "settings": {"steps": 1200},
         "scene": {"path": "photos/bonsai", "train": 7, "test": 2},
@@ -78,10 +78,10 @@ def test_a_damaged_checkpoint_still_says_that_the_run_has_not_finished(tmp_path)
 @pytest.mark.parametrize(
     "call",
     [
-        hyrfpack.load,
-        hyrfpack.describe,
-        lambda run: hyrfpack.compress(run, "x.hyrf"),
-        lambda run: hyrfpack.export(run, "x.ply"),
+        hyrfpack.load_model,
+        hyrfpack.describe_file,
+        lambda run: hyrfpack.compress_model(run, "x.hyrf"),
+        lambda run: hyrfpack.export_model(run, "x.ply"),
         lambda run: hyrfpack.format.repack(run, "x.hyrf"),
         lambda run: hyrfpack.train.photos_of(run),
     ],
@@ -95,18 +95,18 @@ def test_every_function_says_that_a_run_has_not_finished(call, unfinished, tmp_p
 
 
 def test_a_run_reads_as_its_model_does(run, tmp_path):
-    assert len(hyrfpack.load(run)) == len(POSITIONS)
-    assert hyrfpack.describe(run) == hyrfpack.describe(run / "model.hyrf")
-    hyrfpack.compress(run, tmp_path / "a.hyrf", "paper")
-    hyrfpack.compress(run / "model.hyrf", tmp_path / "b.hyrf", "paper")
+    assert len(hyrfpack.load_model(run)) == len(POSITIONS)
+    assert hyrfpack.describe_file(run) == hyrfpack.describe_file(run / "model.hyrf")
+    hyrfpack.compress_model(run, tmp_path / "a.hyrf", "paper")
+    hyrfpack.compress_model(run / "model.hyrf", tmp_path / "b.hyrf", "paper")
     assert (tmp_path / "a.hyrf").read_bytes() == (tmp_path / "b.hyrf").read_bytes()
-    hyrfpack.export(run, tmp_path / "a.ply", degree=0, background=False)
+    hyrfpack.export_model(run, tmp_path / "a.ply", degree=0, background=False)
     assert len(read_splats(tmp_path / "a.ply")) == len(POSITIONS)
 
 
 def test_the_model_of_a_run_that_is_read_is_never_replaced(run):
     before = (run / "model.hyrf").read_bytes()
-    for write in (hyrfpack.format.repack, hyrfpack.compress):
+    for write in (hyrfpack.format.repack, hyrfpack.compress_model):
         with pytest.raises(hyrfpack.HyrfError, match="the output is an input itself"):
             write(run, run / "model.hyrf")
     assert (run / "model.hyrf").read_bytes() == before

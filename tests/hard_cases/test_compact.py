@@ -7,7 +7,7 @@ import pytest
 import torch
 from scenes import ball_points, ring, small_model
 
-from hyrfpack import compress, load, save
+from hyrfpack import compress_model, load_model, save_model
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import decode_model, encode_model
 from hyrfpack.format.compact.quantized import QuantizedModel
@@ -126,10 +126,10 @@ def test_no_gaussian_gives_a_file_of_none(prune):
 
 def test_one_gaussian_is_kept_and_compressed(tmp_path):
     model = small_model([(0.1, 0.2, 0.3)], fields=0.3)
-    save(model, tmp_path / "one.hyrf", "raw")
+    save_model(model, tmp_path / "one.hyrf", "raw")
 
-    report = compress(tmp_path / "one.hyrf", tmp_path / "small.hyrf")
-    decoded = load(tmp_path / "small.hyrf")
+    report = compress_model(tmp_path / "one.hyrf", tmp_path / "small.hyrf")
+    decoded = load_model(tmp_path / "small.hyrf")
 
     assert report.profile == "compact" and report.gaussians == len(decoded) == 1
     assert report.bytes_after < (tmp_path / "one.hyrf").stat().st_size / 2
@@ -137,20 +137,20 @@ def test_one_gaussian_is_kept_and_compressed(tmp_path):
 
 
 def test_a_model_without_gaussians_is_rejected_with_a_clear_error(tmp_path):
-    save(small_model(np.zeros((0, 3))), tmp_path / "none.hyrf", "raw")
+    save_model(small_model(np.zeros((0, 3))), tmp_path / "none.hyrf", "raw")
 
     with pytest.raises(HyrfError, match="none.hyrf: there is no Gaussian in it.*use profile 'paper'$"):
-        compress(tmp_path / "none.hyrf", tmp_path / "small.hyrf")
+        compress_model(tmp_path / "none.hyrf", tmp_path / "small.hyrf")
 
     assert not (tmp_path / "small.hyrf").exists()
 
 
 def test_a_model_that_cannot_be_rendered_is_rejected_with_a_clear_error(tmp_path):
     """Positions whose squares overflow: nothing can be measured on pictures of NaN."""
-    save(small_model([(0.0, 0.0, 0.0), (1e30, 0.0, 0.0)], fields=0.3), tmp_path / "far.hyrf", "raw")
+    save_model(small_model([(0.0, 0.0, 0.0), (1e30, 0.0, 0.0)], fields=0.3), tmp_path / "far.hyrf", "raw")
 
     with pytest.raises(HyrfError):
-        compress(tmp_path / "far.hyrf", tmp_path / "small.hyrf")
+        compress_model(tmp_path / "far.hyrf", tmp_path / "small.hyrf")
 
     assert not (tmp_path / "small.hyrf").exists()
 

@@ -18,7 +18,7 @@ from hyrfpack.errors import HyrfError
 from hyrfpack.format import decode_model, encode_model
 from hyrfpack.model import Frame, HybridModel
 from hyrfpack.ops.contraction import contract
-from hyrfpack.render import render
+from hyrfpack.render import render_view
 from hyrfpack.train import TrainConfig, Trainer
 
 FLOAT16_MAX = 65504.0
@@ -144,7 +144,7 @@ def test_far_backgrounds_look_the_same_after_half_precision_however_far(radius):
     camera = camera_at((0.0, 0.0, 0.0), (0.0, 1.0, 0.0), width=96, height=96)
 
     with torch.no_grad():
-        before, after = (render(m, camera).rgb for m in (model, halves))
+        before, after = (render_view(m, camera).rgb for m in (model, halves))
 
     assert before.std() > 0.05  # else there is nothing to lose
     assert -10 * torch.log10(((after - before) ** 2).mean()) > 56
@@ -159,7 +159,8 @@ def test_a_trained_scene_loses_as_little_far_from_the_origin(offset):
 
     with torch.no_grad():
         errors = [
-            (render(decoded, v.camera).rgb - render(trainer.model, v.camera).rgb).square() for v in trainer.scene.train
+            (render_view(decoded, v.camera).rgb - render_view(trainer.model, v.camera).rgb).square()
+            for v in trainer.scene.train
         ]
     assert -10 * torch.log10(torch.stack(errors).mean()) > 58
 

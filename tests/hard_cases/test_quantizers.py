@@ -360,7 +360,7 @@ def test_models_of_hardly_any_gaussians_survive_and_render(profile, fill, count)
         else:
             assert ((got - expected).abs() <= expected.abs() * 2.0**-10 + 2.0**-24).all(), name
     with torch.no_grad():
-        rgb = render(decoded, camera_at((0, -4, 0), width=9, height=7)).rgb
+        rgb = render_view(decoded, camera_at((0, -4, 0), width=9, height=7)).rgb
     assert torch.isfinite(rgb).all()
 
 

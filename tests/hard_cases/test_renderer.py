@@ -18,7 +18,7 @@ from hyrfpack.errors import HyrfError, HyrfTrainingError
 from hyrfpack.model import HybridModel
 from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.ops.background import BACKGROUND_RADIUS
-from hyrfpack.render import Rendering, RenderSettings, render
+from hyrfpack.render import Rendering, RenderSettings, render_view
 from hyrfpack.scene import Camera
 from hyrfpack.train import TrainConfig
 from hyrfpack.train.trainer import Trainer
@@ -78,7 +78,7 @@ CASES: dict[str, Callable[[], tuple[HybridModel, Camera, bool]]] = {
 
 def _render(model: HybridModel, camera: Camera) -> tuple[Rendering, dict[str, Tensor]]:
     """The rendering, and the gradients of a random linear function of it, by kind of parameter."""
-    rendering = render(model, camera, EXACT, depth=True)
+    rendering = render_view(model, camera, EXACT, depth=True)
     weights = torch.randn(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(1))
     (rendering.rgb * weights.to(rendering.rgb.dtype)).sum().backward()
     parts = {name: [getattr(model.gaussians, name)] for name in Gaussians.PARAMETER_NAMES}
@@ -116,8 +116,8 @@ def test_pictures_and_gradients_keep_to_float64(name: str) -> None:
 @torch.no_grad()
 def test_a_picture_of_4096_by_64_keeps_to_float64() -> None:
     model, camera = _balls(40), _camera(FRONT, width=4096, height=64, focal=900.0)
-    found = render(model, camera, EXACT, depth=True)
-    expected = render(model.double(), camera, EXACT, depth=True)
+    found = render_view(model, camera, EXACT, depth=True)
+    expected = render_view(model.double(), camera, EXACT, depth=True)
     assert expected.visible.sum() > 10 and (expected.alpha > 0).any(0).sum() > 300  # columns
     _assert_same_picture(found, expected)
 
@@ -131,7 +131,7 @@ def test_upside_down_is_the_upright_picture_turned(dtype: torch.dtype) -> None:
     turned = Camera(45, 37, 40.0, 47.0, 45 - 17.25, 37 - 22.5, half_turn @ upright.camera_from_world)
 
     with torch.no_grad():
-        difference = render(model, turned, EXACT).rgb.flip(0, 1) - render(model, upright, EXACT).rgb
+        difference = render_view(model, turned, EXACT).rgb.flip(0, 1) - render_view(model, upright, EXACT).rgb
 
     assert difference.abs().max() < (3e-6 if dtype == torch.float32 else 1e-13)
 
@@ -148,7 +148,7 @@ def test_a_parameter_that_is_not_finite_is_never_rendered(name: str, poison: flo
 
     try:
         with torch.no_grad():
-            rendering = hyrfpack.render(model, camera)
+            rendering = hyrfpack.render_view(model, camera)
     except HyrfError as error:
         assert "NaN or infinity" in str(error)
     else:  # an infinite logit or weight may be cut by an activation, which is as good as a large one
@@ -161,7 +161,7 @@ def test_one_nan_position_among_many_is_rejected_though_it_is_culled() -> None:
     with torch.no_grad():
         model.gaussians.positions[7, 1] = math.nan
     with pytest.raises(HyrfError, match="positions"):
-        hyrfpack.render(model, _camera(FRONT))
+        hyrfpack.render_view(model, _camera(FRONT))
 
 
 def test_kept_geometry_and_solid_colours_that_are_not_finite_are_rejected() -> None:
@@ -169,9 +169,9 @@ def test_kept_geometry_and_solid_colours_that_are_not_finite_are_rejected() -> N
     decoded = model.decode()
     decoded.geometry.opacities[:] = math.nan
     with pytest.raises(HyrfError, match="opacities"):
-        render(model, camera, decoded=decoded)
+        render_view(model, camera, decoded=decoded)
     with pytest.raises(HyrfError, match="background"):
-        render(model, camera, solid=torch.tensor([0.0, math.nan, 0.0]))
+        render_view(model, camera, solid=torch.tensor([0.0, math.nan, 0.0]))
 
 
 def test_a_pose_beyond_float32_is_rejected() -> None:
@@ -180,7 +180,7 @@ def test_a_pose_beyond_float32_is_rejected() -> None:
     pose[2, 3] = 3e38  # in local units it is more than float32 holds
     model.config = dataclasses.replace(model.config, frame=dataclasses.replace(model.config.frame, scale=0.01))
     with pytest.raises(HyrfError, match="pose"):
-        render(model, Camera(40, 30, *camera.intrinsics, pose))
+        render_view(model, Camera(40, 30, *camera.intrinsics, pose))
 
 
 def test_positions_whose_squares_overflow_are_rejected() -> None:
@@ -189,7 +189,7 @@ def test_positions_whose_squares_overflow_are_rejected() -> None:
     with torch.no_grad():
         model.gaussians.positions[:] = torch.tensor([0.0, 1e30, 0.0])
     with pytest.raises(HyrfError, match="scales"):
-        render(model, _camera(FRONT))
+        render_view(model, _camera(FRONT))
 
 
 @pytest.mark.parametrize("poison", [math.nan, math.inf, -math.inf])
@@ -231,5 +231,5 @@ def test_a_nan_model_is_not_saved(tmp_path) -> None:
     with torch.no_grad():
         model.gaussians.scale_logits[3] = math.nan
     with pytest.raises(HyrfError, match="NaN or infinite"):
-        hyrfpack.save(model, tmp_path / "model.hyrf")
+        hyrfpack.save_model(model, tmp_path / "model.hyrf")
     assert not list(tmp_path.iterdir())

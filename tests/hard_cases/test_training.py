@@ -15,14 +15,14 @@ import pytest
 import torch
 from scenes import ball_scene, camera_at, photograph, ring, view_of, visible_points_by_photo
 
-from hyrfpack import TrainConfig, evaluate, load_scene, train
-from hyrfpack.compress import compress
+from hyrfpack import TrainConfig, evaluate_model, load_scene, train_model
+from hyrfpack.compress import compress_model
 from hyrfpack.errors import HyrfTrainingError
-from hyrfpack.format import decode_model, save
+from hyrfpack.format import decode_model, save_model
 from hyrfpack.format.codec import PROFILES
 from hyrfpack.format.container import read_container
 from hyrfpack.model import Frame, HybridModel
-from hyrfpack.render import render
+from hyrfpack.render import render_view
 from hyrfpack.scene import Camera, Picture, Scene, View
 from hyrfpack.train import Trainer
 from hyrfpack.train.setup import MAX_INITIAL_COORDINATE, initial_points
@@ -113,7 +113,7 @@ def mean_psnr(model: HybridModel, views: Iterable[View]) -> float:
     for view in views:
         photo = view.load()
         with torch.no_grad():
-            error = render(model, view.camera).rgb.double().numpy() - photo.composite()
+            error = render_view(model, view.camera).rgb.double().numpy() - photo.composite()
         squares.append(error[... if photo.mask is None else photo.mask].ravel() ** 2)
     mean = np.concatenate(squares).mean()
     return float(-10 * np.log10(mean)) if mean > 0 else np.inf
@@ -136,8 +136,8 @@ def file_of(profile: str, trainer: Trainer) -> bytes:
     """What `hyrfpack compress` makes of the trained model, with its photos where it takes them."""
     with TemporaryDirectory() as folder:
         raw, packed = Path(folder) / "model.hyrf", Path(folder) / "packed.hyrf"
-        save(trainer.model, raw, "raw", {"psnr": min(mean_psnr(trainer.model, trainer.scene.train), 99.0)})
-        compress(raw, packed, profile, data=trainer.scene if profile == "compact" else None)
+        save_model(trainer.model, raw, "raw", {"psnr": min(mean_psnr(trainer.model, trainer.scene.train), 99.0)})
+        compress_model(raw, packed, profile, data=trainer.scene if profile == "compact" else None)
         return packed.read_bytes()
 
 
@@ -310,7 +310,7 @@ def test_real_photos_in_millimetres_and_kilometres_give_the_same_quality(shared_
         trainer.run()
         trainer.scene = dataclasses.replace(in_unit, train=in_unit.train[:3])  # enough to measure at
         models = (trainer.model, *(through(profile, trainer) for profile in LOSSY))
-        scores += [evaluate(model, in_unit.test[:2]).psnr for model in models]
+        scores += [evaluate_model(model, in_unit.test[:2]).psnr for model in models]
 
     assert scores[3:] == pytest.approx(scores[:3], abs=0.1)
     assert min(scores) > best_constant(scene.test[:2]) + 2
@@ -324,6 +324,6 @@ def test_photos_that_are_all_masked_are_rejected_with_a_clear_error(tmp_path):
         HyrfTrainingError,
         match="balls: the masks of all [0-9]+ photos to train on leave no pixel, 000.png for one; check",
     ):
-        train(of_pictures(all_masked), tmp_path, TrainConfig(steps=8, max_gaussians=60), quiet=True)
+        train_model(of_pictures(all_masked), tmp_path, TrainConfig(steps=8, max_gaussians=60), quiet=True)
 
     assert not (tmp_path / "model.hyrf").exists()

@@ -1,6 +1,6 @@
 """3D Gaussians as any program describes them, and how far two descriptions are apart.
 
-Written from the formats' public descriptions, without a line of `hyrfpack.export`: rotations and spherical harmonics
+Written from the formats' public descriptions, without a line of hyrfpack: rotations and spherical harmonics
 are scipy's.
 """
 

@@ -15,10 +15,10 @@ import torch
 from commands import refused, succeeded
 from scenes import ball_scene
 
-from hyrfpack.format import decode_model, describe
+from hyrfpack.format import decode_model, describe_file
 from hyrfpack.live import LiveView, live_view
 from hyrfpack.live.view import MIN_INTERVAL_RATIO, MIN_INTERVAL_SECONDS
-from hyrfpack.train import DensityConfig, TrainConfig, Trainer, train
+from hyrfpack.train import DensityConfig, TrainConfig, Trainer, train_model
 
 CONFIG = TrainConfig(
     steps=40,
@@ -58,7 +58,7 @@ class Clock:
 @pytest.mark.parametrize("background", [False, True])
 def test_a_training_with_a_view_gives_the_same_model_bit_by_bit(exposure, background, tmp_path):
     config = dataclasses.replace(CONFIG, exposure=exposure, background=background)
-    plain = train(a_scene(), tmp_path / "plain", config, quiet=True)
+    plain = train_model(a_scene(), tmp_path / "plain", config, quiet=True)
     clock = Clock(look=MIN_INTERVAL_SECONDS * MIN_INTERVAL_RATIO)
     view = LiveView(clock)
 
@@ -66,7 +66,7 @@ def test_a_training_with_a_view_gives_the_same_model_bit_by_bit(exposure, backgr
         clock.now += 1e9  # a snapshot is due after each step
         view.observe(trainer)
 
-    viewed = train(a_scene(), tmp_path / "viewed", config, quiet=True, observer=observe)
+    viewed = train_model(a_scene(), tmp_path / "viewed", config, quiet=True, observer=observe)
     assert progress(view)["snapshot"] == config.steps
     assert plain.model.read_bytes() == viewed.model.read_bytes()
     curves = [[{**record, "seconds": 0} for record in run.metrics["curve"]] for run in (plain, viewed)]
@@ -89,7 +89,7 @@ def test_a_snapshot_keeps_the_cameras_for_the_page_to_start_from(tmp_path):
     trainer.run(report=lambda trainer, *_: view.observe(trainer))
     file = tmp_path / "snapshot.hyrf"
     file.write_bytes(content(view.scene))
-    kept = describe(file)["provenance"]
+    kept = describe_file(file)["provenance"]
     assert len(kept["cameras"]) == 6 and kept["viewpoint"] and kept["steps"] == 1
 
 

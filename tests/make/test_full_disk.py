@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from hyrfpack.errors import HyrfError
-from hyrfpack.make import make
+from hyrfpack.make import make_scene
 from hyrfpack.train import Trainer
 
 
@@ -25,11 +25,11 @@ def test_a_training_whose_metrics_did_not_fit_is_completed_by_the_next_call(pose
     with monkeypatch.context() as patch:
         patch.setattr("hyrfpack.atomic.os.replace", checked)
         with pytest.raises(HyrfError, match=r"training failed: .*metrics.json: the disk is full.*is kept"):
-            make(posed, tmp_path / "scene.hyrf", quality="draft")
+            make_scene(posed, tmp_path / "scene.hyrf", quality="draft")
     model = (tmp_path / "scene.work" / "run" / "model.hyrf").read_bytes()
 
     monkeypatch.setattr(Trainer, "run", lambda *_, **__: pytest.fail("it was trained again"))
-    result = make(posed, tmp_path / "scene.hyrf", quality="draft")
+    result = make_scene(posed, tmp_path / "scene.hyrf", quality="draft")
 
     run = tmp_path / "scene.work" / "run"
     assert result.output.is_file() and (run / "model.hyrf").read_bytes() == model

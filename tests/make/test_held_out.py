@@ -10,7 +10,7 @@ import pytest
 from commands import succeeded
 
 from hyrfpack import load_scene
-from hyrfpack.make import make
+from hyrfpack.make import make_scene
 from hyrfpack.make.held_out import MAX_PSNR_GAP_DB, choose_inner_view, score_note
 from hyrfpack.make.source import LoadSettings
 from hyrfpack.scene import Camera, Scene, View
@@ -86,7 +86,7 @@ def test_a_split_of_the_sets_own_counts(posed, tmp_path):
 
 def test_a_run_of_a_small_set_finds_its_photos_again_with_the_same_one_held_out(posed, tmp_path):
     few = first_photos(posed, tmp_path, 9)
-    work = make(few, tmp_path / "scene.hyrf", quality="draft").work
+    work = make_scene(few, tmp_path / "scene.hyrf", quality="draft").work
     again = photos_of(work / "run" / "model.hyrf")
     assert [view.name for view in again.test] == [choose_inner_view(again).name]
 

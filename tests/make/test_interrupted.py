@@ -15,7 +15,7 @@ import pytest
 
 from hyrfpack.atomic import TEMPORARY_PREFIX
 from hyrfpack.errors import HyrfError
-from hyrfpack.make import Stopped, make, stages
+from hyrfpack.make import Stopped, make_scene, stages
 from hyrfpack.make.stage_cache import interruptible
 
 STAGES = {  # and what does each of them
@@ -34,7 +34,7 @@ def products(work: Path) -> dict[str, bytes]:
 @pytest.fixture(scope="module")
 def whole_work(posed, tmp_path_factory) -> Path:
     """The work folder of an uninterrupted call."""
-    return make(posed, tmp_path_factory.mktemp("whole") / "scene.html").work
+    return make_scene(posed, tmp_path_factory.mktemp("whole") / "scene.html").work
 
 
 @pytest.fixture(scope="module")
@@ -58,11 +58,11 @@ def test_an_interrupt_in_each_stage_costs_nothing(after, whole, posed, tmp_path,
         with monkeypatch.context() as patch:
             patch.setattr(stages, function, stop)
             with pytest.raises(Stopped) as caught:
-                make(posed, tmp_path / "scene.html", say=said.append)
+                make_scene(posed, tmp_path / "scene.html", say=said.append)
         assert caught.value.stage == stage and not (tmp_path / "scene.html").exists()
         assert [name for name in STAGES if any(f"{name}: done before" in s for s in said)] == done[:-1]
         done.append(stage)
-    result = make(posed, tmp_path / "scene.html")
+    result = make_scene(posed, tmp_path / "scene.html")
     assert products(result.work) == whole and result.output.read_bytes() == whole["export/scene.html"]
     assert list(result.kept) == done[:-1]
 
@@ -73,10 +73,10 @@ def test_an_interrupt_amid_training_continues_from_the_checkpoint(whole, posed, 
             signal.raise_signal(signal.SIGTERM)
 
     with pytest.raises(Stopped, match="stopped in training"):
-        make(posed, tmp_path / "scene.html", report=stop)
+        make_scene(posed, tmp_path / "scene.html", report=stop)
     assert (tmp_path / "scene.work" / "run" / "checkpoint.pt").is_file()
     words = []
-    result = make(posed, tmp_path / "scene.html", report=lambda progress: words.extend(progress.words[:1]))
+    result = make_scene(posed, tmp_path / "scene.html", report=lambda progress: words.extend(progress.words[:1]))
     assert "6/9" in words and "5/9" not in words
     assert products(result.work) == whole
 
@@ -86,9 +86,9 @@ def test_an_interrupt_in_poses_continues(photos, poses, tmp_path, monkeypatch):
         raise KeyboardInterrupt
 
     with pytest.raises(Stopped, match="stopped in poses"):
-        make(photos, tmp_path / "scene.html", quality="draft", report=stop)
-    assert make(photos, tmp_path / "scene.html", quality="draft").kept == ()
-    assert make(photos, tmp_path / "scene.ply", quality="draft").kept[0] == "poses"
+        make_scene(photos, tmp_path / "scene.html", quality="draft", report=stop)
+    assert make_scene(photos, tmp_path / "scene.html", quality="draft").kept == ()
+    assert make_scene(photos, tmp_path / "scene.ply", quality="draft").kept[0] == "poses"
 
 
 def test_an_output_that_was_copied_in_part_is_gone_on_with(posed, tmp_path, monkeypatch):
@@ -103,9 +103,9 @@ def test_an_output_that_was_copied_in_part_is_gone_on_with(posed, tmp_path, monk
     with monkeypatch.context() as patch:
         patch.setattr(stages, "copy_file", stop)
         with pytest.raises(Stopped):
-            make(posed, tmp_path / "player", quality="draft")
+            make_scene(posed, tmp_path / "player", quality="draft")
     assert len(list((tmp_path / "player").iterdir())) == 2
-    assert len(list(make(posed, tmp_path / "player", quality="draft").output.iterdir())) == 5
+    assert len(list(make_scene(posed, tmp_path / "player", quality="draft").output.iterdir())) == 5
 
 
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
@@ -148,9 +148,9 @@ def test_no_room_in_any_stage_is_a_clear_error_and_the_same_call_continues(
     changes = {"output": "scene.html", **changes, "work": work}
     output = tmp_path / changes.pop("output")
     with file_limit(limit), pytest.raises(HyrfError, match=f"{sentence}.*not allowed here"):
-        make(posed, output, **changes)
+        make_scene(posed, output, **changes)
     assert not output.exists()
-    assert make(posed, output, **changes).output.exists()
+    assert make_scene(posed, output, **changes).output.exists()
     assert not [path for path in tmp_path.rglob("*") if path.name.startswith(TEMPORARY_PREFIX)]
 
 
@@ -187,9 +187,9 @@ def test_the_time_of_interrupted_and_killed_calls_counts(posed, tmp_path, monkey
 
     for seconds, error in ((100.0, KeyboardInterrupt()), (40.0, SystemExit("killed"))):
         with monkeypatch.context() as patch, pytest.raises((Stopped, SystemExit)):
-            patch.setattr(stages, "train", end(seconds, error))
-            make(posed, tmp_path / "scene.html")
-    result = make(posed, tmp_path / "scene.html")
+            patch.setattr(stages, "train_model", end(seconds, error))
+            make_scene(posed, tmp_path / "scene.html")
+    result = make_scene(posed, tmp_path / "scene.html")
     assert result.seconds["training"] == 100 + 5 + 40 and result.total_seconds == sum(result.seconds.values())
 
 
@@ -200,4 +200,4 @@ def test_a_kill_costs_nothing(whole, posed, tmp_path):
     child.communicate()
     assert child.returncode == -signal.SIGKILL
     assert (tmp_path / "scene.work" / "make.json").is_file() and not (tmp_path / "scene.html").exists()
-    assert products(make(posed, tmp_path / "scene.html").work) == whole
+    assert products(make_scene(posed, tmp_path / "scene.html").work) == whole

@@ -16,11 +16,11 @@ from explicit_balls import ball_splats
 from exposures import random_map
 from PIL import Image
 
-from hyrfpack import evaluate, load, load_scene, save
+from hyrfpack import evaluate_model, load_model, load_scene, save_model
 from hyrfpack.errors import HyrfError
 from hyrfpack.format.min_file_size import min_file_bytes
 from hyrfpack.lock import exclusive_folder
-from hyrfpack.make import Stopped, make, stages
+from hyrfpack.make import Stopped, make_scene, stages
 from hyrfpack.make.progress import Progress, Reporter
 from hyrfpack.splats.formats import ply
 from hyrfpack.train.setup import MIN_BUDGET
@@ -33,7 +33,7 @@ STAGES = ["training", "compression", "scoring", "export"]
 def made(posed, tmp_path_factory) -> Path:
     """The work folder of a scene that was made."""
     folder = tmp_path_factory.mktemp("made")
-    make(posed, folder / "scene.hyrf")
+    make_scene(posed, folder / "scene.hyrf")
     return folder / "scene.work"
 
 
@@ -74,7 +74,7 @@ def test_scores_and_pictures_after_the_last_step_are_a_part_of_the_training():
 
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_every_ending_is_made_and_nothing_else_again(ending, made, posed, tmp_path):
-    result = make(posed, tmp_path / f"out{ending}", work=copy_of(made, tmp_path))
+    result = make_scene(posed, tmp_path / f"out{ending}", work=copy_of(made, tmp_path))
     assert result.kept == ("training", "compression", "scoring")
     files = [path for path in result.output.rglob("*") if path.is_file()] or [result.output]
     assert result.bytes == sum(path.stat().st_size for path in files) > 100
@@ -82,7 +82,7 @@ def test_every_ending_is_made_and_nothing_else_again(ending, made, posed, tmp_pa
 
 def test_photos_without_poses_get_some(photos, poses, tmp_path):
     said, shares = [], []
-    result = make(photos, tmp_path / "scene.hyrf", say=said.append, report=shares.append)
+    result = make_scene(photos, tmp_path / "scene.hyrf", say=said.append, report=shares.append)
     assert poses == [photos]
     assert list(result.seconds) == ["poses", *STAGES]
     assert result.poses["left_out"] == {"dark.jpg": "blurred"}
@@ -99,49 +99,49 @@ def test_photos_without_poses_may_come_in_an_archive(top, photos, poses, tmp_pat
         for photo in photos.iterdir():
             archive.write(photo, f"{top}{photo.name}")
     said: list[str] = []
-    make(tmp_path / "photos.zip", tmp_path / "scene.hyrf", quality="draft", say=said.append)
+    make_scene(tmp_path / "photos.zip", tmp_path / "scene.hyrf", quality="draft", say=said.append)
     (folder,) = poses
     assert folder.is_relative_to(tmp_path / "cache") and len(list(folder.rglob("*.png"))) == 18
     assert sum(str(folder) in sentence for sentence in said) == 1
-    assert len(make(tmp_path / "photos.zip", tmp_path / "scene.hyrf", quality="draft").kept) == 5
+    assert len(make_scene(tmp_path / "photos.zip", tmp_path / "scene.hyrf", quality="draft").kept) == 5
 
 
 def test_photos_with_poses_are_used_as_they_are(posed, poses, tmp_path):
-    make(posed, tmp_path / "scene.hyrf")
+    make_scene(posed, tmp_path / "scene.hyrf")
     assert not poses
 
 
 def test_a_video_gets_poses(poses, tmp_path):
     (tmp_path / "clip.MP4").write_bytes(b"frames")
-    make(tmp_path / "clip.MP4", tmp_path / "scene.hyrf", quality="draft")
+    make_scene(tmp_path / "clip.MP4", tmp_path / "scene.hyrf", quality="draft")
     assert poses == [tmp_path / "clip.MP4"]
 
 
 @pytest.mark.usefixtures("short_imports")
 def test_splats_of_other_programs_are_imported(tmp_path):
     (tmp_path / "ball.ply").write_bytes(ply.encode(ball_splats(40)))
-    result = make(tmp_path / "ball.ply", tmp_path / "scene.html", quality="draft")
+    result = make_scene(tmp_path / "ball.ply", tmp_path / "scene.html", quality="draft")
     assert list(result.seconds) == ["import", "export"] and result.export["import"]["gaussians_before"] == 40
-    again = make(tmp_path / "ball.ply", tmp_path / "scene.spz", quality="draft")
+    again = make_scene(tmp_path / "ball.ply", tmp_path / "scene.spz", quality="draft")
     assert again.kept == ("import",)
 
 
 def test_a_model_is_exported(made, tmp_path):
-    result = make(made / "model.hyrf", tmp_path / "scene.html")
-    assert list(result.seconds) == ["export"] and result.gaussians == len(load(made / "model.hyrf"))
+    result = make_scene(made / "model.hyrf", tmp_path / "scene.html")
+    assert list(result.seconds) == ["export"] and result.gaussians == len(load_model(made / "model.hyrf"))
 
 
 def test_the_score_is_of_the_packed_model_on_the_photos_held_out(made, posed, tmp_path):
-    result = make(posed, tmp_path / "scene.hyrf", work=copy_of(made, tmp_path))
-    scores = evaluate(load(result.output), load_scene(posed).test)
+    result = make_scene(posed, tmp_path / "scene.hyrf", work=copy_of(made, tmp_path))
+    scores = evaluate_model(load_model(result.output), load_scene(posed).test)
     assert (result.psnr, result.ssim, result.views) == (scores.psnr, scores.ssim, 3)
     assert result.psnr_consistent is None  # the model has no exposure map
 
 
 def test_a_model_with_an_exposure_map_is_scored_as_render_shows_it_and_at_one_exposure(made, posed, tmp_path):
-    model = load(made / "model.hyrf")
+    model = load_model(made / "model.hyrf")
     model.exposure = random_map(3, centers=6)
-    save(model, tmp_path / "model.hyrf")
+    save_model(model, tmp_path / "model.hyrf")
     state = SimpleNamespace(inputs=lambda stage: {"photos and poses": ""})
     reporter = Reporter(["scoring"], None)
     stage = lambda name, inputs, act: act(False)[0]  # noqa: E731
@@ -150,11 +150,11 @@ def test_a_model_with_an_exposure_map_is_scored_as_render_shows_it_and_at_one_ex
 
     scores = stages.run_scoring_stage(work, scene, torch.device("cpu"))
 
-    expected = evaluate(model, scene.test)
+    expected = evaluate_model(model, scene.test)
     assert scores == {
         "views": 3, "psnr": expected.psnr, "psnr_consistent": expected.psnr_consistent, "ssim": expected.ssim
     }  # fmt: skip
-    assert expected.psnr != expected.psnr_consistent == evaluate(load(made / "model.hyrf"), scene.test).psnr
+    assert expected.psnr != expected.psnr_consistent == evaluate_model(load_model(made / "model.hyrf"), scene.test).psnr
 
 
 @pytest.mark.parametrize("count, held_out", [(3, 0), (8, 1), (15, 1)])
@@ -164,13 +164,13 @@ def test_of_few_photos_few_are_held_out(count, held_out, posed, tmp_path):
     content = json.loads(table.read_text())
     content["frames"] = content["frames"][:count]
     table.write_text(json.dumps(content))
-    result = make(tmp_path / "few", tmp_path / "scene.hyrf", quality="draft")
+    result = make_scene(tmp_path / "few", tmp_path / "scene.hyrf", quality="draft")
     assert result.views == held_out and (result.psnr is None) == (held_out == 0)
 
 
 def test_a_target_size_is_met(made, posed, tmp_path):
     whole = (made / "model.hyrf").stat().st_size
-    result = make(posed, tmp_path / "scene.hyrf", target_bytes=whole * 3 // 4)
+    result = make_scene(posed, tmp_path / "scene.hyrf", target_bytes=whole * 3 // 4)
     assert result.bytes <= whole * 3 // 4 and result.gaussians < MIN_BUDGET
 
 
@@ -199,10 +199,10 @@ def test_an_impossible_target_size_is_rejected_before_any_work(
 def test_another_target_size_packs_the_trained_model_again_and_says_how_to_train_again(made, posed, tmp_path):
     work, said = copy_of(made, tmp_path), []
     target = (made / "model.hyrf").stat().st_size * 3 // 4
-    result = make(posed, tmp_path / "a.hyrf", work=work, target_bytes=target, say=said.append)
+    result = make_scene(posed, tmp_path / "a.hyrf", work=work, target_bytes=target, say=said.append)
     assert result.kept == ("training",) and result.bytes <= target
     assert any("trained without a target size" in sentence and "`work`" in sentence for sentence in said)
-    assert make(posed, tmp_path / "b.hyrf", work=work).kept == ("training",)
+    assert make_scene(posed, tmp_path / "b.hyrf", work=work).kept == ("training",)
     assert (tmp_path / "b.hyrf").read_bytes() == (made / "model.hyrf").read_bytes()
 
 
@@ -218,20 +218,20 @@ def test_a_training_that_was_stopped_continues_as_it_was_begun_whatever_target_s
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(stages, "train", stop)
+        patch.setattr(stages, "train_model", stop)
         for target in (30_000, 50_000):
             (tmp_path / "scene.work" / "run" / "metrics.json").unlink(missing_ok=True)
             with pytest.raises(Stopped):
-                make(posed, tmp_path / "scene.hyrf", target_bytes=target)
+                make_scene(posed, tmp_path / "scene.hyrf", target_bytes=target)
     assert [config.target_bytes for config in configs] == [30_000, 30_000]
     said = []
-    result = make(posed, tmp_path / "scene.hyrf", target_bytes=50_000, say=said.append)
+    result = make_scene(posed, tmp_path / "scene.hyrf", target_bytes=50_000, say=said.append)
     assert result.training["target_bytes"] == 30_000 and any("for 30,000 bytes" in sentence for sentence in said)
 
 
 def test_with_minutes_another_target_size_keeps_the_measurement_and_the_training(posed, tmp_path):
-    make(posed, tmp_path / "scene.hyrf", minutes=0.01, target_bytes=30_000)
-    result = make(posed, tmp_path / "scene.hyrf", minutes=0.01, target_bytes=50_000, overwrite=True)
+    make_scene(posed, tmp_path / "scene.hyrf", minutes=0.01, target_bytes=30_000)
+    result = make_scene(posed, tmp_path / "scene.hyrf", minutes=0.01, target_bytes=50_000, overwrite=True)
     assert result.kept == ("measurement", "training")
 
 
@@ -251,9 +251,9 @@ def test_a_work_folder_of_an_earlier_version_is_trained_again_once(made, posed, 
     training = table["stages"]["training"]
     training["inputs"]["settings"] |= training.pop("fixed")  # where both stood before
     (work / "make.json").write_text(json.dumps(table))
-    assert make(posed, tmp_path / "scene.hyrf", work=work, say=said.append).kept[:1] != ("training",)
+    assert make_scene(posed, tmp_path / "scene.hyrf", work=work, say=said.append).kept[:1] != ("training",)
     assert "training: made anew, for settings changed" in said
-    assert len(make(posed, tmp_path / "scene.hyrf", work=work).kept) == 4
+    assert len(make_scene(posed, tmp_path / "scene.hyrf", work=work).kept) == 4
 
 
 # -- what is done anew -----------------------------------------------------------------------------------------------
@@ -273,29 +273,29 @@ def test_a_work_folder_of_an_earlier_version_is_trained_again_once(made, posed, 
     ],
 )
 def test_changed_settings_redo_what_depends_on_them(settings, kept, made, posed, tmp_path):
-    result = make(posed, tmp_path / "scene.hyrf", work=copy_of(made, tmp_path), **settings)
+    result = make_scene(posed, tmp_path / "scene.hyrf", work=copy_of(made, tmp_path), **settings)
     assert result.kept == kept
 
 
 def test_a_changed_photo_redoes_poses_and_all_else_and_a_moved_folder_nothing(photos, poses, tmp_path):
-    make(photos, tmp_path / "a.hyrf", work=tmp_path / "work", quality="draft")
+    make_scene(photos, tmp_path / "a.hyrf", work=tmp_path / "work", quality="draft")
     moved = photos.rename(tmp_path / "elsewhere")
-    assert len(make(moved, tmp_path / "a.hyrf", work=tmp_path / "work", quality="draft").kept) == 5
+    assert len(make_scene(moved, tmp_path / "a.hyrf", work=tmp_path / "work", quality="draft").kept) == 5
     Image.new("RGB", (32, 32), "red").save(moved / "0003.png")
     said: list[str] = []
-    result = make(moved, tmp_path / "b.hyrf", work=tmp_path / "work", quality="draft", say=said.append)
+    result = make_scene(moved, tmp_path / "b.hyrf", work=tmp_path / "work", quality="draft", say=said.append)
     assert "poses" not in result.kept and "poses: made anew, for photos changed" in said
 
 
 def test_poses_are_kept_from_a_draft_to_another_quality_and_back(photos, poses, tmp_path):
     for quality in ("draft", "normal", "draft"):
-        make(photos, tmp_path / "scene.hyrf", quality=quality, overwrite=True)
+        make_scene(photos, tmp_path / "scene.hyrf", quality=quality, overwrite=True)
     assert poses == [photos]
 
 
 def test_matching_is_passed_on_and_counts(photos, poses, tmp_path):
-    make(photos, tmp_path / "a.hyrf", quality="draft")
-    result = make(photos, tmp_path / "b.hyrf", work=tmp_path / "a.work", quality="draft", matching="sequential")
+    make_scene(photos, tmp_path / "a.hyrf", quality="draft")
+    result = make_scene(photos, tmp_path / "b.hyrf", work=tmp_path / "a.work", quality="draft", matching="sequential")
     assert len(poses) == 2 and result.kept == ("training", "compression", "scoring")  # the poses were the same
 
 
@@ -307,27 +307,27 @@ def test_a_product_that_was_damaged_is_made_again(name, kept, made, posed, tmp_p
     work = copy_of(made, tmp_path)
     whole = (work / name).read_bytes()
     (work / name).write_bytes(whole[:100])
-    result = make(posed, tmp_path / "scene.hyrf", work=work)
+    result = make_scene(posed, tmp_path / "scene.hyrf", work=work)
     assert result.kept == kept and (work / name).read_bytes() == whole
 
 
 def test_poses_whose_photos_are_gone_are_estimated_again(photos, poses, tmp_path):
-    work = make(photos, tmp_path / "scene.hyrf", quality="draft").work
+    work = make_scene(photos, tmp_path / "scene.hyrf", quality="draft").work
     (work / "scene" / "images" / "0004.png").unlink()
     said: list[str] = []
-    result = make(photos, tmp_path / "other.hyrf", work=work, quality="draft", say=said.append)
+    result = make_scene(photos, tmp_path / "other.hyrf", work=work, quality="draft", say=said.append)
     assert len(poses) == 2 and result.kept == tuple(STAGES[:-1]) and "poses: made anew, for its files changed" in said
 
 
 def test_made_again_it_is_all_there_and_made_otherwise_it_is_not_replaced_unasked(made, posed, tmp_path):
     work, output = copy_of(made, tmp_path), tmp_path / "scene.html"
-    make(posed, output, work=work)
+    make_scene(posed, output, work=work)
     before = output.read_bytes()
-    assert len(make(posed, output, work=work).kept) == 4
+    assert len(make_scene(posed, output, work=work).kept) == 4
     with pytest.raises(HyrfError, match="other photos or with other settings.*`overwrite=True`"):
-        make(posed, output, work=work, target_bytes=1_000_000)
+        make_scene(posed, output, work=work, target_bytes=1_000_000)
     assert output.read_bytes() == before
-    make(posed, output, work=work, seed=3, overwrite=True)
+    make_scene(posed, output, work=work, seed=3, overwrite=True)
     assert output.read_bytes() != before
 
 
@@ -375,10 +375,10 @@ def test_a_stage_that_fails_names_its_folder_and_keeps_what_is_finished(posed, t
         raise HyrfError("the disk is full", fix="free some space")
 
     with monkeypatch.context() as patch:
-        patch.setattr("hyrfpack.make.stages.compress", full)
+        patch.setattr("hyrfpack.make.stages.compress_model", full)
         sentence = refused("make", posed, "-o", tmp_path / "scene.html", "--quality", "draft")
     assert "compression failed: the disk is full; free some space; what is finished is kept in" in sentence
-    assert make(posed, tmp_path / "scene.html", quality="draft").kept == ("training",)
+    assert make_scene(posed, tmp_path / "scene.html", quality="draft").kept == ("training",)
 
 
 @pytest.mark.parametrize("given", ["clip.mp4", "one photo"])
@@ -399,10 +399,10 @@ def test_a_failure_after_poses_keeps_them_and_says_so(photos, poses, tmp_path, m
         raise HyrfError("the masks leave nothing", fix="check them")
 
     with monkeypatch.context() as patch:
-        patch.setattr(stages, "train", fail)
+        patch.setattr(stages, "train_model", fail)
         with pytest.raises(HyrfError, match="training failed: .*; what is finished is kept in"):
-            make(photos, tmp_path / "scene.html")
-    assert make(photos, tmp_path / "scene.html").kept == ("poses",)
+            make_scene(photos, tmp_path / "scene.html")
+    assert make_scene(photos, tmp_path / "scene.html").kept == ("poses",)
 
 
 @pytest.mark.parametrize(
@@ -421,15 +421,15 @@ def test_a_record_that_is_damaged_is_rejected(record, reason, posed, tmp_path):
     (tmp_path / "work").mkdir()
     (tmp_path / "work" / "make.json").write_text(record)
     with pytest.raises(HyrfError, match=f"cannot be read .*{reason}.*`work`"):
-        make(posed, tmp_path / "scene.hyrf", work=tmp_path / "work")
+        make_scene(posed, tmp_path / "scene.hyrf", work=tmp_path / "work")
 
 
 def test_two_calls_in_one_work_folder_are_kept_apart(made, posed, tmp_path):
     pytest.importorskip("fcntl", reason="locks are of Unix")
     work = copy_of(made, tmp_path)
     with exclusive_folder(work), pytest.raises(HyrfError, match="another hyrfpack command is at work.*`work`"):
-        make(posed, tmp_path / "scene.hyrf", work=work)
-    assert len(make(posed, tmp_path / "scene.hyrf", work=work).kept) == 4
+        make_scene(posed, tmp_path / "scene.hyrf", work=work)
+    assert len(make_scene(posed, tmp_path / "scene.hyrf", work=work).kept) == 4
 
 
 def test_an_output_without_a_name_of_its_own_is_rejected_or_the_present_folder(made, tmp_path, monkeypatch):
@@ -466,7 +466,7 @@ def test_the_command_says_where_it_was_stopped(posed, tmp_path, monkeypatch):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("hyrfpack.make.stages.evaluate", stop)
+        patch.setattr("hyrfpack.make.stages.evaluate_model", stop)
         result = hyrfpack("make", posed, "-o", tmp_path / "scene.html", "--quality", "draft")
     assert result.exit_code == 1 and result.stdout == ""
     assert result.stderr.splitlines()[-1] == "stopped in scoring; the same command resumes"

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from hyrfpack.data import PictureCache, load_scene
-from hyrfpack.make import make, minutes
+from hyrfpack.make import make_scene, minutes
 from hyrfpack.make.minutes import SceneCost, fit_plan_to_minutes
 from hyrfpack.make.plan import Plan
 from hyrfpack.make.progress import Reporter
@@ -136,7 +136,7 @@ def test_photos_are_never_larger_than_asked_for(posed, scene, monkeypatch):
 
 
 def test_what_was_decided_is_kept(posed, tmp_path, monkeypatch):
-    first = make(posed, tmp_path / "scene.hyrf", minutes=0.01)
+    first = make_scene(posed, tmp_path / "scene.hyrf", minutes=0.01)
     assert list(first.seconds)[0] == "measurement"
     monkeypatch.setattr(minutes, "measure_scene_cost", None)
-    assert "measurement" in make(posed, tmp_path / "scene.ply", minutes=0.01).kept
+    assert "measurement" in make_scene(posed, tmp_path / "scene.ply", minutes=0.01).kept

@@ -12,7 +12,7 @@ from scenes import ball_points, ball_scene, small_model
 
 from hyrfpack.choices import CONSISTENT_EXPOSURE
 from hyrfpack.model.exposure import MAX_CENTERS, ExposureMap, apply_exposure_gains
-from hyrfpack.render import RenderSettings, render
+from hyrfpack.render import RenderSettings, render_view
 
 SEEDS = st.integers(0, 2**32 - 1)
 
@@ -103,20 +103,20 @@ def constant_map(log_gains: list[float]) -> ExposureMap:
 
 def test_render_applies_the_map_unless_one_exposure_is_asked_for():
     model, camera = small_model(ball_points(50)[0]), ball_scene().train[0].camera
-    plain = render(model, camera).rgb
+    plain = render_view(model, camera).rgb
     model.exposure = constant_map([0.5, 0.0, -0.25])
 
     gains = torch.tensor([0.5, 0.0, -0.25]).exp()
-    torch.testing.assert_close(render(model, camera).rgb, apply_exposure_gains(plain, gains))
+    torch.testing.assert_close(render_view(model, camera).rgb, apply_exposure_gains(plain, gains))
     torch.testing.assert_close(
-        render(model, camera, RenderSettings(exposure=CONSISTENT_EXPOSURE)).rgb, plain, rtol=0, atol=0
+        render_view(model, camera, RenderSettings(exposure=CONSISTENT_EXPOSURE)).rgb, plain, rtol=0, atol=0
     )
 
 
 def test_render_differentiates_through_the_map():
     model, camera = small_model(ball_points(50)[0]).requires_grad_(), ball_scene().train[0].camera
     model.exposure = constant_map([1.0, 1.0, 1.0])
-    render(model, camera).rgb.sum().backward()
+    render_view(model, camera).rgb.sum().backward()
     grad = model.gaussians.color_logits.grad
     assert grad is not None and grad.isfinite().all() and grad.abs().sum() > 0
 

@@ -30,35 +30,35 @@ scene = ball_scene(8, side=24)
 scene = replace(scene, test=scene.train[:2])
 model = small_model(np.random.default_rng(0).normal(size=(6_000, 3)) * 0.3, fields=1.0, scale_logits=-6.0)
 cameras = provenance_cameras([view.camera for view in scene.train])
-hyrfpack.save(model, "model.hyrf", provenance={"cameras": cameras})
+hyrfpack.save_model(model, "model.hyrf", provenance={"cameras": cameras})
 write_demo_scene(Path("demo"), views=4, size=16)
 
 def load_scene():
     return hyrfpack.load_scene("demo").train[0].load().rgb.tobytes()
 
 def load():
-    return hyrfpack.load("model.hyrf").gaussians.positions.detach().numpy().tobytes()
+    return hyrfpack.load_model("model.hyrf").gaussians.positions.detach().numpy().tobytes()
 
 def save():
-    hyrfpack.save(hyrfpack.load("model.hyrf"), "saved.hyrf", "raw")
+    hyrfpack.save_model(hyrfpack.load_model("model.hyrf"), "saved.hyrf", "raw")
     return Path("saved.hyrf").read_bytes()
 
 def render():
     with torch.no_grad():
-        return hyrfpack.render(model, scene.test[0].camera, decoded=model.decode()).rgb.numpy().tobytes()
+        return hyrfpack.render_view(model, scene.test[0].camera, decoded=model.decode()).rgb.numpy().tobytes()
 
 def evaluate():
-    return str(hyrfpack.evaluate(model, scene.test, pictures="views").psnr).encode()
+    return str(hyrfpack.evaluate_model(model, scene.test, pictures="views").psnr).encode()
 
 def train():
-    return hyrfpack.train(scene, "run", hyrfpack.TrainConfig(steps=3), overwrite=True).model.read_bytes()
+    return hyrfpack.train_model(scene, "run", hyrfpack.TrainConfig(steps=3), overwrite=True).model.read_bytes()
 
 def compress():
-    hyrfpack.compress("model.hyrf", "compact.hyrf", data=scene, finetune_steps=2)
+    hyrfpack.compress_model("model.hyrf", "compact.hyrf", data=scene, finetune_steps=2)
     return Path("compact.hyrf").read_bytes()
 
 def export():
-    hyrfpack.export("model.hyrf", "model.spz", degree=1)
+    hyrfpack.export_model("model.hyrf", "model.spz", degree=1)
     return Path("model.spz").read_bytes()
 
 def send_result(function, sender):

@@ -11,7 +11,7 @@ from PIL import Image
 from scenes import ball_points, ring, small_model
 
 from hyrfpack.errors import HyrfError
-from hyrfpack.render import render
+from hyrfpack.render import render_view
 from hyrfpack.render.files import render_files, save_picture, unique_stems
 from hyrfpack.render.video import write_video
 
@@ -37,7 +37,7 @@ def test_rendered_files_hold_the_rounded_render_and_exact_depth(tmp_path):
     model, camera = small_model(points, scale_logits=-2.0), ring(1)[0]
     (path,) = render_files(model, [("deep/down/a.jpg", camera)], tmp_path / "out", depth=True)
     with torch.no_grad():
-        expected = render(model, camera, depth=True)
+        expected = render_view(model, camera, depth=True)
     assert path == tmp_path / "out" / "deep" / "down" / "a.png"
     saved = np.asarray(Image.open(path)).astype(np.float64)
     np.testing.assert_allclose(saved, 255 * expected.rgb.clamp(0, 1).numpy(), atol=0.501)

@@ -11,7 +11,7 @@ from scenes import ball_points, camera_at, look_at, ring, small_model
 from hyrfpack.model import Frame
 from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.ops.background import BACKGROUND_RADIUS, reference
-from hyrfpack.render import RenderSettings, render
+from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.scene import Camera
 
 FRAME = Frame((10.0, -20.0, 5.0), 7.0, (1.0, 0.5, 0.5))
@@ -36,7 +36,7 @@ def ball_model(count: int = 120, **settings):
 
 def picture(model, camera, **options) -> torch.Tensor:
     with torch.no_grad():
-        return render(model, camera, **options).rgb
+        return render_view(model, camera, **options).rgb
 
 
 def exact_sky(model, camera) -> torch.Tensor:
@@ -58,7 +58,7 @@ def test_a_single_gaussian_lands_where_the_camera_model_says(local):
     x, y, z = camera.rotation @ world(local) + camera.camera_from_world[:3, 3]
 
     with torch.no_grad():
-        rendering = render(model, camera, depth=True)
+        rendering = render_view(model, camera, depth=True)
 
     weights = rendering.alpha.double().numpy()
     rows, columns = np.indices(weights.shape) + 0.5
@@ -76,7 +76,7 @@ def test_a_single_gaussian_is_as_wide_as_projected():
     camera = camera_at((0, -2.0, 0), width=96, height=96, focal=200.0)
 
     with torch.no_grad():
-        alpha = render(model, camera).alpha.double().numpy()
+        alpha = render_view(model, camera).alpha.double().numpy()
 
     variance = (200 * 0.05 / 2) ** 2 + 0.3
     rows, columns = np.indices(alpha.shape) + 0.5 - 48
@@ -126,7 +126,7 @@ def test_the_near_plane_is_in_local_units(depth, seen):
     on_axis = local_pose[:3, :3].T @ (np.array([0, 0, depth]) - local_pose[:3, 3])
     model = small_model([on_axis], frame=FRAME, scale_logits=-6.0)
     with torch.no_grad():
-        rendering = render(model, camera, RenderSettings(near=0.01))
+        rendering = render_view(model, camera, RenderSettings(near=0.01))
     assert len(rendering.indices) == rendering.visible.sum() == seen
     assert bool(rendering.alpha.max() > 0) == seen
 
@@ -138,7 +138,7 @@ def test_the_near_plane_is_in_local_units(depth, seen):
 def test_any_picture_size_renders_whole(width, height):
     model, camera = ball_model(background=True), camera_at((0, -3.0, 0), width=width, height=height, focal=20.0)
     with torch.no_grad():
-        rendering = render(model, camera, depth=True)
+        rendering = render_view(model, camera, depth=True)
     assert rendering.rgb.shape == (height, width, 3)
     assert rendering.alpha.shape == rendering.depth.shape == (height, width)
     assert torch.isfinite(rendering.rgb).all() and rendering.alpha.max() > 0.2
@@ -161,7 +161,7 @@ def test_any_picture_size_renders_whole(width, height):
 def test_pictures_stay_in_range_wherever_the_camera_is(position, target):
     model = ball_model(background=True)
     with torch.no_grad():
-        rendering = render(model, camera_at(position, target), depth=True)
+        rendering = render_view(model, camera_at(position, target), depth=True)
     assert rendering.rgb.min() >= 0 and rendering.rgb.max() <= 1 + 1e-5
     assert torch.isfinite(rendering.depth).all()
 
@@ -173,7 +173,7 @@ def test_nothing_to_draw_leaves_the_background_alone(background, empty):
     positions = ball_points(20)[0] if empty == "all behind the camera" else np.zeros((0, 3))
     model = small_model(positions, fields=1.0, background=background, solid=(0.25, 0.5, 0.75))
 
-    rendering = render(model, camera, EXACT, depth=True, absgrad=True)
+    rendering = render_view(model, camera, EXACT, depth=True, absgrad=True)
 
     expected = exact_sky(model, camera) if background else torch.tensor([0.25, 0.5, 0.75]).expand(32, 32, 3)
     torch.testing.assert_close(rendering.rgb, expected)
@@ -190,8 +190,8 @@ def test_the_background_shines_through_what_light_is_left():
     """C = C_fg + T c, with the parts rendered apart."""
     model, camera = ball_model(background=True), ring(8)[1]
     with torch.no_grad():
-        whole = render(model, camera, EXACT)
-        gaussians = render(model, camera, background=False)
+        whole = render_view(model, camera, EXACT)
+        gaussians = render_view(model, camera, background=False)
 
     left = 1 - whole.alpha[..., None]
     assert 0.2 < left.mean() < 0.95 and left.min() < 0.5
@@ -201,9 +201,9 @@ def test_the_background_shines_through_what_light_is_left():
 def test_pixels_below_the_threshold_get_no_background():
     model, camera = ball_model(background=True), ring(8)[1]
     with torch.no_grad():
-        whole = render(model, camera, EXACT)
-        cut = render(model, camera, RenderSettings(background_threshold=0.6, background_stride=1))
-        gaussians = render(model, camera, background=False)
+        whole = render_view(model, camera, EXACT)
+        cut = render_view(model, camera, RenderSettings(background_threshold=0.6, background_stride=1))
+        gaussians = render_view(model, camera, background=False)
 
     skipped = 1 - whole.alpha <= 0.6
     assert 10 < skipped.sum() < skipped.numel() - 10
@@ -249,8 +249,8 @@ def test_no_pixel_above_the_threshold_lacks_background(stride):
     """What a threshold leaves out is only what lies below it, whatever the stride."""
     model, camera = ball_model(background=True, opacity_logits=5.0), ring(8, width=33, height=29)[1]
     with torch.no_grad():
-        whole = render(model, camera, RenderSettings(background_threshold=0.0, background_stride=stride))
-        cut = render(model, camera, RenderSettings(background_threshold=0.3, background_stride=stride))
+        whole = render_view(model, camera, RenderSettings(background_threshold=0.0, background_stride=stride))
+        cut = render_view(model, camera, RenderSettings(background_threshold=0.3, background_stride=stride))
     seen = 1 - whole.alpha > 0.3
     assert 50 < seen.sum() < seen.numel() - 50
     torch.testing.assert_close(cut.rgb[seen], whole.rgb[seen], rtol=0, atol=1e-6)
@@ -266,9 +266,9 @@ def test_the_default_threshold_does_not_show_in_8_bits():
 def test_a_solid_colour_lies_behind_a_model_without_a_sphere():
     model, camera = ball_model(solid=(1.0, 0.0, 0.5)), ring(8)[2]
     with torch.no_grad():
-        black = render(model, camera, solid=torch.zeros(3))
-        own = render(model, camera)
-        asked = render(model, camera, solid=torch.tensor([0.2, 0.4, 0.6]))
+        black = render_view(model, camera, solid=torch.zeros(3))
+        own = render_view(model, camera)
+        asked = render_view(model, camera, solid=torch.tensor([0.2, 0.4, 0.6]))
 
     left = 1 - black.alpha[..., None]
     torch.testing.assert_close(own.rgb, black.rgb + left * torch.tensor([1.0, 0.0, 0.5]), rtol=0, atol=1e-6)
@@ -279,8 +279,8 @@ def test_antialiasing_dims_small_gaussians_by_what_the_low_pass_adds():
     camera, small = camera_at((0, -3.0, 0)), {"scale_logits": -4.0, "opacity_logits": 3.0}
     variance = (32 / 3 / (1 + np.exp(4.0))) ** 2  # px^2, before the low-pass of 0.3
     with torch.no_grad():
-        plain = render(small_model([[0.0, 0, 0]], **small), camera).alpha.max()
-        compensated = render(small_model([[0.0, 0, 0]], antialiased=True, **small), camera).alpha.max()
+        plain = render_view(small_model([[0.0, 0, 0]], **small), camera).alpha.max()
+        compensated = render_view(small_model([[0.0, 0, 0]], antialiased=True, **small), camera).alpha.max()
     assert float(compensated / plain) == pytest.approx(variance / (variance + 0.3), rel=1e-3)
 
 
@@ -315,7 +315,7 @@ def test_rendering_twice_gives_the_same_bits():
     results = []
     for _ in range(2):
         model = ball_model(background=True)
-        rendering = render(model, ring(8)[3], depth=True, absgrad=True)
+        rendering = render_view(model, ring(8)[3], depth=True, absgrad=True)
         rendering.rgb.square().sum().backward()
         gradients = [p.grad for p in model.parameters()]
         results.append([rendering.rgb.detach(), rendering.alpha.detach(), rendering.absgrad, *gradients])
@@ -326,7 +326,7 @@ def test_rendering_twice_gives_the_same_bits():
 def test_statistics_describe_the_picture():
     model, camera = ball_model(), camera_at((0, -3.0, 0), (0.5, 0, 0), focal=60.0)
     with torch.no_grad():
-        rendering = render(model, camera)
+        rendering = render_view(model, camera)
     assert 0 < len(rendering.indices) < len(model)  # the camera sees a part
     assert 0 < rendering.visible.sum() <= len(rendering.indices)
     assert rendering.pairs >= rendering.visible.sum()
@@ -363,7 +363,7 @@ def test_torch_computes_on_one_thread_while_rendering_and_on_as_many_as_before_a
 @pytest.mark.parametrize("background", [True, False])
 def test_gradients_reach_every_parameter(background):
     model = ball_model(background=background)
-    rendering = render(model, ring(8)[0], absgrad=True)
+    rendering = render_view(model, ring(8)[0], absgrad=True)
     assert (rendering.absgrad == 0).all()
 
     (rendering.rgb * torch.linspace(0, 1, 32 * 32 * 3).view(32, 32, 3)).sum().backward()
@@ -392,12 +392,12 @@ def test_gradients_match_finite_differences_through_the_whole_chain(part, stride
         with torch.no_grad():
             for p, d in zip(parameters, directions, strict=True):
                 p.add_(step * d)
-            total = float((render(model, camera, settings).rgb * weights).sum())
+            total = float((render_view(model, camera, settings).rgb * weights).sum())
             for p, d in zip(parameters, directions, strict=True):
                 p.sub_(step * d)
         return total
 
-    (render(model, camera, settings).rgb * weights).sum().backward()
+    (render_view(model, camera, settings).rgb * weights).sum().backward()
     slope = sum(float((p.grad * d).sum()) for p, d in zip(parameters, directions, strict=True))
 
     step = 1e-7

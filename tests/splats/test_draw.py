@@ -7,7 +7,7 @@ from scenes import camera_at, small_model
 
 from hyrfpack.export.bake import bake
 from hyrfpack.model import Frame
-from hyrfpack.render import RenderSettings, render
+from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.splats.draw import Drawable, draw
 from hyrfpack.splats.harmonics import SH_C0
 from hyrfpack.splats.splats import Splats
@@ -62,7 +62,7 @@ def test_splats_far_from_the_origin_look_like_the_model_they_are(antialiased):
     camera = camera_at(np.add(frame.center, (0, -90, 20)), frame.center)
     drawn = draw(Drawable.from_splats(bake(model, [], (0,))[0], frame), camera)
     with torch.no_grad():
-        assert (drawn.rgb - render(model, camera).rgb).abs().max() < 2e-4
+        assert (drawn.rgb - render_view(model, camera).rgb).abs().max() < 2e-4
 
 
 def test_culling_leaves_out_centres_outside_the_picture():

@@ -13,7 +13,7 @@ from scenes import ball_scene, ring, small_model
 from hyrfpack.data import PictureCache
 from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.model.hash_grid import HashGrid
-from hyrfpack.render import render
+from hyrfpack.render import render_view
 from hyrfpack.train import DensityConfig, LearningRates, TrainConfig, Trainer
 from tools.studies import ablation_models, ablations
 
@@ -207,10 +207,10 @@ def test_without_pre_culling_every_gaussian_is_decoded():
     camera = dataclasses.replace(ring(1)[0], width=6, cx=3.0)  # a slit that sees few of them
 
     with ablations.culling(ablation_models.NO_CULLING):
-        everything = render(model, camera)
+        everything = render_view(model, camera)
 
     assert len(everything.indices) == len(model)
-    assert len(render(model, camera).indices) < len(model)
+    assert len(render_view(model, camera).indices) < len(model)
 
 
 @pytest.mark.parametrize("steps", [1, 3], ids=["in the last step", "midway"])

@@ -51,7 +51,7 @@ def test_a_run_that_another_call_trains_is_left_out(call, tmp_path):
 
 
 def test_a_stopped_run_resumes_from_its_checkpoint(call, monkeypatch):
-    train, resumed = long_runs.hyrfpack.train, []
+    train, resumed = long_runs.hyrfpack.train_model, []
 
     def stop_once(scene, folder, config, *, resume, **options):
         resumed.append(resume)

@@ -19,7 +19,7 @@ from rank_processes import ProcessOutcome, needs_ranks, run_on_ranks
 from hyrfpack.errors import HyrfError
 from hyrfpack.ops.ssim import photometric_loss
 from hyrfpack.parallel.ranks import SINGLE_PROCESS
-from hyrfpack.render import render
+from hyrfpack.render import render_view
 from hyrfpack.scene import Scene
 from hyrfpack.train import TrainConfig, Trainer
 from hyrfpack.train.density import DensityControl
@@ -54,7 +54,7 @@ def one_for_all(scene: Scene, config: TrainConfig) -> tuple[list[Row], Trainer]:
         learnt = [*model.parameters(), *([exposures.values] if exposures else [])]
         sums = [torch.zeros_like(parameter) for parameter in learnt]
         for view in own:
-            drawn = render(model, view.camera, absgrad=density.watching(step))
+            drawn = render_view(model, view.camera, absgrad=density.watching(step))
             image = exposures.exposed(drawn.rgb, view) if exposures else drawn.rgb
             photo = torch.from_numpy(view.load().composite())
             loss = photometric_loss(image, photo, None, ssim_weight=config.ssim_weight)

@@ -11,7 +11,7 @@ from scenes import alternating_gains, ball_scene, exposed_scene
 
 from hyrfpack.data import PictureCache
 from hyrfpack.errors import HyrfTrainingError
-from hyrfpack.evaluate import evaluate
+from hyrfpack.evaluate import evaluate_model
 from hyrfpack.scene import Scene, View
 from hyrfpack.train import TrainConfig, Trainer
 from hyrfpack.train.exposure import GAIN_DECAY, MIN_PIXEL_LEVEL, Exposures, Observations, gains_from, observe
@@ -233,6 +233,6 @@ def test_exposure_that_drifts_stays_out_of_the_model():
     )
 
     model = trained(split, dataclasses.replace(SHORT, steps=200)).model
-    scores = evaluate(model, split.test)
+    scores = evaluate_model(model, split.test)
 
     assert scores.psnr_consistent is not None and scores.psnr > scores.psnr_consistent + 1

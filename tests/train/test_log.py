@@ -15,7 +15,7 @@ from scenes import ball_scene
 
 from hyrfpack.errors import HyrfError
 from hyrfpack.scene import Scene
-from hyrfpack.train import TrainConfig, log, train
+from hyrfpack.train import TrainConfig, log, train_model
 from hyrfpack.train.log import TrainingLog, peak_memory
 from hyrfpack.train.trainer import MIN_CURVE_RECORDS
 
@@ -38,7 +38,7 @@ def read(path: Path) -> list[dict]:
 
 
 def test_each_line_says_where_the_run_is_and_the_last_what_it_came_to(tmp_path: Path) -> None:
-    result = train(a_scene(), tmp_path / "run", CONFIG, quiet=True, log=tmp_path / "new" / "log.jsonl")
+    result = train_model(a_scene(), tmp_path / "run", CONFIG, quiet=True, log=tmp_path / "new" / "log.jsonl")
 
     *steps, end = read(tmp_path / "new" / "log.jsonl")
     assert [record["step"] for record in steps] == list(range(1, CONFIG.steps + 1))
@@ -91,14 +91,14 @@ def test_a_resumed_run_adds_to_its_log_and_another_begins_again(tmp_path: Path) 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("hyrfpack.train.trainer.Trainer._record", lambda *_: next(stop) and _interrupt())
         with pytest.raises(KeyboardInterrupt):
-            train(a_scene(), where, CONFIG, quiet=True, log=file)
-    train(a_scene(), where, CONFIG, quiet=True, log=file, resume=True)
+            train_model(a_scene(), where, CONFIG, quiet=True, log=file)
+    train_model(a_scene(), where, CONFIG, quiet=True, log=file, resume=True)
 
     steps = [record["step"] for record in read(file) if record["event"] == "step"]
     assert steps == [*range(1, 10), *range(10, CONFIG.steps + 1)]
     with pytest.raises(HyrfError, match="log"):
-        train(a_scene(), tmp_path / "other", CONFIG, quiet=True, log=file)
-    train(a_scene(), tmp_path / "other", TrainConfig(steps=2), quiet=True, log=file, overwrite=True)
+        train_model(a_scene(), tmp_path / "other", CONFIG, quiet=True, log=file)
+    train_model(a_scene(), tmp_path / "other", TrainConfig(steps=2), quiet=True, log=file, overwrite=True)
     assert [record["step"] for record in read(file)] == [1, 2, 2]
 
 
@@ -112,7 +112,7 @@ def test_a_run_that_fails_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
     monkeypatch.setattr("hyrfpack.train.trainer.Trainer._train_step", fail)
     with pytest.raises(HyrfError):
-        train(a_scene(), tmp_path / "run", CONFIG, quiet=True, log=tmp_path / "log.jsonl")
+        train_model(a_scene(), tmp_path / "run", CONFIG, quiet=True, log=tmp_path / "log.jsonl")
 
     assert read(tmp_path / "log.jsonl") == [{"event": "end", "complete": False, "error": "it is broken; repair it"}]
 
@@ -120,7 +120,7 @@ def test_a_run_that_fails_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 def test_a_log_that_cannot_be_begun_is_found_before_the_first_step(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(HyrfError, match="file"):
-        train(a_scene(), tmp_path / "run", CONFIG, quiet=True, log=tmp_path / "file" / "log.jsonl")
+        train_model(a_scene(), tmp_path / "run", CONFIG, quiet=True, log=tmp_path / "file" / "log.jsonl")
     assert not (tmp_path / "run" / "model.hyrf").exists()
 
 

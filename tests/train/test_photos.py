@@ -15,7 +15,7 @@ from scenes import ball_scene
 from hyrfpack.data import PictureCache, load_scene
 from hyrfpack.errors import HyrfDataError, HyrfTrainingError
 from hyrfpack.scene import Picture, Scene, View
-from hyrfpack.train import TrainConfig, Trainer, train
+from hyrfpack.train import TrainConfig, Trainer, train_model
 
 CONFIG = TrainConfig(steps=2, max_gaussians=60)
 
@@ -49,12 +49,12 @@ def split(train=lambda view: view, test=lambda view: view) -> Scene:
 
 def test_black_masks_of_all_photos_are_rejected_before_the_first_step(no_step, tmp_path):
     with pytest.raises(HyrfTrainingError, match=r"all 4 photos to train on leave no pixel, 002\.png for one"):
-        train(split(train=masked), tmp_path, CONFIG, quiet=True)
+        train_model(split(train=masked), tmp_path, CONFIG, quiet=True)
 
 
 def test_black_masks_of_all_held_out_photos_are_rejected_before_the_first_step(no_step, tmp_path):
     with pytest.raises(HyrfTrainingError, match=r"all 2 photos to score leave no pixel, 000\.png for one"):
-        train(split(test=masked), tmp_path, CONFIG, quiet=True)
+        train_model(split(test=masked), tmp_path, CONFIG, quiet=True)
 
 
 def test_a_black_mask_file_for_every_photo_is_rejected_by_the_command(no_step, photos, tmp_path):
@@ -72,7 +72,7 @@ def test_one_photo_with_a_pixel_to_train_on_and_one_to_score_are_enough(tmp_path
         scene, train=[masked(first), *others], test=[masked(scene.test[0]), scene.test[1]], notes=[]
     )
 
-    result = train(scene, tmp_path, dataclasses.replace(CONFIG, steps=8), quiet=True)
+    result = train_model(scene, tmp_path, dataclasses.replace(CONFIG, steps=8), quiet=True)
 
     assert result.metrics["evaluation"]["skipped"] == ["000.png"]
 
@@ -82,7 +82,7 @@ def test_a_truncated_held_out_photo_is_rejected_before_the_first_step_and_named(
     (photos / "images" / "0008.png").write_bytes(whole[: len(whole) // 2])
 
     with pytest.raises(HyrfDataError, match=r"0008\.png: cannot decode the picture"):
-        train(load_scene(photos), tmp_path / "run", CONFIG, quiet=True)
+        train_model(load_scene(photos), tmp_path / "run", CONFIG, quiet=True)
 
 
 def test_photos_to_train_on_are_not_all_read_beforehand(tmp_path):
@@ -92,6 +92,6 @@ def test_photos_to_train_on_are_not_all_read_beforehand(tmp_path):
         return dataclasses.replace(view, load=lambda: read.append(view.name) or view.load())
 
     scene = dataclasses.replace(split(train=counted), test=[])
-    train(scene, tmp_path, dataclasses.replace(CONFIG, steps=1), cache=PictureCache(), quiet=True)
+    train_model(scene, tmp_path, dataclasses.replace(CONFIG, steps=1), cache=PictureCache(), quiet=True)
 
     assert len(read) <= 2  # the one that has a pixel, and that of the step

@@ -18,7 +18,7 @@ def run(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A short run on photos that were split and shrunk otherwise than by default."""
     folder = tmp_path_factory.mktemp("photos_of") / "run"
     scene = hyrfpack.load_scene(data, test_every=5, max_size=40)
-    hyrfpack.train(scene, folder, hyrfpack.TrainConfig(steps=3, max_gaussians=100), quiet=True)
+    hyrfpack.train_model(scene, folder, hyrfpack.TrainConfig(steps=3, max_gaussians=100), quiet=True)
     return folder
 
 

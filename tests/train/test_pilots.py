@@ -17,7 +17,7 @@ from hyrfpack.evaluate import Evaluation, ViewScore
 from hyrfpack.format.exposure_header import STOPS_PER_LOG_GAIN
 from hyrfpack.model.exposure import apply_exposure_gains
 from hyrfpack.scene import Scene, View
-from hyrfpack.train import TrainConfig, budget_pilots, decisions, exposure_pilots, pilots, train
+from hyrfpack.train import TrainConfig, budget_pilots, decisions, exposure_pilots, pilots, train_model
 from hyrfpack.train.budget_pilots import BUDGET_FACTORS, measure_budget
 from hyrfpack.train.decisions import (
     MIN_BUDGET_STEPS,
@@ -77,7 +77,7 @@ def scores(monkeypatch) -> dict:
         return scored(0.0, table[config.max_gaussians])
 
     monkeypatch.setattr(pilots, "Trainer", Untrained)
-    monkeypatch.setattr(pilots, "evaluate", evaluate)
+    monkeypatch.setattr(pilots, "evaluate_model", evaluate)
     return table
 
 
@@ -103,7 +103,7 @@ def test_what_would_make_the_model_smaller_is_asked_twice(monkeypatch, scores, f
             seeds.append(config.seed)
 
     monkeypatch.setattr(pilots, "Trainer", Seeded)
-    monkeypatch.setattr(pilots, "evaluate", lambda model, views, report: scored(0.0, model))
+    monkeypatch.setattr(pilots, "evaluate_model", lambda model, views, report: scored(0.0, model))
     assert measured(a_scene())[0] == factor
     assert seeds == ([0, 0] if first >= 1 else [0, 0, 1, 1])
 
@@ -178,7 +178,7 @@ def masked(view: View) -> View:
 @pytest.mark.usefixtures("short")
 def test_a_run_has_the_budget_that_pilots_tell_and_says_why(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(decisions, "measure_budget", lambda *_: (0.5, "by a coin"))
-    train(a_scene(), tmp_path, TrainConfig(steps=10))
+    train_model(a_scene(), tmp_path, TrainConfig(steps=10))
     metrics = json.loads((tmp_path / "metrics.json").read_bytes())
     assert metrics["settings"]["budget_factor"] == 0.5
     reason = metrics["choices"]["max_gaussians"]
@@ -201,14 +201,14 @@ def interrupted_at(step: int):
 @pytest.mark.usefixtures("short", "signals")
 def test_a_run_that_continues_keeps_its_budget_and_the_reason(tmp_path, monkeypatch):
     config = TrainConfig(steps=10)
-    train(a_scene(), tmp_path / "whole", config, quiet=True)
-    assert train(a_scene(), tmp_path / "again", config, report=interrupted_at(6)).step == 6
+    train_model(a_scene(), tmp_path / "whole", config, quiet=True)
+    assert train_model(a_scene(), tmp_path / "again", config, report=interrupted_at(6)).step == 6
 
     monkeypatch.setattr(decisions, "measure_budget", lambda *_: pytest.fail("measured again"))
     for asked in ({"max_gaussians": 5_000}, {"target_bytes": 20_000}, {"budget_factor": 0.9}):
         with pytest.raises(HyrfTrainingError, match="started with other settings"):
-            train(a_scene(), tmp_path / "again", dataclasses.replace(config, **asked), resume=True, quiet=True)
-    train(a_scene(), tmp_path / "again", config, resume=True, quiet=True)
+            train_model(a_scene(), tmp_path / "again", dataclasses.replace(config, **asked), resume=True, quiet=True)
+    train_model(a_scene(), tmp_path / "again", config, resume=True, quiet=True)
 
     whole, again = (json.loads((tmp_path / name / "metrics.json").read_bytes()) for name in ("whole", "again"))
     assert whole["settings"] == again["settings"] and whole["choices"] == again["choices"]
@@ -218,7 +218,7 @@ def test_a_run_that_continues_keeps_its_budget_and_the_reason(tmp_path, monkeypa
 
 @pytest.mark.usefixtures("short", "signals")
 def test_an_interrupt_before_the_first_step_leaves_nothing(tmp_path):
-    result = train(a_scene(), tmp_path, TrainConfig(steps=10), report=interrupted_at(0))
+    result = train_model(a_scene(), tmp_path, TrainConfig(steps=10), report=interrupted_at(0))
     assert (result.complete, result.step, result.model, result.metrics) == (False, 0, None, {})
     assert not any(tmp_path.iterdir())
 
@@ -226,7 +226,7 @@ def test_an_interrupt_before_the_first_step_leaves_nothing(tmp_path):
 @pytest.mark.usefixtures("short")
 def test_the_report_hears_of_pilots_as_step_nought(tmp_path):
     steps: list[int] = []
-    train(a_scene(), tmp_path, TrainConfig(steps=10), report=lambda step, *_: steps.append(step))
+    train_model(a_scene(), tmp_path, TrainConfig(steps=10), report=lambda step, *_: steps.append(step))
     assert steps[-10:] == list(range(1, 11)) and steps[:-10] in ([0] * 12, [0] * 24)
 
 
@@ -366,10 +366,10 @@ def test_a_run_that_continues_keeps_its_exposure_compensation(tmp_path, monkeypa
     monkeypatch.setattr(decisions, "MIN_EXPOSURE_STEPS", 10)
     monkeypatch.setattr(decisions, "measure_exposure", lambda *_: (True, "by a coin"))
     scene, config = relit(a_scene(), [0.5, -0.5]), TrainConfig(steps=10)
-    train(scene, tmp_path / "whole", config, quiet=True)
-    assert train(scene, tmp_path / "again", config, report=interrupted_at(6)).step == 6
+    train_model(scene, tmp_path / "whole", config, quiet=True)
+    assert train_model(scene, tmp_path / "again", config, report=interrupted_at(6)).step == 6
     monkeypatch.setattr(decisions, "measure_exposure", lambda *_: pytest.fail("measured again"))
-    train(scene, tmp_path / "again", config, resume=True, quiet=True)
+    train_model(scene, tmp_path / "again", config, resume=True, quiet=True)
 
     whole, again = (json.loads((tmp_path / name / "metrics.json").read_bytes()) for name in ("whole", "again"))
     assert whole["settings"]["exposure"] is again["settings"]["exposure"] is True

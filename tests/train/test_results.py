@@ -16,7 +16,7 @@ from scenes import ball_scene
 from hyrfpack.errors import HyrfDataError, HyrfError, HyrfTrainingError
 from hyrfpack.outputs import StrPath
 from hyrfpack.scene import Scene
-from hyrfpack.train import TrainConfig, Trainer, train
+from hyrfpack.train import TrainConfig, Trainer, train_model
 from hyrfpack.train import run as runs
 
 CONFIG = TrainConfig(steps=20, seed=1, max_gaussians=120)
@@ -65,14 +65,14 @@ def no_training(monkeypatch):
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("runs") / "undisturbed"
-    train(a_scene(), out, CONFIG, quiet=True)
+    train_model(a_scene(), out, CONFIG, quiet=True)
     return out
 
 
 @pytest.mark.parametrize("resume", [False, True])
 def test_metrics_that_did_not_fit_are_completed_without_training(full, no_training, undisturbed, tmp_path, resume):
     full.add("metrics.json")
-    result = train(a_scene(), tmp_path, CONFIG, quiet=True)
+    result = train_model(a_scene(), tmp_path, CONFIG, quiet=True)
     assert result.complete and result.model.is_file() and result.metrics["evaluation"]["psnr"] > 0
     assert "metrics.json: the disk is full" in result.missing
     assert names(tmp_path) == {"model.hyrf", "curve.png", "views", "training.json"}
@@ -80,7 +80,7 @@ def test_metrics_that_did_not_fit_are_completed_without_training(full, no_traini
 
     full.clear()
     no_training()
-    completed = train(a_scene(), tmp_path, CONFIG, resume=resume, quiet=True)
+    completed = train_model(a_scene(), tmp_path, CONFIG, resume=resume, quiet=True)
 
     assert completed.complete and completed.step == 20 and completed.missing == ""
     assert names(tmp_path) == COMPLETE
@@ -98,7 +98,7 @@ def test_metrics_that_did_not_fit_are_completed_without_training(full, no_traini
 @pytest.mark.parametrize(("ending", "missing"), [("curve.png", "curve.png"), (".png", "views and curve.png")])
 def test_pictures_that_do_not_fit_do_not_fail_the_run(full, no_training, tmp_path, capsys, ending, missing):
     full.add(ending)
-    result = train(a_scene(), tmp_path, CONFIG)
+    result = train_model(a_scene(), tmp_path, CONFIG)
     assert result.complete and metrics_of(tmp_path) == json.loads(json.dumps(result.metrics))
     verb = "is" if ending == "curve.png" else "are"
     told = capsys.readouterr().err
@@ -106,7 +106,7 @@ def test_pictures_that_do_not_fit_do_not_fail_the_run(full, no_training, tmp_pat
 
     full.clear()
     no_training()
-    train(a_scene(), tmp_path, CONFIG, quiet=True)
+    train_model(a_scene(), tmp_path, CONFIG, quiet=True)
     assert names(tmp_path) == COMPLETE and len(list((tmp_path / "views").iterdir())) == 2
 
 
@@ -120,12 +120,12 @@ def test_a_held_out_photo_that_is_gone_after_the_last_step_does_not_fail_the_run
         return scene.train[0].load()
 
     test = [dataclasses.replace(scene.test[0], load=vanishing), scene.test[1]]
-    result = train(dataclasses.replace(scene, test=test), tmp_path, CONFIG, quiet=True)
+    result = train_model(dataclasses.replace(scene, test=test), tmp_path, CONFIG, quiet=True)
     assert result.complete and "photos/0000.png: the file is gone" in result.missing
     assert not (tmp_path / "metrics.json").exists()
 
     no_training()
-    train(a_scene(), tmp_path, CONFIG, quiet=True)
+    train_model(a_scene(), tmp_path, CONFIG, quiet=True)
     assert names(tmp_path) == COMPLETE
 
 
@@ -134,12 +134,12 @@ def test_an_interruption_while_scoring_is_completed_without_training(no_training
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr("hyrfpack.train.results.evaluate", interrupted)
-        train(a_scene(), tmp_path, CONFIG, quiet=True)
+        patch.setattr("hyrfpack.train.results.evaluate_model", interrupted)
+        train_model(a_scene(), tmp_path, CONFIG, quiet=True)
     assert names(tmp_path) == {"model.hyrf", "training.json"} and runs.is_begun(tmp_path)
 
     no_training()
-    train(a_scene(), tmp_path, CONFIG, quiet=True)
+    train_model(a_scene(), tmp_path, CONFIG, quiet=True)
     assert names(tmp_path) == COMPLETE and not runs.is_begun(tmp_path)
 
 
@@ -148,47 +148,47 @@ def test_a_model_that_does_not_fit_leaves_the_checkpoint_and_resuming_completes_
     with pytest.raises(
         HyrfError, match=r"model.hyrf: the disk is full.*checkpoint of step 19 is kept.*`resume=True` continues"
     ):
-        train(a_scene(), tmp_path, CONFIG, quiet=True)
+        train_model(a_scene(), tmp_path, CONFIG, quiet=True)
     assert names(tmp_path) == {"checkpoint.pt"}
 
     full.clear()
-    train(a_scene(), tmp_path, CONFIG, resume=True, quiet=True)
+    train_model(a_scene(), tmp_path, CONFIG, resume=True, quiet=True)
     assert names(tmp_path) == COMPLETE
     assert (tmp_path / "model.hyrf").read_bytes() == (undisturbed / "model.hyrf").read_bytes()
 
 
 def test_where_the_training_record_does_not_fit_the_checkpoint_stays_until_the_metrics_are_there(full, tmp_path):
     full |= {"training.json", "metrics.json"}
-    result = train(a_scene(), tmp_path, CONFIG, quiet=True)
+    result = train_model(a_scene(), tmp_path, CONFIG, quiet=True)
     assert result.complete and names(tmp_path) == {"model.hyrf", "checkpoint.pt", "curve.png", "views"}
 
     full.clear()
-    train(a_scene(), tmp_path, CONFIG, resume=True, quiet=True)
+    train_model(a_scene(), tmp_path, CONFIG, resume=True, quiet=True)
     assert names(tmp_path) == COMPLETE and len(metrics_of(tmp_path)["curve"]) == 20
 
 
 def test_results_are_completed_with_the_settings_of_the_model_only(full, tmp_path):
     full.add("metrics.json")
-    train(a_scene(), tmp_path, CONFIG, quiet=True)
+    train_model(a_scene(), tmp_path, CONFIG, quiet=True)
     before = hashlib.sha256((tmp_path / "model.hyrf").read_bytes()).digest()
     full.clear()
     other = dataclasses.replace(CONFIG, steps=30, seed=2)
     for resume in (False, True):
         with pytest.raises(HyrfTrainingError, match=r"other settings \(seed, steps\).*`overwrite=True`"):
-            train(a_scene(), tmp_path, other, resume=resume, quiet=True)
+            train_model(a_scene(), tmp_path, other, resume=resume, quiet=True)
     fewer = dataclasses.replace(a_scene(), test=a_scene().test[:1])
     with pytest.raises(HyrfTrainingError, match="other settings .held-out views."):
-        train(fewer, tmp_path, CONFIG, quiet=True)
+        train_model(fewer, tmp_path, CONFIG, quiet=True)
     assert hashlib.sha256((tmp_path / "model.hyrf").read_bytes()).digest() == before
 
-    train(a_scene(), tmp_path, other, overwrite=True, quiet=True)
+    train_model(a_scene(), tmp_path, other, overwrite=True, quiet=True)
     assert metrics_of(tmp_path)["settings"]["steps"] == 30 and names(tmp_path) == COMPLETE
 
 
 def test_metrics_of_an_earlier_model_do_not_stay_beside_a_new_one(full, tmp_path):
-    train(a_scene(), tmp_path, CONFIG, quiet=True)
+    train_model(a_scene(), tmp_path, CONFIG, quiet=True)
     full |= {"metrics.json", ".png"}
-    result = train(a_scene(), tmp_path, dataclasses.replace(CONFIG, seed=5), overwrite=True, quiet=True)
+    result = train_model(a_scene(), tmp_path, dataclasses.replace(CONFIG, seed=5), overwrite=True, quiet=True)
     assert "views, curve.png and metrics.json are missing" in result.missing
     assert names(tmp_path) == {"model.hyrf", "training.json", "views"} and not list((tmp_path / "views").iterdir())
 
@@ -196,23 +196,23 @@ def test_metrics_of_an_earlier_model_do_not_stay_beside_a_new_one(full, tmp_path
 @pytest.mark.parametrize("damage", [b"", b"[]", b"{}", b'{"version": 1}', None])
 def test_a_record_that_is_damaged_or_of_another_model_counts_for_nothing(full, tmp_path, damage):
     full.add("metrics.json")
-    train(a_scene(), tmp_path, CONFIG, quiet=True)
+    train_model(a_scene(), tmp_path, CONFIG, quiet=True)
     full.clear()
     if damage is None:
         (tmp_path / "model.hyrf").write_bytes(b"another")
     else:
         (tmp_path / "training.json").write_bytes(damage)
     with pytest.raises(HyrfError, match="holds an earlier run"):
-        train(a_scene(), tmp_path, CONFIG, quiet=True)
+        train_model(a_scene(), tmp_path, CONFIG, quiet=True)
     with pytest.raises(HyrfError, match="no checkpoint to resume"):
-        train(a_scene(), tmp_path, CONFIG, resume=True, quiet=True)
+        train_model(a_scene(), tmp_path, CONFIG, resume=True, quiet=True)
 
 
 def test_the_log_of_a_completed_run_ends_with_its_scores(full, tmp_path):
     full.add("metrics.json")
-    train(a_scene(), tmp_path / "run", CONFIG, quiet=True)
+    train_model(a_scene(), tmp_path / "run", CONFIG, quiet=True)
     full.clear()
-    result = train(a_scene(), tmp_path / "run", CONFIG, quiet=True, log=tmp_path / "log.jsonl")
+    result = train_model(a_scene(), tmp_path / "run", CONFIG, quiet=True, log=tmp_path / "log.jsonl")
     (end,) = map(json.loads, (tmp_path / "log.jsonl").read_text().splitlines())
     assert end["event"] == "end" and end["complete"] is True and end["step"] == 20
     assert end["psnr"] == pytest.approx(result.metrics["evaluation"]["psnr"], rel=1e-5)
@@ -223,7 +223,7 @@ def test_the_log_of_a_completed_run_ends_with_its_scores(full, tmp_path):
 
 def test_all_work_around_the_steps_is_reported_with_its_share(tmp_path):
     told: list[tuple[str, int, int]] = []
-    train(a_scene(), tmp_path, CONFIG, quiet=True, phase=lambda *progress: told.append(progress))
+    train_model(a_scene(), tmp_path, CONFIG, quiet=True, phase=lambda *progress: told.append(progress))
     assert list(dict.fromkeys(what for what, _, _ in told)) == [
         "reading held-out photos",
         "reading photos",

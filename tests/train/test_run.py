@@ -19,9 +19,9 @@ from scenes import ball_scene
 
 from hyrfpack import format as hyrf_format
 from hyrfpack.errors import HyrfError
-from hyrfpack.render import render
+from hyrfpack.render import render_view
 from hyrfpack.scene import Scene
-from hyrfpack.train import DensityConfig, TrainConfig, Trainer, progress, train
+from hyrfpack.train import DensityConfig, TrainConfig, Trainer, progress, train_model
 from hyrfpack.train.run import STOP_SIGNALS, _stop_requests
 
 CONFIG = TrainConfig(
@@ -87,7 +87,7 @@ def whole() -> Trainer:
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     out = tmp_path_factory.mktemp("runs") / "deep" / "balls"
-    return out, train(split_scene(), out, CONFIG, quiet=True)
+    return out, train_model(split_scene(), out, CONFIG, quiet=True)
 
 
 def test_a_run_leaves_model_metrics_curve_and_views(finished):
@@ -102,7 +102,7 @@ def test_the_saved_model_is_the_trained_one(finished):
     _, result = finished
     trainer = Trainer(split_scene(), CONFIG)
     trainer.run()
-    loaded = hyrf_format.load(result.model)
+    loaded = hyrf_format.load_model(result.model)
     assert bytes_of(loaded) == bytes_of(trainer.model)
 
 
@@ -112,17 +112,17 @@ def test_metrics_are_the_results_and_the_settings(finished):
     assert metrics == json.loads(json.dumps(result.metrics))
     assert metrics["bytes"] == result.model.stat().st_size
     assert metrics["settings"]["steps"] == 60 and metrics["scene"]["train"] == 6 and metrics["scene"]["test"] == 2
-    assert metrics["gaussians"] == len(hyrf_format.load(result.model)) <= 120
+    assert metrics["gaussians"] == len(hyrf_format.load_model(result.model)) <= 120
     assert [record["step"] for record in metrics["curve"]] == list(range(1, 61))
 
 
 def test_the_evaluation_is_of_the_file_on_the_held_out_views(finished):
     out, result = finished
-    model = hyrf_format.load(result.model)
+    model = hyrf_format.load_model(result.model)
     expected = {}
     for view in split_scene().test:
         with torch.no_grad():
-            rgb = render(model, view.camera).rgb.double().numpy().clip(0, 1)
+            rgb = render_view(model, view.camera).rgb.double().numpy().clip(0, 1)
         expected[view.name] = -10 * np.log10(np.mean((rgb - view.load().composite()) ** 2))
     found = {view["name"]: view["psnr"] for view in result.metrics["evaluation"]["views"]}
     assert found == pytest.approx(expected, abs=0.05)  # pictures may be rounded to 8 bits
@@ -133,26 +133,26 @@ def test_a_folder_with_a_run_is_not_trained_over_unasked(finished):
     out, _ = finished
     before = (out / "model.hyrf").read_bytes()
     with pytest.raises(HyrfError, match="holds an earlier run.*`overwrite=True`"):
-        train(split_scene(), out, CONFIG, quiet=True)
+        train_model(split_scene(), out, CONFIG, quiet=True)
     assert (out / "model.hyrf").read_bytes() == before
 
 
 def test_overwriting_replaces_the_run(tmp_path):
     config = dataclasses.replace(CONFIG, steps=3)
-    train(a_scene(), tmp_path, config, quiet=True)
-    train(a_scene(), tmp_path, dataclasses.replace(config, seed=9), overwrite=True, quiet=True)
+    train_model(a_scene(), tmp_path, config, quiet=True)
+    train_model(a_scene(), tmp_path, dataclasses.replace(config, seed=9), overwrite=True, quiet=True)
     assert json.loads((tmp_path / "metrics.json").read_text())["settings"]["seed"] == 9
 
 
 def test_a_folder_that_cannot_be_made_is_a_clear_error(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(HyrfError, match="file is a file, not a folder"):
-        train(a_scene(), tmp_path / "file" / "run", CONFIG, quiet=True)
+        train_model(a_scene(), tmp_path / "file" / "run", CONFIG, quiet=True)
 
 
 def test_resuming_nothing_is_a_clear_error(tmp_path):
     with pytest.raises(HyrfError, match="no checkpoint to resume; leave out `resume=True`"):
-        train(a_scene(), tmp_path / "run", CONFIG, resume=True, quiet=True)
+        train_model(a_scene(), tmp_path / "run", CONFIG, resume=True, quiet=True)
     assert not (tmp_path / "run").exists()
 
 
@@ -165,12 +165,12 @@ def test_a_background_that_no_view_sees_is_dropped(tmp_path):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("hyrfpack.train.setup.INITIAL_OPACITY", 0.9999)
         patch.setattr("hyrfpack.train.setup.MIN_INITIAL_SIZE", 0.45)
-        closed = train(scene, tmp_path / "closed", one_step, quiet=True)
-    open_air = train(a_scene(), tmp_path / "open", one_step, quiet=True)
+        closed = train_model(scene, tmp_path / "closed", one_step, quiet=True)
+    open_air = train_model(a_scene(), tmp_path / "open", one_step, quiet=True)
 
-    assert hyrf_format.load(closed.model).config.background is False
+    assert hyrf_format.load_model(closed.model).config.background is False
     assert closed.metrics["choices"]["background"].startswith("none: no training view")
-    assert hyrf_format.load(open_air.model).config.background is True
+    assert hyrf_format.load_model(open_air.model).config.background is True
     assert "of a view's light" in open_air.metrics["choices"]["background"]
 
 
@@ -183,7 +183,7 @@ def test_speed_is_told_of_all_parts_of_a_resumed_run(finished, tmp_path):
     stopped.run(stop=lambda: stopped.step == 50)
     stopped.elapsed = 1e6
     stopped.save(tmp_path / "checkpoint.pt")
-    metrics = train(a_scene(), tmp_path, CONFIG, resume=True, quiet=True).metrics
+    metrics = train_model(a_scene(), tmp_path, CONFIG, resume=True, quiet=True).metrics
 
     assert 1e6 < metrics["seconds"] < 1e6 + 600
     assert metrics["steps_per_second"] == pytest.approx(60 / metrics["seconds"])
@@ -192,7 +192,7 @@ def test_speed_is_told_of_all_parts_of_a_resumed_run(finished, tmp_path):
 def test_a_long_run_says_once_what_would_shorten_it(tmp_path, capsys, monkeypatch):
     for name in ("MIN_ADVICE_STEPS", "MIN_ADVICE_SECONDS", "MIN_ADVICE_SECONDS_LEFT"):
         monkeypatch.setattr(progress, name, 0)
-    train(a_scene(), tmp_path, dataclasses.replace(CONFIG, steps=8))
+    train_model(a_scene(), tmp_path, dataclasses.replace(CONFIG, steps=8))
     (told,) = [line for line in capsys.readouterr().err.splitlines() if "more hours" in line]
     assert all(way in told for way in ("fewer steps", "smaller photos", "fewer Gaussians", "a GPU"))
 
@@ -256,8 +256,8 @@ def test_an_interrupt_saves_exits_cleanly_and_resumes_to_the_same_model(number, 
     said = json.loads(out)
     assert said["complete"] is False and said["model"] is None and 1 <= said["step"] < 60
     assert not (tmp_path / "model.hyrf").exists()
-    result = train(a_scene(), tmp_path, CONFIG, resume=True, quiet=True)
-    assert result.complete and bytes_of(hyrf_format.load(result.model)) == bytes_of(whole.model)
+    result = train_model(a_scene(), tmp_path, CONFIG, resume=True, quiet=True)
+    assert result.complete and bytes_of(hyrf_format.load_model(result.model)) == bytes_of(whole.model)
     assert not checkpoint.exists()
 
 

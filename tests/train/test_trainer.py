@@ -12,7 +12,7 @@ from scenes import ball_scene, view_of
 from hyrfpack.errors import HyrfTrainingError
 from hyrfpack.format import decode_model, encode_model
 from hyrfpack.ops.adam import adam_step
-from hyrfpack.render import render
+from hyrfpack.render import render_view
 from hyrfpack.scene import Picture, Scene
 from hyrfpack.train import DensityConfig, LearningRates, TrainConfig, Trainer
 
@@ -44,7 +44,7 @@ def psnr(trainer: Trainer) -> float:
     values = []
     for view in trainer.scene.train:
         with torch.no_grad():
-            rgb = render(trainer.model, view.camera).rgb.double().numpy()
+            rgb = render_view(trainer.model, view.camera).rgb.double().numpy()
         values.append(-10 * np.log10(np.mean((rgb - view.load().composite()) ** 2)))
     return float(np.mean(values))
 
@@ -124,9 +124,9 @@ def test_absolute_gradients_are_asked_for_only_while_they_are_used(monkeypatch):
 
     def spy(*arguments, absgrad, **options):
         asked.append(absgrad)
-        return render(*arguments, absgrad=absgrad, **options)
+        return render_view(*arguments, absgrad=absgrad, **options)
 
-    monkeypatch.setattr("hyrfpack.train.trainer.render", spy)
+    monkeypatch.setattr("hyrfpack.train.trainer.render_view", spy)
     trained()
     assert asked == [True] * 27 + [False] * 13
 
@@ -242,7 +242,7 @@ def test_reported_errors_are_those_outside_the_mask():
     masked = view_of(view.name, view.camera, Picture(view.load().rgb, None, mask))
     trainer = Trainer(dataclasses.replace(scene, train=[masked]), TrainConfig(steps=1, max_gaussians=80))
     with torch.no_grad():
-        rgb = render(trainer.model, view.camera).rgb.double().numpy()
+        rgb = render_view(trainer.model, view.camera).rgb.double().numpy()
     seen = []
     trainer.run(report=lambda trainer, loss, mse: seen.append(mse))
     errors = (rgb - view.load().rgb / 255) ** 2

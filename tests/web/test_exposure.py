@@ -1,4 +1,4 @@
-"""The exposure map in the player: the pictures of `hyrfpack.render` at both exposures, and the control."""
+"""The exposure map in the player: the pictures of `hyrfpack.render_view` at both exposures, and the control."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ from web.test_sources import Site, site
 
 from hyrfpack.cameras.capture import provenance_cameras
 from hyrfpack.choices import AS_PHOTOGRAPHED, CONSISTENT_EXPOSURE, RENDER_EXPOSURES
-from hyrfpack.export import export
-from hyrfpack.format import encode_model, save
+from hyrfpack.export import export_model
+from hyrfpack.format import encode_model, save_model
 from hyrfpack.format.container import read_container
 from hyrfpack.model import HybridModel
 from hyrfpack.model.exposure import ExposureMap
-from hyrfpack.render import render
+from hyrfpack.render import render_view
 from hyrfpack.scene import Camera
 from hyrfpack.web.player import encode_element_script, encode_player
 from tools.safety.synthetic_encoding import encode
@@ -66,10 +66,10 @@ def mapped(count: int = 2600, **config: object) -> HybridModel:
 
 
 def expected(model: HybridModel, camera: Camera, exposure: str) -> np.ndarray:
-    """(H, W, 3) by hyrfpack.render, in 0 to 255."""
+    """(H, W, 3) by hyrfpack.render_view, in 0 to 255."""
     with torch.no_grad():
         settings = dataclasses.replace(EXACT, exposure=exposure)
-        return render(model, camera, settings).rgb.clamp(0, 1).numpy() * 255
+        return render_view(model, camera, settings).rgb.clamp(0, 1).numpy() * 255
 
 
 def choose(browser: Browser, exposure: str) -> None:
@@ -376,8 +376,8 @@ def test_an_exported_page_brings_the_map_and_its_poster_is_as_photographed(
     browser: Browser, tmp_path: Path, host: Site, target: str
 ):
     model, kept = mapped(200), cameras()
-    save(model, tmp_path / "model.hyrf", provenance={"cameras": provenance_cameras(kept)})
-    export(tmp_path / "model.hyrf", tmp_path / target)
+    save_model(model, tmp_path / "model.hyrf", provenance={"cameras": provenance_cameras(kept)})
+    export_model(tmp_path / "model.hyrf", tmp_path / target)
     folder = tmp_path / target if target == "player" else tmp_path
     host.files = {f"/{path.name}": path.read_bytes() for path in folder.iterdir() if path.is_file()}
     browser.open(f"{host.address}/{'index.html' if target == 'player' else target}")

@@ -1,4 +1,4 @@
-"""Pages with a `.hyrf` file inside: the browser decodes it and draws what `hyrfpack.render` draws."""
+"""Pages with a `.hyrf` file inside: the browser decodes it and draws what `hyrfpack.render_view` draws."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from web.pages import Browser, json_of, psnr, shown, until
 from hyrfpack.format.codec import encode_model
 from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians
-from hyrfpack.render import RenderSettings, render
+from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.scene import Camera
 from hyrfpack.web.html import encode_model_page
 from tools.safety.synthetic_encoding import encode
@@ -80,7 +80,7 @@ def page_of(model: HybridModel, data: bytes | None = None) -> bytes:
 def rendered(model: HybridModel, camera: Camera) -> np.ndarray:
     """(H, W, 3) by our renderer, in 0 to 255."""
     with torch.no_grad():
-        return render(model, camera, EXACT).rgb.clamp(0, 1).numpy() * 255
+        return render_view(model, camera, EXACT).rgb.clamp(0, 1).numpy() * 255
 
 
 def loaded(browser: Browser, tmp_path: Path, page: bytes, complete: bool = True) -> Browser:

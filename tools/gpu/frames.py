@@ -12,7 +12,7 @@ from torch import Tensor
 from hyrfpack.model import HybridModel
 from hyrfpack.model.operation_calls import OperationCall
 from hyrfpack.ops.rasterize import rasterize
-from hyrfpack.render import render
+from hyrfpack.render import render_view
 from hyrfpack.scene import Camera
 from tools.gpu.rows import Row, goal_row, kernel_rows
 from tools.gpu.scene import (
@@ -96,8 +96,8 @@ def _frame_rows(room: str, model: HybridModel, cameras: list[Camera], setup: Set
     with torch.no_grad():
         decoded = model.decode()
         ways: dict[str, Callable[[Camera], object]] = {
-            "decoded once": lambda camera: render(model, camera, decoded=decoded),
-            "decoded each frame": lambda camera: render(model, camera),
+            "decoded once": lambda camera: render_view(model, camera, decoded=decoded),
+            "decoded each frame": lambda camera: render_view(model, camera),
         }
         for name, draw in ways.items():
             ms = _frame_ms(draw, cameras, setup)

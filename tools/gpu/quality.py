@@ -76,6 +76,6 @@ def _train(scene: Scene, steps: int, precision: str, device: torch.device) -> tu
     trainer.run()
     synchronize(device)
     seconds = time.perf_counter() - start
-    psnr = evaluate(trainer.model, scene.test).psnr
+    psnr = evaluate_model(trainer.model, scene.test).psnr
     cells = {"PSNR dB": f"{psnr:.3f}", "Gaussians": f"{len(trainer.model):,}", "steps/s": steps / seconds}
     return psnr, {**cells, "seconds": seconds}

@@ -21,7 +21,7 @@ from hyrfpack.model.gaussians import Gaussians, logit
 from hyrfpack.model.operation_calls import splat_inputs
 from hyrfpack.ops.poses import camera_center
 from hyrfpack.ops.rasterize.reference import ALPHA_MAX, ALPHA_MIN, TILE_SIZE, TRANSMITTANCE_MIN, project
-from hyrfpack.render import render
+from hyrfpack.render import render_view
 from hyrfpack.scene import Camera, Picture, Scene, View
 
 # All lengths are in local units, and z is up.

@@ -48,7 +48,7 @@ from hyrfpack.cameras.paths import orbit
 from hyrfpack.cameras.view_sampling import shrink_camera
 from hyrfpack.cli.files import info
 from hyrfpack.errors import HyrfError, HyrfFormatError
-from hyrfpack.format import decode_model, describe, encode_model, load
+from hyrfpack.format import decode_model, describe_file, encode_model, load_model
 from hyrfpack.format.container import raw_bytes_limit
 from hyrfpack.format.exposure import encode_exposure
 from hyrfpack.model import HybridModel
@@ -180,7 +180,7 @@ def check_file(data: bytes, outcome: HybridModel | str, folder: Path) -> None:
     path = folder / "model.hyrf"
     path.write_bytes(data)
     try:
-        load(path)
+        load_model(path)
         refused = None
     except HyrfFormatError as error:
         refused = str(error).replace(str(path), "the data")
@@ -188,7 +188,7 @@ def check_file(data: bytes, outcome: HybridModel | str, folder: Path) -> None:
         raise Failure(f"reading the file gives {refused!r}, decoding its bytes gives {outcome!r:.200}")
     shown = io.TextIOWrapper(io.BytesIO(), encoding="utf-8")
     try:
-        describe(path)
+        describe_file(path)
         with contextlib.redirect_stdout(shown):
             info.callback(path, False)
             info.callback(path, True)
@@ -205,7 +205,7 @@ def check_rendering(model: HybridModel) -> None:
     with contextlib.suppress(HyrfError), torch.no_grad():
         facts = {"provenance": {}, "config": {"frame": vars(model.config.frame)}}
         (camera,) = orbit(Capture(facts).viewpoint, 1)
-        render(model, shrink_camera(camera, 16))
+        render_view(model, shrink_camera(camera, 16))
 
 
 def examine_input(number: int, seed: int, tally: Tally, folder: Path) -> None:

@@ -19,7 +19,7 @@ from hyrfpack.format import decode_model
 from hyrfpack.format.arrays import to_arrays
 from hyrfpack.model import ExposureMap, Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians
-from hyrfpack.render import RenderSettings, render
+from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.scene import Camera
 from tools.safety import minimal_reader
 from tools.safety.synthetic_encoding import encode

@@ -25,7 +25,7 @@ import torch
 import hyrfpack
 from hyrfpack.data import PictureCache
 from hyrfpack.errors import HyrfTrainingError
-from hyrfpack.format import encode_model, load, save
+from hyrfpack.format import encode_model, load_model, save_model
 from hyrfpack.measure.timing import time_alternately
 from hyrfpack.model import HybridModel
 from hyrfpack.render import renderer
@@ -52,7 +52,7 @@ def run(variant: Variant, scene: Scene, config: TrainConfig, full_path: Path, ca
         The numbers of one row, ready for JSON; {"failed": why} where it did not train.
     """
     if variant is NO_CULLING:
-        full = load(full_path).requires_grad_()  # its bytes are those that could be trained
+        full = load_model(full_path).requires_grad_()  # its bytes are those that could be trained
         return measure(variant, full, full, scene)
     trainer = build_trainer(scene, config, variant, cache)
     try:
@@ -63,8 +63,8 @@ def run(variant: Variant, scene: Scene, config: TrainConfig, full_path: Path, ca
     except HyrfTrainingError as error:
         return {"failed": str(error)}
     if variant is FULL:
-        save(trainer.model, full_path)
-    result = measure(variant, trainer.model, load(full_path), scene)
+        save_model(trainer.model, full_path)
+    result = measure(variant, trainer.model, load_model(full_path), scene)
     return {**result, "steps_per_second": config.steps / trainer.elapsed, "seconds": trainer.elapsed}
 
 
@@ -72,7 +72,7 @@ def run(variant: Variant, scene: Scene, config: TrainConfig, full_path: Path, ca
 def measure(variant: Variant, model: HybridModel, full: HybridModel, scene: Scene) -> dict:
     """Scores on held-out views, sizes, and frames per second also as a multiple of the full model's."""
     with culling(variant):
-        scores = hyrfpack.evaluate(model, scene.test)
+        scores = hyrfpack.evaluate_model(model, scene.test)
     views = evenly_spaced(scene.test, TIMED_VIEWS)
     frames_per_second, frames_ratio = time_frames(variant, model, full, views)
     result = {
@@ -102,10 +102,10 @@ def time_frames(
 
     def draw(view: View) -> None:
         with culling(variant):
-            hyrfpack.render(model, view.camera, decoded=decoded)
+            hyrfpack.render_view(model, view.camera, decoded=decoded)
 
     def draw_full(view: View) -> None:
-        hyrfpack.render(full, view.camera, decoded=decoded_full)
+        hyrfpack.render_view(full, view.camera, decoded=decoded_full)
 
     times = [time_alternately({"this": partial(draw, v), "full": partial(draw_full, v)}, REPEATS)[0] for v in views]
     return 1000 / median(t["this"].ms for t in times), median(t["full"].ms / t["this"].ms for t in times)

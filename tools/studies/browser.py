@@ -4,7 +4,7 @@
     python -m tools.studies.browser --large runs/100k/compact.hyrf runs/1m/compact.hyrf
 
 With --runs: for each set's `compact.hyrf`, eight held-out views each drawn by the native and by the baked page in
-headless Chromium, against `hyrfpack.render` and against the photos. With --large: the time from opening a page to the
+headless Chromium, against `render_view` and against the photos. With --large: the time from opening a page to the
 first picture and to the complete one, and that of a frame while a mouse orbits at full resolution; medians over
 --repeats, native and baked in turn, each in a browser of its own. Without a GPU the browser draws in software.
 """
@@ -51,7 +51,7 @@ def pages(model: Path, folder: Path, data: Scene | None = None) -> dict[str, Pat
     """The native and the baked page of a model; colours are fitted where photos were taken from, if they are given."""
     found = {"native": folder / f"{model.parent.name}.html", "baked": folder / f"{model.parent.name}.baked.html"}
     for name, path in found.items():
-        hyrfpack.export(model, path, data=data, baked=name == "baked")
+        hyrfpack.export_model(model, path, data=data, baked=name == "baked")
     return found
 
 
@@ -65,8 +65,8 @@ def likeness(run: Path, data: Path, folder: Path) -> list[str]:
     model = run / "compact.hyrf"
     scene = hyrfpack.load_scene(data)
     views = evenly_spaced(scene.test, VIEWS)
-    field = hyrfpack.load(model)
-    ours = [hyrfpack.render(field, view.camera).rgb.clamp(0, 1).numpy() for view in views]
+    field = hyrfpack.load_model(model)
+    ours = [hyrfpack.render_view(field, view.camera).rgb.clamp(0, 1).numpy() for view in views]
     solid = np.array(field.config.solid, np.float32)
     photos = [view.load().composite(solid) for view in views]
     scores: dict[str, list[float]] = {}
@@ -116,7 +116,7 @@ def times(model: Path, folder: Path, repeats: int) -> list[list[str]]:
                     browser.evaluate(f"hyrfpack.player.times.{what}") / 1000 for what in ("first", "complete")
                 )
                 taken[name].append((first, complete, frame_ms(browser)))
-    count = len(hyrfpack.load(model))
+    count = len(hyrfpack.load_model(model))
     return [
         [f"{count:,}", name, f"{page.stat().st_size:,}"]
         + [f"{statistics.median(column):.2f}" for column in zip(*taken[name], strict=True)]

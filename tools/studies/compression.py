@@ -75,7 +75,7 @@ class Set:
 
     def scores(self, model: HybridModel) -> tuple[float, float]:
         """PSNR and SSIM on the held-out photos."""
-        scores = hyrfpack.evaluate(model, self.scene.test)
+        scores = hyrfpack.evaluate_model(model, self.scene.test)
         return scores.psnr, scores.ssim
 
     def made(self, data: bytes, distortion: float, start: float, candidate: EncodedCandidate | None = None) -> Made:

@@ -30,11 +30,11 @@ ROW_WIDTH = 720  # pixels
 
 def worst_view(name: str, scene: Scene, model: hyrfpack.HybridModel) -> Image.Image:
     """Photo, render and error map of the held-out view with the lowest PSNR."""
-    scores = hyrfpack.evaluate(model, scene.test)
+    scores = hyrfpack.evaluate_model(model, scene.test)
     worst = min(scores.views, key=lambda view: view.psnr)
     (view,) = (view for view in scene.test if view.name == worst.name)
     photo, mask = upload(view.load(), np.array(model.config.solid, np.float32), torch.device("cpu"))
-    render = to_8bit(hyrfpack.render(model, view.camera).rgb)
+    render = to_8bit(hyrfpack.render_view(model, view.camera).rgb)
     caption = f"{name}: {worst.name}, {worst.psnr:.2f} dB, SSIM {worst.ssim:.3f} (mean {scores.psnr:.2f} dB)"
     return draw_comparison(photo, render, mask, caption)
 
@@ -62,7 +62,7 @@ def main() -> None:
     with torch.no_grad():
         for run in args.runs:
             if (run / "compact.hyrf").is_file():
-                model = hyrfpack.load(run / "compact.hyrf")
+                model = hyrfpack.load_model(run / "compact.hyrf")
                 rows.append(worst_view(run.name, load_variant(args.data, run.name), model))
     if not rows:
         parser.error("none of the folders has a compact.hyrf; train them with tools.studies.train_sets")

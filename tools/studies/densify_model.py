@@ -51,7 +51,7 @@ def densifying_config(gaussians: int, settle: int, seed: int) -> TrainConfig:
 
 def report(label: str, model: HybridModel, scene: Scene, start: float) -> None:
     """Print one line: Gaussians, PSNR on held-out views, seconds since `start`."""
-    psnr = f"{hyrfpack.evaluate(model, scene.test).psnr:.2f} dB" if scene.test else "no held-out views"
+    psnr = f"{hyrfpack.evaluate_model(model, scene.test).psnr:.2f} dB" if scene.test else "no held-out views"
     print(f"{label:>16}: {len(model):>9,} Gaussians, {psnr}, {time.perf_counter() - start:.0f} s", flush=True)
 
 
@@ -89,10 +89,10 @@ def main() -> None:
     source = args.model
     if source is None:
         first = TrainConfig(steps=args.steps, seed=args.seed, log2_table_size=args.log2_table_size)
-        source = hyrfpack.train(scene, args.out / "trained", first, overwrite=True).model
+        source = hyrfpack.train_model(scene, args.out / "trained", first, overwrite=True).model
         if source is None:  # interrupted
             return
-    model = hyrfpack.load(source)
+    model = hyrfpack.load_model(source)
     tables = (model.config.radiance.log2_table_size, model.config.geometry.log2_table_size)
     if tables != (args.log2_table_size, max(4, args.log2_table_size - 1)):
         parser.error(f"{source}: its tables are 2^{tables[0]} and 2^{tables[1]}; name that as --log2-table-size")
@@ -104,14 +104,14 @@ def main() -> None:
     model = densify(scene, model, densifying_config(args.gaussians, args.settle, args.seed), start)
     if len(model) < args.gaussians:
         print(f"{args.gaussians:,} Gaussians were asked for; start from a model that has more than {trained:,}")
-    provenance = hyrfpack.describe(source)["provenance"]
+    provenance = hyrfpack.describe_file(source)["provenance"]
     provenance["choices"] = {
         **provenance.get("choices", {}),
         "max_gaussians": f"{args.gaussians:,}: trained to {trained:,}, split by tools/studies/densify_model.py "
         f"in {GROWING} steps (seed {args.seed}), settled in {args.settle}",
     }
     provenance["viewpoint"] = Viewpoint.from_cameras([view.camera for view in scene.train]).to_json()
-    written = hyrfpack.save(model, args.out / MODEL_FILE, profile="raw", provenance=provenance)
+    written = hyrfpack.save_model(model, args.out / MODEL_FILE, profile="raw", provenance=provenance)
     print(f"{args.out / MODEL_FILE}: {written.bytes_after:,} bytes")
 
 

@@ -86,7 +86,7 @@ def main(arguments: list[str] | None = None) -> None:
     if options.one:
         scene = hyrfpack.load_scene(options.data)
         views = [scaled(view, *options.size) for view in scene.train[:: max(1, len(scene.train) // PHOTOS)]]
-        model = of_so_many(hyrfpack.load(options.model), options.gaussians[0])
+        model = of_so_many(hyrfpack.load_model(options.model), options.gaussians[0])
         print(json.dumps(measured(dataclasses.replace(scene, train=views, test=[]), model, options.steps)))
         return
     rows = []

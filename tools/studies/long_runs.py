@@ -62,11 +62,11 @@ def measure(run: Run, data: Path, out: Path, finetune_steps: int) -> None:
     if not (folder / METRICS_FILE).exists():
         config = TrainConfig(steps=run.steps, seed=run.seed, exposure=run.exposure)
         resume = (folder / CHECKPOINT_FILE).exists()
-        if not hyrfpack.train(scene, folder, config, resume=resume, overwrite=not resume, quiet=True).complete:
+        if not hyrfpack.train_model(scene, folder, config, resume=resume, overwrite=not resume, quiet=True).complete:
             raise SystemExit("stopped; the same command resumes from the checkpoint")
     metrics = json.loads((folder / METRICS_FILE).read_text())
-    model = hyrfpack.load(folder / MODEL_FILE)
-    training = hyrfpack.evaluate(model, evenly_spaced(scene.train, MAX_TRAINING_VIEWS_SCORED))
+    model = hyrfpack.load_model(folder / MODEL_FILE)
+    training = hyrfpack.evaluate_model(model, evenly_spaced(scene.train, MAX_TRAINING_VIEWS_SCORED))
     row = {
         **asdict(run),
         "gains": metrics["settings"]["exposure"],
@@ -88,8 +88,8 @@ def _packed(folder: Path, scene: Scene, profile: str, finetune_steps: int = 0) -
     """Compress the run's model and score the file on the held-out photos."""
     path = folder / f"{'finetuned' if finetune_steps else profile}.hyrf"
     settings = {"data": scene, "finetune_steps": finetune_steps} if finetune_steps else {}
-    hyrfpack.compress(folder / MODEL_FILE, path, profile=profile, **settings)
-    scores = hyrfpack.evaluate(hyrfpack.load(path), scene.test)
+    hyrfpack.compress_model(folder / MODEL_FILE, path, profile=profile, **settings)
+    scores = hyrfpack.evaluate_model(hyrfpack.load_model(path), scene.test)
     return {"bytes": path.stat().st_size, "psnr": scores.psnr, "ssim": scores.ssim}
 
 

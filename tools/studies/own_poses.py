@@ -42,7 +42,7 @@ def common(given: Scene, own: Scene) -> tuple[Scene, Scene, int]:
 
 def score(scene: Scene, out: Path, steps: int, seed: int) -> float:
     """Mean PSNR on held-out photos of a model trained for so many steps."""
-    result = hyrfpack.train(
+    result = hyrfpack.train_model(
         scene, out, hyrfpack.TrainConfig(steps=steps, seed=seed, budget_factor=1.0), overwrite=True, quiet=True
     )
     return result.metrics["evaluation"]["psnr"]

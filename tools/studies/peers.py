@@ -39,7 +39,7 @@ from hyrfpack.export.kinds import select_splats
 from hyrfpack.export.source import Source
 from hyrfpack.format.codec import PROFILES
 from hyrfpack.model import HybridModel
-from hyrfpack.render import render
+from hyrfpack.render import render_view
 from hyrfpack.scene import Camera, View
 from hyrfpack.splats.draw import Drawable, draw
 from hyrfpack.splats.formats import spz
@@ -124,7 +124,7 @@ def held_out(model: HybridModel, views: Sequence[View]) -> list[HeldOut]:
         mask = None if picture.mask is None else torch.from_numpy(picture.mask)
         if mask is not None and not mask.any():
             continue
-        trained = to_8bit(render(model, view.camera, decoded=decoded).rgb)
+        trained = to_8bit(render_view(model, view.camera, decoded=decoded).rgb)
         photo = torch.from_numpy(picture.composite(solid))
         made.append(HeldOut(view.camera, photo, mask, _background(model, view.camera), trained))
     return made
@@ -234,10 +234,10 @@ class Measure:
 
     def ours(self, path: Path, setting: str) -> Row:
         """Load, render and score a `.hyrf` file."""
-        model, profile = hyrfpack.load(path), hyrfpack.describe(path)["profile"]
+        model, profile = hyrfpack.load_model(path), hyrfpack.describe_file(path)["profile"]
         with torch.no_grad():
             decoded = model.decode()
-            scores = score((render(model, view.camera, decoded=decoded).rgb for view in self.views), self.views)
+            scores = score((render_view(model, view.camera, decoded=decoded).rgb for view in self.views), self.views)
         return self._row(f"hyrfpack {profile}", setting, path.stat().st_size, len(model), scores)
 
 
@@ -247,7 +247,7 @@ def our_files(trained: Path, given: Sequence[Path], folder: Path) -> Iterator[tu
         for number, settings in enumerate(OURS.get(profile, [{}])):
             if profile not in REFERENCES:
                 path = folder / f"{profile}-{number}.hyrf"
-                hyrfpack.compress(trained, path, profile, **settings)
+                hyrfpack.compress_model(trained, path, profile, **settings)
                 yield path, ", ".join(f"{name} {value}" for name, value in settings.items()) or "default"
     for path in given:
         yield path, path.stem

@@ -30,7 +30,7 @@ import torch
 from torch import Tensor
 
 import hyrfpack
-from hyrfpack.evaluate import evaluate
+from hyrfpack.evaluate import evaluate_model
 from hyrfpack.model import HybridModel
 from hyrfpack.ops.hash_encode import hash_encode
 from hyrfpack.ops.mlp import mlp
@@ -121,7 +121,7 @@ def main() -> None:
             key = f"{name}, {row}, {args.steps}"
             if key not in scores:
                 model, seconds = train(scene, TrainConfig(steps=args.steps), row)
-                found = evaluate(model, scene.test)
+                found = evaluate_model(model, scene.test)
                 scores[key] = {"psnr": found.psnr, "ssim": found.ssim, "gaussians": len(model), "seconds": seconds}
                 args.out.mkdir(parents=True, exist_ok=True)
                 kept.write_text(json.dumps(scores, indent=1))

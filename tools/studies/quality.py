@@ -63,7 +63,7 @@ def run(version: Path, scene: Scene, steps: int, gaussians: int | None, seed: in
     packed = out / "compact.hyrf"
     packed.unlink(missing_ok=True)
     _command(version, "compress", str(out / "model.hyrf"), "-o", str(packed))
-    scores = hyrfpack.evaluate(hyrfpack.load(packed), scene.test)
+    scores = hyrfpack.evaluate_model(hyrfpack.load_model(packed), scene.test)
     trained = json.loads((out / "metrics.json").read_text())
     found = {
         "bytes": packed.stat().st_size,

@@ -32,16 +32,16 @@ def measure(data: Path, name: str, out: Path, config: TrainConfig, reuse: bool) 
     """Train one set, compress it with each profile that loses something, score all files."""
     scene = load_variant(data, name)
     if not (reuse and (out / "metrics.json").exists()):
-        hyrfpack.train(scene, out, config, overwrite=True)
+        hyrfpack.train_model(scene, out, config, overwrite=True)
     trained = json.loads((out / "metrics.json").read_text())
     model = out / "model.hyrf"
     packed = {}
     for profile in PROFILES:
         path = out / f"{profile}.hyrf"
         began = time.perf_counter()
-        hyrfpack.compress(model, path, profile=profile)
+        hyrfpack.compress_model(model, path, profile=profile)
         seconds = time.perf_counter() - began
-        scores = hyrfpack.evaluate(hyrfpack.load(path), scene.test)
+        scores = hyrfpack.evaluate_model(hyrfpack.load_model(path), scene.test)
         packed |= {f"psnr_{profile}": scores.psnr, f"ssim_{profile}": scores.ssim}
         packed |= {f"bytes_{profile}": path.stat().st_size, f"seconds_{profile}": seconds}
     raw = trained["evaluation"]

@@ -132,7 +132,7 @@ def score(source: Path, out: Path, steps: int, shows: dict[int, Path] | None = N
     scene = hyrfpack.load_scene(out / "scene")
     if shows is not None:
         scene = dataclasses.replace(scene, test=[_of_photo(view, shows) for view in scene.test])
-    result = hyrfpack.train(scene, out / "run", TrainConfig(steps=steps, budget_factor=1.0), overwrite=True)
+    result = hyrfpack.train_model(scene, out / "run", TrainConfig(steps=steps, budget_factor=1.0), overwrite=True)
     return result.metrics["evaluation"]["psnr"]
 
 

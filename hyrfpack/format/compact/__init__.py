@@ -5,7 +5,7 @@ colour, scale, opacity logits      a step for each class of Gaussians, predictio
 hash tables                        a step by how often a row is read, rANS                  section codec 8
 decoders (MLPs)                    a step for each output, rANS                             section codec 8
 
-`hyrfpack.compress` chooses what is stored and the quantisation steps; this package only encodes and decodes.
+`hyrfpack.compress_model` chooses what is stored and the quantisation steps; this package only encodes and decodes.
 """
 
 from __future__ import annotations

@@ -4,8 +4,8 @@ import { backgroundColors } from "../hyrf/fields.js";
 import { viewpointOf } from "../hyrf/viewpoint.js";
 import { BACKGROUND_RADIUS } from "./constants.js";
 
-const NEAR_PLANE_LOCAL = 0.01; // in local units; the default of hyrfpack.render
-const CULL_MARGIN_RATIO = 0.3; // in halves of the picture's size; the default of hyrfpack.render
+const NEAR_PLANE_LOCAL = 0.01; // in local units; the default of hyrfpack.render_view
+const CULL_MARGIN_RATIO = 0.3; // in halves of the picture's size; the default of hyrfpack.render_view
 const MIN_SAMPLED_SPLATS = 10000;
 const BACKGROUND_HEIGHT_PIXELS = 128;
 

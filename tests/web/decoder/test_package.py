@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 import hyrfpack
-from hyrfpack.format import describe
+from hyrfpack.format import describe_file
 from hyrfpack.format.arrays import group_shapes, parse_config
 from hyrfpack.format.container import read_container
 from hyrfpack.format.sections import DECODER_SECTIONS, LAYERED_SECTIONS, TABLE_SECTIONS
@@ -99,7 +99,7 @@ def test_what_is_packed_reads_a_file_where_it_is_installed(npm, tmp_path):
 
 def test_shapes_of_grids_and_decoders_are_hyrfpacks():
     rng = np.random.default_rng(1)
-    facts = describe(GOLDEN / "v1.0_raw.hyrf")["config"]
+    facts = describe_file(GOLDEN / "v1.0_raw.hyrf")["config"]
     configs = []
     for _ in range(3000):
         base = int(rng.integers(2, 1 + 2 ** rng.integers(1, 17)))

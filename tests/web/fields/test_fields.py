@@ -66,7 +66,7 @@ def in_float64(model: HybridModel, along: np.ndarray, places: np.ndarray, behind
 
 def evaluated(model: HybridModel, tmp_path: Path, *inputs: np.ndarray) -> list[np.ndarray]:
     count, sphere = len(model), len(inputs[-1])
-    hyrfpack.save(model, tmp_path / "model.hyrf", profile="raw")
+    hyrfpack.save_model(model, tmp_path / "model.hyrf", profile="raw")
     (tmp_path / "inputs").write_bytes(b"".join(values.astype("<f4").tobytes() for values in inputs))
     run_script(EVALUATE, tmp_path / "model.hyrf", tmp_path / "inputs", tmp_path / "outputs")
     numbers = np.fromfile(tmp_path / "outputs", "<f4")

@@ -33,7 +33,7 @@ FIT = Path(__file__).parent / "fit.mjs"
 def fitted(model: HybridModel, cameras: list[Camera] | None, degree: int, tmp_path: Path) -> tuple[Splats, dict]:
     """Splats, world units, and what the script prints. No list of cameras: those of the file."""
     file, viewpoints, out = tmp_path / "model.hyrf", tmp_path / "cameras.json", tmp_path / "splats"
-    hyrfpack.save(model, file)
+    hyrfpack.save_model(model, file)
     viewpoints.write_text(json.dumps(None if cameras is None else [camera_to_json(camera) for camera in cameras]))
     facts: dict[str, Any] = run_script(FIT, file, viewpoints, degree, out)
     count, others, data = facts["count"], num_sh_bases(degree) - 1, out.read_bytes()

@@ -74,7 +74,7 @@ def numbers_of(cameras: list[dict]) -> np.ndarray:
 @pytest.mark.parametrize("name", GOOD)
 def test_the_page_is_shown_from_where_python_shows_it(name: str, tmp_path: Path) -> None:
     file = tmp_path / "model.hyrf"
-    hyrfpack.save(small_model([[0, 0, 0]], frame=FRAME), file, provenance=GOOD[name])
+    hyrfpack.save_model(small_model([[0, 0, 0]], frame=FRAME), file, provenance=GOOD[name])
     read = Source.read(file)
     cameras = [camera for _, camera in read.cameras] or [camera for camera, _ in read.measured_views]
 

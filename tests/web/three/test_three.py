@@ -23,7 +23,7 @@ from hyrfpack.cameras.capture import provenance_cameras
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.evaluate.metrics import psnr
 from hyrfpack.model import Frame, HybridModel
-from hyrfpack.render import render
+from hyrfpack.render import render_view
 from hyrfpack.scene import Camera
 from tools.browser.chromium import Chromium, find
 
@@ -67,7 +67,7 @@ def cameras_about(count: int) -> list[Camera]:
 def saved(model: HybridModel, file: Path) -> Path:
     cameras = cameras_about(10)
     provenance = {"cameras": provenance_cameras(cameras), "viewpoint": Viewpoint.from_cameras(cameras).to_json()}
-    hyrfpack.save(model, file, provenance=provenance)
+    hyrfpack.save_model(model, file, provenance=provenance)
     return file
 
 
@@ -127,7 +127,9 @@ def test_a_background_becomes_a_sphere_with_its_colours(folder: Path, tmp_path: 
     pose[:3, :3] = [[1, 0, 0], [0, 0, -1], forward]
     pose[:3, 3] = -pose[:3, :3] @ CENTER
     camera = Camera(1, 1, 5e4, 5e4, 0.5, 0.5, pose)
-    seen = render(small_model(np.zeros((0, 3)), **same_fields()), camera, background=True).rgb[0, 0].detach().numpy()
+    seen = (
+        render_view(small_model(np.zeros((0, 3)), **same_fields()), camera, background=True).rgb[0, 0].detach().numpy()
+    )
     np.testing.assert_allclose(pixels[-1, :, :3].mean(0), seen, atol=0.02)
 
 
@@ -152,7 +154,7 @@ def test_the_page_shows_what_is_rendered_here(folder: Path, tmp_path: Path) -> N
         picture = np.array(Image.open(io.BytesIO(browser.screenshot())).convert("RGB"), np.float32) / 255
         complaints = browser.list_errors()
 
-    own = render(model_of(), cameras_about(10)[0]).rgb.detach()
+    own = render_view(model_of(), cameras_about(10)[0]).rgb.detach()
     assert not [line for line in complaints if "WebGPU" not in line], json.dumps(complaints)
     assert psnr(torch.from_numpy(picture), own) > 28
     assert psnr(own.mean((0, 1)).expand_as(own), own) < 20  # there is something to see
