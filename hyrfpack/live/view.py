@@ -24,7 +24,7 @@ MIN_INTERVAL_RATIO = 40.0
 
 
 class LiveView:
-    """Observer of `hyrfpack.train.train` that takes snapshots of the model in training.
+    """Observer of `hyrfpack.train_model` that takes snapshots of the model in training.
 
     A snapshot is a `.hyrf` file in memory with profile "raw", which is the fastest to write. Snapshots are taken after
     the first and the last step, and in between at intervals of at least MIN_INTERVAL_SECONDS and MIN_INTERVAL_RATIO.
