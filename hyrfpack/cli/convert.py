@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from hyrfpack.cli.common import OUTPUT, PATH, format_table, json_option, note, note_rename, overwrite_option, print_json
-from hyrfpack.cli.export import crop_option, min_opacity_option
+from hyrfpack.cli.export import crop_option, min_opacity_option, spz_version_option
 from hyrfpack.cli.progress import show_progress
 from hyrfpack.outputs import Outputs
 
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 )
 @crop_option
 @min_opacity_option
+@spz_version_option
 @overwrite_option
 @json_option
 def convert(
@@ -36,6 +37,7 @@ def convert(
     degree: int | None,
     crop: tuple[float, ...] | None,
     min_opacity: float,
+    spz_version: int,
     overwrite: bool,
     as_json: bool,
 ) -> None:
@@ -64,6 +66,7 @@ def convert(
             degree=degree,
             crop=crop,
             min_opacity=min_opacity,
+            spz_version=spz_version,
             overwrite=overwrite,
             say=note,
             report=progress,

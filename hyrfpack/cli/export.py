@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from hyrfpack.choices import LOCAL_EXPOSURE, SPLAT_EXPOSURES
+from hyrfpack.choices import DEFAULT_SPZ_VERSION, LOCAL_EXPOSURE, SPLAT_EXPOSURES, SPZ_VERSIONS
 from hyrfpack.cli.common import (
     OUTPUT,
     PATH,
@@ -70,6 +70,14 @@ crop_option = click.option(
 min_opacity_option = click.option(
     "--min-opacity", type=click.FloatRange(0, 1), default=0.0, show_default=True, help="Leave out fainter Gaussians."
 )
+spz_version_option = click.option(
+    "--spz-version",
+    type=click.IntRange(SPZ_VERSIONS[0], SPZ_VERSIONS[-1]),
+    default=DEFAULT_SPZ_VERSION,
+    show_default=True,
+    metavar="3|4",
+    help="Version of .spz files; 3 is for programs that do not read version 4 yet.",
+)
 
 
 @click.command(short_help="Write a model for other programs.")
@@ -104,7 +112,7 @@ min_opacity_option = click.option(
     help="Photos of the scene: for a file that keeps no cameras, and to score held-out ones. For a gallery, once for "
     "each MODEL.",
 )
-@click.option("--spz-version", type=click.Choice(["3", "4"]), default="3", show_default=True, help="Of .spz files.")
+@spz_version_option
 @overwrite_option
 @scene_options
 @json_option
@@ -118,7 +126,7 @@ def export(
     min_opacity: float,
     background: bool,
     exposure: str,
-    spz_version: str,
+    spz_version: int,
     data: tuple[Path, ...],
     overwrite: bool,
     reader_options: dict[str, Any],
@@ -188,7 +196,7 @@ def export(
                 crop=crop,
                 min_opacity=min_opacity,
                 background=background,
-                spz_version=int(spz_version),
+                spz_version=spz_version,
                 baked=baked,
                 exposure=exposure,
                 colmap=colmap,

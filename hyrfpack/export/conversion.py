@@ -12,6 +12,7 @@ import numpy as np
 
 from hyrfpack.atomic import write_atomic
 from hyrfpack.cameras.paths import Viewpoint
+from hyrfpack.choices import DEFAULT_SPZ_VERSION
 from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.export.kinds import check_request, select_splats
 from hyrfpack.export.measure import psnr_of_splats
@@ -67,6 +68,7 @@ def convert_splats(
     degree: int | None = None,
     crop: Sequence[float] | None = None,
     min_opacity: float = 0.0,
+    spz_version: int = DEFAULT_SPZ_VERSION,
     overwrite: bool = True,
     say: Callable[[str], None] = lambda sentence: None,
     report: Report = no_report,
@@ -80,6 +82,7 @@ def convert_splats(
         crop: (min x, min y, min z, max x, max y, max z) in world units; Gaussians whose centres lie outside are left
             out. Infinite numbers leave a side open.
         min_opacity: Gaussians with a lower opacity are left out.
+        spz_version: version of ".spz" files, 4 or 3 (for programs that do not read 4), see `Hints`.
         overwrite: replace a file at `target`. If False, an existing file is an error. A file that appears during the
             conversion is kept, and the result gets a free name beside it, which the report contains.
         say: called with a sentence for each property of the splats that the format cannot hold.
@@ -110,7 +113,8 @@ def convert_splats(
     kept = kept.with_degree(min(kept.degree, kind.max_degree, kept.degree if degree is None else degree))
     _check_limits(kind, splats, kept, say)
     weighted = WeightedSplats.from_splats(whole, str(source))
-    hints = Hints(camera=Viewpoint.from_frame(weighted.frame.center, weighted.frame.scale).camera)
+    camera = Viewpoint.from_frame(weighted.frame.center, weighted.frame.scale).camera
+    hints = Hints(camera=camera, spz_version=spz_version)
     report(f"writing {len(kept):,} Gaussians as {kind.ending}", 0.2)
     data = kind.encode(kept, hints)
     report("reading them back", 0.5)

@@ -15,7 +15,7 @@ import numpy as np
 
 from hyrfpack.atomic import write_atomic
 from hyrfpack.checks import check_choice, check_type
-from hyrfpack.choices import CONSISTENT_EXPOSURE, LOCAL_EXPOSURE, SPLAT_EXPOSURES
+from hyrfpack.choices import CONSISTENT_EXPOSURE, DEFAULT_SPZ_VERSION, LOCAL_EXPOSURE, SPLAT_EXPOSURES
 from hyrfpack.errors import HyrfError
 from hyrfpack.export.background import background_picture, background_splats
 from hyrfpack.export.bake import CameraVisibility, bake, compute_visibility
@@ -63,7 +63,7 @@ def export_model(
     crop: Sequence[float] | None = None,
     min_opacity: float = 0.0,
     background: bool = True,
-    spz_version: int = 3,
+    spz_version: int = DEFAULT_SPZ_VERSION,
     baked: bool = False,
     exposure: str = LOCAL_EXPOSURE,
     colmap: bool = False,
@@ -95,7 +95,7 @@ def export_model(
             background, are left out. Infinite numbers leave a side open.
         min_opacity: Gaussians with a lower opacity are left out.
         background: whether to export the model's background.
-        spz_version: version of ".spz" files, 3 (which all programs read) or 4.
+        spz_version: version of ".spz" files, 4 or 3 (for programs that do not read 4), see `Hints`.
         baked: write splats into a page instead of the model.
         exposure: exposure of the baked splats of a model with an exposure map. "local" exposes their colours like the
             photos that see them, so that the splats look as photographed; "consistent" ignores the map. Both are the

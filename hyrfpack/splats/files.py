@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from hyrfpack.choices import DEFAULT_SPZ_VERSION
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.scene import Camera
 from hyrfpack.splats.formats import sog
@@ -22,7 +23,7 @@ MAX_FILE_BYTES = 1 << 32  # a PLY of this size holds 17 million Gaussians
 
 
 def encode_splats(
-    splats: Splats, extension: str, *, up: np.ndarray, camera: Camera | None, spz_version: int = 3
+    splats: Splats, extension: str, *, up: np.ndarray, camera: Camera | None, spz_version: int = DEFAULT_SPZ_VERSION
 ) -> bytes:
     """Encode splats as the bytes of a file.
 
@@ -31,7 +32,7 @@ def encode_splats(
         extension: ending of the format, one of FORMATS. ".splat" holds no harmonics beyond degree 0.
         up: (3,) unit vector in world axes that points up, for the formats that store it (glTF, USD).
         camera: initial camera, for the formats that store one (USD).
-        spz_version: 3 or 4, see `Hints`.
+        spz_version: version of ".spz" files, 3 or 4, see `Hints`.
 
     Raises:
         HyrfError: the format's package is missing.

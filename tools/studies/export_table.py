@@ -19,6 +19,7 @@ from typing import TypeVar
 import numpy as np
 
 import hyrfpack
+from hyrfpack.choices import DEFAULT_SPZ_VERSION
 from hyrfpack.export.background import background_picture, background_splats
 from hyrfpack.export.bake import bake
 from hyrfpack.export.kinds import HTML_PAGE
@@ -35,8 +36,8 @@ Result = TypeVar("Result")
 CHECKED_BY = {
     ".ply": "splat-transform, gsply, three.js",
     ".splat": "splat-transform, three.js",
-    ".spz": "splat-transform, gsply, three.js",
-    ".spz v4": "splat-transform, gsply",
+    ".spz": "splat-transform, gsply",
+    ".spz v3": "splat-transform, gsply, three.js",
     ".sog": "splat-transform, gsply",
     ".glb": "three.js, gltf-validator",
     ".usda": "omniverse-asset-validator, OpenUSD",
@@ -89,7 +90,7 @@ def row(
         back, read = timed(lambda: decode_splats_page(data, name))
     else:
         form = FORMATS[name.split()[0]]
-        hints = Hints(source.up, source.cameras[0][1], 4 if name.endswith("v4") else 3)
+        hints = Hints(source.up, source.cameras[0][1], 3 if name.endswith("v3") else DEFAULT_SPZ_VERSION)
         data, write = timed(lambda: form.encode(whole[degree], hints))
         back, read = timed(lambda: (form.decode(data, name), None))
     file = score(source, {"file": back})["file"]

@@ -32,6 +32,7 @@ import torch
 from torch import Tensor
 
 import hyrfpack
+from hyrfpack.choices import SPZ_VERSIONS
 from hyrfpack.evaluate.figures import blank_figure, save_figure
 from hyrfpack.evaluate.metrics import psnr, ssim, to_8bit
 from hyrfpack.export.bake import bake
@@ -42,7 +43,6 @@ from hyrfpack.model import HybridModel
 from hyrfpack.render import render_view
 from hyrfpack.scene import Camera, View
 from hyrfpack.splats.draw import Drawable, draw
-from hyrfpack.splats.formats import spz
 from hyrfpack.splats.formats.hints import NO_HINTS, Hints
 from hyrfpack.splats.splats import Splats
 from hyrfpack.splats.table import FORMATS
@@ -188,7 +188,7 @@ def through(ending: str, hints: Hints, splats: Splats) -> tuple[int, Splats]:
 def runs_of(peer: str, degree: int) -> dict[str, RoundTrip]:
     """What can be set in a peer's files, by name."""
     if peer == "SPZ":
-        return {f"version {v}": partial(through, ".spz", Hints(spz_version=v)) for v in spz.WRITTEN_VERSIONS}
+        return {f"version {v}": partial(through, ".spz", Hints(spz_version=v)) for v in SPZ_VERSIONS}
     if peer == "SOG":
         return {"": partial(through, ".sog", NO_HINTS)}
     if not degree:  # there is nothing to cluster

@@ -89,5 +89,5 @@ def encode_views(points: Tensor, viewpoint: Tensor, encoding: str, *, implementa
     if choose_implementation(implementation, available, points, viewpoint) == "gpu":
         from hyrfpack.ops.shade import gpu_directions
 
-        return gpu_directions.encode_views(points, viewpoint, encoding)
+        return gpu_directions.encode_views(points, viewpoint, encoding, DIRECTION_FEATURES[encoding])
     return encode_directions(torch.nn.functional.normalize(points - viewpoint, dim=-1, eps=1e-12), encoding)

@@ -9,8 +9,6 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from hyrfpack.ops.shade.directions import DIRECTION_FEATURES
-
 _POINTS_PER_PROGRAM = 128
 
 
@@ -76,13 +74,14 @@ def encode_views_kernel(
         tl.store(out + row.to(tl.int64) * total + index[None, :], encoded, mask=live[None, :] & (row < ROWS))
 
 
-def encode_views(points: Tensor, viewpoint: Tensor, encoding: str) -> Tensor:
-    """Compute `directions.encode_views` without gradients; the result is stored planar, as hash features are."""
-    rows, total = DIRECTION_FEATURES[encoding], len(points)
-    encoded = points.new_empty(rows, total)
+def encode_views(points: Tensor, viewpoint: Tensor, encoding: str, features: int) -> Tensor:
+    """Compute `directions.encode_views` without gradients; the result (N, features) is stored planar."""
+    total = len(points)
+    encoded = points.new_empty(features, total)
     if total:
         encode_views_kernel[(triton.cdiv(total, _POINTS_PER_PROGRAM),)](
             points.detach().contiguous(), viewpoint.detach().contiguous(), total, encoded,
-            ROWS=rows, FREQUENCY=encoding == "frequency", BLOCK=_POINTS_PER_PROGRAM, num_warps=4, enable_fp_fusion=True,
+            ROWS=features, FREQUENCY=encoding == "frequency", BLOCK=_POINTS_PER_PROGRAM, num_warps=4,
+            enable_fp_fusion=True,
         )  # fmt: skip
     return encoded.T

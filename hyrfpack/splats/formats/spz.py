@@ -30,6 +30,7 @@ import zlib
 import numpy as np
 import zstandard
 
+from hyrfpack.choices import SPZ_VERSIONS
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.parallel.pool import run_tasks
 from hyrfpack.splats.formats.hints import NO_HINTS, Hints
@@ -37,8 +38,6 @@ from hyrfpack.splats.formats.smallest_three import drop_largest, restore_largest
 from hyrfpack.splats.formats.validation import build_valid_splats
 from hyrfpack.splats.harmonics import MAX_DEGREE, harmonics_rotation, num_sh_bases
 from hyrfpack.splats.splats import Splats
-
-WRITTEN_VERSIONS = (3, 4)
 
 _MAGIC = b"NGSP"
 _GZIP_MAGIC = b"\x1f\x8b"
@@ -91,15 +90,15 @@ def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
 
     Args:
         splats: the splats.
-        hints: `spz_version`, one of WRITTEN_VERSIONS, is used.
+        hints: `spz_version`, one of SPZ_VERSIONS, is used.
 
     Raises:
         ValueError: the version is another.
         HyrfDataError: a position is too far from the origin (more than 4,194,303 units).
     """
     version = hints.spz_version
-    if version not in WRITTEN_VERSIONS:
-        raise ValueError(f"SPZ version {version} cannot be written; choose one of {WRITTEN_VERSIONS}")
+    if version not in SPZ_VERSIONS:
+        raise ValueError(f"SPZ version {version} cannot be written; choose one of {SPZ_VERSIONS}")
     bits = _choose_fractional_bits(splats.positions)
     signs = _harmonics_signs(splats.degree).astype(np.float32)
     sections = (
