@@ -479,7 +479,7 @@ def test_a_disk_that_fails_leaves_the_old_file_as_it_was(plain, tmp_path, monkey
 def test_export_is_one_call_on_the_package(plain, tmp_path):
     report = hyrfpack.export_model(plain, tmp_path / "a.ply", degree=0)
     assert isinstance(report, hyrfpack.ExportReport) and hyrfpack.ExportReport is ExportReport
-    assert {"export", "ExportReport"} <= set(hyrfpack.__all__)
+    assert {"export_model", "ExportReport"} <= set(hyrfpack.__all__)
 
 
 def test_choosing_all_copies_nothing(plain):

@@ -36,7 +36,7 @@ Result = TypeVar("Result")
 CHECKED_BY = {
     ".ply": "splat-transform, gsply, three.js",
     ".splat": "splat-transform, three.js",
-    ".spz": "splat-transform, gsply",
+    ".spz": "splat-transform, gsply, three.js",
     ".spz v3": "splat-transform, gsply, three.js",
     ".sog": "splat-transform, gsply",
     ".glb": "three.js, gltf-validator",

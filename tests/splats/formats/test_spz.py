@@ -154,11 +154,16 @@ def test_extensions_are_skipped():
 
 
 def test_the_same_splats_make_the_same_bytes_without_a_time():
-    data = spz.encode(make_splats(50))
+    older = Hints(spz_version=3)
+    data = spz.encode(make_splats(50), older)
     assert data[:10] == b"\x1f\x8b\x08\0\0\0\0\0\0\xff"
-    assert data == spz.encode(make_splats(50))
-    newer = Hints(spz_version=4)
-    assert spz.encode(make_splats(50), newer) == spz.encode(make_splats(50), newer)
+    assert data == spz.encode(make_splats(50), older)
+    assert spz.encode(make_splats(50)) == spz.encode(make_splats(50))
+
+
+def test_version_4_is_the_default():
+    assert spz.encode(make_splats(50)) == spz.encode(make_splats(50), Hints(spz_version=4)) != b""
+    assert spz.encode(make_splats(50))[:8] == struct.pack("<4sI", b"NGSP", 4)
 
 
 def test_biker_is_the_model_of_its_compressed_ply(shared_data):
