@@ -78,7 +78,7 @@ def test_sub_packages_support_every_form_of_import():
         "from hyrfpack.train import Trainer, progress as again\n"
         "import hyrfpack.cameras.paths, sys\n"
         "assert progress is again is sys.modules['hyrfpack.train.progress'] is hyrfpack.train.progress\n"
-        "assert t is hyrfpack.train is sys.modules['hyrfpack.train'] and t.train_model is hyrfpack.train_model\n"
+        "assert t is hyrfpack.train_model is sys.modules['hyrfpack.train'] and t.train_model is hyrfpack.train_model\n"
         "assert t.Trainer is Trainer and hyrfpack.cameras.paths.orbit\n"
         "progress.LOG_INTERVAL_SECONDS = 7\n"
         "assert hyrfpack.train.progress.LOG_INTERVAL_SECONDS == 7\n"

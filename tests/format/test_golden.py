@@ -10,7 +10,7 @@ import pytest
 from hyrfpack.choices import CONSISTENT_EXPOSURE
 from hyrfpack.format import describe_file, load_model, metadata
 from hyrfpack.model import Frame, HashGridConfig, ModelConfig
-from hyrfpack.render import RenderSettings, render
+from hyrfpack.render import RenderSettings, render_view
 from tools.safety.make_golden import GOLDEN_FILES, make_golden_camera
 from tools.safety.synthetic_encoding import encode
 
@@ -78,7 +78,7 @@ def test_golden_exposure_map_gives_the_recorded_log_gains(name):
 @pytest.mark.parametrize("name", WITH_EXPOSURE)
 def test_golden_file_with_an_exposure_map_renders_the_recorded_picture(name):
     recorded = np.load(GOLDEN / f"{name}.npz")["exposure.picture"]
-    model, camera = load(GOLDEN / f"{name}.hyrf"), make_golden_camera()
+    model, camera = load_model(GOLDEN / f"{name}.hyrf"), make_golden_camera()
 
     picture = render_view(model, camera).rgb.numpy()
 

@@ -32,7 +32,7 @@ from hyrfpack.quant import (
     huffman_encode,
 )
 from hyrfpack.quant.huffman import MAX_CODE_BITS
-from hyrfpack.render import render
+from hyrfpack.render import render_view
 from tools.safety.synthetic_encoding import quantize_uniformly
 
 LARGEST = float(np.finfo(np.float32).max)

@@ -68,7 +68,7 @@ def _affordable_steps(scene: Scene, setup: Setup) -> int:
 
 def _train(scene: Scene, steps: int, precision: str, device: torch.device) -> tuple[float, Row]:
     """Train a model; return its PSNR on held-out photos in dB, and the cells of its row."""
-    from hyrfpack.evaluate import evaluate
+    from hyrfpack.evaluate import evaluate_model
     from hyrfpack.train import TrainConfig, Trainer
 
     start = time.perf_counter()

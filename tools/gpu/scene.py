@@ -88,7 +88,7 @@ def make_scene(truth: HybridModel, cameras: list[Camera]) -> Scene:
     views = []
     for number, camera in enumerate(cameras):
         with torch.no_grad():
-            rgb = (255 * render(truth, camera).rgb.clamp(0, 1)).round().byte().cpu().numpy()
+            rgb = (255 * render_view(truth, camera).rgb.clamp(0, 1)).round().byte().cpu().numpy()
         views.append(View(f"{number:04d}", camera, _picture_loader(Picture(rgb))))
     points = truth.gaussians.positions.detach()[:: max(1, len(truth) // 500)].double().cpu().numpy()
     colors = np.full(points.shape, 0.5, np.float32)

@@ -53,7 +53,7 @@ from hyrfpack.format.container import raw_bytes_limit
 from hyrfpack.format.exposure import encode_exposure
 from hyrfpack.model import HybridModel
 from hyrfpack.model.exposure import MAX_LOG_GAIN
-from hyrfpack.render.renderer import render
+from hyrfpack.render.renderer import render_view
 from tools.safety.fuzz_mutate import load_seed_files, make_hostile_file
 
 MAX_CPU_SECONDS = 2.0

@@ -126,7 +126,9 @@ def expect_exposure(exposure: minimal_reader.Exposure, model: HybridModel) -> di
     positions[0], directions[0] = (-0.1, -0.2, -1.0), (0.0, 0.0, 1.0)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     logs = np.array([minimal_reader.log_gains(exposure, *view) for view in zip(positions, directions, strict=True)])
-    consistent = render(model, make_golden_camera(), RenderSettings(exposure=CONSISTENT_EXPOSURE)).rgb.double().numpy()
+    consistent = (
+        render_view(model, make_golden_camera(), RenderSettings(exposure=CONSISTENT_EXPOSURE)).rgb.double().numpy()
+    )
     return {
         "exposure.positions": positions,
         "exposure.directions": directions,

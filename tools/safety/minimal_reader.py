@@ -1,4 +1,4 @@
-"""Read `.hyrf` files of versions 1.0 to 1.2, by code written only from docs/format.md, with numpy alone.
+"""Read `.hyrf` files of versions 1.0 to 1.2, by code written only from docs/reference/format.md, with numpy alone.
 
 This reader shares no code with hyrfpack. So it tests whether the page is complete and whether hyrfpack conforms to it.
 It is simple, not fast: a file of 30,000 Gaussians takes some seconds. Section numbers are those of the page.

@@ -1,7 +1,7 @@
 """Encode models in profile `compact` without rendering: the sensitivities are random, or equal for all numbers.
 
 Golden files, recorded sizes, hostile files and tests use this module, so that their bytes do not depend on pictures.
-`hyrfpack.compress` measures the sensitivities instead.
+`hyrfpack.compress_model` measures the sensitivities instead.
 """
 
 from __future__ import annotations
