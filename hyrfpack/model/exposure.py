@@ -25,7 +25,8 @@ def apply_exposure_gains(image: Tensor, gains: Tensor) -> Tensor:
         y' = g y / (1 + (g - 1) y)        that is, logit y' = logit y + log g
 
     Black and white do not change, g is the gain in the shadows, and gains g and h one after the other equal the gain
-    g h. A point's colours in different photos follow this more closely than a linear gain (`docs/how-to/training.md`).
+    g h. A point's colours in different photos follow this more closely than a linear gain
+    (`docs/research/exposure.md`).
 
     Args:
         image: (..., 3) in [0, 1].
