@@ -5,7 +5,7 @@ from __future__ import annotations
 from hyrfpack.evaluate.metrics import provenance_mse
 
 # Estimated loss of PSNR by default. At equal size, a model of more Gaussians with coarser numbers is better than one of
-# fewer Gaussians with finer numbers: docs/research/design-choices.md.
+# fewer Gaussians with finer numbers: docs/research/count-and-precision.md.
 DEFAULT_PSNR_DROP_DB = 0.1
 # Fine-tuning of at least FULL_FINETUNING_STEPS recovers most of the loss, so it starts from a larger distortion.
 FINETUNED_DISTORTION_RATIO = 2.5

@@ -1,6 +1,6 @@
 """The ablation behind each default where the HyRF paper and its authors' code disagree.
 
-    python -m tools.studies.design_choices --steps 2000        prints the table of docs/research/design-choices.md
+    python -m tools.studies.design_choices --steps 2000        prints the table of docs/research/paper-and-code.md
 
 Each row changes one setting of the default. Scores are on held-out views of the `paper` file as decoded from disk;
 every row is the mean over the seeds, and the spread between seeds of the default says what a difference is worth.
