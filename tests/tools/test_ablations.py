@@ -20,7 +20,7 @@ from tools.studies import ablation_models, ablations
 # Density control clones and splits from the second step on.
 DENSITY = DensityConfig(start=0.05, stop=0.7, rounds=5, gradient=1e-6)
 SHORT = TrainConfig(steps=24, seed=3, max_gaussians=160, density=DENSITY)
-VARIANTS = {variant.name: variant for variant in ablation_models.TRAINED}
+VARIANTS = {variant.name: variant for variant in ablation_models.TRAINED_VARIANTS}
 EVERYTHING = {*Gaussians.PARAMETER_NAMES, "geometry", "radiance"}
 KEEPS = {
     "full": EVERYTHING,
@@ -84,18 +84,18 @@ def test_a_run_moves_all_that_a_variant_keeps_and_nothing_else(name):
     assert all(parameter.isfinite().all() for parameter in after.values())
 
 
-@pytest.mark.parametrize("name", [name for name in VARIANTS if VARIANTS[name].lacking])
+@pytest.mark.parametrize("name", [name for name in VARIANTS if VARIANTS[name].missing_logits])
 def test_logits_that_are_lacking_are_zero_to_the_end(name):
     trainer = untrained(name)
     trainer.run()
 
-    for logits in VARIANTS[name].lacking:
+    for logits in VARIANTS[name].missing_logits:
         values = getattr(trainer.model.gaussians, logits)
         assert len(values) == len(trainer.model) > 60
         assert not values.any()
 
 
-@pytest.mark.parametrize("name", [name for name in VARIANTS if VARIANTS[name].lacking])
+@pytest.mark.parametrize("name", [name for name in VARIANTS if VARIANTS[name].missing_logits])
 def test_without_logits_gaussians_start_at_the_mean_of_those_they_would_have_had(name):
     full, model = untrained("full").model, untrained(name).model
 
@@ -206,7 +206,7 @@ def test_without_pre_culling_every_gaussian_is_decoded():
     model = untrained("full").model
     camera = dataclasses.replace(ring(1)[0], width=6, cx=3.0)  # a slit that sees few of them
 
-    with ablations.culling(ablation_models.NO_CULLING):
+    with ablations.patch_culling(ablation_models.NO_CULLING_VARIANT):
         everything = render_view(model, camera)
 
     assert len(everything.indices) == len(model)
@@ -217,7 +217,9 @@ def test_without_pre_culling_every_gaussian_is_decoded():
 def test_a_run_that_diverges_is_a_result(steps, tmp_path):
     config = dataclasses.replace(SHORT, steps=steps, learning_rates=LearningRates(fields=(1e38, 1e38)))
 
-    result = ablations.run(VARIANTS["no explicit scale"], a_scene(), config, tmp_path / "full.hyrf", PictureCache())
+    result = ablations.train_and_measure(
+        VARIANTS["no explicit scale"], a_scene(), config, tmp_path / "full.hyrf", PictureCache()
+    )
 
     assert list(result) == ["failed"]
     assert "finite" in result["failed"]
@@ -260,7 +262,7 @@ def test_tables_hold_differences_their_spread_and_runs_that_failed():
     }
     variants = [VARIANTS["full"], single, scale]
 
-    text = ablations.report(results, ["a", "b"], variants)
+    text = ablations.format_report(results, ["a", "b"], variants)
 
     assert "| full | 24.07, 30.37 | 20.50 ± 0.50 | 30.00 ± 0.00 |" in text
     assert "| single field | -0.29 | -0.75 ± 0.25 | +0.30 ± 0.10 | -0.23 | 1 of 2 |" in text

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scenes import ball_scene
 
-from tools.studies import variants
-from tools.studies.variants import in_two_exposures, load_variant, with_few_photos
+from tools.studies import set_variants
+from tools.studies.set_variants import keep_few_photos, load_variant, split_exposures
 
 
 def split_scene():
@@ -23,7 +23,7 @@ def is_lighter(before, after) -> list[bool]:
 
 def test_few_photos_are_spread_over_all_and_the_held_out_ones_stay():
     scene = split_scene()
-    few = with_few_photos(scene, 7)
+    few = keep_few_photos(scene, 7)
     assert len(few.train) == 7 and few.test == scene.test
     assert {view.name for view in few.train} < {view.name for view in scene.train}
     places = [scene.train.index(view) for view in few.train]
@@ -33,7 +33,7 @@ def test_few_photos_are_spread_over_all_and_the_held_out_ones_stay():
 
 def test_the_second_half_by_name_is_lighter():
     scene = split_scene()
-    relit = in_two_exposures(scene, interleaved=False)
+    relit = split_exposures(scene, interleaved=False)
     names = sorted(view.name for view in scene.views)
     for before, after in ((scene.train, relit.train), (scene.test, relit.test)):
         assert is_lighter(before, after) == [view.name in names[16:] for view in before]
@@ -41,7 +41,7 @@ def test_the_second_half_by_name_is_lighter():
 
 def test_interleaved_groups_are_half_of_all_and_both_hold_photos_out():
     scene = split_scene()
-    relit = in_two_exposures(scene, interleaved=True)
+    relit = split_exposures(scene, interleaved=True)
     lighter = is_lighter(scene.train, relit.train) + is_lighter(scene.test, relit.test)
     assert sum(lighter) == 16
     assert 0 < sum(is_lighter(scene.test, relit.test)) < len(scene.test)
@@ -50,7 +50,7 @@ def test_interleaved_groups_are_half_of_all_and_both_hold_photos_out():
 def test_middle_grey_becomes_two_stops_lighter():
     """By a display gamma of 2.2 a stop multiplies light by 2; the tone curve does so in its slope at middle grey."""
     scene = split_scene()
-    relit = in_two_exposures(scene, interleaved=False)
+    relit = split_exposures(scene, interleaved=False)
     old, new = scene.train[-1].load().rgb / 255, relit.train[-1].load().rgb / 255
     inside = (old > 0.1) & (old < 0.9)
     logit = np.log(new / (1 - np.minimum(new, 0.999))) - np.log(old / (1 - np.minimum(old, 0.999)))
@@ -60,7 +60,7 @@ def test_middle_grey_becomes_two_stops_lighter():
 
 def test_names_say_what_is_changed(tmp_path, monkeypatch):
     asked = []
-    monkeypatch.setattr(variants.hyrfpack, "load_scene", lambda path: asked.append(path) or split_scene())
+    monkeypatch.setattr(set_variants.hyrfpack, "load_scene", lambda path: asked.append(path) or split_scene())
     scene = load_variant(tmp_path, "balls@5@contiguous")
     assert asked == [tmp_path / "balls"] and len(scene.train) == 5
     for wrong in ("balls@0", "balls@dark", "balls@"):

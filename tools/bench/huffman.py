@@ -13,13 +13,13 @@ PEER_SYMBOL_COUNT = 100_000  # dahuffman is slow and its time is linear in the c
 TIMING_REPEATS = 5
 
 
-def make_table_symbols(count: int = SYMBOL_COUNT) -> np.ndarray:
+def make_table_symbols() -> np.ndarray:
     """Return 8-bit min-max codes of values like a trained hash table's.
 
     The values are Gaussian within a level and heavy-tailed over all levels.
     """
     rng = np.random.default_rng(0)
-    spread = np.repeat(np.geomspace(0.3, 1.0, 16), -(-count // 16))[:count]
+    spread = np.repeat(np.geomspace(0.3, 1.0, 16), -(-SYMBOL_COUNT // 16))[:SYMBOL_COUNT]
     values = rng.laplace(scale=spread) * 0.5 + rng.normal(scale=spread)
     return MinMaxQuantizer(8).encode(values.astype(np.float32))[0]
 

@@ -37,6 +37,8 @@ PLANT_CENTERS_AND_RADII = (((-1.1, 0.6, -0.1), 0.28), ((0.9, -0.6, -0.2), 0.24))
 PLANT_GAUSSIAN_RATIO = 0.2
 GAUSSIANS_PER_ROW = 20  # training sizes its hash tables by the same ratio
 FOCAL_LENGTH_TO_WIDTH_RATIO = 0.75
+MAX_SAMPLED_TILES = 48
+NEAR_PLANE = 0.01  # the default of the rasteriser
 
 
 @dataclass(frozen=True)
@@ -100,9 +102,9 @@ def _picture_loader(picture: Picture) -> Callable[[], Picture]:
 
 
 @torch.no_grad()
-def perturb(model: HybridModel, seed: int = 1) -> HybridModel:
+def perturb(model: HybridModel) -> HybridModel:
     """Add noise to the model's colours, sizes and opacities, in place, so that training has something to improve."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(1)
     explicit = model.gaussians
     for values, size in ((explicit.color_logits, 0.5), (explicit.scale_logits, 0.15), (explicit.opacity_logits, 0.3)):
         values += (size * torch.randn(values.shape, generator=generator)).to(values.device)
@@ -137,8 +139,8 @@ def decode_splats(model: HybridModel, camera: Camera) -> Splats:
 
 
 @torch.no_grad()
-def count_blended(splats: Splats, tiles: int = 48, near: float = 0.01) -> tuple[float, float]:
-    """Estimate the work of blending from up to `tiles` of the picture's tiles, evenly spread.
+def count_blended(splats: Splats) -> tuple[float, float]:
+    """Estimate the work of blending from up to MAX_SAMPLED_TILES of the picture's tiles, evenly spread.
 
     Returns:
         The mean number of Gaussians that contribute to a pixel, and the mean share of a tile's Gaussians that are
@@ -146,12 +148,12 @@ def count_blended(splats: Splats, tiles: int = 48, near: float = 0.01) -> tuple[
     """
     camera = splats.camera
     values = [splats.inputs[name] for name in ("means", "quats", "scales", "opacities")]
-    seen = project(*values, *splats.view, near, False)
+    seen = project(*values, *splats.view, NEAR_PLANE, False)
     seen = seen.select(torch.argsort(seen.depths))
     reach = (2 * torch.log(255 * seen.opacities).clamp_min(0))[:, None] * seen.covs2d[:, [0, 2]]
     lower, upper = seen.means2d - reach.sqrt(), seen.means2d + reach.sqrt()
     columns, rows = -(-camera.width // TILE_SIZE), -(-camera.height // TILE_SIZE)
-    places = torch.linspace(0, columns * rows - 1, min(tiles, columns * rows)).long().tolist()
+    places = torch.linspace(0, columns * rows - 1, min(MAX_SAMPLED_TILES, columns * rows)).long().tolist()
     corners = torch.stack(torch.meshgrid(torch.arange(TILE_SIZE), torch.arange(TILE_SIZE), indexing="xy"), -1).view(
         -1, 2
     )

@@ -29,13 +29,13 @@ TOTAL_DECODER_SENSITIVITY = 1.0
 LOG_SENSITIVITY_STD = 1.5
 
 
-def draw_sensitivity(model: HybridModel, seed: int = 0) -> Sensitivity:
+def draw_sensitivity(model: HybridModel) -> Sensitivity:
     """Draw log-normal sensitivities with a fixed seed.
 
     All numbers of a Gaussian share one factor. The sensitivity of a table row is proportional to the number of reads by
     the Gaussians.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     shares = np.exp(LOG_SENSITIVITY_STD * rng.normal(size=len(model))) / max(len(model), 1)
     places = model.cube_coords(model.gaussians.positions.detach().double()).numpy()
     points = 2 * np.minimum(places * (1 << MAX_BITS_PER_AXIS), (1 << MAX_BITS_PER_AXIS) - 1).astype(np.int64) + 1

@@ -1,6 +1,6 @@
-"""The variants of `tools/studies/ablations.py`: a HybridModel with one part taken out, and a fair start for each.
+"""Define the variants of `tools/studies/ablations.py`: models without one part, each with a fair start of training.
 
-Everything else stays the product's own: photos, first Gaussians, budget, density control, losses, schedules.
+Everything else is that of hyrfpack: photos, first Gaussians, budget, density control, losses and schedules.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from hyrfpack.train.config import LearningRates, TrainConfig
 from hyrfpack.train.optimizer import Optimizer
 from hyrfpack.train.trainer import Trainer
 
-EXPLICIT = ("color_logits", "scale_logits", "opacity_logits")
-Y00 = 0.28209479177387814  # the constant spherical harmonic
-SH_NUMBERS = 16  # of bands 0 to 3, for each colour channel
-SH_REST_RATE = 1 / 20  # learning rate of bands 1 to 3 as a part of band 0's (3DGS)
+EXPLICIT_LOGITS = ("color_logits", "scale_logits", "opacity_logits")
+SH_CONSTANT = 0.28209479177387814  # value of the constant spherical harmonic, 1 / sqrt(4 pi)
+SH_COEFFICIENTS = 16  # bands 0 to 3 have this many coefficients for each colour channel
+SH_REST_RATE_RATIO = 1 / 20  # the learning rate of bands 1 to 3 over that of band 0, as in 3DGS
 
 
 class SingleField(HybridModel):
-    """One grid and one decoder predict everything.
+    """A model with one grid and one decoder for geometry and radiance.
 
-    The table has twice the radiance table's rows, so a third more than both tables had, as in the paper. Geometry
-    stays the same from everywhere: it is read with the direction's inputs at zero.
+    The table has twice the rows of the radiance table, which is a third more than both tables together, as in the
+    paper. Geometry does not depend on the view: it is evaluated with the direction's inputs at zero.
     """
 
     def __init__(self, config: ModelConfig, gaussians: Gaussians, generator: torch.Generator | None = None) -> None:
@@ -39,7 +39,7 @@ class SingleField(HybridModel):
         grid = replace(config.radiance, log2_table_size=config.radiance.log2_table_size + 1)
         directions = DIRECTION_FEATURES[config.direction_encoding]
         self.radiance = Field(grid, 3 + 8, config.hidden, extra_inputs=directions, generator=generator)
-        self.geometry = _GeometryOf(self.radiance, directions)
+        self.geometry = _GeometryOutputs(self.radiance, directions)
 
     def _radiance(self, positions: Tensor, viewpoint: Tensor) -> Tensor:
         return super()._radiance(positions, viewpoint)[:, :3]
@@ -50,12 +50,12 @@ class SingleField(HybridModel):
         return [*weights, weight[:3]], [*biases, bias[:3]]
 
 
-class _GeometryOf(nn.Module):
-    """The geometry outputs of a single field; owns none of its parameters."""
+class _GeometryOutputs(nn.Module):
+    """The geometry outputs of a single field, without own parameters."""
 
     def __init__(self, field: Field, directions: int) -> None:
         super().__init__()
-        self._field = (field,)  # in a tuple it is not registered again as a part of this module
+        self._field = (field,)  # the tuple keeps torch from registering the field as a submodule again
         self._directions = directions
 
     def forward(self, coords: Tensor, *, mixed: bool = False) -> Tensor:
@@ -63,9 +63,9 @@ class _GeometryOf(nn.Module):
 
 
 class IsotropicDiffuse(HybridModel):
-    """Gaussians that no field has a say in: round, and of one colour from everywhere.
+    """A model of isotropic Gaussians with one colour for all views, without fields.
 
-    The background sphere, where there is one, keeps its radiance field. What is left unused is frozen.
+    The background sphere, if there is one, keeps its radiance field. Unused parameters are frozen.
     """
 
     def __init__(self, config: ModelConfig, gaussians: Gaussians, generator: torch.Generator | None = None) -> None:
@@ -75,10 +75,10 @@ class IsotropicDiffuse(HybridModel):
 
     def decode_geometry(self, index: Tensor | None = None) -> Geometry:
         explicit = self.gaussians
-        pick = (lambda values: values) if index is None else (lambda values: values[index])
-        positions = self._field_positions(pick(explicit.positions))
+        select = (lambda values: values) if index is None else (lambda values: values[index])
+        positions = self._field_positions(select(explicit.positions))
         nothing = positions.new_zeros(len(positions), 8)
-        return self.activate(nothing, positions, pick(explicit.scale_logits), pick(explicit.opacity_logits))
+        return self.activate(nothing, positions, select(explicit.scale_logits), select(explicit.opacity_logits))
 
     def decode(self) -> Decoded:
         return Decoded(self.decode_geometry(), None)  # colours are no field's
@@ -89,18 +89,18 @@ class IsotropicDiffuse(HybridModel):
 
 
 class HarmonicColors(HybridModel):
-    """Each Gaussian stores the 48 numbers of 3DGS: colour = max(0, 1/2 + sum_k h_k Y_k(direction)), bands 0 to 3.
+    """A model whose Gaussians store the 48 harmonics of 3DGS: colour = max(0, 1/2 + sum_k h_k Y_k(direction)).
 
-    They take the place of the colour logits, (N, 48), so density control and the optimiser carry them along. What is
-    stored of bands 1 to 3 is 20 h: Adam's steps do not follow the gradient's size, so h moves at a twentieth of the
-    rate, as in 3DGS. The radiance field colours the background sphere alone.
+    They replace the colour logits as (N, 48), so that density control and the optimiser handle them. For bands 1 to 3
+    the stored number is 20 h. Adam's step does not depend on the gradient's magnitude, so h changes at 1/20 of the
+    learning rate, as in 3DGS. The radiance field colours only the background sphere.
     """
 
     def __init__(self, config: ModelConfig, gaussians: Gaussians, generator: torch.Generator | None = None) -> None:
         super().__init__(config, gaussians, generator)
         with torch.no_grad():
-            constant = (torch.sigmoid(gaussians.color_logits) - 0.5) / Y00
-            stored = torch.cat((constant, constant.new_zeros(len(constant), 3 * (SH_NUMBERS - 1))), dim=1)
+            constant = (torch.sigmoid(gaussians.color_logits) - 0.5) / SH_CONSTANT
+            stored = torch.cat((constant, constant.new_zeros(len(constant), 3 * (SH_COEFFICIENTS - 1))), dim=1)
         gaussians.color_logits = nn.Parameter(stored)
 
     def decode(self) -> Decoded:
@@ -112,14 +112,14 @@ class HarmonicColors(HybridModel):
             positions, stored = positions[index], stored[index]
         offsets = self._field_positions(positions) - viewpoint
         basis = harmonics_to_degree_3(torch.nn.functional.normalize(offsets, dim=-1, eps=1e-12))
-        rates = basis.new_full((SH_NUMBERS,), SH_REST_RATE)
+        rates = basis.new_full((SH_COEFFICIENTS,), SH_REST_RATE_RATIO)
         rates[0] = 1
-        coefficients = stored.view(-1, SH_NUMBERS, 3)
+        coefficients = stored.view(-1, SH_COEFFICIENTS, 3)
         return (torch.einsum("nk,nkc->nc", basis * rates, coefficients) + 0.5).clamp_min(0)
 
 
 def harmonics_to_degree_3(directions: Tensor) -> Tensor:
-    """Real spherical harmonics of bands 0 to 3, orthonormal, at unit vectors (N, 3): (N, 16)."""
+    """Return the orthonormal real spherical harmonics of bands 0 to 3, (N, 16), at unit vectors (N, 3)."""
     x, y, z = directions.unbind(-1)
     band = torch.stack(
         (
@@ -136,18 +136,18 @@ def harmonics_to_degree_3(directions: Tensor) -> Tensor:
     return torch.cat((spherical_harmonics(directions), band), dim=-1)
 
 
-class WithoutLogits(Optimizer):
-    """Adam for a model that lacks some explicit logits: they are zero and stay so, for new Gaussians too."""
+class OptimizerWithoutLogits(Optimizer):
+    """Adam for a model without some explicit logits, which stay zero, also for new Gaussians."""
 
-    def __init__(self, model: HybridModel, rates: LearningRates, lacking: tuple[str, ...]) -> None:
+    def __init__(self, model: HybridModel, rates: LearningRates, missing_logits: tuple[str, ...]) -> None:
         super().__init__(model, rates)
-        self.lacking = lacking
-        for name in lacking:
+        self.missing_logits = missing_logits
+        for name in missing_logits:
             self.reset(name, torch.zeros_like(getattr(model.gaussians, name)))
 
     def _edit(self, name: str, values: Callable[[Tensor], Tensor], moments: Callable[[Tensor], Tensor]) -> None:
         super()._edit(name, values, moments)
-        if name in self.lacking:
+        if name in self.missing_logits:
             nn.init.zeros_(getattr(self.model.gaussians, name)).requires_grad_(False)
 
 
@@ -156,14 +156,15 @@ class Variant:
     """One row of the ablation.
 
     Attributes:
-        name: what is missing.
-        paper_psnr: what the paper loses by it, dB; None where it has no such row.
-        paper_size, paper_frames: the paper's size and frames per second, as parts of its full model's.
-        model: the class that decodes.
-        lacking: explicit logits that are held at zero.
-        changes: settings of the run.
-        saves: whether a `.hyrf` file holds it without ballast.
-        culling: whether views are culled before they are decoded.
+        name: the missing part.
+        paper_psnr: the paper's change of PSNR in dB; None if the paper has no such row.
+        paper_size: the paper's size over that of its full model.
+        paper_frames: the paper's frames per second over those of its full model.
+        model: the class of the model.
+        missing_logits: explicit logits that are fixed at zero.
+        changes: changed settings of the training run.
+        can_save: whether a `.hyrf` file can store the model without unused parts.
+        has_culling: whether Gaussians are culled before they are decoded.
     """
 
     name: str
@@ -171,48 +172,52 @@ class Variant:
     paper_size: float | None = None
     paper_frames: float | None = None
     model: type[HybridModel] = HybridModel
-    lacking: tuple[str, ...] = ()
+    missing_logits: tuple[str, ...] = ()
     changes: dict = field(default_factory=dict)
-    saves: bool = True
-    culling: bool = True
+    can_save: bool = True
+    has_culling: bool = True
 
 
-# The paper's differences: Tanks & Temples (24.07 dB, 41 MB, 106 frames/s) for the key components, Deep Blending
-# (30.37 dB, 34 MB) for the explicit properties and for spherical harmonics.
-NO_SPHERE = {"background": False}
-FULL = Variant("full")
-TRAINED = (
-    FULL,
-    Variant("single field", 23.78 - 24.07, 37 / 41, 101 / 106, model=SingleField, saves=False),
-    Variant("no explicit properties", 23.45 - 24.07, 27 / 41, 121 / 106, lacking=EXPLICIT),
-    Variant("no neural fields", 22.22 - 24.07, 14 / 41, 127 / 106, IsotropicDiffuse, (), NO_SPHERE, saves=False),
-    Variant("no neural Gaussians, sphere kept", model=IsotropicDiffuse, saves=False),
-    Variant("no background sphere", 23.43 - 24.07, 41 / 41, 112 / 106, changes=NO_SPHERE),
-    Variant("no explicit colour", 29.18 - 30.37, lacking=("color_logits",)),
-    Variant("no explicit scale", 28.74 - 30.37, lacking=("scale_logits",)),
-    Variant("no explicit opacity", 30.21 - 30.37, lacking=("opacity_logits",)),
-    Variant("spherical harmonics for colour", 30.12 - 30.37, 267 / 34, model=HarmonicColors, saves=False),
+# The paper measures the key components on Tanks & Temples (24.07 dB, 41 MB, 106 frames/s), and the explicit properties
+# and spherical harmonics on Deep Blending (30.37 dB, 34 MB).
+NO_SPHERE_SETTINGS = {"background": False}
+FULL_VARIANT = Variant("full")
+TRAINED_VARIANTS = (
+    FULL_VARIANT,
+    Variant("single field", 23.78 - 24.07, 37 / 41, 101 / 106, model=SingleField, can_save=False),
+    Variant("no explicit properties", 23.45 - 24.07, 27 / 41, 121 / 106, missing_logits=EXPLICIT_LOGITS),
+    Variant(
+        "no neural fields", 22.22 - 24.07, 14 / 41, 127 / 106, IsotropicDiffuse, (), NO_SPHERE_SETTINGS, can_save=False
+    ),
+    Variant("no neural Gaussians, sphere kept", model=IsotropicDiffuse, can_save=False),
+    Variant("no background sphere", 23.43 - 24.07, 41 / 41, 112 / 106, changes=NO_SPHERE_SETTINGS),
+    Variant("no explicit colour", 29.18 - 30.37, missing_logits=("color_logits",)),
+    Variant("no explicit scale", 28.74 - 30.37, missing_logits=("scale_logits",)),
+    Variant("no explicit opacity", 30.21 - 30.37, missing_logits=("opacity_logits",)),
+    Variant("spherical harmonics for colour", 30.12 - 30.37, 267 / 34, model=HarmonicColors, can_save=False),
     # The paper does not say whether its row was trained without culling too.
-    Variant("no pre-culling, in training neither", 24.06 - 24.07, 41 / 41, 27 / 106, culling=False),
+    Variant("no pre-culling, in training neither", 24.06 - 24.07, 41 / 41, 27 / 106, has_culling=False),
 )
-NO_CULLING = Variant("no pre-culling", 24.06 - 24.07, 41 / 41, 27 / 106, culling=False)  # renders the full model
+NO_CULLING_VARIANT = Variant(
+    "no pre-culling", 24.06 - 24.07, 41 / 41, 27 / 106, has_culling=False
+)  # this row renders the full model
 
 
 def build_trainer(scene: Scene, config: TrainConfig, variant: Variant, cache: PictureCache | None = None) -> Trainer:
-    """The product's trainer with a variant's model and optimiser in it, ready to run."""
+    """Return hyrfpack's trainer with a variant's model and optimiser."""
     trainer = Trainer(scene, replace(config, **variant.changes), cache)
     if variant.model is not HybridModel:
         product = trainer.model
         trainer.model = variant.model(product.config, product.gaussians, torch.Generator().manual_seed(config.seed))
-    for name in variant.lacking:
+    for name in variant.missing_logits:
         _start_from_mean(trainer.model, name)
-    trainer.optimizer = WithoutLogits(trainer.model, config.learning_rates, variant.lacking)
+    trainer.optimizer = OptimizerWithoutLogits(trainer.model, config.learning_rates, variant.missing_logits)
     return trainer
 
 
 @torch.no_grad()
 def _start_from_mean(model: HybridModel, name: str) -> None:
-    """Start the field's output at the mean of the explicit logits that it will have to do without."""
+    """Initialise the field's output bias with the mean of the explicit logits that the variant lacks."""
     geometry, radiance = model.geometry.biases[-1], model.radiance.biases[-1]
     bias = {"opacity_logits": geometry[:1], "scale_logits": geometry[1:4], "color_logits": radiance}[name]
     bias.copy_(getattr(model.gaussians, name).mean(0).expand_as(bias))

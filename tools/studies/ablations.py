@@ -1,10 +1,11 @@
-"""The HyRF paper's ablations on real sets: what each part of the model is worth, beside what the paper says.
+"""Run the HyRF paper's ablations on real data sets: measure what each part of the model contributes.
 
     python -m tools.studies.ablations            trains every variant, prints the tables of docs/research/ablations.md
-    python -m tools.studies.ablations --reuse    trains only what --out does not hold yet
+    python -m tools.studies.ablations --reuse    trains only variants that --out does not have yet
 
-Scores are on held-out views of the model as trained, not compressed. Frames are timed in turns with the full model's,
-geometry decoded beforehand. Each run leaves its numbers in --out as JSON.
+The tables give PSNR in dB, SSIM, bytes, training steps a second and frames a second, with the paper's differences.
+Scores are those of the trained model before compression on held-out views. Frames of a variant alternate with frames of
+the full model, and the geometry is decoded beforehand. The numbers of each run are stored in --out as JSON.
 """
 
 from __future__ import annotations
@@ -31,38 +32,44 @@ from hyrfpack.model import HybridModel
 from hyrfpack.render import renderer
 from hyrfpack.scene import Scene, View, evenly_spaced
 from hyrfpack.train import TrainConfig
-from tools.studies.ablation_models import FULL, NO_CULLING, TRAINED, Variant, build_trainer
-from tools.studies.train_sets import study_arguments
+from tools.studies.ablation_models import FULL_VARIANT, NO_CULLING_VARIANT, TRAINED_VARIANTS, Variant, build_trainer
+from tools.studies.train_sets import make_study_parser
 from tools.tables import markdown_table
 
-SETS = ("mipnerf360_bonsai", "gerrard_hall", "drone_caliterra")
-ROWS = (*TRAINED, NO_CULLING)
-TIMED_VIEWS, REPEATS = 6, 5
+DEFAULT_SETS = ("mipnerf360_bonsai", "gerrard_hall", "drone_caliterra")
+ALL_VARIANTS = (*TRAINED_VARIANTS, NO_CULLING_VARIANT)
+TIMED_VIEWS, TIMING_REPEATS = 6, 5
 
 Results = dict[tuple[str, str], list[dict]]  # (variant, set) -> a result for each seed
 
 
-def run(variant: Variant, scene: Scene, config: TrainConfig, full_path: Path, cache: PictureCache) -> dict:
-    """Train one variant and measure it; NO_CULLING measures the full model.
+def train_and_measure(
+    variant: Variant, scene: Scene, config: TrainConfig, full_path: Path, cache: PictureCache
+) -> dict:
+    """Train one variant and measure it; for NO_CULLING_VARIANT measure the full model without training.
 
     Args:
-        full_path: the full model of the same set and seed; FULL writes it.
+        variant: the variant.
+        scene: the data set.
+        config: settings of the training run.
+        full_path: file of the full model of the same data set and seed; FULL_VARIANT writes it.
+        cache: cache of the data set's pictures.
 
     Returns:
-        The numbers of one row, ready for JSON; {"failed": why} where it did not train.
+        The numbers of one row for JSON, or {"failed": reason} if training failed.
     """
-    if variant is NO_CULLING:
-        full = load_model(full_path).requires_grad_()  # its bytes are those that could be trained
+    if variant is NO_CULLING_VARIANT:
+        full = load_model(full_path).requires_grad_()  # so that its size counts all parameters
         return measure(variant, full, full, scene)
     trainer = build_trainer(scene, config, variant, cache)
     try:
-        with culling(variant):
+        with patch_culling(variant):
             trainer.run()
         if not all(parameter.isfinite().all() for parameter in trainer.model.parameters()):
             raise HyrfTrainingError("a parameter is not finite after the last step", fix="choose another seed")
     except HyrfTrainingError as error:
         return {"failed": str(error)}
-    if variant is FULL:
+    if variant is FULL_VARIANT:
         save_model(trainer.model, full_path)
     result = measure(variant, trainer.model, load_model(full_path), scene)
     return {**result, "steps_per_second": config.steps / trainer.elapsed, "seconds": trainer.elapsed}
@@ -70,8 +77,8 @@ def run(variant: Variant, scene: Scene, config: TrainConfig, full_path: Path, ca
 
 @torch.no_grad()
 def measure(variant: Variant, model: HybridModel, full: HybridModel, scene: Scene) -> dict:
-    """Scores on held-out views, sizes, and frames per second also as a multiple of the full model's."""
-    with culling(variant):
+    """Measure scores on held-out views, sizes, and frames per second, also relative to the full model."""
+    with patch_culling(variant):
         scores = hyrfpack.evaluate_model(model, scene.test)
     views = evenly_spaced(scene.test, TIMED_VIEWS)
     frames_per_second, frames_ratio = time_frames(variant, model, full, views)
@@ -80,11 +87,11 @@ def measure(variant: Variant, model: HybridModel, full: HybridModel, scene: Scen
         "ssim": scores.ssim,
         "gaussians": len(model),
         "bytes": 4 * sum(parameter.numel() for parameter in model.parameters() if parameter.requires_grad),
-        "bytes_paper": len(encode_model(model, "paper")) if variant.saves else None,
+        "bytes_paper": len(encode_model(model, "paper")) if variant.can_save else None,
         "frames_per_second": frames_per_second,
         "frames_ratio": frames_ratio,
     }
-    if not variant.culling:
+    if not variant.has_culling:
         _, result["frames_ratio_decoding"] = time_frames(variant, model, full, views, keep_geometry=False)
     return result
 
@@ -93,27 +100,33 @@ def measure(variant: Variant, model: HybridModel, full: HybridModel, scene: Scen
 def time_frames(
     variant: Variant, model: HybridModel, full: HybridModel, views: list[View], keep_geometry: bool = True
 ) -> tuple[float, float]:
-    """Frames per second of a model, and as a multiple of the full model's on the same views: medians over views.
+    """Return frames per second of a model, and their ratio to the full model's on the same views; medians over views.
 
     Args:
-        keep_geometry: geometry is decoded once for all views, not again for each.
+        variant: the variant of `model`.
+        model: the model to time.
+        full: the full model.
+        views: the views to render.
+        keep_geometry: whether geometry is decoded once for all views instead of once for each view.
     """
     decoded, decoded_full = (m.decode() if keep_geometry else None for m in (model, full))
 
     def draw(view: View) -> None:
-        with culling(variant):
+        with patch_culling(variant):
             hyrfpack.render_view(model, view.camera, decoded=decoded)
 
     def draw_full(view: View) -> None:
         hyrfpack.render_view(full, view.camera, decoded=decoded_full)
 
-    times = [time_alternately({"this": partial(draw, v), "full": partial(draw_full, v)}, REPEATS)[0] for v in views]
+    times = [
+        time_alternately({"this": partial(draw, v), "full": partial(draw_full, v)}, TIMING_REPEATS)[0] for v in views
+    ]
     return 1000 / median(t["this"].ms for t in times), median(t["full"].ms / t["this"].ms for t in times)
 
 
-def culling(variant: Variant) -> AbstractContextManager:
-    """Where a variant renders: without its pre-culling, every Gaussian is decoded and projected, seen or not."""
-    if variant.culling:
+def patch_culling(variant: Variant) -> AbstractContextManager:
+    """Return the context in which a variant renders; without pre-culling, every Gaussian is decoded and projected."""
+    if variant.has_culling:
         return nullcontext()
     return patch.object(renderer, "frustum_cull", lambda positions, *_: torch.arange(len(positions)))
 
@@ -121,17 +134,19 @@ def culling(variant: Variant) -> AbstractContextManager:
 # -- tables --------------------------------------------------------------------------------------------------------
 
 
-def report(results: Results, sets: Sequence[str], variants: Sequence[Variant]) -> str:
-    """The tables of docs/research/ablations.md; the full model must be among the results."""
-    others = [variant for variant in variants if variant is not FULL]
-    parts = [quality_table(results, sets, others), cost_table(results, sets, others)]
-    return "\n\n".join(parts + [f"`{name}`\n\n{details_table(results, name, variants)}" for name in sets])
+def format_report(results: Results, sets: Sequence[str], variants: Sequence[Variant]) -> str:
+    """Format the tables of docs/research/ablations.md; the results must include the full model."""
+    others = [variant for variant in variants if variant is not FULL_VARIANT]
+    parts = [format_quality_table(results, sets, others), format_cost_table(results, sets, others)]
+    return "\n\n".join(parts + [f"`{name}`\n\n{format_details_table(results, name, variants)}" for name in sets])
 
 
-def quality_table(results: Results, sets: Sequence[str], variants: Sequence[Variant]) -> str:
-    """PSNR lost by each variant, beside what it costs in the paper."""
+def format_quality_table(results: Results, sets: Sequence[str], variants: Sequence[Variant]) -> str:
+    """Format the change of PSNR in dB by each variant, beside the paper's."""
     columns = ("PSNR, dB", "paper", *(f"`{name}`" for name in sets), "mean", "sets that lose")
-    full = [_spread([r["psnr"] for r in results["full", name] if "failed" not in r], "") for name in sets]
+    full = [
+        _format_mean_and_spread([r["psnr"] for r in results["full", name] if "failed" not in r], "") for name in sets
+    ]
     rows = [("full", "24.07, 30.37", *full, "", "")]
     for variant in variants:
         cells, means = [], []
@@ -140,15 +155,17 @@ def quality_table(results: Results, sets: Sequence[str], variants: Sequence[Vari
             differences = [ours["psnr"] - full["psnr"] for ours, full in pairs]
             means += [fmean(differences)] if pairs else []
             failed = sum("failed" in result for result in results[variant.name, name])
-            cells.append(_spread(differences, "+") + (f" ({failed} did not train)" if failed and pairs else ""))
+            cells.append(
+                _format_mean_and_spread(differences, "+") + (f" ({failed} did not train)" if failed and pairs else "")
+            )
         paper = "" if variant.paper_psnr is None else f"{variant.paper_psnr:+.2f}"
         mean = f"{fmean(means):+.2f}" if means else ""
         rows.append((variant.name, paper, *cells, mean, f"{sum(m < 0 for m in means)} of {len(means)}"))
     return markdown_table(columns, rows)
 
 
-def cost_table(results: Results, sets: Sequence[str], variants: Sequence[Variant]) -> str:
-    """Size and speed of each variant as a part of the full model's: means over sets and seeds."""
+def format_cost_table(results: Results, sets: Sequence[str], variants: Sequence[Variant]) -> str:
+    """Format size and speed of each variant relative to the full model: means over data sets and seeds."""
 
     def ratio(variant: Variant, key: str, full_key: str | None = None) -> str:
         pairs = [pair for name in sets for pair in _pairs(results, variant, name) if key in pair[0]]
@@ -166,8 +183,8 @@ def cost_table(results: Results, sets: Sequence[str], variants: Sequence[Variant
     return markdown_table(columns, rows)
 
 
-def details_table(results: Results, name: str, variants: Sequence[Variant]) -> str:
-    """All numbers of one set: means over seeds."""
+def format_details_table(results: Results, name: str, variants: Sequence[Variant]) -> str:
+    """Format all numbers of one data set: means over seeds."""
     formats = {
         "psnr": ".2f",
         "ssim": ".3f",
@@ -188,21 +205,23 @@ def details_table(results: Results, name: str, variants: Sequence[Variant]) -> s
 
 
 def _pairs(results: Results, variant: Variant, name: str) -> list[tuple[dict, dict]]:
-    """The variant's result and the full model's for each seed with which both trained."""
-    both = zip(results[variant.name, name], results[FULL.name, name], strict=True)
+    """Return the results of the variant and of the full model for each seed with which both trained."""
+    both = zip(results[variant.name, name], results[FULL_VARIANT.name, name], strict=True)
     return [pair for pair in both if not any("failed" in result for result in pair)]
 
 
-def _spread(values: list[float], sign: str) -> str:
-    """The mean over seeds, and half the way from the lowest to the highest."""
+def _format_mean_and_spread(values: list[float], sign: str) -> str:
+    """Format the mean over seeds, and half the difference between the largest and the smallest value."""
     return f"{fmean(values):{sign}.2f} ± {(max(values) - min(values)) / 2:.2f}" if values else "did not train"
 
 
 def main() -> None:
-    parser = study_arguments(__doc__, steps=1000, sets=SETS, out=Path("runs/ablations"))
-    parser.add_argument("--reuse", action="store_true", help="keep results that --out holds for these steps")
+    parser = make_study_parser(__doc__, steps=1000, sets=DEFAULT_SETS, out=Path("runs/ablations"))
+    parser.add_argument("--reuse", action="store_true", help="do not repeat results that --out has for these steps")
     args = parser.parse_args()
-    chosen = [v for v in ROWS if v is FULL or not args.only or any(part in v.name for part in args.only)]
+    chosen = [
+        v for v in ALL_VARIANTS if v is FULL_VARIANT or not args.only or any(part in v.name for part in args.only)
+    ]
     out = args.out / str(args.steps)
     out.mkdir(parents=True, exist_ok=True)
     results: Results = defaultdict(list)
@@ -212,15 +231,15 @@ def main() -> None:
             path = out / f"{name}-{seed}-{variant.name.replace(' ', '-')}.json"
             if not (args.reuse and path.exists()):
                 config = TrainConfig(steps=args.steps, seed=seed)
-                result = run(variant, scene, config, out / f"{name}-{seed}.hyrf", cache)
+                result = train_and_measure(variant, scene, config, out / f"{name}-{seed}.hyrf", cache)
                 path.write_text(json.dumps(result, indent=1))
             result = json.loads(path.read_text())
             results[variant.name, name].append(result)
-            said = result.get("failed") or f"{result['psnr']:.2f} dB, {result.get('seconds', 0):.0f} s"
-            print(f"{name}, seed {seed}, {variant.name}: {said}", file=sys.stderr, flush=True)
-            if variant is FULL and "failed" in result:
-                sys.exit("the full model did not train, so there is nothing to compare with")
-    print(report(results, args.sets, chosen))
+            summary = result.get("failed") or f"{result['psnr']:.2f} dB, {result.get('seconds', 0):.0f} s"
+            print(f"{name}, seed {seed}, {variant.name}: {summary}", file=sys.stderr, flush=True)
+            if variant is FULL_VARIANT and "failed" in result:
+                sys.exit("the full model did not train, so the variants cannot be compared with it")
+    print(format_report(results, args.sets, chosen))
 
 
 if __name__ == "__main__":

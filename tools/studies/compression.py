@@ -1,12 +1,13 @@
-"""What profile `compact` takes beside `paper`, on trained models: by itself, at no more loss, and fine-tuned.
+"""Compare profile `compact` with `paper` on trained models: with defaults, at equal loss, and fine-tuned.
 
     python -m tools.studies.train_sets --steps 3000 --sets gerrard_hall        models in runs/sets/3000
     python -m tools.studies.compression --models runs/sets/3000 --finetune 1000 --matched
 
-For each set below --models: the profiles by their defaults, and how far the error that was foretold is from the one at
-held-out cameras; with --matched the smallest `compact` file that loses no more PSNR and no more SSIM than `paper` does
-on held-out photos; with --finetune a fine-tuned one. Losses are against the model as trained, at the exposure that
-photos beside the held-out ones predict where photos' exposures were learnt.
+The table has one row for each data set below --models, with bytes and the losses of PSNR (dB) and SSIM on held-out
+photos: of both profiles with their defaults; with --matched, of the smallest `compact` file that loses no more PSNR and
+no more SSIM than `paper`; with --finetune, of a fine-tuned file. The last columns are the ratio of measured to
+predicted error at held-out cameras, and seconds. Losses are relative to the trained model. If per-image gains were
+learnt, a held-out photo has the exposure that the exposure map predicts for it.
 """
 
 from __future__ import annotations
@@ -28,19 +29,25 @@ from hyrfpack.format import decode_model, encode_model
 from hyrfpack.format.codec import load_with_provenance
 from hyrfpack.model import HybridModel
 from hyrfpack.scene import evenly_spaced
-from tools.studies.train_sets import DATA
+from tools.studies.train_sets import DATA_FOLDER
 from tools.tables import markdown_table
 
-ENDS = (1e-7, 1e-2)
-HELD_OUT = 12  # cameras at most that the error foretold is compared at
+DISTORTION_RANGE = (1e-7, 1e-2)
+MAX_HELD_OUT_CAMERAS = 12  # the predicted error is compared with the measured one at up to this many cameras
 
 
 @dataclasses.dataclass(frozen=True)
-class Made:
-    """A file that was made and what it loses: dB of PSNR and SSIM, mean over held-out photos.
+class MeasuredFile:
+    """A compressed file and its losses.
 
-    `foretold` and `found` are mean squared errors against the model's own pictures: by estimate, and at held-out
-    cameras.
+    Attributes:
+        distortion: the target distortion; 0 for profile paper.
+        bytes, gaussians: size of the file and its number of Gaussians.
+        drop: loss of PSNR in dB, mean over held-out photos.
+        ssim_drop: loss of SSIM, mean over held-out photos.
+        seconds: duration of the compression.
+        foretold: predicted error: mean squared error against the model's own pictures, by the sensitivities.
+        found: measured error: the same at held-out cameras.
     """
 
     distortion: float
@@ -53,74 +60,90 @@ class Made:
     found: float = 0.0
 
 
-class Set:
-    """A trained set, and what is measured of it once."""
+class TrainedSet:
+    """A trained data set with its model, sensitivities and reference renders."""
 
     def __init__(self, folder: Path, data: Path) -> None:
         self.name = folder.name
         self.scene = hyrfpack.load_scene(data)
         self.model, provenance = load_with_provenance(folder / "model.hyrf")
         self.provenance = quantized_provenance(provenance, self.model.config.frame.scale)
-        self.raw = self.scores(self.model)
-        self.held_out = ReferenceRenders.from_views(
-            [view.camera for view in evenly_spaced(self.scene.test, HELD_OUT)], self.model
+        self.raw_scores = self.evaluate(self.model)
+        self.held_out_renders = ReferenceRenders.from_views(
+            [view.camera for view in evenly_spaced(self.scene.test, MAX_HELD_OUT_CAMERAS)], self.model
         )
         start = time.perf_counter()
         cameras = [view.camera for view in self.scene.train]
-        self.sensitivity, self.originals = (
+        self.sensitivity, self.reference_renders = (
             measure_sensitivity(self.model, cameras),
             ReferenceRenders.from_model(self.model, cameras),
         )
-        self.measuring = time.perf_counter() - start
+        self.sensitivity_seconds = time.perf_counter() - start
 
-    def scores(self, model: HybridModel) -> tuple[float, float]:
-        """PSNR and SSIM on the held-out photos."""
+    def evaluate(self, model: HybridModel) -> tuple[float, float]:
+        """Return PSNR and SSIM on the held-out photos."""
         scores = hyrfpack.evaluate_model(model, self.scene.test)
         return scores.psnr, scores.ssim
 
-    def made(self, data: bytes, distortion: float, start: float, candidate: EncodedCandidate | None = None) -> Made:
+    def measure_file(
+        self, data: bytes, distortion: float, start: float, candidate: EncodedCandidate | None = None
+    ) -> MeasuredFile:
+        """Decode a compressed file and measure its losses; `start` is when its compression started."""
         seconds = time.perf_counter() - start
         model = decode_model(data)
-        psnr, ssim = self.scores(model)
-        foretold = sum(candidate.predicted_errors.values()) if candidate else 0.0
-        losses = self.raw[0] - psnr, self.raw[1] - ssim
-        return Made(distortion, len(data), len(model), *losses, seconds, foretold, self.held_out.measure_error(model))
+        psnr, ssim = self.evaluate(model)
+        predicted_error = sum(candidate.predicted_errors.values()) if candidate else 0.0
+        losses = self.raw_scores[0] - psnr, self.raw_scores[1] - ssim
+        return MeasuredFile(
+            distortion,
+            len(data),
+            len(model),
+            *losses,
+            seconds,
+            predicted_error,
+            self.held_out_renders.measure_error(model),
+        )
 
-    def paper(self) -> Made:
+    def compress_paper(self) -> MeasuredFile:
+        """Compress the model in profile paper and measure the file."""
         start = time.perf_counter()
-        return self.made(encode_model(self.model, "paper", self.provenance), 0, start)
+        return self.measure_file(encode_model(self.model, "paper", self.provenance), 0, start)
 
-    def compact(self, distortion: float, steps: int = 0) -> Made:
-        """As `hyrfpack compress` does it."""
+    def compress_compact(self, distortion: float, steps: int = 0) -> MeasuredFile:
+        """Compress the model in profile compact as `hyrfpack compress` does, and measure the file."""
         start = time.perf_counter()
-        sensitivity = calibrate(self.model, self.sensitivity, self.originals, distortion)
+        sensitivity = calibrate(self.model, self.sensitivity, self.reference_renders, distortion)
         packer = Packer(self.model, self.provenance, sensitivity, self.scene, steps, True, lambda sentence: None)
-        candidate = packer.encode(distortion) if steps else packer.encode_to_distortion(distortion, self.originals)
-        return self.made(candidate.data, distortion, start, candidate)
+        candidate = (
+            packer.encode(distortion) if steps else packer.encode_to_distortion(distortion, self.reference_renders)
+        )
+        return self.measure_file(candidate.data, distortion, start, candidate)
 
     def measure(self, steps: int, matched: bool) -> dict:
-        """The row of this set."""
+        """Return the row of this data set."""
         distortion = default_distortion(self.provenance)
-        paper, default = self.paper(), self.compact(distortion)
-        row = {"set": self.name, "gaussians": len(self.model), "psnr": self.raw[0], "ssim": self.raw[1]}
-        row |= {"measuring": self.measuring, "paper": paper, "default": default}
+        paper, default = self.compress_paper(), self.compress_compact(distortion)
+        row = {"set": self.name, "gaussians": len(self.model), "psnr": self.raw_scores[0], "ssim": self.raw_scores[1]}
+        row |= {"measuring": self.sensitivity_seconds, "paper": paper, "default": default}
 
-        def fits(made: Made) -> bool:
+        def fits(made: MeasuredFile) -> bool:
             return made.drop <= paper.drop and made.ssim_drop <= paper.ssim_drop
 
         if matched:
-            found = find_coarsest(self.compact, fits, distortion, 9, ENDS)
+            found = find_coarsest(self.compress_compact, fits, distortion, 9, DISTORTION_RANGE)
             row["matched"] = found and found[1]
         if steps:
-            row["finetuned"] = self.compact(default_distortion(self.provenance, steps), steps)
-        return {key: dataclasses.asdict(value) if isinstance(value, Made) else value for key, value in row.items()}
+            row["finetuned"] = self.compress_compact(default_distortion(self.provenance, steps), steps)
+        return {
+            key: dataclasses.asdict(value) if isinstance(value, MeasuredFile) else value for key, value in row.items()
+        }
 
 
-def table(rows: list[dict]) -> str:
-    """The rows as Markdown."""
+def format_table(rows: list[dict]) -> str:
+    """Format the rows as a Markdown table."""
     kinds = [kind for kind in ("paper", "default", "matched", "finetuned") if kind in rows[0]]
     columns = ["set", "Gaussians", "PSNR / SSIM", *(f"{kind}: bytes, dB lost, SSIM lost" for kind in kinds)]
-    lines = []
+    table_rows = []
     for row in rows:
         cells = [row["set"], f"{row['gaussians']:,}", f"{row['psnr']:.2f} / {row['ssim']:.4f}"]
         for kind in kinds:
@@ -133,30 +156,32 @@ def table(rows: list[dict]) -> str:
         default = row["default"]
         cells.append(f"{default['found'] / default['foretold']:.2f}")
         cells.append(f"{row['measuring']:.1f} + {default['seconds']:.1f}")
-        lines.append(cells)
-    return markdown_table([*columns, "found / foretold", "seconds"], lines)
+        table_rows.append(cells)
+    return markdown_table([*columns, "measured / predicted error", "seconds"], table_rows)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
-        "--models", type=Path, required=True, help="folder with a folder for each set, model.hyrf in it"
+        "--models", type=Path, required=True, help="folder with one folder for each data set, which has model.hyrf"
     )
-    parser.add_argument("--data", type=Path, default=DATA, help="where the photos are, by the same names")
-    parser.add_argument("--sets", nargs="*", help="(all)")
+    parser.add_argument("--data", type=Path, default=DATA_FOLDER, help="folder of the data sets, with the same names")
+    parser.add_argument("--sets", nargs="*", help="data sets to compress (all)")
     parser.add_argument("--finetune", type=int, default=0, metavar="N", help="also fine-tune for N steps (0)")
-    parser.add_argument("--matched", action="store_true", help="also search for the file that loses as little as paper")
-    parser.add_argument("--json", type=Path, help="write the rows there")
+    parser.add_argument(
+        "--matched", action="store_true", help="also search for the smallest file that loses no more than paper"
+    )
+    parser.add_argument("--json", type=Path, help="also write the rows to this file")
     options = parser.parse_args()
     rows = []
     for folder in sorted(path.parent for path in options.models.glob("*/model.hyrf")):
         if options.sets and folder.name not in options.sets:
             continue
-        rows.append(Set(folder, options.data / folder.name).measure(options.finetune, options.matched))
-        print(table(rows[-1:]), flush=True)
+        rows.append(TrainedSet(folder, options.data / folder.name).measure(options.finetune, options.matched))
+        print(format_table(rows[-1:]), flush=True)
         if options.json:
             options.json.write_text(json.dumps(rows, indent=1))
-    print("\n" + table(rows))
+    print("\n" + format_table(rows))
 
 
 if __name__ == "__main__":

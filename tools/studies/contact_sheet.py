@@ -1,10 +1,10 @@
-"""The worst held-out view of each trained set as one picture: photo, render and error map, a row a set.
+"""Draw the worst held-out view of each trained data set into one picture: photo, render and error map in one row.
 
     python -m tools.studies.train_sets --steps 2000 --out runs/sets
     python -m tools.studies.contact_sheet runs/sets/* -o docs/images/worst-views.jpg
 
-A run's folder is named after its set, or after a variant (`variants.py`). What is shown is the compact file as
-decoded, at the exposure that `hyrfpack render` shows.
+A run's folder has the name of its data set, or of a variant (`set_variants.py`). The render is that of the decoded
+compact file, at the exposure of `hyrfpack render`.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from hyrfpack.evaluate.figures import draw_comparison
 from hyrfpack.evaluate.metrics import to_8bit
 from hyrfpack.render.files import save_picture
 from hyrfpack.scene import Scene
-from tools.studies.train_sets import DATA
-from tools.studies.variants import load_variant
+from tools.studies.set_variants import load_variant
+from tools.studies.train_sets import DATA_FOLDER
 
-ROW_WIDTH = 720  # pixels
+ROW_WIDTH_PX = 720
 
 
-def worst_view(name: str, scene: Scene, model: hyrfpack.HybridModel) -> Image.Image:
-    """Photo, render and error map of the held-out view with the lowest PSNR."""
+def draw_worst_view(name: str, scene: Scene, model: hyrfpack.HybridModel) -> Image.Image:
+    """Draw photo, render and error map of the held-out view with the lowest PSNR."""
     scores = hyrfpack.evaluate_model(model, scene.test)
     worst = min(scores.views, key=lambda view: view.psnr)
     (view,) = (view for view in scene.test if view.name == worst.name)
@@ -39,14 +39,15 @@ def worst_view(name: str, scene: Scene, model: hyrfpack.HybridModel) -> Image.Im
     return draw_comparison(photo, render, mask, caption)
 
 
-def stacked(rows: list[Image.Image]) -> Image.Image:
-    """Pictures below each other, all `ROW_WIDTH` wide."""
-    small = [
-        row.resize((ROW_WIDTH, round(row.height * ROW_WIDTH / row.width)), Image.Resampling.LANCZOS) for row in rows
+def stack_pictures(rows: list[Image.Image]) -> Image.Image:
+    """Stack pictures below each other, each scaled to a width of `ROW_WIDTH_PX`."""
+    scaled_rows = [
+        row.resize((ROW_WIDTH_PX, round(row.height * ROW_WIDTH_PX / row.width)), Image.Resampling.LANCZOS)
+        for row in rows
     ]
-    sheet = Image.new("RGB", (ROW_WIDTH, sum(row.height for row in small)), "white")
+    sheet = Image.new("RGB", (ROW_WIDTH_PX, sum(row.height for row in scaled_rows)), "white")
     top = 0
-    for row in small:
+    for row in scaled_rows:
         sheet.paste(row, (0, top))
         top += row.height
     return sheet
@@ -54,19 +55,21 @@ def stacked(rows: list[Image.Image]) -> Image.Image:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("runs", nargs="+", type=Path, help="folders with compact.hyrf, named after their sets")
+    parser.add_argument(
+        "runs", nargs="+", type=Path, help="folders of runs, with compact.hyrf and the name of a data set"
+    )
     parser.add_argument("-o", "--output", type=Path, required=True)
-    parser.add_argument("--data", type=Path, default=DATA, help="where the sets are")
+    parser.add_argument("--data", type=Path, default=DATA_FOLDER, help="folder of the data sets")
     args = parser.parse_args()
     rows = []
     with torch.no_grad():
         for run in args.runs:
             if (run / "compact.hyrf").is_file():
                 model = hyrfpack.load_model(run / "compact.hyrf")
-                rows.append(worst_view(run.name, load_variant(args.data, run.name), model))
+                rows.append(draw_worst_view(run.name, load_variant(args.data, run.name), model))
     if not rows:
-        parser.error("none of the folders has a compact.hyrf; train them with tools.studies.train_sets")
-    save_picture(args.output, stacked(rows))
+        parser.error("none of the folders has a compact.hyrf; make the runs with tools.studies.train_sets")
+    save_picture(args.output, stack_pictures(rows))
 
 
 if __name__ == "__main__":

@@ -1,9 +1,10 @@
-"""The ablation behind each default where the HyRF paper and its authors' code disagree.
+"""Run the ablation behind each default for which the HyRF paper and its authors' code disagree.
 
     python -m tools.studies.design_choices --steps 2000        prints the table of docs/research/paper-and-code.md
 
-Each row changes one setting of the default. Scores are on held-out views of the `paper` file as decoded from disk;
-every row is the mean over the seeds, and the spread between seeds of the default says what a difference is worth.
+Each row changes one setting of the default and is the mean over the seeds: PSNR in dB, its spread between seeds, SSIM,
+number of Gaussians, bytes and training steps a second. Scores are those of the decoded `paper` file on held-out views.
+A difference between rows is significant only if it is larger than the spread.
 """
 
 from __future__ import annotations
@@ -13,10 +14,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from hyrfpack.train import TrainConfig
-from tools.studies.train_sets import measure, study_arguments
+from tools.studies.train_sets import make_study_parser, measure
 from tools.tables import markdown_row, markdown_table
 
-VARIANTS: dict[str, dict] = {
+CHANGED_SETTINGS: dict[str, dict] = {
     "default": {},
     "scale S sigma(s_n) sigma(s_e), as the authors' code": {"scale_rule": "product"},
     "S(p) constant": {"scale_grows": False},
@@ -29,17 +30,18 @@ VARIANTS: dict[str, dict] = {
 
 
 def main() -> None:
-    args = study_arguments(
+    args = make_study_parser(
         __doc__, steps=2000, sets=["mipnerf360_bonsai", "gerrard_hall"], out=Path("runs/design")
     ).parse_args()
     print(markdown_table(("variant", "set", "PSNR", "spread", "SSIM", "Gaussians", "bytes", "steps/s"), []))
-    for number, (variant, changes) in enumerate(VARIANTS.items()):
+    for number, (variant, changes) in enumerate(CHANGED_SETTINGS.items()):
         if args.only and not any(part in variant for part in args.only):
             continue
         for name in args.sets:
             rows = [
                 measure(
-                    args.data / name,
+                    args.data,
+                    name,
                     args.out / str(args.steps) / f"{number}-{name}-{seed}",
                     replace(TrainConfig(steps=args.steps, seed=seed, budget_factor=1.0), **changes),
                     reuse=True,

@@ -1,11 +1,11 @@
-"""gsplat's PNG compression, written and read by gsplat itself: a folder of pictures, quantised and packed losslessly.
+"""Encode and decode Gaussians with gsplat's PNG compression: a folder of quantised pictures.
 
-Needs `pip install --no-deps gsplat jaxtyping wadler-lindig imageio`.
+It needs `pip install --no-deps gsplat jaxtyping wadler-lindig imageio`.
 
-Two parts that gsplat takes from packages for CUDA are ours: Gaussians fill the rows of the grid in Morton order
-(gsplat: PLAS, smoother; a Morton curve over the grid as well takes 3 % more bytes), and the clusters come from k-means
-with squared distances (gsplat: TorchPQ, absolute distances). gsplat always asks for 65,536 clusters, more than a small
-scene has Gaussians.
+Two parts for which gsplat needs CUDA packages are replaced. Gaussians fill the grid's rows in Morton order; gsplat uses
+PLAS, which is smoother, and a Morton curve over the grid as well takes 3 % more bytes. The clusters come from k-means
+with squared distances; gsplat uses TorchPQ with absolute distances. gsplat always asks for 65,536 clusters, which is
+more than the number of Gaussians in a small scene.
 """
 
 from __future__ import annotations
@@ -30,30 +30,32 @@ from hyrfpack.quant.morton import morton_codes
 from hyrfpack.splats.formats.palette import build_palette, find_nearest_entries
 from hyrfpack.splats.splats import Splats, normalized_quats
 
-LOGIT_TAIL = 7.0  # opacities beyond are cut, 1e-3 from 1; the rasteriser cuts alpha at 0.99
-LEAST_SCALE = 4.5e-5  # units, far below a pixel; the least that SPZ can hold, too
+MAX_OPACITY_LOGIT = 7.0  # opacities are clamped to 1 - 1e-3; the rasteriser clamps alpha to 0.99
+MIN_SCALE = 4.5e-5  # world units, far below a pixel; also the smallest scale of SPZ
 
 
-def missing_packages() -> list[str]:
-    """Of those that this takes, the ones that are not here."""
+def list_missing_packages() -> list[str]:
+    """Return the names of the required packages that are not installed."""
     return [name for name in ("gsplat", "jaxtyping", "imageio") if importlib.util.find_spec(name) is None]
 
 
 def round_trip(splats: Splats, clusters: int) -> tuple[int, Splats]:
-    """Bytes of the folder, and the Gaussians read back from it; as in gsplat, as many as fill a square grid.
+    """Encode and decode splats; return the bytes of the folder and the decoded splats.
+
+    As in gsplat, only as many Gaussians are kept as fill a square grid; the most opaque ones stay.
 
     Args:
-        splats: in Morton order, see `in_morton_order`.
-        clusters: of the harmonics of bands 1 and up.
+        splats: splats in the order of `sort_in_morton_order`.
+        clusters: number of clusters for the harmonics of bands 1 and up.
     """
     from gsplat.compression import PngCompression
 
     side = int(len(splats) ** 0.5)
     splats = splats[np.sort(np.argsort(-splats.opacities, kind="stable")[: side**2])]
-    logits = torch.from_numpy(splats.opacities).logit().clamp_max(LOGIT_TAIL)
+    logits = torch.from_numpy(splats.opacities).logit().clamp_max(MAX_OPACITY_LOGIT)
     groups = {
         "means": torch.from_numpy(splats.positions.astype(np.float32)),
-        "scales": torch.from_numpy(splats.scales).clamp_min(LEAST_SCALE).log(),
+        "scales": torch.from_numpy(splats.scales).clamp_min(MIN_SCALE).log(),
         "quats": torch.from_numpy(splats.quats),
         "opacities": logits,
         "sh0": torch.from_numpy(splats.harmonics[:, :1]),
@@ -62,31 +64,31 @@ def round_trip(splats: Splats, clusters: int) -> tuple[int, Splats]:
         groups["shN"] = torch.from_numpy(splats.harmonics[:, 1:])
     compression = PngCompression(use_sort=False, verbose=False)
     with tempfile.TemporaryDirectory() as folder:
-        with _kmeans_of_gsplat(min(clusters, len(splats))), contextlib.redirect_stdout(io.StringIO()):
+        with _replace_torchpq(min(clusters, len(splats))), contextlib.redirect_stdout(io.StringIO()):
             compression.compress(folder, groups)
-            read = {name: values.numpy() for name, values in compression.decompress(folder).items()}
+            decoded = {name: values.numpy() for name, values in compression.decompress(folder).items()}
         size = sum(file.stat().st_size for file in Path(folder).iterdir())
     return size, replace(
         splats,
-        positions=read["means"],
-        scales=np.exp(read["scales"]),
-        quats=normalized_quats(read["quats"]),
-        opacities=expit(read["opacities"]),
-        harmonics=np.concatenate([read[name] for name in ("sh0", "shN") if name in read], axis=1),
+        positions=decoded["means"],
+        scales=np.exp(decoded["scales"]),
+        quats=normalized_quats(decoded["quats"]),
+        opacities=expit(decoded["opacities"]),
+        harmonics=np.concatenate([decoded[name] for name in ("sh0", "shN") if name in decoded], axis=1),
     )
 
 
-def in_morton_order(splats: Splats) -> Splats:
-    """Splats along a Morton curve through their positions, after the sign(x) log(1 + |x|) that draws outliers in."""
-    drawn_in = np.sign(splats.positions) * np.log1p(np.abs(splats.positions))
-    low, high = drawn_in.min(0), drawn_in.max(0)
-    cells = (drawn_in - low) / max(float((high - low).max()), 1e-12) * (2**16 - 1)
+def sort_in_morton_order(splats: Splats) -> Splats:
+    """Sort splats along a Morton curve of their positions after sign(x) log(1 + |x|), which brings outliers closer."""
+    compressed_positions = np.sign(splats.positions) * np.log1p(np.abs(splats.positions))
+    low, high = compressed_positions.min(0), compressed_positions.max(0)
+    cells = (compressed_positions - low) / max(float((high - low).max()), 1e-12) * (2**16 - 1)
     return splats[np.argsort(morton_codes(cells.astype(np.int64)), kind="stable")]
 
 
 @contextlib.contextmanager
-def _kmeans_of_gsplat(clusters: int) -> Iterator[None]:
-    """Inside, gsplat finds our k-means under TorchPQ's name."""
+def _replace_torchpq(clusters: int) -> Iterator[None]:
+    """Within this context, gsplat imports our k-means under TorchPQ's name."""
 
     class KMeans:
         def __init__(self, n_clusters: int, distance: str, verbose: bool) -> None:

@@ -1,12 +1,12 @@
-"""Trains sets at several lengths, over as many calls as it takes, and prints one table of all finished runs.
+"""Train data sets at several numbers of steps, over several calls if needed, and print a table of all finished runs.
 
     python -m tools.studies.long_runs --steps 1000 3000 7000 30000 --sets drone_brighton_beach mipnerf360_bonsai@12
-    python -m tools.studies.long_runs --steps 30000 --table                     only print what is finished
+    python -m tools.studies.long_runs --steps 30000 --table                     only prints the table
 
-The queue takes short runs first. A call that is stopped loses nothing: the next one resumes from the checkpoint, and
-what is finished is not trained again. Several calls share one queue, because each run's folder is locked while it is
-trained and measured. Scores are of the raw file on held-out photos; the gap is the PSNR on (at most 16) training photos
-minus that. Files are measured as decoded from disk.
+Short runs come first. If a call is stopped, the next one resumes from the checkpoint and does not repeat finished runs.
+Several calls can share one queue, because each run's folder is locked while it is trained and measured. The table has
+PSNR in dB and SSIM of the raw file on held-out photos, the gap (PSNR on up to 16 training photos minus that), bytes and
+scores of the compressed files as decoded from disk, and seconds of training.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.scene import Scene, evenly_spaced
 from hyrfpack.train import TrainConfig
-from tools.studies.train_sets import DATA
-from tools.studies.variants import load_variant
+from tools.studies.set_variants import load_variant
+from tools.studies.train_sets import DATA_FOLDER
 from tools.tables import markdown_table
 
-MEASURED = "measured.json"
+MEASUREMENT_FILE = "measured.json"
 MAX_TRAINING_VIEWS_SCORED = 16
-COLUMNS = (
+TABLE_COLUMNS = (
     "set", "steps", "seed", "gains", "PSNR", "SSIM", "gap", "Gaussians", "raw", "paper", "compact", "compact PSNR",
     "compact SSIM", "fine-tuned", "fine-tuned PSNR", "training s",
 )  # fmt: skip
 
 
 @dataclass(frozen=True)
-class Run:
+class QueuedRun:
     """One training run of the queue."""
 
     name: str
@@ -46,16 +46,16 @@ class Run:
     exposure: bool | None
 
     def folder(self, out: Path) -> Path:
-        """Return where it is kept below `out`."""
+        """Return the folder of the run below `out`."""
         gains = {None: "", True: "-gains", False: "-no-gains"}[self.exposure]
         return out / f"{self.steps}{gains}" / f"seed{self.seed}" / self.name
 
 
-def measure(run: Run, data: Path, out: Path, finetune_steps: int) -> None:
-    """Train a run, from its checkpoint if there is one, and write its row into its folder.
+def measure(run: QueuedRun, data: Path, out: Path, finetune_steps: int) -> None:
+    """Train a run, resuming from its checkpoint if there is one, and write its row into its folder.
 
     Raises:
-        HyrfError: the set cannot be read, or a file cannot be written.
+        HyrfError: the data set cannot be read, or a file cannot be written.
     """
     folder = run.folder(out)
     scene = load_variant(data, run.name)
@@ -76,15 +76,15 @@ def measure(run: Run, data: Path, out: Path, finetune_steps: int) -> None:
         "gaussians": metrics["gaussians"],
         "seconds": metrics["seconds"],
         "raw": {"bytes": (folder / MODEL_FILE).stat().st_size},
-        "paper": _packed(folder, scene, "paper"),
-        "compact": _packed(folder, scene, "compact"),
+        "paper": _compress_and_score(folder, scene, "paper"),
+        "compact": _compress_and_score(folder, scene, "compact"),
     }
     if finetune_steps:
-        row["finetuned"] = _packed(folder, scene, "compact", finetune_steps)
-    (folder / MEASURED).write_text(json.dumps(row, indent=1))
+        row["finetuned"] = _compress_and_score(folder, scene, "compact", finetune_steps)
+    (folder / MEASUREMENT_FILE).write_text(json.dumps(row, indent=1))
 
 
-def _packed(folder: Path, scene: Scene, profile: str, finetune_steps: int = 0) -> dict:
+def _compress_and_score(folder: Path, scene: Scene, profile: str, finetune_steps: int = 0) -> dict:
     """Compress the run's model and score the file on the held-out photos."""
     path = folder / f"{'finetuned' if finetune_steps else profile}.hyrf"
     settings = {"data": scene, "finetune_steps": finetune_steps} if finetune_steps else {}
@@ -93,13 +93,13 @@ def _packed(folder: Path, scene: Scene, profile: str, finetune_steps: int = 0) -
     return {"bytes": path.stat().st_size, "psnr": scores.psnr, "ssim": scores.ssim}
 
 
-def finished(out: Path) -> Iterator[dict]:
+def read_finished_rows(out: Path) -> Iterator[dict]:
     """Yield the rows of all finished runs."""
-    for path in sorted(out.glob(f"*/seed*/*/{MEASURED}")):
+    for path in sorted(out.glob(f"*/seed*/*/{MEASUREMENT_FILE}")):
         yield json.loads(path.read_text())
 
 
-def table(rows: list[dict]) -> str:
+def format_table(rows: list[dict]) -> str:
     """Return the rows as Markdown, by set, length and seed."""
     lines = []
     for row in sorted(rows, key=lambda row: (row["name"], row["steps"], row["seed"], str(row["exposure"]))):
@@ -122,44 +122,48 @@ def table(rows: list[dict]) -> str:
                 f"{row['seconds']:.0f}",
             ]
         )
-    return markdown_table(COLUMNS, lines)
+    return markdown_table(TABLE_COLUMNS, lines)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, nargs="+", default=[1000, 3000, 7000, 15000, 30000])
-    parser.add_argument("--sets", nargs="+", help="below --data, or variants (`variants.py`); default all")
-    parser.add_argument("--seeds", type=int, default=1, help="runs of each set and length, with seeds from 0 (1)")
+    parser.add_argument("--sets", nargs="+", help="folders below --data, or variants (`set_variants.py`); default: all")
     parser.add_argument(
-        "--exposure", action=argparse.BooleanOptionalAction, help="learn per-image gains, or not (default: pilot runs)"
+        "--seeds", type=int, default=1, help="number of seeds for each data set and number of steps (1)"
     )
-    parser.add_argument("--finetune", type=int, default=0, help="steps of a fine-tuned file; 0 (default) for none")
-    parser.add_argument("--data", type=Path, default=DATA)
+    parser.add_argument(
+        "--exposure",
+        action=argparse.BooleanOptionalAction,
+        help="learn per-image gains or not (default: pilot runs decide)",
+    )
+    parser.add_argument("--finetune", type=int, default=0, help="steps of fine-tuning a further file; 0 for none (0)")
+    parser.add_argument("--data", type=Path, default=DATA_FOLDER)
     parser.add_argument("--out", type=Path, default=Path("runs/long"))
-    parser.add_argument("--table", action="store_true", help="print the table and train nothing")
+    parser.add_argument("--table", action="store_true", help="only print the table")
     args = parser.parse_args()
     names = args.sets or sorted(
         folder.name for folder in args.data.iterdir() if (folder / "images").exists() or (folder / "train").exists()
     )
     queue = [
-        Run(name, steps, seed, args.exposure)
+        QueuedRun(name, steps, seed, args.exposure)
         for steps in sorted(args.steps)
         for seed in range(args.seeds)
         for name in names
     ]
     for run in [] if args.table else queue:
         folder = run.folder(args.out)
-        lock = folder.with_name(f"{folder.name}.queue")  # not the folder itself, which training locks
+        lock = folder.with_name(f"{folder.name}.queue")  # training locks the folder itself
         try:
             with exclusive_folder(lock):
-                if (folder / MEASURED).exists():
+                if (folder / MEASUREMENT_FILE).exists():
                     continue
-                began = time.strftime("%H:%M")
+                started = time.strftime("%H:%M")
                 measure(run, args.data, args.out, args.finetune)
-                print(f"{began} to {time.strftime('%H:%M')}  {folder}", flush=True)
-        except HyrfError as error:  # another call trains it, or the set cannot be read
+                print(f"{started} to {time.strftime('%H:%M')}  {folder}", flush=True)
+        except HyrfError as error:  # another call trains it, or the data set cannot be read
             print(f"{folder}: {error}", flush=True)
-    print(table(list(finished(args.out))))
+    print(format_table(list(read_finished_rows(args.out))))
 
 
 if __name__ == "__main__":

@@ -1,20 +1,20 @@
-"""Does float32 cost quality? Trains the same run in float32 and in float64, whole and in parts.
+"""Measure whether float32 costs quality: train the same run in float32 and in float64, in whole and in parts.
 
     python -m tools.studies.precision                        two sets, 1,000 steps (an hour: the reference is slow)
     python -m tools.studies.precision --only nudged          some rows
 
 Rows, all of one seed:
 
-    float32        the product
-    nudged N       the product, its first positions moved by one part in ten million: what rounding alone can do
-    mixed          decoders multiply factors rounded to bfloat16, as GPU kernels do by default (here the reference does)
+    float32        hyrfpack's training
+    nudged N       the same with the first positions changed by 1e-7, to show the effect of rounding alone
+    mixed          decoders round factors to bfloat16, as GPU kernels do by default (here the reference does it)
     adam           parameters and Adam's moments in float64, operations in float32
-    rasterizer     rasterising (accumulation front to back, gradient sums of each Gaussian) in float64
-    float64        everything
+    rasterizer     rasterising (front-to-back accumulation, gradient sums of each Gaussian) in float64
+    float64        everything in float64
 
-A difference from `float32` counts only where it is larger than the spread of the nudged rows: training multiplies any
-rounding until two runs differ as two seeds do. Scores are on held-out views, rendered by the product; those that
---out holds already are kept.
+A difference from `float32` is significant only if it is larger than the spread of the nudged rows, because training
+amplifies any rounding until two runs differ as much as two seeds. The table has PSNR in dB and SSIM on held-out views,
+the number of Gaussians and seconds. Scores that --out already has are not measured again.
 """
 
 from __future__ import annotations
@@ -40,25 +40,25 @@ from hyrfpack.scene import Scene
 from hyrfpack.train import TrainConfig
 from hyrfpack.train.optimizer import Optimizer
 from hyrfpack.train.trainer import Trainer
-from tools.studies.train_sets import study_arguments
+from tools.studies.train_sets import make_study_parser
 
-MLPS = ("hyrfpack.model.field.mlp", "hyrfpack.ops.background.reference.mlp")
-# Where the product looks each operation up.
-OPERATIONS = {
+MLP_LOOKUPS = ("hyrfpack.model.field.mlp", "hyrfpack.ops.background.reference.mlp")
+# The module attribute through which hyrfpack calls each operation.
+OPERATION_BY_LOOKUP = {
     "hyrfpack.render.renderer.rasterize": rasterize,
     "hyrfpack.model.hash_grid.hash_encode": hash_encode,
     "hyrfpack.ops.background.reference.hash_encode": hash_encode,
-    **dict.fromkeys(MLPS, mlp),
+    **dict.fromkeys(MLP_LOOKUPS, mlp),
     "hyrfpack.train.trainer.photometric_loss": photometric_loss,
 }
-RASTERIZE = "hyrfpack.render.renderer.rasterize"
-ROWS = ("float32", *(f"nudged {n}" for n in range(1, 7)), "mixed", "adam", "rasterizer", "float64")
-SETS = ("nerf_synthetic_lego", "indoor_room")
-NUDGE = 1e-7
+RASTERIZE_LOOKUP = "hyrfpack.render.renderer.rasterize"
+ALL_ROWS = ("float32", *(f"nudged {n}" for n in range(1, 7)), "mixed", "adam", "rasterizer", "float64")
+DEFAULT_SETS = ("nerf_synthetic_lego", "indoor_room")
+NUDGE_STD = 1e-7
 
 
-def computed_in(dtype: torch.dtype, operation: Callable) -> Callable:
-    """The operation on inputs cast to `dtype`, its results cast back to what they were."""
+def run_in_dtype(dtype: torch.dtype, operation: Callable) -> Callable:
+    """Return the operation with inputs cast to `dtype` and results cast back to the inputs' dtype."""
 
     def cast(value: object, to: torch.dtype) -> object:
         if isinstance(value, list):
@@ -66,9 +66,9 @@ def computed_in(dtype: torch.dtype, operation: Callable) -> Callable:
         return value.to(to) if isinstance(value, Tensor) and value.is_floating_point() else value
 
     def run(*args: object, absgrad: Tensor | None = None, **options: object) -> object:
-        before = (args[0][0] if isinstance(args[0], list) else args[0]).dtype
+        input_dtype = (args[0][0] if isinstance(args[0], list) else args[0]).dtype
         args = [cast(value, dtype) for value in args]
-        if absgrad is not None:  # filled in backward, before the gradient of the means is there
+        if absgrad is not None:  # the backward pass fills it before the gradient of the means is ready
             buffer = torch.zeros_like(absgrad, dtype=dtype)
 
             def fill(_: Tensor) -> None:
@@ -78,30 +78,32 @@ def computed_in(dtype: torch.dtype, operation: Callable) -> Callable:
             options["absgrad"] = buffer
         result = operation(*args, **options)
         if isinstance(result, Rasterization):
-            return Rasterization(**{name: cast(value, before) for name, value in vars(result).items()})
-        return cast(result, before)
+            return Rasterization(**{name: cast(value, input_dtype) for name, value in vars(result).items()})
+        return cast(result, input_dtype)
 
     return run
 
 
-def train(scene: Scene, config: TrainConfig, row: str) -> tuple[HybridModel, float]:
-    """The model of one row, float32 whatever it was trained in, and the seconds it took."""
+def train_row(scene: Scene, config: TrainConfig, row: str) -> tuple[HybridModel, float]:
+    """Train the model of one row; return it in float32, and the seconds of training."""
     trainer = Trainer(scene, config)
     patches = {}
     if row.startswith("nudged"):
         positions = trainer.model.gaussians.positions
         generator = torch.Generator().manual_seed(int(row.split()[1]))
         with torch.no_grad():
-            positions.mul_(1 + NUDGE * torch.randn(positions.shape, generator=generator))
+            positions.mul_(1 + NUDGE_STD * torch.randn(positions.shape, generator=generator))
     if row in ("adam", "float64"):
         trainer.model.double()
         trainer.optimizer = Optimizer(trainer.model, config.learning_rates)
         dtype = torch.float32 if row == "adam" else torch.float64
-        patches = {place: computed_in(dtype, operation) for place, operation in OPERATIONS.items()}
+        patches = {place: run_in_dtype(dtype, operation) for place, operation in OPERATION_BY_LOOKUP.items()}
     elif row == "mixed":
-        patches = dict.fromkeys(MLPS, lambda *layers, mixed: mlp(*layers, mixed=True, implementation="reference"))
+        patches = dict.fromkeys(
+            MLP_LOOKUPS, lambda *layers, mixed: mlp(*layers, mixed=True, implementation="reference")
+        )
     elif row == "rasterizer":
-        patches = {RASTERIZE: computed_in(torch.float64, rasterize)}
+        patches = {RASTERIZE_LOOKUP: run_in_dtype(torch.float64, rasterize)}
     started = time.perf_counter()
     with ExitStack() as stack:
         for place, operation in patches.items():
@@ -111,20 +113,22 @@ def train(scene: Scene, config: TrainConfig, row: str) -> tuple[HybridModel, flo
 
 
 def main() -> None:
-    args = study_arguments(__doc__, steps=1000, sets=SETS, out=Path("runs/precision"), seeds=False).parse_args()
-    kept = args.out / "scores.json"
-    scores = json.loads(kept.read_text()) if kept.exists() else {}
+    args = make_study_parser(
+        __doc__, steps=1000, sets=DEFAULT_SETS, out=Path("runs/precision"), seeds=False
+    ).parse_args()
+    scores_file = args.out / "scores.json"
+    scores = json.loads(scores_file.read_text()) if scores_file.exists() else {}
     print("| set | row | PSNR | against float32 | SSIM | Gaussians | seconds |\n|---|---|---|---|---|---|---|")
     for name in args.sets:
         scene = hyrfpack.load_scene(args.data / name)
-        for row in (row for row in ROWS if any(part in row for part in args.only or ROWS)):
+        for row in (row for row in ALL_ROWS if any(part in row for part in args.only or ALL_ROWS)):
             key = f"{name}, {row}, {args.steps}"
             if key not in scores:
-                model, seconds = train(scene, TrainConfig(steps=args.steps), row)
+                model, seconds = train_row(scene, TrainConfig(steps=args.steps), row)
                 found = evaluate_model(model, scene.test)
                 scores[key] = {"psnr": found.psnr, "ssim": found.ssim, "gaussians": len(model), "seconds": seconds}
                 args.out.mkdir(parents=True, exist_ok=True)
-                kept.write_text(json.dumps(scores, indent=1))
+                scores_file.write_text(json.dumps(scores, indent=1))
             score, base = scores[key], scores.get(f"{name}, float32, {args.steps}", {}).get("psnr", float("nan"))
             print(
                 f"| {name} | {row} | {score['psnr']:.3f} | {score['psnr'] - base:+.3f} | {score['ssim']:.4f} | "

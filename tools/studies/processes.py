@@ -1,9 +1,10 @@
-"""Trains sets on one process and on several, over equally many photos: what is lost, and what a photo takes.
+"""Compare training on one process with training on several, over the same number of photos.
 
     python -m tools.studies.processes --sets gerrard_hall indoor_room --steps 2000 --processes 1 2 4
 
-Each process has one thread. PSNR and SSIM are of held-out photos. "Of the ideal" is the seconds of one process
-over W times those of W; it means something only where each process has a core of its own.
+Each process has one thread. The table has PSNR in dB and SSIM on held-out photos with their differences from one
+process, seconds, and the share of time waiting for other processes. "Of the ideal" is the seconds of one process
+divided by W times those of W processes; it is meaningful only if each process has its own core.
 """
 
 from __future__ import annotations
@@ -16,22 +17,24 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from tools.studies.train_sets import DATA
+from tools.studies.train_sets import DATA_FOLDER
 from tools.tables import markdown_table
 
 
-def trained(data: Path, out: Path, processes: int, options: Sequence[str]) -> dict:
-    """What a run came to, from its metrics; one that is there is not repeated."""
+def train(data: Path, out: Path, processes: int, options: Sequence[str]) -> dict:
+    """Train with several processes unless the run exists; return its metrics."""
     if not (out / "metrics.json").exists():
         command = [sys.executable, "-m", "hyrfpack", "train", str(data), "-o", str(out), "--processes", str(processes)]
-        alone = {**os.environ, "HYRFPACK_THREADS": "1", "OMP_NUM_THREADS": "1"}
-        subprocess.run([*command, *options, "--overwrite", "--quiet"], check=True, env=alone, stdout=subprocess.DEVNULL)
+        environment = {**os.environ, "HYRFPACK_THREADS": "1", "OMP_NUM_THREADS": "1"}
+        subprocess.run(
+            [*command, *options, "--overwrite", "--quiet"], check=True, env=environment, stdout=subprocess.DEVNULL
+        )
     return json.loads((out / "metrics.json").read_text())
 
 
-def row(name: str, processes: int, metrics: dict, alone: dict) -> list[str]:
-    """A run beside that of one process."""
-    scores, first = metrics["evaluation"], alone["evaluation"]
+def format_row(name: str, processes: int, metrics: dict, environment: dict) -> list[str]:
+    """Format the row of a run, compared with the run on one process."""
+    scores, first = metrics["evaluation"], environment["evaluation"]
     exchange = metrics["stage_seconds"].get("exchange", 0.0)
     return [
         name,
@@ -41,15 +44,15 @@ def row(name: str, processes: int, metrics: dict, alone: dict) -> list[str]:
         f"{scores['ssim']:.4f} ({scores['ssim'] - first['ssim']:+.4f})",
         f"{metrics['seconds']:.0f}",
         f"{exchange / metrics['seconds']:.1%}",
-        f"{alone['seconds'] / metrics['seconds'] / processes:.2f}",
+        f"{environment['seconds'] / metrics['seconds'] / processes:.2f}",
     ]
 
 
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=DATA)
+    parser.add_argument("--data", type=Path, default=DATA_FOLDER)
     parser.add_argument("--sets", nargs="+", required=True)
-    parser.add_argument("--steps", type=int, default=2000, help="photos, of all processes together")
+    parser.add_argument("--steps", type=int, default=2000, help="photos of all processes together (2,000)")
     parser.add_argument("--processes", type=int, nargs="+", default=[1, 2, 4])
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("runs/processes"))
@@ -57,7 +60,7 @@ def main(arguments: list[str] | None = None) -> None:
     rows = []
     for name in options.sets:
         runs = {
-            count: trained(
+            count: train(
                 options.data / name,
                 options.out / f"{name}-{options.seed}-{count}",
                 count,
@@ -65,7 +68,7 @@ def main(arguments: list[str] | None = None) -> None:
             )
             for count in options.processes
         }
-        rows += [row(name, count, metrics, runs[options.processes[0]]) for count, metrics in runs.items()]
+        rows += [format_row(name, count, metrics, runs[options.processes[0]]) for count, metrics in runs.items()]
         print(" | ".join(rows[-1]), file=sys.stderr)
     header = ["set", "processes", "Gaussians", "PSNR", "SSIM", "seconds", "waiting for others", "of the ideal"]
     print(markdown_table(header, rows))

@@ -1,12 +1,13 @@
-"""Trains real sets and prints one table: quality, bytes of each profile, what compression lost, speed.
+"""Train real data sets and print one table: quality, bytes of each profile, PSNR lost by compression, and speed.
 
     python -m tools.studies.train_sets --steps 1000                            every set below ../shared/data
     python -m tools.studies.train_sets --steps 2000 --sets mipnerf360_bonsai gerrard_hall
 
-    python -m tools.studies.train_sets --sets mipnerf360_bonsai@25              25 of its photos (`variants.py`)
+    python -m tools.studies.train_sets --sets mipnerf360_bonsai@25              25 of its photos (`set_variants.py`)
 
-Scores are on held-out views (every 8th; Blender-style sets their own split) of the files as decoded from disk.
-Runs stay in --out (default runs/sets/<steps>), so a second call with --reuse only measures.
+The columns are PSNR in dB, SSIM, numbers of Gaussians, bytes, losses in dB, seconds of compression, training steps a
+second, training seconds, and ms a frame. Scores are those of the decoded files on held-out views (every 8th;
+Blender-style sets have their own split). Runs are kept in --out (runs/sets/<steps>), and --reuse only measures them.
 """
 
 from __future__ import annotations
@@ -21,26 +22,26 @@ from pathlib import Path
 
 import hyrfpack
 from hyrfpack.train import TrainConfig
-from tools.studies.variants import load_variant
+from tools.studies.set_variants import load_variant
 from tools.tables import markdown_table
 
-PROFILES = ("paper", "compact")
-DATA = Path(os.environ.get("HYRFPACK_DATA") or Path(__file__).parents[3] / "shared" / "data")
+COMPRESSED_PROFILES = ("paper", "compact")
+DATA_FOLDER = Path(os.environ.get("HYRFPACK_DATA") or Path(__file__).parents[3] / "shared" / "data")
 
 
 def measure(data: Path, name: str, out: Path, config: TrainConfig, reuse: bool) -> dict:
-    """Train one set, compress it with each profile that loses something, score all files."""
+    """Train one data set, compress the model with each lossy profile, and score all files; return the row."""
     scene = load_variant(data, name)
     if not (reuse and (out / "metrics.json").exists()):
         hyrfpack.train_model(scene, out, config, overwrite=True)
     trained = json.loads((out / "metrics.json").read_text())
     model = out / "model.hyrf"
     packed = {}
-    for profile in PROFILES:
+    for profile in COMPRESSED_PROFILES:
         path = out / f"{profile}.hyrf"
-        began = time.perf_counter()
+        started = time.perf_counter()
         hyrfpack.compress_model(model, path, profile=profile)
-        seconds = time.perf_counter() - began
+        seconds = time.perf_counter() - started
         scores = hyrfpack.evaluate_model(hyrfpack.load_model(path), scene.test)
         packed |= {f"psnr_{profile}": scores.psnr, f"ssim_{profile}": scores.ssim}
         packed |= {f"bytes_{profile}": path.stat().st_size, f"seconds_{profile}": seconds}
@@ -60,68 +61,75 @@ def measure(data: Path, name: str, out: Path, config: TrainConfig, reuse: bool) 
     }
 
 
-def table(rows: list[dict]) -> str:
-    """The rows as Markdown."""
+def format_table(rows: list[dict]) -> str:
+    """Format the rows as a Markdown table."""
     header = ["set", "preset", "PSNR", "SSIM", "Gaussians", "raw bytes"]
-    for profile in PROFILES:
+    for profile in COMPRESSED_PROFILES:
         header += [f"{profile} bytes", "loss", "s"]
     header += ["compact / paper", "steps/s", "train s", "frame ms"]
     lines = []
-    for r in rows:
-        cells = [r["set"], r["preset"], f"{r['psnr']:.2f}", f"{r['ssim']:.3f}", f"{r['gaussians']:,}"]
-        cells.append(f"{r['bytes_raw']:,}")
-        for profile in PROFILES:
-            loss = r["psnr"] - r[f"psnr_{profile}"]
-            cells += [f"{r[f'bytes_{profile}']:,}", f"{loss:.3f} dB", f"{r[f'seconds_{profile}']:.1f}"]
-        cells += [f"{r['bytes_compact'] / r['bytes_paper']:.2f}", f"{r['steps_per_second']:.1f}"]
-        cells += [f"{r['seconds']:.0f}", f"{r['frame_ms']:.1f}"]
+    for row in rows:
+        cells = [row["set"], row["preset"], f"{row['psnr']:.2f}", f"{row['ssim']:.3f}", f"{row['gaussians']:,}"]
+        cells.append(f"{row['bytes_raw']:,}")
+        for profile in COMPRESSED_PROFILES:
+            loss = row["psnr"] - row[f"psnr_{profile}"]
+            cells += [f"{row[f'bytes_{profile}']:,}", f"{loss:.3f} dB", f"{row[f'seconds_{profile}']:.1f}"]
+        cells += [f"{row['bytes_compact'] / row['bytes_paper']:.2f}", f"{row['steps_per_second']:.1f}"]
+        cells += [f"{row['seconds']:.0f}", f"{row['frame_ms']:.1f}"]
         lines.append(cells)
     return markdown_table(header, lines)
 
 
-def study_arguments(
+def make_study_parser(
     text: str, steps: int, sets: Sequence[str], out: Path, seeds: bool = True
 ) -> argparse.ArgumentParser:
-    """The options of a study that trains variants on sets; `text` is its help, the rest are defaults.
+    """Return the parser of a study that trains variants on data sets.
 
-    With `seeds` False every run has one seed, and there is no such option.
+    Args:
+        text: the description.
+        steps, sets, out: the defaults of --steps, --sets and --out.
+        seeds: whether there is the option --seeds.
     """
     parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--steps", type=int, default=steps, help=f"of each run ({steps:,})")
-    parser.add_argument("--sets", nargs="*", default=list(sets), help=f"folders below --data ({' '.join(sets)})")
+    parser.add_argument("--steps", type=int, default=steps, help=f"training steps of each run ({steps:,})")
+    parser.add_argument(
+        "--sets", nargs="*", default=list(sets), help=f"data sets: folders below --data ({' '.join(sets)})"
+    )
     if seeds:
-        parser.add_argument("--seeds", type=int, default=2, help="runs of each row and set, with seeds from 0 (2)")
-    parser.add_argument("--data", type=Path, default=DATA, help="where the sets are")
+        parser.add_argument("--seeds", type=int, default=2, help="number of seeds for each row and data set (2)")
+    parser.add_argument("--data", type=Path, default=DATA_FOLDER, help="folder of the data sets")
     parser.add_argument("--out", type=Path, default=out, help=f"folder for results ({out})")
-    parser.add_argument("--only", nargs="*", help="parts of the names of the rows wanted")
+    parser.add_argument("--only", nargs="*", help="run only rows whose names contain one of these words")
     return parser
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, default=1000)
-    parser.add_argument("--sets", nargs="*", help="below --data, or variants (`variants.py`); default all that load")
-    parser.add_argument("--data", type=Path, default=DATA)
+    parser.add_argument("--sets", nargs="*", help="folders below --data, or variants (`set_variants.py`); default: all")
+    parser.add_argument("--data", type=Path, default=DATA_FOLDER)
     parser.add_argument("--out", type=Path)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument(
-        "--exposure", action=argparse.BooleanOptionalAction, help="learn per-image gains, or not (default: pilot runs)"
+        "--exposure",
+        action=argparse.BooleanOptionalAction,
+        help="learn per-image gains or not (default: pilot runs decide)",
     )
-    parser.add_argument("--reuse", action="store_true", help="do not train again what --out already holds")
+    parser.add_argument("--reuse", action="store_true", help="do not repeat training runs that --out already has")
     args = parser.parse_args()
     out = args.out or Path("runs/sets") / str(args.steps)
     names = args.sets or sorted(
         folder.name for folder in args.data.iterdir() if (folder / "images").exists() or (folder / "train").exists()
     )
-    warnings.simplefilter("error")  # a run that warns has not passed
+    warnings.simplefilter("error")  # a run that warns is a failure
     config = TrainConfig(steps=args.steps, seed=args.seed, exposure=args.exposure)
     rows = []
     for name in names:
         rows.append(measure(args.data, name, out / name, config, args.reuse))
-        print(table(rows[-1:]).splitlines()[-1], flush=True)
+        print(format_table(rows[-1:]).splitlines()[-1], flush=True)
         out.mkdir(parents=True, exist_ok=True)
         (out / "table.json").write_text(json.dumps(rows, indent=1))
-    print("\n" + table(rows))
+    print("\n" + format_table(rows))
 
 
 if __name__ == "__main__":

@@ -47,7 +47,7 @@ def main() -> int:
                     if layout in variant.layouts and options.only in variant.name:
                         outcome = check_variant(variant, source, layout, Path(folder, str(number)), original_scene)
                         counts[outcome.kind] += 1
-                        print(f"  {outcome.kind:8}{variant.name:58}{outcome.said[:200]}", flush=True)
+                        print(f"  {outcome.kind:8}{variant.name:58}{outcome.message[:200]}", flush=True)
                 shutil.rmtree(original_set.root)
     print("\n" + ", ".join(f"{kind}: {count}" for kind, count in sorted(counts.items())))
     return 1 if counts["WRONG"] else 0

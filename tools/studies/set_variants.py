@@ -1,11 +1,13 @@
-"""Sets made harder: few photos, or photos in two groups of exposure. Named after the set:
+"""Make harder variants of data sets, with few photos or with photos in two groups of exposure.
 
-    bonsai@25                  25 of its training photos, evenly spread over their names
+The name of a variant is that of the set, with the changes after "@":
+
+    bonsai@25                  25 of the training photos, evenly spread over their names
     bonsai@contiguous          the second half of all photos, by name, two stops lighter
-    bonsai@interleaved         half of all photos two stops lighter, one here and one there
-    bonsai@25@contiguous       both
+    bonsai@interleaved         half of all photos, mixed with the others by name, two stops lighter
+    bonsai@25@contiguous       both changes
 
-Poses and points are the set's own, and held-out photos are the same ones. Photos are made lighter by a tone curve
+The poses, the points and the choice of held-out photos are those of the set. A tone curve makes photos lighter
 (`hyrfpack.model.exposure.apply_exposure_gains`), held-out ones like their neighbours.
 """
 
@@ -22,30 +24,30 @@ from hyrfpack.format.exposure_header import STOPS_PER_LOG_GAIN
 from hyrfpack.model.exposure import apply_exposure_gains
 from hyrfpack.scene import Picture, Scene, View, evenly_spaced
 
-SECOND_GROUP_STOPS = 2.0  # by which it is lighter than the first
+SECOND_GROUP_STOPS = 2.0  # the second group of photos is this much lighter than the first
 
 
 def load_variant(data: Path, name: str) -> Scene:
-    """Read a set below `data`, changed as its name says.
+    """Read a variant of a data set below `data`, with the changes that its name gives.
 
     Raises:
-        ValueError: there is no such change.
-        HyrfDataError: as `hyrfpack.load_scene`.
+        ValueError: a change is unknown.
+        HyrfDataError: the data set cannot be read.
     """
     folder, *changes = name.split("@")
     scene = hyrfpack.load_scene(data / folder)
     for change in changes:
         if change.isdecimal() and int(change) > 0:
-            scene = with_few_photos(scene, int(change))
+            scene = keep_few_photos(scene, int(change))
         elif change in ("contiguous", "interleaved"):
-            scene = in_two_exposures(scene, interleaved=change == "interleaved")
+            scene = split_exposures(scene, interleaved=change == "interleaved")
         else:
             raise ValueError(f"'{name}': the change '{change}' is not a number, 'contiguous' or 'interleaved'")
     return scene
 
 
-def with_few_photos(scene: Scene, count: int) -> Scene:
-    """The scene with `count` of its training photos, evenly spread."""
+def keep_few_photos(scene: Scene, count: int) -> Scene:
+    """Return the scene with `count` of its training photos, evenly spread."""
     train = evenly_spaced(scene.train, count)
     kept = {view.name for view in (*train, *scene.test)}
     return replace(
@@ -53,24 +55,24 @@ def with_few_photos(scene: Scene, count: int) -> Scene:
     )  # fmt: skip
 
 
-def in_two_exposures(scene: Scene, *, interleaved: bool) -> Scene:
-    """The scene with half of its photos lighter by `SECOND_GROUP_STOPS`.
+def split_exposures(scene: Scene, *, interleaved: bool) -> Scene:
+    """Return the scene with half of its photos lighter by `SECOND_GROUP_STOPS`.
 
-    Interleaved, the photo number n by name is lighter if the bits of n have an odd sum (Thue-Morse), so that held-out
-    photos, one of every eight, are in both groups.
+    With `interleaved`, photo number n by name is lighter if the sum of the bits of n is odd (the Thue-Morse sequence),
+    so that both groups have held-out photos, which are one in eight. Otherwise the second half by name is lighter.
     """
     names = sorted(view.name for view in scene.views)
-    lighter = {
+    lightened = {
         name for n, name in enumerate(names) if (n.bit_count() % 2 if interleaved else n >= len(names) // 2)
     }  # fmt: skip
 
     def change(views: list[View]) -> list[View]:
-        return [_lighter(view) if view.name in lighter else view for view in views]
+        return [_lighten(view) if view.name in lightened else view for view in views]
 
     return replace(scene, train=change(scene.train), test=change(scene.test))
 
 
-def _lighter(view: View) -> View:
+def _lighten(view: View) -> View:
     gains = torch.full((3,), float(np.exp(SECOND_GROUP_STOPS / STOPS_PER_LOG_GAIN)), dtype=torch.float64)
 
     def load() -> Picture:

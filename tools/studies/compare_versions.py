@@ -1,0 +1,185 @@
+"""Compare this version of hyrfpack with another one: bytes at equal PSNR, and scores at equal bytes, of compact files.
+
+    git worktree add ../before 42597b1
+    python -m tools.studies.compare_versions --against ../before --steps 2000
+
+Each version trains and compresses each data set at several budgets, given as shares of this version's budget. This
+version scores the decoded files on held-out photos by PSNR and SSIM. For each data set the table has the change of
+bytes at equal PSNR in percent (BD-rate over the common range of PSNR, by monotone cubics), the change of PSNR in dB and
+of SSIM at the largest common number of bytes, and the ratio of training times. The share `measured` is the budget that
+a version chooses itself. Runs are kept in --out and are not repeated; a run with scores.json is not scored again. The
+other version runs with the packages of this environment.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from scipy.interpolate import PchipInterpolator
+
+import hyrfpack
+from hyrfpack.scene import Scene
+from hyrfpack.train import TrainConfig
+from hyrfpack.train.setup import budget_for
+from tools.studies.train_sets import make_study_parser
+from tools.tables import markdown_table
+
+REPOSITORY_ROOT = Path(__file__).parents[2]
+DEFAULT_SETS = (
+    "drone_brighton_beach",
+    "drone_caliterra",
+    "gerrard_hall",
+    "indoor_room",
+    "kitti_street",
+    "llff_fern",
+    "mipnerf360_bonsai",
+    "nerf_synthetic_lego",
+    "ngp_fox",
+    "shiny_can_nerfstudio",
+    "specular_gold_cape",
+    "street_lund",
+)
+ESTIMATED_BUDGET_SHARE = "measured"
+SCORE_KEYS = ("bytes", "psnr", "ssim", "seconds", "gaussians")
+
+
+def train_and_score(
+    version: Path, scene: Scene, steps: int, gaussians: int | None, seed: int, out: Path
+) -> dict[str, float]:
+    """Train and compress with one version, score with this one, and return bytes, scores, seconds and Gaussians.
+
+    With `gaussians` None, the version chooses its budget.
+    """
+    scores_file = out / "scores.json"
+    if scores_file.exists():
+        return json.loads(scores_file.read_text())
+    if not (out / "metrics.json").exists():
+        settings = ["--steps", str(steps), "--seed", str(seed), "--overwrite"]
+        budget = [] if gaussians is None else ["--max-gaussians", str(gaussians)]
+        _run_command(version, "train", str(scene.path), "-o", str(out), *settings, *budget)
+    packed = out / "compact.hyrf"
+    packed.unlink(missing_ok=True)
+    _run_command(version, "compress", str(out / "model.hyrf"), "-o", str(packed))
+    scores = hyrfpack.evaluate_model(hyrfpack.load_model(packed), scene.test)
+    trained = json.loads((out / "metrics.json").read_text())
+    result = {
+        "bytes": packed.stat().st_size,
+        "psnr": scores.psnr,
+        "ssim": scores.ssim,
+        "seconds": trained["seconds"],
+        "gaussians": trained["gaussians"],
+    }
+    scores_file.write_text(json.dumps(result))
+    return result
+
+
+def _run_command(version: Path, command: str, *arguments: str) -> None:
+    """Run a hyrfpack command with the package in the folder `version`."""
+    environment = {**os.environ, "PYTHONPATH": str(version)}
+    command_line = [sys.executable, "-m", "hyrfpack", command, *arguments]
+    process = subprocess.run(command_line, env=environment, cwd=version, capture_output=True, text=True, check=False)
+    if process.returncode:
+        raise SystemExit(f"{version}: {command} failed: {process.stderr.strip().splitlines()[-1]}")
+
+
+def bytes_change_at_equal_psnr(ours: np.ndarray, theirs: np.ndarray) -> float | None:
+    """Return the BD-rate (Bjontegaard) of `ours` against `theirs`: -0.3 means 30 % fewer bytes at equal PSNR.
+
+    It returns None if the ranges of PSNR do not overlap.
+
+    Args:
+        ours, theirs: (n, 2) bytes and PSNR of the same scene at n sizes.
+    """
+    low = max(points[:, 1].min() for points in (ours, theirs))
+    high = min(points[:, 1].max() for points in (ours, theirs))
+    if low >= high:
+        return None
+    means = []
+    for points in (ours, theirs):
+        rising = points[np.argsort(points[:, 0])]
+        best = np.maximum.accumulate(rising[:, 1])  # nobody would use a larger file with a lower PSNR
+        scores_file = np.concatenate(([True], np.diff(best) > 0))
+        if scores_file.sum() < 2:
+            return None
+        curve = PchipInterpolator(best[scores_file], np.log(rising[scores_file, 0]))
+        means.append(curve.integrate(low, high) / (high - low))
+    return float(np.exp(means[0] - means[1]) - 1)
+
+
+def score_gain_at_equal_bytes(ours: np.ndarray, theirs: np.ndarray) -> float:
+    """Return the score of `ours` minus that of `theirs` at the largest number of bytes that both reach.
+
+    Args:
+        ours, theirs: (n, 2) bytes and score at n sizes.
+    """
+    size = np.log(min(points[:, 0].max() for points in (ours, theirs)))
+    values = []
+    for points in (ours, theirs):
+        rising = points[np.argsort(points[:, 0])]
+        values.append(np.interp(size, np.log(rising[:, 0]), rising[:, 1]))
+    return float(values[0] - values[1])
+
+
+def format_row(name: str, ours: list[dict[str, float]], theirs: list[dict[str, float]]) -> list[str]:
+    """Format one row of the table from the mean scores over seeds at each budget."""
+    curves = [{key: np.array([point[key] for point in points]) for key in SCORE_KEYS} for points in (ours, theirs)]
+
+    def pair(score: str) -> list[np.ndarray]:
+        return [np.stack((curve["bytes"], curve[score]), 1) for curve in curves]
+
+    saved = bytes_change_at_equal_psnr(*pair("psnr"))
+    cells = [name, "" if saved is None else f"{100 * saved:+.0f} %"]
+    cells += [f"{score_gain_at_equal_bytes(*pair(score)):+.{digits}f}" for score, digits in _SCORE_DIGITS.items()]
+    cells.append(f"{np.sum(curves[0]['seconds']) / np.sum(curves[1]['seconds']):.2f}")
+    for curve in curves[::-1]:
+        points = zip(curve["bytes"], curve["psnr"], strict=True)
+        cells.append(", ".join(f"{size / 1000:.0f}: {psnr:.2f}" for size, psnr in points))
+    return cells
+
+
+_SCORE_DIGITS = {"psnr": 2, "ssim": 3}
+_TABLE_HEADER = ["set", "bytes at equal PSNR", "dB", "SSIM", "time", "before, kB: dB", "now, kB: dB"]
+
+
+def mean_over_seeds(points: Sequence[dict[str, float]]) -> dict[str, float]:
+    """Return the mean of each score over the seeds."""
+    return {key: float(np.mean([point[key] for point in points])) for key in SCORE_KEYS}
+
+
+def main() -> None:
+    parser = make_study_parser(__doc__ or "", 2000, DEFAULT_SETS, Path("runs/quality"))
+    parser.add_argument("--against", type=Path, required=True, help="folder of the other version")
+    parser.add_argument(
+        "--shares", nargs="+", default=["0.25", "0.5", "1", "2"], help="shares of the budget, or 'measured'"
+    )
+    args = parser.parse_args()
+    versions = {"now": REPOSITORY_ROOT, "before": args.against.resolve()}
+    warnings.simplefilter("ignore")
+    rows = []
+    for name in args.sets:
+        scene = hyrfpack.load_scene((args.data / name).resolve())
+        budget, _ = budget_for(scene, TrainConfig(steps=args.steps))
+        points: dict[str, list[dict[str, float]]] = {version: [] for version in versions}
+        for share in args.shares:
+            for version, folder in versions.items():
+                seeds = []
+                for seed in range(args.seeds):
+                    out = args.out.resolve() / f"{args.steps}" / name / f"{version}-{share}-{seed}"
+                    out.mkdir(parents=True, exist_ok=True)
+                    gaussians = None if share == ESTIMATED_BUDGET_SHARE else round(float(share) * budget)
+                    seeds.append(train_and_score(folder, scene, args.steps, gaussians, seed, out))
+                points[version].append(mean_over_seeds(seeds))
+        rows.append(format_row(name, points["now"], points["before"]))
+        print(markdown_table(_TABLE_HEADER, rows[-1:]).splitlines()[-1], flush=True)
+    print("\n" + markdown_table(_TABLE_HEADER, rows))
+
+
+if __name__ == "__main__":
+    main()

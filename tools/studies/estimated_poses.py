@@ -1,0 +1,99 @@
+"""Compare training on given poses with training on poses estimated by hyrfpack, with the same photos and split.
+
+    python -m tools.studies.poses --out runs/poses                            estimates the poses of every set
+    python -m tools.studies.estimated_poses --scenes runs/poses --steps 1000        trains on both and prints the table
+
+Photos without an estimated pose are left out of both runs and counted. The table has PSNR in dB on held-out photos,
+which are every 8th of the common ones. Each reconstruction undistorts the photos with its own cameras.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import statistics
+from pathlib import Path, PurePosixPath
+
+import hyrfpack
+from hyrfpack.scene import Scene
+from tools.studies.train_sets import DATA_FOLDER
+from tools.tables import markdown_table
+
+TEST_EVERY = 8
+
+
+def select_common_photos(given: Scene, own: Scene) -> tuple[Scene, Scene, int]:
+    """Return both scenes with their common photos and the same split, and the number of photos missing in `own`."""
+
+    def by_stem(scene: Scene) -> dict[str, hyrfpack.View]:
+        return {str(PurePosixPath(view.name).with_suffix("")): view for view in scene.views}
+
+    views = by_stem(given), by_stem(own)
+    names = sorted(views[0].keys() & views[1].keys())
+    held_out = set(names[::TEST_EVERY])
+
+    def restrict(scene: Scene, views_by_name: dict[str, hyrfpack.View]) -> Scene:
+        train = [views_by_name[name] for name in names if name not in held_out]
+        return dataclasses.replace(scene, train=train, test=[views_by_name[name] for name in names if name in held_out])
+
+    return restrict(given, views[0]), restrict(own, views[1]), len(views[0]) - len(names)
+
+
+def train_and_score(scene: Scene, out: Path, steps: int, seed: int) -> float:
+    """Train a model; return its mean PSNR in dB on held-out photos."""
+    result = hyrfpack.train_model(
+        scene, out, hyrfpack.TrainConfig(steps=steps, seed=seed, budget_factor=1.0), overwrite=True, quiet=True
+    )
+    return result.metrics["evaluation"]["psnr"]
+
+
+def measure(name: str, data: Path, scenes: Path, out: Path, steps: int, seeds: int) -> dict:
+    """Train on both poses of one data set with each seed; return the row."""
+    given, own, missing = select_common_photos(
+        hyrfpack.load_scene(data / name, layout="colmap"), hyrfpack.load_scene(scenes / name, layout="colmap")
+    )
+    scores = {
+        kind: [train_and_score(scene, out / name / f"{kind}-{seed}", steps, seed) for seed in range(seeds)]
+        for kind, scene in (("given", given), ("own", own))
+    }
+    return {"set": name, "photos": len(given.views), "lacking": missing, **scores}
+
+
+def format_table(rows: list[dict]) -> str:
+    """Format the rows and the mean loss as a Markdown table."""
+    table_rows, losses = [], []
+    for row in rows:
+        given, own = statistics.mean(row["given"]), statistics.mean(row["own"])
+        losses.append(given - own)
+        counts = [str(row["photos"]), str(row["lacking"])]
+        table_rows.append([row["set"], *counts, f"{given:.2f}", f"{own:.2f}", f"{losses[-1]:+.2f}"])
+    table_rows.append(["mean", "", "", "", "", f"{statistics.mean(losses):+.2f}"])
+    return markdown_table(
+        ["set", "photos", "without estimated pose", "given poses, dB", "estimated poses, dB", "loss, dB"], table_rows
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        "--scenes", type=Path, default=Path("runs/poses"), help="folder that `tools.studies.poses` has written"
+    )
+    parser.add_argument("--sets", nargs="*", help="names of data sets (all in --scenes)")
+    parser.add_argument("--data", type=Path, default=DATA_FOLDER)
+    parser.add_argument("--steps", type=int, default=1000)
+    parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--out", type=Path, default=Path("runs/own-poses"))
+    args = parser.parse_args()
+    names = args.sets or sorted(folder.name for folder in args.scenes.iterdir() if (folder / "sparse").is_dir())
+    rows = []
+    args.out.mkdir(parents=True, exist_ok=True)
+    for name in names:
+        rows.append(measure(name, args.data, args.scenes, args.out, args.steps, args.seeds))
+        print(format_table(rows[-1:]).splitlines()[2], flush=True)
+        (args.out / "table.json").write_text(json.dumps(rows, indent=1))
+    print("\n" + format_table(rows))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,159 @@
+"""Measure the web player in a real browser: its pictures, its bytes and its times, for native and baked pages.
+
+    python -m tools.studies.web_player --runs runs/sets/1000 --data ../shared/data
+    python -m tools.studies.web_player --large runs/100k/compact.hyrf runs/1m/compact.hyrf
+
+With --runs it draws eight held-out views of each data set's `compact.hyrf` with the native and the baked page in
+headless Chromium. The table has bytes, PSNR in dB against the pictures of `render_view` (mean and worst), and the
+difference of PSNR against the photos. With --large it measures the seconds from opening a page to the first and to the
+complete picture, and the ms of a frame while a mouse orbits at full resolution. These are medians over --repeats, where
+native and baked pages alternate, each in a new browser. Without a GPU the browser renders in software.
+"""
+
+from __future__ import annotations
+
+import argparse
+import base64
+import json
+import statistics
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+import hyrfpack
+from hyrfpack.cameras.files import camera_to_json
+from hyrfpack.scene import Camera, Scene, evenly_spaced
+from tools.browser import chromium
+from tools.browser.chromium import Chromium
+from tools.tables import markdown_table
+
+COMPARED_VIEWS = 8
+WINDOW_SIZE = (1280, 800)
+ORBIT_SECONDS = 6.0  # frames are counted for this long
+PAGE_TIMEOUT_SECONDS = 900.0
+READ_PIXELS_SCRIPT = "btoa(Array.from(hyrfpack.pixels(), (byte) => String.fromCharCode(byte)).join(''))"
+
+
+def psnr(first: np.ndarray, second: np.ndarray) -> float:
+    """Return the PSNR in dB of two pictures in [0, 1]."""
+    return float(-10 * np.log10(max(np.mean((first - second) ** 2), 1e-12)))
+
+
+def draw_in_page(browser: Chromium, camera: Camera) -> np.ndarray:
+    """Draw the view of a camera in the page; return (H, W, 3) in [0, 1]."""
+    browser.evaluate(f"hyrfpack.show({json.dumps(camera_to_json(camera))})")
+    data = base64.b64decode(browser.evaluate(READ_PIXELS_SCRIPT))
+    return np.frombuffer(data, np.uint8).reshape(camera.height, camera.width, 3) / 255
+
+
+def write_pages(model: Path, folder: Path, data: Scene | None = None) -> dict[str, Path]:
+    """Write the native and the baked page of a model; baked colours are fitted at the photos' cameras if given."""
+    paths = {"native": folder / f"{model.parent.name}.html", "baked": folder / f"{model.parent.name}.baked.html"}
+    for name, path in paths.items():
+        hyrfpack.export_model(model, path, data=data, baked=name == "baked")
+    return paths
+
+
+def open_page(browser: Chromium, page: Path) -> None:
+    """Open a page and wait until it is ready."""
+    browser.open(page.as_uri())
+    browser.evaluate("hyrfpack.ready")
+
+
+def measure_pictures(run: Path, data: Path, folder: Path) -> list[str]:
+    """Return the row of one data set in the table of pictures."""
+    model = run / "compact.hyrf"
+    scene = hyrfpack.load_scene(data)
+    views = evenly_spaced(scene.test, COMPARED_VIEWS)
+    field = hyrfpack.load_model(model)
+    model_pictures = [hyrfpack.render_view(field, view.camera).rgb.clamp(0, 1).numpy() for view in views]
+    solid = np.array(field.config.solid, np.float32)
+    photos = [view.load().composite(solid) for view in views]
+    scores: dict[str, list[float]] = {}
+    cells = [run.name, f"{model.stat().st_size:,}"]
+    pictures_by_source = {"hyrfpack": model_pictures}
+    page_paths = write_pages(model, folder, scene)
+    with Chromium(Path(tempfile.mkdtemp(dir=folder))) as browser:
+        for name, page in page_paths.items():
+            open_page(browser, page)
+            pictures_by_source[name] = [draw_in_page(browser, view.camera) for view in views]
+    for name, pictures in pictures_by_source.items():
+        scores[name] = [psnr(picture, own) for picture, own in zip(pictures, model_pictures, strict=True)]
+        scores[f"{name} photos"] = [psnr(picture, photo) for picture, photo in zip(pictures, photos, strict=True)]
+    for name, page in page_paths.items():
+        psnr_to_model = scores[name]
+        photo = statistics.mean(scores[f"{name} photos"]) - statistics.mean(scores["hyrfpack photos"])
+        cells += [
+            f"{page.stat().st_size:,}",
+            f"{statistics.mean(psnr_to_model):.1f}",
+            f"{min(psnr_to_model):.1f}",
+            f"{photo:+.3f}",
+        ]
+    return cells
+
+
+def measure_frame_ms(browser: Chromium) -> float:
+    """Return the milliseconds of a frame at full resolution while a mouse orbits."""
+    browser.evaluate("document.getElementById('automatic').checked && document.getElementById('automatic').click()")
+    x, y = WINDOW_SIZE[0] / 2, WINDOW_SIZE[1] / 2
+    browser.mouse("mousePressed", x, y, button="left", buttons=1, clickCount=1)
+    drawn, started, step = browser.evaluate("hyrfpack.frames()"), time.perf_counter(), 0
+    while time.perf_counter() < started + ORBIT_SECONDS:
+        step += 1
+        browser.mouse("mouseMoved", x + 3 * (step % 60), y, button="left", buttons=1)
+        time.sleep(0.02)
+    frames, seconds = browser.evaluate("hyrfpack.frames()") - drawn, time.perf_counter() - started
+    browser.mouse("mouseReleased", x, y, button="left", clickCount=1)
+    return 1000 * seconds / max(1, frames)
+
+
+def measure_times(model: Path, folder: Path, repeats: int) -> list[list[str]]:
+    """Return the two rows of one model in the table of times, native and baked."""
+    page_paths = write_pages(model, folder)
+    samples: dict[str, list[tuple[float, float, float]]] = {name: [] for name in page_paths}
+    for _ in range(repeats):
+        for name, page in page_paths.items():
+            with Chromium(Path(tempfile.mkdtemp(dir=folder))) as browser:
+                browser.resize(*WINDOW_SIZE)
+                open_page(browser, page)
+                browser.evaluate("hyrfpack.player.settled")
+                first, complete = (
+                    browser.evaluate(f"hyrfpack.player.times.{column}") / 1000 for column in ("first", "complete")
+                )
+                samples[name].append((first, complete, measure_frame_ms(browser)))
+    count = len(hyrfpack.load_model(model))
+    return [
+        [f"{count:,}", name, f"{page.stat().st_size:,}"]
+        + [f"{statistics.median(column):.2f}" for column in zip(*samples[name], strict=True)]
+        for name, page in page_paths.items()
+    ]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--runs", type=Path, help="folder of runs, written by tools.studies.train_sets")
+    parser.add_argument("--sets", nargs="*", help="data sets to compare (all)")
+    parser.add_argument("--data", type=Path, help="folder of the data sets")
+    parser.add_argument("--large", type=Path, nargs="*", default=[], help="models to time")
+    parser.add_argument("--repeats", type=int, default=3, help="number of repeats of each time (3)")
+    arguments = parser.parse_args()
+    chromium.TIMEOUT_SECONDS = PAGE_TIMEOUT_SECONDS
+    with tempfile.TemporaryDirectory() as folder:
+        if arguments.runs:
+            runs = [arguments.runs / name for name in arguments.sets or []] or sorted(
+                path.parent for path in arguments.runs.glob("*/compact.hyrf")
+            )
+            rows = [measure_pictures(run, arguments.data / run.name, Path(folder)) for run in runs]
+            columns = [
+                f"{name} {column}" for name in ("native", "baked") for column in ("bytes", "dB", "worst", "photos dB")
+            ]
+            print(markdown_table(["set", ".hyrf bytes", *columns], rows))
+        rows = [row for model in arguments.large for row in measure_times(model, Path(folder), arguments.repeats)]
+        if rows:
+            print(markdown_table(["Gaussians", "page", "bytes", "first s", "complete s", "frame ms"], rows))
+
+
+if __name__ == "__main__":
+    main()
