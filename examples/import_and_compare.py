@@ -1,4 +1,4 @@
-"""3D Gaussians of another program (.ply, .splat, .spz, .sog) to a small `.hyrf` file, and both side by side.
+"""Import 3D Gaussians (.ply, .splat, .spz, .sog) into a small `.hyrf` file, and draw both side by side.
 
 python examples/import_and_compare.py scene.ply scene.hyrf compare.png
 """
@@ -15,19 +15,19 @@ from hyrfpack.cameras.paths import orbit
 from hyrfpack.splats.draw import Drawable, draw
 from hyrfpack.splats.files import read_splats
 
-VIEWS = 3
+COMPARED_VIEWS = 3
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("splats", help="a file of 3D Gaussians")
     parser.add_argument("model", help="the .hyrf file to write")
-    parser.add_argument("picture", help="the picture to write: left the Gaussians, right the model")
-    parser.add_argument("--steps", type=int, default=hyrfpack.DistillConfig.steps)
+    parser.add_argument("picture", help="the picture to write: Gaussians on the left, model on the right")
+    parser.add_argument("--steps", type=int, default=hyrfpack.DistillConfig.steps, help="training steps")
     parser.add_argument(
-        "--size", type=int, default=hyrfpack.DistillConfig.size, help="pixels of pictures to learn from"
+        "--size", type=int, default=hyrfpack.DistillConfig.size, help="size of the reference renders in pixels"
     )
-    parser.add_argument("--psnr", type=float, default=hyrfpack.DistillConfig.psnr, help="dB to aim at")
+    parser.add_argument("--psnr", type=float, default=hyrfpack.DistillConfig.psnr, help="target PSNR in dB")
     args = parser.parse_args()
 
     config = hyrfpack.DistillConfig(steps=args.steps, psnr=args.psnr, size=args.size)
@@ -38,11 +38,11 @@ def main() -> None:
     original = Drawable.from_splats(read_splats(args.splats), model.config.frame)
     rows = []
     with torch.no_grad():
-        for camera in orbit(Capture(hyrfpack.describe_file(args.model)).viewpoint, VIEWS):
+        for camera in orbit(Capture(hyrfpack.describe_file(args.model)).viewpoint, COMPARED_VIEWS):
             pair = draw(original, camera).rgb, hyrfpack.render_view(model, camera, background=False).rgb
             rows.append(np.concatenate([picture.clamp(0, 1).numpy() for picture in pair], axis=1))
     Image.fromarray((np.concatenate(rows) * 255).round().astype(np.uint8)).save(args.picture)
-    print(f"{args.picture}: {VIEWS} views, left the Gaussians, right the model")
+    print(f"{args.picture}: {COMPARED_VIEWS} views, the Gaussians on the left, the model on the right")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Photos with poses to a small file, with the numbers that say how small and how good.
+"""Train a model on photos with poses, compress it, and print the size and the quality of both files.
 
 python examples/train_and_compress.py photos/bonsai runs/bonsai --steps 3000
 """
@@ -12,15 +12,15 @@ import hyrfpack
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("photos", help="a folder of photos and poses: COLMAP, NeRF-synthetic, instant-ngp, nerfstudio")
-    parser.add_argument("out", type=Path, help="a folder for the run")
-    parser.add_argument("--steps", type=int, default=3000)
+    parser.add_argument("out", type=Path, help="folder of the training run")
+    parser.add_argument("--steps", type=int, default=3000, help="training steps (3,000)")
     args = parser.parse_args()
 
     scene = hyrfpack.load_scene(args.photos)
     print(f"{len(scene.train)} photos to train on, {len(scene.test)} held out")
     trained = hyrfpack.train_model(scene, args.out, hyrfpack.TrainConfig(steps=args.steps), overwrite=True)
     if trained.model is None:
-        raise SystemExit(f"interrupted after {trained.step} steps; hyrfpack train --resume goes on")
+        raise SystemExit(f"interrupted after {trained.step} steps; continue with hyrfpack train --resume")
 
     small = args.out / "small.hyrf"
     hyrfpack.compress_model(trained.model, small, data=scene)

@@ -1,5 +1,5 @@
-// Shows `.hyrf` files in scenes of three.js, by its own GaussianSplat: the model's Gaussians, with harmonics fitted to
-// its colours here, in the page.
+// Shows `.hyrf` files in scenes of three.js by its own GaussianSplat, with spherical harmonics that are fitted to the
+// model's colours in the page.
 
 import {
   BackSide, DataTexture, Group, LinearFilter, Matrix4, Mesh, MeshBasicNodeMaterial, Quaternion, RepeatWrapping,
@@ -14,26 +14,27 @@ import { backgroundColors } from "hyrf.js/fields.js";
 import { fitHarmonics } from "hyrf.js/harmonics.js";
 import { viewpointOf } from "hyrf.js/viewpoint.js";
 
-const SPHERE_RADIUS = 100; // of the background, in units of the model
-const SPHERE_WIDTH = 1024, SPHERE_HEIGHT = 512; // pixels of its picture
-const NEAREST = 0.01; // units of the model
-const SLICE = 12; // ms of work until the page gets its turn
+// Lengths are in the model's units.
+const BACKGROUND_RADIUS = 100;
+const BACKGROUND_WIDTH_PX = 1024, BACKGROUND_HEIGHT_PX = 512;
+const NEAR_PLANE = 0.01;
+const WORK_SLICE_MS = 12; // after this time the page can react and render
 
 /**
- * A scene out of a file, in the file's world axes but turned so that up is +y. Below it lies one group in the model's
- * units, with the splats and, where the model has a background, its sphere.
+ * Load a file as an object in the file's world units, rotated so that up is +y. The object has one group in the model's
+ * units, with the splats and, if the model has a background, its sphere.
  *
- * Colours are those of pictures: render with `renderer.outputColorSpace = LinearSRGBColorSpace`, without tone mapping.
+ * Colours are display-referred: render with `renderer.outputColorSpace = LinearSRGBColorSpace`, without tone mapping.
  *
- * @param {string | URL | Uint8Array} source where the file is, or what is in it
+ * @param {string | URL | Uint8Array} source address or bytes of the file
  * @param {{degree?: number, onCoarse?: (object: Group) => void, onProgress?: (done: number) => void}} [options]
- *   `degree` of the harmonics, 0 to 3; `onCoarse` gets the object as soon as it shows the scene as it looks from its
- *   first camera; `onProgress` the part done, 0 to 1
- * @returns {Promise<Group>} with `userData.hyrf`: {metadata, cameras, up, target, near, far, solid}: `cameras` are for
- *   `lookFrom`, `solid` is a colour to clear with where there is no background, or null
+ *   `degree` of the harmonics, 0 to 3; `onCoarse` gets the object as soon as it shows the scene with the colours of its
+ *   first camera; `onProgress` gets the finished part of the work, 0 to 1
+ * @returns {Promise<Group>} with `userData.hyrf`: {metadata, cameras, up, target, near, far, solid}; `cameras` are for
+ *   `lookFrom`, and `solid` is the clear colour, or null if the model has a background
  */
 export async function loadHyrf(source, { degree = 2, onCoarse = () => {}, onProgress = () => {} } = {}) {
-  const model = await read(source instanceof Uint8Array ? source : await fetched(source));
+  const model = await read(source instanceof Uint8Array ? source : await fetchBytes(source));
   const { config, metadata } = model, { center, scale } = config.frame;
   const { cameras, fitted, up, target } = viewpointOf(metadata);
   const object = new Group(), frame = new Group();
@@ -42,14 +43,14 @@ export async function loadHyrf(source, { degree = 2, onCoarse = () => {}, onProg
   frame.position.set(...center);
   frame.scale.setScalar(scale);
   object.add(frame);
-  const near = NEAREST * scale, far = 2.5 * SPHERE_RADIUS * scale;
+  const near = NEAR_PLANE * scale, far = 2.5 * BACKGROUND_RADIUS * scale;
   object.userData.hyrf = { metadata, cameras, up, target, near, far, solid: config.background ? null : config.solid };
 
   const show = (splats) => {
     frame.children.filter((child) => child.isGaussianSplat).forEach(drop);
     if (splats.count) frame.add(new GaussianSplat(splatGeometry(splats)));
   };
-  let rested = performance.now();
+  let lastPause = performance.now();
   const splats = await fitHarmonics(model, fitted, degree, async ({ done, coarse, splats: some }) => {
     if (coarse) {
       show(some);
@@ -57,9 +58,9 @@ export async function loadHyrf(source, { degree = 2, onCoarse = () => {}, onProg
       onCoarse(object);
     }
     onProgress(done);
-    if (performance.now() - rested < SLICE) return;
+    if (performance.now() - lastPause < WORK_SLICE_MS) return;
     await new Promise((resolve) => setTimeout(resolve));
-    rested = performance.now();
+    lastPause = performance.now();
   });
   show(splats);
   if (config.background && !splats.count) frame.add(backgroundSphere(model));
@@ -67,16 +68,16 @@ export async function loadHyrf(source, { degree = 2, onCoarse = () => {}, onProg
 }
 
 /**
- * Put a perspective camera where one of the file's cameras stands. Its picture's shape stays its own.
+ * Move a perspective camera to the pose of one of the file's cameras, with its vertical field of view.
  * @param {import("three/webgpu").PerspectiveCamera} camera
  * @param {Group} object from `loadHyrf`
- * @param {import("hyrf.js/viewpoint.js").Camera} [from] one of `userData.hyrf.cameras`, or alike; else the first
+ * @param {import("hyrf.js/viewpoint.js").Camera} [from] one of `userData.hyrf.cameras` or alike; by default the first
  */
 export function lookFrom(camera, object, from = object.userData.hyrf.cameras[0]) {
   const { near, far } = object.userData.hyrf;
   object.updateWorldMatrix(true, false);
   const pose = new Matrix4().set(...from.camera_from_world.flat()).invert();
-  // OpenCV's cameras look along z with y down, those of three.js against z with y up.
+  // OpenCV's cameras look along +z with y down, those of three.js along -z with y up.
   pose.premultiply(object.matrixWorld).multiply(new Matrix4().makeScale(1, -1, -1));
   pose.decompose(camera.position, camera.quaternion, new Vector3());
   const size = Math.cbrt(Math.abs(object.matrixWorld.determinant()));
@@ -88,7 +89,7 @@ export function lookFrom(camera, object, from = object.userData.hyrf.cameras[0])
 }
 
 /**
- * What three.js draws splats from.
+ * Make the geometry from which three.js draws splats.
  * @param {import("hyrf.js/harmonics.js").Splats} splats
  */
 export function splatGeometry({ count, degree, positions, scales, quats, opacities, colors, harmonics, range }) {
@@ -104,7 +105,7 @@ export function splatGeometry({ count, degree, positions, scales, quats, opaciti
     const { packed, bytes } = createPackedSphericalHarmonicsBand(count, band);
     const length = 3 * (2 * band + 1), stride = bytes.length / (count || 1);
     for (let i = 0; i < count; i++) {
-      for (let k = 0; k < length; k++) { // theirs are of range 1, ours of their own
+      for (let k = 0; k < length; k++) { // three.js has the range 1, our harmonics have their own
         bytes[i * stride + k] = 128 + range * (harmonics[i * others + from + k] - 128);
       }
     }
@@ -114,31 +115,31 @@ export function splatGeometry({ count, degree, positions, scales, quats, opaciti
   return createGaussianSplatGeometry(positions.slice(), covariances, new Uint8Array(tints.buffer), bands);
 }
 
-// The sphere behind everything: as it looks from the model's middle, in its place far away.
+// Makes the background sphere, with the colours that it has from the model's centre.
 function backgroundSphere(model) {
-  const places = new Float32Array(3 * SPHERE_WIDTH), directions = new Float32Array(3 * SPHERE_WIDTH);
-  const pixels = new Uint8Array(4 * SPHERE_WIDTH * SPHERE_HEIGHT).fill(255);
-  for (let row = 0; row < SPHERE_HEIGHT; row++) {
-    const polar = Math.PI * (1 - (row + 0.5) / SPHERE_HEIGHT); // rows from below, as SphereGeometry has them
-    for (let column = 0; column < SPHERE_WIDTH; column++) {
-      const turn = (2 * Math.PI * (column + 0.5)) / SPHERE_WIDTH, level = Math.sin(polar);
+  const places = new Float32Array(3 * BACKGROUND_WIDTH_PX), directions = new Float32Array(3 * BACKGROUND_WIDTH_PX);
+  const pixels = new Uint8Array(4 * BACKGROUND_WIDTH_PX * BACKGROUND_HEIGHT_PX).fill(255);
+  for (let row = 0; row < BACKGROUND_HEIGHT_PX; row++) {
+    const polar = Math.PI * (1 - (row + 0.5) / BACKGROUND_HEIGHT_PX); // SphereGeometry has its rows from bottom to top
+    for (let column = 0; column < BACKGROUND_WIDTH_PX; column++) {
+      const turn = (2 * Math.PI * (column + 0.5)) / BACKGROUND_WIDTH_PX, level = Math.sin(polar);
       directions.set([-Math.cos(turn) * level, Math.cos(polar), Math.sin(turn) * level], 3 * column);
     }
-    places.set(directions.map((value) => SPHERE_RADIUS * value));
+    places.set(directions.map((value) => BACKGROUND_RADIUS * value));
     const colors = backgroundColors(model, places, directions);
     for (let k = 0; k < colors.length; k++) {
-      pixels[4 * (row * SPHERE_WIDTH + Math.floor(k / 3)) + (k % 3)] = Math.round(255 * colors[k]);
+      pixels[4 * (row * BACKGROUND_WIDTH_PX + Math.floor(k / 3)) + (k % 3)] = Math.round(255 * colors[k]);
     }
   }
-  const texture = new DataTexture(pixels, SPHERE_WIDTH, SPHERE_HEIGHT);
+  const texture = new DataTexture(pixels, BACKGROUND_WIDTH_PX, BACKGROUND_HEIGHT_PX);
   texture.wrapS = RepeatWrapping;
   texture.magFilter = texture.minFilter = LinearFilter;
   texture.needsUpdate = true;
   const material = new MeshBasicNodeMaterial({ map: texture, side: BackSide, fog: false });
-  return new Mesh(new SphereGeometry(SPHERE_RADIUS, 96, 48), material);
+  return new Mesh(new SphereGeometry(BACKGROUND_RADIUS, 96, 48), material);
 }
 
-async function fetched(address) {
+async function fetchBytes(address) {
   const answer = await fetch(address);
   if (!answer.ok) throw new Error(`${address} cannot be fetched (${answer.status}); check the address.`);
   return new Uint8Array(await answer.arrayBuffer());

@@ -1,13 +1,13 @@
-// The page: `index.html?file=scene.hyrf`. `&webgl` takes WebGL 2 where there is WebGPU, too.
+// The script of the page `index.html?file=scene.hyrf`; with `&webgl` it uses WebGL 2 even if there is WebGPU.
 
 import { Color, LinearSRGBColorSpace, PerspectiveCamera, Scene, Vector3, WebGPURenderer } from "three/webgpu";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 
 import { loadHyrf, lookFrom } from "./hyrf-three.js";
 
-const asked = new URLSearchParams(location.search), said = document.getElementById("said");
-const renderer = new WebGPURenderer({ forceWebGL: asked.has("webgl") });
-renderer.outputColorSpace = LinearSRGBColorSpace; // the file's colours are those of pictures
+const params = new URLSearchParams(location.search), statusLine = document.getElementById("status");
+const renderer = new WebGPURenderer({ forceWebGL: params.has("webgl") });
+renderer.outputColorSpace = LinearSRGBColorSpace; // the file's colours are display-referred
 renderer.setPixelRatio(devicePixelRatio);
 document.body.append(renderer.domElement);
 const scene = new Scene(), camera = new PerspectiveCamera(), controls = new OrbitControls(camera, renderer.domElement);
@@ -31,9 +31,9 @@ addEventListener("resize", fit);
 fit();
 renderer.setAnimationLoop(() => renderer.render(scene, camera));
 try {
-  const onProgress = (done) => (said.textContent = `${Math.round(100 * done)} %`);
-  await loadHyrf(asked.get("file") ?? "scene.hyrf", { onCoarse: show, onProgress });
-  said.textContent = "";
+  const onProgress = (done) => (statusLine.textContent = `${Math.round(100 * done)} %`);
+  await loadHyrf(params.get("file") ?? "scene.hyrf", { onCoarse: show, onProgress });
+  statusLine.textContent = "";
 } catch (error) {
-  said.textContent = error.message;
+  statusLine.textContent = error.message;
 }

@@ -229,13 +229,13 @@ def test_one_call_measures_the_variants_and_prints_their_tables(tmp_path, monkey
     scene = a_scene()
     scene = dataclasses.replace(scene, train=scene.train[:4], test=scene.train[4:])
     monkeypatch.setattr(ablations.hyrfpack, "load_scene", lambda folder: scene)
-    monkeypatch.setattr(ablations, "REPEATS", 1)
+    monkeypatch.setattr(ablations, "TIMING_REPEATS", 1)
     arguments = ["ablations", "--steps", "3", "--seeds", "1", "--sets", "balls", "--out", str(tmp_path)]
     monkeypatch.setattr(sys, "argv", [*arguments, "--only", "harmonics", "culling"])
 
     ablations.main()
     first = capsys.readouterr().out
-    monkeypatch.setattr(ablations, "run", None)  # what is kept is not run again
+    monkeypatch.setattr(ablations, "train_and_measure", None)  # what is kept is not run again
     monkeypatch.setattr(sys, "argv", [*sys.argv, "--reuse"])
     ablations.main()
 

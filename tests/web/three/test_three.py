@@ -145,7 +145,7 @@ def test_the_page_shows_what_is_rendered_here(folder: Path, tmp_path: Path) -> N
         browser.resize(SIZE, SIZE)
         browser.open(f"{address}/own/index.html?webgl&file=scene.hyrf")
         ends = time.monotonic() + 60
-        while (said := browser.evaluate("document.getElementById('said').textContent")) != "" or browser.evaluate(
+        while (said := browser.evaluate("document.getElementById('status').textContent")) != "" or browser.evaluate(
             "!document.querySelector('canvas')"
         ):
             assert time.monotonic() < ends, (said, browser.list_errors())
