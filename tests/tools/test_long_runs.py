@@ -62,7 +62,7 @@ def test_a_stopped_run_resumes_from_its_checkpoint(call, monkeypatch):
         (folder / "checkpoint.pt").unlink(missing_ok=True)
         return train(scene, folder, config, quiet=True)
 
-    monkeypatch.setattr(long_runs.hyrfpack, "train", stop_once)
+    monkeypatch.setattr(long_runs.hyrfpack, "train_model", stop_once)
     with pytest.raises(SystemExit, match="resumes"):
         call()
     call()
