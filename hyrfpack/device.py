@@ -52,16 +52,18 @@ def choose_device(
     if kind in ("auto", "cuda") and torch.cuda._is_in_bad_fork() and torch.cuda.is_available():
         raise HyrfError(
             "this process was forked from one that uses the GPU, and cannot use it too",
-            fix="start it with multiprocessing's method 'spawn', or take the device 'cpu'",
+            fix="start it with the 'spawn' method of multiprocessing, or use `device='cpu'`",
         )
     if kind == "auto":
         kind = name = "cuda" if torch.cuda.is_available() and has_triton() else "cpu"
     if kind == "cuda":
         count = torch.cuda.device_count() if torch.cuda.is_available() else 0
         if int(number or 0) >= count:
-            there = f"torch sees {count} of them" if count else "torch sees no NVIDIA or AMD GPU"
+            there = (
+                f"torch sees {count} {'GPU' if count == 1 else 'GPUs'}" if count else "torch sees no NVIDIA or AMD GPU"
+            )
             raise HyrfError(
-                f"device '{name}' is not there, {there}",
+                f"device '{name}' is not available: {there}",
                 fix="install a GPU build of torch or use `device='cpu'`",
             )
         if not has_triton():
@@ -71,7 +73,7 @@ def choose_device(
         make_current(torch.device(name))
     if kind == "mps":
         if not torch.backends.mps.is_available():
-            raise HyrfError("device 'mps' is not there, torch sees no Apple GPU", fix="use `device='cpu'`")
+            raise HyrfError("device 'mps' is not available: torch sees no Apple GPU", fix="use `device='cpu'`")
         say(NO_METAL_NOTE)
     return torch.device(name)
 
@@ -96,7 +98,7 @@ def choose_own_device(
         if len(set(gpus)) < len(gpus):
             raise HyrfError(
                 f"{ranks.size} processes have {len(set(gpus))} GPUs between them, and each needs its own",
-                fix="start as many as there are GPUs, with `device='cuda'`, or use `device='cpu'`",
+                fix="start one process for each GPU with `device='cuda'`, or use `device='cpu'`",
             )
     return device
 

@@ -104,7 +104,7 @@ class Outputs:
             raise HyrfError(f"{path}: this is a folder", fix="name a file in it")
         self._check(path)
         if endings and not str(path).lower().endswith(endings):
-            raise HyrfError(f"{path}: what is written here ends in {' or '.join(endings)}", fix="name the file so")
+            raise HyrfError(f"{path}: the file extension must be {' or '.join(endings)}", fix="change the extension")
         if os.path.lexists(path):
             if not self.overwrite:
                 raise HyrfError(
@@ -203,7 +203,10 @@ def _resolved(path: StrPath) -> Path:
     try:
         return Path(os.path.realpath(path))
     except OSError as error:  # the working folder was removed
-        raise HyrfError(f"{path}: the place cannot be found ({error.strerror})", fix="name a whole path") from error
+        raise HyrfError(
+            f"{path}: the path cannot be resolved ({error.strerror})",
+            fix="give an absolute path",
+        ) from error
 
 
 def _check_name_lengths(paths: Iterable[StrPath]) -> None:

@@ -67,7 +67,7 @@ def read_header(data: bytes, name: str) -> PlyHeader:
     if end is None:
         raise HyrfDataError(
             f"{name}: its PLY header has no end within {_MAX_HEADER_BYTES:,} bytes",
-            fix="it is damaged",
+            fix="the file is damaged, export it again",
         )
     order, elements = "", dict[str, Element]()
     properties: dict[str, str] | None = None
@@ -91,7 +91,10 @@ def read_header(data: bytes, name: str) -> PlyHeader:
                     f"{name}: the line '{line[:80]}' of its PLY header is not understood", fix="export it again"
                 )
     if not order:
-        raise HyrfDataError(f"{name}: its PLY header does not say in which format its rows are", fix="it is damaged")
+        raise HyrfDataError(
+            f"{name}: its PLY header does not say in which format its rows are",
+            fix="the file is damaged, export it again",
+        )
     return PlyHeader(order, elements, end.end())
 
 
@@ -120,7 +123,7 @@ def read_elements(data: bytes, header: PlyHeader, wanted: set[str], name: str) -
         if "" in kinds.values() and element.count and (text is None or label in wanted):
             raise HyrfDataError(
                 f"{name}: its element '{label}' has properties that are lists, which are not read",
-                fix="export it again as a plain one",
+                fix="export it again without lists",
             )
         if text is not None:
             lines = (line for line in text if not line.isspace())
@@ -158,7 +161,7 @@ def _parse_rows(lines: list[str], kinds: dict[str, str], label: str, name: str) 
     except ValueError as error:
         raise HyrfDataError(
             f"{name}: a row of its element '{label}' is not made of numbers",
-            fix="it is damaged",
+            fix="the file is damaged, export it again",
         ) from error
     if table.shape != (len(lines), len(kinds)):
         raise HyrfDataError(
@@ -171,5 +174,5 @@ def _parse_rows(lines: list[str], kinds: dict[str, str], label: str, name: str) 
 def _truncated_error(name: str, label: str, count: int) -> HyrfDataError:
     return HyrfDataError(
         f"{name}: the file ends before the {count:,} rows of its element '{label}'",
-        fix="it is truncated",
+        fix="the file is truncated, export it again",
     )

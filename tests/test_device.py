@@ -44,7 +44,7 @@ def test_each_thread_selects_the_gpu_that_it_works_on(monkeypatch):
 @needs_no_gpu
 @pytest.mark.parametrize("name", ["cuda", "cuda:0", "mps"])
 def test_a_device_that_is_not_there_is_rejected_with_a_clear_error(name):
-    with pytest.raises(HyrfError, match=f"'{name}' is not there.*`device='cpu'`"):
+    with pytest.raises(HyrfError, match=f"'{name}' is not available: .*`device='cpu'`"):
         choose_device(name)
 
 
@@ -55,7 +55,7 @@ def test_a_text_that_names_no_device_is_rejected(name):
 
 
 def test_a_gpu_beyond_the_last_is_rejected():
-    with use_fake_gpu(), pytest.raises(HyrfError, match="cuda:1.*sees 1 of them"):
+    with use_fake_gpu(), pytest.raises(HyrfError, match="cuda:1.*sees 1 GPU;"):
         choose_device("cuda:1")
 
 
@@ -76,7 +76,7 @@ def test_a_forked_child_uses_the_cpu_where_there_is_no_gpu(monkeypatch):
 @needs_no_gpu
 def test_a_device_may_be_given_as_a_torch_device():
     assert choose_device(torch.device("cpu", 0)) == torch.device("cpu")
-    with pytest.raises(HyrfError, match="'cuda:0' is not there"):
+    with pytest.raises(HyrfError, match="'cuda:0' is not available"):
         choose_device(torch.device("cuda", 0))
 
 

@@ -123,8 +123,8 @@ def test_pictures_beside_a_single_new_file_do_not_matter(tmp_path, model):
 @pytest.mark.parametrize(
     "name, words",
     [
-        ("small.ply", "ends in .hyrf"),
-        ("small", "ends in .hyrf"),
+        ("small.ply", "extension must be .hyrf"),
+        ("small", "extension must be .hyrf"),
         ("folder", "this is a folder"),
         ("file/small.hyrf", "is a file, not a folder"),
         ("a" * 300 + ".hyrf", "longer than 255 bytes"),
@@ -146,9 +146,9 @@ def test_a_working_folder_that_was_removed_is_a_clear_error(tmp_path, monkeypatc
     monkeypatch.chdir(tmp_path / "gone")
     (tmp_path / "gone").rmdir()
 
-    with pytest.raises(HyrfError, match="the place cannot be found"):
+    with pytest.raises(HyrfError, match="the path cannot be resolved"):
         Outputs().file("small.hyrf")
-    with pytest.raises(HyrfError, match="the place cannot be found"):
+    with pytest.raises(HyrfError, match="the path cannot be resolved"):
         Outputs().folder("pictures", ["0000.png"])
 
 

@@ -125,7 +125,7 @@ def test_a_mistaken_call_is_a_type_error_that_says_what_to_do(call, sentence, tm
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_loading_to_a_missing_device_is_a_clear_error(tmp_path):
     hyrfpack.save_model(small_model([(0, 0, 0)]), tmp_path / "model.hyrf")
-    with pytest.raises(hyrfpack.HyrfError, match="'cuda' is not there"):
+    with pytest.raises(hyrfpack.HyrfError, match="'cuda' is not available"):
         hyrfpack.load_model(tmp_path / "model.hyrf", device="cuda")
 
 

@@ -105,7 +105,10 @@ def read_subject(path: str | os.PathLike[str], scene: Scene | None) -> Subject:
     """
     facts, model = describe_file(path), load_model(path)
     if len(model) == 0:
-        raise HyrfError(f"{path}: the model has no Gaussians, so there is nothing to measure", fix="name another")
+        raise HyrfError(
+            f"{path}: the model has no Gaussians, so there is nothing to measure",
+            fix="choose another model",
+        )
     capture = Capture(facts, scene)
     if scene is None:
         cameras, photos = orbit(capture.viewpoint, MAX_VIEWS), None
@@ -153,6 +156,6 @@ def _load_held_out_photos(scene: Scene, model: HybridModel) -> tuple[list[View],
     if not views:
         raise HyrfError(
             f"{scene.path}: no held-out photo can be scored",
-            fix="name a smaller `test_every` or other masks",
+            fix="use a smaller `test_every` or other masks",
         )
     return views, photos

@@ -113,7 +113,7 @@ def cameras_from_json(path: str | os.PathLike[str]) -> list[tuple[str, Camera]]:
         parse, items, shared = _parse_camera, content, {}
     else:
         raise HyrfDataError(
-            f"{path}: there is neither a list of cameras nor 'frames' in it",
+            f"{path}: the file holds neither a list of cameras nor 'frames'",
             fix="see the help of 'hyrfpack render'",
         )
     cameras = []

@@ -64,7 +64,7 @@ def bench(
       hyrfpack bench runs/bonsai --only render --only codec --json > numbers.json
     """
     if data is not None and model is None:
-        raise click.UsageError("--data are the photos of MODEL; name the model too")
+        raise click.UsageError("--data gives the photos of a MODEL; name the MODEL, too")
     # The references run on torch's own threads, which would keep spinning on the cores of the kernels timed next.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     from hyrfpack.atomic import write_atomic

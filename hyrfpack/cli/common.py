@@ -37,7 +37,7 @@ class _OutputPath(click.ParamType):
 
     def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> Path:
         if str(value) in ("", "-"):
-            self.fail(f"'{value}' names no file; results are written to files, so give one", param, ctx)
+            self.fail(f"'{value}' is not a file name; results are written to files, so give a path", param, ctx)
         return Path(str(value))
 
 
@@ -70,7 +70,7 @@ overwrite_option = click.option(
 def reject_nan(ctx: click.Context, param: click.Parameter, value: float | None) -> float | None:
     """Reject NaN, which click's ranges accept, as the callback of an option."""
     if value is not None and math.isnan(value):
-        raise click.BadParameter("NaN is not a number", ctx, param)
+        raise click.BadParameter("NaN is not allowed; give a number", ctx, param)
     return value
 
 

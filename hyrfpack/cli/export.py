@@ -44,7 +44,7 @@ class _Box(click.ParamType):
         if len(numbers) != 6 or any(map(math.isnan, numbers)):
             self.fail(f"'{value}' is not a box; write it as MINX,MINY,MINZ,MAXX,MAXY,MAXZ in world units", param, ctx)
         if any(low > high for low, high in zip(numbers[:3], numbers[3:], strict=True)):
-            self.fail(f"'{value}' is turned inside out; give the least x, y and z first", param, ctx)
+            self.fail(f"'{value}' has a minimum above its maximum; give the minimum x, y and z first", param, ctx)
         return numbers
 
 
@@ -173,8 +173,8 @@ def export(
         raise HyrfError(f"{splats[0]}: photos go with .hyrf files only", fix="leave out --data, or this file")
     if data and len(data) != len(models):
         raise HyrfError(
-            f"--data is given {len(data)} times, for {len(models)} models",
-            fix="give it once for each, or not",
+            f"--data is given {len(data)} times for {len(models)} models",
+            fix="give it once for each model, or not at all",
         )
     check_request(kind, output, degree, crop, min_opacity, background, baked, exposure)
     scenes = [read_scene(path, reader_options, describe_file(model)) for path, model in zip(data, files, strict=False)]
@@ -220,9 +220,9 @@ def _splats_error(source: Path, output: Path, kind: FileKind) -> HyrfError:
             f"{source}: these are splats, not a model", fix=f"convert them with 'hyrfpack convert {source} {output}'"
         )
     return HyrfError(
-        f"{source}: splats are played from a folder (-o player/)",
-        fix=f"for {kind.ending or 'this'} import them first: "
-        f"'hyrfpack import {source} -o {source.with_suffix('.hyrf').name}'",
+        f"{source}: only a folder (-o player/) can play splats",
+        fix=f"to write {kind.ending or 'this'}, import them first: 'hyrfpack import {source} -o "
+        f"{source.with_suffix('.hyrf').name}'",
     )
 
 

@@ -118,7 +118,7 @@ def compress(
       hyrfpack compress bonsai.hyrf -o small.hyrf --data photos/bonsai
     """
     if data is not None and no_data:
-        raise click.UsageError("--data names photos and --no-data wants none; give one of them")
+        raise click.UsageError("--data and --no-data contradict each other; give one of them")
     from hyrfpack.compress import compress_model as pack
     from hyrfpack.compress.report_page import REPORT_FILES
     from hyrfpack.format import describe_file

@@ -125,7 +125,9 @@ def train(
     if None not in (settings["max_gaussians"], settings["target_bytes"]):
         raise click.UsageError("--max-gaussians and --target-size each decide how large the model is; give one of them")
     if poses and not ranks.is_single:
-        raise click.UsageError("--poses is the work of one process; 'hyrfpack poses' first, then train from its folder")
+        raise click.UsageError(
+            "--poses runs in one process only; run 'hyrfpack poses' first, then train from its folder"
+        )
     from hyrfpack.data import PictureCache
     from hyrfpack.device import describe_device
     from hyrfpack.format.run_folder import MODEL_FILE

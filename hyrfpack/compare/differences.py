@@ -43,9 +43,9 @@ def check_scores(runs: Sequence[Run], names: Sequence[str]) -> None:
         if other.held_out != first.held_out:
             odd = min(other.held_out ^ first.held_out)
             raise HyrfDataError(
-                f"{other.folder}: other photos are held out of '{name}' ({len(other.held_out)}) than of "
-                f"'{first_name}' ({len(first.held_out)}; '{odd}' of one of them alone), so that scores cannot be "
-                "compared",
+                f"{other.folder}: the runs '{first_name}' and '{name}' hold out different photos "
+                f"({len(first.held_out)} and {len(other.held_out)}; '{odd}' is in only one of them), so that their "
+                "scores cannot be compared",
                 fix="train both on the same photos with the same `test_every`",
             )
 

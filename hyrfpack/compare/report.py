@@ -65,8 +65,8 @@ def compare_runs(runs: Sequence[StrPath], out: StrPath, *, overwrite: bool = Fal
     folders = [Path(run) for run in runs]
     if len({os.path.realpath(folder) for folder in folders}) < max(2, len(folders)):
         raise HyrfError(
-            "there are not two different runs to compare",
-            fix="name two folders of runs or more, each once",
+            "a comparison needs at least two different runs",
+            fix="give two or more folders of runs, each once",
         )
     loaded_runs = [read_run(folder) for folder in folders]
     source_files = [

@@ -102,13 +102,16 @@ def read_run(folder: StrPath) -> Run:
         raise HyrfDataError(f"{folder}: there is no such folder", fix="name one that 'hyrfpack train' wrote to")
     if (folder / CHECKPOINT_FILE).exists():
         raise HyrfDataError(
-            f"{folder}: this run is not finished ({CHECKPOINT_FILE} is there)",
-            fix="the 'hyrfpack train' command that started it finishes it with `resume=True` (instead of "
+            f"{folder}: the run has not finished ({CHECKPOINT_FILE} still exists)",
+            fix="finish it by running its 'hyrfpack train' command again with `resume=True` (instead of "
             "`overwrite=True`)",
         )
     for name in (METRICS_FILE, MODEL_FILE):
         if not (folder / name).is_file():
-            raise HyrfDataError(f"{folder}: there is no {name}, so this is no finished run", fix="name a folder of one")
+            raise HyrfDataError(
+                f"{folder}: there is no {name}, so this is not the folder of a finished run",
+                fix="give the folder of a finished run",
+            )
     path = folder / METRICS_FILE
     try:
         metrics = json.loads(path.read_text("utf-8"), parse_constant=_refuse_constant)

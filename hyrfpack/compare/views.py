@@ -58,8 +58,8 @@ def _read_photo_and_render(path: Path) -> tuple[Image.Image, Image.Image]:
         photo, render, _ = split_comparison(Image.fromarray(pixels))
     except ValueError as error:
         raise HyrfDataError(
-            f"{path}: this is no picture of photo, render and error map ({error})",
-            fix="remove it, and the view is left out",
+            f"{path}: the file is not a comparison of photo, render and error map ({error})",
+            fix="delete it to leave out this view",
         ) from error
     return photo, render
 

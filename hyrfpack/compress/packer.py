@@ -146,8 +146,8 @@ def compress_model(
     if profile != "compact":
         if data is not None or finetune_steps or target_bytes or max_psnr_drop is not None or distortion:
             raise HyrfError(
-                f"profile '{profile}' has no settings to fit to photos, sizes or losses",
-                fix="use 'compact'",
+                f"profile '{profile}' cannot be fitted to photos, a target size or a limit on the loss",
+                fix="use profile 'compact'",
             )
         repacked = ranks.run_on_all(
             lambda: repack(source, target, profile, overwrite=overwrite, **settings) if ranks.is_main else None
@@ -164,7 +164,7 @@ def compress_model(
         )
     if data is not None and not data.train:
         raise HyrfError(
-            f"{data.path}: all photos are held out, so there is none to measure at",
+            f"{data.path}: all photos are held out, so that none is left to measure with",
             fix="use a larger `test_every`",
         )
     model, provenance = load_with_provenance(source)
@@ -358,8 +358,9 @@ class Packer:
         if answer is None:
             smallest = len(self.encode(DISTORTION_RANGE[1]).data)
             raise HyrfSizeError(
-                f"the model does not fit into {limit:,} bytes, the least is about {smallest:,}",
-                fix="ask for more, or train with fewer Gaussians (`max_gaussians`)",
+                f"the model does not fit into {limit:,} bytes, and the smallest possible size is about {smallest:,} "
+                "bytes",
+                fix="use a larger target size, or train with fewer Gaussians (`max_gaussians`)",
                 min_bytes=smallest,
             )
         distortion, candidate = answer
@@ -394,7 +395,7 @@ class Packer:
         if answer is None:
             raise HyrfError(
                 f"even the finest file loses more than {limit:g} dB of PSNR",
-                fix="allow more, or use profile 'raw'",
+                fix="use a larger `max_psnr_drop`, or profile 'raw'",
             )
         distortion, candidate = answer
         return (

@@ -99,11 +99,14 @@ def _read(given: Path, top: Path, notes: list[str], reading: dict[str, Any], hel
     chosen = layout or found[0]
     reader, options = LAYOUTS[chosen], {"images": images, "model": model}
     if images is not None and "images" not in reader.options:
-        raise HyrfDataError(f"{folder}: a {chosen} set names its own pictures", fix=f"leave out the folder '{images}'")
+        raise HyrfDataError(
+            f"{folder}: the {chosen} poses name their own pictures, so that the folder '{images}' cannot be chosen",
+            fix="leave out `images`",
+        )
     if model is not None and "model" not in reader.options:
         raise HyrfDataError(
-            f"{folder}: the {chosen} layout has no COLMAP models to choose from",
-            fix=f"leave out '{model}'",
+            f"{folder}: the {chosen} layout has no COLMAP models, so that '{model}' cannot be chosen",
+            fix="leave out `model`",
         )
     wanted = {name: options[name] for name in reader.options}
     every = reading["test_every"] if held_out is None else 0

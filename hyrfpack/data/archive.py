@@ -125,7 +125,10 @@ def _checked_entries(archive: Path, content: zipfile.ZipFile) -> dict[str, zipfi
                 fix="make it again",
             )
         if stat.S_ISLNK(info.external_attr >> 16):
-            raise HyrfDataError(f"{archive}: holds a link, '{name[:80]}'", fix="make it again of the files themselves")
+            raise HyrfDataError(
+                f"{archive}: holds a link, '{name[:80]}'",
+                fix="create the archive again with the files themselves",
+            )
         if info.flag_bits & _ENCRYPTED_FLAG:
             raise HyrfDataError(f"{archive}: the archive is encrypted", fix="unpack it yourself and give the folder")
         path = "/".join(parts)
@@ -133,12 +136,12 @@ def _checked_entries(archive: Path, content: zipfile.ZipFile) -> dict[str, zipfi
             raise HyrfDataError(f"{archive}: holds '{path[:80]}' twice", fix="make it again")
         entries[path] = info
     if not entries:
-        raise HyrfDataError(f"{archive}: the archive holds no file", fix="give one of a set of photos")
+        raise HyrfDataError(f"{archive}: the archive holds no files", fix="give the archive of a set of photos")
     total = sum(info.file_size for info in entries.values())
     if len(entries) > _MAX_FILES or total > _MAX_UNPACKED_RATIO * os.path.getsize(archive) + _UNPACKED_SLACK_BYTES:
         raise HyrfDataError(
-            f"{archive}: would unpack to {len(entries):,} files of {total / 1e9:,.1f} GB together, which is no likely "
-            "set of photos",
+            f"{archive}: the archive would unpack to {len(entries):,} files of {total / 1e9:,.1f} GB in total, which "
+            "is unlikely for a set of photos",
             fix="unpack it yourself if you trust it",
         )
     return entries
@@ -219,4 +222,7 @@ def _cache_folder() -> Path:
                 return folder
         except OSError:
             continue
-    raise HyrfDataError(f"{caches}: no file can be made in this folder", fix="set XDG_CACHE_HOME to one where they can")
+    raise HyrfDataError(
+        f"{caches}: no file can be made in this folder",
+        fix="set XDG_CACHE_HOME to a folder that is writable",
+    )

@@ -93,8 +93,8 @@ def make_scene(
     """
     if not photos:
         raise HyrfDataError(
-            f"{path}: its poses are of no photo at all",
-            fix="reconstruct again, or correct lists of file names",
+            f"{path}: there are no photos for these poses",
+            fix="repeat the reconstruction, or correct the lists of file names",
         )
     photos = _apply_orientations(sorted(photos, key=lambda photo: photo.name), notes)
     for first, second in zip(photos, photos[1:], strict=False):
@@ -110,7 +110,7 @@ def make_scene(
     if not train:
         raise HyrfDataError(
             f"{path}: all {len(test)} photos are held out for testing and none is left to train on",
-            fix="add photos or hold out fewer (0 holds out none)",
+            fix="add photos, or hold out fewer with `test_every` (0 holds out none)",
         )
     raw_photos = _list_raw_photos_beside(photos)
     notes += [*_shared_pose_notes(views), *_loading_notes(photos, max_size, mask_notes), *raw_photos_notes(raw_photos)]
@@ -180,9 +180,9 @@ def missing_photos_notes(
     """
     if ambiguous and not photos:
         raise HyrfDataError(
-            f"{path}: which file is which of the {len(missing)} photos that {where} lists is unclear, because "
-            f"{min(ambiguous)} fits more than one file, or its file more than one name",
-            fix="name the files as the poses do",
+            f"{path}: the {len(missing)} photos that {where} lists cannot be assigned to files, because "
+            f"{min(ambiguous)} matches more than one file, or its file more than one name",
+            fix="use the same file names as the poses",
         )
     if missing and not photos:
         raise HyrfDataError(

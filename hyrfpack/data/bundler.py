@@ -91,7 +91,7 @@ def _check_full_size(folder: Path) -> Path:
     if downscale_factor(folder.name):
         raise HyrfDataError(
             f"{folder}: a Bundler file does not say how large its photos are, so copies of another size cannot be used",
-            fix="put the photos that were posed into images",
+            fix="put the original photos into the folder 'images'",
         )
     return folder
 

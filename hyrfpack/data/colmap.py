@@ -103,16 +103,19 @@ def _photo_folder(path: Path, base: Path, images: str | None, names: Sequence[st
     if images is not None:
         named = next((parent / images for parent in (path, base) if os.path.isdir(parent / images)), None)
         if named is None:
-            raise HyrfDataError(f"{path}: no photo folder '{images}'", fix=describe_subfolders(path))
+            raise HyrfDataError(
+                f"{path}: there is no photo folder '{images}', and {describe_subfolders(path)}",
+                fix="use another folder of photos as `images`",
+            )
         return named
     found = find_photo_folder(base) or find_photo_folder(path)
     if found is None:  # the cameras of a rig have one folder each, and the listed names begin with these folders
         found = next((parent for parent in (base, path) if any(os.path.isfile(parent / name) for name in names)), None)
     if found is None:
         raise HyrfDataError(
-            f"{path}: no photo folder 'images' beside the COLMAP model, and no other that is clearly meant; "
-            f"{describe_subfolders(path)}",
-            fix="name the one of the photos with `images`, or give the folder that holds both",
+            f"{path}: there is no photo folder 'images' beside the COLMAP model, and no other folder is clearly the "
+            f"right one ({describe_subfolders(path)})",
+            fix="choose the folder of photos with `images`, or give the folder that holds both",
         )
     return found
 
@@ -132,7 +135,7 @@ def _choose_model(path: Path, models: Sequence[Path], name: str | None) -> tuple
         if not named:
             raise HyrfDataError(
                 f"{path}: there is no COLMAP model '{name}'",
-                fix=f"name one of those that are there: {there}",
+                fix=f"choose one of these: {there}",
             )
         chosen, why = named[0], "as asked for"
     return chosen, [f"there are {len(models)} COLMAP models: {there}; {chosen.name} was taken, {why}"]
@@ -242,7 +245,7 @@ def _model_kind(model: Path) -> str:
         if not missing(kind):
             return kind
     kind = ".bin" if any((model / f"{table}.bin").is_file() for table in COLMAP_TABLES) else ".txt"
-    raise HyrfDataError(f"{model / missing(kind)[0]}: missing", fix="export the whole COLMAP model again")
+    raise HyrfDataError(f"{model / missing(kind)[0]}: the file is missing", fix="export the whole COLMAP model again")
 
 
 def _visible_rows(image, ids: np.ndarray) -> np.ndarray:

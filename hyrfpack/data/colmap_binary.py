@@ -69,7 +69,7 @@ class _TableReader:
         start, self.offset = self.offset, self.offset + size
         if self.offset > len(self.data):
             raise HyrfDataError(
-                f"{self.path}: the file ends after {len(self.data)} bytes, inside a record that extends to "
+                f"{self.path}: the file ends after {len(self.data)} bytes, inside a record that extends to byte "
                 f"{self.offset}",
                 fix="it is truncated or damaged, export the model again",
             )

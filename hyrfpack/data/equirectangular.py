@@ -90,7 +90,10 @@ class FaceFile:
         rgb, alpha = read_pixels(self.path)
         if rgb.shape[1::-1] != self.stored:
             shown = display_path(self.path)
-            raise HyrfDataError(f"{shown}: the picture changed its size since the scene was read", fix="read it again")
+            raise HyrfDataError(
+                f"{shown}: the picture changed its size since the scene was read",
+                fix="read the scene again",
+            )
         mask = None
         if self.mask is not None:
             whole = read_mask(self.mask, *rgb.shape[:2])

@@ -49,7 +49,7 @@ def read_llff(path: Path, *, test_every: int, images: str | None, max_size: int)
         raise HyrfDataError(
             f"{path / POSES_FILE}: holds the poses of {len(rows)} photos, but {folder.name} holds {len(names)}, and "
             "photos are matched by their order",
-            fix="leave just those that were posed in that folder",
+            fix="keep only the photos with poses in that folder",
         )
     entries: list[PoseEntry] = []
     for name, row in zip(names, rows, strict=True):
@@ -90,7 +90,7 @@ def _read_table(file: Path) -> np.ndarray:
     sizes = rows[:, [4, 9]]
     if not len(rows) or not np.isfinite(rows[:, :15]).all() or not ((sizes >= 0.5) & (sizes < 1e6)).all():
         raise HyrfDataError(
-            f"{file}: a pose or a size in it is not finite, or there is none",
+            f"{file}: the table is empty, or a pose or a size in it is not finite",
             fix="estimate the poses again",
         )
     return rows

@@ -75,7 +75,10 @@ def read_metashape(path: Path, *, test_every: int, images: str | None, max_size:
     """
     table = find_metashape(path)
     if table is None:
-        raise HyrfDataError(f"{path}: no cameras of Metashape (.xml)", fix="export them with Export Cameras")
+        raise HyrfDataError(
+            f"{path}: there is no file of Metashape cameras (.xml)",
+            fix="export it with Export Cameras",
+        )
     chunk, notes = _choose_chunk(_parse(table), table)
     frame, component, frame_notes = _choose_frame(chunk, table)
     sensors = {sensor.get("id"): sensor for sensor in chunk.iterfind("sensors/sensor")}
@@ -192,7 +195,7 @@ def _choose_frame(chunk: Element, table: Path) -> tuple[_Frame, str | None, list
         float(_parse_numbers(transform.findtext("scale") or "1", 1, where)[0]),
     )
     if not frame.scale > 0 or np.abs(frame.rotation @ frame.rotation.T - np.eye(3)).max() > 1e-3:
-        raise HyrfDataError(f"{where} is no rotation with a positive scale", fix="export the cameras again")
+        raise HyrfDataError(f"{where} is not a rotation with a positive scale", fix="export the cameras again")
     if np.abs(frame.translation).max() > _MIN_GEOCENTRIC_COORDINATE:
         notes.append("the cameras are placed on the Earth; they were kept in the coordinates of their component")
         return _IDENTITY_FRAME, component, notes
@@ -223,7 +226,7 @@ def _lens(sensor: Element, where: str) -> Lens | Callable[[Path, PictureHeader],
     if values["p3"] or values["p4"]:
         raise HyrfDataError(
             f"{where} has p3 or p4, which are not supported",
-            fix="calibrate without them, or undistort",
+            fix="calibrate without them, or undistort the photos",
         )
     if kind == "frame":
         return replace(lens, model="brown", coefficients=brown_coefficients(k[0], k[1], *p, k[2], 0, 0, 0, k[3]))

@@ -52,7 +52,10 @@ def read_nerfstudio(path: Path, *, test_every: int, images: str | None, max_size
     content = read_transforms(file)
     frames = content["frames"]
     if images is not None and not (path / images).is_dir():
-        raise HyrfDataError(f"{path}: no photo folder '{images}'", fix=describe_subfolders(path))
+        raise HyrfDataError(
+            f"{path}: there is no photo folder '{images}', and {describe_subfolders(path)}",
+            fix="use another folder of photos as `images`",
+        )
     keep, test_names, notes = _listed_split(content, file)
     frames = [frame for frame in frames if keep is None or PurePosixPath(frame["file_path"]) in keep]
     strip = _common_folder([frame["file_path"] for frame in content["frames"]])
@@ -176,8 +179,8 @@ def _check_scale_is_known(content: dict[str, Any], frame: dict[str, Any], file: 
     entries = {**content, **frame}
     if entries.get("w") is None and entries.get("camera_angle_x") is None:
         raise HyrfDataError(
-            f"{file}: has no 'w' and 'h', so focal lengths cannot be brought to the size of photos of another folder",
-            fix="add the size that was calibrated",
+            f"{file}: there is no 'w' and 'h', so that focal lengths cannot be scaled to the photos of another folder",
+            fix="add the width and height of the calibration",
         )
 
 
@@ -212,14 +215,14 @@ def _lens(content: dict[str, Any], frame: dict[str, Any], header: PictureHeader,
     if model not in _PERSPECTIVE_MODELS:
         raise HyrfDataError(
             f"{where} has camera model {str(model)[:40]!r}, which is not supported",
-            fix="undistort it first",
+            fix="undistort the photos first",
         )
     if model in ("PINHOLE", "SIMPLE_PINHOLE"):
         return Lens(*pinhole)
     if model != "FULL_OPENCV" and (k4 or k5 or k6):
         raise HyrfDataError(
             f"{where} has 'k4' or more, which camera model {model} does not define",
-            fix="say FULL_OPENCV (rational) or OPENCV_FISHEYE, or set it to 0",
+            fix="use camera model FULL_OPENCV (rational) or OPENCV_FISHEYE, or set it to 0",
         )
     return Lens(*pinhole, "brown", brown_coefficients(k1, k2, p1, p2, k3, k4, k5, k6))
 

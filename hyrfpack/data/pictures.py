@@ -93,7 +93,7 @@ class PhotoFile:
         """Return the exception for a file whose size differs from that of the scene."""
         return HyrfDataError(
             f"{display_path(self.path)}: the picture changed its size since the scene was read",
-            fix="read it again",
+            fix="read the scene again",
         )
 
 
@@ -141,7 +141,10 @@ def open_picture(path: Path) -> ImageFile:
     except FileNotFoundError as error:
         raise HyrfDataError(f"{shown}: the picture is missing", fix="restore it or read the scene again") from error
     except PermissionError as error:
-        raise HyrfDataError(f"{shown}: the picture may not be read", fix="check its permissions") from error
+        raise HyrfDataError(
+            f"{shown}: permission to read the picture is denied",
+            fix="check its permissions",
+        ) from error
     except UnidentifiedImageError as error:  # the text of this exception is only the path
         raise HyrfDataError(
             f"{shown}: not a picture that can be read, its format is unknown",
@@ -223,7 +226,7 @@ def read_pixels(
 
         if image.mode == "F":
             raise HyrfDataError(
-                f"{display_path(path)}: floating-point pictures have no display values",
+                f"{display_path(path)}: pictures of floating-point numbers are not supported",
                 fix="save it as 8-bit PNG",
             )
         try:

@@ -35,7 +35,7 @@ def read_ply_points(ply: Path) -> tuple[np.ndarray, np.ndarray]:
     vertex = header.elements.get("vertex")
     kinds = vertex.properties if vertex else {}
     if not all(kinds.get(label) for label in _POSITION_PROPERTIES):
-        raise HyrfDataError(f"{name}: it has no points, or no x, y and z of them", fix="export them again")
+        raise HyrfDataError(f"{name}: the file has no points, or they lack x, y or z", fix="export them again")
     rows = read_elements(data, header, {"vertex"}, name)["vertex"]
     points = stack_columns(rows, _POSITION_PROPERTIES).astype(np.float64)
     if not all(kinds.get(label) for label in _COLOR_PROPERTIES):

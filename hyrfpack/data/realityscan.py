@@ -59,7 +59,7 @@ def read_realityscan(path: Path, *, test_every: int, images: str | None, max_siz
     """
     table = find_realityscan(path)
     if table is None:
-        raise HyrfDataError(f"{path}: no camera parameters of RealityScan (.csv)", fix=_EXPORT_ADVICE)
+        raise HyrfDataError(f"{path}: there is no table of RealityScan camera parameters (.csv)", fix=_EXPORT_ADVICE)
     names, values = _read_table(table)
     poses = np.array([[row[column] for column in _POSE_COLUMNS] for row in values])
     _check_units(poses[:, :3], table)
@@ -120,12 +120,12 @@ def _read_table(table: Path) -> tuple[list[str], list[dict[str, float]]]:
             line = {"f": np.nan}
         if len(row) < len(columns) or not np.isfinite(list(line.values())).all():
             raise HyrfDataError(
-                f"{table}: line {number} is cut short or has something else for a number",
+                f"{table}: line {number} is incomplete or has text in place of a number",
                 fix="export it again",
             )
         if line["t1"] or line["t2"]:
             raise HyrfDataError(
-                f"{table}: {cells['name'][:80]!r} has tangential distortion, which is not read",
+                f"{table}: {cells['name'][:80]!r} has tangential distortion, which is not supported",
                 fix=_EXPORT_ADVICE,
             )
         names.append(cells["name"].strip())
@@ -145,7 +145,7 @@ def _check_units(positions: np.ndarray, table: Path) -> None:
     if geocentric or (len(positions) > 1 and degrees and spread[2] > 100 * across):
         raise HyrfDataError(
             f"{table}: the cameras are in {'geocentric' if geocentric else 'geographic'} coordinates",
-            fix="export them again in the grid plane or in local Euclidean ones",
+            fix="export them again in grid-plane or local Euclidean coordinates",
         )
 
 

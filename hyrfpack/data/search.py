@@ -128,7 +128,7 @@ def _models_in(base: Path) -> list[Path]:
     inside = _subfolders(base / "sparse")
     for folder in (base / "sparse", *inside):
         if os.path.isdir(folder) and not os.access(folder, os.R_OK | os.X_OK):
-            raise HyrfDataError(f"{folder}: the folder may not be read", fix="check its permissions")
+            raise HyrfDataError(f"{folder}: permission to read the folder is denied", fix="check its permissions")
     inside.sort(key=lambda entry: (int(entry.name) if entry.name.isdecimal() else math.inf, entry.name))
     models = [folder for folder in (*inside, base / "sparse") if holds_model(folder)]
     return models or [base] * holds_model(base)

@@ -46,7 +46,10 @@ def find_picture_folder(path: Path, images: str | None) -> Path:
     if images is None:
         return find_photo_folder(path) or path
     if not os.path.isdir(path / images):  # Path.is_dir raises if a name is too long
-        raise HyrfDataError(f"{path}: no photo folder '{images}'", fix=describe_subfolders(path))
+        raise HyrfDataError(
+            f"{path}: there is no photo folder '{images}', and {describe_subfolders(path)}",
+            fix="use another folder of photos as `images`",
+        )
     return path / images
 
 

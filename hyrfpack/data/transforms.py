@@ -23,9 +23,12 @@ def read_json_object(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise HyrfDataError(f"{path}: cannot be read ({error.strerror})", fix="restore the file") from error
     except (ValueError, RecursionError) as error:
-        raise HyrfDataError(f"{path}: not valid JSON ({str(error)[:120]})", fix="the file is damaged") from error
+        raise HyrfDataError(
+            f"{path}: not valid JSON ({str(error)[:120]})",
+            fix="the file is damaged, restore it",
+        ) from error
     if not isinstance(content, dict):
-        raise HyrfDataError(f"{path}: not a JSON object", fix="the file is damaged, or of another program")
+        raise HyrfDataError(f"{path}: not a JSON object", fix="the file is damaged or of another program, restore it")
     return content
 
 
@@ -40,7 +43,10 @@ def read_transforms(path: Path) -> dict[str, Any]:
     content = read_json_object(path)
     frames = content.get("frames")
     if not isinstance(frames, list) or not frames:
-        raise HyrfDataError(f"{path}: has no list of 'frames'", fix="it is not a transforms file, or it is empty")
+        raise HyrfDataError(
+            f"{path}: there is no list of 'frames', so this is not a transforms file or it is empty",
+            fix="export it again",
+        )
     for index, frame in enumerate(frames):
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
             raise HyrfDataError(f"{path}: frame {index} has no 'file_path'", fix="correct or remove the frame")

@@ -123,14 +123,11 @@ class LPIPS:
                 fix=advice,
             ) from error
         except Exception as error:  # torch's unpickler raises exceptions of many types, with long advice
-            raise HyrfError(
-                f"{path}: these are no LPIPS weights (no tensors saved by torch)",
-                fix=advice,
-            ) from error
+            raise HyrfError(f"{path}: these are not LPIPS weights (no tensors saved by torch)", fix=advice) from error
         try:
             return cls(state if isinstance(state, dict) else {})
         except ValueError as error:
-            raise HyrfError(f"{path}: these are no LPIPS weights ({error})", fix=advice) from error
+            raise HyrfError(f"{path}: these are not LPIPS weights ({error})", fix=advice) from error
 
     @torch.no_grad()
     def __call__(self, image: Tensor, reference: Tensor) -> float:

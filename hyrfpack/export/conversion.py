@@ -149,12 +149,15 @@ def find_target_format(source: str | os.PathLike[str], target: str | os.PathLike
                 fix=f"write it with 'hyrfpack export {source} -o {target}'",
             )
         raise HyrfError(
-            f"{source}: this is no file of splats",
-            fix=f"name one of {', '.join(READABLE_ENDINGS)}, or the folder of a SOG",
+            f"{source}: this is not a file of splats",
+            fix=f"give a file that ends in {', '.join(READABLE_ENDINGS)}, or the folder of a SOG",
         )
     name = Path(target).name.lower()
     if name.endswith(".hyrf"):
-        raise HyrfError(f"{target}: a model is learnt from splats", fix=f"run 'hyrfpack import {source} -o {target}'")
+        raise HyrfError(
+            f"{target}: splats cannot be converted to a model, which has to learn from them",
+            fix=f"run 'hyrfpack import {source} -o {target}'",
+        )
     if name.endswith(".compressed.ply"):
         raise HyrfError(
             f"{target}: compressed PLY is read, not written",
@@ -162,7 +165,10 @@ def find_target_format(source: str | os.PathLike[str], target: str | os.PathLike
         )
     kind = FORMATS.get(Path(name).suffix)
     if kind is None:
-        raise HyrfError(f"{target}: the ending names the format", fix=f"end it in one of {', '.join(FORMATS)}")
+        raise HyrfError(
+            f"{target}: the file extension does not name a known format",
+            fix=f"use one of {', '.join(FORMATS)}",
+        )
     return kind
 
 
@@ -171,8 +177,9 @@ def _check_limits(kind: SplatFormat, splats: Splats, kept: Splats, say: Callable
     reach = float(np.abs(kept.positions).max())
     if reach > kind.max_coordinate:
         raise HyrfError(
-            f"the splats reach {reach:,.0f} units from the origin, and {kind.ending} {kind.max_coordinate:,}",
-            fix="name another format, or leave the far ones out with `crop`",
+            f"the splats reach {reach:,.0f} units from the origin, but {kind.ending} is limited to "
+            f"{kind.max_coordinate:,}",
+            fix="choose another format, or leave out the far splats with `crop`",
         )
     if splats.degree > kind.max_degree:
         say(

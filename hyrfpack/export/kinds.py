@@ -50,14 +50,14 @@ def find_file_kind(
     if colmap:
         if name.endswith(ENDINGS) and not os.path.isdir(target):
             raise HyrfError(
-                f"{target}: a COLMAP model is a folder of tables",
-                fix="name one without ending for `colmap=True`",
+                f"{target}: a COLMAP model is a folder of tables, not a file",
+                fix="use a path without a file extension with `colmap=True`",
             )
         return COLMAP_FOLDER
     if name.endswith(".compressed.ply"):
         raise HyrfError(
             f"{target}: compressed PLY is read, not written",
-            fix=".sog and .spz are small, .ply is not compressed",
+            fix="use .sog or .spz, which are small, or .ply, which is not compressed",
         )
     for ending, kind in _KINDS_BY_ENDING.items():
         if name.endswith(ending):
@@ -65,8 +65,8 @@ def find_file_kind(
     if os.path.isdir(target) or not Path(name).suffix:
         return PLAYER_FOLDER
     raise HyrfError(
-        f"{target}: the ending names the format",
-        fix=f"end it in one of {', '.join((*other_endings, *ENDINGS))}, or name a folder for a player",
+        f"{target}: the file extension does not name a known format",
+        fix=f"use one of {', '.join((*other_endings, *ENDINGS))}, or give a folder for a player",
     )
 
 
@@ -82,14 +82,14 @@ def check_request(
 ) -> None:
     """Check the arguments of `export` before any work. Raises HyrfError if they do not go together."""
     if degree is not None and degree not in range(MAX_DEGREE + 1):
-        raise HyrfError(f"spherical harmonics of degree {degree} are not known", fix=f"name 0 to {MAX_DEGREE}")
+        raise HyrfError(f"spherical harmonics of degree {degree} are not supported", fix=f"use 0 to {MAX_DEGREE}")
     if crop is not None and (np.shape(crop) != (6,) or np.isnan(crop).any()):
         raise HyrfError(
             f"the crop {crop} is not a box",
-            fix="name the least x, y, z, then the greatest, in world units",
+            fix="give the minimum x, y and z, then the maximum, in world units",
         )
     if not 0 <= min_opacity <= 1:
-        raise HyrfError(f"an opacity of {min_opacity} cannot be asked for", fix="name 0 to 1")
+        raise HyrfError(f"the minimum opacity {min_opacity} is out of range", fix="use 0 to 1")
     if kind is TRANSFORMS_JSON and (crop is not None or min_opacity > 0):
         raise HyrfError(
             f"{target}: this file holds only cameras, so that Gaussians cannot be selected",
@@ -97,8 +97,8 @@ def check_request(
         )
     if baked and kind is PLAYER_FOLDER:
         raise HyrfError(
-            f"{target}: a player's folder holds the model file itself",
-            fix="for `baked=True` name a file .html",
+            f"{target}: the folder of a player holds the model file itself and no baked splats",
+            fix="with `baked=True`, use a path that ends in .html",
         )
     asked = {
         "`degree`": degree is not None,
@@ -147,9 +147,9 @@ def check_model(loaded: Source, kind: FileKind, crop: Sequence[float] | None, mi
     reach = max(float(np.abs(positions).max()), background_reach(frame) if sphere else 0.0)
     if reach > kind.max_coordinate:
         raise HyrfError(
-            f"the scene reaches {reach:,.0f} units from the origin with its background, and {kind.ending} "
-            f"{kind.max_coordinate:,}",
-            fix="export another format, or try `background=False`",
+            f"the scene reaches {reach:,.0f} units from the origin with its background, but {kind.ending} is limited "
+            f"to {kind.max_coordinate:,}",
+            fix="choose another format, or try `background=False`",
         )
 
 

@@ -161,7 +161,7 @@ def _export_checked(
         kept = "only coarse cameras" if loaded.has_coarse_cameras else "no cameras"
         raise HyrfError(
             f"{source}: it keeps {kept}",
-            fix="export them from the file that training wrote, or name `data`",
+            fix="export the cameras from the file that training wrote, or give the photos with `data`",
         )
     if kind is TRANSFORMS_JSON:
         return _export_cameras(loaded, target, overwrite)

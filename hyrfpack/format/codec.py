@@ -123,9 +123,9 @@ def encode_model(model: HybridModel, profile: str = "raw", provenance: dict | No
     stored, raw_length = (sum(sizes) for sizes in zip(*((len(s.data), s.raw_length) for s in sections), strict=True))
     if raw_length > raw_bytes_limit(stored) or sum(counts) > gaussian_limit(stored):
         raise HyrfError(
-            f"{raw_length:,} bytes of numbers, nearly all alike, would take only {stored:,}, and readers do not "
-            "unpack so much from so few",
-            fix="keep this model as profile raw",
+            f"{raw_length:,} bytes of almost equal numbers would compress to {stored:,} bytes, a ratio that readers "
+            "refuse",
+            fix="use profile 'raw' for this model",
         )
     return write_container(sections, minor=minor)
 
@@ -296,13 +296,14 @@ def _decode(container: Container) -> HybridModel:
     if any(tag not in container for tag in used_tags) and container.available < container.length:
         needed = max(container.entries[tag].end for tag in used_tags)
         raise HyrfFormatError(
-            f"{name}: the first {needed:,} of {container.length:,} bytes make a model, and only "
-            f"{container.available:,} are there or allowed",
-            fix="take more of the file",
+            f"{name}: the model needs the first {needed:,} of {container.length:,} bytes, but only "
+            f"{container.available:,} are available or allowed",
+            fix="read a larger part of the file",
         )
     if sum(layers[:layer_count]) > (limit := gaussian_limit(container.available)):
         raise HyrfFormatError(
-            f"{name}: it says {sum(layers[:layer_count]):,} Gaussians, and so few bytes may hold {limit:,}",
+            f"{name}: the file claims {sum(layers[:layer_count]):,} Gaussians, but its size allows at most {limit:,} "
+            "Gaussians",
             fix="the file is damaged, copy or write it again",
         )
     sections = {tag: container[tag] for tag in used_tags}

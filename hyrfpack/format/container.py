@@ -122,7 +122,7 @@ class Container:
                 file is damaged.
         """
         if fraction is not None and not 0 <= fraction <= 1:
-            raise HyrfFormatError(f"{name}: there is no part of {fraction} of a file", fix="ask for 0 to 1")
+            raise HyrfFormatError(f"{name}: the fraction {fraction} of a file is out of range", fix="use 0 to 1")
         self._read_at = read_at
         self.name = name
         self.length = self.available = length
@@ -191,9 +191,9 @@ class Container:
         entry = self.entries[tag]
         if not self._is_available(entry):
             raise HyrfFormatError(
-                f"{self.name}: section '{tag}' ends at byte {entry.end:,} and only {self.available:,} of the file's "
-                f"{self.length:,} bytes are there or allowed",
-                fix="take more of the file",
+                f"{self.name}: section '{tag}' ends at byte {entry.end:,}, but only {self.available:,} of the file's "
+                f"{self.length:,} bytes are available or allowed",
+                fix="read a larger part of the file",
             )
         stored = memoryview(self._read_at(entry.offset, _padded_length(entry.length)))
         data = stored[: entry.length]

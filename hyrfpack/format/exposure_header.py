@@ -76,7 +76,7 @@ def read_exposure_header(codec: int, data: bytes | memoryview, raw_length: int) 
         or len(data) != _HEADER_STRUCT.size + data[0] * BYTES_PER_CENTER
     ):
         raise HyrfFormatError(
-            f"its {len(data)} bytes are no exposure map of {raw_length} bytes",
+            f"its {len(data)} bytes do not fit an exposure map of {raw_length} bytes",
             fix="the file is damaged, write it again",
         )
     centers, reserved, *numbers = _HEADER_STRUCT.unpack_from(data)

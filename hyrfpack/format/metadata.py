@@ -115,9 +115,9 @@ def read_metadata(container: Container) -> Metadata:
     name, entry = container.name, container.entries.get(METADATA)
     if entry is not None and (entry.raw_length > MAX_METADATA_BYTES or entry.codec not in (CODEC_JSON, CODEC_DEFLATED)):
         raise HyrfFormatError(
-            f"{name}: the metadata has {entry.raw_length} bytes in codec {entry.codec}, and {MAX_METADATA_BYTES} "
-            f"bytes at most in codecs {CODEC_JSON} and {CODEC_DEFLATED} can be read",
-            fix="the file is damaged or newer than this hyrfpack",
+            f"{name}: the metadata has {entry.raw_length} bytes in codec {entry.codec}, but only up to "
+            f"{MAX_METADATA_BYTES} bytes in codecs {CODEC_JSON} and {CODEC_DEFLATED} can be read",
+            fix="the file is damaged or newer than this hyrfpack, update hyrfpack or write the file again",
         )
     if entry is not None and entry.codec == CODEC_JSON and entry.raw_length != entry.length:
         raise HyrfFormatError(

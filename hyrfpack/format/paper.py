@@ -165,35 +165,47 @@ def _decode_residual_vq(data: memoryview, shape: tuple[int, int]) -> np.ndarray:
     if len(data) < _VQ_HEADER_STRUCT.size:
         raise HyrfFormatError(
             f"it has {len(data)} bytes, fewer than the header of a residual quantiser",
-            fix="copy or write the file again",
+            fix="the file is damaged, copy or write it again",
         )
     stages, columns, size = _VQ_HEADER_STRUCT.unpack_from(data)
     position = _VQ_HEADER_STRUCT.size + 2 * stages * size * columns
     if not (1 <= stages <= MAX_VQ_STAGES and size) or columns != shape[1] or position > len(data):
         raise HyrfFormatError(
             f"it says {stages} codebooks of {size} codewords of {columns} numbers",
-            fix="it is damaged",
+            fix="the file is damaged, copy or write it again",
         )
     codebooks = np.frombuffer(data[_VQ_HEADER_STRUCT.size : position], "<f2").reshape(stages, size, columns)
     if not np.isfinite(codebooks).all():
-        raise HyrfFormatError("its codebooks hold numbers that are not finite", fix="it is damaged")
+        raise HyrfFormatError(
+            "its codebooks hold numbers that are not finite",
+            fix="the file is damaged, copy or write it again",
+        )
     decoded = np.zeros(shape, np.float32)
     for stage in range(stages):
         start = position + _STREAM_LENGTH_STRUCT.size
         position = start + (_STREAM_LENGTH_STRUCT.unpack_from(data, position)[0] if start <= len(data) else 0)
         if not start <= position <= len(data):
-            raise HyrfFormatError(f"it ends within stage {stage} of {stages}", fix="it is damaged")
+            raise HyrfFormatError(
+                f"it ends within stage {stage} of {stages}",
+                fix="the file is damaged, copy or write it again",
+            )
         indices = _decode_huffman(data[start:position], shape[0])
         decoded += ResidualVectorQuantizer.decode(indices[:, None], codebooks[stage : stage + 1])
     if position != len(data):
-        raise HyrfFormatError(f"{len(data) - position} bytes follow its last stage", fix="it is damaged")
+        raise HyrfFormatError(
+            f"{len(data) - position} bytes follow its last stage",
+            fix="the file is damaged, copy or write it again",
+        )
     return decoded
 
 
 def _decode_huffman(data: memoryview, count: int) -> np.ndarray:
     stream = HuffmanStream.from_bytes(bytes(data))
     if stream.count != count:
-        raise HyrfFormatError(f"it codes {stream.count} symbols and the metadata asks for {count}", fix="it is damaged")
+        raise HyrfFormatError(
+            f"it codes {stream.count} symbols and the metadata asks for {count}",
+            fix="the file is damaged, copy or write it again",
+        )
     return huffman_decode(stream)
 
 

@@ -43,7 +43,7 @@ def decode_plain(data: memoryview, shape: tuple[int, int], dtype: str) -> np.nda
     if len(data) != expected:
         raise HyrfFormatError(
             f"it has {len(data)} bytes and the metadata asks for {expected}",
-            fix="the file is damaged",
+            fix="the file is damaged, copy or write it again",
         )
     return np.frombuffer(data, dtype).astype(np.float32).reshape(shape)
 

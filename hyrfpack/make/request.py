@@ -28,7 +28,7 @@ def default_work_folder(output: Path) -> Path:
     """Return the default work folder of an output, which lies beside it. Raises HyrfError: the output has no name."""
     absolute = output if output.name.strip(".") else Path(os.path.realpath(output))
     if not absolute.name:
-        raise HyrfError(f"{output}: this is the top of all folders", fix="name a folder or a file in it")
+        raise HyrfError(f"{output}: this is the root folder", fix="choose a folder or a file in it")
     return absolute.with_name(f"{absolute.stem}.work")
 
 
@@ -93,7 +93,9 @@ class Request:
         if not self._is_model:
             check_request(find_file_kind(self.output, other_endings=(".hyrf",)), self.output)
         elif source.kind == "model":
-            raise HyrfError(f"{source.path}: this is a .hyrf file already", fix="'hyrfpack compress' makes it smaller")
+            raise HyrfError(
+                f"{source.path}: this is a .hyrf file already", fix="make it smaller with 'hyrfpack compress'"
+            )
         if source.kind in ("model", "splats"):
             options = {
                 "minutes": self.minutes,

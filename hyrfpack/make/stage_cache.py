@@ -169,8 +169,8 @@ def _remove_product(path: Path) -> None:
             path.unlink(missing_ok=True)
     except OSError as error:
         raise HyrfError(
-            f"{path}: what an earlier call left cannot be removed ({error.strerror})",
-            fix="remove it",
+            f"{path}: the results of an earlier call cannot be deleted ({error.strerror})",
+            fix="delete this path yourself",
         ) from error
 
 

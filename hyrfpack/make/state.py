@@ -48,11 +48,14 @@ class WorkFolderState:
         except (OSError, ValueError) as error:
             reason = error.strerror if isinstance(error, OSError) else error
             raise HyrfError(
-                f"{self._path}: what was done so far cannot be read ({reason})",
-                fix="name another folder with `work`, or delete this one to begin anew",
+                f"{self._path}: the record of finished stages cannot be read ({reason})",
+                fix="choose another folder with `work`, or delete this one to start again",
             ) from error
         if entries and RECORD_NAME not in entries and not all(name.startswith(".") for name in entries):
-            raise HyrfError(f"{folder}: this folder holds something else", fix="name another with `work`")
+            raise HyrfError(
+                f"{folder}: this folder holds other files and is no work folder",
+                fix="choose another with `work`",
+            )
 
     def was_begun(self, stage: str, inputs: dict[str, Any]) -> bool:
         """Return whether a stage was begun with these inputs and is not finished."""

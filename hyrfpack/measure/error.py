@@ -32,7 +32,7 @@ def measure_error(values: Tensor, reference: Tensor, what: str) -> Error:
     """
     if not (torch.isfinite(values).all() and torch.isfinite(reference).all()):
         raise HyrfError(
-            f"{what}: the result holds NaN or infinity, so there is no error to tell",
+            f"{what}: the result holds NaN or infinity, so that the error cannot be measured",
             fix="check the model",
         )
     deviation = values.detach().double() - reference.detach().double()

@@ -54,9 +54,9 @@ def launch(command: Sequence[str], processes: int, say: Callable[[str], None] = 
         if failure.exitcode >= 0:
             return failure.exitcode
         killed = HyrfError(
-            f"process {rank} of {processes} was ended by {signal.Signals(-failure.exitcode).name}, perhaps for want of "
-            "memory",
-            fix="what was written before is kept",
+            f"process {rank} of {processes} was ended by {signal.Signals(-failure.exitcode).name}, perhaps because "
+            "memory ran out",
+            fix="use fewer `processes` or free some memory (files that were written before are kept)",
         )
         if rank == 0:
             raise killed from error

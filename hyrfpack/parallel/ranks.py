@@ -160,8 +160,8 @@ class Ranks:
                 raise
             reason = re.sub(r"\[\S*/\S*:\d+\] ", "", short_reason(error, 300))  # less the location in gloo's source
             raise HyrfError(
-                f"one of the {self.size} processes has ended or says nothing any more ({reason})",
-                fix="see what it said, and whether memory was short",
+                f"one of the {self.size} processes has ended or does not respond ({reason})",
+                fix="read the messages of that process, and check whether memory ran out",
             ) from error
 
 
@@ -192,8 +192,8 @@ def join_processes(environment: Mapping[str, str] | None = None) -> Iterator[Ran
         return
     if not (dist.is_available() and dist.is_gloo_available()):
         raise HyrfError(
-            f"torch {torch.__version__} was built without gloo, by which processes talk",
-            fix="install another build of it, or start one process",
+            f"torch {torch.__version__} was built without gloo, which processes need to communicate",
+            fix="install another build of torch, or start only one process",
         )
     if "TORCHELASTIC_RUN_ID" in environment:
         _stop_when_launcher_ends()
@@ -212,7 +212,9 @@ def join_processes(environment: Mapping[str, str] | None = None) -> Iterator[Ran
             where = f"tcp://{address}:{port}"
             dist.init_process_group(devices, where, timeout=COLLECTIVE_TIMEOUT, rank=ranks.rank, world_size=ranks.size)
     except (RuntimeError, ValueError) as error:
-        hint = "set MASTER_PORT to a free one" if "EADDRINUSE" in str(error) else "see whether all were started"
+        hint = (
+            "set MASTER_PORT to a free one" if "EADDRINUSE" in str(error) else "check that all processes were started"
+        )
         raise HyrfError(
             f"process {ranks.rank} of {ranks.size} did not find the others at {address}:{port} ({short_reason(error)})",
             fix=hint,
@@ -264,9 +266,9 @@ def ranks_from_environment(environment: Mapping[str, str]) -> Ranks:
         return SINGLE_PROCESS
     if not (0 <= rank < size and 0 <= local_rank < local_size <= size):
         raise HyrfError(
-            f"the environment speaks of process {rank} of {size}, number {local_rank} of {local_size} on this "
-            "machine, which cannot be",
-            fix="start them by torchrun or srun, or unset RANK and WORLD_SIZE",
+            f"the environment describes process {rank} of {size}, number {local_rank} of {local_size} on this "
+            "machine, which is impossible",
+            fix="start the processes with torchrun or srun, or unset RANK and WORLD_SIZE",
         )
     return Ranks(rank, size, local_rank, local_size, restarts)
 

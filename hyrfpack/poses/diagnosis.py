@@ -88,9 +88,8 @@ def check_matches(folder: Path, count: int, matches: Mapping[str, Any]) -> None:
         )
     if matches["turned"] >= _PANORAMA_PAIR_RATIO:
         raise HyrfDataError(
-            f"{folder}: the photos are all taken from one place, where the camera turned at most, so that no depth "
-            "can be seen in them",
-            fix="walk around the scene, a step to the side between photos",
+            f"{folder}: all photos were taken from one place, so that they show no depth",
+            fix="walk around the scene, with a step to the side between photos",
         )
 
 
@@ -102,8 +101,8 @@ def check_registered(folder: Path, count: int, found: Mapping[str, Any]) -> None
     """
     if len(found["registered"]) < MIN_PHOTOS:
         raise HyrfDataError(
-            f"{folder}: no poses could be found, for these {count} photos share too little with each other",
-            fix="take more between them, each sharing two thirds of its view with the next",
+            f"{folder}: no poses could be found, because these {count} photos overlap too little",
+            fix="take more photos between them, each sharing two thirds of its view with the next",
         )
 
 

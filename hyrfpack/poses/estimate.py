@@ -217,8 +217,8 @@ class _PoseEstimation:
         masks = find_masks(photos, mask_folder) if mask_folder else {}
         if self.masks is not None and not masks:
             raise HyrfDataError(
-                f"{self.masks}: no mask is named as a photo is ({photos[0].source}.png)",
-                fix="rename them",
+                f"{self.masks}: no mask has the name of a photo ({photos[0].source}.png)",
+                fix="rename the masks",
             )
         copies_masks = bool(masks) and mask_folder is not None and not is_same_path(mask_folder, self.out / "masks")
         if copies_masks:

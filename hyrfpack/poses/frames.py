@@ -259,8 +259,8 @@ def _choose_spaced_frames(
         )
     if len(picked) < _MIN_TAKEN_FRAMES:
         raise HyrfDataError(
-            f"{path}: the camera hardly moves, so that {len(picked)} of {measured.decoded_count} frames can serve as "
-            f"photos, and {_MIN_TAKEN_FRAMES} is the least",
+            f"{path}: the camera hardly moves, so that only {len(picked)} of {measured.decoded_count} frames can "
+            f"serve as photos, but at least {_MIN_TAKEN_FRAMES} are needed",
             fix="walk around what you film",
         )
     steps = np.array(

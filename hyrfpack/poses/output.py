@@ -87,8 +87,8 @@ class SceneOutput:
         }
         if os.path.lexists(folder) and not has_only(self.scene, name, ours):
             raise HyrfError(
-                f"{folder}: there are files that are not of these photos",
-                fix=f"name another folder for the scene, or {self.scene} itself as that of the photos",
+                f"{folder}: the folder holds files that do not belong to these photos",
+                fix=f"choose another folder for the scene, or give {self.scene} as the folder of the photos, too",
             )
 
     def protect(self, files: Collection[Path]) -> None:

@@ -102,8 +102,8 @@ def read_headers(
         if panorama:
             if in_place:
                 raise HyrfDataError(
-                    f"{path}: this picture shows all around and cannot be cut into photos where it is",
-                    fix="put such pictures into a folder, name it, and another one for the scene",
+                    f"{path}: this picture is a panorama, which cannot be cut into photos in its own folder",
+                    fix="put the panoramas into a folder of their own, and choose another folder for the scene",
                 )
             faces = _make_faces(facts, source)
             if taken.isdisjoint(face.name for face in faces):

@@ -109,7 +109,7 @@ def open_video(path: Path) -> Iterator[Video]:
         ) from error
     try:
         if not container.streams.video:
-            raise HyrfDataError(f"{path}: there are no pictures in this file, sound at most", fix="name a video")
+            raise HyrfDataError(f"{path}: the file has no video stream", fix="give the path of a video")
         yield Video(container)
     finally:
         container.close()

@@ -177,7 +177,7 @@ class HuffmanStream:
             raise DamagedDataError(f"Huffman stream: {len(data)} bytes are fewer than its header; it is truncated")
         count, payload_size, leaves, end, width, wide = _HEADER_STRUCT.unpack_from(data)
         if width not in (1, 2) or wide not in (2, 4) or leaves > 256**width + 1 or end > max(leaves - 1, 0):
-            raise DamagedDataError("Huffman stream: its header says what cannot be; the data is damaged")
+            raise DamagedDataError("Huffman stream: its header has impossible values; the data is damaged")
         if count > 8 * payload_size or (count > 0) != (payload_size > 0) or (leaves == 0 and count > 0):
             raise DamagedDataError(
                 f"Huffman stream: {count} symbols cannot come from {payload_size} bytes; the data is damaged"

@@ -84,7 +84,7 @@ def decode_points(data: bytes | memoryview, count: int) -> LatticePoints:
     start = _HEADER_STRUCT.size + kinds
     is_in_range = 1 <= kinds <= MAX_POINT_CLASSES and 1 <= base <= MAX_BITS_PER_AXIS
     if not is_in_range or start + gap_size + class_size > len(data):
-        raise DamagedDataError("points: the header says what cannot be; the data is damaged")
+        raise DamagedDataError("points: the header has impossible values; the data is damaged")
     bits = np.frombuffer(data[_HEADER_STRUCT.size : start], np.uint8).astype(np.int64)
     if bits.min() < base or bits.max() > MAX_BITS_PER_AXIS:
         raise DamagedDataError("points: a class has fewer bits than all share, or too many; the data is damaged")

@@ -305,7 +305,7 @@ def _decode(
         return _decode_constants(data, count, contexts, context_count)
     models = context_count * classes
     if alphabet > MAX_ALPHABET_SIZE or models > MAX_MODELS or 1 << lanes_log2 > MAX_LANES or (is_static and not static):
-        raise DamagedDataError("rANS stream: its header says what cannot be; the data is damaged")
+        raise DamagedDataError("rANS stream: its header has impossible values; the data is damaged")
     if count > _MAX_STEPS_PER_LANE << lanes_log2 and 1 << lanes_log2 < MAX_LANES:
         raise DamagedDataError(f"rANS stream: too few lanes for {count} symbols; the data is damaged")
     place = _HEADER_BYTES + classes - 1

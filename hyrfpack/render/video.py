@@ -69,5 +69,8 @@ def write_video(
             _, complaint = process.communicate()
         if process.returncode:
             lines = complaint.decode(errors="replace").strip().splitlines() or ["it gave no reason"]
-            raise HyrfError(f"{path}: ffmpeg could not make the video ({lines[-1]})", fix="the pictures are in place")
+            raise HyrfError(
+                f"{path}: ffmpeg could not make the video ({lines[-1]})",
+                fix="use the pictures, which are written",
+            )
     return pending.path

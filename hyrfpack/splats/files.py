@@ -55,8 +55,8 @@ def read_splats(path: str | os.PathLike[str]) -> Splats:
             return sog.decode_files(_read_unbundled_sog(path), str(path))
         if path.exists() and extension not in READABLE_ENDINGS:
             raise HyrfDataError(
-                f"{path}: files with this ending are not known",
-                fix=f"name one of {', '.join(READABLE_ENDINGS)}",
+                f"{path}: files with this extension are not supported",
+                fix=f"give a file that ends in {', '.join(READABLE_ENDINGS)}",
             )
         data = _read_bytes(path)
         return FORMATS[extension].decode(data, str(path))
@@ -72,7 +72,7 @@ def _read_unbundled_sog(folder: Path) -> dict[str, bytes]:
     names = os.listdir(folder)
     if sog.META_NAME not in names:
         splats = sorted(name for name in names if name.lower().endswith(READABLE_ENDINGS))
-        advice = f"name {splats[0]} in it" if splats else "name another"
+        advice = f"name {splats[0]} in it" if splats else "name another folder"
         raise HyrfDataError(
             f"{folder}: a folder is read as a loose SOG, {sog.META_NAME} with its pictures, and this one holds "
             f"{_format_names(names)}",

@@ -92,7 +92,7 @@ def apply_transform(splats: Splats, matrix: np.ndarray, turn: np.ndarray, name: 
                 splats.antialiased,
             )
     except ValueError as error:
-        raise HyrfDataError(f"{name}: moved as its transform says, {error}", fix="correct the transform") from error
+        raise HyrfDataError(f"{name}: after its transform, {error}", fix="correct the transform") from error
 
 
 def decompose_similarity(matrix: np.ndarray, name: str) -> tuple[float, np.ndarray]:
@@ -109,7 +109,7 @@ def decompose_similarity(matrix: np.ndarray, name: str) -> tuple[float, np.ndarr
             return scale, u @ vt
     raise HyrfDataError(
         f"{name}: the transform of its splats mirrors, skews or scales axes differently",
-        fix="apply it to them first",
+        fix="apply it to the splats before the export",
     )
 
 

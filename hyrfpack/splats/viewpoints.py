@@ -72,8 +72,8 @@ class WeightedSplats:
         areas = splats.opacities * discs
         if not (areas > 0).any():
             raise HyrfDataError(
-                f"{name}: there is no Gaussian in it that could be seen (of some size and opacity)",
-                fix="name another file",
+                f"{name}: no Gaussian is visible, because all are transparent or without size",
+                fix="give another file",
             )
         seen = areas > 0
         typical = np.median(discs[seen])

@@ -246,7 +246,7 @@ def exposures_for(
         return None, "off"
     if scene.has_alpha:
         raise HyrfTrainingError(
-            f"{scene.path}: photos with transparency are laid over a colour of one exposure",
+            f"{scene.path}: per-image gains do not work with transparent photos, whose background has one exposure",
             fix="leave out `exposure`",
         )
     observed = observe(scene, cache)

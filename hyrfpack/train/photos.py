@@ -44,8 +44,8 @@ def photos_of(model: str | os.PathLike[str]) -> Scene | None:
     scene = load_scene(path, **reading)
     if sizes != (len(scene.train), len(scene.test)):
         raise HyrfDataError(
-            f"{path}: {len(scene.train)} photos to train on and {len(scene.test)} held out, where {model} was trained "
-            f"on {sizes[0]} of {sum(sizes)}",
+            f"{path}: the set has {len(scene.train)} photos to train on and {len(scene.test)} held out, but {model} "
+            f"was trained on {sizes[0]} of {sum(sizes)}",
             fix="name the photos with `data`",
         )
     return scene

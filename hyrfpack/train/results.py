@@ -129,8 +129,8 @@ def save_model(trainer: Trainer, out: Path, phase: Phase, *, overwrite: bool) ->
     scene, config = trainer.scene, trainer.config
     if not trainer.records:
         raise HyrfTrainingError(
-            f"{scene.path}: masks leave no pixel of the photos that the {trainer.steps:,} steps came to",
-            fix="take more steps than there are photos",
+            f"{scene.path}: the masks leave no pixels in the photos of all {trainer.steps:,} steps",
+            fix="use at least as many `steps` as there are photos",
         )
     model = _drop_unseen_background(trainer, phase)
     phase("writing the model", 0, 0)

@@ -415,7 +415,7 @@ def _check_photos(scene: Scene, cache: PictureCache, phase: Phase) -> None:
 
 def _nothing_left(scene: Scene, views: list[View], purpose: str) -> HyrfTrainingError:
     return HyrfTrainingError(
-        f"{scene.path}: the masks of all {len(views)} photos {purpose} leave no pixel, {views[0].name} for one",
+        f"{scene.path}: the masks of all {len(views)} photos {purpose} leave no pixels (for example, {views[0].name})",
         fix="check that white means 'use this pixel'",
     )
 

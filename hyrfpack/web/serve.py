@@ -216,7 +216,7 @@ def _create_server(host: str, port: int, page: bytes, files: ServedFiles) -> _Se
     if not host.strip():  # a socket would listen at every address
         raise HyrfError(
             f"'{host}' is not an address to listen at",
-            fix=f"name {LOCAL_HOST}, or 0.0.0.0 to let others look",
+            fix=f"use {LOCAL_HOST}, or 0.0.0.0 to allow connections from other machines",
         )
     try:
         server = Server((host, port), _Handler)

@@ -141,19 +141,19 @@ def test_folders_are_players_and_galleries(model, data, tmp_path):
 
 WRONG = {
     "no output": ((), "Missing option '-o'"),
-    "ending": (("-o", "a.xyz"), "the ending names the format"),
-    "no name": (("-o", ""), "names no file"),
-    "standard output": (("-o", "-"), "names no file"),
+    "ending": (("-o", "a.xyz"), "the file extension does not name a known format"),
+    "no name": (("-o", ""), "is not a file name"),
+    "standard output": (("-o", "-"), "is not a file name"),
     "too long a name": (("-o", "a" * 260 + ".ply"), "longer than 255 bytes"),
     "degree": (("-o", "a.ply", "--sh-degree", "4"), "'--sh-degree'"),
     "NaN": (("-o", "a.ply", "--crop", "0,0,0,1,nan,1"), "is not a box"),
     "few numbers": (("-o", "a.ply", "--crop", "0,0,0,1"), "is not a box"),
     "words": (("-o", "a.ply", "--crop", "a,b,c,d,e,f"), "is not a box"),
-    "inside out": (("-o", "a.ply", "--crop", "1,0,0,0,1,1"), "turned inside out"),
+    "inside out": (("-o", "a.ply", "--crop", "1,0,0,0,1,1"), "a minimum above its maximum"),
     "nothing inside": (("-o", "a.ply", "--crop", "7,7,7,8,8,8"), "no Gaussian is left"),
     "too faint": (("-o", "a.ply", "--min-opacity", "1"), "no Gaussian is left"),
     "opacity": (("-o", "a.ply", "--min-opacity", "2"), "'--min-opacity'"),
-    "NaN opacity": (("-o", "a.ply", "--min-opacity", "nan"), "opacity of nan"),
+    "NaN opacity": (("-o", "a.ply", "--min-opacity", "nan"), "minimum opacity nan"),
     "crop of cameras": (("-o", "a.json", "--crop", "0,0,0,1,1,1"), "only cameras"),
     "no photos": (("-o", "a.ply", "--data", "none"), "none"),
     "degree of a model": (("-o", "a.html", "--sh-degree", "1"), "--baked"),
@@ -163,7 +163,7 @@ WRONG = {
     "baked player": (("-o", "player", "--baked"), "--baked"),
     "COLMAP file": (("-o", "a.ply", "--colmap"), "a COLMAP model is a folder"),
     "two models": (("second.hyrf", "-o", "a.ply"), "several models make a gallery"),
-    "photos of two": (("-o", "player", "--data", "a", "--data", "b"), "given 2 times, for 1 models"),
+    "photos of two": (("-o", "player", "--data", "a", "--data", "b"), "given 2 times for 1 models"),
 }
 
 

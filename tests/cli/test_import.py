@@ -51,7 +51,7 @@ def test_a_device_that_is_not_there_is_rejected_before_any_work(source: Path, tm
     target = tmp_path / "ball.hyrf"
     target.write_bytes(b"kept")
     told = refused("import", source, "-o", target, *QUICK, "--device", "cuda:9", "--overwrite")
-    assert "device 'cuda:9' is not there" in told and "--device cpu" in told
+    assert "device 'cuda:9' is not available" in told and "--device cpu" in told
     assert target.read_bytes() == b"kept"
 
 

@@ -162,10 +162,10 @@ def test_a_file_cut_short_is_rejected_unless_asked_for(cut, data, tmp_path):
 def test_too_little_of_a_file_is_rejected_with_a_clear_error_that_says_how_much_it_takes(whole, stump, data, tmp_path):
     needed, size = stump.stat().st_size + 1, whole.stat().st_size
     for arguments in attempts(stump, data, tmp_path / "out", part=True):
-        assert f"{stump}: the first {needed:,} of {size:,} bytes make a model" in refused(*arguments)
+        assert f"{stump}: the model needs the first {needed:,} of {size:,} bytes" in refused(*arguments)
     for fraction in (0.0, 0.01, (needed - 1) / size):
         arguments = ("decompress", whole, "-o", tmp_path / "out.hyrf", "--fraction", fraction)
-        assert "take more of the file" in refused(*arguments)
+        assert "read a larger part of the file" in refused(*arguments)
     assert not (tmp_path / "out").exists()
 
 
@@ -177,8 +177,10 @@ def test_files_without_layers_are_rejected_in_part(profile, whole, data, tmp_pat
     size = full.stat().st_size
 
     for arguments in attempts(part, data, tmp_path / "out", part=True):
-        assert f"{part}: the first {size:,} of {size:,} bytes make a model" in refused(*arguments)
-    assert "take more of the file" in refused("decompress", full, "-o", tmp_path / "out.hyrf", "--fraction", 0.99)
+        assert f"{part}: the model needs the first {size:,} of {size:,} bytes" in refused(*arguments)
+    assert "read a larger part of the file" in refused(
+        "decompress", full, "-o", tmp_path / "out.hyrf", "--fraction", 0.99
+    )
     assert not (tmp_path / "out").exists()
 
 

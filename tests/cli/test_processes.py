@@ -194,7 +194,7 @@ def test_a_file_that_is_there_is_rejected_once(model, logs):
     [
         (("train", "nowhere", "-o", "run"), "nowhere"),
         (("train", "data", "-o", "run", "--resume"), "there is no checkpoint to resume"),
-        (("train", "data", "-o", "run", "--poses"), "--poses is the work of one process"),
+        (("train", "data", "-o", "run", "--poses"), "--poses runs in one process only"),
         (("train", "data", "-o", "run", "--resume", "--overwrite"), "give one of them"),
         (("train", "data", "-o", "run", "--processes", "2"), "leave out --processes"),
         (("evaluate", "nothing.hyrf", "--data", "data"), "nothing.hyrf"),

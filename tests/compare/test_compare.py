@@ -246,7 +246,9 @@ def test_runs_without_held_out_photos_are_compared_by_the_rest(which, runs, tmp_
 
 def test_other_held_out_photos_are_rejected(runs, tmp_path):
     changed(runs[1], lambda values: values["evaluation"]["views"].pop())
-    with pytest.raises(HyrfError, match=r"held out of 'b' \(1\) than of 'a' \(2; '001.png' of one of them alone\)"):
+    with pytest.raises(
+        HyrfError, match=r"the runs 'a' and 'b' hold out different photos \(2 and 1; '001.png' is in only one of them\)"
+    ):
         hyrfpack.compare_runs(runs, tmp_path / "page.html")
     assert not (tmp_path / "page.html").exists()
 
@@ -293,16 +295,16 @@ def test_metrics_that_lack_something_are_a_clear_error_that_names_it(change, nam
 def test_what_is_no_finished_run_is_rejected_with_what_to_do(runs, tmp_path):
     page = tmp_path / "page.html"
     assert "there is no such folder" in refused("compare", runs[0], tmp_path / "none", "-o", page)
-    assert "name two folders" in refused("compare", runs[0], "-o", page)
+    assert "give two or more folders" in refused("compare", runs[0], "-o", page)
     assert "each once" in refused("compare", *runs, runs[0] / ".." / "a", "-o", page)
-    assert "ends in .html" in refused("compare", *runs, "-o", tmp_path / "page.pdf")
+    assert "extension must be .html" in refused("compare", *runs, "-o", tmp_path / "page.pdf")
     assert "the output is an input" in refused("compare", *runs, "-o", runs[0] / "metrics.json", "--overwrite")
     Image.new("RGB", (7, 5)).save(runs[0] / "views" / "000.png")
-    assert "remove it, and the view is left out" in refused("compare", *runs, "-o", page)
+    assert "delete it to leave out this view" in refused("compare", *runs, "-o", page)
     (runs[0] / "model.hyrf").write_bytes(b"nothing")
     assert f"{runs[0]}/model.hyrf" in refused("compare", *runs, "-o", page)
     (runs[1] / "checkpoint.pt").touch()
-    assert "finishes it with --resume" in refused("compare", runs[1], runs[0], "-o", page)
+    assert "command again with --resume" in refused("compare", runs[1], runs[0], "-o", page)
     (runs[0] / "model.hyrf").unlink()
     assert "there is no model.hyrf" in refused("compare", *runs, "-o", page)
     assert not page.exists()

@@ -217,9 +217,9 @@ def _break_no_photo_folder(root: Path, folder) -> None:
         (_break_picture_size, "24 x 32"),
         (_break_mask_size, "320 x 32"),
         (_break_duplicate_name, "listed twice"),
-        (_break_missing_table, "cameras.bin: missing"),
+        (_break_missing_table, "cameras.bin: the file is missing"),
         (_break_empty_table, "images.bin"),
-        (_break_no_photo_folder, "there are the folders left, right, sparse; .* `images`"),
+        (_break_no_photo_folder, "there are the folders left, right, sparse.; .* `images`"),
     ],
 )
 def test_broken_model_gives_one_sentence(tmp_path, colmap_folder, damage, says):

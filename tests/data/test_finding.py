@@ -164,13 +164,13 @@ def test_another_model_can_be_named(tmp_path, colmap_folder):
 def test_a_model_that_is_not_there_is_rejected_with_those_that_are(tmp_path, colmap_folder):
     split_model(tmp_path, colmap_folder, {"0": 2, "1": 11})
 
-    says = "there is no COLMAP model '7'; name one of those that are there: 0 (2 photos), 1 (11 photos)"
+    says = "there is no COLMAP model '7'; choose one of these: 0 (2 photos), 1 (11 photos)"
     assert says in sentence(tmp_path, model="7")
     assert says in refused("train", tmp_path, "-o", tmp_path / "run", "--model", 7)
 
 
 def test_a_model_for_a_layout_without_models_is_rejected(nerfstudio_folder):
-    assert "leave out '0'" in sentence(nerfstudio_folder(), model="0")
+    assert "'0' cannot be chosen; leave out `model`" in sentence(nerfstudio_folder(), model="0")
 
 
 def test_a_damaged_model_is_passed_over_for_a_whole_one(tmp_path, colmap_folder):
@@ -293,4 +293,4 @@ def test_a_model_that_may_not_be_read_is_not_taken_for_none(tmp_path, colmap_fol
     colmap_folder(tmp_path, count=4)
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != tmp_path / name)
 
-    assert f"{tmp_path / name}: the folder may not be read; check its permissions" in sentence(tmp_path)
+    assert f"{tmp_path / name}: permission to read the folder is denied; check its permissions" in sentence(tmp_path)

@@ -137,7 +137,7 @@ def test_what_was_looked_for_is_said(tmp_path):
 def test_sets_that_name_their_photos_take_no_folder(tmp_path, write, layout):
     write(layout)
 
-    with pytest.raises(HyrfDataError, match="leave out the folder 'images_2'"):
+    with pytest.raises(HyrfDataError, match="the folder 'images_2' cannot be chosen; leave out `images`"):
         load_scene(tmp_path, images="images_2")
     with pytest.raises(HyrfDataError, match="no COLMAP models"):
         load_scene(tmp_path, model="1")

@@ -66,7 +66,7 @@ def test_single_and_double_precision(folder, kind):
         (lambda root: edit(root, lambda table: table[:, :16]), "17 numbers"),
         (lambda root: edit(root, lambda table: table.astype(object)), "not a table that can be read"),
         (lambda root: edit(root, lambda table: table.astype(complex)), "17 numbers"),
-        (lambda root: edit(root, lambda table: table[:0]), "there is none"),
+        (lambda root: edit(root, lambda table: table[:0]), "the table is empty"),
         (lambda root: edit(root, lambda table: table * np.nan), "not finite"),
         (lambda root: edit(root, lambda table: table * 2), "not rigid"),
         (lambda root: (root / "poses_bounds.npy").write_bytes(b""), "not a table"),

@@ -214,7 +214,7 @@ FINE = camera("a", "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1") + camera("b", "1 0 0 1 0 1
         (document(FINE, size=("wide", 5)), "1 finite numbers"),
         (document(FINE, size=(99, 5)), "not a uniform rescaling"),
         (document(FINE, transform="<transform><rotation>1 0</rotation></transform>"), "9 finite numbers"),
-        (document(FINE, transform=f"<transform><rotation>{'2 ' * 9}</rotation></transform>"), "no rotation"),
+        (document(FINE, transform=f"<transform><rotation>{'2 ' * 9}</rotation></transform>"), "not a rotation"),
     ],
 )
 def test_broken_cameras_give_one_sentence(tmp_path, pictures, text, says):
@@ -233,5 +233,5 @@ def test_labels_that_fit_several_photos_are_called_unclear(tmp_path, pictures):
         pictures(tmp_path / folder, names, size=(48, 36))
     (tmp_path / "cameras.xml").write_text(document(camera("0", NADIR) + camera("1", OBLIQUE, 1), size=(48, 36)))
 
-    with pytest.raises(HyrfDataError, match="unclear, because 0 fits more than one file"):
+    with pytest.raises(HyrfDataError, match="cannot be assigned to files, because 0 matches more than one file"):
         load_scene(tmp_path)

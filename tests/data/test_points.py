@@ -55,7 +55,7 @@ def test_trimesh_is_not_needed(tmp_path, monkeypatch):
 @pytest.mark.parametrize("properties", ["", "property float x\nproperty float y\n"])
 def test_a_file_without_points_is_rejected_by_name(tmp_path, properties):
     (tmp_path / "a.ply").write_text(f"ply\nformat ascii 1.0\nelement vertex 0\n{properties}end_header\n")
-    with pytest.raises(HyrfDataError, match="a.ply: it has no points"):
+    with pytest.raises(HyrfDataError, match="a.ply: the file has no points"):
         read_ply_points(tmp_path / "a.ply")
 
 

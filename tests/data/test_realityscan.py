@@ -65,9 +65,9 @@ def test_other_tables_are_none_of_ours(tmp_path):
 @pytest.mark.parametrize(
     ("damage", "says"),
     [
-        (lambda text: text[:-40], "line 3 is cut short"),
-        (lambda text: text.replace("83.4154", "up"), "line 2 .* something else for a number"),
-        (lambda text: text.replace("83.4154", "nan"), "something else for a number"),
+        (lambda text: text[:-40], "line 3 is incomplete"),
+        (lambda text: text.replace("83.4154", "up"), "line 2 .* text in place of a number"),
+        (lambda text: text.replace("83.4154", "nan"), "text in place of a number"),
         (lambda text: text.split("\n")[0], "lists no photo"),
         (lambda text: text.replace(",18,", ",0,"), "unusable intrinsics"),
         (lambda text: text.replace("0.0004,0,0", "0,0.1,0"), "'b.jpg' has tangential distortion"),

@@ -99,7 +99,7 @@ def test_odd_splats_make_a_model(tmp_path: Path, change) -> None:
     ids=["none", "clear", "points"],
 )
 def test_splats_that_cannot_be_seen_are_a_clear_error(tmp_path: Path, change) -> None:
-    with pytest.raises(HyrfDataError, match="^ball.ply: there is no Gaussian in it that could be seen"):
+    with pytest.raises(HyrfDataError, match="^ball.ply: no Gaussian is visible"):
         distill_splats(change(ball_splats(20)), tmp_path / "x.hyrf", TINY_DISTILL_CONFIG, name="ball.ply")
 
 

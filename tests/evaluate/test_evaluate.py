@@ -212,7 +212,7 @@ def broken_weights(kind: str):
 )
 def test_lpips_rejects_other_files_and_executes_nothing(kind, tmp_path, capsys):
     torch.save(broken_weights(kind), tmp_path / "weights.pt")
-    with pytest.raises(HyrfError, match="these are no LPIPS weights") as refusal:
+    with pytest.raises(HyrfError, match="these are not LPIPS weights") as refusal:
         LPIPS.load(tmp_path / "weights.pt")
     assert "executed" not in capsys.readouterr().out
     assert len(str(refusal.value).replace(str(tmp_path), "")) < 200 and "trust" not in str(refusal.value)

@@ -106,10 +106,10 @@ def test_progress_is_reported_in_order(tmp_path):
     ("source", "target", "sentence"),
     [
         ("model.hyrf", "a.ply", "this is a model, not splats; write it with 'hyrfpack export model.hyrf -o a.ply'"),
-        ("photo.png", "a.ply", "this is no file of splats"),
-        ("a.ply", "b.hyrf", "a model is learnt from splats; run 'hyrfpack import a.ply -o b.hyrf'"),
+        ("photo.png", "a.ply", "this is not a file of splats"),
+        ("a.ply", "b.hyrf", "to a model, which has to learn from them; run 'hyrfpack import a.ply -o b.hyrf'"),
         ("a.ply", "b.compressed.ply", "compressed PLY is read, not written"),
-        ("a.ply", "b.txt", "the ending names the format"),
+        ("a.ply", "b.txt", "the file extension does not name a known format"),
         ("missing.ply", "b.spz", "cannot be read"),
     ],
 )
@@ -131,7 +131,7 @@ def test_splats_that_a_format_cannot_reach_are_refused_before_anything_is_writte
     splats = ball_splats(5)
     positions = splats.positions + [2 * FORMATS[".spz"].max_coordinate, 0, 0]
     far = Splats(positions, splats.scales, splats.quats, splats.opacities, splats.harmonics)
-    with pytest.raises(HyrfError, match="name another format"):
+    with pytest.raises(HyrfError, match="choose another format"):
         hyrfpack.convert_splats(written(tmp_path, ".ply", far), tmp_path / "a.spz")
     assert not (tmp_path / "a.spz").exists()
 
@@ -139,5 +139,5 @@ def test_splats_that_a_format_cannot_reach_are_refused_before_anything_is_writte
 def test_splats_that_cannot_be_seen_are_refused(tmp_path):
     splats = ball_splats(5)
     unseen = Splats(splats.positions, splats.scales * 0, splats.quats, splats.opacities, splats.harmonics)
-    with pytest.raises(HyrfDataError, match="no Gaussian in it that could be seen"):
+    with pytest.raises(HyrfDataError, match="no Gaussian is visible"):
         hyrfpack.convert_splats(written(tmp_path, ".splat", unseen), tmp_path / "a.spz")

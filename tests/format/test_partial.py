@@ -136,8 +136,8 @@ def test_too_short_a_start_is_refused_in_one_sentence(cut):
 
     assert str(caught.value).startswith("x.hyrf: ") and "\n" not in str(caught.value)
     if cut >= ENTRIES["META"].end:
-        assert f"the first {LEAST:,} of {len(COMPACT):,} bytes make a model" in str(caught.value)
-        assert f"only {cut:,} are there" in str(caught.value)
+        assert f"the model needs the first {LEAST:,} of {len(COMPACT):,} bytes" in str(caught.value)
+        assert f"only {cut:,} are available" in str(caught.value)
 
 
 def test_the_bytes_that_the_message_names_make_a_model_and_no_fewer_do():
@@ -155,7 +155,7 @@ def test_the_bytes_that_the_message_names_make_a_model_and_no_fewer_do():
 def test_a_fraction_of_a_whole_file_is_its_start(fraction):
     cut = int(fraction * len(COMPACT))
     if cut < LEAST:
-        with pytest.raises(HyrfFormatError, match="take more of the file"):
+        with pytest.raises(HyrfFormatError, match="read a larger part of the file"):
             decode_model(COMPACT, fraction=fraction)
     else:
         assert_same_bits(decode_model(COMPACT, fraction=fraction), prefix(WHOLE, there(cut)))
@@ -208,7 +208,7 @@ def test_files_of_one_layer_have_no_start_that_is_a_model(profile):
             with pytest.raises(HyrfFormatError) as caught:
                 decode_model(data[:cut], fraction=1.0)
             if cut >= read_container(data).entries["META"].end:
-                assert f"the first {len(data):,} of {len(data):,} bytes make a model" in str(caught.value)
+                assert f"the model needs the first {len(data):,} of {len(data):,} bytes" in str(caught.value)
 
 
 # --- layers of any kind ---
@@ -321,7 +321,7 @@ def test_a_huge_length_in_the_header_costs_nothing():
 
     assert "is truncated" in str(in_little_memory(data, None))
     assert_same_bits(in_little_memory(data, 1.0), prefix(WHOLE, COUNT - LAYERS[-1]))
-    assert "take more of the file" in str(in_little_memory(data[: LEAST - 1], 1.0))
+    assert "read a larger part of the file" in str(in_little_memory(data[: LEAST - 1], 1.0))
     assert "more than a .hyrf file may have" in str(in_little_memory(stretched(COMPACT, 1 << 35), 1.0))
 
 

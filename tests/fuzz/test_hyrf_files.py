@@ -137,14 +137,14 @@ def test_more_gaussians_than_a_file_of_its_length_may_have_are_refused_before_th
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
 
-    assert isinstance(outcome, str) and f"it says {count:,} Gaussians" in outcome
+    assert isinstance(outcome, str) and f"the file claims {count:,} Gaussians" in outcome
     assert peak < 1 << 20
 
 
 def test_a_file_that_readers_would_not_unpack_is_not_written():
     model = small_model(np.zeros((EXTRA_GAUSSIANS_PER_FILE + 200_000, 3)))
 
-    with pytest.raises(HyrfError, match="nearly all alike.*keep this model as profile raw"):
+    with pytest.raises(HyrfError, match="almost equal numbers.*use profile 'raw' for this model"):
         encode_model(model, "compact", quantized=quantize_uniformly(model, 1.0))
 
 
@@ -256,7 +256,7 @@ def test_forged_exposure_maps_meet_every_check_of_the_reader():
     assert outcomes["decoded"] > 50
     sentences = " | ".join(outcomes)
     for words in (
-        "are no exposure map",
+        "do not fit an exposure map",
         "reserved bytes",
         "not finite",
         "centers",

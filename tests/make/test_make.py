@@ -346,13 +346,13 @@ def test_what_cannot_be_is_rejected_before_any_work(posed, photos, made, tmp_pat
     out = tmp_path / "scene.html"
     for sentence, *arguments in (
         ("no such file or folder", tmp_path / "nothing", "-o", out),
-        ("the ending names the format", posed, "-o", tmp_path / "scene.xyz"),
+        ("the file extension does not name a known format", posed, "-o", tmp_path / "scene.xyz"),
         ("there is a file of this name", posed, "-o", tmp_path / "there.html"),
         ("is a file, not a folder", posed, "-o", tmp_path / "there.html" / "scene.html"),
         ("reads what lies in this folder", photos, "-o", photos / "scene.html"),
         ("the work folder would lie among the photos", photos, "-o", photos / "made" / "scene.html"),
         ("lie in each other", posed, "-o", tmp_path / "work" / "a.html", "--work", tmp_path / "work"),
-        ("holds something else", posed, "-o", out, "--work", tmp_path / "full"),
+        ("holds other files", posed, "-o", out, "--work", tmp_path / "full"),
         ("the folder is empty", tmp_path / "empty", "-o", out),
         ("but clip.mp4; name the video", tmp_path / "videos", "-o", out),
         ("is a .hyrf file already", made / "model.hyrf", "-o", tmp_path / "a.hyrf"),
@@ -363,7 +363,7 @@ def test_what_cannot_be_is_rejected_before_any_work(posed, photos, made, tmp_pat
         ("give one of them", posed, "-o", out, "--max-gaussians", 300, "--target-size", "1MB"),
         ("name a folder of photos", tmp_path / "letter.txt", "-o", out),
         ("this is one photo; name a folder of photos", posed / "images" / "0003.png", "-o", out),
-        ("'cuda:9' is not there", posed, "-o", out, "--device", "cuda:9"),
+        ("'cuda:9' is not available", posed, "-o", out, "--device", "cuda:9"),
     ):
         assert sentence in refused("make", *arguments)
     assert not out.exists() and not (tmp_path / "scene.work").exists()
@@ -433,7 +433,7 @@ def test_two_calls_in_one_work_folder_are_kept_apart(made, posed, tmp_path):
 
 
 def test_an_output_without_a_name_of_its_own_is_rejected_or_the_present_folder(made, tmp_path, monkeypatch):
-    assert "the top of all folders" in refused("make", made / "model.hyrf", "-o", "/")
+    assert "the root folder" in refused("make", made / "model.hyrf", "-o", "/")
     (tmp_path / "player").mkdir()
     monkeypatch.chdir(tmp_path / "player")
     succeeded("make", made / "model.hyrf", "-o", ".")

@@ -95,14 +95,14 @@ def test_a_panorama_from_one_place(tmp_path):
         turned = Rotation.from_euler("y", 8 * (number - 2), degrees=True).as_matrix() @ pose
         pictures.append(render_photo(turned, textures, PHOTO_SIZE, FOCAL_PIXELS))
     sentence = refused("poses", save(tmp_path / "photos", pictures), "-o", tmp_path / "scene")
-    assert "all taken from one place" in sentence and "a step to the side" in sentence
+    assert "all photos were taken from one place" in sentence and "a step to the side" in sentence
 
 
 def test_masks_that_fit_nothing(taken, tmp_path):
     (tmp_path / "masks").mkdir()
     for name in ("one", "two"):
         Image.new("L", PHOTO_SIZE, 255).save(tmp_path / "masks" / f"{name}.png")
-    with pytest.raises(hyrfpack.HyrfDataError, match="no mask is named as a photo is"):
+    with pytest.raises(hyrfpack.HyrfDataError, match="no mask has the name of a photo"):
         hyrfpack.estimate_poses(taken[0], tmp_path / "scene", masks=tmp_path / "masks")
 
 
@@ -111,4 +111,4 @@ def test_a_scene_that_cannot_be_made(taken, tmp_path):
     assert "this is a file" in refused("poses", taken[0], "-o", tmp_path / "file")
     shutil.copytree(taken[0], tmp_path / "scene" / "images")
     (tmp_path / "scene" / "images" / "other.png").touch()
-    assert "not of these photos" in refused("poses", taken[0], "-o", tmp_path / "scene")
+    assert "do not belong to these photos" in refused("poses", taken[0], "-o", tmp_path / "scene")

@@ -231,7 +231,7 @@ def test_a_file_of_sound_alone_is_rejected(tmp_path):
         frame.sample_rate = 8000
         container.mux(stream.encode(frame))
         container.mux(stream.encode())
-    assert "no pictures" in refusal(tmp_path / "sound.wav", tmp_path / "frames")
+    assert "no video stream" in refusal(tmp_path / "sound.wav", tmp_path / "frames")
 
 
 def test_without_pyav_the_sentence_names_it(tmp_path, monkeypatch):

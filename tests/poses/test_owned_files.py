@@ -95,7 +95,7 @@ def test_other_photos_take_the_place_of_those_that_we_put_there_and_of_no_others
     finished(tmp_path / "others", tmp_path / "scene", overwrite=True)
     assert same_bytes(images / "0.png", tmp_path / "others" / "0.png")
     Image.new("RGB", (30, 20)).save(images / "mine.png")
-    with pytest.raises(hyrfpack.HyrfError, match="not of these photos"):
+    with pytest.raises(hyrfpack.HyrfError, match="do not belong to these photos"):
         hyrfpack.estimate_poses(tmp_path / "photos", tmp_path / "scene", overwrite=True)
     assert pictures(images) == ["0.png", "1.png", "2.png", "3.png", "mine.png"]
 
@@ -206,7 +206,7 @@ def test_masks_that_lie_there_are_not_taken_for_those_that_were_named(tmp_path):
     for folder, level in (("named", 255), ("scene/masks", 0)):
         (tmp_path / folder).mkdir(parents=True)
         Image.new("L", (30, 20), level).save(tmp_path / folder / "0.png")
-    with pytest.raises(hyrfpack.HyrfError, match="masks: there are files that are not of these photos"):
+    with pytest.raises(hyrfpack.HyrfError, match="masks: the folder holds files that do not belong to these photos"):
         hyrfpack.estimate_poses(tmp_path / "photos", tmp_path / "scene", masks=tmp_path / "named")
     shutil.rmtree(tmp_path / "scene" / "masks")
     finished(tmp_path / "photos", tmp_path / "scene", masks=tmp_path / "named")

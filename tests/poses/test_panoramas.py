@@ -43,7 +43,9 @@ def test_panoramas_are_not_cut_among_the_photos_of_others(panoramas, tmp_path):
     folder, _ = panoramas
     (tmp_path / "scene").mkdir()
     (tmp_path / "scene" / "images").symlink_to(folder, target_is_directory=True)
-    with pytest.raises(hyrfpack.HyrfDataError, match="shows all around and cannot be cut into photos where it is"):
+    with pytest.raises(
+        hyrfpack.HyrfDataError, match="is a panorama, which cannot be cut into photos in its own folder"
+    ):
         hyrfpack.estimate_poses(tmp_path / "scene", tmp_path / "scene")
 
 

@@ -70,7 +70,7 @@ def decode_channel(data: memoryview, classes: np.ndarray) -> tuple[np.ndarray, m
         or weight > 16
         or kinds <= int(classes.max(initial=0))
     ):
-        raise DamagedDataError("a channel's header says what cannot be; it is damaged")
+        raise DamagedDataError("a channel's header has impossible values; it is damaged")
     steps = decode_step(np.frombuffer(data[_HEADER_STRUCT.size : start], np.uint8))
     residuals = decode_integers(data[start : start + size], len(classes), classes, signed=True)
     # Encoders stay within 2 MAX_ABS_CHANNEL_VALUE; sums of far larger differences could overflow.

@@ -70,7 +70,10 @@ def decode(data: bytes, name: str) -> Splats:
         )
     rest = [f"f_rest_{index}" for index in range(len(properties_by_element.get("sh", {})))]
     if len(rest) not in (0, 9, 24, 45):
-        raise HyrfDataError(f"{name}: {len(rest)} properties of its element 'sh' fit no degree", fix="9, 24 or 45 do")
+        raise HyrfDataError(
+            f"{name}: the element 'sh' has {len(rest)} properties, but a degree of harmonics needs 9, 24 or 45",
+            fix="export it again",
+        )
     _require_properties(properties_by_element, "sh", rest, "u1", name)
     if header.order == "=":
         raise HyrfDataError(f"{name}: a compressed PLY file in text cannot be read", fix="export it as a binary one")
@@ -80,7 +83,7 @@ def decode(data: bytes, name: str) -> Splats:
     if len(chunk) != -(-count // _GAUSSIANS_PER_CHUNK) or (rest and len(rows["sh"]) != count):
         raise HyrfDataError(
             f"{name}: {len(chunk):,} chunks do not fit {count:,} Gaussians, {_GAUSSIANS_PER_CHUNK} each",
-            fix="the file is damaged",
+            fix="the file is damaged, export it again",
         )
     color_and_opacity = _unpack_fractions(vertex["packed_color"], (24, 16, 8, 0), (8, 8, 8, 8))
     harmonics = np.empty((count, len(rest) // 3 + 1, 3), np.float32)

@@ -70,7 +70,7 @@ def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
         HyrfDataError: there are no splats, or they do not fit into float32 or into 4 GiB.
     """
     if not len(splats):
-        raise HyrfDataError("there is no Gaussian, and glTF has no form for nothing", fix="export at least one")
+        raise HyrfDataError("there are no Gaussians, and glTF cannot represent an empty set", fix="export at least one")
     origin, turn = local_origin(splats.positions), upright_rotation(hints.up, np.array(GLTF_UP))
     attributes = {"POSITION": local_positions(splats, origin)}
     attributes["COLOR_0"] = linear_colors(splats)
@@ -209,11 +209,17 @@ def _read_chunks(data: bytes, name: str) -> tuple[dict[str, Any], memoryview]:
     offset = _HEADER_STRUCT.size
     while offset < len(data):
         if offset + _CHUNK_HEADER_STRUCT.size > len(data):
-            raise HyrfDataError(f"{name}: it ends within the head of a chunk", fix="the file is damaged")
+            raise HyrfDataError(
+                f"{name}: it ends within the head of a chunk",
+                fix="the file is damaged, export it again",
+            )
         size, kind = _CHUNK_HEADER_STRUCT.unpack_from(data, offset)
         offset += _CHUNK_HEADER_STRUCT.size
         if offset + size > len(data):
-            raise HyrfDataError(f"{name}: a chunk of {size:,} bytes goes past the end", fix="the file is damaged")
+            raise HyrfDataError(
+                f"{name}: a chunk of {size:,} bytes goes past the end",
+                fix="the file is damaged, export it again",
+            )
         chunks.setdefault(kind, memoryview(data)[offset : offset + size])
         offset += size
     try:
@@ -221,10 +227,10 @@ def _read_chunks(data: bytes, name: str) -> tuple[dict[str, Any], memoryview]:
     except (ValueError, RecursionError) as error:
         raise HyrfDataError(
             f"{name}: its JSON cannot be read ({str(error):.120})",
-            fix="the file is damaged",
+            fix="the file is damaged, export it again",
         ) from error
     if not isinstance(content, dict):
-        raise HyrfDataError(f"{name}: its JSON is not an object", fix="the file is damaged")
+        raise HyrfDataError(f"{name}: its JSON is not an object", fix="the file is damaged, export it again")
     return content, chunks.get(_BINARY_CHUNK_TYPE, memoryview(b""))
 
 
@@ -277,8 +283,8 @@ def _read_primitive(content: dict[str, Any], binary: memoryview, primitive: dict
     positions, scales = read("POSITION", 3), read(f"{SPLATTING_EXTENSION}:SCALE", 3)
     if (scales < 0).any():
         raise HyrfDataError(
-            f"{name}: there are negative scales, for it follows a draft with logarithms",
-            fix="export it again",
+            f"{name}: the file follows a draft of the format, with negative (logarithmic) scales",
+            fix="export it again with a newer program",
         )
     quats, opacities = (
         read(f"{SPLATTING_EXTENSION}:ROTATION", 4)[:, [3, 0, 1, 2]],
@@ -293,11 +299,17 @@ def _read_primitive(content: dict[str, Any], binary: memoryview, primitive: dict
 def _read_accessor(content: dict[str, Any], binary: memoryview, accessor: dict, width: int, name: str) -> np.ndarray:
     """Read an accessor as (count, width) float32; integers are normalised where the accessor says so."""
     if "sparse" in accessor or "bufferView" not in accessor:
-        raise HyrfDataError(f"{name}: sparse or absent data is not read", fix="export it plainly")
+        raise HyrfDataError(
+            f"{name}: sparse or missing data is not supported",
+            fix="export it without sparse accessors",
+        )
     view = _get_item(content, "bufferViews", accessor["bufferView"])
     buffer = _get_item(content, "buffers", view["buffer"])
     if integer(view["buffer"]) != 0 or "uri" in buffer or view.get("extensions"):
-        raise HyrfDataError(f"{name}: only plain data within the .glb file is read", fix="pack it into one file")
+        raise HyrfDataError(
+            f"{name}: only uncompressed data inside the .glb file is supported",
+            fix="export it again as one .glb file without compression",
+        )
     dtype = np.dtype(_DTYPE_BY_COMPONENT_TYPE[accessor["componentType"]])
     count, size = integer(accessor["count"]), width * dtype.itemsize
     start, length = integer(view.get("byteOffset", 0)), integer(view["byteLength"])
@@ -309,7 +321,10 @@ def _read_accessor(content: dict[str, Any], binary: memoryview, accessor: dict, 
         )
     within = min(start, length, offset, count) >= 0 and start + length <= len(binary) and stride >= size
     if not within or (count and offset + stride * (count - 1) + size > length):
-        raise HyrfDataError(f"{name}: an attribute goes past the end of the data", fix="the file is damaged")
+        raise HyrfDataError(
+            f"{name}: an attribute goes past the end of the data",
+            fix="the file is damaged, export it again",
+        )
     dtype = dtype.newbyteorder("<")
     values = np.ndarray((count, width), dtype, binary, start + offset, (stride, dtype.itemsize))
     if accessor.get("normalized") is True and dtype.kind in "iu":

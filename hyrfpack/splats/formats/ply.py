@@ -49,8 +49,8 @@ def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
     """
     if np.abs(splats.positions).max(initial=0) > np.finfo(np.float32).max:
         raise HyrfDataError(
-            "a Gaussian lies farther from the origin than PLY's numbers reach",
-            fix="move the scene there",
+            "a Gaussian is farther from the origin than the numbers of PLY can express",
+            fix="move the scene to the origin",
         )
     rest = 3 * (num_sh_bases(splats.degree) - 1)
     names = (
@@ -108,7 +108,7 @@ def decode_plain(data: bytes, name: str) -> Splats:
     if missing:
         shown = ", ".join(missing[:4]) + (f" and {len(missing) - 4} more" if len(missing) > 4 else "")
         raise HyrfDataError(
-            f"{name}: this PLY file holds no Gaussians, for its vertices have no {shown}",
+            f"{name}: this PLY file holds no Gaussians, because its vertices have no {shown}",
             fix="give one that a program for 3D Gaussian Splatting wrote",
         )
     rest = sum(label.startswith("f_rest_") for label in properties)
@@ -119,8 +119,9 @@ def decode_plain(data: bytes, name: str) -> Splats:
         or not all(properties.get(label) for label in _higher_harmonics_properties(rest))
     ):
         raise HyrfDataError(
-            f"{name}: {rest} properties f_rest_ fit no degree of harmonics",
-            fix="0, 9, 24, 45 or 72 of them do, counted from 0",
+            f"{name}: the file has {rest} properties f_rest_, but a degree of harmonics needs 0, 9, 24, 45 or 72, "
+            "numbered from 0",
+            fix="export it again",
         )
     rows = read_elements(data, header, {"vertex"}, name)["vertex"]
     harmonics = np.empty((len(rows), min(terms, num_sh_bases(MAX_DEGREE)), 3), np.float32)

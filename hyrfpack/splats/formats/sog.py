@@ -201,7 +201,7 @@ def decode_files(files: Mapping[str, bytes], name: str) -> Splats:
     if type(count) is not int or not 0 <= count <= min(_MAX_GAUSSIANS, size + _MAX_GAUSSIANS_WITHOUT_BYTES):
         raise HyrfDataError(
             f"{name}: {META_NAME} gives {count!r:.40} as count of Gaussians in {size:,} bytes",
-            fix="damaged",
+            fix="the file is damaged, export it again",
         )
 
     def pixels(group: str, number: int = 0) -> np.ndarray:
@@ -213,7 +213,7 @@ def decode_files(files: Mapping[str, bytes], name: str) -> Splats:
         if len(picture) < count:
             raise HyrfDataError(
                 f"{name}: {file} has {len(picture):,} pixels for {count:,} Gaussians",
-                fix="it is damaged",
+                fix="the file is damaged, export it again",
             )
         return picture[:count]
 
@@ -230,8 +230,8 @@ def decode_files(files: Mapping[str, bytes], name: str) -> Splats:
         labels = pixels("shN", 1)[:, :2] @ np.array((1, 256))
         if labels.max(initial=0) >= len(palette):
             raise HyrfDataError(
-                f"{name}: a label names row {labels.max()} of {len(palette)}",
-                fix="shN_labels is damaged",
+                f"{name}: shN_labels refers to row {labels.max()} of a palette with {len(palette)} rows",
+                fix="the file is damaged, export it again",
             )
         harmonics = np.concatenate((harmonics, palette[labels]), axis=1)
     quats = _unpack_quats(pixels("quats"), name)
@@ -298,7 +298,10 @@ def _read_palette(meta: dict, files: Mapping[str, bytes], name: str) -> np.ndarr
     picture = _read_picture(_get_file(files, file, name), _MAX_PALETTE_ROWS * 15, f"{name}: {file}")[..., :3]
     height, width, _ = picture.shape
     if width not in (64 * 3, 64 * 8, 64 * 15) or height * _PALETTE_ROWS_PER_PICTURE_ROW > _MAX_PALETTE_ROWS:
-        raise HyrfDataError(f"{name}: {file} is {width} x {height}, no palette of degree 1 to 3", fix="it is damaged")
+        raise HyrfDataError(
+            f"{name}: {file} is {width} x {height}, no palette of degree 1 to 3",
+            fix="the file is damaged, export it again",
+        )
     return _look_up_codebook(meta, "shN", picture.reshape(height * _PALETTE_ROWS_PER_PICTURE_ROW, -1, 3), name)
 
 
@@ -314,7 +317,7 @@ def _unpack_quats(packed: np.ndarray, name: str) -> np.ndarray:
     if tags.min(initial=255) < 252:
         raise HyrfDataError(
             f"{name}: a rotation has the tag {tags.min()}, not 252 to 255",
-            fix="its picture is damaged",
+            fix="the file is damaged, export it again",
         )
     return restore_largest(tags - 252, (packed[:, :3] / 127.5 - 1) * math.sqrt(0.5))
 
@@ -335,7 +338,10 @@ def _read_picture(data: bytes, max_pixels: int, name: str) -> np.ndarray:
                 # The size is checked before the pixels are decoded.
                 if picture.width * picture.height > max_pixels or picture.mode not in ("RGB", "RGBA"):
                     found = f"{picture.width} x {picture.height} pixels of {picture.mode}"
-                    raise HyrfDataError(f"{name} has {found}, not RGB or too many", fix="it is damaged")
+                    raise HyrfDataError(
+                        f"{name} has {found}, but must be RGB and not larger than needed",
+                        fix="the file is damaged, export it again",
+                    )
                 return np.asarray(picture.convert("RGBA"))
     except HyrfDataError:
         raise
@@ -346,10 +352,13 @@ def _read_picture(data: bytes, max_pixels: int, name: str) -> np.ndarray:
 def _find_member(archive: zipfile.ZipFile, file: str, bytes_left: int, name: str) -> zipfile.ZipInfo:
     """Find a file in the zip and check that it has at most `bytes_left` bytes and a method that unpacks in pieces."""
     if file not in archive.NameToInfo:
-        raise HyrfDataError(f"{name}: the zip has no {file}", fix="it is not a SOG, or damaged")
+        raise HyrfDataError(f"{name}: the zip has no {file}, so that it is damaged or not a SOG", fix="export it again")
     member = archive.getinfo(file)
     if member.file_size > bytes_left:
-        raise HyrfDataError(f"{name}: {file} unpacks to {member.file_size:,} bytes, far too many", fix="it is damaged")
+        raise HyrfDataError(
+            f"{name}: {file} unpacks to {member.file_size:,} bytes, far too many",
+            fix="the file is damaged, export it again",
+        )
     # Other methods ignore the declared size when they unpack.
     if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise HyrfDataError(
@@ -369,17 +378,20 @@ def _get_file(files: Mapping[str, bytes], file: str, name: str) -> bytes:
 def _parse_meta(data: bytes, name: str) -> dict:
     """Parse a meta.json of version 2."""
     if len(data) > _MAX_META_BYTES:
-        raise HyrfDataError(f"{name}: {META_NAME} has {len(data):,} bytes, far too many", fix="it is damaged")
+        raise HyrfDataError(
+            f"{name}: {META_NAME} has {len(data):,} bytes, far too many",
+            fix="the file is damaged, export it again",
+        )
     try:
         meta = json.loads(data)
     except (ValueError, RecursionError) as error:
         raise HyrfDataError(f"{name}: {META_NAME} is not JSON ({error})", fix="get the file again") from error
     if not isinstance(meta, dict):
-        raise HyrfDataError(f"{name}: {META_NAME} holds no SOG", fix="it is damaged")
+        raise HyrfDataError(f"{name}: {META_NAME} does not describe a SOG", fix="the file is damaged, export it again")
     version = meta.get("version", 1)  # files of version 1 lack the key
     if version != 2:
         raise HyrfDataError(
-            f"{name}: this is SOG version {version!r:.40} and 2 is read",
+            f"{name}: this is SOG version {version!r:.40}, but only version 2 can be read",
             fix="convert it with splat-transform",
         )
     return meta
@@ -400,7 +412,7 @@ def _get_picture_name(meta: dict, group: str, number: int, name: str) -> str:
     if not isinstance(file, str) or not file.isprintable() or file in ("", "..") or set(file) & set("/\\:"):
         raise HyrfDataError(
             f"{name}: {META_NAME} names {file!r:.80} as picture {number + 1} of {group}",
-            fix="it is damaged",
+            fix="the file is damaged, export it again",
         )
     return file
 
@@ -412,7 +424,10 @@ def _get_floats(meta: dict, group: str, key: str, name: str, length: int) -> np.
     is_first_missing = length == _CODEBOOK_ENTRIES and values[0] is None  # as some old writers leave it
     # Numbers beyond float32 are as useless here as infinite ones.
     if not all(type(value) in (int, float) and abs(value) < 1e38 for value in values[is_first_missing:]):
-        raise HyrfDataError(f"{name}: {META_NAME} needs {length} finite numbers as {group}.{key}", fix="it is damaged")
+        raise HyrfDataError(
+            f"{name}: {META_NAME} needs {length} finite numbers as {group}.{key}",
+            fix="the file is damaged, export it again",
+        )
     if is_first_missing:
         values[0] = values[1] + (values[1] - values[-1]) / 255  # the value that PlayCanvas restores
     return np.array(values, np.float64)

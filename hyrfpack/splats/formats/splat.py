@@ -33,8 +33,8 @@ def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
     """
     if np.abs(splats.positions).max(initial=0) > np.finfo(np.float32).max:
         raise HyrfDataError(
-            "a Gaussian lies farther from the origin than .splat's numbers reach",
-            fix="move the scene there",
+            "a Gaussian is farther from the origin than the numbers of .splat can express",
+            fix="move the scene to the origin",
         )
     order = np.argsort(-splats.opacities * np.prod(splats.scales, axis=1, dtype=np.float64), kind="stable")
     colors = splats.base_colors
@@ -58,12 +58,16 @@ def decode(data: bytes, name: str) -> Splats:
     """
     if len(data) % _RECORD_DTYPE.itemsize:
         raise HyrfDataError(
-            f"{name}: {len(data):,} bytes are not a whole number of Gaussians of 32 bytes",
-            fix="this is not a .splat file, or it is truncated",
+            f"{name}: {len(data):,} bytes are not a multiple of 32, the bytes of one Gaussian, so this is not a "
+            ".splat file or it is truncated",
+            fix="check the path, or export it again",
         )
     records = np.frombuffer(data, _RECORD_DTYPE)
     if (records["scale"] < 0).any():
-        raise HyrfDataError(f"{name}: a scale is negative", fix="this is not a .splat file, or it is damaged")
+        raise HyrfDataError(
+            f"{name}: a scale is negative, so this is not a .splat file or it is damaged",
+            fix="check the path, or export it again",
+        )
     colors = records["color"] / np.float32(255)
     return build_valid_splats(
         name,

@@ -143,7 +143,7 @@ def decode(data: bytes, name: str) -> Splats:
         unpacked = _read_streams(data, name)
     else:
         raise HyrfDataError(
-            f"{name}: this is not an SPZ file, because it starts with neither gzip's nor SPZ's own mark",
+            f"{name}: this is not an SPZ file, because it starts with the signature of neither gzip nor SPZ",
             fix="check the path",
         )
     version, degree, bits, flags, sections = unpacked
@@ -196,9 +196,9 @@ def _read_header(header: bytes, versions: range, stored: int, name: str) -> tupl
         )
     if degree > _MAX_FILE_DEGREE or bits > 31:
         raise HyrfDataError(
-            f"{name}: its header says harmonics of degree {degree} and {bits} fractional bits, and 4 and 31 are the "
-            "most",
-            fix="the file is damaged",
+            f"{name}: the header says harmonics of degree {degree} and {bits} fractional bits, but the limits are 4 "
+            "and 31",
+            fix="the file is damaged, export it again",
         )
     if flags & _LOD_TREE_FLAG:
         raise HyrfDataError(
@@ -209,7 +209,7 @@ def _read_header(header: bytes, versions: range, stored: int, name: str) -> tupl
     if length > _UNCHECKED_CONTENT_BYTES and length > _MAX_COMPRESSION_RATIO * stored:
         raise HyrfDataError(
             f"{name}: its header says {count:,} Gaussians, far more than {stored:,} bytes can hold",
-            fix="the file is damaged",
+            fix="the file is damaged, export it again",
         )
     return version, count, degree, bits, flags
 
@@ -246,7 +246,10 @@ def _read_gzip(data: bytes, name: str) -> _UnpackedFile:
     try:
         header = stream.decompress(data, _HEADER_STRUCT.size)
         if len(header) < _HEADER_STRUCT.size:
-            raise HyrfDataError(f"{name}: the file ends within its header", fix="it is truncated")
+            raise HyrfDataError(
+                f"{name}: the file ends within its header",
+                fix="the file is truncated, export it again",
+            )
         version, count, degree, bits, flags = _read_header(header, range(1, 4), len(data), name)
         lengths = _section_lengths(version, count, degree)
         content = stream.decompress(stream.unconsumed_tail, sum(lengths) + 1)
@@ -254,9 +257,15 @@ def _read_gzip(data: bytes, name: str) -> _UnpackedFile:
         raise HyrfDataError(f"{name}: its gzip stream is damaged ({error})", fix="fetch or export it again") from error
     has_more = len(content) > sum(lengths)
     if len(content) < sum(lengths) or not (stream.eof or has_more):
-        raise HyrfDataError(f"{name}: the file ends before its {count:,} Gaussians do", fix="it is truncated")
+        raise HyrfDataError(
+            f"{name}: the file ends before its {count:,} Gaussians do",
+            fix="the file is truncated, export it again",
+        )
     if has_more and not flags & _EXTENSIONS_FLAG:
-        raise HyrfDataError(f"{name}: the file goes on after its {count:,} Gaussians", fix="it is damaged")
+        raise HyrfDataError(
+            f"{name}: the file goes on after its {count:,} Gaussians",
+            fix="the file is damaged, export it again",
+        )
     ends = np.cumsum([0, *lengths])
     sections = [content[start:end] for start, end in zip(ends[:-1], ends[1:], strict=True)]
     return version, degree, bits, flags, sections
@@ -265,7 +274,7 @@ def _read_gzip(data: bytes, name: str) -> _UnpackedFile:
 def _read_streams(data: bytes, name: str) -> _UnpackedFile:
     """Read the sections of a file of version 4."""
     if len(data) < _HEADER_STRUCT.size + _TABLE_OFFSET_STRUCT.size:
-        raise HyrfDataError(f"{name}: the file ends within its header", fix="it is truncated")
+        raise HyrfDataError(f"{name}: the file ends within its header", fix="the file is truncated, export it again")
     version, count, degree, bits, flags = _read_header(data[: _HEADER_STRUCT.size], range(4, 5), len(data), name)
     streams = data[_HEADER_STRUCT.size - 1]
     (table,) = _TABLE_OFFSET_STRUCT.unpack_from(data, _HEADER_STRUCT.size)
@@ -273,21 +282,27 @@ def _read_streams(data: bytes, name: str) -> _UnpackedFile:
     if streams != sum(length > 0 for length in lengths):
         raise HyrfDataError(
             f"{name}: {streams} streams do not fit harmonics of degree {degree} and {count:,} Gaussians",
-            fix="the file is damaged",
+            fix="the file is damaged, export it again",
         )
     place = table + streams * _STREAM_LENGTHS_STRUCT.size
     if table < _HEADER_STRUCT.size + _TABLE_OFFSET_STRUCT.size or place > len(data):
-        raise HyrfDataError(f"{name}: its table of contents lies outside of the file", fix="it is damaged or truncated")
+        raise HyrfDataError(
+            f"{name}: its table of contents lies outside of the file",
+            fix="the file is damaged or truncated, export it again",
+        )
     sections, entries = [], _STREAM_LENGTHS_STRUCT.iter_unpack(data[table:place])
     for length in lengths:
         stored, raw = next(entries) if length else (0, 0)
         if raw != length:
             raise HyrfDataError(
-                f"{name}: a stream of {raw:,} bytes stands where {count:,} Gaussians need {length:,}",
-                fix="the file is damaged",
+                f"{name}: a stream has {raw:,} bytes, but {count:,} Gaussians need {length:,}",
+                fix="the file is damaged, export it again",
             )
         if stored > len(data) - place:
-            raise HyrfDataError(f"{name}: the file ends before its {count:,} Gaussians do", fix="it is truncated")
+            raise HyrfDataError(
+                f"{name}: the file ends before its {count:,} Gaussians do",
+                fix="the file is truncated, export it again",
+            )
         sections.append(_decompress_zstd(data[place : place + stored], length, name))
         place += stored
     return version, degree, bits, flags, sections
@@ -305,7 +320,7 @@ def _decompress_zstd(stream: bytes, length: int, name: str) -> bytes:
     if len(content) != length:
         raise HyrfDataError(
             f"{name}: a zstd stream does not hold the {length:,} bytes it should",
-            fix="the file is damaged",
+            fix="the file is damaged, export it again",
         )
     return content
 

@@ -122,13 +122,16 @@ def decode(data: bytes, name: str, extension: Extension, *, upright: bool = Fals
         try:
             layer = Sdf.Layer.OpenAsAnonymous(str(path))
             if layer is None or layer.GetCompositionAssetDependencies():
-                raise HyrfDataError(f"{name}: this is not a USD file, or it needs others", fix="flatten it into one")
+                raise HyrfDataError(
+                    f"{name}: this is not a USD file, or it refers to other files",
+                    fix="flatten it into one file",
+                )
             stage = Usd.Stage.Open(layer)
             fields = [prim for prim in stage.Traverse() if prim.GetTypeName() == _SPLATS_TYPE_NAME]
             if len(fields) != 1:
                 raise HyrfDataError(
-                    f"{name}: it holds {len(fields)} {_SPLATS_TYPE_NAME}, and one is read",
-                    fix="name another file",
+                    f"{name}: the file holds {len(fields)} {_SPLATS_TYPE_NAME}, but exactly one can be read",
+                    fix="give another file",
                 )
             return _read_splats(fields[0], name, upright)
         except Tf.ErrorException as error:
@@ -230,8 +233,8 @@ def _read_splats(prim: Usd.Prim, name: str, upright: bool) -> Splats:
 
     if not 0 <= degree <= MAX_DEGREE:
         raise HyrfDataError(
-            f"{name}: harmonics of degree {degree} are not read, 0 to {MAX_DEGREE} are",
-            fix="export it so",
+            f"{name}: harmonics of degree {degree} are not supported",
+            fix=f"export it with degree 0 to {MAX_DEGREE}",
         )
     splats: dict[str, Any] = {
         "positions": read(field.GetPositionsAttr(), 3),

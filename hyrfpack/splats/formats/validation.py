@@ -41,8 +41,8 @@ def build_valid_splats(
         if not np.isfinite(values).all():
             bad = int(np.flatnonzero(~np.isfinite(values.reshape(len(values), -1)).all(axis=1))[0])
             raise HyrfDataError(
-                f"{name}: the {part} of Gaussian {bad:,} of {len(values):,} is not a finite number; the file is "
-                "damaged, or its training failed",
+                f"{name}: the {part} of Gaussian {bad:,} of {len(values):,} is not a finite number, because the file "
+                "is damaged or its training failed",
                 fix="export it again",
             )
     return Splats(positions, scales, normalized_quats(quats), opacities, harmonics, antialiased)

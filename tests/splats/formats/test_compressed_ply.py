@@ -91,7 +91,7 @@ GOOD = file_of(300, WORDS)
         (GOOD[:-1], "ends before the 300 rows of its element 'vertex'"),
         (file_of(300, WORDS, chunks=1), "1 chunks do not fit 300 Gaussians"),
         (file_of(300, WORDS, chunks=3), "3 chunks do not fit 300 Gaussians"),
-        (file_of(3, WORDS, rest=8), "8 properties of its element 'sh' fit no degree"),
+        (file_of(3, WORDS, rest=8), "the element 'sh' has 8 properties"),
         (file_of(3, WORDS, rest=9).replace(b"sh 3", b"sh 2"), "do not fit 3 Gaussians"),
         (GOOD.replace(b"binary_little_endian", b"ascii"), "in text cannot be read"),
         (GOOD.replace(np.array([0, 0, 0, 1, 2, 4], "<f4").tobytes(), np.full(6, np.nan, "<f4").tobytes()), "position"),

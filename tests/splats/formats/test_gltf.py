@@ -174,7 +174,7 @@ def test_nothing_is_refused_in_a_sentence():
         (lambda c: c["accessors"][0].update(count=41), "past the end"),
         (lambda c: c["accessors"][0].update(count=-1), "past the end"),
         (lambda c: c["accessors"][0].update(sparse={}), "sparse"),
-        (lambda c: c["buffers"][0].update(uri="a.bin"), "within the .glb"),
+        (lambda c: c["buffers"][0].update(uri="a.bin"), "inside the .glb"),
         (lambda c: c["accessors"][0].update(bufferView=-1), "do not fit together"),
         (lambda c: c["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"].pop("kernel"), "'ellipse'"),
     ],

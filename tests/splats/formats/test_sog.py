@@ -166,8 +166,8 @@ def test_a_palette_finds_separate_clusters() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"version": 1}, "version 1 and 2 is read"),
-        ({"version": 3}, "version 3 and 2 is read"),
+        ({"version": 1}, "version 1, but only version 2 can be read"),
+        ({"version": 3}, "version 3, but only version 2 can be read"),
         ({"count": 2}, "1 pixels for 2 Gaussians"),
         ({"count": 10**9}, "count of Gaussians"),
         ({"count": True}, "count of Gaussians"),

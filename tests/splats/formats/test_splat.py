@@ -72,7 +72,7 @@ def test_a_file_of_another_program_is_read_and_written_again(shared_data):
 @pytest.mark.parametrize(
     ("data", "words"),
     [
-        (bytes(33), "33 bytes are not a whole number of Gaussians"),
+        (bytes(33), "33 bytes are not a multiple of 32"),
         (struct.pack("<6f8x", 0, 0, 0, 1, -1, 1), "a scale is negative"),
         (struct.pack("<6f8x", 0, np.inf, 0, 1, 1, 1), "the position of Gaussian 0 of 1 is not a finite number"),
         (bytes(32) + struct.pack("<6f8x", 0, 0, 0, 1, np.nan, 1), "the scale of Gaussian 1 of 2"),

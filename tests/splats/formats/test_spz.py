@@ -197,7 +197,7 @@ GOOD = {version: file_of(sections_of_one(version), version) for version in (3, 4
         (gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 5, 1, 0, 8, 0, 0)), "this is SPZ version 5"),
         (file_of([*sections_of_one(3), b"!"], 3), "goes on after its 1 Gaussians"),
         (file_of(sections_of_one(3), 3, count=2), "before its 2 Gaussians do"),
-        (file_of(sections_of_one(4), 4, count=2), "a stream of 9 bytes stands where 2 Gaussians need 18"),
+        (file_of(sections_of_one(4), 4, count=2), "a stream has 9 bytes, but 2 Gaussians need 18"),
         (file_of(sections_of_one(4), 4, degree=1), "5 streams do not fit harmonics of degree 1"),
         (file_of(sections_of_one(3), 3, degree=5), "harmonics of degree 5"),
         (file_of(sections_of_one(3), 3, bits=40), "40 fractional bits"),

@@ -145,7 +145,7 @@ def test_what_is_no_usd_is_refused_in_a_sentence(pxr, extension):
         ("float[] opacities = [", "float[] opacities = [0.5, ", "different lengths"),
         ("sphericalHarmonicsDegree = 0", "sphericalHarmonicsDegree = 9", "degree 9"),
         ("float[] opacities = [", "float[] opacities = [7", "opacities"),
-        ('def Xform "World" (', 'def Xform "World" (references = @other.usda@', "needs others"),
+        ('def Xform "World" (', 'def Xform "World" (references = @other.usda@', "refers to other files"),
         ("ParticleField3DGaussianSplat", "Xform", "holds 0"),
     ],
 )

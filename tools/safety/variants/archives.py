@@ -30,7 +30,7 @@ def variants() -> Iterator[Variant]:
         "outside its folder",
     )
     yield Variant("zip: a link", lambda s: _zip_set(s, before=_add_link), "holds a link")
-    yield Variant("zip: a bomb", lambda s: _zip_set(s, before=_add_bomb), "no likely set")
+    yield Variant("zip: a bomb", lambda s: _zip_set(s, before=_add_bomb), "unlikely for a set")
     yield Variant("zip: encrypted", lambda s: _set_encrypted_flags(_zip_set(s)), "encrypted")
     yield Variant("zip: cut", lambda s: _truncate(_zip_set(s)), "damaged")
     yield Variant("zip: a byte is wrong", lambda s: _change_byte(_zip_set(s)), "damaged|cannot|ends after|not a")

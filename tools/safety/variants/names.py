@@ -128,7 +128,7 @@ def variants() -> Iterator[Variant]:
             _add_black_pictures(s, ".webp"),
             s.rename_in_poses(lambda n: f"{PurePosixPath(n).stem}.jpg"),
         ),
-        "is unclear",
+        "cannot be assigned",
         layouts=("colmap",),
     )
     yield Variant("names: a copy beside each", lambda s: _add_black_pictures(s, ".webp"))
