@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 import torch
 from fake_gpu import listen_to_gpu, use_fake_gpu
-from ops.device import INTERPRETED, needs_triton
+from ops.device import IS_INTERPRETED, needs_triton
 from scenes import ball_scene
 from torch import Tensor
 
@@ -25,7 +25,7 @@ from hyrfpack.train import DensityConfig, TrainConfig, Trainer
 
 pytestmark = [
     needs_triton,
-    pytest.mark.skipif(not INTERPRETED, reason="kernels are built for the GPU that is there"),
+    pytest.mark.skipif(not IS_INTERPRETED, reason="kernels are built for the GPU that is there"),
 ]
 
 PACKAGE_FOLDER = Path(hyrfpack.__file__).parent

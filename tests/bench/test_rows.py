@@ -23,5 +23,5 @@ from hyrfpack.bench.rows import format_value
         ("raw", "raw"),
     ],
 )
-def test_values_in_words(value, words):
+def test_values_are_formatted_for_reading(value, words):
     assert format_value(value) == words

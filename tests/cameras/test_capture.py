@@ -25,12 +25,12 @@ from hyrfpack.errors import HyrfDataError
 from hyrfpack.scene import Camera, evenly_spaced
 
 
-def facts(**provenance) -> dict:
-    """What is said of a file with a provenance."""
+def make_description(**provenance) -> dict:
+    """Return the description of a file with this provenance."""
     return {"provenance": provenance, "config": {"frame": {"center": [0.0, 0.0, 0.0], "scale": 1.0}}}
 
 
-def test_files_keep_the_layout_that_they_have_always_had():
+def test_the_stored_layout_has_not_changed_since_earlier_versions():
     pose = [[0.0, 0.0, 1.0, 12345678.1234567], [0.0, 1.0, 0.0, 1 / 3], [-1.0, 0.0, 0.0, -2.0]]
     row = [800, 600, 700.123457, 650.0, 400.5, 300.0, 0.0, 0.0, 1.0, 12345678.123457]
     row += [0.0, 1.0, 0.0, 0.333333333, -1.0, 0.0, 0.0, -2.0]
@@ -39,37 +39,39 @@ def test_files_keep_the_layout_that_they_have_always_had():
     )
 
 
-def test_what_a_model_keeps_of_a_scene_comes_back():
+def test_the_capture_stored_with_a_model_is_read_back():
     scene = replace(ball_scene(5), max_size=700)
-    capture = Capture(facts(**json.loads(json.dumps(scene_provenance(scene)))))
+    capture = Capture(make_description(**json.loads(json.dumps(scene_provenance(scene)))))
     photographed = [view.camera for view in scene.train]
     assert capture.max_size == 700 and not capture.is_synthetic
     assert capture.viewpoint.to_json() == Viewpoint.from_cameras(photographed).to_json()
     assert provenance_cameras(capture.cameras) == provenance_cameras(photographed)
 
 
-def test_only_files_of_earlier_versions_say_that_they_have_a_mean_exposure():
+def test_only_files_of_earlier_versions_have_a_mean_exposure():
     assert has_mean_exposure({"mean_exposure": True}) and not has_mean_exposure(scene_provenance(ball_scene(5)))
     assert not has_mean_exposure({"mean_exposure": "yes"})
 
 
-def test_of_many_cameras_some_are_kept():
+def test_only_some_of_many_cameras_are_stored():
     assert len(provenance_cameras(ring(MAX_STORED_CAMERAS + 9))) == MAX_STORED_CAMERAS
 
 
-def test_photos_come_before_the_cameras_that_are_kept_and_these_before_an_orbit():
+def test_cameras_come_from_photos_then_from_the_file_then_from_an_orbit():
     scene, kept = ball_scene(5), {"cameras": provenance_cameras(ring(3))}
-    assert Capture(facts(**kept), scene).cameras == [view.camera for view in scene.train]
+    assert Capture(make_description(**kept), scene).cameras == [view.camera for view in scene.train]
     held_out = replace(scene, train=[], test=scene.train)
-    for capture in (Capture(facts(**kept)), Capture(facts(**kept), held_out)):
+    for capture in (Capture(make_description(**kept)), Capture(make_description(**kept), held_out)):
         assert len(capture.cameras) == 3 and not capture.is_synthetic
-    assert Capture(facts()).is_synthetic and len(Capture(facts()).cameras) == FALLBACK_ORBIT_CAMERAS
-    assert not Capture(facts(), scene).is_synthetic
+    assert (
+        Capture(make_description()).is_synthetic and len(Capture(make_description()).cameras) == FALLBACK_ORBIT_CAMERAS
+    )
+    assert not Capture(make_description(), scene).is_synthetic
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1.0, 250.0])
 @pytest.mark.parametrize("away", [0.0, 3e4])
-def test_coarse_cameras_stand_about_where_the_cameras_stood(scale, away):
+def test_coarse_cameras_approximate_the_original_cameras(scale, away):
     cameras = []
     for camera in ring(40):
         pose = camera.camera_from_world.copy()
@@ -83,7 +85,7 @@ def test_coarse_cameras_stand_about_where_the_cameras_stood(scale, away):
 
     kept = json.loads(json.dumps(quantized_provenance(provenance, scale)))
 
-    capture = Capture(facts(**kept))
+    capture = Capture(make_description(**kept))
     assert {*kept} == {"coarse_cameras", "viewpoint", "seed"} and capture.is_coarse and not capture.is_synthetic
     assert len(capture.cameras) == MAX_COARSE_CAMERAS and quantized_provenance(kept, scale) == kept
     for rough, exact in zip(capture.cameras, evenly_spaced(cameras, MAX_COARSE_CAMERAS), strict=True):
@@ -100,26 +102,26 @@ def test_coarse_cameras_take_about_30_bytes_each():
     assert len(zlib.compress(json.dumps(kept["coarse_cameras"]).encode(), 9)) < 45 * MAX_COARSE_CAMERAS
 
 
-def test_cameras_and_viewpoints_that_make_no_sense_are_left_out():
+def test_invalid_cameras_and_viewpoints_are_omitted():
     assert quantized_provenance({"cameras": [[1, 2]], "viewpoint": 7, "steps": 5}, 1.0) == {"viewpoint": 7, "steps": 5}
     assert quantized_provenance({"cameras": "none", "seed": 1}, 1.0) == {"seed": 1}
     assert quantized_provenance({}, 1.0) == {}
 
 
-def test_exact_cameras_come_before_coarse_ones():
+def test_exact_cameras_are_preferred_to_coarse_ones():
     rough = quantized_provenance({"cameras": provenance_cameras(ring(3))}, 1.0)
-    capture = Capture(facts(cameras=provenance_cameras(ring(5)), **rough))
+    capture = Capture(make_description(cameras=provenance_cameras(ring(5)), **rough))
     assert len(capture.cameras) == 5 and not capture.is_coarse
 
 
-def test_a_viewpoint_that_is_not_asked_for_is_not_looked_at():
-    assert len(Capture(facts(cameras=provenance_cameras(ring(3)), viewpoint=7)).cameras) == 3
+def test_a_stored_viewpoint_is_read_only_when_requested():
+    assert len(Capture(make_description(cameras=provenance_cameras(ring(3)), viewpoint=7)).cameras) == 3
 
 
 @pytest.mark.parametrize("cameras", [7, [[1, 2, 3]], [[32, 32, 0, 1, 1, 1, *range(12)]], {"a": 1}])
-def test_cameras_without_sense_are_a_clear_error(cameras):
+def test_invalid_cameras_are_a_clear_error(cameras):
     with pytest.raises(HyrfDataError, match=r"cameras that the file keeps are not valid [^\n]*`data`$"):
-        _ = Capture(facts(cameras=cameras)).cameras
+        _ = Capture(make_description(cameras=cameras)).cameras
 
 
 @pytest.mark.parametrize(
@@ -138,26 +140,26 @@ def test_cameras_without_sense_are_a_clear_error(cameras):
         {"camera_from_world": (2 * np.eye(4)).tolist()},
     ],
 )
-def test_a_forged_viewpoint_is_an_error_of_the_files(change):
+def test_a_forged_viewpoint_is_an_error_about_the_file(change):
     with pytest.raises(HyrfDataError, match="viewpoint"):
-        orbit(Capture(facts(viewpoint={**Viewpoint.from_cameras(ring(3)).to_json(), **change})).viewpoint, 2)
+        orbit(Capture(make_description(viewpoint={**Viewpoint.from_cameras(ring(3)).to_json(), **change})).viewpoint, 2)
 
 
 @pytest.mark.parametrize("kind", ["all cameras", "coarse cameras"])
-def test_photos_of_training_match_what_the_model_keeps_also_with_another_split(kind):
+def test_training_photos_match_the_stored_cameras_also_with_another_split(kind):
     scene = ball_scene(20)
     kept = scene_provenance(scene)
-    capture = Capture(facts(**(kept if kind == "all cameras" else quantized_provenance(kept, 1.0))), scene)
+    capture = Capture(make_description(**(kept if kind == "all cameras" else quantized_provenance(kept, 1.0))), scene)
     assert capture.mismatch == ""
     half = replace(scene, train=scene.test, test=scene.train[::2])
     assert replace(capture, scene=half).mismatch == ""
 
 
 @pytest.mark.parametrize("kind", ["all cameras", "coarse cameras"])
-def test_photos_of_another_scene_or_in_another_frame_do_not_match_what_the_model_keeps(kind):
+def test_photos_of_another_scene_or_frame_do_not_match_the_stored_cameras(kind):
     scene = ball_scene(20)
     kept = scene_provenance(scene)
-    model = facts(**(kept if kind == "all cameras" else quantized_provenance(kept, 1.0)))
+    model = make_description(**(kept if kind == "all cameras" else quantized_provenance(kept, 1.0)))
     moved_world, turned_world = np.eye(4), np.diag([-1.0, 1.0, -1.0, 1.0])
     moved_world[0, 3] = 0.5
     for change in (moved_world, turned_world):
@@ -169,15 +171,15 @@ def test_photos_of_another_scene_or_in_another_frame_do_not_match_what_the_model
         assert sentence.startswith("other: of the ") and "another coordinate frame; name the photos" in sentence
 
 
-def test_one_camera_that_two_sets_share_by_chance_does_not_make_them_match():
+def test_one_common_camera_is_not_enough_for_a_match():
     scene, other = ball_scene(20), ball_scene(20, offset=(40.0, 0.0, 0.0))
     other.train[3] = replace(other.train[3], camera=scene.train[3].camera)
-    sentence = Capture(facts(**scene_provenance(scene)), other).mismatch
+    sentence = Capture(make_description(**scene_provenance(scene)), other).mismatch
     assert f"of the {len(scene.train)} cameras that the model keeps of its training, 1 is among" in sentence
 
 
 def test_without_photos_or_kept_cameras_there_is_no_mismatch():
     scene = ball_scene(5)
-    assert Capture(facts(**scene_provenance(scene))).mismatch == ""
-    assert Capture(facts(), scene).mismatch == ""
-    assert Capture(facts(cameras=[["damaged"]]), scene).mismatch == ""
+    assert Capture(make_description(**scene_provenance(scene))).mismatch == ""
+    assert Capture(make_description(), scene).mismatch == ""
+    assert Capture(make_description(cameras=[["damaged"]]), scene).mismatch == ""

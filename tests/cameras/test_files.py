@@ -21,7 +21,7 @@ from hyrfpack.cameras.files import (
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.scene import Camera
 
-POSE = [[1.0, 0.0, 0.0, 0.5], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 4.0], [0.0, 0.0, 0.0, 1.0]]
+POSE_ROWS = [[1.0, 0.0, 0.0, 0.5], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 4.0], [0.0, 0.0, 0.0, 1.0]]
 
 
 def test_cameras_survive_json_exactly(tmp_path):
@@ -81,8 +81,8 @@ def test_transforms_json_takes_the_angle_and_intrinsics_of_one_frame(tmp_path):
     assert (second.width, second.intrinsics) == (60, (70, 71, 3, 4))
 
 
-def test_cameras_of_3dgs_training_are_turned_into_ours(tmp_path):
-    """It writes where a camera is and how it is turned; ours says where the world is, seen from there."""
+def test_cameras_of_3dgs_training_are_converted(tmp_path):
+    """3DGS stores the position and rotation of each camera; here the pose maps world to camera coordinates."""
     made = ring(5)
     items = []
     for number, camera in enumerate(made):
@@ -100,8 +100,8 @@ def test_cameras_of_3dgs_training_are_turned_into_ours(tmp_path):
         assert camera.intrinsics == (expected.fx, expected.fy, expected.width / 2, expected.height / 2)
 
 
-TURNED = {"width": 40, "height": 30, "fx": 25, "rotation": np.eye(3).tolist(), "position": [0, 0, 0]}
-GOOD = {"width": 40, "height": 30, "fx": 25, "camera_from_world": np.eye(4).tolist()}
+CAMERA_BY_ROTATION = {"width": 40, "height": 30, "fx": 25, "rotation": np.eye(3).tolist(), "position": [0, 0, 0]}
+CAMERA_BY_POSE = {"width": 40, "height": 30, "fx": 25, "camera_from_world": np.eye(4).tolist()}
 
 
 @pytest.mark.parametrize(
@@ -112,21 +112,24 @@ GOOD = {"width": 40, "height": 30, "fx": 25, "camera_from_world": np.eye(4).toli
         ('{"cameras": []}', "neither a list"),
         ("[]", "no camera"),
         ("[7]", "camera 0"),
-        (json.dumps([GOOD, {**GOOD, "fx": -1}]), "camera 1 is not valid"),
-        (json.dumps([{**GOOD, "fx": "wide"}]), "camera 0 is not valid"),
-        (json.dumps([{**GOOD, "width": 0}]), "camera 0 is not valid"),
-        (json.dumps([{**GOOD, "width": 10**7}]), "camera 0 is not valid"),
-        (json.dumps([{**GOOD, "height": 30.5}]), "camera 0 is not valid"),
-        (json.dumps([{**GOOD, "height": None}]), "camera 0 is not valid"),
-        (json.dumps([{**GOOD, "cx": math.nan}]), "camera 0 is not valid"),
-        (json.dumps([{**GOOD, "width": math.inf}]), "camera 0 is not valid"),
-        (json.dumps([{**GOOD, "camera_from_world": [1, 2]}]), "camera 0 is not valid"),
-        (json.dumps([{**GOOD, "camera_from_world": np.diag([1, 1, -1, 1]).tolist()}]), "camera 0 is not valid"),
+        (json.dumps([CAMERA_BY_POSE, {**CAMERA_BY_POSE, "fx": -1}]), "camera 1 is not valid"),
+        (json.dumps([{**CAMERA_BY_POSE, "fx": "wide"}]), "camera 0 is not valid"),
+        (json.dumps([{**CAMERA_BY_POSE, "width": 0}]), "camera 0 is not valid"),
+        (json.dumps([{**CAMERA_BY_POSE, "width": 10**7}]), "camera 0 is not valid"),
+        (json.dumps([{**CAMERA_BY_POSE, "height": 30.5}]), "camera 0 is not valid"),
+        (json.dumps([{**CAMERA_BY_POSE, "height": None}]), "camera 0 is not valid"),
+        (json.dumps([{**CAMERA_BY_POSE, "cx": math.nan}]), "camera 0 is not valid"),
+        (json.dumps([{**CAMERA_BY_POSE, "width": math.inf}]), "camera 0 is not valid"),
+        (json.dumps([{**CAMERA_BY_POSE, "camera_from_world": [1, 2]}]), "camera 0 is not valid"),
+        (
+            json.dumps([{**CAMERA_BY_POSE, "camera_from_world": np.diag([1, 1, -1, 1]).tolist()}]),
+            "camera 0 is not valid",
+        ),
         (json.dumps([{"width": 3}]), "camera 0 has no"),
-        (json.dumps([TURNED, {**TURNED, "position": [0, 0]}]), "camera 1 is not valid"),
-        (json.dumps([{**TURNED, "position": [0, 0, math.nan]}]), "camera 0 is not valid"),
-        (json.dumps([{**TURNED, "rotation": [[2, 0, 0], [0, 2, 0], [0, 0, 2]]}]), "camera 0 is not valid"),
-        (json.dumps([{**TURNED, "rotation": "turned"}]), "camera 0 is not valid"),
+        (json.dumps([CAMERA_BY_ROTATION, {**CAMERA_BY_ROTATION, "position": [0, 0]}]), "camera 1 is not valid"),
+        (json.dumps([{**CAMERA_BY_ROTATION, "position": [0, 0, math.nan]}]), "camera 0 is not valid"),
+        (json.dumps([{**CAMERA_BY_ROTATION, "rotation": [[2, 0, 0], [0, 2, 0], [0, 0, 2]]}]), "camera 0 is not valid"),
+        (json.dumps([{**CAMERA_BY_ROTATION, "rotation": "turned"}]), "camera 0 is not valid"),
         (json.dumps([{"rotation": np.eye(3).tolist()}]), "camera 0 has no 'position'"),
         (json.dumps({"frames": [{"transform_matrix": np.eye(4).tolist()}]}), "camera 0 has no 'w'"),
     ],
@@ -145,10 +148,10 @@ def test_a_missing_camera_file_is_named(tmp_path):
 # -- one camera --------------------------------------------------------------------------------------------------------
 
 
-def test_a_camera_is_written_as_camera_files_and_pages_have_always_had_it():
-    text = json.dumps(camera_to_json(Camera(800, 600, 700.0, 650.5, 400.0, 300.25, POSE)))
+def test_the_json_of_a_camera_has_not_changed_since_earlier_versions():
+    text = json.dumps(camera_to_json(Camera(800, 600, 700.0, 650.5, 400.0, 300.25, POSE_ROWS)))
     size = '"width": 800, "height": 600, "fx": 700.0, "fy": 650.5, "cx": 400.0, "cy": 300.25'
-    assert text == f'{{{size}, "camera_from_world": {json.dumps(POSE)}}}'
+    assert text == f'{{{size}, "camera_from_world": {json.dumps(POSE_ROWS)}}}'
 
 
 @given(camera=cameras())
@@ -157,7 +160,7 @@ def test_a_camera_survives_json_exactly(camera):
 
 
 @given(camera=cameras())
-def test_numbers_are_rounded_once(camera):
+def test_numbers_are_not_rounded_again_by_a_round_trip(camera):
     numbers = json.loads(json.dumps(camera_to_numbers(camera)))
     back = camera_from_numbers(numbers)
     assert camera_to_numbers(back) == numbers
@@ -169,4 +172,4 @@ def test_numbers_are_rounded_once(camera):
 @pytest.mark.parametrize("count", [0, 5, 17, 19])
 def test_too_few_numbers_or_too_many_are_rejected(count):
     with pytest.raises(ValueError):
-        camera_from_numbers([*camera_to_numbers(Camera(4, 3, 2.0, 2.0, 2.0, 1.5, POSE)), 0.0][:count])
+        camera_from_numbers([*camera_to_numbers(Camera(4, 3, 2.0, 2.0, 2.0, 1.5, POSE_ROWS)), 0.0][:count])

@@ -12,18 +12,18 @@ from hyrfpack.scene import Camera
 
 
 def azimuths(cameras, center=(0, 0, 0)) -> np.ndarray:
-    """Degrees around the z axis."""
+    """Return azimuths around the z axis in degrees."""
     offsets = np.array([camera.position for camera in cameras]) - center
     return np.degrees(np.arctan2(offsets[:, 1], offsets[:, 0]))
 
 
 def ring_part(first: float, last: float, count: int = 15) -> list[Camera]:
-    """Cameras on a part of a circle of radius 3 and height 1, between two azimuths in degrees."""
+    """Return cameras on an arc of radius 3 and height 1 between two azimuths in degrees."""
     angles = np.radians(np.linspace(first, last, count))
     return [camera_at((3 * math.cos(a), 3 * math.sin(a), 1)) for a in angles]
 
 
-def test_typical_camera_is_no_outlier():
+def test_the_typical_camera_is_not_an_outlier():
     odd = camera_at((40, 0, 30))
     assert np.linalg.norm(np.array(orbit(Viewpoint.from_cameras([odd, *ring(8)]), 1)[0].position)) < 4
 
@@ -38,7 +38,7 @@ def test_swing_stays_on_the_arc_that_the_photos_cover(first, last):
     assert seen.max() == pytest.approx(last - middle, abs=1)
 
 
-def test_cameras_that_look_outwards_do_not_orbit_the_point_behind_them():
+def test_an_orbit_of_cameras_that_look_outwards_is_not_around_the_point_behind_them():
     cameras = [camera_at(camera.position, 2 * camera.position) for camera in ring(8, elevation=0.0)]
     path = orbit(Viewpoint.from_cameras(cameras), 8)
     assert all(camera.forward @ path[0].forward > 0.9 for camera in path)
@@ -69,7 +69,7 @@ def test_orbit_looks_at_the_centre_from_the_typical_distance_and_height():
         np.testing.assert_allclose(camera.rotation @ camera.rotation.T, np.eye(3), atol=1e-12)
         assert np.linalg.det(camera.rotation) == pytest.approx(1)
         assert camera.position[2] == pytest.approx(12)
-        assert camera.rotation[1, 2] < 0  # y points down: the horizon is upright
+        assert camera.rotation[1, 2] < 0  # y points down, so the horizon is upright
     steps = np.diff(np.unwrap(azimuths(path, center), period=360))
     np.testing.assert_allclose(np.abs(steps), 15, atol=1e-6)
 
@@ -81,7 +81,7 @@ def test_orbit_around_a_place_seen_from_straight_above_is_a_circle():
     assert np.ptp(positions, axis=0)[:2].min() > 1
 
 
-def test_look_at_takes_a_view_along_up():
+def test_look_at_accepts_a_viewing_direction_along_up():
     pose = look_at(np.array([0.0, 0.0, 2.0]), np.zeros(3), np.array([0.0, 0.0, 1.0]))
     np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(pose @ [0, 0, 0, 1], [0, 0, 2, 1], atol=1e-12)

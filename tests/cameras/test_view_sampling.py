@@ -13,14 +13,14 @@ from hyrfpack.cameras.view_sampling import (
 )
 from hyrfpack.scene import Camera
 
-CAMERAS = ring(48, elevation=1.2, width=16, height=16)
+RING_CAMERAS = ring(48, elevation=1.2, width=16, height=16)
 
 
-def test_views_between_lie_between_neighbours_that_look_the_same_way():
-    """On a ring of 48 no neighbour is farther than two places: a view is within the chord, and looks inwards too."""
-    chord = 3 * 2 * np.sin(np.pi * 2 / 48)  # to the second next, of a ring of radius 3
+def test_intermediate_views_lie_between_neighbours_with_similar_directions():
+    """On this ring a neighbour is at most two places away, so a view lies within that chord and looks inwards."""
+    chord = 3 * 2 * np.sin(np.pi * 2 / 48)  # to the second next camera, on a ring of radius 3
 
-    for camera, view in zip(CAMERAS, interpolate_views(CAMERAS), strict=True):
+    for camera, view in zip(RING_CAMERAS, interpolate_views(RING_CAMERAS), strict=True):
         moved = np.linalg.norm(view.position - camera.position)
         assert 0.2 * chord / 2 < moved < chord
         assert view.rotation[2] @ camera.rotation[2] > np.cos(2 * np.pi * 2 / 48)
@@ -36,33 +36,33 @@ def test_views_between_lie_between_neighbours_that_look_the_same_way():
 @pytest.mark.parametrize(
     ("count", "places"), [(1, [24]), (2, [12, 36]), (3, [8, 24, 40]), (48, range(48)), (99, range(48))]
 )
-def test_a_few_views_stand_in_the_middle_of_equal_parts_and_between_neighbours_among_all(count, places):
-    at, between = sample_views(CAMERAS, count, seed=3)
+def test_few_views_are_spread_evenly_and_lie_between_neighbours(count, places):
+    at, between = sample_views(RING_CAMERAS, count, seed=3)
 
-    assert at == [CAMERAS[place] for place in places]
+    assert at == [RING_CAMERAS[place] for place in places]
     chord = 3 * 2 * np.sin(np.pi * 2 / 48)
     for camera, view in zip(at, between, strict=True):
         assert 0.2 * chord / 2 < np.linalg.norm(view.position - camera.position) < chord
 
 
-def test_few_views_of_no_camera_are_none_and_of_one_it_and_itself():
+def test_views_of_no_camera_are_none_and_of_one_camera_that_camera():
     assert sample_views([], 3) == ([], [])
-    assert sample_views(CAMERAS[:1], 3) == (CAMERAS[:1], CAMERAS[:1])
+    assert sample_views(RING_CAMERAS[:1], 3) == (RING_CAMERAS[:1], RING_CAMERAS[:1])
 
 
-def test_one_camera_has_no_neighbour_and_stays():
-    assert interpolate_views(CAMERAS[:1]) == CAMERAS[:1]
+def test_a_single_camera_without_neighbours_is_unchanged():
+    assert interpolate_views(RING_CAMERAS[:1]) == RING_CAMERAS[:1]
     assert interpolate_views([]) == []
 
 
-def test_cameras_at_one_place_have_views_between_them():
-    views = interpolate_views([CAMERAS[0]] * 3)
+def test_intermediate_views_exist_for_cameras_at_one_place():
+    views = interpolate_views([RING_CAMERAS[0]] * 3)
 
-    assert all(np.allclose(view.position, CAMERAS[0].position) for view in views)
+    assert all(np.allclose(view.position, RING_CAMERAS[0].position) for view in views)
     assert all(np.isfinite(view.camera_from_world).all() for view in views)
 
 
-def test_large_pictures_are_measured_in_small_ones_of_the_same_view():
+def test_large_cameras_are_reduced_with_the_same_field_of_view():
     large = Camera(4000, 3000, 3500.0, 3400.0, 2100.0, 1400.0, np.eye(4))
     small = shrink_camera(large)
     assert (small.width, small.height) == (MAX_SMALL_VIEW_SIDE_PIXELS, MAX_SMALL_VIEW_SIDE_PIXELS * 3 // 4)

@@ -14,7 +14,7 @@ from hyrfpack.cameras.paths import Viewpoint, common_direction, orbit
 
 
 @pytest.mark.parametrize("offset", [(0, 0, 0), (1e6, -2e6, 3e5)])
-def test_cameras_around_an_object_are_summed_up_by_what_they_look_at(offset):
+def test_the_viewpoint_of_cameras_around_an_object_is_centred_on_it(offset):
     hint = Viewpoint.from_cameras(shift_cameras(ring(12), offset))
     np.testing.assert_allclose(hint.center, offset, atol=1e-6)
     np.testing.assert_allclose(hint.up, (0, 0, 1), atol=1e-9)
@@ -22,14 +22,14 @@ def test_cameras_around_an_object_are_summed_up_by_what_they_look_at(offset):
     assert (hint.camera.width, hint.camera.height, list(hint.camera.intrinsics)) == (32, 32, [32.0, 32.0, 16.0, 16.0])
 
 
-def test_up_is_the_axis_that_cameras_are_level_about():
+def test_up_is_the_axis_about_which_cameras_are_level():
     on_a_part = [camera_at((3 * math.cos(a), 3 * math.sin(a), 2.5)) for a in np.linspace(0, 1.5, 9)]
     np.testing.assert_allclose(Viewpoint.from_cameras(on_a_part).up, (0, 0, 1), atol=1e-9)
     almost_above = [camera_at((1.7 * math.cos(a), 1.7 * math.sin(a), 9)) for a in np.linspace(0, 2.5, 9)]
     np.testing.assert_allclose(Viewpoint.from_cameras(almost_above).up, (0, 0, 1), atol=1e-9)
 
 
-def test_hint_is_json():
+def test_the_viewpoint_converts_to_json():
     hint = Viewpoint.from_cameras(ring(5)).to_json()
     assert json.loads(json.dumps(hint, allow_nan=False)) == hint
 
@@ -46,11 +46,11 @@ def test_a_file_without_a_viewpoint_is_orbited_by_its_frame():
     assert Capture(facts).viewpoint.to_json() == Viewpoint.from_frame([1.0, 2.0, 3.0], 4.0).to_json()
     for camera in orbit(Capture(facts).viewpoint, 5):
         assert np.linalg.norm(camera.position - (1, 2, 3)) == pytest.approx(10)
-        assert camera.position[1] < 2  # looks down: up is -y
+        assert camera.position[1] < 2  # it looks down, because up is -y
         assert camera.forward @ (camera.position - (1, 2, 3)) == pytest.approx(-10)
 
 
-STORED = {
+STORED_VIEWPOINT = {
     "center": [0.5, -1.0, 2.0],
     "up": [0.0, -2.0, 0.0],
     "camera_from_world": [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.5], [0.0, 1.0, 0.0, 4.0], [0.0, 0.0, 0.0, 1.0]],
@@ -61,9 +61,9 @@ STORED = {
 }
 
 
-def test_files_keep_the_layout_that_they_have_always_had():
-    viewpoint = Viewpoint.from_json(STORED)
-    assert json.dumps(viewpoint.to_json()) == json.dumps(STORED)
+def test_the_stored_layout_has_not_changed_since_earlier_versions():
+    viewpoint = Viewpoint.from_json(STORED_VIEWPOINT)
+    assert json.dumps(viewpoint.to_json()) == json.dumps(STORED_VIEWPOINT)
     assert viewpoint.camera.intrinsics == (700, 650.5, 400, 300.25) and viewpoint.arc == (-30, 60.5)
     assert viewpoint.camera.position.tolist() == [0, -4, 0.5]
 
@@ -75,14 +75,14 @@ def test_a_viewpoint_survives_json_exactly(camera):
 
 
 @pytest.mark.parametrize("center", [[1e38, 0, 0], [0, -1e160, 0]])
-def test_what_no_camera_could_be_placed_about_is_rejected(center):
+def test_a_centre_without_a_possible_camera_is_rejected(center):
     with pytest.raises(ValueError, match="not finite"):
-        Viewpoint.from_json({**STORED, "center": center})
-    (camera,) = orbit(Viewpoint.from_json({**STORED, "center": [9e36, 0, 0]}), 1)
+        Viewpoint.from_json({**STORED_VIEWPOINT, "center": center})
+    (camera,) = orbit(Viewpoint.from_json({**STORED_VIEWPOINT, "center": [9e36, 0, 0]}), 1)
     assert np.isfinite(camera.camera_from_world.astype(np.float32)).all()
 
 
-def test_cameras_look_a_common_way_or_none():
+def test_the_common_direction_of_cameras_is_found_or_none():
     ahead = [camera_at((x, -5.0, 0.0), (x, 0.0, 0.0)) for x in (-1.0, 0.0, 1.0)]
     np.testing.assert_allclose(common_direction(ahead), (0, 1, 0), atol=1e-12)
     assert common_direction(ring(8)) is None

@@ -22,7 +22,7 @@ from hyrfpack.format import load_model
 from hyrfpack.train import Trainer
 from hyrfpack.train.decisions import decide
 
-COMMANDS = (
+COMMAND_NAMES = (
     "make",
     "train",
     "compress",
@@ -38,8 +38,8 @@ COMMANDS = (
 )
 
 
-def python(code: str) -> subprocess.CompletedProcess:
-    """Run code in a fresh interpreter that finds this package."""
+def run_python(code: str) -> subprocess.CompletedProcess:
+    """Run code in a new interpreter that finds this package."""
     root = str(Path(__file__).parents[2])
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([root, os.environ.get("PYTHONPATH", "")])}
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
@@ -47,7 +47,7 @@ def python(code: str) -> subprocess.CompletedProcess:
 
 @pytest.fixture(scope="module")
 def run(data, tmp_path_factory) -> Path:
-    """A run of 30 steps on ten small pictures."""
+    """A run of 30 steps on ten small photos."""
     folder = tmp_path_factory.mktemp("runs") / "tiny"
     result = succeeded("train", data, "-o", folder, "--steps", 30, "--max-gaussians", 500, "--json")
     assert json.loads(result.stdout)["complete"] is True
@@ -61,10 +61,10 @@ def packed(run, tmp_path_factory) -> Path:
     return path
 
 
-# -- the whole chain -------------------------------------------------------------------------------------------------
+# -- from photos to files and scores -----------------------------------------------------------------------------------
 
 
-def test_train_leaves_a_model_metrics_and_pictures(run):
+def test_train_writes_a_model_metrics_and_pictures(run):
     metrics = json.loads((run / "metrics.json").read_text())
     assert metrics["settings"]["steps"] == 30 and metrics["settings"]["max_gaussians"] == 500
     assert metrics["bytes"] == (run / "model.hyrf").stat().st_size
@@ -86,14 +86,14 @@ def test_compact_is_the_default_and_smaller_than_the_paper_profile(run, packed, 
     assert report["error"] > 0 and sum(report["shares"].values()) == pytest.approx(1)
 
 
-def test_compress_prints_every_section_and_what_it_costs(run, tmp_path):
+def test_compress_prints_every_section_with_its_bytes(run, tmp_path):
     printed = succeeded("compress", run / "model.hyrf", "-o", tmp_path / "p.hyrf").stdout
     words = ("positions", "geometry hash table", "radiance decoder", "padding", "bits/Gaussian", "bits/number")
     for word in (*words, "of the loss", "loss in pictures"):
         assert word in printed
 
 
-def test_compress_with_photos_says_what_was_lost_on_those_held_out(run, data, tmp_path):
+def test_compress_with_photos_prints_the_loss_on_held_out_photos(run, data, tmp_path):
     arguments = ("compress", run / "model.hyrf", "-o", tmp_path / "p.hyrf", "--overwrite", "--data", data)
     scores = [
         json.loads(succeeded("evaluate", path, "--data", data, "--json").stdout)
@@ -106,7 +106,7 @@ def test_compress_with_photos_says_what_was_lost_on_those_held_out(run, data, tm
     assert "held-out photos: PSNR" in succeeded(*arguments).stdout
 
 
-def test_compress_of_a_runs_folder_uses_its_photos_unless_told_not_to(run, data, tmp_path):
+def test_compress_of_a_run_uses_its_photos_by_default(run, data, tmp_path):
     arguments = ("compress", run, "-o", tmp_path / "p.hyrf", "--overwrite", "--json")
     result, named = succeeded(*arguments), succeeded(*arguments, "--data", data)
     assert f"with the photos that it was trained on, {data}" in result.stderr
@@ -115,7 +115,7 @@ def test_compress_of_a_runs_folder_uses_its_photos_unless_told_not_to(run, data,
     assert "trained on" not in without.stderr and "psnr" not in json.loads(without.stdout)
 
 
-def test_compress_continues_without_photos_that_are_gone(run, tmp_path):
+def test_compress_works_when_the_photos_of_a_run_are_gone(run, tmp_path):
     shutil.copytree(run, tmp_path / "run")
     metrics = json.loads((run / "metrics.json").read_text())
     metrics["scene"]["reading"]["path"] = str(tmp_path / "moved")
@@ -125,7 +125,7 @@ def test_compress_continues_without_photos_that_are_gone(run, tmp_path):
     assert "name their folder with --data" in refused(*arguments, "--overwrite", "--finetune", 1)
 
 
-def test_compress_keeps_to_a_target_size(run, tmp_path):
+def test_compress_meets_a_target_size(run, tmp_path):
     whole = json.loads(succeeded("compress", run / "model.hyrf", "-o", tmp_path / "w.hyrf", "--json").stdout)
     target = int(0.8 * whole["bytes_after"])
     arguments = ("compress", run / "model.hyrf", "-o", tmp_path / "p.hyrf", "--target-size")
@@ -134,14 +134,14 @@ def test_compress_keeps_to_a_target_size(run, tmp_path):
     assert f"of {target:,} bytes" in report["found"]
 
 
-def test_compress_fits_the_quantised_model_to_the_photos_and_keeps_every_gaussian_if_told(run, data, tmp_path):
+def test_compress_can_fine_tune_and_keep_every_gaussian(run, data, tmp_path):
     arguments = ("compress", run / "model.hyrf", "-o", tmp_path / "p.hyrf", "--data", data, "--json")
     report = json.loads(succeeded(*arguments, "--finetune", 3, "--no-prune").stdout)
     assert report["gaussians"] == len(load_model(run / "model.hyrf"))
     assert report["psnr"] > 12
 
 
-def test_the_last_line_says_what_became_of_the_numbers(run, tmp_path):
+def test_the_last_line_says_how_numbers_are_stored(run, tmp_path):
     raw, paper = (
         succeeded(
             "compress", run / "model.hyrf", "-o", tmp_path / f"{profile}.hyrf", "--profile", profile
@@ -176,7 +176,7 @@ def test_evaluate_prints_strict_json_only(packed, data):
     assert values["psnr"] > 12
 
 
-def test_evaluate_scores_the_split_that_is_named(packed, data):
+def test_evaluate_scores_the_requested_split(packed, data):
     values = json.loads(succeeded("evaluate", packed, "--data", data, "--split", "all", "--json").stdout)
     assert len(values["views"]) == 10
     held_out = json.loads(succeeded("evaluate", packed, "--data", data, "--test-every", 5, "--json").stdout)
@@ -189,7 +189,7 @@ def test_evaluate_prints_a_table_and_writes_pictures(packed, data, tmp_path):
     assert len(list((tmp_path / "views").iterdir())) == 2
 
 
-def test_info_tells_what_the_file_holds_and_why(packed):
+def test_info_describes_the_file_and_the_choices_behind_it(packed):
     facts = json.loads(succeeded("info", packed, "--json").stdout)
     assert facts["profile"] == "paper" and facts["bytes"] == packed.stat().st_size
     assert facts["provenance"]["choices"]["preset"]
@@ -204,7 +204,7 @@ def test_render_names_pictures_after_photos(packed, data, tmp_path):
     assert Image.open(tmp_path / "0008.png").size == (48, 48)
 
 
-def test_render_goes_around_the_scene_by_itself(packed, tmp_path):
+def test_render_orbits_the_scene_by_default(packed, tmp_path):
     result = json.loads(succeeded("render", packed, "-o", tmp_path, "--orbit", 3, "--depth", "--json").stdout)
     assert [Path(path).name for path in result["pictures"]] == ["0000.png", "0001.png", "0002.png"]
     assert np.asarray(Image.open(tmp_path / "0001.depth.tiff")).max() > 0.1
@@ -218,7 +218,7 @@ def test_render_takes_cameras_from_a_file(packed, tmp_path):
     assert Image.open(tmp_path / "out" / "left" / "eye.png").size == (20, 10)
 
 
-def test_video_without_ffmpeg_is_a_note_beside_the_pictures(packed, tmp_path, monkeypatch):
+def test_a_video_without_ffmpeg_gives_pictures_and_a_note(packed, tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     result = succeeded("render", packed, "-o", tmp_path / "out", "--orbit", 2, "--video", "--json")
     assert json.loads(result.stdout)["video"] is None
@@ -271,7 +271,7 @@ def test_training_interrupted_during_pilot_runs_exits_with_1_and_saves_nothing(d
     assert signal.getsignal(signal.SIGINT) is before
 
 
-def test_demo_ends_with_a_table_and_a_picture(tmp_path):
+def test_demo_prints_a_table_and_writes_a_picture(tmp_path):
     from hyrfpack.demo.run import run_demo
 
     result = run_demo(tmp_path, steps=10, views=10, size=32)
@@ -296,7 +296,7 @@ def test_demo_ends_with_a_table_and_a_picture(tmp_path):
     assert len(result.table()) == 6
 
 
-# -- what users get wrong --------------------------------------------------------------------------------------------
+# -- mistakes of the user ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -317,7 +317,7 @@ def test_demo_ends_with_a_table_and_a_picture(tmp_path):
         ("train", "data", "-o", "run", "--resume"),
     ],
 )
-def test_a_wrong_input_is_a_clear_error_that_names_it(arguments, tmp_path, monkeypatch):
+def test_an_invalid_input_is_a_clear_error_that_names_it(arguments, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "junk.hyrf").write_bytes(b"no model at all" * 20)
     (tmp_path / "empty").mkdir()
@@ -347,8 +347,8 @@ def test_wrong_usage_exits_with_2(arguments):
     refused(*arguments)
 
 
-# What `compress` is asked on the command line, and what it answers.
-REFUSED_OPTIONS = {
+# Options of `compress` and the error that they give.
+REJECTED_OPTIONS = {
     "fine-tuning without photos": (("--no-data", "--finetune", 5), "need photos; name their folder with --data"),
     "a loss without photos": (("--no-data", "--max-psnr-drop", 0.1), "need photos; name their folder with --data"),
     "photos and none": (("--no-data", "--data", "DATA"), "give one of them"),
@@ -369,22 +369,22 @@ REFUSED_OPTIONS = {
 }
 
 
-@pytest.mark.parametrize("case", REFUSED_OPTIONS)
-def test_options_of_compress_that_cannot_be_met_are_a_clear_error(case, run, data, tmp_path):
-    options, words = REFUSED_OPTIONS[case]
+@pytest.mark.parametrize("case", REJECTED_OPTIONS)
+def test_invalid_options_of_compress_are_a_clear_error(case, run, data, tmp_path):
+    options, words = REJECTED_OPTIONS[case]
     (tmp_path / "old.hyrf").write_bytes(b"old")
     options = [data if option == "DATA" else option for option in options]
     assert words in refused("compress", run / "model.hyrf", "-o", tmp_path / "old.hyrf", "--overwrite", *options)
     assert (tmp_path / "old.hyrf").read_bytes() == b"old" and len(list(tmp_path.iterdir())) == 1
 
 
-def test_a_number_of_gaussians_and_a_target_size_are_one_too_many(data, tmp_path):
+def test_a_number_of_gaussians_together_with_a_target_size_is_rejected(data, tmp_path):
     options = ("--max-gaussians", 500, "--target-size", "20kB")
     assert "give one of them" in refused("train", data, "-o", tmp_path / "run", *options)
     assert not (tmp_path / "run").exists()
 
 
-def test_a_target_size_decides_how_many_gaussians_are_trained(data, tmp_path):
+def test_a_target_size_determines_the_number_of_gaussians(data, tmp_path):
     done = succeeded("train", data, "-o", tmp_path / "run", "--steps", 5, "--target-size", "11.5kB", "--json")
     assert "to be packed into 11,500 bytes" in json.loads(done.stdout)["choices"]["max_gaussians"]
 
@@ -396,7 +396,7 @@ def test_a_second_training_does_not_overwrite_the_first(run, data):
 
 
 @pytest.mark.parametrize("command", ["compress", "decompress"])
-def test_the_output_may_not_be_the_input(command, packed, tmp_path):
+def test_an_output_that_is_the_input_is_rejected(command, packed, tmp_path):
     before = packed.read_bytes()
     (tmp_path / "link.hyrf").symlink_to(packed)
     for target in (packed, packed.parent / ".." / packed.parent.name / packed.name, tmp_path / "link.hyrf"):
@@ -405,7 +405,7 @@ def test_the_output_may_not_be_the_input(command, packed, tmp_path):
     assert packed.read_bytes() == before
 
 
-def test_a_failed_command_leaves_the_old_file_alone(packed, tmp_path):
+def test_a_failed_command_keeps_the_old_file(packed, tmp_path):
     damaged = bytearray(packed.read_bytes())
     damaged[len(damaged) // 2] ^= 1
     (tmp_path / "damaged.hyrf").write_bytes(damaged)
@@ -415,23 +415,23 @@ def test_a_failed_command_leaves_the_old_file_alone(packed, tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["damaged.hyrf", "old.hyrf"]
 
 
-def test_an_output_folder_that_is_missing_is_made(packed, tmp_path):
+def test_a_missing_output_folder_is_created(packed, tmp_path):
     succeeded("decompress", packed, "-o", tmp_path / "not" / "yet" / "there.hyrf")
     assert (tmp_path / "not" / "yet" / "there.hyrf").is_file()
 
 
-def test_pictures_cannot_go_into_a_file(packed, tmp_path):
+def test_a_file_as_the_output_folder_of_pictures_is_rejected(packed, tmp_path):
     (tmp_path / "file").write_text("mine")
     refused("render", packed, "-o", tmp_path / "file", "--orbit", 1)
     assert (tmp_path / "file").read_text() == "mine"
 
 
-def test_an_empty_split_and_missing_weights_are_named(packed, data, tmp_path):
+def test_an_empty_split_and_missing_weights_are_named_in_the_error(packed, data, tmp_path):
     assert "split 'test'" in refused("evaluate", packed, "--data", data, "--test-every", 0)
     assert "none.pt" in refused("evaluate", packed, "--data", data, "--lpips-weights", tmp_path / "none.pt")
 
 
-def test_a_bug_of_ours_keeps_its_traceback(packed, monkeypatch):
+def test_an_unexpected_exception_keeps_its_traceback(packed, monkeypatch):
     def broken(path):
         raise ValueError("a bug")
 
@@ -444,18 +444,18 @@ def test_a_bug_of_ours_keeps_its_traceback(packed, monkeypatch):
 # -- help, defaults, imports -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_explains_itself_with_an_example(command):
+@pytest.mark.parametrize("command", COMMAND_NAMES)
+def test_the_help_of_every_command_has_an_example(command):
     text = succeeded(command, "--help").stdout
     assert "Example" in text and f"hyrfpack {command}" in text
 
 
 def test_all_commands_are_listed():
     text = succeeded("--help").stdout
-    assert all(f"\n  {command}" in text for command in COMMANDS)
+    assert all(f"\n  {command}" in text for command in COMMAND_NAMES)
 
 
-def test_command_line_offers_what_the_library_has():
+def test_the_command_line_offers_the_choices_of_the_library():
     from hyrfpack.format import codec
     from hyrfpack.train import config
 
@@ -468,18 +468,18 @@ def test_command_line_offers_what_the_library_has():
         assert {name: context.params[name] for name in options} == {name: defaults[name] for name in options}
 
 
-def test_importing_the_package_or_the_command_line_loads_no_numerics():
+def test_importing_the_package_or_the_command_line_loads_no_numerical_library():
     code = "import hyrfpack, hyrfpack.cli, sys; print({'torch', 'numpy', 'numba', 'PIL', 'rich'} & set(sys.modules))"
-    assert python(code).stdout.strip() == "set()"
+    assert run_python(code).stdout.strip() == "set()"
 
 
-def test_info_loads_no_numerics(packed):
+def test_info_loads_no_numerical_library(packed):
     code = (
         "import sys; from hyrfpack.cli import main\n"
         f"main(['info', {str(packed)!r}, '--json'], standalone_mode=False)\n"
         "assert not {'torch', 'numpy', 'matplotlib', 'PIL', 'rich'} & set(sys.modules)"
     )
-    result = python(code)
+    result = run_python(code)
     assert result.returncode == 0, result.stderr
     assert json.loads(result.stdout)["profile"] == "paper"
 

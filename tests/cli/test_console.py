@@ -1,4 +1,4 @@
-"""How every command speaks: --quiet, --verbose, closed streams, wide characters, completion."""
+"""Console behaviour of every command: --quiet, --verbose, closed streams, wide characters and completion."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from hyrfpack.cli.common import format_table, note
 from hyrfpack.cli.files import _command_as_typed
 from hyrfpack.format import describe_file, save_model
 
-ROOT = Path(__file__).parents[2]
-TINY = ("--steps", 3, "--max-gaussians", 50)
+REPOSITORY_ROOT = Path(__file__).parents[2]
+TINY_TRAINING_OPTIONS = ("--steps", 3, "--max-gaussians", 50)
 
 
 @pytest.fixture(scope="module")
@@ -34,14 +34,17 @@ def model(tmp_path_factory) -> Path:
 
 
 def shell(redirections: str, *command: object) -> subprocess.CompletedProcess:
-    """Run a command with redirections as a shell writes them; Python finds this package."""
+    """Run a command with redirections in shell syntax, in an environment where Python finds this package."""
     words = ["sh", "-c", f'exec "$@" {redirections}', "sh", *map(str, command)]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join([str(REPOSITORY_ROOT), os.environ.get("PYTHONPATH", "")]),
+    }
     return subprocess.run(words, capture_output=True, text=True, check=False, env=environment)
 
 
-def program(redirections: str, *arguments: object) -> subprocess.CompletedProcess:
-    """The command line in a process of its own."""
+def run_program(redirections: str, *arguments: object) -> subprocess.CompletedProcess:
+    """Run the command line in another process."""
     return shell(redirections, sys.executable, "-m", "hyrfpack", *arguments)
 
 
@@ -49,15 +52,15 @@ def program(redirections: str, *arguments: object) -> subprocess.CompletedProces
 
 
 @pytest.mark.parametrize("command", main.commands)
-def test_every_command_can_be_quiet_and_verbose(command):
+def test_every_command_has_quiet_and_verbose(command):
     printed = succeeded(command, "--help").stdout
     assert "--quiet" in printed and "--verbose" in printed
 
 
 @pytest.mark.parametrize("before", [True, False], ids=["before the command", "after it"])
-def test_quiet_training_and_rendering_say_their_results_alone(before, data, tmp_path):
+def test_quiet_training_and_rendering_print_only_their_results(before, data, tmp_path):
     for command, *arguments in (
-        ("train", data, "-o", tmp_path / "run", *TINY),
+        ("train", data, "-o", tmp_path / "run", *TINY_TRAINING_OPTIONS),
         ("render", tmp_path / "run" / "model.hyrf", "-o", tmp_path / "out", "--orbit", 2),
     ):
         result = succeeded(*(("--quiet", command) if before else (command, "--quiet")), *arguments)
@@ -65,15 +68,15 @@ def test_quiet_training_and_rendering_say_their_results_alone(before, data, tmp_
     assert succeeded(command, *arguments, "--overwrite").stderr != ""
 
 
-def test_quiet_holds_for_whatever_speaks_and_only_as_long_as_the_command_runs(model, monkeypatch):
-    def talkative(path):
+def test_quiet_silences_all_output_only_while_the_command_runs(model, monkeypatch):
+    def describe_loudly(path):
         note("a note")
         print("a library", file=sys.stderr)
         with click.progressbar(range(3), label="a bar", file=sys.stderr) as numbers:
             list(numbers)
         return describe_file(path)
 
-    monkeypatch.setattr("hyrfpack.format.describe_file", talkative)
+    monkeypatch.setattr("hyrfpack.format.describe_file", describe_loudly)
     before = sys.stderr
     assert succeeded("info", model, "--quiet").stderr == ""
     assert sys.stderr is before
@@ -91,12 +94,12 @@ def test_quiet_holds_for_whatever_speaks_and_only_as_long_as_the_command_runs(mo
         ("--quiet", "nothing"),
     ],
 )
-def test_errors_are_said_quietly_too(arguments):
+def test_quiet_still_prints_errors(arguments):
     assert refused(*arguments)
 
 
-def test_verbose_tells_versions_device_and_times(data, tmp_path):
-    result = succeeded("train", data, "-o", tmp_path, *TINY, "--verbose", "--device", "cpu")
+def test_verbose_prints_versions_device_and_times(data, tmp_path):
+    result = succeeded("train", data, "-o", tmp_path, *TINY_TRAINING_OPTIONS, "--verbose", "--device", "cpu")
     first, *others = result.stderr.splitlines()
     assert all(f"{name} " in first for name in ("hyrfpack", "Python", "torch", "numpy"))
     assert any(line.endswith("device: cpu") for line in others)
@@ -106,7 +109,7 @@ def test_verbose_tells_versions_device_and_times(data, tmp_path):
 
 
 @pytest.mark.parametrize("arguments", [("info", "none.hyrf", "--verbose"), ("--verbose", "info", "none.hyrf")])
-def test_verbose_shows_where_an_error_comes_from_and_ends_with_the_sentence(arguments):
+def test_verbose_prints_the_traceback_of_an_error_and_then_its_message(arguments):
     result = hyrfpack(*arguments)
     assert result.exit_code == 2 and result.stdout == ""
     assert "Traceback" in result.stderr and "in describe" in result.stderr
@@ -127,33 +130,33 @@ def test_quiet_and_verbose_exclude_each_other(arguments):
     assert result.exit_code == 2 and "--quiet and --verbose contradict each other" in result.stderr
 
 
-def test_the_command_that_a_report_shows_is_without_them(model):
+def test_reports_show_the_command_without_quiet_and_verbose(model):
     command = main.commands["compress"]
     with command.make_context("compress", [str(model), "-o", "b.hyrf", "--verbose", "--no-prune"]) as context:
         assert _command_as_typed(context) == f"hyrfpack compress {model} --output b.hyrf --no-prune"
 
 
-# -- streams that are not there --------------------------------------------------------------------------------------
+# -- missing streams -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.skipif(os.name == "nt", reason="a shell of Unix closes them")
-def test_training_runs_to_its_end_where_standard_error_is_closed(data, tmp_path):
-    done = program("2>&-", "train", data, "-o", tmp_path, *TINY)
+def test_training_completes_with_standard_error_closed(data, tmp_path):
+    done = run_program("2>&-", "train", data, "-o", tmp_path, *TINY_TRAINING_OPTIONS)
     assert done.returncode == 0 and describe_file(tmp_path / "model.hyrf")["gaussians"] > 0
     assert done.stdout.startswith(str(tmp_path / "model.hyrf")) and "step 3/3" not in done.stdout
 
 
 @pytest.mark.skipif(os.name == "nt", reason="a shell of Unix closes them")
-def test_rendering_runs_to_its_end_where_no_stream_can_be_written_to(model, tmp_path):
+def test_rendering_completes_without_any_writable_stream(model, tmp_path):
     camera = {"width": 20, "height": 10, "fx": 15, "camera_from_world": np.eye(4).tolist()}
     (tmp_path / "cameras.json").write_text(json.dumps([camera]))
-    done = program("<&- >&- 2</dev/null", "render", model, "-o", tmp_path, "--cameras", tmp_path / "cameras.json")
+    done = run_program("<&- >&- 2</dev/null", "render", model, "-o", tmp_path, "--cameras", tmp_path / "cameras.json")
     assert done.returncode == 0 and len(list(tmp_path.glob("*.png"))) == 1
 
 
 @pytest.mark.skipif(os.name == "nt", reason="a shell of Unix closes them")
-def test_no_file_takes_the_number_of_a_closed_stream():
-    """What a library prints would go into it."""
+def test_no_file_gets_the_descriptor_of_a_closed_stream():
+    """Otherwise anything that a library prints would go into that file."""
     code = (
         "import os; from hyrfpack.cli import main; main(['--version'], standalone_mode=False); "
         "os._exit(0 if os.open(os.devnull, os.O_RDONLY) > 2 else 3)"
@@ -162,35 +165,35 @@ def test_no_file_takes_the_number_of_a_closed_stream():
 
 
 @pytest.mark.skipif(os.name == "nt", reason="a shell of Unix closes them")
-def test_a_closed_standard_output_is_no_traceback(model):
-    done = program(">&-", "info", model)
+def test_a_closed_standard_output_gives_no_traceback(model):
+    done = run_program(">&-", "info", model)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="there is no /dev/full")
-def test_notes_that_cannot_be_printed_do_not_end_the_work(data, tmp_path):
-    assert program("2>/dev/full", "train", data, "-o", tmp_path, *TINY).returncode == 0
+def test_unprintable_notes_do_not_end_the_command(data, tmp_path):
+    assert run_program("2>/dev/full", "train", data, "-o", tmp_path, *TINY_TRAINING_OPTIONS).returncode == 0
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="there is no /dev/full")
-def test_a_bar_that_cannot_be_drawn_does_not_end_the_work(model, tmp_path):
-    done = program("2>/dev/full", "render", model, "-o", tmp_path / "out", "--orbit", "2")
+def test_a_progress_bar_that_cannot_be_drawn_does_not_end_the_command(model, tmp_path):
+    done = run_program("2>/dev/full", "render", model, "-o", tmp_path / "out", "--orbit", "2")
     assert done.returncode == 0 and len(list((tmp_path / "out").glob("*.png"))) == 2
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="file names are bytes on Linux")
-def test_names_that_the_encoding_lacks_are_printed_with_escapes(model, tmp_path):
+def test_characters_outside_the_encoding_are_printed_as_escapes(model, tmp_path):
     for name in (b"\xe9.hyrf", "模型.hyrf".encode()):
         path = os.fsdecode(os.path.join(os.fsencode(tmp_path), name))
         shutil.copy(model, path)
-        done = program("", "info", path)
+        done = run_program("", "info", path)
         assert done.returncode == 0 and done.stdout.startswith(str(tmp_path)), done.stderr
 
 
 # -- columns, completion ---------------------------------------------------------------------------------------------
 
 
-def test_columns_of_a_table_stand_under_each_other_with_wide_characters():
+def test_table_columns_are_aligned_with_wide_characters():
     text = format_table(
         ["文件", "dB", "名"], [["写真.png", "1.00", "ü"], ["a.png", "-", "日本"], ["e\u0301.png", "12", ""]]
     )
@@ -205,14 +208,14 @@ def test_columns_of_a_table_stand_under_each_other_with_wide_characters():
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_completion_is_a_script_for_the_shell(shell):
+def test_completion_prints_a_script_for_the_shell(shell):
     if shell == "bash" and not shutil.which("bash"):
         pytest.skip("there is no bash here")
     result = CliRunner().invoke(main, prog_name="hyrfpack", env={"_HYRFPACK_COMPLETE": f"{shell}_source"})
     assert result.exit_code == 0 and "hyrfpack" in result.stdout and f"{shell}_complete" in result.stdout
 
 
-def test_completion_knows_commands_and_options():
+def test_completion_offers_commands_and_options():
     words = {"COMP_WORDS": "hyrfpack tr", "COMP_CWORD": "1", "_HYRFPACK_COMPLETE": "bash_complete"}
     assert CliRunner().invoke(main, prog_name="hyrfpack", env=words).stdout.split() == ["plain,train"]
     words |= {"COMP_WORDS": "hyrfpack --quiet train --max-g", "COMP_CWORD": "3"}

@@ -1,7 +1,7 @@
-"""Disk full, over the whole command line: one sentence, exit code 2, old files as they were, no half file, no litter.
+"""A full disk in any command is a clear error with exit code 2, and leaves old files and no partial ones.
 
-A full disk is a tmpfs of this test's own where mounting is allowed, and everywhere a limit on the size of a file
-(ulimit -f), which stops a write in the middle in the same way.
+The full disk is a tmpfs where mounting is allowed. Elsewhere it is a limit on file sizes (ulimit -f), which stops a
+write in the middle in the same way.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from hyrfpack.errors import HyrfError
 from hyrfpack.train import TrainConfig, Trainer, train_model
 
 resource = pytest.importorskip("resource", reason="limits and mounts are of Unix")
-STEPS = ("--steps", 20, "--max-gaussians", 500)
-PICTURE = re.compile(r"\.(png|tiff)$")
+SHORT_TRAINING_OPTIONS = ("--steps", 20, "--max-gaussians", 500)
+PICTURE_NAME_PATTERN = re.compile(r"\.(png|tiff)$")
 
 
 @contextmanager
 def file_limit(size: int) -> Iterator[None]:
-    """No file of this process may grow past `size` bytes."""
+    """Limit the size of files that this process writes."""
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
     try:
@@ -61,7 +61,7 @@ def disk(tmp_path) -> Iterator[Path]:
 
 
 def fill(disk: Path, leave: int) -> Path:
-    """Put a file on the disk that leaves `leave` bytes; returns it."""
+    """Write a file that leaves `leave` bytes free on the disk, and return its path."""
     ballast = disk / "ballast"
     ballast.write_bytes(bytes(shutil.disk_usage(disk).free - leave))
     return ballast
@@ -73,9 +73,9 @@ def files_in(folder: Path) -> dict[str, bytes]:
 
 @pytest.fixture(scope="module")
 def run(data, tmp_path_factory) -> Path:
-    """A training that nothing disturbs; it also compiles the kernels, whose cache the limits below would hit."""
+    """An undisturbed run. It also compiles the kernels, whose cache the limits of the tests would affect."""
     folder = tmp_path_factory.mktemp("runs") / "tiny"
-    assert hyrfpack("train", data, "-o", folder, *STEPS).exit_code == 0
+    assert hyrfpack("train", data, "-o", folder, *SHORT_TRAINING_OPTIONS).exit_code == 0
     return folder
 
 
@@ -86,9 +86,9 @@ def packed(run, tmp_path_factory) -> Path:
     return path
 
 
-# Command -> what it is asked, given data, the trained model, the packed one, and its output folder.
-WRITERS = {
-    "train": lambda data, model, packed, out: ("train", data, "-o", out, "--overwrite", *STEPS),
+# Command -> its arguments, given data, the trained model, the packed model and the output folder.
+COMMANDS_THAT_WRITE = {
+    "train": lambda data, model, packed, out: ("train", data, "-o", out, "--overwrite", *SHORT_TRAINING_OPTIONS),
     "compress": lambda data, model, packed, out: ("compress", model, "-o", out / "model.hyrf", "--overwrite"),
     "decompress": lambda data, model, packed, out: ("decompress", packed, "-o", out / "model.hyrf", "--overwrite"),
     "render": lambda data, model, packed, out: ("render", packed, "-o", out, "--orbit", 2, "--overwrite"),
@@ -107,7 +107,7 @@ WRITERS = {
 }
 
 
-def check_refusal(result, out: Path, before: dict[str, bytes], reason: str) -> None:
+def check_error(result, out: Path, before: dict[str, bytes], reason: str) -> None:
     assert result.exit_code == 2, result.output
     assert result.stdout == "" and "Traceback" not in result.stderr
     (sentence,) = [line for line in result.stderr.splitlines() if line.startswith("Error: ")]
@@ -115,8 +115,8 @@ def check_refusal(result, out: Path, before: dict[str, bytes], reason: str) -> N
     assert files_in(out) == before
 
 
-def old_outputs(out: Path) -> dict[str, bytes]:
-    """Files of an earlier run under every name that a command here writes."""
+def write_old_outputs(out: Path) -> dict[str, bytes]:
+    """Write files of an earlier run under every name that a command here writes."""
     names = ("model.hyrf", "metrics.json", "curve.png", "views/0000.png", "0000.png", "0000.depth.tiff")
     for name in names:
         (out / name).parent.mkdir(parents=True, exist_ok=True)
@@ -126,41 +126,41 @@ def old_outputs(out: Path) -> dict[str, bytes]:
     return files_in(out)
 
 
-@pytest.mark.parametrize("command", WRITERS)
-def test_full_disk_is_a_clear_error_and_the_old_files_stay(command, data, run, packed, disk):
+@pytest.mark.parametrize("command", COMMANDS_THAT_WRITE)
+def test_a_full_disk_is_a_clear_error_and_the_old_files_stay(command, data, run, packed, disk):
     out = disk / "out"
-    before = old_outputs(out)
+    before = write_old_outputs(out)
     fill(disk, leave=0)
 
-    result = hyrfpack(*WRITERS[command](data, run / "model.hyrf", packed, out))
+    result = hyrfpack(*COMMANDS_THAT_WRITE[command](data, run / "model.hyrf", packed, out))
 
-    check_refusal(result, out, before, "the disk is full and this file was not written; free ")
+    check_error(result, out, before, "the disk is full and this file was not written; free ")
 
 
-@pytest.mark.parametrize("command", WRITERS)
-def test_file_limit_is_a_clear_error_and_the_old_files_stay(command, data, run, packed, tmp_path):
-    before = old_outputs(tmp_path)
-    arguments = WRITERS[command](data, run / "model.hyrf", packed, tmp_path)
+@pytest.mark.parametrize("command", COMMANDS_THAT_WRITE)
+def test_a_file_size_limit_is_a_clear_error_and_the_old_files_stay(command, data, run, packed, tmp_path):
+    before = write_old_outputs(tmp_path)
+    arguments = COMMANDS_THAT_WRITE[command](data, run / "model.hyrf", packed, tmp_path)
 
     with file_limit(1000):
         result = hyrfpack(*arguments)
 
-    check_refusal(result, tmp_path, before, "so large a file is not allowed here (see 'ulimit -f')")
+    check_error(result, tmp_path, before, "so large a file is not allowed here (see 'ulimit -f')")
 
 
-@pytest.mark.parametrize("command", WRITERS)
-def test_read_only_disk_is_a_clear_error(command, data, run, packed, disk):
+@pytest.mark.parametrize("command", COMMANDS_THAT_WRITE)
+def test_a_read_only_disk_is_a_clear_error(command, data, run, packed, disk):
     out = disk / "out"
-    before = old_outputs(out)
+    before = write_old_outputs(out)
     subprocess.run(["mount", "-o", "remount,ro", str(disk)], check=True)
 
-    result = hyrfpack(*WRITERS[command](data, run / "model.hyrf", packed, out))
+    result = hyrfpack(*COMMANDS_THAT_WRITE[command](data, run / "model.hyrf", packed, out))
 
-    check_refusal(result, out, before, "(Read-only file system); choose another place")
-    assert "step" not in result.stderr  # training is refused before it starts
+    check_error(result, out, before, "(Read-only file system); choose another place")
+    assert "step" not in result.stderr  # training is rejected before its first step
 
 
-def test_disk_that_fills_while_rendering_keeps_the_whole_pictures(packed, disk):
+def test_a_disk_that_fills_while_rendering_keeps_complete_pictures(packed, disk):
     size = 256 * 256 // 4
     fill(disk, leave=8 * size)
 
@@ -168,7 +168,7 @@ def test_disk_that_fills_while_rendering_keeps_the_whole_pictures(packed, disk):
 
     assert result.exit_code == 2 and "the disk is full" in result.stderr
     left = sorted((disk / "out").iterdir())
-    assert 1 <= len(left) < 100 and all(PICTURE.search(path.name) for path in left)
+    assert 1 <= len(left) < 100 and all(PICTURE_NAME_PATTERN.search(path.name) for path in left)
     for path in left:
         Image.open(path).load()
 
@@ -177,10 +177,10 @@ def test_disk_that_fills_while_rendering_keeps_the_whole_pictures(packed, disk):
 
 
 def test_training_continues_without_checkpoints_that_do_not_fit(data, run, tmp_path):
-    """The model fits on the disk and the checkpoint, three times as large, does not."""
+    """The model fits on the disk, and the checkpoint, which is three times as large, does not."""
     size = (run / "model.hyrf").stat().st_size
     with file_limit(2 * size):
-        result = hyrfpack("train", data, "-o", tmp_path, *STEPS)
+        result = hyrfpack("train", data, "-o", tmp_path, *SHORT_TRAINING_OPTIONS)
 
     assert result.exit_code == 0, result.output
     notes = [
@@ -191,11 +191,11 @@ def test_training_continues_without_checkpoints_that_do_not_fit(data, run, tmp_p
     assert {path.name for path in tmp_path.iterdir()} == {"model.hyrf", "metrics.json", "curve.png", "views"}
 
 
-CONFIG = TrainConfig(steps=40, seed=1, max_gaussians=120)
+SHORT_CONFIG = TrainConfig(steps=40, seed=1, max_gaussians=120)
 
 
-def balls(before_load=lambda count: None):
-    """Six views whose photos call `before_load` with how many were loaded so far."""
+def balls_with_counted_loads(before_load=lambda count: None):
+    """Return six views whose photos call `before_load` with the number of loads so far."""
     scene, count = ball_scene(views=6, points=60, side=24), [0]
 
     def watched(view):
@@ -209,13 +209,13 @@ def balls(before_load=lambda count: None):
     return dataclasses.replace(scene, train=[watched(view) for view in scene.train])
 
 
-def test_disk_that_fills_in_training_keeps_the_checkpoint_and_resumes_to_the_same_model(disk):
-    whole = Trainer(balls(), CONFIG)
+def test_a_disk_that_fills_in_training_keeps_the_checkpoint_and_resumes_to_the_same_model(disk):
+    whole = Trainer(balls_with_counted_loads(), SHORT_CONFIG)
     whole.run()
     out = disk / "run"
 
     def fill_from_the_30th(count: int) -> None:
-        # Again and again: a checkpoint that was being written gives its forerunner's room back when it is done.
+        # This repeats, because a finished checkpoint frees the space of the one before.
         if count >= 30:
             with suppress(OSError), open(disk / "ballast", "ab", buffering=0) as ballast:
                 ballast.write(bytes(shutil.disk_usage(disk).free))
@@ -225,19 +225,26 @@ def test_disk_that_fills_in_training_keeps_the_checkpoint_and_resumes_to_the_sam
 
     kept = r"checkpoint of step \d+ is kept, the same command with `resume=True` instead of `overwrite=True` continues"
     with pytest.raises(HyrfError, match=rf"model.hyrf: the disk is full.*{kept}") as e:
-        train_model(balls(fill_from_the_30th), out, CONFIG, overwrite=True, cache=PictureCache(0), quiet=True)
+        train_model(
+            balls_with_counted_loads(fill_from_the_30th),
+            out,
+            SHORT_CONFIG,
+            overwrite=True,
+            cache=PictureCache(0),
+            quiet=True,
+        )
 
     assert files_in(out).keys() == {"model.hyrf", "checkpoint.pt"} and (out / "model.hyrf").read_bytes() == b"old"
     assert 10 <= int(re.search(r"checkpoint of step (\d+)", str(e.value))[1]) <= 30
     (disk / "ballast").unlink()
-    result = train_model(balls(), out, CONFIG, resume=True, quiet=True)
+    result = train_model(balls_with_counted_loads(), out, SHORT_CONFIG, resume=True, quiet=True)
     for name, parameter in hyrf_format.load_model(result.model).named_parameters():
         np.testing.assert_array_equal(parameter.detach(), dict(whole.model.named_parameters())[name].detach())
 
 
-def test_stop_without_room_for_the_checkpoint_says_which_one_is_kept(tmp_path):
-    """Ctrl-C on a full disk: there is nothing to go on for."""
-    trainer = Trainer(balls(), CONFIG)
+def test_a_stop_without_space_for_the_checkpoint_names_the_one_that_is_kept(tmp_path):
+    """On a full disk Ctrl-C cannot save a checkpoint, and the run ends."""
+    trainer = Trainer(balls_with_counted_loads(), SHORT_CONFIG)
     path = tmp_path / "checkpoint.pt"
     trainer.run(checkpoint=path, stop=lambda: trainer.step == 10)
     kept = path.read_bytes()
@@ -248,8 +255,8 @@ def test_stop_without_room_for_the_checkpoint_says_which_one_is_kept(tmp_path):
     assert trainer.saved == 10 and files_in(tmp_path) == {"checkpoint.pt": kept}
 
 
-def test_trainer_warns_of_a_checkpoint_that_cannot_be_written(tmp_path):
-    trainer = Trainer(balls(), dataclasses.replace(CONFIG, steps=2))
+def test_the_trainer_warns_when_a_checkpoint_cannot_be_written(tmp_path):
+    trainer = Trainer(balls_with_counted_loads(), dataclasses.replace(SHORT_CONFIG, steps=2))
 
     (tmp_path / "file").write_bytes(b"")
 
@@ -257,11 +264,11 @@ def test_trainer_warns_of_a_checkpoint_that_cannot_be_written(tmp_path):
         assert trainer.run(checkpoint=tmp_path / "file" / "checkpoint.pt")
 
 
-def test_folder_removed_while_training_is_made_again_for_the_model(tmp_path):
+def test_a_folder_removed_while_training_is_created_again_for_the_model(tmp_path):
     out = tmp_path / "run"
-    scene = balls(lambda count: shutil.rmtree(out, ignore_errors=True) if count >= 20 else None)
+    scene = balls_with_counted_loads(lambda count: shutil.rmtree(out, ignore_errors=True) if count >= 20 else None)
 
-    result = train_model(scene, out, CONFIG, cache=PictureCache(0), quiet=True)
+    result = train_model(scene, out, SHORT_CONFIG, cache=PictureCache(0), quiet=True)
 
     assert result.complete and hyrf_format.load_model(out / "model.hyrf") is not None
     assert json.loads((out / "metrics.json").read_text())["settings"]["seed"] == 1
@@ -293,6 +300,6 @@ def test_log_on_a_full_disk_does_not_end_the_training(monkeypatch, tmp_path):
     monkeypatch.setattr("hyrfpack.train.progress.LOG_INTERVAL_SECONDS", 0.0)
     monkeypatch.setattr("sys.stderr", FullLog())
 
-    result = train_model(balls(), tmp_path, dataclasses.replace(CONFIG, steps=2))
+    result = train_model(balls_with_counted_loads(), tmp_path, dataclasses.replace(SHORT_CONFIG, steps=2))
 
     assert result.complete and FullLog.written >= 2

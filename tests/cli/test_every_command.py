@@ -1,9 +1,9 @@
-"""Every command against every one of its inputs as output: what a person has is never lost.
+"""No command loses a user's files: every command is tried with every one of its inputs as its output.
 
-The rule: no command writes over what it reads, into a folder that holds photos or poses, or over a file that exists,
-unless --overwrite says so, and over an input never; every command checks all its outputs before it works.
+No command writes over its inputs. Without --overwrite, no command writes into a folder with photos or poses, or over
+an existing file. Every command checks all its outputs before it works.
 
-`python tests/cli/test_every_command.py` tries all of it and prints the table that docs can show.
+`python tests/cli/test_every_command.py` runs all cases and prints the table for the documentation.
 """
 
 from __future__ import annotations
@@ -26,12 +26,17 @@ from click.testing import Result
 from commands import hyrfpack
 from PIL import Image
 
-REFUSED, REPLACED, WRITTEN = "refused", "replaced", "written"
-WORK_BEGAN, WORK_ENDS = "the work begins", "let it"  # said in place of what would take minutes
+OUTCOME_REFUSED = "refused"
+OUTCOME_REPLACED = "replaced"
+OUTCOME_WRITTEN = "written"
+# The error raised in place of work that would take minutes.
+WORK_BEGAN_PROBLEM = "the work begins"
+WORK_BEGAN_FIX = "let it"
 
-# -- what commands read ------------------------------------------------------------------------------------------------
+# -- inputs of commands ------------------------------------------------------------------------------------------------
 
-SETS = {  # folders of photos and poses, of COLMAP, as NeRF-synthetic and of nerfstudio, and what is read of each
+# Folders of photos and poses (COLMAP, NeRF-synthetic, nerfstudio), and the paths below them that commands read.
+READ_PATHS_BY_SET = {
     "hall": (
         "",
         "/images",
@@ -52,147 +57,162 @@ SETS = {  # folders of photos and poses, of COLMAP, as NeRF-synthetic and of ner
     ),
     "nerfstudio": ("", "/images", "/masks", "/transforms.json", "/points.ply", "/images/0001.png", "/masks/0001.png"),
 }
-KINDS = (".ply", ".splat", ".spz", ".glb", ".sog", ".html", ".points.ply", ".points.glb", ".json")
-USD = (".usda", ".usdc", ".usdz")
+OUTPUT_ENDINGS = (".ply", ".splat", ".spz", ".glb", ".sog", ".html", ".points.ply", ".points.glb", ".json")
+USD_ENDINGS = (".usda", ".usdc", ".usdz")
 
 
 @dataclass(frozen=True)
 class Case:
-    """A command line, with {} where the output is named, what is named there, and what must come of it.
+    """A command line, with {} for the output, the output path, and the expected outcome.
 
     Attributes:
-        command: without "hyrfpack".
-        output: a path below the world.
-        plain, overwriting: what must come of it without and with --overwrite.
+        command: the words after "hyrfpack".
+        output: a path below the working folder.
+        plain, overwriting: the expected outcome without and with --overwrite.
     """
 
     command: str
     output: str
-    plain: str = REFUSED
-    overwriting: str = REFUSED
+    plain: str = OUTCOME_REFUSED
+    overwriting: str = OUTCOME_REFUSED
 
     def __str__(self) -> str:
         return self.command.format(self.output)
 
 
-def _inputs(command: str, *outputs: str) -> list[Case]:
-    """Cases of outputs that are inputs, which nothing replaces."""
+def _input_cases(command: str, *outputs: str) -> list[Case]:
+    """Return cases whose outputs are inputs, which no command replaces."""
     return [Case(command, output) for output in outputs]
 
 
-def _of_set(name: str, new: str = "") -> list[str]:
-    """What is read of a set, and files of a new name in its folders."""
-    paths = [name + part for part in SETS[name]]
+def _paths_of_set(name: str, new: str = "") -> list[str]:
+    """Return the paths of a set that commands read, and paths of a new name in its folders."""
+    paths = [name + part for part in READ_PATHS_BY_SET[name]]
     return paths + [f"{path}/{new}" for path in paths if new and not Path(path).suffix]
 
 
-def _cases() -> list[Case]:
+def _make_cases() -> list[Case]:
     cases = []
-    for name in SETS:
-        cases += _inputs(f"train {name} -o {{}} --steps 2", *_of_set(name))
-        cases += _inputs(f"poses {name} -o {{}}", *_of_set(name))
-        cases += _inputs(f"render model.hyrf --data {name} -o {{}}", "model.hyrf", *_of_set(name))
-        cases += _inputs(f"evaluate model.hyrf --data {name} --pictures {{}}", "model.hyrf", *_of_set(name))
-        cases += _inputs(f"compress model.hyrf --data {name} -o {{}}", "model.hyrf", *_of_set(name, "new.hyrf"))
-        cases += _inputs(f"compress model.hyrf --data {name} -o small.hyrf --report {{}}", "model.hyrf", *_of_set(name))
-        cases += _inputs(f"export model.hyrf --data {name} -o {{}}", "model.hyrf", *_of_set(name))
-        cases += _inputs(f"bench model.hyrf --data {name} -o {{}}", "model.hyrf", *_of_set(name, "new.png"))
-        cases += _inputs(
-            f"bench model.hyrf --data {name} -o new.png --markdown {{}}", "model.hyrf", *_of_set(name, "new.md")
+    for name in READ_PATHS_BY_SET:
+        cases += _input_cases(f"train {name} -o {{}} --steps 2", *_paths_of_set(name))
+        cases += _input_cases(f"poses {name} -o {{}}", *_paths_of_set(name))
+        cases += _input_cases(f"render model.hyrf --data {name} -o {{}}", "model.hyrf", *_paths_of_set(name))
+        cases += _input_cases(f"evaluate model.hyrf --data {name} --pictures {{}}", "model.hyrf", *_paths_of_set(name))
+        cases += _input_cases(
+            f"compress model.hyrf --data {name} -o {{}}", "model.hyrf", *_paths_of_set(name, "new.hyrf")
         )
-    for ending in (*KINDS, *USD):  # a file of each kind among photos that are read
-        cases += _inputs("export model.hyrf --data hall -o {}", f"hall/images/new{ending}", f"hall/new{ending}")
-    for name in SETS:  # of an ending that says what to write, as the folders and a player have
-        cases += _inputs(f"make {name} -o {{}}", *(path for path in _of_set(name, "new.html") if "." not in path))
-        cases += _inputs(f"make {name} -o {{}}", *(path for path in _of_set(name, "new.html") if path.endswith("html")))
-    cases += _inputs("make photos -o {}", "photos", "photos/new.html", "photos/0001.png", "photos/made/new.html")
-    cases += _inputs("make ball.ply -o {}", "ball.ply", "{world}/ball.ply")
-    cases += _inputs("make packed.hyrf -o {}", "packed.hyrf", "named.json/a.html")
-    cases += _inputs("train nerfstudio -o {} --steps 2", "nerfstudio/images/..", "{world}/nerfstudio")
-    cases += _inputs("train link-to-set -o {} --steps 2", "link-to-set", "hall", "hall/images")
-    cases += _inputs("train views-of-its-own -o {} --images views --steps 2", "views-of-its-own")
+        cases += _input_cases(
+            f"compress model.hyrf --data {name} -o small.hyrf --report {{}}", "model.hyrf", *_paths_of_set(name)
+        )
+        cases += _input_cases(f"export model.hyrf --data {name} -o {{}}", "model.hyrf", *_paths_of_set(name))
+        cases += _input_cases(f"bench model.hyrf --data {name} -o {{}}", "model.hyrf", *_paths_of_set(name, "new.png"))
+        cases += _input_cases(
+            f"bench model.hyrf --data {name} -o new.png --markdown {{}}", "model.hyrf", *_paths_of_set(name, "new.md")
+        )
+    for ending in (*OUTPUT_ENDINGS, *USD_ENDINGS):  # a file of each kind beside photos that are read
+        cases += _input_cases("export model.hyrf --data hall -o {}", f"hall/images/new{ending}", f"hall/new{ending}")
+    for name in READ_PATHS_BY_SET:  # an ending decides what is written, as for folders and the player
+        cases += _input_cases(
+            f"make {name} -o {{}}", *(path for path in _paths_of_set(name, "new.html") if "." not in path)
+        )
+        cases += _input_cases(
+            f"make {name} -o {{}}", *(path for path in _paths_of_set(name, "new.html") if path.endswith("html"))
+        )
+    cases += _input_cases("make photos -o {}", "photos", "photos/new.html", "photos/0001.png", "photos/made/new.html")
+    cases += _input_cases("make ball.ply -o {}", "ball.ply", "{world}/ball.ply")
+    cases += _input_cases("make packed.hyrf -o {}", "packed.hyrf", "named.json/a.html")
+    cases += _input_cases("train nerfstudio -o {} --steps 2", "nerfstudio/images/..", "{world}/nerfstudio")
+    cases += _input_cases("train link-to-set -o {} --steps 2", "link-to-set", "hall", "hall/images")
+    cases += _input_cases("train views-of-its-own -o {} --images views --steps 2", "views-of-its-own")
     names = ("packed.hyrf", "soft.hyrf", "hard.hyrf", "old/../packed.hyrf", "{world}/packed.hyrf")
     for command in ("compress packed.hyrf -o {}", "decompress packed.hyrf -o {}"):
-        cases += _inputs(command, *names)
-        cases += _inputs(command.replace("packed.hyrf", "soft.hyrf"), *names)
-    cases += _inputs("render model.hyrf --cameras cameras.json -o {}", "model.hyrf", "cameras.json")
-    cases += _inputs("render model.hyrf --cameras nerfstudio/transforms.json -o {}", "nerfstudio/transforms.json")
-    cases += _inputs("evaluate model.hyrf --data blender --lpips-weights lpips.pth --pictures {}", "lpips.pth")
-    cases += _inputs("export model.hyrf -o {}", "model.hyrf")
-    cases += _inputs("export named.json -o {}", "named.json")  # a model of another name
-    cases += _inputs("import ball.ply -o {}", "ball.ply", "{world}/ball.ply", "old/../ball.ply")
-    cases += _inputs("import ball.hyrf.ply -o {}", "soft-ball.hyrf", "hard-ball.hyrf")
-    cases += _inputs("import ball.ply --cameras cameras.json -o {}", "cameras.json")
-    cases += _inputs("import ball.ply --cameras poses.hyrf -o {}", "poses.hyrf")
-    cases += _inputs("import loose -o {}", "loose", "loose/meta.json", "loose/means_l.webp")
-    cases += _inputs("import loose/meta.json -o {}", "loose", "loose/meta.json", "loose/means_l.webp")
-    cases += _inputs("convert ball.ply {}", "ball.ply", "{world}/ball.ply", "old/../ball.ply")
-    cases += _inputs("convert loose {}", "loose/new.ply")
-    cases += _inputs("compress first --profile paper -o {}", "first/model.hyrf")
-    cases += _inputs("decompress first -o {}", "first/model.hyrf")
-    cases += _inputs("compare first second -o {}", "first", "first/metrics.json", "second/model.hyrf", "{world}/first")
-    # Files of others, which only --overwrite replaces, and sets of photos that the command does not read.
+        cases += _input_cases(command, *names)
+        cases += _input_cases(command.replace("packed.hyrf", "soft.hyrf"), *names)
+    cases += _input_cases("render model.hyrf --cameras cameras.json -o {}", "model.hyrf", "cameras.json")
+    cases += _input_cases("render model.hyrf --cameras nerfstudio/transforms.json -o {}", "nerfstudio/transforms.json")
+    cases += _input_cases("evaluate model.hyrf --data blender --lpips-weights lpips.pth --pictures {}", "lpips.pth")
+    cases += _input_cases("export model.hyrf -o {}", "model.hyrf")
+    cases += _input_cases("export named.json -o {}", "named.json")  # a model under another name
+    cases += _input_cases("import ball.ply -o {}", "ball.ply", "{world}/ball.ply", "old/../ball.ply")
+    cases += _input_cases("import ball.hyrf.ply -o {}", "soft-ball.hyrf", "hard-ball.hyrf")
+    cases += _input_cases("import ball.ply --cameras cameras.json -o {}", "cameras.json")
+    cases += _input_cases("import ball.ply --cameras poses.hyrf -o {}", "poses.hyrf")
+    cases += _input_cases("import loose -o {}", "loose", "loose/meta.json", "loose/means_l.webp")
+    cases += _input_cases("import loose/meta.json -o {}", "loose", "loose/meta.json", "loose/means_l.webp")
+    cases += _input_cases("convert ball.ply {}", "ball.ply", "{world}/ball.ply", "old/../ball.ply")
+    cases += _input_cases("convert loose {}", "loose/new.ply")
+    cases += _input_cases("compress first --profile paper -o {}", "first/model.hyrf")
+    cases += _input_cases("decompress first -o {}", "first/model.hyrf")
+    cases += _input_cases(
+        "compare first second -o {}", "first", "first/metrics.json", "second/model.hyrf", "{world}/first"
+    )
+    # Files of other programs, which only --overwrite replaces, and sets of photos that the command does not read.
     cases += [
-        Case("train hall -o {} --steps 2 --max-gaussians 50", "run", REFUSED, REPLACED),
-        Case("compare first second -o {}", "old/a.html", REFUSED, REPLACED),
-        Case("compress packed.hyrf -o {} --profile paper", "old/a.hyrf", REFUSED, REPLACED),
-        Case("compress packed.hyrf -o {} --profile paper", "soft-to-old.hyrf", REFUSED, REPLACED),
-        Case("compress model.hyrf -o old/new.hyrf --profile paper --report {}", "old/report", REFUSED, REPLACED),
-        Case("decompress packed.hyrf -o {}", "old/a.hyrf", REFUSED, REPLACED),
-        Case("render model.hyrf --orbit 1 -o {}", "old/pictures", REFUSED, REPLACED),
-        Case("evaluate model.hyrf --data hall --pictures {}", "old/pictures", REFUSED, REPLACED),
-        *(
-            Case("export model.hyrf --baked --sh-degree 0 -o {}", f"old/a{ending}", REFUSED, REPLACED)
-            for ending in KINDS
+        Case("train hall -o {} --steps 2 --max-gaussians 50", "run", OUTCOME_REFUSED, OUTCOME_REPLACED),
+        Case("compare first second -o {}", "old/a.html", OUTCOME_REFUSED, OUTCOME_REPLACED),
+        Case("compress packed.hyrf -o {} --profile paper", "old/a.hyrf", OUTCOME_REFUSED, OUTCOME_REPLACED),
+        Case("compress packed.hyrf -o {} --profile paper", "soft-to-old.hyrf", OUTCOME_REFUSED, OUTCOME_REPLACED),
+        Case(
+            "compress model.hyrf -o old/new.hyrf --profile paper --report {}",
+            "old/report",
+            OUTCOME_REFUSED,
+            OUTCOME_REPLACED,
         ),
-        Case("export model.hyrf -o {}", "old/a.html", REFUSED, REPLACED),
-        Case("export model.hyrf --colmap -o {}", "old/colmap", REFUSED, REPLACED),
-        Case("export model.hyrf -o {}", "old/player", REFUSED, REPLACED),
-        Case("export model.hyrf named.json -o {}", "old/gallery", REFUSED, REPLACED),
-        Case("import ball.ply --steps 1 --size 16 -o {}", "old/a.hyrf", REFUSED, REPLACED),
-        Case("convert ball.ply {}", "old/a.ply", REFUSED, REPLACED),
+        Case("decompress packed.hyrf -o {}", "old/a.hyrf", OUTCOME_REFUSED, OUTCOME_REPLACED),
+        Case("render model.hyrf --orbit 1 -o {}", "old/pictures", OUTCOME_REFUSED, OUTCOME_REPLACED),
+        Case("evaluate model.hyrf --data hall --pictures {}", "old/pictures", OUTCOME_REFUSED, OUTCOME_REPLACED),
         *(
-            Case("make packed.hyrf --work made -o {}", f"old/a{ending}", REFUSED, REPLACED)
+            Case("export model.hyrf --baked --sh-degree 0 -o {}", f"old/a{ending}", OUTCOME_REFUSED, OUTCOME_REPLACED)
+            for ending in OUTPUT_ENDINGS
+        ),
+        Case("export model.hyrf -o {}", "old/a.html", OUTCOME_REFUSED, OUTCOME_REPLACED),
+        Case("export model.hyrf --colmap -o {}", "old/colmap", OUTCOME_REFUSED, OUTCOME_REPLACED),
+        Case("export model.hyrf -o {}", "old/player", OUTCOME_REFUSED, OUTCOME_REPLACED),
+        Case("export model.hyrf named.json -o {}", "old/gallery", OUTCOME_REFUSED, OUTCOME_REPLACED),
+        Case("import ball.ply --steps 1 --size 16 -o {}", "old/a.hyrf", OUTCOME_REFUSED, OUTCOME_REPLACED),
+        Case("convert ball.ply {}", "old/a.ply", OUTCOME_REFUSED, OUTCOME_REPLACED),
+        *(
+            Case("make packed.hyrf --work made -o {}", f"old/a{ending}", OUTCOME_REFUSED, OUTCOME_REPLACED)
             for ending in (".html", ".ply")
         ),
-        Case("make packed.hyrf --work made -o {}", "old/player", REFUSED, REPLACED),
-        Case("bench model.hyrf -o {}", "old/a.png", REFUSED, WRITTEN),
-        Case("bench model.hyrf -o new.png --markdown {}", "old/a.md"),  # it has no places for tables
-        Case("demo --steps 1 -o {}", "old/demo", REFUSED, WRITTEN),
-        *(Case("demo --steps 1 -o {}", name, REFUSED, WRITTEN) for name in SETS),
-        Case("train hall -o {} --steps 2 --max-gaussians 50", "nerfstudio", REFUSED, WRITTEN),
-        Case("render model.hyrf --orbit 1 -o {}", "hall/images", REFUSED, REPLACED),
-        Case("render model.hyrf --orbit 1 -o {}", "blender", REFUSED, WRITTEN),
-        Case("evaluate model.hyrf --data hall --pictures {}", "nerfstudio/images", REFUSED, REPLACED),
-        Case("export model.hyrf --colmap -o {}", "hall", REFUSED, REPLACED),
-        Case("export model.hyrf -o {}", "hall", REFUSED, WRITTEN),
-        Case("export model.hyrf packed.hyrf -o {}", "hall", REFUSED, WRITTEN),
-        Case("compare first second -o {}", "hall/new.html", REFUSED, WRITTEN),
-        Case("compress packed.hyrf -o {} --profile paper", "hall/small.hyrf", REFUSED, WRITTEN),
-        Case("decompress packed.hyrf -o {}", "nerfstudio/images/back.hyrf", REFUSED, WRITTEN),
-        Case("export model.hyrf --sh-degree 0 -o {}", "blender/train/a.ply", REFUSED, WRITTEN),
-        Case("import ball.ply --steps 1 --size 16 -o {}", "hall/ball.hyrf", REFUSED, WRITTEN),
+        Case("make packed.hyrf --work made -o {}", "old/player", OUTCOME_REFUSED, OUTCOME_REPLACED),
+        Case("bench model.hyrf -o {}", "old/a.png", OUTCOME_REFUSED, OUTCOME_WRITTEN),
+        Case("bench model.hyrf -o new.png --markdown {}", "old/a.md"),  # the page has no placeholders for tables
+        Case("demo --steps 1 -o {}", "old/demo", OUTCOME_REFUSED, OUTCOME_WRITTEN),
+        *(Case("demo --steps 1 -o {}", name, OUTCOME_REFUSED, OUTCOME_WRITTEN) for name in READ_PATHS_BY_SET),
+        Case("train hall -o {} --steps 2 --max-gaussians 50", "nerfstudio", OUTCOME_REFUSED, OUTCOME_WRITTEN),
+        Case("render model.hyrf --orbit 1 -o {}", "hall/images", OUTCOME_REFUSED, OUTCOME_REPLACED),
+        Case("render model.hyrf --orbit 1 -o {}", "blender", OUTCOME_REFUSED, OUTCOME_WRITTEN),
+        Case("evaluate model.hyrf --data hall --pictures {}", "nerfstudio/images", OUTCOME_REFUSED, OUTCOME_REPLACED),
+        Case("export model.hyrf --colmap -o {}", "hall", OUTCOME_REFUSED, OUTCOME_REPLACED),
+        Case("export model.hyrf -o {}", "hall", OUTCOME_REFUSED, OUTCOME_WRITTEN),
+        Case("export model.hyrf packed.hyrf -o {}", "hall", OUTCOME_REFUSED, OUTCOME_WRITTEN),
+        Case("compare first second -o {}", "hall/new.html", OUTCOME_REFUSED, OUTCOME_WRITTEN),
+        Case("compress packed.hyrf -o {} --profile paper", "hall/small.hyrf", OUTCOME_REFUSED, OUTCOME_WRITTEN),
+        Case("decompress packed.hyrf -o {}", "nerfstudio/images/back.hyrf", OUTCOME_REFUSED, OUTCOME_WRITTEN),
+        Case("export model.hyrf --sh-degree 0 -o {}", "blender/train/a.ply", OUTCOME_REFUSED, OUTCOME_WRITTEN),
+        Case("import ball.ply --steps 1 --size 16 -o {}", "hall/ball.hyrf", OUTCOME_REFUSED, OUTCOME_WRITTEN),
     ]
-    # What may be written: a folder of its own, even within the set, and new names.
+    # Outputs that are allowed: a new folder, even inside the set, and new names.
     cases += [
-        Case("train hall -o {} --steps 2 --max-gaussians 50", "hall/run", WRITTEN, WRITTEN),
-        Case("render model.hyrf --data hall -o {}", "hall/renders", WRITTEN, WRITTEN),
-        Case("compare first second -o {}", "first/comparison.html", WRITTEN, WRITTEN),
-        Case("decompress packed.hyrf -o {}", "back.hyrf", WRITTEN, WRITTEN),
-        Case("bench model.hyrf --data hall -o {}", "new.png", WRITTEN, WRITTEN),
-        Case("demo --steps 1 -o {}", "demo", WRITTEN, WRITTEN),
+        Case("train hall -o {} --steps 2 --max-gaussians 50", "hall/run", OUTCOME_WRITTEN, OUTCOME_WRITTEN),
+        Case("render model.hyrf --data hall -o {}", "hall/renders", OUTCOME_WRITTEN, OUTCOME_WRITTEN),
+        Case("compare first second -o {}", "first/comparison.html", OUTCOME_WRITTEN, OUTCOME_WRITTEN),
+        Case("decompress packed.hyrf -o {}", "back.hyrf", OUTCOME_WRITTEN, OUTCOME_WRITTEN),
+        Case("bench model.hyrf --data hall -o {}", "new.png", OUTCOME_WRITTEN, OUTCOME_WRITTEN),
+        Case("demo --steps 1 -o {}", "demo", OUTCOME_WRITTEN, OUTCOME_WRITTEN),
     ]
     return cases
 
 
-CASES = _cases()
+ALL_CASES = _make_cases()
 
 
-# -- a world to lose ---------------------------------------------------------------------------------------------------
+# -- files that a command could lose -----------------------------------------------------------------------------------
 
 
 def make_world(folder: Path) -> Path:
-    """A folder with a set of photos of each layout, models, splats and files of others, as small as they work."""
+    """Create a set of photos of each layout, models, splats and foreign files, all as small as possible."""
     from explicit_balls import ball_splats
 
     from hyrfpack.cameras.files import cameras_to_json
@@ -217,11 +237,11 @@ def make_world(folder: Path) -> Path:
     _add_masks(folder / "hall", photos)
     _make_blender(folder / "blender", photos, poses["frames"])
 
-    _ok("train", nerfstudio, "-o", folder / "trained", "--steps", 3, "--max-gaussians", 40)
+    _run_checked("train", nerfstudio, "-o", folder / "trained", "--steps", 3, "--max-gaussians", 40)
     shutil.copy(folder / "trained" / "model.hyrf", folder / "model.hyrf")
     (folder / "trained").rename(folder / "first")
     shutil.copytree(folder / "first", folder / "second")
-    _ok("compress", folder / "model.hyrf", "-o", folder / "packed.hyrf", "--profile", "paper")
+    _run_checked("compress", folder / "model.hyrf", "-o", folder / "packed.hyrf", "--profile", "paper")
     shutil.copy(folder / "model.hyrf", folder / "named.json")
     (folder / "cameras.json").write_text(cameras_to_json(named))
     shutil.copy(folder / "cameras.json", folder / "poses.hyrf")
@@ -249,7 +269,7 @@ def _add_masks(root: Path, photos: list[Path]) -> None:
 
 
 def _make_blender(root: Path, photos: list[Path], frames: list[dict]) -> None:
-    """A NeRF-synthetic set: its photos and poses in two splits."""
+    """Write a NeRF-synthetic set with two splits."""
     angle = 2 * math.atan(8 / frames[0]["fl_x"])
     for split, numbers in (("train", (0, 1, 2)), ("test", (3,))):
         (root / split).mkdir(parents=True)
@@ -263,12 +283,12 @@ def _make_blender(root: Path, photos: list[Path], frames: list[dict]) -> None:
 
 
 def _make_foreign(folder: Path, photo: str) -> None:
-    """Files that other programs made, named as the commands' own."""
+    """Write files of other programs under the names that commands use."""
     from hyrfpack.compress.report_page import REPORT_FILES
     from hyrfpack.demo.run import RESULT_FILES as DEMO
 
     scored = f"{Path(photo).stem}.png"
-    names = [f"a{ending}" for ending in (".hyrf", ".png", ".json", ".md", *KINDS)]
+    names = [f"a{ending}" for ending in (".hyrf", ".png", ".json", ".md", *OUTPUT_ENDINGS)]
     names += ["colmap/sparse/0/cameras.bin", "player/index.html", "gallery/index.html"]
     names += ["pictures/0000.png", f"pictures/{scored}", f"report/{REPORT_FILES[0]}"]
     for path in (*(f"old/{name}" for name in names), f"old/demo/{DEMO[0]}", "run/metrics.json"):
@@ -276,13 +296,13 @@ def _make_foreign(folder: Path, photo: str) -> None:
         (folder / path).write_bytes(b"of another program")
 
 
-def _ok(*arguments: object) -> None:
+def _run_checked(*arguments: object) -> None:
     result = hyrfpack(*arguments)
     assert result.exit_code == 0, result.output
 
 
-def files_of(folder: Path) -> dict[str, str]:
-    """What every file and link below a folder is: the SHA-256 of its bytes, where a link points; "" of a folder."""
+def describe_files(folder: Path) -> dict[str, str]:
+    """Return by path the SHA-256 of each file, the target of each link and "" for each folder."""
     found, waiting = {}, [""]
     while waiting:
         below = waiting.pop()
@@ -300,46 +320,51 @@ def files_of(folder: Path) -> dict[str, str]:
     return found
 
 
-# -- trying it ---------------------------------------------------------------------------------------------------------
+# -- running the cases -------------------------------------------------------------------------------------------------
 
 
 def run_case(case: Case, world: Path, before: dict[str, str], overwrite: bool) -> tuple[str, Result]:
-    """Run a case in a world that is the working folder, where `before` is what is there. Returns what came of it, in a
-    word or with what went wrong."""
+    """Run a case in the working folder `world`, whose files are `before`.
+
+    Returns:
+        The outcome: one of the constants above, or what went wrong; and the command's result.
+    """
     output = case.output.format(world=world)
     result = hyrfpack(*case.command.format(output).split(), *(["--overwrite"] if overwrite else []))
-    after = files_of(world)
+    after = describe_files(world)
 
     changed = sorted(path for path in before.keys() | after.keys() if before.get(path) != after.get(path))
     errors = [line for line in result.stderr.splitlines() if line.startswith("Error: ")]
-    began = errors == [f"Error: {WORK_BEGAN}; {WORK_ENDS}"]
+    began = errors == [f"Error: {WORK_BEGAN_PROBLEM}; {WORK_BEGAN_FIX}"]
     if "Traceback" in result.output or (result.exit_code and not (result.exit_code == 2 and len(errors) == 1)):
         return f"exit code {result.exit_code}, {len(errors)} sentences", result
     if result.exit_code and not began:
-        return (f"refused, but {changed[0]} changed" if changed else REFUSED), result
+        return (f"refused, but {changed[0]} changed" if changed else OUTCOME_REFUSED), result
     place = str(Path(os.path.realpath(output)).relative_to(os.path.realpath(world)))
     beyond = [path for path in changed if path != place and not path.startswith(f"{place}/")]
-    beyond = [path for path in beyond if path not in ("old/new.hyrf", "new.png", "small.hyrf")]  # other outputs
+    beyond = [
+        path for path in beyond if path not in ("old/new.hyrf", "new.png", "small.hyrf")
+    ]  # these are further outputs of the command
     beyond = [path for path in beyond if path.split("/")[0] != "made"]
     if beyond:
         return f"wrote over {beyond[0]}", result
     lost = [path for path in changed if path in before and before[path]]
-    return (REPLACED if lost else WRITTEN), result
+    return (OUTCOME_REPLACED if lost else OUTCOME_WRITTEN), result
 
 
 def _replace_work(patch: pytest.MonkeyPatch) -> None:
-    """What takes minutes says instead that it begins."""
+    """Make work that would take minutes raise an error when it begins."""
     from hyrfpack.errors import HyrfError
 
     def begin(*arguments: object, **options: object) -> None:
-        raise HyrfError(WORK_BEGAN, fix=WORK_ENDS)
+        raise HyrfError(WORK_BEGAN_PROBLEM, fix=WORK_BEGAN_FIX)
 
     patch.setattr(import_module("hyrfpack.bench"), "benchmark_model", begin)
     patch.setattr(import_module("hyrfpack.demo.run"), "run_demo", begin)
 
 
 def _forbid_work(patch: pytest.MonkeyPatch) -> None:
-    """Whatever is drawn, to learn, measure, bake or score, is an error: refusals come before."""
+    """Make drawing an error, because outputs must be rejected before anything is learned, measured, baked or scored."""
     for name in ("bench", "compare", "compress", "demo", "distill", "evaluate", "export", "render", "train"):
         import_module(f"hyrfpack.{name}")
     rasterize = import_module("hyrfpack.ops.rasterize").rasterize
@@ -353,21 +378,21 @@ def _forbid_work(patch: pytest.MonkeyPatch) -> None:
 
 
 class Worlds:
-    """Copies of a world, in a folder: one for each that changes it, and one for all that leave it as it is."""
+    """Copies of a folder: a new one for each case that changes it, and one for all cases that do not."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.template = folder, make_world(folder / "template")
-        self.files = files_of(self.template)
+        self.files = describe_files(self.template)
         self._copies = 0
         self._kept: Path | None = None
 
     def new(self) -> Path:
         self._copies += 1
-        return copy_of(self.template, self.folder / str(self._copies))
+        return copy_world(self.template, self.folder / str(self._copies))
 
     @contextmanager
     def kept(self) -> Iterator[Path]:
-        """The one that is left as it is; nobody gets it again where an error says that it is not."""
+        """The unchanged copy. After an error it is not reused."""
         world, self._kept = self._kept or self.new(), None
         yield world
         self._kept = world
@@ -378,8 +403,8 @@ def worlds(tmp_path_factory: pytest.TempPathFactory) -> Worlds:
     return Worlds(tmp_path_factory.mktemp("worlds"))
 
 
-def copy_of(template: Path, folder: Path) -> Path:
-    """A copy of a world, hard links included."""
+def copy_world(template: Path, folder: Path) -> Path:
+    """Copy a folder with its hard links."""
     shutil.copytree(template, folder, symlinks=True)
     for link, name in (("hard.hyrf", "packed.hyrf"), ("hard-ball.hyrf", "ball.hyrf.ply")):
         (folder / link).unlink()
@@ -389,49 +414,49 @@ def copy_of(template: Path, folder: Path) -> Path:
 
 @pytest.mark.usefixtures("short_imports")
 @pytest.mark.parametrize("overwrite", [False, True], ids=["plain", "overwrite"])
-@pytest.mark.parametrize("case", CASES, ids=str)
-def test_every_command_keeps_what_a_person_has(case, overwrite, worlds, monkeypatch):
+@pytest.mark.parametrize("case", ALL_CASES, ids=str)
+def test_no_command_loses_a_users_files(case, overwrite, worlds, monkeypatch):
     expected = case.overwriting if overwrite else case.plain
     _replace_work(monkeypatch)
-    if expected == REFUSED:
+    if expected == OUTCOME_REFUSED:
         _forbid_work(monkeypatch)
 
-    with worlds.kept() if expected == REFUSED else nullcontext(worlds.new()) as world:
+    with worlds.kept() if expected == OUTCOME_REFUSED else nullcontext(worlds.new()) as world:
         monkeypatch.chdir(world)
         outcome, result = run_case(case, world, worlds.files, overwrite)
         assert outcome == expected, result.output
 
 
-def test_the_table_names_every_command_that_writes():
+def test_the_cases_cover_every_command_that_writes():
     from hyrfpack.cli import main
 
     writes = {name for name, command in main.commands.items() if any("--overwrite" in p.opts for p in command.params)}
-    assert {case.command.split()[0] for case in CASES} == writes
+    assert {case.command.split()[0] for case in ALL_CASES} == writes
 
 
 @pytest.mark.usefixtures("short_imports")
-def test_a_world_is_one_that_commands_can_read(worlds, monkeypatch):
-    """Else they would refuse for another reason."""
+def test_commands_accept_the_inputs_of_the_cases(worlds, monkeypatch):
+    """Otherwise commands would fail for another reason."""
     monkeypatch.chdir(worlds.new())
-    for name in SETS:
-        _ok("evaluate", "model.hyrf", "--data", name, "--pictures", f"pictures-{name}")
+    for name in READ_PATHS_BY_SET:
+        _run_checked("evaluate", "model.hyrf", "--data", name, "--pictures", f"pictures-{name}")
     for source in ("ball.ply", "loose"):
-        _ok("import", source, "-o", f"{source}-new.hyrf", "--steps", 1, "--size", 16)
-    _ok("render", "model.hyrf", "--cameras", "cameras.json", "-o", "renders")
+        _run_checked("import", source, "-o", f"{source}-new.hyrf", "--steps", 1, "--size", 16)
+    _run_checked("render", "model.hyrf", "--cameras", "cameras.json", "-o", "renders")
 
 
 # -- the table ---------------------------------------------------------------------------------------------------------
 
 
 def markdown_table() -> str:
-    """What comes of every case, tried now, as a Markdown table; what should not have is in capitals."""
+    """Run all cases and return their outcomes as a Markdown table; an unexpected outcome is in capitals."""
     from tempfile import TemporaryDirectory
 
     lines = ["| command | input as output | without --overwrite | with --overwrite |", "|---|---|---|---|"]
     with TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
         worlds = Worlds(Path(folder))
         _replace_work(patch)
-        for case in CASES:
+        for case in ALL_CASES:
             cells = []
             for overwrite, expected in ((False, case.plain), (True, case.overwriting)):
                 world = worlds.new()

@@ -1,4 +1,4 @@
-"""`hyrfpack export` and `hyrfpack view`, called as a person would."""
+"""`hyrfpack export` and `hyrfpack view` on the command line."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ from hyrfpack.cli import main
 from hyrfpack.format import save_model
 from hyrfpack.splats.files import read_splats
 
-POSITIONS = np.random.default_rng(0).uniform(-0.6, 0.6, (40, 3))
+GAUSSIAN_POSITIONS = np.random.default_rng(0).uniform(-0.6, 0.6, (40, 3))
 
 
 @pytest.fixture(scope="module")
 def model(tmp_path_factory):
-    """Forty Gaussians before a background sphere, and four cameras around them."""
+    """Forty Gaussians in front of a background sphere, and four cameras around them."""
     path, cameras = tmp_path_factory.mktemp("models") / "model.hyrf", ring(4)
     kept = {"cameras": provenance_cameras(cameras), "viewpoint": Viewpoint.from_cameras(cameras).to_json()}
-    save_model(small_model(POSITIONS, fields=2.0, background=True), path, provenance=kept)
+    save_model(small_model(GAUSSIAN_POSITIONS, fields=2.0, background=True), path, provenance=kept)
     return path
 
 
-def test_export_says_what_it_does_and_prints_what_was_lost(model, tmp_path):
+def test_export_reports_its_steps_and_the_loss(model, tmp_path):
     result = succeeded("export", model, "-o", tmp_path / "a.ply", "--sh-degree", 3)
     size, splats = (tmp_path / "a.ply").stat().st_size, read_splats(tmp_path / "a.ply")
     rows = re.findall(r"^(baked to .*|read back from .*?) +(\d+\.\d\d)$", result.stdout, re.MULTILINE)
@@ -65,7 +65,7 @@ def test_identical_pictures_are_json_too(tmp_path):
     assert report["psnr"] == report["psnr_baked"] == report["chosen_by"]["3"] == 100
 
 
-def test_photos_are_scored_if_given(model, data, tmp_path):
+def test_given_photos_are_scored(model, data, tmp_path):
     arguments = ("export", model, "-o", tmp_path / "a.ply", "--overwrite", "--sh-degree", 0, "--data", data)
     last = succeeded(*arguments).stdout.splitlines()[-1]
     form = r"against held-out photos: PSNR \d+\.\d{3} dB of the model, \d+\.\d{3} dB of the file"
@@ -74,7 +74,7 @@ def test_photos_are_scored_if_given(model, data, tmp_path):
 
 
 def test_both_exposures_are_printed_and_the_one_in_the_file_is_marked(data, tmp_path):
-    mapped, cameras = small_model(POSITIONS), ring(4)
+    mapped, cameras = small_model(GAUSSIAN_POSITIONS), ring(4)
     mapped.exposure = random_map(0, centers=4)
     kept = {"cameras": provenance_cameras(cameras), "viewpoint": Viewpoint.from_cameras(cameras).to_json()}
     save_model(mapped, tmp_path / "mapped.hyrf", provenance=kept)
@@ -93,7 +93,7 @@ def test_options_choose_what_is_written(model, tmp_path):
     arguments = ("export", model, "--crop", "-10,-10,-10,10,10,0", "--sh-degree", 1, "--min-opacity", "0.01")
     result = succeeded(*arguments, "-o", tmp_path / "a.spz")
     back = read_splats(tmp_path / "a.spz")
-    assert len(back) == (POSITIONS[:, 2] <= 0).sum() and back.degree == 1
+    assert len(back) == (GAUSSIAN_POSITIONS[:, 2] <= 0).sum() and back.degree == 1
     assert result.stdout.count("\n") == 1 and "nothing is measured" in result.stderr
 
 
@@ -112,7 +112,7 @@ def test_the_degree_is_chosen_and_the_choice_is_reported(model, tmp_path):
     assert read_splats(tmp_path / "a.ply").degree == int(degree) and f"harmonics of degree {degree}," in result.stdout
 
 
-def test_a_page_holds_the_model_unless_it_shall_be_baked(model, tmp_path):
+def test_a_page_embeds_the_model_unless_it_is_baked(model, tmp_path):
     for name, options in (("a.html", ()), ("b.html", ("--baked", "--sh-degree", "0"))):
         succeeded("export", model, "-o", tmp_path / name, *options)
     native, baked = ((tmp_path / name).read_bytes() for name in ("a.html", "b.html"))
@@ -139,7 +139,7 @@ def test_folders_are_players_and_galleries(model, data, tmp_path):
     succeeded("export", model, "-o", tmp_path / "player", "--overwrite")
 
 
-WRONG = {
+WRONG_REQUESTS = {
     "no output": ((), "Missing option '-o'"),
     "ending": (("-o", "a.xyz"), "the file extension does not name a known format"),
     "no name": (("-o", ""), "is not a file name"),
@@ -167,10 +167,10 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize("what", WRONG)
-def test_wrong_requests_are_a_clear_error_and_leave_no_file(what, model, tmp_path, monkeypatch):
+@pytest.mark.parametrize("what", WRONG_REQUESTS)
+def test_invalid_requests_are_a_clear_error_and_leave_no_file(what, model, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    arguments, words = WRONG[what]
+    arguments, words = WRONG_REQUESTS[what]
     assert words in refused("export", model, *arguments)
     assert list(tmp_path.iterdir()) == []
 
@@ -184,7 +184,9 @@ def test_models_that_cannot_be_read_are_a_clear_error(command, model, tmp_path, 
     (tmp_path / "short.hyrf").write_bytes(data[:100])
     (tmp_path / "photo.hyrf").write_bytes(b"\x89PNG")
     (tmp_path / "empty.ply").touch()
-    names = ("damaged.hyrf",) if command == "export" else ("empty.ply", "none.ply")  # a page tells of damage itself
+    names = (
+        ("damaged.hyrf",) if command == "export" else ("empty.ply", "none.ply")
+    )  # the page itself reports a damaged model
     options = ("-o", "a.ply") if command == "export" else ("--no-browser",)
     for name in (*names, "short.hyrf", "photo.hyrf", "none.hyrf", "."):
         assert name in refused(command, name, *options)
@@ -248,7 +250,7 @@ def test_view_rejects_a_port_in_use_and_no_port(model):
     assert hyrfpack("view", model, "--port", 70000).exit_code == 2
 
 
-def test_view_rejects_an_address_that_is_none(model):
+def test_view_rejects_an_invalid_address(model):
     assert "not an address to listen at" in refused("view", model, "--host", "", "--no-browser")
 
 

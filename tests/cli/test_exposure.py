@@ -21,20 +21,20 @@ from hyrfpack.make import MakeResult
 from hyrfpack.render import render_view
 from hyrfpack.render.files import to_image
 
-BOTH = ("as-photographed", "consistent")
+EXPOSURE_CHOICES = ("as-photographed", "consistent")
 
 
 @pytest.fixture(scope="module")
 def run(data, tmp_path_factory) -> Path:
-    """A run of three steps, whose model has no exposure map."""
+    """A run of three steps whose model has no exposure map."""
     folder = tmp_path_factory.mktemp("runs") / "plain"
     succeeded("train", data, "-o", folder, "--steps", 3, "--max-gaussians", 60)
     return folder
 
 
 @pytest.fixture(scope="module")
-def mapped(run, tmp_path_factory) -> Path:
-    """The model of that run with an exposure map."""
+def model_with_map(run, tmp_path_factory) -> Path:
+    """The model of that run with an exposure map added."""
     model, provenance = load_with_provenance(run / "model.hyrf")
     model.exposure = random_map(3, centers=6)
     path = tmp_path_factory.mktemp("mapped") / "mapped.hyrf"
@@ -49,30 +49,31 @@ def splats(run, tmp_path_factory) -> Path:
     return path
 
 
-def pictures(folder: Path) -> list[np.ndarray]:
+def read_pictures(folder: Path) -> list[np.ndarray]:
     return [np.asarray(Image.open(path)) for path in sorted(folder.glob("*.png"))]
 
 
-def test_render_writes_views_as_photographed_and_with_exposure_consistent_those_of_one_exposure(
-    run, mapped, data, tmp_path
-):
+def test_render_writes_views_as_photographed_or_at_one_exposure(run, model_with_map, data, tmp_path):
     views = load_scene(data).test
-    for exposure, model in (("as-photographed", load_model(mapped)), ("consistent", load_model(run / "model.hyrf"))):
+    for exposure, model in (
+        ("as-photographed", load_model(model_with_map)),
+        ("consistent", load_model(run / "model.hyrf")),
+    ):
         out = tmp_path / exposure
-        succeeded("render", mapped, "-o", out, "--data", data, "--exposure", exposure)
+        succeeded("render", model_with_map, "-o", out, "--data", data, "--exposure", exposure)
         expected = [np.asarray(to_image(render_view(model, view.camera).rgb)) for view in views]
-        np.testing.assert_array_equal(pictures(out), expected)
-    succeeded("render", mapped, "-o", tmp_path / "default", "--data", data)
-    np.testing.assert_array_equal(pictures(tmp_path / "default"), pictures(tmp_path / "as-photographed"))
-    assert not np.array_equal(pictures(tmp_path / "default"), pictures(tmp_path / "consistent"))
+        np.testing.assert_array_equal(read_pictures(out), expected)
+    succeeded("render", model_with_map, "-o", tmp_path / "default", "--data", data)
+    np.testing.assert_array_equal(read_pictures(tmp_path / "default"), read_pictures(tmp_path / "as-photographed"))
+    assert not np.array_equal(read_pictures(tmp_path / "default"), read_pictures(tmp_path / "consistent"))
 
 
 @pytest.mark.parametrize("subject", ["run", "splats"])
 def test_without_an_exposure_map_both_exposures_give_the_same_pictures(subject, request, tmp_path):
-    for exposure in BOTH:
+    for exposure in EXPOSURE_CHOICES:
         path = request.getfixturevalue(subject)
         succeeded("render", path, "-o", tmp_path / exposure, "--orbit", 2, "--exposure", exposure)
-    np.testing.assert_array_equal(*(pictures(tmp_path / exposure) for exposure in BOTH))
+    np.testing.assert_array_equal(*(read_pictures(tmp_path / exposure) for exposure in EXPOSURE_CHOICES))
 
 
 @pytest.mark.parametrize("words", [("render", "-o", "out"), ("evaluate", "--data", "photos")], ids=" ".join)
@@ -81,8 +82,8 @@ def test_another_exposure_is_rejected_and_the_choices_are_named(words):
     assert "'bright' is not one of 'as-photographed', 'consistent'" in sentence
 
 
-def test_evaluate_scores_the_exposure_that_is_asked_for_and_names_the_score_at_one_exposure(run, mapped, data):
-    command = ("evaluate", mapped, "--data", data)
+def test_evaluate_scores_the_requested_exposure_and_prints_the_score_at_one_exposure(run, model_with_map, data):
+    command = ("evaluate", model_with_map, "--data", data)
     default = json.loads(succeeded(*command, "--json").stdout)
     at_one = json.loads(succeeded(*command, "--json", "--exposure", "consistent").stdout)
     plain = json.loads(succeeded("evaluate", run, "--data", data, "--json").stdout)
@@ -95,23 +96,21 @@ def test_evaluate_scores_the_exposure_that_is_asked_for_and_names_the_score_at_o
         assert "at one exposure" not in succeeded(*other).stdout
 
 
-def test_evaluate_of_splats_takes_either_exposure_and_has_no_score_at_one(splats, data):
+def test_evaluate_of_splats_accepts_either_exposure_and_has_no_score_at_one_exposure(splats, data):
     scores = [
         json.loads(succeeded("evaluate", splats, "--data", data, "--exposure", exposure, "--json").stdout)
-        for exposure in BOTH
+        for exposure in EXPOSURE_CHOICES
     ]
     assert scores[0]["psnr"] == scores[1]["psnr"] and scores[0]["psnr_consistent"] is None
 
 
-def test_train_and_info_of_its_run_print_the_score_at_one_exposure_where_the_model_has_a_map(
-    data, tmp_path, monkeypatch
-):
+def test_train_and_info_print_the_score_at_one_exposure_for_a_model_with_a_map(data, tmp_path, monkeypatch):
     def with_map(*arguments):
         model = load_model(*arguments)
         model.exposure = random_map(3, centers=6)
         return model
 
-    monkeypatch.setattr(hyrf_format, "load_model", with_map)  # stands for a run that learnt gains
+    monkeypatch.setattr(hyrf_format, "load_model", with_map)  # replaces a run that has learnt gains
     printed = succeeded("train", data, "-o", tmp_path / "run", "--steps", 3, "--max-gaussians", 60).stdout
     monkeypatch.undo()
     scores = json.loads((tmp_path / "run" / "metrics.json").read_text())["evaluation"]
@@ -123,7 +122,7 @@ def test_train_and_info_of_its_run_print_the_score_at_one_exposure_where_the_mod
 
 
 @pytest.mark.parametrize("consistent, words", [(18.204, " (18.20 dB at one exposure)"), (None, "")])
-def test_make_prints_the_score_at_one_exposure_where_the_model_has_a_map(consistent, words, capsys):
+def test_make_prints_the_score_at_one_exposure_for_a_model_with_a_map(consistent, words, capsys):
     result = MakeResult(
         Path("scene.html"), 9, 9, Path("model.hyrf"), Path("work"), 3, 21.5, psnr_consistent=consistent, ssim=0.75
     )
@@ -131,7 +130,7 @@ def test_make_prints_the_score_at_one_exposure_where_the_model_has_a_map(consist
     assert f"3 photos held out: PSNR 21.50 dB{words}, SSIM 0.7500\n" in capsys.readouterr().out
 
 
-def test_info_of_a_run_of_an_earlier_version_leaves_its_predicted_score_out(run, tmp_path):
+def test_info_of_a_run_of_an_earlier_version_omits_its_predicted_score(run, tmp_path):
     folder = tmp_path / "run"
     folder.mkdir()
     (folder / "model.hyrf").write_bytes((run / "model.hyrf").read_bytes())

@@ -15,7 +15,7 @@ from hyrfpack.splats.draw import Drawable
 from hyrfpack.splats.formats import ply
 from hyrfpack.splats.viewpoints import WeightedSplats, sample_viewpoints
 
-QUICK = ("--steps", 2, "--size", 24)
+QUICK_OPTIONS = ("--steps", 2, "--size", 24)
 pytestmark = pytest.mark.usefixtures("short_imports")
 
 
@@ -35,58 +35,58 @@ def cameras(tmp_path: Path) -> Path:
     return path
 
 
-def test_import_learns_what_cameras_see_and_tells_numbers(source: Path, cameras: Path, tmp_path: Path) -> None:
+def test_import_uses_the_cameras_and_prints_its_results(source: Path, cameras: Path, tmp_path: Path) -> None:
     target = tmp_path / "ball.hyrf"
-    result = succeeded("import", source, "-o", target, *QUICK, "--cameras", cameras, "--json")
+    result = succeeded("import", source, "-o", target, *QUICK_OPTIONS, "--cameras", cameras, "--json")
     numbers = json.loads(result.stdout)
-    assert numbers["views"] == 2  # of 9, the first and the ninth
+    assert numbers["views"] == 2  # the first and the ninth of nine
     assert numbers["bytes_after"] == target.stat().st_size
     assert numbers["bytes_source"] == source.stat().st_size
-    words = succeeded("import", source, "-o", target, *QUICK, "--cameras", cameras, "--overwrite").stdout
+    words = succeeded("import", source, "-o", target, *QUICK_OPTIONS, "--cameras", cameras, "--overwrite").stdout
     assert f"{numbers['bytes_after']:,}" in words
     assert f"{numbers['psnr']:.2f} dB against the original" in words
 
 
-def test_a_device_that_is_not_there_is_rejected_before_any_work(source: Path, tmp_path: Path) -> None:
+def test_a_missing_device_is_rejected_before_any_work(source: Path, tmp_path: Path) -> None:
     target = tmp_path / "ball.hyrf"
     target.write_bytes(b"kept")
-    told = refused("import", source, "-o", target, *QUICK, "--device", "cuda:9", "--overwrite")
+    told = refused("import", source, "-o", target, *QUICK_OPTIONS, "--device", "cuda:9", "--overwrite")
     assert "device 'cuda:9' is not available" in told and "--device cpu" in told
     assert target.read_bytes() == b"kept"
 
 
-def test_cameras_may_be_those_of_photos(source: Path, tmp_path: Path) -> None:
+def test_cameras_can_come_from_a_set_of_photos(source: Path, tmp_path: Path) -> None:
     photos = write_demo_scene(tmp_path / "photos", views=10, size=24)
-    result = succeeded("import", source, "-o", tmp_path / "x.hyrf", *QUICK, "--cameras", photos, "--json")
+    result = succeeded("import", source, "-o", tmp_path / "x.hyrf", *QUICK_OPTIONS, "--cameras", photos, "--json")
     assert json.loads(result.stdout)["views"] == 2
     assert "8 viewpoints given" in result.stderr
 
 
-def test_cameras_that_training_left_beside_are_taken(source: Path, cameras: Path, tmp_path: Path) -> None:
+def test_the_cameras_file_of_3dgs_training_is_used(source: Path, cameras: Path, tmp_path: Path) -> None:
     left = tmp_path / "output"
     cloud = left / "point_cloud" / "iteration_30000" / "point_cloud.ply"
     cloud.parent.mkdir(parents=True)
     shutil.copy(source, cloud)
-    assert "made up" in succeeded("import", cloud, "-o", tmp_path / "without.hyrf", *QUICK).stderr
+    assert "made up" in succeeded("import", cloud, "-o", tmp_path / "without.hyrf", *QUICK_OPTIONS).stderr
     shutil.copy(cameras, left / "cameras.json")
 
-    result = succeeded("import", cloud, "-o", tmp_path / "x.hyrf", *QUICK)
+    result = succeeded("import", cloud, "-o", tmp_path / "x.hyrf", *QUICK_OPTIONS)
 
     assert str(left / "cameras.json") in result.stderr and "7 viewpoints given" in result.stderr
 
 
-def test_photos_without_poses_are_no_cameras(source: Path, tmp_path: Path) -> None:
+def test_photos_without_poses_are_rejected_as_cameras(source: Path, tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     sentence = refused("import", source, "-o", tmp_path / "x.hyrf", "--cameras", tmp_path / "empty")
     assert "empty" in sentence and not (tmp_path / "x.hyrf").exists()
 
 
-def test_import_makes_folders_that_are_missing(source: Path, tmp_path: Path) -> None:
-    succeeded("import", source, "-o", tmp_path / "not" / "yet" / "ball.hyrf", *QUICK)
+def test_import_creates_missing_folders(source: Path, tmp_path: Path) -> None:
+    succeeded("import", source, "-o", tmp_path / "not" / "yet" / "ball.hyrf", *QUICK_OPTIONS)
     assert (tmp_path / "not" / "yet" / "ball.hyrf").is_file()
 
 
-def test_import_rejects_with_a_clear_error(source: Path, tmp_path: Path) -> None:
+def test_invalid_inputs_of_import_are_a_clear_error(source: Path, tmp_path: Path) -> None:
     target = tmp_path / "x.hyrf"
     assert "nothing.ply" in refused("import", tmp_path / "nothing.ply", "-o", target)
     assert "name another file" in refused("import", source, "-o", source)
@@ -96,8 +96,8 @@ def test_import_rejects_with_a_clear_error(source: Path, tmp_path: Path) -> None
     assert not target.exists()
 
 
-def test_import_says_what_it_did_not_reach(source: Path, tmp_path: Path) -> None:
-    result = succeeded("import", source, "-o", tmp_path / "x.hyrf", *QUICK, "--psnr", 60, "--json")
+def test_import_reports_a_missed_target(source: Path, tmp_path: Path) -> None:
+    result = succeeded("import", source, "-o", tmp_path / "x.hyrf", *QUICK_OPTIONS, "--psnr", 60, "--json")
     numbers = json.loads(result.stdout)
     assert numbers["psnr_asked"] == 60
     assert f"asked for 60 dB and reached {numbers['psnr']:.1f} at held-out viewpoints" in result.stderr

@@ -1,4 +1,4 @@
-"""The size that photos are read at: kept with a model, taken from there, and said."""
+"""The size at which photos are read is stored with a model, used by later commands, and reported."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from hyrfpack.format import describe_file
 
 @pytest.fixture(scope="module")
 def shrunk_run(data, tmp_path_factory) -> Path:
-    """A run on ten photos, shrunk from 48 to 24 pixels."""
+    """A run on ten photos, reduced from 48 to 24 pixels."""
     folder = tmp_path_factory.mktemp("runs") / "shrunk"
     succeeded("train", data, "-o", folder, "--steps", 10, "--max-gaussians", 200, "--max-size", 24)
     return folder
 
 
-def test_a_model_says_at_which_size_it_was_trained(shrunk_run, tmp_path):
+def test_a_model_stores_the_photo_size_of_its_training(shrunk_run, tmp_path):
     packed = tmp_path / "packed.hyrf"
     succeeded("compress", shrunk_run / "model.hyrf", "-o", packed, "--profile", "paper")
     for file in (shrunk_run / "model.hyrf", packed):
@@ -31,7 +31,7 @@ def test_a_model_says_at_which_size_it_was_trained(shrunk_run, tmp_path):
     assert any("shrunk from up to 48 x 48 to 24 pixels" in note for note in metrics["notes"])
 
 
-def test_evaluate_reads_photos_at_the_size_that_the_model_was_trained_at_and_says_so(shrunk_run, data):
+def test_evaluate_reads_photos_at_the_training_size_and_reports_it(shrunk_run, data):
     command = ("evaluate", shrunk_run / "model.hyrf", "--data", data)
     plain, numbers = succeeded(*command), json.loads(succeeded(*command, "--json").stdout)
     assert "2 photos of up to 24 x 24 pixels (--max-size 24)" in plain.stdout
@@ -41,14 +41,14 @@ def test_evaluate_reads_photos_at_the_size_that_the_model_was_trained_at_and_say
     assert numbers["psnr"] == pytest.approx(stored["psnr"], abs=1e-9)
 
 
-def test_max_size_given_comes_before_the_models(shrunk_run, data):
+def test_an_explicit_max_size_overrides_that_of_the_model(shrunk_run, data):
     command = ("evaluate", shrunk_run / "model.hyrf", "--data", data, "--max-size")
     assert json.loads(succeeded(*command, 0, "--json").stdout)["picture_size"] == [48, 48]
     assert "of up to 16 x 16 pixels (--max-size 16)" in succeeded(*command, 16).stdout
     assert "of up to 48 x 48 pixels (as they are stored)" in succeeded(*command, 0).stdout
 
 
-def test_render_makes_pictures_of_the_size_that_the_model_was_trained_at_and_says_so(shrunk_run, data, tmp_path):
+def test_render_uses_the_training_size_and_reports_it(shrunk_run, data, tmp_path):
     printed = succeeded("render", shrunk_run / "model.hyrf", "-o", tmp_path, "--data", data).stdout
     assert "2 pictures, 24 x 24 pixels" in printed
     assert Image.open(tmp_path / "0000.png").size == (24, 24)
@@ -57,25 +57,25 @@ def test_render_makes_pictures_of_the_size_that_the_model_was_trained_at_and_say
 @pytest.mark.parametrize(
     ("command", "output"), [("compress", "packed.hyrf"), ("export", "scene.splat"), ("bench", "bench.png")]
 )
-def test_every_command_with_photos_reads_them_at_the_models_size(shrunk_run, data, command, output, tmp_path):
-    (tmp_path / output).touch()  # so that it refuses to go on once the photos are read
+def test_every_command_reads_photos_at_the_training_size_of_the_model(shrunk_run, data, command, output, tmp_path):
+    (tmp_path / output).touch()  # an existing output makes the command fail once the photos are read
     result = hyrfpack(command, shrunk_run / "model.hyrf", "--data", data, "-o", tmp_path / output)
     assert result.exit_code == 2 and "to 24 pixels on the longer side" in result.stderr
 
 
-def test_small_photos_leave_no_word_of_their_size(data, tmp_path):
-    """A model of them is the same, byte for byte, as without a limit."""
+def test_a_model_of_small_photos_stores_no_photo_size(data, tmp_path):
+    """A model of small photos is byte for byte the same as without a limit."""
     succeeded("train", data, "-o", tmp_path, "--steps", 2, "--max-gaussians", 50)
     assert "max_size" not in describe_file(tmp_path / "model.hyrf")["provenance"]
     assert json.loads((tmp_path / "metrics.json").read_text())["scene"]["max_size"] == 1600
 
 
-def test_photos_kept_as_they_are_leave_a_word(data, tmp_path):
+def test_a_model_trained_without_a_size_limit_stores_that(data, tmp_path):
     succeeded("train", data, "-o", tmp_path, "--steps", 2, "--max-gaussians", 50, "--max-size", 0)
     assert describe_file(tmp_path / "model.hyrf")["provenance"]["max_size"] == 0
 
 
 @pytest.mark.parametrize("stored", [None, -1, True, 1.5, "800", [800], {}])
-def test_a_limit_that_makes_no_sense_is_as_none(stored):
+def test_an_invalid_stored_size_is_ignored(stored):
     assert Capture({"provenance": {"max_size": stored}}).max_size == 1600
     assert Capture({"provenance": {"max_size": 0}}).max_size == 0

@@ -1,4 +1,4 @@
-"""Commands that several processes carry out: by --processes, or started as torchrun starts them."""
+"""Commands that run in several processes, by --processes or under torchrun."""
 
 from __future__ import annotations
 
@@ -24,22 +24,23 @@ from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.errors import HyrfError
 from hyrfpack.parallel.launch import launch
 
-ROOT = Path(__file__).parents[2]
-STEPS = ("--steps", 60, "--max-gaussians", 200)
-LONG = ("--steps", 100, "--max-gaussians", 200)
-NAMES = ("nowhere", "run", "nothing.hyrf", "out", "out.hyrf")  # of files in the folder of a test
+REPOSITORY_ROOT = Path(__file__).parents[2]
+TRAINING_OPTIONS = ("--steps", 60, "--max-gaussians", 200)
+LONG_TRAINING_OPTIONS = ("--steps", 100, "--max-gaussians", 200)
+# Names of files in a test's folder.
+FILE_NAMES = ("nowhere", "run", "nothing.hyrf", "out", "out.hyrf")
 
 
 def files_in(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def model_of(run: Path) -> bytes:
+def read_model_bytes(run: Path) -> bytes:
     return (run / "model.hyrf").read_bytes()
 
 
-def spoken_for(ends: list[ProcessOutcome], code: int = 0) -> ProcessOutcome:
-    """All ended alike, and rank 0 alone has said something."""
+def check_rank_0_speaks(ends: list[ProcessOutcome], code: int = 0) -> ProcessOutcome:
+    """Check that all processes ended with `code` and only rank 0 printed; return the outcome of rank 0."""
     assert [end.exit_code for end in ends] == [code] * len(ends), [end.errors for end in ends]
     assert [(end.output, end.errors) for end in ends[1:]] == [("", "")] * (len(ends) - 1)
     return ends[0]
@@ -47,7 +48,7 @@ def spoken_for(ends: list[ProcessOutcome], code: int = 0) -> ProcessOutcome:
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory) -> Path:
-    """Ten photos, smaller than those of other tests."""
+    """Ten photos that are smaller than those of other tests."""
     return write_demo_scene(tmp_path_factory.mktemp("data"), views=10, size=24)
 
 
@@ -57,18 +58,18 @@ def logs(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def trained(data, logs, tmp_path_factory) -> tuple[Path, list[ProcessOutcome]]:
-    """A run of two processes, and how they ended."""
+def run_and_outcomes(data, logs, tmp_path_factory) -> tuple[Path, list[ProcessOutcome]]:
+    """The folder of a run of two processes, and their outcomes."""
     out = tmp_path_factory.mktemp("runs") / "two"
-    return out, run_command_on_ranks("train", data, "-o", out, *STEPS, "--json", folder=logs)
+    return out, run_command_on_ranks("train", data, "-o", out, *TRAINING_OPTIONS, "--json", folder=logs)
 
 
 @pytest.fixture(scope="module")
-def model(trained) -> Path:
-    return trained[0] / "model.hyrf"
+def model(run_and_outcomes) -> Path:
+    return run_and_outcomes[0] / "model.hyrf"
 
 
-# -- the words -------------------------------------------------------------------------------------------------------
+# -- arguments -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -82,20 +83,20 @@ def model(trained) -> Path:
         ("train a --processes 2 --processes 3", "train a"),
     ],
 )
-def test_the_option_is_taken_out_with_its_value(words, left):
+def test_the_option_is_removed_with_its_value(words, left):
     assert remove_option(words.split()) == left.split()
 
 
 @given(
     st.lists(st.sampled_from(["train", "a", "--steps", "9", "-o", "run", "--json"])), st.integers(1, 99), st.booleans()
 )
-def test_all_other_words_stay_in_their_order(words, number, joined):
+def test_all_other_arguments_keep_their_order(words, number, joined):
     for place in range(len(words) + 1):
         option = [f"--processes={number}"] if joined else ["--processes", str(number)]
         assert remove_option([*words[:place], *option, *words[place:]]) == words
 
 
-def test_processes_cannot_be_asked_for_within_one_of_several(monkeypatch, tmp_path):
+def test_the_processes_option_is_rejected_in_one_of_several_processes(monkeypatch, tmp_path):
     for name, value in torchrun_environment(0, 2, 1).items():
         monkeypatch.setenv(name, value)
     sentence = refused("train", tmp_path, "-o", tmp_path / "run", "--processes", 2)
@@ -103,7 +104,7 @@ def test_processes_cannot_be_asked_for_within_one_of_several(monkeypatch, tmp_pa
 
 
 @pytest.mark.parametrize("number", ["0", "-1", "two", "1.5"])
-def test_a_number_of_processes_that_is_none_is_rejected(number, tmp_path):
+def test_an_invalid_number_of_processes_is_rejected(number, tmp_path):
     assert "--processes" in refused("train", tmp_path, "-o", tmp_path / "run", "--processes", number)
 
 
@@ -116,7 +117,7 @@ def test_an_environment_that_makes_no_sense_is_a_clear_error(monkeypatch, tmp_pa
 # -- one process -----------------------------------------------------------------------------------------------------
 
 
-def test_one_process_of_torchrun_gives_the_bytes_of_none_and_touches_no_network(data, tmp_path, monkeypatch):
+def test_one_process_under_torchrun_gives_the_same_bytes_without_network_access(data, tmp_path, monkeypatch):
     words = ("train", data, *("--steps", 12, "--max-gaussians", 200))
     succeeded(*words, "-o", tmp_path / "none")
     monkeypatch.setattr(dist, "init_process_group", lambda *_, **__: pytest.fail("the network was touched"))
@@ -124,16 +125,20 @@ def test_one_process_of_torchrun_gives_the_bytes_of_none_and_touches_no_network(
         monkeypatch.setenv(name, value)
     succeeded(*words, "-o", tmp_path / "torchrun")
     succeeded(*words, "-o", tmp_path / "asked", "--processes", 1)
-    assert model_of(tmp_path / "torchrun") == model_of(tmp_path / "none") == model_of(tmp_path / "asked")
+    assert (
+        read_model_bytes(tmp_path / "torchrun")
+        == read_model_bytes(tmp_path / "none")
+        == read_model_bytes(tmp_path / "asked")
+    )
 
 
 # -- two processes ---------------------------------------------------------------------------------------------------
 
 
 @needs_ranks
-def test_rank_0_alone_speaks_and_says_how_many_they_are(trained):
-    out, ends = trained
-    first = spoken_for(ends)
+def test_only_rank_0_prints_and_reports_the_number_of_processes(run_and_outcomes):
+    out, ends = run_and_outcomes
+    first = check_rank_0_speaks(ends)
     said = json.loads(first.output)
     assert said["complete"] and said["step"] == 30 and said["settings"]["steps"] == 60
     assert said["processes"] == json.loads((out / "metrics.json").read_text())["processes"] == 2
@@ -143,10 +148,12 @@ def test_rank_0_alone_speaks_and_says_how_many_they_are(trained):
 
 @needs_ranks
 @pytest.mark.parametrize("size", [2, 3])
-def test_scores_are_those_of_one_process(size, data, model, logs, tmp_path):
-    """With three, one has no photo."""
+def test_scores_equal_those_of_one_process(size, data, model, logs, tmp_path):
+    """With three processes, one has no photo."""
     words = ("evaluate", model, "--data", data, "--json", "--pictures")
-    said = json.loads(spoken_for(run_command_on_ranks(*words, tmp_path / "many", folder=logs, size=size)).output)
+    said = json.loads(
+        check_rank_0_speaks(run_command_on_ranks(*words, tmp_path / "many", folder=logs, size=size)).output
+    )
     expected = json.loads(succeeded(*words, tmp_path / "one").stdout)
     assert len(said["views"]) == 2 and said.pop("seconds_per_frame") > 0 and expected.pop("seconds_per_frame") > 0
     assert said == expected
@@ -154,19 +161,19 @@ def test_scores_are_those_of_one_process(size, data, model, logs, tmp_path):
 
 
 @needs_ranks
-def test_pictures_are_those_of_one_process(model, logs, tmp_path):
+def test_pictures_equal_those_of_one_process(model, logs, tmp_path):
     words = ("render", model, "--orbit", 5, "--depth", "--json", "-o")
-    said = json.loads(spoken_for(run_command_on_ranks(*words, tmp_path / "two", folder=logs)).output)
+    said = json.loads(check_rank_0_speaks(run_command_on_ranks(*words, tmp_path / "two", folder=logs)).output)
     expected = json.loads(succeeded(*words, tmp_path / "one").stdout)
     assert [Path(path).name for path in said["pictures"]] == [Path(path).name for path in expected["pictures"]]
     assert files_in(tmp_path / "two") == files_in(tmp_path / "one") and len(files_in(tmp_path / "one")) == 10
 
 
 @needs_ranks
-def test_fine_tuning_together_gives_the_same_bytes_twice(data, model, logs, tmp_path):
+def test_fine_tuning_in_two_processes_is_deterministic(data, model, logs, tmp_path):
     words = ("compress", model, "--data", data, "--finetune", 6, "--json", "-o")
     reports = [
-        json.loads(spoken_for(run_command_on_ranks(*words, tmp_path / f"{name}.hyrf", folder=logs)).output)
+        json.loads(check_rank_0_speaks(run_command_on_ranks(*words, tmp_path / f"{name}.hyrf", folder=logs)).output)
         for name in "ab"
     ]
     assert (tmp_path / "a.hyrf").read_bytes() == (tmp_path / "b.hyrf").read_bytes()
@@ -175,16 +182,16 @@ def test_fine_tuning_together_gives_the_same_bytes_twice(data, model, logs, tmp_
 
 
 @needs_ranks
-def test_a_profile_that_has_nothing_to_share_gives_what_one_process_does(model, logs, tmp_path):
+def test_a_profile_without_parallel_work_gives_the_bytes_of_one_process(model, logs, tmp_path):
     words = ("compress", model, "--profile", "paper", "-o")
-    spoken_for(run_command_on_ranks(*words, tmp_path / "two.hyrf", folder=logs))
+    check_rank_0_speaks(run_command_on_ranks(*words, tmp_path / "two.hyrf", folder=logs))
     succeeded(*words, tmp_path / "one.hyrf")
     assert (tmp_path / "two.hyrf").read_bytes() == (tmp_path / "one.hyrf").read_bytes()
 
 
 @needs_ranks
-def test_a_file_that_is_there_is_rejected_once(model, logs):
-    end = spoken_for(run_command_on_ranks("compress", model, "-o", model, folder=logs), 2)
+def test_an_existing_file_is_rejected_with_one_error(model, logs):
+    end = check_rank_0_speaks(run_command_on_ranks("compress", model, "-o", model, folder=logs), 2)
     assert str(model) in end.error_line
 
 
@@ -203,9 +210,9 @@ def test_a_file_that_is_there_is_rejected_once(model, logs):
     ],
     ids=lambda words: " ".join(words) if isinstance(words, tuple) else "",
 )
-def test_what_the_user_got_wrong_is_said_once(words, told, data, tmp_path):
-    named = [data if word == "data" else tmp_path / word if word in NAMES else word for word in words]
-    end = spoken_for(run_command_on_ranks(*named, folder=tmp_path / "logs"), 2)
+def test_mistakes_of_the_user_are_reported_once(words, told, data, tmp_path):
+    named = [data if word == "data" else tmp_path / word if word in FILE_NAMES else word for word in words]
+    end = check_rank_0_speaks(run_command_on_ranks(*named, folder=tmp_path / "logs"), 2)
     assert told in end.error_line and end.output == ""
     assert [path.name for path in tmp_path.iterdir()] == ["logs"]
 
@@ -214,8 +221,8 @@ def test_what_the_user_got_wrong_is_said_once(words, told, data, tmp_path):
 
 
 @pytest.fixture
-def launched(tmp_path, monkeypatch, signals, capfd):
-    """Launches two processes that are a script of the shell; returns the exit code or sentence, and what they print."""
+def launch_script(tmp_path, monkeypatch, signals, capfd):
+    """A function that launches a shell script as two processes; returns the exit code or error, and the output."""
     (tmp_path / "python").write_text("")
     (tmp_path / "python").chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
@@ -233,51 +240,51 @@ def launched(tmp_path, monkeypatch, signals, capfd):
 
 
 @needs_ranks
-def test_processes_get_the_words_and_what_they_say_comes_through(launched):
-    code, said = launched('echo "$RANK of $WORLD_SIZE: $5."; echo "also $RANK" >&2')
+def test_processes_receive_the_arguments_and_their_output_is_passed_on(launch_script):
+    code, said = launch_script('echo "$RANK of $WORLD_SIZE: $5."; echo "also $RANK" >&2')
     assert code == 0 and sorted(said.splitlines()) == ["0 of 2: a b.", "1 of 2: a b.", "also 0", "also 1"]
 
 
 @needs_ranks
 @pytest.mark.parametrize("rank", [0, 1])
-def test_the_exit_code_is_that_of_the_first_that_failed_and_the_others_are_ended(rank, launched):
-    code, said = launched(f"test $RANK = {rank} && exit 3; exec sleep 500")
+def test_the_exit_code_is_that_of_the_first_failure_and_the_others_are_ended(rank, launch_script):
+    code, said = launch_script(f"test $RANK = {rank} && exit 3; exec sleep 500")
     assert code == 3 and said == ""
 
 
 @needs_ranks
-def test_a_first_process_that_was_killed_is_told_of(launched):
-    code, _ = launched("test $RANK = 0 && kill -9 $$; exec sleep 500")
+def test_a_killed_first_process_is_reported(launch_script):
+    code, _ = launch_script("test $RANK = 0 && kill -9 $$; exec sleep 500")
     assert "process 0 of 2 was ended by SIGKILL" in code
 
 
 @needs_ranks
-def test_a_request_to_stop_is_passed_on(launched):
-    """Once both listen, the first sends it to the launcher."""
+def test_a_request_to_stop_is_passed_on(launch_script):
+    """When both processes listen, the first one sends the signal to the launcher."""
     listening = """trap 'echo $RANK stops; exit 1' TERM; touch "$0.$RANK" """
     asking = """test $RANK = 0 && { until test -e "$0.1"; do sleep 0.1; done; kill -TERM $PPID; }"""
-    code, said = launched(f"{listening}; {asking}; while true; do sleep 0.1; done")
+    code, said = launch_script(f"{listening}; {asking}; while true; do sleep 0.1; done")
     assert code == 1 and {"0 stops", "1 stops"} <= set(said.splitlines())
 
 
 @needs_ranks
-def test_another_process_that_was_killed_is_told_of_where_the_first_can_say_nothing(launched):
-    """As while it is still loading, or waits for the one that is gone."""
-    code, said = launched("test $RANK = 1 && kill -9 $$; exec sleep 500")
+def test_another_killed_process_is_reported_while_the_first_cannot(launch_script):
+    """The first process may still be loading, or waiting for the one that has ended."""
+    code, said = launch_script("test $RANK = 1 && kill -9 $$; exec sleep 500")
     assert code == 2 and "process 1 of 2 was ended by SIGKILL" in said
 
 
 @needs_ranks
-def test_a_first_process_that_was_killed_is_an_error_of_the_launcher(launched):
-    code, _ = launched("test $RANK = 0 && kill -9 $$; exec sleep 500")
+def test_a_killed_first_process_is_an_error_of_the_launcher(launch_script):
+    code, _ = launch_script("test $RANK = 0 && kill -9 $$; exec sleep 500")
     assert "process 0 of 2 was ended by SIGKILL" in code
 
 
-# -- launchers and whole runs ----------------------------------------------------------------------------------------
+# -- launchers and complete runs -------------------------------------------------------------------------------------
 
-# Python reads it in every process that starts: rank 1, as it was started first, kills itself once the run has written a
-# checkpoint, and comes late when it is started anew.
-KILLER = """
+# Python runs this in every process that starts. The first time, rank 1 kills itself once the run has a checkpoint; when
+# it is started again it waits.
+KILL_RANK_1_CODE = """
 import os, threading, time
 def kill():
     while not os.path.exists({checkpoint!r}):
@@ -290,27 +297,27 @@ elif os.environ.get("RANK") == "1":
 """
 
 
-def ended(*words: object, folder: Path, code: int) -> tuple[str, str]:
-    """Run Python with these words, where rank 1 kills itself; returns what it printed."""
-    (folder / "sitecustomize.py").write_text(KILLER.format(checkpoint=str(folder / "run" / "checkpoint.pt")))
-    paths = [str(folder), str(ROOT), os.environ.get("PYTHONPATH", "")]
+def run_and_kill_rank_1(*words: object, folder: Path, code: int) -> tuple[str, str]:
+    """Run Python with these arguments, where rank 1 kills itself, and return its output."""
+    (folder / "sitecustomize.py").write_text(KILL_RANK_1_CODE.format(checkpoint=str(folder / "run" / "checkpoint.pt")))
+    paths = [str(folder), str(REPOSITORY_ROOT), os.environ.get("PYTHONPATH", "")]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "HYRFPACK_THREADS": "1", "OMP_NUM_THREADS": "1"}
     command = [sys.executable, *map(str, words)]
     process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
         output, errors = process.communicate(timeout=90)
     finally:
-        process.terminate()  # it ends those that it has started
+        process.terminate()  # it ends the processes that it has started
         process.wait()
     assert process.returncode == code, errors
     return output, errors
 
 
-def children(process: int) -> list[int]:
+def child_process_ids(process: int) -> list[int]:
     return [int(word) for word in Path(f"/proc/{process}/task/{process}/children").read_text().split()]
 
 
-def until(happened: Callable[[], bool], seconds: float = 60) -> bool:
+def wait_until(happened: Callable[[], bool], seconds: float = 60) -> bool:
     end = time.monotonic() + seconds
     while not happened() and time.monotonic() < end:
         time.sleep(0.05)
@@ -322,54 +329,65 @@ def until(happened: Callable[[], bool], seconds: float = 60) -> bool:
 def test_processes_stop_when_their_launcher_is_killed(data, tmp_path):
     checkpoint = tmp_path / "run" / "checkpoint.pt"
     words = ["train", data, "-o", checkpoint.parent, "--processes", 2, "--steps", 4000, "--max-gaussians", 50]
-    paths = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    paths = os.pathsep.join([str(REPOSITORY_ROOT), os.environ.get("PYTHONPATH", "")])
     environment = {**os.environ, "PYTHONPATH": paths, "HYRFPACK_THREADS": "1", "OMP_NUM_THREADS": "1"}
     with (tmp_path / "said").open("w") as said:
         command = [sys.executable, "-m", "hyrfpack", *map(str, words)]
         launcher = subprocess.Popen(command, env=environment, stdout=said, stderr=said)
     workers: list[int] = []
     try:
-        assert until(checkpoint.exists), (tmp_path / "said").read_text()
-        workers, before = children(launcher.pid), checkpoint.stat().st_mtime_ns
+        assert wait_until(checkpoint.exists), (tmp_path / "said").read_text()
+        workers, before = child_process_ids(launcher.pid), checkpoint.stat().st_mtime_ns
         launcher.kill()
         launcher.wait()
-        assert until(lambda: not any(Path(f"/proc/{worker}").exists() for worker in workers), 30)
+        assert wait_until(lambda: not any(Path(f"/proc/{worker}").exists() for worker in workers), 30)
     finally:
         launcher.kill()
         launcher.wait()
         for worker in workers:
             with suppress(ProcessLookupError):
                 os.kill(worker, signal.SIGKILL)
-    assert len(workers) == 2 and checkpoint.stat().st_mtime_ns > before  # saved on the way out
+    assert len(workers) == 2 and checkpoint.stat().st_mtime_ns > before  # the checkpoint was saved on exit
 
 
 @pytest.fixture(scope="module")
 def uninterrupted(data, logs, tmp_path_factory) -> bytes:
     out = tmp_path_factory.mktemp("uninterrupted")
-    spoken_for(run_command_on_ranks("train", data, "-o", out, *LONG, folder=logs))
-    return model_of(out)
+    check_rank_0_speaks(run_command_on_ranks("train", data, "-o", out, *LONG_TRAINING_OPTIONS, folder=logs))
+    return read_model_bytes(out)
 
 
 @needs_ranks
 @pytest.mark.usefixtures("signals")
-def test_a_run_of_two_that_has_lost_one_says_so_and_can_be_resumed(data, uninterrupted, logs, tmp_path):
-    words = ("-m", "hyrfpack", "train", data, "-o", tmp_path / "run", *LONG, "--json", "--processes", 2)
-    output, errors = ended(*words, folder=tmp_path, code=2)
+def test_a_run_that_has_lost_a_process_reports_it_and_can_be_resumed(data, uninterrupted, logs, tmp_path):
+    words = (
+        "-m",
+        "hyrfpack",
+        "train",
+        data,
+        "-o",
+        tmp_path / "run",
+        *LONG_TRAINING_OPTIONS,
+        "--json",
+        "--processes",
+        2,
+    )
+    output, errors = run_and_kill_rank_1(*words, folder=tmp_path, code=2)
     told, who = [line for line in errors.splitlines() if line.startswith("Error: ")]
     assert "one of the 2 processes has ended" in told and "the same command with --resume continues" in told
     assert "process 1 of 2 was ended by SIGKILL" in who
     assert json.loads(output)["error"] == told.removeprefix("Error: ") and "Traceback" not in errors
     assert [path.name for path in (tmp_path / "run").iterdir()] == ["checkpoint.pt"]
 
-    spoken_for(run_command_on_ranks(*words[2:-2], "--resume", folder=logs))
-    assert model_of(tmp_path / "run") == uninterrupted
+    check_rank_0_speaks(run_command_on_ranks(*words[2:-2], "--resume", folder=logs))
+    assert read_model_bytes(tmp_path / "run") == uninterrupted
 
 
 @needs_ranks
-def test_torchrun_starts_a_run_again_that_lost_a_process_and_it_continues(data, uninterrupted, tmp_path):
+def test_torchrun_restarts_a_run_that_lost_a_process_and_it_resumes(data, uninterrupted, tmp_path):
     torchrun = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node", 2, "--max-restarts", 1)
-    words = ("-m", "hyrfpack", "train", data, "-o", tmp_path / "run", *LONG)
-    output, errors = ended(*torchrun, *words, folder=tmp_path, code=0)
+    words = ("-m", "hyrfpack", "train", data, "-o", tmp_path / "run", *LONG_TRAINING_OPTIONS)
+    output, errors = run_and_kill_rank_1(*torchrun, *words, folder=tmp_path, code=0)
     assert "200 Gaussians" in output and output.count("model.hyrf") == 1
-    assert "has ended" in errors or "closing signal" in errors  # said by the other process, or by torchrun before it
-    assert model_of(tmp_path / "run") == uninterrupted
+    assert "has ended" in errors or "closing signal" in errors  # printed by the other process, or by torchrun before it
+    assert read_model_bytes(tmp_path / "run") == uninterrupted

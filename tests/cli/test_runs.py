@@ -1,4 +1,4 @@
-"""Folders of training runs where commands want a model, and errors as JSON."""
+"""Folders of training runs in place of models, and errors as JSON."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def unfinished(tmp_path) -> Path:
     return folder
 
 
-COMMANDS = {
+COMMANDS_THAT_READ_MODELS = {
     "compress": ("compress", "{run}", "-o", "{out}/a.hyrf", "--profile", "paper"),
     "decompress": ("decompress", "{run}", "-o", "{out}/a.hyrf"),
     "render": ("render", "{run}", "-o", "{out}/pictures", "--orbit", "1"),
@@ -42,31 +42,31 @@ COMMANDS = {
 }
 
 
-def filled(words, run: Path, data: Path, out: Path) -> list[str]:
+def fill_paths(words, run: Path, data: Path, out: Path) -> list[str]:
     return [word.format(run=run, data=data, out=out) for word in words]
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-def test_a_run_stands_for_its_model_in_every_command(name, run, data, tmp_path):
-    succeeded(*filled(COMMANDS[name], run, data, tmp_path))
+@pytest.mark.parametrize("name", COMMANDS_THAT_READ_MODELS)
+def test_every_command_accepts_a_run_folder_as_a_model(name, run, data, tmp_path):
+    succeeded(*fill_paths(COMMANDS_THAT_READ_MODELS[name], run, data, tmp_path))
 
 
-@pytest.mark.parametrize("name", [*COMMANDS, "view", "bench"])
-def test_every_command_says_that_a_run_has_not_finished(name, unfinished, data, tmp_path):
-    words = COMMANDS.get(name) or (name, "{run}", *(("--no-browser",) if name == "view" else ()))
-    told = refused(*filled(words, unfinished, data, tmp_path / "out"))
+@pytest.mark.parametrize("name", [*COMMANDS_THAT_READ_MODELS, "view", "bench"])
+def test_every_command_reports_an_unfinished_run(name, unfinished, data, tmp_path):
+    words = COMMANDS_THAT_READ_MODELS.get(name) or (name, "{run}", *(("--no-browser",) if name == "view" else ()))
+    told = refused(*fill_paths(words, unfinished, data, tmp_path / "out"))
     assert "the run has not finished (step 120 of 3,000); finish it" in told and "--resume" in told
     assert not (tmp_path / "out").exists()
 
 
-def test_the_model_of_a_run_is_not_replaced_by_what_is_made_of_it(run):
+def test_the_model_of_a_run_is_never_replaced_by_its_own_output(run):
     before = (run / "model.hyrf").read_bytes()
     for command in ("compress", "decompress"):
         assert "input itself" in refused(command, run, "-o", run / "model.hyrf", "--overwrite")
     assert (run / "model.hyrf").read_bytes() == before
 
 
-def test_info_of_a_run_tells_its_steps_scores_and_model_and_not_its_pictures(run, data):
+def test_info_of_a_run_prints_its_steps_scores_and_model(run, data):
     facts = json.loads(succeeded("info", run, "--json").stdout)
     metrics = json.loads((run / "metrics.json").read_text())
     assert facts["run"]["finished"] and facts["run"]["steps"] == 3 and not facts["run"]["has_checkpoint"]
@@ -77,7 +77,7 @@ def test_info_of_a_run_tells_its_steps_scores_and_model_and_not_its_pictures(run
     assert f"{run / 'model.hyrf'}: " in printed and "sharpness" not in printed
 
 
-def test_info_of_an_unfinished_run_says_how_far_it_is(unfinished):
+def test_info_of_an_unfinished_run_prints_its_progress(unfinished):
     printed = succeeded("info", unfinished).stdout
     assert printed.startswith(f"{unfinished}: the run has not finished (step 120 of 3,000)")
     facts = json.loads(succeeded("info", unfinished, "--json").stdout)["run"]
@@ -90,19 +90,19 @@ def test_info_of_an_unfinished_run_says_how_far_it_is(unfinished):
 @pytest.mark.parametrize(
     "arguments",
     [
-        ("info", "missing.hyrf"),  # found by the library
+        ("info", "missing.hyrf"),  # an error of the library
         ("compress", "missing.hyrf", "-o", "a.hyrf"),
         ("convert", "missing.ply", "a.spz"),
         ("train", "missing", "-o", "run"),
         ("make", "missing", "-o", "a.html"),
-        ("info", "a.hyrf", "--no-such-option"),  # by click
+        ("info", "a.hyrf", "--no-such-option"),  # an error of click
         ("render", "a.hyrf"),
         ("export", "a.hyrf", "-o", "a.ply", "--crop", "1,2"),
         ("no-such-command",),
     ],
     ids=" ".join,
 )
-def test_a_failure_under_json_is_an_object_on_stdout_beside_the_sentence(arguments, tmp_path, monkeypatch):
+def test_an_error_under_json_is_an_object_on_stdout_and_a_line_on_stderr(arguments, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     plain, result = hyrfpack(*arguments), hyrfpack(*arguments, "--json")
     assert plain.exit_code == result.exit_code == 2 and plain.stdout == ""
@@ -110,7 +110,7 @@ def test_a_failure_under_json_is_an_object_on_stdout_beside_the_sentence(argumen
     assert json.loads(result.stdout) == {"error": sentence.removeprefix("Error: ")}
 
 
-def test_quiet_failures_under_json_say_the_same(tmp_path):
+def test_errors_under_json_and_quiet_are_the_same(tmp_path):
     result = hyrfpack("info", tmp_path / "missing.hyrf", "--json", "--quiet")
     assert result.exit_code == 2 and "missing.hyrf" in json.loads(result.stdout)["error"]
 

@@ -1,4 +1,4 @@
-"""Splats of other programs, and `hyrfpack convert`, called as a person would."""
+"""Splats of other programs, and `hyrfpack convert`, on the command line."""
 
 from __future__ import annotations
 
@@ -24,37 +24,37 @@ from hyrfpack.splats.formats.hints import NO_HINTS
 from hyrfpack.splats.names import SPLATS_SUFFIXES, is_splats
 from hyrfpack.splats.table import FORMATS
 
-SPLATS = ball_splats(60)
+BALL_SPLATS = ball_splats(60)
 
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory) -> dict[str, Path]:
-    """The same splats in every format that is read, and as a loose SOG."""
+    """The same splats in every format that can be read, and as an unbundled SOG."""
     folder = tmp_path_factory.mktemp("splats")
     paths = {ending: folder / f"ball{ending}" for ending in READABLE_ENDINGS}
     for ending, path in paths.items():
-        path.write_bytes(FORMATS[ending].encode(SPLATS, NO_HINTS))
+        path.write_bytes(FORMATS[ending].encode(BALL_SPLATS, NO_HINTS))
     loose = folder / "loose"
     loose.mkdir()
-    for name, data in sog.encode_files(SPLATS).items():
+    for name, data in sog.encode_files(BALL_SPLATS).items():
         (loose / name).write_bytes(data)
     return {**paths, "loose": loose, "meta.json": loose / "meta.json"}
 
 
-KINDS = [*SPLATS_SUFFIXES, "loose", "meta.json"]
+FILE_KINDS = [*SPLATS_SUFFIXES, "loose", "meta.json"]
 
 
-def test_names_know_every_ending_that_is_read():
+def test_every_ending_of_splats_is_recognised():
     assert sorted(SPLATS_SUFFIXES) == sorted(READABLE_ENDINGS)
 
 
-def test_a_folder_with_another_meta_json_is_no_splats(tmp_path):
+def test_a_folder_with_another_meta_json_is_not_read_as_splats(tmp_path):
     (tmp_path / "meta.json").write_text('{"camera": 1}')
     assert not is_splats(tmp_path)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_info_tells_format_count_degree_bounds_and_bytes(kind, files):
+@pytest.mark.parametrize("kind", FILE_KINDS)
+def test_info_prints_format_count_degree_bounds_and_bytes(kind, files):
     path = files[kind]
     facts = json.loads(succeeded("info", path, "--json").stdout)
     loose = kind in ("loose", "meta.json")
@@ -62,24 +62,24 @@ def test_info_tells_format_count_degree_bounds_and_bytes(kind, files):
     assert (facts["gaussians"], facts["bytes"]) == (60, size)
     assert facts["format"] == ("sog folder" if loose else kind[1:])
     assert facts["degree"] == min(1, FORMATS[".sog" if loose else kind].max_degree)
-    assert facts["low"] == pytest.approx(SPLATS.positions.min(0), abs=2e-3)
-    assert facts["high"] == pytest.approx(SPLATS.positions.max(0), abs=2e-3)
+    assert facts["low"] == pytest.approx(BALL_SPLATS.positions.min(0), abs=2e-3)
+    assert facts["high"] == pytest.approx(BALL_SPLATS.positions.max(0), abs=2e-3)
     printed = succeeded("info", path).stdout
     assert printed.splitlines()[0] == f"{path}: {size:,} bytes, 60 Gaussians"
     assert f"degree {facts['degree']}" in printed and "centres" in printed
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_render_draws_splats_from_cameras_and_around(kind, files, tmp_path):
+@pytest.mark.parametrize("kind", FILE_KINDS)
+def test_render_draws_splats_from_given_cameras_and_from_an_orbit(kind, files, tmp_path):
     cameras = ring(2, width=24, height=24)
     (tmp_path / "path.json").write_text(cameras_to_json([(f"c{n}", camera) for n, camera in enumerate(cameras)]))
     succeeded("render", files[kind], "-o", tmp_path / "out", "--cameras", tmp_path / "path.json")
     pictures = [np.asarray(Image.open(tmp_path / "out" / f"c{n}.png")) for n in range(2)]
     assert all(picture.shape == (24, 24, 3) and picture[12, 12].max() > 30 for picture in pictures)
-    assert all(picture[0, 0].max() == 0 for picture in pictures)  # over black
+    assert all(picture[0, 0].max() == 0 for picture in pictures)  # the background is black
 
 
-def test_an_orbit_of_splats_shows_them_in_the_middle(files, tmp_path):
+def test_an_orbit_of_splats_is_centred_on_them(files, tmp_path):
     succeeded("render", files[".ply"], "-o", tmp_path / "out", "--orbit", 3)
     for path in (tmp_path / "out").iterdir():
         picture = np.asarray(Image.open(path)).max(axis=2) > 20
@@ -91,10 +91,10 @@ def test_depth_of_splats_is_in_world_units(files, tmp_path):
     (tmp_path / "path.json").write_text(cameras_to_json([("c", camera)]))
     succeeded("render", files[".ply"], "-o", tmp_path / "out", "--cameras", tmp_path / "path.json", "--depth")
     depth = np.asarray(Image.open(tmp_path / "out" / "c.depth.tiff"))
-    assert 3.5 < depth[16, 16] < 6.5 and depth[0, 0] == 0  # of a ball of radius 1, seen from 5 away
+    assert 3.5 < depth[16, 16] < 6.5 and depth[0, 0] == 0  # a ball of radius 1 seen from a distance of 5
 
 
-def test_an_exported_file_scores_what_the_export_said(data, tmp_path):
+def test_an_exported_file_has_the_score_that_the_export_printed(data, tmp_path):
     cameras = ring(4)
     positions = np.random.default_rng(0).uniform(-0.6, 0.6, (40, 3))
     kept = {"cameras": provenance_cameras(cameras), "viewpoint": Viewpoint.from_cameras(cameras).to_json()}
@@ -124,13 +124,13 @@ def test_part_of_a_splats_file_is_rejected(command, files, data, tmp_path):
 
 
 @pytest.mark.parametrize("arguments", [("compress", "{}", "-o", "x.hyrf"), ("decompress", "{}", "-o", "x.hyrf")])
-def test_commands_for_models_name_the_import(arguments, files, tmp_path, monkeypatch):
+def test_commands_for_models_reject_splats_and_name_the_import(arguments, files, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     told = refused(*(word.format(files[".ply"]) for word in arguments))
     assert f"import it first: 'hyrfpack import {files['.ply']} -o ball.hyrf'" in told
 
 
-def test_export_of_splats_names_the_command_to_use(files, tmp_path):
+def test_export_of_splats_names_convert_or_import(files, tmp_path):
     convert = f"'hyrfpack convert {files['.ply']} {tmp_path / 'a.spz'}'"
     assert convert in refused("export", files[".ply"], "-o", tmp_path / "a.spz")
     assert f"'hyrfpack import {files['.ply']} -o ball.hyrf'" in refused(
@@ -139,7 +139,7 @@ def test_export_of_splats_names_the_command_to_use(files, tmp_path):
 
 
 @pytest.mark.parametrize("command", ["view", "export"])
-def test_a_page_wants_a_loose_sog_bundled(command, files, tmp_path):
+def test_a_page_of_an_unbundled_sog_is_rejected(command, files, tmp_path):
     output = ("-o", tmp_path / "player") if command == "export" else ("--no-browser",)
     assert f"'hyrfpack convert {files['loose']} " in refused(command, files["loose"], *output)
 
@@ -147,7 +147,7 @@ def test_a_page_wants_a_loose_sog_bundled(command, files, tmp_path):
 # -- convert -----------------------------------------------------------------------------------------------------------
 
 
-def test_convert_prints_what_was_and_what_is(files, tmp_path):
+def test_convert_describes_input_and_output(files, tmp_path):
     target = tmp_path / "a.splat"
     result = succeeded("convert", files[".ply"], target)
     rows = [re.split(r" {2,}", line) for line in result.stdout.splitlines()]
@@ -158,11 +158,11 @@ def test_convert_prints_what_was_and_what_is(files, tmp_path):
     assert "no harmonics above degree 0" in result.stderr
 
 
-def test_convert_reports_json_and_asks_before_it_replaces(files, tmp_path):
+def test_convert_prints_json_and_replaces_only_with_overwrite(files, tmp_path):
     target = tmp_path / "a.spz"
     options = ("--sh-degree", 0, "--crop", "-9,-9,-9,9,9,0", "--min-opacity", 0.5, "--json")
     report = json.loads(succeeded("convert", files[".ply"], target, *options).stdout)
-    wanted = ((SPLATS.positions[:, 2] <= 0) & (SPLATS.opacities >= 0.5)).sum()
+    wanted = ((BALL_SPLATS.positions[:, 2] <= 0) & (BALL_SPLATS.opacities >= 0.5)).sum()
     assert (report["gaussians_before"], report["gaussians_after"], report["degree_after"]) == (60, wanted, 0)
     before = target.read_bytes()
     assert "replace it with --overwrite" in refused("convert", files[".sog"], target)
@@ -171,7 +171,7 @@ def test_convert_reports_json_and_asks_before_it_replaces(files, tmp_path):
     assert target.read_bytes() != before
 
 
-def test_convert_never_writes_into_the_loose_sog_that_it_reads(files, tmp_path):
+def test_convert_never_writes_into_the_unbundled_sog_that_it_reads(files, tmp_path):
     loose = shutil.copytree(files["loose"], tmp_path / "loose")
     for name in ("new.ply", "means_l.webp"):
         assert refused("convert", loose, loose / name, "--overwrite")

@@ -1,4 +1,4 @@
-"""Library messages name Python arguments; the command line names its options in their place."""
+"""Library messages name Python arguments; the command line replaces them by its options."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from hyrfpack.cli.wording import use_option_names
 from hyrfpack.errors import HyrfError
 from hyrfpack.outputs import Outputs
 
-LIBRARY = Path(PACKAGE_FILE).parent
+LIBRARY_FOLDER = Path(PACKAGE_FILE).parent
 
 
-def strings_of(module: Path) -> Iterator[str]:
-    """The strings of a module that are no docstrings; of f-strings, each constant part."""
+def message_strings(module: Path) -> Iterator[str]:
+    """Yield the strings of a module that are not docstrings, and each constant part of f-strings."""
     tree = ast.parse(module.read_text(encoding="utf-8"))
     docstrings = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
     for node in ast.walk(tree):
@@ -28,8 +28,8 @@ def strings_of(module: Path) -> Iterator[str]:
 
 
 def library_strings() -> list[tuple[str, str]]:
-    modules = [(path.relative_to(LIBRARY).as_posix(), path) for path in sorted(LIBRARY.rglob("*.py"))]
-    return [(name, text) for name, path in modules if not name.startswith("cli/") for text in strings_of(path)]
+    modules = [(path.relative_to(LIBRARY_FOLDER).as_posix(), path) for path in sorted(LIBRARY_FOLDER.rglob("*.py"))]
+    return [(name, text) for name, path in modules if not name.startswith("cli/") for text in message_strings(path)]
 
 
 def test_no_library_message_names_an_option_of_the_command_line():
@@ -61,13 +61,13 @@ def test_arguments_become_options(message, expected):
     assert use_option_names(message) == expected
 
 
-def test_text_that_a_problem_quotes_is_never_taken_for_a_setting(tmp_path):
+def test_text_quoted_in_a_problem_is_never_read_as_a_setting(tmp_path):
     name = "`overwrite=True` {data} {0} %s.hyrf"
 
     assert hyrfpack("info", tmp_path / name).stderr.startswith(f"Error: {tmp_path / name}: ")
 
 
-def test_the_same_refusal_names_an_argument_in_python_and_an_option_on_the_command_line(tmp_path):
+def test_the_same_error_names_an_argument_in_python_and_an_option_on_the_command_line(tmp_path):
     (tmp_path / "there.hyrf").write_bytes(b"kept")
 
     with pytest.raises(HyrfError, match="replace it with `overwrite=True`$"):

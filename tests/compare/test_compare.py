@@ -1,4 +1,4 @@
-"""Runs side by side: what the page says of them, what it shows and what is refused; nothing is taken for HTML."""
+"""The comparison page of several runs: its numbers, pictures and errors; text from files is never read as HTML."""
 
 from __future__ import annotations
 
@@ -25,49 +25,49 @@ from hyrfpack.evaluate.figures import PAPER_COLOR
 from hyrfpack.scene import Scene
 from hyrfpack.train import TrainConfig
 
-HOSTILE = "<script>alert(1)</script><b a=\"'&{{style}}"
+HOSTILE_TEXT = "<script>alert(1)</script><b a=\"'&{{style}}"
 
 
-def scene(**options) -> Scene:
-    """Balls, of whose eight photos two are held out."""
+def make_scene(**options) -> Scene:
+    """Return a scene of balls with two of its eight photos held out."""
     whole = ball_scene(side=24, points=60, **options)
     return dataclasses.replace(whole, train=whole.train[2:], test=whole.train[:2])
 
 
-def trained(folder: Path, of: Scene | None = None, **settings) -> Path:
-    hyrfpack.train_model(of or scene(), folder, TrainConfig(steps=12, max_gaussians=60, **settings), quiet=True)
+def train_run(folder: Path, of: Scene | None = None, **settings) -> Path:
+    hyrfpack.train_model(of or make_scene(), folder, TrainConfig(steps=12, max_gaussians=60, **settings), quiet=True)
     return folder
 
 
 @pytest.fixture(scope="module")
-def originals(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Runs a and b, which differ in seed and one setting, and one of another scene; not to be changed."""
+def original_runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Runs a and b, which differ in seed and one setting, and a run of another scene. Tests must not change them."""
     root = tmp_path_factory.mktemp("runs")
-    trained(root / "a")
-    trained(root / "b", seed=1, ssim_weight=0.3)
-    trained(root / "far", scene(offset=(9, 0, 0), scale=2.0))
+    train_run(root / "a")
+    train_run(root / "b", seed=1, ssim_weight=0.3)
+    train_run(root / "far", make_scene(offset=(9, 0, 0), scale=2.0))
     return root
 
 
 @pytest.fixture
-def runs(originals: Path, tmp_path: Path) -> list[Path]:
-    """Copies of a and b."""
-    return [Path(shutil.copytree(originals / name, tmp_path / name)) for name in "ab"]
+def runs(original_runs: Path, tmp_path: Path) -> list[Path]:
+    """Copies of runs a and b."""
+    return [Path(shutil.copytree(original_runs / name, tmp_path / name)) for name in "ab"]
 
 
-def metrics(run: Path) -> dict:
+def read_metrics(run: Path) -> dict:
     return json.loads((run / "metrics.json").read_text())
 
 
-def changed(run: Path, change: Callable[[dict], object]) -> Path:
-    values = metrics(run)
+def change_metrics(run: Path, change: Callable[[dict], object]) -> Path:
+    values = read_metrics(run)
     change(values)
     (run / "metrics.json").write_text(json.dumps(values))
     return run
 
 
 class Page(HTMLParser):
-    """Rows of the tables, tags with their attributes, and what the script is given."""
+    """A parsed page: table rows, tags with their attributes, and the data of the script."""
 
     def __init__(self, path: Path) -> None:
         super().__init__()
@@ -101,10 +101,10 @@ class Page(HTMLParser):
         return np.asarray(Image.open(io.BytesIO(data)))
 
 
-def test_the_page_has_the_numbers_of_all_runs_and_only_the_settings_that_differ(runs, tmp_path):
+def test_the_page_shows_all_results_and_only_settings_that_differ(runs, tmp_path):
     (runs[1] / "small.hyrf").write_bytes(b"x" * 1234)
     report = hyrfpack.compare_runs(runs, tmp_path / "page.html")
-    page, (a, b) = Page(tmp_path / "page.html"), map(metrics, runs)
+    page, (a, b) = Page(tmp_path / "page.html"), map(read_metrics, runs)
     assert page.rows["held-out PSNR (dB)"] == [f"{run['evaluation']['psnr']:.2f}" for run in (a, b)]
     assert page.rows["held-out SSIM"] == [f"{run['evaluation']['ssim']:.4f}" for run in (a, b)]
     assert page.rows["Gaussians"] == ["60", "60"] and page.rows["steps"] == ["12", "12"]
@@ -118,45 +118,45 @@ def test_the_page_has_the_numbers_of_all_runs_and_only_the_settings_that_differ(
     assert report.bytes == (tmp_path / "page.html").stat().st_size
 
 
-def test_the_best_score_stands_out_unless_scores_cannot_be_compared(runs, tmp_path):
+def test_the_best_score_is_marked_where_scores_can_be_compared(runs, tmp_path):
     def best(page: Page) -> list[str]:
         return [name for name, attributes in page.tags if attributes.get("class") == "best"]
 
     for run, psnr in zip(runs, (20.0, 21.0), strict=True):
         scores = {"psnr": psnr, "ssim": 0.8 - psnr / 100}
-        changed(run, lambda values, scores=scores: values["evaluation"].update(scores))
+        change_metrics(run, lambda values, scores=scores: values["evaluation"].update(scores))
     hyrfpack.compare_runs(runs, tmp_path / "page.html")
     text = (tmp_path / "page.html").read_text()
     assert '<td class="best">21.00</td>' in text and '<td class="best">0.6000</td>' in text
     assert best(Page(tmp_path / "page.html")) == ["td", "td"]
-    repaint(runs[1] / "views" / "000.png")
+    darken_photo(runs[1] / "views" / "000.png")
     hyrfpack.compare_runs(runs, tmp_path / "page.html", overwrite=True)
     assert best(Page(tmp_path / "page.html")) == []
 
 
-def test_scores_at_a_predicted_exposure_of_runs_of_earlier_versions_are_left_out(runs, tmp_path):
+def test_scores_at_predicted_exposure_of_earlier_versions_are_omitted(runs, tmp_path):
     for run in runs:
-        changed(run, lambda values: values["evaluation"].update(psnr_predicted=12.34, ssim_predicted="none"))
+        change_metrics(run, lambda values: values["evaluation"].update(psnr_predicted=12.34, ssim_predicted="none"))
     hyrfpack.compare_runs(runs, tmp_path / "page.html")
     page = Page(tmp_path / "page.html")
     assert "12.34" not in page.words and not [name for name in page.rows if "predicted" in name]
 
 
-def test_views_are_the_photo_and_each_render_with_their_scores(runs, tmp_path):
+def test_each_view_shows_the_photo_and_all_renders_with_scores(runs, tmp_path):
     hyrfpack.compare_runs(runs, tmp_path / "page.html")
     page = Page(tmp_path / "page.html")
     assert page.given["runs"] == ["a", "b"] and [view["name"] for view in page.given["views"]] == ["000.png", "001.png"]
-    held_out = scene().test[1]
-    times = 400 // 24  # small pictures are enlarged so many times
+    held_out = make_scene().test[1]
+    times = 400 // 24  # small pictures are enlarged by this factor
     assert (page.picture(1, 0)[::times, ::times] == held_out.load().rgb).all()
     for number, run in enumerate(runs):
         drawn = hyrfpack.render_view(hyrfpack.load_model(run / "model.hyrf"), held_out.camera).rgb.clamp(0, 1)
         assert (page.picture(1, 1 + number)[::times, ::times] == (drawn * 255).round().numpy()).all()
-        score = metrics(run)["evaluation"]["views"][1]
+        score = read_metrics(run)["evaluation"]["views"][1]
         assert page.given["views"][1]["scores"][number] == [score["psnr"], score["ssim"], None]
 
 
-def test_only_views_that_all_runs_have_pictures_of_are_shown(runs, tmp_path):
+def test_only_views_with_pictures_in_all_runs_are_shown(runs, tmp_path):
     (runs[1] / "views" / "000.png").unlink()
     assert hyrfpack.compare_runs(runs, tmp_path / "page.html").views == ["001.png"]
     shutil.rmtree(runs[0] / "views")
@@ -164,12 +164,12 @@ def test_only_views_that_all_runs_have_pictures_of_are_shown(runs, tmp_path):
     assert 'id="views"' not in (tmp_path / "bare.html").read_text()
 
 
-def test_a_curve_knows_its_seconds_and_one_of_an_earlier_version_is_said_to_have_none(runs, tmp_path):
-    first = metrics(runs[0])["curve"]
+def test_a_curve_has_seconds_and_one_of_an_earlier_version_a_note_about_their_absence(runs, tmp_path):
+    first = read_metrics(runs[0])["curve"]
     assert [record.seconds for record in read_run(runs[0]).curve] == [record["seconds"] for record in first]
     hyrfpack.compare_runs(runs, tmp_path / "page.html")
     assert "spread evenly" not in Page(tmp_path / "page.html").words
-    changed(runs[1], lambda values: [record.pop("seconds") for record in values["curve"]])
+    change_metrics(runs[1], lambda values: [record.pop("seconds") for record in values["curve"]])
     hyrfpack.compare_runs(runs, tmp_path / "page.html", overwrite=True)
     assert "No times of single steps were kept of b" in Page(tmp_path / "page.html").words
 
@@ -186,57 +186,57 @@ def test_the_same_runs_give_the_same_bytes_and_a_page_fetches_nothing(runs, tmp_
     assert addresses and all(not address or address.startswith("data:") for address in addresses)
 
 
-def test_nothing_out_of_files_is_taken_for_html(runs, tmp_path):
+def test_text_from_files_is_never_read_as_html(runs, tmp_path):
     plain = [name for name, _ in Page(Path(hyrfpack.compare_runs(runs, tmp_path / "plain.html").file)).tags]
-    hostile = runs[1].rename(tmp_path / HOSTILE.replace("/", ":"))
+    hostile = runs[1].rename(tmp_path / HOSTILE_TEXT.replace("/", ":"))
     for run in (runs[0], hostile):
-        (run / "views" / "000.png").rename(run / "views" / f"{HOSTILE.replace('/', '_')}.png")
+        (run / "views" / "000.png").rename(run / "views" / f"{HOSTILE_TEXT.replace('/', '_')}.png")
 
         def poison(values: dict, run: Path = run) -> None:
-            values["notes"] = [HOSTILE, run.name]
-            values["choices"] = {HOSTILE: run.name}
-            values["settings"] |= {HOSTILE: run.name}
-            values["device"] = HOSTILE + run.name
-            values["evaluation"]["views"][0]["name"] = HOSTILE.replace("/", "_")
+            values["notes"] = [HOSTILE_TEXT, run.name]
+            values["choices"] = {HOSTILE_TEXT: run.name}
+            values["settings"] |= {HOSTILE_TEXT: run.name}
+            values["device"] = HOSTILE_TEXT + run.name
+            values["evaluation"]["views"][0]["name"] = HOSTILE_TEXT.replace("/", "_")
 
-        changed(run, poison)
-    (hostile / f"{HOSTILE.replace('/', '_')}.hyrf").write_bytes(b"")
+        change_metrics(run, poison)
+    (hostile / f"{HOSTILE_TEXT.replace('/', '_')}.hyrf").write_bytes(b"")
     hyrfpack.compare_runs([runs[0], hostile], tmp_path / "page.html")
     page = Page(tmp_path / "page.html")
     assert {name for name, _ in page.tags} == set(plain)
     assert [name for name, _ in page.tags].count("script") == plain.count("script") == 2
-    assert page.rows[HOSTILE] == ["a", HOSTILE.replace("/", ":")]
+    assert page.rows[HOSTILE_TEXT] == ["a", HOSTILE_TEXT.replace("/", ":")]
     assert "alert" not in re.sub(r"&lt;|\\u003c", "", " ".join(str(attributes) for _, attributes in page.tags))
 
 
 # -- what cannot be compared -----------------------------------------------------------------------------------------
 
 
-def repaint(sheet: Path) -> None:
-    """Give a picture another photo: darker, captions and gaps as they were."""
+def darken_photo(sheet: Path) -> None:
+    """Replace the photo in a picture by a darker one, and keep captions and gaps."""
     pixels = np.array(Image.open(sheet).convert("RGB"))
     pixels[(pixels != PAPER_COLOR).any(axis=2)] //= 2
     Image.fromarray(pixels).save(sheet)
 
 
-def test_other_photos_of_the_same_names_are_said_and_not_shown(runs, originals, tmp_path):
-    repaint(runs[1] / "views" / "001.png")
+def test_different_photos_of_the_same_name_are_noted_and_not_shown(runs, original_runs, tmp_path):
+    darken_photo(runs[1] / "views" / "001.png")
     report = hyrfpack.compare_runs(runs, tmp_path / "page.html")
     (sentence,) = report.doubts
     assert "'001.png' for one" in sentence and sentence in Page(tmp_path / "page.html").words
     assert report.views == ["000.png"]
 
 
-def test_other_cameras_are_said(runs, originals, tmp_path):
+def test_different_cameras_are_noted(runs, original_runs, tmp_path):
     shutil.rmtree(runs[0] / "views")
-    report = hyrfpack.compare_runs([runs[0], originals / "far"], tmp_path / "page.html")
+    report = hyrfpack.compare_runs([runs[0], original_runs / "far"], tmp_path / "page.html")
     assert len(report.doubts) == 1 and "trained from different cameras" in report.doubts[0]
 
 
 @pytest.mark.parametrize("which", [[0], [0, 1]], ids=["one", "all"])
 def test_runs_without_held_out_photos_are_compared_by_the_rest(which, runs, tmp_path):
     for number in which:
-        changed(runs[number], lambda values: values.pop("evaluation"))
+        change_metrics(runs[number], lambda values: values.pop("evaluation"))
     report = hyrfpack.compare_runs(runs, tmp_path / "page.html")
     page = Page(tmp_path / "page.html")
     assert report.views == [] and len(report.doubts) == 1 and "o photo is held out of" in report.doubts[0]
@@ -245,7 +245,7 @@ def test_runs_without_held_out_photos_are_compared_by_the_rest(which, runs, tmp_
 
 
 def test_other_held_out_photos_are_rejected(runs, tmp_path):
-    changed(runs[1], lambda values: values["evaluation"]["views"].pop())
+    change_metrics(runs[1], lambda values: values["evaluation"]["views"].pop())
     with pytest.raises(
         HyrfError, match=r"the runs 'a' and 'b' hold out different photos \(2 and 1; '001.png' is in only one of them\)"
     ):
@@ -253,7 +253,7 @@ def test_other_held_out_photos_are_rejected(runs, tmp_path):
     assert not (tmp_path / "page.html").exists()
 
 
-BROKEN = {
+BROKEN_METRICS = {
     "text": ("nothing", "it is no JSON"),
     "cut": ('{"settings": {"steps": 1', "it is no JSON"),
     "nested": ("[" * 100_000, "it is no JSON"),
@@ -263,9 +263,9 @@ BROKEN = {
 }
 
 
-@pytest.mark.parametrize("kind", BROKEN)
-def test_metrics_that_are_no_metrics_are_a_clear_error(kind, runs, tmp_path):
-    text, reason = BROKEN[kind]
+@pytest.mark.parametrize("kind", BROKEN_METRICS)
+def test_files_that_are_no_metrics_are_a_clear_error(kind, runs, tmp_path):
+    text, reason = BROKEN_METRICS[kind]
     (runs[1] / "metrics.json").write_bytes(text if isinstance(text, bytes) else text.encode())
     sentence = refused("compare", *runs, "-o", tmp_path / "page.html")
     assert f"{runs[1]}/metrics.json: the metrics are damaged ({reason})" in sentence
@@ -289,10 +289,10 @@ def test_metrics_that_are_no_metrics_are_a_clear_error(kind, runs, tmp_path):
 )  # fmt: skip
 def test_metrics_that_lack_something_are_a_clear_error_that_names_it(change, named, runs):
     with pytest.raises(HyrfError, match=f"metrics are damaged .*'{named}'.*train the run anew"):
-        read_run(changed(runs[0], change))
+        read_run(change_metrics(runs[0], change))
 
 
-def test_what_is_no_finished_run_is_rejected_with_what_to_do(runs, tmp_path):
+def test_an_unfinished_run_is_an_error_that_says_what_to_do(runs, tmp_path):
     page = tmp_path / "page.html"
     assert "there is no such folder" in refused("compare", runs[0], tmp_path / "none", "-o", page)
     assert "give two or more folders" in refused("compare", runs[0], "-o", page)
@@ -312,17 +312,17 @@ def test_what_is_no_finished_run_is_rejected_with_what_to_do(runs, tmp_path):
         hyrfpack.compare_runs(str(runs[0]), page)
 
 
-def test_the_command_says_what_it_wrote_and_what_is_doubtful(runs, tmp_path):
+def test_the_command_reports_its_output_and_doubts(runs, tmp_path):
     page = tmp_path / "page.html"
     result = succeeded("compare", *runs, "-o", page)
     assert f"{page}: 2 runs, 2 held-out views, {page.stat().st_size:,} bytes" in result.stdout and not result.stderr
     assert "--overwrite" in refused("compare", *runs, "-o", page)
-    changed(runs[0], lambda values: values.pop("evaluation"))
+    change_metrics(runs[0], lambda values: values.pop("evaluation"))
     result = succeeded("compare", *runs, "-o", page, "--overwrite", "--json")
     assert json.loads(result.stdout)["runs"] == ["a", "b"] and "No photo is held out of 'a'" in result.stderr
 
 
-def test_runs_are_called_by_as_much_of_their_paths_as_tells_them_apart():
+def test_runs_are_named_by_the_shortest_distinct_part_of_their_paths():
     assert short_names([Path("/x/runs/a"), Path("/x/runs/b")]) == ["a", "b"]
     assert short_names([Path("/x/a.work/run"), Path("/x/b.work/run")]) == ["a.work/run", "b.work/run"]
     assert short_names([Path("/run"), Path("/x/run")]) == ["//run", "x/run"]

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-WIDTH, HEIGHT = 32, 24
+PHOTO_WIDTH = 32
+PHOTO_HEIGHT = 24
 
 
 def rotation_of(quaternion: np.ndarray) -> np.ndarray:
-    """(3, 3) from a unit quaternion wxyz."""
+    """Return the (3, 3) rotation matrix of a unit quaternion wxyz."""
     w, x, y, z = quaternion
     return np.array(
         [
@@ -26,14 +27,14 @@ def rotation_of(quaternion: np.ndarray) -> np.ndarray:
 
 
 def poses_of(count: int) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Random (quaternion wxyz, translation), camera from world."""
+    """Return random camera-from-world poses as (quaternion wxyz, translation)."""
     rng = np.random.default_rng(5)
     quaternions = rng.normal(size=(count, 4))
     quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
     return list(zip(quaternions, rng.normal(size=(count, 3)), strict=True))
 
 
-def write_pictures(folder: Path, names: list[str], size: tuple[int, int] = (WIDTH, HEIGHT)) -> None:
+def write_pictures(folder: Path, names: list[str], size: tuple[int, int] = (PHOTO_WIDTH, PHOTO_HEIGHT)) -> None:
     for index, name in enumerate(names):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         pixels = np.random.default_rng(index).integers(0, 256, (size[1], size[0], 3), dtype=np.uint8)
@@ -41,7 +42,7 @@ def write_pictures(folder: Path, names: list[str], size: tuple[int, int] = (WIDT
 
 
 class ColmapFolder:
-    """A COLMAP scene written byte by byte as COLMAP documents its format."""
+    """A COLMAP model written byte by byte as COLMAP documents its format."""
 
     points = np.array([[0.0, 0, 1], [0.5, -0.5, 2], [1, 1, 3]])
     colors = np.array([[10, 20, 30], [255, 0, 128], [1, 2, 3]])
@@ -58,7 +59,10 @@ class ColmapFolder:
             (self.model / table).write_bytes(content)
 
     def tables(self) -> dict[str, bytes]:
-        cameras = struct.pack("<QIiQQ", 1, 7, self.model_id, WIDTH, HEIGHT) + np.array(self.params, "<f8").tobytes()
+        cameras = (
+            struct.pack("<QIiQQ", 1, 7, self.model_id, PHOTO_WIDTH, PHOTO_HEIGHT)
+            + np.array(self.params, "<f8").tobytes()
+        )
         images = struct.pack("<Q", self.count)
         for index, (quaternion, translation) in enumerate(self.poses):
             images += struct.pack("<I4d3dI", index + 1, *quaternion, *translation, 7)
@@ -81,13 +85,13 @@ class ColmapFolder:
 
 @pytest.fixture
 def colmap_folder():
-    """ColmapFolder, the class: colmap_folder(root, count, model, params)."""
+    """The class ColmapFolder: colmap_folder(root, count, model, params)."""
     return ColmapFolder
 
 
 @pytest.fixture
 def opengl_frames():
-    """frames(names) -> frames of a transforms file and the OpenCV camera_from_world each stands for."""
+    """A function frames(names) that returns transforms frames and the OpenCV camera_from_world of each."""
 
     def frames(names: list[str]) -> tuple[list[dict], list[np.ndarray]]:
         listed, poses = [], []
@@ -104,12 +108,12 @@ def opengl_frames():
 
 @pytest.fixture
 def nerfstudio_folder(tmp_path, opengl_frames):
-    """write(count, **entries) -> root of a nerfstudio scene; entries go to the top of transforms.json."""
+    """A function write(count, **entries) that returns the root of a set; entries go to the top of transforms.json."""
 
     def write(count: int = 4, **entries) -> Path:
         names = [f"images/{index:03d}.png" for index in range(count)]
         write_pictures(tmp_path, names)
-        intrinsics = {"fl_x": 30.0, "fl_y": 31.0, "cx": 17.0, "cy": 11.0, "w": WIDTH, "h": HEIGHT}
+        intrinsics = {"fl_x": 30.0, "fl_y": 31.0, "cx": 17.0, "cy": 11.0, "w": PHOTO_WIDTH, "h": PHOTO_HEIGHT}
         content = {**intrinsics, "frames": opengl_frames(names)[0], **entries}
         (tmp_path / "transforms.json").write_text(json.dumps(content))
         return tmp_path
@@ -119,11 +123,11 @@ def nerfstudio_folder(tmp_path, opengl_frames):
 
 @pytest.fixture
 def pictures():
-    """write_pictures, the function."""
+    """The function write_pictures."""
     return write_pictures
 
 
 @pytest.fixture
 def random_poses():
-    """random_poses(count) -> rotations and translations, camera from world."""
+    """A function random_poses(count) that returns rotations and translations, camera from world."""
     return lambda count: [(rotation_of(quaternion), translation) for quaternion, translation in poses_of(count)]

@@ -1,4 +1,4 @@
-"""Sets that come as a .zip: unpacked once, nothing outside its folder, and every bad one is a sentence."""
+"""Sets in .zip archives are unpacked once into their own folder, and bad archives are a clear error."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def cache(tmp_path_factory, monkeypatch) -> Path:
     return folder / "hyrfpack" / "archives"
 
 
-def packed(folder: Path, target: Path, top: str = "") -> Path:
+def zip_folder(folder: Path, target: Path, top: str = "") -> Path:
     with zipfile.ZipFile(target, "w") as content:
         for file in sorted(path for path in folder.rglob("*") if path.is_file()):
             content.write(file, top + file.relative_to(folder).as_posix())
@@ -32,14 +32,14 @@ def packed(folder: Path, target: Path, top: str = "") -> Path:
 
 
 @pytest.fixture
-def zipped(tmp_path, colmap_folder) -> Path:
-    """A small set as one file, and its folder `set` beside it."""
+def zipped_set(tmp_path, colmap_folder) -> Path:
+    """A small set as an archive, with its folder `set` beside it."""
     colmap_folder(tmp_path / "set", count=4)
-    return packed(tmp_path / "set", tmp_path / "set.zip", "set/")
+    return zip_folder(tmp_path / "set", tmp_path / "set.zip", "set/")
 
 
-def test_an_archive_reads_as_its_folder(zipped):
-    scene, plain = load_scene(zipped), load_scene(zipped.with_suffix(""))
+def test_an_archive_is_read_like_its_folder(zipped_set):
+    scene, plain = load_scene(zipped_set), load_scene(zipped_set.with_suffix(""))
 
     assert [view.name for view in scene.views] == [view.name for view in plain.views]
     for ours, theirs in zip(scene.views, plain.views, strict=True):
@@ -48,64 +48,64 @@ def test_an_archive_reads_as_its_folder(zipped):
     assert scene.notes[0].startswith("set.zip was unpacked into ")
 
 
-def test_it_is_unpacked_once_and_again_where_a_file_is_gone_or_the_archive_is_another(zipped, cache):
-    folder = archive.unpack(zipped)
+def test_an_archive_is_unpacked_again_only_after_a_change(zipped_set, cache):
+    folder = archive.unpack(zipped_set)
     first = folder / "images" / "000.png"
     about = os.stat(first)
 
-    assert archive.unpack(zipped) == folder and os.stat(first).st_mtime_ns == about.st_mtime_ns
+    assert archive.unpack(zipped_set) == folder and os.stat(first).st_mtime_ns == about.st_mtime_ns
     first.unlink()
-    assert archive.unpack(zipped) == folder and first.is_file()
-    os.utime(zipped, ns=(1, 1))
-    assert archive.unpack(zipped) != folder
+    assert archive.unpack(zipped_set) == folder and first.is_file()
+    os.utime(zipped_set, ns=(1, 1))
+    assert archive.unpack(zipped_set) != folder
     assert sorted(path.name[:4] for path in cache.iterdir()) == ["set-", "set-"]
 
 
-def test_outputs_may_lie_beside_the_archive_and_never_replace_it(zipped):
-    outputs = Outputs(scene=load_scene(zipped), overwrite=True)
+def test_outputs_may_lie_beside_the_archive_and_never_replace_it(zipped_set):
+    outputs = Outputs(scene=load_scene(zipped_set), overwrite=True)
 
-    outputs.file(zipped.parent / "small.hyrf")
+    outputs.file(zipped_set.parent / "small.hyrf")
     with pytest.raises(HyrfError, match="the output is an input itself"):
-        outputs.file(zipped)
+        outputs.file(zipped_set)
     with pytest.raises(HyrfError, match="the same command reads what lies in this folder"):
-        outputs.file(archive.unpack(zipped) / "images" / "new.hyrf")
+        outputs.file(archive.unpack(zipped_set) / "images" / "new.hyrf")
 
 
-def test_a_home_that_cannot_be_written_is_no_obstacle(zipped, monkeypatch, tmp_path):
+def test_an_archive_is_read_also_with_an_unwritable_home_folder(zipped_set, monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", os.devnull + "/none")
     monkeypatch.setattr(archive.tempfile, "gettempdir", lambda: str(tmp_path / "temporary"))
     monkeypatch.setattr(archive.tempfile, "tempdir", str(tmp_path))
 
-    assert archive.unpack(zipped).is_relative_to(tmp_path / "temporary")
+    assert archive.unpack(zipped_set).is_relative_to(tmp_path / "temporary")
 
 
-def test_no_room_is_said_before_anything_is_written(zipped, cache, monkeypatch):
+def test_a_lack_of_space_is_reported_before_anything_is_written(zipped_set, cache, monkeypatch):
     monkeypatch.setattr(shutil, "disk_usage", lambda path: shutil._ntuple_diskusage(100, 99, 1))
 
     with pytest.raises(HyrfDataError, match="do not fit on the disk"):
-        load_scene(zipped)
+        load_scene(zipped_set)
     assert list(cache.iterdir()) == []
 
 
-def test_a_disk_that_fills_up_leaves_nothing(zipped, cache, monkeypatch):
+def test_a_disk_that_fills_up_leaves_nothing(zipped_set, cache, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(shutil, "copyfileobj", full)
 
     with pytest.raises(HyrfDataError, match="No space left on device"):
-        load_scene(zipped)
+        load_scene(zipped_set)
     assert list(cache.iterdir()) == []
 
 
-def test_what_a_killed_process_left_is_removed_after_a_day(zipped, cache):
-    archive.unpack(zipped)
+def test_files_of_a_killed_process_are_removed_after_a_day(zipped_set, cache):
+    archive.unpack(zipped_set)
     for name in (".partial-old", ".partial-new"):
         (cache / name).mkdir()
     os.utime(cache / ".partial-old", (1, 1))
-    os.utime(zipped, ns=(1, 1))
+    os.utime(zipped_set, ns=(1, 1))
 
-    archive.unpack(zipped)
+    archive.unpack(zipped_set)
 
     assert not (cache / ".partial-old").exists() and (cache / ".partial-new").exists()
 
@@ -126,7 +126,7 @@ def test_what_a_killed_process_left_is_removed_after_a_day(zipped, cache):
     ],
 )
 @pytest.mark.filterwarnings("ignore:Duplicate name")
-def test_archives_with_such_names_are_rejected_and_leave_nothing(names, says, tmp_path, cache):
+def test_archives_with_unsafe_names_are_rejected_and_leave_nothing(names, says, tmp_path, cache):
     with zipfile.ZipFile(tmp_path / "a.zip", "w") as content:
         for name in names:
             content.writestr(name, "x")
@@ -138,7 +138,7 @@ def test_archives_with_such_names_are_rejected_and_leave_nothing(names, says, tm
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x05\x06" + bytes(10), b"no archive at all"])
-def test_a_file_that_is_only_called_an_archive_is_rejected(content, tmp_path):
+def test_a_file_that_is_an_archive_only_by_name_is_rejected(content, tmp_path):
     (tmp_path / "a.zip").write_bytes(content)
 
     with pytest.raises(HyrfDataError, match="the archive is damaged"):
@@ -150,12 +150,12 @@ def test_a_file_that_is_only_called_an_archive_is_rejected(content, tmp_path):
 @pytest.mark.filterwarnings("ignore:Duplicate name")
 def test_no_name_writes_outside_the_folder(names, tmp_path_factory):
     top = tmp_path_factory.mktemp("zip")
-    place = top / "1" / "2" / "3" / "4"  # deeper than the longest name leads out
+    place = top / "1" / "2" / "3" / "4"  # deeper than the longest name can climb
     place.mkdir(parents=True)
     with zipfile.ZipFile(place / "a.zip", "w") as content:
         for name in names:
             info = zipfile.ZipInfo("x")
-            info.filename = name  # as it is: the constructor corrects it
+            info.filename = name  # set afterwards, because the constructor corrects names
             content.writestr(info, name)
 
     with pytest.MonkeyPatch.context() as patch:
@@ -173,8 +173,8 @@ def test_no_name_writes_outside_the_folder(names, tmp_path_factory):
 
 @settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_damaged_archives_are_read_or_rejected(zipped, tmp_path_factory, data):
-    content = bytearray(zipped.read_bytes())
+def test_damaged_archives_are_read_or_rejected(zipped_set, tmp_path_factory, data):
+    content = bytearray(zipped_set.read_bytes())
     for _ in range(data.draw(st.integers(1, 3))):
         at = data.draw(st.integers(0, len(content) - 1))
         content[at] ^= data.draw(st.integers(1, 255))
@@ -189,8 +189,8 @@ def test_damaged_archives_are_read_or_rejected(zipped, tmp_path_factory, data):
         assert "\n" not in str(error)
 
 
-def test_names_of_a_mac_are_the_ones_it_wrote(tmp_path):
-    """macOS writes UTF-8 and does not set the flag that says so; zipfile then takes it for cp437."""
+def test_names_in_archives_of_macos_are_read_as_utf_8(tmp_path):
+    """macOS writes UTF-8 names without the flag for it; zipfile then reads them as cp437."""
 
     class AsMacOSWrites(zipfile.ZipInfo):
         def _encodeFilenameFlags(self):
@@ -203,8 +203,8 @@ def test_names_of_a_mac_are_the_ones_it_wrote(tmp_path):
     assert (archive.unpack(tmp_path / "set.zip") / "Müller.txt").read_bytes() == b"1"
 
 
-def test_another_process_that_was_faster_is_no_trouble(zipped, monkeypatch):
-    """Whose folder is there by the time that ours is to take its place."""
+def test_two_processes_can_unpack_the_same_archive(zipped_set, monkeypatch):
+    """The folder of the other process exists when this one is about to be moved there."""
     replace = os.replace
 
     def after_another(partial, folder):
@@ -213,6 +213,6 @@ def test_another_process_that_was_faster_is_no_trouble(zipped, monkeypatch):
 
     monkeypatch.setattr(os, "replace", after_another)
 
-    folder = archive.unpack(zipped)
+    folder = archive.unpack(zipped_set)
 
     assert (folder / "images" / "000.png").is_file() and [*folder.parent.iterdir()] == [folder]

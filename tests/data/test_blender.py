@@ -10,7 +10,7 @@ from PIL import Image
 from hyrfpack.data import load_scene
 from hyrfpack.errors import HyrfDataError
 
-ANGLE = 0.6911112070083618
+FIELD_OF_VIEW_RADIANS = 0.6911112070083618
 
 
 def write_blender(root: Path, opengl_frames, splits=("train", "val", "test")) -> dict[str, list[np.ndarray]]:
@@ -22,7 +22,7 @@ def write_blender(root: Path, opengl_frames, splits=("train", "val", "test")) ->
         for index in range(3):
             rgba = np.random.default_rng(index).integers(0, 256, (20, 30, 4), dtype=np.uint8)
             Image.fromarray(rgba).save(root / split / f"r_{index}.png")
-        content = {"camera_angle_x": ANGLE, "frames": frames}
+        content = {"camera_angle_x": FIELD_OF_VIEW_RADIANS, "frames": frames}
         (root / f"transforms_{split}.json").write_text(json.dumps(content))
     return poses
 
@@ -35,7 +35,7 @@ def test_set_keeps_its_own_split_poses_and_straight_alpha(tmp_path, opengl_frame
     assert scene.layout == "blender" and scene.has_alpha and len(scene.points) == 0
     assert [view.name for view in scene.train] == ["train/r_0.png", "train/r_1.png", "train/r_2.png"]
     assert [view.name for view in scene.test] == ["test/r_0.png", "test/r_1.png", "test/r_2.png"]
-    focal = 15 / np.tan(ANGLE / 2)
+    focal = 15 / np.tan(FIELD_OF_VIEW_RADIANS / 2)
     for view, pose in zip(scene.test, poses["test"], strict=True):
         np.testing.assert_allclose(view.camera.camera_from_world, pose, atol=1e-12)
         np.testing.assert_allclose(view.camera.intrinsics, (focal, focal, 15, 10))
@@ -44,7 +44,7 @@ def test_set_keeps_its_own_split_poses_and_straight_alpha(tmp_path, opengl_frame
     np.testing.assert_array_equal(scene.train[1].load().alpha, stored[..., 3])
 
 
-def test_val_stands_in_for_a_missing_test_split(tmp_path, opengl_frames):
+def test_the_val_split_replaces_a_missing_test_split(tmp_path, opengl_frames):
     write_blender(tmp_path, opengl_frames, splits=("train", "val"))
 
     scene = load_scene(tmp_path)
@@ -62,13 +62,13 @@ def test_set_without_a_split_holds_out_every_nth(tmp_path, opengl_frames):
     assert [view.name for view in load_scene(tmp_path, test_every=2).test] == ["train/r_0.png", "train/r_2.png"]
 
 
-def _edit(root: Path, **entries) -> None:
+def _edit_transforms(root: Path, **entries) -> None:
     file = root / "transforms_train.json"
     content = json.loads(file.read_text()) | entries
     file.write_text(json.dumps({key: value for key, value in content.items() if value is not None}))
 
 
-def _frame(root: Path, **entries) -> None:
+def _edit_frame(root: Path, **entries) -> None:
     file = root / "transforms_train.json"
     content = json.loads(file.read_text())
     content["frames"][1] |= entries
@@ -78,23 +78,23 @@ def _frame(root: Path, **entries) -> None:
 @pytest.mark.parametrize(
     ("damage", "says"),
     [
-        (lambda root: _edit(root, camera_angle_x=None), "camera_angle_x"),
-        (lambda root: _edit(root, camera_angle_x=float("nan")), "camera_angle_x"),
-        (lambda root: _edit(root, camera_angle_x=4.0), "field of view"),
-        (lambda root: _edit(root, frames=[]), "frames"),
-        (lambda root: _frame(root, transform_matrix=[[float("nan")] * 4] * 4), "not finite"),
-        (lambda root: _frame(root, transform_matrix=(np.eye(4) * 3).tolist()), "not rigid"),
-        (lambda root: _frame(root, transform_matrix=np.diag([-1.0, 1, 1, 1]).tolist()), "mirrors"),
-        (lambda root: _frame(root, transform_matrix=[[1, 2], [3, 4]]), "transform_matrix"),
-        (lambda root: _frame(root, transform_matrix=None), "transform_matrix"),
-        (lambda root: _frame(root, file_path=7), "file_path"),
+        (lambda root: _edit_transforms(root, camera_angle_x=None), "camera_angle_x"),
+        (lambda root: _edit_transforms(root, camera_angle_x=float("nan")), "camera_angle_x"),
+        (lambda root: _edit_transforms(root, camera_angle_x=4.0), "field of view"),
+        (lambda root: _edit_transforms(root, frames=[]), "frames"),
+        (lambda root: _edit_frame(root, transform_matrix=[[float("nan")] * 4] * 4), "not finite"),
+        (lambda root: _edit_frame(root, transform_matrix=(np.eye(4) * 3).tolist()), "not rigid"),
+        (lambda root: _edit_frame(root, transform_matrix=np.diag([-1.0, 1, 1, 1]).tolist()), "mirrors"),
+        (lambda root: _edit_frame(root, transform_matrix=[[1, 2], [3, 4]]), "transform_matrix"),
+        (lambda root: _edit_frame(root, transform_matrix=None), "transform_matrix"),
+        (lambda root: _edit_frame(root, file_path=7), "file_path"),
         (lambda root: (root / "transforms_train.json").write_text('{"camera_angle_x": 0.7, "fra'), "JSON"),
         (lambda root: (root / "train" / "r_1.png").write_bytes(b""), "r_1.png"),
         (lambda root: [file.unlink() for file in (root / "train").iterdir()], "none of the 3 photos"),
         (lambda root: [file.unlink() for file in (root / "test").iterdir()], "none of the 3 photos"),
     ],
 )
-def test_broken_set_gives_one_sentence(tmp_path, opengl_frames, damage, says):
+def test_a_broken_set_is_a_clear_error(tmp_path, opengl_frames, damage, says):
     write_blender(tmp_path, opengl_frames)
     damage(tmp_path)
 

@@ -1,4 +1,4 @@
-"""Bundler's files. The real reconstruction's numbers are of bundle/bundle.out in github.com/davidar/pixelstruct."""
+"""Bundler files; the numbers of a real reconstruction are from bundle/bundle.out in github.com/davidar/pixelstruct."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from hyrfpack.data import load_scene
 from hyrfpack.data.undistort import distort
 from hyrfpack.errors import HyrfDataError
 
-# Cameras 0, 1, 2 and 4 (which was not registered), and four points with where cameras 0 to 2 saw them: pixels from the
-# middle of the picture, y up.
-REAL = """# Bundle file v0.3
+# Cameras 0, 1, 2 and 4 (4 is not registered), and four points with their pixels in cameras 0 to 2, measured from the
+# middle of the picture with y up.
+REAL_BUNDLE = """# Bundle file v0.3
 4 4
 6.8458150610e+02 -9.2868493344e-02 1.1613540173e-02
 9.9187742625e-01 -1.2167982186e-01 3.7056608646e-02
@@ -55,13 +55,13 @@ def folder(tmp_path, pictures):
     names = [f"{index}.png" for index in range(4)]
     pictures(tmp_path / "images", names, size=(400, 300))
     (tmp_path / "list.txt").write_text("".join(f"./{name}\n" for name in names))
-    (tmp_path / "bundle.out").write_text(REAL)
+    (tmp_path / "bundle.out").write_text(REAL_BUNDLE)
     return tmp_path
 
 
 def test_points_of_a_real_reconstruction_project_to_where_they_were_seen(folder):
     scene = load_scene(folder, test_every=0)
-    numbers = [line.split() for line in REAL.splitlines()[-10::3]]
+    numbers = [line.split() for line in REAL_BUNDLE.splitlines()[-10::3]]
     seen = np.array([[float(n) for n in line[1:]] for line in numbers]).reshape(4, 3, 4)[:, :, 2:]
 
     assert [view.name for view in scene.views] == ["0.png", "1.png", "2.png"]
@@ -73,27 +73,27 @@ def test_points_of_a_real_reconstruction_project_to_where_they_were_seen(folder)
         x, y = distort(lens, local[:, 0] / local[:, 2], local[:, 1] / local[:, 2])
         pixels = np.column_stack((lens.fx * x + lens.cx, lens.fy * y + lens.cy))
         expected = seen[:, number] * (1, -1) + (200, 150)
-        assert np.abs(pixels - expected).max() < 3, number  # pixels; the reconstruction's own error
+        assert np.abs(pixels - expected).max() < 3, number  # in pixels, the error of the reconstruction itself
         assert np.abs(pixels - expected).mean() < 0.7
     np.testing.assert_allclose(scene.point_colors[0] * 255, (100, 164, 102), atol=1e-4)
 
 
 @pytest.mark.parametrize("line", ["{name}", "{name} 0 653.2", "C:\\\\work\\\\{name}", "/home/me/set/{name} 0 1.2e3"])
-def test_lists_as_programs_write_them(folder, line):
+def test_all_known_forms_of_the_list_file_are_read(folder, line):
     (folder / "list.txt").write_text("".join(line.format(name=f"{index}.png") + "\n" for index in range(4)))
 
     assert len(load_scene(folder).views) == 3
 
 
 @pytest.mark.parametrize("name", ["scene.list.txt", "imagelist.lst", "image_list.txt"])
-def test_other_names_of_the_files(folder, name):
+def test_all_known_names_of_the_bundle_file_are_read(folder, name):
     (folder / "list.txt").rename(folder / name)
     (folder / "bundle.out").rename(folder / "scene.bundle.out")
 
     assert load_scene(folder).layout == "bundler"
 
 
-def test_a_folder_bundle_is_looked_into(folder):
+def test_the_folder_bundle_is_searched_for_the_file(folder):
     (folder / "bundle").mkdir()
     (folder / "bundle.out").rename(folder / "bundle" / "bundle.out")
 
@@ -120,7 +120,7 @@ def rewrite(root, change) -> None:
         (lambda root: (root / "list.txt").write_text("0.png\n0.png\n2.png\n3.png\n"), "listed twice"),
     ],
 )
-def test_broken_set_gives_one_sentence(folder, damage, says):
+def test_a_broken_set_is_a_clear_error(folder, damage, says):
     damage(folder)
 
     with pytest.raises(HyrfDataError, match=says) as caught:
@@ -135,14 +135,14 @@ def test_points_that_are_not_finite_are_dropped(folder):
     assert "1 of 4 points are not finite and were dropped" in load_scene(folder).notes
 
 
-def test_copies_of_a_size_that_is_not_said_are_rejected(folder):
+def test_copies_of_unknown_size_are_rejected(folder):
     (folder / "images").rename(folder / "images_4")
 
     with pytest.raises(HyrfDataError, match="does not say how large its photos are"):
         load_scene(folder)
 
 
-def test_a_list_may_say_the_folder(folder):
+def test_the_list_may_name_the_folder_of_photos(folder):
     (folder / "list.txt").write_text("".join(f"images/{index}.png\n" for index in range(4)))
 
     scene = load_scene(folder)
@@ -151,7 +151,7 @@ def test_a_list_may_say_the_folder(folder):
     assert not any("called otherwise" in note for note in scene.notes)
 
 
-def test_smaller_copies_are_taken_where_the_list_says_that_they_were_posed(folder, pictures):
+def test_smaller_copies_are_used_where_the_list_names_them(folder, pictures):
     names = [f"{index}.png" for index in range(4)]
     pictures(folder / "images_2", names, size=(200, 150))
     (folder / "list.txt").write_text("".join(f"images_2/{name}\n" for name in names))
@@ -163,7 +163,7 @@ def test_smaller_copies_are_taken_where_the_list_says_that_they_were_posed(folde
 
 
 @pytest.mark.parametrize("inside", ["", "left/"])
-def test_smaller_copies_are_rejected_otherwise_for_sizes_are_not_said(folder, pictures, inside):
+def test_smaller_copies_are_rejected_because_the_size_is_unknown(folder, pictures, inside):
     names = [f"{inside}{index}.png" for index in range(4)]
     shutil.rmtree(folder / "images")
     pictures(folder / "images_2", names, size=(200, 150))

@@ -11,8 +11,8 @@ from hyrfpack.errors import HyrfDataError
 from hyrfpack.scene import Camera, Picture, View
 
 
-class Photo:
-    """A `load` that counts its calls."""
+class CountedPhoto:
+    """A `load` function that counts its calls."""
 
     def __init__(self, value: int, size: int = 10, fails: bool = False):
         self.value, self.size, self.fails, self.loads = value, size, fails, 0
@@ -24,7 +24,7 @@ class Photo:
         return Picture(np.full((self.size, self.size, 3), self.value, np.uint8))
 
 
-def views_of(*photos: Photo) -> list[View]:
+def make_views(*photos: CountedPhoto) -> list[View]:
     camera = Camera(10, 10, 1.0, 1.0, 5.0, 5.0, np.eye(4))
     return [View(f"{index}.png", camera, photo) for index, photo in enumerate(photos)]
 
@@ -34,7 +34,7 @@ def photo_threads() -> list[str]:
 
 
 def test_pictures_are_decoded_once():
-    views = views_of(Photo(1), Photo(2))
+    views = make_views(CountedPhoto(1), CountedPhoto(2))
     cache = PictureCache(10_000)
 
     for view in views * 3:
@@ -44,8 +44,8 @@ def test_pictures_are_decoded_once():
     assert cache.nbytes == 600
 
 
-def test_limit_is_kept_and_the_least_recently_used_goes_first():
-    a, b, c = views_of(Photo(1), Photo(2), Photo(3))
+def test_the_limit_is_kept_by_dropping_the_least_recently_used_picture():
+    a, b, c = make_views(CountedPhoto(1), CountedPhoto(2), CountedPhoto(3))
     cache = PictureCache(700)
 
     for view in (a, b, a, c, a):
@@ -57,7 +57,7 @@ def test_limit_is_kept_and_the_least_recently_used_goes_first():
 
 
 def test_picture_above_the_limit_is_not_kept():
-    (view,) = views_of(Photo(1))
+    (view,) = make_views(CountedPhoto(1))
     cache = PictureCache(100)
 
     cache.get(view)
@@ -71,7 +71,7 @@ def test_default_limit_is_part_of_the_memory():
 
 
 def test_stream_keeps_the_order():
-    views = views_of(*(Photo(index) for index in range(20)))
+    views = make_views(*(CountedPhoto(index) for index in range(20)))
 
     streamed = list(PictureCache(0).stream(views))
 
@@ -81,7 +81,7 @@ def test_stream_keeps_the_order():
 
 
 def test_stream_decodes_ahead_but_no_further_than_its_depth():
-    views = views_of(*(Photo(index) for index in range(20)))
+    views = make_views(*(CountedPhoto(index) for index in range(20)))
     stream = PictureCache(0).stream(views, depth=3)
 
     next(stream)
@@ -91,7 +91,7 @@ def test_stream_decodes_ahead_but_no_further_than_its_depth():
 
 
 def test_stream_of_endless_views_ends_its_thread_when_closed():
-    stream = PictureCache(10_000).stream(itertools.cycle(views_of(Photo(1), Photo(2))))
+    stream = PictureCache(10_000).stream(itertools.cycle(make_views(CountedPhoto(1), CountedPhoto(2))))
     for _ in range(50):
         next(stream)
     assert photo_threads()
@@ -102,7 +102,7 @@ def test_stream_of_endless_views_ends_its_thread_when_closed():
 
 
 def test_stream_raises_a_decoding_error_in_its_turn():
-    views = views_of(Photo(1), Photo(2), Photo(3, fails=True), Photo(4))
+    views = make_views(CountedPhoto(1), CountedPhoto(2), CountedPhoto(3, fails=True), CountedPhoto(4))
     seen = []
 
     with pytest.raises(HyrfDataError, match=r"gone\.png"):
@@ -113,8 +113,8 @@ def test_stream_raises_a_decoding_error_in_its_turn():
     assert not photo_threads()
 
 
-def test_threads_sharing_a_cache_keep_its_books():
-    views = views_of(*(Photo(index) for index in range(30)))
+def test_threads_sharing_a_cache_keep_its_size_right():
+    views = make_views(*(CountedPhoto(index) for index in range(30)))
     cache = PictureCache(1500)
 
     def read(seed: int) -> None:

@@ -35,7 +35,7 @@ def test_binary_model_gives_cameras_poses_points_and_split(tmp_path, colmap_fold
 
 
 @pytest.mark.parametrize("place", ["sparse", "colmap/sparse/0"])
-def test_model_is_found_in_other_places(tmp_path, colmap_folder, place):
+def test_a_model_is_found_in_all_known_folders(tmp_path, colmap_folder, place):
     folder = colmap_folder(tmp_path)
     moved = tmp_path / "moved"
     shutil.move(folder.model, moved)
@@ -63,7 +63,7 @@ def test_text_model_equals_binary_model(tmp_path, colmap_folder):
     np.testing.assert_allclose(text.points, binary.points, atol=1e-12)
 
 
-def test_model_with_rigs_and_frames_reads_like_the_plain_one(tmp_path, colmap_folder):
+def test_a_model_with_rigs_and_frames_is_read_like_one_without(tmp_path, colmap_folder):
     folder = colmap_folder(tmp_path)
     plain = load_scene(tmp_path)
     pycolmap.Reconstruction(str(folder.model)).write_binary(str(folder.model))
@@ -85,7 +85,7 @@ def test_smaller_pictures_scale_the_intrinsics(tmp_path, colmap_folder, pictures
     assert view.load().rgb.shape == (12, 16, 3)
 
 
-def test_masks_beside_images_are_honoured_under_each_naming(tmp_path, colmap_folder):
+def test_masks_beside_images_are_used_under_each_naming(tmp_path, colmap_folder):
     folder = colmap_folder(tmp_path)
     shutil.move(tmp_path / "images" / "001.png", tmp_path / "images" / "001.jpg")
     folder.names[1] = "001.jpg"
@@ -104,7 +104,7 @@ def test_masks_beside_images_are_honoured_under_each_naming(tmp_path, colmap_fol
     assert any("3 of 9 photos have a mask" in note for note in scene.notes)
 
 
-def test_photos_not_on_disk_are_skipped_with_a_count(tmp_path, colmap_folder):
+def test_missing_photos_are_skipped_and_counted(tmp_path, colmap_folder):
     colmap_folder(tmp_path)
     (tmp_path / "images" / "004.png").unlink()
 
@@ -222,7 +222,7 @@ def _break_no_photo_folder(root: Path, folder) -> None:
         (_break_no_photo_folder, "there are the folders left, right, sparse.; .* `images`"),
     ],
 )
-def test_broken_model_gives_one_sentence(tmp_path, colmap_folder, damage, says):
+def test_a_broken_model_is_a_clear_error(tmp_path, colmap_folder, damage, says):
     damage(tmp_path, colmap_folder(tmp_path))
 
     with pytest.raises(HyrfDataError, match=says) as caught:
@@ -242,7 +242,7 @@ def test_every_truncation_of_a_table_is_rejected(tmp_path, colmap_folder, table)
             load_scene(tmp_path)
 
 
-def test_text_table_with_lost_lines_is_rejected(tmp_path, colmap_folder):
+def test_a_text_table_with_missing_lines_is_rejected(tmp_path, colmap_folder):
     folder = colmap_folder(tmp_path)
     pycolmap.Reconstruction(str(folder.model)).write_text(str(folder.model))
     for table in folder.model.glob("*.bin"):
@@ -272,7 +272,7 @@ def mutable_root(tmp_path_factory) -> Path:
 
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_mutated_tables_raise_nothing_but_data_errors(mutable_root, colmap_folder, data):
+def test_mutated_tables_raise_only_data_errors(mutable_root, colmap_folder, data):
     exists = (mutable_root / "images").is_dir()
     folder = colmap_folder(
         mutable_root, count=3, model=4, params=(30.0, 31, 17, 11, 0.1, 0.01, 0.001, 0.002), extra=not exists
@@ -300,7 +300,7 @@ def _eight_bytes(value: int) -> bytes:
 
 
 def write_tracks(folder, seen: list[list[int]]) -> None:
-    """Tables whose photo n has found the points seen[n], and a feature of no point."""
+    """Write tables in which photo n has found the points seen[n], and one feature without a point."""
     images, tracks = struct.pack("<Q", folder.count), [b""] * len(folder.points)
     for number, (quaternion, translation) in enumerate(folder.poses):
         images += struct.pack("<I4d3dI", number + 1, *quaternion, *translation, 7) + folder.names[number].encode()
@@ -316,13 +316,13 @@ def write_tracks(folder, seen: list[list[int]]) -> None:
     (folder.model / "points3D.bin").write_bytes(points)
 
 
-SEEN = [[2, 0], [1], [], [0, 1, 2]]
+POINTS_BY_PHOTO = [[2, 0], [1], [], [0, 1, 2]]
 
 
 @pytest.mark.parametrize("kind", ["binary", "text"])
 def test_tracks_are_the_points_that_each_photo_found(tmp_path, colmap_folder, kind):
     folder = colmap_folder(tmp_path, count=4)
-    write_tracks(folder, SEEN)
+    write_tracks(folder, POINTS_BY_PHOTO)
     if kind == "text":
         pycolmap.Reconstruction(str(folder.model)).write_text(str(folder.model))
         for table in folder.model.glob("*.bin"):
@@ -339,11 +339,11 @@ def test_tracks_are_the_points_that_each_photo_found(tmp_path, colmap_folder, ki
     assert all(rows.dtype == np.int64 for rows in tracks.values())
 
 
-def test_tracks_follow_points_that_are_dropped(tmp_path, colmap_folder):
+def test_tracks_are_renumbered_when_points_are_dropped(tmp_path, colmap_folder):
     folder = colmap_folder(tmp_path, count=4)
     folder.points = folder.points.copy()
     folder.points[1, 2] = np.nan
-    write_tracks(folder, SEEN)
+    write_tracks(folder, POINTS_BY_PHOTO)
 
     scene = load_scene(tmp_path)
 

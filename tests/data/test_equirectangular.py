@@ -12,37 +12,39 @@ from hyrfpack.data.equirectangular import FACES, cut_face, cut_panorama, face_le
 from hyrfpack.errors import HyrfDataError
 
 
-def world(directions: np.ndarray) -> np.ndarray:
-    """Colours of a made-up sky, smooth in the direction (..., 3): (..., 3) in [0, 255]."""
+def sky_colors(directions: np.ndarray) -> np.ndarray:
+    """Return the colours (..., 3) in [0, 255] of a synthetic sky that is smooth in the direction (..., 3)."""
     x, y, z = np.moveaxis(directions / np.linalg.norm(directions, axis=-1, keepdims=True), -1, 0)
     waves = np.stack((np.sin(3 * x + y), np.cos(4 * y - 2 * z * x), np.sin(5 * z + 2 * y * x)), axis=-1)
     return 127.5 + 100 * waves
 
 
-def panorama(height: int, finer: int = 1) -> np.ndarray:
-    """(H, 2 H, 3) uint8, from the definition of longitude and latitude; each pixel the mean of `finer` squared."""
+def render_panorama(height: int, finer: int = 1) -> np.ndarray:
+    """Render a (H, 2 H, 3) uint8 panorama by the definition of longitude and latitude, `finer` ** 2 samples a pixel."""
     longitude = ((np.arange(2 * height * finer) + 0.5) / (2 * height * finer) - 0.5) * 2 * np.pi
     latitude = ((np.arange(height * finer) + 0.5) / (height * finer) - 0.5) * np.pi
     lon, lat = np.meshgrid(longitude, latitude)
     directions = np.stack((np.sin(lon) * np.cos(lat), np.sin(lat), np.cos(lon) * np.cos(lat)), axis=-1)
-    colors = world(directions).reshape(height, finer, 2 * height, finer, 3).mean(axis=(1, 3))
+    colors = sky_colors(directions).reshape(height, finer, 2 * height, finer, 3).mean(axis=(1, 3))
     return np.round(colors).astype(np.uint8)
 
 
-def seen(face, size: int) -> np.ndarray:
-    """What a pinhole camera with 90 degrees sees of the made-up sky: through the middle of each pixel."""
+def render_face(face, size: int) -> np.ndarray:
+    """Return what a 90 degree pinhole camera sees of the synthetic sky through the middle of each pixel."""
     lens = face_lens(size)
     v, u = np.mgrid[0:size, 0:size] + 0.5
     rays = np.stack(((u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy, np.ones_like(u)), axis=-1)
-    return world(rays @ face.rotation)  # from the face into the panorama's camera: the transpose, times a column
+    return sky_colors(rays @ face.rotation)  # the transpose maps columns from the face to the panorama's camera
 
 
 @pytest.mark.parametrize("face", FACES, ids=lambda face: face.name)
 @pytest.mark.parametrize(("height", "size"), [(256, 163), (256, 64), (100, 200)])
-def test_a_face_is_what_a_pinhole_camera_would_see(face, height, size):
-    error = cut_face(panorama(height), face, size).astype(float) - seen(face, size)
+def test_a_face_matches_the_view_of_a_pinhole_camera(face, height, size):
+    error = cut_face(render_panorama(height), face, size).astype(float) - render_face(face, size)
 
-    assert np.abs(error).max() < 2.5 and np.sqrt(np.mean(error**2)) < 0.7  # of 255; rounding twice alone is 0.4
+    assert (
+        np.abs(error).max() < 2.5 and np.sqrt(np.mean(error**2)) < 0.7
+    )  # in levels of 255; rounding twice alone gives 0.4
 
 
 def test_faces_are_proper_rotations_that_cover_all_directions():
@@ -56,10 +58,10 @@ def test_faces_are_proper_rotations_that_cover_all_directions():
     assert (inside.sum(axis=0) == 1).all()
 
 
-def test_forward_is_the_middle_and_up_is_above():
+def test_forward_is_the_middle_of_the_panorama_and_up_its_top():
     picture = np.zeros((64, 128, 3), np.uint8)
-    picture[28:36, 60:68] = (255, 0, 0)  # forward
-    picture[28:36, 92:100] = (0, 255, 0)  # a quarter to the right
+    picture[28:36, 60:68] = (255, 0, 0)  # the forward direction
+    picture[28:36, 92:100] = (0, 255, 0)  # a quarter turn to the right
     picture[:3] = (0, 0, 255)
     middles = {face.name: tuple(cut_face(picture, face, 41)[20, 20]) for face in FACES}
 
@@ -67,8 +69,8 @@ def test_forward_is_the_middle_and_up_is_above():
     assert middles["down"] == middles["back"] == middles["left"] == (0, 0, 0)
 
 
-def test_detail_finer_than_a_face_is_averaged_not_picked():
-    """Stripes of a pixel each: every second column would make bands of black and white."""
+def test_detail_finer_than_a_face_is_averaged():
+    """The stripes are one pixel wide; taking every second column would give black and white bands."""
     stripes = np.zeros((512, 1024, 3), np.uint8)
     stripes[:, ::2] = 255
 
@@ -78,11 +80,11 @@ def test_detail_finer_than_a_face_is_averaged_not_picked():
 
 
 @pytest.mark.parametrize("channels", [1, 4])
-def test_other_numbers_of_channels(channels):
+def test_faces_keep_the_number_of_channels(channels):
     assert cut_face(np.full((32, 64, channels), 9, np.uint8), FACES[0], 20).tolist() == [[[9] * channels] * 20] * 20
 
 
-def test_a_picture_of_another_shape_is_no_panorama(tmp_path):
+def test_a_picture_of_another_shape_is_rejected_as_a_panorama(tmp_path):
     Image.new("RGB", (90, 60)).save(tmp_path / "a.png")
 
     with pytest.raises(ValueError, match="90 x 60"):
@@ -91,8 +93,8 @@ def test_a_picture_of_another_shape_is_no_panorama(tmp_path):
         cut_panorama(tmp_path / "a.png", tmp_path)
 
 
-def test_faces_as_files(tmp_path):
-    Image.fromarray(panorama(128)).save(tmp_path / "street.png")
+def test_faces_are_written_as_files(tmp_path):
+    Image.fromarray(render_panorama(128)).save(tmp_path / "street.png")
 
     files = cut_panorama(tmp_path / "street.png", tmp_path / "faces")
 
@@ -100,19 +102,19 @@ def test_faces_as_files(tmp_path):
     for file, face in zip(files, FACES, strict=True):
         picture = np.asarray(Image.open(file)).astype(float)
         assert picture.shape == (face_size(256), face_size(256), 3)
-        assert np.abs(picture - seen(face, len(picture))).mean() < 2
+        assert np.abs(picture - render_face(face, len(picture))).mean() < 2
 
 
-def test_what_a_panorama_is(tmp_path):
-    Image.fromarray(panorama(256)).save(tmp_path / "sky.png")
-    Image.fromarray(panorama(256)[64:192, 100:356]).save(tmp_path / "part.png")
+def test_panoramas_are_recognised_by_shape_and_metadata(tmp_path):
+    Image.fromarray(render_panorama(256)).save(tmp_path / "sky.png")
+    Image.fromarray(render_panorama(256)[64:192, 100:356]).save(tmp_path / "part.png")
     Image.fromarray(np.random.default_rng(0).integers(0, 256, (256, 512, 3), np.uint8)).save(tmp_path / "noise.png")
 
     assert is_panorama(tmp_path / "sky.png")
     assert not is_panorama(tmp_path / "part.png") and not is_panorama(tmp_path / "noise.png")
 
 
-def test_real_photos_cropped_to_that_shape_are_none(shared_data, tmp_path):
+def test_real_photos_cropped_to_2_by_1_are_not_recognised_as_panoramas(shared_data, tmp_path):
     for name in ("mipnerf360_bonsai", "gerrard_hall", "street_lund", "drone_caliterra"):
         for photo in sorted((shared_data / name / "images").iterdir())[::10]:
             with Image.open(photo) as picture:
@@ -124,8 +126,8 @@ def test_real_photos_cropped_to_that_shape_are_none(shared_data, tmp_path):
 # -- posed panoramas ---------------------------------------------------------------------------------------------------
 
 
-def posed(root: Path, height: int = 128) -> None:
-    """Two panoramas of the made-up sky in a transforms.json, the second turned by a quarter about the world's y."""
+def write_posed_panoramas(root: Path, height: int = 128) -> None:
+    """Write two panoramas of the synthetic sky with transforms.json; the second is turned 90 degrees about world y."""
     quarter = [[0, 0, 1, 2.0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]]
     frames = [
         {"file_path": f"images/{name}.png", "transform_matrix": m}
@@ -133,29 +135,29 @@ def posed(root: Path, height: int = 128) -> None:
     ]
     (root / "images").mkdir()
     for name in "ab":
-        Image.fromarray(panorama(height)).save(root / "images" / f"{name}.png")
+        Image.fromarray(render_panorama(height)).save(root / "images" / f"{name}.png")
     (root / "transforms.json").write_text(json.dumps({"camera_model": "EQUIRECTANGULAR", "frames": frames}))
 
 
-def test_posed_panoramas_become_views_that_look_where_they_should(tmp_path):
-    posed(tmp_path)
+def test_posed_panoramas_become_views_with_the_right_directions(tmp_path):
+    write_posed_panoramas(tmp_path)
 
     views = {view.name: view for view in load_scene(tmp_path, test_every=0).views}
 
     assert len(views) == 12
     for face in FACES:
         view = views[f"a_{face.name}.png"]
-        # OpenGL's world: what the panorama calls down is the world's -y, and forward its -z.
+        # In the OpenGL world, the panorama's down is the world's -y and its forward is the world's -z.
         np.testing.assert_allclose(view.camera.rotation, face.rotation @ np.diag([1.0, -1, -1]), atol=1e-12)
-        np.testing.assert_allclose(view.load().rgb, seen(face, view.camera.width), atol=2.5)
+        np.testing.assert_allclose(view.load().rgb, render_face(face, view.camera.width), atol=2.5)
     np.testing.assert_allclose(views["b_front.png"].camera.forward, (-1, 0, 0), atol=1e-12)
     np.testing.assert_allclose(views["b_left.png"].camera.position, (2, 0, 0), atol=1e-12)
 
 
-def test_faces_shrink_and_are_masked_with_their_panorama(tmp_path):
-    posed(tmp_path)
+def test_faces_are_reduced_and_masked_with_their_panorama(tmp_path):
+    write_posed_panoramas(tmp_path)
     mask = np.full((128, 256), 255, np.uint8)
-    mask[88:] = 0  # the photographer, 34 degrees down and more
+    mask[88:] = 0  # the photographer, from 34 degrees below the horizon
     (tmp_path / "masks").mkdir()
     Image.fromarray(mask).save(tmp_path / "masks" / "a.png")
 
@@ -163,12 +165,12 @@ def test_faces_shrink_and_are_masked_with_their_panorama(tmp_path):
 
     assert views["a_down.png"].rgb.shape == (40, 40, 3)
     assert not views["a_down.png"].mask[10:30, 10:30].any() and views["a_up.png"].mask.all()
-    assert 0 < (~views["a_front.png"].mask).mean() < 0.2  # the face reaches 45 degrees down in its middle
+    assert 0 < (~views["a_front.png"].mask).mean() < 0.2  # in its middle, the face reaches 45 degrees below the horizon
     assert views["b_down.png"].mask is None
 
 
-def test_a_split_of_panoramas_takes_all_their_faces(tmp_path):
-    posed(tmp_path, 64)
+def test_a_split_of_panoramas_includes_all_their_faces(tmp_path):
+    write_posed_panoramas(tmp_path, 64)
     content = json.loads((tmp_path / "transforms.json").read_text())
     content |= {"train_filenames": ["images/a.png"], "test_filenames": ["images/b.png"]}
     (tmp_path / "transforms.json").write_text(json.dumps(content))
@@ -179,7 +181,7 @@ def test_a_split_of_panoramas_takes_all_their_faces(tmp_path):
 
 
 def test_whole_panoramas_are_held_out(tmp_path):
-    posed(tmp_path, 64)
+    write_posed_panoramas(tmp_path, 64)
 
     scene = load_scene(tmp_path, test_every=2)
 
@@ -187,7 +189,7 @@ def test_whole_panoramas_are_held_out(tmp_path):
 
 
 def test_a_mask_of_another_shape_is_rejected(tmp_path):
-    posed(tmp_path, 64)
+    write_posed_panoramas(tmp_path, 64)
     (tmp_path / "masks").mkdir()
     Image.new("L", (64, 64)).save(tmp_path / "masks" / "a.png")
 
@@ -196,7 +198,7 @@ def test_a_mask_of_another_shape_is_rejected(tmp_path):
 
 
 def test_a_panorama_that_changed_is_rejected(tmp_path):
-    posed(tmp_path, 64)
+    write_posed_panoramas(tmp_path, 64)
     view = load_scene(tmp_path).views[0]
     Image.new("RGB", (64, 32)).save(tmp_path / "images" / "a.png")
 

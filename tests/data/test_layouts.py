@@ -1,4 +1,4 @@
-"""What all readers of other programs' exports share, on made-up sets and on real photos."""
+"""What all readers of other programs' layouts have in common, on synthetic sets and on real photos."""
 
 from __future__ import annotations
 
@@ -15,11 +15,12 @@ from hyrfpack.data import LAYOUTS, load_scene
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.outputs import Outputs
 
-BARE = ("llff", "polycam", "record3d")  # layouts without points
+# These layouts have no points.
+LAYOUTS_WITHOUT_POINTS = ("llff", "polycam", "record3d")
 
 
-def made_up(pictures, poses_of, root: Path, layout: str, count: int = 5) -> list[PhotoCamera]:
-    """A set of a layout, 32 x 24; its points lie in front of its first camera."""
+def write_set(pictures, poses_of, root: Path, layout: str, count: int = 5) -> list[PhotoCamera]:
+    """Write a set of 32 x 24 photos in a layout, with points in front of its first camera; return the cameras."""
     cameras = []
     for index, (rotation, translation) in enumerate(poses_of(count)):
         pose = np.eye(4)
@@ -33,33 +34,33 @@ def made_up(pictures, poses_of, root: Path, layout: str, count: int = 5) -> list
 
 @pytest.fixture
 def write(pictures, random_poses, tmp_path):
-    """write(layout, count) -> the cameras of a set in tmp_path."""
-    return lambda layout, count=5: made_up(pictures, random_poses, tmp_path, layout, count)
+    """A function write(layout, count) that writes a set into tmp_path and returns its cameras."""
+    return lambda layout, count=5: write_set(pictures, random_poses, tmp_path, layout, count)
 
 
-def test_the_command_line_knows_every_layout():
+def test_the_command_line_accepts_every_layout():
     assert tuple(LAYOUTS) == NAMES
     assert set(WRITERS_BY_LAYOUT) | {"colmap", "blender", "nerfstudio"} == set(LAYOUTS)
 
 
 @pytest.mark.parametrize("layout", WRITERS_BY_LAYOUT)
-def test_cameras_and_points_come_back(tmp_path, write, layout):
+def test_written_cameras_and_points_are_read_back(tmp_path, write, layout):
     cameras = write(layout)
 
     scene = load_scene(tmp_path, test_every=2)
 
     assert (scene.layout, len(scene.train), len(scene.test), scene.notes) == (layout, 2, 3, [])
-    assert len(scene.points) == (0 if layout in BARE else 3)
+    assert len(scene.points) == (0 if layout in LAYOUTS_WITHOUT_POINTS else 3)
     for view, camera in zip(scene.views, cameras, strict=True):
         np.testing.assert_allclose(view.camera.camera_from_world, camera.camera_from_world, atol=1e-9)
         np.testing.assert_allclose(view.camera.intrinsics, (30, 30, 16, 12), atol=1e-9)
         assert view.load().rgb.shape == (24, 32, 3)
-    if layout not in BARE:
+    if layout not in LAYOUTS_WITHOUT_POINTS:
         np.testing.assert_allclose(scene.point_colors, np.eye(3), atol=1e-6)
 
 
 @pytest.mark.parametrize("layout", WRITERS_BY_LAYOUT)
-def test_photos_that_are_not_there_are_counted(tmp_path, write, layout):
+def test_missing_photos_are_counted(tmp_path, write, layout):
     cameras = write(layout)
     (tmp_path / photo_path(layout, 3, cameras[3].name)).unlink()
 
@@ -72,7 +73,7 @@ def test_photos_that_are_not_there_are_counted(tmp_path, write, layout):
 
 
 @pytest.mark.parametrize("layout", [layout for layout in WRITERS_BY_LAYOUT if layout != "llff"])
-def test_no_photo_at_all_is_a_clear_error(tmp_path, write, layout):
+def test_a_set_without_photos_is_a_clear_error(tmp_path, write, layout):
     cameras = write(layout)
     for index, camera in enumerate(cameras):
         (tmp_path / photo_path(layout, index, camera.name)).unlink()
@@ -82,7 +83,7 @@ def test_no_photo_at_all_is_a_clear_error(tmp_path, write, layout):
 
 
 @pytest.mark.parametrize("layout", WRITERS_BY_LAYOUT)
-def test_masks_beside_the_photos_count(tmp_path, write, layout):
+def test_masks_beside_the_photos_are_used(tmp_path, write, layout):
     cameras = write(layout)
     name = Path(photo_path(layout, 1, cameras[1].name)).name
     (tmp_path / "masks").mkdir()
@@ -93,7 +94,9 @@ def test_masks_beside_the_photos_count(tmp_path, write, layout):
     assert [view.load().mask is not None for view in views] == [False, True, False, False, False]
 
 
-@pytest.mark.parametrize("layout", [layout for layout in WRITERS_BY_LAYOUT if layout != "bundler"])  # knows no sizes
+@pytest.mark.parametrize(
+    "layout", [layout for layout in WRITERS_BY_LAYOUT if layout != "bundler"]
+)  # a bundler file has no photo sizes
 def test_smaller_files_scale_the_intrinsics(tmp_path, write, layout):
     cameras = write(layout, 2)
     for index, camera in enumerate(cameras):
@@ -104,7 +107,7 @@ def test_smaller_files_scale_the_intrinsics(tmp_path, write, layout):
 
 
 @pytest.mark.parametrize("layout", WRITERS_BY_LAYOUT)
-def test_nothing_is_written_where_a_set_is_read_from(tmp_path, write, layout):
+def test_outputs_into_the_folders_of_a_set_are_rejected(tmp_path, write, layout):
     from hyrfpack.errors import HyrfError
 
     write(layout)
@@ -117,7 +120,7 @@ def test_nothing_is_written_where_a_set_is_read_from(tmp_path, write, layout):
         Outputs(scene=scene).file(tmp_path / "model.hyrf")
 
 
-def test_a_colmap_model_comes_first(tmp_path, write, colmap_folder):
+def test_a_colmap_model_is_preferred_to_other_layouts(tmp_path, write, colmap_folder):
     write("llff", 9)
     shutil.rmtree(tmp_path / "images")
     colmap_folder(tmp_path)
@@ -126,7 +129,7 @@ def test_a_colmap_model_comes_first(tmp_path, write, colmap_folder):
     assert load_scene(tmp_path, layout="llff").layout == "llff"
 
 
-def test_what_was_looked_for_is_said(tmp_path):
+def test_the_error_names_the_files_that_were_searched(tmp_path):
     with pytest.raises(HyrfDataError, match=r"sparse/0, transforms_train.json, .*poses_bounds.npy, .*Record3D"):
         load_scene(tmp_path)
     with pytest.raises(HyrfDataError, match=r"no metashape poses found \(looked for cameras of Metashape as .xml\)"):
@@ -134,7 +137,7 @@ def test_what_was_looked_for_is_said(tmp_path):
 
 
 @pytest.mark.parametrize("layout", ["bundler", "polycam", "record3d"])
-def test_sets_that_name_their_photos_take_no_folder(tmp_path, write, layout):
+def test_sets_with_photo_paths_reject_a_photo_folder(tmp_path, write, layout):
     write(layout)
 
     with pytest.raises(HyrfDataError, match="the folder 'images_2' cannot be chosen; leave out `images`"):
@@ -144,7 +147,7 @@ def test_sets_that_name_their_photos_take_no_folder(tmp_path, write, layout):
 
 
 @pytest.mark.parametrize("layout", ["llff", "metashape", "realityscan"])
-def test_photos_may_lie_in_another_place(tmp_path, tmp_path_factory, write, layout):
+def test_photos_may_lie_in_another_folder(tmp_path, tmp_path_factory, write, layout):
     write(layout)
     elsewhere = tmp_path_factory.mktemp("elsewhere") / "photos"
     (tmp_path / "images").rename(elsewhere)
@@ -156,7 +159,7 @@ def test_photos_may_lie_in_another_place(tmp_path, tmp_path_factory, write, layo
 
 @pytest.mark.parametrize("layout", ["llff", "metashape", "realityscan"])
 @pytest.mark.parametrize("images", ["images_9", "x" * 300, "a\0b"])
-def test_a_folder_that_is_not_there_is_a_clear_error(tmp_path, write, layout, images):
+def test_a_missing_photo_folder_is_a_clear_error(tmp_path, write, layout, images):
     write(layout)
 
     with pytest.raises(HyrfDataError, match="no photo folder"):
@@ -186,8 +189,8 @@ def test_points_of_another_frame_are_not_used(tmp_path, write, layout):
 
 
 @pytest.mark.parametrize("layout", WRITERS_BY_LAYOUT)
-def test_real_photos_show_the_points_colours(tmp_path, shared_data, layout):
-    """COLMAP's model of real photos, told in another layout: its points project to pixels of their colours."""
+def test_points_of_real_sets_project_to_pixels_of_their_colours(tmp_path, shared_data, layout):
+    """A COLMAP model of real photos is written in another layout; its points project to pixels of their colours."""
     known = load_scene(shared_data / "llff_fern", test_every=0)
     cameras = [
         PhotoCamera(v.name, v.camera.width, v.camera.height, *v.camera.intrinsics, v.camera.camera_from_world)
@@ -209,5 +212,5 @@ def test_real_photos_show_the_points_colours(tmp_path, shared_data, layout):
         shown.append(view.load().rgb[v[inside], u[inside]])
         expected.append(known.point_colors[inside])
 
-    assert len(scene.points) == (0 if layout in BARE else len(known.points))
+    assert len(scene.points) == (0 if layout in LAYOUTS_WITHOUT_POINTS else len(known.points))
     assert np.corrcoef(np.concatenate(shown).ravel(), np.concatenate(expected).ravel())[0, 1] > 0.7

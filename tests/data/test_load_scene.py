@@ -12,7 +12,7 @@ from hyrfpack.data import load_scene
 from hyrfpack.errors import HyrfDataError
 
 
-def test_colmap_comes_before_transforms_and_notes_say_so(tmp_path, colmap_folder, opengl_frames):
+def test_colmap_is_preferred_to_transforms_and_that_is_noted(tmp_path, colmap_folder, opengl_frames):
     folder = colmap_folder(tmp_path)
     frames, _ = opengl_frames([f"images/{name}" for name in folder.names[:5]])
     (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 30.0, "frames": frames}))
@@ -25,7 +25,7 @@ def test_colmap_comes_before_transforms_and_notes_say_so(tmp_path, colmap_folder
     assert any("nerfstudio was taken" in note for note in forced.notes)
 
 
-def test_zero_holds_out_nothing(tmp_path, colmap_folder):
+def test_test_every_0_holds_out_nothing(tmp_path, colmap_folder):
     colmap_folder(tmp_path)
 
     scene = load_scene(tmp_path, test_every=0)
@@ -33,7 +33,7 @@ def test_zero_holds_out_nothing(tmp_path, colmap_folder):
     assert (len(scene.train), len(scene.test)) == (9, 0)
 
 
-def test_photos_that_are_named_are_held_out_instead_of_every_nth(tmp_path, colmap_folder):
+def test_named_photos_are_held_out_instead_of_every_nth(tmp_path, colmap_folder):
     colmap_folder(tmp_path)
 
     scene = load_scene(tmp_path, held_out=["004.png"], test_every=2)
@@ -42,7 +42,7 @@ def test_photos_that_are_named_are_held_out_instead_of_every_nth(tmp_path, colma
     assert load_scene(**scene.reading).test[0].name == "004.png"
 
 
-def test_a_name_of_no_photo_cannot_be_held_out(tmp_path, colmap_folder):
+def test_holding_out_an_unknown_name_is_rejected(tmp_path, colmap_folder):
     colmap_folder(tmp_path)
 
     with pytest.raises(HyrfDataError, match="no photo is named 999.png"):
@@ -56,7 +56,7 @@ def test_holding_out_everything_is_rejected(tmp_path, colmap_folder):
         load_scene(tmp_path, test_every=1)
 
 
-def test_paths_that_are_no_scene_are_rejected(tmp_path):
+def test_paths_without_a_scene_are_rejected(tmp_path):
     (tmp_path / "file").write_text("")
 
     for path, says in (
@@ -68,7 +68,7 @@ def test_paths_that_are_no_scene_are_rejected(tmp_path):
             load_scene(path)
 
 
-def test_forced_layout_that_is_not_there_is_rejected(tmp_path, colmap_folder):
+def test_a_requested_layout_that_is_missing_is_rejected(tmp_path, colmap_folder):
     colmap_folder(tmp_path)
 
     with pytest.raises(HyrfDataError, match="no blender poses"):
@@ -85,7 +85,7 @@ def test_importing_the_readers_loads_no_heavy_library():
     assert printed.strip() == "[]"
 
 
-def test_scene_lists_every_file_it_is_read_from(tmp_path, colmap_folder, nerfstudio_folder):
+def test_a_scene_lists_every_file_that_it_is_read_from(tmp_path, colmap_folder, nerfstudio_folder):
     colmap_folder(tmp_path, count=3)
     (tmp_path / "masks").mkdir()
     shutil.copy(tmp_path / "images" / "001.png", tmp_path / "masks" / "001.png")

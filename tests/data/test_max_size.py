@@ -1,4 +1,4 @@
-"""Photos that are larger than wanted: shrunk as they are decoded, and all that hangs on their size with them."""
+"""Photos above a size limit are reduced while they are decoded, and so are cameras, masks and lenses."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from hyrfpack.data import load_scene
 from hyrfpack.data.pictures import fit_size, read_mask, read_pixels
 from hyrfpack.errors import HyrfDataError
 
-NOISE = np.random.default_rng(0).integers(0, 256, (24, 32, 3), dtype=np.uint8)
+NOISE_PICTURE = np.random.default_rng(0).integers(0, 256, (24, 32, 3), dtype=np.uint8)
 
 
-def ramp(width: int, height: int) -> np.ndarray:
-    """(H, W, 3) whose brightness falls along the diagonal, 200 levels over each side: shrinking must not move it."""
+def ramp_picture(width: int, height: int) -> np.ndarray:
+    """Return a (H, W, 3) ramp of 100 levels along each side, which a reduction must not shift."""
     x, y = (np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height
     return np.repeat((20 + 100 * x[None, :] + 100 * y[:, None])[..., None], 3, axis=2)
 
@@ -29,12 +29,12 @@ def ramp(width: int, height: int) -> np.ndarray:
         ((9000, 2), 100, (100, 1)),
     ],
 )
-def test_the_longer_side_is_what_is_limited(stored, limit, shrunk):
+def test_the_limit_applies_to_the_longer_side(stored, limit, shrunk):
     assert fit_size(*stored, limit) == shrunk
 
 
-def test_cameras_follow_the_photos_exactly(tmp_path, colmap_folder):
-    colmap_folder(tmp_path, count=3)  # 32 x 24, fx 30, fy 31, centre 17, 11
+def test_intrinsics_are_scaled_exactly_with_the_photos(tmp_path, colmap_folder):
+    colmap_folder(tmp_path, count=3)  # 32 x 24 pixels, fx 30, fy 31, centre (17, 11)
 
     halved, uneven = (load_scene(tmp_path, max_size=size).views[0] for size in (16, 21))
 
@@ -46,7 +46,7 @@ def test_cameras_follow_the_photos_exactly(tmp_path, colmap_folder):
     assert uneven.load().rgb.shape == (16, 21, 3)
 
 
-def test_cameras_calibrated_at_another_size_follow_too(tmp_path, colmap_folder, pictures):
+def test_intrinsics_calibrated_at_another_size_are_scaled_too(tmp_path, colmap_folder, pictures):
     folder = colmap_folder(tmp_path, count=3)
     pictures(tmp_path / "images_large", folder.names, size=(64, 48))
 
@@ -56,7 +56,7 @@ def test_cameras_calibrated_at_another_size_follow_too(tmp_path, colmap_folder, 
 
 
 @pytest.mark.parametrize("limit", [0, 32, 1600])
-def test_photos_within_the_limit_come_as_they_are_stored(tmp_path, colmap_folder, limit):
+def test_photos_within_the_limit_are_unchanged(tmp_path, colmap_folder, limit):
     folder = colmap_folder(tmp_path, count=2)
 
     scene = load_scene(tmp_path, max_size=limit)
@@ -69,29 +69,29 @@ def test_photos_within_the_limit_come_as_they_are_stored(tmp_path, colmap_folder
 
 @pytest.mark.parametrize("size", [(1001, 751), (803, 1207)])
 @pytest.mark.parametrize("longer", [100, 37, 700])
-def test_shrinking_moves_nothing(tmp_path, size, longer):
-    Image.fromarray(ramp(*size).round().astype(np.uint8)).save(tmp_path / "a.png")
+def test_reduction_does_not_shift_the_picture(tmp_path, size, longer):
+    Image.fromarray(ramp_picture(*size).round().astype(np.uint8)).save(tmp_path / "a.png")
     small = fit_size(*size, longer)
 
     rgb, _ = read_pixels(tmp_path / "a.png", small)
 
     inner = slice(4, -4)  # the filter is cut off at the border
-    np.testing.assert_allclose(rgb[inner, inner], ramp(*small)[inner, inner], atol=0.8)
+    np.testing.assert_allclose(rgb[inner, inner], ramp_picture(*small)[inner, inner], atol=0.8)
 
 
-def test_a_draft_of_a_jpeg_is_as_good_as_all_of_it(tmp_path):
-    """It is decoded at a quarter of its size here, which is 254.25 x 190.75 pixels in a picture of 255 x 191."""
-    fine = Image.fromarray(NOISE).resize((1017, 763), Image.Resampling.NEAREST)
+def test_a_jpeg_decoded_at_reduced_size_matches_the_full_one(tmp_path):
+    """It is decoded at a quarter of its size, so that 254.25 x 190.75 pixels lie in a picture of 255 x 191."""
+    fine = Image.fromarray(NOISE_PICTURE).resize((1017, 763), Image.Resampling.NEAREST)
     fine.save(tmp_path / "a.jpg", quality=95)
     whole = Image.open(tmp_path / "a.jpg").resize((100, 75), Image.Resampling.LANCZOS)
 
     rgb, _ = read_pixels(tmp_path / "a.jpg", (100, 75))
 
     error = np.square(rgb.astype(float) - np.asarray(whole, float)).mean()
-    assert 0 < error < 255**2 / 10**4.5  # 45 dB, and a draft it was
+    assert 0 < error < 255**2 / 10**4.5  # 45 dB; above 0, because a draft was decoded
 
 
-def test_colours_that_are_not_covered_do_not_leak(tmp_path):
+def test_colours_without_coverage_do_not_affect_reduced_photos(tmp_path):
     rgba = np.zeros((40, 40, 4), np.uint8)
     rgba[:, :17] = (200, 0, 0, 255)
     rgba[:, 17:] = (0, 255, 0, 0)
@@ -103,21 +103,21 @@ def test_colours_that_are_not_covered_do_not_leak(tmp_path):
     assert (rgb[covered][:, 1] == 0).all() and (np.abs(rgb[covered][:, 0].astype(int) - 200) <= 10).all()
     np.testing.assert_allclose(
         alpha[5, [2, 4, 7]], (255, 255 / 4, 0), atol=25
-    )  # the fifth pixel is covered by a quarter
+    )  # the fifth pixel has a coverage of a quarter
 
 
 @pytest.mark.parametrize(
     ("image", "channels"),
     [
-        (Image.fromarray(NOISE[..., 0].astype(np.uint16) * 257), 3),
-        (Image.fromarray(NOISE[..., 0]), 3),
-        (Image.fromarray(NOISE).convert("P"), 3),
-        (Image.fromarray(NOISE).convert("CMYK"), 3),
-        (Image.merge("LA", [Image.fromarray(NOISE[..., 0])] * 2), 4),
+        (Image.fromarray(NOISE_PICTURE[..., 0].astype(np.uint16) * 257), 3),
+        (Image.fromarray(NOISE_PICTURE[..., 0]), 3),
+        (Image.fromarray(NOISE_PICTURE).convert("P"), 3),
+        (Image.fromarray(NOISE_PICTURE).convert("CMYK"), 3),
+        (Image.merge("LA", [Image.fromarray(NOISE_PICTURE[..., 0])] * 2), 4),
     ],
     ids=["16 bits", "grey", "palette", "cmyk", "grey with alpha"],
 )
-def test_every_kind_of_picture_shrinks(tmp_path, image, channels):
+def test_pictures_of_every_mode_are_reduced(tmp_path, image, channels):
     image.save(tmp_path / "a.tif")
 
     rgb, alpha = read_pixels(tmp_path / "a.tif", (16, 12))
@@ -126,19 +126,19 @@ def test_every_kind_of_picture_shrinks(tmp_path, image, channels):
     assert (alpha is not None) == (channels == 4)
 
 
-def test_exif_orientation_is_ignored_in_shrunk_photos(tmp_path, colmap_folder):
+def test_exif_orientation_is_ignored_in_reduced_photos(tmp_path, colmap_folder):
     colmap_folder(tmp_path, count=1)
     exif = Image.Exif()
     exif[0x0112] = 6
-    Image.fromarray(ramp(32, 24).round().astype(np.uint8)).save(tmp_path / "images" / "000.png", exif=exif)
+    Image.fromarray(ramp_picture(32, 24).round().astype(np.uint8)).save(tmp_path / "images" / "000.png", exif=exif)
 
     rgb = load_scene(tmp_path, test_every=0, max_size=16).views[0].load().rgb
 
-    np.testing.assert_allclose(rgb[4:-4, 4:-4], ramp(16, 12)[4:-4, 4:-4], atol=1.5)
+    np.testing.assert_allclose(rgb[4:-4, 4:-4], ramp_picture(16, 12)[4:-4, 4:-4], atol=1.5)
 
 
 @pytest.mark.parametrize("size", [(16, 12), (21, 16), (7, 5)])
-def test_a_pixel_of_a_shrunk_photo_counts_if_all_that_it_covers_does(tmp_path, size):
+def test_a_reduced_pixel_is_used_only_if_all_its_pixels_are(tmp_path, size):
     generator = np.random.default_rng(2)
     ignored = generator.random((24, 32)) < 0.01
     Image.fromarray(np.where(ignored, 0, 255).astype(np.uint8)).save(tmp_path / "m.png")
@@ -146,7 +146,7 @@ def test_a_pixel_of_a_shrunk_photo_counts_if_all_that_it_covers_does(tmp_path, s
     mask = read_mask(tmp_path / "m.png", size[1], size[0], require_all=True)
 
     expected = np.ones((size[1], size[0]), bool)
-    for y, x in np.argwhere(ignored):  # by hand: which small pixels overlap the square of this one
+    for y, x in np.argwhere(ignored):  # computed by hand: the small pixels that overlap the square of this one
         rows = [r for r in range(size[1]) if r * 24 / size[1] < y + 1 and (r + 1) * 24 / size[1] > y]
         columns = [c for c in range(size[0]) if c * 32 / size[0] < x + 1 and (c + 1) * 32 / size[0] > x]
         expected[np.ix_(rows, columns)] = False
@@ -154,23 +154,23 @@ def test_a_pixel_of_a_shrunk_photo_counts_if_all_that_it_covers_does(tmp_path, s
     np.testing.assert_array_equal(mask, expected)
 
 
-def test_masks_of_shrunk_photos_follow_whatever_their_own_size(tmp_path, colmap_folder):
+def test_masks_of_any_size_are_fitted_to_reduced_photos(tmp_path, colmap_folder):
     colmap_folder(tmp_path, count=3)
     (tmp_path / "masks").mkdir()
     for name, size in (("000.png", 1), ("001.png", 2), ("002.png", 4)):
         pixels = np.full((24 // size, 32 // size), 255, np.uint8)
         pixels[: 12 // size] = 0
         if size == 1:
-            pixels[:12:2] = 255  # of every two rows one counts, and so no row of the shrunk photo does
+            pixels[:12:2] = 255  # one of every two rows is used, so no row of the reduced photo is
         Image.fromarray(pixels).save(tmp_path / "masks" / name)
 
     for view in load_scene(tmp_path, max_size=16).views:
         np.testing.assert_array_equal(view.load().mask, np.arange(12)[:, None].repeat(16, 1) >= 6)
 
 
-def test_lenses_are_undone_at_the_small_size(tmp_path, colmap_folder):
+def test_photos_are_undistorted_at_the_reduced_size(tmp_path, colmap_folder):
     colmap_folder(tmp_path, count=1, model=4, params=(30.0, 31, 17, 11, 0.1, 0.01, 0.001, 0.002))
-    Image.fromarray(ramp(32, 24).round().astype(np.uint8)).save(tmp_path / "images" / "000.png")
+    Image.fromarray(ramp_picture(32, 24).round().astype(np.uint8)).save(tmp_path / "images" / "000.png")
 
     small, large = (load_scene(tmp_path, test_every=0, max_size=size).views[0].load() for size in (16, 0))
 
@@ -179,7 +179,7 @@ def test_lenses_are_undone_at_the_small_size(tmp_path, colmap_folder):
     np.testing.assert_allclose(small.rgb[2:-2, 2:-2], halved[2:-2, 2:-2], atol=3)
 
 
-def test_a_note_says_how_many_photos_are_shrunk_and_from_what(tmp_path, colmap_folder):
+def test_a_note_counts_reduced_photos_and_names_their_size(tmp_path, colmap_folder):
     folder = colmap_folder(tmp_path, count=3)
     Image.new("RGB", (64, 48)).save(tmp_path / "images" / folder.names[1])
     Image.new("RGB", (16, 12)).save(tmp_path / "images" / folder.names[2])

@@ -1,4 +1,4 @@
-"""Which file a name stands for: the strictest rule that fits one file alone, and never one file for two names."""
+"""Names are matched to files by the strictest rule that fits exactly one file, and no file serves two names."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hyrfpack.data.names import PictureIndex, find_similar_file, path_parts
 
 
-def folder_of(root: Path, *names: str) -> Path:
+def make_folder(root: Path, *names: str) -> Path:
     for name in names:
         (root / name).parent.mkdir(parents=True, exist_ok=True)
         (root / name).touch()
@@ -45,8 +45,8 @@ def folder_of(root: Path, *names: str) -> Path:
         ("a  b .jpg", "a  b .png"),
     ],
 )
-def test_a_name_finds_the_file_that_it_must_mean(tmp_path, listed, there):
-    folder_of(tmp_path, there, "other.png", "left/other.png")
+def test_a_name_matches_the_only_file_that_it_can_mean(tmp_path, listed, there):
+    make_folder(tmp_path, there, "other.png", "left/other.png")
 
     assert PictureIndex(tmp_path).find(listed) == tmp_path / there
 
@@ -69,14 +69,14 @@ def test_a_name_finds_the_file_that_it_must_mean(tmp_path, listed, there):
         ("a\0b.jpg", ["a.jpg"]),
     ],
 )
-def test_what_is_not_clear_is_not_matched(tmp_path, listed, there):
-    folder_of(tmp_path, *there)
+def test_an_ambiguous_name_is_not_matched(tmp_path, listed, there):
+    make_folder(tmp_path, *there)
 
     assert PictureIndex(tmp_path).find(listed) is None
 
 
-def test_the_strictest_rule_comes_first(tmp_path):
-    folder_of(tmp_path, "a.jpg", "a.png", "A.JPG", "left/a.jpg")
+def test_the_strictest_rule_is_tried_first(tmp_path):
+    make_folder(tmp_path, "a.jpg", "a.png", "A.JPG", "left/a.jpg")
 
     index = PictureIndex(tmp_path)
 
@@ -84,8 +84,8 @@ def test_the_strictest_rule_comes_first(tmp_path):
     assert index.find("x/left/a.jpg") == tmp_path / "left" / "a.jpg"
 
 
-def test_a_file_is_given_to_no_second_name(tmp_path):
-    folder_of(tmp_path, "a.jpg", "b.jpg")
+def test_a_file_is_matched_to_one_name_only(tmp_path):
+    make_folder(tmp_path, "a.jpg", "b.jpg")
 
     matches = PictureIndex(tmp_path).match(["a.jpg", "A.png", "left/b.jpg", "right/b.jpg"])
 
@@ -94,8 +94,8 @@ def test_a_file_is_given_to_no_second_name(tmp_path):
     assert "2 photos fit more than one file" in matches.notes[0] and "left/b.jpg first" in matches.notes[0]
 
 
-def test_notes_say_how_many_are_called_otherwise_with_an_example(tmp_path):
-    folder_of(tmp_path, "a.jpg", "b.jpg", "c.png")
+def test_notes_count_inexact_matches_and_give_an_example(tmp_path):
+    make_folder(tmp_path, "a.jpg", "b.jpg", "c.png")
 
     matches = PictureIndex(tmp_path).match(["a.jpg", "/x/b.jpg", "c.jpg"])
 
@@ -105,7 +105,7 @@ def test_notes_say_how_many_are_called_otherwise_with_an_example(tmp_path):
     ]
 
 
-def test_the_nearest_by_name_is_named():
+def test_the_most_similar_name_is_suggested():
     files = [Path("photos/IMG_0412.jpg"), Path("photos/DSC_0001.jpg")]
 
     assert find_similar_file("images/IMG_412.jpeg", files) == files[0]
@@ -138,8 +138,8 @@ def test_matching_is_one_to_one_and_between_like_names(tmp_path_factory, names, 
     root = tmp_path_factory.mktemp("index")
     for name, end in there:
         try:
-            folder_of(root, name + end)
-        except OSError:  # a folder of that name
+            make_folder(root, name + end)
+        except OSError:  # there is a folder of that name
             continue
 
     matches = PictureIndex(root).match(names)
@@ -148,28 +148,28 @@ def test_matching_is_one_to_one_and_between_like_names(tmp_path_factory, names, 
     for name, file in matches.found.items():
         by_file.setdefault(file.resolve(), set()).add(path_parts(name))
         assert file.is_file()
-        assert stem(file.name) in (stem(path_parts(name)[-1]), plain(path_parts(name)[-1]))
+        assert reference_stem(file.name) in (reference_stem(path_parts(name)[-1]), normalize(path_parts(name)[-1]))
     assert all(len(spellings) == 1 for spellings in by_file.values())
     assert not set(matches.ambiguous) & set(matches.found)
 
 
-def plain(text: str) -> str:
+def normalize(text: str) -> str:
     return unicodedata.normalize("NFC", unicodedata.normalize("NFC", text).casefold())
 
 
-def stem(name: str) -> str:
-    """Independent of the code: what is before the last dot, where letters follow that."""
-    before, dot, after = plain(name).rpartition(".")
-    return before if dot and before and after and after[0] in string.ascii_lowercase else plain(name)
+def reference_stem(name: str) -> str:
+    """Return what precedes the last dot where letters follow it, independently of the code under test."""
+    before, dot, after = normalize(name).rpartition(".")
+    return before if dot and before and after and after[0] in string.ascii_lowercase else normalize(name)
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_two_files_that_fit_alike_are_never_chosen_between(tmp_path_factory, data):
+def test_no_choice_is_made_between_two_equally_good_files(tmp_path_factory, data):
     root = tmp_path_factory.mktemp("twins")
     name = data.draw(part.filter(lambda text: "." not in text))
     first, second = data.draw(st.permutations([".png", ".webp", ".bmp", ".tif"]))[:2]
-    folder_of(root, f"{name}{first}", f"{name}{second}")
+    make_folder(root, f"{name}{first}", f"{name}{second}")
 
     listed = data.draw(st.sampled_from(["", "/x/", "images/"])) + f"{name}.jpg"
 

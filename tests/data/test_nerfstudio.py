@@ -21,7 +21,7 @@ def edit_frame(root: Path, index: int, **entries) -> None:
     (root / "transforms.json").write_text(json.dumps(content))
 
 
-def test_poses_intrinsics_and_names(nerfstudio_folder, opengl_frames):
+def test_poses_intrinsics_and_names_are_read(nerfstudio_folder, opengl_frames):
     root = nerfstudio_folder(9)
     _, poses = opengl_frames([str(index) for index in range(9)])
 
@@ -34,7 +34,7 @@ def test_poses_intrinsics_and_names(nerfstudio_folder, opengl_frames):
         assert view.camera.intrinsics == (30.0, 31.0, 17.0, 11.0)
 
 
-def test_frame_intrinsics_come_before_global_ones(nerfstudio_folder):
+def test_intrinsics_of_a_frame_override_global_ones(nerfstudio_folder):
     root = nerfstudio_folder()
     edit_frame(root, 2, fl_x=40.0, cy=12.5)
 
@@ -44,7 +44,7 @@ def test_frame_intrinsics_come_before_global_ones(nerfstudio_folder):
     assert views[1].camera.intrinsics == (30.0, 31.0, 17.0, 11.0)
 
 
-def test_field_of_view_stands_in_for_the_focal_length(nerfstudio_folder):
+def test_the_field_of_view_replaces_a_missing_focal_length(nerfstudio_folder):
     root = nerfstudio_folder(fl_x=None, fl_y=None, cx=None, cy=None, w=None, h=None, camera_angle_x=1.0)
 
     focal = 16 / math.tan(0.5)
@@ -64,14 +64,14 @@ def test_field_of_view_stands_in_for_the_focal_length(nerfstudio_folder):
         ({"camera_model": "PINHOLE", "k1": 0.1}, "pinhole", ()),
     ],
 )
-def test_camera_models_reach_the_lens(nerfstudio_folder, entries, model, coefficients):
+def test_camera_models_and_coefficients_are_read(nerfstudio_folder, entries, model, coefficients):
     lens = load_scene(nerfstudio_folder(**entries)).views[0].load.lens
 
     assert (lens.model, lens.coefficients) == (model, coefficients)
 
 
 @pytest.mark.parametrize(("lowest", "has_alpha"), [(255, False), (254, True)])
-def test_alpha_that_is_opaque_throughout_is_no_coverage(nerfstudio_folder, lowest, has_alpha):
+def test_completely_opaque_alpha_is_not_read_as_coverage(nerfstudio_folder, lowest, has_alpha):
     root = nerfstudio_folder(9)
     for number, path in enumerate(sorted((root / "images").iterdir())):
         alpha = np.full((24, 32), 255 if number < 8 else lowest, np.uint8)
@@ -80,7 +80,7 @@ def test_alpha_that_is_opaque_throughout_is_no_coverage(nerfstudio_folder, lowes
     assert load_scene(root).has_alpha is has_alpha
 
 
-def test_listed_frames_without_a_file_are_skipped_with_a_count(nerfstudio_folder):
+def test_frames_without_a_file_are_skipped_and_counted(nerfstudio_folder):
     root = nerfstudio_folder(5)
     (root / "images" / "003.png").unlink()
 
@@ -90,7 +90,7 @@ def test_listed_frames_without_a_file_are_skipped_with_a_count(nerfstudio_folder
     assert any("1 of 5 photos" in note for note in scene.notes)
 
 
-def test_own_split_comes_first_and_drops_what_is_in_neither(nerfstudio_folder):
+def test_the_split_of_the_set_is_used_and_unlisted_photos_are_dropped(nerfstudio_folder):
     root = nerfstudio_folder(
         5,
         train_filenames=["images/004.png", "images/001.png"],
@@ -105,7 +105,7 @@ def test_own_split_comes_first_and_drops_what_is_in_neither(nerfstudio_folder):
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary"])
-def test_ply_points_and_colours(nerfstudio_folder, encoding):
+def test_points_and_colours_of_a_ply_file_are_read(nerfstudio_folder, encoding):
     root = nerfstudio_folder(ply_file_path="points.ply")
     points = np.random.default_rng(0).normal(size=(7, 3)).astype(np.float32)
     colors = np.random.default_rng(1).integers(0, 256, (7, 3), dtype=np.uint8)
@@ -131,7 +131,7 @@ def test_points_without_colours_are_grey_and_bad_ones_are_dropped(nerfstudio_fol
     assert any("1 of 3 points" in note for note in scene.notes)
 
 
-def test_mask_paths_are_honoured(nerfstudio_folder):
+def test_mask_paths_are_used(nerfstudio_folder):
     root = nerfstudio_folder()
     mask = np.zeros((24, 32), np.uint8)
     mask[:, 10:] = 255
@@ -146,7 +146,7 @@ def test_mask_paths_are_honoured(nerfstudio_folder):
 
 
 @pytest.mark.parametrize("folder", ["masks", "masks_2"])
-def test_masks_folder_serves_smaller_pictures(nerfstudio_folder, pictures, folder):
+def test_masks_of_full_size_are_used_for_smaller_pictures(nerfstudio_folder, pictures, folder):
     root = nerfstudio_folder()
     pictures(root / "images_2", [f"{index:03d}.png" for index in range(4)], size=(16, 12))
     mask = np.zeros((24, 32), np.uint8)
@@ -167,15 +167,15 @@ def test_smaller_pictures_scale_the_intrinsics(nerfstudio_folder, pictures):
     assert load_scene(root, images="images_2").views[0].camera.intrinsics == (15.0, 15.5, 8.5, 5.5)
 
 
-def _short_ply(root: Path) -> None:
+def _write_truncated_ply(root: Path) -> None:
     header = (
         "ply\nformat ascii 1.0\nelement vertex 5\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
     )
     (root / "points.ply").write_text(header + "0 1 2\n3 4 5\n")
-    _top(root, ply_file_path="points.ply")
+    _edit_transforms(root, ply_file_path="points.ply")
 
 
-def _top(root: Path, **entries) -> None:
+def _edit_transforms(root: Path, **entries) -> None:
     content = json.loads((root / "transforms.json").read_text()) | entries
     (root / "transforms.json").write_text(json.dumps(content))
 
@@ -183,18 +183,21 @@ def _top(root: Path, **entries) -> None:
 @pytest.mark.parametrize(
     ("damage", "says"),
     [
-        (lambda root: _top(root, fl_x=None, fl_y=None), "focal length"),
-        (lambda root: _top(root, fl_x="long"), "fl_x"),
-        (lambda root: _top(root, fl_x=-3.0), "intrinsics"),
-        (lambda root: _top(root, cx=float("inf")), "cx"),
-        (lambda root: _top(root, w=640, h=100), "640 x 100"),
-        (lambda root: _top(root, camera_model="EQUIRECTANGULAR"), "twice as wide as high"),
-        (lambda root: _top(root, camera_model="FISHEYE624"), "FISHEYE624"),
-        (lambda root: _top(root, k4=0.1), "k4"),
-        (lambda root: _top(root, ply_file_path="gone.ply"), "gone.ply"),
-        (lambda root: _top(root, train_filenames=3), "train_filenames"),
-        (_short_ply, "points.ply: .* ends before the 5 rows of its element 'vertex'"),
-        (lambda root: (root / "p.ply").write_bytes(b"ply\n") and _top(root, ply_file_path="p.ply"), "p.ply"),
+        (lambda root: _edit_transforms(root, fl_x=None, fl_y=None), "focal length"),
+        (lambda root: _edit_transforms(root, fl_x="long"), "fl_x"),
+        (lambda root: _edit_transforms(root, fl_x=-3.0), "intrinsics"),
+        (lambda root: _edit_transforms(root, cx=float("inf")), "cx"),
+        (lambda root: _edit_transforms(root, w=640, h=100), "640 x 100"),
+        (lambda root: _edit_transforms(root, camera_model="EQUIRECTANGULAR"), "twice as wide as high"),
+        (lambda root: _edit_transforms(root, camera_model="FISHEYE624"), "FISHEYE624"),
+        (lambda root: _edit_transforms(root, k4=0.1), "k4"),
+        (lambda root: _edit_transforms(root, ply_file_path="gone.ply"), "gone.ply"),
+        (lambda root: _edit_transforms(root, train_filenames=3), "train_filenames"),
+        (_write_truncated_ply, "points.ply: .* ends before the 5 rows of its element 'vertex'"),
+        (
+            lambda root: (root / "p.ply").write_bytes(b"ply\n") and _edit_transforms(root, ply_file_path="p.ply"),
+            "p.ply",
+        ),
         (lambda root: edit_frame(root, 1, mask_path="gone.png"), "gone.png"),
         (lambda root: edit_frame(root, 1, transform_matrix=[[float("nan")] * 4] * 4), "001.png"),
         (lambda root: edit_frame(root, 1, transform_matrix=[[10**400] * 4] * 4), "transform_matrix"),
@@ -206,7 +209,7 @@ def _top(root: Path, **entries) -> None:
         (lambda root: (root / "transforms.json").write_text("[]"), "not a JSON object"),
     ],
 )
-def test_broken_set_gives_one_sentence(nerfstudio_folder, damage, says):
+def test_a_broken_set_is_a_clear_error(nerfstudio_folder, damage, says):
     root = nerfstudio_folder()
     damage(root)
 
@@ -236,10 +239,10 @@ _FRAME_KEYS = ["file_path", "transform_matrix", "mask_path", "fl_x", "w", "k2", 
     frame=st.dictionaries(st.sampled_from(_FRAME_KEYS), _JSON_VALUES, max_size=2),
     cut=st.one_of(st.none(), st.integers(0, 3000)),
 )
-def test_mutated_transforms_raise_nothing_but_data_errors(nerfstudio_folder, top, frame, cut):
+def test_mutated_transforms_raise_only_data_errors(nerfstudio_folder, top, frame, cut):
     root = nerfstudio_folder(3)
     edit_frame(root, 1, **frame)
-    _top(root, **top)
+    _edit_transforms(root, **top)
     if cut is not None:
         (root / "transforms.json").write_text((root / "transforms.json").read_text()[:cut])
 

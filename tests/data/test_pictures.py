@@ -15,25 +15,25 @@ from hyrfpack.data.pictures import PhotoFile, has_same_aspect, read_header, read
 from hyrfpack.data.undistort import Lens
 from hyrfpack.errors import HyrfDataError
 
-RAMP = np.arange(48, dtype=np.uint8).reshape(6, 8) * 5
+RAMP_PIXELS = np.arange(48, dtype=np.uint8).reshape(6, 8) * 5
 
 
 def test_grey_becomes_rgb(tmp_path):
-    Image.fromarray(RAMP).save(tmp_path / "a.png")
+    Image.fromarray(RAMP_PIXELS).save(tmp_path / "a.png")
 
     rgb, alpha = read_pixels(tmp_path / "a.png")
 
-    np.testing.assert_array_equal(rgb, np.repeat(RAMP[..., None], 3, 2))
+    np.testing.assert_array_equal(rgb, np.repeat(RAMP_PIXELS[..., None], 3, 2))
     assert alpha is None
 
 
 def test_sixteen_bit_grey_keeps_its_brightness(tmp_path):
-    Image.fromarray(RAMP.astype(np.uint16) * 257).save(tmp_path / "a.png")
+    Image.fromarray(RAMP_PIXELS.astype(np.uint16) * 257).save(tmp_path / "a.png")
 
-    np.testing.assert_array_equal(read_pixels(tmp_path / "a.png")[0][..., 0], RAMP)
+    np.testing.assert_array_equal(read_pixels(tmp_path / "a.png")[0][..., 0], RAMP_PIXELS)
 
 
-def test_palette_is_resolved(tmp_path):
+def test_palette_pictures_become_rgb(tmp_path):
     rgb = np.zeros((6, 8, 3), np.uint8)
     rgb[:, :4], rgb[:, 4:] = (200, 10, 20), (0, 90, 255)
     Image.fromarray(rgb).quantize(4).save(tmp_path / "a.png")
@@ -43,17 +43,20 @@ def test_palette_is_resolved(tmp_path):
 
 @pytest.mark.parametrize("mode", ["RGBA", "LA"])
 def test_alpha_is_kept_straight(tmp_path, mode):
-    channels = {"RGBA": [RAMP, RAMP, RAMP, 255 - RAMP], "LA": [RAMP, 255 - RAMP]}[mode]
+    channels = {
+        "RGBA": [RAMP_PIXELS, RAMP_PIXELS, RAMP_PIXELS, 255 - RAMP_PIXELS],
+        "LA": [RAMP_PIXELS, 255 - RAMP_PIXELS],
+    }[mode]
     Image.merge(mode, [Image.fromarray(channel) for channel in channels]).save(tmp_path / "a.png")
 
     rgb, alpha = read_pixels(tmp_path / "a.png")
 
-    np.testing.assert_array_equal(rgb[..., 1], RAMP)
-    np.testing.assert_array_equal(alpha, 255 - RAMP)
+    np.testing.assert_array_equal(rgb[..., 1], RAMP_PIXELS)
+    np.testing.assert_array_equal(alpha, 255 - RAMP_PIXELS)
     assert read_header(tmp_path / "a.png").has_alpha
 
 
-def tagged(path: Path, orientation: int, pixels: np.ndarray) -> Path:
+def save_with_orientation(path: Path, orientation: int, pixels: np.ndarray) -> Path:
     exif = Image.Exif()
     exif[0x0112] = orientation
     Image.fromarray(pixels).save(path, exif=exif)
@@ -63,8 +66,8 @@ def tagged(path: Path, orientation: int, pixels: np.ndarray) -> Path:
 @pytest.mark.parametrize("ending", ["jpg", "png", "webp", "tif"])
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_exif_orientation_is_ignored(tmp_path, ending, orientation):
-    tagged(tmp_path / f"a.{ending}", orientation, RAMP)
-    Image.fromarray(RAMP).save(tmp_path / f"b.{ending}")
+    save_with_orientation(tmp_path / f"a.{ending}", orientation, RAMP_PIXELS)
+    Image.fromarray(RAMP_PIXELS).save(tmp_path / f"b.{ending}")
 
     np.testing.assert_array_equal(read_pixels(tmp_path / f"a.{ending}")[0], read_pixels(tmp_path / f"b.{ending}")[0])
     assert read_header(tmp_path / f"a.{ending}").size == (8, 6)
@@ -72,29 +75,29 @@ def test_exif_orientation_is_ignored(tmp_path, ending, orientation):
 
 @pytest.mark.parametrize("ending", ["png", "tif"])
 @pytest.mark.parametrize(
-    ("orientation", "upright"),  # as the EXIF standard defines where row 0 and column 0 are
+    ("orientation", "upright"),  # from the EXIF standard's definition of where row 0 and column 0 are
     [
-        (1, RAMP),
-        (2, RAMP[:, ::-1]),
-        (3, RAMP[::-1, ::-1]),
-        (4, RAMP[::-1]),
-        (5, RAMP.T),
-        (6, RAMP[::-1].T),
-        (7, RAMP[::-1, ::-1].T),
-        (8, RAMP[:, ::-1].T),
+        (1, RAMP_PIXELS),
+        (2, RAMP_PIXELS[:, ::-1]),
+        (3, RAMP_PIXELS[::-1, ::-1]),
+        (4, RAMP_PIXELS[::-1]),
+        (5, RAMP_PIXELS.T),
+        (6, RAMP_PIXELS[::-1].T),
+        (7, RAMP_PIXELS[::-1, ::-1].T),
+        (8, RAMP_PIXELS[:, ::-1].T),
     ],
 )
-def test_a_picture_is_turned_where_that_is_asked_for(tmp_path, ending, orientation, upright):
-    path = tagged(tmp_path / f"a.{ending}", orientation, RAMP)
+def test_a_picture_is_rotated_upright_on_request(tmp_path, ending, orientation, upright):
+    path = save_with_orientation(tmp_path / f"a.{ending}", orientation, RAMP_PIXELS)
 
     assert read_orientation(path) == orientation
     np.testing.assert_array_equal(read_pixels(path, orientation=orientation)[0][..., 0], upright)
 
 
 @pytest.mark.parametrize("ending", ["jpg", "png"])
-def test_a_turned_photo_is_shrunk_as_the_upright_one_is(tmp_path, ending):
+def test_a_rotated_photo_is_reduced_like_the_upright_one(tmp_path, ending):
     ramp = np.add.outer(np.arange(120), 2 * np.arange(160)).astype(np.uint8) // 2
-    path = tagged(tmp_path / f"a.{ending}", 6, ramp)
+    path = save_with_orientation(tmp_path / f"a.{ending}", 6, ramp)
     lens = Lens(15, 20, 20.0, 20.0, 7.5, 10.0)
 
     picture = PhotoFile(path, (120, 160), lens, orientation=6)()
@@ -105,16 +108,16 @@ def test_a_turned_photo_is_shrunk_as_the_upright_one_is(tmp_path, ending):
     assert np.abs(picture.rgb - expected).max() <= (3 if ending == "jpg" else 1)
 
 
-def test_damaged_exif_is_no_orientation(tmp_path):
-    Image.fromarray(RAMP).save(tmp_path / "a.jpg", exif=b"Exif\0\0II*\0\xff\xff\xff\xff")
-    tagged(tmp_path / "b.jpg", 77, RAMP)
+def test_damaged_exif_counts_as_no_orientation(tmp_path):
+    Image.fromarray(RAMP_PIXELS).save(tmp_path / "a.jpg", exif=b"Exif\0\0II*\0\xff\xff\xff\xff")
+    save_with_orientation(tmp_path / "b.jpg", 77, RAMP_PIXELS)
 
     assert read_orientation(tmp_path / "a.jpg") == read_orientation(tmp_path / "b.jpg") == 1
 
 
-def test_heic_photos_are_read_whatever_they_are_called(tmp_path):
+def test_heic_photos_are_read_under_any_ending(tmp_path):
     pytest.importorskip("pillow_heif").register_heif_opener()
-    pixels = np.repeat(RAMP.repeat(8, 0).repeat(8, 1)[..., None], 3, 2)
+    pixels = np.repeat(RAMP_PIXELS.repeat(8, 0).repeat(8, 1)[..., None], 3, 2)
     Image.fromarray(pixels).save(tmp_path / "a.heic", quality=95)
     (tmp_path / "b.jpg").write_bytes((tmp_path / "a.heic").read_bytes())
 
@@ -134,17 +137,17 @@ def test_heic_photos_without_the_package_are_a_clear_error(tmp_path, monkeypatch
 
 
 @pytest.mark.parametrize("ending", ["NEF", "dng", "CR2"])
-def test_raw_files_are_rejected_although_pillow_would_read_their_preview(tmp_path, ending):
-    Image.fromarray(RAMP).save(tmp_path / "preview.tif")
+def test_raw_files_are_rejected_although_pillow_can_read_their_preview(tmp_path, ending):
+    Image.fromarray(RAMP_PIXELS).save(tmp_path / "preview.tif")
     (tmp_path / f"a.{ending}").write_bytes((tmp_path / "preview.tif").read_bytes())
 
     with pytest.raises(HyrfDataError, match="raw files are not supported; export them as JPEG"):
         read_header(tmp_path / f"a.{ending}")
 
 
-def test_a_photo_out_of_an_archive_is_named_by_its_place_in_the_archive(tmp_path, monkeypatch):
+def test_a_photo_from_an_archive_is_named_by_its_path_in_the_archive(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    Image.fromarray(RAMP).save(tmp_path / "a.png")
+    Image.fromarray(RAMP_PIXELS).save(tmp_path / "a.png")
     whole = (tmp_path / "a.png").read_bytes()
     with zipfile.ZipFile(tmp_path / "set.zip", "w") as archive:
         archive.writestr("set/images/cut.png", whole[: len(whole) - 30])
@@ -171,10 +174,10 @@ def test_aspect_tolerates_rounding_only(width, height, same):
 
 @settings(max_examples=60, deadline=None)
 @given(data=st.data())
-def test_damaged_pictures_raise_nothing_but_data_errors(tmp_path_factory, data):
+def test_damaged_pictures_raise_only_data_errors(tmp_path_factory, data):
     suffix = data.draw(st.sampled_from(["png", "jpg", "webp", "tif", "bmp", "avif", "jp2"]))
     path = tmp_path_factory.getbasetemp() / f"damaged.{suffix}"
-    Image.fromarray(np.repeat(RAMP[..., None], 3, 2)).save(path)
+    Image.fromarray(np.repeat(RAMP_PIXELS[..., None], 3, 2)).save(path)
     content = bytearray(path.read_bytes())
     at = data.draw(st.integers(0, len(content) - 1))
     if data.draw(st.booleans()):
@@ -192,7 +195,7 @@ def test_damaged_pictures_raise_nothing_but_data_errors(tmp_path_factory, data):
 
 @pytest.mark.parametrize("length", [0, 10, 45])
 def test_truncated_png_names_the_file(tmp_path, length):
-    Image.fromarray(RAMP).save(tmp_path / "a.png")
+    Image.fromarray(RAMP_PIXELS).save(tmp_path / "a.png")
     (tmp_path / "a.png").write_bytes((tmp_path / "a.png").read_bytes()[:length])
 
     with pytest.raises(HyrfDataError, match=r"a\.png"):

@@ -1,4 +1,4 @@
-"""Points with colours out of PLY files: the expected numbers are those that were written by hand."""
+"""Points with colours from PLY files; the expected numbers are written by hand."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import pytest
 from hyrfpack.data.points import read_ply_points
 from hyrfpack.errors import HyrfDataError
 
-POINTS = [[1.0, -2.5, 3.0], [0.0, 1e3, -4.0]]
+POINT_ROWS = [[1.0, -2.5, 3.0], [0.0, 1e3, -4.0]]
 
 
 def ply_file(path: Path, kind: str, full: float, order: str = "<", faces: bool = False) -> Path:
-    """Two points, the first of all, half and nothing of red, green and blue; as programs write them."""
+    """Write a PLY file of two points with colours of full, half and no intensity, as other programs do."""
     name = {"<": "binary_little_endian", ">": "binary_big_endian", "": "ascii"}[order]
     header = ["ply", f"format {name} 1.0", "comment by hand", "element vertex 2"]
     header += [f"property float {axis}" for axis in ("x", "y", "z", "nx")]
@@ -24,11 +24,11 @@ def ply_file(path: Path, kind: str, full: float, order: str = "<", faces: bool =
     colors = [[full, full // 2 if full > 1 else 0.5, 0], [0, 0, 0]]
     types = {"uchar": "u1", "ushort": "u2", "float": "f4"}
     layout = np.dtype([("p", order + "f4", 4), ("c", (order or "=") + types[kind], 3)])
-    rows = np.array([((*p, 7), tuple(c)) for p, c in zip(POINTS, colors, strict=True)], layout)
+    rows = np.array([((*p, 7), tuple(c)) for p, c in zip(POINT_ROWS, colors, strict=True)], layout)
     if order:
         data = rows.tobytes() + (b"\x03" + bytes(12) if faces else b"")
     else:
-        lines = [" ".join(map(str, (*p, 7, *c))) for p, c in zip(POINTS, colors, strict=True)]
+        lines = [" ".join(map(str, (*p, 7, *c))) for p, c in zip(POINT_ROWS, colors, strict=True)]
         data = "\n".join([*lines, *(["3 0 1 1"] if faces else []), ""]).encode()
     path.write_bytes("\n".join([*header, "end_header", ""]).encode() + data)
     return path
@@ -39,10 +39,10 @@ def ply_file(path: Path, kind: str, full: float, order: str = "<", faces: bool =
 @pytest.mark.parametrize(
     ("kind", "full", "half"), [("uchar", 255, 127 / 255), ("ushort", 65535, 32767 / 65535), ("float", 1.0, 0.5)]
 )
-def test_points_and_colours_are_those_written(tmp_path, kind, full, half, order, faces):
+def test_written_points_and_colours_are_read_back(tmp_path, kind, full, half, order, faces):
     points, colors = read_ply_points(ply_file(tmp_path / "a.ply", kind, full, order, faces))
 
-    np.testing.assert_array_equal(points, POINTS)
+    np.testing.assert_array_equal(points, POINT_ROWS)
     np.testing.assert_allclose(colors, [[1, half, 0], [0, 0, 0]], rtol=0, atol=1e-7)
     assert points.dtype == colors.dtype == np.float64
 
@@ -59,6 +59,6 @@ def test_a_file_without_points_is_rejected_by_name(tmp_path, properties):
         read_ply_points(tmp_path / "a.ply")
 
 
-def test_what_cannot_be_opened_is_rejected_by_name(tmp_path):
+def test_a_file_that_cannot_be_opened_is_rejected_by_name(tmp_path):
     with pytest.raises(HyrfDataError, match="a.ply: the points cannot be read"):
         read_ply_points(tmp_path / "a.ply")

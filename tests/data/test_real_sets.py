@@ -1,4 +1,4 @@
-"""The twelve real sets: all load, and points, poses, lenses and pictures agree with each other."""
+"""The twelve real sets load, and their points, poses, lenses and pictures agree."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import pytest
 
 from hyrfpack.data import load_scene
 
-COLMAP_SETS = {  # photos, points
+# Set -> number of photos and of points.
+COLMAP_SETS = {
     "drone_brighton_beach": (18, 3383),
     "drone_caliterra": (75, 5000),
     "gerrard_hall": (75, 6000),
@@ -54,7 +55,9 @@ def test_lego_keeps_its_split_and_frames_the_object(shared_data):
     assert (scene.layout, len(scene.train), len(scene.test), scene.has_alpha) == ("blender", 100, 50, True)
     for view in scene.train[::20]:
         alpha = view.load().alpha > 128
-        center = view.camera.camera_from_world[:3, 3]  # where the world's origin, inside the object, is seen
+        center = view.camera.camera_from_world[
+            :3, 3
+        ]  # the image position of the world's origin, which is inside the object
         u, v = view.camera.fx * center[0] / center[2] + 100, view.camera.fy * center[1] / center[2] + 100
         assert center[2] > 0 and alpha[int(v), int(u)]
 
@@ -70,7 +73,7 @@ def test_both_descriptions_of_the_can_are_the_same_cameras_and_points(shared_dat
     colmap = load_scene(shared_data / "shiny_can_nerfstudio")
     nerfstudio = load_scene(shared_data / "shiny_can_nerfstudio", layout="nerfstudio")
     applied = np.eye(4)
-    applied[:3] = [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]]  # nerfstudio's axis change, as the file states it
+    applied[:3] = [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]]  # the axis change of nerfstudio, as the file states it
 
     for a, b in zip(colmap.views, nerfstudio.views, strict=True):
         assert a.name == b.name

@@ -1,5 +1,8 @@
-"""RealityScan's camera parameters. The real angles and matrix are of one camera, exported both ways, in
-forums.unrealengine.com/t/different-rotation-of-cameras-in-xmp-and-csv/710449."""
+"""RealityScan's camera parameters.
+
+The real angles and matrix belong to one camera that was exported both ways, in
+forums.unrealengine.com/t/different-rotation-of-cameras-in-xmp-and-csv/710449.
+"""
 
 from __future__ import annotations
 
@@ -9,18 +12,21 @@ import pytest
 from hyrfpack.data import load_scene
 from hyrfpack.errors import HyrfDataError
 
-HEADER = "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2"
-ROWS = ("a.jpg,1,2,3,163.736597399311,83.4154313461628,174.386496244756,18,0.01,-0.02,0,0,0,0,0,0",)
-ROWS += ("b.jpg,4,5,6,0,0,0,18,0,0,-0.1,0.02,-0.003,0.0004,0,0",)
-# xcr:Rotation of the same camera, world to camera; the last number is cut short there.
-REAL = [[0.982594073038806, 0.185426733553445, -0.0112166890261935]]
-REAL += [[-0.032113633044729, 0.11008102707942, -0.993403685341366], [-0.18296885582437, 0.976472781986697, 0.114]]
+CSV_HEADER = "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2"
+CSV_ROWS = ("a.jpg,1,2,3,163.736597399311,83.4154313461628,174.386496244756,18,0.01,-0.02,0,0,0,0,0,0",)
+CSV_ROWS += ("b.jpg,4,5,6,0,0,0,18,0,0,-0.1,0.02,-0.003,0.0004,0,0",)
+# The first row of xcr:Rotation of the same camera, world to camera; the source truncates the last number.
+REAL_ROTATION_ROWS = [[0.982594073038806, 0.185426733553445, -0.0112166890261935]]
+REAL_ROTATION_ROWS += [
+    [-0.032113633044729, 0.11008102707942, -0.993403685341366],
+    [-0.18296885582437, 0.976472781986697, 0.114],
+]
 
 
 @pytest.fixture
 def folder(tmp_path, pictures):
     pictures(tmp_path, ["a.jpg", "b.jpg"])
-    (tmp_path / "cameras.csv").write_text("\n".join((HEADER, *ROWS)) + "\n")
+    (tmp_path / "cameras.csv").write_text("\n".join((CSV_HEADER, *CSV_ROWS)) + "\n")
     return tmp_path
 
 
@@ -28,11 +34,11 @@ def rewrite(root, change) -> None:
     (root / "cameras.csv").write_text(change((root / "cameras.csv").read_text()))
 
 
-def test_angles_mean_the_matrix_that_the_program_itself_exports(folder):
+def test_angles_give_the_matrix_that_realityscan_exports(folder):
     camera = load_scene(folder, test_every=0).views[0].camera
 
-    np.testing.assert_allclose(camera.rotation[:2], REAL[:2], atol=1e-12)
-    np.testing.assert_allclose(camera.rotation[2], REAL[2], atol=2e-4)
+    np.testing.assert_allclose(camera.rotation[:2], REAL_ROTATION_ROWS[:2], atol=1e-12)
+    np.testing.assert_allclose(camera.rotation[2], REAL_ROTATION_ROWS[2], atol=2e-4)
     np.testing.assert_allclose(camera.position, (1, 2, 3))
 
 
@@ -42,7 +48,7 @@ def test_without_angles_a_camera_looks_down_with_north_above(folder):
     np.testing.assert_allclose(camera.rotation, np.diag([1.0, -1, -1]), atol=1e-12)
 
 
-def test_intrinsics_are_parts_of_the_longer_side(folder):
+def test_intrinsics_are_fractions_of_the_longer_side(folder):
     first, second = load_scene(folder, test_every=0).views
 
     np.testing.assert_allclose(first.camera.intrinsics, (16, 16, 16.32, 11.36))
@@ -55,7 +61,7 @@ def test_columns_may_be_fewer_and_in_another_order(folder):
     assert load_scene(folder).views[0].camera.intrinsics == (16, 16, 16, 12)
 
 
-def test_other_tables_are_none_of_ours(tmp_path):
+def test_other_tables_are_ignored(tmp_path):
     (tmp_path / "table.csv").write_text("name,x,y,z\n")
 
     with pytest.raises(HyrfDataError, match="no poses found"):
@@ -86,7 +92,7 @@ def test_other_tables_are_none_of_ours(tmp_path):
         ),
     ],
 )
-def test_broken_set_gives_one_sentence(folder, damage, says):
+def test_a_broken_set_is_a_clear_error(folder, damage, says):
     rewrite(folder, damage)
 
     with pytest.raises(HyrfDataError, match=says) as caught:

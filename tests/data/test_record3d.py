@@ -1,5 +1,8 @@
-"""Record3D's metadata. Numbers of a real recording are those of EXR_RGBD/metadata.json in
-github.com/YaroslavGladun/door_handle_detection, whose phone was held upright."""
+"""Record3D's metadata.
+
+The numbers of a real recording are from EXR_RGBD/metadata.json in github.com/YaroslavGladun/door_handle_detection,
+whose phone was held upright.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ import pytest
 from hyrfpack.data import load_scene
 from hyrfpack.errors import HyrfDataError
 
-REAL = {
+REAL_METADATA = {
     "w": 1440,
     "h": 1920,
     "fps": 60,
@@ -29,29 +32,29 @@ REAL = {
 @pytest.fixture
 def folder(tmp_path, pictures):
     pictures(tmp_path / "rgbd", ["0.jpg", "1.jpg", "2.jpg"], size=(30, 40))
-    (tmp_path / "metadata").write_text(json.dumps(REAL))
+    (tmp_path / "metadata").write_text(json.dumps(REAL_METADATA))
     return tmp_path
 
 
 def test_a_phone_held_upright_is_level_in_the_gravity_aligned_world(folder):
-    """The picture's rows are level, its upper side is up, and the middle of its view where the lens looks."""
+    """The picture's rows are horizontal, its top is up, and the camera looks along the middle of the view."""
     for view in load_scene(folder, test_every=0).views:
         right, down, _ = view.camera.rotation
         assert abs(right[1]) < 0.06
         assert -down[1] > 0.6
         np.testing.assert_allclose(view.camera.intrinsics[:2], 1404.303 * 30 / 1440, rtol=1e-6)
         np.testing.assert_allclose(view.camera.intrinsics[2:], (724.6459 / 48, 963.78375 / 48), rtol=1e-6)
-    np.testing.assert_allclose(load_scene(folder).views[0].camera.position, REAL["poses"][0][4:], atol=1e-7)
+    np.testing.assert_allclose(load_scene(folder).views[0].camera.position, REAL_METADATA["poses"][0][4:], atol=1e-7)
 
 
-def test_each_frame_may_have_intrinsics_of_its_own(folder):
+def test_each_frame_may_have_its_own_intrinsics(folder):
     own = [[1400.0 + frame, 1400.0, 720.0, 960.0] for frame in range(3)]
-    (folder / "metadata").write_text(json.dumps({**REAL, "perFrameIntrinsicCoeffs": own}))
+    (folder / "metadata").write_text(json.dumps({**REAL_METADATA, "perFrameIntrinsicCoeffs": own}))
 
     assert load_scene(folder).views[2].camera.fx == pytest.approx(1402 / 48)
 
 
-def test_the_export_as_exr_and_jpg(folder):
+def test_exports_with_exr_and_jpg_files_are_read(folder):
     (folder / "EXR_RGBD").mkdir()
     (folder / "metadata").rename(folder / "EXR_RGBD" / "metadata.json")
     (folder / "rgbd").rename(folder / "EXR_RGBD" / "rgb")
@@ -73,8 +76,8 @@ def test_the_export_as_exr_and_jpg(folder):
         ({"w": 1920, "h": 1440}, "not a uniform rescaling"),
     ],
 )
-def test_broken_metadata_give_one_sentence(folder, change, says):
-    (folder / "metadata").write_text(json.dumps({**REAL, **change}))
+def test_broken_metadata_are_a_clear_error(folder, change, says):
+    (folder / "metadata").write_text(json.dumps({**REAL_METADATA, **change}))
 
     with pytest.raises(HyrfDataError, match=says) as caught:
         load_scene(folder)
@@ -82,7 +85,7 @@ def test_broken_metadata_give_one_sentence(folder, change, says):
     assert "\n" not in str(caught.value) and str(folder) in str(caught.value)
 
 
-def test_a_recording_is_read_as_it_is_shared(folder, tmp_path_factory, monkeypatch):
+def test_a_shared_recording_is_read_from_its_archive(folder, tmp_path_factory, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
     recording = tmp_path_factory.mktemp("shared") / "walk.r3d"
     with zipfile.ZipFile(recording, "w") as archive:

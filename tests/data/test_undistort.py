@@ -9,8 +9,9 @@ from hyrfpack.data.undistort import Lens, brown_coefficients, distort, fold_radi
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.scene import Picture
 
-WIDTH, HEIGHT = 96, 72
-MODELS = {
+PHOTO_WIDTH = 96
+PHOTO_HEIGHT = 72
+PARAMETERS_BY_MODEL = {
     "SIMPLE_PINHOLE": (80.0, 47.0, 37.0),
     "PINHOLE": (80.0, 84.0, 47.0, 37.0),
     "SIMPLE_RADIAL": (80.0, 47.0, 37.0, -0.12),
@@ -24,7 +25,7 @@ MODELS = {
 
 
 def _colmap_pixels(model: str, rays: np.ndarray) -> np.ndarray:
-    camera = pycolmap.Camera(model=model, width=WIDTH, height=HEIGHT, params=MODELS[model])
+    camera = pycolmap.Camera(model=model, width=PHOTO_WIDTH, height=PHOTO_HEIGHT, params=PARAMETERS_BY_MODEL[model])
     return camera.img_from_cam(np.column_stack([rays, np.ones(len(rays))]))
 
 
@@ -33,10 +34,10 @@ def _pixel_rays(lens: Lens) -> np.ndarray:
     return np.column_stack([((x - lens.cx) / lens.fx).ravel(), ((y - lens.cy) / lens.fy).ravel()])
 
 
-@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("model", PARAMETERS_BY_MODEL)
 def test_distortion_agrees_with_pycolmap(model):
     rays = np.random.default_rng(0).uniform(-0.7, 0.7, (500, 2))
-    lens = lens_from_colmap(model, WIDTH, HEIGHT, np.array(MODELS[model]))
+    lens = lens_from_colmap(model, PHOTO_WIDTH, PHOTO_HEIGHT, np.array(PARAMETERS_BY_MODEL[model]))
 
     x, y = distort(lens, rays[:, 0], rays[:, 1])
 
@@ -44,17 +45,17 @@ def test_distortion_agrees_with_pycolmap(model):
     np.testing.assert_allclose(pixels, _colmap_pixels(model, rays), atol=1e-9)
 
 
-@pytest.mark.parametrize("model", [name for name in MODELS if "PINHOLE" not in name])
-def test_undistorted_pixel_has_the_colour_of_its_ray(model):
-    # A photo whose colour is its own pixel coordinate tells where each undistorted pixel looked.
-    v, u = np.mgrid[0:HEIGHT, 0:WIDTH] + 0.5
+@pytest.mark.parametrize("model", [name for name in PARAMETERS_BY_MODEL if "PINHOLE" not in name])
+def test_an_undistorted_pixel_has_the_colour_of_its_ray(model):
+    # The colour of the photo is its own pixel coordinate, so that it shows where each undistorted pixel has looked.
+    v, u = np.mgrid[0:PHOTO_HEIGHT, 0:PHOTO_WIDTH] + 0.5
     photo = np.stack([u * 2.5, v * 2.5, 0 * u], axis=2).round().astype(np.uint8)
-    lens = lens_from_colmap(model, WIDTH, HEIGHT, np.array(MODELS[model]))
+    lens = lens_from_colmap(model, PHOTO_WIDTH, PHOTO_HEIGHT, np.array(PARAMETERS_BY_MODEL[model]))
 
     picture = undistort(Picture(photo), lens)
 
-    expected = _colmap_pixels(model, _pixel_rays(lens)).reshape(HEIGHT, WIDTH, 2)
-    inside = ((expected > 0.5) & (expected < (WIDTH - 0.5, HEIGHT - 0.5))).all(axis=2)
+    expected = _colmap_pixels(model, _pixel_rays(lens)).reshape(PHOTO_HEIGHT, PHOTO_WIDTH, 2)
+    inside = ((expected > 0.5) & (expected < (PHOTO_WIDTH - 0.5, PHOTO_HEIGHT - 0.5))).all(axis=2)
     assert inside.mean() > 0.7
     seen = np.ones_like(inside) if picture.mask is None else picture.mask
     assert seen[inside].all()
@@ -62,9 +63,9 @@ def test_undistorted_pixel_has_the_colour_of_its_ray(model):
 
 
 @pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV"])
-def test_a_point_lands_where_the_pinhole_camera_projects_it(model):
-    lens = lens_from_colmap(model, WIDTH, HEIGHT, np.array(MODELS[model]))
-    v, u = np.mgrid[0:HEIGHT, 0:WIDTH] + 0.5
+def test_an_undistorted_point_is_where_the_pinhole_camera_projects_it(model):
+    lens = lens_from_colmap(model, PHOTO_WIDTH, PHOTO_HEIGHT, np.array(PARAMETERS_BY_MODEL[model]))
+    v, u = np.mgrid[0:PHOTO_HEIGHT, 0:PHOTO_WIDTH] + 0.5
     for ray in ([0.3, -0.2], [-0.4, 0.25], [0.02, 0.01]):
         spot = _colmap_pixels(model, np.array([ray]))[0]
         blob = 255 * np.exp(-((u - spot[0]) ** 2 + (v - spot[1]) ** 2) / 8)
@@ -88,7 +89,7 @@ def test_pixels_outside_the_photo_are_masked():
 
 
 def test_rays_past_the_fold_of_the_polynomial_are_masked():
-    # r (1 - 0.5 r^2) turns back at r = sqrt(2/3): beyond it the photo would appear a second time.
+    # r (1 - 0.5 r^2) has its maximum at r = sqrt(2/3); beyond it the photo would appear a second time.
     folding = Lens(200, 200, 60.0, 60.0, 100.0, 100.0, "brown", brown_coefficients(-0.5))
     assert fold_radius(folding, 2.0) == pytest.approx(np.sqrt(2 / 3), abs=1e-3)
 
@@ -99,7 +100,7 @@ def test_rays_past_the_fold_of_the_polynomial_are_masked():
     assert picture.mask[np.hypot(x, y) < np.sqrt(2 / 3) - 0.01].all()
 
 
-def test_a_masked_pixel_never_leaks_into_a_used_one():
+def test_masked_pixels_never_affect_unmasked_ones():
     lens = Lens(40, 40, 40.0, 40.0, 20.0, 20.0, "brown", brown_coefficients(0.05))
     rgb = np.full((40, 40, 3), 50, np.uint8)
     mask = np.ones((40, 40), bool)
@@ -111,7 +112,7 @@ def test_a_masked_pixel_never_leaks_into_a_used_one():
     assert (picture.rgb[picture.mask] == 50).all()
 
 
-def test_colour_under_zero_alpha_never_leaks():
+def test_colour_under_zero_alpha_never_affects_other_pixels():
     lens = Lens(40, 40, 40.0, 40.0, 20.0, 20.0, "brown", brown_coefficients(0.05))
     rgb = np.full((40, 40, 3), 50, np.uint8)
     alpha = np.full((40, 40), 255, np.uint8)
@@ -123,6 +124,6 @@ def test_colour_under_zero_alpha_never_leaks():
     assert np.abs(picture.rgb[picture.alpha > 20].astype(int) - 50).max() <= 1
 
 
-def test_unsupported_camera_model_is_rejected():
+def test_an_unsupported_camera_model_is_rejected():
     with pytest.raises(HyrfDataError, match="FOV"):
         lens_from_colmap("FOV", 10, 10, np.ones(5))

@@ -1,4 +1,4 @@
-"""Raw photos and photos that cannot be read: each command counts and names them, and says what to do."""
+"""Every command counts and names raw and unreadable photos, and says what to do."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_each_command_rejects_a_folder_of_raw_photos_alike(command, names, words
 @pytest.mark.parametrize(
     "ending", ["CR2", "CR3", "NEF", "ARW", "DNG", "RAF", "ORF", "RW2", "PEF", "SRW", "X3F", "3FR", "IIQ"]
 )
-def test_one_raw_file_is_rejected_as_such(ending, tmp_path):
+def test_a_single_raw_file_is_rejected_as_raw(ending, tmp_path):
     save_raw_photos(tmp_path, f"a.{ending}")
     for read in (hyrfpack.load_scene, hyrfpack.describe_photos):
         with pytest.raises(HyrfDataError, match=f"a.{ending}: raw files are not supported; export them as JPEG"):
@@ -92,7 +92,7 @@ def test_raw_photos_beside_posed_ones_are_counted_in_one_note(data, tmp_path):
     assert [note for note in scene.notes if "1 raw file (.DNG) is ignored" in note]
 
 
-def test_poses_that_name_raw_files_are_of_the_pictures_exported_from_these(data, tmp_path):
+def test_poses_of_raw_files_apply_to_the_pictures_exported_from_them(data, tmp_path):
     shutil.copytree(data, tmp_path / "set")
     table = tmp_path / "set" / "transforms.json"
     table.write_text(table.read_text().replace(".png", ".CR2"))
@@ -101,15 +101,16 @@ def test_poses_that_name_raw_files_are_of_the_pictures_exported_from_these(data,
     assert {Path(view.load.path).suffix for view in hyrfpack.load_scene(tmp_path / "set").views} == {".png"}
 
 
-def test_a_heic_photo_without_the_package_does_not_stop_a_survey(tmp_path, monkeypatch):
+def test_heic_photos_without_the_package_do_not_stop_a_survey(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
     folder = save_photos(tmp_path, 5)
-    for name in ("a/x.heic", "b/x.heic", "y.HEIC", "z.jpg"):  # a phone may call it .jpg
+    for name in ("a/x.heic", "b/x.heic", "y.HEIC", "z.jpg"):  # a phone may name it .jpg
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_bytes(HEIC_HEADER)
     survey = hyrfpack.describe_photos(folder)
     assert (survey.photos, survey.decoded) == (9, 5)
-    assert not any("evenly spread" in note for note in survey.notes)  # all were looked at
+    # This note would mean that only some of the photos were examined.
+    assert not any("evenly spread" in note for note in survey.notes)
     (problem,) = [sentence for sentence in survey.problems if "HEIC" in sentence]
     assert problem == (
         "4 of 9 photos cannot be read: a/x.heic, b/x.heic, y.HEIC and 1 more (reading HEIC photos needs pillow-heif); "
@@ -137,7 +138,7 @@ def test_make_takes_a_folder_whose_first_photo_cannot_be_read(tmp_path, monkeypa
     assert hyrfpack.data.folder.first_readable_photo(source.files()).size == (64, 48)
 
 
-def test_photos_that_cannot_be_read_for_several_reasons_are_counted_together():
+def test_photos_unreadable_for_several_reasons_are_counted_together():
     reasons = {f"{number}.jpg": f"reason {number}" for number in range(5)}
     assert unreadable_sentences(reasons, 1200) == [
         "5 of 1,200 photos cannot be read: 0.jpg, 1.jpg, 2.jpg and 2 more (0.jpg: reason 0); copy them again, "

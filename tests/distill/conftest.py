@@ -4,5 +4,5 @@ import pytest
 
 
 @pytest.fixture(autouse=True)
-def short_work(short_imports: None) -> None:
+def use_short_imports(short_imports: None) -> None:
     pass

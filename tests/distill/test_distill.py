@@ -19,7 +19,7 @@ from hyrfpack.splats.draw import Drawable, draw
 from hyrfpack.splats.viewpoints import WeightedSplats, sample_viewpoints
 
 
-def test_report_says_what_is_in_the_file(tmp_path: Path) -> None:
+def test_the_report_describes_the_file(tmp_path: Path) -> None:
     splats, target = ball_splats(200), tmp_path / "ball.hyrf"
     report = distill_splats(splats, target, TINY_DISTILL_CONFIG)
     model = hyrfpack.load_model(target)
@@ -34,7 +34,7 @@ def test_report_says_what_is_in_the_file(tmp_path: Path) -> None:
     assert hyrfpack.describe_file(target)["profile"] == "compact"
 
 
-def test_more_steps_bring_the_pictures_nearer(tmp_path: Path) -> None:
+def test_more_steps_raise_the_psnr(tmp_path: Path) -> None:
     splats = ball_splats(200)
     few, many = (
         distill_splats(splats, tmp_path / "ball.hyrf", replace(TINY_DISTILL_CONFIG, steps=steps)).psnr_unpacked
@@ -49,13 +49,13 @@ def test_same_splats_and_seed_give_the_same_bytes(tmp_path: Path) -> None:
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
-def test_the_largest_seed_is_as_good_as_any(tmp_path: Path) -> None:
+def test_the_largest_seed_is_accepted(tmp_path: Path) -> None:
     report = distill_splats(ball_splats(40), tmp_path / "x.hyrf", replace(TINY_DISTILL_CONFIG, seed=2**64 - 1, steps=2))
     assert hyrfpack.describe_file(tmp_path / "x.hyrf")["provenance"]["seed"] == 2**64 - 1 and report.psnr > 10
 
 
 @pytest.mark.parametrize("unit, offset", [(1, 1e6), (1e-6, 0)])
-def test_neither_origin_nor_unit_matters(tmp_path: Path, unit: float, offset: float) -> None:
+def test_the_result_does_not_depend_on_origin_and_unit(tmp_path: Path, unit: float, offset: float) -> None:
     splats = ball_splats(100)
     moved = replace(splats, positions=splats.positions * unit + offset, scales=splats.scales * np.float32(unit))
     here, there = (distill_splats(some, tmp_path / "x.hyrf", TINY_DISTILL_CONFIG) for some in (splats, moved))
@@ -68,7 +68,7 @@ def test_neither_origin_nor_unit_matters(tmp_path: Path, unit: float, offset: fl
     )
 
 
-def test_model_of_degree_0_has_no_colours_by_direction(tmp_path: Path) -> None:
+def test_a_model_of_degree_0_splats_has_colours_without_direction(tmp_path: Path) -> None:
     distill_splats(ball_splats(100, degree=0), tmp_path / "x.hyrf", TINY_DISTILL_CONFIG)
     assert {s["type"]: s["after"] for s in hyrfpack.describe_file(tmp_path / "x.hyrf")["sections"]}["RTAB"] < 32
 
@@ -87,7 +87,7 @@ def test_model_of_degree_0_has_no_colours_by_direction(tmp_path: Path) -> None:
     ],
     ids=["one", "two", "coincident", "flat", "opaque", "clear", "outlier", "antialiased"],
 )
-def test_odd_splats_make_a_model(tmp_path: Path, change) -> None:
+def test_unusual_splats_can_be_distilled(tmp_path: Path, change) -> None:
     report = distill_splats(change(ball_splats(30)), tmp_path / "x.hyrf", TINY_DISTILL_CONFIG)
     assert report.gaussians_after >= 1
     assert report.psnr > 15
@@ -103,9 +103,9 @@ def test_splats_that_cannot_be_seen_are_a_clear_error(tmp_path: Path, change) ->
         distill_splats(change(ball_splats(20)), tmp_path / "x.hyrf", TINY_DISTILL_CONFIG, name="ball.ply")
 
 
-def test_cameras_that_look_away_are_a_clear_error(tmp_path: Path) -> None:
+def test_cameras_that_see_no_splats_are_a_clear_error(tmp_path: Path) -> None:
     pose = np.eye(4)
-    pose[2, 3] = -100  # all splats are behind
+    pose[2, 3] = -100  # moves all splats behind the camera
     with pytest.raises(HyrfDataError, match="no view shows anything"):
         distill_splats(
             ball_splats(20), tmp_path / "x.hyrf", TINY_DISTILL_CONFIG, cameras=[Camera(32, 32, 32, 32, 16, 16, pose)]
@@ -121,20 +121,18 @@ def test_folder_that_cannot_be_made_is_reported_before_the_work(
         distill_splats(ball_splats(20), tmp_path / "file" / "x.hyrf", TINY_DISTILL_CONFIG)
 
 
-def test_interrupt_while_packing_leaves_the_file_that_was_there(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupt_while_packing_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     target = tmp_path / "x.hyrf"
     target.write_bytes(b"before")
-    monkeypatch.setattr(pack, "PLANNED_ERROR_SHARE", 100.0)  # the first try will not do
-    monkeypatch.setattr(pack.Packer, "encode", _interrupted_at_the_second(pack.Packer.encode))
+    monkeypatch.setattr(pack, "PLANNED_ERROR_SHARE", 100.0)  # makes the first attempt miss the target
+    monkeypatch.setattr(pack.Packer, "encode", _interrupt_second_call(pack.Packer.encode))
     with pytest.raises(KeyboardInterrupt):
         distill_splats(ball_splats(20), target, TINY_DISTILL_CONFIG)
     assert [path.name for path in tmp_path.iterdir()] == ["x.hyrf"]
     assert target.read_bytes() == b"before"
 
 
-def _interrupted_at_the_second(compress):
+def _interrupt_second_call(compress):
     calls = []
 
     def wrapped(*args, **options):
@@ -146,20 +144,18 @@ def _interrupted_at_the_second(compress):
     return wrapped
 
 
-def counting(monkeypatch: pytest.MonkeyPatch, place, name: str) -> list:
-    """Arguments of each call of a function from now on."""
+def record_calls(monkeypatch: pytest.MonkeyPatch, place, name: str) -> list:
+    """Record the arguments of each call of a function from now on."""
     calls, whole = [], getattr(place, name)
     monkeypatch.setattr(place, name, lambda *args, **options: calls.append(args) or whole(*args, **options))
     return calls
 
 
-def test_nothing_is_measured_or_drawn_twice_however_often_packing_is_tried(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(pack, "_mse", lambda psnr: 2.0**-psnr)  # what packing adds seems to be very much
-    measured = counting(monkeypatch, calibrate, "measure_sensitivity")
-    tried = counting(monkeypatch, pack.Packer, "encode")
-    drawn = counting(monkeypatch, reference, "render_reference")
+def test_repeated_packing_attempts_measure_and_draw_only_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pack, "_mse", lambda psnr: 2.0**-psnr)  # makes packing seem to add a large error
+    measured = record_calls(monkeypatch, calibrate, "measure_sensitivity")
+    tried = record_calls(monkeypatch, pack.Packer, "encode")
+    drawn = record_calls(monkeypatch, reference, "render_reference")
 
     distill_splats(ball_splats(60), tmp_path / "x.hyrf", replace(TINY_DISTILL_CONFIG, steps=12))
 
@@ -168,17 +164,17 @@ def test_nothing_is_measured_or_drawn_twice_however_often_packing_is_tried(
     assert len(drawn) == TINY_DISTILL_CONFIG.train_views
 
 
-def test_a_short_import_looks_from_fewer_places_and_regresses_less(
+def test_a_short_import_uses_fewer_viewpoints_and_regression_steps(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    looked = counting(monkeypatch, distill_model, "sample_viewpoints")
-    started = counting(monkeypatch, distill_model, "initial_model")
+    looked = record_calls(monkeypatch, distill_model, "sample_viewpoints")
+    started = record_calls(monkeypatch, distill_model, "initial_model")
     monkeypatch.setattr(distill_model, "_fit_to_pictures", lambda *args: None)
     monkeypatch.setattr(fit, "pack", _interrupt)
     for steps in (1, DistillConfig.steps):
         with pytest.raises(KeyboardInterrupt):
             distill_splats(ball_splats(20), tmp_path / "x.hyrf", DistillConfig(steps=steps, size=16))
-    (_, _, few, *_), _, _, (_, _, many, *_), _, _ = looked  # the others decide, or are held out
+    (_, _, few, *_), _, _, (_, _, many, *_), _, _ = looked  # the other calls decide something, or are held out
     (*_, less, _), (*_, whole, _) = started
     assert few <= 64 < many == DistillConfig.train_views
     assert less < whole == 1
@@ -188,7 +184,7 @@ def _interrupt(*args):
     raise KeyboardInterrupt
 
 
-def test_a_file_less_like_the_original_than_asked_for_says_so(tmp_path: Path) -> None:
+def test_a_psnr_below_the_target_is_reported(tmp_path: Path) -> None:
     said: list[str] = []
     report = distill_splats(
         ball_splats(60), tmp_path / "x.hyrf", replace(TINY_DISTILL_CONFIG, psnr=60), say=said.append
@@ -202,7 +198,7 @@ def test_a_file_less_like_the_original_than_asked_for_says_so(tmp_path: Path) ->
     assert not any("asked for" in sentence for sentence in said)
 
 
-def test_what_packing_took_is_asked_for_and_not_learned() -> None:
+def test_the_packing_loss_is_chosen_and_not_learned() -> None:
     told = fit._shortfall(36.5, 38.6, DistillConfig(psnr=37), viewpoints_are_sampled=True)
     assert "reached 36.5" in told and told.endswith("with `psnr`") and "steps" not in told
     assert "cameras" not in fit._shortfall(36.5, 36.6, DistillConfig(psnr=37), viewpoints_are_sampled=False)
@@ -218,7 +214,7 @@ def test_settings_out_of_range_are_rejected() -> None:
             DistillConfig(**wrong)
 
 
-def test_teacher_shows_what_is_drawn() -> None:
+def test_reference_views_hold_the_drawn_pictures() -> None:
     splats = ball_splats(40)
     weighted = WeightedSplats.from_splats(splats, "ball")
     original = Drawable.from_splats(splats, weighted.frame)
@@ -232,17 +228,17 @@ def test_teacher_shows_what_is_drawn() -> None:
 
 @given(st.lists(st.floats(1e-8, 1e-2), min_size=1, max_size=48), st.floats(1.001, 50.0))
 @settings(max_examples=60, deadline=None)
-def test_what_packing_adds_to_each_view_brings_their_mean_psnr_to_what_is_asked(errors, factor):
+def test_the_distortion_added_to_each_view_gives_the_target_mean_psnr(errors, factor):
     errors = np.array(errors)
     own = np.exp(np.log(errors).mean())
 
     added = pack.solve_added_error(errors, factor * own)
 
-    # Where views are unequal, the nearly perfect ones lose most, and less is to be had.
+    # Where views differ, the nearly perfect ones lose most, and less distortion is available.
     assert 0 < added <= (factor - 1) * own * (1 + 1e-6)
     if added > 2e-6 * factor * own:
         assert np.exp(np.log(errors + added).mean()) == pytest.approx(factor * own, rel=1e-6)
 
 
-def test_what_is_added_to_views_without_error_is_all_that_is_asked():
+def test_views_without_error_receive_the_whole_distortion():
     assert pack.solve_added_error(np.zeros(3), 1e-4) == pytest.approx(1e-4)

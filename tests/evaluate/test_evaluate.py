@@ -27,7 +27,7 @@ from hyrfpack.render.files import render_files
 from hyrfpack.scene import Picture, View
 
 
-def two_pictures(height: int = 40, width: int = 52, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+def noisy_and_smooth_pictures(height: int = 40, width: int = 52, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
     generator = np.random.default_rng(seed)
     smooth = gaussian_filter(generator.random((height, width, 3)), (3, 3, 0))
     smooth = (smooth - smooth.min()) / np.ptp(smooth)
@@ -40,8 +40,8 @@ def ball_model(**settings):
     return small_model(points, color_logits=torch.from_numpy(colors) * 4 - 2, scale_logits=-2.5, **settings)
 
 
-def straightforward_ssim_map(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Wang et al. 2004 as printed, by scipy's Gaussian filter cut at 5 pixels, black around the picture."""
+def reference_ssim_map(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Compute SSIM as printed in Wang et al. 2004, by scipy's Gaussian filter cut at 5 pixels, with black outside."""
 
     def mean(values):
         return gaussian_filter(values, (1.5, 1.5, 0), mode="constant", radius=(5, 5, 0))
@@ -55,13 +55,13 @@ def straightforward_ssim_map(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def test_psnr_is_pooled_over_pixels_and_channels_as_in_skimage():
-    image, reference = two_pictures()
+    image, reference = noisy_and_smooth_pictures()
     expected = skimage.metrics.peak_signal_noise_ratio(reference.numpy(), image.numpy(), data_range=1)
     assert psnr(image, reference) == pytest.approx(expected, abs=1e-5)
 
 
 def test_psnr_ignores_masked_pixels():
-    image, reference = two_pictures()
+    image, reference = noisy_and_smooth_pictures()
     mask = torch.zeros(image.shape[:2], dtype=torch.bool)
     mask[5:20, 7:30] = True
     broken = torch.where(mask[..., None], image, 1 - reference)
@@ -70,22 +70,22 @@ def test_psnr_ignores_masked_pixels():
 
 
 def test_equal_pictures_have_a_finite_psnr():
-    image, _ = two_pictures()
+    image, _ = noisy_and_smooth_pictures()
     assert psnr(image, image) == IDENTICAL_PSNR
 
 
 def test_ssim_equals_the_definition():
-    image, reference = two_pictures()
-    expected = straightforward_ssim_map(image.double().numpy(), reference.double().numpy()).mean()
+    image, reference = noisy_and_smooth_pictures()
+    expected = reference_ssim_map(image.double().numpy(), reference.double().numpy()).mean()
     assert ssim(image, reference) == pytest.approx(expected, abs=1e-5)
 
 
-def test_masked_ssim_does_not_see_what_is_rendered_under_the_mask():
-    image, reference = two_pictures()
+def test_masked_ssim_ignores_renders_under_the_mask():
+    image, reference = noisy_and_smooth_pictures()
     mask = torch.ones(image.shape[:2], dtype=torch.bool)
     mask[10:30, 10:30] = False
     x = np.where(mask[..., None], image.double(), reference.double())
-    expected = straightforward_ssim_map(x, reference.double().numpy())[mask.numpy()].mean()
+    expected = reference_ssim_map(x, reference.double().numpy())[mask.numpy()].mean()
     assert ssim(image, reference, mask) == pytest.approx(expected, abs=1e-5)
     assert ssim(torch.where(mask[..., None], image, 7.0), reference, mask) == pytest.approx(expected, abs=1e-5)
 
@@ -103,7 +103,7 @@ def convolution(inputs: int, outputs: int, kernel: int = 3, **options) -> nn.Con
 
 
 def alexnet_layers() -> tuple[list[nn.Module], list[int]]:
-    """torchvision's AlexNet features, and where the five stages end."""
+    """Return torchvision's AlexNet feature layers and the indices where its five stages end."""
     layers = [convolution(3, 64, 11, stride=4, padding=2), nn.ReLU(), nn.MaxPool2d(3, 2)]
     layers += [convolution(64, 192, 5), nn.ReLU(), nn.MaxPool2d(3, 2), convolution(192, 384), nn.ReLU()]
     layers += [convolution(384, 256), nn.ReLU(), convolution(256, 256), nn.ReLU()]
@@ -111,7 +111,7 @@ def alexnet_layers() -> tuple[list[nn.Module], list[int]]:
 
 
 def vgg_layers() -> tuple[list[nn.Module], list[int]]:
-    """torchvision's VGG-16 features up to the last ReLU, and where the five stages end."""
+    """Return torchvision's VGG-16 layers up to the last ReLU, and the indices where its five stages end."""
     layers: list[nn.Module] = []
     ends, width = [], 3
     for stage, (channels, count) in enumerate(zip((64, 128, 256, 512, 512), (2, 2, 3, 3, 3), strict=True)):
@@ -124,8 +124,8 @@ def vgg_layers() -> tuple[list[nn.Module], list[int]]:
     return layers, ends
 
 
-class StraightforwardLPIPS(nn.Module):
-    """The published method built of torch modules, with the names that the lpips package gives its weights."""
+class ReferenceLPIPS(nn.Module):
+    """The published LPIPS method built from torch modules, with the weight names of the lpips package."""
 
     def __init__(self, layers: list[nn.Module], ends: list[int]) -> None:
         super().__init__()
@@ -163,16 +163,16 @@ class StraightforwardLPIPS(nn.Module):
         return total
 
 
-def lpips_network(name: str) -> StraightforwardLPIPS:
+def lpips_network(name: str) -> ReferenceLPIPS:
     torch.manual_seed(3)
-    return StraightforwardLPIPS(*(alexnet_layers() if name == "alex" else vgg_layers())).eval()
+    return ReferenceLPIPS(*(alexnet_layers() if name == "alex" else vgg_layers())).eval()
 
 
 @pytest.mark.parametrize("name", ["alex", "vgg"])
 def test_lpips_equals_the_straightforward_computation(name, tmp_path):
     network = lpips_network(name)
     torch.save(network.state_dict(), tmp_path / "weights.pt")
-    image, reference = two_pictures(64, 75)
+    image, reference = noisy_and_smooth_pictures(64, 75)
     distance = LPIPS.load(tmp_path / "weights.pt")
     assert distance.name == name
     assert distance(image, reference) == pytest.approx(network(image, reference), rel=1e-4)
@@ -187,7 +187,7 @@ def test_lpips_takes_the_smallest_picture_and_rejects_a_smaller_one(name, side):
         distance(torch.zeros(side - 1, 99, 3), torch.ones(side - 1, 99, 3))
 
 
-class Boobytrap:
+class CodeOnUnpickling:
     def __reduce__(self):
         return print, ("executed",)
 
@@ -201,7 +201,7 @@ def broken_weights(kind: str):
     elif kind == "another network":
         state["net.slice1.0.weight"] = torch.zeros(64, 3, 5, 5)
     elif kind == "code":
-        state["net.slice1.0.weight"] = Boobytrap()
+        state["net.slice1.0.weight"] = CodeOnUnpickling()
     elif kind == "a list":
         return [1, 2, 3]
     return state
@@ -241,7 +241,7 @@ def test_scores_are_those_of_the_saved_pictures(tmp_path):
         saved, photo = np.asarray(Image.open(path)), view.load().rgb
         assert score.name == view.name
         assert score.psnr == pytest.approx(skimage.metrics.peak_signal_noise_ratio(photo, saved), abs=1e-4)
-        expected = straightforward_ssim_map(saved / 255, photo / 255).mean()
+        expected = reference_ssim_map(saved / 255, photo / 255).mean()
         assert score.ssim == pytest.approx(expected, abs=1e-4)
     assert scores.psnr == pytest.approx(np.mean([score.psnr for score in scores.views]))
     assert scores.gaussians == 150
@@ -263,28 +263,28 @@ def test_lpips_is_the_mean_over_views_when_there_are_weights(tmp_path):
     assert scores.lpips > 0 and scores.lpips_reason == "network alex"
 
 
-def test_transparent_photos_are_laid_over_the_models_solid_colour():
+def test_transparent_photos_are_composited_over_the_background_colour_of_the_model():
     model = small_model(np.zeros((0, 3)), solid=(0.2, 0.6, 1.0))
     clear = Picture(np.full((32, 32, 3), 99, np.uint8), np.zeros((32, 32), np.uint8))
     view = dataclasses.replace(ball_scene(views=1).train[0], load=lambda: clear)
     assert evaluate_model(model, [view]).psnr == IDENTICAL_PSNR
 
 
-def masked(view: View, mask: np.ndarray) -> View:
+def mask_view(view: View, mask: np.ndarray) -> View:
     picture = view.load()
     return dataclasses.replace(view, load=lambda: dataclasses.replace(picture, mask=mask))
 
 
 def test_views_without_a_usable_pixel_are_named_and_left_out():
     first, second = ball_scene(views=2).train
-    scores = evaluate_model(ball_model(), [masked(first, np.zeros((32, 32), bool)), second])
+    scores = evaluate_model(ball_model(), [mask_view(first, np.zeros((32, 32), bool)), second])
     assert scores.skipped == [first.name]
     assert [score.name for score in scores.views] == [second.name]
     with pytest.raises(HyrfError, match="masks"):
-        evaluate_model(ball_model(), [masked(first, np.zeros((32, 32), bool))])
+        evaluate_model(ball_model(), [mask_view(first, np.zeros((32, 32), bool))])
 
 
-def test_no_view_is_an_error_of_the_users():
+def test_an_empty_list_of_views_is_a_clear_error():
     with pytest.raises(HyrfError, match="no view to score"):
         evaluate_model(ball_model(), [])
 
@@ -304,8 +304,8 @@ def test_comparison_shows_errors_on_a_fixed_scale():
     render[:, 200:] += 1.5 * ERROR_LIMIT
     sheet = np.asarray(draw_comparison(photo, render))
     error = sheet[sheet.shape[0] // 2, -400:]
-    assert tuple(error[50]) == (0, 0, 4)  # inferno's first colour
-    assert tuple(error[150]) == tuple(error[300]) == (252, 255, 164)  # and its last
+    assert tuple(error[50]) == (0, 0, 4)  # the first colour of the inferno colour map
+    assert tuple(error[150]) == tuple(error[300]) == (252, 255, 164)  # the last colour of the map
 
 
 def test_comparison_hides_errors_under_the_mask():
@@ -323,7 +323,7 @@ def test_comparison_takes_any_size(width, height):
 
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (48, 31), (401, 3), (640, 20)])
 def test_a_comparison_can_be_cut_into_its_pictures_again(width, height):
-    photo, render = two_pictures(height, width)
+    photo, render = noisy_and_smooth_pictures(height, width)
     photo, render = to_8bit(photo), to_8bit(render)
     cut = split_comparison(draw_comparison(photo, render, caption="a photo"))
     times = cut[0].width // width

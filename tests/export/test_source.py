@@ -120,7 +120,7 @@ def test_a_viewpoint_without_sense_is_one_sentence(what, written):
 
 
 @pytest.mark.parametrize("cameras", [7, "none", [[1, 2, 3]], [[32, 32, 0, 1, 1, 1, *range(12)]], {"a": 1}])
-def test_cameras_without_sense_are_a_clear_error(cameras, written):
+def test_invalid_cameras_are_a_clear_error(cameras, written):
     with pytest.raises(HyrfError, match=r"cameras that the file keeps are not valid [^\n]*`data`$"):
         Source.read(written({"cameras": cameras}))
 

@@ -98,7 +98,7 @@ def test_numbers_out_of_range_are_rejected(data: bytes, claim: str) -> None:
         decode_groups(memoryview(data), TWO)
 
 
-def test_the_largest_numbers_are_finite() -> None:
+def test_the_largest_float32_values_are_supported() -> None:
     data = written([1, 255], [0, 0], [MAX_ABS_SYMBOL, MAX_ABS_SYMBOL, -MAX_ABS_SYMBOL], [0, 0, 0])
 
     np.testing.assert_array_equal(

@@ -1,4 +1,4 @@
-"""Profile `compact` where Gaussians coincide, lie far out, are all alike, saturated, or cannot be coded at all."""
+"""Profile `compact` for Gaussians that coincide, are far away, identical or saturated, or cannot be encoded."""
 
 from __future__ import annotations
 
@@ -15,11 +15,12 @@ from hyrfpack.format.container import read_container
 from hyrfpack.model import HybridModel
 from tools.safety.synthetic_encoding import quantize_uniformly, quantize_with_drawn_sensitivity
 
-STEP = 2.0**-10
-WIDEST = STEP * 16 / 15  # of the steps that `even` may come to
+PLANNED_STEP = 2.0**-10
+# An even plan of this step may choose steps up to this size.
+MAX_STEP = PLANNED_STEP * 16 / 15
 
 
-def through(model: HybridModel, quantized: QuantizedModel) -> HybridModel:
+def encode_and_decode(model: HybridModel, quantized: QuantizedModel) -> HybridModel:
     return decode_model(encode_model(model, "compact", quantized=quantized))
 
 
@@ -28,7 +29,7 @@ def opacities(model: HybridModel) -> np.ndarray:
         return model.decode_geometry().opacities.double().numpy()
 
 
-def cube(model: HybridModel) -> np.ndarray:
+def contracted_positions(model: HybridModel) -> np.ndarray:
     with torch.no_grad():
         return model.cube_coords(model.gaussians.positions.double()).numpy()
 
@@ -37,47 +38,47 @@ def normal(*shape: int) -> torch.Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(4))
 
 
-def test_coincident_gaussians_keep_their_own_numbers_and_one_place():
+def test_coincident_gaussians_keep_their_values_and_common_position():
     colors, sizes = normal(1000, 3), normal(1000, 1)
     model = small_model(np.tile([0.3, -0.4, 0.2], (1000, 1)), color_logits=colors, scale_logits=sizes)
-    quantized = quantize_uniformly(model, STEP)
+    quantized = quantize_uniformly(model, PLANNED_STEP)
     plan = quantized.plan
 
     data = encode_model(model, "compact", quantized=quantized)
     decoded = decode_model(data)
 
     assert len(decoded.gaussians.positions.unique(dim=0)) == 1
-    assert np.abs(cube(decoded) - cube(model)).max() <= WIDEST / 2
+    assert np.abs(contracted_positions(decoded) - contracted_positions(model)).max() <= MAX_STEP / 2
     assert len(read_container(data)["POSI"].data) < 100  # 1,000 gaps of zero
     assert sorted(plan.kept.tolist()) == list(range(1000))
-    assert (decoded.gaussians.color_logits - colors[plan.kept]).abs().max() <= 1.5 * 3**0.5 * WIDEST
-    assert (decoded.gaussians.scale_logits - sizes[plan.kept]).abs().max() <= 1.5 * WIDEST
+    assert (decoded.gaussians.color_logits - colors[plan.kept]).abs().max() <= 1.5 * 3**0.5 * MAX_STEP
+    assert (decoded.gaussians.scale_logits - sizes[plan.kept]).abs().max() <= 1.5 * MAX_STEP
 
 
 @pytest.mark.parametrize("distance", [1e4, 1e10, 1e30, 3e38])
-def test_gaussians_far_out_keep_their_direction_and_cost_the_others_nothing(distance):
-    """In the contracted cube nothing is far: what is at 1e30 is a hair inside the faces, and comes back nearer."""
+def test_far_gaussians_keep_their_direction_and_do_not_affect_others(distance):
+    """The contracted cube is bounded: a position at 1e30 is just inside its faces, and is decoded nearer."""
     inner = ball_points(100)[0]
     outer = distance * np.array([[1.0, 0.0, 0.0], [-1.0, 1.0, -1.0], [0.0, -0.5, 1.0]])
     model = small_model(np.vstack([inner, outer]))
-    quantized = quantize_uniformly(model, STEP)
+    quantized = quantize_uniformly(model, PLANNED_STEP)
     plan = quantized.plan
 
-    decoded = through(model, quantized)
+    decoded = encode_and_decode(model, quantized)
 
-    before, after = cube(model)[plan.kept], cube(decoded)
-    assert np.abs(after - before).max() <= WIDEST / 2 + 1e-6
+    before, after = contracted_positions(model)[plan.kept], contracted_positions(decoded)
+    assert np.abs(after - before).max() <= MAX_STEP / 2 + 1e-6
     local = decoded.gaussians.positions.detach().double().numpy()[plan.kept >= 100]
     wanted = outer[plan.kept[plan.kept >= 100] - 100]
     cosines = (local * wanted / distance).sum(1)
     cosines /= np.linalg.norm(local, axis=1) * np.linalg.norm(wanted / distance, axis=1)
-    assert (cosines > 1 - (2 * WIDEST) ** 2).all() and np.linalg.norm(local, axis=1).min() > 100
+    assert (cosines > 1 - (2 * MAX_STEP) ** 2).all() and np.linalg.norm(local, axis=1).min() > 100
 
 
 def test_constant_channels_are_exact_and_take_no_bytes():
     model = small_model(ball_points(5000)[0], color_logits=0.3, scale_logits=-3.3, opacity_logits=1.7)
 
-    data = encode_model(model, "compact", quantized=quantize_uniformly(model, STEP))
+    data = encode_model(model, "compact", quantized=quantize_uniformly(model, PLANNED_STEP))
     decoded = decode_model(data).gaussians
 
     for section, bytes_of_all in (("COLO", 200), ("SCAL", 60), ("OPAC", 60)):
@@ -93,33 +94,33 @@ def test_tables_and_decoders_of_one_value_keep_it():
             if not name.startswith("gaussians"):
                 parameter.fill_(-0.7)
 
-    decoded = through(model, quantize_uniformly(model, STEP))
+    decoded = encode_and_decode(model, quantize_uniformly(model, PLANNED_STEP))
 
     for name, parameter in decoded.named_parameters():
         if not name.startswith("gaussians"):
-            assert (parameter + 0.7).abs().max() <= 1.5 * WIDEST, name
+            assert (parameter + 0.7).abs().max() <= 1.5 * MAX_STEP, name
 
 
 @pytest.mark.parametrize("size", [12.0, 80.0, 1e4, 1e30])
 def test_saturated_opacities_and_colours_stay_saturated(size):
-    """Logits beyond 4096 are cut, and opacities earlier; what they look like does not change."""
+    """Logits beyond 4096 are clipped, and opacities earlier; their appearance does not change."""
     signs = normal(400, 1).sign()
     model = small_model(ball_points(400)[0], opacity_logits=signs * size, color_logits=signs * size, fields=0.3)
-    quantized = quantize_uniformly(model, STEP)
+    quantized = quantize_uniformly(model, PLANNED_STEP)
     plan = quantized.plan
 
-    decoded = through(model, quantized)
+    decoded = encode_and_decode(model, quantized)
 
-    assert np.abs(opacities(decoded) - opacities(model)[plan.kept]).max() <= 3.4e-4 + 4.5 * 0.25 * WIDEST
+    assert np.abs(opacities(decoded) - opacities(model)[plan.kept]).max() <= 3.4e-4 + 4.5 * 0.25 * MAX_STEP
     colors = decoded.gaussians.color_logits.detach(), model.gaussians.color_logits.detach()[plan.kept]
     assert (torch.sigmoid(colors[0]) - torch.sigmoid(colors[1])).abs().max() <= 1e-4
 
 
 @pytest.mark.parametrize("prune", [False, True])
-def test_no_gaussian_gives_a_file_of_none(prune):
+def test_a_model_without_gaussians_can_be_written_and_read(prune):
     model = small_model(np.zeros((0, 3)), background=True)
 
-    decoded = through(model, quantize_with_drawn_sensitivity(model, prune=prune))
+    decoded = encode_and_decode(model, quantize_with_drawn_sensitivity(model, prune=prune))
 
     assert len(decoded) == 0 and decoded.config == model.config
 
@@ -133,7 +134,7 @@ def test_one_gaussian_is_kept_and_compressed(tmp_path):
 
     assert report.profile == "compact" and report.gaussians == len(decoded) == 1
     assert report.bytes_after < (tmp_path / "one.hyrf").stat().st_size / 2
-    assert np.abs(cube(decoded) - cube(model)).max() < 1e-3
+    assert np.abs(contracted_positions(decoded) - contracted_positions(model)).max() < 1e-3
 
 
 def test_a_model_without_gaussians_is_rejected_with_a_clear_error(tmp_path):
@@ -146,7 +147,7 @@ def test_a_model_without_gaussians_is_rejected_with_a_clear_error(tmp_path):
 
 
 def test_a_model_that_cannot_be_rendered_is_rejected_with_a_clear_error(tmp_path):
-    """Positions whose squares overflow: nothing can be measured on pictures of NaN."""
+    """The squares of the positions overflow, and nothing can be measured on pictures of NaN."""
     save_model(small_model([(0.0, 0.0, 0.0), (1e30, 0.0, 0.0)], fields=0.3), tmp_path / "far.hyrf", "raw")
 
     with pytest.raises(HyrfError):
@@ -156,7 +157,7 @@ def test_a_model_that_cannot_be_rendered_is_rejected_with_a_clear_error(tmp_path
 
 
 def test_gaussians_that_no_camera_sees_survive():
-    """Behind and beside all cameras their sensitivity is a floor, not zero: they are coarse, but they are there."""
+    """Behind and beside all cameras, sensitivity has a lower bound above zero: they are coarse but still there."""
     from hyrfpack.compress.quantize import decide
     from hyrfpack.compress.sensitivity import measure_sensitivity
 
@@ -164,8 +165,8 @@ def test_gaussians_that_no_camera_sees_survive():
     cameras = ring(4, width=24, height=24)
 
     quantized = decide(model, measure_sensitivity(model, cameras), 1e-6, prune=False)
-    plan, decoded = quantized.plan, through(model, quantized)
+    plan, decoded = quantized.plan, encode_and_decode(model, quantized)
 
     assert set(plan.kept) >= {50, 51}
-    assert np.abs(cube(decoded) - cube(model)[plan.kept]).max() < 0.3
+    assert np.abs(contracted_positions(decoded) - contracted_positions(model)[plan.kept]).max() < 0.3
     assert all(torch.isfinite(parameter).all() for parameter in decoded.parameters())

@@ -1,5 +1,7 @@
-"""Hard cases of what decodes a Gaussian: contraction, hash encoding, decoder, background sphere, activations. The
-bounds are those that `docs/explanation/numerics.md` states."""
+"""Hard cases of decoding a Gaussian: contraction, hash encoding, decoder, background sphere and activations.
+
+`docs/explanation/numerics.md` states the bounds.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,8 @@ from hyrfpack.ops.background import BACKGROUND_RADIUS, sphere_points
 from hyrfpack.ops.hash_encode import hash_encode, level_offsets
 from hyrfpack.ops.mlp import mlp
 
-EPS = 2.0**-24  # half a unit in the last place of float32
+# Half a unit in the last place of float32.
+FLOAT32_ROUNDING = 2.0**-24
 
 
 def _directions(count: int, seed: int = 0) -> np.ndarray:
@@ -31,8 +34,8 @@ def _uniform(*shape: int, seed: int = 0) -> Tensor:
 # -- contraction ----------------------------------------------------------------------------------------------------
 
 
-def _contracted(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """c(u) and its Jacobian (N, 3, 3) by the formulas, in long doubles, whose squares do not overflow."""
+def _contract_in_long_double(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return c(u) and its Jacobian (N, 3, 3) by the formulas in long doubles, whose squares do not overflow."""
     u = u.astype(np.longdouble)
     radius = np.maximum(np.sqrt((u**2).sum(1)), 1e-300)[:, None]
     direction = u / radius
@@ -43,86 +46,92 @@ def _contracted(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return value.astype(float), np.where(r <= 1, 0.25 * np.eye(3), outside).astype(float)
 
 
-@pytest.mark.parametrize("radius", [1e-30, 0.5, 1 - EPS, 1.0, 1 + 2 * EPS, 1.01, 3.0, 1e4, 1e8, 1e18, 1e30])
-def test_contraction_and_its_jacobian_keep_to_the_formula(radius: float) -> None:
+@pytest.mark.parametrize(
+    "radius", [1e-30, 0.5, 1 - FLOAT32_ROUNDING, 1.0, 1 + 2 * FLOAT32_ROUNDING, 1.01, 3.0, 1e4, 1e8, 1e18, 1e30]
+)
+def test_contraction_and_its_jacobian_match_the_formula(radius: float) -> None:
     u = torch.from_numpy(radius * _directions(200)).float().requires_grad_()
     cube = contract(u)
     rows = [torch.autograd.grad(cube[:, axis].sum(), u, retain_graph=True)[0] for axis in range(3)]
-    expected, jacobian = _contracted(u.detach().numpy())
+    expected, jacobian = _contract_in_long_double(u.detach().numpy())
 
     error = np.abs(torch.stack(rows, 1).numpy() - jacobian).max((1, 2))
 
-    np.testing.assert_allclose(cube.detach().numpy(), expected, rtol=0, atol=4 * EPS)
+    np.testing.assert_allclose(cube.detach().numpy(), expected, rtol=0, atol=4 * FLOAT32_ROUNDING)
     assert (error <= 1e-6 * np.abs(jacobian).max((1, 2))).all()
 
 
 @pytest.mark.parametrize("radius", [1 - 1e-9, 1.0, 1 + 1e-9, 1e8, 1e12])
 def test_contraction_has_slopes_at_the_unit_sphere_and_far_outside(radius: float) -> None:
-    """Along steps in proportion to |u|, in float64; at |u| = 1 both sides have the same slope."""
+    """Steps are proportional to |u|, in float64; at |u| = 1 both sides have the same slope."""
     directions = torch.cat([torch.eye(3, dtype=torch.float64), torch.from_numpy(_directions(5))])
     steps = torch.zeros(8, 3, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda step: contract(radius * (directions + step)), steps, eps=1e-6, atol=1e-6)
 
 
-FINITE = st.floats(-(2.0**100), 2.0**100, width=32)
+FINITE_FLOATS = st.floats(-(2.0**100), 2.0**100, width=32)
 
 
 @settings(max_examples=200, deadline=None)
-@given(st.lists(st.tuples(FINITE, FINITE, FINITE), min_size=1, max_size=5))
-def test_contraction_of_any_point_is_in_the_cube_and_right(points: list[tuple]) -> None:
+@given(st.lists(st.tuples(FINITE_FLOATS, FINITE_FLOATS, FINITE_FLOATS), min_size=1, max_size=5))
+def test_contraction_of_any_point_is_inside_the_cube_and_correct(points: list[tuple]) -> None:
     u = torch.tensor(points, dtype=torch.float32)
     cube = contract(u)
     assert cube.min() >= 0 and cube.max() <= 1
-    np.testing.assert_allclose(cube.numpy(), _contracted(u.numpy())[0], rtol=0, atol=4 * EPS)
+    np.testing.assert_allclose(cube.numpy(), _contract_in_long_double(u.numpy())[0], rtol=0, atol=4 * FLOAT32_ROUNDING)
 
 
 # -- hash encoding --------------------------------------------------------------------------------------------------
 
-RESOLUTIONS, LOG2_TABLE_SIZE = (2, 23, 1024, 65536), 12
+LEVEL_RESOLUTIONS = (2, 23, 1024, 65536)
+LOG2_TABLE_SIZE = 12
 
 
-def _table() -> Tensor:
-    return 2 * _uniform(level_offsets(RESOLUTIONS, LOG2_TABLE_SIZE)[-1], 2, seed=1) - 1
+def _make_table() -> Tensor:
+    return 2 * _uniform(level_offsets(LEVEL_RESOLUTIONS, LOG2_TABLE_SIZE)[-1], 2, seed=1) - 1
 
 
-def _boundary(resolution: int, share: float, ulps: int) -> float:
-    """A vertex of a level, or a few floats beside it."""
+def _near_cell_boundary(resolution: int, share: float, ulps: int) -> float:
+    """Return the coordinate of a vertex of a level, or of a few floats beside it."""
     place = np.float32(round(share * (resolution - 1)) / (resolution - 1))
     for _ in range(abs(ulps)):
         place = np.nextafter(place, np.float32(2 if ulps > 0 else -1))
     return float(np.clip(place, 0, 1))
 
 
-COORDINATE = st.one_of(
-    st.builds(_boundary, st.sampled_from(RESOLUTIONS), st.floats(0, 1), st.integers(-3, 3)), st.floats(0, 1, width=32)
+COORDINATES = st.one_of(
+    st.builds(_near_cell_boundary, st.sampled_from(LEVEL_RESOLUTIONS), st.floats(0, 1), st.integers(-3, 3)),
+    st.floats(0, 1, width=32),
 )
 
 
 @settings(max_examples=100, deadline=None)
-@given(st.lists(st.tuples(COORDINATE, COORDINATE, COORDINATE), min_size=1, max_size=8))
+@given(st.lists(st.tuples(COORDINATES, COORDINATES, COORDINATES), min_size=1, max_size=8))
 def test_points_on_cell_boundaries_encode_as_in_float64(points: list[tuple]) -> None:
-    """Rounding may put a point into the next cell; interpolation is continuous, so that changes nothing."""
+    """Rounding may move a point to the next cell, which changes nothing because interpolation is continuous."""
     coords, upstream = torch.tensor(points, dtype=torch.float32), 2 * _uniform(len(points), 8, seed=2) - 1
 
     def run(dtype: torch.dtype, implementation: str) -> tuple[Tensor, Tensor, Tensor]:
-        inputs = [coords.to(dtype).requires_grad_(), _table().to(dtype).requires_grad_()]
-        features = hash_encode(*inputs, RESOLUTIONS, LOG2_TABLE_SIZE, implementation=implementation)
+        inputs = [coords.to(dtype).requires_grad_(), _make_table().to(dtype).requires_grad_()]
+        features = hash_encode(*inputs, LEVEL_RESOLUTIONS, LOG2_TABLE_SIZE, implementation=implementation)
         return features.detach(), *torch.autograd.grad(features, inputs, upstream.to(dtype))
 
     expected, _, expected_table = run(torch.float64, "reference")
     for implementation in ("cpu", "reference"):
         features, grad_coords, grad_table = run(torch.float32, implementation)
-        # A coordinate is known to EPS; along an axis of r vertices a feature in [-1, 1] changes by 2 (r - 1).
-        for level, resolution in enumerate(RESOLUTIONS):
+        # A coordinate is known to one rounding; along an axis of r vertices a feature in [-1, 1] changes by 2 (r - 1).
+        for level, resolution in enumerate(LEVEL_RESOLUTIONS):
             error = (features - expected)[:, 2 * level : 2 * level + 2].abs().max()
-            assert error <= 6 * EPS * resolution + 1e-6, level
-        assert (grad_table - expected_table).abs().max() <= len(points) * 3 * EPS * max(RESOLUTIONS)
-        assert grad_coords.abs().max() <= 4 * sum(RESOLUTIONS)  # two features, each at most 2 (r - 1) steep
+            assert error <= 6 * FLOAT32_ROUNDING * resolution + 1e-6, level
+        assert (grad_table - expected_table).abs().max() <= len(points) * 3 * FLOAT32_ROUNDING * max(LEVEL_RESOLUTIONS)
+        assert grad_coords.abs().max() <= 4 * sum(
+            LEVEL_RESOLUTIONS
+        )  # two features, each with a slope of at most 2 (r - 1)
 
 
 @pytest.mark.parametrize("implementation", ["cpu", "reference"])
 def test_the_faces_of_the_cube_belong_to_the_cells_inside(implementation: str) -> None:
-    """At a coordinate of 1 there is no cell to the right; slopes are those of the last one."""
+    """At a coordinate of 1 there is no cell to the right, so slopes are those of the last cell."""
     places = torch.tensor([0.0, 0.37, 1.0])
     coords, resolutions = torch.cartesian_prod(places, places, places), (2, 5, 23)
     table = 2 * _uniform(level_offsets(resolutions, 9)[-1], 2, seed=1) - 1
@@ -141,16 +150,18 @@ def test_a_hundred_thousand_points_in_one_cell_add_up() -> None:
     coords, upstream = torch.full((100_000, 3), 0.37), _uniform(100_000, 8, seed=3)
 
     def run(dtype: torch.dtype, implementation: str) -> Tensor:
-        table = _table().to(dtype).requires_grad_()
-        features = hash_encode(coords.to(dtype), table, RESOLUTIONS, LOG2_TABLE_SIZE, implementation=implementation)
+        table = _make_table().to(dtype).requires_grad_()
+        features = hash_encode(
+            coords.to(dtype), table, LEVEL_RESOLUTIONS, LOG2_TABLE_SIZE, implementation=implementation
+        )
         return torch.autograd.grad(features, table, upstream.to(dtype))[0]
 
     found, expected = run(torch.float32, "cpu"), run(torch.float64, "reference")
-    # A weight carries the error of its coordinate, which all points share; what adding does comes on top.
-    levels = list(zip(level_offsets(RESOLUTIONS, LOG2_TABLE_SIZE), RESOLUTIONS, strict=False))
+    # A weight has the error of its coordinate, which all points share; the error of adding is on top of it.
+    levels = list(zip(level_offsets(LEVEL_RESOLUTIONS, LOG2_TABLE_SIZE), LEVEL_RESOLUTIONS, strict=False))
     for (first, resolution), (last, _) in zip(levels, [*levels[1:], (len(expected), 0)], strict=True):
         error = (found[first:last] - expected[first:last]).abs().max() / expected[first:last].sum()
-        assert error <= 3 * EPS * resolution + 5e-5, resolution
+        assert error <= 3 * FLOAT32_ROUNDING * resolution + 5e-5, resolution
 
 
 # -- decoder --------------------------------------------------------------------------------------------------------
@@ -158,7 +169,7 @@ def test_a_hundred_thousand_points_in_one_cell_add_up() -> None:
 
 @settings(max_examples=40, deadline=None)
 @given(st.floats(-20, 12), st.floats(-3, 3), st.integers(1, 700), st.integers(0, 10**6))
-def test_decoders_of_any_magnitude_keep_to_float64(inputs: float, weights: float, rows: int, seed: int) -> None:
+def test_decoders_of_any_magnitude_agree_with_float64(inputs: float, weights: float, rows: int, seed: int) -> None:
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> Tensor:
@@ -170,7 +181,7 @@ def test_decoders_of_any_magnitude_keep_to_float64(inputs: float, weights: float
     found = mlp(x, layers, biases, implementation="cpu").double()
 
     expected = mlp(x.double(), [layer.double() for layer in layers], [bias.double() for bias in biases])
-    largest = x.double().abs()  # what each output is the sum of, without cancellation
+    largest = x.double().abs()  # the sum of the magnitudes of the terms of each output
     for layer, bias in zip(layers, biases, strict=True):
         largest = largest @ layer.double().abs().T + bias.double().abs()
     assert ((found - expected).abs() <= 1e-6 * largest).all()
@@ -187,8 +198,8 @@ def test_a_relu_at_its_kink_passes_no_gradient(implementation: str) -> None:
 
 
 @pytest.mark.parametrize("distance", [0.0, 0.5, 99.999, 100.0, 150.0, 1e3, 1e4, 1e5, 1e6, 1e8])
-def test_rays_meet_the_sphere_from_however_far(distance: float) -> None:
-    """Aimed at places inside of it, off the rim, where a ray is tangent and the answer wide open."""
+def test_rays_meet_the_sphere_from_any_distance(distance: float) -> None:
+    """Rays are aimed at places inside the sphere, away from its rim, where a ray is tangent and any answer possible."""
     origin = torch.from_numpy(distance * _directions(1, seed=1)[0]).float()
     targets = 0.95 * BACKGROUND_RADIUS * np.random.default_rng(2).uniform(size=(2000, 1)) * _directions(2000, seed=3)
     aims = targets - origin.double().numpy()
@@ -199,13 +210,13 @@ def test_rays_meet_the_sphere_from_however_far(distance: float) -> None:
     o, d = origin.numpy().astype(np.longdouble), directions.numpy().astype(np.longdouble)
     d /= np.sqrt((d**2).sum(1, keepdims=True))
     along = d @ o
-    root = np.sqrt(np.maximum(along**2 - o @ o + BACKGROUND_RADIUS**2, 0))  # the textbook root, with digits enough
-    bound = 8 * EPS * (distance + BACKGROUND_RADIUS)
+    root = np.sqrt(np.maximum(along**2 - o @ o + BACKGROUND_RADIUS**2, 0))  # the textbook root, in enough digits
+    bound = 8 * FLOAT32_ROUNDING * (distance + BACKGROUND_RADIUS)
     hits = bound < BACKGROUND_RADIUS / 4
-    if hits:  # else float32 directions are too coarse to say what is hit
+    if hits:  # otherwise float32 directions are too coarse to decide what is hit
         assert np.abs(np.linalg.norm(found, axis=1) - BACKGROUND_RADIUS).max() < bound
         np.testing.assert_allclose(found, (o + (root - along)[:, None] * d).astype(float), rtol=0, atol=bound)
-    assert np.abs(np.cross(found - o.astype(float), d.astype(float))).max() < bound + 8 * EPS * distance
+    assert np.abs(np.cross(found - o.astype(float), d.astype(float))).max() < bound + 8 * FLOAT32_ROUNDING * distance
 
 
 @settings(max_examples=200, deadline=None)
@@ -233,7 +244,7 @@ HARD_PLACES = [
 
 
 @pytest.mark.parametrize("logit", [-80.0, 0.0, 80.0])
-def test_decoded_numbers_and_gradients_of_hard_places_and_logits_keep_to_float64(logit: float) -> None:
+def test_decoding_of_hard_positions_and_logits_agrees_with_float64(logit: float) -> None:
     def run(dtype: torch.dtype) -> tuple[list[Tensor], list[Tensor]]:
         model = small_model(
             HARD_PLACES, fields=1.0, position_gradients=True,
@@ -253,4 +264,4 @@ def test_decoded_numbers_and_gradients_of_hard_places_and_logits_keep_to_float64
         torch.testing.assert_close(value.double(), wanted, rtol=0, atol=5e-6)
     for gradient, wanted in zip(gradients[1:], expected_gradients[1:], strict=True):
         torch.testing.assert_close(gradient.double(), wanted, rtol=0, atol=5e-6)
-    assert torch.isfinite(gradients[0]).all()  # of positions: at a place on a cell's boundary either side's will do
+    assert torch.isfinite(gradients[0]).all()  # gradients of positions: on a cell boundary that of either side is valid

@@ -1,4 +1,4 @@
-"""A view of a training: what it shows, what it costs, and that it changes nothing."""
+"""The live page of a training run: its content, its cost, and that it does not change the model."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from hyrfpack.live import LiveView, live_view
 from hyrfpack.live.view import MIN_INTERVAL_RATIO, MIN_INTERVAL_SECONDS
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer, train_model
 
-CONFIG = TrainConfig(
+TRAIN_CONFIG = TrainConfig(
     steps=40,
     seed=1,
     max_gaussians=120,
@@ -29,22 +29,22 @@ CONFIG = TrainConfig(
 )
 
 
-def a_scene():
+def make_scene():
     scene = ball_scene(views=8, points=60, side=24)
     return dataclasses.replace(scene, train=scene.train[2:], test=scene.train[:2])
 
 
-def content(file) -> bytes:
+def read_content(file) -> bytes:
     with file.open()[0] as opened:
         return opened.read()
 
 
-def progress(view: LiveView) -> dict:
-    return json.loads(content(view.updates))
+def read_progress(view: LiveView) -> dict:
+    return json.loads(read_content(view.updates))
 
 
 class Clock:
-    """Seconds that tests let go by; each look at the clock takes `look` of them."""
+    """A clock that tests advance; each reading advances it by `look` seconds."""
 
     def __init__(self, look: float = 0.0) -> None:
         self.now, self.look = 1000.0, look
@@ -56,44 +56,44 @@ class Clock:
 
 @pytest.mark.parametrize("exposure", [False, True])
 @pytest.mark.parametrize("background", [False, True])
-def test_a_training_with_a_view_gives_the_same_model_bit_by_bit(exposure, background, tmp_path):
-    config = dataclasses.replace(CONFIG, exposure=exposure, background=background)
-    plain = train_model(a_scene(), tmp_path / "plain", config, quiet=True)
+def test_training_with_a_live_view_gives_the_same_model_bit_by_bit(exposure, background, tmp_path):
+    config = dataclasses.replace(TRAIN_CONFIG, exposure=exposure, background=background)
+    plain = train_model(make_scene(), tmp_path / "plain", config, quiet=True)
     clock = Clock(look=MIN_INTERVAL_SECONDS * MIN_INTERVAL_RATIO)
     view = LiveView(clock)
 
     def observe(trainer: Trainer) -> None:
-        clock.now += 1e9  # a snapshot is due after each step
+        clock.now += 1e9  # makes a snapshot due after each step
         view.observe(trainer)
 
-    viewed = train_model(a_scene(), tmp_path / "viewed", config, quiet=True, observer=observe)
-    assert progress(view)["snapshot"] == config.steps
+    viewed = train_model(make_scene(), tmp_path / "viewed", config, quiet=True, observer=observe)
+    assert read_progress(view)["snapshot"] == config.steps
     assert plain.model.read_bytes() == viewed.model.read_bytes()
     curves = [[{**record, "seconds": 0} for record in run.metrics["curve"]] for run in (plain, viewed)]
     assert curves[0] == curves[1]
 
 
-def test_a_snapshot_is_the_model_of_its_step_seen_from_the_cameras_of_the_photos():
-    trainer, view = Trainer(a_scene(), CONFIG), LiveView(Clock())
+def test_a_snapshot_holds_the_model_of_its_step_and_the_cameras_of_the_photos():
+    trainer, view = Trainer(make_scene(), TRAIN_CONFIG), LiveView(Clock())
     for wanted in (1, 40):
         trainer.run(report=lambda trainer, *_: view.observe(trainer), stop=lambda wanted=wanted: trainer.step == wanted)
-        assert progress(view) == {"snapshot": 1 if wanted == 1 else 2, "step": wanted, "steps": 40}
-        shown = dict(decode_model(content(view.scene)).named_parameters())
+        assert read_progress(view) == {"snapshot": 1 if wanted == 1 else 2, "step": wanted, "steps": 40}
+        shown = dict(decode_model(read_content(view.scene)).named_parameters())
         assert shown.keys() == dict(trainer.model.named_parameters()).keys()
         for name, parameter in trainer.model.named_parameters():
             np.testing.assert_array_equal(shown[name].detach(), parameter.detach(), err_msg=name)
 
 
 def test_a_snapshot_keeps_the_cameras_for_the_page_to_start_from(tmp_path):
-    trainer, view = Trainer(a_scene(), dataclasses.replace(CONFIG, steps=1)), LiveView()
+    trainer, view = Trainer(make_scene(), dataclasses.replace(TRAIN_CONFIG, steps=1)), LiveView()
     trainer.run(report=lambda trainer, *_: view.observe(trainer))
     file = tmp_path / "snapshot.hyrf"
-    file.write_bytes(content(view.scene))
+    file.write_bytes(read_content(view.scene))
     kept = describe_file(file)["provenance"]
     assert len(kept["cameras"]) == 6 and kept["viewpoint"] and kept["steps"] == 1
 
 
-def made_up_trainer(step: int, steps: int = 10_000) -> SimpleNamespace:
+def fake_trainer(step: int, steps: int = 10_000) -> SimpleNamespace:
     return SimpleNamespace(step=step, steps=steps, model=None, scene=None, exposures=None)
 
 
@@ -115,7 +115,7 @@ def test_snapshots_take_less_than_3_percent_of_the_time_however_large_the_model_
     view, began = LiveView(clock), clock.now
     for step in range(1, 10_000):
         clock.now += 0.5
-        view.observe(made_up_trainer(step))
+        view.observe(fake_trainer(step))
     assert np.diff(taken).min() >= interval and len(taken) > 2
     assert (len(taken) - 1) * seconds <= 0.03 * (clock.now - began)
 
@@ -125,20 +125,20 @@ def test_the_first_step_and_the_last_one_are_always_shown(monkeypatch):
     monkeypatch.setattr("hyrfpack.live.view.scene_provenance", lambda *_, **__: {})
     view, shown = LiveView(Clock()), []
     for step in range(1, 6):
-        view.observe(made_up_trainer(step, steps=5))
-        shown.append(progress(view)["step"])
+        view.observe(fake_trainer(step, steps=5))
+        shown.append(read_progress(view)["step"])
     assert shown == [1, 1, 1, 1, 5]
 
 
-def test_a_model_that_is_not_finite_leaves_the_snapshot_before():
-    trainer, view = Trainer(a_scene(), CONFIG), LiveView(lambda: 0.0)
+def test_a_model_that_is_not_finite_keeps_the_previous_snapshot():
+    trainer, view = Trainer(make_scene(), TRAIN_CONFIG), LiveView(lambda: 0.0)
     trainer.run(report=lambda trainer, *_: view.observe(trainer), stop=lambda: trainer.step == 1)
-    before = content(view.scene)
+    before = read_content(view.scene)
     with torch.no_grad():
         trainer.model.gaussians.positions[0] = float("nan")
     trainer.step = trainer.steps
     view.observe(trainer)
-    assert content(view.scene) == before and progress(view)["step"] == 1
+    assert read_content(view.scene) == before and read_progress(view)["step"] == 1
 
 
 def test_the_page_and_its_files_are_served_while_the_block_runs_and_not_after():
@@ -152,7 +152,7 @@ def test_the_page_and_its_files_are_served_while_the_block_runs_and_not_after():
 
         assert b"<title>a &lt;scene&gt;</title>" in fetched("")
         assert json.loads(fetched("training.json")) == {"snapshot": 0, "step": 0, "steps": 0}
-        trainer = Trainer(a_scene(), dataclasses.replace(CONFIG, steps=2))
+        trainer = Trainer(make_scene(), dataclasses.replace(TRAIN_CONFIG, steps=2))
         trainer.run(report=lambda trainer, *_: view.observe(trainer))
         assert json.loads(fetched("training.json")) == {"snapshot": 2, "step": 2, "steps": 2}
         assert len(decode_model(fetched("scene.hyrf"))) == len(trainer.model)
@@ -165,13 +165,13 @@ def test_the_page_and_its_files_are_served_while_the_block_runs_and_not_after():
 
 @pytest.fixture
 def observed(monkeypatch) -> list[int]:
-    """Steps that views are told of."""
+    """The steps after which a live view was updated."""
     steps: list[int] = []
     monkeypatch.setattr(LiveView, "observe", lambda self, trainer: steps.append(trainer.step))
     return steps
 
 
-def test_train_shows_its_training_where_it_is_asked_to(data, observed, tmp_path):
+def test_train_updates_the_live_view_with_the_option(data, observed, tmp_path):
     command = ("train", data, "-o", tmp_path / "run", "--steps", 3, "--max-gaussians", 100)
     result = succeeded(*command, "--view")
     assert observed == [1, 2, 3]
@@ -182,7 +182,7 @@ def test_train_shows_its_training_where_it_is_asked_to(data, observed, tmp_path)
     assert observed == [] and "http" not in result.stderr
 
 
-def test_make_shows_its_training_where_it_is_asked_to(data, observed, monkeypatch, tmp_path):
+def test_make_updates_the_live_view_with_the_option(data, observed, monkeypatch, tmp_path):
     from hyrfpack.make import plan
 
     quality = dataclasses.replace(plan.QUALITIES["draft"], steps=3, finetune_steps=0)

@@ -17,7 +17,7 @@ from hyrfpack.export.cameras import write_colmap
 from hyrfpack.make import stages
 from hyrfpack.make.plan import QUALITIES, Quality
 
-QUICK = {
+QUICK_QUALITIES = {
     "draft": Quality(steps=6, gpu_steps=6, max_size=40, finetune_steps=0, import_steps=2),
     "normal": Quality(steps=9, gpu_steps=9, max_size=1600, finetune_steps=0, import_steps=3),
     "best": Quality(steps=9, gpu_steps=9, max_size=1600, finetune_steps=3, import_steps=4),
@@ -25,15 +25,15 @@ QUICK = {
 
 
 @pytest.fixture(scope="module", autouse=True)
-def quick():
-    """A few steps and views are enough for tests of this folder, and must not reach those of others."""
+def quick_settings():
+    """Few steps and views are enough here. The patch ends with the module, so that it does not reach other tests."""
     with pytest.MonkeyPatch.context() as patch:
-        hurry(patch)
+        patch_quick_settings(patch)
         yield
 
 
-def hurry(patch: pytest.MonkeyPatch) -> None:
-    for name, quality in QUICK.items():
+def patch_quick_settings(patch: pytest.MonkeyPatch) -> None:
+    for name, quality in QUICK_QUALITIES.items():
         patch.setitem(QUALITIES, name, quality)
     patch.setattr(stages, "DistillConfig", partial(DistillConfig, size=24, train_views=6, test_views=2))
     patch.setattr(sensitivity, "MAX_SENSITIVITY_VIEWS", 12)
@@ -43,20 +43,20 @@ def hurry(patch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="session")
 def posed(tmp_path_factory) -> Path:
-    """Eighteen small photos with poses; not to be changed."""
+    """Eighteen small photos with poses. Tests must not change them."""
     return write_demo_scene(tmp_path_factory.mktemp("posed") / "scene", views=18, size=32)
 
 
 @pytest.fixture
 def photos(posed, tmp_path) -> Path:
-    """The same without poses."""
+    """The same photos without poses."""
     shutil.copytree(posed / "images", tmp_path / "photos")
     return tmp_path / "photos"
 
 
 @pytest.fixture
 def poses(posed, monkeypatch) -> list[Path]:
-    """In place of the estimation of poses: the known ones. Returns what it was asked for, call by call."""
+    """A list of the arguments of each call of `estimate_poses`, which gives the known poses instead of estimating."""
     calls: list[Path] = []
 
     def estimate_poses(photos, out, *, matching="auto", masks=None, seed=0, overwrite=False, report=None, say=None):

@@ -1,4 +1,4 @@
-"""What is seen of the work: one line on a terminal, plain lines elsewhere; and what a forecast is made of."""
+"""The progress display: one line on a terminal, plain lines elsewhere, and the estimate of the remaining time."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hyrfpack.make import display
 from hyrfpack.make.display import Display
 from hyrfpack.make.progress import SLOWDOWN_EXPONENT, Progress, Reporter
 
-TRAINING = Progress("training", 2, 5, 0.2, 72.4, ("604/3,000", "PSNR 29.40", "4,850 Gaussians"))
+TRAINING_PROGRESS = Progress("training", 2, 5, 0.2, 72.4, ("604/3,000", "PSNR 29.40", "4,850 Gaussians"))
 
 
 @pytest.mark.parametrize(
@@ -23,19 +23,19 @@ TRAINING = Progress("training", 2, 5, 0.2, 72.4, ("604/3,000", "PSNR 29.40", "4,
         (20, ("2/5 training",)),
     ],
 )
-def test_one_line_fits_every_terminal(width, words):
+def test_the_progress_line_fits_every_terminal(width, words):
     shown, file = Display(), io.StringIO()
-    shown.show(TRAINING)
+    shown.show(TRAINING_PROGRESS)
     Console(width=width, file=file, force_terminal=True, color_system=None).print(shown)
     (line,) = file.getvalue().splitlines()
     assert all(word in line for word in words) and len(line) <= width
 
 
-def test_elsewhere_a_plain_line_comes_every_few_seconds(capsys, monkeypatch):
+def test_without_a_terminal_a_plain_line_is_printed_every_few_seconds(capsys, monkeypatch):
     monkeypatch.setattr(display, "LOG_INTERVAL_SECONDS", 0.01)
     with Display() as shown:
         sleep(0.05)
-        shown.show(TRAINING)
+        shown.show(TRAINING_PROGRESS)
         shown.say("a sentence [of] its own")
         sleep(0.1)
     out, err = capsys.readouterr()
@@ -43,7 +43,7 @@ def test_elsewhere_a_plain_line_comes_every_few_seconds(capsys, monkeypatch):
     assert "2/5 training  604/3,000  PSNR 29.40  4,850 Gaussians  0 s gone  about 72 s left" in err
 
 
-def test_nothing_is_said_of_a_time_that_is_not_known(capsys, monkeypatch):
+def test_an_unknown_remaining_time_is_not_printed(capsys, monkeypatch):
     monkeypatch.setattr(display, "LOG_INTERVAL_SECONDS", 0.01)
     with Display() as shown:
         Reporter(["import", "export"], shown.show).begin("import")
@@ -52,11 +52,11 @@ def test_nothing_is_said_of_a_time_that_is_not_known(capsys, monkeypatch):
     assert lines and all(line == "1/2 import  0 s gone" for line in lines)
 
 
-def test_a_display_whose_estimate_is_over_never_says_that_nothing_is_left(monkeypatch):
+def test_a_display_past_its_estimate_never_shows_0_s_left(monkeypatch):
     clock = [0.0]
     monkeypatch.setattr(display, "monotonic", lambda: clock[0])
     shown = Display()
-    shown.show(TRAINING)
+    shown.show(TRAINING_PROGRESS)
     left = []
     for clock[0] in (0.0, 50.0, 72.0, 100.0, 400.0):
         left.append(shown._parts()["left"])
@@ -73,7 +73,7 @@ def clock(monkeypatch) -> list[float]:
     return seconds
 
 
-def test_before_anything_is_measured_the_time_left_is_the_sum_of_the_forecasts(clock):
+def test_the_first_remaining_time_is_the_sum_of_the_forecasts(clock):
     told: list[Progress] = []
     reporter = Reporter(["poses", "training", "export"], told.append)
     reporter.estimates |= {"poses": 50.0, "pilots": 10.0, "training": 100.0, "results": 8.0, "export": 5.0}
@@ -98,16 +98,16 @@ def test_the_pace_of_a_part_replaces_its_forecast(clock):
     assert told[-1].left == pytest.approx(30.0)
 
 
-def test_the_pace_of_a_part_that_becomes_slower_is_that_of_its_last_half(clock):
+def test_the_pace_is_measured_over_the_last_half_of_the_progress(clock):
     told: list[Progress] = []
     reporter = Reporter(["poses"], told.append)
     reporter.begin("poses")
-    for clock[0] in range(1, 101):  # at first 1 % a second, then a fifth of it
+    for clock[0] in range(1, 101):  # at first 1 % a second, then a fifth of that pace
         reporter.update(min(clock[0], 50) / 100 + max(clock[0] - 50, 0) / 500)
     assert told[-1].left == pytest.approx(0.4 / 0.002)
 
 
-def test_the_pace_of_a_resumed_part_does_not_count_what_was_done_before(clock):
+def test_the_pace_of_a_resumed_part_ignores_earlier_progress(clock):
     told: list[Progress] = []
     reporter = Reporter(["training"], told.append)
     reporter.begin("training")
@@ -130,7 +130,7 @@ def test_forecasts_of_later_parts_are_scaled_by_the_pace_of_training(clock):
     assert told[-1].left == pytest.approx(3**SLOWDOWN_EXPONENT * 16)
 
 
-def test_the_pace_of_pilots_tells_how_long_the_training_will_take(clock):
+def test_the_pace_of_pilots_scales_the_forecast_of_training(clock):
     told: list[Progress] = []
     reporter = Reporter(["training"], told.append)
     reporter.estimates |= {"pilots": 40.0, "training": 300.0, "results": 5.0}
@@ -140,7 +140,7 @@ def test_the_pace_of_pilots_tells_how_long_the_training_will_take(clock):
     assert told[-1].left == pytest.approx(40 + 2 * 300 + 2**SLOWDOWN_EXPONENT * 5)
 
 
-def test_a_training_of_an_earlier_call_tells_the_pace_too(clock):
+def test_training_in_an_earlier_call_scales_forecasts_too(clock):
     told: list[Progress] = []
     reporter = Reporter(["training", "compression"], told.append)
     reporter.estimates |= {"pilots": 0.0, "training": 100.0, "results": 10.0, "compression": 16.0}
@@ -149,7 +149,7 @@ def test_a_training_of_an_earlier_call_tells_the_pace_too(clock):
     assert told[-1].left == pytest.approx(2**SLOWDOWN_EXPONENT * 16)
 
 
-def test_a_stage_that_outlasts_its_forecast_is_never_said_to_be_over(clock):
+def test_a_stage_past_its_forecast_never_shows_100_percent(clock):
     told: list[Progress] = []
     reporter = Reporter(["compression"], told.append)
     reporter.estimates["compression"] = 10.0
@@ -159,7 +159,7 @@ def test_a_stage_that_outlasts_its_forecast_is_never_said_to_be_over(clock):
     assert told[-1].left == 10.0
 
 
-def test_the_share_of_a_stage_counts_all_its_parts_and_never_falls(clock):
+def test_the_progress_of_a_stage_covers_all_its_parts_and_never_decreases(clock):
     told: list[Progress] = []
     reporter = Reporter(["training"], told.append)
     reporter.estimates |= {"pilots": 20.0, "training": 60.0, "results": 20.0}

@@ -1,4 +1,4 @@
-"""A disk that is full after the last training step: the next call completes the training's results."""
+"""After a disk was full at the end of training, the next call completes the training's results."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hyrfpack.make import make_scene
 from hyrfpack.train import Trainer
 
 
-def test_a_training_whose_metrics_did_not_fit_is_completed_by_the_next_call(posed: Path, monkeypatch, tmp_path):
+def test_missing_metrics_after_a_full_disk_are_completed_by_the_next_call(posed: Path, monkeypatch, tmp_path):
     replace = os.replace
 
     def checked(source, target) -> None:

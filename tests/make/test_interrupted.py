@@ -1,4 +1,4 @@
-"""Interrupted at any stage, by Ctrl-C or a kill, the same call resumes and ends with the same bytes."""
+"""After an interruption at any stage, by Ctrl-C or a kill, the same call resumes and ends with the same bytes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ from hyrfpack.errors import HyrfError
 from hyrfpack.make import Stopped, make_scene, stages
 from hyrfpack.make.stage_cache import interruptible
 
-STAGES = {  # and what does each of them
+# Stage -> the function that runs it.
+FUNCTION_BY_STAGE = {
     "training": "train",
     "compression": "compress",
     "scoring": "evaluate",
@@ -26,28 +27,28 @@ STAGES = {  # and what does each of them
 }
 
 
-def products(work: Path) -> dict[str, bytes]:
+def read_products(work: Path) -> dict[str, bytes]:
     names = ("model.hyrf", "run/model.hyrf", "export/scene.html")
     return {name: (work / name).read_bytes() for name in names}
 
 
 @pytest.fixture(scope="module")
-def whole_work(posed, tmp_path_factory) -> Path:
+def uninterrupted_work(posed, tmp_path_factory) -> Path:
     """The work folder of an uninterrupted call."""
     return make_scene(posed, tmp_path_factory.mktemp("whole") / "scene.html").work
 
 
 @pytest.fixture(scope="module")
-def whole(whole_work) -> dict[str, bytes]:
-    """What it made."""
-    return products(whole_work)
+def uninterrupted_products(uninterrupted_work) -> dict[str, bytes]:
+    """The products of an uninterrupted call."""
+    return read_products(uninterrupted_work)
 
 
 @pytest.mark.parametrize("after", [False, True], ids=["before its work", "after it, before the record of it"])
-def test_an_interrupt_in_each_stage_costs_nothing(after, whole, posed, tmp_path, monkeypatch):
-    """Call by call, each is stopped one stage later."""
+def test_an_interrupt_in_each_stage_loses_no_work(after, uninterrupted_products, posed, tmp_path, monkeypatch):
+    """Each call is stopped one stage later than the one before."""
     done: list[str] = []
-    for stage, function in STAGES.items():
+    for stage, function in FUNCTION_BY_STAGE.items():
         usual, said = getattr(stages, function), []
 
         def stop(*arguments, usual=usual, **options):
@@ -60,14 +61,17 @@ def test_an_interrupt_in_each_stage_costs_nothing(after, whole, posed, tmp_path,
             with pytest.raises(Stopped) as caught:
                 make_scene(posed, tmp_path / "scene.html", say=said.append)
         assert caught.value.stage == stage and not (tmp_path / "scene.html").exists()
-        assert [name for name in STAGES if any(f"{name}: done before" in s for s in said)] == done[:-1]
+        assert [name for name in FUNCTION_BY_STAGE if any(f"{name}: done before" in s for s in said)] == done[:-1]
         done.append(stage)
     result = make_scene(posed, tmp_path / "scene.html")
-    assert products(result.work) == whole and result.output.read_bytes() == whole["export/scene.html"]
+    assert (
+        read_products(result.work) == uninterrupted_products
+        and result.output.read_bytes() == uninterrupted_products["export/scene.html"]
+    )
     assert list(result.kept) == done[:-1]
 
 
-def test_an_interrupt_amid_training_continues_from_the_checkpoint(whole, posed, tmp_path, signals):
+def test_an_interrupted_training_resumes_from_the_checkpoint(uninterrupted_products, posed, tmp_path, signals):
     def stop(progress):
         if progress.words[:1] == ("5/9",):
             signal.raise_signal(signal.SIGTERM)
@@ -78,10 +82,10 @@ def test_an_interrupt_amid_training_continues_from_the_checkpoint(whole, posed, 
     words = []
     result = make_scene(posed, tmp_path / "scene.html", report=lambda progress: words.extend(progress.words[:1]))
     assert "6/9" in words and "5/9" not in words
-    assert products(result.work) == whole
+    assert read_products(result.work) == uninterrupted_products
 
 
-def test_an_interrupt_in_poses_continues(photos, poses, tmp_path, monkeypatch):
+def test_an_interrupted_estimation_of_poses_resumes(photos, poses, tmp_path, monkeypatch):
     def stop(progress):
         raise KeyboardInterrupt
 
@@ -91,7 +95,7 @@ def test_an_interrupt_in_poses_continues(photos, poses, tmp_path, monkeypatch):
     assert make_scene(photos, tmp_path / "scene.ply", quality="draft").kept[0] == "poses"
 
 
-def test_an_output_that_was_copied_in_part_is_gone_on_with(posed, tmp_path, monkeypatch):
+def test_a_partly_copied_output_is_completed(posed, tmp_path, monkeypatch):
     usual, copies = stages.copy_file, []
 
     def stop(source, target, **options):
@@ -109,7 +113,7 @@ def test_an_output_that_was_copied_in_part_is_gone_on_with(posed, tmp_path, monk
 
 
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
-def test_signals_interrupt_and_their_handlers_come_back(name, signals):
+def test_signals_interrupt_and_their_handlers_are_restored(name, signals):
     number = getattr(signal, name, signal.SIGTERM)
     before = signal.getsignal(number)
     with pytest.raises(KeyboardInterrupt), interruptible():
@@ -119,7 +123,7 @@ def test_signals_interrupt_and_their_handlers_come_back(name, signals):
 
 @contextmanager
 def file_limit(size: int) -> Iterator[None]:
-    """No file of this process may grow past `size` bytes: a write stops in the middle, as on a full disk."""
+    """Limit the size of files that this process writes, so that a write stops in the middle, as on a full disk."""
     resource = pytest.importorskip("resource", reason="limits are of Unix")
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
@@ -136,15 +140,15 @@ def file_limit(size: int) -> Iterator[None]:
         ({"seed": 1}, 20_000, "training failed: .*run/model.hyrf: "),
         ({"quality": "best"}, 5_000, "compression failed: .*model.hyrf: "),
         ({"output": "other.html"}, 20_000, "export failed: .*export/other.html: "),
-        ({"output": "scene.html"}, 20_000, "scene.html: "),  # the copy of what is there
+        ({"output": "scene.html"}, 20_000, "scene.html: "),  # the copy to the output path
     ],
 )
-def test_no_room_in_any_stage_is_a_clear_error_and_the_same_call_continues(
-    changes, limit, sentence, whole_work, posed, tmp_path
+def test_a_full_disk_in_any_stage_is_a_clear_error_and_the_same_call_resumes(
+    changes, limit, sentence, uninterrupted_work, posed, tmp_path
 ):
     work = tmp_path / "work"
     if limit > 500:
-        shutil.copytree(whole_work, work)
+        shutil.copytree(uninterrupted_work, work)
     changes = {"output": "scene.html", **changes, "work": work}
     output = tmp_path / changes.pop("output")
     with file_limit(limit), pytest.raises(HyrfError, match=f"{sentence}.*not allowed here"):
@@ -154,33 +158,33 @@ def test_no_room_in_any_stage_is_a_clear_error_and_the_same_call_continues(
     assert not [path for path in tmp_path.rglob("*") if path.name.startswith(TEMPORARY_PREFIX)]
 
 
-CHILD = """
+CHILD_SCRIPT = """
 import sys
 from pathlib import Path
 sys.path[:0] = sys.argv[1:3]
 import conftest, pytest
-conftest.hurry(pytest.MonkeyPatch())
-from hyrfpack.make import make
-make(sys.argv[3], sys.argv[4], report=lambda p: print(p.stage, *p.words[:1], flush=True))
+conftest.patch_quick_settings(pytest.MonkeyPatch())
+from hyrfpack.make import make_scene
+make_scene(sys.argv[3], sys.argv[4], report=lambda p: print(p.stage, *p.words[:1], flush=True))
 """
 
 
-def start(posed: Path, output: Path) -> subprocess.Popen:
+def start_child(posed: Path, output: Path) -> subprocess.Popen:
     here = Path(__file__).parent
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(here.parents[1]), str(here.parent)])}
-    command = [sys.executable, "-c", CHILD, str(here), str(here.parent), str(posed), str(output)]
+    command = [sys.executable, "-c", CHILD_SCRIPT, str(here), str(here.parent), str(posed), str(output)]
     return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
 
 
-def test_the_time_of_interrupted_and_killed_calls_counts(posed, tmp_path, monkeypatch):
+def test_the_time_of_interrupted_and_killed_calls_is_included(posed, tmp_path, monkeypatch):
     clock = [0.0]
     monkeypatch.setattr("hyrfpack.make.stage_cache.monotonic", lambda: clock[0])
 
     def end(seconds: float, error: BaseException):
         def train(*arguments, **options):
             clock[0] += seconds
-            options["report"](1, 0.1, 0.01, 500)  # the time so far is recorded
-            clock[0] += 5  # less than what is recorded again
+            options["report"](1, 0.1, 0.01, 500)  # this call records the time so far
+            clock[0] += 5  # shorter than the interval between records
             raise error
 
         return train
@@ -193,11 +197,11 @@ def test_the_time_of_interrupted_and_killed_calls_counts(posed, tmp_path, monkey
     assert result.seconds["training"] == 100 + 5 + 40 and result.total_seconds == sum(result.seconds.values())
 
 
-def test_a_kill_costs_nothing(whole, posed, tmp_path):
-    child = start(posed, tmp_path / "scene.html")
+def test_a_kill_loses_no_finished_work(uninterrupted_products, posed, tmp_path):
+    child = start_child(posed, tmp_path / "scene.html")
     assert any(line.strip() == "training 4/9" for line in child.stdout)
     child.kill()
     child.communicate()
     assert child.returncode == -signal.SIGKILL
     assert (tmp_path / "scene.work" / "make.json").is_file() and not (tmp_path / "scene.html").exists()
-    assert products(make_scene(posed, tmp_path / "scene.html").work) == whole
+    assert read_products(make_scene(posed, tmp_path / "scene.html").work) == uninterrupted_products

@@ -1,4 +1,4 @@
-"""The whole way: whatever is given, whatever is asked for, what is refused, and what is done anew."""
+"""`make` from end to end: inputs, outputs, errors, and which stages a repeated call runs again."""
 
 from __future__ import annotations
 
@@ -25,23 +25,24 @@ from hyrfpack.make.progress import Progress, Reporter
 from hyrfpack.splats.formats import ply
 from hyrfpack.train.setup import MIN_BUDGET
 
-ENDINGS = (".hyrf", ".html", ".spz", ".points.ply", "")  # of each kind one: tests/export has the others
-STAGES = ["training", "compression", "scoring", "export"]
+# One ending of each kind; tests/export covers the others.
+OUTPUT_ENDINGS = (".hyrf", ".html", ".spz", ".points.ply", "")
+STAGE_NAMES = ["training", "compression", "scoring", "export"]
 
 
 @pytest.fixture(scope="module")
-def made(posed, tmp_path_factory) -> Path:
-    """The work folder of a scene that was made."""
+def finished_work(posed, tmp_path_factory) -> Path:
+    """The work folder of a finished scene."""
     folder = tmp_path_factory.mktemp("made")
     make_scene(posed, folder / "scene.hyrf")
     return folder / "scene.work"
 
 
-def copy_of(made: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(made, tmp_path / "work"))
+def copy_work(finished_work: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(finished_work, tmp_path / "work"))
 
 
-def test_short_runs_before_a_training_do_not_count_in_its_forecast(monkeypatch):
+def test_pilot_runs_do_not_count_in_the_forecast_of_training(monkeypatch):
     clock = [0.0]
     monkeypatch.setattr("hyrfpack.make.progress.monotonic", lambda: clock[0])
     told: list[Progress] = []
@@ -53,11 +54,11 @@ def test_short_runs_before_a_training_do_not_count_in_its_forecast(monkeypatch):
         clock[0] += 0.1
         shown.step(step, 0.1, 0.01, 500)
     assert told[240].words == ("pilot runs",)
-    assert told[240].share == pytest.approx(0.125)  # half of the pilots, a quarter of all
+    assert told[240].share == pytest.approx(0.125)  # half of the pilots, which are a quarter of all steps
     assert told[-1].share == pytest.approx((10 + 0.3 * 30) / 40) and told[-1].left == pytest.approx(70.0, rel=0.02)
 
 
-def test_scores_and_pictures_after_the_last_step_are_a_part_of_the_training():
+def test_scoring_after_the_last_step_is_part_of_the_training_progress():
     told: list[Progress] = []
     reporter = Reporter(["training"], told.append)
     reporter.estimates |= {"pilots": 0.0, "training": 30.0, "results": 10.0}
@@ -69,24 +70,24 @@ def test_scores_and_pictures_after_the_last_step_are_a_part_of_the_training():
     assert told[-1].share == 0.875 and told[-1].words == ("scoring held-out photos", "1/2")
 
 
-# -- what is given, and what is asked for ----------------------------------------------------------------------------
+# -- inputs and outputs ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("ending", ENDINGS)
-def test_every_ending_is_made_and_nothing_else_again(ending, made, posed, tmp_path):
-    result = make_scene(posed, tmp_path / f"out{ending}", work=copy_of(made, tmp_path))
+@pytest.mark.parametrize("ending", OUTPUT_ENDINGS)
+def test_every_kind_of_output_is_written_without_repeating_other_stages(ending, finished_work, posed, tmp_path):
+    result = make_scene(posed, tmp_path / f"out{ending}", work=copy_work(finished_work, tmp_path))
     assert result.kept == ("training", "compression", "scoring")
     files = [path for path in result.output.rglob("*") if path.is_file()] or [result.output]
     assert result.bytes == sum(path.stat().st_size for path in files) > 100
 
 
-def test_photos_without_poses_get_some(photos, poses, tmp_path):
+def test_poses_of_photos_without_poses_are_estimated(photos, poses, tmp_path):
     said, shares = [], []
     result = make_scene(photos, tmp_path / "scene.hyrf", say=said.append, report=shares.append)
     assert poses == [photos]
-    assert list(result.seconds) == ["poses", *STAGES]
+    assert list(result.seconds) == ["poses", *STAGE_NAMES]
     assert result.poses["left_out"] == {"dark.jpg": "blurred"}
-    assert {progress.stage for progress in shares} == {"poses", *STAGES}
+    assert {progress.stage for progress in shares} == {"poses", *STAGE_NAMES}
     for progress in shares:
         assert 0 <= progress.share <= 1 and progress.left is not None and progress.left >= 0, progress
     assert len(load_scene(result.work / "scene").views) == 18
@@ -106,12 +107,12 @@ def test_photos_without_poses_may_come_in_an_archive(top, photos, poses, tmp_pat
     assert len(make_scene(tmp_path / "photos.zip", tmp_path / "scene.hyrf", quality="draft").kept) == 5
 
 
-def test_photos_with_poses_are_used_as_they_are(posed, poses, tmp_path):
+def test_photos_with_poses_need_no_estimation(posed, poses, tmp_path):
     make_scene(posed, tmp_path / "scene.hyrf")
     assert not poses
 
 
-def test_a_video_gets_poses(poses, tmp_path):
+def test_poses_of_a_video_are_estimated(poses, tmp_path):
     (tmp_path / "clip.MP4").write_bytes(b"frames")
     make_scene(tmp_path / "clip.MP4", tmp_path / "scene.hyrf", quality="draft")
     assert poses == [tmp_path / "clip.MP4"]
@@ -126,20 +127,20 @@ def test_splats_of_other_programs_are_imported(tmp_path):
     assert again.kept == ("import",)
 
 
-def test_a_model_is_exported(made, tmp_path):
-    result = make_scene(made / "model.hyrf", tmp_path / "scene.html")
-    assert list(result.seconds) == ["export"] and result.gaussians == len(load_model(made / "model.hyrf"))
+def test_a_model_is_exported(finished_work, tmp_path):
+    result = make_scene(finished_work / "model.hyrf", tmp_path / "scene.html")
+    assert list(result.seconds) == ["export"] and result.gaussians == len(load_model(finished_work / "model.hyrf"))
 
 
-def test_the_score_is_of_the_packed_model_on_the_photos_held_out(made, posed, tmp_path):
-    result = make_scene(posed, tmp_path / "scene.hyrf", work=copy_of(made, tmp_path))
+def test_the_score_is_that_of_the_packed_model_on_held_out_photos(finished_work, posed, tmp_path):
+    result = make_scene(posed, tmp_path / "scene.hyrf", work=copy_work(finished_work, tmp_path))
     scores = evaluate_model(load_model(result.output), load_scene(posed).test)
     assert (result.psnr, result.ssim, result.views) == (scores.psnr, scores.ssim, 3)
     assert result.psnr_consistent is None  # the model has no exposure map
 
 
-def test_a_model_with_an_exposure_map_is_scored_as_render_shows_it_and_at_one_exposure(made, posed, tmp_path):
-    model = load_model(made / "model.hyrf")
+def test_a_model_with_an_exposure_map_is_scored_as_render_shows_it_and_at_one_exposure(finished_work, posed, tmp_path):
+    model = load_model(finished_work / "model.hyrf")
     model.exposure = random_map(3, centers=6)
     save_model(model, tmp_path / "model.hyrf")
     state = SimpleNamespace(inputs=lambda stage: {"photos and poses": ""})
@@ -154,11 +155,15 @@ def test_a_model_with_an_exposure_map_is_scored_as_render_shows_it_and_at_one_ex
     assert scores == {
         "views": 3, "psnr": expected.psnr, "psnr_consistent": expected.psnr_consistent, "ssim": expected.ssim
     }  # fmt: skip
-    assert expected.psnr != expected.psnr_consistent == evaluate_model(load_model(made / "model.hyrf"), scene.test).psnr
+    assert (
+        expected.psnr
+        != expected.psnr_consistent
+        == evaluate_model(load_model(finished_work / "model.hyrf"), scene.test).psnr
+    )
 
 
 @pytest.mark.parametrize("count, held_out", [(3, 0), (8, 1), (15, 1)])
-def test_of_few_photos_few_are_held_out(count, held_out, posed, tmp_path):
+def test_small_sets_hold_out_few_photos(count, held_out, posed, tmp_path):
     shutil.copytree(posed, tmp_path / "few")
     table = tmp_path / "few" / "transforms.json"
     content = json.loads(table.read_text())
@@ -168,8 +173,8 @@ def test_of_few_photos_few_are_held_out(count, held_out, posed, tmp_path):
     assert result.views == held_out and (result.psnr is None) == (held_out == 0)
 
 
-def test_a_target_size_is_met(made, posed, tmp_path):
-    whole = (made / "model.hyrf").stat().st_size
+def test_a_target_size_is_met(finished_work, posed, tmp_path):
+    whole = (finished_work / "model.hyrf").stat().st_size
     result = make_scene(posed, tmp_path / "scene.hyrf", target_bytes=whole * 3 // 4)
     assert result.bytes <= whole * 3 // 4 and result.gaussians < MIN_BUDGET
 
@@ -196,19 +201,17 @@ def test_an_impossible_target_size_is_rejected_before_any_work(
     assert not poses and not (tmp_path / "scene.work").exists()
 
 
-def test_another_target_size_packs_the_trained_model_again_and_says_how_to_train_again(made, posed, tmp_path):
-    work, said = copy_of(made, tmp_path), []
-    target = (made / "model.hyrf").stat().st_size * 3 // 4
+def test_another_target_size_packs_the_trained_model_again_and_says_how_to_train_again(finished_work, posed, tmp_path):
+    work, said = copy_work(finished_work, tmp_path), []
+    target = (finished_work / "model.hyrf").stat().st_size * 3 // 4
     result = make_scene(posed, tmp_path / "a.hyrf", work=work, target_bytes=target, say=said.append)
     assert result.kept == ("training",) and result.bytes <= target
     assert any("trained without a target size" in sentence and "`work`" in sentence for sentence in said)
     assert make_scene(posed, tmp_path / "b.hyrf", work=work).kept == ("training",)
-    assert (tmp_path / "b.hyrf").read_bytes() == (made / "model.hyrf").read_bytes()
+    assert (tmp_path / "b.hyrf").read_bytes() == (finished_work / "model.hyrf").read_bytes()
 
 
-def test_a_training_that_was_stopped_continues_as_it_was_begun_whatever_target_size_is_asked_for_then(
-    posed, tmp_path, monkeypatch
-):
+def test_a_stopped_training_resumes_unchanged_with_another_target_size(posed, tmp_path, monkeypatch):
     configs = []
     usual = stages.train
 
@@ -235,8 +238,8 @@ def test_with_minutes_another_target_size_keeps_the_measurement_and_the_training
     assert result.kept == ("measurement", "training")
 
 
-def test_a_target_size_that_the_trained_model_cannot_have_names_one_that_it_can(made, posed, tmp_path):
-    work = copy_of(made, tmp_path)
+def test_an_unreachable_target_size_names_a_reachable_one(finished_work, posed, tmp_path):
+    work = copy_work(finished_work, tmp_path)
     arguments = ("make", posed, "-o", tmp_path / "scene.hyrf", "--work", work)
     sentence = refused(*arguments, "--target-size", 2_100)
     assert "the trained model does not fit into 2,100 bytes" in sentence and "--max-gaussians" not in sentence
@@ -245,25 +248,25 @@ def test_a_target_size_that_the_trained_model_cannot_have_names_one_that_it_can(
     succeeded(*arguments, "--target-size", possible.replace(",", ""))
 
 
-def test_a_work_folder_of_an_earlier_version_is_trained_again_once(made, posed, tmp_path):
-    work, said = copy_of(made, tmp_path), []
+def test_a_work_folder_of_an_earlier_version_is_trained_again_once(finished_work, posed, tmp_path):
+    work, said = copy_work(finished_work, tmp_path), []
     table = json.loads((work / "make.json").read_text())
     training = table["stages"]["training"]
-    training["inputs"]["settings"] |= training.pop("fixed")  # where both stood before
+    training["inputs"]["settings"] |= training.pop("fixed")  # earlier versions stored both there
     (work / "make.json").write_text(json.dumps(table))
     assert make_scene(posed, tmp_path / "scene.hyrf", work=work, say=said.append).kept[:1] != ("training",)
     assert "training: made anew, for settings changed" in said
     assert len(make_scene(posed, tmp_path / "scene.hyrf", work=work).kept) == 4
 
 
-# -- what is done anew -----------------------------------------------------------------------------------------------
+# -- what runs again -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     "settings, kept",
     [
-        ({}, tuple(STAGES)),
-        ({"quality": "best"}, ("training",)),  # as long a training here
+        ({}, tuple(STAGE_NAMES)),
+        ({"quality": "best"}, ("training",)),  # with these settings, "best" trains as long
         ({"seed": 1}, ()),
         ({"test_every": 3}, ()),
         ({"max_size": 24}, ()),
@@ -272,12 +275,12 @@ def test_a_work_folder_of_an_earlier_version_is_trained_again_once(made, posed, 
         ({"preset": "street"}, ()),
     ],
 )
-def test_changed_settings_redo_what_depends_on_them(settings, kept, made, posed, tmp_path):
-    result = make_scene(posed, tmp_path / "scene.hyrf", work=copy_of(made, tmp_path), **settings)
+def test_changed_settings_repeat_the_stages_that_depend_on_them(settings, kept, finished_work, posed, tmp_path):
+    result = make_scene(posed, tmp_path / "scene.hyrf", work=copy_work(finished_work, tmp_path), **settings)
     assert result.kept == kept
 
 
-def test_a_changed_photo_redoes_poses_and_all_else_and_a_moved_folder_nothing(photos, poses, tmp_path):
+def test_a_changed_photo_repeats_all_stages_and_a_moved_folder_none(photos, poses, tmp_path):
     make_scene(photos, tmp_path / "a.hyrf", work=tmp_path / "work", quality="draft")
     moved = photos.rename(tmp_path / "elsewhere")
     assert len(make_scene(moved, tmp_path / "a.hyrf", work=tmp_path / "work", quality="draft").kept) == 5
@@ -293,34 +296,36 @@ def test_poses_are_kept_from_a_draft_to_another_quality_and_back(photos, poses, 
     assert poses == [photos]
 
 
-def test_matching_is_passed_on_and_counts(photos, poses, tmp_path):
+def test_the_matching_setting_is_passed_on_and_repeats_the_poses(photos, poses, tmp_path):
     make_scene(photos, tmp_path / "a.hyrf", quality="draft")
     result = make_scene(photos, tmp_path / "b.hyrf", work=tmp_path / "a.work", quality="draft", matching="sequential")
-    assert len(poses) == 2 and result.kept == ("training", "compression", "scoring")  # the poses were the same
+    assert len(poses) == 2 and result.kept == ("training", "compression", "scoring")  # the poses did not change
 
 
 @pytest.mark.parametrize(
     "name, kept",
     [("model.hyrf", ("training", "scoring", "export")), ("run/model.hyrf", ("compression", "scoring", "export"))],
 )
-def test_a_product_that_was_damaged_is_made_again(name, kept, made, posed, tmp_path):
-    work = copy_of(made, tmp_path)
+def test_a_damaged_product_is_made_again(name, kept, finished_work, posed, tmp_path):
+    work = copy_work(finished_work, tmp_path)
     whole = (work / name).read_bytes()
     (work / name).write_bytes(whole[:100])
     result = make_scene(posed, tmp_path / "scene.hyrf", work=work)
     assert result.kept == kept and (work / name).read_bytes() == whole
 
 
-def test_poses_whose_photos_are_gone_are_estimated_again(photos, poses, tmp_path):
+def test_poses_without_their_photos_are_estimated_again(photos, poses, tmp_path):
     work = make_scene(photos, tmp_path / "scene.hyrf", quality="draft").work
     (work / "scene" / "images" / "0004.png").unlink()
     said: list[str] = []
     result = make_scene(photos, tmp_path / "other.hyrf", work=work, quality="draft", say=said.append)
-    assert len(poses) == 2 and result.kept == tuple(STAGES[:-1]) and "poses: made anew, for its files changed" in said
+    assert (
+        len(poses) == 2 and result.kept == tuple(STAGE_NAMES[:-1]) and "poses: made anew, for its files changed" in said
+    )
 
 
-def test_made_again_it_is_all_there_and_made_otherwise_it_is_not_replaced_unasked(made, posed, tmp_path):
-    work, output = copy_of(made, tmp_path), tmp_path / "scene.html"
+def test_a_repeated_call_keeps_everything_and_a_changed_output_needs_overwrite(finished_work, posed, tmp_path):
+    work, output = copy_work(finished_work, tmp_path), tmp_path / "scene.html"
     make_scene(posed, output, work=work)
     before = output.read_bytes()
     assert len(make_scene(posed, output, work=work).kept) == 4
@@ -331,10 +336,10 @@ def test_made_again_it_is_all_there_and_made_otherwise_it_is_not_replaced_unaske
     assert output.read_bytes() != before
 
 
-# -- what is refused -------------------------------------------------------------------------------------------------
+# -- errors ----------------------------------------------------------------------------------------------------------
 
 
-def test_what_cannot_be_is_rejected_before_any_work(posed, photos, made, tmp_path, monkeypatch):
+def test_impossible_requests_are_rejected_before_any_work(posed, photos, finished_work, tmp_path, monkeypatch):
     monkeypatch.setattr("hyrfpack.make.stages.train", None)
     (tmp_path / "there.html").write_bytes(b"mine")
     (tmp_path / "full").mkdir()
@@ -355,10 +360,10 @@ def test_what_cannot_be_is_rejected_before_any_work(posed, photos, made, tmp_pat
         ("holds other files", posed, "-o", out, "--work", tmp_path / "full"),
         ("the folder is empty", tmp_path / "empty", "-o", out),
         ("but clip.mp4; name the video", tmp_path / "videos", "-o", out),
-        ("is a .hyrf file already", made / "model.hyrf", "-o", tmp_path / "a.hyrf"),
-        ("with photos only", made / "model.hyrf", "-o", out, "--minutes", 3),
-        ("with photos only", made / "model.hyrf", "-o", out, "--max-gaussians", 30),
-        ("with photos only", made / "model.hyrf", "-o", out, "--preset", "large"),
+        ("is a .hyrf file already", finished_work / "model.hyrf", "-o", tmp_path / "a.hyrf"),
+        ("with photos only", finished_work / "model.hyrf", "-o", out, "--minutes", 3),
+        ("with photos only", finished_work / "model.hyrf", "-o", out, "--max-gaussians", 30),
+        ("with photos only", finished_work / "model.hyrf", "-o", out, "--preset", "large"),
         ("give one of them", posed, "-o", out, "--minutes", 3, "--quality", "draft"),
         ("give one of them", posed, "-o", out, "--max-gaussians", 300, "--target-size", "1MB"),
         ("name a folder of photos", tmp_path / "letter.txt", "-o", out),
@@ -370,7 +375,7 @@ def test_what_cannot_be_is_rejected_before_any_work(posed, photos, made, tmp_pat
     assert (tmp_path / "there.html").read_bytes() == b"mine"
 
 
-def test_a_stage_that_fails_names_its_folder_and_keeps_what_is_finished(posed, tmp_path, monkeypatch):
+def test_a_failed_stage_names_its_folder_and_keeps_finished_stages(posed, tmp_path, monkeypatch):
     def full(*arguments, **options):
         raise HyrfError("the disk is full", fix="free some space")
 
@@ -382,8 +387,8 @@ def test_a_stage_that_fails_names_its_folder_and_keeps_what_is_finished(posed, t
 
 
 @pytest.mark.parametrize("given", ["clip.mp4", "one photo"])
-def test_what_fails_before_any_stage_is_finished_leaves_nothing_behind(given, tmp_path, monkeypatch):
-    """With the real estimation of poses: a video that is none, and a folder with one photo."""
+def test_a_failure_before_the_first_finished_stage_leaves_no_files(given, tmp_path, monkeypatch):
+    """The estimation of poses is the real one; the inputs are a file that is no video, and a folder with one photo."""
     if given == "clip.mp4":
         (tmp_path / given).write_bytes(b"no video" * 100)
     else:
@@ -424,26 +429,26 @@ def test_a_record_that_is_damaged_is_rejected(record, reason, posed, tmp_path):
         make_scene(posed, tmp_path / "scene.hyrf", work=tmp_path / "work")
 
 
-def test_two_calls_in_one_work_folder_are_kept_apart(made, posed, tmp_path):
+def test_a_second_call_in_the_same_work_folder_is_rejected(finished_work, posed, tmp_path):
     pytest.importorskip("fcntl", reason="locks are of Unix")
-    work = copy_of(made, tmp_path)
+    work = copy_work(finished_work, tmp_path)
     with exclusive_folder(work), pytest.raises(HyrfError, match="another hyrfpack command is at work.*`work`"):
         make_scene(posed, tmp_path / "scene.hyrf", work=work)
     assert len(make_scene(posed, tmp_path / "scene.hyrf", work=work).kept) == 4
 
 
-def test_an_output_without_a_name_of_its_own_is_rejected_or_the_present_folder(made, tmp_path, monkeypatch):
-    assert "the root folder" in refused("make", made / "model.hyrf", "-o", "/")
+def test_an_output_without_a_name_is_rejected_or_the_current_folder(finished_work, tmp_path, monkeypatch):
+    assert "the root folder" in refused("make", finished_work / "model.hyrf", "-o", "/")
     (tmp_path / "player").mkdir()
     monkeypatch.chdir(tmp_path / "player")
-    succeeded("make", made / "model.hyrf", "-o", ".")
+    succeeded("make", finished_work / "model.hyrf", "-o", ".")
     assert (tmp_path / "player" / "index.html").is_file() and (tmp_path / "player.work" / "make.json").is_file()
 
 
 # -- the command -----------------------------------------------------------------------------------------------------
 
 
-def test_the_command_tells_what_was_made(photos, poses, tmp_path):
+def test_the_command_reports_its_results(photos, poses, tmp_path):
     result = succeeded("make", photos, "-o", tmp_path / "scene.html", "--quality", "draft")
     for part in (
         "poses: 18 of 19 photos, 17 of them sure\n",
@@ -457,11 +462,11 @@ def test_the_command_tells_what_was_made(photos, poses, tmp_path):
     numbers = json.loads(
         succeeded("make", photos, "-o", tmp_path / "scene.html", "--quality", "draft", "--json").stdout
     )
-    assert numbers["kept"] == ["poses", *STAGES] and numbers["views"] == 3 and numbers["poses"]["sure"] == 17
-    assert numbers["total_seconds"] == pytest.approx(sum(numbers["seconds"].values()), abs=0.5)  # each is rounded
+    assert numbers["kept"] == ["poses", *STAGE_NAMES] and numbers["views"] == 3 and numbers["poses"]["sure"] == 17
+    assert numbers["total_seconds"] == pytest.approx(sum(numbers["seconds"].values()), abs=0.5)  # each value is rounded
 
 
-def test_the_command_says_where_it_was_stopped(posed, tmp_path, monkeypatch):
+def test_the_command_reports_where_it_was_stopped(posed, tmp_path, monkeypatch):
     def stop(*arguments, **options):
         raise KeyboardInterrupt
 
@@ -475,14 +480,14 @@ def test_the_command_says_where_it_was_stopped(posed, tmp_path, monkeypatch):
 # -- train --poses ---------------------------------------------------------------------------------------------------
 
 
-def test_training_on_photos_without_poses_names_the_command(photos, tmp_path):
+def test_training_on_photos_without_poses_names_the_command_that_estimates_them(photos, tmp_path):
     sentence = refused("train", photos, "-o", tmp_path / "run")
     assert f"{photos}: no poses found for the 18 photos; 'hyrfpack poses {photos} -o SCENE' estimates them" in sentence
     (tmp_path / "clip.mp4").write_bytes(b"frames")
     assert "'hyrfpack poses" in refused("train", tmp_path / "clip.mp4", "-o", tmp_path / "run")
 
 
-def test_training_estimates_poses_where_asked_and_once(photos, poses, tmp_path):
+def test_training_estimates_poses_once_with_the_option(photos, poses, tmp_path):
     arguments = ("train", photos, "-o", tmp_path / "run", "--poses", "--steps", 3, "--max-gaussians", 50)
     succeeded(*arguments)
     assert (tmp_path / "run" / "model.hyrf").is_file() and (tmp_path / "run" / "scene" / "sparse").is_dir()

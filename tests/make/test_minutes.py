@@ -1,4 +1,4 @@
-"""Steps that fit a time follow from what was measured."""
+"""The number of steps that fits a time limit follows from the measured cost."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from hyrfpack.train import decisions
 from hyrfpack.train.config import FULL_STEPS
 
 
-def asked(target_bytes: int | None = None, max_gaussians: int | None = None) -> Plan:
+def make_plan(target_bytes: int | None = None, max_gaussians: int | None = None) -> Plan:
     return Plan(3_000, 1_600, target_bytes=target_bytes, max_gaussians=max_gaussians)
 
 
-COST = SceneCost(
+MEASURED_COST = SceneCost(
     step_seconds=0.1, step_seconds_per_gaussian=1e-6, decoding_seconds=0.01, cpu_pass_seconds=0.05, gaussians=5_000
 )
-CPU = torch.device("cpu")
+CPU_DEVICE = torch.device("cpu")
 
 
 @pytest.fixture(scope="module")
@@ -34,42 +34,42 @@ def scene(posed):
 
 
 @pytest.mark.parametrize("seconds", [60.0, 300.0, 1500.0])
-def test_the_most_steps_that_fit_are_taken(seconds, scene):
-    steps = COST.max_steps_within(scene, seconds)
+def test_the_largest_number_of_steps_that_fits_is_used(seconds, scene):
+    steps = MEASURED_COST.max_steps_within(scene, seconds)
     assert 1 < steps < FULL_STEPS
-    assert COST.total_seconds(scene, steps) <= seconds < COST.total_seconds(scene, steps + 1)
+    assert MEASURED_COST.total_seconds(scene, steps) <= seconds < MEASURED_COST.total_seconds(scene, steps + 1)
 
 
-def test_steps_end_at_a_full_run(scene):
-    assert COST.max_steps_within(scene, 1e9) == FULL_STEPS
-    assert COST.max_steps_within(scene, 0.0) == 1
+def test_steps_are_limited_to_a_full_run(scene):
+    assert MEASURED_COST.max_steps_within(scene, 1e9) == FULL_STEPS
+    assert MEASURED_COST.max_steps_within(scene, 0.0) == 1
 
 
-def test_more_pixels_take_as_much_longer(scene):
-    four = COST.scaled_to_pixels(4.0)
-    assert four.training_seconds(scene, 1000) - COST.training_seconds(scene, 1000) == pytest.approx(
-        3 * (COST.training_seconds(scene, 1000) - COST.decoding_seconds * len(scene.train))
+def test_step_time_grows_with_the_number_of_pixels(scene):
+    four = MEASURED_COST.scaled_to_pixels(4.0)
+    assert four.training_seconds(scene, 1000) - MEASURED_COST.training_seconds(scene, 1000) == pytest.approx(
+        3 * (MEASURED_COST.training_seconds(scene, 1000) - MEASURED_COST.decoding_seconds * len(scene.train))
     )
 
 
 def test_a_smaller_model_takes_less_time(scene):
-    small = replace(COST, requested=asked(15_000))
-    assert small.training_seconds(scene, 1000) < COST.training_seconds(scene, 1000)
+    small = replace(MEASURED_COST, requested=make_plan(15_000))
+    assert small.training_seconds(scene, 1000) < MEASURED_COST.training_seconds(scene, 1000)
     assert (
         small.seconds_after_training(scene, 1000)["compression"]
-        < COST.seconds_after_training(scene, 1000)["compression"]
+        < MEASURED_COST.seconds_after_training(scene, 1000)["compression"]
     )
 
 
-def test_a_line_goes_through_what_is_on_a_line_and_never_falls():
+def test_a_linear_fit_is_exact_on_a_line_and_never_decreases():
     counts = list(range(100, 1000, 20))
     assert minutes._fit_line(counts, [0.5 + 1e-3 * n for n in counts]) == pytest.approx((0.5, 1e-3))
     assert minutes._fit_line(counts, [2 - 1e-3 * n for n in counts]) == (pytest.approx(1.16), 0.0)
     assert minutes._fit_line([7] * 9, [0.1] * 9) == (pytest.approx(0.1), 0.0)
 
 
-def test_a_measurement_gives_a_cost_of_this_scene(scene):
-    cost = minutes.measure_scene_cost(scene, asked(), CPU, 0, PictureCache(), 5.0)
+def test_measuring_a_scene_gives_its_cost(scene):
+    cost = minutes.measure_scene_cost(scene, make_plan(), CPU_DEVICE, 0, PictureCache(), 5.0)
     assert (
         cost.step_seconds >= 0
         and cost.step_seconds_per_gaussian >= 0
@@ -78,7 +78,7 @@ def test_a_measurement_gives_a_cost_of_this_scene(scene):
     assert cost.cpu_pass_seconds > 0 and cost.decoding_seconds >= 0 and cost.gaussians > 0
 
 
-def test_large_photos_are_made_smaller_where_the_time_is_short(posed, scene, monkeypatch):
+def test_large_photos_are_reduced_when_time_is_short(posed, scene, monkeypatch):
     def cost(scene, *_):
         return SceneCost(1e-3 * scene.train[0].camera.width ** 2, 0.0, 0.0, 0.0, 100)
 
@@ -87,7 +87,16 @@ def test_large_photos_are_made_smaller_where_the_time_is_short(posed, scene, mon
     said: list[str] = []
 
     def planned(seconds: float) -> Plan:
-        arguments = (posed, LoadSettings(), scene, asked(90_000), CPU, monotonic() + seconds, 0, PictureCache())
+        arguments = (
+            posed,
+            LoadSettings(),
+            scene,
+            make_plan(90_000),
+            CPU_DEVICE,
+            monotonic() + seconds,
+            0,
+            PictureCache(),
+        )
         return fit_plan_to_minutes(*arguments, Reporter(["training"], None), said.append)
 
     plans = [planned(seconds) for seconds in (3000.0, 300.0, 100.0)]
@@ -95,12 +104,21 @@ def test_large_photos_are_made_smaller_where_the_time_is_short(posed, scene, mon
     assert plans[0].steps > 1000 and any("pixels" in sentence for sentence in said)
 
 
-def test_a_long_run_has_the_budget_that_the_scene_is_worth_and_a_short_one_all(posed, scene, monkeypatch):
+def test_a_long_run_has_the_measured_budget_and_a_short_one_the_default(posed, scene, monkeypatch):
     monkeypatch.setattr(minutes, "measure_scene_cost", lambda *_: SceneCost(0.0, 1e-5, 0.0, 0.0, 100))
     monkeypatch.setattr(decisions, "measure_budget", lambda *_: (0.5, "by a coin"))
 
     def planned(seconds: float, target_bytes: int | None = None) -> Plan:
-        arguments = (posed, LoadSettings(), scene, asked(target_bytes), CPU, monotonic() + seconds, 0, PictureCache())
+        arguments = (
+            posed,
+            LoadSettings(),
+            scene,
+            make_plan(target_bytes),
+            CPU_DEVICE,
+            monotonic() + seconds,
+            0,
+            PictureCache(),
+        )
         return fit_plan_to_minutes(*arguments, Reporter(["training"], None), lambda sentence: None)
 
     short, long, targeted = planned(60.0), planned(600.0), planned(600.0, 90_000)
@@ -110,19 +128,37 @@ def test_a_long_run_has_the_budget_that_the_scene_is_worth_and_a_short_one_all(p
     assert planned(600.0).steps < 0.8 * long.steps
 
 
-def test_a_time_that_is_over_or_too_short_makes_a_draft_and_says_so(posed, scene):
+def test_too_little_time_gives_a_draft_with_a_note(posed, scene):
     said: list[str] = []
     for seconds in (-1.0, 0.5):
-        arguments = (posed, LoadSettings(), scene, asked(20_000), CPU, monotonic() + seconds, 0, PictureCache())
+        arguments = (
+            posed,
+            LoadSettings(),
+            scene,
+            make_plan(20_000),
+            CPU_DEVICE,
+            monotonic() + seconds,
+            0,
+            PictureCache(),
+        )
         plan = fit_plan_to_minutes(*arguments, Reporter(["training"], None), said.append)
         assert (plan.steps, plan.target_bytes) == (6, 20_000)
     assert "the time is over" in said[0] and "the time is short" in said[1]
 
 
-def test_a_number_of_gaussians_is_kept_to_and_no_budget_measured(posed, scene, monkeypatch):
+def test_an_explicit_number_of_gaussians_replaces_the_measured_budget(posed, scene, monkeypatch):
     monkeypatch.setattr(minutes, "measure_scene_cost", lambda *_: SceneCost(0.0, 1e-5, 0.0, 0.0, 100))
     monkeypatch.setattr(decisions, "measure_budget", None)
-    arguments = (posed, LoadSettings(), scene, asked(max_gaussians=700), CPU, monotonic() + 600, 0, PictureCache())
+    arguments = (
+        posed,
+        LoadSettings(),
+        scene,
+        make_plan(max_gaussians=700),
+        CPU_DEVICE,
+        monotonic() + 600,
+        0,
+        PictureCache(),
+    )
     plan = fit_plan_to_minutes(*arguments, Reporter(["training"], None), lambda sentence: None)
     assert (plan.train_config(0).max_gaussians, plan.budget_factor) == (700, None)
 
@@ -131,11 +167,20 @@ def test_photos_are_never_larger_than_asked_for(posed, scene, monkeypatch):
     monkeypatch.setattr(minutes, "measure_scene_cost", lambda *_: SceneCost(1e-3, 0.0, 0.0, 0.0, 100))
     reading = LoadSettings(max_size=24)
     for seconds in (600.0, -1.0):
-        arguments = (posed, reading, reading.load(posed), asked(90_000), CPU, monotonic() + seconds, 0, PictureCache())
+        arguments = (
+            posed,
+            reading,
+            reading.load(posed),
+            make_plan(90_000),
+            CPU_DEVICE,
+            monotonic() + seconds,
+            0,
+            PictureCache(),
+        )
         assert fit_plan_to_minutes(*arguments, Reporter(["training"], None), lambda sentence: None).max_size == 24
 
 
-def test_what_was_decided_is_kept(posed, tmp_path, monkeypatch):
+def test_decisions_are_kept_by_the_next_call(posed, tmp_path, monkeypatch):
     first = make_scene(posed, tmp_path / "scene.hyrf", minutes=0.01)
     assert list(first.seconds)[0] == "measurement"
     monkeypatch.setattr(minutes, "measure_scene_cost", None)

@@ -1,4 +1,4 @@
-"""What `describe_photos` says of sets whose faults are made here."""
+"""`describe_photos` names the faults of synthetic sets."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from hyrfpack.errors import HyrfDataError
 from hyrfpack.make.survey import PhotoSurvey, describe_photos
 
 
-def blocks(seed: int, width: int = 160, height: int = 120) -> np.ndarray:
-    """(H, W, 3) uint8: rectangles over one another."""
+def random_rectangles(seed: int, width: int = 160, height: int = 120) -> np.ndarray:
+    """Return a (H, W, 3) uint8 picture of overlapping rectangles."""
     generator = np.random.default_rng(seed)
     picture = np.full((height, width, 3), 128, np.uint8)
     for _ in range(80):
@@ -34,7 +34,7 @@ def blocks(seed: int, width: int = 160, height: int = 120) -> np.ndarray:
     return picture
 
 
-def save(path: Path, picture: np.ndarray, focal: float | None = None, orientation: int = 1) -> None:
+def save_photo(path: Path, picture: np.ndarray, focal: float | None = None, orientation: int = 1) -> None:
     exif = Image.Exif()
     exif[0x010F], exif[0x0110], exif[0x0112] = "Acme", "Phone 3", orientation
     if focal is not None:
@@ -45,28 +45,31 @@ def save(path: Path, picture: np.ndarray, focal: float | None = None, orientatio
 
 @pytest.fixture
 def photos(tmp_path) -> Path:
-    """24 photos with nothing wrong but that they have no poses."""
+    """24 photos whose only problem is that they have no poses."""
     for number in range(24):
-        save(tmp_path / "photos" / f"{number:03d}.jpg", blocks(number), focal=26)
+        save_photo(tmp_path / "photos" / f"{number:03d}.jpg", random_rectangles(number), focal=26)
     return tmp_path / "photos"
 
 
-def problem(survey: PhotoSurvey, word: str) -> str:
-    """The one problem with a word in it."""
+def find_problem(survey: PhotoSurvey, word: str) -> str:
+    """Return the only problem that contains a word."""
     found = [sentence for sentence in survey.problems if word in sentence.replace(survey.path, "")]
     assert len(found) == 1, survey.problems
-    assert ";" in found[0]  # what, and what to do
+    assert ";" in found[0]  # what happened, and what to do
     return found[0]
 
 
-def test_photos_without_poses_are_told_how_to_continue_and_nothing_else(photos):
+def test_for_photos_without_poses_only_the_next_command_is_named(photos):
     survey = describe_photos(photos)
     assert (survey.kind, survey.photos, survey.posed, survey.layout) == ("photos", 24, 0, "")
     assert survey.sizes == {"160 x 120": 24}
     assert survey.cameras == {"Acme Phone 3, 26 mm": 24}
     assert survey.sharpness > 0.8 and survey.blurred == ()
     assert len(survey.problems) == 1
-    assert f"hyrfpack make {photos}" in problem(survey, "no poses") and f"hyrfpack poses {photos}" in survey.problems[0]
+    assert (
+        f"hyrfpack make {photos}" in find_problem(survey, "no poses")
+        and f"hyrfpack poses {photos}" in survey.problems[0]
+    )
 
 
 def test_posed_photos_are_described_with_their_poses(data):
@@ -77,66 +80,69 @@ def test_posed_photos_are_described_with_their_poses(data):
 
 
 def test_blurred_dark_and_copied_photos_are_named(photos):
-    blurred = ndimage.uniform_filter1d(blocks(5).astype(float), 9, axis=1).astype(np.uint8)
-    save(photos / "005.jpg", blurred, focal=26)
-    save(photos / "009.jpg", blocks(9) // 8, focal=26)
+    blurred = ndimage.uniform_filter1d(random_rectangles(5).astype(float), 9, axis=1).astype(np.uint8)
+    save_photo(photos / "005.jpg", blurred, focal=26)
+    save_photo(photos / "009.jpg", random_rectangles(9) // 8, focal=26)
     shutil.copy(photos / "012.jpg", photos / "012 (1).jpg")
     survey = describe_photos(photos)
-    assert survey.blurred == ("005.jpg",) and "005.jpg" in problem(survey, "blurred")
-    assert "009.jpg" in problem(survey, "darker")
-    copy = problem(survey, "copy of another")
+    assert survey.blurred == ("005.jpg",) and "005.jpg" in find_problem(survey, "blurred")
+    assert "009.jpg" in find_problem(survey, "darker")
+    copy = find_problem(survey, "copy of another")
     assert "012 (1).jpg" in copy and "012.jpg" in copy
 
 
-def test_a_set_that_is_blurred_throughout_is_noticed(photos):
+def test_a_completely_blurred_set_is_detected(photos):
     for number in range(24):
-        save(photos / f"{number:03d}.jpg", ndimage.gaussian_filter(blocks(number), (4, 4, 0)))
-    assert "most of them" in problem(describe_photos(photos), "blurred")
+        save_photo(photos / f"{number:03d}.jpg", ndimage.gaussian_filter(random_rectangles(number), (4, 4, 0)))
+    assert "most of them" in find_problem(describe_photos(photos), "blurred")
 
 
-def test_light_is_judged_by_the_set(photos):
+def test_dark_photos_are_judged_relative_to_the_set(photos):
     for number in range(24):
-        save(photos / f"{number:03d}.jpg", blocks(number) // 9)
-    assert "more light" in problem(describe_photos(photos), "dark")
+        save_photo(photos / f"{number:03d}.jpg", random_rectangles(number) // 9)
+    assert "more light" in find_problem(describe_photos(photos), "dark")
     for number in range(24):
-        save(photos / f"{number:03d}.jpg", np.minimum(255, (blocks(number) * (0.3 + 0.1 * number))).astype(np.uint8))
+        save_photo(
+            photos / f"{number:03d}.jpg",
+            np.minimum(255, (random_rectangles(number) * (0.3 + 0.1 * number))).astype(np.uint8),
+        )
     survey = describe_photos(photos)
-    assert survey.stops > 2.5 and "lock exposure" in problem(survey, "stops")
+    assert survey.stops > 2.5 and "lock exposure" in find_problem(survey, "stops")
 
 
-def test_photos_of_one_picture_are_noticed(photos):
+def test_photos_of_a_single_view_are_detected(photos):
     for number in range(24):
-        save(photos / f"{number:03d}.jpg", blocks(1), focal=26)
-    assert "walk around" in problem(describe_photos(photos), "same picture")
+        save_photo(photos / f"{number:03d}.jpg", random_rectangles(1), focal=26)
+    assert "walk around" in find_problem(describe_photos(photos), "same picture")
 
 
-def test_zooms_sides_and_sizes_are_told_apart(photos):
+def test_zooms_orientations_and_sizes_are_distinguished(photos):
     for number in range(10):
-        save(photos / f"{number:03d}.jpg", blocks(number), focal=52)
-    save(photos / "011.jpg", blocks(11), focal=26, orientation=6)
-    save(photos / "big.jpg", blocks(11, 2400, 1800), focal=26)
+        save_photo(photos / f"{number:03d}.jpg", random_rectangles(number), focal=52)
+    save_photo(photos / "011.jpg", random_rectangles(11), focal=26, orientation=6)
+    save_photo(photos / "big.jpg", random_rectangles(11, 2400, 1800), focal=26)
     survey = describe_photos(photos)
-    assert "Acme Phone 3" in problem(survey, "zooms")
+    assert "Acme Phone 3" in find_problem(survey, "zooms")
     assert survey.sizes == {"160 x 120": 23, "120 x 160": 1, "2400 x 1800": 1}
     assert any("stored on the side" in note for note in survey.notes)
     assert any("1 of 25 photos are larger" in note for note in survey.notes)
 
 
-def test_masks_that_fit_nothing_are_noticed(photos):
+def test_masks_without_matching_photos_are_detected(photos):
     for number in range(24):
-        save(photos / "masks" / f"{number:03d}.jpg.png", blocks(number))
-    assert len(describe_photos(photos).problems) == 1  # no poses
-    save(photos / "masks" / "other.png", blocks(1))
-    assert "other.png" in problem(describe_photos(photos), "masks")
+        save_photo(photos / "masks" / f"{number:03d}.jpg.png", random_rectangles(number))
+    assert len(describe_photos(photos).problems) == 1  # the missing poses
+    save_photo(photos / "masks" / "other.png", random_rectangles(1))
+    assert "other.png" in find_problem(describe_photos(photos), "masks")
 
 
 def test_photos_without_a_pose_among_posed_ones_are_counted(data, tmp_path):
     shutil.copytree(data, tmp_path / "set")
     for number in range(3):
-        save(tmp_path / "set" / "images" / f"new{number}.png", blocks(number, 48, 48))
+        save_photo(tmp_path / "set" / "images" / f"new{number}.png", random_rectangles(number, 48, 48))
     survey = describe_photos(tmp_path / "set")
     assert (survey.photos, survey.posed) == (13, 10)
-    assert "hyrfpack poses" in problem(survey, "3 of 13 photos have no pose")
+    assert "hyrfpack poses" in find_problem(survey, "3 of 13 photos have no pose")
 
 
 def test_damaged_photos_are_named_and_the_others_described(photos):
@@ -145,10 +151,10 @@ def test_damaged_photos_are_named_and_the_others_described(photos):
     (photos / "004.jpg").write_bytes(whole[: len(whole) // 2])
     survey = describe_photos(photos)
     assert survey.decoded == 22
-    assert "003.jpg" in problem(survey, "2 of 24 photos cannot be read")
+    assert "003.jpg" in find_problem(survey, "2 of 24 photos cannot be read")
 
 
-def test_poses_that_cannot_be_used_are_a_problem_of_the_set(data, tmp_path):
+def test_unusable_poses_are_reported_as_a_problem_of_the_set(data, tmp_path):
     shutil.copytree(data, tmp_path / "set")
     for table in [*(tmp_path / "set").rglob("*.json"), *(tmp_path / "set").rglob("*.bin")]:
         table.write_bytes(table.read_bytes()[: table.stat().st_size // 2])
@@ -157,13 +163,13 @@ def test_poses_that_cannot_be_used_are_a_problem_of_the_set(data, tmp_path):
     assert any(str(tmp_path / "set") in sentence for sentence in survey.problems)
 
 
-def test_large_sets_are_looked_at_in_part(photos, monkeypatch):
+def test_only_some_photos_of_large_sets_are_examined(photos, monkeypatch):
     monkeypatch.setattr("hyrfpack.make.survey.MAX_DECODED_PHOTOS", 8)
     survey = describe_photos(photos)
     assert survey.decoded == 8 and any("8 of 24 photos" in note for note in survey.notes)
 
 
-def test_a_zip_is_described_as_its_folder(data, tmp_path, monkeypatch):
+def test_a_zip_archive_is_described_like_its_folder(data, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     with zipfile.ZipFile(tmp_path / "set.zip", "w") as archive:
         for file in sorted(data.rglob("*")):
@@ -172,7 +178,7 @@ def test_a_zip_is_described_as_its_folder(data, tmp_path, monkeypatch):
     assert survey.path == str(tmp_path / "set.zip") and survey.photos == 10
 
 
-def test_where_there_are_no_photos_it_says_so(tmp_path):
+def test_a_folder_without_photos_is_reported_as_such(tmp_path):
     for name, sentence in (("", "no photos here"), ("IMG.dng", "raw file"), ("clip.MP4", "name the video itself")):
         if name:
             (tmp_path / name).touch()
@@ -182,7 +188,7 @@ def test_where_there_are_no_photos_it_says_so(tmp_path):
         describe_photos(tmp_path / "nowhere")
 
 
-def test_info_prints_it_as_text_and_as_json(photos):
+def test_info_prints_the_survey_as_text_and_as_json(photos):
     survey = describe_photos(photos)
     found = json.loads(succeeded("info", photos, "--json").stdout)
     assert found == json.loads(json.dumps(asdict(survey)))
@@ -193,7 +199,7 @@ def test_info_prints_it_as_text_and_as_json(photos):
 
 def test_info_of_a_video_says_how_many_frames_would_be_taken(tmp_path):
     av = pytest.importorskip("av")
-    wall = blocks(3, 700, 120)
+    wall = random_rectangles(3, 700, 120)
     with av.open(str(tmp_path / "clip.mp4"), "w") as container:
         stream = container.add_stream("libx264", rate=30, options={"crf": "16"})
         stream.width, stream.height, stream.pix_fmt = 160, 120, "yuv420p"
@@ -207,7 +213,7 @@ def test_info_of_a_video_says_how_many_frames_would_be_taken(tmp_path):
     assert "frames would be" in succeeded("info", tmp_path / "clip.mp4").stdout
 
 
-def test_info_of_what_is_no_photo_is_a_clear_error(tmp_path):
+def test_info_of_a_file_that_is_no_photo_is_a_clear_error(tmp_path):
     (tmp_path / "clip.mp4").write_bytes(b"no video")
     assert "cannot be read as a video" in refused("info", tmp_path / "clip.mp4")
     (tmp_path / "set.zip").write_bytes(b"no archive")

@@ -9,7 +9,7 @@ from hyrfpack.errors import HyrfError
 from hyrfpack.measure.error import Error, largest_error, measure_error, measure_relative_error
 
 
-def test_difference_tells_the_largest_and_the_root_mean_square():
+def test_difference_gives_the_maximum_and_the_root_mean_square():
     off = measure_error(torch.tensor([1.0, 2.0, 7.0]), torch.tensor([1.0, -1.0, 3.0]), "numbers")
     assert off.max == 4 and off.rms == pytest.approx(math.sqrt((0 + 9 + 16) / 3))
 

@@ -7,7 +7,7 @@ from hyrfpack.measure.timing import Timing, time_alternately
 
 
 class Clock:
-    """Stands still but for what tasks take: seconds of wall time each, and twice as many of processor time."""
+    """A clock that only tasks advance, by their seconds of wall time and twice as many of processor time."""
 
     def __init__(self, monkeypatch):
         self.now, self.calls = 0.0, []
@@ -25,7 +25,7 @@ class Clock:
         return run
 
 
-def test_contenders_take_turns_after_one_unmeasured_run_each(monkeypatch):
+def test_tasks_alternate_after_one_unmeasured_run_each(monkeypatch):
     clock = Clock(monkeypatch)
     _, results = time_alternately({"a": clock.task("a", [0.1] * 4), "b": clock.task("b", [0.1] * 4)}, 3)
     assert clock.calls == list("abababab")
@@ -46,17 +46,17 @@ def test_a_task_that_takes_long_enough_leaves_the_round(monkeypatch):
     assert (timings["slow"].repeats, timings["fast"].repeats) == (2, 6)
 
 
-def test_a_quick_task_is_warmed_before_each_of_its_turns(monkeypatch):
+def test_a_quick_task_is_warmed_up_before_each_of_its_turns(monkeypatch):
     monkeypatch.setattr(timing, "WARM_UP_SECONDS", 0.1)
     clock = Clock(monkeypatch)
-    warm = [0.03, 0.03, 0.03, 0.03]  # the fourth begins before a tenth of a second is over
+    warm = [0.03, 0.03, 0.03, 0.03]  # the fourth run begins before 0.1 s have passed
     tasks = {"slow": clock.task("slow", [0.1] * 3), "quick": clock.task("quick", [0.05, *warm, 0.02, *warm, 0.01])}
     timings, _ = time_alternately(tasks, 2)
     assert clock.calls == ["slow", "quick", "slow", *["quick"] * 5, "slow", *["quick"] * 5]
     assert timings["quick"].ms == pytest.approx(15) and timings["quick"].repeats == 2
 
 
-def test_the_first_run_is_the_time_of_a_task_that_is_too_slow_to_repeat(monkeypatch):
+def test_a_task_too_slow_to_repeat_is_timed_by_its_first_run(monkeypatch):
     clock = Clock(monkeypatch)
     timings, results = time_alternately({"slow": clock.task("slow", [5.0])}, 7)
     assert clock.calls == ["slow"] and results["slow"] == ("slow", 1)

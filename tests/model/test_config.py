@@ -9,7 +9,7 @@ import torch
 from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians
 
-CONFIG = ModelConfig(
+MODEL_CONFIG = ModelConfig(
     frame=Frame((1.0, -2.0, 3e5), 0.125, (1.0, 0.25, 0.5)),
     geometry=HashGridConfig(9, levels=8, base=16, finest=256),
     radiance=HashGridConfig(10),
@@ -22,15 +22,15 @@ CONFIG = ModelConfig(
 
 
 def test_config_survives_json():
-    assert ModelConfig.from_dict(json.loads(json.dumps(CONFIG.to_dict()))) == CONFIG
+    assert ModelConfig.from_dict(json.loads(json.dumps(MODEL_CONFIG.to_dict()))) == MODEL_CONFIG
 
 
 def test_by_default_grids_rise_from_8_to_512_vertices_and_directions_have_24_inputs():
     grid = HashGridConfig(10)
     ratios = np.divide(grid.resolutions[1:], grid.resolutions[:-1])
     assert len(grid.resolutions) == 16 and (grid.resolutions[0], grid.resolutions[-1]) == (8, 512)
-    assert np.abs(ratios - 64 ** (1 / 15)).max() < 1 / 8  # geometric, up to whole vertices
-    config = ModelConfig(CONFIG.frame, geometry=grid, radiance=grid)
+    assert np.abs(ratios - 64 ** (1 / 15)).max() < 1 / 8  # geometric, up to rounding to whole vertices
+    config = ModelConfig(MODEL_CONFIG.frame, geometry=grid, radiance=grid)
     nothing = Gaussians(*(torch.zeros(0, width) for width in Gaussians.PARAMETER_WIDTHS))
     model = HybridModel(config, nothing)
     assert model.radiance.weights[0].shape == (64, 16 * 2 + 24)
@@ -53,12 +53,12 @@ def test_by_default_grids_rise_from_8_to_512_vertices_and_directions_have_24_inp
 )
 def test_config_rejects_wrong_fields(name, value):
     with pytest.raises((KeyError, TypeError, ValueError)):
-        ModelConfig.from_dict({**CONFIG.to_dict(), name: value})
+        ModelConfig.from_dict({**MODEL_CONFIG.to_dict(), name: value})
 
 
 @pytest.mark.parametrize("name", ["frame", "geometry", "radiance"])
 def test_config_rejects_missing_fields(name):
-    values = CONFIG.to_dict()
+    values = MODEL_CONFIG.to_dict()
     del values[name]
     with pytest.raises((KeyError, TypeError, ValueError)):
         ModelConfig.from_dict(values)

@@ -14,22 +14,22 @@ from hyrfpack.choices import CONSISTENT_EXPOSURE
 from hyrfpack.model.exposure import MAX_CENTERS, ExposureMap, apply_exposure_gains
 from hyrfpack.render import RenderSettings, render_view
 
-SEEDS = st.integers(0, 2**32 - 1)
+RANDOM_SEEDS = st.integers(0, 2**32 - 1)
 
 
-def unit(vectors: np.ndarray) -> np.ndarray:
+def normalize(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
-def viewpoints(seed: int, count: int = 50) -> tuple[np.ndarray, np.ndarray]:
+def random_viewpoints(seed: int, count: int = 50) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
-    return rng.normal(size=(count, 3)), unit(rng.normal(size=(count, 3)))
+    return rng.normal(size=(count, 3)), normalize(rng.normal(size=(count, 3)))
 
 
-@given(SEEDS)
+@given(RANDOM_SEEDS)
 def test_gains_follow_the_documented_sum(seed):
     exposure = random_map(seed)
-    positions, directions = viewpoints(seed)
+    positions, directions = random_viewpoints(seed)
     least, largest = exposure.box.astype(float)
     for position, direction in zip(positions[:5], directions[:5], strict=True):
         expected = exposure.mean.astype(float)
@@ -42,14 +42,14 @@ def test_gains_follow_the_documented_sum(seed):
         np.testing.assert_allclose(exposure.predict_log_gains(position, direction), expected, rtol=1e-5, atol=1e-6)
 
 
-@given(SEEDS)
+@given(RANDOM_SEEDS)
 def test_exposure_changes_no_faster_than_its_bound(seed):
     exposure = random_map(seed)
     per_unit, per_radian = exposure.slope_bounds
-    positions, directions = viewpoints(seed)
+    positions, directions = random_viewpoints(seed)
     rng = np.random.default_rng(seed)
     moved = positions + rng.normal(size=positions.shape) * 10.0 ** rng.uniform(-5, 1, (len(positions), 1))
-    turned = unit(directions + rng.normal(size=positions.shape) * 10.0 ** rng.uniform(-5, 0, (len(positions), 1)))
+    turned = normalize(directions + rng.normal(size=positions.shape) * 10.0 ** rng.uniform(-5, 0, (len(positions), 1)))
     here = exposure.predict_log_gains(positions, directions)
 
     change = np.abs(exposure.predict_log_gains(moved, directions) - here).max(1)
@@ -59,10 +59,10 @@ def test_exposure_changes_no_faster_than_its_bound(seed):
     assert (change <= per_radian * angle + 1e-9).all()
 
 
-@given(SEEDS)
-def test_far_from_the_cameras_the_exposure_is_that_of_the_nearest_viewpoint_among_them(seed):
+@given(RANDOM_SEEDS)
+def test_far_from_the_cameras_the_exposure_is_that_of_the_nearest_viewpoint(seed):
     exposure = random_map(seed)
-    positions, directions = viewpoints(seed)
+    positions, directions = random_viewpoints(seed)
     nearest = np.clip(positions * 1e6, *exposure.box.astype(float))
     np.testing.assert_allclose(
         exposure.predict_log_gains(positions * 1e6, directions),
@@ -101,7 +101,7 @@ def constant_map(log_gains: list[float]) -> ExposureMap:
     )
 
 
-def test_render_applies_the_map_unless_one_exposure_is_asked_for():
+def test_render_applies_the_map_unless_one_exposure_is_requested():
     model, camera = small_model(ball_points(50)[0]), ball_scene().train[0].camera
     plain = render_view(model, camera).rgb
     model.exposure = constant_map([0.5, 0.0, -0.25])
@@ -126,7 +126,7 @@ def test_an_unknown_exposure_is_rejected():
         RenderSettings(exposure="bright")
 
 
-def test_a_part_of_a_model_keeps_its_map():
+def test_a_subset_of_a_model_keeps_its_exposure_map():
     model = small_model(ball_points(50)[0])
     model.exposure = random_map(1)
     assert model.part(torch.arange(3)).exposure is model.exposure

@@ -11,11 +11,11 @@ from hyrfpack.model.field import Field
 from hyrfpack.model.hash_grid import HashGridConfig
 from hyrfpack.ops.shade import DIRECTION_FEATURES, encode_directions, spherical_harmonics
 
-GRID = HashGridConfig(log2_table_size=7, levels=3, base=3, finest=12)
+SMALL_GRID = HashGridConfig(log2_table_size=7, levels=3, base=3, finest=12)
 
 
 def sphere_quadrature() -> tuple[np.ndarray, np.ndarray]:
-    """Directions and weights that integrate polynomials up to degree 15 over the sphere exactly."""
+    """Return directions and weights that integrate polynomials up to degree 15 exactly over the sphere."""
     heights, weights = np.polynomial.legendre.leggauss(8)
     angles = 2 * np.pi * np.arange(16) / 16
     heights, angles = (grid.ravel() for grid in np.meshgrid(heights, angles, indexing="ij"))
@@ -25,7 +25,7 @@ def sphere_quadrature() -> tuple[np.ndarray, np.ndarray]:
 
 
 def legendre_harmonic(band: int, order: int, directions: np.ndarray) -> np.ndarray:
-    """Real spherical harmonic from associated Legendre functions, Condon-Shortley phase taken out."""
+    """Return a real spherical harmonic from associated Legendre functions, without the Condon-Shortley phase."""
     x, y, z = directions.T
     m = abs(order)
     norm = math.sqrt((2 * band + 1) / (4 * math.pi) * math.factorial(band - m) / math.factorial(band + m))
@@ -40,7 +40,7 @@ def test_spherical_harmonics_are_orthonormal():
     np.testing.assert_allclose(values.T @ (values * weights[:, None]), np.eye(9), atol=1e-12)
 
 
-def test_spherical_harmonics_come_in_the_order_of_bands_and_orders():
+def test_spherical_harmonics_are_ordered_by_band_and_order():
     directions, _ = sphere_quadrature()
     expected = [legendre_harmonic(l, m, directions) for l in range(3) for m in range(-l, l + 1)]  # noqa: E741
     values = spherical_harmonics(torch.from_numpy(directions)).numpy()
@@ -55,19 +55,19 @@ def test_frequency_encoding_is_sines_and_cosines_of_four_octaves():
 
 
 @pytest.mark.parametrize("encoding", ["sh", "frequency"])
-def test_encoded_directions_have_the_promised_width(encoding):
+def test_encoded_directions_have_the_declared_width(encoding):
     directions = torch.nn.functional.normalize(torch.randn(5, 3, generator=torch.Generator().manual_seed(0)), dim=1)
     assert encode_directions(directions, encoding).shape == (5, DIRECTION_FEATURES[encoding])
 
 
-def test_field_starts_near_zero_so_explicit_values_rule():
-    field = Field(GRID, outputs=8, hidden=64, generator=torch.Generator().manual_seed(0))
+def test_an_untrained_field_is_near_zero():
+    field = Field(SMALL_GRID, outputs=8, hidden=64, generator=torch.Generator().manual_seed(0))
     coords = torch.rand(500, 3, generator=torch.Generator().manual_seed(1))
     assert field(coords).abs().max() < 1e-2
 
 
 def test_field_weights_fill_the_xavier_range():
-    field = Field(GRID, outputs=8, hidden=64, extra_inputs=9, generator=torch.Generator().manual_seed(0))
+    field = Field(SMALL_GRID, outputs=8, hidden=64, extra_inputs=9, generator=torch.Generator().manual_seed(0))
     assert [tuple(w.shape) for w in field.weights] == [(64, 15), (64, 64), (8, 64)]
     for weight in field.weights:
         bound = math.sqrt(6 / sum(weight.shape))
@@ -75,10 +75,10 @@ def test_field_weights_fill_the_xavier_range():
         assert abs(weight.std() - bound / math.sqrt(3)) < 0.1 * bound
 
 
-# A squared length of the inputs of 9 / (4 pi) or 24 / 2, through Xavier layers with ReLUs, which halve it:
+# The squared length of the inputs is 9 / (4 pi) or 24 / 2. Xavier layers with ReLUs, which halve it, give
 # |x|^2 * 2 / (inputs + 64) / 2 * 64 * 2 / 128 / 2 * 64 * 2 / 67.
 @pytest.mark.parametrize(("encoding", "deviation"), [("sh", 0.0807), ("frequency", 0.309)])
-def test_an_untrained_field_of_directions_is_as_loud_as_its_inputs(encoding, deviation):
+def test_the_output_of_an_untrained_field_scales_with_its_direction_inputs(encoding, deviation):
     directions = torch.nn.functional.normalize(torch.randn(500, 3, generator=torch.Generator().manual_seed(0)), dim=1)
     extra = encode_directions(directions, encoding)
     squares = []
@@ -92,7 +92,7 @@ def test_an_untrained_field_of_directions_is_as_loud_as_its_inputs(encoding, dev
 
 def test_field_is_the_same_for_the_same_seed_only():
     def made(seed: int) -> Field:
-        return Field(GRID, outputs=3, hidden=16, generator=torch.Generator().manual_seed(seed))
+        return Field(SMALL_GRID, outputs=3, hidden=16, generator=torch.Generator().manual_seed(seed))
 
     for (_, a), (_, b) in zip(made(3).named_parameters(), made(3).named_parameters(), strict=True):
         assert torch.equal(a, b)

@@ -11,12 +11,12 @@ from hyrfpack.model.frame import MIN_HALF_EXTENT
 from hyrfpack.scene import Camera
 
 
-def a_camera(position=(3.0, -2.0, 1.0), target=(0.1, 0.2, 0.3)) -> Camera:
+def make_camera(position=(3.0, -2.0, 1.0), target=(0.1, 0.2, 0.3)) -> Camera:
     return Camera(64, 48, 70.0, 65.0, 30.0, 25.0, look_at(position, target))
 
 
 def project(points: np.ndarray, pose: np.ndarray, camera: Camera) -> np.ndarray:
-    """(N, 3): column, row and depth, by the pinhole formula."""
+    """Return (N, 3) column, row and depth by the pinhole formula."""
     x, y, z = (points @ pose[:3, :3].T + pose[:3, 3]).T
     return np.stack((camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy, z), axis=1)
 
@@ -25,7 +25,7 @@ def project(points: np.ndarray, pose: np.ndarray, camera: Camera) -> np.ndarray:
 def test_local_pose_sees_the_same_pixels_with_depth_in_local_units(offset):
     shift = np.array([offset, -offset, offset / 2])
     points = np.random.default_rng(4).uniform(-1, 1, (100, 3)) + shift
-    camera = a_camera(shift + (3.0, -2.0, 1.0), shift + (0.1, 0.2, 0.3))
+    camera = make_camera(shift + (3.0, -2.0, 1.0), shift + (0.1, 0.2, 0.3))
     frame = Frame.from_box(shift - (2, 3, 1), shift + (2.5, 3, 0.5))
 
     local = project(frame.to_local(points), frame.local_pose(camera), camera)
@@ -36,10 +36,10 @@ def test_local_pose_sees_the_same_pixels_with_depth_in_local_units(offset):
 
 
 def test_local_pose_keeps_a_close_scene_exact_a_million_units_away():
-    """Even after rounding to float32: the numbers the kernels get are small."""
+    """This holds even after rounding to float32, because the kernels get small numbers."""
     shift = np.array([1e6, 1e6, -1e6])
     points = np.random.default_rng(5).uniform(-1, 1, (100, 3))
-    near, far = a_camera(), a_camera(shift + (3.0, -2.0, 1.0), shift + (0.1, 0.2, 0.3))
+    near, far = make_camera(), make_camera(shift + (3.0, -2.0, 1.0), shift + (0.1, 0.2, 0.3))
     frame = Frame.from_box(shift - 1, shift + 1)
 
     local = frame.to_local(points + shift).astype(np.float32)
@@ -48,8 +48,8 @@ def test_local_pose_keeps_a_close_scene_exact_a_million_units_away():
     np.testing.assert_allclose(seen[:, :2], project(points, near.camera_from_world, near)[:, :2], rtol=0, atol=1e-3)
 
 
-def test_local_pose_leaves_the_camera_alone():
-    camera = a_camera()
+def test_local_pose_does_not_change_the_camera():
+    camera = make_camera()
     before = camera.camera_from_world.copy()
     Frame.from_box(np.full(3, 3.0), np.full(3, 9.0)).local_pose(camera)
     assert np.array_equal(camera.camera_from_world, before)
@@ -60,7 +60,7 @@ def test_millimetres_and_kilometres_give_the_same_local_coordinates():
     low, high = points.min(0), points.max(0)
     camera = camera_at((7.0, 1.0, 2.0))
     results = []
-    for unit in (1e3, 1e-3):  # the same metres, said in mm and in km
+    for unit in (1e3, 1e-3):  # the same lengths, in mm and in km
         pose = camera.camera_from_world.copy()
         pose[:3, 3] *= unit
         frame = Frame.from_box(low * unit, high * unit)

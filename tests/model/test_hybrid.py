@@ -8,12 +8,12 @@ from scenes import look_at, small_model
 from hyrfpack.model import Frame
 from hyrfpack.model.gaussians import Gaussians
 
-FRAME = Frame((0.0, 0.0, 0.0), 2.0, (1.0, 0.5, 0.25))
-VIEWPOINT = (0.3, -4.0, 1.5)
+BOX_FRAME = Frame((0.0, 0.0, 0.0), 2.0, (1.0, 0.5, 0.25))
+CAMERA_POSITION = (0.3, -4.0, 1.5)
 
 
-def points(count: int = 40, seed: int = 0) -> np.ndarray:
-    """Some inside the box, some far outside."""
+def random_points(count: int = 40, seed: int = 0) -> np.ndarray:
+    """Return points of which some are inside the box and some far outside."""
     generator = np.random.default_rng(seed)
     return generator.normal(size=(count, 3)) * generator.choice([0.2, 1, 5], (count, 1))
 
@@ -21,8 +21,8 @@ def points(count: int = 40, seed: int = 0) -> np.ndarray:
 def random_model(**settings):
     generator = torch.Generator().manual_seed(3)
     return small_model(
-        points(),
-        frame=FRAME,
+        random_points(),
+        frame=BOX_FRAME,
         fields=1.0,
         color_logits=torch.randn(40, 3, generator=generator),
         scale_logits=torch.randn(40, 1, generator=generator) - 2,
@@ -31,7 +31,7 @@ def random_model(**settings):
     )
 
 
-# -- the model by hand, in numpy float64 -----------------------------------------------------------------------------
+# -- the model in numpy, float64 -------------------------------------------------------------------------------------
 
 
 def sigmoid(x):
@@ -42,7 +42,7 @@ def as_float64(values: torch.Tensor) -> np.ndarray:
     return values.detach().double().numpy()
 
 
-def field_by_hand(field, cube: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
+def evaluate_field_in_numpy(field, cube: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
     table, config = as_float64(field.grid.table), field.grid.config
     rows = []
     for point in cube:
@@ -69,13 +69,13 @@ def field_by_hand(field, cube: np.ndarray, extra: np.ndarray | None = None) -> n
     return h
 
 
-def cube_by_hand(model, positions: np.ndarray) -> np.ndarray:
+def contract_in_numpy(model, positions: np.ndarray) -> np.ndarray:
     u = positions / model.config.frame.half_extent
     radius = np.linalg.norm(u, axis=1, keepdims=True)
     return np.where(radius <= 1, u / 4, (2 - 1 / radius) * u / radius / 4) + 0.5
 
 
-def directions_by_hand(d: np.ndarray, encoding: str) -> np.ndarray:
+def encode_directions_in_numpy(d: np.ndarray, encoding: str) -> np.ndarray:
     x, y, z = d.T
     if encoding == "frequency":
         phases = np.concatenate([np.pi * 2**k * d for k in range(4)], axis=1)
@@ -98,8 +98,10 @@ def test_geometry_is_the_aggregation_of_fields_and_explicit_values(scale_rule, s
     model = random_model(scale_rule=scale_rule, scale_grows=scale_grows)
     g = model.gaussians
     positions, s_e, a_e = map(as_float64, (g.positions, g.scale_logits, g.opacity_logits))
-    raw = field_by_hand(model.geometry, cube_by_hand(model, positions))
-    bound = np.maximum(1, np.linalg.norm(positions / FRAME.half_extent, axis=1, keepdims=True)) if scale_grows else 1
+    raw = evaluate_field_in_numpy(model.geometry, contract_in_numpy(model, positions))
+    bound = (
+        np.maximum(1, np.linalg.norm(positions / BOX_FRAME.half_extent, axis=1, keepdims=True)) if scale_grows else 1
+    )
     s_n = raw[:, 1:4]
     fraction = sigmoid(s_n + s_e) if scale_rule == "sum" else sigmoid(s_n) * sigmoid(s_e)
 
@@ -114,11 +116,13 @@ def test_geometry_is_the_aggregation_of_fields_and_explicit_values(scale_rule, s
 def test_colours_are_the_aggregation_seen_from_the_viewpoint(encoding):
     model = random_model(direction_encoding=encoding)
     positions, c_e = as_float64(model.gaussians.positions), as_float64(model.gaussians.color_logits)
-    directions = positions - VIEWPOINT
+    directions = positions - CAMERA_POSITION
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    raw = field_by_hand(model.radiance, cube_by_hand(model, positions), directions_by_hand(directions, encoding))
+    raw = evaluate_field_in_numpy(
+        model.radiance, contract_in_numpy(model, positions), encode_directions_in_numpy(directions, encoding)
+    )
 
-    colors = model.decode_colors(torch.tensor(VIEWPOINT))
+    colors = model.decode_colors(torch.tensor(CAMERA_POSITION))
 
     np.testing.assert_allclose(as_float64(colors), sigmoid(raw + c_e), atol=1e-5)
 
@@ -127,23 +131,25 @@ def test_colours_are_the_aggregation_seen_from_the_viewpoint(encoding):
 def test_background_is_the_radiance_field_on_the_sphere(encoding):
     model = random_model(background=True, direction_encoding=encoding)
     pose = look_at((0.2, -3.0, 0.4), (0, 0, 0))
-    points, intrinsics = np.array([[0.5, 0.5], [5.5, 0.5], [3.0, 4.2], [-1.0, 9.0]]), (5.0, 6.0, 2.9, 2.1)
+    pixels, intrinsics = np.array([[0.5, 0.5], [5.5, 0.5], [3.0, 4.2], [-1.0, 9.0]]), (5.0, 6.0, 2.9, 2.1)
     fx, fy, cx, cy = intrinsics
-    rays = np.stack([(points[:, 0] - cx) / fx, (points[:, 1] - cy) / fy, np.ones(4)], 1) @ pose[:3, :3]
+    rays = np.stack([(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy, np.ones(4)], 1) @ pose[:3, :3]
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     origin = -pose[:3, :3].T @ pose[:3, 3]
-    # |origin + t ray| = 100, the positive root of the quadratic equation.
+    # |origin + t ray| = 100 gives t as the positive root of the quadratic equation.
     distances = [max(np.roots([1, 2 * ray @ origin, origin @ origin - 100**2]).real) for ray in rays]
     on_sphere = origin + np.array(distances)[:, None] * rays
-    raw = field_by_hand(model.radiance, cube_by_hand(model, on_sphere), directions_by_hand(rays, encoding))
+    raw = evaluate_field_in_numpy(
+        model.radiance, contract_in_numpy(model, on_sphere), encode_directions_in_numpy(rays, encoding)
+    )
 
-    colors = model.decode_background(torch.from_numpy(points).float(), intrinsics, torch.from_numpy(pose).float())
+    colors = model.decode_background(torch.from_numpy(pixels).float(), intrinsics, torch.from_numpy(pose).float())
 
     np.testing.assert_allclose(as_float64(colors), sigmoid(raw), atol=2e-4)
 
 
-def test_silent_fields_leave_the_explicit_values():
-    model = small_model(points(), fields=0.0, color_logits=0.3, scale_logits=-2.0, opacity_logits=1.5)
+def test_fields_with_zero_output_leave_the_explicit_values():
+    model = small_model(random_points(), fields=0.0, color_logits=0.3, scale_logits=-2.0, opacity_logits=1.5)
     geometry = model.decode_geometry()
 
     assert torch.equal(geometry.quats, torch.tensor([1.0, 0, 0, 0]).expand(40, 4))
@@ -151,12 +157,14 @@ def test_silent_fields_leave_the_explicit_values():
     torch.testing.assert_close(
         geometry.scales / model.scale_bounds(model.gaussians.positions), torch.full((40, 3), float(sigmoid(-2.0)))
     )
-    torch.testing.assert_close(model.decode_colors(torch.tensor(VIEWPOINT)), torch.full((40, 3), float(sigmoid(0.3))))
+    torch.testing.assert_close(
+        model.decode_colors(torch.tensor(CAMERA_POSITION)), torch.full((40, 3), float(sigmoid(0.3)))
+    )
 
 
 @pytest.mark.parametrize("learns", [False, True])
-def test_a_colour_decoder_that_says_nothing_is_asked_only_while_it_learns(learns):
-    model, viewpoint = random_model().requires_grad_(False), torch.tensor(VIEWPOINT)
+def test_a_colour_decoder_with_zero_output_is_evaluated_only_in_training(learns):
+    model, viewpoint = random_model().requires_grad_(False), torch.tensor(CAMERA_POSITION)
     for values in (model.radiance.weights[-1], model.radiance.biases[-1]):
         values.zero_()
     model.radiance.requires_grad_(learns)
@@ -173,8 +181,8 @@ def test_a_colour_decoder_that_says_nothing_is_asked_only_while_it_learns(learns
     assert (model.radiance.biases[-1].grad is not None) == learns
 
 
-def test_one_number_in_the_last_layer_is_something_to_say():
-    model, viewpoint = random_model().requires_grad_(False), torch.tensor(VIEWPOINT)
+def test_a_single_weight_in_the_last_layer_counts_as_output():
+    model, viewpoint = random_model().requires_grad_(False), torch.tensor(CAMERA_POSITION)
     weight, bias = model.radiance.weights[-1], model.radiance.biases[-1]
     weight.zero_(), bias.zero_()
     bias[1] = 1.0
@@ -184,13 +192,13 @@ def test_one_number_in_the_last_layer_is_something_to_say():
     torch.testing.assert_close(colors, torch.sigmoid(model.gaussians.color_logits + torch.tensor([0.0, 1.0, 0.0])))
 
 
-def test_decoding_some_equals_picking_from_all():
+def test_decoding_a_subset_equals_a_subset_of_all():
     model, index = random_model(), torch.tensor([3, 3, 17, 0, 39])
-    viewpoint = torch.tensor(VIEWPOINT)
+    viewpoint = torch.tensor(CAMERA_POSITION)
 
     some, picked = model.decode_geometry(index), model.decode_geometry()[index]
 
-    # Up to the last bits: matrix products of other heights may add in another order.
+    # They agree up to the last bits, because matrix products of other heights may add in another order.
     for name in ("scales", "quats", "opacities"):
         torch.testing.assert_close(getattr(some, name), getattr(picked, name), rtol=1e-5, atol=1e-6)
     torch.testing.assert_close(
@@ -200,8 +208,8 @@ def test_decoding_some_equals_picking_from_all():
 
 @pytest.mark.parametrize("extreme", [-80.0, 80.0])
 def test_extreme_logits_decode_to_finite_values_in_range(extreme):
-    model = small_model(points(), color_logits=extreme, scale_logits=extreme, opacity_logits=extreme, fields=1.0)
-    geometry, colors = model.decode_geometry(), model.decode_colors(torch.tensor(VIEWPOINT))
+    model = small_model(random_points(), color_logits=extreme, scale_logits=extreme, opacity_logits=extreme, fields=1.0)
+    geometry, colors = model.decode_geometry(), model.decode_colors(torch.tensor(CAMERA_POSITION))
     for values in (geometry.scales, geometry.quats, geometry.opacities, colors):
         assert torch.isfinite(values).all()
     assert 0 <= geometry.opacities.min() and geometry.opacities.max() <= 1
@@ -209,8 +217,8 @@ def test_extreme_logits_decode_to_finite_values_in_range(extreme):
 
 
 def test_a_gaussian_at_the_viewpoint_has_a_finite_colour_and_gradient():
-    model = small_model([VIEWPOINT], fields=1.0, position_gradients=True)
-    colors = model.decode_colors(torch.tensor(VIEWPOINT))
+    model = small_model([CAMERA_POSITION], fields=1.0, position_gradients=True)
+    colors = model.decode_colors(torch.tensor(CAMERA_POSITION))
     colors.sum().backward()
     assert torch.isfinite(colors).all() and torch.isfinite(model.gaussians.positions.grad).all()
 
@@ -218,7 +226,7 @@ def test_a_gaussian_at_the_viewpoint_has_a_finite_colour_and_gradient():
 def test_an_empty_model_decodes_to_nothing():
     model = small_model(np.zeros((0, 3)))
     assert model.decode_geometry().scales.shape == (0, 3)
-    assert model.decode_colors(torch.tensor(VIEWPOINT)).shape == (0, 3)
+    assert model.decode_colors(torch.tensor(CAMERA_POSITION)).shape == (0, 3)
 
 
 # -- gradients -------------------------------------------------------------------------------------------------------
@@ -226,7 +234,7 @@ def test_an_empty_model_decodes_to_nothing():
 
 def decoded_sum(model) -> torch.Tensor:
     geometry = model.decode_geometry()
-    parts = (geometry.scales, geometry.quats, geometry.opacities, model.decode_colors(torch.tensor(VIEWPOINT)))
+    parts = (geometry.scales, geometry.quats, geometry.opacities, model.decode_colors(torch.tensor(CAMERA_POSITION)))
     return sum((part * torch.linspace(0.5, 1.5, part.numel()).view_as(part)).sum() for part in parts)
 
 
@@ -241,7 +249,7 @@ def test_fields_are_detached_from_positions_by_default():
 @pytest.mark.parametrize("scale_rule", ["sum", "product"])
 def test_position_gradients_attach_the_fields(scale_rule):
     model = random_model(position_gradients=True, scale_rule=scale_rule).double()
-    viewpoint = torch.tensor(VIEWPOINT, dtype=torch.float64)
+    viewpoint = torch.tensor(CAMERA_POSITION, dtype=torch.float64)
     positions = model.gaussians.positions
     generator = torch.Generator().manual_seed(9)
 
@@ -254,7 +262,7 @@ def test_position_gradients_attach_the_fields(scale_rule):
     weights = torch.rand(40, 11, generator=generator, dtype=torch.float64)
     (decoded() * weights).sum().backward()
 
-    # Central differences; points whose cell or ReLU changes within the step would not match, so most must.
+    # Central differences: points whose cell or ReLU changes within the step do not match, so only most have to.
     step, before = 1e-7, positions.detach().clone()
     numeric = torch.empty_like(before)
     with torch.no_grad():
@@ -268,7 +276,7 @@ def test_position_gradients_attach_the_fields(scale_rule):
     torch.testing.assert_close(positions.grad, numeric, rtol=1e-4, atol=1e-5)
 
 
-def test_gaussian_rows_are_the_models_length():
+def test_the_length_of_a_model_is_its_number_of_gaussians():
     model = random_model()
     assert len(model) == len(model.gaussians) == 40
     assert [getattr(model.gaussians, name).shape[1] for name in Gaussians.PARAMETER_NAMES] == list(

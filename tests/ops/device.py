@@ -1,4 +1,4 @@
-"""Where the gpu kernels are tested: on the GPU when there is one, else on the CPU in Triton's interpreter."""
+"""The device for tests of GPU kernels: the GPU where there is one, else the CPU with Triton's interpreter."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from torch import Tensor
 
 from hyrfpack.ops.dispatch import has_triton
 
-DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
-INTERPRETED = DEVICE == "cpu"
+KERNEL_DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
+IS_INTERPRETED = KERNEL_DEVICE == "cpu"
 
 needs_triton = pytest.mark.skipif(not has_triton(), reason="Triton is not installed")
 
 
 def gpu(tensor: Tensor) -> Tensor:
-    """The tensor where the gpu kernels take it; keeps requires_grad."""
-    return tensor.detach().to(DEVICE).requires_grad_(tensor.requires_grad)
+    """Move a tensor to the device of the GPU kernels and keep its requires_grad."""
+    return tensor.detach().to(KERNEL_DEVICE).requires_grad_(tensor.requires_grad)

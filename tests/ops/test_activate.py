@@ -13,9 +13,9 @@ from torch import Tensor
 from hyrfpack.ops.activate import activate_geometry, scale_bounds
 
 IMPLEMENTATIONS = ["reference", pytest.param("gpu", marks=needs_triton)]
-RULES = ["sum", "product"]
+SCALE_RULES = ["sum", "product"]
 HALF_EXTENT = (1.0, 0.5, 0.25)
-LAYOUTS: dict[str, Callable[[Tensor], Tensor]] = {
+RAW_LAYOUTS: dict[str, Callable[[Tensor], Tensor]] = {
     "by rows": lambda stored: stored[:, :8].contiguous(),
     "by columns": lambda stored: stored[:, :8].T.contiguous().T,
     "part of wider rows": lambda stored: stored[:, 2:10],
@@ -25,40 +25,40 @@ LAYOUTS: dict[str, Callable[[Tensor], Tensor]] = {
 }
 
 
-def made(*shape: int, seed: int = 0) -> Tensor:
-    """Numbers that float32 holds, in float64."""
+def random_values(*shape: int, seed: int = 0) -> Tensor:
+    """Return random float64 numbers that float32 can represent."""
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed)).double()
 
 
-def inputs(count: int) -> list[Tensor]:
-    """What raw is laid out from (N, 16), positions inside the box and far outside, scale and opacity logits."""
-    stored, positions = 2 * made(count, 16), made(count, 3, seed=1)
+def make_inputs(count: int) -> list[Tensor]:
+    """Return storage (N, 16) for `raw`, positions inside and far outside the box, scale logits and opacity logits."""
+    stored, positions = 2 * random_values(count, 16), random_values(count, 3, seed=1)
     positions[1::3] *= 100
-    return [stored, positions, made(count, 1, seed=2), made(count, 1, seed=3)]
+    return [stored, positions, random_values(count, 1, seed=2), random_values(count, 1, seed=3)]
 
 
-def placed(tensor: Tensor, implementation: str) -> Tensor:
-    """In float32, where this implementation takes it."""
+def place_float32(tensor: Tensor, implementation: str) -> Tensor:
+    """Return the tensor in float32 on the device of this implementation."""
     return gpu(tensor.float()) if implementation == "gpu" else tensor.float()
 
 
 def values_and_gradients(tensors: list[Tensor], implementation: str, **settings) -> tuple[list[Tensor], list[Tensor]]:
-    """The three results, and gradients of raw and both logits, where the tensors are."""
+    """Return the three results and the gradients of raw and both logits, on the device of the tensors."""
     raw, positions, scale_logits, opacity_logits = tensors
     leaves = [leaf.detach().requires_grad_() for leaf in (raw, scale_logits, opacity_logits)]
     parts = activate_geometry(leaves[0], positions, *leaves[1:], implementation=implementation, **settings)
-    upstream = [made(*part.shape, seed=10 + i).to(part) for i, part in enumerate(parts)]
+    upstream = [random_values(*part.shape, seed=10 + i).to(part) for i, part in enumerate(parts)]
     gradients = torch.autograd.grad(parts, leaves, upstream)
     return [part.detach() for part in parts], list(gradients)
 
 
 def assert_matches_float64(tensors: list[Tensor], layout: str, implementation: str, **settings) -> None:
     stored, *rest = tensors
-    lay_out = LAYOUTS[layout]
-    raw = lay_out(placed(stored, implementation))
-    found = values_and_gradients([raw, *(placed(t, implementation) for t in rest)], implementation, **settings)
+    lay_out = RAW_LAYOUTS[layout]
+    raw = lay_out(place_float32(stored, implementation))
+    found = values_and_gradients([raw, *(place_float32(t, implementation) for t in rest)], implementation, **settings)
     expected = values_and_gradients([lay_out(stored), *rest], "reference", **settings)
-    sizes = scale_bounds(rest[0], settings.get("half_extent"))  # what scales and their gradients are multiplied by
+    sizes = scale_bounds(rest[0], settings.get("half_extent"))  # the factors of scales and of their gradients
     for some, wanted in zip(found, expected, strict=True):
         for one, other in zip(some, wanted, strict=True):
             assert one.shape == other.shape and one.dtype == torch.float32
@@ -67,9 +67,9 @@ def assert_matches_float64(tensors: list[Tensor], layout: str, implementation: s
 
 
 @pytest.mark.parametrize("half_extent", [None, HALF_EXTENT])
-@pytest.mark.parametrize("rule", RULES)
-def test_the_reference_is_what_it_says(rule: str, half_extent: tuple | None) -> None:
-    stored, *rest = inputs(40)
+@pytest.mark.parametrize("rule", SCALE_RULES)
+def test_the_reference_matches_the_formula_in_numpy(rule: str, half_extent: tuple | None) -> None:
+    stored, *rest = make_inputs(40)
     parts = activate_geometry(stored[:, :8], *rest, half_extent=half_extent, rule=rule)
 
     raw, positions, scale_logits, opacity_logits = stored[:, :8].numpy(), *(tensor.numpy() for tensor in rest)
@@ -86,9 +86,9 @@ def test_the_reference_is_what_it_says(rule: str, half_extent: tuple | None) -> 
 
 
 @pytest.mark.parametrize("half_extent", [None, HALF_EXTENT])
-@pytest.mark.parametrize("rule", RULES)
-def test_the_reference_passes_gradcheck_of_positions_too(rule: str, half_extent: tuple | None) -> None:
-    stored, *rest = inputs(5)
+@pytest.mark.parametrize("rule", SCALE_RULES)
+def test_the_reference_passes_gradcheck_with_positions(rule: str, half_extent: tuple | None) -> None:
+    stored, *rest = make_inputs(5)
     leaves = [tensor.requires_grad_() for tensor in (stored[:, :8].clone(), *rest)]
     assert torch.autograd.gradcheck(
         lambda *leaves: activate_geometry(*leaves, half_extent=half_extent, rule=rule), leaves
@@ -97,40 +97,42 @@ def test_the_reference_passes_gradcheck_of_positions_too(rule: str, half_extent:
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
 @pytest.mark.parametrize("count", [0, 1, 127, 128, 129])
-def test_any_number_of_gaussians(count: int, implementation: str) -> None:
-    assert_matches_float64(inputs(count), "by rows", implementation, half_extent=HALF_EXTENT)
+def test_any_number_of_gaussians_matches_float64(count: int, implementation: str) -> None:
+    assert_matches_float64(make_inputs(count), "by rows", implementation, half_extent=HALF_EXTENT)
 
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
 @pytest.mark.parametrize("half_extent", [None, HALF_EXTENT, (3, 1, 2)])
-@pytest.mark.parametrize("rule", RULES)
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_rules_and_layouts(layout: str, rule: str, half_extent: tuple | None, implementation: str) -> None:
-    assert_matches_float64(inputs(7), layout, implementation, rule=rule, half_extent=half_extent)
+@pytest.mark.parametrize("rule", SCALE_RULES)
+@pytest.mark.parametrize("layout", RAW_LAYOUTS)
+def test_all_rules_and_layouts_match_float64(
+    layout: str, rule: str, half_extent: tuple | None, implementation: str
+) -> None:
+    assert_matches_float64(make_inputs(7), layout, implementation, rule=rule, half_extent=half_extent)
 
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
 @pytest.mark.parametrize("count", [0, 1, 130])
 @pytest.mark.parametrize("layout", ["by columns", "part of wider rows"])
-def test_layouts_of_any_number_of_gaussians(layout: str, count: int, implementation: str) -> None:
-    assert_matches_float64(inputs(count), layout, implementation, half_extent=HALF_EXTENT)
+def test_layouts_with_any_number_of_gaussians_match_float64(layout: str, count: int, implementation: str) -> None:
+    assert_matches_float64(make_inputs(count), layout, implementation, half_extent=HALF_EXTENT)
 
 
 @needs_triton
 @pytest.mark.parametrize("count", [1, 130])
 @pytest.mark.parametrize("layout", ["by rows", "by columns"])
 def test_the_gradient_of_raw_keeps_its_layout(layout: str, count: int) -> None:
-    stored, *rest = (placed(tensor, "gpu") for tensor in inputs(count))
-    raw = LAYOUTS[layout](stored)
+    stored, *rest = (place_float32(tensor, "gpu") for tensor in make_inputs(count))
+    raw = RAW_LAYOUTS[layout](stored)
     _, (gradient, *_) = values_and_gradients([raw, *rest], "gpu")
     assert gradient.stride() == raw.stride()
 
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
-def test_rows_of_raw_may_overlap(implementation: str) -> None:
-    """A number that is in several rows is pulled by each of them."""
-    line = placed(made(16), implementation).requires_grad_()
-    rest = [placed(tensor, implementation) for tensor in inputs(9)[1:]]
+def test_overlapping_rows_of_raw_add_their_gradients(implementation: str) -> None:
+    """A number that belongs to several rows receives the gradient of each."""
+    line = place_float32(random_values(16), implementation).requires_grad_()
+    rest = [place_float32(tensor, implementation) for tensor in make_inputs(9)[1:]]
     raw = line.unfold(0, 8, 1)
     assert raw.stride() == (1, 1)
     (found,) = torch.autograd.grad(activate_geometry(raw, *rest, implementation=implementation)[1].sum(), line)
@@ -139,8 +141,10 @@ def test_rows_of_raw_may_overlap(implementation: str) -> None:
 
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
-def test_layouts_of_the_rest_do_not_matter(implementation: str) -> None:
-    stored, positions, scale_logits, opacity_logits = (placed(tensor, implementation) for tensor in inputs(9))
+def test_layouts_of_the_other_inputs_have_no_effect(implementation: str) -> None:
+    stored, positions, scale_logits, opacity_logits = (
+        place_float32(tensor, implementation) for tensor in make_inputs(9)
+    )
     raw = stored[:, :8]
     spread = [positions.T.contiguous().T, *(t.repeat_interleave(2, 0)[::2] for t in (scale_logits, opacity_logits))]
     there, pulled_there = values_and_gradients([raw, *spread], implementation, half_extent=HALF_EXTENT)
@@ -151,29 +155,29 @@ def test_layouts_of_the_rest_do_not_matter(implementation: str) -> None:
         torch.testing.assert_close(found, expected)
 
 
-@pytest.mark.filterwarnings("ignore:overflow encountered in exp")  # numpy's, in the interpreter; 1 / inf is 0
+@pytest.mark.filterwarnings("ignore:overflow encountered in exp")  # a warning of numpy in the interpreter; 1 / inf is 0
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
-@pytest.mark.parametrize("rule", RULES)
-def test_logits_of_any_size(rule: str, implementation: str) -> None:
+@pytest.mark.parametrize("rule", SCALE_RULES)
+def test_logits_of_any_size_match_float64(rule: str, implementation: str) -> None:
     logits = torch.tensor([-80.0, -40.0, -5.0, 0.0, 5.0, 40.0, 80.0]).double()
     neural, explicit = torch.cartesian_prod(logits, logits).unbind(1)
-    positions = made(49, 3, seed=1)
+    positions = random_values(49, 3, seed=1)
     stored = neural[:, None].expand(49, 16)
     tensors = [stored, positions, explicit[:, None], -explicit[:, None]]
     assert_matches_float64(tensors, "by rows", implementation, rule=rule, half_extent=HALF_EXTENT)
 
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
-def test_centres_may_be_far_away(implementation: str) -> None:
-    stored, _, *logits = inputs(12)
-    directions = torch.nn.functional.normalize(made(12, 3, seed=1), dim=1)
+def test_distant_centres_match_float64(implementation: str) -> None:
+    stored, _, *logits = make_inputs(12)
+    directions = torch.nn.functional.normalize(random_values(12, 3, seed=1), dim=1)
     positions = (directions * 10.0 ** torch.arange(-20, 16, 3).double()[:, None]).float().double()
     assert_matches_float64([stored, positions, *logits], "by rows", implementation, half_extent=HALF_EXTENT)
 
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
-def test_upstream_gradients_may_be_expanded(implementation: str) -> None:
-    stored, positions, *logits = (placed(tensor, implementation) for tensor in inputs(6))
+def test_expanded_upstream_gradients_are_supported(implementation: str) -> None:
+    stored, positions, *logits = (place_float32(tensor, implementation) for tensor in make_inputs(6))
     leaves = [leaf.clone().requires_grad_() for leaf in (stored[:, :8], *logits)]
     parts = activate_geometry(leaves[0], positions, *leaves[1:], implementation=implementation)
     wanted = torch.autograd.grad(parts, leaves, list(map(torch.ones_like, parts)), retain_graph=True)
@@ -184,8 +188,8 @@ def test_upstream_gradients_may_be_expanded(implementation: str) -> None:
 
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
-def test_upstream_gradients_may_be_left_out(implementation: str) -> None:
-    stored, positions, *logits = (placed(tensor, implementation) for tensor in inputs(6))
+def test_missing_upstream_gradients_are_supported(implementation: str) -> None:
+    stored, positions, *logits = (place_float32(tensor, implementation) for tensor in make_inputs(6))
     leaves = [leaf.clone().requires_grad_() for leaf in (stored[:, :8], *logits)]
     _, quats, opacities = activate_geometry(leaves[0], positions, *leaves[1:], implementation=implementation)
 
@@ -200,23 +204,25 @@ def test_upstream_gradients_may_be_left_out(implementation: str) -> None:
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
 @pytest.mark.parametrize("learnt", [0, 1, 2])
-@pytest.mark.parametrize("rule", RULES)
-def test_gradients_of_one_alone(rule: str, learnt: int, implementation: str) -> None:
-    stored, positions, *logits = (placed(tensor, implementation) for tensor in inputs(6))
+@pytest.mark.parametrize("rule", SCALE_RULES)
+def test_the_gradient_of_a_single_input_can_be_requested(rule: str, learnt: int, implementation: str) -> None:
+    stored, positions, *logits = (place_float32(tensor, implementation) for tensor in make_inputs(6))
     tensors = [stored[:, :8].contiguous(), positions, *logits]
     _, expected = values_and_gradients(tensors, implementation, rule=rule, half_extent=HALF_EXTENT)
     leaves = [leaf.clone().requires_grad_(i == learnt) for i, leaf in enumerate((tensors[0], *logits))]
     parts = activate_geometry(
         leaves[0], positions, *leaves[1:], rule=rule, half_extent=HALF_EXTENT, implementation=implementation
     )
-    upstream = [(part, made(*part.shape, seed=10 + i).to(part)) for i, part in enumerate(parts) if part.requires_grad]
+    upstream = [
+        (part, random_values(*part.shape, seed=10 + i).to(part)) for i, part in enumerate(parts) if part.requires_grad
+    ]
     torch.autograd.backward(*zip(*upstream, strict=True))
     assert [leaf.grad is not None for leaf in leaves] == [i == learnt for i in range(3)]
     torch.testing.assert_close(leaves[learnt].grad, expected[learnt])
 
 
-# Where a NaN is -> the scales, quaternions and opacities that are NaN.
-SPOILT = {
+# Position of a NaN -> the scales, quaternions and opacities that become NaN.
+NAN_OUTPUTS_BY_INPUT = {
     "an opacity": (0, (slice(None), 0), [0, 0, 0], [0, 0, 0, 0], 1),
     "the first scale": (0, (slice(None), 1), [1, 0, 0], [0, 0, 0, 0], 0),
     "the last scale": (0, (slice(None), 3), [0, 0, 1], [0, 0, 0, 0], 0),
@@ -230,11 +236,11 @@ SPOILT = {
 
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
-@pytest.mark.parametrize("rule", RULES)
-@pytest.mark.parametrize("where", SPOILT)
-def test_what_is_not_a_number_shows(where: str, rule: str, implementation: str) -> None:
-    which, (_, column), *expected = SPOILT[where]
-    stored, *rest = (placed(tensor, implementation) for tensor in inputs(5))
+@pytest.mark.parametrize("rule", SCALE_RULES)
+@pytest.mark.parametrize("where", NAN_OUTPUTS_BY_INPUT)
+def test_nan_inputs_give_nan_outputs(where: str, rule: str, implementation: str) -> None:
+    which, (_, column), *expected = NAN_OUTPUTS_BY_INPUT[where]
+    stored, *rest = (place_float32(tensor, implementation) for tensor in make_inputs(5))
     tensors = [stored[:, :8].contiguous(), *rest]
     tensors[which][3, column] = float("nan")
 
@@ -244,14 +250,14 @@ def test_what_is_not_a_number_shows(where: str, rule: str, implementation: str) 
         found = part.isnan().cpu()
         assert found[3].int().tolist() == wanted
         assert not found[[0, 1, 2, 4]].any()
-    if "rotation" not in where:  # whose gradient does not ask for it
+    if "rotation" not in where:  # the gradient of a rotation does not depend on its value
         assert any(gradient[3].isnan().any() for gradient in gradients)
     assert not any(gradient[[0, 1, 2, 4]].isnan().any() for gradient in gradients)
 
 
 @needs_triton
-def test_the_kernel_is_not_taken_where_positions_want_a_gradient() -> None:
-    stored, positions, *logits = (placed(tensor, "gpu") for tensor in inputs(4))
+def test_the_kernel_is_not_used_where_positions_need_a_gradient() -> None:
+    stored, positions, *logits = (place_float32(tensor, "gpu") for tensor in make_inputs(4))
     arguments = stored[:, :8], positions.requires_grad_(), *logits
     with pytest.raises(ValueError, match="no implementation 'gpu'"):
         activate_geometry(*arguments, implementation="gpu")
@@ -277,13 +283,13 @@ def test_the_kernel_is_not_taken_where_positions_want_a_gradient() -> None:
     ],
 )
 def test_shapes_that_do_not_fit_together_are_rejected(shapes: list[tuple[int, ...]], implementation: str) -> None:
-    tensors = [placed(torch.zeros(shape), implementation) for shape in shapes]
+    tensors = [place_float32(torch.zeros(shape), implementation) for shape in shapes]
     with pytest.raises(ValueError, match="logits are"):
         activate_geometry(*tensors, implementation=implementation)
 
 
-def test_types_rules_and_implementations_that_there_are_not_are_rejected() -> None:
-    stored, *rest = inputs(3)
+def test_unknown_types_rules_and_implementations_are_rejected() -> None:
+    stored, *rest = make_inputs(3)
     raw = stored[:, :8]
     with pytest.raises(ValueError, match="the rule 'mean'"):
         activate_geometry(raw, *rest, rule="mean")
@@ -300,7 +306,7 @@ def test_types_rules_and_implementations_that_there_are_not_are_rejected() -> No
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_bounds_are_one_in_the_box_and_grow_outside(dtype: torch.dtype) -> None:
-    positions = 0.5 * made(500, 3)
+    positions = 0.5 * random_values(500, 3)
     bounds = scale_bounds(positions.to(dtype), HALF_EXTENT)
     lengths = np.linalg.norm(positions.numpy() / HALF_EXTENT, axis=1)
     assert bounds.shape == (500, 1) and bounds.dtype == dtype
@@ -310,8 +316,8 @@ def test_bounds_are_one_in_the_box_and_grow_outside(dtype: torch.dtype) -> None:
     )
 
 
-def test_bounds_without_a_box_are_one_and_learn_nothing() -> None:
-    positions = (1e6 * made(4, 3)).float().requires_grad_()
+def test_bounds_without_a_box_are_one_without_gradient() -> None:
+    positions = (1e6 * random_values(4, 3)).float().requires_grad_()
     bounds = scale_bounds(positions, None)
     assert torch.equal(bounds, torch.ones(4, 1)) and not bounds.requires_grad
 
@@ -320,11 +326,11 @@ def test_gradients_of_bounds_are_finite_and_zero_inside() -> None:
     inside = torch.tensor([[0.0, 0.0, 0.0], [0.3, -0.2, 0.1]], dtype=torch.float64, requires_grad=True)
     scale_bounds(inside, HALF_EXTENT).sum().backward()
     assert torch.equal(inside.grad, torch.zeros(2, 3))
-    outside = (torch.tensor(HALF_EXTENT).double() * (2 + made(5, 3).abs())).requires_grad_()
+    outside = (torch.tensor(HALF_EXTENT).double() * (2 + random_values(5, 3).abs())).requires_grad_()
     assert torch.autograd.gradcheck(lambda positions: scale_bounds(positions, HALF_EXTENT), outside)
 
 
-def test_bounds_of_no_place_and_of_no_number() -> None:
+def test_bounds_of_no_points_and_of_nan() -> None:
     assert scale_bounds(torch.zeros(0, 3), HALF_EXTENT).shape == (0, 1)
     bounds = scale_bounds(torch.tensor([[float("nan"), 0.0, 0.0], [0.0, 0.0, 0.0]]), HALF_EXTENT)
     assert bounds[0].isnan() and bounds[1] == 1

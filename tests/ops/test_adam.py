@@ -11,15 +11,15 @@ from hyrfpack.ops.adam import adam_step
 from hyrfpack.parallel import has_numba
 
 IMPLEMENTATIONS = ["reference", "cpu", pytest.param("gpu", marks=needs_triton)]
-RATE = 1e-2
+LEARNING_RATE = 1e-2
 
 
 def normal(*shape: int, seed: int) -> Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
 
 
-def a_group(shapes: list[tuple[int, ...]], gradient: float = 1.0, step: int = 1) -> list[list[Tensor]]:
-    """Values, gradients of this size, and the moments such gradients may have left before this step."""
+def make_group(shapes: list[tuple[int, ...]], gradient: float = 1.0, step: int = 1) -> list[list[Tensor]]:
+    """Return values, gradients of this size, and moments as such gradients leave them before this step."""
     values = [normal(*shape, seed=i) for i, shape in enumerate(shapes)]
     gradients = [gradient * normal(*shape, seed=10 + i) for i, shape in enumerate(shapes)]
     if step == 1:
@@ -29,10 +29,10 @@ def a_group(shapes: list[tuple[int, ...]], gradient: float = 1.0, step: int = 1)
     return [values, gradients, exp_avg, exp_avg_sq]
 
 
-def stepped(
-    group: list[list[Tensor]], implementation: str, dtype=torch.float32, rate=RATE, **settings
+def step_group(
+    group: list[list[Tensor]], implementation: str, dtype=torch.float32, rate=LEARNING_RATE, **settings
 ) -> tuple[list, list[bool]]:
-    """Values and moments of a copy of the group after a step, on the CPU, and what the step returned."""
+    """Step a copy of the group; return values and moments on the CPU, and what the step returned."""
     place = gpu if implementation == "gpu" else torch.clone
     copy = [[place(tensor.to(dtype).clone()) for tensor in tensors] for tensors in group]
     broken = adam_step(*copy, rate=rate, implementation=implementation, **settings)
@@ -40,37 +40,37 @@ def stepped(
     return [[tensor.cpu() for tensor in copy[i]] for i in (0, 2, 3)], broken.tolist()
 
 
-# name -> the group, and its step
-CASES = {
-    "no number": (a_group([(0,)]), 1),
-    "one number": (a_group([(1,)]), 1),
-    "an odd count": (a_group([(77, 13)], step=5), 5),
-    "many blocks": (a_group([(100_000,)], step=40), 40),
-    "a whole number of blocks": (a_group([(2048,)], step=40), 40),
-    "a field: large, small and empty tensors": (a_group([(5000, 2), (64, 32), (64,), (0, 3), (8, 64), (8,)]), 1),
-    "more tensors than slots": (a_group([(3,)] * 40, step=7), 7),
-    "step 1000": (a_group([(3000,), (10,)], step=1000), 1000),
-    "gradients of zero at the first step": (a_group([(500,)], 0.0), 1),
-    "gradients of zero later": ([*a_group([(500,)], 0.0)[:2], *a_group([(500,)], step=9)[2:]], 9),
-    "tiny gradients": (a_group([(500,)], 1e-30), 1),
-    "gradients of the size of eps": (a_group([(500,)], 1e-15), 1),
-    "huge gradients": (a_group([(500,)], 1e18), 1),
+# Name -> the group and the number of its step.
+GROUPS_AND_STEPS = {
+    "no number": (make_group([(0,)]), 1),
+    "one number": (make_group([(1,)]), 1),
+    "an odd count": (make_group([(77, 13)], step=5), 5),
+    "many blocks": (make_group([(100_000,)], step=40), 40),
+    "a whole number of blocks": (make_group([(2048,)], step=40), 40),
+    "a field: large, small and empty tensors": (make_group([(5000, 2), (64, 32), (64,), (0, 3), (8, 64), (8,)]), 1),
+    "more tensors than slots": (make_group([(3,)] * 40, step=7), 7),
+    "step 1000": (make_group([(3000,), (10,)], step=1000), 1000),
+    "gradients of zero at the first step": (make_group([(500,)], 0.0), 1),
+    "gradients of zero later": ([*make_group([(500,)], 0.0)[:2], *make_group([(500,)], step=9)[2:]], 9),
+    "tiny gradients": (make_group([(500,)], 1e-30), 1),
+    "gradients of the size of eps": (make_group([(500,)], 1e-15), 1),
+    "huge gradients": (make_group([(500,)], 1e18), 1),
 }
 
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", GROUPS_AND_STEPS)
 def test_a_step_matches_the_float64_reference(implementation: str, case: str) -> None:
-    group, step = CASES[case]
-    (values, exp_avg, exp_avg_sq), broken = stepped(group, implementation, step=step)
-    expected, _ = stepped(group, "reference", torch.float64, step=step)
+    group, step = GROUPS_AND_STEPS[case]
+    (values, exp_avg, exp_avg_sq), broken = step_group(group, implementation, step=step)
+    expected, _ = step_group(group, "reference", torch.float64, step=step)
     assert not any(broken)
     for i, before in enumerate(group[0]):
-        # A healthy element moves by about the rate, and float32 holds a value to 2^-24 of its size.
+        # A finite element moves by about the learning rate, and float32 represents a value to 2^-24 of its size.
         error = (values[i].double() - expected[0][i]).abs()
         moved = (expected[0][i] - before).abs()
-        assert (error <= 1e-4 * moved + 1e-6 * RATE + 2**-23 * before.abs()).all()
-        # The two summands of the first moment may cancel.
+        assert (error <= 1e-4 * moved + 1e-6 * LEARNING_RATE + 2**-23 * before.abs()).all()
+        # The two terms of the first moment may cancel.
         size = group[1][i].abs().double() + group[2][i].abs()
         assert ((exp_avg[i] - expected[1][i]).abs() <= 1e-6 * size + 1e-37).all()
         torch.testing.assert_close(exp_avg_sq[i].double(), expected[2][i], rtol=1e-5, atol=1e-37)
@@ -79,14 +79,14 @@ def test_a_step_matches_the_float64_reference(implementation: str, case: str) ->
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
 def test_twenty_steps_match_torch(implementation: str) -> None:
     shapes = [(40, 3), (7,), (300, 2)]
-    values = a_group(shapes)[0]
+    values = make_group(shapes)[0]
     theirs = [value.clone().requires_grad_() for value in values]
     adam = torch.optim.Adam(theirs, eps=1e-15, foreach=False, fused=False)
     place = gpu if implementation == "gpu" else torch.clone
     ours = [place(value) for value in values]
     moments = [[torch.zeros_like(value) for value in ours] for _ in range(2)]
     for step in range(1, 21):
-        rate = RATE / step
+        rate = LEARNING_RATE / step
         gradients = [0.1 * value + normal(*value.shape, seed=step) for value in values]
         for tensor, gradient in zip(theirs, gradients, strict=True):
             tensor.grad = gradient.clone()
@@ -99,16 +99,16 @@ def test_twenty_steps_match_torch(implementation: str) -> None:
 
 
 def test_cpu_has_the_bits_of_torch_fused() -> None:
-    values = a_group([(123, 3), (5000,), (300_001, 2)])[0]
+    values = make_group([(123, 3), (5000,), (300_001, 2)])[0]
     theirs = [value.clone().requires_grad_() for value in values]
-    adam = torch.optim.Adam(theirs, lr=RATE, betas=(0.8, 0.99), eps=1e-15, fused=True)
+    adam = torch.optim.Adam(theirs, lr=LEARNING_RATE, betas=(0.8, 0.99), eps=1e-15, fused=True)
     moments = [[torch.zeros_like(value) for value in values] for _ in range(2)]
     for step in range(1, 9):
         gradients = [normal(*value.shape, seed=step) for value in values]
         for tensor, gradient in zip(theirs, gradients, strict=True):
             tensor.grad = gradient.clone()
         adam.step()
-        adam_step(values, gradients, *moments, step=step, rate=RATE, betas=(0.8, 0.99), implementation="cpu")
+        adam_step(values, gradients, *moments, step=step, rate=LEARNING_RATE, betas=(0.8, 0.99), implementation="cpu")
     assert all(torch.equal(ours, tensor) for ours, tensor in zip(values, theirs, strict=True))
     for name, ours in zip(("exp_avg", "exp_avg_sq"), moments, strict=True):
         assert all(torch.equal(moment, adam.state[p][name]) for moment, p in zip(ours, theirs, strict=True))
@@ -117,14 +117,14 @@ def test_cpu_has_the_bits_of_torch_fused() -> None:
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf"), 1e30, -1e30])
 @pytest.mark.parametrize("place", [(0, 0), (0, 2999), (1, 4)])
-def test_an_element_with_a_broken_gradient_is_reported_and_left_alone(implementation: str, bad: float, place) -> None:
-    group = a_group([(3000,), (5,)], step=6)
+def test_an_element_with_a_broken_gradient_is_reported_and_not_changed(implementation: str, bad: float, place) -> None:
+    group = make_group([(3000,), (5,)], step=6)
     tensor, index = place
-    healthy, broken = stepped(group, implementation, step=6)
+    healthy, broken = step_group(group, implementation, step=6)
     assert broken == [False, False]
     group[1][tensor][index] = bad
 
-    after, broken = stepped(group, implementation, step=6)
+    after, broken = step_group(group, implementation, step=6)
 
     assert broken == [tensor == 0, tensor == 1]
     for old, new, alone in zip((group[0], group[2], group[3]), after, healthy, strict=True):
@@ -134,29 +134,29 @@ def test_an_element_with_a_broken_gradient_is_reported_and_left_alone(implementa
 
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
-def test_each_tensor_may_have_a_step_and_a_rate_of_its_own(implementation: str) -> None:
+def test_each_tensor_may_have_its_own_step_and_rate(implementation: str) -> None:
     steps, rates, shapes = [1, 9, 3, 9], [1e-2, 3e-3, 3e-3, 3e-3], [(1500, 2), (7,), (64, 3), (1,)]
     group = [
         sum(lists, [])
-        for lists in zip(*(a_group([s], step=n) for s, n in zip(shapes, steps, strict=True)), strict=True)
+        for lists in zip(*(make_group([s], step=n) for s, n in zip(shapes, steps, strict=True)), strict=True)
     ]
-    together, broken = stepped(group, implementation, step=steps, rate=rates)
+    together, broken = step_group(group, implementation, step=steps, rate=rates)
     assert broken == [False] * 4
     for place, (step, rate) in enumerate(zip(steps, rates, strict=True)):
-        alone, _ = stepped([[tensors[place]] for tensors in group], implementation, step=step, rate=rate)
+        alone, _ = step_group([[tensors[place]] for tensors in group], implementation, step=step, rate=rate)
         assert all(torch.equal(some[place], one[0]) for some, one in zip(together, alone, strict=True))
 
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
-def test_gradients_may_have_any_layout_and_tensors_may_start_anywhere(implementation: str) -> None:
-    group = a_group([(50, 3), (11, 2)], step=3)
-    expected, _ = stepped(group, implementation, step=3)
+def test_gradients_of_any_layout_and_unaligned_tensors_are_supported(implementation: str) -> None:
+    group = make_group([(50, 3), (11, 2)], step=3)
+    expected, _ = step_group(group, implementation, step=3)
     put = gpu if implementation == "gpu" else torch.clone
-    # One number off what 16-byte reads need.
+    # The start is one number off the alignment that 16-byte reads need.
     copy = [[put(torch.cat((t.new_zeros(1), t.flatten())))[1:].view(t.shape) for t in tensors] for tensors in group]
     copy[1] = [gradient.T.contiguous().T for gradient in copy[1]]
 
-    adam_step(*copy, step=3, rate=RATE, implementation=implementation)
+    adam_step(*copy, step=3, rate=LEARNING_RATE, implementation=implementation)
 
     for tensors, others in zip((copy[0], copy[2], copy[3]), expected, strict=True):
         torch.testing.assert_close([tensor.cpu() for tensor in tensors], others, rtol=1e-6, atol=1e-6)
@@ -164,32 +164,39 @@ def test_gradients_may_have_any_layout_and_tensors_may_start_anywhere(implementa
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
 def test_parameters_that_need_gradients_are_stepped(implementation: str) -> None:
-    group = a_group([(10,)])
+    group = make_group([(10,)])
     parameter = (gpu if implementation == "gpu" else torch.clone)(group[0][0].clone()).requires_grad_()
     parameter.square().sum().backward()
     moments = [torch.zeros_like(parameter.detach()) for _ in range(2)]
-    adam_step([parameter], [parameter.grad], *([m] for m in moments), step=1, rate=RATE, implementation=implementation)
-    expected = group[0][0] - RATE * group[0][0].sign()
+    adam_step(
+        [parameter],
+        [parameter.grad],
+        *([m] for m in moments),
+        step=1,
+        rate=LEARNING_RATE,
+        implementation=implementation,
+    )
+    expected = group[0][0] - LEARNING_RATE * group[0][0].sign()
     torch.testing.assert_close(parameter.detach().cpu(), expected, rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.skipif(not has_numba(), reason="no numba")
-def test_auto_takes_the_fused_kernel_on_the_cpu() -> None:
-    group = a_group([(3000,)], step=4)
-    assert all(map(torch.equal, *(sum(stepped(group, name, step=4)[0], []) for name in ("auto", "cpu"))))
+def test_auto_uses_the_fused_kernel_on_the_cpu() -> None:
+    group = make_group([(3000,)], step=4)
+    assert all(map(torch.equal, *(sum(step_group(group, name, step=4)[0], []) for name in ("auto", "cpu"))))
 
 
-def test_rejects_what_does_not_fit() -> None:
-    group = a_group([(4, 3)])
+def test_inputs_that_do_not_fit_are_rejected() -> None:
+    group = make_group([(4, 3)])
     with pytest.raises(ValueError, match="steps count from 1"):
-        adam_step(*group, step=0, rate=RATE)
+        adam_step(*group, step=0, rate=LEARNING_RATE)
     with pytest.raises(ValueError, match="there must be a tensor"):
-        adam_step([], [], [], [], step=1, rate=RATE)
+        adam_step([], [], [], [], step=1, rate=LEARNING_RATE)
     with pytest.raises(ValueError, match="1 tensors, 2 steps and 1 rates"):
-        adam_step(*group, step=[1, 2], rate=RATE)
+        adam_step(*group, step=[1, 2], rate=LEARNING_RATE)
     with pytest.raises(ValueError, match="shapes differ"):
-        adam_step(group[0], [torch.zeros(3, 4)], *group[2:], step=1, rate=RATE)
+        adam_step(group[0], [torch.zeros(3, 4)], *group[2:], step=1, rate=LEARNING_RATE)
     with pytest.raises(ValueError, match="contiguous"):
-        adam_step([torch.zeros(3, 4).T], *group[1:], step=1, rate=RATE)
+        adam_step([torch.zeros(3, 4).T], *group[1:], step=1, rate=LEARNING_RATE)
     with pytest.raises(ValueError):
-        adam_step(group[0] * 2, *group[1:], step=1, rate=RATE)
+        adam_step(group[0] * 2, *group[1:], step=1, rate=LEARNING_RATE)

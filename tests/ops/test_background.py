@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from fake_gpu import use_fake_gpu
-from ops.device import INTERPRETED, gpu, needs_triton
+from ops.device import IS_INTERPRETED, gpu, needs_triton
 from scenes import look_at
 
 from hyrfpack.ops.background import (
@@ -33,7 +33,7 @@ def uniform(*shape: int, seed: int = 0) -> torch.Tensor:
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """A camera, what of its light is left, and the shape of a field."""
+    """A camera, the transmittance of its picture, and the shape of a field."""
 
     height: int = 13
     width: int = 21
@@ -49,7 +49,7 @@ class Case:
     hidden: tuple[int, int] = (16, 16)
 
     def transmittance(self) -> torch.Tensor:
-        if self.light == "patches":  # smooth, so that whole blocks are dark, and others in part
+        if self.light == "patches":  # smooth, so that some blocks are completely dark and others partly
             rows = torch.arange(self.height)[:, None] / 11
             columns = torch.arange(self.width)[None, :] / 9
             return 0.5 + 0.4999 * torch.sin(rows + 1) * torch.cos(columns)
@@ -60,7 +60,7 @@ class Case:
         return torch.full((self.height, self.width), float(self.light))
 
     def arguments(self) -> dict[str, Any]:
-        """What `background_grid` takes after the transmittance, float32."""
+        """Return the arguments of `background_grid` after the transmittance, in float32."""
         resolutions = level_resolutions(self.levels, 4, self.finest)
         widths = [2 * self.levels + DIRECTION_FEATURES[self.encoding], *self.hidden, 3]
         generator = torch.Generator().manual_seed(1)
@@ -80,7 +80,7 @@ class Case:
         }
 
     def placed(self, dtype: torch.dtype, implementation: str) -> tuple[torch.Tensor, dict[str, Any]]:
-        """The transmittance and the other arguments, where this implementation takes them."""
+        """Return the transmittance and the other arguments on the device of this implementation."""
 
         def placed(value: Any) -> Any:
             if isinstance(value, list):
@@ -94,7 +94,7 @@ class Case:
         return placed(self.transmittance()), arguments
 
     def run(self, dtype: torch.dtype, implementation: str, mixed: bool = False) -> torch.Tensor:
-        """The grid, on the CPU, with no gradients."""
+        """Return the grid on the CPU, without gradients."""
         light, arguments = self.placed(dtype, implementation)
         with torch.no_grad():
             return background_grid(light, **arguments, mixed=mixed, implementation=implementation).cpu()
@@ -102,27 +102,27 @@ class Case:
     def learn(
         self, dtype: torch.dtype, implementation: str, mixed: bool = False
     ) -> tuple[torch.Tensor, list[torch.Tensor]]:
-        """The grid and the gradients of the table, the weights and the biases, on the CPU."""
+        """Return the grid and the gradients of the table, the weights and the biases, on the CPU."""
         light, arguments = self.placed(dtype, implementation)
-        return pulled(light, arguments | {"mixed": mixed}, implementation)
+        return grid_and_gradients(light, arguments | {"mixed": mixed}, implementation)
 
 
-def pulled(
+def grid_and_gradients(
     light: torch.Tensor, arguments: dict[str, Any], implementation: str
 ) -> tuple[torch.Tensor, list[torch.Tensor]]:
-    """As `Case.learn`, of tensors that are where they should be."""
-    field = [leaf.requires_grad_() for leaf in field_of(arguments)]
+    """Do what `Case.learn` does, for tensors that are on the right device."""
+    field = [leaf.requires_grad_() for leaf in field_tensors(arguments)]
     grid = background_grid(light, **arguments, implementation=implementation)
     upstream = torch.randn(grid.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
     gradients = torch.autograd.grad(grid, field, upstream.to(grid.device, grid.dtype))
     return grid.detach().cpu(), [gradient.cpu() for gradient in gradients]
 
 
-def field_of(arguments: dict[str, Any]) -> list[torch.Tensor]:
+def field_tensors(arguments: dict[str, Any]) -> list[torch.Tensor]:
     return [arguments["table"], *arguments["weights"], *arguments["biases"]]
 
 
-CASES = {
+BACKGROUND_CASES = {
     "stride 1, no multiple of a block": Case(stride=1),
     "stride 2": Case(),
     "stride 3, the last nodes past the edge": Case(height=12, width=30, stride=3),
@@ -142,9 +142,12 @@ CASES = {
 
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", BACKGROUND_CASES)
 def test_colors_match_the_float64_reference(implementation: str, case: str) -> None:
-    found, expected = CASES[case].run(torch.float32, implementation), CASES[case].run(torch.float64, "reference")
+    found, expected = (
+        BACKGROUND_CASES[case].run(torch.float32, implementation),
+        BACKGROUND_CASES[case].run(torch.float64, "reference"),
+    )
     torch.testing.assert_close(found.double(), expected, rtol=0, atol=1e-4)
     assert torch.equal(found == 0, expected == 0)
     assert 0 < (expected != 0).sum() and expected.max() < 1
@@ -152,11 +155,11 @@ def test_colors_match_the_float64_reference(implementation: str, case: str) -> N
 
 @needs_triton
 @pytest.mark.parametrize("encoding", ["frequency", "sh"])
-def test_mixed_precision_rounds_factors_alone(encoding: str) -> None:
-    case = dataclasses.replace(CASES["stride 2"], encoding=encoding, hidden=(64, 64), levels=8)
+def test_mixed_precision_rounds_only_factors(encoding: str) -> None:
+    case = dataclasses.replace(BACKGROUND_CASES["stride 2"], encoding=encoding, hidden=(64, 64), levels=8)
     found = case.run(torch.float32, "gpu", mixed=True)
     expected, exact = case.run(torch.float64, "reference", mixed=True), case.run(torch.float64, "reference")
-    # Numbers on the edge between two bfloat16 are rounded one way here and the other way there.
+    # Values halfway between two bfloat16 numbers may round either way.
     torch.testing.assert_close(found.double(), expected, rtol=0, atol=3e-3)
     assert (found - expected).abs().mean() < 0.2 * (exact - expected).abs().mean()
 
@@ -164,28 +167,30 @@ def test_mixed_precision_rounds_factors_alone(encoding: str) -> None:
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
 @pytest.mark.parametrize("distance", [1e3, 1e5])
 @pytest.mark.parametrize("past", [0.0, 0.5, 1.5])
-def test_far_cameras_lose_no_more_than_float32_must(implementation: str, distance: float, past: float) -> None:
-    """A ray's direction is rounded, by 2^-24 a coordinate, and so its point on the sphere by that times the way."""
+def test_far_cameras_lose_no_more_precision_than_float32_requires(
+    implementation: str, distance: float, past: float
+) -> None:
+    """Rounding a ray's direction by 2^-24 a coordinate moves its point on the sphere by that times the distance."""
     position = np.array([0.6, -0.8, 0.3]) * distance
     aside = np.array([0.8, 0.6, 0.0]) * past * BACKGROUND_RADIUS
     case = Case(position=tuple(position), target=tuple(aside), focal=0.1 * distance, stride=3, finest=8, light="1")
     found, expected = case.run(torch.float32, implementation), case.run(torch.float64, "reference")
     off = (
         4 * 2**-24 * distance / BACKGROUND_RADIUS
-    )  # in the cube; features change by up to 2 a vertex, and 7 of them span it
+    )  # in the cube; features change by up to 2 a vertex, and 7 vertices span it
     torch.testing.assert_close(found.double(), expected, rtol=0, atol=1e-4 + 14 * off)
 
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
 @pytest.mark.parametrize(("threshold", "light"), [(1.0, "1"), (0.5, "0.5"), (0.0, "0")])
-def test_nothing_is_drawn_where_no_more_than_the_threshold_passes(implementation, threshold, light) -> None:
+def test_nothing_is_drawn_where_the_transmittance_is_below_the_threshold(implementation, threshold, light) -> None:
     found = Case(threshold=threshold, light=light).run(torch.float32, implementation)
     assert found.shape == (7, 11, 3) and not found.any()
 
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
 @pytest.mark.parametrize("stride", [1, 2, 3])
-def test_a_node_is_drawn_for_each_pixel_that_it_takes_part_in(implementation: str, stride: int) -> None:
+def test_a_node_is_drawn_if_any_of_its_pixels_needs_it(implementation: str, stride: int) -> None:
     case = Case(height=20, width=17, stride=stride, threshold=0.0, light="one pixel")
     found = case.run(torch.float32, implementation)
     rows, columns = grid_size(20, 17, stride)
@@ -196,7 +201,7 @@ def test_a_node_is_drawn_for_each_pixel_that_it_takes_part_in(implementation: st
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
 @pytest.mark.parametrize("part", ["table", "weights", "biases"])
-def test_what_is_not_a_number_shows(implementation: str, part: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nan_inputs_give_nan_outputs(implementation: str, part: str, monkeypatch: pytest.MonkeyPatch) -> None:
     case = Case(light="1")
     arguments = case.arguments()
     (arguments[part] if part == "table" else arguments[part][0]).fill_(math.nan)
@@ -206,7 +211,7 @@ def test_what_is_not_a_number_shows(implementation: str, part: str, monkeypatch:
     assert grid.isnan().all() and any(gradient.isnan().any() for gradient in gradients)
 
 
-def test_nodes_are_the_colors_at_their_pixels_centres() -> None:
+def test_nodes_have_the_colours_at_their_pixel_centres() -> None:
     case = Case(light="1", stride=3)
     arguments = case.arguments()
     threshold, stride = arguments.pop("threshold"), arguments.pop("stride")
@@ -216,7 +221,7 @@ def test_nodes_are_the_colors_at_their_pixels_centres() -> None:
     torch.testing.assert_close(grid.reshape(-1, 3), expected)
 
 
-def test_reference_passes_gradcheck_in_the_field() -> None:
+def test_the_reference_passes_gradcheck_for_the_field() -> None:
     case = Case(height=4, width=5, hidden=(6, 5), levels=2, finest=6)
     arguments = case.arguments()
     parts = [arguments.pop("table"), *arguments.pop("weights"), *arguments.pop("biases")]
@@ -229,13 +234,13 @@ def test_reference_passes_gradcheck_in_the_field() -> None:
     assert torch.autograd.gradcheck(run, inputs)
 
 
-# -- learning the field ----------------------------------------------------------------------------------------------
+# -- gradients of the field ------------------------------------------------------------------------------------------
 
 
 def assert_learns_alike(
     found: tuple[torch.Tensor, list[torch.Tensor]], expected: tuple[torch.Tensor, list[torch.Tensor]]
 ) -> None:
-    """Colours as where no gradient is wanted, and gradients to a thousandth of the largest of each tensor."""
+    """Check the colours against a run without gradients, and gradients to 0.001 of the largest of each tensor."""
     (grid, gradients), (wanted, wanted_gradients) = found, expected
     torch.testing.assert_close(grid.double(), wanted.double(), rtol=0, atol=1e-4)
     assert torch.equal(grid == 0, wanted == 0) and wanted.any()
@@ -246,9 +251,9 @@ def assert_learns_alike(
 
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", BACKGROUND_CASES)
 def test_gradients_match_the_float64_reference(implementation: str, name: str) -> None:
-    case = CASES[name]
+    case = BACKGROUND_CASES[name]
     found = case.learn(torch.float32, implementation)
     assert_learns_alike(found, case.learn(torch.float64, "reference"))
     if implementation == "gpu":
@@ -257,16 +262,16 @@ def test_gradients_match_the_float64_reference(implementation: str, name: str) -
 
 @needs_triton
 @pytest.mark.parametrize(("encoding", "mixed"), [("frequency", False), ("sh", False), ("frequency", True)])
-def test_the_field_is_learnt_by_kernels_alone(encoding: str, mixed: bool) -> None:
-    """Where tensors say that they are on CUDA, hash features and the decoder are the gpu's, too."""
+def test_gradients_of_the_field_use_only_kernels(encoding: str, mixed: bool) -> None:
+    """For tensors that claim to be on CUDA, hash features and decoder use GPU kernels too."""
     case = Case(height=7, width=9, levels=2, encoding=encoding)
-    if INTERPRETED:
+    if IS_INTERPRETED:
         with use_fake_gpu() as device:
             arguments = case.arguments() | {"mixed": mixed}
             for name in ("weights", "biases"):
                 arguments[name] = [tensor.to(device) for tensor in arguments[name]]
             arguments["table"] = arguments["table"].to(device)
-            found = pulled(case.transmittance().to(device), arguments, "auto")
+            found = grid_and_gradients(case.transmittance().to(device), arguments, "auto")
     else:
         found = case.learn(torch.float32, "gpu", mixed)
 
@@ -283,8 +288,8 @@ def test_the_field_is_learnt_by_kernels_alone(encoding: str, mixed: bool) -> Non
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
 @pytest.mark.parametrize("learnt", ["table", "weights", "biases"])
-def test_a_part_of_the_field_may_be_learnt_alone(learnt: str, implementation: str) -> None:
-    case = CASES["stride 2"]
+def test_gradients_of_a_part_of_the_field_can_be_requested(learnt: str, implementation: str) -> None:
+    case = BACKGROUND_CASES["stride 2"]
     wanted, gradients = case.learn(torch.float32, implementation)
     light, arguments = case.placed(torch.float32, implementation)
     part = arguments[learnt] if learnt == "table" else arguments[learnt][1]
@@ -295,13 +300,15 @@ def test_a_part_of_the_field_may_be_learnt_alone(learnt: str, implementation: st
     torch.testing.assert_close(grid.detach().cpu(), wanted)
     expected = gradients[{"table": 0, "weights": 2, "biases": 5}[learnt]]
     torch.testing.assert_close(part.grad.cpu(), expected, rtol=1e-4, atol=1e-5 * expected.abs().max().item())
-    assert [leaf.grad is not None for leaf in field_of(arguments)] == [leaf is part for leaf in field_of(arguments)]
+    assert [leaf.grad is not None for leaf in field_tensors(arguments)] == [
+        leaf is part for leaf in field_tensors(arguments)
+    ]
 
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
-def test_nothing_is_learnt_where_it_is_dark(implementation: str) -> None:
+def test_pixels_without_transmittance_give_no_gradient(implementation: str) -> None:
     light, arguments = Case(light="0", threshold=0.0).placed(torch.float32, implementation)
-    field = [leaf.requires_grad_() for leaf in field_of(arguments)]
+    field = [leaf.requires_grad_() for leaf in field_tensors(arguments)]
     grid = background_grid(light, **arguments, implementation=implementation)
     assert grid.shape == (7, 11, 3) and not grid.any()
     (grid.sum() + sum(0 * leaf.sum() for leaf in field)).backward()
@@ -309,7 +316,7 @@ def test_nothing_is_learnt_where_it_is_dark(implementation: str) -> None:
 
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
-def test_light_learns_nothing(implementation: str) -> None:
+def test_the_transmittance_gets_no_gradient(implementation: str) -> None:
     light, arguments = Case().placed(torch.float32, implementation)
     arguments["table"].requires_grad_()
     background_grid(light.requires_grad_(), **arguments, implementation=implementation).sum().backward()
@@ -323,7 +330,7 @@ def test_light_learns_nothing(implementation: str) -> None:
     [Case(levels=17, finest=60), Case(hidden=(129, 16)), Case(hidden=(16, 129))],
     ids=["17 levels", "a wide first layer", "a wide second layer"],
 )
-def test_the_kernels_are_not_taken_where_the_field_does_not_fit(case: Case, learnt: bool) -> None:
+def test_the_kernels_are_not_used_for_unsupported_fields(case: Case, learnt: bool) -> None:
     light, arguments = case.placed(torch.float32, "gpu")
     arguments["table"].requires_grad_(learnt)
     with pytest.raises(ValueError, match="no implementation 'gpu'"):
@@ -342,7 +349,7 @@ def test_the_kernels_are_not_taken_where_the_field_does_not_fit(case: Case, lear
     ],
     ids=["no stride", "pose", "another encoding's width", "unknown encoding", "four outputs"],
 )
-def test_rejects_what_does_not_fit(change: dict) -> None:
+def test_inputs_that_do_not_fit_are_rejected(change: dict) -> None:
     with pytest.raises(ValueError):
         background_grid(Case().transmittance(), **(Case().arguments() | change))
 

@@ -1,4 +1,4 @@
-"""The light that Gaussians send to a picture: in one pass, and as the derivative of pictures."""
+"""Blend weights of Gaussians from one pass, compared with the derivative of pictures."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ from torch import Tensor
 from hyrfpack.ops.rasterize import rasterize
 from hyrfpack.ops.rasterize.blend_weights import sum_blend_weights
 
-SIZE = ((50.0, 50.0, 24.0, 20.0), 48, 40)
+# Intrinsics, width and height.
+CAMERA_AND_SIZE = ((50.0, 50.0, 24.0, 20.0), 48, 40)
 
 
-def scene(kind: str, count: int = 300) -> tuple[Tensor, ...]:
+def make_scene(kind: str, count: int = 300) -> tuple[Tensor, ...]:
     generator = torch.Generator().manual_seed(len(kind))
     means = torch.randn(count, 3, generator=generator) * 0.8
     means[:, 2] += 4.0
@@ -32,7 +33,7 @@ def scene(kind: str, count: int = 300) -> tuple[Tensor, ...]:
     return means, torch.randn(count, 4, generator=generator), scales, opacities
 
 
-KINDS = [
+SCENE_KINDS = [
     "a cloud",
     "opaque, so that tiles end early",
     "coincident",
@@ -43,47 +44,49 @@ KINDS = [
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
-@pytest.mark.parametrize("kind", KINDS)
-def test_one_pass_finds_the_derivative_that_float64_finds(kind: str, antialiased: bool) -> None:
-    gaussians, camera = scene(kind), torch.eye(4, dtype=torch.float64)
-    expected = sum_blend_weights(*(part.double() for part in gaussians), camera, *SIZE, antialiased=antialiased)
-    found = sum_blend_weights(*gaussians, camera, *SIZE, antialiased=antialiased, implementation="cpu")
+@pytest.mark.parametrize("kind", SCENE_KINDS)
+def test_one_pass_agrees_with_the_float64_derivative(kind: str, antialiased: bool) -> None:
+    gaussians, camera = make_scene(kind), torch.eye(4, dtype=torch.float64)
+    expected = sum_blend_weights(
+        *(part.double() for part in gaussians), camera, *CAMERA_AND_SIZE, antialiased=antialiased
+    )
+    found = sum_blend_weights(*gaussians, camera, *CAMERA_AND_SIZE, antialiased=antialiased, implementation="cpu")
     assert expected[0].max() > 1 > expected[1].min()
     for tensor, wanted in zip(found, expected, strict=True):
         torch.testing.assert_close(tensor, wanted.float(), atol=2e-4, rtol=2e-4)
 
 
-def test_all_light_is_what_does_not_pass() -> None:
-    gaussians, camera = scene("a cloud"), torch.eye(4)
-    picture = rasterize(*gaussians, torch.ones(300, 3), camera, *SIZE)
-    light, passed = sum_blend_weights(*gaussians, camera, *SIZE)
+def test_all_blend_weights_add_up_to_one_minus_the_transmittance() -> None:
+    gaussians, camera = make_scene("a cloud"), torch.eye(4)
+    picture = rasterize(*gaussians, torch.ones(300, 3), camera, *CAMERA_AND_SIZE)
+    light, passed = sum_blend_weights(*gaussians, camera, *CAMERA_AND_SIZE)
     assert torch.equal(passed, picture.transmittance)
     assert float(light.sum()) == pytest.approx(float((1 - picture.transmittance).sum()), rel=1e-5)
     assert not light.requires_grad and not light[~picture.visible].any()
 
 
 @pytest.mark.parametrize("implementation", ["cpu", "reference"])
-def test_where_nothing_is_drawn_there_is_no_light(implementation: str) -> None:
-    means, *rest = scene("a cloud")
+def test_gaussians_that_are_not_drawn_have_no_weight(implementation: str) -> None:
+    means, *rest = make_scene("a cloud")
     nothing, passed = sum_blend_weights(
-        means - torch.tensor([0.0, 0.0, 99.0]), *rest, torch.eye(4), *SIZE, implementation=implementation
+        means - torch.tensor([0.0, 0.0, 99.0]), *rest, torch.eye(4), *CAMERA_AND_SIZE, implementation=implementation
     )
     assert nothing.shape == (300,) and not nothing.any() and bool((passed == 1).all())
     none, _ = sum_blend_weights(
-        *(part[:0] for part in scene("a cloud")), torch.eye(4), *SIZE, implementation=implementation
+        *(part[:0] for part in make_scene("a cloud")), torch.eye(4), *CAMERA_AND_SIZE, implementation=implementation
     )
     assert none.shape == (0,)
 
 
-def test_same_bytes_with_any_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
-    gaussians, found = scene("a cloud", 3000), set()
+def test_bytes_do_not_depend_on_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    gaussians, found = make_scene("a cloud", 3000), set()
     for threads in (1, 2, 5):
         monkeypatch.setenv("HYRFPACK_THREADS", str(threads))
-        found.add(sum_blend_weights(*gaussians, torch.eye(4), *SIZE)[0].numpy().tobytes())
+        found.add(sum_blend_weights(*gaussians, torch.eye(4), *CAMERA_AND_SIZE)[0].numpy().tobytes())
     assert len(found) == 1
 
 
 def test_shapes_that_do_not_fit_are_rejected() -> None:
-    means, quats, scales, opacities = scene("a cloud")
+    means, quats, scales, opacities = make_scene("a cloud")
     with pytest.raises(ValueError, match="scales"):
-        sum_blend_weights(means, quats, scales[:9], opacities, torch.eye(4), *SIZE)
+        sum_blend_weights(means, quats, scales[:9], opacities, torch.eye(4), *CAMERA_AND_SIZE)

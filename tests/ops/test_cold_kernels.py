@@ -1,4 +1,4 @@
-"""Kernels give the same bytes right after they are compiled and when they come from the cache."""
+"""Kernels give the same bytes when they are freshly compiled and when they are loaded from the cache."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import os
 import subprocess
 import sys
 
-SCRIPT = """
+HASH_RESULTS_SCRIPT = """
 import hashlib
 import torch
 from hyrfpack.ops.hash_encode import hash_encode, level_offsets, level_resolutions
@@ -34,7 +34,7 @@ def test_compiled_and_cached_kernels_agree_in_every_bit(tmp_path):
 
     cold, warm = (
         subprocess.run(
-            [sys.executable, "-c", SCRIPT], env=environment, capture_output=True, text=True, check=True
+            [sys.executable, "-c", HASH_RESULTS_SCRIPT], env=environment, capture_output=True, text=True, check=True
         ).stdout
         for _ in range(2)
     )

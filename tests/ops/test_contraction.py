@@ -1,4 +1,4 @@
-"""The contraction against the paper's formula, at its seam, and at both ends of float32."""
+"""The contraction against the paper's formula, at the unit sphere and at both ends of float32's range."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ IMPLEMENTATIONS = ["reference", pytest.param("gpu", marks=needs_triton)]
 HALF_EXTENTS = [(1.0, 1.0, 1.0), (2.0, 0.5, 0.125), (1, 3, 2)]
 
 
-def placed(tensor: torch.Tensor, implementation: str) -> torch.Tensor:
+def place(tensor: torch.Tensor, implementation: str) -> torch.Tensor:
     return gpu(tensor) if implementation == "gpu" else tensor
 
 
 def contract_float64(u: np.ndarray) -> np.ndarray:
-    """The contraction as the paper defines it (with + 0.5), in numpy; the norm by hypot, which cannot overflow."""
+    """Compute the contraction as the paper defines it (plus 0.5) in numpy, with hypot, which cannot overflow."""
     u = u.astype(np.float64)
     radius = np.hypot(np.hypot(u[:, 0], u[:, 1]), u[:, 2])[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -102,12 +102,12 @@ def test_contract_gradient_is_finite_at_hard_points():
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
 @pytest.mark.parametrize("half_extent", HALF_EXTENTS)
 @pytest.mark.parametrize("radius", [0.0, 1e-20, 0.5, 0.999999, 1.0, 1.000001, 2.0, 1e4, 1e20, 1e30])
-def test_a_box_becomes_the_unit_cube_first(radius, half_extent, implementation):
+def test_a_box_is_scaled_to_the_unit_cube_first(radius, half_extent, implementation):
     u = radius * random_directions(20, seed=4)
     u[:6] = radius * np.concatenate([np.eye(3), -np.eye(3)])
     points = torch.from_numpy(u * half_extent).float()
 
-    cube = contract(placed(points, implementation), half_extent, implementation=implementation)
+    cube = contract(place(points, implementation), half_extent, implementation=implementation)
 
     expected = contract_float64(points.double().numpy() / half_extent)
     assert cube.dtype == torch.float32
@@ -119,15 +119,15 @@ def test_a_box_becomes_the_unit_cube_first(radius, half_extent, implementation):
 def test_the_inner_ball_is_in_the_inner_half_of_each_implementation(implementation):
     points = torch.tensor([[2.0, 0, 0], [-2, 0, 0], [0, 0, 0.0625], [0, 0, 0]])
     expected = torch.tensor([[0.75, 0.5, 0.5], [0.25, 0.5, 0.5], [0.5, 0.5, 0.625], [0.5, 0.5, 0.5]])
-    cube = contract(placed(points, implementation), (2.0, 0.5, 0.125), implementation=implementation)
+    cube = contract(place(points, implementation), (2.0, 0.5, 0.125), implementation=implementation)
     torch.testing.assert_close(cube.cpu(), expected, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
 @pytest.mark.parametrize("shape", [(0, 3), (1, 3), (3,), (2, 5, 3), (255, 3), (256, 3), (257, 3)])
-def test_any_number_of_points_of_any_shape(shape, implementation):
+def test_any_shape_of_points_is_supported(shape, implementation):
     points = 3 * torch.randn(shape, generator=torch.Generator().manual_seed(5))
-    cube = contract(placed(points, implementation), HALF_EXTENTS[1], implementation=implementation)
+    cube = contract(place(points, implementation), HALF_EXTENTS[1], implementation=implementation)
     expected = contract_float64(points.reshape(-1, 3).double().numpy() / HALF_EXTENTS[1])
     assert cube.shape == shape
     np.testing.assert_allclose(cube.cpu().numpy().reshape(-1, 3), expected, rtol=0, atol=1e-6)
@@ -135,8 +135,8 @@ def test_any_number_of_points_of_any_shape(shape, implementation):
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
 @pytest.mark.parametrize("layout", ["by columns", "part of wider rows", "expanded"])
-def test_layouts_do_not_matter(layout, implementation):
-    wide = placed(3 * torch.randn(9, 7, generator=torch.Generator().manual_seed(6)), implementation)
+def test_memory_layouts_have_no_effect(layout, implementation):
+    wide = place(3 * torch.randn(9, 7, generator=torch.Generator().manual_seed(6)), implementation)
     views = {
         "by columns": wide[:, :3].T.contiguous().T,
         "part of wider rows": wide[::2, 1:6:2],
@@ -151,10 +151,10 @@ def test_layouts_do_not_matter(layout, implementation):
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_what_is_not_a_number_shows_where_it_is(axis, implementation):
+def test_nan_coordinates_give_nan_only_there(axis, implementation):
     points = torch.ones(4, 3)
     points[2, axis] = float("nan")
-    cube = contract(placed(points, implementation), HALF_EXTENTS[1], implementation=implementation)
+    cube = contract(place(points, implementation), HALF_EXTENTS[1], implementation=implementation)
     assert cube[2, axis].isnan() and not cube[[0, 1, 3]].isnan().any()
 
 
@@ -166,7 +166,7 @@ def test_contract_of_a_box_passes_gradcheck(half_extent):
 
 
 @needs_triton
-def test_the_kernel_is_not_taken_where_a_gradient_is_wanted():
+def test_the_kernel_is_not_used_where_a_gradient_is_needed():
     points = gpu(torch.ones(2, 3)).requires_grad_()
     with pytest.raises(ValueError, match="no implementation 'gpu'"):
         contract(points, implementation="gpu")
@@ -176,14 +176,14 @@ def test_the_kernel_is_not_taken_where_a_gradient_is_wanted():
         assert not contract(points, implementation="gpu").requires_grad
 
 
-def test_types_and_implementations_that_there_are_not_are_rejected():
+def test_unknown_types_and_implementations_are_rejected():
     with pytest.raises(ValueError, match="float32"):
         contract(torch.ones(2, 3).double(), implementation="gpu")
     with pytest.raises(ValueError, match="no implementation 'cpu'"):
         contract(torch.ones(2, 3), implementation="cpu")
 
 
-def test_points_of_other_than_three_coordinates_are_rejected():
+def test_points_without_three_coordinates_are_rejected():
     for shape in ((6, 2), (3, 4), ()):
         with pytest.raises(ValueError, match="3 coordinates"):
             contract(torch.zeros(shape))

@@ -5,43 +5,53 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from ops.device import INTERPRETED, gpu, needs_triton
+from ops.device import IS_INTERPRETED, gpu, needs_triton
 from scenes import look_at
 
 from hyrfpack.ops.rasterize.cull import frustum_cull
 
-WIDTH, HEIGHT, INTRINSICS = 64, 40, (50.0, 60.0, 20.0, 25.0)
+PICTURE_WIDTH = 64
+PICTURE_HEIGHT = 40
+CAMERA_INTRINSICS = (50.0, 60.0, 20.0, 25.0)
 IMPLEMENTATIONS = ["reference", pytest.param("gpu", marks=needs_triton)]
-POSE = look_at((0.0, -3.0, 0.0), (0.0, 0.0, 0.0))
-# Relative: the kernel works in float64, of positions in float32 and a pose in what it comes in.
-UNDECIDED = {"reference": 1e-4, "gpu": 1e-12}
-# numpy's, in the interpreter.
+CAMERA_POSE = look_at((0.0, -3.0, 0.0), (0.0, 0.0, 0.0))
+# Relative widths of the band in which rounding decides. The kernel works in float64.
+UNDECIDED_RATIO = {"reference": 1e-4, "gpu": 1e-12}
+# The warning is numpy's, in the interpreter.
 INFINITY_TIMES_ZERO = pytest.mark.filterwarnings("ignore:invalid value encountered in multiply")
-AHEAD, BEHIND = (0.0, -2.0, 0.0), (0.0, -4.0, 0.0)
+POINT_AHEAD = (0.0, -2.0, 0.0)
+POINT_BEHIND = (0.0, -4.0, 0.0)
 
 
-def cull(points, pose=POSE, implementation="reference", *, near=0.01, tolerance=0.3) -> torch.Tensor:
+def cull(points, pose=CAMERA_POSE, implementation="reference", *, near=0.01, tolerance=0.3) -> torch.Tensor:
     positions = torch.as_tensor(np.asarray(points), dtype=torch.float32).reshape(-1, 3)
     positions = gpu(positions) if implementation == "gpu" else positions
     index = frustum_cull(
-        positions, torch.from_numpy(pose), INTRINSICS, WIDTH, HEIGHT, near, tolerance, implementation=implementation
+        positions,
+        torch.from_numpy(pose),
+        CAMERA_INTRINSICS,
+        PICTURE_WIDTH,
+        PICTURE_HEIGHT,
+        near,
+        tolerance,
+        implementation=implementation,
     )
     assert index.dtype == torch.int64 and index.ndim == 1 and index.device == positions.device
     return index.cpu()
 
 
 def in_view(points, pose, near: float, tolerance: float, undecided: float) -> tuple[set[int], set[int]]:
-    """Those inside and those too near to an edge to say, in float64 from positions as float32 holds them."""
-    fx, fy, cx, cy = INTRINSICS
+    """Return the indices of points inside, and of points too close to an edge to decide, computed in float64."""
+    fx, fy, cx, cy = CAMERA_INTRINSICS
     kept, unsure = set(), set()
     for i, point in enumerate(np.asarray(points, np.float32).astype(np.float64)):
         x, y, z = pose[:3, :3] @ point + pose[:3, 3]
         if abs(z - near) < undecided:
             unsure.add(i)
         elif z > near:
-            # Distances from the picture's middle in units of half its size: inside is [-1, 1].
-            across = (fx * x / z + cx - WIDTH / 2) / (WIDTH / 2)
-            down = (fy * y / z + cy - HEIGHT / 2) / (HEIGHT / 2)
+            # Distances from the middle of the picture in units of half its size: the picture is [-1, 1].
+            across = (fx * x / z + cx - PICTURE_WIDTH / 2) / (PICTURE_WIDTH / 2)
+            down = (fy * y / z + cy - PICTURE_HEIGHT / 2) / (PICTURE_HEIGHT / 2)
             excess = max(abs(across), abs(down)) - (1 + tolerance)
             if abs(excess) < undecided:
                 unsure.add(i)
@@ -55,9 +65,9 @@ def in_view(points, pose, near: float, tolerance: float, undecided: float) -> tu
 @pytest.mark.parametrize("near", [0.01, 1.0])
 def test_cull_keeps_what_projects_into_the_widened_picture(near, tolerance, implementation):
     pose = look_at((1.0, -2.0, 0.5), (0.0, 0.0, 0.0))
-    count = 900 if implementation == "gpu" and INTERPRETED else 5000
+    count = 900 if implementation == "gpu" and IS_INTERPRETED else 5000
     points = np.random.default_rng(0).normal(size=(count, 3)) * 3
-    kept, unsure = in_view(points, pose, near, tolerance, UNDECIDED[implementation])
+    kept, unsure = in_view(points, pose, near, tolerance, UNDECIDED_RATIO[implementation])
 
     index = cull(points, pose, implementation, near=near, tolerance=tolerance)
 
@@ -70,7 +80,7 @@ def test_cull_keeps_what_projects_into_the_widened_picture(near, tolerance, impl
 @pytest.mark.parametrize("count", [1, 2, 127, 128, 129])
 def test_cull_of_any_number_of_points(count, implementation):
     points = np.random.default_rng(count).normal(size=(count, 3))
-    kept, unsure = in_view(points, POSE, 0.01, 0.3, UNDECIDED[implementation])
+    kept, unsure = in_view(points, CAMERA_POSE, 0.01, 0.3, UNDECIDED_RATIO[implementation])
     assert not unsure
     assert cull(points, implementation=implementation).tolist() == sorted(kept)
 
@@ -78,15 +88,15 @@ def test_cull_of_any_number_of_points(count, implementation):
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
 @pytest.mark.parametrize("count", [1, 130])
 def test_cull_keeps_all_or_none(count, implementation):
-    assert cull([AHEAD] * count, implementation=implementation).tolist() == list(range(count))
-    assert cull([BEHIND] * count, implementation=implementation).tolist() == []
+    assert cull([POINT_AHEAD] * count, implementation=implementation).tolist() == list(range(count))
+    assert cull([POINT_BEHIND] * count, implementation=implementation).tolist() == []
 
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
 @pytest.mark.parametrize("place", [0, 127, 128, 129])
 def test_cull_finds_the_only_point_inside(place, implementation):
-    points = np.array([BEHIND] * 130)
-    points[place] = AHEAD
+    points = np.array([POINT_BEHIND] * 130)
+    points[place] = POINT_AHEAD
     assert cull(points, implementation=implementation).tolist() == [place]
 
 
@@ -102,14 +112,14 @@ def test_cull_drops_points_at_the_camera_and_behind_it(implementation):
 
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
-def test_the_near_plane_itself_is_left_out(implementation):
+def test_points_on_the_near_plane_are_culled(implementation):
     points = [[0, 0, 0.5], [0, 0, 0.50001], [0, 0, 0.49999]]
     assert cull(points, np.eye(4), implementation, near=0.5).tolist() == [1]
 
 
 @needs_triton
-def test_the_kernel_loses_nothing_of_a_pose_in_float64():
-    """A turn of 1e-9, which float32 does not hold, decides of a point that is just out of the picture."""
+def test_the_kernel_uses_a_float64_pose_at_full_precision():
+    """A rotation by 1e-9, which float32 cannot represent, decides about a point just outside the picture."""
     width, angle = 64 / 2 * 1.3, 1e-9
     turned = np.eye(4)
     turned[:3, :3] = [[np.cos(angle), 0, -np.sin(angle)], [0, 1, 0], [np.sin(angle), 0, np.cos(angle)]]
@@ -128,11 +138,11 @@ def test_the_kernel_loses_nothing_of_a_pose_in_float64():
 @pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf])
 def test_cull_rejects_points_that_are_not_finite(number, place, implementation):
     for axis in range(3):
-        points = np.array([AHEAD] * 130)
+        points = np.array([POINT_AHEAD] * 130)
         points[place, axis] = number
         with pytest.raises(FloatingPointError, match="positions hold NaN or infinity"):
             cull(points, implementation=implementation)
-    points[:] = BEHIND
+    points[:] = POINT_BEHIND
     points[place, 0] = number
     with pytest.raises(FloatingPointError):
         cull(points, implementation=implementation)
@@ -147,25 +157,25 @@ def test_cull_rejects_the_only_point(number, implementation):
 
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
-def test_the_largest_numbers_are_finite(implementation):
+def test_the_largest_float32_values_are_supported(implementation):
     largest = np.finfo(np.float32).max
-    points = [[largest, 0, 0], [0, -largest, 0], [0, 0, largest], [-largest, -largest, -largest], AHEAD]
+    points = [[largest, 0, 0], [0, -largest, 0], [0, 0, largest], [-largest, -largest, -largest], POINT_AHEAD]
     assert cull(points, implementation=implementation).tolist() == [4]
 
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
-def test_layouts_and_gradients_of_positions_do_not_matter(implementation):
+def test_layouts_and_gradients_of_positions_have_no_effect(implementation):
     points = torch.from_numpy(np.random.default_rng(1).normal(size=(60, 3))).float()
     points = gpu(points) if implementation == "gpu" else points
-    rest = torch.from_numpy(POSE).float(), INTRINSICS, WIDTH, HEIGHT, 0.01, 0.3
+    rest = torch.from_numpy(CAMERA_POSE).float(), CAMERA_INTRINSICS, PICTURE_WIDTH, PICTURE_HEIGHT, 0.01, 0.3
     expected = frustum_cull(points, *rest, implementation=implementation)
     assert 0 < len(expected) < 60
     for other in (points.T.contiguous().T, points.repeat_interleave(2, 0)[::2], points.clone().requires_grad_()):
         assert torch.equal(frustum_cull(other, *rest, implementation=implementation), expected)
 
 
-def test_types_and_implementations_that_there_are_not_are_rejected():
-    rest = torch.eye(4), INTRINSICS, WIDTH, HEIGHT, 0.01, 0.3
+def test_unknown_types_and_implementations_are_rejected():
+    rest = torch.eye(4), CAMERA_INTRINSICS, PICTURE_WIDTH, PICTURE_HEIGHT, 0.01, 0.3
     with pytest.raises(ValueError, match="float32"):
         frustum_cull(torch.zeros(2, 3).double(), *rest, implementation="gpu")
     with pytest.raises(ValueError, match="no implementation 'cpu'"):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from ops.device import INTERPRETED, gpu, needs_triton
+from ops.device import IS_INTERPRETED, gpu, needs_triton
 
 from hyrfpack.ops.hash_encode import cells, corner_rows, hash_encode, level_offsets, level_resolutions
 from hyrfpack.parallel import has_numba
@@ -15,10 +15,10 @@ IMPLEMENTATIONS = [
     pytest.param("cpu", marks=pytest.mark.skipif(not has_numba(), reason="no numba")),
     pytest.param("gpu", marks=needs_triton),
 ]
-KERNELS = IMPLEMENTATIONS[1:]
+KERNEL_IMPLEMENTATIONS = IMPLEMENTATIONS[1:]
 
 
-def placed(tensor: torch.Tensor, implementation: str) -> torch.Tensor:
+def place(tensor: torch.Tensor, implementation: str) -> torch.Tensor:
     return gpu(tensor) if implementation == "gpu" else tensor
 
 
@@ -35,8 +35,8 @@ def coords_on_cell_boundaries(resolution: int, count: int) -> torch.Tensor:
     return vertices / (resolution - 1)
 
 
-# name -> (coords, resolutions, log2_table_size, whether all points lie well inside their cells)
-CASES = {
+# Name -> (coords, resolutions, log2_table_size, whether all points lie well inside their cells).
+ENCODING_CASES = {
     "hashed and dense levels": (uniform(3000, 3), level_resolutions(8, 5, 60), 12, True),
     "every level hashed, tiny table": (uniform(500, 3), level_resolutions(4, 9, 40), 4, True),
     "every level dense": (uniform(700, 3), level_resolutions(4, 2, 16), 12, True),
@@ -52,8 +52,8 @@ CASES = {
 }
 
 
-def well_inside(coords: torch.Tensor, resolutions: tuple[int, ...]) -> torch.Tensor:
-    """Coordinates moved to where rounding cannot put a point into another cell on any level."""
+def move_inside_cells(coords: torch.Tensor, resolutions: tuple[int, ...]) -> torch.Tensor:
+    """Move coordinates to where rounding cannot put a point into another cell on any level."""
     coords = coords.clone()
     for _ in range(50):
         x = coords[:, None, :] * (torch.tensor(resolutions) - 1)[None, :, None]
@@ -64,25 +64,25 @@ def well_inside(coords: torch.Tensor, resolutions: tuple[int, ...]) -> torch.Ten
 
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", ENCODING_CASES)
 def test_values_and_gradients_match_the_float64_reference(implementation: str, case: str) -> None:
-    coords, resolutions, log2_table_size, inside = CASES[case]
-    if implementation == "gpu" and INTERPRETED:
+    coords, resolutions, log2_table_size, inside = ENCODING_CASES[case]
+    if implementation == "gpu" and IS_INTERPRETED:
         coords = coords[:600]
-    coords = well_inside(coords, resolutions) if inside else coords.clone()
+    coords = move_inside_cells(coords, resolutions) if inside else coords.clone()
     table = table_for(resolutions, log2_table_size)
     upstream = torch.randn(coords.shape[0], 2 * len(resolutions), generator=torch.Generator().manual_seed(3))
     upstream[::3] = 0
 
     def run(dtype: torch.dtype, implementation: str) -> list[torch.Tensor]:
-        inputs = [placed(tensor.to(dtype), implementation).requires_grad_() for tensor in (coords, table)]
+        inputs = [place(tensor.to(dtype), implementation).requires_grad_() for tensor in (coords, table)]
         features = hash_encode(*inputs, resolutions, log2_table_size, implementation=implementation)
         grads = torch.autograd.grad(features, inputs, upstream.to(features))
         return [tensor.cpu() for tensor in (features, *grads)]
 
     features, grad_coords, grad_table = run(torch.float32, implementation)
     expected, expected_coords, expected_table = run(torch.float64, "reference")
-    # float32 places a point to 2^-24 of the level's span, and features in [-1, 1] change by up to 2 along an axis.
+    # float32 places a point to 2^-24 of a level's extent, and features in [-1, 1] change by up to 2 along an axis.
     # Extrapolating r spans, weights reach r^3.
     bound = (1e-6 + 6 * 2**-24 * max(resolutions)) * (1 if case != "outside the cube" else max(resolutions) ** 3)
     torch.testing.assert_close(features.double(), expected, rtol=0, atol=bound)
@@ -95,13 +95,13 @@ def test_values_and_gradients_match_the_float64_reference(implementation: str, c
 
 def test_reference_passes_gradcheck() -> None:
     resolutions, log2_table_size = (3, 6, 11), 6
-    coords = well_inside(uniform(12, 3), resolutions).double().requires_grad_()
+    coords = move_inside_cells(uniform(12, 3), resolutions).double().requires_grad_()
     table = table_for(resolutions, log2_table_size).double().requires_grad_()
     assert torch.autograd.gradcheck(lambda c, t: hash_encode(c, t, resolutions, log2_table_size), (coords, table))
 
 
 def encode_by_loops(coords: np.ndarray, table: np.ndarray, resolutions: tuple[int, ...], size: int) -> np.ndarray:
-    """Instant-ngp's encoding, one point, level, corner at a time, with 32-bit wrap-around done by Python integers."""
+    """Compute Instant-ngp's encoding point by point, level by level, corner by corner, with 32-bit wrap-around."""
     result = np.zeros((len(coords), len(resolutions), table.shape[1]))
     for n, point in enumerate(coords):
         first = 0
@@ -147,7 +147,7 @@ def test_level_offsets_are_dense_where_the_vertices_fit() -> None:
     assert level_offsets((4, 8, 16), 9) == (0, 64, 64 + 512, 64 + 512 + 512)
 
 
-def test_corner_rows_of_a_dense_level_number_each_vertex_once() -> None:
+def test_corner_rows_of_a_dense_level_cover_each_vertex_once() -> None:
     resolution = 5
     lowest = torch.cartesian_prod(*[torch.arange(resolution - 1)] * 3)[:, None, :]
     rows = corner_rows(lowest, (resolution,), 7)[:, 0]
@@ -160,7 +160,7 @@ def test_corner_rows_of_a_dense_level_number_each_vertex_once() -> None:
 
 def test_corner_rows_are_exactly_the_rows_with_a_gradient() -> None:
     resolutions, log2_table_size = level_resolutions(6, 4, 50), 9
-    coords = well_inside(uniform(40, 3), resolutions)
+    coords = move_inside_cells(uniform(40, 3), resolutions)
     table = table_for(resolutions, log2_table_size).requires_grad_()
     features = hash_encode(coords, table, resolutions, log2_table_size)
     (grad,) = torch.autograd.grad(features.sum(), table)
@@ -172,44 +172,44 @@ def test_corner_rows_are_exactly_the_rows_with_a_gradient() -> None:
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
 def test_a_constant_table_gives_its_constant_everywhere(implementation: str) -> None:
     resolutions = level_resolutions(6, 4, 200)
-    table = placed(torch.full((level_offsets(resolutions, 10)[-1], 2), 0.75), implementation)
+    table = place(torch.full((level_offsets(resolutions, 10)[-1], 2), 0.75), implementation)
     features = hash_encode(
-        placed(uniform(200, 3), implementation), table, resolutions, 10, implementation=implementation
+        place(uniform(200, 3), implementation), table, resolutions, 10, implementation=implementation
     )
     torch.testing.assert_close(features, torch.full_like(features, 0.75))
 
 
-@pytest.mark.parametrize("implementation", KERNELS)
+@pytest.mark.parametrize("implementation", KERNEL_IMPLEMENTATIONS)
 def test_coordinates_that_are_not_finite_stay_inside_the_table(implementation: str) -> None:
     coords = torch.tensor([[float("nan")] * 3, [float("inf")] * 3, [-float("inf")] * 3, [1e30, -1e30, 0.5]])
-    inputs = [placed(tensor, implementation).requires_grad_() for tensor in (coords, table_for((5, 300), 9))]
+    inputs = [place(tensor, implementation).requires_grad_() for tensor in (coords, table_for((5, 300), 9))]
     features = hash_encode(*inputs, (5, 300), 9, implementation=implementation)
     features.sum().backward()
     assert features.shape == (4, 4)
 
 
 @pytest.mark.parametrize("implementation", ["reference", IMPLEMENTATIONS[2]])
-def test_points_at_a_rounding_error_from_a_boundary_are_in_the_cells_that_files_are_coded_by(implementation) -> None:
+def test_points_close_to_a_boundary_are_in_the_cells_that_the_file_format_defines(implementation) -> None:
     resolutions, log2_table_size = (8, 24, 600), 10
     on = torch.cat([coords_on_cell_boundaries(resolution, 100) for resolution in resolutions])
     coords = torch.cat([on, on.nextafter(torch.tensor(0.0)), on.nextafter(torch.tensor(1.0))])
-    inputs = placed(coords, implementation), placed(table_for(resolutions, log2_table_size), implementation)
+    inputs = place(coords, implementation), place(table_for(resolutions, log2_table_size), implementation)
     features = hash_encode(
         inputs[0], inputs[1].requires_grad_(), resolutions, log2_table_size, implementation=implementation
     )
     for first in range(0, 900, 225):
         rows = corner_rows(cells(coords[first : first + 225], resolutions), resolutions, log2_table_size)
         upstream = torch.zeros_like(features)
-        upstream[first : first + 225] = torch.nan  # shows on every row that is read, also where its weight is 0
+        upstream[first : first + 225] = torch.nan  # NaN appears in every row that is read, also where its weight is 0
         (grad,) = torch.autograd.grad(features, inputs[1], upstream, retain_graph=True)
         assert torch.equal(grad.cpu().isnan().all(dim=1).nonzero()[:, 0], rows.unique())
 
 
-@pytest.mark.parametrize("implementation", KERNELS)
-def test_memory_layout_of_coords_and_gradients_does_not_matter(implementation: str) -> None:
+@pytest.mark.parametrize("implementation", KERNEL_IMPLEMENTATIONS)
+def test_memory_layout_of_coords_and_gradients_has_no_effect(implementation: str) -> None:
     resolutions, log2_table_size = (5, 9, 33), 9
-    coords, table = (placed(t, implementation) for t in (uniform(300, 3), table_for(resolutions, log2_table_size)))
-    upstream = placed(torch.randn(300, 6, generator=torch.Generator().manual_seed(5)), implementation)
+    coords, table = (place(t, implementation) for t in (uniform(300, 3), table_for(resolutions, log2_table_size)))
+    upstream = place(torch.randn(300, 6, generator=torch.Generator().manual_seed(5)), implementation)
     planar = torch.cat((upstream.T, upstream.T)).T[:, 6:]
 
     def run(coords: torch.Tensor, upstream: torch.Tensor) -> list[torch.Tensor]:
@@ -222,10 +222,10 @@ def test_memory_layout_of_coords_and_gradients_does_not_matter(implementation: s
         torch.testing.assert_close(other, expected, rtol=1e-6, atol=1e-6)
 
 
-@pytest.mark.parametrize("implementation", KERNELS)
-def test_a_table_may_lie_anywhere_in_a_larger_tensor(implementation: str) -> None:
+@pytest.mark.parametrize("implementation", KERNEL_IMPLEMENTATIONS)
+def test_a_table_may_be_part_of_a_larger_tensor(implementation: str) -> None:
     resolutions, log2_table_size = (5, 9, 33), 9
-    coords, table = (placed(t, implementation) for t in (uniform(300, 3), table_for(resolutions, log2_table_size)))
+    coords, table = (place(t, implementation) for t in (uniform(300, 3), table_for(resolutions, log2_table_size)))
     inside = torch.cat((table.new_zeros(1), table.reshape(-1)))[1:].view(table.shape)
 
     features = hash_encode(coords, inside, resolutions, log2_table_size, implementation=implementation)
@@ -259,7 +259,7 @@ def test_bytes_do_not_depend_on_threads_or_on_the_run(monkeypatch: pytest.Monkey
     [((5, 2), 64, 2, "auto"), ((5, 3), 63, 2, "auto"), ((5, 3), 64, 4, "cpu"), ((5, 3), 64, 2, "cuda")],
     ids=["coords of two columns", "too few rows", "four features on cpu", "unknown implementation"],
 )
-def test_rejects_what_does_not_fit(coords: tuple, rows: int, features: int, implementation: str) -> None:
+def test_inputs_that_do_not_fit_are_rejected(coords: tuple, rows: int, features: int, implementation: str) -> None:
     with pytest.raises(ValueError):
         hash_encode(torch.rand(coords), torch.rand(rows, features), (4,), 10, implementation=implementation)
 
@@ -270,7 +270,7 @@ def test_level_resolutions_rejects_a_finest_level_below_the_base() -> None:
 
 
 @needs_triton
-def test_coarse_levels_have_copies_that_take_no_more_rows_than_there_are_points() -> None:
+def test_copies_of_coarse_levels_have_no_more_rows_than_there_are_points() -> None:
     from hyrfpack.ops.hash_encode.gpu import plan_gradient_copies
 
     resolutions, device = (8, 16, 32, 64), torch.device("cpu")
@@ -283,7 +283,7 @@ def test_coarse_levels_have_copies_that_take_no_more_rows_than_there_are_points(
         1: [1, 1, 1, 1],
         600: [1, 1, 1, 1],
         5000: [8, 1, 1, 1],
-        70_000: [32, 16, 2, 1],  # 64^3 vertices are more
+        70_000: [32, 16, 2, 1],  # a level with 64^3 vertices has more rows
         10**6: [32, 32, 16, 16],
     }
     for points, told in copies.items():
@@ -294,7 +294,7 @@ def test_coarse_levels_have_copies_that_take_no_more_rows_than_there_are_points(
             int((count > 1).sum()),
             max(rows[count > 1].tolist(), default=0),
         )
-        # One after the other behind the table.
+        # The copies lie one after the other behind the table.
         assert first.tolist() == (offsets[-1] + torch.cumsum(rows * (count - 1), 0) - rows * (count - 1)).tolist()
         assert told.total_rows == offsets[-1] + int((rows * (count - 1)).sum())
 
@@ -302,7 +302,7 @@ def test_coarse_levels_have_copies_that_take_no_more_rows_than_there_are_points(
 @needs_triton
 @pytest.mark.parametrize("resolutions", [(3, 5, 9), (9, 5, 3), (40, 3)])
 def test_sums_of_copies_are_the_gradient_in_any_order_of_levels(resolutions: tuple[int, ...]) -> None:
-    """Many points in one cell, of five blocks and more: each block adds to another copy."""
+    """Many points lie in one cell, over more than five blocks, and each block adds to another copy."""
     from hyrfpack.ops.hash_encode.gpu import plan_gradient_copies
 
     coords = 0.02 * uniform(1200, 3) + 0.3
@@ -311,7 +311,7 @@ def test_sums_of_copies_are_the_gradient_in_any_order_of_levels(resolutions: tup
     upstream = 1 + uniform(len(coords), 2 * len(resolutions), seed=3)
 
     def gradient(dtype: torch.dtype, implementation: str) -> torch.Tensor:
-        inputs = [placed(tensor.to(dtype), implementation) for tensor in (coords, table)]
+        inputs = [place(tensor.to(dtype), implementation) for tensor in (coords, table)]
         inputs[1].requires_grad_()
         features = hash_encode(*inputs, resolutions, 10, implementation=implementation)
         return torch.autograd.grad(features, inputs[1], upstream.to(features))[0].cpu()

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 import torch
-from ops.device import INTERPRETED, gpu, needs_triton
+from ops.device import IS_INTERPRETED, gpu, needs_triton
 
 from hyrfpack.ops.mlp import mlp
 
-KERNELS = ["cpu", pytest.param("gpu", marks=needs_triton)]
-IMPLEMENTATIONS = ["reference", *KERNELS]
+KERNEL_IMPLEMENTATIONS = ["cpu", pytest.param("gpu", marks=needs_triton)]
+IMPLEMENTATIONS = ["reference", *KERNEL_IMPLEMENTATIONS]
 
 
 def normal(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -21,17 +21,17 @@ def layers_for(*widths: int) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
     return weights, [0.1 * normal(o, seed=o) for o in widths[1:]]
 
 
-def with_idle_rows(grad: torch.Tensor, share: float) -> torch.Tensor:
+def zero_some_rows(grad: torch.Tensor, share: float) -> torch.Tensor:
     idle = torch.rand(grad.shape[0], generator=torch.Generator().manual_seed(7)) < share
     return grad.masked_fill(idle[:, None], 0)
 
 
-# name -> (x, layer widths, gradient of the result)
-CASES = {
+# Name -> (x, layer widths, gradient of the result).
+MLP_CASES = {
     "geometry decoder": (normal(5000, 32), (32, 64, 64, 8), normal(5000, 8, seed=1)),
-    "radiance decoder, a third idle": (normal(9001, 41), (41, 64, 64, 3), with_idle_rows(normal(9001, 3, seed=1), 0.3)),
+    "radiance decoder, a third idle": (normal(9001, 41), (41, 64, 64, 3), zero_some_rows(normal(9001, 3, seed=1), 0.3)),
     "radiance decoder, by feature": (normal(56, 3001).T, (56, 64, 64, 3), normal(3001, 3, seed=1)),
-    "rows stored by feature": (normal(32, 6000).T, (32, 16, 4), with_idle_rows(normal(6000, 4, seed=1), 0.5)),
+    "rows stored by feature": (normal(32, 6000).T, (32, 16, 4), zero_some_rows(normal(6000, 4, seed=1), 0.5)),
     "whole chunks idle": (normal(9000, 8), (8, 16, 2), normal(9000, 2) * (torch.arange(9000) > 7000)[:, None]),
     "whole blocks idle": (
         normal(9, 3000).T,
@@ -55,9 +55,9 @@ CASES = {
 
 
 def case_for(implementation: str, case: str) -> tuple[torch.Tensor, tuple[int, ...], torch.Tensor]:
-    """The case, or its first rows for Triton's interpreter: more than all programs take at once, no whole blocks."""
-    x, widths, upstream = CASES[case]
-    return (x[:550], widths, upstream[:550]) if implementation == "gpu" and INTERPRETED else (x, widths, upstream)
+    """Return the case, or for the interpreter its first rows: more than all programs take at once, no whole blocks."""
+    x, widths, upstream = MLP_CASES[case]
+    return (x[:550], widths, upstream[:550]) if implementation == "gpu" and IS_INTERPRETED else (x, widths, upstream)
 
 
 def values_and_gradients(
@@ -75,14 +75,14 @@ def values_and_gradients(
 
 
 def assert_gradients_close(gradients: list[torch.Tensor], expected: list[torch.Tensor], tolerance: float) -> None:
-    """Within a share of the largest number of each."""
+    """Check gradients to a fraction of the largest number of each."""
     for gradient, wanted in zip(gradients, expected, strict=True):
         scale = wanted.abs().max().item() if wanted.numel() else 0.0
         torch.testing.assert_close(gradient.double(), wanted, rtol=0, atol=tolerance * scale)
 
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", MLP_CASES)
 def test_values_and_gradients_match_the_float64_reference(implementation: str, name: str) -> None:
     case = case_for(implementation, name)
     result, *gradients = values_and_gradients(case, torch.float32, implementation)
@@ -93,15 +93,15 @@ def test_values_and_gradients_match_the_float64_reference(implementation: str, n
 
 
 def relative_difference(values: list[torch.Tensor], expected: list[torch.Tensor]) -> float:
-    """|value - expected| / |expected| of the tensors, the largest."""
+    """Return the largest |value - expected| / |expected| of the tensors."""
     pairs = [(a.double(), b.double()) for a, b in zip(values, expected, strict=True)]
     return max(float((a - b).norm() / b.norm().clamp_min(1e-30)) for a, b in pairs)
 
 
-# float32 rounds a few hidden values to another bfloat16 than float64 does, 1/256 away, and some cross a ReLU's zero:
-# so whole tensors are compared. Against exact products all are rounded, and gradients of x cross zeros most.
+# float32 rounds a few hidden values to another bfloat16 than float64, 1/256 away, and some cross the zero of a ReLU.
+# So whole tensors are compared. Against exact products all values are rounded, and gradients of x cross zero most.
 @pytest.mark.parametrize("implementation", ["reference", pytest.param("gpu", marks=needs_triton)])
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", MLP_CASES)
 def test_mixed_values_and_gradients_match_the_mixed_float64_reference(implementation: str, name: str) -> None:
     case = case_for(implementation, name)
     result, *gradients = values_and_gradients(case, torch.float32, implementation, mixed=True)
@@ -153,7 +153,7 @@ def test_zero_weights_give_the_last_bias_and_no_gradient_below(implementation: s
     assert torch.equal(biases[2].grad, x.new_full((2,), 900.0))
 
 
-@pytest.mark.parametrize("implementation", KERNELS)
+@pytest.mark.parametrize("implementation", KERNEL_IMPLEMENTATIONS)
 def test_gradient_of_x_keeps_the_layout_of_x(implementation: str) -> None:
     weights, biases = layers_for(32, 16, 16, 4)
     if implementation == "gpu":
@@ -164,8 +164,8 @@ def test_gradient_of_x_keeps_the_layout_of_x(implementation: str) -> None:
         assert grad.stride() == x.stride()
 
 
-@pytest.mark.parametrize("implementation", KERNELS)
-def test_inputs_that_need_no_gradient_may_be_left_out(implementation: str) -> None:
+@pytest.mark.parametrize("implementation", KERNEL_IMPLEMENTATIONS)
+def test_inputs_without_gradients_are_supported(implementation: str) -> None:
     x, widths, upstream = case_for(implementation, "geometry decoder")
     weights, biases = layers_for(*widths)
     if implementation == "gpu":
@@ -195,7 +195,7 @@ def test_bytes_of_the_gpu_do_not_depend_on_the_run() -> None:
 
 def test_bytes_do_not_depend_on_threads_or_on_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
     def run() -> list[bytes]:
-        tensors = values_and_gradients(CASES["radiance decoder, a third idle"], torch.float32, "cpu")
+        tensors = values_and_gradients(MLP_CASES["radiance decoder, a third idle"], torch.float32, "cpu")
         return [tensor.detach().numpy().tobytes() for tensor in tensors]
 
     monkeypatch.setenv("HYRFPACK_THREADS", "1")
@@ -205,13 +205,13 @@ def test_bytes_do_not_depend_on_threads_or_on_the_run(monkeypatch: pytest.Monkey
     assert run() == alone
 
 
-def test_torch_keeps_its_threads() -> None:
+def test_the_number_of_torch_threads_is_unchanged() -> None:
     before = torch.get_num_threads()
-    values_and_gradients(CASES["one row"], torch.float32, "cpu")
+    values_and_gradients(MLP_CASES["one row"], torch.float32, "cpu")
     assert torch.get_num_threads() == before
 
 
-def test_auto_takes_the_reference_for_float64() -> None:
+def test_auto_uses_the_reference_for_float64() -> None:
     weights, biases = layers_for(4, 3)
     result = mlp(normal(5, 4).double(), [weights[0].double()], [biases[0].double()])
     assert result.dtype == torch.float64
@@ -227,6 +227,6 @@ def test_auto_takes_the_reference_for_float64() -> None:
     ],
     ids=["width of x", "length of a bias", "width between layers", "no layer"],
 )
-def test_rejects_what_does_not_form_layers(x: tuple, weights: list, biases: list) -> None:
+def test_tensors_that_do_not_form_layers_are_rejected(x: tuple, weights: list, biases: list) -> None:
     with pytest.raises(ValueError, match="do not form layers"):
         mlp(torch.rand(x), [torch.rand(shape) for shape in weights], [torch.rand(shape) for shape in biases])

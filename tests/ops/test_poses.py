@@ -5,7 +5,7 @@ import torch
 
 from hyrfpack.ops.poses import camera_center
 
-DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+DEVICE_NAMES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 
 
 @pytest.fixture(params=["highest", "high"])
@@ -17,8 +17,8 @@ def precision(request):
 
 
 @pytest.mark.usefixtures("precision")
-@pytest.mark.parametrize("device", DEVICES)
-def test_a_camera_stands_where_its_pose_says_however_products_are_rounded(device):
+@pytest.mark.parametrize("device", DEVICE_NAMES)
+def test_a_camera_position_is_exact_for_any_matmul_precision(device):
     generator = torch.Generator().manual_seed(0)
     for distance in (1e-3, 1.0, 1e4):
         rotation, _ = torch.linalg.qr(torch.randn(3, 3, generator=generator, dtype=torch.float64))

@@ -1,4 +1,4 @@
-"""Rasterising: every implementation against the float64 reference, and the reference against mathematics."""
+"""Rasterisation: every implementation against the float64 reference, and the reference against closed forms."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from functools import cache
 
 import pytest
 import torch
-from ops.device import DEVICE, INTERPRETED, gpu, needs_triton
+from ops.device import IS_INTERPRETED, KERNEL_DEVICE, gpu, needs_triton
 from torch import Tensor
 
 from hyrfpack.ops.dispatch import has_triton
@@ -32,14 +32,14 @@ if has_triton():
         tl.store(inside + index, found.to(tl.int32))
 
 
-NAMES = ("means", "quats", "scales", "opacities", "colors")
-GPU = pytest.param("gpu", marks=needs_triton)
-IMPLEMENTATIONS = ["cpu", GPU, "reference"]
+PARAMETER_NAMES = ("means", "quats", "scales", "opacities", "colors")
+GPU_IMPLEMENTATION = pytest.param("gpu", marks=needs_triton)
+IMPLEMENTATIONS = ["cpu", GPU_IMPLEMENTATION, "reference"]
 
 
 @dataclass(frozen=True)
 class Case:
-    """One call. Gaussians are float32 numbers, so that every precision gets exactly the same input."""
+    """The arguments of one call. Gaussians are float32 numbers, so that every precision gets the same input."""
 
     gaussians: dict[str, Tensor]
     width: int = 48
@@ -50,7 +50,7 @@ class Case:
 
 
 def _camera(distance: float) -> Tensor:
-    """Looks at the origin along a tilted axis, from a distance."""
+    """Return the pose of a camera that looks at the origin along a tilted axis."""
     angle, tilt = 0.4, -0.3
     turn = torch.tensor([[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]])
     nod = torch.tensor([[1, 0, 0], [0, math.cos(tilt), -math.sin(tilt)], [0, math.sin(tilt), math.cos(tilt)]])
@@ -75,7 +75,7 @@ def _gaussians(count: int, seed: int = 0, size: float = 0.1, spread: float = 0.8
     }
 
 
-def _with(gaussians: dict[str, Tensor], **changes: Tensor) -> dict[str, Tensor]:
+def _replace(gaussians: dict[str, Tensor], **changes: Tensor) -> dict[str, Tensor]:
     return {**gaussians, **changes}
 
 
@@ -92,17 +92,17 @@ def _needles_and_pancakes() -> Case:
     scales = torch.full((40, 3), 1e-4)
     scales[:20, 0] = torch.logspace(-1, 2, 20)
     scales[20:, 1:] = torch.logspace(-1, 1, 20)[:, None]
-    return Case(_with(gaussians, scales=scales))
+    return Case(_replace(gaussians, scales=scales))
 
 
 def _all_sizes() -> Case:
     gaussians = _gaussians(90)
-    return Case(_with(gaussians, scales=torch.logspace(-6, 5, 90)[:, None] * gaussians["scales"] / 0.1))
+    return Case(_replace(gaussians, scales=torch.logspace(-6, 5, 90)[:, None] * gaussians["scales"] / 0.1))
 
 
 def _opacity_zero_and_one() -> Case:
     gaussians = _gaussians(40)
-    return Case(_with(gaussians, opacities=torch.tensor([0.0, 1.0, 1.0, 0.995] * 10)))
+    return Case(_replace(gaussians, opacities=torch.tensor([0.0, 1.0, 1.0, 0.995] * 10)))
 
 
 def _ten_thousand_layers() -> Case:
@@ -120,12 +120,12 @@ def _far_from_the_origin() -> Case:
     offset = torch.tensor([1e6, -2e6, 1.5e6])
     camera = _camera(80.0)
     camera[:3, 3] -= camera[:3, :3] @ offset.double()
-    return Case(_with(gaussians, means=gaussians["means"] + offset), camera=camera)
+    return Case(_replace(gaussians, means=gaussians["means"] + offset), camera=camera)
 
 
 def _all_coincident() -> Case:
     gaussians = _gaussians(50)
-    return Case(_with(gaussians, means=torch.full((50, 3), 0.125)))
+    return Case(_replace(gaussians, means=torch.full((50, 3), 0.125)))
 
 
 def _equal_depths() -> Case:
@@ -136,7 +136,7 @@ def _equal_depths() -> Case:
 
 def _covers_everything() -> Case:
     gaussians = _gaussians(5, size=30.0)
-    return Case(_with(gaussians, opacities=torch.tensor([0.3, 0.9, 0.01, 0.5, 0.2])), width=70, height=45)
+    return Case(_replace(gaussians, opacities=torch.tensor([0.3, 0.9, 0.01, 0.5, 0.2])), width=70, height=45)
 
 
 def _smaller_than_a_pixel() -> Case:
@@ -153,7 +153,7 @@ def _inside_a_gaussian() -> Case:
 def _short_quaternions() -> Case:
     gaussians = _gaussians(40)
     lengths = torch.logspace(-9, 9, 40)[:, None] / gaussians["quats"].norm(dim=1, keepdim=True)
-    return Case(_with(gaussians, quats=gaussians["quats"] * lengths))
+    return Case(_replace(gaussians, quats=gaussians["quats"] * lengths))
 
 
 def _wide_angle() -> Case:
@@ -161,7 +161,7 @@ def _wide_angle() -> Case:
     return Case(gaussians, camera=_camera(1.0), intrinsics=(12.0, 15.0, 20.0, 24.0))
 
 
-CASES: dict[str, Callable[[], Case]] = {
+CASE_MAKERS: dict[str, Callable[[], Case]] = {
     "random scene": lambda: Case(_gaussians(500)),
     "random scene, antialiased": lambda: Case(_gaussians(500, size=0.03), options={"antialiased": True}),
     "off-centre principal point, fx != fy": lambda: Case(_gaussians(200), intrinsics=(45.0, 70.0, 5.5, 33.25)),
@@ -189,37 +189,41 @@ CASES: dict[str, Callable[[], Case]] = {
 }
 
 
-# Triton's interpreter takes 20 ms for a pair of a Gaussian and a tile: it gets this many Gaussians of a case ...
-FEW = 8
-# ... but where fewer or more make the case what it is.
-FEW_OF = {"10,000 layers": 100, "scales from 1e-6 to 1e5": 15, "thick fog, all of it": 15}
+# Triton's interpreter takes 20 ms for each tile-Gaussian pair, so it gets only this many Gaussians of a case.
+INTERPRETED_GAUSSIANS = 8
+# Some cases need fewer or more of them.
+INTERPRETED_GAUSSIANS_BY_CASE = {"10,000 layers": 100, "scales from 1e-6 to 1e5": 15, "thick fog, all of it": 15}
 
 
-def _fitting(case: Case, implementation: str, few: int = FEW) -> Case:
-    """The case, or every so many-th of its Gaussians for the interpreter."""
-    step = -(-len(case.gaussians["means"]) // few) if implementation == "gpu" and INTERPRETED else 1
+def _reduce_for_interpreter(case: Case, implementation: str, few: int = INTERPRETED_GAUSSIANS) -> Case:
+    """Return the case, or for the interpreter an evenly spaced selection of its Gaussians."""
+    step = -(-len(case.gaussians["means"]) // few) if implementation == "gpu" and IS_INTERPRETED else 1
     return replace(case, gaussians={key: value[:: max(step, 1)].clone() for key, value in case.gaussians.items()})
 
 
 def _run(case: Case, implementation: str, dtype: torch.dtype) -> tuple[Rasterization, dict[str, Tensor], Tensor]:
-    """The picture, the gradients under random cotangents, and the abs-gradient; on the CPU."""
+    """Return the picture, the gradients for random cotangents and the absolute gradient, on the CPU."""
     inputs, absgrad = _inputs(case, implementation, dtype)
     for tensor in inputs:
         tensor.requires_grad_()
     picture = _draw(case, implementation, inputs, absgrad)
     torch.autograd.backward([picture.rgb, picture.transmittance], _cotangents(case.height, case.width, dtype))
-    return picture, {name: tensor.grad.cpu() for name, tensor in zip(NAMES, inputs, strict=True)}, absgrad.cpu()
+    return (
+        picture,
+        {name: tensor.grad.cpu() for name, tensor in zip(PARAMETER_NAMES, inputs, strict=True)},
+        absgrad.cpu(),
+    )
 
 
 def _picture(case: Case, implementation: str, dtype: torch.dtype = torch.float32) -> Rasterization:
-    """The picture alone, on the CPU."""
+    """Return the picture alone, on the CPU."""
     return _draw(case, implementation, *_inputs(case, implementation, dtype))
 
 
 def _inputs(case: Case, implementation: str, dtype: torch.dtype) -> tuple[list[Tensor], Tensor]:
-    """Copies of the Gaussians and a buffer of zeros for absgrad, where the implementation takes them."""
-    device = DEVICE if implementation == "gpu" else "cpu"
-    inputs = [case.gaussians[name].to(device, dtype, copy=True) for name in NAMES]
+    """Return copies of the Gaussians and a zero buffer for absgrad, on the device of the implementation."""
+    device = KERNEL_DEVICE if implementation == "gpu" else "cpu"
+    inputs = [case.gaussians[name].to(device, dtype, copy=True) for name in PARAMETER_NAMES]
     return inputs, torch.zeros(len(inputs[0]), 2, dtype=dtype, device=device)
 
 
@@ -245,31 +249,36 @@ def _cotangents(height: int, width: int, dtype: torch.dtype) -> list[Tensor]:
 
 
 def _case(name: str, implementation: str) -> Case:
-    return _fitting(CASES[name](), implementation, FEW_OF.get(name, FEW))
+    return _reduce_for_interpreter(
+        CASE_MAKERS[name](), implementation, INTERPRETED_GAUSSIANS_BY_CASE.get(name, INTERPRETED_GAUSSIANS)
+    )
 
 
 @cache
 def _expected(name: str, implementation: str) -> tuple[Rasterization, dict[str, Tensor], Tensor]:
-    if implementation == "gpu" and not INTERPRETED:
+    if implementation == "gpu" and not IS_INTERPRETED:
         return _expected(name, "cpu")
     return _run(_case(name, implementation), "reference", torch.float64)
 
 
 def _assert_picture_close(actual: Tensor, expected: Tensor, tolerance: float = 1e-4) -> None:
-    """All pixels but one in 500 within tolerance of [0, 1]; those few are where rounding turns a threshold over
-    (alpha against 1/255, T against transmittance_min) and may be off by what that Gaussian adds, below 0.02."""
+    """Check that all pixels but one in 500 are within the tolerance.
+
+    At the others rounding changes the side of a threshold (alpha and 1/255, T and transmittance_min). They may differ
+    by what that Gaussian adds, below 0.02.
+    """
     error = (actual.double() - expected).abs()
     assert error.max() < 0.02
     assert (error > tolerance).double().mean() <= 0.002
 
 
 def _assert_gradient_close(actual: Tensor, expected: Tensor, tolerance: float = 1e-4) -> None:
-    """As a whole within tolerance of its length: single numbers can be differences of large ones."""
+    """Check the difference as a whole, relative to the length: single numbers can be differences of large ones."""
     assert torch.isfinite(actual).all()
     assert (actual.double() - expected).norm() <= tolerance * expected.norm() + 1e-12
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", CASE_MAKERS)
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
 def test_matches_the_float64_reference(implementation: str, name: str) -> None:
     case = _case(name, implementation)
@@ -282,11 +291,11 @@ def test_matches_the_float64_reference(implementation: str, name: str) -> None:
     farthest = float(expected.depth.max()) or 1.0
     _assert_picture_close(picture.depth / farthest, expected.depth / farthest, 1e-3)
     lengths = case.gaussians["quats"].norm(dim=1, keepdim=True)  # short quaternions have long gradients
-    for key in NAMES:
+    for key in PARAMETER_NAMES:
         scale = lengths if key == "quats" else 1
         _assert_gradient_close(grads[key] * scale, expected_grads[key] * scale)
     _assert_gradient_close(absgrad, expected_absgrad)
-    # The kernels may keep a tile whose pixel centres an ellipse just misses, never drop one.
+    # The kernels may keep a tile whose pixel centres an ellipse just misses, but never drop one that it hits.
     assert not (expected.visible & ~picture.visible).any()
     assert expected.pairs <= picture.pairs <= 1.05 * expected.pairs + 2
 
@@ -296,7 +305,7 @@ def test_matches_the_float64_reference(implementation: str, name: str) -> None:
 def test_tiles_and_bounds_do_not_change_the_picture(implementation: str, name: str) -> None:
     case = _case(name, implementation)
     gaussians = {key: value.double() for key, value in case.gaussians.items()}
-    shapes = [gaussians[key] for key in NAMES[:4]]
+    shapes = [gaussians[key] for key in PARAMETER_NAMES[:4]]
     splats = project(*shapes, case.camera, case.intrinsics, case.width, case.height, 0.01, False)
     splats = splats.select(torch.argsort(splats.depths, stable=True))
     ys, xs = torch.meshgrid(torch.arange(case.height) + 0.5, torch.arange(case.width) + 0.5, indexing="ij")
@@ -335,7 +344,7 @@ def test_one_isotropic_gaussian_has_the_closed_form(implementation: str) -> None
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
 def test_antialiasing_keeps_the_light_of_a_small_gaussian(implementation: str) -> None:
-    # Its integral over the picture is opacity 2 pi sqrt(det Sigma), with the low-pass or without.
+    # The integral over the picture is opacity 2 pi sqrt(det Sigma), with or without the low-pass filter.
     focal, sigma, distance, opacity = 60.0, 0.02, 3.0, 0.9
     gaussian = {
         "means": torch.tensor([[0.0, 0.0, distance]]),
@@ -355,11 +364,9 @@ def test_antialiasing_keeps_the_light_of_a_small_gaussian(implementation: str) -
 
 @pytest.mark.parametrize("transmittance_min", [1e-4, 1 / 512, 0.05])
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
-def test_stopping_early_misses_no_more_than_the_light_that_is_left(
-    implementation: str, transmittance_min: float
-) -> None:
+def test_early_termination_loses_at_most_the_remaining_light(implementation: str, transmittance_min: float) -> None:
     def fog(least: float) -> Case:
-        case = _fitting(_thick_fog(least), implementation, few=80)
+        case = _reduce_for_interpreter(_thick_fog(least), implementation, few=80)
         return replace(case, width=6, height=5, intrinsics=(50.0, 50.0, 3.0, 2.5))
 
     whole = _picture(fog(0.0), implementation)
@@ -374,7 +381,7 @@ def test_stopping_early_misses_no_more_than_the_light_that_is_left(
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_reference_passes_gradcheck(antialiased: bool) -> None:
     gaussians = _gaussians(3, seed=3, size=0.6, spread=0.4)
-    inputs = [gaussians[name].double().requires_grad_() for name in NAMES]
+    inputs = [gaussians[name].double().requires_grad_() for name in PARAMETER_NAMES]
 
     def run(*tensors: Tensor) -> tuple[Tensor, Tensor]:
         picture = rasterize(
@@ -387,8 +394,10 @@ def test_reference_passes_gradcheck(antialiased: bool) -> None:
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
 def test_absgrad_is_the_sum_of_absolute_gradients_of_single_pixels(implementation: str) -> None:
-    case = _fitting(Case(_gaussians(12), width=18, height=17, intrinsics=(18.0, 18.0, 9.0, 8.5)), implementation)
-    gaussians = [case.gaussians[name].double() for name in NAMES]
+    case = _reduce_for_interpreter(
+        Case(_gaussians(12), width=18, height=17, intrinsics=(18.0, 18.0, 9.0, 8.5)), implementation
+    )
+    gaussians = [case.gaussians[name].double() for name in PARAMETER_NAMES]
     splats = project(*gaussians[:4], case.camera, case.intrinsics, 18, 17, 0.01, False)
     splats = splats.select(torch.argsort(splats.depths, stable=True))
     colors = gaussians[4][splats.index]
@@ -413,8 +422,8 @@ def test_absgrad_is_added_to_what_the_buffer_holds(implementation: str) -> None:
     case = Case(_gaussians(5), width=18, height=17, intrinsics=(18.0, 18.0, 9.0, 8.5))
     _, _, once = _run(case, implementation, torch.float32)
     place = gpu if implementation == "gpu" else Tensor.clone
-    inputs = [place(case.gaussians[name]).requires_grad_() for name in NAMES]
-    buffer = place(torch.full((5, 4), 3.0))[:, ::2]  # with gaps
+    inputs = [place(case.gaussians[name]).requires_grad_() for name in PARAMETER_NAMES]
+    buffer = place(torch.full((5, 4), 3.0))[:, ::2]  # a buffer with gaps
 
     picture = rasterize(*inputs, case.camera, case.intrinsics, 18, 17, absgrad=buffer, implementation=implementation)
     cotangents = [place(tensor) for tensor in _cotangents(17, 18, torch.float32)]
@@ -423,7 +432,7 @@ def test_absgrad_is_added_to_what_the_buffer_holds(implementation: str) -> None:
     torch.testing.assert_close(buffer.cpu(), once + 3)
 
 
-def test_same_bytes_with_any_number_of_threads_and_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bytes_do_not_depend_on_threads_or_repetition(monkeypatch: pytest.MonkeyPatch) -> None:
     case = Case(_gaussians(3000), width=150, height=90, intrinsics=(150.0, 150.0, 75.0, 45.0))
     results = []
     for threads in (1, 2, 2, 5):
@@ -437,21 +446,21 @@ def test_same_bytes_with_any_number_of_threads_and_again(monkeypatch: pytest.Mon
 
 
 @needs_triton
-def test_same_bytes_on_the_gpu_again() -> None:
-    # Nothing is added up in an order that chance decides.
-    case = _fitting(Case(_gaussians(3000, size=0.2), 40, 20, (50.0, 50.0, 20.0, 10.0)), "gpu")
+def test_bytes_on_the_gpu_do_not_depend_on_repetition() -> None:
+    # No sum depends on the order in which blocks happen to run.
+    case = _reduce_for_interpreter(Case(_gaussians(3000, size=0.2), 40, 20, (50.0, 50.0, 20.0, 10.0)), "gpu")
     (first, first_grads, first_absgrad), (again, grads, absgrad) = (_run(case, "gpu", torch.float32) for _ in range(2))
 
     for name in ("rgb", "transmittance", "depth"):
         assert torch.equal(getattr(again, name), getattr(first, name))
-    assert all(torch.equal(grads[name], first_grads[name]) for name in NAMES)
+    assert all(torch.equal(grads[name], first_grads[name]) for name in PARAMETER_NAMES)
     assert torch.equal(absgrad, first_absgrad)
 
 
 @needs_triton
 @pytest.mark.parametrize("more", [-1, 1])
-def test_tiles_counted_otherwise_than_listed_change_nothing_else(monkeypatch: pytest.MonkeyPatch, more: int) -> None:
-    # Two kernels of one compiler may round differently, however alike they read.
+def test_a_wrong_tile_count_of_one_gaussian_affects_no_other(monkeypatch: pytest.MonkeyPatch, more: int) -> None:
+    # Two kernels of one compiler may round differently even where their source is alike.
     from hyrfpack.ops.rasterize import gpu as module
 
     case = Case(_gaussians(4, size=0.3), width=33, height=17)
@@ -469,8 +478,8 @@ def test_tiles_counted_otherwise_than_listed_change_nothing_else(monkeypatch: py
     assert (picture.pairs - expected.pairs) * more > 0
     if more > 0:
         assert torch.equal(picture.rgb, expected.rgb)
-        assert all(torch.equal(grads[name], expected_grads[name]) for name in NAMES)
-    assert all(torch.isfinite(grads[name]).all() for name in NAMES)
+        assert all(torch.equal(grads[name], expected_grads[name]) for name in PARAMETER_NAMES)
+    assert all(torch.isfinite(grads[name]).all() for name in PARAMETER_NAMES)
 
 
 @needs_triton
@@ -482,20 +491,20 @@ def test_more_pairs_than_can_be_numbered_are_rejected(monkeypatch: pytest.Monkey
         _picture(Case(_gaussians(8)), "gpu")
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", PARAMETER_NAMES)
 @pytest.mark.parametrize("poison", [math.nan, math.inf, -math.inf, 3e38])
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
-def test_numbers_that_are_not_finite_are_named_and_do_no_harm_to_others_memory(
+def test_values_that_are_not_finite_are_named_and_write_no_other_memory(
     implementation: str, poison: float, name: str
 ) -> None:
-    case = Case(_gaussians(4 if implementation == "gpu" and INTERPRETED else 64), 17, 16, (20.0, 20.0, 8.0, 8.0))
+    case = Case(_gaussians(4 if implementation == "gpu" and IS_INTERPRETED else 64), 17, 16, (20.0, 20.0, 8.0, 8.0))
     case.gaussians[name][1::3] = poison
 
     picture, grads, _ = _run(case, implementation, torch.float32)
 
     assert picture.nonfinite == (() if poison == 3e38 else (name,))
     assert picture.rgb.shape == (16, 17, 3)
-    assert all(grads[key].shape == case.gaussians[key].shape for key in NAMES)
+    assert all(grads[key].shape == case.gaussians[key].shape for key in PARAMETER_NAMES)
 
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
@@ -509,8 +518,8 @@ def test_every_input_that_is_not_finite_is_named(implementation: str) -> None:
 
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
-def test_picture_without_gradients_needs_none(implementation: str) -> None:
-    case = _fitting(Case(_gaussians(30)), implementation, few=4)
+def test_a_picture_can_be_drawn_without_gradients(implementation: str) -> None:
+    case = _reduce_for_interpreter(Case(_gaussians(30)), implementation, few=4)
     inputs, _ = _inputs(case, implementation, torch.float32)
     with torch.no_grad():
         picture = rasterize(
@@ -524,7 +533,9 @@ def test_picture_without_gradients_needs_none(implementation: str) -> None:
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
 def test_depth_and_visible_are_not_differentiable(implementation: str) -> None:
-    picture, _, _ = _run(_fitting(Case(_gaussians(30)), implementation, few=4), implementation, torch.float32)
+    picture, _, _ = _run(
+        _reduce_for_interpreter(Case(_gaussians(30)), implementation, few=4), implementation, torch.float32
+    )
 
     assert picture.rgb.requires_grad
     assert picture.transmittance.requires_grad
@@ -535,16 +546,16 @@ def test_depth_and_visible_are_not_differentiable(implementation: str) -> None:
 
 @needs_triton
 @pytest.mark.parametrize("tolerance", [0.0, 0.3])
-def test_frustum_of_the_gpu_is_the_picture_and_a_band_around_it(tolerance: float) -> None:
+def test_the_gpu_frustum_is_the_picture_and_a_band_around_it(tolerance: float) -> None:
     from hyrfpack.ops.rasterize.gpu_project import pack_camera
 
     positions = _gaussians(400, spread=3.0)["means"]
     camera, intrinsics = _camera(2.0), (30.0, 50.0, 20.0, 24.0)
     x, y, z = (positions.double() @ camera[:3, :3].T + camera[:3, 3]).unbind(-1)
-    across, down = (30 * x / z + 20) / 24 - 1, (50 * y / z + 24) / 20 - 1  # -1 to 1 in the picture
+    across, down = (30 * x / z + 20) / 24 - 1, (50 * y / z + 24) / 20 - 1  # -1 to 1 inside the picture
     expected = (z > 0.5) & (across.abs() < 1 + tolerance) & (down.abs() < 1 + tolerance)
 
-    numbers = pack_camera(camera, intrinsics, 48, 40, 0.5, torch.device(DEVICE), tolerance)
+    numbers = pack_camera(camera, intrinsics, 48, 40, 0.5, torch.device(KERNEL_DEVICE), tolerance)
     inside = gpu(torch.zeros(512, dtype=torch.int32))
     _frustum_kernel[(4,)](gpu(positions), numbers, 400, inside, num_warps=4, enable_fp_fusion=True)
 
@@ -572,7 +583,7 @@ def test_unfit_arguments_are_rejected() -> None:
 
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="reads x86 assembly")
 def test_blending_loops_are_vectorised() -> None:
-    # Losing this costs a factor of ten and changes no result, so nothing else would notice.
+    # Losing vectorisation costs a factor of ten and changes no result, so no other test would notice.
     from numba import njit
 
     from hyrfpack.ops.rasterize import cpu_blend

@@ -1,4 +1,4 @@
-"""rasterize_shaded: the one kernel against culling, shading and rasterising one after the other, in float64."""
+"""rasterize_shaded: the combined kernel against culling, shading and rasterising in sequence, in float64."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hyrfpack.ops.rasterize.shaded import rasterize_shaded
 from hyrfpack.ops.shade import DIRECTION_FEATURES, Shading
 
 pytestmark = needs_triton
-LENS = (30.0, 32.0, 11.0, 9.5)
+CAMERA_INTRINSICS = (30.0, 32.0, 11.0, 9.5)
 
 
 def normal(*shape: int, seed: int) -> torch.Tensor:
@@ -40,11 +40,11 @@ def shading(
     )
 
 
-def converted(value, to):
+def convert_tensors(value, to):
     if isinstance(value, Shading):
-        return Shading(*(converted(getattr(value, field.name), to) for field in dataclasses.fields(value)))
+        return Shading(*(convert_tensors(getattr(value, field.name), to) for field in dataclasses.fields(value)))
     if isinstance(value, tuple):
-        return tuple(converted(part, to) for part in value)
+        return tuple(convert_tensors(part, to) for part in value)
     return to(value) if isinstance(value, torch.Tensor) else value
 
 
@@ -54,21 +54,23 @@ def camera(distance: float = 4.0) -> torch.Tensor:
     return pose
 
 
-def drawn(splats: list, colors: Shading, pose: torch.Tensor, **options) -> Rasterization:
+def draw_on_gpu(splats: list, colors: Shading, pose: torch.Tensor, **options) -> Rasterization:
     options = {"depth": True, "cull_tolerance": 0.0, **options}
     splats = [gpu(tensor) for tensor in splats]
-    return rasterize_shaded(*splats, converted(colors, gpu), pose, LENS, 24, 20, implementation="gpu", **options)
+    return rasterize_shaded(
+        *splats, convert_tensors(colors, gpu), pose, CAMERA_INTRINSICS, 24, 20, implementation="gpu", **options
+    )
 
 
-def expected(splats: list, colors: Shading, pose: torch.Tensor, **options) -> Rasterization:
+def draw_reference(splats: list, colors: Shading, pose: torch.Tensor, **options) -> Rasterization:
     options = {"depth": True, "cull_tolerance": 0.0, **options}
     splats = [tensor.double() for tensor in splats]
-    colors = converted(colors, lambda tensor: tensor if tensor.dtype == torch.bfloat16 else tensor.double())
-    return rasterize_shaded(*splats, colors, pose, LENS, 24, 20, implementation="reference", **options)
+    colors = convert_tensors(colors, lambda tensor: tensor if tensor.dtype == torch.bfloat16 else tensor.double())
+    return rasterize_shaded(*splats, colors, pose, CAMERA_INTRINSICS, 24, 20, implementation="reference", **options)
 
 
-# name -> (number, distance of the camera, shading's options, options)
-CASES = {
+# Name -> (number of Gaussians, distance of the camera, options of the shading, options).
+SHADED_CASES = {
     "random": (60, 4.0, {}, {}),
     "a wide band around the picture": (60, 4.0, {}, {"cull_tolerance": 2.0}),
     "in the middle of it, antialiased": (60, 0.5, {}, {"antialiased": True, "near": 0.2}),
@@ -78,13 +80,13 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_matches_the_parts_in_float64(case: str) -> None:
-    count, distance, made, options = CASES[case]
+@pytest.mark.parametrize("case", SHADED_CASES)
+def test_the_combined_kernel_matches_its_parts_in_float64(case: str) -> None:
+    count, distance, made, options = SHADED_CASES[case]
     splats, colors = gaussians(count), shading(count, **made)
-    wanted = expected(splats, colors, camera(distance), **options)
+    wanted = draw_reference(splats, colors, camera(distance), **options)
 
-    found = drawn(splats, colors, camera(distance), **options)
+    found = draw_on_gpu(splats, colors, camera(distance), **options)
 
     for name in ("rgb", "transmittance"):
         torch.testing.assert_close(getattr(found, name).cpu().double(), getattr(wanted, name), rtol=0, atol=1e-4)
@@ -92,14 +94,18 @@ def test_matches_the_parts_in_float64(case: str) -> None:
     assert not (wanted.visible & ~found.visible.cpu()).any() and found.visible.shape == (count,)
     assert wanted.pairs <= found.pairs <= 1.05 * wanted.pairs + 2
     assert found.nonfinite == ()
-    if case == "random":  # that culling has something to do is part of the case
-        assert 0 < wanted.visible.sum() < expected(splats, colors, camera(distance), cull_tolerance=9.0).visible.sum()
+    if case == "random":  # only this case requires that culling removes something
+        assert (
+            0
+            < wanted.visible.sum()
+            < draw_reference(splats, colors, camera(distance), cull_tolerance=9.0).visible.sum()
+        )
 
 
-def test_mixed_precision_stays_near() -> None:
+def test_mixed_precision_stays_close_to_float64() -> None:
     splats, colors = gaussians(60), shading(60, mixed=True)
-    wanted = expected(splats, dataclasses.replace(colors, mixed=False), camera())
-    found = drawn(splats, colors, camera())
+    wanted = draw_reference(splats, dataclasses.replace(colors, mixed=False), camera())
+    found = draw_on_gpu(splats, colors, camera())
     assert (found.rgb.cpu().double() - wanted.rgb).abs().max() < 2e-2
     torch.testing.assert_close(found.transmittance.cpu().double(), wanted.transmittance, rtol=0, atol=1e-5)
 
@@ -108,20 +114,20 @@ def test_mixed_precision_stays_near() -> None:
 def test_shapes_that_disagree_are_rejected_before_a_kernel_reads_past_an_end(index: int) -> None:
     splats, colors = gaussians(20), shading(20)
     with pytest.raises(ValueError):
-        drawn(splats, shading(19), camera())
+        draw_on_gpu(splats, shading(19), camera())
     splats[index] = splats[index][:19]
     with pytest.raises(ValueError):
-        drawn(splats, colors, camera())
+        draw_on_gpu(splats, colors, camera())
 
 
 @pytest.mark.parametrize("index", range(4))
 def test_inputs_that_are_not_finite_are_named(index: int) -> None:
     splats, colors = gaussians(20), shading(20)
     splats[index].view(-1)[7] = float("nan")
-    assert drawn(splats, colors, camera()).nonfinite == (("means", "quats", "scales", "opacities")[index],)
+    assert draw_on_gpu(splats, colors, camera()).nonfinite == (("means", "quats", "scales", "opacities")[index],)
 
 
 def test_colors_that_are_not_finite_are_named_where_they_are_drawn() -> None:
     splats, colors = gaussians(20), shading(20)
     colors.first_layer[3] = float("nan")
-    assert drawn(splats, colors, camera()).nonfinite == ("colors",)
+    assert draw_on_gpu(splats, colors, camera()).nonfinite == ("colors",)

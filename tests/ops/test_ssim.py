@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from ops.device import INTERPRETED, gpu, needs_triton
+from ops.device import IS_INTERPRETED, gpu, needs_triton
 from skimage.metrics import structural_similarity
 
 from hyrfpack.ops.ssim import photometric_loss, ssim
@@ -20,27 +20,27 @@ IMPLEMENTATIONS = [
 ]
 
 
-def photo(height: int, width: int, seed: int = 0) -> torch.Tensor:
-    """Smooth waves of colour and some noise, in [0, 1]."""
+def make_photo(height: int, width: int, seed: int = 0) -> torch.Tensor:
+    """Return a picture of smooth colour waves and some noise, in [0, 1]."""
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     waves = torch.stack([torch.sin(0.11 * x + seed), torch.cos(0.07 * y), torch.sin(0.05 * (x + y))], dim=-1)
     noise = torch.randn(height, width, 3, generator=torch.Generator().manual_seed(seed))
     return (0.5 + 0.3 * waves + 0.08 * noise).clamp(0, 1)
 
 
-# name -> (image, target)
-CASES = {
-    "two pictures": (photo(120, 90), photo(120, 90, seed=1)),
-    "several strips and tiles": (photo(300, 520), photo(300, 520, seed=1)),
-    "one pixel": (photo(1, 1), photo(1, 1, seed=1)),
-    "narrower than the window": (photo(17, 3), photo(17, 3, seed=1)),
-    "one row": (photo(1, 60), photo(1, 60, seed=1)),
+# Name -> (image, target).
+PICTURE_PAIRS = {
+    "two pictures": (make_photo(120, 90), make_photo(120, 90, seed=1)),
+    "several strips and tiles": (make_photo(300, 520), make_photo(300, 520, seed=1)),
+    "one pixel": (make_photo(1, 1), make_photo(1, 1, seed=1)),
+    "narrower than the window": (make_photo(17, 3), make_photo(17, 3, seed=1)),
+    "one row": (make_photo(1, 60), make_photo(1, 60, seed=1)),
     "constant": (torch.full((30, 40, 3), 0.3), torch.full((30, 40, 3), 0.8)),
-    "black against a picture": (torch.zeros(30, 40, 3), photo(30, 40)),
+    "black against a picture": (torch.zeros(30, 40, 3), make_photo(30, 40)),
     "black against black": (torch.zeros(30, 40, 3), torch.zeros(30, 40, 3)),
-    "bright and nearly flat": (1 - 0.002 * photo(64, 64), 1 - 0.002 * photo(64, 64, seed=1)),
+    "bright and nearly flat": (1 - 0.002 * make_photo(64, 64), 1 - 0.002 * make_photo(64, 64, seed=1)),
 }
-MASKS = {
+MASK_MAKERS = {
     "no mask": lambda shape: None,
     "some pixels": lambda shape: torch.rand(shape, generator=torch.Generator().manual_seed(5)) < 0.6,
     "left half": lambda shape: (torch.arange(shape[1]) < (shape[1] + 1) // 2).expand(shape),
@@ -49,21 +49,23 @@ MASKS = {
 }
 
 
-def fitting(implementation: str, *pictures: torch.Tensor, size: tuple[int, int] = (11, 12)) -> list[torch.Tensor]:
-    """The pictures, or corners of them for Triton's interpreter, which is too slow for all."""
-    if implementation == "gpu" and INTERPRETED:
+def crop_for_interpreter(
+    implementation: str, *pictures: torch.Tensor, size: tuple[int, int] = (11, 12)
+) -> list[torch.Tensor]:
+    """Return the pictures, or for the interpreter, which is slow, their corners."""
+    if implementation == "gpu" and IS_INTERPRETED:
         return [picture[: size[0], : size[1]] for picture in pictures]
     return list(pictures)
 
 
 def case_for(implementation: str, name: str) -> list[torch.Tensor]:
-    # What is left of these is still 2 strips, and 2 blocks of columns.
+    # These corners still have 2 strips and 2 blocks of columns.
     sizes = {"several strips and tiles": (25, 12), "one row": (1, 60)}
-    return fitting(implementation, *CASES[name], size=sizes.get(name, (11, 12)))
+    return crop_for_interpreter(implementation, *PICTURE_PAIRS[name], size=sizes.get(name, (11, 12)))
 
 
 def value_and_gradient(loss, implementation: str, image: torch.Tensor, *others: torch.Tensor | None) -> tuple:
-    """A loss of pictures and its gradient by the first, in float64."""
+    """Return a loss of pictures and its gradient by the first one, in float64."""
     image = image.clone().requires_grad_()
     pictures = [image, *others]
     if implementation == "gpu":
@@ -72,7 +74,9 @@ def value_and_gradient(loss, implementation: str, image: torch.Tensor, *others: 
     return value.detach().cpu().double(), torch.autograd.grad(value, pictures[0])[0].cpu().double()
 
 
-def expected_of(loss, image: torch.Tensor, target: torch.Tensor, *others: torch.Tensor | None) -> tuple:
+def reference_value_and_gradient(
+    loss, image: torch.Tensor, target: torch.Tensor, *others: torch.Tensor | None
+) -> tuple:
     return value_and_gradient(loss, "reference", image.double(), target.double(), *others)
 
 
@@ -83,25 +87,25 @@ def assert_same(actual: tuple[torch.Tensor, torch.Tensor], expected: tuple[torch
 
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", PICTURE_PAIRS)
 def test_ssim_matches_the_float64_reference(implementation: str, case: str) -> None:
     pictures = case_for(implementation, case)
-    assert_same(value_and_gradient(ssim, implementation, *pictures), expected_of(ssim, *pictures))
+    assert_same(value_and_gradient(ssim, implementation, *pictures), reference_value_and_gradient(ssim, *pictures))
 
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
-@pytest.mark.parametrize("mask", MASKS)
+@pytest.mark.parametrize("mask", MASK_MAKERS)
 @pytest.mark.parametrize("case", ["two pictures", "several strips and tiles", "narrower than the window", "one pixel"])
 def test_photometric_loss_matches_the_float64_reference(implementation: str, mask: str, case: str) -> None:
     pictures = case_for(implementation, case)
-    chosen = MASKS[mask](pictures[0].shape[:2])
+    chosen = MASK_MAKERS[mask](pictures[0].shape[:2])
     actual = value_and_gradient(photometric_loss, implementation, *pictures, chosen)
-    assert_same(actual, expected_of(photometric_loss, *pictures, chosen))
+    assert_same(actual, reference_value_and_gradient(photometric_loss, *pictures, chosen))
 
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
-def test_ssim_is_that_of_scikit_image_on_a_black_ground(implementation: str) -> None:
-    pictures = fitting(implementation, photo(60, 80), photo(60, 80, seed=1))
+def test_ssim_matches_scikit_image_with_black_padding(implementation: str) -> None:
+    pictures = crop_for_interpreter(implementation, make_photo(60, 80), make_photo(60, 80, seed=1))
     ground = [np.pad(picture.double().numpy(), ((10, 10), (10, 10), (0, 0))) for picture in pictures]
     settings = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 1.0}
     _, expected = structural_similarity(*ground, channel_axis=2, full=True, **settings)
@@ -110,9 +114,9 @@ def test_ssim_is_that_of_scikit_image_on_a_black_ground(implementation: str) -> 
 
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
-def test_loss_without_ssim_is_the_mean_absolute_difference_of_what_counts(implementation: str) -> None:
-    image, target = fitting(implementation, photo(40, 50), photo(40, 50, seed=1))
-    mask = MASKS["some pixels"](image.shape[:2])
+def test_loss_without_ssim_is_the_mean_absolute_difference_of_unmasked_pixels(implementation: str) -> None:
+    image, target = crop_for_interpreter(implementation, make_photo(40, 50), make_photo(40, 50, seed=1))
+    mask = MASK_MAKERS["some pixels"](image.shape[:2])
     loss = partial(photometric_loss, ssim_weight=0.0)
     value, _ = value_and_gradient(loss, implementation, image, target, mask)
     assert value.item() == pytest.approx((image - target).abs()[mask].double().mean().item(), abs=1e-6)
@@ -120,7 +124,7 @@ def test_loss_without_ssim_is_the_mean_absolute_difference_of_what_counts(implem
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
 def test_equal_pictures_have_ssim_one_no_loss_and_no_gradient(implementation: str) -> None:
-    (image,) = fitting(implementation, photo(40, 50))
+    (image,) = crop_for_interpreter(implementation, make_photo(40, 50))
     loss, gradient = value_and_gradient(photometric_loss, implementation, image, image)
     similarity, _ = value_and_gradient(ssim, implementation, image, image)
     assert similarity.item() == pytest.approx(1, abs=1e-6)
@@ -129,9 +133,9 @@ def test_equal_pictures_have_ssim_one_no_loss_and_no_gradient(implementation: st
 
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
-def test_masked_out_pixels_give_neither_value_nor_gradient(implementation: str) -> None:
-    image, target = fitting(implementation, photo(40, 50), photo(40, 50, seed=1))
-    mask = MASKS["left half"](image.shape[:2])
+def test_masked_pixels_give_neither_loss_nor_gradient(implementation: str) -> None:
+    image, target = crop_for_interpreter(implementation, make_photo(40, 50), make_photo(40, 50, seed=1))
+    mask = MASK_MAKERS["left half"](image.shape[:2])
     spoiled = torch.where(mask[..., None], image, torch.tensor(float("nan")))
 
     value, gradient = value_and_gradient(photometric_loss, implementation, spoiled, target, mask)
@@ -142,30 +146,30 @@ def test_masked_out_pixels_give_neither_value_nor_gradient(implementation: str) 
 
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
-def test_nothing_counting_gives_zero(implementation: str) -> None:
-    image, target = fitting(implementation, photo(20, 30), photo(20, 30, seed=1))
-    mask = MASKS["none"](image.shape[:2])
+def test_a_completely_masked_picture_has_zero_loss(implementation: str) -> None:
+    image, target = crop_for_interpreter(implementation, make_photo(20, 30), make_photo(20, 30, seed=1))
+    mask = MASK_MAKERS["none"](image.shape[:2])
     value, gradient = value_and_gradient(photometric_loss, implementation, image, target, mask)
     assert value == 0
     assert not gradient.any()
 
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
-def test_gradient_is_that_of_what_is_made_of_the_loss(implementation: str) -> None:
-    pictures = fitting(implementation, photo(40, 50), photo(40, 50, seed=1))
+def test_the_gradient_is_scaled_by_the_upstream_gradient(implementation: str) -> None:
+    pictures = crop_for_interpreter(implementation, make_photo(40, 50), make_photo(40, 50, seed=1))
 
     def curved(*pictures: torch.Tensor, implementation: str) -> torch.Tensor:
         return -3 * photometric_loss(*pictures, implementation=implementation) ** 2
 
-    assert_same(value_and_gradient(curved, implementation, *pictures), expected_of(curved, *pictures))
+    assert_same(value_and_gradient(curved, implementation, *pictures), reference_value_and_gradient(curved, *pictures))
 
 
 @pytest.mark.gpu
-@pytest.mark.skipif(INTERPRETED, reason="no GPU to wait for")
-def test_host_never_waits_for_the_gpu() -> None:
-    image, target = gpu(photo(40, 50).requires_grad_()), gpu(photo(40, 50, seed=1))
-    mask = gpu(MASKS["some pixels"]((40, 50)))
-    photometric_loss(image, target, mask).backward()  # builds the kernels
+@pytest.mark.skipif(IS_INTERPRETED, reason="no GPU to wait for")
+def test_the_host_never_waits_for_the_gpu() -> None:
+    image, target = gpu(make_photo(40, 50).requires_grad_()), gpu(make_photo(40, 50, seed=1))
+    mask = gpu(MASK_MAKERS["some pixels"]((40, 50)))
+    photometric_loss(image, target, mask).backward()  # compiles the kernels
     torch.cuda.set_sync_debug_mode("error")
     try:
         photometric_loss(image, target, mask).backward()
@@ -174,15 +178,15 @@ def test_host_never_waits_for_the_gpu() -> None:
 
 
 def test_reference_passes_gradcheck() -> None:
-    image, target = photo(7, 6).double().requires_grad_(), photo(7, 6, seed=1).double()
-    mask = MASKS["some pixels"]((7, 6))
+    image, target = make_photo(7, 6).double().requires_grad_(), make_photo(7, 6, seed=1).double()
+    mask = MASK_MAKERS["some pixels"]((7, 6))
     assert torch.autograd.gradcheck(lambda x: ssim(x, target), image)
     assert torch.autograd.gradcheck(lambda x: photometric_loss(x, target, mask), image)
 
 
 @pytest.mark.skipif(not has_numba(), reason="no numba")
 def test_bytes_do_not_depend_on_threads_or_on_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    image, target = CASES["several strips and tiles"]
+    image, target = PICTURE_PAIRS["several strips and tiles"]
 
     def run() -> list[bytes]:
         return [t.numpy().tobytes() for t in value_and_gradient(photometric_loss, "cpu", image, target)]
@@ -204,7 +208,7 @@ def test_bytes_do_not_depend_on_threads_or_on_the_run(monkeypatch: pytest.Monkey
     ],
     ids=["unequal", "four channels", "empty", "mask turned"],
 )
-def test_rejects_what_does_not_fit(image: tuple, target: tuple, mask: tuple | None) -> None:
+def test_inputs_that_do_not_fit_are_rejected(image: tuple, target: tuple, mask: tuple | None) -> None:
     chosen = None if mask is None else torch.ones(mask, dtype=torch.bool)
     with pytest.raises(ValueError):
         photometric_loss(torch.rand(image), torch.rand(target), chosen)

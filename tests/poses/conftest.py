@@ -1,4 +1,4 @@
-"""A small set of photos with known poses, and what an estimation makes of it."""
+"""Fixtures of a small set of photos with known poses, and the result of estimating its poses."""
 
 from __future__ import annotations
 
@@ -13,8 +13,10 @@ import hyrfpack
 
 @pytest.fixture(scope="session")
 def taken(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, np.ndarray]]:
-    """A folder of photos, not to be changed, and their poses by name: names with spaces, any letters, and as long as
-    files may have."""
+    """A folder of photos and their poses by name. Tests must not change it.
+
+    The names have spaces, letters of any alphabet and the longest length that files may have.
+    """
     folder = tmp_path_factory.mktemp("taken") / "my photos"
     poses = write_photos(folder)
     names = {name: f"fähre ({number}).png" for number, name in enumerate(sorted(poses)[:-1])}
@@ -26,9 +28,9 @@ def taken(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, np.
 
 @pytest.fixture(scope="session")
 def posed(taken, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, hyrfpack.PosesReport, list, list]:
-    """The scene made of them, not to be changed; the report; what was told of progress, and what was said."""
-    told: list[tuple[str, float]] = []
-    said: list[str] = []
+    """The estimated scene, its report, the progress that was reported and the messages. Tests must not change it."""
+    progress: list[tuple[str, float]] = []
+    messages: list[str] = []
     out = tmp_path_factory.mktemp("posed") / "a scene"
-    report = hyrfpack.estimate_poses(taken[0], out, report=lambda *now: told.append(now), say=said.append)
-    return out, report, told, said
+    report = hyrfpack.estimate_poses(taken[0], out, report=lambda *now: progress.append(now), say=messages.append)
+    return out, report, progress, messages

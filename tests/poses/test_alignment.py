@@ -1,4 +1,4 @@
-"""Two reconstructions held beside each other: known similarities, folds, flips and pieces."""
+"""Comparison of two reconstructions: known similarities, folds, mirrored scenes and pieces."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hyrfpack.poses.alignment import align_poses, camera_extent, camera_position
 
 
 @pytest.mark.parametrize("poses", [circle_poses(), line_poses()])
-def test_the_same_cameras_in_another_frame_agree_all(poses):
+def test_all_cameras_agree_after_a_change_of_frame(poses):
     found = align_poses(poses, transform_poses(poses))
     assert found.agreeing == set(poses)
     assert found.distance.max() < 1e-9
@@ -25,17 +25,17 @@ def test_small_errors_agree_and_large_ones_do_not():
     assert len(align_poses(transform_poses(circle_poses(noise=1.0, seed=2)), exact).agreeing) < 12
 
 
-def test_a_third_that_is_folded_onto_the_rest_is_found():
+def test_cameras_folded_onto_others_do_not_agree():
     exact = circle_poses()
     folded = dict(exact)
     names = sorted(exact)
-    for name, onto in zip(names[16:], names[:8], strict=True):  # a wall taken for another
+    for name, onto in zip(names[16:], names[:8], strict=True):  # as when one wall is mistaken for another
         folded[name] = exact[onto]
     assert align_poses(transform_poses(folded), exact).agreeing == set(names[:16])
     assert align_poses(exact, transform_poses(folded)).agreeing == set(names[:16])
 
 
-def test_cameras_in_the_right_places_that_look_elsewhere_do_not_agree():
+def test_cameras_with_right_positions_and_wrong_rotations_do_not_agree():
     exact = circle_poses()
     turned = dict(exact)
     for name in sorted(exact)[:5]:
@@ -54,7 +54,7 @@ def test_a_mirrored_scene_does_not_agree():
     assert len(align_poses(flipped, exact).agreeing) < len(exact) / 2
 
 
-def test_only_photos_of_both_are_compared_and_two_never_agree():
+def test_only_common_photos_are_compared_and_two_are_too_few():
     exact = circle_poses()
     half = {name: pose for name, pose in exact.items() if name < "012"}
     assert align_poses(half, exact).agreeing == set(half)

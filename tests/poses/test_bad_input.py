@@ -1,4 +1,4 @@
-"""Photos that no poses can be found for: one sentence each, which says what to do."""
+"""Photos for which no poses can be found give a clear error that says what to do."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 import hyrfpack
 
 
-def save(folder: Path, pictures: list[np.ndarray]) -> Path:
+def save_pictures(folder: Path, pictures: list[np.ndarray]) -> Path:
     folder.mkdir(exist_ok=True)
     for number, pixels in enumerate(pictures):
         Image.fromarray(pixels).save(folder / f"{number:02d}.png")
@@ -23,13 +23,13 @@ def save(folder: Path, pictures: list[np.ndarray]) -> Path:
 
 
 def random_pictures(count: int, seed: int = 0) -> list[np.ndarray]:
-    """Pictures that have nothing in common."""
+    """Return pictures that have nothing in common."""
     rng = np.random.default_rng(seed)
     small = [rng.integers(0, 255, (30, 40, 3), np.uint8) for _ in range(count)]
     return [np.asarray(Image.fromarray(pixels).resize((160, 120), Image.Resampling.BICUBIC)) for pixels in small]
 
 
-def test_no_photos(tmp_path):
+def test_a_folder_without_photos_is_a_clear_error(tmp_path):
     (tmp_path / "photos").mkdir()
     assert "there are no photos here" in refused("poses", tmp_path / "photos", "-o", tmp_path / "scene")
     (tmp_path / "photos" / "clip.MP4").touch()
@@ -40,23 +40,23 @@ def test_no_photos(tmp_path):
 
 
 @pytest.mark.parametrize("count, words", [(1, "1 photo is too few"), (2, "2 photos are too few")])
-def test_too_few_photos(count, words, tmp_path):
-    photos = save(tmp_path / "photos", random_pictures(count))
+def test_too_few_photos_are_a_clear_error(count, words, tmp_path):
+    photos = save_pictures(tmp_path / "photos", random_pictures(count))
     sentence = refused("poses", photos, "-o", tmp_path / "scene")
     assert words in sentence and "take 20 or more" in sentence
 
 
-def test_one_photo_is_no_folder(tmp_path):
-    photos = save(tmp_path / "photos", random_pictures(1))
+def test_a_single_photo_in_place_of_a_folder_is_a_clear_error(tmp_path):
+    photos = save_pictures(tmp_path / "photos", random_pictures(1))
     assert "name the folder of all photos" in refused("poses", photos / "00.png", "-o", tmp_path / "scene")
 
 
-def test_copies_of_one_photo(tmp_path):
-    photos = save(tmp_path / "photos", random_pictures(1) * 5)
+def test_copies_of_one_photo_are_a_clear_error(tmp_path):
+    photos = save_pictures(tmp_path / "photos", random_pictures(1) * 5)
     assert "4 of 5 files are copies of another" in refused("poses", photos, "-o", tmp_path / "scene")
 
 
-def test_files_that_are_no_pictures(tmp_path):
+def test_files_that_are_no_pictures_are_a_clear_error(tmp_path):
     (tmp_path / "photos").mkdir()
     for number in range(4):
         (tmp_path / "photos" / f"{number}.jpg").write_bytes(b"no picture %d" % number)
@@ -65,8 +65,8 @@ def test_files_that_are_no_pictures(tmp_path):
     assert sentence.endswith("copy them again, or remove them")
 
 
-def test_photos_cut_off_in_the_middle(tmp_path):
-    photos = save(tmp_path / "photos", random_pictures(4))
+def test_truncated_photos_are_a_clear_error(tmp_path):
+    photos = save_pictures(tmp_path / "photos", random_pictures(4))
     for path in photos.iterdir():
         path.write_bytes(path.read_bytes()[:2000])
     sentence = refused("poses", photos, "-o", tmp_path / "scene")
@@ -74,31 +74,31 @@ def test_photos_cut_off_in_the_middle(tmp_path):
     assert ".poses" not in sentence
 
 
-def test_photos_with_nothing_in_them(tmp_path):
+def test_photos_without_features_are_a_clear_error(tmp_path):
     rng = np.random.default_rng(0)
     level = [np.full((120, 160, 3), 100, np.uint8) + rng.integers(0, 2, (120, 160, 3), np.uint8) for _ in range(5)]
-    sentence = refused("poses", save(tmp_path / "photos", level), "-o", tmp_path / "scene")
+    sentence = refused("poses", save_pictures(tmp_path / "photos", level), "-o", tmp_path / "scene")
     assert "hardly anything in these photos that can be recognised" in sentence
 
 
-def test_photos_without_overlap(tmp_path):
-    photos = save(tmp_path / "photos", random_pictures(6))
+def test_photos_without_overlap_are_a_clear_error(tmp_path):
+    photos = save_pictures(tmp_path / "photos", random_pictures(6))
     sentence = refused("poses", photos, "-o", tmp_path / "scene")
     assert "no pairs of these 6 photos show the same thing" in sentence
     assert (tmp_path / "scene" / ".poses" / "database.db").is_file()
 
 
-def test_a_panorama_from_one_place(tmp_path):
+def test_photos_from_one_place_are_a_clear_error(tmp_path):
     textures, pose = wall_textures(), arc_pose(0.5)
     pictures = []
     for number in range(5):
         turned = Rotation.from_euler("y", 8 * (number - 2), degrees=True).as_matrix() @ pose
         pictures.append(render_photo(turned, textures, PHOTO_SIZE, FOCAL_PIXELS))
-    sentence = refused("poses", save(tmp_path / "photos", pictures), "-o", tmp_path / "scene")
+    sentence = refused("poses", save_pictures(tmp_path / "photos", pictures), "-o", tmp_path / "scene")
     assert "all photos were taken from one place" in sentence and "a step to the side" in sentence
 
 
-def test_masks_that_fit_nothing(taken, tmp_path):
+def test_masks_without_matching_photos_are_a_clear_error(taken, tmp_path):
     (tmp_path / "masks").mkdir()
     for name in ("one", "two"):
         Image.new("L", PHOTO_SIZE, 255).save(tmp_path / "masks" / f"{name}.png")
@@ -106,7 +106,7 @@ def test_masks_that_fit_nothing(taken, tmp_path):
         hyrfpack.estimate_poses(taken[0], tmp_path / "scene", masks=tmp_path / "masks")
 
 
-def test_a_scene_that_cannot_be_made(taken, tmp_path):
+def test_a_scene_folder_that_cannot_be_created_is_a_clear_error(taken, tmp_path):
     (tmp_path / "file").touch()
     assert "this is a file" in refused("poses", taken[0], "-o", tmp_path / "file")
     shutil.copytree(taken[0], tmp_path / "scene" / "images")

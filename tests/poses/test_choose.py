@@ -1,4 +1,4 @@
-"""The choice between two results, and what is said of it."""
+"""The choice between the results of two mappers, and the notes about it."""
 
 from __future__ import annotations
 
@@ -7,46 +7,46 @@ from made_up_poses import circle_poses, transform_poses
 from hyrfpack.poses.choose import Candidate, choose_candidate, confirmed_photos, describe_doubt
 
 
-def candidate(mapper: str, poses: dict, explained: int, track: float = 5.0, other_pieces: tuple = ()) -> Candidate:
+def make_candidate(mapper: str, poses: dict, explained: int, track: float = 5.0, other_pieces: tuple = ()) -> Candidate:
     return Candidate(mapper, poses, other_pieces, explained, track, 0.4)
 
 
-def test_the_one_that_explains_more_is_taken_though_it_has_fewer_photos_or_shorter_tracks():
+def test_the_result_that_explains_more_matches_is_chosen_over_more_photos_or_longer_tracks():
     poses = circle_poses()
     fewer = {name: pose for name, pose in poses.items() if name < "020"}
-    right = candidate("incremental", fewer, 900, track=4.0)
-    folded = candidate("global", poses, 700, track=6.0)
+    right = make_candidate("incremental", fewer, 900, track=4.0)
+    folded = make_candidate("global", poses, 700, track=6.0)
     chosen, why = choose_candidate([folded, right], 1000)
     assert chosen is right
     assert "explains more" in why and "90.0% of the matches" in why and "70.0%" in why
 
 
-def test_among_equals_more_photos_and_then_longer_tracks_decide():
+def test_on_a_tie_more_photos_and_then_longer_tracks_decide():
     poses = circle_poses()
     fewer = {name: pose for name, pose in poses.items() if name < "020"}
-    a, b = candidate("incremental", fewer, 901), candidate("global", poses, 900)
+    a, b = make_candidate("incremental", fewer, 901), make_candidate("global", poses, 900)
     assert choose_candidate([a, b], 1000)[0] is b
-    a, b = candidate("incremental", poses, 901, 5.5), candidate("global", poses, 902, 5.0)
+    a, b = make_candidate("incremental", poses, 901, 5.5), make_candidate("global", poses, 902, 5.0)
     assert choose_candidate([a, b], 1000)[0] is a
 
 
-def test_all_is_well_where_both_agree_and_said_where_they_do_not():
+def test_disagreement_of_the_mappers_is_noted_and_agreement_is_not():
     poses = circle_poses()
     names = sorted(poses)
     folded = {**poses, **{name: poses[onto] for name, onto in zip(names[16:], names[:8], strict=True)}}
-    assert describe_doubt(poses, candidate("global", transform_poses(poses), 1000)) == ""
-    said = describe_doubt(poses, candidate("global", transform_poses(folded), 800))
+    assert describe_doubt(poses, make_candidate("global", transform_poses(poses), 1000)) == ""
+    said = describe_doubt(poses, make_candidate("global", transform_poses(folded), 800))
     assert said.startswith("16 of 24 posed photos are sure; the global mapper poses 8 of them differently")
     lacking = {name: poses[name] for name in names[:10]}
-    assert "has no pose for 14" in describe_doubt(poses, candidate("incremental", transform_poses(lacking), 400))
+    assert "has no pose for 14" in describe_doubt(poses, make_candidate("incremental", transform_poses(lacking), 400))
     assert "nothing confirms the poses of these 24 photos" in describe_doubt(poses, None)
 
 
-def test_of_the_other_mappers_pieces_the_largest_that_agrees_confirms():
+def test_the_largest_agreeing_piece_of_the_other_mapper_confirms_poses():
     poses = circle_poses()
     names = sorted(poses)
     first = transform_poses({name: poses[name] for name in names[:9]}, seed=3)
     second = transform_poses({name: poses[name] for name in names[9:]}, scale=0.2, seed=4)
-    other = candidate("incremental", first, 500, other_pieces=(second,))
+    other = make_candidate("incremental", first, 500, other_pieces=(second,))
     assert confirmed_photos(poses, other) == set(names[9:])
     assert describe_doubt(poses, other).startswith("15 of 24 posed photos are sure")

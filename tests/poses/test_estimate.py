@@ -1,4 +1,4 @@
-"""Photos of known poses in, a scene out."""
+"""The estimation of poses from end to end, on photos with known poses."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def poses_of(scene: hyrfpack.Scene) -> dict[str, np.ndarray]:
     return {view.name: view.camera.camera_from_world[:3] for view in scene.views}
 
 
-def test_all_photos_are_where_they_were_taken_whatever_their_names(taken, posed):
+def test_estimated_poses_match_the_true_ones_for_photos_of_any_name(taken, posed):
     folder, known = taken
     out, report, _, _ = posed
     scene = hyrfpack.load_scene(out)
@@ -39,7 +39,7 @@ def test_points_lie_on_the_walls_and_have_the_photos_colours(taken, posed):
     assert scene.point_colors.std() > 0.1
 
 
-def test_photos_are_copied_and_products_in_progress_are_gone(taken, posed):
+def test_photos_are_copied_and_intermediate_files_are_removed(taken, posed):
     folder, known = taken
     out = posed[0]
     assert sorted(os.listdir(out)) == ["images", "poses.json", "sparse"]
@@ -51,13 +51,13 @@ def test_photos_are_copied_and_products_in_progress_are_gone(taken, posed):
     assert written["registered"] == len(known) and written["why"] == posed[1].why
 
 
-def test_progress_runs_from_nothing_to_all(posed):
+def test_progress_runs_from_0_to_1(posed):
     shares = [share for _, share in posed[2]]
     assert shares[0] == 0 and shares == sorted(shares) and 0.9 < shares[-1] <= 1
     assert any("matching pair" in doing for doing, _ in posed[2])
 
 
-def test_poses_that_are_there_are_kept_but_for_overwrite(taken, posed, tmp_path):
+def test_existing_poses_are_replaced_only_with_overwrite(taken, posed, tmp_path):
     out = tmp_path / "scene"
     shutil.copytree(posed[0], out)
     before = (out / "sparse" / "0" / "images.bin").read_bytes()
@@ -67,7 +67,7 @@ def test_poses_that_are_there_are_kept_but_for_overwrite(taken, posed, tmp_path)
     assert (out / "sparse" / "0" / "images.bin").read_bytes() == before
 
 
-def test_the_command_ends_with_what_came_out_and_the_next_one(posed, monkeypatch, tmp_path):
+def test_the_command_prints_its_result_and_the_next_command(posed, monkeypatch, tmp_path):
     out, report, *_ = posed
     partly = {"a.jpg": "blurred", "b.jpg": "blurred"}
     made = type(report)(**{**vars(report), "left_out": partly, "scene": Path("scenes/garden")})

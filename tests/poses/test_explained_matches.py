@@ -1,4 +1,4 @@
-"""Matches that poses explain, against projections of known points."""
+"""The count of matches that poses explain, tested with projections of known points."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from made_up_poses import circle_poses, transform_poses
 from hyrfpack.poses.explained_matches import RayMatches, count_explained_matches, explained_mask
 
 
-def pairs_of(poses: dict[str, np.ndarray], noise: float = 0.0) -> list[RayMatches]:
-    """Matches of points around the origin, between neighbours, pixels of a thousandth."""
+def match_neighbours(poses: dict[str, np.ndarray], noise: float = 0.0) -> list[RayMatches]:
+    """Return matches of points around the origin between neighbouring cameras, for a pixel size of 0.001."""
     rng = np.random.default_rng(0)
     points = rng.uniform(-0.5, 0.5, (40, 3))
     names = sorted(poses)
@@ -21,18 +21,18 @@ def pairs_of(poses: dict[str, np.ndarray], noise: float = 0.0) -> list[RayMatche
     return [RayMatches(a, b, rays[a], rays[b], 0.001) for a, b in near]
 
 
-def test_the_right_poses_explain_all_in_any_frame():
+def test_correct_poses_explain_all_matches_in_any_frame():
     poses = circle_poses()
-    pairs = pairs_of(poses, noise=0.0003)
+    pairs = match_neighbours(poses, noise=0.0003)
     total = sum(len(pair.rays1) for pair in pairs)
     assert (
         count_explained_matches(poses, pairs) == count_explained_matches(transform_poses(poses), pairs) >= 0.999 * total
     )
 
 
-def test_a_folded_half_and_lacking_photos_explain_less():
+def test_folded_poses_and_missing_photos_explain_fewer_matches():
     poses = circle_poses()
-    pairs = pairs_of(poses)
+    pairs = match_neighbours(poses)
     names = sorted(poses)
     folded = {**poses, **{name: poses[onto] for name, onto in zip(names[16:], names[:8], strict=True)}}
     some = {name: poses[name] for name in names[:16]}
@@ -42,7 +42,7 @@ def test_a_folded_half_and_lacking_photos_explain_less():
 
 def test_a_match_behind_a_camera_or_off_its_line_is_not_explained():
     poses = circle_poses(8)
-    pair = pairs_of(poses)[0]
+    pair = match_neighbours(poses)[0]
     assert explained_mask(poses, pair).all()
     off = RayMatches(pair.first, pair.second, pair.rays1, pair.rays2 + np.array([0.0, 0.01]), pair.pixel)
     assert not explained_mask(poses, off).any()

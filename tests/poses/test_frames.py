@@ -1,4 +1,4 @@
-"""Frames chosen from videos whose motion, blur and repetitions are known, for they are made here."""
+"""The choice of frames from synthetic videos with known motion, blur and repetitions."""
 
 from __future__ import annotations
 
@@ -20,12 +20,13 @@ from hyrfpack.poses.motion import motion_distances, track_windows
 
 av = pytest.importorskip("av")
 
-WIDTH, HEIGHT = 240, 136
+FRAME_WIDTH = 240
+FRAME_HEIGHT = 136
 
 
 @pytest.fixture(scope="module")
 def wall() -> np.ndarray:
-    """(H, W, 3) uint8: rectangles of many sizes and colours, larger than a frame."""
+    """A (H, W, 3) uint8 picture of rectangles of many sizes and colours, larger than a frame."""
     generator = np.random.default_rng(1)
     picture = np.full((400, 1600, 3), 128, np.uint8)
     for _ in range(1500):
@@ -35,18 +36,18 @@ def wall() -> np.ndarray:
     return picture
 
 
-def seen(wall: np.ndarray, x: float, y: int = 100) -> np.ndarray:
-    """The wall from x on."""
+def crop_wall(wall: np.ndarray, x: float, y: int = 100) -> np.ndarray:
+    """Return the part of the wall that begins at (x, y), interpolated horizontally."""
     left = int(x)
-    pair = wall[y : y + HEIGHT, left : left + WIDTH + 1].astype(np.float32)
+    pair = wall[y : y + FRAME_HEIGHT, left : left + FRAME_WIDTH + 1].astype(np.float32)
     return (pair[:, :-1] + (x - left) * (pair[:, 1:] - pair[:, :-1])).round().astype(np.uint8)
 
 
-def blurred(picture: np.ndarray, length: int = 7) -> np.ndarray:
+def blur(picture: np.ndarray, length: int = 7) -> np.ndarray:
     return ndimage.uniform_filter1d(picture.astype(np.float32), length, axis=1).round().astype(np.uint8)
 
 
-def write(
+def write_video(
     path: Path,
     frames: list[np.ndarray],
     *,
@@ -54,7 +55,7 @@ def write(
     times: list[int] | None = None,
     set_up: Callable = lambda stream: None,
 ) -> Path:
-    """A video of frames at 30 a second, or at `times` in milliseconds."""
+    """Write a video of frames at 30 a second, or at `times` in milliseconds."""
     with av.open(str(path), "w") as container:
         stream = container.add_stream(codec, rate=30, options={"crf": "16"} if codec == "libx264" else {})
         stream.height, stream.width = frames[0].shape[:2]
@@ -71,8 +72,8 @@ def write(
     return path
 
 
-def unlike(folder: Path, number: int, pixels: np.ndarray) -> float:
-    """Mean difference of a frame on disk from a picture, in levels of luma: its colours are stored at half the size."""
+def mean_luma_difference(folder: Path, number: int, pixels: np.ndarray) -> float:
+    """Return the mean luma difference between a frame on disk and a picture; video has half the colour resolution."""
     with Image.open(folder / f"frame_{number:06d}.jpg") as picture:
         found = np.asarray(picture.convert("L"), np.float64)
     expected = np.asarray(Image.fromarray(np.ascontiguousarray(pixels)).convert("L"))
@@ -80,57 +81,59 @@ def unlike(folder: Path, number: int, pixels: np.ndarray) -> float:
     return float(np.abs(found - expected).mean())
 
 
-def taken(folder: Path) -> list[int]:
-    """Numbers of the frames on disk."""
+def frame_numbers(folder: Path) -> list[int]:
+    """Return the numbers of the frames on disk."""
     return sorted(int(path.stem.removeprefix("frame_")) for path in folder.glob("*.jpg"))
 
 
-def test_blurred_and_repeated_frames_are_never_taken(wall, tmp_path):
-    """Every third frame is blurred and every fourth repeated, while the camera moves by 1.5 % of the width a frame."""
+def test_blurred_and_repeated_frames_are_never_chosen(wall, tmp_path):
+    """Every third frame is blurred and every fourth repeated; the camera moves by 1.5 % of the width per frame."""
     frames, kinds, places = [], [], []
     for number in range(80):
         x = 3.6 * number
-        frames.append(seen(wall, x))
+        frames.append(crop_wall(wall, x))
         kinds.append("sharp")
         places.append(x)
         for other, every in (("blurred", 3), ("repeated", 4)):
             if number % every == 1:
-                frames.append(blurred(seen(wall, x)) if other == "blurred" else frames[-1])
+                frames.append(blur(crop_wall(wall, x)) if other == "blurred" else frames[-1])
                 kinds.append("blurred" if kinds[-1] == "blurred" else other)
                 places.append(x)
-    video = write(tmp_path / "clip.mp4", frames)
+    video = write_video(tmp_path / "clip.mp4", frames)
     report = choose_frames(video, tmp_path / "frames")
-    numbers = taken(tmp_path / "frames")
+    numbers = frame_numbers(tmp_path / "frames")
     assert report.taken == len(numbers) > 40 and report.of == len(frames)
     assert "blurred" not in [kinds[number] for number in numbers]
-    assert np.diff([places[number] for number in numbers]).min() > 0  # of frames that repeat another only one
+    assert (
+        np.diff([places[number] for number in numbers]).min() > 0
+    )  # of several frames with the same content only one is chosen
     assert report.blurred == len(range(1, 80, 3))
-    assert unlike(tmp_path / "frames", numbers[3], frames[numbers[3]]) < 4
+    assert mean_luma_difference(tmp_path / "frames", numbers[3], frames[numbers[3]]) < 4
     assert json.loads((tmp_path / "frames" / RECORD_NAME).read_text())["frames"] == numbers
 
 
 def test_frames_are_spread_by_motion_and_not_by_time(wall, tmp_path):
-    """Twice as fast in the second half: as many frames from each part of the way."""
+    """The camera moves twice as fast in the second half; both parts of the path give the same number of frames."""
     places = np.concatenate((np.arange(0, 300, 2.0), np.arange(300, 900, 6.0)))
-    video = write(tmp_path / "clip.mp4", [seen(wall, x) for x in places])
+    video = write_video(tmp_path / "clip.mp4", [crop_wall(wall, x) for x in places])
     report = choose_frames(video, tmp_path / "frames", most=40)
-    numbers = taken(tmp_path / "frames")
+    numbers = frame_numbers(tmp_path / "frames")
     assert 30 <= len(numbers) <= 40
-    steps = np.diff(places[numbers]) / WIDTH
+    steps = np.diff(places[numbers]) / FRAME_WIDTH
     assert np.median(steps) == pytest.approx(report.spacing, rel=0.15)
     slow, fast = (np.median(steps[part]) for part in (places[numbers[1:]] < 300, places[numbers[1:]] > 310))
     assert fast == pytest.approx(slow, rel=0.5)
 
 
-def test_motion_is_measured_right_and_a_shaking_camera_goes_nowhere(wall):
-    small = [seen(wall, x)[:, :160].mean(axis=2).astype(np.uint8) for x in (10, 12, 15, 21, 35, 45, 33, 20, 10)]
+def test_measured_motion_is_right_and_ignores_a_shaking_camera(wall):
+    small = [crop_wall(wall, x)[:, :160].mean(axis=2).astype(np.uint8) for x in (10, 12, 15, 21, 35, 45, 33, 20, 10)]
     found = track_windows(small)
     expected = np.array([0, 2, 5, 11, 25, 35, 23, 10, 0]) / 160
     assert motion_distances(found, 0, slice(0, 9)) == pytest.approx(expected, abs=0.006)
 
 
-def test_the_same_call_again_does_nothing_and_an_interrupted_one_continues(wall, tmp_path):
-    video = write(tmp_path / "clip.mp4", [seen(wall, 4.0 * number) for number in range(60)])
+def test_a_repeated_call_does_nothing_and_an_interrupted_call_resumes(wall, tmp_path):
+    video = write_video(tmp_path / "clip.mp4", [crop_wall(wall, 4.0 * number) for number in range(60)])
     folder = tmp_path / "frames"
     first = choose_frames(video, folder)
     before = {path: path.stat().st_mtime_ns for path in folder.iterdir()}
@@ -148,53 +151,53 @@ def test_the_same_call_again_does_nothing_and_an_interrupted_one_continues(wall,
     assert (folder / "mine.jpg").read_bytes() == b"kept"
 
 
-def test_progress_only_grows(wall, tmp_path):
-    video = write(tmp_path / "clip.mp4", [seen(wall, 4.0 * number) for number in range(40)])
+def test_progress_never_decreases(wall, tmp_path):
+    video = write_video(tmp_path / "clip.mp4", [crop_wall(wall, 4.0 * number) for number in range(40)])
     said: list[float] = []
     choose_frames(video, tmp_path / "frames", report=lambda text, share: said.append(share))
     assert said == sorted(said) and 0 <= said[0] and said[-1] == 1.0
 
 
 @pytest.mark.parametrize("degrees", [90, 180, -90])
-def test_frames_come_upright(wall, tmp_path, degrees):
+def test_frames_are_written_upright(wall, tmp_path, degrees):
     def turned(stream):
         if not hasattr(stream, "set_display_rotation"):
             pytest.skip("this version of PyAV cannot write a rotation")
         stream.set_display_rotation(degrees)
 
-    frames = [seen(wall, 4.0 * number) for number in range(40)]
-    choose_frames(write(tmp_path / "clip.mp4", frames, set_up=turned), tmp_path / "frames")
-    number = taken(tmp_path / "frames")[2]
-    expected = np.rot90(frames[number], degrees // 90)  # counter-clockwise, as the file says
-    assert unlike(tmp_path / "frames", number, expected) < 4
+    frames = [crop_wall(wall, 4.0 * number) for number in range(40)]
+    choose_frames(write_video(tmp_path / "clip.mp4", frames, set_up=turned), tmp_path / "frames")
+    number = frame_numbers(tmp_path / "frames")[2]
+    expected = np.rot90(frames[number], degrees // 90)  # counter-clockwise, as the file states
+    assert mean_luma_difference(tmp_path / "frames", number, expected) < 4
 
 
 def test_frames_at_uneven_times_are_all_found(wall, tmp_path):
     times = np.cumsum(np.random.default_rng(2).integers(5, 200, 50)).tolist()
-    frames = [seen(wall, 4.0 * number) for number in range(50)]
-    report = choose_frames(write(tmp_path / "clip.mkv", frames, times=times), tmp_path / "frames")
+    frames = [crop_wall(wall, 4.0 * number) for number in range(50)]
+    report = choose_frames(write_video(tmp_path / "clip.mkv", frames, times=times), tmp_path / "frames")
     assert report.of == 50
-    number = taken(tmp_path / "frames")[-2]
-    assert unlike(tmp_path / "frames", number, frames[number]) < 4
+    number = frame_numbers(tmp_path / "frames")[-2]
+    assert mean_luma_difference(tmp_path / "frames", number, frames[number]) < 4
 
 
-def test_a_truncated_video_gives_what_is_left_and_says_so(wall, tmp_path):
-    video = write(tmp_path / "clip.mkv", [seen(wall, 4.0 * number) for number in range(120)])
+def test_a_truncated_video_gives_its_frames_and_a_note(wall, tmp_path):
+    video = write_video(tmp_path / "clip.mkv", [crop_wall(wall, 4.0 * number) for number in range(120)])
     video.write_bytes(video.read_bytes()[: video.stat().st_size // 2])
     report = choose_frames(video, tmp_path / "frames")
     assert 20 < report.of < 100
     assert any("cut off" in note for note in report.notes)
 
 
-def test_a_damaged_video_gives_what_can_be_decoded(wall, tmp_path):
-    video = write(tmp_path / "clip.mkv", [seen(wall, 4.0 * number) for number in range(120)])
+def test_a_damaged_video_gives_the_frames_that_can_be_decoded(wall, tmp_path):
+    video = write_video(tmp_path / "clip.mkv", [crop_wall(wall, 4.0 * number) for number in range(120)])
     data = bytearray(video.read_bytes())
     data[len(data) // 2 : len(data) // 2 + 3000] = bytes(3000)
     video.write_bytes(data)
     assert choose_frames(video, tmp_path / "frames").taken >= 20
 
 
-def refusal(video: Path, folder: Path) -> str:
+def frame_error(video: Path, folder: Path) -> str:
     with pytest.raises(HyrfDataError) as caught:
         choose_frames(video, folder)
     assert not folder.exists()
@@ -202,26 +205,26 @@ def refusal(video: Path, folder: Path) -> str:
     return str(caught.value)
 
 
-def test_what_gives_no_photos_is_rejected_with_a_clear_error(wall, tmp_path):
-    moving = [seen(wall, 4.0 * number) for number in range(60)]
-    whole = write(tmp_path / "whole.mp4", moving)
+def test_a_video_without_usable_frames_is_a_clear_error(wall, tmp_path):
+    moving = [crop_wall(wall, 4.0 * number) for number in range(60)]
+    whole = write_video(tmp_path / "whole.mp4", moving)
     out = tmp_path / "frames"
-    assert "only 3 frames" in refusal(write(tmp_path / "three.mp4", moving[:3]), out)
-    assert "hardly moves" in refusal(write(tmp_path / "still.mp4", [moving[0]] * 60), out)
-    flat = [np.full((HEIGHT, WIDTH, 3), 90, np.uint8)] * 30
-    assert "blurred" in refusal(write(tmp_path / "flat.mp4", flat), out)
+    assert "only 3 frames" in frame_error(write_video(tmp_path / "three.mp4", moving[:3]), out)
+    assert "hardly moves" in frame_error(write_video(tmp_path / "still.mp4", [moving[0]] * 60), out)
+    flat = [np.full((FRAME_HEIGHT, FRAME_WIDTH, 3), 90, np.uint8)] * 30
+    assert "blurred" in frame_error(write_video(tmp_path / "flat.mp4", flat), out)
     soft = [ndimage.gaussian_filter(picture, (5, 5, 0)) for picture in moving]
-    assert "blurred" in refusal(write(tmp_path / "soft.mp4", soft), out)
-    cut = tmp_path / "cut.mp4"  # its table of contents is at the end
+    assert "blurred" in frame_error(write_video(tmp_path / "soft.mp4", soft), out)
+    cut = tmp_path / "cut.mp4"  # the table of contents is at the end of the file
     cut.write_bytes(whole.read_bytes()[:-2000])
-    assert "cannot be read as a video" in refusal(cut, out)
+    assert "cannot be read as a video" in frame_error(cut, out)
     text = tmp_path / "text.mp4"
     text.write_text("no video")
-    assert "cannot be read as a video" in refusal(text, out)
+    assert "cannot be read as a video" in frame_error(text, out)
     (tmp_path / "empty.mp4").touch()
-    assert "empty" in refusal(tmp_path / "empty.mp4", out)
-    assert "no such file" in refusal(tmp_path / "nowhere.mp4", out)
-    assert "folder" in refusal(tmp_path, out)
+    assert "empty" in frame_error(tmp_path / "empty.mp4", out)
+    assert "no such file" in frame_error(tmp_path / "nowhere.mp4", out)
+    assert "folder" in frame_error(tmp_path, out)
 
 
 def test_a_file_of_sound_alone_is_rejected(tmp_path):
@@ -231,10 +234,10 @@ def test_a_file_of_sound_alone_is_rejected(tmp_path):
         frame.sample_rate = 8000
         container.mux(stream.encode(frame))
         container.mux(stream.encode())
-    assert "no video stream" in refusal(tmp_path / "sound.wav", tmp_path / "frames")
+    assert "no video stream" in frame_error(tmp_path / "sound.wav", tmp_path / "frames")
 
 
-def test_without_pyav_the_sentence_names_it(tmp_path, monkeypatch):
+def test_without_pyav_the_error_names_it(tmp_path, monkeypatch):
     import sys
 
     (tmp_path / "clip.mp4").write_bytes(b"x")
@@ -243,7 +246,7 @@ def test_without_pyav_the_sentence_names_it(tmp_path, monkeypatch):
         choose_frames(tmp_path / "clip.mp4", tmp_path / "frames")
 
 
-def test_videos_are_known_by_their_endings():
+def test_videos_are_recognised_by_their_endings():
     assert all(is_video(name) for name in ("a.mp4", "b.MOV", Path("c.webm")))
     assert not any(is_video(name) for name in ("a.jpg", "mp4", "a.ply"))
 
@@ -253,7 +256,7 @@ def test_videos_are_known_by_their_endings():
     [(PQ, 0.5806, 203.0), (HLG, 0.75, 203.0), (PQ, 0.4, 32.46), (HLG, 0.25, 1000 * (0.25**2 / 3) ** 1.2)],
 )
 def test_high_dynamic_range_keeps_grey_and_its_light(transfer, signal, light):
-    """Points of the curves as BT.2408 and BT.2100 tabulate them; squeezed above 0.7 of white paper's light."""
+    """The points of the curves are tabulated in BT.2408 and BT.2100; light above 0.7 of paper white is compressed."""
     shown = tone_map_to_srgb(np.full((1, 1, 3), round(signal * 65535), np.uint16), transfer)[0, 0].astype(float)
     assert np.ptp(shown) <= 1
     linear = ((shown[0] / 255 + 0.055) / 1.055) ** 2.4 if shown[0] > 10 else shown[0] / 255 / 12.92
@@ -269,8 +272,8 @@ def test_high_dynamic_range_clips_nothing():
         assert (np.diff(shown) >= 0).all() and shown[0] == 0 and (shown == 255).sum() < 60
 
 
-def test_poses_of_a_video_that_continue_still_say_how_many_frames_were_taken(wall, tmp_path):
-    video = write(tmp_path / "clip.mp4", [seen(wall, 4.0 * number) for number in range(60)])
+def test_a_resumed_estimation_of_a_video_still_reports_its_number_of_frames(wall, tmp_path):
+    video = write_video(tmp_path / "clip.mp4", [crop_wall(wall, 4.0 * number) for number in range(60)])
 
     def stop(doing: str, share: float) -> None:
         if "features" in doing:
@@ -286,17 +289,17 @@ def test_poses_of_a_video_that_continue_still_say_how_many_frames_were_taken(wal
 
 def test_frames_keep_their_times_so_that_messages_can_name_them(wall, tmp_path):
     times = [int(1000 * number / 30) + (500 if number >= 30 else 0) for number in range(60)]
-    video = write(tmp_path / "clip.mp4", [seen(wall, 4 * number) for number in range(60)], times=times)
+    video = write_video(tmp_path / "clip.mp4", [crop_wall(wall, 4 * number) for number in range(60)], times=times)
     choose_frames(video, tmp_path / "frames")
     found = frame_times(tmp_path / "frames")
-    assert sorted(found) == [f"frame_{number:06d}.jpg" for number in taken(tmp_path / "frames")]
+    assert sorted(found) == [f"frame_{number:06d}.jpg" for number in frame_numbers(tmp_path / "frames")]
     for name, seconds in found.items():
         assert seconds == pytest.approx(times[int(name[6:12])] / 1000, abs=0.002)
 
 
-def test_a_video_tells_how_far_it_is_at_each_step(wall, tmp_path):
+def test_every_stage_of_a_video_reports_progress(wall, tmp_path):
     told: list[tuple[str, float]] = []
-    video = write(tmp_path / "clip.mp4", [seen(wall, 4 * number) for number in range(60)])
+    video = write_video(tmp_path / "clip.mp4", [crop_wall(wall, 4 * number) for number in range(60)])
     choose_frames(video, tmp_path / "frames", report=lambda *now: told.append(now))
     shares = [share for _, share in told]
     assert shares == sorted(shares) and shares[-1] == 1
@@ -304,10 +307,10 @@ def test_a_video_tells_how_far_it_is_at_each_step(wall, tmp_path):
         assert any(words in doing for doing, _ in told), words
 
 
-def test_a_frame_that_is_left_out_is_named_with_its_time(wall, tmp_path):
+def test_an_omitted_frame_is_named_with_its_time(wall, tmp_path):
     from hyrfpack.poses.estimate import _PoseEstimation
 
-    video = write(tmp_path / "clip.mp4", [seen(wall, 4 * number) for number in range(60)])
+    video = write_video(tmp_path / "clip.mp4", [crop_wall(wall, 4 * number) for number in range(60)])
     estimation = _PoseEstimation(video, tmp_path / "scene", "auto", None, 0, False, None, None)
     (tmp_path / "scene").mkdir()
     estimation.output.check_replaceable(video, overwrite=False)

@@ -1,4 +1,4 @@
-"""An estimation that is stopped, killed, or let down by the library: what is done is kept."""
+"""An estimation that is stopped, killed or crashes keeps its finished stages."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from commands import succeeded
 import hyrfpack
 from hyrfpack.poses import process
 
-ROOT = Path(__file__).parents[2]
-CRASH = """
+REPOSITORY_ROOT = Path(__file__).parents[2]
+CRASH_AT_STAGE_CODE = """
 import os, sys
 if sys.orig_argv[-1] == {stage!r} and "hyrfpack.poses.worker" in sys.orig_argv:
     os.abort()
 """
 
 
-def watched(monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen]:
-    """The processes that stages are run in from now on."""
+def record_processes(monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen]:
+    """Record the processes in which stages run from now on."""
     found: list[subprocess.Popen] = []
     popen = subprocess.Popen
 
@@ -40,12 +40,12 @@ def watched(monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen]:
 
 
 @pytest.fixture
-def started(monkeypatch) -> list[subprocess.Popen]:
-    return watched(monkeypatch)
+def stage_processes(monkeypatch) -> list[subprocess.Popen]:
+    return record_processes(monkeypatch)
 
 
 def stop_at(moment: str) -> Callable[[str, float], None]:
-    """A report that interrupts when something is told that holds these words."""
+    """Return a report function that interrupts when the progress text contains these words."""
 
     def report(doing: str, share: float) -> None:
         if moment in doing:
@@ -55,19 +55,19 @@ def stop_at(moment: str) -> Callable[[str, float], None]:
 
 
 @pytest.fixture(scope="module")
-def stopped(taken, tmp_path_factory) -> Path:
-    """A scene that was stopped after the matching, not to be changed."""
+def stopped_after_matching(taken, tmp_path_factory) -> Path:
+    """A scene whose estimation was stopped after matching. Tests must not change it."""
     out = tmp_path_factory.mktemp("stopped") / "scene"
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        workers = watched(patch)
+        workers = record_processes(patch)
         hyrfpack.estimate_poses(taken[0], out, report=stop_at("at once"))
     assert len(workers) == 3 and all(worker.poll() is not None for worker in workers)
     return out
 
 
-def test_what_is_stopped_continues_where_it_was(taken, stopped, tmp_path):
-    out, kept = tmp_path / "scene", (stopped / ".poses" / "matches.json").stat().st_mtime_ns
-    shutil.copytree(stopped, out)
+def test_a_stopped_estimation_resumes_after_its_last_finished_stage(taken, stopped_after_matching, tmp_path):
+    out, kept = tmp_path / "scene", (stopped_after_matching / ".poses" / "matches.json").stat().st_mtime_ns
+    shutil.copytree(stopped_after_matching, out)
     assert os.listdir(out) == [".poses"]
     with pytest.raises(KeyboardInterrupt):
         hyrfpack.estimate_poses(taken[0], out, report=stop_at("one by one"))
@@ -75,14 +75,14 @@ def test_what_is_stopped_continues_where_it_was(taken, stopped, tmp_path):
     assert (out / ".poses" / "global-0").is_dir()
 
 
-def test_a_scene_of_ones_own_gets_poses_in_place_also_after_its_worker_was_killed(taken, tmp_path, started):
+def test_poses_in_place_are_completed_after_the_worker_was_killed(taken, tmp_path, stage_processes):
     shutil.copytree(taken[0], tmp_path / "images")
     before = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "images").iterdir()}
-    (tmp_path / "poses.json").write_text("{}")  # of poses that were removed
+    (tmp_path / "poses.json").write_text("{}")  # as left by poses that were removed
 
     def kill(doing: str, share: float) -> None:
         if "matching pair" in doing:
-            started[-1].kill()
+            stage_processes[-1].kill()
 
     with pytest.raises(hyrfpack.HyrfError, match="more memory than there is.*resumes here"):
         hyrfpack.estimate_poses(tmp_path, tmp_path, overwrite=True, report=kill)
@@ -94,15 +94,17 @@ def test_a_scene_of_ones_own_gets_poses_in_place_also_after_its_worker_was_kille
 
 
 def test_a_crash_of_the_library_is_a_clear_error(taken, tmp_path, monkeypatch):
-    (tmp_path / "sitecustomize.py").write_text(CRASH.format(stage="matches"))
+    (tmp_path / "sitecustomize.py").write_text(CRASH_AT_STAGE_CODE.format(stage="matches"))
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     with pytest.raises(hyrfpack.HyrfError, match="matching photos ended by signal SIGABRT.*run the same command again"):
         hyrfpack.estimate_poses(taken[0], tmp_path / "scene")
 
 
-def test_where_one_mapper_crashes_the_other_ones_result_is_taken_and_said(taken, stopped, tmp_path, monkeypatch):
-    shutil.copytree(stopped, tmp_path / "scene")
-    (tmp_path / "sitecustomize.py").write_text(CRASH.format(stage="global"))
+def test_when_one_mapper_crashes_the_result_of_the_other_is_used_and_noted(
+    taken, stopped_after_matching, tmp_path, monkeypatch
+):
+    shutil.copytree(stopped_after_matching, tmp_path / "scene")
+    (tmp_path / "sitecustomize.py").write_text(CRASH_AT_STAGE_CODE.format(stage="global"))
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     report = hyrfpack.estimate_poses(taken[0], tmp_path / "scene")
     assert (report.mapper, report.registered, report.sure) == ("incremental", len(taken[1]), 0)
@@ -112,9 +114,9 @@ def test_where_one_mapper_crashes_the_other_ones_result_is_taken_and_said(taken,
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
 @pytest.mark.parametrize("number, code", [(signal.SIGINT, 1), (signal.SIGKILL, -signal.SIGKILL)])
-def test_the_command_takes_its_worker_along(number, code, taken, tmp_path, signals):
+def test_a_signal_to_the_command_ends_its_worker(number, code, taken, tmp_path, signals):
     command = [sys.executable, "-m", "hyrfpack", "poses", str(taken[0]), "-o", str(tmp_path / "scene")]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY_ROOT)}
     parent = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True, cwd=tmp_path)
     worker = None
     while worker is None and parent.poll() is None:

@@ -1,4 +1,4 @@
-"""Photos that are left out are named as the user named them, counted in a note, and do not stop the others."""
+"""Unusable photos are left out under the user's file names, counted in a note, and do not stop the others."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ import hyrfpack
 HEIC_HEADER = b"\0\0\0\x18ftypheic" + bytes(40)
 
 
-def save_cut_off(path: Path) -> None:
-    """A picture stored on its side whose header is whole and whose pixels are cut off."""
+def save_truncated(path: Path) -> None:
+    """Write a rotated picture with a complete header and truncated pixel data."""
     tags = Image.Exif()
     tags[0x0112] = 6
     pixels = np.random.default_rng(1).integers(0, 255, (150, 200, 3), np.uint8)
@@ -27,10 +27,10 @@ def save_cut_off(path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def report(tmp_path_factory) -> hyrfpack.PosesReport:
-    """Of eight good photos, one that is cut off, two that are HEIC, and two raw files."""
+    """The report on eight good photos, a truncated one, two HEIC photos and two raw files."""
     folder = tmp_path_factory.mktemp("mixed") / "photos"
     write_photos(folder)
-    save_cut_off(folder / "cut.tif")
+    save_truncated(folder / "cut.tif")
     for name in ("a.heic", "b.HEIC"):
         (folder / name).write_bytes(HEIC_HEADER)
     for name in ("a.CR3", "b.CR3"):
@@ -44,7 +44,7 @@ def test_the_other_photos_are_posed(report):
     assert (report.photos, report.registered) == (11, 8)
 
 
-def test_photos_left_out_have_the_names_of_the_users_files_and_no_path_of_ours(report):
+def test_omitted_photos_are_named_by_the_users_files_and_not_by_internal_paths(report):
     assert set(report.left_out) == {"a.heic", "b.HEIC", "cut.tif"}
     assert report.left_out["a.heic"] == "reading HEIC photos needs pillow-heif"
     assert report.left_out["cut.tif"].startswith("cannot decode the picture (")
@@ -58,7 +58,7 @@ def test_each_kind_of_unusable_photo_is_counted_in_one_note(report):
     assert notes.count("2 raw files (.CR3) are ignored") == 1
 
 
-def test_photos_of_an_archive_are_rejected_by_the_archives_name(tmp_path, monkeypatch):
+def test_rejected_photos_of_an_archive_are_named_with_the_archive(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     write_photos(tmp_path / "photos", 2)
     with zipfile.ZipFile(tmp_path / "set.zip", "w") as archive:

@@ -1,4 +1,4 @@
-"""Nothing is removed from a scene's folder but what an estimation put there and does not read."""
+"""An estimation removes only those files from a scene's folder that it has written and does not read."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from hyrfpack.poses.job import Job
 from hyrfpack.poses.owned_files import unchanged_files
 
 
-def photos(folder: Path, seed: int = 0, count: int = 4) -> Path:
+def write_photos(folder: Path, seed: int = 0, count: int = 4) -> Path:
     folder.mkdir(parents=True)
     rng = np.random.default_rng(seed)
     for number in range(count):
@@ -26,8 +26,8 @@ def photos(folder: Path, seed: int = 0, count: int = 4) -> Path:
     return folder
 
 
-def begin(source: Path, scene: Path, **settings) -> None:
-    """Estimate until the photos are made ready."""
+def prepare_photos(source: Path, scene: Path, **settings) -> None:
+    """Estimate poses until the photos are prepared."""
 
     def stop(*arguments) -> None:
         raise KeyboardInterrupt
@@ -37,8 +37,8 @@ def begin(source: Path, scene: Path, **settings) -> None:
         hyrfpack.estimate_poses(source, scene, **settings)
 
 
-def finished(source: Path, scene: Path, **settings) -> None:
-    """Estimate, with answers of stages that are made up, and an empty model."""
+def estimate_with_fake_stages(source: Path, scene: Path, **settings) -> None:
+    """Estimate poses with fake results of the stages and an empty model."""
 
     def answer(job: Path, stage: str, *more) -> dict:
         (job.parent / "chosen").mkdir(exist_ok=True)
@@ -55,7 +55,7 @@ def finished(source: Path, scene: Path, **settings) -> None:
         hyrfpack.estimate_poses(source, scene, **settings)
 
 
-def pictures(folder: Path) -> list[str]:
+def png_names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.glob("*.png"))
 
 
@@ -63,71 +63,71 @@ def same_bytes(first: Path, second: Path) -> bool:
     return first.read_bytes() == second.read_bytes()
 
 
-def contents(folder: Path) -> dict[str, bytes]:
+def read_files(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def test_copies_that_are_all_that_is_left_of_the_photos_are_posed_again_in_place(tmp_path):
-    finished(photos(tmp_path / "photos"), tmp_path / "scene")
+def test_copies_whose_originals_are_gone_are_posed_again_in_place(tmp_path):
+    estimate_with_fake_stages(write_photos(tmp_path / "photos"), tmp_path / "scene")
     shutil.rmtree(tmp_path / "photos")
     for source in (tmp_path / "scene", tmp_path / "scene" / "images"):
-        begin(source, tmp_path / "scene", overwrite=True)
-        assert pictures(tmp_path / "scene" / "images") == ["0.png", "1.png", "2.png", "3.png"]
-        finished(source, tmp_path / "scene", overwrite=True)
-        assert pictures(tmp_path / "scene" / "images") == ["0.png", "1.png", "2.png", "3.png"]
+        prepare_photos(source, tmp_path / "scene", overwrite=True)
+        assert png_names(tmp_path / "scene" / "images") == ["0.png", "1.png", "2.png", "3.png"]
+        estimate_with_fake_stages(source, tmp_path / "scene", overwrite=True)
+        assert png_names(tmp_path / "scene" / "images") == ["0.png", "1.png", "2.png", "3.png"]
 
 
-def test_photos_beside_the_copies_of_them_continue_where_they_were(tmp_path):
-    scene, said = photos(tmp_path / "scene"), []
-    begin(scene, scene)
-    begin(scene, scene, say=said.append)
+def test_an_estimation_resumes_from_the_original_photos_beside_their_copies(tmp_path):
+    scene, said = write_photos(tmp_path / "scene"), []
+    prepare_photos(scene, scene)
+    prepare_photos(scene, scene, say=said.append)
     assert said[0] == "resuming an interrupted estimation"
-    begin(scene, scene, seed=1)
-    finished(scene, scene, seed=1)
-    assert pictures(scene) == pictures(scene / "images") == ["0.png", "1.png", "2.png", "3.png"]
+    prepare_photos(scene, scene, seed=1)
+    estimate_with_fake_stages(scene, scene, seed=1)
+    assert png_names(scene) == png_names(scene / "images") == ["0.png", "1.png", "2.png", "3.png"]
 
 
-def test_other_photos_take_the_place_of_those_that_we_put_there_and_of_no_others(tmp_path):
-    finished(photos(tmp_path / "photos"), tmp_path / "scene")
-    begin(photos(tmp_path / "others", 1), tmp_path / "scene", overwrite=True)
+def test_new_photos_replace_only_earlier_copies_and_no_other_files(tmp_path):
+    estimate_with_fake_stages(write_photos(tmp_path / "photos"), tmp_path / "scene")
+    prepare_photos(write_photos(tmp_path / "others", 1), tmp_path / "scene", overwrite=True)
     images = tmp_path / "scene" / "images"
-    assert same_bytes(images / "0.png", tmp_path / "photos" / "0.png")  # as long as there are no new poses
-    finished(tmp_path / "others", tmp_path / "scene", overwrite=True)
+    assert same_bytes(images / "0.png", tmp_path / "photos" / "0.png")  # until there are new poses
+    estimate_with_fake_stages(tmp_path / "others", tmp_path / "scene", overwrite=True)
     assert same_bytes(images / "0.png", tmp_path / "others" / "0.png")
     Image.new("RGB", (30, 20)).save(images / "mine.png")
     with pytest.raises(hyrfpack.HyrfError, match="do not belong to these photos"):
         hyrfpack.estimate_poses(tmp_path / "photos", tmp_path / "scene", overwrite=True)
-    assert pictures(images) == ["0.png", "1.png", "2.png", "3.png", "mine.png"]
+    assert png_names(images) == ["0.png", "1.png", "2.png", "3.png", "mine.png"]
 
 
-def test_photos_that_are_rejected_leave_what_is_there(tmp_path):
-    finished(photos(tmp_path / "photos"), tmp_path / "scene")
+def test_rejected_photos_leave_the_scene_unchanged(tmp_path):
+    estimate_with_fake_stages(write_photos(tmp_path / "photos"), tmp_path / "scene")
     (tmp_path / "none").mkdir()
     with pytest.raises(hyrfpack.HyrfDataError, match="no photos here"):
         hyrfpack.estimate_poses(tmp_path / "none", tmp_path / "scene", overwrite=True)
-    assert len(pictures(tmp_path / "scene" / "images")) == 4
+    assert len(png_names(tmp_path / "scene" / "images")) == 4
 
 
-def test_a_call_that_fails_leaves_old_poses_with_their_own_photos(tmp_path, monkeypatch):
+def test_a_failed_call_keeps_old_poses_with_their_photos(tmp_path, monkeypatch):
     scene = tmp_path / "scene"
-    finished(photos(tmp_path / "photos"), scene)
-    before = contents(scene)
+    estimate_with_fake_stages(write_photos(tmp_path / "photos"), scene)
+    before = read_files(scene)
 
     def refuse(*arguments) -> dict:
         raise hyrfpack.HyrfDataError("these photos cannot be matched", fix="take others")
 
     monkeypatch.setattr("hyrfpack.poses.estimate.run_stage", refuse)
     with pytest.raises(hyrfpack.HyrfDataError, match="cannot be matched"):
-        hyrfpack.estimate_poses(photos(tmp_path / "others", 1), scene, overwrite=True)
-    assert contents(scene) == before
+        hyrfpack.estimate_poses(write_photos(tmp_path / "others", 1), scene, overwrite=True)
+    assert read_files(scene) == before
 
 
 @pytest.mark.parametrize("moment", range(7))
 def test_old_poses_never_lie_beside_new_photos(moment, tmp_path, monkeypatch):
-    """Killed at any moment of the end: what lies there then is of one estimation, and the same call resumes."""
+    """After a kill at any moment of the final moves all files belong to one estimation, and the same call resumes."""
     scene, replace = tmp_path / "scene", os.replace
-    finished(photos(tmp_path / "photos"), scene)
-    photos(tmp_path / "others", 1)
+    estimate_with_fake_stages(write_photos(tmp_path / "photos"), scene)
+    write_photos(tmp_path / "others", 1)
     calls: list[Path] = []
 
     def kill(source: Path, target: Path) -> None:
@@ -139,7 +139,7 @@ def test_old_poses_never_lie_beside_new_photos(moment, tmp_path, monkeypatch):
 
     with monkeypatch.context() as patch, suppress(KeyboardInterrupt):
         patch.setattr("os.replace", kill)
-        finished(tmp_path / "others", scene, overwrite=True)
+        estimate_with_fake_stages(tmp_path / "others", scene, overwrite=True)
     assert [path.name for path in calls] == ["replaced", "poses.json", "images", "poses.json", "0", "sparse"][
         : moment + 1
     ]
@@ -147,22 +147,22 @@ def test_old_poses_never_lie_beside_new_photos(moment, tmp_path, monkeypatch):
         source = "photos" if moment == 0 else "others"
         assert all(same_bytes(scene / "images" / f"{n}.png", tmp_path / source / f"{n}.png") for n in range(4))
     if moment < 6:
-        finished(tmp_path / "others", scene, overwrite=moment == 0)
+        estimate_with_fake_stages(tmp_path / "others", scene, overwrite=moment == 0)
     assert same_bytes(scene / "images" / "0.png", tmp_path / "others" / "0.png")
     assert sorted(os.listdir(scene)) == ["images", "poses.json", "sparse"]
 
 
-def test_what_is_rejected_or_fails_before_anything_is_done_leaves_nothing(tmp_path, monkeypatch):
+def test_an_early_error_leaves_no_files(tmp_path, monkeypatch):
     out = tmp_path / "new" / "scene"
     with pytest.raises(hyrfpack.HyrfDataError, match="2 photos are too few"):
-        hyrfpack.estimate_poses(photos(tmp_path / "two", count=2), out)
+        hyrfpack.estimate_poses(write_photos(tmp_path / "two", count=2), out)
 
     def refuse(*arguments) -> dict:
         raise hyrfpack.HyrfDataError("these photos cannot be matched", fix="take others")
 
     monkeypatch.setattr("hyrfpack.poses.estimate.run_stage", refuse)
     with pytest.raises(hyrfpack.HyrfDataError, match="cannot be matched"):
-        hyrfpack.estimate_poses(photos(tmp_path / "photos"), out)
+        hyrfpack.estimate_poses(write_photos(tmp_path / "photos"), out)
 
     def full(*arguments) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -173,19 +173,19 @@ def test_what_is_rejected_or_fails_before_anything_is_done_leaves_nothing(tmp_pa
     assert sorted(os.listdir(tmp_path)) == ["photos", "two"]
 
 
-def test_two_calls_for_one_scene_are_kept_apart(tmp_path):
+def test_a_second_call_for_the_same_scene_is_rejected(tmp_path):
     pytest.importorskip("fcntl", reason="locks are of Unix")
     scene = tmp_path / "scene"
     with exclusive_folder(scene), pytest.raises(hyrfpack.HyrfError) as refusal:
-        hyrfpack.estimate_poses(photos(tmp_path / "photos"), scene)
+        hyrfpack.estimate_poses(write_photos(tmp_path / "photos"), scene)
     assert str(refusal.value) == (
         f"{scene}: another hyrfpack command is at work in this folder; wait until it has ended, or name another folder"
     )
     assert not scene.exists()
-    begin(tmp_path / "photos", scene)
+    prepare_photos(tmp_path / "photos", scene)
 
 
-def test_poses_that_another_program_puts_there_meanwhile_are_kept_and_the_work_too(tmp_path):
+def test_poses_that_another_program_writes_meanwhile_are_kept_and_so_is_the_work(tmp_path):
     scene = tmp_path / "scene"
 
     def appear(doing: str, share: float) -> None:
@@ -193,38 +193,38 @@ def test_poses_that_another_program_puts_there_meanwhile_are_kept_and_the_work_t
         (scene / "sparse" / "0" / "cameras.bin").write_bytes(b"of another program")
 
     with pytest.raises(hyrfpack.HyrfError, match="poses of another program, which are kept"):
-        finished(photos(tmp_path / "photos"), scene, report=appear)
+        estimate_with_fake_stages(write_photos(tmp_path / "photos"), scene, report=appear)
     assert (scene / "sparse" / "0" / "cameras.bin").read_bytes() == b"of another program"
     shutil.rmtree(scene / "sparse")
     said = []
-    finished(tmp_path / "photos", scene, say=said.append)
+    estimate_with_fake_stages(tmp_path / "photos", scene, say=said.append)
     assert said[0] == "resuming an interrupted estimation" and (scene / "sparse" / "0").is_dir()
 
 
-def test_masks_that_lie_there_are_not_taken_for_those_that_were_named(tmp_path):
-    photos(tmp_path / "photos")
+def test_leftover_masks_are_not_used_in_place_of_the_given_ones(tmp_path):
+    write_photos(tmp_path / "photos")
     for folder, level in (("named", 255), ("scene/masks", 0)):
         (tmp_path / folder).mkdir(parents=True)
         Image.new("L", (30, 20), level).save(tmp_path / folder / "0.png")
     with pytest.raises(hyrfpack.HyrfError, match="masks: the folder holds files that do not belong to these photos"):
         hyrfpack.estimate_poses(tmp_path / "photos", tmp_path / "scene", masks=tmp_path / "named")
     shutil.rmtree(tmp_path / "scene" / "masks")
-    finished(tmp_path / "photos", tmp_path / "scene", masks=tmp_path / "named")
+    estimate_with_fake_stages(tmp_path / "photos", tmp_path / "scene", masks=tmp_path / "named")
     assert same_bytes(tmp_path / "scene" / "masks" / "0.png.png", tmp_path / "named" / "0.png")
 
 
 @pytest.mark.parametrize("forged", ["{", "[]", '{"made": ["images"]}'])
-def test_a_report_of_another_program_gives_nothing_away(forged, tmp_path):
-    finished(photos(tmp_path / "photos"), tmp_path / "scene")
+def test_a_forged_record_gives_access_to_no_other_file(forged, tmp_path):
+    estimate_with_fake_stages(write_photos(tmp_path / "photos"), tmp_path / "scene")
     (tmp_path / "scene" / "poses.json").write_text(forged)
     with pytest.raises(hyrfpack.HyrfError, match="poses of another program"):
         hyrfpack.estimate_poses(tmp_path / "photos", tmp_path / "scene", overwrite=True)
     assert (tmp_path / "scene" / "sparse" / "0").is_dir()
 
 
-def test_a_record_lists_nothing_outside_the_scene_nor_what_has_changed(tmp_path):
-    photos(tmp_path / "photos")
-    images = photos(tmp_path / "scene" / "images")
+def test_a_record_lists_only_unchanged_files_inside_the_scene(tmp_path):
+    write_photos(tmp_path / "photos")
+    images = write_photos(tmp_path / "scene" / "images")
     size = (images / "0.png").stat().st_size
     (tmp_path / "scene" / "masks").symlink_to(tmp_path / "photos")
     (tmp_path / "scene" / "own.txt").write_text("mine")

@@ -1,4 +1,4 @@
-"""Which photos are matched with which."""
+"""The choice of photo pairs for matching."""
 
 from __future__ import annotations
 
@@ -13,38 +13,38 @@ from hyrfpack.poses.pairs import (
 )
 
 
-def looks(groups: list[int], seed: int = 0) -> list[np.ndarray]:
-    """Descriptors of photos that show the things of their group."""
+def make_descriptors(groups: list[int], seed: int = 0) -> list[np.ndarray]:
+    """Return descriptors of photos, where photos of one group show the same things."""
     rng = np.random.default_rng(seed)
     things = rng.integers(0, 180, (max(groups) + 1, 60, 128))
     return [np.clip(things[group] + rng.integers(-8, 8, (60, 128)), 0, 255).astype(np.uint8) for group in groups]
 
 
-def test_the_kind_follows_from_the_set():
+def test_the_matching_method_follows_from_the_set():
     assert [choose_matching(count, False) for count in (3, 200, 201)] == ["exhaustive", "exhaustive", "retrieval"]
     assert choose_matching(60, True) == "sequential"
 
 
-def test_exhaustive_is_every_pair_once():
+def test_exhaustive_matching_has_every_pair_once():
     pairs = exhaustive_pairs(7)
     assert len(set(pairs)) == len(pairs) == 21
     assert all(first < second for first, second in pairs)
 
 
-def test_photos_that_show_the_same_look_alike():
+def test_photos_of_the_same_things_are_similar():
     groups = [0, 1, 2, 0, 1, 2, 0, 1, 2]
-    similar = compute_similarities(looks(groups), seed=0)
+    similar = compute_similarities(make_descriptors(groups), seed=0)
     same = np.equal.outer(groups, groups)
     assert similar[same].min() > similar[~same].max()
-    assert np.array_equal(similar, compute_similarities(looks(groups), seed=0))
+    assert np.array_equal(similar, compute_similarities(make_descriptors(groups), seed=0))
 
 
-def test_photos_without_features_are_like_none():
-    similar = compute_similarities([*looks([0, 0]), np.zeros((0, 128), np.uint8)], seed=0)
+def test_photos_without_features_are_similar_to_none():
+    similar = compute_similarities([*make_descriptors([0, 0]), np.zeros((0, 128), np.uint8)], seed=0)
     assert np.isfinite(similar).all() and not similar[2].any()
 
 
-def test_sequential_closes_loops():
+def test_sequential_matching_closes_loops():
     count = 60
     similar = np.zeros((count, count))
     similar[2, 57] = similar[57, 2] = 1.0
@@ -53,7 +53,7 @@ def test_sequential_closes_loops():
     assert all(first < second for first, second in pairs) and len(set(pairs)) == len(pairs)
 
 
-def test_retrieval_takes_those_that_look_alike_and_neighbours():
+def test_retrieval_matches_similar_photos_and_neighbours():
     count = 300
     rng = np.random.default_rng(0)
     similar = rng.uniform(0, 0.1, (count, count))

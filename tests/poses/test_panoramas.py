@@ -1,4 +1,4 @@
-"""Photos that show all around: cut into faces, which are posed as photos are."""
+"""Panoramas are cut into faces, which are posed like photos."""
 
 from __future__ import annotations
 
@@ -12,30 +12,33 @@ from hyrfpack.data.equirectangular import FACES
 from hyrfpack.poses.alignment import align_poses
 from hyrfpack.poses.prepare import find_masks, make_masks, read_headers
 
-COUNT, HEIGHT = 3, 320
+PANORAMA_COUNT = 3
+PANORAMA_HEIGHT = 320
 
 
 @pytest.fixture(scope="module")
 def panoramas(tmp_path_factory):
-    """A folder of panoramas, and the pose of each one's middle."""
+    """A folder of panoramas, and the pose of the forward direction of each."""
     folder, textures = tmp_path_factory.mktemp("panoramas"), wall_textures()
-    truth = {f"p{number}": arc_pose(number / (COUNT - 1)) for number in range(COUNT)}
+    truth = {f"p{number}": arc_pose(number / (PANORAMA_COUNT - 1)) for number in range(PANORAMA_COUNT)}
     for name, pose in truth.items():
-        Image.fromarray(render_panorama(pose, textures, HEIGHT, finer=2)).save(folder / f"{name}.jpg", quality=95)
+        Image.fromarray(render_panorama(pose, textures, PANORAMA_HEIGHT, finer=2)).save(
+            folder / f"{name}.jpg", quality=95
+        )
     return folder, truth
 
 
 def test_the_faces_of_panoramas_are_posed(panoramas, tmp_path):
     folder, truth = panoramas
     found = hyrfpack.estimate_poses(folder, tmp_path / "scene")
-    assert found.photos == COUNT * len(FACES)
-    assert f"{COUNT} panoramas were cut into {COUNT * len(FACES)} photos" in found.notes
+    assert found.photos == PANORAMA_COUNT * len(FACES)
+    assert f"{PANORAMA_COUNT} panoramas were cut into {PANORAMA_COUNT * len(FACES)} photos" in found.notes
     expected = {f"{name}_{face.name}.jpg": face.rotation @ pose for name, pose in truth.items() for face in FACES}
     views = hyrfpack.load_scene(tmp_path / "scene").views
-    assert {f"p{number}_front.jpg" for number in range(COUNT)} <= {view.name for view in views}
+    assert {f"p{number}_front.jpg" for number in range(PANORAMA_COUNT)} <= {view.name for view in views}
     poses = {view.name: view.camera.camera_from_world[:3] for view in views}
-    assert len(align_poses(poses, expected).agreeing) >= COUNT
-    for view in views:  # a quarter of a turn wide
+    assert len(align_poses(poses, expected).agreeing) >= PANORAMA_COUNT
+    for view in views:  # each face is 90 degrees wide
         assert view.camera.fx == pytest.approx(view.camera.width / 2, rel=0.05)
 
 
@@ -51,8 +54,8 @@ def test_panoramas_are_not_cut_among_the_photos_of_others(panoramas, tmp_path):
 
 def test_masks_of_panoramas_are_cut_with_them(panoramas, tmp_path):
     folder, _ = panoramas
-    mask = np.full((HEIGHT, 2 * HEIGHT), 255, np.uint8)
-    mask[HEIGHT // 2 :] = 0  # what lies below the horizon
+    mask = np.full((PANORAMA_HEIGHT, 2 * PANORAMA_HEIGHT), 255, np.uint8)
+    mask[PANORAMA_HEIGHT // 2 :] = 0  # everything below the horizon
     (tmp_path / "masks").mkdir()
     Image.fromarray(mask).save(tmp_path / "masks" / "p0.png")
     photos, left_out = read_headers(folder, [folder / "p0.jpg"], in_place=False)

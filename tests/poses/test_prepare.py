@@ -1,4 +1,4 @@
-"""From files as cameras leave them to a scene's photos: upright, told apart, each once, with their masks."""
+"""Preparation of camera files for a scene: upright photos, separate cameras, no duplicates, matching masks."""
 
 from __future__ import annotations
 
@@ -26,49 +26,51 @@ from hyrfpack.poses.prepare import (
     read_headers,
 )
 
-# Pixels of a picture that is stored on its side, and how EXIF says that it is turned upright.
-TURNED = {3: 2, 6: 1, 8: 3}  # orientation: quarter turns, against the clock, from upright to stored
+# EXIF orientation -> counter-clockwise quarter turns from the upright picture to the stored one.
+QUARTER_TURNS_BY_ORIENTATION = {3: 2, 6: 1, 8: 3}
 
 
-def upright(seed: int = 0) -> np.ndarray:
+def upright_picture(seed: int = 0) -> np.ndarray:
     rng = np.random.default_rng(seed)
     small = Image.fromarray(rng.integers(0, 255, (6, 8, 3), np.uint8))
     return np.asarray(small.resize((80, 60), Image.Resampling.BICUBIC))
 
 
-def save(path: Path, pixels: np.ndarray, orientation: int = 1, exif: dict | None = None, device: str = "") -> Path:
+def save_photo(
+    path: Path, pixels: np.ndarray, orientation: int = 1, exif: dict | None = None, device: str = ""
+) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     tags = Image.Exif()
     tags[0x0112] = orientation
     if device:
         tags[0x0110] = device
     tags.get_ifd(0x8769).update(exif or {})
-    stored = np.ascontiguousarray(np.rot90(pixels, TURNED.get(orientation, 0)))
+    stored = np.ascontiguousarray(np.rot90(pixels, QUARTER_TURNS_BY_ORIENTATION.get(orientation, 0)))
     Image.fromarray(stored).save(path, exif=tags, **({"quality": 95} if path.suffix == ".jpg" else {}))
     return path
 
 
-def looked_at(folder: Path, in_place: bool = False) -> tuple[list[Photo], dict[str, str]]:
+def read_photo_headers(folder: Path, in_place: bool = False) -> tuple[list[Photo], dict[str, str]]:
     return read_headers(folder, list_photos(folder), in_place)
 
 
 @pytest.mark.parametrize("orientation", [3, 6, 8])
 @pytest.mark.parametrize("name, written, most", [("a.jpg", "a.jpg", 6.0), ("a.png", "a.png", 0.0)])
 def test_photos_stored_on_their_side_are_written_upright(orientation, name, written, most, tmp_path):
-    save(tmp_path / "in" / name, upright(), orientation)
-    photos, _ = looked_at(tmp_path / "in")
+    save_photo(tmp_path / "in" / name, upright_picture(), orientation)
+    photos, _ = read_photo_headers(tmp_path / "in")
     make_images(photos, tmp_path / "out")
     assert [photo.name for photo in photos] == [written]
     with Image.open(tmp_path / "out" / written) as image:
         assert image.getexif().get(0x0112, 1) == 1
-        assert np.abs(np.asarray(image).astype(float) - upright()).mean() <= most
+        assert np.abs(np.asarray(image).astype(float) - upright_picture()).mean() <= most
 
 
-def test_what_is_upright_is_copied_byte_for_byte_and_edits_of_one_do_not_reach_the_other(tmp_path):
+def test_upright_photos_are_copied_byte_for_byte_and_stay_independent(tmp_path):
     original, copy = tmp_path / "in" / "left" / "a.jpg", tmp_path / "out" / "left" / "a.jpg"
-    save(original, upright())
+    save_photo(original, upright_picture())
     before = original.read_bytes()
-    photos, _ = looked_at(tmp_path / "in")
+    photos, _ = read_photo_headers(tmp_path / "in")
     make_images(photos, tmp_path / "out")
     assert copy.read_bytes() == before and copy.stat().st_mtime_ns == original.stat().st_mtime_ns
     with copy.open("r+b") as file:
@@ -80,16 +82,16 @@ def test_what_is_upright_is_copied_byte_for_byte_and_edits_of_one_do_not_reach_t
 
 
 def test_masks_are_copied_so_that_edits_do_not_reach_the_original(tmp_path):
-    save(tmp_path / "photos" / "a.jpg", upright())
+    save_photo(tmp_path / "photos" / "a.jpg", upright_picture())
     (tmp_path / "masks").mkdir()
     Image.new("L", (80, 60), 255).save(tmp_path / "masks" / "a.png")
-    photos, _ = looked_at(tmp_path / "photos")
+    photos, _ = read_photo_headers(tmp_path / "photos")
     made = make_masks(photos, find_masks(photos, tmp_path / "masks"), tmp_path / "made")
     assert made["a.jpg"].read_bytes() == (tmp_path / "masks" / "a.png").read_bytes()
     assert not made["a.jpg"].samefile(tmp_path / "masks" / "a.png")
 
 
-def test_where_the_file_system_has_reflinks_the_copy_is_one(tmp_path, monkeypatch):
+def test_copies_are_reflinks_where_the_file_system_has_them(tmp_path, monkeypatch):
     fcntl = pytest.importorskip("fcntl")
     (tmp_path / "a.jpg").write_bytes(b"photo")
     asked = []
@@ -106,100 +108,108 @@ def test_where_the_file_system_has_reflinks_the_copy_is_one(tmp_path, monkeypatc
     assert asked == [0x40049409]  # FICLONE of linux/fs.h: _IOW(0x94, 9, int)
 
 
-def test_a_photo_whose_header_alone_is_whole_is_left_out_also_where_it_may_be_a_panorama(tmp_path):
-    path = save(tmp_path / "a.jpg", np.random.default_rng(0).integers(0, 255, (200, 400, 3), np.uint8))
+def test_a_photo_with_only_a_complete_header_is_omitted_also_as_a_panorama(tmp_path):
+    path = save_photo(tmp_path / "a.jpg", np.random.default_rng(0).integers(0, 255, (200, 400, 3), np.uint8))
     path.write_bytes(path.read_bytes()[:5000])
-    save(tmp_path / "b.jpg", upright())
-    photos, left_out = looked_at(tmp_path)
+    save_photo(tmp_path / "b.jpg", upright_picture())
+    photos, left_out = read_photo_headers(tmp_path)
     assert [photo.name for photo in photos] == ["b.jpg"]
     assert left_out["a.jpg"].startswith("cannot decode the picture")
 
 
-def test_photos_that_differ_in_their_ending_alone_keep_apart(tmp_path):
+def test_photos_that_differ_only_in_their_ending_keep_different_names(tmp_path):
     for number, name in enumerate(("a.bmp", "a.jpg", "a.png", "a.webp")):
-        save(tmp_path / "in" / name, upright(number), 6 if name == "a.webp" else 1)
-    save(tmp_path / "in" / "a.jp2", upright(9))  # written anew as a.png, which is taken
-    photos, _ = looked_at(tmp_path / "in")
+        save_photo(tmp_path / "in" / name, upright_picture(number), 6 if name == "a.webp" else 1)
+    save_photo(tmp_path / "in" / "a.jp2", upright_picture(9))  # it would be written as a.png, but that name is taken
+    photos, _ = read_photo_headers(tmp_path / "in")
     assert len({photo.name for photo in photos}) == 5
     make_images(photos, tmp_path / "out")
     assert (tmp_path / "out" / "a.png").read_bytes() == (tmp_path / "in" / "a.png").read_bytes()
 
 
-def test_what_is_stored_on_its_side_and_cut_off_is_put_there_to_be_left_out_by_itself(tmp_path):
-    path = save(tmp_path / "in" / "a.jpg", upright(), 6)
+def test_a_truncated_rotated_photo_is_copied_and_omitted_alone(tmp_path):
+    path = save_photo(tmp_path / "in" / "a.jpg", upright_picture(), 6)
     path.write_bytes(path.read_bytes()[:-500])
-    photos, _ = looked_at(tmp_path / "in")
+    photos, _ = read_photo_headers(tmp_path / "in")
     make_images(photos, tmp_path / "out")
     with pytest.raises(hyrfpack.HyrfDataError, match="cannot decode"):
         read_pixels(tmp_path / "out" / "a.jpg")
 
 
-def test_printing_inks_stored_on_their_side_become_colours_without_the_profile_of_inks(tmp_path):
+def test_rotated_cmyk_photos_become_rgb_without_the_cmyk_profile(tmp_path):
     tags = Image.Exif()
     tags[0x0112] = 6
     (tmp_path / "in").mkdir()
-    inks = Image.fromarray(upright()).convert("CMYK")
+    inks = Image.fromarray(upright_picture()).convert("CMYK")
     inks.save(tmp_path / "in" / "a.jpg", exif=tags, icc_profile=b"of inks", quality=95)
-    photos, _ = looked_at(tmp_path / "in")
+    photos, _ = read_photo_headers(tmp_path / "in")
     make_images(photos, tmp_path / "out")
     with Image.open(tmp_path / "out" / "a.jpg") as image:
         assert (image.mode, image.size, image.info.get("icc_profile")) == ("RGB", (60, 80), None)
 
 
-def test_in_place_nothing_is_turned(tmp_path):
-    save(tmp_path / "a.jpg", upright(), 6)
-    photos, _ = looked_at(tmp_path, in_place=True)
+def test_photos_used_in_place_are_not_rotated(tmp_path):
+    save_photo(tmp_path / "a.jpg", upright_picture(), 6)
+    photos, _ = read_photo_headers(tmp_path, in_place=True)
     devices, _ = group_by_device(photos, in_place=True)
-    assert devices[0].size == (60, 80)  # as it is stored
+    assert devices[0].size == (60, 80)  # the stored size
     assert group_by_device(photos, in_place=False)[0][0].size == (80, 60)
 
 
-def test_copies_and_unreadable_files_are_left_out_with_the_reason(tmp_path):
-    save(tmp_path / "a.png", upright(1))
-    save(tmp_path / "b.png", upright(2))
+def test_duplicates_and_unreadable_files_are_omitted_with_the_reason(tmp_path):
+    save_photo(tmp_path / "a.png", upright_picture(1))
+    save_photo(tmp_path / "b.png", upright_picture(2))
     (tmp_path / "c.png").write_bytes((tmp_path / "a.png").read_bytes())
     (tmp_path / "d.png").write_bytes(b"nothing")
-    photos, left_out = looked_at(tmp_path)
+    photos, left_out = read_photo_headers(tmp_path)
     assert [photo.name for photo in photos] == ["a.png", "b.png"]
     assert left_out["c.png"] == "a copy of a.png"
     assert left_out["d.png"].startswith("not a picture that can be read")
 
 
-def test_cameras_are_told_apart_by_folder_device_size_and_zoom(tmp_path):
+def test_cameras_are_distinguished_by_folder_device_size_and_zoom(tmp_path):
     tele, wide = {0xA405: 70}, {0xA405: 24}
-    save(tmp_path / "a1.jpg", upright(1), exif=wide, device="One")
-    save(tmp_path / "a2.jpg", upright(2), exif=wide, device="One")
-    save(tmp_path / "b.jpg", upright(3), exif=tele, device="One")
-    save(tmp_path / "c.jpg", upright(4), exif=wide, device="Two")
-    save(tmp_path / "d.jpg", upright(5)[:, :40], exif=wide, device="One")
-    save(tmp_path / "left" / "e.jpg", upright(6), exif=wide, device="One")
-    photos, _ = looked_at(tmp_path)
+    save_photo(tmp_path / "a1.jpg", upright_picture(1), exif=wide, device="One")
+    save_photo(tmp_path / "a2.jpg", upright_picture(2), exif=wide, device="One")
+    save_photo(tmp_path / "b.jpg", upright_picture(3), exif=tele, device="One")
+    save_photo(tmp_path / "c.jpg", upright_picture(4), exif=wide, device="Two")
+    save_photo(tmp_path / "d.jpg", upright_picture(5)[:, :40], exif=wide, device="One")
+    save_photo(tmp_path / "left" / "e.jpg", upright_picture(6), exif=wide, device="One")
+    photos, _ = read_photo_headers(tmp_path)
     devices, of = group_by_device(photos, in_place=False)
     assert [photo.name for photo in photos] == ["a1.jpg", "a2.jpg", "b.jpg", "c.jpg", "d.jpg", "left/e.jpg"]
     assert of == (0, 0, 1, 2, 3, 4)
-    # A diagonal of 100 pixels stands for one of 43.27 mm.
+    # In 35 mm terms, the diagonal of 100 pixels stands for 43.27 mm.
     assert devices[0].focal == pytest.approx(24 / np.hypot(36, 24) * 100)
 
 
-def test_photos_that_follow_each_other(tmp_path):
+def test_numbered_photos_count_as_a_sequence(tmp_path):
     for number in range(4):
         taken = {0x9003: f"2024:05:01 12:00:0{number}"}
-        save(tmp_path / "burst" / f"IMG_{number}.jpg", upright(number), exif=taken, device="One")
-        save(tmp_path / "walk" / f"IMG_{number}.jpg", upright(number), exif={0x9003: f"2024:05:01 12:0{number}:00"})
-        save(tmp_path / "frames" / f"frame_{number:03d}.png", upright(number))
-        save(tmp_path / "any" / f"{'abcd'[number]}.png", upright(number))
-    ordered = {name: is_ordered_sequence(looked_at(tmp_path / name)[0]) for name in ("burst", "walk", "frames", "any")}
+        save_photo(tmp_path / "burst" / f"IMG_{number}.jpg", upright_picture(number), exif=taken, device="One")
+        save_photo(
+            tmp_path / "walk" / f"IMG_{number}.jpg",
+            upright_picture(number),
+            exif={0x9003: f"2024:05:01 12:0{number}:00"},
+        )
+        save_photo(tmp_path / "frames" / f"frame_{number:03d}.png", upright_picture(number))
+        save_photo(tmp_path / "any" / f"{'abcd'[number]}.png", upright_picture(number))
+    ordered = {
+        name: is_ordered_sequence(read_photo_headers(tmp_path / name)[0]) for name in ("burst", "walk", "frames", "any")
+    }
     assert ordered == {"burst": True, "walk": False, "frames": True, "any": False}
 
 
-def test_masks_are_turned_with_their_photos(tmp_path):
-    save(tmp_path / "photos" / "a.jpg", upright(), 6)
-    save(tmp_path / "photos" / "b.jpg", upright(1))
+def test_masks_are_rotated_with_their_photos(tmp_path):
+    save_photo(tmp_path / "photos" / "a.jpg", upright_picture(), 6)
+    save_photo(tmp_path / "photos" / "b.jpg", upright_picture(1))
     mask = np.zeros((60, 80), np.uint8)
     mask[:20, :30] = 255
     (tmp_path / "masks").mkdir()
-    Image.fromarray(np.ascontiguousarray(np.rot90(mask, TURNED[6]))).save(tmp_path / "masks" / "a.png")
-    photos, _ = looked_at(tmp_path / "photos")
+    Image.fromarray(np.ascontiguousarray(np.rot90(mask, QUARTER_TURNS_BY_ORIENTATION[6]))).save(
+        tmp_path / "masks" / "a.png"
+    )
+    photos, _ = read_photo_headers(tmp_path / "photos")
     found = find_masks(photos, tmp_path / "masks")
     assert list(found) == ["a.jpg"]
     made = make_masks(photos, found, tmp_path / "made")
@@ -207,7 +217,7 @@ def test_masks_are_turned_with_their_photos(tmp_path):
         assert np.array_equal(np.asarray(image), mask)
 
 
-def test_masked_parts_have_no_features_and_photos_without_a_mask_have_theirs(tmp_path):
+def test_masked_parts_have_no_features_and_photos_without_masks_keep_theirs(tmp_path):
     import pycolmap
 
     from hyrfpack.poses.features import find_features
@@ -228,7 +238,7 @@ def test_masked_parts_have_no_features_and_photos_without_a_mask_have_theirs(tmp
     assert len(masked) > 50 and len(free) > 50
 
 
-def test_large_photos_are_posed_on_small_copies_and_the_poses_are_the_large_ones():
+def test_intrinsics_found_on_small_copies_are_scaled_to_the_photos():
     device = Device((4000, 3000), 3000.0)
     assert device.working_size == (1600, 1200)
     assert device.working_focal == 1200.0
@@ -242,7 +252,7 @@ def test_a_job_is_read_as_it_was_written(tmp_path):
     assert Job.load(tmp_path / "job.json") == job
 
 
-def test_a_set_of_two_cameras_some_on_their_side_becomes_one_scene(tmp_path):
+def test_photos_of_two_cameras_some_of_them_rotated_become_one_scene(tmp_path):
     folder = tmp_path / "photos"
     known = write_photos(folder)
     for number, name in enumerate(sorted(known)):
@@ -250,9 +260,11 @@ def test_a_set_of_two_cameras_some_on_their_side_becomes_one_scene(tmp_path):
         pixels = np.asarray(Image.open(path))
         path.unlink()
         if number % 2:
-            save(folder / name.replace(".png", ".jpg"), pixels, 6, device="One")
+            save_photo(folder / name.replace(".png", ".jpg"), pixels, 6, device="One")
         else:
-            save(folder / "right" / name, pixels[:, : 4 * PHOTO_SIZE[0] // 5], device="Two")  # another principal point
+            save_photo(
+                folder / "right" / name, pixels[:, : 4 * PHOTO_SIZE[0] // 5], device="Two"
+            )  # it has another principal point
     report = hyrfpack.estimate_poses(folder, tmp_path / "scene")
     assert report.registered == len(known)
     assert any("turned upright" in note for note in report.notes)

@@ -1,4 +1,4 @@
-"""Progress of long library calls: read from what the library writes, told at least every two seconds."""
+"""Progress of long library calls is read from what the library writes, and reported at least every two seconds."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hyrfpack.poses.job import Job
 from hyrfpack.poses.watch import count_rows, parse_global_mapping_phase, poll_in_background, report_new_rows
 
 # Lines of pycolmap 4.2.1's global mapper, in the order of its work.
-LOG = [
+MAPPER_LOG = [
     "I2026 global_mapper.cc:553] === Running rotation averaging ===",
     "I2026 global_mapper.cc:565] === Running track establishment ===",
     "I2026 global_mapper.cc:575] === Running global positioning ===",
@@ -39,7 +39,7 @@ def job_with_pairs(folder: Path, count: int) -> Job:
 
 
 def test_the_phase_of_the_global_mapper_follows_its_log_and_never_goes_back():
-    found = [parse_global_mapping_phase("\n".join(LOG[:lines])) for lines in range(len(LOG) + 1)]
+    found = [parse_global_mapping_phase("\n".join(MAPPER_LOG[:lines])) for lines in range(len(MAPPER_LOG) + 1)]
     assert [phase for phase, _ in found] == [
         "",
         "camera rotations",
@@ -58,7 +58,7 @@ def test_the_phase_of_the_global_mapper_follows_its_log_and_never_goes_back():
 def test_rows_are_counted_while_another_connection_writes(tmp_path):
     job = job_with_pairs(tmp_path, 5)
     writer = sqlite3.connect(job.database)
-    writer.execute("INSERT INTO two_view_geometries VALUES (9)")  # a transaction that is not committed
+    writer.execute("INSERT INTO two_view_geometries VALUES (9)")  # the transaction is not committed
     assert count_rows(job, "two_view_geometries") == 5
     writer.commit()
     assert count_rows(job, "two_view_geometries") == 6
@@ -83,7 +83,7 @@ def test_rows_that_a_long_call_writes_are_reported_while_it_runs(tmp_path, monke
     assert told == sorted(told) and told[-1] == 2
 
 
-def test_what_cannot_be_read_does_not_end_the_call_that_is_watched(monkeypatch):
+def test_a_failing_progress_reader_does_not_end_the_watched_call(monkeypatch):
     monkeypatch.setattr(watch, "POLL_INTERVAL_SECONDS", 0.01)
     tried = threading.Event()
 
@@ -95,8 +95,8 @@ def test_what_cannot_be_read_does_not_end_the_call_that_is_watched(monkeypatch):
         assert tried.wait(60)
 
 
-def test_a_stage_that_says_nothing_for_long_is_told_again_and_again(tmp_path, monkeypatch):
-    """The worker tells something once and then ends only when it was told of three times."""
+def test_progress_of_a_silent_stage_is_repeated(tmp_path, monkeypatch):
+    """The worker reports once and ends only when its report was repeated three times."""
     monkeypatch.setattr(process, "MAX_SILENCE_SECONDS", 0.05)
     script = (
         "import sys, json; print(json.dumps({'doing': 'solving', 'share': 0.5}), flush=True); sys.stdin.read(1); "
@@ -118,7 +118,7 @@ def test_a_stage_that_says_nothing_for_long_is_told_again_and_again(tmp_path, mo
     assert told[0] == ("starting", 0.0) and told.count(("solving", 0.5)) >= 3
 
 
-def test_every_stage_tells_how_far_it_is_by_its_own_measure(posed):
+def test_every_stage_reports_progress_in_its_own_units(posed):
     doings = [doing for doing, _ in posed[2]]
     for words in (
         "reading the headers of photos, 8 of 8",
@@ -137,7 +137,7 @@ def test_every_stage_tells_how_far_it_is_by_its_own_measure(posed):
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5])
-def test_shares_told_out_of_order_never_go_back(share, tmp_path):
+def test_progress_reported_out_of_order_never_decreases(share, tmp_path):
     from hyrfpack.poses.estimate import _PoseEstimation
 
     told: list[float] = []

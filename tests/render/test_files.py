@@ -28,7 +28,7 @@ from hyrfpack.render.video import write_video
         (["a\0b:c"], ["a_b_c"]),
     ],
 )
-def test_pictures_are_named_after_photos_and_stay_in_the_folder(names, files):
+def test_pictures_are_named_after_photos_and_written_only_into_the_folder(names, files):
     assert unique_stems(names) == files
 
 
@@ -54,12 +54,12 @@ def test_a_folder_that_cannot_be_made_is_a_clear_error(tmp_path):
 # -- video ------------------------------------------------------------------------------------------------------------
 
 
-def stand_in_ffmpeg(folder, monkeypatch, body: str) -> None:
+def install_fake_ffmpeg(folder, monkeypatch, body: str) -> None:
     """Put a Python program named ffmpeg first on the PATH."""
     script = folder / "bin" / "ffmpeg"
     script.parent.mkdir()
     (folder / "bin" / "program.py").write_text(f"import sys\n{body}\n")
-    # Not by a first line that names Python: its folder may have a space in its name.
+    # A shebang line cannot name Python, whose folder may have a space in its name.
     script.write_text(f'#!/bin/sh\nexec "{sys.executable}" "{script.parent}/program.py" "$@"\n')
     script.chmod(script.stat().st_mode | stat.S_IXUSR)
     monkeypatch.setenv("PATH", f"{script.parent}{os.pathsep}{os.environ['PATH']}")
@@ -67,7 +67,7 @@ def stand_in_ffmpeg(folder, monkeypatch, body: str) -> None:
 
 @pytest.mark.skipif(os.name == "nt", reason="needs executable scripts")
 def test_video_gets_all_frames_in_order(tmp_path, monkeypatch):
-    stand_in_ffmpeg(tmp_path, monkeypatch, "open(sys.argv[-1], 'wb').write(sys.stdin.buffer.read())")
+    install_fake_ffmpeg(tmp_path, monkeypatch, "open(sys.argv[-1], 'wb').write(sys.stdin.buffer.read())")
     frames = [tmp_path / name for name in ("b.png", "a.png")]
     for frame in frames:
         frame.write_bytes(frame.name.encode() * 40_000)
@@ -77,9 +77,9 @@ def test_video_gets_all_frames_in_order(tmp_path, monkeypatch):
 
 
 @pytest.mark.skipif(os.name == "nt", reason="needs executable scripts")
-def test_failing_ffmpeg_is_quoted_and_leaves_the_old_video(tmp_path, monkeypatch):
+def test_an_error_of_ffmpeg_is_quoted_and_keeps_the_old_video(tmp_path, monkeypatch):
     body = "open(sys.argv[-1], 'wb').write(b'half')\nprint('no such encoder', file=sys.stderr)\nsys.exit(1)"
-    stand_in_ffmpeg(tmp_path, monkeypatch, body)
+    install_fake_ffmpeg(tmp_path, monkeypatch, body)
     (tmp_path / "frame.png").write_bytes(bytes(3_000_000))
     (tmp_path / "video.mp4").write_bytes(b"old")
     with pytest.raises(HyrfError, match="no such encoder"):
@@ -92,13 +92,13 @@ def test_failing_ffmpeg_is_quoted_and_leaves_the_old_video(tmp_path, monkeypatch
 def test_without_overwrite_a_video_that_appears_meanwhile_is_kept(tmp_path, monkeypatch):
     video = tmp_path / "video.mp4"
     body = f"open({str(video)!r}, 'wb').write(b'foreign')\nopen(sys.argv[-1], 'wb').write(sys.stdin.buffer.read())"
-    stand_in_ffmpeg(tmp_path, monkeypatch, body)
+    install_fake_ffmpeg(tmp_path, monkeypatch, body)
     (tmp_path / "frame.png").write_bytes(b"frame")
     assert write_video([tmp_path / "frame.png"], video, overwrite=False) == tmp_path / "video-2.mp4"
     assert video.read_bytes() == b"foreign" and (tmp_path / "video-2.mp4").read_bytes() == b"frame"
 
 
-def test_video_without_ffmpeg_says_so(tmp_path, monkeypatch):
+def test_a_video_without_ffmpeg_is_a_clear_error(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(HyrfError, match="no ffmpeg program"):
         write_video([], tmp_path / "video.mp4")

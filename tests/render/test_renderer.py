@@ -14,33 +14,33 @@ from hyrfpack.ops.background import BACKGROUND_RADIUS, reference
 from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.scene import Camera
 
-FRAME = Frame((10.0, -20.0, 5.0), 7.0, (1.0, 0.5, 0.5))
-EXACT = RenderSettings(background_threshold=0.0, background_stride=1)
+WORLD_FRAME = Frame((10.0, -20.0, 5.0), 7.0, (1.0, 0.5, 0.5))
+EXACT_SETTINGS = RenderSettings(background_threshold=0.0, background_stride=1)
 
 
-def world(local) -> np.ndarray:
-    return FRAME.to_world(np.asarray(local, np.float64))
+def to_world(local) -> np.ndarray:
+    return WORLD_FRAME.to_world(np.asarray(local, np.float64))
 
 
-def an_odd_camera(local_position=(0.2, -3.0, 0.7), local_target=(0.1, 0.0, 0.0)) -> Camera:
-    """fx != fy, a principal point off the centre, a picture that is no multiple of a tile."""
-    return Camera(75, 50, 80.0, 95.0, 33.3, 28.4, look_at(world(local_position), world(local_target)))
+def off_centre_camera(local_position=(0.2, -3.0, 0.7), local_target=(0.1, 0.0, 0.0)) -> Camera:
+    """Return a camera with fx != fy, an off-centre principal point and a picture that is no multiple of a tile."""
+    return Camera(75, 50, 80.0, 95.0, 33.3, 28.4, look_at(to_world(local_position), to_world(local_target)))
 
 
 def ball_model(count: int = 120, **settings):
-    """Balls of Gaussians with fields that say something."""
+    """Return a model of balls of Gaussians whose fields contribute."""
     points, colors = ball_points(count)
     settings = {"scale_logits": -2.5, "opacity_logits": 0.5, "fields": 1.0, **settings}
     return small_model(points, color_logits=torch.from_numpy(colors) * 4 - 2, **settings)
 
 
-def picture(model, camera, **options) -> torch.Tensor:
+def render_rgb(model, camera, **options) -> torch.Tensor:
     with torch.no_grad():
         return render_view(model, camera, **options).rgb
 
 
-def exact_sky(model, camera) -> torch.Tensor:
-    """(H, W, 3) the background sphere at every pixel."""
+def render_exact_background(model, camera) -> torch.Tensor:
+    """Return the (H, W, 3) background sphere, evaluated at every pixel."""
     columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     points = torch.from_numpy(np.stack([columns, rows], -1).reshape(-1, 2)).float()
     pose = torch.from_numpy(model.config.frame.local_pose(camera)).float()
@@ -48,14 +48,14 @@ def exact_sky(model, camera) -> torch.Tensor:
         return model.decode_background(points, camera.intrinsics, pose).view(camera.height, camera.width, 3)
 
 
-# -- where and how far -----------------------------------------------------------------------------------------------
+# -- positions and scale ---------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("local", [(0.0, 0.0, 0.0), (0.3, 0.2, -0.25), (-0.4, -0.3, 0.1)])
-def test_a_single_gaussian_lands_where_the_camera_model_says(local):
-    camera = an_odd_camera()
-    model = small_model([local], frame=FRAME, scale_logits=-4.6, opacity_logits=5.0)
-    x, y, z = camera.rotation @ world(local) + camera.camera_from_world[:3, 3]
+def test_a_single_gaussian_is_drawn_where_the_camera_model_projects_it(local):
+    camera = off_centre_camera()
+    model = small_model([local], frame=WORLD_FRAME, scale_logits=-4.6, opacity_logits=5.0)
+    x, y, z = camera.rotation @ to_world(local) + camera.camera_from_world[:3, 3]
 
     with torch.no_grad():
         rendering = render_view(model, camera, depth=True)
@@ -66,12 +66,14 @@ def test_a_single_gaussian_lands_where_the_camera_model_says(local):
     np.testing.assert_allclose(found, (camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy), atol=0.03)
     hit = rendering.alpha > 0
     assert 5 < hit.sum() < hit.numel() / 4
-    np.testing.assert_allclose(rendering.depth[hit].numpy(), z, rtol=1e-5)  # world units: the frame's scale is 7
+    np.testing.assert_allclose(
+        rendering.depth[hit].numpy(), z, rtol=1e-5
+    )  # in world units, because the frame's scale is 7
     assert (rendering.depth[~hit] == 0).all()
 
 
 def test_a_single_gaussian_is_as_wide_as_projected():
-    """Seen head on, a ball of sigma s at depth z has variance (f s / z)^2 + 0.3 in the picture."""
+    """Seen head on, a ball of sigma s at depth z has variance (f s / z)^2 + 0.3 px^2 in the picture."""
     model = small_model([[0.0, 0, 0]], scale_logits=float(np.log(0.05 / 0.95)), opacity_logits=1.0)
     camera = camera_at((0, -2.0, 0), width=96, height=96, focal=200.0)
 
@@ -88,25 +90,27 @@ def test_a_single_gaussian_is_as_wide_as_projected():
 def test_nearer_gaussians_hide_farther_ones_whatever_their_order():
     camera = camera_at((0, -3.0, 0))
     positions = np.array([[0, -1.0, 0], [0, 1.0, 0]])
-    colors = torch.tensor([[5.0, -5, -5], [-5, -5, 5]])  # red before blue
+    colors = torch.tensor([[5.0, -5, -5], [-5, -5, 5]])  # the red one is in front of the blue one
     for order in ([0, 1], [1, 0]):
         model = small_model(positions[order], color_logits=colors[order], scale_logits=-1.0, opacity_logits=3.0)
-        middle = picture(model, camera)[16, 16]
+        middle = render_rgb(model, camera)[16, 16]
         assert middle[0] > 0.9 and middle[2] < 0.1
 
 
-def test_turning_the_camera_upside_down_turns_the_picture():
+def test_rotating_the_camera_by_180_degrees_rotates_the_picture():
     model = ball_model(background=True)
     camera = camera_at((2.0, -2.5, 1.0))
     half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
     turned = Camera(32, 32, *camera.intrinsics, half_turn @ camera.camera_from_world)
 
-    difference = picture(model, turned, settings=EXACT).flip(0, 1) - picture(model, camera, settings=EXACT)
+    difference = render_rgb(model, turned, settings=EXACT_SETTINGS).flip(0, 1) - render_rgb(
+        model, camera, settings=EXACT_SETTINGS
+    )
 
     assert difference.abs().max() < 2e-4
 
 
-def test_the_unit_of_the_world_does_not_matter():
+def test_the_unit_of_the_world_has_no_effect():
     camera, moved = camera_at((2.0, -2.5, 1.0)), np.array([4e5, -3e5, 1e5])
     pose = camera.camera_from_world.copy()
     pose[:3, 3] = 1000 * pose[:3, 3] - pose[:3, :3] @ moved
@@ -114,28 +118,28 @@ def test_the_unit_of_the_world_does_not_matter():
     here = ball_model(background=True)
     there = ball_model(background=True, frame=Frame(tuple(moved), 1000.0, (1.0, 1.0, 1.0)))
 
-    difference = picture(there, far) - picture(here, camera)
+    difference = render_rgb(there, far) - render_rgb(here, camera)
 
     assert difference.abs().max() < 1e-4
 
 
 @pytest.mark.parametrize(("depth", "seen"), [(0.0099, False), (0.0101, True), (-1.0, False)])
 def test_the_near_plane_is_in_local_units(depth, seen):
-    camera = an_odd_camera()
-    local_pose = FRAME.local_pose(camera)
+    camera = off_centre_camera()
+    local_pose = WORLD_FRAME.local_pose(camera)
     on_axis = local_pose[:3, :3].T @ (np.array([0, 0, depth]) - local_pose[:3, 3])
-    model = small_model([on_axis], frame=FRAME, scale_logits=-6.0)
+    model = small_model([on_axis], frame=WORLD_FRAME, scale_logits=-6.0)
     with torch.no_grad():
         rendering = render_view(model, camera, RenderSettings(near=0.01))
     assert len(rendering.indices) == rendering.visible.sum() == seen
     assert bool(rendering.alpha.max() > 0) == seen
 
 
-# -- hard pictures ---------------------------------------------------------------------------------------------------
+# -- extreme pictures and cameras --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (17, 3), (3, 17), (16, 16), (33, 15)])
-def test_any_picture_size_renders_whole(width, height):
+def test_pictures_of_any_size_are_rendered_completely(width, height):
     model, camera = ball_model(background=True), camera_at((0, -3.0, 0), width=width, height=height, focal=20.0)
     with torch.no_grad():
         rendering = render_view(model, camera, depth=True)
@@ -147,14 +151,14 @@ def test_any_picture_size_renders_whole(width, height):
 @pytest.mark.parametrize(
     ("position", "target"),
     [
-        ((0.0, 0.0, 0.0), (0.0, 1.0, 0.0)),  # in the middle of everything
+        ((0.0, 0.0, 0.0), (0.0, 1.0, 0.0)),  # in the middle of the scene
         ((-0.5, 0.0, 0.0), (0.1, -0.5, -0.2)),  # inside a ball
         ((0.0, 0.0, 90.0), (0.0, 0.1, 0.0)),  # close to the background sphere
-        ((0.0, -3 * BACKGROUND_RADIUS, 0.0), (0.0, 0.0, 0.0)),  # outside of it
+        ((0.0, -3 * BACKGROUND_RADIUS, 0.0), (0.0, 0.0, 0.0)),  # outside the background sphere
         (
             (0.0, -3 * BACKGROUND_RADIUS, 0.0),
             (BACKGROUND_RADIUS, -3 * BACKGROUND_RADIUS, 0.0),
-        ),  # outside, looking past it
+        ),  # outside the sphere, and looking past it
         ((1e6, 1e6, 0.0), (0.0, 0.0, 0.0)),
     ],
 )
@@ -168,14 +172,16 @@ def test_pictures_stay_in_range_wherever_the_camera_is(position, target):
 
 @pytest.mark.parametrize("background", [True, False])
 @pytest.mark.parametrize("empty", ["no Gaussians", "all behind the camera"])
-def test_nothing_to_draw_leaves_the_background_alone(background, empty):
+def test_a_model_without_visible_gaussians_renders_the_background(background, empty):
     camera = camera_at((0, -3.0, 0), (0, -6.0, 0))
     positions = ball_points(20)[0] if empty == "all behind the camera" else np.zeros((0, 3))
     model = small_model(positions, fields=1.0, background=background, solid=(0.25, 0.5, 0.75))
 
-    rendering = render_view(model, camera, EXACT, depth=True, absgrad=True)
+    rendering = render_view(model, camera, EXACT_SETTINGS, depth=True, absgrad=True)
 
-    expected = exact_sky(model, camera) if background else torch.tensor([0.25, 0.5, 0.75]).expand(32, 32, 3)
+    expected = (
+        render_exact_background(model, camera) if background else torch.tensor([0.25, 0.5, 0.75]).expand(32, 32, 3)
+    )
     torch.testing.assert_close(rendering.rgb, expected)
     assert (rendering.alpha == 0).all() and (rendering.depth == 0).all() and rendering.pairs == 0
     if background:
@@ -186,22 +192,24 @@ def test_nothing_to_draw_leaves_the_background_alone(background, empty):
 # -- background ------------------------------------------------------------------------------------------------------
 
 
-def test_the_background_shines_through_what_light_is_left():
-    """C = C_fg + T c, with the parts rendered apart."""
+def test_the_background_is_weighted_by_the_transmittance():
+    """C = C_fg + T c, with the two parts rendered separately."""
     model, camera = ball_model(background=True), ring(8)[1]
     with torch.no_grad():
-        whole = render_view(model, camera, EXACT)
+        whole = render_view(model, camera, EXACT_SETTINGS)
         gaussians = render_view(model, camera, background=False)
 
     left = 1 - whole.alpha[..., None]
     assert 0.2 < left.mean() < 0.95 and left.min() < 0.5
-    torch.testing.assert_close(whole.rgb, gaussians.rgb + left * exact_sky(model, camera), rtol=0, atol=1e-6)
+    torch.testing.assert_close(
+        whole.rgb, gaussians.rgb + left * render_exact_background(model, camera), rtol=0, atol=1e-6
+    )
 
 
 def test_pixels_below_the_threshold_get_no_background():
     model, camera = ball_model(background=True), ring(8)[1]
     with torch.no_grad():
-        whole = render_view(model, camera, EXACT)
+        whole = render_view(model, camera, EXACT_SETTINGS)
         cut = render_view(model, camera, RenderSettings(background_threshold=0.6, background_stride=1))
         gaussians = render_view(model, camera, background=False)
 
@@ -216,9 +224,9 @@ def test_pixels_below_the_threshold_get_no_background():
 def test_a_background_stride_interpolates_between_exact_pixels(stride, width, height):
     camera = camera_at((0, -3.0, 0), (0, -6.0, 0), width=width, height=height, focal=30.0)
     model = small_model(np.zeros((0, 3)), fields=1.0, background=True)
-    # Every pixel of a larger picture of the same camera, to interpolate in.
+    # Every pixel of a larger picture of the same camera, which is interpolated.
     larger = Camera(width + stride, height + stride, *camera.intrinsics, camera.camera_from_world)
-    sky = exact_sky(model, larger).double().numpy()
+    sky = render_exact_background(model, larger).double().numpy()
     expected = np.empty((height, width, 3))
     for row, column in np.ndindex(height, width):
         top, left = row // stride * stride, column // stride * stride
@@ -227,7 +235,7 @@ def test_a_background_stride_interpolates_between_exact_pixels(stride, width, he
         lower = (1 - right) * sky[top + stride, left] + right * sky[top + stride, left + stride]
         expected[row, column] = (1 - down) * upper + down * lower
 
-    found = picture(model, camera, settings=RenderSettings(background_stride=stride))
+    found = render_rgb(model, camera, settings=RenderSettings(background_stride=stride))
 
     np.testing.assert_allclose(found.numpy(), expected, atol=1e-5)
 
@@ -239,14 +247,14 @@ def test_every_second_pixel_of_the_background_is_evaluated_by_default(monkeypatc
     monkeypatch.setattr(
         reference, "background_colors", lambda points, **sphere: asked.append(points) or decode(points, **sphere)
     )
-    picture(model, camera)
+    render_rgb(model, camera)
     expected = [(x + 0.5, y + 0.5) for y in range(0, 20, 2) for x in range(0, 32, 2)]
     assert [tuple(point) for point in asked[0].tolist()] == expected and len(asked) == 1
 
 
 @pytest.mark.parametrize("stride", [1, 2, 3])
 def test_no_pixel_above_the_threshold_lacks_background(stride):
-    """What a threshold leaves out is only what lies below it, whatever the stride."""
+    """A threshold omits only what lies below it, at any stride."""
     model, camera = ball_model(background=True, opacity_logits=5.0), ring(8, width=33, height=29)[1]
     with torch.no_grad():
         whole = render_view(model, camera, RenderSettings(background_threshold=0.0, background_stride=stride))
@@ -256,10 +264,10 @@ def test_no_pixel_above_the_threshold_lacks_background(stride):
     torch.testing.assert_close(cut.rgb[seen], whole.rgb[seen], rtol=0, atol=1e-6)
 
 
-def test_the_default_threshold_does_not_show_in_8_bits():
+def test_the_default_threshold_is_invisible_in_8_bits():
     model, camera = ball_model(background=True, opacity_logits=6.0, scale_logits=-1.5), ring(8)[1]
     threshold = RenderSettings(background_stride=1)
-    difference = picture(model, camera, settings=threshold) - picture(model, camera, settings=EXACT)
+    difference = render_rgb(model, camera, settings=threshold) - render_rgb(model, camera, settings=EXACT_SETTINGS)
     assert 0 < difference.abs().max() < 0.5 / 255
 
 
@@ -277,7 +285,7 @@ def test_a_solid_colour_lies_behind_a_model_without_a_sphere():
 
 def test_antialiasing_dims_small_gaussians_by_what_the_low_pass_adds():
     camera, small = camera_at((0, -3.0, 0)), {"scale_logits": -4.0, "opacity_logits": 3.0}
-    variance = (32 / 3 / (1 + np.exp(4.0))) ** 2  # px^2, before the low-pass of 0.3
+    variance = (32 / 3 / (1 + np.exp(4.0))) ** 2  # in px^2, without the low-pass filter of 0.3
     with torch.no_grad():
         plain = render_view(small_model([[0.0, 0, 0]], **small), camera).alpha.max()
         compensated = render_view(small_model([[0.0, 0, 0]], antialiased=True, **small), camera).alpha.max()
@@ -303,12 +311,14 @@ def test_impossible_settings_are_rejected(wrong):
 # -- caching, repeatability, statistics ------------------------------------------------------------------------------
 
 
-def test_what_is_decoded_beforehand_gives_the_same_picture():
+def test_a_model_decoded_beforehand_gives_the_same_picture():
     model = ball_model(background=True)
     with torch.no_grad():
         decoded = model.decode()
     for camera in ring(3):
-        torch.testing.assert_close(picture(model, camera, decoded=decoded), picture(model, camera), rtol=0, atol=1e-6)
+        torch.testing.assert_close(
+            render_rgb(model, camera, decoded=decoded), render_rgb(model, camera), rtol=0, atol=1e-6
+        )
 
 
 def test_rendering_twice_gives_the_same_bits():
@@ -327,7 +337,7 @@ def test_statistics_describe_the_picture():
     model, camera = ball_model(), camera_at((0, -3.0, 0), (0.5, 0, 0), focal=60.0)
     with torch.no_grad():
         rendering = render_view(model, camera)
-    assert 0 < len(rendering.indices) < len(model)  # the camera sees a part
+    assert 0 < len(rendering.indices) < len(model)  # the camera sees only a part
     assert 0 < rendering.visible.sum() <= len(rendering.indices)
     assert rendering.pairs >= rendering.visible.sum()
     assert {"cull", "decode", "background"} < set(rendering.seconds)
@@ -351,7 +361,7 @@ def test_torch_computes_on_one_thread_while_rendering_and_on_as_many_as_before_a
     try:
         torch.set_num_threads(2)
         with pytest.raises(RuntimeError, match="no") if fails else nullcontext():
-            picture(model, ring(8)[0])
+            render_rgb(model, ring(8)[0])
         assert seen == [1] and torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(before)
@@ -378,7 +388,7 @@ def test_gradients_reach_every_parameter(background):
 @pytest.mark.parametrize("stride", [1, 2, 3])
 @pytest.mark.parametrize("part", [*Gaussians.PARAMETER_NAMES, "geometry", "radiance"])
 def test_gradients_match_finite_differences_through_the_whole_chain(part, stride):
-    """In float64, fields attached to positions, along one random direction of each parameter group."""
+    """In float64, with fields attached to positions, along one random direction of each parameter group."""
     model = ball_model(12, background=True, position_gradients=True, scale_logits=-1.8).double()
     camera = camera_at((0.5, -2.5, 0.8), width=12, height=10, focal=10.0)
     settings = RenderSettings(background_threshold=0.0, background_stride=stride)

@@ -1,4 +1,4 @@
-"""The variants of `tools/studies/ablations.py` lack what they say they lack, and train all that they keep."""
+"""Each variant of `tools/studies/ablations.py` lacks what it claims to lack and trains everything else."""
 
 from __future__ import annotations
 
@@ -18,89 +18,89 @@ from hyrfpack.train import DensityConfig, LearningRates, TrainConfig, Trainer
 from tools.studies import ablation_models, ablations
 
 # Density control clones and splits from the second step on.
-DENSITY = DensityConfig(start=0.05, stop=0.7, rounds=5, gradient=1e-6)
-SHORT = TrainConfig(steps=24, seed=3, max_gaussians=160, density=DENSITY)
-VARIANTS = {variant.name: variant for variant in ablation_models.TRAINED_VARIANTS}
-EVERYTHING = {*Gaussians.PARAMETER_NAMES, "geometry", "radiance"}
-KEEPS = {
-    "full": EVERYTHING,
-    "single field": EVERYTHING - {"geometry"},  # the radiance field, doubled, is the one
+EARLY_DENSITY_CONFIG = DensityConfig(start=0.05, stop=0.7, rounds=5, gradient=1e-6)
+SHORT_CONFIG = TrainConfig(steps=24, seed=3, max_gaussians=160, density=EARLY_DENSITY_CONFIG)
+VARIANTS_BY_NAME = {variant.name: variant for variant in ablation_models.TRAINED_VARIANTS}
+ALL_GROUPS = {*Gaussians.PARAMETER_NAMES, "geometry", "radiance"}
+GROUPS_BY_VARIANT = {
+    "full": ALL_GROUPS,
+    "single field": ALL_GROUPS - {"geometry"},  # the only field is the radiance field, with doubled tables
     "no explicit properties": {"positions", "geometry", "radiance"},
     "no neural fields": set(Gaussians.PARAMETER_NAMES),
     "no neural Gaussians, sphere kept": {*Gaussians.PARAMETER_NAMES, "radiance"},
-    "no background sphere": EVERYTHING,
-    "no explicit colour": EVERYTHING - {"color_logits"},
-    "no explicit scale": EVERYTHING - {"scale_logits"},
-    "no explicit opacity": EVERYTHING - {"opacity_logits"},
-    "spherical harmonics for colour": EVERYTHING,
-    "no pre-culling, in training neither": EVERYTHING,
+    "no background sphere": ALL_GROUPS,
+    "no explicit colour": ALL_GROUPS - {"color_logits"},
+    "no explicit scale": ALL_GROUPS - {"scale_logits"},
+    "no explicit opacity": ALL_GROUPS - {"opacity_logits"},
+    "spherical harmonics for colour": ALL_GROUPS,
+    "no pre-culling, in training neither": ALL_GROUPS,
 }
 
 
-def a_scene():
+def make_scene():
     return ball_scene(6, 60, side=24)
 
 
-def untrained(name: str, config: TrainConfig = SHORT) -> Trainer:
-    return ablation_models.build_trainer(a_scene(), config, VARIANTS[name])
+def make_trainer(name: str, config: TrainConfig = SHORT_CONFIG) -> Trainer:
+    return ablation_models.build_trainer(make_scene(), config, VARIANTS_BY_NAME[name])
 
 
-def group(name: str) -> str:
-    """The parameter group of a parameter's full name."""
+def group_of(name: str) -> str:
+    """Return the parameter group of a parameter's full name."""
     head, _, rest = name.partition(".")
     return rest if head == "gaussians" else head
 
 
-def decoded(model, viewpoint=(3.0, 1.0, 0.5)) -> list[torch.Tensor]:
-    """Scales, rotations, opacities and colours of all Gaussians."""
+def decode(model, viewpoint=(3.0, 1.0, 0.5)) -> list[torch.Tensor]:
+    """Return scales, rotations, opacities and colours of all Gaussians."""
     geometry = model.decode_geometry()
     return [geometry.scales, geometry.quats, geometry.opacities, model.decode_colors(torch.tensor(viewpoint))]
 
 
-def changed(model, parameter: torch.Tensor) -> list[bool]:
-    """Which of `decoded` change when a parameter is moved."""
-    before = [values.detach().clone() for values in decoded(model)]
+def find_changed(model, parameter: torch.Tensor) -> list[bool]:
+    """Return which results of decoding change when a parameter changes."""
+    before = [values.detach().clone() for values in decode(model)]
     with torch.no_grad():
         parameter += torch.rand(parameter.shape, generator=torch.Generator().manual_seed(5)) + 0.5
-    return [not torch.equal(old, new) for old, new in zip(before, decoded(model), strict=True)]
+    return [not torch.equal(old, new) for old, new in zip(before, decode(model), strict=True)]
 
 
 # -- what is kept and what is not --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", VARIANTS)
-def test_a_run_moves_all_that_a_variant_keeps_and_nothing_else(name):
-    trainer = untrained(name)
+@pytest.mark.parametrize("name", VARIANTS_BY_NAME)
+def test_a_run_trains_exactly_the_groups_of_its_variant(name):
+    trainer = make_trainer(name)
     before = {key: p.detach().clone() for key, p in trainer.model.named_parameters()}
 
     assert trainer.run()
 
     assert len(trainer.model) > 60  # density control has added some
     after = dict(trainer.model.named_parameters())
-    # New rows are copies at first, so moved means: values that were not there before.
-    moved = {group(key) for key, p in after.items() if not torch.isin(p.detach(), before[key]).all()}
-    assert moved == KEEPS[name]
-    assert {group(key) for key, p in after.items() if p.requires_grad} == KEEPS[name]
+    # New rows begin as copies, so a value counts as moved if it did not exist before.
+    moved = {group_of(key) for key, p in after.items() if not torch.isin(p.detach(), before[key]).all()}
+    assert moved == GROUPS_BY_VARIANT[name]
+    assert {group_of(key) for key, p in after.items() if p.requires_grad} == GROUPS_BY_VARIANT[name]
     assert all(parameter.isfinite().all() for parameter in after.values())
 
 
-@pytest.mark.parametrize("name", [name for name in VARIANTS if VARIANTS[name].missing_logits])
-def test_logits_that_are_lacking_are_zero_to_the_end(name):
-    trainer = untrained(name)
+@pytest.mark.parametrize("name", [name for name in VARIANTS_BY_NAME if VARIANTS_BY_NAME[name].missing_logits])
+def test_missing_logits_stay_zero(name):
+    trainer = make_trainer(name)
     trainer.run()
 
-    for logits in VARIANTS[name].missing_logits:
+    for logits in VARIANTS_BY_NAME[name].missing_logits:
         values = getattr(trainer.model.gaussians, logits)
         assert len(values) == len(trainer.model) > 60
         assert not values.any()
 
 
-@pytest.mark.parametrize("name", [name for name in VARIANTS if VARIANTS[name].missing_logits])
-def test_without_logits_gaussians_start_at_the_mean_of_those_they_would_have_had(name):
-    full, model = untrained("full").model, untrained(name).model
+@pytest.mark.parametrize("name", [name for name in VARIANTS_BY_NAME if VARIANTS_BY_NAME[name].missing_logits])
+def test_without_logits_gaussians_start_at_the_mean_of_the_initial_logits(name):
+    full, model = make_trainer("full").model, make_trainer(name).model
 
-    scales, _, opacities, colors = decoded(model)
-    expected_scales, _, expected_opacities, expected_colors = decoded(full)
+    scales, _, opacities, colors = decode(model)
+    expected_scales, _, expected_opacities, expected_colors = decode(full)
     torch.testing.assert_close(opacities, expected_opacities, atol=1e-3, rtol=0)  # 0.1 for all of them
     fraction, expected = (
         values / model.scale_bounds(model.gaussians.positions) for values in (scales, expected_scales)
@@ -109,8 +109,8 @@ def test_without_logits_gaussians_start_at_the_mean_of_those_they_would_have_had
     torch.testing.assert_close(colors.logit().mean(0), expected_colors.logit().mean(0), atol=1e-3, rtol=0)
 
 
-def test_the_full_row_is_the_product():
-    product, ours = Trainer(a_scene(), SHORT), untrained("full")
+def test_the_full_variant_is_the_released_model():
+    product, ours = Trainer(make_scene(), SHORT_CONFIG), make_trainer("full")
     product.run()
     ours.run()
 
@@ -121,31 +121,31 @@ def test_the_full_row_is_the_product():
 
 
 def test_a_single_field_has_one_grid_that_everything_reads():
-    full, model = untrained("full").model, untrained("single field").model
+    full, model = make_trainer("full").model, make_trainer("single field").model
 
     grids = [part for part in model.modules() if isinstance(part, HashGrid)]
     assert len(grids) == 1
     rows = full.geometry.grid.config.rows + full.radiance.grid.config.rows
     assert rows < grids[0].config.rows < 1.5 * rows
-    assert all(changed(model, grids[0].table))
+    assert all(find_changed(model, grids[0].table))
 
 
 @pytest.mark.parametrize("name", ["no neural fields", "no neural Gaussians, sphere kept"])
-def test_no_field_has_a_say_in_isotropic_diffuse_gaussians(name):
-    model = untrained(name).model
+def test_fields_do_not_affect_isotropic_diffuse_gaussians(name):
+    model = make_trainer(name).model
 
     for field in (model.geometry, model.radiance):
         for parameter in field.parameters():
-            assert not any(changed(model, parameter))
+            assert not any(find_changed(model, parameter))
 
 
-def test_isotropic_diffuse_gaussians_are_those_of_a_model_with_silent_fields():
-    positions = np.random.default_rng(2).normal(size=(7, 3)) * 2  # some outside the box
+def test_isotropic_diffuse_gaussians_equal_a_model_with_zero_fields():
+    positions = np.random.default_rng(2).normal(size=(7, 3)) * 2  # some of them are outside the box
     silent = small_model(positions, fields=0.0, color_logits=[0.3, -1.0, 2.0], opacity_logits=-0.5)
     model = ablation_models.IsotropicDiffuse(silent.config, silent.gaussians)
     index = torch.tensor([1, 2, 5])
 
-    for value, expected in zip(decoded(model), decoded(silent), strict=True):
+    for value, expected in zip(decode(model), decode(silent), strict=True):
         torch.testing.assert_close(value, expected, atol=1e-7, rtol=1e-6)
     assert torch.equal(model.decode_geometry(index).scales, model.decode_geometry().scales[index])
     assert torch.equal(model.decode_colors(torch.zeros(3), index), model.decode_colors(torch.zeros(3))[index])
@@ -155,7 +155,7 @@ def test_isotropic_diffuse_gaussians_are_those_of_a_model_with_silent_fields():
 
 
 def test_harmonics_are_orthonormal_on_the_sphere():
-    z, weights = np.polynomial.legendre.leggauss(8)  # exact for polynomials of degree 15
+    z, weights = np.polynomial.legendre.leggauss(8)  # exact for polynomials up to degree 15
     phi = 2 * np.pi * np.arange(16) / 16
     radius = np.sqrt(1 - z**2)[:, None]
     sphere = np.stack((radius * np.cos(phi), radius * np.sin(phi), np.broadcast_to(z[:, None], (8, 16))), -1)
@@ -166,8 +166,8 @@ def test_harmonics_are_orthonormal_on_the_sphere():
     np.testing.assert_allclose(gram, np.eye(16), atol=1e-12)
 
 
-def test_harmonic_colours_start_as_the_points_colours_from_everywhere():
-    full, model = untrained("full").model, untrained("spherical harmonics for colour").model
+def test_harmonic_colours_start_as_the_point_colours_in_all_directions():
+    full, model = make_trainer("full").model, make_trainer("spherical harmonics for colour").model
 
     assert model.gaussians.color_logits.shape == (len(model), 48)
     for viewpoint in ring(3):
@@ -175,8 +175,8 @@ def test_harmonic_colours_start_as_the_points_colours_from_everywhere():
         torch.testing.assert_close(colors, torch.sigmoid(full.gaussians.color_logits), atol=1e-6, rtol=0)
 
 
-def test_harmonic_colours_are_the_sum_that_3dgs_takes():
-    model = untrained("spherical harmonics for colour").model
+def test_harmonic_colours_match_the_formula_of_3dgs():
+    model = make_trainer("spherical harmonics for colour").model
     generator = torch.Generator().manual_seed(1)
     coefficients = torch.randn(len(model), 16, 3, generator=generator) / 3  # h of each band and channel
     rates = torch.full((16, 1), 20.0)
@@ -188,23 +188,23 @@ def test_harmonic_colours_are_the_sum_that_3dgs_takes():
         torch.nn.functional.normalize(model.gaussians.positions.detach().double() - viewpoint, dim=-1)
     )
     expected = ((basis[..., None] * coefficients).sum(1) + 0.5).clamp_min(0)
-    assert (expected == 0).any()  # some are cut
+    assert (expected == 0).any()  # some colours are clipped
     torch.testing.assert_close(model.decode_colors(viewpoint).double(), expected, atol=1e-5, rtol=0)
     torch.testing.assert_close(model.decode_colors(viewpoint, index).double(), expected[index], atol=1e-5, rtol=0)
 
 
-def test_the_radiance_field_has_no_say_in_harmonic_colours():
-    model = untrained("spherical harmonics for colour").model
+def test_the_radiance_field_does_not_affect_harmonic_colours():
+    model = make_trainer("spherical harmonics for colour").model
 
-    assert not any(any(changed(model, parameter)) for parameter in model.radiance.parameters())
+    assert not any(any(find_changed(model, parameter)) for parameter in model.radiance.parameters())
 
 
 # -- running and reporting ---------------------------------------------------------------------------------------------
 
 
 def test_without_pre_culling_every_gaussian_is_decoded():
-    model = untrained("full").model
-    camera = dataclasses.replace(ring(1)[0], width=6, cx=3.0)  # a slit that sees few of them
+    model = make_trainer("full").model
+    camera = dataclasses.replace(ring(1)[0], width=6, cx=3.0)  # a narrow picture that shows few of them
 
     with ablations.patch_culling(ablation_models.NO_CULLING_VARIANT):
         everything = render_view(model, camera)
@@ -214,11 +214,11 @@ def test_without_pre_culling_every_gaussian_is_decoded():
 
 
 @pytest.mark.parametrize("steps", [1, 3], ids=["in the last step", "midway"])
-def test_a_run_that_diverges_is_a_result(steps, tmp_path):
-    config = dataclasses.replace(SHORT, steps=steps, learning_rates=LearningRates(fields=(1e38, 1e38)))
+def test_a_diverged_run_is_recorded_as_a_result(steps, tmp_path):
+    config = dataclasses.replace(SHORT_CONFIG, steps=steps, learning_rates=LearningRates(fields=(1e38, 1e38)))
 
     result = ablations.train_and_measure(
-        VARIANTS["no explicit scale"], a_scene(), config, tmp_path / "full.hyrf", PictureCache()
+        VARIANTS_BY_NAME["no explicit scale"], make_scene(), config, tmp_path / "full.hyrf", PictureCache()
     )
 
     assert list(result) == ["failed"]
@@ -226,7 +226,7 @@ def test_a_run_that_diverges_is_a_result(steps, tmp_path):
 
 
 def test_one_call_measures_the_variants_and_prints_their_tables(tmp_path, monkeypatch, capsys):
-    scene = a_scene()
+    scene = make_scene()
     scene = dataclasses.replace(scene, train=scene.train[:4], test=scene.train[4:])
     monkeypatch.setattr(ablations.hyrfpack, "load_scene", lambda folder: scene)
     monkeypatch.setattr(ablations, "TIMING_REPEATS", 1)
@@ -235,7 +235,7 @@ def test_one_call_measures_the_variants_and_prints_their_tables(tmp_path, monkey
 
     ablations.main()
     first = capsys.readouterr().out
-    monkeypatch.setattr(ablations, "train_and_measure", None)  # what is kept is not run again
+    monkeypatch.setattr(ablations, "train_and_measure", None)  # finished runs are not repeated
     monkeypatch.setattr(sys, "argv", [*sys.argv, "--reuse"])
     ablations.main()
 
@@ -245,22 +245,22 @@ def test_one_call_measures_the_variants_and_prints_their_tables(tmp_path, monkey
     assert "single field" not in first
 
 
-def result(psnr: float, **other) -> dict:
+def make_result(psnr: float, **other) -> dict:
     return {"psnr": psnr, "ssim": 0.5, "gaussians": 100, "bytes": 800, "frames_ratio": 0.5, **other}
 
 
-def test_tables_hold_differences_their_spread_and_runs_that_failed():
+def test_tables_show_differences_their_spread_and_failed_runs():
     failed = {"failed": "the loss is not finite"}
-    single, scale = VARIANTS["single field"], VARIANTS["no explicit scale"]
+    single, scale = VARIANTS_BY_NAME["single field"], VARIANTS_BY_NAME["no explicit scale"]
     results = {
-        ("full", "a"): [result(20.0), result(21.0)],
-        ("full", "b"): [result(30.0), result(30.0)],
-        (single.name, "a"): [result(19.0, bytes=1000), result(20.5, bytes=1000)],
-        (single.name, "b"): [result(30.2, bytes=1000), result(30.4, bytes=1000)],
-        (scale.name, "a"): [failed, result(18.5)],
+        ("full", "a"): [make_result(20.0), make_result(21.0)],
+        ("full", "b"): [make_result(30.0), make_result(30.0)],
+        (single.name, "a"): [make_result(19.0, bytes=1000), make_result(20.5, bytes=1000)],
+        (single.name, "b"): [make_result(30.2, bytes=1000), make_result(30.4, bytes=1000)],
+        (scale.name, "a"): [failed, make_result(18.5)],
         (scale.name, "b"): [failed, failed],
     }
-    variants = [VARIANTS["full"], single, scale]
+    variants = [VARIANTS_BY_NAME["full"], single, scale]
 
     text = ablations.format_report(results, ["a", "b"], variants)
 

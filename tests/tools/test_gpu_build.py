@@ -1,4 +1,4 @@
-"""Every GPU kernel builds for every GPU we name, as it is launched, and keeps all in registers; no GPU is needed."""
+"""Every GPU kernel compiles for every supported GPU as it is launched, without register spills; no GPU is needed."""
 
 from __future__ import annotations
 
@@ -13,25 +13,26 @@ import pytest
 from filelock import FileLock  # comes with torch
 from ops.device import needs_triton
 
-ROOT = Path(__file__).parents[2]
-LAID_OUT_FOR = ("3.6.", "3.7.")  # Tritons: 3.9 spills 6 to 104 bytes in three of the builds, for sm_80 and gfx942
-TARGETS = ["sm_80", "sm_90", "sm_100", "gfx942"]
+REPOSITORY_ROOT = Path(__file__).parents[2]
+# Versions of Triton for which the kernels are arranged; 3.9 spills 6 to 104 bytes in three builds (sm_80 and gfx942).
+TRITON_VERSIONS_WITHOUT_SPILLS = ("3.6.", "3.7.")
+GPU_TARGETS = ["sm_80", "sm_90", "sm_100", "gfx942"]
 
 pytestmark = [needs_triton, pytest.mark.slow]
 
 
 @pytest.fixture(scope="module")
 def report(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list]:
-    """What tools/gpu/build.py says; in a process of its own, for here kernels may be defined for the interpreter.
+    """The report of tools/gpu/build.py, run in another process, because here kernels may be interpreted.
 
-    The workers of one run share it, for each would wait a minute for its own.
+    The workers of one test run share it, because each build takes a minute.
     """
     told = tmp_path_factory.getbasetemp().parent / f"gpu_build-{os.environ.get('PYTEST_XDIST_TESTRUNUID', os.getpid())}"
     with FileLock(f"{told}.lock"):
         if not told.exists():
             environment = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}
             command = [sys.executable, "-m", "tools.gpu.build", "--json"]
-            done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+            done = subprocess.run(command, cwd=REPOSITORY_ROOT, env=environment, capture_output=True, text=True)
             assert done.returncode == 0, done.stderr
             told.write_text(done.stdout.splitlines()[-1])
     return json.loads(told.read_text())
@@ -45,24 +46,24 @@ def builds_for(report: dict[str, list], target: str) -> list[dict]:
     return [build for build in report["builds"] if build["target"] == target]
 
 
-@pytest.mark.parametrize("target", TARGETS)
+@pytest.mark.parametrize("target", GPU_TARGETS)
 def test_every_kernel_builds(report: dict[str, list], target: str) -> None:
     builds = builds_for(report, target)
     assert builds
     assert [f"{build['kernel']}: {build['error']}" for build in builds if build["error"]] == []
 
 
-@pytest.mark.parametrize("target", TARGETS)
+@pytest.mark.parametrize("target", GPU_TARGETS)
 def test_no_kernel_spills_registers(report: dict[str, list], target: str) -> None:
     spilling = [build for build in builds_for(report, target) if build["spills"]]
     told = [f"{build['kernel']}: {build['spills']} ({build['constants']})" for build in spilling]
-    if told and not version("triton").startswith(LAID_OUT_FOR):
+    if told and not version("triton").startswith(TRITON_VERSIONS_WITHOUT_SPILLS):
         pytest.xfail(
             f"Triton {version('triton')} takes more registers than those the kernels were laid out for: {told}"
         )
     assert told == []
 
 
-def test_no_kernel_is_left_out(report: dict[str, list]) -> None:
+def test_every_kernel_is_built(report: dict[str, list]) -> None:
     assert report["builds"]
     assert report["left_out"] == []

@@ -1,4 +1,4 @@
-"""tools/gpu/check.py: counts by hand, what is written, what happens when something breaks, and that it runs through."""
+"""tools/gpu/check.py: work counted by hand, its page, its behaviour on errors, and a complete run."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ from tools.gpu.scene import TIDY_LOOK, TRAINED_LOOK, Look, decode_splats, make_c
 from tools.gpu.setup import Setup, find_dataset
 from tools.gpu.worker import failure_row, find_missing_package, run_in_children
 
-CUDA = torch.cuda.is_available()
-GPU = "gpu" if has_triton() else "cpu"
-TINY = Setup(
-    device="cuda" if CUDA else "cpu",
-    implementation=GPU,
+HAS_CUDA = torch.cuda.is_available()
+KERNEL_IMPLEMENTATION = "gpu" if has_triton() else "cpu"
+TINY_SETUP = Setup(
+    device="cuda" if HAS_CUDA else "cpu",
+    implementation=KERNEL_IMPLEMENTATION,
     width=16,
     height=16,
     kernel_gaussians=24,
@@ -53,10 +53,10 @@ TINY = Setup(
     demo_size=16,
     quality_steps=4,
 )
-RATES = gpu_timing.Rates(copy=1e12, bf16=4e14, fp32=2e13)
+PEAK_RATES = gpu_timing.Rates(copy=1e12, bf16=4e14, fp32=2e13)
 
-# One child of gpu_worker for the tests: items that print a row, raise, die, hang, or leave the device unusable.
-CHILD = f"""
+# A child of gpu_worker for tests. Its items print a row, raise, die, hang, or leave the device unusable.
+CHILD_SCRIPT = f"""
 import sys
 sys.path.insert(0, {str(gpu_check.REPOSITORY_ROOT)!r})
 import os, time
@@ -85,17 +85,17 @@ sys.exit(gpu_worker.run_child(run, sys.argv[1:], lambda: usable))
 
 
 def run_children(*items: str, seconds: float = 20.0) -> dict[str, list[str]]:
-    """What rows say of each item: "fine", or the status and its reason."""
-    rows = run_in_children(lambda left: [sys.executable, "-c", CHILD, *left], items, seconds)
-    told: dict[str, list[str]] = {}
+    """Return by item what its rows say: "fine", or the status and its reason."""
+    rows = run_in_children(lambda left: [sys.executable, "-c", CHILD_SCRIPT, *left], items, seconds)
+    results: dict[str, list[str]] = {}
     for row in rows:
-        told.setdefault(row["item"], []).append(f"{row['status']}: {row['note']}" if "status" in row else "fine")
-    return told
+        results.setdefault(row["item"], []).append(f"{row['status']}: {row['note']}" if "status" in row else "fine")
+    return results
 
 
-def test_work_of_the_rasteriser_is_that_counted_by_hand() -> None:
+def test_work_of_the_rasteriser_matches_a_count_by_hand() -> None:
     assert gpu_roofline.count_project(10).bytes == 10 * 4 * (3 + 4 + 3 + 1 + 2 + 3 + 1 + 1)
-    # 3 Gaussians sorted by 4 bytes, 5 pairs by the 13 bits of 8,160 tiles: 4 and 2 passes of 8 bytes there and back.
+    # 3 Gaussians are sorted by 4 bytes, and 5 pairs by the 13 bits of 8,160 tiles: 4 and 2 passes of 8 bytes each way.
     sorting = 3 * 4 * 16 + 5 * 2 * 16
     assert gpu_roofline.count_bin_pairs(3, 5, 8160).bytes == 3 * 28 + 5 * 8 + sorting
     work = gpu_roofline.count_blend(pairs=6, pixels=512, reached=0.5, blended=2.0)
@@ -106,8 +106,8 @@ def test_work_of_the_rasteriser_is_that_counted_by_hand() -> None:
     assert work.flops == 3 * 256 * 12 + 2 * 512 * 40
 
 
-def test_work_of_the_fields_is_that_counted_by_hand() -> None:
-    # 100 points, 16 levels of 2 features; 12,800 corners, so that all of 5,000 rows may be needed.
+def test_work_of_the_fields_matches_a_count_by_hand() -> None:
+    # 100 points, 16 levels of 2 features; 12,800 corners may need all of the 5,000 rows.
     assert gpu_roofline.count_hash_encode(100, 16, 5000).bytes == 100 * 3 * 4 + 100 * 32 * 4 + 5000 * 8
     assert gpu_roofline.count_hash_encode(100, 16, 50_000).bytes == 100 * 3 * 4 + 100 * 32 * 4 + 12_800 * 8
     assert gpu_roofline.count_hash_encode_backward(100, 16, 50_000).bytes == 100 * 3 * 4 + 100 * 32 * 4 + 50_000 * 8
@@ -120,11 +120,11 @@ def test_work_of_the_fields_is_that_counted_by_hand() -> None:
     work = gpu_roofline.count_shade(100, (24, 64, 64, 3), mixed=True)
     assert work.bytes == 100 * ((3 + 3 + 3) * 4 + 64 * 2)
     assert work.flops == 100 * (2 * (24 * 64 + 64 * 64 + 64 * 3) + 60)
-    # Of 500 Gaussians 100 are drawn, whose positions are read once.
+    # Of 500 Gaussians 100 are drawn; positions are read once.
     fused = gpu_roofline.count_project_shaded(500, 100, (24, 64, 64, 3), mixed=True)
     assert fused.bytes == 500 * 72 + 100 * ((3 + 3) * 4 + 64 * 2)
     assert (fused.flops, fused.unit) == (work.flops, "bf16")
-    # 100 of 180 nodes are needed; their 12,800 corners may be all of 5,000 rows.
+    # 100 of 180 nodes are needed; their 12,800 corners may need all of the 5,000 rows.
     work = gpu_roofline.count_background(700, 180, 100, (56, 64, 64, 3), 16, 5000, mixed=False)
     assert work.bytes == 700 * 4 + 180 * 3 * 4 + 5000 * 8 and work.unit == "fp32"
     assert work.flops == 100 * (16 * (49 + 32) + 2 * (56 * 64 + 64 * 64 + 64 * 3) + 130)
@@ -132,18 +132,18 @@ def test_work_of_the_fields_is_that_counted_by_hand() -> None:
     assert work.flops == 2 * 100 * (2 * weights + 32 * 64 + 64 * 64) and work.unit == "fp32"
 
 
-def test_work_of_loss_and_optimiser_is_that_counted_by_hand() -> None:
+def test_work_of_loss_and_optimiser_matches_a_count_by_hand() -> None:
     assert gpu_roofline.count_photometric_loss(10).bytes == 10 * 3 * 3 * 4
     assert gpu_roofline.count_photometric_loss(10).flops == 10 * 3 * (8 * 2 * 11 * 2 + 40)
     assert gpu_roofline.count_adam(10).bytes == 10 * (4 + 3) * 4
 
 
-def test_roofline_is_the_slower_of_memory_and_arithmetic() -> None:
+def test_the_roofline_is_the_slower_of_memory_and_arithmetic() -> None:
     memory, arithmetic = gpu_roofline.Work(2e9, 2e10), gpu_roofline.Work(2e9, 8e11, "bf16")
-    assert memory.min_ms(RATES) == pytest.approx(2.0)
-    assert arithmetic.min_ms(RATES) == pytest.approx(2.0)
-    assert memory.shares(4.0, RATES) == pytest.approx((0.5, 0.25))
-    assert gpu_roofline.Work(1e9, 8e12, "bf16").min_ms(RATES) == pytest.approx(20.0)
+    assert memory.min_ms(PEAK_RATES) == pytest.approx(2.0)
+    assert arithmetic.min_ms(PEAK_RATES) == pytest.approx(2.0)
+    assert memory.shares(4.0, PEAK_RATES) == pytest.approx((0.5, 0.25))
+    assert gpu_roofline.Work(1e9, 8e12, "bf16").min_ms(PEAK_RATES) == pytest.approx(20.0)
 
 
 def test_kernels_of_the_profiler_are_added_up_and_grouped_by_stage() -> None:
@@ -157,7 +157,7 @@ def test_kernels_of_the_profiler_are_added_up_and_grouped_by_stage() -> None:
         Event("blend_kernel", 6000, 2),
         Event("aten::sort", 5000, 2, "DeviceType.CPU"),
         Event("cudaStreamSynchronize", 0, 6, "DeviceType.CPU"),
-        Event("cudaDeviceSynchronize", 0, 1, "DeviceType.CPU"),  # of the profile itself
+        Event("cudaDeviceSynchronize", 0, 1, "DeviceType.CPU"),  # an event of the profiler itself
         Event("DeviceRadixSortKernel", 1000, 8),
         Event("memset", 500, 2),
     ]
@@ -168,10 +168,10 @@ def test_kernels_of_the_profiler_are_added_up_and_grouped_by_stage() -> None:
     assert stages == {"project": 1.0, "blend": 3.0, "bin": 0.75}
 
 
-def test_count_of_blended_gaussians_matches_a_walk_from_pixel_to_pixel() -> None:
+def test_the_count_of_blended_gaussians_matches_a_count_pixel_by_pixel() -> None:
     whole = decode_splats(make_model(2000, torch.device("cpu")), make_cameras(4, 128, 128)[1])
     splats = gpu_kernels.crop_splats(whole, 16)
-    splats.inputs["opacities"].fill_(0.97)  # so that all pixels are finished before the last
+    splats.inputs["opacities"].fill_(0.97)  # so that all pixels are finished before the last Gaussian
     values = [splats.inputs[name] for name in ("means", "quats", "scales", "opacities")]
     seen = project(*values, *splats.view, 0.01, False)
     order = torch.argsort(seen.depths).tolist()
@@ -192,7 +192,7 @@ def test_count_of_blended_gaussians_matches_a_walk_from_pixel_to_pixel() -> None
                 added += 1
                 light *= 1 - min(0.99, row[i])
     blended, reached = gpu_kernels.count_blended(splats)
-    assert len(needed) < len(touching)  # or the count of what is reached would say nothing
+    assert len(needed) < len(touching)  # otherwise the count would prove nothing
     assert (blended, reached) == pytest.approx((added / 256, len(needed) / len(touching)), rel=1e-3)
 
 
@@ -212,28 +212,28 @@ def test_numbers_that_are_not_finite_fail_a_row() -> None:
     assert check_call(call, "gpu")["status"] == "failed"
 
 
-def test_an_item_that_raises_dies_or_breaks_the_device_leaves_the_others() -> None:
-    told = run_children("one", "raises", "breaks", "dies", "lacks", "two")
-    assert told["one"] == told["two"] == ["fine"]
-    assert told["raises"] == ["fine", "failed: ValueError: one line"]
-    assert told["breaks"] == ["fine", "failed: RuntimeError: illegal access"]
-    assert told["dies"] == ["fine", "failed: its process ended: last words"]
-    assert told["lacks"][1] == "left out: it needs no_such_package, which is not installed here"
+def test_an_item_that_raises_dies_or_breaks_the_device_does_not_stop_the_others() -> None:
+    results = run_children("one", "raises", "breaks", "dies", "lacks", "two")
+    assert results["one"] == results["two"] == ["fine"]
+    assert results["raises"] == ["fine", "failed: ValueError: one line"]
+    assert results["breaks"] == ["fine", "failed: RuntimeError: illegal access"]
+    assert results["dies"] == ["fine", "failed: its process ended: last words"]
+    assert results["lacks"][1] == "left out: it needs no_such_package, which is not installed here"
 
 
 def test_an_item_that_hangs_is_killed_at_the_time_limit_and_the_rest_is_named() -> None:
-    told = run_children("one", "hangs", "two", seconds=1.5)
-    assert told["one"] == ["fine"]
-    assert told["hangs"][-1] == told["two"][-1] == "failed: not done within the part's 2 s"
+    results = run_children("one", "hangs", "two", seconds=1.5)
+    assert results["one"] == ["fine"]
+    assert results["hangs"][-1] == results["two"][-1] == "failed: not done within the part's 2 s"
 
 
-def test_what_hung_is_reported_by_what_it_printed_last() -> None:
-    told = run_children("hangs in a test", "two", seconds=1.5)
-    assert told["hangs in a test"][-1] == "failed: not done within the part's 2 s; last output: test_loop"
-    assert told["two"] == ["failed: not done within the part's 2 s"]
+def test_a_hanging_item_is_reported_with_its_last_output() -> None:
+    results = run_children("hangs in a test", "two", seconds=1.5)
+    assert results["hangs in a test"][-1] == "failed: not done within the part's 2 s; last output: test_loop"
+    assert results["two"] == ["failed: not done within the part's 2 s"]
 
 
-def test_packages_of_others_are_told_from_our_modules_by_the_error_and_not_by_its_words() -> None:
+def test_missing_packages_are_distinguished_from_internal_modules() -> None:
     lacks = ModuleNotFoundError("in /tmp/hyrfpack-gpu-1/", name="trimesh.path")
     assert find_missing_package(lacks) == "trimesh"
     assert find_missing_package(ModuleNotFoundError(name="PIL.Image")) == "pillow"
@@ -247,38 +247,38 @@ def test_packages_of_others_are_told_from_our_modules_by_the_error_and_not_by_it
 
 
 @pytest.mark.parametrize(("module", "package"), [("PIL", "pillow"), ("rich", "rich"), ("scipy", "scipy")])
-def test_training_is_left_out_where_a_package_is_missing_and_the_sentence_says_which(module: str, package: str) -> None:
+def test_training_is_omitted_with_the_name_of_a_missing_package(module: str, package: str) -> None:
     code = f"""
 import sys
 sys.modules[{module!r}] = None
 from tools.gpu import quality
 from tools.gpu.setup import Setup
 from tools.gpu.worker import run_child
-run_child(lambda item: quality.run(item, Setup.from_json({TINY.to_json()!r})), ["demo"], lambda: True)
+run_child(lambda item: quality.run(item, Setup.from_json({TINY_SETUP.to_json()!r})), ["demo"], lambda: True)
 """
     (row,) = run_in_children(lambda left: [sys.executable, "-c", code], ["demo"], 60.0)
     assert row == {"item": "demo", "status": "left out", "note": f"it needs {package}, which is not installed here"}
 
 
-def test_the_comparison_with_the_cpu_is_left_out_without_numba(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_comparison_with_the_cpu_is_omitted_without_numba(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gpu_quality, "has_numba", lambda: False)
-    (row,) = gpu_quality.run("demo", TINY)
+    (row,) = gpu_quality.run("demo", TINY_SETUP)
     assert row["status"] == "left out" and "needs Numba" in row["note"]
 
 
-def test_frames_are_drawn_where_training_lacks_a_package(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_are_drawn_when_training_lacks_a_package(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "tools.gpu.training", None)
-    with pytest.raises(ModuleNotFoundError):  # a module of ours is no package that is missing
-        list(gpu_frames.run("200", TINY))
+    with pytest.raises(ModuleNotFoundError):  # a module of the package itself is not a missing package
+        list(gpu_frames.run("200", TINY_SETUP))
     monkeypatch.setattr(gpu_frames, "failure_row", lambda error: {"status": "left out", "note": "it needs rich"})
-    rows = list(gpu_frames.run("200", TINY))
+    rows = list(gpu_frames.run("200", TINY_SETUP))
     assert [row["table"] for row in rows if row.get("note") == "it needs rich"] == ["Training"]
     assert "Frames, 16 x 16" in {row["table"] for row in rows}
 
 
-def test_a_part_that_lacks_a_package_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_part_that_lacks_a_package_is_omitted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(gpu_check.CHECK_PARTS, "poor", ("no_such_package.part", 5.0))
-    rows = gpu_check.check(["poor"], TINY)
+    rows = gpu_check.check(["poor"], TINY_SETUP)
     assert rows[0]["status"] == "left out" and "no_such_package" in rows[0]["note"]
 
 
@@ -290,11 +290,11 @@ def test_a_child_that_cannot_start_fails_each_item_once() -> None:
 
 def test_a_part_whose_module_is_broken_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(gpu_check.CHECK_PARTS, "broken", ("tools.gpu.no_such_module", 5.0))
-    rows = gpu_check.check(["broken"], TINY)
+    rows = gpu_check.check(["broken"], TINY_SETUP)
     assert rows[0]["status"] == "failed" and "tools.gpu.no_such_module" in rows[0]["note"]
 
 
-def test_page_has_goals_failures_and_a_table_for_each_kind(tmp_path: Path) -> None:
+def test_the_page_has_goals_failures_and_a_table_for_each_kind(tmp_path: Path) -> None:
     rows = [
         {"part": "kernels", "item": "a", "table": "Kernels", "kernel": "a|b", "ms": 0.5, "pairs": 1_234_567},
         {"part": "kernels", "item": "b", "status": "failed", "note": "RuntimeError: no"},
@@ -313,11 +313,11 @@ def test_page_has_goals_failures_and_a_table_for_each_kind(tmp_path: Path) -> No
     assert json.loads(page.with_suffix(".json").read_text())["rows"] == rows
 
 
-def test_settings_survive_the_way_to_a_child() -> None:
-    assert Setup.from_json(TINY.to_json()) == TINY
+def test_settings_are_passed_to_a_child_unchanged() -> None:
+    assert Setup.from_json(TINY_SETUP.to_json()) == TINY_SETUP
 
 
-def test_set_is_the_one_asked_for_or_one_of_the_data_folder(tmp_path: Path) -> None:
+def test_the_set_is_the_requested_one_or_from_the_data_folder(tmp_path: Path) -> None:
     for name in ("b", "a"):
         (tmp_path / name / "sparse").mkdir(parents=True)
     assert find_dataset(tmp_path / "b", None, tmp_path) == tmp_path / "b"
@@ -325,14 +325,14 @@ def test_set_is_the_one_asked_for_or_one_of_the_data_folder(tmp_path: Path) -> N
     assert find_dataset(None, None, tmp_path / "nowhere") is None
 
 
-@pytest.mark.skipif(CUDA, reason="there is a GPU")
+@pytest.mark.skipif(HAS_CUDA, reason="there is a GPU")
 def test_without_a_gpu_it_ends_with_a_clear_error_and_code_2(capsys: pytest.CaptureFixture) -> None:
     assert gpu_check.main([]) == 2
     assert capsys.readouterr().err == f"tools.gpu.check: {gpu_check.NO_GPU}\n"
 
 
 def test_it_starts_from_the_repository_root_without_an_installed_hyrfpack() -> None:
-    # -S leaves out the environment's packages, and with them an installed hyrfpack; torch is found where it is.
+    # -S excludes the environment's packages, and with them an installed hyrfpack; torch is found where it is.
     environment = {**os.environ, "PYTHONPATH": str(Path(torch.__file__).parents[1])}
     command = [sys.executable, "-S", "-m", "tools.gpu.check", "--help"]
     done = subprocess.run(command, cwd=gpu_check.REPOSITORY_ROOT, env=environment, capture_output=True, text=True)
@@ -343,7 +343,9 @@ def test_the_command_writes_its_page_and_fails_where_a_check_does(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(gpu_check, "Setup", lambda data: replace(TINY, device="cpu", data=str(tmp_path / "no set")))
+    monkeypatch.setattr(
+        gpu_check, "Setup", lambda data: replace(TINY_SETUP, device="cpu", data=str(tmp_path / "no set"))
+    )
     assert gpu_check.main(["--parts", "quality", "--out", str(tmp_path)]) == 1
     (page,) = tmp_path.glob("*.md")
     assert all(f"| {run} | " in page.read_text() for run in ("CPU", "GPU, float32", "GPU, mixed"))
@@ -351,14 +353,14 @@ def test_the_command_writes_its_page_and_fails_where_a_check_does(
     assert capsys.readouterr().out.endswith("1 failed\n")
 
 
-@pytest.mark.parametrize("item", gpu_kernels.items(TINY))
+@pytest.mark.parametrize("item", gpu_kernels.items(TINY_SETUP))
 def test_kernels_part_runs_through(item: str) -> None:
-    rows = list(gpu_kernels.run(item, TINY))
+    rows = list(gpu_kernels.run(item, TINY_SETUP))
     assert rows and not [row for row in rows if "status" in row]
 
 
 def test_matrix_case_runs_through() -> None:
-    (row,) = gpu_tests.run("rasterize, one large Gaussian", TINY)
+    (row,) = gpu_tests.run("rasterize, one large Gaussian", TINY_SETUP)
     assert "status" not in row, row
 
 
@@ -392,14 +394,14 @@ def test_pytest_without_a_result_is_a_failure(content: str, words: str, tmp_path
     assert row["status"] == "failed" and re.search(words, row["note"]), row
 
 
-def test_tests_are_left_out_where_there_is_no_pytest(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gpu_tests_are_omitted_without_pytest(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pytest", None)
     with pytest.raises(ModuleNotFoundError) as caught:
-        list(gpu_tests.run("pytest", TINY))
+        list(gpu_tests.run("pytest", TINY_SETUP))
     assert failure_row(caught.value)["status"] == "left out"
 
 
-def test_every_test_of_kernels_and_of_the_whole_path_is_chosen() -> None:
+def test_every_kernel_test_and_end_to_end_test_is_selected() -> None:
     command = [
         sys.executable,
         "-m",
@@ -421,7 +423,7 @@ def test_every_test_of_kernels_and_of_the_whole_path_is_chosen() -> None:
     assert len(kernels) > 5 and kernels <= {re.search(r"test_(\w+)\.py", name)[1] for name in chosen}
 
 
-def test_a_room_as_trained_has_three_to_five_times_the_pairs() -> None:
+def test_a_model_like_a_trained_room_has_three_to_five_times_the_pairs() -> None:
     @torch.no_grad()
     def pairs(look: Look) -> int:
         splats = decode_splats(make_model(60_000, torch.device("cpu"), look), make_cameras(4, 480, 270)[1])
@@ -430,9 +432,9 @@ def test_a_room_as_trained_has_three_to_five_times_the_pairs() -> None:
     assert 3 <= pairs(TRAINED_LOOK) / pairs(TIDY_LOOK) <= 5
 
 
-@pytest.mark.parametrize("item", gpu_frames.items(TINY))
+@pytest.mark.parametrize("item", gpu_frames.items(TINY_SETUP))
 def test_frames_part_runs_through(item: str) -> None:
-    rows = list(gpu_frames.run(item, TINY))
+    rows = list(gpu_frames.run(item, TINY_SETUP))
     assert all(row["Gaussians"] == item for row in rows if row["table"] in ("The room", "Frames, 16 x 16", "Training"))
     tables = {row["table"] for row in rows}
     assert {"The room", "Frames, 16 x 16", "Rasterising against gsplat", "Training"} <= tables

@@ -1,4 +1,4 @@
-"""The queue of long training runs: what is finished is kept, what another call trains is left alone."""
+"""The queue of long training runs keeps finished runs and skips those that another call trains."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from tools.studies import long_runs
 
 
 @pytest.fixture
-def call(monkeypatch, tmp_path, capsys):
-    """Run the tool on a made-up scene and return what it prints."""
+def run_tool(monkeypatch, tmp_path, capsys):
+    """A function that runs the tool on a synthetic scene and returns what it prints."""
     scene = ball_scene(views=10, points=60, side=24)
     scene = replace(scene, train=scene.train[2:], test=scene.train[:2])
     monkeypatch.setattr(long_runs, "load_variant", lambda data, name: scene)
@@ -29,8 +29,8 @@ def call(monkeypatch, tmp_path, capsys):
     return run
 
 
-def test_the_queue_trains_short_runs_first_and_each_run_once(call, tmp_path):
-    first = call()
+def test_the_queue_trains_short_runs_first_and_each_run_once(run_tool, tmp_path):
+    first = run_tool()
     trained = [line.rsplit("/", 3)[1] for line in first.splitlines() if " to " in line]
     assert trained == ["10", "20"]
 
@@ -38,19 +38,19 @@ def test_the_queue_trains_short_runs_first_and_each_run_once(call, tmp_path):
     row = json.loads(path.read_text())
     assert row["compact"]["bytes"] == (path.parent / "compact.hyrf").stat().st_size
     assert row["compact"]["psnr"] == pytest.approx(row["psnr"], abs=1)
-    again = call()
+    again = run_tool()
     assert " to " not in again and again == first[first.index("| set") :]
 
 
-def test_a_run_that_another_call_trains_is_left_out(call, tmp_path):
+def test_a_run_that_another_call_trains_is_skipped(run_tool, tmp_path):
     with exclusive_folder(tmp_path / "10/seed0/ball.queue"):
-        printed = call()
+        printed = run_tool()
     assert not (tmp_path / "10/seed0/ball").exists()
     assert (tmp_path / "20/seed0/ball/measured.json").exists()
     assert "another" in printed
 
 
-def test_a_stopped_run_resumes_from_its_checkpoint(call, monkeypatch):
+def test_a_stopped_run_resumes_from_its_checkpoint(run_tool, monkeypatch):
     train, resumed = long_runs.hyrfpack.train_model, []
 
     def stop_once(scene, folder, config, *, resume, **options):
@@ -64,6 +64,6 @@ def test_a_stopped_run_resumes_from_its_checkpoint(call, monkeypatch):
 
     monkeypatch.setattr(long_runs.hyrfpack, "train_model", stop_once)
     with pytest.raises(SystemExit, match="resumes"):
-        call()
-    call()
+        run_tool()
+    run_tool()
     assert resumed == [False, True, False]

@@ -21,7 +21,7 @@ def is_lighter(before, after) -> list[bool]:
     ]
 
 
-def test_few_photos_are_spread_over_all_and_the_held_out_ones_stay():
+def test_few_photos_are_spread_over_all_and_the_held_out_photos_stay():
     scene = split_scene()
     few = keep_few_photos(scene, 7)
     assert len(few.train) == 7 and few.test == scene.test
@@ -48,7 +48,7 @@ def test_interleaved_groups_are_half_of_all_and_both_hold_photos_out():
 
 
 def test_middle_grey_becomes_two_stops_lighter():
-    """By a display gamma of 2.2 a stop multiplies light by 2; the tone curve does so in its slope at middle grey."""
+    """With a display gamma of 2.2 a stop doubles the light; the tone curve has that slope at middle grey."""
     scene = split_scene()
     relit = split_exposures(scene, interleaved=False)
     old, new = scene.train[-1].load().rgb / 255, relit.train[-1].load().rgb / 255

@@ -1,4 +1,4 @@
-"""Settings that make no sense are refused where they are made, in one sentence that names them."""
+"""Invalid settings are rejected when the configuration is created, with an error that names them."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from scenes import ball_scene
 from hyrfpack.train import DensityConfig, DensityControl, LearningRates, TrainConfig, Trainer
 from hyrfpack.train.config import LARGEST_SEED
 
-NO_INT = (2.5, math.nan, math.inf, True, "3", (3,), np.int64(3))
-NO_FLOAT = (math.nan, math.inf, -math.inf, True, "0.1", None, np.float32(0.1))
-WRONG = {
-    "steps": (0, -1, None, *NO_INT),
-    "seed": (-1, LARGEST_SEED + 1, None, *NO_INT),
-    "max_gaussians": (0, -1, *NO_INT),
-    "budget_factor": (0.0, -1.0, 1e4, *(value for value in NO_FLOAT if value is not None)),
-    "target_bytes": (0, -1, *NO_INT),
-    "checkpoint_every": (0, -1, *NO_INT),
-    "log2_table_size": (3, 25, 40, -1, *NO_INT),
+NON_INTEGERS = (2.5, math.nan, math.inf, True, "3", (3,), np.int64(3))
+NON_FLOATS = (math.nan, math.inf, -math.inf, True, "0.1", None, np.float32(0.1))
+INVALID_SETTINGS = {
+    "steps": (0, -1, None, *NON_INTEGERS),
+    "seed": (-1, LARGEST_SEED + 1, None, *NON_INTEGERS),
+    "max_gaussians": (0, -1, *NON_INTEGERS),
+    "budget_factor": (0.0, -1.0, 1e4, *(value for value in NON_FLOATS if value is not None)),
+    "target_bytes": (0, -1, *NON_INTEGERS),
+    "checkpoint_every": (0, -1, *NON_INTEGERS),
+    "log2_table_size": (3, 25, 40, -1, *NON_INTEGERS),
     "preset": ("indoor", None, 1),
     "precision": ("float16", None),
     "background": (1, "no", math.nan),
     "exposure": (1, "no", math.nan),
     "background_color": ("grey", None),
     "antialiased": (None, 1, "yes"),
-    "ssim_weight": (1.1, -0.1, *NO_FLOAT),
+    "ssim_weight": (1.1, -0.1, *NON_FLOATS),
     "scale_rule": ("max", None),
     "scale_grows": (None, 0),
     "direction_encoding": ("none", None),
@@ -39,19 +39,30 @@ WRONG = {
     "learning_rates": (None, {}, 1e-3),
     "density": (None, {}, DensityConfig),
 }
-WRONG_DENSITY = {
-    **dict.fromkeys(("start", "stop", "peak", "prune_opacity"), (-0.1, 1.1, *NO_FLOAT)),
-    **dict.fromkeys(("gradient", "split_scale", "prune_scale"), (-1e-9, *NO_FLOAT)),
-    "excess": (0.99, -2.0, *NO_FLOAT),
-    "rounds": (0, -1, None, *NO_INT),
-    "resets": (-1, None, *NO_INT),
-    "reset_opacity": (0, 1, *NO_FLOAT),
+INVALID_DENSITY_SETTINGS = {
+    **dict.fromkeys(("start", "stop", "peak", "prune_opacity"), (-0.1, 1.1, *NON_FLOATS)),
+    **dict.fromkeys(("gradient", "split_scale", "prune_scale"), (-1e-9, *NON_FLOATS)),
+    "excess": (0.99, -2.0, *NON_FLOATS),
+    "rounds": (0, -1, None, *NON_INTEGERS),
+    "resets": (-1, None, *NON_INTEGERS),
+    "reset_opacity": (0, 1, *NON_FLOATS),
 }
-WRONG_RATES = ((0.0, 1e-3), (1e-3, 0.0), (-1e-3, 1e-3), (1e-3,), (1e-3, 1e-3, 1e-3), 1e-3, None, (1e-3, math.nan))
+INVALID_LEARNING_RATES = (
+    (0.0, 1e-3),
+    (1e-3, 0.0),
+    (-1e-3, 1e-3),
+    (1e-3,),
+    (1e-3, 1e-3, 1e-3),
+    1e-3,
+    None,
+    (1e-3, math.nan),
+)
 
 
 @pytest.mark.parametrize(
-    ("kind", "wrong"), [(TrainConfig, WRONG), (DensityConfig, WRONG_DENSITY)], ids=["TrainConfig", "DensityConfig"]
+    ("kind", "wrong"),
+    [(TrainConfig, INVALID_SETTINGS), (DensityConfig, INVALID_DENSITY_SETTINGS)],
+    ids=["TrainConfig", "DensityConfig"],
 )
 def test_each_setting_out_of_range_or_of_another_type_is_a_clear_error_that_names_it(kind, wrong):
     assert set(wrong) == {field.name for field in dataclasses.fields(kind)}
@@ -62,13 +73,13 @@ def test_each_setting_out_of_range_or_of_another_type_is_a_clear_error_that_name
 
 
 @pytest.mark.parametrize("group", [field.name for field in dataclasses.fields(LearningRates)])
-@pytest.mark.parametrize("rates", WRONG_RATES, ids=str)
+@pytest.mark.parametrize("rates", INVALID_LEARNING_RATES, ids=str)
 def test_learning_rates_are_two_positive_numbers(group, rates):
     with pytest.raises(ValueError, match=f"{group} is "):
         LearningRates(**{group: rates})
 
 
-def test_what_lies_at_the_ends_of_the_ranges_is_taken():
+def test_the_limits_of_each_range_are_valid():
     for taken in ({"seed": LARGEST_SEED}, {"log2_table_size": 4}, {"log2_table_size": 24}, {"ssim_weight": 1}):
         json.dumps(TrainConfig(**taken).to_dict(), allow_nan=False)
     DensityConfig(start=1, stop=0, gradient=0, split_scale=0, prune_opacity=0, resets=0, rounds=1)
@@ -86,7 +97,7 @@ def test_training_with_any_seed_of_64_bits_splits_gaussians_and_ends(seed):
 
 
 @pytest.mark.parametrize("config", [DensityConfig(), DensityConfig(start=0.1, stop=0.9, peak=0.9, excess=1.0)])
-def test_the_mean_count_is_that_of_the_rounds_targets(config):
+def test_the_mean_count_agrees_with_the_targets_of_the_rounds(config):
     control = DensityControl(dataclasses.replace(config, rounds=10_000), 10_000, 500, 100, 0)
     steps = range(1, 10_001)
     counts = [100 if step < control.first else control.target(min(step, control.last)) for step in steps]
@@ -101,6 +112,6 @@ def test_the_mean_count_is_that_of_the_rounds_targets(config):
         ({"target_bytes": 20_000, "budget_factor": 0.5}, "a target size and a factor"),
     ],
 )
-def test_two_sizes_of_a_model_are_one_too_many(sizes, named):
+def test_two_settings_of_the_model_size_are_rejected(sizes, named):
     with pytest.raises(ValueError, match=f"{named} each decide .* give one"):
         TrainConfig(**sizes)

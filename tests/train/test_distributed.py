@@ -1,4 +1,4 @@
-"""Processes that train one model together, against one that does the same alone; how they stop, go on and refuse."""
+"""Training by two processes agrees with one process that averages their views; stopping, resuming and errors."""
 
 from __future__ import annotations
 
@@ -27,30 +27,31 @@ from hyrfpack.train.distributed import StepStats, average_gradients, check_setti
 from hyrfpack.train.optimizer import Optimizer
 from hyrfpack.train.trainer import shuffled
 
-SIZE = 2
+WORLD_SIZE = 2
 
 
-class Row(NamedTuple):
-    """What a step comes to."""
+class StepResult(NamedTuple):
+    """The results of one step."""
 
     loss: float
     error: float
     gaussians: int
 
 
-def one_for_all(scene: Scene, config: TrainConfig) -> tuple[list[Row], Trainer]:
-    """What processes should come to: one that renders the views of all in turn and takes the mean of their gradients.
+def train_on_one_process(scene: Scene, config: TrainConfig) -> tuple[list[StepResult], Trainer]:
+    """Train as two processes should: render the views of both in turn and average their gradients.
 
-    Also returns the trainer, whose model and exposures it has trained.
+    Returns:
+        The results of each step, and the trainer with the trained model and exposures.
     """
     trainer = Trainer(scene, config)
     model, exposures = trainer.model, trainer.exposures
-    optimizer = Optimizer(model, config.learning_rates, SIZE)
-    steps = math.ceil(config.steps / SIZE)
+    optimizer = Optimizer(model, config.learning_rates, WORLD_SIZE)
+    steps = math.ceil(config.steps / WORLD_SIZE)
     density = DensityControl(config.density, steps, trainer.budget, len(model), config.seed)
-    views, rows = list(shuffled(scene.train, config.seed, range(steps * SIZE))), []
+    views, rows = list(shuffled(scene.train, config.seed, range(steps * WORLD_SIZE))), []
     for step in range(1, steps + 1):
-        own, losses, errors = views[(step - 1) * SIZE : step * SIZE], [], []
+        own, losses, errors = views[(step - 1) * WORLD_SIZE : step * WORLD_SIZE], [], []
         learnt = [*model.parameters(), *([exposures.values] if exposures else [])]
         sums = [torch.zeros_like(parameter) for parameter in learnt]
         for view in own:
@@ -67,23 +68,25 @@ def one_for_all(scene: Scene, config: TrainConfig) -> tuple[list[Row], Trainer]:
             losses.append(loss.item())
             errors.append((image.detach() - photo).square().mean().item())
         for total, parameter in zip(sums, learnt, strict=True):
-            parameter.grad = total / SIZE
+            parameter.grad = total / WORLD_SIZE
         optimizer.step(step - 1, steps)
         if exposures:
-            exposures.step(config.learning_rates.at("exposure", SIZE * (step - 1), SIZE * steps), own)
+            exposures.step(config.learning_rates.at("exposure", WORLD_SIZE * (step - 1), WORLD_SIZE * steps), own)
         density.act(step, model, optimizer)
-        rows.append(Row(float(np.mean(losses)), float(np.mean(errors)), len(model)))
+        rows.append(StepResult(float(np.mean(losses)), float(np.mean(errors)), len(model)))
     return rows, trainer
 
 
-# -- what is told ----------------------------------------------------------------------------------------------------
+# -- statistics of a step --------------------------------------------------------------------------------------------
 
-NUMBERS = st.floats(0, 10, width=32)
+ERROR_VALUES = st.floats(0, 10, width=32)
 
 
-@given(st.lists(st.tuples(NUMBERS, st.none() | NUMBERS, st.booleans(), st.booleans()), min_size=1, max_size=6))
-def test_what_ranks_tell_is_means_over_views_and_whether_any_stops_or_has_a_problem(rows):
-    """An error of None: all of the photo is masked."""
+@given(
+    st.lists(st.tuples(ERROR_VALUES, st.none() | ERROR_VALUES, st.booleans(), st.booleans()), min_size=1, max_size=6)
+)
+def test_step_statistics_are_means_over_views_and_flags_of_any_rank(rows):
+    """An error of None belongs to a photo that is masked completely."""
     told = [
         pack_step_stats(
             torch.tensor(loss), torch.tensor(math.nan if error is None else error), stop=stop, problem=problem
@@ -97,7 +100,7 @@ def test_what_ranks_tell_is_means_over_views_and_whether_any_stops_or_has_a_prob
     assert found.stop is any(row[2] for row in rows) and found.problem is any(row[3] for row in rows)
 
 
-def test_a_loss_that_is_not_finite_is_reported_as_such():
+def test_a_loss_that_is_not_finite_stays_so_in_the_step_statistics():
     told = torch.stack(
         [pack_step_stats(torch.tensor(loss), torch.tensor(1.0), stop=False, problem=False) for loss in (1, math.nan)]
     )
@@ -113,44 +116,44 @@ def test_one_process_keeps_its_gradients_and_its_settings():
     check_settings(SINGLE_PROCESS, {"seed": 1})
 
 
-def test_a_digest_is_of_every_bit():
+def test_a_digest_depends_on_every_bit():
     tensors = [torch.zeros(3), torch.arange(4.0).view(2, 2).T]
     changed = [tensors[0].clone(), tensors[1]]
     changed[0][1] = -0.0
     assert digest(tensors) == digest([tensor.clone() for tensor in tensors]) != digest(changed)
 
 
-# -- two against one -------------------------------------------------------------------------------------------------
+# -- two processes against one ---------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
-def both() -> list[ProcessOutcome]:
+def outcomes_of_both() -> list[ProcessOutcome]:
     return run_on_ranks(tasks.train_both_scenes)
 
 
-CASES = {
+TRAINING_CASES = {
     "six photos": (0, tasks.six_photo_scene, tasks.SIX_PHOTO_CONFIG),
     "three photos, exposed": (1, tasks.three_photo_scene, tasks.EXPOSURE_CONFIG),
 }
 
 
-@pytest.fixture(scope="module", params=CASES)
-def compared(request, both) -> tuple[list[dict], list[Row], Trainer]:
-    """What each rank came to, and what one process that does the work of both does."""
-    number, scene, config = CASES[request.param]
-    return [end.result[number] for end in both], *one_for_all(scene(), config)
+@pytest.fixture(scope="module", params=TRAINING_CASES)
+def two_ranks_and_one(request, outcomes_of_both) -> tuple[list[dict], list[StepResult], Trainer]:
+    """The results of each rank, and those of one process that does the work of both."""
+    number, scene, config = TRAINING_CASES[request.param]
+    return [end.result[number] for end in outcomes_of_both], *train_on_one_process(scene(), config)
 
 
 @needs_ranks
-def test_two_processes_come_to_the_numbers_of_one_that_averages_their_views(compared):
-    (first, second), expected, _ = compared
+def test_two_processes_have_the_curve_of_one_that_averages_their_views(two_ranks_and_one):
+    (first, second), expected, _ = two_ranks_and_one
     assert first["rows"] == second["rows"] and len(expected) in (30, 200)
     np.testing.assert_allclose(first["rows"], expected, rtol=0, atol=1e-5)
 
 
 @needs_ranks
-def test_two_processes_end_with_the_model_of_one_that_averages_their_views(compared):
-    (first, _), _, trainer = compared
+def test_two_processes_end_with_the_model_of_one_that_averages_their_views(two_ranks_and_one):
+    (first, _), _, trainer = two_ranks_and_one
     for name, parameter in trainer.model.named_parameters():
         np.testing.assert_allclose(first["parameters"][name], parameter.detach(), rtol=0, atol=1e-3)
     if trainer.exposures is not None:
@@ -158,38 +161,38 @@ def test_two_processes_end_with_the_model_of_one_that_averages_their_views(compa
 
 
 @needs_ranks
-def test_gaussians_come_and_go_in_the_runs_that_are_compared(compared):
-    """Else it would say little."""
-    (first, _), _, _ = compared
+def test_the_compared_runs_add_and_prune_gaussians(two_ranks_and_one):
+    """Without this, the comparison would prove little."""
+    (first, _), _, _ = two_ranks_and_one
     counts = [count for _, _, count in first["rows"]]
     assert len(set(counts)) >= 3 and counts[0] < counts[-1] < max(counts)
 
 
 @needs_ranks
-def test_both_hold_the_same_bits_after_every_step(compared):
-    (first, second), _, _ = compared
+def test_both_ranks_have_identical_parameters_after_every_step(two_ranks_and_one):
+    (first, second), _, _ = two_ranks_and_one
     assert first["digests"] == second["digests"] and len(set(first["digests"])) == len(first["digests"])
 
 
 @needs_ranks
-def test_both_keep_the_same_curve_but_for_the_time(compared):
-    (first, second), _, _ = compared
+def test_both_ranks_record_the_same_curve_except_for_times(two_ranks_and_one):
+    (first, second), _, _ = two_ranks_and_one
     curves = [[{**record, "seconds": 0} for record in rank["records"]] for rank in (first, second)]
     assert curves[0] == curves[1] and [record["step"] for record in curves[0]] == list(range(1, len(curves[0]) + 1))
 
 
 @needs_ranks
-def test_exposures_are_learnt_together_also_where_both_have_the_same_photo(both):
+def test_gains_agree_on_both_ranks_also_where_both_render_the_same_photo(outcomes_of_both):
     names = [view.name for view in shuffled(tasks.three_photo_scene().train, tasks.EXPOSURE_CONFIG.seed, range(60))]
-    assert sum(names[place] == names[place + 1] for place in range(0, 60, 2)) > 1  # else it would say little
-    gains = [end.result[1]["gains"] for end in both]
+    assert sum(names[place] == names[place + 1] for place in range(0, 60, 2)) > 1  # otherwise the test proves little
+    gains = [end.result[1]["gains"] for end in outcomes_of_both]
     np.testing.assert_array_equal(gains[0], gains[1])
     untrained = Trainer(tasks.three_photo_scene(), tasks.EXPOSURE_CONFIG).exposures.values
     assert np.abs(gains[0] - untrained.detach().numpy()).max() > 1e-3
 
 
 @pytest.mark.parametrize(("size", "steps"), [(1, 7), (2, 4), (3, 3), (7, 1), (8, 1)])
-def test_steps_count_views_and_all_ranks_see_the_order_of_one(size, steps):
+def test_ranks_together_follow_the_view_order_of_one_process(size, steps):
     config = dataclasses.replace(tasks.SIX_PHOTO_CONFIG, steps=7)
     ranks = [dataclasses.replace(SINGLE_PROCESS, rank=rank, size=size) for rank in range(size)]
     trainers = [Trainer(tasks.six_photo_scene(), config, ranks=rank) for rank in ranks]
@@ -199,12 +202,12 @@ def test_steps_count_views_and_all_ranks_see_the_order_of_one(size, steps):
     assert names == [view.name for view in shuffled(tasks.six_photo_scene().train, config.seed, range(size * steps))]
 
 
-# -- stopping and going on -------------------------------------------------------------------------------------------
+# -- stopping and resuming -------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
-def parts(tmp_path_factory) -> tuple[Path, list[ProcessOutcome]]:
-    """A folder with a run of one piece and one of three, and what was said."""
+def run_folder_and_outcomes(tmp_path_factory) -> tuple[Path, list[ProcessOutcome]]:
+    """A folder with an uninterrupted run and one in three parts, and the outcomes of the processes."""
     folder = tmp_path_factory.mktemp("parts")
     alone = Trainer(tasks.held_out_scene(), tasks.RUN_CONFIG)
     (folder / "alone").mkdir()
@@ -212,13 +215,13 @@ def parts(tmp_path_factory) -> tuple[Path, list[ProcessOutcome]]:
     return folder, run_on_ranks(tasks.stop_and_resume, folder / "whole", folder / "parts", folder / "alone")
 
 
-def model_of(folder: Path) -> bytes:
+def read_model_bytes(folder: Path) -> bytes:
     return (folder / "model.hyrf").read_bytes()
 
 
 @needs_ranks
-def test_a_request_to_one_stops_all_after_the_same_step_and_the_checkpoint_stays(parts):
-    folder, ends = parts
+def test_a_stop_of_one_rank_stops_all_after_the_same_step_and_keeps_the_checkpoint(run_folder_and_outcomes):
+    folder, ends = run_folder_and_outcomes
     for end in ends:
         assert end.result["first"] == (False, 3, False) and end.result["second"] == (False, 17, False)
         assert end.result["checkpoint stays"]
@@ -226,28 +229,28 @@ def test_a_request_to_one_stops_all_after_the_same_step_and_the_checkpoint_stays
 
 
 @needs_ranks
-def test_a_run_that_was_stopped_and_resumed_gives_the_bytes_of_the_uninterrupted_one(parts, tmp_path):
-    folder, ends = parts
+def test_a_stopped_and_resumed_run_gives_the_bytes_of_the_uninterrupted_one(run_folder_and_outcomes, tmp_path):
+    folder, ends = run_folder_and_outcomes
     resumed = tmp_path / "resumed"
     shutil.copytree(folder / "parts", resumed)
     again = run_on_ranks(tasks.train_run, resumed, True)
     assert (
         [end.result for end in again] == [end.result["whole"] for end in ends] == [(True, 30, True), (True, 30, False)]
     )
-    assert model_of(resumed) == model_of(folder / "whole")
+    assert read_model_bytes(resumed) == read_model_bytes(folder / "whole")
     assert not (resumed / "checkpoint.pt").exists()
 
 
 @needs_ranks
-def test_only_rank_0_writes_and_what_it_writes_is_said_of_two(parts):
-    folder, _ = parts
+def test_only_rank_0_writes_and_its_metrics_name_two_processes(run_folder_and_outcomes):
+    folder, _ = run_folder_and_outcomes
     assert {path.name for path in (folder / "whole").iterdir()} == {"model.hyrf", "metrics.json", "curve.png", "views"}
     assert {path.name for path in (folder / "parts").iterdir()} == {"checkpoint.pt"}
 
 
 @needs_ranks
-def test_a_run_is_resumed_by_as_many_processes_only(parts):
-    folder, ends = parts
+def test_a_run_resumes_only_with_the_same_number_of_processes(run_folder_and_outcomes):
+    folder, ends = run_folder_and_outcomes
     with pytest.raises(HyrfError, match=r"other settings \(processes\)"):
         Trainer(tasks.held_out_scene(), tasks.RUN_CONFIG).load(folder / "parts" / "checkpoint.pt")
     assert all("other settings (processes)" in end.result["other size"] for end in ends)
@@ -255,23 +258,27 @@ def test_a_run_is_resumed_by_as_many_processes_only(parts):
 
 
 @needs_ranks
-def test_all_reject_a_folder_that_holds_a_run(parts):
-    _, ends = parts
+def test_all_ranks_reject_a_folder_that_holds_a_run(run_folder_and_outcomes):
+    _, ends = run_folder_and_outcomes
     assert {"the folder holds an earlier run" in end.result["there already"] for end in ends} == {True}
 
 
 @needs_ranks
-def test_processes_that_are_started_again_continue_from_the_checkpoint_if_there_is_one(parts, tmp_path):
-    folder, _ = parts
+def test_processes_that_are_started_again_continue_from_the_checkpoint_if_there_is_one(
+    run_folder_and_outcomes, tmp_path
+):
+    folder, _ = run_folder_and_outcomes
     shutil.copytree(folder / "parts", tmp_path / "some")
     for end in run_on_ranks(tasks.train_after_restart, tmp_path):
         assert end.result == [2, list(range(18, 31))]
-    assert model_of(tmp_path / "some") == model_of(folder / "whole")
+    assert read_model_bytes(tmp_path / "some") == read_model_bytes(folder / "whole")
 
 
 @needs_ranks
 @pytest.mark.parametrize(("killed", "step"), [(0, 17), (1, 13)])
-def test_a_process_that_is_killed_ends_the_other_and_the_run_can_be_resumed(killed, step, parts, tmp_path):
+def test_a_process_that_is_killed_ends_the_other_and_the_run_can_be_resumed(
+    killed, step, run_folder_and_outcomes, tmp_path
+):
     ends = run_on_ranks(tasks.train_and_kill, tmp_path, killed, step, timeout_seconds=30)
     assert ends[killed].exit_code == -9
     assert "one of the 2 processes has ended" in ends[1 - killed].error_text
@@ -280,14 +287,14 @@ def test_a_process_that_is_killed_ends_the_other_and_the_run_can_be_resumed(kill
     assert [path.name for path in tmp_path.iterdir()] == ["checkpoint.pt"]
 
     run_on_ranks(tasks.train_run, tmp_path, True)
-    assert model_of(tmp_path) == model_of(parts[0] / "whole")
+    assert read_model_bytes(tmp_path) == read_model_bytes(run_folder_and_outcomes[0] / "whole")
 
 
-# -- refusals --------------------------------------------------------------------------------------------------------
+# -- errors ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
-def refused() -> list[dict]:
+def errors_by_rank() -> list[dict]:
     return [end.result for end in run_on_ranks(tasks.collect_errors)]
 
 
@@ -304,18 +311,18 @@ def refused() -> list[dict]:
         ("checkpoint", ["no checkpoint to resume"]),
     ],
 )
-def test_what_one_cannot_take_ends_both_with_the_same_sentence(case, words, refused):
-    first, second = (rank[case] for rank in refused)
+def test_an_input_that_one_rank_cannot_use_ends_both_with_the_same_error(case, words, errors_by_rank):
+    first, second = (rank[case] for rank in errors_by_rank)
     assert first == second and all(word in first for word in words), first
 
 
 @needs_ranks
-def test_after_a_refusal_they_can_still_work_together(refused):
-    assert [rank["none"] for rank in refused] == [None, None]
+def test_ranks_can_still_communicate_after_an_error(errors_by_rank):
+    assert [rank["none"] for rank in errors_by_rank] == [None, None]
 
 
 @needs_ranks
-def test_what_cannot_be_trained_on_is_rejected_on_both_before_the_first_step(tmp_path):
+def test_both_ranks_reject_unusable_input_before_the_first_step(tmp_path):
     first, second = (end.result for end in run_on_ranks(tasks.collect_setup_errors, tmp_path))
     assert first == second
     assert "held.png: cannot be read" in first["held out"]

@@ -1,4 +1,4 @@
-"""Photos of different exposure: gains that are known are found by tracks, kept through training, and left out of it."""
+"""Exposure compensation recovers known gains from tracks, keeps them in training and keeps the model free of them."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from hyrfpack.scene import Scene, View
 from hyrfpack.train import TrainConfig, Trainer
 from hyrfpack.train.exposure import GAIN_DECAY, MIN_PIXEL_LEVEL, Exposures, Observations, gains_from, observe
 
-CPU = torch.device("cpu")
-SHORT = TrainConfig(steps=30, seed=3, max_gaussians=160, exposure=True)
+CPU_DEVICE = torch.device("cpu")
+SHORT_CONFIG = TrainConfig(steps=30, seed=3, max_gaussians=160, exposure=True)
 
 
-def centred(gains: np.ndarray) -> np.ndarray:
+def centred_log_gains(gains: np.ndarray) -> np.ndarray:
     logs = np.log(np.broadcast_to(gains, (len(gains), 3)))
     return logs - logs.mean(0)
 
 
-# -- by tracks -------------------------------------------------------------------------------------------------------
+# -- gains from tracks -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("occluded", [0.0, 0.2])
-def test_gains_are_found_beside_points_that_show_something_else(occluded):
+def test_gains_are_recovered_despite_occluded_points(occluded):
     rng = np.random.default_rng(0)
     logs = rng.normal(0, 0.4, (12, 3))
     colors = rng.normal(-0.5, 1, (200, 3))
@@ -44,7 +44,7 @@ def test_gains_are_found_beside_points_that_show_something_else(occluded):
     np.testing.assert_allclose(found.mean(0), 0, atol=1e-12)
 
 
-def test_photos_that_nothing_is_known_of_have_gains_of_one_and_parts_that_share_no_point_keep_apart():
+def test_photos_without_tracks_have_unit_gains_and_unconnected_groups_stay_separate():
     photo, point = np.repeat([0, 1, 3, 4], 50), np.tile(np.arange(50), 4) + np.repeat([0, 50], 100)
     logits = np.repeat([0.3, -0.3, 0.1, -0.1], 50)[:, None] * np.ones(3) + np.linspace(-2, 2, 50)[point % 50, None]
 
@@ -54,8 +54,8 @@ def test_photos_that_nothing_is_known_of_have_gains_of_one_and_parts_that_share_
     assert not gains_from(Observations(photo[:9], point[:9], logits[:9]), 2).any()
 
 
-def test_two_groups_of_photos_that_two_glossy_points_connect_do_not_drift_apart():
-    """The points look a unit of logit lighter from one side; all photos have the same exposure."""
+def test_two_glossy_points_between_two_groups_of_photos_do_not_shift_their_gains():
+    """The points are one logit unit lighter from one side, although all photos have the same exposure."""
     rng = np.random.default_rng(0)
     seen = [(photo, 200 * (photo // 10) + row) for photo in range(20) for row in rng.choice(200, 60, replace=False)]
     glossy = [(photo, point) for point in (400, 401) for photo in (3, 4, 13, 14)]
@@ -66,7 +66,7 @@ def test_two_groups_of_photos_that_two_glossy_points_connect_do_not_drift_apart(
     found = gains_from(Observations(photo, point, logits), 20)
     assert abs(found[10:].mean() - found[:10].mean()) < 0.02
 
-    # Forty points that agree are believed.
+    # Forty points that agree are enough to believe them.
     shared = np.array([(photo, point) for point in range(400, 440) for photo in (3, 4, 13, 14)]).T
     photo, point = np.concatenate((np.array(seen).T, shared), 1)
     logits = rng.normal(size=(440, 3))[point] + rng.normal(0, 0.05, (len(photo), 3))
@@ -75,7 +75,7 @@ def test_two_groups_of_photos_that_two_glossy_points_connect_do_not_drift_apart(
     assert found[10:].mean() - found[:10].mean() == pytest.approx(1, abs=0.05)
 
 
-def test_each_photo_is_read_once_and_what_is_masked_clipped_or_outside_is_left_out():
+def test_each_photo_is_read_once_and_masked_clipped_or_outside_points_are_ignored():
     scene, reads = exposed_scene(np.ones((4, 1))), []
     black, masked, see_through, usual = scene.train
 
@@ -104,9 +104,9 @@ def test_each_photo_is_read_once_and_what_is_masked_clipped_or_outside_is_left_o
 # -- a step ----------------------------------------------------------------------------------------------------------
 
 
-def test_gradients_are_those_of_the_equation_in_float64():
+def test_gain_gradients_match_the_equation_in_float64():
     views = ball_scene(2).train
-    exposures = Exposures(views, np.array([[0.3, -0.2, 0.1], [-0.3, 0.2, -0.1]]), CPU)
+    exposures = Exposures(views, np.array([[0.3, -0.2, 0.1], [-0.3, 0.2, -0.1]]), CPU_DEVICE)
     generator = torch.Generator().manual_seed(0)
     image = torch.rand(7, 5, 3, generator=generator).requires_grad_()
     weights = torch.rand(7, 5, 3, generator=generator)
@@ -123,10 +123,10 @@ def test_gradients_are_those_of_the_equation_in_float64():
     torch.testing.assert_close(image.grad.double(), expected, rtol=1e-4, atol=1e-5)
 
 
-def test_steps_are_adams_with_a_pull_to_one_and_keep_the_mean():
+def test_steps_are_adam_with_a_pull_to_unit_gains_and_keep_the_mean():
     views = ball_scene(3).train
     start = np.array([[0.3, -0.2, 0.1], [-0.1, 0.4, 0.0], [0.2, 0.1, -0.3]])
-    exposures = Exposures(views, start, CPU)
+    exposures = Exposures(views, start, CPU_DEVICE)
     torch.testing.assert_close(exposures.values.detach().double().numpy(), start - start.mean(0), rtol=1e-5, atol=1e-6)
     expected = [torch.from_numpy(row).requires_grad_() for row in start - start.mean(0)]
     optimizers = [torch.optim.Adam([row], lr=0.01, eps=1e-15) for row in expected]
@@ -153,7 +153,7 @@ def test_steps_are_adams_with_a_pull_to_one_and_keep_the_mean():
 
 def test_a_gradient_that_is_not_finite_is_reported_and_changes_nothing():
     views = ball_scene(2).train
-    exposures = Exposures(views, np.array([[0.3, 0.3, 0.3], [-0.3, -0.3, -0.3]]), CPU)
+    exposures = Exposures(views, np.array([[0.3, 0.3, 0.3], [-0.3, -0.3, -0.3]]), CPU_DEVICE)
     before = exposures.values.detach().clone()
     (exposures.exposed(torch.full((2, 2, 3), 0.5), views[0]) * torch.nan).sum().backward()
 
@@ -164,75 +164,79 @@ def test_a_gradient_that_is_not_finite_is_reported_and_changes_nothing():
 # -- a run -----------------------------------------------------------------------------------------------------------
 
 
-def untimed(trainer: Trainer) -> list[dict]:
+def records_without_times(trainer: Trainer) -> list[dict]:
     return [{name: value for name, value in record.items() if name != "seconds"} for record in trainer.records]
 
 
-def parameters(trainer: Trainer) -> dict[str, bytes]:
+def parameter_bytes(trainer: Trainer) -> dict[str, bytes]:
     return {name: p.detach().numpy().tobytes() for name, p in trainer.model.named_parameters()}
 
 
-def trained(scene: Scene, config: TrainConfig = SHORT) -> Trainer:
+def train_trainer(scene: Scene, config: TrainConfig = SHORT_CONFIG) -> Trainer:
     trainer = Trainer(scene, config)
     assert trainer.run()
     return trainer
 
 
-def test_gains_that_are_known_are_found_and_the_model_keeps_the_mean():
+def test_known_gains_are_learnt_and_the_model_keeps_their_mean():
     gains = alternating_gains(8) * np.array([1.1, 1.0, 0.9]) ** np.linspace(-1, 1, 8)[:, None]
     scene = exposed_scene(gains, side=128)
 
-    trainer = trained(scene, dataclasses.replace(SHORT, steps=60))
+    trainer = train_trainer(scene, dataclasses.replace(SHORT_CONFIG, steps=60))
 
     assert trainer.choices["exposure"].startswith("per-image gains; by their tracks the photos differ by 0.5")
-    np.testing.assert_allclose(trainer.exposures.values.detach(), centred(gains), atol=0.05)
+    np.testing.assert_allclose(trainer.exposures.values.detach(), centred_log_gains(gains), atol=0.05)
 
 
 def test_gains_are_not_learnt_by_default_even_where_photos_differ_by_a_stop():
     scene = exposed_scene(alternating_gains(6, stops=1.0))
-    default = dataclasses.replace(SHORT, exposure=TrainConfig().exposure)
+    default = dataclasses.replace(SHORT_CONFIG, exposure=TrainConfig().exposure)
 
-    by_default, without = trained(scene, default), trained(dataclasses.replace(scene, tracks={}), default)
+    by_default, without = train_trainer(scene, default), train_trainer(dataclasses.replace(scene, tracks={}), default)
 
     assert by_default.exposures is None and by_default.choices["exposure"] == "off"
-    assert parameters(by_default) == parameters(without) and untimed(by_default) == untimed(without)
+    assert parameter_bytes(by_default) == parameter_bytes(without) and records_without_times(
+        by_default
+    ) == records_without_times(without)
 
 
 def test_gains_of_photos_without_tracks_start_at_one():
-    trainer = Trainer(dataclasses.replace(exposed_scene(alternating_gains(6)), tracks={}), SHORT)
+    trainer = Trainer(dataclasses.replace(exposed_scene(alternating_gains(6)), tracks={}), SHORT_CONFIG)
     assert trainer.choices["exposure"] == "per-image gains; no tracks show the photos' exposures"
     assert torch.equal(trainer.exposures.values, torch.zeros(6, 3))
 
 
 def test_an_interrupted_run_continues_to_the_same_bytes(tmp_path):
     scene, path = exposed_scene(alternating_gains(6)), tmp_path / "checkpoint.pt"
-    whole, first = trained(scene), Trainer(scene, SHORT)
+    whole, first = train_trainer(scene), Trainer(scene, SHORT_CONFIG)
     assert not first.run(checkpoint=path, stop=lambda: first.step == 17)
 
-    second = Trainer(scene, SHORT)
+    second = Trainer(scene, SHORT_CONFIG)
     second.load(path)
     second.run()
 
-    assert parameters(second) == parameters(whole) and untimed(second) == untimed(whole)
+    assert parameter_bytes(second) == parameter_bytes(whole) and records_without_times(second) == records_without_times(
+        whole
+    )
     assert torch.equal(second.exposures.values, whole.exposures.values)
     with pytest.raises(HyrfTrainingError, match=r"other settings \(exposure\)"):
-        Trainer(scene, dataclasses.replace(SHORT, exposure=False)).load(path)
+        Trainer(scene, dataclasses.replace(SHORT_CONFIG, exposure=False)).load(path)
 
 
 def test_exposure_of_photos_with_transparency_is_rejected():
     with pytest.raises(HyrfTrainingError, match=r"balls: photos with transparency .*leave out `exposure`"):
-        Trainer(ball_scene(4, alpha=True), SHORT)
+        Trainer(ball_scene(4, alpha=True), SHORT_CONFIG)
 
 
-def test_exposure_that_drifts_stays_out_of_the_model():
-    """A cloud passes: half a stop lighter, half a stop darker. Held-out photos are every fourth."""
+def test_drifting_exposure_stays_out_of_the_model():
+    """As when a cloud passes: half a stop lighter, half a stop darker. Every fourth photo is held out."""
     drift = 0.5 * 2 ** (0.5 * np.sin(np.arange(16) / 16 * 2 * np.pi) / 2.2)
     scene = exposed_scene((drift / (1 - drift))[:, None], side=32)
     split = dataclasses.replace(
         scene, train=[v for n, v in enumerate(scene.train) if n % 4 != 2], test=scene.train[2::4]
     )
 
-    model = trained(split, dataclasses.replace(SHORT, steps=200)).model
+    model = train_trainer(split, dataclasses.replace(SHORT_CONFIG, steps=200)).model
     scores = evaluate_model(model, split.test)
 
     assert scores.psnr_consistent is not None and scores.psnr > scores.psnr_consistent + 1

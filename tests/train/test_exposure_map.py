@@ -20,57 +20,59 @@ def poses_of(cameras) -> list[np.ndarray]:
     return [camera.camera_from_world for camera in cameras]
 
 
-def gains_at(cameras, fit) -> np.ndarray:
+def predict_log_gains(cameras, fit) -> np.ndarray:
     return np.array([np.log(fit.map.predict_gains(camera.camera_from_world)) for camera in cameras])
 
 
-def sunny_side(cameras) -> np.ndarray:
-    """Log gains that are larger on one side of a ring."""
+def one_sided_log_gains(cameras) -> np.ndarray:
+    """Return log gains that are larger on one side of a ring."""
     return np.array([np.array([0.5, 0.45, 0.4]) * np.sin(np.arctan2(*c.position[:2])) for c in cameras])
 
 
 def test_gains_that_vary_over_a_ring_are_predicted_between_its_cameras():
     cameras, between = ring(40), ring(80)[1::2]
-    fit = fit_exposure_map(poses_of(cameras), sunny_side(cameras))
+    fit = fit_exposure_map(poses_of(cameras), one_sided_log_gains(cameras))
 
     assert fit.leave_one_out_error < 0.02
-    np.testing.assert_allclose(gains_at(cameras, fit), sunny_side(cameras), atol=0.03)
-    np.testing.assert_allclose(gains_at(between, fit), sunny_side(between), atol=0.05)
+    np.testing.assert_allclose(predict_log_gains(cameras, fit), one_sided_log_gains(cameras), atol=0.03)
+    np.testing.assert_allclose(predict_log_gains(between, fit), one_sided_log_gains(between), atol=0.05)
 
 
-def test_two_flights_of_different_exposure_keep_theirs():
+def test_two_flights_keep_their_different_exposure():
     low, high = ring(20, radius=3.0, elevation=1.0), ring(20, radius=3.0, elevation=4.0)
     gains = np.repeat([[-0.6] * 3, [0.6] * 3], 20, 0)
     fit = fit_exposure_map(poses_of(low + high), gains)
-    np.testing.assert_allclose(gains_at(low + high, fit), gains, atol=0.1)
+    np.testing.assert_allclose(predict_log_gains(low + high, fit), gains, atol=0.1)
 
 
 def test_exposures_that_viewpoints_do_not_explain_become_their_mean():
     cameras = ring(40)
     gains = np.where(np.random.default_rng(3).random((40, 1)) < 0.5, 0.7, -0.7) * np.ones(3)
     fit = fit_exposure_map(poses_of(cameras), gains)
-    predicted = gains_at(cameras, fit)
+    predicted = predict_log_gains(cameras, fit)
     assert np.abs(predicted - gains.mean(0)).max() < 0.35 and fit.leave_one_out_error > 0.6
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
-def test_few_photos_have_a_map(count):
+def test_a_map_can_be_fitted_to_few_photos(count):
     cameras = ring(count)
     gains = np.linspace(-0.2, 0.3, 3 * count).reshape(count, 3)
-    predicted = gains_at(cameras, fit_exposure_map(poses_of(cameras), gains))
+    predicted = predict_log_gains(cameras, fit_exposure_map(poses_of(cameras), gains))
     assert np.isfinite(predicted).all()
     assert (predicted >= gains.min(0) - 1e-6).all() and (predicted <= gains.max(0) + 1e-6).all()
 
 
-def test_photos_from_one_place_have_a_map():
+def test_a_map_can_be_fitted_to_photos_from_one_place():
     camera = camera_at((2, 0, 1))
     gains = np.array([[0.1] * 3, [0.2] * 3, [0.3] * 3])
-    np.testing.assert_allclose(gains_at([camera], fit_exposure_map([camera.camera_from_world] * 3, gains)), 0.2)
+    np.testing.assert_allclose(
+        predict_log_gains([camera], fit_exposure_map([camera.camera_from_world] * 3, gains)), 0.2
+    )
 
 
-def test_equal_gains_are_kept():
+def test_equal_gains_are_predicted_exactly():
     cameras = ring(12)
-    predicted = gains_at(cameras, fit_exposure_map(poses_of(cameras), np.full((12, 3), 0.25)))
+    predicted = predict_log_gains(cameras, fit_exposure_map(poses_of(cameras), np.full((12, 3), 0.25)))
     np.testing.assert_allclose(predicted, 0.25, atol=1e-6)
 
 

@@ -1,4 +1,4 @@
-"""What a run tells programs while it goes on."""
+"""The log that a training run writes for programs."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from hyrfpack.train import TrainConfig, log, train_model
 from hyrfpack.train.log import TrainingLog, peak_memory
 from hyrfpack.train.trainer import MIN_CURVE_RECORDS
 
-CPU = torch.device("cpu")
-CONFIG = TrainConfig(steps=30, seed=1, max_gaussians=120, checkpoint_every=1)
+CPU_DEVICE = torch.device("cpu")
+LOGGED_CONFIG = TrainConfig(steps=30, seed=1, max_gaussians=120, checkpoint_every=1)
 
 
-def a_scene() -> Scene:
+def make_scene() -> Scene:
     scene = ball_scene(views=8, points=60, side=24)
     return replace(scene, train=scene.train[2:], test=scene.train[:2])
 
 
-def read(path: Path) -> list[dict]:
-    """The records of a log; NaN and infinity are no JSON."""
+def read_log(path: Path) -> list[dict]:
+    """Return the records of a log; NaN and infinity are not valid JSON."""
 
     def refuse(name: str) -> None:
         raise AssertionError(f"{name} in the log")
@@ -37,13 +37,13 @@ def read(path: Path) -> list[dict]:
     return [json.loads(line, parse_constant=refuse) for line in path.read_text().splitlines()]
 
 
-def test_each_line_says_where_the_run_is_and_the_last_what_it_came_to(tmp_path: Path) -> None:
-    result = train_model(a_scene(), tmp_path / "run", CONFIG, quiet=True, log=tmp_path / "new" / "log.jsonl")
+def test_each_log_line_reports_progress_and_the_last_one_the_results(tmp_path: Path) -> None:
+    result = train_model(make_scene(), tmp_path / "run", LOGGED_CONFIG, quiet=True, log=tmp_path / "new" / "log.jsonl")
 
-    *steps, end = read(tmp_path / "new" / "log.jsonl")
-    assert [record["step"] for record in steps] == list(range(1, CONFIG.steps + 1))
+    *steps, end = read_log(tmp_path / "new" / "log.jsonl")
+    assert [record["step"] for record in steps] == list(range(1, LOGGED_CONFIG.steps + 1))
     for record in steps:
-        assert record["event"] == "step" and record["steps"] == CONFIG.steps
+        assert record["event"] == "step" and record["steps"] == LOGGED_CONFIG.steps
         assert record["loss"] > 0 and record["psnr"] > 0 and record["gpu_memory_bytes"] is None
     curve = {record["step"]: record for record in result.metrics["curve"]}
     assert all(math.isclose(r["psnr"], curve[r["step"]]["psnr"], rel_tol=1e-5) for r in steps if r["step"] in curve)
@@ -53,88 +53,90 @@ def test_each_line_says_where_the_run_is_and_the_last_what_it_came_to(tmp_path: 
     assert (end["psnr"], end["ssim"]) == pytest.approx((scores["psnr"], scores["ssim"]), rel=1e-5)
 
 
-def test_records_of_a_long_run_are_means_and_few(tmp_path: Path) -> None:
+def test_a_long_run_logs_few_records_of_means(tmp_path: Path) -> None:
     steps = 5 * MIN_CURVE_RECORDS
-    with TrainingLog(tmp_path / "log.jsonl", steps, 0, CPU) as written:
+    with TrainingLog(tmp_path / "log.jsonl", steps, 0, CPU_DEVICE) as written:
         for step in range(1, steps + 1):
             written.step(step, loss=step, mse=0.01 if step % 2 else math.nan, gaussians=7)
 
-    records = read(tmp_path / "log.jsonl")
+    records = read_log(tmp_path / "log.jsonl")
     assert len(records) == MIN_CURVE_RECORDS
-    assert records[0]["loss"] == 3 and records[0]["psnr"] == pytest.approx(20)  # of steps 1, 3 and 5
-    assert records[1]["loss"] == 8  # of 7 and 9
+    assert records[0]["loss"] == 3 and records[0]["psnr"] == pytest.approx(20)  # the mean of steps 1, 3 and 5
+    assert records[1]["loss"] == 8  # the mean of steps 7 and 9
 
 
-def test_a_slow_run_is_told_of_every_few_seconds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_slow_run_is_logged_every_few_seconds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     now = [0.0]
     monkeypatch.setattr(log.time, "monotonic", lambda: now[0])
-    with TrainingLog(tmp_path / "log.jsonl", 10**6, 0, CPU) as written:
+    with TrainingLog(tmp_path / "log.jsonl", 10**6, 0, CPU_DEVICE) as written:
         for step in range(1, 13):
             now[0] += 2.5
             written.step(step, 1.0, 0.1, 7)
 
-    assert [record["step"] for record in read(tmp_path / "log.jsonl")] == [4, 8, 12]
+    assert [record["step"] for record in read_log(tmp_path / "log.jsonl")] == [4, 8, 12]
 
 
-def test_what_masks_leave_nothing_of_is_null(tmp_path: Path) -> None:
-    with TrainingLog(tmp_path / "log.jsonl", 2, 0, CPU) as written:
+def test_the_psnr_of_a_completely_masked_photo_is_null(tmp_path: Path) -> None:
+    with TrainingLog(tmp_path / "log.jsonl", 2, 0, CPU_DEVICE) as written:
         written.step(1, math.nan, math.nan, 7)
         written.step(2, 0.0, 0.0, 7)
 
-    first, second = read(tmp_path / "log.jsonl")
+    first, second = read_log(tmp_path / "log.jsonl")
     assert first["loss"] is first["psnr"] is None and second["loss"] == 0 and second["psnr"] == 100
 
 
-def test_a_resumed_run_adds_to_its_log_and_another_begins_again(tmp_path: Path) -> None:
+def test_a_resumed_run_appends_to_its_log_and_a_new_run_replaces_it(tmp_path: Path) -> None:
     where, file = tmp_path / "run", tmp_path / "log.jsonl"
     stop = iter([False] * 9 + [True])
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("hyrfpack.train.trainer.Trainer._record", lambda *_: next(stop) and _interrupt())
         with pytest.raises(KeyboardInterrupt):
-            train_model(a_scene(), where, CONFIG, quiet=True, log=file)
-    train_model(a_scene(), where, CONFIG, quiet=True, log=file, resume=True)
+            train_model(make_scene(), where, LOGGED_CONFIG, quiet=True, log=file)
+    train_model(make_scene(), where, LOGGED_CONFIG, quiet=True, log=file, resume=True)
 
-    steps = [record["step"] for record in read(file) if record["event"] == "step"]
-    assert steps == [*range(1, 10), *range(10, CONFIG.steps + 1)]
+    steps = [record["step"] for record in read_log(file) if record["event"] == "step"]
+    assert steps == [*range(1, 10), *range(10, LOGGED_CONFIG.steps + 1)]
     with pytest.raises(HyrfError, match="log"):
-        train_model(a_scene(), tmp_path / "other", CONFIG, quiet=True, log=file)
-    train_model(a_scene(), tmp_path / "other", TrainConfig(steps=2), quiet=True, log=file, overwrite=True)
-    assert [record["step"] for record in read(file)] == [1, 2, 2]
+        train_model(make_scene(), tmp_path / "other", LOGGED_CONFIG, quiet=True, log=file)
+    train_model(make_scene(), tmp_path / "other", TrainConfig(steps=2), quiet=True, log=file, overwrite=True)
+    assert [record["step"] for record in read_log(file)] == [1, 2, 2]
 
 
 def _interrupt() -> None:
     raise KeyboardInterrupt
 
 
-def test_a_run_that_fails_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_run_logs_the_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object) -> None:
         raise HyrfError("it is broken", fix="repair it")
 
     monkeypatch.setattr("hyrfpack.train.trainer.Trainer._train_step", fail)
     with pytest.raises(HyrfError):
-        train_model(a_scene(), tmp_path / "run", CONFIG, quiet=True, log=tmp_path / "log.jsonl")
+        train_model(make_scene(), tmp_path / "run", LOGGED_CONFIG, quiet=True, log=tmp_path / "log.jsonl")
 
-    assert read(tmp_path / "log.jsonl") == [{"event": "end", "complete": False, "error": "it is broken; repair it"}]
+    assert read_log(tmp_path / "log.jsonl") == [{"event": "end", "complete": False, "error": "it is broken; repair it"}]
 
 
-def test_a_log_that_cannot_be_begun_is_found_before_the_first_step(tmp_path: Path) -> None:
+def test_a_log_that_cannot_be_written_is_an_error_before_the_first_step(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(HyrfError, match="file"):
-        train_model(a_scene(), tmp_path / "run", CONFIG, quiet=True, log=tmp_path / "file" / "log.jsonl")
+        train_model(make_scene(), tmp_path / "run", LOGGED_CONFIG, quiet=True, log=tmp_path / "file" / "log.jsonl")
     assert not (tmp_path / "run" / "model.hyrf").exists()
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
 def test_a_full_disk_ends_the_log_and_not_the_run() -> None:
     said: list[str] = []
-    with TrainingLog(Path("/dev/full"), 3, 0, CPU, said.append) as written:
+    with TrainingLog(Path("/dev/full"), 3, 0, CPU_DEVICE, said.append) as written:
         for step in (1, 2, 3):
             written.step(step, 1.0, 0.1, 7)
         written.end(complete=True, step=3)
     assert len(said) == 1 and "training continues without it" in said[0]
 
 
-def test_scalars_go_to_tensorboard_where_it_is_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scalars_are_written_to_tensorboard_where_it_is_installed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     scalars: dict[str, list[tuple[int, float]]] = {}
 
     class Writer:
@@ -149,7 +151,7 @@ def test_scalars_go_to_tensorboard_where_it_is_installed(tmp_path: Path, monkeyp
 
     monkeypatch.setattr(log, "find_spec", lambda name: name == "tensorboard")
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", SimpleNamespace(SummaryWriter=Writer))
-    with TrainingLog(tmp_path / "log.jsonl", 2, 0, CPU) as written:
+    with TrainingLog(tmp_path / "log.jsonl", 2, 0, CPU_DEVICE) as written:
         written.step(1, 0.5, 0.1, 7)
         written.step(2, 0.25, 0.01, 8)
         written.end(complete=True, step=2, psnr=21.5, gaussians=8)

@@ -9,7 +9,7 @@ from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.train.config import LearningRates
 from hyrfpack.train.optimizer import Optimizer
 
-RATES = LearningRates(
+LEARNING_RATES = LearningRates(
     positions=(1e-2, 1e-4),
     fields=(2e-2, 1e-3),
     color_logits=(3e-2, 3e-2),
@@ -18,7 +18,7 @@ RATES = LearningRates(
 )
 
 
-def a_model(count: int = 6, seed: int = 0):
+def make_model(count: int = 6, seed: int = 0):
     return small_model(ball_points(count)[0], fields=1.0, seed=seed)
 
 
@@ -28,49 +28,52 @@ def set_gradients(model, seed: int) -> None:
         p.grad = torch.randn(p.shape, generator=generator)
 
 
-def taken(model, optimizer, steps, total: int = 20) -> None:
+def take_steps(model, optimizer, steps, total: int = 20) -> None:
     for step in steps:
         set_gradients(model, step)
         optimizer.step(step, total)
 
 
-# A quarter of the full length doubles the rates; runs shorter than 1,000 steps gain no more.
-PACES = [(20, 30**0.5), (1000, 30**0.5), (7500, 2.0), (30_000, 1.0), (100_000, 1.0)]
+# Pairs of run length in steps and factor. A quarter of the full length doubles the rates; below 1,000 steps the factor
+# is constant.
+RATE_FACTORS_BY_STEPS = [(20, 30**0.5), (1000, 30**0.5), (7500, 2.0), (30_000, 1.0), (100_000, 1.0)]
 
 
-@pytest.mark.parametrize(("steps", "pace"), PACES)
+@pytest.mark.parametrize(("steps", "pace"), RATE_FACTORS_BY_STEPS)
 @pytest.mark.parametrize("name", [*Gaussians.PARAMETER_NAMES, "fields"])
-def test_rates_fall_evenly_in_their_logarithm_and_are_higher_in_short_runs(name, steps, pace):
-    first, last = getattr(RATES, name)
-    assert RATES.at(name, 0, steps) == pytest.approx(pace * first, rel=1e-12)
-    assert RATES.at(name, steps // 2, steps) == pytest.approx(pace * (first * last) ** 0.5, rel=1e-12)
-    assert RATES.at(name, steps - 1, steps) == pytest.approx(pace * last * (first / last) ** (1 / steps), rel=1e-12)
+def test_learning_rates_decay_exponentially_and_are_higher_in_short_runs(name, steps, pace):
+    first, last = getattr(LEARNING_RATES, name)
+    assert LEARNING_RATES.at(name, 0, steps) == pytest.approx(pace * first, rel=1e-12)
+    assert LEARNING_RATES.at(name, steps // 2, steps) == pytest.approx(pace * (first * last) ** 0.5, rel=1e-12)
+    assert LEARNING_RATES.at(name, steps - 1, steps) == pytest.approx(
+        pace * last * (first / last) ** (1 / steps), rel=1e-12
+    )
 
 
 @pytest.mark.parametrize("views", [2, 4, 16])
 @pytest.mark.parametrize("seen", [200, 3000, 30_000])
-def test_steps_of_several_views_are_as_much_larger_as_the_root_of_their_number(views, seen):
+def test_learning_rates_grow_with_the_square_root_of_the_views_per_step(views, seen):
     for name in (*Gaussians.PARAMETER_NAMES, "fields"):
         for share in (0, 0.25, 1):
             alone, together = (
-                RATES.at(name, share * seen, seen),
-                RATES.at(name, share * seen / views, seen / views, views),
+                LEARNING_RATES.at(name, share * seen, seen),
+                LEARNING_RATES.at(name, share * seen / views, seen / views, views),
             )
             assert together == pytest.approx(views**0.5 * alone, rel=1e-12)
 
 
 @pytest.mark.parametrize(("views", "betas"), [(1, (0.9, 0.999)), (4, (0.6, 0.996)), (16, (0.0, 0.984))])
-def test_running_means_cover_as_many_views_whatever_a_step_has_of_them(views, betas):
-    model = a_model()
+def test_adam_averages_cover_the_same_number_of_views_for_any_views_per_step(views, betas):
+    model = make_model()
     plain = {name: p.detach().clone().requires_grad_() for name, p in model.named_parameters()}
     adam = torch.optim.Adam(
         [{"params": [p]} for p in plain.values()], betas=betas, eps=1e-15, foreach=False, fused=False
     )
-    optimizer = Optimizer(model, RATES, views)
+    optimizer = Optimizer(model, LEARNING_RATES, views)
     for step in range(3):
         for group, name in zip(adam.param_groups, plain, strict=True):
             kind = name.removeprefix("gaussians.")
-            group["lr"] = RATES.at(kind if kind in Gaussians.PARAMETER_NAMES else "fields", step, 20, views)
+            group["lr"] = LEARNING_RATES.at(kind if kind in Gaussians.PARAMETER_NAMES else "fields", step, 20, views)
         set_gradients(model, step)
         for name, parameter in model.named_parameters():
             plain[name].grad = parameter.grad.clone()
@@ -86,19 +89,19 @@ def test_rates_fall_tenfold_or_more_by_default():
         assert rates.at(name, 0, 30_000) >= 9.99 * rates.at(name, 30_000, 30_000) > 0
 
 
-@pytest.mark.parametrize(("steps", "pace"), PACES)
+@pytest.mark.parametrize(("steps", "pace"), RATE_FACTORS_BY_STEPS)
 def test_steps_match_adam_with_the_scheduled_rates(steps, pace):
-    model = a_model()
+    model = make_model()
     plain = {name: p.detach().clone().requires_grad_() for name, p in model.named_parameters()}
     adam = torch.optim.Adam([{"params": [p]} for p in plain.values()], eps=1e-15, foreach=False, fused=False)
-    optimizer = Optimizer(model, RATES)
+    optimizer = Optimizer(model, LEARNING_RATES)
 
     for step in range(0, steps, steps // 20):
         progress = step / steps
         set_gradients(model, step)
         for group, (name, p) in zip(adam.param_groups, plain.items(), strict=True):
             p.grad = dict(model.named_parameters())[name].grad.clone()
-            first, last = getattr(RATES, name.removeprefix("gaussians.") if "gaussians" in name else "fields")
+            first, last = getattr(LEARNING_RATES, name.removeprefix("gaussians.") if "gaussians" in name else "fields")
             group["lr"] = pace * np.exp((1 - progress) * np.log(first) + progress * np.log(last))
         adam.step()
         optimizer.step(step, steps)
@@ -108,21 +111,21 @@ def test_steps_match_adam_with_the_scheduled_rates(steps, pace):
 
 
 def test_a_step_clears_the_gradients():
-    model = a_model()
-    taken(model, Optimizer(model, RATES), range(1))
+    model = make_model()
+    take_steps(model, Optimizer(model, LEARNING_RATES), range(1))
     assert all(p.grad is None for p in model.parameters())
 
 
 def test_every_parameter_belongs_to_one_group():
-    model = a_model()
-    owned = [p for group in Optimizer(model, RATES).groups.values() for p in group]
+    model = make_model()
+    owned = [p for group in Optimizer(model, LEARNING_RATES).groups.values() for p in group]
     assert {id(p) for p in owned} == {id(p) for p in model.parameters()} and len(owned) == len(set(map(id, owned)))
 
 
 def test_replacing_keeps_rows_and_moments_and_starts_new_ones_at_zero():
-    model = a_model()
-    optimizer = Optimizer(model, RATES)
-    taken(model, optimizer, range(3))
+    model = make_model()
+    optimizer = Optimizer(model, LEARNING_RATES)
+    take_steps(model, optimizer, range(3))
     values = {name: getattr(model.gaussians, name).detach().clone() for name in Gaussians.PARAMETER_NAMES}
     moments = {key: value.clone() for key, value in optimizer.state_dict().items()}
     keep = torch.tensor([4, 0, 2])
@@ -144,11 +147,11 @@ def test_replacing_keeps_rows_and_moments_and_starts_new_ones_at_zero():
     assert fields and all(torch.equal(after[key], moments[key]) for key in fields)
 
 
-def test_kept_rows_continue_as_if_nothing_happened():
-    edited, alone = a_model(), a_model()
-    optimizers = Optimizer(edited, RATES), Optimizer(alone, RATES)
+def test_kept_rows_continue_unchanged_after_a_replacement():
+    edited, alone = make_model(), make_model()
+    optimizers = Optimizer(edited, LEARNING_RATES), Optimizer(alone, LEARNING_RATES)
     for model, optimizer in zip((edited, alone), optimizers, strict=True):
-        taken(model, optimizer, range(3))
+        take_steps(model, optimizer, range(3))
     keep = torch.tensor([1, 5])
     nothing = {
         name: torch.zeros(0, width)
@@ -167,21 +170,21 @@ def test_kept_rows_continue_as_if_nothing_happened():
 
 
 def test_replacing_before_the_first_step_works():
-    model = a_model()
-    optimizer = Optimizer(model, RATES)
+    model = make_model()
+    optimizer = Optimizer(model, LEARNING_RATES)
     new = {
         name: torch.zeros(3, width)
         for name, width in zip(Gaussians.PARAMETER_NAMES, Gaussians.PARAMETER_WIDTHS, strict=True)
     }
     optimizer.replace_gaussians(torch.arange(6), new)
-    taken(model, optimizer, range(2))
+    take_steps(model, optimizer, range(2))
     assert len(model) == 9 and optimizer.state_dict()["positions.0.exp_avg"].shape == (9, 3)
 
 
 def test_resetting_sets_values_and_forgets_moments_of_one_group():
-    model = a_model()
-    optimizer = Optimizer(model, RATES)
-    taken(model, optimizer, range(3))
+    model = make_model()
+    optimizer = Optimizer(model, LEARNING_RATES)
+    take_steps(model, optimizer, range(3))
     before = {key: value.clone() for key, value in optimizer.state_dict().items()}
 
     optimizer.reset("opacity_logits", torch.full((6, 1), -3.0))
@@ -195,17 +198,17 @@ def test_resetting_sets_values_and_forgets_moments_of_one_group():
 
 
 def test_a_state_dict_continues_with_the_same_bits():
-    model = a_model()
-    optimizer = Optimizer(model, RATES)
-    taken(model, optimizer, range(5))
-    copy = a_model(seed=9)
+    model = make_model()
+    optimizer = Optimizer(model, LEARNING_RATES)
+    take_steps(model, optimizer, range(5))
+    copy = make_model(seed=9)
     copy.load_state_dict(model.state_dict())
     state = {key: value.clone() for key, value in optimizer.state_dict().items()}
-    restored = Optimizer(copy, RATES)
+    restored = Optimizer(copy, LEARNING_RATES)
     restored.load_state_dict(state)
 
-    taken(model, optimizer, range(5, 10))
-    taken(copy, restored, range(5, 10))
+    take_steps(model, optimizer, range(5, 10))
+    take_steps(copy, restored, range(5, 10))
 
     assert all(torch.equal(p, q) for p, q in zip(model.parameters(), copy.parameters(), strict=True))
     states = optimizer.state_dict(), restored.state_dict()
@@ -213,24 +216,24 @@ def test_a_state_dict_continues_with_the_same_bits():
     assert all(torch.equal(states[1][key], states[0][key]) for key in states[0])
 
 
-def test_a_state_of_no_steps_continues_too():
-    model, copy = a_model(), a_model()
-    optimizer, restored = Optimizer(model, RATES), Optimizer(copy, RATES)
+def test_a_state_before_the_first_step_can_be_loaded():
+    model, copy = make_model(), make_model()
+    optimizer, restored = Optimizer(model, LEARNING_RATES), Optimizer(copy, LEARNING_RATES)
     restored.load_state_dict(optimizer.state_dict())
-    taken(model, optimizer, range(2))
-    taken(copy, restored, range(2))
+    take_steps(model, optimizer, range(2))
+    take_steps(copy, restored, range(2))
     assert all(torch.equal(p, q) for p, q in zip(model.parameters(), copy.parameters(), strict=True))
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
 @pytest.mark.parametrize("group", [*Gaussians.PARAMETER_NAMES, "fields"])
 def test_the_group_with_a_broken_gradient_is_named(bad, group):
-    model = a_model()
+    model = make_model()
     set_gradients(model, 0)
     broken = model.radiance.weights[1] if group == "fields" else getattr(model.gaussians, group)
     broken.grad.view(-1)[3] = bad
     before = {name: p.detach().clone() for name, p in model.named_parameters()}
-    optimizer = Optimizer(model, RATES)
+    optimizer = Optimizer(model, LEARNING_RATES)
 
     assert optimizer.names(optimizer.step(0, 20).tolist()) == [group]
 
@@ -239,8 +242,8 @@ def test_the_group_with_a_broken_gradient_is_named(bad, group):
 
 
 def test_healthy_gradients_name_no_group():
-    model = a_model()
+    model = make_model()
     set_gradients(model, 0)
     model.radiance.biases[0].grad = None
-    optimizer = Optimizer(model, RATES)
+    optimizer = Optimizer(model, LEARNING_RATES)
     assert optimizer.names(optimizer.step(0, 20).tolist()) == []

@@ -1,4 +1,4 @@
-"""Photos that cannot be used are found before the first step, not after the last."""
+"""Photos that cannot be used are an error before the first step, not after the last."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from hyrfpack.errors import HyrfDataError, HyrfTrainingError
 from hyrfpack.scene import Picture, Scene, View
 from hyrfpack.train import TrainConfig, Trainer, train_model
 
-CONFIG = TrainConfig(steps=2, max_gaussians=60)
+TINY_TRAIN_CONFIG = TrainConfig(steps=2, max_gaussians=60)
 
 
 @pytest.fixture
 def no_step(monkeypatch):
-    """Training fails at its first step: what is refused is refused before it."""
+    """Training fails at its first step, so that an error has to come before it."""
 
     def step(self, view, picture):
         raise AssertionError("a step was taken")
@@ -32,29 +32,29 @@ def no_step(monkeypatch):
 
 @pytest.fixture
 def photos(data, tmp_path) -> Path:
-    """A copy of ten small photos that may be damaged; 0000.png and 0008.png are held out."""
+    """A copy of ten small photos that a test may damage; 0000.png and 0008.png are held out."""
     return shutil.copytree(data, tmp_path / "photos")
 
 
-def masked(view: View) -> View:
+def mask_all_pixels(view: View) -> View:
     picture = view.load()
     black = Picture(picture.rgb, None, np.zeros(picture.rgb.shape[:2], bool))
     return dataclasses.replace(view, load=lambda: black)
 
 
-def split(train=lambda view: view, test=lambda view: view) -> Scene:
+def make_split_scene(train=lambda view: view, test=lambda view: view) -> Scene:
     scene = ball_scene(views=6, points=60, side=24)
     return dataclasses.replace(scene, train=[*map(train, scene.train[2:])], test=[*map(test, scene.train[:2])])
 
 
 def test_black_masks_of_all_photos_are_rejected_before_the_first_step(no_step, tmp_path):
     with pytest.raises(HyrfTrainingError, match=r"all 4 photos to train on leave no pixel, 002\.png for one"):
-        train_model(split(train=masked), tmp_path, CONFIG, quiet=True)
+        train_model(make_split_scene(train=mask_all_pixels), tmp_path, TINY_TRAIN_CONFIG, quiet=True)
 
 
 def test_black_masks_of_all_held_out_photos_are_rejected_before_the_first_step(no_step, tmp_path):
     with pytest.raises(HyrfTrainingError, match=r"all 2 photos to score leave no pixel, 000\.png for one"):
-        train_model(split(test=masked), tmp_path, CONFIG, quiet=True)
+        train_model(make_split_scene(test=mask_all_pixels), tmp_path, TINY_TRAIN_CONFIG, quiet=True)
 
 
 def test_a_black_mask_file_for_every_photo_is_rejected_by_the_command(no_step, photos, tmp_path):
@@ -66,13 +66,13 @@ def test_a_black_mask_file_for_every_photo_is_rejected_by_the_command(no_step, p
 
 
 def test_one_photo_with_a_pixel_to_train_on_and_one_to_score_are_enough(tmp_path):
-    scene = split()
+    scene = make_split_scene()
     first, *others = scene.train
     scene = dataclasses.replace(
-        scene, train=[masked(first), *others], test=[masked(scene.test[0]), scene.test[1]], notes=[]
+        scene, train=[mask_all_pixels(first), *others], test=[mask_all_pixels(scene.test[0]), scene.test[1]], notes=[]
     )
 
-    result = train_model(scene, tmp_path, dataclasses.replace(CONFIG, steps=8), quiet=True)
+    result = train_model(scene, tmp_path, dataclasses.replace(TINY_TRAIN_CONFIG, steps=8), quiet=True)
 
     assert result.metrics["evaluation"]["skipped"] == ["000.png"]
 
@@ -82,16 +82,16 @@ def test_a_truncated_held_out_photo_is_rejected_before_the_first_step_and_named(
     (photos / "images" / "0008.png").write_bytes(whole[: len(whole) // 2])
 
     with pytest.raises(HyrfDataError, match=r"0008\.png: cannot decode the picture"):
-        train_model(load_scene(photos), tmp_path / "run", CONFIG, quiet=True)
+        train_model(load_scene(photos), tmp_path / "run", TINY_TRAIN_CONFIG, quiet=True)
 
 
-def test_photos_to_train_on_are_not_all_read_beforehand(tmp_path):
+def test_training_photos_are_not_all_read_before_the_first_step(tmp_path):
     read = []
 
     def counted(view: View) -> View:
         return dataclasses.replace(view, load=lambda: read.append(view.name) or view.load())
 
-    scene = dataclasses.replace(split(train=counted), test=[])
-    train_model(scene, tmp_path, dataclasses.replace(CONFIG, steps=1), cache=PictureCache(), quiet=True)
+    scene = dataclasses.replace(make_split_scene(train=counted), test=[])
+    train_model(scene, tmp_path, dataclasses.replace(TINY_TRAIN_CONFIG, steps=1), cache=PictureCache(), quiet=True)
 
-    assert len(read) <= 2  # the one that has a pixel, and that of the step
+    assert len(read) <= 2  # the first photo with an unmasked pixel, and the photo of the step

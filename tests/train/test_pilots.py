@@ -1,4 +1,4 @@
-"""What pilot runs decide for a scene, and that the run they were for keeps to it."""
+"""Decisions of pilot runs about a scene, and how the main run keeps them."""
 
 from __future__ import annotations
 
@@ -31,33 +31,33 @@ from hyrfpack.train.decisions import (
 from hyrfpack.train.exposure_pilots import measure_exposure
 from hyrfpack.train.pilots import PilotsStopped, ScenePilots
 
-CPU = torch.device("cpu")
-LONG = TrainConfig(steps=MIN_BUDGET_STEPS)
+CPU_DEVICE = torch.device("cpu")
+LONG_CONFIG = TrainConfig(steps=MIN_BUDGET_STEPS)
 
 
-def a_scene(views: int = 10) -> Scene:
+def make_scene(views: int = 10) -> Scene:
     return ball_scene(views=views, points=60, side=24)
 
 
-def measured(scene: Scene, config: TrainConfig = LONG, **options) -> tuple[float, str]:
-    return measure_budget(ScenePilots(scene, config, PictureCache(), CPU, **options), exposure=False)
+def measure_scene_budget(scene: Scene, config: TrainConfig = LONG_CONFIG, **options) -> tuple[float, str]:
+    return measure_budget(ScenePilots(scene, config, PictureCache(), CPU_DEVICE, **options), exposure=False)
 
 
 @pytest.fixture
-def short(monkeypatch) -> None:
-    """Pilots before runs of ten steps, and short ones."""
+def short_pilots(monkeypatch) -> None:
+    """Pilots also precede runs of ten steps, and are short."""
     monkeypatch.setattr(decisions, "MIN_BUDGET_STEPS", 10)
     monkeypatch.setattr(budget_pilots, "BUDGET_PILOT_STEPS", 6)
 
 
-def scored(psnr: float, corrected: float = 0.0, apart: tuple[float, ...] = (0.0, 0.0)) -> Evaluation:
+def make_evaluation(psnr: float, corrected: float = 0.0, apart: tuple[float, ...] = (0.0, 0.0)) -> Evaluation:
     views = [ViewScore("view", psnr + part, None, corrected, 0.5, None) for part in apart]
     return Evaluation(psnr, None, corrected, 0.5, None, "", 0, 0.0, views)
 
 
 @pytest.fixture
 def scores(monkeypatch) -> dict:
-    """What models score, by their Gaussians at most, or by whether they learn gains; they are not trained."""
+    """Scores of models by their maximum number of Gaussians, or by whether they learn gains. No model is trained."""
     table: dict = {}
 
     class Untrained:
@@ -69,12 +69,12 @@ def scores(monkeypatch) -> dict:
 
     def evaluate(config, views, report):
         if config.exposure in table:
-            return scored(
+            return make_evaluation(
                 table[config.exposure][config.seed],
                 0.0,
                 table["apart"] if config.exposure else (0.0,) * len(table["apart"]),
             )
-        return scored(0.0, table[config.max_gaussians])
+        return make_evaluation(0.0, table[config.max_gaussians])
 
     monkeypatch.setattr(pilots, "Trainer", Untrained)
     monkeypatch.setattr(pilots, "evaluate_model", evaluate)
@@ -85,26 +85,26 @@ def scores(monkeypatch) -> dict:
     ("gain", "factor"),
     [(-1.0, 0.25), (0.0, 0.25), (0.29, 0.25), (0.31, 0.35), (0.5, 0.5), (0.8, 0.7), (1.2, 1.0), (1.3, 1.5), (9.0, 1.5)],
 )
-def test_a_scene_gets_gaussians_in_proportion_to_what_two_doublings_bring(scores, gain, factor):
+def test_the_budget_factor_follows_the_gain_of_two_doublings(scores, gain, factor):
     gain *= budget_pilots.EXPECTED_GAIN_DB
     scores |= {1250: 20.0, 5000: 20.0 + gain}
     why = f"in {budget_pilots.BUDGET_PILOT_STEPS} steps 5,000 Gaussians scored {gain:+.2f} dB over 1,250"
-    assert measured(a_scene()) == (factor, why)
+    assert measure_scene_budget(make_scene()) == (factor, why)
 
 
 @pytest.mark.parametrize(("first", "second", "factor"), [(0.1, 0.9, 0.5), (0.9, 0.1, 0.5), (1.0, 0.0, 1.0)])
-def test_what_would_make_the_model_smaller_is_asked_twice(monkeypatch, scores, first, second, factor):
+def test_a_smaller_budget_needs_two_seeds(monkeypatch, scores, first, second, factor):
     gains = {0: first * budget_pilots.EXPECTED_GAIN_DB, 1: second * budget_pilots.EXPECTED_GAIN_DB}
     seeds: list[int] = []
 
-    class Seeded(pilots.Trainer):  # the one of `scores`
+    class Seeded(pilots.Trainer):  # this is the Trainer that `scores` has put there
         def __init__(self, scene, config, cache, device):
             self.model = 20 + gains[config.seed] * (config.max_gaussians == 5000)
             seeds.append(config.seed)
 
     monkeypatch.setattr(pilots, "Trainer", Seeded)
-    monkeypatch.setattr(pilots, "evaluate_model", lambda model, views, report: scored(0.0, model))
-    assert measured(a_scene())[0] == factor
+    monkeypatch.setattr(pilots, "evaluate_model", lambda model, views, report: make_evaluation(0.0, model))
+    assert measure_scene_budget(make_scene())[0] == factor
     assert seeds == ([0, 0] if first >= 1 else [0, 0, 1, 1])
 
 
@@ -119,12 +119,12 @@ def test_what_would_make_the_model_smaller_is_asked_twice(monkeypatch, scores, f
         ({"budget_factor": 1.0}, 8, False),
     ],
 )
-def test_it_is_measured_where_nobody_has_said_and_there_is_time_and_photos_enough(change, views, expected):
-    assert measures_budget(a_scene(views), dataclasses.replace(LONG, **change)) is expected
+def test_the_budget_is_measured_only_where_it_is_unset_and_steps_and_photos_suffice(change, views, expected):
+    assert measures_budget(make_scene(views), dataclasses.replace(LONG_CONFIG, **change)) is expected
 
 
 @pytest.mark.parametrize("views", [8, 13, 15, 16, 100, 1000])
-def test_photos_to_judge_by_are_not_trained_on_and_lie_among_those_that_are(views):
+def test_validation_photos_are_not_trained_on_and_lie_between_training_photos(views):
     near, judges = pilots.split(range(views))
     assert not set(near) & set(judges) and set(near) | set(judges) <= set(range(views))
     assert near == sorted(near) and len(near) == min(pilots.MAX_TRAINING_VIEWS, views - len(judges))
@@ -132,53 +132,53 @@ def test_photos_to_judge_by_are_not_trained_on_and_lie_among_those_that_are(view
     assert all(min(abs(judge - n) for n in near) == 1 for judge in judges)
 
 
-@pytest.mark.usefixtures("short")
-def test_pilots_say_the_same_twice_and_report_each_step():
+@pytest.mark.usefixtures("short_pilots")
+def test_pilots_are_deterministic_and_report_each_step():
     told: list[tuple] = []
-    first = measured(a_scene(), report=lambda *facts: told.append(facts))
-    assert first == measured(a_scene())
+    first = measure_scene_budget(make_scene(), report=lambda *facts: told.append(facts))
+    assert first == measure_scene_budget(make_scene())
     assert first is not None and first[0] in BUDGET_FACTORS
     assert [step for step, *_ in told] in (list(range(1, 13)), list(range(1, 25)))
     assert all(np.isfinite(loss) and mse > 0 and gaussians > 0 for _, loss, mse, gaussians in told)
 
 
-@pytest.mark.usefixtures("short")
-def test_pilots_end_where_they_are_asked_to():
+@pytest.mark.usefixtures("short_pilots")
+def test_pilots_stop_when_requested():
     told: list[int] = []
     with pytest.raises(PilotsStopped):
-        measured(a_scene(), report=lambda step, *_: told.append(step), stop=lambda: len(told) >= 8)
+        measure_scene_budget(make_scene(), report=lambda step, *_: told.append(step), stop=lambda: len(told) >= 8)
     assert told[-1] == 8
 
 
-@pytest.mark.usefixtures("short")
+@pytest.mark.usefixtures("short_pilots")
 @pytest.mark.parametrize("left", [0, 1])
-def test_photos_that_masks_leave_nothing_of_do_not_judge(left, monkeypatch):
+def test_completely_masked_photos_are_no_validation_photos(left, monkeypatch):
     judged: list[list[str]] = []
     monkeypatch.setattr(
         pilots,
-        "evaluate",
-        lambda _, views, report: judged.append([view.name for view in views]) or scored(0.0, 20.0),
+        "evaluate_model",
+        lambda _, views, report: judged.append([view.name for view in views]) or make_evaluation(0.0, 20.0),
     )
-    scene = a_scene()
+    scene = make_scene()
     judges = [view.name for view in pilots.split(scene.train)[1]]
-    views = [masked(view) if view.name in judges[left:] else view for view in scene.train]
-    factor, why = measured(dataclasses.replace(scene, train=views))
+    views = [mask_all_pixels(view) if view.name in judges[left:] else view for view in scene.train]
+    factor, why = measure_scene_budget(dataclasses.replace(scene, train=views))
     if left:
-        assert judged == [judges[:1]] * 4  # no gain: asked twice
+        assert judged == [judges[:1]] * 4  # without a gain each size is scored twice
     else:
         assert (factor, why) == (1.0, "masks leave nothing of the photos to judge by") and not judged
 
 
-def masked(view: View) -> View:
+def mask_all_pixels(view: View) -> View:
     picture = view.load()
     nothing = dataclasses.replace(picture, mask=np.zeros(picture.rgb.shape[:2], bool))
     return dataclasses.replace(view, load=lambda: nothing)
 
 
-@pytest.mark.usefixtures("short")
-def test_a_run_has_the_budget_that_pilots_tell_and_says_why(tmp_path, monkeypatch, capsys):
+@pytest.mark.usefixtures("short_pilots")
+def test_a_run_takes_the_budget_of_its_pilots_and_records_the_reason(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(decisions, "measure_budget", lambda *_: (0.5, "by a coin"))
-    train_model(a_scene(), tmp_path, TrainConfig(steps=10))
+    train_model(make_scene(), tmp_path, TrainConfig(steps=10))
     metrics = json.loads((tmp_path / "metrics.json").read_bytes())
     assert metrics["settings"]["budget_factor"] == 0.5
     reason = metrics["choices"]["max_gaussians"]
@@ -186,8 +186,8 @@ def test_a_run_has_the_budget_that_pilots_tell_and_says_why(tmp_path, monkeypatc
     assert f"Gaussians at most: {reason}" in capsys.readouterr().err
 
 
-def interrupted_at(step: int):
-    """A report that interrupts as a person does, once."""
+def interrupt_at(step: int):
+    """Return a report function that sends SIGTERM once, as a user would."""
     left = [step]
 
     def report(step: int, loss: float, mse: float, gaussians: int) -> None:
@@ -198,17 +198,17 @@ def interrupted_at(step: int):
     return report
 
 
-@pytest.mark.usefixtures("short", "signals")
+@pytest.mark.usefixtures("short_pilots", "signals")
 def test_a_run_that_continues_keeps_its_budget_and_the_reason(tmp_path, monkeypatch):
     config = TrainConfig(steps=10)
-    train_model(a_scene(), tmp_path / "whole", config, quiet=True)
-    assert train_model(a_scene(), tmp_path / "again", config, report=interrupted_at(6)).step == 6
+    train_model(make_scene(), tmp_path / "whole", config, quiet=True)
+    assert train_model(make_scene(), tmp_path / "again", config, report=interrupt_at(6)).step == 6
 
     monkeypatch.setattr(decisions, "measure_budget", lambda *_: pytest.fail("measured again"))
     for asked in ({"max_gaussians": 5_000}, {"target_bytes": 20_000}, {"budget_factor": 0.9}):
         with pytest.raises(HyrfTrainingError, match="started with other settings"):
-            train_model(a_scene(), tmp_path / "again", dataclasses.replace(config, **asked), resume=True, quiet=True)
-    train_model(a_scene(), tmp_path / "again", config, resume=True, quiet=True)
+            train_model(make_scene(), tmp_path / "again", dataclasses.replace(config, **asked), resume=True, quiet=True)
+    train_model(make_scene(), tmp_path / "again", config, resume=True, quiet=True)
 
     whole, again = (json.loads((tmp_path / name / "metrics.json").read_bytes()) for name in ("whole", "again"))
     assert whole["settings"] == again["settings"] and whole["choices"] == again["choices"]
@@ -216,24 +216,24 @@ def test_a_run_that_continues_keeps_its_budget_and_the_reason(tmp_path, monkeypa
     assert (tmp_path / "whole/model.hyrf").read_bytes() == (tmp_path / "again/model.hyrf").read_bytes()
 
 
-@pytest.mark.usefixtures("short", "signals")
+@pytest.mark.usefixtures("short_pilots", "signals")
 def test_an_interrupt_before_the_first_step_leaves_nothing(tmp_path):
-    result = train_model(a_scene(), tmp_path, TrainConfig(steps=10), report=interrupted_at(0))
+    result = train_model(make_scene(), tmp_path, TrainConfig(steps=10), report=interrupt_at(0))
     assert (result.complete, result.step, result.model, result.metrics) == (False, 0, None, {})
     assert not any(tmp_path.iterdir())
 
 
-@pytest.mark.usefixtures("short")
-def test_the_report_hears_of_pilots_as_step_nought(tmp_path):
+@pytest.mark.usefixtures("short_pilots")
+def test_pilots_are_reported_as_step_0(tmp_path):
     steps: list[int] = []
-    train_model(a_scene(), tmp_path, TrainConfig(steps=10), report=lambda step, *_: steps.append(step))
+    train_model(make_scene(), tmp_path, TrainConfig(steps=10), report=lambda step, *_: steps.append(step))
     assert steps[-10:] == list(range(1, 11)) and steps[:-10] in ([0] * 12, [0] * 24)
 
 
-@pytest.mark.usefixtures("short")
-def test_pilot_runs_tell_each_step_and_each_view_that_is_scored():
+@pytest.mark.usefixtures("short_pilots")
+def test_pilot_runs_report_each_step_and_each_scored_view():
     told: list[tuple[str, int, int]] = []
-    measured(a_scene(), phase=lambda *progress: told.append(progress))
+    measure_scene_budget(make_scene(), phase=lambda *progress: told.append(progress))
     assert [row for row in told if row[0] == "pilot run 1 of 2 for the budget: training"] == [
         ("pilot run 1 of 2 for the budget: training", step, 6) for step in range(1, 7)
     ]
@@ -245,8 +245,8 @@ def test_pilot_runs_tell_each_step_and_each_view_that_is_scored():
 # -- exposure --------------------------------------------------------------------------------------------------------
 
 
-def relit(scene: Scene, stops: list[float]) -> Scene:
-    """The scene, its training photos exposed by gains, one after another."""
+def expose_scene(scene: Scene, stops: list[float]) -> Scene:
+    """Return the scene with its training photos exposed by these stops, in order."""
 
     def exposed(view: View, gain: float) -> View:
         picture = view.load()
@@ -274,12 +274,12 @@ def relit(scene: Scene, stops: list[float]) -> Scene:
         ([20.0, 25.0], (0.0,) * 5, False, 1),
     ],
 )
-def test_gains_are_learnt_only_where_renders_come_closer_to_photos_by_more_than_chance(
+def test_gains_are_learnt_only_where_the_improvement_is_significant(
     scores, monkeypatch, compensated, apart, expected, rounds
 ):
     monkeypatch.setattr(exposure_pilots, "exposure_spread", lambda *_: 1.0)
     scores |= {False: [20.0, 20.0], True: compensated, "apart": apart}
-    runs = ScenePilots(a_scene(20), LONG, PictureCache(), CPU)
+    runs = ScenePilots(make_scene(20), LONG_CONFIG, PictureCache(), CPU_DEVICE)
     decision, reason = measure_exposure(runs)
 
     assert decision is expected and "validation photos" in reason
@@ -289,29 +289,31 @@ def test_gains_are_learnt_only_where_renders_come_closer_to_photos_by_more_than_
 
 
 @pytest.mark.parametrize(("steps", "pilot_steps"), [(1_000, 167), (900, 150), (3_000, 500), (30_000, 500)])
-def test_pilots_take_a_sixth_of_the_run_within_limits(steps, pilot_steps):
+def test_pilots_have_a_sixth_of_the_steps_of_the_run_within_limits(steps, pilot_steps):
     assert exposure_pilots.exposure_pilot_steps(steps) == pilot_steps
 
 
 @pytest.mark.parametrize("left", [0, 1, 3])
-def test_too_few_validation_photos_with_pixels_decide_nothing(scores, monkeypatch, left):
+def test_too_few_unmasked_validation_photos_decide_nothing(scores, monkeypatch, left):
     monkeypatch.setattr(exposure_pilots, "exposure_spread", lambda *_: 1.0)
     scores |= {False: [20.0] * 2, True: [25.0] * 2, "apart": (0.0,) * left}
-    scene = a_scene(20)
+    scene = make_scene(20)
     usable = {view.name for view in pilots.split(scene.train, 4, 16)[1][:left]}
-    views = [view if view.name in usable else masked(view) for view in scene.train]
-    decision, reason = measure_exposure(ScenePilots(dataclasses.replace(scene, train=views), LONG, PictureCache(), CPU))
+    views = [view if view.name in usable else mask_all_pixels(view) for view in scene.train]
+    decision, reason = measure_exposure(
+        ScenePilots(dataclasses.replace(scene, train=views), LONG_CONFIG, PictureCache(), CPU_DEVICE)
+    )
     assert decision is False and f"{left} " in reason and "validation photos" in reason
 
 
-def test_photos_of_one_exposure_take_no_pilots():
-    runs = ScenePilots(a_scene(20), LONG, PictureCache(), CPU)
+def test_photos_of_one_exposure_need_no_pilots():
+    runs = ScenePilots(make_scene(20), LONG_CONFIG, PictureCache(), CPU_DEVICE)
     decision, reason = measure_exposure(runs)
     assert (decision, runs.scores) == (False, []) and "stops" in reason
 
 
 @pytest.mark.parametrize(("photos", "rounds"), [(8, 3), (11, 3), (12, 2), (100, 2)])
-def test_few_photos_take_more_rounds_so_that_six_photos_validate(scores, monkeypatch, photos, rounds):
+def test_few_photos_take_more_folds_so_that_six_photos_validate(scores, monkeypatch, photos, rounds):
     monkeypatch.setattr(exposure_pilots, "exposure_spread", lambda *_: 1.0)
     scores |= {False: [20.0] * 4, True: [20.3] * 4, "apart": (-0.9, 0.9, 0.0, 0.0, 0.0)}
     validated: list[list[str]] = []
@@ -323,7 +325,7 @@ def test_few_photos_take_more_rounds_so_that_six_photos_validate(scores, monkeyp
         return result
 
     monkeypatch.setattr(ScenePilots, "fold", recorded)
-    decision, _ = measure_exposure(ScenePilots(a_scene(photos), LONG, PictureCache(), CPU))
+    decision, _ = measure_exposure(ScenePilots(make_scene(photos), LONG_CONFIG, PictureCache(), CPU_DEVICE))
 
     names = [name for views in validated for name in views]
     assert decision and len(validated) == rounds
@@ -341,33 +343,33 @@ def test_few_photos_take_more_rounds_so_that_six_photos_validate(scores, monkeyp
         ({"exposure": True}, 8, False),
     ],
 )
-def test_exposure_is_decided_where_no_setting_does_and_run_and_photos_allow_it(change, views, expected):
+def test_exposure_pilots_run_only_where_no_setting_decides_and_steps_and_photos_suffice(change, views, expected):
     config = dataclasses.replace(TrainConfig(steps=3_000), **change)
-    assert measures_exposure(a_scene(views), config) is expected
+    assert measures_exposure(make_scene(views), config) is expected
 
 
 def test_photos_with_transparency_get_no_gains():
-    assert not measures_exposure(ball_scene(views=10, points=60, side=24, alpha=True), LONG)
+    assert not measures_exposure(ball_scene(views=10, points=60, side=24, alpha=True), LONG_CONFIG)
 
 
-def test_what_is_settled_takes_no_pilots():
+def test_settings_that_are_given_need_no_pilots():
     config = TrainConfig(steps=MIN_BUDGET_STEPS, exposure=True, max_gaussians=100)
-    assert decide(a_scene(), config, PictureCache(), CPU) == Decisions(config, {}, [])
-    assert max_pilot_steps(a_scene(), config) == 0
+    assert decide(make_scene(), config, PictureCache(), CPU_DEVICE) == Decisions(config, {}, [])
+    assert max_pilot_steps(make_scene(), config) == 0
 
 
 def test_a_short_run_without_a_decision_learns_no_gains():
-    decided = decide(a_scene(), TrainConfig(steps=10), PictureCache(), CPU)
+    decided = decide(make_scene(), TrainConfig(steps=10), PictureCache(), CPU_DEVICE)
     assert decided is not None and decided.config.exposure is False and decided.config.budget_factor is None
 
 
-@pytest.mark.usefixtures("short", "signals")
+@pytest.mark.usefixtures("short_pilots", "signals")
 def test_a_run_that_continues_keeps_its_exposure_compensation(tmp_path, monkeypatch):
     monkeypatch.setattr(decisions, "MIN_EXPOSURE_STEPS", 10)
     monkeypatch.setattr(decisions, "measure_exposure", lambda *_: (True, "by a coin"))
-    scene, config = relit(a_scene(), [0.5, -0.5]), TrainConfig(steps=10)
+    scene, config = expose_scene(make_scene(), [0.5, -0.5]), TrainConfig(steps=10)
     train_model(scene, tmp_path / "whole", config, quiet=True)
-    assert train_model(scene, tmp_path / "again", config, report=interrupted_at(6)).step == 6
+    assert train_model(scene, tmp_path / "again", config, report=interrupt_at(6)).step == 6
     monkeypatch.setattr(decisions, "measure_exposure", lambda *_: pytest.fail("measured again"))
     train_model(scene, tmp_path / "again", config, resume=True, quiet=True)
 

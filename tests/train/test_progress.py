@@ -13,7 +13,7 @@ from hyrfpack.train import progress
 from hyrfpack.train.progress import PhaseLine, ProgressLine, duration
 
 
-def test_a_log_file_gets_plain_lines_with_all_that_matters(capsys, monkeypatch):
+def test_a_log_file_gets_plain_lines_with_all_labels(capsys, monkeypatch):
     monkeypatch.setattr(progress, "LOG_INTERVAL_SECONDS", 0.0)
     with ProgressLine(20, 0) as line:
         for step in range(1, 21):
@@ -27,21 +27,21 @@ def test_a_log_file_gets_plain_lines_with_all_that_matters(capsys, monkeypatch):
     assert "left" in err.splitlines()[-2] and "left" not in last
 
 
-def test_the_last_step_is_always_said(capsys):
+def test_the_last_step_is_always_printed(capsys):
     with ProgressLine(3, 0) as line:
         for step in (1, 2, 3):
             line.update(step, 1.0, 0.1, 5)
     assert capsys.readouterr().err.startswith("step 3/3")
 
 
-def test_quiet_says_nothing(capsys, monkeypatch):
+def test_quiet_prints_nothing(capsys, monkeypatch):
     monkeypatch.setattr(progress, "LOG_INTERVAL_SECONDS", 0.0)
     with ProgressLine(3, 0, quiet=True) as line:
         line.update(3, 1.0, 0.1, 5)
     assert capsys.readouterr() == ("", "")
 
 
-def test_running_means_start_at_the_first_value_and_follow():
+def test_running_means_start_at_the_first_value():
     line = ProgressLine(1000, 0, quiet=True)
     line.update(1, 1.0, 0.5, 5)
     assert (line.loss, line.mse) == (1.0, 0.5)
@@ -50,8 +50,8 @@ def test_running_means_start_at_the_first_value_and_follow():
     assert line.loss == pytest.approx(0.95**100) and line.mse == pytest.approx(0.5 * 0.95**100)
 
 
-def test_steps_without_an_error_leave_the_means_alone(capsys, monkeypatch):
-    """A photo that is masked all over has none."""
+def test_steps_without_an_error_do_not_change_the_running_means(capsys, monkeypatch):
+    """A photo that is masked completely has no error."""
     monkeypatch.setattr(progress, "LOG_INTERVAL_SECONDS", 0.0)
     with ProgressLine(10, 0) as line:
         line.update(1, 0.0, float("nan"), 5)
@@ -61,15 +61,15 @@ def test_steps_without_an_error_leave_the_means_alone(capsys, monkeypatch):
     assert (line.loss, line.mse) == (1.0, 0.01) and "PSNR 20.00" in capsys.readouterr().err
 
 
-def test_a_perfect_picture_does_not_break_the_line(capsys):
+def test_an_error_of_0_gives_a_valid_line(capsys):
     with ProgressLine(1, 0) as line:
         line.update(1, 0.0, 0.0, 5)
     assert "PSNR 100.00" in capsys.readouterr().err and math.isfinite(line.mse)
 
 
-# -- what fits on a terminal -----------------------------------------------------------------------------------------
+# -- fitting the line to a terminal ----------------------------------------------------------------------------------
 
-PARTS = {
+SHORT_LINE_PARTS = {
     "steps": "604/3,000",
     "speed": "40.2 steps/s",
     "loss": "loss 0.0381",
@@ -78,7 +78,7 @@ PARTS = {
     "gone": "15 s gone",
     "left": "60 s left",
 }
-LONG_PARTS = {
+LONG_LINE_PARTS = {
     "steps": "29,604/30,000",
     "speed": "125.5 s/step",
     "loss": "loss 0.0381",
@@ -87,7 +87,7 @@ LONG_PARTS = {
     "gone": "120:15:22 gone",
     "left": "11:15:22 left",
 }
-FITTING = {
+LINE_BY_TERMINAL_WIDTH = {
     40: "604/3,000  PSNR 29.40  60 s left",
     60: "604/3,000  40.2 steps/s  PSNR 29.40  15 s gone  60 s left",
     80: "604/3,000  ━━━━━━━━  40.2 steps/s  loss 0.0381  PSNR 29.40  15 s gone  60 s left",
@@ -102,8 +102,8 @@ class Terminal(io.StringIO):
         return True
 
 
-def drawn(parts: dict[str, str], width: int, encoding: str = "utf-8") -> str:
-    """The line as a terminal shows it."""
+def draw_line(parts: dict[str, str], width: int, encoding: str = "utf-8") -> str:
+    """Return the line as a terminal shows it."""
     file = Terminal()
     file.encoding = encoding
     Console(width=width, file=file, force_terminal=True, color_system=None).print(
@@ -113,22 +113,22 @@ def drawn(parts: dict[str, str], width: int, encoding: str = "utf-8") -> str:
     return line
 
 
-@pytest.mark.parametrize("width", FITTING)
+@pytest.mark.parametrize("width", LINE_BY_TERMINAL_WIDTH)
 def test_line_fits_the_terminal_and_leaves_out_the_least_important_first(width):
-    assert drawn(PARTS, width) == FITTING[width]
+    assert draw_line(SHORT_LINE_PARTS, width) == LINE_BY_TERMINAL_WIDTH[width]
 
 
-@pytest.mark.parametrize("parts", [PARTS, LONG_PARTS], ids=["short", "long"])
+@pytest.mark.parametrize("parts", [SHORT_LINE_PARTS, LONG_LINE_PARTS], ids=["short", "long"])
 def test_line_never_is_wider_than_the_terminal(parts):
     for width in range(1, 200):
-        line = drawn(parts, width)
+        line = draw_line(parts, width)
         assert len(line) <= width
         assert width < 14 or line.startswith(parts["steps"])
         assert width < 40 or (parts["psnr"] in line and parts["left"] in line)
 
 
 def test_bar_of_a_terminal_without_unicode_is_ascii():
-    assert drawn(PARTS, 120, encoding="ascii").isascii()
+    assert draw_line(SHORT_LINE_PARTS, 120, encoding="ascii").isascii()
 
 
 @pytest.mark.parametrize("width", [40, 60, 80, 120])
@@ -148,8 +148,8 @@ def test_a_terminal_gets_one_line_that_is_redrawn(width, monkeypatch):
     assert lines[-1].startswith("604/3,000  ") and "PSNR 30.00" in lines[-1] and lines[-1].endswith(" left")
 
 
-def test_the_line_stands_before_anything_is_written_above_it(monkeypatch):
-    """Else a sentence and the first drawing of the line, by another thread, can end up in one line."""
+def test_the_line_is_drawn_before_any_message_above_it(monkeypatch):
+    """Otherwise a message and the line's first drawing, by another thread, can end up on one line."""
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
     monkeypatch.setenv("TERM", "xterm")
@@ -170,15 +170,15 @@ def test_a_terminal_that_cannot_redraw_gets_plain_lines(monkeypatch):
 
 
 class Clock:
-    """Time that passes when told so."""
+    """A clock that advances only when a test sets it."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now = 1000.0
         monkeypatch.setattr(progress, "monotonic", lambda: self.now)
 
 
-def trained(clock: Clock, steps: int, seconds: float, count: int, **options) -> None:
-    """`count` steps of a run of `steps`, so many seconds each, the first one ten times as many."""
+def report_steps(clock: Clock, steps: int, seconds: float, count: int, **options) -> None:
+    """Report `count` steps of a run of `steps`; each takes `seconds`, the first one ten times as long."""
     with ProgressLine(steps, 0, **options) as line:
         for step in range(1, count + 1):
             clock.now += seconds * (10 if step == 1 else 1)
@@ -197,23 +197,23 @@ def trained(clock: Clock, steps: int, seconds: float, count: int, **options) -> 
         (45e3, "12:30:00"),
     ],
 )
-def test_more_than_two_minutes_are_said_as_hours_minutes_and_seconds(seconds, said):
+def test_more_than_two_minutes_are_printed_as_hours_minutes_and_seconds(seconds, said):
     assert duration(seconds) == said
 
 
 def test_times_of_a_log_file_are_readable(capsys, monkeypatch):
-    trained(Clock(monkeypatch), steps=3000, seconds=0.5, count=600)
+    report_steps(Clock(monkeypatch), steps=3000, seconds=0.5, count=600)
     last = capsys.readouterr().err.splitlines()[-1]
     assert re.search(r"  0:0[45]:\d\d gone  0:20:\d\d left$", last)
 
 
 def test_compiling_in_the_first_steps_does_not_count_as_slowness(capsys, monkeypatch):
-    trained(Clock(monkeypatch), steps=1000, seconds=2.0, count=20)
+    report_steps(Clock(monkeypatch), steps=1000, seconds=2.0, count=20)
     assert "2.0 s/step" in capsys.readouterr().err.splitlines()[-1]
 
 
 def test_more_than_an_hour_is_reported_once_with_what_would_shorten_it(capsys, monkeypatch):
-    trained(Clock(monkeypatch), steps=3000, seconds=12.0, count=40, advice="fewer --steps")
+    report_steps(Clock(monkeypatch), steps=3000, seconds=12.0, count=40, advice="fewer --steps")
     told = [line for line in capsys.readouterr().err.splitlines() if "hours" in line]
     assert told == ["this takes 10.0 more hours; fewer --steps would shorten it"]
 
@@ -223,17 +223,17 @@ def test_more_than_an_hour_is_reported_once_with_what_would_shorten_it(capsys, m
     [(3000, 1.0, 200), (3000, 12.0, 4), (30_000, 1.0, 11)],
     ids=["less than an hour", "too few steps", "too few seconds"],
 )
-def test_hours_are_not_told_where_there_are_none_or_too_early(steps, seconds, count, capsys, monkeypatch):
-    trained(Clock(monkeypatch), steps=steps, seconds=seconds, count=count, advice="fewer --steps")
+def test_short_runs_and_early_steps_give_no_note_about_hours(steps, seconds, count, capsys, monkeypatch):
+    report_steps(Clock(monkeypatch), steps=steps, seconds=seconds, count=count, advice="fewer --steps")
     assert "hours" not in capsys.readouterr().err
 
 
-def test_quiet_is_not_told_of_hours(capsys, monkeypatch):
-    trained(Clock(monkeypatch), steps=3000, seconds=12.0, count=40, quiet=True, advice="fewer --steps")
+def test_quiet_suppresses_the_note_about_hours(capsys, monkeypatch):
+    report_steps(Clock(monkeypatch), steps=3000, seconds=12.0, count=40, quiet=True, advice="fewer --steps")
     assert capsys.readouterr() == ("", "")
 
 
-# -- standard error that is not there --------------------------------------------------------------------------------
+# -- missing standard error ------------------------------------------------------------------------------------------
 
 
 def test_without_standard_error_nothing_is_shown_and_training_continues(capsys, monkeypatch):
@@ -245,7 +245,7 @@ def test_without_standard_error_nothing_is_shown_and_training_continues(capsys, 
 
 
 @pytest.mark.parametrize("terminal", [False, True], ids=["a file", "a terminal"])
-def test_standard_error_that_goes_away_does_not_end_the_training(terminal, monkeypatch):
+def test_training_continues_when_standard_error_closes(terminal, monkeypatch):
     gone = Terminal() if terminal else io.StringIO()
     monkeypatch.setattr(sys, "stderr", gone)
     monkeypatch.setenv("TERM", "xterm")
@@ -256,10 +256,10 @@ def test_standard_error_that_goes_away_does_not_end_the_training(terminal, monke
         line.update(3, 1.0, 0.1, 5)
 
 
-# -- what comes before and after the steps ---------------------------------------------------------------------------
+# -- phases before and after the steps -------------------------------------------------------------------------------
 
 
-def test_a_phase_says_what_is_done_how_far_it_is_and_how_long_it_takes():
+def test_a_phase_shows_its_name_progress_and_remaining_time():
     line = PhaseLine(quiet=True)
     line.update("scoring held-out photos", 0, 20)
     line.update("scoring held-out photos", 5, 20)
@@ -272,7 +272,7 @@ def test_a_phase_says_what_is_done_how_far_it_is_and_how_long_it_takes():
 
 
 @pytest.mark.parametrize(("done", "total"), [(0, 20), (20, 20), (0, 0)])
-def test_a_phase_never_says_that_no_time_is_left(done, total):
+def test_a_phase_never_shows_0_s_left(done, total):
     line = PhaseLine(quiet=True)
     line.update("scoring held-out photos", done, total)
     assert "left" not in line.parts(line.start + 10)

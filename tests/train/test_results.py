@@ -1,4 +1,4 @@
-"""Results beside the model: a full disk or an interruption after the last step costs no training."""
+"""A full disk or an interruption after the last step does not lose a training run's results."""
 
 from __future__ import annotations
 
@@ -19,28 +19,28 @@ from hyrfpack.scene import Scene
 from hyrfpack.train import TrainConfig, Trainer, train_model
 from hyrfpack.train import run as runs
 
-CONFIG = TrainConfig(steps=20, seed=1, max_gaussians=120)
-COMPLETE = {"model.hyrf", "metrics.json", "curve.png", "views"}
-TIMED = ("seconds", "steps_per_second", "stage_seconds")
+SHORT_CONFIG = TrainConfig(steps=20, seed=1, max_gaussians=120)
+COMPLETE_RUN_FILES = {"model.hyrf", "metrics.json", "curve.png", "views"}
+TIMING_KEYS = ("seconds", "steps_per_second", "stage_seconds")
 
 
-def a_scene() -> Scene:
-    """Six photos to train on and two held out."""
+def make_scene() -> Scene:
+    """Return a scene of six training photos and two held-out photos."""
     scene = ball_scene(views=8, points=60, side=24)
     return dataclasses.replace(scene, train=scene.train[2:], test=scene.train[:2])
 
 
-def names(out: Path) -> set[str]:
+def file_names(out: Path) -> set[str]:
     return {path.name for path in out.iterdir()}
 
 
-def metrics_of(out: Path) -> dict:
+def read_metrics(out: Path) -> dict:
     return json.loads((out / "metrics.json").read_bytes())
 
 
 @pytest.fixture
-def full(monkeypatch) -> set[str]:
-    """Endings of paths that there is no space for on the disk; a test fills and clears it."""
+def full_disk_suffixes(monkeypatch) -> set[str]:
+    """Suffixes of paths for which the disk has no space; a test fills and clears the set."""
     endings: set[str] = set()
 
     def checked(move: Callable[[StrPath, StrPath], None]) -> Callable[[StrPath, StrPath], None]:
@@ -58,35 +58,37 @@ def full(monkeypatch) -> set[str]:
 
 @pytest.fixture
 def no_training(monkeypatch):
-    """Returns a function after whose call nothing may be trained."""
+    """A function after whose call any training fails the test."""
     return lambda: monkeypatch.setattr(Trainer, "run", lambda *_, **__: pytest.fail("it was trained again"))
 
 
 @pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory) -> Path:
+def uninterrupted_run(tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("runs") / "undisturbed"
-    train_model(a_scene(), out, CONFIG, quiet=True)
+    train_model(make_scene(), out, SHORT_CONFIG, quiet=True)
     return out
 
 
 @pytest.mark.parametrize("resume", [False, True])
-def test_metrics_that_did_not_fit_are_completed_without_training(full, no_training, undisturbed, tmp_path, resume):
-    full.add("metrics.json")
-    result = train_model(a_scene(), tmp_path, CONFIG, quiet=True)
+def test_metrics_missing_after_a_full_disk_are_completed_without_training(
+    full_disk_suffixes, no_training, uninterrupted_run, tmp_path, resume
+):
+    full_disk_suffixes.add("metrics.json")
+    result = train_model(make_scene(), tmp_path, SHORT_CONFIG, quiet=True)
     assert result.complete and result.model.is_file() and result.metrics["evaluation"]["psnr"] > 0
     assert "metrics.json: the disk is full" in result.missing
-    assert names(tmp_path) == {"model.hyrf", "curve.png", "views", "training.json"}
-    times = {name: result.metrics[name] for name in TIMED}
+    assert file_names(tmp_path) == {"model.hyrf", "curve.png", "views", "training.json"}
+    times = {name: result.metrics[name] for name in TIMING_KEYS}
 
-    full.clear()
+    full_disk_suffixes.clear()
     no_training()
-    completed = train_model(a_scene(), tmp_path, CONFIG, resume=resume, quiet=True)
+    completed = train_model(make_scene(), tmp_path, SHORT_CONFIG, resume=resume, quiet=True)
 
     assert completed.complete and completed.step == 20 and completed.missing == ""
-    assert names(tmp_path) == COMPLETE
-    metrics, expected = metrics_of(tmp_path), metrics_of(undisturbed)
+    assert file_names(tmp_path) == COMPLETE_RUN_FILES
+    metrics, expected = read_metrics(tmp_path), read_metrics(uninterrupted_run)
     assert metrics == json.loads(json.dumps(completed.metrics)) and metrics.keys() == expected.keys()
-    assert {name: metrics[name] for name in TIMED} == times
+    assert {name: metrics[name] for name in TIMING_KEYS} == times
     for key in ("settings", "choices", "scene", "gaussians", "bytes", "device", "processes", "notes"):
         assert metrics[key] == expected[key], key
     curves = [[{**r, "seconds": 0} for r in m["curve"]] for m in (metrics, expected)]
@@ -96,37 +98,39 @@ def test_metrics_that_did_not_fit_are_completed_without_training(full, no_traini
 
 
 @pytest.mark.parametrize(("ending", "missing"), [("curve.png", "curve.png"), (".png", "views and curve.png")])
-def test_pictures_that_do_not_fit_do_not_fail_the_run(full, no_training, tmp_path, capsys, ending, missing):
-    full.add(ending)
-    result = train_model(a_scene(), tmp_path, CONFIG)
-    assert result.complete and metrics_of(tmp_path) == json.loads(json.dumps(result.metrics))
+def test_pictures_that_do_not_fit_do_not_fail_the_run(
+    full_disk_suffixes, no_training, tmp_path, capsys, ending, missing
+):
+    full_disk_suffixes.add(ending)
+    result = train_model(make_scene(), tmp_path, SHORT_CONFIG)
+    assert result.complete and read_metrics(tmp_path) == json.loads(json.dumps(result.metrics))
     verb = "is" if ending == "curve.png" else "are"
     told = capsys.readouterr().err
     assert f"the model is finished, but {missing} {verb} missing" in told
 
-    full.clear()
+    full_disk_suffixes.clear()
     no_training()
-    train_model(a_scene(), tmp_path, CONFIG, quiet=True)
-    assert names(tmp_path) == COMPLETE and len(list((tmp_path / "views").iterdir())) == 2
+    train_model(make_scene(), tmp_path, SHORT_CONFIG, quiet=True)
+    assert file_names(tmp_path) == COMPLETE_RUN_FILES and len(list((tmp_path / "views").iterdir())) == 2
 
 
 def test_a_held_out_photo_that_is_gone_after_the_last_step_does_not_fail_the_run(no_training, tmp_path):
-    scene, reads = a_scene(), [0]
+    scene, reads = make_scene(), [0]
 
     def vanishing():
         reads[0] += 1
-        if reads[0] == 2:  # the first time is before the first step
+        if reads[0] == 2:  # the first read comes before the first step
             raise HyrfDataError("photos/0000.png: the file is gone", fix="copy it again")
         return scene.train[0].load()
 
     test = [dataclasses.replace(scene.test[0], load=vanishing), scene.test[1]]
-    result = train_model(dataclasses.replace(scene, test=test), tmp_path, CONFIG, quiet=True)
+    result = train_model(dataclasses.replace(scene, test=test), tmp_path, SHORT_CONFIG, quiet=True)
     assert result.complete and "photos/0000.png: the file is gone" in result.missing
     assert not (tmp_path / "metrics.json").exists()
 
     no_training()
-    train_model(a_scene(), tmp_path, CONFIG, quiet=True)
-    assert names(tmp_path) == COMPLETE
+    train_model(make_scene(), tmp_path, SHORT_CONFIG, quiet=True)
+    assert file_names(tmp_path) == COMPLETE_RUN_FILES
 
 
 def test_an_interruption_while_scoring_is_completed_without_training(no_training, monkeypatch, tmp_path):
@@ -135,84 +139,86 @@ def test_an_interruption_while_scoring_is_completed_without_training(no_training
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr("hyrfpack.train.results.evaluate_model", interrupted)
-        train_model(a_scene(), tmp_path, CONFIG, quiet=True)
-    assert names(tmp_path) == {"model.hyrf", "training.json"} and runs.is_begun(tmp_path)
+        train_model(make_scene(), tmp_path, SHORT_CONFIG, quiet=True)
+    assert file_names(tmp_path) == {"model.hyrf", "training.json"} and runs.is_begun(tmp_path)
 
     no_training()
-    train_model(a_scene(), tmp_path, CONFIG, quiet=True)
-    assert names(tmp_path) == COMPLETE and not runs.is_begun(tmp_path)
+    train_model(make_scene(), tmp_path, SHORT_CONFIG, quiet=True)
+    assert file_names(tmp_path) == COMPLETE_RUN_FILES and not runs.is_begun(tmp_path)
 
 
-def test_a_model_that_does_not_fit_leaves_the_checkpoint_and_resuming_completes_the_run(full, undisturbed, tmp_path):
-    full.add("model.hyrf")
+def test_a_model_that_does_not_fit_leaves_the_checkpoint_and_resuming_completes_the_run(
+    full_disk_suffixes, uninterrupted_run, tmp_path
+):
+    full_disk_suffixes.add("model.hyrf")
     with pytest.raises(
         HyrfError, match=r"model.hyrf: the disk is full.*checkpoint of step 19 is kept.*`resume=True` continues"
     ):
-        train_model(a_scene(), tmp_path, CONFIG, quiet=True)
-    assert names(tmp_path) == {"checkpoint.pt"}
+        train_model(make_scene(), tmp_path, SHORT_CONFIG, quiet=True)
+    assert file_names(tmp_path) == {"checkpoint.pt"}
 
-    full.clear()
-    train_model(a_scene(), tmp_path, CONFIG, resume=True, quiet=True)
-    assert names(tmp_path) == COMPLETE
-    assert (tmp_path / "model.hyrf").read_bytes() == (undisturbed / "model.hyrf").read_bytes()
-
-
-def test_where_the_training_record_does_not_fit_the_checkpoint_stays_until_the_metrics_are_there(full, tmp_path):
-    full |= {"training.json", "metrics.json"}
-    result = train_model(a_scene(), tmp_path, CONFIG, quiet=True)
-    assert result.complete and names(tmp_path) == {"model.hyrf", "checkpoint.pt", "curve.png", "views"}
-
-    full.clear()
-    train_model(a_scene(), tmp_path, CONFIG, resume=True, quiet=True)
-    assert names(tmp_path) == COMPLETE and len(metrics_of(tmp_path)["curve"]) == 20
+    full_disk_suffixes.clear()
+    train_model(make_scene(), tmp_path, SHORT_CONFIG, resume=True, quiet=True)
+    assert file_names(tmp_path) == COMPLETE_RUN_FILES
+    assert (tmp_path / "model.hyrf").read_bytes() == (uninterrupted_run / "model.hyrf").read_bytes()
 
 
-def test_results_are_completed_with_the_settings_of_the_model_only(full, tmp_path):
-    full.add("metrics.json")
-    train_model(a_scene(), tmp_path, CONFIG, quiet=True)
+def test_without_space_for_the_training_record_the_checkpoint_stays_until_metrics_exist(full_disk_suffixes, tmp_path):
+    full_disk_suffixes |= {"training.json", "metrics.json"}
+    result = train_model(make_scene(), tmp_path, SHORT_CONFIG, quiet=True)
+    assert result.complete and file_names(tmp_path) == {"model.hyrf", "checkpoint.pt", "curve.png", "views"}
+
+    full_disk_suffixes.clear()
+    train_model(make_scene(), tmp_path, SHORT_CONFIG, resume=True, quiet=True)
+    assert file_names(tmp_path) == COMPLETE_RUN_FILES and len(read_metrics(tmp_path)["curve"]) == 20
+
+
+def test_results_are_completed_with_the_settings_of_the_model_only(full_disk_suffixes, tmp_path):
+    full_disk_suffixes.add("metrics.json")
+    train_model(make_scene(), tmp_path, SHORT_CONFIG, quiet=True)
     before = hashlib.sha256((tmp_path / "model.hyrf").read_bytes()).digest()
-    full.clear()
-    other = dataclasses.replace(CONFIG, steps=30, seed=2)
+    full_disk_suffixes.clear()
+    other = dataclasses.replace(SHORT_CONFIG, steps=30, seed=2)
     for resume in (False, True):
         with pytest.raises(HyrfTrainingError, match=r"other settings \(seed, steps\).*`overwrite=True`"):
-            train_model(a_scene(), tmp_path, other, resume=resume, quiet=True)
-    fewer = dataclasses.replace(a_scene(), test=a_scene().test[:1])
+            train_model(make_scene(), tmp_path, other, resume=resume, quiet=True)
+    fewer = dataclasses.replace(make_scene(), test=make_scene().test[:1])
     with pytest.raises(HyrfTrainingError, match="other settings .held-out views."):
-        train_model(fewer, tmp_path, CONFIG, quiet=True)
+        train_model(fewer, tmp_path, SHORT_CONFIG, quiet=True)
     assert hashlib.sha256((tmp_path / "model.hyrf").read_bytes()).digest() == before
 
-    train_model(a_scene(), tmp_path, other, overwrite=True, quiet=True)
-    assert metrics_of(tmp_path)["settings"]["steps"] == 30 and names(tmp_path) == COMPLETE
+    train_model(make_scene(), tmp_path, other, overwrite=True, quiet=True)
+    assert read_metrics(tmp_path)["settings"]["steps"] == 30 and file_names(tmp_path) == COMPLETE_RUN_FILES
 
 
-def test_metrics_of_an_earlier_model_do_not_stay_beside_a_new_one(full, tmp_path):
-    train_model(a_scene(), tmp_path, CONFIG, quiet=True)
-    full |= {"metrics.json", ".png"}
-    result = train_model(a_scene(), tmp_path, dataclasses.replace(CONFIG, seed=5), overwrite=True, quiet=True)
+def test_metrics_of_an_earlier_model_do_not_stay_beside_a_new_one(full_disk_suffixes, tmp_path):
+    train_model(make_scene(), tmp_path, SHORT_CONFIG, quiet=True)
+    full_disk_suffixes |= {"metrics.json", ".png"}
+    result = train_model(make_scene(), tmp_path, dataclasses.replace(SHORT_CONFIG, seed=5), overwrite=True, quiet=True)
     assert "views, curve.png and metrics.json are missing" in result.missing
-    assert names(tmp_path) == {"model.hyrf", "training.json", "views"} and not list((tmp_path / "views").iterdir())
+    assert file_names(tmp_path) == {"model.hyrf", "training.json", "views"} and not list((tmp_path / "views").iterdir())
 
 
 @pytest.mark.parametrize("damage", [b"", b"[]", b"{}", b'{"version": 1}', None])
-def test_a_record_that_is_damaged_or_of_another_model_counts_for_nothing(full, tmp_path, damage):
-    full.add("metrics.json")
-    train_model(a_scene(), tmp_path, CONFIG, quiet=True)
-    full.clear()
+def test_a_damaged_or_foreign_training_record_is_ignored(full_disk_suffixes, tmp_path, damage):
+    full_disk_suffixes.add("metrics.json")
+    train_model(make_scene(), tmp_path, SHORT_CONFIG, quiet=True)
+    full_disk_suffixes.clear()
     if damage is None:
         (tmp_path / "model.hyrf").write_bytes(b"another")
     else:
         (tmp_path / "training.json").write_bytes(damage)
     with pytest.raises(HyrfError, match="holds an earlier run"):
-        train_model(a_scene(), tmp_path, CONFIG, quiet=True)
+        train_model(make_scene(), tmp_path, SHORT_CONFIG, quiet=True)
     with pytest.raises(HyrfError, match="no checkpoint to resume"):
-        train_model(a_scene(), tmp_path, CONFIG, resume=True, quiet=True)
+        train_model(make_scene(), tmp_path, SHORT_CONFIG, resume=True, quiet=True)
 
 
-def test_the_log_of_a_completed_run_ends_with_its_scores(full, tmp_path):
-    full.add("metrics.json")
-    train_model(a_scene(), tmp_path / "run", CONFIG, quiet=True)
-    full.clear()
-    result = train_model(a_scene(), tmp_path / "run", CONFIG, quiet=True, log=tmp_path / "log.jsonl")
+def test_the_log_of_a_completed_run_ends_with_its_scores(full_disk_suffixes, tmp_path):
+    full_disk_suffixes.add("metrics.json")
+    train_model(make_scene(), tmp_path / "run", SHORT_CONFIG, quiet=True)
+    full_disk_suffixes.clear()
+    result = train_model(make_scene(), tmp_path / "run", SHORT_CONFIG, quiet=True, log=tmp_path / "log.jsonl")
     (end,) = map(json.loads, (tmp_path / "log.jsonl").read_text().splitlines())
     assert end["event"] == "end" and end["complete"] is True and end["step"] == 20
     assert end["psnr"] == pytest.approx(result.metrics["evaluation"]["psnr"], rel=1e-5)
@@ -221,9 +227,9 @@ def test_the_log_of_a_completed_run_ends_with_its_scores(full, tmp_path):
 # -- progress --------------------------------------------------------------------------------------------------------
 
 
-def test_all_work_around_the_steps_is_reported_with_its_share(tmp_path):
+def test_phases_before_and_after_the_steps_report_their_progress(tmp_path):
     told: list[tuple[str, int, int]] = []
-    train_model(a_scene(), tmp_path, CONFIG, quiet=True, phase=lambda *progress: told.append(progress))
+    train_model(make_scene(), tmp_path, SHORT_CONFIG, quiet=True, phase=lambda *progress: told.append(progress))
     assert list(dict.fromkeys(what for what, _, _ in told)) == [
         "reading held-out photos",
         "reading photos",

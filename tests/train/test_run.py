@@ -1,4 +1,4 @@
-"""The whole run in a folder: what it leaves, how it stops, and that a kill at any moment costs nothing."""
+"""A training run in a folder: its files, how it stops, and how it resumes after a kill at any moment."""
 
 from __future__ import annotations
 
@@ -24,59 +24,60 @@ from hyrfpack.scene import Scene
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer, progress, train_model
 from hyrfpack.train.run import STOP_SIGNALS, _stop_requests
 
-CONFIG = TrainConfig(
+RUN_CONFIG = TrainConfig(
     steps=60,
     seed=1,
     max_gaussians=120,
     checkpoint_every=1,
     density=DensityConfig(start=0.05, stop=0.7, rounds=8, gradient=1e-5, resets=1),
 )
-# The same run in a process of its own. "train" takes at least 0.05 s a step, so that the test can stop it early;
-# "loop" prints the number of each step.
-CHILD = """
+# The same run in another process. "train" takes at least 0.05 s a step, so that the test can stop it early; "loop"
+# prints the number of each step.
+CHILD_SCRIPT = """
 import json, sys, time
 from pathlib import Path
 sys.path.append(sys.argv[1])
 from scenes import ball_scene
-from hyrfpack.train import Trainer, train
-from test_run import CONFIG, a_scene
+from hyrfpack.train import Trainer, train_model
+from test_run import RUN_CONFIG, make_scene
 out = Path(sys.argv[2])
 if sys.argv[3] == "train":
     resume = (out / "checkpoint.pt").exists()
-    result = train(a_scene(), out, CONFIG, resume=resume, quiet=True, observer=lambda trainer: time.sleep(0.05))
+    slow = lambda trainer: time.sleep(0.05)
+    result = train_model(make_scene(), out, RUN_CONFIG, resume=resume, quiet=True, observer=slow)
     print(json.dumps({"complete": result.complete, "step": result.step, "model": result.model}))
 else:
-    trainer = Trainer(a_scene(), CONFIG)
+    trainer = Trainer(make_scene(), RUN_CONFIG)
     if (out / "checkpoint.pt").exists():
         trainer.load(out / "checkpoint.pt")
     trainer.run(checkpoint=out / "checkpoint.pt", report=lambda t, loss, mse: print(t.step, flush=True))
 """
 
 
-def a_scene(views: int = 6) -> Scene:
+def make_scene(views: int = 6) -> Scene:
     return ball_scene(views=views, points=60, side=24)
 
 
 def split_scene() -> Scene:
-    scene = a_scene(8)
+    scene = make_scene(8)
     return dataclasses.replace(scene, train=scene.train[2:], test=scene.train[:2])
 
 
-def bytes_of(model) -> dict[str, bytes]:
+def parameter_bytes(model) -> dict[str, bytes]:
     return {name: p.detach().numpy().tobytes() for name, p in model.named_parameters()}
 
 
 def start_child(out: Path, how: str) -> subprocess.Popen:
     here = Path(__file__).parent
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(here), str(here.parents[1])])}
-    command = [sys.executable, "-c", CHILD, str(here.parent), str(out), how]
+    command = [sys.executable, "-c", CHILD_SCRIPT, str(here.parent), str(out), how]
     return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 @pytest.fixture(scope="module")
-def whole() -> Trainer:
-    """The uninterrupted run."""
-    trainer = Trainer(a_scene(), CONFIG)
+def uninterrupted_trainer() -> Trainer:
+    """The trainer of the uninterrupted run."""
+    trainer = Trainer(make_scene(), RUN_CONFIG)
     trainer.run()
     return trainer
 
@@ -87,7 +88,7 @@ def whole() -> Trainer:
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     out = tmp_path_factory.mktemp("runs") / "deep" / "balls"
-    return out, train_model(split_scene(), out, CONFIG, quiet=True)
+    return out, train_model(split_scene(), out, RUN_CONFIG, quiet=True)
 
 
 def test_a_run_leaves_model_metrics_curve_and_views(finished):
@@ -98,12 +99,12 @@ def test_a_run_leaves_model_metrics_curve_and_views(finished):
 
 
 def test_the_saved_model_is_the_trained_one(finished):
-    """The same bytes as the trainer alone gives, with the scene's held-out views left out."""
+    """The bytes equal those of a trainer that has no held-out views."""
     _, result = finished
-    trainer = Trainer(split_scene(), CONFIG)
+    trainer = Trainer(split_scene(), RUN_CONFIG)
     trainer.run()
     loaded = hyrf_format.load_model(result.model)
-    assert bytes_of(loaded) == bytes_of(trainer.model)
+    assert parameter_bytes(loaded) == parameter_bytes(trainer.model)
 
 
 def test_metrics_are_the_results_and_the_settings(finished):
@@ -125,48 +126,48 @@ def test_the_evaluation_is_of_the_file_on_the_held_out_views(finished):
             rgb = render_view(model, view.camera).rgb.double().numpy().clip(0, 1)
         expected[view.name] = -10 * np.log10(np.mean((rgb - view.load().composite()) ** 2))
     found = {view["name"]: view["psnr"] for view in result.metrics["evaluation"]["views"]}
-    assert found == pytest.approx(expected, abs=0.05)  # pictures may be rounded to 8 bits
+    assert found == pytest.approx(expected, abs=0.05)  # renders may be rounded to 8 bits
     assert result.metrics["evaluation"]["psnr"] == pytest.approx(np.mean(list(found.values())))
 
 
-def test_a_folder_with_a_run_is_not_trained_over_unasked(finished):
+def test_a_folder_with_a_run_is_rejected_without_overwrite(finished):
     out, _ = finished
     before = (out / "model.hyrf").read_bytes()
     with pytest.raises(HyrfError, match="holds an earlier run.*`overwrite=True`"):
-        train_model(split_scene(), out, CONFIG, quiet=True)
+        train_model(split_scene(), out, RUN_CONFIG, quiet=True)
     assert (out / "model.hyrf").read_bytes() == before
 
 
 def test_overwriting_replaces_the_run(tmp_path):
-    config = dataclasses.replace(CONFIG, steps=3)
-    train_model(a_scene(), tmp_path, config, quiet=True)
-    train_model(a_scene(), tmp_path, dataclasses.replace(config, seed=9), overwrite=True, quiet=True)
+    config = dataclasses.replace(RUN_CONFIG, steps=3)
+    train_model(make_scene(), tmp_path, config, quiet=True)
+    train_model(make_scene(), tmp_path, dataclasses.replace(config, seed=9), overwrite=True, quiet=True)
     assert json.loads((tmp_path / "metrics.json").read_text())["settings"]["seed"] == 9
 
 
 def test_a_folder_that_cannot_be_made_is_a_clear_error(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(HyrfError, match="file is a file, not a folder"):
-        train_model(a_scene(), tmp_path / "file" / "run", CONFIG, quiet=True)
+        train_model(make_scene(), tmp_path / "file" / "run", RUN_CONFIG, quiet=True)
 
 
-def test_resuming_nothing_is_a_clear_error(tmp_path):
+def test_resuming_without_a_checkpoint_is_a_clear_error(tmp_path):
     with pytest.raises(HyrfError, match="no checkpoint to resume; leave out `resume=True`"):
-        train_model(a_scene(), tmp_path / "run", CONFIG, resume=True, quiet=True)
+        train_model(make_scene(), tmp_path / "run", RUN_CONFIG, resume=True, quiet=True)
     assert not (tmp_path / "run").exists()
 
 
 def test_a_background_that_no_view_sees_is_dropped(tmp_path):
-    """A wall of large opaque Gaussians around everything; balls under a sky keep their sphere."""
+    """A wall of large opaque Gaussians surrounds everything. Balls under a sky keep their background sphere."""
     wall = np.random.default_rng(0).normal(size=(500, 3))
     wall *= 4 / np.linalg.norm(wall, axis=1, keepdims=True)
-    scene = dataclasses.replace(a_scene(), points=wall, point_colors=np.full((500, 3), 0.5, np.float32))
-    one_step = dataclasses.replace(CONFIG, steps=1, max_gaussians=500)
+    scene = dataclasses.replace(make_scene(), points=wall, point_colors=np.full((500, 3), 0.5, np.float32))
+    one_step = dataclasses.replace(RUN_CONFIG, steps=1, max_gaussians=500)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("hyrfpack.train.setup.INITIAL_OPACITY", 0.9999)
         patch.setattr("hyrfpack.train.setup.MIN_INITIAL_SIZE", 0.45)
         closed = train_model(scene, tmp_path / "closed", one_step, quiet=True)
-    open_air = train_model(a_scene(), tmp_path / "open", one_step, quiet=True)
+    open_air = train_model(make_scene(), tmp_path / "open", one_step, quiet=True)
 
     assert hyrf_format.load_model(closed.model).config.background is False
     assert closed.metrics["choices"]["background"].startswith("none: no training view")
@@ -174,34 +175,34 @@ def test_a_background_that_no_view_sees_is_dropped(tmp_path):
     assert "of a view's light" in open_air.metrics["choices"]["background"]
 
 
-def test_speed_is_told_of_all_parts_of_a_resumed_run(finished, tmp_path):
+def test_the_speed_of_a_resumed_run_covers_all_its_parts(finished, tmp_path):
     _, result = finished
     assert 0 < sum(result.metrics["stage_seconds"].values()) <= 1.02 * result.metrics["seconds"] + 0.02
     assert result.metrics["steps_per_second"] == pytest.approx(60 / result.metrics["seconds"])
 
-    stopped = Trainer(a_scene(), CONFIG)
+    stopped = Trainer(make_scene(), RUN_CONFIG)
     stopped.run(stop=lambda: stopped.step == 50)
     stopped.elapsed = 1e6
     stopped.save(tmp_path / "checkpoint.pt")
-    metrics = train_model(a_scene(), tmp_path, CONFIG, resume=True, quiet=True).metrics
+    metrics = train_model(make_scene(), tmp_path, RUN_CONFIG, resume=True, quiet=True).metrics
 
     assert 1e6 < metrics["seconds"] < 1e6 + 600
     assert metrics["steps_per_second"] == pytest.approx(60 / metrics["seconds"])
 
 
-def test_a_long_run_says_once_what_would_shorten_it(tmp_path, capsys, monkeypatch):
+def test_a_long_run_prints_once_how_to_shorten_it(tmp_path, capsys, monkeypatch):
     for name in ("MIN_ADVICE_STEPS", "MIN_ADVICE_SECONDS", "MIN_ADVICE_SECONDS_LEFT"):
         monkeypatch.setattr(progress, name, 0)
-    train_model(a_scene(), tmp_path, dataclasses.replace(CONFIG, steps=8))
+    train_model(make_scene(), tmp_path, dataclasses.replace(RUN_CONFIG, steps=8))
     (told,) = [line for line in capsys.readouterr().err.splitlines() if "more hours" in line]
     assert all(way in told for way in ("fewer steps", "smaller photos", "fewer Gaussians", "a GPU"))
 
 
-# -- stopping and going on -------------------------------------------------------------------------------------------
+# -- stopping and resuming -------------------------------------------------------------------------------------------
 
 
 @pytest.mark.usefixtures("signals")
-def test_the_first_interrupt_asks_and_the_second_interrupts():
+def test_the_first_interrupt_requests_a_stop_and_the_second_interrupts():
     before = signal.getsignal(signal.SIGINT)
     with pytest.raises(KeyboardInterrupt), _stop_requests() as stop:
         assert not stop()
@@ -213,7 +214,7 @@ def test_the_first_interrupt_asks_and_the_second_interrupts():
 
 @pytest.mark.usefixtures("signals")
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
-def test_a_request_to_terminate_and_a_terminal_that_closes_ask_too(name):
+def test_sigterm_and_sighup_request_a_stop_too(name):
     number = getattr(signal, name, None) or pytest.skip(f"there is no {name} here")
     before = signal.getsignal(number)
     with _stop_requests() as stop:
@@ -224,7 +225,7 @@ def test_a_request_to_terminate_and_a_terminal_that_closes_ask_too(name):
 
 @pytest.mark.usefixtures("signals")
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="there is no SIGHUP here")
-def test_a_terminal_that_closes_may_say_so_twice():
+def test_a_second_sighup_has_no_effect():
     with _stop_requests() as stop:
         signal.raise_signal(signal.SIGHUP)
         signal.raise_signal(signal.SIGHUP)
@@ -234,7 +235,7 @@ def test_a_terminal_that_closes_may_say_so_twice():
 @pytest.mark.usefixtures("signals")
 @pytest.mark.parametrize("number", STOP_SIGNALS)
 def test_a_signal_that_is_ignored_stays_ignored(number):
-    """SIGHUP under nohup, Ctrl-C in the background of a script."""
+    """SIGHUP is ignored under nohup, Ctrl-C in background jobs of a script."""
     signal.signal(number, signal.SIG_IGN)
     with _stop_requests() as stop:
         signal.raise_signal(number)
@@ -244,7 +245,7 @@ def test_a_signal_that_is_ignored_stays_ignored(number):
 
 @pytest.mark.usefixtures("signals")
 @pytest.mark.parametrize("number", STOP_SIGNALS)
-def test_an_interrupt_saves_exits_cleanly_and_resumes_to_the_same_model(number, whole, tmp_path):
+def test_an_interrupt_saves_exits_cleanly_and_resumes_to_the_same_model(number, uninterrupted_trainer, tmp_path):
     child = start_child(tmp_path, "train")
     checkpoint = tmp_path / "checkpoint.pt"
     while child.poll() is None and not checkpoint.exists():
@@ -256,13 +257,15 @@ def test_an_interrupt_saves_exits_cleanly_and_resumes_to_the_same_model(number, 
     said = json.loads(out)
     assert said["complete"] is False and said["model"] is None and 1 <= said["step"] < 60
     assert not (tmp_path / "model.hyrf").exists()
-    result = train_model(a_scene(), tmp_path, CONFIG, resume=True, quiet=True)
-    assert result.complete and bytes_of(hyrf_format.load_model(result.model)) == bytes_of(whole.model)
+    result = train_model(make_scene(), tmp_path, RUN_CONFIG, resume=True, quiet=True)
+    assert result.complete and parameter_bytes(hyrf_format.load_model(result.model)) == parameter_bytes(
+        uninterrupted_trainer.model
+    )
     assert not checkpoint.exists()
 
 
-def test_kills_at_random_moments_leave_a_checkpoint_that_resumes_to_the_same_model(whole, tmp_path):
-    """SIGKILL, with a checkpoint written at every step: it often comes while one is being written."""
+def test_kills_at_random_moments_leave_a_checkpoint_that_resumes_to_the_same_model(uninterrupted_trainer, tmp_path):
+    """SIGKILL often arrives while a checkpoint is being written, because every step writes one."""
     generator = random.Random(time.time_ns())
     checkpoint = tmp_path / "checkpoint.pt"
     for target in (1, generator.randrange(10, 30), generator.randrange(35, 50)):
@@ -277,11 +280,11 @@ def test_kills_at_random_moments_leave_a_checkpoint_that_resumes_to_the_same_mod
         if target > 1:
             assert checkpoint.exists()
 
-    resumed = Trainer(a_scene(), CONFIG)
+    resumed = Trainer(make_scene(), RUN_CONFIG)
     resumed.load(checkpoint)
     assert 10 <= resumed.step < 60
     resumed.run()
 
-    assert bytes_of(resumed.model) == bytes_of(whole.model)
-    curves = [[(r["step"], r["loss"], r["gaussians"]) for r in run.records] for run in (resumed, whole)]
+    assert parameter_bytes(resumed.model) == parameter_bytes(uninterrupted_trainer.model)
+    curves = [[(r["step"], r["loss"], r["gaussians"]) for r in run.records] for run in (resumed, uninterrupted_trainer)]
     assert curves[0] == curves[1]

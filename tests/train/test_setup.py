@@ -26,52 +26,54 @@ from hyrfpack.train.setup import (
 )
 
 
-def rig(cameras, points=None, **fields) -> Scene:
-    """A scene whose photos are never opened."""
+def make_rig_scene(cameras, points=None, **fields) -> Scene:
+    """Return a scene whose photos are never opened."""
     points = np.zeros((0, 3)) if points is None else np.asarray(points, np.float64)
     views = [view_of(f"{i:03d}.png", camera, None) for i, camera in enumerate(cameras)]
     return Scene("rig", fields.pop("layout", "colmap"), views, [], points, np.full((len(points), 3), 0.5), **fields)
 
 
-def scattered(low, high, count: int = 200) -> np.ndarray:
+def scatter_points(low, high, count: int = 200) -> np.ndarray:
     return np.random.default_rng(0).uniform(low, high, (count, 3))
 
 
 def around_an_object() -> Scene:
-    return rig(ring(12), ball_points(200)[0])
+    return make_rig_scene(ring(12), ball_points(200)[0])
 
 
 def aerial_survey() -> Scene:
-    """5 x 5 cameras 50 above the ground, looking down."""
+    """Return a scene of 5 x 5 cameras 50 units above the ground, looking down."""
     cameras = [camera_at((x, y, 50.0), (x, y, 0.0), (0, 1, 0)) for x in range(0, 100, 20) for y in range(0, 100, 20)]
-    return rig(cameras, scattered((-20, -20, 0), (100, 100, 5)))
+    return make_rig_scene(cameras, scatter_points((-20, -20, 0), (100, 100, 5)))
 
 
-def drive() -> Scene:
-    """A camera that moves 40 ahead in the direction it looks in."""
+def forward_drive() -> Scene:
+    """Return a scene of a camera that moves 40 units in its viewing direction."""
     cameras = [camera_at((0.1 * np.sin(y), y, 1.5), (0.1 * np.sin(y), y + 5, 1.5)) for y in np.arange(0.0, 40.0)]
-    return rig(cameras, scattered((-8, 0, 0), (8, 60, 6)))
+    return make_rig_scene(cameras, scatter_points((-8, 0, 0), (8, 60, 6)))
 
 
 def forward_facing() -> Scene:
-    """Handheld, from nearly one place."""
+    """Return a scene of handheld photos from nearly one place."""
     cameras = [camera_at((x, 0.0, z), (x, 10.0, z)) for x in (-0.5, 0, 0.5) for z in (-0.3, 0, 0.3)]
-    return rig(cameras, scattered((-4, 5, -3), (4, 12, 3)))
+    return make_rig_scene(cameras, scatter_points((-4, 5, -3), (4, 12, 3)))
 
 
 def inside_a_room() -> Scene:
-    """A full turn from one place."""
+    """Return a scene of photos in all directions from one place."""
     turns = [camera_at((1.0, 2.0, 3.0), (1 + np.cos(a), 2 + np.sin(a), 3.0)) for a in np.arange(0, 6.2, 0.5)]
-    return rig(turns, scattered((-3, -2, 1), (5, 6, 5)))
+    return make_rig_scene(turns, scatter_points((-3, -2, 1), (5, 6, 5)))
 
 
 def tilted_survey(degrees: float) -> Scene:
-    """4 x 6 cameras above the ground, half tilted one way and half the other: cos(tilt) is the length of the mean
-    viewing direction."""
+    """Return a survey of 4 x 6 cameras, half tilted one way and half the other.
+
+    The length of the mean viewing direction is the cosine of the tilt.
+    """
     slope = 50 * math.tan(math.radians(degrees))
     places = [(x, y, slope if (x // 20) % 2 else -slope) for x in range(0, 80, 20) for y in range(0, 120, 20)]
     cameras = [camera_at((x, y, 50.0), (x + shift, y, 0.0), (0, 1, 0)) for x, y, shift in places]
-    return rig(cameras, scattered((-20, -20, 0), (100, 120, 5)))
+    return make_rig_scene(cameras, scatter_points((-20, -20, 0), (100, 120, 5)))
 
 
 # -- regime and frame ------------------------------------------------------------------------------------------------
@@ -82,23 +84,23 @@ def tilted_survey(degrees: float) -> Scene:
     [
         (around_an_object, "standard"),
         (aerial_survey, "large"),
-        (drive, "street"),
+        (forward_drive, "street"),
         (forward_facing, "standard"),
         (inside_a_room, "standard"),
         (lambda: tilted_survey(25), "large"),  # cos 25 = 0.906
         (lambda: tilted_survey(27), "standard"),  # cos 27 = 0.891
-        (lambda: rig(ring(12), has_alpha=True), "synthetic"),
-        (lambda: rig(ring(12), layout="blender"), "synthetic"),
-        (lambda: rig([view.camera for view in aerial_survey().train]), "standard"),  # no points, no height
-        (lambda: rig([camera_at((3, 0, 0))]), "standard"),
+        (lambda: make_rig_scene(ring(12), has_alpha=True), "synthetic"),
+        (lambda: make_rig_scene(ring(12), layout="blender"), "synthetic"),
+        (lambda: make_rig_scene([view.camera for view in aerial_survey().train]), "standard"),  # no points, no height
+        (lambda: make_rig_scene([camera_at((3, 0, 0))]), "standard"),
     ],
 )
-def test_the_preset_follows_from_how_the_cameras_stand(make, preset):
+def test_the_preset_follows_from_the_camera_positions(make, preset):
     found, reason = detect_preset(make())
     assert found == preset and len(reason) > 10
 
 
-@pytest.mark.parametrize("make", [around_an_object, aerial_survey, drive, forward_facing])
+@pytest.mark.parametrize("make", [around_an_object, aerial_survey, forward_drive, forward_facing])
 @pytest.mark.parametrize("scale", [1e-3, 1e3])
 def test_the_preset_does_not_depend_on_the_unit(make, scale):
     scene = make()
@@ -107,25 +109,25 @@ def test_the_preset_does_not_depend_on_the_unit(make, scale):
         camera_at(c.position * scale + shift, (c.position + c.forward) * scale + shift, up=-c.rotation[1])
         for c in (view.camera for view in scene.train)
     ]
-    assert detect_preset(rig(cameras, scene.points * scale + shift))[0] == detect_preset(scene)[0]
+    assert detect_preset(make_rig_scene(cameras, scene.points * scale + shift))[0] == detect_preset(scene)[0]
 
 
 def test_frames_of_the_synthetic_layout_are_the_known_box():
-    scene = rig(ring(12), ball_points(200)[0], layout="blender")
+    scene = make_rig_scene(ring(12), ball_points(200)[0], layout="blender")
     assert scene_frame(scene, "synthetic") == Frame((0.0, 0.0, 0.0), 1.3, (1.0, 1.0, 1.0))
 
 
 def test_frames_of_other_objects_are_the_points_without_their_outliers():
-    """Their unit is not known, and the cameras stand far around."""
+    """Their unit is not known, and the cameras are far away."""
     inner = np.random.default_rng(1).uniform((1, 2, -1), (5, 4, 1), (10_000, 3))
-    scene = rig(ring(12, radius=40.0), np.concatenate([inner, np.full((50, 3), 1e5)]), has_alpha=True)
+    scene = make_rig_scene(ring(12, radius=40.0), np.concatenate([inner, np.full((50, 3), 1e5)]), has_alpha=True)
     frame = scene_frame(scene, "synthetic")
     np.testing.assert_allclose(frame.center, (3, 3, 0), atol=0.05)
     np.testing.assert_allclose(np.array(frame.half_extent) * frame.scale, (2, 1, 1), atol=0.05)
 
 
 def test_frames_of_objects_without_points_are_the_cameras_box():
-    frame = scene_frame(rig(ring(12, radius=40.0), has_alpha=True), "synthetic")
+    frame = scene_frame(make_rig_scene(ring(12, radius=40.0), has_alpha=True), "synthetic")
     np.testing.assert_allclose(frame.center, (0, 0, 1), atol=1e-9)
     np.testing.assert_allclose(np.array(frame.half_extent) * frame.scale, (40, 40, 10))  # the third axis is widened
 
@@ -133,7 +135,7 @@ def test_frames_of_objects_without_points_are_the_cameras_box():
 @pytest.mark.parametrize("preset", ["standard", "street"])
 def test_frames_of_captures_are_the_cameras_box(preset):
     cameras = [camera_at(p) for p in [(4.0, 0, 1), (-2.0, 3, 1), (0.0, -1, 2)]]
-    frame = scene_frame(rig(cameras, scattered(-100, 100)), preset)
+    frame = scene_frame(make_rig_scene(cameras, scatter_points(-100, 100)), preset)
     np.testing.assert_allclose(frame.center, (1, 1, 1.5))
     np.testing.assert_allclose(frame.scale, 3)
     np.testing.assert_allclose(frame.half_extent, (1, 2 / 3, 0.25))  # the third axis is widened
@@ -142,7 +144,7 @@ def test_frames_of_captures_are_the_cameras_box(preset):
 def test_frames_of_surveys_are_the_points_without_their_outliers():
     scene = aerial_survey()
     inner = np.random.default_rng(1).uniform((0, 10, -5), (100, 60, 5), (10_000, 3))
-    scene = rig([view.camera for view in scene.train], np.concatenate([inner, np.full((50, 3), 1e5)]))
+    scene = make_rig_scene([view.camera for view in scene.train], np.concatenate([inner, np.full((50, 3), 1e5)]))
     frame = scene_frame(scene, "large")
     half = np.array(frame.half_extent) * frame.scale
     np.testing.assert_allclose(frame.center, (50, 35, 0), atol=1.5)
@@ -157,16 +159,16 @@ def test_cameras_at_one_place_frame_the_points():
 
 def test_one_camera_without_points_frames_what_is_in_front_of_it():
     camera = camera_at((5.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    frame = scene_frame(rig([camera]), "standard")
+    frame = scene_frame(make_rig_scene([camera]), "standard")
     np.testing.assert_allclose(frame.center, (4, 0, 0))
     assert frame.scale == 1
 
 
-def test_a_camera_that_is_nowhere_is_rejected():
+def test_a_camera_without_a_finite_position_is_rejected():
     camera = camera_at((3.0, 0, 0))
     camera.camera_from_world[0, 3] = np.nan
     with pytest.raises(HyrfDataError, match="not finite"):
-        scene_frame(rig([camera, *ring(3)]), "standard")
+        scene_frame(make_rig_scene([camera, *ring(3)]), "standard")
 
 
 # -- sizes -----------------------------------------------------------------------------------------------------------
@@ -177,38 +179,38 @@ def test_a_camera_that_is_nowhere_is_rejected():
     [
         (100, 800, 30_000, 0.85 * 800 * 800),
         (100, 800, 7_500, 0.85 * 800 * 800 / 2),
-        (100, 800, 120_000, 0.85 * 800 * 800),  # longer runs get no more
-        (200, 800, 30_000, 0.85 * 800 * 800),  # as many views of it add nothing,
-        (408, 800, 30_000, 408 * 800 * 800 / 240),  # twice as many do
+        (100, 800, 120_000, 0.85 * 800 * 800),  # a run of more than 30,000 steps gets the same budget
+        (200, 800, 30_000, 0.85 * 800 * 800),  # up to 204 views of this size get the same budget
+        (408, 800, 30_000, 408 * 800 * 800 / 240),  # beyond that, the budget grows with the number of pixels
         (408, 800, 7_500, 408 * 800 * 800 / 240 / 2),
         (4, 32, 30_000, 5000),
         (100, 800, 1, 5000),
     ],
 )
 def test_the_budget_follows_pixels_and_the_root_of_the_steps(views, side, steps, expected):
-    budget, reason = budget_for(rig(ring(views, width=side, height=side)), TrainConfig(steps=steps))
+    budget, reason = budget_for(make_rig_scene(ring(views, width=side, height=side)), TrainConfig(steps=steps))
     assert budget == round(expected)
     assert f"{steps:,}" in reason
 
 
 def test_the_budget_follows_the_mean_photo_where_they_differ():
     cameras = [*ring(4, width=200, height=100), *ring(4, width=400, height=300)]
-    assert budget_for(rig(cameras), TrainConfig(steps=30_000))[0] == 0.85 * (200 * 100 + 400 * 300) / 2
+    assert budget_for(make_rig_scene(cameras), TrainConfig(steps=30_000))[0] == 0.85 * (200 * 100 + 400 * 300) / 2
 
 
-def test_an_asked_budget_is_taken():
+def test_an_explicit_budget_is_kept():
     assert budget_for(around_an_object(), TrainConfig(max_gaussians=77)) == (77, "asked for")
 
 
 @pytest.mark.parametrize("factor", [0.25, 0.7, 1.0, 2.0])
-def test_a_factor_multiplies_what_pixels_and_steps_suggest(factor):
+def test_a_budget_factor_multiplies_the_budget_by_pixels_and_steps(factor):
     usual, why = budget_for(around_an_object(), TrainConfig())
     found = budget_for(around_an_object(), TrainConfig(budget_factor=factor))
     assert found == (round(factor * usual), why if factor == 1 else f"{factor:g} times what suits {why}")
 
 
 @pytest.mark.parametrize("target", [22_000, 29_000, 36_000])
-def test_a_budget_for_a_target_size_fills_what_decoders_leave(target):
+def test_a_budget_for_a_target_size_fills_the_bytes_that_decoders_leave(target):
     budget, reason = budget_for(around_an_object(), TrainConfig(target_bytes=target))
     assert (budget, reason) == (
         (target - PACKED_HEADER_BYTES) / PACKED_BYTES_PER_GAUSSIAN,
@@ -216,7 +218,7 @@ def test_a_budget_for_a_target_size_fills_what_decoders_leave(target):
     )
 
 
-def test_a_budget_for_a_target_size_is_neither_nothing_nor_more_than_photos_can_use():
+def test_a_budget_for_a_target_size_is_limited_from_below_and_by_the_photos():
     scene = around_an_object()
     assert budget_for(scene, TrainConfig(target_bytes=1))[0] == MIN_TARGETED_BUDGET
     usual, why = budget_for(scene, TrainConfig())
@@ -234,7 +236,7 @@ def test_the_table_holds_about_twenty_gaussians_a_row(budget):
         assert 20 / math.sqrt(2) <= budget / 2**log2 <= 20 * math.sqrt(2)
 
 
-def test_an_asked_table_size_is_taken():
+def test_an_explicit_table_size_is_kept():
     assert table_size_for(1000, TrainConfig(log2_table_size=15))[0] == 15
 
 
@@ -266,7 +268,7 @@ def test_too_many_points_are_thinned_to_the_budget():
 
 
 def test_without_points_half_a_budget_fills_the_box_at_random():
-    scene = rig(ring(12))
+    scene = make_rig_scene(ring(12))
     frame = Frame.from_box(np.array([-2.0, -1, 0]), np.array([2.0, 1, 3]))
 
     positions, colors = initial_points(scene, frame, 2000, seed=0)
@@ -295,7 +297,7 @@ def test_with_coverage_points_start_inside_the_hull():
         row = (view.camera.fy * seen[:, 1] / seen[:, 2] + view.camera.cy).astype(int)
         assert (view.load().alpha[row, column] == 255).all()
     assert colors.min() >= 0 and colors.max() <= 1
-    # A hull point's colour is that of the balls, not of the white or black around them.
+    # A hull point has the colour of the balls, not that of the white or black background.
     red_ball = np.linalg.norm(positions * 1.3 - (-0.5, 0, 0), axis=1) < 0.25
     assert red_ball.sum() > 3 and (colors[red_ball, 0] > 0.5).all() and (colors[red_ball, 1] < 0.45).all()
 
@@ -326,7 +328,7 @@ def test_first_gaussians_look_like_the_points(scale_rule, encoding, noise):
         stored = torch.sigmoid(model.gaussians.color_logits)
 
     sizes = np.sqrt((gaps**2).mean(1))
-    assert sizes.max() < 0.49  # else the cap would be what is tested
+    assert sizes.max() < 0.49  # otherwise the test would measure the cap
     np.testing.assert_allclose(geometry.scales.numpy(), np.repeat(sizes[:, None], 3, 1), rtol=0.02)
     np.testing.assert_allclose(geometry.opacities.numpy(), 0.1, rtol=0.02)
     np.testing.assert_allclose(stored.numpy(), np.clip(scene.point_colors, 0.02, 0.98), atol=1e-6)
@@ -334,8 +336,8 @@ def test_first_gaussians_look_like_the_points(scale_rule, encoding, noise):
 
 
 @pytest.mark.parametrize("scale_grows", [True, False])
-def test_first_sizes_outside_the_box_follow_the_gaps_too(scale_grows):
-    """S(p) grows there, so the stored fraction must be smaller."""
+def test_initial_sizes_outside_the_box_follow_the_point_distances_too(scale_grows):
+    """S(p) grows there, so the stored fraction has to be smaller."""
     scene = ball_scene(points=60)
     far = Scene("far", "colmap", scene.train, [], scene.points + (30, 0, 0), scene.point_colors)
     model, _, _ = build_model(far, TrainConfig(scale_grows=scale_grows))
@@ -354,7 +356,7 @@ def test_the_geometry_table_is_half_the_radiance_table():
 @pytest.mark.parametrize(
     ("preset", "background"), [("synthetic", False), ("standard", True), ("large", True), ("street", True)]
 )
-def test_the_background_follows_the_preset_unless_asked(preset, background):
+def test_the_background_follows_the_preset_by_default(preset, background):
     scene = dataclasses.replace(ball_scene(views=4), has_alpha=preset == "synthetic")
     assert build_model(scene, TrainConfig(preset=preset))[0].config.background is background
     asked = TrainConfig(preset=preset, background=not background)
@@ -379,7 +381,7 @@ def test_choices_are_recorded_with_reasons():
 @pytest.mark.parametrize(
     ("make", "source"),
     [
-        (lambda: rig(ring(12)), "random, in the box"),
+        (lambda: make_rig_scene(ring(12)), "random, in the box"),
         (lambda: alpha_scene(), "random, inside the silhouettes"),
         (lambda: ball_scene(points=2000, alpha=True), "points of the scene"),
     ],
@@ -389,7 +391,7 @@ def test_the_first_gaussians_origin_is_recorded(make, source):
     assert choices["initial_gaussians"] == f"{len(model)}: {source}"
 
 
-def test_grids_and_directions_are_as_asked():
+def test_grids_and_direction_encoding_follow_the_settings():
     model, _, _ = build_model(ball_scene(), TrainConfig())
     for grid in (model.config.geometry, model.config.radiance):
         assert (grid.base, grid.finest) == (8, 512)
@@ -407,7 +409,7 @@ def test_building_twice_gives_the_same_bits():
     assert not torch.equal(first.radiance.grid.table, other.radiance.grid.table)
 
 
-def test_building_leaves_the_global_generators_alone():
+def test_building_does_not_use_the_global_random_generators():
     torch.manual_seed(1)
     np.random.seed(1)
     expected = torch.rand(3), np.random.rand(3)
@@ -424,12 +426,12 @@ def test_a_scene_without_training_views_is_rejected():
 
 
 def test_the_tests_photos_show_the_balls():
-    """The helper's own check: each ball's centre projects onto its colour."""
+    """This checks the tests' own helper: the centre of each ball projects onto its colour."""
     picture = photograph(camera_at((0.0, -3.0, 0.0), width=64, height=64))
     assert picture.rgb[32, int(64 * -0.5 / 3 + 32)].argmax() == 0
 
 
 @pytest.mark.parametrize(("count", "expected"), [(1, [0]), (2, [0, 9]), (4, [0, 3, 6, 9]), (24, range(10))])
 def test_evenly_spaced_views_reach_from_the_first_to_the_last(count, expected):
-    found = [view.name for view in evenly_spaced(rig(ring(10)).train, count)]
+    found = [view.name for view in evenly_spaced(make_rig_scene(ring(10)).train, count)]
     assert found == [f"{place:03d}.png" for place in expected]

@@ -1,4 +1,4 @@
-"""The trainer with a strategy of density control that is not its own."""
+"""The trainer with a custom strategy of density control."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from hyrfpack.scene import Camera
 from hyrfpack.train import Strategy, TrainConfig, Trainer
 from hyrfpack.train.optimizer import Optimizer
 
-CONFIG = TrainConfig(steps=12, max_gaussians=100)
+SHORT_CONFIG = TrainConfig(steps=12, max_gaussians=100)
 
 
-class LeastSeen:
-    """Every fourth step, the Gaussian that the fewest pictures lean on goes: the sum of squared opacity gradients."""
+class PruneLeastSeen:
+    """Prunes, every fourth step, the Gaussian with the smallest sum of squared opacity gradients."""
 
     def __init__(self) -> None:
         self.sums = torch.zeros(0)
@@ -55,21 +55,21 @@ class LeastSeen:
         self.sums = state["sums"]
 
 
-def a_trainer(strategy: Strategy | None) -> Trainer:
-    return Trainer(ball_scene(views=6, points=60, side=24), CONFIG, strategy=strategy)
+def make_trainer(strategy: Strategy | None) -> Trainer:
+    return Trainer(ball_scene(views=6, points=60, side=24), SHORT_CONFIG, strategy=strategy)
 
 
-def test_a_strategy_of_ones_own_decides_which_gaussians_there_are():
-    strategy = LeastSeen()
-    trainer = a_trainer(strategy)
+def test_a_custom_strategy_decides_which_gaussians_exist():
+    strategy = PruneLeastSeen()
+    trainer = make_trainer(strategy)
     trainer.run()
 
     assert len(trainer.model) == 57
     assert strategy.steps == list(range(1, 13)) and strategy.sizes == [(24, 24)] * 12
 
 
-def test_it_continues_from_a_checkpoint_with_what_it_had_collected(tmp_path):
-    whole, first, then = a_trainer(LeastSeen()), a_trainer(LeastSeen()), a_trainer(LeastSeen())
+def test_a_custom_strategy_resumes_with_its_state(tmp_path):
+    whole, first, then = make_trainer(PruneLeastSeen()), make_trainer(PruneLeastSeen()), make_trainer(PruneLeastSeen())
     whole.run()
     first.run(checkpoint=tmp_path / "checkpoint", stop=lambda: first.step == 6)
     then.load(tmp_path / "checkpoint")
@@ -79,8 +79,8 @@ def test_it_continues_from_a_checkpoint_with_what_it_had_collected(tmp_path):
     assert all(torch.equal(a, b) for a, b in zip(then.model.parameters(), whole.model.parameters(), strict=True))
 
 
-def test_a_run_is_not_gone_on_with_by_another_strategy(tmp_path):
-    trainer = a_trainer(LeastSeen())
+def test_a_run_does_not_resume_with_another_strategy(tmp_path):
+    trainer = make_trainer(PruneLeastSeen())
     trainer.run(checkpoint=tmp_path / "checkpoint", stop=lambda: trainer.step == 2)
     with pytest.raises(HyrfTrainingError, match=r"other settings \(strategy\)"):
-        a_trainer(None).load(tmp_path / "checkpoint")
+        make_trainer(None).load(tmp_path / "checkpoint")

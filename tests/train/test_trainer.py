@@ -16,31 +16,31 @@ from hyrfpack.render import render_view
 from hyrfpack.scene import Picture, Scene
 from hyrfpack.train import DensityConfig, LearningRates, TrainConfig, Trainer
 
-# Density control acts after steps 2, 7, 12, 17, 22 and 27, with a reset after 12 and 22: it all happens early.
-DENSITY = DensityConfig(start=0.05, stop=0.68, peak=0.68, excess=1.0, rounds=5, gradient=1e-5, resets=2)
-SHORT = TrainConfig(steps=40, seed=3, max_gaussians=160, density=DENSITY)
+# Density control acts after steps 2, 7, 12, 17, 22 and 27, with resets after 12 and 22, all within a short run.
+EARLY_DENSITY_CONFIG = DensityConfig(start=0.05, stop=0.68, peak=0.68, excess=1.0, rounds=5, gradient=1e-5, resets=2)
+SHORT_CONFIG = TrainConfig(steps=40, seed=3, max_gaussians=160, density=EARLY_DENSITY_CONFIG)
 
 
-def a_scene(**options) -> Scene:
+def make_scene(**options) -> Scene:
     return ball_scene(**{"views": 6, "points": 60, "side": 24, **options})
 
 
-def trained(config: TrainConfig = SHORT, **options) -> Trainer:
-    trainer = Trainer(a_scene(**options), config)
+def train_trainer(config: TrainConfig = SHORT_CONFIG, **options) -> Trainer:
+    trainer = Trainer(make_scene(**options), config)
     assert trainer.run()
     return trainer
 
 
-def parameters(trainer: Trainer) -> dict[str, bytes]:
+def parameter_bytes(trainer: Trainer) -> dict[str, bytes]:
     return {name: p.detach().numpy().tobytes() for name, p in trainer.model.named_parameters()}
 
 
-def without_times(records: list[dict]) -> list[dict]:
+def records_without_times(records: list[dict]) -> list[dict]:
     return [{name: value for name, value in record.items() if name != "seconds"} for record in records]
 
 
-def psnr(trainer: Trainer) -> float:
-    """Mean over the training views, from pictures rendered anew."""
+def mean_training_psnr(trainer: Trainer) -> float:
+    """Return the mean PSNR of fresh renders over the training views."""
     values = []
     for view in trainer.scene.train:
         with torch.no_grad():
@@ -50,76 +50,82 @@ def psnr(trainer: Trainer) -> float:
 
 
 @pytest.fixture(scope="module")
-def whole() -> Trainer:
-    """The uninterrupted run."""
-    return trained()
+def uninterrupted_trainer() -> Trainer:
+    """The trainer of the uninterrupted run."""
+    return train_trainer()
 
 
 # -- a run -----------------------------------------------------------------------------------------------------------
 
 
-def test_training_brings_the_loss_down_and_the_pictures_near():
-    trainer = Trainer(a_scene(side=32), TrainConfig(steps=60, max_gaussians=160))
-    before, losses = psnr(trainer), []
+def test_training_reduces_the_loss_and_raises_the_psnr():
+    trainer = Trainer(make_scene(side=32), TrainConfig(steps=60, max_gaussians=160))
+    before, losses = mean_training_psnr(trainer), []
 
     trainer.run(report=lambda trainer, loss, mse: losses.append(loss))
 
     assert len(losses) == trainer.step == 60
     assert np.mean(losses[-6:]) < 0.5 * np.mean(losses[:6])
-    assert psnr(trainer) > before + 4
+    assert mean_training_psnr(trainer) > before + 4
 
 
 @pytest.mark.parametrize("alpha_color", ["black", "white", "random"])
 def test_objects_with_coverage_train_over_any_colour(alpha_color):
     config = TrainConfig(steps=40, max_gaussians=160, background_color=alpha_color)
-    trainer = Trainer(a_scene(alpha=True), config)
+    trainer = Trainer(make_scene(alpha=True), config)
     losses = []
     trainer.run(report=lambda trainer, loss, mse: losses.append(loss))
     assert trainer.model.config.background is False
     assert np.mean(losses[-6:]) < 0.9 * np.mean(losses[:6])
 
 
-def test_the_same_seed_gives_the_same_bytes(whole):
-    assert parameters(trained()) == parameters(whole)
+def test_the_same_seed_gives_the_same_bytes(uninterrupted_trainer):
+    assert parameter_bytes(train_trainer()) == parameter_bytes(uninterrupted_trainer)
 
 
-def test_another_seed_gives_another_model(whole):
-    other = trained(dataclasses.replace(SHORT, seed=4))
-    assert parameters(other) != parameters(whole)
+def test_another_seed_gives_another_model(uninterrupted_trainer):
+    other = train_trainer(dataclasses.replace(SHORT_CONFIG, seed=4))
+    assert parameter_bytes(other) != parameter_bytes(uninterrupted_trainer)
 
 
 def test_the_budget_is_kept_at_every_step():
     counts = []
-    trainer = Trainer(a_scene(), dataclasses.replace(SHORT, max_gaussians=75))
+    trainer = Trainer(make_scene(), dataclasses.replace(SHORT_CONFIG, max_gaussians=75))
     trainer.run(report=lambda trainer, loss, mse: counts.append(len(trainer.model)))
     assert max(counts) <= 75 and counts[-1] > 60
 
 
-def test_gaussians_are_added_and_reset_in_the_run_that_the_others_compare_with(whole):
-    """Else resume and determinism would say little."""
-    counts = [record["gaussians"] for record in whole.records]
+def test_the_reference_run_adds_gaussians_and_resets_opacities(uninterrupted_trainer):
+    """Otherwise the tests of resuming and determinism would prove little."""
+    counts = [record["gaussians"] for record in uninterrupted_trainer.records]
     assert counts[0] != counts[7] != counts[-1]
-    assert (whole.strategy.first, whole.strategy.interval, whole.strategy.last) == (2, 5, 27)
+    assert (
+        uninterrupted_trainer.strategy.first,
+        uninterrupted_trainer.strategy.interval,
+        uninterrupted_trainer.strategy.last,
+    ) == (2, 5, 27)
 
 
-def test_every_epoch_shows_every_view_once_in_an_order_of_its_own():
-    trainer = Trainer(a_scene(views=5), dataclasses.replace(SHORT, steps=20))
+def test_every_epoch_shows_every_view_once_in_another_order():
+    trainer = Trainer(make_scene(views=5), dataclasses.replace(SHORT_CONFIG, steps=20))
     names = [view.name for view in trainer._order()]
     epochs = [tuple(names[i : i + 5]) for i in range(0, 20, 5)]
     assert all(set(epoch) == {view.name for view in trainer.scene.train} for epoch in epochs)
     assert len(set(epochs)) > 1
 
 
-def test_records_and_times_tell_of_the_run(whole):
-    assert [record["step"] for record in whole.records] == list(range(1, 41))
-    assert whole.records[-1]["gaussians"] == len(whole.model)
-    seconds = [record["seconds"] for record in whole.records]
-    assert seconds == sorted(seconds) and seconds[-1] == pytest.approx(whole.elapsed, abs=1e-3)
-    assert all(set(record) == {"step", "loss", "psnr", "gaussians", "seconds"} for record in whole.records)
-    assert {"data", "cull", "decode", "loss", "backward", "density", "optimizer"} <= set(whole.seconds)
+def test_records_and_times_describe_the_run(uninterrupted_trainer):
+    assert [record["step"] for record in uninterrupted_trainer.records] == list(range(1, 41))
+    assert uninterrupted_trainer.records[-1]["gaussians"] == len(uninterrupted_trainer.model)
+    seconds = [record["seconds"] for record in uninterrupted_trainer.records]
+    assert seconds == sorted(seconds) and seconds[-1] == pytest.approx(uninterrupted_trainer.elapsed, abs=1e-3)
+    assert all(
+        set(record) == {"step", "loss", "psnr", "gaussians", "seconds"} for record in uninterrupted_trainer.records
+    )
+    assert {"data", "cull", "decode", "loss", "backward", "density", "optimizer"} <= set(uninterrupted_trainer.seconds)
 
 
-def test_absolute_gradients_are_asked_for_only_while_they_are_used(monkeypatch):
+def test_absolute_gradients_are_computed_only_while_they_are_used(monkeypatch):
     asked = []
 
     def spy(*arguments, absgrad, **options):
@@ -127,12 +133,12 @@ def test_absolute_gradients_are_asked_for_only_while_they_are_used(monkeypatch):
         return render_view(*arguments, absgrad=absgrad, **options)
 
     monkeypatch.setattr("hyrfpack.train.trainer.render_view", spy)
-    trained()
+    train_trainer()
     assert asked == [True] * 27 + [False] * 13
 
 
 class Clock:
-    """Stands in for the time module: time passes only when told."""
+    """A replacement of the time module in which time passes only when a test advances it."""
 
     now = 0.0
 
@@ -140,8 +146,8 @@ class Clock:
         return self.now
 
 
-def on_the_clock(trainer: Trainer, clock: Clock, monkeypatch) -> None:
-    """Every step takes 2 seconds, of which the optimiser takes all."""
+def use_clock(trainer: Trainer, clock: Clock, monkeypatch) -> None:
+    """Make the optimiser advance the clock by 2 seconds in every step."""
     step = trainer.optimizer.step
 
     def slow(*arguments):
@@ -154,18 +160,18 @@ def on_the_clock(trainer: Trainer, clock: Clock, monkeypatch) -> None:
 def test_elapsed_seconds_are_those_of_the_steps_over_all_parts_of_a_run(tmp_path, monkeypatch):
     clock, path = Clock(), tmp_path / "checkpoint.pt"
     monkeypatch.setattr("hyrfpack.train.trainer.time", clock)
-    config = dataclasses.replace(SHORT, steps=12)
+    config = dataclasses.replace(SHORT_CONFIG, steps=12)
 
     def meanwhile(*_) -> None:
-        clock.now += 1000  # what is done with the report is not training
+        clock.now += 1000  # time spent on the report does not count as training
 
-    first, second = Trainer(a_scene(), config), Trainer(a_scene(), config)
-    on_the_clock(first, clock, monkeypatch)
+    first, second = Trainer(make_scene(), config), Trainer(make_scene(), config)
+    use_clock(first, clock, monkeypatch)
     first.run(checkpoint=path, report=meanwhile, stop=lambda: first.step == 5)
     assert first.elapsed == 10
     second.load(path)
     assert second.elapsed == 10 and second.seconds["optimizer"] == 10
-    on_the_clock(second, clock, monkeypatch)
+    use_clock(second, clock, monkeypatch)
     second.run(report=meanwhile)
 
     assert second.elapsed == 24 and second.seconds["optimizer"] == 24 and second.seconds["backward"] == 0
@@ -173,7 +179,11 @@ def test_elapsed_seconds_are_those_of_the_steps_over_all_parts_of_a_run(tmp_path
 
 @pytest.mark.parametrize("fails", [False, True])
 def test_torch_computes_on_one_thread_while_training_and_on_as_many_as_before_after(fails):
-    trainer, seen, before = Trainer(a_scene(), dataclasses.replace(SHORT, steps=2)), [], torch.get_num_threads()
+    trainer, seen, before = (
+        Trainer(make_scene(), dataclasses.replace(SHORT_CONFIG, steps=2)),
+        [],
+        torch.get_num_threads(),
+    )
 
     def look(*_) -> None:
         seen.append(torch.get_num_threads())
@@ -190,9 +200,9 @@ def test_torch_computes_on_one_thread_while_training_and_on_as_many_as_before_af
 
 
 def test_reported_errors_are_those_of_the_picture():
-    """Step 1 of one view, learning nothing: the mean squared error of the untrained model."""
-    trainer = Trainer(a_scene(views=1), TrainConfig(steps=1, max_gaussians=80))
-    before, seen = psnr(trainer), []
+    """With one view and no learning, step 1 reports the mean squared error of the untrained model."""
+    trainer = Trainer(make_scene(views=1), TrainConfig(steps=1, max_gaussians=80))
+    before, seen = mean_training_psnr(trainer), []
     trainer.run(report=lambda trainer, loss, mse: seen.append(mse))
     assert -10 * np.log10(seen[0]) == pytest.approx(before, abs=1e-3)
 
@@ -201,11 +211,11 @@ def test_learning_rates_fall_from_the_first_value_to_the_last(monkeypatch):
     rates = []
 
     def recorded(*arguments, rate, **others):
-        rates.append(rate[:5])  # the first of each group; the fields have many, of one rate
+        rates.append(rate[:5])  # the first rate of each group, because the fields have many parameters of one rate
         return adam_step(*arguments, rate=rate, **others)
 
     monkeypatch.setattr("hyrfpack.train.optimizer.adam_step", recorded)
-    trainer = Trainer(a_scene(), dataclasses.replace(SHORT, steps=20))
+    trainer = Trainer(make_scene(), dataclasses.replace(SHORT_CONFIG, steps=20))
     trainer.run()
     asked = trainer.config.learning_rates
     for name, found in zip(trainer.optimizer.groups, np.reshape(rates, (20, -1)).T, strict=True):
@@ -213,10 +223,12 @@ def test_learning_rates_fall_from_the_first_value_to_the_last(monkeypatch):
         np.testing.assert_allclose(found, 30**0.5 * np.geomspace(first, last, 21)[:20], rtol=1e-9)
 
 
-def test_masked_pixels_teach_nothing():
-    """Photos that differ only under the mask train the same model (by the L1 part, which has no window)
-    and say the same of themselves."""
-    scene = a_scene(views=2)
+def test_masked_pixels_do_not_affect_training():
+    """Photos that differ only under the mask train the same model and report the same errors.
+
+    The loss is L1 alone, because it has no window.
+    """
+    scene = make_scene(views=2)
     mask = np.ones((24, 24), bool)
     mask[6:18, :10] = False
     models, records = [], []
@@ -226,17 +238,17 @@ def test_masked_pixels_teach_nothing():
             rgb = view.load().rgb.copy()
             rgb[~mask] = fill
             views.append(view_of(view.name, view.camera, Picture(rgb, None, mask)))
-        config = dataclasses.replace(SHORT, steps=6, ssim_weight=0.0)
+        config = dataclasses.replace(SHORT_CONFIG, steps=6, ssim_weight=0.0)
         trainer = Trainer(dataclasses.replace(scene, train=views), config)
         trainer.run()
-        models.append(parameters(trainer))
+        models.append(parameter_bytes(trainer))
         records.append(trainer.records)
     assert models[0] == models[1]
-    assert without_times(records[0]) == without_times(records[1])
+    assert records_without_times(records[0]) == records_without_times(records[1])
 
 
 def test_reported_errors_are_those_outside_the_mask():
-    scene = a_scene(views=1)
+    scene = make_scene(views=1)
     view, mask = scene.train[0], np.zeros((24, 24), bool)
     mask[4:15, 7:20] = True
     masked = view_of(view.name, view.camera, Picture(view.load().rgb, None, mask))
@@ -247,71 +259,71 @@ def test_reported_errors_are_those_outside_the_mask():
     trainer.run(report=lambda trainer, loss, mse: seen.append(mse))
     errors = (rgb - view.load().rgb / 255) ** 2
     assert seen[0] == pytest.approx(errors[4:15, 7:20].mean(), rel=1e-4)
-    assert abs(seen[0] - errors.mean()) > 0.01 * errors.mean()  # else it would not matter
+    assert abs(seen[0] - errors.mean()) > 0.01 * errors.mean()  # otherwise the mask would make no difference
 
 
-def test_a_photo_that_is_masked_all_over_teaches_nothing():
-    scene = a_scene(views=1)
+def test_a_completely_masked_photo_does_not_change_the_model():
+    scene = make_scene(views=1)
     view = scene.train[0]
     masked = view_of(view.name, view.camera, Picture(view.load().rgb, None, np.zeros((24, 24), bool)))
-    trainer = Trainer(dataclasses.replace(scene, train=[masked]), dataclasses.replace(SHORT, steps=1))
-    before, said = parameters(trainer), []
+    trainer = Trainer(dataclasses.replace(scene, train=[masked]), dataclasses.replace(SHORT_CONFIG, steps=1))
+    before, said = parameter_bytes(trainer), []
     trainer.run(report=lambda trainer, loss, mse: said.append((loss, mse)))
     assert said[0][0] == 0 and np.isnan(said[0][1])
-    assert trainer.records == [] and parameters(trainer) == before
+    assert trainer.records == [] and parameter_bytes(trainer) == before
 
 
 # -- resuming --------------------------------------------------------------------------------------------------------
 
 
-def stopped_at(step: int, path: Path, config: TrainConfig = SHORT, **options) -> Trainer:
-    trainer = Trainer(a_scene(**options), config)
+def stop_at(step: int, path: Path, config: TrainConfig = SHORT_CONFIG, **options) -> Trainer:
+    trainer = Trainer(make_scene(**options), config)
     assert not trainer.run(checkpoint=path, stop=lambda: trainer.step == step)
     assert trainer.step == step
     return trainer
 
 
-# 1: before the first regular checkpoint; 2, 12: right after a round (and a reset); 14: between rounds, with gradients
-# collected; 30: after density control; 39: one step is left.
+# 1: before the first regular checkpoint; 2 and 12: directly after a round (and a reset); 14: between rounds, with
+# collected gradients; 30: after density control; 39: one step before the end.
 @pytest.mark.parametrize("step", [1, 2, 12, 14, 30, 39])
-def test_resuming_gives_the_bytes_of_the_uninterrupted_run(step, whole, tmp_path):
+def test_resuming_gives_the_bytes_of_the_uninterrupted_run(step, uninterrupted_trainer, tmp_path):
     path = tmp_path / "checkpoint.pt"
-    stopped_at(step, path)
+    stop_at(step, path)
 
-    resumed = Trainer(a_scene(), SHORT)
+    resumed = Trainer(make_scene(), SHORT_CONFIG)
     resumed.load(path)
     assert resumed.step == step and resumed.run(checkpoint=path)
 
-    assert parameters(resumed) == parameters(whole)
-    assert without_times(resumed.records) == without_times(whole.records)
+    assert parameter_bytes(resumed) == parameter_bytes(uninterrupted_trainer)
+    assert records_without_times(resumed.records) == records_without_times(uninterrupted_trainer.records)
 
 
-def test_resuming_again_and_again_gives_the_same_bytes(whole, tmp_path):
+def test_resuming_again_and_again_gives_the_same_bytes(uninterrupted_trainer, tmp_path):
     path = tmp_path / "checkpoint.pt"
-    stopped_at(5, path)
+    stop_at(5, path)
     for step in (6, 13, 27):
-        trainer = Trainer(a_scene(), SHORT)
+        trainer = Trainer(make_scene(), SHORT_CONFIG)
         trainer.load(path)
         assert not trainer.run(checkpoint=path, stop=lambda t=trainer, s=step: t.step == s)
-    last = Trainer(a_scene(), SHORT)
+    last = Trainer(make_scene(), SHORT_CONFIG)
     last.load(path)
     last.run()
-    assert parameters(last) == parameters(whole)
+    assert parameter_bytes(last) == parameter_bytes(uninterrupted_trainer)
 
 
 def test_random_backgrounds_resume_too(tmp_path):
-    config = dataclasses.replace(SHORT, steps=16, background_color="random")
-    expected = trained(config, alpha=True)
-    stopped_at(9, tmp_path / "checkpoint.pt", config, alpha=True)
-    resumed = Trainer(a_scene(alpha=True), config)
+    config = dataclasses.replace(SHORT_CONFIG, steps=16, background_color="random")
+    expected = train_trainer(config, alpha=True)
+    stop_at(9, tmp_path / "checkpoint.pt", config, alpha=True)
+    resumed = Trainer(make_scene(alpha=True), config)
     resumed.load(tmp_path / "checkpoint.pt")
     resumed.run()
-    assert parameters(resumed) == parameters(expected)
+    assert parameter_bytes(resumed) == parameter_bytes(expected)
 
 
 def test_regular_checkpoints_are_written_while_running(tmp_path):
     path, found = tmp_path / "checkpoint.pt", []
-    trainer = Trainer(a_scene(), dataclasses.replace(SHORT, steps=12, checkpoint_every=5))
+    trainer = Trainer(make_scene(), dataclasses.replace(SHORT_CONFIG, steps=12, checkpoint_every=5))
     trainer.run(checkpoint=path, report=lambda trainer, loss, mse: found.append(path.exists()))
     assert found == [step > 5 for step in range(1, 13)]
     trainer.load(path)
@@ -319,10 +331,10 @@ def test_regular_checkpoints_are_written_while_running(tmp_path):
 
 
 def test_saving_what_was_loaded_gives_the_same_state(tmp_path):
-    stopped = stopped_at(14, tmp_path / "a.pt")
-    loaded = Trainer(a_scene(), SHORT)
+    stopped = stop_at(14, tmp_path / "a.pt")
+    loaded = Trainer(make_scene(), SHORT_CONFIG)
     loaded.load(tmp_path / "a.pt")
-    assert parameters(loaded) == parameters(stopped)
+    assert parameter_bytes(loaded) == parameter_bytes(stopped)
     for name in ("gradients", "views"):
         assert torch.equal(getattr(loaded.strategy, name), getattr(stopped.strategy, name))
     states = stopped.optimizer.state_dict(), loaded.optimizer.state_dict()
@@ -341,33 +353,33 @@ def test_saving_what_was_loaded_gives_the_same_state(tmp_path):
     ],
 )
 def test_a_run_with_other_settings_is_not_resumed(change, named, tmp_path):
-    stopped_at(1, tmp_path / "checkpoint.pt")
+    stop_at(1, tmp_path / "checkpoint.pt")
     with pytest.raises(HyrfTrainingError, match=rf"other settings \(.*{named}"):
-        Trainer(a_scene(), dataclasses.replace(SHORT, **change)).load(tmp_path / "checkpoint.pt")
+        Trainer(make_scene(), dataclasses.replace(SHORT_CONFIG, **change)).load(tmp_path / "checkpoint.pt")
 
 
 @pytest.mark.parametrize("options", [{"views": 5}, {"side": 20}])
 def test_a_run_on_other_photos_is_not_resumed(options, tmp_path):
-    stopped_at(1, tmp_path / "checkpoint.pt")
+    stop_at(1, tmp_path / "checkpoint.pt")
     with pytest.raises(HyrfTrainingError, match=r"other settings \(.*views"):
-        Trainer(a_scene(**options), SHORT).load(tmp_path / "checkpoint.pt")
+        Trainer(make_scene(**options), SHORT_CONFIG).load(tmp_path / "checkpoint.pt")
 
 
 def test_a_run_on_moved_cameras_is_not_resumed(tmp_path):
-    stopped_at(1, tmp_path / "checkpoint.pt")
+    stop_at(1, tmp_path / "checkpoint.pt")
     with pytest.raises(HyrfTrainingError, match="other settings"):
-        Trainer(a_scene(scale=2.0), SHORT).load(tmp_path / "checkpoint.pt")
+        Trainer(make_scene(scale=2.0), SHORT_CONFIG).load(tmp_path / "checkpoint.pt")
 
 
 # -- what is not finite ----------------------------------------------------------------------------------------------
 
 
 def test_a_photo_with_nan_stops_the_run_and_is_named():
-    scene = a_scene()
+    scene = make_scene()
     broken = np.array(scene.train[4].load().rgb, np.float32)
     broken[3, 5, 1] = np.nan
     scene.train[4] = view_of("bad.png", scene.train[4].camera, Picture(broken))
-    trainer = Trainer(scene, SHORT)
+    trainer = Trainer(scene, SHORT_CONFIG)
     step = 1 + next(i for i, view in enumerate(trainer._order()) if view.name == "bad.png")
 
     with pytest.raises(HyrfTrainingError, match=rf"step {step} on view 'bad.png'.*not finite.*photo"):
@@ -376,7 +388,7 @@ def test_a_photo_with_nan_stops_the_run_and_is_named():
 
 @pytest.mark.parametrize("name", ["gaussians.color_logits", "radiance.biases.2", "radiance.grid.table"])
 def test_a_parameter_that_is_not_finite_stops_the_run_and_is_named(name):
-    trainer = Trainer(a_scene(), SHORT)
+    trainer = Trainer(make_scene(), SHORT_CONFIG)
     with torch.no_grad():
         dict(trainer.model.named_parameters())[name].view(-1)[::3] = float("nan")
     first = next(trainer._order()).name
@@ -388,7 +400,7 @@ def test_a_parameter_that_is_not_finite_stops_the_run_and_is_named(name):
 
 
 def test_a_gradient_that_is_not_finite_stops_the_run_before_it_spreads():
-    trainer = Trainer(a_scene(), SHORT)
+    trainer = Trainer(make_scene(), SHORT_CONFIG)
     trainer.model.gaussians.color_logits.register_hook(lambda grad: grad * float("nan"))
     before = trainer.model.gaussians.color_logits.detach().clone()
     with pytest.raises(HyrfTrainingError, match=r"step 1 on view .*gradient is not finite.*color_logits"):
@@ -399,8 +411,8 @@ def test_a_gradient_that_is_not_finite_stops_the_run_before_it_spreads():
 
 @pytest.mark.parametrize("name", ["positions", "scale_logits", "opacity_logits"])
 def test_one_broken_gaussian_neither_crashes_nor_spreads(name):
-    """The rasteriser drops it; the next round removes it."""
-    trainer = Trainer(a_scene(), SHORT)
+    """The rasteriser skips it, and the next round removes it."""
+    trainer = Trainer(make_scene(), SHORT_CONFIG)
     with torch.no_grad():
         getattr(trainer.model.gaussians, name)[7] = float("nan")
     try:
@@ -414,43 +426,47 @@ def test_one_broken_gaussian_neither_crashes_nor_spreads(name):
 # -- hard starts -----------------------------------------------------------------------------------------------------
 
 
-def with_points(points) -> Scene:
-    scene, points = a_scene(), np.asarray(points, np.float64)
+def scene_with_points(points) -> Scene:
+    scene, points = make_scene(), np.asarray(points, np.float64)
     return dataclasses.replace(scene, points=points, point_colors=np.full((len(points), 3), 0.5, np.float32))
 
 
-def of_views(views) -> Scene:
-    return dataclasses.replace(a_scene(), train=list(views))
+def scene_with_views(views) -> Scene:
+    return dataclasses.replace(make_scene(), train=list(views))
 
 
 def black_scene() -> Scene:
     black = Picture(np.zeros((24, 24, 3), np.uint8))
-    return of_views(view_of(view.name, view.camera, black) for view in a_scene().train)
+    return scene_with_views(view_of(view.name, view.camera, black) for view in make_scene().train)
 
 
 def same_way_scene() -> Scene:
-    """Six times the very same photo."""
-    view = a_scene().train[0]
-    return of_views(dataclasses.replace(view, name=f"{i}.png") for i in range(6))
+    """Return a scene with the same photo six times."""
+    view = make_scene().train[0]
+    return scene_with_views(dataclasses.replace(view, name=f"{i}.png") for i in range(6))
 
 
 def invisible_scene() -> Scene:
     nothing = Picture(np.zeros((24, 24, 3), np.uint8), np.zeros((24, 24), np.uint8))
-    views = [view_of(view.name, view.camera, nothing) for view in a_scene().train]
-    return dataclasses.replace(with_points(np.zeros((0, 3))), train=views, has_alpha=True)
+    views = [view_of(view.name, view.camera, nothing) for view in make_scene().train]
+    return dataclasses.replace(scene_with_points(np.zeros((0, 3))), train=views, has_alpha=True)
 
 
 HARD_STARTS = {
-    "all points coincident": lambda: with_points(np.tile([0.1, 0.2, 0.3], (50, 1))),
-    "one point": lambda: with_points([[0.0, 0.0, 0.0]]),
-    "ten points": lambda: with_points(np.random.default_rng(0).normal(size=(10, 3)) * 0.3),
-    "no points": lambda: with_points(np.zeros((0, 3))),
-    "points a million units away": lambda: with_points(np.random.default_rng(0).normal(size=(50, 3)) + 1e6),
-    "a few points a million units away": lambda: with_points(np.vstack([a_scene().points, np.full((5, 3), 1e6)])),
-    "points behind every camera": lambda: with_points(np.random.default_rng(0).normal(size=(50, 3)) + (0, 0, 30)),
-    "points on the cameras": lambda: with_points([view.camera.position for view in a_scene().train]),
-    "one view": lambda: of_views(a_scene().train[:1]),
-    "one view and no points": lambda: dataclasses.replace(with_points(np.zeros((0, 3))), train=a_scene().train[:1]),
+    "all points coincident": lambda: scene_with_points(np.tile([0.1, 0.2, 0.3], (50, 1))),
+    "one point": lambda: scene_with_points([[0.0, 0.0, 0.0]]),
+    "ten points": lambda: scene_with_points(np.random.default_rng(0).normal(size=(10, 3)) * 0.3),
+    "no points": lambda: scene_with_points(np.zeros((0, 3))),
+    "points a million units away": lambda: scene_with_points(np.random.default_rng(0).normal(size=(50, 3)) + 1e6),
+    "a few points a million units away": lambda: scene_with_points(
+        np.vstack([make_scene().points, np.full((5, 3), 1e6)])
+    ),
+    "points behind every camera": lambda: scene_with_points(np.random.default_rng(0).normal(size=(50, 3)) + (0, 0, 30)),
+    "points on the cameras": lambda: scene_with_points([view.camera.position for view in make_scene().train]),
+    "one view": lambda: scene_with_views(make_scene().train[:1]),
+    "one view and no points": lambda: dataclasses.replace(
+        scene_with_points(np.zeros((0, 3))), train=make_scene().train[:1]
+    ),
     "black pictures": black_scene,
     "the same view six times": same_way_scene,
     "nothing covered": invisible_scene,
@@ -458,8 +474,8 @@ HARD_STARTS = {
 
 
 @pytest.mark.parametrize("start", HARD_STARTS)
-def test_hard_starts_train_to_something_finite(start):
-    trainer = Trainer(HARD_STARTS[start](), dataclasses.replace(SHORT, steps=20))
+def test_hard_starts_train_to_finite_parameters(start):
+    trainer = Trainer(HARD_STARTS[start](), dataclasses.replace(SHORT_CONFIG, steps=20))
     losses = []
     trainer.run(report=lambda trainer, loss, mse: losses.append(loss))
     assert 1 <= len(trainer.model) <= 160
@@ -468,7 +484,7 @@ def test_hard_starts_train_to_something_finite(start):
 
 
 def opaque_object_on_a_plain_wall() -> Scene:
-    """As a turntable makes them: no coverage, no points, and no background sphere to hold the wall."""
+    """Return photos as a turntable gives them: no coverage, no points and no background sphere for the wall."""
     return dataclasses.replace(ball_scene(points=0), layout="blender")
 
 
@@ -484,38 +500,40 @@ def opaque_object_on_a_plain_wall() -> Scene:
 )
 def test_sparse_opaque_scenes_do_not_collapse(make, config, gain):
     trainer = Trainer(make(), config)
-    first, before, counts = len(trainer.model), psnr(trainer), []
+    first, before, counts = len(trainer.model), mean_training_psnr(trainer), []
     trainer.run(report=lambda trainer, loss, mse: counts.append(len(trainer.model)))
     assert min(counts) > first / 2
-    assert psnr(trainer) > before + gain
+    assert mean_training_psnr(trainer) > before + gain
 
 
 @pytest.mark.parametrize("budget", [1, 2])
 def test_the_smallest_budgets_train(budget):
-    trainer = trained(dataclasses.replace(SHORT, steps=20, max_gaussians=budget))
+    trainer = train_trainer(dataclasses.replace(SHORT_CONFIG, steps=20, max_gaussians=budget))
     assert len(trainer.model) == budget
 
 
-def test_millimetres_and_kilometres_train_to_the_same_quality(whole):
-    in_mm, in_km = psnr(trained(scale=1e3)), psnr(trained(scale=1e-3))
+def test_millimetres_and_kilometres_train_to_the_same_quality(uninterrupted_trainer):
+    in_mm, in_km = mean_training_psnr(train_trainer(scale=1e3)), mean_training_psnr(train_trainer(scale=1e-3))
     assert in_mm == pytest.approx(in_km, abs=0.1)
-    assert in_mm == pytest.approx(psnr(whole), abs=0.1)
+    assert in_mm == pytest.approx(mean_training_psnr(uninterrupted_trainer), abs=0.1)
 
 
-def test_a_scene_a_million_units_from_the_origin_trains_as_well(whole):
-    assert psnr(trained(offset=(1e6, -1e6, 5e5))) == pytest.approx(psnr(whole), abs=0.1)
+def test_a_scene_a_million_units_from_the_origin_trains_as_well(uninterrupted_trainer):
+    assert mean_training_psnr(train_trainer(offset=(1e6, -1e6, 5e5))) == pytest.approx(
+        mean_training_psnr(uninterrupted_trainer), abs=0.1
+    )
 
 
-def test_a_model_that_was_loaded_can_be_trained_on():
-    model = decode_model(encode_model(Trainer(a_scene(), SHORT).model))
+def test_a_loaded_model_can_be_trained_further():
+    model = decode_model(encode_model(Trainer(make_scene(), SHORT_CONFIG).model))
     before = model.gaussians.color_logits.clone()
-    trainer = Trainer(a_scene(), dataclasses.replace(SHORT, steps=1), model=model)
+    trainer = Trainer(make_scene(), dataclasses.replace(SHORT_CONFIG, steps=1), model=model)
     trainer.run()
     assert not torch.equal(trainer.model.gaussians.color_logits, before)
 
 
-def test_what_is_frozen_on_purpose_stays_frozen():
-    model = Trainer(a_scene(), SHORT).model
+def test_frozen_parameters_stay_frozen():
+    model = Trainer(make_scene(), SHORT_CONFIG).model
     model.geometry.requires_grad_(False)
-    trainer = Trainer(a_scene(), dataclasses.replace(SHORT, steps=1), model=model)
+    trainer = Trainer(make_scene(), dataclasses.replace(SHORT_CONFIG, steps=1), model=model)
     assert not any(parameter.requires_grad for parameter in trainer.model.geometry.parameters())
