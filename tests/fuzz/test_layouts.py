@@ -18,7 +18,7 @@ from PIL import Image
 
 from hyrfpack.data import load_scene
 from hyrfpack.errors import HyrfError
-from tools.safety.fuzz_mutate import HOSTILE_JSON, edit_bytes, iterate_json_values
+from tools.safety.fuzz_mutate import HOSTILE_JSON, edit_bytes, list_json_values
 
 MOST_MEMORY = 60e6  # bytes: the tables are of some kilobytes, and a package may be loaded at its first use
 TABLES = {
@@ -76,7 +76,7 @@ def mutated(data: bytes, name: str, rng: Random) -> bytes:
     if kind == 1 and (name.endswith(".json") or name == "metadata"):
         content = json.loads(data)
         for _ in range(rng.randint(1, 3)):
-            holder, key = rng.choice(iterate_json_values(content))
+            holder, key = rng.choice(list_json_values(content))
             holder[key] = rng.choice((*HOSTILE_JSON, [1e308] * 7, [[0.0] * 7] * 2, "1"))
         return json.dumps(content).encode()
     text = data.decode()

@@ -34,7 +34,7 @@ from hyrfpack.data import load_scene
 from hyrfpack.data.pictures import read_header, read_pixels
 from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.train.checkpoint import load_checkpoint, save_checkpoint
-from tools.safety.fuzz_mutate import EXTREME_INTEGERS, HOSTILE_JSON, edit_bytes, iterate_json_values
+from tools.safety.fuzz_mutate import EXTREME_INTEGERS, HOSTILE_JSON, edit_bytes, list_json_values
 
 numbers = st.integers(0, 2**32 - 1).map(Random)  # hypothesis chooses the seed: mutants are cheap, and small already
 search = settings(max_examples=150, deadline=None)
@@ -63,7 +63,7 @@ def forge_json(values: dict | list, rng: Random) -> bytes:
     """Values with one or two places deleted, doubled or replaced, as text; now and then the text is damaged too."""
     values = json.loads(json.dumps(values))
     for _ in range(rng.randint(1, 2)):
-        node, key = rng.choice(iterate_json_values(values))
+        node, key = rng.choice(list_json_values(values))
         kind = rng.randrange(4)
         if kind == 0:
             del node[key]
@@ -265,7 +265,7 @@ def test_what_a_camera_file_says_is_quoted_in_short(tmp_path):
 @given(rng=numbers)
 def test_a_forged_viewpoint_is_followed_or_refused(rng):
     viewpoint = json.loads(json.dumps(Viewpoint.from_frame((0, 0, 0), 1.0).to_json()))
-    node, key = rng.choice(iterate_json_values(viewpoint))
+    node, key = rng.choice(list_json_values(viewpoint))
     node[key] = rng.choice((*HOSTILE_JSON, 1e160, [1e200] * 3, [5e-324] * 3))
 
     facts = {"provenance": {"viewpoint": viewpoint}, "config": {"frame": None}}

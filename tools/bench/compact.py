@@ -65,7 +65,9 @@ def _bench_model(count: int, log2_table_size: int) -> list[dict]:
     sensitivity = draw_sensitivity(model)
     make = partial(make_plan, model, sensitivity, TARGET_DISTORTION, prune=False)
     plan = make()
-    ways = {"compact (cpu)": True, "compact (numpy)": False} if has_numba() else {"compact (numpy)": False}
+    use_numba_by_profile = (
+        {"compact (cpu)": True, "compact (numpy)": False} if has_numba() else {"compact (numpy)": False}
+    )
 
     def encode() -> bytes:
         return encode_model(model, "compact", quantized=quantize(plan.apply(model), plan, sensitivity))
@@ -73,27 +75,32 @@ def _bench_model(count: int, log2_table_size: int) -> list[dict]:
     planning, _ = time_alternately({"plan": make}, TIMING_REPEATS)
     encoders = {
         "raw": partial(encode_model, model),
-        **{way: _with_numba(use_numba, encode) for way, use_numba in ways.items()},
+        **{profile: _with_numba(use_numba, encode) for profile, use_numba in use_numba_by_profile.items()},
     }
     encoding, files = time_alternately(encoders, TIMING_REPEATS)
-    if len({files[way] for way in ways}) > 1:
+    if len({files[profile] for profile in use_numba_by_profile}) > 1:
         raise AssertionError("the bytes depend on whether there is Numba")
-    decoders = {way: _with_numba(ways.get(way, True), partial(decode_model, data)) for way, data in files.items()}
+    decoders = {
+        profile: _with_numba(use_numba_by_profile.get(profile, True), partial(decode_model, data))
+        for profile, data in files.items()
+    }
     decoding, models = time_alternately(decoders, TIMING_REPEATS)
     return [
         {
             "gaussians": count,
-            "profile": way,
+            "profile": profile,
             "bytes": len(data),
-            "plan_ms": planning["plan"].ms if way in ways else None,
-            "encode_ms": encoding[way].ms,
-            "decode_ms": decoding[way].ms,
-            "decode_over_raw": decoding[way].ratio_to(decoding["raw"]).wall,
-            "decode_work_ms": decoding[way].work_ms,
-            "peak_over_model": _measure_peak_bytes(decoders[way]) / sum(4 * p.numel() for p in model.parameters()),
-            "rms_error": _measure_logit_error(models[way], model, plan if way in ways else None),
+            "plan_ms": planning["plan"].ms if profile in use_numba_by_profile else None,
+            "encode_ms": encoding[profile].ms,
+            "decode_ms": decoding[profile].ms,
+            "decode_over_raw": decoding[profile].ratio_to(decoding["raw"]).wall,
+            "decode_work_ms": decoding[profile].work_ms,
+            "peak_over_model": _measure_peak_bytes(decoders[profile]) / sum(4 * p.numel() for p in model.parameters()),
+            "rms_error": _measure_logit_error(
+                models[profile], model, plan if profile in use_numba_by_profile else None
+            ),
         }
-        for way, data in files.items()
+        for profile, data in files.items()
     ]
 
 

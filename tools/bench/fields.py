@@ -46,21 +46,23 @@ def compare(call: OperationCall, upstream: Tensor, items: int) -> list[dict]:
     `max_error` is the largest difference from the float64 reference over the reference's largest value. `items` divides
     the time into ns an item.
     """
-    ours, reference = (call.separate_tasks(who, upstream=upstream) for who in ("cpu", "reference"))
+    ours, reference = (
+        call.separate_tasks(implementation, upstream=upstream) for implementation in ("cpu", "reference")
+    )
     exact = call.separate_tasks("reference", torch.float64, upstream=upstream)
     rows = []
-    for way, task, slow, right in zip(("forward", "backward"), ours, reference, exact, strict=True):
+    for pass_name, task, slow, right in zip(("forward", "backward"), ours, reference, exact, strict=True):
         times, _ = time_alternately({"cpu": task, "reference": slow}, TIMING_REPEATS)
         # The backward pass is compared by its first gradient: that of the table, or that of x.
-        found, expected = (part if way == "forward" else part[0] for part in (task(), right()))
+        found, expected = (part if pass_name == "forward" else part[0] for part in (task(), right()))
         rows.append(
             {
-                "pass": way,
+                "pass": pass_name,
                 "ms": times["cpu"].ms,
                 "ns_an_item": 1e6 * times["cpu"].ms / items,
                 "reference_ms": times["reference"].ms,
                 "times_faster": times["reference"].ratio_to(times["cpu"]).wall,
-                "max_error": measure_relative_error(found, expected, way).max,
+                "max_error": measure_relative_error(found, expected, pass_name).max,
             }
         )
     return rows

@@ -77,14 +77,20 @@ def bench() -> list[dict]:
 
     rows = []
     for name in WORKLOAD_SIZES:
-        here = times[name, "cpu"]
-        row = {"workload": name, "threads": thread_count(), "pairs": here[0]["pairs"]}
-        row |= {f"{stage}_ms": median(time[stage] for time in here) for stage in TIMED_STAGES}
-        row |= {f"{way}_ns_a_pair": 1e6 * row[f"{way}_ms"] / row["pairs"] for way in ("forward", "backward")}
+        cpu_times = times[name, "cpu"]
+        row = {"workload": name, "threads": thread_count(), "pairs": cpu_times[0]["pairs"]}
+        row |= {f"{stage}_ms": median(time[stage] for time in cpu_times) for stage in TIMED_STAGES}
+        row |= {
+            f"{pass_name}_ns_a_pair": 1e6 * row[f"{pass_name}_ms"] / row["pairs"]
+            for pass_name in ("forward", "backward")
+        }
         rows.append(row)
-    for way in ("forward", "backward"):
-        ours, slow = (median(time[f"{way}_work"] for time in times["A", who]) for who in ("cpu", "reference"))
-        rows[0][f"{way}_times_faster"] = slow / ours
+    for pass_name in ("forward", "backward"):
+        ours, slow = (
+            median(time[f"{pass_name}_work"] for time in times["A", implementation])
+            for implementation in ("cpu", "reference")
+        )
+        rows[0][f"{pass_name}_times_faster"] = slow / ours
     return [rows[0] | measure_errors(*calls["A", "cpu"]), *rows[1:]]
 
 

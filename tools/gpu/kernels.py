@@ -75,11 +75,11 @@ def rasterize_rows(name: str, look: Look, setup: Setup) -> Iterator[Row]:
         rasterize_call(view_splats.inputs, *view_splats.view)
         for view_splats in (splats, crop_splats(splats, setup.crop))
     )
-    drawn = rasterize(*splats.inputs.values(), *splats.view, implementation=setup.implementation)
-    pairs, pixels, count = int(drawn.pairs), setup.width * setup.height, len(splats.inputs["means"])
+    raster = rasterize(*splats.inputs.values(), *splats.view, implementation=setup.implementation)
+    pairs, pixels, count = int(raster.pairs), setup.width * setup.height, len(splats.inputs["means"])
     blended, reached = count_blended(splats)
     tiles = -(-setup.width // 16) * -(-setup.height // 16)
-    seen = int(drawn.visible.sum())
+    seen = int(raster.visible.sum())
     size = f"{count:,} Gaussians, {seen:,} visible, {pairs:,} pairs, {setup.width} x {setup.height}"
     works = {
         "project": roofline.count_project(count),
@@ -93,18 +93,20 @@ def rasterize_rows(name: str, look: Look, setup: Setup) -> Iterator[Row]:
     totals = (sum(works.values(), Work(0, 0)), sum(backward_works.values(), Work(0, 0)))
     yield from _timed_rows(name, size, call, totals, setup, crop)
     forward, backward = call.separate_tasks(setup.implementation)
-    for way, task, parts in (("forward", forward, works), ("backward", backward, backward_works)):
+    for pass_name, task, parts in (("forward", forward, works), ("backward", backward, backward_works)):
         measured = profile_task(task, 5, setup.torch_device).times
-        for stage, ms in group_kernels(measured, STAGE_KERNEL_WORDS, "bin" if way == "forward" else "other").items():
+        for stage, ms in group_kernels(
+            measured, STAGE_KERNEL_WORDS, "bin" if pass_name == "forward" else "other"
+        ).items():
             if stage in parts and ms:
-                yield _row(f"- {stage}", way, size, ms, parts[stage], setup)
+                yield _row(f"- {stage}", pass_name, size, ms, parts[stage], setup)
             elif ms:
-                yield {"table": TABLE_NAME, "kernel": f"- {stage}", "pass": way, "size": size, "ms": ms}
+                yield {"table": TABLE_NAME, "kernel": f"- {stage}", "pass": pass_name, "size": size, "ms": ms}
         for kernel, ms in list(measured.items())[:12]:
             yield {
                 "table": "Rasteriser's kernels on the device",
                 "call": name,
-                "pass": way,
+                "pass": pass_name,
                 "name": kernel[:90],
                 "ms": ms,
             }
@@ -239,18 +241,18 @@ def rasterize_shaded_rows(setup: Setup) -> Iterator[Row]:
         def draw(view: tuple = splats.view, shading: Shading = shading) -> Rasterization:
             return rasterize_shaded(*explicit, shading, *view, implementation=setup.implementation)
 
-        drawn = draw()
-        pairs, seen = int(drawn.pairs), int(drawn.visible.sum())
+        raster = draw()
+        pairs, seen = int(raster.pairs), int(raster.visible.sum())
         ms = median_ms({"draw": draw}, setup.repeats, setup.torch_device)["draw"]
         project = roofline.count_project_shaded(len(model), seen, _widths(shading), shading.mixed)
         # The decoder's arithmetic runs on other units than the blending's, so only its own stage's row counts it.
-        whole = Work(project.bytes, 0) + roofline.count_bin_pairs(seen, pairs, tiles)
-        whole += roofline.count_blend(pairs, pixels, reached, blended)
+        total_work = Work(project.bytes, 0) + roofline.count_bin_pairs(seen, pairs, tiles)
+        total_work += roofline.count_blend(pairs, pixels, reached, blended)
         view = crop_splats(splats, setup.crop).view
-        wanted = rasterize_shaded(*exact, _cast(shading, torch.float64), *view, implementation="reference")
-        error = relative_error(join_color_and_transmittance(draw(view)), join_color_and_transmittance(wanted))
+        expected = rasterize_shaded(*exact, _cast(shading, torch.float64), *view, implementation="reference")
+        error = relative_error(join_color_and_transmittance(draw(view)), join_color_and_transmittance(expected))
         size = f"{len(model):,} Gaussians, {seen:,} visible, {pairs:,} pairs, {setup.width} x {setup.height}"
-        row = _row(f"rasterize shaded, {precision}", "forward", size, ms, whole, setup)
+        row = _row(f"rasterize shaded, {precision}", "forward", size, ms, total_work, setup)
         yield row | {"value error": error} | status_beyond(error, 3e-3 if shading.mixed else 1e-3)
         stages = group_kernels(profile_task(draw, 5, setup.torch_device).times, STAGE_KERNEL_WORDS, "bin")
         if stages["project"]:
@@ -267,20 +269,20 @@ def background_rows(setup: Setup) -> Iterator[Row]:
     view = camera.intrinsics, splats.pose
     exact = copy.deepcopy(model).double()
     exact.precision = "float32"  # no factor of the reference's products is rounded to bfloat16
-    wanted = exact.background_grid(light.double(), *view, **options)
+    expected = exact.background_grid(light.double(), *view, **options)
     on_gpu = setup.torch_device.type == "cuda"
     field, grid = model.radiance, model.radiance.grid.config
     widths = [field.weights[0].shape[1], *(weight.shape[0] for weight in field.weights)]
-    nodes, needed = wanted[..., 0].numel(), int((wanted > 0).any(-1).sum())
+    nodes, needed = expected[..., 0].numel(), int((expected > 0).any(-1).sum())
     size = f"{needed:,} of {nodes:,} nodes, {setup.width} x {setup.height}"
     for precision in ("float32", "mixed") if on_gpu else ("mixed",):  # on a CPU both precisions are the same
         model.precision = precision  # "mixed" is the default, so the model ends in its initial precision
         mixed = on_gpu and precision == "mixed"
-        found = model.background_grid(light, *view, **options)
+        actual = model.background_grid(light, *view, **options)
         task = {"grid": lambda: model.background_grid(light, *view, **options)}
         ms = median_ms(task, setup.repeats, setup.torch_device)["grid"]
         work = roofline.count_background(light.numel(), nodes, needed, widths, grid.levels, grid.rows, mixed)
-        error = relative_error(found, wanted)
+        error = relative_error(actual, expected)
         row = _row(f"background, {'mixed' if mixed else 'float32'}", "forward", size, ms, work, setup)
         yield row | {"value error": error} | status_beyond(error, 1e-2 if mixed else 1e-3)
 
@@ -329,28 +331,28 @@ def _timed_rows(
     """Yield the rows of both passes of a call; the errors are those of `part`, a smaller call."""
     tasks = dict(zip(("forward", "backward"), call.separate_tasks(setup.implementation), strict=True))
     times = median_ms(tasks, setup.repeats, setup.torch_device)
-    found = check_call(part, setup.implementation)
-    values, gradients = found.pop("value error"), found.pop("gradient error")
-    yield _row(name, "forward", size, times["forward"], works[0], setup) | {"value error": values} | found
-    yield _row(name, "backward", size, times["backward"], works[1], setup) | {"gradient error": gradients} | found
+    errors = check_call(part, setup.implementation)
+    values, gradients = errors.pop("value error"), errors.pop("gradient error")
+    yield _row(name, "forward", size, times["forward"], works[0], setup) | {"value error": values} | errors
+    yield _row(name, "backward", size, times["backward"], works[1], setup) | {"gradient error": gradients} | errors
 
 
-def _row(name: str, way: str, size: str, ms: float, work: Work, setup: Setup) -> Row:
+def _row(name: str, pass_name: str, size: str, ms: float, work: Work, setup: Setup) -> Row:
     rates = measure_rates(setup.torch_device)
     copy, arithmetic = work.shares(ms, rates)
-    least = work.min_ms(rates)
+    roofline_ms = work.min_ms(rates)
     return {
         "table": TABLE_NAME,
         "kernel": name,
-        "pass": way,
+        "pass": pass_name,
         "size": size,
         "ms": ms,
         "MB": work.bytes / 1e6,
         "GFLOP": work.flops / 1e9,
         "of copy rate": f"{copy:.0%}",
         "of matrix rate": f"{arithmetic:.0%} {work.unit}",
-        "roofline ms": least,
-        "roofline / time": f"{least / ms:.0%}",
+        "roofline ms": roofline_ms,
+        "roofline / time": f"{roofline_ms / ms:.0%}",
     }
 
 

@@ -56,13 +56,13 @@ def _rasterize(
     return make
 
 
-def _hash_encode(points: int, log2: int, wanted: tuple[str, ...]) -> Callable[[torch.device], OperationCall]:
+def _hash_encode(points: int, log2: int, gradient_inputs: tuple[str, ...]) -> Callable[[torch.device], OperationCall]:
     def make(device: torch.device) -> OperationCall:
         resolutions = level_resolutions(16, 8, 512)
         # Coordinates have 16 bits, so that a point has the same cell and offset in every precision.
         coords = torch.randint(0, 1 << 16, (points, 3), generator=torch.Generator().manual_seed(0)) / (1 << 16)
         table = _random_normal(1, level_offsets(resolutions, log2)[-1], 2)
-        return hash_encode_call(coords.to(device), table.to(device), resolutions, log2, wanted)
+        return hash_encode_call(coords.to(device), table.to(device), resolutions, log2, gradient_inputs)
 
     return make
 

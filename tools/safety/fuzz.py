@@ -186,17 +186,17 @@ def check_file(data: bytes, outcome: HybridModel | str, folder: Path) -> None:
         refused = str(error).replace(str(path), "the data")
     if refused != (outcome if isinstance(outcome, str) else None):
         raise Failure(f"reading the file gives {refused!r}, decoding its bytes gives {outcome!r:.200}")
-    shown = io.TextIOWrapper(io.BytesIO(), encoding="utf-8")
+    output = io.TextIOWrapper(io.BytesIO(), encoding="utf-8")
     try:
         describe_file(path)
-        with contextlib.redirect_stdout(shown):
+        with contextlib.redirect_stdout(output):
             info.callback(path, False)
             info.callback(path, True)
     except HyrfFormatError as error:
         if not isinstance(outcome, str):
             raise Failure(f"the decoder accepts the file, but `describe` refuses it: {error}") from error
-    shown.seek(0)
-    if not shown.read().replace("\n", "").isprintable():
+    output.seek(0)
+    if not output.read().replace("\n", "").isprintable():
         raise Failure("`hyrfpack info` prints unprintable characters")
 
 
@@ -399,11 +399,11 @@ def main() -> int:
     text = report(tally, fuzz_run.resident, time.monotonic() - start)
     (options.out / f"report-{options.seed}.txt").write_text(text + "\n")
     print("\n" + text)
-    for number, story in sorted(tally.failures.items()):
+    for number, description in sorted(tally.failures.items()):
         name = options.out / f"{options.seed}-{number}"
         name.with_suffix(".hyrf").write_bytes(make_hostile_file(number, options.seed)[1])
-        name.with_suffix(".txt").write_text(f"--seed {options.seed} --only {number}\n{story}")
-        print(f"FAILED {name}.hyrf: {story.splitlines()[0][:200]}")
+        name.with_suffix(".txt").write_text(f"--seed {options.seed} --only {number}\n{description}")
+        print(f"FAILED {name}.hyrf: {description.splitlines()[0][:200]}")
     return 1 if tally.failures else 0
 
 

@@ -214,10 +214,10 @@ def main() -> int:
     text = report(tally, time.monotonic() - start)
     (options.out / f"report-{options.seed}.txt").write_text(text + "\n")
     print("\n" + text)
-    for number, story in sorted(tally.failures.items()):
+    for number, description in sorted(tally.failures.items()):
         path = options.out / f"{options.seed}-{number}.hyrf"
         path.write_bytes(make_hostile_file(number, options.seed)[1])
-        print(f"FAILED {path}: {story[:600]}")
+        print(f"FAILED {path}: {description[:600]}")
     return 1 if tally.failures else 0
 
 

@@ -273,10 +273,10 @@ def _forge_header(rng: Random) -> bytes:
     (count,) = struct.unpack_from("<I", data, 36)
     for _ in range(rng.randint(1, 2)):
         entry = 48 + 40 * rng.randrange(count)
-        iterate_json_values = (8, 2), (10, 2), (12, 4), (16, 8), (24, 8), (32, 4), (36, 4)
+        list_json_values = (8, 2), (10, 2), (12, 4), (16, 8), (24, 8), (32, 4), (36, 4)
         columns = (0, 4), (4, 2), (6, 2), (8, 8), (16, 8), (24, 8), (32, 4), (36, 4)
-        at, width = rng.choice(iterate_json_values) if rng.random() < 0.4 else rng.choice(columns)
-        at += entry if (at, width) in columns and (at, width) not in iterate_json_values else 0
+        at, width = rng.choice(list_json_values) if rng.random() < 0.4 else rng.choice(columns)
+        at += entry if (at, width) in columns and (at, width) not in list_json_values else 0
         old = int.from_bytes(data[at : at + width], "little")
         new = rng.choice(
             (rng.choice(EXTREME_INTEGERS), old + rng.choice((-8, -1, 1, 8)), len(data), rng.getrandbits(64))
@@ -331,7 +331,7 @@ def _forge_metadata(rng: Random) -> bytes:
     values = json.loads(zlib.decompress(parts[0].data) if parts[0].codec == 5 else parts[0].data)
     for _ in range(rng.choice((1, 1, 2))):
         kind = rng.randrange(8)
-        all_values = iterate_json_values(values)
+        all_values = list_json_values(values)
         sizes = [(node, key) for node, key in all_values if key in CONFIG_RANGES]
         if kind < 3 and sizes:
             node, key = rng.choice(sizes)
@@ -387,13 +387,13 @@ def _deflate(part: RawSection, rng: Random) -> None:
         part.data = edit_bytes(part.data, rng)
 
 
-def iterate_json_values(node: dict | list) -> list[tuple[dict | list, str | int]]:
+def list_json_values(node: dict | list) -> list[tuple[dict | list, str | int]]:
     """Return every value inside nested JSON as (its container, its key)."""
     keys = list(node) if isinstance(node, dict) else range(len(node))
     found = [(node, key) for key in keys]
     for key in keys:
         if isinstance(node[key], (dict, list)):
-            found += iterate_json_values(node[key])
+            found += list_json_values(node[key])
     return found
 
 

@@ -581,11 +581,11 @@ class Center:
 class Exposure:
     position_length: float
     direction_length: float
-    least: list[float]
-    largest: list[float]
+    box_min: list[float]
+    box_max: list[float]
     mean: list[float]
-    lowest: list[float]
-    highest: list[float]
+    min_log_gains: list[float]
+    max_log_gains: list[float]
     centers: list[Center]
 
 
@@ -597,24 +597,24 @@ def read_exposure(section: Section) -> Exposure:
     require(count <= 64 and not any(reserved), "EXPO: too many centers or reserved bytes")
     position_length, direction_length, *rest = source.unpack("20f")
     require(all(map(math.isfinite, (position_length, direction_length, *rest))), "EXPO: NaN or infinite")
-    least, largest, mean, lowest, highest, steps = (rest[at : at + 3] for at in range(0, 18, 3))
+    box_min, box_max, mean, min_log_gains, max_log_gains, steps = (rest[at : at + 3] for at in range(0, 18, 3))
     require(position_length > 0 and direction_length > 0, "EXPO: lengths must be positive")
-    require(all(low <= high for low, high in zip(least, largest, strict=True)), "EXPO: the box is not in order")
-    limits_in_order = all(-8 <= low <= high <= 8 for low, high in zip(lowest, highest, strict=True))
+    require(all(low <= high for low, high in zip(box_min, box_max, strict=True)), "EXPO: the box is not in order")
+    limits_in_order = all(-8 <= low <= high <= 8 for low, high in zip(min_log_gains, max_log_gains, strict=True))
     require(limits_in_order, "EXPO: limits out of range")
     centers = []
     for _ in range(count):
         x, f, w = source.unpack("3B"), source.unpack("3b"), source.unpack("3h")
-        position = [low + code / 255 * (high - low) for code, low, high in zip(x, least, largest, strict=True)]
+        position = [low + code / 255 * (high - low) for code, low, high in zip(x, box_min, box_max, strict=True)]
         weight = [code * step for code, step in zip(w, steps, strict=True)]
         centers.append(Center(position, [code / 127 for code in f], weight))
     source.end()
-    return Exposure(position_length, direction_length, least, largest, mean, lowest, highest, centers)
+    return Exposure(position_length, direction_length, box_min, box_max, mean, min_log_gains, max_log_gains, centers)
 
 
 def log_gains(exposure: Exposure, position: Sequence[float], direction: Sequence[float]) -> list[float]:
     """Return the log gains (red, green, blue) at a position in local units with a unit viewing direction."""
-    box = zip(position, exposure.least, exposure.largest, strict=True)
+    box = zip(position, exposure.box_min, exposure.box_max, strict=True)
     inside = [min(max(value, low), high) for value, low, high in box]
     gains = list(exposure.mean)
     for center in exposure.centers:
@@ -623,7 +623,7 @@ def log_gains(exposure: Exposure, position: Sequence[float], direction: Sequence
             ((a - b) / exposure.direction_length) ** 2 for a, b in zip(direction, center.direction, strict=True)
         )
         gains = [gain + weight / (1 + distance) for gain, weight in zip(gains, center.weight, strict=True)]
-    limits = zip(gains, exposure.lowest, exposure.highest, strict=True)
+    limits = zip(gains, exposure.min_log_gains, exposure.max_log_gains, strict=True)
     return [min(max(gain, low), high) for gain, low, high in limits]
 
 

@@ -37,8 +37,8 @@ def draw_sensitivity(model: HybridModel) -> Sensitivity:
     """
     rng = np.random.default_rng(0)
     shares = np.exp(LOG_SENSITIVITY_STD * rng.normal(size=len(model))) / max(len(model), 1)
-    places = model.cube_coords(model.gaussians.positions.detach().double()).numpy()
-    points = 2 * np.minimum(places * (1 << MAX_BITS_PER_AXIS), (1 << MAX_BITS_PER_AXIS) - 1).astype(np.int64) + 1
+    cube_coords = model.cube_coords(model.gaussians.positions.detach().double()).numpy()
+    points = 2 * np.minimum(cube_coords * (1 << MAX_BITS_PER_AXIS), (1 << MAX_BITS_PER_AXIS) - 1).astype(np.int64) + 1
     fields = {}
     for group, grid in grid_configs(model.config).items():
         usage = grid.count_row_reads(points, MAX_BITS_PER_AXIS + 1)

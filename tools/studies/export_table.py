@@ -74,8 +74,8 @@ def main() -> None:
     print("| format | degree | bytes | write (s) | read (s) | dB, model | dB, photos | checked by |")
     print("|---|---|---|---|---|---|---|---|")
     for name in formats:
-        kind = FORMATS.get(name.split()[0], HTML_PAGE)
-        for degree in sorted({min(degree, kind.max_degree) for degree in arguments.degrees}):
+        output_format = FORMATS.get(name.split()[0], HTML_PAGE)
+        for degree in sorted({min(degree, output_format.max_degree) for degree in arguments.degrees}):
             print_row(source, name, degree, baked, splats_with_background, picture)
 
 

@@ -152,8 +152,8 @@ def score_pictures(pictures: Iterable[Tensor], views: Sequence[HeldOutView]) -> 
     """Return PSNR and SSIM against the photos, and PSNR against the trained model's pictures; means over views."""
     scores = []
     for picture, view in zip(map(to_8bit, pictures), views, strict=True):
-        against = psnr(picture, view.photo, view.mask), ssim(picture, view.photo, view.mask)
-        scores.append((*against, psnr(picture, view.trained, view.mask)))
+        photo_scores = psnr(picture, view.photo, view.mask), ssim(picture, view.photo, view.mask)
+        scores.append((*photo_scores, psnr(picture, view.trained, view.mask)))
     first, second, third = map(fmean, zip(*scores, strict=True))
     return first, second, third
 
@@ -292,7 +292,7 @@ def plot(rows: Sequence[MeasuredFile], trained: float, baked: float, title: str,
     figure = blank_figure(8, 5.5)
     axes = figure.subplots()
     for (name, format_rows), color in zip(group_by_format(rows).items(), cycle(PLOT_COLORS), strict=False):
-        front_rows = pareto_front(format_rows)
+        front = pareto_front(format_rows)
         axes.scatter(
             [row.bytes for row in format_rows],
             [row.psnr for row in format_rows],
@@ -302,8 +302,8 @@ def plot(rows: Sequence[MeasuredFile], trained: float, baked: float, title: str,
             linewidths=0,
         )
         axes.plot(
-            [row.bytes for row in front_rows],
-            [row.psnr for row in front_rows],
+            [row.bytes for row in front],
+            [row.psnr for row in front],
             "o-",
             color=color,
             markersize=4,

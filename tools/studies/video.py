@@ -109,11 +109,11 @@ def make_frames(
 def blur_by_motion(pixels: np.ndarray, length: float, angle: float) -> np.ndarray:
     """Blur a picture along a line of a length in pixels, centred on each pixel."""
     blurred = np.zeros(pixels.shape, np.float32)
-    places = np.linspace(-(length - 1) / 2, (length - 1) / 2, max(2, round(2 * length)))
-    for place in places:
-        offset = (place * np.sin(angle), place * np.cos(angle), 0)
+    offsets = np.linspace(-(length - 1) / 2, (length - 1) / 2, max(2, round(2 * length)))
+    for distance in offsets:
+        offset = (distance * np.sin(angle), distance * np.cos(angle), 0)
         blurred += ndimage.shift(pixels.astype(np.float32), offset, order=1, mode="nearest")
-    return (blurred / len(places)).round().astype(np.uint8)
+    return (blurred / len(offsets)).round().astype(np.uint8)
 
 
 def format_row(name: str, kinds: list[str], folder: Path, report: FrameReport, seconds: float) -> list[str]:

@@ -24,7 +24,7 @@ from tools.safety.variants.check import check_variant
 from tools.safety.variants.working_set import WorkingSet
 
 
-def layouts_of(source: Path) -> list[str]:
+def list_layouts(source: Path) -> list[str]:
     """Return the layouts as which a data set can be read."""
     marker_files = {"colmap": "sparse", "nerfstudio": "transforms.json", "blender": "transforms_train.json"}
     return [layout for layout, marker in marker_files.items() if (source / marker).exists()]
@@ -39,7 +39,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory(prefix="variants-") as folder:
         os.environ["XDG_CACHE_HOME"] = os.path.join(folder, "cache")
         for source in options.sets:
-            for layout in layouts_of(source):
+            for layout in list_layouts(source):
                 original_set = WorkingSet(source, Path(folder, "plain"), layout)
                 original_scene = load_scene(original_set.root)
                 print(f"\n{source.name} as {layout}: {len(original_scene.views)} photos")
