@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 REPOSITORY_ROOT = Path(__file__).parents[1]
-PACKAGE = REPOSITORY_ROOT / "hyrfpack"
+PACKAGE_FOLDER = REPOSITORY_ROOT / "hyrfpack"
 ARCHITECTURE_PAGE = REPOSITORY_ROOT / "docs" / "explanation" / "architecture.md"
 
 
@@ -22,7 +22,7 @@ def read_layers() -> list[list[str]]:
 
 def package_of(path: Path) -> str:
     """Return the sub-package or top-level module that a file belongs to."""
-    return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+    return path.relative_to(PACKAGE_FOLDER).parts[0].removesuffix(".py")
 
 
 def read_imports(path: Path, text: str | None = None) -> Iterator[tuple[int, str]]:
@@ -48,7 +48,7 @@ def find_upward_imports(path: Path, text: str | None = None) -> list[str]:
 
 def list_modules() -> list[Path]:
     """Return all files of the package except `__init__.py`, which names what is public, and `__main__.py`."""
-    return [path for path in sorted(PACKAGE.rglob("*.py")) if package_of(path) not in ("__init__", "__main__")]
+    return [path for path in sorted(PACKAGE_FOLDER.rglob("*.py")) if package_of(path) not in ("__init__", "__main__")]
 
 
 def test_the_architecture_page_names_every_package_once():
@@ -71,9 +71,9 @@ def test_no_import_runs_upwards_or_across():
     ],
 )
 def test_an_import_upwards_or_across_is_found(text):
-    assert find_upward_imports(PACKAGE / "ops" / "made_up.py", text)
+    assert find_upward_imports(PACKAGE_FOLDER / "ops" / "made_up.py", text)
 
 
 def test_the_package_imports_neither_tools_nor_tests():
-    known = {name.partition(".")[0] for path in PACKAGE.rglob("*.py") for _, name in read_imports(path)}
+    known = {name.partition(".")[0] for path in PACKAGE_FOLDER.rglob("*.py") for _, name in read_imports(path)}
     assert "numpy" in known and not known & {"tools", "tests"}

@@ -18,18 +18,18 @@ from hyrfpack.errors import HyrfDataError, HyrfError, HyrfSizeError, needs_packa
 from hyrfpack.evaluate.figures import draw_training_curve
 from hyrfpack.format import save_model
 
-LIBRARY = Path(hyrfpack.__file__).parent
+LIBRARY_FOLDER = Path(hyrfpack.__file__).parent
 
 
 def raised_errors() -> Iterator[tuple[str, ast.Call]]:
     """Yield (place, call) for every error that hyrfpack makes by the name of its class."""
-    for path in sorted(LIBRARY.rglob("*.py")):
+    for path in sorted(LIBRARY_FOLDER.rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in ERRORS:
-                yield f"{path.relative_to(LIBRARY).as_posix()}:{node.lineno}", node
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in ERROR_CLASS_NAMES:
+                yield f"{path.relative_to(LIBRARY_FOLDER).as_posix()}:{node.lineno}", node
 
 
-ERRORS = {name for name in vars(hyrfpack.errors) if name.startswith("Hyrf")}
+ERROR_CLASS_NAMES = {name for name in vars(hyrfpack.errors) if name.startswith("Hyrf")}
 
 
 def literal_text(node: ast.AST) -> str:

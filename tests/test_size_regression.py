@@ -17,7 +17,7 @@ from hyrfpack.model.gaussians import Gaussians
 from tools.safety.synthetic_encoding import encode
 
 RECORDED_SIZES_PATH = Path(__file__).parent / "golden" / "sizes.json"
-PROFILES = ("raw", "paper", "compact")
+PROFILE_NAMES = ("raw", "paper", "compact")
 # Number of Gaussians and log2 table sizes of a scene with surroundings, of a single object and of a minimal model.
 MODEL_SIZES = {"scene": (20_000, 12, 13), "object": (4_000, 10, 11), "one": (1, 4, 4)}
 
@@ -62,7 +62,7 @@ def measure_bytes(name: str, profile: str) -> int:
     return len(encode(make_model(*MODEL_SIZES[name]), profile))
 
 
-@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize("profile", PROFILE_NAMES)
 @pytest.mark.parametrize("name", MODEL_SIZES)
 def test_fixed_models_keep_their_size(name, profile):
     recorded = json.loads(RECORDED_SIZES_PATH.read_text())["bytes"][name][profile]
@@ -71,7 +71,7 @@ def test_fixed_models_keep_their_size(name, profile):
 
 
 if __name__ == "__main__":
-    sizes = {name: {profile: measure_bytes(name, profile) for profile in PROFILES} for name in MODEL_SIZES}
+    sizes = {name: {profile: measure_bytes(name, profile) for profile in PROFILE_NAMES} for name in MODEL_SIZES}
     record = {"command": "python tests/test_size_regression.py", "bytes": sizes}
     RECORDED_SIZES_PATH.write_text(json.dumps(record, indent=2) + "\n")
     print(RECORDED_SIZES_PATH.read_text())

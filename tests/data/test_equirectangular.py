@@ -105,7 +105,7 @@ def test_faces_are_written_as_files(tmp_path):
         assert np.abs(picture - render_face(face, len(picture))).mean() < 2
 
 
-def test_panoramas_are_recognised_by_shape_and_metadata(tmp_path):
+def test_panoramas_are_recognised_by_shape_and_content(tmp_path):
     Image.fromarray(render_panorama(256)).save(tmp_path / "sky.png")
     Image.fromarray(render_panorama(256)[64:192, 100:356]).save(tmp_path / "part.png")
     Image.fromarray(np.random.default_rng(0).integers(0, 256, (256, 512, 3), np.uint8)).save(tmp_path / "noise.png")

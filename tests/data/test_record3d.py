@@ -54,7 +54,7 @@ def test_each_frame_may_have_its_own_intrinsics(folder):
     assert load_scene(folder).views[2].camera.fx == pytest.approx(1402 / 48)
 
 
-def test_exports_with_exr_and_jpg_files_are_read(folder):
+def test_the_folders_of_exr_and_jpg_exports_are_read(folder):
     (folder / "EXR_RGBD").mkdir()
     (folder / "metadata").rename(folder / "EXR_RGBD" / "metadata.json")
     (folder / "rgbd").rename(folder / "EXR_RGBD" / "rgb")

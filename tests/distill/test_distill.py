@@ -198,7 +198,7 @@ def test_a_psnr_below_the_target_is_reported(tmp_path: Path) -> None:
     assert not any("asked for" in sentence for sentence in said)
 
 
-def test_the_packing_loss_is_chosen_and_not_learned() -> None:
+def test_a_target_missed_only_by_packing_advises_psnr_and_not_steps() -> None:
     told = fit._shortfall(36.5, 38.6, DistillConfig(psnr=37), viewpoints_are_sampled=True)
     assert "reached 36.5" in told and told.endswith("with `psnr`") and "steps" not in told
     assert "cameras" not in fit._shortfall(36.5, 36.6, DistillConfig(psnr=37), viewpoints_are_sampled=False)

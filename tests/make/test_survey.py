@@ -97,7 +97,7 @@ def test_a_completely_blurred_set_is_detected(photos):
     assert "most of them" in find_problem(describe_photos(photos), "blurred")
 
 
-def test_dark_photos_are_judged_relative_to_the_set(photos):
+def test_dark_sets_and_changing_light_are_reported(photos):
     for number in range(24):
         save_photo(photos / f"{number:03d}.jpg", random_rectangles(number) // 9)
     assert "more light" in find_problem(describe_photos(photos), "dark")

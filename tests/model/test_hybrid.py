@@ -181,7 +181,7 @@ def test_a_colour_decoder_with_zero_output_is_evaluated_only_in_training(learns)
     assert (model.radiance.biases[-1].grad is not None) == learns
 
 
-def test_a_single_weight_in_the_last_layer_counts_as_output():
+def test_a_single_bias_in_the_last_layer_counts_as_output():
     model, viewpoint = random_model().requires_grad_(False), torch.tensor(CAMERA_POSITION)
     weight, bias = model.radiance.weights[-1], model.radiance.biases[-1]
     weight.zero_(), bias.zero_()

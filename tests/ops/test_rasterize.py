@@ -459,7 +459,9 @@ def test_bytes_on_the_gpu_do_not_depend_on_repetition() -> None:
 
 @needs_triton
 @pytest.mark.parametrize("more", [-1, 1])
-def test_a_wrong_tile_count_of_one_gaussian_affects_no_other(monkeypatch: pytest.MonkeyPatch, more: int) -> None:
+def test_tile_counts_that_disagree_with_the_list_change_nothing_else(
+    monkeypatch: pytest.MonkeyPatch, more: int
+) -> None:
     # Two kernels of one compiler may round differently even where their source is alike.
     from hyrfpack.ops.rasterize import gpu as module
 

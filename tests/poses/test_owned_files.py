@@ -214,7 +214,7 @@ def test_leftover_masks_are_not_used_in_place_of_the_given_ones(tmp_path):
 
 
 @pytest.mark.parametrize("forged", ["{", "[]", '{"made": ["images"]}'])
-def test_a_forged_record_gives_access_to_no_other_file(forged, tmp_path):
+def test_files_listed_by_a_forged_record_are_not_replaced(forged, tmp_path):
     estimate_with_fake_stages(write_photos(tmp_path / "photos"), tmp_path / "scene")
     (tmp_path / "scene" / "poses.json").write_text(forged)
     with pytest.raises(hyrfpack.HyrfError, match="poses of another program"):

@@ -127,7 +127,7 @@ def test_photos_that_differ_only_in_their_ending_keep_different_names(tmp_path):
     assert (tmp_path / "out" / "a.png").read_bytes() == (tmp_path / "in" / "a.png").read_bytes()
 
 
-def test_a_truncated_rotated_photo_is_copied_and_omitted_alone(tmp_path):
+def test_a_truncated_rotated_photo_is_copied_and_cannot_be_decoded(tmp_path):
     path = save_photo(tmp_path / "in" / "a.jpg", upright_picture(), 6)
     path.write_bytes(path.read_bytes()[:-500])
     photos, _ = read_photo_headers(tmp_path / "in")
@@ -183,7 +183,7 @@ def test_cameras_are_distinguished_by_folder_device_size_and_zoom(tmp_path):
     assert devices[0].focal == pytest.approx(24 / np.hypot(36, 24) * 100)
 
 
-def test_numbered_photos_count_as_a_sequence(tmp_path):
+def test_photos_taken_in_quick_succession_or_numbered_frames_are_a_sequence(tmp_path):
     for number in range(4):
         taken = {0x9003: f"2024:05:01 12:00:0{number}"}
         save_photo(tmp_path / "burst" / f"IMG_{number}.jpg", upright_picture(number), exif=taken, device="One")
@@ -238,7 +238,7 @@ def test_masked_parts_have_no_features_and_photos_without_masks_keep_theirs(tmp_
     assert len(masked) > 50 and len(free) > 50
 
 
-def test_intrinsics_found_on_small_copies_are_scaled_to_the_photos():
+def test_large_photos_have_a_reduced_working_size_and_focal_length():
     device = Device((4000, 3000), 3000.0)
     assert device.working_size == (1600, 1200)
     assert device.working_focal == 1200.0

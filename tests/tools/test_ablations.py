@@ -109,7 +109,7 @@ def test_without_logits_gaussians_start_at_the_mean_of_the_initial_logits(name):
     torch.testing.assert_close(colors.logit().mean(0), expected_colors.logit().mean(0), atol=1e-3, rtol=0)
 
 
-def test_the_full_variant_is_the_released_model():
+def test_the_full_variant_trains_the_same_model_as_the_default_trainer():
     product, ours = Trainer(make_scene(), SHORT_CONFIG), make_trainer("full")
     product.run()
     ours.run()

@@ -16,7 +16,7 @@ def make_curve(sizes: np.ndarray, shift: float = 0.0) -> np.ndarray:
 
 
 @pytest.mark.parametrize("share", [0.5, 0.9, 1.0, 3.0])
-def test_bd_rate_finds_a_constant_ratio_of_bytes(share):
+def test_a_constant_ratio_of_bytes_at_equal_psnr_is_found(share):
     assert bytes_change_at_equal_psnr(make_curve(FILE_SIZES, -np.log2(share)), make_curve(FILE_SIZES)) == pytest.approx(
         share - 1
     )
