@@ -1,7 +1,7 @@
-"""docs/explanation/numerics.md cites only existing tests and cases, and cites every hard case.
+"""The pages on numerics and robustness cite only existing tests and cases, and they cite every hard case.
 
 All hard cases are in this folder instead of beside the modules that they test, because each test here is one row of
-that page, and many rows involve several packages.
+these pages, and many rows involve several packages.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from functools import cache
 from pathlib import Path
 
 REPOSITORY_ROOT = Path(__file__).parents[2]
+CITING_PAGES = [REPOSITORY_ROOT / "docs" / "explanation" / name for name in ("numerics.md", "robustness.md")]
 CITATION_PATTERN = re.compile(r"`(tests/[\w/]+\.py)::(test_\w+)(?:\[([^`]+)\])?`")
 
 
@@ -34,9 +35,7 @@ def _string_constants(path: str) -> set[str]:
 
 
 def _read_citations() -> list[tuple[str, str, str]]:
-    return CITATION_PATTERN.findall(
-        (REPOSITORY_ROOT / "docs" / "explanation" / "numerics.md").read_text(encoding="utf-8")
-    )
+    return [found for page in CITING_PAGES for found in CITATION_PATTERN.findall(page.read_text(encoding="utf-8"))]
 
 
 def test_every_cited_test_exists() -> None:
