@@ -24,6 +24,6 @@ def test_the_site_builds_with_every_public_name(tmp_path):
 
     done = build(tmp_path, REPOSITORY_ROOT / "mkdocs.yml")
     assert done.returncode == 0, done.stderr
-    page = (tmp_path / "api" / "index.html").read_text()
+    page = (tmp_path / "reference" / "api" / "index.html").read_text()
     missing = [name for name in hyrfpack.__all__ if name != "__version__" and f'.{name}"' not in page]
     assert missing == []
