@@ -17,11 +17,10 @@ from hyrfpack.scene import DEFAULT_MAX_SIZE, Camera, Scene, evenly_spaced
 MAX_STORED_CAMERAS = 128
 MAX_COARSE_CAMERAS = 14
 FALLBACK_ORBIT_CAMERAS = 48
-# The positions of coarse cameras are rounded to about the scene's scale divided by this.
-COARSE_POSE_RESOLUTION = 500
+COARSE_POSE_STEPS_PER_SCENE_SCALE = 500
 
 # A stored camera matches a photo's camera that differs from it by no more than these two limits.
-_MAX_MATCH_DISTANCE_SCENE_SCALES = 5 / COARSE_POSE_RESOLUTION
+_MAX_MATCH_DISTANCE_SCENE_SCALES = 5 / COARSE_POSE_STEPS_PER_SCENE_SCALE
 _MAX_MATCH_ANGLE_DEGREES = 3.0
 # With a lower share of matched cameras, the photos are not those of training. The share is above zero because two
 # scenes may have a few cameras in common by chance: the first camera of many scenes stands at the origin.
@@ -55,8 +54,8 @@ def quantized_provenance(provenance: dict, scale: float) -> dict:
     """Shorten a provenance for small files: round its numbers and replace "cameras" by fewer "coarse_cameras".
 
     Up to MAX_COARSE_CAMERAS evenly spaced cameras are kept. Their positions are rounded to about
-    scale / COARSE_POSE_RESOLUTION, which is precise enough to render from there, but not to train. Entries that cannot
-    be read are left out.
+    scale / COARSE_POSE_STEPS_PER_SCENE_SCALE, which is precise enough to render from there, but not to train. Entries
+    that cannot be read are left out.
 
     Args:
         provenance: the provenance of a trained model.
@@ -70,8 +69,8 @@ def quantized_provenance(provenance: dict, scale: float) -> dict:
         farthest = max((float(np.linalg.norm(camera.position)) for camera in cameras), default=0.0)
         # Rounding a rotation moves the camera in proportion to its distance from the origin.
         decimals = (
-            int(np.clip(np.ceil(np.log10(max(2 * farthest / scale, 1e-9) * COARSE_POSE_RESOLUTION)), 4, 9)),
-            int(np.clip(np.ceil(np.log10(COARSE_POSE_RESOLUTION / scale)), 0, 9)),
+            int(np.clip(np.ceil(np.log10(max(2 * farthest / scale, 1e-9) * COARSE_POSE_STEPS_PER_SCENE_SCALE)), 4, 9)),
+            int(np.clip(np.ceil(np.log10(COARSE_POSE_STEPS_PER_SCENE_SCALE / scale)), 0, 9)),
         )
         kept["coarse_cameras"] = [camera_to_numbers(camera, decimals) for camera in cameras]
     return kept

@@ -213,7 +213,7 @@ def calibrate(
 
     def subset_of(kept: np.ndarray) -> tuple[HybridModel, Decoded]:
         index = torch.as_tensor(kept, device=model.gaussians.positions.device)
-        return model.part(index), decoded_all[index]
+        return model.subset(index), decoded_all[index]
 
     # Pruning is calibrated first, because the errors of the other parts depend on which Gaussians are left.
     def measure_pruning(scaled: Sensitivity, _: list[Part], report: Report) -> dict[Part, ErrorMeasurement]:

@@ -17,7 +17,7 @@ from hyrfpack.atomic import write_atomic
 from hyrfpack.checks import check_type
 from hyrfpack.device import choose_device
 from hyrfpack.distill.config import DistillConfig
-from hyrfpack.distill.distill_model import distill_model
+from hyrfpack.distill.distillation import distill_model
 from hyrfpack.distill.pack import pack
 from hyrfpack.outputs import Outputs
 from hyrfpack.progress import Report, no_report, report_part

@@ -11,7 +11,7 @@ from scipy.optimize import brentq
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.compress.calibrate import measure_calibrated_sensitivity
 from hyrfpack.compress.packer import Packer
-from hyrfpack.distill.distill_model import DistilledModel
+from hyrfpack.distill.distillation import DistilledModel
 from hyrfpack.progress import Report, no_report, report_part, report_round
 
 # Compression is planned for this share of the error that it may add, because the measured error varies.
@@ -44,7 +44,7 @@ def pack(
 
     Example:
         >>> from hyrfpack.distill import DistillConfig
-        >>> from hyrfpack.distill.distill_model import distill_model
+        >>> from hyrfpack.distill.distillation import distill_model
         >>> from hyrfpack.splats.files import read_splats
         >>> quick = DistillConfig(steps=1, size=16, train_views=2, test_views=2)
         >>> distilled = distill_model(read_splats("bonsai.ply"), quick)

@@ -49,7 +49,7 @@ def choose_degree(
     fit_cameras, validation = list(cameras), list(cameras)
     stride = -(-len(model) // MAX_GAUSSIANS)
     if stride > 1:
-        model, visibility = model.part(torch.arange(0, len(model), stride)), None
+        model, visibility = model.subset(torch.arange(0, len(model), stride)), None
     fit_visibility = None if visibility is None else list(visibility)
     if len(cameras) >= MIN_CAMERAS_TO_HOLD_OUT:
         validation = fit_cameras[VALIDATION_CAMERAS]

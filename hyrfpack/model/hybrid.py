@@ -96,13 +96,13 @@ class HybridModel(nn.Module):
             generator=generator,
         )
 
-    def part(self, index: Tensor) -> HybridModel:
+    def subset(self, index: Tensor) -> HybridModel:
         """Return a model with copies of the Gaussians at `index` (n,) int64; it shares the fields with this model."""
         explicit = (getattr(self.gaussians, name).detach()[index] for name in Gaussians.PARAMETER_NAMES)
-        part = HybridModel(self.config, Gaussians(*explicit))
-        part.geometry, part.radiance = self.geometry, self.radiance
-        part.precision, part.exposure = self.precision, self.exposure
-        return part
+        subset = HybridModel(self.config, Gaussians(*explicit))
+        subset.geometry, subset.radiance = self.geometry, self.radiance
+        subset.precision, subset.exposure = self.precision, self.exposure
+        return subset
 
     def cube_coords(self, positions: Tensor) -> Tensor:
         """Convert local positions (N, 3) to coordinates (N, 3) in the hash grids' unit cube."""

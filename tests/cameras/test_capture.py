@@ -10,7 +10,7 @@ import pytest
 from scenes import ball_scene, ring
 
 from hyrfpack.cameras.capture import (
-    COARSE_POSE_RESOLUTION,
+    COARSE_POSE_STEPS_PER_SCENE_SCALE,
     FALLBACK_ORBIT_CAMERAS,
     MAX_COARSE_CAMERAS,
     MAX_STORED_CAMERAS,
@@ -89,7 +89,7 @@ def test_coarse_cameras_approximate_the_original_cameras(scale, away):
     assert {*kept} == {"coarse_cameras", "viewpoint", "seed"} and capture.is_coarse and not capture.is_synthetic
     assert len(capture.cameras) == MAX_COARSE_CAMERAS and quantized_provenance(kept, scale) == kept
     for rough, exact in zip(capture.cameras, evenly_spaced(cameras, MAX_COARSE_CAMERAS), strict=True):
-        assert np.linalg.norm(rough.position - exact.position) < 3 * scale / COARSE_POSE_RESOLUTION
+        assert np.linalg.norm(rough.position - exact.position) < 3 * scale / COARSE_POSE_STEPS_PER_SCENE_SCALE
         np.testing.assert_allclose(rough.rotation, exact.rotation, atol=1e-4)
         np.testing.assert_allclose(rough.intrinsics, exact.intrinsics, atol=0.051)
     center = capture.viewpoint.center - Viewpoint.from_cameras(cameras).center

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 import hyrfpack
 from hyrfpack.compress import calibrate
-from hyrfpack.distill import DistillConfig, distill_model, distill_splats, fit, pack, reference
+from hyrfpack.distill import DistillConfig, distill_splats, distillation, fit, pack, reference
 from hyrfpack.distill.reference import ReferenceViews, reference_scene
 from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.scene import Camera
@@ -116,7 +116,7 @@ def test_folder_that_cannot_be_made_is_reported_before_the_work(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "file").write_bytes(b"")
-    monkeypatch.setattr(distill_model, "_choose_cameras", lambda *arguments: pytest.fail("the work began"))
+    monkeypatch.setattr(distillation, "_choose_cameras", lambda *arguments: pytest.fail("the work began"))
     with pytest.raises(HyrfError, match="file is a file, not a folder"):
         distill_splats(ball_splats(20), tmp_path / "file" / "x.hyrf", TINY_DISTILL_CONFIG)
 
@@ -167,9 +167,9 @@ def test_repeated_packing_attempts_measure_and_draw_only_once(tmp_path: Path, mo
 def test_a_short_import_uses_fewer_viewpoints_and_regression_steps(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    looked = record_calls(monkeypatch, distill_model, "sample_viewpoints")
-    started = record_calls(monkeypatch, distill_model, "initial_model")
-    monkeypatch.setattr(distill_model, "_fit_to_pictures", lambda *args: None)
+    looked = record_calls(monkeypatch, distillation, "sample_viewpoints")
+    started = record_calls(monkeypatch, distillation, "initial_model")
+    monkeypatch.setattr(distillation, "_fit_to_pictures", lambda *args: None)
     monkeypatch.setattr(fit, "pack", _interrupt)
     for steps in (1, DistillConfig.steps):
         with pytest.raises(KeyboardInterrupt):

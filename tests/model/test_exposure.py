@@ -129,4 +129,4 @@ def test_an_unknown_exposure_is_rejected():
 def test_a_subset_of_a_model_keeps_its_exposure_map():
     model = small_model(ball_points(50)[0])
     model.exposure = random_map(1)
-    assert model.part(torch.arange(3)).exposure is model.exposure
+    assert model.subset(torch.arange(3)).exposure is model.exposure

@@ -27,7 +27,7 @@ import gsply
 import numpy as np
 
 from hyrfpack.distill import DistillConfig
-from hyrfpack.distill.distill_model import DistilledModel, distill_model
+from hyrfpack.distill.distillation import DistilledModel, distill_model
 from hyrfpack.distill.pack import pack
 from hyrfpack.evaluate.metrics import psnr
 from hyrfpack.format.codec import decode_model
