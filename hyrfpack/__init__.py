@@ -54,7 +54,9 @@ if TYPE_CHECKING:
     from hyrfpack.export import ConversionReport as ConversionReport
     from hyrfpack.export import ExportReport as ExportReport
     from hyrfpack.export import convert_splats as convert_splats
+    from hyrfpack.export import export_gallery as export_gallery
     from hyrfpack.export import export_model as export_model
+    from hyrfpack.export import export_player as export_player
     from hyrfpack.format import describe_file as describe_file
     from hyrfpack.format.codec import CompressionReport as CompressionReport
     from hyrfpack.format.codec import load_model as load_model
@@ -99,7 +101,9 @@ _PUBLIC = {
     "ConversionReport": "hyrfpack.export",
     "ExportReport": "hyrfpack.export",
     "convert_splats": "hyrfpack.export",
+    "export_gallery": "hyrfpack.export",
     "export_model": "hyrfpack.export",
+    "export_player": "hyrfpack.export",
     "describe_file": "hyrfpack.format",
     "CompressionReport": "hyrfpack.format",
     "load_model": "hyrfpack.format",

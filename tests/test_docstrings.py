@@ -16,6 +16,7 @@ from made_up_photos import write_photos
 
 import hyrfpack
 from hyrfpack import quant
+from hyrfpack.train import load_training_scene
 
 DOCUMENTED_OPERATIONS = (
     "activate", "adam", "background", "composite", "contraction", "hash_encode", "mlp", "rasterize", "shade", "ssim",
@@ -30,9 +31,7 @@ def list_public_functions() -> Iterator[tuple[str, object]]:
     for name in hyrfpack.__all__:
         if inspect.isfunction(getattr(hyrfpack, name)):
             yield f"hyrfpack.{name}", getattr(hyrfpack, name)
-    for name in ("gallery", "player"):
-        yield f"hyrfpack.export.{name}", getattr(hyrfpack.export_model, name)
-    yield "hyrfpack.train.photos_of", hyrfpack.train.photos_of
+    yield "hyrfpack.train.load_training_scene", load_training_scene
     modules = [importlib.import_module(f"hyrfpack.ops.{name}") for name in DOCUMENTED_OPERATIONS]
     operations = {f"{m.__name__}.{name}": value for m in modules for name, value in vars(m).items()}
     coders = {f"{quant.__name__}.{name}": getattr(quant, name) for name in quant.__all__}

@@ -23,11 +23,11 @@ import hyrfpack
 PUBLIC_FUNCTIONS = [name for name in hyrfpack.__all__ if inspect.isfunction(getattr(hyrfpack, name))]
 # Arguments that each function rejects at once.
 REJECTED_ARGUMENTS = {
-    "bench": ("missing.hyrf",),
-    "compare": (["missing", "other"], "out.html"),
-    "compress": ("missing.hyrf", "out.hyrf"),
-    "convert": ("missing.ply", "out.spz"),
-    "describe": ("missing.hyrf",),
+    "benchmark_model": ("missing.hyrf",),
+    "compare_runs": (["missing", "other"], "out.html"),
+    "compress_model": ("missing.hyrf", "out.hyrf"),
+    "convert_splats": ("missing.ply", "out.spz"),
+    "describe_file": ("missing.hyrf",),
     "describe_photos": ("missing",),
     "import_splats": ("missing.ply", "out.hyrf"),
     "estimate_poses": ("missing", "out"),
@@ -43,7 +43,15 @@ def run_in_new_interpreter(code: str) -> subprocess.CompletedProcess:
 
 
 def test_every_public_function_is_covered_here():
-    assert set(PUBLIC_FUNCTIONS) == {*REJECTED_ARGUMENTS, "evaluate", "render", "save", "train"}
+    assert set(PUBLIC_FUNCTIONS) == {
+        *REJECTED_ARGUMENTS,
+        "evaluate_model",
+        "export_gallery",
+        "export_player",
+        "render_view",
+        "save_model",
+        "train_model",
+    }
 
 
 @pytest.mark.parametrize("name", PUBLIC_FUNCTIONS)
@@ -67,7 +75,7 @@ def test_functions_can_be_called_in_processes_that_are_spawned():
         calls = {
             name: pool.submit(getattr(hyrfpack, name), *arguments) for name, arguments in REJECTED_ARGUMENTS.items()
         }
-        calls["evaluate"] = pool.submit(hyrfpack.evaluate_model, None, [])
+        calls["evaluate_model"] = pool.submit(hyrfpack.evaluate_model, None, [])
         for name, call in calls.items():
             assert isinstance(call.exception(), (hyrfpack.HyrfError, TypeError)), name
 
@@ -78,7 +86,7 @@ def test_sub_packages_support_every_form_of_import():
         "from hyrfpack.train import Trainer, progress as again\n"
         "import hyrfpack.cameras.paths, sys\n"
         "assert progress is again is sys.modules['hyrfpack.train.progress'] is hyrfpack.train.progress\n"
-        "assert t is hyrfpack.train_model is sys.modules['hyrfpack.train'] and t.train_model is hyrfpack.train_model\n"
+        "assert t is hyrfpack.train is sys.modules['hyrfpack.train'] and t.train_model is hyrfpack.train_model\n"
         "assert t.Trainer is Trainer and hyrfpack.cameras.paths.orbit\n"
         "progress.LOG_INTERVAL_SECONDS = 7\n"
         "assert hyrfpack.train.progress.LOG_INTERVAL_SECONDS == 7\n"

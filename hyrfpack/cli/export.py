@@ -156,7 +156,7 @@ def export(
       hyrfpack export bonsai.hyrf -o table.glb --crop -1,-1,-1,1,1,1
     """
     from hyrfpack.export import export_model as write
-    from hyrfpack.export.folder import check_folder, gallery, player
+    from hyrfpack.export.folder import check_folder, export_gallery, export_player
     from hyrfpack.export.kinds import PLAYER_FOLDER, check_place, check_request, find_file_kind
     from hyrfpack.format import describe_file, find_model
     from hyrfpack.splats.names import is_splats
@@ -184,9 +184,9 @@ def export(
         check_place(output, Outputs(*files, scene=scenes[0] if scenes else None, overwrite=overwrite), colmap)
     with show_progress("export") as progress:
         if len(models) > 1:
-            report = gallery(models, output, data=scenes, overwrite=overwrite, say=note)
+            report = export_gallery(models, output, data=scenes, overwrite=overwrite, say=note)
         elif not models:
-            report = player(None, output, overwrite=overwrite)
+            report = export_player(None, output, overwrite=overwrite)
         else:
             report = write(
                 models[0],

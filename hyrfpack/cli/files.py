@@ -354,10 +354,10 @@ def _command_as_typed(context: click.Context) -> str:
 def _load_training_photos(model: Path) -> Scene | None:
     """Load the photos that the model of a run was trained on; None, with a note, where they cannot be read."""
     from hyrfpack.errors import HyrfDataError
-    from hyrfpack.train import photos_of
+    from hyrfpack.train import load_training_scene
 
     try:
-        scene = photos_of(model)
+        scene = load_training_scene(model)
     except HyrfDataError as error:
         note(f"{error}; going on without the photos that it was trained on")
         return None

@@ -45,7 +45,7 @@ StrPath = str | os.PathLike[str]
 Say = Callable[[str], None]
 
 
-def player(
+def export_player(
     source: StrPath | None,
     folder: StrPath,
     *,
@@ -73,7 +73,7 @@ def player(
 
     Example:
         >>> import hyrfpack
-        >>> report = hyrfpack.export.player("bonsai.hyrf", "bonsai")
+        >>> report = hyrfpack.export_player("bonsai.hyrf", "bonsai")
         >>> sorted(path.name for path in Path("bonsai").glob("*.h*"))
         ['index.html', 'scene.hyrf']
     """
@@ -113,7 +113,7 @@ def _write_player(source: StrPath | None, output: _OutputFolder, data: Scene | N
     return ExportReport(str(output.path), output.bytes, count, native=source is not None)
 
 
-def gallery(
+def export_gallery(
     sources: Sequence[StrPath],
     folder: StrPath,
     *,
@@ -137,7 +137,7 @@ def gallery(
 
     Example:
         >>> import hyrfpack
-        >>> report = hyrfpack.export.gallery(["bonsai.hyrf", "bonsai.ply"], "gallery")
+        >>> report = hyrfpack.export_gallery(["bonsai.hyrf", "bonsai.ply"], "gallery")
         >>> sorted(path.name for path in Path("gallery").glob("bonsai*"))
         ['bonsai-2.jpg', 'bonsai-2.ply', 'bonsai.hyrf', 'bonsai.jpg']
     """

@@ -21,7 +21,7 @@ from hyrfpack.export.background import background_picture, background_splats
 from hyrfpack.export.bake import CameraVisibility, bake, compute_visibility
 from hyrfpack.export.cameras import encode_transforms, write_colmap
 from hyrfpack.export.degree import choose_degree
-from hyrfpack.export.folder import player
+from hyrfpack.export.folder import export_player
 from hyrfpack.export.kinds import (
     COLMAP_FOLDER,
     HTML_PAGE,
@@ -77,7 +77,7 @@ def export_model(
 
     - .ply, .splat, .spz, .glb, .usda, .usdc, .usdz, .sog: 3D Gaussians with spherical harmonics;
     - .html: a self-contained page that shows the scene in any browser, with the `.hyrf` file inside; no ending: a
-      folder with a player and the file, for a web server (see `hyrfpack.export.player`);
+      folder with a player and the file, for a web server (see `hyrfpack.export_player`);
     - .points.ply, .points.glb: the Gaussians' centres as coloured points, and the cameras as frusta;
     - .json: the cameras as a transforms.json.
 
@@ -125,7 +125,7 @@ def export_model(
     check_request(kind, target, degree, crop, min_opacity, background, baked, exposure)
     source = find_model(source)
     if kind is PLAYER_FOLDER:
-        return player(source, target, data=data, overwrite=overwrite, say=say)
+        return export_player(source, target, data=data, overwrite=overwrite, say=say)
     if kind is COLMAP_FOLDER:
         check_place(target, Outputs(source, scene=data, overwrite=True), colmap)
     with exclusive_folder(target) if kind is COLMAP_FOLDER else nullcontext():

@@ -7,8 +7,8 @@ from functools import cache
 import numpy as np
 
 # Numbers of transfer characteristics in ITU-T H.273.
-PQ = 16
-HLG = 18
+PQ_TRANSFER = 16
+HLG_TRANSFER = 18
 
 _REFERENCE_WHITE_CD_M2 = 203.0  # diffuse white of PQ and HLG pictures according to ITU-R BT.2408
 _KNEE_WHITE_RATIO = 0.7  # light above this ratio of the reference white is compressed, light below it is kept
@@ -28,7 +28,7 @@ def tone_map_to_srgb(picture: np.ndarray, transfer: int) -> np.ndarray:
 
     Args:
         picture: (H, W, 3) uint16 RGB signal that uses all 16 bits.
-        transfer: PQ or HLG.
+        transfer: PQ_TRANSFER or HLG_TRANSFER.
 
     Returns:
         (H, W, 3) uint8 sRGB picture.
@@ -41,7 +41,7 @@ def tone_map_to_srgb(picture: np.ndarray, transfer: int) -> np.ndarray:
 
 def _tone_map_band(picture: np.ndarray, transfer: int) -> np.ndarray:
     """Tone map a few rows of a picture: (H, W, 3) uint16 to uint8."""
-    light = _pq_light_table()[picture] if transfer == PQ else _decode_hlg_light(picture)
+    light = _pq_light_table()[picture] if transfer == PQ_TRANSFER else _decode_hlg_light(picture)
     light = np.maximum(light.reshape(-1, 3) @ _BT709_FROM_BT2020.T, 0).reshape(picture.shape)
     brightest = light.max(axis=2)
     above = (np.maximum(brightest, _KNEE_WHITE_RATIO) - _KNEE_WHITE_RATIO) / (1 - _KNEE_WHITE_RATIO)

@@ -11,7 +11,7 @@ import numpy as np
 
 from hyrfpack.errors import HyrfDataError, needs_package
 from hyrfpack.outputs import VIDEO_SUFFIXES, StrPath
-from hyrfpack.poses.hdr import HLG, PQ, tone_map_to_srgb
+from hyrfpack.poses.hdr import HLG_TRANSFER, PQ_TRANSFER, tone_map_to_srgb
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -127,7 +127,7 @@ def decode_upright(frame: Any, aspect: float) -> Image:
     from PIL import Image
 
     color_matrix = _H273_REC709 if frame.colorspace == _H273_UNSPECIFIED and frame.height >= _MIN_REC709_LINES else None
-    if frame.color_trc in (PQ, HLG):
+    if frame.color_trc in (PQ_TRANSFER, HLG_TRANSFER):
         signal = frame.reformat(format="rgb48le", src_colorspace=color_matrix).to_ndarray()
         picture = Image.fromarray(tone_map_to_srgb(signal, frame.color_trc))
     else:

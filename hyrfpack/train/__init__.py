@@ -2,7 +2,7 @@
 
 from hyrfpack.train.config import PRESETS, DensityConfig, LearningRates, TrainConfig
 from hyrfpack.train.density import DensityControl
-from hyrfpack.train.photos import photos_of
+from hyrfpack.train.photos import load_training_scene
 from hyrfpack.train.run import TrainResult, train_model
 from hyrfpack.train.strategy import Strategy
 from hyrfpack.train.trainer import Trainer
@@ -16,6 +16,6 @@ __all__ = [
     "TrainConfig",
     "TrainResult",
     "Trainer",
-    "photos_of",
+    "load_training_scene",
     "train_model",
 ]

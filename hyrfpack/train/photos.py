@@ -12,7 +12,7 @@ from hyrfpack.format.run_folder import METRICS_FILE, MODEL_FILE, find_model
 from hyrfpack.scene import Scene
 
 
-def photos_of(model: str | os.PathLike[str]) -> Scene | None:
+def load_training_scene(model: str | os.PathLike[str]) -> Scene | None:
     """Read the photos that the model of a run's folder was trained on, with the same split.
 
     Args:
@@ -26,7 +26,8 @@ def photos_of(model: str | os.PathLike[str]) -> Scene | None:
 
     Example:
         >>> import hyrfpack
-        >>> photos = hyrfpack.train.photos_of("runs/bonsai/model.hyrf")
+        >>> from hyrfpack.train import load_training_scene
+        >>> photos = load_training_scene("runs/bonsai/model.hyrf")
         >>> len(photos.train), len(photos.test)
         (8, 2)
     """

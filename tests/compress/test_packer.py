@@ -340,7 +340,7 @@ def test_options_that_do_not_go_together_are_refused_and_nothing_is_written(opti
 
 
 def test_a_loss_that_even_the_finest_file_exceeds_is_refused(trained, scene, tmp_path, monkeypatch):
-    scored = running.evaluate
+    scored = running.evaluate_model
 
     def worse_each_time(model, views, **options):
         worse_each_time.calls += 1

@@ -16,7 +16,7 @@ from hyrfpack.cameras.capture import provenance_cameras
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import evaluate_model
-from hyrfpack.export import ExportReport, export_model, gallery, player
+from hyrfpack.export import ExportReport, export_gallery, export_model, export_player
 from hyrfpack.format import load_model, save_model
 
 POSITIONS = np.random.default_rng(0).uniform(-0.6, 0.6, (40, 3))
@@ -76,7 +76,7 @@ def test_a_player_is_a_page_the_file_its_picture_and_what_others_need(model, tmp
 
 
 def test_splats_are_played_as_they_are(splats, tmp_path):
-    report = player(splats, tmp_path / "p")
+    report = export_player(splats, tmp_path / "p")
     assert names(tmp_path / "p") == PLAYER | {"scene.ply", "poster.jpg"} and report.gaussians == 40
     assert (tmp_path / "p" / "scene.ply").read_bytes() == splats.read_bytes()
     assert np.asarray(Image.open(tmp_path / "p" / "poster.jpg")).std() > 5  # something is to be seen
@@ -84,7 +84,7 @@ def test_splats_are_played_as_they_are(splats, tmp_path):
 
 
 def test_a_player_without_a_scene_waits_for_one(tmp_path):
-    report = player(None, tmp_path / "p")
+    report = export_player(None, tmp_path / "p")
     assert names(tmp_path / "p") == PLAYER and (report.gaussians, report.native) == (0, False)
     assert 'id="content"' not in (tmp_path / "p" / "index.html").read_text()
 
@@ -108,7 +108,7 @@ def test_a_file_never_replaces_itself(model, tmp_path):
 def test_nothing_is_put_among_photos_that_are_read(model, tmp_path, data):
     scene = hyrfpack.load_scene(data)
     with pytest.raises(HyrfError, match="reads what lies in this folder"):
-        player(model, Path(scene.path), data=scene)
+        export_player(model, Path(scene.path), data=scene)
 
 
 def test_a_disk_that_fills_up_leaves_no_half_file(model, tmp_path, monkeypatch):
@@ -124,7 +124,7 @@ def test_a_disk_that_fills_up_leaves_no_half_file(model, tmp_path, monkeypatch):
 def test_splats_at_one_place_have_no_picture(tmp_path):
     save_model(small_model(np.zeros((3, 3))), tmp_path / "m.hyrf", provenance={"cameras": provenance_cameras(ring(2))})
     export_model(tmp_path / "m.hyrf", tmp_path / "a.ply", degree=0)
-    player(tmp_path / "a.ply", tmp_path / "p")
+    export_player(tmp_path / "a.ply", tmp_path / "p")
     assert names(tmp_path / "p") == PLAYER | {"scene.ply"} and "poster" not in content_of(tmp_path / "p" / "index.html")
 
 
@@ -132,7 +132,7 @@ def test_splats_at_one_place_have_no_picture(tmp_path):
 
 
 def test_a_gallery_lists_its_scenes_and_links_to_its_player(model, splats, tmp_path):
-    report = gallery([model, splats], tmp_path / "g")
+    report = export_gallery([model, splats], tmp_path / "g")
     assert names(tmp_path / "g") == {
         *("index.html", "player.html", "README.txt"),
         *("room.hyrf", "room.jpg", "cloud.ply", "cloud.jpg"),
@@ -148,14 +148,14 @@ def test_a_gallery_lists_its_scenes_and_links_to_its_player(model, splats, tmp_p
 def test_held_out_photos_score_a_scene(model, tmp_path):
     photos = ball_scene(8)
     photos = type(photos)(**{**vars(photos), "train": photos.train[1:], "test": photos.train[:1]})
-    gallery([model], tmp_path / "g", data=[photos])
+    export_gallery([model], tmp_path / "g", data=[photos])
     score = evaluate_model(load_model(model), photos.test).psnr
     assert f"{score:.2f} dB on 1 held-out photo<" in (tmp_path / "g" / "index.html").read_text()
 
 
 def test_scenes_of_one_name_get_names_of_their_own(tmp_path):
     sources = [write(tmp_path / folder / name) for folder, name in (("a", "m.hyrf"), ("b", "M.hyrf"), ("c", "m.hyrf"))]
-    gallery(sources, tmp_path / "g")
+    export_gallery(sources, tmp_path / "g")
     assert {"m.hyrf", "M-2.hyrf", "m-3.hyrf"} <= names(tmp_path / "g")
     for source, name in zip(sources, ("m.hyrf", "M-2.hyrf", "m-3.hyrf"), strict=True):
         assert (tmp_path / "g" / name).read_bytes() == source.read_bytes()
@@ -163,7 +163,7 @@ def test_scenes_of_one_name_get_names_of_their_own(tmp_path):
 
 def test_names_of_files_are_neither_html_nor_paths(tmp_path):
     source = write(tmp_path / "<b>ä & ?#%..hyrf")
-    gallery([source], tmp_path / "g")
+    export_gallery([source], tmp_path / "g")
     assert {"b-ä.hyrf", "b-ä.jpg"} <= names(tmp_path / "g")
     assert "content=b-%C3%A4.hyrf&amp;poster=b-%C3%A4.jpg" in (tmp_path / "g" / "index.html").read_text()
 
@@ -171,12 +171,12 @@ def test_names_of_files_are_neither_html_nor_paths(tmp_path):
 def test_as_many_photos_as_models_or_none(model, tmp_path):
     for sources, data in (([model], [None, None]), ([], [])):
         with pytest.raises(ValueError, match="one for each"):
-            gallery(sources, tmp_path / "g", data=data)
+            export_gallery(sources, tmp_path / "g", data=data)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_model_that_cannot_be_read_leaves_nothing(model, tmp_path):
     (tmp_path / "bad.hyrf").write_bytes(model.read_bytes()[:-8])
     with pytest.raises(HyrfError, match=r"bad\.hyrf: "):
-        gallery([model, tmp_path / "bad.hyrf"], tmp_path / "g")
+        export_gallery([model, tmp_path / "bad.hyrf"], tmp_path / "g")
     assert not (tmp_path / "g").exists() or not names(tmp_path / "g")

@@ -83,9 +83,9 @@ def test_a_damaged_checkpoint_still_says_that_the_run_has_not_finished(tmp_path)
         lambda run: hyrfpack.compress_model(run, "x.hyrf"),
         lambda run: hyrfpack.export_model(run, "x.ply"),
         lambda run: hyrfpack.format.repack(run, "x.hyrf"),
-        lambda run: hyrfpack.train.photos_of(run),
+        lambda run: hyrfpack.train.load_training_scene(run),
     ],
-    ids=["load", "describe", "compress", "export", "repack", "photos_of"],
+    ids=["load", "describe", "compress", "export", "repack", "load_training_scene"],
 )
 def test_every_function_says_that_a_run_has_not_finished(call, unfinished, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -113,8 +113,8 @@ def test_the_model_of_a_run_that_is_read_is_never_replaced(run):
 
 
 def test_a_player_of_a_run_has_its_name_and_its_model(run, tmp_path):
-    hyrfpack.export.player(run, tmp_path / "player")
-    hyrfpack.export.gallery([run, run], tmp_path / "gallery")
+    hyrfpack.export_player(run, tmp_path / "player")
+    hyrfpack.export_gallery([run, run], tmp_path / "gallery")
     assert (tmp_path / "player" / "scene.hyrf").read_bytes() == (run / "model.hyrf").read_bytes()
     assert sorted(path.name for path in (tmp_path / "gallery").glob("*.hyrf")) == ["bonsai-2.hyrf", "bonsai.hyrf"]
 

@@ -14,7 +14,7 @@ from hyrfpack.make import make_scene
 from hyrfpack.make.held_out import MAX_PSNR_GAP_DB, choose_inner_view, score_note
 from hyrfpack.make.source import LoadSettings
 from hyrfpack.scene import Camera, Scene, View
-from hyrfpack.train import photos_of
+from hyrfpack.train import load_training_scene
 
 
 def camera_looking_at(position: tuple[float, float, float], target: tuple[float, float, float]) -> Camera:
@@ -93,7 +93,7 @@ def test_a_split_defined_by_the_set_is_used(posed, tmp_path):
 def test_photos_of_a_run_on_a_small_set_have_the_same_held_out_photo(posed, tmp_path):
     few = copy_first_photos(posed, tmp_path, 9)
     work = make_scene(few, tmp_path / "scene.hyrf", quality="draft").work
-    again = photos_of(work / "run" / "model.hyrf")
+    again = load_training_scene(work / "run" / "model.hyrf")
     assert [view.name for view in again.test] == [choose_inner_view(again).name]
 
 

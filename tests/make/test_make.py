@@ -192,7 +192,7 @@ def test_the_number_of_gaussians_and_the_preset_are_passed_to_the_training(posed
 def test_an_impossible_target_size_is_rejected_before_any_work(
     size, meant, posed, photos, poses, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr("hyrfpack.make.stages.train", None)
+    monkeypatch.setattr("hyrfpack.make.stages.train_model", None)
     for given in (posed, photos):
         sentence = refused("make", given, "-o", tmp_path / "scene.html", "--target-size", size)
         assert f"{size} bytes" in sentence and f"did you mean {meant}?" in sentence
@@ -213,7 +213,7 @@ def test_another_target_size_packs_the_trained_model_again_and_says_how_to_train
 
 def test_a_stopped_training_resumes_unchanged_with_another_target_size(posed, tmp_path, monkeypatch):
     configs = []
-    usual = stages.train
+    usual = stages.train_model
 
     def stop(scene, run, config, **options):
         configs.append(config)
@@ -340,7 +340,7 @@ def test_a_repeated_call_keeps_everything_and_a_changed_output_needs_overwrite(f
 
 
 def test_impossible_requests_are_rejected_before_any_work(posed, photos, finished_work, tmp_path, monkeypatch):
-    monkeypatch.setattr("hyrfpack.make.stages.train", None)
+    monkeypatch.setattr("hyrfpack.make.stages.train_model", None)
     (tmp_path / "there.html").write_bytes(b"mine")
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "letter.txt").write_bytes(b"mine")

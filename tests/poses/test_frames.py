@@ -15,7 +15,7 @@ from scipy import ndimage
 import hyrfpack
 from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.poses.frames import RECORD_NAME, choose_frames, frame_times, is_video
-from hyrfpack.poses.hdr import HLG, PQ, tone_map_to_srgb
+from hyrfpack.poses.hdr import HLG_TRANSFER, PQ_TRANSFER, tone_map_to_srgb
 from hyrfpack.poses.motion import motion_distances, track_windows
 
 av = pytest.importorskip("av")
@@ -253,7 +253,12 @@ def test_videos_are_recognised_by_their_endings():
 
 @pytest.mark.parametrize(
     ("transfer", "signal", "light"),
-    [(PQ, 0.5806, 203.0), (HLG, 0.75, 203.0), (PQ, 0.4, 32.46), (HLG, 0.25, 1000 * (0.25**2 / 3) ** 1.2)],
+    [
+        (PQ_TRANSFER, 0.5806, 203.0),
+        (HLG_TRANSFER, 0.75, 203.0),
+        (PQ_TRANSFER, 0.4, 32.46),
+        (HLG_TRANSFER, 0.25, 1000 * (0.25**2 / 3) ** 1.2),
+    ],
 )
 def test_high_dynamic_range_keeps_grey_and_its_light(transfer, signal, light):
     """The points of the curves are tabulated in BT.2408 and BT.2100; light above 0.7 of paper white is compressed."""
@@ -267,7 +272,7 @@ def test_high_dynamic_range_keeps_grey_and_its_light(transfer, signal, light):
 
 def test_high_dynamic_range_clips_nothing():
     ramp = np.repeat(np.arange(0, 65536, 257, dtype=np.uint16)[None, :, None], 3, axis=2)
-    for transfer in (PQ, HLG):
+    for transfer in (PQ_TRANSFER, HLG_TRANSFER):
         shown = tone_map_to_srgb(ramp, transfer)[0, :, 0].astype(int)
         assert (np.diff(shown) >= 0).all() and shown[0] == 0 and (shown == 255).sum() < 60
 

@@ -1,4 +1,4 @@
-"""`photos_of` reads the photos of a run from what its folder says, which may be outdated or wrong."""
+"""`load_training_scene` reads the photos of a run from what its folder says, which may be outdated or wrong."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import pytest
 
 import hyrfpack
 from hyrfpack.errors import HyrfDataError
-from hyrfpack.train import photos_of
+from hyrfpack.train import load_training_scene
 
 
 @pytest.fixture(scope="module")
 def run(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A short run on photos that were split and resized in a way that is not the default."""
-    folder = tmp_path_factory.mktemp("photos_of") / "run"
+    folder = tmp_path_factory.mktemp("load_training_scene") / "run"
     scene = hyrfpack.load_scene(data, test_every=5, max_size=40)
     hyrfpack.train_model(scene, folder, hyrfpack.TrainConfig(steps=3, max_gaussians=100), quiet=True)
     return folder
@@ -31,9 +31,9 @@ def copy_run_with(run: Path, folder: Path, **reading: object) -> Path:
     return folder / "model.hyrf"
 
 
-def test_photos_of_a_run_are_read_and_split_as_in_training(run, data, monkeypatch, tmp_path):
+def test_load_training_scene_a_run_are_read_and_split_as_in_training(run, data, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)  # the command may run in any folder
-    scene, same = photos_of(run / "model.hyrf"), hyrfpack.load_scene(data, test_every=5, max_size=40)
+    scene, same = load_training_scene(run / "model.hyrf"), hyrfpack.load_scene(data, test_every=5, max_size=40)
     assert [view.name for view in scene.train] == [view.name for view in same.train]
     assert [view.name for view in scene.test] == [view.name for view in same.test]
     assert scene.train[0].camera.width == 40
@@ -47,14 +47,14 @@ def test_a_relative_path_is_stored_as_an_absolute_one(data, monkeypatch):
 def test_a_file_outside_a_run_has_no_photos(run, tmp_path):
     shutil.copy(run / "model.hyrf", tmp_path / "other.hyrf")
     shutil.copy(run / "model.hyrf", tmp_path / "model.hyrf")
-    assert photos_of(tmp_path / "other.hyrf") is None and photos_of(tmp_path / "model.hyrf") is None
+    assert load_training_scene(tmp_path / "other.hyrf") is None and load_training_scene(tmp_path / "model.hyrf") is None
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"scene": 3}', '{"scene": {"reading": {}, "train": 1, "test": 1}}'])
 def test_metrics_without_facts_about_photos_give_no_photos(text, run, tmp_path):
     shutil.copy(run / "model.hyrf", tmp_path / "model.hyrf")
     (tmp_path / "metrics.json").write_text(text)
-    assert photos_of(tmp_path / "model.hyrf") is None
+    assert load_training_scene(tmp_path / "model.hyrf") is None
 
 
 @pytest.mark.parametrize(
@@ -71,14 +71,14 @@ def test_metrics_without_facts_about_photos_give_no_photos(text, run, tmp_path):
     ids=str,
 )
 def test_metrics_with_invalid_facts_give_no_photos(reading, run, tmp_path):
-    assert photos_of(copy_run_with(run, tmp_path / "run", **reading)) is None
+    assert load_training_scene(copy_run_with(run, tmp_path / "run", **reading)) is None
 
 
 def test_photos_that_are_gone_are_a_clear_error(run, tmp_path):
     with pytest.raises(HyrfDataError, match="no such folder"):
-        photos_of(copy_run_with(run, tmp_path / "run", path=str(tmp_path / "moved")))
+        load_training_scene(copy_run_with(run, tmp_path / "run", path=str(tmp_path / "moved")))
 
 
 def test_photos_that_have_changed_since_are_a_clear_error(run, tmp_path):
     with pytest.raises(HyrfDataError, match="name the photos with `data`"):
-        photos_of(copy_run_with(run, tmp_path / "run", test_every=2))
+        load_training_scene(copy_run_with(run, tmp_path / "run", test_every=2))
