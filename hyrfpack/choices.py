@@ -1,6 +1,7 @@
 """The values of settings that take one of a few words.
 
-They stand here, below the rooms that implement them, so that the command line lists its options without loading those.
+They stand here, below the packages that implement them, so that the command line lists its options without loading
+these packages.
 """
 
 # How renders are exposed: each like the photos taken near its camera, or all alike.
