@@ -114,16 +114,16 @@ class _UserError(click.ClickException):
 @click.group(cls=_CommandGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
 @click.version_option(__version__, prog_name="hyrfpack")
 def main() -> None:
-    """Make small .hyrf files of photos or a video: find poses, train hybrid radiance fields, compress, render, export.
+    """Turn photos or a video into a small .hyrf file: estimate poses, train a radiance field, compress, render, export.
 
     \b
-    A first round:
+    First steps:
       hyrfpack demo -o demo
       hyrfpack info photos/
       hyrfpack make photos/ -o scene.html
 
     \b
-    The same step by step:
+    The same, one stage at a time:
       hyrfpack poses photos/ -o scenes/bonsai
       hyrfpack train scenes/bonsai -o runs/bonsai
       hyrfpack compress runs/bonsai -o bonsai.hyrf

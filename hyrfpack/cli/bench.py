@@ -28,15 +28,32 @@ from hyrfpack.outputs import Outputs
 GROUPS = ("rasterize", "hash_encode", "mlp", "render", "codec")
 
 
-@click.command(short_help="Measure speed against error.")
+@click.command(short_help="Measure speed and error.")
 @click.argument("model", type=PATH, required=False)
-@click.option("--data", type=PATH, metavar="DIR", help="Photos to measure quality against (held-out ones).")
+@click.option("--data", type=PATH, metavar="DIR", help="Photos and poses; the held-out photos measure quality.")
 @scene_options
-@click.option("--repeats", type=click.IntRange(min=1), default=7, show_default=True, help="Turns of each contender.")
-@click.option("--only", type=click.Choice(GROUPS), multiple=True, help="Measure this group; may be given again.")
-@click.option("-o", "--output", type=OUTPUT, default=Path("bench.png"), show_default=True, help="The plot to write.")
 @click.option(
-    "--markdown", type=OUTPUT, metavar="FILE", help="Also write the tables, into the places FILE has for them."
+    "--repeats",
+    type=click.IntRange(min=1),
+    metavar="N",
+    default=7,
+    show_default=True,
+    help="Timed runs of each variant.",
+)
+@click.option("--only", type=click.Choice(GROUPS), multiple=True, help="Measure only this group. May be repeated.")
+@click.option(
+    "-o",
+    "--output",
+    type=OUTPUT,
+    default=Path("bench.png"),
+    show_default=True,
+    help="Plot to write, time against error.",
+)
+@click.option(
+    "--markdown",
+    type=OUTPUT,
+    metavar="FILE",
+    help="Also write the tables to this Markdown file, between the marks that an existing FILE has for them.",
 )
 @overwrite_option
 @json_option
@@ -51,11 +68,11 @@ def bench(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Measure each operation and each setting that trades accuracy for time, and print time beside error.
+    """Measure the time and the error of each operation, and of each setting that trades accuracy for time.
 
-    MODEL is the folder of a run, or a .hyrf file; without it a small one is trained on a made-up scene first (about
-    a minute). Losses are given in PSNR and SSIM against held-out photos of --data, or without photos against the
-    model's own exact pictures. --json prints all numbers, some of which the tables leave out.
+    MODEL is the folder of a run or a .hyrf file. Without MODEL, a small model is first trained on a synthetic scene,
+    which takes about a minute. Quality is given as PSNR and SSIM: against the held-out photos of --data, or without
+    photos against exact renders of the model. --json prints all numbers, including some that the tables leave out.
 
     \b
     Examples:

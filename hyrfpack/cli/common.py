@@ -63,7 +63,7 @@ class _Size(click.ParamType):
 SIZE = _Size()
 
 overwrite_option = click.option(
-    "--overwrite", is_flag=True, help="Replace files that are there; what the command reads is never replaced."
+    "--overwrite", is_flag=True, help="Replace existing files. Files that the command reads are never replaced."
 )
 
 
@@ -74,7 +74,7 @@ def reject_nan(ctx: click.Context, param: click.Parameter, value: float | None) 
     return value
 
 
-json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on standard output.")
+json_option = click.option("--json", "as_json", is_flag=True, help="Print the results as one JSON object.")
 
 
 def scene_options(command: Command) -> Command:
@@ -103,25 +103,25 @@ def scene_options(command: Command) -> Command:
             "--model",
             "colmap_model",
             metavar="NAME",
-            help="COLMAP model to take, such as 1 for sparse/1.  [default: the largest]",
+            help="COLMAP model to read, such as 1 for sparse/1.  [default: the largest]",
         ),
-        click.option("--layout", type=click.Choice(LAYOUTS), help="How the folder is laid out.  [default: detected]"),
+        click.option("--layout", type=click.Choice(LAYOUTS), help="Layout of the data folder.  [default: detected]"),
         click.option(
             "--max-size",
             type=click.IntRange(min=0),
             metavar="PIXELS",
-            help="Shrink photos that are larger than this on the longer side; 0 keeps them.  "
-            "[default: 1600, or what MODEL was trained at]",
+            help="Shrink photos whose longer side exceeds this; 0 keeps their size.  [default: 1600; with a MODEL, "
+            "the size that it was trained at]",
         ),
-        click.option("--images", metavar="NAME", help="Folder of pictures to use, such as images_4."),
+        click.option("--images", metavar="NAME", help="Folder of the photos within the data folder, such as images_4."),
         click.option(
             "--test-every",
             type=click.IntRange(min=0),
             default=8,
             show_default=True,
             metavar="N",
-            help="Hold out every Nth photo by name for testing; 0 holds out none. Sets with a split of their own "
-            "keep it.",
+            help="Hold out every Nth photo, in order of file names, for testing; 0 holds out none. A data set with a "
+            "test split keeps that split.",
         ),
     ):
         with_options = option(with_options)
@@ -133,7 +133,8 @@ device_option = click.option(
     metavar="NAME",
     default="auto",
     show_default=True,
-    help="cpu, cuda (NVIDIA and AMD), cuda:N or mps; auto takes cuda where it and Triton are.",
+    help="Device: cpu, cuda (NVIDIA and AMD GPUs), cuda:N or mps (Apple GPUs). auto uses cuda if there is a GPU and "
+    "Triton is installed, otherwise cpu.",
 )
 
 
@@ -142,8 +143,8 @@ exposure_option = click.option(
     type=click.Choice(RENDER_EXPOSURES),
     default=AS_PHOTOGRAPHED,
     show_default=True,
-    help="Expose each view like the photos taken near it, or all views alike. The same for a model without an "
-    "exposure map.",
+    help="Exposure of renders: each view like the photos taken near it, or one consistent exposure for all views. A "
+    "model without an exposure map looks the same with both.",
 )
 
 
@@ -154,7 +155,8 @@ def device_options(command: Command) -> Command:
         type=click.Choice(PRECISIONS),
         default="mixed",
         show_default=True,
-        help="What a GPU multiplies in: bfloat16 with float32 sums, or float32. The CPU knows float32 only.",
+        help="Precision of matrix products on a GPU: bfloat16 with float32 sums (mixed), or float32. The CPU always "
+        "uses float32.",
     )
     return device_option(precision(command))
 

@@ -10,16 +10,16 @@ import click
 from hyrfpack.cli.common import OUTPUT, PATH, json_option, note, note_rename, overwrite_option, print_json
 
 
-@click.command(short_help="Show training runs side by side.")
+@click.command(short_help="Compare training runs on one page.")
 @click.argument("runs", metavar="RUN RUN...", type=PATH, nargs=-1, required=True)
-@click.option("-o", "--output", type=OUTPUT, required=True, metavar="FILE", help="The page, an .html file.")
+@click.option("-o", "--output", type=OUTPUT, required=True, metavar="FILE", help="The .html page to write.")
 @overwrite_option
 @json_option
 def compare(runs: tuple[Path, ...], output: Path, overwrite: bool, as_json: bool) -> None:
-    """Write one page that shows RUNs, folders of 'hyrfpack train', side by side.
+    """Write one page that compares RUNs, folders written by 'hyrfpack train', side by side.
 
-    Scores, sizes, times and what differs in settings and choices as a table, the training curves in one figure, and
-    held-out photos and renders with a slider between them. The page holds everything and fetches nothing.
+    The page has a table of scores, sizes, times and differing settings, a figure of the training curves, and held-out
+    photos and renders with a slider between them. It is one file and loads nothing from elsewhere.
 
     \b
     Examples:

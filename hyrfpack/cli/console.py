@@ -27,8 +27,8 @@ _REPORTED_PACKAGES = ("torch", "numpy", "numba", "triton", "pycolmap")
 def add_verbosity_options(command: click.Command) -> None:
     """Add the options --quiet and --verbose to a command or a group."""
     for flag, help in (
-        ("--quiet", "Say nothing on standard error but errors."),
-        ("--verbose", "Say what a bug report needs: versions, device, times, tracebacks."),
+        ("--quiet", "Print nothing but errors on standard error."),
+        ("--verbose", "Print details for a bug report: versions, device, times, tracebacks."),
     ):
         command.params.append(
             click.Option([flag], is_flag=True, expose_value=False, callback=_set_verbosity, help=help)

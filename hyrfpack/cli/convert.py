@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     "degree",
     type=click.IntRange(0, 3),
     metavar="0-3",
-    help="Highest degree of the spherical harmonics to keep.  [default: all that the format holds]",
+    help="Highest degree of spherical harmonics to keep.  [default: the highest that the format can store]",
 )
 @crop_option
 @min_opacity_option
@@ -41,11 +41,11 @@ def convert(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Convert SOURCE, 3D Gaussians of another program, to the format that the ending of TARGET names.
+    """Convert SOURCE, 3D Gaussians of another program, to the format that the extension of TARGET names.
 
     SOURCE is a .ply (plain or compressed), .splat, .spz or .sog file, or the folder of a SOG that is not bundled.
-    TARGET ends in .ply, .splat, .spz, .sog, .glb, .usda, .usdc or .usdz. Everything stays in its axes and units. The
-    file is read back, and its pictures are compared with those of SOURCE from 12 viewpoints.
+    TARGET is a .ply, .splat, .spz, .sog, .glb, .usda, .usdc or .usdz file. Axes and units stay the same. The result is
+    checked: 12 renders of the written file are compared with the same renders of SOURCE.
 
     \b
     Examples:

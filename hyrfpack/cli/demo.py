@@ -10,13 +10,17 @@ from hyrfpack.cli.common import OUTPUT, json_option, note, note_rename, overwrit
 from hyrfpack.outputs import Outputs
 
 
-@click.command(short_help="See all of it on a scene made on the spot.")
-@click.option("-o", "--output", type=OUTPUT, default=Path("demo"), show_default=True, metavar="DIR", help="Folder.")
-@click.option("--steps", type=click.IntRange(min=1), default=3000, show_default=True, help="Optimiser steps.")
+@click.command(short_help="Run every stage on a small synthetic scene.")
+@click.option(
+    "-o", "--output", type=OUTPUT, default=Path("demo"), show_default=True, metavar="DIR", help="Folder of the results."
+)
+@click.option(
+    "--steps", type=click.IntRange(min=1), metavar="N", default=3000, show_default=True, help="Training steps."
+)
 @overwrite_option
 @json_option
 def demo(output: Path, steps: int, overwrite: bool, as_json: bool) -> None:
-    """Make a scene, train on it, compress, decompress, render, measure and export, and draw one picture of it all.
+    """Make a synthetic scene, train on it, compress, decompress, render, measure and export it, and plot the results.
 
     \b
     Example:

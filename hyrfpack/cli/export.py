@@ -65,10 +65,14 @@ crop_option = click.option(
     "--crop",
     type=_Box(),
     metavar="BOX",
-    help="Keep what is in MINX,MINY,MINZ,MAXX,MAXY,MAXZ, world units, without the background.",
+    help="Keep only the Gaussians inside MINX,MINY,MINZ,MAXX,MAXY,MAXZ (world units), without the background.",
 )
 min_opacity_option = click.option(
-    "--min-opacity", type=click.FloatRange(0, 1), default=0.0, show_default=True, help="Leave out fainter Gaussians."
+    "--min-opacity",
+    type=click.FloatRange(0, 1),
+    default=0.0,
+    show_default=True,
+    help="Leave out Gaussians with a lower opacity.",
 )
 spz_version_option = click.option(
     "--spz-version",
@@ -80,11 +84,18 @@ spz_version_option = click.option(
 )
 
 
-@click.command(short_help="Write a model for other programs.")
+@click.command(short_help="Export a model to formats of other programs.")
 @click.argument("models", metavar="[MODEL]...", type=PATH, nargs=-1)
-@click.option("-o", "--output", type=OUTPUT, required=True, metavar="FILE", help="What to write; its ending says how.")
-@click.option("--baked", is_flag=True, help="Let a .html hold splats, as other formats do, instead of the model.")
-@click.option("--colmap", is_flag=True, help="Write a folder as a COLMAP model: cameras, and centres as points.")
+@click.option(
+    "-o",
+    "--output",
+    type=OUTPUT,
+    required=True,
+    metavar="FILE",
+    help="File or folder to write. Its extension names the format.",
+)
+@click.option("--baked", is_flag=True, help="Embed baked splats in an .html page instead of the neural model.")
+@click.option("--colmap", is_flag=True, help="Write a folder with a COLMAP model: cameras, and centres as points.")
 @click.option(
     "--sh-degree",
     "degree",
@@ -92,25 +103,26 @@ spz_version_option = click.option(
     default="auto",
     show_default=True,
     metavar="0-3|auto",
-    help="Of the spherical harmonics: how finely colour follows the direction. A .splat has 0.",
+    help="Degree of the spherical harmonics that colours are baked to; auto takes the lowest within 0.2 dB of the "
+    "best. A .splat has degree 0.",
 )
 @crop_option
 @min_opacity_option
-@click.option("--background/--no-background", default=True, help="Take the background along.  [default: do]")
+@click.option("--background/--no-background", default=True, help="Export the background sphere.  [default: background]")
 @click.option(
     "--exposure",
     type=click.Choice(SPLAT_EXPOSURES),
     default=LOCAL_EXPOSURE,
     show_default=True,
-    help="Of splats: local, as bright as the photos that see them, or consistent, one exposure for all. The same for a "
-    "model without an exposure map.",
+    help="Exposure of baked splats: each as bright as in the photos that see it (local), or one exposure for all "
+    "(consistent). A model without an exposure map gives the same splats with both.",
 )
 @click.option(
     "--data",
     type=PATH,
     multiple=True,
-    help="Photos of the scene: for a file that keeps no cameras, and to score held-out ones. For a gallery, once for "
-    "each MODEL.",
+    help="Photos and poses of the scene: cameras for a file that stores none, and held-out photos to score the result. "
+    "For a gallery, give it once for each MODEL.",
 )
 @spz_version_option
 @overwrite_option
@@ -132,19 +144,19 @@ def export(
     reader_options: dict[str, Any],
     as_json: bool,
 ) -> None:
-    """Write MODEL, a .hyrf file or the folder of a run, as what other programs read, and say what was lost on the way.
+    """Export MODEL, a .hyrf file or the folder of a run, to a format of other programs, and report the loss of quality.
 
     \b
-    The ending of -o is the format:
-      .html                                           a page that plays the model itself in any browser
+    The extension of -o selects the format:
+      .html                                           a page that shows the neural model in any browser
       a folder                                        the player and the model, for a web server
       .ply .splat .spz .sog .glb .usda .usdc .usdz    3D Gaussians with spherical harmonics
       .points.ply .points.glb                         centres as points, cameras as frusta
       .json, or a folder with --colmap                cameras: transforms.json, or a COLMAP model
 
-    Several models, and a folder, make a gallery; no model, a player of whatever is dropped on it. Files of splats
-    (.ply .spz .splat .sog) can be played from a folder, too. Everything stays in the axes and units of the photos'
-    poses.
+    Several models exported to a folder make a gallery. Without a model, the folder gets a player that opens the files
+    that are dropped on it. Splats (.ply .spz .splat .sog) can be exported to a player folder, too. Axes and units are
+    those of the photos' poses.
 
     \b
     Examples:

@@ -46,7 +46,7 @@ PROFILES = ("raw", "paper", "compact")
 DEFAULT_PROFILE = "compact"
 
 
-@click.command(short_help="Pack a model into a small file.")
+@click.command(short_help="Compress a model to a small file.")
 @click.argument("model", type=PATH)
 @click.option("-o", "--output", type=OUTPUT, required=True, metavar="FILE", help="The .hyrf file to write.")
 @click.option(
@@ -54,32 +54,36 @@ DEFAULT_PROFILE = "compact"
     type=click.Choice(PROFILES),
     default=DEFAULT_PROFILE,
     show_default=True,
-    help="How: what pictures need and no more (compact), the HyRF paper's recipe (paper), or exact float32 (raw).",
+    help="compact is the smallest and spends bits where renders need them, paper follows the HyRF paper, raw is exact "
+    "float32.",
 )
 @click.option(
     "--data",
     type=PATH,
-    help="Photos of the scene: to measure on, and for the options below.  [default: those that MODEL was trained on]",
+    help="Photos and poses for --finetune, --max-psnr-drop and scores.  [default: those that MODEL was trained on]",
 )
-@click.option("--no-data", is_flag=True, help="Leave the photos alone that MODEL was trained on.")
+@click.option("--no-data", is_flag=True, help="Do not use the photos that MODEL was trained on.")
 @click.option(
     "--finetune",
     "finetune_steps",
     type=click.IntRange(1),
     metavar="N",
-    help="Fit the quantised model to the photos for N steps: a smaller file for more time.",
+    help="Fine-tune the quantised model on the photos for N steps: slower, but a smaller file.",
 )
-@click.option("--prune/--no-prune", default=True, help="Leave out Gaussians that pictures do not miss.  [default: do]")
-@click.option("--target-size", type=SIZE, metavar="SIZE", help="As good as can be in so many bytes, such as 2MB.")
+@click.option("--prune/--no-prune", default=True, help="Prune Gaussians that renders do not need.  [default: prune]")
+@click.option("--target-size", type=SIZE, metavar="SIZE", help="Best quality within this file size, such as 2MB.")
 @click.option(
     "--max-psnr-drop",
     type=click.FloatRange(min=0),
     callback=reject_nan,
     metavar="DB",
-    help="As small as can be for so many dB lost on the held-out photos of --data.",
+    help="Smallest file that loses at most this PSNR, in dB, on the held-out photos of --data.",
 )
 @click.option(
-    "--report", type=OUTPUT, metavar="DIR", help="Write a page there: size against loss, pictures, error maps."
+    "--report",
+    type=OUTPUT,
+    metavar="DIR",
+    help="Write a page to this folder: rate and distortion, renders, error maps.",
 )
 @overwrite_option
 @processes_option
@@ -103,11 +107,11 @@ def compress(
     as_json: bool,
     ranks: Ranks,
 ) -> None:
-    """Pack MODEL, a .hyrf file or the folder of a run, into a smaller file and show what each part takes.
+    """Compress MODEL, a .hyrf file or the folder of a run, to a smaller file, and print the bytes of each section.
 
-    The default profile renders the model to see what each number does to pictures, and spends bits where they show.
-    With the photos it also says what was lost. The folder of a run knows where its photos are, so that they need not
-    be named. Several processes share the photos of --finetune; the rest each does for itself.
+    The default profile measures how much each stored number affects renders, and spends bits accordingly. With photos,
+    it also reports the loss of quality. The folder of a run records where its photos are, so you need not name them.
+    Several processes share the photos of --finetune; each process does all other work itself.
 
     \b
     Examples:
@@ -166,7 +170,7 @@ def compress(
     _print_report(result, scores, as_json)
 
 
-@click.command(short_help="Unpack a file to exact float32.")
+@click.command(short_help="Decompress a file to exact float32.")
 @click.argument("file", type=PATH)
 @click.option("-o", "--output", type=OUTPUT, required=True, metavar="FILE", help="The .hyrf file to write.")
 @click.option(
@@ -174,16 +178,15 @@ def compress(
     type=click.FloatRange(0, 1),
     callback=reject_nan,
     metavar="F",
-    help="Use only so much of the file, from its start, such as 0.6: a coarser model.",
+    help="Read only this fraction of the file, from its start, such as 0.6. The model is coarser then.",
 )
 @overwrite_option
 @json_option
 def decompress(file: Path, output: Path, fraction: float | None, overwrite: bool, as_json: bool) -> None:
-    """Unpack FILE, or the model in the folder of a run, into a .hyrf file of profile raw: bit for bit what it decodes
-    to.
+    """Decompress FILE, or the model of a run, to a .hyrf file of profile raw, which stores the decoded numbers exactly.
 
-    A large file of profile compact comes in layers, the most important Gaussians first, so that its start is a model,
-    too. With --fraction the rest of the file may be missing.
+    A large file of profile compact consists of layers, the most important Gaussians first, so its first layers are a
+    model, too. With --fraction, the rest of the file may be missing.
 
     \b
     Examples:
@@ -199,18 +202,20 @@ def decompress(file: Path, output: Path, fraction: float | None, overwrite: bool
     _print_report(result, {}, as_json)
 
 
-@click.command(short_help="Show what a file, a run or a folder of photos holds.")
+@click.command(short_help="Describe a file, a run or a folder of photos.")
 @click.argument("path", metavar="FILE", type=PATH)
 @json_option
 def info(path: Path, as_json: bool) -> None:
-    """Show what FILE holds: the model, the bytes of each part, and what was chosen in training and why.
+    """Describe FILE.
 
-    Of the folder of a training run, its model, steps and scores, or how far it is.
+    For a .hyrf file: the model, the bytes of each section, and the settings that training chose, with the reasons.
 
-    Of splats (.ply .splat .spz .sog), their format, number, harmonics and bounds.
+    For the folder of a training run: its model, steps and scores, or the progress of an unfinished run.
 
-    Of a folder of photos, with poses or without, its .zip, or a video: how many there are, their poses and cameras,
-    how sharp and how evenly exposed they are, what is wrong with them and what to do.
+    For splats (.ply .splat .spz .sog): format, number of Gaussians, degree of harmonics, bounds.
+
+    For a folder of photos, with or without poses, its .zip, or a video: number of photos, poses, cameras, sharpness,
+    exposure, problems and what to do about them.
 
     \b
     Examples:

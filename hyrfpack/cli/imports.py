@@ -29,10 +29,12 @@ if TYPE_CHECKING:
     from hyrfpack.scene import Camera
 
 
-@click.command("import", short_help="Make a small model of 3D Gaussians from elsewhere.")
+@click.command("import", short_help="Distil splats of another program to a small model.")
 @click.argument("source", type=PATH)
 @click.option("-o", "--output", type=OUTPUT, required=True, metavar="FILE", help="The .hyrf file to write.")
-@click.option("--steps", type=click.IntRange(min=1), default=300, show_default=True, help="Optimiser steps.")
+@click.option(
+    "--steps", type=click.IntRange(min=1), metavar="N", default=300, show_default=True, help="Training steps."
+)
 @click.option(
     "--psnr",
     type=click.FloatRange(10, 60),
@@ -40,7 +42,7 @@ if TYPE_CHECKING:
     default=37.0,
     show_default=True,
     metavar="DB",
-    help="How like SOURCE's pictures those of FILE should be: more dB take more bytes.",
+    help="PSNR of renders of FILE against renders of SOURCE; more dB take more bytes.",
 )
 @click.option(
     "--size",
@@ -48,15 +50,22 @@ if TYPE_CHECKING:
     default=400,
     show_default=True,
     metavar="PIXELS",
-    help="Longer side of the pictures that it learns from.",
+    help="Longer side of the reference renders.",
 )
 @click.option(
     "--cameras",
     type=PATH,
     metavar="PATH",
-    help="Where it will be looked at from: JSON (nerfstudio's and 3DGS' too), or the folder of photos and poses.",
+    help="Cameras to learn from: a JSON file (also of nerfstudio or 3DGS), or a folder of photos and poses.",
 )
-@click.option("--seed", type=SEED, default=0, show_default=True, help="Same seed, same bytes on the CPU.")
+@click.option(
+    "--seed",
+    type=SEED,
+    metavar="N",
+    default=0,
+    show_default=True,
+    help="Random seed. On a CPU, the same seed gives the same file.",
+)
 @device_option
 @overwrite_option
 @json_option
@@ -72,12 +81,12 @@ def import_(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Turn SOURCE, 3D Gaussians as .ply (plain or compressed), .splat, .spz or .sog, into a small .hyrf file.
+    """Distil SOURCE, 3D Gaussians as .ply (plain or compressed), .splat, .spz or .sog, to a small .hyrf file.
 
-    No photos are needed: the model learns from pictures of SOURCE itself, from all around or, where its Gaussians
-    surround, from inside. With --cameras, which reads what `hyrfpack render --cameras` and `--data` read, it learns
-    what is seen from there; a cameras.json that 3DGS training left beside SOURCE is found by itself. Its scores are
-    those of held-out viewpoints.
+    No photos are needed: the model is trained on renders of SOURCE, from all around an object or from inside a room.
+    --cameras names the viewpoints to render instead; it reads the files of 'hyrfpack render --cameras' and the folders
+    of --data. A cameras.json that 3DGS training has left with SOURCE is used automatically. Scores are measured at
+    held-out viewpoints.
 
     \b
     Examples:

@@ -22,9 +22,9 @@ def view_options(command: Command) -> Command:
             "--view-port",
             type=click.IntRange(0, 65535),
             metavar="PORT",
-            help="Port that --view serves at.  [default: a free one]",
+            help="Port for --view.  [default: a free port]",
         ),
-        click.option("--view", is_flag=True, help="Serve a page that shows the model while it is trained."),
+        click.option("--view", is_flag=True, help="Serve a page that shows the model during training."),
     ):
         with_options = option(with_options)
     return with_options

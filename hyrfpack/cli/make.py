@@ -33,46 +33,57 @@ MAX_LISTED_PHOTOS = 5
 
 @click.command(short_help="Make a scene from photos, end to end.")
 @click.argument("photos", type=PATH)
-@click.option("-o", "--output", type=OUTPUT, required=True, metavar="FILE", help="What to make; its ending says what.")
-@click.option("--quality", type=click.Choice(QUALITIES), help="How long to work.  [default: normal]")
+@click.option("-o", "--output", type=OUTPUT, required=True, metavar="FILE", help="File or folder to make.")
+@click.option("--quality", type=click.Choice(QUALITIES), help="Quality; a better one takes longer.  [default: normal]")
 @click.option(
     "--minutes",
     type=click.FloatRange(min=0, min_open=True),
     callback=reject_nan,
     metavar="N",
-    help="Instead of a quality: be ready in about so many minutes, poses included.",
+    help="Instead of --quality: finish in about N minutes, including poses.",
 )
-@click.option("--target-size", type=SIZE, metavar="SIZE", help="As good as can be in so many bytes, such as 2MB.")
+@click.option("--target-size", type=SIZE, metavar="SIZE", help="Best quality within this file size, such as 2MB.")
 @click.option(
     "--max-gaussians",
     type=click.IntRange(min=1),
     metavar="N",
-    help="Budget of Gaussians, instead of --target-size.  [default: measured]",
+    help="Budget: the maximum number of Gaussians, instead of --target-size.  [default: measured by pilot runs]",
 )
-@click.option("--preset", type=click.Choice(PRESETS), default="auto", show_default=True, help="The kind of scene.")
+@click.option(
+    "--preset", type=click.Choice(PRESETS), default="auto", show_default=True, help="Kind of scene; auto detects it."
+)
 @click.option(
     "--matching",
     type=click.Choice(MATCHING_METHODS),
     default="auto",
     show_default=True,
-    help="Which photos are compared with which to find poses, as of 'hyrfpack poses'.",
+    help="Which pairs of photos are matched to estimate poses, see 'hyrfpack poses --help'.",
 )
-@click.option("--images", metavar="NAME", help="Folder of pictures to use, such as images_4.")
+@click.option("--images", metavar="NAME", help="Folder of the photos within PHOTOS, such as images_4.")
 @click.option(
     "--max-size",
     type=click.IntRange(min=0),
     metavar="PIXELS",
-    help="Shrink photos that are larger than this on the longer side; 0 keeps them.  [default: 1600, of a draft 640]",
+    help="Shrink photos whose longer side exceeds this; 0 keeps their size.  [default: 1600; of a draft, 640]",
 )
 @click.option(
     "--test-every",
     type=click.IntRange(min=0),
     metavar="N",
-    help="Hold out every Nth photo for scoring; 0 holds out none.  [default: 8; of fewer than 16 photos, one]",
+    help="Hold out every Nth photo for scoring; 0 holds out none.  [default: 8; of fewer than 16 photos, one photo]",
 )
-@click.option("--work", type=OUTPUT, metavar="DIR", help="Where each stage's product is kept.  [default: FILE's .work]")
-@click.option("--device", metavar="NAME", default="auto", show_default=True, help="Where to train: cpu, cuda, cuda:N.")
-@click.option("--seed", type=SEED, default=0, show_default=True, help="Same seed, same bytes.")
+@click.option(
+    "--work", type=OUTPUT, metavar="DIR", help="Folder of intermediate results.  [default: the name of FILE with .work]"
+)
+@click.option("--device", metavar="NAME", default="auto", show_default=True, help="Device: cpu, cuda, cuda:N.")
+@click.option(
+    "--seed",
+    type=SEED,
+    metavar="N",
+    default=0,
+    show_default=True,
+    help="Random seed. On a CPU, the same seed gives the same file.",
+)
 @view_options
 @overwrite_option
 @json_option
@@ -96,13 +107,13 @@ def make(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Make a scene of PHOTOS: estimate poses where there are none, train, compress, score and export.
+    """Make a scene from PHOTOS: estimate poses if there are none, train, compress, score and export.
 
     PHOTOS is a folder or its .zip, a video, splats of another program (.ply .splat .spz .sog), or a .hyrf file.
-    What FILE is follows from its ending: .hyrf, .html or whatever else 'hyrfpack export' writes; a name without ending
-    is a folder with a player.
+    The extension of FILE names the format: .hyrf, .html or any other that 'hyrfpack export' writes. A FILE without an
+    extension becomes a folder with a player.
 
-    Every stage's product is kept, and after an interruption (Ctrl-C, exit code 1) the same command resumes.
+    The results of each stage are kept. After an interruption (Ctrl-C, exit code 1), the same command resumes.
 
     \b
     Examples:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 _MAX_NAMED_PHOTOS = 5
 
 
-@click.command(short_help="Find where photos were taken, or the frames of a video.")
+@click.command(short_help="Estimate the camera poses of photos or a video.")
 @click.argument("photos", type=PATH)
 @click.option("-o", "--output", "out", type=OUTPUT, required=True, metavar="SCENE", help="Folder of the scene.")
 @click.option(
@@ -27,20 +27,20 @@ _MAX_NAMED_PHOTOS = 5
     type=click.Choice(MATCHING_METHODS),
     default="auto",
     show_default=True,
-    help="Which photos are compared: all with all, each with those that follow it, or those that look alike; auto "
-    "decides by what the photos are and how many.",
+    help="Which pairs of photos are matched: all (exhaustive), neighbours in order (sequential), or photos that look "
+    "alike (retrieval). auto decides by the kind and number of photos.",
 )
-@click.option("--masks", type=PATH, metavar="FOLDER", help="Masks, named as the photos; black is ignored.")
-@click.option("--seed", type=SEED, default=0, show_default=True, help="Random seed.")
-@click.option("--overwrite", is_flag=True, help="Replace poses that an earlier run left in SCENE.")
+@click.option("--masks", type=PATH, metavar="FOLDER", help="Masks, named like the photos; black pixels are ignored.")
+@click.option("--seed", type=SEED, metavar="N", default=0, show_default=True, help="Random seed.")
+@click.option("--overwrite", is_flag=True, help="Replace poses that an earlier run wrote to SCENE.")
 @json_option
 def poses(
     photos: Path, out: Path, matching: str, masks: Path | None, seed: int, overwrite: bool, as_json: bool
 ) -> None:
-    """Find the poses of PHOTOS, a folder of photos, its .zip, or a video, and make a scene that `hyrfpack train` reads.
+    """Estimate the poses of PHOTOS, a folder of photos, its .zip, or a video, and write a scene for 'hyrfpack train'.
 
-    SCENE gets images/ (copies of the photos), sparse/0 (a COLMAP model) and poses.json (what came out). PHOTOS may be
-    SCENE itself if its photos are in images/. Ctrl-C keeps what is done, and the same command resumes from it.
+    SCENE gets images/ (copies of the photos), sparse/0 (a COLMAP model) and poses.json (a report). PHOTOS may be SCENE
+    itself if its photos are in images/. Ctrl-C keeps finished stages, and the same command resumes.
 
     \b
     Examples:

@@ -48,7 +48,7 @@ def processes_option(command: Command) -> Command:
         PROCESSES_OPTION,
         type=click.IntRange(1, 1024),
         metavar="N",
-        help="Share the work among N processes of this machine, one a GPU; torchrun starts them on several.",
+        help="Share the work among N processes on this machine, one per GPU. For several machines, use torchrun.",
     )
     return option(with_option)
 

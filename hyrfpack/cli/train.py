@@ -34,49 +34,70 @@ if TYPE_CHECKING:
 BACKGROUND_COLORS = ("black", "white", "random")
 
 
-@click.command(short_help="Train a model from posed photos.")
+@click.command(short_help="Train a model on photos with poses.")
 @click.argument("data", type=PATH)
 @click.option("-o", "--output", "out", type=OUTPUT, required=True, metavar="RUN", help="Folder of the run.")
-@click.option("--steps", type=click.IntRange(min=1), default=3000, show_default=True, help="Optimiser steps.")
-@click.option("--max-gaussians", type=click.IntRange(min=1), metavar="N", help="Budget.  [default: measured]")
+@click.option(
+    "--steps", type=click.IntRange(min=1), metavar="N", default=3000, show_default=True, help="Training steps."
+)
+@click.option(
+    "--max-gaussians",
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="Budget: the maximum number of Gaussians.  [default: measured by pilot runs]",
+)
 @click.option(
     "--target-size",
     "target_bytes",
     type=SIZE,
     metavar="SIZE",
-    help="As many Gaussians as 'compress' packs into so much, such as 500kB, instead of --max-gaussians.",
+    help="Choose the budget so that 'hyrfpack compress' reaches this file size, such as 500kB.",
 )
-@click.option("--preset", type=click.Choice(PRESETS), default="auto", show_default=True, help="The kind of scene.")
-@click.option("--seed", type=SEED, default=0, show_default=True, help="Same seed, same bytes.")
+@click.option(
+    "--preset", type=click.Choice(PRESETS), default="auto", show_default=True, help="Kind of scene; auto detects it."
+)
+@click.option(
+    "--seed",
+    type=SEED,
+    metavar="N",
+    default=0,
+    show_default=True,
+    help="Random seed. On a CPU, the same seed gives the same file.",
+)
 @scene_options
-@click.option("--background/--no-background", default=None, help="Train a background sphere.  [default: preset]")
+@click.option("--background/--no-background", default=None, help="Train a background sphere.  [default: by preset]")
 @click.option(
     "--background-color",
     type=click.Choice(BACKGROUND_COLORS),
     default="black",
     show_default=True,
-    help="What transparent photos are laid over.",
+    help="Colour behind transparent photos.",
 )
 @click.option(
     "--exposure/--no-exposure",
     default=None,
-    help="Learn per-image exposure gains and an exposure map, or not.  [default: by pilot runs]",
+    help="Exposure compensation: learn per-image gains and an exposure map.  [default: decided by pilot runs]",
 )
-@click.option("--antialiased", is_flag=True, help="Compensate small Gaussians for the pixel filter.")
-@click.option("--log2-table-size", type=click.IntRange(4, 24), metavar="B", help="Hash rows a level, as 2^B.")
+@click.option("--antialiased", is_flag=True, help="Antialiasing: dim small Gaussians as the pixel filter widens them.")
 @click.option(
-    "--cache-mb", type=click.IntRange(min=1), metavar="MB", help="Decoded photos to keep.  [default: RAM / 4]"
+    "--log2-table-size", type=click.IntRange(4, 24), metavar="B", help="Rows per level of the hash grid: 2^B."
+)
+@click.option(
+    "--cache-mb",
+    type=click.IntRange(min=1),
+    metavar="MB",
+    help="Memory for decoded photos, in MiB.  [default: a quarter of the RAM]",
 )
 @click.option(
     "--log",
     type=OUTPUT,
     metavar="FILE",
-    help="Write progress here as lines of JSON; with tensorboard, scalars beside it.",
+    help="Write a log of JSON lines to FILE, and TensorBoard scalars beside it if tensorboard is installed.",
 )
 @view_options
-@click.option("--poses", is_flag=True, help="Where DATA has no poses, estimate them first, into RUN/scene.")
-@click.option("--resume", is_flag=True, help="Resume from the run's checkpoint.")
-@click.option("--overwrite", is_flag=True, help="Replace what an earlier run left in the folder.")
+@click.option("--poses", is_flag=True, help="If DATA has no poses, estimate them first, in RUN/scene.")
+@click.option("--resume", is_flag=True, help="Resume from the checkpoint of the run.")
+@click.option("--overwrite", is_flag=True, help="Replace an earlier run in RUN.")
 @processes_option
 @device_options
 @json_option
@@ -103,12 +124,12 @@ def train(
 
     With --poses, DATA may be photos without poses, or a video.
 
-    With --processes, or started by torchrun or srun, each process renders another photo of a step, on a GPU of its own
-    where there are any; --steps counts photos, and --cache-mb is for all of a machine.
+    With --processes, torchrun or srun, several processes train together. In each step, each process renders a different
+    photo, on its own GPU if there are GPUs. --steps counts photos, and --cache-mb is the total of a machine.
 
-    RUN gets model.hyrf, metrics.json, the training curve and pictures of held-out views. Ctrl-C saves a checkpoint
-    and exits with code 1, as SIGTERM and a terminal that is closed do; --resume continues it and ends with the same
-    model as an uninterrupted run.
+    RUN gets model.hyrf, metrics.json, the training curve and renders of held-out views. Ctrl-C saves a checkpoint and
+    exits with code 1; so do SIGTERM and closing the terminal. --resume then gives the same model as an uninterrupted
+    run.
 
     \b
     Examples:

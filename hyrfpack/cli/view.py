@@ -9,17 +9,29 @@ import click
 from hyrfpack.cli.common import PATH, json_option, note, print_json
 
 
-@click.command(short_help="Look at a model in a browser.")
+@click.command(short_help="Show a model in a browser.")
 @click.argument("model", type=PATH)
-@click.option("--port", type=click.IntRange(0, 65535), default=0, show_default="a free one", help="Port to serve at.")
-@click.option("--host", default="127.0.0.1", show_default=True, help="Address to serve at; 0.0.0.0 lets others look.")
-@click.option("--no-browser", is_flag=True, help="Only print the address.")
+@click.option(
+    "--port",
+    type=click.IntRange(0, 65535),
+    metavar="PORT",
+    default=0,
+    show_default="a free port",
+    help="Port of the server.",
+)
+@click.option(
+    "--host",
+    default="127.0.0.1",
+    show_default=True,
+    help="Address of the server; with 0.0.0.0, other machines can open the page.",
+)
+@click.option("--no-browser", is_flag=True, help="Print the address, but open no browser.")
 @json_option
 def view(model: Path, port: int, host: str, no_browser: bool, as_json: bool) -> None:
-    """Look at MODEL in a browser, until Ctrl-C: a .hyrf file, the folder of a run, or splats (.ply .spz .splat .sog).
+    """Show MODEL in a browser until Ctrl-C: a .hyrf file, the folder of a run, or splats (.ply .spz .splat .sog).
 
-    The file is served as it is, beside the player that 'hyrfpack export' writes into a folder; of a large one, the
-    first layer is seen while the rest comes in.
+    The file is served unchanged, with the same player that 'hyrfpack export' writes to a folder. Of a large file, the
+    first layer appears while the others load.
 
     \b
     Examples:

@@ -47,18 +47,24 @@ SPLITS = ("test", "train", "all")
 DEFAULT_ORBIT_FRAMES = 60
 
 
-@click.command(short_help="Render views to pictures.")
+@click.command(short_help="Render views to picture files.")
 @click.argument("model", type=PATH)
-@click.option("-o", "--output", type=OUTPUT, required=True, metavar="OUT", help="Folder for the pictures.")
-@click.option("--data", type=PATH, help="Render the views of this data folder, named as its photos.")
-@click.option("--split", type=click.Choice(SPLITS), default="test", show_default=True, help="Which views of --data.")
+@click.option("-o", "--output", type=OUTPUT, required=True, metavar="OUT", help="Folder of the pictures.")
+@click.option("--data", type=PATH, help="Render the views of this folder of photos and poses.")
+@click.option(
+    "--split", type=click.Choice(SPLITS), default="test", show_default=True, help="Views of --data to render."
+)
 @scene_options
 @click.option("--cameras", type=PATH, metavar="JSON", help="Render the cameras of this file.")
-@click.option("--orbit", type=click.IntRange(1, 100_000), metavar="N", help="Render N frames around the scene.")
-@click.option("--depth", is_flag=True, help="Also write depth in world units (float32 TIFF).")
-@click.option("--video", is_flag=True, help="Also put the frames together as OUT/video.mp4 (needs ffmpeg).")
 @click.option(
-    "--allow-partial", is_flag=True, help="Take a file that is cut short: a coarser model, if enough is there."
+    "--orbit", type=click.IntRange(1, 100_000), metavar="N", help="Render an orbit of N frames around the scene."
+)
+@click.option("--depth", is_flag=True, help="Also write depth in world units (float32 TIFF).")
+@click.option("--video", is_flag=True, help="Also write the frames as OUT/video.mp4 (needs ffmpeg).")
+@click.option(
+    "--allow-partial",
+    is_flag=True,
+    help="Accept a file that is cut short, if enough of it is there for a coarser model.",
 )
 @exposure_option
 @overwrite_option
@@ -83,12 +89,12 @@ def render(
     as_json: bool,
     ranks: Ranks,
 ) -> None:
-    """Render MODEL to PNG pictures: the views of photos, cameras of a file, or an orbit of 60 frames.
+    """Render MODEL to PNG pictures: the views of photos, the cameras of a file, or by default an orbit of 60 frames.
 
     MODEL is a .hyrf file, the folder of a run, or splats (.ply .splat .spz .sog), which are drawn over black.
 
-    A cameras file is a list of {"name", "width", "height", "fx", "fy", "cx", "cy", "camera_from_world": 4 x 4}
-    with OpenCV axes, or a transforms.json as nerfstudio writes it.
+    The file of --cameras is a list of {"name", "width", "height", "fx", "fy", "cx", "cy", "camera_from_world": 4 x 4}
+    with OpenCV axes, or a transforms.json in the format of nerfstudio.
 
     \b
     Examples:
@@ -161,13 +167,19 @@ def render(
 
 @click.command(short_help="Score a model against photos.")
 @click.argument("model", type=PATH)
-@click.option("--data", type=PATH, required=True, help="The folder of photos and poses.")
-@click.option("--split", type=click.Choice(SPLITS), default="test", show_default=True, help="Which of its photos.")
-@scene_options
-@click.option("--lpips-weights", type=PATH, metavar="FILE", help="Weights of the lpips package, to score LPIPS too.")
-@click.option("--pictures", type=OUTPUT, metavar="DIR", help="Write photo | render | error pictures here.")
+@click.option("--data", type=PATH, required=True, help="Folder of photos and poses.")
 @click.option(
-    "--allow-partial", is_flag=True, help="Take a file that is cut short: a coarser model, if enough is there."
+    "--split", type=click.Choice(SPLITS), default="test", show_default=True, help="Photos of --data to score."
+)
+@scene_options
+@click.option("--lpips-weights", type=PATH, metavar="FILE", help="Weights of the lpips package, needed for LPIPS.")
+@click.option(
+    "--pictures", type=OUTPUT, metavar="DIR", help="Write a picture of each photo, its render and the error to DIR."
+)
+@click.option(
+    "--allow-partial",
+    is_flag=True,
+    help="Accept a file that is cut short, if enough of it is there for a coarser model.",
 )
 @exposure_option
 @overwrite_option
@@ -189,14 +201,14 @@ def evaluate(
     as_json: bool,
     ranks: Ranks,
 ) -> None:
-    """Score MODEL against photos it has not seen: PSNR, SSIM, LPIPS, bytes on disk, seconds a frame.
+    """Score MODEL against held-out photos: PSNR, SSIM, LPIPS, file size in bytes, seconds per frame.
 
-    MODEL is a .hyrf file, the folder of a run, or splats (.ply .splat .spz .sog) in the photos' axes and units, drawn
-    over black: what 'hyrfpack export' wrote, or another program.
+    MODEL is a .hyrf file, the folder of a run, or splats (.ply .splat .spz .sog) of 'hyrfpack export' or another
+    program. Splats must have the axes and units of the photos' poses and are drawn over black.
 
-    Renders are rounded to 8 bits before they are scored. PSNR is of the pictures that 'hyrfpack render' writes;
-    "corrected" is PSNR after an affine map of colours that is fitted to the photo itself. LPIPS needs the trained
-    weights of the lpips package:
+    Renders are rounded to 8 bits before they are scored. PSNR is that of the pictures that 'hyrfpack render' writes.
+    "corrected" is the PSNR after an affine colour map has been fitted to each photo. LPIPS needs the trained weights of
+    the lpips package:
     torch.save(lpips.LPIPS(net="alex").state_dict(), FILE)
 
     \b
