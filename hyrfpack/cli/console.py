@@ -1,4 +1,4 @@
-"""Output of all commands to the terminal: --quiet, --verbose, notes, progress bars, and streams that are closed."""
+"""Output of all commands to the terminal: --quiet, --verbose, notes, and streams that are closed."""
 
 from __future__ import annotations
 
@@ -7,16 +7,15 @@ import os
 import platform
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from contextlib import redirect_stderr, suppress
-from typing import Any, TextIO, TypeVar, cast
+from typing import TextIO
 
 import click
 
 from hyrfpack.cli.wording import use_option_names
 from hyrfpack.version import __version__
 
-T = TypeVar("T")
 # Keys of values in click's context, which all commands share.
 _VERBOSITY_KEY = "hyrfpack.verbosity"
 _START_TIME_KEY = "hyrfpack.start_time"
@@ -49,7 +48,7 @@ def _set_verbosity(ctx: click.Context, option: click.Parameter, given: bool) -> 
         return
     ctx.meta[_START_TIME_KEY] = time.perf_counter()
     note(f"{_versions()}; on {platform.platform()} with {os.cpu_count()} cores")
-    root.call_on_close(lambda: note(f"the end, after {time.process_time():.1f} s of processors"))
+    root.call_on_close(lambda: note(f"done (CPU time {time.process_time():.1f} s)"))
 
 
 def _versions() -> str:
@@ -89,28 +88,6 @@ def note(sentence: str) -> None:
         sentence = f"[{time.perf_counter() - click.get_current_context().meta[_START_TIME_KEY]:7.2f} s] {sentence}"
     with suppress(OSError):  # a full disk or a closed terminal must not end the work
         click.echo(sentence, err=True)
-
-
-def show_progress_bar(items: Iterable[T], length: int, label: str) -> Iterator[T]:
-    """Yield the items and show a progress bar on standard error; errors of drawing it are ignored."""
-    with click.progressbar(items, length, label, file=cast(TextIO, _TolerantStderr())) as bar:
-        yield from bar
-
-
-class _TolerantStderr:
-    """Standard error, but text that cannot be written is dropped."""
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(sys.stderr, name)
-
-    def write(self, text: str) -> int:
-        with suppress(OSError):
-            sys.stderr.write(text)
-        return len(text)
-
-    def flush(self) -> None:
-        with suppress(OSError):
-            sys.stderr.flush()
 
 
 def note_if_verbose(sentence: str) -> None:

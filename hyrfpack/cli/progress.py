@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from hyrfpack.cli.wording import use_option_names
 
 if TYPE_CHECKING:
     from hyrfpack.make.display import Display
     from hyrfpack.progress import Report
+
+T = TypeVar("T")
 
 
 def create_command_display() -> Display:
@@ -33,3 +35,18 @@ def show_progress(command: str) -> Iterator[Report]:
         reporter = Reporter([command], display.show)
         reporter.begin(command)
         yield lambda doing, share: reporter.update(share, doing)
+
+
+def show_item_progress(items: Iterable[T], count: int, command: str, noun: str) -> Iterator[T]:
+    """Yield the items and show on standard error how many of them are done.
+
+    Args:
+        items: the items, each of which takes a while.
+        count: number of items.
+        command: name of the command.
+        noun: what one item is, such as "picture".
+    """
+    with show_progress(command) as report:
+        for done, item in enumerate(items, start=1):
+            report(f"{noun} {done}/{count}", done / count)
+            yield item

@@ -27,9 +27,8 @@ from hyrfpack.cli.common import (
     scene_options,
     select_views,
 )
-from hyrfpack.cli.console import show_progress_bar
 from hyrfpack.cli.processes import processes_option
-from hyrfpack.cli.progress import show_progress
+from hyrfpack.cli.progress import show_item_progress, show_progress
 from hyrfpack.outputs import Outputs
 
 if TYPE_CHECKING:
@@ -141,12 +140,14 @@ def render(
         else:
             picture_of = make_renderer(shown, depth=depth, settings=settings)
         pictures = write_pictures(picture_of, named, output, overwrite=overwrite, ranks=ranks)
-        return list(show_progress_bar(pictures, len(ranks.share(named)), "rendering"))
+        return list(show_item_progress(pictures, len(ranks.share(named)), "render", "picture"))
 
     # This first check ignores existing files. It keeps a folder from being created where nothing may be written.
     ranks.run_on_all(lambda: check(replace=True))
     with exclusive_folder(output, ranks=ranks):  # the lock is held until the video is written, too
         ranks.run_on_all(lambda: check(replace=overwrite))
+        width, height = largest_picture_size(camera for _, camera in named)
+        note(f"rendering {len(named)} pictures of up to {width} x {height} pixels")
         parts = ranks.all_gather(ranks.run_on_all(write))
         if not ranks.is_main:
             return
@@ -160,7 +161,6 @@ def render(
     if as_json:
         print_json({"pictures": [str(path) for path in written], "video": str(video_path) if video_path else None})
     else:
-        width, height = largest_picture_size(camera for _, camera in named)
         film = f" and {video_path.name}" if video_path else ""
         click.echo(f"{output}: {len(written)} pictures{film}, {width} x {height} pixels")
 

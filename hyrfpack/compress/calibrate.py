@@ -185,7 +185,7 @@ def measure_calibrated_sensitivity(
         HyrfError: a number of the model is NaN or infinite.
     """
     sensitivity = measure_sensitivity(model, cameras, report=report_part(report, 0.0, 0.5))
-    report("drawing what files are compared with", 0.5)
+    report("rendering reference views", 0.5)
     references = ReferenceRenders.from_model(model, cameras)
     return calibrate(model, sensitivity, references, distortion, prune, report_part(report, 0.55, 1.0)), references
 
@@ -217,7 +217,7 @@ def calibrate(
 
     # Pruning is calibrated first, because the errors of the other parts depend on which Gaussians are left.
     def measure_pruning(scaled: Sensitivity, _: list[Part], report: Report) -> dict[Part, ErrorMeasurement]:
-        report("calibrating what may be pruned", 0.0)
+        report("calibrating the prediction of pruning errors", 0.0)
         kept = indices_to_keep(scaled, per_number)
         predicted = float(np.delete(scaled.removals, kept).sum())
         return {(PRUNED,): ErrorMeasurement(references.measure_error(*subset_of(kept)), predicted)}
@@ -250,7 +250,10 @@ def calibrate(
 
         measurements = {}
         for number, part in enumerate(parts):
-            report(f"calibrating {' and '.join(SECTION_CONTENTS[name] for name in part)}", number / len(parts))
+            report(
+                f"calibrating predicted errors of {' and '.join(SECTION_CONTENTS[name] for name in part)}",
+                number / len(parts),
+            )
             measurements[part] = ErrorMeasurement(measured_error(part), sum(predicted[name] for name in part))
         return measurements
 

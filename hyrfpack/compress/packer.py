@@ -259,7 +259,7 @@ class Packer:
             own_steps = -(-steps // self.ranks.size)
 
             def report_step(step: int, loss: float) -> None:
-                report(f"fine-tuning, step {step:,} of {own_steps:,}", 0.9 * step / own_steps)
+                report(f"fine-tuning, step {step}/{own_steps}", 0.9 * step / own_steps)
 
             fit = partial(finetune, gains=self._gains, cache=self.cache, report=report_step, ranks=self.ranks)
             planned, plan = fit(model, plan, self.sensitivity, self.scene.train, steps)
@@ -267,7 +267,7 @@ class Packer:
             planned = plan.apply(model)
         report("quantising", 0.9 if steps else 0.1)
         quantized = quantize(planned, plan, self.sensitivity, reach=0 if steps else 1)
-        report("coding", 0.95 if steps else 0.6)
+        report("entropy coding", 0.95 if steps else 0.6)
         data = encode_model(planned, "compact", self.provenance, quantized=quantized)
         return EncodedCandidate(data, predict_errors(self.model, planned, quantized, self.sensitivity))
 
@@ -315,7 +315,7 @@ class Packer:
         def attempt(distortion: float, number: int) -> EncodedCandidate:
             candidate_report = report_round(report, number)
             candidate = self.encode(distortion, report_part(candidate_report, 0.0, 0.5))
-            candidate_report("comparing pictures of the file with the model's", 0.5)
+            candidate_report("comparing renders of the file with those of the model", 0.5)
             return dataclasses.replace(candidate, measured_error=references.measure_error(self.decode(candidate)))
 
         candidate, distortion = attempt(target, 0), target

@@ -111,7 +111,7 @@ def measure_sensitivity(
     required = {name: parameter.requires_grad for name, parameter in model.named_parameters()}
     pixels, field_pixels = 0, 0
     for number, camera in enumerate(views):
-        report(f"measuring sensitivities, view {number + 1} of {len(views)}", number / len(views))
+        report(f"measuring sensitivities, view {number + 1}/{len(views)}", number / len(views))
         # Views at and between cameras alternate, so both kinds are among the views of the fields.
         with_fields = number % (2 * field_interval) < 2
         for name, parameter in model.named_parameters():

@@ -86,7 +86,7 @@ def distill_model(
         f"{len(splats):,} Gaussians, harmonics of degree {splats.degree}; {len(train)} viewpoints "
         f"{'made up' if cameras is None else 'given'} to teach with, {len(test)} held out"
     )
-    report("looking which Gaussians are seen", 0.05)
+    report("measuring which Gaussians are visible", 0.05)
     light = mean_sent_light(original, evenly_spaced(train, LIGHT_MEASUREMENT_VIEWS))
     kept = torch.from_numpy(_indices_without_faint(light.cpu().numpy())).to(device)
     if not len(kept):
@@ -96,7 +96,7 @@ def distill_model(
     model = initial_model(original[kept], light[kept], train, config.seed, share, report_part(report, 0.1, 0.4))
     scene, cache = reference_scene(name, original, train, test), PictureCache()
     _fit_to_pictures(model, scene, config, cache, report_part(report, 0.4, 0.98))
-    report("drawing the held-out views", 0.98)
+    report("rendering held-out views", 0.98)
     return DistilledModel(
         model, train, *(ReferenceViews.from_splats(original, cameras) for cameras in (validation, test))
     )
@@ -153,7 +153,7 @@ def _fit_to_pictures(
     trainer = Trainer(scene, settings, cache, model.gaussians.positions.device, model)
 
     def report_step(trainer: Trainer, loss: float, mse: float) -> None:
-        progress = f"training, step {trainer.step:,} of {config.steps:,}, PSNR {psnr_from_mse(mse):.1f} dB"
+        progress = f"training, step {trainer.step}/{config.steps}, PSNR {psnr_from_mse(mse):.1f} dB"
         report(progress, trainer.step / config.steps)
 
     trainer.run(report=report_step)

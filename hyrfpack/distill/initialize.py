@@ -186,7 +186,7 @@ def _fit_fields(
     with torch_on_one_thread():
         for step, index in zip(range(steps), _batches(count, batch, generator, coords.device), strict=False):
             if step % REPORT_EVERY_STEPS == 0:
-                report(f"fitting the fields, step {step:,} of {steps:,}", step / steps)
+                report(f"fitting the fields, step {step}/{steps}", step / steps)
             opacity, scales, turns = model.geometry(coords.index_select(0, index)).split((1, 3, 4), 1)
             predicted, target = _EllipsoidShapes.from_logits(scales, turns + identity_quat), shapes.subset(index)
             errors = (predicted.matrices - target.matrices).square().sum(0)

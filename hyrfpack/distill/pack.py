@@ -68,7 +68,7 @@ def pack(
     candidate = packer.encode_to_distortion(distortion, references)
     for number in range(MAX_TRIALS):
         trial_report = report_round(report_part(report, 0.85, 1.0), number)
-        trial_report("comparing the file with the original", 0.0)
+        trial_report("comparing renders of the file with those of the original", 0.0)
         added_error = _mse(np.mean(distilled.validation.psnr_per_view(packer.decode(candidate)))) - error
         if added_error <= allowance:
             break

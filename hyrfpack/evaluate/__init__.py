@@ -155,7 +155,7 @@ def evaluate_model(
         scores: list[tuple[int, ViewScore | None, float]] = []
         own = ranks.share(list(enumerate(views)))
         for done, (number, view) in enumerate(own):
-            report(f"scoring photo {done + 1} of {len(own)}", done / len(own))
+            report(f"scoring photo {done + 1}/{len(own)}", done / len(own))
             photo = view.load()
             reference, mask = upload(photo, solid, device)
             if mask is not None and not mask.any():
@@ -186,7 +186,7 @@ def evaluate_model(
                     if warn is None:
                         raise
                     warn(str(error))
-        report(f"{len(own)} photos are scored", 1.0)
+        report(f"scored {len(own)} photos", 1.0)
         return scores
 
     with nullcontext() if pictures is None else exclusive_folder(pictures, ranks=ranks):

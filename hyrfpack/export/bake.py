@@ -156,7 +156,7 @@ def compute_visibility(
     see = report_each_call(
         partial(_compute_camera_visibility, model, model.decode_geometry()),
         report,
-        "looking from each camera",
+        "measuring visibility from each camera",
         len(cameras),
     )
     return parallel_map(see, cameras)

@@ -117,7 +117,7 @@ def convert_splats(
     hints = Hints(camera=camera, spz_version=spz_version)
     report(f"writing {len(kept):,} Gaussians as {kind.ending}", 0.2)
     data = kind.encode(kept, hints)
-    report("reading them back", 0.5)
+    report("reading the file back", 0.5)
     after = kind.decode(data, str(target))
     psnr = _measure_psnr(whole, after, weighted, report_part(report, 0.6, 1.0))
     written = write_atomic(target, data, overwrite=overwrite)
@@ -193,10 +193,10 @@ def _check_limits(kind: SplatFormat, splats: Splats, kept: Splats, say: Callable
 def _measure_psnr(before: Splats, after: Splats, weighted: WeightedSplats, report: Report) -> list[float]:
     """Measure the PSNR in dB of the pictures of `after` against those of `before`, for each view."""
     original, converted = (Drawable.from_splats(splats, weighted.frame) for splats in (before, after))
-    report("choosing viewpoints to compare at", 0.0)
+    report("choosing viewpoints", 0.0)
     cameras = sample_viewpoints(weighted, original, MEASURED_VIEWS, MEASURED_SIZE_PIXELS, seed=0)
     scores = []
     for number, camera in enumerate(cameras):
-        report(f"comparing view {number + 1} of {len(cameras)}", 0.3 + 0.7 * number / len(cameras))
+        report(f"comparing view {number + 1}/{len(cameras)}", 0.3 + 0.7 * number / len(cameras))
         scores.append(psnr_of_splats(original, converted, camera))
     return scores

@@ -79,7 +79,7 @@ def measure_psnr(
             for name, picture in pictures.items()
         }
 
-    compare = report_each_call(scores_at, report, "comparing pictures with the model's", len(views))
+    compare = report_each_call(scores_at, report, "comparing renders with those of the model", len(views))
     scores = [found for found in parallel_map(compare, views) if found]
     return {name: _mean_scores([found[name] for found in scores]) for name in ("model", *drawables)} if scores else {}
 

@@ -12,15 +12,15 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.live import Live
 
 from hyrfpack.make.progress import OVERDUE_TIME_RATIO, Progress
-from hyrfpack.train.progress import LOG_INTERVAL_SECONDS, StatusLine, duration
+from hyrfpack.train.progress import LOG_INTERVAL_SECONDS, PART_SEPARATOR, StatusLine, format_elapsed, format_eta
 
 
 class Display:
-    """Shows the stage, its share and descriptions, the elapsed time and the time left on standard error.
+    """Shows the stage, its share and descriptions, the elapsed and the estimated remaining time on standard error.
 
-    The clock runs on between two reports, because some stages do not know how far they are. When the time left at the
-    last report is over, the time left grows with the time since that report. If standard error is closed, the work
-    continues.
+    The elapsed time is kept current between two reports, because some stages do not know their progress. When the
+    remaining time of the last report is over, the estimate grows with the time since that report. If standard error is
+    closed, the work continues.
     """
 
     def __init__(self, wording: Callable[[str], str] = lambda sentence: sentence) -> None:
@@ -66,8 +66,8 @@ class Display:
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         parts = self._parts()
         if parts and self._latest:
-            droppable = [name for name in reversed(parts) if name not in ("stage", "left")]
-            yield StatusLine(parts, self._latest[0].share, (*droppable, "left"))
+            droppable = [name for name in reversed(parts) if name not in ("stage", "eta")]
+            yield StatusLine(parts, self._latest[0].share, (*droppable, "eta"))
 
     def _parts(self) -> dict[str, str]:
         """Return the texts of the line by name, in reading order."""
@@ -75,19 +75,20 @@ class Display:
             return {}
         (progress, at), now = self._latest, monotonic()
         words = {f"word {number}": word for number, word in enumerate(progress.words)}
+        number = f"{progress.place}/{progress.of} " if progress.of > 1 else ""
         parts = {
-            "stage": f"{progress.place}/{progress.of} {progress.stage}",
+            "stage": f"{number}{progress.stage}",
             **words,
-            "gone": f"{duration(now - self._start)} gone",
+            "elapsed": format_elapsed(now - self._start),
         }
         if progress.left is not None:
             seconds_since_report = now - at
             left = max(progress.left - seconds_since_report, OVERDUE_TIME_RATIO * seconds_since_report, 1.0)
-            parts["left"] = f"about {duration(left)} left"
+            parts["eta"] = format_eta(left)
         return parts
 
     def _print_lines(self) -> None:
         """Print the present line every few seconds until the display is closed."""
         while not self._stopped.wait(LOG_INTERVAL_SECONDS):
             if parts := self._parts():
-                self.say("  ".join(parts.values()))
+                self.say(PART_SEPARATOR.join(parts.values()))

@@ -154,14 +154,14 @@ def fit_plan_to_minutes(
     def at(size: int) -> Scene:
         return scenes[size] if size in scenes else scenes.setdefault(size, reading.load(path, size))
 
-    reporter.update(0.0, f"a few steps on photos of {_longest_side(at(probed))} pixels")
+    reporter.update(0.0, f"timing training steps on photos of {_longest_side(at(probed))} pixels")
     cost = first = measure_scene_cost(at(probed), requested, device, seed, cache, MAX_PROBE_TIME_RATIO * remaining)
     for chosen in sizes:
         cost = first.scaled_to_pixels(mean_megapixels(at(chosen)) / mean_megapixels(at(probed)))
         if cost.max_steps_within(at(chosen), end - monotonic()) >= MIN_USEFUL_STEPS:
             break
     if chosen != probed:
-        reporter.update(0.5, f"a few steps on photos of {_longest_side(at(chosen))} pixels")
+        reporter.update(0.5, f"timing training steps on photos of {_longest_side(at(chosen))} pixels")
         cost = measure_scene_cost(at(chosen), requested, device, seed, cache, MAX_PROBE_TIME_RATIO * remaining)
     chosen_scene = at(chosen)
     config = dataclasses.replace(requested, steps=cost.max_steps_within(chosen_scene, end - monotonic())).train_config(
@@ -170,9 +170,7 @@ def fit_plan_to_minutes(
     max_steps = max(max_pilot_steps(chosen_scene, config), 1)
 
     def report_pilot_step(step: int, loss: float, mse: float, gaussians: int) -> None:
-        reporter.update(
-            0.6 + 0.4 * step / max_steps, "pilot runs choose the exposure compensation and the Gaussian budget"
-        )
+        reporter.update(0.6 + 0.4 * step / max_steps, "pilot runs for exposure compensation and Gaussian budget")
 
     decisions = decide(chosen_scene, config, cache, device, report_pilot_step)
     assert decisions is not None  # None is only returned if the run is stopped, which nothing does here

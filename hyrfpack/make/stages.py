@@ -20,7 +20,6 @@ from hyrfpack.device import describe_device
 from hyrfpack.distill import DistillConfig, import_splats
 from hyrfpack.errors import HyrfError, HyrfSizeError
 from hyrfpack.evaluate import evaluate_model
-from hyrfpack.evaluate.metrics import psnr_from_mse
 from hyrfpack.export import export_model
 from hyrfpack.format import describe_file, load_model
 from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
@@ -32,7 +31,7 @@ from hyrfpack.outputs import Outputs
 from hyrfpack.scene import Scene
 from hyrfpack.train import Trainer, train_model
 from hyrfpack.train.decisions import max_pilot_steps
-from hyrfpack.train.progress import RUNNING_MEAN_WEIGHT
+from hyrfpack.train.progress import RUNNING_MEAN_WEIGHT, format_psnr
 from hyrfpack.train.run import is_begun
 
 SCENE_FOLDER = PRODUCT_NAMES["poses"]
@@ -171,17 +170,17 @@ class _TrainingProgress:
         if not math.isnan(mse):
             weight = 1.0 if math.isnan(self._mse) else RUNNING_MEAN_WEIGHT
             self._mse = mse if weight == 1 else weight * mse + (1 - weight) * self._mse
-        quality = () if math.isnan(self._mse) else (f"PSNR {psnr_from_mse(self._mse):.2f}",)
-        self._reporter.update(step / self._steps, f"{step:,}/{self._steps:,}", *quality, f"{gaussians:,} Gaussians")
+        quality = () if math.isnan(self._mse) else (format_psnr(self._mse),)
+        self._reporter.update(step / self._steps, f"step {step}/{self._steps}", *quality, f"{gaussians:,} Gaussians")
         if step == self._steps:
             self._begin("results")
 
     def phase(self, what: str, done: int, total: int) -> None:
         """Report other work, as the `phase` argument of `train_model`; after the last step it sets the progress."""
         if self._part == "results" and total:
-            self._reporter.update(done / total, what, f"{done:,}/{total:,}")
+            self._reporter.update(done / total, f"{what} {done}/{total}")
         else:
-            self._reporter.say(f"{what}  {done:,}/{total:,}" if total else what)
+            self._reporter.say(f"{what} {done}/{total}" if total else what)
 
     def _begin(self, part: str) -> None:
         if part != self._part:  # each part has a pace of its own

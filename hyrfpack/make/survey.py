@@ -247,7 +247,7 @@ def _read_header_facts(
             facts.append(read_photo_facts(photo))
         except HyrfDataError as error:
             unreadable[_relative_name(photo, folder)] = _unreadable_reason(error, photo)
-        read = f"reading the headers of photos, {done + 1:,} of {len(chosen):,}"
+        read = f"reading the headers of photos {done + 1}/{len(chosen)}"
         report_progress(read, _HEADERS_PROGRESS * (done + 1) / len(chosen))
     return facts, unreadable
 
@@ -264,7 +264,7 @@ def _measure_all_pixels(
                 measurements.append(found)
             else:
                 undecodable[_relative_name(chosen[done], folder)] = found
-            looked = f"looking at the photos, {done + 1:,} of {len(chosen):,}"
+            looked = f"measuring photo {done + 1}/{len(chosen)}"
             report_progress(
                 looked, _HEADERS_PROGRESS + (_PIXELS_PROGRESS - _HEADERS_PROGRESS) * (done + 1) / len(chosen)
             )
@@ -324,7 +324,7 @@ def _copy_problems(
     copies = []
     suspects = [item for group in sizes.values() if len(group) > 1 for item in group]
     for done, photo in enumerate(suspects):
-        compared = f"looking for copies, {done + 1:,} of {len(suspects):,}"
+        compared = f"searching for identical photos {done + 1}/{len(suspects)}"
         report_progress(compared, _PIXELS_PROGRESS + (1 - _PIXELS_PROGRESS) * done / len(suspects))
         digest = hashlib.sha256(photo.read_bytes()).digest()
         if digest in seen:

@@ -113,7 +113,7 @@ def recalibrate(job: Job, step_name: str, decide: Callable[[Cameras], Cameras], 
 
         def report_done(done: int) -> None:
             share = min(done / max(count, 1), 1.0)
-            doing = f"verifying pairs with better focal lengths, {min(done, count):,} of {count:,}"
+            doing = f"verifying pairs with refined focal lengths {min(done, count)}/{count}"
             report_progress(doing, 0.5 + 0.5 * share)
 
         with report_new_rows(job, "two_view_geometries", report_done):

@@ -319,9 +319,7 @@ class _PoseEstimation:
         """Return a function that reports how many photos are done, as `first` to `last` of the first stage."""
 
         def progress(done: int) -> None:
-            self._report_progress(
-                "photos", f"{doing}, {done:,} of {count:,}", first + (last - first) * done / max(count, 1)
-            )
+            self._report_progress("photos", f"{doing} {done}/{count}", first + (last - first) * done / max(count, 1))
 
         return progress
 

@@ -50,7 +50,7 @@ def find_features(job: Job, report_progress: Report) -> dict[str, Any]:
 
     def report_done(done: int) -> None:
         number = min(done + 1, len(job.names))
-        report_progress(f"features of photo {number:,} of {len(job.names):,}", done / len(job.names))
+        report_progress(f"finding features in photo {number}/{len(job.names)}", done / len(job.names))
 
     for camera, device in enumerate(job.devices, start=1):
         camera_photos = [

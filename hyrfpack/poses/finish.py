@@ -43,7 +43,7 @@ def finish_reconstruction(job: Job, models: list[str], report_progress: Report) 
         "mapper", "why" and "doubt": the choice and sentences about it. "angle": the median over points of the largest
         triangulation angle in degrees. If no photo is posed, only "registered", which is empty.
     """
-    report_progress("comparing the results", 0.0)
+    report_progress("comparing both reconstructions", 0.0)
     pieces = {name: read_pieces(job.model_folder(name)) for name in models}
     pieces = {name: found for name, found in pieces.items() if found and found[0].num_reg_images() >= MIN_PIECE_PHOTOS}
     if not pieces:
@@ -56,10 +56,10 @@ def finish_reconstruction(job: Job, models: list[str], report_progress: Report) 
     other = next((candidate for candidate in best.values() if candidate is not chosen), None)
     model, poses, explained_count = found[chosen], chosen.poses, chosen.explained_matches
     steps: list[tuple[str, float, Callable[[pycolmap.Reconstruction], pycolmap.Reconstruction], float]] = [
-        ("looking for poses of the other photos", 0.1, partial(complete_model, job), 1.0),
-        ("adding points that two photos see", 0.4, partial(add_two_view_points, job), 1.0),
+        ("estimating poses of the remaining photos", 0.1, partial(complete_model, job), 1.0),
+        ("triangulating points seen in two photos", 0.4, partial(add_two_view_points, job), 1.0),
         (
-            "finding the lens distortion",
+            "estimating the lens distortion",
             0.5,
             partial(_choose_lens, report_progress=report_progress),
             _MIN_REFITTED_MATCH_RATIO,
@@ -145,12 +145,12 @@ def _choose_lens(model: pycolmap.Reconstruction, report_progress: Report) -> pyc
     """
     error = _refit_with_lens(model, "SIMPLE_RADIAL").compute_mean_reprojection_error()
     photos = Counter(image.camera_id for image in model.images.values() if image.has_pose)
-    report_progress("finding the lens distortion, 1 of 3 models tried", 0.6)
+    report_progress("estimating the lens distortion, model 2/3", 0.6)
     if min(photos.values()) >= _MIN_OPENCV_PHOTOS:
         opencv = _refit_with_lens(model, "OPENCV")
         if opencv.compute_mean_reprojection_error() < _MAX_OPENCV_ERROR_RATIO * error:
             return opencv
-    report_progress("finding the lens distortion, 2 of 3 models tried", 0.7)
+    report_progress("estimating the lens distortion, model 3/3", 0.7)
     pinhole = _refit_with_lens(model, "SIMPLE_PINHOLE")
     return pinhole if pinhole.compute_mean_reprojection_error() <= _MAX_PINHOLE_ERROR_RATIO * error else model
 
@@ -194,9 +194,7 @@ def _color_points(job: Job, model: pycolmap.Reconstruction, report_progress: Rep
     """Give each point the mean colour of the pixels in which it is observed."""
     sums: dict[int, np.ndarray] = {}
     for number, image in enumerate(model.images.values(), start=1):
-        report_progress(
-            f"colouring points, photo {number:,} of {len(model.images):,}", 0.8 + 0.2 * number / len(model.images)
-        )
+        report_progress(f"colouring points, photo {number}/{len(model.images)}", 0.8 + 0.2 * number / len(model.images))
         seen = [(point.point3D_id, point.xy) for point in image.points2D if point.has_point3D()]
         if not (image.has_pose and seen):
             continue

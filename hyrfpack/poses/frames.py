@@ -199,7 +199,7 @@ def _measure_video(path: Path, video: Video, report_progress: Report) -> _VideoM
             times.append(time)
         length = f" of {video.seconds:.0f} s" if video.seconds else ""
         share = min(1.0, time / video.seconds) if video.seconds else 0.0
-        report_progress(f"looking at frame {decoded_count:,}, {time:.0f} s{length}", _MEASURED_PROGRESS * share)
+        report_progress(f"measuring frame {decoded_count}, {time:.0f} s{length}", _MEASURED_PROGRESS * share)
     if decoded_count < _MIN_DECODED_FRAMES:
         can_be_decoded, copy_or = (
             (" that can be decoded", "copy it again in full, or ") if video.damaged_count else ("", "")
@@ -241,7 +241,7 @@ def _choose_spaced_frames(
 
     def progress(done: int) -> None:
         share = _MEASURED_PROGRESS + (_TRACKED_PROGRESS - _MEASURED_PROGRESS) * done / len(sharp)
-        report_progress(f"following the motion, frame {done:,} of {len(sharp):,}", share)
+        report_progress(f"measuring the camera motion, frame {done}/{len(sharp)}", share)
 
     places = track_windows([measured.thumbnails[place] for place in sharp], progress)
     values = measured.sharpness[sharp]
@@ -341,7 +341,7 @@ def _write_frames(video: Video, folder: Path, numbers: list[int], report_progres
             decode_upright(frame, video.aspect).save(data, "JPEG", quality=95, subsampling=0)
             write_atomic(folder / _frame_name(number), data.getvalue())
             missing.remove(number)
-        written = f"writing frames, {left - len(missing):,} of {left:,}"
+        written = f"writing frames {left - len(missing)}/{left}"
         report_progress(written, _TRACKED_PROGRESS + (1 - _TRACKED_PROGRESS) * min((number + 1) / (last + 1), 1.0))
         if not missing:
             break

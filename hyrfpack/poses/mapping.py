@@ -48,7 +48,7 @@ def map_globally(job: Job, report_progress: Report) -> dict[str, Any]:
     for run_index in range(_GLOBAL_RUNS):
         name = f"global-{run_index}"
         if not job.model_folder(name).exists():
-            doing = f"posing all photos at once, run {run_index + 1} of {_GLOBAL_RUNS}"
+            doing = f"global mapping, run {run_index + 1}/{_GLOBAL_RUNS}"
             report_progress(doing, run_index / _GLOBAL_RUNS)
             seed, options = (job.seed + run_index) % 2**31, pycolmap.GlobalPipelineOptions()
             options.random_seed = options.mapper.random_seed = seed
@@ -111,7 +111,7 @@ def map_incrementally(job: Job, report_progress: Report) -> dict[str, Any]:
             options.ba_refine_focal_length = options.ba_refine_extra_params = False
             options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
         count = len(job.names)
-        report_progress(f"posing photos one by one, choosing the first 2 of {count:,}", 0.0)
+        report_progress(f"incremental mapping, choosing the first 2/{count} photos", 0.0)
         pieces = pycolmap.incremental_mapping(
             job.database,
             job.images,
@@ -135,7 +135,7 @@ def _make_photo_callback(count: int, report_progress: Report) -> Callable[[], No
         nonlocal posed
         posed += 1
         report_progress(
-            f"posing photos one by one, {min(posed, count):,} of {count:,} posed", 0.95 * min(posed / count, 1.0)
+            f"incremental mapping, {min(posed, count)}/{count} photos registered", 0.95 * min(posed / count, 1.0)
         )
 
     return report_next_photo

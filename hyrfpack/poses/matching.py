@@ -81,7 +81,7 @@ def _choose_pairs(job: Job, report_progress: Report) -> pairing.Pairs:
             found.append(database.read_descriptors(number).data if there else np.zeros((0, 128), np.uint8))
 
     def progress(done: int) -> None:
-        report_progress(f"choosing which photos to match, {done:,} of {count:,}", 0.02 * done / count)
+        report_progress(f"choosing pairs to match, photo {done}/{count}", 0.02 * done / count)
 
     similarity = pairing.compute_similarities(found, job.seed, progress)
     choose = pairing.sequential_pairs if job.matching == "sequential" else pairing.retrieval_pairs
@@ -108,7 +108,7 @@ def _match_pairs(job: Job, pairs: pairing.Pairs, report_progress: Report) -> Non
 
     def report_done(done: int) -> None:
         number, share = min(done + 1, len(matchable)), min(done / len(matchable), 1.0)
-        report_progress(f"matching pair {number:,} of {len(matchable):,}", 0.02 + 0.8 * share)
+        report_progress(f"matching pair {number}/{len(matchable)}", 0.02 + 0.8 * share)
 
     while remaining:
         report_done(done)
@@ -139,7 +139,7 @@ def _estimate_focals(
         if device.focal is None and len(camera_pairs) >= _MIN_FOCAL_PAIRS:
 
             def progress(share: float, number: int = number) -> None:
-                camera = f", camera {number} of {len(job.devices)}" if len(job.devices) > 1 else ""
+                camera = f", camera {number}/{len(job.devices)}" if len(job.devices) > 1 else ""
                 report_progress(f"{_FOCAL_SEARCH_DESCRIPTION}{camera}", 0.5 * (number - 1 + share) / len(job.devices))
 
             found[number] = search_focal_ratio(camera_pairs, cameras[number], job.seed, progress)

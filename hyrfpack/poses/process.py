@@ -21,8 +21,8 @@ _TERMINATION_TIMEOUT_SECONDS = 3.0  # a process that takes longer to terminate i
 _STAGE_DESCRIPTIONS = {
     "features": "finding features",
     "matches": "matching photos",
-    "global": "posing all photos at once",
-    "incremental": "posing photos one by one",
+    "global": "global mapping",
+    "incremental": "incremental mapping",
 }
 _FINISH_DESCRIPTION = "finishing the poses"
 _IMPORT_ROOT = str(Path(__file__).parents[2])  # the folder from which hyrfpack was imported

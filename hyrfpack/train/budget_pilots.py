@@ -45,7 +45,7 @@ def measure_budget(pilots: ScenePilots, exposure: bool) -> tuple[float, str]:
         seed, before = pilots.config.seed ^ len(gains), 2 * len(gains)
         scores = [
             pilots.run(
-                f"pilot run {before + number} of {before + 2} for the budget",
+                f"budget pilot run {before + number}/{before + 2}",
                 fold,
                 BUDGET_PILOT_STEPS,
                 seed=seed,

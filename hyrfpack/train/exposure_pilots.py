@@ -99,7 +99,7 @@ def _gain_per_view(pilots: ScenePilots, number: int, rounds: int, steps: int) ->
         return []
     without, compensated = (
         pilots.run(
-            f"pilot run {2 * number + position} of {2 * rounds} for exposure",
+            f"exposure pilot run {2 * number + position}/{2 * rounds}",
             fold,
             steps,
             seed=pilots.config.seed ^ number,

@@ -115,7 +115,7 @@ class ScenePilots:
         training, views = split(self.scene.train, every, max_validation, number)
         validation: list[View] = []
         for done, view in enumerate(views):
-            self._phase("reading photos to score pilot runs on", done, len(views))
+            self._phase("reading validation photos", done, len(views))
             if is_usable(self.cache.get(view)):
                 validation.append(view)
         scene = dataclasses.replace(self.scene, train=training, test=[])
@@ -127,7 +127,7 @@ class ScenePilots:
         """Train a pilot and score it on the validation photos.
 
         Args:
-            name: of the pilot, for progress ("pilot run 1 of 2").
+            name: of the pilot, for progress ("budget pilot run 1/2").
             fold: photos to train on and validation photos.
             steps: of the run.
             seed, exposure, max_gaussians: replace those of the run to come; None for the fold's budget.

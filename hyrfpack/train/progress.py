@@ -26,8 +26,9 @@ MIN_ADVICE_STEPS = 3
 MIN_ADVICE_SECONDS = 10.0
 MIN_ADVICE_SECONDS_LEFT = 3600.0
 MIN_BAR_COLUMNS, MAX_BAR_COLUMNS = 8, 24
+PART_SEPARATOR = " | "
 # Parts that a narrow terminal leaves out, the least important ones first.
-OPTIONAL_PARTS = ("gaussians", "loss", "gone", "speed", "psnr", "left")
+OPTIONAL_PARTS = ("gaussians", "loss", "elapsed", "speed", "psnr", "eta")
 
 
 class Pace:
@@ -52,7 +53,7 @@ class Pace:
 
 
 class ProgressLine:
-    """Shows step, steps/s, loss, PSNR, Gaussians and time left on standard error.
+    """Shows step, loss, PSNR, Gaussians, speed, elapsed time and estimated remaining time (ETA) on standard error.
 
     A terminal shows one line that is redrawn and always fits. Elsewhere, as in a log file, a plain line is printed
     every few seconds. A missing or closed standard error does not end the training.
@@ -63,7 +64,7 @@ class ProgressLine:
 
         Args:
             quiet: show nothing.
-            advice: what would shorten the run ("fewer steps or a GPU"), shown once if more than an hour is left.
+            advice: what shortens the run ("fewer steps or a GPU"), shown once if more than an hour remains.
         """
         self.steps = steps
         self.start = self.last_log = monotonic()
@@ -72,7 +73,7 @@ class ProgressLine:
         self.mse: float | None = None
         self.quiet = quiet or sys.stderr is None
         self.advice = advice
-        self.line = StatusLine({"steps": f"{done:,}/{steps:,}", "left": "preparing the first step"}, done / steps)
+        self.line = StatusLine({"steps": f"step {done}/{steps}", "eta": "preparing the first step"}, done / steps)
         self.live = None if self.quiet else _live_on_terminal(self.line)
 
     def __enter__(self) -> ProgressLine:
@@ -109,27 +110,27 @@ class ProgressLine:
         if not due:
             return
         parts = {
-            "steps": f"{step:,}/{self.steps:,}",
-            "speed": f"{speed:.1f} steps/s" if speed >= 1 else f"{1 / speed:.1f} s/step",
-            "loss": f"loss {self.loss:.4f}",
-            "psnr": f"PSNR {psnr_from_mse(self.mse):.2f}",
+            "steps": f"step {step}/{self.steps}",
+            "loss": f"loss {self.loss:.3f}",
+            "psnr": format_psnr(self.mse),
             "gaussians": f"{gaussians:,} Gaussians",
-            "gone": f"{duration(now - self.start)} gone",
-            "left": f"{duration(left)} left",
+            "speed": format_speed(speed),
+            "elapsed": format_elapsed(now - self.start),
+            "eta": format_eta(left),
         }
         if step == self.steps:
-            del parts["left"]
+            del parts["eta"]
         if self.live:
             self.line.parts, self.line.share = parts, step / self.steps
         else:
             self.last_log = now
-            _print("step " + "  ".join(parts.values()))
+            _print(PART_SEPARATOR.join(parts.values()))
 
     def _advise(self, step: int, now: float, left: float) -> None:
         steps, seconds = step - self.pace.warm_step, now - self.pace.warm
         is_speed_known = steps >= MIN_ADVICE_STEPS and seconds >= MIN_ADVICE_SECONDS
         if self.advice and is_speed_known and left > MIN_ADVICE_SECONDS_LEFT:
-            self.note(f"this takes {left / 3600:.1f} more hours; {self.advice} would shorten it")
+            self.note(f"about {left / 3600:.1f} hours remain; to shorten the run, use {self.advice}")
             self.advice = ""
 
 
@@ -187,20 +188,20 @@ class PhaseLine:
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         if parts := self.parts(monotonic()):
-            yield StatusLine(parts, self.done / self.total if self.total else 0.0, ("gone", "left", "count"))
+            yield StatusLine(parts, self.done / self.total if self.total else 0.0, ("elapsed", "eta", "count"))
 
     def parts(self, now: float) -> dict[str, str]:
         """Return the parts of the line at a time of the monotonic clock, by name in reading order."""
         if not self.what:
             return {}
-        gone = now - self.start
+        elapsed = now - self.start
         parts = {"what": self.what}
         if self.total:
-            parts["count"] = f"{self.done:,}/{self.total:,}"
-        parts["gone"] = f"{duration(gone)} gone"
-        left = gone * (self.total - self.done) / self.done if self.done else 0.0
-        if min(gone, left) >= MIN_ETA_SECONDS:
-            parts["left"] = f"{duration(left)} left"
+            parts["count"] = f"{self.done}/{self.total}"
+        parts["elapsed"] = format_elapsed(elapsed)
+        left = elapsed * (self.total - self.done) / self.done if self.done else 0.0
+        if min(elapsed, left) >= MIN_ETA_SECONDS:
+            parts["eta"] = format_eta(left)
         return parts
 
     def _log(self) -> None:
@@ -215,15 +216,40 @@ class PhaseLine:
             )
             if due and (parts := self.parts(now)):
                 printed = start, now
-                _print("  ".join(parts.values()))
+                _print(PART_SEPARATOR.join(parts.values()))
 
 
-def duration(seconds: float) -> str:
-    """Format a duration: up to 120 seconds as "60 s", longer ones as hours, minutes and seconds, "1:04:09"."""
-    whole = round(seconds)
-    if whole <= 120:
-        return f"{whole} s"
-    return f"{whole // 3600}:{whole // 60 % 60:02}:{whole % 60:02}"
+def format_duration(seconds: float) -> str:
+    """Format a duration as minutes and seconds, "0:15", from one hour on as hours, minutes and seconds, "1:04:09"."""
+    minutes, seconds = divmod(round(seconds), 60)
+    return f"{minutes}:{seconds:02}" if minutes < 60 else f"{minutes // 60}:{minutes % 60:02}:{seconds:02}"
+
+
+def format_elapsed(seconds: float) -> str:
+    """Format the elapsed time for a progress line."""
+    return f"elapsed {format_duration(seconds)}"
+
+
+def format_eta(seconds: float) -> str:
+    """Format the estimated remaining time for a progress line."""
+    return f"ETA {format_duration(seconds)}"
+
+
+def format_psnr(mse: float) -> str:
+    """Format a mean squared error as PSNR for a progress line."""
+    return f"PSNR {psnr_from_mse(mse):.1f} dB"
+
+
+def format_speed(steps_per_second: float) -> str:
+    """Format a speed as iterations per second, or if it is below one, as seconds per iteration.
+
+    Example:
+        >>> format_speed(40.2), format_speed(2.5), format_speed(0.5)
+        ('40 it/s', '2.5 it/s', '2.0 s/it')
+    """
+    if steps_per_second < 1:
+        return f"{1 / steps_per_second:.1f} s/it"
+    return f"{steps_per_second:.{0 if steps_per_second >= 10 else 1}f} it/s"
 
 
 class StatusLine:
@@ -240,15 +266,15 @@ class StatusLine:
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         words, width = dict(self.parts), options.max_width
         for name in self.optional:
-            if len("  ".join(words.values())) > width:
+            if len(PART_SEPARATOR.join(words.values())) > width:
                 words.pop(name, None)
         steps, *others = words.values()
         line = Text(steps, no_wrap=True, overflow="crop")
-        room = min(width - len("  ".join(words.values())) - 2, MAX_BAR_COLUMNS)
+        room = min(width - len(PART_SEPARATOR.join(words.values())) - 1, MAX_BAR_COLUMNS)
         if room >= MIN_BAR_COLUMNS:
             done, mark = round(self.share * room), "-" if options.ascii_only else "\u2501"
-            line.append("  ").append(mark * done, "bar.complete").append(mark * (room - done), "bar.back")
-        yield line.append("".join(f"  {word}" for word in others))
+            line.append(" ").append(mark * done, "bar.complete").append(mark * (room - done), "bar.back")
+        yield line.append("".join(f"{PART_SEPARATOR}{word}" for word in others))
 
 
 def _live_on_terminal(line: RenderableType, transient: bool = False) -> Live | None:

@@ -283,7 +283,7 @@ def _drop_unseen_background(trainer: Trainer, phase: Phase) -> HybridModel:
     views = evenly_spaced(trainer.scene.train, MAX_BACKGROUND_VIEWS)
     seen = 0.0
     for done, view in enumerate(views):
-        phase("measuring the light from the background", done, len(views))
+        phase("measuring the share of the background", done, len(views))
         seen = max(seen, float((1 - render_view(model, view.camera, background=False).alpha).mean()))
     if seen >= MIN_BACKGROUND_LIGHT_SHARE:
         trainer.choices["background"] += f"; up to {seen:.1%} of a view's light comes from it"

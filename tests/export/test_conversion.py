@@ -99,7 +99,7 @@ def test_progress_is_reported_in_order(tmp_path):
     hyrfpack.convert_splats(source, tmp_path / "a.spz", report=lambda *said: told.append(said))
     shares = [share for _, share in told]
     assert shares == sorted(shares) and 0 <= shares[0] and shares[-1] <= 1
-    assert told[0][0] == "reading before.ply" and told[-1][0] == "comparing view 2 of 2"
+    assert told[0][0] == "reading before.ply" and told[-1][0] == "comparing view 2/2"
 
 
 @pytest.mark.parametrize(

@@ -12,14 +12,14 @@ from hyrfpack.make import display
 from hyrfpack.make.display import Display
 from hyrfpack.make.progress import SLOWDOWN_EXPONENT, Progress, Reporter
 
-TRAINING_PROGRESS = Progress("training", 2, 5, 0.2, 72.4, ("604/3,000", "PSNR 29.40", "4,850 Gaussians"))
+TRAINING_PROGRESS = Progress("training", 2, 5, 0.2, 72.4, ("step 604/3000", "PSNR 29.4 dB", "4,850 Gaussians"))
 
 
 @pytest.mark.parametrize(
     "width, words",
     [
-        (120, ("2/5 training  ━━━━━", "604/3,000", "PSNR 29.40", "4,850 Gaussians", "0 s gone", "about 72 s left")),
-        (40, ("2/5 training", "604/3,000", "about 72 s left")),
+        (120, ("2/5 training ━━━━━", "step 604/3000", "PSNR 29.4 dB", "4,850 Gaussians", "elapsed 0:00", "ETA 1:12")),
+        (40, ("2/5 training", "step 604/3000", "ETA 1:12")),
         (20, ("2/5 training",)),
     ],
 )
@@ -40,7 +40,7 @@ def test_without_a_terminal_a_plain_line_is_printed_every_few_seconds(capsys, mo
         sleep(0.1)
     out, err = capsys.readouterr()
     assert out == "" and "a sentence [of] its own" in err
-    assert "2/5 training  604/3,000  PSNR 29.40  4,850 Gaussians  0 s gone  about 72 s left" in err
+    assert "2/5 training | step 604/3000 | PSNR 29.4 dB | 4,850 Gaussians | elapsed 0:00 | ETA 1:12" in err
 
 
 def test_an_unknown_remaining_time_is_not_printed(capsys, monkeypatch):
@@ -49,7 +49,7 @@ def test_an_unknown_remaining_time_is_not_printed(capsys, monkeypatch):
         Reporter(["import", "export"], shown.show).begin("import")
         sleep(0.1)
     lines = capsys.readouterr().err.splitlines()
-    assert lines and all(line == "1/2 import  0 s gone" for line in lines)
+    assert lines and all(line == "1/2 import | elapsed 0:00" for line in lines)
 
 
 def test_a_display_past_its_estimate_never_shows_0_s_left(monkeypatch):
@@ -59,8 +59,8 @@ def test_a_display_past_its_estimate_never_shows_0_s_left(monkeypatch):
     shown.show(TRAINING_PROGRESS)
     left = []
     for clock[0] in (0.0, 50.0, 72.0, 100.0, 400.0):
-        left.append(shown._parts()["left"])
-    assert left == ["about 72 s left", "about 22 s left", "about 18 s left", "about 25 s left", "about 100 s left"]
+        left.append(shown._parts()["eta"])
+    assert left == ["ETA 1:12", "ETA 0:22", "ETA 0:18", "ETA 0:25", "ETA 1:40"]
 
 
 # -- the estimate ----------------------------------------------------------------------------------------------------

@@ -308,7 +308,7 @@ def test_every_stage_of_a_video_reports_progress(wall, tmp_path):
     choose_frames(video, tmp_path / "frames", report=lambda *now: told.append(now))
     shares = [share for _, share in told]
     assert shares == sorted(shares) and shares[-1] == 1
-    for words in ("looking at frame 60, 2 s of 2 s", "following the motion, frame 59 of 60", "writing frames, "):
+    for words in ("measuring frame 60, 2 s of 2 s", "measuring the camera motion, frame 59/60", "writing frames "):
         assert any(words in doing for doing, _ in told), words
 
 

@@ -70,7 +70,7 @@ def test_a_stopped_estimation_resumes_after_its_last_finished_stage(taken, stopp
     shutil.copytree(stopped_after_matching, out)
     assert os.listdir(out) == [".poses"]
     with pytest.raises(KeyboardInterrupt):
-        hyrfpack.estimate_poses(taken[0], out, report=stop_at("one by one"))
+        hyrfpack.estimate_poses(taken[0], out, report=stop_at("incremental"))
     assert (out / ".poses" / "matches.json").stat().st_mtime_ns == kept
     assert (out / ".poses" / "global-0").is_dir()
 

@@ -121,17 +121,17 @@ def test_progress_of_a_silent_stage_is_repeated(tmp_path, monkeypatch):
 def test_every_stage_reports_progress_in_its_own_units(posed):
     doings = [doing for doing, _ in posed[2]]
     for words in (
-        "reading the headers of photos, 8 of 8",
-        "copying photos, 8 of 8",
-        "features of photo ",
+        "reading the headers of photos 8/8",
+        "copying photos 8/8",
+        "finding features in photo ",
         "matching pair ",
         "estimating focal lengths",
-        "posing all photos at once, run 1 of 3",
-        "posing photos one by one, 8 of 8 posed",
-        "comparing the results",
-        "adding points",
-        "finding the lens distortion",
-        "colouring points, photo 8 of 8",
+        "global mapping, run 1/3",
+        "incremental mapping, 8/8 photos registered",
+        "comparing both reconstructions",
+        "triangulating points",
+        "estimating the lens distortion",
+        "colouring points, photo 8/8",
     ):
         assert any(words in doing for doing in doings), words
 

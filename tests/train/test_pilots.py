@@ -234,11 +234,11 @@ def test_pilots_are_reported_as_step_0(tmp_path):
 def test_pilot_runs_report_each_step_and_each_scored_view():
     told: list[tuple[str, int, int]] = []
     measure_scene_budget(make_scene(), phase=lambda *progress: told.append(progress))
-    assert [row for row in told if row[0] == "pilot run 1 of 2 for the budget: training"] == [
-        ("pilot run 1 of 2 for the budget: training", step, 6) for step in range(1, 7)
+    assert [row for row in told if row[0] == "budget pilot run 1/2: training"] == [
+        ("budget pilot run 1/2: training", step, 6) for step in range(1, 7)
     ]
-    assert [row for row in told if row[0] == "pilot run 2 of 2 for the budget: scoring"] == [
-        ("pilot run 2 of 2 for the budget: scoring", done, 2) for done in range(3)
+    assert [row for row in told if row[0] == "budget pilot run 2/2: scoring"] == [
+        ("budget pilot run 2/2: scoring", done, 2) for done in range(3)
     ]
 
 

@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 
 from hyrfpack.train import progress
-from hyrfpack.train.progress import PhaseLine, ProgressLine, duration
+from hyrfpack.train.progress import PhaseLine, ProgressLine, format_duration, format_speed
 
 
 def test_a_log_file_gets_plain_lines_with_all_labels(capsys, monkeypatch):
@@ -22,9 +22,9 @@ def test_a_log_file_gets_plain_lines_with_all_labels(capsys, monkeypatch):
     assert out == ""
     assert len(err.splitlines()) == 20
     last = err.splitlines()[-1]
-    for part in ("step 20/20  ", "loss 0.2500", "PSNR 20.00", "1,234 Gaussians", "steps/s", "0 s gone"):
+    for part in ("step 20/20 | ", "loss 0.250", "PSNR 20.0 dB", "1,234 Gaussians", " it/s", "elapsed 0:00"):
         assert part in last
-    assert "left" in err.splitlines()[-2] and "left" not in last
+    assert "ETA 0:00" in err.splitlines()[-2] and "ETA" not in last
 
 
 def test_the_last_step_is_always_printed(capsys):
@@ -58,40 +58,42 @@ def test_steps_without_an_error_do_not_change_the_running_means(capsys, monkeypa
         assert capsys.readouterr().err == ""
         line.update(2, 1.0, 0.01, 5)
         line.update(3, 0.0, float("nan"), 5)
-    assert (line.loss, line.mse) == (1.0, 0.01) and "PSNR 20.00" in capsys.readouterr().err
+    assert (line.loss, line.mse) == (1.0, 0.01) and "PSNR 20.0 dB" in capsys.readouterr().err
 
 
 def test_an_error_of_0_gives_a_valid_line(capsys):
     with ProgressLine(1, 0) as line:
         line.update(1, 0.0, 0.0, 5)
-    assert "PSNR 100.00" in capsys.readouterr().err and math.isfinite(line.mse)
+    assert "PSNR 100.0 dB" in capsys.readouterr().err and math.isfinite(line.mse)
 
 
 # -- fitting the line to a terminal ----------------------------------------------------------------------------------
 
 SHORT_LINE_PARTS = {
-    "steps": "604/3,000",
-    "speed": "40.2 steps/s",
-    "loss": "loss 0.0381",
-    "psnr": "PSNR 29.40",
+    "steps": "step 604/3000",
+    "loss": "loss 0.038",
+    "psnr": "PSNR 29.4 dB",
     "gaussians": "4,850 Gaussians",
-    "gone": "15 s gone",
-    "left": "60 s left",
+    "speed": "40 it/s",
+    "elapsed": "elapsed 0:15",
+    "eta": "ETA 1:00",
 }
 LONG_LINE_PARTS = {
-    "steps": "29,604/30,000",
-    "speed": "125.5 s/step",
-    "loss": "loss 0.0381",
-    "psnr": "PSNR 29.40",
+    "steps": "step 29604/30000",
+    "loss": "loss 0.038",
+    "psnr": "PSNR 29.4 dB",
     "gaussians": "1,234,850 Gaussians",
-    "gone": "120:15:22 gone",
-    "left": "11:15:22 left",
+    "speed": "125.5 s/it",
+    "elapsed": "elapsed 120:15:22",
+    "eta": "ETA 11:15:22",
 }
 LINE_BY_TERMINAL_WIDTH = {
-    40: "604/3,000  PSNR 29.40  60 s left",
-    60: "604/3,000  40.2 steps/s  PSNR 29.40  15 s gone  60 s left",
-    80: "604/3,000  ━━━━━━━━  40.2 steps/s  loss 0.0381  PSNR 29.40  15 s gone  60 s left",
-    120: "604/3,000  " + 24 * "━" + "  40.2 steps/s  loss 0.0381  PSNR 29.40  4,850 Gaussians  15 s gone  60 s left",
+    40: "step 604/3000 | PSNR 29.4 dB | ETA 1:00",
+    60: "step 604/3000 ━━━━━━━━━━ | PSNR 29.4 dB | 40 it/s | ETA 1:00",
+    80: "step 604/3000 | loss 0.038 | PSNR 29.4 dB | 40 it/s | elapsed 0:15 | ETA 1:00",
+    120: "step 604/3000 "
+    + 24 * "━"
+    + " | loss 0.038 | PSNR 29.4 dB | 4,850 Gaussians | 40 it/s | elapsed 0:15 | ETA 1:00",
 }
 
 
@@ -123,8 +125,9 @@ def test_line_never_is_wider_than_the_terminal(parts):
     for width in range(1, 200):
         line = draw_line(parts, width)
         assert len(line) <= width
-        assert width < 14 or line.startswith(parts["steps"])
-        assert width < 40 or (parts["psnr"] in line and parts["left"] in line)
+        assert width < 16 or line.startswith(parts["steps"])
+        assert width < 31 or parts["eta"] in line
+        assert width < 46 or parts["psnr"] in line
 
 
 def test_bar_of_a_terminal_without_unicode_is_ascii():
@@ -145,7 +148,11 @@ def test_a_terminal_gets_one_line_that_is_redrawn(width, monkeypatch):
     lines = [part for part in re.split(r"[\r\n]+", shown) if part.strip()]
     assert max(map(len, lines)) <= width, lines
     assert "a sentence" in [part.strip() for part in lines]
-    assert lines[-1].startswith("604/3,000  ") and "PSNR 30.00" in lines[-1] and lines[-1].endswith(" left")
+    assert (
+        lines[-1].startswith("step 604/3000 ")
+        and "PSNR 30.0 dB" in lines[-1]
+        and re.search(r"ETA \d+:\d\d$", lines[-1])
+    )
 
 
 def test_the_line_is_drawn_before_any_message_above_it(monkeypatch):
@@ -163,7 +170,7 @@ def test_a_terminal_that_cannot_redraw_gets_plain_lines(monkeypatch):
     monkeypatch.setenv("TERM", "dumb")
     with ProgressLine(3, 0) as line:
         line.update(3, 0.05, 0.001, 4850)
-    assert terminal.getvalue().startswith("step 3/3  ") and "\x1b" not in terminal.getvalue()
+    assert terminal.getvalue().startswith("step 3/3 | ") and "\x1b" not in terminal.getvalue()
 
 
 # -- time ------------------------------------------------------------------------------------------------------------
@@ -188,34 +195,42 @@ def report_steps(clock: Clock, steps: int, seconds: float, count: int, **options
 @pytest.mark.parametrize(
     ("seconds", "said"),
     [
-        (0, "0 s"),
-        (0.4, "0 s"),
-        (59.6, "60 s"),
-        (120, "120 s"),
-        (121, "0:02:01"),
+        (0, "0:00"),
+        (0.4, "0:00"),
+        (15, "0:15"),
+        (59.6, "1:00"),
+        (3599, "59:59"),
         (3600, "1:00:00"),
         (45e3, "12:30:00"),
     ],
 )
-def test_more_than_two_minutes_are_printed_as_hours_minutes_and_seconds(seconds, said):
-    assert duration(seconds) == said
+def test_durations_are_minutes_and_seconds_and_from_one_hour_on_hours_too(seconds, said):
+    assert format_duration(seconds) == said
+
+
+@pytest.mark.parametrize(
+    ("speed", "said"),
+    [(0.5, "2.0 s/it"), (1.0, "1.0 it/s"), (9.94, "9.9 it/s"), (10.0, "10 it/s"), (402.4, "402 it/s")],
+)
+def test_speed_is_in_iterations_per_second_or_seconds_per_iteration(speed, said):
+    assert format_speed(speed) == said
 
 
 def test_times_of_a_log_file_are_readable(capsys, monkeypatch):
     report_steps(Clock(monkeypatch), steps=3000, seconds=0.5, count=600)
     last = capsys.readouterr().err.splitlines()[-1]
-    assert re.search(r"  0:0[45]:\d\d gone  0:20:\d\d left$", last)
+    assert re.search(r" \| elapsed [45]:\d\d \| ETA 20:\d\d$", last)
 
 
 def test_compiling_in_the_first_steps_does_not_count_as_slowness(capsys, monkeypatch):
     report_steps(Clock(monkeypatch), steps=1000, seconds=2.0, count=20)
-    assert "2.0 s/step" in capsys.readouterr().err.splitlines()[-1]
+    assert "2.0 s/it" in capsys.readouterr().err.splitlines()[-1]
 
 
 def test_more_than_an_hour_is_reported_once_with_what_would_shorten_it(capsys, monkeypatch):
     report_steps(Clock(monkeypatch), steps=3000, seconds=12.0, count=40, advice="fewer --steps")
     told = [line for line in capsys.readouterr().err.splitlines() if "hours" in line]
-    assert told == ["this takes 10.0 more hours; fewer --steps would shorten it"]
+    assert told == ["about 10.0 hours remain; to shorten the run, use fewer --steps"]
 
 
 @pytest.mark.parametrize(
@@ -266,8 +281,8 @@ def test_a_phase_shows_its_name_progress_and_remaining_time():
     assert line.parts(line.start + 10) == {
         "what": "scoring held-out photos",
         "count": "5/20",
-        "gone": "10 s gone",
-        "left": "30 s left",
+        "elapsed": "elapsed 0:10",
+        "eta": "ETA 0:30",
     }
 
 
@@ -275,7 +290,7 @@ def test_a_phase_shows_its_name_progress_and_remaining_time():
 def test_a_phase_never_shows_0_s_left(done, total):
     line = PhaseLine(quiet=True)
     line.update("scoring held-out photos", done, total)
-    assert "left" not in line.parts(line.start + 10)
+    assert "eta" not in line.parts(line.start + 10)
 
 
 def test_the_clock_of_a_phase_begins_with_the_phase():
@@ -284,7 +299,7 @@ def test_the_clock_of_a_phase_begins_with_the_phase():
     line.update("reading photos", 0, 0)
     first = line.start
     line.update("reading photos", 0, 0)
-    assert line.start == first and line.parts(first + 3)["gone"] == "3 s gone"
+    assert line.start == first and line.parts(first + 3)["elapsed"] == "elapsed 0:03"
 
 
 def test_a_log_file_gets_a_line_for_a_phase_that_is_long_and_none_for_a_short_one(capsys, monkeypatch):
@@ -292,7 +307,7 @@ def test_a_log_file_gets_a_line_for_a_phase_that_is_long_and_none_for_a_short_on
     with PhaseLine() as line:
         line.update("scoring held-out photos", 5, 20)
         time.sleep(0.6)
-    assert capsys.readouterr().err == "scoring held-out photos  5/20  0 s gone\n"
+    assert capsys.readouterr().err == "scoring held-out photos | 5/20 | elapsed 0:00\n"
     monkeypatch.setattr(progress, "FIRST_PHASE_LOG_SECONDS", 1e9)
     with PhaseLine() as line:
         line.update("scoring held-out photos", 5, 20)

@@ -234,7 +234,7 @@ def test_phases_before_and_after_the_steps_report_their_progress(tmp_path):
         "reading held-out photos",
         "reading photos",
         "reading photos and setting up the model",
-        "measuring the light from the background",
+        "measuring the share of the background",
         "writing the model",
         "scoring held-out photos",
         "drawing curve.png",
