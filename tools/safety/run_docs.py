@@ -25,7 +25,7 @@ from pathlib import Path
 from hyrfpack.demo.scene import write_demo_scene
 
 REPOSITORY_ROOT = Path(__file__).parents[2]
-DOCUMENTED_PAGES = (REPOSITORY_ROOT / "docs" / "python-api.md", REPOSITORY_ROOT / "README.md")
+DOCUMENTED_PAGES = (REPOSITORY_ROOT / "docs" / "reference" / "python-api.md", REPOSITORY_ROOT / "README.md")
 DEFAULT_PHOTOS_FOLDER = (
     Path(os.environ.get("HYRFPACK_DATA") or REPOSITORY_ROOT.parent / "shared" / "data") / "mipnerf360_bonsai"
 )
