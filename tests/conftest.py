@@ -56,7 +56,7 @@ def pytest_collection_finish() -> None:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def no_warming() -> None:
+def skip_timing_warm_up() -> None:
     """Skip the warm-up of timings, because no test reads a clock."""
     from hyrfpack.measure import timing
 
@@ -79,7 +79,7 @@ def signals() -> Iterator[None]:
 
 
 @pytest.fixture
-def short_imports(monkeypatch: pytest.MonkeyPatch) -> None:
+def quick_distillation(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reduce the optimisation of an import of splats to the least that still makes a model."""
     from hyrfpack.distill import initialize, pack
 

@@ -53,7 +53,7 @@ def template(data, tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def world(template, tmp_path, monkeypatch) -> Path:
+def working_folder(template, tmp_path, monkeypatch) -> Path:
     """A copy of the template as the working folder."""
     folder = Path(shutil.copytree(template, tmp_path / "world"))
     monkeypatch.chdir(folder)
@@ -117,10 +117,10 @@ FOLDER_COMMANDS_WITH_FREE_NAMES = [
 ]
 
 
-@pytest.mark.usefixtures("short_imports")
+@pytest.mark.usefixtures("quick_distillation")
 @pytest.mark.parametrize(("command", "asked", "beside"), [*SINGLE_FILE_COMMANDS, *FOLDER_COMMANDS_WITH_FREE_NAMES])
 def test_a_file_that_appears_meanwhile_is_kept_and_the_result_gets_another_name(
-    command, asked, beside, world, monkeypatch
+    command, asked, beside, working_folder, monkeypatch
 ):
     create_foreign_file(asked, monkeypatch)
     result = succeeded(*command.format(asked).split())
@@ -136,9 +136,9 @@ def test_a_file_that_appears_meanwhile_is_kept_and_the_result_gets_another_name(
         assert beside in result.stdout and asked not in result.stdout
 
 
-@pytest.mark.usefixtures("short_imports")
+@pytest.mark.usefixtures("quick_distillation")
 @pytest.mark.parametrize(("command", "asked", "beside"), SINGLE_FILE_COMMANDS)
-def test_json_names_the_file_that_was_actually_written(command, asked, beside, world, monkeypatch):
+def test_json_names_the_file_that_was_actually_written(command, asked, beside, working_folder, monkeypatch):
     create_foreign_file(asked, monkeypatch)
     facts = json.loads(succeeded(*command.format(asked).split(), "--json").stdout)
 
@@ -147,9 +147,9 @@ def test_json_names_the_file_that_was_actually_written(command, asked, beside, w
         assert facts["export"]["file"] == beside
 
 
-@pytest.mark.usefixtures("short_imports")
+@pytest.mark.usefixtures("quick_distillation")
 @pytest.mark.parametrize(("command", "asked", "beside"), [*SINGLE_FILE_COMMANDS, *FOLDER_COMMANDS_WITH_FREE_NAMES])
-def test_with_overwrite_the_last_writer_wins(command, asked, beside, world, monkeypatch):
+def test_with_overwrite_the_last_writer_wins(command, asked, beside, working_folder, monkeypatch):
     create_foreign_file(asked, monkeypatch)
     result = succeeded(*command.format(asked).split(), "--overwrite")
 
@@ -157,13 +157,13 @@ def test_with_overwrite_the_last_writer_wins(command, asked, beside, world, monk
     assert "meantime" not in result.stderr
 
 
-def test_json_of_render_names_the_pictures_that_were_actually_written(world, monkeypatch):
+def test_json_of_render_names_the_pictures_that_were_actually_written(working_folder, monkeypatch):
     create_foreign_file("out/0000.png", monkeypatch)
     facts = json.loads(succeeded("render", "model.hyrf", "--orbit", 2, "-o", "out", "--json").stdout)
     assert facts["pictures"] == ["out/0000-2.png", "out/0001.png"]
 
 
-def test_bench_keeps_files_that_appear_meanwhile_and_updates_the_current_page(world, monkeypatch):
+def test_bench_keeps_files_that_appear_meanwhile_and_updates_the_current_page(working_folder, monkeypatch):
     words = import_module("hyrfpack.bench.tables")
     measure = import_module("hyrfpack.bench").benchmark_model
     Path("page.md").write_text(words.empty_page({"machine": "", "codec": ""}))
@@ -183,7 +183,7 @@ def test_bench_keeps_files_that_appear_meanwhile_and_updates_the_current_page(wo
     assert page.startswith("A new line.\n") and "| raw |" in page.replace("`", "")
 
 
-def test_a_log_that_appears_meanwhile_is_kept(world, monkeypatch):
+def test_a_log_that_appears_meanwhile_is_kept(working_folder, monkeypatch):
     run = import_module("hyrfpack.train.run")
     trainer = run.Trainer
 
@@ -198,7 +198,7 @@ def test_a_log_that_appears_meanwhile_is_kept(world, monkeypatch):
     assert json.loads(Path("log-2.jsonl").read_text().splitlines()[-1])["complete"] is True
 
 
-def test_a_checkpoint_of_another_program_is_kept_and_training_continues(world, monkeypatch):
+def test_a_checkpoint_of_another_program_is_kept_and_training_continues(working_folder, monkeypatch):
     create_foreign_file("out/checkpoint.pt", monkeypatch)
     result = succeeded("train", "data", "--steps", 3, "--max-gaussians", 40, "-o", "out")
 
@@ -219,7 +219,7 @@ FOLDER_COMMANDS_WITH_FIXED_NAMES = [
 
 
 @pytest.mark.parametrize(("command", "asked"), FOLDER_COMMANDS_WITH_FIXED_NAMES)
-def test_a_file_that_appears_in_a_folder_with_fixed_names_is_kept(command, asked, world, monkeypatch):
+def test_a_file_that_appears_in_a_folder_with_fixed_names_is_kept(command, asked, working_folder, monkeypatch):
     create_foreign_file(asked, monkeypatch)
     sentence = error_after_work(command)
 
@@ -249,9 +249,9 @@ CALLS_THAT_WRITE_A_FILE = {
 }
 
 
-@pytest.mark.usefixtures("short_imports")
+@pytest.mark.usefixtures("quick_distillation")
 @pytest.mark.parametrize("name", CALLS_THAT_WRITE_A_FILE)
-def test_a_library_call_without_overwrite_keeps_a_new_file_and_reports_its_own_path(name, world, monkeypatch):
+def test_a_library_call_without_overwrite_keeps_a_new_file_and_reports_its_own_path(name, working_folder, monkeypatch):
     ending = {"export": "ply", "compare": "html"}.get(name, "hyrf")
     create_foreign_file(f"out.{ending}", monkeypatch)
     assert CALLS_THAT_WRITE_A_FILE[name](f"out.{ending}").file == f"out-2.{ending}"
@@ -259,13 +259,13 @@ def test_a_library_call_without_overwrite_keeps_a_new_file_and_reports_its_own_p
 
 
 @pytest.mark.parametrize("name", [name for name in CALLS_THAT_WRITE_A_FILE if name != "save"])
-def test_a_library_call_without_overwrite_rejects_an_existing_file(name, world):
+def test_a_library_call_without_overwrite_rejects_an_existing_file(name, working_folder):
     ending = {"export": "ply", "compare": "html"}.get(name, "hyrf")
     Path(f"out.{ending}").write_bytes(FOREIGN_BYTES)
-    before = files_in(world)
+    before = files_in(working_folder)
     with pytest.raises(HyrfError, match="there is a file of this name"):
         CALLS_THAT_WRITE_A_FILE[name](f"out.{ending}")
-    assert files_in(world) == before
+    assert files_in(working_folder) == before
 
 
 # -- two commands in one folder ----------------------------------------------------------------------------------------
@@ -291,11 +291,11 @@ FOLDER_COMMANDS = [
 
 
 @pytest.mark.parametrize("command", FOLDER_COMMANDS)
-def test_a_command_is_rejected_in_a_locked_folder_and_changes_nothing(command, world):
+def test_a_command_is_rejected_in_a_locked_folder_and_changes_nothing(command, working_folder):
     with exclusive_folder("out"):
-        before = files_in(world)
+        before = files_in(working_folder)
         assert refused(*command.split()).startswith(f"Error: out: {BUSY_FOLDER_ERROR}")
-        after = files_in(world)
+        after = files_in(working_folder)
         new = {"new.hyrf"} if "--report" in command else set()  # the file is complete before its page is begun
         assert {name: after[name] for name in after if name not in new} == before
 
@@ -323,18 +323,18 @@ def two_ring_cameras() -> list:
 
 
 @pytest.mark.parametrize("name", CALLS_THAT_WRITE_A_FOLDER)
-def test_a_library_call_is_rejected_in_a_locked_folder_and_changes_nothing(name, world):
+def test_a_library_call_is_rejected_in_a_locked_folder_and_changes_nothing(name, working_folder):
     with exclusive_folder("out"):
-        before = files_in(world)
+        before = files_in(working_folder)
         with pytest.raises(HyrfError, match=f"out: {BUSY_FOLDER_ERROR}"):
             CALLS_THAT_WRITE_A_FOLDER[name]()
-        assert files_in(world) == before
+        assert files_in(working_folder) == before
 
 
 @pytest.mark.parametrize(
     "name", [name for name in CALLS_THAT_WRITE_A_FOLDER if name in ("export", "gallery", "render_files", "evaluate")]
 )
-def test_a_library_call_locks_its_folder_while_it_writes(name, world, monkeypatch):
+def test_a_library_call_locks_its_folder_while_it_writes(name, working_folder, monkeypatch):
     locked = record_lock_at_writes("out", monkeypatch)
     CALLS_THAT_WRITE_A_FOLDER[name]()
     assert locked and all(locked)
@@ -344,7 +344,7 @@ LOCKING_COMMANDS = [command for command in FOLDER_COMMANDS if "--resume" not in 
 
 
 @pytest.mark.parametrize("command", LOCKING_COMMANDS)
-def test_a_command_locks_its_folder_while_it_writes(command, world, monkeypatch):
+def test_a_command_locks_its_folder_while_it_writes(command, working_folder, monkeypatch):
     locked = record_lock_at_writes("out", monkeypatch)
     succeeded(*command.split())
 
@@ -352,7 +352,7 @@ def test_a_command_locks_its_folder_while_it_writes(command, world, monkeypatch)
     assert any(writes) and all(writes[1:])
 
 
-def test_a_video_is_written_before_the_folder_is_unlocked(world, monkeypatch):
+def test_a_video_is_written_before_the_folder_is_unlocked(working_folder, monkeypatch):
     from hyrfpack.render import video
 
     locked = []
@@ -369,7 +369,7 @@ def test_a_video_is_written_before_the_folder_is_unlocked(world, monkeypatch):
     assert locked == [2]
 
 
-def test_two_simultaneous_trainings_in_one_folder_give_one_result_and_one_error(world):
+def test_two_simultaneous_trainings_in_one_folder_give_one_result_and_one_error(working_folder):
     command = [sys.executable, "-m", "hyrfpack", "train", "data", *TINY_TRAINING_OPTIONS.split(), "-o", "out", "--seed"]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2]), "HYRFPACK_THREADS": "1"}
     both = [
@@ -386,7 +386,7 @@ def test_two_simultaneous_trainings_in_one_folder_give_one_result_and_one_error(
     assert BUSY_FOLDER_ERROR in sentence or "the folder holds an earlier run" in sentence
 
 
-def test_two_simultaneous_compressions_to_one_file_keep_both_results(world):
+def test_two_simultaneous_compressions_to_one_file_keep_both_results(working_folder):
     command = [sys.executable, "-m", "hyrfpack", "compress", "model.hyrf", "-o", "out.hyrf", "--profile", "paper"]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2]), "HYRFPACK_THREADS": "1"}
     both = [

@@ -211,7 +211,7 @@ ALL_CASES = _make_cases()
 # -- files that a command could lose -----------------------------------------------------------------------------------
 
 
-def make_world(folder: Path) -> Path:
+def make_input_folder(folder: Path) -> Path:
     """Create a set of photos of each layout, models, splats and foreign files, all as small as possible."""
     from explicit_balls import ball_splats
 
@@ -377,18 +377,18 @@ def _forbid_work(patch: pytest.MonkeyPatch) -> None:
             patch.setattr(module, "rasterize", draw)
 
 
-class Worlds:
+class FolderCopies:
     """Copies of a folder: a new one for each case that changes it, and one for all cases that do not."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder, self.template = folder, make_world(folder / "template")
+        self.folder, self.template = folder, make_input_folder(folder / "template")
         self.files = describe_files(self.template)
         self._copies = 0
         self._kept: Path | None = None
 
     def new(self) -> Path:
         self._copies += 1
-        return copy_world(self.template, self.folder / str(self._copies))
+        return copy_with_hard_links(self.template, self.folder / str(self._copies))
 
     @contextmanager
     def kept(self) -> Iterator[Path]:
@@ -399,11 +399,11 @@ class Worlds:
 
 
 @pytest.fixture(scope="module")
-def worlds(tmp_path_factory: pytest.TempPathFactory) -> Worlds:
-    return Worlds(tmp_path_factory.mktemp("worlds"))
+def folder_copies(tmp_path_factory: pytest.TempPathFactory) -> FolderCopies:
+    return FolderCopies(tmp_path_factory.mktemp("worlds"))
 
 
-def copy_world(template: Path, folder: Path) -> Path:
+def copy_with_hard_links(template: Path, folder: Path) -> Path:
     """Copy a folder with its hard links."""
     shutil.copytree(template, folder, symlinks=True)
     for link, name in (("hard.hyrf", "packed.hyrf"), ("hard-ball.hyrf", "ball.hyrf.ply")):
@@ -412,18 +412,18 @@ def copy_world(template: Path, folder: Path) -> Path:
     return folder
 
 
-@pytest.mark.usefixtures("short_imports")
+@pytest.mark.usefixtures("quick_distillation")
 @pytest.mark.parametrize("overwrite", [False, True], ids=["plain", "overwrite"])
 @pytest.mark.parametrize("case", ALL_CASES, ids=str)
-def test_no_command_loses_a_users_files(case, overwrite, worlds, monkeypatch):
+def test_no_command_loses_a_users_files(case, overwrite, folder_copies, monkeypatch):
     expected = case.overwriting if overwrite else case.plain
     _replace_work(monkeypatch)
     if expected == OUTCOME_REFUSED:
         _forbid_work(monkeypatch)
 
-    with worlds.kept() if expected == OUTCOME_REFUSED else nullcontext(worlds.new()) as world:
+    with folder_copies.kept() if expected == OUTCOME_REFUSED else nullcontext(folder_copies.new()) as world:
         monkeypatch.chdir(world)
-        outcome, result = run_case(case, world, worlds.files, overwrite)
+        outcome, result = run_case(case, world, folder_copies.files, overwrite)
         assert outcome == expected, result.output
 
 
@@ -434,10 +434,10 @@ def test_the_cases_cover_every_command_that_writes():
     assert {case.command.split()[0] for case in ALL_CASES} == writes
 
 
-@pytest.mark.usefixtures("short_imports")
-def test_commands_accept_the_inputs_of_the_cases(worlds, monkeypatch):
+@pytest.mark.usefixtures("quick_distillation")
+def test_commands_accept_the_inputs_of_the_cases(folder_copies, monkeypatch):
     """Otherwise commands would fail for another reason."""
-    monkeypatch.chdir(worlds.new())
+    monkeypatch.chdir(folder_copies.new())
     for name in READ_PATHS_BY_SET:
         _run_checked("evaluate", "model.hyrf", "--data", name, "--pictures", f"pictures-{name}")
     for source in ("ball.ply", "loose"):
@@ -454,14 +454,14 @@ def markdown_table() -> str:
 
     lines = ["| command | input as output | without --overwrite | with --overwrite |", "|---|---|---|---|"]
     with TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
-        worlds = Worlds(Path(folder))
+        folder_copies = FolderCopies(Path(folder))
         _replace_work(patch)
         for case in ALL_CASES:
             cells = []
             for overwrite, expected in ((False, case.plain), (True, case.overwriting)):
-                world = worlds.new()
+                world = folder_copies.new()
                 patch.chdir(world)
-                outcome, _ = run_case(case, world, worlds.files, overwrite)
+                outcome, _ = run_case(case, world, folder_copies.files, overwrite)
                 cells.append(outcome if outcome == expected else outcome.upper())
                 patch.chdir(folder)
                 shutil.rmtree(world)

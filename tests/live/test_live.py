@@ -164,31 +164,31 @@ def test_the_page_and_its_files_are_served_while_the_block_runs_and_not_after():
 
 
 @pytest.fixture
-def observed(monkeypatch) -> list[int]:
+def observed_steps(monkeypatch) -> list[int]:
     """The steps after which a live view was updated."""
     steps: list[int] = []
     monkeypatch.setattr(LiveView, "observe", lambda self, trainer: steps.append(trainer.step))
     return steps
 
 
-def test_train_updates_the_live_view_with_the_option(data, observed, tmp_path):
+def test_train_updates_the_live_view_with_the_option(data, observed_steps, tmp_path):
     command = ("train", data, "-o", tmp_path / "run", "--steps", 3, "--max-gaussians", 100)
     result = succeeded(*command, "--view")
-    assert observed == [1, 2, 3]
+    assert observed_steps == [1, 2, 3]
     assert "the training can be seen at http://127.0.0.1:" in result.stderr and "http" not in result.stdout
     assert f"'hyrfpack view {tmp_path / 'run' / 'model.hyrf'}'" in result.stderr
-    observed.clear()
+    observed_steps.clear()
     result = succeeded(*command, "--overwrite")
-    assert observed == [] and "http" not in result.stderr
+    assert observed_steps == [] and "http" not in result.stderr
 
 
-def test_make_updates_the_live_view_with_the_option(data, observed, monkeypatch, tmp_path):
+def test_make_updates_the_live_view_with_the_option(data, observed_steps, monkeypatch, tmp_path):
     from hyrfpack.make import plan
 
     quality = dataclasses.replace(plan.QUALITIES["draft"], steps=3, finetune_steps=0)
     monkeypatch.setitem(plan.QUALITIES, "draft", quality)
     result = succeeded("make", data, "-o", tmp_path / "scene.hyrf", "--quality", "draft", "--view")
-    assert observed == [1, 2, 3] and "the training can be seen at http://127.0.0.1:" in result.stderr
+    assert observed_steps == [1, 2, 3] and "the training can be seen at http://127.0.0.1:" in result.stderr
 
 
 def test_a_port_that_is_taken_is_a_clear_error_before_any_work(data, tmp_path):

@@ -118,7 +118,7 @@ def test_poses_of_a_video_are_estimated(poses, tmp_path):
     assert poses == [tmp_path / "clip.MP4"]
 
 
-@pytest.mark.usefixtures("short_imports")
+@pytest.mark.usefixtures("quick_distillation")
 def test_splats_of_other_programs_are_imported(tmp_path):
     (tmp_path / "ball.ply").write_bytes(ply.encode(ball_splats(40)))
     result = make_scene(tmp_path / "ball.ply", tmp_path / "scene.html", quality="draft")

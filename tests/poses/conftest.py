@@ -12,7 +12,7 @@ import hyrfpack
 
 
 @pytest.fixture(scope="session")
-def taken(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, np.ndarray]]:
+def photos_and_poses(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, np.ndarray]]:
     """A folder of photos and their poses by name. Tests must not change it.
 
     The names have spaces, letters of any alphabet and the longest length that files may have.
@@ -27,10 +27,14 @@ def taken(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, np.
 
 
 @pytest.fixture(scope="session")
-def posed(taken, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, hyrfpack.PosesReport, list, list]:
+def estimated_scene(
+    photos_and_poses, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, hyrfpack.PosesReport, list, list]:
     """The estimated scene, its report, the progress that was reported and the messages. Tests must not change it."""
     progress: list[tuple[str, float]] = []
     messages: list[str] = []
     out = tmp_path_factory.mktemp("posed") / "a scene"
-    report = hyrfpack.estimate_poses(taken[0], out, report=lambda *now: progress.append(now), say=messages.append)
+    report = hyrfpack.estimate_poses(
+        photos_and_poses[0], out, report=lambda *now: progress.append(now), say=messages.append
+    )
     return out, report, progress, messages

@@ -98,17 +98,17 @@ def test_photos_from_one_place_are_a_clear_error(tmp_path):
     assert "all photos were taken from one place" in sentence and "a step to the side" in sentence
 
 
-def test_masks_without_matching_photos_are_a_clear_error(taken, tmp_path):
+def test_masks_without_matching_photos_are_a_clear_error(photos_and_poses, tmp_path):
     (tmp_path / "masks").mkdir()
     for name in ("one", "two"):
         Image.new("L", PHOTO_SIZE, 255).save(tmp_path / "masks" / f"{name}.png")
     with pytest.raises(hyrfpack.HyrfDataError, match="no mask has the name of a photo"):
-        hyrfpack.estimate_poses(taken[0], tmp_path / "scene", masks=tmp_path / "masks")
+        hyrfpack.estimate_poses(photos_and_poses[0], tmp_path / "scene", masks=tmp_path / "masks")
 
 
-def test_a_scene_folder_that_cannot_be_created_is_a_clear_error(taken, tmp_path):
+def test_a_scene_folder_that_cannot_be_created_is_a_clear_error(photos_and_poses, tmp_path):
     (tmp_path / "file").touch()
-    assert "this is a file" in refused("poses", taken[0], "-o", tmp_path / "file")
-    shutil.copytree(taken[0], tmp_path / "scene" / "images")
+    assert "this is a file" in refused("poses", photos_and_poses[0], "-o", tmp_path / "file")
+    shutil.copytree(photos_and_poses[0], tmp_path / "scene" / "images")
     (tmp_path / "scene" / "images" / "other.png").touch()
-    assert "do not belong to these photos" in refused("poses", taken[0], "-o", tmp_path / "scene")
+    assert "do not belong to these photos" in refused("poses", photos_and_poses[0], "-o", tmp_path / "scene")

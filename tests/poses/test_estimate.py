@@ -19,9 +19,9 @@ def poses_of(scene: hyrfpack.Scene) -> dict[str, np.ndarray]:
     return {view.name: view.camera.camera_from_world[:3] for view in scene.views}
 
 
-def test_estimated_poses_match_the_true_ones_for_photos_of_any_name(taken, posed):
-    folder, known = taken
-    out, report, _, _ = posed
+def test_estimated_poses_match_the_true_ones_for_photos_of_any_name(photos_and_poses, estimated_scene):
+    folder, known = photos_and_poses
+    out, report, _, _ = estimated_scene
     scene = hyrfpack.load_scene(out)
     assert align_poses(poses_of(scene), known).agreeing == set(known)
     assert (report.photos, report.registered, report.left_out) == (len(known), len(known), {})
@@ -29,9 +29,9 @@ def test_estimated_poses_match_the_true_ones_for_photos_of_any_name(taken, posed
     assert report.mapper in ("incremental", "global") and report.why.startswith(f"the {report.mapper} mapper was taken")
 
 
-def test_points_lie_on_the_walls_and_have_the_photos_colours(taken, posed):
-    scene = hyrfpack.load_scene(posed[0])
-    found = align_poses(poses_of(scene), taken[1])
+def test_points_lie_on_the_walls_and_have_the_photos_colours(photos_and_poses, estimated_scene):
+    scene = hyrfpack.load_scene(estimated_scene[0])
+    found = align_poses(poses_of(scene), photos_and_poses[1])
     points = found.scale * scene.points @ found.rotation.T + found.shift
     off = np.abs(points).min(axis=1)  # the walls are x = 0, y = 0 and z = 0
     assert np.median(off) < 0.02
@@ -39,36 +39,36 @@ def test_points_lie_on_the_walls_and_have_the_photos_colours(taken, posed):
     assert scene.point_colors.std() > 0.1
 
 
-def test_photos_are_copied_and_intermediate_files_are_removed(taken, posed):
-    folder, known = taken
-    out = posed[0]
+def test_photos_are_copied_and_intermediate_files_are_removed(photos_and_poses, estimated_scene):
+    folder, known = photos_and_poses
+    out = estimated_scene[0]
     assert sorted(os.listdir(out)) == ["images", "poses.json", "sparse"]
     for name in known:
         assert (folder / name).read_bytes() == (out / "images" / name).read_bytes()
         assert not os.path.samefile(folder / name, out / "images" / name)
-    assert any("edits there do not change yours" in note for note in posed[1].notes)
+    assert any("edits there do not change yours" in note for note in estimated_scene[1].notes)
     written = json.loads((out / "poses.json").read_text())
-    assert written["registered"] == len(known) and written["why"] == posed[1].why
+    assert written["registered"] == len(known) and written["why"] == estimated_scene[1].why
 
 
-def test_progress_runs_from_0_to_1(posed):
-    shares = [share for _, share in posed[2]]
+def test_progress_runs_from_0_to_1(estimated_scene):
+    shares = [share for _, share in estimated_scene[2]]
     assert shares[0] == 0 and shares == sorted(shares) and 0.9 < shares[-1] <= 1
-    assert any("matching pair" in doing for doing, _ in posed[2])
+    assert any("matching pair" in doing for doing, _ in estimated_scene[2])
 
 
-def test_existing_poses_are_replaced_only_with_overwrite(taken, posed, tmp_path):
+def test_existing_poses_are_replaced_only_with_overwrite(photos_and_poses, estimated_scene, tmp_path):
     out = tmp_path / "scene"
-    shutil.copytree(posed[0], out)
+    shutil.copytree(estimated_scene[0], out)
     before = (out / "sparse" / "0" / "images.bin").read_bytes()
-    assert "--overwrite" in refused("poses", taken[0], "-o", out)
+    assert "--overwrite" in refused("poses", photos_and_poses[0], "-o", out)
     (out / "poses.json").unlink()
-    assert "poses of another program" in refused("poses", taken[0], "-o", out, "--overwrite")
+    assert "poses of another program" in refused("poses", photos_and_poses[0], "-o", out, "--overwrite")
     assert (out / "sparse" / "0" / "images.bin").read_bytes() == before
 
 
-def test_the_command_prints_its_result_and_the_next_command(posed, monkeypatch, tmp_path):
-    out, report, *_ = posed
+def test_the_command_prints_its_result_and_the_next_command(estimated_scene, monkeypatch, tmp_path):
+    out, report, *_ = estimated_scene
     partly = {"a.jpg": "blurred", "b.jpg": "blurred"}
     made = type(report)(**{**vars(report), "left_out": partly, "scene": Path("scenes/garden")})
     monkeypatch.setattr("hyrfpack.poses.estimate_poses", lambda *args, **settings: made)
@@ -79,7 +79,7 @@ def test_the_command_prints_its_result_and_the_next_command(posed, monkeypatch, 
 
 
 @pytest.mark.parametrize("wrong", [{"matching": "guess"}, {"seed": -1}])
-def test_a_wrong_setting_is_rejected_at_once(wrong, taken, tmp_path):
+def test_a_wrong_setting_is_rejected_at_once(wrong, photos_and_poses, tmp_path):
     with pytest.raises(ValueError, match="matching is 'guess'|seed is -1"):
-        hyrfpack.estimate_poses(taken[0], tmp_path / "scene", **wrong)
+        hyrfpack.estimate_poses(photos_and_poses[0], tmp_path / "scene", **wrong)
     assert not (tmp_path / "scene").exists()

@@ -55,28 +55,28 @@ def stop_at(moment: str) -> Callable[[str, float], None]:
 
 
 @pytest.fixture(scope="module")
-def stopped_after_matching(taken, tmp_path_factory) -> Path:
+def stopped_after_matching(photos_and_poses, tmp_path_factory) -> Path:
     """A scene whose estimation was stopped after matching. Tests must not change it."""
     out = tmp_path_factory.mktemp("stopped") / "scene"
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
         workers = record_processes(patch)
-        hyrfpack.estimate_poses(taken[0], out, report=stop_at("at once"))
+        hyrfpack.estimate_poses(photos_and_poses[0], out, report=stop_at("at once"))
     assert len(workers) == 3 and all(worker.poll() is not None for worker in workers)
     return out
 
 
-def test_a_stopped_estimation_resumes_after_its_last_finished_stage(taken, stopped_after_matching, tmp_path):
+def test_a_stopped_estimation_resumes_after_its_last_finished_stage(photos_and_poses, stopped_after_matching, tmp_path):
     out, kept = tmp_path / "scene", (stopped_after_matching / ".poses" / "matches.json").stat().st_mtime_ns
     shutil.copytree(stopped_after_matching, out)
     assert os.listdir(out) == [".poses"]
     with pytest.raises(KeyboardInterrupt):
-        hyrfpack.estimate_poses(taken[0], out, report=stop_at("incremental"))
+        hyrfpack.estimate_poses(photos_and_poses[0], out, report=stop_at("incremental"))
     assert (out / ".poses" / "matches.json").stat().st_mtime_ns == kept
     assert (out / ".poses" / "global-0").is_dir()
 
 
-def test_poses_in_place_are_completed_after_the_worker_was_killed(taken, tmp_path, stage_processes):
-    shutil.copytree(taken[0], tmp_path / "images")
+def test_poses_in_place_are_completed_after_the_worker_was_killed(photos_and_poses, tmp_path, stage_processes):
+    shutil.copytree(photos_and_poses[0], tmp_path / "images")
     before = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "images").iterdir()}
     (tmp_path / "poses.json").write_text("{}")  # as left by poses that were removed
 
@@ -93,29 +93,29 @@ def test_poses_in_place_are_completed_after_the_worker_was_killed(taken, tmp_pat
     assert sorted(os.listdir(tmp_path)) == ["images", "poses.json", "sparse"]
 
 
-def test_a_crash_of_the_library_is_a_clear_error(taken, tmp_path, monkeypatch):
+def test_a_crash_of_the_library_is_a_clear_error(photos_and_poses, tmp_path, monkeypatch):
     (tmp_path / "sitecustomize.py").write_text(CRASH_AT_STAGE_CODE.format(stage="matches"))
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     with pytest.raises(hyrfpack.HyrfError, match="matching photos ended by signal SIGABRT.*run the same command again"):
-        hyrfpack.estimate_poses(taken[0], tmp_path / "scene")
+        hyrfpack.estimate_poses(photos_and_poses[0], tmp_path / "scene")
 
 
 def test_when_one_mapper_crashes_the_result_of_the_other_is_used_and_noted(
-    taken, stopped_after_matching, tmp_path, monkeypatch
+    photos_and_poses, stopped_after_matching, tmp_path, monkeypatch
 ):
     shutil.copytree(stopped_after_matching, tmp_path / "scene")
     (tmp_path / "sitecustomize.py").write_text(CRASH_AT_STAGE_CODE.format(stage="global"))
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    report = hyrfpack.estimate_poses(taken[0], tmp_path / "scene")
-    assert (report.mapper, report.registered, report.sure) == ("incremental", len(taken[1]), 0)
+    report = hyrfpack.estimate_poses(photos_and_poses[0], tmp_path / "scene")
+    assert (report.mapper, report.registered, report.sure) == ("incremental", len(photos_and_poses[1]), 0)
     assert any("the global mapper failed" in note for note in report.notes)
     assert any("nothing confirms" in note for note in report.notes)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
 @pytest.mark.parametrize("number, code", [(signal.SIGINT, 1), (signal.SIGKILL, -signal.SIGKILL)])
-def test_a_signal_to_the_command_ends_its_worker(number, code, taken, tmp_path, signals):
-    command = [sys.executable, "-m", "hyrfpack", "poses", str(taken[0]), "-o", str(tmp_path / "scene")]
+def test_a_signal_to_the_command_ends_its_worker(number, code, photos_and_poses, tmp_path, signals):
+    command = [sys.executable, "-m", "hyrfpack", "poses", str(photos_and_poses[0]), "-o", str(tmp_path / "scene")]
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY_ROOT)}
     parent = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True, cwd=tmp_path)
     worker = None

@@ -118,8 +118,8 @@ def test_progress_of_a_silent_stage_is_repeated(tmp_path, monkeypatch):
     assert told[0] == ("starting", 0.0) and told.count(("solving", 0.5)) >= 3
 
 
-def test_every_stage_reports_progress_in_its_own_units(posed):
-    doings = [doing for doing, _ in posed[2]]
+def test_every_stage_reports_progress_in_its_own_units(estimated_scene):
+    doings = [doing for doing, _ in estimated_scene[2]]
     for words in (
         "reading the headers of photos 8/8",
         "copying photos 8/8",

@@ -21,7 +21,7 @@ TINY_TRAIN_CONFIG = TrainConfig(steps=2, max_gaussians=60)
 
 
 @pytest.fixture
-def no_step(monkeypatch):
+def fail_at_first_step(monkeypatch):
     """Training fails at its first step, so that an error has to come before it."""
 
     def step(self, view, picture):
@@ -47,17 +47,17 @@ def make_split_scene(train=lambda view: view, test=lambda view: view) -> Scene:
     return dataclasses.replace(scene, train=[*map(train, scene.train[2:])], test=[*map(test, scene.train[:2])])
 
 
-def test_black_masks_of_all_photos_are_rejected_before_the_first_step(no_step, tmp_path):
+def test_black_masks_of_all_photos_are_rejected_before_the_first_step(fail_at_first_step, tmp_path):
     with pytest.raises(HyrfTrainingError, match=r"all 4 photos to train on leave no pixel, 002\.png for one"):
         train_model(make_split_scene(train=mask_all_pixels), tmp_path, TINY_TRAIN_CONFIG, quiet=True)
 
 
-def test_black_masks_of_all_held_out_photos_are_rejected_before_the_first_step(no_step, tmp_path):
+def test_black_masks_of_all_held_out_photos_are_rejected_before_the_first_step(fail_at_first_step, tmp_path):
     with pytest.raises(HyrfTrainingError, match=r"all 2 photos to score leave no pixel, 000\.png for one"):
         train_model(make_split_scene(test=mask_all_pixels), tmp_path, TINY_TRAIN_CONFIG, quiet=True)
 
 
-def test_a_black_mask_file_for_every_photo_is_rejected_by_the_command(no_step, photos, tmp_path):
+def test_a_black_mask_file_for_every_photo_is_rejected_by_the_command(fail_at_first_step, photos, tmp_path):
     (photos / "masks").mkdir()
     for number in range(10):
         Image.new("L", (48, 48)).save(photos / "masks" / f"{number:04d}.png")
@@ -77,7 +77,7 @@ def test_one_photo_with_a_pixel_to_train_on_and_one_to_score_are_enough(tmp_path
     assert result.metrics["evaluation"]["skipped"] == ["000.png"]
 
 
-def test_a_truncated_held_out_photo_is_rejected_before_the_first_step_and_named(no_step, photos, tmp_path):
+def test_a_truncated_held_out_photo_is_rejected_before_the_first_step_and_named(fail_at_first_step, photos, tmp_path):
     whole = (photos / "images" / "0008.png").read_bytes()
     (photos / "images" / "0008.png").write_bytes(whole[: len(whole) // 2])
 

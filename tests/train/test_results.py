@@ -57,7 +57,7 @@ def full_disk_suffixes(monkeypatch) -> set[str]:
 
 
 @pytest.fixture
-def no_training(monkeypatch):
+def fail_if_trained(monkeypatch):
     """A function after whose call any training fails the test."""
     return lambda: monkeypatch.setattr(Trainer, "run", lambda *_, **__: pytest.fail("it was trained again"))
 
@@ -71,7 +71,7 @@ def uninterrupted_run(tmp_path_factory) -> Path:
 
 @pytest.mark.parametrize("resume", [False, True])
 def test_metrics_missing_after_a_full_disk_are_completed_without_training(
-    full_disk_suffixes, no_training, uninterrupted_run, tmp_path, resume
+    full_disk_suffixes, fail_if_trained, uninterrupted_run, tmp_path, resume
 ):
     full_disk_suffixes.add("metrics.json")
     result = train_model(make_scene(), tmp_path, SHORT_CONFIG, quiet=True)
@@ -81,7 +81,7 @@ def test_metrics_missing_after_a_full_disk_are_completed_without_training(
     times = {name: result.metrics[name] for name in TIMING_KEYS}
 
     full_disk_suffixes.clear()
-    no_training()
+    fail_if_trained()
     completed = train_model(make_scene(), tmp_path, SHORT_CONFIG, resume=resume, quiet=True)
 
     assert completed.complete and completed.step == 20 and completed.missing == ""
@@ -99,7 +99,7 @@ def test_metrics_missing_after_a_full_disk_are_completed_without_training(
 
 @pytest.mark.parametrize(("ending", "missing"), [("curve.png", "curve.png"), (".png", "views and curve.png")])
 def test_pictures_that_do_not_fit_do_not_fail_the_run(
-    full_disk_suffixes, no_training, tmp_path, capsys, ending, missing
+    full_disk_suffixes, fail_if_trained, tmp_path, capsys, ending, missing
 ):
     full_disk_suffixes.add(ending)
     result = train_model(make_scene(), tmp_path, SHORT_CONFIG)
@@ -109,12 +109,12 @@ def test_pictures_that_do_not_fit_do_not_fail_the_run(
     assert f"the model is finished, but {missing} {verb} missing" in told
 
     full_disk_suffixes.clear()
-    no_training()
+    fail_if_trained()
     train_model(make_scene(), tmp_path, SHORT_CONFIG, quiet=True)
     assert file_names(tmp_path) == COMPLETE_RUN_FILES and len(list((tmp_path / "views").iterdir())) == 2
 
 
-def test_a_held_out_photo_that_is_gone_after_the_last_step_does_not_fail_the_run(no_training, tmp_path):
+def test_a_held_out_photo_that_is_gone_after_the_last_step_does_not_fail_the_run(fail_if_trained, tmp_path):
     scene, reads = make_scene(), [0]
 
     def vanishing():
@@ -128,12 +128,12 @@ def test_a_held_out_photo_that_is_gone_after_the_last_step_does_not_fail_the_run
     assert result.complete and "photos/0000.png: the file is gone" in result.missing
     assert not (tmp_path / "metrics.json").exists()
 
-    no_training()
+    fail_if_trained()
     train_model(make_scene(), tmp_path, SHORT_CONFIG, quiet=True)
     assert file_names(tmp_path) == COMPLETE_RUN_FILES
 
 
-def test_an_interruption_while_scoring_is_completed_without_training(no_training, monkeypatch, tmp_path):
+def test_an_interruption_while_scoring_is_completed_without_training(fail_if_trained, monkeypatch, tmp_path):
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
@@ -142,7 +142,7 @@ def test_an_interruption_while_scoring_is_completed_without_training(no_training
         train_model(make_scene(), tmp_path, SHORT_CONFIG, quiet=True)
     assert file_names(tmp_path) == {"model.hyrf", "training.json"} and runs.is_begun(tmp_path)
 
-    no_training()
+    fail_if_trained()
     train_model(make_scene(), tmp_path, SHORT_CONFIG, quiet=True)
     assert file_names(tmp_path) == COMPLETE_RUN_FILES and not runs.is_begun(tmp_path)
 
