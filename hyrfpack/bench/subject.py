@@ -89,7 +89,7 @@ class Subject:
         against = (
             f"quality against {len(self.photos)} held-out photos"
             if self.photos
-            else f"quality against the model's own pictures from {len(self.cameras)} viewpoints around the scene"
+            else f"quality against exact renders of the model from {len(self.cameras)} viewpoints around the scene"
         )
         return (
             f"{self.name}: {len(self.model):,} Gaussians, {'a' if self.model.config.background else 'no'} background "
@@ -132,7 +132,7 @@ def built_in_subject(say: Callable[[str], None]) -> Subject:
     Args:
         say: called with a sentence before training starts.
     """
-    say(f"training the built-in model: {BUILT_IN_STEPS:,} steps on a made-up scene, about a minute on two cores")
+    say(f"training the built-in model: {BUILT_IN_STEPS:,} steps on a synthetic scene, about a minute on two cores")
     with tempfile.TemporaryDirectory(prefix="hyrfpack-bench-") as folder:
         scene = load_scene(
             write_demo_scene(Path(folder) / "scene", views=BUILT_IN_PHOTOS, size=BUILT_IN_PHOTO_SIDE_PIXELS)

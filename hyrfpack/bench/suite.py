@@ -103,5 +103,5 @@ def benchmark_model(
             say(f"measuring {name}")
             rows += GROUPS[name](subject, repeats, notes.append)
     if any(row.time.repeats < repeats for row in rows):
-        notes.append(f"a contender that has been measured for {MAX_SECONDS_PER_TASK:g} s gets no further turn")
+        notes.append(f"a variant that has been measured for {MAX_SECONDS_PER_TASK:g} s is not measured again")
     return BenchReport(describe_machine(), subject.describe(), notes, rows)

@@ -87,7 +87,7 @@ def _note_uncached_kernels() -> None:
     kernels = sys.modules.get("hyrfpack.parallel.compiled")
     if kernels is not None and not kernels.can_cache_kernels():
         note(
-            "compiled kernels cannot be kept, so that each run compiles them anew; name a folder for them in "
+            "compiled kernels cannot be cached, so each run compiles them again; set a folder for them in "
             "NUMBA_CACHE_DIR, and one for matplotlib's fonts in MPLCONFIGDIR"
         )
 

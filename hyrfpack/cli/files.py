@@ -364,10 +364,10 @@ def _load_training_photos(model: Path) -> Scene | None:
     try:
         scene = load_training_scene(model)
     except HyrfDataError as error:
-        note(f"{error}; going on without the photos that it was trained on")
+        note(f"{error}; continuing without the photos that the model was trained on")
         return None
     if scene is not None:
-        note(f"with the photos that it was trained on, {scene.path} (--no-data goes without)")
+        note(f"using the photos that the model was trained on, {scene.path} (turn off with --no-data)")
     return scene
 
 
@@ -390,7 +390,7 @@ def _print_report(report: CompressionReport, scores: dict[str, float], as_json: 
     sections = [asdict(part) for part in report.sections]
     click.echo(_section_table(sections, report.bytes_after, report.gaussians, report.shares))
     ratio = report.bytes_before / report.bytes_after
-    outcome = "every number as float32" if report.profile == "raw" else f"{ratio:.2f} times smaller than as float32"
+    outcome = "all numbers as float32" if report.profile == "raw" else f"{ratio:.2f} times smaller than float32"
     click.echo(f"{report.file}: {report.bytes_after:,} bytes, {report.gaussians:,} Gaussians, {outcome}")
     if report.found:
         click.echo(report.found)

@@ -135,7 +135,7 @@ def _find_training_cameras(source: Path) -> Path | None:
     folders = source.absolute().parents[2:3]
     if source.name != "point_cloud.ply" or not folders or not (folders[0] / "cameras.json").is_file():
         return None
-    note(f"taking the cameras of the training: {folders[0] / 'cameras.json'}")
+    note(f"using the cameras of the training: {folders[0] / 'cameras.json'}")
     return folders[0] / "cameras.json"
 
 

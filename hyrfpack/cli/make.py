@@ -173,7 +173,7 @@ def _print_result(result: MakeResult) -> None:
     """
     poses = result.poses
     if poses:
-        sure = f", {poses['sure']} of them sure" if poses["sure"] < poses["registered"] else ""
+        sure = f", {poses['sure']} confirmed by both mappers" if poses["sure"] < poses["registered"] else ""
         click.echo(f"poses: {poses['registered']} of {poses['photos']} photos{sure}")
         for name, reason in list(poses["left_out"].items())[:MAX_LISTED_PHOTOS]:
             click.echo(f"  left out: {name}, {reason}")
@@ -181,13 +181,13 @@ def _print_result(result: MakeResult) -> None:
             click.echo(f"  left out: {more} more, see {result.work / 'scene' / 'poses.json'}")
     times = ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in result.seconds.items())
     total = f"{result.total_seconds:.0f} s in all"
-    click.echo(f"times: {times}, {total}; {result.work} keeps what each stage made, and may be deleted")
+    click.echo(f"times: {times}, {total}; intermediate results are in {result.work}, which you may delete")
     if result.psnr is not None:
         photos = f"{result.views} photo{'s' if result.views > 1 else ''}"
         consistent = format_consistent_psnr(result.psnr_consistent)
         click.echo(f"{photos} held out: PSNR {result.psnr:.2f} dB{consistent}, SSIM {result.ssim:.4f}")
     elif result.training:
-        click.echo("no photo is held out, so that nothing is scored")
+        click.echo("no photo is held out, so the scene is not scored")
     if result.note:
         click.echo(result.note)
     click.echo(f"{result.output}: {result.bytes:,} bytes, {result.gaussians:,} Gaussians; {_viewing_hint(result)}")

@@ -79,8 +79,8 @@ def poses(
 def _print_result(result: PosesReport) -> None:
     """Print how many photos have a pose, which were left out and why, and the next command."""
     click.echo(
-        f"{result.scene}: {result.registered} of {result.photos} photos have a pose, {result.sure} of them for sure; "
-        f"{result.why}"
+        f"{result.scene}: {result.registered} of {result.photos} photos have a pose, "
+        f"{result.sure} confirmed by both mappers; {result.why}"
     )
     for reason, count in Counter(result.left_out.values()).most_common():
         names = [name for name, why in result.left_out.items() if why == reason]

@@ -32,13 +32,13 @@ def print_survey(survey: PhotoSurvey) -> None:
     else:
         count = len(survey.blurred)
         rows.append(("sharpness", f"{survey.sharpness:.2f} ({count} of {survey.decoded} blurred)"))
-        rows.append(("light", f"{survey.luminance:.2f} of white in the mean, even within {survey.stops:.1f} stops"))
+        rows.append(("light", f"{survey.luminance:.2f} of white on average, spread {survey.stops:.1f} stops"))
     for name, text in rows:
         if text:
             _print_line(f"  {name:<10} {text}")
     for note in survey.notes:
         _print_line(f"  {use_option_names(note)}")
-    click.echo("\nwhat to do" if survey.problems else "\nnothing is wrong with it")
+    click.echo("\nwhat to do" if survey.problems else "\nno problems found")
     for problem in survey.problems:
         _print_line(f"  - {use_option_names(problem)}")
 

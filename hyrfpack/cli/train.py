@@ -184,13 +184,13 @@ def train(
         "seconds: " + ", ".join(f"{part} {t:.1f}" for part, t in result.metrics.get("stage_seconds", {}).items())
     )
     if not result.complete and result.step == 0:
-        note("stopped before the first step; the same command begins anew")
+        note("stopped before the first step; run the same command to start again")
     elif not result.complete:
         note(f"stopped after step {result.step:,}; {resuming(overwrite)} continues from there")
     if result.model is not None:
         note_rename(out / MODEL_FILE, result.model)
     if result.missing:
-        note(f"{resuming(overwrite)} writes what is missing")
+        note(f"{resuming(overwrite)} writes the missing files")
     if as_json:
         print_json({"complete": result.complete, "step": result.step, **result.metrics})
     elif result.complete and ranks.is_main:
@@ -203,7 +203,7 @@ def train(
             consistent = format_consistent_psnr(scores.get("psnr_consistent"))
             click.echo(f"held-out views: {scores['psnr']:.2f} dB{consistent}, SSIM {scores['ssim']:.4f}")
         if view:
-            note(f"'hyrfpack view {result.model}' shows the model again")
+            note(f"to see the model again, run 'hyrfpack view {result.model}'")
     if not result.complete:
         click.get_current_context().exit(1)
 

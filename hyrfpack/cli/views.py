@@ -157,7 +157,7 @@ def render(
     for name, path in zip(render_file_names([name for name, _ in named]), written, strict=True):
         note_rename(output / name, path)
     if video and not video_path:
-        note("there is no ffmpeg program, so no video was made; the pictures are in place")
+        note("ffmpeg was not found, so no video was written; the pictures are complete")
     if as_json:
         print_json({"pictures": [str(path) for path in written], "video": str(video_path) if video_path else None})
     else:

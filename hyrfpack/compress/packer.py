@@ -179,7 +179,7 @@ def compress_model(
             fix="use profile 'paper'",
         )
     cameras = Capture(describe_file(source), data).cameras
-    say(f"measuring what each number does to pictures, at {len(cameras)} cameras and between them")
+    say(f"measuring how each stored number affects renders, at {len(cameras)} cameras and between them")
     start = distortion or default_distortion(provenance, finetune_steps)
     encoding_start = (
         SEARCH_ENCODING_START_SHARE
@@ -294,7 +294,8 @@ class Packer:
                     break
                 distortion *= max(target_drop / psnr_drop, 1 / MAX_REFINING_RATIO)
                 self.say(
-                    f"training photos lose {psnr_drop:.2f} instead of {target_drop:g} dB: finer, for {distortion:.2g}"
+                    f"training photos lose {psnr_drop:.2f} dB, limit {target_drop:g} dB; encoding again at "
+                    f"distortion {distortion:.2g}"
                 )
                 candidate = self.encode(distortion)
                 candidate = dataclasses.replace(
@@ -326,7 +327,10 @@ class Packer:
                 break
             distortion /= min(max(error_ratio, 1 / MAX_COARSENING_RATIO), MAX_REFINING_RATIO)
             kind = "finer" if error_ratio > 1 else "coarser"
-            self.say(f"pictures are off by {error:.2g} instead of {target:.2g}: {kind}, for {distortion:.2g}")
+            self.say(
+                f"renders have a mean squared error of {error:.2g}, target {target:.2g}; encoding again at "
+                f"distortion {distortion:.2g} ({kind})"
+            )
             other = attempt(distortion, number + 1)
             if error_ratio > 1:
                 candidate = other

@@ -131,7 +131,7 @@ def _open_folder(given: Path, notes: list[str]) -> Path:
         raise HyrfDataError(f"{given}: no such folder", fix="check the path")
     if is_archive(given):
         folder = unpack(given)
-        notes.append(f"{given.name} was unpacked into {folder}, where it is found again")
+        notes.append(f"{given.name} was unpacked into {folder} and is reused from there")
         return folder
     if not os.path.isdir(given):
         if given.suffix.lower() in VIDEO_SUFFIXES:

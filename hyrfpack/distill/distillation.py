@@ -91,7 +91,7 @@ def distill_model(
     kept = torch.from_numpy(_indices_without_faint(light.cpu().numpy())).to(device)
     if not len(kept):
         raise HyrfDataError(f"{name}: no view shows anything of the Gaussians", fix="give others with `cameras`")
-    say(f"{len(splats) - len(kept):,} Gaussians are hardly seen and left out; fitting the fields to the others")
+    say(f"{len(splats) - len(kept):,} Gaussians are hardly visible and left out; fitting the fields to the others")
     share = min(1.0, max(MIN_REGRESSION_SHARE, config.steps / FULL_REGRESSION_STEPS))
     model = initial_model(original[kept], light[kept], train, config.seed, share, report_part(report, 0.1, 0.4))
     scene, cache = reference_scene(name, original, train, test), PictureCache()

@@ -55,7 +55,7 @@ def pack(
     psnrs = np.array(distilled.validation.psnr_per_view(model))
     allowed, error = _mse(psnr), _mse(psnrs.mean())
     allowance = max(allowed - error, min(FALLBACK_MODEL_ERROR_SHARE * error, FALLBACK_ALLOWED_ERROR_SHARE * allowed))
-    say(f"measuring what each number does to pictures, at {len(distilled.train)} cameras and between them")
+    say(f"measuring how each stored number affects renders, at {len(distilled.train)} cameras and between them")
     distortion = PLANNED_ERROR_SHARE * solve_added_error(_mse(psnrs), error + allowance)
     sensitivity, references = measure_calibrated_sensitivity(
         model, distilled.train, distortion, report=report_part(report, 0.0, 0.7)
@@ -73,7 +73,10 @@ def pack(
         if added_error <= allowance:
             break
         distortion *= max(PLANNED_ERROR_SHARE * allowance / added_error, 1 / 16)
-        say(f"packing adds {added_error:.2g} to the error instead of {allowance:.2g}: finer, for {distortion:.2g}")
+        say(
+            f"packing adds a mean squared error of {added_error:.2g}, limit {allowance:.2g}; encoding again at "
+            f"distortion {distortion:.2g}"
+        )
         candidate = packer.encode(distortion, report_part(trial_report, 0.5, 1.0))
     return candidate.data
 

@@ -183,11 +183,15 @@ def _check_limits(kind: SplatFormat, splats: Splats, kept: Splats, say: Callable
         )
     if splats.degree > kind.max_degree:
         say(
-            f"{kind.ending} holds no harmonics above degree {kind.max_degree}; those of degree {splats.degree} are lost"
+            f"{kind.ending} stores harmonics up to degree {kind.max_degree}; higher ones, up to degree "
+            f"{splats.degree}, are lost"
         )
     if splats.antialiased and not kind.stores_antialiased:
         able = " or ".join(row.ending for row in FORMATS.values() if row.stores_antialiased)
-        say(f"{kind.ending} cannot tell that the splats are antialiased: set it where they are drawn, or choose {able}")
+        say(
+            f"{kind.ending} cannot store that the splats are antialiased: set it in the program that draws the file, "
+            f"or choose {able}"
+        )
 
 
 def _measure_psnr(before: Splats, after: Splats, weighted: WeightedSplats, report: Report) -> list[float]:

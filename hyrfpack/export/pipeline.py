@@ -172,19 +172,21 @@ def _export_checked(
     photographed, loaded = loaded, by_exposure[exposure]
     compares_exposures = photographed.model.exposure is not None and crop is None and bool(loaded.measured_views)
     places = f"{len(loaded.fit_cameras)} " + (
-        "cameras" if loaded.cameras else "places around the scene, for the file keeps no cameras (`data` names photos)"
+        "cameras"
+        if loaded.cameras
+        else "viewpoints around the scene, because the file stores no cameras (name photos with `data`)"
     )
     highest = kind.max_degree if degree is None else min(degree, kind.max_degree)
     chosen_by: dict[int, float] = {}
     visibility = None
     bake_starts = 0.35 if degree is None and highest else 0.0
     if degree is None and highest:
-        say(f"choosing the degree of the colours among {places}")
+        say(f"choosing the degree of the spherical harmonics at {places}")
         visibility = compute_visibility(loaded.model, loaded.fit_cameras, report_part(report, 0.0, 0.15))
         degree, chosen_by = choose_degree(
             loaded.model, loaded.fit_cameras, highest, visibility, report_part(report, 0.15, bake_starts)
         )
-        say(f"degree {degree} it is: {_format_scores(chosen_by)}, for degrees 0 to {highest} against the model")
+        say(f"chosen degree {degree}: {_format_scores(chosen_by)} against the model for degrees 0 to {highest}")
     else:
         degree = highest
     say(f"fitting colours of degree {degree} at {places}")
@@ -198,7 +200,7 @@ def _export_checked(
     exposures: ShownSplats = {}
     if compares_exposures:
         (other,) = set(SPLAT_EXPOSURES) - {exposure}
-        say(f"fitting colours of {other} exposure, to compare with")
+        say(f"fitting colours of {other} exposure for comparison")
         rival, _, rival_picture = bake_as(by_exposure[other], report=report_part(report, 0.4, 0.5))
         exposures = {exposure: (splats, picture), other: (rival, rival_picture)}
     del bake_as, visibility  # because they are large for many Gaussians and cameras
@@ -220,7 +222,7 @@ def _export_checked(
     )
     del packed
     if crop is not None:
-        say("nothing is measured, for a part of the scene was cropped")
+        say("quality is not measured, because a part of the scene was cropped")
         return result
     measured = _add_scores(
         result, loaded, shown, kind, sphere, say, report_part(report, 0.65, 0.85 if exposures else 1.0)
@@ -289,22 +291,27 @@ def _add_scores(
 ) -> ExportReport:
     """Measure the loss, and return the result with the PSNR fields filled in."""
     if not loaded.measured_views:
-        say("nothing is measured, for no photo is held out")
+        say("quality is not measured, because no photo is held out")
         return result
     say(f"measuring at {len(loaded.measured_views)} views")
     scores = measure_psnr(loaded.model, shown, loaded.measured_views, sphere=sphere, report=report)
     if not scores:
-        say("nothing is measured, for the masks leave no pixel of the held-out photos")
+        say("quality is not measured, because the masks leave no pixel of the held-out photos")
         return result
     file, before = scores["file"], scores["baked"]
     cost = _estimate_cost_db(before, file, loaded.photo_mse)
     if cost > MIN_REPORTED_COST_DB:
-        seen = "" if loaded.cameras else ", seen from made-up viewpoints (name photos with `data` to be sure)"
+        seen = (
+            "" if loaded.cameras else " at generated viewpoints (name photos with `data` for a measurement at theirs)"
+        )
         if loaded.model.config.antialiased and not kind.stores_antialiased:
             able = " or ".join(
                 splat_format.ending for splat_format in FORMATS.values() if splat_format.stores_antialiased
             )
-            say(f"{kind.ending} cannot tell that the model is antialiased: say so where it is drawn, or choose {able}")
+            say(
+                f"{kind.ending} cannot store that the model is antialiased: set it in the program that draws the "
+                f"file, or choose {able}"
+            )
         else:
             say(
                 f"{kind.ending} costs {cost:.1f} dB{seen}: it is too coarse for this scene, perhaps for its unit of "

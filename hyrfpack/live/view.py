@@ -92,7 +92,7 @@ def live_view(title: str, *, port: int = 0, say: Callable[[str], None]) -> Itera
     view = LiveView()
     page = encode_player(title, content=SCENE_NAME, updates=UPDATES_NAME, fetches="'self'")
     with serve_in_thread(page, {SCENE_NAME: view.scene, UPDATES_NAME: view.updates}, port=port) as address:
-        say(f"the training can be seen at {address} until the command ends")
+        say(f"watch the training at {address} until the command ends")
         yield view
 
 

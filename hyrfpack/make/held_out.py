@@ -72,4 +72,4 @@ def score_note(views: int, psnr: float | None, training_psnr: float | None) -> s
         )
     if not reasons:
         return ""
-    return f"the score says little of the scene: {'; and '.join(reasons)}; look at the result to judge it"
+    return f"the score is not representative: {'; and '.join(reasons)}; look at the result to judge it"

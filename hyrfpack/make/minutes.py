@@ -144,7 +144,7 @@ def fit_plan_to_minutes(
     """
     draft = QUALITIES["draft"]
     if (remaining := end - monotonic()) <= 0:
-        say(f"the time is over before the training: a draft follows, of {draft.steps} steps")
+        say(f"no time is left for training: making a draft of {draft.steps} steps")
         draft_max_size = min(reading.max_size or draft.max_size, draft.max_size)
         return dataclasses.replace(requested, steps=draft.steps, max_size=draft_max_size)
     sizes = _candidate_sizes(scene, reading.max_size)
@@ -188,11 +188,11 @@ def fit_plan_to_minutes(
     if steps < draft.steps:
         steps = draft.steps
         say(
-            f"the time is short: a draft, of {steps} steps, takes about "
+            f"the time is short: making a draft of {steps} steps, which takes about "
             f"{cost.total_seconds(chosen_scene, steps) / 60:.1f} minutes"
         )
     else:
-        enough = ", which are enough: it will be ready before" if steps == FULL_STEPS else ""
+        enough = ", the maximum; the scene will be finished early" if steps == FULL_STEPS else ""
         say(
             f"{remaining / 60:.1f} minutes are left: {steps:,} steps on photos of "
             f"{_longest_side(chosen_scene)} pixels{enough}"

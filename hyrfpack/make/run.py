@@ -250,7 +250,7 @@ class _Pipeline:
             estimates = {"poses": estimates["poses"], "training": max(0.0, 60 * request.minutes - estimates["poses"])}
         self.reporter.estimates |= estimates
         if source.archive is not None:
-            self.say(f"{source.archive.name} was unpacked into {source.path}, where it is found again")
+            self.say(f"{source.archive.name} was unpacked into {source.path} and is reused from there")
         return stages.run_pose_stage(self.stage_cache, source.path, source.files(), request.matching, request.seed)
 
     def _scene_digest(self, scene: Scene) -> str:

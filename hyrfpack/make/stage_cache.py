@@ -94,13 +94,13 @@ class StageCache:
             self.kept.append(name)
             self.seconds[name] = self.state.seconds(name)
             self.reporter.skip(name, self.seconds[name])
-            self.say(f"{name}: done before, in {self.seconds[name]:.0f} s")
+            self.say(f"{name}: reused from an earlier run ({self.seconds[name]:.0f} s)")
             return facts
         self._check_replacing(self.state)
         resuming = self.state.was_begun(name, inputs)
         if not resuming:
             if reasons := self.state.changed_inputs(name, inputs):
-                self.say(f"{name}: made anew, for {' and '.join(reasons)} changed")
+                self.say(f"{name}: running again, because {' and '.join(reasons)} changed")
             if name in PRODUCT_NAMES:
                 _remove_product(self.folder / PRODUCT_NAMES[name])
             self.state.begin(name, inputs, fixed or {})

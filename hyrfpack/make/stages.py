@@ -104,7 +104,7 @@ def run_training_stage(
     if config.target_bytes != plan.target_bytes:
         before = "without a target size" if config.target_bytes is None else f"for {config.target_bytes:,} bytes"
         stage_cache.say(
-            f"the model is trained {before}, and only packed for the size that is asked for now; another work folder "
+            f"the model is trained {before}, and only compressed for the requested size; another work folder "
             "(`work`) trains it anew"
         )
 

@@ -303,7 +303,9 @@ def _count_problems(count: int, scene: Scene | None, posed: int, path: Path) -> 
             f"or estimate all anew with 'hyrfpack poses {shlex.quote(str(path))} -o SCENE'"
         )
     if not len(scene.points):
-        found.append("there are no points, so that training starts at random places; give those of the reconstruction")
+        found.append(
+            "there are no points, so training starts at random positions; add the points of the reconstruction"
+        )
     return found
 
 
@@ -344,7 +346,7 @@ def _blur_problems(measurements: list[_PixelMeasurement], blurred: list[Path], f
     values = [measurement.sharpness for measurement in measurements]
     if np.median(values) < MIN_SHARPNESS:
         return [
-            "the photos are blurred, most of them; take them again with the camera held still, in more light, and "
+            "most photos are blurred; take them again with the camera held still, in more light, and "
             "focused on what you photograph"
         ]
     if not blurred:

@@ -61,7 +61,7 @@ def time_alternately(
 ) -> tuple[dict[str, Timing], dict[str, Any]]:
     """Time tasks against each other: run each once unmeasured, then measure them in turns.
 
-    A task gets no further turn once its measured runs add up to MAX_SECONDS_PER_TASK. A task whose first run took that
+    A task is not measured again once its measured runs add up to MAX_SECONDS_PER_TASK. A task whose first run took that
     long is not run again, and the first run counts. A task that takes less than WARM_UP_SECONDS is run unmeasured for
     that long at the start of each turn. A slower task before it leaves cold caches and all threads on one core, which
     would otherwise be measured too.

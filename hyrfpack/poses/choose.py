@@ -51,7 +51,7 @@ def choose_candidate(candidates: Sequence[Candidate], matches: int) -> tuple[Can
     name, figures = _MAPPER_NAMES[chosen.mapper], _describe_figures(chosen, matches)
     others = [candidate for candidate in candidates if candidate is not chosen]
     if not others:
-        return chosen, f"{name} was taken ({figures}); the other one posed no photos"
+        return chosen, f"{name} was taken ({figures}); the other one registered no photos"
     (other,) = others
     against = f"{name} was taken ({figures}; {_MAPPER_NAMES[other.mapper]}: {_describe_figures(other, matches)})"
     if other not in tied:
@@ -84,7 +84,7 @@ def describe_doubt(poses: Poses, other: Candidate | None) -> str:
     parts += [f"has no pose for {lacking}"] if lacking else []
     return (
         f"{len(agreed)} of {len(poses)} posed photos are sure; {_MAPPER_NAMES[other.mapper]} {' and '.join(parts)}, "
-        "so look at the result before you trust it"
+        "so check the result before you use it"
     )
 
 

@@ -367,7 +367,7 @@ class _PoseEstimation:
                 results += self._run_stage(stage)["models"]
             except StageCrashedError as error:
                 failures.append(error)
-                self._add_note(f"the {stage} mapper failed, and the other one's result is taken unchecked: {error}")
+                self._add_note(f"the {stage} mapper failed, so the result of the other one is used unchecked: {error}")
         if len(failures) == 2:
             raise failures[0]
         return results
@@ -383,9 +383,11 @@ class _PoseEstimation:
         if found["doubt"]:
             self._add_note(found["doubt"])
         if found["angle"] < _MIN_RAY_ANGLE_DEGREES:
-            self._add_note("the photos are taken from nearly one place, so that depth is vague; take steps to the side")
+            self._add_note(
+                "the photos are taken from nearly one place, so depth is uncertain; move sideways between photos"
+            )
         if blurred := diagnosis.blurred_photos(features) & registered:
-            self._add_note(f"{len(blurred)} of the posed photos are blurred beside the others")
+            self._add_note(f"{len(blurred)} of the posed photos are more blurred than the others")
         report = PosesReport(
             self.out,
             self.photo_count,

@@ -56,7 +56,7 @@ __all__ = ["VIEWS_FOLDER", "TrainResult", "is_begun", "resuming", "train_model"]
 
 # These signals end a run early. Windows has no SIGHUP.
 STOP_SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
-CHOICE_LABELS = {"exposure": "Exposure compensation", "max_gaussians": "Gaussians at most"}
+CHOICE_LABELS = {"exposure": "Exposure compensation", "max_gaussians": "Gaussian budget"}
 Observer = Callable[[Trainer], None]
 
 
@@ -206,7 +206,7 @@ def _train_in_folder(
         decisions = Decisions(ranks.broadcast(saved), {}, [])
     elif questions := _open_questions(scene, config):
         with PhaseLine(silent) as phases, _stop_requests() as stop:
-            phases.note(f"{questions} by short pilot runs, scored on training photos that they leave out")
+            phases.note(f"{questions} with short pilot runs, scored on validation photos")
             report_pilot: Report = _ignore_step if report is None else partial(_as_step_nought, report)
             # Every rank runs all pilots, so that none waits for another.
             pilots = partial(decide, scene, config, cache, device, report_pilot, stop, phase or phases.update)
@@ -304,7 +304,7 @@ def _complete(
     if not ranks.is_main:
         return TrainResult(True, record.step, out / MODEL_FILE, {})
     with PhaseLine(silent) as phases, ExitStack() as stack:
-        phases.note("the model is trained already; its scores and pictures are computed now")
+        phases.note("the model is already trained; computing its scores and pictures")
         written = None
         if log is not None:
             written = stack.enter_context(TrainingLog(Path(log), record.step, record.step, device, phases.note, True))

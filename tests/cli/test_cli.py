@@ -109,7 +109,7 @@ def test_compress_with_photos_prints_the_loss_on_held_out_photos(run, data, tmp_
 def test_compress_of_a_run_uses_its_photos_by_default(run, data, tmp_path):
     arguments = ("compress", run, "-o", tmp_path / "p.hyrf", "--overwrite", "--json")
     result, named = succeeded(*arguments), succeeded(*arguments, "--data", data)
-    assert f"with the photos that it was trained on, {data}" in result.stderr
+    assert f"using the photos that the model was trained on, {data}" in result.stderr
     assert json.loads(result.stdout) == json.loads(named.stdout) and "psnr" in json.loads(result.stdout)
     without = succeeded(*arguments, "--no-data")
     assert "trained on" not in without.stderr and "psnr" not in json.loads(without.stdout)
@@ -121,7 +121,7 @@ def test_compress_works_when_the_photos_of_a_run_are_gone(run, tmp_path):
     metrics["scene"]["reading"]["path"] = str(tmp_path / "moved")
     (tmp_path / "run" / "metrics.json").write_text(json.dumps(metrics))
     arguments = ("compress", tmp_path / "run", "-o", tmp_path / "p.hyrf")
-    assert "going on without the photos" in succeeded(*arguments).stderr
+    assert "continuing without the photos" in succeeded(*arguments).stderr
     assert "name their folder with --data" in refused(*arguments, "--overwrite", "--finetune", 1)
 
 
@@ -148,8 +148,8 @@ def test_the_last_line_says_how_numbers_are_stored(run, tmp_path):
         ).stdout.splitlines()
         for profile in ("raw", "paper")
     )
-    assert re.search("bytes, [0-9,]+ Gaussians, every number as float32$", raw[-1])
-    assert "times smaller than as float32" in paper[-1]
+    assert re.search("bytes, [0-9,]+ Gaussians, all numbers as float32$", raw[-1])
+    assert "times smaller than float32" in paper[-1]
 
 
 def test_decompress_of_a_raw_file_is_byte_exact(run, tmp_path):
@@ -266,7 +266,7 @@ def test_training_interrupted_during_pilot_runs_exits_with_1_and_saves_nothing(d
     monkeypatch.setattr("hyrfpack.train.run.decide", decide_interrupted)
     result = hyrfpack("train", data, "-o", tmp_path, "--steps", 1_000, "--max-gaussians", 200, "--json")
     assert result.exit_code == 1 and json.loads(result.stdout) == {"complete": False, "step": 0}
-    assert "stopped before the first step; the same command begins anew" in result.stderr
+    assert "stopped before the first step; run the same command to start again" in result.stderr
     assert not any((tmp_path / name).exists() for name in ("checkpoint.pt", "model.hyrf"))
     assert signal.getsignal(signal.SIGINT) is before
 

@@ -91,7 +91,7 @@ def test_decompress_of_a_complete_file_gives_the_complete_model(fraction, layere
 def test_decompress_reads_the_complete_layers_of_a_truncated_file(layered_file, two_layer_file, tmp_path):
     printed = succeeded("decompress", two_layer_file, "-o", tmp_path / "back.hyrf", "--fraction", 1).stdout
     count = count_gaussians(layered_file, 2)
-    assert f"{count:,} Gaussians, every number as float32" in printed
+    assert f"{count:,} Gaussians, all numbers as float32" in printed
     assert_first_of(tmp_path / "back.hyrf", layered_file, count)
 
 

@@ -155,7 +155,7 @@ def test_convert_describes_input_and_output(files, tmp_path):
     assert rows[2] == ["ball.ply", "60", "1", f"{files['.ply'].stat().st_size:,}"]
     assert rows[3] == ["a.splat", "60", "0", f"{32 * 60:,}"]
     assert re.fullmatch(r"12 views of .* PSNR \d+\.\d\d dB, the worst \d+\.\d\d", result.stdout.splitlines()[-1])
-    assert "no harmonics above degree 0" in result.stderr
+    assert "stores harmonics up to degree 0" in result.stderr
 
 
 def test_convert_prints_json_and_replaces_only_with_overwrite(files, tmp_path):

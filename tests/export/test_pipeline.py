@@ -172,7 +172,7 @@ def test_a_crop_keeps_exactly_what_is_inside_and_leaves_the_background_out(endin
     assert 3 < len(expected) < 40 and len(back) == report.gaussians == len(expected) and report.background == 0
     assert nearest(expected, back.positions).max() < 1e-3
     assert (report.views, report.psnr, report.psnr_baked) == (0, None, None)
-    assert said[-1] == "nothing is measured, for a part of the scene was cropped"
+    assert said[-1] == "quality is not measured, because a part of the scene was cropped"
 
 
 def test_a_crop_may_be_open_to_any_side_and_a_list(plain, tmp_path):
@@ -270,14 +270,14 @@ def told_of(unit: float, judged: str, folder) -> tuple[str, ExportReport]:
     model = small_model(POSITIONS, frame=frame, fields=0.0, color_logits=1.0, scale_logits=-1.5)
     cameras = [moved(camera, unit, (0, 0, 0)) for camera in ring(8)]
     source, said = write(folder / "model.hyrf", model, cameras), []
-    if judged == "made-up viewpoints":
+    if judged == "generated viewpoints":
         source = without_cameras(source, folder / "bare.hyrf")
     data = photographed(model, cameras) if judged == "photos" else None
     report = export(source, folder / "a.spz", degree=0, data=data, say=said.append)
     return said[-1], report
 
 
-JUDGED = ("photos", "cameras", "made-up viewpoints")
+JUDGED = ("photos", "cameras", "generated viewpoints")
 
 
 @pytest.mark.parametrize("judged", JUDGED)
@@ -285,7 +285,7 @@ JUDGED = ("photos", "cameras", "made-up viewpoints")
 def test_a_unit_of_length_that_a_format_cannot_hold_is_told(unit, judged, tmp_path):
     told, _ = told_of(unit, judged, tmp_path)
     assert re.fullmatch(r"\.spz costs \d+\.\d dB[^\n]*: it is too coarse for this scene[^\n]*another format", told)
-    assert ("`data`" in told) == (judged == "made-up viewpoints")
+    assert ("`data`" in told) == (judged == "generated viewpoints")
 
 
 @pytest.mark.parametrize("judged", JUDGED)
@@ -319,7 +319,7 @@ def test_held_out_photos_score_the_model_and_the_file_and_are_not_fitted(plain, 
 def test_without_held_out_photos_it_says_that_nothing_is_measured(plain, tmp_path):
     said = []
     report = export(plain, tmp_path / "a.ply", data=ball_scene(3), say=said.append)
-    assert report.views == 0 and said[-1] == "nothing is measured, for no photo is held out"
+    assert report.views == 0 and said[-1] == "quality is not measured, because no photo is held out"
 
 
 def test_masks_that_leave_nothing_leave_the_score_out(plain, tmp_path):
@@ -362,7 +362,7 @@ def test_a_compact_file_is_baked_and_measured_from_where_its_photos_were_taken(c
 def test_a_file_without_cameras_is_baked_and_measured_around_the_scene(plain, tmp_path):
     said = []
     report = export(without_cameras(plain, tmp_path / "bare.hyrf"), tmp_path / "a.spz", degree=1, say=said.append)
-    assert "keeps no cameras" in said[0] and report.views > 0 and report.psnr > 25
+    assert "stores no cameras" in said[0] and report.views > 0 and report.psnr > 25
 
 
 # -- refusals come before the work, and nothing is half done -----------------------------------------------------------

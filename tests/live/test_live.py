@@ -175,7 +175,7 @@ def test_train_updates_the_live_view_with_the_option(data, observed_steps, tmp_p
     command = ("train", data, "-o", tmp_path / "run", "--steps", 3, "--max-gaussians", 100)
     result = succeeded(*command, "--view")
     assert observed_steps == [1, 2, 3]
-    assert "the training can be seen at http://127.0.0.1:" in result.stderr and "http" not in result.stdout
+    assert "watch the training at http://127.0.0.1:" in result.stderr and "http" not in result.stdout
     assert f"'hyrfpack view {tmp_path / 'run' / 'model.hyrf'}'" in result.stderr
     observed_steps.clear()
     result = succeeded(*command, "--overwrite")
@@ -188,7 +188,7 @@ def test_make_updates_the_live_view_with_the_option(data, observed_steps, monkey
     quality = dataclasses.replace(plan.QUALITIES["draft"], steps=3, finetune_steps=0)
     monkeypatch.setitem(plan.QUALITIES, "draft", quality)
     result = succeeded("make", data, "-o", tmp_path / "scene.hyrf", "--quality", "draft", "--view")
-    assert observed_steps == [1, 2, 3] and "the training can be seen at http://127.0.0.1:" in result.stderr
+    assert observed_steps == [1, 2, 3] and "watch the training at http://127.0.0.1:" in result.stderr
 
 
 def test_a_port_that_is_taken_is_a_clear_error_before_any_work(data, tmp_path):

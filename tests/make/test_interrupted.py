@@ -61,7 +61,9 @@ def test_an_interrupt_in_each_stage_loses_no_work(after, uninterrupted_products,
             with pytest.raises(Stopped) as caught:
                 make_scene(posed, tmp_path / "scene.html", say=said.append)
         assert caught.value.stage == stage and not (tmp_path / "scene.html").exists()
-        assert [name for name in FUNCTION_BY_STAGE if any(f"{name}: done before" in s for s in said)] == done[:-1]
+        assert [
+            name for name in FUNCTION_BY_STAGE if any(f"{name}: reused from an earlier run" in s for s in said)
+        ] == done[:-1]
         done.append(stage)
     result = make_scene(posed, tmp_path / "scene.html")
     assert (

@@ -255,7 +255,7 @@ def test_a_work_folder_of_an_earlier_version_is_trained_again_once(finished_work
     training["inputs"]["settings"] |= training.pop("fixed")  # earlier versions stored both there
     (work / "make.json").write_text(json.dumps(table))
     assert make_scene(posed, tmp_path / "scene.hyrf", work=work, say=said.append).kept[:1] != ("training",)
-    assert "training: made anew, for settings changed" in said
+    assert "training: running again, because settings changed" in said
     assert len(make_scene(posed, tmp_path / "scene.hyrf", work=work).kept) == 4
 
 
@@ -287,7 +287,7 @@ def test_a_changed_photo_repeats_all_stages_and_a_moved_folder_none(photos, pose
     Image.new("RGB", (32, 32), "red").save(moved / "0003.png")
     said: list[str] = []
     result = make_scene(moved, tmp_path / "b.hyrf", work=tmp_path / "work", quality="draft", say=said.append)
-    assert "poses" not in result.kept and "poses: made anew, for photos changed" in said
+    assert "poses" not in result.kept and "poses: running again, because photos changed" in said
 
 
 def test_poses_are_kept_from_a_draft_to_another_quality_and_back(photos, poses, tmp_path):
@@ -320,7 +320,9 @@ def test_poses_without_their_photos_are_estimated_again(photos, poses, tmp_path)
     said: list[str] = []
     result = make_scene(photos, tmp_path / "other.hyrf", work=work, quality="draft", say=said.append)
     assert (
-        len(poses) == 2 and result.kept == tuple(STAGE_NAMES[:-1]) and "poses: made anew, for its files changed" in said
+        len(poses) == 2
+        and result.kept == tuple(STAGE_NAMES[:-1])
+        and "poses: running again, because its files changed" in said
     )
 
 
@@ -451,7 +453,7 @@ def test_an_output_without_a_name_is_rejected_or_the_current_folder(finished_wor
 def test_the_command_reports_its_results(photos, poses, tmp_path):
     result = succeeded("make", photos, "-o", tmp_path / "scene.html", "--quality", "draft")
     for part in (
-        "poses: 18 of 19 photos, 17 of them sure\n",
+        "poses: 18 of 19 photos, 17 confirmed by both mappers\n",
         "left out: dark.jpg, blurred",
         "times: poses 0 s, training",
         "3 photos held out: PSNR ",

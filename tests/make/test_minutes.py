@@ -143,7 +143,7 @@ def test_too_little_time_gives_a_draft_with_a_note(posed, scene):
         )
         plan = fit_plan_to_minutes(*arguments, Reporter(["training"], None), said.append)
         assert (plan.steps, plan.target_bytes) == (6, 20_000)
-    assert "the time is over" in said[0] and "the time is short" in said[1]
+    assert "no time is left for training" in said[0] and "the time is short" in said[1]
 
 
 def test_an_explicit_number_of_gaussians_replaces_the_measured_budget(posed, scene, monkeypatch):

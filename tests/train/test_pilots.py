@@ -183,7 +183,7 @@ def test_a_run_takes_the_budget_of_its_pilots_and_records_the_reason(tmp_path, m
     assert metrics["settings"]["budget_factor"] == 0.5
     reason = metrics["choices"]["max_gaussians"]
     assert reason.startswith("2,500: 0.5 times what suits ") and reason.endswith(" steps; by a coin")
-    assert f"Gaussians at most: {reason}" in capsys.readouterr().err
+    assert f"Gaussian budget: {reason}" in capsys.readouterr().err
 
 
 def interrupt_at(step: int):
