@@ -82,7 +82,7 @@ def test_functions_can_be_called_in_processes_that_are_spawned():
 
 def test_sub_packages_support_every_form_of_import():
     code = (
-        "import hyrfpack.train.progress as progress, hyrfpack.train_model as t, hyrfpack.evaluate\n"
+        "import hyrfpack.train.progress as progress, hyrfpack.train as t, hyrfpack.evaluate\n"
         "from hyrfpack.train import Trainer, progress as again\n"
         "import hyrfpack.cameras.paths, sys\n"
         "assert progress is again is sys.modules['hyrfpack.train.progress'] is hyrfpack.train.progress\n"
@@ -94,6 +94,13 @@ def test_sub_packages_support_every_form_of_import():
         "except AttributeError: print('and nothing else')"
     )
     assert run_in_new_interpreter(code).stdout == "and nothing else\n", run_in_new_interpreter(code).stderr
+
+
+def test_a_former_function_name_raises_an_error_with_the_present_name():
+    with pytest.raises(AttributeError, match="the function is now hyrfpack.load_model"):
+        _ = hyrfpack.load
+    stderr = run_in_new_interpreter("import hyrfpack\nhyrfpack.train()").stderr
+    assert "AttributeError" in stderr and "the function is now hyrfpack.train_model" in stderr
 
 
 # A mistaken call, and its error message.
