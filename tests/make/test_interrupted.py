@@ -20,10 +20,10 @@ from hyrfpack.make.stage_cache import interruptible
 
 # Stage -> the function that runs it.
 FUNCTION_BY_STAGE = {
-    "training": "train",
-    "compression": "compress",
-    "scoring": "evaluate",
-    "export": "export",
+    "training": "train_model",
+    "compression": "compress_model",
+    "scoring": "evaluate_model",
+    "export": "export_model",
 }
 
 
