@@ -73,7 +73,7 @@ def test_the_command_prints_its_result_and_the_next_command(estimated_scene, mon
     made = type(report)(**{**vars(report), "left_out": partly, "scene": Path("scenes/garden")})
     monkeypatch.setattr("hyrfpack.poses.estimate_poses", lambda *args, **settings: made)
     said = succeeded("poses", tmp_path, "-o", "scenes/garden").stdout
-    assert f"{report.registered} of {report.photos} photos have a pose, {report.sure} of them for sure" in said
+    assert f"{report.registered} of {report.photos} photos have a pose, {report.sure} confirmed by both mappers" in said
     assert "left out, blurred: a.jpg, b.jpg" in said
     assert "next: hyrfpack train scenes/garden -o runs/garden" in said
 
