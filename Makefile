@@ -49,7 +49,7 @@ test-oldest: ## run the tests with the oldest dependencies that pyproject.toml a
 	$(PYTHON) -m tools.safety.versions oldest
 
 docs: $(VENV_STAMP) ## build the documentation site in site/; a broken link is an error
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 player: $(VENV_STAMP) $(NODE_STAMP) ## minify the web player's scripts again after a change
 	$(BIN)/python -m tools.browser.shorten

@@ -14,7 +14,7 @@ pytest.importorskip("mkdocstrings", reason="mkdocstrings is not installed")
 
 
 def build(folder: Path, config: Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--strict", "-f", str(config), "-d", str(folder)]
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "-f", str(config), "-d", str(folder)]
     return subprocess.run(command, cwd=REPOSITORY_ROOT, capture_output=True, text=True)
 
 

@@ -58,7 +58,7 @@ def describe_file(path: str | os.PathLike[str], fraction: float | None = None) -
     Example:
         >>> import hyrfpack
         >>> facts = hyrfpack.describe_file("bonsai.hyrf")
-        >>> facts["profile"], facts["version"], facts["sections"][0]["type"]
+        >>> facts["profile"], facts["version"], next(section["type"] for section in facts["sections"])
         ('compact', '1.1', 'META')
     """
     with Container.open(path, SECTION_CONTENTS, fraction) as container:

@@ -115,13 +115,15 @@ def make_scene(
         minutes: time that the call may take, instead of a quality. The number of steps and the size of the photos are
             chosen by a measurement.
         work: the work folder; None for the name of the output with the ending ".work" beside it.
-        images, max_size: see `load_scene`; None for the default of the quality.
+        images: see `load_scene`.
+        max_size: see `load_scene`; None for the default of the quality.
         test_every: see `load_scene`. None holds out every 8th photo; of fewer than 16 photos one, and of fewer than 8
             none.
         matching: see `hyrfpack.estimate_poses`.
         target_bytes: maximum size of the packed model in bytes. A later call with another size packs the trained model
             again, without training.
-        max_gaussians, preset: see `hyrfpack.TrainConfig`; `max_gaussians` excludes `target_bytes`.
+        max_gaussians: see `hyrfpack.TrainConfig`; excludes `target_bytes`.
+        preset: see `hyrfpack.TrainConfig`.
         seed: random seed, 0 to 2^64 - 1.
         device: device for training and packing, see `hyrfpack.device.choose_device`.
         overwrite: replace an existing output. Without it, an output that appears during the call is kept as well: a
