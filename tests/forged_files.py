@@ -1,4 +1,4 @@
-"""Files with payloads made by hand: at the edges of what the codecs allow, and small ones that ask for much work."""
+"""Build `.hyrf` files from hand-made payloads: at the limits of the codecs, and small files that demand much work."""
 
 from __future__ import annotations
 
@@ -12,13 +12,14 @@ from hyrfpack.format.arrays import MODEL_RULES, group_shapes, parse_config
 from hyrfpack.quant.integers import encode_integers
 from tools.safety.fuzz_mutate import RawSection, assemble
 
-FREE = 3 << 24  # bytes that a file of any length may decode to
-GAUSSIANS = 1 << 18  # that it may have
-GRID = {"log2_table_size": 4, "levels": 1, "base": 2, "finest": 2}
-CONFIG = {
+# docs/reference/format.md allows a file of any length this many decoded bytes and Gaussians; more need a longer file.
+EXTRA_DECODED_BYTES = 3 << 24
+EXTRA_GAUSSIANS = 1 << 18
+GRID_CONFIG = {"log2_table_size": 4, "levels": 1, "base": 2, "finest": 2}
+MODEL_CONFIG = {
     "frame": {"center": [0.0, 0.0, 0.0], "scale": 1.0, "half_extent": [1.0, 0.75, 0.5]},
-    "geometry": GRID,
-    "radiance": GRID,
+    "geometry": GRID_CONFIG,
+    "radiance": GRID_CONFIG,
     "hidden": 1,
     "background": True,
     "solid": [0.0, 0.0, 0.0],
@@ -28,26 +29,35 @@ CONFIG = {
     "position_gradients": False,
     "antialiased": False,
 }
-# Payloads in which every integer is the same take no bytes, however many there are.
-ALIKE = b"\0\0\0"  # 0 in one context
-POINTS = struct.pack("<BBII", 1, 1, 3, 4) + b"\1" + ALIKE + b"\0\0\0\0"  # in two contexts for the classes
-CHANNEL = struct.pack("<fBIB", 0.5, 16, 3, 1) + b"\x40" + ALIKE
-BASIS = struct.pack("<9f", 1, 0, 0, 0, 1, 0, 0, 0, 1)
-GROUPS = struct.pack("<II", 3, 3) + b"\0\0\x08" + ALIKE + b"\0\0\2"
-COMPACT = {"POSI": (6, POINTS), "COLO": (7, BASIS + 3 * CHANNEL), "SCAL": (7, CHANNEL), "OPAC": (7, CHANNEL)}
-COMPACT |= {group: (8, GROUPS) for group in ("GTAB", "RTAB", "GMLP", "RMLP")}
+# A stream whose integers are all equal takes no bytes for them, however many there are. This one holds zeros in one
+# context; the classes of points need the same in two contexts.
+CONSTANT_STREAM = b"\0\0\0"
+CONSTANT_POINTS = struct.pack("<BBII", 1, 1, 3, 4) + b"\1" + CONSTANT_STREAM + b"\0\0\0\0"
+CONSTANT_CHANNEL = struct.pack("<fBIB", 0.5, 16, 3, 1) + b"\x40" + CONSTANT_STREAM
+IDENTITY_BASIS = struct.pack("<9f", 1, 0, 0, 0, 1, 0, 0, 0, 1)
+CONSTANT_GROUP = struct.pack("<II", 3, 3) + b"\0\0\x08" + CONSTANT_STREAM + b"\0\0\2"
+CONSTANT_PAYLOADS = {
+    "POSI": (6, CONSTANT_POINTS),
+    "COLO": (7, IDENTITY_BASIS + 3 * CONSTANT_CHANNEL),
+    "SCAL": (7, CONSTANT_CHANNEL),
+    "OPAC": (7, CONSTANT_CHANNEL),
+}
+CONSTANT_PAYLOADS |= {group: (8, CONSTANT_GROUP) for group in ("GTAB", "RTAB", "GMLP", "RMLP")}
 
 Payloads = dict[str, tuple[int, bytes]]
 
 
-def metadata(count: int, provenance: dict | None = None, **config: object) -> dict:
-    """What META says."""
+def make_meta(count: int, provenance: dict | None = None, **config: object) -> dict:
+    """Return the content of the META section."""
     texts = {"profile": "", "settings": {}, "provenance": provenance or {}, "writer": ""}
-    return {"gaussians": count, "config": CONFIG | config, "rules": MODEL_RULES, **texts}
+    return {"gaussians": count, "config": MODEL_CONFIG | config, "rules": MODEL_RULES, **texts}
 
 
-def with_text(text: bytes, payloads: Payloads, shapes: dict[str, tuple[int, int]], deflated: bytes = b"") -> bytes:
-    """A file with this text as metadata, deflated if it is given so, and (codec, bytes) by section."""
+def assemble_file(text: bytes, payloads: Payloads, shapes: dict[str, tuple[int, int]], deflated: bytes = b"") -> bytes:
+    """Build a file from the text of its metadata and (codec, bytes) by section.
+
+    `deflated`, if given, is stored in place of the text.
+    """
     parts = [RawSection(b"META", 5 if deflated else 0, 1, deflated or text, len(text))]
     for group, (rows, columns) in shapes.items():
         codec, data = payloads[group]
@@ -55,29 +65,29 @@ def with_text(text: bytes, payloads: Payloads, shapes: dict[str, tuple[int, int]
     return assemble(parts)
 
 
-def text_of(meta: dict) -> bytes:
-    """Metadata as JSON."""
+def metadata_json(meta: dict) -> bytes:
+    """Serialise metadata as compact JSON."""
     return json.dumps(meta, separators=(",", ":")).encode()
 
 
-def shapes_of(meta: dict) -> dict[str, tuple[int, int]]:
-    """Rows and columns of each section."""
+def section_shapes(meta: dict) -> dict[str, tuple[int, int]]:
+    """Return the rows and columns of each section."""
     return group_shapes(parse_config(meta["config"]), meta["gaussians"])
 
 
-def file_of(meta: dict, payloads: Payloads) -> bytes:
-    """A file with this metadata, deflated; other arguments as `with_text`."""
-    text = text_of(meta)
-    return with_text(text, payloads, shapes_of(meta), zlib.compress(text, 9))
+def build_file(meta: dict, payloads: Payloads) -> bytes:
+    """Build a file from its metadata, which is deflated, and (codec, bytes) by section."""
+    text = metadata_json(meta)
+    return assemble_file(text, payloads, section_shapes(meta), zlib.compress(text, 9))
 
 
-def plain(meta: dict) -> Payloads:
-    """Zeros as float32."""
-    return {group: (1, bytes(4 * rows * columns)) for group, (rows, columns) in shapes_of(meta).items()}
+def zero_payloads(meta: dict) -> Payloads:
+    """Return float32 zeros as the payload of every section."""
+    return {group: (1, bytes(4 * rows * columns)) for group, (rows, columns) in section_shapes(meta).items()}
 
 
-def lattice(codes: np.ndarray, base: int, bits: list[int], classes: np.ndarray, tails: bytes = b"") -> bytes:
-    """A payload of codec 6 of Morton codes (N,) of `base` bits an axis, in order."""
+def points_payload(codes: np.ndarray, base: int, bits: list[int], classes: np.ndarray, tails: bytes = b"") -> bytes:
+    """Return a payload of codec 6 from sorted Morton codes (N,) of `base` bits per axis."""
     gaps = np.diff(codes, prepend=0)
     gap_bytes = encode_integers(gaps)
     class_bytes = encode_integers(classes, (gaps == 0).view(np.uint8))
@@ -85,51 +95,54 @@ def lattice(codes: np.ndarray, base: int, bits: list[int], classes: np.ndarray, 
     return head + gap_bytes + class_bytes + tails
 
 
-def channel(differences: np.ndarray, classes: np.ndarray, codes: bytes, mean: float, weight: int) -> bytes:
-    """A channel of codec 7."""
+def channel_payload(differences: np.ndarray, classes: np.ndarray, codes: bytes, mean: float, weight: int) -> bytes:
+    """Return one channel of a payload of codec 7."""
     stream = encode_integers(differences, classes, signed=True)
     return struct.pack("<fBIB", mean, weight, len(stream), len(codes)) + codes + stream
 
 
-def most_gaussians() -> bytes:
-    """As many Gaussians as a file of a kilobyte may have, all alike; valid."""
-    return file_of(metadata(GAUSSIANS - 100), COMPACT)
+def file_with_most_gaussians() -> bytes:
+    """Return a valid file of about a kilobyte with nearly the most Gaussians it may have, all equal."""
+    return build_file(make_meta(EXTRA_GAUSSIANS - 100), CONSTANT_PAYLOADS)
 
 
-def largest_tables() -> bytes:
-    """Tables as large as a file of a kilobyte may have, all numbers alike; valid."""
+def file_with_largest_tables() -> bytes:
+    """Return a valid file of about a kilobyte with the largest tables it may have, all numbers equal."""
     grid = {"log2_table_size": 24, "levels": 1, "base": 146, "finest": 146}
-    return file_of(metadata(1, geometry=grid, radiance=grid), COMPACT)
+    return build_file(make_meta(1, geometry=grid, radiance=grid), CONSTANT_PAYLOADS)
 
 
-def longest_metadata() -> bytes:
-    """A million bytes of JSON out of two thousand; valid."""
-    meta = metadata(0, {"list": [0] * 520_000})
-    return file_of(meta, plain(meta))
+def file_with_longest_metadata() -> bytes:
+    """Return a valid file whose metadata is deflated from a million bytes of JSON to two thousand."""
+    meta = make_meta(0, {"list": [0] * 520_000})
+    return build_file(meta, zero_payloads(meta))
 
 
-def deepest_metadata() -> bytes:
-    """A million brackets."""
-    meta = metadata(0)
+def file_with_deepest_metadata() -> bytes:
+    """Return a file whose metadata is a million opening brackets."""
+    meta = make_meta(0)
     text = b"[" * (1 << 20)
-    return with_text(text, plain(meta), shapes_of(meta), zlib.compress(text, 9))
+    return assemble_file(text, zero_payloads(meta), section_shapes(meta), zlib.compress(text, 9))
 
 
-def nothing_there(codec: int) -> bytes:
-    """Millions of Gaussians in a codec, and no byte of them."""
-    meta = metadata(GAUSSIANS - 100)
+def file_with_empty_payloads(codec: int) -> bytes:
+    """Return a file that declares the most Gaussians in `codec`, with payloads of zero bytes."""
+    meta = make_meta(EXTRA_GAUSSIANS - 100)
     empty = dict.fromkeys(("POSI", "COLO", "SCAL", "OPAC"), (codec, b""))
-    return file_of(meta, plain(metadata(0)) | empty)
+    return build_file(meta, zero_payloads(make_meta(0)) | empty)
 
 
-def ends_in_damage() -> bytes:
-    """Millions of points, all alike, and one bit too many after them."""
-    return file_of(metadata(GAUSSIANS - 100), COMPACT | {"POSI": (6, POINTS + b"\1")})
+def file_with_extra_bit_after_points() -> bytes:
+    """Return a file with the most Gaussians, all equal, whose points are followed by one bit too many."""
+    return build_file(make_meta(EXTRA_GAUSSIANS - 100), CONSTANT_PAYLOADS | {"POSI": (6, CONSTANT_POINTS + b"\1")})
 
 
-SMALL = {
-    "longest_metadata": longest_metadata,
-    "deepest_metadata": deepest_metadata,
-    **{f"nothing_there_{codec}": lambda codec=codec: nothing_there(codec) for codec in (1, 2, 3, 4, 6, 7, 8)},
-    "ends_in_damage": ends_in_damage,
+SMALL_HOSTILE_FILES = {
+    "long_metadata": file_with_longest_metadata,
+    "deep_metadata": file_with_deepest_metadata,
+    **{
+        f"empty_payloads_of_codec_{codec}": lambda codec=codec: file_with_empty_payloads(codec)
+        for codec in (1, 2, 3, 4, 6, 7, 8)
+    },
+    "extra_bit_after_points": file_with_extra_bit_after_points,
 }

@@ -1,4 +1,4 @@
-"""Errors that sensitivities foretell, held to pictures."""
+"""Calibrated sensitivities predict the error that pictures show."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from hyrfpack.format.arrays import iter_parameters, to_arrays
 from hyrfpack.format.sections import COLORS, OPACITIES, POSITIONS
 from hyrfpack.model import HybridModel
 
-CAMERAS = ring(8, width=48, height=48)
-ELSEWHERE = ring(7, width=40, height=40)
+CALIBRATION_CAMERAS = ring(8, width=48, height=48)
+HELD_OUT_CAMERAS = ring(7, width=40, height=40)
 
 
-def layers(count: int = 1500) -> HybridModel:
-    """Half-transparent Gaussians of all colours that lie in each other: what is seen is who is first."""
+def overlapping_model(count: int = 1500) -> HybridModel:
+    """Return overlapping half-transparent Gaussians of all colours, whose pictures depend on their depth order."""
     rng = np.random.default_rng(5)
     return small_model(
         ball_points(count)[0],
@@ -43,41 +43,41 @@ def layers(count: int = 1500) -> HybridModel:
     )
 
 
-def forecast(model: HybridModel, sensitivity: Sensitivity, distortion: float) -> tuple[float, float]:
-    """What a file adds to pictures by estimate, and at viewpoints that no estimate has seen."""
+def predict_and_measure_error(model: HybridModel, sensitivity: Sensitivity, distortion: float) -> tuple[float, float]:
+    """Return the predicted error of a packed file, and the error measured at held-out viewpoints."""
     quantized = decide(model, sensitivity, distortion)
     decoded = decode_model(encode_model(model, "compact", quantized=quantized))
-    told = predict_errors(model, quantized.plan.apply(model), quantized, sensitivity)
-    return sum(told.values()), ReferenceRenders.from_model(model, ELSEWHERE).measure_error(decoded)
+    predicted = predict_errors(model, quantized.plan.apply(model), quantized, sensitivity)
+    return sum(predicted.values()), ReferenceRenders.from_model(model, HELD_OUT_CAMERAS).measure_error(decoded)
 
 
 @pytest.fixture(scope="module")
 def model() -> HybridModel:
-    return layers()
+    return overlapping_model()
 
 
 @pytest.fixture(scope="module")
 def first_order(model) -> Sensitivity:
-    return measure_sensitivity(model, CAMERAS)
+    return measure_sensitivity(model, CALIBRATION_CAMERAS)
 
 
 @pytest.mark.parametrize("distortion", [1e-3, 1e-5])
-def test_where_gaussians_swap_their_order_the_loss_is_foretold_to_a_third(distortion, model, first_order):
-    sensitivity = calibrate(model, first_order, ReferenceRenders.from_model(model, CAMERAS), distortion)
+def test_calibrated_predictions_are_within_50_percent_where_gaussians_swap_order(distortion, model, first_order):
+    sensitivity = calibrate(model, first_order, ReferenceRenders.from_model(model, CALIBRATION_CAMERAS), distortion)
 
-    told, found = forecast(model, sensitivity, distortion)
+    predicted, measured = predict_and_measure_error(model, sensitivity, distortion)
 
-    assert 2 / 3 < told / found < 3 / 2 and 2 / 3 < found / distortion < 3 / 2
-
-
-def test_without_it_the_loss_is_not_foretold(model, first_order):
-    told, found = forecast(model, first_order, 1e-5)
-
-    assert found > 2 * told
+    assert 2 / 3 < predicted / measured < 3 / 2 and 2 / 3 < measured / distortion < 3 / 2
 
 
-def test_what_is_right_already_stays(model, first_order):
-    references = ReferenceRenders.from_model(model, CAMERAS)
+def test_predictions_without_calibration_are_too_low_by_a_factor_of_2(model, first_order):
+    predicted, measured = predict_and_measure_error(model, first_order, 1e-5)
+
+    assert measured > 2 * predicted
+
+
+def test_calibrating_twice_changes_little(model, first_order):
+    references = ReferenceRenders.from_model(model, CALIBRATION_CAMERAS)
     once = calibrate(model, first_order, references, 1e-4)
 
     again = calibrate(model, once, references, 1e-4)
@@ -86,7 +86,7 @@ def test_what_is_right_already_stays(model, first_order):
         np.testing.assert_allclose(getattr(again, part), getattr(once, part), rtol=0.3)
 
 
-def test_factors_go_to_their_parts():
+def test_scaled_by_multiplies_each_part_by_its_factor():
     sensitivity = Sensitivity(*np.ones((5, 3)), {"RTAB": np.ones(4)})
 
     scaled = sensitivity.scaled_by({POSITIONS: 2.0, OPACITIES: 4.0, "RTAB": 3.0, PRUNED: 5.0})
@@ -99,8 +99,8 @@ def test_factors_go_to_their_parts():
     assert scaled.fields["RTAB"].tolist() == [3.0] * 4 and scaled.removals.tolist() == [5.0] * 3
 
 
-def test_where_pruning_darkens_pictures_more_than_the_sum_of_squares_less_is_pruned():
-    """Many faint Gaussians in one place: each alone is nothing, and all of them are what is seen."""
+def test_calibration_prunes_fewer_gaussians_where_their_errors_add_up():
+    """Each of the many faint Gaussians alone is invisible, but together they make up the picture."""
     rng = np.random.default_rng(2)
     model = small_model(
         rng.normal(0, 0.2, size=(3000, 3)),
@@ -108,37 +108,37 @@ def test_where_pruning_darkens_pictures_more_than_the_sum_of_squares_less_is_pru
         scale_logits=-2.0,
         opacity_logits=rng.normal(-5, 1, (3000, 1)),
     )
-    sensitivity = measure_sensitivity(model, CAMERAS)
+    sensitivity = measure_sensitivity(model, CALIBRATION_CAMERAS)
     distortion = 1e-4
 
-    calibrated = calibrate(model, sensitivity, ReferenceRenders.from_model(model, CAMERAS), distortion)
+    calibrated = calibrate(model, sensitivity, ReferenceRenders.from_model(model, CALIBRATION_CAMERAS), distortion)
 
     assert len(make_plan(model, calibrated, distortion).kept) > 2 * len(make_plan(model, sensitivity, distortion).kept)
-    told, found = forecast(model, calibrated, distortion)
-    assert found < 2 * distortion and told < 2 * distortion
+    predicted, measured = predict_and_measure_error(model, calibrated, distortion)
+    assert measured < 2 * distortion and predicted < 2 * distortion
 
 
-def test_a_single_view_that_is_far_off_does_not_decide(model):
-    references = ReferenceRenders.from_model(model, CAMERAS)
+def test_a_single_outlier_view_does_not_affect_the_measured_error(model):
+    references = ReferenceRenders.from_model(model, CALIBRATION_CAMERAS)
     broken = [torch.ones_like(picture) if n == 0 else picture for n, picture in enumerate(references.pictures)]
 
     assert ReferenceRenders(references.views, broken).measure_error(model) == 0.0
 
 
-def test_parts_that_do_nothing_are_left_alone():
-    """Nobody sees it: nothing is found, and nothing divided by."""
+def test_sensitivities_of_invisible_gaussians_are_unchanged():
+    """No camera sees the model, so that the measured error is zero and must not be divided by."""
     model = small_model(ball_points(40)[0] * 0.1 + np.array([0.0, 0.0, 500.0]))
-    sensitivity = measure_sensitivity(model, CAMERAS)
+    sensitivity = measure_sensitivity(model, CALIBRATION_CAMERAS)
 
-    calibrated = calibrate(model, sensitivity, ReferenceRenders.from_model(model, CAMERAS), 1e-4)
+    calibrated = calibrate(model, sensitivity, ReferenceRenders.from_model(model, CALIBRATION_CAMERAS), 1e-4)
 
     for name in ("positions", "colors", "scales", "opacities"):
         np.testing.assert_array_equal(getattr(calibrated, name), getattr(sensitivity, name))
 
 
 @pytest.mark.parametrize("count", [1, 2])
-def test_one_and_two_cameras_will_do(count, model, first_order):
-    references = ReferenceRenders.from_model(model, CAMERAS[:count])
+def test_calibration_works_with_one_and_two_cameras(count, model, first_order):
+    references = ReferenceRenders.from_model(model, CALIBRATION_CAMERAS[:count])
 
     calibrated = calibrate(model, first_order, references, 1e-4)
 
@@ -146,21 +146,21 @@ def test_one_and_two_cameras_will_do(count, model, first_order):
     assert COLORS not in calibrated.fields
 
 
-# -- the search --------------------------------------------------------------------------------------------------------
+# -- correction -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("at_first", [7.0, 3.0, 0.2])
+@pytest.mark.parametrize("first_ratio", [7.0, 3.0, 0.2])
 @pytest.mark.parametrize("power", [0.6, 1.0, 1.4, 2.0])
-@pytest.mark.parametrize("law", [0.7, 1.0, 1.5])
-def test_errors_that_fall_by_any_power_are_met_in_three_tries(law, power, at_first):
-    factor, tries = CorrectionFactor(law), 0
+@pytest.mark.parametrize("exponent", [0.7, 1.0, 1.5])
+def test_the_correction_converges_in_three_rounds_for_any_power_law(exponent, power, first_ratio):
+    factor, tries = CorrectionFactor(exponent), 0
     while not factor.converged:
-        factor.update(at_first * factor.value**-power)
+        factor.update(first_ratio * factor.value**-power)
         tries += 1
-    assert tries <= 3 and at_first * factor.final**-power < PREDICTION_TOLERANCE_RATIO
+    assert tries <= 3 and first_ratio * factor.final**-power < PREDICTION_TOLERANCE_RATIO
 
 
-def test_errors_that_jump_are_bracketed():
+def test_the_correction_brackets_a_jump_of_the_error():
     factor = CorrectionFactor(0.7)
     for _ in range(20):
         if factor.converged:
@@ -170,7 +170,7 @@ def test_errors_that_jump_are_bracketed():
 
 
 @pytest.mark.parametrize("ratio", [0.0, 1.0])
-def test_errors_that_do_not_change_end_no_search_badly(ratio):
+def test_the_correction_stays_finite_for_constant_errors(ratio):
     factor = CorrectionFactor(1.0)
     for _ in range(MAX_CORRECTION_ROUNDS):
         factor.update(ratio)
@@ -178,10 +178,10 @@ def test_errors_that_do_not_change_end_no_search_badly(ratio):
 
 
 @pytest.mark.parametrize("part", CALIBRATED_PARTS[1:], ids="".join)
-@pytest.mark.parametrize("says", [0.2, 0.0])
-def test_what_a_part_does_not_change_need_not_be_decoded_anew(part, says):
-    before = layers(200)
-    if not says:  # a decoder of colours that says nothing
+@pytest.mark.parametrize("decoder_scale", [0.2, 0.0])
+def test_updating_changed_parts_equals_decoding_the_whole_model(part, decoder_scale):
+    before = overlapping_model(200)
+    if not decoder_scale:  # with zero weights the colour decoder has no influence
         before.radiance.weights[-1].data.zero_(), before.radiance.biases[-1].data.zero_()
     changed = deepcopy(before)
     arrays = to_arrays(before)
@@ -189,9 +189,9 @@ def test_what_a_part_does_not_change_need_not_be_decoded_anew(part, says):
     other = {name: arrays[name] * generator.uniform(0.5, 1.5, arrays[name].shape).astype(np.float32) for name in part}
     changed.load_state_dict(dict(iter_parameters(other, changed)), strict=False)
 
-    found = ReferenceRenders.from_model(before, CAMERAS).measure_error(
+    measured = ReferenceRenders.from_model(before, CALIBRATION_CAMERAS).measure_error(
         changed, _update_decoded(changed, before.decode(), part)
     )
 
-    expected = ReferenceRenders.from_model(before, CAMERAS).measure_error(changed)
-    assert found == pytest.approx(expected, rel=1e-3) and (expected > 1e-7 or not says)
+    expected = ReferenceRenders.from_model(before, CALIBRATION_CAMERAS).measure_error(changed)
+    assert measured == pytest.approx(expected, rel=1e-3) and (expected > 1e-7 or not decoder_scale)

@@ -1,4 +1,4 @@
-"""Packing a model beside which photos' exposures were learnt: one exposure is kept, and so is the exposure map."""
+"""Packing a model that was trained with exposure compensation keeps its mean exposure and its exposure map."""
 
 from __future__ import annotations
 
@@ -21,24 +21,26 @@ from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.scene import Scene, View
 from hyrfpack.train import TrainConfig, train_model
 
-GAINS = alternating_gains(8, stops=1.0)
-MEAN = np.exp(np.log(GAINS).mean())
+PHOTO_GAINS = alternating_gains(8, stops=1.0)
+MEAN_GAIN = np.exp(np.log(PHOTO_GAINS).mean())
 
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return exposed_scene(GAINS, side=32)
+    return exposed_scene(PHOTO_GAINS, side=32)
 
 
 @pytest.fixture(scope="module")
-def truth() -> list[View]:
-    """What photos of the mean exposure would show."""
-    return [view_of(v.name, v.camera, expose_picture(v.load(), MEAN)) for v in ball_scene(len(GAINS), 300).train]
+def mean_exposure_views() -> list[View]:
+    """Return the photos as they would be at the mean exposure."""
+    return [
+        view_of(v.name, v.camera, expose_picture(v.load(), MEAN_GAIN)) for v in ball_scene(len(PHOTO_GAINS), 300).train
+    ]
 
 
 @pytest.fixture(scope="module")
-def trained(scene, tmp_path_factory) -> Path:
-    """A model of the mean exposure without an exposure map, as earlier versions wrote it."""
+def model_file(scene, tmp_path_factory) -> Path:
+    """Train a model at the mean exposure and write it without an exposure map, as earlier versions did."""
     folder = tmp_path_factory.mktemp("trained")
     config = TrainConfig(steps=150, max_gaussians=300, exposure=True)
     model, provenance = load_with_provenance(train_model(scene, folder / "run", config, quiet=True).model)
@@ -48,17 +50,17 @@ def trained(scene, tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def unaware(trained, tmp_path_factory) -> Path:
-    """The same model in a file that does not tell of exposures, as older ones do not."""
-    model, provenance = load_with_provenance(trained)
+def file_without_exposure_note(model_file, tmp_path_factory) -> Path:
+    """Write the same model without the note on exposures, as older versions did."""
+    model, provenance = load_with_provenance(model_file)
     del provenance["mean_exposure"]
     path = tmp_path_factory.mktemp("unaware") / "model.hyrf"
     save_model(model, path, provenance=provenance)
     return path
 
 
-def with_map(source: Path, scene: Scene, gains: np.ndarray, path: Path) -> Path:
-    """A model in a file with a map of these gains of the training photos."""
+def write_model_with_map(source: Path, scene: Scene, gains: np.ndarray, path: Path) -> Path:
+    """Write the model with a map of these gains of the training photos."""
     model, provenance = load_with_provenance(source)
     model.exposure = map_with_gains([view.camera for view in scene.train], model.config.frame, gains)
     save_model(model, path, provenance=provenance)
@@ -66,75 +68,82 @@ def with_map(source: Path, scene: Scene, gains: np.ndarray, path: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def mapped(trained, scene, tmp_path_factory) -> Path:
-    """The same model with a map of the photos' gains."""
-    return with_map(trained, scene, GAINS / MEAN, tmp_path_factory.mktemp("mapped") / "model.hyrf")
+def file_with_map(model_file, scene, tmp_path_factory) -> Path:
+    """Write the same model with a map of the photos' gains."""
+    return write_model_with_map(
+        model_file, scene, PHOTO_GAINS / MEAN_GAIN, tmp_path_factory.mktemp("mapped") / "model.hyrf"
+    )
 
 
-def drift(before: Path, after: Path, scene: Scene) -> float:
-    """The mean log gain by which renders at one exposure of one file differ from those of another."""
+def mean_log_gain_between(before: Path, after: Path, scene: Scene) -> float:
+    """Return the mean log gain between renders of two files at the consistent exposure."""
     models, settings = (load_model(before), load_model(after)), RenderSettings(exposure="consistent")
     pairs = [[render_view(model, view.camera, settings).rgb for model in models] for view in scene.train]
     return float(np.mean([np.log(fit_gains(*pair)) for pair in pairs]))
 
 
-def test_without_a_map_gains_are_those_of_the_photos_about_the_mean_exposure(trained, scene):
-    gains = np.array([gains.numpy() for gains in fit_residual_gains(load_model(trained), scene.train).values()])
+def test_without_a_map_fitted_gains_are_relative_to_the_mean_exposure(model_file, scene):
+    gains = np.array([gains.numpy() for gains in fit_residual_gains(load_model(model_file), scene.train).values()])
     np.testing.assert_allclose(np.log(gains).mean(0), 0, atol=0.05)
-    np.testing.assert_allclose(np.log(gains).mean(1), np.log(GAINS / MEAN)[:, 0], atol=0.15)
+    np.testing.assert_allclose(np.log(gains).mean(1), np.log(PHOTO_GAINS / MEAN_GAIN)[:, 0], atol=0.15)
 
 
-def test_with_a_map_gains_are_what_the_map_leaves_of_each_photo(trained, scene, tmp_path):
-    half = with_map(trained, scene, np.sqrt(GAINS / MEAN), tmp_path / "half.hyrf")
+def test_with_a_map_fitted_gains_are_relative_to_the_map(model_file, scene, tmp_path):
+    half = write_model_with_map(model_file, scene, np.sqrt(PHOTO_GAINS / MEAN_GAIN), tmp_path / "half.hyrf")
     gains = np.array([gains.numpy() for gains in fit_residual_gains(load_model(half), scene.train).values()])
-    np.testing.assert_allclose(np.log(gains).mean(1), np.log(GAINS / MEAN)[:, 0] / 2, atol=0.15)
+    np.testing.assert_allclose(np.log(gains).mean(1), np.log(PHOTO_GAINS / MEAN_GAIN)[:, 0] / 2, atol=0.15)
 
 
-def test_fine_tuning_keeps_the_mean_exposure_and_the_file_says_so(trained, unaware, scene, truth, tmp_path):
+def test_finetuning_keeps_the_mean_exposure_and_its_note_in_the_file(
+    model_file, file_without_exposure_note, scene, mean_exposure_views, tmp_path
+):
     scores, told = [], []
-    for source in (trained, unaware):
+    for source in (model_file, file_without_exposure_note):
         compress_model(source, tmp_path / "small.hyrf", data=scene, finetune_steps=160)
-        scores.append(evaluate_model(load_model(tmp_path / "small.hyrf"), truth).psnr)
+        scores.append(evaluate_model(load_model(tmp_path / "small.hyrf"), mean_exposure_views).psnr)
         told.append(has_mean_exposure(describe_file(tmp_path / "small.hyrf")["provenance"]))
 
     assert told == [True, False]
     assert scores[0] > scores[1] + 1
 
 
-def test_fine_tuning_keeps_the_map_and_the_consistent_exposure_and_fits_renders_to_the_photos(mapped, scene, tmp_path):
-    compress_model(mapped, tmp_path / "coarse.hyrf", data=scene, distortion=2e-4)
-    compress_model(mapped, tmp_path / "fitted.hyrf", data=scene, distortion=2e-4, finetune_steps=160)
+def test_finetuning_keeps_the_map_and_the_consistent_exposure_and_improves_the_fit(file_with_map, scene, tmp_path):
+    compress_model(file_with_map, tmp_path / "coarse.hyrf", data=scene, distortion=2e-4)
+    compress_model(file_with_map, tmp_path / "fitted.hyrf", data=scene, distortion=2e-4, finetune_steps=160)
 
     tuned = load_model(tmp_path / "fitted.hyrf")
-    for name, values in vars(load_model(mapped).exposure).items():
+    for name, values in vars(load_model(file_with_map).exposure).items():
         np.testing.assert_array_equal(getattr(tuned.exposure, name), values)
-    assert abs(drift(mapped, tmp_path / "fitted.hyrf", scene)) < 0.03
+    assert abs(mean_log_gain_between(file_with_map, tmp_path / "fitted.hyrf", scene)) < 0.03
     scores = evaluate_model(tuned, scene.train)
     assert scores.psnr > evaluate_model(load_model(tmp_path / "coarse.hyrf"), scene.train).psnr + 0.3
     assert scores.psnr > scores.psnr_consistent + 1
 
 
-def test_fine_tuning_does_not_bake_what_a_map_has_wrong_into_the_consistent_exposure(trained, scene, tmp_path):
-    source = with_map(trained, scene, 1.5 * GAINS / MEAN, tmp_path / "light.hyrf")
+def test_finetuning_does_not_compensate_errors_of_the_map(model_file, scene, tmp_path):
+    source = write_model_with_map(model_file, scene, 1.5 * PHOTO_GAINS / MEAN_GAIN, tmp_path / "light.hyrf")
     compress_model(source, tmp_path / "fitted.hyrf", data=scene, finetune_steps=160)
-    assert abs(drift(source, tmp_path / "fitted.hyrf", scene)) < 0.03  # of log 1.5 = 0.41 that the map is off by
+    # The map is wrong by log 1.5 = 0.41.
+    assert abs(mean_log_gain_between(source, tmp_path / "fitted.hyrf", scene)) < 0.03
 
 
-def test_gains_are_fitted_once_for_all_files_of_a_search_and_only_where_exposures_were_learnt(
-    trained, unaware, scene, tmp_path, monkeypatch
+def test_gains_are_fitted_once_per_search_and_only_with_learned_exposures(
+    model_file, file_without_exposure_note, scene, tmp_path, monkeypatch
 ):
     fitted = []
     monkeypatch.setattr(packer, "fit_residual_gains", lambda *of: fitted.append(of) or fit_residual_gains(*of))
-    mapped = with_map(unaware, scene, GAINS / MEAN, tmp_path / "mapped.hyrf")
-    for source, calls in ((unaware, 0), (trained, 1), (mapped, 2)):
+    file_with_map = write_model_with_map(
+        file_without_exposure_note, scene, PHOTO_GAINS / MEAN_GAIN, tmp_path / "mapped.hyrf"
+    )
+    for source, calls in ((file_without_exposure_note, 0), (model_file, 1), (file_with_map, 2)):
         compress_model(source, tmp_path / "small.hyrf", data=scene, finetune_steps=1, target_bytes=12_000)
         assert len(fitted) == calls
 
 
-def test_a_limit_on_the_loss_is_on_the_psnr_of_what_render_shows(mapped, scene, tmp_path):
-    report = compress_model(mapped, tmp_path / "small.hyrf", data=scene, max_psnr_drop=0.5)
+def test_max_psnr_drop_limits_the_psnr_of_renders_as_photographed(file_with_map, scene, tmp_path):
+    report = compress_model(file_with_map, tmp_path / "small.hyrf", data=scene, max_psnr_drop=0.5)
 
-    before, after = (evaluate_model(load_model(path), scene.train) for path in (mapped, tmp_path / "small.hyrf"))
+    before, after = (evaluate_model(load_model(path), scene.train) for path in (file_with_map, tmp_path / "small.hyrf"))
     lost = before.psnr - after.psnr
     assert lost == pytest.approx(float(re.search(r"loses (\S+) of", report.found)[1]), abs=6e-4)
     assert lost <= 0.5 and abs(lost - (before.psnr_consistent - after.psnr_consistent)) > 1e-3

@@ -1,4 +1,4 @@
-"""Packing a model with an exposure map: the file has the map, and losses are those of renders as photographed."""
+"""Packing a model with an exposure map keeps the map and measures losses on renders as photographed."""
 
 from __future__ import annotations
 
@@ -21,11 +21,12 @@ from hyrfpack.model import ExposureMap, HybridModel
 from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.scene import Picture, Scene
 
-LOG_GAIN = 2.0  # of every viewpoint; 0.5 is shown as 0.88
+# The map has this log gain at every viewpoint, which turns a colour of 0.5 into 0.88.
+CONSTANT_LOG_GAIN = 2.0
 
 
-def bright() -> ExposureMap:
-    gains = np.full(3, LOG_GAIN, np.float32)
+def constant_map() -> ExposureMap:
+    gains = np.full(3, CONSTANT_LOG_GAIN, np.float32)
     return dataclasses.replace(random_map(0, centers=9), mean=gains, limits=np.stack((gains, gains)))
 
 
@@ -34,13 +35,13 @@ def model() -> HybridModel:
     points, colors = ball_points(400)
     logits = np.log(colors / (1 - colors))
     model = small_model(points, fields=0.3, color_logits=logits, scale_logits=-2.5, opacity_logits=2.0)
-    model.exposure = bright()
+    model.exposure = constant_map()
     return model.requires_grad_(False)
 
 
 @pytest.fixture(scope="module")
 def scene(model) -> Scene:
-    """Photos that show what the model's renders as photographed show, and noise of about 33 dB."""
+    """Return photos that equal the model's renders as photographed plus noise of about 33 dB."""
     rng, views = np.random.default_rng(0), []
     for view in ball_scene(8).train:
         rgb = 255 * render_view(model, view.camera).rgb.numpy() + rng.normal(0, 6, (32, 32, 3))
@@ -73,7 +74,7 @@ def test_a_packed_file_keeps_the_map(options, source, scene, tmp_path):
     data = None if "profile" in options else scene
     report = compress_model(source, tmp_path / "small.hyrf", data=data, **options)
 
-    assert maps_equal(load_model(tmp_path / "small.hyrf").exposure, bright())
+    assert maps_equal(load_model(tmp_path / "small.hyrf").exposure, constant_map())
     assert describe_file(tmp_path / "small.hyrf")["version"] == "1.2"
     assert "EXPO" in {section.type for section in report.sections}
 
@@ -92,9 +93,8 @@ def test_the_error_is_measured_on_renders_as_photographed(model, source, scene, 
         ]
         errors[exposure] = float(torch.stack(differences).mean())
     assert report.error / 1.5 < errors["as-photographed"] < 1.5 * report.error
-    assert (
-        errors[CONSISTENT_EXPOSURE] < errors["as-photographed"] / 1.5
-    )  # the two differ, so the test can tell them apart
+    # The two errors must differ for the test to distinguish them.
+    assert errors[CONSISTENT_EXPOSURE] < errors["as-photographed"] / 1.5
 
 
 def test_fine_tuning_fits_renders_as_photographed_and_leaves_the_exposure_to_the_map(model, source, scene, tmp_path):
@@ -108,8 +108,8 @@ def test_fine_tuning_fits_renders_as_photographed_and_leaves_the_exposure_to_the
         assert float(shown) == pytest.approx(float(expected), abs=0.02)
 
 
-def test_a_target_size_below_the_smallest_file_with_a_map_is_refused(source, tmp_path):
-    assert min_file_bytes(exposure=bright()) > min_file_bytes() + 84
-    with pytest.raises(HyrfError, match=f"about {min_file_bytes(exposure=bright()):,} bytes"):
+def test_a_target_size_below_the_minimum_with_a_map_is_refused(source, tmp_path):
+    assert min_file_bytes(exposure=constant_map()) > min_file_bytes() + 84
+    with pytest.raises(HyrfError, match=f"about {min_file_bytes(exposure=constant_map()):,} bytes"):
         compress_model(source, tmp_path / "small.hyrf", target_bytes=min_file_bytes() + 1)
     assert not (tmp_path / "small.hyrf").exists()

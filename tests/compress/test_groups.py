@@ -1,4 +1,4 @@
-"""Numbers in groups, quantised, to bytes and back, and the rule that chooses every symbol."""
+"""Values in step groups round-trip within their error bounds, and symbols minimise rate-distortion cost."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ def random_groups(count: int, groups: int, seed: int = 0) -> StepGroups:
     return StepGroups(np.random.default_rng(seed).integers(groups, size=count), groups)
 
 
-def laplace(groups: StepGroups, seed: int = 1) -> np.ndarray:
-    """Numbers that are wider from group to group."""
+def laplace_values(groups: StepGroups, seed: int = 1) -> np.ndarray:
+    """Return Laplace-distributed values whose scale grows from group to group."""
     return np.random.default_rng(seed).laplace(size=len(groups.index)) * 1.3 ** (groups.index % 10)
 
 
@@ -46,7 +46,7 @@ def check_round_trip(chosen: GroupSymbols, groups: StepGroups) -> bytes:
 @pytest.mark.parametrize("number", [1, 5, 300])
 def test_groups_round_trip(count: int, number: int, reach: int) -> None:
     groups = random_groups(count, number)
-    values = laplace(groups) if number < 300 else np.random.default_rng(2).normal(size=count)
+    values = laplace_values(groups) if number < 300 else np.random.default_rng(2).normal(size=count)
 
     for distortion in (1e-9, 1e-2, 1e9):
         check_round_trip(quantize_groups(values, groups, np.ones(count), distortion, reach), groups)
@@ -70,16 +70,16 @@ def test_any_groups_round_trip_within_their_bound(data: st.DataObject) -> None:
     assert (chosen.values[~coded] == 0).all()
 
 
-def test_many_numbers_round_trip() -> None:
+def test_many_values_round_trip() -> None:
     groups = random_groups(300_000, 100)
 
-    check_round_trip(quantize_groups(laplace(groups), groups, np.ones(300_000), 1e-2), groups)
+    check_round_trip(quantize_groups(laplace_values(groups), groups, np.ones(300_000), 1e-2), groups)
 
 
 @pytest.mark.parametrize("error", [1e-5, 1e-3, 0.1, 10.0])
-def test_without_reach_the_error_is_half_a_step_at_most(error: float) -> None:
+def test_with_reach_0_the_error_is_at_most_half_a_step(error: float) -> None:
     groups = random_groups(5000, 10)
-    values = laplace(groups)
+    values = laplace_values(groups)
 
     chosen = quantize_groups(values, groups, np.ones(5000), error**2, reach=0)
 
@@ -87,7 +87,7 @@ def test_without_reach_the_error_is_half_a_step_at_most(error: float) -> None:
     assert (np.abs(chosen.values - values) <= steps / 2 + np.abs(values) * 2**-23).all()
 
 
-def test_every_number_adds_the_error_it_may() -> None:
+def test_every_group_adds_its_allowed_distortion() -> None:
     groups = random_groups(60_000, 6)
     sensitivity = 8.0 ** -groups.index.astype(float)
     values = 100 * np.random.default_rng(1).normal(size=60_000)
@@ -96,12 +96,12 @@ def test_every_number_adds_the_error_it_may() -> None:
 
     for group in range(6):
         added = (sensitivity * (chosen.values - values) ** 2)[groups.index == group].mean()
-        assert 0.85 < added / 1e-4 < 1.15  # a step is at most 1/16 from the one asked for
+        assert 0.85 < added / 1e-4 < 1.15  # a step differs from the requested one by at most 1/16
 
 
-def test_groups_nobody_sees_become_zeros_and_take_no_symbols() -> None:
+def test_groups_without_sensitivity_become_zeros_without_symbols() -> None:
     groups = random_groups(2000, 4)
-    values, seen = laplace(groups), np.where(groups.index == 2, 0.0, 1.0)
+    values, seen = laplace_values(groups), np.where(groups.index == 2, 0.0, 1.0)
     kept = groups.index != 2
     without = StepGroups(groups.index[kept], 4)
 
@@ -114,7 +114,7 @@ def test_groups_nobody_sees_become_zeros_and_take_no_symbols() -> None:
     )
 
 
-def test_groups_of_zeros_take_hardly_any_bytes() -> None:
+def test_groups_of_zeros_take_few_bytes() -> None:
     groups = random_groups(100_000, 512)
 
     for values in (np.zeros(100_000), np.full(100_000, 1e-6)):
@@ -129,7 +129,7 @@ def test_a_group_without_members_is_not_coded() -> None:
     assert np.flatnonzero(chosen.codes).tolist() == [3]
 
 
-def test_numbers_beyond_the_largest_symbol_are_cut() -> None:
+def test_values_beyond_the_largest_symbol_are_clipped() -> None:
     groups = StepGroups(np.zeros(3, np.int64), 1)
 
     chosen = quantize_groups(np.array([1e30, -1e30, 1.0]), groups, np.ones(3), 1e-6, reach=0)
@@ -139,23 +139,23 @@ def test_numbers_beyond_the_largest_symbol_are_cut() -> None:
 
 
 @pytest.mark.parametrize(("value", "distortion"), [(1e6, 1e-6), (10.0, 1e-16)])
-def test_numbers_beyond_the_largest_symbol_are_cut_with_reach_too(value: float, distortion: float) -> None:
+def test_values_beyond_the_largest_symbol_are_clipped_with_reach_too(value: float, distortion: float) -> None:
     groups = StepGroups(np.zeros(2, np.int64), 1)
 
     check_round_trip(quantize_groups(np.array([value, 1.0]), groups, np.ones(2), distortion), groups)
 
 
-def test_the_same_numbers_give_the_same_bytes() -> None:
+def test_encoding_is_deterministic() -> None:
     groups = random_groups(3000, 30)
-    values = laplace(groups)
+    values = laplace_values(groups)
 
     written = {encode_groups(quantize_groups(values.copy(), groups, np.ones(3000), 1e-3), groups) for _ in range(2)}
 
     assert len(written) == 1
 
 
-def test_groups_that_spread_alike_share_a_model() -> None:
-    """Without models by spread, symbols of wide and narrow groups would be coded alike."""
+def test_groups_of_similar_spread_share_a_model() -> None:
+    """A single model would code the symbols of wide and narrow groups with the same bits."""
     groups = random_groups(40_000, 2)
     scale = np.array([0.2, 20.0])[groups.index]
     values = scale * np.random.default_rng(5).laplace(size=40_000)
@@ -168,24 +168,24 @@ def test_groups_that_spread_alike_share_a_model() -> None:
     assert sizes[0] < 0.9 * sizes[1]
 
 
-# The rule that chooses.
+# Choice of symbols.
 
 
 @given(st.lists(st.integers(-5000, 5000) | st.integers(-3, 3), max_size=60), st.integers(1, 4), st.integers(1, 4))
 @settings(max_examples=80, deadline=None)
-def test_bits_are_code_lengths_that_a_prefix_code_could_have(symbols: list[int], kinds: int, reach: int) -> None:
+def test_symbol_bits_satisfy_krafts_equality(symbols: list[int], kinds: int, reach: int) -> None:
     classes = np.arange(len(symbols)) % kinds
 
     bits, least = estimate_code_bits(np.array(symbols, np.int64), classes.astype(np.uint8), kinds, reach)
 
-    np.testing.assert_allclose((2.0**-bits).sum(axis=1), 1, rtol=1e-9)  # Kraft's sum
+    np.testing.assert_allclose((2.0**-bits).sum(axis=1), 1, rtol=1e-9)  # Kraft's equality
     assert bits.size <= kinds * 4096
     if max([0, *symbols]) - min([0, *symbols]) < 4000:
         assert least <= min([0, *symbols]) - reach
         assert least + bits.shape[1] > max([0, *symbols]) + reach
 
 
-def test_bits_are_what_the_shares_of_symbols_say() -> None:
+def test_symbol_bits_follow_the_frequencies() -> None:
     symbols, classes = np.array([0] * 700 + [1] * 200 + [-1] * 100), np.zeros(1000, np.uint8)
 
     bits, least = estimate_code_bits(symbols, classes, 1, 1)
@@ -197,7 +197,7 @@ def test_bits_are_what_the_shares_of_symbols_say() -> None:
 
 @given(st.data())
 @settings(max_examples=80, deadline=None)
-def test_the_cheapest_symbol_is_the_best_of_all_within_reach(data: st.DataObject) -> None:
+def test_the_chosen_symbol_has_the_lowest_cost_within_reach(data: st.DataObject) -> None:
     pairs = data.draw(st.lists(st.tuples(st.integers(-6, 6), st.floats(-0.5, 0.5)), min_size=1, max_size=20))
     nearest = np.array([symbol for symbol, _ in pairs])
     values = nearest + np.array([offset for _, offset in pairs])
@@ -219,7 +219,7 @@ def test_the_cheapest_symbol_is_the_best_of_all_within_reach(data: st.DataObject
 
 @given(st.data())
 @settings(max_examples=60, deadline=None)
-def test_reach_never_costs_more_by_the_coders_own_measure(data: st.DataObject) -> None:
+def test_reach_never_raises_the_cost_by_the_coders_estimate(data: st.DataObject) -> None:
     values = np.array(data.draw(st.lists(st.floats(-20, 20), min_size=1, max_size=60)))
     groups = random_groups(len(values), data.draw(st.integers(1, 4)))
     distortion = 10.0 ** data.draw(st.floats(-3, 2))
@@ -236,9 +236,9 @@ def test_reach_never_costs_more_by_the_coders_own_measure(data: st.DataObject) -
 
 
 @pytest.mark.parametrize("error", [0.1, 0.3, 1.0, 3.0])
-def test_reach_costs_less_in_error_and_bytes_together(error: float) -> None:
+def test_reach_lowers_the_rate_distortion_cost(error: float) -> None:
     groups = random_groups(30_000, 8)
-    values, ones = laplace(groups), np.ones(30_000)
+    values, ones = laplace_values(groups), np.ones(30_000)
 
     def cost(reach: int) -> float:
         chosen = quantize_groups(values, groups, ones, error**2, reach)

@@ -1,4 +1,4 @@
-"""Compressing a trained file end to end, on photos of the demo's scene."""
+"""Compress a trained file end to end, on photos of the demo scene."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from hyrfpack.render import render_view
 from hyrfpack.scene import Scene
 from hyrfpack.train import TrainConfig, train_model
 
-SIZES = Path(__file__).parents[1] / "golden" / "trained_sizes.json"
+RECORDED_SIZES_FILE = Path(__file__).parents[1] / "golden" / "trained_sizes.json"
 
 
 @pytest.fixture(scope="module")
@@ -33,28 +33,28 @@ def scene(data) -> Scene:
 
 
 @pytest.fixture(scope="module")
-def trained(scene, tmp_path_factory) -> Path:
+def trained_file(scene, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("runs") / "small"
     return train_model(scene, folder, TrainConfig(steps=250, max_gaussians=1500), quiet=True).model
 
 
 @pytest.fixture(scope="module")
-def paper(trained, tmp_path_factory) -> Path:
+def paper_file(trained_file, tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("packed") / "paper.hyrf"
-    compress_model(trained, path, "paper")
+    compress_model(trained_file, path, "paper")
     return path
 
 
 @pytest.fixture(scope="module")
-def compact(trained, scene, tmp_path_factory) -> tuple[Path, object]:
+def compact_file_and_report(trained_file, scene, tmp_path_factory) -> tuple[Path, object]:
     path = tmp_path_factory.mktemp("packed") / "compact.hyrf"
-    return path, compress_model(trained, path, data=scene)
+    return path, compress_model(trained_file, path, data=scene)
 
 
 @pytest.fixture(scope="module")
-def tuned(trained, scene, tmp_path_factory) -> Path:
+def finetuned_file(trained_file, scene, tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("packed") / "tuned.hyrf"
-    compress_model(trained, path, data=scene, finetune_steps=60)
+    compress_model(trained_file, path, data=scene, finetune_steps=60)
     return path
 
 
@@ -62,8 +62,8 @@ def psnr(path: Path, scene: Scene) -> float:
     return evaluate_model(load_model(path), scene.test).psnr
 
 
-def squared_error(first: Path, second: Path, cameras) -> float:
-    """Between pictures of two files, mean over all."""
+def mean_squared_error(first: Path, second: Path, cameras) -> float:
+    """Return the mean squared error between the pictures of two files."""
     with torch.no_grad():
         pictures = [
             torch.cat([render_view(model, camera).rgb.flatten() for camera in cameras])
@@ -72,46 +72,44 @@ def squared_error(first: Path, second: Path, cameras) -> float:
     return float((pictures[0] - pictures[1]).double().square().mean())
 
 
-# -- what it is for --------------------------------------------------------------------------------------------------
+# -- size and loss --------------------------------------------------------------------------------------------------
 
 
-def test_it_is_smaller_than_the_paper_profile_by_far_at_hardly_any_loss(trained, paper, compact, scene):
-    path, _ = compact
+def test_compact_is_much_smaller_than_paper_with_little_loss(trained_file, paper_file, compact_file_and_report, scene):
+    path, _ = compact_file_and_report
 
-    assert path.stat().st_size < 0.4 * paper.stat().st_size
-    assert psnr(path, scene) > psnr(trained, scene) - 0.1
+    assert path.stat().st_size < 0.4 * paper_file.stat().st_size
+    assert psnr(path, scene) > psnr(trained_file, scene) - 0.1
 
 
-def test_with_a_limit_on_the_loss_it_loses_no_more_than_the_paper_profile_and_is_smaller(
-    trained, paper, scene, tmp_path
-):
-    allowed = max(psnr(trained, scene) - psnr(paper, scene), 0.0) + 0.02
+def test_compact_with_the_loss_of_paper_is_smaller(trained_file, paper_file, scene, tmp_path):
+    allowed = max(psnr(trained_file, scene) - psnr(paper_file, scene), 0.0) + 0.02
 
-    report = compress_model(trained, tmp_path / "small.hyrf", data=scene, max_psnr_drop=allowed)
+    report = compress_model(trained_file, tmp_path / "small.hyrf", data=scene, max_psnr_drop=allowed)
 
-    assert psnr(trained, scene) - psnr(tmp_path / "small.hyrf", scene) <= allowed + 1e-6
-    assert report.bytes_after < 0.7 * paper.stat().st_size
+    assert psnr(trained_file, scene) - psnr(tmp_path / "small.hyrf", scene) <= allowed + 1e-6
+    assert report.bytes_after < 0.7 * paper_file.stat().st_size
     assert f"of {allowed:g} dB on {len(scene.test)} photos" in report.found
 
 
-def test_the_report_is_of_the_file_and_its_estimate_of_the_pictures(trained, compact, scene):
-    path, report = compact
+def test_the_report_matches_the_file_and_predicts_the_error(trained_file, compact_file_and_report, scene):
+    path, report = compact_file_and_report
 
     assert report.profile == "compact" == describe_file(path)["profile"]
     assert report.bytes_after == path.stat().st_size
     assert report.gaussians == len(load_model(path))
     assert sum(report.shares.values()) == pytest.approx(1) and min(report.shares.values()) >= 0
     assert set(report.shares) == {"pruned", "POSI", "COLO", "SCAL", "OPAC", "GTAB", "GMLP", "RTAB", "RMLP"}
-    measured = squared_error(trained, path, [view.camera for view in scene.train])
+    measured = mean_squared_error(trained_file, path, [view.camera for view in scene.train])
     assert report.error / 1.5 < measured < 1.5 * report.error
 
 
-def test_the_distortion_that_is_asked_for_is_about_what_pictures_get(trained, scene, tmp_path):
+def test_the_measured_error_is_close_to_the_requested_distortion(trained_file, scene, tmp_path):
     cameras = [view.camera for view in scene.train]
     sizes, errors = [], []
     for distortion in (1e-4, 1e-5, 1e-6):
-        report = compress_model(trained, tmp_path / "small.hyrf", data=scene, distortion=distortion)
-        errors.append(squared_error(trained, tmp_path / "small.hyrf", cameras))
+        report = compress_model(trained_file, tmp_path / "small.hyrf", data=scene, distortion=distortion)
+        errors.append(mean_squared_error(trained_file, tmp_path / "small.hyrf", cameras))
         sizes.append(report.bytes_after)
         assert distortion / 1.75 < errors[-1] < 1.75 * distortion
 
@@ -119,56 +117,66 @@ def test_the_distortion_that_is_asked_for_is_about_what_pictures_get(trained, sc
 
 
 @pytest.mark.parametrize("share", [0.4, 0.8, 1.5])
-def test_a_target_size_is_met_and_nearly_used_up(share, trained, compact, scene, tmp_path):
-    target = int(share * compact[1].bytes_after)
+def test_a_target_size_is_met_and_nearly_reached(share, trained_file, compact_file_and_report, scene, tmp_path):
+    target = int(share * compact_file_and_report[1].bytes_after)
 
-    report = compress_model(trained, tmp_path / "small.hyrf", data=scene, target_bytes=target)
+    report = compress_model(trained_file, tmp_path / "small.hyrf", data=scene, target_bytes=target)
 
     assert 0.9 * target < (tmp_path / "small.hyrf").stat().st_size <= target
     assert f"of {target:,} bytes" in report.found
 
 
-def test_fine_tuning_fits_the_photos_better_in_the_same_bytes(trained, tuned, scene, tmp_path):
-    compress_model(trained, tmp_path / "plain.hyrf", data=scene, target_bytes=tuned.stat().st_size)
+def test_finetuning_raises_the_psnr_at_the_same_size(trained_file, finetuned_file, scene, tmp_path):
+    compress_model(trained_file, tmp_path / "plain.hyrf", data=scene, target_bytes=finetuned_file.stat().st_size)
 
-    fits = [evaluate_model(load_model(path), scene.train).psnr for path in (tuned, tmp_path / "plain.hyrf")]
+    fits = [evaluate_model(load_model(path), scene.train).psnr for path in (finetuned_file, tmp_path / "plain.hyrf")]
     assert fits[0] > fits[1] + 0.1
 
 
-def test_what_is_trained_measured_fine_tuned_and_exported_keeps_its_size(trained, paper, compact, tuned, tmp_path):
-    """On the real way from photos on; where a change is meant to change sizes, what it says here is recorded anew."""
+def test_sizes_after_training_packing_and_export_match_the_recorded_ones(
+    trained_file, paper_file, compact_file_and_report, finetuned_file, tmp_path
+):
+    """If a change is meant to change sizes, record the sizes in the message of this test as the new ones."""
     exported = tmp_path / "small.spz"
-    hyrfpack.export_model(compact[0], exported, degree=1)
-    files = {"raw": trained, "paper": paper, "compact": compact[0], "fine-tuned": tuned, "exported": exported}
+    hyrfpack.export_model(compact_file_and_report[0], exported, degree=1)
+    files = {
+        "raw": trained_file,
+        "paper": paper_file,
+        "compact": compact_file_and_report[0],
+        "fine-tuned": finetuned_file,
+        "exported": exported,
+    }
 
     sizes = {name: path.stat().st_size for name, path in files.items()}
 
-    assert sizes == pytest.approx(json.loads(SIZES.read_text()), rel=0.01)
+    assert sizes == pytest.approx(json.loads(RECORDED_SIZES_FILE.read_text()), rel=0.01)
 
 
-def test_any_number_of_threads_measures_and_writes_the_same(trained, compact, scene, tmp_path, monkeypatch):
+def test_results_do_not_depend_on_the_number_of_threads(
+    trained_file, compact_file_and_report, scene, tmp_path, monkeypatch
+):
     for threads in ("1", "3"):
         monkeypatch.setenv("HYRFPACK_THREADS", threads)
-        compress_model(trained, tmp_path / "small.hyrf", data=scene)
+        compress_model(trained_file, tmp_path / "small.hyrf", data=scene)
 
-        assert (tmp_path / "small.hyrf").read_bytes() == compact[0].read_bytes()
+        assert (tmp_path / "small.hyrf").read_bytes() == compact_file_and_report[0].read_bytes()
 
 
 @pytest.mark.parametrize("limit", [{"target_bytes": 9000}, {"max_psnr_drop": 0.3}], ids=["size", "loss"])
-def test_fine_tuning_keeps_to_limits(limit, trained, scene, tmp_path):
-    report = compress_model(trained, tmp_path / "small.hyrf", data=scene, finetune_steps=20, **limit)
+def test_finetuning_respects_limits(limit, trained_file, scene, tmp_path):
+    report = compress_model(trained_file, tmp_path / "small.hyrf", data=scene, finetune_steps=20, **limit)
 
     if "target_bytes" in limit:
         assert 0.6 * 9000 < report.bytes_after <= 9000
     else:
-        assert psnr(trained, scene) - psnr(tmp_path / "small.hyrf", scene) <= 0.3 + 1e-6
+        assert psnr(trained_file, scene) - psnr(tmp_path / "small.hyrf", scene) <= 0.3 + 1e-6
 
 
-def test_pruning_leaves_out_gaussians_and_bytes_and_not_pruning_keeps_all(trained, scene, tmp_path):
-    model = load_model(trained)
+def test_pruning_removes_gaussians_and_bytes_and_can_be_disabled(trained_file, scene, tmp_path):
+    model = load_model(trained_file)
     every = len(model)
     with torch.no_grad():
-        model.gaussians.opacity_logits[: every // 3] -= 20  # hardly to be seen
+        model.gaussians.opacity_logits[: every // 3] -= 20  # makes them almost invisible
     save_model(model, tmp_path / "some.hyrf")
 
     kept = compress_model(tmp_path / "some.hyrf", tmp_path / "all.hyrf", data=scene, distortion=1e-4, prune=False)
@@ -178,22 +186,25 @@ def test_pruning_leaves_out_gaussians_and_bytes_and_not_pruning_keeps_all(traine
     assert pruned.bytes_after < kept.bytes_after
 
 
-# -- how it goes about it --------------------------------------------------------------------------------------------
+# -- search and inputs ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    ("off", "made", "taken"),
+    ("picture_error", "expected_trials", "expected"),
     [
-        (lambda distortion: 1.1 * distortion, [1e-3], 1e-3),  # as asked for, or nearly
+        (lambda distortion: 1.1 * distortion, [1e-3], 1e-3),  # the error is close enough to the requested one
         (lambda distortion: 4 * distortion, [1e-3, 1e-3 / 4], 1e-3 / 4),
         (lambda distortion: distortion / 1.9, [1e-3, 1.9e-3], 1.9e-3),
         (lambda distortion: 100 * distortion, [1e-3, 1e-3 / 16, 1e-3 / 100], 1e-3 / 100),
-        (lambda distortion: 5e-4 if distortion < 2e-3 else 1e-1, [1e-3, 2e-3], 1e-3),  # a jump: the finer one
-        (lambda distortion: 0.0, [1e-3], 1e-3),  # nothing is seen
+        # At a jump of the error the finer candidate is taken.
+        (lambda distortion: 5e-4 if distortion < 2e-3 else 1e-1, [1e-3, 2e-3], 1e-3),
+        (lambda distortion: 0.0, [1e-3], 1e-3),  # the error is not visible
     ],
 )
-def test_pictures_that_are_off_by_more_or_less_than_was_asked_for_are_mended(off, made, taken, monkeypatch):
-    """A packer that makes distortions, of which pictures are off by what `off` says."""
+def test_the_distortion_is_adjusted_until_the_measured_error_matches(
+    picture_error, expected_trials, expected, monkeypatch
+):
+    """The fake packer's candidates are distortions, whose measured error is `picture_error`."""
     tried: list[float] = []
     packer = running.Packer(None, {}, None, None, 0, True, lambda sentence: None)
     monkeypatch.setattr(
@@ -203,23 +214,25 @@ def test_pictures_that_are_off_by_more_or_less_than_was_asked_for_are_mended(off
     )
     monkeypatch.setattr(running.Packer, "decode", lambda packer, trial: trial.data)
 
-    trial = packer.encode_to_distortion(1e-3, SimpleNamespace(measure_error=off))
+    trial = packer.encode_to_distortion(1e-3, SimpleNamespace(measure_error=picture_error))
 
-    assert tried == pytest.approx(made)
-    assert trial.data == pytest.approx(taken) and trial.measured_error == off(trial.data)
+    assert tried == pytest.approx(expected_trials)
+    assert trial.data == pytest.approx(expected) and trial.measured_error == picture_error(trial.data)
 
 
 @pytest.mark.parametrize(
-    ("lost", "made", "taken"),
+    ("psnr_drop", "expected_trials", "expected"),
     [
-        (lambda distortion: 140 * distortion, [1e-3], 1e-3),  # 0.14 dB for an aim of 0.1
-        (lambda distortion: -0.3, [1e-3], 1e-3),  # photos gain
+        (lambda distortion: 140 * distortion, [1e-3], 1e-3),  # 0.14 dB is close enough to the target of 0.1 dB
+        (lambda distortion: -0.3, [1e-3], 1e-3),  # the PSNR on photos rises
         (lambda distortion: 400 * distortion, [1e-3, 1e-3 / 4], 1e-3 / 4),
         (lambda distortion: 10 * distortion**0.5, [1e-3, 10**-3.5, 10**-3.75], 10**-3.75),  # correlated errors
     ],
 )
-def test_files_that_cost_training_photos_more_than_was_aimed_at_are_made_finer(lost, made, taken, monkeypatch):
-    """A packer whose files cost training photos the dB that `lost` says, of the model's 30."""
+def test_the_distortion_is_lowered_until_the_drop_on_training_photos_is_met(
+    psnr_drop, expected_trials, expected, monkeypatch
+):
+    """The fake packer's candidates lower the PSNR on training photos from 30 dB by `psnr_drop`."""
     tried: list[float] = []
     scene = SimpleNamespace(train=["a photo"])
     packer = running.Packer(None, {}, None, scene, 0, True, lambda sentence: None)
@@ -230,16 +243,16 @@ def test_files_that_cost_training_photos_more_than_was_aimed_at_are_made_finer(l
     monkeypatch.setattr(
         running,
         "evaluate",
-        lambda shown, views, report: SimpleNamespace(psnr=30.0 if shown is None else 30.0 - lost(shown)),
+        lambda shown, views, report: SimpleNamespace(psnr=30.0 if shown is None else 30.0 - psnr_drop(shown)),
     )
 
     trial = packer.encode_to_distortion(1e-3, SimpleNamespace(measure_error=lambda distortion: distortion), 0.1)
 
-    assert tried == pytest.approx(made, rel=1e-3)
-    assert trial.data == trial.measured_error == pytest.approx(taken, rel=1e-3)
+    assert tried == pytest.approx(expected_trials, rel=1e-3)
+    assert trial.data == trial.measured_error == pytest.approx(expected, rel=1e-3)
 
 
-def test_photos_that_cannot_be_read_do_not_end_the_work(monkeypatch):
+def test_unreadable_photos_do_not_stop_packing(monkeypatch):
     said: list[str] = []
     packer = running.Packer(None, {}, None, SimpleNamespace(train=["a photo"]), 0, True, said.append)
     monkeypatch.setattr(packer, "encode", lambda distortion, *_: running.EncodedCandidate(distortion, {}))
@@ -256,67 +269,75 @@ def test_photos_that_cannot_be_read_do_not_end_the_work(monkeypatch):
     assert said == ["a.png: the file is gone; copy it again; the loss on training photos is not measured"]
 
 
-def test_without_photos_it_looks_from_the_cameras_that_the_file_keeps(trained, scene, tmp_path):
-    """They are those of the photos, to nine digits."""
+def test_without_photos_the_stored_cameras_are_used(trained_file, scene, tmp_path):
+    """The stored cameras equal those of the photos to nine digits."""
     said = []
-    wanted = default_distortion(hyrfpack.describe_file(trained)["provenance"])
+    wanted = default_distortion(hyrfpack.describe_file(trained_file)["provenance"])
 
-    report = compress_model(trained, tmp_path / "small.hyrf", say=said.append)
-    beside = compress_model(trained, tmp_path / "beside.hyrf", data=scene, distortion=wanted)
+    report = compress_model(trained_file, tmp_path / "small.hyrf", say=said.append)
+    beside = compress_model(trained_file, tmp_path / "beside.hyrf", data=scene, distortion=wanted)
 
     assert f"at {len(scene.train)} cameras" in said[0]
     assert report.bytes_after == pytest.approx(beside.bytes_after, rel=0.02)
 
 
-def test_without_photos_and_cameras_it_goes_around_the_scene(trained, compact, scene, tmp_path):
-    provenance = describe_file(trained)["provenance"]
+def test_without_photos_and_cameras_an_orbit_is_used(trained_file, compact_file_and_report, scene, tmp_path):
+    provenance = describe_file(trained_file)["provenance"]
     del provenance["cameras"]
-    save_model(load_model(trained), tmp_path / "bare.hyrf", "raw", provenance)
+    save_model(load_model(trained_file), tmp_path / "bare.hyrf", "raw", provenance)
 
     report = compress_model(tmp_path / "bare.hyrf", tmp_path / "small.hyrf")
 
-    assert report.bytes_after < 2 * compact[1].bytes_after
-    assert psnr(tmp_path / "small.hyrf", scene) > psnr(trained, scene) - 1
+    assert report.bytes_after < 2 * compact_file_and_report[1].bytes_after
+    assert psnr(tmp_path / "small.hyrf", scene) > psnr(trained_file, scene) - 1
 
 
-def test_provenance_goes_along_with_some_cameras(trained, compact, paper):
-    before, after = describe_file(trained)["provenance"], describe_file(compact[0])["provenance"]
+def test_provenance_is_kept_with_a_sample_of_cameras(trained_file, compact_file_and_report, paper_file):
+    before, after = describe_file(trained_file)["provenance"], describe_file(compact_file_and_report[0])["provenance"]
 
     assert (
         after
-        == describe_file(paper)["provenance"]
-        == quantized_provenance(before, describe_file(trained)["config"]["frame"]["scale"])
+        == describe_file(paper_file)["provenance"]
+        == quantized_provenance(before, describe_file(trained_file)["config"]["frame"]["scale"])
     )
     assert 0 < len(after["coarse_cameras"]) <= MAX_COARSE_CAMERAS and "cameras" in before and "cameras" not in after
 
 
-def test_a_compressed_file_can_be_compressed_again_and_unpacked_exactly(paper, compact, scene, tmp_path):
-    from_paper = compress_model(paper, tmp_path / "small.hyrf", data=scene)
-    compress_model(compact[0], tmp_path / "back.hyrf", "raw")
+def test_a_compressed_file_can_be_recompressed_and_unpacked_exactly(
+    paper_file, compact_file_and_report, scene, tmp_path
+):
+    from_paper = compress_model(paper_file, tmp_path / "small.hyrf", data=scene)
+    compress_model(compact_file_and_report[0], tmp_path / "back.hyrf", "raw")
 
-    assert from_paper.bytes_after < paper.stat().st_size
-    pairs = zip(load_model(compact[0]).parameters(), load_model(tmp_path / "back.hyrf").parameters(), strict=True)
+    assert from_paper.bytes_after < paper_file.stat().st_size
+    pairs = zip(
+        load_model(compact_file_and_report[0]).parameters(),
+        load_model(tmp_path / "back.hyrf").parameters(),
+        strict=True,
+    )
     assert all(torch.equal(a, b) for a, b in pairs)
 
 
 @pytest.mark.parametrize(
-    ("told", "expected"),
+    ("recorded_psnr", "expected"),
     [(30.0, 2.33e-5), (20.0, 2.33e-4), (None, 2.33e-5), ("good", 2.33e-5), (0.0, 2.33e-5), (1e400, 2.33e-5)],
 )
-def test_by_itself_it_aims_at_a_tenth_of_a_dB(told, expected):
-    """Errors add up: 10 lg((e + distortion) / e) = 0.1 at e = 10^(-psnr / 10)."""
-    assert default_distortion({} if told is None else {"psnr": told}) == pytest.approx(expected, rel=0.01)
+def test_the_default_distortion_costs_a_tenth_of_a_db(recorded_psnr, expected):
+    """Mean squared errors add up: 10 lg((e + distortion) / e) = 0.1 with e = 10^(-psnr / 10)."""
+    assert default_distortion({} if recorded_psnr is None else {"psnr": recorded_psnr}) == pytest.approx(
+        expected, rel=0.01
+    )
 
 
-def test_the_old_word_for_distortion_is_taken_with_a_warning(trained, tmp_path):
-    compress_model(trained, tmp_path / "new.hyrf", distortion=1e-4)
+def test_the_deprecated_option_noise_is_accepted_with_a_warning(trained_file, tmp_path):
+    compress_model(trained_file, tmp_path / "new.hyrf", distortion=1e-4)
     with pytest.warns(DeprecationWarning, match="distortion"):
-        compress_model(trained, tmp_path / "old.hyrf", noise=1e-4)
+        compress_model(trained_file, tmp_path / "old.hyrf", noise=1e-4)
 
     assert (tmp_path / "old.hyrf").read_bytes() == (tmp_path / "new.hyrf").read_bytes()
 
 
-# -- refused ---------------------------------------------------------------------------------------------------------
+# -- refused options ---------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -332,14 +353,14 @@ def test_the_old_word_for_distortion_is_taken_with_a_warning(trained, tmp_path):
         ({"target_bytes": 500}, "500 bytes is below the smallest possible file"),
     ],
 )
-def test_options_that_do_not_go_together_are_refused_and_nothing_is_written(options, words, trained, tmp_path):
+def test_invalid_combinations_of_options_are_refused_and_nothing_is_written(options, words, trained_file, tmp_path):
     with pytest.raises(HyrfError, match=words):
-        compress_model(trained, tmp_path / "small.hyrf", **options)
+        compress_model(trained_file, tmp_path / "small.hyrf", **options)
 
     assert not list(tmp_path.iterdir())
 
 
-def test_a_loss_that_even_the_finest_file_exceeds_is_refused(trained, scene, tmp_path, monkeypatch):
+def test_an_unreachable_max_psnr_drop_is_refused(trained_file, scene, tmp_path, monkeypatch):
     scored = running.evaluate_model
 
     def worse_each_time(model, views, **options):
@@ -350,22 +371,22 @@ def test_a_loss_that_even_the_finest_file_exceeds_is_refused(trained, scene, tmp
     monkeypatch.setattr(running, "evaluate_model", worse_each_time)
 
     with pytest.raises(HyrfError, match="even the finest file loses more than 0.5 dB of PSNR"):
-        compress_model(trained, tmp_path / "small.hyrf", data=scene, max_psnr_drop=0.5)
+        compress_model(trained_file, tmp_path / "small.hyrf", data=scene, max_psnr_drop=0.5)
 
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("options", [{}, {"finetune_steps": 5}, {"max_psnr_drop": 0.1}], ids=["plain", "tune", "limit"])
-def test_photos_that_are_all_held_out_are_refused_or_measured_on(options, trained, scene, tmp_path):
-    """There is nothing to measure at, or to fit to."""
+def test_a_scene_without_training_photos_is_refused(options, trained_file, scene, tmp_path):
+    """Packing needs training photos to measure and to fine-tune on."""
     held_out = dataclasses.replace(scene, train=[], test=scene.train)
 
     with pytest.raises(HyrfError):
-        compress_model(trained, tmp_path / "small.hyrf", data=held_out, **options)
+        compress_model(trained_file, tmp_path / "small.hyrf", data=held_out, **options)
 
 
-def test_a_model_that_nobody_sees_is_compressed_all_the_same(tmp_path, scene):
-    """All Gaussians lie behind the cameras, and there is no background: every slope is zero."""
+def test_an_invisible_model_is_compressed(tmp_path, scene):
+    """All Gaussians lie behind the cameras and there is no background, so that every sensitivity is zero."""
     positions = ball_points(30)[0] * 0.1 + np.array([0.0, 0.0, 500.0])
     save_model(small_model(positions), tmp_path / "behind.hyrf", "raw")
 

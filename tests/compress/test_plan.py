@@ -1,4 +1,4 @@
-"""What is decided of a model: what is stored and how finely, and every number of it quantised."""
+"""A plan decides which Gaussians are stored and how finely, and quantisation follows it."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ from hyrfpack.format.compact.quantized import QuantizedModel
 from hyrfpack.model import Frame, HybridModel, contract
 from hyrfpack.quant.steps import ALL_ZERO_CODE, FIXED_POINT_ONE, decode_step
 
-EXPLICIT = ("COLO", "SCAL", "OPAC")
-FIELDS = ("GTAB", "GMLP", "RTAB", "RMLP")
-DISTORTION = 1e-5
+ATTRIBUTE_SECTIONS = ("COLO", "SCAL", "OPAC")
+FIELD_SECTIONS = ("GTAB", "GMLP", "RTAB", "RMLP")
+TEST_DISTORTION = 1e-5
 
 
-def a_model(count: int = 300, seed: int = 0) -> HybridModel:
+def random_model(count: int = 300, seed: int = 0) -> HybridModel:
     rng = np.random.default_rng(seed)
     return small_model(
         rng.normal(size=(count, 3)) * 0.7,
@@ -49,8 +49,8 @@ def a_model(count: int = 300, seed: int = 0) -> HybridModel:
     )
 
 
-def a_sensitivity(model: HybridModel, spread: float = 2.0, seed: int = 0) -> Sensitivity:
-    """Log-normal; the four of a Gaussian go together, as they do in pictures."""
+def random_sensitivity(model: HybridModel, spread: float = 2.0, seed: int = 0) -> Sensitivity:
+    """Return log-normal sensitivities; those of one Gaussian are correlated, as measured ones are."""
     rng = np.random.default_rng(seed)
 
     def draw(count: int) -> np.ndarray:
@@ -66,30 +66,30 @@ def a_sensitivity(model: HybridModel, spread: float = 2.0, seed: int = 0) -> Sen
     )
 
 
-def a_plan(model: HybridModel, distortion: float = DISTORTION, **settings) -> Plan:
-    return make_plan(model, a_sensitivity(model), distortion, **settings)
+def plan_model(model: HybridModel, distortion: float = TEST_DISTORTION, **settings) -> Plan:
+    return make_plan(model, random_sensitivity(model), distortion, **settings)
 
 
-def decided(model: HybridModel, distortion: float = DISTORTION, **settings) -> QuantizedModel:
-    return decide(model, a_sensitivity(model), distortion, **settings)
+def quantize_model(model: HybridModel, distortion: float = TEST_DISTORTION, **settings) -> QuantizedModel:
+    return decide(model, random_sensitivity(model), distortion, **settings)
 
 
-def cube_of(model: HybridModel) -> np.ndarray:
+def cube_positions(model: HybridModel) -> np.ndarray:
     with torch.no_grad():
         positions = model.gaussians.positions.double()
         return contract(positions / positions.new_tensor(model.config.frame.half_extent)).numpy()
 
 
-# The decisions.
+# Planning.
 
 
 def test_without_pruning_every_gaussian_is_stored_once() -> None:
-    assert sorted(a_plan(a_model(), prune=False).kept.tolist()) == list(range(300))
+    assert sorted(plan_model(random_model(), prune=False).kept.tolist()) == list(range(300))
 
 
-def test_sensitivities_and_classes_follow_the_gaussians_stored() -> None:
-    model = a_model()
-    sensitivity = a_sensitivity(model)
+def test_sensitivities_and_classes_are_in_the_order_of_stored_gaussians() -> None:
+    model = random_model()
+    sensitivity = random_sensitivity(model)
 
     plan = make_plan(model, sensitivity, 1e-4)
 
@@ -100,51 +100,51 @@ def test_sensitivities_and_classes_follow_the_gaussians_stored() -> None:
     np.testing.assert_array_equal(plan.layers[0].points.classes, importance_classes(of_stored))
 
 
-def test_the_planned_model_is_that_part_of_the_model_on_the_lattice() -> None:
-    model = a_model()
-    plan = a_plan(model)
+def test_the_planned_model_has_the_kept_gaussians_on_the_lattice() -> None:
+    model = random_model()
+    plan = plan_model(model)
     original, frame = to_arrays(model), model.config.frame
 
     planned = plan.apply(model)
 
     arrays = to_arrays(planned)
     for group in SECTION_PARAMETERS:
-        expected = original[group][plan.kept] if group in EXPLICIT else original[group]
+        expected = original[group][plan.kept] if group in ATTRIBUTE_SECTIONS else original[group]
         if group != "POSI":
             np.testing.assert_array_equal(arrays[group], expected)
     np.testing.assert_array_equal(arrays["POSI"], lattice_to_local(plan.layers[0].points, frame))
-    # In the cube each is back at its cell's centre, up to float32 of a local position.
+    # In the contracted cube each is at the centre of its cell, up to the float32 rounding of its local position.
     centers = plan.layers[0].points.centers() / 2**19
-    assert np.abs(cube_of(planned) - centers).max() < 1e-6
+    assert np.abs(cube_positions(planned) - centers).max() < 1e-6
 
 
 def position_errors(distortion: float) -> tuple[np.ndarray, np.ndarray]:
-    """How far Gaussians are moved in the cube (N, 3), and the lattice step meant for each (N, 1)."""
-    model = a_model(2000)
-    sensitivity = a_sensitivity(model, spread=4.0)
+    """Return the displacement of Gaussians in the cube (N, 3) and their lattice steps (N, 1)."""
+    model = random_model(2000)
+    sensitivity = random_sensitivity(model, spread=4.0)
     plan = make_plan(model, sensitivity, distortion, prune=False)
     classes = importance_classes(sensitivity)
     steps = 2.0 ** -position_bits(sensitivity.positions, classes, plan.distortion_per_number)[classes][:, None]
-    return np.abs(plan.layers[0].points.centers() / 2**19 - cube_of(model)[plan.kept]), steps[plan.kept]
+    return np.abs(plan.layers[0].points.centers() / 2**19 - cube_positions(model)[plan.kept]), steps[plan.kept]
 
 
-def test_positions_move_by_half_a_lattice_step_at_most() -> None:
+def test_positions_move_by_at_most_half_a_lattice_step() -> None:
     moved, steps = position_errors(1e-6)
 
     assert (moved <= steps / 2 + 1e-12).all()
 
 
-def test_positions_coarser_than_the_base_move_by_half_a_lattice_step_at_most() -> None:
+def test_positions_coarser_than_the_base_move_by_at_most_half_a_lattice_step() -> None:
     moved, steps = position_errors(0.1)
 
     assert (moved <= steps / 2 + 1e-12).all()
 
 
-def test_less_distortion_asked_for_takes_more_bits_everywhere() -> None:
-    model = a_model()
+def test_a_lower_distortion_takes_more_bits_in_every_section() -> None:
+    model = random_model()
 
     def size(distortion: float) -> int:
-        made, _ = encode(model, decided(model, distortion, prune=False))
+        made, _ = encode(model, quantize_model(model, distortion, prune=False))
         return sum(len(section.data) for section in made)
 
     sizes = [size(distortion) for distortion in (1e-8, 1e-6, 1e-4, 1e-2)]
@@ -152,9 +152,9 @@ def test_less_distortion_asked_for_takes_more_bits_everywhere() -> None:
     assert sizes == sorted(sizes, reverse=True) and sizes[0] > 2 * sizes[-1]
 
 
-def test_a_plan_leaves_out_exactly_the_gaussians_that_cost_more_than_they_give() -> None:
-    model = a_model()
-    sensitivity = a_sensitivity(model)
+def test_exactly_the_gaussians_that_cost_more_than_their_removal_are_pruned() -> None:
+    model = random_model()
+    sensitivity = random_sensitivity(model)
 
     plan = make_plan(model, sensitivity, 1e-4)
 
@@ -163,16 +163,16 @@ def test_a_plan_leaves_out_exactly_the_gaussians_that_cost_more_than_they_give()
     with torch.no_grad():
         opacities = model.decode_geometry().opacities.double().tolist()
     for n, (s, o) in enumerate(zip(sensitivity.opacities.tolist(), opacities, strict=True)):
-        slope = max(o * (1 - o), 1e-4)  # of the opacity by its logit
+        slope = max(o * (1 - o), 1e-4)  # the derivative of the opacity by its logit
         error_of_removal = s / slope**2 * o**2
         assert (n in plan.kept) == (error_of_removal >= 2 * math.log(2) * 1e-4 / parameters * PRUNED_GAUSSIAN_BITS)
     assert 0 < len(plan.kept) < len(model)
 
 
-def test_more_distortion_allowed_prunes_more() -> None:
-    model = a_model()
+def test_a_higher_distortion_prunes_more() -> None:
+    model = random_model()
 
-    counts = [len(a_plan(model, distortion).kept) for distortion in (1e-30, 1e-6, 1e-4, 1e-2, 1e9)]
+    counts = [len(plan_model(model, distortion).kept) for distortion in (1e-30, 1e-6, 1e-4, 1e-2, 1e9)]
 
     assert counts == sorted(counts, reverse=True)
     assert counts[0] == 300 and counts[-1] == 0
@@ -180,7 +180,7 @@ def test_more_distortion_allowed_prunes_more() -> None:
 
 @given(st.lists(st.tuples(*[st.floats(1e-12, 1e3)] * 4), min_size=1, max_size=40))
 @settings(max_examples=80, deadline=None)
-def test_classes_fall_with_the_mean_sensitivity(rows: list[tuple[float, ...]]) -> None:
+def test_classes_are_ordered_by_the_mean_sensitivity(rows: list[tuple[float, ...]]) -> None:
     positions, colors, scales, opacities = np.array(rows).T
     sensitivity = Sensitivity(positions, colors, scales, opacities, opacities, {})
 
@@ -191,7 +191,7 @@ def test_classes_fall_with_the_mean_sensitivity(rows: list[tuple[float, ...]]) -
     logs = (np.log2(rows) - np.log2(np.mean(rows, axis=0))) @ weights
     order = np.argsort(-logs)
     assert (np.diff(classes[order].astype(int))[np.diff(logs[order]) < -1e-9] >= 0).all()
-    # Classes are equally wide in octaves, the mean lies in the middle of one, and the ends are open.
+    # Classes have equal widths in octaves; the mean is in the middle of one, and the outer ones are unbounded.
     exact = CLASSES_ABOVE_MEAN - logs / CLASS_WIDTH_LOG2
     expected = np.clip(np.round(exact), 0, IMPORTANCE_CLASS_COUNT - 1)
     unclear = np.abs(exact - np.floor(exact) - 0.5) < 1e-9
@@ -209,7 +209,7 @@ def test_unseen_gaussians_are_in_the_last_class() -> None:
 
 @given(st.lists(st.tuples(st.integers(0, 5), st.floats(1e-12, 1e6)), max_size=30), st.floats(1e-16, 1.0))
 @settings(max_examples=80, deadline=None)
-def test_bits_make_the_lattice_as_fine_as_positions_matter(pairs: list[tuple[int, float]], distortion: float) -> None:
+def test_lattice_bits_follow_the_sensitivity_of_positions(pairs: list[tuple[int, float]], distortion: float) -> None:
     classes = np.array([kind for kind, _ in pairs], np.uint8)
     sensitivity = np.array([value for _, value in pairs])
 
@@ -224,8 +224,8 @@ def test_bits_make_the_lattice_as_fine_as_positions_matter(pairs: list[tuple[int
         assert abs(bits[kind] - min(max(exact, 1), 18)) <= 0.5 + 1e-9
 
 
-def test_the_basis_is_orthonormal_and_takes_correlation_away() -> None:
-    colors = to_arrays(a_model(2000))["COLO"].astype(np.float64)
+def test_the_color_basis_is_orthonormal_and_removes_correlation() -> None:
+    colors = to_arrays(random_model(2000))["COLO"].astype(np.float64)
 
     basis = color_basis(colors)
 
@@ -237,23 +237,23 @@ def test_the_basis_is_orthonormal_and_takes_correlation_away() -> None:
 
 
 @pytest.mark.parametrize("colors", [np.zeros((0, 3)), np.ones((1, 3)), np.ones((9, 3)), np.diag([1e-30] * 3)])
-def test_few_and_equal_colors_have_a_basis_too(colors: np.ndarray) -> None:
+def test_few_and_equal_colors_have_an_orthonormal_basis(colors: np.ndarray) -> None:
     basis = color_basis(colors.astype(np.float32))
 
     np.testing.assert_allclose(basis.T @ basis, np.eye(3), atol=1e-6)
 
 
-# The whole.
+# Planning and quantisation together.
 
 
 @pytest.mark.parametrize("reach", [0, 1])
-@pytest.mark.parametrize("distortion", [1e-9, DISTORTION, 1e-2])
+@pytest.mark.parametrize("distortion", [1e-9, TEST_DISTORTION, 1e-2])
 @pytest.mark.parametrize("count", [0, 1, 2, 300])
-def test_the_decoder_gets_what_the_encoder_said_it_would(count: int, distortion: float, reach: int) -> None:
-    model = a_model(count)
-    plan = a_plan(model, distortion)
+def test_decoded_arrays_equal_those_that_the_encoder_announced(count: int, distortion: float, reach: int) -> None:
+    model = random_model(count)
+    plan = plan_model(model, distortion)
     planned = plan.apply(model)
-    quantized = quantize(planned, plan, a_sensitivity(model), reach=reach)
+    quantized = quantize(planned, plan, random_sensitivity(model), reach=reach)
 
     arrays = to_arrays(decode_model(encode_model(model, "compact", quantized=quantized)))
 
@@ -267,25 +267,25 @@ def test_the_decoder_gets_what_the_encoder_said_it_would(count: int, distortion:
 
 
 @pytest.mark.parametrize("sections", [("COLO",), ("SCAL", "OPAC"), ("GTAB", "GMLP"), ()])
-def test_some_sections_are_quantised_as_among_all(sections: tuple[str, ...]) -> None:
-    model = a_model()
-    plan = a_plan(model)
+def test_quantizing_some_sections_equals_quantizing_all(sections: tuple[str, ...]) -> None:
+    model = random_model()
+    plan = plan_model(model)
     planned = plan.apply(model)
 
-    some = quantize(planned, plan, a_sensitivity(model), sections=sections).arrays()
+    some = quantize(planned, plan, random_sensitivity(model), sections=sections).arrays()
 
-    every = quantize(planned, plan, a_sensitivity(model)).arrays()
+    every = quantize(planned, plan, random_sensitivity(model)).arrays()
     assert some.keys() == set(sections)
     for group, values in some.items():
         np.testing.assert_array_equal(values, every[group])
 
 
-def test_without_reach_every_number_is_half_a_step_away_at_most() -> None:
-    model = a_model()
-    plan = a_plan(model)
+def test_with_reach_0_the_error_is_at_most_half_a_step() -> None:
+    model = random_model()
+    plan = plan_model(model)
     planned = to_arrays(plan.apply(model))
 
-    quantized = quantize(plan.apply(model), plan, a_sensitivity(model), reach=0)
+    quantized = quantize(plan.apply(model), plan, random_sensitivity(model), reach=0)
 
     for group, chosen in quantized.groups.items():
         steps = decode_step(chosen.codes)[plan.groups[group].index] / FIXED_POINT_ONE
@@ -303,27 +303,27 @@ def test_without_reach_every_number_is_half_a_step_away_at_most() -> None:
         assert (np.abs(channel.values - values) <= steps / 2 + 1e-6).all()
 
 
-def test_finer_plans_come_nearer_to_the_model() -> None:
-    model = a_model()
+def test_finer_plans_have_lower_errors() -> None:
+    model = random_model()
 
     def errors(distortion: float) -> dict[str, float]:
-        quantized = decided(model, distortion, prune=False)
+        quantized = quantize_model(model, distortion, prune=False)
         planned, decoded = to_arrays(quantized.plan.apply(model)), quantized.arrays()
         return {group: np.abs(decoded[group].ravel() - planned[group].ravel()).mean() for group in decoded}
 
     coarse, fine = errors(1e-3), errors(1e-7)
 
-    for group in ("COLO", "SCAL", *FIELDS):
+    for group in ("COLO", "SCAL", *FIELD_SECTIONS):
         assert fine[group] < coarse[group] / 10
 
 
-def test_opacities_are_kept_and_not_their_tails() -> None:
-    model = a_model()
+def test_opacities_are_preserved_while_saturated_logits_are_not() -> None:
+    model = random_model()
     with torch.no_grad():
         model.gaussians.opacity_logits[::3] = 300.0
         model.gaussians.opacity_logits[1::3] = -300.0
         before = model.decode_geometry().opacities.detach().double().numpy()
-    quantized = decided(model, 1e-9, prune=False)
+    quantized = quantize_model(model, 1e-9, prune=False)
     plan, planned = quantized.plan, quantized.plan.apply(model)
 
     arrays = {**to_arrays(planned), **{"OPAC": quantized.arrays()["OPAC"]}}
@@ -336,19 +336,19 @@ def test_opacities_are_kept_and_not_their_tails() -> None:
     assert (after[before[plan.kept] > 0.999] > 0.99).all() and (after[before[plan.kept] < 0.001] < 0.01).all()
 
 
-def test_the_same_model_gives_the_same_bytes() -> None:
+def test_encoding_is_deterministic() -> None:
     written = []
     for _ in range(2):
-        model = a_model()
-        made, settings = encode(model, decided(model))
+        model = random_model()
+        made, settings = encode(model, quantize_model(model))
         written.append([(section.type, section.codec, bytes(section.data)) for section in made] + [settings])
 
     assert written[0] == written[1]
 
 
 def test_encoding_changes_neither_the_model_nor_the_plan() -> None:
-    model = a_model()
-    plan, sensitivity = a_plan(model), a_sensitivity(model)
+    model = random_model()
+    plan, sensitivity = plan_model(model), random_sensitivity(model)
     before, positions = to_arrays(model), plan.layers[0].positions
     before = {group: values.copy() for group, values in before.items()}
     cells = plan.layers[0].points.cells.copy()
@@ -361,9 +361,9 @@ def test_encoding_changes_neither_the_model_nor_the_plan() -> None:
     np.testing.assert_array_equal(plan.layers[0].points.cells, cells)
 
 
-def test_sections_say_how_many_bytes_they_decode_to() -> None:
-    model = a_model()
-    quantized = decided(model, 1e-4)
+def test_sections_declare_their_decoded_size() -> None:
+    model = random_model()
+    quantized = quantize_model(model, 1e-4)
 
     made, settings = encode(model, quantized)
 

@@ -23,11 +23,11 @@ from hyrfpack.evaluate import evaluate_model
 from hyrfpack.format import CompressionReport, load_model, save_model
 from hyrfpack.scene import Scene
 
-MARKUP = "<script>alert(1)</script>&amp;.png"
+NAME_WITH_MARKUP = "<script>alert(1)</script>&amp;.png"
 
 
-class Page(HTMLParser):
-    """Tags, attributes, texts by tag, and rows of tables of a page, as a browser would see them."""
+class ParsedReport(HTMLParser):
+    """The tags, links, texts and tables of a report page, as a browser would parse them."""
 
     def __init__(self, path: Path) -> None:
         super().__init__()
@@ -66,8 +66,8 @@ class Page(HTMLParser):
 
 
 @pytest.fixture(scope="module", autouse=True)
-def quick() -> Iterator[None]:
-    """Here neither times need be fair nor sensitivities precise."""
+def use_quick_settings() -> Iterator[None]:
+    """Use settings that save time, because these tests need neither exact times nor precise sensitivities."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("hyrfpack.compress.report.DECODE_TIMING_TURNS", 1)
         patch.setattr("hyrfpack.measure.timing.WARM_UP_SECONDS", 0.0)
@@ -77,15 +77,15 @@ def quick() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    """Photos of balls, the last two held out; one has a name like markup."""
+    """Return photos of balls with two held out, one of which has a name that contains markup."""
     made = ball_scene(8)
-    views = [dataclasses.replace(made.train[0], name=MARKUP), *made.train[1:]]
+    views = [dataclasses.replace(made.train[0], name=NAME_WITH_MARKUP), *made.train[1:]]
     return dataclasses.replace(made, train=views[2:], test=views[:2])
 
 
 @pytest.fixture(scope="module")
-def source(scene, tmp_path_factory) -> Path:
-    """A model of the balls that keeps its cameras, in a folder with a name like markup."""
+def model_file(scene, tmp_path_factory) -> Path:
+    """Write a model of the balls with its cameras to a folder whose name contains markup."""
     positions, colors = ball_points(150)
     model = small_model(positions, color_logits=torch.from_numpy(colors) * 4 - 2, scale_logits=-2.5, fields=0.2)
     folder = tmp_path_factory.mktemp("<img src=x onerror=alert(1)>")
@@ -94,26 +94,26 @@ def source(scene, tmp_path_factory) -> Path:
     return path
 
 
-def reported(
-    source: Path, folder: Path, profile: str = "compact", scene: Scene | None = None, **options
-) -> tuple[Path, CompressionReport, Page]:
-    """Compress and write a page about it: the packed file, the report and the page."""
+def compress_and_report(
+    model_file: Path, folder: Path, profile: str = "compact", scene: Scene | None = None, **options
+) -> tuple[Path, CompressionReport, ParsedReport]:
+    """Compress a model and write its report page; return the packed file, the report and the parsed page."""
     packed = folder / "packed.hyrf"
-    report = compress_model(source, packed, profile, data=scene, **options)
+    report = compress_model(model_file, packed, profile, data=scene, **options)
     return (
         packed,
         report,
-        Page(write_report(folder / "page", source, packed, report, scene, command="make <it> \udcff")),
+        ParsedReport(write_report(folder / "page", model_file, packed, report, scene, command="make <it> \udcff")),
     )
 
 
 @pytest.fixture(scope="module")
-def with_photos(source, scene, tmp_path_factory) -> tuple[Path, CompressionReport, Page]:
-    return reported(source, tmp_path_factory.mktemp("photos"), scene=scene, distortion=1e-4)
+def report_with_photos(model_file, scene, tmp_path_factory) -> tuple[Path, CompressionReport, ParsedReport]:
+    return compress_and_report(model_file, tmp_path_factory.mktemp("photos"), scene=scene, distortion=1e-4)
 
 
 @pytest.mark.parametrize(("profile", "measured"), [("compact", 0), ("paper", 1)])
-def test_what_packing_has_measured_is_not_measured_again(profile, measured, source, tmp_path, monkeypatch):
+def test_the_report_reuses_the_sensitivity_measured_for_packing(profile, measured, model_file, tmp_path, monkeypatch):
     asked = []
 
     def spy(*args: object) -> object:
@@ -121,7 +121,7 @@ def test_what_packing_has_measured_is_not_measured_again(profile, measured, sour
         return measure_calibrated_sensitivity(*args)
 
     monkeypatch.setattr("hyrfpack.compress.report.measure_calibrated_sensitivity", spy)
-    _, report, _ = reported(source, tmp_path, profile)
+    _, report, _ = compress_and_report(model_file, tmp_path, profile)
     assert len(asked) == measured
     assert (report.sensitivity is None) == bool(measured)
     assert set(json.loads(json.dumps(report.to_dict()))) == {f.name for f in dataclasses.fields(report)} - {
@@ -132,45 +132,45 @@ def test_what_packing_has_measured_is_not_measured_again(profile, measured, sour
 # -- the page as a file ----------------------------------------------------------------------------------------------
 
 
-def test_page_is_whole_and_needs_nothing_but_the_pictures_beside_it(with_photos):
-    packed, _, page = with_photos
+def test_the_page_is_valid_and_refers_only_to_its_own_pictures(report_with_photos):
+    packed, _, page = report_with_photos
     folder = packed.parent / "page"
-    assert page.open == []  # every element is closed, in order
+    assert page.open == []  # every element is closed in the right order
     assert not {"script", "link", "iframe", "object"} & set(page.tags)
     assert "url(" not in "".join(page.texts["style"]) and "@import" not in "".join(page.texts["style"])
     assert {"index.html", *page.links} == {path.name for path in folder.iterdir()}
 
 
-def test_words_of_files_are_never_markup(with_photos):
-    _, _, page = with_photos
-    assert any(MARKUP in text for text in page.texts["figcaption"])
+def test_names_of_files_are_escaped(report_with_photos):
+    _, _, page = report_with_photos
+    assert any(NAME_WITH_MARKUP in text for text in page.texts["figcaption"])
     assert any("<img src=x onerror=alert(1)>" in text for text in page.texts["p"])
-    assert page.texts["pre"] == ["make <it> \\udcff"]  # a path that is no Unicode
+    assert page.texts["pre"] == ["make <it> \\udcff"]  # a path that is not valid Unicode
     assert page.tags.count("img") == 1 + 3 * 2
 
 
-def test_folder_that_cannot_be_made_is_refused_before_the_work(source, tmp_path):
+def test_an_unwritable_folder_is_refused_before_the_work(model_file, tmp_path):
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(HyrfError, match="file is a file, not a folder"):
-        write_report(tmp_path / "file" / "page", source, source, CompressionReport("raw", 1, 1, 1, []))
+        write_report(tmp_path / "file" / "page", model_file, model_file, CompressionReport("raw", 1, 1, 1, []))
 
 
-def test_page_appears_only_after_its_pictures(source, tmp_path, monkeypatch):
+def test_the_page_is_written_after_its_pictures(model_file, tmp_path, monkeypatch):
     def full(path, image, **options):
         raise HyrfError("the disk is full", fix="free some space")
 
     monkeypatch.setattr("hyrfpack.compress.report.save_picture", full)
     with pytest.raises(HyrfError, match="full"):
-        reported(source, tmp_path, "raw")
+        compress_and_report(model_file, tmp_path, "raw")
     assert not (tmp_path / "page").exists()
 
 
 # -- its numbers -----------------------------------------------------------------------------------------------------
 
 
-def test_headline_tells_the_bytes_on_disk_and_the_psnr_lost_on_held_out_photos(with_photos, source, scene):
-    packed, report, page = with_photos
-    lost = evaluate_model(load_model(source), scene.test).psnr - evaluate_model(load_model(packed), scene.test).psnr
+def test_the_headline_shows_the_file_size_and_the_psnr_drop_on_held_out_photos(report_with_photos, model_file, scene):
+    packed, report, page = report_with_photos
+    lost = evaluate_model(load_model(model_file), scene.test).psnr - evaluate_model(load_model(packed), scene.test).psnr
     ratio = report.bytes_before / packed.stat().st_size
     size = f"{packed.stat().st_size / 1000:.3g} kB"
     words = f"{abs(lost):.2f} dB {'lost' if lost > 0 else 'gained'}" if abs(lost) >= 0.005 else "less than 0.01 dB lost"
@@ -178,8 +178,8 @@ def test_headline_tells_the_bytes_on_disk_and_the_psnr_lost_on_held_out_photos(w
     assert "2 held-out photos" in page.words
 
 
-def test_parts_add_up_to_the_file_and_to_the_loss(with_photos):
-    packed, _, page = with_photos
+def test_parts_add_up_to_the_file_size_and_to_the_loss(report_with_photos):
+    packed, _, page = report_with_photos
     header, *rows = page.tables[0]
     assert header[2] == "bytes after" and header[5] == "share of the loss"
     *parts, total = [int(row[2].replace(",", "")) for row in rows]
@@ -187,21 +187,21 @@ def test_parts_add_up_to_the_file_and_to_the_loss(with_photos):
     assert sum(float(row[5].rstrip("%")) for row in rows if row[5]) == pytest.approx(100, abs=0.5)
 
 
-def test_layers_of_a_section_are_one_part(source, tmp_path):
-    packed, report, _ = reported(source, tmp_path, "raw")
+def test_layers_of_a_section_are_reported_as_one_part(model_file, tmp_path):
+    packed, report, _ = compress_and_report(model_file, tmp_path, "raw")
     positions = next(part for part in report.sections if part.type == "POSI")
     halves = [
         dataclasses.replace(positions, type=type, before=positions.before // 2, after=positions.after // 2)
         for type in ("POSI", "POS1")
     ]
     sections = [*halves, *(part for part in report.sections if part.type != "POSI")]
-    path = write_report(tmp_path / "page", source, packed, dataclasses.replace(report, sections=sections))
-    (row,) = [row for row in Page(path).tables[0] if row[0].startswith("positions")]
+    path = write_report(tmp_path / "page", model_file, packed, dataclasses.replace(report, sections=sections))
+    (row,) = [row for row in ParsedReport(path).tables[0] if row[0].startswith("positions")]
     assert row[:3] == ["positions", f"{positions.before:,}", f"{positions.after:,}"]
 
 
-def test_curve_gets_smaller_as_it_is_allowed_more_distortion(with_photos):
-    _, _, page = with_photos
+def test_the_curve_has_smaller_files_at_higher_distortion(report_with_photos):
+    _, _, page = report_with_photos
     header, *rows = page.tables[1]
     assert header[:3] == ["file", "bytes", "PSNR lost (dB)"]
     by_name = {row[0]: (int(row[1].replace(",", "")), float(row[2])) for row in rows}
@@ -219,14 +219,14 @@ def test_curve_gets_smaller_as_it_is_allowed_more_distortion(with_photos):
     assert len(by_name) == 7
 
 
-def test_a_file_off_the_curve_stands_beside_it(source, scene, tmp_path):
-    _, _, page = reported(source, tmp_path, scene=scene, distortion=3e-3, finetune_steps=2)
+def test_a_file_that_is_not_on_the_curve_is_shown_separately(model_file, scene, tmp_path):
+    _, _, page = compress_and_report(model_file, tmp_path, scene=scene, distortion=3e-3, finetune_steps=2)
     names = [row[0] for row in page.tables[1]]
     assert "this file" in names and "compact, the same distortion" in names
 
 
-def test_difference_pictures_are_amplified_as_the_page_says(with_photos):
-    packed, _, page = with_photos
+def test_difference_pictures_have_the_documented_amplification(report_with_photos):
+    packed, _, page = report_with_photos
     folder = packed.parent / "page"
     (times,) = {int(text.split()[1]) for text in page.texts["div"] if text.startswith("difference")}
     before, after, difference = (
@@ -236,9 +236,9 @@ def test_difference_pictures_are_amplified_as_the_page_says(with_photos):
     assert difference.max() > 0
 
 
-def test_views_go_from_the_one_that_loses_most_to_the_one_that_loses_least(with_photos, source, scene):
-    packed, _, page = with_photos
-    old, new = (evaluate_model(load_model(path), scene.test).views for path in (source, packed))
+def test_views_are_sorted_by_descending_loss(report_with_photos, model_file, scene):
+    packed, _, page = report_with_photos
+    old, new = (evaluate_model(load_model(path), scene.test).views for path in (model_file, packed))
     lost = {before.name: before.psnr - after.psnr for before, after in zip(old, new, strict=True)}
     expected = sorted(lost, key=lost.get, reverse=True)
     captions = [text for text in page.texts["figcaption"] if "against the photo" in text]
@@ -248,8 +248,8 @@ def test_views_go_from_the_one_that_loses_most_to_the_one_that_loses_least(with_
 # -- other inputs ----------------------------------------------------------------------------------------------------
 
 
-def test_without_photos_renders_are_compared_with_the_uncompressed_model(source, tmp_path):
-    _, _, page = reported(source, tmp_path, distortion=1e-4)
+def test_without_photos_renders_are_compared_with_those_of_the_uncompressed_model(model_file, tmp_path):
+    _, _, page = compress_and_report(model_file, tmp_path, distortion=1e-4)
     assert "dB between pictures before and after" in page.texts["h1"][0]
     assert "against the photo" not in page.words
     assert "what the uncompressed model shows from 6 viewpoints" in page.words
@@ -257,8 +257,8 @@ def test_without_photos_renders_are_compared_with_the_uncompressed_model(source,
     assert raw[2] == "exact"
 
 
-def test_a_raw_file_has_lost_nothing(source, tmp_path):
-    _, _, page = reported(source, tmp_path, "raw")
+def test_a_raw_file_has_no_loss(model_file, tmp_path):
+    _, _, page = compress_and_report(model_file, tmp_path, "raw")
     assert page.texts["h1"][0].endswith("every number exact, nothing lost")
     assert "the same in every pixel" in page.words and "share of the loss" not in page.words
     assert "raw" not in [row[0] for row in page.tables[1]]
@@ -268,24 +268,26 @@ def test_a_model_without_gaussians_has_a_page_without_a_curve(tmp_path):
     save_model(
         small_model(np.zeros((0, 3))), tmp_path / "empty.hyrf", provenance={"cameras": provenance_cameras(ring(2))}
     )
-    _, _, page = reported(tmp_path / "empty.hyrf", tmp_path, "paper")
+    _, _, page = compress_and_report(tmp_path / "empty.hyrf", tmp_path, "paper")
     assert sorted(row[0] for row in page.tables[1][1:]) == ["raw", "this file"]
 
 
-def test_a_model_that_half_precision_cannot_hold_has_a_page_without_paper(tmp_path):
+def test_a_model_beyond_half_precision_has_a_page_without_paper(tmp_path):
     positions, _ = ball_points(20)
     model = small_model(positions)
     with torch.no_grad():
         model.gaussians.positions[0, 0] = 1e5
     save_model(model, tmp_path / "far.hyrf", provenance={"cameras": provenance_cameras(ring(2))})
-    _, _, page = reported(tmp_path / "far.hyrf", tmp_path, distortion=1e-4)
+    _, _, page = compress_and_report(tmp_path / "far.hyrf", tmp_path, distortion=1e-4)
     assert "paper" not in [row[0] for row in page.tables[1]]
 
 
-def test_command_line_writes_the_page_and_says_so(source, tmp_path):
-    result = succeeded("compress", source, "-o", tmp_path / "p.hyrf", "--profile", "raw", "--report", tmp_path / "page")
+def test_the_command_line_writes_the_page_and_reports_it(model_file, tmp_path):
+    result = succeeded(
+        "compress", model_file, "-o", tmp_path / "p.hyrf", "--profile", "raw", "--report", tmp_path / "page"
+    )
     assert "for the page" in result.stderr
-    assert Page(tmp_path / "page" / "index.html").texts["pre"][0].startswith("hyrfpack ")
+    assert ParsedReport(tmp_path / "page" / "index.html").texts["pre"][0].startswith("hyrfpack ")
 
 
 @pytest.mark.parametrize(
@@ -301,7 +303,7 @@ def test_command_line_writes_the_page_and_says_so(source, tmp_path):
         (2_500_000_000, "2.5 GB"),
     ],
 )
-def test_sizes_in_words_keep_three_digits(count, words):
+def test_formatted_sizes_have_three_digits(count, words):
     assert size_in_words(count) == words
 
 

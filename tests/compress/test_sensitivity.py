@@ -1,4 +1,4 @@
-"""How much numbers matter to pictures, against finite differences of renders and a closed form."""
+"""Sensitivities agree with finite differences of renders and with a closed form."""
 
 from __future__ import annotations
 
@@ -17,43 +17,45 @@ from hyrfpack.ops.contraction import contract, expand
 from hyrfpack.render import render_view
 from hyrfpack.scene import Camera
 
-CAMERAS = ring(48, elevation=1.2, width=16, height=16)
+RING_CAMERAS = ring(48, elevation=1.2, width=16, height=16)
 
 
-def a_model() -> HybridModel:
-    """Twenty Gaussians of a few pixels each, half transparent, with fields that say something."""
+def ball_model() -> HybridModel:
+    """Return twenty half-transparent Gaussians of a few pixels each, with random fields."""
     generator = torch.Generator().manual_seed(2)
     colors = torch.randn(20, 3, generator=generator)
     return small_model(ball_points(20)[0], fields=0.3, color_logits=colors, scale_logits=-1.5, opacity_logits=0.0)
 
 
-def looked_at_from(cameras: list[Camera]) -> list[Camera]:
+def add_interpolated_views(cameras: list[Camera]) -> list[Camera]:
     return [*cameras, *interpolate_views(cameras)]
 
 
 @torch.no_grad()
-def pictures(model: HybridModel, views: list[Camera]) -> np.ndarray:
+def render_all_pixels(model: HybridModel, views: list[Camera]) -> np.ndarray:
     decoded = model.decode()
     return np.concatenate([render_view(model, view, decoded=decoded).rgb.double().numpy().ravel() for view in views])
 
 
-def slope(model: HybridModel, views: list[Camera], parameter: torch.Tensor, place: int, step: float) -> float:
-    """Mean squared derivative of all pixels by one number, from central differences."""
+def mean_squared_derivative(
+    model: HybridModel, views: list[Camera], parameter: torch.Tensor, place: int, step: float
+) -> float:
+    """Return the mean squared derivative of all pixels by one number, from central differences."""
     flat = parameter.data.view(-1)
     before, sides = flat[place].item(), []
     for sign in (1, -1):
         flat[place] = before + sign * step
-        sides.append(pictures(model, views))
+        sides.append(render_all_pixels(model, views))
     flat[place] = before
     return float(np.mean(((sides[0] - sides[1]) / (2 * step)) ** 2))
 
 
-# Random signs stand for the pixels' squares: with 96 views and so many numbers, means are off by about 5 to 15 %.
+# Sensitivities are estimated with random signs; with 96 views their means are off by about 5 to 15 %.
 
 
-def test_explicit_numbers_are_the_slopes_of_pictures():
-    model, views = a_model(), looked_at_from(CAMERAS)
-    found = measure_sensitivity(model, CAMERAS)
+def test_sensitivities_of_attributes_equal_finite_differences():
+    model, views = ball_model(), add_interpolated_views(RING_CAMERAS)
+    found = measure_sensitivity(model, RING_CAMERAS)
     gaussians = model.gaussians
 
     for name, values, columns, step in (
@@ -63,20 +65,25 @@ def test_explicit_numbers_are_the_slopes_of_pictures():
     ):
         chosen = [0, 7, 13]
         expected = [
-            np.mean([slope(model, views, getattr(gaussians, name), columns * i + c, step) for c in range(columns)])
+            np.mean(
+                [
+                    mean_squared_derivative(model, views, getattr(gaussians, name), columns * i + c, step)
+                    for c in range(columns)
+                ]
+            )
             for i in chosen
         ]
         np.testing.assert_allclose(values[chosen].sum(), np.sum(expected), rtol=0.25, err_msg=name)
         np.testing.assert_allclose(values[chosen], expected, rtol=0.5, err_msg=name)
 
 
-def test_positions_count_per_unit_of_the_contracted_cube():
-    model, views = a_model(), looked_at_from(CAMERAS)
-    found = measure_sensitivity(model, CAMERAS).positions
+def test_sensitivities_of_positions_are_per_unit_of_the_contracted_cube():
+    model, views = ball_model(), add_interpolated_views(RING_CAMERAS)
+    found = measure_sensitivity(model, RING_CAMERAS).positions
     with torch.no_grad():
-        # One lies outside the box, where the cube's units are long.
+        # One Gaussian lies outside the frame, where a unit of the cube is long.
         model.gaussians.positions[3] = torch.tensor([0.9, 0.9, 0.6])
-    outside = measure_sensitivity(model, CAMERAS).positions[3]
+    outside = measure_sensitivity(model, RING_CAMERAS).positions[3]
     place, step = model.gaussians.positions.data[3].double(), 2e-3
 
     axes = []
@@ -85,35 +92,35 @@ def test_positions_count_per_unit_of_the_contracted_cube():
         for sign in (1, -1):
             moved = contract(place) + sign * step * torch.eye(3, dtype=torch.float64)[axis]
             model.gaussians.positions.data[3] = expand(moved).float()
-            sides.append(pictures(model, views))
+            sides.append(render_all_pixels(model, views))
         axes.append(np.mean(((sides[0] - sides[1]) / (2 * step)) ** 2))
 
     assert outside == pytest.approx(np.mean(axes), rel=0.4)
     assert (found > 0).all()
 
 
-def test_fields_are_the_slopes_of_pictures():
-    model = a_model()
-    found = measure_sensitivity(model, CAMERAS)
-    every = looked_at_from(CAMERAS)
+def test_sensitivities_of_fields_equal_finite_differences():
+    model = ball_model()
+    found = measure_sensitivity(model, RING_CAMERAS)
+    every = add_interpolated_views(RING_CAMERAS)
 
     outputs = {"GMLP": model.geometry.biases[-1], "RMLP": model.radiance.biases[-1]}
     for group, biases in outputs.items():
         values = found.fields[group][-len(biases) :]
-        expected = [slope(model, every, biases, place, 0.02) for place in range(len(biases))]
+        expected = [mean_squared_derivative(model, every, biases, place, 0.02) for place in range(len(biases))]
         assert values.sum() == pytest.approx(sum(expected), rel=0.5), group
     for group, field in (("GTAB", model.geometry), ("RTAB", model.radiance)):
         values = found.fields[group]
         rows = values.reshape(-1, 2)
         assert (rows[:, 0] == rows[:, 1]).all()
         largest = 2 * int(rows[:, 0].argmax())
-        expected = [slope(model, every, field.grid.table, largest + c, 0.02) for c in range(2)]
+        expected = [mean_squared_derivative(model, every, field.grid.table, largest + c, 0.02) for c in range(2)]
         assert values[largest] == pytest.approx(np.mean(expected), rel=0.8), group
 
 
-def test_rows_that_no_gaussian_reads_count_nothing_and_decoders_never_nothing():
-    model = a_model()
-    found = measure_sensitivity(model, CAMERAS)
+def test_unused_table_rows_have_zero_sensitivity_and_decoders_have_not():
+    model = ball_model()
+    found = measure_sensitivity(model, RING_CAMERAS)
     coords = model.cube_coords(model.gaussians.positions).detach()
 
     for group, field in (("GTAB", model.geometry), ("RTAB", model.radiance)):
@@ -125,9 +132,13 @@ def test_rows_that_no_gaussian_reads_count_nothing_and_decoders_never_nothing():
     assert all((values > 0).all() for group, values in found.fields.items() if group in ("GMLP", "RMLP"))
 
 
-def test_gaussians_that_no_camera_sees_count_by_their_size_opacity_and_distance():
-    """The closed form: pi f^2 a b / z^2 pixels under standard deviations a, b depend on colour by o at most."""
-    behind = np.array([[0.01, 0.01, 9.0], [0.02, 0.0, 9.0], [0.0, 0.02, 9.01]])  # all cameras look down
+def test_unseen_gaussians_have_sensitivities_by_size_opacity_and_distance():
+    """By the closed form, pi f^2 a b / z^2 pixels depend on the colour by at most the opacity o.
+
+    The axes of the Gaussian have the standard deviations a and b.
+    """
+    # All cameras look down and away from these positions.
+    behind = np.array([[0.01, 0.01, 9.0], [0.02, 0.0, 9.0], [0.0, 0.02, 9.01]])
     sizes, opacities = torch.tensor([[-1.5], [-2.5], [-1.5]]), torch.tensor([[0.5], [0.5], [-1.0]])
     drawn = torch.full((20, 1), -1.5)
     model = small_model(
@@ -136,12 +147,16 @@ def test_gaussians_that_no_camera_sees_count_by_their_size_opacity_and_distance(
         opacity_logits=torch.cat([drawn + 1.5, opacities]),
     )
     cameras = ring(8, width=16, height=16)
-    views = looked_at_from(cameras)
+    views = add_interpolated_views(cameras)
     color = model.gaussians.color_logits
 
     found = measure_sensitivity(model, cameras)
 
-    assert slope(model, views, color, 3 * 20, 0.1) == slope(model, views, color, 3 * 21, 0.1) == 0
+    assert (
+        mean_squared_derivative(model, views, color, 3 * 20, 0.1)
+        == mean_squared_derivative(model, views, color, 3 * 21, 0.1)
+        == 0
+    )
     with torch.no_grad():
         geometry = model.decode_geometry()
     sides, opacities = geometry.scales[20:].double().numpy(), geometry.opacities[20:].double().numpy()
@@ -155,11 +170,13 @@ def test_gaussians_that_no_camera_sees_count_by_their_size_opacity_and_distance(
 
 
 @pytest.mark.parametrize("background", [False, True])
-def test_the_same_model_gives_the_same_numbers_on_any_number_of_threads(background, monkeypatch):
+def test_sensitivities_do_not_depend_on_the_number_of_threads(background, monkeypatch):
     found = []
     for threads in ("1", "2", "2"):
         monkeypatch.setenv("HYRFPACK_THREADS", threads)
-        found.append(measure_sensitivity(small_model(ball_points(200)[0], fields=0.3, background=background), CAMERAS))
+        found.append(
+            measure_sensitivity(small_model(ball_points(200)[0], fields=0.3, background=background), RING_CAMERAS)
+        )
 
     for other in found[1:]:
         for name in ("positions", "colors", "scales", "opacities"):
@@ -168,22 +185,22 @@ def test_the_same_model_gives_the_same_numbers_on_any_number_of_threads(backgrou
             np.testing.assert_array_equal(other.fields[group], values, err_msg=group)
 
 
-def test_measuring_leaves_the_model_and_the_random_state_alone():
-    model = a_model()
+def test_measuring_changes_neither_the_model_nor_the_random_state():
+    model = ball_model()
     before = {name: value.clone() for name, value in model.state_dict().items()}
     state = torch.get_rng_state()
 
-    measure_sensitivity(model, CAMERAS[:4])
+    measure_sensitivity(model, RING_CAMERAS[:4])
 
     assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
     assert all(parameter.requires_grad and parameter.grad is None for parameter in model.parameters())
     assert torch.equal(torch.get_rng_state(), state)
 
 
-def test_sizes_are_those_of_the_file():
-    model = a_model()
+def test_sensitivities_have_the_shapes_of_the_stored_arrays():
+    model = ball_model()
 
-    found = measure_sensitivity(model, CAMERAS[:2])
+    found = measure_sensitivity(model, RING_CAMERAS[:2])
 
     parameters = dict(model.named_parameters())
     for group, values in found.fields.items():
@@ -193,18 +210,18 @@ def test_sizes_are_those_of_the_file():
         assert getattr(found, name).shape == (20,) and getattr(found, name).dtype == np.float64
 
 
-def test_a_number_that_is_not_finite_is_refused():
-    model = a_model()
+def test_nonfinite_parameters_are_refused():
+    model = ball_model()
     with torch.no_grad():
         model.geometry.biases[-1][0] = torch.nan
 
     with pytest.raises(HyrfError):
-        measure_sensitivity(model, CAMERAS[:2])
+        measure_sensitivity(model, RING_CAMERAS[:2])
 
 
 @pytest.mark.parametrize("wanted", [True, False])
-def test_whether_gradients_are_wanted_is_left_as_it_was(wanted):
-    model = decode_model(encode_model(a_model())).requires_grad_(wanted)
-    sensitivity = measure_sensitivity(model, CAMERAS[:2])
+def test_requires_grad_is_unchanged(wanted):
+    model = decode_model(encode_model(ball_model())).requires_grad_(wanted)
+    sensitivity = measure_sensitivity(model, RING_CAMERAS[:2])
     assert sensitivity.colors.max() > 1e-12
     assert all(parameter.requires_grad == wanted for parameter in model.parameters())

@@ -14,15 +14,15 @@ from hyrfpack.scene import Camera
 from hyrfpack.splats.draw import Drawable, draw
 from hyrfpack.splats.splats import concatenate
 
-POSITIONS = np.random.default_rng(0).uniform(-0.5, 0.5, (40, 3))
+GAUSSIAN_POSITIONS = np.random.default_rng(0).uniform(-0.5, 0.5, (40, 3))
 
 
 def sky_model(fields: float = 1.0, **options):
-    return small_model(POSITIONS, fields=fields, background=True, **options)
+    return small_model(GAUSSIAN_POSITIONS, fields=fields, background=True, **options)
 
 
 @pytest.mark.parametrize("level", [1, 2, 4])
-def test_cells_are_numbered_by_their_middles_and_cover_the_sphere(level):
+def test_cell_centers_and_find_cells_agree_and_cover_the_sphere(level):
     cells = np.arange(6 * 4**level)
     directions, sides = cell_centers(cells, level)
     assert np.array_equal(find_cells(directions, level), cells)
@@ -32,7 +32,7 @@ def test_cells_are_numbered_by_their_middles_and_cover_the_sphere(level):
         assert np.array_equal(find_cells(directions, 3), cells // 4)
 
 
-def test_an_even_background_becomes_an_even_nearly_opaque_layer():
+def test_a_uniform_background_becomes_a_uniform_nearly_opaque_layer():
     splats = background_splats(sky_model(0.0), ring(4))
     drawable = Drawable.from_splats(splats, Frame((0.0, 0.0, 0.0), 1.0, (1.0, 1.0, 1.0)))
     for camera in ring(3, elevation=-2.0, width=64, height=64):
@@ -51,18 +51,18 @@ def test_baked_splats_and_background_look_like_the_model():
     assert math.sqrt(sum(errors) / len(errors)) < 0.02
 
 
-def test_more_splats_go_where_cameras_see_light_and_colours_differ():
+def test_background_splats_are_denser_where_cameras_look():
     model = sky_model(2.0)
     camera = camera_at((0, -3, 0), width=64, height=64, focal=64)
     splats = background_splats(model, [camera])
     assert 384 < len(splats) <= 1000
     ahead = splats.positions[:, 1] / np.linalg.norm(splats.positions, axis=1) > math.cos(0.6)
-    assert ahead.mean() > 3 * (1 - math.cos(0.6)) / 2  # of an even sphere's
+    assert ahead.mean() > 3 * (1 - math.cos(0.6)) / 2  # three times the share of a uniform sphere
     assert splats.scales[ahead].mean() < splats.scales[~ahead].mean()
     assert len(background_splats(model, [])) <= 1000
 
 
-def test_splats_lie_on_the_sphere_around_the_frame():
+def test_background_splats_lie_on_the_sphere_around_the_frame():
     frame = Frame((30.0, 10.0, -5.0), 4.0, (1.0, 1.0, 0.5))
     splats = background_splats(sky_model(frame=frame), ring(3))
     radii = np.linalg.norm(splats.positions - frame.center, axis=1) / frame.scale
@@ -70,28 +70,28 @@ def test_splats_lie_on_the_sphere_around_the_frame():
     assert splats.degree == 0 and np.array_equal(splats.quats, np.eye(1, 4).repeat(len(splats), 0))
 
 
-def test_a_narrow_view_of_an_even_background_has_no_hole():
-    camera = camera_at((0, -3, 0), (0, 0, 4), width=32, height=32, focal=200)  # 9 degrees wide
+def test_a_narrow_view_of_the_background_has_no_holes():
+    camera = camera_at((0, -3, 0), (0, 0, 4), width=32, height=32, focal=200)  # the field of view is 9 degrees
     splats = background_splats(sky_model(0.0), [camera])
     drawn = draw(Drawable.from_splats(splats, Frame((0.0, 0.0, 0.0), 1.0, (1.0, 1.0, 1.0))), camera)
     assert drawn.transmittance.max() < 0.25 and drawn.transmittance.mean() < 0.05
 
 
-def test_models_without_a_learnt_background_have_no_splats_and_no_picture():
-    model = small_model(POSITIONS, solid=(1.0, 1.0, 1.0))
+def test_models_without_a_background_have_no_background_splats_and_no_picture():
+    model = small_model(GAUSSIAN_POSITIONS, solid=(1.0, 1.0, 1.0))
     assert len(background_splats(model, ring(2))) == 0
     with pytest.raises(ValueError):
         background_picture(model)
 
 
-def test_the_picture_looks_along_z_in_the_middle_up_at_the_top_and_along_x_to_the_right():
+def test_the_picture_has_z_in_the_middle_up_at_the_top_and_x_to_the_right():
     model = sky_model(frame=Frame((5.0, 6.0, 7.0), 2.0, (1.0, 0.5, 0.25)))
     picture = background_picture(model, 256)
     assert picture.shape == (256, 512, 3) and picture.dtype == np.float32
-    # A camera that turns nothing sees x right, y down, z ahead; there is nothing between it and the sphere.
+    # A camera without rotation has x right, y down and z ahead; transparent Gaussians leave the sphere visible.
     pose = np.eye(4)
     pose[:3, 3] = -np.array(model.config.frame.center)
-    camera = Camera(3, 3, 1.0, 1.0, 1.5, 1.5, pose)  # rays at 45 degrees
+    camera = Camera(3, 3, 1.0, 1.0, 1.5, 1.5, pose)  # its outer pixels have rays at 45 degrees
     with torch.no_grad():
         model.gaussians.opacity_logits.fill_(-30)
         seen = render_view(model, camera, RenderSettings(background_stride=1)).rgb.numpy()
@@ -101,8 +101,13 @@ def test_the_picture_looks_along_z_in_the_middle_up_at_the_top_and_along_x_to_th
     assert not np.allclose(seen[1, 2], seen[1, 0], atol=2e-2)
 
 
-def test_the_picture_is_as_fine_as_the_field_by_default():
-    assert background_picture(sky_model()).shape == (19, 38, 3)  # pi / 2 times the 12 cells of its finest grid
+def test_the_default_size_of_the_picture_follows_the_finest_grid():
+    # The height is pi / 2 times the 12 cells of the finest grid.
+    assert background_picture(sky_model()).shape == (
+        19,
+        38,
+        3,
+    )
 
 
 def test_a_background_that_is_not_finite_is_refused():

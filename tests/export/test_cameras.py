@@ -16,7 +16,7 @@ from hyrfpack.scene import Camera
 from hyrfpack.splats.splats import Splats
 
 
-def cameras(count: int = 9, kinds: int = 1) -> list[tuple[str, Camera]]:
+def random_named_cameras(count: int = 9, kinds: int = 1) -> list[tuple[str, Camera]]:
     rng = np.random.default_rng(count)
     turns = Rotation.random(count, rng=rng).as_matrix()
     named = []
@@ -28,7 +28,7 @@ def cameras(count: int = 9, kinds: int = 1) -> list[tuple[str, Camera]]:
     return named
 
 
-def splats(count: int = 200) -> Splats:
+def random_splats(count: int = 200) -> Splats:
     rng = np.random.default_rng(0)
     quats = np.tile((1.0, 0, 0, 0), (count, 1))
     opacities = np.where(np.arange(count) % 2, 0.05, 0.9)
@@ -41,7 +41,7 @@ def add_photos(folder: Path, named: list[tuple[str, Camera]]) -> None:
         Image.new("RGB", (camera.width, camera.height)).save(folder / "images" / name)
 
 
-def assert_same(folder: Path, named: list[tuple[str, Camera]], prefix: str = "") -> None:
+def assert_same_cameras(folder: Path, named: list[tuple[str, Camera]], prefix: str = "") -> None:
     views = load_scene(folder).views
     assert [view.name for view in views] == [prefix + name for name, _ in named]
     for view, (_, camera) in zip(views, named, strict=True):
@@ -51,12 +51,12 @@ def assert_same(folder: Path, named: list[tuple[str, Camera]], prefix: str = "")
 
 
 @pytest.mark.parametrize("kinds", [1, 3])
-def test_a_colmap_model_is_read_as_it_was(tmp_path, kinds):
-    named, points = cameras(kinds=kinds), splats()
+def test_a_colmap_model_round_trips(tmp_path, kinds):
+    named, points = random_named_cameras(kinds=kinds), random_splats()
     write_colmap(named, tmp_path, points)
     add_photos(tmp_path, named)
 
-    assert_same(tmp_path, named)
+    assert_same_cameras(tmp_path, named)
     scene, solid = load_scene(tmp_path), points.opacities > 0.5
     assert scene.layout == "colmap"
     np.testing.assert_array_equal(scene.points, points.positions[solid])
@@ -64,67 +64,67 @@ def test_a_colmap_model_is_read_as_it_was(tmp_path, kinds):
     np.testing.assert_allclose(scene.point_colors, srgb, atol=0.51 / 255)
 
 
-def test_photos_of_one_lens_share_a_colmap_camera(tmp_path):
+def test_photos_with_equal_intrinsics_share_a_colmap_camera(tmp_path):
     import pycolmap
 
-    write_colmap(cameras(9, kinds=2), tmp_path, None)
+    write_colmap(random_named_cameras(9, kinds=2), tmp_path, None)
     model = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
     kinds = {number: (camera.model.name, camera.width) for number, camera in model.cameras.items()}
     assert kinds == {1: ("PINHOLE", 32), 2: ("PINHOLE", 40)}
     assert (model.num_reg_images(), model.num_points3D()) == (9, 0)
 
 
-def test_more_points_than_wanted_are_picked_evenly(tmp_path):
+def test_surplus_points_are_sampled_evenly(tmp_path):
     import pycolmap
 
-    points = splats()
-    write_colmap(cameras(2), tmp_path, points, max_points=11)
+    points = random_splats()
+    write_colmap(random_named_cameras(2), tmp_path, points, max_points=11)
     model = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
     picked = np.array([point.xyz for _, point in sorted(model.points3D.items())])
     np.testing.assert_array_equal(picked, points.positions[::2][np.linspace(0, 99, 11).round().astype(int)])
 
 
-def test_the_same_cameras_make_the_same_tables(tmp_path):
+def test_colmap_tables_are_deterministic(tmp_path):
     for folder in ("a", "b"):
-        write_colmap(cameras(), tmp_path / folder, splats())
+        write_colmap(random_named_cameras(), tmp_path / folder, random_splats())
     first, second = (sorted((tmp_path / folder).rglob("*.bin")) for folder in ("a", "b"))
     assert len(first) >= 3
     assert [file.read_bytes() for file in first] == [file.read_bytes() for file in second]
 
 
-def test_a_colmap_model_that_cannot_be_written_leaves_the_old_one(tmp_path, monkeypatch):
-    write_colmap(cameras(3), tmp_path, None)
+def test_a_failed_write_keeps_the_old_colmap_model(tmp_path, monkeypatch):
+    write_colmap(random_named_cameras(3), tmp_path, None)
     before = {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
     write_bytes = Path.write_bytes
 
-    def full(self: Path, data: bytes) -> int:
+    def fail_when_large(self: Path, data: bytes) -> int:
         if atomic.TEMPORARY_PREFIX in self.name and len(data) > 500:
             raise OSError(28, "No space left on device")
         return write_bytes(self, data)
 
-    monkeypatch.setattr(Path, "write_bytes", full)
+    monkeypatch.setattr(Path, "write_bytes", fail_when_large)
     with pytest.raises(HyrfError, match="disk is full"):
-        write_colmap(cameras(9), tmp_path, splats())
+        write_colmap(random_named_cameras(9), tmp_path, random_splats())
     assert {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()} == before
 
 
 @pytest.mark.parametrize("kinds", [1, 3])
-def test_transforms_are_read_as_they_were(tmp_path, kinds):
-    named = cameras(kinds=kinds)
+def test_transforms_round_trip(tmp_path, kinds):
+    named = random_named_cameras(kinds=kinds)
     (tmp_path / "transforms.json").write_bytes(encode_transforms(named))
     add_photos(tmp_path, named)
     assert load_scene(tmp_path).layout == "nerfstudio"
-    assert_same(tmp_path, named)
+    assert_same_cameras(tmp_path, named)
 
 
-def test_transforms_say_what_frames_share_once():
-    shared, own = (json.loads(encode_transforms(cameras(kinds=kinds))) for kinds in (1, 2))
+def test_transforms_store_shared_intrinsics_once():
+    shared, own = (json.loads(encode_transforms(random_named_cameras(kinds=kinds))) for kinds in (1, 2))
     assert shared["fl_x"] == 30.0 and set(shared["frames"][0]) == {"file_path", "transform_matrix"}
     assert "fl_x" not in own and own["frames"][1]["fl_x"] == 31.0
-    assert encode_transforms(cameras()) == encode_transforms(cameras())
+    assert encode_transforms(random_named_cameras()) == encode_transforms(random_named_cameras())
 
 
 def test_an_opengl_camera_looks_along_minus_z_with_y_up():
-    camera = Camera(32, 24, 30.0, 30.0, 16.0, 12.0, np.eye(4))  # looks along +z of the world, whose y is down
+    camera = Camera(32, 24, 30.0, 30.0, 16.0, 12.0, np.eye(4))  # looks along +z of a world with y down
     (frame,) = json.loads(encode_transforms([("a.png", camera)]))["frames"]
     np.testing.assert_array_equal(frame["transform_matrix"], np.diag([1.0, -1, -1, 1]))

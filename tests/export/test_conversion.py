@@ -1,4 +1,4 @@
-"""Splats of one format to another, and what that loses."""
+"""Convert splats from one format to another and report the loss."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from hyrfpack.splats.formats.hints import NO_HINTS
 from hyrfpack.splats.splats import Splats
 from hyrfpack.splats.table import FORMATS
 
-COUNT = 60
+GAUSSIAN_COUNT = 60
 
 
 @pytest.fixture(autouse=True)
-def few_small_views(monkeypatch):
+def measure_few_small_views(monkeypatch):
     from hyrfpack.export import conversion
 
     monkeypatch.setattr(conversion, "MEASURED_VIEWS", 2)
     monkeypatch.setattr(conversion, "MEASURED_SIZE_PIXELS", 32)
 
 
-def written(folder: Path, ending: str, splats: Splats) -> Path:
+def write_splats(folder: Path, ending: str, splats: Splats) -> Path:
     path = folder / f"before{ending}"
     path.write_bytes(FORMATS[ending].encode(splats, NO_HINTS))
     return path
@@ -35,71 +35,76 @@ def written(folder: Path, ending: str, splats: Splats) -> Path:
 
 @pytest.mark.parametrize("after", FORMATS)
 @pytest.mark.parametrize("before", READABLE_ENDINGS)
-def test_every_pair_of_formats_keeps_places_and_looks(before, after, tmp_path):
+def test_every_pair_of_formats_keeps_positions_and_appearance(before, after, tmp_path):
     if FORMATS[after].package:
         pytest.importorskip(FORMATS[after].package[0])
-    source, target = written(tmp_path, before, ball_splats(COUNT)), tmp_path / f"after{after}"
+    source, target = write_splats(tmp_path, before, ball_splats(GAUSSIAN_COUNT)), tmp_path / f"after{after}"
     report = hyrfpack.convert_splats(source, target)
-    kept, back = FORMATS[before].decode(source.read_bytes(), "it"), FORMATS[after].decode(target.read_bytes(), "it")
+    original, converted = (
+        FORMATS[before].decode(source.read_bytes(), "it"),
+        FORMATS[after].decode(target.read_bytes(), "it"),
+    )
     assert (report.bytes_before, report.bytes_after) == (source.stat().st_size, target.stat().st_size)
-    assert report.gaussians_before == report.gaussians_after == len(back) == COUNT
-    assert report.degree_before == kept.degree == min(1, FORMATS[before].max_degree)
-    assert report.degree_after == back.degree == min(kept.degree, FORMATS[after].max_degree)
-    nearest = np.linalg.norm(back.positions[:, None] - kept.positions, axis=-1).min(axis=0)
+    assert report.gaussians_before == report.gaussians_after == len(converted) == GAUSSIAN_COUNT
+    assert report.degree_before == original.degree == min(1, FORMATS[before].max_degree)
+    assert report.degree_after == converted.degree == min(original.degree, FORMATS[after].max_degree)
+    nearest = np.linalg.norm(converted.positions[:, None] - original.positions, axis=-1).min(axis=0)
     assert nearest.max() < 2e-3
-    lost_harmonics = kept.degree > back.degree
+    lost_harmonics = original.degree > converted.degree
     assert report.views == 2 and report.psnr_worst <= report.psnr
     assert report.psnr > (15 if lost_harmonics else 35)
 
 
-def test_a_format_that_holds_all_loses_nothing(tmp_path):
-    report = hyrfpack.convert_splats(written(tmp_path, ".ply", ball_splats(COUNT)), tmp_path / "after.usdc")
+def test_a_lossless_format_has_the_maximum_psnr(tmp_path):
+    report = hyrfpack.convert_splats(
+        write_splats(tmp_path, ".ply", ball_splats(GAUSSIAN_COUNT)), tmp_path / "after.usdc"
+    )
     assert report.psnr == report.psnr_worst == 100
 
 
-def test_a_loose_sog_is_bundled_and_all_its_bytes_are_counted(tmp_path):
+def test_a_loose_sog_is_bundled_and_the_size_of_all_its_files_is_reported(tmp_path):
     folder = tmp_path / "loose"
     folder.mkdir()
-    for name, data in sog.encode_files(ball_splats(COUNT)).items():
+    for name, data in sog.encode_files(ball_splats(GAUSSIAN_COUNT)).items():
         (folder / name).write_bytes(data)
     report = hyrfpack.convert_splats(folder, tmp_path / "bundled.sog")
     assert report.bytes_before == sum(path.stat().st_size for path in folder.iterdir())
     assert hyrfpack.convert_splats(folder / "meta.json", tmp_path / "again.sog").bytes_before == report.bytes_before
 
 
-def test_choices_leave_out_gaussians_and_harmonics(tmp_path):
-    splats = ball_splats(COUNT, degree=2)
-    source = written(tmp_path, ".ply", splats)
+def test_degree_crop_and_min_opacity_reduce_the_splats(tmp_path):
+    splats = ball_splats(GAUSSIAN_COUNT, degree=2)
+    source = write_splats(tmp_path, ".ply", splats)
     box = (-9, -9, -9, 9, 9, 0)
     report = hyrfpack.convert_splats(source, tmp_path / "a.ply", degree=1, crop=box, min_opacity=0.6)
-    back = read_splats(tmp_path / "a.ply")
-    assert len(back) == ((splats.positions[:, 2] <= 0) & (splats.opacities >= 0.6)).sum()
-    assert (report.gaussians_before, report.gaussians_after) == (COUNT, len(back))
-    assert (report.degree_before, report.degree_after, back.degree) == (2, 1, 1)
+    converted = read_splats(tmp_path / "a.ply")
+    assert len(converted) == ((splats.positions[:, 2] <= 0) & (splats.opacities >= 0.6)).sum()
+    assert (report.gaussians_before, report.gaussians_after) == (GAUSSIAN_COUNT, len(converted))
+    assert (report.degree_before, report.degree_after, converted.degree) == (2, 1, 1)
 
 
-def test_a_crop_alone_is_no_loss_and_what_is_left_out_by_opacity_is(tmp_path):
-    source = written(tmp_path, ".ply", ball_splats(COUNT))
+def test_a_crop_has_no_loss_but_min_opacity_has(tmp_path):
+    source = write_splats(tmp_path, ".ply", ball_splats(GAUSSIAN_COUNT))
     cropped = hyrfpack.convert_splats(source, tmp_path / "a.ply", crop=(-9, -9, -9, 9, 9, 0))
     thinned = hyrfpack.convert_splats(source, tmp_path / "b.ply", min_opacity=0.6)
     assert cropped.psnr == 100 and thinned.psnr < 40
 
 
-def test_what_the_format_cannot_hold_is_told(tmp_path):
-    told: list[str] = []
+def test_lost_harmonics_are_reported(tmp_path):
+    messages: list[str] = []
     hyrfpack.convert_splats(
-        written(tmp_path, ".ply", ball_splats(COUNT, degree=3)), tmp_path / "a.splat", say=told.append
+        write_splats(tmp_path, ".ply", ball_splats(GAUSSIAN_COUNT, degree=3)), tmp_path / "a.splat", say=messages.append
     )
-    assert told == [".splat holds no harmonics above degree 0; those of degree 3 are lost"]
+    assert messages == [".splat holds no harmonics above degree 0; those of degree 3 are lost"]
 
 
 def test_progress_is_reported_in_order(tmp_path):
-    told: list[tuple[str, float]] = []
-    source = written(tmp_path, ".ply", ball_splats(COUNT))
-    hyrfpack.convert_splats(source, tmp_path / "a.spz", report=lambda *said: told.append(said))
-    shares = [share for _, share in told]
+    messages: list[tuple[str, float]] = []
+    source = write_splats(tmp_path, ".ply", ball_splats(GAUSSIAN_COUNT))
+    hyrfpack.convert_splats(source, tmp_path / "a.spz", report=lambda *said: messages.append(said))
+    shares = [share for _, share in messages]
     assert shares == sorted(shares) and 0 <= shares[0] and shares[-1] <= 1
-    assert told[0][0] == "reading before.ply" and told[-1][0] == "comparing view 2/2"
+    assert messages[0][0] == "reading before.ply" and messages[-1][0] == "comparing view 2/2"
 
 
 @pytest.mark.parametrize(
@@ -113,31 +118,31 @@ def test_progress_is_reported_in_order(tmp_path):
         ("missing.ply", "b.spz", "cannot be read"),
     ],
 )
-def test_what_cannot_be_converted_is_refused_with_what_to_do(source, target, sentence, tmp_path, monkeypatch):
+def test_unsupported_conversions_are_refused_with_what_to_do(source, target, sentence, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    written(tmp_path, ".ply", ball_splats(5)).rename("a.ply")
+    write_splats(tmp_path, ".ply", ball_splats(5)).rename("a.ply")
     with pytest.raises(HyrfError, match="(?s)" + sentence.replace("(", r"\(")):
         hyrfpack.convert_splats(source, target)
     assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
 
 
-def test_the_source_is_never_replaced(tmp_path):
-    source = written(tmp_path, ".ply", ball_splats(5))
+def test_the_source_is_never_overwritten(tmp_path):
+    source = write_splats(tmp_path, ".ply", ball_splats(5))
     with pytest.raises(HyrfError, match="the output is an input itself"):
         hyrfpack.convert_splats(source, source)
 
 
-def test_splats_that_a_format_cannot_reach_are_refused_before_anything_is_written(tmp_path):
+def test_splats_out_of_a_formats_range_are_refused_before_anything_is_written(tmp_path):
     splats = ball_splats(5)
     positions = splats.positions + [2 * FORMATS[".spz"].max_coordinate, 0, 0]
     far = Splats(positions, splats.scales, splats.quats, splats.opacities, splats.harmonics)
     with pytest.raises(HyrfError, match="choose another format"):
-        hyrfpack.convert_splats(written(tmp_path, ".ply", far), tmp_path / "a.spz")
+        hyrfpack.convert_splats(write_splats(tmp_path, ".ply", far), tmp_path / "a.spz")
     assert not (tmp_path / "a.spz").exists()
 
 
-def test_splats_that_cannot_be_seen_are_refused(tmp_path):
+def test_invisible_splats_are_refused(tmp_path):
     splats = ball_splats(5)
     unseen = Splats(splats.positions, splats.scales * 0, splats.quats, splats.opacities, splats.harmonics)
     with pytest.raises(HyrfDataError, match="no Gaussian is visible"):
-        hyrfpack.convert_splats(written(tmp_path, ".splat", unseen), tmp_path / "a.spz")
+        hyrfpack.convert_splats(write_splats(tmp_path, ".splat", unseen), tmp_path / "a.spz")

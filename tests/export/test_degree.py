@@ -1,4 +1,4 @@
-"""The degree of harmonics follows the scene; the cameras that it is chosen by are not those that judge the result."""
+"""The degree of harmonics is chosen for each scene, by other cameras than those that measure the result."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from hyrfpack.export.source import Source
 from hyrfpack.format import save_model
 from hyrfpack.splats.files import read_splats
 
-POSITIONS = [[0.1, 0.2, 0.3], [-0.4, 0.1, 0.0], [0.2, -0.5, 0.1], [0.0, 0.4, -0.3]]
+GAUSSIAN_POSITIONS = [[0.1, 0.2, 0.3], [-0.4, 0.1, 0.0], [0.2, -0.5, 0.1], [0.0, 0.4, -0.3]]
 
 
-def written(path, fields: float, cameras):
-    """A model whose colours follow the direction if `fields` is not 0."""
-    model = small_model(POSITIONS, fields=fields, direction_encoding="sh")
+def write_model(path, fields: float, cameras):
+    """Write a model whose colours depend on the direction unless `fields` is 0."""
+    model = small_model(GAUSSIAN_POSITIONS, fields=fields, direction_encoding="sh")
     save_model(
         model,
         path,
@@ -31,24 +31,24 @@ def written(path, fields: float, cameras):
     return path
 
 
-def test_colours_that_follow_no_direction_take_degree_0(tmp_path):
-    source = written(tmp_path / "m.hyrf", 0.0, ring(20))
+def test_direction_independent_colors_get_degree_0(tmp_path):
+    source = write_model(tmp_path / "m.hyrf", 0.0, ring(20))
     report = export_model(source, tmp_path / "a.spz")
     assert report.degree == read_splats(tmp_path / "a.spz").degree == 0
     assert list(report.chosen_by) == [0, 1, 2, 3]
 
 
-def test_colours_that_follow_the_direction_take_more_and_the_reason_is_told(tmp_path):
-    source, said = written(tmp_path / "m.hyrf", 4.0, ring(40)), []
+def test_direction_dependent_colors_get_a_higher_degree_and_the_reason_is_reported(tmp_path):
+    source, said = write_model(tmp_path / "m.hyrf", 4.0, ring(40)), []
     report = export_model(source, tmp_path / "a.ply", say=said.append)
     assert report.degree >= 2 and report.degree == lowest_degree_within_tolerance(report.chosen_by)
     told = f"degree {report.degree} it is: {', '.join(f'{score:.2f}' for score in report.chosen_by.values())} dB"
     assert any(sentence.startswith(told) for sentence in said)
 
 
-def test_a_degree_that_is_given_is_not_questioned(tmp_path, monkeypatch):
+def test_a_given_degree_is_not_compared_with_others(tmp_path, monkeypatch):
     monkeypatch.setattr(pipeline, "choose_degree", lambda *arguments: pytest.fail("it was chosen"))
-    source = written(tmp_path / "m.hyrf", 0.0, ring(20))
+    source = write_model(tmp_path / "m.hyrf", 0.0, ring(20))
     assert (
         export_model(source, tmp_path / "a.ply", degree=2).degree,
         export_model(source, tmp_path / "a.splat").degree,
@@ -64,26 +64,26 @@ def test_a_degree_that_is_given_is_not_questioned(tmp_path, monkeypatch):
     ([30.0, 31.0, 32.0, 33.0], 3),
     ([40.0], 0),
 ])  # fmt: skip
-def test_the_lowest_degree_as_good_as_any_is_taken(scores, lowest):
+def test_the_lowest_degree_within_the_tolerance_is_chosen(scores, lowest):
     assert lowest_degree_within_tolerance(dict(enumerate(scores))) == lowest
 
 
 @pytest.mark.parametrize("count", [4, 16, 60])
-def test_cameras_are_kept_back_unless_there_are_too_few_and_the_measured_ones_never_count(count, tmp_path, monkeypatch):
+def test_the_degree_is_chosen_by_held_out_cameras_other_than_the_measured_ones(count, tmp_path, monkeypatch):
     fitted, judged = [], []
 
-    def watched_bake(model, cameras, *others):
+    def recording_bake(model, cameras, *others):
         fitted.extend(camera.position.tobytes() for camera in cameras)
         return bake(model, cameras, *others)
 
-    def watched_likeness(model, contenders, views, **options):
+    def recording_measure_psnr(model, contenders, views, **options):
         judged.extend(camera.position.tobytes() for camera, _ in views)
         return measure_psnr(model, contenders, views, **options)
 
     bake, measure_psnr = degrees.bake, degrees.measure_psnr
-    monkeypatch.setattr(degrees, "bake", watched_bake)
-    monkeypatch.setattr(degrees, "measure_psnr", watched_likeness)
-    source = Source.read(written(tmp_path / "m.hyrf", 1.0, ring(count)))
+    monkeypatch.setattr(degrees, "bake", recording_bake)
+    monkeypatch.setattr(degrees, "measure_psnr", recording_measure_psnr)
+    source = Source.read(write_model(tmp_path / "m.hyrf", 1.0, ring(count)))
     choose_degree(source.model, source.fit_cameras, 3)
     allowed = {camera.position.tobytes() for camera in source.fit_cameras}
     measured = {camera.position.tobytes() for camera, _ in source.measured_views}
@@ -94,15 +94,15 @@ def test_cameras_are_kept_back_unless_there_are_too_few_and_the_measured_ones_ne
         assert not set(fitted) & set(judged)
 
 
-def test_of_many_gaussians_some_are_chosen_by(monkeypatch):
+def test_the_degree_of_many_gaussians_is_chosen_by_a_sample(monkeypatch):
     counts = []
 
-    def watched_bake(model, *others):
+    def recording_bake(model, *others):
         counts.append(len(model))
         return bake(model, *others)
 
     bake = degrees.bake
-    monkeypatch.setattr(degrees, "bake", watched_bake)
+    monkeypatch.setattr(degrees, "bake", recording_bake)
     positions = np.random.default_rng(0).uniform(-0.6, 0.6, (200, 3))
     model, cameras = small_model(positions, fields=4.0, direction_encoding="sh"), ring(40)
     whole = choose_degree(model, cameras, 3)
@@ -111,8 +111,8 @@ def test_of_many_gaussians_some_are_chosen_by(monkeypatch):
     assert counts == [200, 50] and some[0] == whole[0] and some[1] != whole[1]
 
 
-def test_a_crop_is_of_the_degree_of_the_whole(tmp_path):
-    source = written(tmp_path / "m.hyrf", 4.0, ring(40))
+def test_a_crop_gets_the_degree_of_the_whole_scene(tmp_path):
+    source = write_model(tmp_path / "m.hyrf", 4.0, ring(40))
     whole, part = (
         export_model(source, tmp_path / "a.ply"),
         export_model(source, tmp_path / "b.ply", crop=(-9, -9, -9, -0.1, 9, 9)),

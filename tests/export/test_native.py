@@ -1,4 +1,4 @@
-"""Pages with the model itself inside: nothing is lost, what would change it is refused, and bad files go nowhere."""
+"""Pages with the model itself inside contain it unchanged; options that change it and invalid files are refused."""
 
 from __future__ import annotations
 
@@ -22,31 +22,33 @@ from hyrfpack.format import load_model, save_model
 from hyrfpack.render import render_view
 from hyrfpack.web.html import extract_payload
 
-POSITIONS = np.random.default_rng(0).uniform(-0.6, 0.6, (40, 3))
+GAUSSIAN_POSITIONS = np.random.default_rng(0).uniform(-0.6, 0.6, (40, 3))
 
 
 @pytest.fixture(scope="module")
-def model(tmp_path_factory):
-    """Forty Gaussians before a background sphere, and twenty cameras around them."""
+def model_file(tmp_path_factory):
+    """Write a model of forty Gaussians and a background sphere, with twenty cameras around it."""
     path, cameras = tmp_path_factory.mktemp("models") / "model.hyrf", ring(20, width=96, height=64)
     kept = {"cameras": provenance_cameras(cameras), "viewpoint": Viewpoint.from_cameras(cameras).to_json()}
-    save_model(small_model(POSITIONS, fields=2.0, background=True, solid=(0.1, 0.2, 0.3)), path, provenance=kept)
+    save_model(
+        small_model(GAUSSIAN_POSITIONS, fields=2.0, background=True, solid=(0.1, 0.2, 0.3)), path, provenance=kept
+    )
     return path
 
 
 @pytest.fixture(scope="module")
-def compact(model, tmp_path_factory):
+def compact_file(model_file, tmp_path_factory):
     path = tmp_path_factory.mktemp("compact") / "compact.hyrf"
-    hyrfpack.compress_model(model, path)
+    hyrfpack.compress_model(model_file, path)
     return path
 
 
-def test_the_page_holds_the_file_and_what_is_known_of_it(model, tmp_path):
-    report = export_model(model, tmp_path / "room.html")
+def test_the_page_contains_the_file_and_its_metadata(model_file, tmp_path):
+    report = export_model(model_file, tmp_path / "room.html")
     page = (tmp_path / "room.html").read_bytes()
     scene, inside = extract_payload(page, "page")
-    assert inside == model.read_bytes() and b"<title>room</title>" in page
-    frame = load_model(model).config.frame
+    assert inside == model_file.read_bytes() and b"<title>room</title>" in page
+    frame = load_model(model_file).config.frame
     assert (scene["kind"], scene["title"], scene["count"]) == ("hyrf", "room", 40)
     assert (scene["center"], scene["unit"], scene["solid"]) == (list(frame.center), frame.scale, [0.1, 0.2, 0.3])
     first = np.array(scene["cameras"][0]["camera_from_world"])
@@ -55,47 +57,47 @@ def test_the_page_holds_the_file_and_what_is_known_of_it(model, tmp_path):
     assert (report.views, report.psnr, report.psnr_baked, report.chosen_by) == (0, None, None, {})
 
 
-def test_the_same_export_gives_the_same_bytes(model, tmp_path):
+def test_pages_are_deterministic(model_file, tmp_path):
     (tmp_path / "again").mkdir()
     for path in (tmp_path / "a.html", tmp_path / "again" / "a.html"):
-        export_model(model, path)
+        export_model(model_file, path)
     assert (tmp_path / "a.html").read_bytes() == (tmp_path / "again" / "a.html").read_bytes()
 
 
-def test_the_poster_is_what_the_first_camera_sees(model, tmp_path):
-    export_model(model, tmp_path / "a.html")
+def test_the_poster_is_the_view_of_the_first_camera(model_file, tmp_path):
+    export_model(model_file, tmp_path / "a.html")
     (data,) = re.findall(
         rb'id="poster" alt="" src="data:image/webp;base64,([^"]*)"', (tmp_path / "a.html").read_bytes()
     )
     poster = Image.open(io.BytesIO(base64.b64decode(data)))
-    seen = render_view(load_model(model), ring(20, width=96, height=64)[0]).rgb.numpy().clip(0, 1)
+    seen = render_view(load_model(model_file), ring(20, width=96, height=64)[0]).rgb.numpy().clip(0, 1)
     assert poster.size == (96, 64) and np.abs(np.asarray(poster) / 255 - seen).mean() < 0.03
 
 
-@pytest.mark.parametrize(("form", "most"), [("WEBP", 3000), ("JPEG", 3000), ("WEBP", 100)])
-def test_a_poster_takes_no_more_bytes_than_it_may(form, most):
+@pytest.mark.parametrize(("image_format", "max_bytes"), [("WEBP", 3000), ("JPEG", 3000), ("WEBP", 100)])
+def test_a_poster_stays_below_its_size_limit(image_format, max_bytes):
     noise = Image.fromarray(np.random.default_rng(0).integers(0, 255, (360, 480, 3), np.uint8))
-    data = encode_poster(noise, form, most)
-    assert len(data) <= most and Image.open(io.BytesIO(data)).format == form
+    data = encode_poster(noise, image_format, max_bytes)
+    assert len(data) <= max_bytes and Image.open(io.BytesIO(data)).format == image_format
     plain = Image.new("RGB", (480, 360), (10, 20, 30))
-    assert Image.open(io.BytesIO(encode_poster(plain, form, MAX_POSTER_BYTES))).size == (480, 360)
+    assert Image.open(io.BytesIO(encode_poster(plain, image_format, MAX_POSTER_BYTES))).size == (480, 360)
 
 
-def test_a_file_that_keeps_no_cameras_is_seen_from_around_or_from_its_photos(compact, tmp_path):
-    export_model(compact, tmp_path / "a.html")
-    export_model(compact, tmp_path / "b.html", data=ball_scene(5))
+def test_a_file_without_cameras_is_viewed_from_an_orbit_or_from_its_photos(compact_file, tmp_path):
+    export_model(compact_file, tmp_path / "a.html")
+    export_model(compact_file, tmp_path / "b.html", data=ball_scene(5))
     made_up, photos = (extract_payload((tmp_path / name).read_bytes(), name)[0] for name in ("a.html", "b.html"))
     assert len(made_up["cameras"]) == 12 and len(photos["cameras"]) == 5
     assert np.allclose(photos["cameras"][0]["camera_from_world"], ball_scene(5).train[0].camera.camera_from_world)
 
 
-def test_a_file_that_could_be_smaller_goes_along_and_that_is_said(model, compact, tmp_path):
-    said = []
-    export_model(compact, tmp_path / "a.html", say=said.append)
-    assert said == []
-    export_model(model, tmp_path / "a.html", say=said.append)
-    size = model.stat().st_size
-    assert said == [f"{model} goes along as it is, {size:,} bytes; 'hyrfpack compress' makes it smaller"]
+def test_an_uncompressed_file_is_embedded_with_a_note(model_file, compact_file, tmp_path):
+    messages = []
+    export_model(compact_file, tmp_path / "a.html", say=messages.append)
+    assert messages == []
+    export_model(model_file, tmp_path / "a.html", say=messages.append)
+    size = model_file.stat().st_size
+    assert messages == [f"{model_file} goes along as it is, {size:,} bytes; 'hyrfpack compress' makes it smaller"]
 
 
 @pytest.mark.parametrize("target", ["a.html", "player"])
@@ -109,21 +111,21 @@ def test_a_file_that_could_be_smaller_goes_along_and_that_is_said(model, compact
         ({"background": False, "degree": 0}, "`degree` and `background=False`"),
     ],
 )
-def test_what_would_change_the_model_is_refused_and_baked_is_named(target, options, name, model, tmp_path):
+def test_options_that_change_the_model_are_refused_with_a_hint_at_baked(target, options, name, model_file, tmp_path):
     with pytest.raises(HyrfError, match=rf"^[^\n]*{target}: [^\n]* {name}, [^\n]*`baked=True`$"):
-        export_model(model, tmp_path / target, **options)
+        export_model(model_file, tmp_path / target, **options)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_baked_player_folder_is_refused(model, tmp_path):
+def test_a_baked_player_folder_is_refused(model_file, tmp_path):
     with pytest.raises(HyrfError, match=r"player: [^\n]*`baked=True`[^\n]*\.html$"):
-        export_model(model, tmp_path / "player", baked=True)
+        export_model(model_file, tmp_path / "player", baked=True)
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("target", ["a.html", "player"])
-def test_files_that_cannot_be_loaded_go_nowhere(target, compact, tmp_path):
-    data = compact.read_bytes()
+def test_invalid_files_are_refused_and_nothing_is_written(target, compact_file, tmp_path):
+    data = compact_file.read_bytes()
     damaged = bytearray(data)
     damaged[-20] ^= 1
     for bad in (bytes(damaged), data[: len(data) // 2], b"", b"\x89PNG"):

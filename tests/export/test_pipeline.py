@@ -1,4 +1,4 @@
-"""Export: what is written is what was asked for, reads back, and is measured honestly."""
+"""The export pipeline writes what was requested, reads it back and measures its loss."""
 
 from __future__ import annotations
 
@@ -31,46 +31,46 @@ from hyrfpack.scene import Camera, Picture, Scene
 from hyrfpack.splats.table import FORMATS
 from hyrfpack.web.html import decode_splats_page
 
-POSITIONS = np.random.default_rng(0).uniform(-0.6, 0.6, (40, 3))
-FOUR = ring(4)
-CROP = (-0.3, -10, -10, 0.4, 10, 0.2)
-SPLATS = (*FORMATS, ".html")
+GAUSSIAN_POSITIONS = np.random.default_rng(0).uniform(-0.6, 0.6, (40, 3))
+FOUR_CAMERAS = ring(4)
+CROP_BOX = (-0.3, -10, -10, 0.4, 10, 0.2)
+SPLAT_SUFFIXES = (*FORMATS, ".html")
 
 
 def export(source, target, **options) -> ExportReport:
-    """With colours of degree 3 and pages of splats, where nothing else is said; a name without ending is for COLMAP."""
+    """Export with degree 3 and baked pages by default; a target named `colmap` becomes a COLMAP model."""
     kind = {"baked": str(target).endswith(".html"), "colmap": str(target).endswith("colmap")}
     return hyrfpack.export_model(source, target, **{"degree": 3, **kind, **options})
 
 
-def moved(camera: Camera, unit: float, center) -> Camera:
+def scale_and_move(camera: Camera, unit: float, center) -> Camera:
     pose = camera.camera_from_world.copy()
     pose[:3, 3] = unit * pose[:3, 3] - pose[:3, :3] @ np.asarray(center, np.float64)
     return replace(camera, camera_from_world=pose)
 
 
-def write(path, model=None, cameras=FOUR, **options):
-    """A model, as training would leave it; returns its path."""
+def write_model(path, model=None, cameras=FOUR_CAMERAS, **options):
+    """Write a model as training would; return its path."""
     kept = {"cameras": provenance_cameras(cameras), "viewpoint": Viewpoint.from_cameras(cameras).to_json()}
-    save_model(model or small_model(POSITIONS, **{"fields": 2.0, **options}), path, provenance=kept)
+    save_model(model or small_model(GAUSSIAN_POSITIONS, **{"fields": 2.0, **options}), path, provenance=kept)
     return path
 
 
 @pytest.fixture(scope="module")
-def plain(tmp_path_factory):
-    """Forty Gaussians before black."""
-    return write(tmp_path_factory.mktemp("models") / "plain.hyrf")
+def plain_file(tmp_path_factory):
+    """Write a model of forty Gaussians without a background."""
+    return write_model(tmp_path_factory.mktemp("models") / "plain.hyrf")
 
 
 @pytest.fixture(scope="module")
-def sphere(tmp_path_factory):
-    """Forty Gaussians before a background sphere."""
-    return write(tmp_path_factory.mktemp("models") / "sphere.hyrf", background=True)
+def sphere_file(tmp_path_factory):
+    """Write a model of forty Gaussians with a background sphere."""
+    return write_model(tmp_path_factory.mktemp("models") / "sphere.hyrf", background=True)
 
 
 @pytest.fixture
-def no_bake(monkeypatch):
-    """Fails the test when work begins."""
+def fail_if_baked(monkeypatch):
+    """Fail the test if baking starts."""
     for name in ("bake", "compute_visibility"):
         monkeypatch.setattr(pipeline, name, lambda *arguments: pytest.fail("the bake began"))
 
@@ -82,172 +82,175 @@ def read_back(path):
     )
 
 
-def nearest(points: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """How far each of the points is from the nearest other."""
+def distances_to_nearest(points: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Return the distance of each point to the nearest of `others`."""
     return np.linalg.norm(points[:, None] - others, axis=-1).min(1)
 
 
-# -- what is written -------------------------------------------------------------------------------------------------
+# -- written files ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("ending", SPLATS)
+@pytest.mark.parametrize("ending", SPLAT_SUFFIXES)
 @pytest.mark.parametrize("place", [((0, 0, 0), 1.0), ((-30.0, 700.0, 2.0), 0.05), ((0, 0, 0), 300.0)])
-def test_every_ending_reads_back_with_as_many_gaussians_in_the_same_place(ending, place, tmp_path):
+def test_every_format_preserves_count_and_positions(ending, place, tmp_path):
     center, unit = place
-    cameras = [moved(camera, unit, center) for camera in ring(2, width=8, height=8)]
-    model = small_model(POSITIONS, frame=Frame(center, unit, (1.0, 1.0, 1.0)))
-    source, target = write(tmp_path / "model.hyrf", model, cameras), tmp_path / f"out{ending}"
+    cameras = [scale_and_move(camera, unit, center) for camera in ring(2, width=8, height=8)]
+    model = small_model(GAUSSIAN_POSITIONS, frame=Frame(center, unit, (1.0, 1.0, 1.0)))
+    source, target = write_model(tmp_path / "model.hyrf", model, cameras), tmp_path / f"out{ending}"
     report = export(source, target)
-    back, there = read_back(target), POSITIONS * unit + center
+    back, there = read_back(target), GAUSSIAN_POSITIONS * unit + center
     assert (report.file, report.bytes) == (str(target), target.stat().st_size)
     assert report.gaussians == len(back) == 40 and report.degree == back.degree == (0 if ending == ".splat" else 3)
     reach = np.abs(there).max()
-    assert max(nearest(there, back.positions).max(), nearest(back.positions, there).max()) < 3e-4 * unit + 2e-7 * reach
+    assert (
+        max(distances_to_nearest(there, back.positions).max(), distances_to_nearest(back.positions, there).max())
+        < 3e-4 * unit + 2e-7 * reach
+    )
     assert report.psnr > 45 and report.views == 2
 
 
-@pytest.mark.parametrize("ending", SPLATS)
-def test_one_gaussian_alone_is_enough(ending, tmp_path):
-    source = write(tmp_path / "one.hyrf", small_model([[0.1, 0.2, 0.3]]), ring(1))
+@pytest.mark.parametrize("ending", SPLAT_SUFFIXES)
+def test_a_single_gaussian_is_exported(ending, tmp_path):
+    source = write_model(tmp_path / "one.hyrf", small_model([[0.1, 0.2, 0.3]]), ring(1))
     report = export(source, tmp_path / f"one{ending}")
     assert report.gaussians == 1 and report.views == 1
     assert np.allclose(read_back(tmp_path / f"one{ending}").positions, [[0.1, 0.2, 0.3]], atol=2e-4)
 
 
-def test_points_are_the_centres_and_the_cameras(plain, tmp_path):
-    report = export(plain, tmp_path / "a.points.ply")
+def test_points_files_contain_centers_and_cameras(plain_file, tmp_path):
+    report = export(plain_file, tmp_path / "a.points.ply")
     cloud = trimesh.load(tmp_path / "a.points.ply")
-    assert np.allclose(cloud.vertices[:40], load_model(plain).gaussians.positions.detach(), atol=1e-6)
+    assert np.allclose(cloud.vertices[:40], load_model(plain_file).gaussians.positions.detach(), atol=1e-6)
     assert (report.gaussians, report.cameras) == (40, 4) and len(cloud.vertices) > 40
-    export(plain, tmp_path / "a.points.glb")
+    export(plain_file, tmp_path / "a.points.glb")
     assert set(trimesh.load(tmp_path / "a.points.glb").geometry) == {"gaussians", "cameras"}
 
 
-def test_a_transforms_json_holds_the_cameras_and_takes_no_bake(plain, tmp_path, no_bake):
-    report = export(plain, tmp_path / "transforms.json")
+def test_transforms_json_contains_the_cameras_without_a_bake(plain_file, tmp_path, fail_if_baked):
+    report = export(plain_file, tmp_path / "transforms.json")
     frames = json.loads((tmp_path / "transforms.json").read_text())["frames"]
     places = [np.array(frame["transform_matrix"])[:3, 3] for frame in frames]
     assert np.allclose(places, [camera.position for camera in ring(4)], atol=1e-6)
     assert (report.cameras, report.gaussians, report.bytes) == (4, 0, (tmp_path / "transforms.json").stat().st_size)
 
 
-def test_a_folder_becomes_a_colmap_model_and_its_size_is_that_of_the_model(plain, tmp_path):
+def test_a_colmap_export_writes_a_model_and_reports_its_size(plain_file, tmp_path):
     pycolmap = pytest.importorskip("pycolmap")
     (tmp_path / "colmap").mkdir()
     (tmp_path / "colmap" / "mine.bin").write_bytes(bytes(1000))
-    report = export(plain, tmp_path / "colmap", crop=CROP)
+    report = export(plain_file, tmp_path / "colmap", crop=CROP_BOX)
     model = pycolmap.Reconstruction(tmp_path / "colmap" / "sparse" / "0")
     places = sorted(tuple(image.projection_center().round(5)) for image in model.images.values())
     assert places == sorted(tuple(camera.position.round(5)) for camera in ring(4))
     tables = (tmp_path / "colmap" / "sparse" / "0").iterdir()
     assert report.bytes == sum(table.stat().st_size for table in tables) and report.cameras == 4
     points = np.array([point.xyz for point in model.points3D.values()])
-    assert len(points) and ((points >= CROP[:3]) & (points <= CROP[3:])).all()
+    assert len(points) and ((points >= CROP_BOX[:3]) & (points <= CROP_BOX[3:])).all()
 
 
-def test_the_same_export_gives_the_same_bytes(sphere, tmp_path):
+def test_exports_are_deterministic(sphere_file, tmp_path):
     (tmp_path / "again").mkdir()
-    for ending in SPLATS:
+    for ending in SPLAT_SUFFIXES:
         first, second = tmp_path / f"a{ending}", tmp_path / "again" / f"a{ending}"
         for target in (first, second):
-            export(sphere, target, degree=1, crop=(-9, -9, -9, 9, 9, 9))
+            export(sphere_file, target, degree=1, crop=(-9, -9, -9, 9, 9, 9))
         assert first.read_bytes() == second.read_bytes(), ending
 
 
 # -- choices ---------------------------------------------------------------------------------------------------------
 
 
-def inside(points: np.ndarray) -> np.ndarray:
-    return points[((points >= CROP[:3]) & (points <= CROP[3:])).all(1)]
+def points_in_crop(points: np.ndarray) -> np.ndarray:
+    return points[((points >= CROP_BOX[:3]) & (points <= CROP_BOX[3:])).all(1)]
 
 
 @pytest.mark.parametrize("ending", [".ply", ".sog", ".html"])
-def test_a_crop_keeps_exactly_what_is_inside_and_leaves_the_background_out(ending, sphere, tmp_path):
-    said = []
-    report = export(sphere, tmp_path / f"part{ending}", crop=CROP, say=said.append)
+def test_a_crop_keeps_the_gaussians_inside_and_no_background(ending, sphere_file, tmp_path):
+    messages = []
+    report = export(sphere_file, tmp_path / f"part{ending}", crop=CROP_BOX, say=messages.append)
     expected, back = (
-        inside(load_model(sphere).gaussians.positions.detach().numpy()),
+        points_in_crop(load_model(sphere_file).gaussians.positions.detach().numpy()),
         read_back(tmp_path / f"part{ending}"),
     )
     assert 3 < len(expected) < 40 and len(back) == report.gaussians == len(expected) and report.background == 0
-    assert nearest(expected, back.positions).max() < 1e-3
+    assert distances_to_nearest(expected, back.positions).max() < 1e-3
     assert (report.views, report.psnr, report.psnr_baked) == (0, None, None)
-    assert said[-1] == "quality is not measured, because a part of the scene was cropped"
+    assert messages[-1] == "quality is not measured, because a part of the scene was cropped"
 
 
-def test_a_crop_may_be_open_to_any_side_and_a_list(plain, tmp_path):
+def test_a_crop_may_be_a_list_with_infinite_sides(plain_file, tmp_path):
     endless = float("inf")
-    report = export(plain, tmp_path / "a.ply", crop=[0.0, *[-endless] * 2, *[endless] * 3])
-    assert report.gaussians == (POSITIONS[:, 0] >= 0).sum()
+    report = export(plain_file, tmp_path / "a.ply", crop=[0.0, *[-endless] * 2, *[endless] * 3])
+    assert report.gaussians == (GAUSSIAN_POSITIONS[:, 0] >= 0).sum()
 
 
-def test_the_faint_are_left_out(tmp_path):
+def test_min_opacity_removes_faint_gaussians(tmp_path):
     logits = np.linspace(-5, 5, 40, dtype=np.float32)[:, None]
-    source = write(tmp_path / "model.hyrf", fields=0.0, opacity_logits=logits)
+    source = write_model(tmp_path / "model.hyrf", fields=0.0, opacity_logits=logits)
     report = export(source, tmp_path / "a.ply", min_opacity=0.5, degree=0)
     back = read_back(tmp_path / "a.ply")
     assert report.gaussians == len(back) == 20 and back.opacities.min() >= 0.5
-    assert report.views == 4  # and what that costs is measured
+    assert report.views == 4  # the loss is measured
     assert report.psnr < export(source, tmp_path / "b.ply", degree=0).psnr
 
 
-def test_the_background_goes_along_unless_it_shall_not(sphere, tmp_path):
-    whole, alone = export(sphere, tmp_path / "a.ply"), export(sphere, tmp_path / "b.ply", background=False)
+def test_the_background_is_exported_unless_it_is_disabled(sphere_file, tmp_path):
+    whole, alone = export(sphere_file, tmp_path / "a.ply"), export(sphere_file, tmp_path / "b.ply", background=False)
     assert whole.background >= 384 and whole.gaussians == 40 + whole.background
     assert (alone.background, alone.gaussians, len(read_back(tmp_path / "b.ply"))) == (0, 40, 40)
-    page = export(sphere, tmp_path / "a.html")
+    page = export(sphere_file, tmp_path / "a.html")
     assert page.gaussians == 40 and b'<img id="background"' in (tmp_path / "a.html").read_bytes()
-    export(sphere, tmp_path / "b.html", background=False)
+    export(sphere_file, tmp_path / "b.html", background=False)
     assert b'<img id="background"' not in (tmp_path / "b.html").read_bytes()
     assert min(whole.psnr, alone.psnr, page.psnr_baked) > 25
-    assert page.psnr > 20  # what is nearly noise suffers in WebP
+    assert page.psnr > 20  # a nearly random background loses detail in WebP
 
 
-def test_models_before_a_solid_colour_have_it_behind_them(tmp_path):
-    source = write(tmp_path / "model.hyrf", solid=(1.0, 1.0, 1.0))
+def test_a_solid_background_color_is_compared_correctly(tmp_path):
+    source = write_model(tmp_path / "model.hyrf", solid=(1.0, 1.0, 1.0))
     for ending in (".ply", ".html"):
         report = export(source, tmp_path / f"a{ending}")
         assert report.background == 0 and report.psnr > 35
 
 
-# -- what is measured ------------------------------------------------------------------------------------------------
+# -- measured loss ---------------------------------------------------------------------------------------------------
 
 
-def test_psnr_rises_with_the_degree_where_colour_depends_on_the_direction(tmp_path):
-    source = write(tmp_path / "model.hyrf", fields=4.0, direction_encoding="sh", cameras=ring(12))
+def test_psnr_rises_with_the_degree_of_direction_dependent_colors(tmp_path):
+    source = write_model(tmp_path / "model.hyrf", fields=4.0, direction_encoding="sh", cameras=ring(12))
     scores = [export(source, tmp_path / "a.ply", degree=degree).psnr for degree in range(4)]
     assert scores == sorted(scores) and scores[3] > scores[0] + 6
 
 
 @pytest.mark.parametrize("ending", [".ply", ".spz", ".splat", ".sog"])
-def test_the_psnr_is_that_of_the_file(ending, plain, tmp_path):
-    report = export(plain, tmp_path / f"a{ending}", degree=2)
-    views = [(camera, None) for camera in Source.read(plain).fit_cameras]
-    file = measure_psnr(load_model(plain), {"file": (read_back(tmp_path / f"a{ending}"), None)}, views, sphere=False)[
-        "file"
-    ]
+def test_the_reported_psnr_is_measured_on_the_written_file(ending, plain_file, tmp_path):
+    report = export(plain_file, tmp_path / f"a{ending}", degree=2)
+    views = [(camera, None) for camera in Source.read(plain_file).fit_cameras]
+    file = measure_psnr(
+        load_model(plain_file), {"file": (read_back(tmp_path / f"a{ending}"), None)}, views, sphere=False
+    )["file"]
     assert report.psnr == pytest.approx(file.model, abs=1e-3)
     assert (report.psnr == pytest.approx(report.psnr_baked, abs=1e-3)) == (ending == ".ply")
 
 
-def test_a_file_that_lost_something_scores_less(plain, tmp_path, monkeypatch):
+def test_a_lossy_file_has_a_lower_psnr(plain_file, tmp_path, monkeypatch):
     form = FORMATS[".ply"]
     lossy = replace(form, decode=lambda *arguments: form.decode(*arguments)[:20])
     monkeypatch.setattr(pipeline, "find_file_kind", lambda *target: lossy)
-    report = export(plain, tmp_path / "a.ply")
+    report = export(plain_file, tmp_path / "a.ply")
     assert report.psnr < report.psnr_baked - 3
 
 
-def test_a_format_that_forgets_antialiasing_is_told_from_a_coarse_one(tmp_path):
-    source = write(tmp_path / "m.hyrf", antialiased=True, scale_logits=-5.0, fields=0.0)
+def test_a_format_without_antialiasing_is_reported_as_such(tmp_path):
+    source = write_model(tmp_path / "m.hyrf", antialiased=True, scale_logits=-5.0, fields=0.0)
     for ending, word in ((".glb", "antialiased"), (".spz", "measuring"), (".sog", "measuring")):
-        said = []
-        export(source, tmp_path / f"a{ending}", degree=0, say=said.append)
-        assert word in said[-1]
+        messages = []
+        export(source, tmp_path / f"a{ending}", degree=0, say=messages.append)
+        assert word in messages[-1]
 
 
-def photographed(model, cameras) -> Scene:
-    """What a model shows to cameras, as noisy photos of it (30 dB); every other one is held out."""
+def photograph_model(model, cameras) -> Scene:
+    """Render noisy photos (30 dB) of a model; every other one is held out."""
     rng = np.random.default_rng(0)
     views = []
     for number, camera in enumerate(cameras):
@@ -258,117 +261,119 @@ def photographed(model, cameras) -> Scene:
 
 
 def without_cameras(source: Path, target: Path) -> Path:
-    """A copy of a model's file that does not say where its photos were taken."""
+    """Copy a model's file without the cameras of its photos."""
     model, provenance = load_with_provenance(source)
     save_model(model, target, provenance={name: value for name, value in provenance.items() if name != "cameras"})
     return target
 
 
-def told_of(unit: float, judged: str, folder) -> tuple[str, ExportReport]:
-    """What an export to .spz says last of forty Gaussians in a unit of length, and its report."""
+def export_in_unit(unit: float, view_source: str, folder) -> tuple[str, ExportReport]:
+    """Export forty Gaussians in a unit of length to .spz; return the last message and the report."""
     frame = Frame((0, 0, 0), unit, (1.0, 1.0, 1.0))
-    model = small_model(POSITIONS, frame=frame, fields=0.0, color_logits=1.0, scale_logits=-1.5)
-    cameras = [moved(camera, unit, (0, 0, 0)) for camera in ring(8)]
-    source, said = write(folder / "model.hyrf", model, cameras), []
-    if judged == "generated viewpoints":
+    model = small_model(GAUSSIAN_POSITIONS, frame=frame, fields=0.0, color_logits=1.0, scale_logits=-1.5)
+    cameras = [scale_and_move(camera, unit, (0, 0, 0)) for camera in ring(8)]
+    source, messages = write_model(folder / "model.hyrf", model, cameras), []
+    if view_source == "generated viewpoints":
         source = without_cameras(source, folder / "bare.hyrf")
-    data = photographed(model, cameras) if judged == "photos" else None
-    report = export(source, folder / "a.spz", degree=0, data=data, say=said.append)
-    return said[-1], report
+    data = photograph_model(model, cameras) if view_source == "photos" else None
+    report = export(source, folder / "a.spz", degree=0, data=data, say=messages.append)
+    return messages[-1], report
 
 
-JUDGED = ("photos", "cameras", "generated viewpoints")
+VIEW_SOURCES = ("photos", "cameras", "generated viewpoints")
 
 
-@pytest.mark.parametrize("judged", JUDGED)
+@pytest.mark.parametrize("view_source", VIEW_SOURCES)
 @pytest.mark.parametrize("unit", [1e-5, 1e5])
-def test_a_unit_of_length_that_a_format_cannot_hold_is_told(unit, judged, tmp_path):
-    told, _ = told_of(unit, judged, tmp_path)
-    assert re.fullmatch(r"\.spz costs \d+\.\d dB[^\n]*: it is too coarse for this scene[^\n]*another format", told)
-    assert ("`data`" in told) == (judged == "generated viewpoints")
+def test_a_format_too_coarse_for_the_unit_of_length_is_reported(unit, view_source, tmp_path):
+    message, _ = export_in_unit(unit, view_source, tmp_path)
+    assert re.fullmatch(r"\.spz costs \d+\.\d dB[^\n]*: it is too coarse for this scene[^\n]*another format", message)
+    assert ("`data`" in message) == (view_source == "generated viewpoints")
 
 
-@pytest.mark.parametrize("judged", JUDGED)
-def test_rounding_that_photos_do_not_show_is_no_alarm(judged, tmp_path):
-    told, report = told_of(1.0, judged, tmp_path)
-    assert min(report.psnr_baked, 50) - report.psnr > 3  # much, beside the model itself
-    assert told == f"measuring at {report.views} views"
+@pytest.mark.parametrize("view_source", VIEW_SOURCES)
+def test_invisible_rounding_is_not_reported(view_source, tmp_path):
+    message, report = export_in_unit(1.0, view_source, tmp_path)
+    assert min(report.psnr_baked, 50) - report.psnr > 3  # compared with the model, the loss is large
+    assert message == f"measuring at {report.views} views"
 
 
-def test_a_format_is_judged_by_the_photos_where_there_are_some():
-    """Not by the model's own account, nor by how like the model's pictures those of the file are."""
+def test_the_cost_of_a_format_is_measured_on_photos_if_there_are_any():
+    """Neither the model's own PSNR nor the similarity of the file's pictures to the model's decides."""
     cost = {"before": pipeline.PsnrScores(60, 30.0, 1), "after": pipeline.PsnrScores(20, 29.7, 1), "error": 1e-9}
     assert pipeline._estimate_cost_db(**cost) == pytest.approx(0.3)
     cost["after"] = pipeline.PsnrScores(20, None, 1)
     assert pipeline._estimate_cost_db(**cost) == pytest.approx(10 * np.log10((1e-9 + 1e-2) / (1e-9 + 1e-6)))
 
 
-def test_held_out_photos_score_the_model_and_the_file_and_are_not_fitted(plain, tmp_path, monkeypatch):
+def test_held_out_photos_are_scored_but_not_fitted(plain_file, tmp_path, monkeypatch):
     photos = ball_scene(8).train
     scene = replace(ball_scene(8), train=photos[1::2], test=photos[::2])
     fitted = []
     monkeypatch.setattr(
         pipeline, "bake", lambda model, cameras, degrees, *others: fitted.extend(cameras) or bake(model, [], degrees)
     )
-    report = export(plain, tmp_path / "a.ply", data=scene)
+    report = export(plain_file, tmp_path / "a.ply", data=scene)
     assert fitted == [view.camera for view in scene.train] and report.views == 4
-    assert report.photos_model == pytest.approx(evaluate_model(load_model(plain), scene.test).psnr, abs=1e-6)
+    assert report.photos_model == pytest.approx(evaluate_model(load_model(plain_file), scene.test).psnr, abs=1e-6)
     assert report.photos_file == pytest.approx(report.photos_model, abs=0.5)
 
 
-def test_without_held_out_photos_it_says_that_nothing_is_measured(plain, tmp_path):
-    said = []
-    report = export(plain, tmp_path / "a.ply", data=ball_scene(3), say=said.append)
-    assert report.views == 0 and said[-1] == "quality is not measured, because no photo is held out"
+def test_missing_held_out_photos_are_reported(plain_file, tmp_path):
+    messages = []
+    report = export(plain_file, tmp_path / "a.ply", data=ball_scene(3), say=messages.append)
+    assert report.views == 0 and messages[-1] == "quality is not measured, because no photo is held out"
 
 
-def test_masks_that_leave_nothing_leave_the_score_out(plain, tmp_path):
+def test_fully_masked_photos_give_no_score(plain_file, tmp_path):
     scene = ball_scene(2)
     hidden = [
         replace(view, load=lambda view=view: replace(view.load(), mask=np.zeros((32, 32), bool)))
         for view in scene.train
     ]
-    report = export(plain, tmp_path / "a.ply", data=replace(scene, test=hidden))
+    report = export(plain_file, tmp_path / "a.ply", data=replace(scene, test=hidden))
     assert (report.views, report.psnr) == (0, None)
 
 
-# -- files that keep no cameras ---------------------------------------------------------------------------------------
+# -- files without cameras ---------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
-def compact(plain, tmp_path_factory):
+def compact_file(plain_file, tmp_path_factory):
     path = tmp_path_factory.mktemp("compact") / "compact.hyrf"
-    hyrfpack.compress_model(plain, path)
+    hyrfpack.compress_model(plain_file, path)
     return path
 
 
 @pytest.mark.parametrize("name", ["cameras.json", "colmap"])
-def test_cameras_that_a_file_does_not_keep_are_one_sentence_or_come_from_photos(name, compact, tmp_path, no_bake):
+def test_missing_cameras_are_reported_or_taken_from_photos(name, compact_file, tmp_path, fail_if_baked):
     with pytest.raises(HyrfError, match=r"compact\.hyrf: it keeps only coarse cameras; [^\n]*`data`$"):
-        export(compact, tmp_path / name)
+        export(compact_file, tmp_path / name)
     assert list(tmp_path.iterdir()) == []
     if name.endswith(".json"):
-        assert export(compact, tmp_path / name, data=ball_scene(5)).cameras == 5
+        assert export(compact_file, tmp_path / name, data=ball_scene(5)).cameras == 5
 
 
-def test_a_compact_file_is_baked_and_measured_from_where_its_photos_were_taken(compact, tmp_path):
-    said = []
-    report = export(compact, tmp_path / "a.spz", degree=1, say=said.append)
-    assert re.fullmatch(r"fitting colours of degree 1 at \d+ cameras", said[0])
+def test_a_compact_file_is_baked_and_measured_at_the_cameras_of_its_photos(compact_file, tmp_path):
+    messages = []
+    report = export(compact_file, tmp_path / "a.spz", degree=1, say=messages.append)
+    assert re.fullmatch(r"fitting colours of degree 1 at \d+ cameras", messages[0])
     assert report.views > 0 and report.psnr > 25
-    assert export(compact, tmp_path / "a.points.ply").cameras == len(FOUR)
+    assert export(compact_file, tmp_path / "a.points.ply").cameras == len(FOUR_CAMERAS)
 
 
-def test_a_file_without_cameras_is_baked_and_measured_around_the_scene(plain, tmp_path):
-    said = []
-    report = export(without_cameras(plain, tmp_path / "bare.hyrf"), tmp_path / "a.spz", degree=1, say=said.append)
-    assert "stores no cameras" in said[0] and report.views > 0 and report.psnr > 25
+def test_a_file_without_cameras_is_baked_and_measured_on_an_orbit(plain_file, tmp_path):
+    messages = []
+    report = export(
+        without_cameras(plain_file, tmp_path / "bare.hyrf"), tmp_path / "a.spz", degree=1, say=messages.append
+    )
+    assert "stores no cameras" in messages[0] and report.views > 0 and report.psnr > 25
 
 
-# -- refusals come before the work, and nothing is half done -----------------------------------------------------------
+# -- refusals before the work, and no half-written files --------------------------------------------------------------
 
 
-def test_the_ending_names_the_format():
+def test_the_suffix_selects_the_format():
     assert [find_file_kind(f"a/b{ending}").ending for ending in ENDINGS] == list(ENDINGS)
     assert find_file_kind("a/b") is PLAYER_FOLDER and find_file_kind("a/b", colmap=True) is COLMAP_FOLDER
     for name, ending in {"A/B.PLY": ".ply", "a.b/c": "", "my.scene.spz": ".spz"}.items():
@@ -384,7 +389,7 @@ def test_the_ending_names_the_format():
         find_file_kind("a.ply", colmap=True)
 
 
-WRONG = [
+INVALID_OPTIONS = [
     {"degree": 4},
     {"degree": -1},
     {"crop": (0, 0, 0, 1, 1, float("nan"))},
@@ -397,40 +402,40 @@ WRONG = [
 ]
 
 
-@pytest.mark.parametrize("options", WRONG, ids=str)
-def test_options_that_cannot_be_met_are_one_sentence_before_the_bake(options, plain, tmp_path, no_bake):
+@pytest.mark.parametrize("options", INVALID_OPTIONS, ids=str)
+def test_invalid_options_are_refused_before_the_bake(options, plain_file, tmp_path, fail_if_baked):
     with pytest.raises(HyrfError) as refusal:
-        export(plain, tmp_path / "a.ply", **options)
+        export(plain_file, tmp_path / "a.ply", **options)
     assert re.fullmatch(r"[^\n]+; [^\n]+[^.]", str(refusal.value))
     assert list(tmp_path.iterdir()) == []
 
 
-def test_choosing_gaussians_for_a_file_of_cameras_is_refused(plain, tmp_path):
-    for options in ({"crop": CROP}, {"min_opacity": 0.5}):
+def test_gaussian_options_for_a_file_of_cameras_are_refused(plain_file, tmp_path):
+    for options in ({"crop": CROP_BOX}, {"min_opacity": 0.5}):
         with pytest.raises(HyrfError, match=r"holds only cameras[^\n]*$"):
-            export(plain, tmp_path / "a.json", **options)
+            export(plain_file, tmp_path / "a.json", **options)
 
 
-def test_a_model_that_no_camera_sees_is_one_sentence(tmp_path):
-    # So large that it would cover the pictures, and beside them.
-    source = write(tmp_path / "m.hyrf", small_model([[-4.8, 3.1, 4.1]], scale_logits=8.0), ring(4))
+def test_a_model_that_no_camera_sees_is_refused(tmp_path):
+    # The Gaussians lie beside the pictures but are large enough to cover them.
+    source = write_model(tmp_path / "m.hyrf", small_model([[-4.8, 3.1, 4.1]], scale_logits=8.0), ring(4))
     with pytest.raises(HyrfError, match=r"^no Gaussian is left: [^\n]*$"):
         export(source, tmp_path / "a.glb", degree=0)
     assert not (tmp_path / "a.glb").exists()
 
 
 @pytest.mark.parametrize("name", ["file/a.ply", "file/colmap", "file/a.json"])
-def test_places_that_cannot_be_written_to_are_refused_before_the_bake(name, plain, tmp_path, no_bake):
+def test_unwritable_targets_are_refused_before_the_bake(name, plain_file, tmp_path, fail_if_baked):
     (tmp_path / "file").write_text("mine")
     with pytest.raises(HyrfError, match=r"^[^\n]*file[^\n]*$"):
-        export(plain, tmp_path / name)
+        export(plain_file, tmp_path / name)
     assert [path.name for path in tmp_path.iterdir()] == ["file"] and (tmp_path / "file").read_text() == "mine"
 
 
-def test_a_folder_with_the_ending_of_a_file_is_refused_before_the_bake(plain, tmp_path, no_bake):
+def test_a_folder_with_a_file_suffix_is_refused_before_the_bake(plain_file, tmp_path, fail_if_baked):
     (tmp_path / "a.ply").mkdir()
     with pytest.raises(HyrfError, match=r"a\.ply: this is a folder; name a file in it$"):
-        export(plain, tmp_path / "a.ply")
+        export(plain_file, tmp_path / "a.ply")
 
 
 @pytest.mark.parametrize(
@@ -441,16 +446,16 @@ def test_a_folder_with_the_ending_of_a_file_is_refused_before_the_bake(plain, tm
         ("", "pycolmap", "pycolmap"),
     ],
 )
-def test_packages_that_are_not_there_are_missed_before_the_bake(
-    ending, module, package, plain, tmp_path, no_bake, monkeypatch
+def test_missing_packages_are_reported_before_the_bake(
+    ending, module, package, plain_file, tmp_path, fail_if_baked, monkeypatch
 ):
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(HyrfError, match=rf"pip install {package}'$"):
-        export(plain, tmp_path / f"a{ending}", colmap=not ending)
+        export(plain_file, tmp_path / f"a{ending}", colmap=not ending)
 
 
 @pytest.mark.parametrize("failing", ["encode", "decode", "background_splats"])
-def test_what_goes_wrong_leaves_the_old_file_as_it_was(failing, sphere, tmp_path, monkeypatch):
+def test_a_failed_export_keeps_the_old_file(failing, sphere_file, tmp_path, monkeypatch):
     def fail(*arguments, **options):
         raise HyrfError("no", fix="none")
 
@@ -460,30 +465,30 @@ def test_what_goes_wrong_leaves_the_old_file_as_it_was(failing, sphere, tmp_path
         monkeypatch.setattr(pipeline, "find_file_kind", lambda *target: replace(FORMATS[".ply"], **{failing: fail}))
     (tmp_path / "a.ply").write_bytes(b"old")
     with pytest.raises(HyrfError, match="^no; none$"):
-        export(sphere, tmp_path / "a.ply", degree=0)
+        export(sphere_file, tmp_path / "a.ply", degree=0)
     assert [path.name for path in tmp_path.iterdir()] == ["a.ply"] and (tmp_path / "a.ply").read_bytes() == b"old"
 
 
-def test_a_disk_that_fails_leaves_the_old_file_as_it_was(plain, tmp_path, monkeypatch):
+def test_a_full_disk_keeps_the_old_file(plain_file, tmp_path, monkeypatch):
     def fail(*arguments):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("hyrfpack.atomic.os.replace", fail)
     (tmp_path / "a.ply").write_bytes(b"old")
     with pytest.raises(HyrfError, match=r"a\.ply: the disk is full[^\n]*$"):
-        export(plain, tmp_path / "a.ply", degree=0)
+        export(plain_file, tmp_path / "a.ply", degree=0)
     assert [path.name for path in tmp_path.iterdir()] == ["a.ply"] and (tmp_path / "a.ply").read_bytes() == b"old"
 
 
 # -- for callers -----------------------------------------------------------------------------------------------------
 
 
-def test_export_is_one_call_on_the_package(plain, tmp_path):
-    report = hyrfpack.export_model(plain, tmp_path / "a.ply", degree=0)
+def test_export_is_a_function_of_the_package(plain_file, tmp_path):
+    report = hyrfpack.export_model(plain_file, tmp_path / "a.ply", degree=0)
     assert isinstance(report, hyrfpack.ExportReport) and hyrfpack.ExportReport is ExportReport
     assert {"export_model", "ExportReport"} <= set(hyrfpack.__all__)
 
 
-def test_choosing_all_copies_nothing(plain):
-    splats = bake(load_model(plain), [], (0,))[0]
+def test_selecting_all_gaussians_copies_nothing(plain_file):
+    splats = bake(load_model(plain_file), [], (0,))[0]
     assert select_splats(splats) is splats

@@ -1,4 +1,4 @@
-"""What is exported is a model and the cameras that it was, or may have been, photographed with."""
+"""An export source is a model with the cameras of its photos, or with cameras chosen for it."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from hyrfpack.export.source import MAX_MEASURED_VIEWS, MIN_CAMERAS_TO_HOLD_OUT, 
 from hyrfpack.format import save_model
 from hyrfpack.scene import Camera, Scene
 
-POSITIONS = np.random.default_rng(0).uniform(-0.6, 0.6, (20, 3))
+GAUSSIAN_POSITIONS = np.random.default_rng(0).uniform(-0.6, 0.6, (20, 3))
 
 
 @pytest.fixture
-def written(tmp_path):
-    """Writes a model with a provenance; returns its path."""
+def write_model(tmp_path):
+    """Return a function that writes a model with a provenance and returns its path."""
 
-    def write(provenance=None, positions=POSITIONS):
+    def write(provenance=None, positions=GAUSSIAN_POSITIONS):
         path = tmp_path / "model.hyrf"
         save_model(small_model(positions), path, provenance=provenance)
         return path
@@ -30,78 +30,81 @@ def written(tmp_path):
     return write
 
 
-def kept(count: int) -> dict:
+def ring_provenance(count: int) -> dict:
     cameras = ring(count)
     return {"cameras": provenance_cameras(cameras), "viewpoint": Viewpoint.from_cameras(cameras).to_json()}
 
 
-def places(cameras) -> set[tuple[float, ...]]:
+def rounded_positions(cameras) -> set[tuple[float, ...]]:
     return {tuple(camera.position.round(6)) for camera in cameras}
 
 
-def split(scene: Scene) -> Scene:
-    """With every fourth photo held out."""
+def hold_out_every_fourth(scene: Scene) -> Scene:
+    """Return the scene with every fourth photo held out."""
     held = scene.train[::4]
     return replace(scene, train=[view for view in scene.train if view not in held], test=held)
 
 
 @pytest.mark.parametrize("count", [MIN_CAMERAS_TO_HOLD_OUT, 40, 128])
-def test_cameras_that_are_measured_at_are_not_fitted(count, written):
-    source = Source.read(written(kept(count)))
-    fitted, measured = places(source.fit_cameras), places(camera for camera, _ in source.measured_views)
+def test_measured_cameras_are_not_fitted(count, write_model):
+    source = Source.read(write_model(ring_provenance(count)))
+    fitted, measured = (
+        rounded_positions(source.fit_cameras),
+        rounded_positions(camera for camera, _ in source.measured_views),
+    )
     assert not fitted & measured and 2 <= len(measured) <= MAX_MEASURED_VIEWS
     assert len(source.cameras) == count and len(fitted) == count - len(range(0, count, 8))
 
 
-def test_of_few_cameras_none_is_spared(written):
-    source = Source.read(written(kept(MIN_CAMERAS_TO_HOLD_OUT - 1)))
+def test_few_cameras_are_all_fitted(write_model):
+    source = Source.read(write_model(ring_provenance(MIN_CAMERAS_TO_HOLD_OUT - 1)))
     assert len(source.fit_cameras) == MIN_CAMERAS_TO_HOLD_OUT - 1
-    assert places(camera for camera, _ in source.measured_views) <= places(source.fit_cameras)
+    assert rounded_positions(camera for camera, _ in source.measured_views) <= rounded_positions(source.fit_cameras)
 
 
-def test_a_camera_that_is_kept_is_the_one_that_was_photographed_with(written):
+def test_stored_cameras_equal_the_cameras_of_the_photos(write_model):
     cameras = ring(5, width=40, height=30)
-    source = Source.read(written({"cameras": provenance_cameras(cameras)}))
+    source = Source.read(write_model({"cameras": provenance_cameras(cameras)}))
     for (name, back), camera in zip(source.cameras, cameras, strict=True):
         assert name.endswith(".png") and (back.width, back.height, back.fx) == (40, 30, camera.fx)
         assert np.allclose(back.camera_from_world, camera.camera_from_world, atol=1e-7)
     assert len({name for name, _ in source.cameras}) == 5
 
 
-def test_which_way_is_up_and_what_is_looked_at_come_from_the_capture(written):
-    source = Source.read(written(kept(12)))  # a ring about the z axis
+def test_up_and_center_come_from_the_capture(write_model):
+    source = Source.read(write_model(ring_provenance(12)))  # the cameras lie on a ring about the z axis
     assert np.allclose(source.up, (0, 0, 1), atol=1e-6) and np.allclose(source.center, 0, atol=1e-6)
 
 
 @pytest.mark.parametrize("provenance", [None, {"viewpoint": Viewpoint.from_cameras(ring(9)).to_json()}])
-def test_without_cameras_rings_around_the_scene_serve(provenance, written):
-    source = Source.read(written(provenance))
+def test_without_cameras_rings_around_the_scene_are_used(provenance, write_model):
+    source = Source.read(write_model(provenance))
     assert source.cameras == [] and source.fit_cameras and len(source.measured_views) == MAX_MEASURED_VIEWS
-    assert not places(source.fit_cameras) & places(camera for camera, _ in source.measured_views)
+    assert not rounded_positions(source.fit_cameras) & rounded_positions(camera for camera, _ in source.measured_views)
     for camera in source.fit_cameras:
         toward = source.center - camera.position
         assert camera.forward @ toward / np.linalg.norm(toward) == pytest.approx(1)
     assert np.linalg.norm(source.up) == pytest.approx(1)
 
 
-def test_photos_come_before_the_cameras_that_the_file_keeps(written):
-    scene = split(ball_scene(12))
-    source = Source.read(written(kept(30)), scene)
+def test_photos_take_precedence_over_stored_cameras(write_model):
+    scene = hold_out_every_fourth(ball_scene(12))
+    source = Source.read(write_model(ring_provenance(30)), scene)
     assert source.cameras == [(view.name, view.camera) for view in scene.train]
     assert source.fit_cameras == [view.camera for view in scene.train]
     assert source.measured_views == [(view.camera, view) for view in scene.test]
 
 
-def test_at_most_so_many_held_out_photos_are_scored(written):
-    scene = split(ball_scene(80, side=4))
-    assert len(Source.read(written(), scene).measured_views) == MAX_MEASURED_VIEWS < len(scene.test)
+def test_the_number_of_scored_held_out_photos_is_limited(write_model):
+    scene = hold_out_every_fourth(ball_scene(80, side=4))
+    assert len(Source.read(write_model(), scene).measured_views) == MAX_MEASURED_VIEWS < len(scene.test)
 
 
-def test_without_held_out_photos_there_is_nothing_to_measure_at(written):
-    assert Source.read(written(), ball_scene(3)).measured_views == []
+def test_without_held_out_photos_no_view_is_measured(write_model):
+    assert Source.read(write_model(), ball_scene(3)).measured_views == []
 
 
-BROKEN = {
+INVALID_VIEWPOINTS = {
     "no up": {"center": [0, 0, 0]},
     "up without length": {"up": [0, 0, 0], "center": [0, 0, 0]},
     "up in the plane": {"up": [0, 1], "center": [0, 0, 0]},
@@ -112,35 +115,36 @@ BROKEN = {
 }
 
 
-@pytest.mark.parametrize("what", BROKEN)
-def test_a_viewpoint_without_sense_is_one_sentence(what, written):
-    path = written({"viewpoint": BROKEN[what], "cameras": provenance_cameras(ring(3))})
+@pytest.mark.parametrize("case", INVALID_VIEWPOINTS)
+def test_an_invalid_viewpoint_is_reported_in_one_sentence(case, write_model):
+    path = write_model({"viewpoint": INVALID_VIEWPOINTS[case], "cameras": provenance_cameras(ring(3))})
     with pytest.raises(HyrfError, match=r"viewpoint [^\n]*$"):
         Source.read(path)
 
 
 @pytest.mark.parametrize("cameras", [7, "none", [[1, 2, 3]], [[32, 32, 0, 1, 1, 1, *range(12)]], {"a": 1}])
-def test_invalid_cameras_are_a_clear_error(cameras, written):
+def test_invalid_cameras_are_reported_in_one_sentence(cameras, write_model):
     with pytest.raises(HyrfError, match=r"cameras that the file keeps are not valid [^\n]*`data`$"):
-        Source.read(written({"cameras": cameras}))
+        Source.read(write_model({"cameras": cameras}))
 
 
-def test_an_empty_model_and_no_file_are_one_sentence(written, tmp_path):
-    path = written(positions=np.zeros((0, 3)))
+def test_an_empty_model_and_a_missing_file_are_reported_in_one_sentence(write_model, tmp_path):
+    path = write_model(positions=np.zeros((0, 3)))
     with pytest.raises(HyrfError, match=r"there is no Gaussian in it[^\n]*$"):
         Source.read(path)
     with pytest.raises(HyrfError, match=r"none\.hyrf[^\n]*$"):
         Source.read(tmp_path / "none.hyrf")
 
 
-def test_up_is_against_cameras_that_look_down_and_turn(written):
-    # A drone that flies to and fro over the plane z = 0: half of its pictures stand on their heads.
+def test_up_is_opposite_to_the_view_of_cameras_that_look_down_and_turn(write_model):
+    # A drone flies to and fro over the plane z = 0, so that half of its pictures are upside down.
     poses = [np.eye(4) for _ in range(12)]
     for number, pose in enumerate(poses):
         pose[:3, :3] = np.diag([1.0, -1, -1]) if number % 2 else np.diag([-1.0, 1, -1])
         pose[:3, 3] = -pose[:3, :3] @ (number - 6.0, 0.0, 3.0)
     cameras = [Camera(32, 32, 30.0, 30.0, 16.0, 16.0, pose) for pose in poses]
-    kept = {"cameras": provenance_cameras(cameras), "viewpoint": Viewpoint.from_cameras(cameras).to_json()}
-    assert np.allclose(Source.read(written(kept)).up, (0, 0, 1))
-    kept["cameras"] = provenance_cameras(cameras[::2])  # all the same way up: as likely a wall as the ground
-    assert np.allclose(abs(Source.read(written(kept)).up), (0, 1, 0))
+    ring_provenance = {"cameras": provenance_cameras(cameras), "viewpoint": Viewpoint.from_cameras(cameras).to_json()}
+    assert np.allclose(Source.read(write_model(ring_provenance)).up, (0, 0, 1))
+    # With equal orientation the plane may as well be a wall.
+    ring_provenance["cameras"] = provenance_cameras(cameras[::2])
+    assert np.allclose(abs(Source.read(write_model(ring_provenance)).up), (0, 1, 0))

@@ -1,4 +1,4 @@
-"""HybridModel <-> `.hyrf` bytes: exactness, error bounds, and what hostile files meet."""
+"""Encode and decode models as `.hyrf` files: exactness, error bounds and the refusal of hostile files."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians
 from tools.safety.synthetic_encoding import encode, quantize_with_drawn_sensitivity
 
-PROFILES = ("raw", "paper", "compact")
+ALL_PROFILES = ("raw", "paper", "compact")
 
 
 def make_model(count: int = 40, grid: HashGridConfig | None = None, **config) -> HybridModel:
-    """A small seeded model with numbers of every parameter drawn anew."""
+    """Return a small model with seeded random values of every parameter."""
     generator = torch.Generator().manual_seed(count)
     grid = grid or HashGridConfig(log2_table_size=6, levels=3, base=3, finest=9)
     frame = Frame(center=(10.0, -2.5, 0.125), scale=3.5, half_extent=(1.0, 0.5, 0.25))
@@ -39,12 +39,12 @@ def make_model(count: int = 40, grid: HashGridConfig | None = None, **config) ->
     return model
 
 
-def bits(tensor: torch.Tensor) -> np.ndarray:
+def float_bits(tensor: torch.Tensor) -> np.ndarray:
     return tensor.detach().numpy().view(np.uint32)
 
 
-def rewrite(data: bytes, **changes: bytes | None) -> bytes:
-    """The file with payloads of sections replaced (None: dropped) and every checksum right; metadata is plain JSON."""
+def replace_payloads(data: bytes, **changes: bytes | None) -> bytes:
+    """Replace payloads of sections (None drops the section), with valid checksums and uncompressed metadata."""
     sections = []
     for section in read_container(data).sections:
         if section.type == "META" and "META" not in changes:
@@ -62,7 +62,7 @@ def metadata_text(data: bytes) -> bytes:
     return zlib.decompress(section.data) if section.codec == 5 else bytes(section.data)
 
 
-def metadata_of(data: bytes) -> dict:
+def parse_metadata(data: bytes) -> dict:
     return json.loads(metadata_text(data))
 
 
@@ -76,10 +76,10 @@ def test_raw_is_bit_exact(count):
     decoded = decode_model(encode_model(model, "raw"))
 
     for name, expected in model.state_dict().items():
-        assert np.array_equal(bits(decoded.state_dict()[name]), bits(expected)), name
+        assert np.array_equal(float_bits(decoded.state_dict()[name]), float_bits(expected)), name
 
 
-@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize("profile", ALL_PROFILES)
 @pytest.mark.parametrize(
     "config",
     [
@@ -88,7 +88,7 @@ def test_raw_is_bit_exact(count):
         {"direction_encoding": "frequency", "position_gradients": True},
     ],
 )
-def test_configuration_survives(profile, config):
+def test_configuration_round_trips(profile, config):
     model = make_model(**config)
 
     decoded = decode_model(encode(model, profile))
@@ -98,9 +98,9 @@ def test_configuration_survives(profile, config):
 
 
 @pytest.mark.parametrize("count", [0, 1, 3, 500])
-def test_paper_keeps_its_error_bounds(count):
+def test_paper_stays_within_its_error_bounds(count):
     model = make_model(count)
-    with torch.no_grad():  # no opacity so near 0 or 1 that its logit is cut
+    with torch.no_grad():  # keeps all opacities away from 0 and 1, where logits are clipped
         model.geometry.weights[-1][0], model.geometry.biases[-1][0] = 0, 0
     original = model.state_dict()
 
@@ -115,14 +115,14 @@ def test_paper_keeps_its_error_bounds(count):
         elif "logits" not in name:
             assert ((got - expected).abs() <= expected.abs() * 2**-11 + 2**-25).all()
         elif count > 64:
-            # One stage of 64 codewords in 3 dimensions leaves a quarter of the deviation at most.
+            # One stage of 64 codewords in 3 dimensions leaves at most a quarter of the standard deviation.
             assert (got - expected).square().mean().sqrt() < 0.25 * expected.std()
         elif count:
-            # Fewer rows than codewords: only the rounding of the codebooks is left.
+            # With fewer rows than codewords, only the rounding of the codebooks remains.
             assert (got - expected).abs().max() <= expected.abs().max() * 2**-10
 
 
-def test_paper_gets_better_and_bigger_with_stages():
+def test_more_stages_of_paper_lower_the_error_and_raise_the_size():
     model = make_model(2000)
 
     def size_and_error(stages: int) -> tuple[int, float]:
@@ -136,7 +136,7 @@ def test_paper_gets_better_and_bigger_with_stages():
     assert coarse > 2 * fine > 4 * finest
 
 
-def test_saturated_opacities_cost_no_accuracy_elsewhere():
+def test_saturated_opacities_do_not_affect_other_opacities():
     model, with_tail = make_model(2000), make_model(2000)
     with torch.no_grad():
         with_tail.gaussians.opacity_logits[:200] = torch.linspace(40, 900, 200)[:, None]
@@ -164,8 +164,8 @@ def test_constant_channels_and_tables_are_exact():
             assert torch.equal(decoded[name], expected), name
 
 
-@pytest.mark.parametrize("profile", PROFILES)
-def test_same_model_gives_same_bytes(profile):
+@pytest.mark.parametrize("profile", ALL_PROFILES)
+def test_encoding_is_deterministic(profile):
     provenance = {"steps": 1000, "preset": "standard", "why": {"table": "8 Gaussians an entry"}}
 
     first = encode(make_model(300), profile, provenance)
@@ -174,8 +174,8 @@ def test_same_model_gives_same_bytes(profile):
     assert first == second
 
 
-@pytest.mark.parametrize("profile", PROFILES)
-def test_encoding_leaves_model_and_random_state_alone(profile):
+@pytest.mark.parametrize("profile", ALL_PROFILES)
+def test_encoding_changes_neither_the_model_nor_the_random_state(profile):
     model = make_model(300)
     before = {name: value.clone() for name, value in model.state_dict().items()}
     state = torch.get_rng_state()
@@ -186,7 +186,7 @@ def test_encoding_leaves_model_and_random_state_alone(profile):
     assert torch.equal(torch.get_rng_state(), state)
 
 
-@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize("profile", ALL_PROFILES)
 @pytest.mark.parametrize(
     ("parameter", "holds"),
     [
@@ -197,7 +197,7 @@ def test_encoding_leaves_model_and_random_state_alone(profile):
     ],
 )
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_save_refuses_numbers_that_are_not_finite_and_names_the_group(tmp_path, profile, parameter, holds, value):
+def test_save_refuses_nonfinite_values_with_the_name_of_the_group(tmp_path, profile, parameter, holds, value):
     model = make_model()
     planned = quantize_with_drawn_sensitivity(model).plan.apply if profile == "compact" else None
     with torch.no_grad():
@@ -210,7 +210,7 @@ def test_save_refuses_numbers_that_are_not_finite_and_names_the_group(tmp_path, 
 
 
 @pytest.mark.parametrize("parameter", ["gaussians.positions", "gaussians.scale_logits", "radiance.weights.1"])
-def test_paper_refuses_what_overflows_half_precision(parameter):
+def test_paper_refuses_values_that_overflow_half_precision(parameter):
     model = make_model()
     with torch.no_grad():
         model.state_dict()[parameter].view(-1)[0] = -65505.0
@@ -219,7 +219,7 @@ def test_paper_refuses_what_overflows_half_precision(parameter):
         encode_model(model, "paper")
 
 
-def test_paper_keeps_the_largest_half():
+def test_paper_stores_the_largest_half_precision_value():
     model = make_model()
     with torch.no_grad():
         model.gaussians.positions[0, 0] = 65504.0
@@ -236,14 +236,14 @@ def test_unknown_profile_and_settings_out_of_range_are_refused():
         encode_model(make_model(), "paper", opacity=(1, 257))
 
 
-def test_provenance_must_be_json():
+def test_provenance_that_is_not_json_is_refused():
     with pytest.raises(ValueError, match="not JSON"):
         encode_model(make_model(), provenance={"data": object()})
     with pytest.raises(ValueError):
         encode_model(make_model(), provenance={"loss": float("nan")})
 
 
-def test_report_adds_up_to_the_file(tmp_path):
+def test_section_sizes_in_the_report_add_up_to_the_file(tmp_path):
     path = tmp_path / "model.hyrf"
     model = make_model(500)
 
@@ -253,7 +253,7 @@ def test_report_adds_up_to_the_file(tmp_path):
     assert report.bytes_before == 4 * sum(parameter.numel() for parameter in model.parameters())
     stored = {size.type: size.after for size in report.sections}
     assert stored["POSI"] == 500 * 6
-    # What is not in sections: a header of 48 bytes, 40 a section, and padding of less than 8 each.
+    # Outside the sections are a header of 48 bytes, 40 bytes for each section, and up to 7 bytes of padding for each.
     overhead = report.bytes_after - sum(stored.values()) - 48 - 40 * len(stored)
     assert 0 <= overhead < 8 * len(stored)
 
@@ -272,11 +272,11 @@ def test_repacking_keeps_configuration_and_provenance(tmp_path):
     assert describe_file(tmp_path / "back.hyrf")["provenance"] == {"steps": 7}
 
 
-def test_describe_tells_what_is_inside_without_torch_and_numpy(tmp_path):
+def test_describe_works_without_torch_and_numpy(tmp_path):
     path = tmp_path / "model.hyrf"
     save_model(make_model(500), path, "paper", {"steps": 30})
     program = (
-        "import sys, json; from hyrfpack.format import describe; info = describe(sys.argv[1]);"
+        "import sys, json; from hyrfpack.format import describe_file; info = describe_file(sys.argv[1]);"
         "print(json.dumps([info, [name for name in ('torch', 'numpy', 'dahuffman') if name in sys.modules]]))"
     )
 
@@ -308,14 +308,14 @@ def test_describe_reads_deflated_metadata(tmp_path):
     assert facts["config"] == json.loads(json.dumps(model.config.to_dict()))
 
 
-def test_describe_of_no_gaussians_has_no_bits_per_gaussian(tmp_path):
+def test_describe_of_an_empty_model_has_no_bits_per_gaussian(tmp_path):
     save_model(make_model(0), tmp_path / "empty.hyrf")
 
     assert describe_file(tmp_path / "empty.hyrf")["bits_per_gaussian"] is None
 
 
-@pytest.mark.parametrize("profile", PROFILES)
-def test_truncation_is_refused_everywhere(profile):
+@pytest.mark.parametrize("profile", ALL_PROFILES)
+def test_truncation_at_any_byte_is_refused(profile):
     data = encode(make_model(), profile)
     entries = read_container(data).entries.values()
     edges = {
@@ -334,8 +334,8 @@ def test_truncation_is_refused_everywhere(profile):
             decode_model(data[:end])
 
 
-@pytest.mark.parametrize("profile", PROFILES)
-def test_a_flipped_bit_is_found_everywhere(profile):
+@pytest.mark.parametrize("profile", ALL_PROFILES)
+def test_a_flipped_bit_is_detected_anywhere(profile):
     small_codebooks = {"color": (2, 8), "scale": (1, 4), "opacity": (1, 4)} if profile == "paper" else {}
     data = bytearray(encode(make_model(5), profile, **small_codebooks))
 
@@ -346,7 +346,7 @@ def test_a_flipped_bit_is_found_everywhere(profile):
         data[position] ^= 1 << position % 8
 
 
-def test_error_names_the_file_and_the_section(tmp_path):
+def test_errors_contain_the_file_and_the_section(tmp_path):
     path = tmp_path / "model.hyrf"
     data = bytearray(encode_model(make_model()))
     data[read_container(data).entries["GTAB"].offset] ^= 1
@@ -356,30 +356,30 @@ def test_error_names_the_file_and_the_section(tmp_path):
         load_model(path)
 
 
-@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize("profile", ALL_PROFILES)
 @pytest.mark.parametrize("count", [0, 39, 41, 2**39])
 def test_a_forged_count_is_refused(profile, count):
     data = encode(make_model(40), profile, **({"prune": False} if profile == "compact" else {}))
-    forged = json.dumps(metadata_of(data) | {"gaussians": count}).encode()
+    forged = json.dumps(parse_metadata(data) | {"gaussians": count}).encode()
 
     with pytest.raises(HyrfFormatError):
-        decode_model(rewrite(data, META=forged))
+        decode_model(replace_payloads(data, META=forged))
 
 
-def test_a_forged_table_size_is_refused_before_anything_is_allocated():
+def test_a_forged_table_size_is_refused_before_any_allocation():
     data = encode_model(make_model())
-    metadata = metadata_of(data)
+    metadata = parse_metadata(data)
     metadata["config"]["geometry"] = {"log2_table_size": 24, "levels": 32, "base": 1024, "finest": 65536}
 
     with pytest.raises(HyrfFormatError, match="'GTAB' says it decodes to"):
-        decode_model(rewrite(data, META=json.dumps(metadata).encode()))
+        decode_model(replace_payloads(data, META=json.dumps(metadata).encode()))
 
 
-@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize("profile", ALL_PROFILES)
 @pytest.mark.parametrize("type", ["META", "POSI", "RTAB", "GMLP"])
 def test_a_missing_section_is_refused(profile, type):
     with pytest.raises(HyrfFormatError):
-        decode_model(rewrite(encode(make_model(), profile), **{type: None}))
+        decode_model(replace_payloads(encode(make_model(), profile), **{type: None}))
 
 
 def test_an_unknown_codec_is_refused():
@@ -402,13 +402,13 @@ def test_unknown_optional_section_is_skipped():
     assert torch.equal(decoded.gaussians.positions, model.gaussians.positions)
 
 
-def test_numbers_that_are_not_finite_are_refused_on_load():
+def test_nonfinite_values_are_refused_on_load():
     data = encode_model(make_model())
     positions = bytearray(read_container(data)["POSI"].data)
     positions[:4] = np.float32(np.nan).tobytes()
 
     with pytest.raises(HyrfFormatError, match="'POSI' holds numbers that are not finite"):
-        decode_model(rewrite(data, POSI=bytes(positions)))
+        decode_model(replace_payloads(data, POSI=bytes(positions)))
 
 
 METADATA_FORGERIES = {
@@ -440,18 +440,18 @@ METADATA_FORGERIES = {
 @pytest.mark.parametrize("forgery", METADATA_FORGERIES)
 def test_forged_metadata_is_refused(forgery):
     data = encode_model(make_model())
-    forged = json.dumps(METADATA_FORGERIES[forgery](metadata_of(data))).encode()
+    forged = json.dumps(METADATA_FORGERIES[forgery](parse_metadata(data))).encode()
 
     with pytest.raises(HyrfFormatError):
-        decode_model(rewrite(data, META=forged))
+        decode_model(replace_payloads(data, META=forged))
 
 
 @pytest.mark.parametrize("key", ["frame", "geometry", "radiance", "hidden", "solid", "background"])
 def test_describe_refuses_a_configuration_of_wrong_types(tmp_path, key):
     data = encode_model(make_model())
-    metadata = metadata_of(data)
+    metadata = parse_metadata(data)
     metadata["config"][key] = {"center": 0}
-    (tmp_path / "model.hyrf").write_bytes(rewrite(data, META=json.dumps(metadata).encode()))
+    (tmp_path / "model.hyrf").write_bytes(replace_payloads(data, META=json.dumps(metadata).encode()))
 
     with pytest.raises(HyrfFormatError, match=f"model.hyrf.*config.{key}"):
         describe_file(tmp_path / "model.hyrf")
@@ -472,7 +472,7 @@ def test_describe_refuses_a_configuration_of_wrong_types(tmp_path, key):
 )
 def test_metadata_that_is_not_json_is_refused(tmp_path, text):
     path = tmp_path / "model.hyrf"
-    path.write_bytes(rewrite(encode_model(make_model()), META=text))
+    path.write_bytes(replace_payloads(encode_model(make_model()), META=text))
 
     with pytest.raises(HyrfFormatError, match="model.hyrf.*metadata"):
         describe_file(path)
@@ -512,17 +512,17 @@ def test_forged_deflated_metadata_is_refused_in_little_memory(forgery):
 
 @settings(max_examples=150, deadline=None)
 @given(
-    profile=st.sampled_from(PROFILES),
+    profile=st.sampled_from(ALL_PROFILES),
     type=st.sampled_from(["META", "POSI", "COLO", "OPAC", "GTAB", "RMLP"]),
     edit=st.tuples(st.floats(0, 1), st.integers(0, 4), st.binary(max_size=8)),
 )
-def test_forged_payloads_with_right_checksums_never_escape_the_error_family(profile, type, edit):
-    data = FORGERY_TARGETS[profile]
+def test_forged_payloads_with_valid_checksums_raise_only_format_errors(profile, type, edit):
+    data = FILE_BY_PROFILE[profile]
     container = read_container(data)
     where, removed, inserted = edit
     payload = bytes(container[type].data)
     start = int(where * len(payload))
-    forged = rewrite(data, **{type: payload[:start] + inserted + payload[start + removed :]})
+    forged = replace_payloads(data, **{type: payload[:start] + inserted + payload[start + removed :]})
 
     try:
         model = decode_model(forged)
@@ -531,4 +531,4 @@ def test_forged_payloads_with_right_checksums_never_escape_the_error_family(prof
     assert all(torch.isfinite(parameter).all() for parameter in model.parameters())
 
 
-FORGERY_TARGETS = {profile: encode(make_model(20), profile) for profile in PROFILES}
+FILE_BY_PROFILE = {profile: encode(make_model(20), profile) for profile in ALL_PROFILES}

@@ -1,4 +1,4 @@
-"""What a reader tells from decoded positions, and what hostile sections meet."""
+"""The reader derives step groups from decoded positions and refuses hostile sections of profile compact."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ from hyrfpack.quant.points import LatticePoints
 from tools.safety.synthetic_encoding import quantize_with_drawn_sensitivity
 
 
-def a_model(count: int) -> HybridModel:
+def random_model(count: int) -> HybridModel:
     rng = np.random.default_rng(0)
     return small_model(rng.normal(size=(count, 3)) * 0.7, fields=0.3, color_logits=rng.normal(size=(count, 3)))
 
 
-# Groups.
+# Step groups.
 
 
-def a_lattice(count: int = 250, seed: int = 0) -> LatticePoints:
+def random_lattice(count: int = 250, seed: int = 0) -> LatticePoints:
     rng = np.random.default_rng(seed)
     bits, classes = np.array([12, 5, 3]), rng.integers(3, size=count).astype(np.uint8)
     return LatticePoints(rng.integers(0, (1 << bits)[classes][:, None], (count, 3)), classes, bits)
 
 
 @pytest.mark.parametrize("group", ["GTAB", "RTAB"])
-def test_rows_share_a_step_by_level_and_how_often_they_are_read(group: str) -> None:
-    config, points = a_model(1).config, a_lattice()
+def test_table_rows_are_grouped_by_level_and_usage(group: str) -> None:
+    config, points = random_model(1).config, random_lattice()
     grid = config.geometry
     coords = torch.from_numpy((points.cells + 0.5) * 2.0 ** -points.bits[points.classes][:, None])
     read = corner_rows(reference_cells(coords, grid.resolutions), grid.resolutions, grid.log2_table_size)
@@ -58,8 +58,8 @@ def test_rows_share_a_step_by_level_and_how_often_they_are_read(group: str) -> N
     assert groups.count == 16 * grid.levels and max(usage) > 2
 
 
-def test_of_many_gaussians_every_nth_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    config, points = a_model(1).config, a_lattice(250)
+def test_usage_counts_every_nth_of_many_gaussians(monkeypatch: pytest.MonkeyPatch) -> None:
+    config, points = random_model(1).config, random_lattice(250)
     every_third = LatticePoints(points.cells[::3], points.classes[::3], points.bits)
     expected = build_step_groups("GTAB", config, every_third)
 
@@ -68,8 +68,8 @@ def test_of_many_gaussians_every_nth_is_counted(monkeypatch: pytest.MonkeyPatch)
     np.testing.assert_array_equal(build_step_groups("GTAB", config, points).index, expected.index)
 
 
-def test_no_gaussian_reads_no_row() -> None:
-    config = a_model(1).config
+def test_without_gaussians_no_row_is_used() -> None:
+    config = random_model(1).config
     points = LatticePoints(np.zeros((0, 3), np.int64), np.zeros(0, np.uint8), np.ones(6, np.int64))
 
     groups = build_step_groups("RTAB", config, points)
@@ -78,8 +78,8 @@ def test_no_gaussian_reads_no_row() -> None:
 
 
 @pytest.mark.parametrize(("group", "field"), [("GMLP", "geometry"), ("RMLP", "radiance")])
-def test_weights_of_an_output_share_a_step_and_biases_of_a_layer(group: str, field: str) -> None:
-    model = a_model(1)
+def test_weights_are_grouped_by_output_and_biases_by_layer(group: str, field: str) -> None:
+    model = random_model(1)
     arrays = to_arrays(model)
     groups = build_step_groups(group, model.config, None)
     arrays[group] = groups.index.astype(np.float32)[:, None]
@@ -96,7 +96,7 @@ def test_weights_of_an_output_share_a_step_and_biases_of_a_layer(group: str, fie
     assert groups.count == expected
 
 
-# Sections that nobody should have written.
+# Hostile sections.
 
 
 @pytest.mark.parametrize(
@@ -108,20 +108,20 @@ def test_weights_of_an_output_share_a_step_and_biases_of_a_layer(group: str, fie
         if group not in groups
     ],
 )
-def test_sections_with_the_codec_of_another_are_refused(group: str, codec: int) -> None:
+def test_sections_with_a_codec_of_other_groups_are_refused(group: str, codec: int) -> None:
     with pytest.raises(HyrfFormatError, match="codec"):
-        decode_section(group, codec, memoryview(bytes(40)), (0, 1), a_model(1).config, a_lattice())
+        decode_section(group, codec, memoryview(bytes(40)), (0, 1), random_model(1).config, random_lattice())
 
 
 @pytest.mark.parametrize("group", ["COLO", "SCAL", "OPAC", "GTAB", "RTAB"])
-def test_sections_that_lean_on_positions_are_refused_without(group: str) -> None:
+def test_sections_that_need_positions_are_refused_without_them(group: str) -> None:
     codec = CODEC_GROUPS if group.endswith("TAB") else CODEC_CHANNELS
 
     with pytest.raises(HyrfFormatError, match=f"positions of codec {CODEC_POINTS}"):
-        decode_section(group, codec, memoryview(bytes(40)), (0, 1), a_model(1).config, None)
+        decode_section(group, codec, memoryview(bytes(40)), (0, 1), random_model(1).config, None)
 
 
-def decoded_arrays(coded: dict[str, tuple[int, bytes]], model: HybridModel, count: int) -> dict[str, np.ndarray]:
+def decode_sections(coded: dict[str, tuple[int, bytes]], model: HybridModel, count: int) -> dict[str, np.ndarray]:
     arrays = {}
     arrays["POSI"], points = decode_positions(memoryview(coded["POSI"][1]), count, model.config)
     for group, shape in group_shapes(model.config, count).items():
@@ -133,24 +133,24 @@ def decoded_arrays(coded: dict[str, tuple[int, bytes]], model: HybridModel, coun
 
 @given(st.data())
 @settings(max_examples=150, deadline=None)
-def test_damage_is_refused_or_yields_finite_numbers(data: st.DataObject) -> None:
-    group = data.draw(st.sampled_from(sorted(CODED)))
-    codec, stored = CODED[group]
+def test_damaged_sections_are_refused_or_decode_to_finite_values(data: st.DataObject) -> None:
+    group = data.draw(st.sampled_from(sorted(CODED_SECTIONS)))
+    codec, stored = CODED_SECTIONS[group]
     damaged = bytearray(stored)
     for _ in range(data.draw(st.integers(1, 4))):
         damaged[data.draw(st.integers(0, len(damaged) - 1))] ^= data.draw(st.integers(1, 255))
-    coded = {**CODED, group: (codec, bytes(damaged))}
+    coded = {**CODED_SECTIONS, group: (codec, bytes(damaged))}
 
     try:
-        arrays = decoded_arrays(coded, MODEL, 40)
+        arrays = decode_sections(coded, SAMPLE_MODEL, 40)
     except DamagedDataError:
         return
-    for group, shape in group_shapes(MODEL.config, 40).items():
+    for group, shape in group_shapes(SAMPLE_MODEL.config, 40).items():
         assert arrays[group].shape == shape and np.isfinite(arrays[group]).all()
 
 
-MODEL = a_model(40)
-CODED = {
+SAMPLE_MODEL = random_model(40)
+CODED_SECTIONS = {
     section.type: (section.codec, section.data)
-    for section in encode(MODEL, quantize_with_drawn_sensitivity(MODEL, prune=False))[0]
+    for section in encode(SAMPLE_MODEL, quantize_with_drawn_sensitivity(SAMPLE_MODEL, prune=False))[0]
 }

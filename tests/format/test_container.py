@@ -1,4 +1,4 @@
-"""The container: what is written comes back, and nothing that was not written is believed."""
+"""The container round-trips sections and refuses truncated, damaged and forged files."""
 
 from __future__ import annotations
 
@@ -25,26 +25,26 @@ from hyrfpack.format.container import (
     write_container,
 )
 
-# Places of header fields and table columns, from docs/reference/format.md and not from the code.
-HEADER = {"major": (8, "<H"), "minor": (10, "<H"), "flags": (12, "<I"), "file_length": (16, "<Q")}
-HEADER |= {"toc_offset": (24, "<Q"), "toc_length": (32, "<I"), "count": (36, "<I"), "toc_checksum": (40, "<I")}
-ENTRY = {"type": (0, "<4s"), "codec": (4, "<H"), "flags": (6, "<H"), "offset": (8, "<Q"), "length": (16, "<Q")}
-ENTRY |= {"raw_length": (24, "<Q"), "checksum": (32, "<I"), "reserved": (36, "<I")}
+# Offsets and types of header fields and table columns, taken from docs/reference/format.md and not from the code.
+HEADER_FIELDS = {"major": (8, "<H"), "minor": (10, "<H"), "flags": (12, "<I"), "file_length": (16, "<Q")}
+HEADER_FIELDS |= {"toc_offset": (24, "<Q"), "toc_length": (32, "<I"), "count": (36, "<I"), "toc_checksum": (40, "<I")}
+ENTRY_FIELDS = {"type": (0, "<4s"), "codec": (4, "<H"), "flags": (6, "<H"), "offset": (8, "<Q"), "length": (16, "<Q")}
+ENTRY_FIELDS |= {"raw_length": (24, "<Q"), "checksum": (32, "<I"), "reserved": (36, "<I")}
 HEADER_BYTES, ENTRY_BYTES = 48, 40
 
-SMALL = [
+SAMPLE_SECTIONS = [
     Section("META", 1, b'{"gaussians": 3}', 16),
     Section("POSI", 7, b"abc", 36),
     Section("NOTE", 0, b"", 0, required=False),
     Section("TABL", 65535, bytes(range(9)), 5000, required=False),
 ]
-KNOWN = {section.type for section in SMALL}
+KNOWN_TYPES = {section.type for section in SAMPLE_SECTIONS}
 
 
-def forge(data: bytes, index: int | None = None, **fields: int | bytes) -> bytes:
-    """Change header fields, or those of the table's line `index`, and make all checksums right again."""
+def forge_fields(data: bytes, index: int | None = None, **fields: int | bytes) -> bytes:
+    """Change fields of the header, or of entry `index` of the table, and recompute all checksums."""
     forged = bytearray(data)
-    base, columns = (0, HEADER) if index is None else (HEADER_BYTES + ENTRY_BYTES * index, ENTRY)
+    base, columns = (0, HEADER_FIELDS) if index is None else (HEADER_BYTES + ENTRY_BYTES * index, ENTRY_FIELDS)
     for name, value in fields.items():
         place, code = columns[name]
         struct.pack_into(code, forged, base + place, value)
@@ -55,11 +55,11 @@ def forge(data: bytes, index: int | None = None, **fields: int | bytes) -> bytes
     return bytes(forged)
 
 
-def read_all(data: bytes, known: set[str] | None = KNOWN) -> list[Section]:
+def read_all(data: bytes, known: set[str] | None = KNOWN_TYPES) -> list[Section]:
     return read_container(data, known).sections
 
 
-def contents(sections: list[Section]) -> list[tuple]:
+def section_contents(sections: list[Section]) -> list[tuple]:
     return [(s.type, s.codec, bytes(s.data), s.raw_length, s.required) for s in sections]
 
 
@@ -77,24 +77,26 @@ section_lists = st.lists(
 )
 
 
-# --- what is written comes back ---
+# --- round trip ---
 
 
 @given(section_lists)
-def test_sections_come_back_as_written(sections):
-    assert contents(read_all(write_container(sections, minor=MINOR_VERSION), known=None)) == contents(sections)
+def test_sections_round_trip(sections):
+    assert section_contents(read_all(write_container(sections, minor=MINOR_VERSION), known=None)) == section_contents(
+        sections
+    )
 
 
 @given(section_lists)
-def test_same_sections_give_same_bytes_and_rewriting_what_was_read_changes_nothing(sections):
+def test_writing_is_deterministic_and_rewriting_changes_nothing(sections):
     data = write_container(sections, minor=MINOR_VERSION)
 
     assert write_container(sections, minor=MINOR_VERSION) == data
     assert write_container(read_all(data, known=None), minor=MINOR_VERSION) == data
 
 
-def test_bytes_are_those_of_the_specification():
-    # Built by hand from docs/reference/format.md.
+def test_bytes_follow_the_specification():
+    # The expected bytes are built by hand from docs/reference/format.md.
     payload = b"hello"
     entry = b"TEXT" + struct.pack("<HHQQQII", 3, 1, 88, 5, 10, zlib.crc32(payload), 0)
     header = b"\x89HYRF\r\n\n" + struct.pack("<HHIQQIII", 1, 2, 0, 96, 48, 40, 1, zlib.crc32(entry))
@@ -105,11 +107,12 @@ def test_bytes_are_those_of_the_specification():
 
 def test_sections_start_at_multiples_of_eight():
     assert all(
-        entry.offset % 8 == 0 for entry in read_container(write_container(SMALL, minor=MINOR_VERSION)).entries.values()
+        entry.offset % 8 == 0
+        for entry in read_container(write_container(SAMPLE_SECTIONS, minor=MINOR_VERSION)).entries.values()
     )
 
 
-def test_memory_is_viewed_and_not_copied():
+def test_section_data_is_a_view_of_the_input():
     data = write_container([Section("BULK", 0, bytes(1 << 20), 1 << 20)], minor=MINOR_VERSION)
 
     tracemalloc.start()
@@ -144,23 +147,25 @@ def test_writer_accepts_any_contiguous_buffer(values):
     ],
     ids=["long", "space", "unicode", "newline", "twice", "codec", "negative", "bomb", "many"],
 )
-def test_writer_refuses_what_the_reader_would(sections):
+def test_writer_refuses_sections_that_the_reader_would_refuse(sections):
     with pytest.raises(ValueError):
         write_container(sections, minor=MINOR_VERSION)
 
 
 @pytest.mark.parametrize("minor", [-1, 3])
-def test_writer_refuses_a_minor_version_that_the_specification_does_not_have(minor):
+def test_writer_refuses_an_unspecified_minor_version(minor):
     with pytest.raises(ValueError, match=f"version 1.{minor} "):
-        write_container(SMALL, minor=minor)
+        write_container(SAMPLE_SECTIONS, minor=minor)
 
 
 # --- reading from a path ---
 
 
-def test_open_reads_header_and_table_only_until_a_section_is_asked_for(tmp_path):
+def test_open_reads_only_header_and_table_until_a_section_is_requested(tmp_path):
     path = tmp_path / "large.hyrf"
-    path.write_bytes(write_container([Section("BULK", 0, bytes(8 << 20), 8 << 20), *SMALL], minor=MINOR_VERSION))
+    path.write_bytes(
+        write_container([Section("BULK", 0, bytes(8 << 20), 8 << 20), *SAMPLE_SECTIONS], minor=MINOR_VERSION)
+    )
 
     tracemalloc.start()
     with Container.open(path) as container:
@@ -169,23 +174,23 @@ def test_open_reads_header_and_table_only_until_a_section_is_asked_for(tmp_path)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
 
-    assert bytes(meta.data) == SMALL[0].data and places == ["BULK", "META", "POSI", "NOTE", "TABL"]
+    assert bytes(meta.data) == SAMPLE_SECTIONS[0].data and places == ["BULK", "META", "POSI", "NOTE", "TABL"]
     assert peak < 200_000
 
 
-def test_open_sees_damage_only_in_the_section_that_is_read(tmp_path):
+def test_damage_is_detected_only_in_the_section_that_is_read(tmp_path):
     path = tmp_path / "damaged.hyrf"
-    data = bytearray(write_container(SMALL, minor=MINOR_VERSION))
+    data = bytearray(write_container(SAMPLE_SECTIONS, minor=MINOR_VERSION))
     data[-9] ^= 1
     path.write_bytes(data)
 
-    with Container.open(path, KNOWN) as container:
-        assert contents([container["META"], container["POSI"]]) == contents(SMALL[:2])
+    with Container.open(path, KNOWN_TYPES) as container:
+        assert section_contents([container["META"], container["POSI"]]) == section_contents(SAMPLE_SECTIONS[:2])
         with pytest.raises(HyrfFormatError, match="damaged.hyrf.*'TABL'"):
             container["TABL"]
 
 
-def test_open_reports_a_file_cut_short_while_it_is_read(tmp_path):
+def test_a_file_truncated_while_it_is_read_is_reported(tmp_path):
     path = tmp_path / "cut.hyrf"
     path.write_bytes(write_container([Section("BULK", 0, bytes(1 << 20), 1 << 20)], minor=MINOR_VERSION))
 
@@ -195,51 +200,51 @@ def test_open_reports_a_file_cut_short_while_it_is_read(tmp_path):
             container["BULK"]
 
 
-def a_folder(path: Path) -> None:
+def make_folder(path: Path) -> None:
     path.mkdir()
 
 
-def an_empty_file(path: Path) -> None:
+def make_empty_file(path: Path) -> None:
     path.write_bytes(b"")
 
 
-def a_text_file(path: Path) -> None:
+def make_text_file(path: Path) -> None:
     path.write_text("version https://example.org/pointer\nsize 12345\n" * 9)
 
 
-def a_file_mangled_as_text(path: Path) -> None:
-    path.write_bytes(write_container(SMALL, minor=MINOR_VERSION).replace(b"\r\n", b"\n"))
+def make_file_mangled_as_text(path: Path) -> None:
+    path.write_bytes(write_container(SAMPLE_SECTIONS, minor=MINOR_VERSION).replace(b"\r\n", b"\n"))
 
 
-def a_pipe(path: Path) -> None:
+def make_pipe(path: Path) -> None:
     os.mkfifo(path)
 
 
-def a_link_to_itself(path: Path) -> None:
+def make_link_to_itself(path: Path) -> None:
     path.symlink_to(path)
 
 
-def nothing(path: Path) -> None:
+def make_nothing(path: Path) -> None:
     pass
 
 
 @pytest.mark.parametrize(
-    ("make", "says"),
+    ("make", "message_part"),
     [
-        (a_folder, "folder"),
-        (an_empty_file, "empty"),
-        (a_text_file, "not a .hyrf file"),
-        (a_file_mangled_as_text, "not a .hyrf file"),
-        (a_pipe, "not a regular file"),
-        (a_link_to_itself, "cannot be read"),
-        (nothing, "no such file"),
+        (make_folder, "folder"),
+        (make_empty_file, "empty"),
+        (make_text_file, "not a .hyrf file"),
+        (make_file_mangled_as_text, "not a .hyrf file"),
+        (make_pipe, "not a regular file"),
+        (make_link_to_itself, "cannot be read"),
+        (make_nothing, "no such file"),
     ],
 )
-def test_open_refuses(tmp_path, make: Callable[[Path], None], says: str):
+def test_open_refuses_other_paths_than_hyrf_files(tmp_path, make: Callable[[Path], None], message_part: str):
     path = tmp_path / "model.hyrf"
     make(path)
 
-    with pytest.raises(HyrfFormatError, match=f"model.hyrf: .*{says}"):
+    with pytest.raises(HyrfFormatError, match=f"model.hyrf: .*{message_part}"):
         Container.open(path)
 
 
@@ -251,10 +256,10 @@ def test_open_refuses_a_name_with_a_null_byte():
 # --- versions and unknown sections ---
 
 
-def test_unknown_optional_section_is_skipped_and_still_listed():
-    container = read_container(write_container(SMALL, minor=MINOR_VERSION), known={"META", "POSI"})
+def test_unknown_optional_section_is_skipped_but_listed():
+    container = read_container(write_container(SAMPLE_SECTIONS, minor=MINOR_VERSION), known={"META", "POSI"})
 
-    assert contents(container.sections) == contents(SMALL[:2])
+    assert section_contents(container.sections) == section_contents(SAMPLE_SECTIONS[:2])
     assert "TABL" not in container and list(container.entries) == ["META", "POSI", "NOTE", "TABL"]
     with pytest.raises(HyrfFormatError, match="no section 'TABL'"):
         container["TABL"]
@@ -262,55 +267,57 @@ def test_unknown_optional_section_is_skipped_and_still_listed():
 
 def test_unknown_required_section_is_refused_by_name():
     with pytest.raises(HyrfFormatError, match="'POSI' is required.*update hyrfpack"):
-        read_container(write_container(SMALL, minor=MINOR_VERSION), known={"META"})
+        read_container(write_container(SAMPLE_SECTIONS, minor=MINOR_VERSION), known={"META"})
 
 
-def test_newer_major_version_is_refused_whatever_follows_the_version():
+def test_newer_major_version_is_refused_regardless_of_the_content():
     with pytest.raises(HyrfFormatError, match="version 2.7.*update hyrfpack"):
         read_container(b"\x89HYRF\r\n\n" + struct.pack("<HH", 2, 7) + b"\xff" * 100)
 
 
 def test_newer_minor_version_is_read():
-    container = read_container(forge(write_container(SMALL, minor=MINOR_VERSION), minor=9), KNOWN)
+    container = read_container(
+        forge_fields(write_container(SAMPLE_SECTIONS, minor=MINOR_VERSION), minor=9), KNOWN_TYPES
+    )
 
-    assert container.version == (1, 9) and contents(container.sections) == contents(SMALL)
+    assert container.version == (1, 9) and section_contents(container.sections) == section_contents(SAMPLE_SECTIONS)
 
 
 def test_unknown_header_flag_is_refused():
     with pytest.raises(HyrfFormatError, match="flags 0x4.*update hyrfpack"):
-        read_container(forge(write_container(SMALL, minor=MINOR_VERSION), flags=4))
+        read_container(forge_fields(write_container(SAMPLE_SECTIONS, minor=MINOR_VERSION), flags=4))
 
 
 # --- damage ---
 
 
 def test_every_truncation_is_refused():
-    data = write_container(SMALL, minor=MINOR_VERSION)
+    data = write_container(SAMPLE_SECTIONS, minor=MINOR_VERSION)
 
     for length in range(len(data)):
         with pytest.raises(HyrfFormatError, match="truncated" if length >= HEADER_BYTES else None):
             read_container(data[:length])
 
 
-def test_every_truncation_is_refused_even_where_the_header_agrees():
-    data = write_container(SMALL, minor=MINOR_VERSION)
+def test_every_truncation_with_a_matching_header_is_refused():
+    data = write_container(SAMPLE_SECTIONS, minor=MINOR_VERSION)
 
     for length in range(HEADER_BYTES, len(data)):
         with pytest.raises(HyrfFormatError):
-            read_container(forge(data[:length], file_length=length))
+            read_container(forge_fields(data[:length], file_length=length))
 
 
 def test_bytes_after_the_end_are_refused():
-    data = write_container(SMALL, minor=MINOR_VERSION)
+    data = write_container(SAMPLE_SECTIONS, minor=MINOR_VERSION)
 
     with pytest.raises(HyrfFormatError, match=f"says {len(data)} bytes and there are {len(data) + 8}"):
         read_container(data + bytes(8))
     with pytest.raises(HyrfFormatError, match="sections end at"):
-        read_container(forge(data + bytes(8), file_length=len(data) + 8))
+        read_container(forge_fields(data + bytes(8), file_length=len(data) + 8))
 
 
-def test_every_flipped_bit_is_found():
-    data = write_container(SMALL, minor=MINOR_VERSION)
+def test_every_flipped_bit_is_detected():
+    data = write_container(SAMPLE_SECTIONS, minor=MINOR_VERSION)
 
     for bit in range(8 * len(data)):
         flipped = bytearray(data)
@@ -319,62 +326,66 @@ def test_every_flipped_bit_is_found():
             read_all(bytes(flipped))
 
 
-def test_padding_that_is_not_zero_is_refused():
-    data = bytearray(write_container(SMALL, minor=MINOR_VERSION))
+def test_nonzero_padding_is_refused():
+    data = bytearray(write_container(SAMPLE_SECTIONS, minor=MINOR_VERSION))
     data[-1] = 1
 
     with pytest.raises(HyrfFormatError, match="padding after section 'TABL'"):
         read_all(bytes(data))
 
 
-# --- forgery: checksums are right, numbers lie ---
+# --- forged numbers with valid checksums ---
 
-HUGE = (1 << 63, (1 << 64) - 1, 1 << 40)
+HUGE_NUMBERS = (1 << 63, (1 << 64) - 1, 1 << 40)
 
 
-@pytest.mark.parametrize("value", (0, 8, 56, *HUGE))
+@pytest.mark.parametrize("value", (0, 8, 56, *HUGE_NUMBERS))
 @pytest.mark.parametrize(
-    ("field", "says"), [("file_length", "the header says"), ("toc_offset", "misplaces the table of contents")]
+    ("field", "message_part"), [("file_length", "the header says"), ("toc_offset", "misplaces the table of contents")]
 )
-def test_forged_header_place_is_refused(field, says, value):
-    with pytest.raises(HyrfFormatError, match=says):
-        read_container(forge(write_container(SMALL, minor=MINOR_VERSION), **{field: value}))
+def test_forged_header_field_is_refused(field, message_part, value):
+    with pytest.raises(HyrfFormatError, match=message_part):
+        read_container(forge_fields(write_container(SAMPLE_SECTIONS, minor=MINOR_VERSION), **{field: value}))
 
 
 @pytest.mark.parametrize("field", ["toc_length", "count"])
 @pytest.mark.parametrize("value", (0, 3, 5, 1024, 1025, (1 << 32) - 1))
 def test_forged_table_size_is_refused(field, value):
     with pytest.raises(HyrfFormatError):
-        read_container(forge(write_container(SMALL, minor=MINOR_VERSION), **{field: value}))
+        read_container(forge_fields(write_container(SAMPLE_SECTIONS, minor=MINOR_VERSION), **{field: value}))
 
 
 @pytest.mark.parametrize("count", (20, 1024))
 def test_table_past_the_end_is_refused(count):
     with pytest.raises(HyrfFormatError, match="misplaces the table of contents"):
-        read_container(forge(write_container(SMALL, minor=MINOR_VERSION), count=count, toc_length=count * ENTRY_BYTES))
+        read_container(
+            forge_fields(
+                write_container(SAMPLE_SECTIONS, minor=MINOR_VERSION), count=count, toc_length=count * ENTRY_BYTES
+            )
+        )
 
 
 def test_more_sections_than_allowed_are_refused(monkeypatch):
-    data = write_container(SMALL, minor=MINOR_VERSION)
+    data = write_container(SAMPLE_SECTIONS, minor=MINOR_VERSION)
     monkeypatch.setattr(format_container, "MAX_SECTIONS", 3)
 
     with pytest.raises(HyrfFormatError, match="4 sections, more than the 3"):
         read_container(data)
 
 
-def test_section_past_the_end_is_named():
+def test_the_error_for_a_section_past_the_end_contains_its_type():
     with pytest.raises(HyrfFormatError, match="'TABL' says 64 bytes and 16 are left"):
-        read_container(forge(write_container(SMALL, minor=MINOR_VERSION), 3, length=64))
+        read_container(forge_fields(write_container(SAMPLE_SECTIONS, minor=MINOR_VERSION), 3, length=64))
 
 
 @pytest.mark.parametrize("index", range(4))
 @pytest.mark.parametrize(
     "fields",
     [
-        *({"offset": value} for value in (0, 48, 200, 212, *HUGE)),
-        *({"length": value} for value in (64, *HUGE)),
+        *({"offset": value} for value in (0, 48, 200, 212, *HUGE_NUMBERS)),
+        *({"length": value} for value in (64, *HUGE_NUMBERS)),
         {"offset": (1 << 64) - 8, "length": 16},
-        *({"raw_length": value} for value in HUGE),
+        *({"raw_length": value} for value in HUGE_NUMBERS),
         *({"flags": value} for value in (2, 3, 0x8000)),
         {"reserved": 1},
         *({"type": value} for value in (b"\0\0\0\0", b"a-b\n", b"[b] ", b"\xff\xfe\xfd\xfc")),
@@ -383,51 +394,58 @@ def test_section_past_the_end_is_named():
 )
 def test_forged_entry_is_refused(index, fields):
     with pytest.raises(HyrfFormatError):
-        read_container(forge(write_container(SMALL, minor=MINOR_VERSION), index, **fields))
+        read_container(forge_fields(write_container(SAMPLE_SECTIONS, minor=MINOR_VERSION), index, **fields))
 
 
 def test_overlapping_sections_are_refused():
-    data = write_container(SMALL, minor=MINOR_VERSION)
+    data = write_container(SAMPLE_SECTIONS, minor=MINOR_VERSION)
     first = read_container(data).entries["META"]
 
     with pytest.raises(HyrfFormatError, match="'POSI' says it starts at"):
-        read_container(forge(data, 1, offset=first.offset))
+        read_container(forge_fields(data, 1, offset=first.offset))
 
 
 def test_gap_between_sections_is_refused():
     with pytest.raises(HyrfFormatError, match="'POSI' says it starts at"):
-        read_container(forge(write_container(SMALL, minor=MINOR_VERSION), 0, length=5))
+        read_container(forge_fields(write_container(SAMPLE_SECTIONS, minor=MINOR_VERSION), 0, length=5))
 
 
 def test_repeated_type_is_refused():
     with pytest.raises(HyrfFormatError, match="'META' occurs twice"):
-        read_container(forge(write_container(SMALL, minor=MINOR_VERSION), 1, type=b"META"))
+        read_container(forge_fields(write_container(SAMPLE_SECTIONS, minor=MINOR_VERSION), 1, type=b"META"))
 
 
-def test_promised_bytes_are_bounded_over_all_sections_together():
-    data = write_container(SMALL, minor=MINOR_VERSION)
+def test_declared_bytes_of_all_sections_together_are_limited():
+    data = write_container(SAMPLE_SECTIONS, minor=MINOR_VERSION)
     half = raw_bytes_limit(len(data)) // 2
-    assert read_container(forge(data, 0, raw_length=half)).entries["META"].raw_length == half
+    assert read_container(forge_fields(data, 0, raw_length=half)).entries["META"].raw_length == half
 
     with pytest.raises(HyrfFormatError, match="decode to"):
-        read_container(forge(forge(data, 0, raw_length=half), 1, raw_length=half + 1))
+        read_container(forge_fields(forge_fields(data, 0, raw_length=half), 1, raw_length=half + 1))
 
 
-def test_file_over_the_largest_size_is_refused(monkeypatch):
-    data = write_container(SMALL, minor=MINOR_VERSION)
+def test_file_above_the_size_limit_is_refused(monkeypatch):
+    data = write_container(SAMPLE_SECTIONS, minor=MINOR_VERSION)
     monkeypatch.setattr(format_container, "MAX_FILE_BYTES", len(data) - 1)
 
     with pytest.raises(HyrfFormatError, match="more than a .hyrf file may have"):
         read_container(data)
     with pytest.raises(ValueError, match="exceed"):
-        write_container(SMALL, minor=MINOR_VERSION)
+        write_container(SAMPLE_SECTIONS, minor=MINOR_VERSION)
 
 
-def test_forged_numbers_allocate_nothing():
-    data = write_container(SMALL, minor=MINOR_VERSION)
-    forgeries = [forge(data, file_length=v) for v in HUGE] + [forge(data, toc_offset=v) for v in HUGE]
-    forgeries += [forge(data, count=v, toc_length=v) for v in (1024, (1 << 32) - 1)]
-    forgeries += [forge(data, i, **{f: v}) for i in range(4) for f in ("offset", "length", "raw_length") for v in HUGE]
+def test_forged_sizes_are_refused_before_any_allocation():
+    data = write_container(SAMPLE_SECTIONS, minor=MINOR_VERSION)
+    forgeries = [forge_fields(data, file_length=v) for v in HUGE_NUMBERS] + [
+        forge_fields(data, toc_offset=v) for v in HUGE_NUMBERS
+    ]
+    forgeries += [forge_fields(data, count=v, toc_length=v) for v in (1024, (1 << 32) - 1)]
+    forgeries += [
+        forge_fields(data, i, **{f: v})
+        for i in range(4)
+        for f in ("offset", "length", "raw_length")
+        for v in HUGE_NUMBERS
+    ]
 
     tracemalloc.start()
     for forged in forgeries:
@@ -439,13 +457,15 @@ def test_forged_numbers_allocate_nothing():
     assert peak < 1_000_000
 
 
-numbers = st.one_of(st.integers(0, 300), st.sampled_from([1 << 15, 1 << 31, *HUGE]), st.integers(0, (1 << 64) - 1))
+hostile_numbers = st.one_of(
+    st.integers(0, 300), st.sampled_from([1 << 15, 1 << 31, *HUGE_NUMBERS]), st.integers(0, (1 << 64) - 1)
+)
 
 
 @settings(max_examples=400)
 @given(st.data())
-def test_any_mutation_reads_the_same_or_raises_a_format_error(data):
-    file = write_container(SMALL, minor=MINOR_VERSION)
+def test_any_mutation_is_canonical_or_raises_a_format_error(data):
+    file = write_container(SAMPLE_SECTIONS, minor=MINOR_VERSION)
     for _ in range(data.draw(st.integers(1, 3))):
         kind = data.draw(st.sampled_from(["header", "entry", "splice", "raw"]))
         if kind == "splice":
@@ -456,24 +476,24 @@ def test_any_mutation_reads_the_same_or_raises_a_format_error(data):
             file = file[:place] + bytes([data.draw(st.integers(0, 255))]) + file[place + 1 :]
         elif len(file) >= HEADER_BYTES + ENTRY_BYTES * 4:
             index = data.draw(st.integers(0, 3)) if kind == "entry" else None
-            columns = HEADER if index is None else ENTRY
+            columns = HEADER_FIELDS if index is None else ENTRY_FIELDS
             field = data.draw(st.sampled_from(sorted(columns)))
             size = struct.calcsize(columns[field][1])
-            value = data.draw(numbers) % (1 << 8 * size)
-            # The table's checksum is only recomputable where the count still fits the file.
+            value = data.draw(hostile_numbers) % (1 << 8 * size)
+            # The table's checksum can be recomputed only if the count still fits the file.
             if int.from_bytes(file[36:40], "little") <= 4:
-                file = forge(file, index, **{field: value.to_bytes(4, "little") if field == "type" else value})
+                file = forge_fields(file, index, **{field: value.to_bytes(4, "little") if field == "type" else value})
 
     try:
         sections = read_all(file, known=None)
     except HyrfFormatError as error:
         assert str(error).count("\n") == 0
     else:
-        # What is accepted is canonical: it is exactly what the writer makes of it (but for another minor version).
-        assert write_container(sections, minor=MINOR_VERSION) == forge(file, minor=MINOR_VERSION)
+        # Accepted bytes are canonical: the writer reproduces them, except for another minor version.
+        assert write_container(sections, minor=MINOR_VERSION) == forge_fields(file, minor=MINOR_VERSION)
 
 
 @given(st.binary(max_size=300))
-def test_any_bytes_raise_a_format_error(junk):
+def test_random_bytes_raise_a_format_error(junk):
     with pytest.raises(HyrfFormatError):
         read_container(junk)

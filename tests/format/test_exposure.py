@@ -19,11 +19,11 @@ from hyrfpack.format.sections import EXPOSURE
 from hyrfpack.model.exposure import MAX_CENTERS
 from tools.safety.synthetic_encoding import encode
 
-SEEDS = st.integers(0, 2**32 - 1)
+RANDOM_SEEDS = st.integers(0, 2**32 - 1)
 
 
-@given(SEEDS, st.integers(0, MAX_CENTERS))
-def test_a_map_is_read_as_it_was_written(seed, centers):
+@given(RANDOM_SEEDS, st.integers(0, MAX_CENTERS))
+def test_exposure_maps_round_trip(seed, centers):
     exposure = random_map(seed, centers)
     section = encode_exposure(exposure)
 
@@ -31,17 +31,17 @@ def test_a_map_is_read_as_it_was_written(seed, centers):
     assert maps_equal(decode_exposure(section.codec, memoryview(section.data), section.raw_length), exposure)
 
 
-def stored(numbers: list[float], centers: bytes) -> bytes:
-    """Bytes of the right length, with any numbers in them."""
+def build_map_bytes(numbers: list[float], centers: bytes) -> bytes:
+    """Build the bytes of a map with the right length from any numbers."""
     count = len(centers) // 12
     return bytes([count, 0, 0, 0]) + np.array(numbers, "<f4").tobytes() + centers[: 12 * count]
 
 
-NUMBERS = st.lists(st.floats(width=32) | st.floats(-8, 8, width=32), min_size=20, max_size=20)
+TWENTY_FLOATS = st.lists(st.floats(width=32) | st.floats(-8, 8, width=32), min_size=20, max_size=20)
 
 
-@given(st.binary(max_size=200) | st.builds(stored, NUMBERS, st.binary(max_size=800)))
-def test_any_bytes_are_a_map_or_refused(data):
+@given(st.binary(max_size=200) | st.builds(build_map_bytes, TWENTY_FLOATS, st.binary(max_size=800)))
+def test_random_bytes_are_decoded_or_refused(data):
     try:
         exposure = decode_exposure(CODEC_EXPOSURE, memoryview(data), len(data))
     except HyrfFormatError:
@@ -51,7 +51,7 @@ def test_any_bytes_are_a_map_or_refused(data):
 
 
 @pytest.mark.parametrize("change", [b"", b"\1", None])
-def test_bytes_that_do_not_fit_are_refused(change):
+def test_bytes_of_a_wrong_length_are_refused(change):
     section = encode_exposure(random_map(0, 3))
     data = section.data[:-1] if change is None else bytes(section.data) + change
     raw_length = len(data) + (change == b"")
@@ -59,16 +59,16 @@ def test_bytes_that_do_not_fit_are_refused(change):
         decode_exposure(CODEC_EXPOSURE, memoryview(data), raw_length)
 
 
-HEAD = "<BBBB2f6f3f6f3f"  # by docs/reference/format.md
+HEADER_FORMAT = "<BBBB2f6f3f6f3f"  # from docs/reference/format.md
 
 
 @pytest.mark.parametrize(
     ("place", "value"),
     [
-        *[(place, 1) for place in (1, 2, 3)],  # reserved
+        *[(place, 1) for place in (1, 2, 3)],  # reserved bytes
         *[(place, value) for place in (4, 5) for value in (0.0, -1.0)],  # lengths
-        *[(place, 1e6) for place in (6, 7, 8)],  # least corner
-        *[(place, -1e6) for place in (9, 10, 11)],  # largest corner
+        *[(place, 1e6) for place in (6, 7, 8)],  # lower corner
+        *[(place, -1e6) for place in (9, 10, 11)],  # upper corner
         *[(place, value) for place in (15, 16, 17) for value in (-8.001, 7.9)],  # lowest log gains
         *[(place, value) for place in (18, 19, 20) for value in (-7.9, 8.001)],  # highest log gains
         *[(place, value) for place in range(4, 24) for value in (np.nan, np.inf, -np.inf)],
@@ -76,10 +76,10 @@ HEAD = "<BBBB2f6f3f6f3f"  # by docs/reference/format.md
 )
 def test_a_number_out_of_the_range_of_the_specification_is_refused(place, value):
     section = encode_exposure(random_map(3, 2))
-    numbers = list(struct.unpack_from(HEAD, section.data))
-    assert struct.pack(HEAD, *numbers) == section.data[:84]
+    numbers = list(struct.unpack_from(HEADER_FORMAT, section.data))
+    assert struct.pack(HEADER_FORMAT, *numbers) == section.data[:84]
     numbers[place] = value
-    data = struct.pack(HEAD, *numbers) + section.data[84:]
+    data = struct.pack(HEADER_FORMAT, *numbers) + section.data[84:]
 
     with pytest.raises(HyrfFormatError, match="damaged"):
         decode_exposure(section.codec, memoryview(data), len(data))
@@ -95,7 +95,7 @@ def test_more_centers_than_the_specification_allows_are_refused(count):
 
 
 @given(st.integers(0, MAX_CENTERS), st.binary(min_size=12 * MAX_CENTERS, max_size=12 * MAX_CENTERS))
-def test_every_code_of_a_center_is_allowed_and_written_again_as_it_was(count, centers):
+def test_all_center_codes_round_trip(count, centers):
     head = encode_exposure(random_map(5, 0)).data[1:84]
     data = bytes([count]) + head + centers[: 12 * count]
 
@@ -109,7 +109,7 @@ def test_another_codec_is_refused():
 
 
 @pytest.mark.parametrize(("profile", "plain_minor"), [("raw", 0), ("paper", 0), ("compact", 1)])
-def test_a_file_keeps_the_map_of_its_model_and_has_version_1_2_only_with_a_map(profile, plain_minor):
+def test_a_file_stores_the_map_and_has_version_1_2_only_with_a_map(profile, plain_minor):
     model = small_model(ball_points(50)[0])
     plain = encode(model, profile)
     model.exposure = random_map(7, 20)
@@ -119,10 +119,10 @@ def test_a_file_keeps_the_map_of_its_model_and_has_version_1_2_only_with_a_map(p
     assert decode_model(plain).exposure is None
     assert read_container(plain).version == (1, plain_minor) and read_container(data).version == (1, 2)
     assert list(read_container(data).entries)[:2] == ["META", "EXPO"]
-    assert len(data) == len(plain) + 40 + (84 + 12 * 20 + 7) // 8 * 8  # a line of the table, and the section
+    assert len(data) == len(plain) + 40 + (84 + 12 * 20 + 7) // 8 * 8  # an entry of the table, and the padded section
 
 
-def test_readers_that_know_no_map_read_the_rest():
+def test_readers_without_exposure_maps_read_the_rest():
     model = small_model(ball_points(50)[0])
     model.exposure = random_map(7, 20)
     container = read_container(encode_model(model))
@@ -131,7 +131,7 @@ def test_readers_that_know_no_map_read_the_rest():
     read_container(encode_model(model), known=[tag for tag in entries if tag != EXPOSURE])
 
 
-def test_a_damaged_map_names_file_and_section():
+def test_the_error_for_a_damaged_map_contains_file_and_section():
     model = small_model(ball_points(50)[0])
     model.exposure = random_map(7, 20)
     container = read_container(encode_model(model))

@@ -1,4 +1,4 @@
-"""Files that released versions wrote stay readable, and are still written byte by byte the same."""
+"""Golden files of released versions are still read, and are still written with the same bytes."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from hyrfpack.render import RenderSettings, render_view
 from tools.safety.make_golden import GOLDEN_FILES, make_golden_camera
 from tools.safety.synthetic_encoding import encode
 
-GOLDEN = Path(__file__).parents[1] / "golden"
-FILES = sorted(GOLDEN.glob("*.hyrf"))
+GOLDEN_FOLDER = Path(__file__).parents[1] / "golden"
+GOLDEN_PATHS = sorted(GOLDEN_FOLDER.glob("*.hyrf"))
 
 
-def test_golden_files_are_there():
-    assert set(GOLDEN_FILES) <= {file.stem for file in FILES}
+def test_golden_files_exist():
+    assert set(GOLDEN_FILES) <= {file.stem for file in GOLDEN_PATHS}
 
 
-@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
+@pytest.mark.parametrize("file", GOLDEN_PATHS, ids=lambda file: file.stem)
 def test_golden_file_decodes_to_the_recorded_numbers(file):
     recorded = np.load(file.with_suffix(".npz"))
 
@@ -30,11 +30,11 @@ def test_golden_file_decodes_to_the_recorded_numbers(file):
 
     assert sorted(decoded) == sorted(name for name in recorded.files if not name.startswith("exposure."))
     for name, values in decoded.items():
-        # As bits: -0.0 is not 0.0, and denormals count.
+        # Bits are compared, so that -0.0 differs from 0.0 and denormals count.
         assert np.array_equal(values.view(np.uint32), recorded[name].view(np.uint32)), name
 
 
-@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
+@pytest.mark.parametrize("file", GOLDEN_PATHS, ids=lambda file: file.stem)
 def test_golden_file_has_the_recorded_configuration(file):
     config = load_model(file).config
 
@@ -53,32 +53,32 @@ def test_golden_file_has_the_recorded_configuration(file):
     )
 
 
-WITH_EXPOSURE = sorted(name for name, (_, _, exposure) in GOLDEN_FILES.items() if exposure is not None)
+NAMES_WITH_EXPOSURE_MAP = sorted(name for name, (_, _, exposure) in GOLDEN_FILES.items() if exposure is not None)
 
 
 def test_golden_files_have_an_exposure_map_from_version_1_2_on():
-    assert WITH_EXPOSURE == ["v1.2_compact_exposure"]
-    for file in FILES:
-        assert (load_model(file).exposure is not None) == (file.stem in WITH_EXPOSURE)
+    assert NAMES_WITH_EXPOSURE_MAP == ["v1.2_compact_exposure"]
+    for file in GOLDEN_PATHS:
+        assert (load_model(file).exposure is not None) == (file.stem in NAMES_WITH_EXPOSURE_MAP)
 
 
-@pytest.mark.parametrize("name", WITH_EXPOSURE)
+@pytest.mark.parametrize("name", NAMES_WITH_EXPOSURE_MAP)
 def test_golden_exposure_map_gives_the_recorded_log_gains(name):
-    recorded = np.load(GOLDEN / f"{name}.npz")
-    exposure = load_model(GOLDEN / f"{name}.hyrf").exposure
+    recorded = np.load(GOLDEN_FOLDER / f"{name}.npz")
+    exposure = load_model(GOLDEN_FOLDER / f"{name}.hyrf").exposure
     lowest, highest = exposure.limits
 
     gains = exposure.predict_log_gains(recorded["exposure.positions"], recorded["exposure.directions"])
 
     np.testing.assert_allclose(gains, recorded["exposure.log_gains"], rtol=0, atol=1e-12)
-    assert np.isclose(gains, lowest).any() and np.isclose(gains, highest).any()  # both limits are tested
+    assert np.isclose(gains, lowest).any() and np.isclose(gains, highest).any()  # the cases reach both limits
     assert ((gains > lowest) & (gains < highest)).all(1).sum() > 5
 
 
-@pytest.mark.parametrize("name", WITH_EXPOSURE)
+@pytest.mark.parametrize("name", NAMES_WITH_EXPOSURE_MAP)
 def test_golden_file_with_an_exposure_map_renders_the_recorded_picture(name):
-    recorded = np.load(GOLDEN / f"{name}.npz")["exposure.picture"]
-    model, camera = load_model(GOLDEN / f"{name}.hyrf"), make_golden_camera()
+    recorded = np.load(GOLDEN_FOLDER / f"{name}.npz")["exposure.picture"]
+    model, camera = load_model(GOLDEN_FOLDER / f"{name}.hyrf"), make_golden_camera()
 
     picture = render_view(model, camera).rgb.numpy()
 
@@ -91,10 +91,10 @@ def test_golden_file_with_an_exposure_map_renders_the_recorded_picture(name):
 
 @pytest.mark.parametrize("name", GOLDEN_FILES)
 def test_golden_model_encodes_to_the_same_bytes(name, monkeypatch):
-    golden = (GOLDEN / f"{name}.hyrf").read_bytes()
-    info, (profile, settings, exposure) = describe_file(GOLDEN / f"{name}.hyrf"), GOLDEN_FILES[name]
+    golden = (GOLDEN_FOLDER / f"{name}.hyrf").read_bytes()
+    info, (profile, settings, exposure) = describe_file(GOLDEN_FOLDER / f"{name}.hyrf"), GOLDEN_FILES[name]
     monkeypatch.setattr(metadata, "writer_name", lambda: info["writer"])
-    model = load_model(GOLDEN / "v1.0_raw.hyrf")
+    model = load_model(GOLDEN_FOLDER / "v1.0_raw.hyrf")
     model.exposure = exposure
 
     data = encode(model, profile, info["provenance"], **settings)

@@ -26,12 +26,12 @@ from hyrfpack.quant.integers import encode_integers
 from tools.safety import minimal_reader
 from tools.safety.synthetic_encoding import encode
 
-GOLDEN = sorted((Path(__file__).parents[1] / "golden").glob("*.hyrf"))
-PROFILES = ("raw", "paper", "compact")
+GOLDEN_PATHS = sorted((Path(__file__).parents[1] / "golden").glob("*.hyrf"))
+ALL_PROFILES = ("raw", "paper", "compact")
 
 
-def model_of(count: int, **settings):
-    """A model with Gaussians inside and outside the box, and numbers of every parameter drawn."""
+def random_model(count: int, **settings):
+    """Return a model with random values of every parameter and Gaussians inside and outside the frame."""
     rng = np.random.default_rng(count)
     return small_model(
         rng.standard_t(2, (count, 3)),
@@ -68,7 +68,7 @@ def assert_same_gains(read: minimal_reader.Exposure, exposure: ExposureMap) -> N
     np.testing.assert_allclose(exposure.predict_log_gains(positions, directions), gains, rtol=1e-12, atol=1e-12)
 
 
-def test_minimal_reader_is_independent():
+def test_minimal_reader_imports_nothing_of_hyrfpack():
     nodes = list(ast.walk(ast.parse(Path(minimal_reader.__file__).read_text())))
 
     imported = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
@@ -80,73 +80,89 @@ def test_minimal_reader_is_independent():
     }
 
 
-@pytest.mark.parametrize("file", GOLDEN, ids=lambda file: file.stem)
-def test_golden_files_read_the_same(file):
+@pytest.mark.parametrize("file", GOLDEN_PATHS, ids=lambda file: file.stem)
+def test_golden_files_decode_to_the_same_bits(file):
     assert_same_bits(file.read_bytes())
 
 
-@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize("profile", ALL_PROFILES)
 @pytest.mark.parametrize(
     ("count", "background"), [(0, True), (1, False), (2, True), (3, False), (1000, True), (1000, False)]
 )
-def test_fresh_files_read_the_same(profile, count, background):
+def test_new_files_decode_to_the_same_bits(profile, count, background):
     encoding = "sh" if background else "frequency"
 
-    assert_same_bits(encode(model_of(count, background=background, direction_encoding=encoding), profile))
+    assert_same_bits(encode(random_model(count, background=background, direction_encoding=encoding), profile))
 
 
 @pytest.fixture(scope="module")
-def in_layers() -> bytes:
-    """A file large enough for layers."""
-    data = encode(model_of(12_000), "compact")
+def layered_data() -> bytes:
+    """Encode a model large enough for layers."""
+    data = encode(random_model(12_000), "compact")
     assert "POS1" in read_container(data)
     return data
 
 
-def test_files_in_layers_read_the_same(in_layers):
-    assert_same_bits(in_layers)
+def test_layered_files_decode_to_the_same_bits(layered_data):
+    assert_same_bits(layered_data)
 
 
 @pytest.mark.parametrize("least", [None, 100], ids=["two layers", "many layers"])
-def test_the_start_of_a_file_in_layers_reads_the_same(in_layers, least, monkeypatch):
+def test_partial_layered_files_decode_to_the_same_bits(layered_data, least, monkeypatch):
     if least:
         monkeypatch.setattr(plan, "MIN_LAYER_GAUSSIANS", least)
         monkeypatch.setattr(plan, "MAX_LAYERS", 100)
-        in_layers = encode(model_of(2000), "compact")
-    entries = read_container(in_layers).entries
+        layered_data = encode(random_model(2000), "compact")
+    entries = read_container(layered_data).entries
     base, top = entries["RTAB"].end, entries["OPA1"].end
 
-    for cut in (base, top - 1, top, len(in_layers) - 1, len(in_layers)):
-        assert_same_bits(in_layers[:cut], part=True)
+    for cut in (base, top - 1, top, len(layered_data) - 1, len(layered_data)):
+        assert_same_bits(layered_data[:cut], part=True)
     for cut in (base - 1, entries["META"].end, 60):
         with pytest.raises(ValueError):
-            minimal_reader.read(in_layers[:cut], part=True)
+            minimal_reader.read(layered_data[:cut], part=True)
         with pytest.raises(HyrfFormatError):
-            decode_model(in_layers[:cut], fraction=1.0)
+            decode_model(layered_data[:cut], fraction=1.0)
 
 
-def exposure_part(data: bytes) -> minimal_reader.Section:
-    """A section EXPO of these bytes."""
+def exposure_section(data: bytes) -> minimal_reader.Section:
+    """Return a section EXPO with these bytes."""
     padded = data + bytes(-len(data) % 8)
     return minimal_reader.Section("EXPO", 9, len(data), len(data), zlib.crc32(data), padded, whole=True)
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(0, 64))
-def test_exposure_maps_of_any_numbers_give_the_same_gains(seed, centers):
+def test_random_exposure_maps_give_the_same_gains(seed, centers):
     exposure = random_map(seed, centers)
 
-    assert_same_gains(minimal_reader.read_exposure(exposure_part(encode_exposure(exposure).data)), exposure)
+    assert_same_gains(minimal_reader.read_exposure(exposure_section(encode_exposure(exposure).data)), exposure)
 
 
-ABOVE_8 = float(np.nextafter(np.float32(8), np.float32(9)))
-HOSTILE = (np.nan, np.inf, -np.inf, 0.0, -0.0, 2.0**-149, -1.0, 8.0, -8.0, ABOVE_8, -ABOVE_8, 1e30, -1e30)
+NEXT_FLOAT32_ABOVE_8 = float(np.nextafter(np.float32(8), np.float32(9)))
+HOSTILE_FLOATS = (
+    np.nan,
+    np.inf,
+    -np.inf,
+    0.0,
+    -0.0,
+    2.0**-149,
+    -1.0,
+    8.0,
+    -8.0,
+    NEXT_FLOAT32_ABOVE_8,
+    -NEXT_FLOAT32_ABOVE_8,
+    1e30,
+    -1e30,
+)
 
 
 def test_both_readers_accept_the_same_exposure_maps():
-    """Every number in turn takes every hostile value; and every byte of the rest of the head."""
+    """Each float takes every hostile value in turn, and each other byte of the header takes every value."""
     valid = encode_exposure(random_map(4, 2)).data
     maps = [
-        valid[: 4 * place] + np.float32(v).tobytes() + valid[4 * place + 4 :] for place in range(1, 21) for v in HOSTILE
+        valid[: 4 * place] + np.float32(v).tobytes() + valid[4 * place + 4 :]
+        for place in range(1, 21)
+        for v in HOSTILE_FLOATS
     ]
     maps += [valid[:place] + b"\1" + valid[place + 1 :] for place in (1, 2, 3)]
     maps += [bytes([count]) + valid[1:84] + bytes(12 * count) for count in (0, 1, 63, 64, 65, 255)]
@@ -154,7 +170,7 @@ def test_both_readers_accept_the_same_exposure_maps():
     accepted = 0
     for data in maps:
         try:
-            read = minimal_reader.read_exposure(exposure_part(data))
+            read = minimal_reader.read_exposure(exposure_section(data))
         except ValueError:
             with pytest.raises(HyrfFormatError):
                 decode_exposure(9, memoryview(data), len(data))
@@ -165,8 +181,8 @@ def test_both_readers_accept_the_same_exposure_maps():
     assert 50 < accepted < len(maps) - 100
 
 
-def test_the_start_of_a_file_without_the_bytes_of_its_exposure_map_reads_without_one():
-    model = model_of(30)
+def test_a_partial_file_without_the_bytes_of_its_exposure_map_has_none():
+    model = random_model(30)
     model.exposure = random_map(1, 5)
     sections = list(read_container(encode(model, "raw")).sections)
     data = write_container(sorted(sections, key=lambda section: section.type == "EXPO"), minor=MINOR_VERSION)
@@ -176,13 +192,14 @@ def test_the_start_of_a_file_without_the_bytes_of_its_exposure_map_reads_without
     assert_same_bits(data[:-1], part=True)
 
 
-def test_the_stream_of_the_page_is_read():
+def test_the_example_stream_of_the_specification_is_decoded():
     data = bytes.fromhex("00 12 29 B0 03 00 69 B1 00")
 
     assert minimal_reader.read_integers(data, np.zeros(5, np.int64)).tolist() == [0, 0, 1, 0, 20]
 
 
-STREAMS = {  # scale of the integers, and what their stream must have for the test to be worth something
+# By case: the scale of the integers, and whether (first byte, alphabet) of their stream show the intended kind.
+STREAM_CASES = {
     "one lane": (np.ones(500), lambda first, alphabet: first == 0 and alphabet),
     "lanes": (1e9 * np.ones(20_000), lambda first, alphabet: first & 15),
     "classes": (np.exp(4 * np.sin(np.arange(20_000) / 50)), lambda first, alphabet: first >> 4 & 7),
@@ -192,10 +209,10 @@ STREAMS = {  # scale of the integers, and what their stream must have for the te
 
 
 @pytest.mark.parametrize("contexts", [1, 3])
-@pytest.mark.parametrize("kind", STREAMS)
-def test_streams_of_every_kind_read_the_same(kind, contexts):
+@pytest.mark.parametrize("kind", STREAM_CASES)
+def test_streams_of_every_kind_decode_to_the_same_integers(kind, contexts):
     rng = np.random.default_rng(0)
-    scale, has_kind = STREAMS[kind]
+    scale, has_kind = STREAM_CASES[kind]
     context = rng.integers(0, contexts, len(scale)).astype(np.uint8)
     values = np.rint(rng.laplace(size=len(scale)) * scale * (1 + context)).astype(np.int64)
     data = encode_integers(values, context, signed=True)
@@ -207,8 +224,8 @@ def test_streams_of_every_kind_read_the_same(kind, contexts):
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-def test_both_readers_bound_the_basis_alike(sign):
-    sections = list(read_container(encode(model_of(30), "compact")).sections)
+def test_both_readers_have_the_same_limit_for_the_basis(sign):
+    sections = list(read_container(encode(random_model(30), "compact")).sections)
     place = [section.type for section in sections].index("COLO")
     largest = np.float32(1 + 2**-10)
 
@@ -226,13 +243,13 @@ def test_both_readers_bound_the_basis_alike(sign):
             decode_model(with_basis(first))
 
 
-@pytest.mark.parametrize("profile", [*PROFILES, "compact in layers", "raw with an exposure map"])
+@pytest.mark.parametrize("profile", [*ALL_PROFILES, "compact in layers", "raw with an exposure map"])
 def test_both_readers_refuse_the_same_damage(profile, monkeypatch):
     rng = np.random.default_rng(0)
     if profile == "compact in layers":
         monkeypatch.setattr(plan, "MIN_LAYER_GAUSSIANS", 1)
         monkeypatch.setattr(plan, "MAX_LAYERS", 100)
-    model = model_of(30)
+    model = random_model(30)
     if profile.endswith("map"):
         model.exposure = random_map(2, 40)
     sections = list(read_container(encode(model, profile.split()[0])).sections)
@@ -240,7 +257,7 @@ def test_both_readers_refuse_the_same_damage(profile, monkeypatch):
     refused, count = 0, 30
 
     for _ in range(count):
-        data = write_container(damaged(sections, rng), minor=MINOR_VERSION)
+        data = write_container(damage_section(sections, rng), minor=MINOR_VERSION)
         try:
             assert_same_bits(data)
         except (ValueError, zlib.error):
@@ -251,8 +268,8 @@ def test_both_readers_refuse_the_same_damage(profile, monkeypatch):
     assert 0 < refused < count
 
 
-def damaged(sections: list, rng: np.random.Generator) -> list:
-    """The sections, one of them with a bit flipped, cut short or longer; checksums will be right."""
+def damage_section(sections: list, rng: np.random.Generator) -> list:
+    """Return the sections with one of them truncated, extended or changed by one bit."""
     which = rng.integers(len(sections))
     data = bytearray(sections[which].data)
     kind, place = rng.integers(4), rng.integers(len(data))

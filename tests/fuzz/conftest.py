@@ -1,4 +1,4 @@
-"""Makes the scene folders of tests/data at hand."""
+"""Give fuzz tests the scene-folder helpers of tests/data."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from types import SimpleNamespace
 
 import pytest
 
-TESTS = Path(__file__).parents[1]
+TESTS_FOLDER = Path(__file__).parents[1]
 
 
 @pytest.fixture(scope="module")
 def folders() -> SimpleNamespace:
-    """What tests/data/conftest.py defines: ColmapFolder, write_pictures, poses_of, rotation_of."""
-    return SimpleNamespace(**runpy.run_path(str(TESTS / "data" / "conftest.py")))
+    """Return the names defined in tests/data/conftest.py, such as ColmapFolder and write_pictures."""
+    return SimpleNamespace(**runpy.run_path(str(TESTS_FOLDER / "data" / "conftest.py")))

@@ -1,7 +1,7 @@
-"""Hostile `.hyrf` files: a corpus of them, and a taste of what tools/safety/fuzz.py makes by the million.
+"""Hostile `.hyrf` files are decoded or refused in one line: a stored corpus, and a sample of tools/safety/fuzz.py.
 
-`corpus/bugs` holds one file for each defect that was found, `corpus/sentences` one for each complaint of the reader,
-both named after what they are about.
+`corpus/bugs` holds one file for each defect that was found and is named after it. `corpus/sentences` holds one file for
+each error message of the reader and is named after the message.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ from tools.safety.fuzz_mutate import (
 )
 from tools.safety.synthetic_encoding import quantize_uniformly
 
-CORPUS = Path(__file__).parent / "corpus"
+CORPUS_FOLDER = Path(__file__).parent / "corpus"
 
-# What the reader says of the files that are not to be decoded; None for those that are.
-BUGS = {
+# The pattern of the reader's error message for each file of corpus/bugs; None where the file must be decoded.
+EXPECTED_ERROR_BY_FILE = {
     "integer_of_1000_digits": "'config.hidden' is an integer of more than 64 bits",
     "line_end_and_escape_in_scale_rule": r"scale_rule is 'a\\nb\\x1b\[2J'",
     "line_end_and_surrogate_in_key": r"'a\\n\\ud800'",
@@ -59,37 +59,37 @@ BUGS = {
 
 
 @pytest.fixture(autouse=True)
-def one_thread(monkeypatch):
-    """Sections one after another: what is refused first, and how much memory it takes by then, is no matter of luck."""
+def use_one_thread(monkeypatch):
+    """Decode sections one after another, so that the first error and the peak memory are reproducible."""
     monkeypatch.setenv("HYRFPACK_THREADS", "1")
 
 
-def test_every_file_of_the_corpus_is_replayed():
-    assert {file.stem for file in (CORPUS / "bugs").iterdir()} == set(BUGS)
-    assert sum(file.stat().st_size for file in CORPUS.rglob("*")) < 300_000
+def test_every_file_of_the_bug_corpus_has_an_expected_outcome():
+    assert {file.stem for file in (CORPUS_FOLDER / "bugs").iterdir()} == set(EXPECTED_ERROR_BY_FILE)
+    assert sum(file.stat().st_size for file in CORPUS_FOLDER.rglob("*")) < 300_000
 
 
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("name", BUGS)
-def test_a_file_that_was_mishandled_is_decoded_or_refused_in_one_line(name, tmp_path):
-    data = (CORPUS / "bugs" / f"{name}.hyrf").read_bytes()
+@pytest.mark.parametrize("name", EXPECTED_ERROR_BY_FILE)
+def test_a_file_that_once_failed_is_decoded_or_refused_in_one_line(name, tmp_path):
+    data = (CORPUS_FOLDER / "bugs" / f"{name}.hyrf").read_bytes()
 
     tracemalloc.start()
     outcome = decode(data)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
 
-    assert peak < 97 << 20  # the positions that two of the files declare; one of them once took 4 GB
-    if BUGS[name] is None:
+    assert peak < 97 << 20  # two of the files declare positions of this size; one of them once took 4 GB
+    if EXPECTED_ERROR_BY_FILE[name] is None:
         check_model(outcome)
     else:
-        assert re.search(BUGS[name], outcome)
+        assert re.search(EXPECTED_ERROR_BY_FILE[name], outcome)
     check_file(data, outcome, tmp_path)
 
 
-@pytest.mark.parametrize("name", sorted(file.stem for file in (CORPUS / "sentences").iterdir()))
-def test_a_forged_file_is_refused_with_the_sentence_it_is_named_after(name):
-    sentence = decode((CORPUS / "sentences" / f"{name}.hyrf").read_bytes())
+@pytest.mark.parametrize("name", sorted(file.stem for file in (CORPUS_FOLDER / "sentences").iterdir()))
+def test_a_forged_file_is_refused_with_the_message_in_its_name(name):
+    sentence = decode((CORPUS_FOLDER / "sentences" / f"{name}.hyrf").read_bytes())
 
     words = re.sub(r"\W+", " ", sentence.replace("'", "")).lower()
     assert re.search(".*".join(filter(None, name.split("_"))), words), sentence
@@ -106,24 +106,24 @@ def test_mutants_are_decoded_or_refused_in_one_line():
             check_model(outcome)
 
     assert {kind for kind, _ in outcomes} == set(INPUT_KINDS)
-    # Forged content gets past the checksums, to where it is decoded; damage does not.
+    # Forged content has valid checksums, so that some of it is decoded; damaged content has not.
     for kind in INPUT_KINDS:
         assert (outcomes[kind, False] > 10) == kind.startswith("forged"), kind
 
 
-def test_mutants_depend_on_nothing_but_their_numbers():
+def test_mutants_depend_only_on_their_number_and_seed():
     first = [make_hostile_file(number, 7) for number in range(500)]
 
     assert [make_hostile_file(number, 7) for number in reversed(range(500))] == first[::-1]
     assert [make_hostile_file(number, 8) for number in range(50)] != first
 
 
-def test_what_is_taken_apart_is_put_together_the_same():
+def test_assemble_inverts_disassemble():
     for data in load_seed_files()[0]:
         assert assemble(disassemble(data)) == data
 
 
-def test_more_gaussians_than_a_file_of_its_length_may_have_are_refused_before_they_take_memory():
+def test_too_many_gaussians_for_the_length_of_the_file_are_refused_before_any_allocation():
     parts = disassemble(encode_model(small_model(np.zeros((4, 3))), "raw"))
     count = gaussian_limit(len(assemble(parts))) + 10_000
     metadata = json.loads(parts[0].data) | {"gaussians": count}
@@ -141,7 +141,7 @@ def test_more_gaussians_than_a_file_of_its_length_may_have_are_refused_before_th
     assert peak < 1 << 20
 
 
-def test_a_file_that_readers_would_not_unpack_is_not_written():
+def test_a_model_that_readers_would_refuse_is_not_written():
     model = small_model(np.zeros((EXTRA_GAUSSIANS_PER_FILE + 200_000, 3)))
 
     with pytest.raises(HyrfError, match="almost equal numbers.*use profile 'raw' for this model"):
@@ -151,7 +151,7 @@ def test_a_file_that_readers_would_not_unpack_is_not_written():
 @pytest.mark.parametrize("codec", [1, 2, 3, 4, 6, 7, 8])
 @pytest.mark.parametrize("kept", [0, 40, 4000])
 def test_a_small_file_that_declares_a_huge_model_takes_little_memory(codec, kept):
-    """All that the limits allow for so small a file and none of it there."""
+    """The file declares nearly the most Gaussians that the limits allow, but holds hardly any data for them."""
     parts = disassemble(encode_model(decode(load_seed_files()[0][0]), "raw"))
     count = EXTRA_GAUSSIANS_PER_FILE - 1000
     metadata = json.loads(parts[0].data) | {"gaussians": count}
@@ -161,7 +161,7 @@ def test_a_small_file_that_declares_a_huge_model_takes_little_memory(codec, kept
         part.raw_length, part.codec = 4 * width * count, codec
         part.data = bytes([1, width, 1, 0])[: kept or None] * (kept // 4)
     data = assemble(parts)
-    assert allowed_bytes(data) > 9 << 23  # within what the container allows
+    assert allowed_bytes(data) > 9 << 23  # the container allows the declared size
 
     tracemalloc.start()
     outcome = decode(data)
@@ -169,11 +169,11 @@ def test_a_small_file_that_declares_a_huge_model_takes_little_memory(codec, kept
     tracemalloc.stop()
 
     assert isinstance(outcome, str) and "'POSI'" in outcome
-    assert peak < 4 * 3 * count + (1 << 20)  # at most the one array that was promised
+    assert peak < 4 * 3 * count + (1 << 20)  # at most one array of the declared size
 
 
-def test_gaussians_that_are_all_alike_take_next_to_no_bytes_and_little_memory():
-    """Equal symbols are free in codecs 6 to 8: what bounds their number is what a file of its length may declare."""
+def test_equal_gaussians_take_few_bytes_and_little_memory():
+    """Equal symbols take no bytes in codecs 6 to 8; only the limit by the file's length bounds their number."""
     count = 200_000
     model = small_model(np.zeros((count, 3)))
     data = encode_model(model, "compact", quantized=quantize_uniformly(model, 0.01))
@@ -185,11 +185,11 @@ def test_gaussians_that_are_all_alike_take_next_to_no_bytes_and_little_memory():
     tracemalloc.stop()
 
     assert len(decoded) == count and len(decoded.gaussians.positions.unique(dim=0)) == 1
-    assert peak < 4 * 32 * count + (4 << 20)  # four times the numbers it declares; measured 2.1
+    assert peak < 4 * 32 * count + (4 << 20)  # four times the declared numbers; measured: 2.1 times
 
 
-def test_provenance_that_grows_in_writing_is_refused_in_one_line(tmp_path):
-    """2 bytes of UTF-8 become 6 of ASCII: what may be read may not be written again."""
+def test_provenance_that_grows_beyond_the_limit_when_rewritten_is_refused(tmp_path):
+    """Two bytes of UTF-8 become six of ASCII, so that metadata within the limit exceeds it when written again."""
     parts = disassemble(load_seed_files()[0][2])
     metadata = json.loads(parts[0].data) | {"provenance": {"name": "\u00e9" * 400_000}}
     parts[0].data = json.dumps(metadata, ensure_ascii=False).encode()
@@ -202,10 +202,10 @@ def test_provenance_that_grows_in_writing_is_refused_in_one_line(tmp_path):
     assert not (tmp_path / "packed.hyrf").exists()
 
 
-def test_what_a_writer_nests_too_deep_to_be_read_is_not_written():
+def test_metadata_nested_too_deep_to_be_read_is_not_written():
     model = decode(load_seed_files()[0][2])
     deep: list = []
-    for _ in range(62):  # within the list, `provenance` and the metadata
+    for _ in range(62):  # the innermost list, `provenance` and the metadata itself add the other levels
         deep = [deep]
 
     assert not isinstance(decode(encode_model(model, provenance={"deep": deep[0]})), str)
@@ -213,7 +213,7 @@ def test_what_a_writer_nests_too_deep_to_be_read_is_not_written():
         encode_model(model, provenance={"deep": deep})
 
 
-def test_seeds_reach_every_group_and_codec():
+def test_seed_files_cover_every_group_and_codec():
     met = {(part.tag.decode(), part.codec) for data in load_seed_files()[0] for part in disassemble(data)[1:]}
 
     groups = {group for group, _ in met}
@@ -223,16 +223,16 @@ def test_seeds_reach_every_group_and_codec():
     assert all(not isinstance(decode(data), str) for data in load_seed_files()[0])
 
 
-def test_info_shows_what_a_file_says_without_acting_on_it():
+def test_info_escapes_control_characters():
     shown = io.StringIO()
     with redirect_stdout(shown):
-        info.callback(CORPUS / "bugs" / "shown_surrogate_in_writer.hyrf", False)
+        info.callback(CORPUS_FOLDER / "bugs" / "shown_surrogate_in_writer.hyrf", False)
 
     assert r"written by \ud800\x1b[2J" in shown.getvalue()
 
 
-def test_every_group_may_have_stages_up_to_the_limit_and_not_one_more():
-    """Each stage costs milliseconds whatever it holds, so that 255 of them in 8 groups were 13 seconds from 300 kB."""
+def test_a_group_may_have_16_stages_but_not_17():
+    """Each stage costs milliseconds even if it is empty: 255 stages in 8 groups took 13 seconds from 300 kB."""
     model = decode(load_seed_files()[0][2])
     data = encode_model(model, "paper", color=(16, 2))
 
@@ -241,8 +241,8 @@ def test_every_group_may_have_stages_up_to_the_limit_and_not_one_more():
         encode_model(model, "paper", color=(17, 2))
 
 
-def test_forged_exposure_maps_meet_every_check_of_the_reader():
-    """Each sentence of the readers of codec 9, and maps that are decoded."""
+def test_forged_exposure_maps_trigger_every_check_of_the_reader():
+    """The forged maps produce each error message of codec 9, and some are decoded."""
     outcomes = Counter()
     for number in range(500):
         outcome = decode(INPUT_KINDS["forged exposure map"][1](Random(number)))

@@ -1,4 +1,4 @@
-"""Hostile tables of other programs: each is read, or refused in one line, and asks for no memory to speak of."""
+"""Hostile tables of other programs are read or refused in one line, in little memory."""
 
 from __future__ import annotations
 
@@ -20,8 +20,9 @@ from hyrfpack.data import load_scene
 from hyrfpack.errors import HyrfError
 from tools.safety.fuzz_mutate import HOSTILE_JSON, edit_bytes, list_json_values
 
-MOST_MEMORY = 60e6  # bytes: the tables are of some kilobytes, and a package may be loaded at its first use
-TABLES = {
+# The tables have some kilobytes, but a package may be imported at its first use.
+MAX_PEAK_BYTES = 60e6
+TABLES_BY_LAYOUT = {
     "llff": ("poses_bounds.npy",),
     "metashape": ("cameras.xml", "points.ply"),
     "bundler": ("bundle.out", "list.txt"),
@@ -51,8 +52,8 @@ HOSTILE_WORDS += (
 
 
 @pytest.fixture(scope="module")
-def sets(tmp_path_factory) -> Path:
-    """A valid set of each layout, three photos of 32 x 24."""
+def layout_folders(tmp_path_factory) -> Path:
+    """Write a valid scene folder of each layout with three photos of 32 x 24 pixels."""
     root = tmp_path_factory.mktemp("sets")
     cameras = []
     for index in range(3):
@@ -68,8 +69,8 @@ def sets(tmp_path_factory) -> Path:
     return root
 
 
-def mutated(data: bytes, name: str, rng: Random) -> bytes:
-    """Bytes, words or lines of a table changed, or values of JSON."""
+def mutate_table(data: bytes, name: str, rng: Random) -> bytes:
+    """Return the table with some bytes, words, lines or JSON values changed."""
     kind = rng.randrange(4)
     if kind == 0 or name.endswith(".npy"):
         return edit_bytes(data, rng)
@@ -93,16 +94,19 @@ def mutated(data: bytes, name: str, rng: Random) -> bytes:
     return text.encode(errors="surrogatepass")
 
 
-def read_mutant(sets: Path, layout: str, seed: int) -> str:
-    """What became of a mutant: "read" or the sentence. Fails at any other error, and where memory is asked for."""
+def read_mutant(layout_folders: Path, layout: str, seed: int) -> str:
+    """Load a mutated table; return "read" or the error message.
+
+    Fails at any error but a HyrfError of one line, and at a peak of MAX_PEAK_BYTES or more.
+    """
     rng = Random(seed)
-    table = rng.choice(TABLES[layout])
-    file = sets / layout / table
+    table = rng.choice(TABLES_BY_LAYOUT[layout])
+    file = layout_folders / layout / table
     original = file.read_bytes()
-    file.write_bytes(mutated(original, file.name, rng))
+    file.write_bytes(mutate_table(original, file.name, rng))
     tracemalloc.start()
     try:
-        scene = load_scene(sets / layout, layout=layout, test_every=0)
+        scene = load_scene(layout_folders / layout, layout=layout, test_every=0)
         assert np.isfinite(scene.points).all()
         for view in scene.views:
             assert view.load().rgb.shape == (24, 32, 3)
@@ -114,25 +118,25 @@ def read_mutant(sets: Path, layout: str, seed: int) -> str:
         _, most = tracemalloc.get_traced_memory()
         tracemalloc.stop()
         file.write_bytes(original)
-    assert most < MOST_MEMORY, f"seed {seed} asked for {most} bytes"
+    assert most < MAX_PEAK_BYTES, f"seed {seed} asked for {most} bytes"
     return outcome
 
 
 @pytest.mark.parametrize("layout", WRITERS_BY_LAYOUT)
-def test_mutated_tables_are_read_or_refused_in_a_line(sets, layout):
+def test_mutated_tables_are_read_or_refused_in_one_line(layout_folders, layout):
     @settings(max_examples=80, deadline=None)
     @given(st.integers(0, 2**32 - 1))
     def search(seed):
-        read_mutant(sets, layout, seed)
+        read_mutant(layout_folders, layout, seed)
 
     search()
 
 
 @pytest.mark.parametrize("layout", WRITERS_BY_LAYOUT)
 @pytest.mark.parametrize("content", [b"", b"\0" * 100, b"\xff" * 100, b"\n" * 100])
-def test_tables_of_nothing(sets, tmp_path, layout, content):
-    for table in TABLES[layout]:
-        root = shutil.copytree(sets / layout, tmp_path / table.replace("/", "-"))
+def test_tables_without_content_are_refused(layout_folders, tmp_path, layout, content):
+    for table in TABLES_BY_LAYOUT[layout]:
+        root = shutil.copytree(layout_folders / layout, tmp_path / table.replace("/", "-"))
         (root / table).write_bytes(content)
         with pytest.raises(HyrfError) as caught:
             load_scene(root)

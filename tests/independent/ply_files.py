@@ -1,4 +1,4 @@
-"""PLY files of 3D Gaussian Splatting in the INRIA layout, read and written without a line of hyrfpack."""
+"""Read and write PLY files of 3D Gaussian Splatting in the INRIA layout without using hyrfpack."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 
 @dataclass(frozen=True)
-class Stored:
+class StoredSplats:
     """Explicit 3D Gaussians as the INRIA PLY layout stores them, float32.
 
     Attributes:
@@ -18,7 +18,7 @@ class Stored:
         log_scales: (N, 3) natural logarithms of standard deviations.
         quats: (N, 4) wxyz.
         opacity_logits: (N,).
-        harmonics: (N, (degree + 1)^2, 3) colour = 0.5 + sum of coefficient times basis function.
+        harmonics: (N, (degree + 1)^2, 3) coefficients; a colour is 0.5 + the sum of coefficient times basis function.
     """
 
     positions: np.ndarray
@@ -28,7 +28,7 @@ class Stored:
     harmonics: np.ndarray
 
 
-def write_ply(path: Path, splats: Stored) -> None:
+def write_ply(path: Path, splats: StoredSplats) -> None:
     """Write the INRIA layout: binary little-endian float32, higher harmonics channel after channel."""
     rest = splats.harmonics[:, 1:].transpose(0, 2, 1).reshape(len(splats.positions), -1)
     columns = [
@@ -46,7 +46,7 @@ def write_ply(path: Path, splats: Stored) -> None:
     path.write_bytes("\n".join(header).encode() + np.concatenate(columns, axis=1).astype("<f4").tobytes())
 
 
-def read_ply(path: Path) -> Stored:
+def read_ply(path: Path) -> StoredSplats:
     """Read a PLY with float properties only, as `write_ply` and splat-transform write them."""
     data = path.read_bytes()
     header, mark, body = data.partition(b"end_header\n")
@@ -66,7 +66,7 @@ def read_ply(path: Path) -> Stored:
         higher = stack(_names("f_rest", len(rest))).reshape(count, 3, -1).transpose(0, 2, 1)
         harmonics = np.concatenate((harmonics, higher), axis=1)
     scales, quats = stack(_names("scale", 3)), stack(_names("rot", 4))
-    return Stored(stack("xyz"), scales, quats, table["opacity"].copy(), harmonics)
+    return StoredSplats(stack("xyz"), scales, quats, table["opacity"].copy(), harmonics)
 
 
 def _names(stem: str, count: int) -> list[str]:

@@ -12,14 +12,14 @@ from hyrfpack.quant.errors import DamagedDataError
 from hyrfpack.quant.huffman import END_MARK, HuffmanCode, HuffmanStream, chunk_length, huffman_decode, huffman_encode
 
 
-def fibonacci(n: int) -> np.ndarray:
+def fibonacci_numbers(n: int) -> np.ndarray:
     numbers = [1, 1]
     while len(numbers) < n:
         numbers.append(numbers[-1] + numbers[-2])
     return np.array(numbers)
 
 
-def laplace(count: int, scale: float = 6.0, dtype: type = np.uint8) -> np.ndarray:
+def laplace_symbols(count: int, scale: float = 6.0, dtype: type = np.uint8) -> np.ndarray:
     values = np.random.default_rng(count).laplace(np.iinfo(dtype).max / 2, scale, count)
     return np.clip(np.rint(values), 0, np.iinfo(dtype).max).astype(dtype)
 
@@ -30,17 +30,17 @@ HARD_CASES = {
     "constant channel": np.full(5000, 255, np.uint8),
     "two values": np.tile(np.array([0, 255], np.uint8), 777),
     "all symbols once": np.arange(256, dtype=np.uint8),
-    "one chunk exactly": laplace(1024),
-    "one symbol in the last chunk": laplace(2049),
-    "odd count": laplace(4095),
-    "more than 1024 chunks of the least length": laplace(1024 * 1024 + 3),
+    "one chunk exactly": laplace_symbols(1024),
+    "one symbol in the last chunk": laplace_symbols(2049),
+    "odd count": laplace_symbols(4095),
+    "more than 1024 chunks of the least length": laplace_symbols(1024 * 1024 + 3),
     "skewed": np.minimum(np.random.default_rng(1).geometric(0.6, 50_000), 255).astype(np.uint8),
-    "codes of 24 bits": np.repeat(np.arange(25), fibonacci(25)).astype(np.uint8),
-    "uint16": laplace(20_000, 300.0, np.uint16),
+    "codes of 24 bits": np.repeat(np.arange(25), fibonacci_numbers(25)).astype(np.uint8),
+    "uint16": laplace_symbols(20_000, 300.0, np.uint16),
     "uint16 constant": np.full(3000, 65535, np.uint16),
     "uint16 all symbols": np.random.default_rng(2).permutation(65536).astype(np.uint16),
-    "uint16 odd": laplace(1025, 3.0, np.uint16),
-    "not contiguous": laplace(6001)[::2],
+    "uint16 odd": laplace_symbols(1025, 3.0, np.uint16),
+    "not contiguous": laplace_symbols(6001)[::2],
 }
 
 
@@ -81,7 +81,7 @@ def test_any_16_bit_symbols_round_trip_and_match_dahuffman(listed: list[int]) ->
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 def test_codes_of_up_to_52_bits_match_dahuffman(dtype: type) -> None:
-    counts = fibonacci(52)
+    counts = fibonacci_numbers(52)
     code = HuffmanCode.from_frequencies(counts)
     symbols = np.random.default_rng(0).permutation(np.tile(np.arange(52), 100)).astype(dtype)
 
@@ -93,8 +93,8 @@ def test_codes_of_up_to_52_bits_match_dahuffman(dtype: type) -> None:
     np.testing.assert_array_equal(huffman_decode(HuffmanStream.from_bytes(stream.to_bytes())), symbols)
 
 
-def test_codes_are_dahuffmans() -> None:
-    counts = np.bincount(laplace(10_000))
+def test_code_table_equals_that_of_dahuffman() -> None:
+    counts = np.bincount(laplace_symbols(10_000))
 
     code = HuffmanCode.from_frequencies(counts)
 
@@ -107,8 +107,8 @@ def test_codes_are_dahuffmans() -> None:
     assert len(expected) == len(ours) + 1
 
 
-def test_codes_follow_from_the_lengths_as_the_specification_says() -> None:
-    code = HuffmanCode.from_frequencies(np.bincount(laplace(3000)))
+def test_codes_follow_from_their_lengths_as_specified() -> None:
+    code = HuffmanCode.from_frequencies(np.bincount(laplace_symbols(3000)))
 
     fraction, denominator = 0, 1 << 64
     for length, value in zip(code.lengths.tolist(), code.codes.tolist(), strict=True):
@@ -117,13 +117,13 @@ def test_codes_follow_from_the_lengths_as_the_specification_says() -> None:
     assert fraction == denominator
 
 
-def test_histogram_that_needs_longer_codes_than_57_bits_is_refused() -> None:
+def test_histogram_that_needs_codes_longer_than_57_bits_is_refused() -> None:
     with pytest.raises(ValueError, match="57 bits"):
-        HuffmanCode.from_frequencies(fibonacci(70))
+        HuffmanCode.from_frequencies(fibonacci_numbers(70))
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_empty_array_round_trips_in_a_header(dtype: type) -> None:
+def test_empty_array_is_stored_as_a_header_alone(dtype: type) -> None:
     stream = huffman_encode(np.zeros(0, dtype))
 
     data = stream.to_bytes()
@@ -135,16 +135,16 @@ def test_empty_array_round_trips_in_a_header(dtype: type) -> None:
     assert decoded.dtype == dtype
 
 
-def test_decoding_needs_no_dahuffman(monkeypatch: pytest.MonkeyPatch) -> None:
-    symbols = laplace(3000)
+def test_decoding_does_not_import_dahuffman(monkeypatch: pytest.MonkeyPatch) -> None:
+    symbols = laplace_symbols(3000)
     data = huffman_encode(symbols).to_bytes()
     monkeypatch.setitem(sys.modules, "dahuffman", None)
 
     np.testing.assert_array_equal(huffman_decode(HuffmanStream.from_bytes(data)), symbols)
 
 
-def test_what_is_stored_beside_the_payload_is_small() -> None:
-    symbols = laplace(200_000)
+def test_header_code_table_and_chunk_sizes_take_the_documented_bytes() -> None:
+    symbols = laplace_symbols(200_000)
 
     stream = huffman_encode(symbols)
 
@@ -153,8 +153,8 @@ def test_what_is_stored_beside_the_payload_is_small() -> None:
 
 
 def test_chunk_sizes_beyond_16_bits_round_trip() -> None:
-    code = HuffmanCode.from_frequencies(fibonacci(52))
-    symbols = np.zeros(1_500_000, np.uint8)  # 52 bits each, 1466 to a chunk
+    code = HuffmanCode.from_frequencies(fibonacci_numbers(52))
+    symbols = np.zeros(1_500_000, np.uint8)  # codes of 52 bits, 1466 symbols a chunk
 
     stream = HuffmanStream.from_bytes(huffman_encode(symbols, code).to_bytes())
 
@@ -163,7 +163,7 @@ def test_chunk_sizes_beyond_16_bits_round_trip() -> None:
 
 
 @pytest.mark.parametrize("symbols", [np.zeros(3, np.int64), np.zeros((2, 2), np.uint8), np.zeros(3, np.float32)])
-def test_encode_refuses_other_arrays(symbols: np.ndarray) -> None:
+def test_encode_refuses_other_dtypes_and_shapes(symbols: np.ndarray) -> None:
     with pytest.raises(ValueError, match="uint8 or uint16"):
         huffman_encode(symbols)
 
@@ -176,7 +176,7 @@ def test_encode_refuses_symbols_without_a_code() -> None:
 
 
 @pytest.mark.parametrize("name", ["one Gaussian", "constant channel", "uint16 odd"])
-def test_truncation_anywhere_is_refused(name: str) -> None:
+def test_every_truncation_and_a_trailing_byte_are_refused(name: str) -> None:
     data = huffman_encode(HARD_CASES[name]).to_bytes()
 
     for length in range(len(data)):
@@ -188,7 +188,7 @@ def test_truncation_anywhere_is_refused(name: str) -> None:
 
 @given(st.data())
 @settings(max_examples=300, deadline=None)
-def test_damage_is_refused_or_yields_the_announced_count(data: st.DataObject) -> None:
+def test_damaged_stream_is_refused_or_decodes_to_the_declared_count(data: st.DataObject) -> None:
     damaged = bytearray(huffman_encode(HARD_CASES["odd count"]).to_bytes())
     for _ in range(data.draw(st.integers(1, 4))):
         damaged[data.draw(st.integers(0, len(damaged) - 1))] ^= data.draw(st.integers(1, 255))
@@ -203,7 +203,7 @@ def test_damage_is_refused_or_yields_the_announced_count(data: st.DataObject) ->
 
 
 @given(st.binary(max_size=200))
-def test_random_bytes_are_refused_or_empty(data: bytes) -> None:
+def test_random_bytes_are_refused_or_declare_at_most_one_symbol_per_bit(data: bytes) -> None:
     try:
         stream = HuffmanStream.from_bytes(data)
     except DamagedDataError:
@@ -211,7 +211,7 @@ def test_random_bytes_are_refused_or_empty(data: bytes) -> None:
     assert stream.count <= 8 * len(data)
 
 
-def forged(**changes: object) -> bytes:
+def stream_with_changed_fields(**changes: object) -> bytes:
     stream = huffman_encode(np.array([0, 1, 1, 2, 2, 2, 2], np.uint8))
     return HuffmanStream(**{**vars(stream), **changes}).to_bytes()
 
@@ -233,26 +233,26 @@ def test_invalid_code_tables_are_refused(lengths: list[int], symbols: list[int],
     code = HuffmanCode(np.array(symbols, np.int32), np.array(lengths, np.uint8))
 
     with pytest.raises(DamagedDataError, match=claim):
-        HuffmanStream.from_bytes(forged(code=code))
+        HuffmanStream.from_bytes(stream_with_changed_fields(code=code))
 
 
 def test_code_table_whose_sum_wraps_around_is_refused() -> None:
-    # 2^57 + 2^64 in units of the longest code: a 64-bit sum would take it for complete.
+    # In units of the longest code the sum is 2^57 + 2^64; a 64-bit sum overflows and would look complete.
     lengths = [*[1] * 256, 1, 1]
     code = HuffmanCode(np.array([*range(257), END_MARK], np.int32), np.array(lengths, np.uint8))
 
     with pytest.raises(DamagedDataError, match="no complete code"):
-        HuffmanStream.from_bytes(forged(code=code, dtype=np.dtype("u2")))
+        HuffmanStream.from_bytes(stream_with_changed_fields(code=code, dtype=np.dtype("u2")))
 
 
 @pytest.mark.parametrize("count", [0, 10**3, 2**40, 2**63])
-def test_forged_counts_are_refused_before_anything_is_allocated(count: int) -> None:
+def test_forged_counts_are_refused(count: int) -> None:
     with pytest.raises(DamagedDataError):
-        HuffmanStream.from_bytes(forged(count=count))
+        HuffmanStream.from_bytes(stream_with_changed_fields(count=count))
 
 
-def test_count_that_does_not_fit_the_payload_is_refused_in_decoding() -> None:
-    stream = HuffmanStream.from_bytes(forged(count=6))
+def test_count_that_does_not_fit_the_payload_is_refused_while_decoding() -> None:
+    stream = HuffmanStream.from_bytes(stream_with_changed_fields(count=6))
 
     with pytest.raises(DamagedDataError, match="does not end where it should"):
         huffman_decode(stream)
@@ -268,7 +268,7 @@ def test_early_end_mark_is_refused() -> None:
 
 
 def test_chunk_sizes_that_do_not_add_up_are_refused() -> None:
-    symbols = laplace(5000)
+    symbols = laplace_symbols(5000)
     stream = huffman_encode(symbols)
     shifted = stream.chunk_bits.copy()
     shifted[:2] += [1, -1]

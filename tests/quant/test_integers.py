@@ -11,11 +11,11 @@ from token_streams import decode_integers_by_spec
 from hyrfpack.parallel import has_numba
 from hyrfpack.quant import DamagedDataError, decode_integers, encode_integers
 
-IMPLEMENTATIONS = ["numpy", pytest.param("cpu", marks=pytest.mark.skipif(not has_numba(), reason="no numba"))]
-DTYPES = [np.int8, np.uint8, np.int16, np.uint16, np.int32, np.uint32, np.int64, np.uint64]
+CODER_IMPLEMENTATIONS = ["numpy", pytest.param("cpu", marks=pytest.mark.skipif(not has_numba(), reason="no numba"))]
+INTEGER_DTYPES = [np.int8, np.uint8, np.int16, np.uint16, np.int32, np.uint32, np.int64, np.uint64]
 
 _rng = np.random.default_rng(0)
-CASES = {
+HARD_CASES = {
     "one": (np.array([0]), False),
     "one large": (np.array([2**56 - 1]), False),
     "largest and smallest": (np.array([2**55 - 1, 1 - 2**55, 0]), True),
@@ -29,10 +29,10 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("implementation", CODER_IMPLEMENTATIONS)
+@pytest.mark.parametrize("name", HARD_CASES)
 def test_integers_round_trip(name: str, implementation: str) -> None:
-    values, signed = CASES[name]
+    values, signed = HARD_CASES[name]
 
     data = encode_integers(values, signed=signed, implementation=implementation)
 
@@ -42,25 +42,25 @@ def test_integers_round_trip(name: str, implementation: str) -> None:
 
 
 @pytest.mark.skipif(not has_numba(), reason="no numba")
-@pytest.mark.parametrize("name", CASES)
-def test_numpy_and_numba_write_the_same_bytes(name: str) -> None:
-    values, signed = CASES[name]
+@pytest.mark.parametrize("name", HARD_CASES)
+def test_numpy_and_numba_encode_to_the_same_bytes(name: str) -> None:
+    values, signed = HARD_CASES[name]
 
     written = {encode_integers(values, signed=signed, implementation=each) for each in ("numpy", "cpu", "auto")}
 
     assert len(written) == 1
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", CODER_IMPLEMENTATIONS)
 @given(data=st.data())
 @settings(max_examples=150, deadline=None)
 def test_any_integers_of_any_dtype_round_trip(implementation: str, data: st.DataObject) -> None:
-    dtype, signed = data.draw(st.sampled_from(DTYPES)), data.draw(st.booleans())
+    dtype, signed = data.draw(st.sampled_from(INTEGER_DTYPES)), data.draw(st.booleans())
     largest = min(np.iinfo(dtype).max, 2**55 - 1 if signed else 2**56 - 1)
     smallest = max(np.iinfo(dtype).min, 1 - 2**55) if signed else 0
     value = st.one_of(st.integers(max(smallest, -3), 3), st.integers(smallest, largest))
     values = np.array(data.draw(st.lists(value, max_size=200)), dtype)
-    contexts = data.draw(st.none() | st.integers(1, 256).map(lambda n: _contexts(len(values), n)))
+    contexts = data.draw(st.none() | st.integers(1, 256).map(lambda n: _periodic_contexts(len(values), n)))
 
     coded = encode_integers(values, contexts, signed=signed, implementation=implementation)
 
@@ -70,7 +70,7 @@ def test_any_integers_of_any_dtype_round_trip(implementation: str, data: st.Data
     assert decode_integers_by_spec(coded, listed, signed) == values.tolist()
 
 
-def _contexts(count: int, number: int) -> np.ndarray:
+def _periodic_contexts(count: int, number: int) -> np.ndarray:
     return (np.arange(count) * 7 % number).astype(np.uint8)
 
 
@@ -85,7 +85,7 @@ def test_more_values_than_a_block_round_trip() -> None:
         np.testing.assert_array_equal(decoded, values)
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", CODER_IMPLEMENTATIONS)
 @pytest.mark.parametrize(
     ("values", "signed", "dtype"),
     [
@@ -99,7 +99,7 @@ def test_more_values_than_a_block_round_trip() -> None:
         ([-(2**31) - 1, 0], True, np.int64),
     ],
 )
-def test_the_dtype_is_the_narrowest_that_holds_the_values(
+def test_decoded_dtype_is_the_narrowest_that_holds_the_values(
     values: list[int], signed: bool, dtype: type, implementation: str
 ) -> None:
     data = encode_integers(np.array(values, np.int64), signed=signed)
@@ -111,7 +111,7 @@ def test_the_dtype_is_the_narrowest_that_holds_the_values(
 
 
 @pytest.mark.parametrize("scale", [0.3, 1, 3, 10, 40])
-def test_a_laplace_distribution_takes_hardly_more_than_its_entropy(scale: float) -> None:
+def test_laplace_values_take_at_most_half_a_percent_more_than_their_entropy(scale: float) -> None:
     values = np.rint(np.random.default_rng(2).laplace(scale=scale, size=400_000)).astype(np.int64)
 
     data = encode_integers(values, signed=True)
@@ -124,12 +124,12 @@ def test_a_laplace_distribution_takes_hardly_more_than_its_entropy(scale: float)
     assert 8 * len(data) / len(values) < 1.005 * entropy + 0.002
 
 
-def test_no_values_take_no_bytes_and_equal_ones_hardly_any() -> None:
+def test_empty_array_takes_no_bytes_and_equal_values_take_three() -> None:
     assert encode_integers(np.zeros(0, np.int64)) == b""
     assert len(encode_integers(np.full(10**6, -7), signed=True)) == 3
 
 
-def test_decoding_takes_little_memory_beside_the_values() -> None:
+def test_decoding_takes_little_memory_beyond_its_output_and_input() -> None:
     values = np.rint(np.random.default_rng(3).laplace(scale=2, size=2_000_000)).astype(np.int32)
     contexts = np.zeros(len(values), np.uint8)
     contexts[::3] = 1
@@ -144,10 +144,10 @@ def test_decoding_takes_little_memory_beside_the_values() -> None:
         assert peak < 4 * len(values) + len(values) + 3 * len(data) + 2**22
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", CODER_IMPLEMENTATIONS)
 @pytest.mark.parametrize("name", ["one large", "laplace", "constant", "huge outlier", "signed powers of two"])
 def test_truncation_and_trailing_bytes_are_refused(name: str, implementation: str) -> None:
-    values, signed = CASES[name]
+    values, signed = HARD_CASES[name]
     data = encode_integers(values, signed=signed)
 
     for length in np.unique(np.append(np.arange(min(len(data), 60)), np.linspace(0, len(data) - 1, 60).astype(int))):
@@ -159,12 +159,12 @@ def test_truncation_and_trailing_bytes_are_refused(name: str, implementation: st
         decode_integers(data, 0, signed=signed, implementation=implementation)
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", CODER_IMPLEMENTATIONS)
 @given(data=st.data())
 @settings(max_examples=60, deadline=None)
-def test_damage_is_refused_or_yields_as_many_values(implementation: str, data: st.DataObject) -> None:
-    values, signed = CASES["Morton gaps"]
-    damaged = bytearray(GAPS)
+def test_damaged_stream_is_refused_or_decodes_to_the_requested_count(implementation: str, data: st.DataObject) -> None:
+    values, signed = HARD_CASES["Morton gaps"]
+    damaged = bytearray(ENCODED_MORTON_GAPS)
     for _ in range(data.draw(st.integers(1, 4))):
         damaged[data.draw(st.integers(0, len(damaged) - 1))] ^= data.draw(st.integers(1, 255))
 
@@ -175,7 +175,7 @@ def test_damage_is_refused_or_yields_as_many_values(implementation: str, data: s
     assert decoded.shape == values.shape
 
 
-GAPS = encode_integers(CASES["Morton gaps"][0])
+ENCODED_MORTON_GAPS = encode_integers(HARD_CASES["Morton gaps"][0])
 
 
 @pytest.mark.parametrize(
@@ -192,7 +192,7 @@ GAPS = encode_integers(CASES["Morton gaps"][0])
         (np.array([-(2**63)]), True, "between"),
     ],
 )
-def test_encode_refuses_what_it_cannot_code(values: np.ndarray, signed: bool, claim: str) -> None:
+def test_encode_refuses_other_dtypes_shapes_and_ranges(values: np.ndarray, signed: bool, claim: str) -> None:
     with pytest.raises(ValueError, match=claim):
         encode_integers(values, signed=signed)
 

@@ -11,10 +11,10 @@ from hypothesis.extra import numpy as hnp
 from hyrfpack.quant import MinMaxParams, MinMaxQuantizer
 from hyrfpack.quant.errors import DamagedDataError
 
-FINITE = st.floats(width=32, allow_nan=False, allow_infinity=False)
+FINITE_FLOAT32 = st.floats(width=32, allow_nan=False, allow_infinity=False)
 
 
-@given(hnp.arrays(np.float32, hnp.array_shapes(max_dims=3, max_side=20), elements=FINITE), st.integers(1, 16))
+@given(hnp.arrays(np.float32, hnp.array_shapes(max_dims=3, max_side=20), elements=FINITE_FLOAT32), st.integers(1, 16))
 def test_error_stays_within_half_a_step_and_rounding(values: np.ndarray, bits: int) -> None:
     quantizer = MinMaxQuantizer(bits)
 
@@ -24,13 +24,13 @@ def test_error_stays_within_half_a_step_and_rounding(values: np.ndarray, bits: i
     assert codes.shape == decoded.shape == values.shape
     assert decoded.dtype == np.float32
     low, high = float(values.min()), float(values.max())
-    smallest = 2.0**-149  # below the normal floats rounding is absolute
+    smallest = 2.0**-149  # below the normal floats the rounding error is absolute
     bound = (high - low) / (2 * (2**bits - 1)) + 2.0**-23 * max(abs(low), abs(high)) + smallest
     assert np.abs(decoded.astype(np.float64) - values).max() <= bound
 
 
-@given(hnp.arrays(np.float32, st.integers(1, 50), elements=FINITE), st.integers(1, 16))
-def test_codes_are_the_nearest_levels_in_exact_arithmetic(values: np.ndarray, bits: int) -> None:
+@given(hnp.arrays(np.float32, st.integers(1, 50), elements=FINITE_FLOAT32), st.integers(1, 16))
+def test_codes_are_the_nearest_levels_by_exact_arithmetic(values: np.ndarray, bits: int) -> None:
     codes, params = MinMaxQuantizer(bits).encode(values)
 
     low, high = Fraction(params.minimum), Fraction(params.maximum)
@@ -40,7 +40,7 @@ def test_codes_are_the_nearest_levels_in_exact_arithmetic(values: np.ndarray, bi
             assert abs(place - code) <= Fraction(1, 2) + Fraction(1, 2**30)
 
 
-@given(hnp.arrays(np.float32, st.integers(1, 50), elements=FINITE), st.integers(1, 16))
+@given(hnp.arrays(np.float32, st.integers(1, 50), elements=FINITE_FLOAT32), st.integers(1, 16))
 def test_extremes_are_exact(values: np.ndarray, bits: int) -> None:
     decoded = MinMaxQuantizer.decode(*MinMaxQuantizer(bits).encode(values))
 
@@ -65,8 +65,8 @@ def test_empty_one_and_two_values_are_exact(values: np.ndarray) -> None:
     assert decoded.shape == values.shape
 
 
-def test_known_codes() -> None:
-    # Levels 0, 0.25 ... 0.75; 0.125 and 0.375 lie halfway and go to the even code.
+def test_halfway_values_go_to_the_even_code() -> None:
+    # The levels are 0, 0.25, 0.5 and 0.75; 0.125 and 0.375 lie halfway between two of them.
     values = np.float32([0.0, 0.125, 0.375, 0.49, 0.75])
 
     codes, params = MinMaxQuantizer(2).encode(values)
@@ -76,14 +76,14 @@ def test_known_codes() -> None:
 
 
 @pytest.mark.parametrize(("bits", "dtype"), [(1, np.uint8), (8, np.uint8), (9, np.uint16), (16, np.uint16)])
-def test_codes_are_as_narrow_as_they_can_be(bits: int, dtype: type) -> None:
+def test_code_dtype_is_the_narrowest_that_holds_the_bits(bits: int, dtype: type) -> None:
     codes, _ = MinMaxQuantizer(bits).encode(np.float32([0, 1]))
 
     assert codes.dtype == dtype
     assert codes.tolist() == [0, 2**bits - 1]
 
 
-def test_encoding_leaves_its_input_alone() -> None:
+def test_encoding_leaves_its_input_unchanged() -> None:
     values = np.array([0.0, 0.3, 1.0])
 
     MinMaxQuantizer().encode(values)
@@ -91,8 +91,8 @@ def test_encoding_leaves_its_input_alone() -> None:
     assert values.tolist() == [0.0, 0.3, 1.0]
 
 
-def test_double_precision_beyond_the_float32_range_of_its_extremes_stays_in_range() -> None:
-    values = np.array([0.1, 0.2, 0.3])  # none of them a float32
+def test_float64_values_between_float32_numbers_stay_within_the_error_bound() -> None:
+    values = np.array([0.1, 0.2, 0.3])  # none of them is a float32 number
 
     decoded = MinMaxQuantizer.decode(*MinMaxQuantizer().encode(values))
 
@@ -116,7 +116,7 @@ def test_codes_beyond_the_bits_are_refused() -> None:
         MinMaxQuantizer.decode(np.array([3, 16], np.uint8), MinMaxParams(0.0, 1.0, 4))
 
 
-@given(FINITE, FINITE, st.integers(1, 16))
+@given(FINITE_FLOAT32, FINITE_FLOAT32, st.integers(1, 16))
 def test_parameters_round_trip_in_nine_bytes(a: float, b: float, bits: int) -> None:
     params = MinMaxParams(min(a, b), max(a, b), bits)
 

@@ -7,27 +7,27 @@ from hypothesis import strategies as st
 
 from hyrfpack.quant.morton import MAX_BITS_PER_AXIS, morton_cells, morton_codes
 
-COORDINATE = st.one_of(st.integers(0, 3), st.integers(0, 2**21 - 1), st.integers(0, 20).map(lambda bit: 1 << bit))
+CELL_COORDINATE = st.one_of(st.integers(0, 3), st.integers(0, 2**21 - 1), st.integers(0, 20).map(lambda bit: 1 << bit))
 
 
-def interleaved(cell: tuple[int, int, int]) -> int:
-    """The definition, a bit at a time: bit 3 i + a is bit i of coordinate a."""
+def interleave_bits(cell: tuple[int, int, int]) -> int:
+    """Apply the definition bit by bit: bit 3 i + a of the code is bit i of coordinate a."""
     return sum((coordinate >> i & 1) << 3 * i + axis for axis, coordinate in enumerate(cell) for i in range(21))
 
 
-@given(st.lists(st.tuples(COORDINATE, COORDINATE, COORDINATE), max_size=40))
+@given(st.lists(st.tuples(CELL_COORDINATE, CELL_COORDINATE, CELL_COORDINATE), max_size=40))
 @settings(max_examples=150, deadline=None)
-def test_codes_interleave_bits_and_cells_take_them_apart(cells: list[tuple[int, int, int]]) -> None:
+def test_morton_codes_interleave_bits_and_morton_cells_inverts_them(cells: list[tuple[int, int, int]]) -> None:
     array = np.array(cells, np.int64).reshape(-1, 3)
 
     codes = morton_codes(array)
 
     assert codes.dtype == np.int64
-    assert codes.tolist() == [interleaved(cell) for cell in cells]
+    assert codes.tolist() == [interleave_bits(cell) for cell in cells]
     np.testing.assert_array_equal(morton_cells(codes), array)
 
 
-def test_every_single_bit_goes_to_its_place_and_back() -> None:
+def test_every_single_bit_round_trips() -> None:
     cells = np.concatenate([np.eye(3, dtype=np.int64) << bit for bit in range(21)])
 
     codes = morton_codes(cells)
@@ -36,7 +36,7 @@ def test_every_single_bit_goes_to_its_place_and_back() -> None:
     np.testing.assert_array_equal(morton_cells(codes), cells)
 
 
-def test_all_codes_of_a_small_cube_are_different_and_without_holes() -> None:
+def test_codes_of_a_16_cube_are_distinct_and_consecutive() -> None:
     cells = np.stack(np.meshgrid(*[np.arange(16)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 
     codes = morton_codes(cells)
@@ -45,10 +45,10 @@ def test_all_codes_of_a_small_cube_are_different_and_without_holes() -> None:
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.int32, np.uint32, np.uint64])
-def test_cells_of_any_integer_dtype_are_taken(dtype: type) -> None:
+def test_cells_of_any_integer_dtype_are_accepted(dtype: type) -> None:
     cells = np.array([[255, 0, 129], [1, 2, 3]], dtype)
 
-    assert morton_codes(cells).tolist() == [interleaved(cell) for cell in cells.tolist()]
+    assert morton_codes(cells).tolist() == [interleave_bits(cell) for cell in cells.tolist()]
 
 
 def test_the_largest_gap_between_codes_fits_the_integer_coder() -> None:

@@ -16,7 +16,7 @@ from hyrfpack.quant.points import MAX_POINT_CLASSES, LatticePoints, decode_point
 
 
 def random_points(count: int, bits: list[int], seed: int = 0, spread: float = 1.0) -> LatticePoints:
-    """Points in the cube [0, spread)^3 of the unit cube, of classes drawn evenly."""
+    """Draw points from the cube [0, spread)^3, a part of the unit cube, with uniformly random classes."""
     rng = np.random.default_rng(seed)
     classes = rng.integers(len(bits), size=count).astype(np.uint8)
     sides = (1 << np.array(bits))[classes][:, None]
@@ -28,7 +28,7 @@ def sorted_rows(points: LatticePoints) -> list[tuple[int, ...]]:
 
 
 _rng = np.random.default_rng(1)
-CASES = {
+HARD_CASES = {
     "none": random_points(0, [7]),
     "none, all classes": random_points(0, list(range(1, 17))),
     "one": LatticePoints(np.array([[5, 0, 7]]), np.zeros(1, np.uint8), np.array([3])),
@@ -70,14 +70,14 @@ def check_round_trip(points: LatticePoints) -> None:
     assert sorted(order.tolist()) == list(range(len(points.cells)))
     np.testing.assert_array_equal(decoded.classes, points.classes[order])
     assert (decoded.bits >= points.bits).all()
-    # What became finer lies in the cell that was given.
+    # The encoder may refine a class; the finer cell must lie inside the original one.
     shift = (decoded.bits - points.bits)[decoded.classes][:, None]
     np.testing.assert_array_equal(decoded.cells >> shift, points.cells[order])
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", HARD_CASES)
 def test_points_round_trip(name: str) -> None:
-    check_round_trip(CASES[name])
+    check_round_trip(HARD_CASES[name])
 
 
 @given(st.data())
@@ -100,9 +100,9 @@ def test_many_points_round_trip() -> None:
     np.testing.assert_array_equal(decoded.classes, points.classes[order])
 
 
-@pytest.mark.parametrize("name", CASES)
-def test_the_bytes_do_not_depend_on_the_order_given(name: str) -> None:
-    points = CASES[name]
+@pytest.mark.parametrize("name", HARD_CASES)
+def test_the_bytes_do_not_depend_on_the_order_of_points(name: str) -> None:
+    points = HARD_CASES[name]
     shuffled = np.random.default_rng(2).permutation(len(points.cells))
 
     data, _, ordered = encode_points(points)
@@ -113,8 +113,8 @@ def test_the_bytes_do_not_depend_on_the_order_given(name: str) -> None:
     assert sorted_rows(decode_points(from_shuffled, len(shuffled))) == sorted_rows(ordered)
 
 
-def test_equal_points_of_a_class_keep_the_order_given() -> None:
-    points = CASES["coincident in all classes"]
+def test_equal_points_of_a_class_keep_their_order() -> None:
+    points = HARD_CASES["coincident in all classes"]
 
     order = encode_points(points)[1]
 
@@ -122,7 +122,7 @@ def test_equal_points_of_a_class_keep_the_order_given() -> None:
     assert order.tolist() == expected
 
 
-def test_points_near_in_the_list_are_near_in_space() -> None:
+def test_points_adjacent_in_the_encoded_order_are_near_in_space() -> None:
     ordered = encode_points(random_points(4000, [12]))[2]
 
     steps = np.linalg.norm(np.diff(ordered.centers() / 2**19, axis=0), axis=1)
@@ -139,8 +139,8 @@ def test_centers_are_the_middles_of_the_cells(bits: int) -> None:
         assert [value / 2**19 for value in center] == [(coordinate + 0.5) * side for coordinate in cell]
 
 
-def bits_of_a_set(count: int, bits: int) -> float:
-    """What a set of `count` points takes at least, if all are equally likely: log2 of the number of multisets."""
+def min_multiset_bits(count: int, bits: int) -> float:
+    """Return the least bits for `count` points where all multisets are equally likely: log2 of their number."""
     cells = 8**bits
     return (math.lgamma(count + cells) - math.lgamma(count + 1) - math.lgamma(cells)) / math.log(2)
 
@@ -155,13 +155,13 @@ def bits_of_a_set(count: int, bits: int) -> float:
         (100_000, 3),
     ],
 )
-def test_even_points_take_hardly_more_than_their_information(count: int, bits: int) -> None:
+def test_uniform_points_take_at_most_2_percent_more_than_their_entropy(count: int, bits: int) -> None:
     data = encode_points(random_points(count, [bits]))[0]
 
-    assert 8 * len(data) < 1.02 * bits_of_a_set(count, bits) + 400  # bits of header and models
+    assert 8 * len(data) < 1.02 * min_multiset_bits(count, bits) + 400  # 400 bits for header and models
 
 
-def test_classes_take_hardly_more_than_their_entropy() -> None:
+def test_classes_take_at_most_5_percent_more_than_their_entropy() -> None:
     points = random_points(30_000, [14, 14])
     one_class = LatticePoints(points.cells, np.zeros(30_000, np.uint8), np.array([14]))
 
@@ -170,21 +170,21 @@ def test_classes_take_hardly_more_than_their_entropy() -> None:
     assert 0.98 < more < 1.05
 
 
-def test_coincident_points_take_no_bytes() -> None:
+def test_coincident_points_take_fewer_than_60_bytes() -> None:
     points = LatticePoints(np.tile([[77, 5, 9]], (100_000, 1)), np.zeros(100_000, np.uint8), np.array([18]))
 
     assert len(encode_points(points)[0]) < 60
 
 
-SMALL = random_points(60, [9, 7, 6])
-SMALL_DATA = encode_points(SMALL)[0]
-HEADER = struct.Struct("<BBII")  # base, classes, bytes of gaps, bytes of classes
+SAMPLE_POINTS = random_points(60, [9, 7, 6])
+SAMPLE_DATA = encode_points(SAMPLE_POINTS)[0]
+HEADER_STRUCT = struct.Struct("<BBII")  # base bits, number of classes, gap bytes, class bytes
 
 
 @pytest.mark.parametrize("name", ["one", "coincident", "one bit", "two far clumps", "all classes"])
 def test_truncation_and_trailing_bytes_are_refused(name: str) -> None:
-    count = len(CASES[name].cells)
-    data = encode_points(CASES[name])[0]
+    count = len(HARD_CASES[name].cells)
+    data = encode_points(HARD_CASES[name])[0]
 
     for length in np.unique(np.append(np.arange(min(len(data), 100)), np.linspace(0, len(data) - 1, 60).astype(int))):
         with pytest.raises(DamagedDataError):
@@ -193,7 +193,7 @@ def test_truncation_and_trailing_bytes_are_refused(name: str) -> None:
         decode_points(data + b"\0", count)
 
 
-def check_refused_or_on_the_lattice(data: bytes, count: int) -> None:
+def check_decodes_to_the_lattice_or_is_refused(data: bytes, count: int) -> None:
     try:
         points = decode_points(data, count)
     except DamagedDataError:
@@ -207,24 +207,24 @@ def check_refused_or_on_the_lattice(data: bytes, count: int) -> None:
 
 @given(st.data())
 @settings(max_examples=200, deadline=None)
-def test_damage_is_refused_or_stays_on_the_lattice(data: st.DataObject) -> None:
-    damaged = bytearray(SMALL_DATA)
+def test_damaged_data_is_refused_or_decodes_to_the_lattice(data: st.DataObject) -> None:
+    damaged = bytearray(SAMPLE_DATA)
     for _ in range(data.draw(st.integers(1, 4))):
         damaged[data.draw(st.integers(0, len(damaged) - 1))] ^= data.draw(st.integers(1, 255))
 
-    check_refused_or_on_the_lattice(bytes(damaged), 60)
+    check_decodes_to_the_lattice_or_is_refused(bytes(damaged), 60)
 
 
 @given(st.binary(max_size=120), st.integers(0, 50))
 @settings(max_examples=100, deadline=None)
-def test_any_bytes_are_refused_or_stay_on_the_lattice(data: bytes, count: int) -> None:
-    check_refused_or_on_the_lattice(data, count)
-    check_refused_or_on_the_lattice(SMALL_DATA[:13] + data, count)
+def test_random_bytes_are_refused_or_decode_to_the_lattice(data: bytes, count: int) -> None:
+    check_decodes_to_the_lattice_or_is_refused(data, count)
+    check_decodes_to_the_lattice_or_is_refused(SAMPLE_DATA[:13] + data, count)
 
 
-def with_header(**changes: int) -> bytes:
-    fields = dict(zip(("base", "kinds", "gaps", "classes"), HEADER.unpack_from(SMALL_DATA), strict=True))
-    return HEADER.pack(*(fields | changes).values()) + SMALL_DATA[HEADER.size :]
+def sample_with_header(**changes: int) -> bytes:
+    fields = dict(zip(("base", "kinds", "gaps", "classes"), HEADER_STRUCT.unpack_from(SAMPLE_DATA), strict=True))
+    return HEADER_STRUCT.pack(*(fields | changes).values()) + SAMPLE_DATA[HEADER_STRUCT.size :]
 
 
 @pytest.mark.parametrize(
@@ -245,10 +245,10 @@ def with_header(**changes: int) -> bytes:
     ],
     ids=str,
 )
-def test_headers_that_cannot_be_are_refused(changes: dict[str, int]) -> None:
+def test_invalid_headers_are_refused_in_little_memory(changes: dict[str, int]) -> None:
     tracemalloc.start()
     with pytest.raises(DamagedDataError):
-        decode_points(with_header(**changes), 60)
+        decode_points(sample_with_header(**changes), 60)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
 
@@ -256,24 +256,24 @@ def test_headers_that_cannot_be_are_refused(changes: dict[str, int]) -> None:
 
 
 @pytest.mark.parametrize("bits", [0, 19, 63, 255])
-def test_classes_of_impossible_fineness_are_refused(bits: int) -> None:
-    damaged = bytearray(SMALL_DATA)
-    damaged[HEADER.size + 1] = bits
+def test_classes_with_invalid_bits_are_refused(bits: int) -> None:
+    damaged = bytearray(SAMPLE_DATA)
+    damaged[HEADER_STRUCT.size + 1] = bits
 
     with pytest.raises(DamagedDataError, match="bits"):
         decode_points(bytes(damaged), 60)
 
 
 @pytest.mark.parametrize("count", [0, 59, 61, 6000, 100_000])
-def test_another_count_is_refused(count: int) -> None:
+def test_wrong_point_count_is_refused(count: int) -> None:
     with pytest.raises(DamagedDataError):
-        decode_points(SMALL_DATA, count)
+        decode_points(SAMPLE_DATA, count)
 
 
-def test_gaps_that_lead_out_of_the_lattice_are_refused() -> None:
+def test_gaps_that_leave_the_lattice_are_refused() -> None:
     data = encode_points(LatticePoints(np.array([[1, 1, 1], [3, 3, 3]]), np.zeros(2, np.uint8), np.array([2])))[0]
     damaged = bytearray(data)
-    damaged[0] = damaged[HEADER.size] = 1  # a lattice of 8 cells; the last point is in cell 63
+    damaged[0] = damaged[HEADER_STRUCT.size] = 1  # the lattice has 8 cells, and the last point lies in cell 63
 
     assert data[0] == 2
     with pytest.raises(DamagedDataError, match="out of the lattice"):
@@ -281,15 +281,15 @@ def test_gaps_that_lead_out_of_the_lattice_are_refused() -> None:
 
 
 @pytest.mark.parametrize("kind", [2, 300, 2**40])
-def test_classes_that_are_not_there_are_refused(kind: int) -> None:
+def test_undeclared_classes_are_refused(kind: int) -> None:
     gaps, classes = encode_integers(np.array([1, 1])), encode_integers(np.array([0, kind]), np.zeros(2, np.uint8))
-    data = HEADER.pack(2, 2, len(gaps), len(classes)) + bytes([2, 2]) + gaps + classes
+    data = HEADER_STRUCT.pack(2, 2, len(gaps), len(classes)) + bytes([2, 2]) + gaps + classes
 
     with pytest.raises(DamagedDataError, match=f"class {kind} of 2"):
         decode_points(data, 2)
 
 
-def test_decoding_takes_little_memory_beside_the_points() -> None:
+def test_decoding_takes_at_most_120_bytes_per_point() -> None:
     points = random_points(100_000, [14, 12])
     data = encode_points(points)[0]
     decode_points(data, 100_000)

@@ -14,15 +14,15 @@ from hyrfpack.quant.rans import MAX_LANES, decode_tokens, encode_tokens
 from hyrfpack.quant.rans_lanes import LaneLayout
 from hyrfpack.quant.rans_models import LEVEL_WEIGHTS, MAX_LEVEL, adaptive_frequencies, normalise
 
-IMPLEMENTATIONS = ["numpy", pytest.param("cpu", marks=pytest.mark.skipif(not has_numba(), reason="no numba"))]
-STATIC, ADAPTIVE, ALONE = "static", "adaptive", "one token a context"
+CODER_IMPLEMENTATIONS = ["numpy", pytest.param("cpu", marks=pytest.mark.skipif(not has_numba(), reason="no numba"))]
+STATIC_MODELS, ADAPTIVE_MODELS, SINGLE_TOKEN_MODELS = "static", "adaptive", "one token a context"
 
 _rng = np.random.default_rng(0)
 _uneven = (_rng.random(40_000) ** 3 * 30).astype(np.uint8)
 
 
-def following(count: int) -> np.ndarray:
-    """Tokens that are large after large ones."""
+def correlated_tokens(count: int) -> np.ndarray:
+    """Return tokens whose scale changes slowly, so that large tokens follow large ones."""
     rng, scale = np.random.default_rng(count), np.repeat(np.geomspace(0.2, 8, 20), -(-count // 20))[:count]
     return np.minimum(np.rint(np.abs(rng.laplace(scale=scale))), 60).astype(np.uint8)
 
@@ -42,25 +42,25 @@ HARD_CASES = {
     "more contexts than tokens": (laplace_tokens(200, np.geomspace(0.3, 40, 256))),
     "unused contexts": (_uneven % 3, np.where(_uneven % 2, 250, 7).astype(np.uint8)),
     "many tokens, static": (laplace_tokens(400_000, [0.3, 40])),
-    "classes": (following(50_000), None),
-    "classes and contexts": (following(50_000), (np.arange(50_000) // 25_000).astype(np.uint8)),
+    "classes": (correlated_tokens(50_000), None),
+    "classes and contexts": (correlated_tokens(50_000), (np.arange(50_000) // 25_000).astype(np.uint8)),
     "last lane of one token": (laplace_tokens(8 * 4000 + 1, [4.0])),
 }
 
 
-def kind_of(data: bytes) -> str:
-    return ALONE if data[1] == 0 else STATIC if data[0] & 128 else ADAPTIVE
+def model_kind(data: bytes) -> str:
+    return SINGLE_TOKEN_MODELS if data[1] == 0 else STATIC_MODELS if data[0] & 128 else ADAPTIVE_MODELS
 
 
 def adaptive_bits(tokens: np.ndarray, contexts: np.ndarray) -> float:
-    """Bits of the ideal adaptive code: each context learns alone, each token begins with a count of 1/2."""
+    """Return the bits of the ideal adaptive code: a model for each context, whose counts all start at 1/2."""
     size = int(tokens.max()) + 1
     counts = np.bincount(contexts.astype(np.int64) * size + tokens, minlength=size * 256).reshape(256, size)
     logs = (gammaln(counts + 0.5) - gammaln(0.5)).sum(1) - gammaln(counts.sum(1) + size / 2) + gammaln(size / 2)
     return float(-logs.sum() / np.log(2))
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", CODER_IMPLEMENTATIONS)
 @pytest.mark.parametrize("name", HARD_CASES)
 def test_tokens_round_trip(name: str, implementation: str) -> None:
     tokens, contexts = HARD_CASES[name]
@@ -75,12 +75,12 @@ def test_tokens_round_trip(name: str, implementation: str) -> None:
 
 @pytest.mark.skipif(not has_numba(), reason="no numba")
 @pytest.mark.parametrize("name", HARD_CASES)
-def test_numpy_and_numba_write_the_same_bytes(name: str) -> None:
+def test_numpy_and_numba_encode_tokens_to_the_same_bytes(name: str) -> None:
     assert encode_tokens(*HARD_CASES[name], "numpy") == encode_tokens(*HARD_CASES[name], "cpu")
 
 
 @pytest.mark.parametrize("name", [name for name, (tokens, _) in HARD_CASES.items() if len(tokens) <= 50_000])
-def test_a_decoder_written_from_the_specification_agrees(name: str) -> None:
+def test_a_decoder_written_from_the_specification_decodes_the_same_tokens(name: str) -> None:
     tokens, contexts = HARD_CASES[name]
 
     data = encode_tokens(tokens, contexts)
@@ -92,15 +92,15 @@ def test_a_decoder_written_from_the_specification_agrees(name: str) -> None:
 def test_cases_cover_all_kinds_of_models() -> None:
     streams = {name: encode_tokens(*case) for name, case in HARD_CASES.items()}
 
-    assert {kind_of(data) for data in streams.values()} == {STATIC, ADAPTIVE, ALONE}
+    assert {model_kind(data) for data in streams.values()} == {STATIC_MODELS, ADAPTIVE_MODELS, SINGLE_TOKEN_MODELS}
     assert all(streams[name][0] >> 4 & 7 for name in ("classes", "classes and contexts"))
-    assert kind_of(streams["many tokens, static"]) == STATIC
+    assert model_kind(streams["many tokens, static"]) == STATIC_MODELS
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", CODER_IMPLEMENTATIONS)
 @pytest.mark.parametrize("lanes_log2", range(14))
 def test_any_number_of_lanes_decodes(lanes_log2: int, implementation: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    tokens = following(777)
+    tokens = correlated_tokens(777)
     contexts = (np.arange(777) % 3).astype(np.uint8)
     monkeypatch.setattr(rans, "_choose_lanes_log2", lambda count, bits: lanes_log2)
 
@@ -111,7 +111,7 @@ def test_any_number_of_lanes_decodes(lanes_log2: int, implementation: str, monke
     np.testing.assert_array_equal(decode_tokens(data, 777, contexts, implementation).tokens, tokens)
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", CODER_IMPLEMENTATIONS)
 @given(data=st.data())
 @settings(max_examples=150, deadline=None)
 def test_any_tokens_round_trip(implementation: str, data: st.DataObject) -> None:
@@ -137,7 +137,9 @@ def test_any_tokens_round_trip(implementation: str, data: st.DataObject) -> None
         (1_000_000, [0.3, 1, 3, 10, 40], 0.003),
     ],
 )
-def test_streams_are_hardly_longer_than_the_ideal_adaptive_code(count: int, scales: list, excess: float) -> None:
+def test_streams_are_at_most_slightly_longer_than_the_ideal_adaptive_code(
+    count: int, scales: list, excess: float
+) -> None:
     tokens, contexts = laplace_tokens(count, scales)
 
     data = encode_tokens(tokens, contexts)
@@ -145,21 +147,21 @@ def test_streams_are_hardly_longer_than_the_ideal_adaptive_code(count: int, scal
     assert 8 * len(data) <= (1 + excess) * adaptive_bits(tokens, contexts)
 
 
-def test_few_symbols_and_many_contexts_learn_from_each_other() -> None:
+def test_contexts_with_few_symbols_share_statistics() -> None:
     tokens, contexts = laplace_tokens(3000, np.geomspace(0.3, 40, 30))
 
     assert 8 * len(encode_tokens(tokens, contexts)) < adaptive_bits(tokens, contexts)
 
 
-def test_small_streams_have_small_heads() -> None:
+def test_small_streams_have_at_most_10_bytes_of_header() -> None:
     tokens = np.random.default_rng(0).integers(0, 4, 100).astype(np.uint8)
 
     assert encode_tokens(np.zeros(0, np.uint8)) == b""
     assert len(encode_tokens(np.full(10**6, 9, np.uint8))) == 3
-    assert len(encode_tokens(tokens)) <= 25 + 10  # 2 bits each, and 10 bytes
+    assert len(encode_tokens(tokens)) <= 25 + 10  # 2 bits for each token, and 10 bytes of header
 
 
-def test_a_token_that_says_the_next_is_worth_classes() -> None:
+def test_correlated_tokens_are_coded_with_classes_of_the_previous_token() -> None:
     tokens = np.cumsum(np.random.default_rng(0).random(20_000) < 0.05).astype(np.uint8) % 2
 
     data = encode_tokens(tokens)
@@ -170,7 +172,7 @@ def test_a_token_that_says_the_next_is_worth_classes() -> None:
 
 @given(st.data())
 @settings(max_examples=200, deadline=None)
-def test_frequencies_add_up_and_leave_no_token_out(data: st.DataObject) -> None:
+def test_normalised_frequencies_add_up_and_keep_every_nonzero_weight(data: st.DataObject) -> None:
     size = data.draw(st.integers(1, 127))
     weight = st.one_of(st.just(0), st.integers(1, 50), st.integers(0, 2**50))
     weights = np.array([data.draw(st.lists(weight, min_size=size, max_size=size))])
@@ -183,27 +185,27 @@ def test_frequencies_add_up_and_leave_no_token_out(data: st.DataObject) -> None:
 
 
 @pytest.mark.parametrize("raised", range(127))
-def test_the_largest_frequency_pays_for_the_raised_ones(raised: int) -> None:
+def test_normalise_gives_every_rare_token_a_frequency(raised: int) -> None:
     weights = np.array([[1] * raised + [2**40] * (127 - raised)])
 
     assert normalise(weights).min() >= 1
     assert normalise(weights).sum() == 4096
 
 
-def test_adaptive_frequencies_begin_equal_and_take_counts_up_to_their_bound() -> None:
+def test_adaptive_frequencies_start_equal_and_accept_counts_up_to_their_bound() -> None:
     assert set(adaptive_frequencies(np.zeros((3, 64), np.int64)).ravel()) == {64}
     full = adaptive_frequencies(np.array([[2**33, 0], [0, 2**33]]))
     assert full.tolist() == [[4095, 1], [1, 4095]]
 
 
-def test_levels_are_four_to_the_octave() -> None:
+def test_level_weights_have_four_levels_per_octave() -> None:
     assert len(LEVEL_WEIGHTS) == MAX_LEVEL + 1
     assert LEVEL_WEIGHTS[0] == 0
     assert (LEVEL_WEIGHTS[5:] == 2 * LEVEL_WEIGHTS[1:-4]).all()
     assert LEVEL_WEIGHTS[MAX_LEVEL] == 4 * 4096
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", CODER_IMPLEMENTATIONS)
 @pytest.mark.parametrize(
     "name", ["one token", "contexts", "classes", "one token a context", "many contexts, few tokens"]
 )
@@ -216,16 +218,18 @@ def test_truncation_is_refused(name: str, implementation: str) -> None:
             decode_tokens(data[:length], len(tokens), contexts, implementation)
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", CODER_IMPLEMENTATIONS)
 @pytest.mark.parametrize(
     "name", ["contexts", "classes", "many contexts, few tokens", "many tokens, static", "constant"]
 )
 @given(data=st.data())
 @settings(max_examples=15, deadline=None)
-def test_damage_is_refused_or_yields_as_many_tokens(name: str, implementation: str, data: st.DataObject) -> None:
+def test_damaged_stream_is_refused_or_decodes_to_the_requested_count(
+    name: str, implementation: str, data: st.DataObject
+) -> None:
     tokens, contexts = HARD_CASES[name]
     tokens, contexts = tokens[:20_000], contexts if contexts is None else contexts[:20_000]
-    damaged = bytearray(STREAMS.setdefault(name, encode_tokens(tokens, contexts)))
+    damaged = bytearray(STREAM_BY_CASE.setdefault(name, encode_tokens(tokens, contexts)))
     for _ in range(data.draw(st.integers(1, 4))):
         place = data.draw(st.integers(0, len(damaged) - 1) | st.integers(0, min(40, len(damaged) - 1)))
         damaged[place] ^= data.draw(st.integers(1, 255))
@@ -239,13 +243,15 @@ def test_damage_is_refused_or_yields_as_many_tokens(name: str, implementation: s
     assert size <= len(damaged)
 
 
-STREAMS: dict[str, bytes] = {}
+STREAM_BY_CASE: dict[str, bytes] = {}
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", CODER_IMPLEMENTATIONS)
 @given(data=st.binary(max_size=100), count=st.integers(0, 3000))
 @settings(max_examples=200, deadline=None)
-def test_random_bytes_are_refused_or_yield_as_many_tokens(data: bytes, count: int, implementation: str) -> None:
+def test_random_bytes_are_refused_or_decode_to_the_requested_count(
+    data: bytes, count: int, implementation: str
+) -> None:
     try:
         decoded = decode_tokens(data, count, None, implementation)
     except DamagedDataError:
@@ -261,26 +267,26 @@ def test_random_bytes_are_refused_or_yield_as_many_tokens(data: bytes, count: in
         (b"\0\x7f" + bytes(64), "impossible values"),  # an alphabet of 127
         (b"\x10\x05\0" + bytes(64), "do not rise"),  # a threshold of 0
         (b"\x20\x05\x03\x03" + bytes(64), "do not rise"),
-        (b"\x10\x05\x05" + bytes(64), "do not rise"),  # a threshold no token reaches
+        (b"\x10\x05\x05" + bytes(64), "do not rise"),  # a threshold that no token reaches
         (b"\x01\0\x05", "missing or damaged"),  # lanes where there are none
         (b"\0\0\x7e", "missing or damaged"),  # token 126
         (b"\0\0", "missing or damaged"),
         (b"\x03\x02" + bytes(31), "lanes need"),
         (b"\0\x02" + bytes(4), "truncated"),  # a state of 0 needs words
         (b"\0\x02" + b"\xff" * 4 + bytes(400), "does not fit"),
-        (b"\x80\x02\x80\x02" + bytes(64), "impossible values"),  # static models of levels
+        (b"\x80\x02\x80\x02" + bytes(64), "impossible values"),  # static models that code the levels of static models
         (b"\x80\x02\0\0\0" + bytes(64), "no valid frequencies"),  # levels of 0
         (b"\x80\x02\0\0\1" + bytes(64), "no valid frequencies"),  # levels of -1
         (b"\x80\x02\0\0\x34" + bytes(64), "no valid frequencies"),  # levels of 26 and 52
     ],
 )
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", CODER_IMPLEMENTATIONS)
 def test_forged_streams_are_refused(data: bytes, claim: str, implementation: str) -> None:
     with pytest.raises(DamagedDataError, match=claim):
         decode_tokens(data, 1000, None, implementation)
 
 
-def test_more_models_than_the_bound_are_refused() -> None:
+def test_more_models_than_the_limit_are_refused() -> None:
     contexts = np.arange(256).astype(np.uint8)
 
     with pytest.raises(DamagedDataError, match="impossible values"):
@@ -288,12 +294,12 @@ def test_more_models_than_the_bound_are_refused() -> None:
 
 
 @pytest.mark.parametrize("lanes_log2", range(13))
-def test_few_lanes_for_a_huge_count_are_refused_before_anything_is_allocated(lanes_log2: int) -> None:
+def test_too_few_lanes_for_a_huge_count_are_refused_before_any_allocation(lanes_log2: int) -> None:
     with pytest.raises(DamagedDataError, match="too few lanes"):
         decode_tokens(bytes((lanes_log2, 2)) + bytes(5 * MAX_LANES), 2**60)
 
 
-def test_missing_states_for_a_huge_count_are_refused_before_anything_is_allocated() -> None:
+def test_missing_states_for_a_huge_count_are_refused_before_any_allocation() -> None:
     with pytest.raises(DamagedDataError, match="lanes need"):
         decode_tokens(b"\x0d\x02" + bytes(1000), 2**60)
 
@@ -308,12 +314,14 @@ def test_missing_states_for_a_huge_count_are_refused_before_anything_is_allocate
         (np.zeros(3, np.uint8), np.zeros(3, np.int32), "contexts"),
     ],
 )
-def test_encode_refuses_other_arrays(tokens: np.ndarray, contexts: np.ndarray | None, claim: str) -> None:
+def test_encode_refuses_other_dtypes_shapes_and_tokens(
+    tokens: np.ndarray, contexts: np.ndarray | None, claim: str
+) -> None:
     with pytest.raises(ValueError, match=claim):
         encode_tokens(tokens, contexts)
 
 
-def test_wrong_arguments_are_named() -> None:
+def test_invalid_implementation_and_count_are_refused() -> None:
     with pytest.raises(ValueError, match="auto, numpy, cpu"):
         encode_tokens(np.zeros(3, np.uint8), implementation="gpu")
     with pytest.raises(ValueError, match="0 or more"):

@@ -11,15 +11,15 @@ from hyrfpack.quant import ResidualVectorQuantizer
 from hyrfpack.quant.errors import DamagedDataError
 
 
-def attributes(count: int, seed: int = 0) -> np.ndarray:
-    """Rows like a scene's: five correlated columns of very different scale and offset."""
+def correlated_attributes(count: int, seed: int = 0) -> np.ndarray:
+    """Return rows like those of a scene: five correlated columns with very different scales and offsets."""
     rng = np.random.default_rng(seed)
     mixed = rng.standard_normal((count, 5)) @ rng.standard_normal((5, 5)) + rng.laplace(size=(count, 5))
     return (mixed * [1, 30, 0.01, 1, 5] + [0, 1000, 0, -3, 2]).astype(np.float32)
 
 
-def standard_errors(values: np.ndarray, indices: np.ndarray, codebooks: np.ndarray) -> list[float]:
-    """Mean squared error, in standard deviations of each column, after 0, 1, ... S stages."""
+def mse_after_each_stage(values: np.ndarray, indices: np.ndarray, codebooks: np.ndarray) -> list[float]:
+    """Return the mean squared error after 0, 1, ... S stages, in units of each column's standard deviation."""
     errors = []
     for stages in range(codebooks.shape[0] + 1):
         decoded = ResidualVectorQuantizer.decode(indices[:, :stages], codebooks[:stages])
@@ -29,9 +29,9 @@ def standard_errors(values: np.ndarray, indices: np.ndarray, codebooks: np.ndarr
 
 @pytest.mark.parametrize("codebook_dtype", ["float32", "float16"])
 def test_error_falls_with_every_stage(codebook_dtype: str) -> None:
-    values = attributes(5000)
+    values = correlated_attributes(5000)
 
-    errors = standard_errors(values, *ResidualVectorQuantizer(5, 32, codebook_dtype).encode(values))
+    errors = mse_after_each_stage(values, *ResidualVectorQuantizer(5, 32, codebook_dtype).encode(values))
 
     assert all(after < 0.8 * before for before, after in zip(errors, errors[1:], strict=False))
 
@@ -58,8 +58,8 @@ def test_error_never_grows_with_a_stage(values: np.ndarray, size: int, codebook_
         previous = error
 
 
-def test_every_row_gets_its_nearest_codeword() -> None:
-    values = attributes(3000)
+def test_every_row_takes_its_nearest_codeword() -> None:
+    values = correlated_attributes(3000)
 
     indices, codebooks = ResidualVectorQuantizer(2, 16).encode(values)
 
@@ -82,7 +82,7 @@ def test_one_stage_is_as_good_as_scipys_kmeans() -> None:
     assert ours <= 1.02 * ((values - centers[labels]) ** 2).mean()
 
 
-def test_columns_of_any_scale_lose_alike() -> None:
+def test_columns_of_any_scale_have_similar_relative_error() -> None:
     values = np.random.default_rng(4).standard_normal((5000, 3)).astype(np.float32) * np.float32([1e-6, 1, 1e6])
 
     decoded = ResidualVectorQuantizer.decode(*ResidualVectorQuantizer(4, 64).encode(values))
@@ -91,12 +91,12 @@ def test_columns_of_any_scale_lose_alike() -> None:
     assert relative.max() < 1.3 * relative.min()
 
 
-def test_rows_beyond_the_training_sample_are_coded_as_well() -> None:
-    values = attributes(150_000)
+def test_rows_outside_the_training_sample_have_similar_error() -> None:
+    values = correlated_attributes(150_000)
 
-    errors = standard_errors(values, *ResidualVectorQuantizer(2, 16, iterations=3).encode(values))
+    errors = mse_after_each_stage(values, *ResidualVectorQuantizer(2, 16, iterations=3).encode(values))
 
-    few = standard_errors(values[:20_000], *ResidualVectorQuantizer(2, 16, iterations=3).encode(values[:20_000]))
+    few = mse_after_each_stage(values[:20_000], *ResidualVectorQuantizer(2, 16, iterations=3).encode(values[:20_000]))
     assert errors[2] < 1.05 * few[2]
 
 
@@ -110,7 +110,7 @@ def test_codebook_larger_than_the_data_is_exact(rows: int) -> None:
     np.testing.assert_allclose(ResidualVectorQuantizer.decode(indices, codebooks), values, rtol=1e-6, atol=1e-7)
 
 
-def test_no_rows() -> None:
+def test_zero_rows_round_trip() -> None:
     indices, codebooks = ResidualVectorQuantizer(3, 8).encode(np.zeros((0, 5), np.float32))
 
     assert indices.shape == (0, 3)
@@ -118,7 +118,7 @@ def test_no_rows() -> None:
     assert ResidualVectorQuantizer.decode(indices, codebooks).shape == (0, 5)
 
 
-def test_all_rows_the_same_are_exact() -> None:
+def test_identical_rows_are_exact() -> None:
     values = np.tile(np.float32([0.1, -7, 1e6, 0]), (1000, 1))
 
     decoded = ResidualVectorQuantizer.decode(*ResidualVectorQuantizer(2, 64).encode(values))
@@ -127,7 +127,7 @@ def test_all_rows_the_same_are_exact() -> None:
 
 
 @pytest.mark.parametrize("codebook_dtype", ["float32", "float16"])
-def test_constant_channel_is_kept_and_costs_the_others_nothing(codebook_dtype: str) -> None:
+def test_constant_channel_is_exact_and_does_not_affect_the_others(codebook_dtype: str) -> None:
     values = np.random.default_rng(5).standard_normal((4000, 2)).astype(np.float32)
     with_constant = np.insert(values, 1, np.float32(1234.567), axis=1)
     quantizer = ResidualVectorQuantizer(3, 32, codebook_dtype)
@@ -139,16 +139,16 @@ def test_constant_channel_is_kept_and_costs_the_others_nothing(codebook_dtype: s
     assert (beside[:, [0, 2]] ** 2).mean() < 1.05 * (alone**2).mean()
 
 
-def test_heavy_tails_do_not_take_the_bulk_with_them() -> None:
+def test_heavy_tails_keep_the_relative_error_below_a_thousandth() -> None:
     values = np.random.default_rng(6).standard_cauchy((20_000, 5)).astype(np.float32)
 
-    errors = standard_errors(values, *ResidualVectorQuantizer(6, 64).encode(values))
+    errors = mse_after_each_stage(values, *ResidualVectorQuantizer(6, 64).encode(values))
 
     assert np.isfinite(errors).all()
     assert errors[6] < 1e-3 * errors[0]
 
 
-def test_values_at_the_rim_of_float16_stay_finite() -> None:
+def test_largest_float16_values_stay_finite() -> None:
     values = np.full((1000, 2), 65504, np.float32)
     values[::100] = -65504
     values[:500, 1] = 1
@@ -158,15 +158,15 @@ def test_values_at_the_rim_of_float16_stay_finite() -> None:
     assert np.isfinite(decoded).all()
 
 
-def test_float16_codebooks_hold_only_float16_numbers() -> None:
-    _, codebooks = ResidualVectorQuantizer(3, 16, "float16").encode(attributes(2000))
+def test_float16_codebooks_hold_only_float16_values() -> None:
+    _, codebooks = ResidualVectorQuantizer(3, 16, "float16").encode(correlated_attributes(2000))
 
     assert codebooks.dtype == np.float32
     np.testing.assert_array_equal(codebooks.astype(np.float16).astype(np.float32), codebooks)
 
 
-def test_same_seed_same_result() -> None:
-    values = attributes(4000)
+def test_the_same_seed_gives_the_same_result() -> None:
+    values = correlated_attributes(4000)
 
     first = ResidualVectorQuantizer(2, 32, seed=3).encode(values)
     second = ResidualVectorQuantizer(2, 32, seed=3).encode(values)
@@ -176,8 +176,8 @@ def test_same_seed_same_result() -> None:
 
 
 @pytest.mark.parametrize(("size", "dtype"), [(256, np.uint8), (257, np.uint16)])
-def test_indices_are_as_narrow_as_they_can_be(size: int, dtype: type) -> None:
-    indices, _ = ResidualVectorQuantizer(1, size).encode(attributes(600))
+def test_index_dtype_is_the_narrowest_that_holds_the_codebook(size: int, dtype: type) -> None:
+    indices, _ = ResidualVectorQuantizer(1, size).encode(correlated_attributes(600))
 
     assert indices.dtype == dtype
     assert len(np.unique(indices)) == size
@@ -198,7 +198,7 @@ def test_values_that_cannot_be_stored_are_refused(bad: float, codebook_dtype: st
     "settings_",
     [{"stages": 0}, {"codebook_size": 0}, {"codebook_size": 65537}, {"iterations": -1}, {"codebook_dtype": "int8"}],
 )
-def test_impossible_settings_are_rejected(settings_: dict) -> None:
+def test_impossible_settings_are_refused(settings_: dict) -> None:
     with pytest.raises(ValueError, match="codebook_dtype|needs"):
         ResidualVectorQuantizer(**settings_)
 
@@ -208,6 +208,6 @@ def test_decoding_refuses_indices_outside_the_codebook() -> None:
         ResidualVectorQuantizer.decode(np.array([[0, 4]], np.uint8), np.zeros((2, 4, 3), np.float32))
 
 
-def test_decoding_refuses_stages_that_disagree() -> None:
+def test_decoding_refuses_different_numbers_of_stages() -> None:
     with pytest.raises(DamagedDataError, match="disagree"):
         ResidualVectorQuantizer.decode(np.zeros((5, 3), np.uint8), np.zeros((2, 4, 3), np.float32))

@@ -9,22 +9,22 @@ from hypothesis import strategies as st
 
 from hyrfpack.quant.steps import ALL_ZERO_CODE, FIXED_POINT_ONE, decode_step, encode_step
 
-CODES = range(1, 256)
+STEP_CODES = range(1, 256)
 
 
-def step_by_the_book(code: int) -> int:
+def step_by_definition(code: int) -> int:
     return (8 + code % 8) * 2 ** (code // 8)
 
 
-def test_steps_are_the_formula_exactly_and_rise() -> None:
+def test_steps_equal_the_formula_and_increase() -> None:
     steps = decode_step(np.arange(1, 256, dtype=np.uint8))
 
     assert steps.dtype == np.int64
-    assert steps.tolist() == [step_by_the_book(code) for code in CODES]
+    assert steps.tolist() == [step_by_definition(code) for code in STEP_CODES]
     assert (np.diff(steps) > 0).all()
 
 
-def test_steps_reach_as_far_and_lie_as_close_as_promised() -> None:
+def test_steps_have_the_documented_range_and_ratios() -> None:
     steps = decode_step(np.arange(1, 256)) / FIXED_POINT_ONE
 
     assert steps[0] == pytest.approx(5.4e-7, rel=0.01)
@@ -33,31 +33,31 @@ def test_steps_reach_as_far_and_lie_as_close_as_promised() -> None:
     assert ratios.min() == pytest.approx(1 / 15) and ratios.max() == pytest.approx(1 / 8)
 
 
-def test_every_code_comes_back_from_its_step() -> None:
-    assert encode_step(decode_step(np.arange(1, 256)) / FIXED_POINT_ONE).tolist() == list(CODES)
-    assert [int(encode_step(float(decode_step(code)) / FIXED_POINT_ONE)) for code in CODES] == list(CODES)
+def test_every_code_round_trips_through_its_step() -> None:
+    assert encode_step(decode_step(np.arange(1, 256)) / FIXED_POINT_ONE).tolist() == list(STEP_CODES)
+    assert [int(encode_step(float(decode_step(code)) / FIXED_POINT_ONE)) for code in STEP_CODES] == list(STEP_CODES)
 
 
 @given(st.floats(1e-300, 1e300) | st.floats(math.log(1e-8), math.log(1e5)).map(math.exp))
 @settings(max_examples=200, deadline=None)
-def test_the_code_is_that_of_the_nearest_step_in_ratio(step: float) -> None:
+def test_encode_step_chooses_the_nearest_step_by_ratio(step: float) -> None:
     def distance(code: int) -> float:
-        return abs(math.log(step_by_the_book(code) / 2**24) - math.log(step))
+        return abs(math.log(step_by_definition(code) / 2**24) - math.log(step))
 
     code = encode_step(step)
 
     assert code.dtype == np.uint8
-    assert distance(int(code)) <= min(map(distance, CODES)) + 1e-9
+    assert distance(int(code)) <= min(map(distance, STEP_CODES)) + 1e-9
 
 
 @pytest.mark.parametrize(("step", "code"), [(0.0, 1), (1e-300, 1), (1e300, 255), (np.inf, 255)])
-def test_steps_out_of_reach_get_the_last_code_on_their_side(step: float, code: int) -> None:
+def test_steps_out_of_range_get_the_first_or_last_code(step: float, code: int) -> None:
     assert int(encode_step(step)) == code
 
 
 @given(st.lists(st.floats(0, 1e6), max_size=50))
 @settings(max_examples=50, deadline=None)
-def test_no_step_gets_the_code_for_nothing_stored(steps: list[float]) -> None:
+def test_no_step_gets_the_code_for_all_zero(steps: list[float]) -> None:
     codes = encode_step(np.array(steps))
 
     assert codes.shape == (len(steps),)

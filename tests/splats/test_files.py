@@ -1,4 +1,4 @@
-"""Which format a file is of is read off its ending, and what is written can be read."""
+"""The suffix of a file selects its format, and written files can be read again."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from hyrfpack.splats.files import MAX_FILE_BYTES, READABLE_ENDINGS, encode_splat
 from hyrfpack.splats.splats import Splats, normalized_quats
 from hyrfpack.splats.table import FORMATS
 
-UP = np.array([0.0, -1.0, 0.0])
-PLACES = {  # centre and unit of a scene
+UP_DIRECTION = np.array([0.0, -1.0, 0.0])
+SCENE_CENTER_AND_UNIT = {
     "about the origin": ((0, 0, 0), 1),
     "tiny": ((0, 0, 0), 1e-3),
     "huge": ((0, 0, 0), 1e3),
@@ -23,7 +23,7 @@ PLACES = {  # centre and unit of a scene
 }
 
 
-def cloud(count: int = 50, center=(0, 0, 0), unit: float = 1.0) -> Splats:
+def random_splats(count: int = 50, center=(0, 0, 0), unit: float = 1.0) -> Splats:
     generator = np.random.default_rng(0)
     return Splats(
         generator.uniform(-1, 1, (count, 3)) * unit + center,
@@ -34,43 +34,43 @@ def cloud(count: int = 50, center=(0, 0, 0), unit: float = 1.0) -> Splats:
     )
 
 
-def encoded(splats: Splats, extension: str) -> bytes:
-    return encode_splats(splats, extension, up=UP, camera=ring(1)[0])
+def encode_with_camera(splats: Splats, extension: str) -> bytes:
+    return encode_splats(splats, extension, up=UP_DIRECTION, camera=ring(1)[0])
 
 
-@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("place", SCENE_CENTER_AND_UNIT)
 @pytest.mark.parametrize("extension", FORMATS)
-def test_every_format_brings_as_many_gaussians_back_to_the_same_place(extension, place):
-    splats = cloud(50, *PLACES[place])
+def test_every_format_preserves_count_and_positions(extension, place):
+    splats = random_splats(50, *SCENE_CENTER_AND_UNIT[place])
     if extension == ".spz" and place == "map coordinates":
         with pytest.raises(HyrfDataError, match=r"5,4\d\d,\d\d\d units from the origin, and SPZ reaches [^\n]*$"):
-            encoded(splats, extension)
+            encode_with_camera(splats, extension)
         return
-    back = FORMATS[extension].decode(encoded(splats, extension), "it")
+    back = FORMATS[extension].decode(encode_with_camera(splats, extension), "it")
     apart = np.linalg.norm(back.positions[:, None] - splats.positions, axis=-1)
-    assert sorted(apart.argmin(0)) == list(range(50))  # formats may change the order
-    unit = PLACES[place][1]
+    assert sorted(apart.argmin(0)) == list(range(50))  # formats may reorder Gaussians
+    unit = SCENE_CENTER_AND_UNIT[place][1]
     assert apart.min(0).max() < 2e-4 * unit + 2e-7 * np.abs(splats.positions).max()
     assert back.degree == (0 if extension == ".splat" else 3)
 
 
 @pytest.mark.parametrize("extension", READABLE_ENDINGS)
-def test_files_are_read_by_their_ending_in_any_case(extension, tmp_path):
+def test_files_are_read_by_suffix_in_any_case(extension, tmp_path):
     path = tmp_path / f"SCENE{extension.upper()}"
-    path.write_bytes(encoded(cloud(), extension))
+    path.write_bytes(encode_with_camera(random_splats(), extension))
     assert len(read_splats(path)) == 50
     assert len(read_splats(str(path))) == 50
 
 
 @pytest.mark.parametrize("extension", READABLE_ENDINGS)
-def test_damaged_files_are_one_sentence_that_names_them(extension, tmp_path):
+def test_the_error_for_a_damaged_file_contains_its_name(extension, tmp_path):
     path = tmp_path / f"broken{extension}"
-    path.write_bytes(encoded(cloud(), extension)[:-7])
+    path.write_bytes(encode_with_camera(random_splats(), extension)[:-7])
     with pytest.raises(HyrfDataError, match=rf"broken{extension}\b[^\n]*$"):
         read_splats(path)
 
 
-def test_no_file_and_unknown_endings_and_folders_are_one_sentence(tmp_path):
+def test_missing_files_unknown_suffixes_and_folders_are_refused(tmp_path):
     (tmp_path / "scene.obj").write_bytes(b"v 0 0 0")
     (tmp_path / "empty").mkdir()
     (tmp_path / "folder.ply").mkdir()
@@ -80,16 +80,16 @@ def test_no_file_and_unknown_endings_and_folders_are_one_sentence(tmp_path):
         assert str(tmp_path) in str(refusal.value) and "\n" not in str(refusal.value)
 
 
-def test_a_file_too_large_to_be_splats_is_refused_unread(tmp_path):
+def test_a_file_above_the_size_limit_is_refused_before_it_is_read(tmp_path):
     path = tmp_path / "large.ply"
     path.touch()
-    os.truncate(path, MAX_FILE_BYTES + 1)  # a hole, not bytes
+    os.truncate(path, MAX_FILE_BYTES + 1)  # a sparse file, which takes no space
     with pytest.raises(HyrfDataError, match="is larger than 4,294,967,296 bytes; split it first$"):
         read_splats(path)
 
 
 @pytest.mark.parametrize(
-    "holds, told",
+    "holds, message_part",
     [
         ((), "this one holds nothing; name another"),
         (("b.webp", "a.webp"), "this one holds a.webp, b.webp; name another"),
@@ -97,17 +97,17 @@ def test_a_file_too_large_to_be_splats_is_refused_unread(tmp_path):
         (tuple(f"{n}.webp" for n in range(9)), "holds 0.webp, 1.webp, 2.webp, 3.webp and 5 more; name another"),
     ],
 )
-def test_a_folder_without_a_sog_is_told_by_what_it_holds(holds, told, tmp_path):
+def test_the_error_for_a_folder_without_a_sog_lists_its_files(holds, message_part, tmp_path):
     for name in holds:
         (tmp_path / name).write_bytes(b"")
     for source in (tmp_path, tmp_path / "meta.json"):
         with pytest.raises(HyrfDataError) as refusal:
             read_splats(source)
         assert "a folder is read as a loose SOG, meta.json with its pictures" in str(refusal.value)
-        assert told in str(refusal.value)
+        assert message_part in str(refusal.value)
 
 
 @pytest.mark.parametrize("name", ["none.ply", "none.txt", "none", "none/meta.json"])
-def test_a_file_that_is_not_there_is_told_so_whatever_its_ending(name, tmp_path):
+def test_a_missing_file_is_reported_for_any_suffix(name, tmp_path):
     with pytest.raises(HyrfDataError, match="none.*: the file cannot be read"):
         read_splats(tmp_path / name)

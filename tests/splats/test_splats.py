@@ -10,7 +10,7 @@ from hyrfpack.scene import Camera
 from hyrfpack.splats.draw import Drawable, draw
 from hyrfpack.splats.splats import Splats, concatenate, normalized_quats, quaternion_from_matrix
 
-UNIT = Frame((0.0, 0.0, 0.0), 1.0, (1.0, 1.0, 1.0))
+UNIT_FRAME = Frame((0.0, 0.0, 0.0), 1.0, (1.0, 1.0, 1.0))
 
 
 def random_splats(count: int, degree: int = 3, seed: int = 0) -> Splats:
@@ -31,18 +31,18 @@ def random_splats(count: int, degree: int = 3, seed: int = 0) -> Splats:
         {"scales": -np.ones((3, 3))},
         {"opacities": np.full(3, 1.1)},
         {"positions": np.full((3, 3), np.nan)},
-        {"scales": np.full((3, 3), 1e39)},  # beyond float32
+        {"scales": np.full((3, 3), 1e39)},  # exceeds float32
         {"harmonics": np.zeros((3, 0, 3))},
         {"harmonics": np.zeros((3, 5, 3))},
         {"harmonics": np.zeros((3, 25, 3))},
     ],
 )
-def test_numbers_that_make_no_splats_are_refused(change):
+def test_invalid_values_and_shapes_are_refused(change):
     with pytest.raises(ValueError):
         replace(random_splats(3), **change)
 
 
-def test_types_become_those_of_files_and_positions_stay_double():
+def test_positions_are_float64_and_everything_else_float32():
     splats = random_splats(3)
     assert splats.positions.dtype == np.float64
     assert {splats.scales.dtype, splats.quats.dtype, splats.opacities.dtype, splats.harmonics.dtype} == {
@@ -50,7 +50,7 @@ def test_types_become_those_of_files_and_positions_stay_double():
     }
 
 
-def test_a_part_and_the_rest_concatenate_to_the_whole():
+def test_concatenate_joins_parts_of_different_degrees():
     splats = random_splats(5)
     low = splats[:2].with_degree(1)
     whole = concatenate((low, splats[np.arange(2, 5)]))
@@ -59,28 +59,28 @@ def test_a_part_and_the_rest_concatenate_to_the_whole():
     assert np.array_equal(whole.harmonics[:2, :4], splats.harmonics[:2, :4]) and not whole.harmonics[:2, 4:].any()
 
 
-def test_there_may_be_no_splats_at_all():
+def test_empty_splats_can_be_rotated():
     nothing = random_splats(4)[:0]
     assert len(nothing.rotated(np.diag([1.0, -1, -1]))) == 0 and nothing.degree == 3
 
 
 @pytest.mark.parametrize("turn", [*Rotation.random(8, rng=0).as_matrix(), np.eye(3), np.diag([-1.0, -1, 1])])
-def test_quaternions_of_rotations_are_scipys(turn):
+def test_quaternions_of_matrices_equal_those_of_scipy(turn):
     x, y, z, w = Rotation.from_matrix(turn).as_quat(canonical=True)
     assert np.allclose(quaternion_from_matrix(turn), (w, x, y, z), atol=1e-7)
 
 
-def test_quaternions_without_length_become_no_rotation():
+def test_zero_quaternions_become_the_identity():
     quats = normalized_quats([[0, 0, 0, 0], [-2, 0, 0, 0], [0, 0, 3, 4]])
     assert np.allclose(quats, [[1, 0, 0, 0], [1, 0, 0, 0], [0, 0, 0.6, 0.8]])
 
 
-def test_turned_splats_look_as_before_to_a_camera_that_turned_along():
+def test_rotating_splats_and_camera_together_changes_no_picture():
     splats, camera = random_splats(30), camera_at((0.3, -3.0, 0.7))
     turn = np.eye(4)
     turn[:3, :3] = Rotation.random(rng=3).as_matrix()
     sizes = camera.width, camera.height, *camera.intrinsics
     turned = Camera(*sizes, camera.camera_from_world @ turn.T)
-    before = draw(Drawable.from_splats(splats, UNIT), camera).rgb
-    after = draw(Drawable.from_splats(splats.rotated(turn[:3, :3]), UNIT), turned).rgb
+    before = draw(Drawable.from_splats(splats, UNIT_FRAME), camera).rgb
+    after = draw(Drawable.from_splats(splats.rotated(turn[:3, :3]), UNIT_FRAME), turned).rgb
     assert before.max() > 0.3 and (before - after).abs().max() < 1e-5

@@ -1,4 +1,4 @@
-"""The browsers that pages are looked at in."""
+"""Start the browsers in which pages are tested."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from web.pages import Browser
 
 from tools.browser import chromium, firefox
 
-WINDOW = (240, 180)
-BROWSERS = ["chromium", "firefox"]
+WINDOW_SIZE = (240, 180)
+BROWSER_NAMES = ["chromium", "firefox"]
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Tests of files that are marked `in_turn` run in one browser each, and in both with HYRFPACK_BROWSERS=all."""
+    """Deselect tests marked `in_turn` in all browsers but one each, except with HYRFPACK_BROWSERS=all."""
     if os.environ.get("HYRFPACK_BROWSERS") == "all" or None in (chromium.find(), firefox.find()):
         return
-    left = {item for item in items if _is_anothers_turn(item)}
+    left = {item for item in items if _is_turn_of_another_browser(item)}
     config.hook.pytest_deselected(items=list(left))
     items[:] = [item for item in items if item not in left]
 
 
-def _is_anothers_turn(item: pytest.Item) -> bool:
+def _is_turn_of_another_browser(item: pytest.Item) -> bool:
     if item.get_closest_marker("in_turn") is None or not isinstance(item, pytest.Function):
         return False
     given = item.callspec.params if hasattr(item, "callspec") else {}
@@ -33,12 +33,12 @@ def _is_anothers_turn(item: pytest.Item) -> bool:
         return False
     others = sorted(str(value) for name, value in given.items() if name != "browser")
     turn = zlib.crc32("".join([item.originalname, *others]).encode())
-    return BROWSERS[turn % len(BROWSERS)] != given["browser"]
+    return BROWSER_NAMES[turn % len(BROWSER_NAMES)] != given["browser"]
 
 
 @pytest.fixture(scope="session")
-def started(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[str], Browser]]:
-    """Gives a browser by its name, with a small window; it is started once and serves all tests."""
+def start_browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[str], Browser]]:
+    """Return a function that starts a browser by its name, once for all tests, and gives it a small window."""
     running: dict[str, Browser] = {}
 
     with ExitStack() as stack:
@@ -53,19 +53,19 @@ def started(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[str]
                     if firefox.find() is None:
                         pytest.skip("there is no Firefox here, or no Xvfb for it to draw on")
                     running[name] = stack.enter_context(firefox.Firefox(tmp_path_factory.mktemp("profile")))
-            running[name].resize(*WINDOW)
+            running[name].resize(*WINDOW_SIZE)
             return running[name]
 
         yield start
 
 
-@pytest.fixture(params=BROWSERS)
-def browser(request: pytest.FixtureRequest, started: Callable[[str], Browser]) -> Browser:
-    """A browser; each test runs in every one there is, but see the mark `in_turn`."""
-    return started(request.param)
+@pytest.fixture(params=BROWSER_NAMES)
+def browser(request: pytest.FixtureRequest, start_browser: Callable[[str], Browser]) -> Browser:
+    """Run the test in every installed browser, or in one of them if it is marked `in_turn`."""
+    return start_browser(request.param)
 
 
 @pytest.fixture
-def one_browser(started: Callable[[str], Browser]) -> Browser:
-    """Chromium alone, for what is slow or the same in all browsers."""
-    return started("chromium")
+def one_browser(start_browser: Callable[[str], Browser]) -> Browser:
+    """Return Chromium, for tests that are slow or do not depend on the browser."""
+    return start_browser("chromium")

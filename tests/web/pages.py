@@ -1,4 +1,4 @@
-"""Made-up scenes as pages, and what a browser shows of them."""
+"""Make pages of test scenes, open them in a browser and read what it shows."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from tools.browser.firefox import Firefox
 
 Browser = Chromium | Firefox
 
-UP, CENTER = np.array([0.0, -1.0, 0.0]), np.array([1000.0, -50.0, 20.0])
-FRAME = Frame(tuple(CENTER), 1.0, (1.0, 1.0, 1.0))
-NEAR = 0.01
-SOLID = (0.2, 0.3, 0.1)
+UP_DIRECTION, SCENE_CENTER = np.array([0.0, -1.0, 0.0]), np.array([1000.0, -50.0, 20.0])
+SCENE_FRAME = Frame(tuple(SCENE_CENTER), 1.0, (1.0, 1.0, 1.0))
+NEAR_PLANE = 0.01
+BACKGROUND_COLOR = (0.2, 0.3, 0.1)
 
 
-def cloud(count: int = 1500, degree: int = 3, seed: int = 1) -> Splats:
-    """Splats of all shapes around CENTER, far from the origin."""
+def random_splats(count: int = 1500, degree: int = 3, seed: int = 1) -> Splats:
+    """Return splats of all shapes around SCENE_CENTER, far from the origin."""
     rng = np.random.default_rng(seed)
     harmonics = rng.normal(size=(count, 16, 3)) * np.array([0.8] + [0.12] * 15)[:, None]
     return Splats(
-        CENTER + rng.normal(size=(count, 3)) * 0.5,
+        SCENE_CENTER + rng.normal(size=(count, 3)) * 0.5,
         np.exp(rng.normal(-3.3, 0.8, (count, 3))),
         normalized_quats(rng.normal(size=(count, 4))),
         rng.uniform(size=count),
@@ -40,13 +40,13 @@ def cloud(count: int = 1500, degree: int = 3, seed: int = 1) -> Splats:
     ).with_degree(degree)
 
 
-def camera(distance: float = 2.5, width: int = 120, height: int = 90) -> Camera:
-    pose = look_at(CENTER + distance * np.array([0.6, -0.3, -0.74]), CENTER, UP)
+def make_camera(distance: float = 2.5, width: int = 120, height: int = 90) -> Camera:
+    pose = look_at(SCENE_CENTER + distance * np.array([0.6, -0.3, -0.74]), SCENE_CENTER, UP_DIRECTION)
     return Camera(width, height, 110.0, 110.0, width / 2, height / 2, pose)
 
 
-def sky() -> np.ndarray:
-    """(64, 128, 3): smooth over the sphere, different in every direction."""
+def sky_panorama() -> np.ndarray:
+    """Return a panorama (64, 128, 3) that is smooth over the sphere and different in every direction."""
     latitude, longitude = np.meshgrid(
         np.pi / 2 - np.pi * (np.arange(64) + 0.5) / 64, 2 * np.pi * (np.arange(128) + 0.5) / 128 - np.pi, indexing="ij"
     )
@@ -54,24 +54,33 @@ def sky() -> np.ndarray:
     return 0.5 + 0.4 * np.stack((x, y, z), axis=-1)
 
 
-def page_of(splats: Splats, background: np.ndarray | None = None, title: str = "a scene", **more: object) -> bytes:
-    cameras = [camera(), camera(1.5), camera(4.0)]
-    settings = {"title": title, "cameras": cameras, "up": UP, "center": CENTER, "solid": SOLID, "near": NEAR}
+def make_splats_page(
+    splats: Splats, background: np.ndarray | None = None, title: str = "a scene", **more: object
+) -> bytes:
+    cameras = [make_camera(), make_camera(1.5), make_camera(4.0)]
+    settings = {
+        "title": title,
+        "cameras": cameras,
+        "up": UP_DIRECTION,
+        "center": SCENE_CENTER,
+        "solid": BACKGROUND_COLOR,
+        "near": NEAR_PLANE,
+    }
     return encode_splats_page(splats, background=background, **{**settings, **more})
 
 
-def opened(browser: Browser, tmp_path: Path, page: bytes, hash: str = "") -> Browser:
-    """The page in the browser, loaded and seen."""
+def open_page(browser: Browser, tmp_path: Path, page: bytes, hash: str = "") -> Browser:
+    """Open a page in the browser and wait until its scene is visible."""
     file = tmp_path / "page.html"
     file.write_bytes(page)
     browser.open(file.as_uri() + hash)
     browser.evaluate("hyrfpack.ready")
-    until(browser, "document.body.classList.contains('there')")
+    wait_until(browser, "document.body.classList.contains('there')")
     return browser
 
 
-def settled(browser: Browser) -> Browser:
-    """Once the window's picture has not changed for a while."""
+def wait_until_still(browser: Browser) -> Browser:
+    """Wait until the window's picture has not changed for half a second."""
     frames, since, ends = browser.evaluate("hyrfpack.frames()"), time.monotonic(), time.monotonic() + 15
     while time.monotonic() < min(since + 0.5, ends):
         time.sleep(0.05)
@@ -80,32 +89,34 @@ def settled(browser: Browser) -> Browser:
     return browser
 
 
-def json_of(camera: Camera) -> str:
+def camera_json(camera: Camera) -> str:
     fx, fy, cx, cy = camera.intrinsics
     size = {"width": camera.width, "height": camera.height, "fx": fx, "fy": fy, "cx": cx, "cy": cy}
     return json.dumps({**size, "camera_from_world": camera.camera_from_world.tolist()})
 
 
-def pixels(browser: Browser, camera: Camera) -> np.ndarray:
+def read_pixels(browser: Browser, camera: Camera) -> np.ndarray:
     data = browser.evaluate("btoa(Array.from(hyrfpack.pixels(), (byte) => String.fromCharCode(byte)).join(''))")
     return np.frombuffer(base64.b64decode(data), np.uint8).reshape(camera.height, camera.width, 3)
 
 
-def shown(browser: Browser, camera: Camera) -> np.ndarray:
-    """(H, W, 3) uint8: what the page draws for a camera."""
-    browser.evaluate(f"hyrfpack.show({json_of(camera)})")
-    return pixels(browser, camera)
+def render_in_page(browser: Browser, camera: Camera) -> np.ndarray:
+    """Return (H, W, 3) uint8, the picture that the page draws for a camera."""
+    browser.evaluate(f"hyrfpack.show({camera_json(camera)})")
+    return read_pixels(browser, camera)
 
 
-def drawn(splats: Splats, camera: Camera, background: np.ndarray | None = None, frame: Frame = FRAME) -> np.ndarray:
-    """The same by our rasteriser."""
+def rasterize_reference(
+    splats: Splats, camera: Camera, background: np.ndarray | None = None, frame: Frame = SCENE_FRAME
+) -> np.ndarray:
+    """Return the picture of our rasteriser, (H, W, 3) in 0 to 255."""
     raster = draw(Drawable.from_splats(splats, frame), camera)
-    behind = np.array(SOLID) if background is None else background
+    behind = np.array(BACKGROUND_COLOR) if background is None else background
     return np.clip(raster.rgb.numpy() + raster.transmittance.numpy()[..., None] * behind, 0, 1) * 255
 
 
-def sky_seen(camera: Camera) -> np.ndarray:
-    """(H, W, 3) the sky behind each pixel, from its formula."""
+def sky_picture(camera: Camera) -> np.ndarray:
+    """Return (H, W, 3), the sky behind each pixel by its formula."""
     v, u = np.meshgrid(np.arange(camera.height) + 0.5, np.arange(camera.width) + 0.5, indexing="ij")
     rays = np.stack(((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)), axis=-1)
     directions = rays @ camera.rotation
@@ -116,32 +127,34 @@ def psnr(first: np.ndarray, second: np.ndarray) -> float:
     return float(10 * np.log10(255**2 / max(((first - second) ** 2).mean(), 1e-9)))
 
 
-CASES = {
-    "as photographed": camera(),
-    "off-centre": replace(camera(), cx=100.0, cy=10.0),
-    "oblong pixels": replace(camera(), fx=70.0, fy=150.0),
-    "among the splats": camera(0.3),
-    "turned upside down": replace(camera(), camera_from_world=np.diag([-1.0, -1, 1, 1]) @ camera().camera_from_world),
+CAMERA_CASES = {
+    "as photographed": make_camera(),
+    "off-centre": replace(make_camera(), cx=100.0, cy=10.0),
+    "oblong pixels": replace(make_camera(), fx=70.0, fy=150.0),
+    "among the splats": make_camera(0.3),
+    "turned upside down": replace(
+        make_camera(), camera_from_world=np.diag([-1.0, -1, 1, 1]) @ make_camera().camera_from_world
+    ),
 }
 
 
-def rested(browser: Browser) -> Browser:
-    """Once nothing moves the eye any more."""
+def wait_until_at_rest(browser: Browser) -> Browser:
+    """Wait until nothing moves the window's camera any more."""
     look = "const look = () => (hyrfpack.player.driven ? requestAnimationFrame(look) : done())"
     browser.evaluate(f"new Promise((done) => {{ {look}; look(); }})")
     return browser
 
 
-def eye(browser: Browser) -> Camera:
-    """Where the window's eye comes to rest."""
+def window_camera(browser: Browser) -> Camera:
+    """Return the window's camera after it has come to rest."""
     return Camera(**{
         name: np.array(value) if name == "camera_from_world" else value
-        for name, value in rested(browser).evaluate("hyrfpack.camera()").items()
+        for name, value in wait_until_at_rest(browser).evaluate("hyrfpack.camera()").items()
     })  # fmt: skip
 
 
-def message(browser: Browser) -> str:
-    """The sentence that the page shows, once it does."""
+def wait_for_message(browser: Browser) -> str:
+    """Wait until the page shows a message; return its sentence."""
     ends = time.monotonic() + 10
     while time.monotonic() < ends:
         if browser.evaluate("!document.getElementById('message').hidden"):
@@ -150,8 +163,8 @@ def message(browser: Browser) -> str:
     return browser.evaluate("document.getElementById('sentence').textContent")
 
 
-def until(browser: Browser, expression: str, seconds: float = 10.0) -> None:
-    """Once an expression is true in the page."""
+def wait_until(browser: Browser, expression: str, seconds: float = 10.0) -> None:
+    """Wait until an expression is true in the page; fail after `seconds`."""
     ends = time.monotonic() + seconds
     while not browser.evaluate(expression):
         assert time.monotonic() < ends, f"never: {expression}"

@@ -1,4 +1,4 @@
-"""Runs JavaScript modules of the page in node."""
+"""Run JavaScript modules of the page in node."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 
 
 def run_script(script: Path, *arguments: object, flags: tuple[str, ...] = ()) -> Any:
-    """The JSON in the last line that a script prints; skips where there is no node."""
+    """Run a script in node and return the JSON in the last line that it prints; skip the test without node."""
     program = shutil.which("node")
     if program is None:
         pytest.skip("node is not on this machine")

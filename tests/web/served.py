@@ -1,4 +1,4 @@
-"""A folder, and the project's own files, served to a browser: it runs no modules of files on disk."""
+"""Serve a folder and the project's files to a browser, which runs no modules from files on disk."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
-ROOT = Path(__file__).parents[2]
+PROJECT_FOLDER = Path(__file__).parents[2]
 
 
 class _Handler(SimpleHTTPRequestHandler):
@@ -17,7 +17,7 @@ class _Handler(SimpleHTTPRequestHandler):
 
     def __init__(self, *arguments: object, own: Path) -> None:
         self.own = own
-        super().__init__(*arguments, directory=str(ROOT))
+        super().__init__(*arguments, directory=str(PROJECT_FOLDER))
 
     def translate_path(self, path: str) -> str:
         if path.startswith("/own/"):
@@ -29,12 +29,12 @@ class _Handler(SimpleHTTPRequestHandler):
         super().end_headers()
 
     def log_message(self, format: str, *arguments: object) -> None:
-        """Requests are nobody's news."""
+        """Do not print requests."""
 
 
 @contextmanager
-def served(own: Path) -> Iterator[str]:
-    """The address of the project's folder while it is served; below `own/` the files of this folder."""
+def serve_project(own: Path) -> Iterator[str]:
+    """Serve the project's folder, and below `own/` the files of the folder `own`; yield the address."""
     with ThreadingHTTPServer(("127.0.0.1", 0), partial(_Handler, own=own)) as server:
         thread = threading.Thread(target=server.serve_forever, daemon=True)
         thread.start()

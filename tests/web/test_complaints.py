@@ -1,4 +1,4 @@
-"""What other tests rely on when they say that a page has nothing to complain of."""
+"""`browser.complaints()`, on which other tests rely, returns the errors of a page."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from pathlib import Path
 
 from web.pages import Browser
 
-PAGE = """<!doctype html><link rel="icon" href="data:,"><script>
+PAGE_WITH_ERRORS = """<!doctype html><link rel="icon" href="data:,"><script>
 console.error("an error of the page"); setTimeout(() => { throw new Error("thrown"); });
 </script>"""
 
 
-def test_errors_of_a_page_are_told(browser: Browser, tmp_path: Path) -> None:
-    (tmp_path / "page.html").write_text(PAGE)
+def test_complaints_contain_console_and_thrown_errors(browser: Browser, tmp_path: Path) -> None:
+    (tmp_path / "page.html").write_text(PAGE_WITH_ERRORS)
     browser.open((tmp_path / "page.html").as_uri())
     said = " ".join(browser.list_errors())
     assert "an error of the page" in said and "thrown" in said

@@ -1,4 +1,4 @@
-"""The list of scenes: plain HTML without scripts, in which nothing that it is told is HTML."""
+"""The gallery of scenes is plain HTML without scripts, and it escapes all texts that it is given."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import pytest
 
 from hyrfpack.web.gallery import Card, encode_gallery, format_bytes
 
-HOSTILE = "\"><script>alert(1)</script>'&{{style}}"
+HOSTILE_TEXT = "\"><script>alert(1)</script>'&{{style}}"
 
 
-class Elements(HTMLParser):
-    """Tags with their attributes, and the text in them."""
+class ParsedPage(HTMLParser):
+    """The tags of a page with their attributes, and its text."""
 
     def __init__(self, page: bytes) -> None:
         super().__init__()
@@ -36,7 +36,7 @@ def test_each_scene_is_a_card_with_a_link():
         Card("room", "room.hyrf", "room.jpg", 12_345, 86_000, "25.07 dB on 12 held-out photos"),
         Card("hall", "hall.spz", None, 1, 1_500_000),
     ]
-    page = Elements(encode_gallery("scenes", cards, "player.html"))
+    page = ParsedPage(encode_gallery("scenes", cards, "player.html"))
     assert [link["href"] for link in page.of("a")] == [
         "player.html?content=room.hyrf&poster=room.jpg",
         "player.html?content=hall.spz",
@@ -47,9 +47,11 @@ def test_each_scene_is_a_card_with_a_link():
     assert len(page.of("h1")) == 1 and len(page.of("h2")) == len(page.of("li")) == 2
 
 
-def test_a_gallery_runs_no_script_and_takes_nothing_for_html():
-    data = encode_gallery(HOSTILE, [Card(HOSTILE, HOSTILE, HOSTILE, 1, 1, HOSTILE)], "player.html")
-    page = Elements(data)
+def test_a_gallery_contains_no_script_and_escapes_all_texts():
+    data = encode_gallery(
+        HOSTILE_TEXT, [Card(HOSTILE_TEXT, HOSTILE_TEXT, HOSTILE_TEXT, 1, 1, HOSTILE_TEXT)], "player.html"
+    )
+    page = ParsedPage(data)
     assert not page.of("script") and b"{{style}}" in data
     (policy,) = (meta["content"] for meta in page.of("meta") if meta.get("http-equiv"))
     assert "default-src 'none'" in policy and "script-src" not in policy and "unsafe" not in policy
@@ -58,7 +60,7 @@ def test_a_gallery_runs_no_script_and_takes_nothing_for_html():
     }
 
 
-def test_a_gallery_is_shared_with_its_first_picture_and_follows_the_light():
+def test_a_gallery_has_a_preview_picture_and_light_and_dark_colors():
     cards = [Card("a", "a.hyrf", None, 1, 1), Card("b", "b.hyrf", "b.jpg", 1, 1)]
     data = encode_gallery("scenes", cards, "player.html").decode()
     assert '<meta property="og:image" content="b.jpg">' in data and "2 scenes" in data
@@ -66,14 +68,14 @@ def test_a_gallery_is_shared_with_its_first_picture_and_follows_the_light():
 
 
 def luminance(color: str) -> float:
-    """Relative luminance (WCAG 2) of #rgb or #rrggbb."""
+    """Return the relative luminance (WCAG 2) of #rgb or #rrggbb."""
     digits = color[1:] if len(color) == 7 else "".join(2 * digit for digit in color[1:])
     parts = [int(digits[at : at + 2], 16) / 255 for at in (0, 2, 4)]
     linear = [part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts]
     return sum(weight * part for weight, part in zip((0.2126, 0.7152, 0.0722), linear, strict=True))
 
 
-def test_text_stands_out_in_light_and_dark():
+def test_text_has_enough_contrast_in_light_and_dark():
     data = encode_gallery("scenes", [], "player.html").decode()
     schemes = re.findall(r":root \{([^}]*)\}", data)
     assert len(schemes) == 2
@@ -89,5 +91,5 @@ def test_text_stands_out_in_light_and_dark():
     ("length", "said"),
     [(1, "1 kB"), (85_952, "86 kB"), (999_400, "999 kB"), (999_500, "1.0 MB"), (2**30, "1,073.7 MB")],
 )
-def test_sizes_are_in_units_that_people_think_in(length, said):
+def test_file_sizes_have_readable_units(length, said):
     assert format_bytes(length) == said

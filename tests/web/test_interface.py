@@ -1,4 +1,4 @@
-"""What a person is shown and can do besides moving: panel, messages, help, links, pictures; with keys alone, too."""
+"""The interface of the page: panel, messages, help, links and saved pictures, also with the keyboard alone."""
 
 from __future__ import annotations
 
@@ -16,58 +16,62 @@ import pytest
 from PIL import Image
 from web.pages import (
     Browser,
-    camera,
-    cloud,
-    drawn,
-    eye,
-    json_of,
-    message,
-    opened,
-    page_of,
+    camera_json,
+    make_camera,
+    make_splats_page,
+    open_page,
     psnr,
-    rested,
-    settled,
-    shown,
-    until,
+    random_splats,
+    rasterize_reference,
+    render_in_page,
+    wait_for_message,
+    wait_until,
+    wait_until_at_rest,
+    wait_until_still,
+    window_camera,
 )  # fmt: skip
 from web.scripts import run_script
 
 from hyrfpack.web.html import decode_splats_page
 
 pytestmark = pytest.mark.in_turn
-PHONE = {"dense": 2.0, "phone": True}
+PHONE_OPTIONS = {"dense": 2.0, "phone": True}
 
 
 @pytest.fixture(autouse=True)
-def usual(browser: Browser) -> Iterator[None]:
-    """Tests may change the window and what a person prefers."""
+def reset_window(browser: Browser) -> Iterator[None]:
+    """Reset the window size and the user's preferences after each test."""
     yield
     browser.resize(240, 180)
     browser.prefer()
 
 
-def hidden(browser: Browser, name: str) -> bool:
+def is_hidden(browser: Browser, name: str) -> bool:
     return browser.evaluate(f"!document.getElementById('{name}').checkVisibility()")
 
 
-# ---- what stands where
+# ---- layout
 
 
 @pytest.mark.parametrize("size", [(390, 844), (844, 390), (600, 400), (1280, 800)], ids=str)
-def test_the_panel_is_open_only_where_there_is_room(browser: Browser, tmp_path: Path, size: tuple[int, int]):
+def test_the_panel_is_open_only_in_large_windows(browser: Browser, tmp_path: Path, size: tuple[int, int]):
     browser.resize(*size)
-    opened(browser, tmp_path, page_of(cloud(50)))
-    assert hidden(browser, "panel") == (size != (1280, 800))
-    assert not hidden(browser, "toggle")
+    open_page(browser, tmp_path, make_splats_page(random_splats(50)))
+    assert is_hidden(browser, "panel") == (size != (1280, 800))
+    assert not is_hidden(browser, "toggle")
     browser.evaluate("document.getElementById('toggle').click()")
     expanded = browser.evaluate("document.getElementById('toggle').getAttribute('aria-expanded')")
-    assert expanded == str(not hidden(browser, "panel")).lower() == str(size != (1280, 800)).lower()
+    assert expanded == str(not is_hidden(browser, "panel")).lower() == str(size != (1280, 800)).lower()
 
 
 @pytest.mark.parametrize("size", [(800, 600), (390, 844), (844, 390), (320, 480)], ids=str)
-def test_nothing_overlaps_or_sticks_out_whatever_is_said(browser: Browser, tmp_path: Path, size: tuple[int, int]):
+def test_no_element_overlaps_another_or_leaves_the_window(browser: Browser, tmp_path: Path, size: tuple[int, int]):
     browser.resize(*size)
-    opened(browser, tmp_path, page_of(cloud(50), title="a_very_long_name_of_a_scene " * 8 + "without_any_space" * 9))
+    open_page(
+        browser,
+        tmp_path,
+        make_splats_page(random_splats(50), title="a_very_long_name_of_a_scene " * 8 + "without_any_space" * 9),
+    )
     browser.evaluate(
         "document.getElementById('hint').hidden = false,"
         "document.getElementById('exposure').hidden = false,"
@@ -75,7 +79,7 @@ def test_nothing_overlaps_or_sticks_out_whatever_is_said(browser: Browser, tmp_p
         "document.getElementById('remark').hidden = document.getElementById('panel').hidden = false"
     )
     browser.evaluate("location.hash = 'camera=no'")
-    assert "camera" in message(browser)
+    assert "camera" in wait_for_message(browser)
     browser.evaluate("document.getElementById('loading').hidden = false")
     boxes = browser.evaluate(
         "['panel', 'toggle', 'loading', 'hint', 'remark', 'message'].map((name) => {"
@@ -87,27 +91,27 @@ def test_nothing_overlaps_or_sticks_out_whatever_is_said(browser: Browser, tmp_p
         assert left >= 0 and top >= 0 and right <= size[0] and bottom <= size[1] and right - left > 20, name
     for (one, *a), (other, *b) in itertools.combinations(boxes, 2):
         if {one, other} & {"panel"} and size[1] < 500:
-            continue  # a panel that a person opens on a small phone covers what it must
+            continue  # on a small phone the opened panel covers other elements
         assert a[2] <= b[0] or b[2] <= a[0] or a[3] <= b[1] or b[3] <= a[1], f"{one} overlaps {other}"
 
 
-def test_the_panel_tells_what_is_shown(browser: Browser, tmp_path: Path):
+def test_the_panel_shows_title_count_and_speed(browser: Browser, tmp_path: Path):
     browser.resize(1280, 800)
-    opened(browser, tmp_path, page_of(cloud(1500), title="<b>& co"))
+    open_page(browser, tmp_path, make_splats_page(random_splats(1500), title="<b>& co"))
     text = "document.getElementById('{}').textContent"
     assert browser.evaluate(text.format("title")) == "<b>& co"
     assert browser.evaluate(text.format("count")) == "1,500 splats"
     ends = time.monotonic() + 20
     while not re.fullmatch(r"\d+ fps", browser.evaluate(text.format("speed"))):
-        assert time.monotonic() < ends, "it tells no speed"
-        browser.press("w", seconds=0.5)  # a frame may take longer than this
+        assert time.monotonic() < ends, "the panel shows no speed"
+        browser.press("w", seconds=0.5)  # a frame may take longer than half a second
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_text_stands_out_in_light_and_dark(browser: Browser, tmp_path: Path, scheme: str):
+def test_text_has_enough_contrast_in_light_and_dark(browser: Browser, tmp_path: Path, scheme: str):
     browser.prefer(scheme)
     browser.resize(1280, 800)
-    opened(browser, tmp_path, page_of(cloud(3)))
+    open_page(browser, tmp_path, make_splats_page(random_splats(3)))
     script = """(() => {
         const style = getComputedStyle(document.documentElement);
         const context = new OffscreenCanvas(1, 1).getContext("2d", { willReadFrequently: true });
@@ -126,50 +130,48 @@ def test_text_stands_out_in_light_and_dark(browser: Browser, tmp_path: Path, sch
         ]);
     })()"""
     for ink, paper in browser.evaluate(script):
-        light, dark = sorted(map(luminance, (ink, paper)), reverse=True)
+        light, dark = sorted(map(relative_luminance, (ink, paper)), reverse=True)
         assert (light + 0.05) / (dark + 0.05) >= 4.5, (ink, paper)
-    dark_page = luminance(browser.evaluate(script)[-1][1]) < 0.1
+    dark_page = relative_luminance(browser.evaluate(script)[-1][1]) < 0.1
     assert dark_page == (scheme == "dark")
 
 
-def luminance(color: list[int]) -> float:
-    """Relative luminance of sRGB bytes (WCAG 2)."""
+def relative_luminance(color: list[int]) -> float:
+    """Return the relative luminance of sRGB bytes (WCAG 2)."""
     values = np.array(color) / 255
     linear = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
     return float(linear @ [0.2126, 0.7152, 0.0722])
 
 
-def test_noui_leaves_the_canvas_and_messages(browser: Browser, tmp_path: Path):
+def test_noui_hides_everything_but_the_canvas_and_messages(browser: Browser, tmp_path: Path):
     browser.resize(1280, 800)
-    opened(browser, tmp_path, page_of(cloud(50)), "?noui#camera=77")
-    assert all(hidden(browser, name) for name in ("panel", "toggle", "hint", "invitation", "loading"))
-    assert "no camera 77, only 3" in message(browser) and not hidden(browser, "message")
+    open_page(browser, tmp_path, make_splats_page(random_splats(50)), "?noui#camera=77")
+    assert all(is_hidden(browser, name) for name in ("panel", "toggle", "hint", "invitation", "loading"))
+    assert "no camera 77, only 3" in wait_for_message(browser) and not is_hidden(browser, "message")
 
 
 # ---- messages
 
 
-def test_a_message_can_be_dismissed_by_button_and_escape_and_a_good_address_takes_it_away(
-    browser: Browser, tmp_path: Path
-):
+def test_a_message_is_dismissed_by_button_by_escape_and_by_a_valid_address(browser: Browser, tmp_path: Path):
     browser.resize(480, 360)
-    opened(browser, tmp_path, page_of(cloud(50)), "#camera={}")
-    assert "needs width" in message(browser)
+    open_page(browser, tmp_path, make_splats_page(random_splats(50)), "#camera={}")
+    assert "needs width" in wait_for_message(browser)
     browser.evaluate("document.getElementById('dismiss').click()")
-    assert hidden(browser, "message")
+    assert is_hidden(browser, "message")
     for bad, way_out in {
         "%zz": lambda: browser.press("Escape"),
         "0": lambda: browser.evaluate("location.hash = 'camera=2'"),
     }.items():
         browser.evaluate(f"location.hash = 'camera={bad}'")
-        assert "names no camera that can be used" in message(browser)
+        assert "names no camera that can be used" in wait_for_message(browser)
         box = browser.evaluate("document.getElementById('message').getBoundingClientRect().top")
-        assert box > 200, "it covers the middle"
+        assert box > 200, "the message covers the middle of the window"
         way_out()
-        until(browser, "document.getElementById('message').hidden")
+        wait_until(browser, "document.getElementById('message').hidden")
 
 
-BAD_CAMERAS = {
+ERROR_BY_INVALID_CAMERA = {
     "0": "no camera 0, only 3", "4": "no camera 4, only 3", "-1": "9 numbers", "1,2,3": "9 numbers",
     "1,2,3,0,0,0,0,1": "no unit quaternion", "1,2,3,1,0,0,0,1e9": "focal length", "1,2,3,1,0,0,0,nan": "9 numbers",
     "1,2,3,1,0,0,0,": "9 numbers", "{": "names no camera", "[1]": "9 numbers", "null": "9 numbers",
@@ -177,47 +179,47 @@ BAD_CAMERAS = {
 }  # fmt: skip
 
 
-def test_every_bad_camera_is_one_sentence_and_the_scene_is_there(browser: Browser, tmp_path: Path):
-    opened(browser, tmp_path, page_of(cloud(50)))
-    home = eye(browser)
-    for text, words in BAD_CAMERAS.items():
+def test_invalid_cameras_in_the_address_are_reported_and_the_scene_is_shown(browser: Browser, tmp_path: Path):
+    open_page(browser, tmp_path, make_splats_page(random_splats(50)))
+    home = window_camera(browser)
+    for text, words in ERROR_BY_INVALID_CAMERA.items():
         browser.evaluate(f"location.hash = 'camera=' + {json.dumps(text)}")
-        said = message(browser)
+        said = wait_for_message(browser)
         assert words in said and said.startswith("The address names no camera that can be used: "), text
         browser.press("Escape")
-        until(browser, "document.getElementById('message').hidden")
-        np.testing.assert_array_equal(eye(browser).camera_from_world, home.camera_from_world)
+        wait_until(browser, "document.getElementById('message').hidden")
+        np.testing.assert_array_equal(window_camera(browser).camera_from_world, home.camera_from_world)
     assert browser.list_errors() == []
 
 
-# ---- the address, there and back
+# ---- the address and shared links
 
 
-def test_a_shared_link_leads_back_to_the_same_view(browser: Browser, tmp_path: Path):
-    opened(browser, tmp_path, page_of(cloud()))
+def test_a_shared_link_restores_the_view(browser: Browser, tmp_path: Path):
+    open_page(browser, tmp_path, make_splats_page(random_splats()))
     browser.drag((120, 90), (161, 103))
     browser.mouse("mouseWheel", 60, 150, deltaX=0, deltaY=-150)
     browser.drag((120, 90), (107, 93), button="right")
-    before = eye(browser)
+    before = window_camera(browser)
     browser.press("l")
-    until(browser, "!document.getElementById('toast').hidden")
+    wait_until(browser, "!document.getElementById('toast').hidden")
     fragment = browser.evaluate("location.hash")
     assert len(fragment) < 110, fragment
-    opened(browser, tmp_path, page_of(cloud()), fragment)
-    after = eye(browser)
+    open_page(browser, tmp_path, make_splats_page(random_splats()), fragment)
+    after = window_camera(browser)
     assert np.linalg.norm(after.position - before.position) < 1e-4
     assert np.abs(after.rotation - before.rotation).max() < 1e-4
     assert after.fx == pytest.approx(before.fx, rel=1e-4)
     turned = [(120, 90), (160, 90)]
-    browser.drag(*turned)  # about the same point
-    there = eye(browser)
-    opened(browser, tmp_path, page_of(cloud()), "#camera=" + json_of(before))
+    browser.drag(*turned)  # orbits the same point as before
+    there = window_camera(browser)
+    open_page(browser, tmp_path, make_splats_page(random_splats()), "#camera=" + camera_json(before))
     browser.drag(*turned)
-    assert np.linalg.norm(there.position - eye(browser).position) < 0.5
+    assert np.linalg.norm(there.position - window_camera(browser).position) < 0.5
     assert browser.list_errors() == []
 
 
-def test_links_are_as_exact_in_any_unit_and_however_a_camera_is_turned(tmp_path: Path):
+def test_links_are_exact_for_any_unit_and_rotation(tmp_path: Path):
     rng = np.random.default_rng(5)
     cases = []
     for _ in range(300):
@@ -240,39 +242,39 @@ def test_links_are_as_exact_in_any_unit_and_however_a_camera_is_turned(tmp_path:
         assert answer["depth"] == pytest.approx(wanted["depth"], rel=1e-4) and len(answer["text"]) < 140, answer
 
 
-def test_where_the_clipboard_is_closed_the_link_stands_there_to_be_copied(browser: Browser, tmp_path: Path):
+def test_the_link_is_shown_selected_where_the_clipboard_is_unavailable(browser: Browser, tmp_path: Path):
     with browser.before_every_page("Object.defineProperty(Navigator.prototype, 'clipboard', { value: undefined })"):
-        opened(browser, tmp_path, page_of(cloud(50)))
+        open_page(browser, tmp_path, make_splats_page(random_splats(50)))
         browser.press("l")
-        until(browser, "!document.getElementById('toast').hidden")
+        wait_until(browser, "!document.getElementById('toast').hidden")
         selected = "((field) => field.value.slice(field.selectionStart, field.selectionEnd))(document.activeElement)"
         assert browser.evaluate(selected) == browser.evaluate("location.href")
-        home = eye(browser)
-        browser.press("w", seconds=0.1)  # typed into the field
-        assert np.array_equal(eye(browser).camera_from_world, home.camera_from_world)
+        home = window_camera(browser)
+        browser.press("w", seconds=0.1)  # goes to the text field
+        assert np.array_equal(window_camera(browser).camera_from_world, home.camera_from_world)
         browser.press("Escape")
-        assert hidden(browser, "toast")
+        assert is_hidden(browser, "toast")
 
 
-def test_a_copied_link_is_what_the_address_says(browser: Browser, tmp_path: Path):
+def test_a_copied_link_equals_the_address(browser: Browser, tmp_path: Path):
     clipboard = "{ value: { writeText: async (text) => { window.copied = text; } } }"
     with browser.before_every_page(f"Object.defineProperty(Navigator.prototype, 'clipboard', {clipboard})"):
-        opened(browser, tmp_path, page_of(cloud(50)))
+        open_page(browser, tmp_path, make_splats_page(random_splats(50)))
         browser.press("l")
-        until(browser, "window.copied !== undefined")
+        wait_until(browser, "window.copied !== undefined")
         assert browser.evaluate("copied === location.href && location.hash.startsWith('#camera=')")
         assert "copied" in browser.evaluate("document.getElementById('done').textContent")
 
 
 @pytest.mark.parametrize("where", ["?camera=2", "#camera=2", "?camera=3#camera=2"])
-def test_the_address_can_name_a_camera_by_its_number(browser: Browser, tmp_path: Path, where: str):
-    opened(browser, tmp_path, page_of(cloud(50)), where)
-    np.testing.assert_allclose(eye(browser).camera_from_world, camera(1.5).camera_from_world, atol=1e-9)
+def test_the_address_can_select_a_camera_by_number(browser: Browser, tmp_path: Path, where: str):
+    open_page(browser, tmp_path, make_splats_page(random_splats(50)), where)
+    np.testing.assert_allclose(window_camera(browser).camera_from_world, make_camera(1.5).camera_from_world, atol=1e-9)
     assert browser.evaluate("document.getElementById('cameras').selectedIndex") == 1
 
 
-def test_the_address_can_name_the_title(browser: Browser, tmp_path: Path):
-    opened(browser, tmp_path, page_of(cloud(50)), "?title=%3Ci%3Emine")
+def test_the_address_can_set_the_title(browser: Browser, tmp_path: Path):
+    open_page(browser, tmp_path, make_splats_page(random_splats(50)), "?title=%3Ci%3Emine")
     assert browser.evaluate("document.title") == "<i>mine"
     assert browser.evaluate("document.getElementById('title').children.length") == 0
 
@@ -280,33 +282,33 @@ def test_the_address_can_name_the_title(browser: Browser, tmp_path: Path):
 # ---- pictures
 
 
-def test_a_picture_is_what_the_window_shows(browser: Browser, tmp_path: Path):
+def test_a_saved_picture_equals_the_window(browser: Browser, tmp_path: Path):
     script = (
         "const make = URL.createObjectURL; URL.createObjectURL = (blob) => { window.saved = blob; return make(blob); };"
         "HTMLAnchorElement.prototype.click = function () { window.named = this.download; }"
     )
     with browser.before_every_page(script):
-        page = page_of(cloud(), title="a/scene: 1")
-        settled(opened(browser, tmp_path, page))
+        page = make_splats_page(random_splats(), title="a/scene: 1")
+        wait_until_still(open_page(browser, tmp_path, page))
         browser.press("c")
-        until(browser, "window.named !== undefined")
+        wait_until(browser, "window.named !== undefined")
         assert browser.evaluate("named") == "a_scene_ 1.png"
         text = "((bytes) => btoa(Array.from(bytes, (byte) => String.fromCharCode(byte)).join('')))"
         data = base64.b64decode(browser.evaluate(f"saved.arrayBuffer().then((all) => {text}(new Uint8Array(all)))"))
     with Image.open(io.BytesIO(data)) as picture:
         assert picture.format == "PNG"
         seen = np.asarray(picture.convert("RGB"), np.float64)
-    at = eye(browser)
+    at = window_camera(browser)
     assert seen.shape == (at.height, at.width, 3) == (180, 240, 3)
-    assert psnr(seen, drawn(decode_splats_page(page, "page")[0], at)) > 40
-    assert np.abs(shown(browser, at) - seen).max() <= 3
+    assert psnr(seen, rasterize_reference(decode_splats_page(page, "page")[0], at)) > 40
+    assert np.abs(render_in_page(browser, at) - seen).max() <= 3
 
 
-POSTER = base64.b64decode(b"UklGRh4AAABXRUJQVlA4TBEAAAAvAAAAAAdQ//73v/+BiOh/AAA=")  # one pixel
+ONE_PIXEL_POSTER = base64.b64decode(b"UklGRh4AAABXRUJQVlA4TBEAAAAvAAAAAAdQ//73v/+BiOh/AAA=")  # one pixel
 
 
-def test_a_poster_is_there_until_something_is_seen(browser: Browser, tmp_path: Path):
-    (tmp_path / "page.html").write_bytes(page_of(cloud(), poster=POSTER))
+def test_the_poster_is_shown_until_the_first_picture(browser: Browser, tmp_path: Path):
+    (tmp_path / "page.html").write_bytes(make_splats_page(random_splats(), poster=ONE_PIXEL_POSTER))
     watch = (
         "addEventListener('DOMContentLoaded', () => { window.posters = [Boolean(document.getElementById('poster'))]; })"
     )
@@ -314,71 +316,71 @@ def test_a_poster_is_there_until_something_is_seen(browser: Browser, tmp_path: P
         browser.open((tmp_path / "page.html").as_uri())
     browser.evaluate("hyrfpack.ready")
     assert browser.evaluate("posters") == [True]
-    until(browser, "!document.getElementById('poster') && hyrfpack.player.times.first !== null")
+    wait_until(browser, "!document.getElementById('poster') && hyrfpack.player.times.first !== null")
 
 
-def test_without_webgl_the_poster_stays_with_a_sentence_and_no_buttons(browser: Browser, tmp_path: Path):
+def test_without_webgl_the_poster_and_a_message_are_shown_and_no_buttons(browser: Browser, tmp_path: Path):
     browser.resize(1280, 800)
-    (tmp_path / "page.html").write_bytes(page_of(cloud(50), poster=POSTER))
+    (tmp_path / "page.html").write_bytes(make_splats_page(random_splats(50), poster=ONE_PIXEL_POSTER))
     with browser.before_every_page("HTMLCanvasElement.prototype.getContext = () => null"):
         browser.open((tmp_path / "page.html").as_uri())
-        assert "no WebGL 2" in message(browser)
-    assert not hidden(browser, "poster")
-    assert all(hidden(browser, name) for name in ("panel", "toggle", "loading"))
+        assert "no WebGL 2" in wait_for_message(browser)
+    assert not is_hidden(browser, "poster")
+    assert all(is_hidden(browser, name) for name in ("panel", "toggle", "loading"))
     assert browser.evaluate("document.getElementById('message').getBoundingClientRect().top") > 600
 
 
 # ---- help
 
 
-def test_help_is_for_what_a_person_has_at_hand(browser: Browser, tmp_path: Path):
+def test_help_describes_only_the_available_input_devices(browser: Browser, tmp_path: Path):
     parts = (
         "[...document.querySelectorAll('#help [data-with]')].filter((part) => part.checkVisibility())"
         ".map((part) => part.dataset.with)"
     )
-    browser.resize(390, 844, **PHONE)
-    opened(browser, tmp_path, page_of(cloud(3)))
+    browser.resize(390, 844, **PHONE_OPTIONS)
+    open_page(browser, tmp_path, make_splats_page(random_splats(3)))
     ask = "document.querySelector('[data-key=\"?\"]').click()"
     browser.evaluate(ask)
     assert browser.evaluate(parts) == ["touch"]
     browser.press("Escape")
-    browser.evaluate(ask)  # a keyboard has been used meanwhile
+    browser.evaluate(ask)  # the Escape key has shown that there is a keyboard
     assert browser.evaluate(parts) == ["touch", "keys"]
     browser.resize(1280, 800)
-    opened(browser, tmp_path, page_of(cloud(3)))
+    open_page(browser, tmp_path, make_splats_page(random_splats(3)))
     browser.press("?")
     assert browser.evaluate(parts) == ["mouse", "keys"]
 
 
-def test_a_first_visit_has_a_hint_that_the_first_act_takes_away(browser: Browser, tmp_path: Path):
-    opened(browser, tmp_path, page_of(cloud(3)))
+def test_the_hint_of_a_first_visit_disappears_with_the_first_input(browser: Browser, tmp_path: Path):
+    open_page(browser, tmp_path, make_splats_page(random_splats(3)))
     browser.evaluate("localStorage.clear()")
-    opened(browser, tmp_path, page_of(cloud(3)))
+    open_page(browser, tmp_path, make_splats_page(random_splats(3)))
     assert browser.evaluate("document.getElementById('hint').textContent").startswith("Drag to turn")
-    assert not hidden(browser, "hint")
+    assert not is_hidden(browser, "hint")
     browser.drag((120, 90), (125, 90))
-    until(browser, "document.getElementById('hint').hidden")
-    opened(browser, tmp_path, page_of(cloud(3)))
-    assert hidden(browser, "hint")
+    wait_until(browser, "document.getElementById('hint').hidden")
+    open_page(browser, tmp_path, make_splats_page(random_splats(3)))
+    assert is_hidden(browser, "hint")
 
 
-def test_a_page_without_storage_works(browser: Browser, tmp_path: Path):
+def test_a_page_works_without_local_storage(browser: Browser, tmp_path: Path):
     with browser.before_every_page(
         "Object.defineProperty(window, 'localStorage', { get() { throw new Error('no'); } })"
     ):
-        opened(browser, tmp_path, page_of(cloud(3)))
-        assert not hidden(browser, "hint")
+        open_page(browser, tmp_path, make_splats_page(random_splats(3)))
+        assert not is_hidden(browser, "hint")
         browser.drag((120, 90), (125, 90))
-        until(browser, "document.getElementById('hint').hidden")
+        wait_until(browser, "document.getElementById('hint').hidden")
     assert browser.list_errors() == []
 
 
-# ---- keys alone, and ears alone
+# ---- keyboard and screen readers
 
 
-def test_the_tab_key_reaches_everything_shows_where_it_is_and_leaves(browser: Browser, tmp_path: Path):
+def test_the_tab_key_visibly_focuses_every_control_and_leaves_the_page(browser: Browser, tmp_path: Path):
     browser.resize(1280, 800)
-    opened(browser, tmp_path, page_of(cloud(50)))
+    open_page(browser, tmp_path, make_splats_page(random_splats(50)))
     browser.evaluate("(localStorage.setItem('hyrfpack.hinted', '1'), document.querySelector('details').open = true)")
     wanted = browser.evaluate(
         "[...document.querySelectorAll('canvas, button, select, summary, input')].filter((it) => it.checkVisibility()"
@@ -392,15 +394,17 @@ def test_the_tab_key_reaches_everything_shows_where_it_is_and_leaves(browser: Br
             "((it) => [it.dataset.number, getComputedStyle(it).outlineStyle])(document.activeElement)"
         )
         met.append(number)
-        assert outline != "none", "one cannot see where the focus is"
+        assert outline != "none", "the focus is not visible"
     assert met == wanted
     browser.press("Tab")
-    assert browser.evaluate("document.activeElement === document.body || !document.hasFocus()"), "a trap"
+    assert browser.evaluate("document.activeElement === document.body || !document.hasFocus()"), (
+        "the focus cannot leave the page"
+    )
 
 
-def test_keys_press_every_button(browser: Browser, tmp_path: Path):
+def test_every_button_has_a_working_key(browser: Browser, tmp_path: Path):
     browser.resize(1280, 800)
-    opened(browser, tmp_path, page_of(cloud(50)))
+    open_page(browser, tmp_path, make_splats_page(random_splats(50)))
     keys = browser.evaluate("[...document.querySelectorAll('[data-key]')].map((button) => button.dataset.key)")
     assert sorted(keys) == sorted("PNRTLC?FHX")
     for key, effect in {
@@ -412,12 +416,12 @@ def test_keys_press_every_button(browser: Browser, tmp_path: Path):
         "?": "document.getElementById('help').open",
     }.items():
         browser.press(key)
-        until(browser, effect)
+        wait_until(browser, effect)
     browser.press("Escape")
-    until(browser, "!document.getElementById('help').open")
+    wait_until(browser, "!document.getElementById('help').open")
 
 
-def test_those_who_hear_the_page_are_told_what_happens(browser: Browser, tmp_path: Path):
+def test_screen_readers_get_labels_and_status_messages(browser: Browser, tmp_path: Path):
     watch = (
         "addEventListener('DOMContentLoaded', () => { window.heard = [];"
         "  const status = document.getElementById('status');"
@@ -425,13 +429,13 @@ def test_those_who_hear_the_page_are_told_what_happens(browser: Browser, tmp_pat
         "})"
     )
     with browser.before_every_page(watch):
-        opened(browser, tmp_path, page_of(cloud(50), title="bonsai"))
+        open_page(browser, tmp_path, make_splats_page(random_splats(50), title="bonsai"))
     browser.evaluate("hyrfpack.player.settled.then(() => true)")
     heard = browser.evaluate("heard")
     assert any("percent" in sentence for sentence in heard) and heard[-1] == "bonsai is shown."
-    assert len(heard) < 16, "it chatters"
+    assert len(heard) < 16, "too many status messages"
     browser.press("n")
-    rested(browser)
+    wait_until_at_rest(browser)
     assert browser.evaluate("heard.at(-1)") == "Camera 2 of 3"
     nameless = browser.evaluate(
         "[...document.querySelectorAll('button, select, input:not([hidden]), canvas, progress')].filter((it) =>"

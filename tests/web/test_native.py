@@ -1,4 +1,4 @@
-"""Pages with a `.hyrf` file inside: the browser decodes it and draws what `hyrfpack.render_view` draws."""
+"""Pages with a `.hyrf` file inside decode it in the browser and draw the same pictures as `hyrfpack.render_view`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from scenes import camera_at, shift_cameras
-from web.pages import Browser, json_of, psnr, shown, until
+from web.pages import Browser, camera_json, psnr, render_in_page, wait_until
 
 from hyrfpack.format.codec import encode_model
 from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
@@ -21,26 +21,30 @@ from hyrfpack.scene import Camera
 from hyrfpack.web.html import encode_model_page
 from tools.safety.synthetic_encoding import encode
 
-FRAME = Frame((10.0, -20.0, 5.0), 7.0, (1.0, 0.5, 0.8))
-EXACT = RenderSettings(background_threshold=0.0, background_stride=1)
-UP, CENTER = np.array([0.0, 0.0, 1.0]), np.array(FRAME.center)
-PLACES = [(0.4, -2.4, 0.7), (-2.0, 0.3, 0.2), (0.1, 0.1, 0.05), (3.5, 2.0, -1.5)]
+MODEL_FRAME = Frame((10.0, -20.0, 5.0), 7.0, (1.0, 0.5, 0.8))
+EXACT_SETTINGS = RenderSettings(background_threshold=0.0, background_stride=1)
+UP_DIRECTION, SCENE_CENTER = np.array([0.0, 0.0, 1.0]), np.array(MODEL_FRAME.center)
+CAMERA_POSITIONS = [(0.4, -2.4, 0.7), (-2.0, 0.3, 0.2), (0.1, 0.1, 0.05), (3.5, 2.0, -1.5)]
 
-SMALL = HashGridConfig(log2_table_size=9, levels=4, base=4, finest=40)
-SIXTEEN = HashGridConfig(log2_table_size=11, levels=16, base=4, finest=256)
-ONE = HashGridConfig(log2_table_size=12, levels=1, base=12, finest=12)
-CASES = {
+SMALL_GRID = HashGridConfig(log2_table_size=9, levels=4, base=4, finest=40)
+SIXTEEN_LEVEL_GRID = HashGridConfig(log2_table_size=11, levels=16, base=4, finest=256)
+ONE_LEVEL_GRID = HashGridConfig(log2_table_size=12, levels=1, base=12, finest=12)
+MODEL_SETTINGS = {
     "usual": {},
     "harmonics, product, solid": {"direction_encoding": "sh", "scale_rule": "product", "background": False},
-    "sixteen levels, antialiased": {"geometry": SIXTEEN, "radiance": SIXTEEN, "antialiased": True},
-    "one level, 3 hidden": {"geometry": ONE, "radiance": ONE, "hidden": 3},
+    "sixteen levels, antialiased": {
+        "geometry": SIXTEEN_LEVEL_GRID,
+        "radiance": SIXTEEN_LEVEL_GRID,
+        "antialiased": True,
+    },
+    "one level, 3 hidden": {"geometry": ONE_LEVEL_GRID, "radiance": ONE_LEVEL_GRID, "hidden": 3},
     "100 hidden, even scales": {"hidden": 100, "scale_grows": False, "direction_encoding": "sh"},
 }
 
 
-def made_up(count: int = 2600, seed: int = 0, **config: object) -> HybridModel:
-    """A model whose fields say much: Gaussians of all shapes and colours, inside the frame's box and far out."""
-    shape = {"geometry": SMALL, "radiance": SMALL, "hidden": 16, "solid": (0.2, 0.3, 0.1), **config}
+def random_model(count: int = 2600, seed: int = 0, **config: object) -> HybridModel:
+    """Return a model with large random fields and Gaussians of all shapes and colours, inside and outside the frame."""
+    shape = {"geometry": SMALL_GRID, "radiance": SMALL_GRID, "hidden": 16, "solid": (0.2, 0.3, 0.1), **config}
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*size: int) -> torch.Tensor:
@@ -48,69 +52,71 @@ def made_up(count: int = 2600, seed: int = 0, **config: object) -> HybridModel:
 
     positions = normal(count, 3) * 0.4 * torch.exp(normal(count, 1) * 0.5)
     gaussians = Gaussians(positions, normal(count, 3), normal(count, 1) * 0.5 - 3, normal(count, 1) + 1)
-    model = HybridModel(ModelConfig(frame=FRAME, **shape), gaussians, generator)
+    model = HybridModel(ModelConfig(frame=MODEL_FRAME, **shape), gaussians, generator)
     with torch.no_grad():
         for field in (model.geometry, model.radiance):
             field.grid.table.copy_(normal(*field.grid.table.shape))
             for bias in field.biases:
                 bias.copy_(normal(*bias.shape) * 0.3)
-        # The background is seen along directions from the middle; models that are not made up hardly tell them apart.
+        # The background is evaluated along directions from the centre, on which trained models hardly depend.
         model.radiance.weights[0][:, model.radiance.grid.feature_count :] *= 0.5
     return model
 
 
-def cameras(width: int = 120, height: int = 90) -> list[Camera]:
-    """Around, among and away from the Gaussians, in the world."""
-    local = [camera_at(place, up=UP, width=width, height=height, focal=100.0) for place in PLACES]
-    return shift_cameras([replace(camera, camera_from_world=_scaled(camera)) for camera in local], CENTER)
+def make_cameras(width: int = 120, height: int = 90) -> list[Camera]:
+    """Return cameras around, among and far from the Gaussians, in world units."""
+    local = [camera_at(place, up=UP_DIRECTION, width=width, height=height, focal=100.0) for place in CAMERA_POSITIONS]
+    return shift_cameras([replace(camera, camera_from_world=_scale_pose(camera)) for camera in local], SCENE_CENTER)
 
 
-def _scaled(camera: Camera) -> np.ndarray:
+def _scale_pose(camera: Camera) -> np.ndarray:
     pose = camera.camera_from_world.copy()
-    pose[:3, 3] *= FRAME.scale
+    pose[:3, 3] *= MODEL_FRAME.scale
     return pose
 
 
-def page_of(model: HybridModel, data: bytes | None = None) -> bytes:
+def make_model_page(model: HybridModel, data: bytes | None = None) -> bytes:
     data = encode_model(model) if data is None else data
     facts = {"count": len(model), "frame": model.config.frame, "solid": model.config.solid}
-    return encode_model_page(data, title="a model", cameras=cameras(), up=UP, center=CENTER, **facts)
+    return encode_model_page(
+        data, title="a model", cameras=make_cameras(), up=UP_DIRECTION, center=SCENE_CENTER, **facts
+    )
 
 
-def rendered(model: HybridModel, camera: Camera) -> np.ndarray:
-    """(H, W, 3) by our renderer, in 0 to 255."""
+def render_reference(model: HybridModel, camera: Camera) -> np.ndarray:
+    """Return the picture of `hyrfpack.render_view`, (H, W, 3) in 0 to 255."""
     with torch.no_grad():
-        return render_view(model, camera, EXACT).rgb.clamp(0, 1).numpy() * 255
+        return render_view(model, camera, EXACT_SETTINGS).rgb.clamp(0, 1).numpy() * 255
 
 
-def loaded(browser: Browser, tmp_path: Path, page: bytes, complete: bool = True) -> Browser:
-    """The page in the browser, its picture complete."""
+def load_page(browser: Browser, tmp_path: Path, page: bytes, complete: bool = True) -> Browser:
+    """Open a page in the browser and, if `complete`, wait until its picture is complete."""
     file = tmp_path / "page.html"
     file.write_bytes(page)
     browser.open(file.as_uri())
     browser.evaluate("hyrfpack.ready")
     if complete:
-        settled(browser)
+        wait_until_complete(browser)
     return browser
 
 
-def run(browser: Browser, statements: str) -> None:
-    """Statements of JavaScript; what they keep, they keep in the window."""
+def run_statements(browser: Browser, statements: str) -> None:
+    """Run JavaScript statements in the page; values for later are stored as properties of `window`."""
     browser.evaluate(f"(() => {{ {statements} }})()")
 
 
-def settled(browser: Browser) -> None:
+def wait_until_complete(browser: Browser) -> None:
     browser.evaluate("hyrfpack.player.settled.then(() => true)")
 
 
-def numbers(browser: Browser, expression: str, kind: type) -> np.ndarray:
-    """A typed array of the page."""
+def read_typed_array(browser: Browser, expression: str, kind: type) -> np.ndarray:
+    """Return the value of an expression that is a typed array in the page."""
     text = f"((a) => btoa(Array.from(new Uint8Array(a.buffer), (b) => String.fromCharCode(b)).join('')))({expression})"
     return np.frombuffer(base64.b64decode(browser.evaluate(text)), kind)
 
 
-def texels(browser: Browser, name: str, width: int, words: int) -> np.ndarray:
-    """(height, 2048, 4) uint32 of a texture of what is drawn, of which the first `words` are in use."""
+def read_texture(browser: Browser, name: str, width: int, words: int) -> np.ndarray:
+    """Read a texture of the renderer: (texels, words) uint32, the first `words` components of each texel."""
     script = f"""(() => {{
         const {{ gl, content }} = hyrfpack.player.renderer, height = content.height;
         const target = gl.createFramebuffer(), words = new Uint32Array(4 * {width} * height);
@@ -120,25 +126,25 @@ def texels(browser: Browser, name: str, width: int, words: int) -> np.ndarray:
         gl.deleteFramebuffer(target);
         return words;
     }})()"""
-    return numbers(browser, script, np.uint32).reshape(-1, 4)[:, :words]
+    return read_typed_array(browser, script, np.uint32).reshape(-1, 4)[:, :words]
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_pictures_geometry_and_colours_are_those_of_the_model(browser: Browser, tmp_path: Path, case: str):
-    model = made_up(**CASES[case])
-    loaded(browser, tmp_path, page_of(model), complete=False)
-    camera = cameras()[0]
-    shown(browser, camera)
-    check_geometry_and_colours(browser, model, camera)
-    scores = [psnr(shown(browser, camera), rendered(model, camera)) for camera in cameras()]
+@pytest.mark.parametrize("case", MODEL_SETTINGS)
+def test_pictures_geometry_and_colors_equal_those_of_the_model(browser: Browser, tmp_path: Path, case: str):
+    model = random_model(**MODEL_SETTINGS[case])
+    load_page(browser, tmp_path, make_model_page(model), complete=False)
+    camera = make_cameras()[0]
+    render_in_page(browser, camera)
+    check_geometry_and_colors(browser, model, camera)
+    scores = [psnr(render_in_page(browser, camera), render_reference(model, camera)) for camera in make_cameras()]
     assert min(scores) > 45 and browser.list_errors() == [], scores
 
 
-def check_geometry_and_colours(browser: Browser, model: HybridModel, camera: Camera) -> None:
-    """What lies in the textures of the page, which shows this camera alone."""
+def check_geometry_and_colors(browser: Browser, model: HybridModel, camera: Camera) -> None:
+    """Compare the textures of the page, which has shown this camera alone, with the model."""
     count = len(model)
-    places, shapes = (texels(browser, name, 2048, 4)[:count] for name in ("places", "shapes"))
-    halves = np.ascontiguousarray(texels(browser, "colors", 2048, 2)[:count]).view(np.float16)[:, :3]
+    places, shapes = (read_texture(browser, name, 2048, 4)[:count] for name in ("places", "shapes"))
+    halves = np.ascontiguousarray(read_texture(browser, "colors", 2048, 2)[:count]).view(np.float16)[:, :3]
     with torch.no_grad():
         geometry = model.decode_geometry()
         eye = torch.tensor(model.config.frame.to_local(camera.position), dtype=torch.float32)
@@ -150,46 +156,46 @@ def check_geometry_and_colours(browser: Browser, model: HybridModel, camera: Cam
     quats = np.ascontiguousarray(shapes[:, :2]).view(np.int16) / 32767
     expected = torch.nn.functional.normalize(geometry.quats, dim=-1).numpy()
     np.testing.assert_allclose(quats, expected, atol=1e-4)
-    seen = halves.any(axis=1)  # rows out of the picture are not coloured
+    seen = halves.any(axis=1)  # Gaussians outside the picture get no colours
     assert seen.mean() > 0.5
     np.testing.assert_allclose(halves[seen].astype(np.float32), colors[seen], atol=1e-3)
 
 
-def test_decoders_lie_in_a_block_of_uniforms_where_a_device_reads_them(browser: Browser, tmp_path: Path):
-    model = made_up(600)
+def test_decoder_weights_are_in_a_uniform_block_on_devices_that_support_it(browser: Browser, tmp_path: Path):
+    model = random_model(600)
     script = "const proto = WebGL2RenderingContext.prototype, ask = proto.getParameter; proto.getParameter = "
     script += "function (name) { return name === this.RENDERER ? 'a device' : ask.call(this, name); }"
     with browser.before_every_page(script):
-        loaded(browser, tmp_path, page_of(model))
+        load_page(browser, tmp_path, make_model_page(model))
         assert browser.evaluate("hyrfpack.player.renderer.content.radiance.block")
-        camera = cameras()[0]
-        assert psnr(shown(browser, camera), rendered(model, camera)) > 45
+        camera = make_cameras()[0]
+        assert psnr(render_in_page(browser, camera), render_reference(model, camera)) > 45
 
 
 @pytest.mark.in_turn
 def test_a_model_without_gaussians_shows_its_background(browser: Browser, tmp_path: Path):
-    model = made_up(0)
-    loaded(browser, tmp_path, page_of(model))
-    camera = cameras()[2]
-    assert psnr(shown(browser, camera), rendered(model, camera)) > 40
+    model = random_model(0)
+    load_page(browser, tmp_path, make_model_page(model))
+    camera = make_cameras()[2]
+    assert psnr(render_in_page(browser, camera), render_reference(model, camera)) > 40
 
 
 @pytest.mark.in_turn
-def test_the_window_shows_what_scripts_are_given_and_then_rests(browser: Browser, tmp_path: Path):
-    loaded(browser, tmp_path, page_of(made_up()))
+def test_a_still_window_requests_no_frames(browser: Browser, tmp_path: Path):
+    load_page(browser, tmp_path, make_model_page(random_model()))
     frames = browser.evaluate("hyrfpack.frames()")
-    run(browser, "window.asked = 0; const ask = requestAnimationFrame;"
+    run_statements(browser, "window.asked = 0; const ask = requestAnimationFrame;"
                  "window.requestAnimationFrame = (frame) => (window.asked++, ask(frame));")  # fmt: skip
     time.sleep(0.5)
     assert browser.evaluate("hyrfpack.frames()") == frames and browser.evaluate("window.asked") == 0
 
 
 @pytest.mark.in_turn
-def test_colours_follow_the_view_while_it_moves_and_are_complete_when_it_stands(browser: Browser, tmp_path: Path):
-    model = made_up()
-    loaded(browser, tmp_path, page_of(model))
+def test_colors_are_complete_for_the_view_after_a_drag(browser: Browser, tmp_path: Path):
+    model = random_model()
+    load_page(browser, tmp_path, make_model_page(model))
     browser.drag((120, 90), (200, 110), steps=8)
-    settled(browser)
+    wait_until_complete(browser)
     rows = "hyrfpack.player.renderer.content.rows"
     turned = browser.evaluate(
         f"Array.from({{length: {rows}.count}}, (_, r) => Math.hypot(...[0, 1, 2].map("
@@ -198,14 +204,16 @@ def test_colours_follow_the_view_while_it_moves_and_are_complete_when_it_stands(
     assert max(turned) < 0.05
 
 
-def test_a_lost_device_comes_back_with_the_same_view(browser: Browser, tmp_path: Path):
-    model = made_up(300)
-    loaded(browser, tmp_path, page_of(model))
-    run(browser, "window.device = hyrfpack.player.renderer.gl.getExtension('WEBGL_lose_context');")
+def test_a_restored_device_shows_the_same_view(browser: Browser, tmp_path: Path):
+    model = random_model(300)
+    load_page(browser, tmp_path, make_model_page(model))
+    run_statements(browser, "window.device = hyrfpack.player.renderer.gl.getExtension('WEBGL_lose_context');")
     browser.drag((120, 90), (160, 100))
-    settled(browser)
+    wait_until_complete(browser)
     before = browser.evaluate("JSON.stringify(hyrfpack.camera())")
-    run(browser, "window.said = []; hyrfpack.player.addEventListener('remark', ({detail}) => said.push(detail));")
+    run_statements(
+        browser, "window.said = []; hyrfpack.player.addEventListener('remark', ({detail}) => said.push(detail));"
+    )
     made = []
     for _ in range(8):
         browser.evaluate(
@@ -214,19 +222,19 @@ def test_a_lost_device_comes_back_with_the_same_view(browser: Browser, tmp_path:
             "player.addEventListener('loaded', () => resolve(true), {once: true});"
             "device.loseContext(); })"
         )
-        settled(browser)
+        wait_until_complete(browser)
         assert browser.evaluate("JSON.stringify(hyrfpack.camera())") == before
         sizes = "hyrfpack.player.renderer.graphics.made.size, hyrfpack.player.renderer.content.graphics.made.size"
         made.append(browser.evaluate(f"[{sizes}]"))
     assert "taken away" in browser.evaluate("said[0]") and browser.evaluate("said.at(-1)") == ""
-    # Nothing is left behind; how much is there when it is asked differs by what the last picture needed.
+    # The counts must not grow; they vary a little with what the last picture needed.
     assert all(last - first < 5 for first, last in zip(made[0], made[-1], strict=True)), made
-    camera = cameras()[0]
-    assert psnr(shown(browser, camera), rendered(model, camera)) > 45
+    camera = make_cameras()[0]
+    assert psnr(render_in_page(browser, camera), render_reference(model, camera)) > 45
 
 
-def taken_away(browser: Browser) -> None:
-    """The device is taken away and comes back."""
+def lose_and_restore_device(browser: Browser) -> None:
+    """Make the browser lose the WebGL device and restore it."""
     browser.evaluate(
         "new Promise((resolve) => { const { player } = hyrfpack;"
         "const device = player.renderer.gl.getExtension('WEBGL_lose_context'), back = () => device.restoreContext();"
@@ -234,15 +242,15 @@ def taken_away(browser: Browser) -> None:
         "player.addEventListener('loaded', () => resolve(true), {once: true});"
         "device.loseContext(); })"
     )
-    settled(browser)
+    wait_until_complete(browser)
 
 
 @pytest.mark.in_turn
-def test_many_files_opened_one_after_the_other_leave_nothing_behind(browser: Browser, tmp_path: Path):
-    model = made_up(200)
-    loaded(browser, tmp_path, page_of(model))
+def test_opening_many_files_leaks_no_webgl_objects(browser: Browser, tmp_path: Path):
+    model = random_model(200)
+    load_page(browser, tmp_path, make_model_page(model))
     file = base64.b64encode(encode_model(model)).decode()
-    run(
+    run_statements(
         browser,
         f"window.file = Uint8Array.from(atob('{file}'), (c) => c.charCodeAt(0));"
         "window.count = 0; for (const kind of ['Texture', 'Buffer', 'Framebuffer', 'Program']) {"
@@ -261,52 +269,55 @@ def test_many_files_opened_one_after_the_other_leave_nothing_behind(browser: Bro
     assert browser.evaluate("hyrfpack.player.scene.count") == 200
 
 
-PATCHED = "const proto = WebGL2RenderingContext.prototype; "
-NO_TEXELS = PATCHED + (
+WEBGL_PROTOTYPE_JS = "const proto = WebGL2RenderingContext.prototype; "
+SMALL_TEXTURES_JS = WEBGL_PROTOTYPE_JS + (
     "const ask = proto.getParameter; "
     "proto.getParameter = function (name) { return name === this.MAX_TEXTURE_SIZE ? 128 : ask.call(this, name); }"
 )
-NO_MEMORY = PATCHED + (
+OUT_OF_MEMORY_JS = WEBGL_PROTOTYPE_JS + (
     "const { texStorage3D, getError } = proto; let times = 0; "
     "proto.texStorage3D = function (...all) { times += all[3] > 1; texStorage3D.apply(this, all); }; "
     "proto.getError = function () { return times === 1 && times++ ? 0x0505 : getError.call(this); };"
 )
-REFUSED = PATCHED + (
+SHADER_ERROR_JS = WEBGL_PROTOTYPE_JS + (
     "const { shaderSource } = proto; proto.shaderSource = function (shader, text) {"
     "  shaderSource.call(this, shader, text.includes('u_half_extent') ? 'no' : text); };"
 )
-SAYING = (
+RECORD_REMARK_JS = (
     "; { const tell = EventTarget.prototype.dispatchEvent; EventTarget.prototype.dispatchEvent = function (event) {"
     "  if (event.type === 'remark') window.said = event.detail; return tell.call(this, event); }; }"
 )
 
 
-@pytest.mark.parametrize("script", ["", NO_TEXELS, NO_MEMORY, REFUSED], ids=["asked", "texels", "memory", "driver"])
+@pytest.mark.parametrize(
+    "script", ["", SMALL_TEXTURES_JS, OUT_OF_MEMORY_JS, SHADER_ERROR_JS], ids=["asked", "texels", "memory", "driver"]
+)
 def test_a_weak_device_draws_fitted_harmonics(browser: Browser, tmp_path: Path, script: str):
-    wide = {"radiance": replace(SIXTEEN, log2_table_size=15)} if script == NO_TEXELS else {}  # more than 128 rows
-    model = made_up(400, **wide)
-    with torch.no_grad():  # colours that degree 3 can hold
+    # The tables need more than 128 rows.
+    wide = {"radiance": replace(SIXTEEN_LEVEL_GRID, log2_table_size=15)} if script == SMALL_TEXTURES_JS else {}
+    model = random_model(400, **wide)
+    with torch.no_grad():  # degree 3 can represent such colours
         model.radiance.weights[0][:, model.radiance.grid.feature_count :] *= 0.1
-    page_bytes = page_of(model)
+    page_bytes = make_model_page(model)
     if not script:
         page_bytes = page_bytes.replace(b'{"kind": "hyrf"', b'{"plain": true, "kind": "hyrf"')
-    with browser.before_every_page(script + SAYING):
-        loaded(browser, tmp_path, page_bytes)
+    with browser.before_every_page(script + RECORD_REMARK_JS):
+        load_page(browser, tmp_path, page_bytes)
         assert not script or browser.evaluate("said").startswith("Drawn with harmonics: ")
-        if script:  # and it is said again when the device was gone
-            taken_away(browser)
+        if script:  # the remark appears again after the device was lost
+            lose_and_restore_device(browser)
             assert browser.evaluate("said").startswith("Drawn with harmonics: ")
         assert browser.evaluate("Boolean(hyrfpack.player.renderer.content.harmonics)")
-        scores = [psnr(shown(browser, camera), rendered(model, camera)) for camera in cameras()]
+        scores = [psnr(render_in_page(browser, camera), render_reference(model, camera)) for camera in make_cameras()]
     assert min(scores) > 28 and browser.list_errors() == [], scores
 
 
 @pytest.mark.in_turn
-def test_the_first_layer_is_seen_while_the_rest_comes(browser: Browser, tmp_path: Path):
-    model, data = made_up(200), encode(made_up(14000), "compact")
-    loaded(browser, tmp_path, page_of(model))
+def test_the_first_layer_is_shown_while_the_rest_is_loading(browser: Browser, tmp_path: Path):
+    model, data = random_model(200), encode(random_model(14000), "compact")
+    load_page(browser, tmp_path, make_model_page(model))
     file = base64.b64encode(data).decode()
-    run(
+    run_statements(
         browser,
         f"window.file = Uint8Array.from(atob('{file}'), (c) => c.charCodeAt(0));"
         "window.seen = []; window.rest = null; const { player } = hyrfpack;"
@@ -321,14 +332,14 @@ def test_the_first_layer_is_seen_while_the_rest_comes(browser: Browser, tmp_path
     )
     first, last = browser.evaluate("seen")
     assert 0 < first < last == 14000
-    settled(browser)
+    wait_until_complete(browser)
     assert browser.evaluate("hyrfpack.player.whole") and browser.evaluate("counted") == 14000
 
 
-def test_a_device_lost_while_a_file_comes_in_is_made_up_for(browser: Browser, tmp_path: Path):
-    model = made_up(3000)
+def test_a_device_lost_while_a_file_is_loading_is_restored(browser: Browser, tmp_path: Path):
+    model = random_model(3000)
     file = tmp_path / "page.html"
-    file.write_bytes(page_of(model))
+    file.write_bytes(make_model_page(model))
     script = (
         "addEventListener('DOMContentLoaded', () => { const canvas = document.getElementById('view'), "
         "device = canvas.getContext('webgl2').getExtension('WEBGL_lose_context'); "
@@ -339,104 +350,106 @@ def test_a_device_lost_while_a_file_comes_in_is_made_up_for(browser: Browser, tm
     with browser.before_every_page(script):
         browser.open(file.as_uri())
         browser.evaluate("hyrfpack.ready")
-        until(browser, "window.restored === true")  # a small file may be loaded before the device is lost
-        settled(browser)
-        camera = cameras()[0]
-        assert psnr(shown(browser, camera), rendered(model, camera)) > 45
+        wait_until(browser, "window.restored === true")  # a small file may be loaded before the device is lost
+        wait_until_complete(browser)
+        camera = make_cameras()[0]
+        assert psnr(render_in_page(browser, camera), render_reference(model, camera)) > 45
 
 
 @pytest.mark.in_turn
 def test_scripts_may_dispose_of_a_player(browser: Browser, tmp_path: Path):
-    loaded(browser, tmp_path, page_of(made_up(50)))
+    load_page(browser, tmp_path, make_model_page(random_model(50)))
     browser.evaluate("hyrfpack.player.dispose()")
     assert browser.evaluate("hyrfpack.player.renderer.gl.isContextLost()")
     assert browser.list_errors() == []
 
 
 @pytest.mark.in_turn
-def test_a_damaged_file_is_refused_in_a_sentence(browser: Browser, tmp_path: Path):
-    data = bytearray(encode_model(made_up(50)))
+def test_a_damaged_file_is_refused_with_one_sentence(browser: Browser, tmp_path: Path):
+    data = bytearray(encode_model(random_model(50)))
     data[-20] ^= 1
     file = tmp_path / "page.html"
-    file.write_bytes(page_of(made_up(50), bytes(data)))
+    file.write_bytes(make_model_page(random_model(50), bytes(data)))
     browser.open(file.as_uri())
     said = browser.evaluate("hyrfpack.ready.then(() => '', (error) => error.message)")
     assert "cannot be unpacked" in said and "\n" not in said
 
 
-def keep_file(browser: Browser, data: bytes) -> None:
+def store_file_in_page(browser: Browser, data: bytes) -> None:
     file = base64.b64encode(data).decode()
-    run(browser, f"window.file = Uint8Array.from(atob('{file}'), (c) => c.charCodeAt(0));")
+    run_statements(browser, f"window.file = Uint8Array.from(atob('{file}'), (c) => c.charCodeAt(0));")
 
 
-def failing(browser: Browser, stream: str, name: str = "x.hyrf") -> str:
-    """With what a file fails, the statements of a generator giving its bytes; "" if it does not."""
+def open_file_error(browser: Browser, stream: str, name: str = "x.hyrf") -> str:
+    """Open a file from a generator with these statements; return the error message, or "" without an error."""
     opening = f"hyrfpack.player.open({{ name: '{name}', stream: (async function* () {{ {stream} }})() }})"
     return browser.evaluate(f"{opening}.then(() => '', (error) => error.message)")
 
 
-def test_what_is_drawn_of_a_broken_download_survives_the_loss_of_the_device(one_browser: Browser, tmp_path: Path):
-    loaded(one_browser, tmp_path, page_of(made_up(50)))
-    keep_file(one_browser, encode(made_up(14000), "compact"))
-    run(one_browser, "window.seen = new Promise((resolve) => hyrfpack.player.addEventListener('loaded', resolve));")
-    said = failing(
+def test_a_partly_loaded_scene_survives_the_loss_of_the_device(one_browser: Browser, tmp_path: Path):
+    load_page(one_browser, tmp_path, make_model_page(random_model(50)))
+    store_file_in_page(one_browser, encode(random_model(14000), "compact"))
+    run_statements(
+        one_browser, "window.seen = new Promise((resolve) => hyrfpack.player.addEventListener('loaded', resolve));"
+    )
+    said = open_file_error(
         one_browser,
         "yield file.slice(0, Math.floor(0.9 * file.length)); await seen; throw new Error('the connection broke');",
     )
     assert "the connection broke" in said
-    settled(one_browser)
+    wait_until_complete(one_browser)
     count = one_browser.evaluate("hyrfpack.player.renderer.content.count")
-    taken_away(one_browser)
+    lose_and_restore_device(one_browser)
     assert one_browser.evaluate("hyrfpack.player.renderer.content.count") == count < 14000
 
 
-def test_a_file_is_refused_as_soon_as_its_header_makes_no_sense(one_browser: Browser, tmp_path: Path):
-    data = encode_model(made_up(50))
-    loaded(one_browser, tmp_path, page_of(made_up(50)))
-    keep_file(one_browser, data[:20] + bytes([data[20] ^ 1]) + data[21:])
-    assert "checksum of the header" in failing(one_browser, "yield file; await new Promise(() => {});")
-    keep_file(one_browser, data + bytes(8))
-    assert "bytes and there are" in failing(one_browser, "yield file; await new Promise(() => {});")
-    keep_file(one_browser, data)
-    run(one_browser, "window.ended = new Promise((resolve) => (window.end = resolve));")
+def test_a_file_with_an_invalid_header_is_refused_before_the_rest_arrives(one_browser: Browser, tmp_path: Path):
+    data = encode_model(random_model(50))
+    load_page(one_browser, tmp_path, make_model_page(random_model(50)))
+    store_file_in_page(one_browser, data[:20] + bytes([data[20] ^ 1]) + data[21:])
+    assert "checksum of the header" in open_file_error(one_browser, "yield file; await new Promise(() => {});")
+    store_file_in_page(one_browser, data + bytes(8))
+    assert "bytes and there are" in open_file_error(one_browser, "yield file; await new Promise(() => {});")
+    store_file_in_page(one_browser, data)
+    run_statements(one_browser, "window.ended = new Promise((resolve) => (window.end = resolve));")
     endless = (
         "try { for (;;) { yield file.slice(); await new Promise((go) => setTimeout(go, 10)); } } finally { end(); }"
     )
-    assert "bytes and there are" in failing(one_browser, endless)
+    assert "bytes and there are" in open_file_error(one_browser, endless)
     one_browser.evaluate("ended.then(() => true)")
     assert one_browser.evaluate("hyrfpack.player.scene.count") == 50
 
 
-def test_files_in_many_pieces_are_joined_once(one_browser: Browser, tmp_path: Path):
-    loaded(one_browser, tmp_path, page_of(made_up(50)))
+def test_a_file_in_many_pieces_is_joined_in_linear_time(one_browser: Browser, tmp_path: Path):
+    load_page(one_browser, tmp_path, make_model_page(random_model(50)))
     began = time.monotonic()
-    said = failing(one_browser, "for (let k = 0; k < 1024; k++) yield new Uint8Array(1 << 16);", "x.splat")
+    said = open_file_error(one_browser, "for (let k = 0; k < 1024; k++) yield new Uint8Array(1 << 16);", "x.splat")
     assert ".hyrf files only" in said and time.monotonic() - began < 4
 
 
-def test_a_file_that_cannot_be_shown_leaves_all_as_it_was(one_browser: Browser, tmp_path: Path):
-    model = made_up(300)
-    loaded(one_browser, tmp_path, page_of(model))
-    keep_file(one_browser, encode_model(made_up(500)))
-    run(
+def test_a_file_that_cannot_be_shown_leaves_the_scene_unchanged(one_browser: Browser, tmp_path: Path):
+    model = random_model(300)
+    load_page(one_browser, tmp_path, make_model_page(model))
+    store_file_in_page(one_browser, encode_model(random_model(500)))
+    run_statements(
         one_browser,
         "const { player } = hyrfpack; window.kept = JSON.stringify(hyrfpack.camera());window.Loaded = player.loader;",
     )
-    # The fields are refused, then the harmonics in their place.
-    run(one_browser, "const { renderer } = hyrfpack.player, no = () => { throw new Error('no memory'); };"
+    # First the fields are refused, then the harmonics that replace them.
+    run_statements(one_browser, "const { renderer } = hyrfpack.player, no = () => { throw new Error('no memory'); };"
                      "renderer.stage = no;")  # fmt: skip
-    assert "no memory" in failing(one_browser, "yield file;")
+    assert "no memory" in open_file_error(one_browser, "yield file;")
     assert one_browser.evaluate("hyrfpack.player.scene.count === 300 && hyrfpack.player.loader === Loaded")
     assert one_browser.evaluate("JSON.stringify(hyrfpack.camera()) === kept && hyrfpack.player.next === null")
     assert one_browser.evaluate("document.getElementById('remark').hidden")
-    run(one_browser, "delete hyrfpack.player.renderer.stage;")
-    camera = cameras()[0]
-    assert psnr(shown(one_browser, camera), rendered(model, camera)) > 45
+    run_statements(one_browser, "delete hyrfpack.player.renderer.stage;")
+    camera = make_cameras()[0]
+    assert psnr(render_in_page(one_browser, camera), render_reference(model, camera)) > 45
 
 
-def test_the_pages_own_scene_comes_when_a_file_that_was_opened_meanwhile_fails(one_browser: Browser, tmp_path: Path):
+def test_the_pages_own_scene_is_shown_when_another_file_fails_to_open(one_browser: Browser, tmp_path: Path):
     file = tmp_path / "page.html"
-    file.write_bytes(page_of(made_up(3000)))
+    file.write_bytes(make_model_page(random_model(3000)))
     script = (
         "addEventListener('DOMContentLoaded', () => setTimeout(() => { window.bad = hyrfpack.player.open("
         "{ name: 'bad.hyrf', stream: (async function* () { yield new Uint8Array(100); })() })"
@@ -445,15 +458,15 @@ def test_the_pages_own_scene_comes_when_a_file_that_was_opened_meanwhile_fails(o
     with one_browser.before_every_page(script):
         one_browser.open(file.as_uri())
         one_browser.evaluate("hyrfpack.ready")
-        settled(one_browser)
+        wait_until_complete(one_browser)
         assert "bad.hyrf cannot be opened" in one_browser.evaluate("bad")
         assert one_browser.evaluate("hyrfpack.player.renderer.content.count") == 3000
 
 
-def test_a_file_opened_before_the_pages_own_is_there_takes_its_place(one_browser: Browser, tmp_path: Path):
+def test_a_file_opened_before_the_pages_own_scene_is_loaded_replaces_it(one_browser: Browser, tmp_path: Path):
     file = tmp_path / "page.html"
-    file.write_bytes(page_of(made_up(3000)))
-    other = base64.b64encode(encode_model(made_up(70))).decode()
+    file.write_bytes(make_model_page(random_model(3000)))
+    other = base64.b64encode(encode_model(random_model(70))).decode()
     script = (
         f"const other = Uint8Array.from(atob('{other}'), (c) => c.charCodeAt(0));"
         "addEventListener('DOMContentLoaded', () => setTimeout(() => { window.good = hyrfpack.player.open("
@@ -461,15 +474,15 @@ def test_a_file_opened_before_the_pages_own_is_there_takes_its_place(one_browser
     )
     with one_browser.before_every_page(script):
         one_browser.open(file.as_uri())
-        one_browser.evaluate("hyrfpack.ready")  # no error
+        one_browser.evaluate("hyrfpack.ready")  # raises no error
         assert one_browser.evaluate("good")
-        settled(one_browser)
+        wait_until_complete(one_browser)
         assert one_browser.evaluate("hyrfpack.player.renderer.content.count") == 70
 
 
-def test_a_device_that_was_away_between_two_looks_at_it_is_noticed(one_browser: Browser, tmp_path: Path):
+def test_a_device_lost_and_restored_between_two_checks_is_noticed(one_browser: Browser, tmp_path: Path):
     file = tmp_path / "page.html"
-    file.write_bytes(page_of(made_up(3000)))
+    file.write_bytes(make_model_page(random_model(3000)))
     script = (
         "const wait = setTimeout; window.setTimeout = (work, ms) => wait(work, ms === 4 ? 100 : ms);"
         "addEventListener('DOMContentLoaded', () => { const canvas = document.getElementById('view'), "
@@ -485,12 +498,12 @@ def test_a_device_that_was_away_between_two_looks_at_it_is_noticed(one_browser: 
         assert one_browser.evaluate("window.lost")
 
 
-def test_pictures_asked_for_while_another_file_comes_end(one_browser: Browser, tmp_path: Path):
-    loaded(one_browser, tmp_path, page_of(made_up(300)))
-    keep_file(one_browser, encode_model(made_up(200)))
+def test_pictures_requested_while_another_file_is_loading_finish(one_browser: Browser, tmp_path: Path):
+    load_page(one_browser, tmp_path, make_model_page(random_model(300)))
+    store_file_in_page(one_browser, encode_model(random_model(200)))
     opening = "hyrfpack.player.open({ name: 'x.hyrf', stream: (async function* () { yield file; })() })"
     ask = "hyrfpack.player.show(camera).then(() => 'drawn', (error) => error.message)"
-    run(one_browser, f"window.answers = []; window.camera = hyrfpack.camera(); window.opening = {opening};")
+    run_statements(one_browser, f"window.answers = []; window.camera = hyrfpack.camera(); window.opening = {opening};")
     many = f"(async () => {{ for (let k = 0; k < 40; k++) answers.push(await {ask}); return answers; }})()"
     assert set(one_browser.evaluate(many)) <= {"drawn", one_browser.evaluate("answers.find((a) => a !== 'drawn')")}
     one_browser.evaluate("opening.then(() => true)")
@@ -498,7 +511,7 @@ def test_pictures_asked_for_while_another_file_comes_end(one_browser: Browser, t
     assert one_browser.evaluate(f"(() => {{ {sort} player.loader.dispose(); return sorted; }})()") is None
 
 
-WRONG = {
+INVALID_CAMERA_FIELDS = {
     "needs width": "camera_from_world: [camera_from_world.slice(0, 3).flat()]",
     "fx and fy": "fx: -100",
     "rotation": "camera_from_world: camera_from_world.map((row) => row.map((value) => 2 * value))",
@@ -507,27 +520,27 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize("sentence", WRONG)
-def test_cameras_that_make_no_sense_are_refused(one_browser: Browser, tmp_path: Path, sentence: str):
-    loaded(one_browser, tmp_path, page_of(made_up(50)))
+@pytest.mark.parametrize("sentence", INVALID_CAMERA_FIELDS)
+def test_invalid_cameras_are_refused(one_browser: Browser, tmp_path: Path, sentence: str):
+    load_page(one_browser, tmp_path, make_model_page(random_model(50)))
     before = one_browser.evaluate("JSON.stringify(hyrfpack.camera())")
     ask = "(({ camera_from_world, ...more }) => hyrfpack.player.show({ ...more, camera_from_world, %s }))"
-    said = f"{ask % WRONG[sentence]}(hyrfpack.camera()).then(() => '', (error) => error.message)"
+    said = f"{ask % INVALID_CAMERA_FIELDS[sentence]}(hyrfpack.camera()).then(() => '', (error) => error.message)"
     assert sentence in one_browser.evaluate(said)
     assert one_browser.evaluate("JSON.stringify(hyrfpack.camera())") == before
 
 
-def test_photos_may_be_larger_than_pictures_that_are_drawn(one_browser: Browser, tmp_path: Path):
-    model = made_up(50)
-    large = [replace(camera, width=12000, height=9000) for camera in cameras()]
-    facts = {"count": 50, "frame": FRAME, "solid": model.config.solid, "up": UP, "center": CENTER}
-    loaded(one_browser, tmp_path, encode_model_page(encode_model(model), title="large", cameras=large, **facts))
+def test_cameras_may_be_larger_than_the_largest_picture(one_browser: Browser, tmp_path: Path):
+    model = random_model(50)
+    large = [replace(camera, width=12000, height=9000) for camera in make_cameras()]
+    facts = {"count": 50, "frame": MODEL_FRAME, "solid": model.config.solid, "up": UP_DIRECTION, "center": SCENE_CENTER}
+    load_page(one_browser, tmp_path, encode_model_page(encode_model(model), title="large", cameras=large, **facts))
     assert one_browser.evaluate("hyrfpack.player.cameras[0].width") == 12000
 
 
-def test_a_large_picture_keeps_no_memory(one_browser: Browser, tmp_path: Path):
-    loaded(one_browser, tmp_path, page_of(made_up(50)))
-    camera = replace(cameras()[0], width=1200, height=900)
-    one_browser.evaluate(f"hyrfpack.show({json_of(camera)}).then(() => true)")
-    settled(one_browser)
+def test_a_large_picture_releases_its_memory(one_browser: Browser, tmp_path: Path):
+    load_page(one_browser, tmp_path, make_model_page(random_model(50)))
+    camera = replace(make_cameras()[0], width=1200, height=900)
+    one_browser.evaluate(f"hyrfpack.show({camera_json(camera)}).then(() => true)")
+    wait_until_complete(one_browser)
     assert max(one_browser.evaluate("hyrfpack.player.renderer.reserved")) < 900

@@ -1,4 +1,4 @@
-"""The page's file: whole, small and safe, whatever is inside; what is put in comes out."""
+"""The encoded page is reproducible, small and safe, and its content can be extracted again."""
 
 from __future__ import annotations
 
@@ -23,91 +23,100 @@ from hyrfpack.splats.splats import Splats, normalized_quats
 from hyrfpack.web.html import decode_splats_page, encode_model_page, encode_splats_page, extract_payload
 from hyrfpack.web.player import assemble_player_page, encode_player
 
-UP, CENTER = np.array([0.0, -1.0, 0.0]), np.array([1000.0, -50.0, 20.0])
-FRAME = Frame((1000.0, -50.0, 20.0), 4.0, (1.0, 1.0, 1.0))
-TITLE = '</title><script>alert("x")</script>{{script}}'
-PAGE_BYTES = 90_000  # of a page besides its file in base64
+UP_DIRECTION, SCENE_CENTER = np.array([0.0, -1.0, 0.0]), np.array([1000.0, -50.0, 20.0])
+SCENE_FRAME = Frame((1000.0, -50.0, 20.0), 4.0, (1.0, 1.0, 1.0))
+HOSTILE_TITLE = '</title><script>alert("x")</script>{{script}}'
+MAX_PAGE_OVERHEAD_BYTES = 90_000
 
 
-def cloud(count: int = 1500) -> Splats:
-    """Splats of all shapes around CENTER, far from the origin."""
+def random_splats(count: int = 1500) -> Splats:
+    """Return splats of all shapes around SCENE_CENTER, far from the origin."""
     rng = np.random.default_rng(1)
     harmonics = rng.normal(size=(count, 16, 3)) * np.array([0.8] + [0.12] * 15)[:, None]
     shapes = np.exp(rng.normal(-3.3, 0.8, (count, 3))), normalized_quats(rng.normal(size=(count, 4)))
-    return Splats(CENTER + rng.normal(size=(count, 3)) * 0.5, *shapes, rng.uniform(size=count), harmonics)
+    return Splats(SCENE_CENTER + rng.normal(size=(count, 3)) * 0.5, *shapes, rng.uniform(size=count), harmonics)
 
 
-def stage(**more: object) -> dict:
-    pose = look_at(CENTER + np.array([1.5, -0.75, -1.8]), CENTER, UP)
+def page_settings(**more: object) -> dict:
+    pose = look_at(SCENE_CENTER + np.array([1.5, -0.75, -1.8]), SCENE_CENTER, UP_DIRECTION)
     cameras = [Camera(120, 90, 110.0, 110.0, 60.0, 45.0, pose)]
-    return {"title": "a scene", "cameras": cameras, "up": UP, "center": CENTER, "solid": (0.2, 0.3, 0.1), **more}
+    return {
+        "title": "a scene",
+        "cameras": cameras,
+        "up": UP_DIRECTION,
+        "center": SCENE_CENTER,
+        "solid": (0.2, 0.3, 0.1),
+        **more,
+    }
 
 
-def baked(splats: Splats | None = None, **more: object) -> bytes:
+def encode_baked_page(splats: Splats | None = None, **more: object) -> bytes:
     return encode_splats_page(
-        cloud() if splats is None else splats, **stage(**{"near": 0.01, "background": None, **more})
+        random_splats() if splats is None else splats, **page_settings(**{"near": 0.01, "background": None, **more})
     )
 
 
-def native(data: bytes = b"a model", **more: object) -> bytes:
-    return encode_model_page(data, count=1234, frame=FRAME, **stage(**more))
+def encode_native_page(data: bytes = b"a model", **more: object) -> bytes:
+    return encode_model_page(data, count=1234, frame=SCENE_FRAME, **page_settings(**more))
 
 
-def packed_texts(page: bytes) -> dict[str, str]:
-    """The player's scripts and shaders, unpacked."""
+def unpack_scripts_and_shaders(page: bytes) -> dict[str, str]:
+    """Return the player's scripts and shaders by name."""
     (packed,) = re.findall(rb'id="player">([^<]*)<', page)
     return json.loads(gzip.decompress(base64.b64decode(packed)))
 
 
-def policy(page: bytes) -> dict[str, str]:
+def parse_policy(page: bytes) -> dict[str, str]:
     (content,) = re.findall(rb'http-equiv="Content-Security-Policy" content="([^"]*)"', page)
     return dict(directive.split(" ", 1) for directive in content.decode().split("; "))
 
 
-PAGES = {
-    "native": lambda: native(title=TITLE, poster=b"picture"),
-    "baked": lambda: baked(title=TITLE, poster=b"picture", background=np.full((4, 8, 3), 0.5)),
-    "player": lambda: encode_player(TITLE, content="scene.hyrf", poster="poster.jpg", description=TITLE),
-    "served": lambda: encode_player(TITLE, content="scene.hyrf", fetches="'self'"),
+PAGE_ENCODERS = {
+    "native": lambda: encode_native_page(title=HOSTILE_TITLE, poster=b"picture"),
+    "baked": lambda: encode_baked_page(title=HOSTILE_TITLE, poster=b"picture", background=np.full((4, 8, 3), 0.5)),
+    "player": lambda: encode_player(
+        HOSTILE_TITLE, content="scene.hyrf", poster="poster.jpg", description=HOSTILE_TITLE
+    ),
+    "served": lambda: encode_player(HOSTILE_TITLE, content="scene.hyrf", fetches="'self'"),
 }
 
 
-@pytest.mark.parametrize("kind", PAGES)
-def test_a_page_is_the_same_bytes_each_time_and_runs_only_what_its_policy_names(kind):
-    page = PAGES[kind]()
-    assert page == PAGES[kind]()
+@pytest.mark.parametrize("kind", PAGE_ENCODERS)
+def test_a_page_is_reproducible_and_runs_only_scripts_in_its_policy(kind):
+    page = PAGE_ENCODERS[kind]()
+    assert page == PAGE_ENCODERS[kind]()
     (script,) = re.findall(r"<script>(.*?)</script>", page.decode(), re.DOTALL)
-    allowed = policy(page)
+    allowed = parse_policy(page)
     hashes = [base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in (
         script,
-        packed_texts(page)["main.js"],
+        unpack_scripts_and_shaders(page)["main.js"],
     )]  # fmt: skip
     assert allowed["script-src"] == " ".join(f"'sha256-{value}'" for value in hashes)
     assert allowed["default-src"] == "'none'" and "unsafe" not in str(allowed)
     assert not re.search(r"\son\w+=", page.decode()), "an inline handler"
 
 
-@pytest.mark.parametrize("kind", PAGES)
-def test_a_title_cannot_break_out_of_the_page(kind):
-    text = PAGES[kind]().decode()
+@pytest.mark.parametrize("kind", PAGE_ENCODERS)
+def test_a_hostile_title_is_escaped(kind):
+    text = PAGE_ENCODERS[kind]().decode()
     assert '<script>alert("x")' not in text and "&lt;script&gt;alert" in text and "{{script}}" in text
 
 
 @pytest.mark.parametrize("kind", ["native", "baked"])
-def test_a_page_with_a_scene_inside_names_no_other_file_and_may_fetch_nothing(kind):
-    page = PAGES[kind]()
+def test_a_page_with_a_scene_inside_refers_to_no_other_file_and_may_not_fetch(kind):
+    page = PAGE_ENCODERS[kind]()
     assert not re.search(rb'(src|href)="(?!data:)', page) and b"og:image" not in page
-    assert not re.search(r"import\(|\bhttps?://", "".join(packed_texts(page).values()))
-    assert "connect-src" not in policy(page) and policy(page)["img-src"] == "data: blob:"
+    assert not re.search(r"import\(|\bhttps?://", "".join(unpack_scripts_and_shaders(page).values()))
+    assert "connect-src" not in parse_policy(page) and parse_policy(page)["img-src"] == "data: blob:"
 
 
-def test_a_player_may_fetch_what_its_address_names_and_a_served_one_only_from_its_server():
-    hosted, served = policy(PAGES["player"]()), policy(PAGES["served"]())
+def test_a_hosted_player_may_fetch_from_the_web_and_a_served_one_only_from_its_server():
+    hosted, served = parse_policy(PAGE_ENCODERS["player"]()), parse_policy(PAGE_ENCODERS["served"]())
     assert hosted["connect-src"] == "'self' https: http:" and hosted["img-src"] == "'self' https: http: data: blob:"
     assert served["connect-src"] == "'self'" and served["img-src"] == "'self' data: blob:"
 
 
-def test_a_player_is_told_what_lies_beside_it():
+def test_a_player_page_refers_to_its_content_and_poster():
     page = encode_player("room", content="scene.hyrf", poster="poster.jpg", description="a & b").decode()
     assert (
         '<script type="text/plain" id="content">{"content": "scene.hyrf", "title": "room", "stages": {}}</script>'
@@ -121,49 +130,49 @@ def test_a_player_is_told_what_lies_beside_it():
 
 
 @pytest.mark.parametrize(("readers", "most"), [(False, 51_800), (True, 59_400)])
-def test_the_player_alone_is_small(readers, most):
+def test_the_compressed_player_stays_below_its_size_limit(readers, most):
     assert len(gzip.compress(assemble_player_page("hyrfpack", [], "a player", readers=readers))) <= most
 
 
-def test_a_native_page_is_little_more_than_its_file():
+def test_a_native_page_adds_at_most_90_kb_to_its_file_in_base64():
     data = np.random.default_rng(0).bytes(86_000)
-    assert len(native(data, poster=bytes(9_000))) <= len(data) * 4 / 3 + PAGE_BYTES
+    assert len(encode_native_page(data, poster=bytes(9_000))) <= len(data) * 4 / 3 + MAX_PAGE_OVERHEAD_BYTES
 
 
 @pytest.mark.parametrize("length", [0, 1, 2, 3, 1000, 10_000])
-def test_the_file_inside_a_native_page_is_the_file(length, monkeypatch):
+def test_extract_payload_returns_the_file_inside_a_native_page(length, monkeypatch):
     monkeypatch.setattr("hyrfpack.web.player.PAYLOAD_BLOCK_BYTES", 3000)
     data = np.random.default_rng(0).bytes(length)
-    page = native(data)
+    page = encode_native_page(data)
     scene, inside = extract_payload(page, "page")
     assert inside == data and page.count(b'class="payload"') == -(-length // 3000)
     assert (scene["kind"], scene["title"], scene["count"], len(scene["cameras"])) == ("hyrf", "a scene", 1234, 1)
     assert (scene["center"], scene["unit"], scene["near"]) == ([1000.0, -50.0, 20.0], 4.0, 0.01)
 
 
-def test_a_poster_is_in_the_page():
+def test_a_poster_is_embedded_in_the_page():
     file = io.BytesIO()
     Image.new("RGB", (8, 4)).save(file, "WEBP")
     (address,) = re.findall(
-        rb'<img id="poster" alt="" src="data:image/webp;base64,([^"]*)"', native(poster=file.getvalue())
+        rb'<img id="poster" alt="" src="data:image/webp;base64,([^"]*)"', encode_native_page(poster=file.getvalue())
     )
     assert base64.b64decode(address) == file.getvalue()
 
 
-@pytest.mark.parametrize("page", [native, baked])
-def test_a_page_needs_a_camera(page):
+@pytest.mark.parametrize("encode_page", [encode_native_page, encode_baked_page])
+def test_a_page_without_cameras_is_refused(encode_page):
     with pytest.raises(ValueError, match="camera"):
-        page(cameras=[])
+        encode_page(cameras=[])
 
 
 # --- splats -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_page_holds_its_splats_as_finely_as_spz_far_from_the_origin_and_in_any_unit():
+def test_a_page_stores_splats_with_the_precision_of_spz_in_any_unit_and_place():
     for factor in (1e-6, 1.0, 1e6):
-        splats = cloud(300)
+        splats = random_splats(300)
         splats = replace(splats, positions=splats.positions * factor, scales=splats.scales * np.float32(factor))
-        back, _ = decode_splats_page(baked(splats), "page")
+        back, _ = decode_splats_page(encode_baked_page(splats), "page")
         extent = np.ptp(splats.positions, axis=0).max()
         assert np.abs(back.positions - splats.positions).max() < extent * 2**-21
         assert np.abs(np.log(back.scales / splats.scales)).max() < 1 / 31
@@ -171,20 +180,22 @@ def test_a_page_holds_its_splats_as_finely_as_spz_far_from_the_origin_and_in_any
         assert back.degree == 3
 
 
-def test_many_splats_come_in_blocks_that_unpack_apart(monkeypatch: pytest.MonkeyPatch):
+def test_many_splats_are_stored_in_separate_blocks(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("hyrfpack.web.player.PAYLOAD_BLOCK_BYTES", 3000)
-    page = baked()
+    page = encode_baked_page()
     assert page.count(b'class="payload"') > 10 and len(decode_splats_page(page, "page")[0]) == 1500
 
 
-@pytest.mark.parametrize("data", [b"", b"<html>", b'<script type="text/plain" id="scene">{}</script>', native()])
-def test_what_is_no_page_of_splats_is_refused_in_one_sentence(data: bytes):
+@pytest.mark.parametrize(
+    "data", [b"", b"<html>", b'<script type="text/plain" id="scene">{}</script>', encode_native_page()]
+)
+def test_other_files_than_pages_of_splats_are_refused(data: bytes):
     with pytest.raises(HyrfDataError, match=r"^x\.html: this is not a page"):
         decode_splats_page(data, "x.html")
 
 
-def test_damaged_pages_give_splats_or_one_sentence():
-    page = baked(cloud(20))
+def test_damaged_pages_are_decoded_or_refused_in_one_line():
+    page = encode_baked_page(random_splats(20))
     rng = np.random.default_rng(0)
     places = [match.span(1) for match in re.finditer(rb'(?:id="scene"|class="payload")>([^<]*)<', page)]
     for _ in range(300):
@@ -196,14 +207,14 @@ def test_damaged_pages_give_splats_or_one_sentence():
             assert str(error).startswith("x.html: ") and "\n" not in str(error)
 
 
-def test_the_viewers_endings_of_splats_are_those_that_hyrfpack_reads():
+def test_the_viewer_reads_the_same_splat_suffixes_as_hyrfpack():
     from hyrfpack.splats.files import READABLE_ENDINGS
     from hyrfpack.web.player import SPLATS_SUFFIXES
 
     assert set(SPLATS_SUFFIXES) == set(READABLE_ENDINGS)
 
 
-def test_the_page_and_its_parts_are_installed_with_the_package():
+def test_all_files_of_the_page_are_package_data():
     import hyrfpack.web
 
     folder = Path(hyrfpack.web.__file__).parent
@@ -215,7 +226,7 @@ def test_the_page_and_its_parts_are_installed_with_the_package():
             assert f'"{pattern}"' in listed, entry
 
 
-def test_a_player_is_told_from_where_to_look_at_the_files_beside_it():
+def test_a_player_page_contains_the_viewpoints_of_its_files():
     seen = {"cameras": [], "up": [0, -1, 0], "target": [0, 0, 0]}
     page = encode_player("a", stages={"a </script>.hyrf": seen}).decode()
     (beside,) = re.findall(r'<script type="text/plain" id="content">([^<]*)</script>', page)

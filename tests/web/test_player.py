@@ -1,4 +1,4 @@
-"""The player in browsers: it can be moved by mouse, fingers and keys, and says what it cannot do."""
+"""The player moves its camera by mouse, touch and keys, and reports what the browser cannot do."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 from web.pages import (
-    CASES,
-    CENTER,
-    UP,
+    CAMERA_CASES,
+    SCENE_CENTER,
+    UP_DIRECTION,
     Browser,
-    camera,
-    cloud,
-    eye,
-    json_of,
-    message,
-    opened,
-    page_of,
-    rested,
-    settled,
-    until,
+    camera_json,
+    make_camera,
+    make_splats_page,
+    open_page,
+    random_splats,
+    wait_for_message,
+    wait_until,
+    wait_until_at_rest,
+    wait_until_still,
+    window_camera,
 )
 
 from hyrfpack.cameras.paths import look_at
@@ -33,174 +33,182 @@ from hyrfpack.scene import Camera
 pytestmark = pytest.mark.in_turn
 
 
-def test_the_address_can_name_the_camera(browser: Browser, tmp_path: Path):
-    opened(browser, tmp_path, page_of(cloud()), "#camera=" + json_of(camera(1.0)))
-    np.testing.assert_allclose(eye(browser).camera_from_world, camera(1.0).camera_from_world, atol=1e-9)
+def test_the_address_can_set_the_camera(browser: Browser, tmp_path: Path):
+    open_page(browser, tmp_path, make_splats_page(random_splats()), "#camera=" + camera_json(make_camera(1.0)))
+    np.testing.assert_allclose(window_camera(browser).camera_from_world, make_camera(1.0).camera_from_world, atol=1e-9)
 
 
 def test_the_window_starts_at_the_first_camera_and_draws_only_when_something_changes(browser: Browser, tmp_path: Path):
-    settled(opened(browser, tmp_path, page_of(cloud())))
-    np.testing.assert_allclose(eye(browser).camera_from_world, camera().camera_from_world, atol=1e-9)
+    wait_until_still(open_page(browser, tmp_path, make_splats_page(random_splats())))
+    np.testing.assert_allclose(window_camera(browser).camera_from_world, make_camera().camera_from_world, atol=1e-9)
     frames = browser.evaluate("hyrfpack.frames()")
     time.sleep(0.3)
     assert browser.evaluate("hyrfpack.frames()") == frames
 
 
-def test_mouse_and_keys_move_the_eye(browser: Browser, tmp_path: Path):
-    browser.prefer(less_motion=True)  # it gets there at once, and to the same places: see below
-    opened(browser, tmp_path, page_of(cloud()))
-    home = eye(browser)
+def test_mouse_and_keys_move_the_camera(browser: Browser, tmp_path: Path):
+    browser.prefer(less_motion=True)  # the camera jumps to its target, which a test below shows to be the same
+    open_page(browser, tmp_path, make_splats_page(random_splats()))
+    home = window_camera(browser)
 
     browser.drag((120, 90), (170, 90))
-    orbited = eye(browser)
-    assert np.linalg.norm(orbited.position - CENTER) == pytest.approx(np.linalg.norm(home.position - CENTER))
+    orbited = window_camera(browser)
+    assert np.linalg.norm(orbited.position - SCENE_CENTER) == pytest.approx(
+        np.linalg.norm(home.position - SCENE_CENTER)
+    )
     assert (orbited.position - home.position) @ home.rotation[0] < -0.3  # the scene follows the pointer
-    assert orbited.position @ UP == pytest.approx(home.position @ UP, abs=1e-6)
+    assert orbited.position @ UP_DIRECTION == pytest.approx(home.position @ UP_DIRECTION, abs=1e-6)
 
-    for _ in range(5):  # far beyond the pole
+    for _ in range(5):  # the drags lead far beyond the pole
         browser.drag((120, 20), (120, 170))
-    assert 0.99 < -eye(browser).forward @ UP < 1.0
+    assert 0.99 < -window_camera(browser).forward @ UP_DIRECTION < 1.0
 
     browser.press("r")
-    np.testing.assert_allclose(eye(browser).camera_from_world, home.camera_from_world, atol=1e-9)
+    np.testing.assert_allclose(window_camera(browser).camera_from_world, home.camera_from_world, atol=1e-9)
     browser.drag((120, 90), (140, 90), button="right")
-    panned = eye(browser).position - home.position
+    panned = window_camera(browser).position - home.position
     assert panned @ home.rotation[0] < -0.1 and abs(panned @ home.forward) < 1e-9
 
     browser.press("r")
     browser.mouse("mouseWheel", 120, 90, deltaX=0, deltaY=-300)
-    assert np.linalg.norm(eye(browser).position - CENTER) < 2.0
+    assert np.linalg.norm(window_camera(browser).position - SCENE_CENTER) < 2.0
     browser.press("w", seconds=0.3)
-    settled(browser)
-    assert np.linalg.norm(eye(browser).position - CENTER) < 1.6
+    wait_until_still(browser)
+    assert np.linalg.norm(window_camera(browser).position - SCENE_CENTER) < 1.6
 
     browser.press("n")
-    np.testing.assert_allclose(eye(browser).camera_from_world, camera(1.5).camera_from_world, atol=1e-9)
+    np.testing.assert_allclose(window_camera(browser).camera_from_world, make_camera(1.5).camera_from_world, atol=1e-9)
     browser.press("p")
     browser.press("p")
-    np.testing.assert_allclose(eye(browser).camera_from_world, camera(4.0).camera_from_world, atol=1e-9)
+    np.testing.assert_allclose(window_camera(browser).camera_from_world, make_camera(4.0).camera_from_world, atol=1e-9)
     assert browser.evaluate("document.getElementById('cameras').selectedIndex") == 2
     hidden = "document.getElementById('panel').hidden"
-    assert browser.evaluate(hidden)  # in a window so small
+    assert browser.evaluate(hidden)  # the window is too small for the panel
     browser.press("h")
     assert not browser.evaluate(hidden)
     assert browser.list_errors() == []
 
 
-def test_the_scene_follows_the_pointer_where_the_camera_stands_on_its_head(browser: Browser, tmp_path: Path):
-    opened(browser, tmp_path, page_of(cloud(), cameras=[CASES["turned upside down"]]))
-    home = eye(browser)
+def test_the_scene_follows_the_pointer_when_the_camera_is_upside_down(browser: Browser, tmp_path: Path):
+    open_page(browser, tmp_path, make_splats_page(random_splats(), cameras=[CAMERA_CASES["turned upside down"]]))
+    home = window_camera(browser)
     browser.drag((120, 90), (170, 90))
-    assert (eye(browser).position - home.position) @ home.rotation[0] < -0.3
+    assert (window_camera(browser).position - home.position) @ home.rotation[0] < -0.3
 
 
-def test_a_camera_in_the_middle_of_the_scene_flies_as_fast_as_befits_its_size(browser: Browser, tmp_path: Path):
-    opened(browser, tmp_path, page_of(cloud(), cameras=[camera(0.01), camera(2.5), camera(4.0)]))
-    home = eye(browser)
+def test_the_speed_in_the_middle_of_the_scene_follows_its_size(browser: Browser, tmp_path: Path):
+    open_page(
+        browser,
+        tmp_path,
+        make_splats_page(random_splats(), cameras=[make_camera(0.01), make_camera(2.5), make_camera(4.0)]),
+    )
+    home = window_camera(browser)
     browser.drag((120, 90), (140, 90), button="right")
-    assert np.linalg.norm(eye(browser).position - home.position) > 0.05
+    assert np.linalg.norm(window_camera(browser).position - home.position) > 0.05
 
 
 def test_the_wheel_zooms_towards_the_pointer(browser: Browser, tmp_path: Path):
-    opened(browser, tmp_path, page_of(cloud()))
-    home = eye(browser)
+    open_page(browser, tmp_path, make_splats_page(random_splats()))
+    home = window_camera(browser)
     ray = np.array([(60 - home.cx) / home.fx, (150 - home.cy) / home.fy, 1.0])
     point = home.position + 2.5 * ray @ home.rotation
     browser.mouse("mouseWheel", 60, 150, deltaX=0, deltaY=-200)
-    near = eye(browser)
+    near = window_camera(browser)
     x, y, z = near.rotation @ point + near.camera_from_world[:3, 3]
     assert z < 2.2
     assert (near.fx * x / z + near.cx, near.fy * y / z + near.cy) == pytest.approx((60, 150), abs=1e-6)
 
 
 def test_two_fingers_pan_and_pinch(browser: Browser, tmp_path: Path):
-    opened(browser, tmp_path, page_of(cloud()))
+    open_page(browser, tmp_path, make_splats_page(random_splats()))
     browser.resize(240, 180, phone=True)
     try:
-        home = eye(browser)
+        home = window_camera(browser)
         browser.touch("touchStart", (100, 90), (140, 90))
         browser.touch("touchMove", (80, 90), (160, 90))
         browser.touch("touchEnd")
-        assert np.linalg.norm(eye(browser).position - CENTER) == pytest.approx(1.25, abs=0.05)
-        near = eye(browser)
+        assert np.linalg.norm(window_camera(browser).position - SCENE_CENTER) == pytest.approx(1.25, abs=0.05)
+        near = window_camera(browser)
         browser.touch("touchStart", (100, 90))
         browser.touch("touchMove", (140, 90))
         browser.touch("touchEnd")
-        assert (eye(browser).position - near.position) @ home.rotation[0] < -0.1
+        assert (window_camera(browser).position - near.position) @ home.rotation[0] < -0.1
     finally:
         browser.resize(240, 180)
 
 
-def test_a_double_click_sets_what_is_orbited(browser: Browser, tmp_path: Path):
-    one = cloud(1, 0)
-    place = CENTER + 0.4 * camera().rotation[0] - 0.5 * camera().forward
-    one = replace(one, positions=place[None], scales=np.full((1, 3), 0.05, np.float32), opacities=np.ones(1))
-    settled(opened(browser, tmp_path, page_of(one)))
-    at = eye(browser)
-    x, y, z = at.rotation @ place + at.camera_from_world[:3, 3]
+def test_a_double_click_sets_the_center_of_the_orbit(browser: Browser, tmp_path: Path):
+    one = random_splats(1, 0)
+    current_position = SCENE_CENTER + 0.4 * make_camera().rotation[0] - 0.5 * make_camera().forward
+    one = replace(one, positions=current_position[None], scales=np.full((1, 3), 0.05, np.float32), opacities=np.ones(1))
+    wait_until_still(open_page(browser, tmp_path, make_splats_page(one)))
+    at = window_camera(browser)
+    x, y, z = at.rotation @ current_position + at.camera_from_world[:3, 3]
     spot = at.fx * x / z + at.cx, at.fy * y / z + at.cy
     for count in (1, 2):
         for kind in ("mousePressed", "mouseReleased"):
             browser.mouse(kind, *spot, button="left", clickCount=count)
     browser.drag((120, 90), (160, 100))
-    after = eye(browser)
+    after = window_camera(browser)
     assert np.linalg.norm(after.position - at.position) > 0.3
-    assert np.linalg.norm(after.position - place) == pytest.approx(np.linalg.norm(at.position - place), rel=0.01)
+    assert np.linalg.norm(after.position - current_position) == pytest.approx(
+        np.linalg.norm(at.position - current_position), rel=0.01
+    )
 
 
-def test_what_a_browser_cannot_do_is_said_in_a_sentence(browser: Browser, tmp_path: Path):
+def test_missing_webgl_damaged_pages_and_invalid_cameras_are_reported(browser: Browser, tmp_path: Path):
     file = tmp_path / "page.html"
-    page = page_of(cloud(50))
+    page = make_splats_page(random_splats(50))
     file.write_bytes(page)
     with browser.before_every_page("HTMLCanvasElement.prototype.getContext = () => null"):
         browser.open(file.as_uri())
-        assert "no WebGL 2" in message(browser)
+        assert "no WebGL 2" in wait_for_message(browser)
     file.write_bytes(re.sub(rb'(class="payload">.{400}).{40}', rb"\1", page))
     browser.open(file.as_uri())
-    assert "cannot be unpacked" in message(browser)
+    assert "cannot be unpacked" in wait_for_message(browser)
     file.write_bytes(page)
     browser.open(file.as_uri() + "#camera={}")
-    assert "needs width" in message(browser)
+    assert "needs width" in wait_for_message(browser)
 
 
-def test_the_page_may_not_use_the_network(browser: Browser, tmp_path: Path):
-    opened(browser, tmp_path, page_of(cloud(3)))
+def test_the_page_cannot_fetch_anything(browser: Browser, tmp_path: Path):
+    open_page(browser, tmp_path, make_splats_page(random_splats(3)))
     refused = "fetch('data:,x').then(() => 'fetched', () => 'refused')"
     assert browser.evaluate(refused) == "refused"
 
 
 @pytest.fixture(autouse=True)
-def usual(browser: Browser) -> Iterator[None]:
-    """Tests may change the window and what a person prefers."""
+def reset_window(browser: Browser) -> Iterator[None]:
+    """Reset the window size and the user's preferences after each test."""
     yield
     browser.resize(240, 180)
     browser.prefer()
 
 
-def place(browser: Browser) -> np.ndarray:
-    """Where the eye is now, perhaps on its way."""
+def current_position(browser: Browser) -> np.ndarray:
+    """Return the current position of the camera, which may still be moving."""
     return Camera(**{**browser.evaluate("hyrfpack.camera()"), "camera_from_world": np.array(
         browser.evaluate("hyrfpack.camera().camera_from_world")
     )}).position  # fmt: skip
 
 
-def test_a_drag_ends_softly_exactly_where_it_leads_without_movement(browser: Browser, tmp_path: Path):
+def test_a_damped_drag_ends_exactly_where_an_undamped_one_does(browser: Browser, tmp_path: Path):
     ends = {}
     for less_motion in (True, False):
         browser.prefer(less_motion=less_motion)
-        opened(browser, tmp_path, page_of(cloud(50)))
+        open_page(browser, tmp_path, make_splats_page(random_splats(50)))
         browser.drag((120, 90), (150, 110))
-        rested(browser).drag((120, 90), (110, 93), button="right")
-        rested(browser).mouse("mouseWheel", 60, 150, deltaX=0, deltaY=-200)
-        ends[less_motion] = eye(browser).camera_from_world
+        wait_until_at_rest(browser).drag((120, 90), (110, 93), button="right")
+        wait_until_at_rest(browser).mouse("mouseWheel", 60, 150, deltaX=0, deltaY=-200)
+        ends[less_motion] = window_camera(browser).camera_from_world
     np.testing.assert_allclose(ends[True], ends[False], atol=1e-9)
 
 
-def test_damping_takes_frames_and_then_there_are_none(browser: Browser, tmp_path: Path):
-    settled(opened(browser, tmp_path, page_of(cloud(50))))
+def test_no_frames_are_drawn_after_damping_ends(browser: Browser, tmp_path: Path):
+    wait_until_still(open_page(browser, tmp_path, make_splats_page(random_splats(50))))
     before = browser.evaluate("hyrfpack.frames()")
     browser.mouse("mouseWheel", 120, 90, deltaX=0, deltaY=-200)
-    settled(browser)
+    wait_until_still(browser)
     frames = browser.evaluate("hyrfpack.frames()")
     assert frames - before > 3
     time.sleep(0.5)
@@ -208,32 +216,34 @@ def test_damping_takes_frames_and_then_there_are_none(browser: Browser, tmp_path
     assert not browser.evaluate("hyrfpack.player.driven")
 
 
-def test_the_eye_glides_to_another_camera_and_stops_for_a_person(browser: Browser, tmp_path: Path):
-    opened(browser, tmp_path, page_of(cloud(50)))
-    far, near = camera(2.5).position, camera(1.5).position
+def test_the_glide_to_another_camera_stops_at_user_input(browser: Browser, tmp_path: Path):
+    open_page(browser, tmp_path, make_splats_page(random_splats(50)))
+    far, near = make_camera(2.5).position, make_camera(1.5).position
     browser.evaluate("(window.way = [], hyrfpack.player.addEventListener('frame', () => way.push(hyrfpack.camera())))")
     browser.press("n")
-    np.testing.assert_allclose(eye(browser).camera_from_world, camera(1.5).camera_from_world, atol=1e-9)
+    np.testing.assert_allclose(window_camera(browser).camera_from_world, make_camera(1.5).camera_from_world, atol=1e-9)
     on_its_way = [np.linalg.norm(np.array(at["camera_from_world"])[:3, 3]) for at in browser.evaluate("way")]
     assert len(set(np.round(on_its_way, 6))) > 3
     browser.press("p")
     time.sleep(0.25)
     browser.mouse("mousePressed", 120, 90, button="left", buttons=1, clickCount=1)
-    stopped = place(browser)
+    stopped = current_position(browser)
     browser.mouse("mouseReleased", 120, 90, button="left", clickCount=1)
     time.sleep(0.4)
-    np.testing.assert_allclose(place(browser), stopped, atol=1e-9)
+    np.testing.assert_allclose(current_position(browser), stopped, atol=1e-9)
     assert np.linalg.norm(stopped - far) > 1e-3 and np.linalg.norm(stopped - near) > 1e-3
 
 
-def test_glides_pass_between_their_ends_and_less_motion_jumps(browser: Browser, tmp_path: Path):
-    turned = replace(camera(), camera_from_world=look_at(CENTER + np.array([-2.0, -0.5, 1.5]), CENTER, UP))
+def test_a_glide_passes_between_its_ends_and_reduced_motion_jumps(browser: Browser, tmp_path: Path):
+    turned = replace(
+        make_camera(), camera_from_world=look_at(SCENE_CENTER + np.array([-2.0, -0.5, 1.5]), SCENE_CENTER, UP_DIRECTION)
+    )
     browser.prefer(less_motion=True)
-    opened(browser, tmp_path, page_of(cloud(50), cameras=[camera(), turned]))
+    open_page(browser, tmp_path, make_splats_page(random_splats(50), cameras=[make_camera(), turned]))
     browser.press("n")
-    np.testing.assert_array_equal(place(browser), eye(browser).position)
-    assert np.linalg.norm(place(browser) - turned.position) < 1e-9
-    # Half-way by the mover itself: about the target they share, at a distance between theirs.
+    np.testing.assert_array_equal(current_position(browser), window_camera(browser).position)
+    assert np.linalg.norm(current_position(browser) - turned.position) < 1e-9
+    # The script stops half-way: both cameras look at the same target, and the distance lies between theirs.
     browser.prefer()
     script = """(() => {
         const { player } = hyrfpack, glide = player.movers.find((mover) => "path" in mover);
@@ -247,87 +257,89 @@ def test_glides_pass_between_their_ends_and_less_motion_jumps(browser: Browser, 
     (half, active) = browser.evaluate(script)
     pose = np.array(half["camera_from_world"])
     position = -pose[:3, :3].T @ pose[:3, 3]
-    distances = sorted(np.linalg.norm(at.position - CENTER) for at in (camera(), turned))
-    assert distances[0] * 0.7 < np.linalg.norm(position - CENTER) < distances[1] * 1.05
+    distances = sorted(np.linalg.norm(at.position - SCENE_CENTER) for at in (make_camera(), turned))
+    assert distances[0] * 0.7 < np.linalg.norm(position - SCENE_CENTER) < distances[1] * 1.05
     np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-9)
-    ahead = pose[:3, :3] @ CENTER + pose[:3, 3]
-    assert np.abs(ahead[:2]).max() < 0.05 * ahead[2], "the target leaves the middle"
+    ahead = pose[:3, :3] @ SCENE_CENTER + pose[:3, 3]
+    assert np.abs(ahead[:2]).max() < 0.05 * ahead[2], "the target is not in the middle"
     assert not active
 
 
-def test_it_turns_by_itself_pauses_for_a_person_and_can_be_stopped(browser: Browser, tmp_path: Path):
-    opened(browser, tmp_path, page_of(cloud(50)), "?autorotate")
-    start = place(browser)
+def test_autorotation_pauses_at_user_input_and_can_be_stopped(browser: Browser, tmp_path: Path):
+    open_page(browser, tmp_path, make_splats_page(random_splats(50)), "?autorotate")
+    start = current_position(browser)
     time.sleep(0.6)
-    turning = place(browser)
+    turning = current_position(browser)
     assert np.linalg.norm(turning - start) > 0.05
-    assert np.linalg.norm(turning - CENTER) == pytest.approx(np.linalg.norm(start - CENTER), rel=1e-6)
+    assert np.linalg.norm(turning - SCENE_CENTER) == pytest.approx(np.linalg.norm(start - SCENE_CENTER), rel=1e-6)
     browser.drag((120, 90), (125, 90))
-    paused = eye(browser).position
+    paused = window_camera(browser).position
     time.sleep(0.5)
-    np.testing.assert_array_equal(place(browser), paused)
+    np.testing.assert_array_equal(current_position(browser), paused)
     ends = time.monotonic() + 10
-    while np.array_equal(place(browser), paused):
-        assert time.monotonic() < ends, "it does not go on"
+    while np.array_equal(current_position(browser), paused):
+        assert time.monotonic() < ends, "the rotation does not resume"
         time.sleep(0.1)
     browser.press("t")
-    stopped = eye(browser).position
-    settled(browser)
-    np.testing.assert_array_equal(place(browser), stopped)
+    stopped = window_camera(browser).position
+    wait_until_still(browser)
+    np.testing.assert_array_equal(current_position(browser), stopped)
 
 
-def test_who_wants_less_motion_is_not_turned_unasked(browser: Browser, tmp_path: Path):
+def test_reduced_motion_prevents_autorotation_until_it_is_requested(browser: Browser, tmp_path: Path):
     browser.prefer(less_motion=True)
-    opened(browser, tmp_path, page_of(cloud(50)), "?autorotate")
-    start = place(browser)
+    open_page(browser, tmp_path, make_splats_page(random_splats(50)), "?autorotate")
+    start = current_position(browser)
     time.sleep(0.3)
-    np.testing.assert_array_equal(place(browser), start)
+    np.testing.assert_array_equal(current_position(browser), start)
     browser.press("t")
     time.sleep(0.4)
-    assert np.linalg.norm(place(browser) - start) > 0.02
+    assert np.linalg.norm(current_position(browser) - start) > 0.02
 
 
-def test_keys_zoom_orbit_and_choose_the_middle(browser: Browser, tmp_path: Path):
-    settled(opened(browser, tmp_path, page_of(cloud())))
-    home = eye(browser)
+def test_keys_zoom_orbit_and_set_the_center_of_the_orbit(browser: Browser, tmp_path: Path):
+    wait_until_still(open_page(browser, tmp_path, make_splats_page(random_splats())))
+    home = window_camera(browser)
     browser.press("+", seconds=0.3)
-    near = eye(browser)
-    assert np.linalg.norm(near.position - CENTER) < 0.9 * np.linalg.norm(home.position - CENTER)
+    near = window_camera(browser)
+    assert np.linalg.norm(near.position - SCENE_CENTER) < 0.9 * np.linalg.norm(home.position - SCENE_CENTER)
     browser.press("-", seconds=0.3)
-    assert np.linalg.norm(eye(browser).position - CENTER) > np.linalg.norm(near.position - CENTER)
-    before = eye(browser)
+    assert np.linalg.norm(window_camera(browser).position - SCENE_CENTER) > np.linalg.norm(near.position - SCENE_CENTER)
+    before = window_camera(browser)
     browser.press("ArrowLeft", seconds=0.3, shift=True)
-    after = eye(browser)
+    after = window_camera(browser)
     assert np.linalg.norm(after.position - before.position) > 0.1
-    assert np.linalg.norm(after.position - CENTER) == pytest.approx(np.linalg.norm(before.position - CENTER))
+    assert np.linalg.norm(after.position - SCENE_CENTER) == pytest.approx(
+        np.linalg.norm(before.position - SCENE_CENTER)
+    )
     browser.press("ArrowLeft", seconds=0.3)
-    looked = eye(browser)
-    np.testing.assert_allclose(looked.position, after.position, atol=1e-9)
-    assert not np.allclose(looked.forward, after.forward, atol=1e-3)
+    rotated = window_camera(browser)
+    np.testing.assert_allclose(rotated.position, after.position, atol=1e-9)
+    assert not np.allclose(rotated.forward, after.forward, atol=1e-3)
     browser.press("r")
-    rested(browser).press("o")
-    until(browser, "!document.getElementById('ring').hidden")
+    wait_until_at_rest(browser).press("o")
+    wait_until(browser, "!document.getElementById('ring').hidden")
     assert browser.list_errors() == []
 
 
-def test_a_short_press_moves_however_slow_the_frames_are(browser: Browser, tmp_path: Path):
-    opened(browser, tmp_path, page_of(cloud(50)))
-    home = eye(browser)
+def test_a_short_key_press_moves_the_camera_at_any_frame_rate(browser: Browser, tmp_path: Path):
+    open_page(browser, tmp_path, make_splats_page(random_splats(50)))
+    home = window_camera(browser)
     browser.press("ArrowUp")
-    assert not np.array_equal(eye(browser).camera_from_world, home.camera_from_world)
-    settled(browser)
-    at = place(browser)
+    assert not np.array_equal(window_camera(browser).camera_from_world, home.camera_from_world)
+    wait_until_still(browser)
+    at = current_position(browser)
     browser.press("w")
-    step = np.linalg.norm(eye(browser).position - at)
+    step = np.linalg.norm(window_camera(browser).position - at)
     assert 0.01 < step < 0.7
 
 
-def test_a_double_tap_shows_where(browser: Browser, tmp_path: Path):
-    settled(opened(browser, tmp_path, page_of(cloud())))
+def test_a_double_tap_marks_its_position(browser: Browser, tmp_path: Path):
+    wait_until_still(open_page(browser, tmp_path, make_splats_page(random_splats())))
     for _ in range(2):
         browser.mouse("mousePressed", 120, 90, button="left", buttons=1, clickCount=1)
         browser.mouse("mouseReleased", 120, 90, button="left", clickCount=1)
     box = browser.evaluate("(({ left, right, top, bottom }) => [left + right, top + bottom])"
                            "(document.getElementById('ring').getBoundingClientRect())")  # fmt: skip
     assert box == pytest.approx([240, 180], abs=3)
-    until(browser, "document.getElementById('ring').hidden")
+    wait_until(browser, "document.getElementById('ring').hidden")

@@ -1,4 +1,4 @@
-"""A page and its file are served to this machine alone, in ranges if asked, until interrupted."""
+"""The server offers a page and its file to this machine only, supports ranges and ends at an interrupt."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from hyrfpack.errors import HyrfError
 from hyrfpack.web import serve as serving
 from hyrfpack.web.serve import CHUNK_BYTES, MemoryFile, serve
 
-PAGE = b"<!DOCTYPE html><title>served</title>"
-DATA = np.random.default_rng(0).bytes(3 * CHUNK_BYTES + 17)
+PAGE_HTML = b"<!DOCTYPE html><title>served</title>"
+FILE_DATA = np.random.default_rng(0).bytes(3 * CHUNK_BYTES + 17)
 
 
 @pytest.fixture
-def scene(tmp_path: Path) -> Path:
+def scene_file(tmp_path: Path) -> Path:
     path = tmp_path / "room.hyrf"
-    path.write_bytes(DATA)
+    path.write_bytes(FILE_DATA)
     return path
 
 
 @pytest.fixture
-def port(scene: Path) -> Iterator[int]:
-    """Of a server with a page and a file."""
-    with serving._create_server("127.0.0.1", 0, PAGE, {"scene.hyrf": scene}) as server:
+def port(scene_file: Path) -> Iterator[int]:
+    """Start a server with a page and a file; yield its port."""
+    with serving._create_server("127.0.0.1", 0, PAGE_HTML, {"scene.hyrf": scene_file}) as server:
         thread = threading.Thread(target=server.serve_forever, args=(0.02,))
         thread.start()
         yield server.server_port
@@ -42,7 +42,9 @@ def port(scene: Path) -> Iterator[int]:
         thread.join()
 
 
-def ask(port: int, path: str = "/scene.hyrf", method: str = "GET", **headers: str) -> tuple[int, dict[str, str], bytes]:
+def send_request(
+    port: int, path: str = "/scene.hyrf", method: str = "GET", **headers: str
+) -> tuple[int, dict[str, str], bytes]:
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
     try:
         connection.request(method, path, headers={name.replace("_", "-"): value for name, value in headers.items()})
@@ -52,89 +54,89 @@ def ask(port: int, path: str = "/scene.hyrf", method: str = "GET", **headers: st
         connection.close()
 
 
-def test_page_and_file_are_served_and_nothing_else(port, scene):
-    status, headers, body = ask(port, "/?content=any")
-    assert (status, headers["Content-Type"], body) == (200, "text/html; charset=utf-8", PAGE)
-    status, headers, body = ask(port)
-    assert (status, headers["Content-Type"], body) == (200, "application/octet-stream", DATA)
+def test_only_the_page_and_its_file_are_served(port, scene_file):
+    status, headers, body = send_request(port, "/?content=any")
+    assert (status, headers["Content-Type"], body) == (200, "text/html; charset=utf-8", PAGE_HTML)
+    status, headers, body = send_request(port)
+    assert (status, headers["Content-Type"], body) == (200, "application/octet-stream", FILE_DATA)
     assert headers["Accept-Ranges"] == "bytes" and headers["ETag"] and headers["X-Content-Type-Options"] == "nosniff"
-    for path in ("/other", f"/{scene.name}", "/../room.hyrf", "/%2e%2e/room.hyrf", str(scene)):
-        assert ask(port, path)[0] == 404, path
-    assert ask(port, method="POST")[0] == 501
+    for path in ("/other", f"/{scene_file.name}", "/../room.hyrf", "/%2e%2e/room.hyrf", str(scene_file)):
+        assert send_request(port, path)[0] == 404, path
+    assert send_request(port, method="POST")[0] == 501
 
 
-def test_a_head_is_the_answer_without_its_body(port):
-    for path, length in (("/", len(PAGE)), ("/scene.hyrf", len(DATA))):
-        status, headers, body = ask(port, path, "HEAD")
+def test_a_head_request_returns_headers_without_a_body(port):
+    for path, length in (("/", len(PAGE_HTML)), ("/scene.hyrf", len(FILE_DATA))):
+        status, headers, body = send_request(port, path, "HEAD")
         assert (status, headers["Content-Length"], body) == (200, str(length), b"")
 
 
-END = len(DATA) - 1
-RANGES = {
+LAST_BYTE = len(FILE_DATA) - 1
+FIRST_AND_LAST_BYTE_BY_RANGE = {
     "bytes=0-0": (0, 0),
     "bytes=5-9": (5, 9),
     f"bytes={CHUNK_BYTES - 1}-{2 * CHUNK_BYTES}": (CHUNK_BYTES - 1, 2 * CHUNK_BYTES),
-    "bytes=100-": (100, END),
-    "bytes=-7": (END - 6, END),
-    f"bytes=-{10 * len(DATA)}": (0, END),
-    f"bytes=10-{10 * len(DATA)}": (10, END),
-    f"bytes={END}-": (END, END),
+    "bytes=100-": (100, LAST_BYTE),
+    "bytes=-7": (LAST_BYTE - 6, LAST_BYTE),
+    f"bytes=-{10 * len(FILE_DATA)}": (0, LAST_BYTE),
+    f"bytes=10-{10 * len(FILE_DATA)}": (10, LAST_BYTE),
+    f"bytes={LAST_BYTE}-": (LAST_BYTE, LAST_BYTE),
 }
 
 
-@pytest.mark.parametrize("asked", RANGES)
-def test_a_range_is_what_was_asked_for(asked, port):
-    first, last = RANGES[asked]
-    status, headers, body = ask(port, Range=asked)
+@pytest.mark.parametrize("asked", FIRST_AND_LAST_BYTE_BY_RANGE)
+def test_a_range_request_returns_the_requested_bytes(asked, port):
+    first, last = FIRST_AND_LAST_BYTE_BY_RANGE[asked]
+    status, headers, body = send_request(port, Range=asked)
     assert (status, headers["Content-Range"], body) == (
         206,
-        f"bytes {first}-{last}/{len(DATA)}",
-        DATA[first : last + 1],
+        f"bytes {first}-{last}/{len(FILE_DATA)}",
+        FILE_DATA[first : last + 1],
     )
 
 
-@pytest.mark.parametrize("asked", [f"bytes={len(DATA)}-", f"bytes={10**30}-", "bytes=-0"])
+@pytest.mark.parametrize("asked", [f"bytes={len(FILE_DATA)}-", f"bytes={10**30}-", "bytes=-0"])
 def test_a_range_beyond_the_end_is_refused_with_the_length(asked, port):
-    status, headers, body = ask(port, Range=asked)
-    assert (status, headers["Content-Range"], body) == (416, f"bytes */{len(DATA)}", b"")
+    status, headers, body = send_request(port, Range=asked)
+    assert (status, headers["Content-Range"], body) == (416, f"bytes */{len(FILE_DATA)}", b"")
 
 
 @pytest.mark.parametrize("asked", ["bytes=9-5", "bytes=", "bytes=-", "bytes=a-b", "lines=0-1", "bytes=0-1,5-6", "٣-٤"])
-def test_a_range_that_makes_no_sense_is_passed_over(asked, port):
-    status, _, body = ask(port, Range=asked.encode().decode("latin-1"))
-    assert (status, body) == (200, DATA)
+def test_an_invalid_range_is_ignored(asked, port):
+    status, _, body = send_request(port, Range=asked.encode().decode("latin-1"))
+    assert (status, body) == (200, FILE_DATA)
 
 
-def test_a_file_that_changed_is_sent_whole_to_who_asks_for_the_rest_of_the_old_one(port, scene):
-    tag = ask(port)[1]["ETag"]
-    assert ask(port, Range="bytes=10-", If_Range=tag)[0] == 206
-    scene.write_bytes(DATA[:1000])
-    status, headers, body = ask(port, Range="bytes=10-", If_Range=tag)
-    assert (status, body) == (200, DATA[:1000]) and headers["ETag"] != tag
+def test_a_changed_file_is_sent_whole_when_the_rest_of_the_old_one_is_requested(port, scene_file):
+    tag = send_request(port)[1]["ETag"]
+    assert send_request(port, Range="bytes=10-", If_Range=tag)[0] == 206
+    scene_file.write_bytes(FILE_DATA[:1000])
+    status, headers, body = send_request(port, Range="bytes=10-", If_Range=tag)
+    assert (status, body) == (200, FILE_DATA[:1000]) and headers["ETag"] != tag
 
 
-def test_a_file_that_is_gone_is_not_found_until_it_is_back(port, scene):
-    scene.unlink()
-    assert ask(port)[0] == ask(port, method="HEAD")[0] == 404
-    scene.mkdir()
-    assert ask(port)[0] == 404
-    scene.rmdir()
-    scene.write_bytes(b"again")
-    assert ask(port)[2] == b"again"
+def test_a_deleted_file_is_not_found_until_it_exists_again(port, scene_file):
+    scene_file.unlink()
+    assert send_request(port)[0] == send_request(port, method="HEAD")[0] == 404
+    scene_file.mkdir()
+    assert send_request(port)[0] == 404
+    scene_file.rmdir()
+    scene_file.write_bytes(b"again")
+    assert send_request(port)[2] == b"again"
 
 
-def test_an_empty_file_is_empty(port, scene):
-    scene.write_bytes(b"")
-    assert ask(port)[::2] == (200, b"") and ask(port, Range="bytes=0-")[0] == 416
+def test_an_empty_file_is_served_and_has_no_ranges(port, scene_file):
+    scene_file.write_bytes(b"")
+    assert send_request(port)[::2] == (200, b"") and send_request(port, Range="bytes=0-")[0] == 416
 
 
-def test_a_file_that_shrinks_while_it_is_sent_ends_the_connection_short(port, scene):
-    with scene.open("r+b") as file:
-        file.truncate(1 << 28)  # more than sockets hold
+def test_a_file_that_shrinks_while_it_is_sent_closes_the_connection_early(port, scene_file):
+    with scene_file.open("r+b") as file:
+        file.truncate(1 << 28)  # more than the buffers of sockets hold
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
     connection.request("GET", "/scene.hyrf")
     answer = connection.getresponse()
-    os.truncate(scene, CHUNK_BYTES)
+    os.truncate(scene_file, CHUNK_BYTES)
     with pytest.raises(http.client.IncompleteRead):
         answer.read()
     connection.close()
@@ -163,51 +165,52 @@ with serve._create_server("127.0.0.1", 0, b"", {"scene.hyrf": Path(sys.argv[1])}
         [sys.executable, "-c", program, large], capture_output=True, text=True, check=True, timeout=120
     )
     total, grown = map(int, done.stdout.split())
-    assert total > 1 << 30 and grown < 32 << 10  # kB
+    assert total > 1 << 30 and grown < 32 << 10  # ru_maxrss is in kB
 
 
 @pytest.mark.usefixtures("signals")
-def test_it_serves_the_browser_until_an_interrupt_which_is_no_error(monkeypatch: pytest.MonkeyPatch):
+def test_serve_opens_the_browser_and_ends_at_an_interrupt_without_error(monkeypatch: pytest.MonkeyPatch):
     said, seen = [], []
 
     def visit(address: str) -> None:
         try:
             seen.append(address)
-            seen.append(ask(int(address.rsplit(":")[-1].strip("/")), "/")[2])
+            seen.append(send_request(int(address.rsplit(":")[-1].strip("/")), "/")[2])
         finally:
             os.kill(os.getpid(), signal.SIGINT)
 
     monkeypatch.setattr("webbrowser.open", visit)
-    serve(PAGE, open_browser=True, say=said.append)
-    assert said[0].startswith("http://127.0.0.1:") and seen == [said[0], PAGE]
+    serve(PAGE_HTML, open_browser=True, say=said.append)
+    assert said[0].startswith("http://127.0.0.1:") and seen == [said[0], PAGE_HTML]
 
 
-def test_a_port_in_use_is_one_sentence():
+def test_a_port_in_use_is_reported_in_one_sentence():
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         with pytest.raises(HyrfError, match=rf"^port {port} of 127.0.0.1 is taken by another program; [^\n]*$"):
-            serve(PAGE, port=port, open_browser=False, say=lambda address: None)
+            serve(PAGE_HTML, port=port, open_browser=False, say=lambda address: None)
 
 
 @pytest.mark.parametrize("host", ["192.0.2.1", "no such name", "a" * 70])
-def test_an_address_that_is_not_ours_is_one_sentence(host):
+def test_an_unusable_host_is_reported_in_one_sentence(host):
     with pytest.raises(HyrfError, match=rf"^nothing can listen at port 0 of {host} [^\n]*$"):
-        serve(PAGE, host=host, open_browser=False, say=lambda address: None)
+        serve(PAGE_HTML, host=host, open_browser=False, say=lambda address: None)
 
 
 @pytest.mark.parametrize("host", ["", " "])
-def test_no_address_is_one_sentence_and_does_not_mean_all(host):
+def test_an_empty_host_is_refused(host):
     with pytest.raises(HyrfError, match="not an address to listen at.*127.0.0.1.*0.0.0.0"):
-        serve(PAGE, host=host, open_browser=False, say=lambda address: None)
+        serve(PAGE_HTML, host=host, open_browser=False, say=lambda address: None)
 
 
 @pytest.mark.usefixtures("signals")
-def test_a_browser_that_goes_away_is_nobodys_news(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
+def test_a_closed_connection_prints_nothing(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
     def visit_in_a_hurry(address: str) -> None:
         try:
             for request in (b"GET / HTTP/1.1\r\n\r\n", b"GET"):
                 with socket.create_connection(("127.0.0.1", int(address.rsplit(":")[-1].strip("/")))) as client:
-                    client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")  # reset at the end
+                    # Closing resets the connection.
+                    client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")
                     client.sendall(request)
             time.sleep(0.3)
         finally:
@@ -220,37 +223,37 @@ def test_a_browser_that_goes_away_is_nobodys_news(capsys: pytest.CaptureFixture,
     assert capsys.readouterr().err == ""
 
 
-# -- from memory -----------------------------------------------------------------------------------------------------
+# -- files in memory ---------------------------------------------------------------------------------------------------
 
 
-def port_of(address: str) -> int:
+def port_from_address(address: str) -> int:
     return int(address.rstrip("/").rpartition(":")[2])
 
 
 def test_a_file_in_memory_is_served_whole_and_in_ranges():
-    with serving.serve_in_thread(PAGE, {"scene.hyrf": MemoryFile(DATA)}) as address:
-        port = port_of(address)
-        assert ask(port, "/")[2] == PAGE and ask(port)[2] == DATA
-        status, headers, body = ask(port, Range="bytes=5-9")
-        assert (status, headers["Content-Range"], body) == (206, f"bytes 5-9/{len(DATA)}", DATA[5:10])
+    with serving.serve_in_thread(PAGE_HTML, {"scene.hyrf": MemoryFile(FILE_DATA)}) as address:
+        port = port_from_address(address)
+        assert send_request(port, "/")[2] == PAGE_HTML and send_request(port)[2] == FILE_DATA
+        status, headers, body = send_request(port, Range="bytes=5-9")
+        assert (status, headers["Content-Range"], body) == (206, f"bytes 5-9/{len(FILE_DATA)}", FILE_DATA[5:10])
 
 
-def test_a_file_in_memory_that_is_replaced_has_another_tag_and_none_gets_parts_of_both():
-    file = MemoryFile(DATA)
-    with serving.serve_in_thread(PAGE, {"scene.hyrf": file}) as address:
-        tag = ask(port_of(address))[1]["ETag"]
-        file.replace(DATA[::-1])
-        status, headers, body = ask(port_of(address), Range="bytes=5-9", If_Range=tag)
-        assert status == 200 and body == DATA[::-1] and headers["ETag"] != tag
+def test_a_replaced_file_in_memory_has_another_tag_and_is_sent_whole():
+    file = MemoryFile(FILE_DATA)
+    with serving.serve_in_thread(PAGE_HTML, {"scene.hyrf": file}) as address:
+        tag = send_request(port_from_address(address))[1]["ETag"]
+        file.replace(FILE_DATA[::-1])
+        status, headers, body = send_request(port_from_address(address), Range="bytes=5-9", If_Range=tag)
+        assert status == 200 and body == FILE_DATA[::-1] and headers["ETag"] != tag
 
 
-def test_serving_in_a_thread_ends_with_the_block():
-    with serving.serve_in_thread(PAGE, {"scene.hyrf": MemoryFile(DATA)}) as address:
-        kept = http.client.HTTPConnection("127.0.0.1", port_of(address), timeout=20)
+def test_serve_in_thread_stops_at_the_end_of_the_block():
+    with serving.serve_in_thread(PAGE_HTML, {"scene.hyrf": MemoryFile(FILE_DATA)}) as address:
+        kept = http.client.HTTPConnection("127.0.0.1", port_from_address(address), timeout=20)
         kept.request("GET", "/scene.hyrf")
-        assert kept.getresponse().read() == DATA
+        assert kept.getresponse().read() == FILE_DATA
     with pytest.raises(OSError):
-        ask(port_of(address), "/")
-    kept.request("GET", "/scene.hyrf")  # on a connection of before
+        send_request(port_from_address(address), "/")
+    kept.request("GET", "/scene.hyrf")  # on the connection that was opened before
     assert kept.getresponse().status == 404
     kept.close()

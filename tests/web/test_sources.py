@@ -1,4 +1,4 @@
-"""Where a player's scene comes from: its address, a file dropped on it, other people's pages around it."""
+"""The player loads scenes from its address, from dropped files, and inside frames and elements of other pages."""
 
 from __future__ import annotations
 
@@ -14,26 +14,28 @@ from urllib.parse import unquote
 
 import numpy as np
 import pytest
-from web.pages import CENTER, Browser, cloud, message, opened, page_of, until
+from web.pages import SCENE_CENTER, Browser, make_splats_page, open_page, random_splats, wait_for_message, wait_until
 
 from hyrfpack.splats.formats import spz
 from hyrfpack.splats.formats.hints import Hints
 from hyrfpack.web.player import encode_element_script, encode_player
 
 pytestmark = pytest.mark.in_turn
-GOLDEN = (Path(__file__).parents[1] / "golden" / "v1.1_compact.hyrf").read_bytes()
-SHOWN = "hyrfpack.player.loaded && hyrfpack.player.scene.count"
+GOLDEN_FILE_DATA = (Path(__file__).parents[1] / "golden" / "v1.1_compact.hyrf").read_bytes()
+LOADED_COUNT_JS = "hyrfpack.player.loaded && hyrfpack.player.scene.count"
 
 
 @dataclass
 class Site:
-    """A server whose answers tests choose.
+    """The state of a server whose answers tests choose.
 
     Attributes:
-        files: what lies at each path; HTML by its ending.
-        headers: sent with everything.
-        breaks: after so many bytes of a .hyrf file the connection ends, once or (with `always`) each time.
-        asked: (path, Range header) of each request.
+        files: content of each path; the suffix gives the content type.
+        headers: headers sent with every answer.
+        breaks: bytes of a .hyrf file after which the connection breaks.
+        always: whether it breaks every time and not only at requests from the start of the file.
+        ranges: whether the server honours Range headers.
+        asked: (path, Range header) of each request, in order.
     """
 
     address: str = ""
@@ -46,31 +48,31 @@ class Site:
 
 
 @contextmanager
-def site() -> Iterator[Site]:
-    here = Site()
+def serve_site() -> Iterator[Site]:
+    server_state = Site()
 
     class Handler(BaseHTTPRequestHandler):
         protocol_version = "HTTP/1.1"
 
         def do_GET(self) -> None:
             path, asked = unquote(self.path.partition("?")[0]), self.headers.get("Range")
-            here.asked.append((path, asked))
-            data = here.files.get(path)
+            server_state.asked.append((path, asked))
+            data = server_state.files.get(path)
             if data is None:
                 self.send_error(404)
                 return
-            first = int(asked.removeprefix("bytes=").removesuffix("-")) if asked and here.ranges else 0
+            first = int(asked.removeprefix("bytes=").removesuffix("-")) if asked and server_state.ranges else 0
             self.send_response(206 if first else 200)
             kind = {"html": "text/html; charset=utf-8", "js": "text/javascript"}.get(path.rpartition(".")[2])
             self.send_header("Content-Type", kind or "application/octet-stream")
             self.send_header("Content-Length", str(len(data) - first))
             if first:
                 self.send_header("Content-Range", f"bytes {first}-{len(data) - 1}/{len(data)}")
-            for name, value in here.headers.items():
+            for name, value in server_state.headers.items():
                 self.send_header(name, value)
             self.end_headers()
-            if path.endswith(".hyrf") and here.breaks is not None and (here.always or not first):
-                self.wfile.write(data[first : first + here.breaks])
+            if path.endswith(".hyrf") and server_state.breaks is not None and (server_state.always or not first):
+                self.wfile.write(data[first : first + server_state.breaks])
                 self.wfile.flush()
                 time.sleep(0.2)
                 self.close_connection = True
@@ -79,32 +81,32 @@ def site() -> Iterator[Site]:
                 self.wfile.write(data[first:])
 
         def log_message(self, format: str, *arguments: object) -> None:
-            """Requests are nobody's news."""
+            """Do not print requests."""
 
     with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
-        here.address = f"http://127.0.0.1:{server.server_port}"
+        server_state.address = f"http://127.0.0.1:{server.server_port}"
         threading.Thread(target=server.serve_forever, daemon=True).start()
         try:
-            yield here
+            yield server_state
         finally:
             server.shutdown()
 
 
 @pytest.fixture
 def host() -> Iterator[Site]:
-    """A player to be hosted, beside two files."""
-    with site() as here:
-        here.files = {
+    """Serve a player beside two files."""
+    with serve_site() as server_state:
+        server_state.files = {
             "/index.html": encode_player("player"),
-            "/some scene.hyrf": GOLDEN,
-            "/cloud.spz": spz.encode(cloud(300), Hints(spz_version=3)),
+            "/some scene.hyrf": GOLDEN_FILE_DATA,
+            "/cloud.spz": spz.encode(random_splats(300), Hints(spz_version=3)),
             "/hyrf-viewer.js": encode_element_script(),
         }
-        yield here
+        yield server_state
 
 
 @pytest.fixture(autouse=True)
-def usual(browser: Browser) -> Iterator[None]:
+def reset_window(browser: Browser) -> Iterator[None]:
     yield
     browser.resize(240, 180)
 
@@ -112,15 +114,15 @@ def usual(browser: Browser) -> Iterator[None]:
 # ---- the address
 
 
-def test_the_address_names_the_file(browser: Browser, host: Site):
+def test_the_address_selects_the_file(browser: Browser, host: Site):
     browser.open(f"{host.address}/index.html?content=some%20scene.hyrf&noui&title=Mine")
     browser.evaluate("hyrfpack.ready")
-    assert browser.evaluate(SHOWN) > 0 and browser.evaluate("hyrfpack.player.scene.kind") == "hyrf"
+    assert browser.evaluate(LOADED_COUNT_JS) > 0 and browser.evaluate("hyrfpack.player.scene.kind") == "hyrf"
     assert browser.evaluate("document.title") == "Mine"
     browser.open(f"{host.address}/index.html?content={host.address}/cloud.spz#camera=1")
     browser.evaluate("hyrfpack.ready")
     assert browser.evaluate("hyrfpack.player.scene.kind") == "splats"
-    assert np.linalg.norm(np.array(browser.evaluate("hyrfpack.player.scene.target")) - CENTER) < 0.3
+    assert np.linalg.norm(np.array(browser.evaluate("hyrfpack.player.scene.target")) - SCENE_CENTER) < 0.3
     assert browser.list_errors() == []
 
 
@@ -129,25 +131,25 @@ def test_a_file_beside_the_player_is_the_default(browser: Browser, host: Site):
     host.files["/poster.webp"] = b"no picture"
     browser.open(f"{host.address}/index.html")
     browser.evaluate("hyrfpack.ready")
-    assert browser.evaluate(SHOWN) > 0 and browser.evaluate("document.title") == "a title"
+    assert browser.evaluate(LOADED_COUNT_JS) > 0 and browser.evaluate("document.title") == "a title"
     browser.open(f"{host.address}/index.html?content=cloud.spz")
     browser.evaluate("hyrfpack.ready")
-    assert browser.evaluate(SHOWN) == 300
+    assert browser.evaluate(LOADED_COUNT_JS) == 300
 
 
-def test_what_cannot_be_fetched_is_one_sentence(browser: Browser, host: Site):
+def test_a_failed_fetch_is_reported_in_one_sentence(browser: Browser, host: Site):
     browser.open(f"{host.address}/index.html?content=not%20there.hyrf")
-    assert message(browser).startswith("not there.hyrf could not be fetched (404 Not Found); check")
-    until(browser, "document.getElementById('invitation').checkVisibility()")  # another may be chosen
-    with site() as closed:  # it does not let pages of others read
-        closed.files = {"/scene.hyrf": GOLDEN}
-        browser.open(f"{host.address}/index.html?content={closed.address}/scene.hyrf")
-        said = message(browser)
+    assert wait_for_message(browser).startswith("not there.hyrf could not be fetched (404 Not Found); check")
+    wait_until(browser, "document.getElementById('invitation').checkVisibility()")  # the user may choose another file
+    with serve_site() as other_site:  # without CORS headers, other sites cannot read it
+        other_site.files = {"/scene.hyrf": GOLDEN_FILE_DATA}
+        browser.open(f"{host.address}/index.html?content={other_site.address}/scene.hyrf")
+        said = wait_for_message(browser)
         assert said.startswith("scene.hyrf could not be fetched: 127.0.0.1:") and "other sites" in said
-        closed.headers = {"Access-Control-Allow-Origin": "*"}
-        browser.open(f"{host.address}/index.html?content={closed.address}/scene.hyrf")
+        other_site.headers = {"Access-Control-Allow-Origin": "*"}
+        browser.open(f"{host.address}/index.html?content={other_site.address}/scene.hyrf")
         browser.evaluate("hyrfpack.ready")
-        assert browser.evaluate(SHOWN) > 0
+        assert browser.evaluate(LOADED_COUNT_JS) > 0
 
 
 @pytest.mark.parametrize(
@@ -156,47 +158,49 @@ def test_what_cannot_be_fetched_is_one_sentence(browser: Browser, host: Site):
 def test_only_web_addresses_are_fetched(browser: Browser, host: Site, content: str):
     host.files["/index.html"] = encode_player("a title", content="some scene.hyrf")
     browser.open(f"{host.address}/index.html?content={content}")
-    assert message(browser).startswith("The content in the address")
+    assert wait_for_message(browser).startswith("The content in the address")
     time.sleep(0.2)
     assert [path for path, _ in host.asked] == ["/index.html"]
 
 
-def test_an_address_that_cannot_be_a_poster_does_not_stop_the_scene(browser: Browser, host: Site):
+def test_an_invalid_poster_address_is_reported_and_the_scene_is_shown(browser: Browser, host: Site):
     browser.open(f"{host.address}/index.html?content=cloud.spz&poster=javascript:0")
     browser.evaluate("hyrfpack.ready")
-    assert browser.evaluate(SHOWN) == 300 and message(browser).startswith("The poster in the address")
+    assert browser.evaluate(LOADED_COUNT_JS) == 300 and wait_for_message(browser).startswith(
+        "The poster in the address"
+    )
 
 
-def test_a_file_that_is_none_is_one_sentence(browser: Browser, host: Site):
+def test_a_file_of_another_kind_is_reported_in_one_sentence(browser: Browser, host: Site):
     host.files["/x.hyrf"] = b"<!DOCTYPE html><title>Sorry</title>" * 50
     browser.open(f"{host.address}/index.html?content=x.hyrf")
-    said = message(browser)
+    said = wait_for_message(browser)
     assert said.startswith("x.hyrf cannot be opened: ") and "\n" not in said
 
 
-def test_a_connection_that_breaks_is_taken_up_where_it_broke(browser: Browser, host: Site):
-    host.breaks = len(GOLDEN) // 3
+def test_a_broken_download_resumes_where_it_broke(browser: Browser, host: Site):
+    host.breaks = len(GOLDEN_FILE_DATA) // 3
     browser.open(f"{host.address}/index.html?content=some%20scene.hyrf")
     browser.evaluate("hyrfpack.ready")
-    assert browser.evaluate(SHOWN) > 0
+    assert browser.evaluate(LOADED_COUNT_JS) > 0
     asked = [ranges for path, ranges in host.asked if path.endswith("hyrf")]
     assert asked[0] is None and asked[-1] == f"bytes={host.breaks}-"
 
 
 @pytest.mark.parametrize("why", ["it breaks again", "there are no ranges"])
-def test_a_connection_that_breaks_for_good_is_one_sentence(browser: Browser, host: Site, why: str):
-    host.breaks, host.always, host.ranges = len(GOLDEN) // 3, True, why != "there are no ranges"
-    host.files["/x.hyrf"] = GOLDEN
+def test_a_download_that_cannot_resume_is_reported_in_one_sentence(browser: Browser, host: Site, why: str):
+    host.breaks, host.always, host.ranges = len(GOLDEN_FILE_DATA) // 3, True, why != "there are no ranges"
+    host.files["/x.hyrf"] = GOLDEN_FILE_DATA
     browser.open(f"{host.address}/index.html?content=x.hyrf")
-    said = message(browser)
+    said = wait_for_message(browser)
     assert "the connection broke after" in said and said.startswith("x.hyrf cannot be opened: ")
 
 
-# ---- a person's files
+# ---- dropped files
 
 
-def drop(browser: Browser, data: bytes, name: str) -> None:
-    """Drop a file on the page."""
+def drop_file(browser: Browser, data: bytes, name: str) -> None:
+    """Drop a file with this content and name on the page."""
     browser.evaluate(
         f"""(() => {{
             const bytes = Uint8Array.from(atob("{base64.b64encode(data).decode()}"), (letter) => letter.charCodeAt(0));
@@ -211,76 +215,78 @@ def drop(browser: Browser, data: bytes, name: str) -> None:
     )
 
 
-def test_an_empty_player_asks_for_a_file_and_takes_what_is_dropped(browser: Browser, host: Site):
+def test_an_empty_player_asks_for_a_file_and_opens_dropped_files(browser: Browser, host: Site):
     browser.resize(1280, 800)
     browser.open(f"{host.address}/index.html")
     browser.evaluate("hyrfpack.ready")
     invitation = "document.getElementById('invitation').checkVisibility()"
     assert browser.evaluate(invitation)
     assert not browser.evaluate("document.getElementById('loading').checkVisibility()")
-    browser.press("w", seconds=0.1)  # nothing to move in
+    browser.press("w", seconds=0.1)  # must do nothing without a scene
     browser.drag((120, 90), (130, 90))
-    drop(browser, host.files["/cloud.spz"], "my cloud.spz")
-    until(browser, SHOWN + " === 300")
+    drop_file(browser, host.files["/cloud.spz"], "my cloud.spz")
+    wait_until(browser, LOADED_COUNT_JS + " === 300")
     assert not browser.evaluate(invitation)
     assert browser.evaluate("document.title") == "my cloud"
-    until(browser, "document.getElementById('panel').checkVisibility()")
-    drop(browser, GOLDEN, "model.hyrf")
-    until(browser, "hyrfpack.player.scene.kind === 'hyrf'")
-    until(browser, "document.getElementById('count').textContent.startsWith('hybrid field, ')")
+    wait_until(browser, "document.getElementById('panel').checkVisibility()")
+    drop_file(browser, GOLDEN_FILE_DATA, "model.hyrf")
+    wait_until(browser, "hyrfpack.player.scene.kind === 'hyrf'")
+    wait_until(browser, "document.getElementById('count').textContent.startsWith('hybrid field, ')")
     assert browser.list_errors() == []
 
 
-def test_a_bad_file_leaves_the_scene_and_says_so(browser: Browser, host: Site):
+def test_a_damaged_file_is_reported_and_the_scene_stays(browser: Browser, host: Site):
     browser.open(f"{host.address}/index.html?content=cloud.spz")
     browser.evaluate("hyrfpack.ready")
-    drop(browser, GOLDEN[:300], "half.hyrf")
-    assert message(browser).startswith("half.hyrf cannot be opened: ")
-    assert browser.evaluate(SHOWN) == 300 and browser.evaluate("document.title") == "cloud"
-    drop(browser, b"", "empty.ply")
-    until(browser, "document.getElementById('sentence').textContent.startsWith('empty.ply cannot be opened: ')")
+    drop_file(browser, GOLDEN_FILE_DATA[:300], "half.hyrf")
+    assert wait_for_message(browser).startswith("half.hyrf cannot be opened: ")
+    assert browser.evaluate(LOADED_COUNT_JS) == 300 and browser.evaluate("document.title") == "cloud"
+    drop_file(browser, b"", "empty.ply")
+    wait_until(browser, "document.getElementById('sentence').textContent.startsWith('empty.ply cannot be opened: ')")
 
 
-def test_a_page_with_a_scene_inside_takes_files_as_well(browser: Browser, tmp_path: Path):
-    opened(browser, tmp_path, page_of(cloud(50)))
-    drop(browser, GOLDEN, "model.hyrf")
-    until(browser, "hyrfpack.player.scene.kind === 'hyrf'")
+def test_a_page_with_a_scene_inside_opens_dropped_files(browser: Browser, tmp_path: Path):
+    open_page(browser, tmp_path, make_splats_page(random_splats(50)))
+    drop_file(browser, GOLDEN_FILE_DATA, "model.hyrf")
+    wait_until(browser, "hyrfpack.player.scene.kind === 'hyrf'")
     browser.press("l")
-    until(browser, "/does not hold the file|Copy this link/.test(document.getElementById('done').textContent)")
+    wait_until(browser, "/does not hold the file|Copy this link/.test(document.getElementById('done').textContent)")
 
 
-# ---- other people's pages
+# ---- inside other pages
 
-TALL = '<!DOCTYPE html><body style="margin: 0; height: 3000px">'
+TALL_PAGE_HTML = '<!DOCTYPE html><body style="margin: 0; height: 3000px">'
 
 
-def test_a_frame_leaves_the_wheel_to_the_page_until_it_is_clicked(browser: Browser, host: Site):
+def test_in_a_frame_the_wheel_scrolls_the_page_until_the_scene_is_clicked(browser: Browser, host: Site):
     frame = '<iframe src="index.html?content=cloud.spz" style="border: 0; width: 240px; height: 180px"></iframe>'
-    host.files["/around.html"] = (TALL + frame).encode()
+    host.files["/around.html"] = (TALL_PAGE_HTML + frame).encode()
     browser.open(f"{host.address}/around.html")
     inside = "document.querySelector('iframe').contentWindow"
-    until(browser, f"{inside}.hyrfpack?.player?.loaded")
+    wait_until(browser, f"{inside}.hyrfpack?.player?.loaded")
     where = f"JSON.stringify({inside}.hyrfpack.camera())"
     home = browser.evaluate(where)
     browser.mouse("mouseWheel", 120, 90, deltaX=0, deltaY=30)
-    until(browser, "scrollY > 0")
+    wait_until(browser, "scrollY > 0")
     assert browser.evaluate(where) == home
     assert "Click" in browser.evaluate(f"{inside}.document.getElementById('done').textContent")
     browser.evaluate("scrollTo(0, 0)")
     for kind in ("mousePressed", "mouseReleased"):
         browser.mouse(kind, 120, 90, button="left", clickCount=1)
     browser.mouse("mouseWheel", 120, 90, deltaX=0, deltaY=30)
-    until(browser, f"{where} !== '{home}'")
+    wait_until(browser, f"{where} !== '{home}'")
     assert browser.evaluate("scrollY") == 0
 
 
-def test_in_a_frame_a_finger_moves_the_page_until_the_scene_is_tapped(browser: Browser, host: Site):
+def test_in_a_frame_a_touch_scrolls_the_page_until_the_scene_is_tapped(browser: Browser, host: Site):
     frame = '<iframe src="index.html?content=cloud.spz" style="border: 0; width: 240px; height: 180px"></iframe>'
-    host.files["/around.html"] = ('<meta name="viewport" content="width=device-width">' + TALL + frame).encode()
+    host.files["/around.html"] = (
+        '<meta name="viewport" content="width=device-width">' + TALL_PAGE_HTML + frame
+    ).encode()
     browser.resize(240, 360, phone=True)
     browser.open(f"{host.address}/around.html")
     inside = "document.querySelector('iframe').contentWindow"
-    until(browser, f"{inside}.hyrfpack?.player?.loaded")
+    wait_until(browser, f"{inside}.hyrfpack?.player?.loaded")
     where = f"JSON.stringify({inside}.hyrfpack.camera())"
     home = browser.evaluate(where)
     touches = f"getComputedStyle({inside}.document.getElementById('view')).touchAction"
@@ -299,22 +305,22 @@ def test_in_a_frame_a_finger_moves_the_page_until_the_scene_is_tapped(browser: B
     browser.evaluate("scrollTo(0, 0)")
     browser.touch("touchStart", (120, 90))
     browser.touch("touchEnd")
-    until(browser, f"{touches} === 'none'")
+    wait_until(browser, f"{touches} === 'none'")
     ends = time.monotonic() + 20
-    while browser.evaluate(where) == home:  # until the browser has made up its mind who scrolls
-        assert time.monotonic() < ends, "a finger does not move the scene"
+    while browser.evaluate(where) == home:  # the browser needs some touches to switch from scrolling the page
+        assert time.monotonic() < ends, "a touch does not move the scene"
         browser.evaluate("scrollTo(0, 0)")
         browser.evaluate(settle)
         swipe()
         browser.evaluate(settle)
 
 
-ELEMENT = "document.querySelector('hyrf-viewer')"
-INSIDE = f"{ELEMENT}.shadowRoot.querySelector('iframe').contentWindow"
+ELEMENT_JS = "document.querySelector('hyrf-viewer')"
+ELEMENT_WINDOW_JS = f"{ELEMENT_JS}.shadowRoot.querySelector('iframe').contentWindow"
 
 
 @pytest.mark.parametrize("kind", ["", ' type="module"'])
-def test_the_element_plays_a_file_and_follows_its_attributes(browser: Browser, host: Site, kind: str):
+def test_the_element_shows_a_file_and_follows_its_attributes(browser: Browser, host: Site, kind: str):
     host.files["/blog/post.html"] = (
         "<!DOCTYPE html><meta http-equiv=Content-Security-Policy content=\"style-src 'none'\">"
         f"<script{kind} src=../hyrf-viewer.js></script>"
@@ -323,23 +329,23 @@ def test_the_element_plays_a_file_and_follows_its_attributes(browser: Browser, h
         '<hyrf-viewer src="../cloud.spz" camera="1" title="A cloud" noui></hyrf-viewer>'
     ).encode()
     browser.open(f"{host.address}/blog/post.html")
-    until(browser, "told.some(([name, detail]) => name === 'load' && detail === '')")
-    assert browser.evaluate(f"{INSIDE}.{SHOWN.split(' && ')[0]}")
-    assert browser.evaluate(f"{INSIDE}.document.title") == "A cloud"
-    assert browser.evaluate(f"{INSIDE}.document.body.classList.contains('bare')")
-    box = browser.evaluate(f"(({{ width, height }}) => [width, height])({ELEMENT}.getBoundingClientRect())")
+    wait_until(browser, "told.some(([name, detail]) => name === 'load' && detail === '')")
+    assert browser.evaluate(f"{ELEMENT_WINDOW_JS}.{LOADED_COUNT_JS.split(' && ')[0]}")
+    assert browser.evaluate(f"{ELEMENT_WINDOW_JS}.document.title") == "A cloud"
+    assert browser.evaluate(f"{ELEMENT_WINDOW_JS}.document.body.classList.contains('bare')")
+    box = browser.evaluate(f"(({{ width, height }}) => [width, height])({ELEMENT_JS}.getBoundingClientRect())")
     assert box[0] / box[1] == pytest.approx(4 / 3, rel=0.01)
-    browser.evaluate(f"({INSIDE}.marked = true, {ELEMENT}.setAttribute('camera', '77'))")
-    until(browser, f"{INSIDE}.document.getElementById('sentence').textContent.includes('no camera 77')")
-    assert browser.evaluate(f"{INSIDE}.marked"), "it was loaded anew"
-    browser.evaluate(f"({ELEMENT}.setAttribute('src', '../some scene.hyrf'), {ELEMENT}.removeAttribute('noui'))")
-    until(browser, f"{INSIDE}.hyrfpack?.player?.scene?.kind === 'hyrf'")
-    assert not browser.evaluate(f"{INSIDE}.document.body.classList.contains('bare')")
-    browser.evaluate(f"{ELEMENT}.setAttribute('src', '../nothing.hyrf')")
-    until(browser, "told.some(([name, detail]) => name === 'error' && String(detail).includes('404'))")
+    browser.evaluate(f"({ELEMENT_WINDOW_JS}.marked = true, {ELEMENT_JS}.setAttribute('camera', '77'))")
+    wait_until(browser, f"{ELEMENT_WINDOW_JS}.document.getElementById('sentence').textContent.includes('no camera 77')")
+    assert browser.evaluate(f"{ELEMENT_WINDOW_JS}.marked"), "the frame was reloaded"
+    browser.evaluate(f"({ELEMENT_JS}.setAttribute('src', '../some scene.hyrf'), {ELEMENT_JS}.removeAttribute('noui'))")
+    wait_until(browser, f"{ELEMENT_WINDOW_JS}.hyrfpack?.player?.scene?.kind === 'hyrf'")
+    assert not browser.evaluate(f"{ELEMENT_WINDOW_JS}.document.body.classList.contains('bare')")
+    browser.evaluate(f"{ELEMENT_JS}.setAttribute('src', '../nothing.hyrf')")
+    wait_until(browser, "told.some(([name, detail]) => name === 'error' && String(detail).includes('404'))")
 
 
-def test_the_element_names_nothing_in_the_page(browser: Browser, host: Site):
+def test_the_element_adds_no_global_names(browser: Browser, host: Site):
     host.files["/post.html"] = b"<!DOCTYPE html>" + 2 * b"<script src=hyrf-viewer.js></script>"
     host.files["/plain.html"] = b"<!DOCTYPE html>"
     names = "Object.getOwnPropertyNames(window).filter((name) => !/^\\d+$/.test(name)).sort()"

@@ -1,4 +1,4 @@
-"""Compressed PLY: records packed by hand, a real file, and what hostile files meet."""
+"""Compressed PLY: hand-packed records and a real file are decoded, invalid files are refused."""
 
 from __future__ import annotations
 
@@ -10,14 +10,16 @@ from made_up_splats import FILE_EDITS, KEPT_FRACTIONS, damage_file
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.splats.formats import compressed_ply, ply
 
-AXES, SCALES, COLORS = ("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b")
-Y00 = 0.5 / np.sqrt(np.pi)
+POSITION_AXES, SCALE_NAMES, COLOR_CHANNELS = ("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b")
+BAND_0_VALUE = 0.5 / np.sqrt(np.pi)
 
 
-def file_of(count: int, words: list[int], colored: bool = False, rest: int = 0, chunks: int | None = None) -> bytes:
-    """`count` Gaussians of the same four words; chunk k spans x, y, z from k to (k + 1, k + 2, k + 4)."""
+def build_compressed_ply(
+    count: int, words: list[int], colored: bool = False, rest: int = 0, chunks: int | None = None
+) -> bytes:
+    """Build a file of `count` equal Gaussians; chunk k spans x, y, z from k to (k + 1, k + 2, k + 4)."""
     chunks = -(-count // 256) if chunks is None else chunks
-    parts = (AXES, SCALES, COLORS) if colored else (AXES, SCALES)
+    parts = (POSITION_AXES, SCALE_NAMES, COLOR_CHANNELS) if colored else (POSITION_AXES, SCALE_NAMES)
     names = [f"{end}_{part}" for group in parts for end in ("min", "max") for part in group]
     bounds = [[k, k, k, k + 1, k + 2, k + 4, -4, -3, -2, 0, 1, 2, *([0.25, 0, 0, 0.5, 2, 1] if colored else [])]
               for k in range(chunks)]  # fmt: skip
@@ -36,40 +38,41 @@ def file_of(count: int, words: list[int], colored: bool = False, rest: int = 0, 
     return data + bytes(range(rest)) * count
 
 
-# Position (2047, 0, 1024) / 2047; w is largest, x, y, z are 1023, 0, 512; scale 0, 1023, 0; RGB 255, 51, 0; opacity 102
-WORDS = [2047 << 21 | 1024, 1023 << 20 | 512, 1023 << 11, 255 << 24 | 51 << 16 | 102]
+# The words hold position (2047, 0, 1024) / 2047; a quaternion whose largest component is w and whose x, y, z are 1023,
+# 0, 512; scale 0, 1023, 0; RGB 255, 51, 0; opacity 102.
+PACKED_WORDS = [2047 << 21 | 1024, 1023 << 20 | 512, 1023 << 11, 255 << 24 | 51 << 16 | 102]
 
 
 @pytest.mark.parametrize("colored", [False, True])
-def test_decode_reads_records_packed_by_hand(colored):
-    splats = compressed_ply.decode(file_of(300, WORDS, colored, rest=9), "a.ply")
+def test_hand_packed_records_are_decoded(colored):
+    splats = compressed_ply.decode(build_compressed_ply(300, PACKED_WORDS, colored, rest=9), "a.ply")
 
     part = 4 * 1024 / 2047
     np.testing.assert_allclose(splats.positions[[0, 255]], [[1, 0, part]] * 2, rtol=1e-12)
-    np.testing.assert_allclose(splats.positions[256], [2, 1, 1 + part], rtol=1e-12)  # of the second chunk
+    np.testing.assert_allclose(splats.positions[256], [2, 1, 1 + part], rtol=1e-12)  # lies in the second chunk
     np.testing.assert_allclose(splats.scales[0], np.exp([-4, 1, -2]), rtol=1e-6)
     np.testing.assert_allclose(splats.quats[0], [0, 0.5**0.5, -(0.5**0.5), (512 / 1023 - 0.5) * 2**0.5], atol=1e-3)
     np.testing.assert_allclose(splats.opacities, 0.4, rtol=1e-6)
     color = np.array([0.5, 2 * 0.2, 0]) if colored else np.array([1, 0.2, 0])
-    np.testing.assert_allclose(splats.harmonics[0, 0], (color - 0.5) / Y00, rtol=1e-5)
-    codes = np.arange(9).reshape(3, 3).T  # channel after channel
+    np.testing.assert_allclose(splats.harmonics[0, 0], (color - 0.5) / BAND_0_VALUE, rtol=1e-5)
+    codes = np.arange(9).reshape(3, 3).T  # the codes are stored channel by channel
     np.testing.assert_allclose(splats.harmonics[5, 1:], np.where(codes == 0, -4, (codes + 0.5) / 32 - 4), rtol=1e-6)
 
 
 @pytest.mark.parametrize("largest", [0, 1, 2, 3])
-def test_the_largest_of_w_x_y_z_is_left_out(largest):
+def test_the_largest_quaternion_component_is_restored(largest):
     words = [0, largest << 30 | 716 << 20 | 307 << 10 | 512, 0, 0]
-    quat = compressed_ply.decode(file_of(1, words), "a.ply").quats[0]
+    quat = compressed_ply.decode(build_compressed_ply(1, words), "a.ply").quats[0]
     others = (np.array([716, 307, 512]) / 1023 - 0.5) * 2**0.5
     expected = np.insert(others, largest, np.sqrt(1 - others @ others))
     np.testing.assert_allclose(quat, np.sign(expected[0]) * expected, atol=1e-6)
 
 
-def test_no_gaussians_are_a_file_too():
-    assert len(ply.decode(file_of(0, WORDS, rest=24), "a.ply")) == 0
+def test_a_file_without_gaussians_is_read():
+    assert len(ply.decode(build_compressed_ply(0, PACKED_WORDS, rest=24), "a.ply")) == 0
 
 
-def test_decoding_a_ply_tells_both_kinds_apart(shared_data):
+def test_the_ply_reader_recognises_compressed_files(shared_data):
     data = (shared_data / "trained_models" / "biker.compressed.ply").read_bytes()
     splats = ply.decode(data, "biker.compressed.ply")
     assert len(splats) == 152_746 and splats.degree == 0
@@ -77,27 +80,30 @@ def test_decoding_a_ply_tells_both_kinds_apart(shared_data):
         ply.decode_plain(data, "biker.compressed.ply")
 
 
-GOOD = file_of(300, WORDS)
+VALID_FILE = build_compressed_ply(300, PACKED_WORDS)
 
 
 @pytest.mark.parametrize(
     ("data", "words"),
     [
-        (ply.encode(ply.decode(file_of(0, WORDS), "")), "'vertex' has no property packed_position"),
-        (GOOD.replace(b"uint packed_scale", b"int packed_scale"), "no property packed_scale of the right type"),
-        (GOOD.replace(b"max_scale_z", b"max_scale_w"), "'chunk' has no property max_scale_z"),
-        (GOOD.replace(b"element chunk", b"element chunky"), "'chunk' has no property min_x"),
-        (GOOD.replace(b"min_scale_x", b"min_r"), "no property min_scale_x"),
-        (GOOD[:-1], "ends before the 300 rows of its element 'vertex'"),
-        (file_of(300, WORDS, chunks=1), "1 chunks do not fit 300 Gaussians"),
-        (file_of(300, WORDS, chunks=3), "3 chunks do not fit 300 Gaussians"),
-        (file_of(3, WORDS, rest=8), "the element 'sh' has 8 properties"),
-        (file_of(3, WORDS, rest=9).replace(b"sh 3", b"sh 2"), "do not fit 3 Gaussians"),
-        (GOOD.replace(b"binary_little_endian", b"ascii"), "in text cannot be read"),
-        (GOOD.replace(np.array([0, 0, 0, 1, 2, 4], "<f4").tobytes(), np.full(6, np.nan, "<f4").tobytes()), "position"),
+        (ply.encode(ply.decode(build_compressed_ply(0, PACKED_WORDS), "")), "'vertex' has no property packed_position"),
+        (VALID_FILE.replace(b"uint packed_scale", b"int packed_scale"), "no property packed_scale of the right type"),
+        (VALID_FILE.replace(b"max_scale_z", b"max_scale_w"), "'chunk' has no property max_scale_z"),
+        (VALID_FILE.replace(b"element chunk", b"element chunky"), "'chunk' has no property min_x"),
+        (VALID_FILE.replace(b"min_scale_x", b"min_r"), "no property min_scale_x"),
+        (VALID_FILE[:-1], "ends before the 300 rows of its element 'vertex'"),
+        (build_compressed_ply(300, PACKED_WORDS, chunks=1), "1 chunks do not fit 300 Gaussians"),
+        (build_compressed_ply(300, PACKED_WORDS, chunks=3), "3 chunks do not fit 300 Gaussians"),
+        (build_compressed_ply(3, PACKED_WORDS, rest=8), "the element 'sh' has 8 properties"),
+        (build_compressed_ply(3, PACKED_WORDS, rest=9).replace(b"sh 3", b"sh 2"), "do not fit 3 Gaussians"),
+        (VALID_FILE.replace(b"binary_little_endian", b"ascii"), "in text cannot be read"),
+        (
+            VALID_FILE.replace(np.array([0, 0, 0, 1, 2, 4], "<f4").tobytes(), np.full(6, np.nan, "<f4").tobytes()),
+            "position",
+        ),
     ],
-)  # fmt: skip
-def test_decode_refuses_with_a_sentence(data, words):
+)
+def test_invalid_files_are_refused_with_the_reason(data, words):
     with pytest.raises(HyrfDataError, match=words) as error:
         compressed_ply.decode(data, "some.ply")
     assert str(error.value).startswith("some.ply: ")
@@ -108,8 +114,8 @@ def test_decode_refuses_with_a_sentence(data, words):
     edits=FILE_EDITS,
     length=KEPT_FRACTIONS,
 )
-def test_damaged_files_become_splats_or_a_sentence(edits, length):
-    data = file_of(5, WORDS, colored=True, rest=9)
+def test_damaged_files_are_decoded_or_refused(edits, length):
+    data = build_compressed_ply(5, PACKED_WORDS, colored=True, rest=9)
     try:
         splats = ply.decode(damage_file(data, edits, length), "a.ply")
     except HyrfDataError as error:

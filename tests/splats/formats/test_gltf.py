@@ -21,8 +21,8 @@ from hyrfpack.splats.splats import Splats
 Y_DOWN, Z_UP = np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, 1.0])
 
 
-def same(first: Splats, second: Splats) -> bool:
-    """All but positions; quaternions are brought to unit length on reading."""
+def are_equal_except_positions(first: Splats, second: Splats) -> bool:
+    """Compare everything but positions; quaternions with a tolerance, because reading normalises them."""
     equal = all(np.array_equal(getattr(first, name), getattr(second, name)) for name in ("scales", "opacities"))
     return (
         equal
@@ -31,11 +31,11 @@ def same(first: Splats, second: Splats) -> bool:
     )
 
 
-def json_of(data: bytes) -> dict:
+def parse_json(data: bytes) -> dict:
     return json.loads(data[20 : 20 + struct.unpack_from("<I", data, 12)[0]])
 
 
-def glb_of(content: dict, binary: bytes) -> bytes:
+def build_glb(content: dict, binary: bytes) -> bytes:
     text = json.dumps(content).encode()
     text += b" " * (-len(text) % 4)
     binary += bytes(-len(binary) % 4)
@@ -44,21 +44,21 @@ def glb_of(content: dict, binary: bytes) -> bytes:
 
 
 @pytest.mark.parametrize("degree", range(4))
-def test_what_is_written_is_read_in_the_same_axes(degree):
+def test_splats_round_trip_in_the_same_axes(degree):
     splats = random_splats(degree=degree)
     read = gltf.decode(gltf.encode(splats, Hints(Y_DOWN)), "a.glb")
-    assert same(read, splats)
+    assert are_equal_except_positions(read, splats)
     np.testing.assert_array_equal(read.positions, splats.positions.astype(np.float32))
 
 
-def test_the_same_splats_make_the_same_bytes():
+def test_encoding_is_deterministic():
     assert gltf.encode(random_splats(), Hints(Z_UP)) == gltf.encode(random_splats(), Hints(Z_UP))
 
 
-def test_attributes_lie_where_the_specification_says():
+def test_attributes_follow_the_specification():
     splats = random_splats(3, degree=1)
     data = gltf.encode(splats, Hints(Y_DOWN))
-    content = json_of(data)
+    content = parse_json(data)
     primitive = content["meshes"][0]["primitives"][0]
     assert content["extensionsUsed"] == ["KHR_gaussian_splatting"] and primitive["mode"] == 0
     assert primitive["extensions"]["KHR_gaussian_splatting"] == {
@@ -84,7 +84,7 @@ def test_attributes_lie_where_the_specification_says():
     assert content["accessors"][0]["max"] == stored.max(0).tolist()
 
 
-def test_viewers_without_the_extension_see_coloured_upright_points():
+def test_viewers_without_the_extension_see_colored_upright_points():
     splats = random_splats(50)
     cloud = trimesh.load_scene(io.BytesIO(gltf.encode(splats, Hints(Y_DOWN))), file_type="glb").to_geometry()
     np.testing.assert_allclose(cloud.vertices, splats.positions * (1, -1, -1), atol=1e-6)
@@ -95,17 +95,17 @@ def test_viewers_without_the_extension_see_coloured_upright_points():
 
 
 @pytest.mark.parametrize("up", [Y_DOWN, -Y_DOWN, Z_UP, -Z_UP, np.array([1.0, 0, 0]), np.array([0.48, -0.6, 0.64])])
-def test_the_node_turns_up_to_y(up):
+def test_the_node_rotates_up_to_y(up):
     splats = random_splats(5)
     data = gltf.encode(splats, Hints(up))
-    turn = Rotation.from_quat(json_of(data)["nodes"][0]["rotation"])
+    turn = Rotation.from_quat(parse_json(data)["nodes"][0]["rotation"])
     np.testing.assert_allclose(turn.apply(up), (0, 1, 0), atol=1e-12)
     upright = gltf.decode(data, "a.glb", upright=True)
     np.testing.assert_allclose(upright.positions, turn.apply(splats.positions), atol=1e-6)
     np.testing.assert_allclose(upright.harmonics, splats.rotated(turn.as_matrix()).harmonics, atol=1e-6)
 
 
-def test_y_down_turns_by_half_about_x_and_z_up_by_a_quarter():
+def test_upright_rotation_is_a_half_turn_for_y_down_and_a_quarter_turn_for_z_up():
     np.testing.assert_array_equal(upright_rotation(Y_DOWN, -Y_DOWN), np.diag((1, -1, -1)))
     np.testing.assert_array_equal(upright_rotation(Z_UP, -Y_DOWN), [[1, 0, 0], [0, 0, 1], [0, -1, 0]])
 
@@ -114,11 +114,11 @@ def test_a_scene_far_away_keeps_its_precision():
     splats = random_splats(100, shift=(5e5, -4e6, 120.0))
     data = gltf.encode(splats, Hints(Z_UP))
     np.testing.assert_allclose(gltf.decode(data, "a.glb").positions, splats.positions, rtol=0, atol=1e-6)
-    assert np.abs(json_of(data)["accessors"][0]["max"]).max() < 8
+    assert np.abs(parse_json(data)["accessors"][0]["max"]).max() < 8
     assert not local_origin(random_splats(100, shift=(2, 2, 2)).positions).any()
 
 
-def test_smaller_integers_strides_and_matrices_of_others_are_read():
+def test_normalized_integers_strides_and_matrices_are_read():
     record = struct.pack("<3f4hHHBBBx3f", 1, 2, 3, 0, 0, 32767, 0, 5, 65535, 255, 0, 51, 0.1, 0.2, 0.3)
     fields = {
         "POSITION": (0, 5126, False, "VEC3"),
@@ -139,7 +139,7 @@ def test_smaller_integers_strides_and_matrices_of_others_are_read():
     content = {
         "asset": {"version": "2.0"},
         "scenes": [{"nodes": [1]}],
-        # Doubled and moved, below a node that turns a quarter about z.
+        # The node scales by two and moves; its parent rotates a quarter turn about z.
         "nodes": [
             {"mesh": 0, "matrix": [2, 0, 0, 0, 0, 2, 0, 0, 0, 0, 2, 0, 10, 0, 0, 1]},
             {"children": [0], "rotation": [0, 0, 0.5**0.5, 0.5**0.5]},
@@ -149,7 +149,7 @@ def test_smaller_integers_strides_and_matrices_of_others_are_read():
         "bufferViews": [{"buffer": 0, "byteLength": 80, "byteStride": 40}],
         "buffers": [{"byteLength": 80}],
     }
-    read = gltf.decode(glb_of(content, 2 * record), "a.glb", upright=True)
+    read = gltf.decode(build_glb(content, 2 * record), "a.glb", upright=True)
     np.testing.assert_allclose(read.positions, [(-4, 12, 6)] * 2, atol=1e-12)
     np.testing.assert_allclose(read.scales, [(2, 0, 0.4)] * 2, atol=1e-7)
     np.testing.assert_allclose(read.opacities, [1, 1])
@@ -159,7 +159,7 @@ def test_smaller_integers_strides_and_matrices_of_others_are_read():
     np.testing.assert_allclose(read.harmonics[:, 0], [(0.1, 0.2, 0.3)] * 2, atol=1e-7)
 
 
-def test_nothing_is_refused_in_a_sentence():
+def test_encoding_no_gaussians_is_refused():
     with pytest.raises(HyrfDataError, match="no Gaussian"):
         gltf.encode(random_splats()[:0], Hints(Y_DOWN))
 
@@ -179,24 +179,24 @@ def test_nothing_is_refused_in_a_sentence():
         (lambda c: c["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"].pop("kernel"), "'ellipse'"),
     ],
 )
-def test_what_cannot_be_read_is_refused_in_a_sentence(change, sentence):
+def test_invalid_content_is_refused_with_the_reason(change, sentence):
     data = gltf.encode(random_splats(40, degree=0), Hints(Y_DOWN))
-    content = json_of(data)
+    content = parse_json(data)
     change(content)
     with pytest.raises(HyrfDataError, match=f"^a.glb: .*{sentence}"):
-        gltf.decode(glb_of(content, data[-content["buffers"][0]["byteLength"] :]), "a.glb")
+        gltf.decode(build_glb(content, data[-content["buffers"][0]["byteLength"] :]), "a.glb")
 
 
-_SMALL = gltf.encode(random_splats(3, degree=1), Hints(Y_DOWN))
+_SAMPLE_FILE = gltf.encode(random_splats(3, degree=1), Hints(Y_DOWN))
 
 
 @settings(max_examples=150, deadline=None)
 @given(
-    places=st.lists(st.tuples(st.integers(0, len(_SMALL) - 1), st.integers(0, 255)), max_size=4),
-    end=st.integers(0, len(_SMALL)) | st.just(len(_SMALL)),
+    places=st.lists(st.tuples(st.integers(0, len(_SAMPLE_FILE) - 1), st.integers(0, 255)), max_size=4),
+    end=st.integers(0, len(_SAMPLE_FILE)) | st.just(len(_SAMPLE_FILE)),
 )
-def test_damaged_bytes_are_splats_or_a_sentence(places, end):
-    data = bytearray(_SMALL)
+def test_damaged_bytes_are_decoded_or_refused(places, end):
+    data = bytearray(_SAMPLE_FILE)
     for place, value in places:
         data[place] = value
     try:
@@ -205,16 +205,16 @@ def test_damaged_bytes_are_splats_or_a_sentence(places, end):
         pass
 
 
-_BINARY = json_of(_SMALL)["buffers"][0]["byteLength"]
-_VALUES = st.sampled_from([None, -1, 0, 1e308, 2**70, True, "x", [], {}, [1], float("nan")])
+_SAMPLE_BINARY_BYTES = parse_json(_SAMPLE_FILE)["buffers"][0]["byteLength"]
+_HOSTILE_JSON_VALUES = st.sampled_from([None, -1, 0, 1e308, 2**70, True, "x", [], {}, [1], float("nan")])
 
 
 @settings(max_examples=150, deadline=None)
-@given(keys=st.lists(st.integers(0, 30), min_size=1, max_size=6), value=_VALUES)
-def test_any_odd_entry_of_the_json_is_splats_or_a_sentence(keys, value):
-    content = json_of(_SMALL)
+@given(keys=st.lists(st.integers(0, 30), min_size=1, max_size=6), value=_HOSTILE_JSON_VALUES)
+def test_any_invalid_json_entry_is_decoded_or_refused(keys, value):
+    content = parse_json(_SAMPLE_FILE)
     target = content
-    for key in keys:  # walk down, and put the value where it ends
+    for key in keys:  # descend by the keys and replace the last entry that is reached
         names = list(target) if isinstance(target, dict) else list(range(len(target)))
         name = names[key % len(names)]
         if not isinstance(target[name], dict | list) or not target[name]:
@@ -224,6 +224,6 @@ def test_any_odd_entry_of_the_json_is_splats_or_a_sentence(keys, value):
         target, name = above, name
     target[name] = value
     try:
-        assert isinstance(gltf.decode(glb_of(content, _SMALL[-_BINARY:]), "a.glb"), Splats)
+        assert isinstance(gltf.decode(build_glb(content, _SAMPLE_FILE[-_SAMPLE_BINARY_BYTES:]), "a.glb"), Splats)
     except HyrfDataError:
         pass

@@ -7,14 +7,14 @@ from hyrfpack.splats.splats import normalized_quats
 
 @pytest.mark.parametrize("largest", range(4))
 @pytest.mark.parametrize("sign", [1, -1])
-def test_the_largest_is_left_out_and_made_positive(largest, sign):
+def test_the_largest_component_is_omitted_and_made_positive(largest, sign):
     quats = np.insert([0.1, -0.2, 0.3], largest, 0.86**0.5)[None]
     number, others = drop_largest(sign * quats)
     assert number == [largest] and np.array_equal(others, [[0.1, -0.2, 0.3]])
     assert np.allclose(restore_largest(number, others), quats)
 
 
-def test_rotations_come_back_in_their_precision():
+def test_rotations_round_trip_with_the_precision_of_the_bits():
     quats = normalized_quats(np.random.default_rng(0).normal(size=(1000, 4)))
     largest, others = drop_largest(quats)
     back = restore_largest(largest, others)
@@ -22,5 +22,5 @@ def test_rotations_come_back_in_their_precision():
     assert np.allclose(np.abs((back * quats).sum(1)), 1, atol=1e-6)
 
 
-def test_no_rotations_are_rotations_too():
+def test_an_empty_array_of_rotations_round_trips():
     assert restore_largest(*drop_largest(np.zeros((0, 4)))).shape == (0, 4)

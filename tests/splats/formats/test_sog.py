@@ -1,4 +1,4 @@
-"""SOG: what it rounds, what it keeps, and what it refuses."""
+"""SOG: splats round-trip within the precision of the format, invalid and oversized bundles are refused."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from hyrfpack.splats.harmonics import num_sh_bases
 from hyrfpack.splats.splats import Splats, normalized_quats
 
 
-def some_splats(count: int, degree: int = 3) -> Splats:
-    """Made-up splats; positions reach far out, and opacities 0 and 1 occur."""
+def random_splats(count: int, degree: int = 3) -> Splats:
+    """Return random splats with far outliers and opacities of 0 and 1."""
     rng = np.random.default_rng(count)
     return Splats(
         rng.standard_cauchy((count, 3)),
@@ -34,15 +34,15 @@ def some_splats(count: int, degree: int = 3) -> Splats:
     )
 
 
-def webp(pixels: list) -> bytes:
-    """Lossless WebP of one row of pixels."""
+def encode_webp(pixels: list) -> bytes:
+    """Encode one row of pixels as lossless WebP."""
     file = io.BytesIO()
     Image.fromarray(np.array([pixels], np.uint8)).save(file, "WEBP", lossless=True, exact=True)
     return file.getvalue()
 
 
-def packed(**changes: object) -> dict[str, bytes]:
-    """A file of one Gaussian packed by hand: at (0, e - 1, 1 - e), turned about z by a right angle."""
+def hand_packed_bundle(**changes: object) -> dict[str, bytes]:
+    """Return the files of one hand-packed Gaussian at (0, e - 1, 1 - e), rotated by 90 degrees about z."""
     book = [float(i) for i in range(256)]
     meta = {
         "version": 2,
@@ -53,12 +53,12 @@ def packed(**changes: object) -> dict[str, bytes]:
         "sh0": {"codebook": [value / 10 for value in book], "files": ["sh0.webp"]},
     } | changes
     pictures = {"low": [0, 255, 0], "high": [128, 255, 0], "scales": [0, 1, 2], "quats": [255, 128, 128, 255]}
-    files = {f"{name}.webp": webp([pixel]) for name, pixel in (pictures | {"sh0": [1, 2, 3, 51]}).items()}
+    files = {f"{name}.webp": encode_webp([pixel]) for name, pixel in (pictures | {"sh0": [1, 2, 3, 51]}).items()}
     return {"meta.json": json.dumps(meta).encode(), **files}
 
 
-def test_a_file_packed_by_hand_is_read() -> None:
-    splats = sog.decode_files(packed(antialias=True), "hand")
+def test_a_hand_packed_bundle_is_decoded() -> None:
+    splats = sog.decode_files(hand_packed_bundle(antialias=True), "hand")
     np.testing.assert_allclose(splats.positions, [[0, np.e - 1, 1 - np.e]], atol=2e-5)
     np.testing.assert_allclose(splats.scales, np.exp([[0, 1, 2]]), rtol=1e-6)
     np.testing.assert_allclose(splats.quats, [[0.5**0.5, 0, 0, 0.5**0.5]], atol=5e-3)
@@ -67,12 +67,12 @@ def test_a_file_packed_by_hand_is_read() -> None:
     assert splats.antialiased
 
 
-def test_a_first_entry_that_old_writers_lost_follows_from_the_others() -> None:
-    files = packed(scales={"codebook": [None, *map(float, range(1, 256))], "files": ["scales.webp"]})
+def test_a_missing_first_codebook_entry_is_extrapolated() -> None:
+    files = hand_packed_bundle(scales={"codebook": [None, *map(float, range(1, 256))], "files": ["scales.webp"]})
     np.testing.assert_allclose(np.log(sog.decode_files(files, "old").scales), [[1 - 254 / 255, 1, 2]], atol=1e-6)
 
 
-def test_splat_transform_means_the_same_numbers(shared_data: Path) -> None:
+def test_a_sog_of_splat_transform_equals_its_ply(shared_data: Path) -> None:
     folder = shared_data / "trained_models"
     if not folder.is_dir():
         pytest.skip(f"trained models not found at {folder}")
@@ -95,12 +95,12 @@ def test_splat_transform_means_the_same_numbers(shared_data: Path) -> None:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_what_is_written_is_read_within_the_steps_of_the_format(degree: int) -> None:
-    splats = some_splats(500, degree)
+def test_splats_round_trip_within_the_precision_of_the_format(degree: int) -> None:
+    splats = random_splats(500, degree)
     read = sog.decode(sog.encode(splats), "bundle")
     cells = np.sign(splats.positions) * np.log1p(np.abs(splats.positions))
     read_cells = np.sign(read.positions) * np.log1p(np.abs(read.positions))
-    # The order is the file's: each finds the one at its own place.
+    # The file reorders Gaussians, so each is matched by its position.
     order = np.abs(cells[:, None] - read_cells).max(2).argmin(1)
     read, read_cells = read[order], read_cells[order]
     assert sorted(order) == list(range(500))
@@ -108,44 +108,45 @@ def test_what_is_written_is_read_within_the_steps_of_the_format(degree: int) -> 
     np.testing.assert_allclose(np.log(read.scales), np.log(splats.scales), atol=0.02)
     assert np.abs((read.quats * splats.quats).sum(1)).min() > np.cos(np.radians(1) / 2)
     np.testing.assert_allclose(read.opacities, splats.opacities, atol=0.501 / 255)
-    np.testing.assert_allclose(read.harmonics[:, 0], splats.harmonics[:, 0], atol=0.005)  # also where opacity is 0
+    # Also of Gaussians with opacity 0.
+    np.testing.assert_allclose(read.harmonics[:, 0], splats.harmonics[:, 0], atol=0.005)
     assert read.degree == degree
 
 
-def test_colours_that_repeat_are_kept_to_the_last_bit() -> None:
-    splats = some_splats(64)
+def test_repeated_colors_are_stored_exactly() -> None:
+    splats = random_splats(64)
     read = sog.decode_files(sog.encode_files(splats[np.arange(512) % 2]), "same")
     assert set(map(bytes, read.harmonics[:, 0])) == set(map(bytes, splats.harmonics[:2, 0]))
     np.testing.assert_allclose(np.unique(read.harmonics[:, 1:]), np.unique(splats.harmonics[:2, 1:]))
 
 
-def test_one_value_beyond_all_others_leaves_the_rest_fine() -> None:
-    splats = some_splats(2000, 0)
+def test_an_outlier_does_not_coarsen_the_other_values() -> None:
+    splats = random_splats(2000, 0)
     splats.harmonics[7] = 1000
     read = sog.decode_files(sog.encode_files(splats), "outlier").harmonics
     ordinary = np.sort(splats.harmonics[np.arange(2000) != 7].ravel())
-    assert np.abs(np.sort(read[read < 999].ravel()) - ordinary).max() < 0.1  # even steps: 2
+    assert np.abs(np.sort(read[read < 999].ravel()) - ordinary).max() < 0.1  # evenly spaced steps would be 2 apart
     assert read.max() == pytest.approx(1000)
 
 
 @pytest.mark.parametrize("count", [0, 1, 65])
-def test_small_files_are_whole(count: int) -> None:
-    splats = some_splats(count)
+def test_bundles_of_few_gaussians_round_trip(count: int) -> None:
+    splats = random_splats(count)
     read = sog.decode(sog.encode(splats), "small")
     assert len(read) == count and read.degree == (3 if count else 0)
 
 
-def test_scales_of_nothing_and_flat_scenes_are_written() -> None:
-    flat = some_splats(300, 1)
+def test_zero_scales_and_flat_scenes_round_trip() -> None:
+    flat = random_splats(300, 1)
     flat.positions[:, 2], flat.scales[:, 1] = 5, 0
     read = sog.decode_files(sog.encode_files(flat), "flat")
     np.testing.assert_allclose(read.positions[:, 2], 5, rtol=1e-12)
     assert read.scales.min() < 1e-11
 
 
-def test_same_input_same_bytes_in_a_stored_zip() -> None:
-    data = sog.encode(some_splats(200))
-    assert data == sog.encode(some_splats(200))
+def test_encoding_is_deterministic_and_the_zip_is_uncompressed() -> None:
+    data = sog.encode(random_splats(200))
+    assert data == sog.encode(random_splats(200))
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         assert {(member.compress_type, member.date_time[0]) for member in archive.infolist()} == {(0, 1980)}
         assert archive.namelist()[0] == "meta.json"
@@ -189,22 +190,22 @@ def test_a_palette_finds_separate_clusters() -> None:
         ({"shN": {"codebook": [0.0] * 256, "files": ["low.webp", "high.webp"]}}, "no palette"),
     ],
 )
-def test_what_cannot_be_is_refused_in_a_sentence(changes: dict, message: str) -> None:
+def test_invalid_metadata_is_refused_with_the_reason(changes: dict, message: str) -> None:
     with pytest.raises(HyrfDataError, match=message):
-        sog.decode_files(packed(**changes), "bad")
+        sog.decode_files(hand_packed_bundle(**changes), "bad")
 
 
-def test_a_zip_that_unpacks_to_far_more_is_refused_unread() -> None:
+def test_a_zip_bomb_is_refused_before_it_is_unpacked() -> None:
     bundle = io.BytesIO()
     with zipfile.ZipFile(bundle, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, data in packed().items():
+        for name, data in hand_packed_bundle().items():
             archive.writestr(name, data if name == "meta.json" else data + bytes(10_000_000))
     with pytest.raises(HyrfDataError, match="far too many"):
         sog.unzip(bundle.getvalue(), "bomb")
 
 
 @pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
-def test_a_zip_that_lies_about_sizes_is_refused_unread(method: int) -> None:
+def test_a_zip_with_forged_sizes_is_refused_before_it_is_unpacked(method: int) -> None:
     bundle = io.BytesIO()
     with zipfile.ZipFile(bundle, "w", method) as archive:
         archive.writestr("meta.json", bytes(10_000_000))
@@ -218,25 +219,25 @@ def test_a_zip_that_lies_about_sizes_is_refused_unread(method: int) -> None:
 
 
 @pytest.mark.parametrize("side", [300, 16000])
-def test_a_picture_of_far_more_pixels_than_gaussians_is_refused_undecoded(side: int) -> None:
+def test_a_picture_with_too_many_pixels_is_refused_before_it_is_decoded(side: int) -> None:
     file = io.BytesIO()
     Image.new("RGB" if side == 300 else "1", (side, side)).save(file, "PNG")
     with pytest.raises(HyrfDataError, match=r"quats.webp .*(pixels|picture)"):
-        sog.decode_files(packed() | {"quats.webp": file.getvalue()}, "bomb")
+        sog.decode_files(hand_packed_bundle() | {"quats.webp": file.getvalue()}, "bomb")
 
 
-def test_only_what_meta_names_is_unpacked() -> None:
+def test_only_files_named_in_the_metadata_are_unpacked() -> None:
     bundle = io.BytesIO()
     with zipfile.ZipFile(bundle, "w") as archive:
-        for name, data in (packed() | {"../evil": b"!"}).items():
+        for name, data in (hand_packed_bundle() | {"../evil": b"!"}).items():
             archive.writestr(name, data)
-    assert set(sog.unzip(bundle.getvalue(), "bundle")) == set(packed())
+    assert set(sog.unzip(bundle.getvalue(), "bundle")) == set(hand_packed_bundle())
 
 
 @settings(max_examples=150, deadline=None)
 @given(st.data())
-def test_mutated_bundles_are_splats_or_refused(data: st.DataObject) -> None:
-    bundle = bytearray(BUNDLE)
+def test_mutated_bundles_are_decoded_or_refused(data: st.DataObject) -> None:
+    bundle = bytearray(SAMPLE_BUNDLE)
     for _ in range(data.draw(st.integers(1, 6))):
         bundle[data.draw(st.integers(0, len(bundle) - 1))] = data.draw(st.integers(0, 255))
     bundle = bundle[: data.draw(st.integers(0, 2 * len(bundle)))]
@@ -248,8 +249,8 @@ def test_mutated_bundles_are_splats_or_refused(data: st.DataObject) -> None:
 
 @settings(max_examples=150, deadline=None)
 @given(st.data())
-def test_mutated_files_are_splats_or_refused(data: st.DataObject) -> None:
-    files = dict(FILES)
+def test_mutated_files_are_decoded_or_refused(data: st.DataObject) -> None:
+    files = dict(SAMPLE_FILES)
     name = data.draw(st.sampled_from(sorted(files)))
     changed = bytearray(files[name])
     for _ in range(data.draw(st.integers(1, 6))):
@@ -261,5 +262,5 @@ def test_mutated_files_are_splats_or_refused(data: st.DataObject) -> None:
         pass
 
 
-FILES = sog.encode_files(some_splats(40))
-BUNDLE = sog.encode(some_splats(40))
+SAMPLE_FILES = sog.encode_files(random_splats(40))
+SAMPLE_BUNDLE = sog.encode(random_splats(40))

@@ -1,4 +1,4 @@
-"""The .splat format: a record packed by hand, its order, a real file, and what hostile files meet."""
+"""The .splat format: records, their order and a real file round-trip, invalid files are refused."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hyrfpack.errors import HyrfDataError
 from hyrfpack.splats.formats import splat
 from hyrfpack.splats.splats import Splats, normalized_quats
 
-Y00 = 0.5 / np.sqrt(np.pi)
+BAND_0_VALUE = 0.5 / np.sqrt(np.pi)
 
 
 def make_splats(count: int) -> Splats:
@@ -28,7 +28,7 @@ def make_splats(count: int) -> Splats:
 
 
 def test_a_record_has_32_bytes():
-    color = (np.array([1, 0.2, -3]) - 0.5) / Y00
+    color = (np.array([1, 0.2, -3]) - 0.5) / BAND_0_VALUE
     splats = Splats(np.array([[1.0, -2, 3]]), np.array([[0.1, 0.2, 0.3]]), np.array([[1.0, 0, 0, 0]]), np.array([0.4]),
                     color.reshape(1, 1, 3))  # fmt: skip
     record = struct.pack("<6f8B", 1, -2, 3, 0.1, 0.2, 0.3, 255, 51, 0, 102, 255, 128, 128, 128)
@@ -40,26 +40,26 @@ def test_a_record_has_32_bytes():
     np.testing.assert_array_equal(decoded.scales, splats.scales)
     np.testing.assert_array_equal(decoded.quats, [[1, 0, 0, 0]])
     np.testing.assert_allclose(decoded.opacities, [0.4], rtol=1e-6)
-    np.testing.assert_allclose(decoded.harmonics[0], (np.array([[1, 0.2, 0]]) - 0.5) / Y00, rtol=1e-5)
+    np.testing.assert_allclose(decoded.harmonics[0], (np.array([[1, 0.2, 0]]) - 0.5) / BAND_0_VALUE, rtol=1e-5)
 
 
-def test_what_shows_most_comes_first():
+def test_gaussians_are_sorted_by_visible_size():
     splats = make_splats(200)
     order = np.argsort(-splats.opacities.astype(float) * splats.scales.astype(float).prod(axis=1))
     decoded = splat.decode(splat.encode(splats), "a.splat")
     np.testing.assert_array_equal(decoded.positions, splats.positions[order])
     assert np.abs(decoded.opacities - splats.opacities[order]).max() <= 0.5 / 255 + 1e-6
-    assert np.abs(decoded.harmonics - splats.harmonics[order, :1]).max() <= 0.5 / 255 / Y00 + 1e-5
+    assert np.abs(decoded.harmonics - splats.harmonics[order, :1]).max() <= 0.5 / 255 / BAND_0_VALUE + 1e-5
     assert np.abs((decoded.quats * splats.quats[order]).sum(1)).min() > 0.9999
     assert splat.encode(splats) == splat.encode(splats)
 
 
-def test_no_gaussians_are_an_empty_file():
+def test_no_gaussians_are_encoded_as_an_empty_file():
     assert splat.encode(make_splats(0)) == b""
     assert len(splat.decode(b"", "a.splat")) == 0
 
 
-def test_a_file_of_another_program_is_read_and_written_again(shared_data):
+def test_a_file_of_another_program_round_trips(shared_data):
     data = (shared_data / "trained_models" / "small_scene.splat").read_bytes()
     splats = splat.decode(data, "small_scene.splat")
     assert len(splats) == 22_764 == len(data) // 32
@@ -78,7 +78,7 @@ def test_a_file_of_another_program_is_read_and_written_again(shared_data):
         (bytes(32) + struct.pack("<6f8x", 0, 0, 0, 1, np.nan, 1), "the scale of Gaussian 1 of 2"),
     ],
 )
-def test_decode_refuses_with_a_sentence(data, words):
+def test_invalid_files_are_refused_with_the_reason(data, words):
     with pytest.raises(HyrfDataError, match=words) as error:
         splat.decode(data, "some.splat")
     assert str(error.value).startswith("some.splat: ")
@@ -93,7 +93,7 @@ def test_positions_beyond_float32_are_refused():
 
 @settings(max_examples=40, deadline=None, derandomize=True, database=None)
 @given(st.binary(max_size=100), st.integers(0, 3))
-def test_any_bytes_become_splats_or_a_sentence(data, records):
+def test_random_bytes_are_decoded_or_refused(data, records):
     try:
         splats = splat.decode((data + bytes(32))[: 32 * records] or data, "a.splat")
     except HyrfDataError as error:

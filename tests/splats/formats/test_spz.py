@@ -1,4 +1,4 @@
-"""SPZ: records packed by hand, bounds of what is lost, real files, and what hostile files meet."""
+"""SPZ: hand-packed records and real files are decoded, errors are bounded, invalid files are refused."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from hyrfpack.splats.formats import compressed_ply, spz
 from hyrfpack.splats.formats.hints import Hints
 from hyrfpack.splats.splats import Splats, normalized_quats
 
-# Half a turn about x changes the sign of harmonics that are odd in y and z together.
-HALF_TURN = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1])
+# A half turn about x changes the sign of the harmonics that are odd in (y, z).
+HALF_TURN_SIGNS = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1])
 
 
 def make_splats(count: int, degree: int = 3, antialiased: bool = False) -> Splats:
@@ -34,17 +34,17 @@ def make_splats(count: int, degree: int = 3, antialiased: bool = False) -> Splat
     )
 
 
-def sections_of_one(version: int, degree: int = 0) -> list[bytes]:
-    """One Gaussian, packed by hand: at (1, -2, 0.5) of the file with 8 fractional bits."""
+def sections_of_one_gaussian(version: int, degree: int = 0) -> list[bytes]:
+    """Pack the sections of one Gaussian at (1, -2, 0.5) in the file's axes, with 8 fractional bits."""
     fixed = b"\x00\x01\x00" + b"\x00\xfe\xff" + b"\x80\x00\x00"
     position = struct.pack("<3e", 1, -2, 0.5) if version == 1 else fixed
-    # w is largest: index 3; x = -256/511 sqrt(1/2), y = 0, z = 511/511 sqrt(1/2)
+    # The largest component is w, index 3; x = -256/511 sqrt(1/2), y = 0, z = 511/511 sqrt(1/2)
     rotation = struct.pack("<I", 3 << 30 | (512 | 256) << 20 | 511) if version >= 3 else bytes([0, 128, 128])
     harmonics = bytes(range(128, 128 + 3 * ((degree + 1) ** 2 - 1)))
     return [position, bytes([51]), bytes([255, 0, 51]), bytes([160, 144, 176]), rotation, harmonics]
 
 
-def file_of(sections: list[bytes], version: int, degree: int = 0, count: int = 1, bits: int = 8, flags: int = 0):
+def build_spz(sections: list[bytes], version: int, degree: int = 0, count: int = 1, bits: int = 8, flags: int = 0):
     if version < 4:
         return gzip.compress(
             struct.pack("<4sIIBBBB", b"NGSP", version, count, degree, bits, flags, 0) + b"".join(sections)
@@ -57,14 +57,14 @@ def file_of(sections: list[bytes], version: int, degree: int = 0, count: int = 1
 
 
 @pytest.mark.parametrize("version", [1, 2, 3, 4])
-def test_decode_reads_a_record_packed_by_hand(version):
-    splats = spz.decode(file_of(sections_of_one(version, degree=1), version, degree=1, flags=1), "a.spz")
+def test_a_hand_packed_record_is_decoded(version):
+    splats = spz.decode(build_spz(sections_of_one_gaussian(version, degree=1), version, degree=1, flags=1), "a.spz")
 
-    np.testing.assert_array_equal(splats.positions, [[1, 2, -0.5]])  # half a turn about x
+    np.testing.assert_array_equal(splats.positions, [[1, 2, -0.5]])  # differs from the file by a half turn about x
     np.testing.assert_allclose(splats.scales, np.exp([[0, -1, 1]]), rtol=1e-6)
     np.testing.assert_allclose(splats.opacities, [0.2], rtol=1e-6)
     np.testing.assert_allclose(splats.harmonics[0, 0], np.array([0.5, -0.5, -0.3]) / 0.15, rtol=1e-6)
-    np.testing.assert_allclose(splats.harmonics[0, 1:], HALF_TURN[1:4, None] * np.arange(9).reshape(3, 3) / 128)
+    np.testing.assert_allclose(splats.harmonics[0, 1:], HALF_TURN_SIGNS[1:4, None] * np.arange(9).reshape(3, 3) / 128)
     x, y, z = (-256 / 511 * 0.5**0.5, 0, 0.5**0.5) if version >= 3 else (-1, 1 / 255, 1 / 255)
     expected = np.array([np.sqrt(max(0, 1 - x * x - y * y - z * z)), x, -y, -z])
     np.testing.assert_allclose(abs(splats.quats[0] @ expected) / np.linalg.norm(expected), 1, rtol=1e-6)
@@ -73,7 +73,7 @@ def test_decode_reads_a_record_packed_by_hand(version):
 
 @pytest.mark.parametrize("version", [3, 4])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_what_is_lost_stays_within_the_promised_bounds(version, degree):
+def test_splats_round_trip_within_the_documented_error_bounds(version, degree):
     splats = make_splats(3000, degree, antialiased=degree == 2)
 
     decoded = spz.decode(spz.encode(splats, Hints(spz_version=version)), "a.spz")
@@ -90,7 +90,7 @@ def test_what_is_lost_stays_within_the_promised_bounds(version, degree):
 
 
 @pytest.mark.parametrize("version", [3, 4])
-def test_numbers_that_were_decoded_are_encoded_as_they_were(version):
+def test_encoding_decoded_splats_again_changes_nothing(version):
     once = spz.encode(make_splats(500), Hints(spz_version=version))
     twice = spz.encode(spz.decode(once, "a.spz"), Hints(spz_version=version))
 
@@ -101,7 +101,7 @@ def test_numbers_that_were_decoded_are_encoded_as_they_were(version):
 
 
 @pytest.mark.parametrize("version", [3, 4])
-def test_stored_numbers_are_those_of_the_model_turned_about_x(version):
+def test_stored_values_are_those_of_the_splats_rotated_about_x(version):
     splats = make_splats(1)
     turned = splats.rotated(np.diag([1.0, -1, -1]))
     data = spz.encode(splats, Hints(spz_version=version))
@@ -115,11 +115,11 @@ def test_stored_numbers_are_those_of_the_model_turned_about_x(version):
 
 
 @pytest.mark.parametrize("version", [3, 4])
-def test_no_gaussians_make_a_file_too(version):
+def test_a_file_without_gaussians_round_trips(version):
     assert len(spz.decode(spz.encode(make_splats(0, 2), Hints(spz_version=version)), "a.spz")) == 0
 
 
-def test_positions_use_the_bits_that_the_farthest_one_leaves():
+def test_positions_use_as_many_fractional_bits_as_the_farthest_one_allows():
     near = Splats(*(np.repeat(part, 2, axis=0) for part in (np.array([[0.1, 0.2, 0.3]]), np.ones((1, 3)))),
                   np.tile([1.0, 0, 0, 0], (2, 1)), np.ones(2), np.zeros((2, 1, 3)))  # fmt: skip
     for farthest, step in ((0.5, 2**-23), (1.0, 2**-22), (100.0, 2**-16), (4e6, 2**-1)):
@@ -131,7 +131,7 @@ def test_positions_use_the_bits_that_the_farthest_one_leaves():
         spz.encode(near)
 
 
-def test_numbers_out_of_reach_become_the_nearest():
+def test_values_out_of_range_are_clipped():
     splats = Splats(np.zeros((2, 3)), np.array([[0, 1e-9, 1e9]] * 2), np.tile([1.0, 0, 0, 0], (2, 1)),
                     np.array([0.0, 1]), np.array([[[9.0, -9, 0], [5, -5, 0], [0] * 3, [0] * 3]] * 2))  # fmt: skip
     decoded = spz.decode(spz.encode(splats), "a.spz")
@@ -142,18 +142,18 @@ def test_numbers_out_of_reach_become_the_nearest():
 
 
 @pytest.mark.parametrize("version", [3, 4])
-def test_harmonics_of_degree_4_are_left_out(version):
-    decoded = spz.decode(file_of(sections_of_one(version, degree=4), version, degree=4), "a.spz")
+def test_harmonics_of_degree_4_are_ignored(version):
+    decoded = spz.decode(build_spz(sections_of_one_gaussian(version, degree=4), version, degree=4), "a.spz")
     assert decoded.degree == 3
-    np.testing.assert_allclose(decoded.harmonics[0, 15], HALF_TURN[15] * np.arange(42, 45) / 128)
+    np.testing.assert_allclose(decoded.harmonics[0, 15], HALF_TURN_SIGNS[15] * np.arange(42, 45) / 128)
 
 
 def test_extensions_are_skipped():
-    assert len(spz.decode(file_of(sections_of_one(4), 4, flags=2), "a.spz")) == 1
-    assert len(spz.decode(file_of([*sections_of_one(3), b"extension"], 3, flags=2), "a.spz")) == 1
+    assert len(spz.decode(build_spz(sections_of_one_gaussian(4), 4, flags=2), "a.spz")) == 1
+    assert len(spz.decode(build_spz([*sections_of_one_gaussian(3), b"extension"], 3, flags=2), "a.spz")) == 1
 
 
-def test_the_same_splats_make_the_same_bytes_without_a_time():
+def test_encoding_is_deterministic_and_stores_no_time():
     older = Hints(spz_version=3)
     data = spz.encode(make_splats(50), older)
     assert data[:10] == b"\x1f\x8b\x08\0\0\0\0\0\0\xff"
@@ -166,7 +166,7 @@ def test_version_4_is_the_default():
     assert spz.encode(make_splats(50))[:8] == struct.pack("<4sI", b"NGSP", 4)
 
 
-def test_biker_is_the_model_of_its_compressed_ply(shared_data):
+def test_a_real_spz_equals_its_compressed_ply(shared_data):
     folder = shared_data / "trained_models"
     splats = spz.decode((folder / "biker.spz").read_bytes(), "biker.spz")
     other = compressed_ply.decode((folder / "biker.compressed.ply").read_bytes(), "biker.compressed.ply")
@@ -179,7 +179,7 @@ def test_biker_is_the_model_of_its_compressed_ply(shared_data):
     assert np.abs((splats.quats * other.quats).sum(1)).min() > 0.99999
 
 
-GOOD = {version: file_of(sections_of_one(version), version) for version in (3, 4)}
+VALID_FILE_BY_VERSION = {version: build_spz(sections_of_one_gaussian(version), version) for version in (3, 4)}
 
 
 @pytest.mark.parametrize(
@@ -187,49 +187,50 @@ GOOD = {version: file_of(sections_of_one(version), version) for version in (3, 4
     [
         (b"", "this is not an SPZ file"),
         (b"ply\n", "this is not an SPZ file"),
-        (GOOD[3][:20], "ends within its header"),
-        (GOOD[3][:-4], "is truncated"),
-        (GOOD[3][:-8] + bytes(8), "gzip stream is damaged"),
-        (GOOD[4][:31], "ends within its header"),
-        (GOOD[4][:100], "outside of the file"),
-        (GOOD[4][:-1], "is truncated"),
+        (VALID_FILE_BY_VERSION[3][:20], "ends within its header"),
+        (VALID_FILE_BY_VERSION[3][:-4], "is truncated"),
+        (VALID_FILE_BY_VERSION[3][:-8] + bytes(8), "gzip stream is damaged"),
+        (VALID_FILE_BY_VERSION[4][:31], "ends within its header"),
+        (VALID_FILE_BY_VERSION[4][:100], "outside of the file"),
+        (VALID_FILE_BY_VERSION[4][:-1], "is truncated"),
         (gzip.compress(b"NGSQ" + bytes(40)), "do not start with 'NGSP'"),
         (gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 5, 1, 0, 8, 0, 0)), "this is SPZ version 5"),
-        (file_of([*sections_of_one(3), b"!"], 3), "goes on after its 1 Gaussians"),
-        (file_of(sections_of_one(3), 3, count=2), "before its 2 Gaussians do"),
-        (file_of(sections_of_one(4), 4, count=2), "a stream has 9 bytes, but 2 Gaussians need 18"),
-        (file_of(sections_of_one(4), 4, degree=1), "5 streams do not fit harmonics of degree 1"),
-        (file_of(sections_of_one(3), 3, degree=5), "harmonics of degree 5"),
-        (file_of(sections_of_one(3), 3, bits=40), "40 fractional bits"),
-        (file_of(sections_of_one(3), 3, flags=0x80), "levels of detail"),
-        (file_of(sections_of_one(3), 3, count=2**32 - 1), "far more than"),
-        (file_of(sections_of_one(4), 4, count=2**32 - 1), "far more than"),
+        (build_spz([*sections_of_one_gaussian(3), b"!"], 3), "goes on after its 1 Gaussians"),
+        (build_spz(sections_of_one_gaussian(3), 3, count=2), "before its 2 Gaussians do"),
+        (build_spz(sections_of_one_gaussian(4), 4, count=2), "a stream has 9 bytes, but 2 Gaussians need 18"),
+        (build_spz(sections_of_one_gaussian(4), 4, degree=1), "5 streams do not fit harmonics of degree 1"),
+        (build_spz(sections_of_one_gaussian(3), 3, degree=5), "harmonics of degree 5"),
+        (build_spz(sections_of_one_gaussian(3), 3, bits=40), "40 fractional bits"),
+        (build_spz(sections_of_one_gaussian(3), 3, flags=0x80), "levels of detail"),
+        (build_spz(sections_of_one_gaussian(3), 3, count=2**32 - 1), "far more than"),
+        (build_spz(sections_of_one_gaussian(4), 4, count=2**32 - 1), "far more than"),
         (
-            file_of([b"\0\x7c" * 3, *sections_of_one(1)[1:]], 1),
+            build_spz([b"\0\x7c" * 3, *sections_of_one_gaussian(1)[1:]], 1),
             "the position of Gaussian 0 of 1 is not a finite number",
         ),
     ],
-    ids=lambda value: value if isinstance(value, str) else "",  # gzip's bytes hold the time
+    # The bytes of gzip contain the time, so they cannot be test ids.
+    ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_decode_refuses_with_a_sentence(data, words):
+def test_invalid_files_are_refused_with_the_reason(data, words):
     with pytest.raises(HyrfDataError, match=words) as error:
         spz.decode(data, "some.spz")
     assert str(error.value).startswith("some.spz: ")
 
 
-def test_versions_that_are_not_written_are_a_mistake_of_the_caller():
+def test_unsupported_versions_raise_value_error():
     with pytest.raises(ValueError, match="version 2"):
         spz.encode(make_splats(1), Hints(spz_version=2))
 
 
 @pytest.mark.parametrize("version", [3, 4])
-def test_a_bomb_is_not_unpacked(version):
+def test_a_compression_bomb_is_refused_in_little_memory(version):
     zeros = bytes(50_000_000)
-    sections = sections_of_one(version)
+    sections = sections_of_one_gaussian(version)
     if version == 3:
-        bomb = file_of([*sections, zeros], 3)
+        bomb = build_spz([*sections, zeros], 3)
     else:
-        good = file_of(sections, 4)
+        good = build_spz(sections, 4)
         first = zstandard.compress(zeros)
         rest = good[32 + 5 * 16 + struct.unpack_from("<Q", good, 32)[0] :]
         bomb = good[:32] + struct.pack("<QQ", len(first), 9) + good[48 : 32 + 5 * 16] + first + rest
@@ -248,12 +249,12 @@ def test_a_bomb_is_not_unpacked(version):
     edits=st.lists(st.tuples(st.floats(0, 0.999), st.integers(0, 255)), min_size=1, max_size=4),
     length=st.sampled_from([1.0, 1.0, 0.9, 0.3]),
 )
-def test_damaged_files_become_splats_or_a_sentence(version, inside, edits, length):
+def test_damaged_files_are_decoded_or_refused(version, inside, edits, length):
     data = spz.encode(make_splats(20, 1), Hints(spz_version=version))
     inside &= version == 3
     data = bytearray(gzip.decompress(data) if inside else data)
     for place, byte in edits:
-        data[int(place**3 * len(data))] = byte  # mostly near the start
+        data[int(place**3 * len(data))] = byte  # most edits are near the start
     data = bytes(data[: int(length * len(data))])
     try:
         splats = spz.decode(gzip.compress(data) if inside else data, "a.spz")
@@ -263,8 +264,8 @@ def test_damaged_files_become_splats_or_a_sentence(version, inside, edits, lengt
         assert np.isfinite(splats.positions).all()
 
 
-def test_the_checksum_of_gzip_is_compared():
-    content = gzip.decompress(GOOD[3])
+def test_a_wrong_gzip_checksum_is_refused():
+    content = gzip.decompress(VALID_FILE_BY_VERSION[3])
     deflate = zlib.compressobj(wbits=-15)
     body = deflate.compress(content) + deflate.flush()
     wrong = b"\x1f\x8b\x08\0\0\0\0\0\0\xff" + body + struct.pack("<II", zlib.crc32(content) ^ 1, len(content))

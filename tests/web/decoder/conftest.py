@@ -1,4 +1,4 @@
-"""What the decoder's tests need beside Python: node, and for some npm and TypeScript."""
+"""Fixtures for programs that the decoder's tests need: node, npm and the TypeScript compiler."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-COMPILER = Path(__file__).parents[2] / "node" / "node_modules" / "typescript" / "bin" / "tsc"
+TYPESCRIPT_COMPILER = Path(__file__).parents[2] / "node" / "node_modules" / "typescript" / "bin" / "tsc"
 
 
 @pytest.fixture(scope="session", autouse=True)
 def node() -> str:
-    """The path of node."""
+    """Return the path of node; skip the test without it."""
     if not (path := shutil.which("node")):
         pytest.skip("node is not here; install Node.js 20 or newer")
     return path
@@ -20,7 +20,7 @@ def node() -> str:
 
 @pytest.fixture(scope="session")
 def npm() -> str:
-    """The path of npm."""
+    """Return the path of npm; skip the test without it."""
     if not (path := shutil.which("npm")):
         pytest.skip("npm is not here; it comes with Node.js")
     return path
@@ -28,7 +28,7 @@ def npm() -> str:
 
 @pytest.fixture(scope="session")
 def compiler() -> Path:
-    """The path of TypeScript's compiler."""
-    if not COMPILER.exists():
+    """Return the path of the TypeScript compiler; skip the test without it."""
+    if not TYPESCRIPT_COMPILER.exists():
         pytest.skip("TypeScript is not here; run `npm ci` in tests/node")
-    return COMPILER
+    return TYPESCRIPT_COMPILER

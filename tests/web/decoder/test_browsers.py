@@ -1,4 +1,4 @@
-"""The modules as they are, in browsers: in the page and in a module worker."""
+"""The unbundled modules decode files in browsers, in the page and in a module worker."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from queue import Queue
 import numpy as np
 import pytest
 
-ROOT = Path(__file__).parents[3]
-PACKAGE = ROOT / "hyrfpack" / "web" / "hyrf"
-GOLDEN = ROOT / "tests" / "golden"
-BROWSERS = {
+PROJECT_FOLDER = Path(__file__).parents[3]
+PACKAGE_FOLDER = PROJECT_FOLDER / "hyrfpack" / "web" / "hyrf"
+GOLDEN_FOLDER = PROJECT_FOLDER / "tests" / "golden"
+BROWSER_FLAGS = {
     "chromium": ["--headless", "--no-sandbox", "--disable-dev-shm-usage", "--user-data-dir={profile}"],
     "firefox-esr": ["--headless", "--no-remote", "--profile", "{profile}"],
 }
-NUMBERS = {"positions": "positions", "colorLogits": "color_logits", "scaleLogits": "scale_logits"}
-PAGE = """<!doctype html><title>page</title><script type="module">
+RECORDED_NAME_BY_FIELD = {"positions": "positions", "colorLogits": "color_logits", "scaleLogits": "scale_logits"}
+PAGE_HTML = """<!doctype html><title>page</title><script type="module">
 const told = (answer) => fetch("/answer", { method: "POST", body: JSON.stringify(answer) });
 const numbers = ({ positions, colorLogits, scaleLogits }) =>
   [positions, colorLogits, scaleLogits].map((array) => Array.from(new Uint32Array(array.buffer)));
@@ -45,20 +45,20 @@ try {
   await told(String(error));
 }
 </script>"""
-WORKER = """
+WORKER_JS = """
 import { read } from "./hyrf/index.js";
 onmessage = async ({ data }) => postMessage(await read(data));
 """
 
 
 @contextmanager
-def served(answers: Queue) -> Iterator[str]:
-    """The address of the page; what the page tells comes into the queue."""
-    names = [file.name for file in sorted(GOLDEN.glob("*.hyrf"))]
-    files = {"/": ("text/html", PAGE.replace("NAMES", json.dumps(names)).encode())}
-    files["/worker.js"] = ("text/javascript", WORKER.encode())
-    files |= {f"/hyrf/{file.name}": ("text/javascript", file.read_bytes()) for file in PACKAGE.glob("*.js")}
-    files |= {f"/{name}": ("application/octet-stream", (GOLDEN / name).read_bytes()) for name in names}
+def serve_page(answers: Queue) -> Iterator[str]:
+    """Serve the page, put the answer that it posts into the queue, and yield its address."""
+    names = [file.name for file in sorted(GOLDEN_FOLDER.glob("*.hyrf"))]
+    files = {"/": ("text/html", PAGE_HTML.replace("NAMES", json.dumps(names)).encode())}
+    files["/worker.js"] = ("text/javascript", WORKER_JS.encode())
+    files |= {f"/hyrf/{file.name}": ("text/javascript", file.read_bytes()) for file in PACKAGE_FOLDER.glob("*.js")}
+    files |= {f"/{name}": ("application/octet-stream", (GOLDEN_FOLDER / name).read_bytes()) for name in names}
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
@@ -86,14 +86,14 @@ def served(answers: Queue) -> Iterator[str]:
         server.server_close()
 
 
-@pytest.mark.parametrize("browser", BROWSERS)
+@pytest.mark.parametrize("browser", BROWSER_FLAGS)
 def test_golden_files_decode_to_the_recorded_numbers_in_a_browser(browser, tmp_path):
     if not shutil.which(browser):
         pytest.skip(f"{browser} is not here")
     answers: Queue = Queue()
-    flags = [flag.format(profile=tmp_path) for flag in BROWSERS[browser]]
+    flags = [flag.format(profile=tmp_path) for flag in BROWSER_FLAGS[browser]]
 
-    with served(answers) as address:
+    with serve_page(answers) as address:
         process = subprocess.Popen(
             [browser, *flags, address],
             stdout=subprocess.DEVNULL,
@@ -108,8 +108,8 @@ def test_golden_files_decode_to_the_recorded_numbers_in_a_browser(browser, tmp_p
 
     assert isinstance(answer, dict), answer
     for name, (in_page, in_worker, refusal) in answer.items():
-        recorded = np.load((GOLDEN / name).with_suffix(".npz"))
-        for bits, key in zip(in_page, NUMBERS.values(), strict=True):
+        recorded = np.load((GOLDEN_FOLDER / name).with_suffix(".npz"))
+        for bits, key in zip(in_page, RECORDED_NAME_BY_FIELD.values(), strict=True):
             assert bits == recorded[f"gaussians.{key}"].astype("<f4").view("<u4").ravel().tolist(), (name, key)
         assert in_worker == in_page
         assert refusal.startswith("The file is truncated: ")

@@ -1,4 +1,4 @@
-"""The decoder as others get it: an npm package without dependencies, and modules with types."""
+"""The decoder is an npm package without dependencies whose modules have types."""
 
 from __future__ import annotations
 
@@ -16,68 +16,70 @@ from hyrfpack.format.container import read_container
 from hyrfpack.format.sections import DECODER_SECTIONS, LAYERED_SECTIONS, TABLE_SECTIONS
 from hyrfpack.model import HashGridConfig
 
-ROOT = Path(__file__).parents[3]
-PACKAGE = ROOT / "hyrfpack" / "web" / "hyrf"
-GOLDEN = ROOT / "tests" / "golden"
-PUBLIC = ("index", "grids", "exposure", "fields", "harmonics", "viewpoint")
+PROJECT_FOLDER = Path(__file__).parents[3]
+PACKAGE_FOLDER = PROJECT_FOLDER / "hyrfpack" / "web" / "hyrf"
+GOLDEN_FOLDER = PROJECT_FOLDER / "tests" / "golden"
+PUBLIC_MODULES = ("index", "grids", "exposure", "fields", "harmonics", "viewpoint")
 
 
 def run_module(code: str, folder: Path, *arguments: str) -> object:
-    """What a module under node prints as JSON."""
-    run = subprocess.run(
+    """Run a module in node and return the JSON that it prints."""
+    completed = subprocess.run(
         ["node", "--input-type=module", "-e", code, *arguments], cwd=folder, capture_output=True, text=True
     )
-    assert run.returncode == 0, run.stderr
-    return json.loads(run.stdout)
+    assert completed.returncode == 0, completed.stderr
+    return json.loads(completed.stdout)
 
 
-def test_types_hold(compiler):
-    run = subprocess.run(
+def test_type_declarations_pass_the_typescript_compiler(compiler):
+    completed = subprocess.run(
         ["node", str(compiler), "--project", str(Path(__file__).with_name("tsconfig.json"))],
         capture_output=True,
         text=True,
     )
 
-    assert run.returncode == 0, run.stdout
+    assert completed.returncode == 0, completed.stdout
 
 
-def test_the_package_is_of_hyrfpacks_version_and_license():
-    package = json.loads((PACKAGE / "package.json").read_text())
+def test_the_package_has_the_version_and_license_of_hyrfpack():
+    package = json.loads((PACKAGE_FOLDER / "package.json").read_text())
 
     assert package["version"] == hyrfpack.__version__
     assert package["license"] == "Apache-2.0"
-    assert (PACKAGE / "LICENSE").read_bytes() == (ROOT / "LICENSE").read_bytes()
+    assert (PACKAGE_FOLDER / "LICENSE").read_bytes() == (PROJECT_FOLDER / "LICENSE").read_bytes()
 
 
 def test_public_modules_are_exported():
-    exports = json.loads((PACKAGE / "package.json").read_text())["exports"]
+    exports = json.loads((PACKAGE_FOLDER / "package.json").read_text())["exports"]
 
-    assert exports == {("." if name == "index" else f"./{name}.js"): f"./{name}.js" for name in PUBLIC}
-    assert all((PACKAGE / file).exists() for file in exports.values())
+    assert exports == {("." if name == "index" else f"./{name}.js"): f"./{name}.js" for name in PUBLIC_MODULES}
+    assert all((PACKAGE_FOLDER / file).exists() for file in exports.values())
 
 
-def test_modules_import_nothing_but_each_other_and_use_no_page():
-    for module in PACKAGE.glob("*.js"):
+def test_modules_import_only_each_other_and_use_no_browser_objects():
+    for module in PACKAGE_FOLDER.glob("*.js"):
         code = module.read_text()
         for source in re.findall(r'^import .* from "(.*)";$', code, re.MULTILINE):
-            assert (PACKAGE / source).parent == PACKAGE and (PACKAGE / source).exists()
-        # One form of import, on one line: what puts modules together for a page knows no other.
+            assert (PACKAGE_FOLDER / source).parent == PACKAGE_FOLDER and (PACKAGE_FOLDER / source).exists()
+        # The bundler for pages understands only this one-line form of import.
         assert len(re.findall(r"^import\b", code, re.MULTILINE)) == len(
             re.findall(r'^import \{ [\w, ]+ \} from "\./\w+\.js";$', code, re.MULTILINE)
         )
         assert not re.search(r"\b(document|window|eval|require)\b[.(]", code), module.name
 
 
-def test_what_is_packed_reads_a_file_where_it_is_installed(npm, tmp_path):
+def test_the_packed_and_installed_package_reads_a_file(npm, tmp_path):
     listed = subprocess.run(
-        [npm, "pack", "--dry-run", "--json"], cwd=PACKAGE, capture_output=True, text=True, check=True
+        [npm, "pack", "--dry-run", "--json"], cwd=PACKAGE_FOLDER, capture_output=True, text=True, check=True
     )
     (pack,) = json.loads(listed.stdout)
-    modules = {path.name for path in PACKAGE.glob("*.js")}
+    modules = {path.name for path in PACKAGE_FOLDER.glob("*.js")}
     assert {file["path"] for file in pack["files"]} == modules | {"package.json", "README.md", "LICENSE"}
     assert pack["size"] < 60_000
 
-    subprocess.run([npm, "pack", "--pack-destination", str(tmp_path)], cwd=PACKAGE, capture_output=True, check=True)
+    subprocess.run(
+        [npm, "pack", "--pack-destination", str(tmp_path)], cwd=PACKAGE_FOLDER, capture_output=True, check=True
+    )
     (archive,) = tmp_path.glob("*.tgz")
     (tmp_path / "app").mkdir()
     (tmp_path / "app" / "package.json").write_text("{}")
@@ -90,16 +92,16 @@ def test_what_is_packed_reads_a_file_where_it_is_installed(npm, tmp_path):
         const model = await read(readFileSync(process.argv[1]));
         console.log(JSON.stringify([Array.from(model.positions), gridLevels(model.config.geometry).length]));
     """
-    positions, levels = run_module(code, tmp_path / "app", str(GOLDEN / "v1.1_compact.hyrf"))
+    positions, levels = run_module(code, tmp_path / "app", str(GOLDEN_FOLDER / "v1.1_compact.hyrf"))
 
-    recorded = np.load(GOLDEN / "v1.1_compact.npz")["gaussians.positions"]
+    recorded = np.load(GOLDEN_FOLDER / "v1.1_compact.npz")["gaussians.positions"]
     assert np.array_equal(np.array(positions, np.float32), recorded.ravel())
     assert levels == 2
 
 
-def test_shapes_of_grids_and_decoders_are_hyrfpacks():
+def test_shapes_of_grids_and_decoders_equal_those_of_hyrfpack():
     rng = np.random.default_rng(1)
-    facts = describe_file(GOLDEN / "v1.0_raw.hyrf")["config"]
+    facts = describe_file(GOLDEN_FOLDER / "v1.0_raw.hyrf")["config"]
     configs = []
     for _ in range(3000):
         base = int(rng.integers(2, 1 + 2 ** rng.integers(1, 17)))
@@ -119,16 +121,16 @@ def test_shapes_of_grids_and_decoders_are_hyrfpacks():
           decoderLayout(config, "radiance"),
         ])));
     """
-    run = subprocess.run(
+    completed = subprocess.run(
         ["node", "--input-type=module", "-e", code],
         input=json.dumps(configs),
-        cwd=PACKAGE,
+        cwd=PACKAGE_FOLDER,
         capture_output=True,
         text=True,
         check=True,
     )
 
-    for config, (levels, rows, geometry, radiance, layers) in zip(configs, json.loads(run.stdout), strict=True):
+    for config, (levels, rows, geometry, radiance, layers) in zip(configs, json.loads(completed.stdout), strict=True):
         grid, shapes = HashGridConfig(**config["radiance"]), group_shapes(parse_config(config), 0)
         assert [level[0] for level in levels] == list(grid.resolutions)
         assert [level[1] for level in levels] + [levels[-1][2]] == list(grid.offsets)
@@ -145,7 +147,7 @@ def test_shapes_of_grids_and_decoders_are_hyrfpacks():
 
 
 def test_a_file_is_described_from_its_first_bytes():
-    file = GOLDEN / "v1.1_compact_layers.hyrf"
+    file = GOLDEN_FOLDER / "v1.1_compact_layers.hyrf"
     data = file.read_bytes()
     container = read_container(data)
     start = 48 + 40 * len(container.entries)
@@ -159,7 +161,7 @@ def test_a_file_is_described_from_its_first_bytes():
         console.log(JSON.stringify({ facts, refused, same: describe(bytes) }));
     """
 
-    answer = run_module(code, PACKAGE, str(file), str(start))
+    answer = run_module(code, PACKAGE_FOLDER, str(file), str(start))
 
     first = ("META", *LAYERED_SECTIONS, *TABLE_SECTIONS, *DECODER_SECTIONS)
     assert (
@@ -197,17 +199,17 @@ def test_a_file_is_read_in_a_worker():
         worker.once("message", ({ count, positions }) => console.log(JSON.stringify([count, Array.from(positions)])));
     """
 
-    count, positions = run_module(code, PACKAGE, str(GOLDEN / "v1.1_compact.hyrf"))
+    count, positions = run_module(code, PACKAGE_FOLDER, str(GOLDEN_FOLDER / "v1.1_compact.hyrf"))
 
-    recorded = np.load(GOLDEN / "v1.1_compact.npz")["gaussians.positions"]
+    recorded = np.load(GOLDEN_FOLDER / "v1.1_compact.npz")["gaussians.positions"]
     assert count == len(recorded) and np.array_equal(np.array(positions, np.float32), recorded.ravel())
 
 
-def test_the_documentation_and_the_readme_name_the_package_and_the_three_js_loader():
-    page, readme = ((ROOT / path).read_text() for path in ("docs/how-to/web.md", "README.md"))
+def test_documentation_and_readme_mention_the_package_and_the_three_js_loader():
+    page, readme = ((PROJECT_FOLDER / path).read_text() for path in ("docs/how-to/web.md", "README.md"))
 
     for place in ("hyrfpack/web/hyrf", "examples/three"):
-        assert place in page and (ROOT / place / "README.md").exists()
+        assert place in page and (PROJECT_FOLDER / place / "README.md").exists()
     assert "npm install ./hyrfpack/web/hyrf" in page and "loadHyrf" in page
     assert "hyrf.js" in readme and "three.js" in readme and "docs/how-to/web.md#in-your-own-javascript" in readme
     assert "\n## In your own JavaScript\n" in page

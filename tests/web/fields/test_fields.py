@@ -1,4 +1,4 @@
-"""The fields in JavaScript say what the model says in float64."""
+"""The fields in JavaScript return the same values as the model in float64."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from hyrfpack.ops.contraction import contract
 from hyrfpack.ops.shade import encode_directions
 from hyrfpack.splats.splats import normalized_quats
 
-EVALUATE = Path(__file__).parent / "evaluate.mjs"
-SMALL = HashGridConfig(log2_table_size=6, levels=3, base=3, finest=12)
-LARGE = HashGridConfig(log2_table_size=14, levels=16, base=16, finest=512)
-ONE_LEVEL = HashGridConfig(log2_table_size=4, levels=1, base=2, finest=2)
-# What was measured is 1e-7: one rounding of sums in float64. Only numbers near 0 are farther off, by as little.
-EXACT = {"rtol": 2e-7, "atol": 1e-7}
+EVALUATE_SCRIPT = Path(__file__).parent / "evaluate.mjs"
+SMALL_GRID = HashGridConfig(log2_table_size=6, levels=3, base=3, finest=12)
+LARGE_GRID = HashGridConfig(log2_table_size=14, levels=16, base=16, finest=512)
+ONE_LEVEL_GRID = HashGridConfig(log2_table_size=4, levels=1, base=2, finest=2)
+# The measured error is 1e-7, one float32 rounding of sums in float64; for numbers near 0 it is absolute.
+FLOAT32_ROUNDING = {"rtol": 2e-7, "atol": 1e-7}
 
 
 def random_model(count: int, seed: int = 3, **settings: object) -> HybridModel:
-    """A model with loud fields; Gaussians inside the frame's box, outside and far away, and at its centre."""
+    """Return a model with large random fields and Gaussians inside the frame, far outside and at its centre."""
     generator = torch.Generator().manual_seed(seed)
     frame = Frame((10.0, -3.0, 0.5), 2.5, (1.0, 0.5, 0.25))
-    config = ModelConfig(**{"frame": frame, "geometry": SMALL, "radiance": LARGE, "hidden": 19, **settings})
+    config = ModelConfig(**{"frame": frame, "geometry": SMALL_GRID, "radiance": LARGE_GRID, "hidden": 19, **settings})
 
     def normal(width: int, spread: float = 1.0) -> torch.Tensor:
         return torch.randn(count, width, generator=generator) * spread
@@ -43,15 +43,17 @@ def random_model(count: int, seed: int = 3, **settings: object) -> HybridModel:
     return model
 
 
-def directions(count: int, seed: int) -> np.ndarray:
+def random_directions(count: int, seed: int) -> np.ndarray:
     values = np.random.default_rng(seed).normal(size=(count, 3))
     values /= np.linalg.norm(values, axis=1, keepdims=True)
     values[:1] = 0, 0, 1
     return values.astype(np.float32)
 
 
-def in_float64(model: HybridModel, along: np.ndarray, places: np.ndarray, behind: np.ndarray) -> list[np.ndarray]:
-    """What the script writes, by the model itself."""
+def evaluate_in_float64(
+    model: HybridModel, along: np.ndarray, places: np.ndarray, behind: np.ndarray
+) -> list[np.ndarray]:
+    """Evaluate with the model what the script writes."""
     model = model.double()
     along, places, behind = (torch.from_numpy(values).double() for values in (along, places, behind))
     coding = model.config.direction_encoding
@@ -64,11 +66,11 @@ def in_float64(model: HybridModel, along: np.ndarray, places: np.ndarray, behind
     return [part.numpy() for part in (geometry.opacities, geometry.scales, quats, colors, background)]
 
 
-def evaluated(model: HybridModel, tmp_path: Path, *inputs: np.ndarray) -> list[np.ndarray]:
+def evaluate_in_node(model: HybridModel, tmp_path: Path, *inputs: np.ndarray) -> list[np.ndarray]:
     count, sphere = len(model), len(inputs[-1])
     hyrfpack.save_model(model, tmp_path / "model.hyrf", profile="raw")
     (tmp_path / "inputs").write_bytes(b"".join(values.astype("<f4").tobytes() for values in inputs))
-    run_script(EVALUATE, tmp_path / "model.hyrf", tmp_path / "inputs", tmp_path / "outputs")
+    run_script(EVALUATE_SCRIPT, tmp_path / "model.hyrf", tmp_path / "inputs", tmp_path / "outputs")
     numbers = np.fromfile(tmp_path / "outputs", "<f4")
     parts = np.split(numbers, np.cumsum([count, 3 * count, 4 * count, 3 * count]))
     shapes = (count,), (count, 3), (count, 4), (count, 3), (sphere, 3)
@@ -80,39 +82,41 @@ def evaluated(model: HybridModel, tmp_path: Path, *inputs: np.ndarray) -> list[n
     [
         {},
         {"direction_encoding": "sh", "scale_rule": "product"},
-        {"geometry": LARGE, "radiance": SMALL, "hidden": 64, "scale_grows": False},
-        {"geometry": ONE_LEVEL, "radiance": ONE_LEVEL, "hidden": 1},
+        {"geometry": LARGE_GRID, "radiance": SMALL_GRID, "hidden": 64, "scale_grows": False},
+        {"geometry": ONE_LEVEL_GRID, "radiance": ONE_LEVEL_GRID, "hidden": 1},
     ],
     ids=["frequency", "sh", "wide", "smallest"],
 )
-def test_fields_are_those_of_the_model_in_float64(settings: dict, tmp_path: Path) -> None:
+def test_fields_equal_those_of_the_model_in_float64(settings: dict, tmp_path: Path) -> None:
     model = random_model(700, **settings)
-    along, behind = directions(700, 1), directions(300, 2)
-    places = (BACKGROUND_RADIUS * directions(300, 5)).astype(np.float32)
+    along, behind = random_directions(700, 1), random_directions(300, 2)
+    places = (BACKGROUND_RADIUS * random_directions(300, 5)).astype(np.float32)
 
-    found = evaluated(model, tmp_path, along, places, behind)
+    found = evaluate_in_node(model, tmp_path, along, places, behind)
 
-    for values, expected in zip(found, in_float64(model, along, places, behind), strict=True):
-        np.testing.assert_allclose(values, expected, **EXACT)
+    for values, expected in zip(found, evaluate_in_float64(model, along, places, behind), strict=True):
+        np.testing.assert_allclose(values, expected, **FLOAT32_ROUNDING)
 
 
-def test_a_model_of_no_gaussians_has_fields_all_the_same(tmp_path: Path) -> None:
-    model, behind = random_model(0), directions(5, 2)
+def test_a_model_without_gaussians_has_a_background(tmp_path: Path) -> None:
+    model, behind = random_model(0), random_directions(5, 2)
     places = (BACKGROUND_RADIUS * behind).astype(np.float32)
 
-    *gaussians, background = evaluated(model, tmp_path, directions(0, 1), places, behind)
+    *gaussians, background = evaluate_in_node(model, tmp_path, random_directions(0, 1), places, behind)
 
     assert [part.size for part in gaussians] == [0, 0, 0, 0]
-    expected = in_float64(model, directions(0, 1), places, behind)[-1]
-    np.testing.assert_allclose(background, expected, **EXACT)
+    expected = evaluate_in_float64(model, random_directions(0, 1), places, behind)[-1]
+    np.testing.assert_allclose(background, expected, **FLOAT32_ROUNDING)
 
 
-def test_a_rotation_that_the_field_takes_to_nothing_is_no_rotation(tmp_path: Path) -> None:
+def test_a_zero_quaternion_becomes_the_identity(tmp_path: Path) -> None:
     model = random_model(4)
     with torch.no_grad():
         model.geometry.weights[-1].zero_()
         model.geometry.biases[-1].copy_(torch.tensor([0.0, 0, 0, 0, -1, 0, 0, 0]))
 
-    quats = evaluated(model, tmp_path, directions(4, 1), directions(1, 2), directions(1, 2))[2]
+    quats = evaluate_in_node(
+        model, tmp_path, random_directions(4, 1), random_directions(1, 2), random_directions(1, 2)
+    )[2]
 
     np.testing.assert_array_equal(quats, normalized_quats(np.zeros((4, 4))))

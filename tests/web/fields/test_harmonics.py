@@ -1,4 +1,4 @@
-"""Splats that JavaScript fits to a model: the least squares that they promise, and how like the model they look."""
+"""Splats that JavaScript fits to a model solve the documented least squares and look like the model."""
 
 from __future__ import annotations
 
@@ -27,15 +27,18 @@ from hyrfpack.scene import Camera
 from hyrfpack.splats.harmonics import SH_C0, fibonacci_sphere, harmonics_basis, num_sh_bases
 from hyrfpack.splats.splats import Splats
 
-FIT = Path(__file__).parent / "fit.mjs"
+FIT_SCRIPT = Path(__file__).parent / "fit.mjs"
 
 
-def fitted(model: HybridModel, cameras: list[Camera] | None, degree: int, tmp_path: Path) -> tuple[Splats, dict]:
-    """Splats, world units, and what the script prints. No list of cameras: those of the file."""
+def fit_in_node(model: HybridModel, cameras: list[Camera] | None, degree: int, tmp_path: Path) -> tuple[Splats, dict]:
+    """Fit splats in node; return them in world units and the facts that the script prints.
+
+    `cameras` None uses the cameras of the file.
+    """
     file, viewpoints, out = tmp_path / "model.hyrf", tmp_path / "cameras.json", tmp_path / "splats"
     hyrfpack.save_model(model, file)
     viewpoints.write_text(json.dumps(None if cameras is None else [camera_to_json(camera) for camera in cameras]))
-    facts: dict[str, Any] = run_script(FIT, file, viewpoints, degree, out)
+    facts: dict[str, Any] = run_script(FIT_SCRIPT, file, viewpoints, degree, out)
     count, others, data = facts["count"], num_sh_bases(degree) - 1, out.read_bytes()
     numbers = np.frombuffer(data, "<f4", 14 * count)
     packed = np.frombuffer(data, np.uint8, offset=56 * count).reshape(count, others, 3)
@@ -54,8 +57,8 @@ def fitted(model: HybridModel, cameras: list[Camera] | None, degree: int, tmp_pa
     return splats, facts
 
 
-def least_squares(model: HybridModel, cameras: list[Camera], degree: int) -> np.ndarray:
-    """(N, K, 3) the harmonics that the fit is to find, in float64."""
+def solve_least_squares(model: HybridModel, cameras: list[Camera], degree: int) -> np.ndarray:
+    """Solve for the expected harmonics (N, K, 3) in float64."""
     model = model.double()
     positions, count = model.gaussians.positions.detach(), len(model)
     with torch.no_grad():
@@ -90,14 +93,14 @@ def least_squares(model: HybridModel, cameras: list[Camera], degree: int) -> np.
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_colours_solve_the_least_squares_over_the_views_and_the_sphere(degree: int, tmp_path: Path) -> None:
+def test_harmonics_solve_the_least_squares_over_views_and_sphere(degree: int, tmp_path: Path) -> None:
     model = random_model(300, antialiased=True)
     at = np.array(model.config.frame.center)
     cameras = ring(9, radius=6.0, target=(0, 0, 0), width=50, height=40)
-    cameras = [Camera(50, 40, *c.intrinsics, moved_pose(c, at)) for c in cameras]
+    cameras = [Camera(50, 40, *c.intrinsics, move_pose(c, at)) for c in cameras]
 
-    splats, facts = fitted(model, cameras, degree, tmp_path)
-    expected = least_squares(random_model(300, antialiased=True), cameras, degree)
+    splats, facts = fit_in_node(model, cameras, degree, tmp_path)
+    expected = solve_least_squares(random_model(300, antialiased=True), cameras, degree)
 
     np.testing.assert_allclose(splats.harmonics[:, 0], expected[:, 0], atol=2e-5)
     most = facts["range"]
@@ -107,17 +110,17 @@ def test_colours_solve_the_least_squares_over_the_views_and_the_sphere(degree: i
     assert splats.antialiased and facts["degree"] == degree
 
 
-def moved_pose(camera: Camera, offset: np.ndarray) -> np.ndarray:
-    """The camera's pose, were it to stand and look so much farther."""
+def move_pose(camera: Camera, offset: np.ndarray) -> np.ndarray:
+    """Return the camera's pose after a translation by `offset` in world units."""
     pose = camera.camera_from_world.copy()
     pose[:3, 3] -= pose[:3, :3] @ offset
     return pose
 
 
-def test_shapes_and_progress_are_whole_and_the_coarse_colours_are_those_of_the_first_view(tmp_path: Path) -> None:
+def test_shapes_equal_the_model_and_coarse_colors_those_of_the_first_view(tmp_path: Path) -> None:
     model, cameras = random_model(600), ring(3)
 
-    splats, facts = fitted(model, cameras, 1, tmp_path)
+    splats, facts = fit_in_node(model, cameras, 1, tmp_path)
 
     frame = model.config.frame
     geometry = model.double().decode_geometry()
@@ -137,10 +140,10 @@ def ball_model() -> HybridModel:
     return small_model(points, fields=0.6, color_logits=logits, scale_logits=-2.5)
 
 
-def test_the_splats_look_like_the_model_as_those_do_that_python_bakes(tmp_path: Path) -> None:
+def test_fitted_splats_match_the_model_as_well_as_splats_baked_in_python(tmp_path: Path) -> None:
     cameras = ring(24, width=64, height=48)
 
-    splats, _ = fitted(ball_model(), cameras, 3, tmp_path)
+    splats, _ = fit_in_node(ball_model(), cameras, 3, tmp_path)
 
     model = ball_model()
     contenders = {"page": (splats, None), "bake": (bake(model, cameras, (3,))[3], None)}
@@ -150,8 +153,8 @@ def test_the_splats_look_like_the_model_as_those_do_that_python_bakes(tmp_path: 
     assert scores["page"].model > 35
 
 
-def test_a_file_without_cameras_is_fitted_from_rings_about_it(tmp_path: Path) -> None:
-    splats, _ = fitted(ball_model(), None, 2, tmp_path)
+def test_a_file_without_cameras_is_fitted_from_an_orbit(tmp_path: Path) -> None:
+    splats, _ = fit_in_node(ball_model(), None, 2, tmp_path)
 
     model = ball_model()
     around = orbit(Viewpoint.from_frame(model.config.frame.center, model.config.frame.scale), 7)
@@ -159,14 +162,14 @@ def test_a_file_without_cameras_is_fitted_from_rings_about_it(tmp_path: Path) ->
     assert measure_psnr(model, {"page": (splats, None)}, views, sphere=False)["page"].model > 35
 
 
-def test_a_model_of_no_gaussians_makes_no_splats(tmp_path: Path) -> None:
-    splats, facts = fitted(small_model(np.zeros((0, 3))), ring(2), 3, tmp_path)
+def test_a_model_without_gaussians_has_no_splats(tmp_path: Path) -> None:
+    splats, facts = fit_in_node(small_model(np.zeros((0, 3))), ring(2), 3, tmp_path)
     assert len(splats) == 0 and facts["coarse"] is None
 
 
-def test_a_broken_model_is_refused_in_one_sentence(tmp_path: Path) -> None:
+def test_a_model_with_infinite_scales_is_refused(tmp_path: Path) -> None:
     model = random_model(5)
     with torch.no_grad():
-        model.gaussians.positions.fill_(3e38)  # with a half-axis of 1/4, scales are beyond float32
+        model.gaussians.positions.fill_(3e38)  # with a half-axis of 1/4, scales exceed float32
     with pytest.raises(AssertionError, match=r"HyrfFormatError: The shape of a Gaussian is not a finite number.*"):
-        fitted(model, ring(2), 1, tmp_path)
+        fit_in_node(model, ring(2), 1, tmp_path)

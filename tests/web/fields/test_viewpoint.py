@@ -1,4 +1,4 @@
-"""From where the page shows a model: as Python does, and whatever a file says of its photos."""
+"""The page chooses the same viewpoint as Python and a valid one for any provenance."""
 
 from __future__ import annotations
 
@@ -21,79 +21,89 @@ from hyrfpack.export.source import Source
 from hyrfpack.model import Frame
 from hyrfpack.scene import Camera, Scene, evenly_spaced
 
-SCRIPT = Path(__file__).parent / "viewpoints.mjs"
-FRAME = Frame((40.0, -3.0, 7.0), 2.5, (1.0, 0.5, 0.25))
+VIEWPOINTS_SCRIPT = Path(__file__).parent / "viewpoints.mjs"
+MODEL_FRAME = Frame((40.0, -3.0, 7.0), 2.5, (1.0, 0.5, 0.25))
 
 
-def metadata(provenance: Any, **frame: Any) -> dict:
-    numbers = {"center": list(FRAME.center), "scale": FRAME.scale, "half_extent": list(FRAME.half_extent)}
+def make_metadata(provenance: Any, **frame: Any) -> dict:
+    numbers = {
+        "center": list(MODEL_FRAME.center),
+        "scale": MODEL_FRAME.scale,
+        "half_extent": list(MODEL_FRAME.half_extent),
+    }
     return {"provenance": provenance, "config": {"frame": {**numbers, **frame}}}
 
 
-def viewpoints(tmp_path: Path, all_metadata: list[dict]) -> list[dict]:
+def viewpoints_in_node(tmp_path: Path, all_metadata: list[dict]) -> list[dict]:
     file = tmp_path / "metadata.json"
     file.write_text(json.dumps(all_metadata))
-    return run_script(SCRIPT, file)
+    return run_script(VIEWPOINTS_SCRIPT, file)
 
 
-def photographed(cameras: list[Camera]) -> dict:
-    """The provenance of a model trained on photos from there."""
+def provenance_of_cameras(cameras: list[Camera]) -> dict:
+    """Return the provenance of a model trained on photos from these cameras."""
     scene = ball_scene(2)
     views = [view_of(f"{k}.png", camera, scene.train[0].load()) for k, camera in enumerate(cameras)]
     parts = {"points": scene.points, "point_colors": scene.point_colors}
     return json.loads(json.dumps(scene_provenance(Scene("made", "colmap", views, [], **parts))))
 
 
-def drone(count: int) -> list[Camera]:
-    """Cameras that look straight down and are turned against each other."""
+def drone_cameras(count: int) -> list[Camera]:
+    """Return cameras that look straight down and are rotated against each other."""
     turns = [(math.cos(a), math.sin(a), 0) for a in 2 * np.pi * np.arange(count) / count]
     return [camera_at((0.1 * k, 0, 9), (0.1 * k, 0, 0), up) for k, up in enumerate(turns)]
 
 
-GOOD = {
+VALID_PROVENANCES = {
     "nothing": {},
-    "ring": photographed(ring(40, width=80, height=60)),
-    "few": photographed(ring(3)),
-    "one": photographed([camera_at((0, -3, 1))]),
-    "drone": photographed(drone(14)),
-    "cameras alone": {"cameras": photographed(ring(30))["cameras"]},
-    "viewpoint alone": {"viewpoint": photographed(ring(30))["viewpoint"]},
-    "viewpoint of an arc": {"viewpoint": photographed([camera_at((3, 0.1 * k, 1)) for k in range(7)])["viewpoint"]},
+    "ring": provenance_of_cameras(ring(40, width=80, height=60)),
+    "few": provenance_of_cameras(ring(3)),
+    "one": provenance_of_cameras([camera_at((0, -3, 1))]),
+    "drone": provenance_of_cameras(drone_cameras(14)),
+    "cameras alone": {"cameras": provenance_of_cameras(ring(30))["cameras"]},
+    "viewpoint alone": {"viewpoint": provenance_of_cameras(ring(30))["viewpoint"]},
+    "viewpoint of an arc": {
+        "viewpoint": provenance_of_cameras([camera_at((3, 0.1 * k, 1)) for k in range(7)])["viewpoint"]
+    },
 }
 
 
-def json_of(cameras: list[Camera]) -> np.ndarray:
-    return numbers_of([camera_to_json(camera) for camera in cameras])
+def camera_array(cameras: list[Camera]) -> np.ndarray:
+    return camera_json_array([camera_to_json(camera) for camera in cameras])
 
 
-def numbers_of(cameras: list[dict]) -> np.ndarray:
+def camera_json_array(cameras: list[dict]) -> np.ndarray:
     order = ("width", "height", "fx", "fy", "cx", "cy")
     return np.array([[*(item[key] for key in order), *np.ravel(item["camera_from_world"])] for item in cameras])
 
 
-@pytest.mark.parametrize("name", GOOD)
-def test_the_page_is_shown_from_where_python_shows_it(name: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", VALID_PROVENANCES)
+def test_the_page_has_the_same_viewpoint_as_python(name: str, tmp_path: Path) -> None:
     file = tmp_path / "model.hyrf"
-    hyrfpack.save_model(small_model([[0, 0, 0]], frame=FRAME), file, provenance=GOOD[name])
+    hyrfpack.save_model(small_model([[0, 0, 0]], frame=MODEL_FRAME), file, provenance=VALID_PROVENANCES[name])
     read = Source.read(file)
     cameras = [camera for _, camera in read.cameras] or [camera for camera, _ in read.measured_views]
 
-    (found,) = viewpoints(tmp_path, [metadata(GOOD[name])])
+    (found,) = viewpoints_in_node(tmp_path, [make_metadata(VALID_PROVENANCES[name])])
 
     close = {"rtol": 1e-9, "atol": 1e-9}
-    np.testing.assert_allclose(numbers_of(found["cameras"]), json_of(evenly_spaced(cameras, MAX_PAGE_CAMERAS)), **close)
+    np.testing.assert_allclose(
+        camera_json_array(found["cameras"]), camera_array(evenly_spaced(cameras, MAX_PAGE_CAMERAS)), **close
+    )
     np.testing.assert_allclose(found["up"], read.up, **close)
     np.testing.assert_allclose(found["target"], read.center, **close)
     assert found["madeUp"] is (not read.cameras)
     if found["madeUp"]:
-        np.testing.assert_allclose(numbers_of(found["fitted"]), json_of(read.fit_cameras), **close)
+        np.testing.assert_allclose(camera_json_array(found["fitted"]), camera_array(read.fit_cameras), **close)
     else:
-        np.testing.assert_allclose(numbers_of(found["fitted"]), json_of(evenly_spaced(cameras, 48)), **close)
+        np.testing.assert_allclose(
+            camera_json_array(found["fitted"]), camera_array(evenly_spaced(cameras, 48)), **close
+        )
 
 
-def spoiled() -> list[Any]:
-    """Provenances of which each number, list or key is wrong in turn."""
-    row, view = GOOD["few"]["cameras"][0], GOOD["few"]["viewpoint"]
+def invalid_provenances() -> list[Any]:
+    """Return provenances in each of which one number, list or key is invalid."""
+    row, view = VALID_PROVENANCES["few"]["cameras"][0], VALID_PROVENANCES["few"]["viewpoint"]
     wrong = [None, "<b>", [], {}, True, 1e308, -1e300, 0, [[[1]]], "1", 2**53]
     made: list[Any] = [None, 7, [], "text", {"cameras": 3}, {"viewpoint": 3}, {"cameras": {"length": 3}}]
     for value in wrong:
@@ -111,13 +121,13 @@ def spoiled() -> list[Any]:
     return made
 
 
-def test_whatever_a_provenance_says_there_is_a_place_to_look_from(tmp_path: Path) -> None:
-    cases = [metadata(provenance) for provenance in spoiled()]
+def test_an_invalid_provenance_still_gives_a_valid_viewpoint(tmp_path: Path) -> None:
+    cases = [make_metadata(provenance) for provenance in invalid_provenances()]
     frames = [{"center": [1e308, 0, 0]}, {"scale": 1e308}, {"scale": 5e-324}, {"center": [1e37, 1e37, -1e37]}]
-    cases += [metadata(provenance, **frame) for frame in frames for provenance in ({}, GOOD["ring"])]
+    cases += [make_metadata(provenance, **frame) for frame in frames for provenance in ({}, VALID_PROVENANCES["ring"])]
 
-    for found in viewpoints(tmp_path, cases):
+    for found in viewpoints_in_node(tmp_path, cases):
         assert found["cameras"] and found["fitted"]
         for item in (*found["cameras"], *found["fitted"]):
-            camera_from_json(item)  # which refuses all that is not a camera
+            camera_from_json(item)  # raises an error for anything but a valid camera
         assert math.isclose(math.hypot(*found["up"]), 1, rel_tol=1e-9) and np.isfinite(found["target"]).all()

@@ -1,4 +1,4 @@
-"""What the player's readers of splats make of files, beside what Python's make of them."""
+"""Compare the splats that the player's readers return with those of Python's readers."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from web.scripts import run_script
 from hyrfpack.splats.harmonics import SH_C0, num_sh_bases
 from hyrfpack.splats.splats import Splats
 
-DECODE = Path(__file__).parent / "decode.mjs"
+DECODE_SCRIPT = Path(__file__).parent / "decode.mjs"
 
 
 @dataclass(frozen=True)
 class PageSplats:
-    """Splats as the page has them: `facts` and arrays as the script writes them."""
+    """Splats as the page holds them: the `facts` and the arrays that the script writes."""
 
     facts: dict
     data: bytes
 
-    def assert_are(self, expected: Splats) -> None:
-        """They are Python's, to the precision of float32 in the page's frame and of bytes for harmonics."""
+    def assert_equal(self, expected: Splats) -> None:
+        """Assert that they equal Python's, up to float32 in the page's frame and to bytes for harmonics."""
         facts, count, terms = self.facts, len(expected), num_sh_bases(expected.degree)
         assert (facts["count"], facts["degree"]) == (count, expected.degree)
         assert facts["antialiased"] is expected.antialiased
@@ -42,19 +42,23 @@ class PageSplats:
         found, inside = (packed.astype(np.float64) - 128) / 128 * most, np.clip(expected.harmonics[:, 1:], -most, most)
         np.testing.assert_allclose(found, inside, atol=most / 127)
         assert np.mean(np.abs(expected.harmonics[:, 1:]) > most * (1 + 1e-6)) <= 1e-3 if terms > 1 and count else True
-        if count > 20:  # most of the scene is about one unit large
+        if count > 20:  # the size of most of the scene is about one unit
             assert np.quantile(np.abs(wanted).max(1), 0.8) <= 1
 
 
 def read_in_node(folder: Path, files: Sequence[tuple[str, bytes]]) -> tuple[list[PageSplats | str], int]:
-    """What the player makes of files given by name and contents: splats or one sentence; and kilobytes of memory."""
+    """Read files (name, content) with the player's readers in node.
+
+    Returns:
+        The splats or the error message of each file, and the memory used in kilobytes.
+    """
     paths = []
     for number, (name, data) in enumerate(files):
         (folder / "in" / str(number)).mkdir(parents=True)
         paths.append(folder / "in" / str(number) / name)
         paths[-1].write_bytes(data)
     (folder / "out").mkdir()
-    answer = run_script(DECODE, folder / "out", *paths)
+    answer = run_script(DECODE_SCRIPT, folder / "out", *paths)
     results: list[PageSplats | str] = []
     for number, facts in enumerate(answer["answers"]):
         if "error" in facts:

@@ -1,4 +1,4 @@
-"""The adapter for three.js: a file arrives in a scene with its splats, in place, and looks as it does here."""
+"""The adapter for three.js adds a file's splats to a scene, where they look as in `hyrfpack.render_view`."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ import pytest
 import torch
 from PIL import Image
 from scenes import ball_points, ring, small_model
-from web.fields.test_harmonics import fitted
+from web.fields.test_harmonics import fit_in_node
 from web.scripts import run_script
-from web.served import served
+from web.served import serve_project
 
 import hyrfpack
 from hyrfpack.cameras.capture import provenance_cameras
@@ -27,69 +27,75 @@ from hyrfpack.render import render_view
 from hyrfpack.scene import Camera
 from tools.browser.chromium import Chromium, find
 
-ROOT = Path(__file__).parents[3]
-MODULES = ROOT / "tests" / "node" / "node_modules"
-CENTER, SCALE = np.array([40.0, -3.0, 7.0]), 2.0
-SIZE = 256
+PROJECT_FOLDER = Path(__file__).parents[3]
+NODE_MODULES = PROJECT_FOLDER / "tests" / "node" / "node_modules"
+MODEL_CENTER, MODEL_SCALE = np.array([40.0, -3.0, 7.0]), 2.0
+PICTURE_SIZE_PIXELS = 256
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The example as someone has it who has installed three and hyrf.js beside it."""
-    if not (MODULES / "three").is_dir():
+def app_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Copy the example and install three and hyrf.js beside it."""
+    if not (NODE_MODULES / "three").is_dir():
         pytest.skip("three is not installed (npm ci --prefix tests/node)")
-    folder = shutil.copytree(ROOT / "examples" / "three", tmp_path_factory.mktemp("three") / "app")
-    shutil.copy(Path(__file__).with_name("describe.mjs"), folder)
-    (folder / "node_modules").mkdir()
-    (folder / "node_modules" / "three").symlink_to(MODULES / "three")
-    (folder / "node_modules" / "hyrf.js").symlink_to(ROOT / "hyrfpack" / "web" / "hyrf")
-    return folder
+    app_folder = shutil.copytree(PROJECT_FOLDER / "examples" / "three", tmp_path_factory.mktemp("three") / "app")
+    shutil.copy(Path(__file__).with_name("describe.mjs"), app_folder)
+    (app_folder / "node_modules").mkdir()
+    (app_folder / "node_modules" / "three").symlink_to(NODE_MODULES / "three")
+    (app_folder / "node_modules" / "hyrf.js").symlink_to(PROJECT_FOLDER / "hyrfpack" / "web" / "hyrf")
+    return app_folder
 
 
-def model_of(count: int = 1200, **settings: Any) -> HybridModel:
+def make_model(count: int = 1200, **settings: Any) -> HybridModel:
     points, colors = ball_points(count)
     logits = np.log(colors / (1 - colors).clip(1e-3)).astype(np.float32)
-    frame = Frame(tuple(CENTER), SCALE, (1.0, 1.0, 1.0))
+    frame = Frame(tuple(MODEL_CENTER), MODEL_SCALE, (1.0, 1.0, 1.0))
     settings = {"scale_logits": -3.0, "opacity_logits": 3.0, "antialiased": True, **settings}
     return small_model(points, frame=frame, fields=0.5, color_logits=logits, **settings)
 
 
-def cameras_about(count: int) -> list[Camera]:
-    """About the model, which is SCALE large, with z up."""
+def cameras_around_model(count: int) -> list[Camera]:
+    """Return cameras on a ring around the model, with z up."""
     cameras = []
-    for camera in ring(count, radius=3.0 * SCALE, elevation=1.2 * SCALE, width=SIZE, height=SIZE):
+    for camera in ring(
+        count,
+        radius=3.0 * MODEL_SCALE,
+        elevation=1.2 * MODEL_SCALE,
+        width=PICTURE_SIZE_PIXELS,
+        height=PICTURE_SIZE_PIXELS,
+    ):
         pose = camera.camera_from_world.copy()
-        pose[:3, 3] -= pose[:3, :3] @ CENTER
-        cameras.append(Camera(SIZE, SIZE, *camera.intrinsics, pose))
+        pose[:3, 3] -= pose[:3, :3] @ MODEL_CENTER
+        cameras.append(Camera(PICTURE_SIZE_PIXELS, PICTURE_SIZE_PIXELS, *camera.intrinsics, pose))
     return cameras
 
 
-def saved(model: HybridModel, file: Path) -> Path:
-    cameras = cameras_about(10)
+def save_model(model: HybridModel, file: Path) -> Path:
+    cameras = cameras_around_model(10)
     provenance = {"cameras": provenance_cameras(cameras), "viewpoint": Viewpoint.from_cameras(cameras).to_json()}
     hyrfpack.save_model(model, file, provenance=provenance)
     return file
 
 
-def described(folder: Path, file: Path, degree: int) -> dict:
-    return run_script(folder / "describe.mjs", file, degree)
+def describe_in_node(app_folder: Path, file: Path, degree: int) -> dict:
+    return run_script(app_folder / "describe.mjs", file, degree)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
-def test_a_file_in_a_scene_has_its_splats_in_place(folder: Path, tmp_path: Path, degree: int) -> None:
-    found = described(folder, saved(model_of(), tmp_path / "scene.hyrf"), degree)
+def test_a_loaded_file_has_the_fitted_splats(app_folder: Path, tmp_path: Path, degree: int) -> None:
+    found = describe_in_node(app_folder, save_model(make_model(), tmp_path / "scene.hyrf"), degree)
 
-    splats, facts = fitted(model_of(), cameras_about(10), degree, tmp_path)
+    splats, facts = fit_in_node(make_model(), cameras_around_model(10), degree, tmp_path)
     assert found["meshes"] == 1 and found["early"] == 1
     assert found["told"] == sorted(found["told"]) and found["told"][-1] == 1
     np.testing.assert_allclose(found["places"], splats.positions, rtol=1e-6)
-    assert found["unit"] == pytest.approx(SCALE)
+    assert found["unit"] == pytest.approx(MODEL_SCALE)
     turn = torch.from_numpy(splats.quats).double()
     w, x, y, z = turn.T.numpy()
     rows = [[1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
             [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]]  # fmt: skip
-    axes = np.moveaxis(np.array(rows), -1, 0) * (splats.scales / SCALE)[:, None, :]
+    axes = np.moveaxis(np.array(rows), -1, 0) * (splats.scales / MODEL_SCALE)[:, None, :]
     covariances = (axes @ axes.transpose(0, 2, 1))[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
     np.testing.assert_allclose(np.reshape(found["covariances"], (-1, 6)), covariances, rtol=1e-4, atol=1e-9)
     colors = np.reshape(found["colors"], (-1, 4)) / 255
@@ -106,43 +112,46 @@ def test_a_file_in_a_scene_has_its_splats_in_place(folder: Path, tmp_path: Path,
     assert facts["count"] == 1200
 
 
-def test_the_first_camera_of_the_file_is_where_three_looks_from(folder: Path, tmp_path: Path) -> None:
-    found = described(folder, saved(model_of(9), tmp_path / "scene.hyrf"), 0)
+def test_the_camera_of_three_is_the_first_camera_of_the_file(app_folder: Path, tmp_path: Path) -> None:
+    found = describe_in_node(app_folder, save_model(make_model(9), tmp_path / "scene.hyrf"), 0)
 
-    camera = cameras_about(10)[0]
+    camera = cameras_around_model(10)[0]
     np.testing.assert_allclose(found["eye"], camera.position, rtol=1e-5)
     np.testing.assert_allclose(found["forward"], camera.forward, atol=1e-5)
     np.testing.assert_allclose(found["up"], [0, 1, 0], atol=1e-6)
-    assert found["fov"] == pytest.approx(np.degrees(2 * np.arctan(SIZE / 2 / camera.fy)))
+    assert found["fov"] == pytest.approx(np.degrees(2 * np.arctan(PICTURE_SIZE_PIXELS / 2 / camera.fy)))
     assert found["sphere"] is None
 
 
-def test_a_background_becomes_a_sphere_with_its_colours(folder: Path, tmp_path: Path) -> None:
-    model = model_of(5, background=True)
-    found = described(folder, saved(model, tmp_path / "scene.hyrf"), 0)
+def test_a_background_becomes_a_sphere_with_the_same_colors(app_folder: Path, tmp_path: Path) -> None:
+    model = make_model(5, background=True)
+    found = describe_in_node(app_folder, save_model(model, tmp_path / "scene.hyrf"), 0)
 
     pixels = np.reshape(found["sphere"], (512, 1024, 4)) / 255
-    forward = np.array([0.0, 1.0, 0.0])  # from the middle along y: the top of three's sphere
+    forward = np.array([0.0, 1.0, 0.0])  # from the centre along y, the top of three's sphere
     pose = np.eye(4)
     pose[:3, :3] = [[1, 0, 0], [0, 0, -1], forward]
-    pose[:3, 3] = -pose[:3, :3] @ CENTER
+    pose[:3, 3] = -pose[:3, :3] @ MODEL_CENTER
     camera = Camera(1, 1, 5e4, 5e4, 0.5, 0.5, pose)
     seen = (
-        render_view(small_model(np.zeros((0, 3)), **same_fields()), camera, background=True).rgb[0, 0].detach().numpy()
+        render_view(small_model(np.zeros((0, 3)), **field_settings()), camera, background=True)
+        .rgb[0, 0]
+        .detach()
+        .numpy()
     )
     np.testing.assert_allclose(pixels[-1, :, :3].mean(0), seen, atol=0.02)
 
 
-def same_fields() -> dict[str, Any]:
-    return {"frame": Frame(tuple(CENTER), SCALE, (1.0, 1.0, 1.0)), "fields": 0.5, "background": True}
+def field_settings() -> dict[str, Any]:
+    return {"frame": Frame(tuple(MODEL_CENTER), MODEL_SCALE, (1.0, 1.0, 1.0)), "fields": 0.5, "background": True}
 
 
 @pytest.mark.skipif(find() is None, reason="there is no Chromium on this machine")
-def test_the_page_shows_what_is_rendered_here(folder: Path, tmp_path: Path) -> None:
-    saved(model_of(), folder / "scene.hyrf")
+def test_the_example_page_shows_the_rendered_picture(app_folder: Path, tmp_path: Path) -> None:
+    save_model(make_model(), app_folder / "scene.hyrf")
     flags = ("--enable-unsafe-swiftshader", "--use-angle=swiftshader")
-    with served(folder) as address, Chromium(tmp_path / "profile", *flags) as browser:
-        browser.resize(SIZE, SIZE)
+    with serve_project(app_folder) as address, Chromium(tmp_path / "profile", *flags) as browser:
+        browser.resize(PICTURE_SIZE_PIXELS, PICTURE_SIZE_PIXELS)
         browser.open(f"{address}/own/index.html?webgl&file=scene.hyrf")
         ends = time.monotonic() + 60
         while (said := browser.evaluate("document.getElementById('status').textContent")) != "" or browser.evaluate(
@@ -150,11 +159,11 @@ def test_the_page_shows_what_is_rendered_here(folder: Path, tmp_path: Path) -> N
         ):
             assert time.monotonic() < ends, (said, browser.list_errors())
             time.sleep(0.2)
-        time.sleep(1.5)  # some frames
+        time.sleep(1.5)  # lets the page draw some frames
         picture = np.array(Image.open(io.BytesIO(browser.screenshot())).convert("RGB"), np.float32) / 255
         complaints = browser.list_errors()
 
-    own = render_view(model_of(), cameras_about(10)[0]).rgb.detach()
+    own = render_view(make_model(), cameras_around_model(10)[0]).rgb.detach()
     assert not [line for line in complaints if "WebGPU" not in line], json.dumps(complaints)
     assert psnr(torch.from_numpy(picture), own) > 28
-    assert psnr(own.mean((0, 1)).expand_as(own), own) < 20  # there is something to see
+    assert psnr(own.mean((0, 1)).expand_as(own), own) < 20  # the picture is not nearly uniform

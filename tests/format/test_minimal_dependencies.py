@@ -1,4 +1,4 @@
-"""Files are read and rendered where nothing is installed but torch, numpy and what these ask for."""
+"""Files can be read and rendered with only torch, numpy and their dependencies installed."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-ROOT = Path(__file__).parents[2]
-FILES = sorted((ROOT / "tests" / "golden").glob("*.hyrf"))
+PROJECT_FOLDER = Path(__file__).parents[2]
+GOLDEN_PATHS = sorted((PROJECT_FOLDER / "tests" / "golden").glob("*.hyrf"))
 
-# Run here and in an interpreter of its own.
-PICTURES = """
+# This code runs in this process and in an isolated one.
+RENDER_CODE = """
 import numpy as np
 import hyrfpack
 from hyrfpack.format import decode_model
@@ -29,7 +29,7 @@ def picture(path):
     assert len(model) == len(decode_model(data)) == facts["gaussians"]
     return hyrfpack.render_view(model, hyrfpack.Camera(16, 12, 20.0, 20.0, 8.0, 6.0, pose)).rgb.numpy()
 """
-ALONE = """
+ISOLATED_SCRIPT = """
 import sys
 from importlib.machinery import PathFinder
 
@@ -47,8 +47,8 @@ print(*sys.modules)
 """
 
 
-def required(*roots: str) -> set[str]:
-    """The distributions, and all that they ask for."""
+def required_distributions(*roots: str) -> set[str]:
+    """Return the names of distributions and of everything that they require."""
     found, waiting = set(), list(roots)
     while waiting:
         name = re.match(r"[\w.-]+", waiting.pop())[0].lower().replace("_", "-")
@@ -57,22 +57,24 @@ def required(*roots: str) -> set[str]:
             try:
                 waiting += [line for line in metadata.requires(name) or () if "extra ==" not in line]
             except metadata.PackageNotFoundError:
-                continue  # for another platform
+                continue  # is required on another platform only
     return found
 
 
 @pytest.fixture(scope="module")
-def alone(tmp_path_factory) -> tuple[dict[str, np.ndarray], set[str]]:
-    """Pictures of the golden files, drawn where all other packages are missing, and the modules that reading loads."""
-    allowed = {*required("torch", "numpy"), "hyrfpack"}
+def isolated_run(tmp_path_factory) -> tuple[dict[str, np.ndarray], set[str]]:
+    """Render golden files without all other packages; return the pictures and the modules that reading imports."""
+    allowed = {*required_distributions("torch", "numpy"), "hyrfpack"}
     refused = {
         module
         for module, names in metadata.packages_distributions().items()
         if not allowed & {name.lower().replace("_", "-") for name in names}
     }
     assert refused >= {"scipy", "PIL", "numba", "dahuffman", "click", "rich", "pytest"}
-    out, files = str(tmp_path_factory.mktemp("alone") / "pictures.npz"), [str(path) for path in FILES]
-    script = ALONE.format(refused=refused, root=str(ROOT), pictures=PICTURES, out=out, files=files)
+    out, files = str(tmp_path_factory.mktemp("alone") / "pictures.npz"), [str(path) for path in GOLDEN_PATHS]
+    script = ISOLATED_SCRIPT.format(
+        refused=refused, root=str(PROJECT_FOLDER), pictures=RENDER_CODE, out=out, files=files
+    )
 
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
 
@@ -83,16 +85,16 @@ def alone(tmp_path_factory) -> tuple[dict[str, np.ndarray], set[str]]:
         return dict(pictures), to_read
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
-def test_golden_files_look_the_same_with_torch_and_numpy_alone(path, alone):
+@pytest.mark.parametrize("path", GOLDEN_PATHS, ids=lambda path: path.stem)
+def test_golden_files_render_the_same_with_torch_and_numpy_alone(path, isolated_run):
     here: dict = {}
-    exec(PICTURES, here)
+    exec(RENDER_CODE, here)
 
     expected = here["picture"](str(path))
 
-    assert np.ptp(expected) > 0.05  # there is something to see
-    np.testing.assert_allclose(alone[0][str(path)], expected, rtol=0, atol=2e-3)
+    assert np.ptp(expected) > 0.05  # the picture is not uniform
+    np.testing.assert_allclose(isolated_run[0][str(path)], expected, rtol=0, atol=2e-3)
 
 
-def test_torchs_compiler_is_not_loaded_which_takes_longer_than_a_file(alone):
-    assert "torch" in alone[1] and "torch._dynamo" not in alone[1]
+def test_loading_a_file_does_not_import_the_compiler_of_torch(isolated_run):
+    assert "torch" in isolated_run[1] and "torch._dynamo" not in isolated_run[1]
