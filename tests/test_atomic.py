@@ -377,13 +377,13 @@ def test_two_processes_that_write_one_name_without_overwrite_keep_both_results_i
     racers = [spawn.Process(target=write_in_race, args=(tmp_path, letter, start, answers)) for letter in (b"a", b"b")]
     for racer in racers:
         racer.start()
-    told = sorted(answers.get() for _ in range(2 * RACE_ROUNDS))
+    messages = sorted(answers.get() for _ in range(2 * RACE_ROUNDS))
     for racer in racers:
         racer.join()
 
-    assert told == sorted((number, f"{number}{end}.hyrf") for number in range(RACE_ROUNDS) for end in ("", "-2"))
+    assert messages == sorted((number, f"{number}{end}.hyrf") for number in range(RACE_ROUNDS) for end in ("", "-2"))
     files = files_in(tmp_path)
-    assert files.keys() == {name for _, name in told}
+    assert files.keys() == {name for _, name in messages}
     for number in range(RACE_ROUNDS):
         assert {files[f"{number}.hyrf"], files[f"{number}-2.hyrf"]} == {b"a" * 1000, b"b" * 1000}
 

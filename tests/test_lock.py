@@ -79,12 +79,12 @@ def test_folder_is_free_again_after_the_call_and_after_its_failure(tmp_path):
 
 
 def test_two_threads_of_one_process_exclude_each_other(tmp_path):
-    told = []
+    messages = []
     with exclusive_folder(tmp_path):
-        thread = threading.Thread(target=lambda: told.append(second_call_error(tmp_path)))
+        thread = threading.Thread(target=lambda: messages.append(second_call_error(tmp_path)))
         thread.start()
         thread.join()
-    assert told == [f"{tmp_path}: {BUSY_FOLDER_ERROR}"]
+    assert messages == [f"{tmp_path}: {BUSY_FOLDER_ERROR}"]
 
 
 def test_another_name_of_the_same_folder_is_locked_too(tmp_path):

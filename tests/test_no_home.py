@@ -19,8 +19,8 @@ CACHE_FOLDER_VARIABLES = ("MPLCONFIGDIR", "XDG_CACHE_HOME", "XDG_CONFIG_HOME")
 def test_a_command_says_once_that_kernels_cannot_be_cached_and_how_to_change_that(room, tmp_path, monkeypatch):
     if not room:
         monkeypatch.setattr(CompileResultCacheImpl, "_locator_classes", [])
-    told = succeeded("decompress", COMPACT_GOLDEN_FILE, "-o", tmp_path / "raw.hyrf").stderr
-    assert told.count("NUMBA_CACHE_DIR") == told.count("MPLCONFIGDIR") == (0 if room else 1)
+    messages = succeeded("decompress", COMPACT_GOLDEN_FILE, "-o", tmp_path / "raw.hyrf").stderr
+    assert messages.count("NUMBA_CACHE_DIR") == messages.count("MPLCONFIGDIR") == (0 if room else 1)
 
 
 def test_the_library_prints_no_note_about_the_cache(tmp_path):

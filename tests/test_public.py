@@ -154,12 +154,12 @@ def test_a_render_of_a_loaded_model_converts_to_numpy(tmp_path):
 def test_type_checkers_see_the_public_names_and_nothing_else():
     nodes = [node for node in ast.parse(inspect.getsource(hyrfpack)).body if isinstance(node, ast.If)]
     (block,) = [node for node in nodes if ast.unparse(node.test) == "TYPE_CHECKING"]
-    told = {}
+    messages = {}
     for statement in block.body:
         for alias in statement.names:
             assert alias.name == alias.asname, "what is not imported under its own name again is private"
-            told[alias.name] = statement.module
-    assert {"__version__", *told} == set(hyrfpack.__all__)
-    for name, module in told.items():
+            messages[alias.name] = statement.module
+    assert {"__version__", *messages} == set(hyrfpack.__all__)
+    for name, module in messages.items():
         assert getattr(import_module(module), name) is getattr(hyrfpack, name)
     assert files("hyrfpack").joinpath("py.typed").is_file()

@@ -50,6 +50,6 @@ def test_a_correct_program_passes_and_each_mistaken_line_is_reported(tmp_path):
     command = [sys.executable, "-m", "mypy", "--config-file", REPOSITORY_ROOT / "pyproject.toml", "--no-pretty"]
     command += [tmp_path / "right.py", tmp_path / "wrong.py"]
     done = subprocess.run(command, cwd=REPOSITORY_ROOT, capture_output=True, text=True)
-    told = re.findall(r"(right|wrong)\.py:(\d+): error: .*\[([\w-]+)\]$", done.stdout, re.MULTILINE)
+    messages = re.findall(r"(right|wrong)\.py:(\d+): error: .*\[([\w-]+)\]$", done.stdout, re.MULTILINE)
     expected = [("wrong", str(line), code) for line, code in enumerate(ERROR_CODES_BY_LINE.values(), start=2)]
-    assert told == expected, done.stdout + done.stderr
+    assert messages == expected, done.stdout + done.stderr

@@ -313,13 +313,13 @@ class Packer:
         The parts were calibrated separately, so their errors together may differ a little from the prediction.
         """
 
-        def attempt(distortion: float, number: int) -> EncodedCandidate:
+        def encode_candidate(distortion: float, number: int) -> EncodedCandidate:
             candidate_report = report_round(report, number)
             candidate = self.encode(distortion, report_part(candidate_report, 0.0, 0.5))
             candidate_report("comparing renders of the file with those of the model", 0.5)
             return dataclasses.replace(candidate, measured_error=references.measure_error(self.decode(candidate)))
 
-        candidate, distortion = attempt(target, 0), target
+        candidate, distortion = encode_candidate(target, 0), target
         for number in range(MAX_CORRECTIONS):
             error = candidate.measured_error
             error_ratio = error / target
@@ -331,7 +331,7 @@ class Packer:
                 f"renders have a mean squared error of {error:.2g}, target {target:.2g}; encoding again at "
                 f"distortion {distortion:.2g} ({kind})"
             )
-            other = attempt(distortion, number + 1)
+            other = encode_candidate(distortion, number + 1)
             if error_ratio > 1:
                 candidate = other
                 continue
@@ -351,13 +351,13 @@ class Packer:
         """
         rounds = count()
 
-        def attempt(distortion: float) -> EncodedCandidate:
+        def encode_candidate(distortion: float) -> EncodedCandidate:
             candidate = self.encode(distortion, report_round(self.report, next(rounds)))
             self.say(f"distortion {distortion:.2g}: {len(candidate.data):,} bytes")
             return candidate
 
         answer = find_fullest(
-            attempt, lambda candidate: len(candidate.data), limit, start, self._max_trials(), DISTORTION_RANGE
+            encode_candidate, lambda candidate: len(candidate.data), limit, start, self._max_trials(), DISTORTION_RANGE
         )
         if answer is None:
             smallest = len(self.encode(DISTORTION_RANGE[1]).data)
@@ -384,7 +384,7 @@ class Packer:
         before = evaluate_model(self.model, views).psnr
         rounds = count()
 
-        def attempt(distortion: float) -> EncodedCandidate:
+        def encode_candidate(distortion: float) -> EncodedCandidate:
             report = report_round(self.report, next(rounds))
             candidate = self.encode(distortion, report_part(report, 0.0, 0.7))
             report("scoring the file", 0.7)
@@ -394,7 +394,11 @@ class Packer:
             return candidate
 
         answer = find_coarsest(
-            attempt, lambda candidate: candidate.psnr_drop <= limit, start, self._max_trials(), DISTORTION_RANGE
+            encode_candidate,
+            lambda candidate: candidate.psnr_drop <= limit,
+            start,
+            self._max_trials(),
+            DISTORTION_RANGE,
         )
         if answer is None:
             raise HyrfError(

@@ -24,7 +24,7 @@ MIN_BRACKET_LOG_WIDTH = math.log(1.01)
 
 
 def find_coarsest(
-    attempt: Callable[[float], Trial],
+    make_trial: Callable[[float], Trial],
     fits: Callable[[Trial], bool],
     start: float,
     trials: int,
@@ -33,7 +33,7 @@ def find_coarsest(
     """Find the largest distortion whose trial fits, by bracketing and bisection of its logarithm.
 
     Args:
-        attempt: makes the trial of a distortion; if a trial fits, those of smaller distortions fit too.
+        make_trial: makes the trial of a distortion; if a trial fits, those of smaller distortions fit too.
         fits: returns whether a trial is good enough.
         start: distortion of the first trial.
         trials: maximum number of trials, at least 2.
@@ -46,7 +46,7 @@ def find_coarsest(
     high: float | None = None  # the smallest distortion that does not fit
     distortion, best = min(max(start, bounds[0]), bounds[1]), None
     for _ in range(trials):
-        trial = attempt(distortion)
+        trial = make_trial(distortion)
         if fits(trial):
             low, best = distortion, (distortion, trial)
         else:
@@ -61,13 +61,13 @@ def find_coarsest(
                 if high is None
                 else max(distortion / BRACKETING_RATIO, bounds[0])
             )
-    if best is None and high != bounds[0] and fits(trial := attempt(bounds[0])):
+    if best is None and high != bounds[0] and fits(trial := make_trial(bounds[0])):
         best = bounds[0], trial
     return best
 
 
 def find_fullest(
-    attempt: Callable[[float], Trial],
+    make_trial: Callable[[float], Trial],
     size: Callable[[Trial], int],
     limit: int,
     start: float,
@@ -82,7 +82,7 @@ def find_fullest(
     Args:
         size: returns the bytes of a trial; a larger distortion never takes more bytes.
         limit: maximum size in bytes.
-        attempt, start, trials, bounds: as for `find_coarsest`.
+        make_trial, start, trials, bounds: as for `find_coarsest`.
 
     Returns:
         The distortion and the largest trial that fits; None if none does.
@@ -97,7 +97,7 @@ def find_fullest(
     measured: list[tuple[float, float]] = []  # logarithms of the distortion and the bytes of each trial
     for _ in range(trials):
         distortion = math.exp(place)
-        trial = attempt(distortion)
+        trial = make_trial(distortion)
         measured.append((place, math.log(max(size(trial), 1))))
         if size(trial) <= limit:
             fitting, best = measured[-1], (distortion, trial)

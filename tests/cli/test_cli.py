@@ -228,14 +228,14 @@ def test_a_video_without_ffmpeg_gives_pictures_and_a_note(packed, tmp_path, monk
 
 @pytest.mark.usefixtures("signals")
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "messages"),
     [
         ((), "the same command with --resume continues"),
         (("--overwrite",), "with --resume instead of --overwrite continues"),
     ],
     ids=["new", "overwriting"],
 )
-def test_interrupted_training_saves_exits_with_1_and_says_how_to_resume(options, told, data, tmp_path, monkeypatch):
+def test_interrupted_training_saves_exits_with_1_and_says_how_to_resume(options, messages, data, tmp_path, monkeypatch):
     before, run = signal.getsignal(signal.SIGINT), Trainer.run
 
     def run_interrupted(trainer, *, report, **rest):
@@ -250,7 +250,7 @@ def test_interrupted_training_saves_exits_with_1_and_says_how_to_resume(options,
     assert result.exit_code == 1 and isinstance(result.exception, SystemExit)
     summary = json.loads(result.stdout)
     assert (summary["complete"], summary["step"]) == (False, 1)
-    assert told in result.stderr
+    assert messages in result.stderr
     assert (tmp_path / "checkpoint.pt").is_file() and not (tmp_path / "model.hyrf").exists()
     assert signal.getsignal(signal.SIGINT) is before
 

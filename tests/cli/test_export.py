@@ -228,10 +228,10 @@ def test_view_serves_the_player_and_the_file_at_a_free_port_until_ctrl_c(ending,
                 status, part = answer.status, answer.read()
         finally:
             os.kill(process.pid, signal.SIGINT)
-        said, told = process.communicate(timeout=20)
+        said, messages = process.communicate(timeout=20)
     assert page.startswith(b"<!DOCTYPE html>") and f"<title>{file.stem}</title>".encode() in page
     assert (status, part) == (206, file.read_bytes()[8:100])
-    assert (process.returncode, said) == (0, "") and "Traceback" not in told
+    assert (process.returncode, said) == (0, "") and "Traceback" not in messages
 
 
 def test_view_decodes_nothing_and_loads_no_torch(model):

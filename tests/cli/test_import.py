@@ -50,8 +50,8 @@ def test_import_uses_the_cameras_and_prints_its_results(source: Path, cameras: P
 def test_a_missing_device_is_rejected_before_any_work(source: Path, tmp_path: Path) -> None:
     target = tmp_path / "ball.hyrf"
     target.write_bytes(b"kept")
-    told = refused("import", source, "-o", target, *QUICK_OPTIONS, "--device", "cuda:9", "--overwrite")
-    assert "device 'cuda:9' is not available" in told and "--device cpu" in told
+    messages = refused("import", source, "-o", target, *QUICK_OPTIONS, "--device", "cuda:9", "--overwrite")
+    assert "device 'cuda:9' is not available" in messages and "--device cpu" in messages
     assert target.read_bytes() == b"kept"
 
 

@@ -39,9 +39,9 @@ def data_in_another_frame(data, tmp_path) -> Path:
 
 def test_evaluate_notes_poses_in_another_frame_and_scores(model, data, data_in_another_frame):
     assert MISMATCH_NOTE not in succeeded("evaluate", model, "--data", data).stderr
-    told = succeeded("evaluate", model, "--data", data_in_another_frame, "--json")
-    assert told.stderr.count(MISMATCH_NOTE) == 1
-    assert json.loads(told.stdout)["psnr"] > 0
+    messages = succeeded("evaluate", model, "--data", data_in_another_frame, "--json")
+    assert messages.stderr.count(MISMATCH_NOTE) == 1
+    assert json.loads(messages.stdout)["psnr"] > 0
 
 
 def test_render_notes_poses_in_another_frame_and_renders(model, data, data_in_another_frame, tmp_path):

@@ -197,7 +197,7 @@ def test_an_existing_file_is_rejected_with_one_error(model, logs):
 
 @needs_ranks
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "messages"),
     [
         (("train", "nowhere", "-o", "run"), "nowhere"),
         (("train", "data", "-o", "run", "--resume"), "there is no checkpoint to resume"),
@@ -210,10 +210,10 @@ def test_an_existing_file_is_rejected_with_one_error(model, logs):
     ],
     ids=lambda words: " ".join(words) if isinstance(words, tuple) else "",
 )
-def test_mistakes_of_the_user_are_reported_once(words, told, data, tmp_path):
+def test_mistakes_of_the_user_are_reported_once(words, messages, data, tmp_path):
     named = [data if word == "data" else tmp_path / word if word in FILE_NAMES else word for word in words]
     end = check_rank_0_speaks(run_command_on_ranks(*named, folder=tmp_path / "logs"), 2)
-    assert told in end.error_line and end.output == ""
+    assert messages in end.error_line and end.output == ""
     assert [path.name for path in tmp_path.iterdir()] == ["logs"]
 
 
@@ -373,10 +373,10 @@ def test_a_run_that_has_lost_a_process_reports_it_and_can_be_resumed(data, unint
         2,
     )
     output, errors = run_and_kill_rank_1(*words, folder=tmp_path, code=2)
-    told, who = [line for line in errors.splitlines() if line.startswith("Error: ")]
-    assert "one of the 2 processes has ended" in told and "the same command with --resume continues" in told
+    messages, who = [line for line in errors.splitlines() if line.startswith("Error: ")]
+    assert "one of the 2 processes has ended" in messages and "the same command with --resume continues" in messages
     assert "process 1 of 2 was ended by SIGKILL" in who
-    assert json.loads(output)["error"] == told.removeprefix("Error: ") and "Traceback" not in errors
+    assert json.loads(output)["error"] == messages.removeprefix("Error: ") and "Traceback" not in errors
     assert [path.name for path in (tmp_path / "run").iterdir()] == ["checkpoint.pt"]
 
     check_rank_0_speaks(run_command_on_ranks(*words[2:-2], "--resume", folder=logs))

@@ -54,8 +54,8 @@ def test_every_command_accepts_a_run_folder_as_a_model(name, run, data, tmp_path
 @pytest.mark.parametrize("name", [*COMMANDS_THAT_READ_MODELS, "view", "bench"])
 def test_every_command_reports_an_unfinished_run(name, unfinished, data, tmp_path):
     words = COMMANDS_THAT_READ_MODELS.get(name) or (name, "{run}", *(("--no-browser",) if name == "view" else ()))
-    told = refused(*fill_paths(words, unfinished, data, tmp_path / "out"))
-    assert "the run has not finished (step 120 of 3,000); finish it" in told and "--resume" in told
+    messages = refused(*fill_paths(words, unfinished, data, tmp_path / "out"))
+    assert "the run has not finished (step 120 of 3,000); finish it" in messages and "--resume" in messages
     assert not (tmp_path / "out").exists()
 
 

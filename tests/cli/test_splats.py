@@ -100,14 +100,14 @@ def test_an_exported_file_has_the_score_that_the_export_printed(data, tmp_path):
     kept = {"cameras": provenance_cameras(cameras), "viewpoint": Viewpoint.from_cameras(cameras).to_json()}
     save_model(small_model(positions, fields=2.0, background=True), tmp_path / "model.hyrf", provenance=kept)
     export = ("export", tmp_path / "model.hyrf", "-o", tmp_path / "a.ply", "--data", data, "--sh-degree", 1, "--json")
-    told = json.loads(succeeded(*export).stdout)
+    messages = json.loads(succeeded(*export).stdout)
     scored = {
         name: json.loads(succeeded("evaluate", tmp_path / name, "--data", data, "--json").stdout)
         for name in ("a.ply", "model.hyrf")
     }
-    assert scored["a.ply"]["psnr"] == pytest.approx(told["photos_file"], abs=0.01)
-    assert scored["model.hyrf"]["psnr"] == pytest.approx(told["photos_model"], abs=0.01)
-    assert scored["a.ply"]["gaussians"] == told["gaussians"]
+    assert scored["a.ply"]["psnr"] == pytest.approx(messages["photos_file"], abs=0.01)
+    assert scored["model.hyrf"]["psnr"] == pytest.approx(messages["photos_model"], abs=0.01)
+    assert scored["a.ply"]["gaussians"] == messages["gaussians"]
     assert scored["a.ply"]["bytes"] == (tmp_path / "a.ply").stat().st_size
 
 
@@ -119,15 +119,15 @@ def test_evaluate_writes_pictures_of_splats_too(files, data, tmp_path):
 @pytest.mark.parametrize("command", ["render", "evaluate"])
 def test_part_of_a_splats_file_is_rejected(command, files, data, tmp_path):
     output = ("-o", tmp_path / "out") if command == "render" else ()
-    told = refused(command, files[".ply"], "--data", data, "--allow-partial", *output)
-    assert "splats are read whole; leave out --allow-partial" in told
+    messages = refused(command, files[".ply"], "--data", data, "--allow-partial", *output)
+    assert "splats are read whole; leave out --allow-partial" in messages
 
 
 @pytest.mark.parametrize("arguments", [("compress", "{}", "-o", "x.hyrf"), ("decompress", "{}", "-o", "x.hyrf")])
 def test_commands_for_models_reject_splats_and_name_the_import(arguments, files, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    told = refused(*(word.format(files[".ply"]) for word in arguments))
-    assert f"import it first: 'hyrfpack import {files['.ply']} -o ball.hyrf'" in told
+    messages = refused(*(word.format(files[".ply"]) for word in arguments))
+    assert f"import it first: 'hyrfpack import {files['.ply']} -o ball.hyrf'" in messages
 
 
 def test_export_of_splats_names_convert_or_import(files, tmp_path):

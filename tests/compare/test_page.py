@@ -57,13 +57,13 @@ def test_pictures_can_be_chosen_split_by_keys_and_pointer_and_subtracted(page: P
     with chromium.Chromium(tmp_path / "profile") as browser:
         browser.resize(900, 700)
         browser.open(page.as_uri())
-        told = "document.getElementById('difference-name').textContent"
-        wait_until(browser, f"{told}.includes('10.00 levels')")
-        assert "brightest 51 of 255" in browser.evaluate(told)
+        messages = "document.getElementById('difference-name').textContent"
+        wait_until(browser, f"{messages}.includes('10.00 levels')")
+        assert "brightest 51 of 255" in browser.evaluate(messages)
         assert browser.evaluate("document.getElementById('over').alt") == "one.png, photo"
 
         browser.evaluate("right.value = 2, right.dispatchEvent(new Event('change'))")
-        wait_until(browser, f"{told}.includes('60.00 levels')")
+        wait_until(browser, f"{messages}.includes('60.00 levels')")
         assert browser.evaluate("document.getElementById('right-name').textContent") == f"right: {RUN_NAMES[1]}"
         brightest = "[...difference.getContext('2d').getImageData(5, 5, 1, 1).data]"
         assert browser.evaluate(brightest) == [252, 255, 164, 255]  # the last colour of the inferno colour map
@@ -77,7 +77,7 @@ def test_pictures_can_be_chosen_split_by_keys_and_pointer_and_subtracted(page: P
         assert float(browser.evaluate("cut.value")) == pytest.approx(25, abs=1)
 
         browser.evaluate("view.value = 1, view.dispatchEvent(new Event('change'))")
-        wait_until(browser, f"{told}.includes('is 0.00 levels')")
+        wait_until(browser, f"{messages}.includes('is 0.00 levels')")
         assert browser.list_errors() == []
 
 

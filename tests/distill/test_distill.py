@@ -199,8 +199,8 @@ def test_a_psnr_below_the_target_is_reported(tmp_path: Path) -> None:
 
 
 def test_a_target_missed_only_by_packing_advises_psnr_and_not_steps() -> None:
-    told = fit._shortfall(36.5, 38.6, DistillConfig(psnr=37), viewpoints_are_sampled=True)
-    assert "reached 36.5" in told and told.endswith("with `psnr`") and "steps" not in told
+    messages = fit._shortfall(36.5, 38.6, DistillConfig(psnr=37), viewpoints_are_sampled=True)
+    assert "reached 36.5" in messages and messages.endswith("with `psnr`") and "steps" not in messages
     assert "cameras" not in fit._shortfall(36.5, 36.6, DistillConfig(psnr=37), viewpoints_are_sampled=False)
     assert not fit._falls_short(36.96, 37) and fit._falls_short(36.94, 37)
 

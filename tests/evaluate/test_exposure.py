@@ -108,9 +108,9 @@ def test_psnr_uses_renders_as_photographed_and_psnr_consistent_those_at_one_expo
         image = render_view(plain_model, view.camera).rgb.detach()
         gains = model_with_map.exposure.predict_gains(plain_model.config.frame.local_pose(view.camera))
         assert np.abs(np.log(gains)).max() > 0.1
-        for told, drawn in ((score.psnr, gains), (score.psnr_consistent, np.ones(3))):
+        for messages, drawn in ((score.psnr, gains), (score.psnr_consistent, np.ones(3))):
             expected = -10 * np.log10(np.mean((expose_by_formula(image, drawn) - photo) ** 2))
-            assert told == pytest.approx(expected, abs=0.01)
+            assert messages == pytest.approx(expected, abs=0.01)
     for name in ("psnr", "psnr_consistent", "psnr_corrected", "ssim"):
         assert getattr(scores, name) == pytest.approx(np.mean([getattr(score, name) for score in scores.views]))
 

@@ -45,29 +45,31 @@ def copy_work(finished_work: Path, tmp_path: Path) -> Path:
 def test_pilot_runs_do_not_count_in_the_forecast_of_training(monkeypatch):
     clock = [0.0]
     monkeypatch.setattr("hyrfpack.make.progress.monotonic", lambda: clock[0])
-    told: list[Progress] = []
-    reporter = Reporter(["training"], told.append)
+    messages: list[Progress] = []
+    reporter = Reporter(["training"], messages.append)
     reporter.estimates |= {"pilots": 10.0, "training": 30.0, "results": 0.0}
     reporter.begin("training")
     shown = stages._TrainingProgress(reporter, 1000, 480)
     for step in [0] * 240 + list(range(1, 301)):
         clock[0] += 0.1
         shown.step(step, 0.1, 0.01, 500)
-    assert told[240].words == ("pilot runs",)
-    assert told[240].share == pytest.approx(0.125)  # half of the pilots, which are a quarter of all steps
-    assert told[-1].share == pytest.approx((10 + 0.3 * 30) / 40) and told[-1].left == pytest.approx(70.0, rel=0.02)
+    assert messages[240].words == ("pilot runs",)
+    assert messages[240].share == pytest.approx(0.125)  # half of the pilots, which are a quarter of all steps
+    assert messages[-1].share == pytest.approx((10 + 0.3 * 30) / 40) and messages[-1].left == pytest.approx(
+        70.0, rel=0.02
+    )
 
 
 def test_scoring_after_the_last_step_is_part_of_the_training_progress():
-    told: list[Progress] = []
-    reporter = Reporter(["training"], told.append)
+    messages: list[Progress] = []
+    reporter = Reporter(["training"], messages.append)
     reporter.estimates |= {"pilots": 0.0, "training": 30.0, "results": 10.0}
     reporter.begin("training")
     shown = stages._TrainingProgress(reporter, 1, 0)
     shown.step(1, 0.1, 0.01, 500)
-    assert told[-1].share == 0.75 and told[-1].left > 0
+    assert messages[-1].share == 0.75 and messages[-1].left > 0
     shown.phase("scoring held-out photos", 1, 2)
-    assert told[-1].share == 0.875 and told[-1].words == ("scoring held-out photos", "1/2")
+    assert messages[-1].share == 0.875 and messages[-1].words == ("scoring held-out photos", "1/2")
 
 
 # -- inputs and outputs ----------------------------------------------------------------------------------------------

@@ -278,7 +278,7 @@ def test_copies_of_coarse_levels_have_no_more_rows_than_there_are_points() -> No
 
     copies = {points: plan_gradient_copies(points, resolutions, 15, device) for points in (1, 600, 5000, 70_000, 10**6)}
 
-    counts = {points: told.layout[:, 1].tolist() for points, told in copies.items()}
+    counts = {points: messages.layout[:, 1].tolist() for points, messages in copies.items()}
     assert counts == {
         1: [1, 1, 1, 1],
         600: [1, 1, 1, 1],
@@ -286,17 +286,17 @@ def test_copies_of_coarse_levels_have_no_more_rows_than_there_are_points() -> No
         70_000: [32, 16, 2, 1],  # a level with 64^3 vertices has more rows
         10**6: [32, 32, 16, 16],
     }
-    for points, told in copies.items():
-        rows, count, first = told.layout.T
+    for points, messages in copies.items():
+        rows, count, first = messages.layout.T
         assert rows.tolist() == [512, 4096, 32768, 32768]
         assert (rows * count <= max(points, 1))[count > 1].all()
-        assert (told.copied_levels, told.max_copied_rows) == (
+        assert (messages.copied_levels, messages.max_copied_rows) == (
             int((count > 1).sum()),
             max(rows[count > 1].tolist(), default=0),
         )
         # The copies lie one after the other behind the table.
         assert first.tolist() == (offsets[-1] + torch.cumsum(rows * (count - 1), 0) - rows * (count - 1)).tolist()
-        assert told.total_rows == offsets[-1] + int((rows * (count - 1)).sum())
+        assert messages.total_rows == offsets[-1] + int((rows * (count - 1)).sum())
 
 
 @needs_triton

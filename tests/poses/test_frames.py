@@ -303,13 +303,13 @@ def test_frames_keep_their_times_so_that_messages_can_name_them(wall, tmp_path):
 
 
 def test_every_stage_of_a_video_reports_progress(wall, tmp_path):
-    told: list[tuple[str, float]] = []
+    messages: list[tuple[str, float]] = []
     video = write_video(tmp_path / "clip.mp4", [crop_wall(wall, 4 * number) for number in range(60)])
-    choose_frames(video, tmp_path / "frames", report=lambda *now: told.append(now))
-    shares = [share for _, share in told]
+    choose_frames(video, tmp_path / "frames", report=lambda *now: messages.append(now))
+    shares = [share for _, share in messages]
     assert shares == sorted(shares) and shares[-1] == 1
     for words in ("measuring frame 60, 2 s of 2 s", "measuring the camera motion, frame 59/60", "writing frames "):
-        assert any(words in doing for doing, _ in told), words
+        assert any(words in doing for doing, _ in messages), words
 
 
 def test_an_omitted_frame_is_named_with_its_time(wall, tmp_path):

@@ -67,10 +67,10 @@ def test_rows_are_counted_while_another_connection_writes(tmp_path):
 
 def test_rows_that_a_long_call_writes_are_reported_while_it_runs(tmp_path, monkeypatch):
     monkeypatch.setattr(watch, "POLL_INTERVAL_SECONDS", 0.01)
-    job, told, seen = job_with_pairs(tmp_path, 5), [], threading.Event()
+    job, messages, seen = job_with_pairs(tmp_path, 5), [], threading.Event()
 
     def tell(count: int) -> None:
-        told.append(count)
+        messages.append(count)
         if count == 2:
             seen.set()
 
@@ -80,7 +80,7 @@ def test_rows_that_a_long_call_writes_are_reported_while_it_runs(tmp_path, monke
         writer.commit()
         writer.close()
         assert seen.wait(60)
-    assert told == sorted(told) and told[-1] == 2
+    assert messages == sorted(messages) and messages[-1] == 2
 
 
 def test_a_failing_progress_reader_does_not_end_the_watched_call(monkeypatch):
@@ -103,11 +103,11 @@ def test_progress_of_a_silent_stage_is_repeated(tmp_path, monkeypatch):
         "print(json.dumps({'answer': {'found': 1}}), flush=True)"
     )
     worker = subprocess.Popen([sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-    told: list[tuple[str, float]] = []
+    messages: list[tuple[str, float]] = []
 
     def tell(doing: str, share: float) -> None:
-        told.append((doing, share))
-        if told.count(("solving", 0.5)) == 3:
+        messages.append((doing, share))
+        if messages.count(("solving", 0.5)) == 3:
             assert worker.stdin is not None
             worker.stdin.write("x")
             worker.stdin.flush()
@@ -115,7 +115,7 @@ def test_progress_of_a_silent_stage_is_repeated(tmp_path, monkeypatch):
     answer = process._read_answer(worker, tell, "starting")
     process._terminate(worker)
     assert answer == {"found": 1}
-    assert told[0] == ("starting", 0.0) and told.count(("solving", 0.5)) >= 3
+    assert messages[0] == ("starting", 0.0) and messages.count(("solving", 0.5)) >= 3
 
 
 def test_every_stage_reports_progress_in_its_own_units(estimated_scene):
@@ -140,10 +140,10 @@ def test_every_stage_reports_progress_in_its_own_units(estimated_scene):
 def test_progress_reported_out_of_order_never_decreases(share, tmp_path):
     from hyrfpack.poses.estimate import _PoseEstimation
 
-    told: list[float] = []
+    messages: list[float] = []
     estimation = _PoseEstimation(
-        tmp_path, tmp_path / "scene", "auto", None, 0, False, lambda _, done: told.append(done), None
+        tmp_path, tmp_path / "scene", "auto", None, 0, False, lambda _, done: messages.append(done), None
     )
     estimation._report_progress("matches", "matching", 0.9)
     estimation._report_progress("matches", "matching", share)
-    assert told[0] == told[1]
+    assert messages[0] == messages[1]

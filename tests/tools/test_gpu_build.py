@@ -27,15 +27,17 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list]:
 
     The workers of one test run share it, because each build takes a minute.
     """
-    told = tmp_path_factory.getbasetemp().parent / f"gpu_build-{os.environ.get('PYTEST_XDIST_TESTRUNUID', os.getpid())}"
-    with FileLock(f"{told}.lock"):
-        if not told.exists():
+    record = (
+        tmp_path_factory.getbasetemp().parent / f"gpu_build-{os.environ.get('PYTEST_XDIST_TESTRUNUID', os.getpid())}"
+    )
+    with FileLock(f"{record}.lock"):
+        if not record.exists():
             environment = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}
             command = [sys.executable, "-m", "tools.gpu.build", "--json"]
             done = subprocess.run(command, cwd=REPOSITORY_ROOT, env=environment, capture_output=True, text=True)
             assert done.returncode == 0, done.stderr
-            told.write_text(done.stdout.splitlines()[-1])
-    return json.loads(told.read_text())
+            record.write_text(done.stdout.splitlines()[-1])
+    return json.loads(record.read_text())
 
 
 def builds_for(report: dict[str, list], target: str) -> list[dict]:
@@ -56,12 +58,12 @@ def test_every_kernel_builds(report: dict[str, list], target: str) -> None:
 @pytest.mark.parametrize("target", GPU_TARGETS)
 def test_no_kernel_spills_registers(report: dict[str, list], target: str) -> None:
     spilling = [build for build in builds_for(report, target) if build["spills"]]
-    told = [f"{build['kernel']}: {build['spills']} ({build['constants']})" for build in spilling]
-    if told and not version("triton").startswith(TRITON_VERSIONS_WITHOUT_SPILLS):
+    messages = [f"{build['kernel']}: {build['spills']} ({build['constants']})" for build in spilling]
+    if messages and not version("triton").startswith(TRITON_VERSIONS_WITHOUT_SPILLS):
         pytest.xfail(
-            f"Triton {version('triton')} takes more registers than those the kernels were laid out for: {told}"
+            f"Triton {version('triton')} takes more registers than those the kernels were laid out for: {messages}"
         )
-    assert told == []
+    assert messages == []
 
 
 def test_every_kernel_is_built(report: dict[str, list]) -> None:

@@ -87,13 +87,13 @@ ERROR_VALUES = st.floats(0, 10, width=32)
 )
 def test_step_statistics_are_means_over_views_and_flags_of_any_rank(rows):
     """An error of None belongs to a photo that is masked completely."""
-    told = [
+    messages = [
         pack_step_stats(
             torch.tensor(loss), torch.tensor(math.nan if error is None else error), stop=stop, problem=problem
         )
         for loss, error, stop, problem in rows
     ]
-    found = StepStats.from_sums(torch.stack(told).sum(0).tolist(), len(rows))
+    found = StepStats.from_sums(torch.stack(messages).sum(0).tolist(), len(rows))
     errors = [error for _, error, _, _ in rows if error is not None]
     assert found.loss == pytest.approx(np.mean([row[0] for row in rows]), rel=1e-5, abs=1e-30)
     assert found.error == pytest.approx(np.mean(errors) if errors else math.nan, rel=1e-5, abs=1e-30, nan_ok=True)
@@ -101,10 +101,10 @@ def test_step_statistics_are_means_over_views_and_flags_of_any_rank(rows):
 
 
 def test_a_loss_that_is_not_finite_stays_so_in_the_step_statistics():
-    told = torch.stack(
+    messages = torch.stack(
         [pack_step_stats(torch.tensor(loss), torch.tensor(1.0), stop=False, problem=False) for loss in (1, math.nan)]
     )
-    assert math.isnan(StepStats.from_sums(told.sum(0).tolist(), 2).loss)
+    assert math.isnan(StepStats.from_sums(messages.sum(0).tolist(), 2).loss)
 
 
 def test_one_process_keeps_its_gradients_and_its_settings():

@@ -134,20 +134,22 @@ def test_validation_photos_are_not_trained_on_and_lie_between_training_photos(vi
 
 @pytest.mark.usefixtures("short_pilots")
 def test_pilots_are_deterministic_and_report_each_step():
-    told: list[tuple] = []
-    first = measure_scene_budget(make_scene(), report=lambda *facts: told.append(facts))
+    messages: list[tuple] = []
+    first = measure_scene_budget(make_scene(), report=lambda *facts: messages.append(facts))
     assert first == measure_scene_budget(make_scene())
     assert first is not None and first[0] in BUDGET_FACTORS
-    assert [step for step, *_ in told] in (list(range(1, 13)), list(range(1, 25)))
-    assert all(np.isfinite(loss) and mse > 0 and gaussians > 0 for _, loss, mse, gaussians in told)
+    assert [step for step, *_ in messages] in (list(range(1, 13)), list(range(1, 25)))
+    assert all(np.isfinite(loss) and mse > 0 and gaussians > 0 for _, loss, mse, gaussians in messages)
 
 
 @pytest.mark.usefixtures("short_pilots")
 def test_pilots_stop_when_requested():
-    told: list[int] = []
+    messages: list[int] = []
     with pytest.raises(PilotsStopped):
-        measure_scene_budget(make_scene(), report=lambda step, *_: told.append(step), stop=lambda: len(told) >= 8)
-    assert told[-1] == 8
+        measure_scene_budget(
+            make_scene(), report=lambda step, *_: messages.append(step), stop=lambda: len(messages) >= 8
+        )
+    assert messages[-1] == 8
 
 
 @pytest.mark.usefixtures("short_pilots")
@@ -232,12 +234,12 @@ def test_pilots_are_reported_as_step_0(tmp_path):
 
 @pytest.mark.usefixtures("short_pilots")
 def test_pilot_runs_report_each_step_and_each_scored_view():
-    told: list[tuple[str, int, int]] = []
-    measure_scene_budget(make_scene(), phase=lambda *progress: told.append(progress))
-    assert [row for row in told if row[0] == "budget pilot run 1/2: training"] == [
+    messages: list[tuple[str, int, int]] = []
+    measure_scene_budget(make_scene(), phase=lambda *progress: messages.append(progress))
+    assert [row for row in messages if row[0] == "budget pilot run 1/2: training"] == [
         ("budget pilot run 1/2: training", step, 6) for step in range(1, 7)
     ]
-    assert [row for row in told if row[0] == "budget pilot run 2/2: scoring"] == [
+    assert [row for row in messages if row[0] == "budget pilot run 2/2: scoring"] == [
         ("budget pilot run 2/2: scoring", done, 2) for done in range(3)
     ]
 

@@ -229,8 +229,8 @@ def test_compiling_in_the_first_steps_does_not_count_as_slowness(capsys, monkeyp
 
 def test_more_than_an_hour_is_reported_once_with_what_would_shorten_it(capsys, monkeypatch):
     report_steps(Clock(monkeypatch), steps=3000, seconds=12.0, count=40, advice="fewer --steps")
-    told = [line for line in capsys.readouterr().err.splitlines() if "hours" in line]
-    assert told == ["about 10.0 hours remain; to shorten the run, use fewer --steps"]
+    messages = [line for line in capsys.readouterr().err.splitlines() if "hours" in line]
+    assert messages == ["about 10.0 hours remain; to shorten the run, use fewer --steps"]
 
 
 @pytest.mark.parametrize(

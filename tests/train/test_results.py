@@ -105,8 +105,8 @@ def test_pictures_that_do_not_fit_do_not_fail_the_run(
     result = train_model(make_scene(), tmp_path, SHORT_CONFIG)
     assert result.complete and read_metrics(tmp_path) == json.loads(json.dumps(result.metrics))
     verb = "is" if ending == "curve.png" else "are"
-    told = capsys.readouterr().err
-    assert f"the model is finished, but {missing} {verb} missing" in told
+    messages = capsys.readouterr().err
+    assert f"the model is finished, but {missing} {verb} missing" in messages
 
     full_disk_suffixes.clear()
     fail_if_trained()
@@ -228,9 +228,9 @@ def test_the_log_of_a_completed_run_ends_with_its_scores(full_disk_suffixes, tmp
 
 
 def test_phases_before_and_after_the_steps_report_their_progress(tmp_path):
-    told: list[tuple[str, int, int]] = []
-    train_model(make_scene(), tmp_path, SHORT_CONFIG, quiet=True, phase=lambda *progress: told.append(progress))
-    assert list(dict.fromkeys(what for what, _, _ in told)) == [
+    messages: list[tuple[str, int, int]] = []
+    train_model(make_scene(), tmp_path, SHORT_CONFIG, quiet=True, phase=lambda *progress: messages.append(progress))
+    assert list(dict.fromkeys(what for what, _, _ in messages)) == [
         "reading held-out photos",
         "reading photos",
         "reading photos and setting up the model",
@@ -239,7 +239,7 @@ def test_phases_before_and_after_the_steps_report_their_progress(tmp_path):
         "scoring held-out photos",
         "drawing curve.png",
     ]
-    assert [row for row in told if row[0].startswith("scoring")] == [
+    assert [row for row in messages if row[0].startswith("scoring")] == [
         ("scoring held-out photos", done, 2) for done in range(3)
     ]
-    assert all(0 <= done <= total for _, done, total in told)
+    assert all(0 <= done <= total for _, done, total in messages)

@@ -14,7 +14,7 @@ A header of 16 bytes comes first: "NGSP", version, count (all uint32), degree, f
 each). Up to version 3, header and sections are one gzip stream.
 
 Version 4 is not compressed as a whole. Its header of 32 bytes starts with the same 16 bytes, whose last is the number
-of streams, and goes on with the offset of the table of contents (uint32) and 12 zero bytes. Then come optional
+of streams, and continues with the offset of the table of contents (uint32) and 12 zero bytes. Then come optional
 extensions, and the table of contents with the stored and the raw length of each stream (uint64 each). Then each section
 that is not empty follows as a zstd stream.
 
