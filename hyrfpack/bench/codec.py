@@ -69,8 +69,8 @@ def codec_rows(subject: Subject, repeats: int, note: Callable[[str], None]) -> I
     """
     if subject.profile != REFERENCE_PROFILE:
         note(
-            f"{subject.name} is of profile '{subject.profile}': its numbers are quantised already, so coding them "
-            "again loses less than coding the trained model"
+            f"{subject.name} has profile '{subject.profile}', so its numbers are quantised already; encoding them "
+            "again loses less than encoding the trained model"
         )
     cases: list[EncodingCase] = []
     for profile in PROFILES:
@@ -167,8 +167,8 @@ def _compact_encoder(subject: Subject, note: Callable[[str], None]) -> tuple[Cal
     with torch.enable_grad():
         sensitivity = measure_sensitivity(subject.model, subject.capture)
     note(
-        f"before profile 'compact' encodes, measuring what each number does to pictures took "
-        f"{perf_counter() - start:.1f} s; that is the same for all its settings and in none of the times"
+        f"measuring the sensitivities for profile 'compact' took {perf_counter() - start:.1f} s; all its settings "
+        "share them, and no time in the table includes this"
     )
 
     def encode(distortion: float = subject.distortion, prune: bool = True) -> bytes:

@@ -83,6 +83,6 @@ def _print_report(source: Path, report: ConversionReport) -> None:
     after = [Path(report.file).name, f"{report.gaussians_after:,}", str(report.degree_after), f"{report.bytes_after:,}"]
     click.echo(format_table(["file", "Gaussians", "SH degree", "bytes"], [before, after]))
     click.echo(
-        f"{report.views} views of the file against the same of {source.name}: PSNR {report.psnr:.2f} dB, the worst "
-        f"{report.psnr_worst:.2f}"
+        f"PSNR against renders of {source.name}, {report.views} views: mean {report.psnr:.2f} dB, worst "
+        f"{report.psnr_worst:.2f} dB"
     )

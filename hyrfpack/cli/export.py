@@ -241,7 +241,7 @@ def _splats_error(source: Path, output: Path, kind: FileKind) -> HyrfError:
 def _print_exposures(report: ExportReport) -> None:
     """Print a table of the PSNR of baked splats with local and with consistent exposure."""
     photos = report.photos_by_exposure
-    head = ["exposure of baked splats, not yet written", "PSNR (dB) as photographed"]
+    head = ["exposure of baked splats, before writing", "PSNR (dB), renders as photographed"]
     rows = [
         [f"{name}{' (in the file)' if name == report.exposure else ''}", f"{psnr:.2f}"]
         + ([f"{photos[name]:.2f}"] if photos else [])
@@ -253,19 +253,19 @@ def _print_exposures(report: ExportReport) -> None:
 def _print_report(report: ExportReport) -> None:
     if report.native:
         click.echo(
-            f"{report.file}: {report.bytes:,} bytes, {report.gaussians:,} Gaussians, as they are: nothing is baked"
+            f"{report.file}: {report.bytes:,} bytes, {report.gaussians:,} Gaussians, unchanged: nothing is baked"
         )
         return
     ending = Path(report.file).suffix
     if report.views:
         rows = [
-            [f"baked to harmonics of degree {report.degree}, not yet written", f"{report.psnr_baked:.2f}"],
+            [f"baked to harmonics of degree {report.degree}, before writing", f"{report.psnr_baked:.2f}"],
             [f"read back from the {ending} file", f"{report.psnr:.2f}"],
         ]
-        click.echo(format_table([f"against the model's own pictures, {report.views} views", "PSNR (dB)"], rows))
+        click.echo(format_table([f"against renders of the model, {report.views} views", "PSNR (dB)"], rows))
         click.echo(
-            f"the first row is what baking loses, the second what baking and the rounding of {ending} lose together; "
-            "neither compares with photos"
+            f"the first row shows the loss by baking, the second the loss by baking and by the rounding of {ending} "
+            "together; neither compares with photos"
         )
     if report.psnr_by_exposure:
         _print_exposures(report)
@@ -275,6 +275,5 @@ def _print_report(report: ExportReport) -> None:
     click.echo(f"{report.file}: {report.bytes:,} bytes{holds}{cameras}")
     if report.photos_model is not None:
         click.echo(
-            f"against held-out photos: PSNR {report.photos_model:.3f} dB of the model, {report.photos_file:.3f} dB of "
-            "the file"
+            f"PSNR against held-out photos: model {report.photos_model:.3f} dB, file {report.photos_file:.3f} dB"
         )

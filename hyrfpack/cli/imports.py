@@ -122,8 +122,8 @@ def import_(
     ]
     click.echo(format_table(["file", "Gaussians", "bytes", "smaller by"], rows))
     click.echo(
-        f"{report.views} held-out views: {report.psnr:.2f} dB against the original, the worst {report.psnr_worst:.2f}; "
-        f"{report.seconds:.0f} s"
+        f"PSNR against renders of {source.name}, {report.views} held-out views: mean {report.psnr:.2f} dB, worst "
+        f"{report.psnr_worst:.2f} dB; took {report.seconds:.0f} s"
     )
 
 

@@ -62,19 +62,19 @@ def comparability_warnings(runs: Sequence[Run], names: Sequence[str], changed: S
     without_scores = [name for run, name in zip(runs, names, strict=True) if not run.scores]
     if without_scores and len(without_scores) < len(runs):
         found.append(
-            f"No photo is held out of {_quoted(without_scores)}, so that only the curves and the sizes can be compared."
+            f"No photos were held out in {_quoted(without_scores)}, so only the curves and the sizes can be compared."
         )
     elif without_scores:
-        found.append("No photo is held out of these runs, so that only their curves and sizes are compared.")
+        found.append("No photos were held out in these runs, so only their curves and sizes are compared.")
     if changed:
         found.append(
-            f"Held-out photos are not the same pictures in all runs ({_quoted(changed[:1])} for one): another scene, "
-            "size or undistortion, or another colour behind transparent photos; the scores cannot be compared."
+            f"The held-out photos differ between the runs (such as {_quoted(changed[:1])}), so their scores cannot be "
+            "compared. The scene, the size, the undistortion or the colour behind transparent photos is different."
         )
     elif any(run.cameras != runs[0].cameras for run in runs):
         found.append(
-            "The runs were trained from different cameras: other photos, poses or sizes, or another scene; the curves "
-            "cannot be compared."
+            "The runs were trained from different cameras, so their curves cannot be compared. The photos, the poses, "
+            "the sizes or the scene are different."
         )
     return found
 

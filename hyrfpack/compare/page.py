@@ -74,7 +74,7 @@ def _tables(runs: Sequence[Run], names: Sequence[str], ranked: bool) -> list[str
     differing = {
         "Settings": settings_that_differ(runs),
         "Choices": choices_that_differ(runs),
-        "Notes": {"on reading the photos": notes} if len(set(notes)) > 1 else {},
+        "Notes": {"from reading the photos": notes} if len(set(notes)) > 1 else {},
     }
     tables = [_table("Numbers", names, numbers)]
     for kind, rows in differing.items():
@@ -129,7 +129,7 @@ def _curves(runs: Sequence[Run], names: Sequence[str]) -> str:
     """Return the figure as HTML, with one image for light and one for dark backgrounds."""
     svg = draw_curves(runs)
     light, dark = (_svg_data_uri(svg.replace(LIGHT_TEXT_COLOR, ink)) for ink in (LIGHT_TEXT_COLOR, DARK_TEXT_COLOR))
-    note = "Training PSNR over steps, training PSNR over seconds and Gaussians over steps, the table's runs as lines"
+    note = "Training PSNR over steps, training PSNR over seconds and Gaussians over steps, with a line for each run"
     return (
         f'<div class="wide"><picture><source media="(prefers-color-scheme: dark)" srcset="{dark}">'
         f'<img class="curves" src="{light}" alt="{note}"></picture></div>'
@@ -141,10 +141,13 @@ def _svg_data_uri(svg: str) -> str:
 
 
 def _curves_note(runs: Sequence[Run], names: Sequence[str]) -> str:
-    note = f"PSNR is that of the photos trained on, in running means of {2 * SMOOTHING_RADIUS_RECORDS + 1} records."
+    note = (
+        f"PSNR is measured on the training photos, as a running mean over {2 * SMOOTHING_RADIUS_RECORDS + 1} records."
+    )
     timeless = [name for run, name in zip(runs, names, strict=True) if not has_times(run)]
     if timeless:
-        note += f" No times of single steps were kept of {', '.join(timeless)}: the seconds are spread evenly there."
+        missing = ", ".join(timeless)
+        note += f" Times of single steps are missing for {missing}; the seconds are spread evenly over the steps there."
     return note
 
 

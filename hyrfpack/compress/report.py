@@ -116,7 +116,7 @@ def _write_report(
     """Do the work of `write_report` in a folder that this call has locked."""
     model, provenance = load_with_provenance(source)
     views, views_in_words = _views_to_score(model, source, scene)
-    say(f"comparing pictures with {views_in_words}, for the page")
+    say(f"comparing renders with {views_in_words} for the report")
     before = evaluate_model(model, views)
     facts, data = describe_file(packed), _read_bytes(packed)
     scored = [view for view in views if view.name not in before.skipped]
@@ -174,7 +174,7 @@ def _views_to_score(model: HybridModel, source: Path, scene: Scene | None) -> tu
             View(f"viewpoint {number}", camera, partial(Picture, np.asarray(picture)))
             for number, (camera, picture) in enumerate(zip(cameras, renders, strict=True), 1)
         ]
-        return views, f"what the uncompressed model shows from {len(views)} viewpoints"
+        return views, f"renders of the uncompressed model from {len(views)} viewpoints"
     views, kind = (scene.test, "held-out") if scene.test else (scene.train, "training")
     chosen = evenly_spaced(views, MAX_SCORED_PHOTOS)
     count = f"{len(chosen)}" if len(chosen) == len(views) else f"{len(chosen)} of {len(views)}"

@@ -142,13 +142,13 @@ def build_page(source: Path, packed: Path, report: CompressionReport, findings: 
         "body",
         _element("h1", title),
         *_summary(source, packed, report, findings),
-        _element("h2", "What each part takes"),
+        _element("h2", "Size of each part"),
         *_section_sizes(report),
         _element("h2", "Size, loss and speed"),
         *_alternatives(findings),
         _element("h2", "Before and after"),
         *_view_pictures(findings),
-        *([_element("h2", "How to make this file again"), _element("pre", command)] if command else []),
+        *([_element("h2", "Command that makes this file again"), _element("pre", command)] if command else []),
         _element("p", f"Written by {findings.writer}. Times were measured on this machine: {findings.machine}."),
     )
     document = _element("html", head, body, lang="en")
@@ -186,29 +186,30 @@ def _loss_in_words(findings: Findings) -> str:
 def _summary(source: Path, packed: Path, report: CompressionReport, findings: Findings) -> list[Element]:
     kept = f"{report.gaussians:,} Gaussians"
     if report.gaussians < findings.gaussians:
-        kept += f" out of {findings.gaussians:,} (pictures do not miss the others)"
+        kept += f" out of {findings.gaussians:,} (the others hardly affect renders and were pruned)"
     before, after = findings.before, findings.chosen.scores
     sentences = [
-        f"{packed} is a packed copy of {source}: a scene learnt from photos, which can be looked at from any side. "
-        f"It is {report.bytes_after:,} bytes long and holds {kept}; as plain 32-bit numbers they take "
+        f"{packed} is a compressed copy of {source}, a 3D scene that was reconstructed from photos. "
+        f"It has {report.bytes_after:,} bytes and holds {kept}. As uncompressed 32-bit numbers, its parameters take "
         f"{report.bytes_before:,} bytes. Profile: {report.profile}.",
     ]
     if findings.has_photos:
         sentences.append(
-            f"Its pictures were compared with {findings.views}: PSNR {before.psnr:.3f} dB before and {after.psnr:.3f} "
-            f"dB after compression, SSIM {before.ssim:.4f} before and {after.ssim:.4f} after. PSNR says how near "
-            "pictures are to the photos, and so does SSIM, up to 1; more is nearer. A tenth of a dB is rarely seen."
+            f"Its renders were compared with {findings.views}: PSNR {before.psnr:.3f} dB before and {after.psnr:.3f} "
+            f"dB after compression, SSIM {before.ssim:.4f} before and {after.ssim:.4f} after. PSNR and SSIM measure "
+            "how similar renders are to the photos. Higher is better; the maximum of SSIM is 1. A difference of 0.1 dB "
+            "is rarely visible."
         )
     elif findings.is_exact(after):
-        sentences.append(f"Its pictures were compared with {findings.views}: they are the same in every pixel.")
+        sentences.append(f"Its renders were compared with {findings.views}: they are identical in every pixel.")
     else:
         sentences.append(
-            f"Its pictures were compared with {findings.views}: PSNR {after.psnr:.2f} dB, SSIM {after.ssim:.4f}. PSNR "
-            "says how near pictures are, and so does SSIM, up to 1; more is nearer. From 40 dB on differences are hard "
-            "to see. A report made with photos of the scene tells what was lost against them."
+            f"Its renders were compared with {findings.views}: PSNR {after.psnr:.2f} dB, SSIM {after.ssim:.4f}. PSNR "
+            "and SSIM measure how similar renders are. Higher is better; the maximum of SSIM is 1. From 40 dB on, "
+            "differences are hard to see. A report made with photos of the scene also measures the loss against them."
         )
     if report.found:
-        sentences.append(f"The search came to this: {report.found}.")
+        sentences.append(f"Result of the search: {report.found}.")
     return [_element("p", sentence) for sentence in sentences]
 
 
@@ -220,7 +221,7 @@ def _section_sizes(report: CompressionReport) -> list[Element]:
         size = sizes.setdefault(group_and_layer(part.type)[0], [0, 0])
         size[0] += part.before
         size[1] += part.after
-    header = ["part", "bytes before", "bytes after", "share of the file", "bits a number"]
+    header = ["part", "bytes before", "bytes after", "share of the file", "bits per number"]
     rows, total = [], report.bytes_after
     for tag, (before, after) in sizes.items():
         numbers = 0 if tag in NON_PARAMETER_SECTIONS else before // 4
@@ -234,13 +235,13 @@ def _section_sizes(report: CompressionReport) -> list[Element]:
     rows.append(["header, table of contents, padding", "", f"{rest:,}", f"{rest / total:.1%}", "", ""])
     rows.append(["the whole file", f"{report.bytes_before:,}", f"{total:,}", "100.0%", "", ""])
     note = (
-        "Positions and logits belong to the Gaussians, soft blobs of colour. Hash tables and decoders are two small "
-        "neural networks that add to each Gaussian's colour, size and opacity and turn it. Bytes before are those of "
-        "plain 32-bit numbers, the metadata not counted in the sum."
+        "Positions and logits belong to the Gaussians, which are soft blobs of colour. Hash tables and decoders form "
+        "two small neural networks, which adjust each Gaussian's colour, size, opacity and rotation. Bytes before are "
+        "those of uncompressed 32-bit numbers; their sum leaves out the metadata."
     )
     if report.shares:
         header.append("share of the loss")
-        note += " The share of the loss is an estimate: how much of what changed in pictures is due to this part."
+        note += " The share of the loss estimates how much of the change in renders each part causes."
     return [_table(header, [row[: len(header)] for row in rows]), _element("p", note)]
 
 
@@ -258,10 +259,10 @@ def _alternatives(findings: Findings) -> list[Element]:
         for point in findings.points
     ]
     caption = (
-        "Other files that the same model could be. The line joins those of profile compact at its defaults, without "
-        "fine-tuning, that allow pictures more or less distortion; paper is the recipe of the HyRF paper, raw stores "
-        "every number exactly. Below: how long each takes to decode. For another file on the line compress "
-        "the model again with its size as the target size."
+        "Other files that the same model can be compressed to. The line joins files of profile compact at several "
+        "distortions, with default settings and without fine-tuning. Profile paper is the method of the HyRF paper; "
+        "profile raw stores every number exactly. The plot below shows the time to decode each file. To get another "
+        "file on the line, compress the model again with its size as the target size."
     )
     return [
         _element(
@@ -280,7 +281,7 @@ def _alternatives(findings: Findings) -> list[Element]:
 
 
 def _view_pictures(findings: Findings) -> list[Element]:
-    labels = ("before", "after", f"difference, {findings.amplified} times as strong")
+    labels = ("before", "after", f"difference, amplified {findings.amplified} times")
     figures = []
     for view in findings.shown:
         caption = f"{view.name}: {view.between:.1f} dB between before and after"
@@ -296,9 +297,9 @@ def _view_pictures(findings: Findings) -> list[Element]:
             _element("figure", _element("div", *pictures, **{"class": "views"}), _element("figcaption", caption))
         )
     intro = (
-        "Rendered by the model before compression, and from the file after it. The third picture shows how far the two "
-        f"are apart in each colour, {findings.amplified} times as strong as it is: black is no difference. The view "
-        "that loses most comes first, the one that loses least last. Each picture is linked in its full size."
+        "Renders of the model before compression and of the compressed file. The third picture is the absolute "
+        f"difference in each colour channel, amplified {findings.amplified} times; black means no difference. The "
+        "views are sorted from the largest loss to the smallest. Select a picture to see it in full size."
     )
     return [_element("p", intro), *figures]
 

@@ -112,7 +112,7 @@ def _read(given: Path, top: Path, notes: list[str], reading: dict[str, Any], hel
     every = reading["test_every"] if held_out is None else 0
     scene = reader.read(folder, test_every=every, max_size=reading["max_size"], **wanted)
     if len(found) > 1:
-        notes.append(f"poses are there as {' and '.join(found)}; {chosen} was taken")
+        notes.append(f"there are poses in several layouts ({' and '.join(found)}); {chosen} is used")
     scene.notes[:0] = notes
     files = (*scene.files, str(given)) if is_archive(given) else scene.files
     reading = {**reading, "layout": chosen}
@@ -159,7 +159,7 @@ def _find_set(folder: Path, layout: str | None, notes: list[str]) -> tuple[Path,
 
     inside = None if holds(folder) else find_set(folder, holds)
     if inside is not None:
-        notes.append(f"the set in {inside.relative_to(folder)} was taken")
+        notes.append(f"the set in {inside.relative_to(folder)} is used")
     return inside or folder, _layouts_in(inside or folder)
 
 

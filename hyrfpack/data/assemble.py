@@ -193,8 +193,8 @@ def missing_photos_notes(
     if not missing:
         return []
     return [
-        f"{len(missing)} of {len(missing) + len(photos)} photos listed in {where} are not on disk and were skipped, "
-        f"{min(missing)} first"
+        f"{len(missing)} of {len(missing) + len(photos)} photos listed in {where} are not on disk and were skipped "
+        f"(such as {min(missing)})"
     ]
 
 
@@ -220,8 +220,8 @@ def _shared_pose_notes(views: list[View]) -> list[str]:
     if not shared:
         return []
     return [
-        f"{sum(map(len, shared))} photos have the very pose of another, {shared[0][0]} that of {shared[0][1]} for one; "
-        "if they were not taken from one place, the poses are wrong"
+        f"{sum(map(len, shared))} photos have exactly the same pose as another (such as {shared[0][0]} and "
+        f"{shared[0][1]}); unless they were taken from one place, the poses are wrong"
     ]
 
 
@@ -247,7 +247,7 @@ def _apply_orientations(photos: list[Photo], notes: list[str]) -> list[Photo]:
         upright |= {photo.path for photo in photos if orientations[photo.path] != 1 and fits(photo)}
     if upright:
         notes.append(
-            f"{len(upright)} of {len(photos)} photos are turned as their EXIF orientation says, for their cameras were "
+            f"{len(upright)} of {len(photos)} photos are rotated by their EXIF orientation, because their cameras were "
             "calibrated on upright pictures"
         )
     return [

@@ -71,7 +71,7 @@ def read_bundler(path: Path, *, test_every: int, max_size: int) -> Scene:
     folder = find_listed_folder(path, names) or _check_full_size(find_picture_folder(path, None))
     photos, masks, notes = find_listed_photos(path, folder, entries, bundle.name)
     if len(entries) < len(names):
-        notes.append(f"{len(names) - len(entries)} photos were never registered and were skipped")
+        notes.append(f"{len(names) - len(entries)} photos are not registered and were skipped")
     return make_scene(
         path,
         "bundler",

@@ -59,15 +59,17 @@ def read_colmap(path: Path, *, test_every: int, images: str | None, model: str |
     folder = _photo_folder(path, base, images, names)
     relative_folder = Path(os.path.relpath(folder, path))  # may start with ".."
     if base not in (path, path / "colmap"):
-        notes.append(f"poses were taken from {tables.relative_to(path)}")
+        notes.append(f"poses are read from {tables.relative_to(path)}")
     if images is None and relative_folder != Path("images"):
-        smaller = ", smaller copies that intrinsics are brought to the size of" if downscale_factor(folder.name) else ""
-        notes.append(f"photos were taken from {'the folder itself' if folder == path else relative_folder}{smaller}")
+        smaller = (
+            "; these are smaller copies, and the intrinsics are scaled to them" if downscale_factor(folder.name) else ""
+        )
+        notes.append(f"photos are read from {'the folder itself' if folder == path else relative_folder}{smaller}")
     if unposed:
-        notes.append(f"{unposed} photos were never registered and were skipped")
+        notes.append(f"{unposed} photos are not registered and were skipped")
     if not len(points):
         notes.append(
-            f"the model in {tables.relative_to(path)} has no points; training starts from random places instead"
+            f"the model in {tables.relative_to(path)} has no points; training starts from random positions instead"
         )
     pictures = PictureIndex(folder)
     matches = pictures.match(names)
@@ -129,7 +131,7 @@ def _choose_model(path: Path, models: Sequence[Path], name: str | None) -> tuple
     sizes = {model: _count_registered_photos(model) for model in models}
     there = ", ".join(f"{model.name} ({size} photos)" for model, size in sizes.items())
     chosen = max(models, key=lambda model: sizes[model])  # the first of the largest
-    why = "with the most photos; `model` takes another"
+    why = "because it has the most photos; select another with `model`"
     if name is not None:
         named = [model for model in models if model.name == name]
         if not named:
@@ -137,8 +139,8 @@ def _choose_model(path: Path, models: Sequence[Path], name: str | None) -> tuple
                 f"{path}: there is no COLMAP model '{name}'",
                 fix=f"choose one of these: {there}",
             )
-        chosen, why = named[0], "as asked for"
-    return chosen, [f"there are {len(models)} COLMAP models: {there}; {chosen.name} was taken, {why}"]
+        chosen, why = named[0], "as requested"
+    return chosen, [f"there are {len(models)} COLMAP models: {there}; {chosen.name} is used, {why}"]
 
 
 def _count_registered_photos(model: Path) -> int:

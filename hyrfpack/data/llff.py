@@ -37,7 +37,7 @@ def read_llff(path: Path, *, test_every: int, images: str | None, max_size: int)
     rows = _read_table(path / POSES_FILE)
     folder, notes = find_picture_folder(path, images), []
     if images is None and folder.name != "images":
-        notes.append(f"photos were taken from {folder.name}")
+        notes.append(f"photos are read from {folder.name}")
     try:
         names = sorted(entry.name for entry in os.scandir(folder) if is_picture_name(entry.name) and entry.is_file())
     except OSError as error:

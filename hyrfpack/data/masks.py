@@ -54,16 +54,18 @@ def find_masks(folder: Path, photos: Sequence[tuple[str, tuple[int, int]]], used
     if len(for_all) == 1 and len(photos) > 1:
         header, path = read_header(for_all[0]), for_all[0].relative_to(folder.parent)
         if all(has_same_aspect(*header.size, *size) for _, size in photos):
-            return MaskMatches(dict.fromkeys(names, for_all[0]), [f"{path} is the one mask and taken for all photos"])
+            return MaskMatches(
+                dict.fromkeys(names, for_all[0]), [f"{path} is the only mask and is used for all photos"]
+            )
         return MaskMatches(
             {},
             [
-                f"the mask {path} is {header.width} x {header.height}, which is not the shape of all photos, and is "
-                "not used; make it their size, or name it as its photo"
+                f"the mask {path} is not used, because its aspect ratio ({header.width} x {header.height}) is not that "
+                "of all photos; make it their size, or give it the name of its photo"
             ],
         )
     if not folder.is_dir() and (folder.parent / "mask").is_dir():
-        return MaskMatches({}, [f"the folder mask is not read; masks belong into {folder.name}"])
+        return MaskMatches({}, [f"the folder mask is not read; rename it to {folder.name}"])
     return MaskMatches({}, _unmatched_mask_notes(folder, unmatched, len(index.files), names))
 
 
@@ -72,6 +74,7 @@ def _unmatched_mask_notes(folder: Path, unmatched: list[Path], count: int, names
     if not unmatched:
         return []
     return [
-        f"{len(unmatched)} of {count} masks in {folder.name} are of no posed photo, {unmatched[0].relative_to(folder)} "
-        f"first; masks are named as their photos{f', {names[0]} for one' if names else ''}"
+        f"{len(unmatched)} of {count} masks in {folder.name} match no posed photo (such as "
+        f"{unmatched[0].relative_to(folder)}); give each the name of its photo"
+        f"{f' (such as {names[0]})' if names else ''}"
     ]

@@ -109,7 +109,7 @@ def read_metashape(path: Path, *, test_every: int, images: str | None, max_size:
     photos, masks, found = find_listed_photos(path, find_picture_folder(path, images), entries, table.name)
     notes += frame_notes + found
     if unposed:
-        notes.append(f"{unposed} photos have no pose in the component that was taken and were skipped")
+        notes.append(f"{unposed} photos have no pose in the chosen component and were skipped")
     points, colors, tables = read_sidecar_points(path, photos, notes)
     return make_scene(
         path,
@@ -166,7 +166,7 @@ def _choose_chunk(document: Element, table: Path) -> tuple[Element, list[str]]:
     chosen = next(chunk for size, chunk in sizes if size == most)
     if len(sizes) == 1:
         return chosen, []
-    return chosen, [f"there are {len(sizes)} chunks in {table.name}; the one with the most cameras, {most}, was taken"]
+    return chosen, [f"there are {len(sizes)} chunks in {table.name}; the one with the most cameras ({most}) is used"]
 
 
 def _is_in_component(camera: Element, component: str | None) -> bool:
@@ -183,7 +183,7 @@ def _choose_frame(chunk: Element, table: Path) -> tuple[_Frame, str | None, list
     component = max((key for key in ids if key is not None), key=lambda key: ids[key], default=None)
     notes = []
     if sum(key is not None for key in ids) > 1:
-        notes.append(f"there are {len(ids)} components; the one with the most cameras, {ids[component]}, was taken")
+        notes.append(f"there are {len(ids)} components; the one with the most cameras ({ids[component]}) is used")
     elements = [c for c in chunk.iterfind("components/component") if c.get("id") == component]
     transform = next((e.find("transform") for e in (*elements, chunk) if e.find("transform") is not None), None)
     if transform is None or transform.find("rotation") is None:
@@ -197,7 +197,7 @@ def _choose_frame(chunk: Element, table: Path) -> tuple[_Frame, str | None, list
     if not frame.scale > 0 or np.abs(frame.rotation @ frame.rotation.T - np.eye(3)).max() > 1e-3:
         raise HyrfDataError(f"{where} is not a rotation with a positive scale", fix="export the cameras again")
     if np.abs(frame.translation).max() > _MIN_GEOCENTRIC_COORDINATE:
-        notes.append("the cameras are placed on the Earth; they were kept in the coordinates of their component")
+        notes.append("the cameras are georeferenced; they stay in the coordinate system of their component")
         return _IDENTITY_FRAME, component, notes
     return frame, component, notes
 

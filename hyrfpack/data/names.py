@@ -48,13 +48,13 @@ class NameMatches:
             file = Path(os.path.relpath(self.found[first], self.folder)).as_posix()
             accents = " in another form of Unicode" if _normalize_unicode(file) == _normalize_unicode(first) else ""
             notes.append(
-                f"{len(self.inexact)} of {len(self.found)} photos are called otherwise than the poses say and were "
-                f"matched by what fits one file alone: {first} is {file}{accents}"
+                f"{len(self.inexact)} of {len(self.found)} photos have other names than in the poses and were "
+                f"matched to the only file that fits (such as {first} to {file}{accents})"
             )
         if self.ambiguous:
             notes.append(
-                f"{len(self.ambiguous)} photos fit more than one file, or their file more than one name, and were not "
-                f"matched, {self.ambiguous[0]} first; name the files as the poses do"
+                f"{len(self.ambiguous)} photos were not matched (such as {self.ambiguous[0]}), because they fit more "
+                "than one file, or their file more than one name; use the same file names as the poses"
             )
         return notes
 

@@ -64,7 +64,7 @@ def read_nerfstudio(path: Path, *, test_every: int, images: str | None, max_size
     masks = PictureIndex(path, photos=False)
     if is_moved and images is None:
         where = "the folder itself" if pictures == path else pictures.name
-        notes.append(f"the photos are not where {file.name} says; those in {where} were taken")
+        notes.append(f"the photos are not where {file.name} says; those in {where} are used")
     photos: list[Photo] = []
     missing: list[str] = []
     test: set[str] = set()

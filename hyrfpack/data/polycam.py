@@ -43,7 +43,7 @@ def read_polycam(path: Path, *, test_every: int, max_size: int) -> Scene:
     if not _camera_files(path / cameras) or not (path / images).is_dir():
         cameras, images = UNCORRECTED_FOLDERS
         notes.append(
-            "there are no corrected_cameras in keyframes; the poses are those that the phone tracked, and drift"
+            "there are no corrected_cameras in keyframes; the poses are those tracked by the phone, which drift"
         )
     if not (path / images).is_dir():
         raise HyrfDataError(f"{path}: there is {cameras} but no {images}", fix="export the raw data again")

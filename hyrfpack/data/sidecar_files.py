@@ -117,7 +117,7 @@ def read_sidecar_points(
     if not files:
         return none
     if len(files) > 1:
-        notes.append(f"there are {len(files)} .ply files and it is not said which holds the points; none is used")
+        notes.append(f"there are {len(files)} .ply files and none is marked as the one with the points; none is used")
         return none
     points, colors = read_ply_points(files[0])
     if not len(points) or not _are_in_view(points, photos):

@@ -44,8 +44,8 @@ def raw_photos_notes(raw_photos: Sequence[Path]) -> list[str]:
         return []
     noun, verb = ("raw file", "is") if len(raw_photos) == 1 else ("raw files", "are")
     return [
-        f"{len(raw_photos):,} {noun} ({_format_extensions(raw_photos)}) {verb} ignored, for raw files are not "
-        "supported; export those as JPEG that you want to use"
+        f"{len(raw_photos):,} {noun} ({_format_extensions(raw_photos)}) {verb} ignored because raw files are "
+        "not supported; export those that you want to use as JPEG"
     ]
 
 

@@ -83,15 +83,15 @@ def distill_model(
     original = Drawable.from_splats(splats, weighted.frame, device)
     train, validation, test = _choose_cameras(weighted, original, config, cameras)
     say(
-        f"{len(splats):,} Gaussians, harmonics of degree {splats.degree}; {len(train)} viewpoints "
-        f"{'made up' if cameras is None else 'given'} to teach with, {len(test)} held out"
+        f"{len(splats):,} Gaussians, harmonics of degree {splats.degree}; {len(train)} "
+        f"{'sampled' if cameras is None else 'given'} viewpoints for training, {len(test)} held out"
     )
     report("measuring which Gaussians are visible", 0.05)
     light = mean_sent_light(original, evenly_spaced(train, LIGHT_MEASUREMENT_VIEWS))
     kept = torch.from_numpy(_indices_without_faint(light.cpu().numpy())).to(device)
     if not len(kept):
         raise HyrfDataError(f"{name}: no view shows anything of the Gaussians", fix="give others with `cameras`")
-    say(f"{len(splats) - len(kept):,} Gaussians are hardly visible and left out; fitting the fields to the others")
+    say(f"{len(splats) - len(kept):,} Gaussians are hardly visible and are left out; fitting the fields to the others")
     share = min(1.0, max(MIN_REGRESSION_SHARE, config.steps / FULL_REGRESSION_STEPS))
     model = initial_model(original[kept], light[kept], train, config.seed, share, report_part(report, 0.1, 0.4))
     scene, cache = reference_scene(name, original, train, test), PictureCache()

@@ -147,7 +147,7 @@ def distill_splats(
         splats, config, name=name, cameras=cameras, device=torch_device, say=say, report=report_part(report, 0.0, 0.7)
     )
     unpacked_psnr = float(np.mean(distilled.test.psnr_per_view(distilled.model)))
-    say(f"{unpacked_psnr:.2f} dB before packing")
+    say(f"PSNR before compression: {unpacked_psnr:.2f} dB")
     imported = f"{len(splats):,} Gaussians of degree {splats.degree} from {Path(name).name}, without photos"
     provenance = {"steps": config.steps, "seed": config.seed, "psnr": unpacked_psnr, "choices": {"imported": imported}}
     data = pack(distilled, config.psnr, provenance, say, report_part(report, 0.7, 0.97))
@@ -186,10 +186,10 @@ def _shortfall(
 ) -> str:
     """Describe how far the file falls short of the target PSNR, and what the user can do about it."""
     outcome = (
-        f"asked for {config.psnr:g} dB and reached {reached_psnr:.1f} at held-out viewpoints, "
-        f"{unpacked_psnr:.1f} before packing"
+        f"the target PSNR is {config.psnr:g} dB, but the file reaches {reached_psnr:.1f} dB at held-out viewpoints "
+        f"({unpacked_psnr:.1f} dB before compression)"
     )
     if not _falls_short(unpacked_psnr, config.psnr):
-        return f"{outcome}: ask for more than you need with `psnr`"
-    where = ", or name with `cameras` from where it will be looked at" if viewpoints_are_sampled else ""
-    return f"{outcome}: learn longer, as with `steps={max(DistillConfig.steps, 2 * config.steps)}`{where}"
+        return f"{outcome}; set a higher target with `psnr`"
+    where = ", or give the viewpoints that matter with `cameras`" if viewpoints_are_sampled else ""
+    return f"{outcome}; train longer, for example with `steps={max(DistillConfig.steps, 2 * config.steps)}`{where}"

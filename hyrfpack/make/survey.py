@@ -164,7 +164,7 @@ def describe_photos(path: StrPath, *, report: Callable[[str, float], None] | Non
         problems += _zoom_problems(facts) + _mask_problems(folder, photos)
     notes = list(scene.notes) if scene is not None else _header_notes(facts) + raw_photos_notes(list_raw_photos(folder))
     if len(measurements) + len(unreadable) < len(photos):
-        notes.append(f"the pixels of {len(measurements)} of {len(photos)} photos were looked at, evenly spread")
+        notes.append(f"the pixels of {len(measurements)} of {len(photos)} photos were measured, evenly spaced")
     preset = ": ".join(detect_preset(scene)) if scene is not None and scene.train else ""
     report_progress("described", 1.0)
     return PhotoSurvey(
@@ -211,7 +211,7 @@ def _describe_video(path: Path, report_progress: Callable[[str, float], None]) -
         luminance=0.0,
         frames=found.taken,
         notes=(
-            f"{found.blurred} frames are blurred and {found.repeated} repeated, and would not be taken",
+            f"{found.blurred} frames are blurred and {found.repeated} repeated, and would be skipped",
             *found.notes,
         ),
         problems=tuple(problems),
@@ -300,7 +300,7 @@ def _count_problems(count: int, scene: Scene | None, posed: int, path: Path) -> 
     if posed and without > 0:
         found.append(
             f"{without} of {count} photos have no pose and are not used; take more photos between them and the others, "
-            f"or estimate all anew with 'hyrfpack poses {shlex.quote(str(path))} -o SCENE'"
+            f"or estimate all poses again with 'hyrfpack poses {shlex.quote(str(path))} -o SCENE'"
         )
     if not len(scene.points):
         found.append(
@@ -336,7 +336,7 @@ def _copy_problems(
         return []
     first, of = (_relative_name(item, folder) for item in copies[0])
     return [
-        f"{format_photo_count(len(copies))} {_be(len(copies))} a copy of another, {first} of {of} for one; "
+        f"{format_photo_count(len(copies))} {_be(len(copies))} a copy of another (such as {first} of {of}); "
         "remove the copies"
     ]
 
@@ -353,7 +353,7 @@ def _blur_problems(measurements: list[_PixelMeasurement], blurred: list[Path], f
         return []
     names = format_file_names([_relative_name(item, folder) for item in blurred])
     return [
-        f"{format_photo_count(len(blurred))} {_be(len(blurred))} blurred ({names}); leave out or retake what is blurred"
+        f"{format_photo_count(len(blurred))} {_be(len(blurred))} blurred ({names}); leave out or retake blurred photos"
     ]
 
 
@@ -374,8 +374,8 @@ def _light_problems(
     ]
     if dark:
         found.append(
-            f"{format_photo_count(len(dark))} {_be(len(dark))} far darker than the others "
-            f"({format_file_names(dark)}); leave out what is dark"
+            f"{format_photo_count(len(dark))} {_be(len(dark))} over {_DARK_PHOTO_STOPS:g} stops darker than the others "
+            f"({format_file_names(dark)}); leave out dark photos"
         )
     bright = [
         _relative_name(measurement.path, folder)
@@ -384,13 +384,12 @@ def _light_problems(
     ]
     if len(bright) > len(measurements) / 4:
         found.append(
-            f"{format_photo_count(len(bright))} {_be(len(bright))} white over a quarter or more "
-            f"({format_file_names(bright)}); expose less, and lock it"
+            f"{format_photo_count(len(bright))} {_be(len(bright))} overexposed in a quarter or more of the "
+            f"pixels ({format_file_names(bright)}); reduce the exposure, and lock it"
         )
     if stops > _MAX_EXPOSURE_SPREAD_STOPS:
         found.append(
-            f"the photos differ by {stops:.1f} stops in how light they are; lock exposure and white balance while you "
-            "take them"
+            f"the photos differ by {stops:.1f} stops in brightness; lock exposure and white balance while you take them"
         )
     return found
 
@@ -409,8 +408,8 @@ def _zoom_problems(facts: list[PhotoFacts]) -> list[str]:
         return []
     device = max(lengths, key=lambda name: len(lengths[name]))
     return [
-        f"photos of {most} zooms or lenses are mixed{f' ({device})' if device else ''}, which are distinguished but "
-        "posed less surely; keep one, and do not zoom"
+        f"the photos have {most} different focal lengths{f' ({device})' if device else ''}; each gets its own "
+        "intrinsics, but poses are less reliable; use one lens, and do not zoom"
     ]
 
 
@@ -423,7 +422,8 @@ def _mask_problems(folder: Path, photos: list[Path]) -> list[str]:
     if not stray:
         return []
     return [
-        f"{len(stray)} of {len(there)} masks are of no photo ({format_file_names(stray)}); name each as its photo is"
+        f"{len(stray)} of {len(there)} masks match no photo ({format_file_names(stray)}); give each the name of its "
+        "photo"
     ]
 
 
@@ -433,7 +433,7 @@ def _header_notes(facts: list[PhotoFacts]) -> list[str]:
     turned = sum(fact.orientation != 1 for fact in facts)
     if turned:
         notes.append(
-            f"{format_photo_count(turned)} {_be(turned)} stored on the side; 'hyrfpack poses' makes upright copies"
+            f"{format_photo_count(turned)} {_be(turned)} stored rotated; 'hyrfpack poses' makes upright copies"
         )
     large = sum(max(fact.size) > DEFAULT_MAX_SIZE for fact in facts)
     if large:
@@ -444,7 +444,7 @@ def _header_notes(facts: list[PhotoFacts]) -> list[str]:
     round_ = sum(fact.size[0] == 2 * fact.size[1] for fact in facts)
     if round_:
         notes.append(
-            f"{format_photo_count(round_)} {_be(round_)} twice as wide as high, as those of 360-degree cameras are"
+            f"{format_photo_count(round_)} {_be(round_)} twice as wide as high, like those of 360-degree cameras"
         )
     return notes
 

@@ -51,13 +51,13 @@ def choose_candidate(candidates: Sequence[Candidate], matches: int) -> tuple[Can
     name, figures = _MAPPER_NAMES[chosen.mapper], _describe_figures(chosen, matches)
     others = [candidate for candidate in candidates if candidate is not chosen]
     if not others:
-        return chosen, f"{name} was taken ({figures}); the other one registered no photos"
+        return chosen, f"{name} was chosen ({figures}); the other mapper registered no photos"
     (other,) = others
-    against = f"{name} was taken ({figures}; {_MAPPER_NAMES[other.mapper]}: {_describe_figures(other, matches)})"
+    against = f"{name} was chosen ({figures}; {_MAPPER_NAMES[other.mapper]}: {_describe_figures(other, matches)})"
     if other not in tied:
-        return chosen, f"{against}: it explains more of what was matched"
-    lead = "poses more photos" if len(chosen.poses) > len(other.poses) else "follows points through more photos"
-    return chosen, f"{against}: both explain what was matched alike, and it {lead}"
+        return chosen, f"{against}: it explains more of the matches"
+    lead = "poses more photos" if len(chosen.poses) > len(other.poses) else "has longer tracks"
+    return chosen, f"{against}: both explain about as many matches, and it {lead}"
 
 
 def confirmed_photos(poses: Poses, other: Candidate | None) -> frozenset[str]:
@@ -75,16 +75,18 @@ def describe_doubt(poses: Poses, other: Candidate | None) -> str:
     if len(agreed) >= _MIN_CONFIRMED_RATIO * len(poses):
         return ""
     if other is None:
-        return f"nothing confirms the poses of these {len(poses)} photos, for one mapper alone found any; look at them"
+        return (
+            f"the poses of these {len(poses)} photos are not confirmed, because only one mapper found any; check them"
+        )
     lacking = len(set(poses).difference(other.poses, *other.other_pieces))
     in_other_pieces = len(set().union(*other.other_pieces).intersection(poses).difference(agreed))
     unlike = len(poses) - len(agreed) - lacking - in_other_pieces
-    parts = [f"poses {unlike} of them differently"] if unlike > 0 else []
-    parts += [f"has {in_other_pieces} in pieces of their own"] if in_other_pieces else []
+    parts = [f"gives {unlike} photos other poses"] if unlike > 0 else []
+    parts += [f"has {in_other_pieces} in other pieces"] if in_other_pieces else []
     parts += [f"has no pose for {lacking}"] if lacking else []
     return (
-        f"{len(agreed)} of {len(poses)} posed photos are sure; {_MAPPER_NAMES[other.mapper]} {' and '.join(parts)}, "
-        "so check the result before you use it"
+        f"{len(agreed)} of {len(poses)} poses are confirmed by both mappers; {_MAPPER_NAMES[other.mapper]} "
+        f"{' and '.join(parts)}, so check the result before you use it"
     )
 
 

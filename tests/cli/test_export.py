@@ -41,9 +41,9 @@ def test_export_reports_its_steps_and_the_loss(model, tmp_path):
     result = succeeded("export", model, "-o", tmp_path / "a.ply", "--sh-degree", 3)
     size, splats = (tmp_path / "a.ply").stat().st_size, read_splats(tmp_path / "a.ply")
     rows = re.findall(r"^(baked to .*|read back from .*?) +(\d+\.\d\d)$", result.stdout, re.MULTILINE)
-    names = ["baked to harmonics of degree 3, not yet written", "read back from the .ply file"]
+    names = ["baked to harmonics of degree 3, before writing", "read back from the .ply file"]
     assert [name.rstrip() for name, _ in rows] == names
-    assert result.stdout.splitlines()[0].split("  ")[0] == "against the model's own pictures, 4 views"
+    assert result.stdout.splitlines()[0].split("  ")[0] == "against renders of the model, 4 views"
     last = f"{tmp_path / 'a.ply'}: {size:,} bytes, {len(splats):,} Gaussians, {len(splats) - 40:,} of them for the"
     assert result.stdout.splitlines()[-1] == f"{last} background"
     assert [line.split()[0] for line in result.stderr.splitlines()] == ["fitting", "writing", "measuring"]
@@ -68,7 +68,7 @@ def test_identical_pictures_are_json_too(tmp_path):
 def test_given_photos_are_scored(model, data, tmp_path):
     arguments = ("export", model, "-o", tmp_path / "a.ply", "--overwrite", "--sh-degree", 0, "--data", data)
     last = succeeded(*arguments).stdout.splitlines()[-1]
-    form = r"against held-out photos: PSNR \d+\.\d{3} dB of the model, \d+\.\d{3} dB of the file"
+    form = r"PSNR against held-out photos: model \d+\.\d{3} dB, file \d+\.\d{3} dB"
     assert re.fullmatch(form, last)
     assert json.loads(succeeded(*arguments, "--test-every", 0, "--json").stdout)["photos_model"] is None
 
@@ -106,9 +106,11 @@ def test_cameras_and_points_are_counted(model, tmp_path):
 def test_the_degree_is_chosen_and_the_choice_is_reported(model, tmp_path):
     result = succeeded("export", model, "-o", tmp_path / "a.ply")
     assert [line.split()[0] for line in result.stderr.splitlines()] == [
-        *("choosing", "degree", "fitting", "writing", "measuring")
+        *("choosing", "chosen", "fitting", "writing", "measuring")
     ]
-    (degree,) = re.findall(r"^degree (\d) it is: .* for degrees 0 to 3 against the model$", result.stderr, re.MULTILINE)
+    (degree,) = re.findall(
+        r"^chosen degree (\d): .* against the model for degrees 0 to 3$", result.stderr, re.MULTILINE
+    )
     assert read_splats(tmp_path / "a.ply").degree == int(degree) and f"harmonics of degree {degree}," in result.stdout
 
 
@@ -120,7 +122,7 @@ def test_a_page_embeds_the_model_unless_it_is_baked(model, tmp_path):
     assert base64.b64encode(model.read_bytes()[:300]) not in baked and b'"kind": "splats"' in baked
     result = succeeded("export", model, "-o", tmp_path / "a.html", "--overwrite")
     size = (tmp_path / "a.html").stat().st_size
-    assert result.stdout == f"{tmp_path / 'a.html'}: {size:,} bytes, 40 Gaussians, as they are: nothing is baked\n"
+    assert result.stdout == f"{tmp_path / 'a.html'}: {size:,} bytes, 40 Gaussians, unchanged: nothing is baked\n"
     assert "goes along as it is" in result.stderr
 
 

@@ -154,7 +154,9 @@ def test_convert_describes_input_and_output(files, tmp_path):
     assert rows[0] == ["file", "Gaussians", "SH degree", "bytes"]
     assert rows[2] == ["ball.ply", "60", "1", f"{files['.ply'].stat().st_size:,}"]
     assert rows[3] == ["a.splat", "60", "0", f"{32 * 60:,}"]
-    assert re.fullmatch(r"12 views of .* PSNR \d+\.\d\d dB, the worst \d+\.\d\d", result.stdout.splitlines()[-1])
+    assert re.fullmatch(
+        r"PSNR against renders of .*, 12 views: mean \d+\.\d\d dB, worst \d+\.\d\d dB", result.stdout.splitlines()[-1]
+    )
     assert "stores harmonics up to degree 0" in result.stderr
 
 

@@ -171,7 +171,7 @@ def test_a_curve_has_seconds_and_one_of_an_earlier_version_a_note_about_their_ab
     assert "spread evenly" not in Page(tmp_path / "page.html").words
     change_metrics(runs[1], lambda values: [record.pop("seconds") for record in values["curve"]])
     hyrfpack.compare_runs(runs, tmp_path / "page.html", overwrite=True)
-    assert "No times of single steps were kept of b" in Page(tmp_path / "page.html").words
+    assert "Times of single steps are missing for b" in Page(tmp_path / "page.html").words
 
 
 def test_the_same_runs_give_the_same_bytes_and_a_page_fetches_nothing(runs, tmp_path):
@@ -223,7 +223,7 @@ def test_different_photos_of_the_same_name_are_noted_and_not_shown(runs, origina
     darken_photo(runs[1] / "views" / "001.png")
     report = hyrfpack.compare_runs(runs, tmp_path / "page.html")
     (sentence,) = report.doubts
-    assert "'001.png' for one" in sentence and sentence in Page(tmp_path / "page.html").words
+    assert "such as '001.png'" in sentence and sentence in Page(tmp_path / "page.html").words
     assert report.views == ["000.png"]
 
 
@@ -239,7 +239,7 @@ def test_runs_without_held_out_photos_are_compared_by_the_rest(which, runs, tmp_
         change_metrics(runs[number], lambda values: values.pop("evaluation"))
     report = hyrfpack.compare_runs(runs, tmp_path / "page.html")
     page = Page(tmp_path / "page.html")
-    assert report.views == [] and len(report.doubts) == 1 and "o photo is held out of" in report.doubts[0]
+    assert report.views == [] and len(report.doubts) == 1 and "o photos were held out in" in report.doubts[0]
     assert ("held-out PSNR (dB)" in page.rows) == (len(which) == 1)
     assert page.rows["Gaussians"] == ["60", "60"] and "training" in page.words
 
@@ -319,7 +319,7 @@ def test_the_command_reports_its_output_and_doubts(runs, tmp_path):
     assert "--overwrite" in refused("compare", *runs, "-o", page)
     change_metrics(runs[0], lambda values: values.pop("evaluation"))
     result = succeeded("compare", *runs, "-o", page, "--overwrite", "--json")
-    assert json.loads(result.stdout)["runs"] == ["a", "b"] and "No photo is held out of 'a'" in result.stderr
+    assert json.loads(result.stdout)["runs"] == ["a", "b"] and "No photos were held out in 'a'" in result.stderr
 
 
 def test_runs_are_named_by_the_shortest_distinct_part_of_their_paths():

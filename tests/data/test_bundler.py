@@ -65,7 +65,7 @@ def test_points_of_a_real_reconstruction_project_to_where_they_were_seen(folder)
     seen = np.array([[float(n) for n in line[1:]] for line in numbers]).reshape(4, 3, 4)[:, :, 2:]
 
     assert [view.name for view in scene.views] == ["0.png", "1.png", "2.png"]
-    assert "1 photos were never registered and were skipped" in scene.notes
+    assert "1 photos are not registered and were skipped" in scene.notes
     for number, view in enumerate(scene.views):
         local = scene.points @ view.camera.rotation.T + view.camera.camera_from_world[:3, 3]
         assert (local[:, 2] > 0).all()
@@ -148,7 +148,7 @@ def test_the_list_may_name_the_folder_of_photos(folder):
     scene = load_scene(folder)
 
     assert {view.name for view in scene.views} == {"0.png", "1.png", "2.png"}
-    assert not any("called otherwise" in note for note in scene.notes)
+    assert not any("have other names" in note for note in scene.notes)
 
 
 def test_smaller_copies_are_used_where_the_list_names_them(folder, pictures):

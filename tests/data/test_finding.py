@@ -75,7 +75,7 @@ def test_the_first_skipped_photo_is_named(nerfstudio_folder):
     root = nerfstudio_folder(4)
     (root / "images" / "002.png").unlink()
 
-    expected = "1 of 4 photos listed in transforms.json are not on disk and were skipped, images/002.png first"
+    expected = "1 of 4 photos listed in transforms.json are not on disk and were skipped (such as images/002.png)"
     assert expected in load_scene(root).notes
 
 
@@ -134,7 +134,7 @@ def test_the_model_with_the_most_photos_is_used_and_noted(tmp_path, colmap_folde
     assert len(scene.views) == sizes[taken]
     (note,) = [note for note in scene.notes if "COLMAP models" in note]
     assert note.startswith(f"there are {len(sizes)} COLMAP models: ")
-    assert note.endswith(f"; {taken} was taken, with the most photos; `model` takes another")
+    assert note.endswith(f"; {taken} is used, because it has the most photos; select another with `model`")
     assert all(f"{name} ({count} photos)" in note for name, count in sizes.items())
     assert all("sparse" not in file or f"sparse/{taken}/" in file for file in scene.files)
 
@@ -160,7 +160,7 @@ def test_another_model_can_be_named(tmp_path, colmap_folder):
     scene = load_scene(tmp_path, model="0")
 
     assert len(scene.views) == 2
-    assert "there are 2 COLMAP models: 0 (2 photos), 1 (11 photos); 0 was taken, as asked for" in scene.notes
+    assert "there are 2 COLMAP models: 0 (2 photos), 1 (11 photos); 0 is used, as requested" in scene.notes
 
 
 def test_a_missing_model_is_rejected_and_existing_ones_are_named(tmp_path, colmap_folder):
@@ -192,7 +192,7 @@ def test_photos_that_share_one_pose_are_noted(nerfstudio_folder):
         content["frames"][index]["transform_matrix"] = content["frames"][1]["transform_matrix"]
     edit_transforms(root, frames=content["frames"])
 
-    assert "3 photos have the very pose of another, 001.png that of 003.png for one" in notes_of_loading(root)
+    assert "3 photos have exactly the same pose as another (such as 001.png and 003.png)" in notes_of_loading(root)
 
 
 @pytest.mark.parametrize("key", ["train_filenames", "test_filenames"])
@@ -210,7 +210,7 @@ def test_a_folder_named_mask_is_noted(tmp_path, colmap_folder, pictures):
     folder = colmap_folder(tmp_path)
     pictures(tmp_path / "mask", folder.names)
 
-    assert "the folder mask is not read; masks belong into masks" in load_scene(tmp_path).notes
+    assert "the folder mask is not read; rename it to masks" in load_scene(tmp_path).notes
     (tmp_path / "mask").rename(tmp_path / "masks")
     assert "not read" not in notes_of_loading(tmp_path)
 
@@ -220,7 +220,7 @@ def test_masks_without_a_photo_are_noted(nerfstudio_folder, pictures):
     pictures(root / "masks", ["000.png", "001_mask.png", "002_mask.png"])
     (root / "masks" / "readme.txt").touch()
 
-    assert "2 of 3 masks in masks are of no posed photo, 001_mask.png first" in notes_of_loading(root)
+    assert "2 of 3 masks in masks match no posed photo (such as 001_mask.png)" in notes_of_loading(root)
 
 
 def test_a_set_without_problems_has_no_notes(nerfstudio_folder, pictures):
@@ -254,7 +254,7 @@ def test_folders_of_several_cameras_are_not_read_as_smaller_copies(tmp_path, col
     scene = load_scene(tmp_path)
 
     assert sorted(view.name for view in scene.views) == sorted(folder.names)
-    assert "photos were taken from the folder itself" in scene.notes
+    assert "photos are read from the folder itself" in scene.notes
 
 
 def test_folders_of_masks_previews_and_depth_maps_are_not_read_as_photos(tmp_path, colmap_folder, pictures):
@@ -263,7 +263,7 @@ def test_folders_of_masks_previews_and_depth_maps_are_not_read_as_photos(tmp_pat
     for other in ("depth", "masks", "thumbs", "stereo"):
         pictures(tmp_path / other, folder.names)
 
-    assert "photos were taken from saturday" in load_scene(tmp_path).notes
+    assert "photos are read from saturday" in load_scene(tmp_path).notes
 
 
 def test_folders_of_masks_may_be_links(tmp_path, colmap_folder, pictures):

@@ -125,7 +125,7 @@ def test_a_colmap_model_is_preferred_to_other_layouts(tmp_path, write, colmap_fo
     shutil.rmtree(tmp_path / "images")
     colmap_folder(tmp_path)
 
-    assert load_scene(tmp_path).notes[0] == "poses are there as colmap and llff; colmap was taken"
+    assert load_scene(tmp_path).notes[0] == "there are poses in several layouts (colmap and llff); colmap is used"
     assert load_scene(tmp_path, layout="llff").layout == "llff"
 
 

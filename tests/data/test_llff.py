@@ -48,7 +48,7 @@ def test_the_largest_copies_replace_missing_photos(folder, pictures):
 
     scene = load_scene(folder)
 
-    assert "photos were taken from images_4" in scene.notes
+    assert "photos are read from images_4" in scene.notes
     assert scene.views[0].camera.width == 16
 
 

@@ -21,8 +21,8 @@ def test_colmap_is_preferred_to_transforms_and_that_is_noted(tmp_path, colmap_fo
 
     assert (preferred.layout, len(preferred.views)) == ("colmap", 9)
     assert (forced.layout, len(forced.views)) == ("nerfstudio", 5)
-    assert any("colmap was taken" in note for note in preferred.notes)
-    assert any("nerfstudio was taken" in note for note in forced.notes)
+    assert any("colmap is used" in note for note in preferred.notes)
+    assert any("nerfstudio is used" in note for note in forced.notes)
 
 
 def test_test_every_0_holds_out_nothing(tmp_path, colmap_folder):

@@ -91,7 +91,7 @@ def test_a_file_is_matched_to_one_name_only(tmp_path):
 
     assert matches.found == {"a.jpg": tmp_path / "a.jpg"}
     assert matches.ambiguous == ["left/b.jpg", "right/b.jpg"]
-    assert "2 photos fit more than one file" in matches.notes[0] and "left/b.jpg first" in matches.notes[0]
+    assert "2 photos were not matched (such as left/b.jpg)" in matches.notes[0]
 
 
 def test_notes_count_inexact_matches_and_give_an_example(tmp_path):
@@ -100,8 +100,8 @@ def test_notes_count_inexact_matches_and_give_an_example(tmp_path):
     matches = PictureIndex(tmp_path).match(["a.jpg", "/x/b.jpg", "c.jpg"])
 
     assert matches.notes == [
-        "2 of 3 photos are called otherwise than the poses say and were matched by what fits one file alone: "
-        "/x/b.jpg is b.jpg"
+        "2 of 3 photos have other names than in the poses and were matched to the only file that fits "
+        "(such as /x/b.jpg to b.jpg)"
     ]
 
 

@@ -190,17 +190,19 @@ def test_a_psnr_below_the_target_is_reported(tmp_path: Path) -> None:
         ball_splats(60), tmp_path / "x.hyrf", replace(TINY_DISTILL_CONFIG, psnr=60), say=said.append
     )
     assert report.psnr_asked == 60
-    assert said[-1].startswith(f"asked for 60 dB and reached {report.psnr:.1f} at held-out viewpoints")
+    assert said[-1].startswith(
+        f"the target PSNR is 60 dB, but the file reaches {report.psnr:.1f} dB at held-out viewpoints"
+    )
     assert f"`steps={DistillConfig.steps}`" in said[-1] and "`cameras`" in said[-1]
 
     said.clear()
     distill_splats(ball_splats(60), tmp_path / "x.hyrf", replace(TINY_DISTILL_CONFIG, psnr=10), say=said.append)
-    assert not any("asked for" in sentence for sentence in said)
+    assert not any("target PSNR" in sentence for sentence in said)
 
 
 def test_a_target_missed_only_by_packing_advises_psnr_and_not_steps() -> None:
     messages = fit._shortfall(36.5, 38.6, DistillConfig(psnr=37), viewpoints_are_sampled=True)
-    assert "reached 36.5" in messages and messages.endswith("with `psnr`") and "steps" not in messages
+    assert "reaches 36.5" in messages and messages.endswith("with `psnr`") and "steps" not in messages
     assert "cameras" not in fit._shortfall(36.5, 36.6, DistillConfig(psnr=37), viewpoints_are_sampled=False)
     assert not fit._falls_short(36.96, 37) and fit._falls_short(36.94, 37)
 

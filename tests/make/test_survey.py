@@ -107,7 +107,7 @@ def test_dark_sets_and_changing_light_are_reported(photos):
             np.minimum(255, (random_rectangles(number) * (0.3 + 0.1 * number))).astype(np.uint8),
         )
     survey = describe_photos(photos)
-    assert survey.stops > 2.5 and "lock exposure" in find_problem(survey, "stops")
+    assert survey.stops > 2.5 and "lock exposure" in find_problem(survey, "in brightness")
 
 
 def test_photos_of_a_single_view_are_detected(photos):
@@ -122,9 +122,9 @@ def test_zooms_orientations_and_sizes_are_distinguished(photos):
     save_photo(photos / "011.jpg", random_rectangles(11), focal=26, orientation=6)
     save_photo(photos / "big.jpg", random_rectangles(11, 2400, 1800), focal=26)
     survey = describe_photos(photos)
-    assert "Acme Phone 3" in find_problem(survey, "zooms")
+    assert "Acme Phone 3" in find_problem(survey, "focal lengths")
     assert survey.sizes == {"160 x 120": 23, "120 x 160": 1, "2400 x 1800": 1}
-    assert any("stored on the side" in note for note in survey.notes)
+    assert any("stored rotated" in note for note in survey.notes)
     assert any("1 of 25 photos are larger" in note for note in survey.notes)
 
 

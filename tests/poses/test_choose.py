@@ -36,10 +36,10 @@ def test_disagreement_of_the_mappers_is_noted_and_agreement_is_not():
     folded = {**poses, **{name: poses[onto] for name, onto in zip(names[16:], names[:8], strict=True)}}
     assert describe_doubt(poses, make_candidate("global", transform_poses(poses), 1000)) == ""
     said = describe_doubt(poses, make_candidate("global", transform_poses(folded), 800))
-    assert said.startswith("16 of 24 posed photos are sure; the global mapper poses 8 of them differently")
+    assert said.startswith("16 of 24 poses are confirmed by both mappers; the global mapper gives 8 photos other poses")
     lacking = {name: poses[name] for name in names[:10]}
     assert "has no pose for 14" in describe_doubt(poses, make_candidate("incremental", transform_poses(lacking), 400))
-    assert "nothing confirms the poses of these 24 photos" in describe_doubt(poses, None)
+    assert "the poses of these 24 photos are not confirmed" in describe_doubt(poses, None)
 
 
 def test_the_largest_agreeing_piece_of_the_other_mapper_confirms_poses():
@@ -49,4 +49,4 @@ def test_the_largest_agreeing_piece_of_the_other_mapper_confirms_poses():
     second = transform_poses({name: poses[name] for name in names[9:]}, scale=0.2, seed=4)
     other = make_candidate("incremental", first, 500, other_pieces=(second,))
     assert confirmed_photos(poses, other) == set(names[9:])
-    assert describe_doubt(poses, other).startswith("15 of 24 posed photos are sure")
+    assert describe_doubt(poses, other).startswith("15 of 24 poses are confirmed")

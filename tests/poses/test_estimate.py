@@ -26,7 +26,9 @@ def test_estimated_poses_match_the_true_ones_for_photos_of_any_name(photos_and_p
     assert align_poses(poses_of(scene), known).agreeing == set(known)
     assert (report.photos, report.registered, report.left_out) == (len(known), len(known), {})
     assert report.sure == len(known)
-    assert report.mapper in ("incremental", "global") and report.why.startswith(f"the {report.mapper} mapper was taken")
+    assert report.mapper in ("incremental", "global") and report.why.startswith(
+        f"the {report.mapper} mapper was chosen"
+    )
 
 
 def test_points_lie_on_the_walls_and_have_the_photos_colours(photos_and_poses, estimated_scene):

@@ -109,7 +109,7 @@ def test_when_one_mapper_crashes_the_result_of_the_other_is_used_and_noted(
     report = hyrfpack.estimate_poses(photos_and_poses[0], tmp_path / "scene")
     assert (report.mapper, report.registered, report.sure) == ("incremental", len(photos_and_poses[1]), 0)
     assert any("the global mapper failed" in note for note in report.notes)
-    assert any("nothing confirms" in note for note in report.notes)
+    assert any("are not confirmed" in note for note in report.notes)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")

@@ -22,19 +22,19 @@ def variants() -> Iterator[Variant]:
     )
     yield Variant("masks: in a folder", lambda s: s.write_masks(lambda f: f"masks/left/{f.stem}.webp"), note=note)
     yield Variant("masks: half as large", lambda s: _write_half_size_masks(s), note=note)
-    yield Variant("masks: one, mask.png", lambda s: s.write_masks(lambda f: "mask.png"), note="taken for all")
+    yield Variant("masks: one, mask.png", lambda s: s.write_masks(lambda f: "mask.png"), note="used for all")
     yield Variant(
-        "masks: one in the folder", lambda s: s.write_masks(lambda f: "masks/camera.png"), note="taken for all"
+        "masks: one in the folder", lambda s: s.write_masks(lambda f: "masks/camera.png"), note="used for all"
     )
     yield Variant(
         "masks: one of another shape",
         lambda s: (s.write_masks(lambda f: "masks/camera.png", (50, 13)), setattr(s, "masked", 0.0)),
-        note="not the shape",
+        note="aspect ratio",
     )
     yield Variant(
         "masks: of no photo",
         lambda s: (s.write_masks(lambda f: f"masks/{f.stem}_mask.png"), setattr(s, "masked", 0.0)),
-        note="of no posed photo",
+        note="match no posed photo",
     )
     yield Variant(
         "masks: in mask/",

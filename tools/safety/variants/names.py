@@ -12,7 +12,7 @@ from tools.safety.variants.variant import ALL_LAYOUTS, Variant
 from tools.safety.variants.working_set import WorkingSet
 
 JSON_LAYOUTS = ("nerfstudio", "blender")
-LOOSE_MATCH_NOTE = "called otherwise"
+LOOSE_MATCH_NOTE = "have other names"
 
 
 def variants() -> Iterator[Variant]:

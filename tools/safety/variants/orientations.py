@@ -51,19 +51,19 @@ def variants() -> Iterator[Variant]:
         yield Variant(
             f"turned: stored as EXIF {orientation} says",
             store_rotated(orientation),
-            note="are turned",
+            note="are rotated",
             layouts=ALL_LAYOUTS[:2],
         )
     for ending in (".jpg", ".webp", ".tif", ".avif"):
-        yield Variant(f"turned: {ending} stored as EXIF 6 says", store_rotated(6, ending=ending), note="are turned")
-    yield Variant("turned: every third alone", store_rotated(8, every=3), note="are turned")
+        yield Variant(f"turned: {ending} stored as EXIF 6 says", store_rotated(6, ending=ending), note="are rotated")
+    yield Variant("turned: every third alone", store_rotated(8, every=3), note="are rotated")
     yield Variant(
         "turned: EXIF lost", store_rotated(6, keep_tag=False), "not a uniform rescaling", layouts=ALL_LAYOUTS[:2]
     )
     yield Variant(
         "turned: 6 and upside down mixed",
         lambda s: (store_rotated(6, every=2)(s), _store_upside_down(s)),
-        note="are turned",
+        note="are rotated",
     )
     yield Variant("turned: as calibrated, EXIF says 6", _tag_orientation(6), layouts=ALL_LAYOUTS)
     yield Variant("turned: as calibrated, EXIF says 3", _tag_orientation(3), layouts=ALL_LAYOUTS)
