@@ -164,7 +164,7 @@ def test_a_message_is_dismissed_by_button_by_escape_and_by_a_valid_address(brows
         "0": lambda: browser.evaluate("location.hash = 'camera=2'"),
     }.items():
         browser.evaluate(f"location.hash = 'camera={bad}'")
-        assert "names no camera that can be used" in wait_for_message(browser)
+        assert "camera in the address cannot be used" in wait_for_message(browser)
         box = browser.evaluate("document.getElementById('message').getBoundingClientRect().top")
         assert box > 200, "the message covers the middle of the window"
         way_out()
@@ -174,8 +174,8 @@ def test_a_message_is_dismissed_by_button_by_escape_and_by_a_valid_address(brows
 ERROR_BY_INVALID_CAMERA = {
     "0": "no camera 0, only 3", "4": "no camera 4, only 3", "-1": "9 numbers", "1,2,3": "9 numbers",
     "1,2,3,0,0,0,0,1": "no unit quaternion", "1,2,3,1,0,0,0,1e9": "focal length", "1,2,3,1,0,0,0,nan": "9 numbers",
-    "1,2,3,1,0,0,0,": "9 numbers", "{": "names no camera", "[1]": "9 numbers", "null": "9 numbers",
-    '{"width": 1}': "needs width", "%E0%A4%A": "names no camera", "<b>x</b>": "9 numbers",
+    "1,2,3,1,0,0,0,": "9 numbers", "{": "cannot be used", "[1]": "9 numbers", "null": "9 numbers",
+    '{"width": 1}': "needs width", "%E0%A4%A": "cannot be used", "<b>x</b>": "9 numbers",
 }  # fmt: skip
 
 
@@ -185,7 +185,7 @@ def test_invalid_cameras_in_the_address_are_reported_and_the_scene_is_shown(brow
     for text, words in ERROR_BY_INVALID_CAMERA.items():
         browser.evaluate(f"location.hash = 'camera=' + {json.dumps(text)}")
         said = wait_for_message(browser)
-        assert words in said and said.startswith("The address names no camera that can be used: "), text
+        assert words in said and said.startswith("The camera in the address cannot be used: "), text
         browser.press("Escape")
         wait_until(browser, "document.getElementById('message').hidden")
         np.testing.assert_array_equal(window_camera(browser).camera_from_world, home.camera_from_world)

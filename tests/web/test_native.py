@@ -226,7 +226,7 @@ def test_a_restored_device_shows_the_same_view(browser: Browser, tmp_path: Path)
         assert browser.evaluate("JSON.stringify(hyrfpack.camera())") == before
         sizes = "hyrfpack.player.renderer.graphics.made.size, hyrfpack.player.renderer.content.graphics.made.size"
         made.append(browser.evaluate(f"[{sizes}]"))
-    assert "taken away" in browser.evaluate("said[0]") and browser.evaluate("said.at(-1)") == ""
+    assert "was lost" in browser.evaluate("said[0]") and browser.evaluate("said.at(-1)") == ""
     # The counts must not grow; they vary a little with what the last picture needed.
     assert all(last - first < 5 for first, last in zip(made[0], made[-1], strict=True)), made
     camera = make_cameras()[0]

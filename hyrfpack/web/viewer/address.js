@@ -80,7 +80,7 @@ export function parseCamera(text, scene) {
     if (text.startsWith("{")) return { view: viewOf(JSON.parse(text), scene) };
     return parseCompactCamera(text, scene);
   } catch ({ message }) {
-    throw new Error(`The address names no camera that can be used: ${message}.`);
+    throw new Error(`The camera in the address cannot be used: ${message}.`);
   }
 }
 

@@ -4,7 +4,7 @@
 {
   // Decompresses a JSON text in base64.
   const unpack = async (text) => {
-    if (!window.DecompressionStream) throw new Error("This browser is too old for this page; take a newer one.");
+    if (!window.DecompressionStream) throw new Error("This browser is too old for this page; use a newer one.");
     const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
     const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
     return JSON.parse(await new Response(stream).text());

@@ -11,7 +11,7 @@ export class Loader {
   // promise resolves to whether the content is shown. `progress({what, part})` is called with the fraction `part` of the step
   // `what`.
   constructor({ content, progress }) {
-    if (!window.DecompressionStream) throw new Error("This browser is too old to unpack the scene; take a newer one.");
+    if (!window.DecompressionStream) throw new Error("This browser is too old to unpack the scene; use a newer one.");
     Object.assign(this, { content, progress });
     this.ticket = 0;
     this.waiting = new Map(); // ticket -> the function that resolves the promise of its order

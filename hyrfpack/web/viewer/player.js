@@ -28,7 +28,7 @@ const MAX_STEP_SECONDS = 0.25; // longer frames do not move the eye farther
 const COLORING_RATIO = 0.25; // the share of a frame that is used for colours while moving
 const PROGRESS_RANGES = { loading: [0, 0.3], unpacking: [0.3, 0.6], preparing: [0.6, 1] };
 
-const DEVICE_LOST_TEXT = "The graphics device was taken away, or another scene opened, meanwhile; try again.";
+const DEVICE_LOST_TEXT = "Meanwhile the graphics device was lost, or another scene opened; try again.";
 
 export class Player extends EventTarget {
   // A player without a scene gets one by `open`. Throws an Error with a sentence where the browser cannot draw.
@@ -101,7 +101,7 @@ export class Player extends EventTarget {
     } catch (error) {
       const { message } = error;
       if (error instanceof SupersededError) return;
-      throw new Error(`The scene cannot be unpacked; if this page is not whole, fetch it again (${message}).`);
+      throw new Error(`The scene cannot be unpacked; if this page is truncated, fetch it again (${message}).`);
     }
   }
 
@@ -245,7 +245,7 @@ export class Player extends EventTarget {
     countContextChange(this.renderer.gl);
     this.loaded = false;
     this.idle = false; // the picture is not complete until the device is restored
-    this.emit("remark", "The graphics device was taken away; the picture comes back with it.");
+    this.emit("remark", "The graphics device was lost; drawing resumes when it is back.");
   }
 
   // Handles the restored context, whose objects are all lost.

@@ -12,7 +12,7 @@ export class Renderer {
   constructor(canvas) {
     const contextOptions = { alpha: false, antialias: false, depth: false, powerPreference: "high-performance" };
     const gl = canvas.getContext("webgl2", contextOptions);
-    if (!gl) throw new Error("This browser offers no WebGL 2, which drawing needs; switch it on or take another one.");
+    if (!gl) throw new Error("This page needs WebGL 2, which this browser lacks; enable it or use another browser.");
     gl.getError(); // clears the error of a context that was lost before
     this.gl = gl;
     this.graphics = new Graphics(gl);

@@ -14,7 +14,7 @@ export async function shareView(camera, exposure, includesScene) {
   } catch {
     // pages without an address of their own, as in srcdoc, cannot change it
   }
-  const ending = includesScene ? "." : "; it does not hold the file that you opened.";
+  const ending = includesScene ? "." : "; it does not include the opened file.";
   const copied = `The link to this view is copied${ending}`;
   try {
     await navigator.clipboard.writeText(address.href);

@@ -87,7 +87,7 @@ function queueDecoding(partial) {
 
 function reportError(error) {
   const isOutOfMemory = error instanceof RangeError; // thrown for arrays that are too long
-  postMessage({ error: isOutOfMemory ? "It takes more memory than there is; open a smaller one." : error.message });
+  postMessage({ error: isOutOfMemory ? "There is not enough memory; open a smaller file." : error.message });
 }
 
 // Takes a piece of the file, and starts to decode the first layer when it is complete.
@@ -134,7 +134,7 @@ function identifyFile(bytes, before) {
 // Throws the error for a file that is too long.
 function rejectLongFile() {
   if (kind === "model") describe(gatherBytes()); // throws the error about the length
-  throw new Error("It is longer than 4 GiB; open a smaller one.");
+  throw new Error("It is larger than 4 GiB; open a smaller one.");
 }
 
 // Returns all bytes so far as one array.
