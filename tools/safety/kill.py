@@ -34,6 +34,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import torch
 from PIL import Image
@@ -64,6 +65,7 @@ WRITTEN_FOLDERS = (
 POLL_SECONDS = 2e-4  # interval of looking for temporary files
 MAX_KILL_DELAY_SECONDS = 2e-3  # longest delay of the kill after a temporary file appears
 RERUN_EVERY = 5
+TIME_KEYS = {"seconds", "steps_per_second", "stage_seconds", "seconds_per_frame"}  # of metrics.json
 
 
 @dataclass
@@ -132,13 +134,11 @@ def wait_for_temporary_files(process: subprocess.Popen, folder: Path, count: int
     return len(seen)
 
 
-def drop_times(metrics: bytes) -> dict:
-    """Return a run's metrics without the measured times."""
-    values = json.loads(metrics)
-    for key in ("seconds", "steps_per_second", "stage_seconds"):
-        del values[key]
-    del values["evaluation"]["seconds_per_frame"]
-    return values
+def drop_times(value: Any) -> Any:
+    """Return values of JSON without the measured times that dictionaries at any depth contain."""
+    if isinstance(value, dict):
+        return {key: drop_times(item) for key, item in value.items() if key not in TIME_KEYS}
+    return [drop_times(item) for item in value] if isinstance(value, list) else value
 
 
 def find_file_fault(name: str, data: bytes, case: Case) -> str | None:
@@ -153,7 +153,7 @@ def find_file_fault(name: str, data: bytes, case: Case) -> str | None:
             same = hashlib.sha256(data[:-DIGEST_BYTES]).digest() == data[-DIGEST_BYTES:]
             torch.load(io.BytesIO(data[:-DIGEST_BYTES]), weights_only=True)
         elif base == METRICS_FILE:
-            same = drop_times(data) == drop_times(case.new[name])
+            same = drop_times(json.loads(data)) == drop_times(json.loads(case.new[name]))
         elif base == RECORD:
             same = set(json.loads(data)["stages"]) <= set(json.loads(case.new[name])["stages"])
         else:
