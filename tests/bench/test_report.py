@@ -149,7 +149,7 @@ def test_mistakes_of_the_user_are_a_clear_error(model, tmp_path):
     assert "not a .hyrf file" in refused("bench", tmp_path / "bad.hyrf")
     assert "nowhere" in refused("bench", model, "--data", tmp_path / "nowhere")
     assert "'nothing' is not one of" in refused("bench", model, "--only", "nothing")
-    assert "name the model too" in refused("bench", "--data", tmp_path)
+    assert "name the MODEL, too" in refused("bench", "--data", tmp_path)
     assert "plot is written as" in refused("bench", model, "-o", tmp_path / "plot.txt")
 
 

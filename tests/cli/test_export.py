@@ -94,7 +94,7 @@ def test_options_choose_what_is_written(model, tmp_path):
     result = succeeded(*arguments, "-o", tmp_path / "a.spz")
     back = read_splats(tmp_path / "a.spz")
     assert len(back) == (GAUSSIAN_POSITIONS[:, 2] <= 0).sum() and back.degree == 1
-    assert result.stdout.count("\n") == 1 and "nothing is measured" in result.stderr
+    assert result.stdout.count("\n") == 1 and "quality is not measured" in result.stderr
 
 
 def test_cameras_and_points_are_counted(model, tmp_path):

@@ -242,7 +242,7 @@ def test_the_distortion_is_lowered_until_the_drop_on_training_photos_is_met(
     monkeypatch.setattr(running.Packer, "decode", lambda packer, trial: trial.data)
     monkeypatch.setattr(
         running,
-        "evaluate",
+        "evaluate_model",
         lambda shown, views, report: SimpleNamespace(psnr=30.0 if shown is None else 30.0 - psnr_drop(shown)),
     )
 

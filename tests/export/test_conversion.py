@@ -95,7 +95,7 @@ def test_lost_harmonics_are_reported(tmp_path):
     hyrfpack.convert_splats(
         write_splats(tmp_path, ".ply", ball_splats(GAUSSIAN_COUNT, degree=3)), tmp_path / "a.splat", say=messages.append
     )
-    assert messages == [".splat holds no harmonics above degree 0; those of degree 3 are lost"]
+    assert messages == [".splat stores harmonics up to degree 0; higher ones, up to degree 3, are lost"]
 
 
 def test_progress_is_reported_in_order(tmp_path):

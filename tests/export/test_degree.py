@@ -42,8 +42,8 @@ def test_direction_dependent_colors_get_a_higher_degree_and_the_reason_is_report
     source, said = write_model(tmp_path / "m.hyrf", 4.0, ring(40)), []
     report = export_model(source, tmp_path / "a.ply", say=said.append)
     assert report.degree >= 2 and report.degree == lowest_degree_within_tolerance(report.chosen_by)
-    told = f"degree {report.degree} it is: {', '.join(f'{score:.2f}' for score in report.chosen_by.values())} dB"
-    assert any(sentence.startswith(told) for sentence in said)
+    reason = f"chosen degree {report.degree}: {', '.join(f'{score:.2f}' for score in report.chosen_by.values())} dB"
+    assert any(sentence.startswith(reason) for sentence in said)
 
 
 def test_a_given_degree_is_not_compared_with_others(tmp_path, monkeypatch):

@@ -331,7 +331,7 @@ def test_real_photos_in_millimetres_and_kilometres_give_the_same_quality(shared_
 def test_photos_that_are_all_masked_are_rejected_with_a_clear_error(tmp_path):
     with pytest.raises(
         HyrfTrainingError,
-        match="balls: the masks of all [0-9]+ photos to train on leave no pixel, 000.png for one; check",
+        match="balls: the masks of all [0-9]+ photos to train on leave no pixels .for example, 000.png.; check",
     ):
         train_model(scene_with_edited_photos(mask_all), tmp_path, TrainConfig(steps=8, max_gaussians=60), quiet=True)
 

@@ -75,7 +75,7 @@ def test_an_interrupt_in_each_stage_loses_no_work(after, uninterrupted_products,
 
 def test_an_interrupted_training_resumes_from_the_checkpoint(uninterrupted_products, posed, tmp_path, signals):
     def stop(progress):
-        if progress.words[:1] == ("5/9",):
+        if progress.words[:1] == ("step 5/9",):
             signal.raise_signal(signal.SIGTERM)
 
     with pytest.raises(Stopped, match="stopped in training"):
@@ -83,7 +83,7 @@ def test_an_interrupted_training_resumes_from_the_checkpoint(uninterrupted_produ
     assert (tmp_path / "scene.work" / "run" / "checkpoint.pt").is_file()
     words = []
     result = make_scene(posed, tmp_path / "scene.html", report=lambda progress: words.extend(progress.words[:1]))
-    assert "6/9" in words and "5/9" not in words
+    assert "step 6/9" in words and "step 5/9" not in words
     assert read_products(result.work) == uninterrupted_products
 
 
@@ -201,7 +201,7 @@ def test_the_time_of_interrupted_and_killed_calls_is_included(posed, tmp_path, m
 
 def test_a_kill_loses_no_finished_work(uninterrupted_products, posed, tmp_path):
     child = start_child(posed, tmp_path / "scene.html")
-    assert any(line.strip() == "training 4/9" for line in child.stdout)
+    assert any(line.strip() == "training step 4/9" for line in child.stdout)
     child.kill()
     child.communicate()
     assert child.returncode == -signal.SIGKILL

@@ -69,7 +69,7 @@ def test_scoring_after_the_last_step_is_part_of_the_training_progress():
     shown.step(1, 0.1, 0.01, 500)
     assert messages[-1].share == 0.75 and messages[-1].left > 0
     shown.phase("scoring held-out photos", 1, 2)
-    assert messages[-1].share == 0.875 and messages[-1].words == ("scoring held-out photos", "1/2")
+    assert messages[-1].share == 0.875 and messages[-1].words == ("scoring held-out photos 1/2",)
 
 
 # -- inputs and outputs ----------------------------------------------------------------------------------------------

@@ -60,7 +60,7 @@ def stopped_after_matching(photos_and_poses, tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("stopped") / "scene"
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
         workers = record_processes(patch)
-        hyrfpack.estimate_poses(photos_and_poses[0], out, report=stop_at("at once"))
+        hyrfpack.estimate_poses(photos_and_poses[0], out, report=stop_at("global mapping"))
     assert len(workers) == 3 and all(worker.poll() is not None for worker in workers)
     return out
 

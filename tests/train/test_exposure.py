@@ -224,7 +224,9 @@ def test_an_interrupted_run_continues_to_the_same_bytes(tmp_path):
 
 
 def test_exposure_of_photos_with_transparency_is_rejected():
-    with pytest.raises(HyrfTrainingError, match=r"balls: photos with transparency .*leave out `exposure`"):
+    with pytest.raises(
+        HyrfTrainingError, match=r"balls: per-image gains do not work with transparent photos.*leave out `exposure`"
+    ):
         Trainer(ball_scene(4, alpha=True), SHORT_CONFIG)
 
 

@@ -48,12 +48,12 @@ def make_split_scene(train=lambda view: view, test=lambda view: view) -> Scene:
 
 
 def test_black_masks_of_all_photos_are_rejected_before_the_first_step(fail_at_first_step, tmp_path):
-    with pytest.raises(HyrfTrainingError, match=r"all 4 photos to train on leave no pixel, 002\.png for one"):
+    with pytest.raises(HyrfTrainingError, match=r"all 4 photos to train on leave no pixels \(for example, 002\.png\)"):
         train_model(make_split_scene(train=mask_all_pixels), tmp_path, TINY_TRAIN_CONFIG, quiet=True)
 
 
 def test_black_masks_of_all_held_out_photos_are_rejected_before_the_first_step(fail_at_first_step, tmp_path):
-    with pytest.raises(HyrfTrainingError, match=r"all 2 photos to score leave no pixel, 000\.png for one"):
+    with pytest.raises(HyrfTrainingError, match=r"all 2 photos to score leave no pixels \(for example, 000\.png\)"):
         train_model(make_split_scene(test=mask_all_pixels), tmp_path, TINY_TRAIN_CONFIG, quiet=True)
 
 

@@ -194,7 +194,7 @@ def test_a_long_run_prints_once_how_to_shorten_it(tmp_path, capsys, monkeypatch)
     for name in ("MIN_ADVICE_STEPS", "MIN_ADVICE_SECONDS", "MIN_ADVICE_SECONDS_LEFT"):
         monkeypatch.setattr(progress, name, 0)
     train_model(make_scene(), tmp_path, dataclasses.replace(RUN_CONFIG, steps=8))
-    (messages,) = [line for line in capsys.readouterr().err.splitlines() if "more hours" in line]
+    (messages,) = [line for line in capsys.readouterr().err.splitlines() if "hours remain" in line]
     assert all(way in messages for way in ("fewer steps", "smaller photos", "fewer Gaussians", "a GPU"))
 
 
