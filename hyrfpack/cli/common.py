@@ -128,6 +128,14 @@ def scene_options(command: Command) -> Command:
     return with_options
 
 
+seed_option = click.option(
+    "--seed",
+    type=SEED,
+    metavar="N",
+    default=0,
+    show_default=True,
+    help="Random seed. On a CPU, the same seed gives the same file.",
+)
 device_option = click.option(
     "--device",
     metavar="NAME",

@@ -10,7 +10,6 @@ import click
 from hyrfpack.cli.common import (
     OUTPUT,
     PATH,
-    SEED,
     choose_command_device,
     device_option,
     format_table,
@@ -20,6 +19,7 @@ from hyrfpack.cli.common import (
     overwrite_option,
     print_json,
     reject_nan,
+    seed_option,
 )
 from hyrfpack.cli.progress import show_progress
 from hyrfpack.outputs import Outputs
@@ -58,14 +58,7 @@ if TYPE_CHECKING:
     metavar="PATH",
     help="Cameras to learn from: a JSON file (also of nerfstudio or 3DGS), or a folder of photos and poses.",
 )
-@click.option(
-    "--seed",
-    type=SEED,
-    metavar="N",
-    default=0,
-    show_default=True,
-    help="Random seed. On a CPU, the same seed gives the same file.",
-)
+@seed_option
 @device_option
 @overwrite_option
 @json_option

@@ -11,7 +11,6 @@ from hyrfpack.choices import MATCHING_METHODS, PRESETS, QUALITIES
 from hyrfpack.cli.common import (
     OUTPUT,
     PATH,
-    SEED,
     SIZE,
     choose_command_device,
     format_consistent_psnr,
@@ -21,6 +20,7 @@ from hyrfpack.cli.common import (
     overwrite_option,
     print_json,
     reject_nan,
+    seed_option,
 )
 from hyrfpack.cli.live import serve_training_view, view_options
 
@@ -76,14 +76,7 @@ MAX_LISTED_PHOTOS = 5
     "--work", type=OUTPUT, metavar="DIR", help="Folder of intermediate results.  [default: the name of FILE with .work]"
 )
 @click.option("--device", metavar="NAME", default="auto", show_default=True, help="Device: cpu, cuda, cuda:N.")
-@click.option(
-    "--seed",
-    type=SEED,
-    metavar="N",
-    default=0,
-    show_default=True,
-    help="Random seed. On a CPU, the same seed gives the same file.",
-)
+@seed_option
 @view_options
 @overwrite_option
 @json_option

@@ -11,7 +11,6 @@ from hyrfpack.choices import PRESETS
 from hyrfpack.cli.common import (
     OUTPUT,
     PATH,
-    SEED,
     SIZE,
     choose_command_device,
     device_options,
@@ -23,6 +22,7 @@ from hyrfpack.cli.common import (
     print_json,
     read_scene,
     scene_options,
+    seed_option,
 )
 from hyrfpack.cli.live import serve_training_view, view_options
 from hyrfpack.cli.processes import processes_option
@@ -56,14 +56,7 @@ BACKGROUND_COLORS = ("black", "white", "random")
 @click.option(
     "--preset", type=click.Choice(PRESETS), default="auto", show_default=True, help="Kind of scene; auto detects it."
 )
-@click.option(
-    "--seed",
-    type=SEED,
-    metavar="N",
-    default=0,
-    show_default=True,
-    help="Random seed. On a CPU, the same seed gives the same file.",
-)
+@seed_option
 @scene_options
 @click.option("--background/--no-background", default=None, help="Train a background sphere.  [default: by preset]")
 @click.option(
