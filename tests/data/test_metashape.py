@@ -84,7 +84,7 @@ def test_cameras_of_a_real_flight_match_the_records_of_the_aircraft(tmp_path, pi
 
     scene = load_scene(tmp_path, test_every=0)
 
-    assert any("placed on the Earth" in note for note in scene.notes)
+    assert any("georeferenced" in note for note in scene.notes)
     rotation, shift = (
         _parse_numbers(CHUNK_ROTATION, 9, "").reshape(3, 3),
         _parse_numbers(CHUNK_TRANSLATION, 3, ""),

@@ -48,7 +48,7 @@ def test_recorded_cameras_replace_missing_corrected_ones_with_a_note(folder):
 
     scene = load_scene(folder, test_every=0)
 
-    assert scene.views[0].camera.position[0] == 0 and "the phone tracked" in scene.notes[0]
+    assert scene.views[0].camera.position[0] == 0 and "tracked by the phone" in scene.notes[0]
 
 
 @pytest.mark.parametrize(

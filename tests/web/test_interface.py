@@ -324,7 +324,7 @@ def test_without_webgl_the_poster_and_a_message_are_shown_and_no_buttons(browser
     (tmp_path / "page.html").write_bytes(make_splats_page(random_splats(50), poster=ONE_PIXEL_POSTER))
     with browser.before_every_page("HTMLCanvasElement.prototype.getContext = () => null"):
         browser.open((tmp_path / "page.html").as_uri())
-        assert "no WebGL 2" in wait_for_message(browser)
+        assert "needs WebGL 2" in wait_for_message(browser)
     assert not is_hidden(browser, "poster")
     assert all(is_hidden(browser, name) for name in ("panel", "toggle", "loading"))
     assert browser.evaluate("document.getElementById('message').getBoundingClientRect().top") > 600
