@@ -178,15 +178,15 @@ def test_splats_of_other_programs_are_distilled_on_a_gpu(gpu, few_pictures, tmp_
         "hyrfpack.data.PictureCache.stream", lambda cache, views: ((view, cache.get(view)) for view in views)
     )
     monkeypatch.setattr("hyrfpack.distill.pack.MAX_TRIALS", 1)
-    taught = []
-    monkeypatch.setattr("hyrfpack.distill.fit.pack", lambda learnt, *rest: taught.append(learnt) or pack(learnt, *rest))
+    packed = []
+    monkeypatch.setattr("hyrfpack.distill.fit.pack", lambda learnt, *rest: packed.append(learnt) or pack(learnt, *rest))
     cameras = [camera_at(place, width=12, height=12) for place in ((0.0, -3, 0.5), (0.0, 3, 0.5), (3.0, 0, -0.5))]
     quick = DistillConfig(steps=1, test_views=2, psnr=12)
     reports = [
         distill_splats(ball_splats(12), tmp_path / f"{device}.hyrf", quick, cameras=cameras, device=device)
         for device in ("cpu", "cuda")
     ]
-    places = [(t.model.gaussians.positions.device, t.test.pictures[0].device) for t in taught]
+    places = [(t.model.gaussians.positions.device, t.test.pictures[0].device) for t in packed]
     assert places == [2 * (torch.device("cpu"),), 2 * (gpu,)]
     here, there = (report.psnr_unpacked for report in reports)
     assert there == pytest.approx(here, abs=0.05)

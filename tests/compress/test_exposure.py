@@ -97,13 +97,13 @@ def test_with_a_map_fitted_gains_are_relative_to_the_map(model_file, scene, tmp_
 def test_finetuning_keeps_the_mean_exposure_and_its_note_in_the_file(
     model_file, file_without_exposure_note, scene, mean_exposure_views, tmp_path
 ):
-    scores, told = [], []
+    scores, notes_found = [], []
     for source in (model_file, file_without_exposure_note):
         compress_model(source, tmp_path / "small.hyrf", data=scene, finetune_steps=160)
         scores.append(evaluate_model(load_model(tmp_path / "small.hyrf"), mean_exposure_views).psnr)
-        told.append(has_mean_exposure(describe_file(tmp_path / "small.hyrf")["provenance"]))
+        notes_found.append(has_mean_exposure(describe_file(tmp_path / "small.hyrf")["provenance"]))
 
-    assert told == [True, False]
+    assert notes_found == [True, False]
     assert scores[0] > scores[1] + 1
 
 

@@ -99,14 +99,14 @@ def _near_cell_boundary(resolution: int, share: float, ulps: int) -> float:
     return float(np.clip(place, 0, 1))
 
 
-COORDINATES = st.one_of(
+COORDINATE_STRATEGY = st.one_of(
     st.builds(_near_cell_boundary, st.sampled_from(LEVEL_RESOLUTIONS), st.floats(0, 1), st.integers(-3, 3)),
     st.floats(0, 1, width=32),
 )
 
 
 @settings(max_examples=100, deadline=None)
-@given(st.lists(st.tuples(COORDINATES, COORDINATES, COORDINATES), min_size=1, max_size=8))
+@given(st.lists(st.tuples(COORDINATE_STRATEGY, COORDINATE_STRATEGY, COORDINATE_STRATEGY), min_size=1, max_size=8))
 def test_points_on_cell_boundaries_encode_as_in_float64(points: list[tuple]) -> None:
     """Rounding may move a point to the next cell, which changes nothing because interpolation is continuous."""
     coords, upstream = torch.tensor(points, dtype=torch.float32), 2 * _uniform(len(points), 8, seed=2) - 1

@@ -511,7 +511,7 @@ def _log_uniform(low: float, high: float) -> st.SearchStrategy[float]:
 
 # x/z and y/z; the picture reaches from -0.5 to 0.5.
 VIEWING_SLOPES = st.floats(-1.5, 1.5)
-DEPTHS = st.one_of(
+DEPTH_STRATEGY = st.one_of(
     st.sampled_from([0.01, 0.0100001, 0.011, 1.0, 1.0]),
     st.floats(-0.02, 0.05),
     _log_uniform(0.01, 1e6),
@@ -521,7 +521,7 @@ DEPTHS = st.one_of(
 
 def _gaussian(opacity: st.SearchStrategy[float]) -> st.SearchStrategy[tuple]:
     return st.tuples(
-        st.tuples(VIEWING_SLOPES, VIEWING_SLOPES, DEPTHS),
+        st.tuples(VIEWING_SLOPES, VIEWING_SLOPES, DEPTH_STRATEGY),
         st.tuples(*[_log_uniform(1e-6, 1e2)] * 3),
         st.tuples(*[st.floats(-1, 1)] * 4, _log_uniform(1e-20, 1e10)),
         opacity,

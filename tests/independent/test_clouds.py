@@ -55,7 +55,7 @@ def _read_planar_as_interleaved(splats: Splats) -> Splats:
 
 
 CONDON_SHORTLEY_SIGNS = np.array([1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1.0])[:, None]
-CORRUPTIONS = {
+CORRUPTIONS_BY_NAME = {
     "x mirrored": _multiply("positions", [-1, 1, 1]),
     "y and z exchanged": _reorder("positions", 1, [0, 2, 1]),
     "turned about x, colours too": lambda splats: splats.rotated(HALF_TURN_ABOUT_X),
@@ -80,10 +80,10 @@ CORRUPTIONS = {
 }
 
 
-@pytest.mark.parametrize("corruption", CORRUPTIONS)
+@pytest.mark.parametrize("corruption", CORRUPTIONS_BY_NAME)
 def test_the_loosest_precision_detects(corruption):
     splats = sample_splats(3)
-    wrong = CORRUPTIONS[corruption](splats)
+    wrong = CORRUPTIONS_BY_NAME[corruption](splats)
     assert not compare_clouds(cloud_from_splats(splats), cloud_from_splats(wrong)).is_within(LOOSEST_PRECISION)
 
 

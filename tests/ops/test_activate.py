@@ -12,7 +12,7 @@ from torch import Tensor
 
 from hyrfpack.ops.activate import activate_geometry, scale_bounds
 
-IMPLEMENTATIONS = ["reference", pytest.param("gpu", marks=needs_triton)]
+TESTED_IMPLEMENTATIONS = ["reference", pytest.param("gpu", marks=needs_triton)]
 SCALE_RULES = ["sum", "product"]
 HALF_EXTENT = (1.0, 0.5, 0.25)
 RAW_LAYOUTS: dict[str, Callable[[Tensor], Tensor]] = {
@@ -95,13 +95,13 @@ def test_the_reference_passes_gradcheck_with_positions(rule: str, half_extent: t
     )
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 @pytest.mark.parametrize("count", [0, 1, 127, 128, 129])
 def test_any_number_of_gaussians_matches_float64(count: int, implementation: str) -> None:
     assert_matches_float64(make_inputs(count), "by rows", implementation, half_extent=HALF_EXTENT)
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 @pytest.mark.parametrize("half_extent", [None, HALF_EXTENT, (3, 1, 2)])
 @pytest.mark.parametrize("rule", SCALE_RULES)
 @pytest.mark.parametrize("layout", RAW_LAYOUTS)
@@ -111,7 +111,7 @@ def test_all_rules_and_layouts_match_float64(
     assert_matches_float64(make_inputs(7), layout, implementation, rule=rule, half_extent=half_extent)
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 @pytest.mark.parametrize("count", [0, 1, 130])
 @pytest.mark.parametrize("layout", ["by columns", "part of wider rows"])
 def test_layouts_with_any_number_of_gaussians_match_float64(layout: str, count: int, implementation: str) -> None:
@@ -128,7 +128,7 @@ def test_the_gradient_of_raw_keeps_its_layout(layout: str, count: int) -> None:
     assert gradient.stride() == raw.stride()
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 def test_overlapping_rows_of_raw_add_their_gradients(implementation: str) -> None:
     """A number that belongs to several rows receives the gradient of each."""
     line = place_float32(random_values(16), implementation).requires_grad_()
@@ -140,7 +140,7 @@ def test_overlapping_rows_of_raw_add_their_gradients(implementation: str) -> Non
     assert found.tolist() == quats_with
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 def test_layouts_of_the_other_inputs_have_no_effect(implementation: str) -> None:
     stored, positions, scale_logits, opacity_logits = (
         place_float32(tensor, implementation) for tensor in make_inputs(9)
@@ -156,7 +156,7 @@ def test_layouts_of_the_other_inputs_have_no_effect(implementation: str) -> None
 
 
 @pytest.mark.filterwarnings("ignore:overflow encountered in exp")  # a warning of numpy in the interpreter; 1 / inf is 0
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 @pytest.mark.parametrize("rule", SCALE_RULES)
 def test_logits_of_any_size_match_float64(rule: str, implementation: str) -> None:
     logits = torch.tensor([-80.0, -40.0, -5.0, 0.0, 5.0, 40.0, 80.0]).double()
@@ -167,7 +167,7 @@ def test_logits_of_any_size_match_float64(rule: str, implementation: str) -> Non
     assert_matches_float64(tensors, "by rows", implementation, rule=rule, half_extent=HALF_EXTENT)
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 def test_distant_centres_match_float64(implementation: str) -> None:
     stored, _, *logits = make_inputs(12)
     directions = torch.nn.functional.normalize(random_values(12, 3, seed=1), dim=1)
@@ -175,7 +175,7 @@ def test_distant_centres_match_float64(implementation: str) -> None:
     assert_matches_float64([stored, positions, *logits], "by rows", implementation, half_extent=HALF_EXTENT)
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 def test_expanded_upstream_gradients_are_supported(implementation: str) -> None:
     stored, positions, *logits = (place_float32(tensor, implementation) for tensor in make_inputs(6))
     leaves = [leaf.clone().requires_grad_() for leaf in (stored[:, :8], *logits)]
@@ -187,7 +187,7 @@ def test_expanded_upstream_gradients_are_supported(implementation: str) -> None:
     assert all(map(torch.equal, found, wanted)) and all(gradient.all() for gradient in found)
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 def test_missing_upstream_gradients_are_supported(implementation: str) -> None:
     stored, positions, *logits = (place_float32(tensor, implementation) for tensor in make_inputs(6))
     leaves = [leaf.clone().requires_grad_() for leaf in (stored[:, :8], *logits)]
@@ -202,7 +202,7 @@ def test_missing_upstream_gradients_are_supported(implementation: str) -> None:
     torch.testing.assert_close(leaves[2].grad, slope[:, None])
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 @pytest.mark.parametrize("learnt", [0, 1, 2])
 @pytest.mark.parametrize("rule", SCALE_RULES)
 def test_the_gradient_of_a_single_input_can_be_requested(rule: str, learnt: int, implementation: str) -> None:
@@ -235,7 +235,7 @@ NAN_OUTPUTS_BY_INPUT = {
 }
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 @pytest.mark.parametrize("rule", SCALE_RULES)
 @pytest.mark.parametrize("where", NAN_OUTPUTS_BY_INPUT)
 def test_nan_inputs_give_nan_outputs(where: str, rule: str, implementation: str) -> None:
@@ -268,7 +268,7 @@ def test_the_kernel_is_not_used_where_positions_need_a_gradient() -> None:
         torch.testing.assert_close(part, expected.detach())
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 @pytest.mark.parametrize(
     "shapes",
     [

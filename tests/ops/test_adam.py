@@ -10,7 +10,7 @@ from torch import Tensor
 from hyrfpack.ops.adam import adam_step
 from hyrfpack.parallel import has_numba
 
-IMPLEMENTATIONS = ["reference", "cpu", pytest.param("gpu", marks=needs_triton)]
+TESTED_IMPLEMENTATIONS = ["reference", "cpu", pytest.param("gpu", marks=needs_triton)]
 LEARNING_RATE = 1e-2
 
 
@@ -58,7 +58,7 @@ GROUPS_AND_STEPS = {
 }
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 @pytest.mark.parametrize("case", GROUPS_AND_STEPS)
 def test_a_step_matches_the_float64_reference(implementation: str, case: str) -> None:
     group, step = GROUPS_AND_STEPS[case]
@@ -76,7 +76,7 @@ def test_a_step_matches_the_float64_reference(implementation: str, case: str) ->
         torch.testing.assert_close(exp_avg_sq[i].double(), expected[2][i], rtol=1e-5, atol=1e-37)
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 def test_twenty_steps_match_torch(implementation: str) -> None:
     shapes = [(40, 3), (7,), (300, 2)]
     values = make_group(shapes)[0]
@@ -114,7 +114,7 @@ def test_cpu_has_the_bits_of_torch_fused() -> None:
         assert all(torch.equal(moment, adam.state[p][name]) for moment, p in zip(ours, theirs, strict=True))
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf"), 1e30, -1e30])
 @pytest.mark.parametrize("place", [(0, 0), (0, 2999), (1, 4)])
 def test_an_element_with_a_broken_gradient_is_reported_and_not_changed(implementation: str, bad: float, place) -> None:
@@ -133,7 +133,7 @@ def test_an_element_with_a_broken_gradient_is_reported_and_not_changed(implement
         torch.testing.assert_close(new, alone, rtol=1e-6, atol=1e-6)
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 def test_each_tensor_may_have_its_own_step_and_rate(implementation: str) -> None:
     steps, rates, shapes = [1, 9, 3, 9], [1e-2, 3e-3, 3e-3, 3e-3], [(1500, 2), (7,), (64, 3), (1,)]
     group = [
@@ -147,7 +147,7 @@ def test_each_tensor_may_have_its_own_step_and_rate(implementation: str) -> None
         assert all(torch.equal(some[place], one[0]) for some, one in zip(together, alone, strict=True))
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 def test_gradients_of_any_layout_and_unaligned_tensors_are_supported(implementation: str) -> None:
     group = make_group([(50, 3), (11, 2)], step=3)
     expected, _ = step_group(group, implementation, step=3)
@@ -162,7 +162,7 @@ def test_gradients_of_any_layout_and_unaligned_tensors_are_supported(implementat
         torch.testing.assert_close([tensor.cpu() for tensor in tensors], others, rtol=1e-6, atol=1e-6)
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 def test_parameters_that_need_gradients_are_stepped(implementation: str) -> None:
     group = make_group([(10,)])
     parameter = (gpu if implementation == "gpu" else torch.clone)(group[0][0].clone()).requires_grad_()

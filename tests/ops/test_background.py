@@ -24,7 +24,7 @@ from hyrfpack.ops.background import (
 from hyrfpack.ops.hash_encode import level_offsets, level_resolutions
 from hyrfpack.ops.shade.directions import DIRECTION_FEATURES
 
-IMPLEMENTATIONS = ["reference", pytest.param("gpu", marks=needs_triton)]
+TESTED_IMPLEMENTATIONS = ["reference", pytest.param("gpu", marks=needs_triton)]
 
 
 def uniform(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -141,7 +141,7 @@ BACKGROUND_CASES = {
 }
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 @pytest.mark.parametrize("case", BACKGROUND_CASES)
 def test_colors_match_the_float64_reference(implementation: str, case: str) -> None:
     found, expected = (
@@ -164,7 +164,7 @@ def test_mixed_precision_rounds_only_factors(encoding: str) -> None:
     assert (found - expected).abs().mean() < 0.2 * (exact - expected).abs().mean()
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 @pytest.mark.parametrize("distance", [1e3, 1e5])
 @pytest.mark.parametrize("past", [0.0, 0.5, 1.5])
 def test_far_cameras_lose_no_more_precision_than_float32_requires(
@@ -181,14 +181,14 @@ def test_far_cameras_lose_no_more_precision_than_float32_requires(
     torch.testing.assert_close(found.double(), expected, rtol=0, atol=1e-4 + 14 * off)
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 @pytest.mark.parametrize(("threshold", "light"), [(1.0, "1"), (0.5, "0.5"), (0.0, "0")])
 def test_nothing_is_drawn_where_the_transmittance_is_below_the_threshold(implementation, threshold, light) -> None:
     found = Case(threshold=threshold, light=light).run(torch.float32, implementation)
     assert found.shape == (7, 11, 3) and not found.any()
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 @pytest.mark.parametrize("stride", [1, 2, 3])
 def test_a_node_is_drawn_if_any_of_its_pixels_needs_it(implementation: str, stride: int) -> None:
     case = Case(height=20, width=17, stride=stride, threshold=0.0, light="one pixel")
@@ -199,7 +199,7 @@ def test_a_node_is_drawn_if_any_of_its_pixels_needs_it(implementation: str, stri
     assert [tuple(node) for node in found.any(-1).nonzero().tolist()] == near
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 @pytest.mark.parametrize("part", ["table", "weights", "biases"])
 def test_nan_inputs_give_nan_outputs(implementation: str, part: str, monkeypatch: pytest.MonkeyPatch) -> None:
     case = Case(light="1")
@@ -250,7 +250,7 @@ def assert_learns_alike(
         torch.testing.assert_close(gradient.double(), other.double(), rtol=0, atol=1e-3 * scale)
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 @pytest.mark.parametrize("name", BACKGROUND_CASES)
 def test_gradients_match_the_float64_reference(implementation: str, name: str) -> None:
     case = BACKGROUND_CASES[name]
@@ -286,7 +286,7 @@ def test_gradients_of_the_field_use_only_kernels(encoding: str, mixed: bool) -> 
         assert (gradient - wanted).norm() < 0.02 * wanted.norm()
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 @pytest.mark.parametrize("learnt", ["table", "weights", "biases"])
 def test_gradients_of_a_part_of_the_field_can_be_requested(learnt: str, implementation: str) -> None:
     case = BACKGROUND_CASES["stride 2"]
@@ -305,7 +305,7 @@ def test_gradients_of_a_part_of_the_field_can_be_requested(learnt: str, implemen
     ]
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 def test_pixels_without_transmittance_give_no_gradient(implementation: str) -> None:
     light, arguments = Case(light="0", threshold=0.0).placed(torch.float32, implementation)
     field = [leaf.requires_grad_() for leaf in field_tensors(arguments)]
@@ -315,7 +315,7 @@ def test_pixels_without_transmittance_give_no_gradient(implementation: str) -> N
     assert not any(leaf.grad.any() for leaf in field)
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 def test_the_transmittance_gets_no_gradient(implementation: str) -> None:
     light, arguments = Case().placed(torch.float32, implementation)
     arguments["table"].requires_grad_()

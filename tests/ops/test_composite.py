@@ -10,7 +10,7 @@ from torch import Tensor
 from hyrfpack.ops.background import grid_size
 from hyrfpack.ops.composite import composite
 
-IMPLEMENTATIONS = ["reference", pytest.param("gpu", marks=needs_triton)]
+TESTED_IMPLEMENTATIONS = ["reference", pytest.param("gpu", marks=needs_triton)]
 NODE_STRIDES = [1, 2, 3, 5]
 # Picture sizes (H, W). At some strides the last node is at the picture's edge, at others past it. The last size is more
 # than one block, also of nodes.
@@ -61,7 +61,7 @@ def place_float32(tensors: list[Tensor], implementation: str) -> list[Tensor]:
     return [gpu(tensor.float()) if implementation == "gpu" else tensor.float() for tensor in tensors]
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 @pytest.mark.parametrize("stride", NODE_STRIDES)
 @pytest.mark.parametrize("size", PICTURE_SIZES)
 def test_values_and_gradients_match_float64(size: tuple[int, int], stride: int, implementation: str) -> None:
@@ -94,7 +94,7 @@ def test_the_reference_passes_gradcheck(stride: int) -> None:
     assert torch.autograd.gradcheck(lambda *leaves: composite(*leaves, stride), leaves)
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 @pytest.mark.parametrize("layout", GRID_LAYOUTS)
 @pytest.mark.parametrize("stride", [1, 2])
 def test_memory_layouts_have_no_effect(stride: int, layout: str, implementation: str) -> None:
@@ -119,7 +119,7 @@ def test_memory_layouts_have_no_effect(stride: int, layout: str, implementation:
         torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 def test_a_gradient_may_be_one_expanded_number(implementation: str) -> None:
     leaves = [leaf.requires_grad_() for leaf in place_float32(make_inputs(4, 7, 3), implementation)]
     composite(*leaves, 3, implementation=implementation).sum().backward()
@@ -129,7 +129,7 @@ def test_a_gradient_may_be_one_expanded_number(implementation: str) -> None:
     torch.testing.assert_close(pulled[2].double(), shares[..., None].expand(2, 3, 3), rtol=1e-6, atol=1e-6)
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 @pytest.mark.parametrize("learnt", [(0,), (1,), (2,), (1, 2), (0, 2)])
 def test_gradients_of_some_inputs_can_be_requested(learnt: tuple[int, ...], implementation: str) -> None:
     leaves = place_float32(make_inputs(5, 8, 2), implementation)
@@ -145,7 +145,7 @@ def test_gradients_of_some_inputs_can_be_requested(learnt: tuple[int, ...], impl
     assert all(torch.equal(some[i].grad, expected[i]) for i in learnt)
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 def test_nothing_is_recorded_where_no_gradient_is_needed(implementation: str) -> None:
     leaves = place_float32(make_inputs(3, 4, 2), implementation)
     assert not composite(*leaves, 2, implementation=implementation).requires_grad
@@ -154,7 +154,7 @@ def test_nothing_is_recorded_where_no_gradient_is_needed(implementation: str) ->
 NAN_CASES = [(8, 8, 2, (2, 1)), (8, 8, 3, (1, 3)), (8, 8, 3, (0, 0)), (5, 9, 1, (4, 3)), (7, 7, 3, (2, 2))]
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 @pytest.mark.parametrize(("height", "width", "stride", "node"), NAN_CASES)
 def test_a_nan_node_affects_only_the_pixels_that_use_it(
     height: int, width: int, stride: int, node: tuple[int, int], implementation: str
@@ -174,7 +174,7 @@ def test_a_nan_node_affects_only_the_pixels_that_use_it(
         assert torch.equal(spoilt[..., 1], apart < stride)
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 @pytest.mark.parametrize("part", [0, 1])
 def test_a_nan_pixel_affects_only_itself(part: int, implementation: str) -> None:
     leaves = place_float32(make_inputs(5, 7, 2), implementation)
@@ -183,7 +183,7 @@ def test_a_nan_pixel_affects_only_itself(part: int, implementation: str) -> None
     assert picture.isnan().any(-1).nonzero().tolist() == [[3, 4]] and picture[3, 4].isnan().all()
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 def test_a_nan_gradient_reaches_only_the_nodes_around_it(implementation: str) -> None:
     leaves = [leaf.requires_grad_() for leaf in place_float32(make_inputs(7, 7, 3), implementation)]
     upstream = torch.zeros_like(leaves[0])
@@ -193,7 +193,7 @@ def test_a_nan_gradient_reaches_only_the_nodes_around_it(implementation: str) ->
     assert grid.isnan().all(-1).nonzero().tolist() == [[1, 0], [1, 1], [2, 0], [2, 1]]
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 @pytest.mark.parametrize(
     ("rgb", "transmittance", "grid", "stride"),
     [

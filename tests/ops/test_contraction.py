@@ -9,7 +9,7 @@ from ops.device import gpu, needs_triton
 
 from hyrfpack.ops.contraction import contract
 
-IMPLEMENTATIONS = ["reference", pytest.param("gpu", marks=needs_triton)]
+TESTED_IMPLEMENTATIONS = ["reference", pytest.param("gpu", marks=needs_triton)]
 HALF_EXTENTS = [(1.0, 1.0, 1.0), (2.0, 0.5, 0.125), (1, 3, 2)]
 
 
@@ -99,7 +99,7 @@ def test_contract_gradient_is_finite_at_hard_points():
 # -- boxes and implementations ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 @pytest.mark.parametrize("half_extent", HALF_EXTENTS)
 @pytest.mark.parametrize("radius", [0.0, 1e-20, 0.5, 0.999999, 1.0, 1.000001, 2.0, 1e4, 1e20, 1e30])
 def test_a_box_is_scaled_to_the_unit_cube_first(radius, half_extent, implementation):
@@ -115,7 +115,7 @@ def test_a_box_is_scaled_to_the_unit_cube_first(radius, half_extent, implementat
     assert cube.min() >= 0 and cube.max() <= 1
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 def test_the_inner_ball_is_in_the_inner_half_of_each_implementation(implementation):
     points = torch.tensor([[2.0, 0, 0], [-2, 0, 0], [0, 0, 0.0625], [0, 0, 0]])
     expected = torch.tensor([[0.75, 0.5, 0.5], [0.25, 0.5, 0.5], [0.5, 0.5, 0.625], [0.5, 0.5, 0.5]])
@@ -123,7 +123,7 @@ def test_the_inner_ball_is_in_the_inner_half_of_each_implementation(implementati
     torch.testing.assert_close(cube.cpu(), expected, rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 @pytest.mark.parametrize("shape", [(0, 3), (1, 3), (3,), (2, 5, 3), (255, 3), (256, 3), (257, 3)])
 def test_any_shape_of_points_is_supported(shape, implementation):
     points = 3 * torch.randn(shape, generator=torch.Generator().manual_seed(5))
@@ -133,7 +133,7 @@ def test_any_shape_of_points_is_supported(shape, implementation):
     np.testing.assert_allclose(cube.cpu().numpy().reshape(-1, 3), expected, rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 @pytest.mark.parametrize("layout", ["by columns", "part of wider rows", "expanded"])
 def test_memory_layouts_have_no_effect(layout, implementation):
     wide = place(3 * torch.randn(9, 7, generator=torch.Generator().manual_seed(6)), implementation)
@@ -149,7 +149,7 @@ def test_memory_layouts_have_no_effect(layout, implementation):
     torch.testing.assert_close(cube, expected, rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_nan_coordinates_give_nan_only_there(axis, implementation):
     points = torch.ones(4, 3)

@@ -13,7 +13,7 @@ from hyrfpack.ops.rasterize.cull import frustum_cull
 PICTURE_WIDTH = 64
 PICTURE_HEIGHT = 40
 CAMERA_INTRINSICS = (50.0, 60.0, 20.0, 25.0)
-IMPLEMENTATIONS = ["reference", pytest.param("gpu", marks=needs_triton)]
+TESTED_IMPLEMENTATIONS = ["reference", pytest.param("gpu", marks=needs_triton)]
 CAMERA_POSE = look_at((0.0, -3.0, 0.0), (0.0, 0.0, 0.0))
 # Relative widths of the band in which rounding decides. The kernel works in float64.
 UNDECIDED_RATIO = {"reference": 1e-4, "gpu": 1e-12}
@@ -60,7 +60,7 @@ def in_view(points, pose, near: float, tolerance: float, undecided: float) -> tu
     return kept, unsure
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 @pytest.mark.parametrize("tolerance", [0.0, 0.3, 2.0])
 @pytest.mark.parametrize("near", [0.01, 1.0])
 def test_cull_keeps_what_projects_into_the_widened_picture(near, tolerance, implementation):
@@ -76,7 +76,7 @@ def test_cull_keeps_what_projects_into_the_widened_picture(near, tolerance, impl
     assert (index.diff() > 0).all()
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 @pytest.mark.parametrize("count", [1, 2, 127, 128, 129])
 def test_cull_of_any_number_of_points(count, implementation):
     points = np.random.default_rng(count).normal(size=(count, 3))
@@ -85,14 +85,14 @@ def test_cull_of_any_number_of_points(count, implementation):
     assert cull(points, implementation=implementation).tolist() == sorted(kept)
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 @pytest.mark.parametrize("count", [1, 130])
 def test_cull_keeps_all_or_none(count, implementation):
     assert cull([POINT_AHEAD] * count, implementation=implementation).tolist() == list(range(count))
     assert cull([POINT_BEHIND] * count, implementation=implementation).tolist() == []
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 @pytest.mark.parametrize("place", [0, 127, 128, 129])
 def test_cull_finds_the_only_point_inside(place, implementation):
     points = np.array([POINT_BEHIND] * 130)
@@ -100,18 +100,18 @@ def test_cull_finds_the_only_point_inside(place, implementation):
     assert cull(points, implementation=implementation).tolist() == [place]
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 def test_cull_of_no_points_is_empty(implementation):
     assert cull(np.zeros((0, 3)), np.eye(4), implementation).shape == (0,)
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 def test_cull_drops_points_at_the_camera_and_behind_it(implementation):
     points = [[0, -3, 0], [0, -4, 0], [0, -1e6, 0], [0, -2, 0]]
     assert cull(points, implementation=implementation).tolist() == [3]
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 def test_points_on_the_near_plane_are_culled(implementation):
     points = [[0, 0, 0.5], [0, 0, 0.50001], [0, 0, 0.49999]]
     assert cull(points, np.eye(4), implementation, near=0.5).tolist() == [1]
@@ -133,7 +133,7 @@ def test_the_kernel_uses_a_float64_pose_at_full_precision():
 
 
 @INFINITY_TIMES_ZERO
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 @pytest.mark.parametrize("place", [0, 128, 129])
 @pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf])
 def test_cull_rejects_points_that_are_not_finite(number, place, implementation):
@@ -149,21 +149,21 @@ def test_cull_rejects_points_that_are_not_finite(number, place, implementation):
 
 
 @INFINITY_TIMES_ZERO
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 @pytest.mark.parametrize("number", [np.nan, np.inf])
 def test_cull_rejects_the_only_point(number, implementation):
     with pytest.raises(FloatingPointError):
         cull([[0, 0, number]], implementation=implementation)
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 def test_the_largest_float32_values_are_supported(implementation):
     largest = np.finfo(np.float32).max
     points = [[largest, 0, 0], [0, -largest, 0], [0, 0, largest], [-largest, -largest, -largest], POINT_AHEAD]
     assert cull(points, implementation=implementation).tolist() == [4]
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 def test_layouts_and_gradients_of_positions_have_no_effect(implementation):
     points = torch.from_numpy(np.random.default_rng(1).normal(size=(60, 3))).float()
     points = gpu(points) if implementation == "gpu" else points

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from hyrfpack.ops.shade import DIRECTION_FEATURES, encode_views
 
-IMPLEMENTATIONS = ["reference", pytest.param("gpu", marks=needs_triton)]
+TESTED_IMPLEMENTATIONS = ["reference", pytest.param("gpu", marks=needs_triton)]
 
 
 def random_values(*shape: int, seed: int = 0) -> Tensor:
@@ -59,7 +59,7 @@ def place_float32(tensor: Tensor, implementation: str) -> Tensor:
     return gpu(tensor.float()) if implementation == "gpu" else tensor.float()
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 @pytest.mark.parametrize("encoding", DIRECTION_FEATURES)
 @pytest.mark.parametrize("case", POINTS_AND_VIEWPOINTS)
 def test_encodings_match_the_formulas(case: str, encoding: str, implementation: str) -> None:
@@ -99,7 +99,7 @@ def test_the_kernel_stores_columns(encoding: str) -> None:
     assert encoded.stride() == (1, 9)
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 @pytest.mark.parametrize("encoding", DIRECTION_FEATURES)
 def test_memory_layouts_have_no_effect(encoding: str, implementation: str) -> None:
     points, viewpoint = (
@@ -112,7 +112,7 @@ def test_memory_layouts_have_no_effect(encoding: str, implementation: str) -> No
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 @pytest.mark.parametrize("encoding", DIRECTION_FEATURES)
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_nan_inputs_give_nan_outputs(axis: int, encoding: str, implementation: str) -> None:

@@ -10,12 +10,12 @@ from ops.device import IS_INTERPRETED, gpu, needs_triton
 from hyrfpack.ops.hash_encode import cells, corner_rows, hash_encode, level_offsets, level_resolutions
 from hyrfpack.parallel import has_numba
 
-IMPLEMENTATIONS = [
+TESTED_IMPLEMENTATIONS = [
     "reference",
     pytest.param("cpu", marks=pytest.mark.skipif(not has_numba(), reason="no numba")),
     pytest.param("gpu", marks=needs_triton),
 ]
-KERNEL_IMPLEMENTATIONS = IMPLEMENTATIONS[1:]
+KERNEL_IMPLEMENTATIONS = TESTED_IMPLEMENTATIONS[1:]
 
 
 def place(tensor: torch.Tensor, implementation: str) -> torch.Tensor:
@@ -63,7 +63,7 @@ def move_inside_cells(coords: torch.Tensor, resolutions: tuple[int, ...]) -> tor
     return coords
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 @pytest.mark.parametrize("case", ENCODING_CASES)
 def test_values_and_gradients_match_the_float64_reference(implementation: str, case: str) -> None:
     coords, resolutions, log2_table_size, inside = ENCODING_CASES[case]
@@ -169,7 +169,7 @@ def test_corner_rows_are_exactly_the_rows_with_a_gradient() -> None:
     assert touched == set(rows.flatten().tolist())
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 def test_a_constant_table_gives_its_constant_everywhere(implementation: str) -> None:
     resolutions = level_resolutions(6, 4, 200)
     table = place(torch.full((level_offsets(resolutions, 10)[-1], 2), 0.75), implementation)
@@ -188,7 +188,7 @@ def test_coordinates_that_are_not_finite_stay_inside_the_table(implementation: s
     assert features.shape == (4, 4)
 
 
-@pytest.mark.parametrize("implementation", ["reference", IMPLEMENTATIONS[2]])
+@pytest.mark.parametrize("implementation", ["reference", TESTED_IMPLEMENTATIONS[2]])
 def test_points_close_to_a_boundary_are_in_the_cells_that_the_file_format_defines(implementation) -> None:
     resolutions, log2_table_size = (8, 24, 600), 10
     on = torch.cat([coords_on_cell_boundaries(resolution, 100) for resolution in resolutions])

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from hyrfpack.ops.least_squares import least_squares
 
-IMPLEMENTATIONS = ["cpu", "reference"]
+TESTED_IMPLEMENTATIONS = ["cpu", "reference"]
 
 
 def make_problems(count: int = 40, rows: int = 700, terms: int = 9, seed: int = 0) -> tuple[Tensor, ...]:
@@ -32,7 +32,7 @@ def solve_one_by_one(
     return torch.tensor(np.array(solved)).float()
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 @pytest.mark.parametrize("terms", [1, 4, 16])
 def test_solutions_match_numpy(implementation: str, terms: int) -> None:
     given = make_problems(terms=terms)
@@ -41,7 +41,7 @@ def test_solutions_match_numpy(implementation: str, terms: int) -> None:
     )
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 def test_the_first_terms_alone_can_be_solved(implementation: str) -> None:
     index, basis, values, weights, gram, right = make_problems(terms=16)
     some = index, basis[:, :4], values, weights, gram[:4, :4], right[:, :4]  # views into larger arrays
@@ -50,7 +50,7 @@ def test_the_first_terms_alone_can_be_solved(implementation: str) -> None:
     )
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 def test_nearly_dependent_rows_agree_with_float64(implementation: str) -> None:
     # Directions a thousandth apart, as of distant cameras: only the ridge separates the terms.
     index, basis, values, weights, _, right = make_problems(terms=4)
@@ -61,7 +61,7 @@ def test_nearly_dependent_rows_agree_with_float64(implementation: str) -> None:
     )
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 def test_a_problem_without_a_solution_is_nan_and_affects_no_other(implementation: str) -> None:
     index, basis, values, weights, gram, right = make_problems()
     found = least_squares(index, basis, values, weights, torch.zeros_like(gram), right, implementation=implementation)
@@ -72,7 +72,7 @@ def test_a_problem_without_a_solution_is_nan_and_affects_no_other(implementation
     assert not broken[index[0]].isfinite().any() and broken[others].isfinite().all()
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 def test_empty_problems_and_empty_rows_are_supported(implementation: str) -> None:
     assert least_squares(*make_problems(count=0, rows=0), implementation=implementation).shape == (0, 9, 3)
     alone = make_problems(rows=0)

@@ -9,7 +9,7 @@ from ops.device import IS_INTERPRETED, gpu, needs_triton
 from hyrfpack.ops.mlp import mlp
 
 KERNEL_IMPLEMENTATIONS = ["cpu", pytest.param("gpu", marks=needs_triton)]
-IMPLEMENTATIONS = ["reference", *KERNEL_IMPLEMENTATIONS]
+TESTED_IMPLEMENTATIONS = ["reference", *KERNEL_IMPLEMENTATIONS]
 
 
 def normal(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -81,7 +81,7 @@ def assert_gradients_close(gradients: list[torch.Tensor], expected: list[torch.T
         torch.testing.assert_close(gradient.double(), wanted, rtol=0, atol=tolerance * scale)
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 @pytest.mark.parametrize("name", MLP_CASES)
 def test_values_and_gradients_match_the_float64_reference(implementation: str, name: str) -> None:
     case = case_for(implementation, name)
@@ -113,7 +113,7 @@ def test_mixed_values_and_gradients_match_the_mixed_float64_reference(implementa
     assert relative_difference(gradients, exact_gradients) < 0.3
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 def test_matches_torch_modules(implementation: str) -> None:
     x, widths, upstream = case_for(implementation, "geometry decoder")
     torch.manual_seed(0)
@@ -137,7 +137,7 @@ def test_reference_passes_gradcheck() -> None:
     assert torch.autograd.gradcheck(lambda x, *p: mlp(x, p[:3], p[3:]), inputs)
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 @pytest.mark.parametrize("mixed", [False, True])
 def test_zero_weights_give_the_last_bias_and_no_gradient_below(implementation: str, mixed: bool) -> None:
     x = gpu(normal(900, 8)) if implementation == "gpu" else normal(900, 8)

@@ -34,7 +34,7 @@ if has_triton():
 
 PARAMETER_NAMES = ("means", "quats", "scales", "opacities", "colors")
 GPU_IMPLEMENTATION = pytest.param("gpu", marks=needs_triton)
-IMPLEMENTATIONS = ["cpu", GPU_IMPLEMENTATION, "reference"]
+TESTED_IMPLEMENTATIONS = ["cpu", GPU_IMPLEMENTATION, "reference"]
 
 
 @dataclass(frozen=True)
@@ -279,7 +279,7 @@ def _assert_gradient_close(actual: Tensor, expected: Tensor, tolerance: float = 
 
 
 @pytest.mark.parametrize("name", CASE_MAKERS)
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 def test_matches_the_float64_reference(implementation: str, name: str) -> None:
     case = _case(name, implementation)
     expected, expected_grads, expected_absgrad = _expected(name, "gpu" if implementation == "gpu" else "cpu")
@@ -301,7 +301,7 @@ def test_matches_the_float64_reference(implementation: str, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["random scene", "needles and pancakes", "256 x 16 picture"])
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 def test_tiles_and_bounds_do_not_change_the_picture(implementation: str, name: str) -> None:
     case = _case(name, implementation)
     gaussians = {key: value.double() for key, value in case.gaussians.items()}
@@ -319,7 +319,7 @@ def test_tiles_and_bounds_do_not_change_the_picture(implementation: str, name: s
     _assert_picture_close(picture.transmittance, transmittance.view(case.height, case.width))
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 def test_one_isotropic_gaussian_has_the_closed_form(implementation: str) -> None:
     focal, sigma, distance, opacity = 60.0, 0.2, 3.0, 0.7
     gaussian = {
@@ -342,7 +342,7 @@ def test_one_isotropic_gaussian_has_the_closed_form(implementation: str) -> None
     torch.testing.assert_close(picture.depth, torch.where(alpha > 0, distance, 0.0), atol=1e-3, rtol=0)
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 def test_antialiasing_keeps_the_light_of_a_small_gaussian(implementation: str) -> None:
     # The integral over the picture is opacity 2 pi sqrt(det Sigma), with or without the low-pass filter.
     focal, sigma, distance, opacity = 60.0, 0.02, 3.0, 0.9
@@ -363,7 +363,7 @@ def test_antialiasing_keeps_the_light_of_a_small_gaussian(implementation: str) -
 
 
 @pytest.mark.parametrize("transmittance_min", [1e-4, 1 / 512, 0.05])
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 def test_early_termination_loses_at_most_the_remaining_light(implementation: str, transmittance_min: float) -> None:
     def fog(least: float) -> Case:
         case = _reduce_for_interpreter(_thick_fog(least), implementation, few=80)
@@ -392,7 +392,7 @@ def test_reference_passes_gradcheck(antialiased: bool) -> None:
     assert torch.autograd.gradcheck(run, inputs)
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 def test_absgrad_is_the_sum_of_absolute_gradients_of_single_pixels(implementation: str) -> None:
     case = _reduce_for_interpreter(
         Case(_gaussians(12), width=18, height=17, intrinsics=(18.0, 18.0, 9.0, 8.5)), implementation
@@ -417,7 +417,7 @@ def test_absgrad_is_the_sum_of_absolute_gradients_of_single_pixels(implementatio
     torch.testing.assert_close(absgrad.double(), expected, atol=1e-4, rtol=1e-4)
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 def test_absgrad_is_added_to_what_the_buffer_holds(implementation: str) -> None:
     case = Case(_gaussians(5), width=18, height=17, intrinsics=(18.0, 18.0, 9.0, 8.5))
     _, _, once = _run(case, implementation, torch.float32)
@@ -495,7 +495,7 @@ def test_more_pairs_than_can_be_numbered_are_rejected(monkeypatch: pytest.Monkey
 
 @pytest.mark.parametrize("name", PARAMETER_NAMES)
 @pytest.mark.parametrize("poison", [math.nan, math.inf, -math.inf, 3e38])
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 def test_values_that_are_not_finite_are_named_and_write_no_other_memory(
     implementation: str, poison: float, name: str
 ) -> None:
@@ -509,7 +509,7 @@ def test_values_that_are_not_finite_are_named_and_write_no_other_memory(
     assert all(grads[key].shape == case.gaussians[key].shape for key in PARAMETER_NAMES)
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 def test_every_input_that_is_not_finite_is_named(implementation: str) -> None:
     case = Case(_gaussians(3), 8, 8, (20.0, 20.0, 4.0, 4.0))
     case.gaussians["opacities"][2], case.gaussians["means"][0, 1] = math.nan, math.inf
@@ -519,7 +519,7 @@ def test_every_input_that_is_not_finite_is_named(implementation: str) -> None:
     assert picture.nonfinite == ("means", "opacities")
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 def test_a_picture_can_be_drawn_without_gradients(implementation: str) -> None:
     case = _reduce_for_interpreter(Case(_gaussians(30)), implementation, few=4)
     inputs, _ = _inputs(case, implementation, torch.float32)
@@ -533,7 +533,7 @@ def test_a_picture_can_be_drawn_without_gradients(implementation: str) -> None:
     assert not picture.rgb.requires_grad
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 def test_depth_and_visible_are_not_differentiable(implementation: str) -> None:
     picture, _, _ = _run(
         _reduce_for_interpreter(Case(_gaussians(30)), implementation, few=4), implementation, torch.float32

@@ -14,7 +14,7 @@ from hyrfpack.ops.shade import DIRECTION_FEATURES, Shading, encode_directions, s
 # Implementations that take factors in bfloat16.
 BFLOAT16_IMPLEMENTATIONS = ["reference", pytest.param("gpu", marks=needs_triton)]
 ON_CPU = pytest.mark.skipif(KERNEL_DEVICE != "cpu", reason="tensors of these tests are on the GPU")
-IMPLEMENTATIONS = [*BFLOAT16_IMPLEMENTATIONS, pytest.param("cpu", marks=ON_CPU)]
+TESTED_IMPLEMENTATIONS = [*BFLOAT16_IMPLEMENTATIONS, pytest.param("cpu", marks=ON_CPU)]
 HASH_FEATURES = 10
 
 
@@ -77,7 +77,7 @@ def test_the_reference_matches_the_whole_decoder(case: str, encoding: str) -> No
     torch.testing.assert_close(colors, torch.sigmoid(mlp(inputs, weights, biases) + logits), rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 @pytest.mark.parametrize("encoding", DIRECTION_FEATURES)
 @pytest.mark.parametrize("case", SHADING_CASES)
 def test_matches_the_float64_reference(case: str, encoding: str, implementation: str) -> None:
@@ -108,7 +108,7 @@ def test_mixed_precision_stays_close_to_float64(encoding: str, implementation: s
     assert (colors.cpu().double() - exact).abs().max() < 2e-2
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 @pytest.mark.parametrize("places", [[], [7], [299, 3, 3, 0]])
 def test_shading_a_subset_gives_the_same_colours(places: list[int], implementation: str) -> None:
     positions, viewpoint, widths = SHADING_CASES["random"]
@@ -134,7 +134,7 @@ def test_chunks_on_the_cpu_do_not_depend_on_threads(monkeypatch: pytest.MonkeyPa
     torch.testing.assert_close(found[0], expected, rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 def test_memory_layout_has_no_effect(implementation: str) -> None:
     positions, viewpoint, widths = SHADING_CASES["random"]
     shading = to_gpu_float32(make_shading(*make_decoder(len(positions), "sh", widths), "sh"))

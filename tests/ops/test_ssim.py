@@ -13,7 +13,7 @@ from skimage.metrics import structural_similarity
 from hyrfpack.ops.ssim import photometric_loss, ssim
 from hyrfpack.parallel import has_numba
 
-IMPLEMENTATIONS = [
+TESTED_IMPLEMENTATIONS = [
     "reference",
     pytest.param("cpu", marks=pytest.mark.skipif(not has_numba(), reason="no numba")),
     pytest.param("gpu", marks=needs_triton),
@@ -86,14 +86,14 @@ def assert_same(actual: tuple[torch.Tensor, torch.Tensor], expected: tuple[torch
     torch.testing.assert_close(actual[1], expected[1], rtol=0, atol=1e-3 * scale + 1e-9)
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 @pytest.mark.parametrize("case", PICTURE_PAIRS)
 def test_ssim_matches_the_float64_reference(implementation: str, case: str) -> None:
     pictures = case_for(implementation, case)
     assert_same(value_and_gradient(ssim, implementation, *pictures), reference_value_and_gradient(ssim, *pictures))
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 @pytest.mark.parametrize("mask", MASK_MAKERS)
 @pytest.mark.parametrize("case", ["two pictures", "several strips and tiles", "narrower than the window", "one pixel"])
 def test_photometric_loss_matches_the_float64_reference(implementation: str, mask: str, case: str) -> None:
@@ -103,7 +103,7 @@ def test_photometric_loss_matches_the_float64_reference(implementation: str, mas
     assert_same(actual, reference_value_and_gradient(photometric_loss, *pictures, chosen))
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 def test_ssim_matches_scikit_image_with_black_padding(implementation: str) -> None:
     pictures = crop_for_interpreter(implementation, make_photo(60, 80), make_photo(60, 80, seed=1))
     ground = [np.pad(picture.double().numpy(), ((10, 10), (10, 10), (0, 0))) for picture in pictures]
@@ -113,7 +113,7 @@ def test_ssim_matches_scikit_image_with_black_padding(implementation: str) -> No
     assert value.item() == pytest.approx(expected[10:-10, 10:-10].mean(), abs=1e-6)
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 def test_loss_without_ssim_is_the_mean_absolute_difference_of_unmasked_pixels(implementation: str) -> None:
     image, target = crop_for_interpreter(implementation, make_photo(40, 50), make_photo(40, 50, seed=1))
     mask = MASK_MAKERS["some pixels"](image.shape[:2])
@@ -122,7 +122,7 @@ def test_loss_without_ssim_is_the_mean_absolute_difference_of_unmasked_pixels(im
     assert value.item() == pytest.approx((image - target).abs()[mask].double().mean().item(), abs=1e-6)
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 def test_equal_pictures_have_ssim_one_no_loss_and_no_gradient(implementation: str) -> None:
     (image,) = crop_for_interpreter(implementation, make_photo(40, 50))
     loss, gradient = value_and_gradient(photometric_loss, implementation, image, image)
@@ -132,7 +132,7 @@ def test_equal_pictures_have_ssim_one_no_loss_and_no_gradient(implementation: st
     assert gradient.abs().max() < 5e-5 / image.numel()
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 def test_masked_pixels_give_neither_loss_nor_gradient(implementation: str) -> None:
     image, target = crop_for_interpreter(implementation, make_photo(40, 50), make_photo(40, 50, seed=1))
     mask = MASK_MAKERS["left half"](image.shape[:2])
@@ -145,7 +145,7 @@ def test_masked_pixels_give_neither_loss_nor_gradient(implementation: str) -> No
     assert gradient[mask].all() and gradient.isfinite().all()
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 def test_a_completely_masked_picture_has_zero_loss(implementation: str) -> None:
     image, target = crop_for_interpreter(implementation, make_photo(20, 30), make_photo(20, 30, seed=1))
     mask = MASK_MAKERS["none"](image.shape[:2])
@@ -154,7 +154,7 @@ def test_a_completely_masked_picture_has_zero_loss(implementation: str) -> None:
     assert not gradient.any()
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 def test_the_gradient_is_scaled_by_the_upstream_gradient(implementation: str) -> None:
     pictures = crop_for_interpreter(implementation, make_photo(40, 50), make_photo(40, 50, seed=1))
 

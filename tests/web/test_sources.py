@@ -324,12 +324,12 @@ def test_the_element_shows_a_file_and_follows_its_attributes(browser: Browser, h
     host.files["/blog/post.html"] = (
         "<!DOCTYPE html><meta http-equiv=Content-Security-Policy content=\"style-src 'none'\">"
         f"<script{kind} src=../hyrf-viewer.js></script>"
-        "<script>window.told = []; for (const name of ['load', 'error'])"
-        " document.addEventListener(name, (event) => told.push([name, event.detail]), true);</script>"
+        "<script>window.fired = []; for (const name of ['load', 'error'])"
+        " document.addEventListener(name, (event) => fired.push([name, event.detail]), true);</script>"
         '<hyrf-viewer src="../cloud.spz" camera="1" title="A cloud" noui></hyrf-viewer>'
     ).encode()
     browser.open(f"{host.address}/blog/post.html")
-    wait_until(browser, "told.some(([name, detail]) => name === 'load' && detail === '')")
+    wait_until(browser, "fired.some(([name, detail]) => name === 'load' && detail === '')")
     assert browser.evaluate(f"{ELEMENT_WINDOW_JS}.{LOADED_COUNT_JS.split(' && ')[0]}")
     assert browser.evaluate(f"{ELEMENT_WINDOW_JS}.document.title") == "A cloud"
     assert browser.evaluate(f"{ELEMENT_WINDOW_JS}.document.body.classList.contains('bare')")
@@ -342,7 +342,7 @@ def test_the_element_shows_a_file_and_follows_its_attributes(browser: Browser, h
     wait_until(browser, f"{ELEMENT_WINDOW_JS}.hyrfpack?.player?.scene?.kind === 'hyrf'")
     assert not browser.evaluate(f"{ELEMENT_WINDOW_JS}.document.body.classList.contains('bare')")
     browser.evaluate(f"{ELEMENT_JS}.setAttribute('src', '../nothing.hyrf')")
-    wait_until(browser, "told.some(([name, detail]) => name === 'error' && String(detail).includes('404'))")
+    wait_until(browser, "fired.some(([name, detail]) => name === 'error' && String(detail).includes('404'))")
 
 
 def test_the_element_adds_no_global_names(browser: Browser, host: Site):

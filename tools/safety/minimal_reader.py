@@ -63,7 +63,7 @@ def read(data: bytes, part: bool = False) -> tuple[dict[str, Any], dict[str, np.
         columns); and the exposure map, None without one.
 
     Raises:
-        ValueError: the page tells a reader to refuse the file.
+        ValueError: the specification requires readers to reject the file.
         zlib.error: a deflate stream is damaged.
     """
     sections = read_container(data, part)

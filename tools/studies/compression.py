@@ -46,8 +46,8 @@ class MeasuredFile:
         drop: loss of PSNR in dB, mean over held-out photos.
         ssim_drop: loss of SSIM, mean over held-out photos.
         seconds: duration of the compression.
-        foretold: predicted error: mean squared error against the model's own pictures, by the sensitivities.
-        found: measured error: the same at held-out cameras.
+        predicted_error: mean squared error against the model's own pictures, by the sensitivities.
+        measured_error: the same at held-out cameras.
     """
 
     distortion: float
@@ -56,8 +56,8 @@ class MeasuredFile:
     drop: float
     ssim_drop: float
     seconds: float
-    foretold: float = 0.0
-    found: float = 0.0
+    predicted_error: float = 0.0
+    measured_error: float = 0.0
 
 
 class TrainedSet:
@@ -154,7 +154,7 @@ def format_table(rows: list[dict]) -> str:
             share = "" if kind == "paper" else f" ({made['bytes'] / row['paper']['bytes']:.3f})"
             cells.append(f"{made['bytes']:,}{share}, {made['drop']:+.3f}, {made['ssim_drop']:+.4f}")
         default = row["default"]
-        cells.append(f"{default['found'] / default['foretold']:.2f}")
+        cells.append(f"{default['measured_error'] / default['predicted_error']:.2f}")
         cells.append(f"{row['measuring']:.1f} + {default['seconds']:.1f}")
         table_rows.append(cells)
     return markdown_table([*columns, "measured / predicted error", "seconds"], table_rows)

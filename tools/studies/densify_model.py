@@ -31,13 +31,13 @@ SPLIT_ROUNDS, STEPS_PER_ROUND = 20, 6
 SPLIT_STEPS = SPLIT_ROUNDS * STEPS_PER_ROUND
 
 
-def make_split_config(gaussians: int, settle: int, seed: int) -> TrainConfig:
-    """Return a run of SPLIT_STEPS steps with a round every STEPS_PER_ROUND steps, then `settle` steps without rounds.
+def make_split_config(gaussians: int, final_steps: int, seed: int) -> TrainConfig:
+    """Return a run of SPLIT_STEPS steps with a round every STEPS_PER_ROUND steps, then `final_steps` without rounds.
 
     All Gaussians are large enough to split, and any gradient suffices. None is cloned, because copies at one position
     would compress better than trained Gaussians.
     """
-    steps = SPLIT_STEPS + settle
+    steps = SPLIT_STEPS + final_steps
     density = DensityConfig(
         start=STEPS_PER_ROUND / steps,
         stop=SPLIT_STEPS / steps,
@@ -83,7 +83,7 @@ def main() -> None:
     )
     parser.add_argument("--model", type=Path, help="start from this model of the scene instead of training one")
     parser.add_argument("--steps", type=int, default=1500, help="training steps before splitting (1,500)")
-    parser.add_argument("--settle", type=int, default=60, help="training steps after splitting (60)")
+    parser.add_argument("--final-steps", type=int, default=60, help="training steps after splitting (60)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, required=True)
     args = parser.parse_args()
@@ -109,14 +109,14 @@ def main() -> None:
 
     print_scores("before splitting", model, scene, start)
     trained = len(model)
-    model = densify(scene, model, make_split_config(args.gaussians, args.settle, args.seed), start)
+    model = densify(scene, model, make_split_config(args.gaussians, args.final_steps, args.seed), start)
     if len(model) < args.gaussians:
         print(f"the model has fewer than {args.gaussians:,} Gaussians; start from a model with more than {trained:,}")
     provenance = hyrfpack.describe_file(source)["provenance"]
     provenance["choices"] = {
         **provenance.get("choices", {}),
         "max_gaussians": f"{args.gaussians:,}: trained to {trained:,}, split by tools/studies/densify_model.py "
-        f"in {SPLIT_STEPS} steps (seed {args.seed}), settled in {args.settle}",
+        f"in {SPLIT_STEPS} steps (seed {args.seed}), then {args.final_steps} steps without splitting",
     }
     provenance["viewpoint"] = Viewpoint.from_cameras([view.camera for view in scene.train]).to_json()
     written = hyrfpack.save_model(model, args.out / MODEL_FILE, profile="raw", provenance=provenance)

@@ -32,6 +32,7 @@ from hyrfpack.compress.quantize import quantize
 from hyrfpack.compress.sensitivity import Sensitivity
 from hyrfpack.evaluate.figures import blank_figure
 from hyrfpack.format import CompressionReport
+from hyrfpack.format.codec import PROFILES
 from hyrfpack.format.compact.groups import encode_groups
 from hyrfpack.format.compact.quantized import QuantizedModel
 from hyrfpack.format.container import Container
@@ -66,9 +67,9 @@ STORED_COLOR = "#d2e3fc"
 FIELD_COLOR = "#ceead6"
 RESULT_COLOR = "#fef0c7"
 DOT_SCALE_LOCAL = 0.004  # standard deviation of the dots that show the Gaussians' centres
-CONTAINER = "container"
+CONTAINER_GROUP = "container"
 SECTION_COLORS = {
-    CONTAINER: "#3c4043",
+    CONTAINER_GROUP: "#3c4043",
     METADATA: "#9aa0a6",
     GEOMETRY_DECODER: "#7b61c9",
     RADIANCE_DECODER: "#b39ddb",
@@ -81,7 +82,6 @@ SECTION_COLORS = {
 }
 LABEL_WIDTH = 4.6  # of a section, in hundredths of the figure
 UNREAD_SENSITIVITY = 1e-29  # numbers with less are read by no view
-PROFILES = ("raw", "paper", "compact")
 MAX_DRAWN_SYMBOL = 6  # symbols of larger magnitude are counted with this one
 
 
@@ -171,13 +171,8 @@ def draw_method(model: HybridModel, camera: Camera, path: Path) -> Path:
     axes.set(xlim=(-0.5, 100.5), ylim=(0, 36))
     axes.axis("off")
     box(axes, (0, 2, 19, 32), STORED_COLOR, "stored numbers", "", top=True)
-    for height, text in (
-        (25, "position  p (3)"),
-        (11.5, "opacity  $a_e$"),
-        (8, "scale  $s_e$"),
-        (4.5, "colour  $c_e$ (3)"),
-    ):
-        axes.text(1.5, height, text, fontsize=9, color=TEXT_COLOR, va="center")
+    stored_lines = {25: "position  p (3)", 11.5: "opacity  $a_e$", 8: "scale  $s_e$", 4.5: "colour  $c_e$ (3)"}
+    write_lines(axes, 1.5, stored_lines, fontsize=9)
     box(axes, (26, 21, 12, 8), FIELD_COLOR, "contraction", "c(p / h)")
     arrow(axes, (19, 25), (26, 25))
     for bottom, name, outputs in (
@@ -196,13 +191,13 @@ def draw_method(model: HybridModel, camera: Camera, path: Path) -> Path:
     arrow(axes, (19, 5), (79, 5))
     axes.text(41, 5.8, "added to what the fields predict", fontsize=9, color=TEXT_COLOR, ha="center", va="bottom")
     box(axes, (79, 2, 21, 32), RESULT_COLOR, "drawn Gaussian", "", top=True)
-    for height, text in (
-        (25, "opacity  $\\sigma(a_n + a_e)$"),
-        (19.5, "scales  $S\\,\\sigma(s_n + s_e)$"),
-        (14, "rotation  $r_n + (1,0,0,0)$"),
-        (8.5, "colour  $\\sigma(c_n + c_e)$"),
-    ):
-        axes.text(80.3, height, text, fontsize=8.5, color=TEXT_COLOR, va="center")
+    drawn_lines = {
+        25: "opacity  $\\sigma(a_n + a_e)$",
+        19.5: "scales  $S\\,\\sigma(s_n + s_e)$",
+        14: "rotation  $r_n + (1,0,0,0)$",
+        8.5: "colour  $\\sigma(c_n + c_e)$",
+    }
+    write_lines(axes, 80.3, drawn_lines, fontsize=8.5)
     figure.text(
         0.01,
         0.39,
@@ -246,6 +241,12 @@ def box(
         left + width / 2, middle + offset, title, fontsize=9, color=TEXT_COLOR, ha="center", va="center", weight="bold"
     )
     axes.text(left + width / 2, middle - offset, text, fontsize=9, color=TEXT_COLOR, ha="center", va="center")
+
+
+def write_lines(axes: Axes, left: float, text_by_height: dict[float, str], fontsize: float) -> None:
+    """Write left-aligned lines, each centred at its height."""
+    for height, text in text_by_height.items():
+        axes.text(left, height, text, fontsize=fontsize, color=TEXT_COLOR, va="center")
 
 
 def arrow(axes: Axes, start: tuple[float, float], end: tuple[float, float]) -> None:
@@ -344,11 +345,11 @@ def draw_fields(axes: Axes, bottom: float, fields: Sequence[tuple[int, str, str]
 def read_sizes(path: Path) -> dict[str, int]:
     """Return the bytes of header, contents and padding, then of each section in file order with all its layers."""
     with Container.open(path, SECTION_CONTENTS) as container:
-        sizes = {CONTAINER: container.length}
+        sizes = {CONTAINER_GROUP: container.length}
         for size in section_sizes(container):
             group = group_and_layer(size.type)[0]
             sizes[group] = sizes.get(group, 0) + size.after
-            sizes[CONTAINER] -= size.after
+            sizes[CONTAINER_GROUP] -= size.after
     return sizes
 
 
@@ -367,7 +368,7 @@ def draw_bar(
     for group, size in parts.items():
         part = width * size / total
         axes.add_patch(rectangle_of((left, bottom, part, height), SECTION_COLORS.get(group, SECTION_COLORS[METADATA])))
-        if labels and group != CONTAINER:
+        if labels and group != CONTAINER_GROUP:
             above = not above
             axes.text(
                 min(max(left + part / 2, LABEL_WIDTH / 2), 100 - LABEL_WIDTH / 2),

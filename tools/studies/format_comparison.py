@@ -7,7 +7,7 @@ Other formats store explicit Gaussians, so the model is baked first, as by `hyrf
 SOG; its SPZ keeps 6 bits of a harmonic, others 4 or 5, so its files are larger and closer to the model. gsplat writes
 its PNG format (see `gsplat_png.py`). Every file is decoded, drawn by hyrfpack's rasteriser and scored on held-out
 photos. The table has bytes, bits a Gaussian, PSNR in dB, SSIM, losses in dB, and PSNR against the trained model's
-pictures ("likeness"). It also writes peers.json and a plot into --out.
+pictures ("PSNR, to the model"). It also writes peers.json and a plot into --out.
 
 Wherever there is a choice, it favours the other formats. They cannot store the background sphere, so it is rendered
 from our model and its bytes are not counted; Gaussians come in Morton order; and some of their settings leave out the
@@ -82,7 +82,7 @@ class MeasuredFile:
         psnr, ssim: PSNR in dB and SSIM against the held-out photos.
         drop_hybrid: loss of `psnr` in dB against the trained model.
         drop_baked: loss of `psnr` in dB against the baked model of the same degree; None for `.hyrf` files.
-        likeness: PSNR in dB against the trained model's pictures.
+        psnr_to_model: PSNR in dB against the trained model's pictures.
     """
 
     format: str
@@ -94,7 +94,7 @@ class MeasuredFile:
     ssim: float
     drop_hybrid: float
     drop_baked: float | None
-    likeness: float
+    psnr_to_model: float
 
 
 @dataclass(frozen=True)
@@ -224,10 +224,12 @@ class Measurements:
     def _row(
         self, format_name: str, setting: str, size: int, count: int, scores: Sequence[float], degree: int | None = None
     ) -> MeasuredFile:
-        quality, structure, likeness = scores
+        quality, structure, psnr_to_model = scores
         drop_baked = None if degree is None else self.baked_psnr[degree] - quality
         bits, drop = 8 * size / len(self.model), self.trained[0] - quality
-        return MeasuredFile(format_name, setting, size, count, bits, quality, structure, drop, drop_baked, likeness)
+        return MeasuredFile(
+            format_name, setting, size, count, bits, quality, structure, drop, drop_baked, psnr_to_model
+        )
 
     def measure_peer(self, setting: PeerSetting) -> MeasuredFile:
         """Encode, decode, draw and score a file of another format."""
@@ -275,14 +277,14 @@ def format_table(rows: Sequence[MeasuredFile], trained: int) -> str:
     """Format the rows as a Markdown table; `trained` is the number of Gaussians of the trained model."""
     lines = [
         "| format | setting | Gaussians | bytes | bits/Gaussian "
-        "| PSNR | SSIM | drop, trained | drop, baked | likeness |",
+        "| PSNR | SSIM | drop, trained | drop, baked | PSNR, to the model |",
         "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for row in rows:
         baked = "" if row.drop_baked is None else f"{row.drop_baked:.2f}"
         lines.append(
             f"| {row.format} | {row.setting} | {row.gaussians / trained:.0%} | {row.bytes:,} | {row.bits:.1f} | "
-            f"{row.psnr:.2f} | {row.ssim:.3f} | {row.drop_hybrid:.2f} | {baked} | {row.likeness:.1f} |"
+            f"{row.psnr:.2f} | {row.ssim:.3f} | {row.drop_hybrid:.2f} | {baked} | {row.psnr_to_model:.1f} |"
         )
     return "\n".join(lines)
 
