@@ -1,6 +1,6 @@
 """Reading and writing `.hyrf` files: the container (bytes, sections, checks) and the codec of a HybridModel.
 
-`describe` needs no torch. The names that need torch are imported at their first use.
+`describe_file` needs no torch. The names that need torch are imported at their first use.
 """
 
 from __future__ import annotations

@@ -100,7 +100,7 @@ def decoder_widths(config: ModelConfig) -> dict[str, tuple[int, int, int, int]]:
 def to_model(config: ModelConfig, arrays: dict[str, np.ndarray]) -> HybridModel:
     """Build a model from matrices: the inverse of `to_arrays`. Shapes must be those of `group_shapes`."""
     gaussians = Gaussians(*(torch.from_numpy(arrays[group]) for group in sections.LAYERED_SECTIONS))
-    with torch.device("meta"):  # has shapes but no storage, so that no initial values are drawn and thrown away
+    with torch.device("meta"):  # has shapes but no storage, so that no random initial values are computed
         model = HybridModel(config, gaussians)
     model.load_state_dict({name: value.clone() for name, value in iter_parameters(arrays, model)}, assign=True)
     return model

@@ -43,8 +43,8 @@ PROFILES: dict[str, Callable[..., tuple[list[Section], dict]]] = {
     "compact": compact.encode,
 }
 DEFAULT_PROFILE = "compact"  # `hyrfpack.compress_model` and the command line use it where no profile is named
-# A file may declare a number of Gaussians for each of its bytes. The extra ones are needed because Gaussians that are
-# all equal take no bytes.
+# A file may declare this many Gaussians for each of its bytes, plus a constant, because equal Gaussians may take no
+# bytes at all.
 MAX_GAUSSIANS_PER_FILE_BYTE = 32
 EXTRA_GAUSSIANS_PER_FILE = 1 << 18
 # Decoders of the codecs that read no other section; `compact` has those that need the positions.
@@ -68,8 +68,8 @@ class CompressionReport:
         found: the outcome of a search for a target size or quality, as a sentence.
         finetuned: profile "compact" only: whether the quantised numbers were fine-tuned on photos.
         sensitivity: profile "compact" only: how much each number changes renders
-            (`hyrfpack.compress.sensitivity.Sensitivity`), by which the steps were chosen; kept so that a report page
-            need not measure it again.
+            (`hyrfpack.compress.sensitivity.Sensitivity`), by which the steps were chosen. It is kept so that a report
+            page need not measure it again.
         file: path of the file that was written.
     """
 
@@ -86,7 +86,7 @@ class CompressionReport:
     file: str = ""
 
     def to_dict(self) -> dict:
-        """Return all fields but the sensitivity as plain numbers, strings, lists and dictionaries, ready for JSON."""
+        """Return all fields except the sensitivity as plain numbers, strings, lists and dictionaries for JSON."""
         values = asdict(replace(self, sensitivity=None))
         del values["sensitivity"]
         return values
@@ -98,7 +98,7 @@ def encode_model(model: HybridModel, profile: str = "raw", provenance: dict | No
     Args:
         model: the model, on any device.
         profile: "raw" (float32, exact), "paper" (see `hyrfpack.format.paper`) or "compact" (`hyrfpack.format.compact`).
-        provenance: any JSON object that says where the model comes from; stored for people to read.
+        provenance: any JSON object that says where the model comes from. It is stored for readers of the file.
         settings: settings of the profile: for "paper" the fields of `paper.PaperSettings`, for "compact" the
             `quantized` numbers from `hyrfpack.compress_model`; "raw" has none.
 
@@ -171,7 +171,7 @@ def save_model(
     overwrite: bool = True,
     **settings: Any,
 ) -> CompressionReport:
-    """Write a model to a `.hyrf` file, whole or not at all.
+    """Write a model to a `.hyrf` file, completely or not at all.
 
     The other arguments and errors are those of `encode_model`.
 
@@ -193,7 +193,9 @@ def save_model(
 
 
 def write_model(data: bytes, path: str | os.PathLike[str], *, overwrite: bool = True) -> CompressionReport:
-    """Write the bytes that `encode_model` returned to a file, whole or not at all; `overwrite` as in `save`.
+    """Write the bytes that `encode_model` returned to a file, completely or not at all.
+
+    `overwrite` is that of `save_model`.
 
     Raises:
         HyrfError: the file cannot be written.
@@ -241,11 +243,11 @@ def repack(
     """Rewrite a `.hyrf` file with profile "raw" or "paper", and copy its provenance.
 
     Except for profile "raw", the cameras in the provenance are rounded, see `quantized_provenance`. The other
-    arguments and the errors are those of `encode_model`, `load` and `save`.
+    arguments and the errors are those of `encode_model`, `load_model` and `save_model`.
 
     Args:
-        overwrite: replace a file at `target`. Without it, an existing file is an error. A file that appears in the
-            meantime is kept: then a free file name in the same folder is used, which the report names.
+        overwrite: replace a file at `target`. Without it, an existing file is an error. If a file appears in the
+            meantime, it is kept, and a free file name in the same folder is used, which the report contains.
     """
     source = find_model(source)
     Outputs(source, overwrite=overwrite).file(target)
@@ -255,7 +257,7 @@ def repack(
 
 
 def load_with_provenance(path: str | os.PathLike[str], fraction: float | None = None) -> tuple[HybridModel, dict]:
-    """Read a model and its provenance. Arguments and errors as `load`."""
+    """Read a model and its provenance. The arguments and the errors are those of `load_model`."""
     with Container.open(path, SECTION_CONTENTS, fraction) as container:
         return _decode(container), read_metadata(container).provenance
 
@@ -286,7 +288,7 @@ def _decode(container: Container) -> HybridModel:
                 f"{4 * rows * columns}",
                 fix="the file is damaged, write it again",
             )
-    # Of a partial file the first layer must be complete; further layers are used up to the first incomplete one.
+    # In a partial file, the first layer must be complete; further layers are used up to the first incomplete one.
     layer_count = 1
     while layer_count < len(layers) and all(
         layer_section(group, layer_count) in container for group in LAYERED_SECTIONS
@@ -308,7 +310,7 @@ def _decode(container: Container) -> HybridModel:
         )
     sections = {tag: container[tag] for tag in used_tags}
     arrays: dict[str, np.ndarray] = {}
-    points = {}  # lattice points by layer, where positions are on a lattice; other sections need them for decoding
+    points = {}  # lattice points by layer, if positions are on a lattice; other sections need them for decoding
 
     def decode_positions(layer: int) -> None:
         tag = layer_section(POSITIONS, layer)

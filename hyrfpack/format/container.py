@@ -30,8 +30,8 @@ MINOR_VERSION = 2
 MAX_SECTIONS = 1024
 MAX_FILE_BYTES = 1 << 34
 MAX_RAW_BYTES = 1 << 34
-# A file may declare this many decoded bytes for each of its bytes: deflate, the densest common coder, reaches at most
-# 1032:1. The extra bytes allow a small file to hold large hash tables of which few rows are read.
+# A file may declare this many decoded bytes for each of its bytes, since deflate, the densest common coder, reaches at
+# most 1032:1. The extra bytes allow a small file to hold large hash tables of which few rows are read.
 MAX_RAW_BYTES_PER_FILE_BYTE = 1024
 EXTRA_RAW_BYTES_PER_FILE = 3 << 24
 
@@ -224,7 +224,7 @@ class Container:
             raise self._damaged_error("the file is empty")
         if start[: len(MAGIC)] != MAGIC[: len(start)]:
             raise HyrfFormatError(f"{self.name}: this is not a .hyrf file", fix="check the path, or write it again")
-        # The version is checked first, because another major version may change the layout of all that follows.
+        # The version is checked first, because another major version may change the layout of everything after it.
         if len(start) >= len(MAGIC) + _VERSION_STRUCT.size:
             major, minor = _VERSION_STRUCT.unpack_from(start, len(MAGIC))
             if major != MAJOR_VERSION:

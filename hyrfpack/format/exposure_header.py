@@ -1,6 +1,6 @@
-"""Header of section `EXPO`: all of an exposure map but its centres. `docs/reference/format.md` specifies its layout.
+"""Header of section `EXPO`: an exposure map without its centres. `docs/reference/format.md` specifies its layout.
 
-It is read without numpy, because importing numpy would make `describe` slow.
+It is read without numpy, because importing numpy would make `describe_file` slow.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from hyrfpack.errors import HyrfFormatError
 
 CODEC_EXPOSURE = 9
 BYTES_PER_CENTER = 12
-# Stops of exposure by which middle grey (0.5) becomes lighter for each unit of log gain, at a display gamma of 2.2.
+# One unit of log gain makes middle grey (0.5) lighter by this many stops of exposure, at a display gamma of 2.2.
 STOPS_PER_LOG_GAIN = 2.2 / 2 / math.log(2)
 _HEADER_STRUCT = struct.Struct("<B3s20f")
 _FLOATS_PER_FIELD = {"lengths": 2, "box": 6, "mean": 3, "limits": 6, "steps": 3}  # in file order
@@ -21,7 +21,7 @@ _FLOATS_PER_FIELD = {"lengths": 2, "box": 6, "mean": 3, "limits": 6, "steps": 3}
 
 @dataclass(frozen=True)
 class ExposureHeader:
-    """The fields of an exposure map but its centres, in file order; `hyrfpack.model.ExposureMap` defines them.
+    """The fields of an exposure map except its centres, in file order; `hyrfpack.model.ExposureMap` defines them.
 
     Attributes:
         centers: number of centres that follow the header.

@@ -19,7 +19,7 @@ class SectionSize:
     Attributes:
         type: four letters of the section's type.
         holds: the content that the type stands for.
-        before: bytes of the decoded content, numbers as float32 (metadata and exposure map: as they are).
+        before: bytes of the decoded content, numbers as float32 (metadata and exposure map: as stored).
         after: stored bytes.
     """
 

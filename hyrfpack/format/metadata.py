@@ -1,6 +1,6 @@
 """The META section: one JSON object that says what the other sections hold.
 
-It is read without numpy, because importing numpy would make `describe` slow.
+It is read without numpy, because importing numpy would make `describe_file` slow.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from hyrfpack.version import __version__
 CODEC_JSON = 0
 CODEC_DEFLATED = 5
 MAX_METADATA_BYTES = 1 << 20
-MAX_NESTING_DEPTH = 64  # limits how deep functions recurse that walk the objects and lists
+MAX_NESTING_DEPTH = 64  # limits the recursion of functions that walk the objects and lists
 INTEGER_LIMIT = 1 << 63
 
 # JSON types of the configuration's values; a tuple stands for a list of that length. `ModelConfig` checks the ranges.
@@ -74,7 +74,7 @@ class Metadata:
 
         Raises:
             ValueError: a value cannot be written as JSON, such as NaN and infinity.
-            HyrfError: the values take more than MAX_METADATA_BYTES, or nested deeper than MAX_NESTING_DEPTH.
+            HyrfError: the values take more than MAX_METADATA_BYTES, or are nested deeper than MAX_NESTING_DEPTH.
         """
         values = {item.name: getattr(self, item.name) for item in fields(self)}
         if not self.layers:
@@ -102,7 +102,7 @@ class Metadata:
 
 
 def writer_name() -> str:
-    """Return the program and its version, as files name it."""
+    """Return the name and the version of this program, as files state them."""
     return f"hyrfpack {__version__}"
 
 
@@ -162,7 +162,7 @@ def read_metadata(container: Container) -> Metadata:
 
 
 def _inflate(data: bytes, length: int, name: str) -> bytes:
-    """Decompress exactly `length` bytes of a zlib stream; never more are allocated."""
+    """Decompress exactly `length` bytes of a zlib stream, and never allocate more."""
     inflater = zlib.decompressobj()
     try:
         text = inflater.decompress(data, length + 1)

@@ -17,9 +17,9 @@ from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.quant.points import LatticePoints, encode_points
 from hyrfpack.quant.steps import ALL_ZERO_CODE
 
-# A table of zeros takes the same bytes at any size, so that the smallest size, which is encoded fastest, is used.
+# A table of zeros takes the same number of bytes at any size. The smallest table is encoded fastest.
 MIN_LOG2_TABLE_SIZE = 4
-# A target size below these many bytes was most likely meant in megabytes or in kilobytes.
+# A target size below this many bytes was most likely meant in megabytes or in kilobytes.
 MEGABYTE_HINT_BELOW_BYTES = 100
 KILOBYTE_HINT_BELOW_BYTES = 1_000
 
@@ -62,7 +62,7 @@ def check_target_bytes(target_bytes: int, provenance: dict | None = None, exposu
         exposure: exposure map that the file will have, as far as it is known.
 
     Raises:
-        HyrfError: no packed file is so small. The message suggests a unit where it seems to be missing.
+        HyrfError: no packed file can be that small. The message suggests a unit if it seems to be missing.
     """
     smallest = min_file_bytes(provenance, exposure)
     if target_bytes >= smallest:

@@ -83,9 +83,10 @@ def encode(model: HybridModel, **settings: Any) -> tuple[list[Section], dict]:
     """
     chosen = PaperSettings(**settings)
     with needs_package("dahuffman", "profile 'paper'"):
-        import dahuffman  # noqa: F401 - builds the Huffman codes; imported here so that its absence shows at once
+        import dahuffman  # noqa: F401 - builds the Huffman codes; imported here to fail early if it is missing
     arrays = to_arrays(model)
-    # Halves come first: they reject values that would overflow the geometry field, which clips the opacities below.
+    # Halves are encoded first. They reject values that would overflow the geometry field, whose outputs are needed to
+    # clip the opacity logits below.
     halves = {
         group: _encode_float16(group, arrays[group]) for group in (sections.POSITIONS, *sections.DECODER_SECTIONS)
     }
@@ -104,7 +105,7 @@ def encode(model: HybridModel, **settings: Any) -> tuple[list[Section], dict]:
 
 @torch.no_grad()
 def _clip_opacity_logits(model: HybridModel, opacity_logits: np.ndarray) -> np.ndarray:
-    """Clip opacity logits (N, 1) where opacity no longer changes, so that no codewords are spent on invisible tails.
+    """Clip opacity logits (N, 1) where opacity no longer changes, so that no codewords code invisible differences.
 
     The sum of the explicit logit and the field's output is clipped to +-LOGIT_LIMIT, within 7e-6 of opacity 0 and 1.
     """

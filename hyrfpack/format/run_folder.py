@@ -76,7 +76,7 @@ def find_model(path: str | os.PathLike[str]) -> Path:
 
 
 def describe_unfinished_run(run: RunStatus) -> str:
-    """Return a message clause that says how far an unfinished run is; FINISH_RUN_ADVICE says how to finish it."""
+    """Return a message clause on the progress of an unfinished run; FINISH_RUN_ADVICE says how to finish it."""
     done = "" if run.step is None or run.steps is None else f" (step {run.step:,} of {run.steps:,})"
     return f"the run has not finished{done}"
 

@@ -1,6 +1,6 @@
 """Types and contents of the sections of a `.hyrf` file.
 
-This module imports nothing, because imports would make `describe` slow.
+This module imports nothing, because imports would make `describe_file` slow.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ from hyrfpack.parallel import has_numba
 
 @cache
 def has_triton() -> bool:
-    """Return whether GPU kernels can be compiled. Triton comes with torch wherever torch runs on CUDA or ROCm."""
+    """Return whether GPU kernels can be compiled. Builds of torch for CUDA and ROCm include Triton."""
     try:
         import triton  # noqa: F401
     except ImportError:

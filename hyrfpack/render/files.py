@@ -43,8 +43,8 @@ def render_files(
         depth: whether to write also `<name>.depth.tiff`: one float32 channel, depth along the view axis in world units,
             0 where no Gaussian is hit.
         settings: render settings.
-        overwrite: replace existing files. Without it, an image whose file exists gets a free file name in the same
-            folder, and an existing depth file is an error.
+        overwrite: replace existing files. Without it, an image whose file exists is written under a free file name in
+            the same folder, and an existing depth file is an error.
         ranks: processes that share the cameras; each yields the paths that it has written.
 
     Raises:
@@ -71,7 +71,7 @@ def make_renderer(
     depth: bool = False,
     settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
 ) -> Callable[[Camera], ColorAndDepth]:
-    """Decode a model once, and return a function that renders it from a camera. Arguments as in `render_files`."""
+    """Decode a model once, and return a function that renders it. The arguments are those of `render_files`."""
     with torch.no_grad():
         decoded = model.decode()
     return partial(render_view, model, settings=settings, decoded=decoded, depth=depth)
@@ -135,7 +135,7 @@ def _safe_relative_path(name: str) -> str:
 def save_picture(
     path: str | os.PathLike[str], image: Image.Image, *, overwrite: bool = True, rename: bool = True
 ) -> Path:
-    """Write an image, whole or not at all, in the format of its extension; return the path that was written.
+    """Write an image, completely or not at all, in the format of its extension; return the path that was written.
 
     The folder is created if missing. `overwrite` and `rename` are those of `hyrfpack.atomic.pending_file`.
 

@@ -1,4 +1,4 @@
-"""The renderer: cull Gaussians, decode the visible ones, project, sort into tiles, blend, and add the background."""
+"""Renders a view: culls Gaussians, decodes the others, projects, sorts into tiles, blends and adds the background."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from hyrfpack.scene import Camera
 
 @dataclass(frozen=True)
 class RenderSettings:
-    """Settings of accuracy against speed. `docs/research/speed-and-accuracy.md` lists error and time of each default.
+    """Settings that trade accuracy for speed. `docs/research/speed-and-accuracy.md` lists their errors and times.
 
     Attributes:
         near: Gaussians nearer than this are culled, in local units (the frame's longest half-axis is 1).
@@ -44,7 +44,7 @@ class RenderSettings:
             interpolated between them; 1 is exact.
         transmittance_min: blending of a pixel stops when its transmittance is at most this; 0 blends every Gaussian.
         exposure: "as-photographed" applies the model's exposure map, so that a view looks like the photos taken near
-            it; "consistent" renders all views at the model's own exposure. A model without a map renders the same.
+            it; "consistent" renders all views at the model's own exposure. Without a map, both are the same.
     """
 
     near: float = 0.01
@@ -76,7 +76,7 @@ class Rendering:
             requested.
         indices: (n,) indices of the Gaussians that were decoded.
         visible: (n,) bool, whether each of these touches the image.
-        absgrad: (n, 2) sums over pixels of |dL/d mean2d| in pixels; zero until backward has run; None unless requested.
+        absgrad: (n, 2) sums over pixels of |dL/d mean2d| in 1/px; zero until backward has run; None unless requested.
         pairs: number of blended tile-Gaussian pairs.
         seconds: wall time of each stage in seconds.
     """
@@ -108,9 +108,9 @@ def render_view(
     Args:
         model: the model to render.
         camera: the camera, in world units.
-        settings: accuracy against speed.
-        decoded: result of `model.decode()`. It does not depend on the view, so that callers who render many views of
-            an unchanged model compute it once. The result is not differentiable then.
+        settings: render settings.
+        decoded: result of `model.decode()`. It does not depend on the view, so callers who render many views of an
+            unchanged model compute it once. A rendering with `decoded` is not differentiable.
         depth: whether to return depth.
         absgrad: whether to collect absolute gradients of the projected centres during backward.
         solid: (3,) colour behind everything instead of the model's own; for models without a background sphere.
@@ -179,8 +179,8 @@ def render_view(
         else:
             behind = tensor_like(model.config.solid, positions) if solid is None else solid
             rgb = raster.rgb + raster.transmittance[..., None] * behind
-        # On a GPU each check waits for the device. So only the image is checked there, and in training not even that,
-        # because its loss shows the same.
+        # Each check on a GPU waits for the device. So only the image is checked there, and no image in training,
+        # because the loss is checked.
         if on_cpu or not rgb.requires_grad:
             _check_finite(background=behind if on_cpu else rgb)
     if settings.exposure == AS_PHOTOGRAPHED:
@@ -198,7 +198,7 @@ def render_view(
 
 
 def apply_exposure_map(model: HybridModel, camera: Camera, rgb: Tensor) -> Tensor:
-    """Apply the model's exposure map to a render of the consistent exposure, as `render` does for "as-photographed".
+    """Apply the exposure map to a render of the consistent exposure, as `render_view` does for "as-photographed".
 
     Args:
         model: the model that was rendered.

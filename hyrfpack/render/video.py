@@ -23,7 +23,7 @@ def has_ffmpeg() -> bool:
 def write_video(
     frames: Sequence[Path], path: str | os.PathLike[str], frames_per_second: int = 30, *, overwrite: bool = True
 ) -> Path:
-    """Encode PNG files as an MP4 video; the video file is written whole or not at all.
+    """Encode PNG files as an MP4 video, which is written completely or not at all.
 
     Args:
         frames: PNG files in order; those of another size than the first are scaled to its size.

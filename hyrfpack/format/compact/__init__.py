@@ -2,7 +2,7 @@
 
 positions                          lattice of the contracted cube, Morton order, gaps       section codec 6
 colour, scale, opacity logits      a step for each class of Gaussians, prediction, rANS     section codec 7
-hash tables                        a step by how often a row is read, rANS                  section codec 8
+hash tables                        a step for each usage class of rows, rANS                section codec 8
 decoders (MLPs)                    a step for each output, rANS                             section codec 8
 
 `hyrfpack.compress_model` chooses what is stored and the quantisation steps; this package only encodes and decodes.
@@ -59,7 +59,7 @@ def decode_section(
         data: stored bytes of the section.
         shape: (rows, columns) of the result.
         config: configuration of the model.
-        points: lattice points from `decode_positions`; None when the positions have another codec.
+        points: lattice points from `decode_positions`; None if the positions have another codec.
 
     Returns:
         (rows, columns) float32.

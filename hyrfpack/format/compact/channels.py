@@ -1,4 +1,4 @@
-"""Coding of channels: one number per Gaussian, one step per class of Gaussians, predicted along the list.
+"""Coding of channels: one number per Gaussian, one step per class of Gaussians, prediction by `quant.lifting`.
 
 The bytes of a channel are: float32 mean, u8 weight of the prediction, u32 length of the stream in bytes, u8 number of
 classes, a u8 step code per class, and the stream.
@@ -16,7 +16,7 @@ from hyrfpack.quant.integers import decode_integers, encode_integers
 from hyrfpack.quant.lifting import inverse_lift
 from hyrfpack.quant.steps import FIXED_POINT_ONE, decode_step
 
-MAX_ABS_CHANNEL_VALUE = 4096.0  # keeps sums in fixed point far within 64 bits
+MAX_ABS_CHANNEL_VALUE = 4096.0  # keeps fixed-point sums well within 64 bits
 _NUMBERS_PER_BLOCK = 1 << 16  # small enough that temporary arrays stay in the caches
 _HEADER_STRUCT = struct.Struct("<fBIB")
 

@@ -24,7 +24,7 @@ _HEADER_STRUCT = struct.Struct("<II")
 
 
 def iter_blocks(count: int) -> Iterator[slice]:
-    """Return consecutive slices of a list of `count` numbers, so short that temporary arrays stay in the caches."""
+    """Yield consecutive slices of a list of `count` numbers, short enough that temporary arrays stay in the caches."""
     return (slice(first, first + _NUMBERS_PER_BLOCK) for first in range(0, count, _NUMBERS_PER_BLOCK))
 
 
@@ -41,7 +41,7 @@ class StepGroups:
     count: int
 
     def gather(self, values: np.ndarray) -> np.ndarray:
-        """Return for each number (n,) the value of its group, out of `values` (count,)."""
+        """Return the value of each number's group, (n,), given the groups' `values` (count,)."""
         result = np.empty(len(self.index), values.dtype)
         for part in iter_blocks(len(result)):
             result[part] = values.take(self.index[part])

@@ -20,8 +20,8 @@ from hyrfpack.quant.morton import MAX_BITS_PER_AXIS
 from hyrfpack.quant.points import LatticePoints
 
 USAGE_CLASS_COUNT = 16
-MAX_COUNTED_GAUSSIANS = 1 << 16  # of larger models only every n-th Gaussian is counted, which saves time
-GAUSSIANS_PER_BLOCK = 1 << 13  # so few that torch does not start its own threads for a block
+MAX_COUNTED_GAUSSIANS = 1 << 16  # in larger models, only every n-th Gaussian is counted, which saves time
+GAUSSIANS_PER_BLOCK = 1 << 13  # small enough that torch does not start its own threads for a block
 
 
 @dataclass(frozen=True)
@@ -44,9 +44,10 @@ class Plan:
     Attributes:
         kept: (M,) int64 indices of the Gaussians that are stored, in file order.
         layers: the stored Gaussians in layers, the most important first.
-        basis: (3, 3) float32, its columns are an orthonormal basis of colour logits, the largest variance first.
+        basis: (3, 3) float32 whose columns are an orthonormal basis of colour logits, the largest variance first.
         groups: groups of numbers of the tables and decoders that share a step, by section.
-        distortion_per_number: mean squared error that each number may add to renders; stored in the file for people.
+        distortion_per_number: mean squared error that each number may add to renders; the file states it, but no
+            decoder needs it.
     """
 
     kept: np.ndarray
@@ -83,9 +84,9 @@ def lattice_to_local(points: LatticePoints, frame: Frame) -> np.ndarray:
 def build_step_groups(group: str, config: ModelConfig, points: LatticePoints | None = None) -> StepGroups:
     """Group the numbers of a hash table or decoder that share a step.
 
-    Rows of a table are grouped by level and usage class: 0 if no Gaussian reads the row, else 1 + floor(log4 n),
-    where n counts the corners, with this row, of the cells that hold a Gaussian. Numbers of a decoder are grouped by
-    layer and output; the biases of a layer form one group.
+    Rows of a table are grouped by level and usage class: 0 if no Gaussian reads the row, else 1 + floor(log4 n). Here n
+    is the number of cell corners that have this row, among all cells that hold a Gaussian. Numbers of a decoder are
+    grouped by layer and output; the biases of a layer form one group.
 
     Args:
         group: section of the table or decoder.

@@ -35,7 +35,7 @@ _GAUSSIANS_PER_BLOCK = 1 << 15  # small enough that temporary arrays stay in the
 
 @dataclass(frozen=True)
 class QuantizedModel:
-    """Quantised numbers of a model. Only `encode` needs those of all sections.
+    """Quantised numbers of a model. `encode` needs those of all sections; other callers may leave some out.
 
     Attributes:
         plan: selection, order and grouping of the numbers.
@@ -49,7 +49,7 @@ class QuantizedModel:
     groups: dict[str, GroupSymbols]
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Return the numbers as they will be decoded, float32: flat tables and decoders, logits (M, columns)."""
+        """Return float32 numbers as they will be decoded, by section: flat tables and decoders, logits (M, columns)."""
         arrays = {group: chosen.values for group, chosen in self.groups.items()}
         for group in self.channels[0]:
             layers = [[channel.values for channel in layer[group]] for layer in self.channels]
@@ -58,7 +58,7 @@ class QuantizedModel:
 
 
 def encode(model: HybridModel, quantized: QuantizedModel) -> tuple[list[Section], dict]:
-    """Encode quantised numbers; return all sections but the metadata, in file order, and the settings for people.
+    """Encode quantised numbers; return all sections except the metadata, in file order, and the metadata's settings.
 
     The start of the file is a usable model as soon as it contains the first layer and the fields.
 

@@ -30,7 +30,7 @@ def activate_geometry(
         scale = S(p) sigmoid(s_n + s_e),  or S(p) sigmoid(s_n) sigmoid(s_e) with rule "product"
 
     Args:
-        raw: (N, 8) outputs of the geometry field: a_n, s_n (3), r_n (4). In any layout.
+        raw: (N, 8) outputs of the geometry field, in any layout: a_n, s_n (3), r_n (4).
         positions: (N, 3) p, local units.
         scale_logits, opacity_logits: (N, 1) s_e and a_e.
         half_extent: half-axes of the box in the definition of S(p), see `scale_bounds`; None for S(p) = 1.

@@ -1,4 +1,4 @@
-"""Implements activation in Triton: one launch forward and one backward, where plain torch takes a dozen each."""
+"""Implements activation in Triton with one launch forward and one backward; plain torch needs a dozen for each."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def activate_backward(
 
 
 class _Activate(torch.autograd.Function):
-    """Autograd function of `activate_geometry`; gives gradients of `raw` and of both logits."""
+    """Autograd function of `activate_geometry`; computes the gradients of `raw` and of both logits."""
 
     @staticmethod
     def forward(

@@ -22,7 +22,7 @@ def adam_step(
     eps: float,
 ) -> Tensor:
     """Take the step of `hyrfpack.ops.adam.adam_step`."""
-    # The fused kernel indexes all four tensors indices_by_rate, so that the gradients must be contiguous too.
+    # The fused kernel indexes all four tensors alike, so the gradients must be contiguous, too.
     gradients = [gradient.contiguous() for gradient in gradients]
     skipped = [not _squares_are_finite(gradient) for gradient in gradients]
     # Torch increments each tensor's step number before it uses it.
@@ -58,5 +58,5 @@ def _squares_are_finite(gradient: Tensor) -> bool:
     """Return whether g^2 is finite for all elements of a gradient."""
     if not gradient.numel():
         return True
-    low, high = gradient.aminmax()  # Takes one pass; both are NaN if any element is.
+    low, high = gradient.aminmax()  # This takes one pass; both are NaN if any element is.
     return bool((torch.maximum(-low, high) ** 2).isfinite())

@@ -1,8 +1,8 @@
 """Implements the Adam step in one Triton launch for all tensors.
 
 Tensors may have 8 elements or 100 million. A small table on the device holds each tensor's addresses and its first
-program; another holds each tensor's step scales. A program looks up its tensor there and updates one block of it.
-Each element is read and written once, in accesses of 16 bytes.
+program; another holds each tensor's step scales. Each program looks up its tensor there and updates one block of that
+tensor. It reads and writes each element once, in accesses of 16 bytes.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from torch import Tensor
 # bus.
 _ELEMENTS_PER_PROGRAM = 1024
 _WARPS_PER_PROGRAM = 4
-# The table's length is a compile-time power of two; this minimum avoids a new kernel for a few more tensors.
+# The table's length is a compile-time power of two. This minimum lets small numbers of tensors share one kernel.
 _MIN_TABLE_SLOTS = 32
 
 
@@ -117,8 +117,8 @@ def adam_step_kernel(
 def _table(sizes: tuple[int, ...], addresses: tuple[int, ...], device: torch.device) -> tuple[Tensor, int]:
     """Return the kernel's table on the device and the number of programs.
 
-    `addresses` holds those of all values, then of all gradients, exp_avg and exp_avg_sq. The result is cached, since
-    the allocator returns the same addresses at every step.
+    `addresses` lists the addresses of all values, then of all gradients, exp_avg and exp_avg_sq. The result is cached,
+    since the allocator returns the same addresses at every step.
     """
     count = len(sizes)
     slots = max(_MIN_TABLE_SLOTS, triton.next_power_of_2(count))

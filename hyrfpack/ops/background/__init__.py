@@ -1,4 +1,4 @@
-"""Renders the background: a sphere around the scene, coloured by the radiance field, seen where light passes."""
+"""Renders the background: a sphere around the scene that the radiance field colours, visible where light passes."""
 
 from __future__ import annotations
 
@@ -58,14 +58,14 @@ def background_grid(
 
     Args:
         transmittance: (H, W) the share of light that passes all Gaussians; it receives no gradient.
-        threshold: the transmittance above which a pixel needs the background, not negative.
+        threshold: the transmittance above which a pixel needs the background, 0 or more.
         stride: pixels between neighbouring nodes, at least 1.
         pose: (4, 4) camera_from_local, preferably on the CPU, where "gpu" reads it. Not differentiable.
         intrinsics: (fx, fy, cx, cy) in pixels.
         half_extent: half-axes of the box that the contraction maps linearly, local units.
         table, resolutions, log2_table_size: the radiance field's hash grid, as in `hash_encode`.
         weights, biases: the radiance field's decoder, as in `mlp`; three outputs.
-        encoding: of d, "frequency" or "sh", see `encode_directions`.
+        encoding: the encoding of d, "frequency" or "sh", see `encode_directions`.
         mixed: as in `mlp`.
         implementation: "auto", "reference" or "gpu" (float32, two features per level, at most 16 levels, two hidden
             layers of width 128 or less). Without gradients "gpu" is one launch; with gradients it synchronises with

@@ -1,13 +1,13 @@
 """Computes the background at the nodes of a grid on a GPU.
 
-Without gradients, one kernel goes from transmittance to colours. With gradients, one kernel finds the nodes that are
-needed and another computes the field's inputs at each; the field's own kernels do the rest.
+Without gradients, one kernel computes colours from the transmittance. With gradients, one kernel finds the nodes that
+are needed, and another computes the field's inputs at each; the field's own kernels compute the colours.
 
 A program of the first kernel handles a block of neighbouring nodes, or returns early where no light passes. Neighbours
-see neighbouring points of the sphere and so mostly read the same rows of the tables. Hash features are therefore tiles
-[level, node], and a warp's lanes are nodes. The decoder runs on the matrix units with nodes as rows, so that the output
-of one layer enters the next without leaving the registers. The first layer is a sum of three products: one for each of
-a level's two features, and one for the encoded direction.
+see neighbouring points of the sphere, so they mostly read the same rows of the tables. Hash features are therefore
+tiles [level, node], and a warp's lanes are nodes. The decoder runs on the matrix units with nodes as rows, so that the
+output of one layer enters the next without leaving the registers. The first layer is a sum of three products: one for
+each of a level's two features, and one for the encoded direction.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from hyrfpack.ops.shade.directions import DIRECTION_FEATURES
 from hyrfpack.ops.shade.gpu_directions import encode_block
 
 _NODE_ROWS_PER_BLOCK = tl.constexpr(8)
-_NODES_PER_PROGRAM = 256  # In kernels with one node per thread.
+_NODES_PER_PROGRAM = 256  # This holds for `find_nodes_kernel` and `encode_nodes_kernel`, with one node per thread.
 _BACKGROUND_RADIUS = tl.constexpr(BACKGROUND_RADIUS)
 _CHANNELS = tl.constexpr(3)
 _PADDED_CHANNELS = tl.constexpr(16)
@@ -39,8 +39,8 @@ def _launch_shape(mixed: bool, hidden: int) -> tuple[int, int, int]:
     """Return the columns of nodes per block, the warps per block, and the neurons of the second layer per slice.
 
     Each thread handles one node, and registers limit the threads per multiprocessor. Wide layers and float32 factors
-    need so many registers that several threads share a node. Every program loads all weights, about as much data as
-    128 nodes read from the tables.
+    need so many registers that several threads share a node. Every program loads all weights, which is about as much
+    data as 128 nodes read from the tables.
     """
     if mixed:
         columns, warps, part = (16, 4, 64) if hidden <= 64 else (16, 8, 64)
@@ -53,7 +53,7 @@ def _launch_shape(mixed: bool, hidden: int) -> tuple[int, int, int]:
 def _sees_background(transmittance, height, width, y, x, threshold, stride, STRIDE: tl.constexpr):
     """Return whether the transmittance exceeds `threshold` at any pixel nearer to (y, x) than STRIDE in both axes."""
     sees_background = y < 0
-    down = 1 - stride  # The bound is not a constant, as compilers would unroll both loops and run out of registers.
+    down = 1 - stride  # With a constant bound, compilers would unroll both loops and run out of registers.
     while down < stride:
         row = y + down
         for right in tl.static_range(1 - STRIDE, STRIDE):

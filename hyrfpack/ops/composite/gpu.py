@@ -52,7 +52,7 @@ def composite_kernel(
 def grad_transmittance_kernel(
     grad, grid, row, column, channel, stride, width, total, grad_transmittance, BLOCK: tl.constexpr
 ):
-    """Write the gradient by the transmittance (H, W)."""
+    """Write the gradient of the transmittance (H, W)."""
     pixel, y, x, live = _pixel_block(width, total, BLOCK)
     gradient = tl.zeros([BLOCK], tl.float32)
     for part in tl.static_range(3):
@@ -63,7 +63,7 @@ def grad_transmittance_kernel(
 
 @triton.jit(do_not_specialize=["height", "width", "columns", "total", "stride"])
 def grad_grid_kernel(grad, transmittance, stride, height, width, columns, total, grad_grid, BLOCK: tl.constexpr):
-    """Write the gradient by the grid, planar (3, R, S)."""
+    """Write the gradient of the grid, planar (3, R, S)."""
     node = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = node < total
     row, column = node // columns * stride, node % columns * stride

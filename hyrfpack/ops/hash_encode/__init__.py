@@ -62,7 +62,7 @@ def hash_encode(
 
 
 def _kernels(implementation: str) -> ModuleType:
-    """Import and return the module of an implementation, since not every machine has its dependencies."""
+    """Import and return the module of an implementation. It is imported late, since its dependencies are optional."""
     if implementation == "gpu":
         from hyrfpack.ops.hash_encode import gpu
 

@@ -120,7 +120,7 @@ def _add_table_grad(coords, grad, resolution, mask, grad_table):
 
 @njit
 def _add_coords_grad(coords, table, grad, resolution, mask, start, stop, grad_coords):
-    """Add the gradient by the coordinates from one level's gradient `grad` (2, N) to `grad_coords` (3, N).
+    """Add the gradient of the coordinates from one level's gradient `grad` (2, N) to `grad_coords` (3, N).
 
     Only points [start, stop) are handled.
     """
@@ -187,7 +187,7 @@ def encode(coords: Tensor, table: Tensor, resolutions: tuple[int, ...], log2_tab
 def grad_table(
     coords: Tensor, table: Tensor, resolutions: tuple[int, ...], log2_table_size: int, grad: Tensor
 ) -> Tensor:
-    """Compute the gradient by the table, in its shape, from the gradient (N, 2L) of the features."""
+    """Compute the gradient of the table, in its shape, from the gradient (N, 2L) of the features."""
     planes, grads = _to_planar(coords), _to_planar(grad)
     result = torch.zeros(table.shape)
     levels = _split_levels(result.view(-1).numpy(), resolutions, log2_table_size)
@@ -203,7 +203,7 @@ def grad_table(
 def grad_coords(
     coords: Tensor, table: Tensor, resolutions: tuple[int, ...], log2_table_size: int, grad: Tensor
 ) -> Tensor:
-    """Compute the gradient (N, 3) by the coordinates from the gradient (N, 2L) of the features."""
+    """Compute the gradient (N, 3) of the coordinates from the gradient (N, 2L) of the features."""
     planes, grads = _to_planar(coords), _to_planar(grad)
     tables = _split_levels(table.detach().contiguous().view(-1).numpy(), resolutions, log2_table_size)
     points = planes.shape[1]

@@ -104,7 +104,7 @@ def grad_table_kernel(
     coords, axis_stride, point_stride, levels, copies,
     grad, feature_stride, grad_stride, out, points, POINTS: tl.constexpr,
 ):  # fmt: skip
-    """Add gradients of a block of points (grid axis 0) on a level (grid axis 1) to a copy of it in `out` (rows, 2)."""
+    """Add gradients of a block of points (grid axis 0) to a copy of a level (grid axis 1) in `out` (rows, 2)."""
     start, level = tl.program_id(0).to(tl.int64) * POINTS, tl.program_id(1)
     lane = tl.arange(0, POINTS)
     inside = lane < points - start
@@ -133,7 +133,7 @@ def grad_table_kernel(
 
 @triton.jit
 def sum_copies_kernel(levels, copies, out, BLOCK: tl.constexpr):
-    """Add the further copies of a level (grid axis 1) to its rows in `out` (rows, 2), by blocks (grid axis 0)."""
+    """Add the further copies of a level (grid axis 1) to its first in `out` (rows, 2), by blocks (grid axis 0)."""
     level = tl.program_id(1)
     rows, count = tl.load(copies + level * 3), tl.load(copies + level * 3 + 1)
     lane = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -164,7 +164,7 @@ def grad_coords_kernel(
     LEVELS: tl.constexpr,
     POINTS: tl.constexpr,
 ):
-    """Write the gradient by the coordinates of a block of points (grid axis 0), summed over levels in order."""
+    """Write the gradient of the coordinates for a block of points (grid axis 0), summed over levels in order."""
     start = tl.program_id(0).to(tl.int64) * POINTS
     lane = tl.arange(0, POINTS)
     inside = lane < points - start
@@ -235,8 +235,8 @@ def plan_gradient_copies(
 ) -> GradientCopies:
     """Plan the copies of levels for the gradients of at least one point.
 
-    A level with at most as many vertices as points gets as many copies as have no more rows in total than points, so
-    that summing costs at most an eighth of the additions. A finer level gets one, since few points share a row there.
+    A level whose vertices do not outnumber the points gets about points / rows copies, at most _MAX_COPIES_PER_LEVEL.
+    Summing these takes at most an eighth of all additions. A finer level gets one, since few points share a row there.
     """
     return _plan_gradient_copies(points.bit_length() - 1, resolutions, log2_table_size, device)
 
@@ -245,7 +245,7 @@ def plan_gradient_copies(
 def _plan_gradient_copies(
     log2_points: int, resolutions: tuple[int, ...], log2_table_size: int, device: torch.device
 ) -> GradientCopies:
-    """Plan the copies for 2^log2_points points; the cache stays small although the number varies from step to step."""
+    """Plan the copies for 2^log2_points points. Powers of two keep the cache small as the number of points varies."""
     offsets = level_offsets(resolutions, log2_table_size)
     points, numbers, end, levels, widest = 1 << log2_points, [], offsets[-1], 0, 0
     for level, (resolution, (first, last)) in enumerate(zip(resolutions, pairwise(offsets), strict=True)):
@@ -294,7 +294,7 @@ def encode(coords: Tensor, table: Tensor, resolutions: tuple[int, ...], log2_tab
 def grad_table(
     coords: Tensor, table: Tensor, resolutions: tuple[int, ...], log2_table_size: int, grad: Tensor
 ) -> Tensor:
-    """Compute the gradient by the table, in its shape, from the gradient (N, 2L) of the features, in any layout.
+    """Compute the gradient of the table, in its shape, from the gradient (N, 2L) of the features, in any layout.
 
     Points add to rows by atomics, in no fixed order, so sums differ in their last bits from run to run. A point whose
     two gradients on a level are zero is skipped there.
@@ -320,7 +320,7 @@ def grad_table(
 def grad_coords(
     coords: Tensor, table: Tensor, resolutions: tuple[int, ...], log2_table_size: int, grad: Tensor
 ) -> Tensor:
-    """Compute the gradient (N, 3) by the coordinates, in their layout, from the gradient (N, 2L) of the features."""
+    """Compute the gradient (N, 3) of the coordinates, in their layout, from the gradient (N, 2L) of the features."""
     points = coords.shape[0]
     result = torch.empty_like(coords)
     if points:

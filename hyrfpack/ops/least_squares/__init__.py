@@ -31,7 +31,7 @@ def least_squares(
     G and `right` add terms that are known in advance, such as a ridge or rows that all problems share.
 
     Args:
-        index: (R,) int64 in [0, N), the problem of each row, in any order.
+        index: (R,) int64 in [0, N), the problem to which each row belongs, in any order.
         basis: (R, K) float32 b.
         values: (R, C) float32 v.
         weights: (R,) float32 w, 0 or more.

@@ -51,7 +51,7 @@ def _group_by_problem(index, problems):
     """Group rows by problem.
 
     Returns:
-        (R,) the row indices sorted by problem, and (problems + 1,) the position of each problem's first row therein.
+        (R,) the row indices sorted by problem, and (problems + 1,) the position of each problem's first row in them.
     """
     starts = np.zeros(problems + 1, np.int64)
     for at in index:

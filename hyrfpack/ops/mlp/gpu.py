@@ -3,7 +3,7 @@
 Points are columns: a block of them is a tile [width, BLOCK], so planar features load without a transpose. The kernels
 are persistent: a fixed number of programs loop over all blocks, each with a stride of the number of programs. Hidden
 activations never leave the chip; backward recomputes them. Each program sums its own gradients of weights and biases,
-and torch sums those of all programs. There are no atomics, so that all runs on one machine give the same bytes.
+and torch sums those of all programs. There are no atomics, so all runs on one machine give the same bytes.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from hyrfpack.ops.mlp.tiles import (
     round_relu,
 )
 
-# As many programs are launched per multiprocessor as fit at once by their registers.
+# The registers of a multiprocessor suffice for this many programs at once.
 _FORWARD_PROGRAMS_PER_PROCESSOR = 4
 _BACKWARD_PROGRAMS_PER_PROCESSOR = 2
-# The largest blocks that leave registers for all resident programs (mixed) or that do not spill (float32).
+# Larger blocks would leave too few registers for the other resident programs (mixed) or would spill (float32).
 _FORWARD_POINTS_PER_BLOCK_MIXED = 128
 _FORWARD_POINTS_PER_BLOCK_FLOAT32 = 32
 
@@ -77,7 +77,7 @@ def backward(
     Args:
         packed: the packed weights that `forward` returned.
         biases: as in `forward`; the last one is not used.
-        widths: of inputs, hidden layers and outputs.
+        widths: widths of the inputs, the hidden layers and the outputs.
         needs_x: whether to compute the gradient of x; otherwise it is None.
 
     Returns:
@@ -95,7 +95,7 @@ def backward(
     programs = _program_count(x, block, _BACKWARD_PROGRAMS_PER_PROCESSOR)
     partials = x.new_empty(programs, sum(lengths))
     launches = [{"UPPER_LAYERS": True, "FIRST_LAYER": True, "NEEDS_X": needs_x}]
-    if multiplication == "tf32x3":  # Products take three times as many factors, so that one kernel for all would spill.
+    if multiplication == "tf32x3":  # Products hold three times as many factors, so one kernel for all would spill.
         launches = [{name: name == part for name in launches[0]} for part, needed in launches[0].items() if needed]
     for launch in launches if programs else []:
         backward_kernel[(programs,)](
@@ -213,7 +213,7 @@ def forward_kernel(
     IN_P: tl.constexpr, H1_P: tl.constexpr, H2_P: tl.constexpr, OUT_P: tl.constexpr,
     PLANAR: tl.constexpr, NEEDS_INT64: tl.constexpr, BLOCK: tl.constexpr, PRECISION: tl.constexpr,
 ):  # fmt: skip
-    """Compute y (count, OUT) of x (count, IN). PLANAR says that the stride between points of x is 1."""
+    """Compute y (count, OUT) from x (count, IN). PLANAR: whether the stride between points of x is 1."""
     w2 = packed + H1_P * IN_P
     w3 = w2 + H2_P * H1_P
     start = tl.program_id(0) * BLOCK

@@ -24,12 +24,12 @@ def kernel_widths(widths: Sequence[int]) -> dict[str, int]:
 
 
 def product_precision(mixed: bool) -> str:
-    """Return how `multiply_add` multiplies on this machine.
+    """Return the precision with which `multiply_add` multiplies on this machine.
 
     This is "bf16" if mixed, else the fastest method with the accuracy of float32. On NVIDIA's matrix units that is
-    "tf32x3": three passes with shortened factors, several times as fast as plain arithmetic. AMD's multiply float32
-    ("ieee"). Triton's interpreter multiplies bfloat16 incorrectly and truncates instead of rounding; "rounded" rounds
-    the bits of float32 there.
+    "tf32x3": three passes with shortened factors, several times as fast as plain arithmetic. AMD's matrix units
+    multiply float32 ("ieee"). Triton's interpreter multiplies bfloat16 incorrectly and truncates instead of rounding;
+    "rounded" rounds the bits of float32 there.
     """
     if mixed:
         return "rounded" if is_interpreting() else "bf16"

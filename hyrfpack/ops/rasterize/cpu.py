@@ -14,13 +14,13 @@ from hyrfpack.ops.rasterize import cpu_bin, cpu_blend, cpu_project
 from hyrfpack.ops.rasterize.reference import TILE_SIZE, jacobian_limits
 from hyrfpack.parallel.pool import run_ranges, run_tasks, thread_count
 
-# A thread blends about this many pairs while another one starts; shorter runs are not worth a task.
+# A thread blends about this many pairs in the time that another one takes to start. Shorter runs would not pay off.
 _MIN_PAIRS_PER_RUN = 128
 
 
 @dataclass(frozen=True)
 class _View:
-    """The arguments of a call without gradients. Each has one fixed type, since kernels are compiled per type.
+    """The arguments of `rasterize` that get no gradients. Each has one fixed type, since kernels are compiled per type.
 
     Attributes:
         axes: the rows of the camera's rotation.
@@ -125,7 +125,7 @@ def _view(
     depth: bool = False,
     absgrad: Tensor | None = None,
 ) -> _View:
-    """Convert the arguments of `rasterize` without gradients for the kernels."""
+    """Convert the arguments of `rasterize` that get no gradients to the types that the kernels take."""
     camera = camera_from_world.detach().double().tolist()[:3]
     return _View(
         axes=tuple(tuple(row[:3]) for row in camera),
@@ -304,7 +304,7 @@ def _blend_backward(
 
 
 def _project_backward(tiles: _Tiles, view: _View, rows: np.ndarray, inputs: list[np.ndarray]) -> tuple[np.ndarray, ...]:
-    """Return the gradients by means, quats, scales, opacities and colors."""
+    """Return the gradients of means, quats, scales, opacities and colors."""
     means, quats, scales, opacities = inputs
     grads = tuple(np.empty_like(array) for array in (means, quats, scales, opacities, means))
 

@@ -168,7 +168,7 @@ def find_pairs(start, stop, order, tile_count_bounds, records, width, height, ti
 
 @_kernel
 def assign_chunk_offsets(tile_counts, tile_starts):
-    """Replace the counts (chunks, tiles) by the offset of each chunk's pairs of each tile.
+    """Replace the pair counts (chunks, tiles) by the index of each chunk's first pair in each tile.
 
     Writes the first pair of each tile to tile_starts (tiles + 1,).
     """
@@ -188,7 +188,7 @@ def fill_tiles(start, stop, order, slot_starts, tiles, rows, offsets, pairs):
 
     Args:
         slot_starts: (N + 1,) the first slot of each Gaussian.
-        offsets: (tiles,) the offset of the chunk's next pair of each tile; incremented.
+        offsets: (tiles,) the index in `pairs` of the chunk's next pair in each tile; incremented.
         pairs: (P,) uint64, written.
     """
     source = np.uint64(0)

@@ -62,7 +62,7 @@ _EXP_3, _EXP_4, _EXP_5 = np.float32(0.16599276), np.float32(0.03980572), np.floa
 
 @_kernel
 def _exp8(x):
-    """Return exp(8 x) for x in [-ln 2, 0] to a relative error of 2e-6; below, some positive number or infinity."""
+    """Return exp(8 x) for x in [-ln 2, 0] to a relative error of 2e-6; for smaller x, a positive number or infinity."""
     e = ((((_EXP_5 * x + _EXP_4) * x + _EXP_3) * x + _EXP_2) * x + _EXP_1) * x + _EXP_0
     e *= e
     e *= e
@@ -90,8 +90,7 @@ def blend_tiles(
 
     Args:
         rgb, depth: None if not needed.
-        pair_weights: (P,) zeros, to which the sum over pixels of T alpha of each pair is written at its slot; None if
-            not needed.
+        pair_weights: (P,) zeros. The sum of T alpha over pixels is written to each pair's slot. None if not needed.
         blended: (tiles,), written: the number of pairs after which each tile was finished.
     """
     s = _scratch(7)
@@ -139,7 +138,7 @@ def blend_tiles(
                 pair_weights[(packed >> SLOT_SHIFT_BITS) & SLOT_MASK] = total
             pair += _UINT_1
             if (pair - begin) & _FINISH_TEST_MASK == np.uint64(0):
-                unfinished = _ZERO  # This is a sum, because a maximum would not be vectorised.
+                unfinished = _ZERO  # Pixels are summed, because a maximum would not be vectorised.
                 for k in range(np.uint64(_PIXELS_PER_TILE)):
                     unfinished += max(s[k + _T_PLANE] - transmittance_min, _ZERO)
                 if unfinished == _ZERO:
@@ -178,9 +177,9 @@ def blend_tiles_backward(
 ):  # fmt: skip
     """Write the gradient row of each pair of tiles first_tile to last_tile at the pair's slot.
 
-    Blending is replayed front to back with the rest R, the contribution of all that lies behind a Gaussian to g . rgb.
-    Then dL/d(alpha) = T (color . g) - R / (1 - alpha) needs nothing stored in forward. The sums for absgrad, which take
-    a tenth of the time, are skipped if it is None; the array itself is not accessed.
+    Blending is replayed front to back with the rest R, the contribution to g . rgb of everything behind a Gaussian.
+    Then dL/d(alpha) = T (color . g) - R / (1 - alpha) needs no values stored by forward. The sums for absgrad take a
+    tenth of the time and are skipped if it is None; the array itself is not accessed.
     """
     s = _scratch(7)
     tiles_x = (width + TILE_SIZE - 1) // TILE_SIZE

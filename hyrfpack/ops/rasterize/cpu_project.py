@@ -24,7 +24,7 @@ from hyrfpack.parallel.compiled import compiled
 # Squares of a triangular form do not cancel on long needles, and are never negative.
 MEAN_X, MEAN_Y, U_X, U_Y, V_Y, CUTOFF, OPACITY, RED, GREEN, BLUE, DEPTH, COV_XX, COV_YY, REACH = range(14)
 RECORD_FLOATS = 16
-# CUTOFF: the largest u^2 + v^2 with alpha >= 1/255. REACH: the largest d^T Sigma^-1 d to bin, slightly more than that.
+# CUTOFF: the largest u^2 + v^2 with alpha >= 1/255. REACH: the largest d^T Sigma^-1 d to bin, slightly above 16 CUTOFF.
 
 # Columns of the gradient row of a (Gaussian, tile) pair: sums over pixels of p = dL/d(exponent) times u, v, uu, uv, vv
 # and 1; dL/d(color); sums of |p u| and |p (U_Y u + V_Y v)|. The row is padded to a cache line.
@@ -141,8 +141,8 @@ def project(
     """Project Gaussians start to stop. A record is written only for a Gaussian that is drawn.
 
     Args:
-        axes: the rows of the camera's rotation. All camera arguments are tuples of float64, because loads from arrays
-            would stay in the loop.
+        axes: the rows of the camera's rotation. All camera arguments are tuples of float64, because the compiler would
+            not move loads from arrays out of the loop.
         shift: the camera's translation.
         lens: fx, fy, cx, cy, then the limits of x/z (low, high) and of y/z in the Jacobian.
         records: (N, 16), written.
@@ -200,7 +200,7 @@ def project_backward(
         slot_starts: (N + 1,) the first slot of each Gaussian.
         rows: (P, 16) the gradient rows, by slot.
         grad_means, grad_quats, grad_scales, grad_opacities, grad_colors: the gradients, written.
-        absgrad: (N, 2), added to, or None.
+        absgrad: (N, 2), incremented; None if not needed.
     """
     sums = np.empty(GRADIENT_ROW_FLOATS, np.float32)
     for i in range(np.uint64(start), np.uint64(stop)):

@@ -47,7 +47,7 @@ def frustum_cull(
     fx, fy, cx, cy = intrinsics
     x, y, z = (positions @ pose[:3, :3].T + pose[:3, 3]).unbind(-1)
     margin_x, margin_y = tolerance * width / 2, tolerance * height / 2
-    u, v = fx * x, fy * y  # Limits are multiplied by z > 0 instead of dividing by z, which needs no guard.
+    u, v = fx * x, fy * y  # The limits are multiplied by z, because a division by z would need a guard against 0.
     inside = (
         (z > near)
         & (u > (-margin_x - cx) * z)

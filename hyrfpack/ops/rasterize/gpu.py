@@ -1,7 +1,7 @@
 """Rasterises on the GPU with Triton kernels, behind one autograd.Function.
 
-The steps are: project, sort by depth, list pairs, sort them by tile, blend. `bin_and_blend` does all but the
-projection, for projections that other kernels make.
+The steps are: project, sort by depth, list pairs, sort them by tile, blend. `bin_and_blend` does all steps after the
+projection, so that other kernels can project.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def bin_and_blend(
 
 @dataclass(frozen=True)
 class _View:
-    """The arguments of a call without gradients; `camera` is the result of `gpu_project.pack_camera`."""
+    """The arguments of `rasterize` that get no gradients; `camera` is the result of `gpu_project.pack_camera`."""
 
     camera: Tensor
     width: int

@@ -27,7 +27,7 @@ from hyrfpack.ops.rasterize.gpu_project import (
 )
 
 MAX_PAIRS = 2**31 - 64  # Indices of pairs are int32, and loops may count slightly past the end.
-# A program runs as long as its largest Gaussian takes, so that few Gaussians per program, in one warp, waste least.
+# A program takes as long as its largest Gaussian. Few Gaussians per program, in one warp, therefore waste least time.
 _GAUSSIANS_PER_PROGRAM = 32
 _WARPS_PER_PROGRAM = 1
 # Tiles of a row are stored in groups of this size, so that one Gaussian over thousands of tiles does not delay others.
@@ -39,8 +39,8 @@ class Pairs:
     """The P pairs of an image, ordered by tile (row by row) and, within a tile, by depth.
 
     Attributes:
-        tile_starts: (tiles + 2,) int32, the first pair of each tile. An extra tile after the last holds pairs of no
-            tile: those that were counted but not listed, because the two kernels rounded differently.
+        tile_starts: (tiles + 2,) int32, the first pair of each tile. An extra tile after the last holds pairs without
+            a tile. These were counted but not listed, because the two kernels rounded differently.
         owners: (P,) int32, the Gaussian of each pair.
         slots: (P,) int64, the slot of each pair.
         slot_starts: (N,) int32, the first slot of each Gaussian; undefined for Gaussians that are not drawn.
@@ -72,7 +72,7 @@ def _list_pairs_kernel(
 
     Args:
         order: (N,) int64, the Gaussian at each position of the depth order.
-        ends: (N,) int64, the end of its slots.
+        ends: (N,) int64, the end of that Gaussian's slots.
         tiles, owners: (P,), written: the tile and the Gaussian of each slot.
         slot_starts: (N,), written: the first slot of each Gaussian.
     """
@@ -115,8 +115,8 @@ def _list_pairs_kernel(
         row += 1
         unfinished = tl.max(last - row, 0) >= 0
 
-    # Counting and listing may round differently. A surplus tile was skipped above; a missing one becomes a pair of no
-    # tile.
+    # Counting and listing may round differently. A surplus tile was skipped above; a missing one becomes a pair without
+    # a tile.
     missing = tl.max(end - at, 0)
     while missing > 0:
         no_tile = tiles_x * tl.cdiv(height, TILE_SIZE) + tl.zeros_like(row)

@@ -1,8 +1,8 @@
 """Blends on the GPU, forward and backward, with one program per tile.
 
-A tile's 256 pixels are a block (ROWS, LANES). A thread owns one column of it, whose pixels have the same x, so that it
-computes v, which depends on x alone, and everything that depends on the Gaussian alone once for all its pixels. Records
-are loaded as scalars, the same for all threads, for a chunk of Gaussians at once, so that the loads' latencies overlap.
+A tile's 256 pixels are a block (ROWS, LANES). A thread owns one column of the block, whose pixels share one x. It
+computes v, which depends on x alone, and all that depends on the Gaussian alone, once for all its pixels. Records are
+loaded as scalars, the same for all threads, and for a chunk of Gaussians at once, so that latencies overlap.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _LANES_PER_BLOCK = tl.constexpr(32)
 _ROWS_PER_BLOCK = tl.constexpr(reference.TILE_SIZE**2 // 32)
 _ALPHA_MAX = tl.constexpr(reference.ALPHA_MAX)
 _LOG2_ALPHA_MAX = tl.constexpr(math.log2(reference.ALPHA_MAX))
-# Stands for the logarithm of opacity 0.
+# A finite number replaces log2(0), the logarithm of opacity 0.
 _LOG2_ZERO_OPACITY = tl.constexpr(-1e30)
 _ROWS_CLEARED_PER_STORE = tl.constexpr(32)
 # A tile has one warp with 8 pixels per thread. On sm_90 forward then takes 131 instructions per pair; two warps would
@@ -77,7 +77,7 @@ def _store_pixels(pointer, values, inside):
 
 @triton.jit
 def _load_record(records, owner, live):
-    """Load the numbers of a record; the opacity is zero where not live."""
+    """Load the numbers of a record; the opacity is 0 unless `live`."""
     at = records + owner.to(tl.int64) * RECORD_WORDS
     # All words are loaded before the first is used, so that their latencies overlap. They are unpacked inline, since
     # calls of `unpack_pair` are slow in Triton's interpreter.
@@ -187,7 +187,7 @@ def _backpropagate_pair(
 ):
     """Write the gradient row of one pair to `to`; returns the transmittance and the rest R behind the pair.
 
-    R is the contribution of all that lies behind to g . rgb: dL/d(alpha) = T (color . g) - R / (1 - alpha).
+    R is the contribution to g . rgb of everything behind the pair: dL/d(alpha) = T (color . g) - R / (1 - alpha).
     """
     u, v, log2_alpha = _log2_alpha(record, x, y, row)
     alpha = tl.minimum(tl.exp2(log2_alpha), _ALPHA_MAX)
@@ -198,7 +198,7 @@ def _backpropagate_pair(
     p = contribution - rest * (alpha / (1 - alpha))
     p = tl.where(log2_alpha <= _LOG2_ALPHA_MAX, p, 0.0)  # A clamped alpha passes no gradient.
     pu = p * u
-    # Sums run over a thread's pixels first, for which v is one number.
+    # Each thread first sums over its own pixels, which share one v.
     by_p, by_u, by_uu = tl.sum(p, 0), tl.sum(pu, 0), tl.sum(pu * u, 0)
     sum_u, sum_v, sum_uu, sum_uv = tl.sum(by_u, 0), tl.sum(by_p * v, 0), tl.sum(by_uu, 0), tl.sum(by_u * v, 0)
     sum_vv, sum_p = tl.sum(by_p * v * v, 0), tl.sum(by_p, 0)
@@ -227,8 +227,8 @@ def blend_backward(
 ):  # fmt: skip
     """Write the gradient row of each pair of one tile to its slot in gradient_rows (P, 6) int64.
 
-    Pairs after the tile was finished get zeros. Blending is replayed front to back, so that forward stores only the
-    image.
+    Pairs behind the one that finished the tile get zeros. Blending is replayed front to back, so that forward stores
+    only the image.
     """
     tile = tl.program_id(0)
     x, y, row, place, inside = _tile_pixels(tile, width, height)

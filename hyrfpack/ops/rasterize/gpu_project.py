@@ -127,7 +127,7 @@ def pack_camera(
         -margin_x - cx, width + margin_x - cx, -margin_y - cy, height + margin_y - cy,
         *camera_center(pose).tolist(),
     ]  # fmt: skip
-    # The copy does not block, because a blocking one would wait for the device. Its source is staged at once.
+    # A blocking copy would wait for the device. This one stages its source at once, so the source may be freed.
     return torch.tensor(numbers, dtype=torch.float64).to(device, non_blocking=True)
 
 
@@ -231,7 +231,7 @@ def in_frustum(mean, camera):
     """
     axes, shift, lens, near, _, limits = camera
     x, y, z = _to_camera(mean, axes, shift)
-    u, v = lens[0] * x, lens[1] * y  # Limits are multiplied by z > 0 instead of dividing by z, which needs no guard.
+    u, v = lens[0] * x, lens[1] * y  # The limits are multiplied by z; a division by z would need a guard against 0.
     inside = (u > limits[0] * z) & (u < limits[1] * z) & (v > limits[2] * z) & (v < limits[3] * z)
     return inside & (z > near)
 
@@ -434,13 +434,13 @@ def project_backward(
     grad_means, grad_quats, grad_scales, grad_opacities, grad_colors, absgrad, absgrad_row, absgrad_column,
     ANTIALIASED: tl.constexpr, ABSGRAD: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Backpropagate the gradient row of each Gaussian, its sum over tiles, through the projection.
+    """Backpropagate the gradient row of each Gaussian, summed over tiles, through the projection.
 
     Args:
         rows: (P, 12) gradient rows; that of Gaussian i is rows[slot_starts[i]].
         slot_starts, counts: (N,) int32.
         grad_means, grad_quats, grad_scales, grad_opacities, grad_colors: the gradients, written.
-        absgrad: (N, 2) with the strides absgrad_row and absgrad_column, added to.
+        absgrad: (N, 2) with the strides absgrad_row and absgrad_column, incremented.
     """
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = index < total

@@ -35,7 +35,7 @@ def project_shaded_kernel(
     IN_P: tl.constexpr, H1_P: tl.constexpr, H2_P: tl.constexpr, OUT_P: tl.constexpr,
     FREQUENCY: tl.constexpr, PRECISION: tl.constexpr, ANTIALIASED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Do what `gpu_project.project` does for means in the frustum, with colours from `shade_block`."""
+    """Project the Gaussians in the frustum as `gpu_project.project` does, with colours from `shade_block`."""
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = index < total
     mean, quat = load_rows_3(means, index, live), load_rows_4(quats, index, live)

@@ -32,7 +32,7 @@ class Projected:
     """The M Gaussians in front of the camera, projected to the image, in the order of the input.
 
     Attributes:
-        index: (M,) the index of each one in the input.
+        index: (M,) the index of each Gaussian in the input.
         means2d: (M, 2) pixels.
         covs2d: (M, 3) xx, xy, yy in px^2, low-pass included.
         conics: (M, 3) xx, xy, yy of the inverse covariance in 1/px^2.

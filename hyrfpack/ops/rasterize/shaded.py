@@ -35,8 +35,8 @@ def rasterize_shaded(
 ) -> Rasterization:
     """Render the Gaussians whose centres a camera sees, with their view-dependent colours.
 
-    The result is that of `frustum_cull`, `shade` from the camera's centre and `rasterize`. "gpu" runs all steps before
-    binning in one kernel, which decodes a colour while it projects the Gaussian, and only if the Gaussian is drawn.
+    The result equals that of `frustum_cull`, `shade` from the camera's centre and `rasterize`. "gpu" runs all steps
+    before binning in one kernel, which decodes a colour while it projects, and only for a Gaussian that is drawn.
 
     Args:
         means, quats, scales, opacities: (N, 3), (N, 4), (N, 3), (N,) as in `rasterize`, of all Gaussians.

@@ -47,7 +47,7 @@ class Shading:
         weights, biases: of the second and third layer: (H2, H), (H2,), then (3, H2), (3,).
         color_logits: (N, 3) explicit colour logits, added to the decoder's outputs.
         encoding: "frequency" (E = 24) or "sh" (E = 9), see `encode_directions`.
-        mixed: the factors of products are rounded to bfloat16, as in `hyrfpack.ops.mlp`.
+        mixed: whether the factors of products are rounded to bfloat16, as in `hyrfpack.ops.mlp`.
     """
 
     first_layer: Tensor
@@ -64,7 +64,7 @@ class Shading:
 
     @cached_property
     def kernel_arguments(self) -> tuple[tuple[Tensor, ...], dict]:
-        """Tensors and named constants that GPU kernels take, packed once for all views."""
+        """The tensors and named constants that GPU kernels take, packed once for all views."""
         from hyrfpack.ops.shade import gpu
 
         return gpu.kernel_arguments(self)
@@ -114,8 +114,8 @@ def shade(
         viewpoint: (3,) o, in the same units.
         shading: the decoder of these N Gaussians.
         index: (n,) int64, the Gaussians to shade; None shades all.
-        implementation: "auto", "reference", "cpu" (float32, not mixed) or "gpu" (float32, two hidden layers of at
-            most 128).
+        implementation: "auto", "reference", "cpu" (float32, not mixed) or "gpu" (float32, two hidden layers of width
+            128 or less).
 
     Returns:
         (n, 3) in (0, 1). Not differentiable.

@@ -41,7 +41,7 @@ def spherical_harmonics(directions: Tensor) -> Tensor:
 
 
 def frequency_encoding(directions: Tensor) -> Tensor:
-    """Return NeRF's positional encoding (Mildenhall et al. 2020, eq. 4) of directions (N, 3): (N, 24), octaves 0-3."""
+    """Return NeRF's positional encoding (N, 24) of directions (N, 3), octaves 0-3 (Mildenhall et al. 2020, eq. 4)."""
     octaves = math.pi * 2 ** torch.arange(FREQUENCY_OCTAVES, dtype=directions.dtype, device=directions.device)
     phases = (directions[:, None, :] * octaves[:, None]).flatten(1)
     return torch.cat((phases.sin(), phases.cos()), dim=-1)

@@ -23,7 +23,7 @@ def normalize_block(x, y, z):
 def _sin_of_turns(turns):
     """Return sin(2 pi t) for t in [-1/2, 3/4], with an absolute error of 1e-7.
 
-    The library's sine would keep a table in memory for huge arguments.
+    The library's sine would take memory for a table that only huge arguments need.
     """
     turns = tl.where(turns > 0.25, 0.5 - turns, tl.where(turns < -0.25, -0.5 - turns, turns))
     square = turns * turns

@@ -1,9 +1,9 @@
 """Computes L1, SSIM and their gradient in one pass over the image, in Numba.
 
 A task processes one tile from top to bottom. It reads each row of the two images once and blurs it horizontally into
-local moments. 8 such rows and the 10 before them are blurred vertically, which gives SSIM and its derivatives by the
-moments. The derivatives are blurred horizontally and vertically in the same way into the gradient: the window is
-symmetric, so the blur is its own transpose.
+local moments. 8 such rows and the 10 before them are blurred vertically, which gives SSIM and its derivatives with
+respect to the moments. The derivatives are blurred horizontally and vertically in the same way into the gradient: the
+window is symmetric, so the blur is its own transpose.
 
 Pixels stay interleaved, so a horizontal neighbour is 3 floats away. All rows of a task lie in one buffer at constant
 offsets, so that the loops vectorise without alias checks and the data stays in the L2 cache.
@@ -31,14 +31,14 @@ _ROWS_PER_GROUP = 4  # Rows that are blurred vertically together share most of t
 _ROWS_PER_STEP = 2 * _ROWS_PER_GROUP
 _CARRIED_ROWS = 2 * WINDOW_RADIUS
 
-# Sizes and offsets in the buffer, in floats. A row starts at column -10 of the tile (x, y), -5 (moments) or 0
-# (gradient).
+# Sizes and offsets in the buffer, in floats. A row starts at column -10 of the tile for pixels x and y, at -5 for
+# moments, and at 0 for the gradient.
 _ROW_FLOATS = np.uint64(3 * (_MAX_TILE_COLUMNS + 4 * WINDOW_RADIUS) + 64)
 _PLANE_FLOATS = _ROW_FLOATS * np.uint64(_CARRIED_ROWS + _ROWS_PER_STEP)
 _X_OFFSET = np.uint64(0)
 _Y_OFFSET = _ROW_FLOATS
 _SSIM_OFFSET = np.uint64(2) * _ROW_FLOATS
-# Derivatives of SSIM by E[x], E[xx + yy] and E[xy] along one row.
+# Derivatives of SSIM with respect to E[x], E[xx + yy] and E[xy] along one row.
 _BY_X_OFFSET = np.uint64(3) * _ROW_FLOATS
 _BY_SQUARE_OFFSET = np.uint64(4) * _ROW_FLOATS
 _BY_PRODUCT_OFFSET = np.uint64(5) * _ROW_FLOATS
@@ -47,7 +47,7 @@ _BLURRED_OFFSET = np.uint64(6) * _ROW_FLOATS
 _BLURRED_PLANE_FLOATS = np.uint64(_ROWS_PER_GROUP) * _ROW_FLOATS
 # 4 planes of x, y, xx + yy and xy, blurred horizontally.
 _MOMENTS_OFFSET = _BLURRED_OFFSET + np.uint64(4) * _BLURRED_PLANE_FLOATS
-# 3 planes of the derivatives by E[x], E[xx + yy] and E[xy], blurred horizontally.
+# 3 planes of the derivatives with respect to E[x], E[xx + yy] and E[xy], blurred horizontally.
 _DERIVATIVES_OFFSET = _MOMENTS_OFFSET + np.uint64(4) * _PLANE_FLOATS
 _BUFFER_FLOATS = int(_DERIVATIVES_OFFSET + np.uint64(3) * _PLANE_FLOATS)
 
@@ -136,7 +136,7 @@ def _blur_down(buffer, source, target, count):
 
 @inlined
 def _compute_ssim_row(buffer, source, start, count):
-    """Compute SSIM and its derivatives by E[x], E[xx + yy] and E[xy] along one row of moments."""
+    """Compute SSIM and its derivatives with respect to E[x], E[xx + yy] and E[xy] along one row of moments."""
     for j in range(count):
         j = start + np.uint64(j)
         i = source + j
@@ -193,7 +193,7 @@ def _process_tile(image, target, weight, l1_scale, ssim_scale, top, bottom, left
     moment_floats = tile_floats + 6 * WINDOW_RADIUS
     # Padding avoids remainders in vectorised loops; rows of the buffer have room for it.
     padded_floats = (moment_floats + 31) // 32 * 32
-    # The range of a row of moments whose window centres lie inside the image.
+    # The part of a row of moments whose window centres lie inside the image.
     start, stop = max(0, 3 * WINDOW_RADIUS - first_float), min(moment_floats, floats - first_float + 3 * WINDOW_RADIUS)
     total_l1, total_ssim = 0.0, 0.0
 
@@ -294,7 +294,7 @@ def _process_tile(image, target, weight, l1_scale, ssim_scale, top, bottom, left
 def loss_and_gradient(
     image: np.ndarray, target: np.ndarray, weight: np.ndarray | None, l1_weight: float, ssim_weight: float
 ) -> tuple[float, np.ndarray]:
-    """Compute the weighted sum of |image - target| and of 1 - SSIM over an image, and its gradient by `image`.
+    """Compute the weighted sum of |image - target| and of 1 - SSIM over an image, and the gradient of `image`.
 
     Args:
         image, target: (H, 3W) float32, interleaved; equal where `weight` is 0.

@@ -2,10 +2,10 @@
 
 A program processes a strip of rows in a block of columns, from top to bottom. It blurs each row horizontally by 11
 shifted loads, of which the L1 cache serves all but one. It keeps the last 11 blurred rows in registers and blurs them
-vertically there. The first pass blurs the local moments and writes the derivatives of SSIM by E[x], E[xx] and E[xy].
-The second pass, in backward, blurs these derivatives in the same way into the gradient: the window is symmetric, so
-the blur is its own transpose. Pixels stay interleaved, so a horizontal neighbour is 3 floats away. Nothing is copied
-to the host, and the order of all sums is fixed.
+vertically there. The first pass blurs the local moments and writes the derivatives of SSIM with respect to E[x], E[xx]
+and E[xy]. The second pass, in backward, blurs these derivatives in the same way into the gradient: the window is
+symmetric, so the blur is its own transpose. Pixels stay interleaved, so a horizontal neighbour is 3 floats away.
+Nothing is copied to the host, and the order of all sums is fixed.
 
 Memory: the first pass reads 2 planes of 3 floats per pixel and writes 3; the second reads 5 and writes 1. This is 132
 bytes per pixel. Strips share 10 of every 34 rows they read, which usually come from the L2 cache.
@@ -93,7 +93,7 @@ def _loss_kernel(
     Args:
         image, target: (H, 3W).
         mask: (H, W) or None.
-        derivatives: (3, H, 3W), written: derivatives of SSIM by E[x], E[xx] and E[xy].
+        derivatives: (3, H, 3W), written: derivatives of SSIM with respect to E[x], E[xx] and E[xy].
         partials: (3, programs), written: sums of |x - y| and of 1 - SSIM, and the number of included values.
         plane: 3 H W.
     """
@@ -146,7 +146,7 @@ def _loss_kernel(
 
 @triton.jit
 def _reduce_kernel(partials, programs, l1_weight, ssim_weight, loss, inverse_count, BLOCK: tl.constexpr):
-    """Compute the loss and 1 / count, the weight of a value in a mean, from all partial sums, in one program."""
+    """Compute the loss and 1 / count, the weight of one value in a mean, from all partial sums, in one program."""
     lane = tl.arange(0, BLOCK)
     l1 = tl.zeros([BLOCK], tl.float64)
     dissimilarity, count = l1, l1
@@ -181,7 +181,7 @@ def _gradient_kernel(
     COLUMNS: tl.constexpr,
     STRIP: tl.constexpr,
 ):
-    """Write the gradient of the loss by `image`, (H, 3W), over one strip of a column block."""
+    """Write the gradient of `image`, (H, 3W), over one strip of a column block."""
     column = tl.program_id(0) * COLUMNS + tl.arange(0, COLUMNS)
     inside = column < floats
     top = tl.program_id(1) * STRIP
@@ -232,8 +232,8 @@ def loss_and_derivatives(
         l1_weight, ssim_weight: factors of the two means.
 
     Returns:
-        The scalar loss; (3, H, W, 3) derivatives of each pixel's SSIM by its local means of x, xx and xy; and the
-        scalar 1 / count, with count the number of included values. All on the device.
+        The scalar loss; (3, H, W, 3) derivatives of each pixel's SSIM with respect to its local means of x, xx and xy;
+        and the scalar 1 / count, with count the number of included values. All on the device.
     """
     height, floats = image.shape[0], 3 * image.shape[1]
     grid = _grid(image)
@@ -270,9 +270,9 @@ def gradient(
     ssim_weight: float,
     upstream: Tensor,
 ) -> Tensor:
-    """Compute the gradient (H, W, 3) by `image`, times the scalar `upstream`.
+    """Compute the gradient (H, W, 3) of `image`, times the scalar `upstream`.
 
-    The other arguments are those and the results of `loss_and_derivatives`.
+    The other arguments are the arguments and the results of `loss_and_derivatives`.
     """
     height, floats = image.shape[0], 3 * image.shape[1]
     gradient = torch.empty_like(image)
