@@ -77,7 +77,7 @@ def quantized_provenance(provenance: dict, scale: float) -> dict:
 
 
 def has_mean_exposure(provenance: dict) -> bool:
-    """Whether a model was trained to its photos' mean exposure without an exposure map, by an earlier version.
+    """Return whether a model was trained to its photos' mean exposure without an exposure map, by an earlier version.
 
     Renders of such a model also differ from a photo by that photo's own exposure.
     """
@@ -86,7 +86,7 @@ def has_mean_exposure(provenance: dict) -> bool:
 
 @dataclass(frozen=True)
 class Capture:
-    """The cameras and the viewpoint that a model was photographed with, from its file or from a scene.
+    """The cameras and the viewpoint from which a model was photographed, taken from its file or from a scene.
 
     Values are read from the provenance only when a property is asked for.
 
@@ -122,12 +122,12 @@ class Capture:
 
     @property
     def is_synthetic(self) -> bool:
-        """Whether `cameras` is a generated orbit, because no camera is known."""
+        """Return whether `cameras` is a generated orbit, because no camera is known."""
         return not (self._training_cameras or self._stored_cameras or self._coarse_cameras)
 
     @property
     def is_coarse(self) -> bool:
-        """Whether `cameras` have rounded poses, see `quantized_provenance`."""
+        """Return whether `cameras` have rounded poses, see `quantized_provenance`."""
         return bool(not (self._training_cameras or self._stored_cameras) and self._coarse_cameras)
 
     @property

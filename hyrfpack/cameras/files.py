@@ -14,7 +14,7 @@ import numpy as np
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.scene import Camera, rigid_pose
 
-MAX_IMAGE_SIDE_PIXELS = 16384  # a larger number in a file is taken for a mistake
+MAX_IMAGE_SIDE_PIXELS = 16384  # a larger number in a file is treated as a mistake
 INTRINSICS_KEYS = ("width", "height", "fx", "fy", "cx", "cy")
 
 
@@ -84,19 +84,19 @@ def cameras_to_json(cameras: Sequence[tuple[str, Camera]]) -> str:
 def cameras_from_json(path: str | os.PathLike[str]) -> list[tuple[str, Camera]]:
     """Read named cameras.
 
-    Three forms are understood:
+    Three layouts are accepted:
 
-    - ours, a list: `[{"name": "0001", "width": 800, "height": 600, "fx": 700, "fy": 700, "cx": 400, "cy": 300,
-      "camera_from_world": [[4 x 4]]}, ...]`, OpenCV axes (x right, y down, z forward). `name` may be left out, `fy`
-      then equals `fx`, and `cx`, `cy` the picture's middle;
-    - `cameras.json` of 3DGS training: a list, too, with "position" (the camera's place), "rotation" (world_from_camera,
-      3 x 3) and "img_name" in place of "camera_from_world" and "name";
+    - that of `cameras_to_json`, a list: `[{"name": "0001", "width": 800, "height": 600, "fx": 700, "fy": 700,
+      "cx": 400, "cy": 300, "camera_from_world": [[4 x 4]]}, ...]`, OpenCV axes (x right, y down, z forward). `name`,
+      `fy` (then equal to `fx`), `cx` and `cy` (then the picture's centre) are optional;
+    - `cameras.json` of 3DGS training: also a list, with "position" (of the camera), "rotation" (3 x 3
+      world_from_camera) and "img_name" in place of "camera_from_world" and "name";
     - `transforms.json` of nerfstudio and instant-ngp: an object with `frames`, each with a `transform_matrix`
       (world_from_camera, OpenGL axes) and, here or for all frames, `w`, `h` and `fl_x` or `camera_angle_x`. Lens
       distortion is left out: renders are pinhole pictures.
 
     Raises:
-        HyrfDataError: the file cannot be read, or a camera is incomplete or impossible; it is named.
+        HyrfDataError: the file cannot be read, or a camera is incomplete or impossible; the message names the camera.
     """
     try:
         content = json.loads(Path(path).read_text(encoding="utf-8"))

@@ -82,7 +82,7 @@ class Viewpoint:
             typical = _nearest_to_median(positions)
             spread = float(np.median(np.linalg.norm(positions - positions[typical], axis=1)))
             center = positions[typical] + forwards[typical] * (2 * spread or 1.0)
-            up = -cameras[typical].rotation[1]  # so that the arc goes sideways, whatever the camera looks at
+            up = -cameras[typical].rotation[1]  # makes the arc horizontal in this camera's picture
             arc = -MIN_ARC_DEGREES / 2, MIN_ARC_DEGREES / 2
         return cls(center, up, cameras[typical], arc)
 

@@ -35,8 +35,8 @@ def sample_views(cameras: Sequence[Camera], count: int, seed: int = 0) -> tuple[
 def interpolate_views(cameras: Sequence[Camera], seed: int = 0, indices: Sequence[int] | None = None) -> list[Camera]:
     """Interpolate between each camera and a neighbour with a similar viewing direction, in a wider picture.
 
-    Held-out photos show what lies between the training photos and just beside them, and so do these views. The
-    neighbour is drawn from the nearest cameras, the position on the way to it from 25 to 75 %.
+    Like held-out photos, these views show what lies between the training photos and just outside them. The neighbour is
+    drawn from the nearest cameras, and the view lies 25 to 75 % of the way to it.
 
     Args:
         cameras: all cameras; neighbours are searched among them.

@@ -79,7 +79,7 @@ class _CommandGroup(click.Group):
         return result
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        return list(self.commands)  # help lists commands in the order of their use, not of the alphabet
+        return list(self.commands)  # help lists commands in the order of their use, not in alphabetical order
 
 
 def _note_uncached_kernels() -> None:
@@ -94,7 +94,7 @@ def _note_uncached_kernels() -> None:
 
 @contextmanager
 def _errors_as_json(arguments: Sequence[str]) -> Iterator[None]:
-    """Print an error that the user can correct as JSON on standard output, too, if the arguments contain --json."""
+    """If the arguments contain --json, print an error that the user can correct also as JSON on standard output."""
     as_json = "--json" in arguments
     try:
         yield

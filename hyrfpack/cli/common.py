@@ -170,7 +170,7 @@ def device_options(command: Command) -> Command:
 
 
 def choose_command_device(name: str, ranks: Ranks | None = None) -> torch.device:
-    """Choose the device that --device names, and print a note where it is slow.
+    """Choose the device that --device names, and print a note if it is slow.
 
     Args:
         name: value of the option.
@@ -196,7 +196,7 @@ def read_scene(path: Path, reader_options: dict[str, Any], model: dict | None = 
         path: the folder, or an archive of it.
         reader_options: values of the options of `scene_options`.
         model: description (`hyrfpack.describe_file`) of the model file that belongs to the photos, if any. It gives the
-            size of the photos where --max-size does not.
+            size of the photos if --max-size does not.
 
     Raises:
         HyrfError: as `hyrfpack.load_scene`.
@@ -258,7 +258,7 @@ def largest_picture_size(cameras: Iterable[Camera]) -> tuple[int, int]:
 
 
 def format_consistent_psnr(psnr_consistent: float | None) -> str:
-    """Return the PSNR of renders at one exposure, to be printed behind another; "" for a model without a map."""
+    """Return text on the PSNR at the consistent exposure, to append to another PSNR; "" if there is none."""
     return "" if psnr_consistent is None else f" ({psnr_consistent:.2f} dB at one exposure)"
 
 

@@ -357,7 +357,7 @@ def _command_as_typed(context: click.Context) -> str:
 
 
 def _load_training_photos(model: Path) -> Scene | None:
-    """Load the photos that the model of a run was trained on; None, with a note, where they cannot be read."""
+    """Load the photos that the model of a run was trained on; None, with a note, if they cannot be read."""
     from hyrfpack.errors import HyrfDataError
     from hyrfpack.train import load_training_scene
 

@@ -121,9 +121,9 @@ def import_(
 
 
 def _find_training_cameras(source: Path) -> Path | None:
-    """Return the cameras.json that 3DGS training has left, whose splats these are; None if there is none.
+    """Return the cameras.json that 3DGS training wrote together with these splats; None if there is none.
 
-    That training writes cameras.json and point_cloud/iteration_30000/point_cloud.ply into one folder.
+    3DGS training writes cameras.json and point_cloud/iteration_30000/point_cloud.ply into one folder.
     """
     folders = source.absolute().parents[2:3]
     if source.name != "point_cloud.ply" or not folders or not (folders[0] / "cameras.json").is_file():
@@ -144,5 +144,5 @@ def _read_cameras(path: Path) -> list[Camera]:
 
 
 def _format_ratio(report: DistillReport, size: int | None) -> str:
-    """Return how many times larger a size is than that of the file written; "" for no size."""
+    """Return as text how many times larger a size is than the written file; "" if the size is None."""
     return "" if size is None else f"{size / report.bytes_after:.1f}x"

@@ -26,7 +26,7 @@ class RenderSource:
     """A model or splats to be drawn.
 
     Attributes:
-        path: path of the file; of a run, that of its model.
+        path: path of the file; for a run, path of its model.
         device, precision: device and precision of drawing; splats are drawn in float32.
         fraction: share of the file that must exist, see `hyrfpack.load_model`.
         facts: description of a model, see `hyrfpack.describe_file`; None for splats.
@@ -42,7 +42,7 @@ class RenderSource:
 
     @classmethod
     def open(cls, path: Path, device: torch.device, precision: str, allow_partial: bool) -> RenderSource:
-        """Read splats whole, or of a model the first kilobytes.
+        """Open a file: read splats completely, but only the first kilobytes of a model.
 
         Raises:
             HyrfError: the file cannot be read, or an option does not apply to splats.
@@ -66,7 +66,7 @@ class RenderSource:
 
     @property
     def viewpoint(self) -> Viewpoint:
-        """The viewpoint that an orbit goes around: what the photos showed, or the middle of the splats."""
+        """The viewpoint to orbit around: that of the photos, or the middle of the splats."""
         if self.splats is not None:
             frame = self.splats.frame
             return Viewpoint.from_frame(frame.center, frame.scale)
@@ -74,7 +74,7 @@ class RenderSource:
 
     @property
     def folder(self) -> Path | None:
-        """The folder whose files are all read; None where a single file is read."""
+        """The folder whose files are all read; None if a single file is read."""
         return sog_folder(self.path) if self.splats is not None else None
 
     @property

@@ -60,5 +60,5 @@ def record_seconds(run: Run) -> list[float]:
 
 
 def has_times(run: Run) -> bool:
-    """Whether each record of the run's curve has its time."""
+    """Return whether each record of the run's curve has its time."""
     return all(record.seconds is not None for record in run.curve)

@@ -1,4 +1,4 @@
-"""Reading and checking the folder of a finished training run."""
+"""Read and check the folder of a finished training run."""
 
 from __future__ import annotations
 
@@ -217,7 +217,7 @@ def _existing_pictures(folder: Path, names: Sequence[str]) -> dict[str, Path]:
 
 
 def short_names(folders: Sequence[Path]) -> list[str]:
-    """Return names of runs: as many of the last parts of their paths as are needed to tell them apart."""
+    """Return a short name for each run: the last parts of its path that distinguish it from the other runs."""
     parts = [Path(os.path.abspath(folder)).parts for folder in folders]
     for count in range(1, max(map(len, parts)) + 1):
         names = ["/".join(part[-count:]) for part in parts]

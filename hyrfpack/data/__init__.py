@@ -88,7 +88,7 @@ def _read(given: Path, top: Path, notes: list[str], reading: dict[str, Any], hel
     Args:
         given: the folder or archive that the user named.
         top: that folder, or the one that the archive was unpacked into.
-        notes: sentences for the user so far.
+        notes: sentences for the user; more are added.
         reading: the arguments of `load_scene` except `path` and `held_out`.
         held_out: as in `load_scene`.
     """
@@ -147,7 +147,7 @@ def _open_folder(given: Path, notes: list[str]) -> Path:
 def _find_set(folder: Path, layout: str | None, notes: list[str]) -> tuple[Path, list[str]]:
     """Find the folder with poses, which is `folder` or the only one below it that has some.
 
-    If a layout is given, only poses of that layout count. A note is added if the folder is below `folder`.
+    If a layout is given, only poses of that layout count. A note is added if the poses lie in a folder below `folder`.
 
     Returns:
         The folder, and the names of all layouts whose poses it holds.

@@ -1,6 +1,6 @@
-"""Unpack datasets that come as one .zip, once, into a folder of the user's cache that is named by a digest.
+"""Unpack .zip archives of datasets, each once, into a folder of the user's cache that is named by a digest.
 
-Archives are not trusted: an entry that leads out of the folder, a link, or an implausible total size is an error.
+Archives are not trusted: an entry outside the folder, a link, or an implausible total size is an error.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from hyrfpack.outputs import ARCHIVE_SUFFIXES
 
 _MAX_FILES = 200_000
 # The unpacked size may be at most the archive's size times the ratio, plus the slack. Photos hardly shrink in an
-# archive and text shrinks to a tenth, so that no dataset has a larger ratio.
+# archive and text shrinks to a tenth, so no dataset has a larger ratio.
 _MAX_UNPACKED_RATIO = 100
 _UNPACKED_SLACK_BYTES = 1 << 26
 _COPY_CHUNK_BYTES = 1 << 20
@@ -34,9 +34,9 @@ _UTF8_NAME_FLAG = 0x800
 
 
 def is_archive(path: Path) -> bool:
-    """Whether a path is a .zip file (or a .r3d file of Record3D).
+    """Return whether a path is a .zip file (or a .r3d file of Record3D).
 
-    The name decides, because files of many other kinds are ZIP archives by their content.
+    The name decides, because many other file formats are ZIP archives, too.
     """
     return path.suffix.lower() in ARCHIVE_SUFFIXES and os.path.isfile(path)
 
@@ -148,7 +148,7 @@ def _checked_entries(archive: Path, content: zipfile.ZipFile) -> dict[str, zipfi
 
 
 def _entry_path(info: zipfile.ZipInfo) -> str:
-    """Return an entry's path with forward slashes, which programs on Windows may not have written."""
+    """Return an entry's path with forward slashes; programs on Windows may write backslashes."""
     name = info.filename
     if not info.flag_bits & _UTF8_NAME_FLAG:  # macOS writes UTF-8 without the flag, and zipfile decodes it as cp437
         with suppress(UnicodeError):
@@ -157,7 +157,7 @@ def _entry_path(info: zipfile.ZipInfo) -> str:
 
 
 def _is_complete(folder: Path, entries: dict[str, zipfile.ZipInfo]) -> bool:
-    """Whether a folder holds all files in full; a program that cleans up caches may have deleted some."""
+    """Return whether a folder holds all files in full; a program that cleans up caches may have deleted some."""
     try:
         return all(os.path.getsize(folder / path) == info.file_size for path, info in entries.items())
     except OSError:

@@ -33,17 +33,18 @@ _MAX_PHOTOS_CHECKED_FOR_ALPHA = 4
 
 @dataclass(frozen=True)
 class Photo:
-    """One photo as a format describes it.
+    """A photo as its dataset describes it.
 
     Attributes:
         name: path below the picture folder.
         path: the file, which exists.
-        header: size and kind of the picture after it was turned by `orientation`.
+        header: size and kind of the picture after `orientation` is applied.
         lens: the calibrated lens; its size may differ from the file's by a uniform scale.
         camera_from_world: (4, 4) OpenCV pose, not yet checked.
         mask: the file of the mask, if the poses name one.
-        orientation: EXIF orientation by which stored pixels are turned, if the camera was calibrated that way.
-        face: the face of the panorama that the photo was cut from; name, header and lens are then the face's.
+        orientation: EXIF orientation to apply to the stored pixels; 1 unless the camera was calibrated on the upright
+            picture.
+        face: the face of a panorama that this photo is cut from, with its own name, header and lens; None otherwise.
         visible_points: (M,) int64 rows of the points that the format lists for the photo; None if it lists none.
     """
 
@@ -228,8 +229,9 @@ def _shared_pose_notes(views: list[View]) -> list[str]:
 def _apply_orientations(photos: list[Photo], notes: list[str]) -> list[Photo]:
     """Apply EXIF orientations to the photos whose cameras were calibrated on upright pictures.
 
-    The sizes show which these are: the stored picture does not fit the camera, and the picture after a quarter turn
-    does. Upside-down and square photos fit both ways, and are treated as the photos for which the sizes decide.
+    The sizes show which photos these are: the stored picture does not fit the camera, but the picture after a quarter
+    turn does. The sizes of upside-down and square photos fit both ways. Such photos are treated like those whose sizes
+    decide.
     """
 
     def fits(photo: Photo) -> bool:
@@ -316,7 +318,7 @@ def _make_view(photo: Photo, max_size: int) -> View:
 
 
 def _is_plausible(lens: Lens) -> bool:
-    """Whether all numbers are finite and the field of view is possible, within bounds far wider than of real lenses."""
+    """Return whether all numbers are finite and the field of view lies within bounds far wider than of real lenses."""
     size = max(lens.width, lens.height)
     return (
         bool(np.isfinite((lens.fx, lens.fy, lens.cx, lens.cy, lens.skew, *lens.coefficients)).all())
@@ -340,7 +342,7 @@ def _orthonormal_pose(pose: np.ndarray, path: Path) -> np.ndarray:
 
 
 def _has_transparency(photos: list[Photo], max_size: int) -> bool:
-    """Whether a photo has a transparent pixel, among a few photos that have an alpha channel.
+    """Return whether a photo has a transparent pixel, among a few photos that have an alpha channel.
 
     The pixels decide, because many alpha channels are opaque throughout.
     """
@@ -365,7 +367,7 @@ def _drop_nonfinite_points(
         finite = np.all(np.isfinite(points.astype(np.float32)), axis=1)
     if not finite.all():
         notes.append(f"{(~finite).sum()} of {len(points)} points are not finite and were dropped")
-    new_row = np.cumsum(finite) - 1  # of each finite point after the others are dropped
+    new_row = np.cumsum(finite) - 1  # row of each finite point after the others are dropped
     visible = {p.name: np.unique(p.visible_points) for p in photos if p.visible_points is not None}
     tracks = {name: new_row[rows[finite[rows]]] for name, rows in visible.items()}
     return points[finite].astype(np.float64), colors[finite].astype(np.float32), tracks

@@ -14,9 +14,9 @@ from hyrfpack.scene import Scene
 
 
 def read_blender(path: Path, *, test_every: int, max_size: int) -> Scene:
-    """Read a Blender-style dataset. The world is that of the files (z up), and pictures keep straight alpha.
+    """Read a Blender-style dataset. World coordinates are those of the files (z up), and pictures keep straight alpha.
 
-    The dataset's own split is used: train, and test (val if there is no test). `test_every` applies to datasets with
+    The dataset's own split is used: train, and test (val if there is no test). `test_every` applies only if there is
     neither. `max_size` is that of `load_scene`.
 
     Raises:

@@ -14,7 +14,7 @@ from hyrfpack.scene import Picture, View
 
 
 class PictureCache:
-    """A cache of the pictures used last, up to a number of bytes. Threads may share it.
+    """A cache of the most recently used pictures, limited in bytes. Threads may share it.
 
     Attributes:
         limit_bytes: size limit of the cache; a larger picture is decoded but not cached.

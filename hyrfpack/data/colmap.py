@@ -130,7 +130,7 @@ def _choose_model(path: Path, models: Sequence[Path], name: str | None) -> tuple
         return models[0], []
     sizes = {model: _count_registered_photos(model) for model in models}
     there = ", ".join(f"{model.name} ({size} photos)" for model, size in sizes.items())
-    chosen = max(models, key=lambda model: sizes[model])  # the first of the largest
+    chosen = max(models, key=lambda model: sizes[model])  # max returns the first of several models of the same size
     why = "because it has the most photos; select another with `model`"
     if name is not None:
         named = [model for model in models if model.name == name]
@@ -170,7 +170,7 @@ def lens_from_colmap(model: str, width: int, height: int, params: np.ndarray) ->
         params: parameters in COLMAP's order for that model.
 
     Raises:
-        HyrfDataError: the model is neither a perspective nor a fisheye polynomial.
+        HyrfDataError: the camera model is neither a perspective one nor a polynomial fisheye.
     """
     p = [float(value) for value in params]
     match model:
@@ -217,7 +217,7 @@ def _read_model(model: Path) -> tuple[dict[int, Lens], list[_Image], int, np.nda
         colors = np.array([point.color for point in table], np.float32).reshape(-1, 3) / 255
     except HyrfDataError as error:
         raise error.with_text(f"{model}: {error.problem}") from error
-    except Exception as error:  # pycolmap raises what its C++ checks throw, of many types
+    except Exception as error:  # pycolmap passes on C++ exceptions of many types
         raise HyrfDataError(
             f"{model}: the model's tables do not fit together ({short_reason(error, 160)})",
             fix="export it again",

@@ -70,7 +70,7 @@ def _read_text(file: Path) -> str:
 
 
 def _image_lines(text: str) -> Iterator[str]:
-    """Yield the first of the two lines of each photo; the second line, of its 2D points, may be empty."""
+    """Yield the first of each photo's two lines; the second lists its 2D points and may be empty."""
     lines = iter(text.split("\n"))
     for line in lines:
         if line.strip() and not line.lstrip().startswith("#"):
@@ -97,7 +97,7 @@ def _remove_binary_observations(content: bytes) -> bytes:
 
 
 def _has_byte_order_mark(file: Path) -> bool:
-    """Whether a file exists and starts with the byte-order mark of UTF-8."""
+    """Return whether a file exists and starts with the byte-order mark of UTF-8."""
     if not file.is_file():
         return False
     with file.open("rb") as stream:

@@ -1,7 +1,7 @@
 """Cut panoramas of the whole sphere (equirectangular) into square pinhole pictures, the faces of a cube.
 
-A panorama's camera has the axes of every camera, x right, y down, z forward; the picture's centre looks forward. Pixel
-(u, v) of a W x H picture, H = W / 2, looks along
+A panorama's camera has the usual axes (x right, y down, z forward), and the picture's centre looks forward.
+Pixel (u, v) of a W x H picture, H = W / 2, looks along
 
     longitude = 2 pi (u / W - 1/2) = atan2(x, z),   latitude = pi (v / H - 1/2) = atan2(y, sqrt(x^2 + z^2)),
 
@@ -228,7 +228,7 @@ def panorama_lens(path: Path, header: PictureHeader) -> Lens:
 
 
 def is_panorama(path: str | os.PathLike[str]) -> bool:
-    """Whether a picture is a panorama of the whole sphere.
+    """Return whether a picture is a panorama of the whole sphere.
 
     It is one if it is twice as wide as high, and either its XMP data say so, or its content fits: the left edge
     continues the right edge, and the first and the last row, which show one point each, have nearly uniform colour.
@@ -252,7 +252,7 @@ def is_panorama(path: str | os.PathLike[str]) -> bool:
     steps = np.abs(np.diff(rgb, axis=1)).mean(axis=(0, 2))  # mean difference of neighbouring columns
     seam = np.abs(rgb[:, 0] - rgb[:, -1]).mean()
     spread = rgb.std(axis=1).mean(axis=1)  # standard deviation of the colours in each row
-    # A row at a pole shows what is within a degree of one point, so its colours vary less than those of other rows.
+    # A row at a pole shows only what lies within a degree of it, so its colours vary less than those of other rows.
     return bool(seam <= 1.5 * steps.mean() and max(spread[0], spread[-1]) <= max(0.5 * spread.max(), 2.0))
 
 

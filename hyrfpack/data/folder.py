@@ -107,12 +107,12 @@ def list_pictures(folder: StrPath) -> list[Path]:
 
 
 def is_raw_name(name: str) -> bool:
-    """Whether a file name has the extension of a camera's raw photo and is not hidden."""
+    """Return whether a file name has the extension of a camera's raw photo and is not hidden."""
     return name.lower().endswith(RAW_PHOTO_SUFFIXES) and not name.startswith(".")
 
 
 def may_hold_photos(name: str) -> bool:
-    """Whether a folder of this name is searched for photos, which folders of masks, previews and depth maps are not."""
+    """Return whether a folder of this name may hold photos, unlike those of masks, previews and depth maps."""
     return not (_HIDDEN_FOLDER.fullmatch(name) or _NON_PHOTO_FOLDER.fullmatch(name))
 
 

@@ -1,4 +1,4 @@
-"""The table of layouts: how each is recognised and which function reads it. The first match is used."""
+"""The table of layouts, with the functions that recognise and read each. The first match is used."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Layout:
     options: tuple[str, ...] = ()
 
     def is_present(self, folder: Path) -> bool:
-        """Whether a folder has this layout."""
+        """Return whether a folder has this layout."""
         return bool(self.find(folder))
 
 

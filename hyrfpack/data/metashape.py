@@ -1,14 +1,14 @@
 """Read Agisoft Metashape's cameras as XML ("Export Cameras"), beside the photos.
 
 A camera's `transform` is world_from_camera, row by row, in the frame of its component, with OpenCV's axes. A sensor's
-calibration has f, cx and cy from the centre of the picture, b1 and b2, in pixels, and k1 to k4, p1 and p2:
+calibration has f, cx and cy (from the picture's centre), b1 and b2 in pixels, and k1 to k4, p1 and p2:
 
     x = X / Z, y = Y / Z            (fisheye: times theta / r, theta = atan r)
     x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8) + p1 (r^2 + 2 x^2) + 2 p2 x y,   y' with p1 and p2, x and y exchanged
     u = w / 2 + cx + x' (f + b1) + y' b2,   v = h / 2 + cy + y' f
 
 OpenCV's p1 is Metashape's p2 and vice versa. A component (in older files the chunk) may have a rotation, a translation
-and a scale that lead to the coordinates of exported points.
+and a scale, which map it to the coordinates of exported points.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ _IDENTITY_FRAME = _Frame(np.eye(3), np.zeros(3), 1.0)
 
 
 def find_metashape(path: Path) -> Path | None:
-    """Find the first file by name in a folder that holds Metashape's cameras."""
+    """Find the first file, in order of names, that holds Metashape's cameras."""
     return find_first_file(path, ".xml", _is_camera_file)
 
 
@@ -126,7 +126,7 @@ def read_metashape(path: Path, *, test_every: int, images: str | None, max_size:
 
 
 def _is_camera_file(file: Path) -> bool:
-    """Whether a file starts like Metashape's XML."""
+    """Return whether a file starts like Metashape's XML."""
     try:
         with file.open("rb") as stream:
             head = stream.read(4096)
@@ -170,7 +170,7 @@ def _choose_chunk(document: Element, table: Path) -> tuple[Element, list[str]]:
 
 
 def _is_in_component(camera: Element, component: str | None) -> bool:
-    """Whether a camera belongs to a component. Without components, or without an id of its own, it belongs to any."""
+    """Return whether a camera belongs to a component; without components or without an id, it belongs to any."""
     return component is None or camera.get("component_id") in (None, component)
 
 

@@ -35,9 +35,9 @@ _DENOMINATOR_KEYS = ("k4", "k5", "k6")
 def read_nerfstudio(path: Path, *, test_every: int, images: str | None, max_size: int) -> Scene:
     """Read a folder with a transforms.json.
 
-    The world is that of the file's matrices. `applied_transform` is ignored: it describes the rotation from the
-    reconstruction's frame, which poses and the points of `ply_file_path` already include. EQUIRECTANGULAR frames become
-    the faces of a cube. Depth maps are not read.
+    World coordinates are those of the file's matrices. `applied_transform` is ignored: it describes the rotation from
+    the reconstruction's frame, which poses and the points of `ply_file_path` already include. EQUIRECTANGULAR frames
+    become the faces of a cube. Depth maps are not read.
 
     Args:
         path: the scene folder.

@@ -38,7 +38,7 @@ _MIN_DRAFT_SIZE_RATIO = 2
 
 @dataclass(frozen=True)
 class PictureHeader:
-    """Size and kind of a picture file, known before its pixels are decoded."""
+    """Size and kind of a picture file, read without decoding its pixels."""
 
     width: int
     height: int
@@ -98,12 +98,12 @@ class PhotoFile:
 
 
 def is_picture_name(name: str) -> bool:
-    """Whether a file name has the extension of a readable picture and is not hidden."""
+    """Return whether a file name has the extension of a readable picture and is not hidden."""
     return name.lower().endswith(READABLE_PICTURE_SUFFIXES) and not name.startswith(".")
 
 
 def has_same_aspect(width: int, height: int, of_width: int, of_height: int) -> bool:
-    """Whether two sizes have the same aspect ratio, if each side may be rounded by less than a pixel."""
+    """Return whether two sizes have the same aspect ratio, if each side may be rounded by less than a pixel."""
     return abs(width * of_height - height * of_width) <= of_width + of_height
 
 
@@ -191,7 +191,7 @@ def read_orientation(path: Path) -> int:
 
 
 def is_tagged_panorama(path: Path) -> bool:
-    """Whether the XMP data of a picture file declare an equirectangular panorama (Google's GPano).
+    """Return whether the XMP data of a picture file declare an equirectangular panorama (Google's GPano).
 
     360-degree cameras write such data.
 
@@ -272,8 +272,8 @@ def read_mask(path: Path, height: int, width: int, *, require_all: bool = False,
     Args:
         path: the file.
         height, width: size of the result.
-        require_all: a pixel of the result is usable only if all pixels of the mask that it covers are, as shrunk photos
-            need it. Otherwise, and if the mask is smaller than the result, the nearest pixel of the mask decides.
+        require_all: a pixel of the result is usable only if all mask pixels that it covers are usable, as is right for
+            shrunk photos. If False, or if the mask is smaller than the result, the nearest mask pixel decides.
         orientation: EXIF orientation by which the mask is turned.
 
     Returns:
@@ -295,7 +295,7 @@ def read_mask(path: Path, height: int, width: int, *, require_all: bool = False,
 def _covering_bounds(many: int, few: int) -> np.ndarray:
     """Return bounds for `reduceat` over the source pixels that each of `few` pixels covers at least in part.
 
-    The first of `many` source pixels and the one after the last alternate.
+    The bounds alternate between the first of these pixels and the one after the last; there are `many` source pixels.
     """
     starts = np.arange(few) * many // few
     ends = -(-np.arange(1, few + 1) * many // few)
@@ -309,7 +309,7 @@ def _orientation_applied_by_pillow(image) -> int:
 
 
 def _has_alpha(image) -> bool:
-    """Whether a picture opened with Pillow has an alpha channel or a transparent colour."""
+    """Return whether a picture opened with Pillow has an alpha channel or a transparent colour."""
     # The grey level that means "transparent" in a 16-bit picture is ignored: conversion to 8 bits would lose it.
     transparent = "transparency" in image.info and image.mode not in _SIXTEEN_BIT_MODES
     return transparent or image.mode in ("RGBA", "LA", "PA", "La", "RGBa")

@@ -24,7 +24,7 @@ UNCORRECTED_FOLDERS = ("keyframes/cameras", "keyframes/images")
 
 
 def has_polycam_cameras(path: Path) -> bool:
-    """Whether a folder holds cameras of a raw export."""
+    """Return whether a folder holds cameras of a raw export."""
     return any(_camera_files(path / cameras) for cameras, _ in (CORRECTED_FOLDERS, UNCORRECTED_FOLDERS))
 
 

@@ -21,8 +21,8 @@ _NEIGHBOURS_PER_SIDE = 4
 # Nearly all sharp photos of real datasets have more than 0.75 of the median sharpness.
 _MIN_SHARPNESS_RATIO_TO_NEIGHBOURS = 0.65
 _MIN_SHARPNESS_RATIO_TO_SET = 0.6
-_ROUNDING_SQUARED_DIFFERENCE = 1e-6  # about the squared difference that rounding to 8 bits makes
-_NORMAL_MEDIAN_ABSOLUTE_VALUE = 0.6745  # of the standard normal distribution
+_ROUNDING_SQUARED_DIFFERENCE = 1e-6  # rounding to 8 bits causes about this squared difference
+_NORMAL_MEDIAN_ABSOLUTE_VALUE = 0.6745  # at a standard deviation of 1
 _LUMA_WEIGHTS = np.array((0.299, 0.587, 0.114), np.float32)  # Rec. 601, as in JPEG
 # Luma at or beyond these limits is clipped: differences there are lost.
 _MAX_DARK_LUMA = 2 / 255
@@ -77,7 +77,7 @@ def measure_sharpness(gray: np.ndarray) -> float:
 
         4 (D(1) - 2 s^2) / (D(4) - 2 s^2), the minimum over the four directions
 
-    At a sharp edge D grows as r, at a blurred one as r^2, for any contrast, so that pictures of different content are
+    D grows as r at a sharp edge and as r^2 at a blurred one, for any contrast. So pictures of different content are
     comparable. The minimum is taken because motion blurs one direction only. s is the standard deviation of white
     noise, from the median residual of predicting each pixel by its 8 neighbours (Immerkaer 1996).
 
@@ -85,7 +85,7 @@ def measure_sharpness(gray: np.ndarray) -> float:
         gray: (H, W) luma in [0, 1].
 
     Returns:
-        Sharpness, 0 or more; 0 for pictures without content and for those of less than 8 pixels on a side.
+        Sharpness, 0 or more; 0 for pictures without content and for those with a side of less than 8 pixels.
 
     Raises:
         ValueError: the shape is not (H, W), or a value is not finite.

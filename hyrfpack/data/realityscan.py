@@ -42,7 +42,7 @@ _EXPORT_ADVICE = "export the registration as COLMAP, Bundler or NeRF transforms 
 
 
 def find_realityscan(path: Path) -> Path | None:
-    """Find the first file by name in a folder that holds camera parameters."""
+    """Find the first file, in order of names, that holds camera parameters."""
     return find_first_file(path, ".csv", _is_parameter_file)
 
 
@@ -83,7 +83,7 @@ def read_realityscan(path: Path, *, test_every: int, images: str | None, max_siz
 
 
 def _is_parameter_file(file: Path) -> bool:
-    """Whether the first line of a file names the columns of camera parameters."""
+    """Return whether the first line of a file names the columns of camera parameters."""
     try:
         with file.open("rb") as stream:
             return _parse_header(stream.read(4096).decode("utf-8-sig", errors="replace").split("\n")[0]) is not None

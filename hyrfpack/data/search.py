@@ -44,9 +44,9 @@ def find_models(path: Path) -> list[Path]:
 def find_workspace(path: Path) -> tuple[Path, list[Path]]:
     """Find the folder of a COLMAP reconstruction and its models.
 
-    The folder is `path`, or one such as `dense/` or `dense/0/` in it. Of several, it is the first with photos of its
-    own, otherwise the first. The models are the folders in `sparse/` by number, then by name, then `sparse/` itself,
-    or the folder itself if there are none.
+    The folder is `path`, or one such as `dense/` or `dense/0/` in it. If there are several, it is the first that has
+    photos of its own, or else the first. The models are the folders in `sparse/` by number, then by name, then
+    `sparse/` itself, or the folder itself if there are none.
 
     Raises:
         HyrfDataError: a folder `sparse` or one in it may not be read.
@@ -79,7 +79,7 @@ def find_photo_folder(path: Path) -> Path | None:
     if any(is_picture_name(name) and not name.lower().startswith("mask.") for name in _list_names(path)):
         return path
     if named:
-        return named[0]  # it is empty or has unreadable pictures, which reading it reports
+        return named[0]  # it is empty or its pictures are unreadable, which the reader reports
     others = [
         entry
         for name, entry in inside.items()
@@ -135,7 +135,7 @@ def _models_in(base: Path) -> list[Path]:
 
 
 def _holds_photos(folder: Path) -> bool:
-    """Whether a folder or one of its subfolders holds photos."""
+    """Return whether a folder or one of its subfolders holds photos."""
     if any(
         is_picture_name(name) for name in _list_names(folder)
     ):  # the usual case, which needs no search of subfolders

@@ -24,12 +24,12 @@ PoseEntry = tuple[str, Lens | Callable[[Path, PictureHeader], Lens], np.ndarray]
 # Points and cameras that are sampled to decide whether the points belong to the cameras.
 _MAX_SAMPLED_POINTS = 2000
 _MAX_SAMPLED_CAMERAS = 20
-# Points whose median distance from the cameras is larger belong to another coordinate system.
+# Points whose median distance from the cameras is larger are taken for points of another coordinate system.
 _MAX_POINT_DISTANCE_CAMERA_EXTENTS = 1000
 
 
 def find_first_file(folder: Path, extension: str, is_wanted: Callable[[Path], bool]) -> Path | None:
-    """Find the first file by name with this extension, in any letter case, whose content `is_wanted` accepts."""
+    """Find the first file, in order of names, with this extension in any letter case that `is_wanted` accepts."""
     try:
         files = sorted(file for file in folder.iterdir() if file.suffix.lower() == extension and file.is_file())
         return next((file for file in files if is_wanted(file)), None)
@@ -56,7 +56,7 @@ def find_picture_folder(path: Path, images: str | None) -> Path:
 def find_listed_folder(path: Path, names: Iterable[str]) -> Path | None:
     """Find the folder in `path` that all listed names begin with, such as "images" in "images/a.jpg".
 
-    None if the names share no such folder, or if none of the listed photos exists.
+    It returns None if the names share no such folder, or if none of the listed photos exists.
     """
     parts = [path_parts(name) for name in names]
     folders = {part[0] if len(part) > 1 else "" for part in parts}
@@ -130,7 +130,7 @@ def read_sidecar_points(
 
 
 def _are_in_view(points: np.ndarray, photos: Sequence[Photo]) -> bool:
-    """Whether half of the points lie in or near the picture of a camera and at a plausible distance."""
+    """Return whether half of the points lie in or near the picture of a camera and at a plausible distance."""
     sample = points[np.linspace(0, len(points) - 1, min(len(points), _MAX_SAMPLED_POINTS)).astype(int)]
     cameras = evenly_spaced(photos, _MAX_SAMPLED_CAMERAS)
     seen = np.zeros(len(sample), bool)

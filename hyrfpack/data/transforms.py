@@ -116,8 +116,8 @@ def pose_from_opengl(frame: dict[str, Any], path: Path) -> np.ndarray:
 def pose_from_camera_axes(axes: np.ndarray, position: np.ndarray) -> np.ndarray:
     """Return the (4, 4) camera_from_world of a camera from its axes and its position in the world.
 
-    The rotation is inverted by transposition, without a check that it is one. `make_scene` rejects poses that are not
-    rigid.
+    The axes are inverted by transposition, without a check that they are orthonormal. `make_scene` rejects poses that
+    are not rigid.
 
     Args:
         axes: (3, 3) matrix whose columns are the camera's OpenCV axes.
@@ -131,7 +131,7 @@ def pose_from_camera_axes(axes: np.ndarray, position: np.ndarray) -> np.ndarray:
 
 
 def _is_finite(value: float) -> bool:
-    """Whether a number is finite as a float64."""
+    """Return whether a number is finite as a float64."""
     try:
         return math.isfinite(value)
     except OverflowError:  # an integer beyond float64

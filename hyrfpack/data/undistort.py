@@ -1,6 +1,6 @@
 """Lens distortion models, and the undistortion of photos.
 
-Undistortion needs only the forward distortion: each pixel of the undistorted picture takes its colour from the place in
+Undistortion needs only the forward distortion: each pixel of the undistorted picture takes its colour from the point in
 the photo where its ray was imaged. The undistorted camera keeps the photo's size, focal lengths and principal point, so
 that nothing is rescaled. Pixels whose rays fell outside the photo are masked out, not cropped or painted black.
 """
@@ -23,9 +23,9 @@ class Lens:
     Attributes:
         width, height: picture size in pixels.
         fx, fy, cx, cy: pinhole part, in pixels (pixel centres at .5).
-        model: "pinhole" (no coefficients), "brown" (k1 k2 p1 p2 k3 k4 k5 k6, COLMAP's FULL_OPENCV, and a k7 where
-            there is one), "fisheye" (k1 k2 k3 k4 of the equidistant OPENCV_FISHEYE, and p1 p2 if there are any), or
-            "equirectangular" (the whole sphere, which is cut into faces and never undistorted).
+        model: "pinhole" (no coefficients), "brown" (k1 k2 p1 p2 k3 k4 k5 k6, COLMAP's FULL_OPENCV, and optionally k7),
+            "fisheye" (k1 k2 k3 k4 of the equidistant OPENCV_FISHEYE, and optionally p1 p2), or "equirectangular" (the
+            whole sphere, which is cut into faces and never undistorted).
         coefficients: the coefficients of the model, dimensionless.
         skew: shear of the picture to the right, in pixels for each unit of y'; undistorted pictures have none.
     """
@@ -42,7 +42,7 @@ class Lens:
 
     @property
     def is_distorted(self) -> bool:
-        """Whether the photo differs from a pinhole picture, by distortion or by skew."""
+        """Return whether the photo differs from a pinhole picture, by distortion or by skew."""
         return self.model == "fisheye" or any(self.coefficients) or self.skew != 0
 
     def scaled(self, width: int, height: int) -> Lens:
@@ -140,9 +140,9 @@ def fold_radius(lens: Lens, largest: float) -> float:
     return float(radii[folded[0]]) if folded.size else largest
 
 
-@lru_cache(maxsize=4)  # usually all photos share one camera; a map takes 9 bytes a pixel
+@lru_cache(maxsize=4)  # usually all photos share one camera; a map takes 9 bytes per pixel
 def _source_map(lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Return where each undistorted pixel takes its colour from in the photo.
+    """Return the position in the photo that each undistorted pixel takes its colour from.
 
     Returns:
         (H, W) float32 columns and (H, W) float32 rows, clipped to the photo, with pixel centres at integers; (H, W)

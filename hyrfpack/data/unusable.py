@@ -69,7 +69,7 @@ def unreadable_error(place: Path, reasons: Mapping[str, str], count: int, conseq
     Args:
         place: the path that the user named.
         reasons, count: as in `unreadable_sentences`; at least one reason.
-        consequence: end of the problem: ", and the 2 that can be read are too few".
+        consequence: last clause of the problem, such as ", and the 2 that can be read are too few".
     """
     (problem, fix), *others = _unreadable_problems(reasons, count)
     more = [f"{other_problem}; {other_fix}" for other_problem, other_fix in others]
@@ -96,7 +96,7 @@ def _cannot_be_read(names: Sequence[str], count: int) -> str:
 
 
 def no_photos_error(given: Path, folder: Path) -> HyrfDataError:
-    """Return the error for a folder without a usable photo; it says why there is none.
+    """Return the error for a folder without a usable photo, with the reason.
 
     Args:
         given: the path that the user named.

@@ -38,7 +38,7 @@ PAGE_FILE = "demo.html"
 PICTURE_FILE = "demo.png"
 UNPACKED_FILE = "back.hyrf"
 PACKED_FILES = {profile: f"{profile}.hyrf" for profile in ("paper", "compact")}
-# Files that a demo writes; of numbered pictures, the first.
+# Files that a demo writes; for numbered pictures, only the first is listed.
 RESULT_FILES = (
     PICTURE_FILE,
     PAGE_FILE,

@@ -148,7 +148,7 @@ def _render(world_from_camera: np.ndarray, focal: float, size: int, noise: np.nd
 def _radiance(
     origins: np.ndarray, directions: np.ndarray, sun: np.ndarray, noise: np.ndarray, bounces: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the linear light (3, N) along each ray, and the distance (N,) that it comes from."""
+    """Return the linear light (3, N) along each ray, and the distance (N,) to the surface that it comes from."""
     distance, hit = _find_nearest_hit(origins, directions)
     color = np.empty_like(directions)
     sky = hit < 0

@@ -33,7 +33,7 @@ def fit_gains(image: Tensor, photo: Tensor, mask: Tensor | None = None) -> np.nd
 
     Args:
         image, photo: (H, W, 3) in [0, 1].
-        mask: (H, W) bool, True where a pixel counts; all when None.
+        mask: (H, W) bool, True where a pixel counts; None counts all pixels.
 
     Returns:
         (3,) float64 in [1 / 16, 16]; ones if too few pixels are left.
@@ -71,12 +71,12 @@ def fit_gains(image: Tensor, photo: Tensor, mask: Tensor | None = None) -> np.nd
 def correct_colors(image: Tensor, photo: Tensor, mask: Tensor | None = None) -> Tensor:
     """Correct the colours of a render by the affine map (3 x 4) with the least squared error to its photo.
 
-    This is the correction of NeRF in the Wild and RawNeRF, which uses the very photo that the render is scored against.
-    If several maps have the least error, as for a picture of one colour, the one closest to the identity is used.
+    This is the correction of NeRF in the Wild and RawNeRF. It uses the same photo that the render is scored against. If
+    several maps have the least error, as for a picture of one colour, the one closest to the identity is used.
 
     Args:
         image, photo: (H, W, 3) in [0, 1].
-        mask: (H, W) bool, True where a pixel counts; all when None. At least one must.
+        mask: (H, W) bool, True where a pixel counts, at least at one; None counts all pixels.
 
     Returns:
         (H, W, 3) in [0, 1], rounded to 8 bits.

@@ -22,7 +22,7 @@ from hyrfpack.errors import needs_package
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Errors, as mean absolute difference over channels, have the brightest colour of the map from here on.
+# Errors (mean absolute difference over channels) from this value on have the brightest colour of the map.
 ERROR_LIMIT = 0.2
 # Wider pictures are shrunk to this width.
 MAX_PANEL_WIDTH_PIXELS = 640
@@ -120,7 +120,7 @@ def draw_training_curve(records: Sequence[dict], path: str | os.PathLike[str], *
     Raises:
         HyrfError: the file cannot be written.
     """
-    figure = blank_figure(9, 6, layout=None)  # the constrained layout would take longer than drawing
+    figure = blank_figure(9, 6, layout=None)  # matplotlib's constrained layout takes longer than drawing
     axes = figure.subplots(3, 1, sharex=True, gridspec_kw=CURVE_MARGINS)
     steps = [record["step"] for record in records]
     for axis, key, label, color in zip(
@@ -244,7 +244,7 @@ def _color_bar(
 
 
 def _line_height(width: int) -> int:
-    """Return the height of a line of text above or below a picture of this width; pixels."""
+    """Return the height in pixels of a line of text above or below a picture of this width in pixels."""
     return round(1.6 * _font(width).size)
 
 

@@ -30,7 +30,7 @@ class Network:
     Attributes:
         stages: layer numbers of each stage's convolutions, as in torchvision.
         channels: number of output channels of each stage.
-        strides, paddings: strides and paddings by layer number, where they are not 1 and half the kernel.
+        strides, paddings: strides and paddings by layer number, if they differ from 1 and from half the kernel size.
         pool: kernel size of the max-pooling (stride 2) before a stage.
         pooled_stages: the stages that start with pooling.
         min_size_pixels: shortest picture side in pixels for which the last stage has an output.
@@ -82,7 +82,7 @@ class LPIPS:
         """Take the weights out of an `lpips.LPIPS` state dictionary.
 
         Raises:
-            ValueError: it is not such a dictionary, or a weight is missing or has another shape.
+            ValueError: `state` is not such a dictionary, or a weight is missing or has another shape.
         """
         shapes = {(64, 3, 11, 11): "alex", (64, 3, 3, 3): "vgg"}
         shape = tuple(_take_weight(state, "net.slice1.0.weight", 4).shape)
@@ -131,7 +131,7 @@ class LPIPS:
 
     @torch.no_grad()
     def __call__(self, image: Tensor, reference: Tensor) -> float:
-        """Return the distance between two pictures (H, W, 3) in [0, 1], which is symmetric.
+        """Return the symmetric distance between two pictures (H, W, 3) in [0, 1].
 
         Raises:
             HyrfError: a side of the pictures is too short for the network.

@@ -16,7 +16,7 @@ ASSUMED_PSNR = 30.0
 
 
 def to_8bit(image: Tensor) -> Tensor:
-    """Clamp to [0, 1] and round to the 256 levels of a saved picture, still float32 in [0, 1].
+    """Clamp a picture to [0, 1] and round it to the 256 levels of a saved one; the result is float32 in [0, 1].
 
     Renders are rounded before they are scored, so scores equal those measured on the saved PNG files.
     """
@@ -24,16 +24,16 @@ def to_8bit(image: Tensor) -> Tensor:
 
 
 def psnr(image: Tensor, reference: Tensor, mask: Tensor | None = None) -> float:
-    """Peak signal-to-noise ratio in dB, the squared error pooled over all counted pixels and channels.
+    """Return the peak signal-to-noise ratio in dB, with the squared error pooled over counted pixels and channels.
 
         PSNR = -10 log10(mean((image - reference)^2))
 
     Args:
         image, reference: (H, W, 3) in [0, 1].
-        mask: (H, W) bool, True where a pixel counts; all when None. At least one must.
+        mask: (H, W) bool, True where a pixel counts, at least at one; None counts all pixels.
 
     Returns:
-        dB; `IDENTICAL_PSNR` at most.
+        PSNR in dB, at most `IDENTICAL_PSNR`.
     """
     squares = (image.double() - reference.double()) ** 2
     return psnr_from_mse(float(squares.mean() if mask is None else squares[mask].mean()))
@@ -59,13 +59,13 @@ def provenance_mse(provenance: dict) -> float:
 
 
 def ssim(image: Tensor, reference: Tensor, mask: Tensor | None = None) -> float:
-    """Structural similarity: Gaussian window 11x11 with sigma 1.5, zeros around the picture, mean over channels.
+    """Return the structural similarity: Gaussian window 11x11, sigma 1.5, zero padding, mean over channels.
 
     Ignored pixels are left out of the mean. In both pictures they are set to the photo's values, so that the render
     there does not affect the windows of their neighbours.
 
     Args:
         image, reference: (H, W, 3) in [0, 1].
-        mask: (H, W) bool, True where a pixel counts; all when None. At least one must.
+        mask: (H, W) bool, True where a pixel counts, at least at one; None counts all pixels.
     """
     return 1 - float(photometric_loss(image, reference, mask, ssim_weight=1.0))

@@ -7,13 +7,13 @@ import numpy as np
 from hyrfpack.scene import Scene, View
 
 NEAREST_CAMERAS = 4  # a camera is compared with its nearest neighbours
-MAX_WEAK_VIEWS = 2  # the mean score of so few held-out photos depends on which ones are held out
+MAX_WEAK_VIEWS = 2  # up to this number, the mean score depends on which photos are held out
 # A held-out PSNR this far below that of the photos trained on means four times their squared error.
 MAX_PSNR_GAP_DB = 6.0
 
 
 def choose_inner_view(scene: Scene) -> View:
-    """Choose the view that is best surrounded by others; of several equally good ones, the first by name.
+    """Choose the view that is best surrounded by others; of equally good views, the first by name is chosen.
 
     Each camera is a point with six coordinates: its position, in units of the median distance from cameras to scene
     points, and its viewing direction. The score of a camera is the mean distance to its NEAREST_CAMERAS nearest others

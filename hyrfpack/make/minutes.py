@@ -40,7 +40,7 @@ MAX_PROBE_TIME_RATIO = 0.06  # a probe takes at most this ratio of the remaining
 MIN_USEFUL_STEPS = 1_000  # with fewer steps, smaller photos give a better scene
 CANDIDATE_PHOTO_SIZES = (1200, 800, 600, 400)  # longer sides in pixels, tried in this order
 MIN_PROBE_PHOTO_SIZE = 640  # photos are not shrunk below this size in pixels for the first probe
-TRAINED_PACE_RATIO = 0.92  # steps of a trained scene take this ratio of the probe's time, because more is hidden
+TRAINED_PACE_RATIO = 0.92  # later steps take this ratio of the probe's time, because more Gaussians are hidden
 # A pass, which renders a view on the CPU and back-propagates through it, is the unit of the work after training.
 VERIFICATION_VIEWS = 12  # packing verifies its result on this number of views
 CODING_SECONDS_PER_GAUSSIAN = 1.5e-4

@@ -20,7 +20,7 @@ from hyrfpack.train.decisions import (
 from hyrfpack.train.setup import budget_for
 
 # Measured on two CPU cores, for the first estimate only; during the work, measured times replace it.
-CPU_STEP_SECONDS_PER_MEGAPIXEL = 0.7  # a training step
+CPU_STEP_SECONDS_PER_MEGAPIXEL = 0.7
 GPU_STEP_SECONDS_PER_MEGAPIXEL = 0.02
 CPU_PASS_SECONDS_PER_MEGAPIXEL = 0.6  # a pass renders a view and back-propagates through it
 BACKGROUND_SEARCH_PASSES = 8.0  # time of the search for a background in unseen directions
@@ -152,7 +152,7 @@ def estimate_scene_seconds(scene: Scene, plan: Plan, device: torch.device) -> di
 
 
 def estimate_photos_seconds(sizes: Sequence[tuple[int, int]], plan: Plan, device: torch.device) -> dict[str, float]:
-    """Return `estimate_seconds` and the time for poses, for photos of these (width, height); none mean a video."""
+    """Return `estimate_seconds` and the time for poses, for photos of these (width, height); no sizes mean a video."""
     width, height = sizes[0] if sizes else (1920, 1080)
     shrunk = min(1.0, plan.max_size / max(width, height)) if plan.max_size else 1.0
     pixels, count = width * height * shrunk**2 / 1e6, len(sizes) or ASSUMED_VIDEO_PHOTOS

@@ -11,13 +11,13 @@ from time import monotonic
 STAGE_PARTS = {"training": ("pilots", "training", "results")}
 PACED_PARTS = ("pilots", "training")  # all steps are alike, so their pace shows how fast the machine is
 UNPACED_PARTS = ("poses", "measurement")  # their time does not depend on the pace of training
-# The pace of a part is used from this share of the part and this time on.
+# The pace of a part is used once at least this share of the part and this time have passed.
 MIN_PACE_SHARE = 0.01
 MIN_PACE_SECONDS = 2.0
 MIN_SAMPLE_SECONDS = 0.5  # time between two shares that are remembered
 MAX_SAMPLES = 200  # number of evenly spaced samples; there may be more, because the first ones are closer together
-FULL_TRUST_SECONDS = 20.0  # after this time only the measured pace counts, and the forecast no longer
-OVERDUE_TIME_RATIO = 0.25  # an overdue part is expected to take this ratio of its time so far in addition
+FULL_TRUST_SECONDS = 20.0  # after this time only the measured pace counts, not the forecast
+OVERDUE_TIME_RATIO = 0.25  # an overdue part is expected to take this ratio of its elapsed time in addition
 # Limits of the slowdown, the ratio of measured to forecast seconds.
 MIN_SLOWDOWN = 0.1
 MAX_SLOWDOWN = 20.0
@@ -50,8 +50,8 @@ class Reporter:
     """Reports progress and estimates the time that is left.
 
     A stage has one or more parts, which follow each other. Before a part begins, its time is known only from a
-    forecast. While it runs, its pace during the last half of its time counts more and more. If the paced parts take
-    longer than their forecast, because the machine is slow or busy, the forecasts of later parts are scaled as well.
+    forecast. While it runs, the measured pace gradually replaces the forecast. If the paced parts take longer than
+    their forecast, because the machine is slow or busy, the forecasts of later parts are scaled as well.
 
     Attributes:
         estimates: forecast seconds of parts by name, as far as known.
@@ -114,7 +114,7 @@ class Reporter:
         self._report(Progress(stage, place + 1, len(self._stages), self._shown, left, words))
 
     def report_share(self, doing: str, share: float) -> None:
-        """Report progress with the arguments of `hyrfpack.progress.Report`."""
+        """Report progress with the arguments of a `hyrfpack.progress.Report`."""
         self.update(share, doing)
 
     def say(self, sentence: str) -> None:

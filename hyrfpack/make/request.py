@@ -80,7 +80,7 @@ class Request:
             )
 
     def is_output_unchanged(self, state: WorkFolderState) -> bool:
-        """Return whether the output exists and its existing files are as the record of the work folder lists them."""
+        """Return whether the output exists and its files match the record of the work folder."""
         top = f"{EXPORT_FOLDER}/{self.output.name}"
         files = state.files("export").items()
         there = [(self.output / name[len(top) :].lstrip("/"), made) for name, made in files if name.startswith(top)]

@@ -48,7 +48,8 @@ class MakeResult:
         work: the work folder, which holds the products of all stages.
         views: number of held-out photos on which the model was scored.
         psnr, ssim: mean scores of these photos; None if there were none.
-        psnr_consistent: mean score as in `hyrfpack.Evaluation`; None also if the model has no exposure map.
+        psnr_consistent: mean PSNR at the consistent exposure (`hyrfpack.Evaluation`); None without scores or without an
+            exposure map.
         poses: report of `hyrfpack.estimate_poses`; empty if the photos had poses.
         training: steps, Gaussians, bytes and decisions of the training; empty if there was none.
         export: report of `hyrfpack.export_model`; for splats, it has that of `hyrfpack.import_splats` under "import".
@@ -114,11 +115,11 @@ def make_scene(
         quality: a key of QUALITIES.
         minutes: time that the call may take, instead of a quality. The number of steps and the size of the photos are
             chosen by a measurement.
-        work: the work folder; None for the name of the output with the ending ".work" beside it.
+        work: the work folder. None puts it beside the output, with the output's name and the ending ".work".
         images: see `load_scene`.
         max_size: see `load_scene`; None for the default of the quality.
-        test_every: see `load_scene`. None holds out every 8th photo; of fewer than 16 photos one, and of fewer than 8
-            none.
+        test_every: see `load_scene`. None holds out every 8th photo, but a single one if there are fewer than 16
+            photos, and none if there are fewer than 8.
         matching: see `hyrfpack.estimate_poses`.
         target_bytes: maximum size of the packed model in bytes. A later call with another size packs the trained model
             again, without training.
@@ -256,7 +257,7 @@ class _Pipeline:
         return stages.run_pose_stage(self.stage_cache, source.path, source.files(), request.matching, request.seed)
 
     def _scene_digest(self, scene: Scene) -> str:
-        """Return the digest of all files of a scene; an archive itself is left out, its unpacked files count."""
+        """Return the digest of all files of a scene; of an archive, the unpacked files are digested instead."""
         return files_digest((file for file in scene.files if Path(file) != self.source.path), Path(scene.path))
 
     def _requested_plan(self) -> Plan:
@@ -299,7 +300,7 @@ class _Pipeline:
             "number of Gaussians": request.max_gaussians,
             "preset": request.preset,
         }
-        # A training that was begun keeps its plan; for another target size, only packing runs again.
+        # A training run that was begun keeps its plan; for another target size, only packing runs again.
         earlier = {**inputs, "target size": stages.trained_target_bytes(self.stage_cache)}
         if self.stage_cache.state.facts("measurement", earlier) is not None:
             inputs = earlier

@@ -16,8 +16,8 @@ from hyrfpack.outputs import PICTURE_SUFFIXES, VIDEO_SUFFIXES, Outputs, StrPath
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Scene
 from hyrfpack.splats.files import READABLE_ENDINGS
 
-MIN_SPLIT_PHOTOS = 16  # of fewer photos, a single one is held out
-MIN_HELD_OUT_PHOTOS = 8  # of fewer photos, none is held out
+MIN_SPLIT_PHOTOS = 16  # if there are fewer photos, a single one is held out
+MIN_HELD_OUT_PHOTOS = 8  # if there are fewer photos, none is held out
 DEFAULT_TEST_EVERY = 8
 _SOG_INDEX_NAME = "meta.json"  # the main file of splats in SOG format that are not packed into one file
 
@@ -26,9 +26,9 @@ _SOG_INDEX_NAME = "meta.json"  # the main file of splats in SOG format that are 
 class LoadSettings:
     """Settings with which photos are read, see `load_scene`.
 
-    Without `test_every`, every 8th photo is held out (DEFAULT_TEST_EVERY). Of fewer than MIN_SPLIT_PHOTOS, only the
-    photo that is best surrounded by others is held out (`choose_inner_view`), and of fewer than MIN_HELD_OUT_PHOTOS
-    none. If the set has a split of its own, that is used instead.
+    Without `test_every`, every 8th photo is held out (DEFAULT_TEST_EVERY). If there are fewer than MIN_SPLIT_PHOTOS,
+    only the photo that is best surrounded by others is held out (`choose_inner_view`). If there are fewer than
+    MIN_HELD_OUT_PHOTOS, none is held out. If the set has a split of its own, that is used instead.
     """
 
     images: str | None = None

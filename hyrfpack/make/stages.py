@@ -38,7 +38,7 @@ SCENE_FOLDER = PRODUCT_NAMES["poses"]
 RUN_FOLDER = PRODUCT_NAMES["training"]
 PACKED_MODEL = PRODUCT_NAMES["compression"]
 EXPORT_FOLDER = PRODUCT_NAMES["export"]
-FIXED_SETTINGS = ("target_bytes", "budget_factor", "exposure")  # a training that was begun keeps these settings
+FIXED_SETTINGS = ("target_bytes", "budget_factor", "exposure")  # a training run that was begun keeps these settings
 POSES_REPORT_NAME = "poses.json"  # `hyrfpack.estimate_poses` writes its report into the scene's folder
 
 
@@ -92,7 +92,7 @@ def run_training_stage(
 ) -> dict[str, Any]:
     """Train into `run/`; return the numbers of steps and Gaussians, the decisions made, and other facts.
 
-    A training that was begun keeps its target size and what was decided from it. So a call with another target size
+    A training run that was begun keeps its target size and what was decided from it. So a call with another target size
     does not train again.
     """
     config = plan.train_config(seed)
@@ -121,7 +121,7 @@ def run_training_stage(
                     scene, run, config, resume=resume, overwrite=True, cache=picture_cache, device=device, quiet=True,
                     report=progress.step, phase=progress.phase, observer=observer,
                 )  # fmt: skip
-            except HyrfError as error:  # its advice how to resume is about the command `train`
+            except HyrfError as error:  # the fix of this error refers to the command `train`
                 raise error.__cause__ if isinstance(error.__cause__, HyrfError) else error from None
             if not trained.complete:
                 raise KeyboardInterrupt

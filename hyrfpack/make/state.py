@@ -25,7 +25,7 @@ class WorkFolderState:
     The record of a stage has these parts:
 
         inputs     plain values on which the product of the stage depends
-        fixed      plain values that keep what they were when the stage was begun
+        fixed      plain values that stay as they were when the stage was begun
         files      digests of the files that the stage wrote, by path relative to the folder
         facts      plain values for the report
         seconds    time that the stage has taken

@@ -32,7 +32,7 @@ from hyrfpack.parallel.pool import thread_count
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Scene, evenly_spaced
 from hyrfpack.train.setup import detect_preset
 
-# Of larger sets, an evenly spaced selection is examined, so that a survey takes seconds and not minutes.
+# An evenly spaced selection of larger sets is examined, so that a survey takes seconds and not minutes.
 MAX_DECODED_PHOTOS = 150
 MAX_OPENED_PHOTOS = 2000
 
@@ -56,7 +56,7 @@ class PhotoSurvey:
     Attributes:
         path: the path that was described.
         kind: "photos" or "video".
-        photos: number of photos; of a video, number of frames.
+        photos: number of photos; for a video, number of frames.
         layout: layout of the poses; "" if there are none.
         posed: number of photos with poses.
         points: number of points of the reconstruction.
@@ -68,7 +68,7 @@ class PhotoSurvey:
         blurred: names of photos that are blurred compared with the others.
         stops: difference in stops between the 5 % and 95 % quantiles of the mean luminance; 0 for a video.
         luminance: median of the mean linear luminance, in [0, 1]; 0 for a video.
-        frames: number of frames that would be taken of a video.
+        frames: number of frames that would be taken from a video.
         notes: sentences about the set.
         problems: sentences about problems, each with advice.
     """
@@ -112,8 +112,8 @@ class _PixelMeasurement:
 def describe_photos(path: StrPath, *, report: Callable[[str, float], None] | None = None) -> PhotoSurvey:
     """Describe a folder of photos, with poses or without, a .zip of one, or a video.
 
-    Of a large set, an evenly spaced selection is examined: the headers of 2,000 photos and the pixels of 150. A video
-    is decoded once. No file is written.
+    An evenly spaced selection of a large set is examined: the headers of 2,000 photos and the pixels of 150. A video is
+    decoded once. No file is written.
 
     Args:
         path: the folder or file.
@@ -255,7 +255,7 @@ def _read_header_facts(
 def _measure_all_pixels(
     photos: list[Path], folder: Path, report_progress: Callable[[str, float], None]
 ) -> tuple[list[_PixelMeasurement], dict[str, str]]:
-    """Measure the pixels of photos; return the reason for each undecodable photo by name, too."""
+    """Measure the pixels of photos; also return the reason for each undecodable photo, by name."""
     chosen = evenly_spaced(photos, MAX_DECODED_PHOTOS)
     measurements, undecodable = [], {}
     with ThreadPoolExecutor(thread_count()) as pool:
@@ -294,7 +294,7 @@ def _count_problems(count: int, scene: Scene | None, posed: int, path: Path) -> 
             f"there {'is' if count == 1 else 'are'} only {format_photo_count(count)}; take {_MIN_RECOMMENDED_PHOTOS} "
             "or more, from all around and with much overlap"
         )
-    if scene is None or scene.layout == "blender":  # of Blender sets, only some of the splits are used
+    if scene is None or scene.layout == "blender":  # only some splits of a Blender set are used
         return found
     without = count - posed
     if posed and without > 0:

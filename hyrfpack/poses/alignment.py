@@ -49,7 +49,7 @@ def camera_positions(poses: Poses) -> np.ndarray:
 
 
 def camera_extent(poses: Poses) -> float:
-    """Return the diagonal of the box around the cameras; of 20 or more, the outer 5 % along each axis are left out."""
+    """Return the diagonal of the box around the cameras; for 20 or more, without the outer 5 % along each axis."""
     positions = camera_positions(poses)
     if len(positions) < 2:
         return 0.0
@@ -78,7 +78,7 @@ def align_poses(a: Poses, b: Poses) -> PoseAlignment:
         return PoseAlignment(names, np.full(len(names), np.inf), np.full(len(names), 180.0))
     rotations_a, rotations_b = (np.array([poses[name][:, :3] for name in names]) for poses in (a, b))
     positions_a, positions_b = (camera_positions({name: poses[name] for name in names}) for poses in (a, b))
-    relative_rotations = np.einsum("nji,njk->nik", rotations_b, rotations_a)  # of each camera
+    relative_rotations = np.einsum("nji,njk->nik", rotations_b, rotations_a)  # (N, 3, 3), one for each camera
 
     def errors(scale: float, rotation: np.ndarray, shift: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         distance = np.linalg.norm(scale * positions_a @ rotation.T + shift - positions_b, axis=1) / size

@@ -12,7 +12,7 @@ from hyrfpack.poses.job import DEFAULT_FOCAL_RATIO
 
 # Focal lengths over the longer side of the picture, from the wide angles of phones to short telephoto lenses.
 CANDIDATE_FOCAL_RATIOS = np.geomspace(0.45, 2.8, 17)
-# A focal length this far from the default (in natural logarithms) must explain this ratio of the matches more.
+# The score of a focal length, a ratio of matches, is lowered by penalty * (ln(focal / default) / width)^2.
 _PRIOR_PENALTY = 0.01
 _PRIOR_LOG_WIDTH = 0.5
 _RANSAC_ERROR_PIXELS = 1.0  # a looser threshold would accept any focal length
@@ -43,13 +43,14 @@ def search_focal_ratio(
     """Search the focal length, over the longer side, with which calibrated geometry explains the most matches.
 
     The score of a candidate is the mean inlier ratio minus a small penalty for its distance from DEFAULT_FOCAL_RATIO.
-    The penalty decides where matches cannot, such as with flat ground from above or motion straight ahead.
+    The penalty decides between candidates that matches do not distinguish, as with flat ground from above or motion
+    straight ahead.
 
     Args:
         pairs: matches between photos of the camera.
         camera: the camera, of which only size and model are used.
         seed: random seed of RANSAC.
-        progress: called with the ratio of the search that is done.
+        progress: called with the completed ratio of the search, in [0, 1).
     """
     options = pycolmap.RANSACOptions()
     options.max_error, options.random_seed = _RANSAC_ERROR_PIXELS, seed % 2**31

@@ -16,7 +16,7 @@ from hyrfpack.poses.process import Report
 from hyrfpack.poses.watch import count_rows, report_new_rows
 
 pycolmap.logging.minloglevel = 1  # only warnings and errors go into the log of a stage
-Cameras = dict[int, pycolmap.Camera]  # by camera number
+Cameras = dict[int, pycolmap.Camera]  # cameras by their numbers, which start at 1
 
 MIN_PAIR_MATCHES = 15  # a pair of photos with fewer verified matches is ignored (pycolmap's own default)
 _UNUSABLE_PAIR_KINDS = ("UNDEFINED", "DEGENERATE", "WATERMARK")
@@ -36,7 +36,7 @@ def make_database(job: Job) -> None:
     """Create the database with all cameras and photos, unless it exists.
 
     Cameras and photos are written in order, so that later results do not depend on the order of threads. Cameras have
-    one coefficient of radial distortion. Their focal length counts as known even if it is a guess. Then pairs are
+    one coefficient of radial distortion. Their focal length counts as known even if it is a guess. So pairs are
     verified by calibrated geometry, or by uncalibrated geometry if that explains more matches.
     """
     if job.database.exists():
@@ -84,13 +84,14 @@ def read_cameras(database: pycolmap.Database) -> Cameras:
 def recalibrate(job: Job, step_name: str, decide: Callable[[Cameras], Cameras], report_progress: Report) -> bool:
     """Replace cameras in the database by better ones, and verify all pairs again with them.
 
-    The decision is saved before the database is changed, so that a repeated call after an interruption does the same.
+    The decision is saved before the database is changed, so that a call after an interruption makes the same
+    replacements.
 
     Args:
         job: the estimation.
         step_name: name of this step, used in the names of its files.
-        decide: maps the present cameras to the replacements, both by number.
-        report_progress: called with a description and the ratio of this step that is done, from 0.5 on.
+        decide: maps the current cameras to the replacements, both by number.
+        report_progress: called with a description and the completed ratio of this step, in [0.5, 1].
 
     Returns:
         Whether any camera was replaced.

@@ -16,7 +16,7 @@ from hyrfpack.poses.prepare import COPY_REASON_PREFIX, select_unreadable
 MIN_PHOTOS = 3
 _MIN_TYPICAL_FEATURES = 60  # photos with fewer features cannot be matched
 _MIN_CONTENT_SHARPNESS = 0.1  # a blurred photo that shows something is sharper than this
-_PANORAMA_PAIR_RATIO = 0.8  # from this ratio of pairs without translation on, the photos show one place
+_PANORAMA_PAIR_RATIO = 0.8  # with this ratio of pairs without translation or more, the photos were taken from one place
 
 
 def check_photo_count(given: Path, folder: Path, usable: int, left_out: Mapping[str, str]) -> None:
@@ -25,7 +25,7 @@ def check_photo_count(given: Path, folder: Path, usable: int, left_out: Mapping[
     Args:
         given: the path that the user gave.
         folder: the folder of the photos, which for an archive is where it was unpacked.
-        usable: number of photos that can be read and are no copies.
+        usable: number of photos that can be read and are not copies.
         left_out: the reason for each other photo.
 
     Raises:

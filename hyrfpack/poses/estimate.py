@@ -104,7 +104,7 @@ def estimate_poses(
         matching: "exhaustive" (all pairs), "sequential" (photos that follow each other, and loops), "retrieval"
             (similar photos) or "auto". "auto" means exhaustive for up to 200 photos, sequential for videos and larger
             numbered bursts, and retrieval for other large sets.
-        masks: folder of masks named as the photos, black where a photo is ignored. None searches for masks/ in or
+        masks: folder of masks, named like the photos, black where a photo is ignored. None searches for masks/ in or
             beside the folder of photos.
         seed: random seed.
         overwrite: replace poses and photos that an earlier call wrote into `out`. Files of other origin are never
@@ -148,9 +148,9 @@ class _PoseEstimation:
     left_out: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
-    user_names: dict[str, str] = field(default_factory=dict)  # names that the user knows photos by, if they differ
+    user_names: dict[str, str] = field(default_factory=dict)  # by name in images/, where the two names differ
     is_video: bool = False
-    reported_ratio: float = 0.0  # reported progress never goes back
+    reported_ratio: float = 0.0  # reported progress never decreases
     has_work_folder: bool = False
     has_products: bool = False  # this call or an interrupted one has finished a stage
 

@@ -25,7 +25,7 @@ from hyrfpack.poses.process import Report
 _MAX_OPENCV_ERROR_RATIO = 0.99
 _MAX_PINHOLE_ERROR_RATIO = 1.003
 _MIN_OPENCV_PHOTOS = 20  # fewer photos of a camera do not determine the four coefficients of the OPENCV model
-_CAUCHY_SCALE_PIXELS = 0.5  # with this robust loss, the errors of poses are a third smaller than without
+_CAUCHY_SCALE_PIXELS = 0.5  # with this robust loss, pose errors are a third smaller than without it
 _MIN_REFITTED_MATCH_RATIO = 0.997  # a refit with another lens model must keep this ratio of the explained matches
 _COLOR_PICTURE_SIDE_PIXELS = 400  # points get their colours from pictures with this longer side
 
@@ -179,7 +179,7 @@ def _refit_with_lens(model: pycolmap.Reconstruction, lens: str) -> pycolmap.Reco
 
 
 def _rescale_to_photos(job: Job, model: pycolmap.Reconstruction) -> None:
-    """Rescale cameras and observations from the working copies to the photos, and name the images as the photos."""
+    """Rescale cameras and observations from the working copies to the photos, and name the images after the photos."""
     for number, camera in model.cameras.items():
         camera.rescale(*job.devices[number - 1].size)
     for image in model.images.values():

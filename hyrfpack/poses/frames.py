@@ -23,7 +23,7 @@ __all__ = ["FrameReport", "choose_frames", "is_video", "survey_frames"]
 
 Report = Callable[[str, float], None]
 
-RECORD_NAME = "frames.json"  # A file beside the frames, with their video and settings.
+RECORD_NAME = "frames.json"  # this file beside the frames states their video and settings
 
 # Spacings are the motion of the picture between two taken frames, as a ratio of its longer side.
 _DEFAULT_SPACING_RATIO = 0.05
@@ -51,7 +51,7 @@ class FrameReport:
         taken: number of frames written.
         of: number of frames that could be decoded.
         blurred: number of measured frames that are blurred compared with the others.
-        repeated: number of measured frames that equal the frame before.
+        repeated: number of measured frames that equal the previous frame.
         seconds: duration of the decoded video.
         spacing: median motion of the picture between two taken frames, as a ratio of its longer side.
         notes: sentences for the user.
@@ -76,7 +76,7 @@ class _VideoMeasurement:
         sharpness: (N,) sharpness of each frame.
         thumbnails: N pictures, (h, w) uint8.
         decoded_count: number of frames that could be decoded.
-        repeated_count: number of measured frames that equal the frame before.
+        repeated_count: number of measured frames that equal the previous frame.
         seconds: duration of the decoded video.
         notes: sentences for the user.
     """
@@ -96,8 +96,8 @@ def choose_frames(video: StrPath, folder: StrPath, *, most: int = 150, report: R
 
     All frames are decoded once to measure their sharpness and the motion of the picture. The chosen frames are decoded
     once more at full size. Blurred and repeated frames are never taken. Between two taken frames the picture moves by
-    about 5 % of its longer side, less in slow videos and more in long ones. Among the frames around that spacing, the
-    sharpest is taken.
+    about 5 % of its longer side, less in slow videos and more in long ones. The sharpest of the frames near that
+    spacing is taken.
 
     The frames are upright JPEG files, named by their number in the video ("frame_000123.jpg"), with "frames.json"
     beside them. If the folder already has all frames of the same video and settings, nothing is written. A repeated

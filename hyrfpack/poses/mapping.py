@@ -20,7 +20,7 @@ from hyrfpack.poses.job import Job
 from hyrfpack.poses.process import Report
 from hyrfpack.poses.watch import report_global_mapping_phase
 
-_GLOBAL_RUNS = 3  # each run starts from other random positions, with the focal lengths that the run before found
+_GLOBAL_RUNS = 3  # each run starts from other random positions, with the focal lengths that the previous run found
 _FOCAL_CHANGE_THRESHOLD = 0.01  # pairs are verified again if the focal length changes by more than this ratio
 _MIN_POSE_INLIERS = 20  # pycolmap's own limit of 30 points leaves out many small photos
 # A focal length outside these ratios of the longer side means that the mapper has failed.
@@ -72,7 +72,7 @@ def map_globally(job: Job, report_progress: Report) -> dict[str, Any]:
 
 
 def _run_part_report(report_progress: Report, run_index: int, first: float, last: float) -> Report:
-    """Return the report of a part of one run, whose ratio 0 to 1 becomes `first` to `last` of that run."""
+    """Return a report function for a part of one run, which maps its ratio from [0, 1] to [first, last] of that run."""
     return lambda doing, share: report_progress(doing, (run_index + first + (last - first) * share) / _GLOBAL_RUNS)
 
 
@@ -126,8 +126,8 @@ def map_incrementally(job: Job, report_progress: Report) -> dict[str, Any]:
 def _make_photo_callback(count: int, report_progress: Report) -> Callable[[], None]:
     """Return the function that the incremental mapper calls after each photo.
 
-    The number of photos to come is unknown, because some stay without a pose and discarded models are begun again. So
-    the reported ratio stays below 1.
+    The number of remaining photos is unknown, because some get no pose and discarded models are restarted. So the
+    reported ratio stays below 1.
     """
     posed = 2  # the mapper begins with a pair of photos
 
@@ -142,7 +142,7 @@ def _make_photo_callback(count: int, report_progress: Report) -> Callable[[], No
 
 
 def complete_model(job: Job, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
-    """Continue a model with the incremental mapper: add points and fitting photos, and refine all of it together."""
+    """Continue a model with the incremental mapper: add points and photos that fit, and refine the whole model."""
     start, scratch = job.work / "start", _make_scratch_folder(job)
     shutil.rmtree(start, ignore_errors=True)
     start.mkdir()

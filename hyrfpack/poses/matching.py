@@ -30,7 +30,7 @@ from hyrfpack.poses.job import Job
 from hyrfpack.poses.process import Report
 from hyrfpack.poses.watch import report_new_rows
 
-_PORTION_SECONDS = 2.0  # pairs are matched in portions of about this time, and saved after each
+_PORTION_SECONDS = 2.0  # pairs are matched in portions that take about this time, and saved after each portion
 _FIRST_PORTION_PAIRS = 100
 _MAX_PORTION_PAIRS = 2000
 # The focal length of a camera is estimated from pairs of its photos with many matches.

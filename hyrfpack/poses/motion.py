@@ -24,8 +24,8 @@ _MOTION_QUANTILE = 0.75  # near objects move more than most windows, and they mu
 def track_windows(frames: Sequence[np.ndarray], progress: Callable[[int], None] = lambda done: None) -> np.ndarray:
     """Track windows of the picture from the first frame on.
 
-    Each frame is compared by phase correlation with a reference frame, which is often older than the previous frame.
-    So slow motion is not lost, and a shaking camera does not look like a moving one.
+    Each frame is compared by phase correlation with a reference frame, which is often older than the previous frame. So
+    slow motion is not lost, and a shaking camera is not mistaken for a moving one.
 
     Args:
         frames: (H, W) uint8 frames with TRACKING_SIDE_PIXELS on the longer side.

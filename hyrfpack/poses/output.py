@@ -120,7 +120,7 @@ class SceneOutput:
         Args:
             name: name of the folder.
             fill: called with the folder to fill.
-            resume_filling: files that an interrupted call has put into the folder stay.
+            resume_filling: keep files that an interrupted call has written into the folder.
         """
         folder, unfinished = self.work / name, self.work / f"unfinished-{name}"
         if not folder.is_dir():
@@ -129,7 +129,7 @@ class SceneOutput:
             unfinished.mkdir(exist_ok=True)
             try:
                 fill(unfinished)
-            except OSError:  # unfinished copies of many photos would keep a full disk full
+            except OSError:  # on a full disk, unfinished copies of many photos would take the space that the user needs
                 if not resume_filling:
                     shutil.rmtree(unfinished, ignore_errors=True)
                 raise
@@ -187,13 +187,13 @@ class SceneOutput:
 
 
 def is_same_path(first: Path, second: Path) -> bool:
-    """Return whether two paths lead to the same place."""
+    """Return whether two paths lead to the same file or folder."""
     return first.resolve() == second.resolve()
 
 
 @contextmanager
 def explain_disk_errors(out: Path) -> Iterator[None]:
-    """Turn errors of the disk in the block into a HyrfError of one sentence."""
+    """Convert disk errors in the block into a HyrfError of one sentence."""
     try:
         yield
     except OSError as error:

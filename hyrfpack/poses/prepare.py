@@ -23,7 +23,7 @@ from hyrfpack.errors import HyrfDataError, short_reason, strip_path
 from hyrfpack.poses.copying import copy_file
 from hyrfpack.poses.job import Device
 
-# Photos with these endings are copied, because other programs that read scenes know them, too.
+# Photos with these endings are copied, because other programs that read scenes know these formats.
 _COPIED_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")
 _SUFFIXES_WRITTEN_AS_JPEG = (".jpg", ".jpeg", ".heic", ".heif")  # photos with other endings are rewritten as PNG
 _JPEG_SAVE_OPTIONS = {"quality": 95, "subsampling": 0}
@@ -44,7 +44,7 @@ class Photo:
 
     Attributes:
         name: path relative to the scene's images/.
-        facts: header facts of the source file; for a face, those of the face, but the path of the panorama.
+        facts: header facts of the source file; for a face, facts of the face with the path of the panorama.
         source: path of the source file relative to the folder of photos.
         face: the face of the panorama; None for an ordinary photo.
     """
@@ -204,7 +204,7 @@ def make_masks(photos: Sequence[Photo], masks: dict[str, Path], folder: Path) ->
         if photo.face is not None:
             stored = read_header(photo.facts.path).size
             usable = FaceFile(photo.facts.path, stored, photo.face, photo.facts.size[0], mask)().mask
-            assert usable is not None  # because a mask is given above
+            assert usable is not None  # a FaceFile with a mask always loads one
             Image.fromarray(usable.astype(np.uint8) * 255).save(target)
             made[photo.name] = target
             continue

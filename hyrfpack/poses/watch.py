@@ -28,7 +28,7 @@ _GLOBAL_PHASES = (
 def poll_in_background(poll: Callable[[], None]) -> Iterator[None]:
     """Call `poll` every POLL_INTERVAL_SECONDS from a second thread while the block runs.
 
-    Errors that `poll` meets while it reads are ignored, such as a locked database or a log that does not exist yet.
+    Read errors in `poll` are ignored, such as a locked database or a log that does not exist yet.
     """
     stopped = Event()
 
@@ -91,7 +91,7 @@ def report_global_mapping_phase(log: Path, doing: str, report_progress: Report) 
 
 
 def parse_global_mapping_phase(log: str) -> tuple[str, float]:
-    """Return the present phase of the global mapper and the ratio of its work before it; ("", 0.0) before the first."""
+    """Return the global mapper's current phase and the ratio of work before it; ("", 0.0) before the first phase."""
     started = [(log.rfind(mark), name, share) for mark, name, share in _GLOBAL_PHASES if mark in log]
     if not started:
         return "", 0.0
