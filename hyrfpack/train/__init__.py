@@ -1,4 +1,4 @@
-"""Posed photos -> a trained HybridModel in a run folder."""
+"""Train a HybridModel on posed photos, and write it into a run folder."""
 
 from hyrfpack.train.config import PRESETS, DensityConfig, LearningRates, TrainConfig
 from hyrfpack.train.density import DensityControl

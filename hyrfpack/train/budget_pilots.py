@@ -1,8 +1,9 @@
 """Estimate the Gaussian budget of a scene from pilot runs with a small and a usual budget.
 
-If n Gaussians score a + g log2(n) dB on validation photos and each Gaussian costs the same, the best number of
-Gaussians is proportional to g: a plain scene needs fewer than a detailed one, however many pixels its photos have. Two
-pilots with a quarter of a usual budget and all of it measure g. If g is small, two more with another seed confirm it.
+Suppose that n Gaussians score a + g log2(n) dB on validation photos, and that each Gaussian costs the same. Then the
+best number of Gaussians is proportional to g: a plain scene needs fewer than a detailed one, however many pixels its
+photos have. Two pilots measure g, one with a quarter of the usual budget and one with all of it. If g is small, two
+more pilots with another seed confirm it.
 """
 
 from __future__ import annotations
@@ -13,9 +14,9 @@ from statistics import fmean
 from hyrfpack.train.pilots import ScenePilots
 
 BUDGET_PILOT_STEPS = 120
-MAX_BUDGET_ROUNDS = 2  # A round is two pilots.
+MAX_BUDGET_ROUNDS = 2  # Each round runs two pilots.
 SMALL_PILOT_BUDGET_RATIO = 0.25
-EXPECTED_GAIN_DB = 0.6  # With this gain between the two pilots, the usual budget is right.
+EXPECTED_GAIN_DB = 0.6  # If the larger pilot scores this much more, the usual budget is right.
 # Multiples of the usual budget. The steps are wide, because another seed changes the gain by up to 0.3 dB.
 BUDGET_FACTORS = (0.25, 0.35, 0.5, 0.7, 1.0, 1.5)
 
@@ -23,11 +24,11 @@ BUDGET_FACTORS = (0.25, 0.35, 0.5, 0.7, 1.0, 1.5)
 def measure_budget(pilots: ScenePilots, exposure: bool) -> tuple[float, str]:
     """Estimate the Gaussian budget of a scene.
 
-    Scores are taken after an affine correction of colours, so that they compare detail.
+    Scores are computed after an affine correction of colours, so that they compare detail.
 
     Args:
-        pilots: of the scene.
-        exposure: whether per-image gains are learnt.
+        pilots: runs the pilots of the scene.
+        exposure: whether the pilots learn per-image gains.
 
     Returns:
         The budget as a multiple of the usual one, one of `BUDGET_FACTORS`, and the reason in words.

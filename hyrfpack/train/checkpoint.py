@@ -1,4 +1,4 @@
-"""Checkpoints: the complete state of a run, from which it resumes as if it had never stopped.
+"""Checkpoints hold the complete state of a run, from which it resumes as if it had never stopped.
 
 Random numbers come from generators seeded by (seed, step), so that no generator state is stored.
 """
@@ -15,7 +15,7 @@ import torch
 from hyrfpack.atomic import write_atomic
 from hyrfpack.checks import check_float
 from hyrfpack.errors import HyrfTrainingError
-from hyrfpack.train.config import BUDGET_FACTORS
+from hyrfpack.train.config import BUDGET_FACTOR_RANGE
 
 CHECKPOINT_VERSION = 2
 DIGEST_BYTES = 32  # The file ends with the SHA-256 digest of everything before it.
@@ -27,10 +27,10 @@ def save_checkpoint(
     """Write a checkpoint atomically.
 
     Args:
-        settings: plain values that a resumed run must share.
-        tensors: by name.
-        progress: plain values (step, records).
-        overwrite: replace a file that is there.
+        settings: plain values that must be the same in a resumed run.
+        tensors: the tensors of the run's state by name.
+        progress: plain values of the run's state (step, records).
+        overwrite: replace a file at `path`.
 
     Raises:
         HyrfError: the file cannot be written; an earlier file stays.
@@ -47,7 +47,7 @@ def save_checkpoint(
 
 
 def saved_decisions(path: Path) -> tuple[float | None, bool]:
-    """Read what pilots may have decided for the run of a checkpoint: its budget factor, and whether gains are learnt.
+    """Read the decisions of pilot runs from a checkpoint: the budget factor, and whether per-image gains are learnt.
 
     Raises:
         HyrfTrainingError: the checkpoint is missing, damaged or of another version.
@@ -56,7 +56,7 @@ def saved_decisions(path: Path) -> tuple[float | None, bool]:
     factor, exposure = saved.get("budget_factor"), saved.get("exposure", False)
     if factor is not None:
         try:
-            check_float("budget_factor", factor, *BUDGET_FACTORS)
+            check_float("budget_factor", factor, *BUDGET_FACTOR_RANGE)
         except ValueError as error:
             raise _damaged(path) from error
     if not isinstance(exposure, bool):
@@ -71,7 +71,7 @@ def load_checkpoint(path: Path, settings: dict) -> tuple[dict[str, torch.Tensor]
         Tensors by name, and progress.
 
     Raises:
-        HyrfTrainingError: the checkpoint is missing, damaged, or of a run with other settings, which are named.
+        HyrfTrainingError: the checkpoint is missing or damaged, or its run had other settings, which the message names.
     """
     saved, tensors, progress = _read(path)
     if different := sorted(
@@ -85,7 +85,7 @@ def load_checkpoint(path: Path, settings: dict) -> tuple[dict[str, torch.Tensor]
 
 
 def _read(path: Path) -> tuple[dict, dict[str, torch.Tensor], dict]:
-    """Return settings, tensors and progress."""
+    """Read a checkpoint and return its settings, tensors and progress."""
     if not path.is_file():
         raise HyrfTrainingError(f"{path}: there is no checkpoint to resume from", fix="train without `resume=True`")
     try:
@@ -97,7 +97,7 @@ def _read(path: Path) -> tuple[dict, dict[str, torch.Tensor], dict]:
         tensors, version = content["tensors"], content["version"]
         if not isinstance(saved, dict):
             raise ValueError("the settings are no object")
-    except Exception as error:  # torch's unpickler raises whatever it meets
+    except Exception as error:  # torch's unpickler raises errors of any type
         raise _damaged(path) from error
     if version != CHECKPOINT_VERSION:
         raise HyrfTrainingError(

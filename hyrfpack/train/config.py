@@ -10,21 +10,20 @@ from hyrfpack.checks import check_bool, check_choice, check_float, check_int, ch
 from hyrfpack.choices import PRECISIONS, PRESETS
 
 BACKGROUND_COLORS = ("black", "white", "random")
-LARGEST_SEED = 2**64 - 1  # torch's generators take 64 bits
-FULL_STEPS = 30_000  # the length of a run that the paper's schedule is written for
-SHORT_STEPS = 1_000  # rates grow no further in runs shorter than this
-BUDGET_FACTORS = 1e-3, 1e3  # least and largest
-SMALLEST_RATE = 1e-30  # next to nothing; their ratio is taken, so 0 is none
+LARGEST_SEED = 2**64 - 1  # torch's generators take seeds of 64 bits.
+FULL_STEPS = 30_000  # The paper's schedules are written for runs of this length.
+MIN_RATE_SCALING_STEPS = 1_000  # Shorter runs use the learning rates of a run of this length.
+BUDGET_FACTOR_RANGE = 1e-3, 1e3
+MIN_LEARNING_RATE = 1e-30  # It is above 0, because the schedule divides by the first rate.
 
 
 @dataclass(frozen=True)
 class LearningRates:
-    """Adam's step sizes at the first and the last step of a full-length run; exponential in between.
+    """Adam's learning rates of each parameter group at the first and the last step of a full-length run.
 
-    A shorter run has fewer steps to go the same way: its rates are sqrt(FULL_STEPS / steps) times these.
-    Positions are in local units (the frame's longest half-axis is 1), the rest are logits, field weights and
-    logarithms of photos' gains.
-    All are positive.
+    Rates decay exponentially in between. Shorter runs multiply them by sqrt(FULL_STEPS / steps). Positions are in local
+    units (the frame's longest half-axis is 1). The other parameters are logits, weights of the fields, and log gains of
+    photos. All rates are positive.
     """
 
     positions: tuple[float, float] = (2e-4, 2e-6)
@@ -38,36 +37,36 @@ class LearningRates:
         for group in fields(self):
             check_pair(group.name, getattr(self, group.name))
             for rate in getattr(self, group.name):
-                check_float(f"a rate of {group.name}", rate, SMALLEST_RATE)
+                check_float(f"a rate of {group.name}", rate, MIN_LEARNING_RATE)
 
     def at(self, name: str, step: int, steps: int, views: int = 1) -> float:
-        """The rate of one group for `step` (from 0) of a run of `steps`, each by the mean gradient of so many views.
+        """Return the learning rate of the group `name` at `step` (from 0) of a run of `steps` steps.
 
-        The mean of W gradients has 1 / sqrt(W) of the noise of one, and there are as many steps fewer: the rate grows
-        with sqrt(W).
+        Each step uses the mean gradient of W = `views` views. That mean has 1 / sqrt(W) of the noise of one gradient,
+        and the run has 1 / W of the steps, so the rate grows with sqrt(W).
         """
         first, last = getattr(self, name)
-        pace = math.sqrt(views * FULL_STEPS / min(max(steps * views, SHORT_STEPS), FULL_STEPS))
+        pace = math.sqrt(views * FULL_STEPS / min(max(steps * views, MIN_RATE_SCALING_STEPS), FULL_STEPS))
         return pace * first * (last / first) ** (step / steps)
 
 
 @dataclass(frozen=True)
 class DensityConfig:
-    """When and how Gaussians are cloned, split and pruned. Times are fractions of the run.
+    """Settings of density control, which clones, splits and prunes Gaussians. Times are fractions of the run, 0 to 1.
 
     Attributes:
-        start, stop: density control acts in this part of the run.
-        peak: when there are most Gaussians; before, they become more along a line, and after, fewer.
-        excess: how many there are then, in budgets; at `stop` one budget is left, of those that pictures need most.
-            1 keeps the count at the budget from `peak` on.
-        rounds: how many times it acts.
-        gradient: least mean absolute gradient of a Gaussian's projected centre (NDC units) to clone or split it.
-        split_scale: Gaussians larger than this (local units, divided by max(1, |u|)) are split, others cloned.
-        prune_opacity: Gaussians fainter than this are removed.
-        prune_scale: Gaussians larger than this (as split_scale) are removed, unless they are more than a tenth of all.
-        resets: how many times opacities are capped at reset_opacity, evenly spread over the part in which Gaussians
-            become more, not counting its end.
-        reset_opacity: the cap.
+        start, stop: times between which rounds take place.
+        peak: time at which the number of Gaussians is largest; it grows linearly until then, and falls linearly after.
+        excess: largest number of Gaussians, in budgets, at least 1. Until `stop` those with the lowest importance are
+            pruned, down to one budget. With 1 the number stays at the budget from `peak` on.
+        rounds: number of rounds, at least 1.
+        gradient: mean absolute gradient of a Gaussian's projected centre (NDC units) above which it is cloned or split.
+        split_scale: a Gaussian with a larger scale (local units, divided by max(1, |u|)) is split instead of cloned.
+        prune_opacity: Gaussians with a lower opacity are pruned.
+        prune_scale: Gaussians with a larger scale (units of `split_scale`) are pruned, unless they are more than a
+            tenth of all.
+        resets: number of opacity resets, evenly spread between `start` and `peak` (exclusive); 0 or more.
+        reset_opacity: opacity that a reset caps all Gaussians at.
     """
 
     start: float = 0.02
@@ -90,10 +89,10 @@ class DensityConfig:
         check_float("excess", self.excess, 1)
         check_int("rounds", self.rounds, 1)
         check_int("resets", self.resets, 0)
-        check_float("reset_opacity", self.reset_opacity, 1e-6, 1 - 1e-6)  # its logit is finite
+        check_float("reset_opacity", self.reset_opacity, 1e-6, 1 - 1e-6)  # so that its logit is finite
 
     def mean_count(self, initial: int, budget: int) -> float:
-        """How many Gaussians there are on average over a run, if each round finds as many as it may."""
+        """Return the mean number of Gaussians over a run in which each round reaches its target number."""
         most = self.excess * budget
         corners = (0, initial), (self.start, initial), (self.peak, most), (self.stop, budget), (1, budget)
         return sum((t1 - t0) * (n0 + n1) / 2 for (t0, n0), (t1, n1) in pairwise(corners))
@@ -105,28 +104,29 @@ class TrainConfig:
 
     Attributes:
         steps: optimiser steps, one view each; every schedule scales with it.
-        seed: of view order, initialisation and density control; 0 to LARGEST_SEED.
-        preset: the paper's regime, one of PRESETS; "auto" looks at the scene.
-        max_gaussians: budget, the most that a run ends with; on the way it is exceeded by `DensityConfig.excess`.
-            None chooses from the pictures' pixels, the steps, `target_bytes` and `budget_factor`.
-        budget_factor: the budget as a multiple of what pixels and steps suggest, instead of `max_gaussians`. None is 1,
-            but `hyrfpack.train_model` measures it before a run of at least 2,000 steps on at least eight photos, see
-            `hyrfpack.train.budget_pilots`.
-        target_bytes: the size of the packed file to train for, instead of `max_gaussians`; None for no limit.
-        log2_table_size: rows per level of the radiance grid as a power of two (the geometry grid has half);
-            None follows the budget. 4 to 24.
+        seed: random seed of view order, initialisation and density control; 0 to LARGEST_SEED.
+        preset: the paper's regime, one of PRESETS; "auto" chooses by the scene.
+        max_gaussians: budget, the most Gaussians that a run ends with, at least 1. During the run there may be
+            `DensityConfig.excess` times as many. None chooses the budget by the photos' pixels, the steps,
+            `target_bytes` and `budget_factor`.
+        budget_factor: the budget as a multiple of what pixels and steps suggest, instead of `max_gaussians`; 0.001 to
+            1000. None means 1, but `hyrfpack.train_model` measures the factor before a run of at least 2,000 steps on
+            at least eight photos, see `hyrfpack.train.budget_pilots`.
+        target_bytes: size in bytes of the packed file to train for, instead of `max_gaussians`; None for no limit.
+        log2_table_size: log2 of the radiance grid's rows per level, 4 to 24 (the geometry grid has half as many rows);
+            None chooses it by the budget.
         background: whether a background sphere is trained; None lets the preset decide.
-        exposure: whether per-image gains are learnt beside the model (exposure compensation), and an exposure map over
-            viewpoints that the file carries. None leaves it to pilot runs, see `hyrfpack.train.exposure_pilots`; a
-            `Trainer` by itself then learns none.
-        background_color: what transparent pictures are laid over: "black", "white" or "random" (a new colour
-            every step; the model then has black behind it).
-        ssim_weight: w in (1 - w) L1 + w (1 - SSIM).
+        exposure: whether per-image gains (exposure compensation) and an exposure map, which the file stores, are learnt
+            beside the model. None leaves the decision to pilot runs, see `hyrfpack.train.exposure_pilots`; a `Trainer`
+            by itself then learns none.
+        background_color: colour that transparent pictures are composited over: "black", "white", or "random" (a new
+            colour in each step; the model's own background is then black).
+        ssim_weight: weight w of SSIM in the loss (1 - w) L1 + w (1 - SSIM), 0 to 1.
         checkpoint_every: steps between checkpoints; None for a twentieth of the run.
-        precision: "mixed" or "float32", as `HybridModel.precision`: what GPU kernels multiply in.
+        precision: number format of products in GPU kernels, "mixed" or "float32", see `HybridModel.precision`.
         scale_rule, scale_grows, direction_encoding, position_gradients, antialiased: as in ModelConfig.
         learning_rates, density: see LearningRates and DensityConfig.
-        grid_resolutions: vertices per axis of the coarsest and the finest level of both hash grids.
+        grid_resolutions: vertices per axis of the coarsest and the finest level of both hash grids, 2 to 65536.
     """
 
     steps: int = 3000
@@ -165,7 +165,7 @@ class TrainConfig:
         if len(given := [name for name, value in sizes.items() if value is not None]) > 1:
             raise ValueError(f"{' and '.join(given)} each decide how large the model is; give one")
         if self.budget_factor is not None:
-            check_float("budget_factor", self.budget_factor, *BUDGET_FACTORS)
+            check_float("budget_factor", self.budget_factor, *BUDGET_FACTOR_RANGE)
         if self.log2_table_size is not None:
             check_int("log2_table_size", self.log2_table_size, 4, 24)
         check_choice("preset", self.preset, PRESETS)
@@ -188,5 +188,5 @@ class TrainConfig:
                 raise ValueError(f"{name} is {getattr(self, name)!r}; it must be a {kind.__name__}")
 
     def to_dict(self) -> dict:
-        """Plain numbers, strings, lists and dictionaries, ready for JSON."""
+        """Return the settings as plain numbers, strings, lists and dictionaries, ready for JSON."""
         return asdict(self)

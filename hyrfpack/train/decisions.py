@@ -1,4 +1,4 @@
-"""Decisions that pilot runs take for a scene before it is trained: per-image gains or none, and the Gaussian budget."""
+"""Decide by pilot runs, before a scene is trained, whether per-image gains are learnt, and the Gaussian budget."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ MAX_BUDGET_PILOT_STEPS = 2 * MAX_BUDGET_ROUNDS * BUDGET_PILOT_STEPS
 
 @dataclass(frozen=True)
 class Decisions:
-    """Decisions and their evidence.
+    """Decisions and the pilot scores that they are based on.
 
     Attributes:
-        config: the settings, with nothing left to decide.
-        reasons: in words, by setting: "exposure", "max_gaussians".
-        scores: of each pilot.
+        config: the settings of the run, including the decisions.
+        reasons: the reason for each decision in words, by setting: "exposure", "max_gaussians".
+        scores: the scores of each pilot.
     """
 
     config: TrainConfig
@@ -46,12 +46,12 @@ def is_budget_open(config: TrainConfig) -> bool:
 
 
 def measures_budget(scene: Scene, config: TrainConfig) -> bool:
-    """Return whether pilots estimate the budget: it is open, the run is long enough, and there are enough photos."""
+    """Return whether pilots estimate the budget: no setting fixes it, and run and photos are large enough."""
     return is_budget_open(config) and config.steps >= MIN_BUDGET_STEPS and len(scene.train) >= MIN_TRAINING_VIEWS
 
 
 def measures_exposure(scene: Scene, config: TrainConfig) -> bool:
-    """Return whether pilots decide on per-image gains: no setting does, and run and photos allow it."""
+    """Return whether pilots decide on per-image gains: no setting does, and run and photos are large enough."""
     is_open = config.exposure is None and not scene.has_alpha
     return is_open and config.steps >= MIN_EXPOSURE_STEPS and len(scene.train) >= MIN_TRAINING_VIEWS
 
@@ -68,7 +68,7 @@ def max_exposure_pilot_steps(count: int, steps: int) -> int:
 
 
 def without_pilots(config: TrainConfig) -> Decisions:
-    """Return the safe defaults of what the settings leave open: no gains, the usual budget."""
+    """Return safe defaults for what the settings leave open: no per-image gains and the usual budget."""
     return Decisions(dataclasses.replace(config, exposure=bool(config.exposure)), {}, [])
 
 
@@ -81,7 +81,7 @@ def decide(
     stop: Callable[[], bool] = lambda: False,
     phase: Phase = lambda what, done, total: None,
 ) -> Decisions | None:
-    """Decide what the settings leave open by pilot runs, exposure first.
+    """Decide by pilot runs what the settings leave open: first exposure compensation, then the budget.
 
     Args:
         scene, config, cache, device, report, stop, phase: see `ScenePilots`.

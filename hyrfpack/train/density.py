@@ -1,7 +1,7 @@
-"""Density control: where Gaussians are added and which are removed.
+"""Density control decides where Gaussians are added and which ones are pruned.
 
-Small Gaussians are cloned and large ones are split, in the order of the largest absolute gradients of their projected
-centres (3DGS; AbsGS), until their number exceeds the budget. Then each round prunes the Gaussians with the lowest
+Gaussians with the largest absolute gradients of their projected centres are cloned if they are small and split if they
+are large (3DGS; AbsGS), until their number exceeds the budget. Then each round prunes the Gaussians with the lowest
 importance scores, until their number equals the budget. So the budget is filled with the best candidates instead of the
 first ones.
 """
@@ -21,33 +21,36 @@ from hyrfpack.train.config import DensityConfig
 from hyrfpack.train.optimizer import Optimizer
 
 SPLIT_SHRINK = 1.6
-SQUARED_GRADIENT_DECAY = 0.8  # factor that each round applies to the sums of earlier rounds
-# The importance score divides by the transmittance of a Gaussian. The logit of an opaque one hardly moves its opacity,
-# so that without this bound its score would be noise.
+SQUARED_GRADIENT_DECAY = 0.8  # Each round multiplies the sums of earlier rounds by this factor.
+# The importance score divides by the transmittance of a Gaussian. The logit of an opaque Gaussian hardly changes its
+# opacity, so without this bound its score would be noise.
 MIN_SCORE_TRANSMITTANCE = 0.02
 STATE_NAMES = ("gradients", "views", "squares")
-# A Gaussian fainter than this keeps its opacity when it is cloned or split. The error asked for more light than it
-# sends, and Gaussians halved in each round would vanish.
+# A Gaussian of lower opacity keeps its opacity when it is cloned or split. The picture needs more light there, and
+# Gaussians whose opacity is reduced in each round would vanish.
 MIN_HALVED_OPACITY = 0.2
 MIN_ROUND_INTERVAL_STEPS = 5  # After fewer steps, new Gaussians have hardly moved.
-MAX_OUTLIER_SHARE = 0.1  # If more Gaussians than this are huge, they carry the scene and are kept.
+# If more Gaussians than this are huge, they are kept, because they show the scene itself, such as an even sky without a
+# background sphere.
+MAX_OUTLIER_SHARE = 0.1
 
 
 class DensityControl:
-    """Collects gradients and, in its rounds, edits the model through the optimiser.
+    """Collects gradients in each step, and adds and prunes Gaussians in rounds.
 
     Removing a Gaussian of opacity o changes a view's loss L by about o dL/do, which is dL/dx / (1 - o) for the logit x
-    of its opacity. The importance score is the sum of the squares of this over views. Where residuals are random, it is
-    the Gauss-Newton estimate of the rise of the loss, up to a factor. A view without the
-    Gaussian adds nothing.
+    of its opacity. The importance score is the sum of the squares of this change over views. Where residuals are
+    random, it is the Gauss-Newton estimate of the rise of the loss, up to a factor. Views that do not show the
+    Gaussian add nothing.
 
-    Each of several processes observes its own views. A round first sums what all have observed, so that all take the
-    same decisions.
+    Each of several processes observes its own views. A round first sums the observations of all processes, so that all
+    take the same decisions.
 
     Attributes:
-        gradients: (N,) sum over views of the mean2d gradient's norm, NDC units.
-        views: (N,) in how many views each Gaussian was visible since the last round.
-        squares: (N,) sum over views of the squared gradient of the opacity's explicit logit; earlier rounds decay.
+        gradients: (N,) sum over views, since the last round, of the norm of the means2d gradient, NDC units.
+        views: (N,) number of views in which each Gaussian was visible since the last round.
+        squares: (N,) sum over views of the squared gradient of the explicit opacity logit; sums of earlier rounds decay
+            by `SQUARED_GRADIENT_DECAY`.
     """
 
     def __init__(
@@ -69,14 +72,14 @@ class DensityControl:
         self.first = max(1, round(config.start * steps))
         self.last = round(config.stop * steps)
         self.interval = max(MIN_ROUND_INTERVAL_STEPS, (self.last - self.first) // max(1, config.rounds))
-        self.last -= max(0, self.last - self.first) % self.interval  # of the last round
+        self.last -= max(0, self.last - self.first) % self.interval  # The last round may come before `stop`.
         self.peak = min(max(self.first, round(config.peak * steps)), self.last)
         self.reset_interval = (self.peak - self.first) // (config.resets + 1) if config.resets else None
         self.squares = torch.zeros(initial, device=device)
         self.clear(initial)
 
     def clear(self, count: int) -> None:
-        """Reset the sums of centre gradients to zero, for `count` Gaussians."""
+        """Reset the gradient sums and view counts to zero, for `count` Gaussians."""
         self.gradients = torch.zeros(count, device=self.device)
         self.views = torch.zeros(count, device=self.device)
 
@@ -85,10 +88,11 @@ class DensityControl:
         return step <= self.last
 
     def observe(self, rendering: Rendering, camera: Camera, model: HybridModel) -> None:
-        """Collect the gradients of one view, after backward."""
+        """Collect the gradients of one view, after its backward pass."""
         if rendering.absgrad is None:
             return
-        # Selecting the visible Gaussians would make the host wait for the device, so zeros are added for the others.
+        # Selecting the visible Gaussians would make the host wait for the device. Instead, zeros are added for the
+        # invisible ones.
         ndc = rendering.absgrad * tensor_like((camera.width / 2, camera.height / 2), rendering.absgrad)
         lengths = torch.where(rendering.visible, torch.linalg.vector_norm(ndc, dim=-1), 0)
         self.gradients.index_add_(0, rendering.indices, lengths.to(self.gradients.dtype))
@@ -107,7 +111,10 @@ class DensityControl:
             self._reset(model, optimizer)
 
     def target(self, step: int) -> int:
-        """Return the most Gaussians after this step's round: linear up to the peak, then linear down to the budget."""
+        """Return the largest number of Gaussians after a round at this step.
+
+        It grows linearly up to the peak, and falls linearly to the budget after it.
+        """
         most = self.config.excess * self.budget
         if step < self.peak:
             return int(self.initial + (most - self.initial) * (step - self.first) / (self.peak - self.first))
@@ -145,19 +152,17 @@ class DensityControl:
         self.squares = SQUARED_GRADIENT_DECAY * torch.cat(
             (self.squares[keep], self.squares[cloned], self.squares[split.repeat(2)] / 2)
         )
-        if not self.ranks.is_main:  # what came before is summed once
+        if not self.ranks.is_main:  # The sum over all ranks stays on rank 0, so that the next round counts it once.
             self.squares.zero_()
         self.clear(len(model))
 
     def _alive(self, geometry: Geometry, sizes: Tensor, target: int) -> Tensor:
         """Return the mask (N,) of the Gaussians to keep: neither faint nor huge, and at most `target` of them."""
-        huge = ~(sizes <= self.config.prune_scale)  # True also where the size is NaN
-        if huge.sum() > MAX_OUTLIER_SHARE * len(
-            huge
-        ):  # they carry the scene, as over an even sky without a background sphere
+        huge = ~(sizes <= self.config.prune_scale)  # This way NaN counts as huge.
+        if huge.sum() > MAX_OUTLIER_SHARE * len(huge):
             huge = torch.zeros_like(huge)
         alive = (geometry.opacities >= self.config.prune_opacity) & ~huge
-        if not alive.any():  # never end with an empty scene: keep the most opaque
+        if not alive.any():  # The scene must not become empty, so the most opaque Gaussian is kept.
             alive[geometry.opacities.argmax()] = True
         if alive.sum() > target:
             importance = self.squares / (1 - geometry.opacities).clamp_min(MIN_SCORE_TRANSMITTANCE).square()
@@ -168,16 +173,19 @@ class DensityControl:
     def _split(
         self, step: int, model: HybridModel, geometry: Geometry, bounds: Tensor, split: Tensor
     ) -> dict[str, Tensor]:
-        """Sample two children from each Gaussian at `split`; their decoded scales are `SPLIT_SHRINK` times smaller."""
+        """Return the parameters of two children sampled from each Gaussian at `split` (n,) int64.
+
+        The decoded scales of children are those of their parent divided by `SPLIT_SHRINK`.
+        """
         explicit = model.gaussians
         generator = torch.Generator().manual_seed((self.seed * 1_000_003 + step) % 2**64)
         twice = split.repeat(2)
         scales, quats = geometry.scales[twice], geometry.quats[twice]
-        # Sampling on the CPU gives the same numbers for every device.
+        # Sampling on the CPU gives the same numbers whatever the device.
         offsets = torch.randn(len(twice), 3, generator=generator).to(scales.device) * scales
         positions = explicit.positions[twice] + rotate(quats, offsets)
 
-        # The neural part does not change, so the explicit logit alone must shrink the Gaussian.
+        # The neural part stays the same, so the explicit logit alone must reduce the scale.
         old = explicit.scale_logits[twice]
         if model.config.scale_rule == "sum":
             fraction = scales / bounds[twice]
@@ -213,7 +221,7 @@ class DensityControl:
 def _dimmed(explicit: Gaussians, geometry: Geometry, parents: Tensor) -> Tensor:
     """Return opacity logits (n, 1) with which two Gaussians transmit as much light as their parent.
 
-    The opacity o of the parent becomes 1 - sqrt(1 - o), but not less than `MIN_HALVED_OPACITY` if o is not less.
+    The parent's opacity o becomes 1 - sqrt(1 - o), but at least min(o, `MIN_HALVED_OPACITY`).
     """
     old = geometry.opacities[parents, None].double()
     new = torch.maximum(1 - (1 - old).sqrt(), old.clamp_max(MIN_HALVED_OPACITY))

@@ -19,8 +19,8 @@ class StepStats:
     """Statistics of one step over all ranks.
 
     Attributes:
-        loss: mean over the ranks' views.
-        error: mean squared error over the ranks' views; NaN where the photos of all ranks are masked completely.
+        loss: mean loss of all ranks' views.
+        error: mean squared error of all ranks' views; NaN if masks leave no pixel of any of their photos.
         stop: whether any rank was asked to stop.
         problem: whether any rank cannot continue.
     """
@@ -41,8 +41,8 @@ def pack_step_stats(loss: Tensor, error: Tensor, *, stop: bool, problem: bool) -
     """Pack one rank's statistics into a tensor (5,), whose sum over ranks `StepStats.from_sums` unpacks.
 
     Args:
-        loss: scalar.
-        error: scalar mean squared error; NaN where all of the photo is masked.
+        loss: scalar loss of the rank's view.
+        error: scalar mean squared error of the view; NaN if the mask leaves no pixel of its photo.
         stop, problem: see `StepStats`.
     """
     masked = torch.isnan(error)
@@ -51,14 +51,13 @@ def pack_step_stats(loss: Tensor, error: Tensor, *, stop: bool, problem: bool) -
 
 
 def average_gradients(ranks: Ranks, parameters: Sequence[nn.Parameter], numbers: Tensor) -> Tensor:
-    """Replace the gradients by their means over all ranks, and sum some numbers over all ranks.
+    """Replace gradients by their means over all ranks, and return the sums of `numbers` over all ranks.
 
-    Gradients and numbers travel in one message, because the cost of an all-reduce depends more on the number of
-    messages than on their bytes. A parameter without a gradient counts as one with a gradient of zeros. The sums have
-    the same bits on all ranks.
+    Gradients and numbers are sent in one message, because the cost of an all-reduce depends more on the number of
+    messages than on their size. A missing gradient counts as zeros. The results have the same bits on all ranks.
 
     Args:
-        parameters: with the same shapes on each rank.
+        parameters: parameters of the same shapes on each rank.
         numbers: (K,) float32 on the parameters' device.
 
     Returns:
@@ -85,7 +84,8 @@ def check_settings(ranks: Ranks, settings: Mapping[str, object]) -> None:
     """Check that all ranks were started with the same settings.
 
     Raises:
-        HyrfTrainingError: a rank has other settings than rank 0; the first such rank and the settings are named.
+        HyrfTrainingError: a rank has other settings than rank 0. The message names the first such rank and the settings
+            that differ.
     """
     first, *others = ranks.all_gather(settings)
     for rank, theirs in enumerate(others, 1):

@@ -1,8 +1,8 @@
 """Per-image gains: exposure and white balance of each training photo, learnt beside the model.
 
-The gains are initialised from the colours of tracked points. A training photo is compared with the render that its
-three gains expose (`hyrfpack.model.exposure.apply_exposure_gains`). The mean of the log gains over all training photos
-is zero, so that the model has the photos' mean exposure.
+The gains are initialised from the colours of tracked points. Before a render is compared with a training photo, the
+photo's three gains are applied to it (`hyrfpack.model.exposure.apply_exposure_gains`). The mean of the log gains over
+all training photos is zero, so that the model has the photos' mean exposure.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from hyrfpack.scene import Camera, Picture, Scene, View
 from hyrfpack.train.config import TrainConfig
 from hyrfpack.train.exposure_map import ExposureFit, fit_exposure_map
 
-GAIN_DECAY = 1e-4  # weight decay of log gains: added to the gradient, for each unit of log gain
-MAX_TRACKS_PER_PHOTO = 500  # the longest ones
+GAIN_DECAY = 1e-4  # Weight decay: this multiple of each log gain is added to its gradient.
+MAX_TRACKS_PER_PHOTO = 500  # Of more tracks, the longest ones are taken.
 COLOR_WINDOW_RADIUS_PIXELS = 2  # A point's colour in a photo is the mean of a square window around it.
 MIN_PIXEL_LEVEL, MAX_PIXEL_LEVEL = 8, 247  # A window with a level outside these is nearly black or clipped.
 MIN_POINTS_PER_PHOTO = 10  # A photo with fewer usable points starts with gains of one.
 REWEIGHTING_ROUNDS = 10
-# Scale of the Cauchy weights in standard deviations: an error of this size counts half. The estimate is 95 % efficient
-# for normal errors.
+# Scale of the Cauchy weights in standard deviations: an error of this size has half the weight. With this scale the
+# estimate is 95 % efficient for normal errors.
 CAUCHY_SCALE = 2.385
-# Each photo gets this many virtual observations of gains of one, which determine what no track determines.
+# Each photo gets this many virtual observations of gains of one, which determine the gains where no track does.
 PRIOR_OBSERVATIONS = 0.01
 # Two photos with fewer points in common are not compared, so that a few glossy points cannot shift a whole group.
 MIN_SHARED_POINTS = 10
@@ -48,7 +48,7 @@ class Observations:
     """Colours of points in photos.
 
     Attributes:
-        photo, point: (K,) int64 rows of the photos and of the points.
+        photo, point: (K,) int64 row of the photo, and row of the point, of each observation.
         logits: (K, 3) log(y / (1 - y)) of display-referred RGB y in (0, 1).
     """
 
@@ -60,8 +60,8 @@ class Observations:
 def observe(scene: Scene, cache: PictureCache) -> Observations:
     """Measure the colours of tracked points in the training photos, reading each photo once.
 
-    Windows that leave the photo or are masked, transparent, nearly black or nearly white are left out, and points that
-    only one photo sees.
+    Windows that cross the photo's border, or contain masked, transparent, nearly black or nearly white pixels, are left
+    out. So are points that only one photo observes.
 
     Raises:
         HyrfDataError: a photo cannot be read.
@@ -107,15 +107,15 @@ def _colors(picture: Picture, camera: Camera, points: np.ndarray) -> tuple[np.nd
 def gains_from(observed: Observations, photos: int) -> np.ndarray:
     """Estimate each photo's log gains, (photos, 3), from the colours of shared points.
 
-    Photo i shows point p with the point's colour, exposed by the photo's gains g:
+    Photo i shows point p with the point's colour, changed by the photo's gains g:
 
         logit y_ip = log g_i + c_p + e        weighted least squares over log g and c
 
-    The weights 1 / (1 + (|e| / 2.385 s)^2) are iterated, where s is the standard deviation of the residuals estimated
-    from their median, so that occlusions and highlights hardly count. For given weights the best c_p is a weighted
-    mean. That leaves a sparse linear system for the gains, which conjugate gradients solve. The mean log gain of all
-    photos with at least `MIN_POINTS_PER_PHOTO` points is 0; the other photos get 0. Groups of photos that are not
-    connected by pairs with `MIN_SHARED_POINTS` common points are not compared: each group keeps a mean near 0.
+    The weights 1 / (1 + (|e| / 2.385 s)^2) are recomputed in each round, so that occlusions and highlights have little
+    weight. Here s is the standard deviation of the residuals, estimated from their median. For given weights the best
+    c_p is a weighted mean. That leaves a sparse linear system for the gains, which conjugate gradients solve. Photos
+    with fewer than `MIN_POINTS_PER_PHOTO` points get log gains of 0; the others have mean 0. Groups of photos that no
+    pair with `MIN_SHARED_POINTS` common points connects are not compared: each group keeps a mean near 0.
     """
     gains = np.zeros((photos, 3))
     known = np.bincount(observed.photo, minlength=photos) >= MIN_POINTS_PER_PHOTO
@@ -145,7 +145,7 @@ def gains_from(observed: Observations, photos: int) -> np.ndarray:
 
 
 def _points_of_groups(observed: Observations, photos: int) -> np.ndarray:
-    """Return point rows (K,) in which a point that several groups of photos see has one row for each group."""
+    """Return the point rows (K,) after splitting each point that several groups of photos observe: one row a group."""
     _, point = np.unique(observed.point, return_inverse=True)
     sees = csr_array((np.ones(len(point)), (observed.photo, point)), shape=(photos, point.max() + 1))
     _, group = connected_components((sees @ sees.T) >= MIN_SHARED_POINTS, directed=False)
@@ -159,25 +159,25 @@ def _means(group: np.ndarray, weights: np.ndarray, values: np.ndarray) -> np.nda
 
 
 class Exposures:
-    """Holds the gains of each training photo and their Adam state.
+    """The gains of each training photo and their Adam state.
 
     Attributes:
         values: (N, 3) log gains, in the order of the views, with mean zero.
     """
 
     def __init__(self, views: Sequence[View], gains: np.ndarray, device: torch.device) -> None:
-        """Start from `gains`, (N, 3) log gains."""
+        """Start from `gains`, (N, 3) log gains, less their mean."""
         self._row = {view.name: row for row, view in enumerate(views)}
         self.values = nn.Parameter(torch.from_numpy(gains - gains.mean(0)).float().to(device))
         self._exp_avg, self._exp_avg_sq = torch.zeros_like(self.values), torch.zeros_like(self.values)
         self._steps = [0] * len(views)
 
     def exposed(self, rgb: Tensor, view: View) -> Tensor:
-        """Expose a render (H, W, 3) like the view's photo; differentiable."""
+        """Apply the gains of a view's photo to its render (H, W, 3); differentiable."""
         return apply_exposure_gains(rgb, self.values[self._row[view.name]].exp())
 
     def fit_map(self, frame: Frame, views: Sequence[View]) -> ExposureFit:
-        """Fit an exposure map to the gains; `views` as given at the start, `frame` the model's."""
+        """Fit an exposure map to the gains, given the model's frame and the same views as at construction."""
         poses = [frame.local_pose(view.camera) for view in views]
         return fit_exposure_map(poses, self.values.detach().cpu().numpy())
 
@@ -186,8 +186,8 @@ class Exposures:
         """Take one Adam step for the photos of these views, clear the gradients, and subtract the mean of all gains.
 
         Returns:
-            Bool scalar on the device: whether a gradient was not finite. Its gain takes no step. The host does not wait
-            for the device.
+            Bool scalar on the device: whether a gradient was not finite. Such a gain stays as it is. The host does not
+            wait for the device.
         """
         assert self.values.grad is not None
         rows = sorted({self._row[view.name] for view in views})
@@ -231,12 +231,10 @@ def exposure_spread(scene: Scene, cache: PictureCache) -> float:
 def exposures_for(
     scene: Scene, config: TrainConfig, cache: PictureCache, device: torch.device
 ) -> tuple[Exposures | None, str]:
-    """Estimate the per-image gains that a run starts from.
-
-    Gains are learnt only where `config.exposure` says so.
+    """Estimate the per-image gains that a run starts from, if `config.exposure` asks for them.
 
     Returns:
-        The gains, None where exposure compensation is off, and a sentence for the run's record.
+        The gains, None if exposure compensation is off; and a description for the run's record.
 
     Raises:
         HyrfTrainingError: exposure compensation is on and the photos have transparency.

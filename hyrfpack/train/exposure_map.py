@@ -18,23 +18,26 @@ from hyrfpack.model.exposure import (
     inverse_quadratic_kernel,
 )
 
-# The kernel's lengths and the ridge that are tried: position in root mean square distances of the cameras from their
-# mean, direction as an angle in degrees, ridge as the variance of noise relative to that of the gains.
+# These lengths of the kernel and ridges are tried. A radius is the root mean square distance of the cameras from their
+# mean. A ridge is the variance of noise relative to that of the gains.
 POSITION_LENGTHS_RADII = (0.25, 0.5, 1.0, 2.0, 4.0)
 DIRECTION_LENGTHS_DEGREES = (15.0, 30.0, 60.0, 120.0)
 RIDGE_VARIANCES = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
-MAX_SLOPE_PER_DEGREE = 0.15  # change of a log gain for each degree of viewing angle, by its bound
-MAX_SLOPE_PER_RADIUS = 20.0  # and for each root mean square distance of the cameras from their mean
-MIN_CENTER_VARIANCE_RIDGES = 0.1  # of a centre given those before it: with less, it is left out
+# A map is rejected if the bound of a log gain's change per degree of viewing angle, or per radius, is larger.
+MAX_SLOPE_PER_DEGREE = 0.15
+MAX_SLOPE_PER_RADIUS = 20.0
+# A centre is left out if its variance, given the centres before it, is a smaller multiple of the ridge.
+MIN_CENTER_VARIANCE_RIDGES = 0.1
 
 
 @dataclass(frozen=True)
 class ExposureFit:
-    """An exposure map and how well it predicts photos that it has not seen.
+    """An exposure map and its error on photos that it was not fitted to.
 
     Attributes:
         map: the exposure map.
-        leave_one_out_error: root mean square of log gains of photos predicted from all other photos; 0 for one photo.
+        leave_one_out_error: root mean square error of each photo's log gains predicted from all other photos; 0 if
+            there is only one photo.
     """
 
     map: ExposureMap
@@ -46,9 +49,9 @@ def fit_exposure_map(poses: Sequence[np.ndarray], log_gains: np.ndarray) -> Expo
 
         minimise  sum_n |y_n - mean - sum_m k(v_n, v_m) w_m|^2 + ridge w^T K w
 
-    The centres v_m are a subset of the cameras, chosen by pivoted Cholesky factorisation of the kernel matrix: each
-    next one is the camera that the others predict worst, until the rest is small. Lengths of the kernel and ridge have
-    the least leave-one-out error.
+    The centres v_m are a subset of the cameras, chosen by pivoted Cholesky factorisation of the kernel matrix. Each
+    further centre is the camera that the centres so far predict worst, until the remaining variance is small. The
+    kernel's lengths and the ridge are those with the smallest leave-one-out error.
 
     Args:
         poses: N >= 1 poses (4, 4), camera_from_local, of the training photos.
@@ -65,7 +68,8 @@ def fit_exposure_map(poses: Sequence[np.ndarray], log_gains: np.ndarray) -> Expo
         features = np.concatenate((positions / lengths[0], directions / lengths[1]), 1)
         centers, factor, variances = choose_centers(features)
         for ridge in RIDGE_VARIANCES:
-            count = int((variances >= MIN_CENTER_VARIANCE_RIDGES * ridge).sum())  # they fall
+            # Variances are in descending order, so the centres to keep come first.
+            count = int((variances >= MIN_CENTER_VARIANCE_RIDGES * ridge).sum())
             error = leave_one_out_error(factor[:, :count], gains, ridge)
             candidates.append((error, lengths, centers[:count], ridge))
     for error, lengths, centers, ridge in sorted(candidates, key=lambda candidate: candidate[0]):
@@ -82,9 +86,9 @@ def fit_exposure_map(poses: Sequence[np.ndarray], log_gains: np.ndarray) -> Expo
 def _without_weights(
     positions: np.ndarray, directions: np.ndarray, gains: np.ndarray, lengths: np.ndarray, centers: list[int]
 ) -> ExposureMap:
-    """A map of the mean exposure everywhere, with centres that have no weight yet."""
+    """Return a map that has the mean exposure everywhere, because the weights of its centres are 0."""
     box = np.stack((positions.min(0), positions.max(0))).astype(np.float32)
-    box[0] = np.nextafter(box[0], -np.inf, dtype=np.float32)  # rounding leaves no camera outside
+    box[0] = np.nextafter(box[0], -np.inf, dtype=np.float32)  # so that rounding leaves no camera outside
     box[1] = np.nextafter(box[1], np.inf, dtype=np.float32)
     size = np.maximum(box[1].astype(np.float64) - box[0], 1e-30)
     return ExposureMap(
@@ -103,11 +107,11 @@ def choose_centers(features: np.ndarray) -> tuple[list[int], np.ndarray, np.ndar
     """Choose centres by pivoted Cholesky factorisation of the kernel matrix.
 
     Args:
-        features: (N, D) of the cameras, see `hyrfpack.model.exposure.inverse_quadratic_kernel`.
+        features: (N, D) features of the cameras, see `hyrfpack.model.exposure.inverse_quadratic_kernel`.
 
     Returns:
-        Rows of the centres in the order chosen, M <= 64; F (N, M) with F F^T close to the kernel matrix; and (M,) the
-        variance of each centre given those before it, which falls.
+        The rows of the M <= 64 centres in the order in which they were chosen; F (N, M) with F F^T close to the kernel
+        matrix; and (M,) the variance of each centre given those before it, in descending order.
     """
     residual = np.ones(len(features))
     factor = np.zeros((len(features), 0))
@@ -128,9 +132,9 @@ def choose_centers(features: np.ndarray) -> tuple[list[int], np.ndarray, np.ndar
 
 
 def leave_one_out_error(factor: np.ndarray, gains: np.ndarray, ridge: float) -> float:
-    """Root mean square error of each photo's log gains predicted from those of all others.
+    """Return the root mean square error of each photo's log gains predicted from those of all others.
 
-    Of a linear smoother with the matrix H the residual of a row that was left out is (y - H y) / (1 - H_nn).
+    If row n is left out, a linear smoother with matrix H has the residual (y - H y)_n / (1 - H_nn) there.
     """
     if len(gains) < 2:
         return 0.0
@@ -144,14 +148,14 @@ def leave_one_out_error(factor: np.ndarray, gains: np.ndarray, ridge: float) -> 
 def _solve(
     exposure: ExposureMap, positions: np.ndarray, directions: np.ndarray, gains: np.ndarray, ridge: float
 ) -> ExposureMap:
-    """The map with the weights and the mean of the least penalised error, for its centres as they are stored."""
+    """Return the map with the mean and weights that minimise the penalised error, given its centres as stored."""
     across = exposure.kernel_at(positions, directions)
     among = exposure.kernel_of_centers()
     count = len(among)
     design = np.column_stack((np.ones(len(gains)), across))
     penalty = np.zeros((count + 1, count + 1))
     penalty[1:, 1:] = ridge * among
-    # Two centres may have become one by rounding: of several solutions the smallest.
+    # Rounding may have made two centres equal. Least squares then takes the smallest of several solutions.
     solution = np.linalg.lstsq(design.T @ design + penalty, design.T @ gains, rcond=1e-10)[0]
     mean, weights = solution[0], solution[1:]
     steps = np.full(3, 1.0, np.float32)

@@ -1,4 +1,4 @@
-"""The training log for programs: one line of JSON for each record, and TensorBoard scalars where it is installed."""
+"""The machine-readable training log: one line of JSON per record, and TensorBoard scalars if that is installed."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ SCALAR_NAMES = ("loss", "psnr", "gaussians", "steps_per_second", "memory_bytes",
 class TrainingLog:
     """Writes the records of a run to a file, each one as soon as it is known.
 
-    Each line is a JSON object with the key "event". Its value is "step" for a step of which `is_recorded` is true, and
-    for the first step that ends `MAX_RECORD_INTERVAL_SECONDS` after the last record. Its value is "end" for the end of
-    the run, where "complete" is whether the run is complete, and "error" is why it failed. A step has
+    Each line is a JSON object with the key "event". Its value is "step" for a step, and "end" for the end of the run.
+    Steps are recorded if `is_recorded` is true, or if the last record is `MAX_RECORD_INTERVAL_SECONDS` old. An "end"
+    has "complete", whether the run is complete, and "error", the reason if it failed. A "step" has
 
-        step, steps         taken and to be taken
-        loss, psnr          means over the steps since the last record, psnr in dB; null where masks left no pixel
-        gaussians           of the model
-        memory_bytes        peak memory of the process so far; null where the system has no such number
-        gpu_memory_bytes    the same of the GPU; null on a CPU
+        step, steps         steps taken, and steps of the whole run
+        loss, psnr          means over the steps since the last record, psnr in dB; null if masks left no pixel
+        gaussians           number of Gaussians of the model
+        memory_bytes        peak memory of the process so far; null if the system does not report it
+        gpu_memory_bytes    peak GPU memory of the process so far; null on a CPU
         steps_per_second    current speed
-        seconds             since training started or was resumed
-        seconds_left        estimated
+        seconds             time since training started or was resumed
+        seconds_left        estimated remaining time
 
     If the file can no longer be written, as on a full disk, the log ends and the run continues.
     """
@@ -53,9 +53,10 @@ class TrainingLog:
         warn: Callable[[str], None] = warnings.warn,
         overwrite: bool = True,
     ) -> None:
-        """Start a log, or continue one if steps are done already. TensorBoard's files go to a folder of its name.
+        """Start a log, or continue it if `done` steps of `steps` have been taken already.
 
-        Without `overwrite`, an existing file is kept when a log starts, and the log gets a free name beside it.
+        TensorBoard's files go to a folder beside the log with the suffix ".tensorboard". Without `overwrite`, a new log
+        does not replace an existing file, but gets a free name beside it.
 
         Raises:
             HyrfError: the file cannot be written.
@@ -79,10 +80,10 @@ class TrainingLog:
         self.scalars = _summary_writer(self.path)
 
     def step(self, step: int, loss: float, mse: float, gaussians: int) -> None:
-        """Add one finished step."""
+        """Add a finished step, and write a record if one is due."""
         now = time.monotonic()
         speed, left = self.pace.at(step, now)
-        if mse == mse:  # not all of the photo is masked
+        if mse == mse:  # The mean squared error is NaN if all of the photo is masked.
             self.losses.append(loss)
             self.errors.append(mse)
         if not (is_recorded(step, self.steps) or now - self.last >= MAX_RECORD_INTERVAL_SECONDS):
@@ -138,12 +139,12 @@ class TrainingLog:
             self.file.flush()
         except OSError as error:
             self.warn(f"{self.path}: the log cannot be written ({error.strerror}); training continues without it")
-            with suppress(OSError):  # closing tries to write the rest once more
+            with suppress(OSError):  # Closing tries to write the buffered bytes again.
                 self.file.close()
 
 
 def _open_new(path: Path) -> TextIO:
-    """Open a new file, under the first free one of `numbered_names`."""
+    """Open a new file under the first free name of `numbered_names`."""
     for name in numbered_names(path):
         with suppress(FileExistsError):
             return open(name, "x", encoding="utf-8")
@@ -151,7 +152,7 @@ def _open_new(path: Path) -> TextIO:
 
 
 def peak_memory() -> int | None:
-    """Return the peak memory of this process in bytes; None where the system has no such number.
+    """Return the peak memory of this process in bytes; None if the system does not report it.
 
     Example:
         >>> peak_memory() is None or peak_memory() > 1_000_000

@@ -30,14 +30,14 @@ class Optimizer:
     """Adam (betas 0.9, 0.999, eps 1e-15) with one group for each kind of Gaussian property and one for the fields.
 
     If a step uses the mean gradient of W views, each beta b becomes 1 - W (1 - b), so that the running means cover as
-    many views as with one view a step.
+    many views as with one view per step.
 
     Attributes:
-        groups: parameters by the group's name, which is that of its learning rate.
+        groups: the parameters of each group by its name, which is also the name of its learning rate.
     """
 
     def __init__(self, model: HybridModel, rates: LearningRates, views: int = 1) -> None:
-        """Start without any state; `views` is W, the views of each step."""
+        """Start without any state; `views` is W, the number of views of each step."""
         self.model = model
         self.rates = rates
         self.views = views
@@ -48,14 +48,15 @@ class Optimizer:
         }
         self.groups["fields"] = [*model.geometry.parameters(), *model.radiance.parameters()]
         self._states: dict[nn.Parameter, _State] = {}
-        self._stepped: list[str] = []  # group of each parameter in the last step
+        self._stepped: list[str] = []  # The group of each parameter that the last step updated.
 
     def step(self, step: int, steps: int) -> Tensor:
-        """Take one step with the learning rates due at `step` (from 0) of `steps`, and clear the gradients.
+        """Take one step with the learning rates of `step` (from 0) of `steps`, and clear the gradients.
 
         Returns:
-            (tensors,) float32 on the model's device, for `names`: not 0 for a parameter with gradients that are not
-            finite. Elements with such gradients take no step. The host does not wait for the device.
+            (tensors,) float32 flags on the model's device, to be passed to `names`: not 0 for each parameter that has
+            a gradient that is not finite. Elements with such gradients stay as they are. The host does not wait for
+            the device.
         """
         stepped = [(name, p) for name, group in self.groups.items() for p in group if p.grad is not None]
         self._stepped = [name for name, _ in stepped]
@@ -98,7 +99,7 @@ class Optimizer:
             edit(name, new[name])
 
     def reset(self, name: str, values: Tensor) -> None:
-        """Set one kind of Gaussian property and reset its moments to zero."""
+        """Set the Gaussian property `name` to `values`, and reset its moments to zero."""
         self._edit(name, lambda _: values, torch.zeros_like)
 
     def _edit(self, name: str, values: Callable[[Tensor], Tensor], moments: Callable[[Tensor], Tensor]) -> None:
@@ -112,7 +113,7 @@ class Optimizer:
         setattr(self.model.gaussians, name, new)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return moments and step counts as tensors, by group and position."""
+        """Return moments and step counts as tensors, by group and by place in the group."""
         return {
             f"{name}.{i}.{key}": torch.as_tensor(getattr(self._states[parameter], key))
             for name, parameters in self.groups.items()

@@ -1,4 +1,4 @@
-"""Reading of the photos that a run was trained on, by the record in its folder."""
+"""Read the photos that a run was trained on, as recorded in its folder."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from hyrfpack.scene import Scene
 
 
 def load_training_scene(model: str | os.PathLike[str]) -> Scene | None:
-    """Read the photos that the model of a run's folder was trained on, with the same split.
+    """Read the photos that the model in a run's folder was trained on, with the same held-out photos.
 
     Args:
         model: the folder that `hyrfpack.train_model` wrote, or `model.hyrf` in it.
 
     Returns:
-        The photos, or None for a file outside a run's folder, or a run without a record of its photos.
+        The photos; None if the file is not in a run's folder, or the run has no record of its photos.
 
     Raises:
         HyrfDataError: the photos are missing or have changed.
@@ -53,10 +53,10 @@ def load_training_scene(model: str | os.PathLike[str]) -> Scene | None:
 
 
 def _is_reading(path: object, options: dict) -> bool:
-    """Return whether these are arguments of `load_scene`; a run's folder may come from an untrusted source."""
+    """Return whether values from a run's folder, which may be hostile, are valid arguments of `load_scene`."""
     text = (str, type(None))
     kinds: dict[str, Any] = {"test_every": int, "images": text, "layout": str, "model": text, "max_size": int}
-    held_out = options.get("held_out", [])  # there only where photos were named
+    held_out = options.get("held_out", [])  # The key exists only if photos were held out by name.
     if not isinstance(held_out, list) or not all(isinstance(name, str) for name in held_out):
         return False
     options = {name: value for name, value in options.items() if name != "held_out"}

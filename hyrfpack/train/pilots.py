@@ -1,6 +1,6 @@
-"""Pilot runs: short training runs before the long one, scored on validation photos taken from the training photos.
+"""Pilot runs: short training runs before the main run, scored on validation photos taken from the training photos.
 
-Held-out photos have no part in them.
+Held-out photos are not used.
 """
 
 from __future__ import annotations
@@ -18,17 +18,19 @@ from hyrfpack.train.config import TrainConfig
 from hyrfpack.train.setup import budget_for
 from hyrfpack.train.trainer import Trainer
 
-BUDGET_REFERENCE_STEPS = 500  # A pilot has the budget of a run of this length, unless it asks for another one.
-MAX_TRAINING_VIEWS = 150  # The shortest pilots have no steps for more photos.
+BUDGET_REFERENCE_STEPS = 500  # By default a pilot has the budget of a run of this length.
+MAX_TRAINING_VIEWS = 150  # The shortest pilots have too few steps for more photos.
 MAX_VALIDATION_VIEWS = 8
 MIN_TRAINING_VIEWS = 8  # With fewer photos, none can be spared for validation.
 
-Report = Callable[[int, float, float, int], None]  # step, loss, mean squared error, Gaussians
-Phase = Callable[[str, int, int], None]  # what is being done, items done, items in all (0: not known)
+# Called with step, loss, mean squared error and number of Gaussians.
+Report = Callable[[int, float, float, int], None]
+# Called with the name of the current task, the number of items done, and that of all items (0 if unknown).
+Phase = Callable[[str, int, int], None]
 
 
 class PilotsStopped(Exception):
-    """Raised when the run is asked to end during pilot runs."""
+    """Raised if training is asked to stop during pilot runs."""
 
 
 @dataclass(frozen=True)
@@ -36,11 +38,11 @@ class PilotScore:
     """The scores of one pilot run on the validation photos.
 
     Attributes:
-        steps, seed: of the run.
-        max_gaussians: its budget.
+        steps, seed: number of steps and random seed of the run.
+        max_gaussians: Gaussian budget of the run.
         exposure: whether per-image gains were learnt, and renders exposed by the map fitted to them.
         psnr, ssim, psnr_corrected: means over the validation photos, see `hyrfpack.Evaluation`.
-        psnr_per_view: dB of each of them.
+        psnr_per_view: PSNR of each validation photo in dB.
     """
 
     steps: int
@@ -55,12 +57,12 @@ class PilotScore:
 
 @dataclass(frozen=True)
 class Fold:
-    """One split of a scene's training photos.
+    """One split of a scene's training photos into photos to train on and validation photos.
 
     Attributes:
-        scene: the scene with the photos that pilots train on, and none held out.
-        validation: the photos that pilots are scored on; empty where masks leave nothing of them.
-        max_gaussians: the budget of a pilot that has no budget of its own.
+        scene: the scene with only the photos that pilots train on.
+        validation: the photos that pilots are scored on; empty if masks leave no pixel of them.
+        max_gaussians: the budget of pilots that are run without another one.
     """
 
     scene: Scene
@@ -72,9 +74,9 @@ class ScenePilots:
     """Runs pilots of one scene and keeps their scores.
 
     Attributes:
-        scene, config, cache: as given.
-        scores: of all pilots so far.
-        steps: that all pilots have taken so far.
+        scene, config, cache: as given to `__init__`.
+        scores: the scores of all pilots so far.
+        steps: number of steps that all pilots have taken so far.
     """
 
     def __init__(
@@ -90,13 +92,14 @@ class ScenePilots:
         """Start without any scores.
 
         Args:
-            scene: whose training photos are used.
-            config: of the run to come.
-            cache: keeps photos that are decoded.
-            report: called after each step with its number among those of all pilots, the loss and mean squared error
-                of its view, and the number of Gaussians.
+            scene: the scene; only its training photos are used.
+            config: settings of the main run.
+            cache: cache of decoded photos.
+            device: where to train.
+            report: called after each step with its number, counted over all pilots, the loss and mean squared error of
+                its view, and the number of Gaussians.
             stop: called after each step; True ends the pilots.
-            phase: called with what is being done, and how many of how many steps, photos or views are done.
+            phase: called with the name of the current task, the number of steps, photos or views done, and that of all.
         """
         self.scene, self.config, self.cache = scene, config, cache
         self._device, self._report, self._stop, self._phase = device, report, stop, phase
@@ -104,7 +107,7 @@ class ScenePilots:
         self.steps = 0
 
     def fold(self, every: int | None = None, max_validation: int = MAX_VALIDATION_VIEWS, number: int = 0) -> Fold:
-        """Split the training photos.
+        """Split the training photos, and read the validation photos.
 
         Args:
             every, max_validation, number: see `split`.
@@ -127,13 +130,13 @@ class ScenePilots:
         """Train a pilot and score it on the validation photos.
 
         Args:
-            name: of the pilot, for progress ("budget pilot run 1/2").
+            name: name of the pilot in progress lines ("budget pilot run 1/2").
             fold: photos to train on and validation photos.
-            steps: of the run.
-            seed, exposure, max_gaussians: replace those of the run to come; None for the fold's budget.
+            steps: number of steps of the pilot.
+            seed, exposure, max_gaussians: replace those of the main run; without `max_gaussians` the fold's budget.
 
         Raises:
-            PilotsStopped: `stop` said so.
+            PilotsStopped: `stop` returned True.
             HyrfError: as `Trainer.run`.
         """
         max_gaussians = max_gaussians or fold.max_gaussians
@@ -179,7 +182,7 @@ class ScenePilots:
 
 
 def is_usable(picture: Picture) -> bool:
-    """Return whether the mask leaves any pixel of the picture."""
+    """Return whether the picture has a pixel that is not masked."""
     return picture.mask is None or bool(picture.mask.any())
 
 
@@ -188,13 +191,14 @@ def split(
 ) -> tuple[list[View], list[View]]:
     """Split photos into those that pilots train on and validation photos.
 
-    Pilots train on the photos that do not validate; of many, on those next to a validation photo, because photos spread
-    over a large set would show too little of each place.
+    Pilots train on the photos that are not validation photos. If these are more than `MAX_TRAINING_VIEWS`, pilots train
+    on those nearest to a validation photo in the order of views, because photos spread over a large set would show too
+    little of each place.
 
     Args:
-        every: one of so many photos validates; None for 8, or 5 of fewer than 16 photos.
-        max_validation: the most validation photos.
-        number: of the fold. Folds 0 to `every` - 1 have no validation photo in common.
+        every: one in `every` photos is a validation photo; None for 8, or 5 if there are fewer than 16 photos.
+        max_validation: largest number of validation photos.
+        number: number of the fold, from 0. Folds 0 to `every` - 1 have no validation photo in common.
     """
     every = every or (8 if len(views) >= 16 else 5)
     chosen = evenly_spaced(range((every // 2 + number) % every, len(views), every), max_validation)

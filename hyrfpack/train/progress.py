@@ -1,4 +1,4 @@
-"""The progress line of a training run, and of the work before its first and after its last step."""
+"""The progress lines of a training run, and of the work before its first and after its last step."""
 
 from __future__ import annotations
 
@@ -15,19 +15,21 @@ from rich.text import Text
 
 from hyrfpack.evaluate.metrics import psnr_from_mse
 
-RUNNING_MEAN_WEIGHT = 0.05  # of the newest step
-LOG_INTERVAL_SECONDS = 15.0  # between lines when standard error is not a terminal
-FIRST_PHASE_LOG_SECONDS = 2.0  # There, a phase that takes longer than this gets a line.
-MIN_ETA_SECONDS = 1.0  # A phase shows no remaining time below this, nor before it has taken as long.
-COMPILATION_STEPS = 2  # The first steps compile kernels, so that they do not count for the speed.
-# Advice to shorten the run is given once its speed was measured over so many steps and seconds, if so much
-# time is left.
+RUNNING_MEAN_WEIGHT = 0.05  # The newest step has this weight in the running means of loss and squared error.
+# If standard error is not a terminal, lines are printed at this interval. A phase gets its first line once it takes
+# longer than FIRST_PHASE_LOG_SECONDS.
+LOG_INTERVAL_SECONDS = 15.0
+FIRST_PHASE_LOG_SECONDS = 2.0
+MIN_ETA_SECONDS = 1.0  # A phase shows the remaining time only if this and the elapsed time are at least this long.
+COMPILATION_STEPS = 2  # The first steps compile kernels, so they do not count for the speed.
+# Advice to shorten the run is shown once its speed has been measured over at least this many steps and seconds, if at
+# least this much time is left.
 MIN_ADVICE_STEPS = 3
 MIN_ADVICE_SECONDS = 10.0
 MIN_ADVICE_SECONDS_LEFT = 3600.0
 MIN_BAR_COLUMNS, MAX_BAR_COLUMNS = 8, 24
 PART_SEPARATOR = " | "
-# Parts that a narrow terminal leaves out, the least important ones first.
+# Parts that are left out on a narrow terminal, the least important ones first.
 OPTIONAL_PARTS = ("gaussians", "loss", "elapsed", "speed", "psnr", "eta")
 
 
@@ -35,8 +37,8 @@ class Pace:
     """Measures the speed of a run since its kernels were compiled.
 
     Attributes:
-        warm: time of the monotonic clock when they were compiled.
-        warm_step: the step after which they were compiled.
+        warm: time of the monotonic clock, in seconds, at which all kernels were compiled.
+        warm_step: the step after which all kernels were compiled.
     """
 
     def __init__(self, steps: int, done: int) -> None:
@@ -44,7 +46,7 @@ class Pace:
         self.start = self.warm = monotonic()
 
     def at(self, step: int, now: float) -> tuple[float, float]:
-        """Return steps per second and seconds left after this step, which was finished at the time `now`."""
+        """Return the speed in steps per second, and the seconds left, after a step that was finished at time `now`."""
         since, taken = (self.warm, self.warm_step) if step > self.warm_step else (self.start, self.first)
         speed = max(step - taken, 1) / max(now - since, 1e-9)
         if step - self.first <= COMPILATION_STEPS:
@@ -55,8 +57,8 @@ class Pace:
 class ProgressLine:
     """Shows step, loss, PSNR, Gaussians, speed, elapsed time and estimated remaining time (ETA) on standard error.
 
-    A terminal shows one line that is redrawn and always fits. Elsewhere, as in a log file, a plain line is printed
-    every few seconds. A missing or closed standard error does not end the training.
+    On a terminal, one line is redrawn that fits any width. Elsewhere, as in a log file, a plain line is printed every
+    `LOG_INTERVAL_SECONDS`. A missing or closed standard error does not end the training.
     """
 
     def __init__(self, steps: int, done: int, quiet: bool = False, advice: str = "") -> None:
@@ -64,7 +66,7 @@ class ProgressLine:
 
         Args:
             quiet: show nothing.
-            advice: what shortens the run ("fewer steps or a GPU"), shown once if more than an hour remains.
+            advice: how to shorten the run ("fewer steps or a GPU"), shown once if more than an hour remains.
         """
         self.steps = steps
         self.start = self.last_log = monotonic()
@@ -137,9 +139,9 @@ class ProgressLine:
 class PhaseLine:
     """Shows work other than training steps on standard error, with its progress, elapsed and remaining time.
 
-    A terminal shows one line, which is removed at the end. Elsewhere a plain line is printed for a phase of more than
-    `FIRST_PHASE_LOG_SECONDS`, and then every `LOG_INTERVAL_SECONDS`. The elapsed time is kept current between two
-    updates. A missing or closed standard error is ignored.
+    On a terminal, one line is redrawn, also between updates, and removed at the end. Elsewhere a plain line is printed
+    once a phase takes longer than `FIRST_PHASE_LOG_SECONDS`, and then every `LOG_INTERVAL_SECONDS`. A missing or closed
+    standard error is ignored.
     """
 
     def __init__(self, quiet: bool = False) -> None:
@@ -168,7 +170,7 @@ class PhaseLine:
             self._logger.join()
 
     def note(self, sentence: str) -> None:
-        """Print a sentence that stays."""
+        """Print a sentence above the line, which stays there."""
         if self.live:
             with suppress(OSError, ValueError):
                 self.live.console.print(sentence, markup=False, highlight=False)
@@ -179,8 +181,8 @@ class PhaseLine:
         """Show progress.
 
         Args:
-            what: the work; another text starts a new phase.
-            done, total: items; a total of 0 means that it is not known.
+            what: name of the work; another name starts a new phase.
+            done, total: number of items done and of all items; a total of 0 means that it is not known.
         """
         if what != self.what:
             self.start = monotonic()
@@ -191,7 +193,7 @@ class PhaseLine:
             yield StatusLine(parts, self.done / self.total if self.total else 0.0, ("elapsed", "eta", "count"))
 
     def parts(self, now: float) -> dict[str, str]:
-        """Return the parts of the line at a time of the monotonic clock, by name in reading order."""
+        """Return the parts of the line at time `now` of the monotonic clock, by name in reading order."""
         if not self.what:
             return {}
         elapsed = now - self.start
@@ -205,8 +207,8 @@ class PhaseLine:
         return parts
 
     def _log(self) -> None:
-        """Print lines when they are due, until the end."""
-        printed: tuple[float, float] = (-1.0, 0.0)  # start of the phase in the last line, and time of that line
+        """Print lines when they are due, until `__exit__`."""
+        printed: tuple[float, float] = (-1.0, 0.0)  # The start of the last line's phase, and the time of that line.
         while not self._over.wait(0.25):
             now, start = monotonic(), self.start
             due = (
@@ -220,7 +222,7 @@ class PhaseLine:
 
 
 def format_duration(seconds: float) -> str:
-    """Format a duration as minutes and seconds, "0:15", from one hour on as hours, minutes and seconds, "1:04:09"."""
+    """Format a duration as minutes and seconds, "0:15", or from one hour on with hours, "1:04:09"."""
     minutes, seconds = divmod(round(seconds), 60)
     return f"{minutes}:{seconds:02}" if minutes < 60 else f"{minutes // 60}:{minutes % 60:02}:{seconds:02}"
 
@@ -236,12 +238,12 @@ def format_eta(seconds: float) -> str:
 
 
 def format_psnr(mse: float) -> str:
-    """Format a mean squared error as PSNR for a progress line."""
+    """Format the PSNR of a mean squared error for a progress line."""
     return f"PSNR {psnr_from_mse(mse):.1f} dB"
 
 
 def format_speed(steps_per_second: float) -> str:
-    """Format a speed as iterations per second, or if it is below one, as seconds per iteration.
+    """Format a speed as iterations per second, or as seconds per iteration if it is below one.
 
     Example:
         >>> format_speed(40.2), format_speed(2.5), format_speed(0.5)
@@ -256,8 +258,9 @@ class StatusLine:
     """The progress of long work as one line that fits any terminal width.
 
     Attributes:
-        parts: by name, in reading order; where the line is too long, parts are left out in the order of `optional`.
-        share: of the work that is done, drawn as a bar where there is room for one.
+        parts: texts of the line by name, in reading order.
+        share: share of the work that is done, 0 to 1; shown as a bar if there is room for one.
+        optional: names of the parts to leave out if the line is too long, the first ones first.
     """
 
     def __init__(self, parts: dict[str, str], share: float, optional: Sequence[str] = OPTIONAL_PARTS) -> None:
@@ -278,7 +281,7 @@ class StatusLine:
 
 
 def _live_on_terminal(line: RenderableType, transient: bool = False) -> Live | None:
-    """Return a display that redraws a line on standard error; None where that is no terminal that can."""
+    """Return a display that redraws a line on standard error; None if it is no terminal that supports this."""
     if not sys.stderr.isatty():
         return None
     console = Console(stderr=True)

@@ -1,8 +1,8 @@
-"""Files of a finished run: the model, then scores, pictures, the training curve and `metrics.json`.
+"""Write the files of a finished run: the model, then scores, pictures, the training curve and `metrics.json`.
 
-The model is written first. Everything else can be computed again from the model and the training record, a small file
-beside it that is removed when all results are there. So a full disk or an interruption after the last step costs no
-training.
+The model is written first. All other results can be computed again from the model and the training record, a small file
+beside it that is removed once all results are written. So after a full disk or an interruption, nothing has to be
+trained again.
 """
 
 from __future__ import annotations
@@ -37,21 +37,22 @@ from hyrfpack.train.trainer import Trainer
 
 CURVE_FILE, VIEWS_FOLDER, RECORD_FILE = "curve.png", "views", "training.json"
 RECORD_VERSION = 1
-MIN_BACKGROUND_LIGHT_SHARE = 1e-3  # A background sphere that gives less of the light to all views is removed.
-MAX_BACKGROUND_VIEWS = 16  # training views that decide this
+MIN_BACKGROUND_LIGHT_SHARE = 1e-3  # A background sphere is removed if every view gets less of its light from it.
+MAX_BACKGROUND_VIEWS = 16  # At most this many training views decide whether it is removed.
 
-Phase = Callable[[str, int, int], None]  # what is being done, items done, items in all (0: not known)
+# Called with the name of the current task, the number of items done, and that of all items (0 if unknown).
+Phase = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)
 class TrainingRecord:
-    """Everything that `metrics.json` needs and the model's file does not hold.
+    """The data for `metrics.json` that the model's file does not contain.
 
     Attributes:
         model: name of the model's file in the run's folder.
         model_sha256: digest of that file, in hexadecimal digits.
         step: optimiser steps taken.
-        settings: plain values that decide the model, see `_settings_of`.
+        settings: plain values that determine the model, see `_settings_of`.
         metrics: content of `metrics.json` without the scores.
     """
 
@@ -73,7 +74,7 @@ class Results:
     Attributes:
         metrics: content of `metrics.json`, without scores if these could not be computed.
         missing: files and folders that could not be written, relative to the run's folder.
-        reasons: one sentence for each failure, in order of time.
+        reasons: one sentence for each failure, in the order in which they happened.
     """
 
     metrics: dict[str, Any]
@@ -85,7 +86,7 @@ def read_record(out: Path) -> TrainingRecord | None:
     """Read the training record of a finished model whose results are incomplete.
 
     Returns:
-        The record, or None where there is none, or it is damaged, or it belongs to another model.
+        The record; None if there is none, or it is damaged, or it belongs to another model.
     """
     try:
         content = json.loads((out / RECORD_FILE).read_bytes())
@@ -99,7 +100,7 @@ def read_record(out: Path) -> TrainingRecord | None:
 
 
 def changed_settings(record: TrainingRecord, scene: Scene, config: TrainConfig) -> list[str]:
-    """Return the names of settings that differ from those of the finished run, without those that pilots decided."""
+    """Return the names of settings that differ from those of the finished run, except those that pilots decided."""
     asked = json.loads(json.dumps(_settings_of(scene, config)))
     if is_budget_open(config):
         asked["budget_factor"] = record.settings.get("budget_factor")
@@ -112,18 +113,18 @@ def changed_settings(record: TrainingRecord, scene: Scene, config: TrainConfig) 
 def save_model(trainer: Trainer, out: Path, phase: Phase, *, overwrite: bool) -> TrainingRecord:
     """Write the model of a finished run and its training record, and remove results of an earlier model.
 
-    The record is written first, so that a model on a full disk has its record. If only the record cannot be written,
-    the checkpoint stays in its place.
+    The record is written first, so that a model has its record even if the disk becomes full. If only the record cannot
+    be written, the checkpoint is kept instead.
 
     Args:
-        trainer: of the finished run.
+        trainer: the trainer of the finished run.
         out: the run's folder.
-        phase: called with the progress.
+        phase: called with the name of the current task, the number of items done, and that of all items.
         overwrite: replace and remove files of an earlier run. Without it, a file that appeared at the model's name
-            during the run is kept: the model gets a free name beside it.
+            during the run is kept, and the model gets a free name beside it.
 
     Raises:
-        HyrfTrainingError: no step had a pixel to train on.
+        HyrfTrainingError: masks left no pixel to train on in any step.
         HyrfError: the model cannot be written; the checkpoint stays.
     """
     scene, config = trainer.scene, trainer.config
@@ -181,14 +182,11 @@ def save_model(trainer: Trainer, out: Path, phase: Phase, *, overwrite: bool) ->
         with suppress(HyrfError):
             write_atomic(out / RECORD_FILE, record.encode())
     if overwrite:
-        for result in (
-            METRICS_FILE,
-            CURVE_FILE,
-            *_picture_files(scene),
-        ):  # they would be taken for results of this model
+        # Results of an earlier run would be mistaken for those of this model.
+        for result in (METRICS_FILE, CURVE_FILE, *_picture_files(scene)):
             _remove(out / result)
     if is_recorded and (overwrite or trainer.saved is not None):
-        _remove(out / CHECKPOINT_FILE)  # this also frees space for the results
+        _remove(out / CHECKPOINT_FILE)  # This also frees space for the results.
     return record
 
 
@@ -202,17 +200,17 @@ def write_results(
     *,
     overwrite: bool,
 ) -> Results:
-    """Score the model's file, and write pictures, curve and `metrics.json`. Failures do not fail the run.
+    """Score the model's file, and write pictures, curve and `metrics.json`; failures are returned, not raised.
 
     The training record is removed once all results are written.
 
     Args:
-        record: of the model in the folder.
-        scene: with the held-out photos.
+        record: training record of the model in the folder.
+        scene: the scene, with the held-out photos.
         out: the run's folder.
-        config: of the run.
+        config: settings of the run.
         device: where to render.
-        phase: called with the progress.
+        phase: called with the name of the current task, the number of items done, and that of all items.
         overwrite: replace files at the results' names; without it they are kept.
     """
     metrics, missing, reasons = dict(record.metrics), [], []
@@ -221,7 +219,7 @@ def write_results(
         unwritten: list[str] = []
         photos = len(scene.test)
         try:
-            # Scores are those of the written file, not of the model in memory.
+            # The written file is scored, not the model in memory.
             model = hyrf_format.load_model(out / record.model, device)
             model.precision = config.precision
             scores = evaluate_model(
@@ -259,7 +257,7 @@ def write_results(
 
 
 def _settings_of(scene: Scene, config: TrainConfig) -> dict[str, Any]:
-    """Return plain values that must be equal for results to be completed."""
+    """Return the plain values that must be the same when a later call completes the results."""
     views = [[view.name, view.camera.width, view.camera.height] for view in scene.train]
     return {**config.to_dict(), "views": views, "held-out views": [view.name for view in scene.test]}
 
@@ -276,7 +274,7 @@ def _remove(path: Path) -> None:
 
 @torch.no_grad()
 def _drop_unseen_background(trainer: Trainer, phase: Phase) -> HybridModel:
-    """Return the model, without its background sphere if hardly any light reaches the training cameras from there."""
+    """Return the model, without its background sphere if the training cameras get hardly any light from it."""
     model = trainer.model
     if not model.config.background:
         return model

@@ -1,4 +1,4 @@
-"""A complete training run in a folder: train, save, score on held-out views, report."""
+"""Do a complete training run in a folder: train, save the model, score it on held-out views, and report."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ from hyrfpack.train.trainer import Trainer
 
 __all__ = ["VIEWS_FOLDER", "TrainResult", "is_begun", "resuming", "train_model"]
 
-# These signals end a run early. Windows has no SIGHUP.
+# These signals end a run early (Windows has no SIGHUP).
 STOP_SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 CHOICE_LABELS = {"exposure": "Exposure compensation", "max_gaussians": "Gaussian budget"}
 Observer = Callable[[Trainer], None]
@@ -69,8 +69,8 @@ class TrainResult:
         step: optimiser steps taken.
         model: path of the `.hyrf` file; None if interrupted.
         metrics: content of `metrics.json`; empty if interrupted.
-        missing: a sentence that names the results that could not be written beside the model, as on a full disk, and
-            why; empty if all are written.
+        missing: a sentence that names the results that could not be written, as on a full disk, and gives the reason;
+            empty if all are written.
     """
 
     complete: bool
@@ -99,43 +99,44 @@ def train_model(
     """Train a model on a scene and write all results of the run into a folder.
 
     The folder gets `model.hyrf` (profile raw), `metrics.json`, `curve.png`, `views/` (held-out photos beside their
-    renders and error maps) and, while running, `checkpoint.pt`. The first Ctrl-C (or SIGTERM, or SIGHUP as when the
-    terminal is closed) saves the checkpoint and returns, unless whoever started the program has it ignored; before the
-    first step, while short runs measure the budget, there is nothing to save.
+    renders and error maps) and, while running, `checkpoint.pt`. The first Ctrl-C, SIGTERM or SIGHUP (as when the
+    terminal is closed) saves the checkpoint and returns, unless the parent process ignores the signal. Before the first
+    step, during pilot runs, there is nothing to save.
 
-    Results that cannot be written beside the model do not fail the run: a call with the same settings, with `resume` or
-    without, completes them without training again. So does a call after an interruption while they are written.
+    If a result other than the model cannot be written, the run does not fail. A later call with the same settings, with
+    or without `resume`, completes the results without training again. The same holds after an interruption while
+    results are written.
 
     Args:
-        scene: from `hyrfpack.load_scene`.
+        scene: the scene, from `hyrfpack.load_scene`.
         out: the run's folder, created if missing.
-        config: settings.
+        config: settings of the run; None for the defaults.
         resume: resume from the folder's checkpoint, or complete the results of a finished model. The result equals that
             of an uninterrupted run.
-        overwrite: replace an earlier run in the folder. Without it, nothing is replaced, not even a file that appears
-            during training: a result then gets a free name beside it; `TrainResult.model` has that of the model.
-        cache: cache of decoded photos; by default a quarter of the memory.
-        device: where to train, see `hyrfpack.device.choose_device`. A run may be resumed on another one. On a GPU
-            sums of gradients vary in their last bits from run to run, which may tip the measured budget.
+        overwrite: replace an earlier run in the folder. Without it, nothing is replaced. If a file appears at a
+            result's name during training, the result gets a free name beside it; `TrainResult.model` is the model's.
+        cache: cache of decoded photos; by default one that takes a quarter of the memory.
+        device: where to train, see `hyrfpack.device.choose_device`. A run may be resumed on another device. On a GPU
+            sums of gradients vary in their last bits from run to run, which may change the measured budget.
         quiet: print nothing.
         report: called after each step with its number (0 during pilot runs), the loss and mean squared error of its
-            view (NaN where all of it is masked) and the number of Gaussians. It replaces the progress line.
-        phase: called during all other work with its name ("scoring held-out photos"), the number of items done, and of
-            all items (0 if unknown). It replaces the progress line.
-        observer: called after each step with the trainer, whose model it may read and must not change. On several
-            processes rank 0's is called. Its time does not count as training time.
+            view (NaN if all of it is masked) and the number of Gaussians. It replaces the progress line.
+        phase: called during all other work with its name ("scoring held-out photos"), the number of items done, and
+            that of all items (0 if unknown). It replaces the progress line.
+        observer: called after each step with the trainer, whose model it may read and must not change. Of several
+            processes only rank 0 calls it. Its time does not count as training time.
         log: a file that gets a line of JSON every few steps, and TensorBoard files beside it if that is installed; see
-            `hyrfpack.train.log.TrainingLog`. A resumed run adds to it.
-        ranks: processes that train together, from `hyrfpack.parallel.ranks.join_processes`: all call this with the
-            same scene and settings. Only rank 0 writes, prints and returns metrics. When the launcher restarts the
-            processes, as torchrun does after one has ended, they resume from the checkpoint if there is one.
+            `hyrfpack.train.log.TrainingLog`. A resumed run appends to it.
+        ranks: processes that train together, from `hyrfpack.parallel.ranks.join_processes`. All of them call this
+            function with the same scene and settings. Only rank 0 writes, prints and returns metrics. If the launcher
+            restarts the processes, as torchrun does after one has ended, they resume from the checkpoint if any.
 
     Raises:
-        HyrfError: another call is at work in the folder, the folder holds another run, training cannot start or go on,
-            no photo has a pixel to train on or to score, a held-out photo cannot be read (all of which is found before
-            the first step), or the results would replace photos or other files, or the model cannot be written (a
-            checkpoint that cannot, while training, is a line on standard error; for other results see
-            `TrainResult.missing`).
+        HyrfError: another call is working in the folder, the folder holds another run, the results would replace photos
+            or other files, no photo has a pixel to train on or to score, or a held-out photo cannot be read; all of
+            this is checked before the first step. Or training cannot start or continue, or the model cannot be written.
+            If a checkpoint cannot be written during training, a line on standard error says so; for other results see
+            `TrainResult.missing`.
         TypeError: `scene` is no Scene or `config` no TrainConfig.
 
     Example:
@@ -150,7 +151,7 @@ def train_model(
     config = TrainConfig() if config is None else config
     check_type("config", config, TrainConfig)
     check_target(scene, config)
-    # Whatever lies there: no folder is created where nothing may be written.
+    # This check ignores existing results. It runs first, so that no folder is created where nothing may be written.
     ranks.run_on_all(lambda: _check_outputs(out, scene, overwrite=True) if ranks.is_main else None)
     with exclusive_folder(out, ranks=ranks):
         return _train_in_folder(
@@ -175,7 +176,7 @@ def _train_in_folder(
     log: Path | str | None,
     ranks: Ranks,
 ) -> TrainResult:
-    """Train in a folder that this call has locked; see `train`."""
+    """Train in a folder that this call has locked; see `train_model`."""
     checkpoint = out / CHECKPOINT_FILE
     device = choose_own_device(device, ranks)
     resume = ranks.broadcast(resume or (ranks.restarts > 0 and is_begun(out)))
@@ -200,7 +201,7 @@ def _train_in_folder(
     if record is not None:
         return _complete(record, scene, out, config, device, phase, silent, log, ranks)
     if overwrite and not resume and ranks.is_main:
-        (out / RECORD_FILE).unlink(missing_ok=True)  # of the earlier run: this one is not to be taken for it
+        (out / RECORD_FILE).unlink(missing_ok=True)  # It belongs to the earlier run, which this one replaces.
     if resume:
         saved = ranks.run_on_all(lambda: _with_saved_decisions(config, checkpoint) if ranks.is_main else config)
         decisions = Decisions(ranks.broadcast(saved), {}, [])
@@ -208,7 +209,7 @@ def _train_in_folder(
         with PhaseLine(silent) as phases, _stop_requests() as stop:
             phases.note(f"{questions} with short pilot runs, scored on validation photos")
             report_pilot: Report = _ignore_step if report is None else partial(_as_step_nought, report)
-            # Every rank runs all pilots, so that none waits for another.
+            # Every rank runs all pilots, so that no rank waits for another.
             pilots = partial(decide, scene, config, cache, device, report_pilot, stop, phase or phases.update)
             answers = ranks.all_gather(ranks.run_on_all(pilots))
         if answers[0] is None or None in answers:
@@ -226,7 +227,7 @@ def _train_in_folder(
     if resume:
         trainer.load(checkpoint)
     elif ranks.is_main and not ranks.is_single:
-        # Restarted processes resume from the checkpoint that they find, which must not be that of an earlier run.
+        # Restarted processes resume from any checkpoint that they find, so that of an earlier run must not remain.
         checkpoint.unlink(missing_ok=True)
     with ExitStack() as stack:
         with (
@@ -270,7 +271,7 @@ def _train_in_folder(
 
 
 def _with_saved_decisions(config: TrainConfig, checkpoint: Path) -> TrainConfig:
-    """Return the settings, completed by the decisions of the interrupted run."""
+    """Return the settings with the decisions that the interrupted run made where they were left open."""
     factor, exposure = saved_decisions(checkpoint)
     if is_budget_open(config):
         config = dataclasses.replace(config, budget_factor=factor)
@@ -278,14 +279,14 @@ def _with_saved_decisions(config: TrainConfig, checkpoint: Path) -> TrainConfig:
 
 
 def _open_questions(scene: Scene, config: TrainConfig) -> str:
-    """Return what pilot runs decide, as the start of a sentence; "" if nothing is open."""
+    """Return what pilot runs have to decide, as the start of a sentence; "" if they decide nothing."""
     questions = ["choosing exposure compensation"] * measures_exposure(scene, config)
     questions += ["estimating the Gaussian budget"] * measures_budget(scene, config)
     return " and ".join(questions)
 
 
 def is_begun(out: Path) -> bool:
-    """Return whether `resume` can continue in a folder, from a checkpoint or with a model to be scored."""
+    """Return whether a run in the folder can be resumed, from a checkpoint or from a model with missing results."""
     return (out / CHECKPOINT_FILE).is_file() or read_record(out) is not None
 
 
@@ -300,7 +301,7 @@ def _complete(
     log: Path | str | None,
     ranks: Ranks,
 ) -> TrainResult:
-    """Compute and write missing results of a finished model, on rank 0."""
+    """Compute and write the missing results of a finished model; only rank 0 does so."""
     if not ranks.is_main:
         return TrainResult(True, record.step, out / MODEL_FILE, {})
     with PhaseLine(silent) as phases, ExitStack() as stack:
@@ -318,7 +319,7 @@ def _complete(
 
 
 def _tell_missing(results: Results, line: PhaseLine) -> str:
-    """Note which results are missing, if any, and return the sentence."""
+    """Print which results are missing, if any, and return the printed sentence."""
     if not results.missing:
         return ""
     names = " and ".join(filter(None, [", ".join(results.missing[:-1]), results.missing[-1]]))
@@ -336,7 +337,7 @@ def _log_end(log: TrainingLog, step: int, results: Results) -> None:
 
 
 def _ignore_step(step: int, loss: float, mse: float, gaussians: int) -> None:
-    """Ignore a step of a pilot run, whose progress is reported as a phase."""
+    """Ignore a step of a pilot run, because the progress of pilots is reported as a phase."""
 
 
 def _as_step_nought(report: Report, step: int, loss: float, mse: float, gaussians: int) -> None:
@@ -344,12 +345,12 @@ def _as_step_nought(report: Report, step: int, loss: float, mse: float, gaussian
 
 
 def resuming(overwrite: bool) -> str:
-    """Return how to resume a run that was started with or without `overwrite`."""
+    """Describe, as words of a sentence, how to resume a run that was started with or without `overwrite`."""
     return f"the same command with `resume=True`{' instead of `overwrite=True`' if overwrite else ''}"
 
 
 def _shorter(device: torch.device) -> str:
-    """Return what would shorten a run, as words of a sentence."""
+    """Describe, as words of a sentence, how to shorten a run on a device."""
     ways = ["fewer steps", "smaller photos", "fewer Gaussians"]
     if device.type == "cpu":
         ways.append("a GPU")
@@ -358,7 +359,7 @@ def _shorter(device: torch.device) -> str:
 
 @contextmanager
 def _naming_the_checkpoint(trainer: Trainer, overwrite: bool) -> Iterator[None]:
-    """Add the checkpoint to resume from to an error of reading or writing."""
+    """Add to the fix of an error of reading or writing that the checkpoint is kept and how to resume from it."""
     try:
         yield
     except HyrfError as error:
@@ -371,7 +372,7 @@ def _naming_the_checkpoint(trainer: Trainer, overwrite: bool) -> Iterator[None]:
 def _prepare(
     out: Path, scene: Scene, config: TrainConfig, record: TrainingRecord | None, resume: bool, overwrite: bool
 ) -> None:
-    """Check that the run may be written or resumed; `record` is that of a finished model to be completed."""
+    """Check that the run may be written or resumed; `record` is that of a finished model with missing results."""
     if record is not None:
         if different := changed_settings(record, scene, config):
             raise HyrfTrainingError(
@@ -398,9 +399,9 @@ def _check_outputs(out: Path, scene: Scene, *, overwrite: bool) -> None:
 
 
 def _check_photos(scene: Scene, cache: PictureCache, phase: Phase) -> None:
-    """Check that held-out photos can be read and that masks leave pixels, before that ends the run after its last step.
+    """Check that held-out photos can be read and that masks leave pixels, so that scoring cannot fail after training.
 
-    Training photos are read in the first steps, so that one usable photo is enough here.
+    Training photos are read in the first steps anyway, so one usable training photo is enough here.
     """
     held_out = []
     for done, view in enumerate(scene.test):
@@ -422,13 +423,16 @@ def _nothing_left(scene: Scene, views: list[View], purpose: str) -> HyrfTraining
 
 @contextmanager
 def _stop_requests() -> Iterator:
-    """Turn the first Ctrl-C, SIGTERM or SIGHUP into a request to stop; a second one interrupts at once.
+    """Turn the first Ctrl-C, SIGTERM or SIGHUP into a request to stop; a second Ctrl-C or SIGTERM interrupts at once.
 
     Signals that the parent process ignores stay ignored: SIGHUP under nohup, Ctrl-C in the background of a script. A
-    second SIGHUP has no effect, because a terminal that closes sends it twice: by the shell, and itself.
+    second SIGHUP has no effect, because closing a terminal sends two: one by the shell and one by the terminal.
+
+    Yields:
+        A function that returns whether a stop was requested.
     """
     requested = threading.Event()
-    if threading.current_thread() is not threading.main_thread():  # signals belong to the main thread
+    if threading.current_thread() is not threading.main_thread():  # Only the main thread can handle signals.
         yield requested.is_set
         return
     found = {number: signal.getsignal(number) for number in STOP_SIGNALS}

@@ -1,6 +1,6 @@
 """Set up an untrained model for a scene: preset, frame, sizes and initial Gaussians.
 
-Every size follows from the photos and the length of the run. Each choice is recorded with its reason, which
+All sizes are chosen by the photos and the length of the run. Each choice is recorded with its reason, which
 `hyrfpack info` shows.
 """
 
@@ -23,34 +23,35 @@ from hyrfpack.scene import Scene
 from hyrfpack.train.config import FULL_STEPS, TrainConfig
 from hyrfpack.train.silhouette import inside_silhouettes
 
-SYNTHETIC_HALF_BOX = 1.3  # NeRF-synthetic objects lie in [-1.3, 1.3]^3
-# The budget of a full-length run is the larger of two: Gaussians for each pixel of one photo, and for each pixel of all
-# photos. For Mip-NeRF 360 at 1 megapixel they give 0.85 and 0.9 million; published models have up to 2.5 million.
+SYNTHETIC_HALF_BOX = 1.3  # NeRF-synthetic objects lie in [-1.3, 1.3]^3.
+# The budget of a full-length run is the larger of two numbers, one by the pixels of one photo and one by those of all
+# photos. For Mip-NeRF 360 at 1 megapixel they are 0.85 and 0.9 million; published models have up to 2.5 million.
 GAUSSIANS_PER_PIXEL_OF_ONE_PHOTO = 0.85
 GAUSSIANS_PER_PIXEL_OF_ALL_PHOTOS = 1 / 240
 MIN_BUDGET = 5_000
-# A packed file has so many bytes of decoders and headers, and so many for each Gaussian with its table rows. By itself
-# `compress` takes 2 to 6 bytes for a Gaussian, most often 4 to 5. Of two files of equal size, the one with more
-# Gaussians and coarser numbers scores higher.
+# A packed file is assumed to take this many bytes for decoders and headers, and for each Gaussian with its table rows.
+# By default `compress` takes 2 to 6 bytes per Gaussian, most often 4 to 5. Of two files of equal size, the one with
+# more Gaussians and coarser numbers scores higher.
 PACKED_HEADER_BYTES = 8_000
 PACKED_BYTES_PER_GAUSSIAN = 3.5
 MIN_TARGETED_BUDGET = 250
-MAX_TARGETED_BUDGET_RATIO = 2  # of the budget for a target size to the usual one
-GAUSSIANS_PER_ROW = 20  # for each row and level of the radiance table; the paper's models have 8 to 20
+MAX_TARGETED_BUDGET_RATIO = 2  # The budget for a target size is at most this multiple of the usual one.
+GAUSSIANS_PER_ROW = 20  # Applies to each level of the radiance grid. The paper's models have 8 to 20.
 INITIAL_OPACITY = 0.1
-MIN_INITIAL_SIZE, MAX_INITIAL_SIZE = 1e-5, 0.5  # local units over S(p)
-# In local units for each axis. Pulling in a point that is farther away changes its direction, seen from the box, by
-# 2e-4 radians at most.
+# Initial scales are clamped to these multiples of the largest scale S(p).
+MIN_INITIAL_SIZE, MAX_INITIAL_SIZE = 1e-5, 0.5
+# Points with larger coordinates, in local units, are moved towards the box. That changes their direction, seen from the
+# box, by at most 2e-4 radians.
 MAX_INITIAL_COORDINATE = 1e4
-# Cameras whose spread is a smaller share than this of their distance to the points count as standing in one place.
+# Cameras count as standing in one place if their spread is a smaller share of their distance to the points.
 MIN_CAMERA_SPREAD_RATIO = 1e-3
 BACKGROUND_RGB = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "random": (0.0, 0.0, 0.0)}
 
 
 def detect_preset(scene: Scene) -> tuple[str, str]:
-    """Choose the preset (the paper's regime) that fits a scene, and give the reason in words.
+    """Choose the preset (the paper's regime) that fits a scene; return it and the reason in words.
 
-    - "synthetic": photos with coverage (an object without a background);
+    - "synthetic": photos with transparency (an object without a background);
     - "large": the cameras look the same way and fly across it (aerial surveys);
     - "street": the cameras look the same way and move along it;
     - "standard": everything else.
@@ -76,9 +77,9 @@ def detect_preset(scene: Scene) -> tuple[str, str]:
 def scene_frame(scene: Scene, preset: str) -> Frame:
     """Return the frame of a scene under a preset: the box B0, in the scene's own axes.
 
-    NeRF-synthetic layouts have +-1.3 around the origin. Other "synthetic" scenes, whose unit is not known, and "large"
-    ones have the 1st to 99th percentile of the points. Others have the box of the cameras, or of the points where all
-    cameras stand in one place.
+    The box of a NeRF-synthetic layout is +-1.3 around the origin. For "large" scenes, and other "synthetic" scenes,
+    whose unit is not known, it spans the 1st to 99th percentile of the points. For all other scenes it is the box of
+    the cameras. If all cameras stand in one place, it also spans these percentiles.
     """
     if preset == "synthetic" and scene.layout == "blender":
         return Frame((0.0, 0.0, 0.0), SYNTHETIC_HALF_BOX, (1.0, 1.0, 1.0))
@@ -88,7 +89,7 @@ def scene_frame(scene: Scene, preset: str) -> Frame:
         reach = float(np.median(np.linalg.norm(scene.points - positions.mean(0), axis=1)))
         if preset in ("large", "synthetic") or (high - low).max() <= MIN_CAMERA_SPREAD_RATIO * reach:
             low, high = np.percentile(scene.points, [1, 99], axis=0)
-    # Without an extent (up to rounding), a box of unit size in front of the first camera is used.
+    # If the box has no extent (up to rounding), a box with half-axes of 1 in front of the first camera replaces it.
     if (high - low).max() <= 1e-9 * np.abs(positions).max():
         forward = scene.train[0].camera.forward
         low, high = positions[0] + forward - 1, positions[0] + forward + 1
@@ -98,9 +99,9 @@ def scene_frame(scene: Scene, preset: str) -> Frame:
 def budget_for(scene: Scene, config: TrainConfig) -> tuple[int, str]:
     """Return the Gaussian budget of a run and the reason in words.
 
-    The budget is the configured factor times a number that grows with the photos' pixels and with the square root of
-    the run's length, because a shorter run can fit fewer Gaussians. For a target size it is about what fits in, and at
-    most `MAX_TARGETED_BUDGET_RATIO` times the usual budget.
+    The usual budget grows with the photos' pixels, and with the square root of the run's length, because a shorter run
+    can fit fewer Gaussians. It is multiplied by `config.budget_factor`. For a target size, the budget is the number of
+    Gaussians that fit, at most `MAX_TARGETED_BUDGET_RATIO` times the usual budget.
     """
     if config.max_gaussians is not None:
         return config.max_gaussians, "asked for"
@@ -123,10 +124,10 @@ def budget_for(scene: Scene, config: TrainConfig) -> tuple[int, str]:
 def check_target(scene: Scene, config: TrainConfig) -> None:
     """Check that a packed model of these photos can be as small as the target size.
 
-    A file carries some of the cameras, so that its smallest size depends on the scene.
+    A file contains some of the cameras, so its smallest possible size depends on the scene.
 
     Raises:
-        HyrfError: the target size is smaller than that.
+        HyrfError: the target size is below the smallest possible size.
     """
     if config.target_bytes is None or not scene.train:
         return
@@ -147,7 +148,7 @@ def build_model(scene: Scene, config: TrainConfig) -> tuple[HybridModel, int, di
     """Build an untrained model for a scene.
 
     Returns:
-        The model, its Gaussian budget, and by setting the choice and its reason.
+        The model, its Gaussian budget, and a text with the choice and its reason for each setting.
 
     Raises:
         HyrfTrainingError: the scene has no training views.
@@ -199,9 +200,9 @@ def build_model(scene: Scene, config: TrainConfig) -> tuple[HybridModel, int, di
 def initial_points(scene: Scene, frame: Frame, budget: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Return initial local positions (N, 3) float64 and colours (N, 3) in [0, 1], where N is at most the budget.
 
-    They are the scene's points, or a random subset of them. A scene without points starts from half a budget of random
-    points in the box; where photos have transparency, in the visual hull. Outliers of the reconstruction are pulled in,
-    along the line to the frame's centre, to coordinates that half precision can hold.
+    They are the scene's points, or a random subset of them. A scene without points starts from random points in the
+    box, half as many as the budget; if photos have transparency, they lie in the visual hull. Outliers of the
+    reconstruction are moved along the line to the frame's centre until half precision can represent their coordinates.
     """
     generator = np.random.default_rng(seed)
     if len(scene.points):
@@ -218,7 +219,7 @@ def initial_points(scene: Scene, frame: Frame, budget: int, seed: int) -> tuple[
 
 
 def _gaussians(points: np.ndarray, colors: np.ndarray, config: ModelConfig) -> Gaussians:
-    """Place Gaussians at points; sigma is the root mean square distance to the 3 nearest points."""
+    """Place Gaussians at points; their standard deviation is the rms distance to the 3 nearest points."""
     positions = torch.from_numpy(points).float()
     bounds = scale_bounds(positions, config)
     if len(points) > 1:
@@ -228,7 +229,7 @@ def _gaussians(points: np.ndarray, colors: np.ndarray, config: ModelConfig) -> G
         sizes = np.full(len(points), 0.1)
     fraction = (torch.from_numpy(sizes).float()[:, None] / bounds).clamp(MIN_INITIAL_SIZE, MAX_INITIAL_SIZE)
     if config.scale_rule == "product":
-        fraction = (2 * fraction).clamp(max=0.999)  # the neural factor starts at a half
+        fraction = (2 * fraction).clamp(max=0.999)  # The neural factor is 1/2 at the start.
     return Gaussians(
         positions,
         logit(torch.from_numpy(np.clip(colors, 0.02, 0.98))),

@@ -1,4 +1,4 @@
-"""Sampling of random points inside an object's visual hull."""
+"""Sample random points inside an object's visual hull."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ import numpy as np
 from hyrfpack.model import Frame
 from hyrfpack.scene import Scene, evenly_spaced
 
-MAX_SILHOUETTES = 24  # More would hardly make the hull smaller.
-MIN_COVERED_SHARE = 0.95  # of the views that see a point, for the point to be inside
+MAX_SILHOUETTES = 24  # More silhouettes would hardly make the hull smaller.
+MIN_COVERED_SHARE = 0.95  # A point is inside if at least this share of the views that see it cover it.
 
 
 def inside_silhouettes(
     scene: Scene, frame: Frame, count: int, generator: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draw points in the frame's box that project onto covered pixels in (nearly) every view that sees them.
+    """Draw points in the frame's box that project onto covered pixels in nearly every view that sees them.
 
     Returns:
-        Local positions (N, 3) and mean pixel colours (N, 3) in [0, 1]; N is `count`, or less when hardly any point
-        of the box lies inside the silhouettes (then points of the whole box fill up, in grey).
+        Local positions (N, 3) and mean pixel colours (N, 3) in [0, 1], where N is at most `count`. If fewer than a
+        tenth of `count` points are found inside the silhouettes, grey points of the whole box make up the rest.
     """
     pictures = [(view.camera, view.load()) for view in evenly_spaced(scene.train, MAX_SILHOUETTES)]
     half = np.array(frame.half_extent)

@@ -16,9 +16,10 @@ class Strategy(Protocol):
     """Interface of a density control strategy, for `Trainer(scene, config, strategy=...)`.
 
     In every step the trainer calls `watching` before it renders the view, `observe` after the backward pass, and `act`
-    after the optimiser's step. A resumed run must end like an uninterrupted one: seed random numbers by the run's seed
-    and the step, and put everything observed into the state. On several processes each strategy observes its own
-    views; sum what decides over the ranks first (`Ranks.all_reduce`), so that all take the same decisions.
+    after the optimiser's step. A resumed run must give the same result as an uninterrupted one, so a strategy seeds
+    random numbers by the run's seed and the step, and its state contains everything that it has observed. On several
+    processes each strategy observes its own views. It must sum its observations over the ranks (`Ranks.all_reduce`)
+    before it decides, so that all take the same decisions.
 
     The default strategy is `hyrfpack.train.DensityControl`.
 
@@ -44,10 +45,13 @@ class Strategy(Protocol):
         """Return whether this step, counted from 1, needs absolute gradients of the projected centres."""
 
     def observe(self, rendering: Rendering, camera: Camera, model: HybridModel) -> None:
-        """Observe one view after the backward pass: the rendering, and the gradients of the model's parameters."""
+        """Observe the rendering of one view and the gradients of the model's parameters, after the backward pass."""
 
     def act(self, step: int, model: HybridModel, optimizer: Optimizer) -> None:
-        """Add and remove Gaussians through the optimiser, which keeps the moments of the others."""
+        """Add and remove Gaussians after this step, counted from 1, by methods of the optimiser.
+
+        The optimiser keeps the moments of the other Gaussians.
+        """
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return everything observed that later steps need."""

@@ -37,11 +37,11 @@ from hyrfpack.train.setup import build_model
 from hyrfpack.train.strategy import Strategy
 from hyrfpack.version import __version__
 
-MIN_CURVE_RECORDS = 200  # A longer run has up to twice as many.
+MIN_CURVE_RECORDS = 200  # A run of more steps has up to twice as many records.
 
 
 def shuffled(views: Sequence[View], seed: int, places: range) -> Iterator[View]:
-    """Yield the views at these places, counted from 0, of an endless order; each epoch is another permutation."""
+    """Yield the views at `places` (from 0) of an endless sequence, in which each epoch is another permutation."""
     current_epoch, order = -1, np.zeros(0, np.int64)
     for index in places:
         epoch, place = divmod(index, len(views))
@@ -51,19 +51,19 @@ def shuffled(views: Sequence[View], seed: int, places: range) -> Iterator[View]:
 
 
 def is_recorded(step: int, steps: int) -> bool:
-    """Return whether the training curve has a record of this step; the last step has one."""
+    """Return whether the training curve has a record of this step; the last step always has one."""
     return step % max(1, steps // MIN_CURVE_RECORDS) == 0 or step == steps
 
 
 class Trainer:
-    """Holds the state of a run: model, optimiser, density control strategy and step.
+    """The training loop and its state: model, optimiser, density control strategy and step.
 
     Of several processes (ranks), each renders another view in a step, and all apply the mean of their gradients.
-    `TrainConfig.steps` counts views, so that W processes take 1/W as many steps with larger learning rates
-    (`LearningRates.at`). All ranks hold the same model, bit by bit, because they apply the same gradients.
+    `TrainConfig.steps` counts views, so W processes take 1/W as many steps, with larger learning rates
+    (`LearningRates.at`). All ranks hold the same model, bit for bit, because they apply the same gradients.
 
     Attributes:
-        steps: optimiser steps of the whole run.
+        steps: number of optimiser steps of the whole run.
 
     Example:
         >>> trainer = Trainer(scene, TrainConfig(steps=2000))
@@ -84,9 +84,9 @@ class Trainer:
         """Set up a run.
 
         Args:
-            model: the model to continue with, changed in place; None builds an untrained one for the scene.
-            strategy: adds and removes Gaussians; None for `DensityControl` as configured.
-            ranks: the processes that train together, each of which sets up the same run.
+            model: the model to continue training, changed in place; None builds an untrained one for the scene.
+            strategy: adds and removes Gaussians; None for `DensityControl` with the settings of `config.density`.
+            ranks: the processes that train together; each of them sets up the same run.
         """
         self.ranks = ranks
         self.steps = -(-config.steps // ranks.size)
@@ -95,8 +95,8 @@ class Trainer:
         self.cache = cache or PictureCache()
         self.device = device
         self.photos = Photos(device)
-        self.choices: dict[str, str] = {}  # by setting: the choice and its reason
-        self.pilots: list[dict] = []  # scores of the pilot runs that decided
+        self.choices: dict[str, str] = {}  # For each setting, the choice and its reason.
+        self.pilots: list[dict] = []  # The scores of the pilot runs, see `PilotScore`.
         if model is None:
             model, self.budget, self.choices = build_model(scene, config)
         else:
@@ -107,15 +107,15 @@ class Trainer:
             config.density, self.steps, self.budget, len(self.model), config.seed, device, ranks
         )
         self.step = 0
-        self.saved: int | None = None  # step of the checkpoint on disk
+        self.saved: int | None = None  # The step of the checkpoint on disk.
         self.records: list[dict] = []
-        self.seconds: dict[str, float] = defaultdict(float)  # by stage, over all parts of a resumed run
+        self.seconds: dict[str, float] = defaultdict(float)  # By stage, summed over all parts of a resumed run.
         self.elapsed = 0.0
 
     def _take(self, model: HybridModel) -> None:
         """Replace the trained model and start a new optimiser for it."""
         model.precision = self.config.precision
-        if not any(parameter.requires_grad for parameter in model.parameters()):  # a loaded model has none
+        if not any(parameter.requires_grad for parameter in model.parameters()):  # A loaded model records none.
             model.requires_grad_(True)
         self.model = model.to(self.device)
         self.optimizer = Optimizer(self.model, self.config.learning_rates, self.ranks.size)
@@ -135,8 +135,8 @@ class Trainer:
 
         Args:
             checkpoint: path of the checkpoint; written every `checkpoint_every` steps and when stopped early.
-            report: called after each step with the loss and the mean squared error of its view (NaN where the whole
-                photo is masked).
+            report: called after each step with the trainer, and the loss and mean squared error of the step's view (NaN
+                if all of its photo is masked).
             stop: called in each step; the run ends after the step in which it returns True.
             warn: called with a sentence when a checkpoint cannot be written, as on a full disk. Training continues and
                 tries again at the next checkpoint.
@@ -146,7 +146,8 @@ class Trainer:
             Whether the run is complete.
 
         Raises:
-            HyrfTrainingError: a parameter, the loss or a gradient is not finite; step, view and group are named.
+            HyrfTrainingError: a parameter, the loss or a gradient is not finite. The message names step, view and
+                group.
             HyrfError: the run was stopped early and the checkpoint cannot be written; or one of several processes
                 cannot continue or has ended.
         """
@@ -173,7 +174,7 @@ class Trainer:
                             raise
                         warn(f"{error}; training continues, without the checkpoint of step {self.step:,}")
                 if stopped:
-                    # The launcher ends all processes once one has left, so all wait until the checkpoint is written.
+                    # The launcher ends all processes once one has ended, so all wait until the checkpoint is written.
                     self.ranks.all_gather(None)
                     return False
         return True
@@ -184,10 +185,10 @@ class Trainer:
         return shuffled(self.scene.train, self.config.seed, range(first + self.ranks.rank, count, self.ranks.size))
 
     def _train_step(self, views: Iterator[tuple[View, Picture]], stop: Callable[[], bool]) -> tuple[float, float, bool]:
-        """Take a step.
+        """Take one optimiser step, and add and prune Gaussians if a round is due.
 
         Returns:
-            Loss and mean squared error, means over all ranks' views, and whether any rank was asked to stop.
+            Mean loss and mean squared error over all ranks' views, and whether any rank was asked to stop.
         """
         problem: HyrfError | None = None
         try:
@@ -207,12 +208,12 @@ class Trainer:
         with self._timed("optimizer"):
             broken = self.optimizer.step(self.step - 1, self.steps)
             if self.exposures is not None:
-                # The gains of a photo take as many steps as in a single process.
+                # A photo's gains take as many steps as with a single process, so their rate is that of such a run.
                 seen, all_seen = (self.ranks.size * steps for steps in (self.step - 1, self.steps))
                 rate = self.config.learning_rates.at("exposure", seen, all_seen)
                 broken = torch.cat((broken, self.exposures.step(rate, self._views_of_step())[None]))
         with self._timed("loss"):
-            # The host waits for the device once in each step: here.
+            # This is the only place in a step where the host waits for the device.
             numbers = torch.cat((packed, broken)).tolist()
         sums, flags = numbers[: len(packed)], numbers[len(packed) :]
         stats = StepStats(*sums) if self.ranks.is_single else StepStats.from_sums(sums, self.ranks.size)
@@ -233,7 +234,7 @@ class Trainer:
         """Accumulate the gradients of one view.
 
         Returns:
-            Scalars: the view's loss, and its mean squared error, NaN where all of the photo is masked.
+            The view's loss, and its mean squared error, NaN if all of the photo is masked; both scalars.
         """
         with self._timed("data"):
             solid = self._solid()
@@ -242,7 +243,7 @@ class Trainer:
             rendering = render_view(
                 self.model,
                 view.camera,
-                RenderSettings(exposure=CONSISTENT_EXPOSURE),  # the photo's own gains come after
+                RenderSettings(exposure=CONSISTENT_EXPOSURE),  # The photo's own gains are applied below.
                 absgrad=self.strategy.watching(self.step),
                 solid=None if solid is None else upload_array(solid, self.device),
             )
@@ -279,22 +280,22 @@ class Trainer:
         return list(shuffled(self.scene.train, self.config.seed, places))
 
     def _synchronize(self) -> None:
-        """Check that all ranks hold the same parameters after density control; if not, take those of rank 0."""
+        """Copy the state of rank 0 to all ranks, if their parameters differ after density control."""
         if len(set(self.ranks.all_gather(digest(self.model.parameters())))) > 1:
             self._restore(self.ranks.broadcast(self._tensors()))
 
     def _record(self, loss: float, mse: float) -> None:
-        """Add the step to the training curve if it has a record, unless all of its photo is masked."""
+        """Add a record of the step to the training curve if `is_recorded`, unless all of its photo is masked."""
         if not np.isnan(mse) and is_recorded(self.step, self.steps):
             record = {"step": self.step, "loss": loss, "psnr": psnr_from_mse(mse), "gaussians": len(self.model)}
             self.records.append({**record, "seconds": round(self.elapsed, 3)})
 
     def _solid(self) -> np.ndarray | None:
-        """Return the background colour (3,) of this step's view; None when the model has a background sphere."""
+        """Return the background colour (3,) of this step's view; None if the model has a background sphere."""
         if self.model.config.background:
             return None
         if self.config.background_color == "random":
-            number = (self.step - 1) * self.ranks.size + self.ranks.rank + 1  # of the view, from 1
+            number = (self.step - 1) * self.ranks.size + self.ranks.rank + 1  # The number of the view, from 1.
             return np.random.default_rng((self.config.seed, 1, number)).random(3, dtype=np.float32)
         return np.array(self.model.config.solid, np.float32)
 
@@ -330,7 +331,7 @@ class Trainer:
         return {**self.config.to_dict(), "views": views, "strategy": type(self.strategy).__qualname__, **chosen}
 
     def _tensors(self) -> dict[str, Tensor]:
-        """Return the run's state on the CPU, without what each rank has observed for density control."""
+        """Return the tensors of the run's state on the CPU, except the density control observations of each rank."""
         tensors: dict[str, Tensor] = {f"model.{name}": p for name, p in self.model.named_parameters()}
         tensors |= {f"adam.{name}": value for name, value in self.optimizer.state_dict().items()}
         if self.exposures is not None:
@@ -349,7 +350,7 @@ class Trainer:
             self.exposures.load_state_dict(_under("exposure.", tensors))
 
     def save(self, path: Path, *, overwrite: bool = True) -> None:
-        """Write a checkpoint to `path`. All ranks must call this; rank 0 writes.
+        """Write a checkpoint to `path`. All ranks must call this, and rank 0 writes the file.
 
         Raises:
             HyrfError: the file cannot be written, or exists and `overwrite` is False.
@@ -373,7 +374,9 @@ class Trainer:
         self.saved = self.step
 
     def load(self, path: Path) -> None:
-        """Resume from the checkpoint at `path`, which rank 0 reads. The result equals that of an uninterrupted run.
+        """Resume from the checkpoint at `path`, so that the result equals that of an uninterrupted run.
+
+        All ranks must call this, and rank 0 reads the file.
 
         Raises:
             HyrfTrainingError: as `load_checkpoint`.
@@ -396,12 +399,12 @@ def _on_cpu(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
 
 
 def _under(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Select the tensors whose names start with `prefix`, and remove it from the names."""
+    """Return the tensors whose names start with `prefix`, by the names without it."""
     return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
 
 
 def _strategy_prefix(rank: int) -> str:
-    """Return the name prefix of what a rank has observed for density control, in a checkpoint."""
+    """Return the prefix that names of a rank's density control observations have in a checkpoint."""
     return f"density{rank or ''}."
 
 
