@@ -60,7 +60,7 @@ class EncodingCase:
 
 @torch.no_grad()
 def codec_rows(subject: Subject, repeats: int, note: Callable[[str], None]) -> Iterator[Row]:
-    """Measure encoding and decoding with every profile, and with each setting of it away from its default.
+    """Measure encoding and decoding with every profile, and with other values of each of its settings.
 
     Args:
         subject: the model to encode.
@@ -157,12 +157,12 @@ def _encoder(model: HybridModel, profile: str) -> tuple[Callable[..., bytes], di
     """Return a function that encodes the model with settings of a profile, and the defaults of the settings."""
     encode = partial(encode_model, model, profile)
     defaults = read_metadata(read_container(encode(), SECTION_CONTENTS)).settings
-    # JSON has no tuples, so that they were read as lists.
+    # JSON has no tuples, so they were read as lists.
     return encode, {name: tuple(value) if isinstance(value, list) else value for name, value in defaults.items()}
 
 
 def _compact_encoder(subject: Subject, note: Callable[[str], None]) -> tuple[Callable[..., bytes], dict]:
-    """Return the same as `_encoder` for profile "compact"; the sensitivity is measured once for all settings."""
+    """Do what `_encoder` does, for profile "compact"; the sensitivity is measured once for all settings."""
     start = perf_counter()
     with torch.enable_grad():
         sensitivity = measure_sensitivity(subject.model, subject.capture)

@@ -48,8 +48,8 @@ def plot(rows: Sequence[Row], path: str | os.PathLike[str], *, overwrite: bool =
     """Plot the rms error of each row against the ratio of its time to the reference's, both on logarithmic axes.
 
     There is one panel for each group. "render" has one for each setting with a curve. "codec" has one for the profiles
-    and one for each profile's settings, and each of these again with the file size. References are stars, defaults have
-    a ring. Results without any error lie on the line marked 0.
+    and one for each profile's settings; each is repeated with the file size as horizontal axis. References are stars,
+    defaults have a ring. Results without any error lie on the line marked 0.
 
     Args:
         rows: the measured rows.
@@ -164,7 +164,7 @@ def _draw_panel(axes: Axes, panel: Panel) -> list[tuple[Row, float, float, str]]
 
 
 def _draw_labels(axes: Axes, labels: Sequence[tuple[Row, float, float, str]]) -> None:
-    """Write values beside their points if there is room; references and defaults are placed first."""
+    """Write the values at their points if there is room; references and defaults are placed first."""
     scale = axes.figure.dpi / 72
     edge = axes.bbox.x1 / scale
     taken: list[Box] = []
@@ -189,7 +189,7 @@ def _draw_labels(axes: Axes, labels: Sequence[tuple[Row, float, float, str]]) ->
 
 
 def _overlap(a: Box, b: Box) -> bool:
-    """Whether two boxes overlap."""
+    """Return whether two boxes overlap."""
     return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
 
 

@@ -18,8 +18,8 @@ from hyrfpack.model import HybridModel
 from hyrfpack.render import RenderSettings, render_view
 
 # Values that are measured for each setting, the exact value first. `near` is left out, because it decides what belongs
-# to the picture. The exact `cull_tolerance` is not infinity: EWA projection is linearised about a centre and smears
-# Gaussians far outside the picture all over it. Training culls these Gaussians and never optimises them for such views.
+# to the picture. The exact `cull_tolerance` is not infinity: EWA projection is linear about a Gaussian's centre, so it
+# smears Gaussians far outside the picture across it. Training culls these and never optimises them for such views.
 RENDER_SETTING_VALUES: dict[str, tuple[Any, ...]] = {
     "background_threshold": (0.0, 1 / 512, 1 / 255, 0.01, 0.03, 0.1, 0.2, 0.3),
     "background_stride": (1, 2, 3, 4),
@@ -34,10 +34,10 @@ RenderTask = Callable[[], list[Tensor]]
 
 @torch.no_grad()
 def render_rows(subject: Subject, repeats: int, note: Callable[[str], None]) -> Iterator[Row]:
-    """Measure one setting at a time away from the defaults, then all of them together.
+    """Measure the values of one setting at a time with the defaults of all others, then all settings together.
 
-    The reference of a setting has its exact value and the defaults of all others. So the time is what a user saves by
-    this setting, and the error is caused by it alone. "all" compares the defaults with all exact values.
+    The reference of a setting has its exact value. So the difference in time is what this setting saves, and the error
+    is caused by it alone. The last setting, "all", compares the defaults with all exact values.
     """
     model, defaults = subject.model, RenderSettings()
     decoded = model.decode()

@@ -24,9 +24,9 @@ class Row:
         time: time of one call; in "render" of one picture, in "codec" of encoding.
         ratio: ratio of this time to the reference's; both were measured in turns.
         error: error of the result against the reference's. Pictures: in colour units, [0, 1]. Features and gradients:
-            the maximum relative to the reference's largest magnitude, the rms relative to its rms; the largest of all
-            gradients.
-        parts: the same for each part: relative errors of gradients by input, absolute errors of parameters by group.
+            the maximum relative to the reference's largest magnitude, the rms relative to its rms. Of several
+            gradients, the largest errors are given.
+        parts: errors of each part: relative errors of gradients by input, absolute errors of parameters by group.
         psnr, ssim: scores of 8-bit pictures, means over views, against the photos, or without photos against the
             reference's pictures. None if there is no picture.
         psnr_drop, ssim_drop: the reference's score minus this row's, in dB and SSIM. None without photos.

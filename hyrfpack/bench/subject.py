@@ -29,7 +29,7 @@ from hyrfpack.scene import Camera, Scene, View, evenly_spaced
 from hyrfpack.train import TrainConfig, train_model
 
 MAX_VIEWS = 6
-# Training of the built-in model.
+# Settings for training the built-in model.
 BUILT_IN_STEPS = 1000
 BUILT_IN_PHOTOS = 48
 BUILT_IN_PHOTO_SIDE_PIXELS = 200
@@ -98,7 +98,7 @@ class Subject:
 
 
 def read_subject(path: str | os.PathLike[str], scene: Scene | None) -> Subject:
-    """Read a model file; its viewpoints are a scene's held-out views, or an orbit around what it was trained on.
+    """Read a model file; its viewpoints are a scene's held-out views, or an orbit around the trained scene.
 
     Raises:
         HyrfError: the file cannot be read, has no Gaussians or no usable viewpoint, or no held-out photo can be scored.

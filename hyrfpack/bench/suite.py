@@ -18,7 +18,7 @@ from hyrfpack.measure.timing import MAX_SECONDS_PER_TASK
 from hyrfpack.scene import Scene
 
 # Groups in order of measurement. Each function takes a subject, the number of repeats, and a function that is called
-# with a sentence about everything that is left out.
+# with a sentence for each part that is left out.
 GROUPS: dict[str, Callable[[Subject, int, Callable[[str], None]], Iterator[Row]]] = {
     "rasterize": rasterize_rows,
     "hash_encode": hash_encode_rows,
@@ -30,7 +30,7 @@ GROUPS: dict[str, Callable[[Subject, int, Callable[[str], None]], Iterator[Row]]
 
 @dataclass(frozen=True)
 class BenchReport:
-    """Results of `bench`.
+    """Results of `benchmark_model`.
 
     Attributes:
         machine: the machine that the times belong to, see `describe_machine`.

@@ -101,7 +101,7 @@ def fill_page(text: str, blocks: dict[str, str], name: str = "the page") -> str:
 
 
 def empty_page(blocks: dict[str, str]) -> str:
-    """Make a Markdown page with a heading and an empty place for each block."""
+    """Make a Markdown page with a heading and empty insertion marks for each block."""
     return "\n".join(f"## {key}\n\n<!-- bench {key} -->\n{BLOCK_END}\n" for key in blocks)
 
 

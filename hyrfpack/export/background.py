@@ -34,8 +34,8 @@ MIN_CELL_LEVEL = 3
 MAX_CELL_LEVEL = 9
 # Where cameras see light, a cell's side is at most this share of the angle from a picture's middle to its nearest edge.
 MAX_LIT_CELL_VIEW_RATIO = 0.4
-# The weight of each direction of an even net, which matters only where no camera sees light. A pixel that Gaussians do
-# not cover weighs 1.
+# Weight of each direction of an even grid, which matters only where no camera sees light. A pixel that no Gaussian
+# covers has weight 1.
 UNSEEN_COLOR_WEIGHT = 1e-6
 
 MIN_SPLAT_BUDGET = 1000
@@ -43,7 +43,7 @@ SPLAT_BUDGET_PER_GAUSSIAN = 0.1
 MIN_DIVIDED_COLOR_STD = 1 / 512  # half a step of 8-bit colours
 SPLAT_OPACITY = 0.99  # the limit of the rasteriser
 SPLAT_SCALE_PER_CELL_SIDE = 0.7
-# A splat is farther away than one of the next finer level by this factor, so that finer ones are drawn over it.
+# Radius of each level's splats divided by that of the next finer level, so that finer splats are drawn over coarser.
 RADIUS_RATIO_PER_LEVEL = 1.1
 
 GAIN_SMOOTHING_RADIANS = math.pi / 2 / 2**MIN_CELL_LEVEL  # the side of a coarse cell
@@ -65,7 +65,7 @@ def background_splats(
     """Represent the background as round splats of one colour each (degree 0) around the scene, world units.
 
     The splats tile a sphere of `BACKGROUND_RADIUS` about the frame's centre; coarse ones lie somewhat farther away.
-    They overlap, so that a hundredth of the light passes, and a tenth in some corners.
+    They overlap, so that they let 1 % of the light pass, and 10 % in some corners.
 
     All cells are coarse at first. Where cameras see light through the scene, cells are divided into four, in the order
     of their error in the pictures: the sum of squared differences of their colours from the mean, weighted by the
@@ -76,7 +76,7 @@ def background_splats(
         model: a model on the CPU.
         cameras: cameras from which the model was photographed, world units. Without any, cells are divided where
             colours differ.
-        largest_scale: largest scale of the splats, world units. If they would be larger, the whole sphere shrinks.
+        largest_scale: largest allowed scale of a splat, world units. The sphere is shrunk until all splats comply.
         visibility: result of `compute_visibility` for the cameras, if it is known already.
 
     Returns:
@@ -180,12 +180,12 @@ def background_picture(
 class BackgroundGains:
     """Gains of the background as a smooth function of the direction, from the cameras that see it there.
 
-    The log gain along a direction d is a weighted mean over the cells of the sphere that cameras see. A cell with the
-    middle c weighs the light that cameras see of it, times exp(-|d - c|^2 / (2 s^2)), s = GAIN_SMOOTHING_RADIANS. So
-    directions that no camera sees get the gains of the nearest ones that a camera sees, without a step.
+    The log gain along a direction d is a weighted mean over the cells of the sphere that cameras see. The weight of a
+    cell is the light that cameras see of it, times exp(-|d - c|^2 / (2 s^2)), with c the cell's centre and
+    s = GAIN_SMOOTHING_RADIANS. Directions that no camera sees thus get the gains of the nearest cells, without a step.
 
     Attributes:
-        directions: (n, 3) float32 unit vectors to the middles of the cells that cameras see.
+        directions: (n, 3) float32 unit vectors to the centres of the cells that cameras see.
         log_light: (n,) float32 logarithm of the light that cameras see of each cell.
         log_gains: (n, 3) float32 mean log gains of the cells.
     """
@@ -282,7 +282,7 @@ def _accumulate_colors(
 
     Returns:
         sums: (6 * 4^MAX_CELL_LEVEL, 5) sums of w, w red, w green, w blue and w |color|^2 for each cell. They run over
-            pixels, with w = T^2 the squared transmittance, and over an even net of directions, with
+            pixels, with w = T^2 the squared transmittance, and over an even grid of directions, with
             w = UNSEEN_COLOR_WEIGHT.
         largest: largest acceptable side, in radians, of a cell whose light is seen.
     """
@@ -329,7 +329,7 @@ def _divide_sphere(
         spread = np.maximum(squares - (colors**2).sum(1) / np.maximum(weights, UNSEEN_COLOR_WEIGHT), 0)
         is_too_large = (weights > 1) & (math.pi / 2 / 2**level > largest)
         errors.append(np.where(is_too_large, np.inf, np.where(spread > MIN_DIVIDED_COLOR_STD**2 * weights, spread, 0)))
-    # A cell's error is at least the sum of its parts' errors, so that parents come before their parts in this order.
+    # A cell's error is at least the sum of its parts' errors, so sorting by error puts parents before their parts.
     all_errors = np.concatenate(errors)
     order = np.argsort(-all_errors, kind="stable")
     order = order[all_errors[order] > 0][: (budget - len(pyramid[0])) // 3]
@@ -350,11 +350,11 @@ def _divide_sphere(
 
 
 def find_cells(points: np.ndarray, level: int) -> np.ndarray:
-    """Find the cells (N,) in which points (N, 3) lie as seen from the origin.
+    """Find the cells (N,) that contain the directions from the origin to points (N, 3).
 
     The number of a cell is face 4^level + the interleaved bits of i and j, with the bit of i before that of j. The face
-    is 2 axis, plus 1 on the negative side; i and j count steps of equal angles along the next two axes. So a cell's
-    number divided by 4 is the number of its parent.
+    is 2 axis, plus 1 on the negative side; i and j count steps of equal angles along the next two axes. A cell's number
+    divided by 4, rounded down, is therefore the number of its parent.
     """
     rows = np.arange(len(points))
     axis = np.abs(points).argmax(1)
@@ -368,7 +368,7 @@ def find_cells(points: np.ndarray, level: int) -> np.ndarray:
 
 
 def cell_centers(cells: np.ndarray, level: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return unit vectors (N, 3) to the middles of cells (N,) of a level >= 1, and sides (N,) of the cells.
+    """Return unit vectors (N, 3) to the centres of cells (N,) of a level >= 1, and sides (N,) of the cells.
 
     The side of a cell is the square root of its solid angle, in radians.
     """

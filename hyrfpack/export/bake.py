@@ -41,7 +41,7 @@ TRANSMITTANCE_STRIDE_PIXELS = 2
 # the time goes to Python, which runs in one thread only.
 MIN_BLOCK_GAUSSIANS = 2048
 MAX_BLOCK_GAUSSIANS = 8192
-MIN_BLOCKS = 8  # where the model has enough Gaussians, so that all threads have work
+MIN_BLOCKS = 8  # gives all threads work, if the model has enough Gaussians
 
 
 @torch_on_one_thread()
@@ -55,16 +55,16 @@ def bake(
 ) -> dict[int, Splats]:
     """Bake a model to explicit Gaussians in world units, in the model's order, for each degree of spherical harmonics.
 
-    Scales, rotations and opacities are the model's own. Each Gaussian sends light w_v to the cameras v, the sum over
-    pixels of T alpha, scaled so that sum_v w_v = 1, along the directions d_v. Its harmonics h minimise
+    Scales, rotations and opacities are the model's own. The light w_v that a Gaussian sends to camera v, along the
+    direction d_v, is the sum of T alpha over pixels, scaled so that sum_v w_v = 1. Its harmonics h minimise
 
         sum_v w_v |f(d_v) - color(d_v)|^2
             + SPHERE_WEIGHT mean_s |f(d_s) - color(d_s)|^2
             + RIDGE_WEIGHT sum_{k > 0} |h_k|^2
 
     with f(d) = 0.5 + sum_k h_k Y_k(d) and SPHERE_DIRECTIONS directions d_s that cover the sphere evenly. The second
-    term keeps the colours close to the model's along directions from which no camera looks, at hardly any cost for the
-    cameras.
+    term keeps the colours close to the model's along directions from which no camera looks. It changes the colours that
+    the cameras see only slightly.
 
     If the model has an exposure map, color(d_v) is exposed by the gains of camera v. color(d_s) is exposed by the mean
     gains of the cameras that see the Gaussian or its neighbours (`BakeGains`), and EXPOSED_SPHERE_WEIGHT replaces
@@ -122,9 +122,9 @@ class CameraVisibility:
     Attributes:
         viewpoint: (3,) position of the camera, local units.
         index: (n,) int32 ascending indices of the Gaussians that the model draws and that send light.
-        light: (n,) float32 light of these.
+        light: (n,) float32 light that each of these sends, in pixels.
         culled_index: (m,) int32 ascending indices of the Gaussians that the model culls for this camera.
-        culled_light: (m,) float32 light of these, if nothing were culled.
+        culled_light: (m,) float32 light that each of these would send if nothing were culled, in pixels.
         transmittance: (H / stride, W / stride) transmittance of the drawn Gaussians, at every
             TRANSMITTANCE_STRIDE_PIXELS-th pixel in both directions.
     """
@@ -152,7 +152,7 @@ def compute_visibility(
     Raises:
         HyrfError: a camera's pose is NaN, infinite or beyond float32.
     """
-    # Cameras run in parallel, because much of the work for one camera uses one core only.
+    # Cameras are processed in parallel, because much of the work for one camera uses one core only.
     see = report_each_call(
         partial(_compute_camera_visibility, model, model.decode_geometry()),
         report,
@@ -162,7 +162,7 @@ def compute_visibility(
     return parallel_map(see, cameras)
 
 
-@torch.no_grad()  # because the setting is per thread
+@torch.no_grad()  # because torch keeps this setting per thread
 def _compute_camera_visibility(model: HybridModel, geometry: Geometry, camera: Camera) -> CameraVisibility:
     settings, positions = RenderSettings(), model.gaussians.positions.detach()
     camera = shrink_camera(camera)
@@ -179,7 +179,7 @@ def _compute_camera_visibility(model: HybridModel, geometry: Geometry, camera: C
     light = culled_light[drawn]
     culled_light[drawn] = 0
     culled_index = torch.nonzero(culled_light).squeeze(-1)
-    if len(culled_index):  # without them, the others send more light
+    if len(culled_index):  # the culled Gaussians no longer block the light of the others
         light, transmittance = compute_light(positions[drawn], geometry[drawn])
     lit = light > 0
     stride = TRANSMITTANCE_STRIDE_PIXELS

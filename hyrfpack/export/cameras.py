@@ -29,11 +29,11 @@ def write_colmap(
     *,
     overwrite: bool = True,
 ) -> None:
-    """Write a binary COLMAP model to `folder`/sparse/0. The photos belong into `folder`/images.
+    """Write a binary COLMAP model to `folder`/sparse/0. The photos belong in `folder`/images.
 
     The model has one PINHOLE camera for each distinct size and intrinsics, and one image without observations for each
-    photo, all numbered from 1 in order. The points are evenly picked centres of Gaussians that are not faint, without
-    tracks, from which a trainer can start. No table is replaced before all are written.
+    photo, all numbered from 1 in order. The points, from which a trainer can start, are evenly picked centres of
+    Gaussians that are not faint; they have no tracks. Existing tables are replaced only when all new ones are written.
 
     Args:
         cameras: names of the photos, relative to the photo folder, with their cameras.

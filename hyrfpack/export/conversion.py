@@ -84,7 +84,7 @@ def convert_splats(
         min_opacity: Gaussians with a lower opacity are left out.
         spz_version: version of ".spz" files, 4 or 3 (for programs that do not read 4), see `Hints`.
         overwrite: replace a file at `target`. If False, an existing file is an error. A file that appears during the
-            conversion is kept, and the result gets a free name beside it, which the report contains.
+            conversion is kept, and the result gets a free name in its folder, which the report contains.
         say: called with a sentence for each property of the splats that the format cannot hold.
         report: called with the current activity and the share of the work that is done, 0 to 1.
 

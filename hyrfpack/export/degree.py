@@ -14,8 +14,8 @@ from hyrfpack.model import HybridModel
 from hyrfpack.progress import Report, no_report, report_part
 from hyrfpack.scene import Camera, evenly_spaced
 
-# Every ninth camera, from the fifth on, is a validation camera. The cameras that `Source` makes up stand three above
-# one another; this slice takes middle ones.
+# Every ninth camera, from the fifth on, is a validation camera. `Source` makes up cameras at three heights in turn, of
+# which this slice takes the middle one.
 VALIDATION_CAMERAS = slice(4, None, 9)
 MAX_GAUSSIANS = 200_000
 # A lower degree takes fewer bytes, so it may score this much less than the best one.
@@ -33,12 +33,12 @@ def choose_degree(
 
     The model is baked at all degrees without the validation cameras. A degree's score is the PSNR of its pictures (of
     at most 512 pixels, without the background) against the model's at these cameras. With fewer than
-    MIN_CAMERAS_TO_HOLD_OUT cameras, all are fitted and all are compared, so that overfitting is not detected. Of models
-    with more than MAX_GAUSSIANS Gaussians, every n-th is used.
+    MIN_CAMERAS_TO_HOLD_OUT cameras, all are fitted and all are compared, so overfitting is not detected. In models with
+    more than MAX_GAUSSIANS Gaussians, every n-th is used.
 
     Args:
         model: a model on the CPU.
-        cameras: cameras at which colours may be fitted, world units; none at which the result will be measured.
+        cameras: cameras at which colours may be fitted, world units, without those that will measure the result.
         highest: highest degree to consider, 0 to 3.
         visibility: result of `compute_visibility` for the cameras, if it is known already.
         report: called with the current activity and the share of the work that is done, 0 to 1.

@@ -1,4 +1,4 @@
-"""Local exposure of baked splats: the gains that expose the colours to which splats are fitted.
+"""Local exposure of baked splats: the gains by which the colours are multiplied before splats are fitted to them.
 
 Splats have no exposure map, so their colours include the gains that the map predicts for the cameras that see them.
 """
@@ -22,8 +22,8 @@ from hyrfpack.scene import Camera
 if TYPE_CHECKING:
     from hyrfpack.export.bake import CameraVisibility
 
-# Without smoothing, indoor_room loses 0.18 dB at training cameras that are not fitted. 64 neighbours gain another
-# 0.05 dB but take four times as long.
+# Without smoothing, the set indoor_room loses 0.18 dB at training cameras that are not fitted. 64 neighbours gain
+# another 0.05 dB but take four times as long.
 SMOOTHING_NEIGHBORS = 16
 GAUSSIANS_PER_TASK = 1 << 16
 
@@ -44,7 +44,7 @@ class BakeGains:
     def predict(
         cls, model: HybridModel, cameras: Sequence[Camera], visibility: Sequence[CameraVisibility]
     ) -> BakeGains | None:
-        """Predict the gains of a bake's samples by the exposure map; None without a map, or where all gains are 1.
+        """Predict the gains of a bake's samples by the exposure map; None without a map, or if all gains are 1.
 
         The log gain of a Gaussian is a mean over the cameras and over its nearest neighbours, weighted by the light
         that each neighbour sends to each camera; see `smooth_log_gains`.

@@ -55,8 +55,8 @@ def export_player(
 ) -> ExportReport:
     """Write a folder of static files that plays a scene on any web server: a page, the file itself and a poster.
 
-    The page plays other files as well: one that its address names (`index.html?content=URL`), or one that is dropped
-    on it. `hyrf-viewer.js` beside it embeds the player into other pages: `<hyrf-viewer src="scene.hyrf">`.
+    The page also plays a file that its address names (`index.html?content=URL`) or that a user drops on it. The script
+    `hyrf-viewer.js` in the same folder embeds the player into other pages: `<hyrf-viewer src="scene.hyrf">`.
 
     Args:
         source: a `.hyrf` file or the folder of a run, or a file of splats (.ply, .spz, .splat, .sog), which is copied
@@ -87,7 +87,7 @@ def export_player(
 
 
 def _write_player(source: StrPath | None, output: _OutputFolder, data: Scene | None, say: Say) -> ExportReport:
-    """Write the files of `player` into a folder that this call has locked."""
+    """Write the files of `export_player` into a folder that the caller has locked."""
     title = _folder_title(output.path)
     content = poster = None
     stages = {}
@@ -124,7 +124,7 @@ def export_gallery(
     """Write a folder of static files that shows several scenes: a page that lists them, a player, and the files.
 
     Args:
-        sources: at least one source as in `player`; a scene from the folder of a run is named after the folder.
+        sources: at least one source as in `export_player`; a scene from the folder of a run is named after the folder.
         folder: output folder; created if it is missing. Files with other names stay.
         data: photos of each scene, or None. Held-out photos score a model, and the list shows the score. Without them
             the list shows how well the model fits its training photos, if the file states it.
@@ -156,7 +156,7 @@ def export_gallery(
 def _write_gallery(
     sources: Sequence[StrPath], output: _OutputFolder, scenes: Sequence[Scene | None], say: Say
 ) -> ExportReport:
-    """Write the files of `gallery` into a folder that this call has locked."""
+    """Write the files of `export_gallery` into a folder that the caller has locked."""
     contents = []
     for source, scene in zip(sources, scenes, strict=True):  # all are read before anything is written
         say(f"reading {source}")
@@ -182,12 +182,12 @@ def _write_gallery(
 def check_folder(
     folder: StrPath, sources: Sequence[StrPath], scenes: Sequence[Scene | None], *, overwrite: bool, is_gallery: bool
 ) -> None:
-    """Check that `player`, or `gallery` if `is_gallery`, may write into a folder.
+    """Check that `export_player`, or `export_gallery` if `is_gallery`, may write into a folder.
 
     Args:
-        folder, sources, scenes: arguments of `player` or `gallery`.
+        folder, sources, scenes: arguments of `export_player` or `export_gallery`.
         overwrite: existing files may be replaced, except those that are read.
-        is_gallery: check for the files of `gallery`.
+        is_gallery: check for the files of `export_gallery`.
 
     Raises:
         HyrfError: a file may not or cannot be written.
@@ -201,7 +201,7 @@ def check_folder(
 
 @dataclass(frozen=True)
 class _PlayableContent:
-    """A file to be played, with what the page says about it.
+    """A file to be played, with the facts and the picture that a page shows for it.
 
     Attributes:
         count: number of Gaussians.
@@ -222,7 +222,7 @@ class _PlayableContent:
         """Read a whole file, so that no damaged file is published.
 
         Args:
-            path, data, say: `source`, `data` and `say` of `player`.
+            path, data, say: `source`, `data` and `say` of `export_player`.
             with_quality: whether to determine the quality.
 
         Raises:
@@ -257,7 +257,7 @@ def _describe_quality(path: StrPath, model: HybridModel, data: Scene | None, say
 class _OutputFolder:
     """An output folder that counts the bytes written; each file is written completely or not at all.
 
-    The files refer to each other by name. So a file whose name is taken does not get another name, which is an error.
+    The files refer to each other by name. So if a name is taken, it is an error; no other name is chosen.
     """
 
     def __init__(self, path: Path, overwrite: bool) -> None:
@@ -288,7 +288,7 @@ def _choose_file_names(sources: Sequence[StrPath], *, is_gallery: bool) -> list[
 
 
 def _playable_ending(path: StrPath) -> str:
-    """Return the ending of a file to be played; a file without an ending of splats is taken for a model."""
+    """Return the ending of a file to be played; ".hyrf" for all files without an ending of splats."""
     ending = Path(path).suffix.lower()
     return ending if ending in READABLE_ENDINGS else HYRF_ENDING
 

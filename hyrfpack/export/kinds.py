@@ -36,7 +36,7 @@ ENDINGS = tuple(_KINDS_BY_ENDING)
 def find_file_kind(
     target: str | os.PathLike[str], colmap: bool = False, *, other_endings: tuple[str, ...] = ()
 ) -> FileKind:
-    """Find the kind of file that the ending of `target` names; a folder or a name without ending is for a player.
+    """Find the kind of file that the ending of `target` names; a folder or a name without ending means a player.
 
     Args:
         target: path of the output.
@@ -44,7 +44,7 @@ def find_file_kind(
         other_endings: further endings that the caller accepts, to be named in the error message.
 
     Raises:
-        HyrfError: the ending is none of ENDINGS, or does not go with `colmap`.
+        HyrfError: the ending is none of ENDINGS, or contradicts `colmap`.
     """
     name = Path(target).name.lower()
     if colmap:
@@ -80,7 +80,7 @@ def check_request(
     baked: bool = False,
     exposure: str = LOCAL_EXPOSURE,
 ) -> None:
-    """Check the arguments of `export` before any work. Raises HyrfError if they do not go together."""
+    """Check the arguments of `export_model` before any work. Raises HyrfError if they contradict each other."""
     if degree is not None and degree not in range(MAX_DEGREE + 1):
         raise HyrfError(f"spherical harmonics of degree {degree} are not supported", fix=f"use 0 to {MAX_DEGREE}")
     if crop is not None and (np.shape(crop) != (6,) or np.isnan(crop).any()):
@@ -134,7 +134,7 @@ def check_model(loaded: Source, kind: FileKind, crop: Sequence[float] | None, mi
     Args:
         loaded: the model.
         kind: the kind of file.
-        crop, min_opacity: as in `export`.
+        crop, min_opacity: as in `export_model`.
         sphere: whether the background sphere is exported, too.
 
     Raises:
@@ -142,7 +142,7 @@ def check_model(loaded: Source, kind: FileKind, crop: Sequence[float] | None, mi
     """
     model, frame = loaded.model, loaded.model.config.frame
     positions = frame.to_world(model.gaussians.positions.numpy())
-    if crop is not None or min_opacity > 0:  # checked early, because the bake raises no opacity
+    if crop is not None or min_opacity > 0:  # valid before the bake, because it raises no opacity
         positions = positions[selection_mask(positions, model.decode_geometry().opacities.numpy(), crop, min_opacity)]
     reach = max(float(np.abs(positions).max()), background_reach(frame) if sphere else 0.0)
     if reach > kind.max_coordinate:
@@ -154,7 +154,7 @@ def check_model(loaded: Source, kind: FileKind, crop: Sequence[float] | None, mi
 
 
 def select_splats(splats: Splats, crop: Sequence[float] | None = None, min_opacity: float = 0.0) -> Splats:
-    """Return the splats with centres in the box `crop` and opacities of at least `min_opacity`; see `export`.
+    """Return the splats with centres in the box `crop` and opacities of at least `min_opacity`; see `export_model`.
 
     Raises:
         HyrfError: no splat is left.

@@ -62,7 +62,7 @@ def measure_psnr(
     solid = torch.tensor(model.config.solid)
     drawables = {name: (Drawable.from_splats(splats, frame), behind) for name, (splats, behind) in candidates.items()}
 
-    @torch.no_grad()  # because the setting is per thread
+    @torch.no_grad()  # because torch keeps this setting per thread
     def scores_at(viewpoint: tuple[Camera, View | None]) -> dict[str, tuple[float, float | None]]:
         camera, view = viewpoint
         own = to_8bit(render_view(model, camera, decoded=decoded, background=sphere).rgb)
@@ -85,7 +85,7 @@ def measure_psnr(
 
 
 def _equirect_colors(picture: Tensor, camera: Camera) -> Tensor:
-    """Sample an equirectangular picture as a camera sees it at infinite distance; returns (H, W, 3)."""
+    """Return an equirectangular picture as a camera sees it at infinite distance, (H, W, 3)."""
     height, width, _ = picture.shape
     rows, columns = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
     points = torch.stack((columns, rows), -1).reshape(-1, 2) + 0.5

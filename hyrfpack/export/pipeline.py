@@ -81,14 +81,13 @@ def export_model(
     - .points.ply, .points.glb: the Gaussians' centres as coloured points, and the cameras as frusta;
     - .json: the cameras as a transforms.json.
 
-    The loss is not measured if the scene is cropped, or if the output holds only points, only cameras or the model
-    itself.
+    The loss is not measured for a cropped scene, nor for an output of only points, only cameras or the model itself.
 
     Args:
         source: the model, a `.hyrf` file or the folder of a run.
         target: the file or the folder to write.
-        degree: degree of the spherical harmonics, 0 to 3; ".splat" has 0. None chooses the lowest degree that looks as
-            good as any at validation cameras, at which the result is not measured.
+        degree: degree of the spherical harmonics, 0 to 3; ".splat" has 0. None chooses the lowest degree that scores
+            about as well as the best at validation cameras. The result is not measured at these.
         data: photos of the scene. Colours are fitted at the training cameras, and the held-out photos score the result.
             Without photos, the cameras that the file keeps are used, or else rings of cameras around the scene.
         crop: (min x, min y, min z, max x, max y, max z) in world units; Gaussians whose centres lie outside, and the
@@ -102,13 +101,14 @@ def export_model(
             same for a model without a map.
         colmap: write cameras and points into a folder, as a COLMAP model.
         overwrite: replace existing files. If False, an existing file is an error. A file that appears during the export
-            is kept: a single file gets a free name beside it, which the report contains; in a folder it is an error.
+            is kept: a single file gets a free name in its folder, which the report contains; in a folder it is an
+            error.
         say: called with notes on the progress.
         report: called with the current activity and the share of the work that is done, 0 to 1.
 
     Raises:
-        HyrfError: a file cannot be read or written, the options do not go together, or another call is writing into the
-            folder.
+        HyrfError: a file cannot be read or written, the options contradict each other, or another call is writing into
+            the folder.
         TypeError: `data` is not a Scene.
         ValueError: `exposure` is neither "local" nor "consistent".
 
@@ -153,7 +153,7 @@ def _export_checked(
     say: Say,
     report: Report,
 ) -> ExportReport:
-    """Export after the request has been checked; if the output is a folder, this call has locked it."""
+    """Export after the request has been checked; if the output is a folder, the caller has locked it."""
     loaded = Source.read(source, data)
     if kind is HTML_PAGE and not baked:
         return write_native_page(loaded, source, target, say, overwrite)
@@ -203,7 +203,7 @@ def _export_checked(
         say(f"fitting colours of {other} exposure for comparison")
         rival, _, rival_picture = bake_as(by_exposure[other], report=report_part(report, 0.4, 0.5))
         exposures = {exposure: (splats, picture), other: (rival, rival_picture)}
-    del bake_as, visibility  # because they are large for many Gaussians and cameras
+    del bake_as, visibility  # to free memory, because they are large for many Gaussians and cameras
     say(f"writing {len(splats) - count:,} Gaussians{' and the background' if sphere else ''}")
     report(f"writing {len(splats) - count:,} Gaussians", 0.5)
     if isinstance(kind, SplatFormat):
@@ -330,7 +330,7 @@ def _add_scores(
 def _add_exposure_scores(
     result: ExportReport, loaded: Source, exposures: ShownSplats, sphere: bool, report: Report
 ) -> ExportReport:
-    """Measure splats of both exposures against the model as photographed and against photos, and add the scores."""
+    """Add the scores of splats of both exposures, against the model as photographed and against photos."""
     scores = measure_psnr(loaded.model, exposures, loaded.measured_views, sphere=sphere, report=report)
     found = {name: scores[name] for name in SPLAT_EXPOSURES if name in scores}
     return replace(

@@ -24,11 +24,11 @@ class ExportReport:
         psnr: PSNR of the file's pictures, as read back from its bytes, against the model's own.
         photos_model, photos_file: PSNR of the model's and of the file's pictures against held-out photos, if given.
         exposure: exposure of the splats in the file, "local" or "consistent"; None for a model without an exposure map.
-            The model's pictures behind `psnr_baked`, `psnr` and `photos_model` have the same exposure.
+            The model's pictures for `psnr_baked`, `psnr` and `photos_model` have the same exposure.
         psnr_by_exposure: PSNR of baked splats with local and with consistent exposure, before rounding, against the
             model's pictures as photographed. Empty without an exposure map, or if it was not measured.
-        photos_by_exposure: the same against held-out photos, if given.
-        cameras: number of cameras in the file, if it is one of points or cameras.
+        photos_by_exposure: PSNR of the same splats against held-out photos, if given.
+        cameras: number of cameras in a file of points or of cameras.
     """
 
     file: str

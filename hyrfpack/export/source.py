@@ -41,7 +41,7 @@ class Source:
         up: (3,) unit vector that points up in the scene.
         center: (3,) point at the centre of interest, world units.
         photo_mse: mean squared error of the model's pictures against its photos, as stated in the file.
-        has_coarse_cameras: whether `cameras` are approximate, as small files keep them, and not to be trained on.
+        has_coarse_cameras: whether `cameras` are approximate, as in small files, and so unsuitable for training.
     """
 
     model: HybridModel
@@ -106,7 +106,7 @@ class Source:
 
 
 def _choose_up(cameras: list[Camera], up: np.ndarray) -> np.ndarray:
-    """Return the unit vector that points up, corrected for cameras that look down on a flat scene, as drones do.
+    """Return the unit vector that points up, also for cameras that look straight down, as those of drones do.
 
     Such cameras share a forward direction while their pictures are rotated against each other; up is opposite to it.
     """

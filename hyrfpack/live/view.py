@@ -28,7 +28,7 @@ class LiveView:
 
     A snapshot is a `.hyrf` file in memory with profile "raw", which is the fastest to write. Snapshots are taken after
     the first and the last step, and in between at intervals of at least MIN_INTERVAL_SECONDS and MIN_INTERVAL_RATIO.
-    The model is only read, so a training with a live view gives the same model, bit by bit, as one without.
+    The model is only read, so training with a live view gives the same model, bit by bit, as training without.
 
     Attributes:
         scene: the newest snapshot.
@@ -43,7 +43,7 @@ class LiveView:
         """Create a view without a snapshot.
 
         Args:
-            clock: returns the present time in seconds.
+            clock: returns the current time in seconds.
         """
         self.scene = MemoryFile(b"")
         self.updates = MemoryFile(_encode_progress(0, 0, 0))

@@ -17,7 +17,7 @@ from hyrfpack.splats.table import FORMATS
 
 READABLE_ENDINGS = tuple(
     ending for ending, row in FORMATS.items() if row.is_readable
-)  # .compressed.ply files end in .ply
+)  # ".compressed.ply" is covered by ".ply"
 MAX_LISTED_NAMES = 4
 MAX_FILE_BYTES = 1 << 32  # a PLY of this size holds 17 million Gaussians
 
@@ -28,7 +28,7 @@ def encode_splats(
     """Encode splats as the bytes of a file.
 
     Args:
-        splats: the splats, in the axes and units that the file shall have.
+        splats: the splats, in the axes and units of the file.
         extension: ending of the format, one of FORMATS. ".splat" holds no harmonics beyond degree 0.
         up: (3,) unit vector in world axes that points up, for the formats that store it (glTF, USD).
         camera: initial camera, for the formats that store one (USD).
@@ -85,7 +85,7 @@ def _read_unbundled_sog(folder: Path) -> dict[str, bytes]:
 
 
 def _format_names(names: list[str]) -> str:
-    """Format the first few names of a folder's files, with the number of the others."""
+    """Format the first few names of a folder's files, and the number of the others."""
     more = f" and {len(names) - MAX_LISTED_NAMES} more" if len(names) > MAX_LISTED_NAMES else ""
     return (", ".join(sorted(names)[:MAX_LISTED_NAMES]) or "nothing") + more
 

@@ -1,4 +1,4 @@
-"""Recognition of splats by their paths, without torch, so that the command line can tell before it loads a reader."""
+"""Recognition of splats by their paths. It imports no torch, so that the command line starts fast."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ SOG_META_NAME = "meta.json"
 def is_splats(path: str | os.PathLike[str]) -> bool:
     """Return whether a path names 3D Gaussians of another program.
 
-    It does if it ends in one of SPLATS_SUFFIXES, or is the folder or the meta.json of an unbundled SOG.
+    Such a path ends in one of SPLATS_SUFFIXES, or is the folder or the meta.json of an unbundled SOG.
     """
     path = Path(path)
     return path.suffix.lower() in SPLATS_SUFFIXES or path.name == SOG_META_NAME or _is_sog_folder(path)

@@ -11,7 +11,7 @@ import numpy as np
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.splats.splats import Splats
 
-# A scene farther from the origin than this gets an origin of its own. Up to there, float32 resolves at least
+# A scene farther from the origin than this gets an origin of its own. Up to this distance, float32 resolves at least
 # 1/2,000,000 of the scene's size.
 _MAX_DISTANCE_IN_SCENE_SIZES = 8
 
@@ -19,8 +19,8 @@ _MAX_DISTANCE_IN_SCENE_SIZES = 8
 def upright_rotation(up: np.ndarray, target_up: np.ndarray) -> np.ndarray:
     """Return a rotation (3, 3) that maps `up` to `target_up`.
 
-    Where the two point in opposite directions, a half turn about x comes first, as between the axes of OpenCV and
-    OpenGL. The shortest rotation alone would change its heading with every small change of `up`.
+    If the two point in opposite directions, a half turn about x comes first, as between the axes of OpenCV and OpenGL.
+    Without it, small changes of `up` would change the axis of the shortest rotation completely.
 
     Args:
         up: (3,) unit vector that points up in the scene.
@@ -36,7 +36,7 @@ def upright_rotation(up: np.ndarray, target_up: np.ndarray) -> np.ndarray:
 def local_origin(positions: np.ndarray) -> np.ndarray:
     """Choose the origin (3,) float64 relative to which float32 positions are stored.
 
-    It is the world's origin, unless the scene is far from that compared to its size. Then it is a point with round
+    It is the world's origin unless the scene is far from there compared to its size. Otherwise it is a point with round
     coordinates near the scene's middle.
 
     Args:

@@ -41,8 +41,8 @@ class SplatFormat(FileKind):
 
     Attributes:
         encode: turns splats, in the input's axes and units, into the bytes of a file. Raises HyrfError.
-        decode: turns the bytes of a file, and its name in error messages, into splats in the axes that `encode` was
-            given. Raises HyrfDataError where the bytes are damaged or of another format.
+        decode: turns the bytes of a file, and its name in error messages, into splats in the axes of the splats that
+            `encode` took. Raises HyrfDataError if the bytes are damaged or of another format.
         is_readable: whether `read_splats` accepts the format. The others are decoded only to measure what was written.
     """
 

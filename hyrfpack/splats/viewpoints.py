@@ -1,4 +1,4 @@
-"""Sampling of cameras for splats that come without any: cameras that see much of the scene from clear positions."""
+"""Sampling of cameras for splats that have none: cameras that see much of the scene from unobstructed positions."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ class WeightedSplats:
         splats: the splats.
         areas: (N,) float64 opacity times the product of the two larger scales, squared world units, limited to their
             MAX_AREA_QUANTILE.
-        detail_weights: (N,) float64 opacity, times the median area over the splat's own where that is larger. Large
-            splats weigh less, because they make up what is far from all cameras, such as a sky.
+        detail_weights: (N,) float64 opacity times min(1, m / a), with a the product of the splat's two larger scales
+            and m the median of a. Large splats weigh less, because they represent distant things, such as a sky.
         frame: the box between the FRAME_QUANTILES of the detail weights along each axis.
-        target_weights: (N,) float64 areas, divided beyond the box by the fourth power of the distance in boxes, because
-            a sky is large and far away.
+        target_weights: (N,) float64 areas / max(1, d)^4, with d the largest coordinate in units of the box's half-axes.
+            Distant splats weigh less, because a sky is large and far away.
     """
 
     splats: Splats
@@ -118,9 +118,9 @@ def sample_viewpoints(
 
     Cameras outside stand in all directions and at distances spread evenly in their logarithm. They look at splats
     sampled by `target_weights`. Cameras inside look at splats sampled by `detail_weights`, because walls and skies
-    would fill most of the pictures otherwise. Both kinds keep at most MAX_CLUTTER of the sphere around them covered by
-    near splats, and show splats on at least MIN_COVERAGE of the picture, as long as such views are found among
-    CANDIDATES_PER_CAMERA times `count` candidates.
+    would fill most of the pictures otherwise. In both cases, near splats cover at most MAX_CLUTTER of the sphere around
+    a camera, and splats cover at least MIN_COVERAGE of its picture. If CANDIDATES_PER_CAMERA times `count` candidates
+    contain too few such views, the next best are used.
 
     Args:
         weighted: the splats with their weights.
@@ -158,21 +158,21 @@ def sample_viewpoints(
 def coverage(drawable: Drawable, camera: Camera) -> float:
     """Measure the share of a camera's picture that splats cover, 0 to 1, in a small picture of every n-th splat."""
     stride = _choose_stride(len(drawable.positions))
-    # With n times as many splats like these, the n-th power of the transmittance would remain.
+    # All splats, n times as many, would let the n-th power of this transmittance through.
     seen = draw(drawable[::stride], shrink_camera(camera, THUMBNAIL_SIDE_PIXELS), black=True).transmittance ** stride
     return 1 - float(seen.mean())
 
 
 def _choose_stride(count: int) -> int:
-    """Return the n for which every n-th of `count` splats makes at most MAX_SAMPLED_SPLATS."""
+    """Return the smallest n for which every n-th of `count` splats gives at most MAX_SAMPLED_SPLATS splats."""
     return max(1, -(-count // MAX_SAMPLED_SPLATS))
 
 
 def has_enclosed_places(weighted: WeightedSplats, drawable: Drawable) -> bool:
-    """Return whether the box has places that are clear of near splats and have splats in nearly all directions.
+    """Return whether the box has places without near splats from which splats are seen in nearly all directions.
 
-    The clearest of ENCLOSURE_CANDIDATES places are tested. Splats have to cover MIN_ENCLOSED_COVERAGE of all directions
-    from half of them.
+    The clearest of ENCLOSURE_CANDIDATES places are tested. From at least half of them, splats have to cover
+    MIN_ENCLOSED_COVERAGE of all directions.
     """
     rng = np.random.default_rng(0)
     places = [_sample_inside_view(weighted, rng)[0] for _ in range(ENCLOSURE_CANDIDATES)]

@@ -33,7 +33,7 @@ def bundle(entry: str) -> str:
         ValueError: a module uses another form, modules import each other in a circle, two modules define the same name,
             or the script holds text that would end its script element.
     """
-    placed: dict[str, str | None] = {}  # module path -> its bare text, None while its imports are placed
+    placed: dict[str, str | None] = {}  # stripped text by module path, None while the module's imports are placed
     owners: dict[str, str] = {}
 
     def place(path: str) -> None:
@@ -60,7 +60,7 @@ def bundle(entry: str) -> str:
                 lines.append(_EXPORT_KEYWORD.sub("", line))
         for other in needed:
             place(other)
-        del placed[path]  # inserted again, it comes after the modules that it needs
+        del placed[path]  # so that the next line inserts it after the modules that it needs
         placed[path] = "\n".join(lines)
 
     place(entry)

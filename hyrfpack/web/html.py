@@ -97,9 +97,9 @@ def encode_splats_page(
         background: (H, W, 3) RGB in [0, 1] of the background: pixel (row v, column u) is at longitude
             phi = 2 pi (u + 0.5) / W - pi and latitude lam = pi / 2 - pi (v + 0.5) / H, in the world's direction
             (cos lam sin phi, -sin lam, cos lam cos phi). None for the colour `solid`.
-        near: near plane in world units; splats nearer than it are not drawn.
-        sphere: centre (3,), from which directions count, and radius of the sphere that the background lies on, world
-            units; None for a background that is infinitely far away.
+        near: near plane in world units; splats in front of it are not drawn.
+        sphere: centre (3,) and radius of the sphere that the background lies on, world units. Directions are relative
+            to the centre. None for a background that is infinitely far away.
         title, cameras, up, center, solid, poster: as for `encode_model_page`.
 
     Returns:
@@ -207,7 +207,7 @@ def _page_description(count: int, length: int) -> str:
 
 
 def _page_origin_and_unit(splats: Splats) -> tuple[np.ndarray, float]:
-    """Return the page's origin in the world and its unit: the least power of two in which all splats fit into SPZ."""
+    """Return the page's origin in the world and its unit, the smallest power of two with which all splats fit SPZ."""
     if not len(splats):
         return np.zeros(3), 1.0
     low, high = splats.positions.min(0), splats.positions.max(0)

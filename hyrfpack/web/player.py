@@ -23,7 +23,7 @@ SHADER_SUFFIXES = (".vert", ".frag", ".glsl")
 # The browser decodes one base64 block while it loads the next one. A multiple of 3 needs no padding.
 PAYLOAD_BLOCK_BYTES = 3 << 20
 GZIP_WINDOW_BITS = 31  # zlib's value for the largest window with a gzip header, which holds no time and no name
-# Sources in the content security policy of a player whose address may name a file on any server.
+# Content security policy sources of a player whose address may name a file on any server.
 ANY_SOURCE = "'self' https: http:"
 
 
@@ -41,12 +41,12 @@ def encode_player(
 
     Args:
         title: title of the page.
-        content: address, relative to the page, of the file that it plays when its own address names none; None for
-            none.
+        content: address, relative to the page, of the file that it plays if its own address names none; None for no
+            such file.
         poster: address, relative to the page, of the picture that is shown while that file loads; None for none.
         description: description for those who share the page.
         fetches: sources that the page may fetch from, in the syntax of a content security policy.
-        stages: from where to look at `.hyrf` files beside the page, by their address relative to it; see
+        stages: initial cameras for `.hyrf` files, by the file's address relative to the page; see
             `html.encode_stage`.
         updates: address of a JSON file that says which snapshot of a training `content` is: {"snapshot": number from 1,
             0 while there is none, "step", "steps"}. The page requests it repeatedly and shows newer snapshots from the
@@ -107,7 +107,7 @@ def assemble_player_page(
 
 
 def content_security_policy(style: str, scripts: Sequence[str] = (), fetches: str = "") -> str:
-    """Return a content security policy by which only the page's own scripts run and only `fetches` are fetched.
+    """Return a content security policy that allows only the page's own scripts, and fetches only from `fetches`.
 
     Args:
         style: text of the page's style element.
@@ -135,7 +135,7 @@ def meta_tags(title: str, description: str, image: str | None = None) -> str:
 
 
 def encode_element_script() -> bytes:
-    """Return the script that defines <hyrf-viewer> for other people's pages and adds no global names to them."""
+    """Return the script that defines <hyrf-viewer> for pages of other authors and adds no global names to them."""
     return f"(() => {{\n{read_script('element.js')}\n}})();\n".encode()
 
 
@@ -182,7 +182,7 @@ def read_script(name: str) -> str:
 
 
 def _hash_source(text: str) -> str:
-    """Return the source by which a content security policy allows an inline text."""
+    """Return the hash source by which a content security policy allows an inline script or style."""
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
 
 

@@ -54,7 +54,7 @@ def serve(
     open_browser: bool,
     say: Callable[[str], None],
 ) -> None:
-    """Serve a page, and files beside it, until interrupted (Ctrl-C), which is the normal end.
+    """Serve a page and files until interrupted by Ctrl-C, which is the normal end.
 
     Files on disk are read in chunks on request, whole or by byte range (RFC 9110, one range for each request). A file
     that changes gets another ETag, and a file that is removed is not found.
@@ -73,7 +73,7 @@ def serve(
     with _create_server(host, port, page, files or {}) as server:
         address = _page_address(host, server)
         say(address)
-        if open_browser:  # in a thread, because some browsers do not return before they are closed
+        if open_browser:  # in a thread, because opening some browsers blocks until they are closed
             threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
         with contextlib.suppress(KeyboardInterrupt):
             server.serve_forever()
@@ -97,7 +97,7 @@ def serve_in_thread(page: bytes, files: ServedFiles, *, port: int = 0) -> Iterat
         finally:
             server.shutdown()
             thread.join()
-            server.page, server.files = b"", {}  # connections that browsers keep open must find nothing any more
+            server.page, server.files = b"", {}  # connections that browsers keep open must get nothing from now on
 
 
 def _page_address(host: str, server: _Server) -> str:
@@ -116,7 +116,7 @@ class _Server(ThreadingHTTPServer):
 
 class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
-    timeout = 60  # seconds, so that a silent browser does not occupy a thread for ever
+    timeout = 60  # seconds, so that an idle connection does not occupy a thread for ever
     server: _Server
 
     def do_GET(self) -> None:
@@ -191,7 +191,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.end_headers()
 
     def log_message(self, format: str, *args: object) -> None:
-        """Print nothing, because requests are of no interest to the user."""
+        """Print nothing, because users need no log of requests."""
 
 
 def _open_on_disk(path: Path) -> tuple[BinaryIO, int, str]:

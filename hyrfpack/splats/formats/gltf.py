@@ -50,7 +50,7 @@ _ARRAY_BUFFER_TARGET = 34962
 _DTYPE_BY_COMPONENT_TYPE = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5126: np.float32}
 _WIDTH_BY_ACCESSOR_TYPE = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 _MAX_NODES = 10_000
-# A file with fewer bytes per splat repeats the same data, and would unpack to far more than its size.
+# A file with fewer bytes per splat must refer to the same data repeatedly, and would unpack to far more than its size.
 _MIN_BYTES_PER_SPLAT = 16
 _MAX_FILE_BYTES = (1 << 32) - 1  # because lengths in the file are uint32
 
@@ -126,7 +126,7 @@ def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
 
 
 def decode(data: bytes, name: str, *, upright: bool = False) -> Splats:
-    """Decode a .glb file: one that `encode` wrote, or any other in the ratified form, with floats or smaller integers.
+    """Decode a .glb file in the ratified form, with floats or smaller integers, written by `encode` or any program.
 
     The result holds all splats of the file's default scene, one node after the other, transformed by their nodes.
     `antialiased` is False, because glTF does not store it.
@@ -189,14 +189,14 @@ def _harmonics_semantics(degree: int) -> list[str]:
 
 
 def linear_colors(splats: Splats) -> np.ndarray:
-    """Return the colours of degree 0 as linear RGB, which glTF's COLOR_0 means, with the opacities: (N, 4) uint8."""
+    """Return the colours of degree 0 as linear RGB, as glTF defines COLOR_0, with the opacities: (N, 4) uint8."""
     srgb = splats.base_colors
     linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
     return np.round(255 * np.column_stack((linear, splats.opacities))).astype(np.uint8)
 
 
 def _read_chunks(data: bytes, name: str) -> tuple[dict[str, Any], memoryview]:
-    """Return the parsed JSON and the binary chunk, which is empty where the file has none."""
+    """Return the parsed JSON and the binary chunk, which is empty if the file has none."""
     if len(data) < _HEADER_STRUCT.size + _CHUNK_HEADER_STRUCT.size or data[:4] != b"glTF":
         raise HyrfDataError(f"{name}: this is not a .glb file", fix="check the path")
     _, version, length = _HEADER_STRUCT.unpack_from(data)
@@ -259,7 +259,7 @@ def _local_transform(node: dict[str, Any]) -> np.ndarray:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T
     x, y, z, w = np.array(node.get("rotation", (0, 0, 0, 1)), np.float64)
     quat = np.array([[w, x, y, z]])
-    rotation = rotation_matrices(quat / (math.hypot(*quat[0]) or 1))[0]  # hypot, because its squares cannot overflow
+    rotation = rotation_matrices(quat / (math.hypot(*quat[0]) or 1))[0]  # hypot cannot overflow, unlike squares
     matrix = np.eye(4)
     matrix[:3, :3] = rotation * np.array(node.get("scale", (1, 1, 1)), np.float64)
     matrix[:3, 3] = np.array(node.get("translation", (0, 0, 0)), np.float64)

@@ -1,4 +1,4 @@
-"""Optional information that a format's `encode` takes besides the splats; few formats use any of it."""
+"""Optional information that a format's `encode` takes in addition to the splats; few formats use it."""
 
 from __future__ import annotations
 

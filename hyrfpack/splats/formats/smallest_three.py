@@ -11,7 +11,7 @@ _OTHER_COMPONENTS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 def drop_largest(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Remove the component of largest magnitude from each unit quaternion; it follows from the other three.
 
-    q and -q are the same rotation. The components are those of the sign whose largest component is positive.
+    q and -q are the same rotation. Of these two, the one whose largest component is positive is encoded.
 
     Args:
         quats: (N, 4) unit quaternions, with components in the file's order.

@@ -53,13 +53,13 @@ _GAUSSIANS_PER_PALETTE_ROW = 4
 _MAX_WRITTEN_PALETTE_ROWS = 16384  # because more rows take much longer
 _MAX_PALETTE_ROWS = 65536  # because labels have 16 bits
 
-# More effort (method 4 to 6, quality 75 to 100) takes up to 30 times as long and makes these pictures larger.
+# Higher settings (method 4 to 6, quality 75 to 100) take up to 30 times as long and make these pictures larger.
 _WEBP_OPTIONS = {"lossless": True, "exact": True, "method": 2, "quality": 50}
 
 _MAX_GAUSSIANS = 1 << 26
 # The limits below protect a reader against small files that would unpack to very large arrays.
 _MAX_PIXELS_PER_GAUSSIAN = 4
-_EXTRA_PIXELS = 1 << 16  # allowed in addition to those of the Gaussians
+_MAX_EXTRA_PIXELS = 1 << 16
 _MAX_META_BYTES = 1 << 20
 _MAX_GAUSSIANS_WITHOUT_BYTES = 1 << 20  # each further Gaussian needs a byte of the file
 
@@ -160,7 +160,7 @@ def unzip(data: bytes, name: str) -> dict[str, bytes]:
                 files[wanted] = archive.read(member)
     except HyrfDataError:
         raise
-    except Exception as error:  # zipfile passes on a dozen types of error from the modules that it uses
+    except Exception as error:  # zipfile lets a dozen types of error through from the modules that it uses
         raise HyrfDataError(f"{name}: the zip cannot be unpacked ({error})", fix="get the file again") from error
     return files
 
@@ -207,7 +207,7 @@ def decode_files(files: Mapping[str, bytes], name: str) -> Splats:
     def pixels(group: str, number: int = 0) -> np.ndarray:
         file = _get_picture_name(meta, group, number, name)
         picture = _read_picture(
-            _get_file(files, file, name), _MAX_PIXELS_PER_GAUSSIAN * count + _EXTRA_PIXELS, f"{name}: {file}"
+            _get_file(files, file, name), _MAX_PIXELS_PER_GAUSSIAN * count + _MAX_EXTRA_PIXELS, f"{name}: {file}"
         )
         picture = picture.reshape(-1, 4)
         if len(picture) < count:
@@ -350,7 +350,7 @@ def _read_picture(data: bytes, max_pixels: int, name: str) -> np.ndarray:
 
 
 def _find_member(archive: zipfile.ZipFile, file: str, bytes_left: int, name: str) -> zipfile.ZipInfo:
-    """Find a file in the zip and check that it has at most `bytes_left` bytes and a method that unpacks in pieces."""
+    """Find a file in the zip and check that it has at most `bytes_left` bytes and is stored or deflated."""
     if file not in archive.NameToInfo:
         raise HyrfDataError(f"{name}: the zip has no {file}, so that it is damaged or not a SOG", fix="export it again")
     member = archive.getinfo(file)
@@ -359,7 +359,7 @@ def _find_member(archive: zipfile.ZipFile, file: str, bytes_left: int, name: str
             f"{name}: {file} unpacks to {member.file_size:,} bytes, far too many",
             fix="the file is damaged, export it again",
         )
-    # Other methods ignore the declared size when they unpack.
+    # With other methods, zipfile does not limit how much a piece of the file unpacks to.
     if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise HyrfDataError(
             f"{name}: {file} is packed by method {member.compress_type}",
@@ -421,7 +421,7 @@ def _get_floats(meta: dict, group: str, key: str, name: str, length: int) -> np.
     """Read a list of `length` finite numbers from meta.json as float64."""
     values = meta[group].get(key) if isinstance(meta.get(group), dict) else None
     values = list(values) if isinstance(values, list) and len(values) == length else [math.nan]
-    is_first_missing = length == _CODEBOOK_ENTRIES and values[0] is None  # as some old writers leave it
+    is_first_missing = length == _CODEBOOK_ENTRIES and values[0] is None  # some old writers omit this entry
     # Numbers beyond float32 are as useless here as infinite ones.
     if not all(type(value) in (int, float) and abs(value) < 1e38 for value in values[is_first_missing:]):
         raise HyrfDataError(

@@ -48,19 +48,18 @@ _ANTIALIASED_FLAG = 0x01
 _EXTENSIONS_FLAG = 0x02
 _LOD_TREE_FLAG = 0x80
 
-_FRACTIONAL_BITS_RANGE = range(1, 24)  # because all readers that we know accept these
+_FRACTIONAL_BITS_RANGE = range(1, 24)  # because all known readers accept these
 MAX_COORDINATE = (1 << 22) - 1  # world units
 
-# With 6 of 8 bits, pictures of two models have 48 and 51 dB against those before. With all 8 bits it is 51 and 53 dB,
-# in files larger by 33 and 16 %. With the usual choice (5 bits for degree 1, 4 above) it is 38 and 45 dB, in files
-# smaller by 22 and 11 %.
+# With 6 of 8 bits, pictures of two models have 48 and 51 dB against those of the unencoded splats. All 8 bits give 51
+# and 53 dB, in files larger by 33 and 16 %. The usual choice (5 bits for degree 1, 4 above) gives 38 and 45 dB, in
+# files smaller by 22 and 11 %.
 _KEPT_HARMONICS_BITS = 6
-_MAX_FILE_DEGREE = 4  # of files that are read; splats in memory end at MAX_DEGREE
+_MAX_READABLE_DEGREE = 4  # is higher than MAX_DEGREE, because decoding drops the harmonics of degree 4
 
 _DEFLATE_PIECE_BYTES = 1 << 22
 
-# A file whose sections unpack to far more than their size could exhaust memory. Real scenes do not even reach a ratio
-# of 20.
+# A file whose sections unpack to far more than their size could exhaust memory. Real scenes stay below a ratio of 20.
 _UNCHECKED_CONTENT_BYTES = 1 << 26
 _MAX_COMPRESSION_RATIO = 100
 
@@ -82,8 +81,8 @@ def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
 
     The format rounds
 
-    - positions to multiples of 2^-b, with b the most fractional bits, at most 23, that the farthest coordinate allows:
-      to 1/4,194,304 of that coordinate or finer, or else to 2^-23;
+    - positions to multiples of 2^-b, with b the largest number of fractional bits, at most 23, that the farthest
+      coordinate allows: to 1/4,194,304 of that coordinate or finer, or else to 2^-23;
     - scales to steps of 6 %, clamped to 4.5e-5 to 379 units;
     - opacities to 1/255 and quaternions to 1/723;
     - harmonics of degree 0 to 1/38, clamped to -3.3 to 3.3, and higher ones to 1/32, clamped to -1 to 1.
@@ -93,7 +92,7 @@ def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
         hints: `spz_version`, one of SPZ_VERSIONS, is used.
 
     Raises:
-        ValueError: the version is another.
+        ValueError: the version is not one of SPZ_VERSIONS.
         HyrfDataError: a position is too far from the origin (more than 4,194,303 units).
     """
     version = hints.spz_version
@@ -194,7 +193,7 @@ def _read_header(header: bytes, versions: range, stored: int, name: str) -> tupl
             f"{name}: this is SPZ version {version}, and versions 1 to 3 (gzip) and 4 (plain header) can be read",
             fix="export it as one of these",
         )
-    if degree > _MAX_FILE_DEGREE or bits > 31:
+    if degree > _MAX_READABLE_DEGREE or bits > 31:
         raise HyrfDataError(
             f"{name}: the header says harmonics of degree {degree} and {bits} fractional bits, but the limits are 4 "
             "and 31",
@@ -217,7 +216,7 @@ def _read_header(header: bytes, versions: range, stored: int, name: str) -> tupl
 def _compress_gzip(contents: list[bytes]) -> bytes:
     """Compress contents as one gzip member without name and time, so that the bytes are the same on any system.
 
-    Pieces are deflated independently, in parallel, so that the codes of each piece fit its section. At level 5 the
+    Pieces are deflated independently and in parallel, so that the codes of each piece suit its section. At level 5 the
     result is as small as one stream at level 6, in half the time.
     """
     pieces = [
@@ -241,7 +240,7 @@ def _compress_gzip(contents: list[bytes]) -> bytes:
 
 
 def _read_gzip(data: bytes, name: str) -> _UnpackedFile:
-    """Read the sections of a file of version 1 to 3. Unpacks no more bytes than the header's count needs."""
+    """Read the sections of a file of version 1 to 3, without unpacking more bytes than the header's count needs."""
     stream = zlib.decompressobj(16 + zlib.MAX_WBITS)
     try:
         header = stream.decompress(data, _HEADER_STRUCT.size)
@@ -309,7 +308,7 @@ def _read_streams(data: bytes, name: str) -> _UnpackedFile:
 
 
 def _decompress_zstd(stream: bytes, length: int, name: str) -> bytes:
-    """Decompress a zstd stream of exactly `length` bytes. Unpacks no more than one byte beyond these."""
+    """Decompress a zstd stream of exactly `length` bytes, without unpacking more than one byte beyond these."""
     if not length:
         return b""
     try:

@@ -43,7 +43,7 @@ REQUIRED_PACKAGE = "pxr", "usd-core"
 _SPLATS_TYPE_NAME = "ParticleField3DGaussianSplat"
 # In tenths of a scene unit, like USD's focal lengths. Only its ratio to the focal length matters.
 _HORIZONTAL_APERTURE = 36.0
-# The clipping range of the camera: near plane over median depth, far plane over the largest reach of a splat.
+# Clipping range of the camera: near plane over median depth, and far plane over the distance of the farthest splat.
 _NEAR_MEDIAN_DEPTH_RATIO = 0.01
 _FAR_MAX_REACH_RATIO = 1.1
 _USDZ_ALIGNMENT_BYTES = 64
@@ -99,8 +99,8 @@ def encode(
 def decode(data: bytes, name: str, extension: Extension, *, upright: bool = False) -> Splats:
     """Decode a USD file like those of `encode`: float32 arrays, one field of splats, no references to other files.
 
-    It serves to measure the loss of an export. usd-core parses the bytes, so this function is no safer with hostile
-    files than usd-core is.
+    The loss of an export is measured with it. usd-core parses the bytes, so hostile files are as dangerous here as in
+    usd-core.
 
     Args:
         data: the file's bytes.

@@ -19,7 +19,7 @@ def build_valid_splats(
 ) -> Splats:
     """Build Splats from decoded arrays and raise an error for numbers that are not finite.
 
-    Only the shapes of the arrays have to be right.
+    The caller guarantees only the shapes of the arrays.
 
     Args:
         name: the file's name in error messages.
