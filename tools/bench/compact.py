@@ -1,7 +1,7 @@
 """Measure speed, size and memory of `compact` files, with and without Numba, against `raw` files of the same models.
 
-The models are random: points near a wavy surface, logits that vary slowly with added noise, and sensitivities that
-spread over decades as those of trained models do. The error is that of the explicit logits against the encoded model;
+The models are random: points near a wavy surface, logits that vary slowly with added noise, and sensitivities that vary
+by orders of magnitude, as in trained models. The error is that of the explicit logits against the encoded model;
 `hyrfpack bench` measures what a trained model loses in pictures.
 """
 
@@ -34,7 +34,7 @@ TARGET_DISTORTION = 2e-6
 
 
 def make_random_model(count: int, log2_table_size: int) -> HybridModel:
-    """Return a random model with `count` Gaussians and a radiance table of at most 2^log2_table_size rows a level."""
+    """Return a random model with `count` Gaussians and a radiance table of at most 2^log2_table_size rows per level."""
     rng = np.random.default_rng(0)
     frame = Frame((0.0, 0.0, 0.0), 1.0, (1.0, 1.0, 1.0))
     config = ModelConfig(frame, HashGridConfig(log2_table_size - 1), HashGridConfig(log2_table_size))
@@ -105,7 +105,7 @@ def _bench_model(count: int, log2_table_size: int) -> list[dict]:
 
 
 def _with_numba(use_numba: bool, task: Callable[[], object]) -> Callable[[], object]:
-    """Return the task so that it runs with Numba's kernels, or as it does where Numba is missing."""
+    """Return the task with Numba's kernels enabled, or disabled as on machines without Numba."""
 
     def run() -> object:
         with mock.patch("hyrfpack.quant.rans.has_numba", lambda: use_numba):
@@ -115,7 +115,7 @@ def _with_numba(use_numba: bool, task: Callable[[], object]) -> Callable[[], obj
 
 
 def _measure_peak_bytes(task: Callable[[], object]) -> float:
-    """Return the most bytes that numpy holds at once during a task."""
+    """Return numpy's peak memory during a task in bytes."""
     tracemalloc.start()
     try:
         task()

@@ -43,8 +43,8 @@ def make_mlp_call(rows: int, zero_gradient_share: float) -> tuple[OperationCall,
 def compare(call: OperationCall, upstream: Tensor, items: int) -> list[dict]:
     """Return one row for the forward pass and one for the backward pass.
 
-    `max_error` is the largest difference from the float64 reference over the reference's largest value. `items` divides
-    the time into ns an item.
+    `max_error` is the largest difference from the float64 reference over the reference's largest value. The time is
+    divided by `items` and given in ns per item.
     """
     ours, reference = (
         call.separate_tasks(implementation, upstream=upstream) for implementation in ("cpu", "reference")

@@ -9,7 +9,7 @@ from hyrfpack.measure.timing import time_alternately
 from hyrfpack.quant import MinMaxQuantizer, huffman_decode, huffman_encode
 
 SYMBOL_COUNT = 3_400_000
-PEER_SYMBOL_COUNT = 100_000  # dahuffman is slow and its time is linear in the count, so a part gives its rate
+PEER_SYMBOL_COUNT = 100_000  # dahuffman is slow, and its rate does not depend on the count
 TIMING_REPEATS = 5
 
 
@@ -25,7 +25,7 @@ def make_table_symbols() -> np.ndarray:
 
 
 def entropy_bits(symbols: np.ndarray) -> float:
-    """Return the zeroth-order entropy in bits a symbol."""
+    """Return the zeroth-order entropy in bits per symbol."""
     shares = np.bincount(symbols)[np.unique(symbols)] / len(symbols)
     return float(-(shares * np.log2(shares)).sum())
 
@@ -34,8 +34,8 @@ def bench() -> list[dict]:
     """Time both coders in alternation; times are medians.
 
     Returns:
-        One row for encoding and one for decoding: million symbols a second of our coder and of dahuffman, their ratio,
-        and the bits a symbol of the payload, of the whole stream and of the entropy.
+        One row for encoding and one for decoding: million symbols per second of our coder and of dahuffman, their
+        ratio, and bits per symbol of the payload, of the whole stream and of the entropy.
     """
     symbols = make_table_symbols()
     stream = huffman_encode(symbols)
@@ -68,7 +68,7 @@ def bench() -> list[dict]:
 
 
 def main() -> None:
-    """Print the table: million symbols a second and bits a symbol."""
+    """Print the table: million symbols per second and bits per symbol."""
     rows = bench()
     print(f"{SYMBOL_COUNT:,} symbols; medians of {TIMING_REPEATS}; million symbols a second")
     print(f"{'':8}{'ours':>10}{'dahuffman':>12}{'ratio':>8}")

@@ -29,7 +29,7 @@ except ImportError:
 SYMBOL_COUNTS = (3_400_000, 30_000)
 TIMING_REPEATS = 3
 
-Coder = tuple[Callable[[], bytes], Callable[[bytes], np.ndarray], int]  # encode, decode, bits beside the bytes
+Coder = tuple[Callable[[], bytes], Callable[[bytes], np.ndarray], int]  # encode, decode, size of the extra bits
 
 
 def make_laplace_with_contexts(count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -40,7 +40,7 @@ def make_laplace_with_contexts(count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def make_morton_gaps(count: int) -> tuple[np.ndarray, None]:
-    """Return the gaps along the Morton curve between points near a surface, on a grid of 2^14 cells an axis."""
+    """Return the gaps along the Morton curve between points near a surface, on a grid of 2^14 cells per axis."""
     rng = np.random.default_rng(0)
     plane = rng.integers(0, 1 << 14, (count + 1, 2))
     height = 8000 + 2000 * np.sin(plane[:, 0] / 2000) + rng.normal(0, 20, count + 1)
@@ -52,7 +52,7 @@ def make_morton_gaps(count: int) -> tuple[np.ndarray, None]:
 
 
 def make_mostly_zero(count: int) -> tuple[np.ndarray, None]:
-    """Return Laplace residuals of which nine in ten are zero."""
+    """Return Laplace residuals, 90 % of which are zero."""
     return np.rint(np.random.default_rng(0).laplace(scale=0.22, size=count)).astype(np.int32), None
 
 
@@ -67,8 +67,8 @@ def bench() -> list[dict]:
     """Time all coders in alternation; times are medians.
 
     Returns:
-        A row for each source, count and coder: bits a symbol, the excess over the entropy in percent, and million
-        symbols a second. The entropy is that of each context's tokens plus the extra bits.
+        A row for each source, count and coder: bits per symbol, the excess over the entropy in percent, and million
+        symbols per second. The entropy is that of each context's tokens plus the extra bits.
 
     Raises:
         AssertionError: a coder does not decode to the values that it encoded.
@@ -166,7 +166,7 @@ def _zstd_coder(values: np.ndarray) -> Coder:
 
 
 def main() -> None:
-    """Print the table: bits a symbol, percent above the entropy and million symbols a second."""
+    """Print the table: bits per symbol, percent above the entropy and million symbols per second."""
     for module, name in ((zstandard, "zstandard"), (constriction, "constriction")):
         if module is None:
             print(f"{name} is not installed, so it is left out")

@@ -60,7 +60,7 @@ def time_stages(inputs: dict[str, Tensor], camera: tuple, implementation: str) -
 
 
 def bench() -> list[dict]:
-    """Return one row for each workload: medians in ms, ns a pair, and for A the speed ratio and the errors."""
+    """Return one row for each workload: medians in ms, ns per pair, and for A the speed ratio and the errors."""
     calls = {(name, "cpu"): make_workload(name) for name in WORKLOAD_SIZES}
     calls["A", "reference"] = make_workload("A")
     time_stages(*calls["B", "cpu"], "cpu")  # the first call compiles the kernels

@@ -121,7 +121,7 @@ class Chromium:
     def open(self, address: str) -> None:
         """Open an address and wait until its document is loaded."""
         self.events.clear()
-        self.call("Page.navigate", url="about:blank")  # otherwise a change of only #... does not reload the page
+        self.call("Page.navigate", url="about:blank")  # a change of the fragment alone would not reload
         self.call("Page.navigate", url=address)
         deadline = time.monotonic() + TIMEOUT_SECONDS
         while self.evaluate("location.href === 'about:blank' || document.readyState !== 'complete'"):
@@ -130,7 +130,7 @@ class Chromium:
             time.sleep(0.02)
 
     def evaluate(self, expression: str) -> Any:
-        """Evaluate JavaScript and return its value, that of a promise when it is fulfilled.
+        """Evaluate JavaScript and return its value; a promise is awaited.
 
         Raises:
             RuntimeError: the script throws an exception, whose text is the message.
@@ -192,7 +192,7 @@ class Chromium:
 
     @contextlib.contextmanager
     def before_every_page(self, script: str) -> Iterator[None]:
-        """Within this context, run a script before the scripts of every opened page; its names are local."""
+        """Within this context, run a script before the scripts of every opened page; its variables are local."""
         added = self.call("Page.addScriptToEvaluateOnNewDocument", source=f"{{{script}\n}}")["identifier"]
         try:
             yield

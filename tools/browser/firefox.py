@@ -1,4 +1,4 @@
-"""Drive a Firefox without a screen by its Marionette protocol over a local socket, without any Python package.
+"""Drive Firefox on a virtual display by its Marionette protocol over a local socket, without any Python package.
 
 Firefox's headless mode has no WebGL, so it runs on a virtual display (Debian's `xvfb`) and renders in software.
 """
@@ -185,12 +185,12 @@ class Firefox:
 
     def open(self, address: str) -> None:
         """Open an address and wait until its document is loaded."""
-        self.call("WebDriver:Navigate", url="about:blank")  # otherwise a change of only #... does not reload the page
+        self.call("WebDriver:Navigate", url="about:blank")  # a change of the fragment alone would not reload
         self._privileged("Services.console.reset(); window.said = [];")
         self.call("WebDriver:Navigate", url=address)
 
     def evaluate(self, expression: str) -> Any:
-        """Evaluate JavaScript and return its value, that of a promise when it is fulfilled.
+        """Evaluate JavaScript and return its value; a promise is awaited.
 
         Raises:
             RuntimeError: the script throws an exception, whose text is the message.
@@ -288,7 +288,7 @@ class Firefox:
 
     @contextlib.contextmanager
     def before_every_page(self, script: str) -> Iterator[None]:
-        """Within this context, run a script before the scripts of every opened page; its names are local."""
+        """Within this context, run a script before the scripts of every opened page; its variables are local."""
         text = (
             "{let on = true;"
             f'addMessageListener("forget {self._number}", () => {{ on = false; }});'

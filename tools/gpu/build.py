@@ -1,12 +1,12 @@
 """Build every Triton kernel of hyrfpack.ops for several GPU types without a GPU, and report the kernels' resources.
 
-    python -m tools.gpu.build                  a table for each kernel and target: registers a thread, shared memory
-                                               in bytes a program, spills in bytes (NVIDIA) or registers (AMD)
+    python -m tools.gpu.build                  a table for each kernel and target: registers per thread, shared memory
+                                               in bytes per program, spills in bytes (NVIDIA) or registers (AMD)
     python -m tools.gpu.build --json           the same as JSON; tests/tools/test_gpu_build.py reads it
 
 The operations run as usual on small CPU tensors, but each launch of a kernel only builds it, for a driver that names
-the target, with the types, constants, alignment and options of the launch. Therefore this file needs no list of kernels
-and signatures. It reports kernels that no operation launches.
+the target, with the types, constants, alignment and options of the launch. So this file needs no list of kernels and
+signatures. It reports kernels that no operation launches.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class Build:
         warps: warps in a program.
         registers: registers of a thread (AMD: vector registers).
         shared: shared memory of a program in bytes.
-        spills: bytes of local memory a thread (NVIDIA), or spilled registers (AMD).
+        spills: bytes of local memory per thread (NVIDIA), or spilled registers (AMD).
         error: why the build failed; empty if it succeeded.
     """
 
@@ -93,7 +93,7 @@ def hash_encode_runs(count: int, width: int, height: int) -> Iterator[Run]:
     from hyrfpack.model.hash_grid import HashGridConfig
     from hyrfpack.ops.hash_encode import hash_encode, level_offsets
 
-    # A level this coarse uses several copies of its gradient even for few points.
+    # On a level this coarse, even few points make the kernel use several copies of the gradient.
     resolutions, size = HashGridConfig(log2_table_size=10, base=4).resolutions, 10
     table = torch.rand(level_offsets(resolutions, size)[-1], 2, requires_grad=True)
     coords = torch.rand(count, 3, requires_grad=True)
@@ -265,7 +265,7 @@ RUNS_ON_OTHER_TARGETS = 2
 
 @triton.jit
 def _spilling_kernel(numbers, COUNT: tl.constexpr):
-    """Need more registers than there are, to test whether Triton builds for a target and reports spills."""
+    """Use more registers than a thread has, to test whether Triton builds for a target and reports spills."""
     at = tl.arange(0, COUNT)
     a = tl.load(numbers + at)
     b = tl.load(numbers + COUNT + at)

@@ -44,7 +44,7 @@ def items(setup: Setup) -> list[str]:
 
 
 def run(item: str, setup: Setup) -> Iterator[Row]:
-    """Yield the rows of one room: statistics, training, frames and rasteriser; the model is trained a little first."""
+    """Yield the rows of one room: statistics, training, frames and rasteriser, measured after a short training."""
     number, look = item.removesuffix(AS_TRAINED_SUFFIX), TRAINED_LOOK if item.endswith(AS_TRAINED_SUFFIX) else TIDY_LOOK
     count, device = int(number.replace(",", "")), setup.torch_device
     cameras = make_cameras(setup.views, setup.width, setup.height)
@@ -90,7 +90,7 @@ def _statistics_row(room: str, splats: Splats, model: HybridModel) -> Row:
 
 
 def _frame_rows(room: str, model: HybridModel, cameras: list[Camera], setup: Setup) -> Iterator[Row]:
-    """Yield the frames a second over all cameras; the wall-clock time includes a final wait for the device."""
+    """Yield the frames per second over all cameras; the wall-clock time includes a final wait for the device."""
     device = setup.torch_device
     reset_peak_memory(device)
     with torch.no_grad():

@@ -141,7 +141,7 @@ def mlp_rows(mixed: bool, setup: Setup) -> Iterator[Row]:
 
 @torch.no_grad()
 def decode_rows(setup: Setup) -> Iterator[Row]:
-    """Measure the decoding of all Gaussians' geometry and colours for a frame; the error is that of all rounding."""
+    """Measure the decoding of all Gaussians' geometry and colours for a frame; the error includes all rounding."""
     model, camera = _model(setup), make_cameras(1, setup.width, setup.height)[0]
     viewpoint = torch.as_tensor(camera.position, dtype=torch.float32, device=setup.torch_device)
     sample = _sample(torch.arange(len(model), device=setup.torch_device), setup)
@@ -245,7 +245,7 @@ def rasterize_shaded_rows(setup: Setup) -> Iterator[Row]:
         pairs, seen = int(raster.pairs), int(raster.visible.sum())
         ms = median_ms({"draw": draw}, setup.repeats, setup.torch_device)["draw"]
         project = roofline.count_project_shaded(len(model), seen, _widths(shading), shading.mixed)
-        # The decoder's arithmetic runs on other units than the blending's, so only its own stage's row counts it.
+        # The decoder's arithmetic and the blending's run on different units, so only the decoder's own row counts it.
         total_work = Work(project.bytes, 0) + roofline.count_bin_pairs(seen, pairs, tiles)
         total_work += roofline.count_blend(pairs, pixels, reached, blended)
         view = crop_splats(splats, setup.crop).view
@@ -261,7 +261,7 @@ def rasterize_shaded_rows(setup: Setup) -> Iterator[Row]:
 
 @torch.no_grad()
 def background_rows(setup: Setup) -> Iterator[Row]:
-    """Measure the background's grid at the window for a frame; the error is that of all rounding."""
+    """Measure the background's grid at the window for a frame; the error includes all rounding."""
     model, camera = _model(setup), make_cameras(setup.views, setup.width, setup.height)[0]
     splats, defaults = decode_splats(model, camera), RenderSettings()
     light = rasterize(*splats.inputs.values(), *splats.view).transmittance

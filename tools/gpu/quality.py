@@ -18,7 +18,7 @@ from tools.gpu.timing import synchronize
 PROBE_STEPS = 25  # timed on the CPU, to estimate how many steps its time limit allows
 LATE_STEP_TIME_RATIO = 2.0  # late steps take about twice as long as the first ones, because there are more Gaussians
 MIN_STEPS = 100
-# Rounding alone can decide which Gaussian is split, so that two equal runs differ by tenths of a dB.
+# Rounding alone can decide which Gaussian is split, so two equal runs differ by tenths of a dB.
 MAX_PSNR_LOSS_DB = 0.3
 
 

@@ -40,12 +40,12 @@ class Work:
         return self.bytes / seconds / rates.copy, self.flops / seconds / getattr(rates, self.unit)
 
     def min_ms(self, rates: Rates) -> float:
-        """Return the roofline time in ms, below which no call can be."""
+        """Return the roofline time in ms, the lower bound of any call."""
         return 1e3 * max(self.bytes / rates.copy, self.flops / getattr(rates, self.unit))
 
 
 def count_project(gaussians: int) -> Work:
-    """Count the projection.
+    """Count the work of the projection.
 
     It reads mean 3, quaternion 4, scale 3, opacity 1 and writes mean2d 2, conic 3, depth 1, opacity 1 (44 + 28 bytes).
     The operations are: to the camera 18, rotation matrix 30, J R Q S 45, covariance 18, determinant and inverse 20,
@@ -55,7 +55,7 @@ def count_project(gaussians: int) -> Work:
 
 
 def count_project_backward(gaussians: int) -> Work:
-    """Count the projection's backward pass.
+    """Count the work of the projection's backward pass.
 
     It reads the same 11 numbers and the gradients of mean2d 2, conic 3 and opacity 1, and writes 11. The arithmetic is
     twice that of the forward pass.
@@ -69,21 +69,21 @@ def count_sort_bytes(items: int, key_bits: int) -> int:
 
 
 def count_bin_pairs(gaussians: int, pairs: int, tiles: int) -> Work:
-    """Count the binning.
+    """Count the work of binning.
 
     It sorts Gaussians by depth (32 bits), writes a tile and an index for each pair, and sorts the pairs by tile. It
-    reads 7 numbers a Gaussian. The arithmetic is negligible: 20 operations a Gaussian and 10 a pair.
+    reads 7 numbers per Gaussian. The arithmetic is negligible: 20 operations per Gaussian and 10 per pair.
     """
     sorting = count_sort_bytes(gaussians, 32) + count_sort_bytes(pairs, max(1, (tiles - 1).bit_length()))
     return Work(28 * gaussians + 8 * pairs + sorting, 20 * gaussians + 10 * pairs)
 
 
 def count_blend(pairs: int, pixels: int, reached: float, blended: float) -> Work:
-    """Count the blending.
+    """Count the work of blending.
 
     It reads index 1, mean2d 2, conic 3, opacity 1 and colour 3 of each reached pair (40 bytes), and writes rgb and T
-    (16 bytes a pixel). A reached pair costs 12 operations at each of 256 pixels (offset 2, exponent 8, exp 1,
-    opacity 1), and a blended one 10 more (threshold, clamp, weight, three multiply-adds, T).
+    (16 bytes per pixel). A reached pair costs 12 operations at each of 256 pixels (offset 2, exponent 8, exp 1, opacity
+    1), and a blended one 10 more (threshold, clamp, weight, three multiply-adds, T).
 
     Args:
         pairs: number of Gaussian-tile pairs.
@@ -96,21 +96,21 @@ def count_blend(pairs: int, pixels: int, reached: float, blended: float) -> Work
 
 
 def count_blend_backward(pairs: int, pixels: int, reached: float, blended: float) -> Work:
-    """Count the blending's backward pass; the arguments are those of `count_blend`.
+    """Count the work of blending's backward pass; the arguments are those of `count_blend`.
 
-    It reads the pairs again (40 bytes), and T and the gradients of rgb and T (20 bytes a pixel). It writes 11 sums a
-    pair (44 bytes). An evaluation costs 12 operations as before, and a blended one 40 more (alpha's gradient 12; conic,
-    mean and opacity 17; 11 sums over pixels).
+    It reads the pairs again (40 bytes), and T and the gradients of rgb and T (20 bytes per pixel). It writes 11 sums
+    per pair (44 bytes). An evaluation costs 12 operations as before, and a blended one 40 more (alpha's gradient 12;
+    conic, mean and opacity 17; 11 sums over pixels).
     """
     evaluations = reached * pairs * TILE_PIXELS
     return Work(84 * reached * pairs + 20 * pixels, 12 * evaluations + 40 * blended * pixels)
 
 
 def count_hash_encode(points: int, levels: int, rows: int, features: int = 2) -> Work:
-    """Count the hash encoding.
+    """Count the work of the hash encoding.
 
-    It reads 3 coordinates a point and the table rows that the points can need, and writes the features. The table is
-    read once, with at most 8 rows a point and level. The operations for a point and level are 9 for the cell, 16 for
+    It reads 3 coordinates per point and the table rows that the points can need, and writes the features. The table is
+    read once, with at most 8 rows per point and level. The operations per point and level are 9 for the cell, 16 for
     the weights, 24 for the rows' hashes, and a multiply-add for each feature of 8 corners.
     """
     table = 4 * features * min(rows, 8 * points * levels)
@@ -118,21 +118,21 @@ def count_hash_encode(points: int, levels: int, rows: int, features: int = 2) ->
 
 
 def count_hash_encode_backward(points: int, levels: int, rows: int, features: int = 2) -> Work:
-    """Count the hash encoding's backward pass: reads coordinates and feature gradients, writes the table's gradient."""
+    """Count the hash encoding's backward pass, which reads coordinates and feature gradients and writes the table's."""
     work = count_hash_encode(points, levels, 0, features)
     return Work(work.bytes + 4 * features * rows, work.flops)
 
 
 def count_mlp(rows: int, widths: Sequence[int], mixed: bool) -> Work:
-    """Count an MLP: reads x and the weights, writes y; one multiply-add for each row and weight."""
+    """Count an MLP, which reads x and the weights and writes y; one multiply-add for each row and weight."""
     weights = sum(i * o for i, o in zip(widths, widths[1:], strict=False))
     return Work(4 * rows * (widths[0] + widths[-1]) + 4 * weights, 2 * rows * weights, "bf16" if mixed else "fp32")
 
 
 def count_mlp_backward(rows: int, widths: Sequence[int], mixed: bool) -> Work:
-    """Count an MLP's backward pass: reads x and y's gradient, writes x's gradient.
+    """Count an MLP's backward pass, which reads x and the gradient of y and writes the gradient of x.
 
-    The arithmetic is the hidden layers once more, then two products a layer.
+    The arithmetic is that of the hidden layers once more, then of two products per layer.
     """
     forward = count_mlp(rows, widths, mixed)
     hidden = count_mlp(rows, widths[:-1], mixed)
@@ -140,15 +140,16 @@ def count_mlp_backward(rows: int, widths: Sequence[int], mixed: bool) -> Work:
 
 
 def count_photometric_loss(pixels: int) -> Work:
-    """Count the loss and its gradient: reads two pictures and writes one, with 3 float32 a pixel each.
+    """Count the loss and its gradient, which read two pictures and write one, with 3 float32 per pixel each.
 
-    A channel takes 5 blurs and 3 more for the gradient, each two passes of 11 multiply-adds, and 40 other operations.
+    A channel takes 5 blurs and 3 more for the gradient, each with two passes of 11 multiply-adds, and 40 other
+    operations.
     """
     return Work(36 * pixels, 3 * pixels * (8 * 2 * 2 * SSIM_WINDOW_TAPS + 40))
 
 
 def count_adam(parameters: int) -> Work:
-    """Count an Adam step: reads value, gradient and both moments, writes all but the gradient; 14 operations each."""
+    """Count an Adam step: 14 operations; it reads value, gradient and both moments and writes all but the gradient."""
     return Work(28 * parameters, 14 * parameters)
 
 
@@ -166,7 +167,7 @@ def count_decode(gaussians: int, widths: Sequence[int], levels: int, rows: int, 
 
 
 def count_shade(gaussians: int, widths: Sequence[int], mixed: bool) -> Work:
-    """Count the shading.
+    """Count the work of shading.
 
     It reads position 3, colour logits 3 and the position's part of the first layer, and writes 3 colours. The
     arithmetic is the decoder's on the encoded direction, and 60 operations for the encoding and the sigmoids.
@@ -182,10 +183,10 @@ def count_shade(gaussians: int, widths: Sequence[int], mixed: bool) -> Work:
 
 
 def count_project_shaded(gaussians: int, drawn: int, widths: Sequence[int], mixed: bool) -> Work:
-    """Count projection and shading in one: bytes of `count_project` for all Gaussians, of `count_shade` for drawn ones.
+    """Count projection and shading together: `count_project`'s bytes for all Gaussians, `count_shade`'s for drawn ones.
 
-    The positions are read once. The arithmetic is that of the shading, because the projection's is a few hundredths of
-    it and runs on other units at the same time.
+    The positions are read once. The arithmetic is that of shading, because the projection's is a few percent of it and
+    runs on other units at the same time.
 
     Args:
         gaussians: number of Gaussians.
@@ -199,7 +200,7 @@ def count_project_shaded(gaussians: int, drawn: int, widths: Sequence[int], mixe
 def count_background(
     pixels: int, nodes: int, needed: int, widths: Sequence[int], levels: int, rows: int, mixed: bool
 ) -> Work:
-    """Count the background's grid.
+    """Count the work of the background's grid.
 
     It reads T of each pixel and the table rows that the needed nodes can use, and writes 3 colours of each node. The
     arithmetic is that of the encoding and the decoder at needed nodes, and 130 operations each: the ray, its point on

@@ -69,9 +69,9 @@ class Setup:
 
 
 def find_dataset(folder: Path | None, environment: str | None, default: Path) -> Path | None:
-    """Return the real data set to train on, from the first of three folders that exists and has one; None without.
+    """Return the real data set to train on, from the first of three folders that has one; None if no folder has one.
 
-    Of a folder with several data sets it returns mipnerf360_bonsai, otherwise the first by name.
+    From a folder with several data sets it returns mipnerf360_bonsai, or else the first by name.
 
     Args:
         folder: a data set or a folder of data sets, from the command line.

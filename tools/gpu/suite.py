@@ -25,8 +25,9 @@ _FAILED_OUTCOMES = ("FAILED", "ERROR")
 def run_suite(paths: Sequence[str] = TEST_PATHS) -> Iterator[Row]:
     """Run the tests marked `gpu`; yield one row for each file, and one more if pytest failed outside of a test.
 
-    The row of a file without failures comes when the next file begins; that of a file with failures comes at the end,
-    with the first reason. Each test's line is printed when the test ends, so the last line precedes a test that hangs.
+    The row of a file without failures is yielded when the next file begins. That of a file with failures is yielded at
+    the end, with the first reason. Each test's line is printed when the test ends, so the last line precedes a test
+    that hangs.
 
     Raises:
         ModuleNotFoundError: pytest is not installed.

@@ -1,4 +1,4 @@
-"""Time tasks on a device, and measure the device's peak rates: copied bytes and matrix operations a second."""
+"""Time tasks on a device, and measure the device's peak rates: copied bytes and matrix operations per second."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from hyrfpack.measure.timing import Clock, time_alternately
 # cache, and writing it takes so long that the host has queued a short task before the task starts.
 FLUSH_BYTES = 1 << 30
 WARM_RUNS = 3
-# torch calls these to read a number from the device. The end of a profile waits by another call, which is not counted.
+# torch calls these functions to read a number from the device. The wait at the end of a profile is another call, which
+# is not counted.
 WAIT_CALL_NAMES = ("cudaStreamSynchronize", "hipStreamSynchronize")
 
 
@@ -25,8 +26,8 @@ class Rates:
     """Peak rates that were measured on this device.
 
     Attributes:
-        copy: bytes read plus bytes written a second in a large copy.
-        bf16, fp32: floating point operations a second in a large matrix product; fp32 without TF32.
+        copy: bytes read plus bytes written per second in a large copy.
+        bf16, fp32: floating point operations per second in a large matrix product; fp32 without TF32.
     """
 
     copy: float

@@ -115,7 +115,7 @@ class Tally:
 
 
 def allowed_bytes(data: bytes) -> int:
-    """Return the number of bytes that decoding may have allocated at once."""
+    """Return the largest number of bytes that decoding may allocate at one time."""
     declared = 0
     if len(data) >= 48:
         (count,) = struct.unpack_from("<I", data, 36)
@@ -227,7 +227,7 @@ def examine_input(number: int, seed: int, tally: Tally, folder: Path) -> None:
             if number % RENDER_EVERY == 0:
                 tally.rendered += 1
                 with warnings.catch_warnings():
-                    warnings.simplefilter("ignore")  # models without meaning may overflow
+                    warnings.simplefilter("ignore")  # models decoded from damaged files may overflow
                     check_rendering(outcome)
         if number % TRACE_EVERY == 0:
             peak, share = check_memory(data)

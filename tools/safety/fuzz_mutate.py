@@ -454,7 +454,7 @@ def _forge_exposure(rng: Random) -> bytes:
 def _split_fields(part: RawSection) -> dict[str, bytes | tuple[int, int]]:
     """Split the payload of a valid section into fields in order; a field is (number, its width in bytes), or bytes.
 
-    A field "size of NAME" is the number of bytes of all fields whose names start with NAME.
+    The field "size of NAME" states the number of bytes of all fields whose names start with NAME.
     """
     if part.codec == 6:
         return _split_points_fields(part.data)

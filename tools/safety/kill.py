@@ -47,7 +47,7 @@ from hyrfpack.make.state import RECORD_NAME as RECORD
 from hyrfpack.train.checkpoint import DIGEST_BYTES
 
 COMMAND_ENVIRONMENT = {**os.environ, "HYRFPACK_THREADS": "1", "OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE"}
-COMMAND_NAMES = ("train", "compress", "decompress", "render", "make")  # the inputs of each come from those before it
+COMMAND_NAMES = ("train", "compress", "decompress", "render", "make")  # each command reads the output of earlier ones
 KILL_MOMENTS = ("before", "while writing", "between or after", "too late")
 MAKE_OPTIONS = ["--quality", "draft"]
 TRAIN_OPTIONS = ["--steps", "60", "--log2-table-size", "13"]
@@ -62,10 +62,10 @@ WRITTEN_FOLDERS = (
     f"{WORK_FOLDER_NAME}/run/views",
     f"{WORK_FOLDER_NAME}/export",
 )
-POLL_SECONDS = 2e-4  # interval of looking for temporary files
+POLL_INTERVAL_SECONDS = 2e-4  # time between two searches for temporary files
 MAX_KILL_DELAY_SECONDS = 2e-3  # longest delay of the kill after a temporary file appears
 RERUN_EVERY = 5
-TIME_KEYS = {"seconds", "steps_per_second", "stage_seconds", "seconds_per_frame"}  # of metrics.json
+METRICS_TIME_KEYS = {"seconds", "steps_per_second", "stage_seconds", "seconds_per_frame"}  # these differ between runs
 
 
 @dataclass
@@ -130,14 +130,14 @@ def wait_for_temporary_files(process: subprocess.Popen, folder: Path, count: int
         for folder_path in (folder / name for name in WRITTEN_FOLDERS):
             if folder_path.is_dir():
                 seen.update(name for name in os.listdir(folder_path) if is_temporary_file(name))
-        time.sleep(POLL_SECONDS)
+        time.sleep(POLL_INTERVAL_SECONDS)
     return len(seen)
 
 
 def drop_times(value: Any) -> Any:
     """Return values of JSON without the measured times that dictionaries at any depth contain."""
     if isinstance(value, dict):
-        return {key: drop_times(item) for key, item in value.items() if key not in TIME_KEYS}
+        return {key: drop_times(item) for key, item in value.items() if key not in METRICS_TIME_KEYS}
     return [drop_times(item) for item in value] if isinstance(value, list) else value
 
 

@@ -31,7 +31,7 @@ GOLDEN_PROVENANCE = {
     "steps": 100,
     "why": {"geometry": "one entry a Gaussian", "name": "caf\u00e9"},
 }
-# The map has the smallest and the largest codes of centers, and limits that are reached.
+# The map has centers with the smallest and the largest codes, and log gains that reach the limits.
 GOLDEN_EXPOSURE_MAP = ExposureMap(
     box=np.array([[-0.5, -0.25, -1.0], [0.75, -0.25, 2.0]], np.float32),
     lengths=np.array([0.7, 1.3], np.float32),

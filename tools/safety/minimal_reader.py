@@ -294,7 +294,7 @@ def matrix_shapes(config: dict[str, Any], layers: list[int]) -> dict[tuple[str, 
 
 
 def grid_levels(grid: dict[str, int]) -> list[tuple[int, int]]:
-    """Return (vertices an axis, rows) of each level of a hash grid (2.3)."""
+    """Return (vertices per axis, rows) of each level of a hash grid (2.3)."""
     growth = (grid["finest"] / grid["base"]) ** (1 / max(grid["levels"] - 1, 1))
     vertices = [math.ceil(grid["base"] * growth**level - 1e-6) for level in range(grid["levels"])]
     return [(r, min(r**3, 2 ** grid["log2_table_size"])) for r in vertices]

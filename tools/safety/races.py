@@ -44,7 +44,7 @@ from hyrfpack.format.run_folder import METRICS_FILE, MODEL_FILE
 from tools.safety.kill import COMMAND_ENVIRONMENT, is_temporary_file
 
 FOREIGN_BYTES = b"of another program"
-POLL_SECONDS = 2e-4  # interval of looking for temporary files
+POLL_INTERVAL_SECONDS = 2e-4  # time between two searches for temporary files
 TRAIN_OPTIONS = ["--steps", "30", "--max-gaussians", "200", "--log2-table-size", "10"]
 FORK_CONTEXT = get_context("fork")
 # Each error message of a refused command has one of these texts.
@@ -175,7 +175,7 @@ def race_with_file(race: Race, folder: Path, random_source: random.Random, toget
     while running.process.is_alive():
         if any(map(is_temporary_file, os.listdir(folder))) if together else time.perf_counter() - started >= moment:
             break
-        time.sleep(POLL_SECONDS)
+        time.sleep(POLL_INTERVAL_SECONDS)
     created = False
     with contextlib.suppress(FileExistsError), open(output, "xb") as file:
         file.write(FOREIGN_BYTES)

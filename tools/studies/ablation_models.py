@@ -31,7 +31,7 @@ class SingleField(HybridModel):
     """A model with one grid and one decoder for geometry and radiance.
 
     The table has twice the rows of the radiance table, which is a third more than both tables together, as in the
-    paper. Geometry does not depend on the view: it is evaluated with the direction's inputs at zero.
+    paper. Geometry does not depend on the view, because it is evaluated with the direction's inputs at zero.
     """
 
     def __init__(self, config: ModelConfig, gaussians: Gaussians, generator: torch.Generator | None = None) -> None:
@@ -51,7 +51,7 @@ class SingleField(HybridModel):
 
 
 class _GeometryOutputs(nn.Module):
-    """The geometry outputs of a single field, without own parameters."""
+    """The geometry outputs of a single field, without parameters of their own."""
 
     def __init__(self, field: Field, directions: int) -> None:
         super().__init__()
@@ -81,7 +81,7 @@ class IsotropicDiffuse(HybridModel):
         return self.activate(nothing, positions, select(explicit.scale_logits), select(explicit.opacity_logits))
 
     def decode(self) -> Decoded:
-        return Decoded(self.decode_geometry(), None)  # colours are no field's
+        return Decoded(self.decode_geometry(), None)  # no field predicts colours
 
     def decode_colors(self, viewpoint: Tensor, index: Tensor | None = None) -> Tensor:
         logits = self.gaussians.color_logits
@@ -104,7 +104,7 @@ class HarmonicColors(HybridModel):
         gaussians.color_logits = nn.Parameter(stored)
 
     def decode(self) -> Decoded:
-        return Decoded(self.decode_geometry(), None)  # colours are no field's
+        return Decoded(self.decode_geometry(), None)  # no field predicts colours
 
     def decode_colors(self, viewpoint: Tensor, index: Tensor | None = None) -> Tensor:
         positions, stored = self.gaussians.positions, self.gaussians.color_logits

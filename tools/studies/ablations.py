@@ -3,7 +3,7 @@
     python -m tools.studies.ablations            trains every variant, prints the tables of docs/research/ablations.md
     python -m tools.studies.ablations --reuse    trains only variants that --out does not have yet
 
-The tables give PSNR in dB, SSIM, bytes, training steps a second and frames a second, with the paper's differences.
+The tables give PSNR in dB, SSIM, bytes, training steps per second and frames per second, with the paper's differences.
 Scores are those of the trained model before compression on held-out views. Frames of a variant alternate with frames of
 the full model, and the geometry is decoded beforehand. The numbers of each run are stored in --out as JSON.
 """
@@ -59,7 +59,7 @@ def train_and_measure(
         The numbers of one row for JSON, or {"failed": reason} if training failed.
     """
     if variant is NO_CULLING_VARIANT:
-        full = load_model(full_path).requires_grad_()  # so that its size counts all parameters
+        full = load_model(full_path).requires_grad_()  # then its size includes all parameters
         return measure(variant, full, full, scene)
     trainer = build_trainer(scene, config, variant, cache)
     try:

@@ -104,7 +104,7 @@ def bytes_change_at_equal_psnr(ours: np.ndarray, theirs: np.ndarray) -> float | 
     means = []
     for points in (ours, theirs):
         rising = points[np.argsort(points[:, 0])]
-        best = np.maximum.accumulate(rising[:, 1])  # nobody would use a larger file with a lower PSNR
+        best = np.maximum.accumulate(rising[:, 1])  # a larger file with a lower PSNR is not worth using
         scores_file = np.concatenate(([True], np.diff(best) > 0))
         if scores_file.sum() < 2:
             return None

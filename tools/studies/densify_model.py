@@ -4,9 +4,9 @@
     python -m tools.studies.densify_model --data ../shared/data/ngp_fox --model fox.hyrf \\
         --gaussians 200000 --out runs/fox
 
-Density control never asks for a million Gaussians on small photos. Therefore this program forces it to split. It trains
-a model; then in each round it replaces the Gaussians with the largest gradients by two children, with training steps in
-between, until there are enough; then it trains without density control, so that all parameters are trained again. It
+Density control never requests a million Gaussians on small photos, so this program forces it to split. It first trains
+a model. Then in each round it replaces the Gaussians with the largest gradients by two children, with training steps in
+between, until there are enough. Last, it trains without density control, so that all parameters are trained again. It
 writes `model.hyrf` (profile raw) into --out, and prints the number of Gaussians, PSNR in dB on held-out views and
 seconds before splitting, after splitting and at the end.
 """

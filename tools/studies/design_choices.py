@@ -3,8 +3,8 @@
     python -m tools.studies.design_choices --steps 2000        prints the table of docs/research/paper-and-code.md
 
 Each row changes one setting of the default and is the mean over the seeds: PSNR in dB, its spread between seeds, SSIM,
-number of Gaussians, bytes and training steps a second. Scores are those of the decoded `paper` file on held-out views.
-A difference between rows is significant only if it is larger than the spread.
+number of Gaussians, bytes and training steps per second. Scores are those of the decoded `paper` file on held-out
+views. A difference between rows is significant only if it is larger than the spread.
 """
 
 from __future__ import annotations

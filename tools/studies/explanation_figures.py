@@ -1,4 +1,4 @@
-"""The figures of docs/explanation/how-it-works.md, drawn from one trained model.
+"""Draw the figures of docs/explanation/how-it-works.md from one trained model.
 
     python -m hyrfpack demo -o demo
     python -m tools.studies.explanation_figures demo/run -o docs/images
@@ -80,8 +80,8 @@ SECTION_COLORS = {
     GEOMETRY_TABLE: "#188038",
     RADIANCE_TABLE: "#81c995",
 }
-LABEL_WIDTH = 4.6  # of a section, in hundredths of the figure
-UNREAD_SENSITIVITY = 1e-29  # numbers with less are read by no view
+SECTION_LABEL_WIDTH_PERCENT = 4.6  # the axes are 100 units wide
+MAX_UNREAD_SENSITIVITY = 1e-29  # no view reads numbers of this sensitivity or less
 MAX_DRAWN_SYMBOL = 6  # symbols of larger magnitude are counted with this one
 
 
@@ -165,7 +165,7 @@ def render_stages(model: HybridModel, camera: Camera) -> list[tuple[str, np.ndar
 
 
 def draw_method(model: HybridModel, camera: Camera, path: Path) -> Path:
-    """Draw how a Gaussian's properties come about, and one view with the parts of the model added one by one."""
+    """Draw how a Gaussian's properties are computed, and one view with the parts of the model added one by one."""
     figure = blank_figure(FIGURE_WIDTH_INCHES, 5.1, layout=None)
     axes = figure.add_axes((0.005, 0.43, 0.99, 0.565))
     axes.set(xlim=(-0.5, 100.5), ylim=(0, 36))
@@ -371,7 +371,7 @@ def draw_bar(
         if labels and group != CONTAINER_GROUP:
             above = not above
             axes.text(
-                min(max(left + part / 2, LABEL_WIDTH / 2), 100 - LABEL_WIDTH / 2),
+                min(max(left + part / 2, SECTION_LABEL_WIDTH_PERCENT / 2), 100 - SECTION_LABEL_WIDTH_PERCENT / 2),
                 bottom + height + 2.6 if above else bottom - 2.6,
                 f"{group}\n{size / 1000:.1f} kB",
                 fontsize=7.5,
@@ -428,7 +428,7 @@ def draw_sensitivities(axes: Axes, sensitivity: Sensitivity) -> None:
         RADIANCE_TABLE: sensitivity.fields[RADIANCE_TABLE],
         RADIANCE_DECODER: sensitivity.fields[RADIANCE_DECODER],
     }
-    logs = {group: np.log10(values[values > UNREAD_SENSITIVITY]) for group, values in kinds.items()}
+    logs = {group: np.log10(values[values > MAX_UNREAD_SENSITIVITY]) for group, values in kinds.items()}
     low, high = np.percentile(
         np.concatenate([np.percentile(values, (1, 99)) for values in logs.values() if len(values)]), (0, 100)
     )
@@ -511,7 +511,7 @@ def draw_shares(axes: Axes, report: CompressionReport, file: Path) -> None:
 
 
 def label_of(group: str) -> str:
-    """Return what a section holds, in words short enough for a legend."""
+    """Return the content of a section as a short text for a legend."""
     return SECTION_CONTENTS[group].replace(" logits", "s").replace("opacitys", "opacities").replace(" hash", "")
 
 

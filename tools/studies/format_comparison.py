@@ -6,7 +6,7 @@
 Other formats store explicit Gaussians, so the model is baked first, as by `hyrfpack export`. hyrfpack writes SPZ and
 SOG; its SPZ keeps 6 bits of a harmonic, others 4 or 5, so its files are larger and closer to the model. gsplat writes
 its PNG format (see `gsplat_png.py`). Every file is decoded, drawn by hyrfpack's rasteriser and scored on held-out
-photos. The table has bytes, bits a Gaussian, PSNR in dB, SSIM, losses in dB, and PSNR against the trained model's
+photos. The table has bytes, bits per Gaussian, PSNR in dB, SSIM, losses in dB, and PSNR against the trained model's
 pictures ("PSNR, to the model"). It also writes peers.json and a plot into --out.
 
 Wherever there is a choice, it favours the other formats. They cannot store the background sphere, so it is rendered
@@ -66,7 +66,7 @@ MIN_OPACITIES = (0.0, 0.05, 0.15)
 PNG_CLUSTERS = (1024, 4096)
 
 RoundTrip = Callable[[Splats], tuple[int, Splats]]
-PLOT_COLORS = ("#d93025", "#8430ce", "#1a73e8", "#188038", "#e37400", "#12858d", "#5f6368")  # of the formats in order
+FORMAT_COLORS = ("#d93025", "#8430ce", "#1a73e8", "#188038", "#e37400", "#12858d", "#5f6368")
 
 
 @dataclass(frozen=True)
@@ -293,7 +293,7 @@ def plot(rows: Sequence[MeasuredFile], trained: float, baked: float, title: str,
     """Plot PSNR against bytes: the Pareto front of each format as a line, its other settings as faint dots."""
     figure = blank_figure(8, 5.5)
     axes = figure.subplots()
-    for (name, format_rows), color in zip(group_by_format(rows).items(), cycle(PLOT_COLORS), strict=False):
+    for (name, format_rows), color in zip(group_by_format(rows).items(), cycle(FORMAT_COLORS), strict=False):
         front = pareto_front(format_rows)
         axes.scatter(
             [row.bytes for row in format_rows],

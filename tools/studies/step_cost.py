@@ -5,7 +5,7 @@
 
 The Gaussians are an even selection of those of --model; if it has fewer, they are repeated with an offset. The photos
 are scaled to --size. Each number of Gaussians runs in its own process. The table has median seconds of a step, seconds
-of the step with a round of density control, peak memory in MB, and the bytes a Gaussian that training adds after the
+of the step with a round of density control, peak memory in MB, and the bytes per Gaussian that training adds after the
 model and the photos are loaded.
 """
 

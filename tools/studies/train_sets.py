@@ -5,8 +5,8 @@
 
     python -m tools.studies.train_sets --sets mipnerf360_bonsai@25              25 of its photos (`set_variants.py`)
 
-The columns are PSNR in dB, SSIM, numbers of Gaussians, bytes, losses in dB, seconds of compression, training steps a
-second, training seconds, and ms a frame. Scores are those of the decoded files on held-out views (every 8th;
+The columns are PSNR in dB, SSIM, numbers of Gaussians, bytes, losses in dB, seconds of compression, training steps per
+second, training seconds, and ms per frame. Scores are those of the decoded files on held-out views (every 8th;
 Blender-style sets have their own split). Runs are kept in --out (runs/sets/<steps>), and --reuse only measures them.
 """
 

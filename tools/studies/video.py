@@ -107,7 +107,7 @@ def make_frames(
 
 
 def blur_by_motion(pixels: np.ndarray, length: float, angle: float) -> np.ndarray:
-    """Blur a picture along a line of a length in pixels, centred on each pixel."""
+    """Blur a picture along a line that is `length` pixels long and centred on each pixel."""
     blurred = np.zeros(pixels.shape, np.float32)
     offsets = np.linspace(-(length - 1) / 2, (length - 1) / 2, max(2, round(2 * length)))
     for distance in offsets:

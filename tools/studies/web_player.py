@@ -6,7 +6,7 @@
 With --runs it draws eight held-out views of each data set's `compact.hyrf` with the native and the baked page in
 headless Chromium. The table has bytes, PSNR in dB against the pictures of `render_view` (mean and worst), and the
 difference of PSNR against the photos. With --large it measures the seconds from opening a page to the first and to the
-complete picture, and the ms of a frame while a mouse orbits at full resolution. These are medians over --repeats, where
+complete picture, and the ms per frame while a mouse orbits at full resolution. These are medians over --repeats, where
 native and baked pages alternate, each in a new browser. Without a GPU the browser renders in software.
 """
 
@@ -95,7 +95,7 @@ def measure_pictures(run: Path, data: Path, folder: Path) -> list[str]:
 
 
 def measure_frame_ms(browser: Chromium) -> float:
-    """Return the milliseconds of a frame at full resolution while a mouse orbits."""
+    """Return the milliseconds per frame at full resolution while a mouse orbits."""
     browser.evaluate("document.getElementById('automatic').checked && document.getElementById('automatic').click()")
     x, y = WINDOW_SIZE[0] / 2, WINDOW_SIZE[1] / 2
     browser.mouse("mousePressed", x, y, button="left", buttons=1, clickCount=1)
