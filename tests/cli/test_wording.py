@@ -11,6 +11,7 @@ import pytest
 from commands import hyrfpack, refused
 
 from hyrfpack import __file__ as PACKAGE_FILE
+from hyrfpack.cli import main
 from hyrfpack.cli.wording import use_option_names
 from hyrfpack.errors import HyrfError
 from hyrfpack.outputs import Outputs
@@ -40,8 +41,15 @@ def test_every_argument_in_a_library_message_is_an_option_of_some_command():
     arguments = [
         (module, found) for module, text in library_strings() for found in re.findall(r"`[a-z_0-9]+(?:=[^`]+)?`", text)
     ]
+    options = {
+        name
+        for command in main.commands.values()
+        for option in command.params
+        for name in (*option.opts, *option.secondary_opts)
+    }
+
     assert len(arguments) > 40
-    assert [(module, found) for module, found in arguments if use_option_names(found) == found] == []
+    assert [(module, found) for module, found in arguments if use_option_names(found).split()[0] not in options] == []
 
 
 @pytest.mark.parametrize(
@@ -54,7 +62,6 @@ def test_every_argument_in_a_library_message_is_an_option_of_some_command():
         ("try `background=False`", "try --no-background"),
         ("lower `degree`, or raise `target_bytes`", "lower --sh-degree, or raise --target-size"),
         ("see `hyrfpack render --help`", "see `hyrfpack render --help`"),
-        ("the key `unheard_of` is missing", "the key `unheard_of` is missing"),
     ],
 )
 def test_arguments_become_options(message, expected):

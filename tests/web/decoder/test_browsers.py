@@ -25,7 +25,7 @@ BROWSER_FLAGS = {
 }
 RECORDED_NAME_BY_FIELD = {"positions": "positions", "colorLogits": "color_logits", "scaleLogits": "scale_logits"}
 PAGE_HTML = """<!doctype html><title>page</title><script type="module">
-const told = (answer) => fetch("/answer", { method: "POST", body: JSON.stringify(answer) });
+const sendAnswer = (answer) => fetch("/answer", { method: "POST", body: JSON.stringify(answer) });
 const numbers = ({ positions, colorLogits, scaleLogits }) =>
   [positions, colorLogits, scaleLogits].map((array) => Array.from(new Uint32Array(array.buffer)));
 try {
@@ -40,9 +40,9 @@ try {
     answer[name].push(numbers(data));
     answer[name].push(await read(bytes.subarray(0, -8)).catch((error) => error.message));
   }
-  await told(answer);
+  await sendAnswer(answer);
 } catch (error) {
-  await told(String(error));
+  await sendAnswer(String(error));
 }
 </script>"""
 WORKER_JS = """

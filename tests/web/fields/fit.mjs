@@ -15,9 +15,9 @@ const model = await read(new Uint8Array(await readFile(file)));
 const given = JSON.parse(await readFile(cameras, "utf-8"));
 const progress = [], started = performance.now();
 let coarse = null;
-const splats = await fitHarmonics(model, given ?? viewpointOf(model.metadata).fitted, Number(degree), (told) => {
-  progress.push(told.done);
-  if (told.coarse) coarse = { after: progress.length, colors: Array.from(told.splats.colors.slice(0, 30)) };
+const splats = await fitHarmonics(model, given ?? viewpointOf(model.metadata).fitted, Number(degree), (step) => {
+  progress.push(step.done);
+  if (step.coarse) coarse = { after: progress.length, colors: Array.from(step.splats.colors.slice(0, 30)) };
 });
 const { positions, scales, quats, opacities, colors, harmonics, ...rest } = splats;
 const parts = [positions, scales, quats, opacities, colors, harmonics];

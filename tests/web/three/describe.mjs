@@ -7,11 +7,11 @@ import { PerspectiveCamera, Scene, Vector3 } from "three/webgpu";
 
 import { loadHyrf, lookFrom } from "./hyrf-three.js";
 
-const [file, degree] = process.argv.slice(2), scene = new Scene(), told = [];
+const [file, degree] = process.argv.slice(2), scene = new Scene(), progress = [];
 let early = null;
 const onCoarse = (some) => (early = some.children[0].children.filter((child) => child.isGaussianSplat).length);
 const bytes = new Uint8Array(await readFile(file));
-const options = { degree: Number(degree), onCoarse, onProgress: (done) => told.push(done) };
+const options = { degree: Number(degree), onCoarse, onProgress: (done) => progress.push(done) };
 const object = await loadHyrf(bytes, options), camera = new PerspectiveCamera();
 scene.add(object);
 scene.updateMatrixWorld(true);
@@ -28,7 +28,7 @@ const numbers = (name) => Array.from(geometry.getAttribute(name)?.array ?? []);
 const bytesOf = (band) => Array.from(new Uint8Array(Uint32Array.from(numbers(`sphericalHarmonics${band}`)).buffer));
 const sphere = object.children[0].children.find((child) => !child.isGaussianSplat);
 console.log(JSON.stringify({
-  early, told,
+  early, progress,
   meshes: meshes.length,
   places,
   covariances: numbers("covariance"),

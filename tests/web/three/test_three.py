@@ -87,7 +87,7 @@ def test_a_loaded_file_has_the_fitted_splats(app_folder: Path, tmp_path: Path, d
 
     splats, facts = fit_in_node(make_model(), cameras_around_model(10), degree, tmp_path)
     assert found["meshes"] == 1 and found["early"] == 1
-    assert found["told"] == sorted(found["told"]) and found["told"][-1] == 1
+    assert found["progress"] == sorted(found["progress"]) and found["progress"][-1] == 1
     np.testing.assert_allclose(found["places"], splats.positions, rtol=1e-6)
     assert found["unit"] == pytest.approx(MODEL_SCALE)
     turn = torch.from_numpy(splats.quats).double()
