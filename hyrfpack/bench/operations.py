@@ -112,7 +112,7 @@ def _compare(
             parts = {}
             if make == call.forward_backward_task:
                 pairs = zip(call.gradient_inputs, result[1], exact[1], strict=True)
-                parts = {name: measure_relative_error(found, right, what) for name, found, right in pairs}
+                parts = {name: measure_relative_error(value, reference, what) for name, value, reference in pairs}
             yield Row(
                 group=group,
                 setting=prefix + setting,

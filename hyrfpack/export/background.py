@@ -95,8 +95,8 @@ def background_splats(
     )
     gains = BackgroundGains.predict(model, cameras, visibility)
     if gains is not None:
-        towards = torch.from_numpy(directions).float()
-        colors = apply_exposure_gains(torch.from_numpy(colors), gains.evaluate(towards).double()).numpy()
+        direction_tensor = torch.from_numpy(directions).float()
+        colors = apply_exposure_gains(torch.from_numpy(colors), gains.evaluate(direction_tensor).double()).numpy()
     radii = BACKGROUND_RADIUS * RADIUS_RATIO_PER_LEVEL ** (levels.max() - levels)
     count, frame = len(colors), model.config.frame
     shrink = min(1.0, largest_scale / (SPLAT_SCALE_PER_CELL_SIDE * sides * radii * frame.scale).max())
@@ -161,15 +161,15 @@ def background_picture(
     latitudes, longitudes = torch.meshgrid(latitudes, longitudes, indexing="ij")
     level = latitudes.cos()
     directions = torch.stack((level * longitudes.sin(), -latitudes.sin(), level * longitudes.cos()), -1)
-    towards = directions.reshape(-1, 3).float()
-    colors = _sphere_colors(model, towards)
+    flat_directions = directions.reshape(-1, 3).float()
+    colors = _sphere_colors(model, flat_directions)
     gains = BackgroundGains.predict(model, cameras, visibility)
     if gains is not None:
         colors = torch.cat(
             [
-                apply_exposure_gains(some, gains.evaluate(there))
-                for some, there in zip(
-                    colors.split(GAIN_BATCH_DIRECTIONS), towards.split(GAIN_BATCH_DIRECTIONS), strict=True
+                apply_exposure_gains(batch_colors, gains.evaluate(batch_directions))
+                for batch_colors, batch_directions in zip(
+                    colors.split(GAIN_BATCH_DIRECTIONS), flat_directions.split(GAIN_BATCH_DIRECTIONS), strict=True
                 )
             ]
         )
@@ -209,19 +209,19 @@ class BackgroundGains:
         if model.exposure is None:
             return None
         logs = camera_log_gains(model, model.exposure, cameras)
-        middles = cell_centers(np.arange(6 * 4**MIN_CELL_LEVEL), MIN_CELL_LEVEL)[0]
-        light, sums = np.zeros(len(middles)), np.zeros((len(middles), 3))
+        centers = cell_centers(np.arange(6 * 4**MIN_CELL_LEVEL), MIN_CELL_LEVEL)[0]
+        light, sums = np.zeros(len(centers)), np.zeros((len(centers), 3))
         visibility = compute_visibility(model, cameras) if visibility is None else visibility
-        for log, seen in zip(logs, _iterate_seen_pixels(model, cameras, visibility), strict=True):
-            cells = find_cells(seen.places.double().numpy(), MIN_CELL_LEVEL)
-            received = np.bincount(cells, seen.weights, len(middles))
+        for log, pixels in zip(logs, _iterate_seen_pixels(model, cameras, visibility), strict=True):
+            cells = find_cells(pixels.places.double().numpy(), MIN_CELL_LEVEL)
+            received = np.bincount(cells, pixels.weights, len(centers))
             light += received
             sums += received[:, None] * log
         if not light.any():
-            light, sums = np.ones(len(middles)), np.tile(typical_log_gains(model.exposure, logs), (len(middles), 1))
-        lit = light > 0
-        middles, light, means = middles[lit], light[lit], sums[lit] / light[lit, None]
-        return cls(*(torch.from_numpy(some).float() for some in (middles, np.log(light), means)))
+            light, sums = np.ones(len(centers)), np.tile(typical_log_gains(model.exposure, logs), (len(centers), 1))
+        is_seen = light > 0
+        centers, light, means = centers[is_seen], light[is_seen], sums[is_seen] / light[is_seen, None]
+        return cls(*(torch.from_numpy(array).float() for array in (centers, np.log(light), means)))
 
     def evaluate(self, directions: Tensor) -> Tensor:
         """Evaluate the gains (N, 3) along unit vectors (N, 3) from the sphere's centre."""
@@ -235,8 +235,8 @@ def _sphere_colors(model: HybridModel, directions: Tensor) -> Tensor:
     encoding = model.config.direction_encoding
     colors = torch.cat(
         [
-            model.radiance(model.cube_coords(BACKGROUND_RADIUS * some), encode_directions(some, encoding)).sigmoid()
-            for some in directions.split(COLOR_BATCH_DIRECTIONS)
+            model.radiance(model.cube_coords(BACKGROUND_RADIUS * batch), encode_directions(batch, encoding)).sigmoid()
+            for batch in directions.split(COLOR_BATCH_DIRECTIONS)
         ]
     )
     check_finite("background", colors)

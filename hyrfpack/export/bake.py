@@ -207,37 +207,51 @@ def _fit_harmonics(
     highest = max(fitted)
     sphere = fibonacci_sphere(SPHERE_DIRECTIONS).float()
     terms = num_sh_bases(highest)
-    net = harmonics_basis(sphere, highest)
+    sphere_basis = harmonics_basis(sphere, highest)
     sphere_weight = SPHERE_WEIGHT if gains is None else EXPOSED_SPHERE_WEIGHT
-    around = (sphere_weight / len(sphere) * net.T).contiguous()
+    weighted_sphere_basis = (sphere_weight / len(sphere) * sphere_basis.T).contiguous()
     ridge = torch.full((terms,), RIDGE_WEIGHT, dtype=torch.float64)
     ridge[0] = 0
-    gram = around.double() @ net.double() + ridge.diag()
+    gram = weighted_sphere_basis.double() @ sphere_basis.double() + ridge.diag()
     size = min(max(len(model) // MIN_BLOCKS, MIN_BLOCK_GAUSSIANS), MAX_BLOCK_GAUSSIANS)
     edges = torch.arange(0, len(model) + size, size, dtype=torch.int32)
     ranges = [torch.searchsorted(view.index, edges) for view in visibility]
 
     def fit_block(block: int) -> None:
         start, stop = block * size, min((block + 1) * size, len(model))
-        here = slice(start, stop)
-        mean_gains = None if gains is None else gains.gaussians[here]
-        far = torch.stack(
-            [_centered_colors(direction[None], shading, here, mean_gains) for direction in sphere]
+        block_slice = slice(start, stop)
+        mean_gains = None if gains is None else gains.gaussians[block_slice]
+        sphere_colors = torch.stack(
+            [_centered_colors(direction[None], shading, block_slice, mean_gains) for direction in sphere]
         ).flatten(1)
-        right = (around @ far).reshape(terms, stop - start, 3).transpose(0, 1)
-        rows = [(torch.empty(0, dtype=torch.int64), net[:0], net.new_empty(0, 3), net.new_empty(0))]
+        right_sides = (weighted_sphere_basis @ sphere_colors).reshape(terms, stop - start, 3).transpose(0, 1)
+        rows = [
+            (
+                torch.empty(0, dtype=torch.int64),
+                sphere_basis[:0],
+                sphere_basis.new_empty(0, 3),
+                sphere_basis.new_empty(0),
+            )
+        ]
         for number, (view, bounds) in enumerate(zip(visibility, ranges, strict=True)):
-            seen = slice(int(bounds[block]), int(bounds[block + 1]))
-            index = view.index[seen].long()
+            view_slice = slice(int(bounds[block]), int(bounds[block + 1]))
+            index = view.index[view_slice].long()
             directions = torch.nn.functional.normalize(positions[index] - view.viewpoint, dim=-1, eps=1e-12)
             camera_gains = None if gains is None else gains.cameras[number]
             colors = _centered_colors(directions, shading, index, camera_gains)
-            weights = (view.light[seen] / light[index]).float()
+            weights = (view.light[view_slice] / light[index]).float()
             rows.append((index - start, harmonics_basis(directions, highest), colors, weights))
         owners, basis, colors, weights = map(torch.cat, zip(*rows, strict=True))
         for degree, harmonics in fitted.items():
-            some = slice(num_sh_bases(degree))
-            harmonics[here] = least_squares(owners, basis[:, some], colors, weights, gram[some, some], right[:, some])
+            terms_slice = slice(num_sh_bases(degree))
+            harmonics[block_slice] = least_squares(
+                owners,
+                basis[:, terms_slice],
+                colors,
+                weights,
+                gram[terms_slice, terms_slice],
+                right_sides[:, terms_slice],
+            )
 
     blocks = len(edges) - 1
     run_tasks(report_each_call(fit_block, report, "fitting colours", blocks), blocks)
@@ -252,11 +266,11 @@ def _centered_colors(directions: Tensor, shading: Shading, index: Tensor | slice
     """
     encoded = encode_directions(directions, shading.encoding)
     if isinstance(index, slice):
-        first = shading.first_layer[index] + encoded @ shading.direction_weight.T
+        hidden = shading.first_layer[index] + encoded @ shading.direction_weight.T
     else:
-        first = shading.first_layer[index].addmm_(encoded, shading.direction_weight.T)
-    rest = mlp(first.relu_(), shading.weights, shading.biases)
-    colors = rest.add_(shading.color_logits[index]).sigmoid_()
+        hidden = shading.first_layer[index].addmm_(encoded, shading.direction_weight.T)
+    logits = mlp(hidden.relu_(), shading.weights, shading.biases)
+    colors = logits.add_(shading.color_logits[index]).sigmoid_()
     return (colors if gains is None else apply_exposure_gains(colors, gains)).sub_(0.5)
 
 

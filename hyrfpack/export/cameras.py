@@ -78,7 +78,7 @@ def write_colmap(
 
 
 def encode_transforms(cameras: Sequence[tuple[str, Camera]]) -> bytes:
-    """Encode cameras as a transforms.json, to be placed beside the photo folder "images".
+    """Encode cameras as a transforms.json, which belongs in the same folder as the photo folder "images".
 
     Matrices are world_from_camera for OpenGL cameras (x right, y up, z backward), in the input's axes and units.
     Intrinsics are written once if all frames share them, otherwise for each frame.

@@ -53,13 +53,13 @@ def choose_degree(
     fit_visibility = None if visibility is None else list(visibility)
     if len(cameras) >= MIN_CAMERAS_TO_HOLD_OUT:
         validation = fit_cameras[VALIDATION_CAMERAS]
-        for some in (fit_cameras, fit_visibility or []):
-            del some[VALIDATION_CAMERAS]
+        for items in (fit_cameras, fit_visibility or []):
+            del items[VALIDATION_CAMERAS]
     baked = bake(model, fit_cameras, range(highest + 1), fit_visibility, report_part(report, 0.0, 0.6))
     candidates = {str(degree): (splats, None) for degree, splats in baked.items()}
     views = [(shrink_camera(camera), None) for camera in evenly_spaced(validation, MAX_MEASURED_VIEWS)]
-    found = measure_psnr(model, candidates, views, sphere=False, report=report_part(report, 0.6, 1.0))
-    scores = {degree: found[str(degree)].model for degree in baked}
+    measured = measure_psnr(model, candidates, views, sphere=False, report=report_part(report, 0.6, 1.0))
+    scores = {degree: measured[str(degree)].model for degree in baked}
     return lowest_degree_within_tolerance(scores), scores
 
 

@@ -66,7 +66,7 @@ class BakeGains:
             light[index] += received
             sums[index] += received[:, None] * log
         smooth = smooth_log_gains(model.gaussians.positions.detach().numpy(), light, sums, typical)
-        return cls(*(torch.from_numpy(np.exp(some)).float() for some in (logs, smooth)))
+        return cls(*(torch.from_numpy(np.exp(log_gains)).float() for log_gains in (logs, smooth)))
 
 
 def camera_log_gains(model: HybridModel, exposure: ExposureMap, cameras: Sequence[Camera]) -> np.ndarray:
@@ -95,16 +95,16 @@ def smooth_log_gains(positions: np.ndarray, light: np.ndarray, sums: np.ndarray,
         (N, 3) float64, finite.
     """
     smooth = np.broadcast_to(typical, sums.shape).copy()
-    seen = light > 0
-    if not seen.any():
+    is_seen = light > 0
+    if not is_seen.any():
         return smooth
-    tree, weights, weighted = cKDTree(positions[seen]), light[seen], sums[seen]
+    tree, weights, weighted = cKDTree(positions[is_seen]), light[is_seen], sums[is_seen]
     count = min(SMOOTHING_NEIGHBORS, len(weights))
 
     def smooth_block(block: int) -> None:
-        here = slice(block * GAUSSIANS_PER_TASK, (block + 1) * GAUSSIANS_PER_TASK)
-        _, nearest = tree.query(positions[here], k=range(1, count + 1))
-        smooth[here] = weighted[nearest].sum(1) / weights[nearest].sum(1)[:, None]
+        block_slice = slice(block * GAUSSIANS_PER_TASK, (block + 1) * GAUSSIANS_PER_TASK)
+        _, nearest = tree.query(positions[block_slice], k=range(1, count + 1))
+        smooth[block_slice] = weighted[nearest].sum(1) / weights[nearest].sum(1)[:, None]
 
     run_tasks(smooth_block, -(-len(positions) // GAUSSIANS_PER_TASK))
     return smooth

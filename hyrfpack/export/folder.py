@@ -190,7 +190,7 @@ def check_folder(
         is_gallery: check for the files of `export_gallery`.
 
     Raises:
-        HyrfError: a file may not or cannot be written.
+        HyrfError: a file must not be replaced or cannot be written.
     """
     names = [name for pair in _choose_file_names(sources, is_gallery=is_gallery) for name in pair]
     names += [README_NAME, INDEX_NAME, GALLERY_PLAYER_NAME if is_gallery else ELEMENT_SCRIPT_NAME]

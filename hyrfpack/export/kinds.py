@@ -20,7 +20,7 @@ from hyrfpack.splats.harmonics import MAX_DEGREE
 from hyrfpack.splats.splats import Splats
 from hyrfpack.splats.table import FORMATS, FileKind
 
-# The kinds of output besides the formats of splats.
+# The kinds of output other than the formats of splats.
 HTML_PAGE = FileKind(ending=".html", stores_antialiased=True)
 TRANSFORMS_JSON = FileKind(ending=".json", max_degree=0)
 POINT_FILES = (

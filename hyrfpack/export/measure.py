@@ -60,28 +60,34 @@ def measure_psnr(
     """
     decoded, frame = model.decode(), model.config.frame
     solid = torch.tensor(model.config.solid)
-    drawables = {name: (Drawable.from_splats(splats, frame), behind) for name, (splats, behind) in candidates.items()}
+    drawables = {
+        name: (Drawable.from_splats(splats, frame), panorama) for name, (splats, panorama) in candidates.items()
+    }
 
     @torch.no_grad()  # because torch keeps this setting per thread
     def scores_at(viewpoint: tuple[Camera, View | None]) -> dict[str, tuple[float, float | None]]:
         camera, view = viewpoint
-        own = to_8bit(render_view(model, camera, decoded=decoded, background=sphere).rgb)
-        pictures = {"model": own}
-        for name, (drawable, behind) in drawables.items():
+        model_picture = to_8bit(render_view(model, camera, decoded=decoded, background=sphere).rgb)
+        pictures = {"model": model_picture}
+        for name, (drawable, panorama) in drawables.items():
             raster = draw(drawable, camera)
-            backdrop = solid if behind is None else _equirect_colors(torch.from_numpy(behind), camera)
+            backdrop = solid if panorama is None else _equirect_colors(torch.from_numpy(panorama), camera)
             pictures[name] = to_8bit(raster.rgb + raster.transmittance[..., None] * backdrop)
         photo, mask = (None, None) if view is None else _load_photo(view, model)
         if mask is not None and not mask.any():
             return {}
         return {
-            name: (psnr(picture, own, mask), None if photo is None else psnr(picture, photo, mask))
+            name: (psnr(picture, model_picture, mask), None if photo is None else psnr(picture, photo, mask))
             for name, picture in pictures.items()
         }
 
     compare = report_each_call(scores_at, report, "comparing renders with those of the model", len(views))
-    scores = [found for found in parallel_map(compare, views) if found]
-    return {name: _mean_scores([found[name] for found in scores]) for name in ("model", *drawables)} if scores else {}
+    scores = [view_scores for view_scores in parallel_map(compare, views) if view_scores]
+    return (
+        {name: _mean_scores([view_scores[name] for view_scores in scores]) for name in ("model", *drawables)}
+        if scores
+        else {}
+    )
 
 
 def _equirect_colors(picture: Tensor, camera: Camera) -> Tensor:
@@ -92,11 +98,11 @@ def _equirect_colors(picture: Tensor, camera: Camera) -> Tensor:
     directions = pixel_directions(points.double(), camera.intrinsics, torch.from_numpy(camera.camera_from_world))
     x, y, z = directions.float().unbind(-1)
     # The picture is extended by one column of the opposite side at each edge, so that interpolation wraps around.
-    around = torch.cat((picture[:, -1:], picture, picture[:, :1]), dim=1).permute(2, 0, 1)[None]
+    wrapped = torch.cat((picture[:, -1:], picture, picture[:, :1]), dim=1).permute(2, 0, 1)[None]
     across = torch.atan2(x, z) / torch.pi * width / (width + 2)
     down = 2 * torch.atan2(y, torch.hypot(x, z)) / torch.pi
-    places = torch.stack((across, down), -1)[None, None]
-    sampled = torch.nn.functional.grid_sample(around, places, padding_mode="border", align_corners=False)
+    sample_points = torch.stack((across, down), -1)[None, None]
+    sampled = torch.nn.functional.grid_sample(wrapped, sample_points, padding_mode="border", align_corners=False)
     return sampled[0, :, 0].T.reshape(camera.height, camera.width, 3)
 
 
@@ -107,12 +113,12 @@ def _load_photo(view: View, model: HybridModel) -> tuple[Tensor, Tensor | None]:
 
 
 def _mean_scores(scores: Sequence[tuple[float, float | None]]) -> PsnrScores:
-    own, photos = zip(*scores, strict=True)
-    return PsnrScores(fmean(own), None if None in photos else fmean(photos), len(scores))
+    model, photos = zip(*scores, strict=True)
+    return PsnrScores(fmean(model), None if None in photos else fmean(photos), len(scores))
 
 
 @torch.no_grad()
 def psnr_of_splats(before: Drawable, after: Drawable, camera: Camera) -> float:
     """Return the PSNR in dB of a camera's picture of `after` against that of `before`, both over black."""
-    shown, reference = (to_8bit(draw(drawable, camera).rgb) for drawable in (after, before))
-    return psnr(shown, reference)
+    picture, reference = (to_8bit(draw(drawable, camera).rgb) for drawable in (after, before))
+    return psnr(picture, reference)

@@ -263,8 +263,8 @@ def _bake_scene(
         return splats, 0, None
     if kind is HTML_PAGE:
         return splats, 0, background_picture(loaded.model, cameras=loaded.fit_cameras, visibility=visibility)
-    behind = background_splats(loaded.model, loaded.fit_cameras, kind.max_scale, visibility)
-    return concatenate((splats, behind)), len(behind), None
+    distant = background_splats(loaded.model, loaded.fit_cameras, kind.max_scale, visibility)
+    return concatenate((splats, distant)), len(distant), None
 
 
 # Splats by name, each with the picture of its background or None: "baked" before writing, "file" as read back.
@@ -301,20 +301,20 @@ def _add_scores(
     file, before = scores["file"], scores["baked"]
     cost = _estimate_cost_db(before, file, loaded.photo_mse)
     if cost > MIN_REPORTED_COST_DB:
-        seen = (
+        where = (
             "" if loaded.cameras else " at generated viewpoints (name photos with `data` for a measurement at theirs)"
         )
         if loaded.model.config.antialiased and not kind.stores_antialiased:
-            able = " or ".join(
+            alternatives = " or ".join(
                 splat_format.ending for splat_format in FORMATS.values() if splat_format.stores_antialiased
             )
             say(
                 f"{kind.ending} cannot store that the model is antialiased: set it in the program that draws the "
-                f"file, or choose {able}"
+                f"file, or choose {alternatives}"
             )
         else:
             say(
-                f"{kind.ending} costs {cost:.1f} dB{seen}: it is too coarse for this scene, perhaps for its unit of "
+                f"{kind.ending} costs {cost:.1f} dB{where}: it is too coarse for this scene, perhaps for its unit of "
                 "length; choose another format"
             )
     return replace(
@@ -332,11 +332,11 @@ def _add_exposure_scores(
 ) -> ExportReport:
     """Add the scores of splats of both exposures, against the model as photographed and against photos."""
     scores = measure_psnr(loaded.model, exposures, loaded.measured_views, sphere=sphere, report=report)
-    found = {name: scores[name] for name in SPLAT_EXPOSURES if name in scores}
+    by_exposure = {name: scores[name] for name in SPLAT_EXPOSURES if name in scores}
     return replace(
         result,
-        psnr_by_exposure={name: score.model for name, score in found.items()},
-        photos_by_exposure={name: score.photos for name, score in found.items() if score.photos is not None},
+        psnr_by_exposure={name: score.model for name, score in by_exposure.items()},
+        photos_by_exposure={name: score.photos for name, score in by_exposure.items() if score.photos is not None},
     )
 
 

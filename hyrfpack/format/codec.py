@@ -43,8 +43,7 @@ PROFILES: dict[str, Callable[..., tuple[list[Section], dict]]] = {
     "compact": compact.encode,
 }
 DEFAULT_PROFILE = "compact"  # `hyrfpack.compress_model` and the command line use it where no profile is named
-# A file may declare this many Gaussians for each of its bytes, plus a constant, because equal Gaussians may take no
-# bytes at all.
+# A file may declare this many Gaussians for each of its bytes, plus a constant, because equal Gaussians take no bytes.
 MAX_GAUSSIANS_PER_FILE_BYTE = 32
 EXTRA_GAUSSIANS_PER_FILE = 1 << 18
 # Decoders of the codecs that read no other section; `compact` has those that need the positions.
@@ -246,14 +245,14 @@ def repack(
     arguments and the errors are those of `encode_model`, `load_model` and `save_model`.
 
     Args:
-        overwrite: replace a file at `target`. Without it, an existing file is an error. If a file appears in the
-            meantime, it is kept, and a free file name in the same folder is used, which the report contains.
+        overwrite: replace a file at `target`. Without it, an existing file is an error. A file that appears during the
+            call is kept, and a free file name in the same folder is used, which the report contains.
     """
     source = find_model(source)
     Outputs(source, overwrite=overwrite).file(target)
     model, provenance = load_with_provenance(source, fraction)
-    kept = provenance if profile == "raw" else quantized_provenance(provenance, model.config.frame.scale)
-    return save_model(model, target, profile, kept, overwrite=overwrite, **settings)
+    stored_provenance = provenance if profile == "raw" else quantized_provenance(provenance, model.config.frame.scale)
+    return save_model(model, target, profile, stored_provenance, overwrite=overwrite, **settings)
 
 
 def load_with_provenance(path: str | os.PathLike[str], fraction: float | None = None) -> tuple[HybridModel, dict]:

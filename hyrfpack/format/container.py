@@ -3,7 +3,7 @@
     header (48 bytes) | table of contents (40 bytes a section) | section, zero padding to 8 bytes | section, ...
 
 The layout is canonical: sections follow each other in the order of the table with no gaps, and nothing follows the
-last, so every byte of a file is checked or covered by a checksum. `docs/reference/format.md` specifies each byte. This
+last. So every byte of a file is checked or covered by a checksum. `docs/reference/format.md` specifies each byte. This
 module treats payloads as opaque bytes; `hyrfpack.format.codec` decodes them.
 """
 

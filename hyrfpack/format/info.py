@@ -47,8 +47,8 @@ def describe_file(path: str | os.PathLike[str], fraction: float | None = None) -
     Returns:
         A dictionary ready for JSON: `bytes` (of the file), `version` ("1.0"), and the metadata's `writer`, `profile`,
         `gaussians`, `config` (frame, grids, background, rules of the model), `rules`, `settings`, `provenance`;
-        `exposure` of a file with an exposure map: its number of `centers`, and the lowest and the highest exposure of
-        renders in `stops`, each the mean of the three channels (null without a map, or where its bytes are missing);
+        `exposure` of a file with an exposure map: its number of `centers`, and in `stops` the lowest and the highest
+        exposure of renders, as means of the three channels (null without a map, or if its bytes are missing);
         `bits_per_gaussian` of the whole file (null without Gaussians); and `sections`, each with `type`, `holds`,
         `before` (bytes as float32), `after` (stored bytes) and `bits_per_gaussian`.
 

@@ -48,7 +48,7 @@ class Metadata:
         profile: "raw", "paper" or "compact"; informative, because each section names its own codec.
         gaussians: number of Gaussians.
         config: `ModelConfig.to_dict()`.
-        rules: names of the equations that are not settings of a model; a reader rejects names that it does not know.
+        rules: names of the equations that no setting changes; a reader rejects names that it does not know.
         settings: settings of the profile, informative.
         provenance: where the model comes from, informative: preset, steps, why the sizes were chosen.
         writer: program and version that wrote the file.

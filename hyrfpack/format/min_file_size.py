@@ -58,8 +58,8 @@ def check_target_bytes(target_bytes: int, provenance: dict | None = None, exposu
 
     Args:
         target_bytes: largest allowed size of the packed file, bytes.
-        provenance: provenance that the file will have, as far as it is known.
-        exposure: exposure map that the file will have, as far as it is known.
+        provenance: provenance that the file will have, if known.
+        exposure: exposure map that the file will have, if known.
 
     Raises:
         HyrfError: no packed file can be that small. The message suggests a unit if it seems to be missing.

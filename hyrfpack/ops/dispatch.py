@@ -38,9 +38,9 @@ def choose_implementation(implementation: str, available: tuple[str, ...], *tens
         tensors: the operation's inputs; all must have the same device and dtype.
 
     Returns:
-        A name from `available`. "auto" selects "gpu" for float32 tensors on a CUDA or ROCm device when Triton is
-        installed, "cpu" for float32 tensors on the CPU when Numba is installed, and "reference" (plain torch, any
-        device, any dtype) otherwise.
+        A name from `available`. For float32 tensors, "auto" selects "gpu" on a CUDA or ROCm device if Triton is
+        installed, and "cpu" on the CPU if Numba is installed. Otherwise it selects "reference" (plain torch, any
+        device, any dtype).
 
     Raises:
         ValueError: the name is not available, the implementation does not support these tensors, or the tensors

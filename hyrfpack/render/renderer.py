@@ -1,4 +1,4 @@
-"""Renders a view: culls Gaussians, decodes the others, projects, sorts into tiles, blends and adds the background."""
+"""Renders a view: culls, decodes, projects and blends Gaussians, sorted into tiles, and adds the background."""
 
 from __future__ import annotations
 

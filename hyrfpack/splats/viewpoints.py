@@ -75,11 +75,13 @@ class WeightedSplats:
                 f"{name}: no Gaussian is visible, because all are transparent or without size",
                 fix="give another file",
             )
-        seen = areas > 0
-        typical = np.median(discs[seen])
-        detail_weights = np.where(seen, splats.opacities * (typical / np.maximum(discs, typical)), 0.0)
-        areas = np.minimum(areas, np.quantile(areas[seen], MAX_AREA_QUANTILE))
-        frame = Frame.from_box(*_quantile_box(splats.positions[seen], sides[seen, 2], detail_weights[seen]))
+        is_visible = areas > 0
+        typical = np.median(discs[is_visible])
+        detail_weights = np.where(is_visible, splats.opacities * (typical / np.maximum(discs, typical)), 0.0)
+        areas = np.minimum(areas, np.quantile(areas[is_visible], MAX_AREA_QUANTILE))
+        frame = Frame.from_box(
+            *_quantile_box(splats.positions[is_visible], sides[is_visible, 2], detail_weights[is_visible])
+        )
         boxes_away = np.abs(frame.to_local(splats.positions) / frame.half_extent).max(axis=1)
         return cls(splats, areas, detail_weights, frame, areas / np.maximum(boxes_away, 1) ** 4)
 
@@ -177,7 +179,7 @@ def has_enclosed_places(weighted: WeightedSplats, drawable: Drawable) -> bool:
     rng = np.random.default_rng(0)
     places = [_sample_inside_view(weighted, rng)[0] for _ in range(ENCLOSURE_CANDIDATES)]
     clutter = np.array(parallel_map(lambda place: weighted.clutter(place, ROOM_CLEARANCE_RADII), places))
-    seen = []
+    coverages = []
     for index in np.argsort(clutter, kind="stable")[:MAX_ENCLOSURE_TESTS]:
         if clutter[index] <= MAX_CLUTTER:
             axes = np.concatenate((np.eye(3), -np.eye(3)))
@@ -186,8 +188,8 @@ def has_enclosed_places(weighted: WeightedSplats, drawable: Drawable) -> bool:
                 for axis in axes
             ]
             shares = parallel_map(lambda camera: coverage(drawable, camera), cameras, drawable.device)
-            seen.append(np.mean(shares))
-    return len(seen) > 0 and float(np.median(seen)) >= MIN_ENCLOSED_COVERAGE
+            coverages.append(np.mean(shares))
+    return len(coverages) > 0 and float(np.median(coverages)) >= MIN_ENCLOSED_COVERAGE
 
 
 def _sample_inside_view(weighted: WeightedSplats, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

@@ -30,8 +30,8 @@ def bundle(entry: str) -> str:
         entry: path of the module, relative to `hyrfpack/web`.
 
     Raises:
-        ValueError: a module uses another form, modules import each other in a circle, two modules define the same name,
-            or the script holds text that would end its script element.
+        ValueError: a module uses another form, imports are circular, two modules define the same name, or the script
+            holds text that would end its script element.
     """
     placed: dict[str, str | None] = {}  # stripped text by module path, None while the module's imports are placed
     owners: dict[str, str] = {}

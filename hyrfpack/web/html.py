@@ -94,9 +94,9 @@ def encode_splats_page(
 
     Args:
         splats: the splats to show, world units.
-        background: (H, W, 3) RGB in [0, 1] of the background: pixel (row v, column u) is at longitude
-            phi = 2 pi (u + 0.5) / W - pi and latitude lam = pi / 2 - pi (v + 0.5) / H, in the world's direction
-            (cos lam sin phi, -sin lam, cos lam cos phi). None for the colour `solid`.
+        background: (H, W, 3) RGB in [0, 1] of the background, or None for the colour `solid`. The pixel in row v and
+            column u shows the world's direction (cos lam sin phi, -sin lam, cos lam cos phi), with longitude
+            phi = 2 pi (u + 0.5) / W - pi and latitude lam = pi / 2 - pi (v + 0.5) / H.
         near: near plane in world units; splats in front of it are not drawn.
         sphere: centre (3,) and radius of the sphere that the background lies on, world units. Directions are relative
             to the centre. None for a background that is infinitely far away.

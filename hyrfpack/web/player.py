@@ -37,7 +37,7 @@ def encode_player(
     stages: Mapping[str, dict] | None = None,
     updates: str | None = None,
 ) -> bytes:
-    """Return a page that plays a file beside it, a file that its address names (`?content=URL`), or a dropped file.
+    """Return a page that plays a hosted file, a file that its address names (`?content=URL`), or a dropped file.
 
     Args:
         title: title of the page.
@@ -55,10 +55,10 @@ def encode_player(
     Returns:
         The file, UTF-8. The same arguments give the same bytes.
     """
-    beside: dict = {"content": content, "title": title, "stages": stages or {}}
+    settings: dict = {"content": content, "title": title, "stages": stages or {}}
     if updates is not None:
-        beside["updates"] = updates
-    texts = [json_element("content", beside)] if content is not None or stages else []
+        settings["updates"] = updates
+    texts = [json_element("content", settings)] if content is not None or stages else []
     if poster is not None:
         texts.append(f'<img id="poster" alt="" src="{html.escape(poster)}">')
     return assemble_player_page(title, texts, description, image=poster, fetches=fetches)
@@ -112,18 +112,18 @@ def content_security_policy(style: str, scripts: Sequence[str] = (), fetches: st
     Args:
         style: text of the page's style element.
         scripts: texts of its script elements.
-        fetches: sources of files and pictures besides the page itself.
+        fetches: further sources of files and pictures, in addition to the page itself.
     """
     allowed = {"default-src": "'none'", "style-src": _hash_source(style), "img-src": f"{fetches} data: blob:".strip()}
     if scripts:
         allowed |= {"script-src": " ".join(map(_hash_source, scripts)), "worker-src": "blob:"}
         allowed |= {"connect-src": fetches} if fetches else {}
     allowed |= {"base-uri": "'none'", "form-action": "'none'"}
-    return "; ".join(f"{what} {where}" for what, where in allowed.items())
+    return "; ".join(f"{directive} {sources}" for directive, sources in allowed.items())
 
 
 def meta_tags(title: str, description: str, image: str | None = None) -> str:
-    """Return the meta elements of a page, from which programs show a preview of its address.
+    """Return the meta elements of a page, from which programs make a preview of its address.
 
     Args:
         title, description: plain text.

@@ -52,9 +52,9 @@ def background_grid(
 
         color = sigmoid(mlp([hash_encode(contract(p / half_extent)), e(d)]))
 
-    Nodes lie at the centres of pixels 0, stride, 2 stride, ..., the last at or past the image's edge. A node is needed
-    if the transmittance exceeds `threshold` at any pixel that interpolates from it, that is, at any pixel nearer to it
-    than `stride` in both axes.
+    Nodes lie at the centres of pixels 0, stride, 2 stride, ..., the last at or past the image's edge. Pixels nearer to
+    a node than `stride` in both axes interpolate from it. A node is needed if the transmittance exceeds `threshold` at
+    any of these pixels.
 
     Args:
         transmittance: (H, W) the share of light that passes all Gaussians; it receives no gradient.

@@ -23,7 +23,7 @@ def expand(c: Tensor) -> Tensor:
         u = y                             |y| <= 1,     y = 4 (c - 0.5)
         u = y / (|y| (2 - |y|))           otherwise
 
-    No finite u maps to |y| >= 2. Such points are treated as if they lay just inside, so that |u| stays below 2^20.
+    No finite u maps to |y| >= 2. Such points are moved just inside, so that |u| stays below 2^20.
 
     Example:
         >>> expand(torch.tensor([[0.875, 0.5, 0.5]]))

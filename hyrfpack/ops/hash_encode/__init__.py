@@ -34,8 +34,8 @@ def hash_encode(
     Returns:
         (N, L * F) features, ordered by level. "cpu" and "gpu" store them planar, as the transpose of a contiguous
         (L * F, N). Callers that keep this layout, as `mlp` does, avoid a copy or slow reads in backward.
-        Differentiable once in `table` and in `coords`, in the latter within the cell of the point. On "gpu" the order
-        in which points add to the gradient of `table` varies from run to run, and with it the last bits.
+        Differentiable once in `table` and, within the cell of each point, in `coords`. On "gpu" the order of additions
+        to the gradient of `table` varies, so its last bits differ from run to run.
 
     Raises:
         ValueError: shapes, sizes, dtypes or devices do not match.

@@ -1,7 +1,7 @@
 """Implements multiresolution hash encoding in Numba, with two features per level.
 
-Coordinates, features and their gradients are planar, (3, N) and (2L, N), so that every loop over points reads and
-writes whole cache lines and no two levels share one. For a block of points, a vectorised loop first computes rows and
+Coordinates, features and their gradients are planar, (3, N) and (2L, N). Every loop over points thus reads and writes
+whole cache lines, and no two levels share one. For a block of points, a vectorised loop first computes rows and
 weights; a second loop then reads the table. Gradients need no atomics: each thread owns one level (gradient of the
 table) or one range of points (gradient of the coordinates), which also fixes the order of every sum.
 """

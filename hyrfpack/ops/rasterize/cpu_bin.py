@@ -33,7 +33,7 @@ SLOT_MASK = np.uint64(MAX_PAIRS - 1)
 
 _MAX_RADIX_BITS = 11
 _POSITIONS_PER_BLOCK = 64
-# Spans are widened by this margin against rounding errors; blending tests alpha at each pixel anyway.
+# Spans are widened by this margin against rounding errors. Too wide a span is harmless, because blending tests alpha.
 _SPAN_MARGIN_PIXELS = 0.01
 _kernel = compiled(fastmath={"contract", "nsz", "nnan"}, error_model="numpy")
 

@@ -287,17 +287,17 @@ def sum_rows(
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     count = tl.load(counts + index, mask=index < total, other=0)
     begin = tl.load(slot_starts + index, mask=count > 0, other=0).to(tl.int64)
-    most = tl.max(count, 0)
-    if most > 1:
+    max_count = tl.max(count, 0)
+    if max_count > 1:
         column = tl.arange(0, 16)
         used = column <= (SUM_ABS_Y if ABSGRAD else SUM_BLUE)
         slot = tl.arange(0, SLOTS)
         sums = tl.zeros([BLOCK, 16], tl.float32)
         first = gradient_rows + begin[:, None] * GRADIENT_ROW_FLOATS + column[None, :]
         done = 0
-        while done < most:
+        while done < max_count:
             at = first[:, None, :] + ((done + slot) * GRADIENT_ROW_FLOATS)[None, :, None]
-            there = ((done + slot)[None, :] < count[:, None])[:, :, None] & used[None, None, :]
-            sums += tl.sum(tl.load(at, mask=there, other=0.0), 1)
+            is_used = ((done + slot)[None, :] < count[:, None])[:, :, None] & used[None, None, :]
+            sums += tl.sum(tl.load(at, mask=is_used, other=0.0), 1)
             done += SLOTS
         tl.store(first, sums, mask=(count > 1)[:, None] & used[None, :])

@@ -1,6 +1,7 @@
 """Device functions that find the tiles an ellipse touches, for the kernels that count and list pairs.
 
-They compute in float32. Spans are widened by more than the rounding error, and blending tests alpha at each pixel.
+They compute in float32. Spans are widened by more than the rounding error. Too wide a span is harmless, because
+blending tests alpha at each pixel.
 """
 
 from __future__ import annotations

@@ -114,9 +114,9 @@ def pack_camera(
         tolerance: width of the band of `in_frustum`, as a fraction of half the image's size.
 
     Returns:
-        (28,): the rows of the rotation and the translation (12), fx, fy, cx, cy, near, the limits of x/z (low, high)
-        and of y/z in the Jacobian, the limits of fx x/z (low, high) and of fy y/z in the frustum,
-        and, from VIEWPOINT_OFFSET on, the camera's centre.
+        (28,): the rows of the rotation and the translation (12); fx, fy, cx, cy; near; the limits of x/z (low, high)
+        and of y/z in the Jacobian; the limits of fx x/z (low, high) and of fy y/z in the frustum; and, from
+        VIEWPOINT_OFFSET on, the camera's centre.
     """
     fx, fy, cx, cy = (float(number) for number in intrinsics)
     pose = camera_from_world.detach().to("cpu", torch.float64)

@@ -78,8 +78,8 @@ def project(
 ) -> Projected:
     """Project 3D Gaussians to 2D Gaussians (EWA splatting).
 
-    With p = R m + t the mean in the camera's frame and J the Jacobian of the pinhole projection at p, the 2D covariance
-    is J R Q diag(s^2) Q^T R^T J^T + 0.3 I. J is evaluated with x/z and y/z clamped to `jacobian_limits`. Gaussians at
+    The 2D covariance is J R Q diag(s^2) Q^T R^T J^T + 0.3 I. Here J is the Jacobian of the pinhole projection at the
+    mean in the camera's frame, p = R m + t, evaluated with x/z and y/z clamped to `jacobian_limits`. Gaussians at
     z <= near are dropped. The arguments are those of `hyrfpack.ops.rasterize.rasterize`.
     """
     fx, fy, cx, cy = intrinsics

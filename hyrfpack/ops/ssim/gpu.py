@@ -1,7 +1,7 @@
 """Computes L1, SSIM and their gradient in two passes over the image, in Triton.
 
 A program processes a strip of rows in a block of columns, from top to bottom. It blurs each row horizontally by 11
-shifted loads, of which the L1 cache serves all but one. It keeps the last 11 blurred rows in registers and blurs them
+shifted loads, of which the L1 cache serves 10. It keeps the last 11 blurred rows in registers and blurs them
 vertically there. The first pass blurs the local moments and writes the derivatives of SSIM with respect to E[x], E[xx]
 and E[xy]. The second pass, in backward, blurs these derivatives in the same way into the gradient: the window is
 symmetric, so the blur is its own transpose. Pixels stay interleaved, so a horizontal neighbour is 3 floats away.

@@ -59,8 +59,8 @@ def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
     """Encode splats as a .glb file.
 
     The stored numbers keep the input's axes and units. The node's rotation turns them to glTF's axes, where y is up.
-    Where the scene lies far from the origin compared to its size, the node's translation holds that distance, so that
-    float32 positions stay exact to a millionth of the scene's size. The same splats give the same bytes.
+    For a scene far from the origin compared to its size, the node's translation holds that distance, so that float32
+    positions stay exact to a millionth of the scene's size. The same splats give the same bytes.
 
     Args:
         splats: at least one splat.

@@ -61,14 +61,14 @@ def find_nearest_entries(rows: np.ndarray, entries: np.ndarray) -> tuple[np.ndar
     def search(block: int) -> None:
         # |p - c|^2 is smallest where p . c - |c|^2 / 2 is largest.
         block_rows = slice(block * _BLOCK_ROWS, (block + 1) * _BLOCK_ROWS)
-        best, found = np.full(len(rows[block_rows]), -np.inf, np.float32), labels[block_rows]
+        best, block_labels = np.full(len(rows[block_rows]), -np.inf, np.float32), labels[block_rows]
         for first in range(0, len(entries), _BLOCK_ENTRIES):
             part = slice(first, first + _BLOCK_ENTRIES)
             scores = torch.addmm(half_squares[part], points[block_rows], table[:, part], beta=-1).numpy()
-            here = scores.argmax(1)
-            score = np.take_along_axis(scores, here[:, None], 1)[:, 0]
+            nearest = scores.argmax(1)
+            score = np.take_along_axis(scores, nearest[:, None], 1)[:, 0]
             better = score > best
-            best[better], found[better] = score[better], here[better] + first
+            best[better], block_labels[better] = score[better], nearest[better] + first
         distances[block_rows] = np.maximum((rows[block_rows] ** 2).sum(1) - 2 * best, 0)
 
     run_tasks(search, -(-len(rows) // _BLOCK_ROWS))

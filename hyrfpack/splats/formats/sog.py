@@ -147,7 +147,7 @@ def unzip(data: bytes, name: str) -> dict[str, bytes]:
     Raises:
         HyrfDataError: the bytes are not a zip, are damaged, lack a file, or would unpack to far more than their size.
     """
-    bytes_left = 2 * len(data) + _MAX_META_BYTES  # a zip hardly shrinks pictures, which are compressed already
+    bytes_left = 2 * len(data) + _MAX_META_BYTES  # a zip shrinks pictures little, because they are compressed
     files = {}
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -280,8 +280,8 @@ def _build_harmonics_palette(splats: Splats) -> tuple[np.ndarray, np.ndarray, np
     size = _PALETTE_ROWS_PER_PICTURE_ROW * max(
         1, min(_MAX_WRITTEN_PALETTE_ROWS, len(rows) // _GAUSSIANS_PER_PALETTE_ROW) // _PALETTE_ROWS_PER_PICTURE_ROW
     )
-    # The basis is orthonormal, so distances of coefficients are those of colours over all directions. The weights lie
-    # between equal ones and the visible areas of the Gaussians; pictures are worse with either of these.
+    # The basis is orthonormal, so distances of coefficients are those of colours over all directions. The weights are a
+    # compromise between equal ones and the visible areas of the Gaussians. Both of these give worse pictures.
     _, middle, largest = np.sort(splats.scales.astype(np.float64), axis=1).T
     weights = splats.opacities * (middle * largest) ** 0.25
     weights += max(0.01 * weights.mean(), 1e-30)

@@ -13,8 +13,8 @@ Every attribute has its own section, with a few bytes for each Gaussian, in this
 A header of 16 bytes comes first: "NGSP", version, count (all uint32), degree, fractional bits, flags and 0 (one byte
 each). Up to version 3, header and sections are one gzip stream.
 
-Version 4 is not compressed as a whole. Its header of 32 bytes starts with the same 16 bytes, whose last is the number
-of streams, and continues with the offset of the table of contents (uint32) and 12 zero bytes. Then come optional
+Version 4 is not compressed as a whole. Its header of 32 bytes starts with the same 16 bytes, but the last one is the
+number of streams. It continues with the offset of the table of contents (uint32) and 12 zero bytes. Then come optional
 extensions, and the table of contents with the stored and the raw length of each stream (uint64 each). Then each section
 that is not empty follows as a zstd stream.
 
