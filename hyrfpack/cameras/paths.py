@@ -61,11 +61,11 @@ class Viewpoint:
     def from_cameras(cls, cameras: Sequence[Camera]) -> Viewpoint:
         """Summarise a capture of at least one camera.
 
-        - `center`: the point nearest to all viewing axes (least squares). If the axes are nearly parallel or point
-          away from it, as on a drive or in a room seen from its middle, it is a point in front of the typical camera.
-        - `up`, of unit length: the axis about which the pictures' rows are level. If that axis is ambiguous (all
-          cameras look the same way, or many are rolled), it is the mean of the cameras' up axes, or the typical
-          camera's own.
+        - `center`: the point nearest to all viewing axes (least squares). It is a point in front of the typical camera
+          if the axes are nearly parallel, as on a drive, or point away from it, as in a room seen from its middle.
+        - `up`, of unit length: the direction perpendicular to the cameras' right axes (least squares). If it is
+          ambiguous (all cameras look in one direction, or many are rolled), it is the mean of their up axes, or the
+          typical camera's own.
         - `camera`: the camera nearest to the capture's median distance and height.
         """
         positions = np.array([camera.position for camera in cameras])

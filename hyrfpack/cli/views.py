@@ -151,7 +151,7 @@ def render(
         parts = ranks.all_gather(ranks.run_on_all(write))
         if not ranks.is_main:
             return
-        written = [parts[place % ranks.size][place // ranks.size] for place in range(len(named))]
+        written = [parts[index % ranks.size][index // ranks.size] for index in range(len(named))]
         if video_path:
             video_path = note_rename(video_path, write_video(written, video_path, overwrite=overwrite))
     for name, path in zip(render_file_names([name for name, _ in named]), written, strict=True):

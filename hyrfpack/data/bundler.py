@@ -1,10 +1,10 @@
 """Read Bundler's bundle.out (version 0.3), which many programs export, and its list of photos.
 
 After the line `# Bundle file v0.3` and the numbers of cameras and points, each camera has five lines: f k1 k2, three
-rows of R and t, with P = R X + t. A camera looks along -z with y up. With p = -P / P.z, a point is imaged at f (1 + k1
-|p|^2 + k2 |p|^4) p in pixels from the picture's centre, y up. f = 0 marks a photo without a pose. Each point has three
-lines: position, colour (0 to 255) and observations. Photos are in the order of the list. The file does not state the
-size of the photos, so smaller copies cannot be distinguished from the photos themselves.
+rows of R, and t. A point X has the camera coordinates P = R X + t. A camera looks along -z with y up. With p = -P /
+P.z, a point is imaged f (1 + k1 |p|^2 + k2 |p|^4) p pixels from the picture's centre, y up. f = 0 marks a photo without
+a pose. Each point has three lines: position, colour (0 to 255) and observations. Photos are in the order of the list.
+The file does not state the size of the photos, so smaller copies cannot be distinguished from the photos themselves.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Validate COLMAP's binary tables before pycolmap reads them.
 
-pycolmap trusts the counts in these files: a truncated file is read as zeros without an error, and a forged count leads
+pycolmap trusts the counts in these files. It reads a truncated file as zeros without an error, and a forged count leads
 to an endless loop. This module checks that every count fits the size of the file. All numbers are little-endian, and
 the layouts are those that COLMAP documents (src/colmap/scene/reconstruction_io).
 """

@@ -230,8 +230,8 @@ def panorama_lens(path: Path, header: PictureHeader) -> Lens:
 def is_panorama(path: str | os.PathLike[str]) -> bool:
     """Return whether a picture is a panorama of the whole sphere.
 
-    It is one if it is twice as wide as high, and either its XMP data say so, or its content fits: the left edge
-    continues the right edge, and the first and the last row, which show one point each, have nearly uniform colour.
+    It is one if it is twice as wide as high, and if its XMP data or its content say so. The content fits if the left
+    edge continues the right edge, and the first and the last row, which show one point each, are nearly uniform.
 
     Raises:
         HyrfDataError: the file is no picture.

@@ -62,8 +62,8 @@ class PhotoFacts:
 def list_photos(folder: StrPath) -> list[Path]:
     """List the photos in a folder and its subfolders.
 
-    Hidden files, folders of masks, depth maps and thumbnails, the smaller copies in images_2, images_4 and so on
-    beside images/, and subfolders with results of hyrfpack are left out.
+    These are left out: hidden files, folders of masks, depth maps and thumbnails, smaller copies beside images/
+    (images_2, images_4 and so on), and subfolders with results of hyrfpack.
 
     Args:
         folder: the folder to search. Links to folders are followed.

@@ -1,8 +1,9 @@
 """Read LLFF datasets: poses_bounds.npy beside folders of photos.
 
-Each row has 17 numbers: a 3 x 5 matrix, row by row, and the nearest and the farthest depth. Its first three columns are
-the camera's axes down, right and backwards in the world, the fourth its position, and the fifth the picture's height,
-width and focal length, all in pixels of the photos whose poses were estimated. Rows are sorted by the photos' names.
+Each row has 17 numbers: a 3 x 5 matrix, row by row, and the nearest and the farthest depth. The first three columns are
+the camera's axes down, right and backwards in the world, and the fourth is its position. The fifth is the picture's
+height, width and focal length, in pixels of the photos whose poses were estimated. Rows are sorted by the photos'
+names.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Read Polycam's raw export: keyframes/ with photos and a JSON file of the camera for each.
 
-`t_00` to `t_23` are the rows of a 3 x 4 world_from_camera in ARKit's axes: the camera's are OpenGL's (x right, y up, z
-backward) for the picture as stored, and the world's y is up. Photos in `corrected_images` are undistorted, and poses in
-`corrected_cameras` are optimised. Sessions that are too large for that have only `images` and `cameras`, with ARKit's
-poses. Depth maps and the mesh, which has a frame of its own, are not read.
+`t_00` to `t_23` are the rows of a 3 x 4 world_from_camera in ARKit's axes. The camera's axes are OpenGL's (x right, y
+up, z backward) for the picture as stored, and the world's y is up. Photos in `corrected_images` are undistorted, and
+poses in `corrected_cameras` are optimised. Sessions that are too large to be optimised have only `images` and
+`cameras`, with ARKit's poses. Depth maps and the mesh, which has a frame of its own, are not read.
 """
 
 from __future__ import annotations

@@ -113,8 +113,8 @@ def measure_sharpness(gray: np.ndarray) -> float:
 def is_blurred(sharpness: Sequence[float] | np.ndarray) -> np.ndarray:
     """Decide which photos of a set are blurred, relative to their neighbours and to the set.
 
-    A photo is blurred if its sharpness is below 0.65 of the median of its neighbours (up to four on each side, in order
-    of capture), below 0.6 of the median of the set, or below 0.4.
+    A photo is blurred if its sharpness is below 0.65 of its neighbours' median, below 0.6 of the set's median, or below
+    0.4. Its neighbours are up to four photos on each side, in order of capture.
 
     Args:
         sharpness: (N,) results of `measure_sharpness`, in the order in which the photos were taken.

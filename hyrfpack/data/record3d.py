@@ -1,7 +1,7 @@
 """Read Record3D's recordings: metadata beside a folder of frames, as in a .r3d archive or an "EXR + JPG" export.
 
-`metadata` is JSON: `w` and `h`, `K` in column-major order, `poses` as qx qy qz qw px py pz, one for each frame, and
-often `perFrameIntrinsicCoeffs` as fx fy cx cy. A pose is world_from_camera with OpenGL's axes (x right, y up, z
+`metadata` is JSON: `w` and `h`, `K` in column-major order, and `poses` as qx qy qz qw px py pz, one for each frame. It
+often has `perFrameIntrinsicCoeffs` as fx fy cx cy. A pose is world_from_camera with OpenGL's axes (x right, y up, z
 backward) for the picture as stored. Frames are numbered from 0. Depth maps are not read.
 """
 

@@ -1,8 +1,8 @@
 """Lens distortion models, and the undistortion of photos.
 
-Undistortion needs only the forward distortion: each pixel of the undistorted picture takes its colour from the point in
-the photo where its ray was imaged. The undistorted camera keeps the photo's size, focal lengths and principal point, so
-that nothing is rescaled. Pixels whose rays fell outside the photo are masked out, not cropped or painted black.
+Undistortion needs only the forward distortion: each undistorted pixel takes its colour from the point in the photo
+where its ray was imaged. The undistorted camera keeps the photo's size, focal lengths and principal point, so that
+nothing is rescaled. Pixels whose rays fell outside the photo are masked out, not cropped or painted black.
 """
 
 from __future__ import annotations

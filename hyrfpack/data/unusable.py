@@ -63,17 +63,17 @@ def unreadable_sentences(reasons: Mapping[str, str], count: int) -> list[str]:
     return [f"{problem}; {fix}" for problem, fix in _unreadable_problems(reasons, count)]
 
 
-def unreadable_error(place: Path, reasons: Mapping[str, str], count: int, consequence: str = "") -> HyrfDataError:
+def unreadable_error(given: Path, reasons: Mapping[str, str], count: int, consequence: str = "") -> HyrfDataError:
     """Return the error for photos that cannot be read.
 
     Args:
-        place: the path that the user named.
+        given: the path that the user named.
         reasons, count: as in `unreadable_sentences`; at least one reason.
         consequence: last clause of the problem, such as ", and the 2 that can be read are too few".
     """
     (problem, fix), *others = _unreadable_problems(reasons, count)
     more = [f"{other_problem}; {other_fix}" for other_problem, other_fix in others]
-    return HyrfDataError(f"{place}: {problem}{consequence}", fix="; ".join([fix, *more]))
+    return HyrfDataError(f"{given}: {problem}{consequence}", fix="; ".join([fix, *more]))
 
 
 def _unreadable_problems(reasons: Mapping[str, str], count: int) -> list[tuple[str, str]]:

@@ -239,7 +239,7 @@ def _mean(values: Iterable[float | None]) -> float | None:
 def picture_names(views: Sequence[View], count: int = DEFAULT_PICTURE_COUNT) -> dict[int, str]:
     """Return the names of the pictures that `evaluate` writes, by the index of their view."""
     names = unique_stems([view.name for view in views])
-    return {place: f"{names[place]}.png" for place in evenly_spaced(range(len(views)), count)}
+    return {index: f"{names[index]}.png" for index in evenly_spaced(range(len(views)), count)}
 
 
 def _caption(score: ViewScore) -> str:

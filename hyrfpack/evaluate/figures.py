@@ -217,8 +217,8 @@ def running_mean(values: Sequence[float]) -> list[float]:
 
     The windows shrink towards the ends.
     """
-    reach = [min(SMOOTHING_RADIUS_RECORDS, place, len(values) - 1 - place) for place in range(len(values))]
-    return [fmean(values[place - radius : place + radius + 1]) for place, radius in enumerate(reach)]
+    reach = [min(SMOOTHING_RADIUS_RECORDS, index, len(values) - 1 - index) for index in range(len(values))]
+    return [fmean(values[index - radius : index + radius + 1]) for index, radius in enumerate(reach)]
 
 
 def error_colors(error: np.ndarray) -> np.ndarray:

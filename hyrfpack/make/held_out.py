@@ -30,8 +30,8 @@ def choose_inner_view(scene: Scene) -> View:
     cameras = np.hstack((positions / _median_depth(scene, positions), directions))
     offsets = cameras[None] - cameras[:, None]  # [i, j] points from i to j
     scores = []
-    for place, others in enumerate(offsets):
-        others = np.delete(others, place, axis=0)
+    for index, others in enumerate(offsets):
+        others = np.delete(others, index, axis=0)
         distances = np.linalg.norm(others, axis=1)
         near = np.argsort(distances, kind="stable")[:NEAREST_CAMERAS]
         scores.append(distances[near].mean() + np.linalg.norm(others[near].mean(axis=0)))

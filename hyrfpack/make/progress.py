@@ -107,11 +107,11 @@ class Reporter:
         if share > 0 and (not self._samples or now - self._samples[-1][0] >= least):
             self._samples.append((now, share))
         stage = stage_of(self._part)
-        place, left = self._stages.index(stage), self._estimate_part_seconds(share, now)
+        index, left = self._stages.index(stage), self._estimate_part_seconds(share, now)
         self._shown = max(self._shown, self._share_of_stage(share))
         if left is not None:
             left += sum(self._forecast(part) for part in self._later_parts())
-        self._report(Progress(stage, place + 1, len(self._stages), self._shown, left, words))
+        self._report(Progress(stage, index + 1, len(self._stages), self._shown, left, words))
 
     def report_share(self, doing: str, share: float) -> None:
         """Report progress with the arguments of a `hyrfpack.progress.Report`."""
@@ -163,11 +163,11 @@ class Reporter:
     def _share_of_stage(self, share: float) -> float:
         """Convert the share of the present part to that of its stage, by the forecasts of all its parts."""
         parts = parts_of(stage_of(self._part))
-        place = parts.index(self._part)
+        index = parts.index(self._part)
         forecasts = [self.estimates.get(part, 0.0) for part in parts]
-        if len(parts) == 1 or not forecasts[place] > 0:
+        if len(parts) == 1 or not forecasts[index] > 0:
             return share
-        return (sum(forecasts[:place]) + share * forecasts[place]) / sum(forecasts)
+        return (sum(forecasts[:index]) + share * forecasts[index]) / sum(forecasts)
 
 
 def parts_of(stage: str) -> tuple[str, ...]:

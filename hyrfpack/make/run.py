@@ -127,8 +127,8 @@ def make_scene(
         preset: see `hyrfpack.TrainConfig`.
         seed: random seed, 0 to 2^64 - 1.
         device: device for training and packing, see `hyrfpack.device.choose_device`.
-        overwrite: replace an existing output. Without it, an output that appears during the call is kept as well: a
-            file then gets a free name beside it, which the result reports; a folder is an error.
+        overwrite: replace an existing output. Without it, an output that appears during the call is also kept. A file
+            then gets a free name beside it, which the result reports; a folder is an error.
         report: called with the progress.
         say: called with sentences for the user.
         observer: observer of the training, see `hyrfpack.train_model`.
@@ -137,8 +137,8 @@ def make_scene(
         The output, the scores, and the reports of the stages.
 
     Raises:
-        HyrfError: the source cannot be used, the output may not or cannot be written, or options exclude each other,
-            all of which is checked before the work; or a stage fails. Products of finished stages are kept.
+        HyrfError: the source cannot be used, the output may not or cannot be written, or options exclude each other;
+            all this is checked before any work. Or a stage fails; products of finished stages are kept.
         Stopped: the call was interrupted; a KeyboardInterrupt that names the stage.
         ValueError: an argument is out of range or unknown.
 

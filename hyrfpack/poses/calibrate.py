@@ -56,8 +56,8 @@ def search_focal_ratio(
     options.max_error, options.random_seed = _RANSAC_ERROR_PIXELS, seed % 2**31
     options.min_num_trials, options.max_num_trials = _MAX_RANSAC_TRIALS // 3, _MAX_RANSAC_TRIALS
     scores = []
-    for place, focal in enumerate(CANDIDATE_FOCAL_RATIOS):
-        progress(place / len(CANDIDATE_FOCAL_RATIOS))
+    for index, focal in enumerate(CANDIDATE_FOCAL_RATIOS):
+        progress(index / len(CANDIDATE_FOCAL_RATIOS))
         candidate = camera_with_focal(camera, focal)
         found = [pycolmap.estimate_essential_matrix(p.pixels1, p.pixels2, candidate, candidate, options) for p in pairs]
         shares = [0.0 if f is None else f["num_inliers"] / len(p.pixels1) for f, p in zip(found, pairs, strict=True)]

@@ -37,9 +37,9 @@ class Candidate:
 def choose_candidate(candidates: Sequence[Candidate], matches: int) -> tuple[Candidate, str]:
     """Choose the candidate that explains the most matches between photos, and return it with the reason.
 
-    The number of photos and the reprojection error do not show whether a part of the scene was folded onto another one,
-    because each mapper drops the points that would show it. If candidates explain about the same number of matches, the
-    one with more photos is chosen, then the one with longer tracks.
+    The number of photos and the reprojection error do not reveal that one part of the scene was folded onto another,
+    because mappers drop the points that contradict it. If candidates explain about the same number of matches, the one
+    with more photos is chosen, then the one with longer tracks.
 
     Args:
         candidates: one or two results.

@@ -13,7 +13,7 @@ _FICLONE = 0x40049409  # ioctl request of Linux (linux/fs.h) that makes a file s
 def copy_file(source: Path, target: Path) -> None:
     """Copy a file with its times and permissions; later edits of one file never change the other.
 
-    On Linux file systems with reflinks (Btrfs, XFS, bcachefs) the copy shares the blocks of its source and takes no
+    On Linux file systems with reflinks (Btrfs, XFS, bcachefs) the copy shares the blocks of its source. It takes no
     space until one of the two is changed. Elsewhere all bytes are copied.
 
     Args:

@@ -222,10 +222,10 @@ def _save_chosen(job: Job, model: pycolmap.Reconstruction) -> None:
 
 def _median_triangulation_angle(model: pycolmap.Reconstruction) -> float:
     """Return the median over points of the largest angle between two of their viewing rays, in degrees."""
-    places = {number: image.projection_center() for number, image in model.images.items() if image.has_pose}
+    centers = {number: image.projection_center() for number, image in model.images.items() if image.has_pose}
     largest = []
     for point in model.points3D.values():
-        rays = np.array([places[element.image_id] - point.xyz for element in point.track.elements])
+        rays = np.array([centers[element.image_id] - point.xyz for element in point.track.elements])
         rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
         largest.append(np.degrees(np.arccos(np.clip((rays @ rays.T).min(), -1, 1))))
     return float(np.median(largest)) if largest else 0.0

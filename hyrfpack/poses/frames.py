@@ -243,19 +243,19 @@ def _choose_spaced_frames(
         share = _MEASURED_PROGRESS + (_TRACKED_PROGRESS - _MEASURED_PROGRESS) * done / len(sharp)
         report_progress(f"measuring the camera motion, frame {done}/{len(sharp)}", share)
 
-    places = track_windows([measured.thumbnails[place] for place in sharp], progress)
+    trajectories = track_windows([measured.thumbnails[index] for index in sharp], progress)
     values = measured.sharpness[sharp]
     spacing = _DEFAULT_SPACING_RATIO
-    picked = _pick_sharpest_frames(places, values, spacing)
+    picked = _pick_sharpest_frames(trajectories, values, spacing)
     wanted = min(_TARGET_FRAMES, most)
     if len(picked) > most:
-        spacing, picked = _bisect_spacing(places, values, most, spacing, 2.0 * len(sharp) * spacing)
+        spacing, picked = _bisect_spacing(trajectories, values, most, spacing, 2.0 * len(sharp) * spacing)
     elif len(picked) < wanted:
-        closest = _pick_sharpest_frames(places, values, _MIN_SPACING_RATIO)
+        closest = _pick_sharpest_frames(trajectories, values, _MIN_SPACING_RATIO)
         spacing, picked = (
             (_MIN_SPACING_RATIO, closest)
             if len(closest) <= wanted
-            else _bisect_spacing(places, values, wanted, _MIN_SPACING_RATIO, spacing)
+            else _bisect_spacing(trajectories, values, wanted, _MIN_SPACING_RATIO, spacing)
         )
     if len(picked) < _MIN_TAKEN_FRAMES:
         raise HyrfDataError(
@@ -264,7 +264,7 @@ def _choose_spaced_frames(
             fix="walk around what you film",
         )
     steps = np.array(
-        [motion_distances(places, a, slice(b, b + 1))[0] for a, b in zip(picked, picked[1:], strict=False)]
+        [motion_distances(trajectories, a, slice(b, b + 1))[0] for a, b in zip(picked, picked[1:], strict=False)]
     )
     notes = list(measured.notes)
     if np.median(steps) > _MAX_MATCHABLE_SPACING_RATIO:
@@ -286,20 +286,20 @@ def _choose_spaced_frames(
 
 
 def _bisect_spacing(
-    places: np.ndarray, sharp: np.ndarray, most: int, low: float, high: float
+    trajectories: np.ndarray, sharp: np.ndarray, most: int, low: float, high: float
 ) -> tuple[float, list[int]]:
     """Bisect between two spacings for the smallest one that takes at most `most` frames; return it and these frames."""
     for _ in range(12):
         middle = (low * high) ** 0.5
-        low, high = (middle, high) if len(_pick_sharpest_frames(places, sharp, middle)) > most else (low, middle)
-    return high, _pick_sharpest_frames(places, sharp, high)
+        low, high = (middle, high) if len(_pick_sharpest_frames(trajectories, sharp, middle)) > most else (low, middle)
+    return high, _pick_sharpest_frames(trajectories, sharp, high)
 
 
-def _pick_sharpest_frames(places: np.ndarray, sharp: np.ndarray, spacing: float) -> list[int]:
+def _pick_sharpest_frames(trajectories: np.ndarray, sharp: np.ndarray, spacing: float) -> list[int]:
     """Pick the sharpest frame near the start, then repeatedly the sharpest one about `spacing` from the last pick.
 
     Args:
-        places: (N, windows, 2) displacements, from `track_windows`.
+        trajectories: (N, windows, 2) displacements, from `track_windows`.
         sharp: (N,) sharpness.
         spacing: wanted motion between two picks, as a ratio of the longer side.
 
@@ -311,7 +311,7 @@ def _pick_sharpest_frames(places: np.ndarray, sharp: np.ndarray, spacing: float)
     while begin < len(sharp):
         first = stop = None
         for start in range(begin, len(sharp), 64):
-            moved = motion_distances(places, base, slice(start, start + 64))
+            moved = motion_distances(trajectories, base, slice(start, start + 64))
             if first is None and (moved >= low).any():
                 first = start + int((moved >= low).argmax())
             if first is not None:

@@ -23,8 +23,8 @@ _BT709_FROM_BT2020 = np.array(  # matrix of ITU-R BT.2087
 def tone_map_to_srgb(picture: np.ndarray, transfer: int) -> np.ndarray:
     """Convert a BT.2020 picture of high dynamic range to sRGB.
 
-    The steps are: signal to linear light (BT.2100), BT.2020 primaries to BT.709 primaries, compression of light above
-    0.7 of the reference white so that nothing is clipped, and the sRGB transfer curve.
+    The steps are: signal to linear light (BT.2100), BT.2020 primaries to BT.709 primaries, compression of bright light,
+    and the sRGB transfer curve. Light above 0.7 of the reference white is compressed, so that nothing is clipped.
 
     Args:
         picture: (H, W, 3) uint16 RGB signal that uses all 16 bits.

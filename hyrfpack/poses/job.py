@@ -90,9 +90,9 @@ class Job:
         """Read a job that `save` wrote."""
         values = json.loads(path.read_text())
         devices = tuple(Device(tuple(device["size"]), device["focal"]) for device in values["devices"])
-        places = {"images": Path(values["images"]), "work": Path(values["work"])}
+        folders = {"images": Path(values["images"]), "work": Path(values["work"])}
         lists = {key: tuple(values[key]) for key in ("names", "device_of")}
-        return Job(**{**values, **places, **lists, "devices": devices})
+        return Job(**{**values, **folders, **lists, "devices": devices})
 
 
 def chunks(items: list, size: int) -> Iterable[list]:

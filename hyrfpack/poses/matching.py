@@ -164,7 +164,7 @@ def _sample_strong_pairs(job: Job, database: pycolmap.Database) -> dict[int, lis
     chosen = {}
     for device, candidates in candidates_of.items():
         picked = rng.permutation(len(candidates))[:_MAX_FOCAL_PAIRS]
-        chosen[device] = [_read_pixel_matches(database, *candidates[place]) for place in picked]
+        chosen[device] = [_read_pixel_matches(database, *candidates[index]) for index in picked]
     return chosen
 
 

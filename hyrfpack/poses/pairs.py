@@ -71,7 +71,7 @@ def compute_similarities(
     """Compute the similarity of each pair of photos from their feature descriptors (VLAD, Jegou et al. 2010).
 
     The vocabulary is learned from the set itself. The vector of a photo sums the differences between its descriptors
-    and their nearest words, normalised for each word (Arandjelovic and Zisserman 2013) and as a whole.
+    and their nearest words. It is normalised for each word (Arandjelovic and Zisserman 2013) and as a whole.
 
     Args:
         descriptors: (N, 128) uint8 descriptors of each photo; N may be 0.

@@ -181,8 +181,8 @@ def make_images(photos: Sequence[Photo], folder: Path, progress: CountCallback =
     with ThreadPoolExecutor() as pool:
         list(_report_counts(pool.map(lambda photo: _write_photo(photo, folder / photo.name), whole), progress))
     panoramas = {photo.facts.path: (folder / photo.name).parent for photo in photos if photo.face}
-    for number, (path, place) in enumerate(panoramas.items(), start=1):
-        cut_panorama(path, place)
+    for number, (path, target_folder) in enumerate(panoramas.items(), start=1):
+        cut_panorama(path, target_folder)
         progress(len(whole) + number * len(FACES))
 
 

@@ -95,8 +95,8 @@ def parse_global_mapping_phase(log: str) -> tuple[str, float]:
     started = [(log.rfind(mark), name, share) for mark, name, share in _GLOBAL_PHASES if mark in log]
     if not started:
         return "", 0.0
-    place, name, share = max(started)
+    offset, name, share = max(started)
     if name == "bundle adjustment":
-        rounds = log.count("fixed-rotation stage finished", place)
+        rounds = log.count("fixed-rotation stage finished", offset)
         return (f"{name}, round {rounds + 1}", min(share + 0.06 * rounds, 0.69))
     return name, share

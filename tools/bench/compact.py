@@ -38,11 +38,11 @@ def make_random_model(count: int, log2_table_size: int) -> HybridModel:
     rng = np.random.default_rng(0)
     frame = Frame((0.0, 0.0, 0.0), 1.0, (1.0, 1.0, 1.0))
     config = ModelConfig(frame, HashGridConfig(log2_table_size - 1), HashGridConfig(log2_table_size))
-    places = rng.uniform(-1, 1, (count, 3))
-    places[:, 2] = 0.3 * np.sin(4 * places[:, 0]) + rng.normal(0, 0.02, count)
-    waves = np.sin(places @ rng.normal(0, 8, (3, 5)))
+    positions = rng.uniform(-1, 1, (count, 3))
+    positions[:, 2] = 0.3 * np.sin(4 * positions[:, 0]) + rng.normal(0, 0.02, count)
+    waves = np.sin(positions @ rng.normal(0, 8, (3, 5)))
     logits = torch.from_numpy(waves + rng.normal(0, 0.3, (count, 5))).float()
-    gaussians = Gaussians(torch.from_numpy(places).float(), logits[:, :3], logits[:, 3:4], logits[:, 4:])
+    gaussians = Gaussians(torch.from_numpy(positions).float(), logits[:, :3], logits[:, 3:4], logits[:, 4:])
     model = HybridModel(config, gaussians, torch.Generator().manual_seed(0))
     arrays = to_arrays(model)
     for group in TABLE_SECTIONS:
@@ -55,7 +55,7 @@ def bench() -> list[dict]:
 
     Returns:
         A row for each model size and profile: bytes, times in ms, the largest root mean square error of a group of
-        explicit logits, and numpy's peak memory while decoding as a multiple of the decoded model's size.
+        explicit logits, and numpy's peak memory while decoding over the decoded model's size.
     """
     return [row for size in MODEL_SIZES for row in _bench_model(*size)]
 

@@ -45,9 +45,9 @@ def make_morton_gaps(count: int) -> tuple[np.ndarray, None]:
     plane = rng.integers(0, 1 << 14, (count + 1, 2))
     height = 8000 + 2000 * np.sin(plane[:, 0] / 2000) + rng.normal(0, 20, count + 1)
     code = np.zeros(count + 1, np.int64)
-    for axis, place in enumerate((*plane.T, height.astype(np.int64))):
+    for axis, coordinate in enumerate((*plane.T, height.astype(np.int64))):
         for bit in range(14):
-            code |= (place >> bit & 1) << (3 * bit + axis)
+            code |= (coordinate >> bit & 1) << (3 * bit + axis)
     return np.diff(np.sort(code)), None
 
 
@@ -140,19 +140,19 @@ def _huffman_coder(tokens: np.ndarray, extra: int) -> Coder:
 
 def _constriction_coder(tokens: np.ndarray, groups: np.ndarray, shares: np.ndarray, extra: int) -> Coder:
     """Return a range coder that encodes one context after another; the size of its models is not counted."""
-    places = [np.flatnonzero(groups == group) for group in range(len(shares))]
+    rows_by_group = [np.flatnonzero(groups == group) for group in range(len(shares))]
     models = [constriction.stream.model.Categorical(row.astype(np.float64), perfect=False) for row in shares]
 
     def encode() -> bytes:
         coder = constriction.stream.queue.RangeEncoder()
-        for place, model in zip(places, models, strict=True):
-            coder.encode(tokens[place].astype(np.int32), model)
+        for rows, model in zip(rows_by_group, models, strict=True):
+            coder.encode(tokens[rows].astype(np.int32), model)
         return coder.get_compressed().tobytes()
 
     def decode(data: bytes) -> np.ndarray:
         coder, decoded = constriction.stream.queue.RangeDecoder(np.frombuffer(data, np.uint32)), np.empty_like(tokens)
-        for place, model in zip(places, models, strict=True):
-            decoded[place] = coder.decode(model, len(place))
+        for rows, model in zip(rows_by_group, models, strict=True):
+            decoded[rows] = coder.decode(model, len(rows))
         return decoded
 
     return encode, decode, extra

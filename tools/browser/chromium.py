@@ -159,8 +159,8 @@ class Chromium:
         buttons = {"left": 1, "right": 2}[button]
         self.mouse("mousePressed", *start, button=button, buttons=buttons, clickCount=1)
         for step in range(1, steps + 1):
-            place = [a + (b - a) * step / steps for a, b in zip(start, end, strict=True)]
-            self.mouse("mouseMoved", *place, button=button, buttons=buttons)
+            point = [a + (b - a) * step / steps for a, b in zip(start, end, strict=True)]
+            self.mouse("mouseMoved", *point, button=button, buttons=buttons)
         self.mouse("mouseReleased", *end, button=button, clickCount=1)
 
     def touch(self, kind: str, *points: tuple[float, float]) -> None:

@@ -233,12 +233,12 @@ class Firefox:
 
     def mouse(self, kind: str, x: float, y: float, **more: Any) -> None:
         """Send a mouse event: mousePressed, mouseReleased, mouseMoved or mouseWheel."""
-        place = {"x": x, "y": y, "duration": 0, "origin": "viewport"}
+        point = {"x": x, "y": y, "duration": 0, "origin": "viewport"}
         if kind == "mouseWheel":
             by = {"deltaX": more["deltaX"], "deltaY": more["deltaY"]}
-            self._act({"type": "wheel", "id": "wheel", "actions": [{"type": "scroll", **place, **by}]})
+            self._act({"type": "wheel", "id": "wheel", "actions": [{"type": "scroll", **point, **by}]})
             return
-        actions: list[dict] = [{"type": "pointerMove", **place}]
+        actions: list[dict] = [{"type": "pointerMove", **point}]
         if kind != "mouseMoved":
             number = {"left": 0, "middle": 1, "right": 2}[more.get("button", "left")]
             actions.append(

@@ -4,9 +4,9 @@
                                                in bytes per program, spills in bytes (NVIDIA) or registers (AMD)
     python -m tools.gpu.build --json           the same as JSON; tests/tools/test_gpu_build.py reads it
 
-The operations run as usual on small CPU tensors, but each launch of a kernel only builds it, for a driver that names
-the target, with the types, constants, alignment and options of the launch. So this file needs no list of kernels and
-signatures. It reports kernels that no operation launches.
+The operations run as usual on small CPU tensors, but a launch only builds its kernel, for a driver that names the
+target. The build has the types, constants, alignment and options of the launch. So this file needs no list of kernels
+and signatures. It reports kernels that no operation launches.
 """
 
 from __future__ import annotations

@@ -203,8 +203,8 @@ def count_background(
     """Count the work of the background's grid.
 
     It reads T of each pixel and the table rows that the needed nodes can use, and writes 3 colours of each node. The
-    arithmetic is that of the encoding and the decoder at needed nodes, and 130 operations each: the ray, its point on
-    the sphere and the contraction 70, the encoded direction and the sigmoids 60.
+    arithmetic is that of the encoding and the decoder at needed nodes, and 130 operations each: 70 for the ray, its
+    point on the sphere and the contraction, and 60 for the encoded direction and the sigmoids.
     """
     encoding, decoder = count_hash_encode(needed, levels, rows), count_mlp(needed, widths, mixed)
     table = encoding.bytes - needed * (12 + 8 * levels)

@@ -153,13 +153,13 @@ def count_blended(splats: Splats) -> tuple[float, float]:
     reach = (2 * torch.log(255 * seen.opacities).clamp_min(0))[:, None] * seen.covs2d[:, [0, 2]]
     lower, upper = seen.means2d - reach.sqrt(), seen.means2d + reach.sqrt()
     columns, rows = -(-camera.width // TILE_SIZE), -(-camera.height // TILE_SIZE)
-    places = torch.linspace(0, columns * rows - 1, min(MAX_SAMPLED_TILES, columns * rows)).long().tolist()
+    tiles = torch.linspace(0, columns * rows - 1, min(MAX_SAMPLED_TILES, columns * rows)).long().tolist()
     corners = torch.stack(torch.meshgrid(torch.arange(TILE_SIZE), torch.arange(TILE_SIZE), indexing="xy"), -1).view(
         -1, 2
     )
     added = reached = pairs = 0.0
-    for place in places:
-        corner = torch.tensor([TILE_SIZE * (place % columns), TILE_SIZE * (place // columns)])
+    for tile in tiles:
+        corner = torch.tensor([TILE_SIZE * (tile % columns), TILE_SIZE * (tile // columns)])
         pixels = (corner + corners + 0.5).to(lower)
         inside = (lower <= pixels[-1]).all(-1) & (upper >= pixels[0]).all(-1) & (seen.opacities >= ALPHA_MIN)
         here = seen.select(torch.nonzero(inside)[:, 0])
@@ -175,7 +175,7 @@ def count_blended(splats: Splats) -> tuple[float, float]:
         added += float((open_ & (alphas > 0)).sum()) / len(pixels)
         reached += float(open_.any(0).sum())
         pairs += alphas.shape[1]
-    return added / len(places), reached / max(1.0, pairs)
+    return added / len(tiles), reached / max(1.0, pairs)
 
 
 def _draw_gaussians(count: int, look: Look, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor, Tensor]:

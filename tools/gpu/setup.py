@@ -78,12 +78,12 @@ def find_dataset(folder: Path | None, environment: str | None, default: Path) ->
         environment: the value of HYRFPACK_DATA.
         default: the folder of data sets beside the repository.
     """
-    for place in (folder, Path(environment) if environment else None, default):
-        if place is None or not place.is_dir():
+    for candidate in (folder, Path(environment) if environment else None, default):
+        if candidate is None or not candidate.is_dir():
             continue
-        if _is_dataset(place):
-            return place
-        sets = sorted(part for part in place.iterdir() if part.is_dir() and _is_dataset(part))
+        if _is_dataset(candidate):
+            return candidate
+        sets = sorted(part for part in candidate.iterdir() if part.is_dir() and _is_dataset(part))
         if sets:
             return next((part for part in sets if part.name == "mipnerf360_bonsai"), sets[0])
     return None

@@ -1,8 +1,8 @@
 """Run one part of the check in child processes, so that a failure there does not end the other parts.
 
-A kernel with an illegal memory access leaves its whole process without a usable GPU, and a kernel that hangs can only
-be killed from another process. The child prints one line for each row and for each finished item. If the child ends
-early, its current item has failed, and a new child runs the remaining items.
+A kernel with an illegal memory access leaves its whole process without a usable GPU. A kernel that hangs can only be
+killed from another process. The child prints one line for each row and for each finished item. If the child ends early,
+its current item has failed, and a new child runs the remaining items.
 """
 
 from __future__ import annotations

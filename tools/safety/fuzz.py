@@ -5,8 +5,8 @@
 It prints a summary with counts, seconds of CPU time and MB of memory, saves it in --out, and exits with 1 after a
 failure. For each input of `fuzz_mutate.make_hostile_file` the reader must do one of two things. It decodes the input:
 all numbers are finite, and the model survives a round trip through profile raw. Or it raises HyrfFormatError with one
-printable line. Anything else is a failure, and the input is saved with the seed and number that reproduce it: another
-exception, a warning, the death of the process, more than MAX_CPU_SECONDS of CPU time, more than
+printable line. Anything else is a failure, and the input is saved with the seed and number that reproduce it. Failures
+are: another exception, a warning, the death of the process, more than MAX_CPU_SECONDS of CPU time, more than
 MAX_EXTRA_ADDRESS_SPACE_BYTES of address space, or (for one input in TRACE_EVERY) a peak of allocated memory above
 
     10 x (decoded bytes of the sections by the table of contents, within the format's limit, + bytes of the file)

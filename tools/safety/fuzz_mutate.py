@@ -430,11 +430,11 @@ def _forge_fields(rng: Random) -> bytes:
 def _forge_exposure(rng: Random) -> bytes:
     """Forge an exposure map's numbers, centers or length; add a map if there is none."""
     parts = [replace(part) for part in _choose_sections(rng)]
-    place = next((index for index, part in enumerate(parts) if part.tag == b"EXPO"), None)
-    if place is None:
-        section, place = encode_exposure(_make_exposure_map(rng.choice((0, 1, 5, 64)))), 1
-        parts.insert(place, RawSection(section.type.encode(), section.codec, 0, section.data, section.raw_length))
-    data = bytearray(parts[place].data)
+    index = next((index for index, part in enumerate(parts) if part.tag == b"EXPO"), None)
+    if index is None:
+        section, index = encode_exposure(_make_exposure_map(rng.choice((0, 1, 5, 64)))), 1
+        parts.insert(index, RawSection(section.type.encode(), section.codec, 0, section.data, section.raw_length))
+    data = bytearray(parts[index].data)
     for _ in range(rng.choice((1, 1, 2))):
         kind = rng.randrange(4)
         if kind < 2:
@@ -446,8 +446,8 @@ def _forge_exposure(rng: Random) -> bytes:
     if rng.random() < 0.7:
         del data[84 + (len(data) - 84) // 12 * 12 :]
         data[0] = (len(data) - 84) // 12 % 256
-    parts[place].data = bytes(data)
-    parts[place].raw_length = len(data) if rng.random() < 0.9 else rng.choice((*EXTREME_INTEGERS, len(data) + 4))
+    parts[index].data = bytes(data)
+    parts[index].raw_length = len(data) if rng.random() < 0.9 else rng.choice((*EXTREME_INTEGERS, len(data) + 4))
     return assemble(parts)
 
 

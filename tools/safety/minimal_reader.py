@@ -419,15 +419,15 @@ def read_tokens(source: Cursor, contexts: Sequence[int]) -> list[int]:
         if step == change and not static:
             sums, change = cumulative_frequencies(adaptive_weights(np.array(seen))), change + 1 + change // 8
         for lane in range(-(-(count - step) // per_lane)):
-            place, x = lane * per_lane + step, states[lane]
-            model = classes * contexts[place] + lane_class[lane]
+            index, x = lane * per_lane + step, states[lane]
+            model = classes * contexts[index] + lane_class[lane]
             low = x % 4096
             token = bisect_right(sums[model], low) - 1
             x = (sums[model][token + 1] - sums[model][token]) * (x // 4096) + low - sums[model][token]
             if x < 65536:
                 require(taken < len(words), "tokens: words run out")
                 x, taken = 65536 * x + words[taken], taken + 1
-            states[lane], tokens[place], lane_class[lane] = x, token, class_after[token]
+            states[lane], tokens[index], lane_class[lane] = x, token, class_after[token]
             seen[model][token] += 1
     require(all(x == 65536 for x in states), "tokens: wrong last state")
     source.take(2 * taken)

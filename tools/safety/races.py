@@ -8,8 +8,8 @@ one file. In every other round both start together; otherwise the second starts 
 run. There are two races with a file of another program, which is created at the output while the command runs: `export`
 and `make`. The file is created at a random moment, or in every other round when the command's temporary file appears.
 
-Each command runs in a process forked from this one, which has loaded all modules, so that commands that start together
-also run at the same time. A command with exit code 0 must have left the bytes of an undisturbed run in the file that it
+Each command runs in a process forked from this one, which has loaded all modules. So commands that start together also
+run at the same time. A command with exit code 0 must have left the bytes of an undisturbed run in the file that it
 reports. Every other command must end with exit code 2 and one error message. A file of another program must stay
 unchanged, and no temporary file may be left.
 

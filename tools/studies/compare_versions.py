@@ -5,10 +5,10 @@
 
 Each version trains and compresses each data set at several budgets, given as shares of this version's budget. This
 version scores the decoded files on held-out photos by PSNR and SSIM. For each data set the table has the change of
-bytes at equal PSNR in percent (BD-rate over the common range of PSNR, by monotone cubics), the change of PSNR in dB and
-of SSIM at the largest common number of bytes, and the ratio of training times. The share `measured` is the budget that
-a version chooses itself. Runs are kept in --out and are not repeated; a run with scores.json is not scored again. The
-other version runs with the packages of this environment.
+bytes at equal PSNR in percent (BD-rate over the common range of PSNR, by monotone cubics). It also has the change of
+PSNR in dB and of SSIM at the largest common number of bytes, and the ratio of training times. The share `measured` is
+the budget that a version chooses itself. Runs are kept in --out and are not repeated; a run with scores.json is not
+scored again. The other version runs with the packages of this environment.
 """
 
 from __future__ import annotations

@@ -7,8 +7,8 @@
 Density control never requests a million Gaussians on small photos, so this program forces it to split. It first trains
 a model. Then in each round it replaces the Gaussians with the largest gradients by two children, with training steps in
 between, until there are enough. Last, it trains without density control, so that all parameters are trained again. It
-writes `model.hyrf` (profile raw) into --out, and prints the number of Gaussians, PSNR in dB on held-out views and
-seconds before splitting, after splitting and at the end.
+writes `model.hyrf` (profile raw) into --out, and prints number of Gaussians, PSNR in dB on held-out views and seconds:
+before splitting, after splitting and at the end.
 """
 
 from __future__ import annotations

@@ -477,16 +477,19 @@ def draw_steps(axes: Axes, quantized: QuantizedModel, sensitivity: Sensitivity) 
 
 def draw_symbols(axes: Axes, chosen: QuantizedModel, nearest: QuantizedModel) -> None:
     """Draw the symbols of the radiance table, rounded to the nearest and chosen by rate and distortion."""
-    group, places = RADIANCE_TABLE, np.arange(-MAX_DRAWN_SYMBOL, MAX_DRAWN_SYMBOL + 1)
+    group, drawn_symbols = RADIANCE_TABLE, np.arange(-MAX_DRAWN_SYMBOL, MAX_DRAWN_SYMBOL + 1)
     for offset, quantized, color, name in (
         (-0.2, nearest, "#bdc1c6", "nearest"),
         (0.2, chosen, SECTION_COLORS[group], "chosen"),
     ):
         symbols = quantized.groups[group]
         bits = 8 * len(encode_groups(symbols, quantized.plan.groups[group])) / len(symbols.symbols)
-        shares = np.bincount(np.clip(symbols.symbols, places[0], places[-1]) - places[0], minlength=len(places))
+        shares = np.bincount(
+            np.clip(symbols.symbols, drawn_symbols[0], drawn_symbols[-1]) - drawn_symbols[0],
+            minlength=len(drawn_symbols),
+        )
         axes.bar(
-            places + offset,
+            drawn_symbols + offset,
             100 * shares / len(symbols.symbols),
             0.4,
             color=color,
@@ -494,7 +497,7 @@ def draw_symbols(axes: Axes, chosen: QuantizedModel, nearest: QuantizedModel) ->
         )
     axes.set(title="3  Symbols of the radiance table", xlabel="symbol", ylabel="share of the numbers (%)")
     axes.margins(y=0.25)
-    axes.set_xticks(places[::2])
+    axes.set_xticks(drawn_symbols[::2])
     axes.legend(fontsize=8, frameon=False)
 
 
@@ -523,9 +526,9 @@ def save_png(figure: Any, path: Path) -> Path:
     palette = picture.quantize(255)
     palette.putpalette([*(palette.getpalette() or [])[: 3 * 255], 255, 255, 255])
     reduced = picture.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG)
-    places = np.array(reduced)
-    places[(np.asarray(picture) == 255).all(-1)] = 255  # dithering would make white grey
-    exact = Image.fromarray(places, "P")
+    indices = np.array(reduced)
+    indices[(np.asarray(picture) == 255).all(-1)] = 255  # dithering would make white grey
+    exact = Image.fromarray(indices, "P")
     exact.putpalette(reduced.getpalette() or [])
     exact.save(data, "PNG", optimize=True)
     return write_atomic(path, data.getbuffer())

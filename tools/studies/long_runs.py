@@ -5,8 +5,8 @@
 
 Short runs come first. If a call is stopped, the next one resumes from the checkpoint and does not repeat finished runs.
 Several calls can share one queue, because each run's folder is locked while it is trained and measured. The table has
-PSNR in dB and SSIM of the raw file on held-out photos, the gap (PSNR on up to 16 training photos minus that), bytes and
-scores of the compressed files as decoded from disk, and seconds of training.
+PSNR in dB and SSIM of the raw file on held-out photos, and the gap, which is PSNR on up to 16 training photos minus
+that. It also has bytes and scores of the compressed files as decoded from disk, and seconds of training.
 """
 
 from __future__ import annotations

@@ -3,9 +3,10 @@
     python -m tools.studies.poses                                   every COLMAP set below ../shared/data
     python -m tools.studies.poses --sets ngp_fox llff_fern --out runs/fox
 
-The estimation only gets the photos. A pose is correct if, after a robust similarity transform, its position is within
-2 % of the extent of the known cameras and its rotation within 5 degrees of the known pose. The table has numbers of
-photos and seconds. It prints each row as JSON first. The scenes are kept in --out for training.
+The estimation only gets the photos. Both sets of poses are first aligned by a robust similarity transform. A pose is
+correct if its position is then within 2 % of the cameras' extent from the known one, and its rotation within 5 degrees.
+The table has numbers of photos and seconds. It prints each row as JSON first. The scenes are kept in --out for
+training.
 """
 
 from __future__ import annotations

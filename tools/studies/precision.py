@@ -12,9 +12,9 @@ Rows, all of one seed:
     rasterizer     rasterising (front-to-back accumulation, gradient sums of each Gaussian) in float64
     float64        everything in float64
 
-A difference from `float32` is significant only if it is larger than the spread of the nudged rows, because training
-amplifies any rounding until two runs differ as much as two seeds. The table has PSNR in dB and SSIM on held-out views,
-the number of Gaussians and seconds. Scores that --out already has are not measured again.
+A difference from `float32` is significant only if it is larger than the spread of the nudged rows. Training amplifies
+any rounding until two runs differ as much as two seeds. The table has PSNR in dB and SSIM on held-out views, the number
+of Gaussians and seconds. Scores that --out already has are not measured again.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ def train_row(scene: Scene, config: TrainConfig, row: str) -> tuple[HybridModel,
         trainer.model.double()
         trainer.optimizer = Optimizer(trainer.model, config.learning_rates)
         dtype = torch.float32 if row == "adam" else torch.float64
-        patches = {place: run_in_dtype(dtype, operation) for place, operation in OPERATION_BY_LOOKUP.items()}
+        patches = {lookup: run_in_dtype(dtype, operation) for lookup, operation in OPERATION_BY_LOOKUP.items()}
     elif row == "mixed":
         patches = dict.fromkeys(
             MLP_LOOKUPS, lambda *layers, mixed: mlp(*layers, mixed=True, implementation="reference")
@@ -106,8 +106,8 @@ def train_row(scene: Scene, config: TrainConfig, row: str) -> tuple[HybridModel,
         patches = {RASTERIZE_LOOKUP: run_in_dtype(torch.float64, rasterize)}
     started = time.perf_counter()
     with ExitStack() as stack:
-        for place, operation in patches.items():
-            stack.enter_context(mock.patch(place, operation))
+        for lookup, operation in patches.items():
+            stack.enter_context(mock.patch(lookup, operation))
         trainer.run()
     return trainer.model.float(), time.perf_counter() - started
 

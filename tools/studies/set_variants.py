@@ -58,8 +58,8 @@ def keep_few_photos(scene: Scene, count: int) -> Scene:
 def split_exposures(scene: Scene, *, interleaved: bool) -> Scene:
     """Return the scene with half of its photos lighter by `SECOND_GROUP_STOPS`.
 
-    With `interleaved`, photo number n by name is lighter if the sum of the bits of n is odd (the Thue-Morse sequence),
-    so that both groups have held-out photos, which are one in eight. Otherwise the second half by name is lighter.
+    With `interleaved`, photo number n by name is lighter if the sum of the bits of n is odd (the Thue-Morse sequence).
+    So both groups have held-out photos, which are every 8th. Otherwise the second half by name is lighter.
     """
     names = sorted(view.name for view in scene.views)
     lightened = {

@@ -5,8 +5,8 @@
 
 The photos are in the order of their names. After a photo come a motion-blurred copy of random direction and length, or
 one or two repeated frames, or neither. The table has the numbers of chosen frames of each kind and seconds. With
---train it also estimates poses (`hyrfpack.estimate_poses`) and trains, both on the photos and on the frames, and has
-PSNR in dB on held-out photos with their original pixels.
+--train it also estimates poses (`hyrfpack.estimate_poses`) and trains, on the photos and on the frames. The table then
+has PSNR in dB on held-out photos with their original pixels.
 """
 
 from __future__ import annotations

@@ -6,8 +6,8 @@
 With --runs it draws eight held-out views of each data set's `compact.hyrf` with the native and the baked page in
 headless Chromium. The table has bytes, PSNR in dB against the pictures of `render_view` (mean and worst), and the
 difference of PSNR against the photos. With --large it measures the seconds from opening a page to the first and to the
-complete picture, and the ms per frame while a mouse orbits at full resolution. These are medians over --repeats, where
-native and baked pages alternate, each in a new browser. Without a GPU the browser renders in software.
+complete picture. It also measures the ms per frame while a mouse orbits at full resolution. These are medians over
+--repeats, where native and baked pages alternate, each in a new browser. Without a GPU the browser renders in software.
 """
 
 from __future__ import annotations

@@ -4,8 +4,8 @@
 
 Each variant is built in a temporary folder from links to the set's files, and read. The program prints one line for
 each: "read" with the notes, if cameras and pictures equal those of the set; "refused" with the error message; or
-"WRONG" if the pictures or cameras differ, if the variant should be refused but is read or the other way round, or if
-reading raises anything but a HyrfError. It exits with 1 if a variant is WRONG.
+"WRONG" if pictures or cameras differ, if the variant should be refused but is read or vice versa, or if reading raises
+anything but a HyrfError. It exits with 1 if a variant is WRONG.
 """
 
 from __future__ import annotations

@@ -39,7 +39,7 @@ def variants() -> Iterator[Variant]:
         "folders: images empty, photos in the root",
         lambda s: (move_folders(("images", "."))(s), (s.root / "images").mkdir()),
     )
-    for place in (
+    for folder in (
         "sparse/1",
         "sparse/model",
         "colmap/sparse/0",
@@ -50,7 +50,7 @@ def variants() -> Iterator[Variant]:
         "undistorted/sparse",
         "distorted/sparse/0",
     ):
-        yield Variant(f"folders: model in {place}", move_folders(("sparse/0", "taken"), ("taken", place)))
+        yield Variant(f"folders: model in {folder}", move_folders(("sparse/0", "taken"), ("taken", folder)))
     yield Variant(
         "folders: dense/", move_folders(("sparse/0", "taken"), ("taken", "dense/sparse"), ("images", "dense/images"))
     )
@@ -113,11 +113,11 @@ def variants() -> Iterator[Variant]:
     yield Variant("folders: the model's given", lambda s: setattr(s, "given", s.model), "no photo folder")
 
 
-def _nest_set(s: WorkingSet, place: str) -> None:
+def _nest_set(s: WorkingSet, folder: str) -> None:
     away = s.root.with_name("away")
     s.root.rename(away)
-    (s.root / place).parent.mkdir(parents=True)
-    away.rename(s.root / place)
+    (s.root / folder).parent.mkdir(parents=True)
+    away.rename(s.root / folder)
 
 
 def _shrink_photos(s: WorkingSet, divisor: int) -> None:
