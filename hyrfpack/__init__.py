@@ -9,7 +9,7 @@
     print(hyrfpack.evaluate_model(model, scene.test).psnr)
     picture = hyrfpack.render_view(model, scene.test[0].camera).rgb
 
-Importing hyrfpack loads nothing else; each name below brings what it needs at its first use.
+Importing hyrfpack loads no other package. Each name below loads the modules that it needs when it is first used.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from typing import TYPE_CHECKING, Any
 from hyrfpack.version import __version__
 
 _TOO_LATE = sys.platform == "linux" and "pycolmap" in sys.modules and "zlib" not in sys.modules
-# Before pycolmap, wherever that is loaded: its wheel for Linux exports a zlib of its own, and the system's, when it is
-# loaded second, calls into that one. Memory is corrupted then, and the process aborts at the next PNG or .spz file.
+# zlib must be loaded before pycolmap, whose wheel for Linux exports a zlib of its own. If the system's zlib is loaded
+# second, it calls into that one and corrupts memory, and the process aborts at the next PNG or .spz file.
 import zlib  # noqa: E402, F401
 
 if _TOO_LATE:
@@ -80,7 +80,7 @@ if TYPE_CHECKING:
     from hyrfpack.train import TrainResult as TrainResult
     from hyrfpack.train import train_model as train_model
 
-# Public name -> the module that defines or re-exports it.
+# The module that defines or re-exports each public name.
 _PUBLIC = {
     "BenchReport": "hyrfpack.bench",
     "benchmark_model": "hyrfpack.bench",
@@ -127,7 +127,7 @@ _PUBLIC = {
     "TrainResult": "hyrfpack.train",
     "train_model": "hyrfpack.train",
 }
-# Former name of a public function -> its name now, for the error message.
+# The present name of each renamed public function, for the error message.
 _RENAMED = {
     "bench": "benchmark_model",
     "compare": "compare_runs",
@@ -147,7 +147,7 @@ _RENAMED = {
 __all__ = ["__version__", *_PUBLIC]
 
 
-if not TYPE_CHECKING:  # type checkers read the imports above, so that they report names that do not exist
+if not TYPE_CHECKING:  # Type checkers read the imports above, so that they report unknown names.
 
     def __getattr__(name: str) -> Any:
         if name in _PUBLIC:

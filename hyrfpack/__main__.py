@@ -1,4 +1,4 @@
-"""`python -m hyrfpack` is the `hyrfpack` command."""
+"""Run the `hyrfpack` command as `python -m hyrfpack`."""
 
 from hyrfpack.cli import main
 

@@ -1,4 +1,4 @@
-"""Atomic writes: a file appears whole under its name, or not at all."""
+"""Write files atomically: a file appears complete under its name, or not at all."""
 
 from __future__ import annotations
 
@@ -44,15 +44,15 @@ class PendingFile:
 def write_atomic(
     path: str | os.PathLike[str], data: bytes | memoryview, *, overwrite: bool = True, rename: bool = True
 ) -> Path:
-    """Write `data` to `path` atomically: at any time, also after a crash, readers find the old file or the new one.
+    """Write `data` to `path` atomically: readers always find the old file or the new one, also after a crash.
 
     Arguments and errors are those of `pending_file`.
 
     Returns:
         The path that was written.
     """
-    # The view is released in any case. If the traceback of a failure kept the view of a BytesIO, the garbage collector
-    # of Python 3.12.1 would crash.
+    # The view is always released. If the traceback of a failure kept the view of a BytesIO, the garbage collector of
+    # Python 3.12.1 would crash.
     with memoryview(data) as view:
         del data
         with pending_file(path, view.nbytes, overwrite=overwrite, rename=rename) as pending:
@@ -74,22 +74,21 @@ def pending_file(
 ) -> Iterator[PendingFile]:
     """Yield a temporary file beside `path`, which gets its final name when the block ends.
 
-    The bytes are forced to the disk before the file gets its name. When anything fails, an interrupt included, the
-    file at `path` is untouched and the temporary file is removed. The temporary files of killed processes are removed
-    by the next call that writes into the same folder (but not on Windows).
+    The bytes are forced to the disk before the file gets its name. If anything fails, or an interrupt comes, the file
+    at `path` is untouched and the temporary file is removed. The next call that writes into the same folder removes the
+    temporary files of killed processes (but not on Windows).
 
-    With `overwrite`, the file replaces an existing one. Of several simultaneous writers the last one wins, and of a
-    link the target is replaced. Without `overwrite`, no file is ever replaced, not even one that appears at the last
-    moment: the name is given by a hard link, which the system refuses where the name is taken. File systems without
-    hard links (FAT, some network file systems) get an empty file of that name first, which a crash at that moment
-    would leave behind.
+    With `overwrite`, the file replaces an existing one. The last of several simultaneous writers wins. If `path` is a
+    link, its target is replaced. Without `overwrite`, no file is ever replaced, not even one that appears at the last
+    moment: a hard link gives the file its name, which fails if the name is taken. On file systems without hard links
+    (FAT, some network file systems), an empty file takes the name first; a crash at that moment would leave it behind.
 
     Args:
         path: path of the file; its folder is created if missing.
         length: number of bytes that will be written, for the message when the disk is full.
         overwrite: replace a file at `path`.
-        rename: where a file at `path` may not be replaced, take the first free one of `numbered_names`; otherwise
-            raise.
+        rename: if a file at `path` may not be replaced, use the first free name of `numbered_names` instead of raising
+            an error.
 
     Raises:
         HyrfError: the folder cannot be created, is not writable or is full; with `overwrite`, `path` exists and is not
@@ -165,13 +164,13 @@ def _move_without_replacing(temporary: Path, target: Path) -> None:
     """Move a file to a free path.
 
     Raises:
-        FileExistsError: `target` exists. The system checks this in the same step that gives the name.
+        FileExistsError: `target` exists. The system checks this in the same step in which it gives the name.
     """
     try:
         os.link(temporary, target)
     except FileExistsError:
         raise
-    except OSError:  # this file system has no hard links
+    except OSError:  # This file system has no hard links.
         os.close(os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
         try:
             os.replace(temporary, target)
@@ -196,7 +195,7 @@ def make_folder(path: Path) -> None:
 
 
 def check_writable(folder: Path) -> None:
-    """Check that files can be created in a folder, so that a failure comes before hours of work and not after.
+    """Check that files can be created in a folder, so that writing does not fail after hours of work.
 
     Raises:
         HyrfError: no file can be created in it.
@@ -213,7 +212,7 @@ def check_writable(folder: Path) -> None:
 
 @contextmanager
 def _temporary_file(folder: Path) -> Iterator[Path]:
-    """Yield a new, empty file and remove it at the end if it still exists; first remove stale files in the folder."""
+    """Yield a new, empty file, and remove it at the end if it still exists; stale files in the folder are removed."""
     _remove_stale_files(folder)
     temporary, lock = _create_locked_file(folder)
     try:
@@ -234,11 +233,11 @@ def _create_locked_file(folder: Path) -> tuple[Path, int | None]:
         if fcntl is None:  # Windows cannot rename an open file
             os.close(lock)
             return temporary, None
-        with contextlib.suppress(OSError):  # some network folders have no locks, and stale files stay there
+        with contextlib.suppress(OSError):  # Some network folders have no locks. Stale files stay there.
             fcntl.flock(lock, fcntl.LOCK_EX)
         if temporary.exists():
             return temporary, lock
-        os.close(lock)  # before it was locked, another process removed the file as a stale one
+        os.close(lock)  # Another process removed the file as a stale one before it was locked.
 
 
 def _remove_stale_files(folder: Path) -> None:
@@ -247,7 +246,7 @@ def _remove_stale_files(folder: Path) -> None:
         return
     try:
         names = os.listdir(folder)
-    except OSError:  # the folder is writable but not readable, or does not exist
+    except OSError:  # The folder is writable but not readable, or does not exist.
         return
     for name in names:
         if name.startswith(TEMPORARY_PREFIX) and name.endswith(TEMPORARY_SUFFIX):
@@ -263,7 +262,7 @@ def _remove_stale_files(folder: Path) -> None:
 def _sync_folder(folder: Path) -> None:
     """Force a folder's new entry to the disk, so that it survives a power cut.
 
-    Windows and some network folders do not support this; the file is whole there too.
+    Windows and some network folders do not support this. A file that appears there is complete all the same.
     """
     with contextlib.suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)

@@ -1,6 +1,6 @@
-"""Checks of settings and arguments, which fail at the call instead of in the middle of the work.
+"""Check settings and arguments, so that errors are raised at the call instead of in the middle of the work.
 
-Settings are written as JSON beside results. JSON cannot hold NumPy's numbers, so only Python's own are accepted.
+Settings are written as JSON beside results. JSON cannot represent NumPy's numbers, so only Python's own are accepted.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def check_pair(name: str, value: Any) -> None:
         raise ValueError(f"{name} is {value!r}; it must be a tuple of two numbers")
 
 
-# How to get an argument of the type that a call needs, by the name of the type.
+# For each type, by its name, how to get an argument of that type.
 _REMEDIES = {
     "Camera": "a View has one: view.camera",
     "HybridModel": "hyrfpack.load_model reads it from a file",
@@ -81,7 +81,7 @@ def check_type(argument: str, value: object, expected: type) -> None:
     """Check that an argument of a call has the expected type, one of those in `_REMEDIES`.
 
     Raises:
-        TypeError: it has not; the message says how to get one.
+        TypeError: it has another type; the message says how to get the right one.
     """
     if not isinstance(value, expected):
         raise TypeError(

@@ -1,7 +1,7 @@
-"""The values of settings that take one of a few words.
+"""The allowed values of settings that take one of a few words.
 
-They stand here, below the packages that implement them, so that the command line lists its options without loading
-these packages.
+They are defined here, below the packages that implement them, so that the command line lists its options without
+loading these packages.
 """
 
 # How renders are exposed: each like the photos taken near its camera, or all alike.
@@ -28,7 +28,7 @@ LAYOUTS = (
 )
 # Methods that choose the pairs of photos to match.
 MATCHING_METHODS = ("auto", "exhaustive", "sequential", "retrieval")
-# Kinds of scenes, each with its defaults of training.
+# Kinds of scenes, each with its own defaults for training.
 PRESETS = ("auto", "synthetic", "standard", "large", "street")
 # Number formats of matrix products on a GPU: bfloat16 with float32 sums, or float32.
 PRECISIONS = ("mixed", "float32")

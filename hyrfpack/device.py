@@ -1,4 +1,4 @@
-"""The choice of a torch device, and the upload of photos to it."""
+"""Choose a torch device, and upload photos to it."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def choose_device(
     Args:
         name: "auto" (a CUDA or ROCm device where one is usable and Triton is installed, the CPU otherwise), "cpu",
             "cuda" (torch's current CUDA or ROCm device), "cuda:N" or "mps"; or a torch.device.
-        say: called with a sentence where the device has no kernels or runs them slowly.
+        say: called with a sentence if the device has no kernels or runs them slowly.
 
     Returns:
         The device. "cuda:N" also becomes torch's current device, on which kernels are launched.
@@ -48,7 +48,7 @@ def choose_device(
     if not re.fullmatch(r"auto|cpu|mps|cuda(:[0-9]{1,3})?", name):
         raise HyrfError(f"'{name}' is not a device", fix="use auto, cpu, cuda, cuda:N or mps")
     kind, _, number = name.partition(":")
-    # Asking torch for GPUs marks later forks as bad, also on a machine without a GPU; hence the check is_available().
+    # Asking torch for GPUs marks later forks as bad, even on a machine without a GPU. So is_available() is checked too.
     if kind in ("auto", "cuda") and torch.cuda._is_in_bad_fork() and torch.cuda.is_available():
         raise HyrfError(
             "this process was forked from one that uses the GPU, and cannot use it too",
@@ -88,7 +88,7 @@ def choose_own_device(
         ranks: the processes, all of which call this.
 
     Raises:
-        HyrfError: on all processes, where `choose_device` fails on one, or where two would share a GPU.
+        HyrfError: `choose_device` fails on one process, or two would share a GPU; it is raised on all processes.
     """
     device = ranks.run_on_all(lambda: choose_device(name, say))
     if device.type == "cuda" and not ranks.is_single:
@@ -149,12 +149,12 @@ class Photos:
     """A cache of uploaded photos for a run that uses each of them many times.
 
     On CUDA the bytes of the first photos stay on the device until they take an eighth of its memory. A run uses each
-    photo once a round, so keeping the first ones is as good as any other choice. On other devices nothing is cached.
+    photo once per epoch, so keeping the first ones is as good as any other choice. On other devices nothing is cached.
 
     Attributes:
-        device: the device of the photos.
-        limit_bytes: most bytes that are kept.
-        nbytes: bytes that are kept now.
+        device: the device that photos are uploaded to.
+        limit_bytes: maximum number of bytes that are kept on the device.
+        nbytes: number of bytes that are kept now.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -165,7 +165,7 @@ class Photos:
         self._kept: dict[str, tuple[Tensor, Tensor | None, Tensor | None]] = {}
 
     def get(self, name: str, picture: Picture, solid: np.ndarray | None) -> tuple[Tensor, Tensor | None]:
-        """Return what `upload` returns for a photo; its name must stand for the same photo on every call."""
+        """Return what `upload` returns for a photo; the same name must mean the same photo in every call."""
         if self.device.type != "cuda":
             return upload(picture, solid, self.device)
         sent = self._kept.get(name)

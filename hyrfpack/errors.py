@@ -25,9 +25,9 @@ class HyrfError(Exception):
     `str(error)` is one line, "problem; fix". Both parts are made `printable`, because they quote hostile files.
 
     Attributes:
-        problem: what happened, and where: the path, the setting, the value. Contents of files are quoted here alone.
+        problem: what happened, and where: the path, the setting, the value. Only this part quotes contents of files.
         fix: what to do next, as an instruction to a user of the library. Settings are Python arguments in backticks:
-            "replace it with `overwrite=True`". The command line writes its options in their place, in the fix only.
+            "replace it with `overwrite=True`". The command line replaces them by its options, in the fix only.
 
     Example:
         >>> from hyrfpack.errors import HyrfError
@@ -38,7 +38,7 @@ class HyrfError(Exception):
 
     def __init__(self, problem: str, fix: str) -> None:
         self.problem, self.fix = printable(problem), printable(fix)
-        super().__init__(self.problem, self.fix)  # the arguments from which an error is made again when it is copied
+        super().__init__(self.problem, self.fix)  # Copying and unpickling call the class with these arguments.
 
     def __str__(self) -> str:
         return f"{self.problem}; {self.fix}"
@@ -66,7 +66,7 @@ class HyrfSizeError(HyrfError):
     """A model does not fit into the target size.
 
     Attributes:
-        min_bytes: approximate size of the smallest file that holds the model; 0 where that is not known.
+        min_bytes: approximate size of the smallest file that holds the model; 0 if it is not known.
     """
 
     def __init__(self, problem: str, fix: str, min_bytes: int = 0) -> None:

@@ -1,4 +1,4 @@
-"""Folder locks, with which only one call at a time writes into a folder."""
+"""Lock folders, so that only one call at a time writes into a folder."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ def exclusive_folder(
 ) -> Iterator[None]:
     """Create a folder and lock it, so that no other call of hyrfpack writes into it at the same time.
 
-    The lock is an `flock` on the folder itself. The kernel releases it when the process ends, also when the process is
-    killed, so that no lock is ever left behind. Every call opens the folder for itself: calls in two threads of one
-    process exclude each other as two processes do. A call must therefore not lock a folder that it holds already.
-    Where the system knows no such locks (Windows, some network file systems), nothing is locked.
+    The lock is an `flock` on the folder itself. The kernel releases it when the process ends, even if it is killed, so
+    no lock is ever left behind. Every call opens the folder for itself, so calls in two threads of one process exclude
+    each other as two processes do. A call must therefore not lock a folder that it holds already. If the system does
+    not support such locks (Windows, some network file systems), nothing is locked.
 
     Folders that are created here and are still empty at the end are removed.
 
     Args:
         folder: the folder to write into.
         remedy: what the user can name instead, for the message: "another folder with --work".
-        ranks: processes that work together, all of which call this. The main process holds the lock; when it is
-            refused, all of them are.
+        ranks: processes that work together, all of which call this. The main process holds the lock; if it is refused,
+            all of them raise the error.
 
     Raises:
-        HyrfError: another call is at work in the folder, or the folder cannot be created.
+        HyrfError: another call is working in the folder, or the folder cannot be created.
     """
     folder = Path(folder)
     if ranks is not None and not ranks.is_main:
@@ -52,27 +52,27 @@ def exclusive_folder(
     try:
         yield
     finally:
-        with suppress(OSError):  # rmdir fails for a folder that is not empty, which stays
+        with suppress(OSError):  # rmdir fails for a folder that is not empty, and keeps it.
             for path in created:
                 path.rmdir()
         if handle is not None:
-            with suppress(OSError):  # this file system has no locks
-                # Closing alone would leave the lock with a process that was forked meanwhile.
+            with suppress(OSError):  # This file system may have no locks.
+                # If the folder were only closed, a process that was forked in the meantime would keep the lock.
                 fcntl.flock(handle, fcntl.LOCK_UN)
             os.close(handle)
 
 
 def _lock(folder: Path, remedy: str) -> int | None:
-    """Create a folder, lock it and return the descriptor that holds the lock; None where it cannot be locked."""
+    """Create a folder, lock it and return the descriptor that holds the lock; None if it cannot be locked."""
     while True:
         make_folder(folder)
         if fcntl is None:
             return None
         try:
             handle = os.open(folder, os.O_RDONLY)
-        except FileNotFoundError:  # another call removed the folder at its end, so it is created again
+        except FileNotFoundError:  # Another call removed the folder at its end, so it is created again.
             continue
-        except OSError:  # a folder may be writable and not readable
+        except OSError:  # A folder may be writable and not readable.
             return None
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -82,9 +82,9 @@ def _lock(folder: Path, remedy: str) -> int | None:
                 f"{folder}: another hyrfpack command is at work in this folder",
                 fix=f"wait until it has ended, or name {remedy}",
             ) from None
-        except OSError:  # this file system has no locks
+        except OSError:  # This file system has no locks.
             return handle
         with suppress(FileNotFoundError):
             if os.path.samestat(os.fstat(handle), os.stat(folder)):
                 return handle
-        os.close(handle)  # another call removed the folder between opening and locking
+        os.close(handle)  # Another call removed the folder between opening and locking.

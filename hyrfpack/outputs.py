@@ -1,11 +1,11 @@
-"""Checks of output paths, which protect the user's files.
+"""Check output paths, to protect the user's files.
 
 1. A file that is read is never replaced, and no file is written into a folder that photos or poses are read from.
 2. Without `overwrite`, no existing file is replaced, and no file is written into a folder of other photos or poses.
 
-The checks run before any work, so that a failure does not come after minutes. Files that appear during the work are
+The checks run before any work, so that a command does not fail after minutes. Files that appear during the work are
 kept as well: `atomic` checks again in the step that gives a finished file its name, and `lock` keeps a second call of
-hyrfpack out of a folder that a first one writes into.
+hyrfpack out of a folder that the first one writes into.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from hyrfpack.errors import HyrfError
 if TYPE_CHECKING:
     from hyrfpack.scene import Scene
 
-# Suffixes of pictures that count as photos. A photo's name without a suffix means the first of these that exists.
+# Suffixes of pictures that count as photos. A photo's name without a suffix means the first file with one of these.
 READABLE_PICTURE_SUFFIXES = (
     ".png",
     ".jpg",
@@ -36,14 +36,14 @@ READABLE_PICTURE_SUFFIXES = (
     ".heif",
     ".hif",
 )
-# Suffixes of raw photos of cameras. They are never read, but counted and reported to the user.
+# Suffixes of cameras' raw photos. They are never read, but counted and reported to the user.
 RAW_PHOTO_SUFFIXES = (
     *(".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dcr", ".dng", ".erf", ".fff", ".gpr", ".iiq", ".kdc", ".mos", ".mrw"),
     *(".nef", ".nrw", ".orf", ".pef", ".raf", ".rw2", ".rwl", ".sr2", ".srf", ".srw", ".x3f"),
 )
 PICTURE_SUFFIXES = (*READABLE_PICTURE_SUFFIXES, *RAW_PHOTO_SUFFIXES)
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp", ".mts", ".m2ts", ".mpg", ".mpeg", ".wmv")
-ARCHIVE_SUFFIXES = (".zip", ".r3d")  # an archive may hold a whole set of photos and poses
+ARCHIVE_SUFFIXES = (".zip", ".r3d")  # An archive may hold a whole set of photos and poses.
 COLMAP_TABLE_NAMES = tuple(f"{table}{kind}" for table in ("cameras", "images", "points3D") for kind in (".bin", ".txt"))
 # Names of files and folders that hold poses, besides the tables of COLMAP.
 POSE_FILE_NAMES = (
@@ -51,7 +51,7 @@ POSE_FILE_NAMES = (
     *("poses_bounds.npy", "bundle.out", "cameras.xml", "metadata", "keyframes"),
 )
 COLMAP_MODEL_FOLDERS = ("sparse", "colmap/sparse")
-MAX_PATH_BYTES = 4095  # the limit of common systems
+MAX_PATH_BYTES = 4095  # This is the limit of common systems.
 
 StrPath = str | os.PathLike[str]
 
@@ -74,7 +74,8 @@ class Outputs:
         scene: Scene | None = None,
         overwrite: bool = False,
     ) -> None:
-        """
+        """Collect the inputs that no output may replace.
+
         Args:
             files: files that are read; None and files that do not exist are ignored.
             folder: a folder whose files are all read.
@@ -97,7 +98,7 @@ class Outputs:
 
         Args:
             path: path of the file.
-            endings: suffixes of which its name must have one; none for any name.
+            endings: allowed suffixes of its name; if none are given, any name is allowed.
         """
         path = Path(path)
         if os.path.isdir(path):
@@ -120,7 +121,7 @@ class Outputs:
         _check_folder(_resolved_folder(path))
 
     def folder(self, folder: StrPath, names: Iterable[str]) -> None:
-        """Check files that will be written into a folder or folders in it.
+        """Check files that will be written into a folder or its subfolders.
 
         Args:
             folder: the folder, which need not exist.
@@ -154,7 +155,7 @@ class Outputs:
         _check_name_lengths(paths)
 
     def _check(self, path: StrPath) -> None:
-        """Refuse a path that is read, under whatever name, and one that exists and is not a file."""
+        """Raise an error for a path that is read, also under another name, or that exists and is not a file."""
         if _file_ids([path]) & self._files:
             raise HyrfError(f"{path}: the output is an input itself", fix="name another file")
         if os.path.exists(path) and not os.path.isfile(path):
@@ -163,7 +164,7 @@ class Outputs:
         self._check_folder_not_read(_resolved_folder(path))
 
     def _check_folder_not_read(self, folder: StrPath) -> None:
-        """Refuse a folder whose photos or poses are read."""
+        """Raise an error for a folder whose photos or poses are read."""
         if _file_ids([folder]) & self._folders:
             raise HyrfError(
                 f"{folder}: the same command reads what lies in this folder",
@@ -172,7 +173,7 @@ class Outputs:
 
 
 def _folders_between(top: StrPath, files: Iterable[StrPath]) -> set[Path]:
-    """Return a folder, the folders of files, and all folders between it and those that lie in it."""
+    """Return the folder `top`, the folders of the files, and all folders between `top` and those below it."""
     root = _resolved(top)
     found = {root}
     for folder in {_resolved(file).parent for file in files}:
@@ -182,7 +183,7 @@ def _folders_between(top: StrPath, files: Iterable[StrPath]) -> set[Path]:
 
 
 def _file_ids(paths: Iterable[StrPath]) -> set[tuple[int, int]]:
-    """Return device and inode number of each path that exists, which are the same for all its names and links."""
+    """Return the device and inode number of each existing path, which all names and links of a file share."""
     found = set()
     for path in paths:
         try:
@@ -194,7 +195,7 @@ def _file_ids(paths: Iterable[StrPath]) -> set[tuple[int, int]]:
 
 
 def _resolved_folder(path: StrPath) -> Path:
-    """Return the folder of a file with all links followed: a write replaces the target of a link."""
+    """Return the folder of a file with all links followed, because a write replaces the target of a link."""
     return _resolved(path).parent
 
 
@@ -202,7 +203,7 @@ def _resolved(path: StrPath) -> Path:
     """Return a path with all links followed."""
     try:
         return Path(os.path.realpath(path))
-    except OSError as error:  # the working folder was removed
+    except OSError as error:  # The working folder was removed.
         raise HyrfError(
             f"{path}: the path cannot be resolved ({error.strerror})",
             fix="give an absolute path",
@@ -210,7 +211,7 @@ def _resolved(path: StrPath) -> Path:
 
 
 def _check_name_lengths(paths: Iterable[StrPath]) -> None:
-    """Refuse names and paths that are too long for common systems."""
+    """Raise an error for names and paths that are too long for common systems."""
     for path in map(os.path.abspath, paths):
         for part in Path(path).parts:
             if len(os.fsencode(part)) > MAX_NAME_BYTES:
@@ -220,7 +221,7 @@ def _check_name_lengths(paths: Iterable[StrPath]) -> None:
 
 
 def _check_folder(folder: Path) -> None:
-    """Refuse a folder in which no file can be created, or that cannot be created itself."""
+    """Raise an error for a folder in which no file can be created, or that cannot be created itself."""
     resolved = _resolved(folder)
     existing = next(path for path in (resolved, *resolved.parents) if os.path.lexists(path))
     if not existing.is_dir():
@@ -232,7 +233,7 @@ def _belongs_to_photo_set(folder: Path) -> bool:
     """Return whether a folder belongs to a set of posed photos.
 
     It does if it holds photos and poses, if it is a folder of photos in such a set, or if it is a COLMAP model.
-    Pictures alone do not count, because many folders hold some that users write other files to.
+    Pictures alone do not count, because users write files into many folders that hold pictures.
     """
     names = _entry_names(folder)
     if not names.isdisjoint(COLMAP_TABLE_NAMES):
@@ -259,7 +260,7 @@ def _has_pictures(folder: Path) -> bool:
 
 
 def _entry_names(folder: StrPath) -> set[str]:
-    """Return the names of all entries of a folder; none where it is not a folder or cannot be read."""
+    """Return the names of all entries of a folder; none if it is not a folder or cannot be read."""
     try:
         return set(os.listdir(folder))
     except OSError:

@@ -1,4 +1,4 @@
-"""Reader of the PLY container (Turk 1994): a text header names elements and their properties, and their rows follow."""
+"""Read the PLY container (Turk 1994): a text header names elements and their properties, and their rows follow."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Element:
 
     Attributes:
         count: number of rows.
-        properties: name of each property -> numpy's name of its type without byte order, or "" for a list.
+        properties: maps the name of each property to numpy's name of its type without byte order, or "" for a list.
     """
 
     count: int
@@ -99,7 +99,7 @@ def read_header(data: bytes, name: str) -> PlyHeader:
 
 
 def read_elements(data: bytes, header: PlyHeader, wanted: set[str], name: str) -> dict[str, np.ndarray]:
-    """Read the rows of those `wanted` elements that the file has, and skip the others.
+    """Read the rows of the `wanted` elements, as far as the file has them, and skip the other elements.
 
     Args:
         data: the whole file.
@@ -108,7 +108,8 @@ def read_elements(data: bytes, header: PlyHeader, wanted: set[str], name: str) -
         name: name of the file in error messages.
 
     Returns:
-        By element, a structured array (count,) with the file's property names. Text rows are float64.
+        The rows of each element by its name, a structured array (count,) with the file's property names. Text rows are
+        float64.
 
     Raises:
         HyrfDataError: the file ends too early, a text row does not consist of numbers, or a wanted element, or a binary
@@ -146,7 +147,7 @@ def stack_columns(rows: np.ndarray, names: Collection[str]) -> np.ndarray:
     """Return the properties `names` of rows as one array (count, len(names)) of their widest type."""
     fields = rows.dtype.names or ()
     kinds = {rows.dtype[name] for name in fields}
-    if len(kinds) == 1:  # most files have one type, and viewing their rows as one table is many times faster
+    if len(kinds) == 1:  # This holds for most files, and viewing their rows as one table is many times faster.
         table = rows.view(kinds.pop()).reshape(len(rows), len(fields))
         return table[:, [fields.index(name) for name in names]]
     return np.stack([rows[name] for name in names], axis=1)

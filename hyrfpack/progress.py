@@ -1,4 +1,4 @@
-"""Progress reports of long work: calls that say what is being done, and which share of the whole work is done."""
+"""Progress reports of long work: calls with the name of the current task and the completed share of the whole work."""
 
 from __future__ import annotations
 
@@ -6,21 +6,21 @@ from collections.abc import Callable
 from threading import Lock
 from typing import TypeVar
 
-# A function of two arguments: what is being done, and the share of the whole work that is done, 0 to 1.
+# A function of two arguments: the name of the current task, and the completed share of the whole work, 0 to 1.
 Report = Callable[[str, float], None]
 S = TypeVar("S")
 T = TypeVar("T")
 
-# Share of the remaining work that each round is assumed to do, where nobody knows the number of rounds.
+# If the number of rounds is unknown, each round is assumed to do this share of the remaining work.
 REMAINING_SHARE_PER_ROUND = 0.4
 
 
 def no_report(doing: str, share: float) -> None:
-    """Ignore a report, for callers that want none."""
+    """Ignore a report, for callers that need none."""
 
 
 def report_part(report: Report, start: float, end: float) -> Report:
-    """Return a report for one part of the work: its share 0 to 1 becomes `start` to `end` of the whole work.
+    """Return a report function for a part of the work, which maps its shares 0 to 1 to `start` to `end` of the whole.
 
     Example:
         >>> report_part(lambda doing, share: print(doing, share), 0.5, 1.0)("measuring", 0.5)
@@ -30,13 +30,13 @@ def report_part(report: Report, start: float, end: float) -> Report:
 
 
 def report_round(report: Report, number: int) -> Report:
-    """Return a report for one round of work that takes a few rounds, where nobody knows how many.
+    """Return a report function for one round of work that takes an unknown number of rounds.
 
     Each round is assumed to do REMAINING_SHARE_PER_ROUND of the remaining work, so that the share of the whole grows
     and never reaches 1.
 
     Args:
-        report: report of the whole work.
+        report: report function of the whole work.
         number: the number of the round, from 0.
     """
     return report_part(report, *(1 - (1 - REMAINING_SHARE_PER_ROUND) ** rounds for rounds in (number, number + 1)))

@@ -95,22 +95,22 @@ class Camera:
 
     @property
     def rotation(self) -> np.ndarray:
-        """(3, 3) rotation from world to camera axes; its rows are the camera's axes in the world."""
+        """Return the (3, 3) rotation from world to camera axes; its rows are the camera's axes in the world."""
         return self.camera_from_world[:3, :3]
 
     @property
     def position(self) -> np.ndarray:
-        """(3,) centre of projection in world coordinates: -R^T t."""
+        """Return the centre of projection (3,) in world coordinates: -R^T t."""
         return -self.rotation.T @ self.camera_from_world[:3, 3]
 
     @property
     def forward(self) -> np.ndarray:
-        """(3,) unit viewing direction in world coordinates."""
+        """Return the unit viewing direction (3,) in world coordinates."""
         return self.rotation[2]
 
     @property
     def intrinsics(self) -> tuple[float, float, float, float]:
-        """(fx, fy, cx, cy) in pixels."""
+        """Return (fx, fy, cx, cy) in pixels."""
         return self.fx, self.fy, self.cx, self.cy
 
 
@@ -122,7 +122,7 @@ class Picture:
 
     Attributes:
         rgb: (H, W, 3) uint8, display-referred sRGB.
-        alpha: (H, W) uint8 coverage, or None when the photo is opaque.
+        alpha: (H, W) uint8 coverage; None if the photo is opaque.
         mask: (H, W) bool, True where a pixel may be used for training and scoring, or None for all.
     """
 
@@ -132,7 +132,7 @@ class Picture:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of memory that the arrays of this picture take."""
+        """Return the number of bytes of memory that the arrays of this picture take."""
         return sum(part.nbytes for part in (self.rgb, self.alpha, self.mask) if part is not None)
 
     def composite(self, background: np.ndarray | None = None) -> np.ndarray:
@@ -189,8 +189,8 @@ class Scene:
         max_size: photos whose longer side has more pixels are shrunk to this length; 0 if photos are loaded as stored,
             None if the scene was not read from files.
         tracks: maps a view's name to (M,) int64 rows of `points` that the reconstruction found in that photo, in
-            ascending order; empty if the input has no tracks. A point may lie outside the picture, because
-            undistortion crops it.
+            ascending order; empty if the input has no tracks. A point may lie outside the picture, because undistortion
+            crops pictures.
         reading: all arguments of `hyrfpack.load_scene` that read the scene, including defaults, with an absolute path;
             empty if the scene was not read from files.
 
@@ -244,7 +244,7 @@ class Scene:
 
     @property
     def views(self) -> list[View]:
-        """Training and held-out views together, sorted by name."""
+        """Return training and held-out views together, sorted by name."""
         return sorted(self.train + self.test, key=lambda view: view.name)
 
 

@@ -1,4 +1,4 @@
-"""Rate-distortion compression: bits go to the numbers that change rendered pictures most."""
+"""Rate-distortion compression, which spends bits on the numbers that change rendered pictures most."""
 
 from hyrfpack.compress.packer import compress_model
 

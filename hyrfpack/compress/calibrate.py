@@ -4,7 +4,7 @@ A sensitivity is a derivative, so it predicts the error only for small, independ
 this assumption in three ways:
 
 - Gaussians that move swap their depth order, which adds an error in proportion to the step and not to its square.
-- Pruning only ever removes light, so its errors have the same sign and add up.
+- Pruning only removes light, so its errors have the same sign and add up.
 - Where opacity or transmittance saturates, a larger perturbation adds no further error.
 
 So each part of a plan is quantised by itself, rendered and compared with the model. The part's sensitivities are
@@ -82,7 +82,7 @@ class CorrectionFactor:
         exponent: power of measured over predicted error to multiply by; re-estimated once two factors were measured.
         value: the factor to measure next.
         low, high: the largest factor measured to be too small, and the smallest measured to be large enough.
-        converged: whether the errors are predicted well enough.
+        converged: whether predicted and measured error agree within PREDICTION_TOLERANCE_RATIO.
         last: the factor measured last, and its ratio of measured to predicted error; None before the first.
     """
 
@@ -95,7 +95,7 @@ class CorrectionFactor:
 
     def update(self, ratio: float) -> None:
         """Choose the next factor, given the ratio of measured to predicted error with the present `value`."""
-        if self.last is not None and ratio > 0:  # secant method on logarithms
+        if self.last is not None and ratio > 0:  # The exponent follows by the secant method on logarithms.
             value, before = self.last
             estimate = np.log(self.value / value) / (np.log(before / ratio) or np.inf)
             self.exponent = (
@@ -116,7 +116,7 @@ class CorrectionFactor:
 
     @property
     def final(self) -> float:
-        """The factor to use: one that was measured to be large enough, if there is one."""
+        """Return the factor to use, which is one that was measured to be large enough, if there is one."""
         return self.value if self.converged or self.high == np.inf else self.high
 
 
@@ -238,7 +238,7 @@ def calibrate(
         _, plan, planned = last_planned
         quantized = quantize(planned, plan, scaled, sections=[name for part in parts for name in part])
         predicted, stored = _predict_quantization_errors(planned, quantized, scaled), quantized.arrays()
-        # Sorted like the Gaussians that are left, so that their decoded values can be reused for the unchanged parts.
+        # Sorting restores the order of the remaining Gaussians, whose decoded values are reused for unchanged parts.
         order = np.argsort(plan.kept)
         stored = {name: values[order] if name in LOGIT_SECTIONS else values for name, values in stored.items()}
 
@@ -321,14 +321,14 @@ def _correct_by_measurement(
 
 
 def _replace_arrays(model: HybridModel, arrays: dict[str, np.ndarray]) -> HybridModel:
-    """Return a copy of a model with other numbers in some sections."""
+    """Return a copy of a model whose sections named in `arrays` hold these numbers instead."""
     changed = deepcopy(model)
     changed.load_state_dict(dict(iter_parameters(arrays, changed)), strict=False)
     return changed
 
 
 def _update_decoded(model: HybridModel, before: Decoded, part: Part) -> Decoded:
-    """Decode a changed model again, reusing what it decoded to before where the changed sections do not matter."""
+    """Decode a model again after one part changed, reusing the results `before` that do not depend on this part."""
     if GEOMETRY_TABLE in part or OPACITIES in part:
         return replace(before, geometry=model.decode_geometry())
     if before.shading is None:

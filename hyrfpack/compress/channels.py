@@ -1,4 +1,4 @@
-"""Quantisation of channels: one number per Gaussian, one step per class, each number predicted from those before it."""
+"""Quantise channels of one number per Gaussian and one step per class, each number predicted from those before it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from hyrfpack.quant.steps import FIXED_POINT_ONE, decode_step
 
 # Candidate weights of the prediction.
 PREDICTION_WEIGHTS_SIXTEENTHS = (0, 6, 9, 12)
-# The code of step 8e-6. It keeps the difference of any two numbers within the limit below 2^30 steps.
+# This is the code of step 8e-6, with which any two numbers of a channel differ by less than 2^30 steps.
 MIN_STEP_CODE = 32
 # At most this many numbers of a channel are used to choose the weight.
 _WEIGHT_SAMPLE_SIZE = 1 << 16
@@ -48,7 +48,7 @@ def quantize_channel(
         error: error of candidate values; by default s (candidate - value)^2.
         reach: distance in steps of the furthest candidate from the nearest symbol; 0 takes the nearest and ignores
             the rate.
-        weight: weight of the prediction in sixteenths; by default the best of PREDICTION_WEIGHTS_SIXTEENTHS.
+        weight: weight of the prediction in sixteenths; None for the best of PREDICTION_WEIGHTS_SIXTEENTHS.
     """
     kinds = int(classes.max(initial=0)) + 1
     members = np.bincount(classes, minlength=kinds)
@@ -82,7 +82,7 @@ def quantize_channel(
             errors = added_error(np.arange(len(numbers)), numbers / FIXED_POINT_ONE + float(mean))
             return float(errors.sum() + LAMBDA_PER_DISTORTION * distortion * look_up_bits(symbols, classes, bits).sum())
 
-        # A choice also changes the predictions of later numbers. With coarse steps that can cost more than it saves.
+        # A choice also changes the predictions of later numbers. With coarse steps this can cost more than it saves.
         chosen = lift(len(target), weight, steps, choose)
         if total(*chosen) < total(residuals, decoded):
             residuals, decoded = chosen

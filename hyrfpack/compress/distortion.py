@@ -16,7 +16,7 @@ DISTORTION_RANGE = (1e-8, 1e-2)
 def default_distortion(provenance: dict, finetune_steps: int = 0) -> float:
     """Return the distortion that costs DEFAULT_PSNR_DROP_DB of PSNR against photos, before fine-tuning.
 
-    The model's own error E against its photos and the distortion D are taken to be independent. They then add up, so
+    The model's own error E against its photos and the distortion D are assumed to be independent. Then they add up, so
     D = E (10^(drop / 10) - 1).
 
     Args:

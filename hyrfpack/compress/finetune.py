@@ -1,4 +1,4 @@
-"""Quantisation-aware fine-tuning: continue training with quantised parameters and the rate in the loss."""
+"""Quantisation-aware fine-tuning, which continues training with quantised parameters and the rate in the loss."""
 
 from __future__ import annotations
 
@@ -36,7 +36,8 @@ from hyrfpack.train.optimizer import Optimizer
 from hyrfpack.train.trainer import shuffled
 
 FINETUNING_RATES = LearningRates(
-    positions=(1e-4, 1e-6),  # a Gaussian that changes its cell late invalidates what its other numbers converged to
+    # The last rate is low: if a Gaussian changes its cell late, its other numbers no longer fit.
+    positions=(1e-4, 1e-6),
     fields=(2e-3, 2e-4),
     color_logits=(6e-3, 6e-4),
     scale_logits=(8e-3, 8e-4),

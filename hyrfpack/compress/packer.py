@@ -1,4 +1,4 @@
-"""Compression of a file: measure sensitivities, plan, fine-tune or search if asked for, and write."""
+"""Compress a file: measure sensitivities, plan, fine-tune or search if requested, and write."""
 
 from __future__ import annotations
 
@@ -44,16 +44,17 @@ from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.progress import Report, no_report, report_part, report_round
 from hyrfpack.scene import Scene, evenly_spaced
 
-# A file that loses more than this many times the intended PSNR on training photos is encoded again, finer.
+# A file is encoded again, with a smaller distortion, if its PSNR drop on training photos is more than this multiple of
+# the intended one.
 PSNR_DROP_TOLERANCE_RATIO = 1.5
 PSNR_DROP_VIEWS = 8
-# A file is encoded again if the measured error is off by more than this ratio from the intended one.
+# A file is encoded again if the measured error differs by more than this ratio from the intended one.
 DISTORTION_TOLERANCE_RATIO = 1.2
 MAX_CORRECTIONS = 3
 # The distortion changes at most by these ratios from one file to the next.
 MAX_COARSENING_RATIO = 2.0
 MAX_REFINING_RATIO = 16.0
-# Fine-tuning takes long, so a search over fine-tuned files makes fewer.
+# Fine-tuning takes long, so a search over fine-tuned files makes fewer trials.
 SEARCH_TRIALS = 9
 FINETUNED_SEARCH_TRIALS = 4
 # Share of the progress at which sensitivities are measured and encoding starts, for a single file and for a search.
@@ -63,7 +64,7 @@ SEARCH_ENCODING_START_SHARE = 0.3
 
 @dataclass(frozen=True)
 class EncodedCandidate:
-    """An encoded file of the model, and how far its pictures are off.
+    """An encoded file of the model, and the errors of its pictures.
 
     Attributes:
         data: the bytes of the file.
@@ -108,7 +109,7 @@ def compress_model(
         target: the file to write.
         profile: "compact", "paper" or "raw".
         data: photos of the scene.
-        finetune_steps: steps of fitting the quantised model to the photos of `data`; takes longer, gives smaller files.
+        finetune_steps: steps of fitting the quantised model to the photos of `data`; more steps give smaller files.
         prune: leave out Gaussians whose removal saves more rate than it costs in distortion.
         target_bytes: write the best file of at most this many bytes.
         max_psnr_drop: write the smallest file that loses at most this many dB of mean PSNR on the held-out photos of
@@ -248,7 +249,7 @@ class Packer:
     ranks: Ranks = SINGLE_PROCESS
 
     def encode(self, distortion: float, report: Report = no_report) -> EncodedCandidate:
-        """Encode a file that adds about `distortion` to the mean squared error of pictures, by estimate."""
+        """Encode a file that adds an estimated `distortion` to the mean squared error of pictures."""
         report("planning quantisation", 0.0)
         model, steps = self.model, self.finetune_steps
         plan = make_plan(model, self.sensitivity, distortion, self.prune)
@@ -335,7 +336,7 @@ class Packer:
             if error_ratio > 1:
                 candidate = other
                 continue
-            # Coarsen only once, because the errors that the comparison views do not show must stay bounded, too.
+            # Coarsen only once, because errors that the comparison views do not show must also stay bounded.
             return (
                 (other, distortion)
                 if other.measured_error < DISTORTION_TOLERANCE_RATIO * target
@@ -413,7 +414,7 @@ class Packer:
 
     @cached_property
     def _gains(self) -> dict[str, torch.Tensor] | None:
-        """Residual gains of the photos to fine-tune on; None if the model was trained without per-image gains."""
+        """Return the residual gains of the photos to fine-tune on; None if the model was trained without gains."""
         assert self.scene is not None
         if self.model.exposure is None and not has_mean_exposure(self.provenance):
             return None

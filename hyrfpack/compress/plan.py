@@ -1,4 +1,4 @@
-"""Planning of compression: which Gaussians are kept, their order, importance classes and position lattice."""
+"""Plan the compression: which Gaussians are kept, their order, importance classes and position lattice."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ IMPORTANCE_CLASS_COUNT = 6
 CLASS_WIDTH_LOG2 = 3.0
 # This many classes are for Gaussians that are more important than the mean.
 CLASSES_ABOVE_MEAN = 2
-# Pruning a Gaussian is taken to save this many bits. It is low, because the Gaussians that are pruned are cheap ones.
+# Pruning a Gaussian is assumed to save this many bits. This is low, because pruned Gaussians take few bits.
 PRUNED_GAUSSIAN_BITS = 16
 # A layer has at least MIN_LAYER_GAUSSIANS and at least 1 / MAX_LAYERS of all Gaussians; smaller layers cost over 1 %.
 MIN_LAYER_GAUSSIANS = 5000
@@ -91,8 +91,8 @@ def _cube_coords(model: HybridModel) -> np.ndarray:
 def replan_moved(plan: Plan, model: HybridModel) -> tuple[Plan, HybridModel]:
     """Update a plan to the new positions of its Gaussians; return it and the model, reordered and on the lattice.
 
-    Each Gaussian stays in its layer and class. Lattice points and order are computed anew, and with them which rows of
-    the hash tables are read.
+    Each Gaussian stays in its layer and class. Lattice points, the order, and the set of hash table rows that are read
+    are computed again.
 
     Args:
         plan: the plan before the Gaussians moved.

@@ -1,4 +1,4 @@
-"""Quantisation of a planned model: choose all steps and symbols by rate and distortion, before they are coded."""
+"""Quantise a planned model: choose all steps and symbols by rate and distortion, before they are coded."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def quantize(
     logits = [group for group in LOGIT_SECTIONS if group in sections]
     weights = {COLORS: sensitivity.colors, SCALES: sensitivity.scales, OPACITIES: sensitivity.opacities}
     error: ErrorModel | None = None
-    if COLORS in logits:  # clamped before the change of basis, since clamping in the basis would change the hue
+    if COLORS in logits:  # Colours are clamped before the change of basis; clamping after it would change the hue.
         arrays[COLORS] = np.clip(
             arrays[COLORS], -MAX_ABS_CHANNEL_VALUE / 2, MAX_ABS_CHANNEL_VALUE / 2
         ) @ plan.basis.astype(np.float64)
@@ -107,7 +107,7 @@ def opacity_error_model(
     Args:
         model: the planned model, whose geometry field adds to the explicit logits.
         logits: (M,) explicit opacity logits.
-        sensitivity: (M,) sensitivities by the explicit opacity logits.
+        sensitivity: (M,) sensitivities of the explicit opacity logits.
 
     Returns:
         (M,) clamped logits; and the model that maps (places, candidate logits) to errors.

@@ -52,7 +52,7 @@ from hyrfpack.scene import Picture, Scene, View, evenly_spaced
 
 # Distortions of the rate-distortion curve, relative to that of the file.
 CURVE_DISTORTION_RATIOS = (1 / 16, 1 / 4, 1, 4, 16)
-# From this many Gaussians on the curve has only the middle three points, because each takes long to encode and score.
+# With this many Gaussians or more, the curve has only the middle three points: each takes long to encode and score.
 SHORT_CURVE_MIN_GAUSSIANS = 200_000
 MAX_SCORED_PHOTOS = 24
 MAX_SCORED_VIEWPOINTS = 12

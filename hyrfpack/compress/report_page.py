@@ -95,7 +95,7 @@ class Findings:
         profiles: the model in the other profiles, which have no settings.
         curve: the model in profile "compact" at several distortions, smallest distortion first.
         shown: views whose pictures are shown, the one that loses most first.
-        amplified: amplification of the difference pictures.
+        amplified: factor by which the difference pictures are amplified.
         gaussians: number of Gaussians of the uncompressed model.
         machine: the machine on which times were measured.
         writer: the program that wrote the file, and its version.
@@ -115,12 +115,12 @@ class Findings:
 
     @property
     def points(self) -> list[MeasuredFile]:
-        """All files, largest first; the chosen file may also be a point of the curve."""
+        """Return all files, largest first; the chosen file may also be a point of the curve."""
         others = [point for point in (*self.profiles, *self.curve) if point is not self.chosen]
         return sorted([self.chosen, *others], key=lambda point: -point.bytes)
 
     def is_exact(self, scores: Evaluation) -> bool:
-        """Whether renders before and after are identical in every pixel; always False with photos."""
+        """Return whether renders before and after are identical in every pixel; always False with photos."""
         return not self.has_photos and scores.psnr == IDENTICAL_PSNR
 
     def fidelity(self, scores: Evaluation) -> float:

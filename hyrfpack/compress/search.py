@@ -90,11 +90,11 @@ def find_fullest(
     bounds = math.log(bounds[0]), math.log(bounds[1])
     wanted, place = math.log(TARGET_SIZE_RATIO * limit), min(max(_log(start), bounds[0]), bounds[1])
     best: tuple[float, Trial] | None = None
-    fitting: tuple[float, float] | None = None  # logarithms of the smallest distortion that fits, and of its bytes
-    too_large: tuple[float, float] | None = (
-        None  # logarithms of the largest distortion that does not fit, and of its bytes
-    )
-    measured: list[tuple[float, float]] = []  # logarithms of the distortion and the bytes of each trial
+    # The pairs are logarithms of a distortion and of its bytes: for the smallest distortion that fits, for the largest
+    # that does not fit, and for each trial.
+    fitting: tuple[float, float] | None = None
+    too_large: tuple[float, float] | None = None
+    measured: list[tuple[float, float]] = []
     for _ in range(trials):
         distortion = math.exp(place)
         trial = make_trial(distortion)

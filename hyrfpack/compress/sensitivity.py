@@ -1,4 +1,4 @@
-"""Sensitivities: mean squared derivatives of rendered pictures by each number of a model, measured on renders."""
+"""Measure sensitivities: mean squared derivatives of rendered pictures with respect to each number of a model."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ PRIOR_CELLS_PER_AXIS = 32
 MIN_CAMERA_DISTANCE_LOCAL = 0.05
 # Lower bound of the sensitivity of a decoder's number, as a share of the mean of its decoder.
 MIN_RELATIVE_DECODER_SENSITIVITY = 1e-2
-# Setting a whole decoder to zero is taken to add at least this error, because gradients vanish under saturation.
+# Setting a whole decoder to zero is assumed to add at least this error, because gradients vanish under saturation.
 MIN_ZEROED_DECODER_ERROR = 1e-6
 # Key of the Gaussians that are left out, beside the names of the sections.
 PRUNED = "pruned"
@@ -37,17 +37,17 @@ PRUNED = "pruned"
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """Mean squared derivatives of pictures by each number of a model.
+    """Mean squared derivatives of pictures with respect to each number of a model.
 
     The sensitivity of a number x is s = mean over views, pixels and channels of (d colour / d x)^2. An error e in x
     adds about s e^2 to the pictures' mean squared error. All values are float64, 0 or more.
 
     Attributes:
-        positions: (N,) by a coordinate in the contracted cube, mean of the three axes.
-        colors: (N,) by a colour logit, mean of the three.
-        scales, opacities: (N,) by the explicit logits.
+        positions: (N,) sensitivity of a coordinate in the contracted cube, mean of the three axes.
+        colors: (N,) sensitivity of a colour logit, mean of the three.
+        scales, opacities: (N,) sensitivities of the explicit logits.
         removals: (N,) mean squared error that leaving out a Gaussian adds, see `removal_error`.
-        fields: by section, the sensitivities of each hash table and decoder, in the order of the file.
+        fields: sensitivities of each hash table and decoder by section, in the order of the file.
     """
 
     positions: np.ndarray
@@ -81,10 +81,10 @@ class Sensitivity:
 def measure_sensitivity(
     model: HybridModel, cameras: Sequence[Camera], seed: int = 0, report: Report = no_report
 ) -> Sensitivity:
-    """Estimate the mean squared derivatives of pictures by every number of a model.
+    """Estimate the mean squared derivatives of pictures with respect to every number of a model.
 
-    Let v be a picture of random signs. The derivative of (picture . v) by a number x is the sum of the pixels'
-    derivatives by x with random signs, and the expectation of its square is the sum of their squares (Hutchinson 1990).
+    Let v be a picture of random signs. The derivative of (picture . v) with respect to a number x is the sum of the
+    pixels' derivatives with random signs. The expectation of its square is the sum of their squares (Hutchinson 1990).
     One v is drawn for each view. Half of the views are at cameras and half between them.
 
     A Gaussian may be visible in few of the measured views, or in none, and still be visible in others. So measurements
@@ -182,12 +182,12 @@ def _combine(
 def removal_error(opacities: np.ndarray, logit_sensitivity: np.ndarray) -> np.ndarray:
     """Estimate the mean squared error (N,) that leaving out each Gaussian adds to the pictures.
 
-    If s is the sensitivity by the opacity logit, the sensitivity by the opacity o itself is s / (o (1 - o))^2, and
-    setting o to 0 adds o^2 times that.
+    If s is the sensitivity of the opacity logit, that of the opacity o itself is s / (o (1 - o))^2. Setting o to 0 adds
+    o^2 times that.
 
     Args:
         opacities: (N,) in [0, 1].
-        logit_sensitivity: (N,) sensitivities by explicit opacity logits.
+        logit_sensitivity: (N,) sensitivities of the explicit opacity logits.
     """
     return logit_sensitivity / np.maximum(opacities * (1 - opacities), 1e-4) ** 2 * opacities**2
 
@@ -221,8 +221,8 @@ def _expected_sensitivity(
     """Estimate the sensitivities (N,) of each kind of number of unoccluded Gaussians, up to a common factor.
 
     A Gaussian of opacity o and standard deviations a, b (the larger two) at depth z covers pi f^2 a b / z^2 pixels.
-    The derivative of such a pixel is at most o by the Gaussian's colour, o (1 - o) by its opacity logit, and
-    o / (a b)^(1/2) by its position.
+    The derivative of such a pixel is at most o with respect to the Gaussian's colour, o (1 - o) with respect to its
+    opacity logit, and o / (a b)^(1/2) with respect to its position.
     """
     sides = geometry.scales.double().sort(dim=1).values
     area, opacities = sides[:, 1] * sides[:, 2], geometry.opacities.double()

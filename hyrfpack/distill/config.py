@@ -14,7 +14,7 @@ class DistillConfig:
 
     Attributes:
         steps: optimiser steps of fitting to reference renders of the splats, one render per step.
-        psnr: target PSNR in dB of the file on held-out reference renders; a higher value takes more bytes.
+        psnr: target PSNR in dB of the file on held-out reference renders; a higher target takes more bytes.
         size: longer side of the renders in pixels.
         train_views, test_views: number of sampled viewpoints to train at (at most) and to score at.
         seed: random seed of the viewpoints, initial weights and order; 0 to LARGEST_SEED.

@@ -1,4 +1,4 @@
-"""Distillation of splats into a model: choose viewpoints, initialise by regression, train on reference renders."""
+"""Distil splats into a model: choose viewpoints, initialise by regression, train on reference renders."""
 
 from __future__ import annotations
 
@@ -148,7 +148,7 @@ def _fit_to_pictures(
         seed=config.seed,
         learning_rates=WARM_START_RATES,
         density=DensityConfig(stop=0.0),
-        precision="float32",  # the remaining corrections are smaller than the rounding of lower precisions on a GPU
+        precision="float32",  # Lower precisions on a GPU round more than the corrections that remain.
     )
     trainer = Trainer(scene, settings, cache, model.gaussians.positions.device, model)
 

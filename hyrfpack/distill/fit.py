@@ -151,7 +151,7 @@ def distill_splats(
     imported = f"{len(splats):,} Gaussians of degree {splats.degree} from {Path(name).name}, without photos"
     provenance = {"steps": config.steps, "seed": config.seed, "psnr": unpacked_psnr, "choices": {"imported": imported}}
     data = pack(distilled, config.psnr, provenance, say, report_part(report, 0.7, 0.97))
-    written = write_atomic(target, data, overwrite=overwrite)  # written last, so an interrupt keeps the old file
+    written = write_atomic(target, data, overwrite=overwrite)  # written last, so that an interrupt keeps the old file
     report("scoring the file", 0.97)
     decoded = hyrf_format.load_model(written).to(torch_device)
     decoded.precision = distilled.model.precision
@@ -177,7 +177,7 @@ def distill_splats(
 
 
 def _falls_short(reached_psnr: float, asked: float) -> bool:
-    """Whether a PSNR, rounded as in messages, is less than the target."""
+    """Return whether a PSNR, rounded as in messages, is less than the target."""
     return round(reached_psnr, 1) < asked
 
 

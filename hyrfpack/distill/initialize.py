@@ -1,4 +1,4 @@
-"""Initialisation of a distilled model: copy explicit values of the splats, and fit the fields by regression.
+"""Initialise a distilled model: copy explicit values of the splats, and fit the fields by regression.
 
 The explicit values that a model stores for each Gaussian (position, one size, opacity, colour) are copied. Anisotropic
 scales, rotations and view-dependent colours come from the fields, which are fitted by regression over the Gaussians
@@ -26,8 +26,8 @@ from hyrfpack.splats.harmonics import SH_C0
 from hyrfpack.train.config import LearningRates
 from hyrfpack.train.optimizer import Optimizer
 
-# The size of the hash tables follows from the number of Gaussians for each row of a level. With harmonics the tables
-# are larger, because the model has view-dependent colours to learn, and its source is 2 to 4 times as large, too.
+# The number of Gaussians for each row of a level determines the size of the hash tables. With harmonics the tables are
+# larger, because the model must learn view-dependent colours. Its source is then also 2 to 4 times as large.
 GAUSSIANS_PER_ROW = 8
 GAUSSIANS_PER_ROW_WITH_HARMONICS = 2
 # Vertices of the finest level along each axis.
@@ -41,8 +41,8 @@ MIN_BATCH_GAUSSIANS = 4096
 TARGET_EPOCHS = 80
 MIN_STEPS = 2400
 MAX_STEPS = 6000
-# With many Gaussians the hash tables are large, and the time of a step grows with their size whatever the batch. So
-# there are fewer steps, of larger batches.
+# With many Gaussians the hash tables are large, and the time of a step grows with their size, whatever the batch. So
+# there are fewer steps, with larger batches.
 MAX_STEPS_TIMES_GAUSSIANS = 1_000_000_000
 MIN_EPOCHS = 16
 REGRESSION_RATES = LearningRates(fields=(4e-3, 1e-4), color_logits=(1e-2, 1e-3))

@@ -1,4 +1,4 @@
-"""Compression of a distilled model to the smallest file that reaches a target PSNR."""
+"""Compress a distilled model to the smallest file that reaches a target PSNR."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Renders of the original splats: as a scene to train on, as references to compare with, and the light they send."""
+"""Render the original splats, as photos to train on and as references, and measure the light that they send."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ class ReferenceViews:
 
     @torch.no_grad()
     def psnr_per_view(self, model: HybridModel) -> list[float]:
-        """Return the PSNR in dB of each view of a model, rendered over black and clamped to [0, 1]; on one device."""
+        """Return the PSNR in dB of each view of a model, rendered over black on the device of the references."""
         decoded = model.decode()
 
         @torch.no_grad()  # gradient mode is kept per thread

@@ -14,7 +14,7 @@ from hyrfpack.version import __version__
 
 
 def describe_machine() -> dict[str, object]:
-    """Return what run times depend on: processor, cores in use, GPU, and versions of packages."""
+    """Return facts that run times depend on: processor, cores in use, GPU, and versions of packages."""
     facts: dict[str, object] = {
         "cpu": _processor_name(),
         "cores": thread_count(),

@@ -37,7 +37,7 @@ class Timing:
         ms: median wall time in milliseconds.
         spread_ms: interquartile range of the wall times in milliseconds; None if there is only one.
         work_ms: median processor time in milliseconds, summed over all threads; other programs on the machine distort
-            it least.
+            it less than the wall time.
         repeats: number of measured runs.
     """
 
@@ -61,10 +61,9 @@ def time_alternately(
 ) -> tuple[dict[str, Timing], dict[str, Any]]:
     """Time tasks against each other: run each once unmeasured, then measure them in turns.
 
-    A task is not measured again once its measured runs add up to MAX_SECONDS_PER_TASK. A task whose first run took that
-    long is not run again, and the first run counts. A task that takes less than WARM_UP_SECONDS is run unmeasured for
-    that long at the start of each turn. A slower task before it leaves cold caches and all threads on one core, which
-    would otherwise be measured too.
+    A task is not measured again once its measured runs add up to MAX_SECONDS_PER_TASK. If the first run took that
+    long, it counts as the measurement. A task that takes less than WARM_UP_SECONDS is run unmeasured for that long at
+    the start of each turn, because a slower task before it leaves cold caches and all threads on one core.
 
     Args:
         tasks: the tasks by name.

@@ -17,11 +17,11 @@ class ModelConfig:
         geometry, radiance: hash grids of the two fields.
         hidden: width of the decoders' two hidden layers.
         background: whether a background sphere, coloured by the radiance field, lies behind the Gaussians.
-        solid: RGB in [0, 1] behind everything when there is no background sphere.
+        solid: RGB in [0, 1] of the background if there is no background sphere.
         scale_rule: "sum" S * sigmoid(s_n + s_e), or "product" S * sigmoid(s_n) * sigmoid(s_e).
         scale_grows: whether the largest scale S(p) grows with max(1, |u|) outside the box.
         direction_encoding: "frequency" (NeRF, 4 octaves) or "sh" (real spherical harmonics, bands 0 to 2).
-        position_gradients: whether the fields pass gradients on to positions (training only).
+        position_gradients: whether gradients flow from the fields to the Gaussians' positions (training only).
         antialiased: whether opacity is compensated for the rasteriser's low-pass filter.
     """
 

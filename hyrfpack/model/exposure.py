@@ -1,7 +1,7 @@
-"""Exposure and white balance as a smooth function of the viewpoint: the exposure map that a model may carry.
+"""The exposure map of a model: exposure and white balance as a smooth function of the viewpoint.
 
-Photos of one capture differ in exposure. A model that is trained with per-image gains holds one consistent exposure;
-the map predicts the gains of any viewpoint, so that a render looks like the photos taken near it.
+Photos of one capture differ in exposure. A model that is trained with per-image gains has one consistent exposure. The
+map predicts the gains of any viewpoint, so that a render looks like the photos taken near it.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ def apply_exposure_gains(image: Tensor, gains: Tensor) -> Tensor:
 
         y' = g y / (1 + (g - 1) y)        that is, logit y' = logit y + log g
 
-    Black and white do not change, g is the gain in the shadows, and gains g and h one after the other equal the gain
-    g h. A point's colours in different photos follow this more closely than a linear gain
+    Black and white do not change, g is the gain in the shadows, and applying g and then h equals applying g h. The
+    colours of a point in different photos follow this curve more closely than a linear gain
     (`docs/research/exposure.md`).
 
     Args:
@@ -59,7 +59,7 @@ class ExposureMap:
 
     x is the viewpoint's position in local units, f its unit viewing direction, and x' the point nearest to x in the box
     of the training cameras: a viewpoint outside the box has the exposure of the nearest one inside. The function is
-    continuous, and Lipschitz with the constants `slope_bounds`. The fields are the numbers that a file stores, so that
+    continuous, and Lipschitz with the constants `slope_bounds`. The attributes are the numbers that a file stores, so
     writing and reading a map changes nothing.
 
     Attributes:
@@ -67,7 +67,7 @@ class ExposureMap:
         lengths: (2,) float32 > 0, l_x in local units and l_f in units of the sphere of directions.
         mean: (3,) float32 log gains far from all centres.
         limits: (2, 3) float32, lowest and highest log gain of each channel, in [-8, 8].
-        steps: (3,) float32, unit of the weights of each channel.
+        steps: (3,) float32, quantisation step of the weights of each channel.
         positions: (M, 3) uint8, x_m = least + code / 255 (largest - least). M <= 64.
         directions: (M, 3) int8, f_m = code / 127.
         weights: (M, 3) int16, w_m = code * step.

@@ -12,7 +12,7 @@ from hyrfpack.ops.mlp import mlp
 
 
 class Field(nn.Module):
-    """Hash grid with a decoder: features and extra inputs pass two hidden ReLU layers to raw outputs."""
+    """A hash grid and a decoder of two hidden ReLU layers, which maps features and extra inputs to raw outputs."""
 
     def __init__(
         self,

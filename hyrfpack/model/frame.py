@@ -70,7 +70,7 @@ class Frame:
     def local_pose(self, camera: Camera) -> np.ndarray:
         """Return the camera's pose camera_from_local (4, 4) float64, with depths in local units.
 
-        It is computed in float64, so that a scene a million units from the origin loses no precision.
+        The pose is computed in float64, so that a scene a million units away from the origin loses no precision.
         """
         pose = camera.camera_from_world.copy()
         pose[:3, 3] = (pose[:3, :3] @ np.array(self.center) + pose[:3, 3]) / self.scale

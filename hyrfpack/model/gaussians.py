@@ -1,4 +1,4 @@
-"""The explicit part of a model: eight numbers per Gaussian."""
+"""The explicit part of a model, which has eight numbers per Gaussian."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-LOGIT_LIMIT = 12.0  # the sigmoid is within 7e-6 of 0 or 1 there, and its gradient vanishes beyond
+LOGIT_LIMIT = 12.0  # There the sigmoid is within 7e-6 of 0 or 1; beyond, its gradient vanishes.
 
 
 def logit(values: Tensor) -> Tensor:
@@ -23,9 +23,9 @@ class Gaussians(nn.Module):
 
     Attributes:
         positions: (N, 3) in local units.
-        color_logits: (N, 3).
-        scale_logits: (N, 1).
-        opacity_logits: (N, 1).
+        color_logits: (N, 3) explicit RGB logits.
+        scale_logits: (N, 1) explicit logit of the scale.
+        opacity_logits: (N, 1) explicit logit of the opacity.
     """
 
     PARAMETER_NAMES = ("positions", "color_logits", "scale_logits", "opacity_logits")
@@ -54,7 +54,7 @@ class Gaussians(nn.Module):
 def take_rows(values: Tensor, index: Tensor) -> Tensor:
     """Return the rows values[index] (n, C), for index (n,) int64 without repeated rows; differentiable.
 
-    The gradient of rows that are taken only once needs no summation: a copy is enough, while torch would sort the
+    As no row is taken twice, the backward pass copies gradients and need not sum them. For the sum torch would sort the
     indices.
     """
     return _TakeRows.apply(values, index)

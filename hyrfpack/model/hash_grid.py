@@ -1,4 +1,4 @@
-"""Multiresolution hash grids (Mueller et al. 2022): configuration and table; `ops.hash_encode` looks features up."""
+"""Multiresolution hash grids (Mueller et al. 2022): configuration and table; `ops.hash_encode` looks up features."""
 
 from __future__ import annotations
 
@@ -56,8 +56,8 @@ class HashGridConfig:
     def count_row_reads(self, points: np.ndarray, bits: int) -> np.ndarray:
         """Count how often each row of the table is read when features are looked up at the given points.
 
-        Each point reads the rows of the 8 corners of its cell on every level. The arithmetic is in integers only, so
-        that every decoder gets the same counts.
+        Each point reads the rows of the 8 corners of its cell on every level. All arithmetic is in integers, so that
+        every decoder gets the same counts.
 
         Args:
             points: (N, 3) int64 in units of 2^-bits of the unit cube, 0 to 2^bits - 1.
@@ -85,10 +85,10 @@ class HashGridConfig:
 
 
 def draw_uniform(rows: int, columns: int, *, bound: float, generator: torch.Generator | None = None) -> Tensor:
-    """Draw (rows, columns) numbers uniformly from -bound to bound.
+    """Return (rows, columns) numbers drawn uniformly from -bound to bound.
 
-    The operations are in place, because on the device "meta", on which the model of a file is built, out-of-place ones
-    would make torch import its compiler, which takes longer than reading the file.
+    The operations are in place, because the model of a file is built on the device "meta". Other operations there would
+    make torch import its compiler, which takes longer than reading the file.
     """
     return torch.rand(rows, columns, generator=generator).mul_(2).sub_(1).mul_(bound)
 

@@ -18,7 +18,7 @@ from hyrfpack.ops.contraction import contract
 from hyrfpack.ops.mlp import mlp
 from hyrfpack.ops.shade import DIRECTION_FEATURES, Shading, encode_views
 
-GAUSSIANS_PER_SHADING_BLOCK = 1 << 20  # bounds the memory of hash features in `HybridModel.shading`
+GAUSSIANS_PER_SHADING_BLOCK = 1 << 20  # This bounds the memory of hash features in `HybridModel.shading`.
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Decoded:
     Attributes:
         geometry: geometry of all Gaussians.
         shading: the position-dependent part of the colour decoder's first layer for all Gaussians, and the remaining
-            layers; None where it would save no time.
+            layers; None if it would save no time.
     """
 
     geometry: Geometry
@@ -123,7 +123,7 @@ class HybridModel(nn.Module):
     def decode(self) -> Decoded:
         """Evaluate the view-independent part for all Gaussians, to render many views of a model that does not change.
 
-        The result takes 4 (hidden + 8) bytes per Gaussian; with mixed precision on a GPU, 2 hidden + 32.
+        The result takes 4 (hidden + 8) bytes per Gaussian, or 2 hidden + 32 with mixed precision on a GPU.
         """
         is_faster = self.gaussians.positions.device.type in ("cpu", "cuda") and not self.radiance.is_constant_zero
         return Decoded(self.decode_geometry(), self.shading() if is_faster else None)

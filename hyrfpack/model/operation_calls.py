@@ -1,7 +1,7 @@
-"""Calls of the hot operations with named inputs, to run in any implementation and precision.
+"""Call the hot operations with named inputs, in any implementation and precision.
 
-Benchmarks and GPU checks use them to time implementations and to compare them with each other. This module needs no
-packages beyond those of the operations.
+Benchmarks and GPU checks use these calls to time implementations and to compare them with each other. This module needs
+no packages beyond those of the operations.
 """
 
 from __future__ import annotations
@@ -67,14 +67,14 @@ class OperationCall:
             nonlocal upstream
             with torch.enable_grad():
                 values = run()
-            if upstream is None:  # only in the first run, which is not timed
+            if upstream is None:  # This is so only in the first run, which is not timed.
                 upstream = random_cotangent(values)
             return values.detach(), torch.autograd.grad(values, leaves, upstream)
 
         return task
 
     def separate_tasks(self, *options: Any, upstream: Tensor | None = None) -> tuple[Callable[[], Tensor], Callable]:
-        """Return two tasks: the forward pass with recorded gradients, as in training, and the backward pass of one.
+        """Return two tasks: the forward pass with recorded gradients, as in training, and its backward pass.
 
         Args:
             options: the arguments of `forward_backward_task`.
@@ -115,7 +115,7 @@ def rasterize_call(inputs: Mapping[str, Tensor], *view: Any, **options: Any) -> 
         splats: Iterable[Any] = tensors.values()
         return join_color_and_transmittance(rasterize(*splats, *view, implementation=implementation, **options))
 
-    # In a few pixels, alpha or transmittance falls on the other side of a threshold; these bounds allow for them.
+    # In a few pixels, rounding moves alpha or transmittance across a threshold. These bounds allow for that.
     return OperationCall(draw, inputs, tuple(inputs), (1e-3, 1e-2))
 
 

@@ -1,4 +1,4 @@
-"""Compiled CPU kernels, cached on disk where that is possible."""
+"""Compile CPU kernels, and cache them on disk where this is possible."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ def can_cache_kernels() -> bool:
 def compiled(**options: Any) -> Callable[[Callable], Callable]:
     """Decorate a function with `numba.njit(nogil=True, **options)` and cache its machine code on disk.
 
-    Where nothing can be cached (the disk is full or no folder is writable), each process compiles the kernel again.
+    If nothing can be cached (the disk is full or no folder is writable), each process compiles the kernel again.
     """
 
     def decorate(function: Callable) -> Callable:
         kernel = numba.njit(nogil=True, **options)(function)
-        with suppress(RuntimeError):  # Numba found no writable folder
+        with suppress(RuntimeError):  # Numba raises this if it finds no writable folder.
             kernel._cache = _TolerantCache(function)
         return kernel
 

@@ -96,9 +96,9 @@ def torch_on_one_thread() -> Iterator[None]:
 def run_tasks(task: Callable[[int], None], count: int, *, sequential: bool = False) -> None:
     """Call task(0) ... task(count - 1) on the threads of the pool and wait until all have finished.
 
-    Threads take tasks one by one, so that tasks of different length balance. The result must not depend on which
-    thread runs which task: each task writes to a place of its own. Tasks that are started inside a task run one after
-    the other in the same thread. After the first error no further task is started.
+    Threads take tasks one by one, so that tasks of different length are balanced. The result must not depend on which
+    thread runs which task, so each task must write to its own memory. Tasks that are started inside a task run one
+    after the other in the same thread. After the first error no further task is started.
 
     Args:
         task: function of the task's index.
@@ -124,7 +124,7 @@ def run_tasks(task: Callable[[int], None], count: int, *, sequential: bool = Fal
                 task(index)
             except BaseException as error:
                 errors[index] = error
-                for _ in pending:  # no further task is started
+                for _ in pending:  # Taking all remaining tasks keeps the other threads from starting them.
                     pass
 
     for future in [_executor(threads).submit(worker) for _ in range(min(threads, count))]:

@@ -26,11 +26,11 @@ from hyrfpack.parallel.pool import available_cores
 
 Item = TypeVar("Item")
 
-# A process that sends nothing for this long counts as gone. It is long because shares of work may be uneven; a process
-# that has ended is noticed at once.
+# A process that sends nothing for this long counts as ended. The time is long because shares of work may be uneven.
+# The others notice at once if a process really ends.
 COLLECTIVE_TIMEOUT = timedelta(minutes=30)
-# Ports from which each SLURM job gets one for its rendezvous, unless MASTER_PORT names one. Job numbers decide, so that
-# two jobs on one machine do not collide.
+# Each SLURM job uses one of these ports for its rendezvous, unless MASTER_PORT is set. The job number selects the port,
+# so that two jobs on one machine do not collide.
 SLURM_PORTS = range(20_000, 40_000)
 
 
@@ -43,8 +43,8 @@ class Ranks:
 
     Attributes:
         rank, size: number of this process, from 0, and number of processes.
-        local_rank, local_size: the same among the processes on this machine.
-        restarts: how often the launcher has restarted the group.
+        local_rank, local_size: the same, counting only the processes on this machine.
+        restarts: number of times that the launcher has restarted the group.
 
     Example:
         >>> with join_processes() as ranks:  # a single process, unless a launcher has started more
@@ -60,12 +60,12 @@ class Ranks:
 
     @property
     def is_single(self) -> bool:
-        """Whether this process is the only one of the group."""
+        """Return whether this process is the only one of the group."""
         return self.size == 1
 
     @property
     def is_main(self) -> bool:
-        """Whether this is the main process, rank 0, which writes files and prints for all."""
+        """Return whether this is the main process, rank 0, which writes files and prints for all."""
         return self.rank == 0
 
     def share(self, items: Sequence[Item]) -> list[Item]:
@@ -145,7 +145,7 @@ class Ranks:
         errors = self.all_gather(None if problem is None else (problem.problem, problem.fix))
         failed = [(rank, *error) for rank, error in enumerate(errors) if error is not None]
         if problem is not None and len(failed) == self.size:
-            raise problem  # an error of all processes reads as that of a single one
+            raise problem  # If all processes fail, each raises its own error, as a single process would.
         if failed:
             rank, what, fix = failed[0]
             raise HyrfError(f"process {rank} of {self.size}: {what}", fix=fix) from problem
@@ -155,10 +155,10 @@ class Ranks:
         """Turn an error of torch.distributed in the block into a HyrfError."""
         try:
             yield
-        except RuntimeError as error:  # the type of all errors of torch.distributed
+        except RuntimeError as error:  # All errors of torch.distributed have this type.
             if isinstance(error, (torch.OutOfMemoryError, NotImplementedError)):
                 raise
-            reason = re.sub(r"\[\S*/\S*:\d+\] ", "", short_reason(error, 300))  # less the location in gloo's source
+            reason = re.sub(r"\[\S*/\S*:\d+\] ", "", short_reason(error, 300))  # without the location in gloo's source
             raise HyrfError(
                 f"one of the {self.size} processes has ended or does not respond ({reason})",
                 fix="read the messages of that process, and check whether memory ran out",
@@ -173,7 +173,7 @@ def join_processes(environment: Mapping[str, str] | None = None) -> Iterator[Ran
     """Connect to the other processes that torchrun or SLURM's srun has started, while the block runs.
 
     A process that was started without a launcher is a group of its own. The processes on one machine share its cores:
-    HYRFPACK_THREADS of each is set, unless it is set already.
+    HYRFPACK_THREADS is set for each process, unless it is set already.
 
     Args:
         environment: environment variables that describe the group; None for those of this process.
@@ -187,7 +187,7 @@ def join_processes(environment: Mapping[str, str] | None = None) -> Iterator[Ran
     if ranks.is_single:
         yield ranks
         return
-    if dist.is_initialized():  # by the program that uses this library
+    if dist.is_initialized():  # The program that uses this library has connected the processes.
         yield ranks
         return
     if not (dist.is_available() and dist.is_gloo_available()):
@@ -202,7 +202,8 @@ def join_processes(environment: Mapping[str, str] | None = None) -> Iterator[Ran
     devices = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() and dist.is_nccl_available() else "gloo"
     try:
         if "TORCHELASTIC_RUN_ID" in environment:
-            # This is torchrun's own store. It still holds the keys of processes before a restart, hence the prefix.
+            # This store belongs to torchrun, and after a restart it still holds the keys of the old processes. So the
+            # keys of each start get a prefix.
             tcp_store = dist.TCPStore(address, port, None, False, COLLECTIVE_TIMEOUT)
             store = dist.PrefixStore(f"start {ranks.restarts}", tcp_store)
             dist.init_process_group(
@@ -243,7 +244,7 @@ def _stop_when_launcher_ends() -> None:
 def ranks_from_environment(environment: Mapping[str, str]) -> Ranks:
     """Return the group that environment variables describe: those of torchrun, or else those of a step of SLURM's srun.
 
-    The batch script of a SLURM job is a single process, however many tasks the job has.
+    The batch script of a SLURM job counts as a single process, whatever the number of tasks.
 
     Raises:
         HyrfError: a variable is missing, or they contradict each other.
@@ -285,7 +286,7 @@ def rendezvous_address(environment: Mapping[str, str]) -> tuple[str, int]:
     """
     address = environment.get("MASTER_ADDR")
     if address is None:
-        # Of "gpu[07-09,12]-ib,cpu3", take what is before the first comma outside of brackets, and the first number of
+        # Of "gpu[07-09,12]-ib,cpu3", take the text before the first comma outside brackets, and the first number of
         # each bracket.
         first = re.match(r"(?:[^,\[]|\[[^\]]*\])+", environment.get("SLURM_STEP_NODELIST", "127.0.0.1"))
         address = re.sub(r"\[([^\],-]+)[^\]]*\]", r"\1", first[0]) if first else "127.0.0.1"
@@ -294,7 +295,7 @@ def rendezvous_address(environment: Mapping[str, str]) -> tuple[str, int]:
 
 
 def _tasks_on_this_machine(environment: Mapping[str, str], default: int) -> int:
-    """Return the number of tasks of a SLURM step on this machine, or `default` where SLURM does not give it.
+    """Return the number of tasks of a SLURM step on this machine, or `default` if SLURM does not give it.
 
     SLURM writes "2(x3),1" for two tasks on each of three machines, and one on a fourth.
     """
@@ -308,7 +309,7 @@ def _tasks_on_this_machine(environment: Mapping[str, str], default: int) -> int:
 
 
 def _read_count(name: str, environment: Mapping[str, str], default: int | None = None) -> int:
-    """Return an environment variable as a whole number, or `default` where it is not set."""
+    """Return an environment variable as a whole number, or `default` if it is not set."""
     text = environment.get(name)
     if text is None and default is not None:
         return default

@@ -1,6 +1,6 @@
-"""Packing of values of varying bit length one after another.
+"""Pack values of varying bit length one after another.
 
-The lowest bit of a value comes first and goes into the lowest free bit.
+The lowest bit of a value comes first and takes the lowest free bit.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from hyrfpack.quant.errors import DamagedDataError
 
 MAX_BITS_PER_VALUE = 56
 
-_VALUES_PER_BLOCK = 1 << 16  # small enough that temporary arrays stay in the caches
+_VALUES_PER_BLOCK = 1 << 16  # Temporary arrays of this size stay in the caches.
 
 
 def pack_bits(values: np.ndarray, lengths: np.ndarray) -> bytes:

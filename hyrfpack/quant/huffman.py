@@ -1,17 +1,18 @@
 """Huffman coding of whole arrays: dahuffman builds the codes, numpy packs and unpacks the bits.
 
 The packed bytes are exactly those of `dahuffman.HuffmanCodec.from_frequencies(histogram).encode(symbols)`: codes
-follow one another, most significant bit first; the last byte, if not full, is filled with the first bits of the code
-of the end mark and then with zeros. dahuffman stores no symbol count, so that a decoder of these bytes alone may read
-extra symbols out of the last byte. This module stores the count.
+follow one another, most significant bit first. If the last byte is not full, it is filled with the first bits of the
+end mark's code and then with zeros. dahuffman stores no symbol count, so a decoder that has only these bytes may read
+extra symbols from the last byte. This module stores the count.
 
 **The code.** Leaves of the Huffman tree are listed from left to right, that is by rising code, each with its symbol
-and its length in bits; one leaf is the end mark. The codes follow from the lengths: the first is all zeros, and as
-binary fractions each is the one before plus 2^-length of that one. The fractions 2^-length add up to exactly 1.
+and its length in bits; one leaf is the end mark. The codes follow from the lengths. The first code is all zeros. Read
+as a binary fraction, each further code is the previous code plus 2^-length of that code. The fractions 2^-length add
+up to exactly 1.
 
 **Chunks.** A prefix code can only be read from one end to the other, one symbol after another. To decode many symbols
-at a time, the number of bits of every `chunk_length(count)` consecutive symbols is stored beside the stream; the stream
-itself is not interrupted.
+in parallel, the number of bits of every `chunk_length(count)` consecutive symbols is stored beside the stream. The
+stream itself has no gaps between chunks.
 
 **Bytes of a stream** (`HuffmanStream.to_bytes`), little-endian, nothing between or after:
 
@@ -46,9 +47,9 @@ array of fewer than 10^12 symbols needs more: a Huffman code that long needs a h
 numbers."""
 
 _HEADER_STRUCT = struct.Struct("<QQIIBB")
-_MAX_PEEK_BITS = 16  # bounds the lookup table of the decoder at 2^16 entries
-_CODES_PER_BLOCK = 1 << 16  # small enough that temporary arrays stay in the caches
-_STEPS_PER_BLOCK = 64  # decoding steps between two transpositions of the decoded symbols
+_MAX_PEEK_BITS = 16  # The lookup table of the decoder then has at most 2^16 entries.
+_CODES_PER_BLOCK = 1 << 16  # Temporary arrays of this size stay in the caches.
+_STEPS_PER_BLOCK = 64  # After each block the decoded symbols are transposed.
 
 
 def chunk_length(count: int) -> int:
@@ -343,9 +344,9 @@ def _decoding_tables(code: HuffmanCode, count: int) -> tuple[np.ndarray, np.ndar
     """Build the decoding tables: entries with the symbol in the 16 lowest bits and the code's length above.
 
     Returns:
-        (2^p,) entries by the next p bits, 0 where the code is longer. p is the length of the longest code, at most 16
-        and so small that building the table pays off for `count` symbols. And (n,) entries by leaf, empty if no code
-        is longer than p bits.
+        (2^p,) entries by the next p bits, 0 where the code is longer; and (n,) entries by leaf, empty if no code is
+        longer than p bits. p is the length of the longest code, but at most 16, and less if `count` symbols are too few
+        for the larger table to save time.
     """
     advance = code.lengths.astype(np.uint64)
     advance[code.symbols == END_MARK] = 1 << 40  # leads out of the stream, so that the check of chunk ends fails

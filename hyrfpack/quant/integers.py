@@ -1,4 +1,4 @@
-"""Coding of integer arrays: a token for the magnitude of each value is coded by rANS, lower bits are stored raw.
+"""Code integer arrays: a token for the magnitude of each value is coded by rANS, and lower bits are stored raw.
 
     v < 16     token v, no extra bits
     v < 128    n = floor(log2 v); token 4 n + (bits n - 1 and n - 2 of v); extra: the lowest n - 2 bits of v
@@ -16,13 +16,13 @@ from hyrfpack.quant.bits import BitReader, pack_bits
 from hyrfpack.quant.rans import decode_tokens, encode_tokens, uses_numba
 
 _VALUE_LIMIT = 1 << 56
-_VALUES_PER_BLOCK = 1 << 16  # small enough that temporary arrays stay in the caches
+_VALUES_PER_BLOCK = 1 << 16  # Temporary arrays of this size stay in the caches.
 
 
 def _build_token_tables() -> tuple[np.ndarray, np.ndarray]:
     """Return the smallest value (uint64) and the number of extra bits (uint8) of each token."""
     exponents = np.append(np.repeat(np.arange(4, 7), 4), np.repeat(np.arange(7, 56), 2)).astype(np.int64)
-    kept = np.where(exponents < 7, 2, 1)  # number of bits below the highest that are part of the token
+    kept = np.where(exponents < 7, 2, 1)  # The number of bits below the highest one that are part of the token.
     leading = (1 << kept) + np.arange(len(exponents)) % (1 << kept)
     extra = exponents - kept
     return np.append(np.arange(16), leading << extra).astype(np.uint64), np.append(np.zeros(16), extra).astype(np.uint8)

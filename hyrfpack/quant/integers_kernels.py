@@ -9,7 +9,7 @@ from hyrfpack.parallel.compiled import compiled
 njit = compiled(error_model="numpy")
 
 _ONE = np.uint64(1)
-_WORD_SHIFT = np.uint64(6)  # a bit position shifted by it is the index of its 64-bit word
+_WORD_SHIFT = np.uint64(6)  # A bit position shifted by this is the index of its 64-bit word.
 _OFFSET_MASK = np.uint64(63)
 
 

@@ -1,8 +1,9 @@
 """Lifting: each number of a list is predicted from neighbours that are decoded before it.
 
 The list is coded in levels: first number 0, then the numbers at odd multiples of the largest power of two, and so on
-down to the odd indices. A number at an odd multiple of d is predicted by the mean of its neighbours d before and d
-after it (the last number by the one before), times weight / 16. The rounded difference is stored, in steps.
+down to the odd indices. The prediction of a number at an odd multiple of d is weight / 16 times the mean of its
+neighbours d before and d after it, or times the former if there is no latter. The rounded difference is stored, in
+steps.
 
 All arithmetic is in integers (fixed point, `steps.FIXED_POINT_ONE`), so that every decoder gets the same bits. A whole
 level is one array operation, because no number depends on another of its level.
@@ -14,7 +15,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-_PLACES_PER_BLOCK = 1 << 14  # small enough that temporary arrays stay in the caches
+_PLACES_PER_BLOCK = 1 << 14  # Temporary arrays of this size stay in the caches.
 
 
 def iter_levels(count: int) -> Iterator[tuple[np.ndarray, int]]:

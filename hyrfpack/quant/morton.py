@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-MAX_BITS_PER_AXIS = 18  # a code then has 54 bits, so that gaps between codes fit the integer coder
+MAX_BITS_PER_AXIS = 18  # A code then has 54 bits, so that the integer coder can code gaps between codes.
 
 # (shift, mask) of each step that moves groups of bits apart, from 21 consecutive bits to every third bit.
 _SPREAD_STEPS = (
@@ -25,7 +25,7 @@ _GATHER_STEPS = (
     (16, 0x1F00000000FFFF),
     (32, 0x1FFFFF),
 )
-_POINTS_PER_BLOCK = 1 << 14  # small enough that temporary arrays stay in the caches
+_POINTS_PER_BLOCK = 1 << 14  # Temporary arrays of this size stay in the caches.
 
 
 def morton_codes(cells: np.ndarray) -> np.ndarray:

@@ -1,9 +1,9 @@
-"""Coding of points on a lattice with a resolution for each class: gaps in Morton order, and raw finer bits.
+"""Code points on a lattice with a resolution for each class: gaps in Morton order, and raw finer bits.
 
 A point of class k has b_k bits per axis. The points are sorted by the Morton code of the first `base` bits of each
-axis, and within one such cell by class; as their order carries no information, it takes no bits. The stream holds the
-gaps between successive Morton codes, the classes, and the 3 (b_k - base) finer bits of each point, which are nearly
-random and hence stored raw.
+axis, and within one such cell by class. The original order of the points is not stored. The stream holds the gaps
+between successive Morton codes, the classes, and the 3 (b_k - base) finer bits of each point. These are nearly random
+and hence stored raw.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from hyrfpack.quant.integers import decode_integers, encode_integers
 from hyrfpack.quant.morton import MAX_BITS_PER_AXIS, morton_cells, morton_codes
 
 MAX_POINT_CLASSES = 16
-_HEADER_STRUCT = struct.Struct("<BBII")  # base, number of classes, bytes of the gaps, bytes of the classes
+# The fields are the base, the number of classes, the bytes of the gaps, and the bytes of the classes.
+_HEADER_STRUCT = struct.Struct("<BBII")
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ def encode_points(points: LatticePoints) -> tuple[bytes, np.ndarray, LatticePoin
 
     Returns:
         The bytes; (N,) int64 index of the point at each place of the new order; and the points in the new order, as
-        the decoder will return them (classes with fewer bits than the base get as many as it).
+        the decoder will return them. Classes with fewer bits than the base get as many bits as the base.
     """
     cells, classes, bits = points.cells, points.classes, points.bits
     finest = int(bits.max(initial=1))
@@ -106,11 +107,11 @@ def decode_points(data: bytes | memoryview, count: int) -> LatticePoints:
 
 
 def _choose_base_bits(codes: np.ndarray, classes: np.ndarray, bits: np.ndarray, finest: int) -> int:
-    """Choose how many bits per axis to sort by and to code as gaps, by an estimate of the encoded size.
+    """Choose the number of bits per axis to sort by and to code as gaps, by an estimate of the encoded size.
 
-    Each further bit costs about 3 bits per point, as when it is stored raw, but less in dense places. Against it counts
-    that classes with a coarser lattice get bits that they do not need, and that the order of points within a shared
-    cell takes no bits.
+    Each further bit costs about 3 bits per point, as when it is stored raw, but less in dense places. But classes with
+    a coarser lattice then get bits that they do not need. And fewer points share a cell, in which their order takes no
+    bits.
     """
     if len(codes) == 0:
         return 1

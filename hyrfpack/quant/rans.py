@@ -1,4 +1,4 @@
-"""Interleaved rANS: entropy coding of arrays of small numbers (tokens), close to their entropy.
+"""Interleaved rANS codes arrays of small numbers (tokens) in nearly as few bits as their entropy.
 
 The coder is a range asymmetric numeral system (Duda, arXiv:1311.2540) with 32-bit states, 16-bit words and frequencies
 in 4096ths. It codes the array on many parallel lanes, which is fast in numpy and in pipelined processors.
@@ -41,12 +41,12 @@ from hyrfpack.quant.rans_models import (
 
 MAX_LANES = 8192
 MAX_TOKEN_CLASSES = 8
-MAX_MODELS = 1024  # (contexts times classes) bounds the table of the decoder at 16 MiB
+MAX_MODELS = 1024  # A model is a pair of context and class. The table of the decoder then takes at most 16 MiB.
 
 _HEADER_BYTES = 2
-_MAX_STEPS_PER_LANE = 1 << 16  # a decoder requires it of streams with fewer than MAX_LANES lanes
-_TARGET_BYTES_PER_LANE = 1024  # keeps the overhead small: each lane takes about 3 extra bytes
-_MIN_TOKENS_PER_MODEL = 64  # with fewer tokens on average, token classes do not pay off
+_MAX_STEPS_PER_LANE = 1 << 16  # A decoder rejects longer lanes if a stream has fewer than MAX_LANES lanes.
+_TARGET_BYTES_PER_LANE = 1024  # The overhead is then small, because each lane takes about 3 extra bytes.
+_MIN_TOKENS_PER_MODEL = 64  # With fewer tokens on average, token classes do not save bytes.
 _STATIC_FLAG = 0x80
 
 
@@ -55,7 +55,7 @@ class DecodedTokens(NamedTuple):
 
     Attributes:
         tokens: (M,) uint8.
-        size: length of the stream, bytes.
+        size: length of the stream in bytes.
         alphabet: size of the alphabet: the largest token plus 1, unless the stream is damaged.
     """
 
@@ -169,7 +169,7 @@ def _encode(
 
 @dataclass(frozen=True, eq=False)
 class _CodingPlan:
-    """A variant of coding tokens, with its estimated size.
+    """One way of coding the tokens, with its estimated size.
 
     Attributes:
         cost: size of tokens and models, in 2^-16 bits.
@@ -234,9 +234,9 @@ def _make_selector(contexts: np.ndarray | None, thresholds: Sequence[int], alpha
 
 
 def _candidate_thresholds(pairs: np.ndarray, most_classes: int) -> list[tuple[tuple[int, ...], int]]:
-    """Return thresholds that are worth trying, with the estimated size in bits.
+    """Return the class thresholds to try, each with the estimated size in bits.
 
-    These are no thresholds, that is one class, and the thresholds with the smallest estimate.
+    These are the empty thresholds, which make one class, and the thresholds with the smallest estimate.
 
     Args:
         pairs: (contexts, previous token, token) number of occurrences of each pair.
@@ -263,7 +263,7 @@ def _estimate_bits(counts: np.ndarray) -> int:
 
 
 def _choose_lanes_log2(count: int, bits: float) -> int:
-    """Choose the number of lanes, so that they take few bytes and none is too long; return its log2."""
+    """Return log2 of the number of lanes, so that lanes take few extra bytes and none is too long."""
     wanted = max(int(bits) // (8 * _TARGET_BYTES_PER_LANE), count // (_MAX_STEPS_PER_LANE // 2), 1)
     return min(wanted, MAX_LANES).bit_length() - 1
 
@@ -294,7 +294,7 @@ def _decode_levels(data: memoryview, models: int, alphabet: int, backend: Module
 def _decode(
     data: memoryview, count: int, contexts: np.ndarray | None, context_count: int, backend: ModuleType, static: bool
 ) -> DecodedTokens:
-    """Decode tokens, arguments have been checked; static models are rejected unless `static`."""
+    """Decode tokens with checked arguments; static models are rejected unless `static`."""
     if count == 0:
         return DecodedTokens(np.zeros(0, np.uint8), 0, 0)
     if len(data) < _HEADER_BYTES:

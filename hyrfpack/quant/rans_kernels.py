@@ -19,7 +19,7 @@ _ZERO = np.uint64(0)
 _ONE = np.uint64(1)
 _SCALE_BITS = np.uint32(SCALE_BITS)
 _WORD_BITS = np.uint32(16)
-_FLUSH_SHIFT = np.uint32(32 - SCALE_BITS)  # a lane emits a word if its state shifted by it reaches the frequency
+_FLUSH_SHIFT = np.uint32(32 - SCALE_BITS)  # A lane emits a word if its state shifted by this reaches the frequency.
 _TOKEN_SHIFT = np.uint32(25)
 _OFFSET_MASK = np.uint32(FREQUENCY_TOTAL - 1)
 _FREQUENCY_MASK = np.uint32(2 * FREQUENCY_TOTAL - 1)
@@ -50,7 +50,7 @@ def encode_lanes(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Encode all tokens; see `rans_lanes.encode_lanes`."""
     states = np.full(lanes.used_lanes, START_STATE, np.uint32)
-    words = np.empty(lanes.count, np.uint16)  # a token emits at most one word; unused pages are never touched
+    words = np.empty(lanes.count, np.uint16)  # Each token emits at most one word. Unused pages take no memory.
     place = lanes.count
     for start, stop, frequencies in reversed(segments):
         bases = np.cumsum(frequencies, axis=1) - frequencies

@@ -17,7 +17,7 @@ START_STATE = 1 << 16
 """State of a lane before its last token is coded and after it is decoded; also the lowest state."""
 
 _STEPS_PER_BLOCK = 64
-_TOKENS_PER_BLOCK = 1 << 20  # bounds the memory of `count_pairs`
+_TOKENS_PER_BLOCK = 1 << 20  # This bounds the memory of `count_pairs`.
 
 
 class LaneLayout:
@@ -46,7 +46,7 @@ class LaneLayout:
         return self.used_lanes - (step >= self.last_lane_steps)
 
     def load(self, array: np.ndarray, start: int, stop: int, out: np.ndarray) -> None:
-        """Copy elements of steps start to stop - 1 into out[step - start, lane]; places without one stay unchanged."""
+        """Copy elements of steps start to stop - 1 into out[step - start, lane]; entries without one stay unchanged."""
         edge = (self.used_lanes - 1) * self.steps
         out[: stop - start, :-1] = array[:edge].reshape(self.used_lanes - 1, self.steps)[:, start:stop].T
         last = array[edge:][start:stop]
@@ -86,7 +86,7 @@ class ModelSelector:
         if self.classes > 1:
             before = np.zeros((_STEPS_PER_BLOCK, lanes.used_lanes), np.uint8)
             lanes.load(tokens, max(start - 1, 0), stop - 1, before[start == 0 :])
-            out += self.class_of.take(before)  # before the first step it is token 0, whose class is 0
+            out += self.class_of.take(before)  # Before the first step this is token 0, whose class is 0.
 
 
 def count_tokens(

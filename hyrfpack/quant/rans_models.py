@@ -1,7 +1,7 @@
 """Frequencies for the rANS coder: the probability of each token, in 4096ths.
 
 A *model* is one row of frequencies; a stream has one model per context. Every function takes and returns the rows of
-all models. The decoder's symbols depend on these numbers, so that they are computed in integers only.
+all models. The decoder's symbols depend on these numbers, so they are computed in integers only.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ MAX_ALPHABET_SIZE = 126
 MAX_LEVEL = 4 * SCALE_BITS + 1
 """Highest level of a static model."""
 
-_PRIOR_SYMBOLS = 16  # in each context, the frequencies over all contexts weigh as much as this many symbols
+_PRIOR_SYMBOLS = 16  # In each context, the frequencies over all contexts weigh as much as this many symbols.
 _WEIGHT_FRACTION_BITS = 16
 
 _LEVEL_RANKS = np.arange(MAX_LEVEL, dtype=np.int64)
@@ -38,8 +38,9 @@ def normalise(weights: np.ndarray) -> np.ndarray:
 
         f_i = max(1, floor(4096 w_i / sum w)) where w_i > 0, else 0;   the first largest weight gets the remainder
 
-    Its frequency stays at least 1: if b frequencies were raised to 1, the remainder is at least -(b - 1), the largest
-    frequency is at least floor((4096 - b) / (A - b)), and (4096 - b) >= b (A - b) for every b as long as A <= 127.
+    The frequency of that weight stays at least 1. If b frequencies were raised to 1, the remainder is at least
+    -(b - 1), and the largest frequency is at least floor((4096 - b) / (A - b)). And (4096 - b) >= b (A - b) for every b
+    as long as A <= 127.
 
     Args:
         weights: (K, A) int64, 0 to 2^50, A at most `MAX_ALPHABET_SIZE`; no row is all zero.

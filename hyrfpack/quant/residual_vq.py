@@ -10,8 +10,9 @@ from hyrfpack.quant.errors import DamagedDataError
 
 _MAX_TRAINING_ROWS = 100_000
 _MAX_SEEDING_ROWS = 16_384
-_MAX_PRODUCTS_PER_CHUNK = 1 << 18  # so small that BLAS computes a matrix product in one thread, see `_nearest_centers`
-_MAX_ABS_VALUE = {"float32": 1e30, "float16": 65504.0}  # by dtype of the codebooks; differences of values stay finite
+_MAX_PRODUCTS_PER_CHUNK = 1 << 18  # BLAS computes a matrix product this small in one thread, see `_nearest_centers`.
+# By dtype of the codebooks; differences of values then stay finite.
+_MAX_ABS_VALUE = {"float32": 1e30, "float16": 65504.0}
 
 
 @dataclass(frozen=True)
@@ -25,9 +26,9 @@ class ResidualVectorQuantizer:
     replaced by the means over all rows and rounded as they will be stored. Finally every row is assigned to the
     codewords that a decoder will have.
 
-    A stage never increases the mean over rows of |error / sigma|^2 (up to float32 rounding): the mean of a cluster,
-    even rounded to the nearest storable number, leaves no larger error than no codeword at all, and the final
-    assignment only lowers it.
+    A stage never increases the mean over rows of |error / sigma|^2 (up to float32 rounding). The mean of a cluster,
+    even rounded to the nearest storable number, leaves no larger error than a codeword of zero. The final assignment
+    only lowers the error.
 
     The same values and settings give the same result on the same machine.
 
@@ -172,7 +173,7 @@ def _choose_initial_centers(points: np.ndarray, clusters: int, rng: np.random.Ge
         latest = sum((column - value) ** 2 for column, value in zip(columns, centers[k - 1], strict=True))
         distance = np.minimum(distance, latest)
         mass = np.cumsum(distance)
-        if mass[-1] == 0:  # every row is a centre already
+        if mass[-1] == 0:  # Every row is a centre already.
             centers[k:] = centers[0]
             break
         centers[k] = points[np.searchsorted(mass, rng.random() * mass[-1], side="right")]
