@@ -32,9 +32,9 @@ class Variant:
 
     Attributes:
         name: name in tables and plots.
-        implementation: the operation's name of the implementation.
+        implementation: name by which the operation selects the implementation.
         dtype: dtype of all tensors that are not in `dtypes`.
-        dtypes: dtypes of single tensors by name.
+        dtypes: dtypes of individual tensors by name.
     """
 
     name: str

@@ -40,8 +40,8 @@ class ConversionReport:
         gaussians_before, gaussians_after: numbers of Gaussians in the source and in the file.
         degree_before, degree_after: degrees of their spherical harmonics.
         views: number of viewpoints at which the loss was measured.
-        psnr: PSNR in dB, mean over the views, of the file's pictures against the source's, both over black. The file is
-            read back from its bytes. Of a cropped source, only the Gaussians in the box are compared.
+        psnr: mean PSNR over the views, in dB, of the file's pictures against the source's, both over black. The file is
+            read back from its bytes. If the source is cropped, only the Gaussians in the box are compared.
         psnr_worst: PSNR in dB of the worst view.
     """
 

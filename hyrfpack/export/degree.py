@@ -31,8 +31,8 @@ def choose_degree(
 ) -> tuple[int, dict[int, float]]:
     """Choose the lowest degree of harmonics, 0 to `highest`, whose score is within SCORE_TOLERANCE_DB of the best.
 
-    The model is baked at all degrees without the validation cameras. A degree's score is the PSNR of its pictures (of
-    at most 512 pixels, without the background) against the model's at these cameras. With fewer than
+    The model is baked at all degrees without the validation cameras. A degree's score is the PSNR of its pictures at
+    the validation cameras (at most 512 pixels a side, without the background) against the model's. With fewer than
     MIN_CAMERAS_TO_HOLD_OUT cameras, all are fitted and all are compared, so overfitting is not detected. In models with
     more than MAX_GAUSSIANS Gaussians, every n-th is used.
 

@@ -257,7 +257,7 @@ def _describe_quality(path: StrPath, model: HybridModel, data: Scene | None, say
 class _OutputFolder:
     """An output folder that counts the bytes written; each file is written completely or not at all.
 
-    The files refer to each other by name. So if a name is taken, it is an error; no other name is chosen.
+    The files refer to each other by name, so a name that is taken causes an error instead of another name.
     """
 
     def __init__(self, path: Path, overwrite: bool) -> None:
@@ -275,7 +275,7 @@ class _OutputFolder:
 
 
 def _choose_file_names(sources: Sequence[StrPath], *, is_gallery: bool) -> list[tuple[str, str]]:
-    """Choose names for the files and their posters that differ on any file system and need no quoting."""
+    """Choose names for the files and their posters that are distinct on any file system and need no quoting."""
     if not is_gallery:
         return [(f"{DEFAULT_SCENE_STEM}{_playable_ending(source)}", POSTER_NAME) for source in sources]
     names: list[str] = []

@@ -56,7 +56,7 @@ def measure_psnr(
         report: called after each view with the share of the work that is done, 0 to 1.
 
     Returns:
-        Scores by name, and of "model"; empty if the masks of the photos leave no pixel.
+        Scores by candidate, and those of the model as "model"; empty if the masks of the photos leave no pixel.
     """
     decoded, frame = model.decode(), model.config.frame
     solid = torch.tensor(model.config.solid)

@@ -76,8 +76,8 @@ def export_model(
     The ending of `target` names the format:
 
     - .ply, .splat, .spz, .glb, .usda, .usdc, .usdz, .sog: 3D Gaussians with spherical harmonics;
-    - .html: a self-contained page that shows the scene in any browser, with the `.hyrf` file inside; no ending: a
-      folder with a player and the file, for a web server (see `hyrfpack.export_player`);
+    - .html: a self-contained page that shows the scene in any browser, with the `.hyrf` file inside;
+    - no ending: a folder with a player and the file, for a web server (see `hyrfpack.export_player`);
     - .points.ply, .points.glb: the Gaussians' centres as coloured points, and the cameras as frusta;
     - .json: the cameras as a transforms.json.
 
@@ -96,9 +96,9 @@ def export_model(
         background: whether to export the model's background.
         spz_version: version of ".spz" files, 4 or 3 (for programs that do not read 4), see `Hints`.
         baked: write splats into a page instead of the model.
-        exposure: exposure of the baked splats of a model with an exposure map. "local" exposes their colours like the
-            photos that see them, so that the splats look as photographed; "consistent" ignores the map. Both are the
-            same for a model without a map.
+        exposure: exposure of baked splats. "local" exposes their colours like the photos that see them, by the model's
+            exposure map, so that the splats look as photographed; "consistent" ignores the map. Both are the same for
+            a model without a map.
         colmap: write cameras and points into a folder, as a COLMAP model.
         overwrite: replace existing files. If False, an existing file is an error. A file that appears during the export
             is kept: a single file gets a free name in its folder, which the report contains; in a folder it is an
@@ -341,7 +341,7 @@ def _add_exposure_scores(
 
 
 def _estimate_cost_db(before: PsnrScores, after: PsnrScores, error: float) -> float:
-    """Return the PSNR in dB against photos that a format costs, as measured or, without photos, as estimated.
+    """Return the loss of PSNR in dB against photos that a format causes, measured or, without photos, estimated.
 
     The estimate assumes that the errors of the format are independent of those of the model, so that squared errors
     add up. Rounding errors far below the model's own error then cost almost nothing.
@@ -364,7 +364,7 @@ def _export_cameras(loaded: Source, target: str | os.PathLike[str], overwrite: b
 def _export_points(
     loaded: Source, kind: FileKind, target: str | os.PathLike[str], splats: Splats, overwrite: bool
 ) -> ExportReport:
-    """Write the centres of splats, and the cameras."""
+    """Write the centres of splats as points, and the cameras."""
     if kind is COLMAP_FOLDER:
         write_colmap(loaded.cameras, target, splats, overwrite=overwrite)
         size = sum(table.stat().st_size for table in Path(target, "sparse", "0").glob("*.bin"))

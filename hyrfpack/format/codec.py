@@ -179,7 +179,7 @@ def save_model(
             is the path that was written.
 
     Raises:
-        HyrfError: the file cannot be written, or as `encode_model`.
+        HyrfError: the file cannot be written, or an error of `encode_model`.
 
     Example:
         >>> import hyrfpack
@@ -217,7 +217,7 @@ def load_model(
         path: a `.hyrf` file, or the folder of a training run.
 
     Raises:
-        HyrfFormatError: there is no readable file at `path`, or as `decode_model`.
+        HyrfFormatError: there is no readable file at `path`, or an error of `decode_model`.
 
     Example:
         >>> import hyrfpack

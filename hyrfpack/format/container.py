@@ -144,7 +144,7 @@ class Container:
             path: the file or the folder, see `find_model`.
 
         Raises:
-            HyrfFormatError: there is no readable file at `path`, or as the constructor.
+            HyrfFormatError: there is no readable file at `path`, or an error of the constructor.
         """
         path = find_model(path)
         name = os.fspath(path)

@@ -105,7 +105,7 @@ def encode(model: HybridModel, **settings: Any) -> tuple[list[Section], dict]:
 
 @torch.no_grad()
 def _clip_opacity_logits(model: HybridModel, opacity_logits: np.ndarray) -> np.ndarray:
-    """Clip opacity logits (N, 1) where opacity no longer changes, so that no codewords code invisible differences.
+    """Clip opacity logits (N, 1) where opacity no longer changes, so that no codewords go to invisible differences.
 
     The sum of the explicit logit and the field's output is clipped to +-LOGIT_LIMIT, within 7e-6 of opacity 0 and 1.
     """

@@ -67,7 +67,7 @@ class Drawable:
         return round(self.harmonics.shape[1] ** 0.5) - 1
 
     def evaluate_colors(self, viewpoint: Tensor, index: Tensor) -> Tensor:
-        """Evaluate the colours (n, 3), not clamped, of the splats at `index` (n,) seen from `viewpoint` (3,), local."""
+        """Evaluate the colours (n, 3), not clamped, of splats `index` (n,) from `viewpoint` (3,) in local units."""
         directions = torch.nn.functional.normalize(self.positions[index] - viewpoint, dim=-1, eps=1e-12)
         return torch.einsum("nk,nkc->nc", harmonics_basis(directions, self.degree), self.harmonics[index]) + 0.5
 

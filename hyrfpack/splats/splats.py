@@ -21,11 +21,11 @@ class Splats:
     with the basis Y of `hyrfpack.splats.harmonics`.
 
     Attributes:
-        positions: (N, 3) float64.
-        scales: (N, 3) float32 standard deviations along the rotated axes, >= 0.
-        quats: (N, 4) float32 wxyz, unit length.
+        positions: (N, 3) float64 centres, world units.
+        scales: (N, 3) float32 standard deviations along the rotated axes, world units, >= 0.
+        quats: (N, 4) float32 rotations, wxyz, unit length.
         opacities: (N,) float32 in [0, 1].
-        harmonics: (N, (degree + 1)^2, 3) float32, degree 0 to 3.
+        harmonics: (N, (degree + 1)^2, 3) float32 coefficients of RGB, degree 0 to 3.
         antialiased: whether opacities are meant to be compensated for the rasteriser's low-pass filter (Mip-Splatting).
 
     Raises:

@@ -18,10 +18,10 @@ class Card:
 
     Attributes:
         title: name of the scene.
-        content, poster: addresses of its file and its picture (None for none) relative to the gallery.
+        content, poster: addresses of its file and its picture, relative to the gallery; `poster` may be None.
         count: number of Gaussians in the file.
         length: size of the file in bytes.
-        quality: quality of the scene in words; empty where nothing is known.
+        quality: quality of the scene in words; empty if unknown.
     """
 
     title: str

@@ -19,8 +19,8 @@ def composite(rgb: Tensor, transmittance: Tensor, grid: Tensor, stride: int, *, 
     Args:
         rgb: (H, W, 3) C_fg, the foreground, premultiplied by its alpha.
         transmittance: (H, W) T, the transmittance of the foreground.
-        grid: (R, S, 3) B at the pixels 0, stride, 2 stride, ... of both axes, as returned by `background_grid`. The
-            last node of an axis lies at or past the image's edge. In any layout.
+        grid: (R, S, 3), in any layout, B at the pixels 0, stride, 2 stride, ... of both axes, as returned by
+            `background_grid`. The last node of an axis lies at or past the image's edge.
         stride: pixels between neighbouring nodes, at least 1.
         implementation: "auto", "reference" or "gpu" (float32). On CUDA the reference accumulates its gradient by
             atomics, so that equal runs differ; "gpu" gathers each node's gradient in a fixed order.

@@ -4,9 +4,9 @@ A program processes a block of points on one level. Programs run in the order of
 a few megabytes, stays in the L2 cache while all points read it. A row of the table (two float32) is loaded as one
 64-bit word. Features and their gradients are planar, (2L, N), so that neighbouring threads write neighbouring numbers.
 
-Points add to the table's gradient by atomics, which serialise on a row: on a level of 8 vertices per axis, a third of
-the points may share one. Coarse levels therefore have several copies, to which blocks add in turn; a last kernel sums
-the copies.
+Points add to the table's gradient by atomics. Additions to the same row are serialised, and on a level of 8 vertices
+per axis a third of the points may share a row. Coarse levels therefore have several copies, to which blocks add in
+turn; a last kernel sums the copies.
 
 The cell is the floor of the rounded product coords * span, as in `reference.cells`: the compiler cannot fuse a product
 whose floor is taken. It may fuse the position within the cell, product - cell, which then differs from the reference by

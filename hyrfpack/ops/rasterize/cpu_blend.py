@@ -159,7 +159,7 @@ def blend_tiles(
 
 @_kernel
 def sum_slots(start, stop, slot_starts, values, sums):
-    """Write the sums (N,) over each Gaussian's slots of values (P,), for Gaussians start to stop.
+    """Write the sum of `values` (P,) over each Gaussian's slots to `sums` (N,), for Gaussians start to stop.
 
     slot_starts: (N + 1,) the first slot of each Gaussian.
     """

@@ -27,9 +27,9 @@ class BlendedImage:
     """An image and the data that its backward pass needs.
 
     Attributes:
-        rgb: (H, W, 3).
-        transmittance: (H, W).
-        depth: (H, W), or None.
+        rgb: (H, W, 3) colours, without background.
+        transmittance: (H, W) the share of light that passes all Gaussians, 0 to 1.
+        depth: (H, W) mean camera z in world units, 0 where nothing is hit; or None.
         pairs: the pairs that each tile blends.
         blended: (tiles + 1,) int32, the number of pairs after which each tile was finished.
     """

@@ -183,7 +183,7 @@ def _copy_row(pixels, row, start, count, buffer, target):
 def _process_tile(image, target, weight, l1_scale, ssim_scale, top, bottom, left, right, grad, sums):
     """Compute the gradient and the sums of |x - y| and of SSIM for rows [top, bottom) and columns [left, right).
 
-    `weight` is 1 for values to include and 0 for others; with no rows, all values are included.
+    `weight` is 1 for values to include and 0 for others; if it has no rows, all values are included.
     """
     buffer = np.zeros(_BUFFER_FLOATS, np.float32)
     height, floats = image.shape[0], image.shape[1]

@@ -126,7 +126,7 @@ def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
 
 
 def decode(data: bytes, name: str, *, upright: bool = False) -> Splats:
-    """Decode a .glb file in the ratified form, with floats or smaller integers, written by `encode` or any program.
+    """Decode a .glb file in the ratified form, with floats or smaller integers, from `encode` or another program.
 
     The result holds all splats of the file's default scene, one node after the other, transformed by their nodes.
     `antialiased` is False, because glTF does not store it.
