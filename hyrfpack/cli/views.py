@@ -142,7 +142,7 @@ def render(
         pictures = write_pictures(picture_of, named, output, overwrite=overwrite, ranks=ranks)
         return list(show_item_progress(pictures, len(ranks.share(named)), "render", "picture"))
 
-    # This first check ignores existing files. It keeps a folder from being created where nothing may be written.
+    # This first check ignores existing files. It prevents the creation of a folder where nothing may be written.
     ranks.run_on_all(lambda: check(replace=True))
     with exclusive_folder(output, ranks=ranks):  # the lock is held until the video is written, too
         ranks.run_on_all(lambda: check(replace=overwrite))

@@ -159,7 +159,8 @@ def _walk_files(folder: Path, visited: set[str], is_wanted: Callable[[str], bool
             folders.append(entry)
         elif is_wanted(entry.name) and entry.is_file():
             yield folder / entry.name
-    for entry in sorted(folders, key=lambda entry: (entry.is_symlink(), entry.name)):  # links last, for real names
+    # Links come last, so that a folder that is reached twice is listed by its real path.
+    for entry in sorted(folders, key=lambda entry: (entry.is_symlink(), entry.name)):
         is_downscaled = downscale_factor(entry.name) and "images" in names
         if _HIDDEN_FOLDER.fullmatch(entry.name) or (photos_only and (is_downscaled or not may_hold_photos(entry.name))):
             continue

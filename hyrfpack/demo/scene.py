@@ -27,7 +27,7 @@ _SUN_HALF_WIDTH_RADIANS = 0.012  # each subsample of a pixel sees another corner
 _HORIZON_COLOR = np.array([[0.66], [0.78], [0.92]], np.float32)
 _ZENITH_COLOR = np.array([[0.07], [0.21], [0.58]], np.float32)
 _SUBSAMPLES_PER_PIXEL_SIDE = 2  # each pixel has four rays
-_FOCAL_LENGTH_PICTURE_WIDTHS = 1.1  # a field of view of 49 degrees
+_FOCAL_LENGTH_PICTURE_WIDTHS = 1.1  # gives a field of view of 49 degrees
 _SPARSE_POINT_COUNT = 4000
 
 # A function of surface coordinates (2, N) and the noise tile that returns the albedo (3, N).
@@ -192,9 +192,9 @@ def _shade(
         cosine = -_dot(directions, normals)
         mirrored = directions + 2 * cosine * normals
         face_on = albedo if metal else np.float32(reflectance)
-        fresnel = face_on + (1 - face_on) * 0.9 * np.clip(1 - cosine, 0, 1) ** 5  # Schlick
+        fresnel = face_on + (1 - face_on) * 0.9 * np.clip(1 - cosine, 0, 1) ** 5  # Schlick's approximation
         seen = _radiance(lifted, mirrored, sun, noise, bounces - 1)[0] if bounces else _sky_color(mirrored, noise)
-        glint = 3.0 * lit * np.maximum(_dot(mirrored, sun), 0) ** 180  # Phong
+        glint = 3.0 * lit * np.maximum(_dot(mirrored, sun), 0) ** 180  # Phong's highlight
         color = color * (1 - fresnel) + seen * fresnel + glint * (fresnel + 0.2)
     haze = np.exp(-distance / 90)
     return color * haze + _HORIZON_COLOR * (1 - haze)

@@ -88,7 +88,7 @@ class Display:
         return parts
 
     def _print_lines(self) -> None:
-        """Print the present line every few seconds until the display is closed."""
+        """Print the current line every few seconds until the display is closed."""
         while not self._stopped.wait(LOG_INTERVAL_SECONDS):
             if parts := self._parts():
                 self.say(PART_SEPARATOR.join(parts.values()))

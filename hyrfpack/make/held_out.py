@@ -1,4 +1,4 @@
-"""Choose the held-out photo of a small set, and judge how much its score says."""
+"""Choose the held-out photo of a small set, and decide whether its score is meaningful."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from hyrfpack.scene import Scene, View
 
 NEAREST_CAMERAS = 4  # a camera is compared with its nearest neighbours
 MAX_WEAK_VIEWS = 2  # up to this number, the mean score depends on which photos are held out
-# A held-out PSNR this far below that of the photos trained on means four times their squared error.
+# A held-out PSNR this far below that of the training photos means four times their squared error.
 MAX_PSNR_GAP_DB = 6.0
 
 

@@ -44,7 +44,7 @@ TRAINED_PACE_RATIO = 0.92  # later steps take this ratio of the probe's time, be
 # A pass, which renders a view on the CPU and back-propagates through it, is the unit of the work after training.
 VERIFICATION_VIEWS = 12  # packing verifies its result on this number of views
 CODING_SECONDS_PER_GAUSSIAN = 1.5e-4
-OVERHEAD_SECONDS = 6.0  # for coding and writing a model of any size
+OVERHEAD_SECONDS = 6.0  # coding and writing a model of any size takes this long
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class SceneCost:
         )
 
     def training_seconds(self, scene: Scene, steps: int) -> float:
-        """Estimate the seconds of a training from its mean number of Gaussians."""
+        """Estimate the seconds of a training run from its mean number of Gaussians."""
         budget = self._budget(scene, steps)
         mean = DensityConfig().mean_count(min(budget, len(scene.points) or budget // 2), budget)
         step = self.step_seconds + self.step_seconds_per_gaussian * mean
@@ -98,7 +98,7 @@ class SceneCost:
         }
 
     def _budget(self, scene: Scene, steps: int) -> int:
-        """Return the budget of a training with this number of steps."""
+        """Return the budget of a training run with this number of steps."""
         return budget_for(scene, dataclasses.replace(self.requested, steps=steps).train_config(seed=0))[0]
 
     def total_seconds(self, scene: Scene, steps: int) -> float:

@@ -7,14 +7,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from time import monotonic
 
-# A training consists of pilot runs that decide settings, the run itself, and its scores and pictures.
+# Training consists of pilot runs that decide settings, the run itself, and its scores and pictures.
 STAGE_PARTS = {"training": ("pilots", "training", "results")}
 PACED_PARTS = ("pilots", "training")  # all steps are alike, so their pace shows how fast the machine is
 UNPACED_PARTS = ("poses", "measurement")  # their time does not depend on the pace of training
 # The pace of a part is used once at least this share of the part and this time have passed.
 MIN_PACE_SHARE = 0.01
 MIN_PACE_SECONDS = 2.0
-MIN_SAMPLE_SECONDS = 0.5  # time between two shares that are remembered
+MIN_SAMPLE_INTERVAL_SECONDS = 0.5
 MAX_SAMPLES = 200  # number of evenly spaced samples; there may be more, because the first ones are closer together
 FULL_TRUST_SECONDS = 20.0  # after this time only the measured pace counts, not the forecast
 OVERDUE_TIME_RATIO = 0.25  # an overdue part is expected to take this ratio of its elapsed time in addition
@@ -35,7 +35,7 @@ class Progress:
         of: number of all stages.
         share: share of the stage that is done, 0 to 1; 0 if it is unknown.
         left: estimated seconds until all stages are done; None if there is no estimate yet.
-        words: descriptions of the present work, the most important first.
+        words: descriptions of the current work, the most important first.
     """
 
     stage: str
@@ -63,7 +63,7 @@ class Reporter:
         self._report = report
         self._call_watcher: Callable[[], None] = lambda: None
         self._part = parts_of(stages[0])[0]
-        self._samples: list[tuple[float, float]] = []  # (time, share) of the present part
+        self._samples: list[tuple[float, float]] = []  # (time, share) of the current part
         self._began, self._share, self._shown, self._slowdown = monotonic(), 0.0, 0.0, 1.0
 
     @contextmanager
@@ -81,7 +81,7 @@ class Reporter:
         self.begin_part(parts_of(stage)[0], *words)
 
     def begin_part(self, part: str, *words: str) -> None:
-        """Report that a part of the present stage begins or is restarted; its pace is measured from now on."""
+        """Report that a part of the current stage begins or is restarted; its pace is measured from now on."""
         self._part, self._began, self._samples = part, monotonic(), []
         self.update(0.0, *words)
 
@@ -92,18 +92,18 @@ class Reporter:
             self._set_slowdown(seconds, forecast)
 
     def update(self, share: float, *words: str) -> None:
-        """Report the progress of the present part.
+        """Report the progress of the current part.
 
         Args:
             share: share of the part that is done, 0 to 1; 0 if it is unknown.
-            words: descriptions of the present work, the most important first.
+            words: descriptions of the current work, the most important first.
         """
         self._call_watcher()
         self._share = share
         if self._report is None:
             return
         now = monotonic()
-        least = max(MIN_SAMPLE_SECONDS, (now - self._began) / MAX_SAMPLES)
+        least = max(MIN_SAMPLE_INTERVAL_SECONDS, (now - self._began) / MAX_SAMPLES)
         if share > 0 and (not self._samples or now - self._samples[-1][0] >= least):
             self._samples.append((now, share))
         stage = stage_of(self._part)
@@ -118,11 +118,11 @@ class Reporter:
         self.update(share, doing)
 
     def say(self, sentence: str) -> None:
-        """Report a description of the present work without changing the share."""
+        """Report a description of the current work without changing the share."""
         self.update(self._share, sentence)
 
     def _estimate_part_seconds(self, share: float, now: float) -> float | None:
-        """Estimate the seconds until the present part is done; None if there is neither a forecast nor a pace."""
+        """Estimate the seconds until the current part is done; None if there is neither a forecast nor a pace."""
         elapsed = now - self._began
         forecast = self._forecast(self._part) if self._part in self.estimates else None
         if (pace := self._pace(share, now)) is not None:
@@ -138,7 +138,7 @@ class Reporter:
         return max(forecast * (1 - share) - (elapsed if share == 0 else 0.0), OVERDUE_TIME_RATIO * elapsed)
 
     def _pace(self, share: float, now: float) -> float | None:
-        """Return the shares per second during the last half of the present part; None if too little is done."""
+        """Return the shares per second during the last half of the current part; None if too little is done."""
         middle = now - (now - self._began) / 2
         samples = self._samples or [(now, share)]
         since, first = next((sample for sample in reversed(samples) if sample[0] <= middle), samples[0])
@@ -156,12 +156,12 @@ class Reporter:
         return self._slowdown**exponent * self.estimates.get(part, 0.0)
 
     def _later_parts(self) -> list[str]:
-        """Return the parts after the present one, of all stages."""
+        """Return the parts after the current one, of all stages."""
         parts = [part for stage in self._stages for part in parts_of(stage)]
         return parts[parts.index(self._part) + 1 :]
 
     def _share_of_stage(self, share: float) -> float:
-        """Convert the share of the present part to that of its stage, by the forecasts of all its parts."""
+        """Convert the share of the current part to that of its stage, by the forecasts of all its parts."""
         parts = parts_of(stage_of(self._part))
         index = parts.index(self._part)
         forecasts = [self.estimates.get(part, 0.0) for part in parts]

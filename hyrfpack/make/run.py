@@ -183,7 +183,7 @@ def make_scene(
                 return _Pipeline(request, began, report, say, observer).run()
         except Stopped:
             raise
-        except KeyboardInterrupt as error:  # outside the stages
+        except KeyboardInterrupt as error:  # interrupted before or between the stages
             raise Stopped("preparation") from error
 
 

@@ -36,7 +36,7 @@ class LoadSettings:
     test_every: int | None = None
 
     def load(self, path: Path, max_size: int | None = None) -> Scene:
-        """Read photos with poses; `max_size` replaces that of these settings."""
+        """Read photos with poses; `max_size` overrides that of these settings."""
         size = self.max_size if max_size is None else max_size
         read = partial(load_scene, path, images=self.images, max_size=size)
         scene = read(test_every=DEFAULT_TEST_EVERY if self.test_every is None else self.test_every)
@@ -66,7 +66,7 @@ class Source:
 
     @classmethod
     def from_path(cls, path: StrPath, reading: LoadSettings) -> Source:
-        """Find out what kind of source a path leads to, and load photos that have poses.
+        """Determine the kind of source at a path, and load photos that have poses.
 
         Raises:
             HyrfDataError: no scene can be made from it.

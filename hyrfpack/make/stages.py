@@ -153,7 +153,7 @@ def _split_inputs(scene: Scene) -> dict[str, Any]:
 
 
 class _TrainingProgress:
-    """Reports the parts of a training: the pilot runs, the steps, then scores and pictures."""
+    """Reports the parts of a training run: pilot runs, steps, then scores and pictures."""
 
     def __init__(self, reporter: Reporter, steps: int, max_pilot_steps: int) -> None:
         """Args: steps: number of training steps; max_pilot_steps: maximum of all pilot runs together."""

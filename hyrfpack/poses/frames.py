@@ -33,7 +33,7 @@ _TARGET_FRAMES = 60  # in slow videos the spacing is reduced until this number i
 _MIN_DECODED_FRAMES = 10
 _MIN_TAKEN_FRAMES = 5
 _SHARPNESS_SIDE_PIXELS = 640  # longer side of the pictures whose sharpness is measured
-# Measuring more frames than these takes time and improves nothing.
+# Measuring more frames than this takes time and does not improve the choice.
 _MAX_MEASURED_FRAMES_PER_SECOND = 30.5
 _MAX_MEASURED_FRAMES = 6000
 _MAX_REPEAT_DIFFERENCE_LEVELS = 0.4  # mean over 255 levels: video coders change repeated frames by less than this

@@ -182,7 +182,7 @@ def read_pieces(folder: Path) -> list[pycolmap.Reconstruction]:
 
 
 def _select_better_cameras(model: pycolmap.Reconstruction, cameras: Cameras) -> Cameras:
-    """Select the cameras of a model whose focal length is plausible and differs from the present one."""
+    """Select the cameras of a model whose focal length is plausible and differs from the current one."""
     better = {}
     for number, camera in model.cameras.items():
         focal, longer = camera.focal_length, max(camera.width, camera.height)

@@ -301,7 +301,7 @@ def _write_photo(photo: Photo, target: Path) -> None:
         if upright.mode not in modes:
             profile = (
                 None if upright.mode in ("CMYK", "LAB", "YCbCr") else profile
-            )  # the profile belongs to the old mode
+            )  # the colour profile belongs to the old mode
             upright = upright.convert("RGB")
         metadata = {"icc_profile": profile} if profile else {}
         upright.save(target, "JPEG" if jpeg else "PNG", **(_JPEG_SAVE_OPTIONS if jpeg else {}), **metadata)

@@ -10,7 +10,7 @@ from hyrfpack.measure.timing import time_alternately
 from hyrfpack.model.operation_calls import loss_call
 
 TIMING_REPEATS = 7
-PICTURE_SIZES = ((200, 200), (240, 320), (800, 800))  # height and width in pixels
+PICTURE_SIZES = ((200, 200), (240, 320), (800, 800))  # (height, width) in pixels
 
 
 def make_pictures(height: int, width: int) -> tuple[Tensor, Tensor]:

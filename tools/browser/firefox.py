@@ -95,7 +95,7 @@ class Firefox:
         )
         try:
             self._socket = self._connect(profile / "MarionetteActivePort")
-            self._receive()  # the browser's greeting
+            self._receive()  # the browser begins with a greeting
             self.call("WebDriver:NewSession", strictFileInteractability=False)
             self._forward_console()
             self.call("WebDriver:SetTimeouts", script=int(TIMEOUT_SECONDS * 1000), pageLoad=int(TIMEOUT_SECONDS * 1000))
@@ -167,7 +167,7 @@ class Firefox:
         """Forward console.error and console.warn from the pages' processes to the browser's window."""
         script = (
             "{const tell = ({ wrappedJSObject: { level, innerID, arguments: said } }) => {"
-            '  if (typeof innerID !== "number") return;'  # a module of Firefox itself
+            '  if (typeof innerID !== "number") return;'  # it comes from a module of Firefox
             '  if (level === "error" || level === "warn") sendAsyncMessage("said", said.map(String).join(" "));'
             "};"
             'const storage = Cc["@mozilla.org/consoleAPI-storage;1"].getService(Ci.nsIConsoleAPIStorage);'

@@ -302,7 +302,7 @@ def build(task: tuple[str, str]) -> list[Build]:
             built = launch(kernel, *args, grid=grid, warmup=True, **options)
             if built.hash not in builds:
                 builds[built.hash] = _describe_build(kernel, name, built)
-        except Exception as error:  # the compilers raise many types
+        except Exception as error:  # the compilers raise exceptions of many types
             builds[str(error)] = Build(_kernel_name(kernel), name, error=_format_error(error))
 
     with ExitStack() as stack:

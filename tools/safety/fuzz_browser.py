@@ -38,7 +38,7 @@ from tools.safety.fuzz_mutate import make_hostile_file
 
 READER_SCRIPT = Path(__file__).parent / "read_many.mjs"
 MIN_LIMIT_SECONDS, MAX_JAVASCRIPT_RATIO = 0.5, 20.0
-NODE_TIMEOUT_SECONDS = 600  # time limit of one batch
+NODE_BATCH_TIMEOUT_SECONDS = 600
 INPUTS_PER_BATCH = 500
 PARTIAL_EVERY = 4  # one input in this many is read as the start of a file
 
@@ -90,7 +90,7 @@ def read_in_javascript(files: Sequence[tuple[bytes, bool]]) -> list[Verdict]:
         batch = Path(folder) / "files"
         batch.write_bytes(b"".join(struct.pack("<IB", len(data), is_start) + data for data, is_start in files))
         run = subprocess.run(
-            ["node", str(READER_SCRIPT), str(batch)], capture_output=True, text=True, timeout=NODE_TIMEOUT_SECONDS
+            ["node", str(READER_SCRIPT), str(batch)], capture_output=True, text=True, timeout=NODE_BATCH_TIMEOUT_SECONDS
         )
     answers = [json.loads(line) for line in run.stdout.splitlines()]
     if run.returncode or len(answers) != len(files):

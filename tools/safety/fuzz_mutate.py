@@ -65,7 +65,7 @@ class RawSection:
 
 
 def assemble(parts: list[RawSection]) -> bytes:
-    """Return a file of these sections with correct offsets, lengths and checksums, whatever the sections contain."""
+    """Return a file of these sections with correct offsets, lengths and checksums, for any content of the sections."""
     minor = 2 if any(part.codec == 9 for part in parts) else int(any(5 <= part.codec <= 8 for part in parts))
     offset = 48 + 40 * len(parts)
     toc, payloads = [], []
@@ -195,7 +195,7 @@ def _make_exposure_map(centers: int) -> ExposureMap:
 
 
 def _make_equal_gaussians(model: HybridModel) -> HybridModel:
-    """Make all Gaussians equal, so that their streams have one symbol and take no bytes, whatever their number."""
+    """Make all Gaussians equal, so that their streams have one symbol and take no bytes for any number of them."""
     with torch.no_grad():
         for parameter in model.gaussians.parameters():
             parameter.copy_(parameter[:1].expand_as(parameter))

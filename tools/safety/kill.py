@@ -52,15 +52,15 @@ KILL_MOMENTS = ("before", "while writing", "between or after", "too late")
 MAKE_OPTIONS = ["--quality", "draft"]
 TRAIN_OPTIONS = ["--steps", "60", "--log2-table-size", "13"]
 ORBIT_FRAMES = 6
-WORK_FOLDER_NAME = "out.work"  # the work folder of make
+MAKE_WORK_FOLDER_NAME = "out.work"
 # The folders of an output in which the commands write files.
 WRITTEN_FOLDERS = (
     "",
     "views",
-    WORK_FOLDER_NAME,
-    f"{WORK_FOLDER_NAME}/run",
-    f"{WORK_FOLDER_NAME}/run/views",
-    f"{WORK_FOLDER_NAME}/export",
+    MAKE_WORK_FOLDER_NAME,
+    f"{MAKE_WORK_FOLDER_NAME}/run",
+    f"{MAKE_WORK_FOLDER_NAME}/run/views",
+    f"{MAKE_WORK_FOLDER_NAME}/export",
 )
 POLL_INTERVAL_SECONDS = 2e-4  # time between two searches for temporary files
 MAX_KILL_DELAY_SECONDS = 2e-3  # longest delay of the kill after a temporary file appears
@@ -170,7 +170,9 @@ def find_file_fault(name: str, data: bytes, case: Case) -> str | None:
 def find_faults(found: dict[str, bytes], case: Case) -> list[str]:
     """Return descriptions of all faults in a folder after a kill."""
     faults = [
-        f"{name} is missing" for name in case.old if name not in found and not name.startswith(f"{WORK_FOLDER_NAME}/")
+        f"{name} is missing"
+        for name in case.old
+        if name not in found and not name.startswith(f"{MAKE_WORK_FOLDER_NAME}/")
     ]
     for name, data in found.items():
         if not is_temporary_file(name) and (reason := find_file_fault(name, data, case)):

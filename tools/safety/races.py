@@ -115,7 +115,7 @@ class RunningCommand:
             outputs.append(log.read())
             log.close()
         code = self.process.exitcode
-        assert code is not None  # it has ended
+        assert code is not None  # the process has ended
         return code, outputs[0], outputs[1]
 
 
