@@ -43,7 +43,7 @@ SPLAT_BUDGET_PER_GAUSSIAN = 0.1
 MIN_DIVIDED_COLOR_STD = 1 / 512  # half a step of 8-bit colours
 SPLAT_OPACITY = 0.99  # the limit of the rasteriser
 SPLAT_SCALE_PER_CELL_SIDE = 0.7
-# Radius of each level's splats divided by that of the next finer level, so that finer splats are drawn over coarser.
+# Ratio of each level's radius to that of the next finer level, so that finer splats are drawn over coarser ones.
 RADIUS_RATIO_PER_LEVEL = 1.1
 
 GAIN_SMOOTHING_RADIANS = math.pi / 2 / 2**MIN_CELL_LEVEL  # the side of a coarse cell

@@ -142,7 +142,7 @@ def check_model(loaded: Source, kind: FileKind, crop: Sequence[float] | None, mi
     """
     model, frame = loaded.model, loaded.model.config.frame
     positions = frame.to_world(model.gaussians.positions.numpy())
-    if crop is not None or min_opacity > 0:  # valid before the bake, because it raises no opacity
+    if crop is not None or min_opacity > 0:  # certain before the bake, because it raises no opacity
         positions = positions[selection_mask(positions, model.decode_geometry().opacities.numpy(), crop, min_opacity)]
     reach = max(float(np.abs(positions).max()), background_reach(frame) if sphere else 0.0)
     if reach > kind.max_coordinate:

@@ -24,7 +24,7 @@ MIN_CAMERAS_TO_HOLD_OUT = 16
 VIEWS_BETWEEN_PER_CAMERA = 4
 RING_CAMERAS = 24
 RING_HEIGHTS_PER_DISTANCE = (-0.2, 0.0, 0.2)
-# Downward axes of pictures that are rotated against each other cancel: their mean is shorter than this.
+# If pictures are rotated against each other, their downward axes cancel, so that the mean axis is shorter than this.
 MIN_MEAN_DOWN_LENGTH = 0.5
 
 

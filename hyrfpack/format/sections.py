@@ -24,7 +24,7 @@ LAYERED_SECTIONS = (POSITIONS, *LOGIT_SECTIONS)
 MAX_LAYERS = 8
 NON_PARAMETER_SECTIONS = (METADATA, EXPOSURE)
 
-# Content of each section type. Every section but EXPOSURE is required.
+# Content of each section type. Every section except EXPOSURE is required.
 SECTION_CONTENTS = {
     METADATA: "metadata",
     EXPOSURE: "exposure map",

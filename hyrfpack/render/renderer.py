@@ -179,8 +179,8 @@ def render_view(
         else:
             behind = tensor_like(model.config.solid, positions) if solid is None else solid
             rgb = raster.rgb + raster.transmittance[..., None] * behind
-        # Each check on a GPU waits for the device. So only the image is checked there, and no image in training,
-        # because the loss is checked.
+        # Each check on a GPU waits for the device. So only the image is checked there, and not even the image in
+        # training, where the caller checks the loss.
         if on_cpu or not rgb.requires_grad:
             _check_finite(background=behind if on_cpu else rgb)
     if settings.exposure == AS_PHOTOGRAPHED:

@@ -47,7 +47,7 @@ class Splats:
             values = getattr(self, name)
             if values.shape != shape:
                 raise ValueError(f"{name} has shape {values.shape}; {shape} is needed")
-            with np.errstate(over="ignore", invalid="ignore"):  # infinite results are rejected below; NaN may signal
+            with np.errstate(over="ignore", invalid="ignore"):  # infinite results are rejected below; a NaN may warn
                 values = np.ascontiguousarray(values, np.float64 if name == "positions" else np.float32)
             if not np.isfinite(values).all():
                 raise ValueError(f"{name} must be finite")
@@ -119,7 +119,8 @@ def normalized_quats(quats: np.ndarray) -> np.ndarray:
 def quaternion_from_matrix(rotation: np.ndarray) -> np.ndarray:
     """Convert a proper rotation (3, 3) to a unit quaternion (4,) float64 wxyz with w >= 0."""
     r = np.asarray(rotation, np.float64)
-    # The outer product of the quaternion with itself; the column of the largest diagonal entry has no cancellation.
+    # This is the outer product of the quaternion with itself. Its column with the largest diagonal entry is computed
+    # without cancellation.
     outer = np.empty((4, 4))
     outer[0, 0] = 1 + r[0, 0] + r[1, 1] + r[2, 2]
     outer[1, 1] = 1 + r[0, 0] - r[1, 1] - r[2, 2]

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-TILE_SIZE = 16  # Tiles are squares with sides of 16 pixels.
+TILE_SIZE = 16  # Tiles are squares; this is the side in pixels.
 # Variance in px^2 that is added to the diagonal of every 2D covariance.
 LOW_PASS_VARIANCE = 0.3
 ALPHA_MAX = 0.99

@@ -21,8 +21,8 @@ from hyrfpack.parallel.pool import run_tasks
 # With error_model="numpy", divisions do not test for zero; such a test would keep the loop from vectorising.
 _FAST_MATH = {"contract", "nsz", "nnan", "reassoc", "arcp"}
 njit = compiled(fastmath=_FAST_MATH, error_model="numpy")
-# Inlining is forced, because a helper that stays a call is linked from its own object right after compilation but from
-# the caller's object when that is loaded from the cache, and the two may round differently.
+# Inlining is forced. A helper that stays a call is linked from its own object right after compilation, but from the
+# caller's object when that is loaded from the cache. These two may round differently.
 inlined = numba.njit(fastmath=_FAST_MATH, error_model="numpy", forceinline=True)
 
 _MAX_TILE_COLUMNS = 236

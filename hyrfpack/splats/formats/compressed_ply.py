@@ -87,7 +87,7 @@ def decode(data: bytes, name: str) -> Splats:
         )
     color_and_opacity = _unpack_fractions(vertex["packed_color"], (24, 16, 8, 0), (8, 8, 8, 8))
     harmonics = np.empty((count, len(rest) // 3 + 1, 3), np.float32)
-    with np.errstate(over="ignore", invalid="ignore"):  # infinite results are rejected below; NaN may signal
+    with np.errstate(over="ignore", invalid="ignore"):  # infinite results are rejected below; a NaN may warn
         colors = (
             _interpolate_in_chunk(chunk, _COLOR_BOUNDS, color_and_opacity[:, :3])
             if colored

@@ -125,7 +125,7 @@ def decode_plain(data: bytes, name: str) -> Splats:
         )
     rows = read_elements(data, header, {"vertex"}, name)["vertex"]
     harmonics = np.empty((len(rows), min(terms, num_sh_bases(MAX_DEGREE)), 3), np.float32)
-    with np.errstate(over="ignore", invalid="ignore"):  # infinite results are rejected below; NaN may signal
+    with np.errstate(over="ignore", invalid="ignore"):  # infinite results are rejected below; a NaN may warn
         harmonics[:, 0] = stack_columns(rows, _COLOR_PROPERTIES)
         for channel, term in product(range(3), range(1, harmonics.shape[1])):
             harmonics[:, term, channel] = rows[f"f_rest_{channel * (terms - 1) + term - 1}"]

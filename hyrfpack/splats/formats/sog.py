@@ -422,7 +422,7 @@ def _get_floats(meta: dict, group: str, key: str, name: str, length: int) -> np.
     values = meta[group].get(key) if isinstance(meta.get(group), dict) else None
     values = list(values) if isinstance(values, list) and len(values) == length else [math.nan]
     is_first_missing = length == _CODEBOOK_ENTRIES and values[0] is None  # some old writers omit this entry
-    # Numbers beyond float32 are as useless here as infinite ones.
+    # Numbers beyond float32 are rejected like infinite ones.
     if not all(type(value) in (int, float) and abs(value) < 1e38 for value in values[is_first_missing:]):
         raise HyrfDataError(
             f"{name}: {META_NAME} needs {length} finite numbers as {group}.{key}",

@@ -207,7 +207,7 @@ def _add_camera(stage: Usd.Stage, camera: Camera, splats: Splats) -> None:
 
 def _pack_usdz(binary: bytes, name: str) -> bytes:
     """Pack one file into a .usdz: a zip without compression or time stamps, with files aligned to 64 bytes."""
-    info = zipfile.ZipInfo(name)  # dated 1980
+    info = zipfile.ZipInfo(name)  # dated 1980, so that the bytes do not depend on the time
     header = 30 + len(name) + 4  # bytes of the local file header, with the header of its extra field
     padding = -header % _USDZ_ALIGNMENT_BYTES
     info.extra = (0x1986).to_bytes(2, "little") + padding.to_bytes(2, "little") + bytes(padding)

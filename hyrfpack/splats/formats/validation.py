@@ -31,7 +31,7 @@ def build_valid_splats(
     Raises:
         HyrfDataError: a number is not finite in the precision that Splats store.
     """
-    with np.errstate(over="ignore", invalid="ignore"):  # infinite results are rejected below; NaN may signal
+    with np.errstate(over="ignore", invalid="ignore"):  # infinite results are rejected below; a NaN may warn
         positions = np.asarray(positions, np.float64)
         scales, quats, opacities, harmonics = (
             np.asarray(values, np.float32) for values in (scales, quats, opacities, harmonics)
