@@ -33,8 +33,8 @@ def choose_device(
     """Return the torch device of a name, after checking that it can be used.
 
     Args:
-        name: "auto" (a CUDA or ROCm device where one is usable and Triton is installed, the CPU otherwise), "cpu",
-            "cuda" (torch's current CUDA or ROCm device), "cuda:N" or "mps"; or a torch.device.
+        name: "auto", "cpu", "cuda" (torch's current CUDA or ROCm device), "cuda:N" or "mps"; or a torch.device. "auto"
+            means a CUDA or ROCm device if one is usable and Triton is installed, otherwise the CPU.
         say: called with a sentence if the device has no kernels or runs them slowly.
 
     Returns:

@@ -4,8 +4,8 @@
 2. Without `overwrite`, no existing file is replaced, and no file is written into a folder of other photos or poses.
 
 The checks run before any work, so that a command does not fail after minutes. Files that appear during the work are
-kept as well: `atomic` checks again in the step that gives a finished file its name, and `lock` keeps a second call of
-hyrfpack out of a folder that the first one writes into.
+kept as well, because `atomic` checks again in the step that gives a finished file its name. `lock` keeps a second call
+of hyrfpack out of a folder that the first one writes into.
 """
 
 from __future__ import annotations

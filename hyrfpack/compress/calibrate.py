@@ -7,7 +7,7 @@ this assumption in three ways:
 - Pruning only removes light, so its errors have the same sign and add up.
 - Where opacity or transmittance saturates, a larger perturbation adds no further error.
 
-So each part of a plan is quantised by itself, rendered and compared with the model. The part's sensitivities are
+So each part of a plan is quantised alone, rendered and compared with the model. The part's sensitivities are
 multiplied by measured over predicted error, repeatedly, until the prediction is close enough.
 """
 
@@ -65,9 +65,9 @@ CALIBRATED_PARTS: tuple[Part, ...] = (
     (SCALES, OPACITIES),
     *zip(TABLE_SECTIONS, DECODER_SECTIONS, strict=True),
 )
-# A correction multiplies the sensitivities by (measured error / predicted error)^exponent. The exponent is 1 where the
-# error falls with the square of the step, as for small independent perturbations. It is up to 2 where the error falls
-# with the step, as for swapped depth orders, and down to 1/2 for pruning, whose errors add up.
+# A correction multiplies the sensitivities by (measured error / predicted error)^exponent. The exponent is 1 if the
+# error falls with the square of the step, as for small independent perturbations. It is up to 2 if the error falls with
+# the step, as for swapped depth orders. It is down to 1/2 for pruning, whose errors add up.
 CORRECTION_EXPONENTS: dict[Part, float] = {(POSITIONS,): 1.5, (PRUNED,): 0.7}
 # An exponent estimated from two factors is used only within these bounds: factors close to each other give noise.
 MIN_CORRECTION_EXPONENT = 0.25

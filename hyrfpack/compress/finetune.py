@@ -68,9 +68,9 @@ def finetune(
 
         LOSS_PER_MSE * 2 ln 2 D * bits
 
-    to the photometric loss, with the same lambda as `quantize`. The rate of a number q steps from its prediction is
-    |q| / (b ln 2) bits, where b is the mean of |q| in its group (the ideal code of a Laplace distribution). Positions
-    move on the lattice; classes and their steps stay fixed.
+    to the photometric loss, with the same lambda as `quantize`. A number q steps from its prediction has the rate
+    |q| / (b ln 2) bits, where b is the mean of |q| in its group. This is the ideal code of a Laplace distribution.
+    Positions move on the lattice; classes and their steps stay fixed.
 
     Args:
         model: a trained model; not changed.
@@ -163,9 +163,9 @@ def fit_residual_gains(
 
         photo = E(E(consistent, g_map), g) + e = E(consistent, g_map g) + e
 
-    A model that is fitted to photos with these gains keeps its consistent exposure and its map, because g absorbs what
-    the map does not explain of a photo's exposure. Without a map, g holds the whole exposure. The gains of a photo that
-    is nearly black or white are one, so the exposure that the map predicts is used.
+    A model that is fitted to photos with these gains keeps its consistent exposure and its map, because g absorbs the
+    part of a photo's exposure that the map does not explain. Without a map, g is the whole exposure. A photo that is
+    nearly black or white has gains of one, so it has the exposure that the map predicts.
 
     Returns:
         (3,) gains on the model's device, by the name of the photo.

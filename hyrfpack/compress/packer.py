@@ -99,8 +99,8 @@ def compress_model(
 ) -> CompressionReport:
     """Compress a `.hyrf` file into a smaller one.
 
-    Profile "compact" measures how much each number of the model affects pictures, at the cameras of `data` or those
-    stored in the file, and spends bits accordingly. By default it aims at a loss of
+    Profile "compact" measures how much each number of the model affects pictures and spends bits accordingly. It
+    measures at the cameras of `data`, or at those stored in the file. By default it aims at a loss of
     `hyrfpack.compress.distortion.DEFAULT_PSNR_DROP_DB`. Profiles "paper" and "raw" have fixed recipes and accept none
     of `data`, `finetune_steps`, `target_bytes`, `max_psnr_drop` and `distortion`.
 

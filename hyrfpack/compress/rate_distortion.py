@@ -18,7 +18,7 @@ _MAX_TABLE_SYMBOLS = 4096
 
 
 def choose_step_codes(sensitivity: np.ndarray, distortion: float) -> np.ndarray:
-    """Choose step codes (n,) uint8 for mean sensitivities (n,) > 0, so that rounding adds the error D per number."""
+    """Choose step codes (n,) uint8 for mean sensitivities (n,) > 0, so that rounding each number adds the error D."""
     return encode_step(np.sqrt(12 * distortion / np.maximum(sensitivity, 1e-300)))
 
 

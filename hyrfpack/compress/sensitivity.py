@@ -221,8 +221,8 @@ def _expected_sensitivity(
     """Estimate the sensitivities (N,) of each kind of number of unoccluded Gaussians, up to a common factor.
 
     A Gaussian of opacity o and standard deviations a, b (the larger two) at depth z covers pi f^2 a b / z^2 pixels.
-    The derivative of such a pixel is at most o with respect to the Gaussian's colour, o (1 - o) with respect to its
-    opacity logit, and o / (a b)^(1/2) with respect to its position.
+    The derivative of such a pixel is at most o with respect to the Gaussian's colour. With respect to its opacity logit
+    it is at most o (1 - o), and with respect to its position o / (a b)^(1/2).
     """
     sides = geometry.scales.double().sort(dim=1).values
     area, opacities = sides[:, 1] * sides[:, 2], geometry.opacities.double()

@@ -1,4 +1,4 @@
-"""Distillation: turn explicit 3D Gaussians of other programs into a hybrid model, without photos."""
+"""Distil explicit 3D Gaussians of other programs into a hybrid model, without photos."""
 
 from hyrfpack.distill.config import DistillConfig
 from hyrfpack.distill.fit import DistillReport, distill_splats, import_splats

@@ -1,4 +1,4 @@
-"""The public functions of distillation: from a file of 3D Gaussians, or from splats, to a `.hyrf` file."""
+"""Distil a file of 3D Gaussians, or splats in memory, into a `.hyrf` file."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def distill_splats(
 
     Without cameras, viewpoints are sampled (`sample_viewpoints`). The Gaussians that contribute least to the renders
     from there are left out. The fields are initialised by regression on the shapes and colours of the others
-    (`initial_model`), and the whole model is then fitted to renders of the original. On the CPU the same splats and
+    (`initial_model`). Then the whole model is fitted to renders of the original. On the CPU the same splats and
     settings give the same bytes; on a GPU sums of gradients vary in their last bits.
 
     Args:

@@ -41,7 +41,7 @@ MIN_BATCH_GAUSSIANS = 4096
 TARGET_EPOCHS = 80
 MIN_STEPS = 2400
 MAX_STEPS = 6000
-# With many Gaussians the hash tables are large, and the time of a step grows with their size, whatever the batch. So
+# With many Gaussians the hash tables are large, and the time of a step grows with their size for any batch. So
 # there are fewer steps, with larger batches.
 MAX_STEPS_TIMES_GAUSSIANS = 1_000_000_000
 MIN_EPOCHS = 16

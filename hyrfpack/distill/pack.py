@@ -16,8 +16,8 @@ from hyrfpack.progress import Report, no_report, report_part, report_round
 
 # Compression is planned for this share of the error that it may add, because the measured error varies.
 PLANNED_ERROR_SHARE = 0.8
-# If the model's own error leaves too little of the allowed error, compression may still add this share of the model's
-# error, or this share of the allowed error, whichever is smaller.
+# If the model's own error leaves too little of the allowed error, compression may still add the smaller of two errors:
+# this share of the model's error, and this share of the allowed error.
 FALLBACK_MODEL_ERROR_SHARE = 0.25
 FALLBACK_ALLOWED_ERROR_SHARE = 0.5
 MAX_TRIALS = 5

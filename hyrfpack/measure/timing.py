@@ -62,8 +62,8 @@ def time_alternately(
     """Time tasks against each other: run each once unmeasured, then measure them in turns.
 
     A task is not measured again once its measured runs add up to MAX_SECONDS_PER_TASK. If the first run took that
-    long, it counts as the measurement. A task that takes less than WARM_UP_SECONDS is run unmeasured for that long at
-    the start of each turn, because a slower task before it leaves cold caches and all threads on one core.
+    long, it counts as the measurement. At the start of each turn, a task that takes less than WARM_UP_SECONDS is run
+    unmeasured for that long. The reason is that a slower task before it leaves cold caches and all threads on one core.
 
     Args:
         tasks: the tasks by name.

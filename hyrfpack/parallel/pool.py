@@ -103,8 +103,8 @@ def run_tasks(task: Callable[[int], None], count: int, *, sequential: bool = Fal
     Args:
         task: function of the task's index.
         count: number of tasks.
-        sequential: run all tasks in the calling thread. This is faster where they take less time together than waking
-            a thread (about 50 microseconds).
+        sequential: run all tasks in the calling thread. This is faster if they take less time together than waking a
+            thread (about 50 microseconds).
 
     Raises:
         BaseException: the error of the failed task with the lowest index.
@@ -177,5 +177,5 @@ def parallel_map(
 
 
 def run_jobs(jobs: dict[str, Callable[[], T]]) -> dict[str, T]:
-    """Run independent jobs on the threads of the pool and return the result of each by its name."""
+    """Run independent jobs on the threads of the pool and return their results by the names of the jobs."""
     return dict(zip(jobs, parallel_map(lambda job: job(), list(jobs.values())), strict=True))

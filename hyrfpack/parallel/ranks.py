@@ -27,7 +27,7 @@ from hyrfpack.parallel.pool import available_cores
 Item = TypeVar("Item")
 
 # A process that sends nothing for this long counts as ended. The time is long because shares of work may be uneven.
-# The others notice at once if a process really ends.
+# If a process really ends, the others notice immediately.
 COLLECTIVE_TIMEOUT = timedelta(minutes=30)
 # Each SLURM job uses one of these ports for its rendezvous, unless MASTER_PORT is set. The job number selects the port,
 # so that two jobs on one machine do not collide.
@@ -244,7 +244,7 @@ def _stop_when_launcher_ends() -> None:
 def ranks_from_environment(environment: Mapping[str, str]) -> Ranks:
     """Return the group that environment variables describe: those of torchrun, or else those of a step of SLURM's srun.
 
-    The batch script of a SLURM job counts as a single process, whatever the number of tasks.
+    The batch script of a SLURM job counts as a single process, even if the job has several tasks.
 
     Raises:
         HyrfError: a variable is missing, or they contradict each other.
@@ -277,7 +277,7 @@ def ranks_from_environment(environment: Mapping[str, str]) -> Ranks:
 def rendezvous_address(environment: Mapping[str, str]) -> tuple[str, int]:
     """Return the address and port at which rank 0 waits for the other processes.
 
-    They are MASTER_ADDR and MASTER_PORT where these are set. Otherwise the address is the first machine of the SLURM
+    They are MASTER_ADDR and MASTER_PORT if these are set. Otherwise the address is the first machine of the SLURM
     step, and the port follows from the numbers of the job and the step.
 
     Example:

@@ -5,10 +5,10 @@ follow one another, most significant bit first. If the last byte is not full, it
 end mark's code and then with zeros. dahuffman stores no symbol count, so a decoder that has only these bytes may read
 extra symbols from the last byte. This module stores the count.
 
-**The code.** Leaves of the Huffman tree are listed from left to right, that is by rising code, each with its symbol
-and its length in bits; one leaf is the end mark. The codes follow from the lengths. The first code is all zeros. Read
-as a binary fraction, each further code is the previous code plus 2^-length of that code. The fractions 2^-length add
-up to exactly 1.
+**The code.** Leaves of the Huffman tree are listed from left to right, that is by rising code. Each has its symbol and
+its length in bits; one leaf is the end mark. The codes follow from the lengths. The first code is all zeros. Read as a
+binary fraction, each further code is the previous code plus 2^-length of that code. The fractions 2^-length add up to
+exactly 1.
 
 **Chunks.** A prefix code can only be read from one end to the other, one symbol after another. To decode many symbols
 in parallel, the number of bits of every `chunk_length(count)` consecutive symbols is stored beside the stream. The
@@ -345,8 +345,8 @@ def _decoding_tables(code: HuffmanCode, count: int) -> tuple[np.ndarray, np.ndar
 
     Returns:
         (2^p,) entries by the next p bits, 0 where the code is longer; and (n,) entries by leaf, empty if no code is
-        longer than p bits. p is the length of the longest code, but at most 16, and less if `count` symbols are too few
-        for the larger table to save time.
+        longer than p bits. p is the length of the longest code, but at most 16. It is less if `count` symbols are too
+        few for the larger table to save time.
     """
     advance = code.lengths.astype(np.uint64)
     advance[code.symbols == END_MARK] = 1 << 40  # leads out of the stream, so that the check of chunk ends fails

@@ -1,9 +1,9 @@
 """Lifting: each number of a list is predicted from neighbours that are decoded before it.
 
 The list is coded in levels: first number 0, then the numbers at odd multiples of the largest power of two, and so on
-down to the odd indices. The prediction of a number at an odd multiple of d is weight / 16 times the mean of its
-neighbours d before and d after it, or times the former if there is no latter. The rounded difference is stored, in
-steps.
+down to the odd indices. A number at an odd multiple of d is predicted from the neighbours d before and d after it. The
+prediction is weight / 16 times their mean, or times the number before if none follows. The rounded difference is
+stored, in steps.
 
 All arithmetic is in integers (fixed point, `steps.FIXED_POINT_ONE`), so that every decoder gets the same bits. A whole
 level is one array operation, because no number depends on another of its level.

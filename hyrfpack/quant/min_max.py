@@ -54,8 +54,8 @@ class MinMaxQuantizer:
 
         L = 2^b - 1        q = round(L (v - min) / (max - min))        decoded: ((L - q) min + q max) / L
 
-    The arithmetic is float64, one correctly rounded operation at a time in the order written, halves are rounded to
-    the even code, and decoded levels are rounded to float32 once. So every platform gives the same codes and values.
+    The arithmetic is float64, one correctly rounded operation at a time in the order written. Halves are rounded to the
+    even code, and decoded levels are rounded to float32 once. So every platform gives the same codes and values.
 
     Error of a decoded value: at most (max - min) / (2 L), half a step, plus rounding, at most
     2^-23 max(|min|, |max|). Arrays with min = max, and the minimum and the maximum of a float32 array, are exact.
@@ -117,5 +117,5 @@ class MinMaxQuantizer:
         if codes.max(initial=0) > last:
             raise DamagedDataError(f"min-max codes: {codes.max()} is more than {params.bits} bits; the data is damaged")
         levels = np.arange(last + 1)
-        # Both products are exact in float64, so that the ends of the range are exact, however far apart they are.
+        # Both products are exact in float64. So the ends of the range are exact, even if they are far apart.
         return (((last - levels) * params.minimum + levels * params.maximum) / last).astype(np.float32)[codes]

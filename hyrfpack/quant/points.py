@@ -3,7 +3,7 @@
 A point of class k has b_k bits per axis. The points are sorted by the Morton code of the first `base` bits of each
 axis, and within one such cell by class. The original order of the points is not stored. The stream holds the gaps
 between successive Morton codes, the classes, and the 3 (b_k - base) finer bits of each point. These are nearly random
-and hence stored raw.
+and therefore stored raw.
 """
 
 from __future__ import annotations

@@ -29,8 +29,8 @@ class LaneLayout:
 
     Attributes:
         count: number of tokens.
-        steps: tokens per lane: ceil(count / max_lanes), or one more if that is even, because lanes at a distance of a
-            power of two would compete for the same few cache lines.
+        steps: tokens per lane: ceil(count / max_lanes), or one more if that is even. Lanes at a distance of a power of
+            two would compete for the same few cache lines.
         used_lanes: number of lanes that have tokens, at most `max_lanes`.
         last_lane_steps: number of tokens in the last used lane.
     """

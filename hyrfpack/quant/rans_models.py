@@ -38,9 +38,8 @@ def normalise(weights: np.ndarray) -> np.ndarray:
 
         f_i = max(1, floor(4096 w_i / sum w)) where w_i > 0, else 0;   the first largest weight gets the remainder
 
-    The frequency of that weight stays at least 1. If b frequencies were raised to 1, the remainder is at least
-    -(b - 1), and the largest frequency is at least floor((4096 - b) / (A - b)). And (4096 - b) >= b (A - b) for every b
-    as long as A <= 127.
+    That weight keeps a frequency of at least 1: if b frequencies were raised to 1, the remainder is at least -(b - 1).
+    The largest frequency is at least floor((4096 - b) / (A - b)), and (4096 - b) >= b (A - b) for every b if A <= 127.
 
     Args:
         weights: (K, A) int64, 0 to 2^50, A at most `MAX_ALPHABET_SIZE`; no row is all zero.

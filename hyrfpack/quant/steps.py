@@ -11,7 +11,7 @@ ALL_ZERO_CODE = 0  # code of a group whose numbers are all zero, so that no symb
 def decode_step(code: int | np.ndarray) -> np.ndarray:
     """Return the step, int64 in units of 2^-24, of a code e from 1 to 255: (8 + e mod 8) 2^(e div 8).
 
-    A step is larger than the one before by 1/15 to 1/8 of it. Steps range from 5e-7 to 1920.
+    Each step is 1/15 to 1/8 larger than the previous one. Steps range from 5e-7 to 1920.
 
     Example:
         >>> float(decode_step(encode_step(0.25)) / FIXED_POINT_ONE)

@@ -1,8 +1,8 @@
 """Estimate the Gaussian budget of a scene from pilot runs with a small and a usual budget.
 
 Suppose that n Gaussians score a + g log2(n) dB on validation photos, and that each Gaussian costs the same. Then the
-best number of Gaussians is proportional to g: a plain scene needs fewer than a detailed one, however many pixels its
-photos have. Two pilots measure g, one with a quarter of the usual budget and one with all of it. If g is small, two
+best number of Gaussians is proportional to g. A plain scene needs fewer than a detailed one, even if its photos have
+more pixels. Two pilots measure g, one with a quarter of the usual budget and one with the full one. If g is small, two
 more pilots with another seed confirm it.
 """
 

@@ -43,7 +43,7 @@ class LearningRates:
         """Return the learning rate of the group `name` at `step` (from 0) of a run of `steps` steps.
 
         Each step uses the mean gradient of W = `views` views. That mean has 1 / sqrt(W) of the noise of one gradient,
-        and the run has 1 / W of the steps, so the rate grows with sqrt(W).
+        and the run has 1 / W of the steps. So the rate grows with sqrt(W).
         """
         first, last = getattr(self, name)
         pace = math.sqrt(views * FULL_STEPS / min(max(steps * views, MIN_RATE_SCALING_STEPS), FULL_STEPS))
@@ -66,7 +66,7 @@ class DensityConfig:
         prune_scale: Gaussians with a larger scale (units of `split_scale`) are pruned, unless they are more than a
             tenth of all.
         resets: number of opacity resets, evenly spread between `start` and `peak` (exclusive); 0 or more.
-        reset_opacity: opacity that a reset caps all Gaussians at.
+        reset_opacity: opacity that a reset caps all Gaussians at, between 0 and 1.
     """
 
     start: float = 0.02

@@ -38,8 +38,8 @@ MAX_OUTLIER_SHARE = 0.1
 class DensityControl:
     """Collects gradients in each step, and adds and prunes Gaussians in rounds.
 
-    Removing a Gaussian of opacity o changes a view's loss L by about o dL/do, which is dL/dx / (1 - o) for the logit x
-    of its opacity. The importance score is the sum of the squares of this change over views. Where residuals are
+    Removing a Gaussian of opacity o changes a view's loss L by about o dL/do. With the logit x of its opacity, that is
+    dL/dx / (1 - o). The importance score is the sum of the squares of this change over views. Where residuals are
     random, it is the Gauss-Newton estimate of the rise of the loss, up to a factor. Views that do not show the
     Gaussian add nothing.
 
@@ -181,7 +181,7 @@ class DensityControl:
         generator = torch.Generator().manual_seed((self.seed * 1_000_003 + step) % 2**64)
         twice = split.repeat(2)
         scales, quats = geometry.scales[twice], geometry.quats[twice]
-        # Sampling on the CPU gives the same numbers whatever the device.
+        # Sampling on the CPU gives the same numbers for all devices.
         offsets = torch.randn(len(twice), 3, generator=generator).to(scales.device) * scales
         positions = explicit.positions[twice] + rotate(quats, offsets)
 

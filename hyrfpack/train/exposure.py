@@ -37,7 +37,7 @@ REWEIGHTING_ROUNDS = 10
 # Scale of the Cauchy weights in standard deviations: an error of this size has half the weight. With this scale the
 # estimate is 95 % efficient for normal errors.
 CAUCHY_SCALE = 2.385
-# Each photo gets this many virtual observations of gains of one, which determine the gains where no track does.
+# Each photo gets this many virtual observations of gains of one, which determine the gains that tracks leave open.
 PRIOR_OBSERVATIONS = 0.01
 # Two photos with fewer points in common are not compared, so that a few glossy points cannot shift a whole group.
 MIN_SHARED_POINTS = 10
@@ -145,7 +145,7 @@ def gains_from(observed: Observations, photos: int) -> np.ndarray:
 
 
 def _points_of_groups(observed: Observations, photos: int) -> np.ndarray:
-    """Return the point rows (K,) after splitting each point that several groups of photos observe: one row a group."""
+    """Return point rows (K,) in which a point that several groups of photos observe has one row for each group."""
     _, point = np.unique(observed.point, return_inverse=True)
     sees = csr_array((np.ones(len(point)), (observed.photo, point)), shape=(photos, point.max() + 1))
     _, group = connected_components((sees @ sees.T) >= MIN_SHARED_POINTS, directed=False)
@@ -231,7 +231,7 @@ def exposure_spread(scene: Scene, cache: PictureCache) -> float:
 def exposures_for(
     scene: Scene, config: TrainConfig, cache: PictureCache, device: torch.device
 ) -> tuple[Exposures | None, str]:
-    """Estimate the per-image gains that a run starts from, if `config.exposure` asks for them.
+    """Estimate the per-image gains that a run starts from, if `config.exposure` is True.
 
     Returns:
         The gains, None if exposure compensation is off; and a description for the run's record.

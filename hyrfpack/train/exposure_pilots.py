@@ -1,7 +1,7 @@
 """Decide whether a scene's per-image gains are learnt, by plain PSNR of pilot runs with and without them.
 
-Neither the spread of the photos' exposures nor the leave-one-out error of the exposure map can decide, because glossy
-surfaces and a small number of points look like differences in exposure. Pilot runs measure what a viewer would see.
+Neither the spread of the photos' exposures nor the leave-one-out error of the exposure map can decide. Glossy surfaces
+and a small number of points look like differences in exposure. Pilot runs measure what a viewer would see.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ MAX_EXPOSURE_PILOT_STEPS = 500
 # predicted exposure of a single photo has a large error.
 EXPOSURE_VALIDATION_EVERY = 4
 MAX_EXPOSURE_VALIDATION_VIEWS_PER_FOLD = 16
-MIN_EXPOSURE_VALIDATION_VIEWS = 6  # With fewer in all folds together, the safe default is kept.
+MIN_EXPOSURE_VALIDATION_VIEWS = 6  # With fewer in all folds, the safe default is kept.
 MIN_EXPOSURE_ROUNDS = 2
 MIN_EXPOSURE_SPREAD_STOPS = 0.05  # Photos whose exposures have a smaller standard deviation need no gains.
 MIN_EXPOSURE_GAIN_DB = 0.1

@@ -29,8 +29,8 @@ class _State:
 class Optimizer:
     """Adam (betas 0.9, 0.999, eps 1e-15) with one group for each kind of Gaussian property and one for the fields.
 
-    If a step uses the mean gradient of W views, each beta b becomes 1 - W (1 - b), so that the running means cover as
-    many views as with one view per step.
+    If a step uses the mean gradient of W views, each beta b becomes 1 - W (1 - b). The running means then cover as many
+    views as with one view per step.
 
     Attributes:
         groups: the parameters of each group by its name, which is also the name of its learning rate.

@@ -191,9 +191,9 @@ def split(
 ) -> tuple[list[View], list[View]]:
     """Split photos into those that pilots train on and validation photos.
 
-    Pilots train on the photos that are not validation photos. If these are more than `MAX_TRAINING_VIEWS`, pilots train
-    on those nearest to a validation photo in the order of views, because photos spread over a large set would show too
-    little of each place.
+    Pilots train on the photos that are not validation photos. If these are more than `MAX_TRAINING_VIEWS`, only those
+    nearest to a validation photo, in the order of views, are used. Photos spread over a large set would show too little
+    of each place.
 
     Args:
         every: one in `every` photos is a validation photo; None for 8, or 5 if there are fewer than 16 photos.

@@ -22,8 +22,8 @@ LOG_INTERVAL_SECONDS = 15.0
 FIRST_PHASE_LOG_SECONDS = 2.0
 MIN_ETA_SECONDS = 1.0  # A phase shows the remaining time only if this and the elapsed time are at least this long.
 COMPILATION_STEPS = 2  # The first steps compile kernels, so they do not count for the speed.
-# Advice to shorten the run is shown once its speed has been measured over at least this many steps and seconds, if at
-# least this much time is left.
+# Advice to shorten the run is shown if at least this much time is left. Before that, the speed must have been measured
+# over at least this many steps and seconds.
 MIN_ADVICE_STEPS = 3
 MIN_ADVICE_SECONDS = 10.0
 MIN_ADVICE_SECONDS_LEFT = 3600.0

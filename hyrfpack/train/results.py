@@ -1,8 +1,8 @@
 """Write the files of a finished run: the model, then scores, pictures, the training curve and `metrics.json`.
 
-The model is written first. All other results can be computed again from the model and the training record, a small file
-beside it that is removed once all results are written. So after a full disk or an interruption, nothing has to be
-trained again.
+The model is written first. All other results can be computed again from the model and the training record. The record
+is a small file beside the model, which is removed once all results are written. So after a full disk or an
+interruption, nothing has to be trained again.
 """
 
 from __future__ import annotations

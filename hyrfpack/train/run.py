@@ -114,13 +114,13 @@ def train_model(
         resume: resume from the folder's checkpoint, or complete the results of a finished model. The result equals that
             of an uninterrupted run.
         overwrite: replace an earlier run in the folder. Without it, nothing is replaced. If a file appears at a
-            result's name during training, the result gets a free name beside it; `TrainResult.model` is the model's.
+            result's name during training, the result gets a free name beside it; `TrainResult.model` has the model's.
         cache: cache of decoded photos; by default one that takes a quarter of the memory.
         device: where to train, see `hyrfpack.device.choose_device`. A run may be resumed on another device. On a GPU
             sums of gradients vary in their last bits from run to run, which may change the measured budget.
         quiet: print nothing.
         report: called after each step with its number (0 during pilot runs), the loss and mean squared error of its
-            view (NaN if all of it is masked) and the number of Gaussians. It replaces the progress line.
+            view (NaN if the view is masked completely) and the number of Gaussians. It replaces the progress line.
         phase: called during all other work with its name ("scoring held-out photos"), the number of items done, and
             that of all items (0 if unknown). It replaces the progress line.
         observer: called after each step with the trainer, whose model it may read and must not change. Of several
@@ -129,12 +129,12 @@ def train_model(
             `hyrfpack.train.log.TrainingLog`. A resumed run appends to it.
         ranks: processes that train together, from `hyrfpack.parallel.ranks.join_processes`. All of them call this
             function with the same scene and settings. Only rank 0 writes, prints and returns metrics. If the launcher
-            restarts the processes, as torchrun does after one has ended, they resume from the checkpoint if any.
+            restarts the processes, as torchrun does after one has ended, they resume from any checkpoint.
 
     Raises:
-        HyrfError: another call is working in the folder, the folder holds another run, the results would replace photos
-            or other files, no photo has a pixel to train on or to score, or a held-out photo cannot be read; all of
-            this is checked before the first step. Or training cannot start or continue, or the model cannot be written.
+        HyrfError: before the first step, if another call is working in the folder, the folder holds another run, the
+            results would replace photos or other files, no photo has a pixel to train on or to score, or a held-out
+            photo cannot be read. Later, if training cannot start or continue, or the model cannot be written.
             If a checkpoint cannot be written during training, a line on standard error says so; for other results see
             `TrainResult.missing`.
         TypeError: `scene` is no Scene or `config` no TrainConfig.
@@ -271,7 +271,7 @@ def _train_in_folder(
 
 
 def _with_saved_decisions(config: TrainConfig, checkpoint: Path) -> TrainConfig:
-    """Return the settings with the decisions that the interrupted run made where they were left open."""
+    """Return the settings, completed by the decisions that the interrupted run made for them."""
     factor, exposure = saved_decisions(checkpoint)
     if is_budget_open(config):
         config = dataclasses.replace(config, budget_factor=factor)
@@ -423,7 +423,7 @@ def _nothing_left(scene: Scene, views: list[View], purpose: str) -> HyrfTraining
 
 @contextmanager
 def _stop_requests() -> Iterator:
-    """Turn the first Ctrl-C, SIGTERM or SIGHUP into a request to stop; a second Ctrl-C or SIGTERM interrupts at once.
+    """Turn the first Ctrl-C, SIGTERM or SIGHUP into a request to stop; a second Ctrl-C or SIGTERM takes effect at once.
 
     Signals that the parent process ignores stay ignored: SIGHUP under nohup, Ctrl-C in the background of a script. A
     second SIGHUP has no effect, because closing a terminal sends two: one by the shell and one by the terminal.

@@ -43,7 +43,7 @@ MIN_INITIAL_SIZE, MAX_INITIAL_SIZE = 1e-5, 0.5
 # Points with larger coordinates, in local units, are moved towards the box. That changes their direction, seen from the
 # box, by at most 2e-4 radians.
 MAX_INITIAL_COORDINATE = 1e4
-# Cameras count as standing in one place if their spread is a smaller share of their distance to the points.
+# Cameras count as being in one place if their spread is a smaller share of their distance to the points.
 MIN_CAMERA_SPREAD_RATIO = 1e-3
 BACKGROUND_RGB = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "random": (0.0, 0.0, 0.0)}
 
@@ -52,8 +52,8 @@ def detect_preset(scene: Scene) -> tuple[str, str]:
     """Choose the preset (the paper's regime) that fits a scene; return it and the reason in words.
 
     - "synthetic": photos with transparency (an object without a background);
-    - "large": the cameras look the same way and fly across it (aerial surveys);
-    - "street": the cameras look the same way and move along it;
+    - "large": the cameras look in one direction and move across it (aerial surveys);
+    - "street": the cameras look in one direction and move along it;
     - "standard": everything else.
     """
     if scene.has_alpha or scene.layout == "blender":
@@ -79,7 +79,7 @@ def scene_frame(scene: Scene, preset: str) -> Frame:
 
     The box of a NeRF-synthetic layout is +-1.3 around the origin. For "large" scenes, and other "synthetic" scenes,
     whose unit is not known, it spans the 1st to 99th percentile of the points. For all other scenes it is the box of
-    the cameras. If all cameras stand in one place, it also spans these percentiles.
+    the cameras. If all cameras are in one place, it also spans these percentiles.
     """
     if preset == "synthetic" and scene.layout == "blender":
         return Frame((0.0, 0.0, 0.0), SYNTHETIC_HALF_BOX, (1.0, 1.0, 1.0))

@@ -16,10 +16,10 @@ class Strategy(Protocol):
     """Interface of a density control strategy, for `Trainer(scene, config, strategy=...)`.
 
     In every step the trainer calls `watching` before it renders the view, `observe` after the backward pass, and `act`
-    after the optimiser's step. A resumed run must give the same result as an uninterrupted one, so a strategy seeds
-    random numbers by the run's seed and the step, and its state contains everything that it has observed. On several
-    processes each strategy observes its own views. It must sum its observations over the ranks (`Ranks.all_reduce`)
-    before it decides, so that all take the same decisions.
+    after the optimiser's step. A resumed run must give the same result as an uninterrupted one. So a strategy seeds
+    random numbers by the run's seed and the step, and its state contains all its observations. On several processes
+    each strategy observes its own views. It must sum its observations over the ranks (`Ranks.all_reduce`) before it
+    decides, so that all take the same decisions.
 
     The default strategy is `hyrfpack.train.DensityControl`.
 

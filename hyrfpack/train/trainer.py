@@ -409,7 +409,7 @@ def _strategy_prefix(rank: int) -> str:
 
 
 def _mean_square(error: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:
-    """Return the mean square of `error` (H, W, 3) over the pixels inside the mask; NaN where there are none."""
+    """Return the mean square of `error` (H, W, 3) over the pixels inside the mask; NaN if there are none."""
     squares = error.square()
     if mask is None:
         return squares.mean()
