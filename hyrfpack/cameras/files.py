@@ -82,7 +82,7 @@ def cameras_to_json(cameras: Sequence[tuple[str, Camera]]) -> str:
 
 
 def cameras_from_json(path: str | os.PathLike[str]) -> list[tuple[str, Camera]]:
-    """Read named cameras.
+    """Read named cameras from a JSON file.
 
     Three layouts are accepted:
 

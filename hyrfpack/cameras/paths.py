@@ -233,7 +233,7 @@ def _nearest_to_median(rows: np.ndarray) -> int:
 
 
 def _unit(vector: np.ndarray, fallback: np.ndarray) -> np.ndarray:
-    """Scale a vector to unit length; return `fallback` if it has none."""
+    """Scale a vector to unit length; return `fallback` if it is shorter than 1e-12."""
     length = np.linalg.norm(vector)
     return vector / length if length > 1e-12 else fallback
 

@@ -78,7 +78,7 @@ json_option = click.option("--json", "as_json", is_flag=True, help="Print the re
 
 
 def scene_options(command: Command) -> Command:
-    """Add the options that say how a folder of photos and poses is read.
+    """Add the options that control how a folder of photos and poses is read.
 
     They are --test-every, --images, --max-size, --layout and --model. The command gets them as one argument,
     `reader_options`, for `read_scene`.
@@ -157,7 +157,7 @@ exposure_option = click.option(
 
 
 def device_options(command: Command) -> Command:
-    """Add the options that choose the device and the precision there: --device, --precision."""
+    """Add the options --device and --precision, which choose the device and its precision."""
     precision = click.option(
         "--precision",
         type=click.Choice(PRECISIONS),

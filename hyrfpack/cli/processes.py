@@ -21,7 +21,7 @@ PROCESSES_OPTION = "--processes"
 def processes_option(command: Command) -> Command:
     """Add the option --processes to a command, and let it run in several processes.
 
-    The option starts them; torchrun or srun may have started them instead. The command gets them as the argument
+    The option starts the processes, unless torchrun or srun has started them. The command gets them as the argument
     `ranks`. Only rank 0 prints.
     """
 

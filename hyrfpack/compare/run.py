@@ -211,7 +211,7 @@ def _file_sizes(folder: Path) -> dict[str, int]:
 
 
 def _existing_pictures(folder: Path, names: Sequence[str]) -> dict[str, Path]:
-    """Return the paths of those of `evaluate`'s pictures that exist, by the name of their photo."""
+    """Return the paths of the existing pictures of `evaluate`, by the name of their photo."""
     files = {name: folder / VIEWS_FOLDER / f"{file}.png" for name, file in zip(names, unique_stems(names), strict=True)}
     return {name: path for name, path in files.items() if path.is_file()}
 

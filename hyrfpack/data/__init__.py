@@ -83,7 +83,7 @@ def load_scene(
 
 
 def _read(given: Path, top: Path, notes: list[str], reading: dict[str, Any], held_out: Collection[str] | None) -> Scene:
-    """Read the scene in a folder, see `load_scene`.
+    """Read the scene in a folder, as described in `load_scene`.
 
     Args:
         given: the folder or archive that the user named.
@@ -126,7 +126,7 @@ def _read(given: Path, top: Path, notes: list[str], reading: dict[str, Any], hel
 
 
 def _open_folder(given: Path, notes: list[str]) -> Path:
-    """Return the folder that the user named, or unpack the archive that was named and return its folder with a note."""
+    """Return the user's folder; unpack an archive, add a note, and return the folder of its files."""
     if not os.path.exists(given):  # the methods of Path raise if a name is too long
         raise HyrfDataError(f"{given}: no such folder", fix="check the path")
     if is_archive(given):
@@ -145,7 +145,7 @@ def _open_folder(given: Path, notes: list[str]) -> Path:
 
 
 def _find_set(folder: Path, layout: str | None, notes: list[str]) -> tuple[Path, list[str]]:
-    """Find the folder with poses, which is `folder` or the only one below it that has some.
+    """Find the folder with poses, which is `folder` or the only folder below it that has poses.
 
     If a layout is given, only poses of that layout count. A note is added if the poses lie in a folder below `folder`.
 

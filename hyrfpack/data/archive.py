@@ -92,7 +92,7 @@ def display_path(path: Path) -> Path:
 
 @contextmanager
 def archive_paths_in_errors() -> Iterator[None]:
-    """Replace the folders of unpacked archives by the archives' paths in messages of errors raised inside."""
+    """Replace folders of unpacked archives by the archives' paths in messages of errors that the block raises."""
     try:
         yield
     except HyrfError as error:

@@ -167,7 +167,7 @@ def _loading_notes(photos: list[Photo], max_size: int, mask_notes: list[str]) ->
 def missing_photos_notes(
     path: Path, photos: list[Photo], missing: list[str], where: str, ambiguous: Sequence[str] = ()
 ) -> list[str]:
-    """Return a note about listed photos that are not on disk, in a list that is empty if none is missing.
+    """Return a list with a note about listed photos that are not on disk; the list is empty if none is missing.
 
     Args:
         path: the scene folder.
@@ -213,7 +213,7 @@ def _describe_folder(path: Path, name: str) -> str:
 
 
 def _shared_pose_notes(views: list[View]) -> list[str]:
-    """Return a note about photos with exactly the same pose, which is usually a mistake."""
+    """Return a list with a note if photos have exactly the same pose, which is usually a mistake."""
     names_by_pose: dict[bytes, list[str]] = {}
     for view in views:
         names_by_pose.setdefault(view.camera.camera_from_world.tobytes(), []).append(view.name)
@@ -342,7 +342,7 @@ def _orthonormal_pose(pose: np.ndarray, path: Path) -> np.ndarray:
 
 
 def _has_transparency(photos: list[Photo], max_size: int) -> bool:
-    """Return whether a photo has a transparent pixel, among a few photos that have an alpha channel.
+    """Return whether any of a few photos with an alpha channel has a transparent pixel.
 
     The pixels decide, because many alpha channels are opaque throughout.
     """

@@ -97,7 +97,7 @@ def _check_full_size(folder: Path) -> Path:
 
 
 def _lens(focal: float, k1: float, k2: float, _: Path, header: PictureHeader) -> Lens:
-    """Return the lens of a photo, whose size only its file states."""
+    """Return the lens of a photo; the size comes from the photo's file, because the bundle does not state it."""
     width, height = header.size
     return Lens(width, height, focal, focal, width / 2, height / 2, "brown", brown_coefficients(k1, k2))
 

@@ -50,7 +50,7 @@ class PictureCache:
         return picture
 
     def stream(self, views: Iterable[View], depth: int = 4) -> Generator[tuple[View, Picture]]:
-        """Yield each view with its picture, and decode the next pictures in another thread meanwhile.
+        """Yield each view with its picture, while another thread decodes the next pictures.
 
         Leaving the loop or closing the iterator ends the thread.
 

@@ -95,7 +95,7 @@ def list_raw_photos(folder: StrPath) -> list[Path]:
 
 
 def list_pictures(folder: StrPath) -> list[Path]:
-    """List all pictures in a folder and its subfolders, including masks, previews and results, without hidden ones.
+    """List all pictures in a folder and its subfolders, including masks, previews and results, but no hidden ones.
 
     Args, order and errors are those of `list_photos`.
 
@@ -123,7 +123,7 @@ def downscale_factor(name: str) -> int:
 
 
 def _list_files(root: Path, is_wanted: Callable[[str], bool], photos_only: bool) -> list[Path]:
-    """List the files below a folder whose names are wanted, sorted by their relative paths."""
+    """List the files below a folder whose names `is_wanted` accepts, sorted by their relative paths."""
     if not os.path.isdir(root):  # Path.is_dir raises if a name is too long
         what = "is a file, not a folder of photos" if os.path.exists(root) else "there is no such folder"
         raise HyrfDataError(f"{root}: {what}", fix="name the folder that holds the photos")
@@ -214,7 +214,7 @@ def read_photo_facts(path: StrPath) -> PhotoFacts:
 
 
 def _focal_in_pixels(tags: dict[int, Any], width: int, height: int) -> float | None:
-    """Work out the focal length in pixels from EXIF tags, None if they do not state it."""
+    """Compute the focal length in pixels from EXIF tags; return None if they do not state it."""
     equivalent, diagonal = _positive(tags.get(_FOCAL_LENGTH_35MM_TAG)), math.hypot(width, height)
     if equivalent:
         return equivalent / _FULL_FRAME_DIAGONAL_MM * diagonal
@@ -230,7 +230,7 @@ def _focal_in_pixels(tags: dict[int, Any], width: int, height: int) -> float | N
 
 
 def _positive(value: Any) -> float:
-    """Convert a tag to a positive finite number, or to 0 if it is none."""
+    """Convert a tag to a positive finite number; return 0 if that is not possible."""
     with suppress(TypeError, ValueError, ZeroDivisionError):
         number = float(value)
         return number if 0 < number < math.inf else 0.0

@@ -70,7 +70,7 @@ def find_masks(folder: Path, photos: Sequence[tuple[str, tuple[int, int]]], used
 
 
 def _unmatched_mask_notes(folder: Path, unmatched: list[Path], count: int, names: list[str]) -> list[str]:
-    """Return a note about masks that match no photo, in a list that is empty if there are none."""
+    """Return a list with a note about masks that match no photo; the list is empty if there are none."""
     if not unmatched:
         return []
     return [

@@ -1,4 +1,4 @@
-"""Read Agisoft Metashape's cameras as XML ("Export Cameras"), beside the photos.
+"""Read cameras that Agisoft Metashape exported as XML ("Export Cameras") beside the photos.
 
 A camera's `transform` is world_from_camera, row by row, in the frame of its component, with OpenCV's axes. A sensor's
 calibration has f, cx and cy (from the picture's centre), b1 and b2 in pixels, and k1 to k4, p1 and p2:
@@ -239,7 +239,7 @@ def _lens(sensor: Element, where: str) -> Lens | Callable[[Path, PictureHeader],
 
 
 def _pixels(size: Element | None, side: str, where: str) -> int:
-    """Read a side of a resolution in whole pixels."""
+    """Read the width or the height of a resolution in pixels."""
     value = float(_parse_numbers(None if size is None else size.get(side), 1, where)[0])
     return round(value)
 

@@ -121,7 +121,7 @@ class PictureIndex:
         return safe_name(listed)
 
     def _find_exact(self, name: str) -> Path | None:
-        """Find the file of exactly this path; a name without the extension of a picture may lack it."""
+        """Find the file at exactly this path; if the name has no extension of a picture, the file may have one."""
         path = self.folder / name.replace("\\", "/")
         if is_raw_name(
             path.name
@@ -132,7 +132,7 @@ class PictureIndex:
 
     @cached_property
     def _rules(self) -> list[Callable[[str], list[Path]]]:
-        """Matching rules, the strictest first; each returns the files that a name may refer to."""
+        """The matching rules, the strictest first; each returns the files that a name may refer to."""
         paths, stems, suffixes = defaultdict(list), defaultdict(list), defaultdict(list)
         for file in self.files:
             key = _key(file.relative_to(self.folder).as_posix())
@@ -143,7 +143,7 @@ class PictureIndex:
                 suffixes[stem[-length:]].append(file)
 
         def by_suffix(key: Key) -> list[Path]:
-            """Return the files whose path ends with the name, otherwise those with the longest path that ends it."""
+            """Return the files whose path ends with the name, or else those with the longest path that ends it."""
             shorter = (stems[key[-length:]] for length in range(len(key) - 1, 0, -1) if key[-length:] in stems)
             return suffixes.get(key) or next(shorter, [])
 
@@ -191,7 +191,7 @@ def _normalize_unicode(text: str) -> str:
 
 
 def _without_extension(key: Key, extensions: tuple[str, ...] | None = None) -> Key:
-    """Remove the extension of the last part: one of `extensions`, or anything that looks like an extension."""
+    """Remove the extension of a path's last part: one of `extensions`, or anything that looks like an extension."""
     if not key:
         return key
     last = key[-1]

@@ -103,7 +103,7 @@ def is_picture_name(name: str) -> bool:
 
 
 def has_same_aspect(width: int, height: int, of_width: int, of_height: int) -> bool:
-    """Return whether two sizes have the same aspect ratio, if each side may be rounded by less than a pixel."""
+    """Return whether two sizes have the same aspect ratio, up to rounding of each side by less than a pixel."""
     return abs(width * of_height - height * of_width) <= of_width + of_height
 
 

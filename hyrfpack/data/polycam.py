@@ -24,12 +24,12 @@ UNCORRECTED_FOLDERS = ("keyframes/cameras", "keyframes/images")
 
 
 def has_polycam_cameras(path: Path) -> bool:
-    """Return whether a folder holds cameras of a raw export."""
+    """Return whether a folder holds the cameras of Polycam's raw export."""
     return any(_camera_files(path / cameras) for cameras, _ in (CORRECTED_FOLDERS, UNCORRECTED_FOLDERS))
 
 
 def read_polycam(path: Path, *, test_every: int, max_size: int) -> Scene:
-    """Read a raw export. The world is in metres with y up, and there are no points.
+    """Read Polycam's raw export. The world is in metres with y up, and there are no points.
 
     Args:
         path: the folder that contains `keyframes/`.

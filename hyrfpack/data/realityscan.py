@@ -160,7 +160,7 @@ def _pose(pose: np.ndarray) -> np.ndarray:
 
 
 def _lens(row: dict[str, float], _: Path, header: PictureHeader) -> Lens:
-    """Return the lens of a photo, whose size only its file states."""
+    """Return the lens of a photo; the size comes from the photo's file, because the table does not state it."""
     width, height = header.size
     side = max(width, height)
     focal = row["f"] * side / _FILM_LONGER_SIDE_MM

@@ -39,7 +39,7 @@ def raise_if_single_photo(path: Path) -> None:
 
 
 def raw_photos_notes(raw_photos: Sequence[Path]) -> list[str]:
-    """Return a note about raw files beside photos, which are ignored, in a list that is empty if there are none."""
+    """Return a list with a note about ignored raw files beside photos; the list is empty if there are none."""
     if not raw_photos:
         return []
     noun, verb = ("raw file", "is") if len(raw_photos) == 1 else ("raw files", "are")

@@ -120,9 +120,9 @@ def run_demo(
 ) -> DemoResult:
     """Write a scene, train on it, compress, decompress, render, score, export, and draw a picture of the result.
 
-    Writes into `folder`: `scene/` (photos and poses), `run/` (the training), `paper.hyrf`, `compact.hyrf`, `back.hyrf`
-    (compact.hyrf decompressed), `renders/` (held-out views from compact.hyrf), `demo.html` (a page that holds
-    compact.hyrf and plays it) and `demo.png`.
+    The files in `folder` are: `scene/` (photos and poses), `run/` (the training), `paper.hyrf`, `compact.hyrf`,
+    `back.hyrf` (compact.hyrf decompressed), `renders/` (held-out views from compact.hyrf), `demo.html` (a page that
+    holds compact.hyrf and plays it) and `demo.png`.
 
     Args:
         folder: folder of the results; created if missing.
@@ -132,7 +132,7 @@ def run_demo(
         say: called with a sentence before each stage.
 
     Raises:
-        HyrfError: a file cannot be written, or another call is at work in the folder.
+        HyrfError: a file cannot be written, or another call is writing into the folder.
     """
     folder = Path(folder)
     Outputs(overwrite=True).folder(folder, RESULT_FILES)

@@ -213,7 +213,7 @@ def _sky_color(directions: np.ndarray, noise: np.ndarray) -> np.ndarray:
 
 
 def _find_nearest_hit(origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distance to the nearest surface and its index: of a solid, or the number of solids for the ground.
+    """Return the distance to the nearest surface and its index, which is the number of solids for the ground.
 
     Rays that hit the sky have index -1 and the distance _NO_HIT_DISTANCE.
     """
@@ -288,7 +288,7 @@ def _open_sky_share(points: np.ndarray, normals: np.ndarray, index: int) -> np.n
 
 
 def _noise_tile(rng: np.random.Generator, size: int = 256) -> np.ndarray:
-    """Return a periodic tile (size, size) of cloud-like noise in [0, 1]: white noise with its spectrum times f^-1.6."""
+    """Return a periodic tile (size, size) of cloud-like noise in [0, 1]: white noise, filtered by f^-1.6."""
     frequency = np.hypot(np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size)[None, :])
     frequency[0, 0] = np.inf
     tile = np.fft.irfft2(np.fft.rfft2(rng.normal(size=(size, size))) * frequency**-1.6, s=(size, size))

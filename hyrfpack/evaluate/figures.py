@@ -177,7 +177,7 @@ def blank_figure(width: float, height: float, layout: Literal["constrained"] | N
 def save_figure(
     path: str | os.PathLike[str], figure: Figure, *, overwrite: bool = True, rename: bool = True, **options: Any
 ) -> Path:
-    """Write a figure in one step, making its folder, and return the path that was written.
+    """Write a figure in one step, create its folder if needed, and return the path that was written.
 
     `overwrite` and `rename` are those of `hyrfpack.atomic.pending_file`, `options` those of matplotlib's `savefig`.
 

@@ -79,7 +79,7 @@ class LPIPS:
     """
 
     def __init__(self, state: dict[str, Tensor]) -> None:
-        """Take the weights out of an `lpips.LPIPS` state dictionary.
+        """Extract the weights from an `lpips.LPIPS` state dictionary.
 
         Raises:
             ValueError: `state` is not such a dictionary, or a weight is missing or has another shape.
@@ -112,7 +112,7 @@ class LPIPS:
         """Read the weights file, without executing code from it.
 
         Raises:
-            HyrfError: the file is missing, or is not the file that the module's docstring describes.
+            HyrfError: the file is missing, or does not hold the weights of an `lpips.LPIPS`.
         """
         advice = 'make it with torch.save(lpips.LPIPS(net="alex").state_dict(), FILE)'
         try:

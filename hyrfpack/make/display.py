@@ -24,7 +24,7 @@ class Display:
     """
 
     def __init__(self, wording: Callable[[str], str] = lambda sentence: sentence) -> None:
-        """Args: wording: rewrites each sentence before it is shown."""
+        """Start the display; `wording` rewrites each sentence before it is shown."""
         self._wording = wording
         self._start = monotonic()
         self._latest: tuple[Progress, float] | None = None

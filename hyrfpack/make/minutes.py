@@ -102,7 +102,7 @@ class SceneCost:
         return budget_for(scene, dataclasses.replace(self.requested, steps=steps).train_config(seed=0))[0]
 
     def total_seconds(self, scene: Scene, steps: int) -> float:
-        """Estimate the seconds of the training and of all that follows."""
+        """Estimate the seconds of training and of everything after it."""
         return self.training_seconds(scene, steps) + sum(self.seconds_after_training(scene, steps).values())
 
     def max_steps_within(self, scene: Scene, seconds: float) -> int:

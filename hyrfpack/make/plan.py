@@ -31,7 +31,7 @@ ASSUMED_VIDEO_PHOTOS = 100  # before a video is decoded, the number of its photo
 
 @dataclass(frozen=True)
 class Quality:
-    """Settings of a quality.
+    """Settings of one of the qualities that can be requested.
 
     Attributes:
         steps: training steps on a CPU.

@@ -198,7 +198,7 @@ class _Pipeline:
         say: Say,
         observer: Callable[[Trainer], None] | None,
     ) -> None:
-        """Args: began: start of the call by the monotonic clock, in seconds."""
+        """Prepare the stages; `began` is the start of the call by the monotonic clock, in seconds."""
         self.observer = observer
         self.request = request
         self.source = request.source
@@ -257,7 +257,7 @@ class _Pipeline:
         return stages.run_pose_stage(self.stage_cache, source.path, source.files(), request.matching, request.seed)
 
     def _scene_digest(self, scene: Scene) -> str:
-        """Return the digest of all files of a scene; of an archive, the unpacked files are digested instead."""
+        """Return the digest of all files of a scene; for an archive, that of its unpacked files."""
         return files_digest((file for file in scene.files if Path(file) != self.source.path), Path(scene.path))
 
     def _requested_plan(self) -> Plan:

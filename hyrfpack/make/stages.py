@@ -156,7 +156,7 @@ class _TrainingProgress:
     """Reports the parts of a training run: pilot runs, steps, then scores and pictures."""
 
     def __init__(self, reporter: Reporter, steps: int, max_pilot_steps: int) -> None:
-        """Args: steps: number of training steps; max_pilot_steps: maximum of all pilot runs together."""
+        """Prepare for `steps` training steps, and at most `max_pilot_steps` steps of all pilot runs together."""
         self._reporter, self._steps, self._max_pilot_steps = reporter, steps, max_pilot_steps
         self._part, self._pilot_steps, self._mse = "pilots", 0, math.nan
 
@@ -313,7 +313,7 @@ def copy_to_output(product: Path, output: Path, *, overwrite: bool) -> Path:
 
 
 def copy_file(source: Path, target: Path, *, overwrite: bool = True, rename: bool = True) -> Path:
-    """Copy a file as a whole, unless the target has the same content; see `hyrfpack.atomic.pending_file`.
+    """Copy a file in one step, unless the target has the same content; see `hyrfpack.atomic.pending_file`.
 
     Returns:
         The path of the copy.

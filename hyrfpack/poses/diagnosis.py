@@ -119,7 +119,7 @@ def explain_unposed(
 
     Args:
         names: names of the photos that could be decoded.
-        features, matches, found: the answers of the stages.
+        features, matches, found: the answers of the stages that find features, match and finish.
     """
     soft, posed = blurred_photos(features), set(found["registered"])
 

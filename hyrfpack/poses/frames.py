@@ -68,7 +68,7 @@ class FrameReport:
 
 @dataclass(frozen=True)
 class _VideoMeasurement:
-    """Result of the measuring pass over a video; the arrays hold the N measured frames that are no repetitions.
+    """Result of the measuring pass over a video; the arrays hold the N measured frames without repeated ones.
 
     Attributes:
         numbers: (N,) frame numbers in the video.

@@ -181,7 +181,7 @@ class SceneOutput:
         shutil.rmtree(self.work, ignore_errors=True)
 
     def clear_if_empty(self) -> None:
-        """Remove the folder of products in progress if there are none in it."""
+        """Remove the folder of products in progress if it has no products."""
         if all(path.is_dir() or path.name == _FINGERPRINT_NAME for path in self.work.rglob("*")):
             self.clear()
 

@@ -60,7 +60,7 @@ def remove_files(scene: Path, owned: OwnedFiles, keep: Collection[Path]) -> None
 
 
 def has_only(scene: Path, name: str, owned: OwnedFiles) -> bool:
-    """Return whether a folder of the scene is no link and would be empty after its owned files are removed."""
+    """Return whether a folder of the scene is not a link and would be empty after its owned files are removed."""
     folder = scene / name
     if folder.is_symlink() or not folder.is_dir():
         return False

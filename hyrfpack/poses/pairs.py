@@ -99,7 +99,7 @@ def compute_similarities(
 
 
 def _k_means(values: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return (words, 128) k-means centres; the values themselves if there are no more of them than words."""
+    """Return (words, 128) k-means centres, or the values themselves if there are at most as many as words."""
     words = values[rng.permutation(len(values))[:_VOCABULARY_WORDS]]
     for _ in range(_KMEANS_ITERATIONS):
         nearest = _nearest_words(values, words)

@@ -121,7 +121,7 @@ def read_headers(
 
 
 def select_unreadable(left_out: Mapping[str, str]) -> dict[str, str]:
-    """Select those of the photos left out by `read_headers` that cannot be read; copies are dropped."""
+    """Select the unreadable photos, without copies, from those that `read_headers` leaves out."""
     return {
         name: reason
         for name, reason in left_out.items()
@@ -130,7 +130,7 @@ def select_unreadable(left_out: Mapping[str, str]) -> dict[str, str]:
 
 
 def group_by_device(photos: Sequence[Photo], in_place: bool) -> tuple[tuple[Device, ...], tuple[int, ...]]:
-    """Group photos by camera: by folder, EXIF's device name, size, and focal length rounded to 1 % of the longer side.
+    """Group photos by camera: equal folder, EXIF device name, size, and focal length (to 1 % of the longer side).
 
     Returns:
         The cameras, and for each photo the index of its camera.
@@ -194,7 +194,7 @@ def find_masks(photos: Sequence[Photo], folder: Path) -> dict[str, Path]:
 
 
 def make_masks(photos: Sequence[Photo], masks: dict[str, Path], folder: Path) -> dict[str, Path]:
-    """Write upright masks into a new folder, named as the photo + ".png"; return their paths by photo name."""
+    """Write upright masks into a new folder, under the photo's name + ".png"; return their paths by photo name."""
     made = {}
     for photo in photos:
         if photo.name not in masks:

@@ -30,7 +30,7 @@ TIMEOUT_SECONDS = 30.0  # time limit for each answer of the browser
 
 
 def find() -> str | None:
-    """Return the path of the installed program, or None."""
+    """Return the path of the installed browser, or None."""
     return next(filter(None, map(shutil.which, PROGRAM_NAMES)), None)
 
 

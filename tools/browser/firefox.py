@@ -48,7 +48,7 @@ WEBDRIVER_KEYS = {
 
 
 def find() -> str | None:
-    """Return the path of the installed program; None if it or Xvfb is missing."""
+    """Return the path of the installed browser; None if it or Xvfb is missing."""
     return next(filter(None, map(shutil.which, PROGRAM_NAMES)), None) if shutil.which("Xvfb") else None
 
 

@@ -372,7 +372,7 @@ def _read_resources(built: object) -> tuple[int, int]:
 
 
 def list_kernels(_: object = None) -> list[str]:
-    """Return the names of the kernels of hyrfpack.ops: Triton functions that return nothing and that no other calls."""
+    """Return the names of the kernels of hyrfpack.ops: Triton functions that return nothing and no other calls."""
     import hyrfpack.ops
 
     for module in pkgutil.walk_packages(hyrfpack.ops.__path__, "hyrfpack.ops."):

@@ -37,7 +37,7 @@ GSPLAT_TRANSMITTANCE_MIN = 1e-4
 
 
 def items(setup: Setup) -> list[str]:
-    """Return one item for each number of Gaussians, and one for each room with Gaussians as trained."""
+    """Return one item for each number of Gaussians, and one for each room whose Gaussians look as if trained."""
     return [f"{count:,}" for count in setup.frame_gaussians] + [
         f"{count:,}{AS_TRAINED_SUFFIX}" for count in setup.trained_gaussians
     ]

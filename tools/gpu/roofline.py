@@ -118,21 +118,25 @@ def count_hash_encode(points: int, levels: int, rows: int, features: int = 2) ->
 
 
 def count_hash_encode_backward(points: int, levels: int, rows: int, features: int = 2) -> Work:
-    """Count the hash encoding's backward pass, which reads coordinates and feature gradients and writes the table's."""
+    """Count the work of the hash encoding's backward pass.
+
+    It reads coordinates and feature gradients, and writes the table's gradient.
+    """
     work = count_hash_encode(points, levels, 0, features)
     return Work(work.bytes + 4 * features * rows, work.flops)
 
 
 def count_mlp(rows: int, widths: Sequence[int], mixed: bool) -> Work:
-    """Count an MLP, which reads x and the weights and writes y; one multiply-add for each row and weight."""
+    """Count the work of an MLP, which reads x and the weights and writes y: one multiply-add per row and weight."""
     weights = sum(i * o for i, o in zip(widths, widths[1:], strict=False))
     return Work(4 * rows * (widths[0] + widths[-1]) + 4 * weights, 2 * rows * weights, "bf16" if mixed else "fp32")
 
 
 def count_mlp_backward(rows: int, widths: Sequence[int], mixed: bool) -> Work:
-    """Count an MLP's backward pass, which reads x and the gradient of y and writes the gradient of x.
+    """Count the work of an MLP's backward pass.
 
-    The arithmetic is that of the hidden layers once more, then of two products per layer.
+    It reads x and the gradient of y, and writes the gradient of x. The arithmetic is that of the hidden layers once
+    more, then of two products per layer.
     """
     forward = count_mlp(rows, widths, mixed)
     hidden = count_mlp(rows, widths[:-1], mixed)
@@ -140,21 +144,24 @@ def count_mlp_backward(rows: int, widths: Sequence[int], mixed: bool) -> Work:
 
 
 def count_photometric_loss(pixels: int) -> Work:
-    """Count the loss and its gradient, which read two pictures and write one, with 3 float32 per pixel each.
+    """Count the work of the loss and its gradient.
 
-    A channel takes 5 blurs and 3 more for the gradient, each with two passes of 11 multiply-adds, and 40 other
-    operations.
+    They read two pictures and write one, with 3 float32 per pixel each. A channel takes 5 blurs and 3 more for the
+    gradient, each with two passes of 11 multiply-adds, and 40 other operations.
     """
     return Work(36 * pixels, 3 * pixels * (8 * 2 * 2 * SSIM_WINDOW_TAPS + 40))
 
 
 def count_adam(parameters: int) -> Work:
-    """Count an Adam step: 14 operations; it reads value, gradient and both moments and writes all but the gradient."""
+    """Count the work of an Adam step.
+
+    It reads value, gradient and both moments, and writes all but the gradient. A parameter takes 14 operations.
+    """
     return Work(28 * parameters, 14 * parameters)
 
 
 def count_decode(gaussians: int, widths: Sequence[int], levels: int, rows: int, mixed: bool) -> Work:
-    """Count the decoding of positions and explicit logits to activated values.
+    """Count the work of decoding positions and explicit logits to activated values.
 
     It reads 3 coordinates, the table once, and at most one logit for each output; it writes the outputs. The features
     need not go through memory. The arithmetic is that of the encoding, the decoder, and 10 operations for each output.
@@ -183,10 +190,11 @@ def count_shade(gaussians: int, widths: Sequence[int], mixed: bool) -> Work:
 
 
 def count_project_shaded(gaussians: int, drawn: int, widths: Sequence[int], mixed: bool) -> Work:
-    """Count projection and shading together: `count_project`'s bytes for all Gaussians, `count_shade`'s for drawn ones.
+    """Count the work of projection and shading together.
 
-    The positions are read once. The arithmetic is that of shading, because the projection's is a few percent of it and
-    runs on other units at the same time.
+    The bytes are those of `count_project` for all Gaussians and of `count_shade` for drawn ones, with the positions
+    read once. The arithmetic is that of shading, because the projection's is a few percent of it and runs on other
+    units at the same time.
 
     Args:
         gaussians: number of Gaussians.

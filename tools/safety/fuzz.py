@@ -73,7 +73,7 @@ class Failure(Exception):
 
 
 class CpuTimeExceeded(BaseException):
-    """The CPU time is used up; this is no Exception, so that no reader catches it as one of its own."""
+    """The CPU time is used up; this does not derive from Exception, so that the reader does not catch it."""
 
 
 @dataclass

@@ -110,7 +110,7 @@ def read_in_javascript(files: Sequence[tuple[bytes, bool]]) -> list[Verdict]:
 
 
 def find_disagreement(python: Verdict, javascript: Verdict) -> str:
-    """Return how two results of one file disagree, or which rule they break; an empty string if all is well."""
+    """Return how two results of one file disagree, or which rule they break; "" if neither is the case."""
     if javascript.failed:
         return f"JavaScript fails: {javascript.failed}"
     if bool(python.refused) != bool(javascript.refused):

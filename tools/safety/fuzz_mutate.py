@@ -316,7 +316,7 @@ def _forge_sections(rng: Random) -> bytes:
 
 
 def _forge_payload(rng: Random) -> bytes:
-    """Edit any bytes of a section."""
+    """Edit random bytes of a section."""
     parts = [replace(part) for part in _choose_sections(rng)]
     part = rng.choice(parts)
     part.data = edit_bytes(part.data, rng)

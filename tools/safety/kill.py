@@ -135,7 +135,7 @@ def wait_for_temporary_files(process: subprocess.Popen, folder: Path, count: int
 
 
 def drop_times(value: Any) -> Any:
-    """Return values of JSON without the measured times that dictionaries at any depth contain."""
+    """Return JSON values without the measured times in dictionaries at any depth."""
     if isinstance(value, dict):
         return {key: drop_times(item) for key, item in value.items() if key not in METRICS_TIME_KEYS}
     return [drop_times(item) for item in value] if isinstance(value, list) else value

@@ -53,7 +53,7 @@ FOLDER_BUSY_TEXT, OUTPUT_EXISTS_TEXT = "is at work in this folder", "--overwrite
 
 @dataclass
 class Command:
-    """One command.
+    """A command of a race.
 
     Attributes:
         arguments: returns the command line for an output.
@@ -91,7 +91,7 @@ class RunningCommand:
     """A hyrfpack command that runs in its own process.
 
     Attributes:
-        process: the process.
+        process: the child process.
     """
 
     def __init__(self, arguments: list[str]) -> None:

@@ -65,7 +65,7 @@ def extract_python(page: str) -> str:
 
 
 def run_page(page: Path, data: Path, steps: int | None) -> bool:
-    """Run one page; return whether it ran to its end."""
+    """Run the code of one page; return whether it ran without an error."""
     code = extract_python(page.read_text(encoding="utf-8"))
     if not code.strip():
         print(f"{page}: the page has no Python code")

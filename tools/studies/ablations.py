@@ -205,7 +205,7 @@ def format_details_table(results: Results, name: str, variants: Sequence[Variant
 
 
 def _pairs(results: Results, variant: Variant, name: str) -> list[tuple[dict, dict]]:
-    """Return the results of the variant and of the full model for each seed with which both trained."""
+    """Return the results of the variant and of the full model for each seed with which both were trained."""
     both = zip(results[variant.name, name], results[FULL_VARIANT.name, name], strict=True)
     return [pair for pair in both if not any("failed" in result for result in pair)]
 

@@ -49,7 +49,7 @@ def train_and_score(scene: Scene, out: Path, steps: int, seed: int) -> float:
 
 
 def measure(name: str, data: Path, scenes: Path, out: Path, steps: int, seeds: int) -> dict:
-    """Train on both poses of one data set with each seed; return the row."""
+    """Train on both sets of poses of one data set with each seed; return the row."""
     given, own, missing = select_common_photos(
         hyrfpack.load_scene(data / name, layout="colmap"), hyrfpack.load_scene(scenes / name, layout="colmap")
     )

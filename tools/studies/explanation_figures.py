@@ -395,7 +395,7 @@ def rectangle_of(rectangle: tuple[float, float, float, float], color: str) -> An
 
 
 def draw_codec(model: HybridModel, report: CompressionReport, file: Path, path: Path) -> Path:
-    """Draw sensitivities, steps and symbols of a compact file, and where its bytes and errors are."""
+    """Draw sensitivities, steps and symbols of a compact file, and the shares of its bytes and errors."""
     sensitivity: Sensitivity = report.sensitivity
     per_number = hyrfpack.describe_file(file)["settings"]["distortion"]
     distortion = per_number * sum(parameter.numel() for parameter in model.parameters())

@@ -206,7 +206,7 @@ def iterate_settings(peer: str) -> Iterator[PeerSetting]:
 
 
 class Measurements:
-    """Measurements of files of one trained model."""
+    """Scores of files in different formats that store one trained model."""
 
     def __init__(self, source: Source, test: Sequence[View]) -> None:
         self.model = source.model

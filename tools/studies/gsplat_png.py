@@ -3,9 +3,9 @@
 It needs `pip install --no-deps gsplat jaxtyping wadler-lindig imageio`.
 
 Two parts for which gsplat needs CUDA packages are replaced. Gaussians fill the grid's rows in Morton order; gsplat uses
-PLAS, which is smoother, and a Morton curve over the grid as well takes 3 % more bytes. The clusters come from k-means
-with squared distances; gsplat uses TorchPQ with absolute distances. gsplat always asks for 65,536 clusters, which is
-more than the number of Gaussians in a small scene.
+PLAS, whose order is smoother. Filling the grid along a Morton curve instead of by rows takes 3 % more bytes. The
+clusters come from k-means with squared distances; gsplat uses TorchPQ with absolute distances. gsplat always asks for
+65,536 clusters, which is more than the number of Gaussians in a small scene.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def list_missing_packages() -> list[str]:
 def round_trip(splats: Splats, clusters: int) -> tuple[int, Splats]:
     """Encode and decode splats; return the bytes of the folder and the decoded splats.
 
-    As in gsplat, only as many Gaussians are kept as fill a square grid; the most opaque ones stay.
+    As in gsplat, only the most opaque Gaussians are kept, as many as fill a square grid.
 
     Args:
         splats: splats in the order of `sort_in_morton_order`.

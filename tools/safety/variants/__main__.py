@@ -25,7 +25,7 @@ from tools.safety.variants.working_set import WorkingSet
 
 
 def list_layouts(source: Path) -> list[str]:
-    """Return the layouts as which a data set can be read."""
+    """Return the layouts in which a data set can be read."""
     marker_files = {"colmap": "sparse", "nerfstudio": "transforms.json", "blender": "transforms_train.json"}
     return [layout for layout, marker in marker_files.items() if (source / marker).exists()]
 
