@@ -9,7 +9,7 @@
     print(hyrfpack.evaluate_model(model, scene.test).psnr)
     picture = hyrfpack.render_view(model, scene.test[0].camera).rgb
 
-Importing hyrfpack loads no other package. Each name below loads the modules that it needs when it is first used.
+Importing hyrfpack loads none of its packages. Each name below loads what it needs when it is first used.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ except ModuleNotFoundError:  # Windows
 # A temporary file's name is this prefix, random digits and this suffix.
 TEMPORARY_PREFIX = ".hyrfpack-"
 TEMPORARY_SUFFIX = ".tmp"
-MAX_NAME_BYTES = 255  # the limit of common file systems
+MAX_NAME_BYTES = 255  # This is the limit of common file systems.
 _SUFFIX_PART = r"\.[A-Za-z][A-Za-z0-9]*"
 _STEM_AND_SUFFIX = re.compile(rf"(.+?)((?:{_SUFFIX_PART}){{1,2}})", re.DOTALL)
 

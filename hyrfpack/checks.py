@@ -16,7 +16,7 @@ def check_int(name: str, value: Any, minimum: int, maximum: int | None = None) -
     """Check that a value is an int, not a bool, in [minimum, maximum].
 
     Raises:
-        ValueError: it is not.
+        ValueError: the check fails.
     """
     is_int = isinstance(value, int) and not isinstance(value, bool)
     if is_int and value >= minimum and (maximum is None or value <= maximum):
@@ -29,7 +29,7 @@ def check_float(name: str, value: Any, minimum: float = 0.0, maximum: float = MA
     """Check that a value is a float or an int, not a bool and not NaN, in [minimum, maximum].
 
     Raises:
-        ValueError: it is not.
+        ValueError: the check fails.
     """
     if isinstance(value, float | int) and not isinstance(value, bool) and minimum <= value <= maximum:
         return
@@ -41,7 +41,7 @@ def check_bool(name: str, value: Any) -> None:
     """Check that a value is True or False.
 
     Raises:
-        ValueError: it is not.
+        ValueError: the check fails.
     """
     if not isinstance(value, bool):
         raise ValueError(f"{name} is {value!r}; it must be True or False")
@@ -51,7 +51,7 @@ def check_choice(name: str, value: Any, choices: Collection[str]) -> None:
     """Check that a value is one of the choices.
 
     Raises:
-        ValueError: it is not.
+        ValueError: the check fails.
     """
     if value not in choices:
         raise ValueError(f"{name} is {value!r}; it must be one of {', '.join(choices)}")
@@ -61,7 +61,7 @@ def check_pair(name: str, value: Any) -> None:
     """Check that a value is a tuple of two.
 
     Raises:
-        ValueError: it is not.
+        ValueError: the check fails.
     """
     if not (isinstance(value, tuple) and len(value) == 2):
         raise ValueError(f"{name} is {value!r}; it must be a tuple of two numbers")

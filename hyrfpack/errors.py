@@ -84,7 +84,7 @@ def strip_path(error: HyrfError, path: object) -> str:
 
 
 def short_reason(error: Exception, max_length: int = 120) -> str:
-    """Return the first line of another library's error message, to be quoted in one of ours; else the error's type."""
+    """Return the first line of another library's error message, or the error's type, to be quoted in one of ours."""
     return str(error).splitlines()[0][:max_length] if str(error) else type(error).__name__
 
 

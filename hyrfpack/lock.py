@@ -36,8 +36,8 @@ def exclusive_folder(
     Args:
         folder: the folder to write into.
         remedy: what the user can name instead, for the message: "another folder with --work".
-        ranks: processes that work together, all of which call this. The main process holds the lock; if it is refused,
-            all of them raise the error.
+        ranks: processes that work together, all of which call this. The main process holds the lock; if it cannot
+            get the lock, all of them raise the error.
 
     Raises:
         HyrfError: another call is working in the folder, or the folder cannot be created.
@@ -52,7 +52,7 @@ def exclusive_folder(
     try:
         yield
     finally:
-        with suppress(OSError):  # rmdir fails for a folder that is not empty, and keeps it.
+        with suppress(OSError):  # A folder that is not empty stays, because rmdir fails.
             for path in created:
                 path.rmdir()
         if handle is not None:

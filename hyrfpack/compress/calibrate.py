@@ -321,7 +321,7 @@ def _correct_by_measurement(
 
 
 def _replace_arrays(model: HybridModel, arrays: dict[str, np.ndarray]) -> HybridModel:
-    """Return a copy of a model whose sections named in `arrays` hold these numbers instead."""
+    """Return a copy of a model in which some sections have the numbers of `arrays` (by section)."""
     changed = deepcopy(model)
     changed.load_state_dict(dict(iter_parameters(arrays, changed)), strict=False)
     return changed

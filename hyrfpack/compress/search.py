@@ -42,8 +42,9 @@ def find_coarsest(
     Returns:
         The distortion and its trial; None if not even the smallest distortion fits.
     """
-    low: float | None = None  # the largest distortion that fits
-    high: float | None = None  # the smallest distortion that does not fit
+    # The bracket is from the largest distortion that fits to the smallest one that does not fit.
+    low: float | None = None
+    high: float | None = None
     distortion, best = min(max(start, bounds[0]), bounds[1]), None
     for _ in range(trials):
         trial = make_trial(distortion)

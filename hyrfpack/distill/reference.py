@@ -41,7 +41,7 @@ def reference_scene(name: str, drawable: Drawable, train: Sequence[Camera], test
 
 
 def render_reference(drawable: Drawable, camera: Camera) -> Picture:
-    """Render the splats from a camera as a picture of 8 bits with straight alpha."""
+    """Render the splats from a camera as a picture of 8 bits per channel with straight alpha."""
     make_current(drawable.device)  # the current device is kept per thread, and this may be a prefetching thread
     rendered = draw(drawable, camera)
     alpha = 1 - rendered.transmittance

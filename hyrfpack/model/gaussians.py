@@ -54,7 +54,7 @@ class Gaussians(nn.Module):
 def take_rows(values: Tensor, index: Tensor) -> Tensor:
     """Return the rows values[index] (n, C), for index (n,) int64 without repeated rows; differentiable.
 
-    As no row is taken twice, the backward pass copies gradients and need not sum them. For the sum torch would sort the
+    As no row is taken twice, the backward pass copies gradients instead of summing them, for which torch would sort the
     indices.
     """
     return _TakeRows.apply(values, index)

@@ -181,7 +181,7 @@ def splat_inputs(model: HybridModel, viewpoint: Tensor) -> dict[str, Tensor]:
 def decoder_inputs(model: HybridModel, viewpoint: Tensor) -> Iterator[tuple[str, Field, Tensor]]:
     """Yield the name of each field, the field, and the inputs (N, inputs) of its decoder for all Gaussians.
 
-    They are seen from a point (3,) in local units.
+    The Gaussians are seen from `viewpoint` (3,) in local units.
     """
     positions = model.gaussians.positions.detach()
     seen = encode_views(positions, viewpoint.to(positions), model.config.direction_encoding)

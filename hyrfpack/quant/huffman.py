@@ -299,10 +299,10 @@ def huffman_decode(stream: HuffmanStream) -> np.ndarray:
     if (int(ends[-1]) + 7) // 8 != len(stream.payload):
         raise DamagedDataError("Huffman stream: its chunks do not add up to its length; the data is damaged")
     steps, lanes = min(interval, count), len(ends)
-    left_over = count - (lanes - 1) * interval  # symbols in the last chunk
+    left_over = count - (lanes - 1) * interval  # The last chunk has this many symbols.
 
     halves = np.frombuffer(stream.payload + bytes(20 + -len(stream.payload) % 4), ">u4").astype(np.uint64)
-    windows = halves[:-1] << np.uint64(32) | halves[1:]  # the 64 bits that start at each 32nd bit
+    windows = halves[:-1] << np.uint64(32) | halves[1:]  # A window has the 64 bits from every 32nd bit on.
     table, leaf_entries = _decoding_tables(stream.code, count)
     has_long = len(leaf_entries) > 0
     peek_shift = np.uint64(64 - int(table.size).bit_length() + 1)

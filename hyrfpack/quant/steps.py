@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-FIXED_POINT_ONE = 1 << 24  # the number 1 in fixed point, whose unit is 2^-24
-ALL_ZERO_CODE = 0  # code of a group whose numbers are all zero, so that no symbols are stored
+FIXED_POINT_ONE = 1 << 24  # The unit of fixed-point numbers is 2^-24.
+ALL_ZERO_CODE = 0  # A group with this code has only zeros, so no symbols are stored.
 
 
 def decode_step(code: int | np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Exchange of gradients and step statistics between the processes that train one model."""
+"""Exchange gradients and step statistics between the processes that train one model."""
 
 from __future__ import annotations
 

@@ -74,7 +74,7 @@ class ScenePilots:
     """Runs pilots of one scene and keeps their scores.
 
     Attributes:
-        scene, config, cache: as given to `__init__`.
+        scene, config, cache: the arguments of `__init__`.
         scores: the scores of all pilots so far.
         steps: number of steps that all pilots have taken so far.
     """
