@@ -57,6 +57,6 @@ def measure_budget(pilots: ScenePilots, exposure: bool) -> tuple[float, str]:
         ]
         gains.append(scores[1] - scores[0])
     gain = fmean(gains)
-    worth = max(gain / EXPECTED_GAIN_DB, BUDGET_FACTORS[0])
-    factor = min(BUDGET_FACTORS, key=lambda factor: abs(math.log(factor / worth)))
+    relative_gain = max(gain / EXPECTED_GAIN_DB, BUDGET_FACTORS[0])
+    factor = min(BUDGET_FACTORS, key=lambda factor: abs(math.log(factor / relative_gain)))
     return factor, f"in {BUDGET_PILOT_STEPS} steps {usual:,} Gaussians scored {gain:+.2f} dB over {small:,}"

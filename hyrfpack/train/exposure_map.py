@@ -141,20 +141,20 @@ def leave_one_out_error(factor: np.ndarray, gains: np.ndarray, ridge: float) -> 
     design = np.column_stack((np.ones(len(gains)), factor))
     penalty = np.diag([0.0] + [ridge] * factor.shape[1])
     solver = np.linalg.solve(design.T @ design + penalty, design.T)
-    kept = np.maximum(1 - np.einsum("nm,mn->n", design, solver), 1e-9)
-    return float(np.sqrt(np.square((gains - design @ (solver @ gains)) / kept[:, None]).mean()))
+    one_minus_leverages = np.maximum(1 - np.einsum("nm,mn->n", design, solver), 1e-9)
+    return float(np.sqrt(np.square((gains - design @ (solver @ gains)) / one_minus_leverages[:, None]).mean()))
 
 
 def _solve(
     exposure: ExposureMap, positions: np.ndarray, directions: np.ndarray, gains: np.ndarray, ridge: float
 ) -> ExposureMap:
     """Return the map with the mean and weights that minimise the penalised error, given its centres as stored."""
-    across = exposure.kernel_at(positions, directions)
-    among = exposure.kernel_of_centers()
-    count = len(among)
-    design = np.column_stack((np.ones(len(gains)), across))
+    camera_kernel = exposure.kernel_at(positions, directions)
+    center_kernel = exposure.kernel_of_centers()
+    count = len(center_kernel)
+    design = np.column_stack((np.ones(len(gains)), camera_kernel))
     penalty = np.zeros((count + 1, count + 1))
-    penalty[1:, 1:] = ridge * among
+    penalty[1:, 1:] = ridge * center_kernel
     # Rounding may have made two centres equal. Least squares then takes the smallest of several solutions.
     solution = np.linalg.lstsq(design.T @ design + penalty, design.T @ gains, rcond=1e-10)[0]
     mean, weights = solution[0], solution[1:]

@@ -196,8 +196,8 @@ def _train_in_folder(
         return record
 
     with PhaseLine(silent) as phases:
-        tell_phase = phase or phases.update
-        record = ranks.broadcast(ranks.run_on_all(partial(check, config, tell_phase)))
+        report_phase = phase or phases.update
+        record = ranks.broadcast(ranks.run_on_all(partial(check, config, report_phase)))
     if record is not None:
         return _complete(record, scene, out, config, device, phase, silent, log, ranks)
     if overwrite and not resume and ranks.is_main:
@@ -208,7 +208,7 @@ def _train_in_folder(
     elif questions := _open_questions(scene, config):
         with PhaseLine(silent) as phases, _stop_requests() as stop:
             phases.note(f"{questions} with short pilot runs, scored on validation photos")
-            report_pilot: Report = _ignore_step if report is None else partial(_as_step_nought, report)
+            report_pilot: Report = _ignore_step if report is None else partial(_report_as_step_zero, report)
             # Every rank runs all pilots, so that no rank waits for another.
             pilots = partial(decide, scene, config, cache, device, report_pilot, stop, phase or phases.update)
             answers = ranks.all_gather(ranks.run_on_all(pilots))
@@ -231,8 +231,8 @@ def _train_in_folder(
         checkpoint.unlink(missing_ok=True)
     with ExitStack() as stack:
         with (
-            _naming_the_checkpoint(trainer, overwrite),
-            ProgressLine(trainer.steps, trainer.step, silent, _shorter(device)) as line,
+            _checkpoint_named_in_errors(trainer, overwrite),
+            ProgressLine(trainer.steps, trainer.step, silent, _describe_shortening(device)) as line,
             _stop_requests() as stop,
         ):
             for choice in decisions.reasons:
@@ -258,11 +258,11 @@ def _train_in_folder(
                 written.end(complete=complete, step=trainer.step)
             return TrainResult(complete, trainer.step, out / MODEL_FILE if complete else None, {})
         with PhaseLine(silent) as phases:
-            tell_phase = phase or phases.update
-            with _naming_the_checkpoint(trainer, overwrite):
-                record = save_model(trainer, out, tell_phase, overwrite=replace)
-            results = write_results(record, scene, out, config, device, tell_phase, overwrite=replace)
-            missing = _tell_missing(results, phases)
+            report_phase = phase or phases.update
+            with _checkpoint_named_in_errors(trainer, overwrite):
+                record = save_model(trainer, out, report_phase, overwrite=replace)
+            results = write_results(record, scene, out, config, device, report_phase, overwrite=replace)
+            missing = _note_missing(results, phases)
         if METRICS_FILE not in results.missing and (replace or trainer.saved is not None):
             checkpoint.unlink(missing_ok=True)
         if written:
@@ -312,13 +312,13 @@ def _complete(
         results = write_results(record, scene, out, config, device, phase or phases.update, overwrite=True)
         if written:
             _log_end(written, record.step, results)
-        missing = _tell_missing(results, phases)
+        missing = _note_missing(results, phases)
     if METRICS_FILE not in results.missing:
         (out / CHECKPOINT_FILE).unlink(missing_ok=True)
     return TrainResult(True, record.step, out / record.model, results.metrics, missing)
 
 
-def _tell_missing(results: Results, line: PhaseLine) -> str:
+def _note_missing(results: Results, line: PhaseLine) -> str:
     """Print which results are missing, if any, and return the printed sentence."""
     if not results.missing:
         return ""
@@ -340,7 +340,7 @@ def _ignore_step(step: int, loss: float, mse: float, gaussians: int) -> None:
     """Ignore a step of a pilot run, because the progress of pilots is reported as a phase."""
 
 
-def _as_step_nought(report: Report, step: int, loss: float, mse: float, gaussians: int) -> None:
+def _report_as_step_zero(report: Report, step: int, loss: float, mse: float, gaussians: int) -> None:
     report(0, loss, mse, gaussians)
 
 
@@ -349,7 +349,7 @@ def resuming(overwrite: bool) -> str:
     return f"the same command with `resume=True`{' instead of `overwrite=True`' if overwrite else ''}"
 
 
-def _shorter(device: torch.device) -> str:
+def _describe_shortening(device: torch.device) -> str:
     """Describe, as words of a sentence, how to shorten a run on a device."""
     ways = ["fewer steps", "smaller photos", "fewer Gaussians"]
     if device.type == "cpu":
@@ -358,7 +358,7 @@ def _shorter(device: torch.device) -> str:
 
 
 @contextmanager
-def _naming_the_checkpoint(trainer: Trainer, overwrite: bool) -> Iterator[None]:
+def _checkpoint_named_in_errors(trainer: Trainer, overwrite: bool) -> Iterator[None]:
     """Add to the fix of an error of reading or writing that the checkpoint is kept and how to resume from it."""
     try:
         yield
