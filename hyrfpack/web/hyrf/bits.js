@@ -1,4 +1,4 @@
-// Reads packed values of different bit widths. Each value is stored from its lowest bit on, into the lowest free bit.
+// Reads packed unsigned integers of different bit widths. Each value starts at the lowest free bit of the stream.
 
 import { assertValid } from "./errors.js";
 
@@ -8,7 +8,7 @@ export const MAX_BITS_PER_READ = 24;
 /** Reads unsigned values from packed bits, from the first to the last. */
 export class BitReader {
   /**
-   * @param {Uint8Array} data exactly the packed bytes
+   * @param {Uint8Array} data the packed bytes, without any before or after them
    * @param {number} bits the sum of the bit widths of all values
    * @throws {DamagedData} the number of bytes does not fit `bits`, or the unused bits at the end are not zero
    */
@@ -23,8 +23,9 @@ export class BitReader {
 
   /**
    * Reads the next value.
-   * @param {number} bits its width, at most MAX_BITS_PER_READ; the widths of all calls add up to at most `bits` of the
-   *   constructor
+   * @param {number} bits its width, 0 to MAX_BITS_PER_READ. The widths of all calls add up to at most the `bits` of the
+   *   constructor.
+   * @returns {number} 0 to 2^bits - 1
    */
   take(bits) {
     while (this.count < bits) {

@@ -1,4 +1,4 @@
-// Codec 7 (docs/reference/format.md 3.4): channels of numbers in the order of the Gaussians. Each number is predicted from
+// Decodes channels of numbers, one per Gaussian (codec 7, docs/reference/format.md 3.4). Each number is predicted from
 // numbers of the same channel that were decoded before it.
 
 import { assertValid } from "./errors.js";
@@ -17,11 +17,11 @@ const MAX_DIFFERENCE_STEPS = 2 ** 30;
 
 /**
  * Decodes a section of 1 or 3 channels.
- * @param {Uint8Array} data
+ * @param {Uint8Array} data the bytes of the section
  * @param {LatticePoints} points the positions of the same Gaussians
  * @param {number} columns 1, or 3 for channels that are coordinates in an orthonormal basis
- * @returns {Float32Array} (columns N), row by row
- * @throws {DamagedData}
+ * @returns {Float32Array} (N x columns), row by row
+ * @throws {DamagedData} a length, a header or a number is invalid
  */
 export const decodeChannels = (data, points, columns) => {
   const { count } = points;
@@ -53,9 +53,9 @@ export const decodeChannels = (data, points, columns) => {
 
 /**
  * Decodes the channel at the start of `data`.
- * @param {Uint8Array} data
+ * @param {Uint8Array} data the rest of the section
  * @param {LatticePoints} points
- * @returns {{numbers: Float64Array, size: number}} the numbers (N), and how many bytes the channel takes
+ * @returns {{numbers: Float64Array, size: number}} the N numbers, and the length of the channel in bytes
  */
 const decodeChannel = (data, { classes, count }) => {
   assertValid(data.length >= CHANNEL_HEADER_BYTES, "it ends within the header of a channel");
@@ -83,9 +83,10 @@ const decodeChannel = (data, { classes, count }) => {
 };
 
 /**
- * Adds to each difference the prediction from its neighbours, in place, from the largest distance to the smallest.
- * @param {Float64Array} values integers below 2^45; differences before, values after
- * @param {number} weight of the prediction, in units of 1/16 of the mean of both neighbours
+ * Adds to each difference the prediction from its two neighbours, in place. The distance to the neighbours is a power
+ * of two that is halved in each pass.
+ * @param {Float64Array} values the differences, replaced by the values: integers of magnitude below 2^45
+ * @param {number} weight 1 to 16; the prediction is weight / 16 times the mean of both neighbours
  */
 const addPredictions = (values, weight) => {
   const count = values.length;

@@ -4,8 +4,8 @@ import { crc32 } from "./crc.js";
 import { HyrfFormatError, groupedDigits, quotedText, rejectDamaged, rejectNewer } from "./errors.js";
 
 /**
- * An entry of the table of contents. `stored` and `raw` are the section's bytes in the file and after decoding;
- * `end` is the offset after its padding.
+ * An entry of the table of contents. `stored` and `raw` are the section's lengths in the file and after decoding, in
+ * bytes; `offset` and `end` are where its bytes start and where its padding ends; `checksum` is the CRC-32.
  * @typedef {{
  *   type: string, codec: number, offset: number, stored: number, raw: number, checksum: number, end: number,
  * }} Entry
@@ -16,7 +16,7 @@ const MAJOR_VERSION = 1;
 export const HEADER_BYTES = 48;
 export const ENTRY_BYTES = 40;
 export const MAX_SECTIONS = 1024;
-const MAX_FILE_BYTES = 2 ** 34; // the limit of a file's decoded bytes, too
+const MAX_FILE_BYTES = 2 ** 34; // limits a file and its decoded bytes
 // A file of n bytes may declare at most MAX_RAW_BYTES_PER_BYTE n + BASE_RAW_BYTES decoded bytes, so that a small file
 // cannot claim large memory.
 const MAX_RAW_BYTES_PER_BYTE = 1024;
@@ -49,13 +49,13 @@ export class Container {
   /**
    * @param {Uint8Array} bytes the whole file, or its start
    * @param {boolean} partial whether the start of a file is accepted
-   * @throws {HyrfFormatError}
+   * @throws {HyrfFormatError} the header or the table of contents is invalid, or the file is truncated
    */
   constructor(bytes, partial) {
     this.bytes = bytes;
     /** @type {[number, number]} */
     this.version = [MAJOR_VERSION, 0];
-    /** The length of the whole file in bytes, by its header. */
+    /** The length of the whole file in bytes, from its header. */
     this.length = 0;
     /** @type {Map<string, Entry>} */
     this.entries = new Map();
@@ -72,9 +72,9 @@ export class Container {
   }
 
   /**
-   * Returns the stored bytes of a section, after a check of its checksum and its padding.
-   * @param {string} type of a section that is available
-   * @throws {HyrfFormatError}
+   * Returns the stored bytes of a section, after it has checked their checksum and their padding.
+   * @param {string} type the type of an available section
+   * @throws {HyrfFormatError} the checksum or the padding is wrong
    */
   stored(type) {
     const entry = /** @type {Entry} */ (this.entries.get(type));
@@ -86,9 +86,9 @@ export class Container {
   }
 
   /**
-   * Checks the header, by steps 1 to 3 of docs/reference/format.md 1.3.
-   * @param {boolean} partial
-   * @returns {DataView} the table of contents
+   * Checks the header by steps 1 to 3 of docs/reference/format.md 1.3.
+   * @param {boolean} partial whether the start of a file is accepted
+   * @returns {DataView} the table of contents, whose checksum is right
    */
   checkHeader(partial) {
     const { bytes } = this;
@@ -98,7 +98,7 @@ export class Container {
       throw new HyrfFormatError("This is not a .hyrf file; check the address or the path.");
     }
     const view = new DataView(bytes.buffer, bytes.byteOffset, available);
-    // The version is checked first, because another major version may change the layout of all that follows it.
+    // The version is checked first, because another major version may change the layout of everything after it.
     if (available >= 12) {
       this.version = [view.getUint16(8, true), view.getUint16(10, true)];
       if (this.version[0] !== MAJOR_VERSION) {
@@ -134,7 +134,7 @@ export class Container {
   }
 
   /**
-   * Checks the table of contents and fills `entries`, by steps 4 to 6 of docs/reference/format.md 1.3.
+   * Checks the table of contents by steps 4 to 6 of docs/reference/format.md 1.3, and fills `entries`.
    * @param {DataView} table
    */
   checkEntries(table) {
@@ -165,7 +165,7 @@ export class Container {
 /**
  * Throws the error for a file of which too few bytes are available.
  * @param {Container} container
- * @param {number} needed how many bytes of the file are needed
+ * @param {number} needed the number of bytes, from the start of the file, that are needed
  * @returns {never}
  */
 export const rejectIncomplete = (container, needed) => {
@@ -174,7 +174,7 @@ export const rejectIncomplete = (container, needed) => {
 };
 
 /**
- * Reads an unsigned 64-bit integer. Beyond 2^53 it is rounded to the nearest number, which is far above every limit.
+ * Reads an unsigned 64-bit integer. Above 2^53 it is rounded, which is harmless, because all limits are far lower.
  * @param {DataView} view
  * @param {number} at the offset in bytes
  */

@@ -9,7 +9,7 @@ export class HyrfFormatError extends Error {
   }
 }
 
-/** The bytes of a section are invalid. The caller that knows the section's name turns it into a HyrfFormatError. */
+/** The bytes of a section are invalid. A caller that knows the section's name converts this to a HyrfFormatError. */
 export class DamagedData extends Error {}
 
 /**
@@ -32,7 +32,7 @@ export const rejectNewer = (what) => {
 
 /**
  * Throws DamagedData unless a condition holds.
- * @param {boolean} holds
+ * @param {boolean} holds whether the condition holds
  * @param {string} what the reason
  */
 export const assertValid = (holds, what) => {

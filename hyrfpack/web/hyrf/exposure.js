@@ -3,10 +3,10 @@
 import { assertValid } from "./errors.js";
 
 /**
- * An exposure map. `box`: smallest and largest coordinates of the training cameras (6 numbers, local units); `lengths`:
+ * An exposure map. `box`: minimum and maximum coordinates of the training cameras (6 numbers, local units); `lengths`:
  * the kernel's length scales for positions (local units) and for directions (unit vectors); `mean`: log gains far from
- * all centers; `limits`: lowest and highest log gains (6 numbers). Each center has a position in local units, a viewing
- * direction, and the log gains that the kernel weights.
+ * all centers (3 numbers); `limits`: minimum and maximum log gains (6 numbers). Each center has a position in local
+ * units, a viewing direction of unit length, and the 3 log gains that the kernel weights.
  * @typedef {{
  *   box: Float32Array, lengths: Float32Array, mean: Float32Array, limits: Float32Array,
  *   centers: {position: number[], direction: number[], weight: number[]}[],
@@ -23,10 +23,10 @@ const AXES = [0, 1, 2];
 
 /**
  * Decodes an exposure map (codec 9).
- * @param {Uint8Array} data
- * @param {number} rawLength the section's decoded bytes by the table of contents
+ * @param {Uint8Array} data the bytes of the section
+ * @param {number} rawLength the section's decoded length in bytes, from the table of contents
  * @returns {ExposureMap}
- * @throws {DamagedData}
+ * @throws {DamagedData} a length or a number is invalid
  */
 export const decodeExposure = (data, rawLength) => {
   const count = data[0], { length } = data;
@@ -58,7 +58,7 @@ export const decodeExposure = (data, rawLength) => {
  *     clip(mean + sum over centers of weight / (1 + |x' - position|^2 / lengths[0]^2 + |f - direction|^2 /
  *     lengths[1]^2))
  *
- * where x' is the point of `box` nearest to the viewpoint and f its viewing direction. A channel y of the picture is
+ * where x' is the point of `box` nearest to the viewpoint and f is the viewing direction. A channel y of the picture is
  * displayed as g y / (1 + (g - 1) y) with g = exp(log gain).
  * @param {ExposureMap} exposure
  * @param {ArrayLike<number>} position 3 numbers, local units

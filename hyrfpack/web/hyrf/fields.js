@@ -1,5 +1,5 @@
-// Evaluates the two fields of a model on the CPU: hash grids with small decoders (docs/reference/format.md 2.3, 2.4, 2.7).
-// Inputs and outputs are float32; all sums are computed in float64.
+// Evaluates the two fields of a model on the CPU: hash grids with small decoders (docs/reference/format.md 2.3, 2.4 and
+// 2.7). Inputs and outputs are float32; all sums are computed in float64.
 
 import { HASH_FACTOR_Y, HASH_FACTOR_Z, decoderLayout, gridLevels } from "./grids.js";
 
@@ -16,7 +16,7 @@ const OUTPUTS_PER_GROUP = 8;
  *
  * A field that is prepared for evaluation. The decoder's first layer is split in two: `first` reads the features of a
  * position, `directional` the encoded direction. The Float64Arrays are buffers for ROWS_PER_BATCH rows: contracted
- * positions (`places`), distances from the frame's centre but at least 1 (`radii`), hash features, encoded directions
+ * positions (`places`), max(1, distance from the frame's centre) (`radii`), hash features, encoded directions
  * (`encoded`), and the outputs of the three layers.
  * @typedef {{levels: import("./grids.js").GridLevel[], table: Float32Array, encoding: string,
  *   first: Layer, directional: Layer, middle: Layer, last: Layer,
@@ -36,10 +36,10 @@ const preparedFields = new WeakMap();
 /**
  * Evaluates the geometry field: opacities, scales and rotations of Gaussians `start` to `stop`.
  * @param {Model} model
- * @param {number} start
- * @param {number} stop
- * @returns {{opacities: Float32Array, scales: Float32Array, quats: Float32Array}} n in [0, 1]; 3 n standard deviations,
- *   local units; 4 n, wxyz of unit length
+ * @param {number} start the index of the first Gaussian
+ * @param {number} stop the index after the last Gaussian
+ * @returns {{opacities: Float32Array, scales: Float32Array, quats: Float32Array}} opacities (n) in [0, 1]; scales
+ *   (3 n), standard deviations in local units; quaternions (4 n), wxyz of unit length
  */
 export function decodeGeometry(model, start, stop) {
   const { geometry } = getPreparedFields(model), { scale_rule: rule, scale_grows: grows } = model.config;
@@ -75,8 +75,8 @@ export function decodeGeometry(model, start, stop) {
 /**
  * Evaluates the view-independent part of the colour decoder's first layer, before its ReLU, for `colorsAlong`.
  * @param {Model} model
- * @param {number} start
- * @param {number} stop
+ * @param {number} start the index of the first Gaussian
+ * @param {number} stop the index after the last Gaussian
  * @returns {Float32Array} `config.hidden` numbers for each Gaussian
  */
 export function firstLayers(model, start, stop) {
@@ -98,8 +98,8 @@ export function firstLayers(model, start, stop) {
  * Evaluates the colours of Gaussians `start` to `stop` along given directions.
  * @param {Model} model
  * @param {Float32Array} layers from `firstLayers`, of the same Gaussians
- * @param {number} start
- * @param {number} stop
+ * @param {number} start the index of the first Gaussian
+ * @param {number} stop the index after the last Gaussian
  * @param {Float32Array} directions 3 n: unit vectors from the viewpoint to each Gaussian
  * @returns {Float32Array} 3 n in [0, 1]
  */
@@ -109,12 +109,12 @@ export function colorsAlong(model, layers, start, stop, directions) {
 }
 
 /**
- * Evaluates colours of selected Gaussians along given directions. A Gaussian may be selected more than once.
+ * Evaluates colours in [0, 1] of selected Gaussians along given directions. A Gaussian may be selected repeatedly.
  * @param {Model} model
  * @param {Float32Array} layers from `firstLayers`
  * @param {number} start the first Gaussian of `layers`
  * @param {Int32Array} rows n: the selected Gaussians, counted from `start`
- * @param {Float32Array} directions 3 n or more
+ * @param {Float32Array} directions 3 n or more: a unit vector from the viewpoint for each selected Gaussian
  * @param {Float32Array} colors 3 n or more, overwritten
  * @returns {Float32Array} `colors`
  */
@@ -165,7 +165,7 @@ export function backgroundColors(model, places, directions) {
 }
 
 /**
- * The logistic function, 1 / (1 + e^-x).
+ * Returns the logistic function 1 / (1 + e^-x).
  * @param {number} logit
  */
 const sigmoid = (logit) => 1 / (1 + Math.exp(-logit));
@@ -173,7 +173,7 @@ const sigmoid = (logit) => 1 / (1 + Math.exp(-logit));
 // --- prepared fields -------------------------------------------------------------------------------------------------
 
 /**
- * Returns the prepared fields of a model, and prepares them in the first call.
+ * Returns the prepared fields of a model. The first call for a model prepares them.
  * @param {Model} model
  * @returns {Record<FieldName, PreparedField>}
  */
@@ -208,12 +208,12 @@ function prepareField(model, which) {
 
 /**
  * Copies columns `from` to `to` of a layer's matrix into groups: for each input, the weights of OUTPUTS_PER_GROUP
- * outputs are adjacent. The last group is padded with zeros. Unless `biased`, all biases are zero.
- * @param {Float32Array} decoder
+ * outputs are adjacent. The last group is padded with zeros.
+ * @param {Float32Array} decoder the decoder's numbers
  * @param {import("./grids.js").DecoderLayer} layer
- * @param {number} from
- * @param {number} to
- * @param {boolean} biased
+ * @param {number} from the index of the first column (input)
+ * @param {number} to the index after the last column
+ * @param {boolean} biased whether the layer's biases are copied, too
  * @returns {Layer}
  */
 function packLayer(decoder, { inputs, outputs, matrix, bias }, from, to, biased) {
@@ -235,9 +235,9 @@ function packLayer(decoder, { inputs, outputs, matrix, bias }, from, to, biased)
 /**
  * Maps local positions into the unit cube of the hash grids (the contraction of docs/reference/format.md 2.3).
  * @param {Model} model
- * @param {Float32Array} positions
- * @param {number} first
- * @param {number} rows
+ * @param {Float32Array} positions local units
+ * @param {number} first the index of the first position to be mapped
+ * @param {number} rows the number of positions to be mapped, at most ROWS_PER_BATCH
  * @param {Float64Array} places receives the contracted positions
  * @param {Float64Array} radii receives max(1, |u|) of each position u in units of the half extents
  */
@@ -268,7 +268,7 @@ function encodePositions({ levels, table, places, features }, rows) {
     for (let row = 0, from = 0, to = 2 * level; row < rows; row++, from += 3, to += wide) {
       const vx = places[from] * span, vy = places[from + 1] * span, vz = places[from + 2] * span;
       const x = Math.min(vx | 0, most), y = Math.min(vy | 0, most), z = Math.min(vz | 0, most); // NaN | 0 is 0
-      let y0, y1, z0, z1, a, b, c, d, e, f, g, h; // corners: x, then y, then z
+      let y0, y1, z0, z1, a, b, c, d, e, f, g, h; // a to h: the rows of the 8 corners; x varies fastest
       if (dense) {
         y0 = resolution * (y + resolution * z) + x;
         y1 = y0 + resolution;
@@ -298,9 +298,9 @@ function encodePositions({ levels, table, places, features }, rows) {
 // --- directions ------------------------------------------------------------------------------------------------------
 
 /**
- * Encodes directions `first` to `first + rows` into the buffer `encoded`.
+ * Encodes `rows` directions, from the one with index `first` on, into the buffer `encoded`.
  * @param {PreparedField} field
- * @param {Float32Array} directions
+ * @param {Float32Array} directions unit vectors
  * @param {number} first
  * @param {number} rows
  */
@@ -369,13 +369,14 @@ function runLaterLayers(field, rows, outputs) {
 }
 
 /**
- * Runs one layer of a decoder, without the ReLU after it. Inputs of 0 are skipped: after a ReLU they are about half.
+ * Runs one layer of a decoder, without the ReLU after it. Zero inputs are skipped, because a ReLU sets about half of
+ * its outputs to zero.
  * @param {Layer} layer
- * @param {Float64Array} from inputs
- * @param {number} apart the distance between rows of inputs
+ * @param {Float64Array} from the inputs
+ * @param {number} apart the distance in `from` between the starts of two rows
  * @param {boolean} rectified whether a ReLU is applied to the inputs
  * @param {number} rows
- * @param {Float64Array} to outputs
+ * @param {Float64Array} to receives the outputs, `stride` numbers for each row
  */
 function runLayer({ inputs, stride, weights, biases, index, value }, from, apart, rectified, rows, to) {
   const groupSize = inputs * OUTPUTS_PER_GROUP;
@@ -383,7 +384,7 @@ function runLayer({ inputs, stride, weights, biases, index, value }, from, apart
     let used = 0;
     for (let i = 0, at = row * apart; i < inputs; i++, at++) {
       const number = from[at];
-      if (rectified ? number <= 0 : number === 0) continue; // NaN is neither
+      if (rectified ? number <= 0 : number === 0) continue; // false for NaN, which is kept
       index[used] = i * OUTPUTS_PER_GROUP;
       value[used++] = number;
     }

@@ -1,11 +1,11 @@
 // Computes the shapes of hash grids (docs/reference/format.md 2.3) and decoders (2.4) from a model's configuration.
 
 /**
- * A hash grid, as the metadata has it.
+ * A hash grid, with the keys of the metadata. `base` and `finest` are the resolutions of its first and last level.
  * @typedef {{log2_table_size: number, levels: number, base: number, finest: number}} Grid
  *
- * A level of a hash grid: `resolution` is the number of vertices along an axis; `rows` and `first` are the number of
- * its table rows and the first of them; `dense` says whether each vertex has a row of its own.
+ * A level of a hash grid: `resolution` is the number of vertices along an axis; `rows` is the number of its table rows
+ * and `first` the index of the first one; `dense` is true if each vertex has a row of its own.
  * @typedef {{resolution: number, rows: number, first: number, dense: boolean}} GridLevel
  *
  * A layer of a decoder. `matrix` and `bias` are the offsets of its matrix (outputs x inputs, row by row) and its bias
@@ -32,7 +32,7 @@ export const HASH_FACTOR_Y = 2654435761 | 0;
 export const HASH_FACTOR_Z = 805459861;
 
 /**
- * Returns the levels of a grid in the order of its table.
+ * Returns the levels of a grid, from the coarsest to the finest, as they follow each other in its table.
  * @param {Grid} grid
  * @returns {GridLevel[]}
  */
@@ -73,7 +73,7 @@ export const decoderLayout = (config, which) => {
 };
 
 /**
- * Returns how many numbers a field's decoder has.
+ * Returns the number of weights and biases of a field's decoder.
  * @param {DecoderConfig} config
  * @param {FieldName} which
  */

@@ -1,5 +1,5 @@
-// Codec 8 (docs/reference/format.md 3.5): numbers in groups that share a quantisation step. The groups follow from the
-// configuration and the positions, so that they are not stored.
+// Decodes numbers in groups that share a quantisation step (codec 8, docs/reference/format.md 3.5). The groups are not
+// stored, because they follow from the configuration and the positions.
 
 import { assertValid } from "./errors.js";
 import { FEATURES_PER_ROW, HASH_FACTOR_Y, HASH_FACTOR_Z, decoderLayout, gridLevels, tableRows } from "./grids.js";
@@ -13,17 +13,19 @@ import { FIXED_POINT_ONE, STEP_BY_CODE } from "./steps.js";
  * @typedef {import("./grids.js").FieldName} FieldName
  * @typedef {import("./lattice.js").LatticePoints} LatticePoints
  *
- * Groups of numbers: `index` is the group of each row, `count` the number of groups, `width` the numbers of a row.
+ * Groups of numbers: `index` has the group of each row, `count` is the number of groups, `width` the number of numbers
+ * in a row.
  * @typedef {{index: Uint16Array, count: number, width: number}} NumberGroups
  */
 
 const GROUP_MODEL_COUNT = 8;
 const MAX_ABS_SYMBOL = 2 ** 24;
 const USE_CLASSES_PER_LEVEL = 16;
-const MAX_COUNTED_POINTS = 65536; // of a layer with more points, every n-th is counted
+const MAX_COUNTED_POINTS = 65536; // in larger layers only every n-th point is counted, to bound the time
 
 /**
- * Returns the groups of a decoder's numbers: for each layer, a group for each output and then one for the biases.
+ * Returns the groups of a decoder's numbers. Each layer has a group for the weights of each output, and then a group
+ * for all biases.
  * @param {DecoderConfig} config
  * @param {FieldName} which
  * @returns {NumberGroups}
@@ -42,9 +44,10 @@ export const decoderGroups = (config, which) => {
 };
 
 /**
- * Returns the groups of a table's rows: by level, and by how often points read them.
+ * Returns the groups of a table's rows. Rows are grouped by their level and by the number of times that points read
+ * them.
  * @param {Grid} grid
- * @param {LatticePoints} points of the first layer
+ * @param {LatticePoints} points the positions of the first layer's Gaussians
  * @returns {NumberGroups}
  */
 export const tableGroups = (grid, points) => {
@@ -66,7 +69,7 @@ export const tableGroups = (grid, points) => {
  * Counts how many corners of the points' cells read each row of a level.
  * @param {import("./grids.js").GridLevel} level
  * @param {LatticePoints} points
- * @param {Uint32Array} uses the counts of each row, incremented
+ * @param {Uint32Array} uses the count of each row, which is incremented
  */
 const countUses = ({ resolution, rows, dense }, { centers, count }, uses) => {
   const stride = 3 * Math.max(1, Math.ceil(count / MAX_COUNTED_POINTS));
@@ -87,8 +90,8 @@ const countUses = ({ resolution, rows, dense }, { centers, count }, uses) => {
  * Decodes numbers in groups.
  * @param {Uint8Array} data
  * @param {NumberGroups} groups
- * @returns {Float32Array}
- * @throws {DamagedData}
+ * @returns {Float32Array} (rows x width), row by row; 0 where a group has no step
+ * @throws {DamagedData} a length or a number is invalid
  */
 export const decodeGroups = (data, { index, count, width }) => {
   assertValid(data.length >= 8, "it ends within its header");

@@ -1,5 +1,5 @@
-// Converts a model to explicit splats: spherical harmonics are fitted to the colours of its radiance field. Browsers
-// that cannot evaluate the field while the view moves need them, and so do programs that read splats only.
+// Converts a model to explicit splats by fitting spherical harmonics to the colours of its radiance field. Splats are
+// for browsers that cannot evaluate the field while the view moves, and for programs that read only splats.
 
 import { HyrfFormatError } from "./errors.js";
 import { colorsAlong, colorsOfRows, decodeGeometry, firstLayers } from "./fields.js";
@@ -11,18 +11,18 @@ export const HIGHER_HARMONICS_BY_DEGREE = [0, 3, 8, 15];
 export const SH_BAND_0 = 0.28209479177387814;
 
 const SPHERE_DIRECTION_COUNT = 32;
-const SPHERE_TOTAL_WEIGHT = 3e-3; // the weights of all cameras add up to 1
+const SPHERE_TOTAL_WEIGHT = 3e-3; // small against the cameras' weights, which add up to 1
 const RIDGE_WEIGHT = 1e-5;
 const GAUSSIANS_PER_BLOCK = 256; // fitted together, so that the data of a block stays in the cache
 const MIN_VISIBLE_DEPTH_LOCAL = 0.01;
-const PICTURE_MARGIN_RATIO = 0.3; // Gaussians this far outside the picture count as visible, in halves of its size
+const PICTURE_MARGIN_RATIO = 0.3; // Gaussians in this margin count as visible; in halves of the picture's size
 const RANGE_SAMPLE_BLOCKS = 4;
-const CLIPPED_RATIO = 1e-4; // the share of harmonics that are clipped, so that the others get fine steps
-const COARSE_TIME_RATIO = 0.1; // measured: the coarse result takes about this share of the time
+const CLIPPED_RATIO = 1e-4; // clipping a few harmonics gives all others finer steps
+const COARSE_TIME_RATIO = 0.1; // the measured share of the time until the coarse result
 
 /**
- * Explicit splats. World coordinates are `center` + `unit` times theirs; the axes are the world's. The colour along the
- * unit vector d is max(0, `colors` + sum over k > 0 of Y_k(d) harmonic_k).
+ * Explicit splats. The world position of a point p is `center` + `unit` p; the axes are the world's. The colour along
+ * the unit vector d is max(0, `colors` + sum over k > 0 of Y_k(d) harmonic_k).
  * @typedef {{
  *   count: number,
  *   degree: number,
@@ -39,8 +39,8 @@ const COARSE_TIME_RATIO = 0.1; // measured: the coarse result takes about this s
  * }} Splats For each Gaussian: position and scales (standard deviations) in units of `unit`; the rotation, wxyz of unit
  *   length; the opacity in [0, 1]; the colour; RGB of each higher harmonic, (byte - 128) / 128 * range
  *
- * A camera in a model's local units. `bounds` are the least and largest x / z and y / z that count as visible, `focal`
- * is the product of both focal lengths in pixels, `area` the picture's number of pixels.
+ * A camera in a model's local units, at `place`. `bounds` are the minimum and maximum of x / z, then of y / z, that
+ * count as visible; `focal` is the product of both focal lengths in pixels; `area` is the picture's number of pixels.
  * @typedef {{place: number[], rows: number[][], translation: number[], bounds: number[], focal: number, area: number}}
  *   LocalCamera
  *
@@ -48,21 +48,21 @@ const COARSE_TIME_RATIO = 0.1; // measured: the coarse result takes about this s
  */
 
 /**
- * Converts a model to splats. Shapes and opacities are the model's. The colours of each Gaussian minimise, over the
+ * Converts a model to splats with the model's shapes and opacities. The harmonics h of each Gaussian minimise, over the
  * cameras v that see it,
  *
  *     sum_v w_v |f(d_v) - color(d_v)|^2 + s mean_s |f(d_s) - color(d_s)|^2 + r sum_{k > 0} |h_k|^2
  *
- * where s is SPHERE_TOTAL_WEIGHT, r is RIDGE_WEIGHT, w_v is proportional to its area in their pictures, sum_v w_v = 1,
- * and the directions d_s cover the sphere evenly. Occlusion is ignored.
+ * where s is SPHERE_TOTAL_WEIGHT, r is RIDGE_WEIGHT, w_v is proportional to the Gaussian's area in the picture of v,
+ * sum_v w_v = 1, and the directions d_s cover the sphere evenly. Occlusion is ignored.
  *
  * @param {Model} model
  * @param {import("./viewpoint.js").Camera[]} viewpoints cameras in world units; if empty, only the sphere is fitted
  * @param {number} degree of the harmonics, 0 to 3
  * @param {(progress: {done: number, splats: Splats, coarse: boolean}) => unknown} [report] called and awaited after
- *   each block, with the fraction `done` and the splats so far. `coarse` is true once, if there is a Gaussian: all
- *   Gaussians are there then, with their colours from the first viewpoint. An exception that it throws ends the
- *   conversion.
+ *   each block, with the fraction `done` in [0, 1] and the splats so far. `coarse` is true in one call, unless the
+ *   model is empty: then all Gaussians are present, with their colours from the first viewpoint. An exception that
+ *   `report` throws ends the conversion.
  * @returns {Promise<Splats>}
  * @throws {HyrfFormatError} a resulting number is NaN or infinite
  */
@@ -114,8 +114,8 @@ export function chooseHarmonicsRange(sizes) {
  * @param {Model} model
  * @param {Splats} splats
  * @param {LocalCamera[]} cameras
- * @param {number} start
- * @param {number} stop
+ * @param {number} start the index of the first Gaussian
+ * @param {number} stop the index after the last Gaussian
  */
 function decodeBlock(model, splats, cameras, start, stop) {
   const { opacities, scales, quats } = decodeGeometry(model, start, stop);
@@ -132,7 +132,7 @@ function decodeBlock(model, splats, cameras, start, stop) {
 
 /**
  * Throws an error unless all numbers are finite.
- * @param {string} what the numbers' name in the message
+ * @param {string} what the name of the numbers in the message
  * @param {...Float32Array} arrays
  * @throws {HyrfFormatError}
  */
@@ -162,7 +162,7 @@ function toLocalCamera(camera, { center, scale }) {
 }
 
 /**
- * Estimates the area, in pixels, of Gaussian i in a camera's picture; 0 where the camera does not draw it.
+ * Estimates the area, in pixels, of Gaussian i in a camera's picture, or 0 if the camera does not see it.
  * @param {LocalCamera} eye
  * @param {Splats} splats
  * @param {number} i
@@ -178,7 +178,7 @@ function visibleArea({ rows: [right, down, forward], translation: [tx, ty, tz], 
   if (!(along > bounds[2] && along < bounds[3])) return 0;
   const a = scales[3 * i], b = scales[3 * i + 1], c = scales[3 * i + 2];
   const face = Math.max(a * b, b * c, c * a) / (depth * depth);
-  return Math.min(2 * Math.PI * (focal * face + 0.3), area); // no smaller than the renderer's low-pass filter
+  return Math.min(2 * Math.PI * (focal * face + 0.3), area); // 0.3 px^2: variance of the renderer's low-pass
 }
 
 /**
@@ -199,9 +199,9 @@ function writeDirection(eye, positions, i, directions, to) {
 
 // --- least squares ---------------------------------------------------------------------------------------------------
 
-/** Fits harmonics by least squares, one Gaussian after the other. */
+/** Fits harmonics by least squares, one Gaussian at a time. */
 class HarmonicsFit {
-  /** @param {number} degree */
+  /** @param {number} degree 0 to 3 */
   constructor(degree) {
     const terms = (degree + 1) ** 2;
     this.degree = degree;
@@ -243,13 +243,13 @@ class HarmonicsFit {
   }
 
   /**
-   * Fits the colours of Gaussians `start` to `stop`, whose shapes are decoded. `keep` is called with each Gaussian's
-   * number while `right` has its coefficients.
+   * Fits the colours of Gaussians `start` to `stop`, whose shapes are decoded. `keep` is called with the index of each
+   * Gaussian while `right` has its coefficients.
    * @param {Model} model
    * @param {Splats} splats
    * @param {LocalCamera[]} cameras
-   * @param {number} start
-   * @param {number} stop
+   * @param {number} start the index of the first Gaussian
+   * @param {number} stop the index after the last Gaussian
    * @param {(i: number) => void} keep
    */
   block(model, splats, cameras, start, stop, keep) {
@@ -284,8 +284,8 @@ class HarmonicsFit {
   }
 
   /**
-   * Computes the coefficients `right` from rows `from` to `to` of directions, weights and colours. The sphere's rows
-   * are the last ones.
+   * Computes the coefficients `right` from rows `from` to `to` of directions, weights and colours. The last
+   * SPHERE_DIRECTION_COUNT rows are those of the sphere.
    * @param {Float32Array} directions
    * @param {Float64Array} weights
    * @param {Float32Array} colors
@@ -387,12 +387,12 @@ function fibonacciDirections(count) {
 }
 
 /**
- * Evaluates the real spherical harmonics with the Condon-Shortley phase up to a degree, as files of splats use them.
- * @param {number} degree
+ * Evaluates the real spherical harmonics of a direction with the Condon-Shortley phase, the convention of splat files.
+ * @param {number} degree the largest degree, 0 to 3
  * @param {number} x
  * @param {number} y
  * @param {number} z
- * @param {Float64Array} basis
+ * @param {Float64Array} basis receives (degree + 1)^2 numbers
  */
 function evaluateBasis(degree, x, y, z, basis) {
   basis[0] = SH_BAND_0;

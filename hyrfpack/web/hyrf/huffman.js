@@ -17,8 +17,8 @@ const MAX_LOOKUP_BITS = 12; // longer codes are found by binary search
  * Decodes a Huffman stream.
  * @param {Uint8Array} data exactly the bytes of the stream
  * @param {number} count the expected number of symbols
- * @returns {Uint16Array}
- * @throws {DamagedData}
+ * @returns {Uint16Array} the symbols
+ * @throws {DamagedData} the stream is damaged, or has another number of symbols
  */
 export const decodeHuffman = (data, count) => {
   assertValid(data.length >= HUFFMAN_HEADER_BYTES, "a Huffman stream ends within its header");
@@ -51,10 +51,11 @@ export const decodeHuffman = (data, count) => {
 };
 
 /**
- * Builds the prefix code of given lengths, leaf after leaf, and checks it.
- * @param {Int32Array} symbols
- * @param {Uint8Array} lengths in bits
+ * Builds the prefix code of given code lengths, and checks that it is complete.
+ * @param {Int32Array} symbols in the order of their codes
+ * @param {Uint8Array} lengths the length of each symbol's code in bits
  * @returns {HuffmanCode}
+ * @throws {DamagedData} the lengths give no complete prefix code
  */
 const buildHuffmanCode = (symbols, lengths) => {
   const leaves = symbols.length;
@@ -82,10 +83,10 @@ const buildHuffmanCode = (symbols, lengths) => {
 };
 
 /**
- * Finds the last leaf whose code is not above these 64 bits.
+ * Returns the index of the last symbol whose code is at most a number of 64 bits.
  * @param {HuffmanCode} code
- * @param {number} high
- * @param {number} low
+ * @param {number} high the upper 32 bits
+ * @param {number} low the lower 32 bits
  */
 const findLeaf = (code, high, low) => {
   let from = 0, to = code.symbols.length - 1;
@@ -102,22 +103,22 @@ const findLeaf = (code, high, low) => {
  * Decodes the chunks of a stream.
  * @param {Uint8Array} packed
  * @param {number} count
- * @param {number} chunkLength
- * @param {Float64Array} sizes of the chunks in bits
+ * @param {number} chunkLength the number of symbols in a chunk; the last one may have fewer
+ * @param {Float64Array} sizes the length of each chunk in bits
  * @param {HuffmanCode} code
  */
 const decodeChunks = (packed, count, chunkLength, sizes, code) => {
   const { symbols, lengths } = code;
   const decoded = new Uint16Array(count);
   if (count === 0) return decoded;
-  // The table maps the next bits to the leaf whose code they begin with, or to -1 where that code is longer.
+  // The table maps the next bits to the index of the symbol whose code starts them, or to -1 if that code is longer.
   const lookupBits = Math.min(MAX_LOOKUP_BITS, lengths.reduce((longest, length) => Math.max(longest, length), 0));
   const table = Int32Array.from({ length: 2 ** lookupBits }, (_, bits) => {
     const leaf = findLeaf(code, bits * 2 ** (32 - lookupBits), 0);
     return lengths[leaf] <= lookupBits ? leaf : -1;
   });
   /**
-   * Returns the 32 bits from an offset on, with zeros after the end.
+   * Returns the 32 bits that start at an offset. Bits after the end are 0.
    * @param {number} at the offset in bits
    */
   const bitsAt = (at) => {

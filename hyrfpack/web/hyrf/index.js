@@ -12,7 +12,7 @@ import { decodeFloat16, decodeFloat32, decodeMinMax, decodeVectors } from "./pla
 
 export { HyrfFormatError };
 
-// A file of n bytes may have at most MAX_GAUSSIANS_PER_BYTE n + BASE_GAUSSIANS Gaussians.
+// A file of n bytes may have at most MAX_GAUSSIANS_PER_BYTE n + BASE_GAUSSIANS Gaussians, which bounds the memory.
 const MAX_GAUSSIANS_PER_BYTE = 32;
 const BASE_GAUSSIANS = 2 ** 18;
 
@@ -24,8 +24,8 @@ const BASE_GAUSSIANS = 2 ** 18;
  * @typedef {import("./metadata.js").Config} Config
  * @typedef {import("./metadata.js").Metadata} Metadata
  *
- * A field: its hash table (rows x 2) and the numbers of its decoder. `gridLevels` and `decoderLayout` give their
- * shapes.
+ * A field: its hash table (rows x 2, laid out by `gridLevels`) and the weights and biases of its decoder (laid out by
+ * `decoderLayout`).
  * @typedef {{table: Float32Array, decoder: Float32Array}} Field
  *
  * @typedef {{
@@ -41,7 +41,9 @@ const BASE_GAUSSIANS = 2 ** 18;
  *   geometry: Field,
  *   radiance: Field,
  *   exposure: ExposureMap | null,
- * }} Model `exposure` is the exposure map, for `logGains`, or null where the file has none
+ * }} Model `layers` has the number of Gaussians of each layer that was read, and `count` is their sum; `whole` is true
+ *   if these are all layers of the file. `positions` (3 numbers per Gaussian) are in local units. `exposure` is the
+ *   exposure map, for `logGains`, or null if the file has none.
  *
  * @typedef {{
  *   version: [number, number],
@@ -63,8 +65,8 @@ const LAYERED_COLUMNS = [3, 3, 1, 1];
 /**
  * Describes a file by its header and its table of contents.
  * @param {Uint8Array} bytes the start of a file, or all of it
- * @returns {Description} `firstLayer` is the number of bytes, from the start, that a model of the first layer needs
- * @throws {HyrfFormatError}
+ * @returns {Description} all lengths in bytes; a model of the first layer needs the first `firstLayer` bytes
+ * @throws {HyrfFormatError} the header or the table of contents is invalid
  */
 export const describe = (bytes) => {
   const container = new Container(bytes, true);
@@ -80,10 +82,10 @@ export const describe = (bytes) => {
 
 /**
  * Decodes a file.
- * @param {Uint8Array} bytes
- * @param {{partial?: boolean}} [options] `partial`: accept the start of a file, and read the layers that are in it
+ * @param {Uint8Array} bytes the file, or its start if `partial` is true
+ * @param {{partial?: boolean}} [options] `partial`: accept the start of a file, and read the layers that are complete
  * @returns {Promise<Model>}
- * @throws {HyrfFormatError}
+ * @throws {HyrfFormatError} the file is damaged, truncated or too new; or `bytes` has no complete layer
  */
 export const read = async (bytes, { partial = false } = {}) => {
   try {
@@ -104,7 +106,7 @@ const readModel = (container) => {
   const { config } = metadata;
   const counts = metadata.layers?.length ? metadata.layers : [metadata.gaussians];
   const sections = expectedSections(config, counts);
-  sections.forEach((section) => checkSection(container, section)); // all of them before any is decoded
+  sections.forEach((section) => checkSection(container, section)); // all are checked before the first one is decoded
   let layerCount = 1;
   /** @param {number} layer */
   const hasLayer = (layer) => LAYERED_TYPES.every((type) => container.has(layerType(type, layer)));
@@ -145,7 +147,7 @@ const readModel = (container) => {
 };
 
 /**
- * Reads the exposure map; null where the file has none or its bytes are not available yet.
+ * Reads the exposure map. Returns null if the file has none, or if its bytes are not available yet.
  * @param {Container} container
  * @returns {ExposureMap | null}
  */
@@ -184,10 +186,11 @@ const expectedSections = (config, counts) => {
 const fieldOf = (type) => (type.startsWith("G") ? "geometry" : "radiance");
 
 /**
- * Returns the entry of a section; throws an error where there is none.
+ * Returns the entry of a section.
  * @param {Container} container
  * @param {string} type
  * @returns {Entry}
+ * @throws {HyrfFormatError} there is no such section
  */
 const requireEntry = (container, type) =>
   container.entries.get(type) ?? rejectDamaged(`there is no section '${type}', so that it is incomplete`);
@@ -208,7 +211,7 @@ const checkSection = (container, { type, rows, columns }) => {
  * @param {Container} container
  * @param {ExpectedSection} section
  * @param {Config} config
- * @param {LatticePoints[]} points by layer; the section of positions adds its own
+ * @param {LatticePoints[]} points the lattice points of each layer; a section of positions adds its own
  * @returns {Float32Array} (rows x columns), finite
  */
 const decodeSection = (container, section, config, points) => {
@@ -224,7 +227,7 @@ const decodeSection = (container, section, config, points) => {
 };
 
 /**
- * Returns the result of `decode`, and adds the section's name to an error about damaged data.
+ * Returns the result of `decode`. If it throws DamagedData, the error is replaced by one that names the section.
  * @template Decoded
  * @param {string} type
  * @param {() => Decoded} decode
@@ -268,14 +271,14 @@ const decodeNumbers = ({ group, layer, rows, columns }, codec, data, config, poi
 };
 
 /**
- * Returns the array of a section that was decoded.
+ * Returns the array of a decoded section.
  * @param {Map<string, Float32Array>} arrays
  * @param {string} type
  */
 const getArray = (arrays, type) => /** @type {Float32Array} */ (arrays.get(type));
 
 /**
- * Concatenates arrays; a single one is returned as it is.
+ * Concatenates arrays. A single array is returned without a copy.
  * @param {Float32Array[]} parts
  */
 const concatenateArrays = (parts) => {

@@ -24,7 +24,7 @@ LENGTH_BASES[28] = 258;
 /**
  * Builds the canonical prefix code of given lengths.
  * @param {ArrayLike<number>} lengths the length of each symbol's code in bits, 0 for unused symbols
- * @param {boolean} mayBeSingle whether a code of no symbol, or of one symbol of one bit, is accepted
+ * @param {boolean} mayBeSingle whether a code with no symbol, or with one symbol of one bit, is accepted
  * @returns {DeflateCode}
  */
 const buildDeflateCode = (lengths, mayBeSingle) => {
@@ -59,9 +59,9 @@ const adler32 = (bytes) => {
 };
 
 /**
- * Decompresses a zlib stream that ends where the data ends.
- * @param {Uint8Array} data
- * @param {number} length the exact number of decompressed bytes; never more memory is used
+ * Decompresses a zlib stream.
+ * @param {Uint8Array} data the whole stream, without any bytes after it
+ * @param {number} length the exact number of decompressed bytes, which bounds the memory
  * @returns {Uint8Array}
  * @throws {DamagedData} the stream is damaged, or has another length
  */

@@ -1,4 +1,5 @@
-// Decodes streams of integers (docs/reference/format.md 3.1): a token gives the size of each, extra bits its lower digits.
+// Decodes streams of integers (docs/reference/format.md 3.1). Each integer is stored as a token, for its leading bits
+// and its magnitude, and extra bits, for its lower bits.
 
 import { BitReader, MAX_BITS_PER_READ } from "./bits.js";
 import { assertValid } from "./errors.js";
@@ -7,7 +8,7 @@ import { decodeTokens } from "./rans.js";
 const TOKEN_COUNT = 126;
 const FIRST_WIDE_TOKEN = 78; // the first token of integers that do not fit 32 bits
 
-// For each token: how many lower bits of the integer follow it, and the leading bits that the token stands for.
+// For each token: the number of extra bits, and the leading bits that the token stands for.
 const TOKEN_EXTRA_BITS = new Uint8Array(TOKEN_COUNT);
 const TOKEN_LEADING_BITS = new Uint8Array(TOKEN_COUNT);
 for (let token = 0; token < TOKEN_COUNT; token++) {
@@ -23,7 +24,7 @@ for (let token = 0; token < TOKEN_COUNT; token++) {
 }
 
 /**
- * Returns how many extra bits follow tokens in all.
+ * Returns the total number of extra bits of tokens.
  * @param {Uint8Array} tokens
  */
 const sumExtraBits = (tokens) => {
@@ -33,13 +34,13 @@ const sumExtraBits = (tokens) => {
 };
 
 /**
- * Decodes integers of at most 32 bits. Larger ones are treated as damage.
+ * Decodes integers that fit Int32Array.
  * @param {Uint8Array} data exactly the bytes of the integers
  * @param {number} count
  * @param {Uint8Array | null} contexts the context of each integer; null if there is one context
- * @param {boolean} isSigned
+ * @param {boolean} isSigned whether the lowest bit of each stored integer is its sign
  * @returns {Int32Array}
- * @throws {DamagedData}
+ * @throws {DamagedData} the stream is damaged, or an integer is too large
  */
 export const decodeIntegers = (data, count, contexts, isSigned) => {
   const { tokens, end } = decodeTokens(data, count, contexts);
@@ -70,7 +71,7 @@ export const LOW_HALF_BITS = 27;
  * @param {Uint8Array} data exactly the bytes of the integers
  * @param {number} count
  * @returns {{high: Int32Array, low: Int32Array}}
- * @throws {DamagedData}
+ * @throws {DamagedData} the stream is damaged
  */
 export const decodeWideIntegers = (data, count) => {
   const { tokens, end } = decodeTokens(data, count, null);
@@ -84,7 +85,7 @@ export const decodeWideIntegers = (data, count) => {
       continue;
     }
     const lowest = reader.take(MAX_BITS_PER_READ), left = bits - MAX_BITS_PER_READ;
-    let rest = leading << left; // all higher bits; they are at most 32
+    let rest = leading << left; // all bits but the lowest 24: at most 32 bits
     rest |= reader.take(Math.min(left, MAX_BITS_PER_READ));
     if (left > MAX_BITS_PER_READ) rest |= reader.take(left - MAX_BITS_PER_READ) << MAX_BITS_PER_READ;
     low[i] = ((rest & ((1 << half) - 1)) << MAX_BITS_PER_READ) | lowest;

@@ -1,5 +1,5 @@
-// Parses JSON by the rules of docs/reference/format.md 2.1. Unlike JSON.parse, it distinguishes 1 from 1.0 and limits the
-// nesting.
+// Parses JSON by the rules of docs/reference/format.md 2.1. Unlike JSON.parse, it distinguishes 1 from 1.0 and limits
+// the nesting.
 
 import { assertValid } from "./errors.js";
 
@@ -9,7 +9,7 @@ const NUMBER_PATTERN = /-?(?:0|[1-9]\d*)(\.\d+)?([eE][+-]?\d+)?/y;
 /** @type {[string, boolean | null][]} */
 const JSON_LITERALS = [["true", true], ["false", false], ["null", null]];
 
-/** A number, rounded to the nearest one of JavaScript, and whether its text is an integer. */
+/** A number as float64, and whether its text is an integer. */
 export class JsonNumber {
   /**
    * @param {string} text
@@ -28,10 +28,10 @@ export class JsonNumber {
  */
 
 /**
- * Parses a text. Of equal keys the last one counts.
+ * Parses a JSON text. If a key is repeated in an object, its last value is used.
  * @param {string} text
  * @returns {JsonNode}
- * @throws {DamagedData} the text is not JSON, is nested too deeply, or has a number that is not finite
+ * @throws {DamagedData} the text is not JSON, is nested too deeply, or has a number that is too large
  */
 export const parseJson = (text) => {
   let place = 0;
@@ -47,7 +47,7 @@ export const parseJson = (text) => {
   };
 
   /**
-   * Consumes the next character if it is `sign`, and returns whether it was.
+   * Consumes the next character that is not white space if it is `sign`. Returns whether it was.
    * @param {string} sign
    */
   const accept = (sign) => {

@@ -1,11 +1,11 @@
-// Codec 6 (docs/reference/format.md 3.3): points on a lattice in the contracted cube, stored in Morton order.
+// Decodes points on a lattice in the contracted cube, stored in Morton order (codec 6, docs/reference/format.md 3.3).
 
 import { BitReader } from "./bits.js";
 import { assertValid } from "./errors.js";
 import { LOW_HALF_BITS, decodeIntegers, decodeWideIntegers } from "./integers.js";
 
 /**
- * The points of a layer: the centres of their cells in units of 2^-19 of the cube (3 N), and their classes (N).
+ * The points of a layer: the centres of their cells (3 N), in units of 2^-19 of the cube's edge, and their classes (N).
  * @typedef {{centers: Int32Array, classes: Uint8Array, count: number}} LatticePoints
  */
 
@@ -13,15 +13,16 @@ const MAX_BITS_PER_AXIS = 18;
 const MAX_POINT_CLASSES = 16;
 const LATTICE_HEADER_BYTES = 10;
 const LOW_HALF_MASK = 2 ** LOW_HALF_BITS - 1;
-const AXIS_BITS_PER_HALF = LOW_HALF_BITS / 3; // a half of a Morton code interleaves three axes
-const TAIL_BITS_PER_READ = 24; // a multiple of 3, at most MAX_BITS_PER_READ
+const AXIS_BITS_PER_HALF = LOW_HALF_BITS / 3; // because a Morton code interleaves three axes
+const TAIL_BITS_PER_READ = 24; // must be a multiple of 3 and at most MAX_BITS_PER_READ
 
-/** The logarithm to base 2 of the number of units along an axis of the cube in which centres of cells are given. */
+/** Centres of cells are given in units of 2^-CENTER_BITS_PER_AXIS of the cube's edge. */
 export const CENTER_BITS_PER_AXIS = MAX_BITS_PER_AXIS + 1;
 
 /**
- * Extracts every third bit of 27 bits of a Morton code, from the lowest on.
+ * Extracts every third bit of a Morton code of 27 bits, beginning with the lowest bit.
  * @param {number} code
+ * @returns {number} 9 bits
  */
 const extractEveryThirdBit = (code) => {
   code &= 0x01249249;
@@ -33,10 +34,10 @@ const extractEveryThirdBit = (code) => {
 
 /**
  * Decodes the points of a layer.
- * @param {Uint8Array} data
- * @param {number} count
+ * @param {Uint8Array} data the bytes of the section
+ * @param {number} count the number of points
  * @returns {LatticePoints}
- * @throws {DamagedData}
+ * @throws {DamagedData} a length or a number is invalid, or a point lies outside the cube
  */
 export const decodeLattice = (data, count) => {
   assertValid(data.length >= LATTICE_HEADER_BYTES, "it ends within its header");
@@ -62,7 +63,7 @@ export const decodeLattice = (data, count) => {
   }
   const tails = new BitReader(data.subarray(tailsAt), tailBits);
 
-  // A code of `base` bits an axis is below 2^(3 base).
+  // A code with `base` bits per axis is below 2^(3 base).
   const maxHigh = 2 ** Math.max(3 * base - LOW_HALF_BITS, 0) - 1, maxLow = 2 ** Math.min(3 * base, LOW_HALF_BITS) - 1;
   const centers = new Int32Array(3 * count);
   let high = 0, low = 0;
@@ -90,10 +91,10 @@ export const decodeLattice = (data, count) => {
 };
 
 /**
- * Computes the local positions of lattice points by the inverse of the contraction, in float64, and rounds them.
+ * Computes the positions of lattice points by the inverse of the contraction, in float64, and rounds them to float32.
  * @param {LatticePoints} points
- * @param {number[]} halfExtent
- * @returns {Float32Array} (3 N)
+ * @param {number[]} halfExtent the frame's half extents in local units
+ * @returns {Float32Array} (3 N), local units
  */
 export const latticePositions = ({ centers, count }, [width, height, depth]) => {
   const positions = new Float32Array(3 * count), outermost = 2 - 2 ** -20;

@@ -21,7 +21,7 @@ import { JsonNumber, parseJson } from "./json.js";
  *   antialiased: boolean, position_gradients: boolean,
  * }} Config
  *
- * The stored object. It keeps keys of the top level that this reader does not know.
+ * The stored object. At its top level it keeps keys that this reader does not know.
  * @typedef {{
  *   gaussians: number, layers?: number[], config: Config, rules: Record<string, string | number>, profile: string,
  *   settings: Record<string, any>, provenance: Record<string, any>, writer: string,
@@ -62,7 +62,7 @@ export const readMetadata = (container) => {
 };
 
 /**
- * Returns the text of the metadata, decompressed.
+ * Returns the decompressed text of the metadata.
  * @param {Container} container
  * @param {Entry} entry
  */
@@ -100,7 +100,7 @@ const checkMetadata = (node) => {
 };
 
 /**
- * Checks that the file follows the rules that this reader knows, and no others.
+ * Checks that the rules of the file are exactly those that this reader knows.
  * @param {JsonObject} rules
  */
 const checkRules = (rules) => {
@@ -144,9 +144,11 @@ const checkConfig = (node) => {
 };
 
 /**
+ * Returns a node that must be an object.
  * @param {JsonNode | undefined} node
- * @param {string} path
+ * @param {string} path its keys, for the error message
  * @returns {JsonObject}
+ * @throws {DamagedData} it is not an object
  */
 const requireObject = (node, path) => {
   assertValid(node instanceof Map, `'${path}' must be an object`);
@@ -154,7 +156,7 @@ const requireObject = (node, path) => {
 };
 
 /**
- * Returns an object that has exactly these keys.
+ * Returns a node that must be an object with exactly these keys.
  * @param {JsonNode | undefined} node
  * @param {string} path
  * @param {string[]} keys
@@ -167,6 +169,7 @@ const requireExactObject = (node, path, keys) => {
 };
 
 /**
+ * Returns a node that must be a list.
  * @param {JsonNode | undefined} node
  * @param {string} path
  * @returns {JsonNode[]}
@@ -177,6 +180,7 @@ const requireList = (node, path) => {
 };
 
 /**
+ * Returns the value of a node that must be an integer from `low` to `high`.
  * @param {JsonNode | undefined} node
  * @param {string} path
  * @param {number} low
@@ -189,6 +193,7 @@ const requireInteger = (node, path, low, high) => {
 };
 
 /**
+ * Returns the value of a node that must be a finite number.
  * @param {JsonNode | undefined} node
  * @param {string} path
  */
@@ -199,6 +204,7 @@ const requireFiniteNumber = (node, path) => {
 };
 
 /**
+ * Returns the values of a node that must be a list of three finite numbers.
  * @param {JsonNode | undefined} node
  * @param {string} path
  */
@@ -209,6 +215,7 @@ const requireTriple = (node, path) => {
 };
 
 /**
+ * Checks that a node is one of several strings.
  * @param {JsonNode | undefined} node
  * @param {string} path
  * @param {string[]} choices

@@ -1,4 +1,5 @@
-// Codecs 1 to 4 (docs/reference/format.md 2.2): plain float32 and float16 numbers, and the two quantisers of the profile `paper`.
+// Decodes plain float32 and float16 numbers and the two quantisers of the profile `paper` (codecs 1 to 4,
+// docs/reference/format.md 2.2).
 
 import { readUint64 } from "./container.js";
 import { assertValid } from "./errors.js";
@@ -10,7 +11,7 @@ const MIN_MAX_HEADER_BYTES = 9;
 
 /**
  * Converts an IEEE 754 binary16 to a number.
- * @param {number} bits
+ * @param {number} bits 16 bits
  */
 const halfToNumber = (bits) => {
   const sign = bits & 0x8000 ? -1 : 1, exponent = (bits >> 10) & 31, fraction = bits & 1023;
@@ -19,10 +20,10 @@ const halfToNumber = (bits) => {
 };
 
 /**
- * Checks that the bytes are `count` numbers.
+ * Checks that `data` has the length of `count` numbers.
  * @param {Uint8Array} data
  * @param {number} count
- * @param {number} width the bytes of a number
+ * @param {number} width the bytes per number
  */
 const assertLength = (data, count, width) =>
   assertValid(data.length === count * width, `it has ${data.length} bytes, and ${count} numbers take ${count * width}`);
@@ -52,7 +53,7 @@ export const decodeFloat16 = (data, count) => {
 };
 
 /**
- * Decodes a residual vector quantiser (codec 3): each row is the sum of one codeword of every stage.
+ * Decodes a residual vector quantiser (codec 3). Each row is the sum of one codeword of each stage.
  * @param {Uint8Array} data
  * @param {number} rows
  * @param {number} columns
@@ -85,7 +86,7 @@ export const decodeVectors = (data, rows, columns) => {
 };
 
 /**
- * Decodes a uniform quantiser (codec 4), whose levels divide a range from a minimum to a maximum evenly.
+ * Decodes a uniform quantiser (codec 4), whose levels are evenly spaced from a stored minimum to a stored maximum.
  * @param {Uint8Array} data
  * @param {number} count
  */

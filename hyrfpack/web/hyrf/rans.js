@@ -5,8 +5,8 @@ import { assertValid } from "./errors.js";
 const MAX_ALPHABET_TOKENS = 126;
 const MAX_MODELS = 1024;
 const MAX_LANES_LOG2 = 13;
-const MAX_STEPS_PER_LANE = 65536; // does not apply at the largest number of lanes
-const MAX_TOKEN_COUNT = 2 ** 31; // keeps all products here exact; no array is longer anyway
+const MAX_STEPS_PER_LANE = 65536; // not a limit of streams with the largest number of lanes
+const MAX_TOKEN_COUNT = 2 ** 31; // keeps all products below 2^53, so that they are exact
 const FREQUENCY_BITS = 12;
 const FREQUENCY_SUM = 1 << FREQUENCY_BITS; // the sum of the token frequencies of a model
 const FINAL_LANE_STATE = 65536; // the state of each lane after its last token
@@ -20,7 +20,7 @@ const WEIGHT_BY_LEVEL = [0];
 for (let level = 0; level < MAX_WEIGHT_LEVEL; level++) WEIGHT_BY_LEVEL.push((4 + (level % 4)) * 2 ** (level >> 2));
 
 /**
- * Returns the number of contexts: the largest one plus 1.
+ * Returns the number of contexts, which is the largest context plus 1.
  * @param {Uint8Array | null} contexts
  * @returns {number}
  */
@@ -31,13 +31,13 @@ const countContexts = (contexts) => {
 };
 
 /**
- * Decodes tokens from the start of bytes.
+ * Decodes the tokens at the start of `data`.
  * @param {Uint8Array} data
- * @param {number} count
+ * @param {number} count the number of tokens
  * @param {Uint8Array | null} contexts the context of each token; null if there is one context
  * @param {boolean} [mayBeStatic] whether static models are allowed
- * @returns {{tokens: Uint8Array, end: number}} `end` is how many bytes the tokens take
- * @throws {DamagedData}
+ * @returns {{tokens: Uint8Array, end: number}} `end` is the number of bytes of the tokens
+ * @throws {DamagedData} the stream is damaged
  */
 export const decodeTokens = (data, count, contexts, mayBeStatic = true) => {
   if (count === 0) return { tokens: new Uint8Array(0), end: 0 };
@@ -58,7 +58,7 @@ export const decodeTokens = (data, count, contexts, mayBeStatic = true) => {
 };
 
 /**
- * Decodes tokens each of which is determined by its context.
+ * Decodes a stream in which the context of a token determines it.
  * @param {Uint8Array} data
  * @param {number} count
  * @param {Uint8Array | null} contexts
@@ -75,9 +75,9 @@ const decodeConstantTokens = (data, count, contexts, contextCount) => {
 };
 
 /**
- * Returns the class of a lane after each token.
- * @param {Uint8Array} thresholds
- * @param {number} alphabet
+ * Returns, for each token, the class of a lane whose last token it is.
+ * @param {Uint8Array} thresholds the first token of each class but the first, in rising order
+ * @param {number} alphabet the number of different tokens
  */
 const classByToken = (thresholds, alphabet) => {
   const edges = [0, ...thresholds, alphabet];
@@ -89,15 +89,15 @@ const classByToken = (thresholds, alphabet) => {
 /** Lookup tables of all models, built from the weights of their tokens. */
 class ModelTables {
   /**
-   * @param {number} models
-   * @param {number} alphabet
+   * @param {number} models the number of models
+   * @param {number} alphabet the number of different tokens
    */
   constructor(models, alphabet) {
     this.models = models;
     this.alphabet = alphabet;
-    /** Cumulative frequencies f_0 + ... + f_(j-1) of the tokens; MODEL_STRIDE entries a model. */
+    /** Cumulative frequencies f_0 + ... + f_(j-1) of the tokens; MODEL_STRIDE entries per model. */
     this.sums = new Uint16Array(models * MODEL_STRIDE);
-    /** The token at the first position of each bucket; BUCKETS_PER_MODEL entries a model. */
+    /** The token at the first position of each bucket; BUCKETS_PER_MODEL entries per model. */
     this.firsts = new Uint8Array(models * BUCKETS_PER_MODEL);
     /** The weights of one model, which `build` reads. */
     this.weights = new Float64Array(MODEL_STRIDE);
@@ -140,7 +140,7 @@ class ModelTables {
  * Builds static models from their stored levels.
  * @param {Uint8Array} data
  * @param {ModelTables} tables
- * @returns {number} how many bytes the levels take
+ * @returns {number} the number of bytes of the levels
  */
 const readStaticModels = (data, tables) => {
   const { models, alphabet, weights } = tables;
@@ -167,11 +167,11 @@ const readStaticModels = (data, tables) => {
  * @param {number} place the offset of the lanes' states
  * @param {number} count
  * @param {Uint8Array | null} contexts
- * @param {number} classes
- * @param {Uint8Array} tokenClasses
+ * @param {number} classes the number of classes of lanes
+ * @param {Uint8Array} tokenClasses the result of `classByToken`
  * @param {ModelTables} tables
- * @param {number} lanes the number of lanes by the header
- * @param {boolean} isStatic
+ * @param {number} lanes the number of lanes in the header
+ * @param {boolean} isStatic whether the models stay as they are
  */
 const decodeLanes = (data, place, count, contexts, classes, tokenClasses, tables, lanes, isStatic) => {
   const { models, alphabet, sums, firsts, weights } = tables;

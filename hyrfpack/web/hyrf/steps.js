@@ -1,6 +1,6 @@
-// Quantisation steps (docs/reference/format.md 3.2).
+// Defines the quantisation steps (docs/reference/format.md 3.2).
 
-/** The number 1 in fixed point: its unit is 1 / FIXED_POINT_ONE. */
+/** The number 1 in fixed point. The unit of fixed-point numbers is 1 / FIXED_POINT_ONE. */
 export const FIXED_POINT_ONE = 2 ** 24;
 
 /** The quantisation step that each code stands for, in fixed point. */

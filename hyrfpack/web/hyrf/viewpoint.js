@@ -1,5 +1,5 @@
-// Chooses cameras from which a model is viewed, by the provenance of its file. The provenance is not trusted: invalid
-// entries are ignored.
+// Chooses the cameras from which a model is shown, from the provenance of its file. The provenance is not trusted:
+// invalid entries are ignored.
 
 const MAX_SHOWN_CAMERAS = 12;
 const MAX_FITTED_CAMERAS = 48;
@@ -9,8 +9,8 @@ const RING_HEIGHT_RATIOS = [-0.2, 0, 0.2]; // in units of the distance from the 
 const MAX_PICTURE_SIDE_PIXELS = 16384;
 const MAX_ABS_COORDINATE = 1e37; // cameras around such a point are still finite in float32
 const RIGID_TOLERANCE = 1e-3;
-// Cameras look the same way if their mean viewing direction is at least MIN_MEAN_FORWARD_LENGTH long. Their pictures
-// are turned against each other if their mean down axis is shorter than MAX_MEAN_DOWN_LENGTH.
+// Cameras have similar viewing directions if the mean of these unit vectors is at least MIN_MEAN_FORWARD_LENGTH long.
+// Their pictures are rotated against each other if the mean of their down axes is shorter than MAX_MEAN_DOWN_LENGTH.
 const MIN_MEAN_FORWARD_LENGTH = 0.9;
 const MAX_MEAN_DOWN_LENGTH = 0.5;
 
@@ -19,7 +19,7 @@ const MAX_MEAN_DOWN_LENGTH = 0.5;
  * @typedef {{width: number, height: number, fx: number, fy: number, cx: number, cy: number,
  *   camera_from_world: number[][]}} Camera
  *
- * A view of a model: the point that it looks at, which way is up, a camera, and the range of angles about `up`, in
+ * A view of a model: the point that it looks at, the up direction, a camera, and the range of angles about `up`, in
  * degrees from that camera, that the photos cover.
  * @typedef {{target: number[], up: number[], camera: Camera, arc: number[]}} Viewpoint
  */
@@ -28,9 +28,9 @@ const MAX_MEAN_DOWN_LENGTH = 0.5;
  * Chooses the cameras for showing a model.
  * @param {import("./metadata.js").Metadata} metadata the checked metadata of the model
  * @returns {{cameras: Camera[], fitted: Camera[], up: number[], target: number[], madeUp: boolean}} `cameras`, at least
- *   one, for a viewer to step through, beginning with the first; `fitted`, at which colours are fitted; `up` in world
- *   axes, of unit length; `target`, the point that the viewer looks at, in world units; `madeUp` is true if the file
- *   has no usable cameras
+ *   one, are those of a viewer, which starts at the first; `fitted` are those at which colours are fitted; `up` is a
+ *   unit vector in world axes; `target` is the point that the viewer looks at, in world units; `madeUp` is true if the
+ *   file has no usable cameras
  */
 export function viewpointOf(metadata) {
   const provenance = metadata.provenance ?? {}, { center, scale } = metadata.config.frame;
@@ -44,13 +44,13 @@ export function viewpointOf(metadata) {
     const cameras = evenlySpaced(others, MAX_SHOWN_CAMERAS);
     return { cameras, fitted: ringCameras(viewpoint, up), up, target, madeUp: true };
   }
-  // Coarse cameras are too few for fitting colours, so rings of cameras about the scene are added.
+  // Few coarse cameras are stored, too few for fitting colours, so rings of cameras about the scene are added.
   const fitted = [...evenlySpaced(kept, MAX_FITTED_CAMERAS), ...(exact.length ? [] : ringCameras(viewpoint, up))];
   return { cameras: evenlySpaced(kept, MAX_SHOWN_CAMERAS), fitted, up: estimateUp(kept, up), target, madeUp: false };
 }
 
 /**
- * Selects at most `count` items at even distances, the first and the last included.
+ * Selects at most `count` evenly spaced items, which include the first and the last one.
  * @template Item
  * @param {Item[]} items
  * @param {number} count
@@ -63,7 +63,7 @@ export function evenlySpaced(items, count) {
 }
 
 /**
- * Rounds to the nearest integer, halves to the even one.
+ * Rounds to the nearest integer. Halves are rounded to the nearest even integer.
  * @param {number} value
  */
 const roundHalfToEven = (value) => (value % 1 === 0.5 ? 2 * Math.round(value / 2) : Math.round(value));
@@ -80,8 +80,8 @@ export function cameraPosition({ camera_from_world: pose }) {
 // --- cameras of the file ---------------------------------------------------------------------------------------------
 
 /**
- * Parses the cameras of a provenance. The list is empty if one of them is invalid.
- * @param {any} stored
+ * Parses the cameras of a provenance. Returns an empty list if one of them is invalid.
+ * @param {any} stored a parsed JSON value
  * @returns {Camera[]}
  */
 function parseStoredCameras(stored) {
@@ -91,7 +91,7 @@ function parseStoredCameras(stored) {
 }
 
 /**
- * Parses a camera that is stored as 18 numbers; returns null if it is invalid.
+ * Parses a camera that is stored as 18 numbers. Returns null if it is invalid.
  * @param {any} numbers
  * @returns {Camera | null}
  */
@@ -103,7 +103,7 @@ function parseCameraNumbers(numbers) {
 }
 
 /**
- * Parses the viewpoint of a provenance; returns null if it is absent or invalid.
+ * Parses the viewpoint of a provenance. Returns null if it is absent or invalid.
  * @param {any} stored
  * @returns {Viewpoint | null}
  */
@@ -116,7 +116,7 @@ function parseStoredViewpoint(stored) {
 }
 
 /**
- * Returns the viewpoint, or null if it is invalid.
+ * Returns the viewpoint with a checked camera, or null if it is invalid.
  * @param {Record<keyof Viewpoint, any>} viewpoint
  * @returns {Viewpoint | null}
  */
@@ -130,8 +130,8 @@ function validateViewpoint({ target, up, camera: stored, arc }) {
 }
 
 /**
- * Returns the camera with all four rows of its pose, or null if its picture has no valid size or its pose is not rigid
- * or not finite in float32.
+ * Returns the camera with all four rows of its pose. Returns null if the size of its picture is invalid, or if its pose
+ * is not rigid or not finite in float32.
  * @param {Record<keyof Camera, any>} camera
  * @returns {Camera | null}
  */
@@ -162,7 +162,8 @@ const isNumberList = (values, count) =>
 // --- default cameras -------------------------------------------------------------------------------------------------
 
 /**
- * Returns the view of a model without one: slightly from above, at 2.5 times the frame's longest half-axis.
+ * Returns the viewpoint of a model whose file has none. It looks slightly down from 2.5 times the frame's longest
+ * half-axis away.
  * @param {number[]} center
  * @param {number} scale
  * @returns {Viewpoint}
@@ -176,7 +177,7 @@ function defaultViewpoint(center, scale) {
 }
 
 /**
- * Returns cameras on a circle about the target, or back and forth over the arc that the photos cover.
+ * Returns cameras on a circle about the target or, if the photos cover only an arc, back and forth on that arc.
  * @param {Viewpoint} viewpoint
  * @param {number} count
  * @returns {Camera[]}
@@ -185,7 +186,7 @@ function orbitCameras({ target, up: stored, camera, arc: [first, last] }, count)
   const up = unit3(stored);
   let offset = minus3(cameraPosition(camera), target);
   const level = minus3(offset, times3(up, dot3(offset, up)));
-  if (!(Math.hypot(...level) > 1e-9 * Math.hypot(...offset))) { // straight above: the circle would be a point
+  if (!(Math.hypot(...level) > 1e-9 * Math.hypot(...offset))) { // from straight above, the circle would be a point
     offset = plus3(offset, times3(perpendicularTo(up), 0.5 * Math.max(Math.hypot(...offset), 1e-6)));
   }
   return Array.from({ length: count }, (_, k) => {
@@ -215,11 +216,11 @@ function ringCameras(viewpoint, up) {
 }
 
 /**
- * Estimates which way is up. If cameras look the same way but their pictures are turned against each other, as those of
- * drones that look down, up is against their viewing direction.
+ * Estimates the up direction. If cameras have similar viewing directions but rotated pictures, as those of drones that
+ * look down, up is opposite to their viewing direction.
  * @param {Camera[]} cameras
- * @param {number[]} up
- * @returns {number[]}
+ * @param {number[]} up the direction for all other cameras
+ * @returns {number[]} a unit vector
  */
 function estimateUp(cameras, up) {
   const mean = (/** @type {number} */ row) => {

@@ -11,7 +11,7 @@ const MIN_FOCAL_RATIO = 0.05;
 const MAX_FOCAL_RATIO = 50;
 const MAX_TITLE_LETTERS = 200;
 
-// Resolves an address against the page's. Throws an Error with a sentence for an address that cannot be fetched.
+// Resolves an address against the page's. Throws an Error with a message for the user if it cannot be fetched.
 export function resolveAddress(text, what) {
   let address;
   try {
@@ -29,8 +29,9 @@ export function resolveAddress(text, what) {
 // Shortens a text from the address for a message.
 const shortenForMessage = (text) => (text.length > 60 ? `${text.slice(0, 60)}…` : text || "an empty one");
 
-// Parses what follows "?": {content, poster, title, camera, exposure, noui, autorotate}, null where a parameter is
-// absent. `wrong` has a sentence for each invalid parameter; invalid addresses become "", an invalid exposure null.
+// Parses what follows "?". Returns {content, poster, title, camera, exposure, noui, autorotate, wrong}: the flags noui
+// and autorotate are boolean, and other absent parameters are null. `wrong` has a sentence for each invalid parameter;
+// invalid addresses become "", an invalid exposure null.
 export function parseSearch(search) {
   const parameters = new URLSearchParams(search), wrong = [];
   const readAddress = (name, what) => {
@@ -61,14 +62,14 @@ export function parseSearch(search) {
   };
 }
 
-// Returns the text of the camera in #camera=..., or null.
+// Returns the text of the camera in #camera=..., or null if there is none.
 export function parseHash(hash) {
   const [name, ...values] = hash.slice(1).split("=");
   return name === "camera" ? values.join("=") : null;
 }
 
-// Parses the text of a camera: {number} is an index into the scene's cameras; {view} is a camera of its own, with the
-// {depth} of the point to orbit about where the text has it.
+// Parses the text of a camera. Returns {number}, an index into the scene's cameras, or {view, depth}: another camera
+// and, where the text has it, the depth of the point to orbit about. Throws an Error with a message for the user.
 export function parseCamera(text, scene) {
   try {
     text = decodeURIComponent(text).trim();
@@ -84,9 +85,9 @@ export function parseCamera(text, scene) {
   }
 }
 
-// Formats the eye as nine numbers for a link: position (world), rotation (camera from world: w, x, y, z), focal length
-// divided by the square root of the picture's area, and depth of the target. Lengths are rounded to 1e-4 of the viewing
-// distance or finer.
+// Formats the eye as nine numbers for a link: position (world units), rotation (camera from world: w, x, y, z), focal
+// length divided by the square root of the picture's area, and depth of the target (world units). Lengths are rounded
+// to 1e-4 of the viewing distance or finer.
 export function formatCamera(eye, scene) {
   const { fy, camera_from_world: pose } = cameraOf(eye.view(LINK_SIDE_PIXELS, LINK_SIDE_PIXELS), scene);
   const position = eye.position.map((value, axis) => scene.center[axis] + scene.unit * value);
@@ -96,7 +97,7 @@ export function formatCamera(eye, scene) {
   return [...lengths.slice(0, 3), ...quat, Number((fy / LINK_SIDE_PIXELS).toPrecision(6)), lengths[3]].join(",");
 }
 
-// Parses the numbers that formatCamera writes.
+// Parses the numbers that formatCamera writes; the depth may be missing. Returns {view, depth}.
 function parseCompactCamera(text, scene) {
   const numbers = text.split(",").map((part) => (part.trim() ? Number(part) : NaN));
   if (![8, 9].includes(numbers.length) || !numbers.every(Number.isFinite)) {

@@ -1,5 +1,6 @@
-// Unpacks the player's texts into script elements, which are found by their ids, and runs its script. The page's policy
-// names both scripts. Until the player runs, `hyrfpack.ready` is a promise that follows the player's own.
+// Unpacks the player's texts into script elements, which other scripts find by their ids, and runs the player. The
+// page's content security policy allows only this script and the player's. Until the player runs, `hyrfpack.ready` is a
+// promise that follows the player's own.
 
 {
   // Decompresses a JSON text in base64.

@@ -1,6 +1,6 @@
-// Cameras. The page uses the world's axes, with the origin `scene.center` and the unit `scene.unit` (both in world
-// units). A view is a pinhole camera in these coordinates: rows (right, down, forward), translation, eye, fx, fy, cx,
-// cy.
+// Defines cameras. The page uses the world's axes, with the origin `scene.center` and the unit `scene.unit` (both in
+// world units). A view is a pinhole camera in these coordinates: rows (right, down, forward), translation, eye, and fx,
+// fy, cx, cy in pixels.
 
 export const add = (a, b) => [a[0] + b[0], a[1] + b[1], a[2] + b[2]];
 export const sub = (a, b) => [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
@@ -9,7 +9,7 @@ export const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 export const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 export const unit = (a) => mul(a, 1 / (Math.hypot(...a) || 1));
 
-// Rotates a vector about a unit axis by Rodrigues' formula.
+// Rotates a vector about a unit axis by an angle in radians (Rodrigues' formula).
 function rotate(vector, axis, angle) {
   const c = Math.cos(angle);
   return add(add(mul(vector, c), mul(cross(axis, vector), Math.sin(angle))), mul(axis, dot(axis, vector) * (1 - c)));
@@ -20,7 +20,7 @@ const MAX_ELEVATION_RADIANS = 1.55;
 
 const isPoseRow = (row) => Array.isArray(row) && row.length === 4 && row.every(Number.isFinite);
 
-// Returns whether three rows are a rotation.
+// Returns whether three rows are a rotation matrix.
 function isRigid(rows) {
   const near = (a, b, wanted) => Math.abs(dot(a, b) - wanted) <= POSE_TOLERANCE;
   const right = rows.every((a, i) => rows.every((b, j) => near(a, b, i === j ? 1 : 0)));
@@ -28,7 +28,7 @@ function isRigid(rows) {
 }
 
 // Converts a camera in world units, {width, height, fx, fy, cx, cy, camera_from_world: 4 x 4 rows}, to a view. The last
-// row may be absent. Throws an Error with a sentence where the camera is invalid.
+// row may be absent. Throws an Error that says what is wrong with an invalid camera.
 export function viewOf({ width, height, fx, fy, cx, cy, camera_from_world: pose }, scene) {
   const posed = Array.isArray(pose) && [3, 4].includes(pose.length) && pose.every(isPoseRow);
   if (!posed || ![width, height, fx, fy, cx, cy].every(Number.isFinite)) {
@@ -51,9 +51,9 @@ export function cameraOf({ rows, translation, width, height, fx, fy, cx, cy }, s
   return { width, height, fx, fy, cx, cy, camera_from_world: [...world, [0, 0, 0, 1]] };
 }
 
-// A camera that can be moved; what the window shows is seen from it.
+// The movable camera from which the window's picture is drawn.
 export class Eye {
-  // The median distance of `views` from the scene's target is taken as the scene's size.
+  // The size of the scene is the median distance of `views` from its target.
   constructor(scene, views) {
     this.up = scene.up;
     this.center = mul(sub(scene.target, scene.center), 1 / scene.unit);
@@ -67,18 +67,18 @@ export class Eye {
     this.rows = view.rows;
     this.focal = view.fy / Math.sqrt(view.width * view.height);
     const ahead = dot(sub(this.center, this.position), this.rows[2]);
-    this.pace = Math.max(ahead, 0.3 * this.size) || 1; // the depth is small or negative for cameras inside the scene
+    this.pace = Math.max(ahead, 0.3 * this.size) || 1; // for cameras inside the scene, the depth is small or negative
     this.target = add(this.position, mul(this.rows[2], this.pace));
   }
 
-  // The state that `Object.assign` restores.
+  // Returns the state of the eye, which `Object.assign` restores.
   get pose() {
     const { position, rows, focal, pace, target } = this;
     return { position, rows, focal, pace, target };
   }
 
-  // Returns the view for a picture of this size. The focal length is scaled so that pictures of different shapes show
-  // areas of equal size.
+  // Returns the view for a picture of this size in pixels. The focal length is scaled so that pictures of different
+  // shapes show equal areas.
   view(width, height) {
     const focal = this.focal * Math.sqrt(width * height);
     return {
@@ -87,7 +87,7 @@ export class Eye {
     };
   }
 
-  // The depth of the target.
+  // Returns the depth of the target.
   get depth() {
     return Math.max(dot(sub(this.target, this.position), this.rows[2]), 1e-3 * this.pace);
   }
@@ -98,13 +98,13 @@ export class Eye {
     return add(this.position, mul(add(add(mul(this.rows[0], x), mul(this.rows[1], y)), this.rows[2]), depth));
   }
 
-  // Rotates the eye about a point, by a yaw about the up axis and then a pitch. The view direction stays short of
-  // straight up and straight down. Angles are in radians.
+  // Rotates the eye about a point, by a yaw about the up axis and then a pitch, in radians. The view direction never
+  // reaches straight up or straight down.
   turn(yaw, pitch, about) {
     const level = sub(this.rows[0], mul(this.up, dot(this.rows[0], this.up)));
     const across = Math.hypot(...level) > 0.3 ? unit(level) : unit(cross(this.rows[2], this.up));
     const elevation = Math.asin(Math.max(-1, Math.min(1, dot(this.rows[2], this.up))));
-    if (dot(this.rows[1], this.up) > 0) yaw = -yaw; // upside down, the scene still follows the pointer
+    if (dot(this.rows[1], this.up) > 0) yaw = -yaw; // so that the scene follows the pointer when it is upside down
     const lowest = Math.min(-MAX_ELEVATION_RADIANS, elevation), highest = Math.max(MAX_ELEVATION_RADIANS, elevation);
     pitch = Math.max(lowest, Math.min(highest, elevation + pitch)) - elevation;
     const turn = (vector) => rotate(rotate(vector, across, pitch), this.up, yaw);
@@ -123,20 +123,20 @@ export class Eye {
     this.turn(yaw, pitch, this.position);
   }
 
-  // Moves the eye and its target along right, down and forward.
+  // Moves the eye and its target along its right, down and forward axes.
   move(right, down, forward) {
     const step = [right, down, forward].reduce((sum, length, r) => add(sum, mul(this.rows[r], length)), [0, 0, 0]);
     this.position = add(this.position, step);
     this.target = add(this.target, step);
   }
 
-  // Moves the eye so that points at the target's depth follow the pointer, by x and y in units of the focal length.
+  // Moves the eye so that points at the target's depth move by x and y in the picture, in units of the focal length.
   pan(x, y) {
     this.move(-x * this.depth, -y * this.depth, 0);
   }
 
-  // Scales the distance to a point at the target's depth by a factor (below 1 is nearer). The point keeps its place in
-  // the picture; x and y are as of `point`.
+  // Multiplies the distance to a point at the target's depth by a factor; factors below 1 move the eye nearer. The
+  // point keeps its place in the picture, which x and y give as for `point`.
   zoom(factor, x, y) {
     const least = (1e-3 * this.pace) / this.depth;
     const point = this.point(x, y);

@@ -1,4 +1,4 @@
-// Constants that the packing worker and the drawing page share.
+// Defines constants that the worker and the page share.
 
-export const TEXTURE_WIDTH = 2048; // textures with a texel a splat; every WebGL 2 device supports this width
-export const BACKGROUND_RADIUS = 100; // of the background sphere, in a model's local units (docs/reference/format.md 2.7)
+export const TEXTURE_WIDTH = 2048; // for textures with one texel per splat; all WebGL 2 devices support it
+export const BACKGROUND_RADIUS = 100; // local units of the model (docs/reference/format.md 2.7)

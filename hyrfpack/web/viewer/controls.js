@@ -3,27 +3,27 @@
 import { mul } from "./camera.js";
 
 const MAX_TAP_MOVE_PIXELS = 8;
-const MAX_DOUBLE_TAP_DISTANCE_PIXELS = 30; // the second tap of a finger is less precise than one tap
+const MAX_DOUBLE_TAP_DISTANCE_PIXELS = 30; // larger, because two taps of a finger are rarely at the same place
 const MAX_TAP_MS = 350;
-const ORBIT_RADIANS = 3.6; // for a drag of two focal lengths
+const ORBIT_RADIANS = 3.6; // the rotation for a drag of two focal lengths
 const FLY_AXES = { W: [0, 0, 1], S: [0, 0, -1], A: [-1, 0, 0], D: [1, 0, 0], Q: [0, 1, 0], E: [0, -1, 0] };
 const LOOK_SIGNS = { ArrowLeft: [1, 0], ArrowRight: [-1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }; // yaw, pitch
-const ZOOM_SIGNS = { "+": -1, "-": 1 }; // the sign of the change of depth
-const FLY_SPEED = 0.5; // in units of the eye's `pace` per second
+const ZOOM_SIGNS = { "+": -1, "-": 1 }; // zooming in lowers the depth
+const FLY_SPEED = 0.5; // `pace` of the eye per second
 const SHIFT_FACTOR = 4;
 const LOOK_RADIANS_PER_SECOND = 1.0;
 const ZOOM_EFOLDS_PER_SECOND = 1.2;
-const KEY_PRESS_SECONDS = 1 / 60; // a key moves the eye at once for this time, even if it is released before a frame
+const KEY_PRESS_SECONDS = 1 / 60; // a short press moves the eye this long, even if no frame falls into it
 const KEY_ALIASES = { "=": "+", _: "-", Add: "+", Subtract: "-" }; // keys with the same function
 
 export class Controls {
-  // Callbacks: `acted()` after any input, `pick(x, y)` after a double-click, `press(key)` for keys that do not move the
-  // eye, `ignored(kind)` when a wheel or a finger is left to the surrounding page.
+  // Callbacks: `acted()` after any input; `pick(x, y)` after a double-click, in CSS pixels; `press(key)` for keys that
+  // do not move the eye; `ignored(kind)` when a "wheel" or a "finger" is left to the surrounding page.
   constructor(player, damper, { acted, pick, press, ignored }) {
     const { canvas } = player;
     Object.assign(this, { player, canvas, damper, acted, pick, press, ignored });
     this.pointers = new Map();
-    this.held = new Map(); // code of each key that is down -> its name
+    this.held = new Map(); // code of each pressed key -> its name
     this.tapped = null;
     this.framed = window.parent !== window;
     this.engage(!this.framed); // in a frame, wheel and fingers scroll the surrounding page until the canvas is clicked
@@ -42,7 +42,7 @@ export class Controls {
   }
 
   get eye() {
-    return this.player.eye; // null before a scene is loaded
+    return this.player.eye; // null until a scene is loaded
   }
 
   // Sets whether the canvas uses wheel and fingers, or leaves them to the surrounding page.
@@ -51,18 +51,18 @@ export class Controls {
     this.canvas.classList.toggle("engaged", engaged);
   }
 
-  // Whether a key that moves the eye, a button or a finger is down.
+  // Returns whether a key that moves the eye, a mouse button or a finger is down.
   get active() {
     return this.pointers.size > 0 || [...this.held.values()].some((key) => key !== "Shift");
   }
 
-  // Moves the eye by the keys that are down. Returns whether it moved.
+  // Moves the eye by all pressed keys, for a time in seconds. Returns whether it moved.
   advance(seconds) {
     const keys = [...this.held.values()];
     return keys.map((key) => this.step(key, seconds, keys.includes("Shift"))).some(Boolean);
   }
 
-  // Moves the eye by one key. Returns whether it is a key that moves the eye.
+  // Moves the eye by one key, for a time in seconds. Returns whether the key moves the eye.
   step(key, seconds, shift) {
     if (FLY_AXES[key]) {
       this.eye.move(...mul(FLY_AXES[key], seconds * (shift ? SHIFT_FACTOR : 1) * FLY_SPEED * this.eye.pace));
@@ -78,13 +78,13 @@ export class Controls {
     return true;
   }
 
-  // The size of a CSS pixel in units of the focal length.
+  // Returns the size of a CSS pixel in units of the focal length.
   get pixel() {
     const { clientWidth, clientHeight } = this.canvas;
     return 1 / (this.eye.focal * Math.sqrt(clientWidth * clientHeight));
   }
 
-  // Converts a position in CSS pixels to units of the focal length, from the canvas' centre.
+  // Converts a position in CSS pixels to units of the focal length, measured from the canvas' centre.
   fromMiddle(x, y) {
     const { clientWidth, clientHeight } = this.canvas;
     return [(x - clientWidth / 2) * this.pixel, (y - clientHeight / 2) * this.pixel];

@@ -1,12 +1,12 @@
-// <hyrf-viewer src="scene.hyrf" camera="2" poster="scene.jpg" exposure="consistent" autorotate noui>: shows the player
-// that lies next to this script in a frame. `src` and `poster` are relative to the page of the element. Events: "load",
-// "error" (detail: a sentence).
+// Defines <hyrf-viewer src="scene.hyrf" camera="2" poster="scene.jpg" exposure="consistent" autorotate noui>, which
+// shows in a frame the player from the folder of this script. `src` and `poster` are relative to the page of the
+// element. It fires the events "load" and "error" (detail: a sentence for the user).
 
 const PLAYER_URL = new URL("index.html", document.currentScript?.src ?? findScriptAddress());
 const ELEMENT_CSS = ":host { display: block; aspect-ratio: 4 / 3; } :host([hidden]) { display: none; } " +
   "iframe { display: block; width: 100%; height: 100%; border: 0; }";
 
-// Finds this script's address among the page's scripts, for modules have no document.currentScript.
+// Finds this script's address among the page's scripts, because modules have no document.currentScript.
 function findScriptAddress() {
   const scripts = [...document.querySelectorAll("script[src]")].map(({ src }) => src);
   return scripts.find((address) => new URL(address).pathname.endsWith("/hyrf-viewer.js")) ?? document.baseURI;
@@ -17,7 +17,7 @@ class HyrfViewer extends HTMLElement {
 
   constructor() {
     super();
-    const style = new CSSStyleSheet(); // unlike a style element, allowed by every policy of a page
+    const style = new CSSStyleSheet(); // unlike style elements, no page's security policy forbids it
     style.replaceSync(ELEMENT_CSS);
     this.frame = document.createElement("iframe");
     this.frame.allow = "fullscreen; clipboard-write";

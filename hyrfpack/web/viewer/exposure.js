@@ -1,8 +1,8 @@
-// The exposure of pictures: that of the photos taken near the viewpoint, or a consistent one.
+// Applies the exposure of the photos taken near the viewpoint, or a consistent one.
 
 import { logGains } from "../hyrf/exposure.js";
 
-export const AS_PHOTOGRAPHED = "as-photographed", CONSISTENT = "consistent"; // as in hyrfpack.RenderSettings
+export const AS_PHOTOGRAPHED = "as-photographed", CONSISTENT = "consistent"; // the names in hyrfpack.RenderSettings
 export const EXPOSURES = [AS_PHOTOGRAPHED, CONSISTENT];
 
 // Returns the gains of red, green and blue for the picture of a view. Gains of 1 change nothing.

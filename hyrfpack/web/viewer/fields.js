@@ -1,4 +1,4 @@
-// Evaluates a model on the graphics device: view-independent numbers once, colours again when the view moves.
+// Evaluates a model on the graphics device: view-independent numbers once, and colours again when the view moves.
 
 import { frustumPlanes } from "./frustum.js";
 import { ContextLostError, Graphics, WorkPacer } from "./graphics.js";
@@ -8,18 +8,18 @@ import { elementText } from "./dom.js";
 import { RowStates } from "./row_states.js";
 
 const MAX_CELLS = 32; // a cell is 8 hidden units; the shaders hold all cells in variables
-const WEIGHTS_TEXTURE_WIDTH = 1024; // the texture holds a decoder's numbers where no block of uniforms does
+const WEIGHTS_TEXTURE_WIDTH = 1024; // of the texture for a decoder's numbers if no uniform block is used
 const WEIGHTS_TEXTURE_UNIT = 6;
 const TABLE_NUMBERS_PER_UPLOAD = 1 << 21;
-const MAX_FRESH_TURN_RADIANS = 2e-3; // the colours of a row are stale when the viewing direction turned by more
-const MOVING_ROWS_DIVISOR = 8; // while moving, a frame colours at most this fraction of the visible rows
+const MAX_FRESH_TURN_RADIANS = 2e-3; // a larger turn of its viewing direction makes a row's colours stale
+const MOVING_ROWS_DIVISOR = 8; // while moving, a frame colours at most this part of the visible rows
 
-// The device cannot evaluate fields, for the reason in the message, which is the end of a sentence. It can draw splats.
+// The device cannot evaluate fields, but it can draw splats. The message gives the reason, as the end of a sentence.
 export class UnsupportedDeviceError extends Error {}
 export const MEMORY_REASON = "this device's memory does not hold the fields.";
 
 export class Fields {
-  // Throws UnsupportedDeviceError for a device that cannot hold a model of pack.js.
+  // Throws UnsupportedDeviceError if the device cannot hold a model that pack.js has packed.
   static check(gl, { cells, height, geometry, radiance }) {
     const side = gl.getParameter(gl.MAX_TEXTURE_SIZE);
     const rows = Math.max(height, ...[geometry, radiance].map(({ table }) => table.length / 2 / TEXTURE_WIDTH));
@@ -36,7 +36,8 @@ export class Fields {
     this.pace = new WorkPacer();
   }
 
-  // Evaluates all that does not depend on the view. `report` is called with the fraction done, and may throw to stop.
+  // Evaluates everything that does not depend on the view. `report` is called with the fraction done; it may throw an
+  // error to stop the work.
   async prepare(report) {
     const { gl, graphics, model, height } = this, size = [TEXTURE_WIDTH, height];
     Fields.check(gl, model);
@@ -48,7 +49,7 @@ export class Fields {
     const floats = [gl.RGBA32F, gl.RGBA, gl.FLOAT, 4];
     const explicit = graphics.table(floats, TEXTURE_WIDTH, model.explicit);
     this.logits = graphics.table(floats, TEXTURE_WIDTH, model.logits);
-    model.explicit = model.logits = null; // frees memory; the worker can make them again
+    model.explicit = model.logits = null; // frees memory; the worker can decode them again
     const geometry = await this.field(model.geometry), radiance = await this.field(model.radiance);
     this.checkMemory();
 
@@ -74,7 +75,7 @@ export class Fields {
     }
   }
 
-  // Throws an error unless everything so far fits into the device's memory.
+  // Throws an error if the device's memory was too small for the objects so far.
   checkMemory() {
     const { gl } = this, error = gl.getError();
     if (this.graphics.lost) throw new ContextLostError();
@@ -107,8 +108,8 @@ export class Fields {
     return { table: texture, levels: new Uint32Array(levels.flat()), block, weights, places, freeTable, free };
   }
 
-  // Returns whether shaders read a decoder's numbers from a block of uniforms. Graphics devices read it far faster than
-  // a texture; for software renderers it is the other way round.
+  // Returns whether shaders read a decoder's numbers from a uniform block. Graphics devices read a uniform block far
+  // faster than a texture; software renderers read a texture faster.
   fitsBlock({ byteLength }) {
     const { gl } = this, rendererName = gl.getParameter(gl.RENDERER);
     // WebKit hides the device's name.
@@ -117,10 +118,10 @@ export class Fields {
     return byteLength <= gl.getParameter(gl.MAX_UNIFORM_BLOCK_SIZE) && !/swiftshader|llvmpipe|software/i.test(name);
   }
 
-  // Builds the fragment shaders of the passes.
+  // Builds the fragment shaders of all passes.
   shaders() {
     const { gl, cells, model: { geometry, radiance, sh, background } } = this;
-    // Some devices cannot draw to as many targets as they offer, for lack of bytes per pixel.
+    // Some devices cannot draw to as many targets as they report, because they limit the bytes per pixel.
     this.targets = Math.min(cells, gl.getParameter(gl.MAX_DRAW_BUFFERS), gl.getParameter(gl.MAX_COLOR_ATTACHMENTS));
     while (this.targets > 1 && !this.supports(this.targets)) this.targets >>= 1;
     const common = ({ decoder: { numbers, places } }) => ({
@@ -146,7 +147,7 @@ export class Fields {
     return { ...shaders, panorama: buildFieldShader("panorama.frag", constants) };
   }
 
-  // Returns whether `count` layers can be drawn to at once.
+  // Returns whether the device can draw to `count` layers in one pass.
   supports(count) {
     const { gl, graphics } = this;
     const framebuffer = graphics.framebuffer(...Array.from({ length: count }, (_, k) => [this.cached, k]));
@@ -175,7 +176,7 @@ export class Fields {
     this.area(target, [TEXTURE_WIDTH, this.height], [0, first, wide, last - first]);
   }
 
-  // Draws a pass to a part (x, y, width, height) of its target.
+  // Draws a pass to a part (x, y, width, height in pixels) of its target.
   area(target, size, part) {
     const { gl } = this;
     gl.bindFramebuffer(gl.FRAMEBUFFER, target);
@@ -215,14 +216,14 @@ export class Fields {
     }
   }
 
-  // Draws a part of a picture of the background.
+  // Draws a part (x, y, width, height in pixels) of a picture of the background.
   drawSky(target, size, part) {
     const { gl } = this, p = this.use("panorama", this.radiance);
     gl.uniform2f(p.u_size, ...size);
     this.area(target, size, part);
   }
 
-  // Evaluates the colours of rows; adjacent rows are drawn at once.
+  // Evaluates the colours of rows. Adjacent rows are drawn together.
   color(rows, eye) {
     const { gl, graphics } = this, p = this.use("colors", this.radiance);
     graphics.bind(p, { u_places: this.places, u_logits: this.logits });
@@ -237,28 +238,29 @@ export class Fields {
     }
   }
 
-  // While moving, colours the stalest rows for about `ms`, and all rows without colours.
+  // Colours, while the view moves, all rows without colours and then the stalest rows, for about `ms`.
   recolor(view, margin, ms) {
     const { visible, rows, fresh } = this.rows.stale(frustumPlanes(view, margin), view.eye, MAX_FRESH_TURN_RADIANS);
     const most = Math.max(fresh, Math.min(this.pace.within(ms), Math.ceil(visible / MOVING_ROWS_DIVISOR)));
     if (rows.length) this.color(rows.slice(0, most), view.eye);
   }
 
-  // Colours all stale rows in view, while `goOn()` is true. `exact`: no colour may be stale. Returns {rows: their
-  // number, done: whether all were coloured}.
+  // Colours all stale rows in view while `goOn()` is true. If `exact`, any turn of the viewing direction makes colours
+  // stale. Returns {rows: their number, done: whether all were coloured}.
   async coloured(view, margin, { goOn, exact = false } = {}) {
     const { rows } = this.rows.stale(frustumPlanes(view, margin), view.eye, exact ? 0 : MAX_FRESH_TURN_RADIANS);
     return { rows: rows.length, done: await this.coloring(rows, view.eye, goOn) };
   }
 
-  // Colours rows in slices. Returns whether all were coloured.
+  // Colours rows in slices while `goOn()` is true. Returns whether all were coloured.
   coloring(rows, eye, goOn) {
     const work = (first, last) => this.color(rows.slice(first, last), eye);
     return this.pace.run(this.graphics, rows.length, work, { goOn });
   }
 
-  // Standing still, colours all rows in view, completes the background, then colours the rows without colours, while
-  // `goOn()` is true. `changed` is called when there is more to see. Returns whether the picture is complete.
+  // Completes the picture of a still view while `goOn()` is true: colours all rows in view, draws the background, then
+  // colours the rows without colours. `changed` is called when the picture has improved. Returns whether it is
+  // complete.
   async complete(view, margin, { goOn, changed = () => {}, exact = false }) {
     const { rows, done } = await this.coloured(view, margin, { goOn, exact });
     if (rows) changed();
@@ -268,7 +270,7 @@ export class Fields {
     return this.coloring(this.rows.fresh(), view.eye, goOn);
   }
 
-  // Frees what only the background needs.
+  // Frees the objects that only the background needs.
   freeSky() {
     this.radiance.freeTable();
     this.graphics.free(this.programs.panorama.program);
@@ -280,7 +282,7 @@ export class Fields {
 }
 
 // Builds the shader of a pass from constants, field.glsl and the pass' own text. Lines that begin with EACH are
-// repeated for each cell.
+// repeated for each cell of hidden units.
 function buildFieldShader(name, constants) {
   const lines = Object.entries(constants).map(([key, value]) => `#define ${key} ${value}`);
   const cells = Array.from({ length: constants.CELLS }, (_, cell) => cell);

@@ -1,9 +1,9 @@
-// Tests whether a view may see a sphere.
+// Tests whether a sphere may be visible in a view.
 
 import { add, mul } from "./camera.js";
 
-// Returns the four planes through the eye and the sides of a view's picture, 4 numbers each, with unit normals inwards.
-// The picture is enlarged on each side by `margin` halves of its size.
+// Returns the four planes through the eye and the sides of a view's picture: 4 numbers each, with unit normals that
+// point inwards. The picture is enlarged on each side by `margin` halves of its size.
 export function frustumPlanes({ rows, translation, fx, fy, cx, cy, width, height }, margin) {
   const side = (axis, sign, focal, reach) => {
     const length = Math.hypot(focal, reach);
@@ -17,7 +17,7 @@ export function frustumPlanes({ rows, translation, fx, fy, cx, cy, width, height
   ].flat();
 }
 
-// Returns whether a ball is not wholly outside one of these planes.
+// Returns whether no plane has the whole ball on its outer side.
 export function intersectsFrustum(sides, x, y, z, radius) {
   for (let s = 0; s < 16; s += 4) {
     if (!(sides[s] * x + sides[s + 1] * y + sides[s + 2] * z + sides[s + 3] > -radius)) return false;

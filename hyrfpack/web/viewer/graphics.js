@@ -1,4 +1,4 @@
-// A thin layer over WebGL 2. All objects that a Graphics creates are freed together.
+// Wraps WebGL 2. All objects that a Graphics creates are freed together.
 
 import { elementText } from "./dom.js";
 
@@ -7,10 +7,10 @@ const POLL_INTERVAL_MS = 4;
 // The graphics context was lost during an operation. The canvas fires an event when it is restored.
 export class ContextLostError extends Error {}
 
-const contextChanges = new WeakMap(); // context -> how often it was lost or restored
+const contextChanges = new WeakMap(); // context -> the number of its losses and restorations
 const contextChangesOf = (gl) => contextChanges.get(gl) ?? 0;
 
-// Counts that a context was lost or restored, so that all earlier objects are invalid.
+// Records that a context was lost or restored, which makes all earlier objects invalid.
 export function countContextChange(gl) {
   contextChanges.set(gl, contextChangesOf(gl) + 1);
 }
@@ -18,16 +18,16 @@ export function countContextChange(gl) {
 export class Graphics {
   constructor(gl) {
     this.gl = gl;
-    this.made = new Map(); // object -> the kind in the name of the function that deletes it
+    this.made = new Map(); // object -> its kind, which ends the name of the function that deletes it
     this.losses = contextChangesOf(gl);
   }
 
-  // Whether the context was lost since, even if it is restored.
+  // Returns whether the context was lost after this object was created, even if it was restored since.
   get lost() {
     return this.gl.isContextLost() || this.losses !== contextChangesOf(this.gl);
   }
 
-  // Registers an object to be freed.
+  // Registers an object, so that `dispose` deletes it.
   track(object, kind) {
     this.made.set(object, kind);
     return object;
@@ -45,7 +45,7 @@ export class Graphics {
     for (const object of [...this.made.keys()]) this.free(object);
   }
 
-  // Creates a texture without filtering; with a depth, an array of textures.
+  // Creates a texture without filtering, or an array of textures if `depth` is given.
   texture(kind, format, width, height, depth) {
     const { gl } = this, texture = this.track(gl.createTexture(), "Texture");
     gl.bindTexture(kind, texture);
@@ -62,8 +62,8 @@ export class Graphics {
     for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, name, gl.LINEAR);
   }
 
-  // Creates a texture of an array of numbers, row after row; the last row may be short. The first argument has the
-  // internal format, the format, the type and the number of components of a texel.
+  // Creates a texture from an array of numbers, row by row; the last row may be short. The first argument has the
+  // internal format, the format, the type, and the number of components per texel.
   table([internal, format, type, size], width, numbers) {
     const { gl } = this, texels = numbers.length / size, rows = Math.floor(texels / width);
     const texture = this.texture(gl.TEXTURE_2D, internal, width, Math.max(1, Math.ceil(texels / width)));
@@ -87,7 +87,7 @@ export class Graphics {
     return framebuffer;
   }
 
-  // Binds textures, given by the names of a program's uniforms, to texture units from `first` on.
+  // Binds textures to the units from `first` on. `textures` maps names of the program's uniforms to textures.
   bind(program, textures, kind = this.gl.TEXTURE_2D, first = 0) {
     const { gl } = this;
     Object.entries(textures).forEach(([name, texture], index) => {
@@ -95,10 +95,10 @@ export class Graphics {
       gl.bindTexture(kind, texture);
       gl.uniform1i(program[name], first + index);
     });
-    gl.activeTexture(gl.TEXTURE7); // a unit that no program reads, so that later bindings do no harm
+    gl.activeTexture(gl.TEXTURE7); // no program reads this unit, so that later bindings change no texture in use
   }
 
-  // Starts to compile a program of two texts. `link` or `compiled` finish it.
+  // Starts to compile a program from two texts. `link` or `compiled` finishes it.
   compile(vertex, fragment) {
     const { gl } = this, program = this.track(gl.createProgram(), "Program");
     for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
@@ -131,7 +131,7 @@ export class Graphics {
     return this.link(this.compile(elementText(vertex), elementText(fragment)), `${vertex} and ${fragment}`);
   }
 
-  // As `link`, but does not block the page where the driver compiles in parallel.
+  // Finishes a program like `link`, without blocking the page if the driver compiles in parallel.
   async compiled(found, what) {
     const { gl } = this, parallel = gl.getExtension("KHR_parallel_shader_compile");
     const pending = () => parallel && !gl.getProgramParameter(found.program, parallel.COMPLETION_STATUS_KHR);
@@ -140,7 +140,7 @@ export class Graphics {
     return this.link(found, what);
   }
 
-  // Waits until the device has done all work so far.
+  // Waits until the device has finished all work so far.
   async whenDone() {
     const { gl } = this, fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
     gl.flush();
@@ -161,16 +161,16 @@ export class WorkPacer {
   static SLICE_MS = 100;
 
   constructor() {
-    this.unit = null; // ms that a unit of the work took lately; null before the first slice
+    this.unit = null; // recent ms per unit of the work; null before the first slice
   }
 
-  // Returns how many units of the work take about `ms`, at least one.
+  // Returns the number of units of the work, at least one, that take about `ms`.
   within(ms) {
     return this.unit === null ? 1 : Math.max(1, Math.floor(ms / this.unit));
   }
 
-  // Calls `work(first, last)` for consecutive ranges of 0 to `count`, and waits for the device after each, while
-  // `goOn()` is true. `report` is called with the fraction done. Returns whether all was done.
+  // Calls `work(first, last)` for consecutive ranges of 0 to `count` while `goOn()` is true, and waits for the device
+  // after each. `report` is called with the fraction done. Returns whether the work is complete.
   async run(graphics, count, work, { goOn = () => true, report = () => {} } = {}) {
     for (let first = 0; first < count;) {
       if (!goOn()) return false;
@@ -178,7 +178,7 @@ export class WorkPacer {
       work(first, last);
       await graphics.whenDone();
       const unit = (performance.now() - began) / (last - first);
-      this.unit = this.unit === null ? unit : Math.max(unit, this.unit / 4); // so that a slice grows at most fourfold
+      this.unit = this.unit === null ? unit : Math.max(unit, this.unit / 4); // slices grow at most fourfold
       first = last;
       report(first / count);
     }

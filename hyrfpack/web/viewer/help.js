@@ -5,7 +5,7 @@ import { element } from "./dom.js";
 const HINT_SEEN_KEY = "hyrfpack.hinted";
 const HINTS = { touch: "One finger turns, two move and zoom", mouse: "Drag to turn, wheel to zoom, ? for help" };
 
-// Returns whether the hint was seen before. Access to the storage may be forbidden, as in frames.
+// Returns whether the hint was seen before. Browsers may forbid access to the storage, for example in frames.
 const wasHintSeen = () => {
   try {
     return localStorage.getItem(HINT_SEEN_KEY) !== null;
@@ -18,7 +18,7 @@ const markHintSeen = () => {
   try {
     localStorage.setItem(HINT_SEEN_KEY, "1");
   } catch {
-    // without storage the hint is shown again
+    // without storage, the next visit shows the hint again
   }
 };
 
@@ -32,7 +32,7 @@ export class Help {
     this.hint.textContent = HINTS[coarse ? "touch" : "mouse"];
   }
 
-  // Opens the help, with the sections for devices that were used.
+  // Opens the help, with the sections for the input devices that were used.
   show() {
     for (const part of document.querySelectorAll("#help [data-with]")) part.hidden = !this.used.has(part.dataset.with);
     element("help").showModal();

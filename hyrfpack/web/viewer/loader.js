@@ -1,15 +1,15 @@
-// The page's side of the worker that reads files and sorts splats.
+// Connects the page with the worker that reads files and sorts splats.
 
 import { frustumPlanes } from "./frustum.js";
 import { elementText } from "./dom.js";
 
-// The file is not wanted any more, because another one was opened.
+// The file is no longer needed, because another one was opened.
 export class SupersededError extends Error {}
 
 export class Loader {
-  // `content(message)` is called with each content that was read (see worker_tasks.js), one after the other; its
-  // promise resolves to whether the content is shown. `progress({what, part})` is called with the fraction `part` of the step
-  // `what`.
+  // `content(message)` is called with each content that was read (see worker_tasks.js), one after the other. Its
+  // promise resolves to true if the content is shown. `progress({what, part})` is called with the fraction `part` of
+  // the step `what`.
   constructor({ content, progress }) {
     if (!window.DecompressionStream) throw new Error("This browser is too old to unpack the scene; use a newer one.");
     Object.assign(this, { content, progress });
@@ -27,11 +27,11 @@ export class Loader {
     };
     this.worker.onerror = ({ message }) => this.fail(new Error(message));
     this.delivered = Promise.resolve();
-    this.broken = false; // no more of the file will come; what was shown can be decoded again
+    this.broken = false; // true if no more of the file will arrive; the part that was shown can be decoded again
     this.pending = []; // {resolve, reject} of the promises of `expect`
   }
 
-  // Passes a content on after the one before it.
+  // Calls `content` after the call for the previous content has ended.
   deliver(content) {
     this.delivered = this.delivered.then(() => this.content(content)).then(
       (shown) => {
@@ -41,7 +41,7 @@ export class Loader {
     );
   }
 
-  // Returns a promise that all available content is shown.
+  // Returns a promise that resolves when all available content is shown.
   expect() {
     return new Promise((resolve, reject) => this.pending.push({ resolve, reject }));
   }
@@ -52,8 +52,8 @@ export class Loader {
     this.pending.splice(0).forEach(({ reject }) => reject(error));
   }
 
-  // Reads a file: an async iterable of its bytes, which are transferred to the worker. `length` is 0 where it is
-  // unknown.
+  // Reads a file from an async iterable of its bytes, which are transferred to the worker. `length` is in bytes, and 0
+  // if it is unknown.
   async read({ name, scene, stage, plain = false, stream, length = stream.length }) {
     const shown = this.expect(), source = stream[Symbol.asyncIterator]();
     this.worker.postMessage({ start: { name, scene, stage, plain } });
@@ -77,12 +77,12 @@ export class Loader {
     return shown;
   }
 
-  // Decodes the same bytes again; `plain`: as splats.
+  // Decodes the same bytes again, as splats if `plain`.
   again(plain) {
     this.worker.postMessage({ again: { plain } });
   }
 
-  // Selects the content that is sorted from now on.
+  // Selects the content that later calls of `sort` sort.
   use(number) {
     this.current = number;
     this.worker.postMessage({ use: number });
@@ -92,10 +92,10 @@ export class Loader {
     return this.waiting.size > 0;
   }
 
-  // Sorts the splats for a view of a scene. Returns a promise of {order, drawn}, or of null if another content is used
-  // by then. The caller returns the order by `reuse` after copying it.
+  // Sorts the splats for a view of a scene. Returns a promise of {order, drawn}, or of null if another content has been
+  // selected meanwhile. The caller passes the order to `reuse` after copying it.
   sort(view, { near, tolerance }) {
-    // The frustum is enlarged, so that no splats are missing at the edges until the next order comes.
+    // The frustum is enlarged, so that no splats are missing at the edges until the next order arrives.
     const sides = frustumPlanes(view, 1 + tolerance), row = [...view.rows[2], view.translation[2]];
     const ticket = ++this.ticket, order = this.spare;
     this.spare = null;
@@ -108,7 +108,7 @@ export class Loader {
     this.waiting.delete(answer.ticket);
   }
 
-  // Takes back the array of an order.
+  // Keeps the array of an order for the next call of `sort`.
   reuse(order) {
     this.spare = order;
   }

@@ -1,4 +1,4 @@
-// The page: connects the player, the controls, the panel and the source of the scene.
+// Connects the player, the controls, the panel and the source of the scene.
 
 import { formatCamera, parseCamera, parseHash, parseSearch, resolveAddress } from "./address.js";
 import { Controls } from "./controls.js";
@@ -22,7 +22,7 @@ const IGNORED_TEXTS = {
   finger: "Tap the scene, then fingers move it.",
 };
 
-// Reports a load or an error to the <hyrf-viewer> that this page may be in.
+// Reports a load or an error to the page around this one, where <hyrf-viewer> handles it.
 const postToParent = (hyrf, message = "") => {
   if (window.parent !== window) window.parent.postMessage({ hyrf, message }, "*");
 };
@@ -47,7 +47,7 @@ function showRing(x, y) {
   const ring = element("ring");
   Object.assign(ring.style, { left: `${x}px`, top: `${y}px` });
   ring.hidden = true;
-  ring.getBoundingClientRect(); // forces a layout, which restarts the animation
+  ring.getBoundingClientRect(); // restarts the animation by forcing a layout
   ring.hidden = false;
   ring.onanimationend = () => (ring.hidden = true);
 }
@@ -61,14 +61,14 @@ function start() {
 
   const player = new Player(element("view"), embedded);
   const damper = new Damper(player), glide = new Glide(player), turntable = new Turntable(player), help = new Help();
-  // Whether the scene that is shown, and the one that is loading, come from the page or its address, not from a person.
+  // Whether the shown scene and the loading one were named by the page or its address, and not chosen by the user.
   let isOwn = true, isNextOwn = true;
   let title = embedded ? (parameters.title ?? embedded.title) : document.title;
-  let nextTitle = title; // of the scene that is loading
-  let openCount = 0; // identifies what was opened last
+  let nextTitle = title; // the title of the scene that is loading
+  let openCount = 0; // identifies the scene that was opened last
   let lastPicture = null;
 
-  // ---- moving
+  // ---- cameras
 
   const choose = (camera) => {
     if (player.scene && camera < player.cameras.length) glide.to(() => player.choose(camera));
@@ -91,7 +91,7 @@ function start() {
     else move();
   };
 
-  // Moves the eye to the camera of a text, null for none, and shows what is wrong with it.
+  // Moves the eye to the camera of a text from the address (null for none), and shows an error if it is invalid.
   const followCamera = (text, smoothly) => {
     if (text === null || !player.scene) return;
     try {
@@ -172,8 +172,8 @@ function start() {
 
   // ---- opening scenes
 
-  // Opens a scene. `fetchFile` returns a promise of {name, stream}; `name` is the scene's title, if not the file's
-  // name; `isGiven`: the page or its address names it.
+  // Opens a scene. `fetchFile` returns a promise of {name, stream}. `name` is the scene's title; if it is null, the
+  // file's name is. `isGiven` is true if the page or its address names the scene.
   const open = async (fetchFile, name = null, isGiven = true) => {
     const thisOpen = ++openCount;
     dismiss();
@@ -186,7 +186,7 @@ function start() {
       await player.open(file);
       postToParent("load");
     } catch (error) {
-      if (thisOpen !== openCount) return; // another file was opened meanwhile
+      if (thisOpen !== openCount) return; // another scene was opened meanwhile
       document.body.classList.toggle("empty", !player.loaded);
       throw error;
     }
@@ -197,15 +197,15 @@ function start() {
     open(async () => chosenFile(file), null, false).catch(fail);
   };
 
-  // Returns the cameras of a file next to the page, {cameras, up, target}, or null where the page has none.
+  // Returns the cameras of a file in the page's folder, {cameras, up, target}, or null if the page has none for it.
   const findStage = (address) => {
     const stages = Object.entries(served?.stages ?? {});
     return stages.find(([name]) => new URL(encodeURI(name), document.baseURI).href === address)?.[1] ?? null;
   };
 
-  // Shows a model that is being trained. Newer snapshots replace it, and the eye stays.
+  // Shows a model that is being trained. Newer snapshots replace it without moving the eye.
   const watchTraining = (address, updates) => new Promise((shown, failed) => {
-    let thisOpen = openCount, isShown = false; // a person who opens a file changes `openCount`
+    let thisOpen = openCount, isShown = false; // changes when the user opens a file
     const isWanted = () => thisOpen === openCount;
     const show = async (progress) => {
       const name = trainingTitle(served.title, progress);
@@ -249,7 +249,7 @@ function start() {
 
   element("file").onchange = ({ target }) => {
     openFile(target.files[0]);
-    target.value = ""; // so that the same file can be chosen again
+    target.value = ""; // so that choosing the same file again fires an event
   };
   for (const button of document.querySelectorAll(".choose")) button.onclick = () => element("file").click();
   addEventListener("dragover", (event) => {
@@ -274,10 +274,10 @@ function start() {
   });
   if (parameters.wrong.length) fail(new Error(parameters.wrong.join(" ")));
 
-  // The interface for scripts. Cameras are {width, height, fx, fy, cx, cy, camera_from_world: 4 x 4}, with OpenCV axes,
-  // in world units.
+  // The interface for scripts. Cameras are {width, height, fx, fy, cx, cy, camera_from_world: 4 x 4}, with OpenCV axes;
+  // poses are in world units, the rest in pixels.
   window.hyrfpack = {
-    ready, // a promise that the scene is loaded
+    ready, // a promise that resolves when the scene is loaded
     show: async (camera) => { // moves the eye to a camera and draws its picture
       await ready;
       lastPicture = await player.show(camera);

@@ -1,10 +1,10 @@
-// Movers of the eye (see Player.movers): damped movements, glides between cameras, and a slow turn.
+// Moves the eye over time (see Player.movers): damped movements, glides between cameras, and a slow turn.
 
 import { dot, mul, sub } from "./camera.js";
 import { quatOf, rowsOf, slerp } from "./rotation.js";
 
 const DAMPING_SECONDS = 0.07; // the remaining movement falls to 1/e in this time
-const REST_THRESHOLD = 1e-4; // radians, or focal lengths; smaller movements are invisible
+const REST_THRESHOLD = 1e-4; // in radians or focal lengths; smaller movements are invisible
 const GLIDE_SECONDS = 0.8;
 const TURN_RADIANS_PER_SECOND = 0.25;
 const TURN_RESUME_MS = 4000; // after the last input
@@ -12,7 +12,7 @@ const TURN_RESUME_MS = 4000; // after the last input
 const reducedMotion = matchMedia("(prefers-reduced-motion: reduce)");
 export const prefersReducedMotion = () => reducedMotion.matches;
 
-// Spreads movements over time with an exponential decay. Their sum is exact, whatever the frame rate.
+// Spreads movements over time with an exponential decay. Their sum is exact at every frame rate.
 export class Damper {
   constructor(player) {
     this.player = player;
@@ -24,7 +24,7 @@ export class Damper {
     this.place = [0, 0]; // the point of the picture that keeps its place in a zoom
   }
 
-  // Movements have the units of Eye; a zoom is the logarithm of its factor.
+  // Adds movements in the units of Eye; a zoom is the natural logarithm of its factor.
   orbit(yaw, pitch) {
     this.add({ yaw, pitch });
   }
@@ -38,7 +38,7 @@ export class Damper {
     this.add({ depth });
   }
 
-  // Adds to the remaining movement.
+  // Adds a movement to the remaining one.
   add(movement) {
     for (const [name, value] of Object.entries(movement)) this.left[name] += value;
     this.player.changed();
@@ -108,19 +108,19 @@ export class Glide {
   }
 }
 
-// Returns a pose in terms that can be interpolated: its target, and the distance and direction (in the eye's axes) to
-// it.
+// Returns a pose in terms that can be interpolated, such as its target, and the distance and direction (in the eye's
+// axes) to it.
 function blendablePose({ position, rows, focal, pace, target }) {
   const away = sub(target, position), distance = Math.hypot(...away) || 1;
   return { quat: quatOf(rows), target, distance, away: rows.map((row) => dot(row, away) / distance), focal, pace };
 }
 
-// Turns the eye slowly about its target while there is no input.
+// Turns the eye slowly about its target while the user makes no input.
 export class Turntable {
   constructor(player) {
     this.player = player;
     this.on = false;
-    this.resumesAt = 0; // the time from which it turns again
+    this.resumesAt = 0; // the time in ms at which the turn resumes
   }
 
   get active() {

@@ -1,4 +1,4 @@
-// Messages at the lower edge of the page: progress, errors, and confirmations.
+// Shows progress, errors and confirmations at the lower edge of the page.
 
 import { element } from "./dom.js";
 
@@ -19,10 +19,10 @@ export function dismiss() {
   element("toast").hidden = true;
 }
 
-// Shows a confirmation for TOAST_MS; screen readers read it. With an address to copy, it stays until it is dismissed.
+// Shows a confirmation, which screen readers read, for TOAST_MS. With an address to copy, it stays until dismissed.
 export function toast(sentence, address = "") {
   const link = element("link");
-  element("toast").hidden = false; // before its text changes, so that screen readers read it
+  element("toast").hidden = false; // before the text changes, so that screen readers notice the change
   element("done").textContent = sentence;
   link.hidden = !address;
   link.value = address;
@@ -36,7 +36,7 @@ export function announce(sentence) {
   element("status").textContent = sentence;
 }
 
-// Shows a lasting remark about the scene; "" hides it.
+// Shows a permanent remark about the scene; "" hides it.
 export function remark(sentence) {
   element("remark").hidden = !sentence;
   element("remark").textContent = sentence;

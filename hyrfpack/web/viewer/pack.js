@@ -13,7 +13,8 @@ const pair16 = (low, high) => (low | (high << 16)) >>> 0;
 const quantizeScale = (scale) => unorm16((Math.log(scale) + 22) / 44);
 const quantizeColor = (color, levels) => Math.round((levels * (Math.min(2, Math.max(-1, color)) + 1)) / 3);
 
-// Packs splats (see viewer/formats): positions and shapes have 4 words a splat, harmonics 4 words a splat and layer.
+// Packs splats (see viewer/formats): positions and shapes take 4 words per splat, harmonics 4 words per splat and
+// layer.
 export function packSplats(splats) {
   const { count, degree, antialiased, positions, scales, quats, opacities, colors, harmonics, range } = splats;
   const height = countRows(count), capacity = TEXTURE_WIDTH * height;
@@ -32,14 +33,14 @@ export function packSplats(splats) {
     shapes[q + 3] = red | (green << 11) | (blue << 22);
   }
   const higher = count ? harmonics.length / count : 0;
-  const layered = new Uint8Array(16 * capacity * degree); // a layer holds 16 bytes of each splat
+  const layered = new Uint8Array(16 * capacity * degree); // a layer has 16 bytes per splat
   for (let i = 0, at = 0; i < count; i++) {
     for (let b = 0; b < higher; b++) layered[16 * ((b >> 4) * capacity + i) + (b & 15)] = harmonics[at++];
   }
   return { count, height, degree, range, antialiased, places, shapes, harmonics: new Uint32Array(layered.buffer) };
 }
 
-// Packs a model of hyrf/index.js for fields.js.
+// Packs a model that hyrf/index.js has read for fields.js.
 export function packModel({ config, count, positions, colorLogits, scaleLogits, opacityLogits, geometry, radiance }) {
   const height = countRows(count);
   const explicit = new Float32Array(4 * TEXTURE_WIDTH * height), logits = new Float32Array(4 * TEXTURE_WIDTH * height);
@@ -74,9 +75,9 @@ export function packModel({ config, count, positions, colorLogits, scaleLogits, 
   };
 }
 
-// Packs a decoder's numbers by fours; hidden units are padded to whole cells. The order is: bias 1, the weights of each
-// input, bias 2, the weights of matrix 2 (for each four outputs those of each input), bias 3, matrix 3 likewise.
-// Returns {numbers, places: the offset of each part, in fours}.
+// Packs a decoder's numbers in groups of four; hidden units are padded to whole cells. The order is: bias 1, the
+// weights of each input, bias 2, matrix 2 (for each four outputs, the weights of each input), bias 3, matrix 3 like
+// matrix 2. Returns {numbers, places: the offset of each part, in groups of four}.
 function packDecoder(decoder, [first, second, last]) {
   const width = UNITS_PER_CELL * Math.ceil(first.outputs / UNITS_PER_CELL), ends = 4 * Math.ceil(last.outputs / 4);
   const places = { BIAS_1: 0, INPUTS: width / 4 };
@@ -102,7 +103,7 @@ function packDecoder(decoder, [first, second, last]) {
   return { numbers, places: { ...places, WEIGHTS } };
 }
 
-// Returns, for each row of a texture, a ball around its Gaussians' positions: x, y, z, radius.
+// Returns, for each row of a texture, a ball around the positions of its Gaussians: x, y, z, radius.
 function rowBalls(positions, count) {
   const balls = new Float32Array(4 * countRows(count));
   for (let row = 0; row * TEXTURE_WIDTH < count; row++) {

@@ -1,4 +1,4 @@
-// The panel with the scene's name, its cameras and the settings.
+// Shows the panel with the scene's name, its cameras and the settings.
 
 import { AS_PHOTOGRAPHED } from "./exposure.js";
 import { element } from "./dom.js";
@@ -7,7 +7,7 @@ const SMALL_SCREEN_QUERY = "(max-width: 640px), (max-height: 480px)"; // the ope
 const COUNT_TEXTS = { hyrf: (count) => `hybrid field, ${count} Gaussians`, splats: (count) => `${count} splats` };
 
 export class Panel {
-  // `actions`: functions by key, for the keys that do not move the eye. Buttons call the same functions.
+  // `actions` has a function for each key that does not move the eye. Buttons call the same functions.
   constructor(player, actions) {
     Object.assign(this, { player, actions });
     for (const button of document.querySelectorAll("[data-key]")) button.onclick = () => this.press(button.dataset.key);
@@ -45,7 +45,7 @@ export class Panel {
     for (const name of ["previous", "next", "cameras"]) element(name).disabled = cameras.length < 2;
   }
 
-  // Shows the exposure's button if the scene has an exposure map, and its state.
+  // Shows the exposure's button and its state if the scene has an exposure map.
   showExposure() {
     const { hasExposureMap, exposure } = this.player;
     for (const part of document.querySelectorAll("[data-needs-map]")) part.hidden = !hasExposureMap;

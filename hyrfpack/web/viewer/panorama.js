@@ -1,21 +1,21 @@
-// The background as an equirectangular picture: coarse at once, then finer in tiles, those in view first.
+// Draws the background as an equirectangular picture: first a coarse one, then finer tiles, those in view first.
 
 import { dot } from "./camera.js";
 import { frustumPlanes, intersectsFrustum } from "./frustum.js";
 import { WorkPacer } from "./graphics.js";
 import { BACKGROUND_RADIUS } from "./constants.js";
 
-// Heights in texels; pictures are twice as wide. The encoding of directions alone needs MIN_HEIGHT_TEXELS.
+// Pictures are twice as wide as high. The encoding of directions needs MIN_HEIGHT_TEXELS even with a coarse hash grid.
 const COARSE_HEIGHT_TEXELS = 64;
 const MIN_HEIGHT_TEXELS = 256;
 const MAX_HEIGHT_TEXELS = 1024;
 const TILE_SIZE_TEXELS = [64, 32];
-const MAX_EAGER_TILE_MS = 5; // devices that are this fast draw tiles out of view, too
+const MAX_EAGER_TILE_MS = 5; // devices that draw a tile in this time draw tiles out of view, too
 
 export class Panorama {
   // `paint(framebuffer, size, part)` draws a part (x, y, width, height) of a picture. `finest` is the finest resolution
-  // of the hash grid. From pole to pole the sphere crosses about pi / 2 times as many cells, and two texels a cell
-  // suffice.
+  // of the hash grid. An arc from pole to pole crosses about pi / 2 times as many cells, and two texels per cell are
+  // enough.
   constructor(graphics, finest, paint) {
     Object.assign(this, { graphics, paint });
     this.pace = new WorkPacer();
@@ -53,9 +53,9 @@ export class Panorama {
     this.tiles = this.cut();
   }
 
-  // Returns the tiles: their part of the picture, and the ball around that part of the sphere.
+  // Returns the tiles. Each has its part of the picture, and a ball around that part of the sphere.
   cut() {
-    const { height } = this, tiles = [], [wide, high] = TILE_SIZE_TEXELS, angle = Math.PI / height; // of a texel
+    const { height } = this, tiles = [], [wide, high] = TILE_SIZE_TEXELS, angle = Math.PI / height; // per texel
     const radius = (BACKGROUND_RADIUS * angle * Math.hypot(wide, high)) / 2;
     for (let y = 0; y < height; y += high) {
       for (let x = 0; x < 2 * height; x += wide) {
@@ -68,7 +68,8 @@ export class Panorama {
     return tiles;
   }
 
-  // Draws all tiles that a view shows, see Fields.complete. `done` is called when all tiles are drawn.
+  // Draws all tiles that a view shows; for the callbacks see Fields.complete. `done` is called when all tiles are
+  // drawn.
   async complete(view, { goOn, changed, done }) {
     const sides = frustumPlanes(view, 0), ahead = ({ middle }) => dot(view.rows[2], middle);
     const make = async (tiles) => {

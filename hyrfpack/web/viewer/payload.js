@@ -1,6 +1,6 @@
 // Reads the file that is embedded in the page.
 
-const READ_INTERVAL_MS = 20; // while the page is loading
+const READ_INTERVAL_MS = 20; // the wait for more of the page while it is loading
 
 // Yields the bytes of the page's base64 blocks as the page loads. Each block is removed after it is read.
 export async function* readPayload() {

@@ -1,14 +1,14 @@
-// The player: draws a scene on a canvas with a worker, a renderer and an eye. It knows no other part of the page.
+// Draws a scene on a canvas, with a worker, a renderer and an eye. The player does not depend on the rest of the page.
 //
 // Events:
-//     "progress"   detail {part: fraction, what: "loading" | "unpacking" | "preparing"}
-//     "opened"     detail: the scene of a file that was opened without one
-//     "count"    detail: the scene, when more Gaussians of its file were loaded
-//     "loaded"     something can be drawn
-//     "exposure"    the exposure was chosen, or the scene has got or lost its exposure map
-//     "remark"       detail: a remark on the scene, "" for none
-//     "frame"      detail: ms a frame while moving
-//     "camera"      detail: the index of the camera that the eye was moved to
+//     "progress"   detail: {part: fraction, what: "loading" | "unpacking" | "preparing"}
+//     "opened"     detail: the scene of a file that was opened without a scene
+//     "count"      detail: the scene, when more Gaussians of its file were loaded
+//     "loaded"     a content is ready to be drawn
+//     "exposure"   an exposure was chosen, or the scene has got or lost its exposure map
+//     "remark"     detail: a remark about the scene, "" for none
+//     "frame"      detail: ms per frame while moving
+//     "camera"     detail: the index of the scene's camera to which the eye was moved
 //     "failed"     detail: an Error
 
 import { Eye, cameraOf, viewOf } from "./camera.js";
@@ -19,34 +19,35 @@ import { Loader, SupersededError } from "./loader.js";
 import { Renderer } from "./renderer.js";
 import { Splats } from "./splats.js";
 
-const SETTLE_MS = 200; // after the last movement, the picture is drawn at full resolution
+const SETTLE_MS = 200; // the wait after a movement before the picture is drawn at full resolution
 const TARGET_FRAME_MS = 33; // slower frames lower the resolution while moving
 const MIN_SCALE = 0.2;
-const MAX_PIXEL_RATIO = 2; // device pixels a CSS pixel
-const FIRST_STEP_SECONDS = 1 / 60; // for the first frame of a movement, which has none before it
-const MAX_STEP_SECONDS = 0.25; // longer frames do not move the eye farther
+const MAX_PIXEL_RATIO = 2; // device pixels per CSS pixel
+const FIRST_STEP_SECONDS = 1 / 60; // for the first frame of a movement, which has no earlier one to measure from
+const MAX_STEP_SECONDS = 0.25; // limits the movement of the eye after a long frame
 const COLORING_RATIO = 0.25; // the share of a frame that is used for colours while moving
 const PROGRESS_RANGES = { loading: [0, 0.3], unpacking: [0.3, 0.6], preparing: [0.6, 1] };
 
 const DEVICE_LOST_TEXT = "Meanwhile the graphics device was lost, or another scene opened; try again.";
 
 export class Player extends EventTarget {
-  // A player without a scene gets one by `open`. Throws an Error with a sentence where the browser cannot draw.
+  // A player without a scene gets one from `open`. Throws an Error with a message for the user if the browser cannot
+  // draw.
   constructor(canvas, scene = null) {
     super();
     this.canvas = canvas;
     this.renderer = new Renderer(canvas);
-    this.loader = null; // of the file that is drawn
-    this.next = null; // of the file that is being loaded
-    this.previous = null; // of the file that was being loaded before, in case the next one cannot be shown
-    this.waiters = []; // called when `previous` changes
+    this.loader = null; // the loader of the file that is drawn
+    this.next = null; // the loader of the file that is being loaded
+    this.previous = null; // the loader of the file before, in case the next one cannot be shown
+    this.waiters = []; // functions that are called when `previous` changes
     this.scene = null;
     this.cameras = [];
     this.eye = null;
-    this.movers = []; // {active: whether it moves the eye, advance(seconds): moves it and returns whether it moved}
-    this.resolution = 1; // a fraction of the canvas' size, chosen by a person
-    this.automatic = true; // lower the resolution while moving, if frames are slow
-    this.mode = AS_PHOTOGRAPHED; // of the exposure
+    this.movers = []; // {active: whether it moves the eye, advance(seconds): moves it, returns whether it moved}
+    this.resolution = 1; // a fraction of the canvas' size that the user chose
+    this.automatic = true; // whether slow frames lower the resolution while moving
+    this.mode = AS_PHOTOGRAPHED; // the exposure
     this.frames = 0; // the number of frames drawn so far
     // The times of the first picture and of the first complete one, in ms since the page was opened.
     this.times = { first: null, complete: null };
@@ -54,23 +55,23 @@ export class Player extends EventTarget {
     this.moves = 0; // the number of changes of the view or the content
     this.before = null; // the time of the last frame, if a mover was active then
     this.began = null; // the start of the frame that is being drawn
-    this.took = null; // the running mean of ms a frame
+    this.took = null; // the running mean of ms per frame
     this.coarse = 1; // the factor of the resolution while moving
     this.scheduled = false;
     this.loaded = false;
     this.whole = false; // whether all layers of the file are loaded
-    this.stale = true; // whether the canvas must be drawn again
+    this.stale = true; // whether the canvas must be redrawn
     this.unsorted = true; // whether the splats must be sorted for the view
     this.idle = false; // whether the picture is complete
     this.onIdle = []; // functions that resolve the promises of `settled`
-    this.queue = Promise.resolve(); // the end of the queue of `enqueue`
+    this.queue = Promise.resolve(); // a promise of the end of the work in the queue
     if (scene) this.setScene(initialView(scene));
 
     this.aborter = new AbortController();
     const { signal } = this.aborter;
     canvas.addEventListener("webglcontextlost", (event) => this.onLost(event), { signal });
     canvas.addEventListener("webglcontextrestored", () => this.onRestored(), { signal });
-    addEventListener("resize", () => this.schedule(), { signal }); // comes with a new pixel ratio, too
+    addEventListener("resize", () => this.schedule(), { signal }); // fired for a new pixel ratio, too
     this.observer = new ResizeObserver(() => this.schedule());
     this.observer.observe(canvas);
   }
@@ -80,7 +81,7 @@ export class Player extends EventTarget {
     this.dispatchEvent(new CustomEvent(name, { detail }));
   }
 
-  // Frees the worker and all objects of the graphics device. The canvas is blank from then on.
+  // Frees the worker and all objects of the graphics device. The canvas becomes blank.
   dispose() {
     this.aborter.abort();
     this.observer.disconnect();
@@ -93,8 +94,8 @@ export class Player extends EventTarget {
   // ---- loading
 
   // Loads the file of the scene that the player was created with, from an async iterable of its bytes, which may have
-  // their `length`. `picture`: an <img> of the background, or null. If another file is opened meanwhile, that one is
-  // shown.
+  // their `length`. `picture` is an <img> of the background, or null. If another file is opened meanwhile, the player
+  // shows that one.
   async load(stream, picture = null) {
     try {
       await this.receive({ scene: this.scene, stream, picture });
@@ -105,8 +106,8 @@ export class Player extends EventTarget {
     }
   }
 
-  // Opens a file, {name, stream}. `stage` has its {cameras, up, target} where they are known. `update`: the file is a
-  // newer version of the scene that is shown; the eye stays, and only errors are reported.
+  // Opens a file, {name, stream}. `stage` has its {cameras, up, target} if they are known. `update` is true for a newer
+  // version of the scene that is shown: then the eye stays, and only errors are reported.
   async open({ name, stream, stage = null, update = false }) {
     try {
       await this.receive({ name, stream, stage, picture: null, update });
@@ -130,7 +131,7 @@ export class Player extends EventTarget {
       await loader.read({ name, scene, stage, plain: scene?.plain ?? false, stream });
     } catch (error) {
       if (this.loader === loader) {
-        this.whole = true; // no more of the file will come
+        this.whole = true; // no more of the file will arrive
         this.redraw();
       } else {
         this.discard(loader);
@@ -139,7 +140,7 @@ export class Player extends EventTarget {
     }
   }
 
-  // Discards a loader that has nothing to show.
+  // Discards a loader whose file cannot be shown.
   discard(loader) {
     loader.dispose();
     if (loader === this.next) [this.next, this.previous] = [this.previous, null];
@@ -147,26 +148,25 @@ export class Player extends EventTarget {
     for (const resolve of this.waiters.splice(0)) resolve();
   }
 
-  // Reports progress, only of the file that was opened last.
+  // Reports progress, but only of the file that was opened last.
   progress(loader, what, part) {
     const [first, last] = PROGRESS_RANGES[what];
     loader.part = Math.max(loader.part, first + (last - first) * part);
     if (loader === (this.next ?? this.loader) && !loader.update) this.emit("progress", { what, part: loader.part });
   }
 
-  // Returns whether a loader is in use.
+  // Returns whether the player still uses a loader.
   wanted(loader) {
     return [this.loader, this.next, this.previous].includes(loader);
   }
 
-  // Waits until a loader may show its content. Throws SupersededError if it is not in use any more.
+  // Waits until a loader may show its content. Throws SupersededError if the player no longer uses it.
   async waitFor(loader) {
     while (loader === this.previous) await new Promise((resolve) => this.waiters.push(resolve));
     if (!this.wanted(loader)) throw new SupersededError();
   }
 
-  // Uploads a content that the worker has read, and shows it. The old content stays until then. Returns whether the new
-  // one is shown.
+  // Uploads a content that the worker has read, and then shows it instead of the old one. Returns whether it is shown.
   async install(loader, { number, whole, scene, model, splats, picture }) {
     const { gl } = this.renderer, initial = loader.scene ? null : initialView(scene);
     let content = null, staged = null;
@@ -235,16 +235,16 @@ export class Player extends EventTarget {
   setScene({ scene, cameras, eye }) {
     this.scene = scene;
     this.cameras = cameras;
-    this.eye = this.eye ? Object.assign(this.eye, eye) : eye; // other objects refer to the eye
+    this.eye = this.eye ? Object.assign(this.eye, eye) : eye; // the same object, because others refer to it
     this.choose(0);
   }
 
-  // Handles a lost graphics context. Browsers drop contexts of pages in the background, or when a driver restarts.
+  // Handles a lost graphics context. Browsers drop contexts of background pages, and when a driver restarts.
   onLost(event) {
-    event.preventDefault(); // otherwise the context is never restored
+    event.preventDefault(); // otherwise the browser never restores the context
     countContextChange(this.renderer.gl);
     this.loaded = false;
-    this.idle = false; // the picture is not complete until the device is restored
+    this.idle = false; // the picture is incomplete until the device is restored
     this.emit("remark", "The graphics device was lost; drawing resumes when it is back.");
   }
 
@@ -255,7 +255,7 @@ export class Player extends EventTarget {
       this.renderer = new Renderer(this.canvas);
       this.coarse = 1;
       for (const loader of [this.loader, this.next, this.previous]) loader?.again(false);
-      if (this.loader) await this.loader.expect(); // showing the content updates the remark, too
+      if (this.loader) await this.loader.expect(); // showing the content also updates the remark
       else this.emit("remark", "");
     } catch (error) {
       if (!(error instanceof SupersededError)) this.emit("failed", error);
@@ -264,7 +264,7 @@ export class Player extends EventTarget {
 
   // ---- drawing
 
-  // The exposure, "as-photographed" or "consistent", see exposure.js.
+  // Returns the exposure, "as-photographed" or "consistent" (see exposure.js).
   get exposure() {
     return this.mode;
   }
@@ -276,38 +276,38 @@ export class Player extends EventTarget {
     this.redraw();
   }
 
-  // Whether the scene has an exposure map. Without one, both exposures are the same.
+  // Returns whether the scene has an exposure map. Without one, both exposures are the same.
   get hasExposureMap() {
     return Boolean(this.scene?.exposure);
   }
 
-  // Returns the exposure gains of a view.
+  // Returns the gains of red, green and blue for a view.
   gains(view) {
     return viewGains(this.scene, view, this.exposure);
   }
 
-  // The factor of the resolution of the next frame.
+  // Returns the factor of the resolution of the next frame, in (0, 1].
   get scale() {
     return this.moving && this.automatic ? Math.max(MIN_SCALE, this.resolution * this.coarse) : this.resolution;
   }
 
-  // Whether a mover moves the eye.
+  // Returns whether a mover moves the eye.
   get driven() {
     return this.movers.some((mover) => mover.active);
   }
 
-  // Whether the eye moves or moved just now.
+  // Returns whether the eye moves, or has moved in the last SETTLE_MS.
   get moving() {
     return this.driven || performance.now() - this.movedAt < SETTLE_MS;
   }
 
-  // A promise that the picture is complete: at full resolution, with the order and colours of this view, and the
-  // background.
+  // Returns a promise that resolves when the picture is complete: at full resolution, with the order and colours of
+  // this view, and with the background.
   get settled() {
     return this.idle ? Promise.resolve() : new Promise((resolve) => this.onIdle.push(resolve));
   }
 
-  // Sets the canvas to the window's size. A change blanks the canvas, so it must be drawn in the same frame.
+  // Sets the canvas to the window's size. A change blanks the canvas, so it must be redrawn in the same frame.
   resize() {
     const { clientWidth, clientHeight } = this.canvas, [wide, high] = this.renderer.largest;
     const dense = Math.min(devicePixelRatio, MAX_PIXEL_RATIO, wide / clientWidth, high / clientHeight);
@@ -341,7 +341,7 @@ export class Player extends EventTarget {
     requestAnimationFrame((now) => this.frame(now));
   }
 
-  // Moves the eye, and draws a frame if something has changed.
+  // Moves the eye, and draws a frame if the picture has changed.
   frame(now) {
     this.scheduled = false;
     if (!this.loaded) return;
@@ -377,7 +377,7 @@ export class Player extends EventTarget {
     this.emit("frame", this.took);
     if (this.automatic) {
       const wanted = this.coarse * Math.min(1.15, Math.sqrt(TARGET_FRAME_MS / took));
-      // Small changes of the resolution would be visible as jitter and save little.
+      // Small changes of the resolution would be visible as jitter, and save little time.
       const isOffTarget = took > 1.3 * TARGET_FRAME_MS || took < 0.7 * TARGET_FRAME_MS;
       if (isOffTarget) this.coarse = Math.min(1, Math.max(MIN_SCALE, wanted));
     }
@@ -403,8 +403,8 @@ export class Player extends EventTarget {
     for (const resolve of this.onIdle.splice(0)) resolve();
   }
 
-  // Runs work on the content after all earlier work on it. Returns a promise of its result, null if the context was
-  // lost.
+  // Runs work on the content after all earlier work on it. Returns a promise of its result, or of null if the context
+  // was lost.
   enqueue(work) {
     const done = this.queue.then(work).catch((error) => {
       if (!(error instanceof ContextLostError)) throw error;
@@ -418,7 +418,7 @@ export class Player extends EventTarget {
     return eye.view(this.canvas.width, this.canvas.height);
   }
 
-  // The camera, in world units, of the window's picture.
+  // Returns the camera of the window's picture, in world units.
   get viewed() {
     return cameraOf(this.view(), this.scene);
   }
@@ -449,7 +449,7 @@ export class Player extends EventTarget {
     this.changed();
   }
 
-  // Sets the target to the point that is seen at a position of the canvas, in CSS pixels. Returns whether there is one.
+  // Sets the target to the visible point at a position of the canvas, in CSS pixels. Returns whether there is a point.
   pick(x, y) {
     if (!this.loaded) return false;
     const { width, height, clientWidth, clientHeight } = this.canvas, view = this.view();
@@ -461,15 +461,15 @@ export class Player extends EventTarget {
     return depth !== null;
   }
 
-  // Returns a promise of a PNG of the window's picture at full size.
+  // Returns a promise of a PNG file (Blob) of the window's picture at full size.
   capture() {
     const view = this.view();
     this.renderer.draw(view, this.resolution, this.gains(view));
     return new Promise((resolve) => this.canvas.toBlob(resolve, "image/png"));
   }
 
-  // Moves the eye to a camera in world units and draws its picture. Returns its RGB bytes, top row first. Throws an
-  // Error with a sentence where that is impossible; the eye does not move then.
+  // Moves the eye to a camera in world units and draws its picture. Returns its RGB bytes, top row first. If that is
+  // impossible, throws an Error with a message for the user, and the eye does not move.
   async show(camera) {
     if (!this.loaded) throw new Error(DEVICE_LOST_TEXT);
     const view = viewOf(camera, this.scene), { content } = this.renderer;
@@ -490,12 +490,12 @@ export class Player extends EventTarget {
   }
 }
 
-// Returns whether two scenes have the same origin and unit, so that an eye of one scene fits the other.
+// Returns whether two scenes have the same origin and unit, so that an eye of one is valid in the other.
 function sameAxes(before, after) {
   return before?.unit === after.unit && before.center.every((value, axis) => value === after.center[axis]);
 }
 
-// Returns the views and the eye at the start of a scene. Throws an Error where a camera is invalid.
+// Returns the views and the first eye of a scene. Throws an Error if a camera is invalid.
 function initialView(scene) {
   const cameras = scene.cameras.map((camera) => viewOf(camera, scene)), eye = new Eye(scene, cameras);
   eye.setView(cameras[0]);

@@ -1,26 +1,26 @@
-// Draws splats with WebGL 2 in three passes: project (one fragment a splat), blend (one quad a splat, farthest first)
-// and resolve (composite over the background, and apply the gains of the exposure).
+// Draws splats with WebGL 2 in three passes: project (one fragment per splat), blend (one quad per splat, farthest
+// first) and resolve (composite over the background, and apply the gains of the exposure).
 
 import { Graphics } from "./graphics.js";
 import { BACKGROUND_RADIUS, TEXTURE_WIDTH } from "./constants.js";
 
-const MAX_READ_SIDE_PIXELS = 8192; // of pictures that are read back
+const MAX_READ_SIDE_PIXELS = 8192; // the limit of pictures that are read back
 const QUADS_PER_INSTANCE = 1024; // drivers are slow with many small instances
 
 export class Renderer {
-  // Throws an Error with a sentence where the browser has no WebGL 2.
+  // Throws an Error with a message for the user if the browser has no WebGL 2.
   constructor(canvas) {
     const contextOptions = { alpha: false, antialias: false, depth: false, powerPreference: "high-performance" };
     const gl = canvas.getContext("webgl2", contextOptions);
     if (!gl) throw new Error("This page needs WebGL 2, which this browser lacks; enable it or use another browser.");
-    gl.getError(); // clears the error of a context that was lost before
+    gl.getError(); // clears the error that a lost context has left
     this.gl = gl;
     this.graphics = new Graphics(gl);
     const side = gl.getParameter(gl.MAX_TEXTURE_SIZE), sides = gl.getParameter(gl.MAX_VIEWPORT_DIMS) ?? [0, 0];
     this.largest = [...sides].map((limit) => Math.min(limit, side)); // the maximum width and height of a picture
-    // Thousands of splats are blended, and 8 bits would round the faint ones to nothing.
+    // Thousands of splats are blended, and 8 bits would round the faint ones to zero.
     this.fine = Boolean(gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float"));
-    gl.getExtension("WEBGL_provoking_vertex")?.provokingVertexWEBGL(0x8e4d); // the first one: fast on all devices
+    gl.getExtension("WEBGL_provoking_vertex")?.provokingVertexWEBGL(0x8e4d); // the first vertex: fast on all devices
     this.project = this.graphics.program("whole.vert", "project.frag");
     this.blend = this.graphics.program("blend.vert", "blend.frag");
     this.resolve = this.graphics.program("whole.vert", "resolve.frag");
@@ -41,8 +41,8 @@ export class Renderer {
     this.drawn = 0;
   }
 
-  // Creates all objects for drawing a content (`Splats` or `Fields`), for `show`. They are freed with the content.
-  // `picture` is the background's, see `background`, or null.
+  // Creates all objects for drawing a content (`Splats` or `Fields`), which `show` uses. They are freed with the
+  // content. `picture` is the background's picture (see `background`), or null.
   stage(content, scene, picture) {
     const { gl } = this, { graphics } = content, size = [TEXTURE_WIDTH, content.height];
     const order = graphics.texture(gl.TEXTURE_2D, gl.R32UI, ...size);
@@ -53,7 +53,7 @@ export class Renderer {
     return { content, scene, order, shapes, appearances, projection, tableSize: size, picture: background };
   }
 
-  // Draws a staged content from now on, and frees the one before it.
+  // Selects a staged content for drawing, and frees the previous one.
   show(staged) {
     this.content?.dispose();
     Object.assign(this, staged);
@@ -82,14 +82,14 @@ export class Renderer {
     this.drawn = drawn;
   }
 
-  // Draws a view to the canvas, with splats at `scale` times its resolution. `gains`: of the exposure, see exposure.js.
+  // Draws a view to the canvas, with splats at `scale` times its resolution. `gains` are those of exposure.js.
   draw(view, scale, gains) {
     const size = [view.width, view.height].map((side) => Math.max(1, Math.round(side * scale)));
     this.splats(resizeView(view, ...size));
     this.over(view, size, null, gains);
   }
 
-  // Draws a view and returns its RGB bytes, top row first. Throws an Error with a sentence where the device cannot.
+  // Draws a view and returns its RGB bytes, top row first. Throws an Error with a message for the user on failure.
   read(view, gains) {
     const { gl, graphics } = this, { width, height } = view;
     this.check(view);
@@ -107,15 +107,15 @@ export class Renderer {
     return rgba.filter((_, place) => (place & 3) !== 3);
   }
 
-  // Throws an Error with a sentence where a view's picture is too large.
+  // Throws an Error with a message for the user if a view's picture is too large.
   check({ width, height }) {
     const [wide, high] = this.largest.map((side) => Math.min(side, MAX_READ_SIDE_PIXELS));
     if (width <= wide && height <= high) return;
     throw new Error(`Pictures here are ${wide} x ${high} pixels at most; ask for a smaller one.`);
   }
 
-  // Returns the mean depth of the splats at a pixel, null where there are none. Depths z are blended as z / (z +
-  // scale), so `scale` should be of their magnitude.
+  // Returns the mean depth of the splats at a pixel, or null if there are none. Depths z are blended as z / (z +
+  // scale), so `scale` should be a typical depth.
   pick(view, x, y, scale) {
     const { gl } = this;
     const place = [Math.floor(x), Math.floor(y), 1, 1];
@@ -127,7 +127,7 @@ export class Renderer {
     return alpha > (this.fine ? 0.1 : 25) && share < 1 ? (scale * share) / (1 - share) : null;
   }
 
-  // Whether the last frame is still being drawn.
+  // Returns whether the last frame is still being drawn.
   busy() {
     const { gl } = this;
     if (!this.fence) return false;
@@ -137,8 +137,8 @@ export class Renderer {
     return false;
   }
 
-  // Blends the splats of a view at the pixels of `part` (x, y, width, height). If `pick` is not 0, it blends depths
-  // instead of colours, see `pick`.
+  // Blends the splats of a view at the pixels of `part` (x, y, width, height). If `pick` is not 0, it is the `scale` of
+  // the method `pick`, and depths are blended instead of colours.
   splats(view, pick = 0, part = [0, 0, view.width, view.height]) {
     const { gl, graphics, blend } = this, { width, height } = view;
     this.projections(view, pick);
@@ -189,7 +189,7 @@ export class Renderer {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  // Composites the blended splats, which fill the size `used`, over the background, to a target or the canvas.
+  // Composites the blended splats, which fill the size `used`, over the background. Draws to a target or the canvas.
   over(view, used, target, gains) {
     const { gl, graphics, resolve: r, scene, content } = this, picture = content.panorama?.texture ?? this.picture;
     const { center, radius } = backgroundSphere(scene);
@@ -224,7 +224,7 @@ export class Renderer {
     this.layers = graphics.framebuffer(this.layered);
   }
 
-  // Frees that target.
+  // Frees the target of `reserve`.
   release() {
     for (const object of [this.layered, this.layers]) this.graphics.free(object);
     this.layered = this.layers = this.reserved = null;
@@ -238,7 +238,7 @@ export class Renderer {
   }
 }
 
-// Returns the background sphere in the page's units. The radius is Infinity where the scene has none.
+// Returns the background sphere in the page's units. The radius is Infinity if the scene has none.
 function backgroundSphere({ kind, sphere, center, unit }) {
   if (kind === "hyrf") return { center: [0, 0, 0], radius: BACKGROUND_RADIUS };
   if (!sphere) return { center: [0, 0, 0], radius: Infinity };

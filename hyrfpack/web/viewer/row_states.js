@@ -3,16 +3,16 @@
 import { intersectsFrustum } from "./frustum.js";
 
 export class RowStates {
-  // `balls`: a ball around each row, see pack.js.
+  // `balls` has a ball around each row (see rowBalls in pack.js).
   constructor(balls) {
     this.balls = balls;
     this.count = balls.length / 4;
     this.eyes = new Float64Array(3 * this.count).fill(NaN);
   }
 
-  // Returns {visible, fresh, rows}: the number of rows within the planes `sides`; the rows among them whose viewing
-  // direction has turned by more than `angle` radians since they were coloured, the largest turns first; and how many
-  // of these have no colours yet (`fresh`).
+  // Returns {visible, fresh, rows}. `visible` is the number of rows within the planes `sides`. `rows` are those among
+  // them whose viewing direction has turned by more than `angle` radians since they were coloured, largest turns first.
+  // `fresh` is the number of these that have no colours yet.
   stale(sides, eye, angle) {
     const { balls, eyes } = this, stale = [], angles = new Float64Array(this.count);
     let visible = 0, fresh = 0;

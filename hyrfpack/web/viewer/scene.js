@@ -1,10 +1,10 @@
-// Describes the scene of a file that is opened without a page of its own, in the form of the JSON in pages.
+// Describes the scene of a file that has no page of its own, in the same form as the JSON in pages.
 
 import { backgroundColors } from "../hyrf/fields.js";
 import { viewpointOf } from "../hyrf/viewpoint.js";
 import { BACKGROUND_RADIUS } from "./constants.js";
 
-const NEAR_PLANE_LOCAL = 0.01; // in local units; the default of hyrfpack.render_view
+const NEAR_PLANE_LOCAL = 0.01; // the default of hyrfpack.render_view
 const CULL_MARGIN_RATIO = 0.3; // in halves of the picture's size; the default of hyrfpack.render_view
 const MIN_SAMPLED_SPLATS = 10000;
 const BACKGROUND_HEIGHT_PIXELS = 128;
@@ -36,8 +36,8 @@ export function splatsScene({ count, center, unit, positions }, name) {
 
 const percentile = (values, part) => Float32Array.from(values).sort()[Math.floor(part * (values.length - 1))] ?? 0;
 
-// Returns the background of a model as an equirectangular picture, {width, height, rgba}, seen from its centre; null
-// where there is none. It is for devices that cannot evaluate the background.
+// Returns the background of a model, seen from its centre, as an equirectangular picture {width, height, rgba}, or null
+// if there is none. The picture is for devices that cannot evaluate the background.
 export function backgroundPicture(model) {
   if (!model.config.background) return null;
   const height = BACKGROUND_HEIGHT_PIXELS, width = 2 * height, directions = new Float32Array(3 * width * height);

@@ -2,8 +2,8 @@
 
 import { toast } from "./notifications.js";
 
-// Copies the page's address with this camera and exposure (null for the default). `includesScene`: whether the address
-// opens the scene, too.
+// Copies the page's address with this camera and exposure (null for the default). `includesScene` is true if the
+// address also opens the scene.
 export async function shareView(camera, exposure, includesScene) {
   const address = new URL(location.href), { searchParams: parameters } = address;
   if (exposure) parameters.set("exposure", exposure);
@@ -12,7 +12,7 @@ export async function shareView(camera, exposure, includesScene) {
   try {
     history.replaceState(null, "", address);
   } catch {
-    // pages without an address of their own, as in srcdoc, cannot change it
+    // pages without an address of their own (srcdoc) cannot change it
   }
   const ending = includesScene ? "." : "; it does not include the opened file.";
   const copied = `The link to this view is copied${ending}`;
@@ -24,7 +24,7 @@ export async function shareView(camera, exposure, includesScene) {
   }
 }
 
-// Downloads a picture.
+// Downloads a picture (Blob), with the title in its file name.
 export function savePicture(blob, title) {
   const link = document.createElement("a"), address = URL.createObjectURL(blob);
   Object.assign(link, { href: address, download: `${fileName(title)}.png` });

@@ -3,7 +3,7 @@
 const RADIX_BINS = 1 << 16;
 
 export class DepthSort {
-  // `positions` are those of the splats (3 N). Orders fill whole rows of a texture of this `width`.
+  // `positions` are those of the splats (3 N). Orders fill whole rows of a texture that is `width` texels wide.
   constructor(positions, width) {
     this.positions = positions;
     this.count = positions.length / 3;
@@ -15,9 +15,9 @@ export class DepthSort {
   }
 
   // Returns {order, drawn}: indices of splats, of which the first `drawn` are valid. Uses a radix sort of the float32
-  // depths in two passes of 16 bits. `row` is the third row of the camera's pose. Splats before the near plane or
-  // outside the planes `sides` (see frustum.js) are left out. At equal depth the later splat comes first, as in the
-  // rasteriser. `order` is reused if its length fits.
+  // depths in two passes of 16 bits. `row` is the third row of the camera's pose. Splats nearer than the near plane or
+  // outside the planes `sides` (see frustum.js) are omitted. At equal depth the splat with the larger index comes
+  // first, as in the rasteriser. `order` is reused if its length fits.
   sort(row, sides, near, order) {
     const { positions, depths, bits, indices, others, counts } = this;
     const [a, b, c, d] = row;
@@ -45,7 +45,7 @@ export class DepthSort {
   }
 }
 
-// Distributes indices by their keys, in a stable order: one pass of the radix sort.
+// Distributes indices by their keys in a stable order, which is one pass of the radix sort.
 function scatter(from, to, length, counts, key) {
   let start = 0;
   for (let k = 0; k < counts.length; k++) {

@@ -1,7 +1,7 @@
-// Sources of a scene's bytes: an address, or a file that a person chose. Each is {name, stream}; the stream is an async
-// iterable of Uint8Array, with its `length` in bytes, or 0 where that is unknown.
+// Reads a scene's bytes from an address, or from a file that the user chose. Both give {name, stream}; the stream is an
+// async iterable of Uint8Array, whose `length` is the number of bytes, or 0 if that is unknown.
 
-// Fetches a file. Throws an Error with a sentence where that fails.
+// Fetches a file. Throws an Error with a message for the user on failure.
 export async function fetchedFile(address) {
   const name = nameOfAddress(address), answer = await request(address, name);
   if (!answer.ok) {
@@ -14,7 +14,7 @@ export async function fetchedFile(address) {
   return { name, stream: Object.assign(downloaded(address, name, answer, length), { length }) };
 }
 
-// Returns a file that a person chose.
+// Returns a file that the user chose.
 export function chosenFile(file) {
   return { name: file.name, stream: Object.assign(pieces(file.stream()), { length: file.size }) };
 }
@@ -29,7 +29,7 @@ const nameOfAddress = (address) => {
   }
 };
 
-// Sends a request. Throws an Error with a sentence where no answer comes.
+// Sends a request. Throws an Error with a message for the user if the server does not answer.
 async function request(address, name, headers = {}) {
   try {
     return await fetch(address, { headers, credentials: "same-origin" });
@@ -43,7 +43,7 @@ async function request(address, name, headers = {}) {
   }
 }
 
-// Yields the bytes of an answer. A connection that breaks is resumed once, by a range request.
+// Yields the bytes of an answer. After a broken connection, the rest is requested once, by a range request.
 async function* downloaded(address, name, answer, length) {
   const isSameOrigin = new URL(address).origin === location.origin, tag = answer.headers.get("ETag");
   let done = 0;
@@ -59,7 +59,7 @@ async function* downloaded(address, name, answer, length) {
       const sentence = `the connection broke after ${done.toLocaleString("en")} bytes; reload the page to try again`;
       const brokenError = new Error(sentence);
       if (isResumed || !done) throw brokenError;
-      // If-Range is sent to the page's own server only, because other servers would have to allow it.
+      // If-Range is sent only to the page's own server, because other servers would have to allow it.
       const condition = isSameOrigin && tag && !tag.startsWith("W/") ? { "If-Range": tag } : {};
       const headers = { Range: `bytes=${done}-`, ...condition };
       answer = await request(address, name, headers);
@@ -69,7 +69,7 @@ async function* downloaded(address, name, answer, length) {
   }
 }
 
-// Iterates over a ReadableStream, which not every browser can do itself.
+// Iterates over a ReadableStream, because not every browser supports `for await` with streams.
 async function* pieces(stream) {
   const reader = stream.getReader();
   try {

@@ -1,4 +1,4 @@
-// Splats with harmonics on the graphics device, from the arrays of pack.js.
+// Holds splats with harmonics on the graphics device, made from the arrays of pack.js.
 
 import { Graphics } from "./graphics.js";
 import { TEXTURE_WIDTH } from "./constants.js";
@@ -14,7 +14,7 @@ export class Splats {
     if (degree) gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, 0, ...size, gl.RGBA_INTEGER, gl.UNSIGNED_INT, harmonics);
   }
 
-  // Splats do not change with the view, unlike Fields.
+  // Does nothing: unlike Fields, splats do not change with the view.
   recolor() {}
 
   async complete() {

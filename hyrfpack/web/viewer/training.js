@@ -1,13 +1,13 @@
-// Follows a training through its server, which has the progress and the newest snapshot of the model.
+// Follows a training run through its server, which has the progress and the newest snapshot of the model.
 
 const REQUEST_INTERVAL_MS = 2000;
-const WAIT_PER_LOAD_RATIO = 3; // after a snapshot, the wait is at least this many times its loading time
-const MAX_FAILURES = 3; // after as many failed requests in a row, the training counts as ended
+const WAIT_PER_LOAD_RATIO = 3; // the wait after a snapshot is at least this many times its loading time
+const MAX_FAILURES = 3; // after this many consecutive failed requests, the run counts as ended
 
 const wait = (duration) => new Promise((done) => setTimeout(done, duration));
 
-// Requests the progress {snapshot, step, steps}; `snapshot` counts from 1 and is 0 while there is none. Returns null
-// where the server does not answer.
+// Requests the progress {snapshot, step, steps}; `snapshot` counts from 1 and is 0 while there is none. Returns null if
+// the server does not answer.
 async function requestProgress(address) {
   try {
     const answer = await fetch(address, { cache: "no-store" });
@@ -17,8 +17,8 @@ async function requestProgress(address) {
   }
 }
 
-// Follows a training until its server stops answering or `isWanted()` is false. `show(progress)` is called for each new
-// snapshot, and its promise is awaited; `waiting()` is called while there is none.
+// Follows a training run until its server stops answering or `isWanted()` is false. `show(progress)` is called for each
+// new snapshot, and its promise is awaited; `waiting()` is called while there is no snapshot.
 export async function followTraining(address, { show, waiting, isWanted }) {
   let shown = 0;
   for (let failures = 0; isWanted() && failures < MAX_FAILURES; ) {
@@ -32,7 +32,7 @@ export async function followTraining(address, { show, waiting, isWanted }) {
         await show(progress);
         shown = progress.snapshot;
       } catch (error) {
-        if (!shown) throw error; // after the first one, errors are ignored: the next snapshot may be valid
+        if (!shown) throw error; // after the first snapshot errors are ignored, because the next one may be valid
       }
       loadMs = performance.now() - began;
     }

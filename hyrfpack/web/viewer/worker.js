@@ -1,4 +1,4 @@
-// The worker of pages that open files of all formats.
+// Starts the worker of pages that open files of all formats.
 
 import { decodeSplats } from "./formats/index.js";
 import { startWorker } from "./worker_tasks.js";

@@ -1,4 +1,4 @@
-// The worker of pages with an embedded model. It is smaller, because it reads no other format.
+// Starts the worker of pages with an embedded model. It is smaller, because it reads no other format.
 
 import { HyrfFormatError } from "../hyrf/errors.js";
 import { startWorker } from "./worker_tasks.js";

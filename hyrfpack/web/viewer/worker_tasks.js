@@ -1,20 +1,18 @@
-// The tasks of the worker: reads a file, and sorts its splats by depth, away from the page's own thread.
+// Reads a file and sorts its splats by depth, in a worker, so that the page's own thread stays responsive.
 //
 // Messages to the worker:
-//     {start: {name, scene, stage, plain}}   a file will come; `scene` or `stage` (cameras, up, target) as far as the
-//     page
-//                                            knows them; `plain`: decode it as splats
-//     {bytes}                                the next piece of the file; after the last one {end}, or {broken} if no
-//     more
-//                                            can be had
+//     {start: {name, scene, stage, plain}}   a file follows; `scene` or `stage` (cameras, up, target) if the page has
+//                                            them; `plain`: decode it as splats
+//     {bytes}                                the next piece of the file
+//     {end} or {broken}                      the file is complete, or no more of it can be read
 //     {again: {plain}}                       decode the same bytes again
-//     {use: number}                          sort this content from now on
+//     {use: number}                          select the content to sort
 //     {sort: {ticket, row, sides, near, order}}
 // Messages from the worker:
 //     {progress: {what, part}}
 //     {content: {number, whole, scene, model | splats, picture}}   see pack.js
 //     {order: {ticket, number, order, drawn}}
-//     {error}                                why the file cannot be read, as soon as that is certain
+//     {error}                                the reason, as soon as it is certain that the file cannot be read
 
 import { ENTRY_BYTES, HEADER_BYTES, MAGIC_BYTES, MAX_SECTIONS } from "../hyrf/container.js";
 import { fitHarmonics } from "../hyrf/harmonics.js";
@@ -25,12 +23,11 @@ import { packModel, packSplats } from "./pack.js";
 import { backgroundPicture, modelScene, splatsScene } from "./scene.js";
 import { DepthSort } from "./sort.js";
 
-const FIRST_LAYER_DELAY_MS = 150; // if the whole file comes within this time, its first layer is not shown alone
-const MAX_FIRST_LAYER_RATIO = 0.8; // first layers that are larger parts of a file are not shown alone
+const FIRST_LAYER_DELAY_MS = 150; // if the rest of the file arrives in this time, the first layer is not shown alone
+const MAX_FIRST_LAYER_RATIO = 0.8; // a first layer that is a larger part of its file is not shown alone
 const HARMONICS_DEGREE = 3;
-const MAX_UNSIZED_FILE_BYTES = 2 ** 32; // for formats whose header does not give the file's length
-// The start of the magic bytes. The line ends after it may be damaged by a transfer, and the reader reports that
-// better.
+const MAX_UNSIZED_FILE_BYTES = 2 ** 32; // the limit for formats whose header does not give the file's length
+// The magic bytes without the line ends, which a transfer may damage; the reader has a better message for that.
 const MODEL_SIGNATURE = MAGIC_BYTES.slice(0, 5);
 
 let readSplats = null;
@@ -40,17 +37,17 @@ let length = 0;
 let firstBytes = new Uint8Array(HEADER_BYTES + ENTRY_BYTES * MAX_SECTIONS); // null once the format is known
 let kind = null; // "model" or "other"; null until the format is known
 let maxLength = Infinity; // in bytes
-let firstLayerLength = Infinity; // the bytes of a model's first layer, if it is shown alone
+let firstLayerLength = Infinity; // in bytes; finite if a model's first layer may be shown alone
 let ended = false;
-let broken = false; // whether some of the file is missing or damaged
-let decodedLength = 0; // the number of bytes that were decoded last
+let broken = false; // whether a part of the file is missing or damaged
+let decodedLength = 0; // the number of bytes in the last decoding
 let isRejected = false; // whether the whole file is useless
 let queue = Promise.resolve();
 let number = 0;
 const sorters = new Map(); // number of a content -> its DepthSort
 let sortedContent = null;
 
-// Starts to handle messages. `reader(name, bytes)` decodes files of splats, see formats/index.js.
+// Starts to handle messages. `reader(name, bytes)` decodes files of splats, like decodeSplats in formats/index.js.
 export function startWorker(reader) {
   readSplats = reader;
   onmessage = (event) => handleMessage(event.data);
@@ -74,13 +71,13 @@ function handleMessage(data) {
 
 const reportProgress = (what, part) => postMessage({ progress: { what, part } });
 
-// Decodes the bytes so far, after the decoding that is under way. `partial`: the file is not complete.
+// Decodes the bytes so far, after any earlier decoding has ended. `partial` is true if the file is not complete.
 function queueDecoding(partial) {
   if (isRejected) return;
   queue = queue
     .then(() => (partial && ended && !broken ? null : decode(partial)))
     .catch((error) => {
-      broken = true; // `again` then decodes only the bytes that could be decoded before
+      broken = true; // `again` then decodes only bytes that could be decoded before
       reportError(error);
     });
 }
@@ -90,7 +87,7 @@ function reportError(error) {
   postMessage({ error: isOutOfMemory ? "There is not enough memory; open a smaller file." : error.message });
 }
 
-// Takes a piece of the file, and starts to decode the first layer when it is complete.
+// Stores a piece of the file, and starts to decode the first layer when it is complete.
 function receiveBytes(bytes) {
   if (isRejected) return;
   const before = length;
@@ -109,7 +106,7 @@ function receiveBytes(bytes) {
   if (hasFirstLayer) setTimeout(() => queueDecoding(true), FIRST_LAYER_DELAY_MS);
 }
 
-// Identifies the format from the first bytes. Throws an error where a model's header is invalid.
+// Identifies the format from the first bytes. Throws an error if a model's header is invalid.
 function identifyFile(bytes, before) {
   if (before < firstBytes.length) firstBytes.set(bytes.subarray(0, firstBytes.length - before), before);
   const available = firstBytes.subarray(0, length);
@@ -133,7 +130,7 @@ function identifyFile(bytes, before) {
 
 // Throws the error for a file that is too long.
 function rejectLongFile() {
-  if (kind === "model") describe(gatherBytes()); // throws the error about the length
+  if (kind === "model") describe(gatherBytes()); // throws an error about the length
   throw new Error("It is larger than 4 GiB; open a smaller one.");
 }
 
@@ -200,7 +197,7 @@ function selectContent(content) {
   for (const other of sorters.keys()) if (other < content) sorters.delete(other);
 }
 
-// Answers a request for an order.
+// Posts the order of the splats for a request.
 function sortContent({ ticket, row, sides, near, order: spare }) {
   const { order: sorted, drawn } = sorters.get(sortedContent).sort(row, sides, near, spare);
   postMessage({ order: { ticket, number: sortedContent, order: sorted, drawn } }, [sorted.buffer]);

@@ -1,11 +1,11 @@
-// Reads the compressed PLY of PlayCanvas and SuperSplat: 16 bytes a Gaussian, plus its higher harmonics. Element
-// `chunk` has, for each 256 Gaussians, the floats min_ and max_ of x, y, z, of scale_x, scale_y, scale_z (logarithms),
-// and, in newer files, of r, g, b (else 0 and 1). Element `vertex` has four uint32; positions, scales and colours are
-// fractions between the chunk's bounds:
+// Reads the compressed PLY of PlayCanvas and SuperSplat: 16 bytes per Gaussian, plus its higher harmonics. Element
+// `chunk` has, for each 256 Gaussians, the floats min_ and max_ of x, y, z, of scale_x, scale_y, scale_z (logarithms)
+// and, in newer files, of r, g, b (otherwise 0 and 1). Element `vertex` has four uint32; positions, scales and colours
+// are fractions between the chunk's bounds:
 //
 //     packed_position   x 11 bits, y 10, z 11, from the highest bit
 //     packed_rotation   2 bits: which of w, x, y, z is largest; 10 bits each for the others, sqrt(2) (v / 1023 - 1/2)
-//     packed_scale      as the position
+//     packed_scale      as packed_position
 //     packed_color      r, g, b, and the opacity, 8 bits each; r, g, b are 0.5 + Y00 k
 //
 // Element `sh`, if any: uchar f_rest_0.., channel after channel; v is (v + 1/2) / 32 - 4, but 0 and 255 are -4 and 4.
@@ -88,11 +88,11 @@ export function decodeCompressedPly(bytes, header) {
   return normalizeSplats({ count, degree, antialiased: false, positions, scales, quats, opacities, colors }, harmonic);
 }
 
-// Returns the component of a position or scale, which has 11, 10 or 11 bits of the word, as a fraction.
+// Returns a component of a position or scale, which has 11, 10 or 11 bits of the word, as a fraction in [0, 1].
 function unpackComponent(word, axis) {
   if (axis === 0) return (word >>> 21) / 2047;
   return axis === 1 ? ((word >>> 11) & 1023) / 1023 : (word & 2047) / 2047;
 }
 
-// Returns a component of a rotation from 10 bits.
+// Returns a component of a rotation from the lowest 10 bits of a word.
 const unpackQuatComponent = (code) => ((code & 1023) / 1023 - 0.5) * Math.SQRT2;

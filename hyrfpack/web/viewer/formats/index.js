@@ -14,10 +14,10 @@ const READERS_BY_SIGNATURE = [["ply", decodePly], ["\x1f\x8b", decodeSpz], ["NGS
 
 /**
  * Reads a file of splats. Large files take seconds, so it should be called in a worker.
- * @param {string} name the file's name; without a known ending, the first bytes decide
- * @param {Uint8Array} bytes
+ * @param {string} name the file's name; if its ending is unknown, the first bytes determine the format
+ * @param {Uint8Array} bytes the whole file
  * @returns {Promise<import("../../hyrf/harmonics.js").Splats>} in the axes of the file
- * @throws {import("../../hyrf/errors.js").HyrfFormatError}
+ * @throws {import("../../hyrf/errors.js").HyrfFormatError} the file is damaged, or its format is unknown
  */
 export async function decodeSplats(name, bytes) {
   const ending = SPLAT_ENDINGS.findIndex((known) => name.toLowerCase().endsWith(known));

@@ -1,14 +1,14 @@
-// Checks the numbers that other formats' readers decode, and normalises them to splats for the player.
+// Checks the numbers that the readers of splat formats decode, and converts them to splats for the player.
 
 import { HyrfFormatError, groupedDigits } from "../../hyrf/errors.js";
 import { HIGHER_HARMONICS_BY_DEGREE, chooseHarmonicsRange } from "../../hyrf/harmonics.js";
 
 const MAX_FRAME_SAMPLES = 1 << 16;
-const FRAME_QUANTILE = 0.9; // this share of the splats lies within one unit of the centre, along each axis
+const FRAME_QUANTILE = 0.9; // the share of the splats within one unit of the centre along each axis
 const MAX_RANGE_SAMPLES = 1 << 12;
 
 /**
- * The decoded but unchecked numbers of a file.
+ * The decoded numbers of a file, which are not checked yet.
  * @typedef {{
  *   count: number,
  *   degree: number,
@@ -26,7 +26,7 @@ const MAX_RANGE_SAMPLES = 1 << 12;
  * Checks decoded numbers, normalises rotations, and converts lengths to a frame in which most splats lie within one
  * unit of the centre.
  * @param {DecodedSplats} numbers its arrays are reused for the splats
- * @param {(i: number, at: number) => number} [harmonic] returns number `at`, of 3 K, of the higher harmonics of splat i
+ * @param {(i: number, at: number) => number} [harmonic] returns number `at` of the 3 K higher harmonics of splat i
  * @returns {import("../../hyrf/harmonics.js").Splats}
  * @throws {HyrfFormatError} a number is not finite in float32
  */
@@ -66,14 +66,14 @@ export function rejectSplats(what) {
   throw new HyrfFormatError(`The file cannot be shown: ${what}.`);
 }
 
-// Throws an error for the first number that is not finite; `each` is how many numbers a Gaussian has.
+// Throws an error for the first number that is not finite. `each` is the number of values per Gaussian.
 function requireFiniteNumbers(what, values, each) {
   for (let k = 0; k < values.length; k++) {
     if (!Number.isFinite(values[k])) rejectNumber(what, Math.floor(k / each), values.length / each);
   }
 }
 
-// Throws the error for a number of Gaussian i that is not finite.
+// Throws the error for a value of Gaussian i that is not finite.
 function rejectNumber(what, i, count) {
   rejectSplats(
     `the ${what} of Gaussian ${groupedDigits(i)} of ${groupedDigits(count)} is not a finite number; it is damaged, ` +
@@ -91,8 +91,8 @@ function normalizeQuat(quats, at) {
   quats[at + 3] = z * factor;
 }
 
-// Returns the median position, and the FRAME_QUANTILE of the distances from it along the farthest axis; 1 if that is 0
-// or infinite.
+// Returns the median position, and the FRAME_QUANTILE of the distances from it along the axis with the largest one. A
+// distance of 0 or infinity is replaced by 1.
 function estimateFrame(worldPositions, count) {
   if (!count) return { center: [0, 0, 0], unit: 1 };
   const step = Math.ceil(count / MAX_FRAME_SAMPLES), sampled = Math.ceil(count / step);

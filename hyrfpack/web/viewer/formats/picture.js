@@ -8,9 +8,9 @@ const decodeLatin1 = (bytes) => String.fromCharCode(...bytes);
 /**
  * Reads a picture.
  * @param {Uint8Array} bytes of a WebP or PNG file
- * @param {number} maxPixels
- * @param {string} name its name in messages
- * @returns {Promise<{width: number, height: number, pixels: Uint8Array}>} RGBA, row after row from the top
+ * @param {number} maxPixels the maximum number of pixels; larger pictures throw an error
+ * @param {string} name the picture's name in messages
+ * @returns {Promise<{width: number, height: number, pixels: Uint8Array}>} RGBA, row by row from the top
  */
 export async function readPicture(bytes, maxPixels, name) {
   const size = parsePictureSize(bytes);
@@ -35,7 +35,7 @@ export async function readPicture(bytes, maxPixels, name) {
   }
 }
 
-// Reads the pixels of a bitmap through WebGL, which does not change them by alpha.
+// Reads the pixels of a bitmap through WebGL, which does not multiply them by alpha.
 function readPixels(bitmap) {
   const { width, height } = bitmap, gl = new OffscreenCanvas(1, 1).getContext("webgl2");
   if (!gl || Math.max(width, height) > gl.getParameter(gl.MAX_TEXTURE_SIZE)) {
@@ -56,7 +56,7 @@ function readPixels(bitmap) {
   return pixels;
 }
 
-// Returns {width, height} from the header of a picture, before it is decompressed; null where it is no WebP or PNG.
+// Returns {width, height} from the header of a picture, or null if it is neither WebP nor PNG.
 function parsePictureSize(bytes) {
   if (bytes.length < 30) return null;
   const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.length);
@@ -65,11 +65,11 @@ function parsePictureSize(bytes) {
   }
   if (decodeLatin1(bytes.subarray(0, 4)) !== "RIFF" || decodeLatin1(bytes.subarray(8, 12)) !== "WEBP") return null;
   const kind = decodeLatin1(bytes.subarray(12, 16));
-  if (kind === "VP8L" && bytes[20] === 0x2f) { // lossless: 14 bits each
+  if (kind === "VP8L" && bytes[20] === 0x2f) { // lossless WebP: 14 bits for each side
     const bits = view.getUint32(21, true);
     return { width: (bits & 0x3fff) + 1, height: ((bits >>> 14) & 0x3fff) + 1 };
   }
-  if (kind === "VP8X") { // extended: 24 bits each
+  if (kind === "VP8X") { // extended WebP: 24 bits for each side
     const side = (at) => 1 + bytes[at] + (bytes[at + 1] << 8) + (bytes[at + 2] << 16);
     return { width: side(24), height: side(27) };
   }

@@ -1,6 +1,6 @@
 // Reads the PLY files of 3D Gaussian Splatting: one element `vertex` of x y z, f_dc_0..2 (harmonics of degree 0, RGB),
 // f_rest_0.. (higher ones, channel after channel), opacity (its logit), scale_0..2 (natural logarithms) and rot_0..3
-// (wxyz). RowStates may be binary or text, properties in any order and of any type.
+// (wxyz). Rows may be binary or text; properties may be in any order and of any type.
 
 import { HIGHER_HARMONICS_BY_DEGREE, SH_BAND_0 } from "../../hyrf/harmonics.js";
 import { normalizeSplats, rejectSplats } from "./normalize.js";
@@ -14,11 +14,11 @@ const PLY_ROTATION_NAMES = ["rot_0", "rot_1", "rot_2", "rot_3"];
 const PLY_REQUIRED_NAMES = [
   ...PLY_POSITION_NAMES, ...PLY_COLOR_NAMES, "opacity", ...PLY_SCALE_NAMES, ...PLY_ROTATION_NAMES,
 ];
-const REST_NUMBERS_BY_DEGREE = [0, 9, 24, 45, 72]; // of degree 4, only degrees up to 3 are used
+const REST_NUMBERS_BY_DEGREE = [0, 9, 24, 45, 72]; // degree 4 is read, but only degrees up to 3 are used
 
 /**
  * Reads the splats of a PLY file, compressed or not.
- * @param {Uint8Array} bytes
+ * @param {Uint8Array} bytes the whole file
  * @returns {Promise<import("../../hyrf/harmonics.js").Splats>}
  * @throws {import("../../hyrf/errors.js").HyrfFormatError}
  */

@@ -1,4 +1,4 @@
-// Reads the PLY container (Turk 1994): a text header that names elements and their properties, then their rows.
+// Reads the PLY container (Turk 1994): a text header that lists elements and their properties, then their rows.
 
 import { groupedDigits, quotedText } from "../../hyrf/errors.js";
 import { rejectSplats } from "./normalize.js";
@@ -16,7 +16,7 @@ const NON_FINITE_NUMBERS = { nan: NaN, inf: Infinity, infinity: Infinity };
 
 /**
  * The header of a PLY file: the format of the rows (`order`); for each element the number of its rows and its
- * properties (name -> type of a DataView's numbers, "" for a list); and the header's length in bytes.
+ * properties (name -> type in the method names of DataView, "" for a list); and the header's length in bytes.
  * @typedef {{order: string, elements: Map<string, {count: number, properties: Map<string, string>}>, length: number}}
  *   PlyHeader
  *
@@ -62,7 +62,7 @@ export function readPlyHeader(bytes) {
  * Reads the rows of the wanted elements that the file has. Other elements are skipped.
  * @param {Uint8Array} bytes the whole file
  * @param {PlyHeader} header
- * @param {string[]} wanted
+ * @param {string[]} wanted the names of the elements
  * @returns {Map<string, PlyRows>}
  */
 export function readPlyRows(bytes, { order, elements, length }, wanted) {
@@ -119,7 +119,7 @@ function tableRowsOfText(table, properties, count) {
   return { count: names.length ? count : 0, column };
 }
 
-// Parses rows of text, one row a line. Empty lines are skipped.
+// Parses rows of text, one row per line. Empty lines are skipped.
 class TextNumbers {
   constructor(bytes) {
     this.bytes = bytes;

@@ -1,14 +1,14 @@
 // Reads PlayCanvas SOG, version 2 (developer.playcanvas.com, "The SOG Format"): meta.json and lossless WebP pictures in
 // a zip archive. Each pixel of a picture belongs to a Gaussian, row by row from the top left.
 //
-//     means_l, means_u    RGB    low and high bytes of steps between means.mins and means.maxs, 65535 of them, of
-//                                sign(x) log(1 + |x|)
+//     means_l, means_u    RGB    low and high bytes of sign(x) log(1 + |x|), in 65535 steps from means.mins to
+//                                means.maxs
 //     scales              RGB    entries of scales.codebook: natural logarithms of standard deviations
-//     quats               RGBA   127.5 + 127.5 sqrt(2) times the components but the largest, which is positive, in the
-//                                order wxyz; A = 252 + the number of the largest
+//     quats               RGBA   127.5 + 127.5 sqrt(2) q for the three smallest components q, in the order wxyz; the
+//                                largest is positive, and A = 252 + its index
 //     sh0                 RGBA   entries of sh0.codebook: harmonics of band 0; A = 255 opacity
-//     shN_labels          RG     low and high bytes of the number of a palette row
-//     shN_centroids       RGB    the palette, 64 rows side by side, a pixel for each coefficient of bands 1 and up:
+//     shN_labels          RG     low and high bytes of the index of a palette row
+//     shN_centroids       RGB    the palette: 64 rows side by side, one pixel per coefficient of bands 1 and up, with
 //                                entries of shN.codebook
 
 import { groupedDigits, quotedText } from "../../hyrf/errors.js";
@@ -23,24 +23,24 @@ const MAX_SOG_META_BYTES = 1 << 20;
 const PICTURES_BY_GROUP = { means: 2, scales: 1, quats: 1, sh0: 1, shN: 2 };
 const CODEBOOK_ENTRIES = 256;
 const PALETTE_ROWS_PER_LINE = 64;
-const MAX_PALETTE_ROWS = 65536; // labels have 16 bits
+const MAX_PALETTE_ROWS = 65536; // because labels have 16 bits
 const MAX_SOG_GAUSSIANS = 1 << 26;
-// For n Gaussians a picture may have MAX_PIXELS_PER_GAUSSIAN n + BASE_PIXELS pixels.
+// A picture of n Gaussians may have at most MAX_PIXELS_PER_GAUSSIAN n + BASE_PIXELS pixels.
 const MAX_PIXELS_PER_GAUSSIAN = 4;
 const BASE_PIXELS = 1 << 16;
-// Pictures of n bytes may declare n + BASE_SOG_GAUSSIANS Gaussians.
+// Pictures of n bytes may have at most n + BASE_SOG_GAUSSIANS Gaussians.
 const BASE_SOG_GAUSSIANS = 1 << 20;
 
 /**
  * Reads the splats of a SOG file.
- * @param {Uint8Array} bytes
+ * @param {Uint8Array} bytes the whole file
  * @returns {Promise<import("../../hyrf/harmonics.js").Splats>}
  * @throws {import("../../hyrf/errors.js").HyrfFormatError}
  */
 export async function decodeSog(bytes) {
   const archive = new ZipArchive(bytes), meta = parseSogMeta(await archive.file(SOG_META_FILE, MAX_SOG_META_BYTES));
   const files = new Map();
-  // Pictures are compressed already, so that a zip saves little.
+  // The zip archive saves little, because pictures are compressed already.
   let room = 2 * bytes.length + MAX_SOG_META_BYTES, size = 0;
   for (const [group, pictures] of Object.entries(PICTURES_BY_GROUP)) {
     for (let number = 0; number < pictures && (group !== "shN" || "shN" in meta); number++) {
@@ -88,7 +88,7 @@ export async function decodeSog(bytes) {
   return normalizeSplats({ count, degree, antialiased, positions, scales, quats, opacities, colors }, harmonic);
 }
 
-// Reads the harmonics of bands 1 and up. Returns their degree, and the function that returns number `at` of Gaussian i.
+// Reads the harmonics of bands 1 and up. Returns their degree, and a function of Gaussian i and the index of a number.
 async function readPalette(meta, files, pixels, count) {
   const name = pictureName(meta, "shN", 0), values = readCodebook(meta, "shN");
   const picture = await readPicture(files.get(name), MAX_PALETTE_ROWS * 15, quotedText(name));
@@ -103,7 +103,7 @@ async function readPalette(meta, files, pixels, count) {
   for (let i = 0; i < count; i++) {
     if (label(i) >= rows) rejectSplats(`a label names row ${label(i)} of ${rows} of its palette; it is damaged`);
   }
-  // The pixels of a palette row are adjacent, and so are the rows: 64 of them fill a line of the picture.
+  // The pixels of a palette row are adjacent, and 64 adjacent rows fill a line of the picture.
   return { degree, harmonic: (i, at) => values[entries[4 * (label(i) * terms + Math.floor(at / 3)) + (at % 3)]] };
 }
 

@@ -1,5 +1,6 @@
-// Reads the .splat format of antimatter15's viewer: 32 bytes a Gaussian, little-endian, and nothing else: position and
-// scale as 3 float32 each, colour and opacity as 4 bytes, the rotation wxyz as 4 bytes (q * 128 + 128).
+// Reads the .splat format of antimatter15's viewer, which has no header. Each Gaussian has 32 bytes, little-endian:
+// position and scale as 3 float32 each, colour and opacity as 4 bytes, and the rotation wxyz as 4 bytes (q * 128 +
+// 128).
 
 import { groupedDigits } from "../../hyrf/errors.js";
 import { normalizeSplats, rejectSplats } from "./normalize.js";
@@ -8,7 +9,7 @@ const BYTES_PER_SPLAT = 32;
 
 /**
  * Reads the splats of a .splat file.
- * @param {Uint8Array} bytes
+ * @param {Uint8Array} bytes the whole file
  * @returns {Promise<import("../../hyrf/harmonics.js").Splats>} of degree 0
  * @throws {import("../../hyrf/errors.js").HyrfFormatError}
  */

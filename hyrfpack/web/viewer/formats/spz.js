@@ -6,10 +6,10 @@
 //     colours     3 bytes      (0.5 + 0.15 k) * 255 of the harmonics k of degree 0
 //     scales      3 bytes      (ln s + 10) * 16
 //     rotations   4 bytes      smallest three (before version 3: 3 bytes, (q + 1) * 127.5 of x, y, z)
-//     harmonics   3 (K - 1)    (k + 1) * 128 of the degrees from 1, one basis function after the other, RGB each
+//     harmonics   3 (K - 1)    (k + 1) * 128 of the degrees from 1 on, as RGB for each basis function
 //
-// Up to version 3 the whole is one gzip stream. Version 4 has an uncompressed header of 32 bytes, optional extensions,
-// a table of the streams' lengths, and a zstd stream for each attribute that is not empty.
+// Up to version 3 the whole file is one gzip stream. Version 4 has an uncompressed header of 32 bytes, optional
+// extensions, a table of the streams' lengths, and a zstd stream for each attribute that is not empty.
 //
 // The axes are right, up, back. They are rotated by half a turn about x, as other converters do.
 
@@ -24,18 +24,18 @@ const SPZ_HEADER_BYTES = 16;
 const SPZ_HEADER_BYTES_V4 = 32;
 const STREAM_ENTRY_BYTES = 16;
 const FLAG_ANTIALIASED = 0x01, FLAG_EXTENDED = 0x02, FLAG_LOD_TREE = 0x80;
-const SPZ_HARMONICS_BY_DEGREE = [0, 3, 8, 15, 24]; // without degree 0; those of degree 4 are not used
-// A file may unpack to BASE_UNPACKED_BYTES, or to MAX_UNPACKED_BYTES_PER_BYTE times its size. Real scenes stay below
-// a factor of 20.
+const SPZ_HARMONICS_BY_DEGREE = [0, 3, 8, 15, 24]; // without degree 0; degree 4 is read but not used
+// A file may unpack to BASE_UNPACKED_BYTES, or to MAX_UNPACKED_BYTES_PER_BYTE times its size. Real scenes need less
+// than 20 times their size.
 const BASE_UNPACKED_BYTES = 1 << 26;
 const MAX_UNPACKED_BYTES_PER_BYTE = 100;
 const WXYZ_INDEX_OF_XYZW = [1, 2, 3, 0]; // the components of a file's quaternion are x, y, z, w
-// The factors of the harmonics of degree 1 and higher after half a turn about x.
+// Half a turn about x multiplies the harmonics of degree 1 and higher by these factors.
 const SIGNS_AFTER_HALF_TURN = [-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1];
 
 /**
  * Reads the splats of an SPZ file.
- * @param {Uint8Array} bytes
+ * @param {Uint8Array} bytes the whole file
  * @returns {Promise<import("../../hyrf/harmonics.js").Splats>}
  * @throws {import("../../hyrf/errors.js").HyrfFormatError}
  */

@@ -1,10 +1,10 @@
-// Decompresses streams by the browser's own decompressors, and no more bytes of them than are asked for.
+// Decompresses streams with the browser's own decompressors, and only as many bytes as are requested.
 
 import { rejectSplats } from "./normalize.js";
 
 /**
  * Decompresses a stream piece by piece.
- * @param {Uint8Array} bytes
+ * @param {Uint8Array} bytes the compressed stream
  * @param {"gzip" | "deflate-raw" | "zstd"} how
  */
 export class Unpacker {
@@ -21,7 +21,7 @@ export class Unpacker {
   }
 
   /**
-   * Returns the next `length` bytes, or fewer where the stream ends.
+   * Returns the next `length` bytes, or fewer if the stream ends.
    * @param {number} length
    * @returns {Promise<Uint8Array>}
    */
@@ -38,7 +38,7 @@ export class Unpacker {
   }
 
   /**
-   * Returns whether there is another byte.
+   * Returns whether the stream has another byte.
    * @returns {Promise<boolean>}
    */
   async more() {

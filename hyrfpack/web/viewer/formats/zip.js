@@ -36,7 +36,7 @@ export class ZipArchive {
     }
   }
 
-  // Returns the offset of the record at the end of the archive.
+  // Returns the offset of the end-of-central-directory record.
   end() {
     const last = this.bytes.length - END_RECORD_BYTES;
     for (let place = last; place >= Math.max(0, last - MAX_COMMENT_BYTES); place--) {
@@ -48,7 +48,7 @@ export class ZipArchive {
   /**
    * Reads and decompresses a file.
    * @param {string} name
-   * @param {number} maxBytes the maximum of its decompressed bytes
+   * @param {number} maxBytes the maximum number of decompressed bytes
    * @returns {Promise<Uint8Array>}
    */
   async file(name, maxBytes) {
