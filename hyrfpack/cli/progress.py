@@ -44,7 +44,7 @@ def show_item_progress(items: Iterable[T], count: int, command: str, noun: str) 
         items: the items, each of which takes a while.
         count: number of items.
         command: name of the command.
-        noun: what one item is, such as "picture".
+        noun: noun for one item, such as "picture".
     """
     with show_progress(command) as report:
         for done, item in enumerate(items, start=1):

@@ -1,4 +1,4 @@
-"""Printing of the survey of photos or a video for `hyrfpack info`."""
+"""Print the survey of photos or a video for `hyrfpack info`."""
 
 from __future__ import annotations
 

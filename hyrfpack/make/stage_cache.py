@@ -76,11 +76,11 @@ class StageCache:
 
         Args:
             name: name of the stage.
-            inputs: plain values, all on which the product of the stage depends.
-            execute: runs the stage. It gets whether an earlier call began the stage with the same inputs. It returns
-                facts, which are plain values, and the files that it wrote, as paths relative to the folder.
-            fixed: plain values that are recorded when the stage is begun, for `WorkFolderState.fixed`. Other values in
-                a later call do not run the stage again.
+            inputs: all plain values on which the product of the stage depends.
+            execute: runs the stage. Its argument is whether an earlier call began the stage with the same inputs. It
+                returns facts, which are plain values, and the files that it wrote, as paths relative to the folder.
+            fixed: plain values that are recorded when the stage is begun, for `WorkFolderState.fixed`. Different values
+                in a later call do not make the stage run again.
 
         Returns:
             The facts of the stage.

@@ -60,7 +60,7 @@ class Build:
         kernel: the kernel's module and name.
         target: a key of GPU_TARGETS.
         constants: the specialisation: constexprs, arguments that are 1 or None, and multiples of 16.
-        warps: warps in a program.
+        warps: number of warps in a program.
         registers: registers of a thread (AMD: vector registers).
         shared: shared memory of a program in bytes.
         spills: bytes of local memory per thread (NVIDIA), or spilled registers (AMD).
@@ -372,7 +372,7 @@ def _read_resources(built: object) -> tuple[int, int]:
 
 
 def list_kernels(_: object = None) -> list[str]:
-    """Return the names of the kernels of hyrfpack.ops: Triton functions that return nothing and no other calls."""
+    """Return the names of the kernels of hyrfpack.ops: Triton functions without result that no other function calls."""
     import hyrfpack.ops
 
     for module in pkgutil.walk_packages(hyrfpack.ops.__path__, "hyrfpack.ops."):

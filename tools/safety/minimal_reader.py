@@ -552,7 +552,7 @@ def decoder_groups(layers: list[tuple[int, int]]) -> tuple[np.ndarray, int]:
 
 
 def table_groups(grid: dict[str, int], m: np.ndarray) -> np.ndarray:
-    """Return the group of each row of a hash table: 16 level + u."""
+    """Return the group of each row of a hash table, which is 16 level + u (3.5)."""
     groups, m = [], m[:: max(1, -(-len(m) // 65536))]
     for level, (r, rows) in enumerate(grid_levels(grid)):
         cells, use = m * (r - 1) // 2**19, np.zeros(rows, np.int64)

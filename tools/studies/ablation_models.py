@@ -137,7 +137,7 @@ def harmonics_to_degree_3(directions: Tensor) -> Tensor:
 
 
 class OptimizerWithoutLogits(Optimizer):
-    """Adam for a model without some explicit logits, which stay zero, also for new Gaussians."""
+    """Adam for a model that lacks some explicit logits; these stay zero, also for new Gaussians."""
 
     def __init__(self, model: HybridModel, rates: LearningRates, missing_logits: tuple[str, ...]) -> None:
         super().__init__(model, rates)

@@ -49,7 +49,7 @@ def draw_in_page(browser: Chromium, camera: Camera) -> np.ndarray:
 
 
 def write_pages(model: Path, folder: Path, data: Scene | None = None) -> dict[str, Path]:
-    """Write the native and the baked page of a model; baked colours are fitted at the photos' cameras if given."""
+    """Write the native and the baked page of a model; baked colours are fitted at the cameras of `data`, if given."""
     paths = {"native": folder / f"{model.parent.name}.html", "baked": folder / f"{model.parent.name}.baked.html"}
     for name, path in paths.items():
         hyrfpack.export_model(model, path, data=data, baked=name == "baked")

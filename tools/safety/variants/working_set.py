@@ -50,7 +50,7 @@ class WorkingSet:
 
     @property
     def photos(self) -> list[Path]:
-        """The photo files with poses, as long as they have their original folder and name; endings may differ."""
+        """The photo files with poses that still have their original folder and name; endings may differ."""
         files = (path for path in sorted(self.root.rglob("*")) if path.is_file() or path.is_symlink())
         pose_names = {PurePosixPath(name).with_suffix("").as_posix() for name in self.list_pose_names()}
         top = self.root / "images" if self.layout == "colmap" else self.root
