@@ -1,5 +1,5 @@
-// Shows `.hyrf` files in scenes of three.js by its own GaussianSplat, with spherical harmonics that are fitted to the
-// model's colours in the page.
+// Shows `.hyrf` files in scenes of three.js with its GaussianSplat. The spherical harmonics are fitted to the model's
+// colours in the page.
 
 import {
   BackSide, DataTexture, Group, LinearFilter, Matrix4, Mesh, MeshBasicNodeMaterial, Quaternion, RepeatWrapping,
@@ -18,20 +18,23 @@ import { viewpointOf } from "hyrf.js/viewpoint.js";
 const BACKGROUND_RADIUS = 100;
 const BACKGROUND_WIDTH_PX = 1024, BACKGROUND_HEIGHT_PX = 512;
 const NEAR_PLANE = 0.01;
-const WORK_SLICE_MS = 12; // after this time the page can react and render
+const WORK_SLICE_MS = 12; // then the page can react and render a frame
 
 /**
- * Load a file as an object in the file's world units, rotated so that up is +y. The object has one group in the model's
- * units, with the splats and, if the model has a background, its sphere.
+ * Loads a file as an object in the file's world units, rotated so that up is +y. The object has one group in the
+ * model's units, with the splats and, if the model has a background, its sphere.
  *
  * Colours are display-referred: render with `renderer.outputColorSpace = LinearSRGBColorSpace`, without tone mapping.
  *
- * @param {string | URL | Uint8Array} source address or bytes of the file
+ * @param {string | URL | Uint8Array} source the address or the bytes of the file
  * @param {{degree?: number, onCoarse?: (object: Group) => void, onProgress?: (done: number) => void}} [options]
- *   `degree` of the harmonics, 0 to 3; `onCoarse` gets the object as soon as it shows the scene with the colours of its
- *   first camera; `onProgress` gets the finished part of the work, 0 to 1
- * @returns {Promise<Group>} with `userData.hyrf`: {metadata, cameras, up, target, near, far, solid}; `cameras` are for
- *   `lookFrom`, and `solid` is the clear colour, or null if the model has a background
+ *   `degree` is that of the harmonics, 0 to 3 (default 2). `onCoarse` is called once, with the object, when it shows
+ *   the scene with the colours seen from its first camera. `onProgress` is called with the finished part of the work, 0
+ *   to 1.
+ * @returns {Promise<Group>} with `userData.hyrf`: {metadata, cameras, up, target, near, far, solid}. `cameras` are for
+ *   `lookFrom`; `up`, `target`, `near` and `far` are in the file's world units; `solid` is the clear colour (RGB in
+ *   [0, 1]), or null if the model has a background.
+ * @throws {Error} the file cannot be fetched or read; the message is a sentence for the user
  */
 export async function loadHyrf(source, { degree = 2, onCoarse = () => {}, onProgress = () => {} } = {}) {
   const model = await read(source instanceof Uint8Array ? source : await fetchBytes(source));
@@ -68,16 +71,16 @@ export async function loadHyrf(source, { degree = 2, onCoarse = () => {}, onProg
 }
 
 /**
- * Move a perspective camera to the pose of one of the file's cameras, with its vertical field of view.
+ * Moves a perspective camera to the pose of one of the file's cameras, and sets its vertical field of view.
  * @param {import("three/webgpu").PerspectiveCamera} camera
  * @param {Group} object from `loadHyrf`
- * @param {import("hyrf.js/viewpoint.js").Camera} [from] one of `userData.hyrf.cameras` or alike; by default the first
+ * @param {import("hyrf.js/viewpoint.js").Camera} [from] by default the first of `userData.hyrf.cameras`
  */
 export function lookFrom(camera, object, from = object.userData.hyrf.cameras[0]) {
   const { near, far } = object.userData.hyrf;
   object.updateWorldMatrix(true, false);
   const pose = new Matrix4().set(...from.camera_from_world.flat()).invert();
-  // OpenCV's cameras look along +z with y down, those of three.js along -z with y up.
+  // OpenCV's cameras look along +z with y down; those of three.js look along -z with y up.
   pose.premultiply(object.matrixWorld).multiply(new Matrix4().makeScale(1, -1, -1));
   pose.decompose(camera.position, camera.quaternion, new Vector3());
   const size = Math.cbrt(Math.abs(object.matrixWorld.determinant()));
@@ -89,8 +92,8 @@ export function lookFrom(camera, object, from = object.userData.hyrf.cameras[0])
 }
 
 /**
- * Make the geometry from which three.js draws splats.
- * @param {import("hyrf.js/harmonics.js").Splats} splats
+ * Makes the geometry from which three.js draws splats, in the units of `splats.positions`.
+ * @param {import("hyrf.js/harmonics.js").Splats} splats of degree 0 to 3
  */
 export function splatGeometry({ count, degree, positions, scales, quats, opacities, colors, harmonics, range }) {
   const covariances = new Float32Array(6 * count), tints = new Uint8ClampedArray(4 * count), bands = {};
@@ -105,7 +108,7 @@ export function splatGeometry({ count, degree, positions, scales, quats, opaciti
     const { packed, bytes } = createPackedSphericalHarmonicsBand(count, band);
     const length = 3 * (2 * band + 1), stride = bytes.length / (count || 1);
     for (let i = 0; i < count; i++) {
-      for (let k = 0; k < length; k++) { // three.js has the range 1, our harmonics have their own
+      for (let k = 0; k < length; k++) { // three.js stores harmonics with the range 1
         bytes[i * stride + k] = 128 + range * (harmonics[i * others + from + k] - 128);
       }
     }
@@ -115,12 +118,12 @@ export function splatGeometry({ count, degree, positions, scales, quats, opaciti
   return createGaussianSplatGeometry(positions.slice(), covariances, new Uint8Array(tints.buffer), bands);
 }
 
-// Makes the background sphere, with the colours that it has from the model's centre.
+// Makes the background sphere with its colours as seen from the model's centre.
 function backgroundSphere(model) {
   const places = new Float32Array(3 * BACKGROUND_WIDTH_PX), directions = new Float32Array(3 * BACKGROUND_WIDTH_PX);
   const pixels = new Uint8Array(4 * BACKGROUND_WIDTH_PX * BACKGROUND_HEIGHT_PX).fill(255);
   for (let row = 0; row < BACKGROUND_HEIGHT_PX; row++) {
-    const polar = Math.PI * (1 - (row + 0.5) / BACKGROUND_HEIGHT_PX); // SphereGeometry has its rows from bottom to top
+    const polar = Math.PI * (1 - (row + 0.5) / BACKGROUND_HEIGHT_PX); // rows of SphereGeometry start at the bottom
     for (let column = 0; column < BACKGROUND_WIDTH_PX; column++) {
       const turn = (2 * Math.PI * (column + 0.5)) / BACKGROUND_WIDTH_PX, level = Math.sin(polar);
       directions.set([-Math.cos(turn) * level, Math.cos(polar), Math.sin(turn) * level], 3 * column);

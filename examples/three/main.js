@@ -1,4 +1,4 @@
-// The script of the page `index.html?file=scene.hyrf`; with `&webgl` it uses WebGL 2 even if there is WebGPU.
+// Shows a file in the page `index.html?file=scene.hyrf`. With `&webgl`, uses WebGL 2 even if the browser has WebGPU.
 
 import { Color, LinearSRGBColorSpace, PerspectiveCamera, Scene, Vector3, WebGPURenderer } from "three/webgpu";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
@@ -7,7 +7,7 @@ import { loadHyrf, lookFrom } from "./hyrf-three.js";
 
 const params = new URLSearchParams(location.search), statusLine = document.getElementById("status");
 const renderer = new WebGPURenderer({ forceWebGL: params.has("webgl") });
-renderer.outputColorSpace = LinearSRGBColorSpace; // the file's colours are display-referred
+renderer.outputColorSpace = LinearSRGBColorSpace; // because the file's colours are display-referred
 renderer.setPixelRatio(devicePixelRatio);
 document.body.append(renderer.domElement);
 const scene = new Scene(), camera = new PerspectiveCamera(), controls = new OrbitControls(camera, renderer.domElement);

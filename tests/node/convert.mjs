@@ -1,9 +1,9 @@
-// splat-transform, many conversions in one process (it takes half a second to start).
+// Runs many conversions of splat-transform in one process, because it takes half a second to start.
 //
 //     node convert.mjs '[["a.ply", "b.spz", "--spz-version", "3"], ["b.spz", "c.ply"]]'
 //
-// Each is a source, a target and options for its command line. The last line printed is a list with one entry a
-// conversion, in order: null, or what it complained of. A failed one does not stop the next.
+// Each conversion is a source, a target and options of its command line. The last line printed is a JSON list with one
+// entry per conversion, in order: null, or its error message. Conversions after a failed one still run.
 
 import { syncBuiltinESMExports } from "node:module";
 
@@ -22,16 +22,16 @@ process.exit = (code) => {
 syncBuiltinESMExports();
 
 async function convert([source, target, ...options]) {
-  const said = [];
+  const messages = [];
   const write = process.stderr.write;
-  process.stderr.write = (text) => said.push(text);
+  process.stderr.write = (text) => messages.push(text);
   process.argv.length = 2;
   process.argv.push("--quiet", "--overwrite", "--gpu", "cpu", "--max-workers", "1", ...options, source, target);
   try {
     await main();
   } catch (error) {
     if (!(error instanceof Exit)) return String(error);
-    return error.code ? said.join("").trim() || error.message : null;
+    return error.code ? messages.join("").trim() || error.message : null;
   } finally {
     process.stderr.write = write;
     process.removeAllListeners("uncaughtException").removeAllListeners("unhandledRejection");

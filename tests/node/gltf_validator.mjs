@@ -1,4 +1,5 @@
-// Khronos' glTF validator: `node gltf_validator.mjs a.glb b.glb`. The last line printed is a list of its reports.
+// Runs Khronos' glTF validator: `node gltf_validator.mjs a.glb b.glb`. The last line printed is a JSON list of its
+// reports.
 
 import { readFile } from "node:fs/promises";
 

@@ -1,11 +1,11 @@
-// three.js reads splats: `node three.mjs a.spz b.glb c.ply d.splat`. The last line printed is a list with one entry a
-// file, in order: {error} with what its loader said, or, as its GaussianSplat object would draw them,
+// Reads splats with three.js: `node three.mjs a.spz b.glb c.ply d.splat`. The last line printed is a JSON list with one
+// entry per file, in order: {error} with the message of its loader, or the splats that its GaussianSplat object draws:
 //
-//     positions     3 numbers each
-//     covariances   6 each: xx xy xz yy yz zz
-//     colors        4 bytes each, as numbers in [0, 1]: RGB of harmonic 0, opacity
-//     harmonics     by band: 3 colour channels times (3, 5, 7) each, coefficient after coefficient
-//     matrix        16 numbers, column after column: from these positions to the scene's (of a glTF)
+//     positions     3 numbers per splat
+//     covariances   6 numbers per splat: xx xy xz yy yz zz
+//     colors        4 bytes per splat, as numbers in [0, 1]: RGB of harmonic 0, opacity
+//     harmonics     for each band, 3, 5 or 7 coefficients per splat, each as 3 colour channels
+//     matrix        16 numbers, column by column: from these positions to the scene's; only for glTF
 
 import { readFile } from "node:fs/promises";
 
@@ -15,7 +15,7 @@ import { GaussianSplatPLYLoader } from "three/addons/loaders/GaussianSplatPLYLoa
 import { SPLATLoader } from "three/addons/loaders/SPLATLoader.js";
 import { SPZLoader } from "three/addons/loaders/SPZLoader.js";
 
-globalThis.self ??= globalThis; // GLTFLoader asks it for URL
+globalThis.self ??= globalThis; // because GLTFLoader reads self.URL
 
 const readers = {
   spz: async (bytes) => described(await new SPZLoader().parse(bytes)),
@@ -38,7 +38,7 @@ function described(geometry) {
   for (const band of [1, 2, 3]) {
     const attribute = geometry.getAttribute(`sphericalHarmonics${band}`);
     if (!attribute) break;
-    const stride = 4 * attribute.itemSize; // bytes, filled up to words
+    const stride = 4 * attribute.itemSize; // in bytes, padded to whole words
     const bytes = new Uint8Array(attribute.array.buffer);
     harmonics.push(Array.from(bytes, (byte) => (byte - 128) / 128).filter((_, i) => i % stride < 3 * (2 * band + 1)));
   }

@@ -17,7 +17,7 @@ BROWSER_NAMES = ["chromium", "firefox"]
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Deselect tests marked `in_turn` in all browsers but one each, except with HYRFPACK_BROWSERS=all."""
+    """Run each test marked `in_turn` in one browser only, unless HYRFPACK_BROWSERS=all."""
     if os.environ.get("HYRFPACK_BROWSERS") == "all" or None in (chromium.find(), firefox.find()):
         return
     left = {item for item in items if _is_turn_of_another_browser(item)}
@@ -38,7 +38,7 @@ def _is_turn_of_another_browser(item: pytest.Item) -> bool:
 
 @pytest.fixture(scope="session")
 def start_browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[str], Browser]]:
-    """Return a function that starts a browser by its name, once for all tests, and gives it a small window."""
+    """Return a function that returns a running browser by name, with a small window; all tests share it."""
     running: dict[str, Browser] = {}
 
     with ExitStack() as stack:

@@ -1,4 +1,5 @@
-// Cameras written as links write them and read again: [{rows, eye, fy, unit, center}] as JSON in a file.
+// Formats cameras for links and parses them again: `node links.mjs CAMERAS.json` with a list of {rows, eye, fy, unit,
+// center}. Prints, for each camera, its text, the parsed camera, and the expected values, as JSON.
 
 import { readFileSync } from "node:fs";
 import { formatCamera, parseCamera } from "../../hyrfpack/web/viewer/address.js";
@@ -7,10 +8,11 @@ import { Eye } from "../../hyrfpack/web/viewer/camera.js";
 const answers = JSON.parse(readFileSync(process.argv[2], "utf8")).map(({ rows, eye, fy, unit, center }) => {
   const scene = { center, unit, up: [0, -1, 0], target: center, cameras: [] };
   const view = { rows, eye, fy, width: 900, height: 700 };
-  const person = new Eye(scene, [view]);
-  person.setView(view);
-  const text = formatCamera(person, scene), { view: back, depth } = parseCamera(text, scene);
-  const focal = back.fy / Math.sqrt(back.width * back.height);
-  return { text, rows: back.rows, eye: back.eye, focal, depth, wanted: { focal: person.focal, depth: person.depth, pace: person.pace } };
+  const mover = new Eye(scene, [view]);
+  mover.setView(view);
+  const text = formatCamera(mover, scene), { view: parsed, depth } = parseCamera(text, scene);
+  const focal = parsed.fy / Math.sqrt(parsed.width * parsed.height);
+  const expected = { focal: mover.focal, depth: mover.depth, pace: mover.pace };
+  return { text, rows: parsed.rows, eye: parsed.eye, focal, depth, expected };
 });
 console.log(JSON.stringify(answers));

@@ -80,7 +80,7 @@ def open_page(browser: Browser, tmp_path: Path, page: bytes, hash: str = "") -> 
 
 
 def wait_until_still(browser: Browser) -> Browser:
-    """Wait until the window's picture has not changed for half a second."""
+    """Wait, at most 15 seconds, until the window's picture has not changed for half a second."""
     frames, since, ends = browser.evaluate("hyrfpack.frames()"), time.monotonic(), time.monotonic() + 15
     while time.monotonic() < min(since + 0.5, ends):
         time.sleep(0.05)
@@ -101,7 +101,7 @@ def read_pixels(browser: Browser, camera: Camera) -> np.ndarray:
 
 
 def render_in_page(browser: Browser, camera: Camera) -> np.ndarray:
-    """Return (H, W, 3) uint8, the picture that the page draws for a camera."""
+    """Return the picture that the page draws for a camera, (H, W, 3) uint8."""
     browser.evaluate(f"hyrfpack.show({camera_json(camera)})")
     return read_pixels(browser, camera)
 
@@ -116,7 +116,7 @@ def rasterize_reference(
 
 
 def sky_picture(camera: Camera) -> np.ndarray:
-    """Return (H, W, 3), the sky behind each pixel by its formula."""
+    """Return the colour of the sky behind each pixel, (H, W, 3) in [0.1, 0.9], from its formula."""
     v, u = np.meshgrid(np.arange(camera.height) + 0.5, np.arange(camera.width) + 0.5, indexing="ij")
     rays = np.stack(((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)), axis=-1)
     directions = rays @ camera.rotation
@@ -139,9 +139,9 @@ CAMERA_CASES = {
 
 
 def wait_until_at_rest(browser: Browser) -> Browser:
-    """Wait until nothing moves the window's camera any more."""
-    look = "const look = () => (hyrfpack.player.driven ? requestAnimationFrame(look) : done())"
-    browser.evaluate(f"new Promise((done) => {{ {look}; look(); }})")
+    """Wait until nothing moves the window's camera."""
+    check = "const check = () => (hyrfpack.player.driven ? requestAnimationFrame(check) : resolve())"
+    browser.evaluate(f"new Promise((resolve) => {{ {check}; check(); }})")
     return browser
 
 

@@ -34,7 +34,7 @@ class _Handler(SimpleHTTPRequestHandler):
 
 @contextmanager
 def serve_project(own: Path) -> Iterator[str]:
-    """Serve the project's folder, and below `own/` the files of the folder `own`; yield the address."""
+    """Serve the project's folder, and the folder `own` as `own/`; yield the address."""
     with ThreadingHTTPServer(("127.0.0.1", 0), partial(_Handler, own=own)) as server:
         thread = threading.Thread(target=server.serve_forever, daemon=True)
         thread.start()

@@ -14,5 +14,5 @@ console.error("an error of the page"); setTimeout(() => { throw new Error("throw
 def test_complaints_contain_console_and_thrown_errors(browser: Browser, tmp_path: Path) -> None:
     (tmp_path / "page.html").write_text(PAGE_WITH_ERRORS)
     browser.open((tmp_path / "page.html").as_uri())
-    said = " ".join(browser.list_errors())
-    assert "an error of the page" in said and "thrown" in said
+    errors = " ".join(browser.list_errors())
+    assert "an error of the page" in errors and "thrown" in errors

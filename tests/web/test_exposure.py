@@ -142,16 +142,16 @@ def test_moving_and_switching_decode_nothing_and_a_still_picture_draws_nothing(b
     load_page(browser, tmp_path, make_model_page(random_model_with_map(200)))
     run_statements(
         browser,
-        "const { player } = hyrfpack; window.content = player.renderer.content; window.asked = [];"
+        "const { player } = hyrfpack; window.content = player.renderer.content; window.messages = [];"
         "const { worker } = player.loader, post = worker.postMessage.bind(worker);"
-        "worker.postMessage = (data, ...more) => (asked.push(...Object.keys(data)), post(data, ...more));",
+        "worker.postMessage = (data, ...rest) => (messages.push(...Object.keys(data)), post(data, ...rest));",
     )
     browser.drag((120, 90), (200, 110))
     wait_until_complete(browser)
     browser.press("x")
     wait_until_complete(browser)
     assert browser.evaluate("hyrfpack.player.renderer.content === content")
-    assert set(browser.evaluate("asked")) == {"sort"}
+    assert set(browser.evaluate("messages")) == {"sort"}
     frames = browser.evaluate("hyrfpack.frames()")
     browser.evaluate("new Promise((done) => setTimeout(done, 400))")
     assert browser.evaluate("hyrfpack.frames()") == frames
@@ -218,15 +218,15 @@ def test_the_first_layer_of_a_file_is_shown_with_its_map(browser: Browser, tmp_p
     store_file_in_page(browser, data)
     run_statements(
         browser,
-        "window.seen = []; const { player } = hyrfpack; player.addEventListener('loaded', () => {"
-        "  seen.push([player.renderer.content.count, player.gains(player.view())]); window.rest?.(); });",
+        "window.contents = []; const { player } = hyrfpack; player.addEventListener('loaded', () => {"
+        "  contents.push([player.renderer.content.count, player.gains(player.view())]); window.sendRest?.(); });",
     )
     browser.evaluate(
         "hyrfpack.player.open({ name: 'x.hyrf', stream: (async function* () {"
-        f"  yield file.slice(0, {first + 8}); await new Promise((resolve) => (window.rest = resolve));"
+        f"  yield file.slice(0, {first + 8}); await new Promise((resolve) => (window.sendRest = resolve));"
         f"  yield file.slice({first + 8}); }})() }}).then(() => true)"
     )
-    (count, gains), *_ = browser.evaluate("seen")
+    (count, gains), *_ = browser.evaluate("contents")
     pose = model.config.frame.local_pose(window_camera(browser))
     assert count < 14000
     np.testing.assert_allclose(gains, model.exposure.predict_gains(pose), rtol=1e-9)
@@ -262,7 +262,7 @@ def test_key_and_button_switch_the_exposure_and_announce_it(wide_browser: Browse
     assert wide_browser.evaluate(heard) == "Exposure: as photographed"
     wide_browser.press("?")
     assert wide_browser.evaluate(
-        "[...document.querySelectorAll('#help dd[data-needs-map]')].every((it) => it.checkVisibility())"
+        "[...document.querySelectorAll('#help dd[data-needs-map]')].every((entry) => entry.checkVisibility())"
     )
     wide_browser.press("Escape")
 
@@ -308,8 +308,8 @@ def test_the_control_depends_on_the_opened_file_and_the_choice_is_kept(browser: 
 @pytest.mark.in_turn
 def test_scripts_cannot_set_an_unknown_exposure(browser: Browser, tmp_path: Path):
     open_complete_page(browser, tmp_path, make_model_page(random_model_with_map(50)))
-    ask = f"(() => {{ try {{ {EXPOSURE_JS} = 'bright'; return ''; }} catch (error) {{ return error.message; }} }})()"
-    assert browser.evaluate(ask) == "The exposure must be as-photographed or consistent, not bright."
+    script = f"(() => {{ try {{ {EXPOSURE_JS} = 'bright'; return ''; }} catch (error) {{ return error.message; }} }})()"
+    assert browser.evaluate(script) == "The exposure must be as-photographed or consistent, not bright."
     assert browser.evaluate(EXPOSURE_JS) == AS_PHOTOGRAPHED
 
 

@@ -88,8 +88,8 @@ def test_text_has_enough_contrast_in_light_and_dark():
 
 
 @pytest.mark.parametrize(
-    ("length", "said"),
+    ("length", "text"),
     [(1, "1 kB"), (85_952, "86 kB"), (999_400, "999 kB"), (999_500, "1.0 MB"), (2**30, "1,073.7 MB")],
 )
-def test_file_sizes_have_readable_units(length, said):
-    assert format_bytes(length) == said
+def test_file_sizes_have_readable_units(length, text):
+    assert format_bytes(length) == text

@@ -184,8 +184,8 @@ def test_invalid_cameras_in_the_address_are_reported_and_the_scene_is_shown(brow
     home = window_camera(browser)
     for text, words in ERROR_BY_INVALID_CAMERA.items():
         browser.evaluate(f"location.hash = 'camera=' + {json.dumps(text)}")
-        said = wait_for_message(browser)
-        assert words in said and said.startswith("The camera in the address cannot be used: "), text
+        message = wait_for_message(browser)
+        assert words in message and message.startswith("The camera in the address cannot be used: "), text
         browser.press("Escape")
         wait_until(browser, "document.getElementById('message').hidden")
         np.testing.assert_array_equal(window_camera(browser).camera_from_world, home.camera_from_world)
@@ -235,11 +235,11 @@ def test_links_are_exact_for_any_unit_and_rotation(tmp_path: Path):
     (tmp_path / "cases.json").write_text(json.dumps(cases))
     answers = run_script(Path(__file__).with_name("links.mjs"), tmp_path / "cases.json")
     for case, answer in zip(cases, answers, strict=True):
-        wanted = answer["wanted"]
+        expected = answer["expected"]
         assert np.abs(np.array(answer["rows"]) - case["rows"]).max() < 1e-5, answer
-        assert np.abs(np.array(answer["eye"]) - case["eye"]).max() < 1e-5 * wanted["pace"], answer
-        assert answer["focal"] == pytest.approx(wanted["focal"], rel=1e-5)
-        assert answer["depth"] == pytest.approx(wanted["depth"], rel=1e-4) and len(answer["text"]) < 140, answer
+        assert np.abs(np.array(answer["eye"]) - case["eye"]).max() < 1e-5 * expected["pace"], answer
+        assert answer["focal"] == pytest.approx(expected["focal"], rel=1e-5)
+        assert answer["depth"] == pytest.approx(expected["depth"], rel=1e-4) and len(answer["text"]) < 140, answer
 
 
 def test_the_link_is_shown_selected_where_the_clipboard_is_unavailable(browser: Browser, tmp_path: Path):
@@ -250,7 +250,7 @@ def test_the_link_is_shown_selected_where_the_clipboard_is_unavailable(browser: 
         selected = "((field) => field.value.slice(field.selectionStart, field.selectionEnd))(document.activeElement)"
         assert browser.evaluate(selected) == browser.evaluate("location.href")
         home = window_camera(browser)
-        browser.press("w", seconds=0.1)  # goes to the text field
+        browser.press("w", seconds=0.1)  # is typed into the text field
         assert np.array_equal(window_camera(browser).camera_from_world, home.camera_from_world)
         browser.press("Escape")
         assert is_hidden(browser, "toast")
@@ -285,14 +285,14 @@ def test_the_address_can_set_the_title(browser: Browser, tmp_path: Path):
 def test_a_saved_picture_equals_the_window(browser: Browser, tmp_path: Path):
     script = (
         "const make = URL.createObjectURL; URL.createObjectURL = (blob) => { window.saved = blob; return make(blob); };"
-        "HTMLAnchorElement.prototype.click = function () { window.named = this.download; }"
+        "HTMLAnchorElement.prototype.click = function () { window.savedName = this.download; }"
     )
     with browser.before_every_page(script):
         page = make_splats_page(random_splats(), title="a/scene: 1")
         wait_until_still(open_page(browser, tmp_path, page))
         browser.press("c")
-        wait_until(browser, "window.named !== undefined")
-        assert browser.evaluate("named") == "a_scene_ 1.png"
+        wait_until(browser, "window.savedName !== undefined")
+        assert browser.evaluate("savedName") == "a_scene_ 1.png"
         text = "((bytes) => btoa(Array.from(bytes, (byte) => String.fromCharCode(byte)).join('')))"
         data = base64.b64decode(browser.evaluate(f"saved.arrayBuffer().then((all) => {text}(new Uint8Array(all)))"))
     with Image.open(io.BytesIO(data)) as picture:
@@ -382,20 +382,21 @@ def test_the_tab_key_visibly_focuses_every_control_and_leaves_the_page(browser: 
     browser.resize(1280, 800)
     open_page(browser, tmp_path, make_splats_page(random_splats(50)))
     browser.evaluate("(localStorage.setItem('hyrfpack.hinted', '1'), document.querySelector('details').open = true)")
-    wanted = browser.evaluate(
-        "[...document.querySelectorAll('canvas, button, select, summary, input')].filter((it) => it.checkVisibility()"
-        " && !it.disabled).map((it) => (it.dataset.number = Math.random(), it.dataset.number))"
+    controls = browser.evaluate(
+        "[...document.querySelectorAll('canvas, button, select, summary, input')].filter((part) =>"
+        " part.checkVisibility() && !part.disabled)"
+        ".map((part) => (part.dataset.number = Math.random(), part.dataset.number))"
     )
-    assert len(wanted) == 15
-    met = []
-    for _ in range(len(wanted)):
+    assert len(controls) == 15
+    focused = []
+    for _ in range(len(controls)):
         browser.press("Tab")
         number, outline = browser.evaluate(
-            "((it) => [it.dataset.number, getComputedStyle(it).outlineStyle])(document.activeElement)"
+            "((part) => [part.dataset.number, getComputedStyle(part).outlineStyle])(document.activeElement)"
         )
-        met.append(number)
+        focused.append(number)
         assert outline != "none", "the focus is not visible"
-    assert met == wanted
+    assert focused == controls
     browser.press("Tab")
     assert browser.evaluate("document.activeElement === document.body || !document.hasFocus()"), (
         "the focus cannot leave the page"

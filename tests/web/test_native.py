@@ -58,7 +58,7 @@ def random_model(count: int = 2600, seed: int = 0, **config: object) -> HybridMo
             field.grid.table.copy_(normal(*field.grid.table.shape))
             for bias in field.biases:
                 bias.copy_(normal(*bias.shape) * 0.3)
-        # The background is evaluated along directions from the centre, on which trained models hardly depend.
+        # The background is evaluated along directions from the centre; trained models hardly depend on these.
         model.radiance.weights[0][:, model.radiance.grid.feature_count :] *= 0.5
     return model
 
@@ -101,7 +101,7 @@ def load_page(browser: Browser, tmp_path: Path, page: bytes, complete: bool = Tr
 
 
 def run_statements(browser: Browser, statements: str) -> None:
-    """Run JavaScript statements in the page; values for later are stored as properties of `window`."""
+    """Run JavaScript statements in the page. Properties of `window` keep values for later calls."""
     browser.evaluate(f"(() => {{ {statements} }})()")
 
 
@@ -110,13 +110,13 @@ def wait_until_complete(browser: Browser) -> None:
 
 
 def read_typed_array(browser: Browser, expression: str, kind: type) -> np.ndarray:
-    """Return the value of an expression that is a typed array in the page."""
+    """Return the value of a JavaScript expression, a typed array whose element type is `kind`."""
     text = f"((a) => btoa(Array.from(new Uint8Array(a.buffer), (b) => String.fromCharCode(b)).join('')))({expression})"
     return np.frombuffer(base64.b64decode(browser.evaluate(text)), kind)
 
 
 def read_texture(browser: Browser, name: str, width: int, words: int) -> np.ndarray:
-    """Read a texture of the renderer: (texels, words) uint32, the first `words` components of each texel."""
+    """Return the first `words` components of each texel of a content's texture, (texels, words) uint32."""
     script = f"""(() => {{
         const {{ gl, content }} = hyrfpack.player.renderer, height = content.height;
         const target = gl.createFramebuffer(), words = new Uint32Array(4 * {width} * height);
@@ -163,8 +163,8 @@ def check_geometry_and_colors(browser: Browser, model: HybridModel, camera: Came
 
 def test_decoder_weights_are_in_a_uniform_block_on_devices_that_support_it(browser: Browser, tmp_path: Path):
     model = random_model(600)
-    script = "const proto = WebGL2RenderingContext.prototype, ask = proto.getParameter; proto.getParameter = "
-    script += "function (name) { return name === this.RENDERER ? 'a device' : ask.call(this, name); }"
+    script = "const proto = WebGL2RenderingContext.prototype, { getParameter } = proto; proto.getParameter = "
+    script += "function (name) { return name === this.RENDERER ? 'a device' : getParameter.call(this, name); }"
     with browser.before_every_page(script):
         load_page(browser, tmp_path, make_model_page(model))
         assert browser.evaluate("hyrfpack.player.renderer.content.radiance.block")
@@ -184,10 +184,10 @@ def test_a_model_without_gaussians_shows_its_background(browser: Browser, tmp_pa
 def test_a_still_window_requests_no_frames(browser: Browser, tmp_path: Path):
     load_page(browser, tmp_path, make_model_page(random_model()))
     frames = browser.evaluate("hyrfpack.frames()")
-    run_statements(browser, "window.asked = 0; const ask = requestAnimationFrame;"
-                 "window.requestAnimationFrame = (frame) => (window.asked++, ask(frame));")  # fmt: skip
+    run_statements(browser, "window.requests = 0; const request = requestAnimationFrame;"
+                 "window.requestAnimationFrame = (frame) => (window.requests++, request(frame));")  # fmt: skip
     time.sleep(0.5)
-    assert browser.evaluate("hyrfpack.frames()") == frames and browser.evaluate("window.asked") == 0
+    assert browser.evaluate("hyrfpack.frames()") == frames and browser.evaluate("window.requests") == 0
 
 
 @pytest.mark.in_turn
@@ -212,7 +212,7 @@ def test_a_restored_device_shows_the_same_view(browser: Browser, tmp_path: Path)
     wait_until_complete(browser)
     before = browser.evaluate("JSON.stringify(hyrfpack.camera())")
     run_statements(
-        browser, "window.said = []; hyrfpack.player.addEventListener('remark', ({detail}) => said.push(detail));"
+        browser, "window.remarks = []; hyrfpack.player.addEventListener('remark', ({detail}) => remarks.push(detail));"
     )
     made = []
     for _ in range(8):
@@ -226,15 +226,15 @@ def test_a_restored_device_shows_the_same_view(browser: Browser, tmp_path: Path)
         assert browser.evaluate("JSON.stringify(hyrfpack.camera())") == before
         sizes = "hyrfpack.player.renderer.graphics.made.size, hyrfpack.player.renderer.content.graphics.made.size"
         made.append(browser.evaluate(f"[{sizes}]"))
-    assert "was lost" in browser.evaluate("said[0]") and browser.evaluate("said.at(-1)") == ""
-    # The counts must not grow; they vary a little with what the last picture needed.
+    assert "was lost" in browser.evaluate("remarks[0]") and browser.evaluate("remarks.at(-1)") == ""
+    # The counts must not grow. They vary a little, because the last picture may need more or fewer objects.
     assert all(last - first < 5 for first, last in zip(made[0], made[-1], strict=True)), made
     camera = make_cameras()[0]
     assert psnr(render_in_page(browser, camera), render_reference(model, camera)) > 45
 
 
 def lose_and_restore_device(browser: Browser) -> None:
-    """Make the browser lose the WebGL device and restore it."""
+    """Lose and restore the WebGL device, and wait until the picture is complete."""
     browser.evaluate(
         "new Promise((resolve) => { const { player } = hyrfpack;"
         "const device = player.renderer.gl.getExtension('WEBGL_lose_context'), back = () => device.restoreContext();"
@@ -257,7 +257,7 @@ def test_opening_many_files_leaks_no_webgl_objects(browser: Browser, tmp_path: P
         "  const proto = WebGL2RenderingContext.prototype;"
         "  const make = proto['create' + kind], free = proto['delete' + kind];"
         "  proto['create' + kind] = function () { window.count++; return make.call(this); };"
-        "  proto['delete' + kind] = function (it) { if (it) window.count--; return free.call(this, it); };"
+        "  proto['delete' + kind] = function (object) { if (object) window.count--; return free.call(this, object); };"
         "}",
     )
     open_once = "hyrfpack.player.open({name: 'x.hyrf', stream: (async function* () { yield file.slice(); })()})"
@@ -271,29 +271,29 @@ def test_opening_many_files_leaks_no_webgl_objects(browser: Browser, tmp_path: P
 
 WEBGL_PROTOTYPE_JS = "const proto = WebGL2RenderingContext.prototype; "
 SMALL_TEXTURES_JS = WEBGL_PROTOTYPE_JS + (
-    "const ask = proto.getParameter; "
-    "proto.getParameter = function (name) { return name === this.MAX_TEXTURE_SIZE ? 128 : ask.call(this, name); }"
+    "const { getParameter } = proto; proto.getParameter = function (name) { "
+    "  return name === this.MAX_TEXTURE_SIZE ? 128 : getParameter.call(this, name); }"
 )
 OUT_OF_MEMORY_JS = WEBGL_PROTOTYPE_JS + (
-    "const { texStorage3D, getError } = proto; let times = 0; "
-    "proto.texStorage3D = function (...all) { times += all[3] > 1; texStorage3D.apply(this, all); }; "
-    "proto.getError = function () { return times === 1 && times++ ? 0x0505 : getError.call(this); };"
+    "const { texStorage3D, getError } = proto; let calls = 0; "
+    "proto.texStorage3D = function (...values) { calls += values[3] > 1; texStorage3D.apply(this, values); }; "
+    "proto.getError = function () { return calls === 1 && calls++ ? 0x0505 : getError.call(this); };"
 )
 SHADER_ERROR_JS = WEBGL_PROTOTYPE_JS + (
     "const { shaderSource } = proto; proto.shaderSource = function (shader, text) {"
     "  shaderSource.call(this, shader, text.includes('u_half_extent') ? 'no' : text); };"
 )
 RECORD_REMARK_JS = (
-    "; { const tell = EventTarget.prototype.dispatchEvent; EventTarget.prototype.dispatchEvent = function (event) {"
-    "  if (event.type === 'remark') window.said = event.detail; return tell.call(this, event); }; }"
+    "; { const proto = EventTarget.prototype, { dispatchEvent } = proto; proto.dispatchEvent = function (event) {"
+    "  if (event.type === 'remark') window.lastRemark = event.detail; return dispatchEvent.call(this, event); }; }"
 )
 
 
 @pytest.mark.parametrize(
-    "script", ["", SMALL_TEXTURES_JS, OUT_OF_MEMORY_JS, SHADER_ERROR_JS], ids=["asked", "texels", "memory", "driver"]
+    "script", ["", SMALL_TEXTURES_JS, OUT_OF_MEMORY_JS, SHADER_ERROR_JS], ids=["requested", "rows", "memory", "shader"]
 )
 def test_a_weak_device_draws_fitted_harmonics(browser: Browser, tmp_path: Path, script: str):
-    # The tables need more than 128 rows.
+    # SMALL_TEXTURES_JS allows 128 rows, fewer than this table needs.
     wide = {"radiance": replace(SIXTEEN_LEVEL_GRID, log2_table_size=15)} if script == SMALL_TEXTURES_JS else {}
     model = random_model(400, **wide)
     with torch.no_grad():  # degree 3 can represent such colours
@@ -303,10 +303,10 @@ def test_a_weak_device_draws_fitted_harmonics(browser: Browser, tmp_path: Path, 
         page_bytes = page_bytes.replace(b'{"kind": "hyrf"', b'{"plain": true, "kind": "hyrf"')
     with browser.before_every_page(script + RECORD_REMARK_JS):
         load_page(browser, tmp_path, page_bytes)
-        assert not script or browser.evaluate("said").startswith("Drawn with harmonics: ")
+        assert not script or browser.evaluate("lastRemark").startswith("Drawn with harmonics: ")
         if script:  # the remark appears again after the device was lost
             lose_and_restore_device(browser)
-            assert browser.evaluate("said").startswith("Drawn with harmonics: ")
+            assert browser.evaluate("lastRemark").startswith("Drawn with harmonics: ")
         assert browser.evaluate("Boolean(hyrfpack.player.renderer.content.harmonics)")
         scores = [psnr(render_in_page(browser, camera), render_reference(model, camera)) for camera in make_cameras()]
     assert min(scores) > 28 and browser.list_errors() == [], scores
@@ -320,17 +320,17 @@ def test_the_first_layer_is_shown_while_the_rest_is_loading(browser: Browser, tm
     run_statements(
         browser,
         f"window.file = Uint8Array.from(atob('{file}'), (c) => c.charCodeAt(0));"
-        "window.seen = []; window.rest = null; const { player } = hyrfpack;"
-        "player.addEventListener('loaded', () => { seen.push(player.renderer.content.count);"
-        " rest?.(); rest = null; });"
+        "window.counts = []; window.sendRest = null; const { player } = hyrfpack;"
+        "player.addEventListener('loaded', () => { counts.push(player.renderer.content.count);"
+        " sendRest?.(); sendRest = null; });"
         "player.addEventListener('count', ({ detail }) => (window.counted = detail.count));",
     )
     browser.evaluate(
         "hyrfpack.player.open({ name: 'x.hyrf', stream: (async function* () {"
-        "  const most = Math.floor(0.9 * file.length); yield file.slice(0, 3000); yield file.slice(3000, most);"
-        "  await new Promise((resolve) => (window.rest = resolve)); yield file.slice(most); })() }).then(() => true)"
+        "  const cut = Math.floor(0.9 * file.length); yield file.slice(0, 3000); yield file.slice(3000, cut);"
+        "  await new Promise((resolve) => (window.sendRest = resolve)); yield file.slice(cut); })() }).then(() => true)"
     )
-    first, last = browser.evaluate("seen")
+    first, last = browser.evaluate("counts")
     assert 0 < first < last == 14000
     wait_until_complete(browser)
     assert browser.evaluate("hyrfpack.player.whole") and browser.evaluate("counted") == 14000
@@ -350,7 +350,7 @@ def test_a_device_lost_while_a_file_is_loading_is_restored(browser: Browser, tmp
     with browser.before_every_page(script):
         browser.open(file.as_uri())
         browser.evaluate("hyrfpack.ready")
-        wait_until(browser, "window.restored === true")  # a small file may be loaded before the device is lost
+        wait_until(browser, "window.restored === true")  # because a small file may be loaded before the loss
         wait_until_complete(browser)
         camera = make_cameras()[0]
         assert psnr(render_in_page(browser, camera), render_reference(model, camera)) > 45
@@ -371,8 +371,8 @@ def test_a_damaged_file_is_refused_with_one_sentence(browser: Browser, tmp_path:
     file = tmp_path / "page.html"
     file.write_bytes(make_model_page(random_model(50), bytes(data)))
     browser.open(file.as_uri())
-    said = browser.evaluate("hyrfpack.ready.then(() => '', (error) => error.message)")
-    assert "cannot be unpacked" in said and "\n" not in said
+    message = browser.evaluate("hyrfpack.ready.then(() => '', (error) => error.message)")
+    assert "cannot be unpacked" in message and "\n" not in message
 
 
 def store_file_in_page(browser: Browser, data: bytes) -> None:
@@ -381,7 +381,7 @@ def store_file_in_page(browser: Browser, data: bytes) -> None:
 
 
 def open_file_error(browser: Browser, stream: str, name: str = "x.hyrf") -> str:
-    """Open a file from a generator with these statements; return the error message, or "" without an error."""
+    """Open a file whose bytes these statements of a generator yield; return the error message, or "" on success."""
     opening = f"hyrfpack.player.open({{ name: '{name}', stream: (async function* () {{ {stream} }})() }})"
     return browser.evaluate(f"{opening}.then(() => '', (error) => error.message)")
 
@@ -390,13 +390,13 @@ def test_a_partly_loaded_scene_survives_the_loss_of_the_device(one_browser: Brow
     load_page(one_browser, tmp_path, make_model_page(random_model(50)))
     store_file_in_page(one_browser, encode(random_model(14000), "compact"))
     run_statements(
-        one_browser, "window.seen = new Promise((resolve) => hyrfpack.player.addEventListener('loaded', resolve));"
+        one_browser, "window.loaded = new Promise((resolve) => hyrfpack.player.addEventListener('loaded', resolve));"
     )
-    said = open_file_error(
+    message = open_file_error(
         one_browser,
-        "yield file.slice(0, Math.floor(0.9 * file.length)); await seen; throw new Error('the connection broke');",
+        "yield file.slice(0, Math.floor(0.9 * file.length)); await loaded; throw new Error('the connection broke');",
     )
-    assert "the connection broke" in said
+    assert "the connection broke" in message
     wait_until_complete(one_browser)
     count = one_browser.evaluate("hyrfpack.player.renderer.content.count")
     lose_and_restore_device(one_browser)
@@ -413,7 +413,8 @@ def test_a_file_with_an_invalid_header_is_refused_before_the_rest_arrives(one_br
     store_file_in_page(one_browser, data)
     run_statements(one_browser, "window.ended = new Promise((resolve) => (window.end = resolve));")
     endless = (
-        "try { for (;;) { yield file.slice(); await new Promise((go) => setTimeout(go, 10)); } } finally { end(); }"
+        "try { for (;;) { yield file.slice(); await new Promise((resolve) => setTimeout(resolve, 10)); } }"
+        " finally { end(); }"
     )
     assert "bytes and there are" in open_file_error(one_browser, endless)
     one_browser.evaluate("ended.then(() => true)")
@@ -423,8 +424,8 @@ def test_a_file_with_an_invalid_header_is_refused_before_the_rest_arrives(one_br
 def test_a_file_in_many_pieces_is_joined_in_linear_time(one_browser: Browser, tmp_path: Path):
     load_page(one_browser, tmp_path, make_model_page(random_model(50)))
     began = time.monotonic()
-    said = open_file_error(one_browser, "for (let k = 0; k < 1024; k++) yield new Uint8Array(1 << 16);", "x.splat")
-    assert ".hyrf files only" in said and time.monotonic() - began < 4
+    message = open_file_error(one_browser, "for (let k = 0; k < 1024; k++) yield new Uint8Array(1 << 16);", "x.splat")
+    assert ".hyrf files only" in message and time.monotonic() - began < 4
 
 
 def test_a_file_that_cannot_be_shown_leaves_the_scene_unchanged(one_browser: Browser, tmp_path: Path):
@@ -433,14 +434,13 @@ def test_a_file_that_cannot_be_shown_leaves_the_scene_unchanged(one_browser: Bro
     store_file_in_page(one_browser, encode_model(random_model(500)))
     run_statements(
         one_browser,
-        "const { player } = hyrfpack; window.kept = JSON.stringify(hyrfpack.camera());window.Loaded = player.loader;",
+        "window.camera = JSON.stringify(hyrfpack.camera()); window.loader = hyrfpack.player.loader;",
     )
-    # First the fields are refused, then the harmonics that replace them.
-    run_statements(one_browser, "const { renderer } = hyrfpack.player, no = () => { throw new Error('no memory'); };"
-                     "renderer.stage = no;")  # fmt: skip
+    # The player tries the fields first, then the harmonics that replace them; both fail.
+    run_statements(one_browser, "hyrfpack.player.renderer.stage = () => { throw new Error('no memory'); };")
     assert "no memory" in open_file_error(one_browser, "yield file;")
-    assert one_browser.evaluate("hyrfpack.player.scene.count === 300 && hyrfpack.player.loader === Loaded")
-    assert one_browser.evaluate("JSON.stringify(hyrfpack.camera()) === kept && hyrfpack.player.next === null")
+    assert one_browser.evaluate("hyrfpack.player.scene.count === 300 && hyrfpack.player.loader === loader")
+    assert one_browser.evaluate("JSON.stringify(hyrfpack.camera()) === camera && hyrfpack.player.next === null")
     assert one_browser.evaluate("document.getElementById('remark').hidden")
     run_statements(one_browser, "delete hyrfpack.player.renderer.stage;")
     camera = make_cameras()[0]
@@ -489,7 +489,7 @@ def test_a_device_lost_and_restored_between_two_checks_is_noticed(one_browser: B
         "device = canvas.getContext('webgl2').getExtension('WEBGL_lose_context'); "
         "canvas.addEventListener('webglcontextlost', () => wait(() => device.restoreContext(), 0)); "
         "const { fenceSync } = WebGL2RenderingContext.prototype; WebGL2RenderingContext.prototype.fenceSync = "
-        "function (...all) { const fence = fenceSync.apply(this, all); WebGL2RenderingContext.prototype.fenceSync = "
+        "function () { const fence = fenceSync.apply(this, arguments); WebGL2RenderingContext.prototype.fenceSync = "
         "fenceSync; window.lost = true; wait(() => device.loseContext(), 10); return fence; }; })"
     )
     with one_browser.before_every_page(script):
@@ -502,9 +502,9 @@ def test_pictures_requested_while_another_file_is_loading_finish(one_browser: Br
     load_page(one_browser, tmp_path, make_model_page(random_model(300)))
     store_file_in_page(one_browser, encode_model(random_model(200)))
     opening = "hyrfpack.player.open({ name: 'x.hyrf', stream: (async function* () { yield file; })() })"
-    ask = "hyrfpack.player.show(camera).then(() => 'drawn', (error) => error.message)"
+    show = "hyrfpack.player.show(camera).then(() => 'drawn', (error) => error.message)"
     run_statements(one_browser, f"window.answers = []; window.camera = hyrfpack.camera(); window.opening = {opening};")
-    many = f"(async () => {{ for (let k = 0; k < 40; k++) answers.push(await {ask}); return answers; }})()"
+    many = f"(async () => {{ for (let k = 0; k < 40; k++) answers.push(await {show}); return answers; }})()"
     assert set(one_browser.evaluate(many)) <= {"drawn", one_browser.evaluate("answers.find((a) => a !== 'drawn')")}
     one_browser.evaluate("opening.then(() => true)")
     sort = "const { player } = hyrfpack, sorted = player.loader.sort(player.view(), player.scene);"
@@ -524,9 +524,9 @@ INVALID_CAMERA_FIELDS = {
 def test_invalid_cameras_are_refused(one_browser: Browser, tmp_path: Path, sentence: str):
     load_page(one_browser, tmp_path, make_model_page(random_model(50)))
     before = one_browser.evaluate("JSON.stringify(hyrfpack.camera())")
-    ask = "(({ camera_from_world, ...more }) => hyrfpack.player.show({ ...more, camera_from_world, %s }))"
-    said = f"{ask % INVALID_CAMERA_FIELDS[sentence]}(hyrfpack.camera()).then(() => '', (error) => error.message)"
-    assert sentence in one_browser.evaluate(said)
+    show = "(({ camera_from_world, ...rest }) => hyrfpack.player.show({ ...rest, camera_from_world, %s }))"
+    script = f"{show % INVALID_CAMERA_FIELDS[sentence]}(hyrfpack.camera()).then(() => '', (error) => error.message)"
+    assert sentence in one_browser.evaluate(script)
     assert one_browser.evaluate("JSON.stringify(hyrfpack.camera())") == before
 
 

@@ -1,4 +1,4 @@
-"""The server offers a page and its file to this machine only, supports ranges and ends at an interrupt."""
+"""The server serves a page and its file only to this machine, supports ranges and ends at an interrupt."""
 
 from __future__ import annotations
 
@@ -84,10 +84,10 @@ FIRST_AND_LAST_BYTE_BY_RANGE = {
 }
 
 
-@pytest.mark.parametrize("asked", FIRST_AND_LAST_BYTE_BY_RANGE)
-def test_a_range_request_returns_the_requested_bytes(asked, port):
-    first, last = FIRST_AND_LAST_BYTE_BY_RANGE[asked]
-    status, headers, body = send_request(port, Range=asked)
+@pytest.mark.parametrize("byte_range", FIRST_AND_LAST_BYTE_BY_RANGE)
+def test_a_range_request_returns_the_requested_bytes(byte_range, port):
+    first, last = FIRST_AND_LAST_BYTE_BY_RANGE[byte_range]
+    status, headers, body = send_request(port, Range=byte_range)
     assert (status, headers["Content-Range"], body) == (
         206,
         f"bytes {first}-{last}/{len(FILE_DATA)}",
@@ -95,15 +95,17 @@ def test_a_range_request_returns_the_requested_bytes(asked, port):
     )
 
 
-@pytest.mark.parametrize("asked", [f"bytes={len(FILE_DATA)}-", f"bytes={10**30}-", "bytes=-0"])
-def test_a_range_beyond_the_end_is_refused_with_the_length(asked, port):
-    status, headers, body = send_request(port, Range=asked)
+@pytest.mark.parametrize("byte_range", [f"bytes={len(FILE_DATA)}-", f"bytes={10**30}-", "bytes=-0"])
+def test_a_range_beyond_the_end_is_refused_with_the_length(byte_range, port):
+    status, headers, body = send_request(port, Range=byte_range)
     assert (status, headers["Content-Range"], body) == (416, f"bytes */{len(FILE_DATA)}", b"")
 
 
-@pytest.mark.parametrize("asked", ["bytes=9-5", "bytes=", "bytes=-", "bytes=a-b", "lines=0-1", "bytes=0-1,5-6", "٣-٤"])
-def test_an_invalid_range_is_ignored(asked, port):
-    status, _, body = send_request(port, Range=asked.encode().decode("latin-1"))
+@pytest.mark.parametrize(
+    "byte_range", ["bytes=9-5", "bytes=", "bytes=-", "bytes=a-b", "lines=0-1", "bytes=0-1,5-6", "٣-٤"]
+)
+def test_an_invalid_range_is_ignored(byte_range, port):
+    status, _, body = send_request(port, Range=byte_range.encode().decode("latin-1"))
     assert (status, body) == (200, FILE_DATA)
 
 
@@ -132,7 +134,7 @@ def test_an_empty_file_is_served_and_has_no_ranges(port, scene_file):
 
 def test_a_file_that_shrinks_while_it_is_sent_closes_the_connection_early(port, scene_file):
     with scene_file.open("r+b") as file:
-        file.truncate(1 << 28)  # more than the buffers of sockets hold
+        file.truncate(1 << 28)  # larger than the buffers of sockets
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
     connection.request("GET", "/scene.hyrf")
     answer = connection.getresponse()
@@ -170,18 +172,18 @@ with serve._create_server("127.0.0.1", 0, b"", {"scene.hyrf": Path(sys.argv[1])}
 
 @pytest.mark.usefixtures("signals")
 def test_serve_opens_the_browser_and_ends_at_an_interrupt_without_error(monkeypatch: pytest.MonkeyPatch):
-    said, seen = [], []
+    messages, received = [], []
 
     def visit(address: str) -> None:
         try:
-            seen.append(address)
-            seen.append(send_request(int(address.rsplit(":")[-1].strip("/")), "/")[2])
+            received.append(address)
+            received.append(send_request(int(address.rsplit(":")[-1].strip("/")), "/")[2])
         finally:
             os.kill(os.getpid(), signal.SIGINT)
 
     monkeypatch.setattr("webbrowser.open", visit)
-    serve(PAGE_HTML, open_browser=True, say=said.append)
-    assert said[0].startswith("http://127.0.0.1:") and seen == [said[0], PAGE_HTML]
+    serve(PAGE_HTML, open_browser=True, say=messages.append)
+    assert messages[0].startswith("http://127.0.0.1:") and received == [messages[0], PAGE_HTML]
 
 
 def test_a_port_in_use_is_reported_in_one_sentence():
@@ -254,6 +256,6 @@ def test_serve_in_thread_stops_at_the_end_of_the_block():
         assert kept.getresponse().read() == FILE_DATA
     with pytest.raises(OSError):
         send_request(port_from_address(address), "/")
-    kept.request("GET", "/scene.hyrf")  # on the connection that was opened before
+    kept.request("GET", "/scene.hyrf")  # on the connection of the first request
     assert kept.getresponse().status == 404
     kept.close()

@@ -30,12 +30,13 @@ class Site:
     """The state of a server whose answers tests choose.
 
     Attributes:
-        files: content of each path; the suffix gives the content type.
+        address: URL of the server, without a path.
+        files: content of each path; the suffix determines the content type.
         headers: headers sent with every answer.
-        breaks: bytes of a .hyrf file after which the connection breaks.
-        always: whether it breaks every time and not only at requests from the start of the file.
+        breaks: number of bytes of a .hyrf file after which the connection breaks, or None.
+        always: whether it breaks in every request and not only in those from the start of the file.
         ranges: whether the server honours Range headers.
-        asked: (path, Range header) of each request, in order.
+        requests: (path, Range header or None) of each request, in order.
     """
 
     address: str = ""
@@ -44,7 +45,7 @@ class Site:
     breaks: int | None = None
     always: bool = False
     ranges: bool = True
-    asked: list[tuple[str, str | None]] = field(default_factory=list)
+    requests: list[tuple[str, str | None]] = field(default_factory=list)
 
 
 @contextmanager
@@ -55,13 +56,14 @@ def serve_site() -> Iterator[Site]:
         protocol_version = "HTTP/1.1"
 
         def do_GET(self) -> None:
-            path, asked = unquote(self.path.partition("?")[0]), self.headers.get("Range")
-            server_state.asked.append((path, asked))
+            path, byte_range = unquote(self.path.partition("?")[0]), self.headers.get("Range")
+            server_state.requests.append((path, byte_range))
             data = server_state.files.get(path)
             if data is None:
                 self.send_error(404)
                 return
-            first = int(asked.removeprefix("bytes=").removesuffix("-")) if asked and server_state.ranges else 0
+            start = (byte_range or "bytes=0-").removeprefix("bytes=").removesuffix("-")
+            first = int(start) if server_state.ranges else 0
             self.send_response(206 if first else 200)
             kind = {"html": "text/html; charset=utf-8", "js": "text/javascript"}.get(path.rpartition(".")[2])
             self.send_header("Content-Type", kind or "application/octet-stream")
@@ -94,7 +96,7 @@ def serve_site() -> Iterator[Site]:
 
 @pytest.fixture
 def host() -> Iterator[Site]:
-    """Serve a player beside two files."""
+    """Yield a server that has a player and two files."""
     with serve_site() as server_state:
         server_state.files = {
             "/index.html": encode_player("player"),
@@ -144,8 +146,8 @@ def test_a_failed_fetch_is_reported_in_one_sentence(browser: Browser, host: Site
     with serve_site() as other_site:  # without CORS headers, other sites cannot read it
         other_site.files = {"/scene.hyrf": GOLDEN_FILE_DATA}
         browser.open(f"{host.address}/index.html?content={other_site.address}/scene.hyrf")
-        said = wait_for_message(browser)
-        assert said.startswith("scene.hyrf could not be fetched: 127.0.0.1:") and "other sites" in said
+        message = wait_for_message(browser)
+        assert message.startswith("scene.hyrf could not be fetched: 127.0.0.1:") and "other sites" in message
         other_site.headers = {"Access-Control-Allow-Origin": "*"}
         browser.open(f"{host.address}/index.html?content={other_site.address}/scene.hyrf")
         browser.evaluate("hyrfpack.ready")
@@ -160,7 +162,7 @@ def test_only_web_addresses_are_fetched(browser: Browser, host: Site, content: s
     browser.open(f"{host.address}/index.html?content={content}")
     assert wait_for_message(browser).startswith("The content in the address")
     time.sleep(0.2)
-    assert [path for path, _ in host.asked] == ["/index.html"]
+    assert [path for path, _ in host.requests] == ["/index.html"]
 
 
 def test_an_invalid_poster_address_is_reported_and_the_scene_is_shown(browser: Browser, host: Site):
@@ -174,8 +176,8 @@ def test_an_invalid_poster_address_is_reported_and_the_scene_is_shown(browser: B
 def test_a_file_of_another_kind_is_reported_in_one_sentence(browser: Browser, host: Site):
     host.files["/x.hyrf"] = b"<!DOCTYPE html><title>Sorry</title>" * 50
     browser.open(f"{host.address}/index.html?content=x.hyrf")
-    said = wait_for_message(browser)
-    assert said.startswith("x.hyrf cannot be opened: ") and "\n" not in said
+    message = wait_for_message(browser)
+    assert message.startswith("x.hyrf cannot be opened: ") and "\n" not in message
 
 
 def test_a_broken_download_resumes_where_it_broke(browser: Browser, host: Site):
@@ -183,8 +185,8 @@ def test_a_broken_download_resumes_where_it_broke(browser: Browser, host: Site):
     browser.open(f"{host.address}/index.html?content=some%20scene.hyrf")
     browser.evaluate("hyrfpack.ready")
     assert browser.evaluate(LOADED_COUNT_JS) > 0
-    asked = [ranges for path, ranges in host.asked if path.endswith("hyrf")]
-    assert asked[0] is None and asked[-1] == f"bytes={host.breaks}-"
+    ranges = [byte_range for path, byte_range in host.requests if path.endswith("hyrf")]
+    assert ranges[0] is None and ranges[-1] == f"bytes={host.breaks}-"
 
 
 @pytest.mark.parametrize("why", ["it breaks again", "there are no ranges"])
@@ -192,8 +194,8 @@ def test_a_download_that_cannot_resume_is_reported_in_one_sentence(browser: Brow
     host.breaks, host.always, host.ranges = len(GOLDEN_FILE_DATA) // 3, True, why != "there are no ranges"
     host.files["/x.hyrf"] = GOLDEN_FILE_DATA
     browser.open(f"{host.address}/index.html?content=x.hyrf")
-    said = wait_for_message(browser)
-    assert "the connection broke after" in said and said.startswith("x.hyrf cannot be opened: ")
+    message = wait_for_message(browser)
+    assert "the connection broke after" in message and message.startswith("x.hyrf cannot be opened: ")
 
 
 # ---- dropped files

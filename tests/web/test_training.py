@@ -82,7 +82,7 @@ def test_a_newer_snapshot_replaces_the_previous_one_and_keeps_the_camera(browser
         before = window_camera(wait_until_still(browser))
         assert not np.allclose(before.camera_from_world, home.camera_from_world, atol=1e-3)
         picture = browser.screenshot()
-        browser.evaluate("(window.seen = [], new MutationObserver(() => seen.push(loading.hidden)))"
+        browser.evaluate("(window.changes = [], new MutationObserver(() => changes.push(loading.hidden)))"
                          ".observe(document.getElementById('loading'), { attributes: true })")  # fmt: skip
 
         training.show(encode_snapshot(60), 1200)
@@ -93,7 +93,7 @@ def test_a_newer_snapshot_replaces_the_previous_one_and_keeps_the_camera(browser
         )
         assert browser.evaluate("document.getElementById('count').textContent") == "hybrid field, 60 Gaussians"
         assert browser.screenshot() != picture
-        assert browser.evaluate("window.seen") == []  # the progress bar does not appear
+        assert browser.evaluate("window.changes") == []  # the progress bar has not appeared
         assert browser.list_errors() == []
     browser.prefer()
 

@@ -55,8 +55,8 @@ export const decodeExposure = (data, rawLength) => {
 /**
  * Computes the log gains of a viewpoint, in float64:
  *
- *     clip(mean + sum over centers of weight / (1 + |x' - position|^2 / lengths[0]^2 + |f - direction|^2 /
- *     lengths[1]^2))
+ *     clip(mean + sum over centers of weight / (1 + |x' - position|^2 / lengths[0]^2
+ *                                                 + |f - direction|^2 / lengths[1]^2))
  *
  * where x' is the point of `box` nearest to the viewpoint and f is the viewing direction. A channel y of the picture is
  * displayed as g y / (1 + (g - 1) y) with g = exp(log gain).

@@ -6,7 +6,7 @@ const BLOCK_FIXED = 1;
 const BLOCK_DYNAMIC = 2;
 const MAX_DEFLATE_CODE_BITS = 15;
 const LENGTH_CODE_ORDER = [16, 17, 18, 0, 8, 7, 9, 6, 10, 5, 11, 4, 12, 3, 13, 2, 14, 1, 15];
-// Each length code and each distance code stands for a base value plus the value of its extra bits (RFC 1951, 3.2.5).
+// The value of a length code or distance code is a base value plus the value of its extra bits (RFC 1951, 3.2.5).
 const LENGTH_EXTRA_BITS = Array.from({ length: 29 }, (_, code) => (code < 8 || code === 28 ? 0 : (code >> 2) - 1));
 const DISTANCE_EXTRA_BITS = Array.from({ length: 30 }, (_, code) => (code < 4 ? 0 : (code >> 1) - 1));
 const LENGTH_BASES = [3], DISTANCE_BASES = [1];

@@ -8,7 +8,7 @@ import { decodeTokens } from "./rans.js";
 const TOKEN_COUNT = 126;
 const FIRST_WIDE_TOKEN = 78; // the first token of integers that do not fit 32 bits
 
-// For each token: the number of extra bits, and the leading bits that the token stands for.
+// For each token: the number of extra bits, and the leading bits of its integers.
 const TOKEN_EXTRA_BITS = new Uint8Array(TOKEN_COUNT);
 const TOKEN_LEADING_BITS = new Uint8Array(TOKEN_COUNT);
 for (let token = 0; token < TOKEN_COUNT; token++) {

@@ -15,7 +15,7 @@ const MODEL_STRIDE = 128; // entries of a model in the tables: a power of two ab
 const BUCKET_SIZE_LOG2 = 4; // a lookup table gives the first token of each bucket of positions
 const BUCKETS_PER_MODEL = FREQUENCY_SUM >> BUCKET_SIZE_LOG2;
 
-/** The weight that each level of a static model stands for. */
+/** The weight for each level of a static model. */
 const WEIGHT_BY_LEVEL = [0];
 for (let level = 0; level < MAX_WEIGHT_LEVEL; level++) WEIGHT_BY_LEVEL.push((4 + (level % 4)) * 2 ** (level >> 2));
 
@@ -58,7 +58,7 @@ export const decodeTokens = (data, count, contexts, mayBeStatic = true) => {
 };
 
 /**
- * Decodes a stream in which the context of a token determines it.
+ * Decodes a stream in which each context has only one token.
  * @param {Uint8Array} data
  * @param {number} count
  * @param {Uint8Array | null} contexts

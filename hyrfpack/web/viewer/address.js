@@ -69,7 +69,7 @@ export function parseHash(hash) {
 }
 
 // Parses the text of a camera. Returns {number}, an index into the scene's cameras, or {view, depth}: another camera
-// and, where the text has it, the depth of the point to orbit about. Throws an Error with a message for the user.
+// and, if the text has it, the depth of the point to orbit about. Throws an Error with a message for the user.
 export function parseCamera(text, scene) {
   try {
     text = decodeURIComponent(text).trim();

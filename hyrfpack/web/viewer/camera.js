@@ -130,7 +130,7 @@ export class Eye {
     this.target = add(this.target, step);
   }
 
-  // Moves the eye so that points at the target's depth move by x and y in the picture, in units of the focal length.
+  // Moves the eye so that the picture of points at the target's depth moves by x and y, in units of the focal length.
   pan(x, y) {
     this.move(-x * this.depth, -y * this.depth, 0);
   }

@@ -64,7 +64,7 @@ export class Player extends EventTarget {
     this.unsorted = true; // whether the splats must be sorted for the view
     this.idle = false; // whether the picture is complete
     this.onIdle = []; // functions that resolve the promises of `settled`
-    this.queue = Promise.resolve(); // a promise of the end of the work in the queue
+    this.queue = Promise.resolve(); // resolves when all queued work has ended
     if (scene) this.setScene(initialView(scene));
 
     this.aborter = new AbortController();

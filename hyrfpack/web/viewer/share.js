@@ -1,4 +1,4 @@
-// Shares the view: copies its address, and saves a picture of it.
+// Copies the address of the view, and saves a picture of it.
 
 import { toast } from "./notifications.js";
 

@@ -1,7 +1,8 @@
-// The exposure maps of files, evaluated in JavaScript: `node log_gains.mjs CASES`.
+// Evaluates the exposure maps of files: `node log_gains.mjs CASES.json`.
 //
-// CASES is JSON, a list of {file, partial, positions, directions}: path, number of bytes of the file's start to be read
-// or 0 for all, viewpoints. Printed is JSON: of each file its log gains at each viewpoint, null where it has no map.
+// CASES.json is a list of {file, partial, positions, directions}: the path, the number of bytes to read from the start
+// of the file (0 for the whole file), and the viewpoints. Prints, as JSON, the log gains of each file at each
+// viewpoint, or null for a file without a map.
 
 import { readFileSync } from "node:fs";
 

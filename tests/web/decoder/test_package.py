@@ -61,7 +61,7 @@ def test_modules_import_only_each_other_and_use_no_browser_objects():
         code = module.read_text()
         for source in re.findall(r'^import .* from "(.*)";$', code, re.MULTILINE):
             assert (PACKAGE_FOLDER / source).parent == PACKAGE_FOLDER and (PACKAGE_FOLDER / source).exists()
-        # The bundler for pages understands only this one-line form of import.
+        # The bundler accepts only this one-line form of import.
         assert len(re.findall(r"^import\b", code, re.MULTILINE)) == len(
             re.findall(r'^import \{ [\w, ]+ \} from "\./\w+\.js";$', code, re.MULTILINE)
         )

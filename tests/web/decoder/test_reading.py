@@ -52,7 +52,7 @@ CORPUS_FILES = sorted((TESTS_FOLDER / "fuzz" / "corpus").glob("*/*.hyrf"))
 
 
 def check_readers_agree(files: dict[str, bytes], cut: bool = False) -> tuple[list[str], list[str]]:
-    """Assert that both readers agree on these files; return the names of the accepted and of the refused files."""
+    """Assert that both readers agree on these files; return the names of accepted files and of refused files."""
     accepted: list[str] = []
     refused: list[str] = []
     for (name, data), verdict in zip(
@@ -125,7 +125,7 @@ def test_every_group_in_every_codec_decodes_to_the_same_numbers():
 
 
 def test_streams_of_many_lanes_decode_to_the_same_numbers():
-    """The file has dozens of lanes, static and adaptive models, and a layer whose every second point is counted."""
+    """The file has dozens of lanes, static and adaptive models, and a layer of which every second point is counted."""
     data = encode(random_model(3, 160_000), "compact", prune=False)
     assert read_container(data)["POSI"].raw_length // 12 > 65536
 
@@ -257,7 +257,7 @@ def test_trailing_bytes_are_refused_when_truncation_is_allowed(layered_file):
     assert refused
 
 
-# By name: the bytes to replace in valid metadata, their replacement, and whether the result is still valid.
+# For each case: the bytes to replace in valid metadata, their replacement, and whether the result is valid.
 JSON_CASES: dict[str, tuple[bytes, bytes, bool]] = {
     "as it is": (b"", b"", True),
     "float for an integer": (b'"gaussians":0', b'"gaussians":0.0', False),
@@ -448,7 +448,7 @@ def test_too_many_and_too_long_lanes_are_refused():
 
 
 def test_single_numbers_out_of_range_are_refused():
-    """Each file has one number just beyond its range; a second file has the same number just within the range."""
+    """One file has a number just outside its range, and a second file has the same number just inside."""
     zeros, classes = np.zeros(8, np.int64), np.arange(8).astype(np.uint8) % 2
     largest = 1 + 2**-10
     files = {}
@@ -571,7 +571,7 @@ def test_the_largest_models_that_fit_a_kilobyte_are_read_in_bounded_memory(make)
     small, largest = read_in_javascript([(GOLDEN_FILES[0].read_bytes(), False), (make(), False)])
 
     assert largest.groups and largest.seconds < 10
-    # The small file measures the memory of node itself, which depends on the machine.
+    # The small file shows the memory that node itself needs, which depends on the machine.
     assert largest.peak - small.peak < 4 * EXTRA_DECODED_BYTES
 
 

@@ -1,8 +1,9 @@
-// The fields of a model, evaluated in JavaScript: `node evaluate.mjs MODEL.hyrf INPUTS OUTPUTS`.
+// Evaluates the fields of a model: `node evaluate.mjs MODEL.hyrf INPUTS OUTPUTS`.
 //
-// INPUTS holds float32: a unit direction for each Gaussian, then places on the background sphere and as many unit
-// directions. OUTPUTS gets float32: opacities, scales, quats, colours along the directions, background colours.
-// Gaussians go in two calls, so that a start other than 0 is met, too.
+// INPUTS has float32 numbers: a unit direction for each Gaussian, then points on the background sphere and a unit
+// direction for each point. Writes float32 numbers to OUTPUTS: opacities, scales, quats, colours along the directions,
+// background colours. Prints the lengths of the arrays. Gaussians are evaluated in two calls, the second of which
+// starts at an index other than 0.
 
 import { readFile, writeFile } from "node:fs/promises";
 
@@ -13,8 +14,8 @@ const [file, inputs, outputs] = process.argv.slice(2);
 const model = await read(new Uint8Array(await readFile(file)));
 const { buffer } = new Uint8Array(await readFile(inputs));
 const numbers = new Float32Array(buffer), { count } = model;
-const others = (numbers.length - 3 * count) / 2;
-const places = numbers.subarray(3 * count, 3 * count + others), behind = numbers.subarray(3 * count + others);
+const pointsEnd = 3 * count + (numbers.length - 3 * count) / 2;
+const points = numbers.subarray(3 * count, pointsEnd), pointDirections = numbers.subarray(pointsEnd);
 
 const cut = Math.floor(count / 3), parts = [[0, cut], [cut, count]];
 const shapes = parts.map(([start, stop]) => decodeGeometry(model, start, stop));
@@ -23,6 +24,6 @@ const colors = parts.map(([start, stop]) => {
   return colorsAlong(model, layers, start, stop, numbers.subarray(3 * start, 3 * stop));
 });
 const arrays = ["opacities", "scales", "quats"].flatMap((name) => shapes.map((shape) => shape[name]));
-arrays.push(...colors, backgroundColors(model, places, behind));
+arrays.push(...colors, backgroundColors(model, points, pointDirections));
 await writeFile(outputs, Buffer.concat(arrays.map((array) => new Uint8Array(array.buffer))));
 console.log(JSON.stringify(arrays.map((array) => array.length)));

@@ -1,8 +1,9 @@
-// Splats of a model: `node fit.mjs MODEL.hyrf CAMERAS.json DEGREE OUTPUTS`. For `null` in place of the list, those are
-// taken that the file keeps, or else rings about it.
+// Fits splats to a model: `node fit.mjs MODEL.hyrf CAMERAS.json DEGREE OUTPUTS`. If CAMERAS.json is `null`, the cameras
+// are those that `viewpointOf` chooses for fitting.
 //
-// OUTPUTS gets, one after the other, positions, scales, quats, opacities and colours as float32, and the bytes of the
-// harmonics. Prints the rest of the splats, and how the work went.
+// Writes to OUTPUTS positions, scales, quats, opacities and colours as float32, then the bytes of the harmonics.
+// Prints, as JSON, the other properties of the splats, all `progress` values, the `coarse` result ({after: the number
+// of reports until then, colors: of the first 10 splats}) and the time in seconds.
 
 import { readFile, writeFile } from "node:fs/promises";
 

@@ -21,7 +21,7 @@ EVALUATE_SCRIPT = Path(__file__).parent / "evaluate.mjs"
 SMALL_GRID = HashGridConfig(log2_table_size=6, levels=3, base=3, finest=12)
 LARGE_GRID = HashGridConfig(log2_table_size=14, levels=16, base=16, finest=512)
 ONE_LEVEL_GRID = HashGridConfig(log2_table_size=4, levels=1, base=2, finest=2)
-# The measured error is 1e-7, one float32 rounding of sums in float64; for numbers near 0 it is absolute.
+# Sums are float64 and rounded once to float32, so the measured error is 1e-7; near 0 it is absolute.
 FLOAT32_ROUNDING = {"rtol": 2e-7, "atol": 1e-7}
 
 
@@ -53,7 +53,7 @@ def random_directions(count: int, seed: int) -> np.ndarray:
 def evaluate_in_float64(
     model: HybridModel, along: np.ndarray, places: np.ndarray, behind: np.ndarray
 ) -> list[np.ndarray]:
-    """Evaluate with the model what the script writes."""
+    """Return the arrays that evaluate.mjs writes, computed by the model in float64."""
     model = model.double()
     along, places, behind = (torch.from_numpy(values).double() for values in (along, places, behind))
     coding = model.config.direction_encoding

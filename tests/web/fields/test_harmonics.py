@@ -31,7 +31,7 @@ FIT_SCRIPT = Path(__file__).parent / "fit.mjs"
 
 
 def fit_in_node(model: HybridModel, cameras: list[Camera] | None, degree: int, tmp_path: Path) -> tuple[Splats, dict]:
-    """Fit splats in node; return them in world units and the facts that the script prints.
+    """Fit splats in node; return them in world units, with the JSON object that the script prints.
 
     `cameras` None uses the cameras of the file.
     """

@@ -1,4 +1,4 @@
-// `node viewpoints.mjs METADATA.json`: what `viewpointOf` says of each metadata in a list.
+// Prints, as JSON, what `viewpointOf` returns for each metadata in a list: `node viewpoints.mjs METADATA.json`.
 
 import { readFile } from "node:fs/promises";
 

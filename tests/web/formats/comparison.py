@@ -17,13 +17,13 @@ DECODE_SCRIPT = Path(__file__).parent / "decode.mjs"
 
 @dataclass(frozen=True)
 class PageSplats:
-    """Splats as the page holds them: the `facts` and the arrays that the script writes."""
+    """Splats as the page stores them: the `facts` that the script prints and the arrays that it writes."""
 
     facts: dict
     data: bytes
 
     def assert_equal(self, expected: Splats) -> None:
-        """Assert that they equal Python's, up to float32 in the page's frame and to bytes for harmonics."""
+        """Assert that they equal Python's splats, up to float32 in the page's frame and to bytes for harmonics."""
         facts, count, terms = self.facts, len(expected), num_sh_bases(expected.degree)
         assert (facts["count"], facts["degree"]) == (count, expected.degree)
         assert facts["antialiased"] is expected.antialiased
@@ -42,7 +42,7 @@ class PageSplats:
         found, inside = (packed.astype(np.float64) - 128) / 128 * most, np.clip(expected.harmonics[:, 1:], -most, most)
         np.testing.assert_allclose(found, inside, atol=most / 127)
         assert np.mean(np.abs(expected.harmonics[:, 1:]) > most * (1 + 1e-6)) <= 1e-3 if terms > 1 and count else True
-        if count > 20:  # the size of most of the scene is about one unit
+        if count > 20:  # most splats lie within one unit of the centre
             assert np.quantile(np.abs(wanted).max(1), 0.8) <= 1
 
 

@@ -1,7 +1,8 @@
-// Files of splats, read as the player reads them: `node decode.mjs OUTPUTS FILE...`. OUTPUTS is a folder that gets, for
-// the file of each number, float32 positions, scales, quats, opacities, colours, one after the other, and the bytes of
-// the harmonics. Prints a list with one entry a file: {error, kind}, or the rest of the splats. `kilobytes` is the
-// most memory that the process had.
+// Reads files of splats with the player's readers: `node decode.mjs OUTPUTS FILE...`. For file number k, writes to
+// OUTPUTS/k positions, scales, quats, opacities and colours as float32, then the bytes of the harmonics.
+//
+// Prints {answers, kilobytes} as JSON. `answers` has, for each file, {error, kind} or the other properties of its
+// splats. `kilobytes` is the maximum memory of the process (0 on other systems than Linux).
 
 import { readFile, writeFile } from "node:fs/promises";
 import { basename } from "node:path";
@@ -20,5 +21,5 @@ for (const [number, file] of files.entries()) {
     answers.push({ error: error.message, kind: error.name });
   }
 }
-const status = await readFile("/proc/self/status", "utf-8").catch(() => ""); // of Linux
+const status = await readFile("/proc/self/status", "utf-8").catch(() => "");
 console.log(JSON.stringify({ answers, kilobytes: Number(/VmHWM:\s*(\d+)/.exec(status)?.[1] ?? 0) }));

@@ -1,5 +1,5 @@
-// A worker: reads the file of an address as the player does, and answers with {error, kind}, or with the facts of its
-// splats and, in base64, what `decode.mjs` writes.
+// Reads files of splats in a worker. A message is the address of a file. The answer is {error, kind}, or {facts, data}:
+// the properties of its splats without their arrays, and in base64 the arrays in the order of decode.mjs.
 
 import { decodeSplats } from "../../../hyrfpack/web/viewer/formats/index.js";
 

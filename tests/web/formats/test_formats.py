@@ -31,7 +31,7 @@ def read_in_python(name: str, data: bytes) -> Splats | None:
 
 
 def check_readers_agree(folder: Path, files: list[tuple[str, bytes]]) -> int:
-    """Assert that the player and Python read and refuse the same files; return the number of refused files."""
+    """Assert that the player reads and refuses the same files as Python; return the number of refused files."""
     answers, _ = read_in_node(folder, files)
     refused = 0
     for (name, data), answer in zip(files, answers, strict=True):

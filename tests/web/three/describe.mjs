@@ -1,5 +1,6 @@
-// `node describe.mjs MODEL.hyrf DEGREE`, in a folder where three, hyrf.js and hyrf-three.js are: what of a file arrives
-// in a scene of three.js, in the axes of the file's world, and where its first camera looks from.
+// Describes the objects that hyrf-three.js adds to a scene: `node describe.mjs MODEL.hyrf DEGREE`, in a folder with
+// three, hyrf.js and hyrf-three.js. Prints, as JSON, the splats in the axes of the file's world, and the pose of
+// three's camera after `lookFrom`.
 
 import { readFile } from "node:fs/promises";
 

@@ -154,10 +154,10 @@ def test_the_example_page_shows_the_rendered_picture(app_folder: Path, tmp_path:
         browser.resize(PICTURE_SIZE_PIXELS, PICTURE_SIZE_PIXELS)
         browser.open(f"{address}/own/index.html?webgl&file=scene.hyrf")
         ends = time.monotonic() + 60
-        while (said := browser.evaluate("document.getElementById('status').textContent")) != "" or browser.evaluate(
+        while (status := browser.evaluate("document.getElementById('status').textContent")) != "" or browser.evaluate(
             "!document.querySelector('canvas')"
         ):
-            assert time.monotonic() < ends, (said, browser.list_errors())
+            assert time.monotonic() < ends, (status, browser.list_errors())
             time.sleep(0.2)
         time.sleep(1.5)  # lets the page draw some frames
         picture = np.array(Image.open(io.BytesIO(browser.screenshot())).convert("RGB"), np.float32) / 255

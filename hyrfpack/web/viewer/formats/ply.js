@@ -20,7 +20,7 @@ const REST_NUMBERS_BY_DEGREE = [0, 9, 24, 45, 72]; // degree 4 is read, but only
  * Reads the splats of a PLY file, compressed or not.
  * @param {Uint8Array} bytes the whole file
  * @returns {Promise<import("../../hyrf/harmonics.js").Splats>}
- * @throws {import("../../hyrf/errors.js").HyrfFormatError}
+ * @throws {import("../../hyrf/errors.js").HyrfFormatError} the file is damaged
  */
 export async function decodePly(bytes) {
   const header = readPlyHeader(bytes);

@@ -35,7 +35,7 @@ const BASE_SOG_GAUSSIANS = 1 << 20;
  * Reads the splats of a SOG file.
  * @param {Uint8Array} bytes the whole file
  * @returns {Promise<import("../../hyrf/harmonics.js").Splats>}
- * @throws {import("../../hyrf/errors.js").HyrfFormatError}
+ * @throws {import("../../hyrf/errors.js").HyrfFormatError} the file is damaged
  */
 export async function decodeSog(bytes) {
   const archive = new ZipArchive(bytes), meta = parseSogMeta(await archive.file(SOG_META_FILE, MAX_SOG_META_BYTES));

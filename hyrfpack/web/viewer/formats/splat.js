@@ -11,7 +11,7 @@ const BYTES_PER_SPLAT = 32;
  * Reads the splats of a .splat file.
  * @param {Uint8Array} bytes the whole file
  * @returns {Promise<import("../../hyrf/harmonics.js").Splats>} of degree 0
- * @throws {import("../../hyrf/errors.js").HyrfFormatError}
+ * @throws {import("../../hyrf/errors.js").HyrfFormatError} the file is damaged
  */
 export async function decodeSplat(bytes) {
   if (bytes.length % BYTES_PER_SPLAT) {

@@ -37,7 +37,7 @@ const SIGNS_AFTER_HALF_TURN = [-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1,
  * Reads the splats of an SPZ file.
  * @param {Uint8Array} bytes the whole file
  * @returns {Promise<import("../../hyrf/harmonics.js").Splats>}
- * @throws {import("../../hyrf/errors.js").HyrfFormatError}
+ * @throws {import("../../hyrf/errors.js").HyrfFormatError} the file is damaged
  */
 export async function decodeSpz(bytes) {
   if (bytes[0] === 0x1f && bytes[1] === 0x8b) return decodeSections(...(await readGzipSections(bytes)));
