@@ -14,6 +14,7 @@ from typing import TextIO
 import click
 
 from hyrfpack.cli.wording import use_option_names
+from hyrfpack.errors import printable
 from hyrfpack.version import __version__
 
 # Keys of values in click's context, which all commands share.
@@ -88,6 +89,11 @@ def note(sentence: str) -> None:
         sentence = f"[{time.perf_counter() - click.get_current_context().meta[_START_TIME_KEY]:7.2f} s] {sentence}"
     with suppress(OSError):  # a full disk or a closed terminal must not end the work
         click.echo(sentence, err=True)
+
+
+def print_line(line: str) -> None:
+    """Print a line on standard output; unprintable characters, as of quoted file names, become escapes."""
+    click.echo(printable(line))
 
 
 def note_if_verbose(sentence: str) -> None:

@@ -28,10 +28,10 @@ from hyrfpack.cli.common import (
     resolve_model_file,
     scene_options,
 )
+from hyrfpack.cli.console import print_line
 from hyrfpack.cli.processes import processes_option
 from hyrfpack.cli.progress import show_progress
 from hyrfpack.cli.wording import use_option_names
-from hyrfpack.errors import printable
 from hyrfpack.outputs import ARCHIVE_SUFFIXES, PICTURE_SUFFIXES, VIDEO_SUFFIXES, Outputs
 from hyrfpack.progress import report_part
 
@@ -265,14 +265,14 @@ def _print_run(folder: Path, as_json: bool) -> None:
     if run.finished:
         steps = "" if run.steps is None else f": {run.steps:,} steps"
         seconds = "" if run.seconds is None else f" in {run.seconds:,.0f} s"
-        _print_line(f"{folder}: a finished training run{steps}{seconds}")
+        print_line(f"{folder}: a finished training run{steps}{seconds}")
     else:
-        _print_line(f"{folder}: {describe_unfinished_run(run)}; {use_option_names(FINISH_RUN_ADVICE)}")
+        print_line(f"{folder}: {describe_unfinished_run(run)}; {use_option_names(FINISH_RUN_ADVICE)}")
     if run.photos is not None:
-        _print_line(f"photos: {run.photos}, {run.train} to train on and {run.test} held out")
+        print_line(f"photos: {run.photos}, {run.train} to train on and {run.test} held out")
     if run.psnr is not None and run.ssim is not None:
         consistent = format_consistent_psnr(run.psnr_consistent)
-        _print_line(f"held-out photos: PSNR {run.psnr:.2f} dB{consistent}, SSIM {run.ssim:.4f}")
+        print_line(f"held-out photos: PSNR {run.psnr:.2f} dB{consistent}, SSIM {run.ssim:.4f}")
     if facts:
         click.echo()
         _print_model_facts(folder / MODEL_FILE, facts)
@@ -296,7 +296,7 @@ def _print_splats(path: Path, as_json: bool) -> None:
         low, high = (", ".join(f"{value:.4g}" for value in corner) for corner in (facts.low, facts.high))
         rows += [("centres", f"from ({low}) to ({high}), world units"), ("opacity", f"median {facts.opacity:.2f}")]
     for name, text in rows:
-        _print_line(f"  {name:<14}  {text}")
+        print_line(f"  {name:<14}  {text}")
 
 
 def _print_model(file: Path, as_json: bool) -> None:
@@ -312,31 +312,26 @@ def _print_model(file: Path, as_json: bool) -> None:
 def _print_model_facts(file: Path, facts: dict) -> None:
     config, provenance = facts["config"], facts["provenance"]
     click.echo(f"{file}: {facts['bytes']:,} bytes, {facts['gaussians']:,} Gaussians")
-    _print_line(f"written by {facts['writer']}, format {facts['version']}, profile {facts['profile']}")
+    print_line(f"written by {facts['writer']}, format {facts['version']}, profile {facts['profile']}")
     click.echo("\n" + _section_table(facts["sections"], facts["bytes"], facts["gaussians"]))
     click.echo("\nmodel")
     frame = config["frame"]
     center = ", ".join(f"{value:.4g}" for value in frame["center"])
     half = " x ".join(f"{2.0 * value * frame['scale']:.4g}" for value in frame["half_extent"])
-    _print_line(f"  {'box':<18}  {half} around ({center}), world units")
+    print_line(f"  {'box':<18}  {half} around ({center}), world units")
     for name in ("geometry", "radiance"):
-        _print_line(f"  {name + ' grid':<18}  {_format_settings(config[name])}")
+        print_line(f"  {name + ' grid':<18}  {_format_settings(config[name])}")
     if (exposure := facts["exposure"]) is not None:
         lowest, highest = exposure["stops"]
-        _print_line(f"  {'exposure map':<18}  {exposure['centers']} centres, {lowest:+.2f} to {highest:+.2f} stops")
+        print_line(f"  {'exposure map':<18}  {exposure['centers']} centres, {lowest:+.2f} to {highest:+.2f} stops")
     for name, value in config.items():
         if name not in ("frame", "geometry", "radiance"):
-            _print_line(f"  {name.replace('_', ' '):<18}  {value}")
+            print_line(f"  {name.replace('_', ' '):<18}  {value}")
     choices = provenance.get("choices")
     if choices and isinstance(choices, dict):
         click.echo("\nchosen in training")
         for name, reason in choices.items():
-            _print_line(f"  {name.replace('_', ' '):<18}  {reason}")
-
-
-def _print_line(line: str) -> None:
-    """Print a line that may quote the file; its unprintable characters become escapes."""
-    click.echo(printable(line))
+            print_line(f"  {name.replace('_', ' '):<18}  {reason}")
 
 
 def _command_as_typed(context: click.Context) -> str:

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import click
 
+from hyrfpack.cli.console import print_line
 from hyrfpack.cli.wording import use_option_names
-from hyrfpack.errors import printable
 
 if TYPE_CHECKING:
     from hyrfpack.make.survey import PhotoSurvey
@@ -20,7 +20,7 @@ def print_survey(survey: PhotoSurvey) -> None:
     """Print a survey: a line for each fact, then each problem with what to do."""
     video = survey.kind == "video"
     things = "frames" if video else "photo" if survey.photos == 1 else "photos"
-    _print_line(f"{survey.path}: {survey.photos:,} {things}")
+    print_line(f"{survey.path}: {survey.photos:,} {things}")
     rows = [
         ("poses", f"{survey.posed:,} as {survey.layout}, {survey.points:,} points" if survey.layout else "none"),
         ("sizes", _format_counts(survey.sizes)),
@@ -35,12 +35,12 @@ def print_survey(survey: PhotoSurvey) -> None:
         rows.append(("light", f"{survey.luminance:.2f} of white on average, spread {survey.stops:.1f} stops"))
     for name, text in rows:
         if text:
-            _print_line(f"  {name:<10} {text}")
+            print_line(f"  {name:<10} {text}")
     for note in survey.notes:
-        _print_line(f"  {use_option_names(note)}")
+        print_line(f"  {use_option_names(note)}")
     click.echo("\nwhat to do" if survey.problems else "\nno problems found")
     for problem in survey.problems:
-        _print_line(f"  - {use_option_names(problem)}")
+        print_line(f"  - {use_option_names(problem)}")
 
 
 def _format_counts(counts: dict[str, int]) -> str:
@@ -48,8 +48,3 @@ def _format_counts(counts: dict[str, int]) -> str:
     parts = [f"{count:,} of {name}" for name, count in list(counts.items())[:_MAX_LISTED_KINDS]]
     more = len(counts) - _MAX_LISTED_KINDS
     return ", ".join(parts) + (f" and {more} more kinds" if more > 0 else "")
-
-
-def _print_line(line: str) -> None:
-    """Print a line that may quote file names; their unprintable characters become escapes."""
-    click.echo(printable(line))

@@ -246,7 +246,7 @@ def _read_header_facts(
         try:
             facts.append(read_photo_facts(photo))
         except HyrfDataError as error:
-            unreadable[_relative_name(photo, folder)] = _unreadable_reason(error, photo)
+            unreadable[_relative_name(photo, folder)] = strip_path(error, display_path(photo))
         read = f"reading the headers of photos {done + 1}/{len(chosen)}"
         report_progress(read, _HEADERS_PROGRESS * (done + 1) / len(chosen))
     return facts, unreadable
@@ -276,14 +276,9 @@ def _measure_pixels(path: Path) -> _PixelMeasurement | str:
     try:
         gray = read_gray(path)
     except HyrfDataError as error:
-        return _unreadable_reason(error, path)
+        return strip_path(error, display_path(path))
     small = Image.fromarray(gray).resize((_THUMBNAIL_SIDE_PIXELS, _THUMBNAIL_SIDE_PIXELS), Image.Resampling.BOX)
     return _PixelMeasurement(path, measure_sharpness(gray), measure_exposure(gray), 255 * np.asarray(small))
-
-
-def _unreadable_reason(error: HyrfDataError, path: Path) -> str:
-    """Return why a photo cannot be read, without its path and the advice, which all such photos share."""
-    return strip_path(error, display_path(path))
 
 
 def _count_problems(count: int, scene: Scene | None, posed: int, path: Path) -> list[str]:

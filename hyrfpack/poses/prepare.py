@@ -234,7 +234,7 @@ def _read_facts_or_reason(path: Path) -> PhotoFacts | str:
     try:
         return read_photo_facts(path)
     except HyrfDataError as error:
-        return _unusable_reason(error, path)
+        return strip_path(error, display_path(path))
 
 
 def _is_panorama_or_reason(path: Path) -> bool | str:
@@ -242,12 +242,7 @@ def _is_panorama_or_reason(path: Path) -> bool | str:
     try:
         return is_panorama(path)
     except HyrfDataError as error:
-        return _unusable_reason(error, path)
-
-
-def _unusable_reason(error: HyrfDataError, path: Path) -> str:
-    """Return why a photo cannot be used, without its path and the advice, which all such photos share."""
-    return strip_path(error, display_path(path))
+        return strip_path(error, display_path(path))
 
 
 def _report_counts(items: Iterable[Item], progress: CountCallback) -> Iterator[Item]:

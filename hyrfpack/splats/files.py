@@ -15,9 +15,8 @@ from hyrfpack.splats.formats.hints import Hints
 from hyrfpack.splats.splats import Splats
 from hyrfpack.splats.table import FORMATS
 
-READABLE_ENDINGS = tuple(
-    ending for ending, row in FORMATS.items() if row.is_readable
-)  # ".compressed.ply" is covered by ".ply"
+# ".ply" covers ".compressed.ply".
+READABLE_ENDINGS = tuple(ending for ending, row in FORMATS.items() if row.is_readable)
 MAX_LISTED_NAMES = 4
 MAX_FILE_BYTES = 1 << 32  # a PLY of this size holds 17 million Gaussians
 

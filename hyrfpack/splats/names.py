@@ -6,7 +6,7 @@ import json
 import os
 from pathlib import Path
 
-SPLATS_SUFFIXES = (".ply", ".splat", ".spz", ".sog")  # must equal READABLE_ENDINGS of `hyrfpack.splats.files`
+SPLATS_SUFFIXES = (".ply", ".spz", ".splat", ".sog")  # must equal READABLE_ENDINGS of `hyrfpack.splats.files`
 SOG_META_NAME = "meta.json"
 
 

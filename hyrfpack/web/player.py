@@ -12,13 +12,12 @@ from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib.resources import files
 
+from hyrfpack.splats.names import SPLATS_SUFFIXES
 from hyrfpack.version import __version__
 from hyrfpack.web.bundle import bundle, read_web_file, script_digest, strip_comments
 
 SCRIPT_NAMES = ("boot.js", "element.js", "main.js", "worker.js", "worker_model.js")
-# Suffixes of the files that the page plays.
 MODEL_SUFFIX = ".hyrf"
-SPLATS_SUFFIXES = (".ply", ".spz", ".splat", ".sog")
 SHADER_SUFFIXES = (".vert", ".frag", ".glsl")
 # The browser decodes one base64 block while it loads the next one. A multiple of 3 needs no padding.
 PAYLOAD_BLOCK_BYTES = 3 << 20

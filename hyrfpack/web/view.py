@@ -8,8 +8,8 @@ from pathlib import Path
 
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.format import describe_file, find_model
-from hyrfpack.splats.names import is_splats, sog_folder
-from hyrfpack.web.player import MODEL_SUFFIX, SPLATS_SUFFIXES, encode_player
+from hyrfpack.splats.names import SPLATS_SUFFIXES, is_splats, sog_folder
+from hyrfpack.web.player import MODEL_SUFFIX, encode_player
 from hyrfpack.web.serve import LOCAL_HOST, serve
 
 
@@ -25,7 +25,7 @@ def view(
 
     Args:
         path: a `.hyrf` file, the folder of a run, or a file of splats with one of the suffixes
-            `hyrfpack.web.player.SPLATS_SUFFIXES`.
+            `hyrfpack.splats.names.SPLATS_SUFFIXES`.
         host, port, open_browser, say: as for `hyrfpack.web.serve.serve`.
 
     Raises:

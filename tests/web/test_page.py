@@ -207,13 +207,6 @@ def test_damaged_pages_are_decoded_or_refused_in_one_line():
             assert str(error).startswith("x.html: ") and "\n" not in str(error)
 
 
-def test_the_viewer_reads_the_same_splat_suffixes_as_hyrfpack():
-    from hyrfpack.splats.files import READABLE_ENDINGS
-    from hyrfpack.web.player import SPLATS_SUFFIXES
-
-    assert set(SPLATS_SUFFIXES) == set(READABLE_ENDINGS)
-
-
 def test_all_files_of_the_page_are_package_data():
     import hyrfpack.web
 

@@ -129,13 +129,3 @@ def _measure_logit_error(decoded: HybridModel, model: HybridModel, plan: Plan | 
     order = slice(None) if plan is None else plan.kept
     after, before = to_arrays(decoded), to_arrays(model)
     return max(float(np.sqrt(np.square(after[group] - before[group][order]).mean())) for group in LOGIT_SECTIONS)
-
-
-def main() -> None:
-    """Print one dictionary for each row."""
-    for row in bench():
-        print(row)
-
-
-if __name__ == "__main__":
-    main()

@@ -81,13 +81,3 @@ def bench() -> list[dict]:
         size = {"operation": "mlp", "size": f"{count:,}, {zero_gradient_share:.0%} without gradient"}
         rows += [size | row for row in compare(*make_mlp_call(count, zero_gradient_share), count)]
     return rows
-
-
-def main() -> None:
-    """Print one dictionary for each row."""
-    for row in bench():
-        print(row)
-
-
-if __name__ == "__main__":
-    main()

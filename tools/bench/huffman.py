@@ -65,19 +65,3 @@ def bench() -> list[dict]:
             }
         )
     return rows
-
-
-def main() -> None:
-    """Print the table: million symbols per second and bits per symbol."""
-    rows = bench()
-    print(f"{SYMBOL_COUNT:,} symbols; medians of {TIMING_REPEATS}; million symbols a second")
-    print(f"{'':8}{'ours':>10}{'dahuffman':>12}{'ratio':>8}")
-    for row in rows:
-        ours, peer = row["ours_msymbols_per_s"], row["dahuffman_msymbols_per_s"]
-        print(f"{row['operation']:8}{ours:10.1f}{peer:12.2f}{row['ratio']:7.0f}x")
-    payload, stream, entropy = (rows[0][f"{what}_bits_per_symbol"] for what in ("payload", "stream", "entropy"))
-    print(f"bits a symbol: {payload:.4f} payload, {stream:.4f} with table and chunk sizes, {entropy:.4f} entropy")
-
-
-if __name__ == "__main__":
-    main()

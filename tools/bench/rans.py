@@ -163,20 +163,3 @@ def _zstd_coder(values: np.ndarray) -> Coder:
     raw = values.astype(dtype).tobytes()
     encode = partial(zstandard.ZstdCompressor(level=19).compress, raw)
     return encode, lambda data: np.frombuffer(zstandard.ZstdDecompressor().decompress(data), dtype), 0
-
-
-def main() -> None:
-    """Print the table: bits per symbol, percent above the entropy and million symbols per second."""
-    for module, name in ((zstandard, "zstandard"), (constriction, "constriction")):
-        if module is None:
-            print(f"{name} is not installed, so it is left out")
-    print(f"bits a symbol, excess over the entropy, million symbols a second (medians of {TIMING_REPEATS} repeats)")
-    print(f"{'':52}{'bits':>9}{'above':>9}{'encode':>9}{'decode':>9}")
-    for row in bench():
-        head = f"{row['set']:22}{row['symbols']:>12,}  {row['coder']:16}"
-        speeds = "".join(f"{row[f'{what}_msymbols_per_s']:9.1f}" for what in ("encode", "decode") if len(row) > 5)
-        print(f"{head}{row['bits_per_symbol']:9.4f}{row['above_entropy_%']:8.2f}%{speeds}")
-
-
-if __name__ == "__main__":
-    main()

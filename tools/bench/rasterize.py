@@ -1,6 +1,6 @@
 """Time each stage of the rasteriser, compare its speed with the torch reference, and measure its error.
 
-    python -m tools.bench.rasterize
+    python -m tools.bench --only rasterize
 
 Workload A has 50,000 Gaussians at 320 x 240 pixels, B has 200,000 at 800 x 800; both come from a fixed seed. Times are
 medians in ms over alternating repeats. The reference runs only on A and on one thread. The speed ratio compares CPU
@@ -114,13 +114,3 @@ def measure_errors(inputs: dict[str, Tensor], camera: tuple) -> dict[str, float]
             [measure_relative_error(found, right, name) for name, found, right in pairs]
         ).rms,
     }
-
-
-def main() -> None:
-    """Print one dictionary for each row."""
-    for row in bench():
-        print(row)
-
-
-if __name__ == "__main__":
-    main()

@@ -51,13 +51,3 @@ def bench() -> list[dict]:
         for name, mask in (("none", None), ("half", half)):
             rows.append({"picture": f"{width}x{height}x3", "mask": name, **compare(image, target, mask)})
     return rows
-
-
-def main() -> None:
-    """Print one dictionary for each row."""
-    for row in bench():
-        print(row)
-
-
-if __name__ == "__main__":
-    main()
