@@ -262,7 +262,7 @@ def _read_gzip(data: bytes, name: str) -> _UnpackedFile:
         )
     if has_more and not flags & _EXTENSIONS_FLAG:
         raise HyrfDataError(
-            f"{name}: the file goes on after its {count:,} Gaussians",
+            f"{name}: the file continues after its {count:,} Gaussians",
             fix="the file is damaged, export it again",
         )
     ends = np.cumsum([0, *lengths])

@@ -195,7 +195,7 @@ VALID_FILE_BY_VERSION = {version: build_spz(sections_of_one_gaussian(version), v
         (VALID_FILE_BY_VERSION[4][:-1], "is truncated"),
         (gzip.compress(b"NGSQ" + bytes(40)), "do not start with 'NGSP'"),
         (gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 5, 1, 0, 8, 0, 0)), "this is SPZ version 5"),
-        (build_spz([*sections_of_one_gaussian(3), b"!"], 3), "goes on after its 1 Gaussians"),
+        (build_spz([*sections_of_one_gaussian(3), b"!"], 3), "continues after its 1 Gaussians"),
         (build_spz(sections_of_one_gaussian(3), 3, count=2), "before its 2 Gaussians do"),
         (build_spz(sections_of_one_gaussian(4), 4, count=2), "a stream has 9 bytes, but 2 Gaussians need 18"),
         (build_spz(sections_of_one_gaussian(4), 4, degree=1), "5 streams do not fit harmonics of degree 1"),

@@ -136,7 +136,7 @@ async function readGzipSections(bytes) {
     const content = await unpacker.take(length);
     if (content.length < length) rejectTruncatedSpz(count);
     if (!(header.flags & FLAG_EXTENDED) && (await unpacker.more())) {
-      rejectSplats(`it goes on after its ${groupedDigits(count)} Gaussians; it is damaged`);
+      rejectSplats(`it continues after its ${groupedDigits(count)} Gaussians; it is damaged`);
     }
     let place = 0;
     return [header, header.lengths.map((own) => content.subarray(place, (place += own)))];
