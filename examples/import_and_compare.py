@@ -4,6 +4,7 @@ python examples/import_and_compare.py scene.ply scene.hyrf compare.png
 """
 
 import argparse
+import logging
 
 import numpy as np
 import torch
@@ -30,8 +31,9 @@ def main() -> None:
     parser.add_argument("--psnr", type=float, default=hyrfpack.DistillConfig.psnr, help="target PSNR in dB")
     args = parser.parse_args()
 
+    logging.basicConfig(level=logging.INFO, format="%(message)s")  # shows what the import does
     config = hyrfpack.DistillConfig(steps=args.steps, psnr=args.psnr, size=args.size)
-    report = hyrfpack.import_splats(args.splats, args.model, config, say=print)
+    report = hyrfpack.import_splats(args.splats, args.model, config)
     print(f"{report.bytes_source:,} -> {report.bytes_after:,} bytes, {report.psnr:.1f} dB against the Gaussians")
 
     model = hyrfpack.load_model(args.model)

@@ -14,12 +14,16 @@ Importing hyrfpack loads none of its packages. Each name below loads what it nee
 
 from __future__ import annotations
 
+import logging
 import sys
 import warnings
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from hyrfpack.version import __version__
+
+# Programs that use the library see its messages only if they configure logging.
+logging.getLogger(__name__).addHandler(logging.NullHandler())
 
 _TOO_LATE = sys.platform == "linux" and "pycolmap" in sys.modules and "zlib" not in sys.modules
 # zlib must be loaded before pycolmap, whose wheel for Linux exports a zlib of its own. If the system's zlib is loaded

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import logging
 import re
-from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -13,6 +13,8 @@ from hyrfpack.errors import HyrfError
 from hyrfpack.ops.dispatch import has_triton
 from hyrfpack.parallel.ranks import Ranks
 from hyrfpack.scene import Picture
+
+_LOG = logging.getLogger(__name__)
 
 NO_TRITON_NOTE = (
     "Triton is not installed, so the GPU runs plain torch, far slower than kernels would be; install the package "
@@ -27,15 +29,15 @@ NO_METAL_NOTE = (
 )
 
 
-def choose_device(
-    name: str | torch.device = "auto", say: Callable[[str], None] = lambda sentence: None
-) -> torch.device:
+def choose_device(name: str | torch.device = "auto") -> torch.device:
     """Return the torch device of a name, after checking that it can be used.
+
+    A warning is logged if the named device has no kernels or runs them slowly. A torch.device was chosen before, and
+    is only checked.
 
     Args:
         name: "auto", "cpu", "cuda" (torch's current CUDA or ROCm device), "cuda:N" or "mps"; or a torch.device. "auto"
             means a CUDA or ROCm device if one is usable and Triton is installed, otherwise the CPU.
-        say: called with a sentence if the device has no kernels or runs them slowly.
 
     Returns:
         The device. "cuda:N" also becomes torch's current device, on which kernels are launched.
@@ -43,6 +45,7 @@ def choose_device(
     Raises:
         HyrfError: there is no such device, or this process was forked from one that uses the GPU.
     """
+    is_named = isinstance(name, str)
     if isinstance(name, torch.device):
         name = str(name) if name.type == "cuda" else name.type
     if not re.fullmatch(r"auto|cpu|mps|cuda(:[0-9]{1,3})?", name):
@@ -66,34 +69,33 @@ def choose_device(
                 f"device '{name}' is not available: {there}",
                 fix="install a GPU build of torch or use `device='cpu'`",
             )
-        if not has_triton():
-            say(NO_TRITON_NOTE)
-        elif not torch.version.hip and torch.cuda.get_device_capability(name) < (8, 0):
-            say(OLD_GPU_NOTE)
+        if is_named and not has_triton():
+            _LOG.warning(NO_TRITON_NOTE)
+        elif is_named and not torch.version.hip and torch.cuda.get_device_capability(name) < (8, 0):
+            _LOG.warning(OLD_GPU_NOTE)
         make_current(torch.device(name))
     if kind == "mps":
         if not torch.backends.mps.is_available():
             raise HyrfError("device 'mps' is not available: torch sees no Apple GPU", fix="use `device='cpu'`")
-        say(NO_METAL_NOTE)
+        if is_named:
+            _LOG.warning(NO_METAL_NOTE)
     return torch.device(name)
 
 
-def choose_own_device(
-    name: str | torch.device, ranks: Ranks, say: Callable[[str], None] = lambda sentence: None
-) -> torch.device:
+def choose_own_device(name: str | torch.device, ranks: Ranks) -> torch.device:
     """Choose the device of one of several processes: "auto" and "cuda" give each process on a machine its own GPU.
 
     Args:
-        name, say: as for `choose_device`.
+        name: as for `choose_device`.
         ranks: the processes, all of which call this.
 
     Raises:
         HyrfError: `choose_device` fails on one process, or two would share a GPU; it is raised on all processes.
     """
-    device = ranks.run_on_all(lambda: choose_device(name, say))
+    device = ranks.run_on_all(lambda: choose_device(name))
     if device.type == "cuda" and not ranks.is_single:
         if device.index is None:
-            device = choose_device(f"cuda:{ranks.local_rank % torch.cuda.device_count()}")
+            device = choose_device(torch.device("cuda", ranks.local_rank % torch.cuda.device_count()))
         gpus = ranks.all_gather(str(torch.cuda.get_device_properties(device).uuid))
         if len(set(gpus)) < len(gpus):
             raise HyrfError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 import os
 import signal
 from collections.abc import Callable
@@ -171,6 +172,17 @@ def stop_and_resume(ranks: Ranks, whole: Path, parts: Path, alone: Path) -> dict
     said["there already"] = error_message(lambda: train_run(ranks, whole))
     said["checkpoint stays"] = ranks.run_on_all((parts / "checkpoint.pt").is_file)
     return said
+
+
+def log_lost_checkpoints(ranks: Ranks, checkpoint: Path) -> list[str]:
+    """Train three steps, after the first two of which a checkpoint is due; return the messages of this process."""
+    messages: list[str] = []
+    handler = logging.Handler()
+    handler.emit = lambda record: messages.append(record.getMessage())
+    logging.getLogger("hyrfpack").addHandler(handler)
+    config = dataclasses.replace(RUN_CONFIG, steps=6, checkpoint_every=1)
+    Trainer(six_photo_scene(), config, ranks=ranks).run(checkpoint=checkpoint)
+    return messages
 
 
 def train_after_restart(ranks: Ranks, out: Path) -> list[tuple[bool, int, bool]]:

@@ -110,19 +110,19 @@ def test_kernels_are_available_only_where_their_compiler_can_be_imported(has, pa
     assert not has.__wrapped__()
 
 
-def test_a_slow_device_is_reported(monkeypatch):
-    said = []
+def test_a_slow_device_is_reported_when_it_is_named(monkeypatch, caplog):
     monkeypatch.setattr(torch.backends.mps, "is_available", lambda: True)
     monkeypatch.setattr(devices, "has_triton", lambda: False)
-    assert choose_device("mps", said.append).type == "mps"
+    assert choose_device("mps").type == "mps"
     with use_fake_gpu():
-        assert choose_device("cuda", said.append).type == "cuda"
+        assert choose_device("cuda").type == "cuda"
+        assert choose_device(torch.device("cuda")).type == "cuda"
     monkeypatch.setattr(devices, "has_triton", lambda: True)
     with use_fake_gpu():
-        choose_device("cuda", said.append)
+        choose_device("cuda")
         monkeypatch.setattr(torch.cuda, "get_device_capability", lambda _: (7, 5))
-        choose_device("cuda", said.append)
-    assert said == [devices.NO_METAL_NOTE, devices.NO_TRITON_NOTE, devices.OLD_GPU_NOTE]
+        choose_device("cuda")
+    assert caplog.messages == [devices.NO_METAL_NOTE, devices.NO_TRITON_NOTE, devices.OLD_GPU_NOTE]
 
 
 @pytest.mark.parametrize("solid", [None, np.array([0.25, 0.5, 1.0], np.float32)])

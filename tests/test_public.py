@@ -80,6 +80,26 @@ def test_functions_can_be_called_in_processes_that_are_spawned():
             assert isinstance(call.exception(), (hyrfpack.HyrfError, TypeError)), name
 
 
+@pytest.mark.parametrize(
+    ("asking", "printed"),
+    [
+        ("", ""),
+        (
+            "logging.basicConfig(level=logging.INFO)",
+            "INFO:hyrfpack.make.auto_pose:a note\nWARNING:hyrfpack.train.log:a loss\n",
+        ),
+    ],
+    ids=["not asked for", "asked for"],
+)
+def test_messages_are_printed_only_if_the_program_asks_for_them(asking, printed):
+    code = (
+        f"import logging, hyrfpack\n{asking}\n"
+        "from hyrfpack.make.auto_pose import _LOG\n_LOG.info('a note')\n"
+        "from hyrfpack.train.log import _LOG\n_LOG.warning('a loss')\n"
+    )
+    assert run_in_new_interpreter(code).stderr == printed
+
+
 def test_sub_packages_support_every_form_of_import():
     code = (
         "import hyrfpack.train.progress as progress, hyrfpack.train as t, hyrfpack.evaluate\n"

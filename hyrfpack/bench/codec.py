@@ -59,25 +59,25 @@ class EncodingCase:
 
 
 @torch.no_grad()
-def codec_rows(subject: Subject, repeats: int, note: Callable[[str], None]) -> Iterator[Row]:
+def codec_rows(subject: Subject, repeats: int, notes: list[str]) -> Iterator[Row]:
     """Measure encoding and decoding with every profile, and with other values of each of its settings.
 
     Args:
         subject: the model to encode.
         repeats: measured runs of each case.
-        note: called with a sentence about each profile that cannot encode this model.
+        notes: gets a sentence about each profile that cannot encode this model.
     """
     if subject.profile != REFERENCE_PROFILE:
-        note(
+        notes.append(
             f"{subject.name} has profile '{subject.profile}', so its numbers are quantised already; encoding them "
             "again loses less than encoding the trained model"
         )
     cases: list[EncodingCase] = []
     for profile in PROFILES:
         try:
-            cases += _encoding_cases(subject, profile, note)
+            cases += _encoding_cases(subject, profile, notes)
         except HyrfError as error:
-            note(f"profile '{profile}' is left out: {error}")
+            notes.append(f"profile '{profile}' is left out: {error}")
     names = {f"{case.setting} {case.value}": case for case in cases}
     encoding, files = time_alternately({name: case.encode for name, case in names.items()}, repeats)
     decoding, models = time_alternately({name: partial(decode_model, data) for name, data in files.items()}, repeats)
@@ -134,10 +134,10 @@ def _match_gaussians(old: dict[str, np.ndarray], new: dict[str, np.ndarray]) -> 
     return cKDTree(rows[1] / size).query(rows[0] / size)[1]
 
 
-def _encoding_cases(subject: Subject, profile: str, note: Callable[[str], None]) -> Iterator[EncodingCase]:
+def _encoding_cases(subject: Subject, profile: str, notes: list[str]) -> Iterator[EncodingCase]:
     """Yield the profile with its defaults, then each value of each of its settings."""
     if profile == "compact":
-        encode, defaults = _compact_encoder(subject, note)
+        encode, defaults = _compact_encoder(subject, notes)
     else:
         encode, defaults = _encoder(subject.model, profile)
     itself = EncodingCase("profile", profile, profile == DEFAULT_PROFILE, encode)
@@ -161,12 +161,12 @@ def _encoder(model: HybridModel, profile: str) -> tuple[Callable[..., bytes], di
     return encode, {name: tuple(value) if isinstance(value, list) else value for name, value in defaults.items()}
 
 
-def _compact_encoder(subject: Subject, note: Callable[[str], None]) -> tuple[Callable[..., bytes], dict]:
+def _compact_encoder(subject: Subject, notes: list[str]) -> tuple[Callable[..., bytes], dict]:
     """Do what `_encoder` does, for profile "compact"; the sensitivity is measured once for all settings."""
     start = perf_counter()
     with torch.enable_grad():
         sensitivity = measure_sensitivity(subject.model, subject.capture)
-    note(
+    notes.append(
         f"measuring the sensitivities for profile 'compact' took {perf_counter() - start:.1f} s; all its settings "
         "share them, and no time in the table includes this"
     )

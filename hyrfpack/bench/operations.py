@@ -58,7 +58,7 @@ MLP_VARIANTS = (*RASTERIZE_VARIANTS, Variant("bfloat16 reference", "reference", 
 DEFAULT_VARIANT = "cpu"
 
 
-def rasterize_rows(subject: Subject, repeats: int, note: Callable[[str], None]) -> Iterator[Row]:
+def rasterize_rows(subject: Subject, repeats: int, notes: list[str]) -> Iterator[Row]:
     """Measure the rasterisation of one view, with and without antialiasing, forward and with all gradients."""
     model, camera, pose = _middle_view(subject)
     inputs = splat_inputs(model, camera_center(pose))
@@ -68,7 +68,7 @@ def rasterize_rows(subject: Subject, repeats: int, note: Callable[[str], None]) 
         yield from _compare("rasterize", name, call, RASTERIZE_VARIANTS, measure_error, repeats)
 
 
-def hash_encode_rows(subject: Subject, repeats: int, note: Callable[[str], None]) -> Iterator[Row]:
+def hash_encode_rows(subject: Subject, repeats: int, notes: list[str]) -> Iterator[Row]:
     """Measure the lookup of both fields' features at all Gaussians, with gradients of the table, as in training."""
     coords = subject.model.cube_coords(subject.model.gaussians.positions)
     for name, part in named_fields(subject.model):
@@ -77,7 +77,7 @@ def hash_encode_rows(subject: Subject, repeats: int, note: Callable[[str], None]
         yield from _compare("hash_encode", f"{name}, ", call, HASH_ENCODE_VARIANTS, measure_relative_error, repeats)
 
 
-def mlp_rows(subject: Subject, repeats: int, note: Callable[[str], None]) -> Iterator[Row]:
+def mlp_rows(subject: Subject, repeats: int, notes: list[str]) -> Iterator[Row]:
     """Measure both fields' decoders on the features of all Gaussians, seen from one camera."""
     model, _, pose = _middle_view(subject)
     for name, part, features in decoder_inputs(model, camera_center(pose)):

@@ -33,7 +33,7 @@ RenderTask = Callable[[], list[Tensor]]
 
 
 @torch.no_grad()
-def render_rows(subject: Subject, repeats: int, note: Callable[[str], None]) -> Iterator[Row]:
+def render_rows(subject: Subject, repeats: int, notes: list[str]) -> Iterator[Row]:
     """Measure the values of one setting at a time with the defaults of all others, then all settings together.
 
     The reference of a setting has its exact value. So the difference in time is what this setting saves, and the error
@@ -49,7 +49,7 @@ def render_rows(subject: Subject, repeats: int, note: Callable[[str], None]) -> 
     render_task(defaults)()  # compiles kernels that are not cached, which must not count as a slow first run
     for name, values in RENDER_SETTING_VALUES.items():
         if name in BACKGROUND_SETTINGS and not model.config.background:
-            note(f"the model has no background sphere, so {name} is left out")
+            notes.append(f"the model has no background sphere, so {name} is left out")
             continue
         default = getattr(defaults, name)
         exact, others = values[0], sorted({*values[1:], default})

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
@@ -27,6 +28,8 @@ from hyrfpack.measure.error import measure_error
 from hyrfpack.model import HybridModel
 from hyrfpack.scene import Camera, Scene, View, evenly_spaced
 from hyrfpack.train import TrainConfig, train_model
+
+_LOG = logging.getLogger(__name__)
 
 MAX_VIEWS = 6
 # Settings for training the built-in model.
@@ -126,13 +129,11 @@ def read_subject(path: str | os.PathLike[str], scene: Scene | None) -> Subject:
     )
 
 
-def built_in_subject(say: Callable[[str], None]) -> Subject:
-    """Train a small model on the demo's scene in a temporary folder; the result is the same every time.
-
-    Args:
-        say: called with a sentence before training starts.
-    """
-    say(f"training the built-in model: {BUILT_IN_STEPS:,} steps on a synthetic scene, about a minute on two cores")
+def built_in_subject() -> Subject:
+    """Train a small model on the demo's scene in a temporary folder; the result is the same every time."""
+    _LOG.info(
+        f"training the built-in model: {BUILT_IN_STEPS:,} steps on a synthetic scene, about a minute on two cores"
+    )
     with tempfile.TemporaryDirectory(prefix="hyrfpack-bench-") as folder:
         scene = load_scene(
             write_demo_scene(Path(folder) / "scene", views=BUILT_IN_PHOTOS, size=BUILT_IN_PHOTO_SIDE_PIXELS)

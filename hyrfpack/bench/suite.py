@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -17,9 +18,11 @@ from hyrfpack.measure.machine import describe_machine
 from hyrfpack.measure.timing import MAX_SECONDS_PER_TASK
 from hyrfpack.scene import Scene
 
-# Groups in order of measurement. Each function takes a subject, the number of repeats, and a function that is called
-# with a sentence for each part that is left out.
-GROUPS: dict[str, Callable[[Subject, int, Callable[[str], None]], Iterator[Row]]] = {
+_LOG = logging.getLogger(__name__)
+
+# Groups in order of measurement. Each function takes a subject, the number of repeats, and a list, to which it appends
+# a sentence for each part that is left out.
+GROUPS: dict[str, Callable[[Subject, int, list[str]], Iterator[Row]]] = {
     "rasterize": rasterize_rows,
     "hash_encode": hash_encode_rows,
     "mlp": mlp_rows,
@@ -55,7 +58,6 @@ def benchmark_model(
     *,
     repeats: int = 7,
     only: Sequence[str] | None = None,
-    say: Callable[[str], None] = lambda sentence: None,
 ) -> BenchReport:
     """Measure the time and the error of operations, renderer settings and file profiles on a model.
 
@@ -71,7 +73,6 @@ def benchmark_model(
             pictures, from an orbit around the viewpoint stored in the file.
         repeats: measured runs of each value, at least 1; tasks that take seconds get fewer.
         only: names of the groups to measure, out of `GROUPS`; None for all.
-        say: called with a sentence before each part.
 
     Raises:
         HyrfError: the model or the photos cannot be used, a result is not finite, or Numba is missing.
@@ -95,13 +96,13 @@ def benchmark_model(
         check_type("scene", scene, Scene)
     with needs_package("numba", "measuring the compiled kernels"):
         import numba  # noqa: F401 - imported here, so that it fails before the work starts
-    subject = built_in_subject(say) if model is None else read_subject(model, scene)
+    subject = built_in_subject() if model is None else read_subject(model, scene)
     notes: list[str] = []
     rows: list[Row] = []
     for name in GROUPS:
         if name in (only or GROUPS):
-            say(f"measuring {name}")
-            rows += GROUPS[name](subject, repeats, notes.append)
+            _LOG.info(f"measuring {name}")
+            rows += GROUPS[name](subject, repeats, notes)
     if any(row.time.repeats < repeats for row in rows):
         notes.append(f"a variant that has been measured for {MAX_SECONDS_PER_TASK:g} s is not measured again")
     return BenchReport(describe_machine(), subject.describe(), notes, rows)

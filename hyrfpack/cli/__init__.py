@@ -22,6 +22,7 @@ from hyrfpack.cli.compare import compare
 from hyrfpack.cli.console import (
     add_verbosity_options,
     is_verbose,
+    log_as_notes,
     note,
     repair_std_streams,
     store_arguments,
@@ -60,7 +61,7 @@ class _CommandGroup(click.Group):
             return super().make_context(info_name, args, parent, **extra)
 
     def invoke(self, ctx: click.Context) -> Any:
-        with _errors_as_json(stored_arguments(ctx)):
+        with _errors_as_json(stored_arguments(ctx)), log_as_notes():
             return self._invoke(ctx)
 
     def _invoke(self, ctx: click.Context) -> Any:

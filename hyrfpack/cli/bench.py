@@ -21,6 +21,7 @@ from hyrfpack.cli.common import (
     resolve_model_file,
     scene_options,
 )
+from hyrfpack.cli.console import notes_only_of
 from hyrfpack.errors import HyrfError
 from hyrfpack.outputs import Outputs
 
@@ -101,7 +102,8 @@ def bench(
         tables.fill_page(page, dict.fromkeys(("machine", *(only or GROUPS)), ""), str(markdown))
     if markdown is not None:  # an existing page with places is filled, which needs no permission to overwrite
         Outputs(model, scene=scene, overwrite=overwrite or bool(page)).file(markdown)
-    result = measure(model, scene, repeats=repeats, only=only or None, say=note)
+    with notes_only_of("hyrfpack.bench"):
+        result = measure(model, scene, repeats=repeats, only=only or None)
     if as_json:
         print_json(result.to_dict())
     else:

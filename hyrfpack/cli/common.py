@@ -170,7 +170,7 @@ def device_options(command: Command) -> Command:
 
 
 def choose_command_device(name: str, ranks: Ranks | None = None) -> torch.device:
-    """Choose the device that --device names, and print a note if it is slow.
+    """Choose the device that --device names.
 
     Args:
         name: value of the option.
@@ -182,7 +182,7 @@ def choose_command_device(name: str, ranks: Ranks | None = None) -> torch.device
     from hyrfpack.device import choose_own_device, describe_device
     from hyrfpack.parallel.ranks import SINGLE_PROCESS
 
-    device = choose_own_device(name, ranks or SINGLE_PROCESS, note)
+    device = choose_own_device(name, ranks or SINGLE_PROCESS)
     note_if_verbose(f"device: {describe_device(device)}")
     return device
 

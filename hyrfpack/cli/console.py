@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import errno
+import logging
 import os
 import platform
 import sys
 import time
-from collections.abc import Iterable
-from contextlib import redirect_stderr, suppress
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, redirect_stderr, suppress
 from typing import TextIO
 
 import click
@@ -87,7 +88,7 @@ def note(sentence: str) -> None:
     sentence = use_option_names(sentence)
     if is_verbose():
         sentence = f"[{time.perf_counter() - click.get_current_context().meta[_START_TIME_KEY]:7.2f} s] {sentence}"
-    with suppress(OSError):  # a full disk or a closed terminal must not end the work
+    with suppress(OSError, ValueError):  # a full disk or a closed stream must not end the work
         click.echo(sentence, err=True)
 
 
@@ -100,6 +101,46 @@ def note_if_verbose(sentence: str) -> None:
     """Print a note that only --verbose shows."""
     if is_verbose():
         note(sentence)
+
+
+class _NoteHandler(logging.Handler):
+    """Prints the messages that the library logs as notes."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        note(record.getMessage())
+
+
+_HANDLER = _NoteHandler()
+
+
+@contextmanager
+def log_as_notes() -> Iterator[None]:
+    """Print the messages that the library logs in the block as notes."""
+    logger = logging.getLogger("hyrfpack")
+    level, propagate = logger.level, logger.propagate
+    logger.addHandler(_HANDLER)
+    logger.setLevel(logging.INFO)
+    logger.propagate = False  # a handler of another library would print the messages again
+    try:
+        yield
+    finally:
+        logger.removeHandler(_HANDLER)
+        logger.setLevel(level)
+        logger.propagate = propagate
+
+
+@contextmanager
+def notes_only_of(*packages: str) -> Iterator[None]:
+    """Print no messages of other packages in the block, because these show their work as progress or not at all."""
+
+    def is_shown(record: logging.LogRecord) -> bool:
+        return record.name.startswith(packages)
+
+    _HANDLER.addFilter(is_shown)
+    try:
+        yield
+    finally:
+        _HANDLER.removeFilter(is_shown)
 
 
 def repair_std_streams() -> None:

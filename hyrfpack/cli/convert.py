@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from hyrfpack.cli.common import OUTPUT, PATH, format_table, json_option, note, note_rename, overwrite_option, print_json
+from hyrfpack.cli.common import OUTPUT, PATH, format_table, json_option, note_rename, overwrite_option, print_json
 from hyrfpack.cli.export import crop_option, min_opacity_option, spz_version_option
 from hyrfpack.cli.progress import show_progress
 from hyrfpack.outputs import Outputs
@@ -68,7 +68,6 @@ def convert(
             min_opacity=min_opacity,
             spz_version=spz_version,
             overwrite=overwrite,
-            say=note,
             report=progress,
         )
     note_rename(target, report.file)

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import click
 
-from hyrfpack.cli.common import OUTPUT, json_option, note, note_rename, overwrite_option, print_json
+from hyrfpack.cli.common import OUTPUT, json_option, note_rename, overwrite_option, print_json
+from hyrfpack.cli.console import notes_only_of
 from hyrfpack.outputs import Outputs
 
 
@@ -29,7 +30,8 @@ def demo(output: Path, steps: int, overwrite: bool, as_json: bool) -> None:
     from hyrfpack.demo.run import PAGE_FILE, PICTURE_FILE, RESULT_FILES, run_demo
 
     Outputs(overwrite=overwrite).folder(output, RESULT_FILES)
-    result = run_demo(output, steps=steps, overwrite=overwrite, say=note)
+    with notes_only_of("hyrfpack.demo", "hyrfpack.train"):
+        result = run_demo(output, steps=steps, overwrite=overwrite)
     note_rename(output / PICTURE_FILE, result.picture)
     note_rename(output / PAGE_FILE, result.page.file)
     if as_json:

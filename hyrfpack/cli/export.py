@@ -15,7 +15,6 @@ from hyrfpack.cli.common import (
     PATH,
     format_table,
     json_option,
-    note,
     note_rename,
     overwrite_option,
     print_json,
@@ -196,7 +195,7 @@ def export(
         check_place(output, Outputs(*files, scene=scenes[0] if scenes else None, overwrite=overwrite), colmap)
     with show_progress("export") as progress:
         if len(models) > 1:
-            report = export_gallery(models, output, data=scenes, overwrite=overwrite, say=note)
+            report = export_gallery(models, output, data=scenes, overwrite=overwrite)
         elif not models:
             report = export_player(None, output, overwrite=overwrite)
         else:
@@ -213,7 +212,6 @@ def export(
                 exposure=exposure,
                 colmap=colmap,
                 overwrite=overwrite,
-                say=note,
                 report=progress,
             )
     note_rename(output, report.file)

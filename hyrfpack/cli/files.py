@@ -154,7 +154,6 @@ def compress(
             max_psnr_drop=max_psnr_drop,
             overwrite=overwrite,
             device=torch_device,
-            say=note,
             report=report_part(progress, 0.0, 0.9),
             ranks=ranks,
         )
@@ -166,7 +165,7 @@ def compress(
         from hyrfpack.compress.report import write_report
 
         command = _command_as_typed(click.get_current_context())
-        write_report(report, model, written, result, scene, command=command, overwrite=overwrite, say=note)
+        write_report(report, model, written, result, scene, command=command, overwrite=overwrite)
     _print_report(result, scores, as_json)
 
 

@@ -97,7 +97,7 @@ def import_(
     config = DistillConfig(steps=steps, psnr=psnr, size=size, seed=seed)
     with show_progress("import") as progress:
         report = import_splats(
-            source, output, config, cameras=given, overwrite=overwrite, device=torch_device, say=note, report=progress
+            source, output, config, cameras=given, overwrite=overwrite, device=torch_device, report=progress
         )
     written = note_rename(output, report.file)
     if as_json:

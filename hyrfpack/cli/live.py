@@ -31,9 +31,7 @@ def view_options(command: Command) -> Command:
 
 
 @contextmanager
-def serve_training_view(
-    title: str, view: bool, view_port: int | None, say: Callable[[str], None]
-) -> Iterator[Callable[[Trainer], None] | None]:
+def serve_training_view(title: str, view: bool, view_port: int | None) -> Iterator[Callable[[Trainer], None] | None]:
     """Serve a page that shows the training, if --view asks for it, while the block runs.
 
     Yields:
@@ -42,7 +40,6 @@ def serve_training_view(
     Args:
         title: title of the page.
         view, view_port: values of the options.
-        say: called with a sentence that names the page's address.
 
     Raises:
         UsageError: --view-port is given without --view.
@@ -55,5 +52,5 @@ def serve_training_view(
         return
     from hyrfpack.live import live_view
 
-    with live_view(title, port=view_port or 0, say=say) as live:
+    with live_view(title, port=view_port or 0) as live:
         yield live.observe

@@ -22,6 +22,7 @@ from hyrfpack.cli.common import (
     reject_nan,
     seed_option,
 )
+from hyrfpack.cli.console import notes_only_of
 from hyrfpack.cli.live import serve_training_view, view_options
 
 if TYPE_CHECKING:
@@ -119,15 +120,16 @@ def make(
         raise click.UsageError("--quality and --minutes each decide how long to work; give one of them")
     if target_size is not None and max_gaussians is not None:
         raise click.UsageError("--max-gaussians and --target-size each decide how large the model is; give one of them")
-    from hyrfpack.cli.progress import create_command_display
     from hyrfpack.make import Stopped
     from hyrfpack.make import make_scene as run
+    from hyrfpack.make.display import Display
 
     torch_device = choose_command_device(device)
     try:
         with (
-            create_command_display() as display,
-            serve_training_view(output.name, view, view_port, display.say) as observer,
+            notes_only_of("hyrfpack.make", "hyrfpack.poses", "hyrfpack.live"),
+            Display() as display,
+            serve_training_view(output.name, view, view_port) as observer,
         ):
             result = run(
                 photos,
@@ -146,7 +148,6 @@ def make(
                 device=torch_device,
                 overwrite=overwrite,
                 report=display.show,
-                say=display.say,
                 observer=observer,
             )
     except Stopped as stop:

@@ -48,12 +48,12 @@ def poses(
       hyrfpack poses clip.mp4 -o scenes/clip
       hyrfpack train scenes/garden -o runs/garden
     """
-    from hyrfpack.cli.progress import create_command_display
+    from hyrfpack.make.display import Display
     from hyrfpack.make.progress import Reporter
     from hyrfpack.poses import estimate_poses
 
     try:
-        with create_command_display() as display:
+        with Display() as display:
             reporter = Reporter(["poses"], display.show)
             reporter.begin("poses")
             result = estimate_poses(
@@ -64,7 +64,6 @@ def poses(
                 seed=seed,
                 overwrite=overwrite,
                 report=lambda doing, share: reporter.update(share, doing),
-                say=display.say,
             )
     except KeyboardInterrupt:
         note("stopped; the same command resumes from here")

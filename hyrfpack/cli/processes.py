@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import click
 
-from hyrfpack.cli.console import note, stored_arguments
+from hyrfpack.cli.console import stored_arguments
 from hyrfpack.errors import HyrfError
 
 Command = TypeVar("Command", bound=Callable)
@@ -39,7 +39,7 @@ def processes_option(command: Command) -> Command:
             from hyrfpack.parallel.launch import launch
 
             ctx = click.get_current_context()
-            ctx.exit(launch(remove_option(stored_arguments(ctx)), processes, note))
+            ctx.exit(launch(remove_option(stored_arguments(ctx)), processes))
         with join_processes() as ranks, _silence_unless(ranks.is_main):
             return command(*args, ranks=ranks, **options)
 

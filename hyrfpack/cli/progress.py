@@ -6,20 +6,10 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, TypeVar
 
-from hyrfpack.cli.wording import use_option_names
-
 if TYPE_CHECKING:
-    from hyrfpack.make.display import Display
     from hyrfpack.progress import Report
 
 T = TypeVar("T")
-
-
-def create_command_display() -> Display:
-    """Return a progress display that names options where messages of the library name Python arguments."""
-    from hyrfpack.make.display import Display
-
-    return Display(use_option_names)
 
 
 @contextmanager
@@ -29,9 +19,10 @@ def show_progress(command: str) -> Iterator[Report]:
     Yields:
         The function that the work reports its progress to. Sentences printed meanwhile appear above the line.
     """
+    from hyrfpack.make.display import Display
     from hyrfpack.make.progress import Reporter
 
-    with create_command_display() as display:
+    with Display() as display:
         reporter = Reporter([command], display.show)
         reporter.begin(command)
         yield lambda doing, share: reporter.update(share, doing)

@@ -162,7 +162,7 @@ def train(
     note(f"{scene.layout} scene: {len(scene.train)} photos to train on, {len(scene.test)} held out; on {where}")
     cache = None if cache_mb is None else PictureCache(cache_mb * 2**20 // ranks.local_size)
     config = TrainConfig(**settings)
-    with serve_training_view(out.name, view and ranks.is_main, view_port, note) as observer:
+    with serve_training_view(out.name, view and ranks.is_main, view_port) as observer:
         try:
             result = run(
                 scene, out, config, resume=resume, overwrite=overwrite, cache=cache, device=torch_device,
@@ -203,14 +203,12 @@ def train(
 
 def _estimate_poses(photos: Path, run: Path, images: str | None, resume: bool, overwrite: bool) -> Path:
     """Estimate the poses of photos and return the folder of the scene, which lies in the folder of the run."""
-    from hyrfpack.cli.progress import create_command_display
     from hyrfpack.make.auto_pose import SCENE_FOLDER, auto_pose
+    from hyrfpack.make.display import Display
 
     try:
-        with create_command_display() as display:
-            return auto_pose(
-                photos, run, images=images, resume=resume, overwrite=overwrite, report=display.show, say=display.say
-            )
+        with Display() as display:
+            return auto_pose(photos, run, images=images, resume=resume, overwrite=overwrite, report=display.show)
     except KeyboardInterrupt:
         note(f"stopped in poses; the same command resumes with {run / SCENE_FOLDER}")
         click.get_current_context().exit(1)

@@ -40,11 +40,11 @@ def view(model: Path, port: int, host: str, no_browser: bool, as_json: bool) -> 
     """
     from hyrfpack.web.view import view as serve_view
 
-    def say(address: str) -> None:
+    def print_address(address: str) -> None:
         note("press Ctrl-C to end")
         if as_json:
             print_json({"address": address})
         else:
             click.echo(address)
 
-    serve_view(model, host=host, port=port, open_browser=not no_browser, say=say)
+    serve_view(model, host=host, port=port, open_browser=not no_browser, on_ready=print_address)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 import os
 import warnings
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from itertools import count
@@ -43,6 +43,8 @@ from hyrfpack.outputs import Outputs
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.progress import Report, no_report, report_part, report_round
 from hyrfpack.scene import Scene, evenly_spaced
+
+_LOG = logging.getLogger(__name__)
 
 # A file is encoded again, with a smaller distortion, if its PSNR drop on training photos is more than this multiple of
 # the intended one.
@@ -92,7 +94,6 @@ def compress_model(
     distortion: float | None = None,
     overwrite: bool = True,
     device: str | torch.device = "auto",
-    say: Callable[[str], None] = lambda sentence: None,
     report: Report = no_report,
     ranks: Ranks = SINGLE_PROCESS,
     **settings: Any,
@@ -119,7 +120,6 @@ def compress_model(
             meantime is kept, and the result is written beside it under a free name, which the report names.
         device: device that renders, see `hyrfpack.device.choose_device`. On the CPU the same input gives the same
             bytes. On a GPU sums of gradients vary in their last bits, and so may the bytes.
-        say: called with a sentence for each step of the work.
         report: called with the name of the current task and the completed share of the work, 0 to 1.
         ranks: processes that share the photos of fine-tuning; rank 0 writes the file.
         settings: settings of "paper", see `hyrfpack.format.paper`; `noise` is the deprecated name of `distortion`.
@@ -172,7 +172,7 @@ def compress_model(
     kept = quantized_provenance(provenance, model.config.frame.scale)
     if target_bytes is not None:
         check_target_bytes(target_bytes, kept, model.exposure)
-    model = model.to(choose_own_device(device, ranks, say))
+    model = model.to(choose_own_device(device, ranks))
     model.precision = "float32"  # quantisation errors are smaller than the rounding of lower precisions on a GPU
     if len(model) == 0:
         raise HyrfError(
@@ -180,7 +180,7 @@ def compress_model(
             fix="use profile 'paper'",
         )
     cameras = Capture(describe_file(source), data).cameras
-    say(f"measuring how each stored number affects renders, at {len(cameras)} cameras and between them")
+    _LOG.info(f"measuring how each stored number affects renders, at {len(cameras)} cameras and between them")
     start = distortion or default_distortion(provenance, finetune_steps)
     encoding_start = (
         SEARCH_ENCODING_START_SHARE
@@ -191,7 +191,7 @@ def compress_model(
     sensitivity, references = measure_calibrated_sensitivity(model, cameras, start, prune, measuring_report)
     sensitivity = ranks.broadcast(sensitivity)  # on GPUs the other ranks' values differ in their last bits
     encoding_report = report_part(report, encoding_start, 1.0)
-    packer = Packer(model, kept, sensitivity, data, finetune_steps, prune, say, encoding_report, ranks=ranks)
+    packer = Packer(model, kept, sensitivity, data, finetune_steps, prune, encoding_report, ranks=ranks)
     if target_bytes is not None:
         candidate, search_result = packer.encode_within_bytes(target_bytes, start)
     elif max_psnr_drop is not None:
@@ -231,7 +231,6 @@ class Packer:
         scene: photos to fine-tune on and to measure losses on; None if there are none.
         finetune_steps: steps of fine-tuning for each file; 0 for none.
         prune: leave out Gaussians whose removal saves more rate than it costs in distortion.
-        say: called with a sentence for each step of the work.
         report: called with the name of the current task and the completed share of encoding all files, 0 to 1.
         cache: cache of decoded photos.
         ranks: processes that fine-tune together.
@@ -243,7 +242,6 @@ class Packer:
     scene: Scene | None
     finetune_steps: int
     prune: bool
-    say: Callable[[str], None]
     report: Report = no_report
     cache: PictureCache = field(default_factory=PictureCache)
     ranks: Ranks = SINGLE_PROCESS
@@ -255,7 +253,7 @@ class Packer:
         plan = make_plan(model, self.sensitivity, distortion, self.prune)
         if steps:
             assert self.scene is not None
-            self.say(f"fine-tuning for {steps:,} steps")
+            _LOG.info(f"fine-tuning for {steps:,} steps")
 
             own_steps = -(-steps // self.ranks.size)
 
@@ -294,7 +292,7 @@ class Packer:
                 if psnr_drop <= PSNR_DROP_TOLERANCE_RATIO * target_drop:
                     break
                 distortion *= max(target_drop / psnr_drop, 1 / MAX_REFINING_RATIO)
-                self.say(
+                _LOG.info(
                     f"training photos lose {psnr_drop:.2f} dB, limit {target_drop:g} dB; encoding again at "
                     f"distortion {distortion:.2g}"
                 )
@@ -303,7 +301,7 @@ class Packer:
                     candidate, measured_error=references.measure_error(self.decode(candidate))
                 )
         except HyrfError as error:  # a photo cannot be read, or masks leave no pixel to score
-            self.say(f"{error}; the loss on training photos is not measured")
+            _LOG.warning(f"{error}; the loss on training photos is not measured")
         return candidate
 
     def _encode_to_distortion(
@@ -328,7 +326,7 @@ class Packer:
                 break
             distortion /= min(max(error_ratio, 1 / MAX_COARSENING_RATIO), MAX_REFINING_RATIO)
             kind = "finer" if error_ratio > 1 else "coarser"
-            self.say(
+            _LOG.info(
                 f"renders have a mean squared error of {error:.2g}, target {target:.2g}; encoding again at "
                 f"distortion {distortion:.2g} ({kind})"
             )
@@ -354,7 +352,7 @@ class Packer:
 
         def encode_candidate(distortion: float) -> EncodedCandidate:
             candidate = self.encode(distortion, report_round(self.report, next(rounds)))
-            self.say(f"distortion {distortion:.2g}: {len(candidate.data):,} bytes")
+            _LOG.info(f"distortion {distortion:.2g}: {len(candidate.data):,} bytes")
             return candidate
 
         answer = find_fullest(
@@ -391,7 +389,7 @@ class Packer:
             report("scoring the file", 0.7)
             psnr_drop = before - evaluate_model(self.decode(candidate), views).psnr
             candidate = dataclasses.replace(candidate, psnr_drop=psnr_drop)
-            self.say(f"distortion {distortion:.2g}: {len(candidate.data):,} bytes, {psnr_drop:+.3f} dB lost")
+            _LOG.info(f"distortion {distortion:.2g}: {len(candidate.data):,} bytes, {psnr_drop:+.3f} dB lost")
             return candidate
 
         answer = find_coarsest(

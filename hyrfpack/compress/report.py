@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from fractions import Fraction
 from functools import partial
@@ -50,6 +51,8 @@ from hyrfpack.render import render_view
 from hyrfpack.render.files import save_picture, to_image
 from hyrfpack.scene import Picture, Scene, View, evenly_spaced
 
+_LOG = logging.getLogger(__name__)
+
 # Distortions of the rate-distortion curve, relative to that of the file.
 CURVE_DISTORTION_RATIOS = (1 / 16, 1 / 4, 1, 4, 16)
 # With this many Gaussians or more, the curve has only the middle three points: each takes long to encode and score.
@@ -73,7 +76,6 @@ def write_report(
     *,
     command: str = "",
     overwrite: bool = True,
-    say: Callable[[str], None] = lambda sentence: None,
 ) -> Path:
     """Write `folder/index.html` about a compressed file, and its pictures beside it.
 
@@ -88,7 +90,6 @@ def write_report(
         scene: photos of the scene.
         command: command line shown on the page as the way to make the file again.
         overwrite: replace files of an earlier page; if False, they are an error.
-        say: called with a sentence for each step of the work.
 
     Returns:
         The path of the page. It is written last, so if it exists, all pictures that it shows exist.
@@ -100,7 +101,7 @@ def write_report(
     Outputs(source, packed, scene=scene, overwrite=True).folder(folder, REPORT_FILES)
     with exclusive_folder(folder, "another folder with `report`"):
         Outputs(source, packed, scene=scene, overwrite=overwrite).folder(folder, REPORT_FILES)
-        return _write_report(folder, source, packed, report, scene, command, overwrite, say)
+        return _write_report(folder, source, packed, report, scene, command, overwrite)
 
 
 def _write_report(
@@ -111,12 +112,11 @@ def _write_report(
     scene: Scene | None,
     command: str,
     overwrite: bool,
-    say: Callable[[str], None],
 ) -> Path:
     """Do the work of `write_report` in a folder that this call has locked."""
     model, provenance = load_with_provenance(source)
     views, views_in_words = _views_to_score(model, source, scene)
-    say(f"comparing renders with {views_in_words} for the report")
+    _LOG.info(f"comparing renders with {views_in_words} for the report")
     before = evaluate_model(model, views)
     facts, data = describe_file(packed), _read_bytes(packed)
     scored = [view for view in views if view.name not in before.skipped]

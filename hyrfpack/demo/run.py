@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 import os
 import time
 from collections.abc import Callable
@@ -29,6 +30,8 @@ from hyrfpack.render import render_view
 from hyrfpack.render.files import render_files, save_picture
 from hyrfpack.scene import Scene, evenly_spaced
 from hyrfpack.train import TrainConfig, train_model
+
+_LOG = logging.getLogger(__name__)
 
 DRAWN_VIEW_COUNT = 4
 SCENE_FOLDER = "scene"
@@ -116,7 +119,6 @@ def run_demo(
     views: int = 60,
     size: int = 200,
     overwrite: bool = True,
-    say: Callable[[str], None] = lambda sentence: None,
 ) -> DemoResult:
     """Write a scene, train on it, compress, decompress, render, score, export, and draw a picture of the result.
 
@@ -129,7 +131,6 @@ def run_demo(
         steps: number of training steps.
         views, size: number of photos, and their width and height in pixels.
         overwrite: replace existing files; without it, they are an error.
-        say: called with a sentence before each stage.
 
     Raises:
         HyrfError: a file cannot be written, or another call is writing into the folder.
@@ -138,22 +139,20 @@ def run_demo(
     Outputs(overwrite=True).folder(folder, RESULT_FILES)
     with exclusive_folder(folder):
         Outputs(overwrite=overwrite).folder(folder, RESULT_FILES)
-        return _run_demo(folder, steps, views, size, overwrite, say)
+        return _run_demo(folder, steps, views, size, overwrite)
 
 
-def _run_demo(
-    folder: Path, steps: int, views: int, size: int, overwrite: bool, say: Callable[[str], None]
-) -> DemoResult:
+def _run_demo(folder: Path, steps: int, views: int, size: int, overwrite: bool) -> DemoResult:
     """Run the demo as `run_demo` does, in a folder that is locked."""
-    say(f"making a scene of {views} photos")
+    _LOG.info(f"making a scene of {views} photos")
     write_demo_scene(folder / SCENE_FOLDER, views=views, size=size, overwrite=overwrite)
     scene = load_scene(folder / SCENE_FOLDER)
-    say(f"training {steps:,} steps on {len(scene.train)} photos, {len(scene.test)} held out")
+    _LOG.info(f"training {steps:,} steps on {len(scene.train)} photos, {len(scene.test)} held out")
     trained = train_model(scene, folder / RUN_FOLDER, TrainConfig(steps=steps), overwrite=overwrite)
     if trained.model is None:
         raise KeyboardInterrupt
 
-    say("compressing, decompressing and scoring")
+    _LOG.info("compressing, decompressing and scoring")
     unpacked_path, profiles, replace = folder / UNPACKED_FILE, [], overwrite
     for profile in ("raw", *PACKED_FILES):
         path, compress_seconds = trained.model, None
@@ -168,12 +167,12 @@ def _run_demo(
         stored = path.stat().st_size
         profiles.append(ProfileResult(profile, scores.psnr, scores.ssim, stored, compress_seconds, decompress_seconds))
 
-    say("rendering held-out views")
+    _LOG.info("rendering held-out views")
     model = load_model(path)
     held_out = [(view.name, view.camera) for view in scene.test]
     for _ in render_files(model, held_out, folder / RENDERS_FOLDER, overwrite=overwrite):
         pass
-    say("making a page for the browser")
+    _LOG.info("making a page for the browser")
     page = export_model(path, folder / PAGE_FILE, data=scene, overwrite=overwrite)
     result = DemoResult(
         steps=steps,

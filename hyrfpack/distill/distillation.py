@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +24,8 @@ from hyrfpack.splats.splats import Splats
 from hyrfpack.splats.viewpoints import WeightedSplats, has_enclosed_places, sample_viewpoints
 from hyrfpack.train.config import LARGEST_SEED, DensityConfig, LearningRates, TrainConfig
 from hyrfpack.train.trainer import Trainer
+
+_LOG = logging.getLogger(__name__)
 
 # Compression is decided on more views than are scored, because the mean PSNR of few views is off by up to 1 dB.
 VALIDATION_VIEWS_PER_TEST_VIEW = 3
@@ -67,7 +70,6 @@ def distill_model(
     name: str = "the splats",
     cameras: Sequence[Camera] | None = None,
     device: torch.device = torch.device("cpu"),  # noqa: B008 - a constant
-    say: Callable[[str], None] = lambda sentence: None,
     report: Report = no_report,
 ) -> DistilledModel:
     """Train a hybrid model to look like splats. Arguments and errors are those of `distill_splats`.
@@ -82,7 +84,7 @@ def distill_model(
     weighted = WeightedSplats.from_splats(splats, name)
     original = Drawable.from_splats(splats, weighted.frame, device)
     train, validation, test = _choose_cameras(weighted, original, config, cameras)
-    say(
+    _LOG.info(
         f"{len(splats):,} Gaussians, harmonics of degree {splats.degree}; {len(train)} "
         f"{'sampled' if cameras is None else 'given'} viewpoints for training, {len(test)} held out"
     )
@@ -91,7 +93,9 @@ def distill_model(
     kept = torch.from_numpy(_indices_without_faint(light.cpu().numpy())).to(device)
     if not len(kept):
         raise HyrfDataError(f"{name}: no view shows anything of the Gaussians", fix="give others with `cameras`")
-    say(f"{len(splats) - len(kept):,} Gaussians are hardly visible and are left out; fitting the fields to the others")
+    _LOG.info(
+        f"{len(splats) - len(kept):,} Gaussians are hardly visible and are left out; fitting the fields to the others"
+    )
     share = min(1.0, max(MIN_REGRESSION_SHARE, config.steps / FULL_REGRESSION_STEPS))
     model = initial_model(original[kept], light[kept], train, config.seed, share, report_part(report, 0.1, 0.4))
     scene, cache = reference_scene(name, original, train, test), PictureCache()

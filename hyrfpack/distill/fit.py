@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -25,6 +26,8 @@ from hyrfpack.scene import Camera
 from hyrfpack.splats.files import read_splats
 from hyrfpack.splats.names import bytes_on_disk
 from hyrfpack.splats.splats import Splats
+
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -74,7 +77,6 @@ def import_splats(
     cameras: Sequence[Camera] | None = None,
     overwrite: bool = True,
     device: str | torch.device = "auto",
-    say: Callable[[str], None] = lambda sentence: None,
     report: Report = no_report,
 ) -> DistillReport:
     """Make a `.hyrf` file from a file of 3D Gaussians.
@@ -99,7 +101,7 @@ def import_splats(
     Outputs(source, overwrite=overwrite).file(target)
     splats = read_splats(source)
     result = distill_splats(
-        splats, target, config, name=str(source), cameras=cameras, overwrite=overwrite, device=device, say=say,
+        splats, target, config, name=str(source), cameras=cameras, overwrite=overwrite, device=device,
         report=report,
     )  # fmt: skip
     return dataclasses.replace(result, bytes_source=bytes_on_disk(source))
@@ -114,7 +116,6 @@ def distill_splats(
     cameras: Sequence[Camera] | None = None,
     overwrite: bool = True,
     device: str | torch.device = "auto",
-    say: Callable[[str], None] = lambda sentence: None,
     report: Report = no_report,
 ) -> DistillReport:
     """Distil splats into a hybrid model of the same appearance, and compress it with profile "compact".
@@ -133,7 +134,6 @@ def distill_splats(
         overwrite: replace a file at `target`. If False, an existing file is an error. A file that appears in the
             meantime is kept, and the result is written beside it under a free name, which the report names.
         device: device for rendering and training, see `hyrfpack.device.choose_device`.
-        say: called with a sentence for each step of the work.
         report: called with the name of the current task and the completed share of the work, 0 to 1.
 
     Raises:
@@ -142,15 +142,15 @@ def distill_splats(
     """
     started = time.perf_counter()
     Outputs(overwrite=overwrite).file(target)
-    torch_device = choose_device(device, say)
+    torch_device = choose_device(device)
     distilled = distill_model(
-        splats, config, name=name, cameras=cameras, device=torch_device, say=say, report=report_part(report, 0.0, 0.7)
+        splats, config, name=name, cameras=cameras, device=torch_device, report=report_part(report, 0.0, 0.7)
     )
     unpacked_psnr = float(np.mean(distilled.test.psnr_per_view(distilled.model)))
-    say(f"PSNR before compression: {unpacked_psnr:.2f} dB")
+    _LOG.info(f"PSNR before compression: {unpacked_psnr:.2f} dB")
     imported = f"{len(splats):,} Gaussians of degree {splats.degree} from {Path(name).name}, without photos"
     provenance = {"steps": config.steps, "seed": config.seed, "psnr": unpacked_psnr, "choices": {"imported": imported}}
-    data = pack(distilled, config.psnr, provenance, say, report_part(report, 0.7, 0.97))
+    data = pack(distilled, config.psnr, provenance, report_part(report, 0.7, 0.97))
     written = write_atomic(target, data, overwrite=overwrite)  # written last, so that an interrupt keeps the old file
     report("scoring the file", 0.97)
     decoded = hyrf_format.load_model(written).to(torch_device)
@@ -158,7 +158,7 @@ def distill_splats(
     scores = distilled.test.psnr_per_view(decoded)
     reached_psnr = float(np.mean(scores))
     if _falls_short(reached_psnr, config.psnr):
-        say(_shortfall(reached_psnr, unpacked_psnr, config, viewpoints_are_sampled=cameras is None))
+        _LOG.warning(_shortfall(reached_psnr, unpacked_psnr, config, viewpoints_are_sampled=cameras is None))
     return DistillReport(
         gaussians_before=len(splats),
         gaussians_after=len(decoded),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import logging
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,8 @@ from hyrfpack.compress.calibrate import measure_calibrated_sensitivity
 from hyrfpack.compress.packer import Packer
 from hyrfpack.distill.distillation import DistilledModel
 from hyrfpack.progress import Report, no_report, report_part, report_round
+
+_LOG = logging.getLogger(__name__)
 
 # Compression is planned for this share of the error that it may add, because the measured error varies.
 PLANNED_ERROR_SHARE = 0.8
@@ -27,7 +29,6 @@ def pack(
     distilled: DistilledModel,
     psnr: float,
     provenance: dict,
-    say: Callable[[str], None] = lambda sentence: None,
     report: Report = no_report,
 ) -> bytes:
     """Encode the smallest file that reaches a target PSNR on the validation views.
@@ -36,7 +37,6 @@ def pack(
         distilled: the model, and reference renders of the original.
         psnr: target PSNR in dB against the reference renders.
         provenance: provenance to store in the file; the viewpoint is added to it.
-        say: called with a sentence for each step of the work.
         report: called with the name of the current task and the completed share of the work, 0 to 1.
 
     Returns:
@@ -55,16 +55,14 @@ def pack(
     psnrs = np.array(distilled.validation.psnr_per_view(model))
     allowed, error = _mse(psnr), _mse(psnrs.mean())
     allowance = max(allowed - error, min(FALLBACK_MODEL_ERROR_SHARE * error, FALLBACK_ALLOWED_ERROR_SHARE * allowed))
-    say(f"measuring how each stored number affects renders, at {len(distilled.train)} cameras and between them")
+    _LOG.info(f"measuring how each stored number affects renders, at {len(distilled.train)} cameras and between them")
     distortion = PLANNED_ERROR_SHARE * solve_added_error(_mse(psnrs), error + allowance)
     sensitivity, references = measure_calibrated_sensitivity(
         model, distilled.train, distortion, report=report_part(report, 0.0, 0.7)
     )
     provenance = {**provenance, "viewpoint": Viewpoint.from_cameras(distilled.train).to_json()}
     encoding_report = report_part(report, 0.7, 0.85)
-    packer = Packer(
-        model, provenance, sensitivity, scene=None, finetune_steps=0, prune=True, say=say, report=encoding_report
-    )
+    packer = Packer(model, provenance, sensitivity, scene=None, finetune_steps=0, prune=True, report=encoding_report)
     candidate = packer.encode_to_distortion(distortion, references)
     for number in range(MAX_TRIALS):
         trial_report = report_round(report_part(report, 0.85, 1.0), number)
@@ -73,7 +71,7 @@ def pack(
         if added_error <= allowance:
             break
         distortion *= max(PLANNED_ERROR_SHARE * allowance / added_error, 1 / 16)
-        say(
+        _LOG.info(
             f"packing adds a mean squared error of {added_error:.2g}, limit {allowance:.2g}; encoding again at "
             f"distortion {distortion:.2g}"
         )

@@ -98,7 +98,7 @@ def evaluate_model(
     picture_count: int = DEFAULT_PICTURE_COUNT,
     overwrite: bool = True,
     report: Report = no_report,
-    warn: Callable[[str], None] | None = None,
+    unwritten: list[str] | None = None,
     ranks: Ranks = SINGLE_PROCESS,
 ) -> Evaluation:
     """Render held-out views and score them against their photos.
@@ -117,8 +117,8 @@ def evaluate_model(
         overwrite: replace files in `pictures`; if False, an existing file is an error.
         report: called before each view with a description and the completed share of the work, 0 to 1. Each of several
             processes reports its own share.
-        warn: called with a message for each picture that cannot be written, while scoring continues. Without it, such
-            a picture is an error.
+        unwritten: gets a message for each picture that cannot be written, while scoring continues. Without it, such a
+            picture is an error.
         ranks: processes that share the views; each of them gets all scores.
 
     Raises:
@@ -183,9 +183,9 @@ def evaluate_model(
                 try:
                     save_picture(Path(pictures, pictures_to_write[number]), sheet, overwrite=overwrite, rename=False)
                 except HyrfError as error:
-                    if warn is None:
+                    if unwritten is None:
                         raise
-                    warn(str(error))
+                    unwritten.append(str(error))
         report(f"scored {len(own)} photos", 1.0)
         return scores
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import fmean
@@ -25,6 +26,8 @@ from hyrfpack.splats.names import bytes_on_disk, is_splats, sog_folder
 from hyrfpack.splats.splats import Splats
 from hyrfpack.splats.table import FORMATS, SplatFormat
 from hyrfpack.splats.viewpoints import WeightedSplats, sample_viewpoints
+
+_LOG = logging.getLogger(__name__)
 
 MEASURED_VIEWS = 12
 MEASURED_SIZE_PIXELS = 400
@@ -70,10 +73,11 @@ def convert_splats(
     min_opacity: float = 0.0,
     spz_version: int = DEFAULT_SPZ_VERSION,
     overwrite: bool = True,
-    say: Callable[[str], None] = lambda sentence: None,
     report: Report = no_report,
 ) -> ConversionReport:
     """Convert splats between the formats of other programs, in their own axes and units, and measure the loss.
+
+    A warning is logged for each property of the splats that the format cannot hold.
 
     Args:
         source: .ply (plain or compressed), .splat, .spz, .sog, or the folder of an unbundled SOG.
@@ -85,7 +89,6 @@ def convert_splats(
         spz_version: version of ".spz" files, 4 or 3 (for programs that do not read 4), see `Hints`.
         overwrite: replace a file at `target`. If False, an existing file is an error. A file that appears during the
             conversion is kept, and the result gets a free name in its folder, which the report contains.
-        say: called with a sentence for each property of the splats that the format cannot hold.
         report: called with the current activity and the share of the work that is done, 0 to 1.
 
     Raises:
@@ -111,7 +114,7 @@ def convert_splats(
     whole = splats if crop is None else select_splats(splats, crop)
     kept = select_splats(whole, None, min_opacity)
     kept = kept.with_degree(min(kept.degree, kind.max_degree, kept.degree if degree is None else degree))
-    _check_limits(kind, splats, kept, say)
+    _check_limits(kind, splats, kept)
     weighted = WeightedSplats.from_splats(whole, str(source))
     camera = Viewpoint.from_frame(weighted.frame.center, weighted.frame.scale).camera
     hints = Hints(camera=camera, spz_version=spz_version)
@@ -172,8 +175,8 @@ def find_target_format(source: str | os.PathLike[str], target: str | os.PathLike
     return kind
 
 
-def _check_limits(kind: SplatFormat, splats: Splats, kept: Splats, say: Callable[[str], None]) -> None:
-    """Raise HyrfError for positions that the format cannot hold, and report the other losses with `say`."""
+def _check_limits(kind: SplatFormat, splats: Splats, kept: Splats) -> None:
+    """Raise HyrfError for positions that the format cannot hold, and log a warning for each other loss."""
     reach = float(np.abs(kept.positions).max())
     if reach > kind.max_coordinate:
         raise HyrfError(
@@ -182,13 +185,13 @@ def _check_limits(kind: SplatFormat, splats: Splats, kept: Splats, say: Callable
             fix="choose another format, or leave out the far splats with `crop`",
         )
     if splats.degree > kind.max_degree:
-        say(
+        _LOG.warning(
             f"{kind.ending} stores harmonics up to degree {kind.max_degree}; higher ones, up to degree "
             f"{splats.degree}, are lost"
         )
     if splats.antialiased and not kind.stores_antialiased:
         able = " or ".join(row.ending for row in FORMATS.values() if row.stores_antialiased)
-        say(
+        _LOG.warning(
             f"{kind.ending} cannot store that the splats are antialiased: set it in the program that draws the file, "
             f"or choose {able}"
         )

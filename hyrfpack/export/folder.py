@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import count as count_up
 from pathlib import Path
@@ -31,6 +32,8 @@ from hyrfpack.web.html import encode_stage
 from hyrfpack.web.player import encode_element_script, encode_player, encode_readme
 from hyrfpack.web.view import find_playable_file
 
+_LOG = logging.getLogger(__name__)
+
 POSTER_LONGEST_SIDE_PIXELS = 640
 MAX_POSTER_BYTES = 30_000
 INDEX_NAME = "index.html"
@@ -42,7 +45,6 @@ HYRF_ENDING = ".hyrf"
 POSTER_NAME = "poster.jpg"
 
 StrPath = str | os.PathLike[str]
-Say = Callable[[str], None]
 
 
 def export_player(
@@ -51,7 +53,6 @@ def export_player(
     *,
     data: Scene | None = None,
     overwrite: bool = True,
-    say: Say = lambda sentence: None,
 ) -> ExportReport:
     """Write a folder of static files that plays a scene on any web server: a page, the file itself and a poster.
 
@@ -65,7 +66,6 @@ def export_player(
         data: photos of the scene; the poster is rendered from the first camera. Without them it is rendered from a
             camera that the file keeps or suggests.
         overwrite: replace existing files; if False, an existing file is an error.
-        say: called with notes on the progress.
 
     Raises:
         HyrfError: the file cannot be read, a file cannot be written, or another call is writing into the folder.
@@ -83,10 +83,10 @@ def export_player(
     check_folder(folder, sources, [data], overwrite=True, is_gallery=False)
     with exclusive_folder(folder):
         check_folder(folder, sources, [data], overwrite=overwrite, is_gallery=False)
-        return _write_player(source, _OutputFolder(Path(folder), overwrite), data, say)
+        return _write_player(source, _OutputFolder(Path(folder), overwrite), data)
 
 
-def _write_player(source: StrPath | None, output: _OutputFolder, data: Scene | None, say: Say) -> ExportReport:
+def _write_player(source: StrPath | None, output: _OutputFolder, data: Scene | None) -> ExportReport:
     """Write the files of `export_player` into a folder that the caller has locked."""
     title = _folder_title(output.path)
     content = poster = None
@@ -95,7 +95,7 @@ def _write_player(source: StrPath | None, output: _OutputFolder, data: Scene | N
     if source is not None:
         title = Path(source).stem
         source = find_playable_file(source)
-        scene = _PlayableContent.read(source, data, say, with_quality=False)
+        scene = _PlayableContent.read(source, data, with_quality=False)
         count = scene.count
         content, poster = _choose_file_names([source], is_gallery=False)[0]
         output.copy(content, source)
@@ -119,7 +119,6 @@ def export_gallery(
     *,
     data: Sequence[Scene | None] = (),
     overwrite: bool = True,
-    say: Say = lambda sentence: None,
 ) -> ExportReport:
     """Write a folder of static files that shows several scenes: a page that lists them, a player, and the files.
 
@@ -129,7 +128,6 @@ def export_gallery(
         data: photos of each scene, or None. Held-out photos score a model, and the list shows the score. Without them
             the list shows how well the model fits its training photos, if the file states it.
         overwrite: replace existing files; if False, an existing file is an error.
-        say: called with notes on the progress.
 
     Raises:
         HyrfError: a file cannot be read or written, or another call is writing into the folder.
@@ -150,17 +148,15 @@ def export_gallery(
     check_folder(folder, sources, scenes, overwrite=True, is_gallery=True)
     with exclusive_folder(folder):
         check_folder(folder, sources, scenes, overwrite=overwrite, is_gallery=True)
-        return _write_gallery(sources, _OutputFolder(Path(folder), overwrite), scenes, say)
+        return _write_gallery(sources, _OutputFolder(Path(folder), overwrite), scenes)
 
 
-def _write_gallery(
-    sources: Sequence[StrPath], output: _OutputFolder, scenes: Sequence[Scene | None], say: Say
-) -> ExportReport:
+def _write_gallery(sources: Sequence[StrPath], output: _OutputFolder, scenes: Sequence[Scene | None]) -> ExportReport:
     """Write the files of `export_gallery` into a folder that the caller has locked."""
     contents = []
     for source, scene in zip(sources, scenes, strict=True):  # all are read before anything is written
-        say(f"reading {source}")
-        contents.append(_PlayableContent.read(find_playable_file(source), scene, say, with_quality=True))
+        _LOG.info(f"reading {source}")
+        contents.append(_PlayableContent.read(find_playable_file(source), scene, with_quality=True))
     cards = []
     for source, shown, (content, poster) in zip(
         sources, contents, _choose_file_names(sources, is_gallery=True), strict=True
@@ -218,11 +214,11 @@ class _PlayableContent:
     stage: dict | None = None
 
     @classmethod
-    def read(cls, path: StrPath, data: Scene | None, say: Say, *, with_quality: bool) -> _PlayableContent:
+    def read(cls, path: StrPath, data: Scene | None, *, with_quality: bool) -> _PlayableContent:
         """Read a whole file, so that no damaged file is published.
 
         Args:
-            path, data, say: `source`, `data` and `say` of `export_player`.
+            path, data: `source` and `data` of `export_player`.
             with_quality: whether to determine the quality.
 
         Raises:
@@ -233,17 +229,17 @@ class _PlayableContent:
             splats = read_splats(path)
             return cls(len(splats), length, render_splats_poster(splats, POSTER_LONGEST_SIDE_PIXELS))
         loaded = Source.read(path, data)
-        suggest_compression(path, length, say)
-        quality = _describe_quality(path, loaded.model, data, say) if with_quality else ""
+        suggest_compression(path, length)
+        quality = _describe_quality(path, loaded.model, data) if with_quality else ""
         cameras = page_cameras(loaded)
         poster = render_model_poster(loaded.model, cameras[0], POSTER_LONGEST_SIDE_PIXELS)
         return cls(len(loaded.model), length, poster, quality, encode_stage(cameras, loaded.up, loaded.center))
 
 
-def _describe_quality(path: StrPath, model: HybridModel, data: Scene | None, say: Say) -> str:
+def _describe_quality(path: StrPath, model: HybridModel, data: Scene | None) -> str:
     """Describe the quality of a model in words, on held-out photos if there are any, else as stated in its file."""
     if data is not None and data.test:
-        say(f"scoring on {_format_photo_count(len(data.test))}")
+        _LOG.info(f"scoring on {_format_photo_count(len(data.test))}")
         scores = evaluate_model(model, data.test)
         return f"{scores.psnr:.2f} dB on {_format_photo_count(len(scores.views))}"
     provenance = describe_file(path)["provenance"]

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import logging
 import os
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,8 @@ from hyrfpack.render import RenderSettings
 from hyrfpack.scene import Camera, evenly_spaced
 from hyrfpack.splats.splats import Splats
 from hyrfpack.web.html import encode_model_page, encode_splats_page
+
+_LOG = logging.getLogger(__name__)
 
 MAX_PAGE_CAMERAS = 12
 POSTER_LONGEST_SIDE_PIXELS = 480
@@ -63,7 +65,6 @@ def write_native_page(
     loaded: Source,
     source: str | os.PathLike[str],
     target: str | os.PathLike[str],
-    say: Callable[[str], None],
     overwrite: bool = True,
 ) -> ExportReport:
     """Write a page that contains a model file; `overwrite` is that of `hyrfpack.atomic.pending_file`.
@@ -72,16 +73,16 @@ def write_native_page(
         HyrfError: the page cannot be written.
     """
     data = Path(source).read_bytes()
-    suggest_compression(source, len(data), say)
+    suggest_compression(source, len(data))
     page = encode_native_page(loaded, data, Path(target).stem)
     written = write_atomic(target, page, overwrite=overwrite)
     return ExportReport(str(written), len(page), len(loaded.model), native=True)
 
 
-def suggest_compression(source: str | os.PathLike[str], length: int, say: Callable[[str], None]) -> None:
-    """Suggest `hyrfpack compress` with `say` if a model file of `length` bytes is large or uncompressed."""
+def suggest_compression(source: str | os.PathLike[str], length: int) -> None:
+    """Suggest `hyrfpack compress` if a model file of `length` bytes is large or uncompressed."""
     if length > LARGE_FILE_BYTES or describe_file(source)["profile"] == "raw":
-        say(f"{source} goes along as it is, {length:,} bytes; 'hyrfpack compress' makes it smaller")
+        _LOG.info(f"{source} goes along as it is, {length:,} bytes; 'hyrfpack compress' makes it smaller")
 
 
 def _page_settings(loaded: Source, title: str) -> dict[str, Any]:

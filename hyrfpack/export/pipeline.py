@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import copy
+import logging
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
@@ -49,9 +50,9 @@ from hyrfpack.splats.splats import Splats, concatenate
 from hyrfpack.splats.table import FORMATS, FileKind, SplatFormat
 from hyrfpack.web.html import decode_splats_page
 
-MIN_REPORTED_COST_DB = 1.0
+_LOG = logging.getLogger(__name__)
 
-Say = Callable[[str], None]
+MIN_REPORTED_COST_DB = 1.0
 
 
 def export_model(
@@ -68,7 +69,6 @@ def export_model(
     exposure: str = LOCAL_EXPOSURE,
     colmap: bool = False,
     overwrite: bool = True,
-    say: Say = lambda sentence: None,
     report: Report = no_report,
 ) -> ExportReport:
     """Write a `.hyrf` model in a format of other programs, in its own axes and units, and measure the loss.
@@ -103,7 +103,6 @@ def export_model(
         overwrite: replace existing files. If False, an existing file is an error. A file that appears during the export
             is kept: a single file gets a free name in its folder, which the report contains; in a folder it is an
             error.
-        say: called with notes on the progress.
         report: called with the current activity and the share of the work that is done, 0 to 1.
 
     Raises:
@@ -125,14 +124,14 @@ def export_model(
     check_request(kind, target, degree, crop, min_opacity, background, baked, exposure)
     source = find_model(source)
     if kind is PLAYER_FOLDER:
-        return export_player(source, target, data=data, overwrite=overwrite, say=say)
+        return export_player(source, target, data=data, overwrite=overwrite)
     if kind is COLMAP_FOLDER:
         check_place(target, Outputs(source, scene=data, overwrite=True), colmap)
     with exclusive_folder(target) if kind is COLMAP_FOLDER else nullcontext():
         check_place(target, Outputs(source, scene=data, overwrite=overwrite), colmap)
         return _export_checked(
             source, target, kind, degree=degree, data=data, crop=crop, min_opacity=min_opacity, background=background,
-            spz_version=spz_version, baked=baked, exposure=exposure, overwrite=overwrite, say=say, report=report,
+            spz_version=spz_version, baked=baked, exposure=exposure, overwrite=overwrite, report=report,
         )  # fmt: skip
 
 
@@ -150,13 +149,12 @@ def _export_checked(
     baked: bool,
     exposure: str,
     overwrite: bool,
-    say: Say,
     report: Report,
 ) -> ExportReport:
     """Export after the request has been checked; if the output is a folder, the caller has locked it."""
     loaded = Source.read(source, data)
     if kind is HTML_PAGE and not baked:
-        return write_native_page(loaded, source, target, say, overwrite)
+        return write_native_page(loaded, source, target, overwrite)
     if kind in (TRANSFORMS_JSON, COLMAP_FOLDER) and (loaded.has_coarse_cameras or not loaded.cameras):
         kept = "only coarse cameras" if loaded.has_coarse_cameras else "no cameras"
         raise HyrfError(
@@ -181,15 +179,15 @@ def _export_checked(
     visibility = None
     bake_starts = 0.35 if degree is None and highest else 0.0
     if degree is None and highest:
-        say(f"choosing the degree of the spherical harmonics at {places}")
+        _LOG.info(f"choosing the degree of the spherical harmonics at {places}")
         visibility = compute_visibility(loaded.model, loaded.fit_cameras, report_part(report, 0.0, 0.15))
         degree, chosen_by = choose_degree(
             loaded.model, loaded.fit_cameras, highest, visibility, report_part(report, 0.15, bake_starts)
         )
-        say(f"chosen degree {degree}: {_format_scores(chosen_by)} against the model for degrees 0 to {highest}")
+        _LOG.info(f"chosen degree {degree}: {_format_scores(chosen_by)} against the model for degrees 0 to {highest}")
     else:
         degree = highest
-    say(f"fitting colours of degree {degree} at {places}")
+    _LOG.info(f"fitting colours of degree {degree} at {places}")
     visibility = visibility or compute_visibility(loaded.model, loaded.fit_cameras, report_part(report, 0.0, 0.25))
     bake_as = partial(
         _bake_scene, degree=degree, visibility=visibility, crop=crop, min_opacity=min_opacity, kind=kind, sphere=sphere
@@ -200,11 +198,11 @@ def _export_checked(
     exposures: ShownSplats = {}
     if compares_exposures:
         (other,) = set(SPLAT_EXPOSURES) - {exposure}
-        say(f"fitting colours of {other} exposure for comparison")
+        _LOG.info(f"fitting colours of {other} exposure for comparison")
         rival, _, rival_picture = bake_as(by_exposure[other], report=report_part(report, 0.4, 0.5))
         exposures = {exposure: (splats, picture), other: (rival, rival_picture)}
     del bake_as, visibility  # to free memory, because they are large for many Gaussians and cameras
-    say(f"writing {len(splats) - count:,} Gaussians{' and the background' if sphere else ''}")
+    _LOG.info(f"writing {len(splats) - count:,} Gaussians{' and the background' if sphere else ''}")
     report(f"writing {len(splats) - count:,} Gaussians", 0.5)
     if isinstance(kind, SplatFormat):
         packed, shown = _pack_splats(loaded, splats, Path(target), kind, spz_version)
@@ -222,11 +220,9 @@ def _export_checked(
     )
     del packed
     if crop is not None:
-        say("quality is not measured, because a part of the scene was cropped")
+        _LOG.info("quality is not measured, because a part of the scene was cropped")
         return result
-    measured = _add_scores(
-        result, loaded, shown, kind, sphere, say, report_part(report, 0.65, 0.85 if exposures else 1.0)
-    )
+    measured = _add_scores(result, loaded, shown, kind, sphere, report_part(report, 0.65, 0.85 if exposures else 1.0))
     if not exposures:
         return measured
     return _add_exposure_scores(measured, photographed, exposures, sphere, report_part(report, 0.85, 1.0))
@@ -287,16 +283,16 @@ def _pack_splats(
 
 
 def _add_scores(
-    result: ExportReport, loaded: Source, shown: ShownSplats, kind: FileKind, sphere: bool, say: Say, report: Report
+    result: ExportReport, loaded: Source, shown: ShownSplats, kind: FileKind, sphere: bool, report: Report
 ) -> ExportReport:
     """Measure the loss, and return the result with the PSNR fields filled in."""
     if not loaded.measured_views:
-        say("quality is not measured, because no photo is held out")
+        _LOG.info("quality is not measured, because no photo is held out")
         return result
-    say(f"measuring at {len(loaded.measured_views)} views")
+    _LOG.info(f"measuring at {len(loaded.measured_views)} views")
     scores = measure_psnr(loaded.model, shown, loaded.measured_views, sphere=sphere, report=report)
     if not scores:
-        say("quality is not measured, because the masks leave no pixel of the held-out photos")
+        _LOG.warning("quality is not measured, because the masks leave no pixel of the held-out photos")
         return result
     file, before = scores["file"], scores["baked"]
     cost = _estimate_cost_db(before, file, loaded.photo_mse)
@@ -308,12 +304,12 @@ def _add_scores(
             alternatives = " or ".join(
                 splat_format.ending for splat_format in FORMATS.values() if splat_format.stores_antialiased
             )
-            say(
+            _LOG.warning(
                 f"{kind.ending} cannot store that the model is antialiased: set it in the program that draws the "
                 f"file, or choose {alternatives}"
             )
         else:
-            say(
+            _LOG.warning(
                 f"{kind.ending} costs {cost:.1f} dB{where}: it is too coarse for this scene, perhaps for its unit of "
                 "length; choose another format"
             )

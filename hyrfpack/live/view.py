@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from time import monotonic
@@ -13,6 +14,8 @@ from hyrfpack.format import encode_model
 from hyrfpack.train import Trainer
 from hyrfpack.web.player import encode_player
 from hyrfpack.web.serve import MemoryFile, serve_in_thread
+
+_LOG = logging.getLogger(__name__)
 
 # File names under which the page fetches the snapshot and the progress.
 SCENE_NAME = "scene.hyrf"
@@ -74,25 +77,24 @@ class LiveView:
 
 
 @contextmanager
-def live_view(title: str, *, port: int = 0, say: Callable[[str], None]) -> Iterator[LiveView]:
-    """Serve a page that shows the training to browsers of this machine, until the block ends.
+def live_view(title: str, *, port: int = 0) -> Iterator[LiveView]:
+    """Serve a page that shows the training to browsers of this machine, until the block ends, and log its address.
 
     Args:
         title: title of the page.
         port: port to listen on, 0 to 65535; 0 takes a free one.
-        say: called with a sentence that contains the page's address.
 
     Raises:
         HyrfError: the port cannot be used.
 
     Example:
-        >>> with live_view("bonsai", say=print) as view:
+        >>> with live_view("bonsai") as view:
         ...     hyrfpack.train_model(scene, "runs/bonsai", observer=view.observe)
     """
     view = LiveView()
     page = encode_player(title, content=SCENE_NAME, updates=UPDATES_NAME, fetches="'self'")
     with serve_in_thread(page, {SCENE_NAME: view.scene, UPDATES_NAME: view.updates}, port=port) as address:
-        say(f"watch the training at {address} until the command ends")
+        _LOG.info(f"watch the training at {address} until the command ends")
         yield view
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -11,8 +12,10 @@ from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.make.progress import Progress, Reporter
 from hyrfpack.make.source import LoadSettings, Source
-from hyrfpack.make.stage_cache import Say, interruptible
+from hyrfpack.make.stage_cache import interruptible
 from hyrfpack.make.stages import SCENE_FOLDER, is_posed
+
+_LOG = logging.getLogger(__name__)
 
 
 def auto_pose(
@@ -23,7 +26,6 @@ def auto_pose(
     resume: bool = False,
     overwrite: bool = False,
     report: Callable[[Progress], None] | None = None,
-    say: Say = lambda sentence: None,
 ) -> Path:
     """Estimate the poses of photos into the folder of a training run, unless an earlier call has done so.
 
@@ -34,7 +36,6 @@ def auto_pose(
         resume: the run is resumed, so the folder may have a run.
         overwrite: estimate again if there are poses.
         report: called with the progress.
-        say: called with sentences for the user.
 
     Returns:
         The folder of the scene.
@@ -50,7 +51,7 @@ def auto_pose(
         raise HyrfError(f"{run}: the run would lie among the photos", fix="name another folder")
     with exclusive_folder(run):
         _check_run_folder(source, run, overwrite=overwrite or resume)
-        _estimate_unless_posed(source.path, scene, overwrite, report, say)
+        _estimate_unless_posed(source.path, scene, overwrite, report)
     return scene
 
 
@@ -61,15 +62,17 @@ def _check_run_folder(source: Source, run: Path, *, overwrite: bool) -> None:
 
 
 def _estimate_unless_posed(
-    photos: Path, scene: Path, overwrite: bool, report: Callable[[Progress], None] | None, say: Say
+    photos: Path, scene: Path, overwrite: bool, report: Callable[[Progress], None] | None
 ) -> None:
     """Estimate poses into the folder of a scene, unless it has poses and `overwrite` is not set."""
     from hyrfpack.poses import estimate_poses
 
     if is_posed(scene) and not overwrite:
-        say(f"poses are taken from {scene}, where they were estimated before; `overwrite=True` estimates them anew")
+        _LOG.info(
+            f"poses are taken from {scene}, where they were estimated before; `overwrite=True` estimates them anew"
+        )
         return
     reporter = Reporter(["poses"], report)
     reporter.begin("poses")
     with interruptible():
-        estimate_poses(photos, scene, overwrite=overwrite, report=reporter.report_share, say=say)
+        estimate_poses(photos, scene, overwrite=overwrite, report=reporter.report_share)

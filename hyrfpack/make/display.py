@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from contextlib import suppress
 from threading import Event, Thread
 from time import monotonic
@@ -19,18 +18,16 @@ class Display:
     """Shows the stage, its share and descriptions, the elapsed and the estimated remaining time on standard error.
 
     The elapsed time is kept current between two reports, because some stages do not know their progress. When the
-    remaining time of the last report is over, the estimate grows with the time since that report. If standard error is
-    closed, the work continues.
+    remaining time of the last report is over, the estimate grows with the time since that report. What is printed to
+    standard error meanwhile appears above the line. If standard error is closed, the work continues.
     """
 
-    def __init__(self, wording: Callable[[str], str] = lambda sentence: sentence) -> None:
-        """Start the display; `wording` rewrites each sentence before it is shown."""
-        self._wording = wording
+    def __init__(self) -> None:
         self._start = monotonic()
         self._latest: tuple[Progress, float] | None = None
         self._stopped = Event()
         self._live: Live | None = None
-        if sys.stderr.isatty() and not (console := Console(stderr=True)).is_dumb_terminal:
+        if sys.stderr.isatty() and not (console := Console(stderr=True, soft_wrap=True)).is_dumb_terminal:
             self._live = Live(self, console=console, refresh_per_second=4, transient=True)
         self._log_thread = Thread(target=self._print_lines, daemon=True)
 
@@ -53,15 +50,6 @@ class Display:
     def show(self, progress: Progress) -> None:
         """Show this progress from now on."""
         self._latest = progress, monotonic()
-
-    def say(self, sentence: str) -> None:
-        """Print a sentence that stays on the screen."""
-        sentence = self._wording(sentence)
-        with suppress(OSError, ValueError):
-            if self._live:
-                self._live.console.print(sentence, markup=False, highlight=False, soft_wrap=True)
-            else:
-                print(sentence, file=sys.stderr, flush=True)
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         parts = self._parts()
@@ -91,4 +79,5 @@ class Display:
         """Print the current line every few seconds until the display is closed."""
         while not self._stopped.wait(LOG_INTERVAL_SECONDS):
             if parts := self._parts():
-                self.say(PART_SEPARATOR.join(parts.values()))
+                with suppress(OSError, ValueError):
+                    print(PART_SEPARATOR.join(parts.values()), file=sys.stderr, flush=True)

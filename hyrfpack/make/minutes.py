@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,7 +24,6 @@ from hyrfpack.make.plan import (
 )
 from hyrfpack.make.progress import Reporter
 from hyrfpack.make.source import LoadSettings
-from hyrfpack.make.stage_cache import Say
 from hyrfpack.model import HybridModel
 from hyrfpack.render import render_view
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Camera, Scene, evenly_spaced
@@ -31,6 +31,8 @@ from hyrfpack.train import DensityConfig, TrainConfig, Trainer
 from hyrfpack.train.config import FULL_STEPS
 from hyrfpack.train.decisions import decide, is_budget_open, max_pilot_steps
 from hyrfpack.train.setup import budget_for
+
+_LOG = logging.getLogger(__name__)
 
 PROBE_STEPS = 45  # a complete small run, from the first Gaussians to the budget
 # The number of Gaussians grows during most of the probe, so that the time per Gaussian can be measured.
@@ -124,7 +126,6 @@ def fit_plan_to_minutes(
     seed: int,
     cache: PictureCache,
     reporter: Reporter,
-    say: Say,
 ) -> Plan:
     """Measure the cost of a scene, and return the plan with the most steps that is finished in time.
 
@@ -140,11 +141,10 @@ def fit_plan_to_minutes(
         seed: random seed.
         cache: cache of decoded photos.
         reporter: reports progress, and gets the estimates of the plan.
-        say: called with sentences for the user.
     """
     draft = QUALITIES["draft"]
     if (remaining := end - monotonic()) <= 0:
-        say(f"no time is left for training: making a draft of {draft.steps} steps")
+        _LOG.warning(f"no time is left for training: making a draft of {draft.steps} steps")
         draft_max_size = min(reading.max_size or draft.max_size, draft.max_size)
         return dataclasses.replace(requested, steps=draft.steps, max_size=draft_max_size)
     sizes = _candidate_sizes(scene, reading.max_size)
@@ -178,7 +178,7 @@ def fit_plan_to_minutes(
     if is_budget_open(config) and factor is None:
         factor = 1.0  # the decision stays the same if a few more steps fit
     for reason in decisions.reasons.values():
-        say(f"pilot runs: {reason}")
+        _LOG.info(f"pilot runs: {reason}")
     requested = dataclasses.replace(
         requested, max_size=chosen, budget_factor=factor, exposure=decisions.config.exposure
     )
@@ -187,13 +187,13 @@ def fit_plan_to_minutes(
     steps = cost.max_steps_within(chosen_scene, remaining)
     if steps < draft.steps:
         steps = draft.steps
-        say(
+        _LOG.warning(
             f"the time is short: making a draft of {steps} steps, which takes about "
             f"{cost.total_seconds(chosen_scene, steps) / 60:.1f} minutes"
         )
     else:
         enough = ", the maximum; the scene will be finished early" if steps == FULL_STEPS else ""
-        say(
+        _LOG.info(
             f"{remaining / 60:.1f} minutes are left: {steps:,} steps on photos of "
             f"{_longest_side(chosen_scene)} pixels{enough}"
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, replace
@@ -24,12 +25,14 @@ from hyrfpack.make.plan import QUALITIES, Plan, estimate_photos_seconds, estimat
 from hyrfpack.make.progress import Progress, Reporter
 from hyrfpack.make.request import Request, default_work_folder
 from hyrfpack.make.source import LoadSettings, Source
-from hyrfpack.make.stage_cache import Say, StageCache, Stopped, interruptible
+from hyrfpack.make.stage_cache import StageCache, Stopped, interruptible
 from hyrfpack.make.state import files_digest
 from hyrfpack.outputs import StrPath
 from hyrfpack.scene import Scene
 from hyrfpack.train import Trainer
 from hyrfpack.train.config import LARGEST_SEED, PRESETS
+
+_LOG = logging.getLogger(__name__)
 
 MEASUREMENT_TIME_RATIO = 0.15  # probes and pilot runs take about this ratio of the remaining time
 
@@ -99,7 +102,6 @@ def make_scene(
     device: str | torch.device = "auto",
     overwrite: bool = False,
     report: Callable[[Progress], None] | None = None,
-    say: Say = lambda sentence: None,
     observer: Callable[[Trainer], None] | None = None,
 ) -> MakeResult:
     """Make a scene from photos: estimate missing poses, train, compress, score on held-out photos, and export.
@@ -130,7 +132,6 @@ def make_scene(
         overwrite: replace an existing output. Without it, an output that appears during the call is also kept. A file
             then gets a free name beside it, which the result reports; a folder is an error.
         report: called with the progress.
-        say: called with sentences for the user.
         observer: observer of the training, see `hyrfpack.train_model`.
 
     Returns:
@@ -180,7 +181,7 @@ def make_scene(
                 exclusive_folder(request.work, "another folder with `work`"),
                 exclusive_folder(request.output) if request.makes_folder else nullcontext(),
             ):
-                return _Pipeline(request, began, report, say, observer).run()
+                return _Pipeline(request, began, report, observer).run()
         except Stopped:
             raise
         except KeyboardInterrupt as error:  # interrupted before or between the stages
@@ -195,7 +196,6 @@ class _Pipeline:
         request: Request,
         began: float,
         report: Callable[[Progress], None] | None,
-        say: Say,
         observer: Callable[[Trainer], None] | None,
     ) -> None:
         """Prepare the stages; `began` is the start of the call by the monotonic clock, in seconds."""
@@ -203,9 +203,8 @@ class _Pipeline:
         self.request = request
         self.source = request.source
         self.began = began
-        self.say = say
         self.reporter = Reporter(request.stages, report)
-        self.stage_cache = StageCache(request.work, self.reporter, say, request.check_replacing)
+        self.stage_cache = StageCache(request.work, self.reporter, request.check_replacing)
 
     def run(self) -> MakeResult:
         """Run all stages that the source needs."""
@@ -231,7 +230,7 @@ class _Pipeline:
             scene = reading.load(path)
         else:
             for sentence in scene.notes:
-                self.say(sentence)
+                _LOG.info(sentence)
         cache = PictureCache()
         plan, scene = self._decide_plan(path, reading, scene, cache)
         if request.minutes is None:
@@ -253,7 +252,7 @@ class _Pipeline:
             estimates = {"poses": estimates["poses"], "training": max(0.0, 60 * request.minutes - estimates["poses"])}
         self.reporter.estimates |= estimates
         if source.archive is not None:
-            self.say(f"{source.archive.name} was unpacked into {source.path} and is reused from there")
+            _LOG.info(f"{source.archive.name} was unpacked into {source.path} and is reused from there")
         return stages.run_pose_stage(self.stage_cache, source.path, source.files(), request.matching, request.seed)
 
     def _scene_digest(self, scene: Scene) -> str:
@@ -287,7 +286,7 @@ class _Pipeline:
         def execute(resuming: bool) -> tuple[dict[str, Any], list[str]]:
             requested = replace(self._requested_plan(), finetune_steps=0)
             plan = fit_plan_to_minutes(
-                path, reading, scene, requested, request.device, end, request.seed, cache, self.reporter, self.say
+                path, reading, scene, requested, request.device, end, request.seed, cache, self.reporter
             )
             return asdict(plan), []
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import shutil
 import signal
 import threading
@@ -15,6 +16,8 @@ from hyrfpack.errors import HyrfError
 from hyrfpack.make.progress import Reporter
 from hyrfpack.make.state import WorkFolderState
 
+_LOG = logging.getLogger(__name__)
+
 # The file or folder that each stage writes into the work folder. It is removed before a stage runs again.
 PRODUCT_NAMES = {
     "poses": "scene",
@@ -25,8 +28,6 @@ PRODUCT_NAMES = {
 }
 
 MIN_RECORD_SECONDS = 15.0  # the time that a stage has taken so far is recorded at most this often
-
-Say = Callable[[str], None]
 
 
 class Stopped(KeyboardInterrupt):
@@ -48,19 +49,15 @@ class StageCache:
         folder: the work folder, which holds the products.
         state: the record of the work folder.
         reporter: reports progress.
-        say: called with sentences for the user.
         kept: names of stages whose products were reused.
         seconds: time that each stage has taken in all calls together.
     """
 
-    def __init__(
-        self, folder: Path, reporter: Reporter, say: Say, check_replacing: Callable[[WorkFolderState], None]
-    ) -> None:
+    def __init__(self, folder: Path, reporter: Reporter, check_replacing: Callable[[WorkFolderState], None]) -> None:
         """Open the work folder; `check_replacing` is called before a stage runs, and raises HyrfError to prevent it."""
         self.folder = folder
         self.state = WorkFolderState(folder)
         self.reporter = reporter
-        self.say = say
         self.kept: list[str] = []
         self.seconds: dict[str, float] = {}
         self._check_replacing = check_replacing
@@ -94,13 +91,13 @@ class StageCache:
             self.kept.append(name)
             self.seconds[name] = self.state.seconds(name)
             self.reporter.skip(name, self.seconds[name])
-            self.say(f"{name}: reused from an earlier run ({self.seconds[name]:.0f} s)")
+            _LOG.info(f"{name}: reused from an earlier run ({self.seconds[name]:.0f} s)")
             return facts
         self._check_replacing(self.state)
         resuming = self.state.was_begun(name, inputs)
         if not resuming:
             if reasons := self.state.changed_inputs(name, inputs):
-                self.say(f"{name}: running again, because {' and '.join(reasons)} changed")
+                _LOG.info(f"{name}: running again, because {' and '.join(reasons)} changed")
             if name in PRODUCT_NAMES:
                 _remove_product(self.folder / PRODUCT_NAMES[name])
             self.state.begin(name, inputs, fixed or {})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
 import os
 import shutil
@@ -33,6 +34,8 @@ from hyrfpack.train import Trainer, train_model
 from hyrfpack.train.decisions import max_pilot_steps
 from hyrfpack.train.progress import RUNNING_MEAN_WEIGHT, format_psnr
 from hyrfpack.train.run import is_begun
+
+_LOG = logging.getLogger(__name__)
 
 SCENE_FOLDER = PRODUCT_NAMES["poses"]
 RUN_FOLDER = PRODUCT_NAMES["training"]
@@ -66,7 +69,6 @@ def run_pose_stage(
                 matching=matching,
                 seed=seed,
                 report=stage_cache.reporter.report_share,
-                say=stage_cache.say,
             )
         shutil.rmtree(scene / ".poses", ignore_errors=True)  # products in progress stay if a call is killed at its end
         files = sorted(path for path in scene.rglob("*") if path.is_file())
@@ -103,14 +105,14 @@ def run_training_stage(
         config = replace(config, **stage_cache.state.fixed("training"))
     if config.target_bytes != plan.target_bytes:
         before = "without a target size" if config.target_bytes is None else f"for {config.target_bytes:,} bytes"
-        stage_cache.say(
+        _LOG.info(
             f"the model is trained {before}, and only compressed for the requested size; another work folder "
             "(`work`) trains it anew"
         )
 
     def execute(resuming: bool) -> tuple[dict, list[str]]:
         if not (resuming and _is_run_finished(run)):
-            stage_cache.say(
+            _LOG.info(
                 f"training: {plan.steps:,} steps on {len(scene.train)} photos, {len(scene.test)} held out; "
                 f"on {describe_device(device)}"
             )
@@ -199,7 +201,7 @@ def run_compression_stage(stage_cache: StageCache, scene: Scene, plan: Plan, dev
         try:
             report = compress_model(
                 source, target, data=scene, finetune_steps=plan.finetune_steps, target_bytes=plan.target_bytes,
-                device=device, say=stage_cache.reporter.say, report=stage_cache.reporter.report_share,
+                device=device, report=stage_cache.reporter.report_share,
             )  # fmt: skip
         except HyrfSizeError as error:
             advice = ", or name another work folder (`work`) to train a smaller model for this size"
@@ -232,7 +234,6 @@ def run_import_stage(stage_cache: StageCache, source: Path, steps: int, seed: in
             source,
             stage_cache.folder / PACKED_MODEL,
             config,
-            say=stage_cache.reporter.say,
             report=stage_cache.reporter.report_share,
         )
         return report.to_dict(), [PACKED_MODEL]
@@ -255,9 +256,7 @@ def run_export_stage(
             copy_file(model, target)
             report: dict[str, Any] = {"bytes": target.stat().st_size}
         else:
-            made = export_model(
-                model, target, data=scene, say=stage_cache.reporter.say, report=stage_cache.reporter.report_share
-            )
+            made = export_model(model, target, data=scene, report=stage_cache.reporter.report_share)
             report = {**asdict(made), "file": name, "chosen_by": {}}
         files = sorted(target.rglob("*")) if target.is_dir() else [target]
         return report, [path.relative_to(stage_cache.folder).as_posix() for path in files if path.is_file()]

@@ -6,21 +6,23 @@ import logging
 import os
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from hyrfpack.errors import HyrfError
 
+_LOG = logging.getLogger(__name__)
 
-def launch(command: Sequence[str], processes: int, say: Callable[[str], None] = print) -> int:
+
+def launch(command: Sequence[str], processes: int) -> int:
     """Run `python -m hyrfpack COMMAND ...` as several processes that form one group, and wait until all have ended.
 
     The output of the processes is passed through. When one process fails, the others are asked to stop and are killed
-    half a minute later if they still run. Signals are forwarded to all processes.
+    half a minute later if they still run. Signals are forwarded to all processes. An error that names a killed process
+    is logged, unless rank 0 was killed.
 
     Args:
         command: the arguments after `hyrfpack`.
         processes: the number of processes, at least 1.
-        say: called with a sentence that names the killed process, unless rank 0 was killed.
 
     Returns:
         The exit code of the first process that failed, or 0 if none failed.
@@ -37,7 +39,6 @@ def launch(command: Sequence[str], processes: int, say: Callable[[str], None] = 
             f"this build of torch cannot start processes that talk to each other ({error})",
             fix="leave out `processes`",
         ) from error
-    logging.disable()  # the launcher would repeat the errors that the processes print themselves
     config = LaunchConfig(
         min_nodes=1,
         max_nodes=1,
@@ -48,7 +49,11 @@ def launch(command: Sequence[str], processes: int, say: Callable[[str], None] = 
         max_restarts=0,
     )
     try:
-        elastic_launch(config, sys.executable)("-u", "-m", "hyrfpack", *command)
+        logging.disable()  # the launcher would repeat the errors that the processes print themselves
+        try:
+            elastic_launch(config, sys.executable)("-u", "-m", "hyrfpack", *command)
+        finally:
+            logging.disable(logging.NOTSET)
     except ChildFailedError as error:
         rank, failure = error.get_first_failure()
         if failure.exitcode >= 0:
@@ -60,10 +65,8 @@ def launch(command: Sequence[str], processes: int, say: Callable[[str], None] = 
         )
         if rank == 0:
             raise killed from error
-        say(f"Error: {killed}")
+        _LOG.error(f"Error: {killed}")
         return 2
     except SignalException:
         return 1
-    finally:
-        logging.disable(logging.NOTSET)
     return 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field
@@ -34,6 +35,8 @@ from hyrfpack.poses.prepare import (
 )
 from hyrfpack.poses.process import StageCrashedError, run_stage
 
+_LOG = logging.getLogger(__name__)
+
 # Ratio of each stage in the whole time, a compromise between sets of small and of large photos.
 _STAGE_TIME_RATIOS = {
     "photos": 0.03,
@@ -46,7 +49,6 @@ _STAGE_TIME_RATIOS = {
 _VIDEO_FRAMES_TIME_RATIO = 0.3  # choosing the frames of a video takes this ratio of the time, all other stages the rest
 _MIN_RAY_ANGLE_DEGREES = 2.0  # with smaller triangulation angles, the camera hardly moved
 
-Say = Callable[[str], None]
 Report = Callable[[str, float], None]
 
 
@@ -88,7 +90,6 @@ def estimate_poses(
     seed: int = 0,
     overwrite: bool = False,
     report: Report | None = None,
-    say: Say | None = None,
 ) -> PosesReport:
     """Estimate the camera poses of photos and write a scene that `load_scene` reads.
 
@@ -110,7 +111,6 @@ def estimate_poses(
         overwrite: replace poses and photos that an earlier call wrote into `out`. Files of other origin are never
             replaced.
         report: called with a description of the current work and the ratio of the whole work that is done.
-        say: called with sentences for the user.
 
     Returns:
         The number of registered photos, the choice that was made, and doubts about it.
@@ -129,7 +129,7 @@ def estimate_poses(
     check_choice("matching", matching, MATCHING_METHODS)
     check_int("seed", seed, 0, 2**64 - 1)
     with explain_disk_errors(Path(out)), archive_paths_in_errors():
-        return _PoseEstimation(Path(photos), Path(out), matching, masks, seed, overwrite, report, say).run()
+        return _PoseEstimation(Path(photos), Path(out), matching, masks, seed, overwrite, report).run()
 
 
 @dataclass
@@ -143,7 +143,6 @@ class _PoseEstimation:
     seed: int
     overwrite: bool
     report: Report | None
-    say: Say | None
     photo_count: int = 0
     left_out: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
@@ -183,7 +182,7 @@ class _PoseEstimation:
         unreadable = {self._user_name(name): reason for name, reason in features["unreadable"].items()}
         self.left_out |= unreadable
         diagnosis.check_features(self.given_path, self.photo_count, features, unreadable)
-        self._add_notes(unreadable_sentences(unreadable, self.photo_count))
+        self._add_notes(unreadable_sentences(unreadable, self.photo_count), logging.WARNING)
         matches = self._run_stage("matches")
         diagnosis.check_matches(self.given_path, self.photo_count, matches)
         found = self._run_stage("finish", *self._run_mappers())
@@ -287,8 +286,8 @@ class _PoseEstimation:
         """Create the folder of products in progress, or take over that of an interrupted call."""
         self.has_products = self.output.claim_work_folder([self.matching, self.seed])
         self.has_work_folder = True
-        if self.has_products and self.say is not None:
-            self.say("resuming an interrupted estimation")
+        if self.has_products:
+            _LOG.info("resuming an interrupted estimation")
 
     def _take_frames(self) -> Path:
         """Write the chosen frames of the video; return their folder."""
@@ -332,7 +331,7 @@ class _PoseEstimation:
             copies_photos: the photos were copied into images/.
             turned: photos that are stored on their side were turned upright.
         """
-        self._add_notes(unreadable_sentences(select_unreadable(self.left_out), self.photo_count))
+        self._add_notes(unreadable_sentences(select_unreadable(self.left_out), self.photo_count), logging.WARNING)
         if copies_photos:
             size = sum(path.stat().st_size for path in {photo.facts.path for photo in photos})
             where = self.out / "images"
@@ -367,7 +366,10 @@ class _PoseEstimation:
                 results += self._run_stage(stage)["models"]
             except StageCrashedError as error:
                 failures.append(error)
-                self._add_note(f"the {stage} mapper failed, so the result of the other one is used unchecked: {error}")
+                self._add_note(
+                    f"the {stage} mapper failed, so the result of the other one is used unchecked: {error}",
+                    logging.WARNING,
+                )
         if len(failures) == 2:
             raise failures[0]
         return results
@@ -381,13 +383,14 @@ class _PoseEstimation:
         unposed = diagnosis.explain_unposed(decoded, features, matches, found)
         self.left_out |= {self._user_name(name): reason for name, reason in unposed.items()}
         if found["doubt"]:
-            self._add_note(found["doubt"])
+            self._add_note(found["doubt"], logging.WARNING)
         if found["angle"] < _MIN_RAY_ANGLE_DEGREES:
             self._add_note(
-                "the photos are taken from nearly one place, so depth is uncertain; move sideways between photos"
+                "the photos are taken from nearly one place, so depth is uncertain; move sideways between photos",
+                logging.WARNING,
             )
         if blurred := diagnosis.blurred_photos(features) & registered:
-            self._add_note(f"{len(blurred)} of the posed photos are more blurred than the others")
+            self._add_note(f"{len(blurred)} of the posed photos are more blurred than the others", logging.WARNING)
         report = PosesReport(
             self.out,
             self.photo_count,
@@ -406,14 +409,14 @@ class _PoseEstimation:
         self.output.install(job.model_folder("chosen"), asdict(report) | {"scene": str(self.out), "unsure": unsure})
         return report
 
-    def _add_notes(self, sentences: Iterable[str]) -> None:
+    def _add_notes(self, sentences: Iterable[str], level: int = logging.INFO) -> None:
         for sentence in sentences:
-            self._add_note(sentence)
+            self._add_note(sentence, level)
 
-    def _add_note(self, sentence: str) -> None:
+    def _add_note(self, sentence: str, level: int = logging.INFO) -> None:
+        """Add a sentence to the report, and log it at a level of `logging`."""
         self.notes.append(sentence)
-        if self.say is not None:
-            self.say(sentence)
+        _LOG.log(level, sentence)
 
     def _report_progress(self, stage: str, doing: str, share: float) -> None:
         """Report the progress of a stage as a ratio of the whole work."""

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import sys
 import time
-import warnings
-from collections.abc import Callable
 from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
@@ -20,6 +19,8 @@ from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate.metrics import psnr_from_mse
 from hyrfpack.train.progress import Pace
 from hyrfpack.train.trainer import is_recorded
+
+_LOG = logging.getLogger(__name__)
 
 MAX_RECORD_INTERVAL_SECONDS = 10.0
 SCALAR_NAMES = ("loss", "psnr", "gaussians", "steps_per_second", "memory_bytes", "gpu_memory_bytes")
@@ -44,15 +45,7 @@ class TrainingLog:
     If the file can no longer be written, as on a full disk, the log ends and the run continues.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        steps: int,
-        done: int,
-        device: torch.device,
-        warn: Callable[[str], None] = warnings.warn,
-        overwrite: bool = True,
-    ) -> None:
+    def __init__(self, path: Path, steps: int, done: int, device: torch.device, overwrite: bool = True) -> None:
         """Start a log, or continue it if `done` steps of `steps` have been taken already.
 
         TensorBoard's files go to a folder beside the log with the suffix ".tensorboard". Without `overwrite`, a new log
@@ -61,7 +54,7 @@ class TrainingLog:
         Raises:
             HyrfError: the file cannot be written.
         """
-        self.steps, self.device, self.warn = steps, device, warn
+        self.steps, self.device = steps, device
         self.pace = Pace(steps, done)
         self.start = self.last = time.monotonic()
         self.losses: list[float] = []
@@ -76,7 +69,7 @@ class TrainingLog:
             raise HyrfError(f"{path}: the log cannot be written ({error.strerror})", fix="name another file") from error
         self.path = Path(self.file.name)
         if self.path != path:
-            warn(describe_rename(path, self.path))
+            _LOG.warning(describe_rename(path, self.path))
         self.scalars = _summary_writer(self.path)
 
     def step(self, step: int, loss: float, mse: float, gaussians: int) -> None:
@@ -138,7 +131,7 @@ class TrainingLog:
             self.file.write(json.dumps(numbers, allow_nan=False) + "\n")
             self.file.flush()
         except OSError as error:
-            self.warn(f"{self.path}: the log cannot be written ({error.strerror}); training continues without it")
+            _LOG.warning(f"{self.path}: the log cannot be written ({error.strerror}); training continues without it")
             with suppress(OSError):  # Closing tries to write the buffered bytes again.
                 self.file.close()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import sys
 from collections.abc import Sequence
@@ -15,6 +16,8 @@ from rich.text import Text
 
 from hyrfpack.evaluate.metrics import psnr_from_mse
 
+_LOG = logging.getLogger(__name__)
+
 RUNNING_MEAN_WEIGHT = 0.05  # The newest step has this weight in the running means of loss and squared error.
 # If standard error is not a terminal, lines are printed at this interval. A phase gets its first line once it takes
 # longer than FIRST_PHASE_LOG_SECONDS.
@@ -22,7 +25,7 @@ LOG_INTERVAL_SECONDS = 15.0
 FIRST_PHASE_LOG_SECONDS = 2.0
 MIN_ETA_SECONDS = 1.0  # A phase shows the remaining time only if this and the elapsed time are at least this long.
 COMPILATION_STEPS = 2  # The first steps compile kernels, so they do not count for the speed.
-# Advice to shorten the run is shown if at least this much time is left. Before that, the speed must have been measured
+# Advice to shorten the run is logged if at least this much time is left. Before that, the speed must have been measured
 # over at least this many steps and seconds.
 MIN_ADVICE_STEPS = 3
 MIN_ADVICE_SECONDS = 10.0
@@ -58,7 +61,8 @@ class ProgressLine:
     """Shows step, loss, PSNR, Gaussians, speed, elapsed time and estimated remaining time (ETA) on standard error.
 
     On a terminal, one line is redrawn that fits any width. Elsewhere, as in a log file, a plain line is printed every
-    `LOG_INTERVAL_SECONDS`. A missing or closed standard error does not end the training.
+    `LOG_INTERVAL_SECONDS`. What is printed to standard error meanwhile appears above the line. A missing or closed
+    standard error does not end the training.
     """
 
     def __init__(self, steps: int, done: int, quiet: bool = False, advice: str = "") -> None:
@@ -66,7 +70,7 @@ class ProgressLine:
 
         Args:
             quiet: show nothing.
-            advice: how to shorten the run ("fewer steps or a GPU"), shown once if more than an hour remains.
+            advice: how to shorten the run ("fewer steps or a GPU"), logged once if more than an hour remains.
         """
         self.steps = steps
         self.start = self.last_log = monotonic()
@@ -88,14 +92,6 @@ class ProgressLine:
         if self.live:
             with suppress(OSError, ValueError):
                 self.live.stop()
-
-    def note(self, sentence: str) -> None:
-        """Print a sentence above the line."""
-        if self.live:
-            with suppress(OSError, ValueError):
-                self.live.console.print(sentence, markup=False, highlight=False)
-        elif not self.quiet:
-            _print(sentence)
 
     def update(self, step: int, loss: float, mse: float, gaussians: int) -> None:
         """Show one finished step."""
@@ -132,7 +128,7 @@ class ProgressLine:
         steps, seconds = step - self.pace.warm_step, now - self.pace.warm
         is_speed_known = steps >= MIN_ADVICE_STEPS and seconds >= MIN_ADVICE_SECONDS
         if self.advice and is_speed_known and left > MIN_ADVICE_SECONDS_LEFT:
-            self.note(f"about {left / 3600:.1f} hours remain; to shorten the run, use {self.advice}")
+            _LOG.info(f"about {left / 3600:.1f} hours remain; to shorten the run, use {self.advice}")
             self.advice = ""
 
 
@@ -168,14 +164,6 @@ class PhaseLine:
                 self.live.stop()
         elif not self.quiet:
             self._logger.join()
-
-    def note(self, sentence: str) -> None:
-        """Print a sentence above the line, which stays there."""
-        if self.live:
-            with suppress(OSError, ValueError):
-                self.live.console.print(sentence, markup=False, highlight=False)
-        elif not self.quiet:
-            _print(sentence)
 
     def update(self, what: str, done: int, total: int) -> None:
         """Show progress.

@@ -228,7 +228,7 @@ def write_results(
                 pictures=out / VIEWS_FOLDER,
                 overwrite=overwrite,
                 report=lambda _, share: phase("scoring held-out photos", round(share * photos), photos),
-                warn=unwritten.append,
+                unwritten=unwritten,
             )
             metrics["evaluation"] = scores.to_dict()
         except HyrfError as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 import signal
 import threading
 from collections.abc import Callable, Iterator
@@ -53,6 +54,8 @@ from hyrfpack.train.setup import check_target
 from hyrfpack.train.trainer import Trainer
 
 __all__ = ["VIEWS_FOLDER", "TrainResult", "is_begun", "resuming", "train_model"]
+
+_LOG = logging.getLogger(__name__)
 
 # These signals end a run early (Windows has no SIGHUP).
 STOP_SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
@@ -118,7 +121,7 @@ def train_model(
         cache: cache of decoded photos; by default one that takes a quarter of the memory.
         device: where to train, see `hyrfpack.device.choose_device`. A run may be resumed on another device. On a GPU
             sums of gradients vary in their last bits from run to run, which may change the measured budget.
-        quiet: print nothing.
+        quiet: show no progress.
         report: called after each step with its number (0 during pilot runs), the loss and mean squared error of its
             view (NaN if the view is masked completely) and the number of Gaussians. It replaces the progress line.
         phase: called during all other work with its name ("scoring held-out photos"), the number of items done, and
@@ -128,14 +131,14 @@ def train_model(
         log: a file that gets a line of JSON every few steps, and TensorBoard files beside it if that is installed; see
             `hyrfpack.train.log.TrainingLog`. A resumed run appends to it.
         ranks: processes that train together, from `hyrfpack.parallel.ranks.join_processes`. All of them call this
-            function with the same scene and settings. Only rank 0 writes, prints and returns metrics. If the launcher
-            restarts the processes, as torchrun does after one has ended, they resume from any checkpoint.
+            function with the same scene and settings. Only rank 0 writes, prints, logs and returns metrics. If the
+            launcher restarts the processes, as torchrun does after one has ended, they resume from any checkpoint.
 
     Raises:
         HyrfError: before the first step, if another call is working in the folder, the folder holds another run, the
             results would replace photos or other files, no photo has a pixel to train on or to score, or a held-out
             photo cannot be read. Later, if training cannot start or continue, or the model cannot be written.
-            If a checkpoint cannot be written during training, a line on standard error says so; for other results see
+            If a checkpoint cannot be written during training, a warning is logged; for other results see
             `TrainResult.missing`.
         TypeError: `scene` is no Scene or `config` no TrainConfig.
 
@@ -207,7 +210,8 @@ def _train_in_folder(
         decisions = Decisions(ranks.broadcast(saved), {}, [])
     elif questions := _open_questions(scene, config):
         with PhaseLine(silent) as phases, _stop_requests() as stop:
-            phases.note(f"{questions} with short pilot runs, scored on validation photos")
+            if ranks.is_main:
+                _LOG.info(f"{questions} with short pilot runs, scored on validation photos")
             report_pilot: Report = _ignore_step if report is None else partial(_report_as_step_zero, report)
             # Every rank runs all pilots, so that no rank waits for another.
             pilots = partial(decide, scene, config, cache, device, report_pilot, stop, phase or phases.update)
@@ -235,13 +239,12 @@ def _train_in_folder(
             ProgressLine(trainer.steps, trainer.step, silent, _describe_shortening(device)) as line,
             _stop_requests() as stop,
         ):
-            for choice in decisions.reasons:
-                line.note(f"{CHOICE_LABELS[choice]}: {trainer.choices[choice]}")
+            if ranks.is_main:
+                for choice in decisions.reasons:
+                    _LOG.info(f"{CHOICE_LABELS[choice]}: {trainer.choices[choice]}")
             written = None
             if log is not None and ranks.is_main:
-                written = stack.enter_context(
-                    TrainingLog(Path(log), trainer.steps, trainer.step, device, line.note, replace)
-                )
+                written = stack.enter_context(TrainingLog(Path(log), trainer.steps, trainer.step, device, replace))
             step_reports = [report or line.update, *([written.step] if written else [])]
 
             def report_step(trainer: Trainer, loss: float, mse: float) -> None:
@@ -250,9 +253,7 @@ def _train_in_folder(
                 if observer is not None and ranks.is_main:
                     observer(trainer)
 
-            complete = trainer.run(
-                checkpoint=checkpoint, report=report_step, stop=stop, warn=line.note, overwrite=replace
-            )
+            complete = trainer.run(checkpoint=checkpoint, report=report_step, stop=stop, overwrite=replace)
         if not complete or not ranks.is_main:
             if written:
                 written.end(complete=complete, step=trainer.step)
@@ -262,7 +263,7 @@ def _train_in_folder(
             with _checkpoint_named_in_errors(trainer, overwrite):
                 record = save_model(trainer, out, report_phase, overwrite=replace)
             results = write_results(record, scene, out, config, device, report_phase, overwrite=replace)
-            missing = _note_missing(results, phases)
+            missing = _log_missing(results)
         if METRICS_FILE not in results.missing and (replace or trainer.saved is not None):
             checkpoint.unlink(missing_ok=True)
         if written:
@@ -305,27 +306,27 @@ def _complete(
     if not ranks.is_main:
         return TrainResult(True, record.step, out / MODEL_FILE, {})
     with PhaseLine(silent) as phases, ExitStack() as stack:
-        phases.note("the model is already trained; computing its scores and pictures")
+        _LOG.info("the model is already trained; computing its scores and pictures")
         written = None
         if log is not None:
-            written = stack.enter_context(TrainingLog(Path(log), record.step, record.step, device, phases.note, True))
+            written = stack.enter_context(TrainingLog(Path(log), record.step, record.step, device))
         results = write_results(record, scene, out, config, device, phase or phases.update, overwrite=True)
         if written:
             _log_end(written, record.step, results)
-        missing = _note_missing(results, phases)
+        missing = _log_missing(results)
     if METRICS_FILE not in results.missing:
         (out / CHECKPOINT_FILE).unlink(missing_ok=True)
     return TrainResult(True, record.step, out / record.model, results.metrics, missing)
 
 
-def _note_missing(results: Results, line: PhaseLine) -> str:
-    """Print which results are missing, if any, and return the printed sentence."""
+def _log_missing(results: Results) -> str:
+    """Log which results are missing, if any, and return the logged sentence."""
     if not results.missing:
         return ""
     names = " and ".join(filter(None, [", ".join(results.missing[:-1]), results.missing[-1]]))
     verb = "are" if len(results.missing) > 1 else "is"
     sentence = f"{results.reasons[0]}; the model is finished, but {names} {verb} missing"
-    line.note(sentence)
+    _LOG.warning(sentence)
     return sentence
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import logging
 import time
-import warnings
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
@@ -36,6 +36,8 @@ from hyrfpack.train.optimizer import Optimizer
 from hyrfpack.train.setup import build_model
 from hyrfpack.train.strategy import Strategy
 from hyrfpack.version import __version__
+
+_LOG = logging.getLogger(__name__)
 
 MIN_CURVE_RECORDS = 200  # A run of more steps has up to twice as many records.
 
@@ -128,18 +130,18 @@ class Trainer:
         checkpoint: Path | None = None,
         report: Callable[[Trainer, float, float], None] = lambda trainer, loss, mse: None,
         stop: Callable[[], bool] = lambda: False,
-        warn: Callable[[str], None] = warnings.warn,
         overwrite: bool = True,
     ) -> bool:
         """Train until the last step, or until `stop()` returns True.
+
+        If a checkpoint cannot be written, as on a full disk, the main process logs a warning. Training continues and
+        tries again at the next checkpoint.
 
         Args:
             checkpoint: path of the checkpoint; written every `checkpoint_every` steps and when stopped early.
             report: called after each step with the trainer, and the loss and mean squared error of the step's view (NaN
                 if all of its photo is masked).
             stop: called in each step; the run ends after the step in which it returns True.
-            warn: called with a sentence when a checkpoint cannot be written, as on a full disk. Training continues and
-                tries again at the next checkpoint.
             overwrite: replace a file at `checkpoint` that belongs to another run.
 
         Returns:
@@ -172,7 +174,8 @@ class Trainer:
                     except HyrfError as error:
                         if stopped:
                             raise
-                        warn(f"{error}; training continues, without the checkpoint of step {self.step:,}")
+                        if self.ranks.is_main:
+                            _LOG.warning(f"{error}; training continues, without the checkpoint of step {self.step:,}")
                 if stopped:
                     # The launcher ends all processes once one has ended, so all wait until the checkpoint is written.
                     self.ranks.all_gather(None)

@@ -52,7 +52,7 @@ def serve(
     host: str = LOCAL_HOST,
     port: int = 0,
     open_browser: bool,
-    say: Callable[[str], None],
+    on_ready: Callable[[str], None],
 ) -> None:
     """Serve a page and files until interrupted by Ctrl-C, which is the normal end.
 
@@ -65,14 +65,14 @@ def serve(
         host: address to listen at. Any other than the default lets other machines connect.
         port: port to listen at, 0 to 65535; 0 takes a free one.
         open_browser: open the page in the user's browser.
-        say: called with the page's address, once it can be opened.
+        on_ready: called with the page's address, once it can be opened.
 
     Raises:
         HyrfError: the server cannot listen at this address.
     """
     with _create_server(host, port, page, files or {}) as server:
         address = _page_address(host, server)
-        say(address)
+        on_ready(address)
         if open_browser:  # in a thread, because opening some browsers blocks until they are closed
             threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
         with contextlib.suppress(KeyboardInterrupt):

@@ -19,14 +19,14 @@ def view(
     host: str = LOCAL_HOST,
     port: int = 0,
     open_browser: bool,
-    say: Callable[[str], None],
+    on_ready: Callable[[str], None],
 ) -> None:
     """Serve a scene's file and a player for it until interrupted; the page decodes the file.
 
     Args:
         path: a `.hyrf` file, the folder of a run, or a file of splats with one of the suffixes
             `hyrfpack.splats.names.SPLATS_SUFFIXES`.
-        host, port, open_browser, say: as for `hyrfpack.web.serve.serve`.
+        host, port, open_browser, on_ready: as for `hyrfpack.web.serve.serve`.
 
     Raises:
         HyrfError: there is no such file, its first kilobytes are damaged, or the server cannot listen at the address.
@@ -40,7 +40,7 @@ def view(
         describe_file(path)
     name = f"scene{suffix}"
     page = encode_player(title, content=name, fetches="'self'")
-    serve(page, {name: path}, host=host, port=port, open_browser=open_browser, say=say)
+    serve(page, {name: path}, host=host, port=port, open_browser=open_browser, on_ready=on_ready)
 
 
 def find_playable_file(path: str | os.PathLike[str]) -> Path:

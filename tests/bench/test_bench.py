@@ -41,10 +41,6 @@ def make_subject(model, photos=None) -> Subject:
     return Subject("tiny", "raw", model, RING_CAMERAS, photos, ring(8, width=24, height=24), BENCH_DISTORTION)
 
 
-def ignore_message(sentence: str) -> None:
-    pass
-
-
 def rows_by_setting(rows) -> dict[str, dict]:
     found = defaultdict(dict)
     for row in rows:
@@ -63,7 +59,7 @@ def rms(values) -> float:
 
 @pytest.mark.parametrize("measure", [rasterize_rows, hash_encode_rows, mlp_rows, render_rows])
 def test_every_setting_has_one_reference_without_error_and_one_default(measure):
-    for values in rows_by_setting(measure(make_subject(make_model()), 1, ignore_message)).values():
+    for values in rows_by_setting(measure(make_subject(make_model()), 1, [])).values():
         (reference,) = [row for row in values.values() if row.is_reference]
         assert reference.error.max == reference.error.rms == 0 and reference.ratio.wall == 1
         assert sum(row.is_default for row in values.values()) == 1
@@ -85,14 +81,14 @@ def test_rasterize_errors_are_against_float64_with_the_same_antialiasing(antiali
         picture = rasterize(*cast, *view, antialiased=antialiased, implementation=implementation)
         found.append(np.concatenate([picture.rgb.flatten(), picture.transmittance.flatten()]).astype(np.float64))
 
-    rows = rows_by_setting(rasterize_rows(make_subject(model), 1, ignore_message))
+    rows = rows_by_setting(rasterize_rows(make_subject(model), 1, []))
     row = rows["antialiased, forward" if antialiased else "forward"]["cpu"]
     assert row.error.max == pytest.approx(np.abs(found[0] - found[1]).max()) and row.error.max > 0
     assert row.error.rms == pytest.approx(rms(found[0] - found[1]))
 
 
 def test_gradient_errors_are_given_for_each_input_and_as_their_maximum():
-    rows = rows_by_setting(rasterize_rows(make_subject(make_model()), 1, ignore_message))
+    rows = rows_by_setting(rasterize_rows(make_subject(make_model()), 1, []))
     row = rows["forward + backward"]["cpu"]
     assert set(row.parts) == {"means", "quats", "scales", "opacities", "colors"}
     assert row.error.max == max(part.max for part in row.parts.values())
@@ -107,9 +103,7 @@ def test_half_precision_errors_of_the_fields_are_relative_to_float64():
     table = grid.table.detach()
     exact = hash_encode(coords.double(), table.double(), *settings)
     rounded = hash_encode(coords, table.bfloat16().float(), *settings)
-    row = rows_by_setting(hash_encode_rows(make_subject(model), 1, ignore_message))["geometry, forward"][
-        "cpu, bfloat16 table"
-    ]
+    row = rows_by_setting(hash_encode_rows(make_subject(model), 1, []))["geometry, forward"]["cpu, bfloat16 table"]
     assert row.error.rms == pytest.approx(rms(rounded - exact) / rms(exact), rel=1e-4)
     assert 1e-4 < row.error.max == pytest.approx(float((rounded - exact).abs().max() / exact.abs().max()), rel=1e-4)
 
@@ -118,7 +112,7 @@ def test_half_precision_errors_of_the_fields_are_relative_to_float64():
         mlp(features.to(dtype), [w.to(dtype) for w in part.weights], [b.to(dtype) for b in part.biases]).detach()
         for dtype in (torch.bfloat16, torch.float64)
     ]
-    row = rows_by_setting(mlp_rows(make_subject(model), 1, ignore_message))["geometry, forward"]["bfloat16 reference"]
+    row = rows_by_setting(mlp_rows(make_subject(model), 1, []))["geometry, forward"]["bfloat16 reference"]
     assert row.error.rms == pytest.approx(rms(outputs[0].double() - outputs[1]) / rms(outputs[1]), rel=0.05)
 
 
@@ -134,14 +128,14 @@ def test_every_accuracy_setting_of_rendering_is_swept_but_near():
 
 
 def test_the_default_is_among_the_measured_values_of_each_setting():
-    rows = rows_by_setting(render_rows(make_subject(make_model()), 1, ignore_message))
+    rows = rows_by_setting(render_rows(make_subject(make_model()), 1, []))
     for name, values in RENDER_SETTING_VALUES.items():
         assert len(rows[name]) == len({*values, getattr(RenderSettings(), name)})
 
 
 def test_the_error_of_a_render_setting_isolates_that_setting():
     model = make_model()
-    row = rows_by_setting(render_rows(make_subject(model), 1, ignore_message))["background_threshold"]["0.3"]
+    row = rows_by_setting(render_rows(make_subject(model), 1, []))["background_threshold"]["0.3"]
     exact, cut = (render_all(model, RenderSettings(background_threshold=tau)).double() for tau in (0, 0.3))
     assert row.error.max == pytest.approx(float((cut - exact).abs().max()), rel=1e-5) and row.error.max > 0.01
     assert row.error.rms == pytest.approx(rms(cut - exact), rel=1e-5)
@@ -150,7 +144,7 @@ def test_the_error_of_a_render_setting_isolates_that_setting():
 
 def test_all_defaults_together_are_compared_with_exact_settings():
     model = make_model()
-    row = rows_by_setting(render_rows(make_subject(model), 1, ignore_message))["all"]["defaults"]
+    row = rows_by_setting(render_rows(make_subject(model), 1, []))["all"]["defaults"]
     assert row.error.rms == pytest.approx(
         rms(render_all(model).double() - render_all(model, EXACT_SETTINGS).double()), rel=1e-4
     )
@@ -158,7 +152,7 @@ def test_all_defaults_together_are_compared_with_exact_settings():
 
 def test_without_a_background_sphere_its_settings_are_left_out_and_named():
     notes = []
-    rows = rows_by_setting(render_rows(make_subject(make_model(background=False)), 1, notes.append))
+    rows = rows_by_setting(render_rows(make_subject(make_model(background=False)), 1, notes))
     assert "background_stride" not in rows and "cull_tolerance" in rows
     assert len(notes) == 2 and all("no background sphere" in sentence for sentence in notes)
 
@@ -168,7 +162,7 @@ def test_quality_drops_are_differences_of_scores_by_evaluate():
     views = scene.train
     photos = [(torch.from_numpy(view.load().composite()), None) for view in views]
     tested = dataclasses.replace(make_subject(model, photos), cameras=[view.camera for view in views])
-    row = rows_by_setting(render_rows(tested, 1, ignore_message))["background_threshold"]["0.3"]
+    row = rows_by_setting(render_rows(tested, 1, []))["background_threshold"]["0.3"]
     exact, cut = (
         hyrfpack.evaluate_model(model, views, settings=RenderSettings(background_threshold=tau)) for tau in (0, 0.3)
     )
@@ -181,7 +175,7 @@ def test_quality_drops_are_differences_of_scores_by_evaluate():
 def coded_model() -> tuple[HybridModel, dict[str, dict]]:
     """A model and the measurements of its coding. Tests must not change them."""
     model = make_model()
-    return model, rows_by_setting(codec_rows(make_subject(model), 1, ignore_message))
+    return model, rows_by_setting(codec_rows(make_subject(model), 1, []))
 
 
 def test_raw_is_the_exact_codec_and_bytes_are_those_of_the_file(coded_model):
@@ -220,7 +214,7 @@ def test_every_setting_of_the_paper_profile_is_measured_with_its_default_marked(
 
 def test_every_setting_of_the_compact_profile_is_measured_with_its_default_marked():
     notes = []
-    rows = rows_by_setting(codec_rows(make_subject(make_model(300, scale_logits=-4.0)), 1, notes.append))
+    rows = rows_by_setting(codec_rows(make_subject(make_model(300, scale_logits=-4.0)), 1, notes))
     itself = rows["profile"]["compact"]
     for knob, count in (("distortion", 5), ("prune", 2)):
         values = rows[f"compact, {knob}"]
@@ -249,7 +243,7 @@ def test_a_new_profile_is_measured_automatically_and_may_reorder_gaussians(monke
     monkeypatch.setitem(PROFILES, "shuffled", shuffled)
     generator = torch.Generator().manual_seed(5)
     model = make_model(color_logits=torch.randn(60, 3, generator=generator))
-    row = rows_by_setting(codec_rows(make_subject(model), 1, ignore_message))["profile"]["shuffled"]
+    row = rows_by_setting(codec_rows(make_subject(model), 1, []))["profile"]["shuffled"]
     assert all(part.max == 0 for part in row.parts.values())
     assert row.error.max < 1e-5
 
@@ -269,7 +263,7 @@ def test_a_profile_that_cannot_write_the_model_is_omitted_with_the_reason():
     with torch.no_grad():
         model.gaussians.positions[0, 0] = 1e6  # beyond the range of half precision
     notes = []
-    rows = rows_by_setting(codec_rows(make_subject(model), 1, notes.append))
+    rows = rows_by_setting(codec_rows(make_subject(model), 1, notes))
     assert set(rows["profile"]) == set(PROFILES) - {"paper"} and "paper, color" not in rows
     assert any("'paper' is left out" in sentence and "half precision" in sentence for sentence in notes)
 
@@ -279,7 +273,7 @@ def test_a_result_that_is_not_finite_stops_the_measurement():
     with torch.no_grad():
         model.geometry.biases[-1][0] = torch.nan
     with pytest.raises(HyrfError, match="mlp, geometry, forward"):
-        list(mlp_rows(make_subject(model), 1, ignore_message))
+        list(mlp_rows(make_subject(model), 1, []))
 
 
 @pytest.mark.parametrize(
@@ -298,7 +292,7 @@ def test_the_time_to_compile_kernels_is_not_measured(monkeypatch, measure, modul
 
     monkeypatch.setattr(timing, "perf_counter", lambda: now[0])
     monkeypatch.setattr(module, operation, slow_at_first)
-    rows = list(measure(make_subject(make_model()), 2, ignore_message))
+    rows = list(measure(make_subject(make_model()), 2, []))
     assert compiled and all(row.time.ms < 10 and row.time.repeats == 2 for row in rows)
 
 
@@ -308,32 +302,30 @@ def test_without_numba_there_is_a_clear_error(monkeypatch):
         benchmark_model()
 
 
-def test_a_file_is_measured_from_an_orbit_and_the_report_survives_json(tmp_path):
+def test_a_file_is_measured_from_an_orbit_and_the_report_survives_json(tmp_path, caplog):
     save_model(make_model(), tmp_path / "tiny.hyrf")
-    said = []
-    report = benchmark_model(tmp_path / "tiny.hyrf", repeats=1, only=["mlp"], say=said.append)
-    assert {row.group for row in report.rows} == {"mlp"} and said == ["measuring mlp"]
+    report = benchmark_model(tmp_path / "tiny.hyrf", repeats=1, only=["mlp"])
+    assert {row.group for row in report.rows} == {"mlp"} and caplog.messages == ["measuring mlp"]
     assert "60 Gaussians" in report.subject and "6 viewpoints" in report.subject
     assert {"cpu", "cores", "torch"} <= set(report.machine)
     values = report.to_dict()
     assert json.loads(json.dumps(values, allow_nan=False)) == values
 
 
-def test_the_built_in_model_is_measured_on_its_own_photos(monkeypatch):
+def test_the_built_in_model_is_measured_on_its_own_photos(monkeypatch, caplog):
     monkeypatch.setattr(subject, "BUILT_IN_STEPS", 2)
     monkeypatch.setattr(subject, "BUILT_IN_PHOTOS", 9)
     monkeypatch.setattr(subject, "BUILT_IN_PHOTO_SIDE_PIXELS", 32)
-    said = []
-    report = benchmark_model(only=["mlp"], repeats=1, say=said.append)
+    report = benchmark_model(only=["mlp"], repeats=1)
     assert "built-in" in report.subject and "2 held-out photos" in report.subject
-    assert "2 steps" in said[0] and "minute" in said[0]
+    assert "2 steps" in caplog.messages[0] and "minute" in caplog.messages[0]
 
 
 def test_coding_a_quantised_model_again_gives_a_note(tmp_path):
     save_model(make_model(), tmp_path / "tiny.hyrf", "paper")
     read = subject.read_subject(tmp_path / "tiny.hyrf", None)
     notes = []
-    next(iter(codec_rows(dataclasses.replace(read, cameras=RING_CAMERAS, capture=RING_CAMERAS), 1, notes.append)))
+    next(iter(codec_rows(dataclasses.replace(read, cameras=RING_CAMERAS, capture=RING_CAMERAS), 1, notes)))
     assert any("quantised already" in sentence for sentence in notes)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import shutil
 import subprocess
@@ -19,6 +20,7 @@ from scenes import small_model
 
 from hyrfpack.cli import main
 from hyrfpack.cli.common import format_table, note
+from hyrfpack.cli.console import notes_only_of
 from hyrfpack.cli.files import _command_as_typed
 from hyrfpack.format import describe_file, save_model
 
@@ -134,6 +136,49 @@ def test_reports_show_the_command_without_quiet_and_verbose(model):
     command = main.commands["compress"]
     with command.make_context("compress", [str(model), "-o", "b.hyrf", "--verbose", "--no-prune"]) as context:
         assert _command_as_typed(context) == f"hyrfpack compress {model} --output b.hyrf --no-prune"
+
+
+# -- messages of the library -----------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def describe_with_messages(monkeypatch) -> None:
+    """Let `hyrfpack info` log messages; its description of a file that does not exist fails after them."""
+
+    def describe(path):
+        logging.getLogger("hyrfpack.made_up").warning("100 % of it is lost; use `max_size=0`")
+        with notes_only_of("hyrfpack.train", "hyrfpack.make"):
+            logging.getLogger("hyrfpack.export.pipeline").warning("a detail of a stage")
+            logging.getLogger("hyrfpack.make.run").info("a sentence of the command")
+        logging.getLogger("hyrfpack.made_up").debug("a detail for developers")
+        return describe_file(path)
+
+    monkeypatch.setattr("hyrfpack.format.describe_file", describe)
+
+
+@pytest.mark.usefixtures("describe_with_messages")
+def test_messages_of_the_library_are_notes_that_name_options(model):
+    printed = ["100 % of it is lost; use --max-size 0", "a sentence of the command"]
+    assert succeeded("info", model).stderr.splitlines() == printed
+    json.loads(succeeded("info", model, "--json").stdout)
+    assert succeeded("info", model, "--json").stderr.splitlines() == printed
+    assert succeeded("info", model, "--quiet").stderr == ""
+    verbose = succeeded("info", model, "--verbose").stderr
+    assert all(f" s] {sentence}\n" in verbose for sentence in printed)
+
+
+@pytest.mark.usefixtures("describe_with_messages")
+@pytest.mark.parametrize("exists", [True, False])
+def test_a_command_leaves_the_loggers_as_they_were(exists, model, tmp_path, capsys):
+    logger, printed = logging.getLogger("hyrfpack"), logging.StreamHandler()
+    before = [*logger.handlers], logger.level, logger.propagate
+    logging.getLogger().addHandler(printed)  # as other libraries do; it must not print a message again
+    try:
+        assert (hyrfpack("info", model if exists else tmp_path / "none.hyrf").exit_code == 0) == exists
+    finally:
+        logging.getLogger().removeHandler(printed)
+    assert (logger.handlers, logger.level, logger.propagate) == before
+    assert capsys.readouterr().err == ""
 
 
 # -- missing streams -------------------------------------------------------------------------------------------------

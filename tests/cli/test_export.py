@@ -239,7 +239,7 @@ def test_view_serves_the_player_and_the_file_at_a_free_port_until_ctrl_c(ending,
 def test_view_decodes_nothing_and_loads_no_torch(model):
     program = (
         "import sys, hyrfpack.web.view as v; v.serve = lambda page, files, **more: print(len(page), list(files));"
-        f"v.view({str(model)!r}, open_browser=False, say=print); print('torch' in sys.modules)"
+        f"v.view({str(model)!r}, open_browser=False, on_ready=print); print('torch' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60)
     assert done.stdout.endswith("['scene.hyrf']\nFalse\n")

@@ -268,10 +268,10 @@ def test_a_request_to_stop_is_passed_on(launch_script):
 
 
 @needs_ranks
-def test_another_killed_process_is_reported_while_the_first_cannot(launch_script):
+def test_another_killed_process_is_reported_while_the_first_cannot(launch_script, caplog):
     """The first process may still be loading, or waiting for the one that has ended."""
-    code, said = launch_script("test $RANK = 1 && kill -9 $$; exec sleep 500")
-    assert code == 2 and "process 1 of 2 was ended by SIGKILL" in said
+    code, _ = launch_script("test $RANK = 1 && kill -9 $$; exec sleep 500")
+    assert code == 2 and "process 1 of 2 was ended by SIGKILL" in caplog.messages[-1]
 
 
 @needs_ranks

@@ -206,7 +206,7 @@ def test_the_distortion_is_adjusted_until_the_measured_error_matches(
 ):
     """The fake packer's candidates are distortions, whose measured error is `picture_error`."""
     tried: list[float] = []
-    packer = running.Packer(None, {}, None, None, 0, True, lambda sentence: None)
+    packer = running.Packer(None, {}, None, None, 0, True)
     monkeypatch.setattr(
         packer,
         "encode",
@@ -235,7 +235,7 @@ def test_the_distortion_is_lowered_until_the_drop_on_training_photos_is_met(
     """The fake packer's candidates lower the PSNR on training photos from 30 dB by `psnr_drop`."""
     tried: list[float] = []
     scene = SimpleNamespace(train=["a photo"])
-    packer = running.Packer(None, {}, None, scene, 0, True, lambda sentence: None)
+    packer = running.Packer(None, {}, None, scene, 0, True)
     monkeypatch.setattr(
         packer, "encode", lambda distortion, *_: tried.append(distortion) or running.EncodedCandidate(distortion, {})
     )
@@ -252,9 +252,8 @@ def test_the_distortion_is_lowered_until_the_drop_on_training_photos_is_met(
     assert trial.data == trial.measured_error == pytest.approx(expected, rel=1e-3)
 
 
-def test_unreadable_photos_do_not_stop_packing(monkeypatch):
-    said: list[str] = []
-    packer = running.Packer(None, {}, None, SimpleNamespace(train=["a photo"]), 0, True, said.append)
+def test_unreadable_photos_do_not_stop_packing(monkeypatch, caplog):
+    packer = running.Packer(None, {}, None, SimpleNamespace(train=["a photo"]), 0, True)
     monkeypatch.setattr(packer, "encode", lambda distortion, *_: running.EncodedCandidate(distortion, {}))
     monkeypatch.setattr(running.Packer, "decode", lambda packer, trial: trial.data)
 
@@ -266,18 +265,17 @@ def test_unreadable_photos_do_not_stop_packing(monkeypatch):
         packer.encode_to_distortion(1e-3, SimpleNamespace(measure_error=lambda distortion: distortion), 0.1).data
         == 1e-3
     )
-    assert said == ["a.png: the file is gone; copy it again; the loss on training photos is not measured"]
+    assert caplog.messages == ["a.png: the file is gone; copy it again; the loss on training photos is not measured"]
 
 
-def test_without_photos_the_stored_cameras_are_used(trained_file, scene, tmp_path):
+def test_without_photos_the_stored_cameras_are_used(trained_file, scene, tmp_path, caplog):
     """The stored cameras equal those of the photos to nine digits."""
-    said = []
     wanted = default_distortion(hyrfpack.describe_file(trained_file)["provenance"])
 
-    report = compress_model(trained_file, tmp_path / "small.hyrf", say=said.append)
+    report = compress_model(trained_file, tmp_path / "small.hyrf")
     beside = compress_model(trained_file, tmp_path / "beside.hyrf", data=scene, distortion=wanted)
 
-    assert f"at {len(scene.train)} cameras" in said[0]
+    assert f"at {len(scene.train)} cameras" in caplog.messages[0]
     assert report.bytes_after == pytest.approx(beside.bytes_after, rel=0.02)
 
 

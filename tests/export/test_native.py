@@ -91,13 +91,14 @@ def test_a_file_without_cameras_is_viewed_from_an_orbit_or_from_its_photos(compa
     assert np.allclose(photos["cameras"][0]["camera_from_world"], ball_scene(5).train[0].camera.camera_from_world)
 
 
-def test_an_uncompressed_file_is_embedded_with_a_note(model_file, compact_file, tmp_path):
-    messages = []
-    export_model(compact_file, tmp_path / "a.html", say=messages.append)
-    assert messages == []
-    export_model(model_file, tmp_path / "a.html", say=messages.append)
+def test_an_uncompressed_file_is_embedded_with_a_note(model_file, compact_file, tmp_path, caplog):
+    export_model(compact_file, tmp_path / "a.html")
+    assert caplog.messages == []
+    export_model(model_file, tmp_path / "a.html")
     size = model_file.stat().st_size
-    assert messages == [f"{model_file} goes along as it is, {size:,} bytes; 'hyrfpack compress' makes it smaller"]
+    assert caplog.messages == [
+        f"{model_file} goes along as it is, {size:,} bytes; 'hyrfpack compress' makes it smaller"
+    ]
 
 
 @pytest.mark.parametrize("target", ["a.html", "player"])

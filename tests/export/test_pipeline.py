@@ -165,9 +165,8 @@ def points_in_crop(points: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("ending", [".ply", ".sog", ".html"])
-def test_a_crop_keeps_the_gaussians_inside_and_no_background(ending, sphere_file, tmp_path):
-    messages = []
-    report = export(sphere_file, tmp_path / f"part{ending}", crop=CROP_BOX, say=messages.append)
+def test_a_crop_keeps_the_gaussians_inside_and_no_background(ending, sphere_file, tmp_path, caplog):
+    report = export(sphere_file, tmp_path / f"part{ending}", crop=CROP_BOX)
     expected, back = (
         points_in_crop(load_model(sphere_file).gaussians.positions.detach().numpy()),
         read_back(tmp_path / f"part{ending}"),
@@ -175,7 +174,7 @@ def test_a_crop_keeps_the_gaussians_inside_and_no_background(ending, sphere_file
     assert 3 < len(expected) < 40 and len(back) == report.gaussians == len(expected) and report.background == 0
     assert distances_to_nearest(expected, back.positions).max() < 1e-3
     assert (report.views, report.psnr, report.psnr_baked) == (0, None, None)
-    assert messages[-1] == "quality is not measured, because a part of the scene was cropped"
+    assert caplog.messages[-1] == "quality is not measured, because a part of the scene was cropped"
 
 
 def test_a_crop_may_be_a_list_with_infinite_sides(plain_file, tmp_path):
@@ -241,12 +240,11 @@ def test_a_lossy_file_has_a_lower_psnr(plain_file, tmp_path, monkeypatch):
     assert report.psnr < report.psnr_baked - 3
 
 
-def test_a_format_without_antialiasing_is_reported_as_such(tmp_path):
+def test_a_format_without_antialiasing_is_reported_as_such(tmp_path, caplog):
     source = write_model(tmp_path / "m.hyrf", antialiased=True, scale_logits=-5.0, fields=0.0)
     for ending, word in ((".glb", "antialiased"), (".spz", "measuring"), (".sog", "measuring")):
-        messages = []
-        export(source, tmp_path / f"a{ending}", degree=0, say=messages.append)
-        assert word in messages[-1]
+        export(source, tmp_path / f"a{ending}", degree=0)
+        assert word in caplog.messages[-1]
 
 
 def photograph_model(model, cameras) -> Scene:
@@ -267,17 +265,16 @@ def without_cameras(source: Path, target: Path) -> Path:
     return target
 
 
-def export_in_unit(unit: float, view_source: str, folder) -> tuple[str, ExportReport]:
-    """Export forty Gaussians in a unit of length to .spz; return the last message and the report."""
+def export_in_unit(unit: float, view_source: str, folder) -> ExportReport:
+    """Export forty Gaussians in a unit of length to .spz."""
     frame = Frame((0, 0, 0), unit, (1.0, 1.0, 1.0))
     model = small_model(GAUSSIAN_POSITIONS, frame=frame, fields=0.0, color_logits=1.0, scale_logits=-1.5)
     cameras = [scale_and_move(camera, unit, (0, 0, 0)) for camera in ring(8)]
-    source, messages = write_model(folder / "model.hyrf", model, cameras), []
+    source = write_model(folder / "model.hyrf", model, cameras)
     if view_source == "generated viewpoints":
         source = without_cameras(source, folder / "bare.hyrf")
     data = photograph_model(model, cameras) if view_source == "photos" else None
-    report = export(source, folder / "a.spz", degree=0, data=data, say=messages.append)
-    return messages[-1], report
+    return export(source, folder / "a.spz", degree=0, data=data)
 
 
 VIEW_SOURCES = ("photos", "cameras", "generated viewpoints")
@@ -285,17 +282,19 @@ VIEW_SOURCES = ("photos", "cameras", "generated viewpoints")
 
 @pytest.mark.parametrize("view_source", VIEW_SOURCES)
 @pytest.mark.parametrize("unit", [1e-5, 1e5])
-def test_a_format_too_coarse_for_the_unit_of_length_is_reported(unit, view_source, tmp_path):
-    message, _ = export_in_unit(unit, view_source, tmp_path)
+def test_a_format_too_coarse_for_the_unit_of_length_is_reported(unit, view_source, tmp_path, caplog):
+    export_in_unit(unit, view_source, tmp_path)
+    message = caplog.messages[-1]
+    assert caplog.records[-1].levelname == "WARNING"
     assert re.fullmatch(r"\.spz costs \d+\.\d dB[^\n]*: it is too coarse for this scene[^\n]*another format", message)
     assert ("`data`" in message) == (view_source == "generated viewpoints")
 
 
 @pytest.mark.parametrize("view_source", VIEW_SOURCES)
-def test_invisible_rounding_is_not_reported(view_source, tmp_path):
-    message, report = export_in_unit(1.0, view_source, tmp_path)
+def test_invisible_rounding_is_not_reported(view_source, tmp_path, caplog):
+    report = export_in_unit(1.0, view_source, tmp_path)
     assert min(report.psnr_baked, 50) - report.psnr > 3  # compared with the model, the loss is large
-    assert message == f"measuring at {report.views} views"
+    assert caplog.messages[-1] == f"measuring at {report.views} views"
 
 
 def test_the_cost_of_a_format_is_measured_on_photos_if_there_are_any():
@@ -319,10 +318,9 @@ def test_held_out_photos_are_scored_but_not_fitted(plain_file, tmp_path, monkeyp
     assert report.photos_file == pytest.approx(report.photos_model, abs=0.5)
 
 
-def test_missing_held_out_photos_are_reported(plain_file, tmp_path):
-    messages = []
-    report = export(plain_file, tmp_path / "a.ply", data=ball_scene(3), say=messages.append)
-    assert report.views == 0 and messages[-1] == "quality is not measured, because no photo is held out"
+def test_missing_held_out_photos_are_reported(plain_file, tmp_path, caplog):
+    report = export(plain_file, tmp_path / "a.ply", data=ball_scene(3))
+    assert report.views == 0 and caplog.messages[-1] == "quality is not measured, because no photo is held out"
 
 
 def test_fully_masked_photos_give_no_score(plain_file, tmp_path):
@@ -354,20 +352,16 @@ def test_missing_cameras_are_reported_or_taken_from_photos(name, compact_file, t
         assert export(compact_file, tmp_path / name, data=ball_scene(5)).cameras == 5
 
 
-def test_a_compact_file_is_baked_and_measured_at_the_cameras_of_its_photos(compact_file, tmp_path):
-    messages = []
-    report = export(compact_file, tmp_path / "a.spz", degree=1, say=messages.append)
-    assert re.fullmatch(r"fitting colours of degree 1 at \d+ cameras", messages[0])
+def test_a_compact_file_is_baked_and_measured_at_the_cameras_of_its_photos(compact_file, tmp_path, caplog):
+    report = export(compact_file, tmp_path / "a.spz", degree=1)
+    assert re.fullmatch(r"fitting colours of degree 1 at \d+ cameras", caplog.messages[0])
     assert report.views > 0 and report.psnr > 25
     assert export(compact_file, tmp_path / "a.points.ply").cameras == len(FOUR_CAMERAS)
 
 
-def test_a_file_without_cameras_is_baked_and_measured_on_an_orbit(plain_file, tmp_path):
-    messages = []
-    report = export(
-        without_cameras(plain_file, tmp_path / "bare.hyrf"), tmp_path / "a.spz", degree=1, say=messages.append
-    )
-    assert "stores no cameras" in messages[0] and report.views > 0 and report.psnr > 25
+def test_a_file_without_cameras_is_baked_and_measured_on_an_orbit(plain_file, tmp_path, caplog):
+    report = export(without_cameras(plain_file, tmp_path / "bare.hyrf"), tmp_path / "a.spz", degree=1)
+    assert "stores no cameras" in caplog.messages[0] and report.views > 0 and report.psnr > 25
 
 
 # -- refusals before the work, and no half-written files --------------------------------------------------------------

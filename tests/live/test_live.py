@@ -141,10 +141,9 @@ def test_a_model_that_is_not_finite_keeps_the_previous_snapshot():
     assert read_content(view.scene) == before and read_progress(view)["step"] == 1
 
 
-def test_the_page_and_its_files_are_served_while_the_block_runs_and_not_after():
-    said: list[str] = []
-    with live_view("a <scene>", say=said.append) as view:
-        (address,) = [word for word in said[0].split() if word.startswith("http://127.0.0.1:")]
+def test_the_page_and_its_files_are_served_while_the_block_runs_and_not_after(caplog):
+    with live_view("a <scene>") as view:
+        (address,) = [word for word in caplog.messages[0].split() if word.startswith("http://127.0.0.1:")]
 
         def fetched(name: str) -> bytes:
             with urllib.request.urlopen(address + name, timeout=20) as answer:

@@ -59,7 +59,7 @@ def poses(posed, monkeypatch) -> list[Path]:
     """A list of the arguments of each call of `estimate_poses`, which gives the known poses instead of estimating."""
     calls: list[Path] = []
 
-    def estimate_poses(photos, out, *, matching="auto", masks=None, seed=0, overwrite=False, report=None, say=None):
+    def estimate_poses(photos, out, *, matching="auto", masks=None, seed=0, overwrite=False, report=None):
         out = Path(out)
         calls.append(Path(photos))
         report("matching", 0.5)

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import io
+import re
+import sys
 from time import sleep
 
 import pytest
 from rich.console import Console
 
+from hyrfpack.cli.console import note
 from hyrfpack.make import display
 from hyrfpack.make.display import Display
 from hyrfpack.make.progress import SLOWDOWN_EXPONENT, Progress, Reporter
@@ -36,11 +39,32 @@ def test_without_a_terminal_a_plain_line_is_printed_every_few_seconds(capsys, mo
     with Display() as shown:
         sleep(0.05)
         shown.show(TRAINING_PROGRESS)
-        shown.say("a sentence [of] its own")
         sleep(0.1)
     out, err = capsys.readouterr()
-    assert out == "" and "a sentence [of] its own" in err
+    assert out == ""
     assert "2/5 training | step 604/3000 | PSNR 29.4 dB | 4,850 Gaussians | elapsed 0:00 | ETA 1:12" in err
+
+
+def test_a_note_appears_whole_above_the_line_of_a_terminal(monkeypatch):
+    """A terminal wraps a long sentence itself, so that a path in it can be copied."""
+
+    class Terminal(io.StringIO):
+        encoding = "utf-8"
+
+        def isatty(self) -> bool:
+            return True
+
+    terminal, sentence = Terminal(), "a sentence [of] its own that is longer than :one: line of the terminal"
+    monkeypatch.setattr(sys, "stderr", terminal)
+    for name, value in (("COLUMNS", "40"), ("TERM", "xterm"), ("NO_COLOR", "1")):
+        monkeypatch.setenv(name, value)
+    with Display() as shown:
+        shown.show(TRAINING_PROGRESS)
+        note(sentence)
+        sleep(0.3)
+    written = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", terminal.getvalue())
+    lines = [line for line in re.split(r"[\r\n]+", written) if line.strip()]
+    assert sentence in lines and lines[-1].startswith("2/5 training")
 
 
 def test_an_unknown_remaining_time_is_not_printed(capsys, monkeypatch):

@@ -45,11 +45,12 @@ def uninterrupted_products(uninterrupted_work) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("after", [False, True], ids=["before its work", "after it, before the record of it"])
-def test_an_interrupt_in_each_stage_loses_no_work(after, uninterrupted_products, posed, tmp_path, monkeypatch):
+def test_an_interrupt_in_each_stage_loses_no_work(after, uninterrupted_products, posed, tmp_path, monkeypatch, caplog):
     """Each call is stopped one stage later than the one before."""
     done: list[str] = []
     for stage, function in FUNCTION_BY_STAGE.items():
-        usual, said = getattr(stages, function), []
+        usual = getattr(stages, function)
+        caplog.clear()
 
         def stop(*arguments, usual=usual, **options):
             if after:
@@ -59,10 +60,12 @@ def test_an_interrupt_in_each_stage_loses_no_work(after, uninterrupted_products,
         with monkeypatch.context() as patch:
             patch.setattr(stages, function, stop)
             with pytest.raises(Stopped) as caught:
-                make_scene(posed, tmp_path / "scene.html", say=said.append)
+                make_scene(posed, tmp_path / "scene.html")
         assert caught.value.stage == stage and not (tmp_path / "scene.html").exists()
         assert [
-            name for name in FUNCTION_BY_STAGE if any(f"{name}: reused from an earlier run" in s for s in said)
+            name
+            for name in FUNCTION_BY_STAGE
+            if any(f"{name}: reused from an earlier run" in s for s in caplog.messages)
         ] == done[:-1]
         done.append(stage)
     result = make_scene(posed, tmp_path / "scene.html")

@@ -84,8 +84,8 @@ def test_every_kind_of_output_is_written_without_repeating_other_stages(ending, 
 
 
 def test_poses_of_photos_without_poses_are_estimated(photos, poses, tmp_path):
-    said, shares = [], []
-    result = make_scene(photos, tmp_path / "scene.hyrf", say=said.append, report=shares.append)
+    shares: list[Progress] = []
+    result = make_scene(photos, tmp_path / "scene.hyrf", report=shares.append)
     assert poses == [photos]
     assert list(result.seconds) == ["poses", *STAGE_NAMES]
     assert result.poses["left_out"] == {"dark.jpg": "blurred"}
@@ -96,16 +96,15 @@ def test_poses_of_photos_without_poses_are_estimated(photos, poses, tmp_path):
 
 
 @pytest.mark.parametrize("top", ["", "holiday/"])
-def test_photos_without_poses_may_come_in_an_archive(top, photos, poses, tmp_path, monkeypatch):
+def test_photos_without_poses_may_come_in_an_archive(top, photos, poses, tmp_path, monkeypatch, caplog):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     with zipfile.ZipFile(tmp_path / "photos.zip", "w") as archive:
         for photo in photos.iterdir():
             archive.write(photo, f"{top}{photo.name}")
-    said: list[str] = []
-    make_scene(tmp_path / "photos.zip", tmp_path / "scene.hyrf", quality="draft", say=said.append)
+    make_scene(tmp_path / "photos.zip", tmp_path / "scene.hyrf", quality="draft")
     (folder,) = poses
     assert folder.is_relative_to(tmp_path / "cache") and len(list(folder.rglob("*.png"))) == 18
-    assert sum(str(folder) in sentence for sentence in said) == 1
+    assert sum(str(folder) in sentence for sentence in caplog.messages) == 1
     assert len(make_scene(tmp_path / "photos.zip", tmp_path / "scene.hyrf", quality="draft").kept) == 5
 
 
@@ -203,17 +202,19 @@ def test_an_impossible_target_size_is_rejected_before_any_work(
     assert not poses and not (tmp_path / "scene.work").exists()
 
 
-def test_another_target_size_packs_the_trained_model_again_and_says_how_to_train_again(finished_work, posed, tmp_path):
-    work, said = copy_work(finished_work, tmp_path), []
+def test_another_target_size_packs_the_trained_model_again_and_says_how_to_train_again(
+    finished_work, posed, tmp_path, caplog
+):
+    work = copy_work(finished_work, tmp_path)
     target = (finished_work / "model.hyrf").stat().st_size * 3 // 4
-    result = make_scene(posed, tmp_path / "a.hyrf", work=work, target_bytes=target, say=said.append)
+    result = make_scene(posed, tmp_path / "a.hyrf", work=work, target_bytes=target)
     assert result.kept == ("training",) and result.bytes <= target
-    assert any("trained without a target size" in sentence and "`work`" in sentence for sentence in said)
+    assert any("trained without a target size" in sentence and "`work`" in sentence for sentence in caplog.messages)
     assert make_scene(posed, tmp_path / "b.hyrf", work=work).kept == ("training",)
     assert (tmp_path / "b.hyrf").read_bytes() == (finished_work / "model.hyrf").read_bytes()
 
 
-def test_a_stopped_training_resumes_unchanged_with_another_target_size(posed, tmp_path, monkeypatch):
+def test_a_stopped_training_resumes_unchanged_with_another_target_size(posed, tmp_path, monkeypatch, caplog):
     configs = []
     usual = stages.train_model
 
@@ -229,9 +230,10 @@ def test_a_stopped_training_resumes_unchanged_with_another_target_size(posed, tm
             with pytest.raises(Stopped):
                 make_scene(posed, tmp_path / "scene.hyrf", target_bytes=target)
     assert [config.target_bytes for config in configs] == [30_000, 30_000]
-    said = []
-    result = make_scene(posed, tmp_path / "scene.hyrf", target_bytes=50_000, say=said.append)
-    assert result.training["target_bytes"] == 30_000 and any("for 30,000 bytes" in sentence for sentence in said)
+    result = make_scene(posed, tmp_path / "scene.hyrf", target_bytes=50_000)
+    assert result.training["target_bytes"] == 30_000 and any(
+        "for 30,000 bytes" in sentence for sentence in caplog.messages
+    )
 
 
 def test_with_minutes_another_target_size_keeps_the_measurement_and_the_training(posed, tmp_path):
@@ -250,14 +252,14 @@ def test_an_unreachable_target_size_names_a_reachable_one(finished_work, posed, 
     succeeded(*arguments, "--target-size", possible.replace(",", ""))
 
 
-def test_a_work_folder_of_an_earlier_version_is_trained_again_once(finished_work, posed, tmp_path):
-    work, said = copy_work(finished_work, tmp_path), []
+def test_a_work_folder_of_an_earlier_version_is_trained_again_once(finished_work, posed, tmp_path, caplog):
+    work = copy_work(finished_work, tmp_path)
     table = json.loads((work / "make.json").read_text())
     training = table["stages"]["training"]
     training["inputs"]["settings"] |= training.pop("fixed")  # earlier versions stored both there
     (work / "make.json").write_text(json.dumps(table))
-    assert make_scene(posed, tmp_path / "scene.hyrf", work=work, say=said.append).kept[:1] != ("training",)
-    assert "training: running again, because settings changed" in said
+    assert make_scene(posed, tmp_path / "scene.hyrf", work=work).kept[:1] != ("training",)
+    assert "training: running again, because settings changed" in caplog.messages
     assert len(make_scene(posed, tmp_path / "scene.hyrf", work=work).kept) == 4
 
 
@@ -282,14 +284,13 @@ def test_changed_settings_repeat_the_stages_that_depend_on_them(settings, kept, 
     assert result.kept == kept
 
 
-def test_a_changed_photo_repeats_all_stages_and_a_moved_folder_none(photos, poses, tmp_path):
+def test_a_changed_photo_repeats_all_stages_and_a_moved_folder_none(photos, poses, tmp_path, caplog):
     make_scene(photos, tmp_path / "a.hyrf", work=tmp_path / "work", quality="draft")
     moved = photos.rename(tmp_path / "elsewhere")
     assert len(make_scene(moved, tmp_path / "a.hyrf", work=tmp_path / "work", quality="draft").kept) == 5
     Image.new("RGB", (32, 32), "red").save(moved / "0003.png")
-    said: list[str] = []
-    result = make_scene(moved, tmp_path / "b.hyrf", work=tmp_path / "work", quality="draft", say=said.append)
-    assert "poses" not in result.kept and "poses: running again, because photos changed" in said
+    result = make_scene(moved, tmp_path / "b.hyrf", work=tmp_path / "work", quality="draft")
+    assert "poses" not in result.kept and "poses: running again, because photos changed" in caplog.messages
 
 
 def test_poses_are_kept_from_a_draft_to_another_quality_and_back(photos, poses, tmp_path):
@@ -316,15 +317,14 @@ def test_a_damaged_product_is_made_again(name, kept, finished_work, posed, tmp_p
     assert result.kept == kept and (work / name).read_bytes() == whole
 
 
-def test_poses_without_their_photos_are_estimated_again(photos, poses, tmp_path):
+def test_poses_without_their_photos_are_estimated_again(photos, poses, tmp_path, caplog):
     work = make_scene(photos, tmp_path / "scene.hyrf", quality="draft").work
     (work / "scene" / "images" / "0004.png").unlink()
-    said: list[str] = []
-    result = make_scene(photos, tmp_path / "other.hyrf", work=work, quality="draft", say=said.append)
+    result = make_scene(photos, tmp_path / "other.hyrf", work=work, quality="draft")
     assert (
         len(poses) == 2
         and result.kept == tuple(STAGE_NAMES[:-1])
-        and "poses: running again, because its files changed" in said
+        and "poses: running again, because its files changed" in caplog.messages
     )
 
 
@@ -468,6 +468,12 @@ def test_the_command_reports_its_results(photos, poses, tmp_path):
     )
     assert numbers["kept"] == ["poses", *STAGE_NAMES] and numbers["views"] == 3 and numbers["poses"]["sure"] == 17
     assert numbers["total_seconds"] == pytest.approx(sum(numbers["seconds"].values()), abs=0.5)  # each value is rounded
+
+
+def test_the_command_prints_what_its_stages_do_as_progress_only(posed, tmp_path):
+    result = succeeded("make", posed, "-o", tmp_path / "scene.html", "--quality", "draft")
+    (line,) = [line for line in result.stderr.splitlines() if "| elapsed" not in line]  # without lines of progress
+    assert line.startswith("training: ") and line.endswith("; on cpu")
 
 
 def test_the_command_reports_where_it_was_stopped(posed, tmp_path, monkeypatch):

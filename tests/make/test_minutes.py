@@ -78,13 +78,12 @@ def test_measuring_a_scene_gives_its_cost(scene):
     assert cost.cpu_pass_seconds > 0 and cost.decoding_seconds >= 0 and cost.gaussians > 0
 
 
-def test_large_photos_are_reduced_when_time_is_short(posed, scene, monkeypatch):
+def test_large_photos_are_reduced_when_time_is_short(posed, scene, monkeypatch, caplog):
     def cost(scene, *_):
         return SceneCost(1e-3 * scene.train[0].camera.width ** 2, 0.0, 0.0, 0.0, 100)
 
     monkeypatch.setattr(minutes, "measure_scene_cost", cost)
     monkeypatch.setattr(minutes, "CANDIDATE_PHOTO_SIZES", (24, 16, 8))
-    said: list[str] = []
 
     def planned(seconds: float) -> Plan:
         arguments = (
@@ -97,11 +96,11 @@ def test_large_photos_are_reduced_when_time_is_short(posed, scene, monkeypatch):
             0,
             PictureCache(),
         )
-        return fit_plan_to_minutes(*arguments, Reporter(["training"], None), said.append)
+        return fit_plan_to_minutes(*arguments, Reporter(["training"], None))
 
     plans = [planned(seconds) for seconds in (3000.0, 300.0, 100.0)]
     assert [plan.max_size for plan in plans] == [1600, 16, 8] and {plan.target_bytes for plan in plans} == {90_000}
-    assert plans[0].steps > 1000 and any("pixels" in sentence for sentence in said)
+    assert plans[0].steps > 1000 and any("pixels" in sentence for sentence in caplog.messages)
 
 
 def test_a_long_run_has_the_measured_budget_and_a_short_one_the_default(posed, scene, monkeypatch):
@@ -119,7 +118,7 @@ def test_a_long_run_has_the_measured_budget_and_a_short_one_the_default(posed, s
             0,
             PictureCache(),
         )
-        return fit_plan_to_minutes(*arguments, Reporter(["training"], None), lambda sentence: None)
+        return fit_plan_to_minutes(*arguments, Reporter(["training"], None))
 
     short, long, targeted = planned(60.0), planned(600.0), planned(600.0, 90_000)
     assert short.steps < decisions.MIN_BUDGET_STEPS <= long.steps
@@ -128,8 +127,7 @@ def test_a_long_run_has_the_measured_budget_and_a_short_one_the_default(posed, s
     assert planned(600.0).steps < 0.8 * long.steps
 
 
-def test_too_little_time_gives_a_draft_with_a_note(posed, scene):
-    said: list[str] = []
+def test_too_little_time_gives_a_draft_with_a_note(posed, scene, caplog):
     for seconds in (-1.0, 0.5):
         arguments = (
             posed,
@@ -141,9 +139,10 @@ def test_too_little_time_gives_a_draft_with_a_note(posed, scene):
             0,
             PictureCache(),
         )
-        plan = fit_plan_to_minutes(*arguments, Reporter(["training"], None), said.append)
+        plan = fit_plan_to_minutes(*arguments, Reporter(["training"], None))
         assert (plan.steps, plan.target_bytes) == (6, 20_000)
-    assert "no time is left for training" in said[0] and "the time is short" in said[1]
+    first, *_, last = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert "no time is left for training" in first and "the time is short" in last
 
 
 def test_an_explicit_number_of_gaussians_replaces_the_measured_budget(posed, scene, monkeypatch):
@@ -159,7 +158,7 @@ def test_an_explicit_number_of_gaussians_replaces_the_measured_budget(posed, sce
         0,
         PictureCache(),
     )
-    plan = fit_plan_to_minutes(*arguments, Reporter(["training"], None), lambda sentence: None)
+    plan = fit_plan_to_minutes(*arguments, Reporter(["training"], None))
     assert (plan.train_config(0).max_gaussians, plan.budget_factor) == (700, None)
 
 
@@ -177,7 +176,7 @@ def test_photos_are_never_larger_than_asked_for(posed, scene, monkeypatch):
             0,
             PictureCache(),
         )
-        assert fit_plan_to_minutes(*arguments, Reporter(["training"], None), lambda sentence: None).max_size == 24
+        assert fit_plan_to_minutes(*arguments, Reporter(["training"], None)).max_size == 24
 
 
 def test_the_measured_cost_is_kept_by_the_next_call(posed, tmp_path, monkeypatch):

@@ -29,12 +29,9 @@ def photos_and_poses(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, di
 @pytest.fixture(scope="session")
 def estimated_scene(
     photos_and_poses, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Path, hyrfpack.PosesReport, list, list]:
-    """The estimated scene, its report, the progress that was reported and the messages. Tests must not change it."""
+) -> tuple[Path, hyrfpack.PosesReport, list]:
+    """The estimated scene, its report and the progress that was reported. Tests must not change it."""
     progress: list[tuple[str, float]] = []
-    messages: list[str] = []
     out = tmp_path_factory.mktemp("posed") / "a scene"
-    report = hyrfpack.estimate_poses(
-        photos_and_poses[0], out, report=lambda *now: progress.append(now), say=messages.append
-    )
-    return out, report, progress, messages
+    report = hyrfpack.estimate_poses(photos_and_poses[0], out, report=lambda *now: progress.append(now))
+    return out, report, progress

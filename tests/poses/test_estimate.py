@@ -21,7 +21,7 @@ def poses_of(scene: hyrfpack.Scene) -> dict[str, np.ndarray]:
 
 def test_estimated_poses_match_the_true_ones_for_photos_of_any_name(photos_and_poses, estimated_scene):
     folder, known = photos_and_poses
-    out, report, _, _ = estimated_scene
+    out, report, _ = estimated_scene
     scene = hyrfpack.load_scene(out)
     assert align_poses(poses_of(scene), known).agreeing == set(known)
     assert (report.photos, report.registered, report.left_out) == (len(known), len(known), {})

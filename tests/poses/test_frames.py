@@ -277,17 +277,19 @@ def test_high_dynamic_range_clips_nothing():
         assert (np.diff(shown) >= 0).all() and shown[0] == 0 and (shown == 255).sum() < 60
 
 
-def test_a_resumed_estimation_of_a_video_still_reports_its_number_of_frames(wall, tmp_path):
+def test_a_resumed_estimation_of_a_video_still_reports_its_number_of_frames(wall, tmp_path, caplog):
     video = write_video(tmp_path / "clip.mp4", [crop_wall(wall, 4.0 * number) for number in range(60)])
 
     def stop(doing: str, share: float) -> None:
         if "features" in doing:
             raise KeyboardInterrupt
 
-    said: list[list[str]] = [[], []]
-    for sentences in said:
+    said: list[list[str]] = []
+    for _ in range(2):
+        caplog.clear()
         with pytest.raises(KeyboardInterrupt):
-            hyrfpack.estimate_poses(video, tmp_path / "scene", report=stop, say=sentences.append)
+            hyrfpack.estimate_poses(video, tmp_path / "scene", report=stop)
+        said.append(caplog.messages)
     assert said[1] == ["resuming an interrupted estimation", *said[0]]
     assert "frames were taken" in said[0][0]
 

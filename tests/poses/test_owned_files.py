@@ -77,11 +77,12 @@ def test_copies_whose_originals_are_gone_are_posed_again_in_place(tmp_path):
         assert png_names(tmp_path / "scene" / "images") == ["0.png", "1.png", "2.png", "3.png"]
 
 
-def test_an_estimation_resumes_from_the_original_photos_beside_their_copies(tmp_path):
-    scene, said = write_photos(tmp_path / "scene"), []
+def test_an_estimation_resumes_from_the_original_photos_beside_their_copies(tmp_path, caplog):
+    scene = write_photos(tmp_path / "scene")
     prepare_photos(scene, scene)
-    prepare_photos(scene, scene, say=said.append)
-    assert said[0] == "resuming an interrupted estimation"
+    caplog.clear()
+    prepare_photos(scene, scene)
+    assert caplog.messages[0] == "resuming an interrupted estimation"
     prepare_photos(scene, scene, seed=1)
     estimate_with_fake_stages(scene, scene, seed=1)
     assert png_names(scene) == png_names(scene / "images") == ["0.png", "1.png", "2.png", "3.png"]
@@ -185,7 +186,7 @@ def test_a_second_call_for_the_same_scene_is_rejected(tmp_path):
     prepare_photos(tmp_path / "photos", scene)
 
 
-def test_poses_that_another_program_writes_meanwhile_are_kept_and_so_is_the_work(tmp_path):
+def test_poses_that_another_program_writes_meanwhile_are_kept_and_so_is_the_work(tmp_path, caplog):
     scene = tmp_path / "scene"
 
     def appear(doing: str, share: float) -> None:
@@ -196,9 +197,9 @@ def test_poses_that_another_program_writes_meanwhile_are_kept_and_so_is_the_work
         estimate_with_fake_stages(write_photos(tmp_path / "photos"), scene, report=appear)
     assert (scene / "sparse" / "0" / "cameras.bin").read_bytes() == b"of another program"
     shutil.rmtree(scene / "sparse")
-    said = []
-    estimate_with_fake_stages(tmp_path / "photos", scene, say=said.append)
-    assert said[0] == "resuming an interrupted estimation" and (scene / "sparse" / "0").is_dir()
+    caplog.clear()
+    estimate_with_fake_stages(tmp_path / "photos", scene)
+    assert caplog.messages[0] == "resuming an interrupted estimation" and (scene / "sparse" / "0").is_dir()
 
 
 def test_leftover_masks_are_not_used_in_place_of_the_given_ones(tmp_path):

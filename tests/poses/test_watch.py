@@ -142,7 +142,7 @@ def test_progress_reported_out_of_order_never_decreases(share, tmp_path):
 
     messages: list[float] = []
     estimation = _PoseEstimation(
-        tmp_path, tmp_path / "scene", "auto", None, 0, False, lambda _, done: messages.append(done), None
+        tmp_path, tmp_path / "scene", "auto", None, 0, False, lambda _, done: messages.append(done)
     )
     estimation._report_progress("matches", "matching", 0.9)
     estimation._report_progress("matches", "matching", share)

@@ -249,6 +249,14 @@ def test_only_rank_0_writes_and_its_metrics_name_two_processes(run_folder_and_ou
 
 
 @needs_ranks
+def test_only_rank_0_logs_that_a_checkpoint_cannot_be_written(tmp_path):
+    (tmp_path / "file").write_bytes(b"")
+    first, second = (end.result for end in run_on_ranks(tasks.log_lost_checkpoints, tmp_path / "file" / "a.pt"))
+    assert len(first) == 2 and all("without the checkpoint of step" in message for message in first)
+    assert second == []
+
+
+@needs_ranks
 def test_a_run_resumes_only_with_the_same_number_of_processes(run_folder_and_outcomes):
     folder, ends = run_folder_and_outcomes
     with pytest.raises(HyrfError, match=r"other settings \(processes\)"):

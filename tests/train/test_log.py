@@ -125,13 +125,12 @@ def test_a_log_that_cannot_be_written_is_an_error_before_the_first_step(tmp_path
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
-def test_a_full_disk_ends_the_log_and_not_the_run() -> None:
-    said: list[str] = []
-    with TrainingLog(Path("/dev/full"), 3, 0, CPU_DEVICE, said.append) as written:
+def test_a_full_disk_ends_the_log_and_not_the_run(caplog: pytest.LogCaptureFixture) -> None:
+    with TrainingLog(Path("/dev/full"), 3, 0, CPU_DEVICE) as written:
         for step in (1, 2, 3):
             written.step(step, 1.0, 0.1, 7)
         written.end(complete=True, step=3)
-    assert len(said) == 1 and "training continues without it" in said[0]
+    assert len(caplog.messages) == 1 and "training continues without it" in caplog.messages[0]
 
 
 def test_scalars_are_written_to_tensorboard_where_it_is_installed(

@@ -178,14 +178,14 @@ def mask_all_pixels(view: View) -> View:
 
 
 @pytest.mark.usefixtures("short_pilots")
-def test_a_run_takes_the_budget_of_its_pilots_and_records_the_reason(tmp_path, monkeypatch, capsys):
+def test_a_run_takes_the_budget_of_its_pilots_and_records_the_reason(tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(decisions, "measure_budget", lambda *_: (0.5, "by a coin"))
     train_model(make_scene(), tmp_path, TrainConfig(steps=10))
     metrics = json.loads((tmp_path / "metrics.json").read_bytes())
     assert metrics["settings"]["budget_factor"] == 0.5
     reason = metrics["choices"]["max_gaussians"]
     assert reason.startswith("2,500: 0.5 times what suits ") and reason.endswith(" steps; by a coin")
-    assert f"Gaussian budget: {reason}" in capsys.readouterr().err
+    assert f"Gaussian budget: {reason}" in caplog.messages
 
 
 def interrupt_at(step: int):

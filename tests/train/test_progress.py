@@ -9,6 +9,7 @@ import time
 import pytest
 from rich.console import Console
 
+from hyrfpack.cli.console import note
 from hyrfpack.train import progress
 from hyrfpack.train.progress import PhaseLine, ProgressLine, format_duration, format_speed
 
@@ -143,7 +144,7 @@ def test_a_terminal_gets_one_line_that_is_redrawn(width, monkeypatch):
     with ProgressLine(3000, 0) as line:
         for step in range(1, 605):
             line.update(step, 0.05, 0.001, 4850)
-        line.note("a sentence")
+        note("a sentence")
     shown = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", terminal.getvalue())
     lines = [part for part in re.split(r"[\r\n]+", shown) if part.strip()]
     assert max(map(len, lines)) <= width, lines
@@ -227,10 +228,9 @@ def test_compiling_in_the_first_steps_does_not_count_as_slowness(capsys, monkeyp
     assert "2.0 s/it" in capsys.readouterr().err.splitlines()[-1]
 
 
-def test_more_than_an_hour_is_reported_once_with_what_would_shorten_it(capsys, monkeypatch):
+def test_more_than_an_hour_is_reported_once_with_what_would_shorten_it(caplog, monkeypatch):
     report_steps(Clock(monkeypatch), steps=3000, seconds=12.0, count=40, advice="fewer --steps")
-    messages = [line for line in capsys.readouterr().err.splitlines() if "hours" in line]
-    assert messages == ["about 10.0 hours remain; to shorten the run, use fewer --steps"]
+    assert caplog.messages == ["about 10.0 hours remain; to shorten the run, use fewer --steps"]
 
 
 @pytest.mark.parametrize(
@@ -238,14 +238,14 @@ def test_more_than_an_hour_is_reported_once_with_what_would_shorten_it(capsys, m
     [(3000, 1.0, 200), (3000, 12.0, 4), (30_000, 1.0, 11)],
     ids=["less than an hour", "too few steps", "too few seconds"],
 )
-def test_short_runs_and_early_steps_give_no_note_about_hours(steps, seconds, count, capsys, monkeypatch):
+def test_short_runs_and_early_steps_give_no_note_about_hours(steps, seconds, count, caplog, monkeypatch):
     report_steps(Clock(monkeypatch), steps=steps, seconds=seconds, count=count, advice="fewer --steps")
-    assert "hours" not in capsys.readouterr().err
+    assert caplog.messages == []
 
 
-def test_quiet_suppresses_the_note_about_hours(capsys, monkeypatch):
+def test_quiet_suppresses_the_note_about_hours(caplog, monkeypatch):
     report_steps(Clock(monkeypatch), steps=3000, seconds=12.0, count=40, quiet=True, advice="fewer --steps")
-    assert capsys.readouterr() == ("", "")
+    assert caplog.messages == []
 
 
 # -- missing standard error ------------------------------------------------------------------------------------------
@@ -255,7 +255,7 @@ def test_without_standard_error_nothing_is_shown_and_training_continues(capsys, 
     monkeypatch.setattr(sys, "stderr", None)
     with ProgressLine(3, 0) as line:
         line.update(3, 1.0, 0.1, 5)
-        line.note("a sentence")
+        note("a sentence")
     assert capsys.readouterr().out == ""
 
 
@@ -267,7 +267,7 @@ def test_training_continues_when_standard_error_closes(terminal, monkeypatch):
     with ProgressLine(3, 0) as line:
         line.update(2, 1.0, 0.1, 5)
         gone.close()
-        line.note("a sentence")
+        note("a sentence")
         line.update(3, 1.0, 0.1, 5)
 
 

@@ -99,14 +99,13 @@ def test_metrics_missing_after_a_full_disk_are_completed_without_training(
 
 @pytest.mark.parametrize(("ending", "missing"), [("curve.png", "curve.png"), (".png", "views and curve.png")])
 def test_pictures_that_do_not_fit_do_not_fail_the_run(
-    full_disk_suffixes, fail_if_trained, tmp_path, capsys, ending, missing
+    full_disk_suffixes, fail_if_trained, tmp_path, caplog, ending, missing
 ):
     full_disk_suffixes.add(ending)
     result = train_model(make_scene(), tmp_path, SHORT_CONFIG)
     assert result.complete and read_metrics(tmp_path) == json.loads(json.dumps(result.metrics))
     verb = "is" if ending == "curve.png" else "are"
-    messages = capsys.readouterr().err
-    assert f"the model is finished, but {missing} {verb} missing" in messages
+    assert f"the model is finished, but {missing} {verb} missing" in caplog.messages[-1]
 
     full_disk_suffixes.clear()
     fail_if_trained()

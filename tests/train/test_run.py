@@ -190,12 +190,12 @@ def test_the_speed_of_a_resumed_run_covers_all_its_parts(finished, tmp_path):
     assert metrics["steps_per_second"] == pytest.approx(60 / metrics["seconds"])
 
 
-def test_a_long_run_prints_once_how_to_shorten_it(tmp_path, capsys, monkeypatch):
+def test_a_long_run_logs_once_how_to_shorten_it(tmp_path, caplog, monkeypatch):
     for name in ("MIN_ADVICE_STEPS", "MIN_ADVICE_SECONDS", "MIN_ADVICE_SECONDS_LEFT"):
         monkeypatch.setattr(progress, name, 0)
     train_model(make_scene(), tmp_path, dataclasses.replace(RUN_CONFIG, steps=8))
-    (messages,) = [line for line in capsys.readouterr().err.splitlines() if "hours remain" in line]
-    assert all(way in messages for way in ("fewer steps", "smaller photos", "fewer Gaussians", "a GPU"))
+    (message,) = [message for message in caplog.messages if "hours remain" in message]
+    assert all(way in message for way in ("fewer steps", "smaller photos", "fewer Gaussians", "a GPU"))
 
 
 # -- stopping and resuming -------------------------------------------------------------------------------------------

@@ -182,7 +182,7 @@ def test_serve_opens_the_browser_and_ends_at_an_interrupt_without_error(monkeypa
             os.kill(os.getpid(), signal.SIGINT)
 
     monkeypatch.setattr("webbrowser.open", visit)
-    serve(PAGE_HTML, open_browser=True, say=messages.append)
+    serve(PAGE_HTML, open_browser=True, on_ready=messages.append)
     assert messages[0].startswith("http://127.0.0.1:") and received == [messages[0], PAGE_HTML]
 
 
@@ -190,19 +190,19 @@ def test_a_port_in_use_is_reported_in_one_sentence():
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         with pytest.raises(HyrfError, match=rf"^port {port} of 127.0.0.1 is taken by another program; [^\n]*$"):
-            serve(PAGE_HTML, port=port, open_browser=False, say=lambda address: None)
+            serve(PAGE_HTML, port=port, open_browser=False, on_ready=lambda address: None)
 
 
 @pytest.mark.parametrize("host", ["192.0.2.1", "no such name", "a" * 70])
 def test_an_unusable_host_is_reported_in_one_sentence(host):
     with pytest.raises(HyrfError, match=rf"^nothing can listen at port 0 of {host} [^\n]*$"):
-        serve(PAGE_HTML, host=host, open_browser=False, say=lambda address: None)
+        serve(PAGE_HTML, host=host, open_browser=False, on_ready=lambda address: None)
 
 
 @pytest.mark.parametrize("host", ["", " "])
 def test_an_empty_host_is_refused(host):
     with pytest.raises(HyrfError, match="not an address to listen at.*127.0.0.1.*0.0.0.0"):
-        serve(PAGE_HTML, host=host, open_browser=False, say=lambda address: None)
+        serve(PAGE_HTML, host=host, open_browser=False, on_ready=lambda address: None)
 
 
 @pytest.mark.usefixtures("signals")
@@ -221,7 +221,7 @@ def test_a_closed_connection_prints_nothing(capsys: pytest.CaptureFixture, monke
     monkeypatch.setattr(
         "webbrowser.open", lambda address: threading.Thread(target=visit_in_a_hurry, args=[address]).start()
     )
-    serve(bytes(20_000_000), open_browser=True, say=lambda address: None)
+    serve(bytes(20_000_000), open_browser=True, on_ready=lambda address: None)
     assert capsys.readouterr().err == ""
 
 

@@ -140,7 +140,7 @@ def train_and_score(source: Path, out: Path, steps: int, photo_by_frame: dict[in
 
     `photo_by_frame` has the photo of each frame of a video, whose pixels replace those of held-out frames.
     """
-    hyrfpack.estimate_poses(source, out / "scene", overwrite=True, say=print)
+    hyrfpack.estimate_poses(source, out / "scene", overwrite=True)
     scene = hyrfpack.load_scene(out / "scene")
     if photo_by_frame is not None:
         scene = dataclasses.replace(scene, test=[_replace_by_photo(view, photo_by_frame) for view in scene.test])
