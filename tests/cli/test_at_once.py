@@ -9,9 +9,9 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import subprocess
-import sys
 from importlib import import_module
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import pytest
@@ -24,6 +24,7 @@ import hyrfpack
 from hyrfpack.compress.report import write_report
 from hyrfpack.data import load_scene
 from hyrfpack.demo.run import run_demo
+from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import CompressionReport, load_model, repack
 from hyrfpack.lock import exclusive_folder
@@ -58,6 +59,16 @@ def working_folder(template, tmp_path, monkeypatch) -> Path:
     folder = Path(shutil.copytree(template, tmp_path / "world"))
     monkeypatch.chdir(folder)
     return folder
+
+
+@pytest.fixture
+def quick_demo(monkeypatch) -> None:
+    """Reduce the demo to four photos of 16 pixels."""
+
+    def write_tiny_scene(folder: Path, views: int, size: int, overwrite: bool) -> Path:
+        return write_demo_scene(folder, views=4, size=16, overwrite=overwrite)
+
+    monkeypatch.setattr("hyrfpack.demo.run.write_demo_scene", write_tiny_scene)
 
 
 def create_foreign_file(path: str, patch: pytest.MonkeyPatch) -> None:
@@ -174,6 +185,7 @@ def test_bench_keeps_files_that_appear_meanwhile_and_updates_the_current_page(wo
         return measure(*arguments, **options)
 
     monkeypatch.setattr(import_module("hyrfpack.bench"), "benchmark_model", edited_meanwhile)
+    monkeypatch.setattr("hyrfpack.bench.codec.PROFILE_SETTING_VALUES", {})
     options = "--only codec --repeats 1 -o out.png --markdown page.md"
     result = succeeded("bench", "packed.hyrf", *options.split())
 
@@ -218,6 +230,7 @@ FOLDER_COMMANDS_WITH_FIXED_NAMES = [
 ]
 
 
+@pytest.mark.usefixtures("quick_demo")
 @pytest.mark.parametrize(("command", "asked"), FOLDER_COMMANDS_WITH_FIXED_NAMES)
 def test_a_file_that_appears_in_a_folder_with_fixed_names_is_kept(command, asked, working_folder, monkeypatch):
     create_foreign_file(asked, monkeypatch)
@@ -343,6 +356,7 @@ def test_a_library_call_locks_its_folder_while_it_writes(name, working_folder, m
 LOCKING_COMMANDS = [command for command in FOLDER_COMMANDS if "--resume" not in command and "pos" not in command]
 
 
+@pytest.mark.usefixtures("quick_demo")
 @pytest.mark.parametrize("command", LOCKING_COMMANDS)
 def test_a_command_locks_its_folder_while_it_writes(command, working_folder, monkeypatch):
     locked = record_lock_at_writes("out", monkeypatch)
@@ -369,35 +383,43 @@ def test_a_video_is_written_before_the_folder_is_unlocked(working_folder, monkey
     assert locked == [2]
 
 
-def test_two_simultaneous_trainings_in_one_folder_give_one_result_and_one_error(working_folder):
-    command = [sys.executable, "-m", "hyrfpack", "train", "data", *TINY_TRAINING_OPTIONS.split(), "-o", "out", "--seed"]
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2]), "HYRFPACK_THREADS": "1"}
-    both = [
-        subprocess.Popen([*command, seed], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-        for seed in ("1", "2")
-    ]
-    said = [process.communicate() for process in both]
+def run_at_once(*commands: str) -> list[tuple[int, str, str]]:
+    """Run commands in forked processes that start together; return exit code, output and messages of each."""
+    fork = get_context("fork")
+    barrier = fork.Barrier(len(commands))
 
-    assert sorted(process.returncode for process in both) == [0, 2], said
-    winner = 0 if both[0].returncode == 0 else 1
-    assert json.loads(Path("out/metrics.json").read_text())["settings"]["seed"] == winner + 1
-    assert len(load_model("out/model.hyrf")) and said[winner][0].startswith("out/model.hyrf: ")
-    (sentence,) = [line for line in said[1 - winner][1].splitlines() if line.startswith("Error: ")]
-    assert BUSY_FOLDER_ERROR in sentence or "the folder holds an earlier run" in sentence
+    def run(command: str, sender: Connection) -> None:
+        barrier.wait()
+        result = run_command(*command.split())
+        sender.send((result.exit_code, result.stdout, result.stderr))
+
+    started = []
+    for command in commands:
+        receiver, sender = fork.Pipe(duplex=False)
+        started.append((receiver, fork.Process(target=run, args=(command, sender))))
+        started[-1][1].start()
+        sender.close()  # so that a process that ends without a result is an error here
+    results = [receiver.recv() for receiver, _ in started]
+    for _, process in started:
+        process.join()
+    return results
 
 
-def test_two_simultaneous_compressions_to_one_file_keep_both_results(working_folder):
-    command = [sys.executable, "-m", "hyrfpack", "compress", "model.hyrf", "-o", "out.hyrf", "--profile", "paper"]
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2]), "HYRFPACK_THREADS": "1"}
-    both = [
-        subprocess.Popen(
-            [*command, "--json"], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )
-        for _ in range(2)
-    ]
-    said = [process.communicate() for process in both]
-    written = [json.loads(out)["file"] for process, (out, _) in zip(both, said, strict=True) if not process.returncode]
+def test_two_simultaneous_renderings_in_one_folder_give_one_result_and_one_error(working_folder):
+    results = run_at_once(*(f"render model.hyrf --orbit {count} -o out" for count in (1, 2)))
+
+    codes = [code for code, _, _ in results]
+    assert sorted(codes) == [0, 2], results
+    assert len(files_in(Path("out"))) == codes.index(0) + 1
+    (sentence,) = [line for line in results[codes.index(2)][2].splitlines() if line.startswith("Error: ")]
+    assert BUSY_FOLDER_ERROR in sentence or "there is a file of this name" in sentence  # if it started late
+
+
+def test_two_simultaneous_decompressions_to_one_file_keep_both_results(working_folder):
+    results = run_at_once(*["decompress packed.hyrf -o out.hyrf --json"] * 2)
+    written = [json.loads(output)["file"] for code, output, _ in results if code == 0]
 
     assert written and {path.name for path in Path().glob("out*.hyrf")} == set(written)
-    for process, (_, complaint) in zip(both, said, strict=True):  # a command that started late gets this error
-        assert process.returncode == 0 or "there is a file of this name" in complaint
+    assert len(written) == len(set(written))
+    for code, _, messages in results:  # a command that started late gets this error
+        assert code == 0 or "there is a file of this name" in messages
