@@ -136,11 +136,12 @@ def train_trainer(scene: Scene, steps: int = 100, exposure: bool = False) -> Tra
 
 
 def compress_to_bytes(profile: str, trainer: Trainer) -> bytes:
-    """Return the file that `hyrfpack compress` writes, with photos for the profiles that use them."""
+    """Return the file that `hyrfpack compress` writes, with two photos for the profiles that use them."""
+    photos = dataclasses.replace(trainer.scene, train=trainer.scene.train[:2])  # enough to measure sensitivity
     with TemporaryDirectory() as folder:
         raw, packed = Path(folder) / "model.hyrf", Path(folder) / "packed.hyrf"
         save_model(trainer.model, raw, "raw", {"psnr": min(mean_psnr(trainer.model, trainer.scene.train), 99.0)})
-        compress_model(raw, packed, profile, data=trainer.scene if profile == "compact" else None)
+        compress_model(raw, packed, profile, data=photos if profile == "compact" else None)
         return packed.read_bytes()
 
 
@@ -150,34 +151,35 @@ def compress_and_decode(profile: str, trainer: Trainer) -> HybridModel:
 
 # -- points and cameras ----------------------------------------------------------------------------------------------
 
-# Each start has a scene, the least gain over the best constant colour in dB, and the number of steps. The gain is about
-# half of what was measured (three fifths for 50 steps, a quarter for a single pixel). Without points the first
-# Gaussians fill the box at random, and those in front delay the training.
+# Each start has a scene, the least gain over the best constant colour in dB, and the number of steps. The gain is at
+# most half of what was measured (a quarter for a single pixel). Most starts show a gain after 25 or 50 steps. Six are
+# trained for longer: without points the first Gaussians fill the box at random, and those in front delay the training;
+# clipped pictures, a black one among others and transparent pixels delay it too.
 BAD_STARTS = {
-    "all points coincident": (lambda: scene_with_points(np.tile([0.1, 0.2, 0.3], (50, 1))), 3.5, 100),
-    "one point": (lambda: scene_with_points([[0.0, 0.0, 0.0]]), 3.5, 100),
-    "ten points": (lambda: scene_with_points(np.random.default_rng(0).normal(size=(10, 3)) * 0.3), 3.5, 100),
-    "no points": (lambda: drop_points(make_scene()), 3, 300),
+    "all points coincident": (lambda: scene_with_points(np.tile([0.1, 0.2, 0.3], (50, 1))), 1.2, 50),
+    "one point": (lambda: scene_with_points([[0.0, 0.0, 0.0]]), 1.1, 50),
+    "ten points": (lambda: scene_with_points(np.random.default_rng(0).normal(size=(10, 3)) * 0.3), 0.6, 50),
+    "no points": (lambda: drop_points(make_scene()), 2.5, 200),
     "all points a million units away": (
         lambda: scene_with_points(np.random.default_rng(0).normal(size=(50, 3)) + 1e6),
-        3,
-        100,
+        1.2,
+        50,
     ),
-    "one view": (lambda: scene_with_views(make_scene().train[:1]), 9, 50),
-    "one view and no points": (lambda: drop_points(scene_with_views(make_scene().train[:1])), 7, 100),
-    "views the same way": (parallel_views_scene, 6, 50),
-    "views the same way and no points": (lambda: drop_points(parallel_views_scene()), 2, 200),
-    "views from one place": (turning_camera_scene, 6, 50),
+    "one view": (lambda: scene_with_views(make_scene().train[:1]), 3.5, 25),
+    "one view and no points": (lambda: drop_points(scene_with_views(make_scene().train[:1])), 2.5, 50),
+    "views the same way": (parallel_views_scene, 2.3, 25),
+    "views the same way and no points": (lambda: drop_points(parallel_views_scene()), 1.4, 200),
+    "views from one place": (turning_camera_scene, 2.5, 25),
     "views from one place and no points": (lambda: drop_points(turning_camera_scene()), 2.5, 200),
-    "views from one place the same way": (repeated_photo_scene, 9, 50),
-    "one-pixel pictures": (one_pixel_scene, 9, 100),
-    "one-pixel pictures and no points": (lambda: drop_points(one_pixel_scene()), 6, 100),
+    "views from one place the same way": (repeated_photo_scene, 3.5, 25),
+    "one-pixel pictures": (one_pixel_scene, 2, 25),
+    "one-pixel pictures and no points": (lambda: drop_points(one_pixel_scene()), 0.7, 50),
     "one-pixel cut-outs and no points": (lambda: drop_points(one_pixel_scene(alpha=True)), 6, 100),
-    "one photo masked all over": (lambda: scene_with_edited_photos(mask_all_but_first), 5, 100),
+    "one photo masked all over": (lambda: scene_with_edited_photos(mask_all_but_first), 1.9, 25),
     "one black picture": (
         lambda: scene_with_edited_photos(lambda n, p: fill_with_level(0)(n, p) if n == 0 else p),
-        9,
-        200,
+        1.7,
+        100,
     ),
     "over-exposed threefold": (lambda: scene_with_edited_photos(alternate_exposures(3.0)), 2.5, 100),
 }
@@ -195,14 +197,22 @@ def test_bad_starts_beat_the_best_constant_colour_also_when_compressed(start):
         assert mean_psnr(compress_and_decode(profile, trainer), trainer.scene.train) > least, profile
 
 
-@pytest.mark.parametrize("distance", [1e5, 1e9, 1e20, 3e38])
-def test_a_few_far_outliers_do_not_affect_training(distance):
-    """Unchanged, the first could not be stored in half precision, and the last would overflow the scale limit S(p)."""
-    trainer = train_trainer(scene_with_outliers(distance))
+def test_a_few_far_outliers_do_not_affect_training():
+    """Unchanged, they could not be stored in half precision and would overflow the scale limit S(p)."""
+    trainer = train_trainer(scene_with_outliers(1e20))
 
     least = best_constant_psnr(trainer.scene.train) + 2
     for profile in LOSSY_PROFILES:
         assert mean_psnr(compress_and_decode(profile, trainer), trainer.scene.train) > least, profile
+
+
+@pytest.mark.parametrize("distance", [1e5, 1e9, 3e38])
+def test_the_distance_of_far_outliers_does_not_change_the_start(distance):
+    """None of them can be stored in half precision, and the squares of the largest overflow."""
+    here, far = (Trainer(scene_with_outliers(d), TrainConfig(steps=1)).model for d in (distance, 1e20))
+
+    for one, other in zip(here.parameters(), far.parameters(), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
 
 
 def test_far_outliers_are_moved_closer_along_their_direction():
@@ -223,7 +233,7 @@ def test_far_outliers_are_moved_closer_along_their_direction():
 @pytest.fixture(scope="module", params=[0, 255], ids=["black", "white"])
 def trainer_on_one_level(request: pytest.FixtureRequest) -> Trainer:
     """A trainer that was trained on pictures of one level. Tests must not change it."""
-    return train_trainer(scene_with_edited_photos(fill_with_level(request.param)))
+    return train_trainer(scene_with_edited_photos(fill_with_level(request.param)), 40)
 
 
 @pytest.mark.parametrize("profile", ["raw", "paper", "compact"])
@@ -244,15 +254,15 @@ def alternating_exposure_scene(*gains: float) -> tuple[Scene, list[View]]:
 
 
 # Without gains, direction-dependent colours absorb the exposure of each photo, and views between photos suffer.
-# Measured in dB over the best constant colour of held-out views: 7.6 where each second photo is a fifth darker (5.5
-# without gains), and 6.9 where it is half as bright (-2.3).
+# Measured in dB over the best constant colour of held-out views: 7.5 where each second photo is a fifth darker (6.5
+# without gains), and 7.4 where it is half as bright (-1.2).
 @pytest.mark.parametrize(("gains", "without"), [((1.0, 0.8), 7), ((1.0, 0.5), 0)])
 def test_exposure_that_jumps_between_photos_is_kept_out_of_the_model(gains, without):
     scene, between = alternating_exposure_scene(*gains)
     scene = dataclasses.replace(scene, tracks=visible_points_by_photo(scene, facing=0.0))
 
-    trainer = train_trainer(scene, 150, exposure=True)
-    plain = train_trainer(scene, 150)
+    trainer = train_trainer(scene, exposure=True)
+    plain = train_trainer(scene)
 
     assert trainer.exposures is not None and plain.exposures is None
     assert mean_psnr(trainer.model, between) > best_constant_psnr(between) + 4.5
@@ -277,18 +287,16 @@ def test_two_exposures_of_one_photo_are_trained_to_a_value_between_them():
 
 def test_a_power_of_two_as_unit_changes_no_bit_of_model_and_file():
     """Not even rounding depends on the unit; of the file, only the frame in the metadata differs."""
-    here, *there = (train_trainer(make_scene(scale=unit), 40) for unit in (1.0, 2.0**20, 2.0**-20))
-    files = {profile: read_container(compress_to_bytes(profile, here)) for profile in PROFILES}
+    small, large = (train_trainer(make_scene(scale=unit), 20) for unit in (2.0**-20, 2.0**20))
 
-    for other in there:
-        assert all(torch.equal(a, b) for a, b in zip(here.model.parameters(), other.model.parameters(), strict=True))
-        for profile, file in files.items():
-            sections = zip(file.sections, read_container(compress_to_bytes(profile, other)).sections, strict=True)
-            assert [s.type for s, t in sections if s.data != t.data] == ["META"]
+    assert all(torch.equal(a, b) for a, b in zip(small.model.parameters(), large.model.parameters(), strict=True))
+    for profile in PROFILES:
+        files = (read_container(compress_to_bytes(profile, trainer)).sections for trainer in (small, large))
+        assert [s.type for s, t in zip(*files, strict=True) if s.data != t.data] == ["META"]
 
 
 def test_millimetres_and_kilometres_compress_to_the_same_quality_and_size():
-    trainers = [train_trainer(make_scene(scale=scale)) for scale in (1e3, 1e-3)]
+    trainers = [train_trainer(make_scene(scale=scale), 25) for scale in (1e3, 1e-3)]
     for profile in LOSSY_PROFILES:
         files = [compress_to_bytes(profile, trainer) for trainer in trainers]
         pairs = zip(files, trainers, strict=True)
@@ -309,20 +317,17 @@ def rescale_scene(scene: Scene, unit: float) -> Scene:
 
 
 def test_real_photos_in_millimetres_and_kilometres_give_the_same_quality(shared_data):
-    scene = load_scene(shared_data / "drone_caliterra")
+    scene = load_scene(shared_data / "drone_caliterra", max_size=100)
     scores = []
     for unit in (1e3, 1e-3):
         in_unit = rescale_scene(scene, unit)
-        trainer = Trainer(in_unit, TrainConfig(steps=40, max_gaussians=3000))
+        trainer = Trainer(in_unit, TrainConfig(steps=40, max_gaussians=1000))
         trainer.run()
-        trainer.scene = dataclasses.replace(
-            in_unit, train=in_unit.train[:3]
-        )  # three photos are enough to measure sensitivity
         models = (trainer.model, *(compress_and_decode(profile, trainer) for profile in LOSSY_PROFILES))
         scores += [evaluate_model(model, in_unit.test[:2]).psnr for model in models]
 
     assert scores[3:] == pytest.approx(scores[:3], abs=0.1)
-    assert min(scores) > best_constant_psnr(scene.test[:2]) + 2
+    assert min(scores) > best_constant_psnr(scene.test[:2]) + 0.8
 
 
 # -- rejected inputs -------------------------------------------------------------------------------------------------
