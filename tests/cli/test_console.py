@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import io
 import json
 import logging
 import os
@@ -9,6 +11,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from threading import Event
 
 import click
 import pytest
@@ -21,6 +24,7 @@ from hyrfpack.cli import main
 from hyrfpack.cli.common import format_table, note
 from hyrfpack.cli.console import notes_only_of
 from hyrfpack.cli.files import _command_as_typed
+from hyrfpack.cli.progress import show_item_progress
 from hyrfpack.format import describe_file, save_model
 
 REPOSITORY_ROOT = Path(__file__).parents[2]
@@ -182,23 +186,33 @@ def test_a_command_leaves_the_loggers_as_they_were(exists, model, tmp_path, caps
 
 # -- missing streams -------------------------------------------------------------------------------------------------
 
-# The command line, with an `info` that also prints a note and shows progress.
+# The command line, with an `info` that also prints a note.
 LOUD_INFO_SCRIPT = """
 from hyrfpack import format
 from hyrfpack.cli import main
-from hyrfpack.cli.console import note
-from hyrfpack.cli.progress import show_item_progress
+from hyrfpack.cli.common import note
 
 describe_file = format.describe_file
 
 def describe_loudly(path):
     note("a note")
-    list(show_item_progress(range(3), 3, "info", "number"))
     return describe_file(path)
 
 format.describe_file = describe_loudly
 main()
 """
+
+
+class FullDisk(io.StringIO):
+    """A stream that raises an error when it is written to."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.tried = Event()
+
+    def write(self, text: str) -> int:
+        self.tried.set()
+        raise OSError(errno.ENOSPC, "No space left on device")
 
 
 @pytest.mark.skipif(os.name == "nt", reason="a shell of Unix closes them")
@@ -209,11 +223,19 @@ def test_training_completes_with_standard_error_closed(data, tmp_path):
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="there is no /dev/full")
-@pytest.mark.parametrize("redirections", ["2>/dev/full", "<&- >&- 2</dev/null"])
-def test_notes_and_progress_that_cannot_be_printed_do_not_end_the_command(redirections, model):
-    done = shell(redirections, sys.executable, "-c", LOUD_INFO_SCRIPT, "info", model)
-    assert done.returncode == 0 and done.stderr == ""
-    assert done.stdout.startswith(str(model)) is (">&- 2" not in redirections)
+@pytest.mark.parametrize("redirection", ["2>/dev/full", "2>&-", "2</dev/null"])
+def test_unprintable_notes_do_not_end_the_command(redirection, model):
+    done = shell(redirection, sys.executable, "-c", LOUD_INFO_SCRIPT, "info", model)
+    assert done.returncode == 0 and done.stdout.startswith(str(model))
+
+
+def test_progress_that_cannot_be_printed_does_not_end_the_work(monkeypatch):
+    disk, failures = FullDisk(), []
+    monkeypatch.setattr(sys, "stderr", disk)
+    monkeypatch.setattr("threading.excepthook", failures.append)
+    monkeypatch.setattr("hyrfpack.make.display.LOG_INTERVAL_SECONDS", 0.01)
+    shown = [number for number in show_item_progress(range(2), 2, "render", "picture") if disk.tried.wait(10)]
+    assert shown == [0, 1] and not failures
 
 
 @pytest.mark.skipif(os.name == "nt", reason="a shell of Unix closes them")
@@ -227,8 +249,9 @@ def test_no_file_gets_the_descriptor_of_a_closed_stream():
 
 
 @pytest.mark.skipif(os.name == "nt", reason="a shell of Unix closes them")
-def test_a_closed_standard_output_gives_no_traceback(model):
-    done = run_program(">&-", "info", model)
+@pytest.mark.parametrize("redirections", [">&-", "<&- >&- 2</dev/null"])
+def test_a_command_completes_without_standard_output(redirections, model):
+    done = run_program(redirections, "info", model)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
