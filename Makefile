@@ -10,7 +10,7 @@ BIN := .venv/bin
 VENV_STAMP := .venv/.ready
 NODE_STAMP := tests/node/node_modules/.ready
 
-.PHONY: help demo test test-browsers test-newest test-oldest docs player bench gpu speed sets choices ablations precision kill races fuzz fuzz-browser lint format clean
+.PHONY: help demo test test-browsers test-newest test-oldest docs player golden bench gpu speed sets choices ablations precision kill races fuzz fuzz-browser lint format clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z.-]+:.*## / { printf "  make %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -53,6 +53,9 @@ docs: $(VENV_STAMP) ## build the documentation site in site/; a broken link is a
 
 player: $(VENV_STAMP) $(NODE_STAMP) ## minify the web player's scripts again after a change
 	$(BIN)/python -m tools.browser.shorten
+
+golden: $(VENV_STAMP) ## train the golden models of the tests again, after a change that improves training (a minute)
+	$(BIN)/python -m tools.safety.train_golden
 
 bench: $(VENV_STAMP) ## time each hot operation at several sizes against its references
 	$(BIN)/python -m tools.bench

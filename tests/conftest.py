@@ -89,10 +89,13 @@ def quick_distillation(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="session")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of ten small photos of the demo scene, with poses. Tests must not change it."""
-    from hyrfpack.demo.scene import write_demo_scene
+    """A folder of ten small photos of the demo scene, with poses. Tests must not change it.
 
-    return write_demo_scene(tmp_path_factory.mktemp("data"), views=10, size=48)
+    The golden model of the demo scene is trained on the same photos.
+    """
+    from tools.safety.train_golden import write_demo_photos
+
+    return write_demo_photos(tmp_path_factory.mktemp("data"))
 
 
 @pytest.fixture(scope="session")
