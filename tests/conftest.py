@@ -87,6 +87,17 @@ def quick_distillation(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pack, "MAX_TRIALS", 2)
 
 
+@pytest.fixture(scope="module")
+def quick_calibration() -> Iterator[None]:
+    """Measure sensitivities of profile "compact" in few small views and correct them once, in all tests of a module."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("hyrfpack.compress.sensitivity.MAX_SENSITIVITY_VIEWS", 8)
+        patch.setattr("hyrfpack.compress.calibrate.MIN_COMPARISON_VIEWS", 4)
+        patch.setattr("hyrfpack.compress.calibrate.MAX_COMPARISON_VIEWS", 4)
+        patch.setattr("hyrfpack.compress.calibrate.MAX_CORRECTION_ROUNDS", 1)
+        yield
+
+
 @pytest.fixture(scope="session")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder of ten small photos of the demo scene, with poses. Tests must not change it.

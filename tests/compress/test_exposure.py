@@ -1,4 +1,4 @@
-"""Packing a model that was trained with exposure compensation keeps its mean exposure and its exposure map."""
+"""Packing the golden model that was trained with exposure compensation keeps its mean exposure and its exposure map."""
 
 from __future__ import annotations
 
@@ -19,9 +19,11 @@ from hyrfpack.format import describe_file, load_model, save_model
 from hyrfpack.format.codec import load_with_provenance
 from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.scene import Scene, View
-from hyrfpack.train import TrainConfig, train_model
+from tools.safety.train_golden import EXPOSED_MODEL_FILE
 
+pytestmark = pytest.mark.usefixtures("quick_calibration")
 PHOTO_GAINS = alternating_gains(8, stops=1.0)
+FINETUNE_STEPS = 64
 MEAN_GAIN = np.exp(np.log(PHOTO_GAINS).mean())
 
 
@@ -39,14 +41,13 @@ def mean_exposure_views() -> list[View]:
 
 
 @pytest.fixture(scope="module")
-def model_file(scene, tmp_path_factory) -> Path:
-    """Train a model at the mean exposure and write it without an exposure map, as earlier versions did."""
-    folder = tmp_path_factory.mktemp("trained")
-    config = TrainConfig(steps=150, max_gaussians=300, exposure=True)
-    model, provenance = load_with_provenance(train_model(scene, folder / "run", config, quiet=True).model)
+def model_file(tmp_path_factory) -> Path:
+    """Write the golden model, which is at the mean exposure, without its map, as earlier versions did."""
+    model, provenance = load_with_provenance(EXPOSED_MODEL_FILE)
     model.exposure = None
-    save_model(model, folder / "model.hyrf", provenance={**provenance, "mean_exposure": True})
-    return folder / "model.hyrf"
+    path = tmp_path_factory.mktemp("mean") / "model.hyrf"
+    save_model(model, path, provenance={**provenance, "mean_exposure": True})
+    return path
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +100,7 @@ def test_finetuning_keeps_the_mean_exposure_and_its_note_in_the_file(
 ):
     scores, notes_found = [], []
     for source in (model_file, file_without_exposure_note):
-        compress_model(source, tmp_path / "small.hyrf", data=scene, finetune_steps=160)
+        compress_model(source, tmp_path / "small.hyrf", data=scene, finetune_steps=FINETUNE_STEPS)
         scores.append(evaluate_model(load_model(tmp_path / "small.hyrf"), mean_exposure_views).psnr)
         notes_found.append(has_mean_exposure(describe_file(tmp_path / "small.hyrf")["provenance"]))
 
@@ -109,7 +110,7 @@ def test_finetuning_keeps_the_mean_exposure_and_its_note_in_the_file(
 
 def test_finetuning_keeps_the_map_and_the_consistent_exposure_and_improves_the_fit(file_with_map, scene, tmp_path):
     compress_model(file_with_map, tmp_path / "coarse.hyrf", data=scene, distortion=2e-4)
-    compress_model(file_with_map, tmp_path / "fitted.hyrf", data=scene, distortion=2e-4, finetune_steps=160)
+    compress_model(file_with_map, tmp_path / "fitted.hyrf", data=scene, distortion=2e-4, finetune_steps=FINETUNE_STEPS)
 
     tuned = load_model(tmp_path / "fitted.hyrf")
     for name, values in vars(load_model(file_with_map).exposure).items():
@@ -122,7 +123,7 @@ def test_finetuning_keeps_the_map_and_the_consistent_exposure_and_improves_the_f
 
 def test_finetuning_does_not_compensate_errors_of_the_map(model_file, scene, tmp_path):
     source = write_model_with_map(model_file, scene, 1.5 * PHOTO_GAINS / MEAN_GAIN, tmp_path / "light.hyrf")
-    compress_model(source, tmp_path / "fitted.hyrf", data=scene, finetune_steps=160)
+    compress_model(source, tmp_path / "fitted.hyrf", data=scene, finetune_steps=FINETUNE_STEPS)
     # The map is wrong by log 1.5 = 0.41.
     assert abs(mean_log_gain_between(source, tmp_path / "fitted.hyrf", scene)) < 0.03
 

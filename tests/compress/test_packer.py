@@ -1,4 +1,4 @@
-"""Compress a trained file end to end, on photos of the demo scene."""
+"""Compress the golden model of the demo scene with its photos, and small models where a claim needs no trained one."""
 
 from __future__ import annotations
 
@@ -10,20 +10,23 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from scenes import ball_points, small_model
+from scenes import ball_points, ball_scene, small_model
 
 import hyrfpack
-from hyrfpack.cameras.capture import MAX_COARSE_CAMERAS, quantized_provenance
+from hyrfpack.cameras.capture import MAX_COARSE_CAMERAS, provenance_cameras, quantized_provenance
 from hyrfpack.compress import compress_model
 from hyrfpack.compress import packer as running
+from hyrfpack.compress.calibrate import measure_calibrated_sensitivity
 from hyrfpack.compress.distortion import default_distortion
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import evaluate_model
 from hyrfpack.format import describe_file, load_model, save_model
+from hyrfpack.format.codec import load_with_provenance
 from hyrfpack.render import render_view
 from hyrfpack.scene import Scene
-from hyrfpack.train import TrainConfig, train_model
+from tools.safety.train_golden import DEMO_COMPACT_FILE, DEMO_MODEL_FILE
 
+START_DISTORTION = default_distortion(describe_file(DEMO_MODEL_FILE)["provenance"])
 RECORDED_SIZES_FILE = Path(__file__).parents[1] / "golden" / "trained_sizes.json"
 
 
@@ -33,28 +36,39 @@ def scene(data) -> Scene:
 
 
 @pytest.fixture(scope="module")
-def trained_file(scene, tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("runs") / "small"
-    return train_model(scene, folder, TrainConfig(steps=250, max_gaussians=1500), quiet=True).model
-
-
-@pytest.fixture(scope="module")
-def paper_file(trained_file, tmp_path_factory) -> Path:
+def paper_file(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("packed") / "paper.hyrf"
-    compress_model(trained_file, path, "paper")
+    compress_model(DEMO_MODEL_FILE, path, "paper")
     return path
 
 
 @pytest.fixture(scope="module")
-def compact_file_and_report(trained_file, scene, tmp_path_factory) -> tuple[Path, object]:
+def compact_file_and_report(scene, tmp_path_factory) -> tuple[Path, object]:
     path = tmp_path_factory.mktemp("packed") / "compact.hyrf"
-    return path, compress_model(trained_file, path, data=scene)
+    return path, compress_model(DEMO_MODEL_FILE, path, data=scene)
 
 
 @pytest.fixture(scope="module")
-def finetuned_file(trained_file, scene, tmp_path_factory) -> Path:
+def demo_packer(scene, compact_file_and_report) -> running.Packer:
+    """Return a packer of the golden model with the sensitivities that were measured for the compact file."""
+    sensitivity = compact_file_and_report[1].sensitivity
+    return running.Packer(load_model(DEMO_MODEL_FILE), {}, sensitivity, scene, 0, True)
+
+
+@pytest.fixture(scope="module")
+def ball_file(tmp_path_factory) -> Path:
+    """Write an untrained model of the balls with the cameras of `ball_scene`."""
+    path = tmp_path_factory.mktemp("balls") / "balls.hyrf"
+    model = small_model(ball_points(60)[0], fields=0.2, scale_logits=-2.0)
+    cameras = provenance_cameras([view.camera for view in ball_scene().train])
+    save_model(model, path, provenance={"cameras": cameras, "psnr": 20.0})
+    return path
+
+
+@pytest.fixture(scope="module")
+def finetuned_file(scene, tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("packed") / "tuned.hyrf"
-    compress_model(trained_file, path, data=scene, finetune_steps=60)
+    compress_model(DEMO_MODEL_FILE, path, data=scene, finetune_steps=60)
     return path
 
 
@@ -75,24 +89,25 @@ def mean_squared_error(first: Path, second: Path, cameras) -> float:
 # -- size and loss --------------------------------------------------------------------------------------------------
 
 
-def test_compact_is_much_smaller_than_paper_with_little_loss(trained_file, paper_file, compact_file_and_report, scene):
+def test_compact_is_much_smaller_than_paper_with_little_loss(paper_file, compact_file_and_report, scene):
     path, _ = compact_file_and_report
 
     assert path.stat().st_size < 0.4 * paper_file.stat().st_size
-    assert psnr(path, scene) > psnr(trained_file, scene) - 0.1
+    assert psnr(path, scene) > psnr(DEMO_MODEL_FILE, scene) - 0.1
 
 
-def test_compact_with_the_loss_of_paper_is_smaller(trained_file, paper_file, scene, tmp_path):
-    allowed = max(psnr(trained_file, scene) - psnr(paper_file, scene), 0.0) + 0.02
+def test_compact_with_the_loss_of_paper_is_smaller(demo_packer, paper_file, scene):
+    allowed = max(psnr(DEMO_MODEL_FILE, scene) - psnr(paper_file, scene), 0.0) + 0.02
 
-    report = compress_model(trained_file, tmp_path / "small.hyrf", data=scene, max_psnr_drop=allowed)
+    candidate, found = demo_packer.encode_within_psnr_drop(allowed, START_DISTORTION)
 
-    assert psnr(trained_file, scene) - psnr(tmp_path / "small.hyrf", scene) <= allowed + 1e-6
-    assert report.bytes_after < 0.7 * paper_file.stat().st_size
-    assert f"of {allowed:g} dB on {len(scene.test)} photos" in report.found
+    after = evaluate_model(demo_packer.decode(candidate), scene.test).psnr
+    assert psnr(DEMO_MODEL_FILE, scene) - after <= allowed + 1e-6
+    assert len(candidate.data) < 0.7 * paper_file.stat().st_size
+    assert f"of {allowed:g} dB on {len(scene.test)} photos" in found
 
 
-def test_the_report_matches_the_file_and_predicts_the_error(trained_file, compact_file_and_report, scene):
+def test_the_report_matches_the_file_and_predicts_the_error(compact_file_and_report, scene):
     path, report = compact_file_and_report
 
     assert report.profile == "compact" == describe_file(path)["profile"]
@@ -100,16 +115,16 @@ def test_the_report_matches_the_file_and_predicts_the_error(trained_file, compac
     assert report.gaussians == len(load_model(path))
     assert sum(report.shares.values()) == pytest.approx(1) and min(report.shares.values()) >= 0
     assert set(report.shares) == {"pruned", "POSI", "COLO", "SCAL", "OPAC", "GTAB", "GMLP", "RTAB", "RMLP"}
-    measured = mean_squared_error(trained_file, path, [view.camera for view in scene.train])
+    measured = mean_squared_error(DEMO_MODEL_FILE, path, [view.camera for view in scene.train])
     assert report.error / 1.5 < measured < 1.5 * report.error
 
 
-def test_the_measured_error_is_close_to_the_requested_distortion(trained_file, scene, tmp_path):
+def test_the_measured_error_is_close_to_the_requested_distortion(scene, tmp_path):
     cameras = [view.camera for view in scene.train]
     sizes, errors = [], []
-    for distortion in (1e-4, 1e-5, 1e-6):
-        report = compress_model(trained_file, tmp_path / "small.hyrf", data=scene, distortion=distortion)
-        errors.append(mean_squared_error(trained_file, tmp_path / "small.hyrf", cameras))
+    for distortion in (1e-4, 1e-6):
+        report = compress_model(DEMO_MODEL_FILE, tmp_path / "small.hyrf", data=scene, distortion=distortion)
+        errors.append(mean_squared_error(DEMO_MODEL_FILE, tmp_path / "small.hyrf", cameras))
         sizes.append(report.bytes_after)
         assert distortion / 1.75 < errors[-1] < 1.75 * distortion
 
@@ -117,30 +132,32 @@ def test_the_measured_error_is_close_to_the_requested_distortion(trained_file, s
 
 
 @pytest.mark.parametrize("share", [0.4, 0.8, 1.5])
-def test_a_target_size_is_met_and_nearly_reached(share, trained_file, compact_file_and_report, scene, tmp_path):
+def test_a_target_size_is_met_and_nearly_reached(share, demo_packer, compact_file_and_report):
     target = int(share * compact_file_and_report[1].bytes_after)
 
-    report = compress_model(trained_file, tmp_path / "small.hyrf", data=scene, target_bytes=target)
+    candidate, found = demo_packer.encode_within_bytes(target, START_DISTORTION)
 
-    assert 0.9 * target < (tmp_path / "small.hyrf").stat().st_size <= target
-    assert f"of {target:,} bytes" in report.found
+    assert 0.9 * target < len(candidate.data) <= target
+    assert f"of {target:,} bytes" in found
 
 
-def test_finetuning_raises_the_psnr_at_the_same_size(trained_file, finetuned_file, scene, tmp_path):
-    compress_model(trained_file, tmp_path / "plain.hyrf", data=scene, target_bytes=finetuned_file.stat().st_size)
+def test_finetuning_raises_the_psnr_at_the_same_size(demo_packer, finetuned_file, scene):
+    plain, _ = demo_packer.encode_within_bytes(finetuned_file.stat().st_size, START_DISTORTION)
 
-    fits = [evaluate_model(load_model(path), scene.train).psnr for path in (finetuned_file, tmp_path / "plain.hyrf")]
+    fits = [
+        evaluate_model(model, scene.train).psnr for model in (load_model(finetuned_file), demo_packer.decode(plain))
+    ]
     assert fits[0] > fits[1] + 0.1
 
 
-def test_sizes_after_training_packing_and_export_match_the_recorded_ones(
-    trained_file, paper_file, compact_file_and_report, finetuned_file, tmp_path
+def test_sizes_after_packing_and_export_match_the_recorded_ones(
+    paper_file, compact_file_and_report, finetuned_file, tmp_path
 ):
     """If a change is meant to change sizes, record the sizes in the message of this test as the new ones."""
     exported = tmp_path / "small.spz"
     hyrfpack.export_model(compact_file_and_report[0], exported, degree=1)
     files = {
-        "raw": trained_file,
+        "raw": DEMO_MODEL_FILE,
         "paper": paper_file,
         "compact": compact_file_and_report[0],
         "fine-tuned": finetuned_file,
@@ -152,35 +169,33 @@ def test_sizes_after_training_packing_and_export_match_the_recorded_ones(
     assert sizes == pytest.approx(json.loads(RECORDED_SIZES_FILE.read_text()), rel=0.01)
 
 
-def test_results_do_not_depend_on_the_number_of_threads(
-    trained_file, compact_file_and_report, scene, tmp_path, monkeypatch
-):
+def test_results_do_not_depend_on_the_number_of_threads(compact_file_and_report, scene, tmp_path, monkeypatch):
     for threads in ("1", "3"):
         monkeypatch.setenv("HYRFPACK_THREADS", threads)
-        compress_model(trained_file, tmp_path / "small.hyrf", data=scene)
+        compress_model(DEMO_MODEL_FILE, tmp_path / "small.hyrf", data=scene)
 
         assert (tmp_path / "small.hyrf").read_bytes() == compact_file_and_report[0].read_bytes()
 
 
 @pytest.mark.parametrize("limit", [{"target_bytes": 9000}, {"max_psnr_drop": 0.3}], ids=["size", "loss"])
-def test_finetuning_respects_limits(limit, trained_file, scene, tmp_path):
-    report = compress_model(trained_file, tmp_path / "small.hyrf", data=scene, finetune_steps=20, **limit)
+def test_finetuning_respects_limits(limit, scene, tmp_path):
+    report = compress_model(DEMO_MODEL_FILE, tmp_path / "small.hyrf", data=scene, finetune_steps=5, **limit)
 
     if "target_bytes" in limit:
         assert 0.6 * 9000 < report.bytes_after <= 9000
     else:
-        assert psnr(trained_file, scene) - psnr(tmp_path / "small.hyrf", scene) <= 0.3 + 1e-6
+        assert psnr(DEMO_MODEL_FILE, scene) - psnr(tmp_path / "small.hyrf", scene) <= 0.3 + 1e-6
 
 
-def test_pruning_removes_gaussians_and_bytes_and_can_be_disabled(trained_file, scene, tmp_path):
-    model = load_model(trained_file)
+def test_pruning_removes_gaussians_and_bytes_and_can_be_disabled(ball_file, tmp_path):
+    model, provenance = load_with_provenance(ball_file)
     every = len(model)
     with torch.no_grad():
         model.gaussians.opacity_logits[: every // 3] -= 20  # makes them almost invisible
-    save_model(model, tmp_path / "some.hyrf")
+    save_model(model, tmp_path / "some.hyrf", provenance=provenance)
 
-    kept = compress_model(tmp_path / "some.hyrf", tmp_path / "all.hyrf", data=scene, distortion=1e-4, prune=False)
-    pruned = compress_model(tmp_path / "some.hyrf", tmp_path / "fewer.hyrf", data=scene, distortion=1e-4)
+    kept = compress_model(tmp_path / "some.hyrf", tmp_path / "all.hyrf", distortion=1e-4, prune=False)
+    pruned = compress_model(tmp_path / "some.hyrf", tmp_path / "fewer.hyrf", distortion=1e-4)
 
     assert kept.gaussians == every > every - every // 3 >= pruned.gaussians > every / 4
     assert pruned.bytes_after < kept.bytes_after
@@ -268,51 +283,49 @@ def test_unreadable_photos_do_not_stop_packing(monkeypatch, caplog):
     assert caplog.messages == ["a.png: the file is gone; copy it again; the loss on training photos is not measured"]
 
 
-def test_without_photos_the_stored_cameras_are_used(trained_file, scene, tmp_path, caplog):
+def test_without_photos_the_stored_cameras_and_the_stored_psnr_are_used(ball_file, tmp_path, monkeypatch):
     """The stored cameras equal those of the photos to nine digits."""
-    wanted = default_distortion(hyrfpack.describe_file(trained_file)["provenance"])
+    poses, distortions = [], []
 
-    report = compress_model(trained_file, tmp_path / "small.hyrf")
-    beside = compress_model(trained_file, tmp_path / "beside.hyrf", data=scene, distortion=wanted)
+    def measure_and_record(model, cameras, distortion, *rest):
+        poses.append([camera.camera_from_world for camera in cameras])
+        distortions.append(distortion)
+        return measure_calibrated_sensitivity(model, cameras, distortion, *rest)
 
-    assert f"at {len(scene.train)} cameras" in caplog.messages[0]
-    assert report.bytes_after == pytest.approx(beside.bytes_after, rel=0.02)
+    monkeypatch.setattr(running, "measure_calibrated_sensitivity", measure_and_record)
+    compress_model(ball_file, tmp_path / "small.hyrf")
+
+    assert distortions == pytest.approx([2.33e-4], rel=0.01)
+    np.testing.assert_allclose(poses, [[view.camera.camera_from_world for view in ball_scene().train]], atol=1e-8)
 
 
-def test_without_photos_and_cameras_an_orbit_is_used(trained_file, compact_file_and_report, scene, tmp_path):
-    provenance = describe_file(trained_file)["provenance"]
+def test_without_photos_and_cameras_an_orbit_is_used(compact_file_and_report, scene, tmp_path):
+    provenance = describe_file(DEMO_MODEL_FILE)["provenance"]
     del provenance["cameras"]
-    save_model(load_model(trained_file), tmp_path / "bare.hyrf", "raw", provenance)
+    save_model(load_model(DEMO_MODEL_FILE), tmp_path / "bare.hyrf", "raw", provenance)
 
     report = compress_model(tmp_path / "bare.hyrf", tmp_path / "small.hyrf")
 
     assert report.bytes_after < 2 * compact_file_and_report[1].bytes_after
-    assert psnr(tmp_path / "small.hyrf", scene) > psnr(trained_file, scene) - 1
+    assert psnr(tmp_path / "small.hyrf", scene) > psnr(DEMO_MODEL_FILE, scene) - 1
 
 
-def test_provenance_is_kept_with_a_sample_of_cameras(trained_file, compact_file_and_report, paper_file):
-    before, after = describe_file(trained_file)["provenance"], describe_file(compact_file_and_report[0])["provenance"]
+def test_provenance_is_kept_with_a_sample_of_cameras(compact_file_and_report, paper_file):
+    raw = describe_file(DEMO_MODEL_FILE)
+    before, after = raw["provenance"], describe_file(compact_file_and_report[0])["provenance"]
 
-    assert (
-        after
-        == describe_file(paper_file)["provenance"]
-        == quantized_provenance(before, describe_file(trained_file)["config"]["frame"]["scale"])
-    )
+    expected = quantized_provenance(before, raw["config"]["frame"]["scale"])
+    assert after == describe_file(paper_file)["provenance"] == expected
     assert 0 < len(after["coarse_cameras"]) <= MAX_COARSE_CAMERAS and "cameras" in before and "cameras" not in after
 
 
-def test_a_compressed_file_can_be_recompressed_and_unpacked_exactly(
-    paper_file, compact_file_and_report, scene, tmp_path
-):
+def test_a_compressed_file_can_be_recompressed_and_unpacked_exactly(paper_file, scene, tmp_path):
     from_paper = compress_model(paper_file, tmp_path / "small.hyrf", data=scene)
-    compress_model(compact_file_and_report[0], tmp_path / "back.hyrf", "raw")
+    compress_model(DEMO_COMPACT_FILE, tmp_path / "back.hyrf", "raw")
 
     assert from_paper.bytes_after < paper_file.stat().st_size
-    pairs = zip(
-        load_model(compact_file_and_report[0]).parameters(),
-        load_model(tmp_path / "back.hyrf").parameters(),
-        strict=True,
-    )
+    models = load_model(DEMO_COMPACT_FILE), load_model(tmp_path / "back.hyrf")
+    pairs = zip(*(model.parameters() for model in models), strict=True)
     assert all(torch.equal(a, b) for a, b in pairs)
 
 
@@ -327,10 +340,10 @@ def test_the_default_distortion_costs_a_tenth_of_a_db(recorded_psnr, expected):
     )
 
 
-def test_the_deprecated_option_noise_is_accepted_with_a_warning(trained_file, tmp_path):
-    compress_model(trained_file, tmp_path / "new.hyrf", distortion=1e-4)
+def test_the_deprecated_option_noise_is_accepted_with_a_warning(ball_file, tmp_path):
+    compress_model(ball_file, tmp_path / "new.hyrf", distortion=1e-4)
     with pytest.warns(DeprecationWarning, match="distortion"):
-        compress_model(trained_file, tmp_path / "old.hyrf", noise=1e-4)
+        compress_model(ball_file, tmp_path / "old.hyrf", noise=1e-4)
 
     assert (tmp_path / "old.hyrf").read_bytes() == (tmp_path / "new.hyrf").read_bytes()
 
@@ -351,14 +364,14 @@ def test_the_deprecated_option_noise_is_accepted_with_a_warning(trained_file, tm
         ({"target_bytes": 500}, "500 bytes is below the smallest possible file"),
     ],
 )
-def test_invalid_combinations_of_options_are_refused_and_nothing_is_written(options, words, trained_file, tmp_path):
+def test_invalid_combinations_of_options_are_refused_and_nothing_is_written(options, words, tmp_path):
     with pytest.raises(HyrfError, match=words):
-        compress_model(trained_file, tmp_path / "small.hyrf", **options)
+        compress_model(DEMO_MODEL_FILE, tmp_path / "small.hyrf", **options)
 
     assert not list(tmp_path.iterdir())
 
 
-def test_an_unreachable_max_psnr_drop_is_refused(trained_file, scene, tmp_path, monkeypatch):
+def test_an_unreachable_max_psnr_drop_is_refused(ball_file, tmp_path, monkeypatch):
     scored = running.evaluate_model
 
     def worse_each_time(model, views, **options):
@@ -369,18 +382,18 @@ def test_an_unreachable_max_psnr_drop_is_refused(trained_file, scene, tmp_path, 
     monkeypatch.setattr(running, "evaluate_model", worse_each_time)
 
     with pytest.raises(HyrfError, match="even the finest file loses more than 0.5 dB of PSNR"):
-        compress_model(trained_file, tmp_path / "small.hyrf", data=scene, max_psnr_drop=0.5)
+        compress_model(ball_file, tmp_path / "small.hyrf", data=ball_scene(), max_psnr_drop=0.5)
 
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("options", [{}, {"finetune_steps": 5}, {"max_psnr_drop": 0.1}], ids=["plain", "tune", "limit"])
-def test_a_scene_without_training_photos_is_refused(options, trained_file, scene, tmp_path):
+def test_a_scene_without_training_photos_is_refused(options, scene, tmp_path):
     """Packing needs training photos to measure and to fine-tune on."""
     held_out = dataclasses.replace(scene, train=[], test=scene.train)
 
     with pytest.raises(HyrfError):
-        compress_model(trained_file, tmp_path / "small.hyrf", data=held_out, **options)
+        compress_model(DEMO_MODEL_FILE, tmp_path / "small.hyrf", data=held_out, **options)
 
 
 def test_an_invisible_model_is_compressed(tmp_path, scene):

@@ -23,6 +23,7 @@ from hyrfpack.evaluate import evaluate_model
 from hyrfpack.format import CompressionReport, load_model, save_model
 from hyrfpack.scene import Scene
 
+pytestmark = pytest.mark.usefixtures("quick_calibration")
 NAME_WITH_MARKUP = "<script>alert(1)</script>&amp;.png"
 
 
@@ -66,12 +67,10 @@ class ParsedReport(HTMLParser):
 
 
 @pytest.fixture(scope="module", autouse=True)
-def use_quick_settings() -> Iterator[None]:
-    """Use settings that save time, because these tests need neither exact times nor precise sensitivities."""
+def use_quick_timing() -> Iterator[None]:
+    """Time each file once, because these tests need no exact times."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("hyrfpack.compress.report.DECODE_TIMING_TURNS", 1)
-        patch.setattr("hyrfpack.measure.timing.WARM_UP_SECONDS", 0.0)
-        patch.setattr("hyrfpack.compress.sensitivity.MAX_SENSITIVITY_VIEWS", 24)
         yield
 
 
