@@ -54,10 +54,9 @@ class Clock:
         return self.now
 
 
-@pytest.mark.parametrize("exposure", [False, True])
-@pytest.mark.parametrize("background", [False, True])
+@pytest.mark.parametrize(("exposure", "background"), [(False, True), (True, False)])
 def test_training_with_a_live_view_gives_the_same_model_bit_by_bit(exposure, background, tmp_path):
-    config = dataclasses.replace(TRAIN_CONFIG, exposure=exposure, background=background)
+    config = dataclasses.replace(TRAIN_CONFIG, steps=20, exposure=exposure, background=background)
     plain = train_model(make_scene(), tmp_path / "plain", config, quiet=True)
     clock = Clock(look=MIN_INTERVAL_SECONDS * MIN_INTERVAL_RATIO)
     view = LiveView(clock)
