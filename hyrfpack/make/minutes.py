@@ -250,7 +250,7 @@ def _fit_line(counts: Sequence[int], seconds: Sequence[float]) -> tuple[float, f
     y0, y1 = (float(np.median(seconds[part])) for part in (first, last))
     slope = (y1 - y0) / (x1 - x0) if x1 > x0 else 0.0
     slope = min(max(slope, 0.0), y1 / max(x1, 1.0))
-    return y1 - slope * x1, slope
+    return max(0.0, y1 - slope * x1), slope  # rounding can make the difference negative
 
 
 def _measure_cpu_pass(model: HybridModel, cameras: Sequence[Camera]) -> float:

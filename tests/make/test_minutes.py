@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from time import monotonic
 
+import numpy as np
 import pytest
 import torch
 
@@ -66,6 +67,13 @@ def test_a_linear_fit_is_exact_on_a_line_and_never_decreases():
     assert minutes._fit_line(counts, [0.5 + 1e-3 * n for n in counts]) == pytest.approx((0.5, 1e-3))
     assert minutes._fit_line(counts, [2 - 1e-3 * n for n in counts]) == (pytest.approx(1.16), 0.0)
     assert minutes._fit_line([7] * 9, [0.1] * 9) == (pytest.approx(0.1), 0.0)
+
+
+def test_rounding_makes_no_intercept_of_a_linear_fit_negative():
+    """From the first to the last count, the times of these lines grow as fast as a line through the origin allows."""
+    for seconds in np.linspace(0.001, 0.01, 500):
+        intercept, _ = minutes._fit_line([100, 4999], [0.0, float(seconds)])
+        assert intercept >= 0
 
 
 def test_measuring_a_scene_gives_its_cost(scene):
