@@ -1,21 +1,32 @@
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
 import sys
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import pytest
+from scenes import ball_points, small_model
 
+from hyrfpack import save_model
+from hyrfpack.atomic import write_atomic
+from hyrfpack.cameras.capture import scene_provenance
 from hyrfpack.compress import sensitivity
 from hyrfpack.data import load_scene
 from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.distill import DistillConfig
+from hyrfpack.errors import HyrfError
 from hyrfpack.export.cameras import write_colmap
-from hyrfpack.make import stages
+from hyrfpack.format.codec import encode_model
+from hyrfpack.make import make_scene, minutes, stages
+from hyrfpack.make.minutes import SceneCost
 from hyrfpack.make.plan import QUALITIES, Quality
+from hyrfpack.model import HybridModel
+from hyrfpack.train.results import RECORD_FILE, TrainingRecord, read_record
+from hyrfpack.train.run import TrainResult
 
 QUICK_QUALITIES = {
     "draft": Quality(steps=6, gpu_steps=6, max_size=40, finetune_steps=0, import_steps=2),
@@ -28,17 +39,77 @@ QUICK_QUALITIES = {
 def quick_settings():
     """Few steps and views are enough here. The patch ends with the module, so that it does not reach other tests."""
     with pytest.MonkeyPatch.context() as patch:
-        patch_quick_settings(patch)
+        for name, quality in QUICK_QUALITIES.items():
+            patch.setitem(QUALITIES, name, quality)
+        patch.setattr(stages, "DistillConfig", partial(DistillConfig, size=24, train_views=6, test_views=2))
+        patch.setattr(sensitivity, "MAX_SENSITIVITY_VIEWS", 12)
+        # Drawing the curve takes as long as all steps.
+        patch.setattr("hyrfpack.train.results.draw_training_curve", lambda _, path, **options: path.touch())
         yield
 
 
-def patch_quick_settings(patch: pytest.MonkeyPatch) -> None:
-    for name, quality in QUICK_QUALITIES.items():
-        patch.setitem(QUALITIES, name, quality)
-    patch.setattr(stages, "DistillConfig", partial(DistillConfig, size=24, train_views=6, test_views=2))
-    patch.setattr(sensitivity, "MAX_SENSITIVITY_VIEWS", 12)
-    # Drawing the curve takes as long as all steps.
-    patch.setattr("hyrfpack.train.results.draw_training_curve", lambda _, path, **options: path.touch())
+@pytest.fixture
+def fake_stages(monkeypatch) -> None:
+    """Training, compression, scoring and timing that do no work but read and write the same files as the real ones."""
+    monkeypatch.setattr(stages, "train_model", fake_train_model)
+    monkeypatch.setattr(stages, "compress_model", fake_compress_model)
+    monkeypatch.setattr(stages, "evaluate_model", fake_evaluate_model)
+    monkeypatch.setattr(minutes, "measure_scene_cost", lambda *_: SceneCost(1e-3, 0.0, 0.0, 0.0, 100))
+
+
+@pytest.fixture
+def finished_work(fake_stages, posed, tmp_path_factory) -> Path:
+    """The work folder of a scene that was made with fake stages. Tests may change it."""
+    return make_scene(posed, tmp_path_factory.mktemp("made") / "scene.hyrf").work
+
+
+@cache
+def tiny_model(gaussians: int) -> HybridModel:
+    return small_model(ball_points(gaussians)[0])
+
+
+def fake_train_model(scene, run, config, *, resume, report, phase, **options) -> TrainResult:
+    """Write a checkpoint before each report and then the results, in the order of the real training.
+
+    The model's file depends on the scene and on all settings.
+    """
+    run.mkdir(exist_ok=True)
+    checkpoint, record_file = run / "checkpoint.pt", run / RECORD_FILE
+    if not (resume and read_record(run)):
+        done = int(checkpoint.read_text()) if resume else 0
+        for step in range(done + 1, config.steps + 1):
+            write_atomic(checkpoint, str(step).encode())
+            report(step, 0.1, 0.01, 400)
+        provenance = {"settings": config.to_dict(), **scene_provenance(scene), "psnr": 25.0}
+        data = encode_model(tiny_model(400), "raw", provenance)
+        choices = {name: f"{getattr(config, name)}: as asked for" for name in ("max_gaussians", "preset")}
+        metrics = {"gaussians": 400, "bytes": len(data), "choices": choices, "device": "none"}
+        record = TrainingRecord("model.hyrf", hashlib.sha256(data).hexdigest(), config.steps, {}, metrics)
+        write_atomic(record_file, record.encode())
+        write_atomic(run / "model.hyrf", data)
+        checkpoint.unlink()
+    phase("scoring held-out photos", 1, 2)
+    metrics, missing = read_record(run).metrics, ""
+    try:
+        write_atomic(run / "metrics.json", json.dumps(metrics).encode())
+        record_file.unlink()
+    except HyrfError as error:
+        missing = error.problem
+    return TrainResult(True, config.steps, run / "model.hyrf", metrics, missing)
+
+
+def fake_compress_model(source, target, *, finetune_steps, target_bytes, report, **options):
+    """Write a model whose file depends on that of the trained one and on the settings; a target size makes it small."""
+    report("compressing", 0.5)
+    digest = hashlib.sha256(source.read_bytes()).hexdigest()
+    model = tiny_model(20 if target_bytes else 400)
+    return save_model(model, target, provenance={"of": digest, "settings": [finetune_steps, target_bytes]})
+
+
+def fake_evaluate_model(model, views, *, report):
+    """Return the same scores for any model."""
+    report("scoring", 0.5)
+    return SimpleNamespace(views=views, psnr=25.0, psnr_consistent=None, ssim=0.9)
 
 
 @pytest.fixture(scope="session")

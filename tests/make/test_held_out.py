@@ -10,11 +10,10 @@ import pytest
 from commands import succeeded
 
 from hyrfpack import load_scene
-from hyrfpack.make import make_scene
 from hyrfpack.make.held_out import MAX_PSNR_GAP_DB, choose_inner_view, score_note
 from hyrfpack.make.source import LoadSettings
 from hyrfpack.scene import Camera, Scene, View
-from hyrfpack.train import load_training_scene
+from hyrfpack.train import TrainConfig, load_training_scene, train_model
 
 
 def camera_looking_at(position: tuple[float, float, float], target: tuple[float, float, float]) -> Camera:
@@ -91,9 +90,9 @@ def test_a_split_defined_by_the_set_is_used(posed, tmp_path):
 
 
 def test_photos_of_a_run_on_a_small_set_have_the_same_held_out_photo(posed, tmp_path):
-    few = copy_first_photos(posed, tmp_path, 9)
-    work = make_scene(few, tmp_path / "scene.hyrf", quality="draft").work
-    again = load_training_scene(work / "run" / "model.hyrf")
+    scene = LoadSettings().load(copy_first_photos(posed, tmp_path, 9))
+    train_model(scene, tmp_path / "run", TrainConfig(steps=1, max_gaussians=50), quiet=True)
+    again = load_training_scene(tmp_path / "run" / "model.hyrf")
     assert [view.name for view in again.test] == [choose_inner_view(again).name]
 
 
@@ -117,6 +116,7 @@ def test_the_note_names_the_gap_to_the_training_score():
     assert "only 1 photo was held out" in note and "16.5 dB less" in note and "(25.0 dB)" in note
 
 
+@pytest.mark.usefixtures("fake_stages")
 def test_the_command_prints_the_note_and_includes_it_in_its_json(posed, tmp_path):
     few = copy_first_photos(posed, tmp_path, 9)
     arguments = ("make", few, "-o", tmp_path / "scene.hyrf", "--quality", "draft")

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import re
 import shutil
 import signal
-import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,11 +15,13 @@ import pytest
 
 from hyrfpack.atomic import TEMPORARY_PREFIX
 from hyrfpack.errors import HyrfError
-from hyrfpack.make import Stopped, make_scene, stages
+from hyrfpack.make import Progress, Stopped, make_scene, stages
 from hyrfpack.make.stage_cache import interruptible
 
-# Stage -> the function that runs it.
-FUNCTION_BY_STAGE = {
+pytestmark = pytest.mark.usefixtures("fake_stages")
+
+# Stage -> the function of `stages` that does its work.
+STAGE_FUNCTIONS = {
     "training": "train_model",
     "compression": "compress_model",
     "scoring": "evaluate_model",
@@ -32,13 +34,13 @@ def read_products(work: Path) -> dict[str, bytes]:
     return {name: (work / name).read_bytes() for name in names}
 
 
-@pytest.fixture(scope="module")
-def uninterrupted_work(posed, tmp_path_factory) -> Path:
+@pytest.fixture
+def uninterrupted_work(fake_stages, posed, tmp_path_factory) -> Path:
     """The work folder of an uninterrupted call."""
     return make_scene(posed, tmp_path_factory.mktemp("whole") / "scene.html").work
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def uninterrupted_products(uninterrupted_work) -> dict[str, bytes]:
     """The products of an uninterrupted call."""
     return read_products(uninterrupted_work)
@@ -48,7 +50,7 @@ def uninterrupted_products(uninterrupted_work) -> dict[str, bytes]:
 def test_an_interrupt_in_each_stage_loses_no_work(after, uninterrupted_products, posed, tmp_path, monkeypatch, caplog):
     """Each call is stopped one stage later than the one before."""
     done: list[str] = []
-    for stage, function in FUNCTION_BY_STAGE.items():
+    for stage, function in STAGE_FUNCTIONS.items():
         usual = getattr(stages, function)
         caplog.clear()
 
@@ -63,9 +65,7 @@ def test_an_interrupt_in_each_stage_loses_no_work(after, uninterrupted_products,
                 make_scene(posed, tmp_path / "scene.html")
         assert caught.value.stage == stage and not (tmp_path / "scene.html").exists()
         assert [
-            name
-            for name in FUNCTION_BY_STAGE
-            if any(f"{name}: reused from an earlier run" in s for s in caplog.messages)
+            name for name in STAGE_FUNCTIONS if any(f"{name}: reused from an earlier run" in s for s in caplog.messages)
         ] == done[:-1]
         done.append(stage)
     result = make_scene(posed, tmp_path / "scene.html")
@@ -74,20 +74,6 @@ def test_an_interrupt_in_each_stage_loses_no_work(after, uninterrupted_products,
         and result.output.read_bytes() == uninterrupted_products["export/scene.html"]
     )
     assert list(result.kept) == done[:-1]
-
-
-def test_an_interrupted_training_resumes_from_the_checkpoint(uninterrupted_products, posed, tmp_path, signals):
-    def stop(progress):
-        if progress.words[:1] == ("step 5/9",):
-            signal.raise_signal(signal.SIGTERM)
-
-    with pytest.raises(Stopped, match="stopped in training"):
-        make_scene(posed, tmp_path / "scene.html", report=stop)
-    assert (tmp_path / "scene.work" / "run" / "checkpoint.pt").is_file()
-    words = []
-    result = make_scene(posed, tmp_path / "scene.html", report=lambda progress: words.extend(progress.words[:1]))
-    assert "step 6/9" in words and "step 5/9" not in words
-    assert read_products(result.work) == uninterrupted_products
 
 
 def test_an_interrupted_estimation_of_poses_resumes(photos, poses, tmp_path, monkeypatch):
@@ -142,8 +128,8 @@ def file_limit(size: int) -> Iterator[None]:
     "changes, limit, sentence",
     [
         ({}, 500, "make.json: "),
-        ({"seed": 1}, 20_000, "training failed: .*run/model.hyrf: "),
-        ({"quality": "best"}, 5_000, "compression failed: .*model.hyrf: "),
+        ({"seed": 1}, 6_000, "training failed: .*run/model.hyrf: "),
+        ({"quality": "best"}, 6_000, "compression failed: .*model.hyrf: "),
         ({"output": "other.html"}, 20_000, "export failed: .*export/other.html: "),
         ({"output": "scene.html"}, 20_000, "scene.html: "),  # the copy to the output path
     ],
@@ -161,24 +147,6 @@ def test_a_full_disk_in_any_stage_is_a_clear_error_and_the_same_call_resumes(
     assert not output.exists()
     assert make_scene(posed, output, **changes).output.exists()
     assert not [path for path in tmp_path.rglob("*") if path.name.startswith(TEMPORARY_PREFIX)]
-
-
-CHILD_SCRIPT = """
-import sys
-from pathlib import Path
-sys.path[:0] = sys.argv[1:3]
-import conftest, pytest
-conftest.patch_quick_settings(pytest.MonkeyPatch())
-from hyrfpack.make import make_scene
-make_scene(sys.argv[3], sys.argv[4], report=lambda p: print(p.stage, *p.words[:1], flush=True))
-"""
-
-
-def start_child(posed: Path, output: Path) -> subprocess.Popen:
-    here = Path(__file__).parent
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(here.parents[1]), str(here.parent)])}
-    command = [sys.executable, "-c", CHILD_SCRIPT, str(here), str(here.parent), str(posed), str(output)]
-    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
 
 
 def test_the_time_of_interrupted_and_killed_calls_is_included(posed, tmp_path, monkeypatch):
@@ -202,11 +170,55 @@ def test_the_time_of_interrupted_and_killed_calls_is_included(posed, tmp_path, m
     assert result.seconds["training"] == 100 + 5 + 40 and result.total_seconds == sum(result.seconds.values())
 
 
-def test_a_kill_loses_no_finished_work(uninterrupted_products, posed, tmp_path):
-    child = start_child(posed, tmp_path / "scene.html")
-    assert any(line.strip() == "training step 4/9" for line in child.stdout)
-    child.kill()
-    child.communicate()
-    assert child.returncode == -signal.SIGKILL
-    assert (tmp_path / "scene.work" / "make.json").is_file() and not (tmp_path / "scene.html").exists()
-    assert read_products(make_scene(posed, tmp_path / "scene.html").work) == uninterrupted_products
+def test_a_kill_at_any_report_loses_no_finished_work(uninterrupted_products, posed, tmp_path):
+    """A copy of the work folder during a report is what a process that was killed there leaves."""
+    killed: list[tuple[Progress, Path]] = []
+
+    def copy_work(progress: Progress) -> None:
+        output = tmp_path / str(len(killed)) / "scene.html"
+        shutil.copytree(tmp_path / "scene.work", output.with_suffix(".work"))
+        killed.append((progress, output))
+
+    make_scene(posed, tmp_path / "scene.html", report=copy_work)
+    for progress, output in killed:
+        words: list[str] = []
+        again = make_scene(posed, output, report=lambda progress, words=words: words.extend(progress.words[:1]))
+        assert again.kept == tuple(STAGE_FUNCTIONS)[: progress.place - 1]
+        if match := re.match(r"step (\d)/9", "".join(progress.words[:1])):
+            steps = [word for word in words if word.startswith("step ")]
+            assert steps == [f"step {step}/9" for step in range(int(match[1]) + 1, 10)]
+        assert read_products(again.work) == uninterrupted_products
+    assert {progress.stage for progress, _ in killed} == set(STAGE_FUNCTIONS)
+
+
+def test_an_interrupted_training_is_not_resumed_with_other_settings(posed, tmp_path):
+    def stop(progress: Progress) -> None:
+        if progress.words[:1] == ("step 5/9",):
+            raise KeyboardInterrupt
+
+    with pytest.raises(Stopped):
+        make_scene(posed, tmp_path / "scene.html", report=stop)
+    words: list[str] = []
+    make_scene(posed, tmp_path / "scene.html", seed=1, report=lambda progress: words.extend(progress.words[:1]))
+    assert "step 1/9" in words
+
+
+def test_missing_metrics_after_a_full_disk_are_completed_by_the_next_call(posed, tmp_path, monkeypatch):
+    replace = os.replace
+
+    def replace_on_full_disk(source, target) -> None:
+        if str(target).endswith("metrics.json"):
+            raise OSError(errno.ENOSPC, "No space left on device")
+        replace(source, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("hyrfpack.atomic.os.replace", replace_on_full_disk)
+        with pytest.raises(HyrfError, match=r"training failed: .*metrics.json: the disk is full.*is kept"):
+            make_scene(posed, tmp_path / "scene.html")
+    run = tmp_path / "scene.work" / "run"
+    assert (run / "model.hyrf").is_file() and not (run / "metrics.json").exists()
+
+    words: list[str] = []
+    result = make_scene(posed, tmp_path / "scene.html", report=lambda progress: words.extend(progress.words[:1]))
+    assert result.output.is_file() and (run / "metrics.json").is_file()
+    assert not any(word.startswith("step ") for word in words), "it was trained again"

@@ -187,6 +187,7 @@ def test_photos_are_never_larger_than_asked_for(posed, scene, monkeypatch):
         assert fit_plan_to_minutes(*arguments, Reporter(["training"], None)).max_size == 24
 
 
+@pytest.mark.usefixtures("fake_stages")
 def test_the_measured_cost_is_kept_by_the_next_call(posed, tmp_path, monkeypatch):
     first = make_scene(posed, tmp_path / "scene.hyrf", minutes=0.01)
     assert list(first.seconds)[0] == "measurement"

@@ -1,0 +1,126 @@
+"""Calls of `make` with the real stages: the products, their scores, target sizes and an interruption.
+
+The other tests of `make` use fake stages.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import signal
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+from commands import hyrfpack, refused, succeeded
+from explicit_balls import ball_splats
+from exposures import random_map
+
+from hyrfpack import evaluate_model, load_model, load_scene, save_model
+from hyrfpack.make import make_scene, stages
+from hyrfpack.make.display import Display
+from hyrfpack.make.progress import Progress, Reporter
+from hyrfpack.splats.formats import ply
+
+PRODUCTS = ("model.hyrf", "run/model.hyrf", "export/scene.html")
+
+
+@pytest.fixture(scope="module")
+def reports() -> list[Progress]:
+    """The progress that the call of `finished_work` reported."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def finished_work(reports, posed, tmp_path_factory) -> Path:
+    """The work folder of a scene that was made with the real stages. Tests must not change it."""
+    return make_scene(posed, tmp_path_factory.mktemp("made") / "scene.html", report=reports.append).work
+
+
+def test_every_stage_reports_its_progress_and_the_remaining_time(finished_work, reports):
+    assert list(dict.fromkeys(progress.stage for progress in reports)) == [
+        "training", "compression", "scoring", "export"
+    ]  # fmt: skip
+    for progress in reports:
+        assert 0 <= progress.share <= 1 and progress.left is not None and progress.left >= 0, progress
+    for stage in ("training", "compression", "scoring"):
+        assert max(progress.share for progress in reports if progress.stage == stage) > 0.5
+
+
+def test_an_interrupted_command_resumes_from_its_checkpoint_to_the_same_products(
+    finished_work, posed, tmp_path, monkeypatch, signals
+):
+    words: list[str] = []
+
+    def show(display: Display, progress: Progress) -> None:
+        words.extend(progress.words[:1])
+        if words[-1:] == ["step 5/9"]:
+            signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(Display, "show", show)
+    arguments = ("make", posed, "-o", tmp_path / "scene.html")
+    stopped = hyrfpack(*arguments)
+    assert stopped.exit_code == 1 and stopped.stderr.endswith("stopped in training; the same command resumes\n")
+    work = tmp_path / "scene.work"
+    assert (work / "run" / "checkpoint.pt").is_file()
+
+    words.clear()
+    (sentence,) = succeeded(*arguments).stderr.splitlines()  # everything else is shown as progress
+    assert sentence.startswith("training: 9 steps") and sentence.endswith("; on cpu")
+    assert "step 6/9" in words and "step 5/9" not in words
+    for name in PRODUCTS:
+        assert (work / name).read_bytes() == (finished_work / name).read_bytes(), name
+    assert (tmp_path / "scene.html").read_bytes() == (finished_work / "export" / "scene.html").read_bytes()
+
+
+def test_the_score_is_that_of_the_packed_model_on_held_out_photos(finished_work, posed, tmp_path):
+    work = shutil.copytree(finished_work, tmp_path / "work")
+    result = make_scene(posed, tmp_path / "scene.hyrf", work=work)
+    scores = evaluate_model(load_model(result.output), load_scene(posed).test)
+    assert (result.psnr, result.ssim, result.views) == (scores.psnr, scores.ssim, 3)
+    assert result.psnr_consistent is None  # the model has no exposure map
+
+
+def test_a_model_with_an_exposure_map_is_scored_as_render_shows_it_and_at_one_exposure(finished_work, posed, tmp_path):
+    model = load_model(finished_work / "model.hyrf")
+    model.exposure = random_map(3, centers=6)
+    save_model(model, tmp_path / "model.hyrf")
+    state = SimpleNamespace(inputs=lambda stage: {"photos and poses": ""})
+    reporter = Reporter(["scoring"], None)
+    stage = lambda name, inputs, act: act(False)[0]  # noqa: E731
+    work = SimpleNamespace(folder=tmp_path, state=state, reporter=reporter, run_stage=stage)
+    scene = load_scene(posed)
+
+    scores = stages.run_scoring_stage(work, scene, torch.device("cpu"))
+
+    expected = evaluate_model(model, scene.test)
+    assert scores == {
+        "views": 3, "psnr": expected.psnr, "psnr_consistent": expected.psnr_consistent, "ssim": expected.ssim
+    }  # fmt: skip
+    assert (
+        expected.psnr
+        != expected.psnr_consistent
+        == evaluate_model(load_model(finished_work / "model.hyrf"), scene.test).psnr
+    )
+
+
+def test_an_unreachable_target_size_names_a_reachable_one_which_is_met(finished_work, posed, tmp_path):
+    work = shutil.copytree(finished_work, tmp_path / "work")
+    arguments = ("make", posed, "-o", tmp_path / "scene.hyrf", "--work", work)
+    sentence = refused(*arguments, "--target-size", 2_100)
+    assert "the trained model does not fit into 2,100 bytes" in sentence and "--max-gaussians" not in sentence
+    assert "another work folder (--work)" in sentence
+    (possible,) = re.findall(r"ask for ([\d,]+) bytes or more", sentence)
+    smallest = int(possible.replace(",", ""))
+    succeeded(*arguments, "--target-size", smallest)
+    assert (tmp_path / "scene.hyrf").stat().st_size <= smallest < (finished_work / "model.hyrf").stat().st_size
+
+
+@pytest.mark.usefixtures("quick_distillation")
+def test_splats_of_other_programs_are_imported(tmp_path):
+    (tmp_path / "ball.ply").write_bytes(ply.encode(ball_splats(40)))
+    result = make_scene(tmp_path / "ball.ply", tmp_path / "scene.html", quality="draft")
+    assert list(result.seconds) == ["import", "export"] and result.export["import"]["gaussians_before"] == 40
+    again = make_scene(tmp_path / "ball.ply", tmp_path / "scene.spz", quality="draft")
+    assert again.kept == ("import",)
