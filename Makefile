@@ -6,11 +6,12 @@ SHELL := bash
 .DEFAULT_GOAL := help
 
 BIN := .venv/bin
+PYTEST := $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal
 # Each stamp file is newer than the files from which its environment was made.
 VENV_STAMP := .venv/.ready
 NODE_STAMP := tests/node/node_modules/.ready
 
-.PHONY: help demo test test-browsers test-newest test-oldest docs player golden bench gpu speed sets choices ablations precision kill races fuzz fuzz-browser lint format clean
+.PHONY: help demo test test-all test-browsers test-newest test-oldest docs player golden bench gpu speed sets choices ablations precision kill races fuzz fuzz-browser lint format clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z.-]+:.*## / { printf "  make %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -36,11 +37,14 @@ $(NODE_STAMP): tests/node/package.json tests/node/package-lock.json
 demo: $(VENV_STAMP) ## train, compress and render a small synthetic scene; results in demo/
 	$(BIN)/hyrfpack demo -o demo --overwrite
 
-test: lint $(NODE_STAMP) ## check style and types, then run all tests
-	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal
+test: lint $(NODE_STAMP) ## check style and types, then run the tests of every change (see tests/layers.py)
+	$(PYTEST) -m "not acceptance"
+
+test-all: lint $(NODE_STAMP) ## check style and types, then run all tests
+	$(PYTEST)
 
 test-browsers: $(VENV_STAMP) ## run the web player's tests in every installed browser (5 minutes)
-	HYRFPACK_BROWSERS=all $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal tests/web
+	HYRFPACK_BROWSERS=all $(PYTEST) tests/web
 
 test-newest: ## run the tests with the newest dependencies, on each installed Python (6 GB and 10 minutes each)
 	$(PYTHON) -m tools.safety.versions newest

@@ -11,7 +11,8 @@ import os
 import shutil
 import signal
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
+from contextlib import nullcontext
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -37,13 +38,22 @@ if os.environ["TRITON_INTERPRET"] == "1" and find_spec("triton"):
 
     speed_up_interpreter()
 
+from layers import forbid_training_and_processes, layer_of
 from ops.device import needs_triton  # this import asks for Triton, which reads the environment set above
 
 
 def pytest_itemcollected(item: pytest.Item) -> None:
-    """Mark the tests that run GPU kernels, so that a machine with a GPU can select them with `-m gpu`."""
+    """Mark each test with its layer, and those that run GPU kernels with `gpu`, so that `-m` can select them."""
     if needs_triton.mark in item.iter_markers():
         item.add_marker("gpu")
+    item.add_marker(layer_of(item))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
+    """Make training and the start of processes an error in unit tests and their fixtures."""
+    with forbid_training_and_processes() if layer_of(item) == "unit" else nullcontext():
+        return (yield)
 
 
 # Until all tests are collected nothing becomes garbage, and the garbage collector takes a third of the time.

@@ -118,6 +118,7 @@ def test_all_parts_of_a_step_are_counted(asked: WorkCounts) -> None:
     assert count_kind(asked, "copy") > 0  # the photo, at least
 
 
+@pytest.mark.acceptance
 def test_a_step_of_a_larger_scene_gives_the_gpu_the_same_work(asked: WorkCounts) -> None:
     """The scene exceeds one block of every kernel, and one tile of the picture."""
     bigger = count_step_work(points=130, side=17)

@@ -141,6 +141,7 @@ def test_numbers_that_are_not_finite_are_rejected(gpu, part, kept):
             render_view(model, camera_at((0.3, -2.2, 0.6), width=16, height=16), decoded=decoded)
 
 
+@pytest.mark.acceptance
 def test_the_command_line_trains_and_renders_on_a_gpu(gpu, tmp_path):
     data, run, options = write_demo_scene(tmp_path / "data", views=2, size=16), tmp_path / "run", ["--device", "cuda"]
     succeeded("train", data, "-o", run, "--steps", 1, "--max-gaussians", 20, "--log2-table-size", 5, *options)
@@ -168,6 +169,7 @@ def test_a_model_is_measured_packed_and_fine_tuned_on_a_gpu(gpu, few_pictures, t
     assert sizes["cuda"] == pytest.approx(sizes["cpu"], rel=0.02)
 
 
+@pytest.mark.acceptance
 def test_splats_of_other_programs_are_distilled_on_a_gpu(gpu, few_pictures, tmp_path, monkeypatch):
     monkeypatch.setattr("hyrfpack.distill.initialize.MIN_STEPS", 3)
     monkeypatch.setattr(

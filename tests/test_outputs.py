@@ -187,6 +187,7 @@ def test_training_never_replaces_photos_in_its_output_folder(photos):
         train_model(load_scene(photos, test_every=2), photos, TINY_TRAIN_CONFIG, overwrite=True, quiet=True)
 
 
+@pytest.mark.integration
 def test_training_keeps_a_foreign_metrics_json_without_overwrite(photos, tmp_path):
     out = tmp_path / "run"
     out.mkdir()

@@ -18,7 +18,7 @@ def build(folder: Path, config: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, cwd=REPOSITORY_ROOT, capture_output=True, text=True)
 
 
-@pytest.mark.slow
+@pytest.mark.acceptance
 def test_the_site_builds_with_every_public_name(tmp_path):
     import hyrfpack
 

@@ -43,7 +43,7 @@ ERROR_CODES_BY_LINE = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.acceptance
 def test_a_correct_program_passes_and_each_mistaken_line_is_reported(tmp_path):
     (tmp_path / "right.py").write_text(CORRECT_PROGRAM)
     (tmp_path / "wrong.py").write_text("\n".join(["import hyrfpack", *ERROR_CODES_BY_LINE]))

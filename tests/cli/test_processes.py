@@ -135,6 +135,7 @@ def test_one_process_under_torchrun_gives_the_same_bytes_without_network_access(
 # -- two processes ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.integration
 @needs_ranks
 def test_only_rank_0_prints_and_reports_the_number_of_processes(run_and_outcomes):
     out, ends = run_and_outcomes

@@ -77,6 +77,7 @@ def test_a_requested_layout_that_is_missing_is_rejected(tmp_path, colmap_folder)
         load_scene(tmp_path, layout="openmvg")
 
 
+@pytest.mark.integration
 def test_importing_the_readers_loads_no_heavy_library():
     code = "import sys, hyrfpack.data; print([m for m in ('pycolmap', 'trimesh', 'PIL', 'torch') if m in sys.modules])"
 

@@ -272,6 +272,7 @@ def test_repacking_keeps_configuration_and_provenance(tmp_path):
     assert describe_file(tmp_path / "back.hyrf")["provenance"] == {"steps": 7}
 
 
+@pytest.mark.integration
 def test_describe_works_without_torch_and_numpy(tmp_path):
     path = tmp_path / "model.hyrf"
     save_model(make_model(500), path, "paper", {"steps": 30})

@@ -158,6 +158,7 @@ def mean_stops(log_gains: np.ndarray) -> float:
     return float(log_gains.astype(float).mean()) / (np.log(2) * 2 / 2.2)
 
 
+@pytest.mark.integration
 def test_describe_reports_the_map_without_torch_and_numpy(raw_file):
     program = (
         "import sys, json; from hyrfpack.format import describe_file; facts = describe_file(sys.argv[1]);"

@@ -16,6 +16,8 @@ from hyrfpack.format.codec import load_with_provenance
 from hyrfpack.format.min_file_size import check_target_bytes, min_file_bytes
 from hyrfpack.train import TrainConfig, train_model
 
+pytestmark = pytest.mark.integration
+
 
 @pytest.fixture(scope="module")
 def tiny_file_and_provenance(tmp_path_factory):

@@ -11,6 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+pytestmark = pytest.mark.integration
+
 PROJECT_FOLDER = Path(__file__).parents[2]
 GOLDEN_PATHS = sorted((PROJECT_FOLDER / "tests" / "golden").glob("*.hyrf"))
 

@@ -65,6 +65,7 @@ def install_fake_ffmpeg(folder, monkeypatch, body: str) -> None:
     monkeypatch.setenv("PATH", f"{script.parent}{os.pathsep}{os.environ['PATH']}")
 
 
+@pytest.mark.integration
 @pytest.mark.skipif(os.name == "nt", reason="needs executable scripts")
 def test_video_gets_all_frames_in_order(tmp_path, monkeypatch):
     install_fake_ffmpeg(tmp_path, monkeypatch, "open(sys.argv[-1], 'wb').write(sys.stdin.buffer.read())")
@@ -76,6 +77,7 @@ def test_video_gets_all_frames_in_order(tmp_path, monkeypatch):
     assert not list(tmp_path.glob(".*"))
 
 
+@pytest.mark.integration
 @pytest.mark.skipif(os.name == "nt", reason="needs executable scripts")
 def test_an_error_of_ffmpeg_is_quoted_and_keeps_the_old_video(tmp_path, monkeypatch):
     body = "open(sys.argv[-1], 'wb').write(b'half')\nprint('no such encoder', file=sys.stderr)\nsys.exit(1)"
@@ -88,6 +90,7 @@ def test_an_error_of_ffmpeg_is_quoted_and_keeps_the_old_video(tmp_path, monkeypa
     assert not list(tmp_path.glob(".*"))
 
 
+@pytest.mark.integration
 @pytest.mark.skipif(os.name == "nt", reason="needs executable scripts")
 def test_without_overwrite_a_video_that_appears_meanwhile_is_kept(tmp_path, monkeypatch):
     video = tmp_path / "video.mp4"

@@ -47,7 +47,6 @@ def opengl(pose: np.ndarray) -> np.ndarray:
     return np.linalg.inv(np.vstack((pose, (0, 0, 0, 1)))) * (1, -1, -1, 1)
 
 
-@pytest.mark.slow
 def test_every_page_runs_as_written(photos, capfd):
     assert all(run_page(page, photos, 2) for page in DOCUMENTED_PAGES), capfd.readouterr().err
 

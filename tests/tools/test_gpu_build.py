@@ -18,7 +18,7 @@ REPOSITORY_ROOT = Path(__file__).parents[2]
 TRITON_VERSIONS_WITHOUT_SPILLS = ("3.6.", "3.7.")
 GPU_TARGETS = ["sm_80", "sm_90", "sm_100", "gfx942"]
 
-pytestmark = [needs_triton, pytest.mark.slow]
+pytestmark = needs_triton
 
 
 @pytest.fixture(scope="module")

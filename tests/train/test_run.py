@@ -264,6 +264,7 @@ def test_an_interrupt_saves_exits_cleanly_and_resumes_to_the_same_model(number, 
     assert not checkpoint.exists()
 
 
+@pytest.mark.acceptance
 def test_kills_at_random_moments_leave_a_checkpoint_that_resumes_to_the_same_model(uninterrupted_trainer, tmp_path):
     """SIGKILL often arrives while a checkpoint is being written, because every step writes one."""
     generator = random.Random(time.time_ns())

@@ -139,6 +139,7 @@ def test_a_file_beside_the_player_is_the_default(browser: Browser, host: Site):
     assert browser.evaluate(LOADED_COUNT_JS) == 300
 
 
+@pytest.mark.integration
 def test_a_failed_fetch_is_reported_in_one_sentence(browser: Browser, host: Site):
     browser.open(f"{host.address}/index.html?content=not%20there.hyrf")
     assert wait_for_message(browser).startswith("not there.hyrf could not be fetched (404 Not Found); check")
@@ -321,6 +322,7 @@ ELEMENT_JS = "document.querySelector('hyrf-viewer')"
 ELEMENT_WINDOW_JS = f"{ELEMENT_JS}.shadowRoot.querySelector('iframe').contentWindow"
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("kind", ["", ' type="module"'])
 def test_the_element_shows_a_file_and_follows_its_attributes(browser: Browser, host: Site, kind: str):
     host.files["/blog/post.html"] = (

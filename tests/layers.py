@@ -1,0 +1,85 @@
+"""The layer of each test, which decides when it runs.
+
+- `unit` tests train nothing and start no process.
+- `integration` tests may train on tiny scenes, run commands and start short scripts.
+- `acceptance` tests run browsers, several processes, kills, compilers and maintainers' tools.
+
+`make test` runs the first two, `make test-all` everything. A mark at the test or its module decides; otherwise a test
+that opens a browser is an acceptance test, and the longest matching path below decides for the others.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from unittest.mock import patch
+
+import pytest
+
+LAYERS = ("unit", "integration", "acceptance")
+BROWSER_FIXTURES = {"browser", "one_browser", "start_browser"}
+TESTS_FOLDER = Path(__file__).parent
+LAYER_BY_PATH = {
+    "": "integration",
+    "cameras": "unit",
+    "cli/test_processes.py": "acceptance",
+    "compress/test_determinism.py": "acceptance",
+    "data": "unit",
+    "evaluate": "unit",
+    "format": "unit",
+    "fuzz": "unit",
+    "measure": "unit",
+    "model": "unit",
+    "ops": "unit",
+    "ops/test_cold_kernels.py": "acceptance",
+    "parallel/test_fork.py": "acceptance",
+    "parallel/test_ranks.py": "acceptance",
+    "poses/test_interruptions.py": "acceptance",
+    "quant": "unit",
+    "render": "unit",
+    "splats": "unit",
+    "test_architecture.py": "unit",
+    "test_choices.py": "unit",
+    "test_errors.py": "unit",
+    "test_examples.py": "acceptance",
+    "test_no_home.py": "acceptance",
+    "test_outputs.py": "unit",
+    "test_progress.py": "unit",
+    "test_public.py": "acceptance",
+    "test_pycolmap.py": "acceptance",
+    "test_scene.py": "unit",
+    "test_site.py": "acceptance",
+    "tools": "acceptance",
+    "train/test_distributed.py": "acceptance",
+}
+
+
+def layer_of(item: pytest.Item) -> str:
+    """Return the layer of a test, one of LAYERS."""
+    for mark in item.iter_markers():  # the closest first, so that a test can differ from its module
+        if mark.name in LAYERS:
+            return mark.name
+    if BROWSER_FIXTURES & set(getattr(item, "fixturenames", ())):
+        return "acceptance"
+    path = item.path.relative_to(TESTS_FOLDER).as_posix()
+    return LAYER_BY_PATH[max((prefix for prefix in LAYER_BY_PATH if path.startswith(prefix)), key=len)]
+
+
+@contextmanager
+def forbid_training_and_processes() -> Iterator[None]:
+    """Make training and the start of processes an error, in the tests of the layer `unit`."""
+
+    def refuse(*arguments: object, **options: object) -> None:
+        raise AssertionError("a unit test trains or starts a process: give it the mark of another layer")
+
+    with ExitStack() as stack:
+        stack.enter_context(patch.object(subprocess.Popen, "__init__", refuse))
+        if hasattr(os, "fork"):
+            stack.enter_context(patch.object(os, "fork", refuse))
+        if "hyrfpack.train.trainer" in sys.modules:
+            stack.enter_context(patch.object(sys.modules["hyrfpack.train.trainer"].Trainer, "run", refuse))
+        yield

@@ -1,0 +1,44 @@
+"""The layers of tests, see tests/layers.py."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+from layers import LAYER_BY_PATH, LAYERS, TESTS_FOLDER, forbid_training_and_processes, layer_of
+from scenes import ball_scene
+
+from hyrfpack.train import TrainConfig
+from hyrfpack.train.trainer import Trainer
+
+
+def test_every_listed_path_exists_and_has_a_known_layer():
+    assert [path for path in LAYER_BY_PATH if not (TESTS_FOLDER / path).exists()] == []
+    assert set(LAYER_BY_PATH.values()) <= set(LAYERS)
+
+
+def test_a_test_without_a_mark_has_the_layer_of_its_path(request):
+    assert layer_of(request.node) == "integration"
+
+
+@pytest.mark.unit
+def test_a_mark_at_the_test_decides(request):
+    assert layer_of(request.node) == "unit"
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork")
+def test_training_and_processes_are_errors_where_they_are_forbidden():
+    trainer = Trainer(ball_scene(views=2, side=16), TrainConfig(steps=1, max_gaussians=50))
+
+    refusal = pytest.raises(AssertionError, match="give it the mark of another layer")
+    with forbid_training_and_processes():
+        with refusal:
+            os.fork()
+        with refusal:
+            trainer.run()
+        with refusal:
+            subprocess.run([sys.executable, "-c", ""], check=True)
+
+    assert trainer.run()
