@@ -66,8 +66,6 @@ if TYPE_CHECKING:
     from hyrfpack.format.codec import load_model as load_model
     from hyrfpack.format.codec import save_model as save_model
     from hyrfpack.make import MakeResult as MakeResult
-    from hyrfpack.make import PhotoSurvey as PhotoSurvey
-    from hyrfpack.make import describe_photos as describe_photos
     from hyrfpack.make import make_scene as make_scene
     from hyrfpack.model import HybridModel as HybridModel
     from hyrfpack.model import ModelConfig as ModelConfig
@@ -80,6 +78,8 @@ if TYPE_CHECKING:
     from hyrfpack.scene import Picture as Picture
     from hyrfpack.scene import Scene as Scene
     from hyrfpack.scene import View as View
+    from hyrfpack.survey import PhotoSurvey as PhotoSurvey
+    from hyrfpack.survey import describe_photos as describe_photos
     from hyrfpack.train import TrainConfig as TrainConfig
     from hyrfpack.train import TrainResult as TrainResult
     from hyrfpack.train import train_model as train_model
@@ -113,8 +113,6 @@ _PUBLIC = {
     "load_model": "hyrfpack.format",
     "save_model": "hyrfpack.format",
     "MakeResult": "hyrfpack.make",
-    "PhotoSurvey": "hyrfpack.make",
-    "describe_photos": "hyrfpack.make",
     "make_scene": "hyrfpack.make",
     "HybridModel": "hyrfpack.model",
     "ModelConfig": "hyrfpack.model",
@@ -127,6 +125,8 @@ _PUBLIC = {
     "Picture": "hyrfpack.scene",
     "Scene": "hyrfpack.scene",
     "View": "hyrfpack.scene",
+    "PhotoSurvey": "hyrfpack.survey",
+    "describe_photos": "hyrfpack.survey",
     "TrainConfig": "hyrfpack.train",
     "TrainResult": "hyrfpack.train",
     "train_model": "hyrfpack.train",

@@ -19,6 +19,7 @@ import click
 from hyrfpack.cli.bench import bench
 from hyrfpack.cli.common import print_json
 from hyrfpack.cli.compare import compare
+from hyrfpack.cli.compress import compress, decompress
 from hyrfpack.cli.console import (
     add_verbosity_options,
     is_verbose,
@@ -30,14 +31,15 @@ from hyrfpack.cli.console import (
 )
 from hyrfpack.cli.convert import convert
 from hyrfpack.cli.demo import demo
+from hyrfpack.cli.evaluate import evaluate
 from hyrfpack.cli.export import export
-from hyrfpack.cli.files import compress, decompress, info
 from hyrfpack.cli.imports import import_
+from hyrfpack.cli.info import info
 from hyrfpack.cli.make import make
 from hyrfpack.cli.poses import poses
+from hyrfpack.cli.render import render
 from hyrfpack.cli.train import train
 from hyrfpack.cli.view import view
-from hyrfpack.cli.views import evaluate, render
 from hyrfpack.cli.wording import use_option_names
 from hyrfpack.errors import HyrfError, printable
 from hyrfpack.version import __version__

@@ -6,14 +6,14 @@ import functools
 import json
 import math
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
 from hyrfpack.atomic import describe_rename
-from hyrfpack.choices import AS_PHOTOGRAPHED, LAYOUTS, PRECISIONS, RENDER_EXPOSURES
+from hyrfpack.choices import LAYOUTS, PRECISIONS
 from hyrfpack.cli.console import note, note_if_verbose
 from hyrfpack.errors import HyrfError
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import torch
 
     from hyrfpack.parallel.ranks import Ranks
-    from hyrfpack.scene import Camera, Scene, View
+    from hyrfpack.scene import Scene
 
 Command = TypeVar("Command", bound=Callable)
 
@@ -146,16 +146,6 @@ device_option = click.option(
 )
 
 
-exposure_option = click.option(
-    "--exposure",
-    type=click.Choice(RENDER_EXPOSURES),
-    default=AS_PHOTOGRAPHED,
-    show_default=True,
-    help="Exposure of renders: each view like the photos taken near it, or one consistent exposure for all views. A "
-    "model without an exposure map looks the same with both.",
-)
-
-
 def device_options(command: Command) -> Command:
     """Add the options --device and --precision, which choose the device and its precision."""
     precision = click.option(
@@ -238,23 +228,6 @@ def resolve_model_file(path: Path) -> Path:
             fix=f"import it first: 'hyrfpack import {path} -o {model}'",
         )
     return find_model(path)
-
-
-def select_views(scene: Scene, split: str) -> list[View]:
-    """Return the views of a split: "test", "train" or "all".
-
-    Raises:
-        HyrfError: the split has no views.
-    """
-    views = {"test": scene.test, "train": scene.train, "all": scene.views}[split]
-    if not views:
-        raise HyrfError(f"{scene.path}: no photo is in the split '{split}'", fix="name another --split or --test-every")
-    return views
-
-
-def largest_picture_size(cameras: Iterable[Camera]) -> tuple[int, int]:
-    """Return (width, height) in pixels of the largest picture that any of the cameras makes."""
-    return max(((camera.width, camera.height) for camera in cameras), key=lambda size: size[0] * size[1])
 
 
 def format_consistent_psnr(psnr_consistent: float | None) -> str:

@@ -10,7 +10,7 @@ from hyrfpack.cli.console import print_line
 from hyrfpack.cli.wording import use_option_names
 
 if TYPE_CHECKING:
-    from hyrfpack.make.survey import PhotoSurvey
+    from hyrfpack.survey import PhotoSurvey
 
 # Sizes of photos, and cameras, that are listed; the others are only counted.
 _MAX_LISTED_KINDS = 4

@@ -16,6 +16,7 @@ import torch
 
 from hyrfpack.atomic import pending_file
 from hyrfpack.compress import compress_model
+from hyrfpack.copying import copy_file
 from hyrfpack.data import PictureCache
 from hyrfpack.device import describe_device
 from hyrfpack.distill import DistillConfig, import_splats
@@ -253,7 +254,7 @@ def run_export_stage(
 
     def execute(resuming: bool) -> tuple[dict, list[str]]:
         if name.lower().endswith(".hyrf"):
-            copy_file(model, target)
+            copy_if_different(model, target)
             report: dict[str, Any] = {"bytes": target.stat().st_size}
         else:
             made = export_model(model, target, data=scene, report=stage_cache.reporter.report_share)
@@ -302,16 +303,16 @@ def copy_to_output(product: Path, output: Path, *, overwrite: bool) -> Path:
         HyrfError: the product cannot be copied; it stays in the work folder.
     """
     if not product.is_dir():
-        return copy_file(product, output, overwrite=overwrite)
+        return copy_if_different(product, output, overwrite=overwrite)
     files = {path: output / path.relative_to(product) for path in sorted(product.rglob("*")) if path.is_file()}
     different = [target for path, target in files.items() if file_digest(path) != file_digest(target)]
     Outputs(overwrite=overwrite).folder(output, [os.path.relpath(target, output) for target in different])
     for path, target in files.items():
-        copy_file(path, target, overwrite=overwrite, rename=False)
+        copy_if_different(path, target, overwrite=overwrite, rename=False)
     return output
 
 
-def copy_file(source: Path, target: Path, *, overwrite: bool = True, rename: bool = True) -> Path:
+def copy_if_different(source: Path, target: Path, *, overwrite: bool = True, rename: bool = True) -> Path:
     """Copy a file in one step, unless the target has the same content; see `hyrfpack.atomic.pending_file`.
 
     Returns:
@@ -320,5 +321,5 @@ def copy_file(source: Path, target: Path, *, overwrite: bool = True, rename: boo
     if file_digest(source) == file_digest(target):
         return target
     with pending_file(target, source.stat().st_size, overwrite=overwrite, rename=rename) as pending:
-        shutil.copyfile(source, pending.temporary)
+        copy_file(source, pending.temporary)
     return pending.path

@@ -14,13 +14,13 @@ from typing import TypeVar
 import numpy as np
 from PIL import Image, ImageOps
 
+from hyrfpack.copying import copy_file
 from hyrfpack.data import masks as mask_files
 from hyrfpack.data.archive import display_path
 from hyrfpack.data.equirectangular import FACES, Face, FaceFile, cut_panorama, face_lens, face_size, is_panorama
 from hyrfpack.data.folder import PhotoFacts, read_photo_facts
 from hyrfpack.data.pictures import open_picture, read_header
 from hyrfpack.errors import HyrfDataError, short_reason, strip_path
-from hyrfpack.poses.copying import copy_file
 from hyrfpack.poses.job import Device
 
 # Photos with these endings are copied, because other programs that read scenes know these formats.
@@ -222,7 +222,7 @@ def make_masks(photos: Sequence[Photo], masks: dict[str, Path], folder: Path) ->
                 image.getexif()[_EXIF_ORIENTATION_TAG] = photo.facts.orientation
                 ImageOps.exif_transpose(image).save(target)
             elif mask.suffix.lower() == ".png":
-                copy_file(mask, target)
+                copy_file(mask, target, keep_metadata=True)
             else:
                 image.convert("RGB").save(target)
         made[photo.name] = target
@@ -280,7 +280,7 @@ def _rewritten_name(source: str, taken: set[str]) -> str:
 def _write_photo(photo: Photo, target: Path) -> None:
     """Copy a photo, or write it upright if it cannot be used unchanged."""
     if photo.is_usable_unchanged:
-        copy_file(photo.facts.path, target)
+        copy_file(photo.facts.path, target, keep_metadata=True)
         return
     with open_picture(photo.facts.path) as image:
         try:
@@ -288,7 +288,7 @@ def _write_photo(photo: Photo, target: Path) -> None:
         except Exception:  # Pillow's decoders raise many types of errors
             upright = None
         if upright is None or upright.mode == "F":  # undecodable: the feature stage leaves it out
-            copy_file(photo.facts.path, target)
+            copy_file(photo.facts.path, target, keep_metadata=True)
             return
         jpeg = target.suffix.lower() in (".jpg", ".jpeg")
         modes = ("L", "RGB") if jpeg else _PNG_MODES

@@ -15,7 +15,7 @@ import torch
 from commands import hyrfpack, refused, succeeded
 from PIL import Image
 
-from hyrfpack.cli.files import DEFAULT_PROFILE, PROFILES
+from hyrfpack.cli.compress import DEFAULT_PROFILE, PROFILES
 from hyrfpack.cli.train import PRESETS, train
 from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.format import load_model

@@ -22,8 +22,8 @@ from scenes import small_model
 
 from hyrfpack.cli import main
 from hyrfpack.cli.common import format_table, note
+from hyrfpack.cli.compress import _command_as_typed
 from hyrfpack.cli.console import notes_only_of
-from hyrfpack.cli.files import _command_as_typed
 from hyrfpack.cli.progress import show_item_progress
 from hyrfpack.format import describe_file, save_model
 

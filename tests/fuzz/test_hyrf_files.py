@@ -20,7 +20,7 @@ import pytest
 import torch
 from scenes import small_model
 
-from hyrfpack.cli.files import info
+from hyrfpack.cli.info import info
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import encode_model, repack
 from hyrfpack.format.codec import EXTRA_GAUSSIANS_PER_FILE, gaussian_limit

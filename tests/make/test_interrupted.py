@@ -87,7 +87,7 @@ def test_an_interrupted_estimation_of_poses_resumes(photos, poses, tmp_path, mon
 
 
 def test_a_partly_copied_output_is_completed(posed, tmp_path, monkeypatch):
-    usual, copies = stages.copy_file, []
+    usual, copies = stages.copy_if_different, []
 
     def stop(source, target, **options):
         copies.append(target)
@@ -96,7 +96,7 @@ def test_a_partly_copied_output_is_completed(posed, tmp_path, monkeypatch):
         usual(source, target, **options)
 
     with monkeypatch.context() as patch:
-        patch.setattr(stages, "copy_file", stop)
+        patch.setattr(stages, "copy_if_different", stop)
         with pytest.raises(Stopped):
             make_scene(posed, tmp_path / "player", quality="draft")
     assert len(list((tmp_path / "player").iterdir())) == 2

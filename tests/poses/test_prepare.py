@@ -12,9 +12,9 @@ from made_up_photos import PHOTO_SIZE, write_photos
 from PIL import Image
 
 import hyrfpack
+from hyrfpack.copying import copy_file
 from hyrfpack.data.folder import list_photos, read_photo_facts
 from hyrfpack.data.pictures import read_pixels
-from hyrfpack.poses.copying import copy_file
 from hyrfpack.poses.job import Device, Job
 from hyrfpack.poses.prepare import (
     Photo,

@@ -8,6 +8,7 @@ import pytest
 import torch
 from scenes import ball_points, ball_scene, camera_at, photograph, ring, view_of
 
+from hyrfpack.data.preset import detect_preset
 from hyrfpack.errors import HyrfDataError, HyrfTrainingError
 from hyrfpack.model import Frame
 from hyrfpack.scene import Picture, Scene, evenly_spaced
@@ -19,7 +20,6 @@ from hyrfpack.train.setup import (
     PACKED_HEADER_BYTES,
     budget_for,
     build_model,
-    detect_preset,
     initial_points,
     scene_frame,
     table_size_for,

@@ -46,7 +46,7 @@ import torch
 from hyrfpack.cameras.capture import Capture
 from hyrfpack.cameras.paths import orbit
 from hyrfpack.cameras.view_sampling import shrink_camera
-from hyrfpack.cli.files import info
+from hyrfpack.cli.info import info
 from hyrfpack.errors import HyrfError, HyrfFormatError
 from hyrfpack.format import decode_model, describe_file, encode_model, load_model
 from hyrfpack.format.container import raw_bytes_limit

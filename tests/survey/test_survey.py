@@ -17,7 +17,7 @@ from PIL import Image
 from scipy import ndimage
 
 from hyrfpack.errors import HyrfDataError
-from hyrfpack.make.survey import PhotoSurvey, describe_photos
+from hyrfpack.survey import PhotoSurvey, describe_photos
 
 
 def random_rectangles(seed: int, width: int = 160, height: int = 120) -> np.ndarray:
@@ -164,7 +164,7 @@ def test_unusable_poses_are_reported_as_a_problem_of_the_set(data, tmp_path):
 
 
 def test_only_some_photos_of_large_sets_are_examined(photos, monkeypatch):
-    monkeypatch.setattr("hyrfpack.make.survey.MAX_DECODED_PHOTOS", 8)
+    monkeypatch.setattr("hyrfpack.survey.measure.MAX_DECODED_PHOTOS", 8)
     survey = describe_photos(photos)
     assert survey.decoded == 8 and any("8 of 24 photos" in note for note in survey.notes)
 
@@ -222,7 +222,7 @@ def test_info_of_a_file_that_is_no_photo_is_a_clear_error(tmp_path):
     assert "no photos here" in refused("info", tmp_path / "empty")
 
 
-@pytest.mark.parametrize("name", ["data.quality", "make.survey", "poses.frames", "poses.video"])
+@pytest.mark.parametrize("name", ["data.quality", "survey.describe", "poses.frames", "poses.video"])
 def test_the_examples_of_these_modules_run(name, data, tmp_path, monkeypatch):
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "bonsai").symlink_to(data)

@@ -1,4 +1,4 @@
-"""Copy photos and masks; the copies share the disk space of the originals if the file system supports it."""
+"""Copies of files, which share the disk space of the originals if the file system supports it."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from pathlib import Path
 _FICLONE = 0x40049409  # ioctl request of Linux (linux/fs.h) that makes a file share all blocks of another file
 
 
-def copy_file(source: Path, target: Path) -> None:
-    """Copy a file with its times and permissions; later edits of one file never change the other.
+def copy_file(source: Path, target: Path, *, keep_metadata: bool = False) -> None:
+    """Copy a file; later edits of one file never change the other.
 
     On Linux file systems with reflinks (Btrfs, XFS, bcachefs) the copy shares the blocks of its source. It takes no
     space until one of the two is changed. Elsewhere all bytes are copied.
@@ -19,6 +19,7 @@ def copy_file(source: Path, target: Path) -> None:
     Args:
         source: file to copy; links are followed.
         target: path of the copy, which is created or overwritten.
+        keep_metadata: give the copy the times and permissions of the source.
 
     Raises:
         OSError: the source cannot be read, or the target cannot be written.
@@ -26,8 +27,9 @@ def copy_file(source: Path, target: Path) -> None:
     source = Path(os.path.realpath(source))
     if not _reflink(source, target):
         shutil.copyfile(source, target)
-    with suppress(OSError):  # some file systems keep neither times nor permissions
-        shutil.copystat(source, target)
+    if keep_metadata:
+        with suppress(OSError):  # some file systems keep neither times nor permissions
+            shutil.copystat(source, target)
 
 
 def _reflink(source: Path, target: Path) -> bool:

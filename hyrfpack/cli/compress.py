@@ -1,4 +1,4 @@
-"""The commands `hyrfpack compress`, `decompress` and `info`."""
+"""The commands `hyrfpack compress` and `decompress`."""
 
 from __future__ import annotations
 
@@ -16,8 +16,6 @@ from hyrfpack.cli.common import (
     SIZE,
     choose_command_device,
     device_option,
-    format_consistent_psnr,
-    format_table,
     json_option,
     note,
     note_rename,
@@ -28,11 +26,10 @@ from hyrfpack.cli.common import (
     resolve_model_file,
     scene_options,
 )
-from hyrfpack.cli.console import print_line
 from hyrfpack.cli.processes import processes_option
 from hyrfpack.cli.progress import show_progress
-from hyrfpack.cli.wording import use_option_names
-from hyrfpack.outputs import ARCHIVE_SUFFIXES, PICTURE_SUFFIXES, VIDEO_SUFFIXES, Outputs
+from hyrfpack.cli.section_table import format_section_table
+from hyrfpack.outputs import Outputs
 from hyrfpack.progress import report_part
 
 if TYPE_CHECKING:
@@ -201,138 +198,6 @@ def decompress(file: Path, output: Path, fraction: float | None, overwrite: bool
     _print_report(result, {}, as_json)
 
 
-@click.command(short_help="Describe a file, a run or a folder of photos.")
-@click.argument("path", metavar="FILE", type=PATH)
-@json_option
-def info(path: Path, as_json: bool) -> None:
-    """Describe FILE.
-
-    For a .hyrf file: the model, the bytes of each section, and the settings that training chose, with the reasons.
-
-    For the folder of a training run: its model, steps and scores, or the progress of an unfinished run.
-
-    For splats (.ply .splat .spz .sog): format, number of Gaussians, degree of harmonics, bounds.
-
-    For a folder of photos, with or without poses, its .zip, or a video: number of photos, poses, cameras, sharpness,
-    exposure, problems and what to do about them.
-
-    \b
-    Examples:
-      hyrfpack info bonsai.hyrf
-      hyrfpack info bonsai.hyrf --json
-      hyrfpack info runs/bonsai
-      hyrfpack info other.ply
-      hyrfpack info photos/bonsai
-      hyrfpack info clip.mp4
-    """
-    from hyrfpack.format.run_folder import is_run_folder
-    from hyrfpack.splats.names import is_splats
-
-    if is_run_folder(path):
-        _print_run(path, as_json)
-    elif is_splats(path):
-        _print_splats(path, as_json)
-    elif path.is_dir() or (
-        path.is_file() and path.suffix.lower() in (*ARCHIVE_SUFFIXES, *VIDEO_SUFFIXES, *PICTURE_SUFFIXES)
-    ):
-        _print_photos(path, as_json)
-    else:
-        _print_model(path, as_json)
-
-
-def _print_photos(path: Path, as_json: bool) -> None:
-    from hyrfpack.cli.survey import print_survey
-    from hyrfpack.make.survey import describe_photos
-
-    with show_progress("info") as progress:
-        survey = describe_photos(path, report=progress)
-    if as_json:
-        print_json(asdict(survey))
-    else:
-        print_survey(survey)
-
-
-def _print_run(folder: Path, as_json: bool) -> None:
-    from hyrfpack.format import describe_file, read_run_status
-    from hyrfpack.format.run_folder import FINISH_RUN_ADVICE, MODEL_FILE, describe_unfinished_run
-
-    run = read_run_status(folder)
-    facts = describe_file(folder) if (folder / MODEL_FILE).is_file() else {}
-    if as_json:
-        print_json({**facts, "run": asdict(run)})
-        return
-    if run.finished:
-        steps = "" if run.steps is None else f": {run.steps:,} steps"
-        seconds = "" if run.seconds is None else f" in {run.seconds:,.0f} s"
-        print_line(f"{folder}: a finished training run{steps}{seconds}")
-    else:
-        print_line(f"{folder}: {describe_unfinished_run(run)}; {use_option_names(FINISH_RUN_ADVICE)}")
-    if run.photos is not None:
-        print_line(f"photos: {run.photos}, {run.train} to train on and {run.test} held out")
-    if run.psnr is not None and run.ssim is not None:
-        consistent = format_consistent_psnr(run.psnr_consistent)
-        print_line(f"held-out photos: PSNR {run.psnr:.2f} dB{consistent}, SSIM {run.ssim:.4f}")
-    if facts:
-        click.echo()
-        _print_model_facts(folder / MODEL_FILE, facts)
-
-
-def _print_splats(path: Path, as_json: bool) -> None:
-    from hyrfpack.splats.facts import describe_splats
-    from hyrfpack.splats.files import read_splats
-
-    facts = describe_splats(path, read_splats(path))
-    if as_json:
-        print_json(facts.to_dict())
-        return
-    click.echo(f"{path}: {facts.bytes:,} bytes, {facts.gaussians:,} Gaussians")
-    rows = [
-        ("format", facts.format + (", antialiased" if facts.antialiased else "")),
-        ("bytes/Gaussian", f"{facts.bytes / max(facts.gaussians, 1):.1f}"),
-        ("harmonics", f"degree {facts.degree}"),
-    ]
-    if facts.low is not None and facts.high is not None and facts.opacity is not None:
-        low, high = (", ".join(f"{value:.4g}" for value in corner) for corner in (facts.low, facts.high))
-        rows += [("centres", f"from ({low}) to ({high}), world units"), ("opacity", f"median {facts.opacity:.2f}")]
-    for name, text in rows:
-        print_line(f"  {name:<14}  {text}")
-
-
-def _print_model(file: Path, as_json: bool) -> None:
-    from hyrfpack.format import describe_file
-
-    facts = describe_file(file)
-    if as_json:
-        print_json(facts)
-    else:
-        _print_model_facts(file, facts)
-
-
-def _print_model_facts(file: Path, facts: dict) -> None:
-    config, provenance = facts["config"], facts["provenance"]
-    click.echo(f"{file}: {facts['bytes']:,} bytes, {facts['gaussians']:,} Gaussians")
-    print_line(f"written by {facts['writer']}, format {facts['version']}, profile {facts['profile']}")
-    click.echo("\n" + _section_table(facts["sections"], facts["bytes"], facts["gaussians"]))
-    click.echo("\nmodel")
-    frame = config["frame"]
-    center = ", ".join(f"{value:.4g}" for value in frame["center"])
-    half = " x ".join(f"{2.0 * value * frame['scale']:.4g}" for value in frame["half_extent"])
-    print_line(f"  {'box':<18}  {half} around ({center}), world units")
-    for name in ("geometry", "radiance"):
-        print_line(f"  {name + ' grid':<18}  {_format_settings(config[name])}")
-    if (exposure := facts["exposure"]) is not None:
-        lowest, highest = exposure["stops"]
-        print_line(f"  {'exposure map':<18}  {exposure['centers']} centres, {lowest:+.2f} to {highest:+.2f} stops")
-    for name, value in config.items():
-        if name not in ("frame", "geometry", "radiance"):
-            print_line(f"  {name.replace('_', ' '):<18}  {value}")
-    choices = provenance.get("choices")
-    if choices and isinstance(choices, dict):
-        click.echo("\nchosen in training")
-        for name, reason in choices.items():
-            print_line(f"  {name.replace('_', ' '):<18}  {reason}")
-
-
 def _command_as_typed(context: click.Context) -> str:
     """Return the command line of a command, with the parameters that were given there."""
     words = ["hyrfpack", str(context.info_name)]
@@ -382,7 +247,7 @@ def _print_report(report: CompressionReport, scores: dict[str, float], as_json: 
         print_json({**report.to_dict(), **scores})
         return
     sections = [asdict(part) for part in report.sections]
-    click.echo(_section_table(sections, report.bytes_after, report.gaussians, report.shares))
+    click.echo(format_section_table(sections, report.bytes_after, report.gaussians, report.shares))
     ratio = report.bytes_before / report.bytes_after
     outcome = "all numbers as float32" if report.profile == "raw" else f"{ratio:.2f} times smaller than float32"
     click.echo(f"{report.file}: {report.bytes_after:,} bytes, {report.gaussians:,} Gaussians, {outcome}")
@@ -395,40 +260,3 @@ def _print_report(report: CompressionReport, scores: dict[str, float], as_json: 
             f"held-out photos: PSNR {scores['psnr_before']:.3f} to {scores['psnr']:.3f} dB, "
             f"SSIM {scores['ssim_before']:.4f} to {scores['ssim']:.4f}"
         )
-
-
-def _section_table(sections: list[dict], total: int, gaussians: int, shares: dict[str, float] | None = None) -> str:
-    """Format a table of the bytes of each section, summed over its layers, and of its share of the loss if known."""
-    from hyrfpack.format.sections import NON_PARAMETER_SECTIONS, SECTION_CONTENTS, group_and_layer
-
-    together: dict[str, list] = {}
-    for part in sections:
-        tag = group_and_layer(part["type"])[0]
-        sizes = together.setdefault(tag, [SECTION_CONTENTS.get(tag, part["holds"]), 0, 0])
-        sizes[1] += part["before"]
-        sizes[2] += part["after"]
-    parts = [(tag, holds, f"{before:,}", after) for tag, (holds, before, after) in together.items()]
-    parts.append(("", "header, table of contents, padding", "", total - sum(after for *_, after in parts)))
-    rows, header = [], ["section", "unpacked bytes", "stored bytes", "share", "bits/Gaussian", "bits/number"]
-    for tag, holds, before, after in parts:
-        numbers = int(before.replace(",", "") or 0) / 4 if tag not in (*NON_PARAMETER_SECTIONS, "") else 0
-        rows.append(
-            [
-                f"{tag} {holds}".strip(),
-                before,
-                f"{after:,}",
-                f"{after / total:.1%}",
-                f"{8 * after / max(gaussians, 1):.2f}",
-                f"{8 * after / numbers:.2f}" if numbers else "",
-            ]
-        )
-        if shares:
-            rows[-1].append(f"{shares[tag]:.1%}" if tag in shares else "")
-    if shares:
-        left_out = sum(share for part, share in shares.items() if part not in together)
-        rows.append(["Gaussians left out", "", "", "", "", "", f"{left_out:.1%}"])
-    return format_table([*header, *(["of the loss"] if shares else [])], rows)
-
-
-def _format_settings(values: dict) -> str:
-    return ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in values.items())

@@ -1,0 +1,151 @@
+"""The command `hyrfpack info`."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+
+import click
+
+from hyrfpack.cli.common import PATH, format_consistent_psnr, json_option, print_json
+from hyrfpack.cli.console import print_line
+from hyrfpack.cli.progress import show_progress
+from hyrfpack.cli.section_table import format_section_table
+from hyrfpack.cli.wording import use_option_names
+from hyrfpack.outputs import ARCHIVE_SUFFIXES, PICTURE_SUFFIXES, VIDEO_SUFFIXES
+
+
+@click.command(short_help="Describe a file, a run or a folder of photos.")
+@click.argument("path", metavar="FILE", type=PATH)
+@json_option
+def info(path: Path, as_json: bool) -> None:
+    """Describe FILE.
+
+    For a .hyrf file: the model, the bytes of each section, and the settings that training chose, with the reasons.
+
+    For the folder of a training run: its model, steps and scores, or the progress of an unfinished run.
+
+    For splats (.ply .splat .spz .sog): format, number of Gaussians, degree of harmonics, bounds.
+
+    For a folder of photos, with or without poses, its .zip, or a video: number of photos, poses, cameras, sharpness,
+    exposure, problems and what to do about them.
+
+    \b
+    Examples:
+      hyrfpack info bonsai.hyrf
+      hyrfpack info bonsai.hyrf --json
+      hyrfpack info runs/bonsai
+      hyrfpack info other.ply
+      hyrfpack info photos/bonsai
+      hyrfpack info clip.mp4
+    """
+    from hyrfpack.format.run_folder import is_run_folder
+    from hyrfpack.splats.names import is_splats
+
+    if is_run_folder(path):
+        _print_run(path, as_json)
+    elif is_splats(path):
+        _print_splats(path, as_json)
+    elif path.is_dir() or (
+        path.is_file() and path.suffix.lower() in (*ARCHIVE_SUFFIXES, *VIDEO_SUFFIXES, *PICTURE_SUFFIXES)
+    ):
+        _print_photos(path, as_json)
+    else:
+        _print_model(path, as_json)
+
+
+def _print_photos(path: Path, as_json: bool) -> None:
+    from hyrfpack.cli.survey import print_survey
+    from hyrfpack.survey import describe_photos
+
+    with show_progress("info") as progress:
+        survey = describe_photos(path, report=progress)
+    if as_json:
+        print_json(asdict(survey))
+    else:
+        print_survey(survey)
+
+
+def _print_run(folder: Path, as_json: bool) -> None:
+    from hyrfpack.format import describe_file, read_run_status
+    from hyrfpack.format.run_folder import FINISH_RUN_ADVICE, MODEL_FILE, describe_unfinished_run
+
+    run = read_run_status(folder)
+    facts = describe_file(folder) if (folder / MODEL_FILE).is_file() else {}
+    if as_json:
+        print_json({**facts, "run": asdict(run)})
+        return
+    if run.finished:
+        steps = "" if run.steps is None else f": {run.steps:,} steps"
+        seconds = "" if run.seconds is None else f" in {run.seconds:,.0f} s"
+        print_line(f"{folder}: a finished training run{steps}{seconds}")
+    else:
+        print_line(f"{folder}: {describe_unfinished_run(run)}; {use_option_names(FINISH_RUN_ADVICE)}")
+    if run.photos is not None:
+        print_line(f"photos: {run.photos}, {run.train} to train on and {run.test} held out")
+    if run.psnr is not None and run.ssim is not None:
+        consistent = format_consistent_psnr(run.psnr_consistent)
+        print_line(f"held-out photos: PSNR {run.psnr:.2f} dB{consistent}, SSIM {run.ssim:.4f}")
+    if facts:
+        click.echo()
+        _print_model_facts(folder / MODEL_FILE, facts)
+
+
+def _print_splats(path: Path, as_json: bool) -> None:
+    from hyrfpack.splats.facts import describe_splats
+    from hyrfpack.splats.files import read_splats
+
+    facts = describe_splats(path, read_splats(path))
+    if as_json:
+        print_json(facts.to_dict())
+        return
+    click.echo(f"{path}: {facts.bytes:,} bytes, {facts.gaussians:,} Gaussians")
+    rows = [
+        ("format", facts.format + (", antialiased" if facts.antialiased else "")),
+        ("bytes/Gaussian", f"{facts.bytes / max(facts.gaussians, 1):.1f}"),
+        ("harmonics", f"degree {facts.degree}"),
+    ]
+    if facts.low is not None and facts.high is not None and facts.opacity is not None:
+        low, high = (", ".join(f"{value:.4g}" for value in corner) for corner in (facts.low, facts.high))
+        rows += [("centres", f"from ({low}) to ({high}), world units"), ("opacity", f"median {facts.opacity:.2f}")]
+    for name, text in rows:
+        print_line(f"  {name:<14}  {text}")
+
+
+def _print_model(file: Path, as_json: bool) -> None:
+    from hyrfpack.format import describe_file
+
+    facts = describe_file(file)
+    if as_json:
+        print_json(facts)
+    else:
+        _print_model_facts(file, facts)
+
+
+def _print_model_facts(file: Path, facts: dict) -> None:
+    config, provenance = facts["config"], facts["provenance"]
+    click.echo(f"{file}: {facts['bytes']:,} bytes, {facts['gaussians']:,} Gaussians")
+    print_line(f"written by {facts['writer']}, format {facts['version']}, profile {facts['profile']}")
+    click.echo("\n" + format_section_table(facts["sections"], facts["bytes"], facts["gaussians"]))
+    click.echo("\nmodel")
+    frame = config["frame"]
+    center = ", ".join(f"{value:.4g}" for value in frame["center"])
+    half = " x ".join(f"{2.0 * value * frame['scale']:.4g}" for value in frame["half_extent"])
+    print_line(f"  {'box':<18}  {half} around ({center}), world units")
+    for name in ("geometry", "radiance"):
+        print_line(f"  {name + ' grid':<18}  {_format_settings(config[name])}")
+    if (exposure := facts["exposure"]) is not None:
+        lowest, highest = exposure["stops"]
+        print_line(f"  {'exposure map':<18}  {exposure['centers']} centres, {lowest:+.2f} to {highest:+.2f} stops")
+    for name, value in config.items():
+        if name not in ("frame", "geometry", "radiance"):
+            print_line(f"  {name.replace('_', ' '):<18}  {value}")
+    choices = provenance.get("choices")
+    if choices and isinstance(choices, dict):
+        click.echo("\nchosen in training")
+        for name, reason in choices.items():
+            print_line(f"  {name.replace('_', ' '):<18}  {reason}")
+
+
+def _format_settings(values: dict) -> str:
+    return ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in values.items())

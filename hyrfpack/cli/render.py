@@ -1,0 +1,125 @@
+"""The command `hyrfpack render`."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from hyrfpack.cli.common import OUTPUT, PATH, note, note_rename, print_json, read_scene, scene_options
+from hyrfpack.cli.drawing import drawing_options, largest_picture_size, select_views, split_option
+from hyrfpack.cli.progress import show_item_progress
+from hyrfpack.outputs import Outputs
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from hyrfpack.cli.drawing import Drawing
+    from hyrfpack.render.files import ColorAndDepth
+    from hyrfpack.scene import Camera
+
+DEFAULT_ORBIT_FRAMES = 60
+
+
+@click.command(short_help="Render views to picture files.")
+@click.argument("model", type=PATH)
+@click.option("-o", "--output", type=OUTPUT, required=True, metavar="OUT", help="Folder of the pictures.")
+@click.option("--data", type=PATH, help="Render the views of this folder of photos and poses.")
+@split_option("Views of --data to render.")
+@scene_options
+@click.option("--cameras", type=PATH, metavar="JSON", help="Render the cameras of this file.")
+@click.option(
+    "--orbit", type=click.IntRange(1, 100_000), metavar="N", help="Render an orbit of N frames around the scene."
+)
+@click.option("--depth", is_flag=True, help="Also write depth in world units (float32 TIFF).")
+@click.option("--video", is_flag=True, help="Also write the frames as OUT/video.mp4 (needs ffmpeg).")
+@drawing_options
+def render(
+    model: Path,
+    output: Path,
+    data: Path | None,
+    split: str,
+    reader_options: dict[str, Any],
+    cameras: Path | None,
+    orbit: int | None,
+    depth: bool,
+    video: bool,
+    drawing: Drawing,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
+    """Render MODEL to PNG pictures: the views of photos, the cameras of a file, or by default an orbit of 60 frames.
+
+    MODEL is a .hyrf file, the folder of a run, or splats (.ply .splat .spz .sog), which are drawn over black.
+
+    The file of --cameras is a list of {"name", "width", "height", "fx", "fy", "cx", "cy", "camera_from_world": 4 x 4}
+    with OpenCV axes, or a transforms.json in the format of nerfstudio.
+
+    \b
+    Examples:
+      hyrfpack render bonsai.hyrf -o orbit --video
+      hyrfpack render bonsai.hyrf -o out --data photos/bonsai --split test
+      hyrfpack render bonsai.hyrf -o path --cameras path.json --depth
+      hyrfpack render other.ply -o orbit --orbit 90
+    """
+    if sum(source is not None for source in (data, cameras, orbit)) > 1:
+        raise click.UsageError("--data, --cameras and --orbit each say what to render; give one of them")
+    from hyrfpack.cameras.files import cameras_from_json
+    from hyrfpack.cameras.paths import orbit as orbit_around
+    from hyrfpack.lock import exclusive_folder
+    from hyrfpack.render.files import make_renderer, render_file_names, write_pictures
+    from hyrfpack.render.video import has_ffmpeg, write_video
+    from hyrfpack.splats.draw import Drawable, draw
+
+    ranks, settings = drawing.ranks, drawing.settings
+    source, scene = drawing.open(model), None
+    if data is not None:
+        scene = ranks.run_on_all(lambda: read_scene(data, reader_options, source.facts))
+        views = select_views(scene, split)
+        named = [(view.name, view.camera) for view in views]
+    elif cameras is not None:
+        named = cameras_from_json(cameras)
+    else:
+        cameras_around = orbit_around(source.viewpoint, orbit or DEFAULT_ORBIT_FRAMES)
+        named = [(f"{number:04d}", camera) for number, camera in enumerate(cameras_around)]
+    video_path = output / "video.mp4" if video and has_ffmpeg() else None
+    names = render_file_names([name for name, _ in named], depth)
+    names += [video_path.name] if video_path else []
+
+    def check(replace: bool) -> None:
+        if ranks.is_main:
+            outputs = Outputs(source.path, cameras, folder=source.folder, scene=scene, overwrite=replace)
+            outputs.folder(output, names)
+
+    def write() -> list[Path]:
+        shown = source.load()
+        if isinstance(shown, Drawable):
+            picture_of: Callable[[Camera], ColorAndDepth] = partial(draw, shown, settings=settings, depth=depth)
+        else:
+            picture_of = make_renderer(shown, depth=depth, settings=settings)
+        pictures = write_pictures(picture_of, named, output, overwrite=overwrite, ranks=ranks)
+        return list(show_item_progress(pictures, len(ranks.share(named)), "render", "picture"))
+
+    # This first check ignores existing files. It prevents the creation of a folder where nothing may be written.
+    ranks.run_on_all(lambda: check(replace=True))
+    with exclusive_folder(output, ranks=ranks):  # the lock is held until the video is written, too
+        ranks.run_on_all(lambda: check(replace=overwrite))
+        width, height = largest_picture_size(camera for _, camera in named)
+        note(f"rendering {len(named)} pictures of up to {width} x {height} pixels")
+        parts = ranks.all_gather(ranks.run_on_all(write))
+        if not ranks.is_main:
+            return
+        written = [parts[index % ranks.size][index // ranks.size] for index in range(len(named))]
+        if video_path:
+            video_path = note_rename(video_path, write_video(written, video_path, overwrite=overwrite))
+    for name, path in zip(render_file_names([name for name, _ in named]), written, strict=True):
+        note_rename(output / name, path)
+    if video and not video_path:
+        note("ffmpeg was not found, so no video was written; the pictures are complete")
+    if as_json:
+        print_json({"pictures": [str(path) for path in written], "video": str(video_path) if video_path else None})
+    else:
+        film = f" and {video_path.name}" if video_path else ""
+        click.echo(f"{output}: {len(written)} pictures{film}, {width} x {height} pixels")

@@ -1,0 +1,215 @@
+"""Describe a set of photos or a video before it is used: its properties, its problems, and what to do about them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hyrfpack.data import load_scene, pose_commands
+from hyrfpack.data.archive import is_archive, unpack
+from hyrfpack.data.folder import PhotoFacts, list_photos, list_raw_photos
+from hyrfpack.data.preset import detect_preset
+from hyrfpack.data.quality import is_blurred
+from hyrfpack.data.unusable import (
+    no_photos_error,
+    raise_if_single_photo,
+    raw_photos_notes,
+    unreadable_error,
+    unreadable_sentences,
+)
+from hyrfpack.errors import HyrfDataError, HyrfNoPosesError
+from hyrfpack.outputs import VIDEO_SUFFIXES, StrPath
+from hyrfpack.poses.frames import survey_frames
+from hyrfpack.scene import DEFAULT_MAX_SIZE, Scene
+from hyrfpack.survey.measure import measure_pixels, read_header_facts, relative_name
+from hyrfpack.survey.problems import (
+    find_blur_problems,
+    find_copy_problems,
+    find_count_problems,
+    find_light_problems,
+    find_mask_problems,
+    find_zoom_problems,
+    header_notes,
+)
+
+
+@dataclass(frozen=True)
+class PhotoSurvey:
+    """Description of a set of photos or a video, which `dataclasses.asdict` turns into JSON values.
+
+    Attributes:
+        path: the path that was described.
+        kind: "photos" or "video".
+        photos: number of photos; for a video, number of frames.
+        layout: layout of the poses; "" if there are none.
+        posed: number of photos with poses.
+        points: number of points of the reconstruction.
+        preset: the preset that training would use, and why; "" without poses.
+        sizes: number of photos by size, such as "4032 x 3024", of upright pictures; the most frequent first.
+        cameras: number of photos by camera, such as "Apple iPhone 12, 26 mm", of the photos whose headers were read.
+        decoded: number of photos whose pixels were measured; the next four values describe these photos.
+        sharpness: median sharpness, about 1 for pictures that are sharp to the pixel; 0 for a video.
+        blurred: names of photos that are blurred compared with the others.
+        stops: difference in stops between the 5 % and 95 % quantiles of the mean luminance; 0 for a video.
+        luminance: median of the mean linear luminance, in [0, 1]; 0 for a video.
+        frames: number of frames that would be taken from a video.
+        notes: sentences about the set.
+        problems: sentences about problems, each with advice.
+    """
+
+    path: str
+    kind: str
+    photos: int
+    layout: str
+    posed: int
+    points: int
+    preset: str
+    sizes: dict[str, int]
+    cameras: dict[str, int]
+    decoded: int
+    sharpness: float
+    blurred: tuple[str, ...]
+    stops: float
+    luminance: float
+    frames: int
+    notes: tuple[str, ...]
+    problems: tuple[str, ...]
+
+
+def describe_photos(path: StrPath, *, report: Callable[[str, float], None] | None = None) -> PhotoSurvey:
+    """Describe a folder of photos, with poses or without, a .zip of one, or a video.
+
+    An evenly spaced selection of a large set is examined: the headers of 2,000 photos and the pixels of 150. A video is
+    decoded once. No file is written.
+
+    Args:
+        path: the folder or file.
+        report: called with a description of the current work and the ratio of the work that is done, in [0, 1].
+
+    Raises:
+        HyrfDataError: the path does not exist, or has no photo that can be read.
+
+    Example:
+        >>> survey = describe_photos("photos/bonsai")
+        >>> survey.photos, survey.posed, survey.layout, survey.sizes
+        (10, 10, 'nerfstudio', {'48 x 48': 10})
+        >>> survey.problems[0]
+        'there are only 10 photos; take 20 or more, from all around and with much overlap'
+    """
+    path = Path(path)
+    report_progress = report or (lambda text, share: None)
+    if path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES:
+        return _describe_video(path, report_progress)
+    raise_if_single_photo(path)
+    folder = unpack(path) if is_archive(path) else path
+    photos = list_photos(folder)
+    report_progress("reading poses", 0.0)
+    scene, problems = _load_scene_or_problem(path, folder)
+    posed = _posed_files(scene)
+    photos = sorted({*photos, *posed})
+    if not photos:
+        raise no_photos_error(path, folder)
+    facts, unreadable = read_header_facts(photos, folder, report_progress)
+    measurements, undecodable = measure_pixels([fact.path for fact in facts], folder, report_progress)
+    unreadable |= undecodable
+    if not measurements:
+        raise unreadable_error(path, unreadable, len(photos))
+    blurred = [
+        measurement.path
+        for measurement, bad in zip(measurements, is_blurred([x.sharpness for x in measurements]), strict=True)
+        if bad
+    ]
+    light = np.log2([max(measurement.exposure.luminance, 1e-6) for measurement in measurements])
+    stops = float(np.ptp(np.quantile(light, (0.05, 0.95))))
+
+    problems += find_count_problems(len(photos), scene, len(posed), path)
+    problems += unreadable_sentences(unreadable, len(photos))
+    problems += find_copy_problems(photos, measurements, folder, report_progress)
+    problems += find_blur_problems(measurements, blurred, folder)
+    problems += find_light_problems(measurements, light, stops, folder, scene)
+    if scene is None:
+        problems += find_zoom_problems(facts) + find_mask_problems(folder, photos)
+    notes = list(scene.notes) if scene is not None else header_notes(facts) + raw_photos_notes(list_raw_photos(folder))
+    if len(measurements) + len(unreadable) < len(photos):
+        notes.append(f"the pixels of {len(measurements)} of {len(photos)} photos were measured, evenly spaced")
+    preset = ": ".join(detect_preset(scene)) if scene is not None and scene.train else ""
+    report_progress("described", 1.0)
+    return PhotoSurvey(
+        path=str(path),
+        kind="photos",
+        photos=len(photos),
+        layout=scene.layout if scene is not None else "",
+        posed=len(posed) or (len(scene.views) if scene is not None else 0),
+        points=len(scene.points) if scene is not None else 0,
+        preset=preset,
+        sizes=_count_values(f"{fact.size[0]} x {fact.size[1]}" for fact in facts),
+        cameras=_count_values(_describe_camera(fact) for fact in facts),
+        decoded=len(measurements),
+        sharpness=round(float(np.median([measurement.sharpness for measurement in measurements])), 3),
+        blurred=tuple(relative_name(item, folder) for item in blurred),
+        stops=round(stops, 2),
+        luminance=round(float(2 ** np.median(light)), 4),
+        frames=0,
+        notes=tuple(notes),
+        problems=tuple(problems),
+    )
+
+
+def _describe_video(path: Path, report_progress: Callable[[str, float], None]) -> PhotoSurvey:
+    """Describe a video."""
+    found, size, looked = survey_frames(path, report=report_progress)
+    problems = [f"a video has no poses; {pose_commands(path)}"]
+    return PhotoSurvey(
+        path=str(path),
+        kind="video",
+        photos=found.of,
+        layout="",
+        posed=0,
+        points=0,
+        preset="",
+        sizes={f"{size[0]} x {size[1]}": found.of},
+        cameras={},
+        decoded=looked,
+        sharpness=0.0,
+        blurred=(),
+        stops=0.0,
+        luminance=0.0,
+        frames=found.taken,
+        notes=(
+            f"{found.blurred} frames are blurred and {found.repeated} repeated, and would be skipped",
+            *found.notes,
+        ),
+        problems=tuple(problems),
+    )
+
+
+def _load_scene_or_problem(path: Path, folder: Path) -> tuple[Scene | None, list[str]]:
+    """Load the photos with their poses; without poses, return None and sentences about the problem."""
+    try:
+        return load_scene(folder, test_every=0, max_size=DEFAULT_MAX_SIZE), []
+    except HyrfNoPosesError:
+        return None, [f"the photos have no poses; {pose_commands(path)}"]
+    except HyrfDataError as error:
+        if not list_photos(folder):
+            return None, []
+        return None, [str(error)]
+
+
+def _posed_files(scene: Scene | None) -> set[Path]:
+    """Return the paths of the photos with poses."""
+    files = (getattr(view.load, "path", None) for view in scene.views) if scene is not None else ()
+    return {Path(file) for file in files if file is not None}
+
+
+def _describe_camera(fact: PhotoFacts) -> str:
+    """Return the name of a photo's camera, with its focal length in 35 mm equivalents if known."""
+    name = fact.device or "unknown camera"
+    return name if fact.focal is None else f"{name}, {fact.focal / np.hypot(*fact.size) * np.hypot(36, 24):.0f} mm"
+
+
+def _count_values(items: Iterable[str]) -> dict[str, int]:
+    return dict(Counter(items).most_common())

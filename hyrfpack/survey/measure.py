@@ -1,0 +1,91 @@
+"""Measurements of photos for their survey: headers, and the sharpness, exposure and thumbnail of each picture."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from hyrfpack.data.archive import display_path
+from hyrfpack.data.folder import PhotoFacts, read_photo_facts
+from hyrfpack.data.quality import Exposure, measure_exposure, measure_sharpness, read_gray
+from hyrfpack.errors import HyrfDataError, strip_path
+from hyrfpack.parallel.pool import thread_count
+from hyrfpack.scene import evenly_spaced
+
+# An evenly spaced selection of larger sets is examined, so that a survey takes seconds and not minutes.
+MAX_DECODED_PHOTOS = 150
+MAX_OPENED_PHOTOS = 2000
+# Ratios of the whole work that are done after the headers are read and after the pixels are measured.
+HEADERS_PROGRESS = 0.2
+PIXELS_PROGRESS = 0.95
+_THUMBNAIL_SIDE_PIXELS = 24
+
+
+@dataclass(frozen=True)
+class PhotoMeasurement:
+    """Measurements of the pixels of one photo.
+
+    Attributes:
+        path: the photo.
+        sharpness: its sharpness.
+        exposure: its luminance and clipping.
+        thumbnail: (_THUMBNAIL_SIDE_PIXELS, _THUMBNAIL_SIDE_PIXELS) grey levels in [0, 255].
+    """
+
+    path: Path
+    sharpness: float
+    exposure: Exposure
+    thumbnail: np.ndarray
+
+
+def read_header_facts(
+    photos: list[Path], folder: Path, report_progress: Callable[[str, float], None]
+) -> tuple[list[PhotoFacts], dict[str, str]]:
+    """Read the headers of photos; return their facts, and the reason for each photo that cannot be read, by name."""
+    facts, unreadable = [], {}
+    chosen = evenly_spaced(photos, MAX_OPENED_PHOTOS)
+    for done, photo in enumerate(chosen):
+        try:
+            facts.append(read_photo_facts(photo))
+        except HyrfDataError as error:
+            unreadable[relative_name(photo, folder)] = strip_path(error, display_path(photo))
+        read = f"reading the headers of photos {done + 1}/{len(chosen)}"
+        report_progress(read, HEADERS_PROGRESS * (done + 1) / len(chosen))
+    return facts, unreadable
+
+
+def measure_pixels(
+    photos: list[Path], folder: Path, report_progress: Callable[[str, float], None]
+) -> tuple[list[PhotoMeasurement], dict[str, str]]:
+    """Measure the pixels of photos; also return the reason for each undecodable photo, by name."""
+    chosen = evenly_spaced(photos, MAX_DECODED_PHOTOS)
+    measurements, undecodable = [], {}
+    with ThreadPoolExecutor(thread_count()) as pool:
+        for done, found in enumerate(pool.map(_measure_one, chosen)):
+            if isinstance(found, PhotoMeasurement):
+                measurements.append(found)
+            else:
+                undecodable[relative_name(chosen[done], folder)] = found
+            looked = f"measuring photo {done + 1}/{len(chosen)}"
+            report_progress(looked, HEADERS_PROGRESS + (PIXELS_PROGRESS - HEADERS_PROGRESS) * (done + 1) / len(chosen))
+    return measurements, undecodable
+
+
+def _measure_one(path: Path) -> PhotoMeasurement | str:
+    """Measure the pixels of a photo; return the reason if it cannot be decoded."""
+    try:
+        gray = read_gray(path)
+    except HyrfDataError as error:
+        return strip_path(error, display_path(path))
+    small = Image.fromarray(gray).resize((_THUMBNAIL_SIDE_PIXELS, _THUMBNAIL_SIDE_PIXELS), Image.Resampling.BOX)
+    return PhotoMeasurement(path, measure_sharpness(gray), measure_exposure(gray), 255 * np.asarray(small))
+
+
+def relative_name(path: Path, folder: Path) -> str:
+    """Return the path of a photo below its folder; a path elsewhere stays as it is."""
+    return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else str(path)

@@ -1,0 +1,193 @@
+"""Problems of a set of photos, as sentences for the user: what is wrong, and what to do about it."""
+
+from __future__ import annotations
+
+import hashlib
+import shlex
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from hyrfpack.data.folder import PhotoFacts
+from hyrfpack.data.quality import MIN_SHARPNESS
+from hyrfpack.data.unusable import format_file_names, format_photo_count
+from hyrfpack.outputs import PICTURE_SUFFIXES
+from hyrfpack.scene import DEFAULT_MAX_SIZE, Scene
+from hyrfpack.survey.measure import PIXELS_PROGRESS, PhotoMeasurement, relative_name
+
+_MIN_RECOMMENDED_PHOTOS = 20  # fewer photos hardly show an object from all sides
+_MAX_EXPOSURE_SPREAD_STOPS = 2.5  # between the 5 % and 95 % quantiles; real sets at one exposure have up to 2
+_MIN_SET_LUMINANCE = 0.02  # a set with a lower median of the mean luminances is dark
+_DARK_PHOTO_STOPS = 3.0  # a photo this far below the median of its set is dark
+_MAX_CLIPPED_PIXEL_RATIO = 0.25
+_SAME_ZOOM_TOLERANCE = 0.03  # EXIF rounds focal lengths by up to this ratio
+_SAME_PICTURE_MAX_LEVELS = 1.0  # thumbnails of the same picture differ by less, in levels of 255 on average
+
+
+def find_count_problems(count: int, scene: Scene | None, posed: int, path: Path) -> list[str]:
+    """Describe too few photos, photos without poses, and missing points."""
+    found = []
+    if count < _MIN_RECOMMENDED_PHOTOS:
+        found.append(
+            f"there {'is' if count == 1 else 'are'} only {format_photo_count(count)}; take {_MIN_RECOMMENDED_PHOTOS} "
+            "or more, from all around and with much overlap"
+        )
+    if scene is None or scene.layout == "blender":  # only some splits of a Blender set are used
+        return found
+    without = count - posed
+    if posed and without > 0:
+        found.append(
+            f"{without} of {count} photos have no pose and are not used; take more photos between them and the others, "
+            f"or estimate all poses again with 'hyrfpack poses {shlex.quote(str(path))} -o SCENE'"
+        )
+    if not len(scene.points):
+        found.append(
+            "there are no points, so training starts at random positions; add the points of the reconstruction"
+        )
+    return found
+
+
+def find_copy_problems(
+    photos: list[Path],
+    measurements: list[PhotoMeasurement],
+    folder: Path,
+    report_progress: Callable[[str, float], None],
+) -> list[str]:
+    """Describe copies of photos, or a set that shows the same picture throughout."""
+    thumbnails = np.stack([measurement.thumbnail for measurement in measurements])
+    if len(measurements) > 2 and np.abs(thumbnails - thumbnails[0]).mean(axis=(1, 2)).max() < _SAME_PICTURE_MAX_LEVELS:
+        return ["all photos show the same picture; walk around and take photos from many places"]
+    sizes: dict[int, list[Path]] = {}
+    for photo in photos:
+        sizes.setdefault(photo.stat().st_size, []).append(photo)
+    seen: dict[bytes, Path] = {}
+    copies = []
+    suspects = [item for group in sizes.values() if len(group) > 1 for item in group]
+    for done, photo in enumerate(suspects):
+        compared = f"searching for identical photos {done + 1}/{len(suspects)}"
+        report_progress(compared, PIXELS_PROGRESS + (1 - PIXELS_PROGRESS) * done / len(suspects))
+        digest = hashlib.sha256(photo.read_bytes()).digest()
+        if digest in seen:
+            copies.append((photo, seen[digest]))
+        seen.setdefault(digest, photo)
+    if not copies:
+        return []
+    first, of = (relative_name(item, folder) for item in copies[0])
+    return [
+        f"{format_photo_count(len(copies))} {_be(len(copies))} a copy of another (such as {first} of {of}); "
+        "remove the copies"
+    ]
+
+
+def find_blur_problems(measurements: list[PhotoMeasurement], blurred: list[Path], folder: Path) -> list[str]:
+    """Describe a blurred set, or its blurred photos."""
+    values = [measurement.sharpness for measurement in measurements]
+    if np.median(values) < MIN_SHARPNESS:
+        return [
+            "most photos are blurred; take them again with the camera held still, in more light, and "
+            "focused on what you photograph"
+        ]
+    if not blurred:
+        return []
+    names = format_file_names([relative_name(item, folder) for item in blurred])
+    return [
+        f"{format_photo_count(len(blurred))} {_be(len(blurred))} blurred ({names}); leave out or retake blurred photos"
+    ]
+
+
+def find_light_problems(
+    measurements: list[PhotoMeasurement], light: np.ndarray, stops: float, folder: Path, scene: Scene | None
+) -> list[str]:
+    """Describe dark, clipped or unevenly exposed photos."""
+    if scene is not None and scene.has_alpha:
+        return []  # transparent pixels are not dark
+    found = []
+    middle = float(np.median(light))
+    if 2**middle < _MIN_SET_LUMINANCE:
+        found.append("the photos are dark; take them in more light, or with a longer exposure and a tripod")
+    dark = [
+        relative_name(measurement.path, folder)
+        for measurement, value in zip(measurements, light, strict=True)
+        if value < middle - _DARK_PHOTO_STOPS
+    ]
+    if dark:
+        found.append(
+            f"{format_photo_count(len(dark))} {_be(len(dark))} over {_DARK_PHOTO_STOPS:g} stops darker than the others "
+            f"({format_file_names(dark)}); leave out dark photos"
+        )
+    bright = [
+        relative_name(measurement.path, folder)
+        for measurement in measurements
+        if measurement.exposure.bright > _MAX_CLIPPED_PIXEL_RATIO
+    ]
+    if len(bright) > len(measurements) / 4:
+        found.append(
+            f"{format_photo_count(len(bright))} {_be(len(bright))} overexposed in a quarter or more of the "
+            f"pixels ({format_file_names(bright)}); reduce the exposure, and lock it"
+        )
+    if stops > _MAX_EXPOSURE_SPREAD_STOPS:
+        found.append(
+            f"the photos differ by {stops:.1f} stops in brightness; lock exposure and white balance while you take them"
+        )
+    return found
+
+
+def find_zoom_problems(facts: list[PhotoFacts]) -> list[str]:
+    """Describe a mixture of focal lengths of one device."""
+    lengths: dict[str, set[float]] = {}
+    for fact in facts:
+        if fact.focal is not None:
+            known = lengths.setdefault(fact.device, set())
+            relative = fact.focal / max(fact.size)
+            if not any(abs(relative / other - 1) < _SAME_ZOOM_TOLERANCE for other in known):
+                known.add(relative)
+    most = max((len(values) for values in lengths.values()), default=0)
+    if most < 2:
+        return []
+    device = max(lengths, key=lambda name: len(lengths[name]))
+    return [
+        f"the photos have {most} different focal lengths{f' ({device})' if device else ''}; each gets its own "
+        "intrinsics, but poses are less reliable; use one lens, and do not zoom"
+    ]
+
+
+def find_mask_problems(folder: Path, photos: list[Path]) -> list[str]:
+    """Describe masks whose names match no photo; for photos with poses, `load_scene` reports them."""
+    masks = next((folder / name for name in ("masks", "mask") if (folder / name).is_dir()), None)
+    there = [] if masks is None else [file for file in masks.rglob("*") if file.suffix.lower() in PICTURE_SUFFIXES]
+    names = {photo.stem for photo in photos} | {photo.name for photo in photos}
+    stray = sorted(file.name for file in there if file.stem not in names)
+    if not stray:
+        return []
+    return [
+        f"{len(stray)} of {len(there)} masks match no photo ({format_file_names(stray)}); give each the name of its "
+        "photo"
+    ]
+
+
+def header_notes(facts: list[PhotoFacts]) -> list[str]:
+    """Describe rotated, large and panoramic photos."""
+    notes = []
+    turned = sum(fact.orientation != 1 for fact in facts)
+    if turned:
+        notes.append(
+            f"{format_photo_count(turned)} {_be(turned)} stored rotated; 'hyrfpack poses' makes upright copies"
+        )
+    large = sum(max(fact.size) > DEFAULT_MAX_SIZE for fact in facts)
+    if large:
+        notes.append(
+            f"{large} of {len(facts)} photos are larger than {DEFAULT_MAX_SIZE:,} pixels and are shrunk to that for "
+            "training; `max_size` sets another limit"
+        )
+    round_ = sum(fact.size[0] == 2 * fact.size[1] for fact in facts)
+    if round_:
+        notes.append(
+            f"{format_photo_count(round_)} {_be(round_)} twice as wide as high, like those of 360-degree cameras"
+        )
+    return notes
+
+
+def _be(count: int) -> str:
+    """Return "is" or "are", by the count."""
+    return "is" if count == 1 else "are"
