@@ -28,6 +28,7 @@ LAYER_BY_PATH = {
     "cameras": "unit",
     "cli/test_processes.py": "acceptance",
     "compress/test_determinism.py": "acceptance",
+    "config": "unit",
     "data": "unit",
     "evaluate": "unit",
     "format": "unit",

@@ -5,10 +5,8 @@ from __future__ import annotations
 from hyrfpack import choices
 from hyrfpack.data import LAYOUTS
 from hyrfpack.make import QUALITIES
-from hyrfpack.train.config import PRECISIONS
 
 
 def test_the_choices_are_those_of_the_packages_that_define_them():
     assert choices.LAYOUTS == tuple(LAYOUTS)
     assert choices.QUALITIES == tuple(QUALITIES)
-    assert choices.PRECISIONS == PRECISIONS

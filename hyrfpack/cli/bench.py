@@ -9,8 +9,6 @@ from typing import Any
 import click
 
 from hyrfpack.cli.common import (
-    OUTPUT,
-    PATH,
     format_table,
     json_option,
     note,
@@ -22,6 +20,7 @@ from hyrfpack.cli.common import (
     scene_options,
 )
 from hyrfpack.cli.console import notes_only_of
+from hyrfpack.cli.types import OUTPUT, PATH
 from hyrfpack.errors import HyrfError
 from hyrfpack.outputs import Outputs
 

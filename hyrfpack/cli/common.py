@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import functools
 import json
-import math
-import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -13,8 +11,10 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from hyrfpack.atomic import describe_rename
-from hyrfpack.choices import LAYOUTS, PRECISIONS
+from hyrfpack.choices import LAYOUTS
 from hyrfpack.cli.console import note, note_if_verbose
+from hyrfpack.cli.settings import settings_options
+from hyrfpack.config.train import TrainConfig
 from hyrfpack.errors import HyrfError
 
 if TYPE_CHECKING:
@@ -25,55 +25,9 @@ if TYPE_CHECKING:
 
 Command = TypeVar("Command", bound=Callable)
 
-PATH = click.Path(path_type=Path)
-SEED = click.IntRange(0, 2**64 - 1)  # the limit of hyrfpack.train.config, which cannot be imported without torch
-_SIZE_PATTERN = re.compile(r"([0-9.]+)\s*([kmg]?)b?", re.IGNORECASE)
-
-
-class _OutputPath(click.ParamType):
-    """Path of an output. Unlike the path of an input it may not be empty or "-"."""
-
-    name = "path"
-
-    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> Path:
-        if str(value) in ("", "-"):
-            self.fail(f"'{value}' is not a file name; results are written to files, so give a path", param, ctx)
-        return Path(str(value))
-
-
-OUTPUT = _OutputPath()
-
-
-class _Size(click.ParamType):
-    """Number of bytes, such as 2MB, 350k or 1500000; k, M and G are powers of 1000."""
-
-    name = "size"
-
-    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        match = _SIZE_PATTERN.fullmatch(str(value).strip())
-        try:
-            size = int(float(match[1]) * 1000 ** " kmg".index(match[2].lower() or " ")) if match else 0
-        except (ValueError, OverflowError):
-            size = 0
-        if size < 1:
-            self.fail(f"'{value}' is not a size; write it as 2MB, 350kB or 1500000", param, ctx)
-        return size
-
-
-SIZE = _Size()
-
 overwrite_option = click.option(
     "--overwrite", is_flag=True, help="Replace existing files. Files that the command reads are never replaced."
 )
-
-
-def reject_nan(ctx: click.Context, param: click.Parameter, value: float | None) -> float | None:
-    """Reject NaN, which click's ranges accept, as the callback of an option."""
-    if value is not None and math.isnan(value):
-        raise click.BadParameter("NaN is not allowed; give a number", ctx, param)
-    return value
-
-
 json_option = click.option("--json", "as_json", is_flag=True, help="Print the results as one JSON object.")
 
 
@@ -128,14 +82,6 @@ def scene_options(command: Command) -> Command:
     return with_options
 
 
-seed_option = click.option(
-    "--seed",
-    type=SEED,
-    metavar="N",
-    default=0,
-    show_default=True,
-    help="Random seed. On a CPU, the same seed gives the same file.",
-)
 device_option = click.option(
     "--device",
     metavar="NAME",
@@ -148,15 +94,7 @@ device_option = click.option(
 
 def device_options(command: Command) -> Command:
     """Add the options --device and --precision, which choose the device and its precision."""
-    precision = click.option(
-        "--precision",
-        type=click.Choice(PRECISIONS),
-        default="mixed",
-        show_default=True,
-        help="Precision of matrix products on a GPU: bfloat16 with float32 sums (mixed), or float32. The CPU always "
-        "uses float32.",
-    )
-    return device_option(precision(command))
+    return device_option(settings_options(TrainConfig, "precision")(command))
 
 
 def choose_command_device(name: str, ranks: Ranks | None = None) -> torch.device:

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import click
 
-from hyrfpack.cli.common import OUTPUT, PATH, json_option, note, note_rename, overwrite_option, print_json
+from hyrfpack.cli.common import json_option, note, note_rename, overwrite_option, print_json
+from hyrfpack.cli.types import OUTPUT, PATH
 
 
 @click.command(short_help="Compare training runs on one page.")

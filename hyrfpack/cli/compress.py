@@ -11,9 +11,6 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from hyrfpack.cli.common import (
-    OUTPUT,
-    PATH,
-    SIZE,
     choose_command_device,
     device_option,
     json_option,
@@ -22,13 +19,13 @@ from hyrfpack.cli.common import (
     overwrite_option,
     print_json,
     read_scene,
-    reject_nan,
     resolve_model_file,
     scene_options,
 )
 from hyrfpack.cli.processes import processes_option
 from hyrfpack.cli.progress import show_progress
 from hyrfpack.cli.section_table import format_section_table
+from hyrfpack.cli.types import OUTPUT, PATH, SIZE, reject_nan
 from hyrfpack.outputs import Outputs
 from hyrfpack.progress import report_part
 

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 
 import click
 
-from hyrfpack.cli.common import OUTPUT, PATH, format_table, json_option, note_rename, overwrite_option, print_json
+from hyrfpack.cli.common import format_table, json_option, note_rename, overwrite_option, print_json
 from hyrfpack.cli.export import crop_option, min_opacity_option, spz_version_option
 from hyrfpack.cli.progress import show_progress
+from hyrfpack.cli.types import OUTPUT, PATH
 from hyrfpack.outputs import Outputs
 
 if TYPE_CHECKING:

@@ -6,8 +6,11 @@ from pathlib import Path
 
 import click
 
-from hyrfpack.cli.common import OUTPUT, json_option, note_rename, overwrite_option, print_json
+from hyrfpack.cli.common import json_option, note_rename, overwrite_option, print_json
 from hyrfpack.cli.console import notes_only_of
+from hyrfpack.cli.settings import settings_options
+from hyrfpack.cli.types import OUTPUT
+from hyrfpack.config.train import TrainConfig
 from hyrfpack.outputs import Outputs
 
 
@@ -15,9 +18,7 @@ from hyrfpack.outputs import Outputs
 @click.option(
     "-o", "--output", type=OUTPUT, default=Path("demo"), show_default=True, metavar="DIR", help="Folder of the results."
 )
-@click.option(
-    "--steps", type=click.IntRange(min=1), metavar="N", default=3000, show_default=True, help="Training steps."
-)
+@settings_options(TrainConfig, "steps")
 @overwrite_option
 @json_option
 def demo(output: Path, steps: int, overwrite: bool, as_json: bool) -> None:

@@ -8,18 +8,10 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from hyrfpack.choices import AS_PHOTOGRAPHED
-from hyrfpack.cli.common import (
-    OUTPUT,
-    PATH,
-    format_consistent_psnr,
-    format_table,
-    note,
-    print_json,
-    read_scene,
-    scene_options,
-)
+from hyrfpack.cli.common import format_consistent_psnr, format_table, note, print_json, read_scene, scene_options
 from hyrfpack.cli.drawing import drawing_options, largest_picture_size, select_views, split_option
 from hyrfpack.cli.progress import show_progress
+from hyrfpack.cli.types import OUTPUT, PATH
 from hyrfpack.outputs import Outputs
 
 if TYPE_CHECKING:

@@ -11,8 +11,6 @@ import click
 
 from hyrfpack.choices import DEFAULT_SPZ_VERSION, LOCAL_EXPOSURE, SPLAT_EXPOSURES, SPZ_VERSIONS
 from hyrfpack.cli.common import (
-    OUTPUT,
-    PATH,
     format_table,
     json_option,
     note_rename,
@@ -22,6 +20,7 @@ from hyrfpack.cli.common import (
     scene_options,
 )
 from hyrfpack.cli.progress import show_progress
+from hyrfpack.cli.types import OUTPUT, PATH
 from hyrfpack.errors import HyrfError
 from hyrfpack.outputs import Outputs
 

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from hyrfpack.cli.common import (
-    OUTPUT,
-    PATH,
     choose_command_device,
     device_option,
     format_table,
@@ -18,10 +16,11 @@ from hyrfpack.cli.common import (
     note_rename,
     overwrite_option,
     print_json,
-    reject_nan,
-    seed_option,
 )
 from hyrfpack.cli.progress import show_progress
+from hyrfpack.cli.settings import settings_options
+from hyrfpack.cli.types import OUTPUT, PATH
+from hyrfpack.config.distill import DistillConfig
 from hyrfpack.outputs import Outputs
 
 if TYPE_CHECKING:
@@ -32,47 +31,25 @@ if TYPE_CHECKING:
 @click.command("import", short_help="Distil splats of another program to a small model.")
 @click.argument("source", type=PATH)
 @click.option("-o", "--output", type=OUTPUT, required=True, metavar="FILE", help="The .hyrf file to write.")
-@click.option(
-    "--steps", type=click.IntRange(min=1), metavar="N", default=300, show_default=True, help="Training steps."
-)
-@click.option(
-    "--psnr",
-    type=click.FloatRange(10, 60),
-    callback=reject_nan,
-    default=37.0,
-    show_default=True,
-    metavar="DB",
-    help="PSNR of renders of FILE against renders of SOURCE; more dB take more bytes.",
-)
-@click.option(
-    "--size",
-    type=click.IntRange(min=16, max=4096),
-    default=400,
-    show_default=True,
-    metavar="PIXELS",
-    help="Longer side of the reference renders.",
-)
+@settings_options(DistillConfig, "steps", "psnr", "size")
 @click.option(
     "--cameras",
     type=PATH,
     metavar="PATH",
     help="Cameras to learn from: a JSON file (also of nerfstudio or 3DGS), or a folder of photos and poses.",
 )
-@seed_option
+@settings_options(DistillConfig, "seed")
 @device_option
 @overwrite_option
 @json_option
 def import_(
     source: Path,
     output: Path,
-    steps: int,
-    psnr: float,
-    size: int,
     cameras: Path | None,
-    seed: int,
     device: str,
     overwrite: bool,
     as_json: bool,
+    **settings: Any,
 ) -> None:
     """Distil SOURCE, 3D Gaussians as .ply (plain or compressed), .splat, .spz or .sog, to a small .hyrf file.
 
@@ -89,12 +66,12 @@ def import_(
     """
     folder = source.parent if source.name == "meta.json" else source  # a SOG may be a folder that holds meta.json
     Outputs(source, cameras, folder=folder, overwrite=overwrite).file(output, ".hyrf")
-    from hyrfpack.distill import DistillConfig, import_splats
+    from hyrfpack.distill import import_splats
 
     cameras = cameras or _find_training_cameras(source)
     given = None if cameras is None else _read_cameras(cameras)
     torch_device = choose_command_device(device)
-    config = DistillConfig(steps=steps, psnr=psnr, size=size, seed=seed)
+    config = DistillConfig(**settings)
     with show_progress("import") as progress:
         report = import_splats(
             source, output, config, cameras=given, overwrite=overwrite, device=torch_device, report=progress

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import click
 
-from hyrfpack.cli.common import PATH, format_consistent_psnr, json_option, print_json
+from hyrfpack.cli.common import format_consistent_psnr, json_option, print_json
 from hyrfpack.cli.console import print_line
 from hyrfpack.cli.progress import show_progress
 from hyrfpack.cli.section_table import format_section_table
+from hyrfpack.cli.types import PATH
 from hyrfpack.cli.wording import use_option_names
 from hyrfpack.outputs import ARCHIVE_SUFFIXES, PICTURE_SUFFIXES, VIDEO_SUFFIXES
 

@@ -7,11 +7,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from hyrfpack.choices import MATCHING_METHODS, PRESETS, QUALITIES
+from hyrfpack.choices import MATCHING_METHODS, QUALITIES
 from hyrfpack.cli.common import (
-    OUTPUT,
-    PATH,
-    SIZE,
     choose_command_device,
     format_consistent_psnr,
     json_option,
@@ -19,11 +16,12 @@ from hyrfpack.cli.common import (
     note_rename,
     overwrite_option,
     print_json,
-    reject_nan,
-    seed_option,
 )
 from hyrfpack.cli.console import notes_only_of
 from hyrfpack.cli.live import serve_training_view, view_options
+from hyrfpack.cli.settings import settings_options
+from hyrfpack.cli.types import OUTPUT, PATH, SIZE, reject_nan
+from hyrfpack.config.train import TrainConfig
 
 if TYPE_CHECKING:
     from hyrfpack.make import MakeResult
@@ -50,9 +48,7 @@ MAX_LISTED_PHOTOS = 5
     metavar="N",
     help="Budget: the maximum number of Gaussians, instead of --target-size.  [default: measured by pilot runs]",
 )
-@click.option(
-    "--preset", type=click.Choice(PRESETS), default="auto", show_default=True, help="Kind of scene; auto detects it."
-)
+@settings_options(TrainConfig, "preset")
 @click.option(
     "--matching",
     type=click.Choice(MATCHING_METHODS),
@@ -77,7 +73,7 @@ MAX_LISTED_PHOTOS = 5
     "--work", type=OUTPUT, metavar="DIR", help="Folder of intermediate results.  [default: the name of FILE with .work]"
 )
 @click.option("--device", metavar="NAME", default="auto", show_default=True, help="Device: cpu, cuda, cuda:N.")
-@seed_option
+@settings_options(TrainConfig, "seed")
 @view_options
 @overwrite_option
 @json_option

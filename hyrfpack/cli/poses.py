@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING
 import click
 
 from hyrfpack.choices import MATCHING_METHODS
-from hyrfpack.cli.common import OUTPUT, PATH, SEED, json_option, note, note_if_verbose, print_json
+from hyrfpack.cli.common import json_option, note, note_if_verbose, print_json
+from hyrfpack.cli.types import OUTPUT, PATH
+from hyrfpack.config.settings import LARGEST_SEED
 
 if TYPE_CHECKING:
     from hyrfpack.poses import PosesReport
@@ -31,7 +33,9 @@ _MAX_NAMED_PHOTOS = 5
     "alike (retrieval). auto decides by the kind and number of photos.",
 )
 @click.option("--masks", type=PATH, metavar="FOLDER", help="Masks, named like the photos; black pixels are ignored.")
-@click.option("--seed", type=SEED, metavar="N", default=0, show_default=True, help="Random seed.")
+@click.option(
+    "--seed", type=click.IntRange(0, LARGEST_SEED), metavar="N", default=0, show_default=True, help="Random seed."
+)
 @click.option("--overwrite", is_flag=True, help="Replace poses that an earlier run wrote to SCENE.")
 @json_option
 def poses(

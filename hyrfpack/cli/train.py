@@ -7,11 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from hyrfpack.choices import PRESETS
 from hyrfpack.cli.common import (
-    OUTPUT,
-    PATH,
-    SIZE,
     choose_command_device,
     device_options,
     format_consistent_psnr,
@@ -22,59 +18,24 @@ from hyrfpack.cli.common import (
     print_json,
     read_scene,
     scene_options,
-    seed_option,
 )
 from hyrfpack.cli.live import serve_training_view, view_options
 from hyrfpack.cli.processes import processes_option
+from hyrfpack.cli.settings import settings_options
+from hyrfpack.cli.types import OUTPUT, PATH
+from hyrfpack.config.train import TrainConfig
 from hyrfpack.errors import HyrfNoPosesError
 
 if TYPE_CHECKING:
     from hyrfpack.parallel.ranks import Ranks
 
-BACKGROUND_COLORS = ("black", "white", "random")
-
 
 @click.command(short_help="Train a model on photos with poses.")
 @click.argument("data", type=PATH)
 @click.option("-o", "--output", "out", type=OUTPUT, required=True, metavar="RUN", help="Folder of the run.")
-@click.option(
-    "--steps", type=click.IntRange(min=1), metavar="N", default=3000, show_default=True, help="Training steps."
-)
-@click.option(
-    "--max-gaussians",
-    type=click.IntRange(min=1),
-    metavar="N",
-    help="Budget: the maximum number of Gaussians.  [default: measured by pilot runs]",
-)
-@click.option(
-    "--target-size",
-    "target_bytes",
-    type=SIZE,
-    metavar="SIZE",
-    help="Choose the budget so that 'hyrfpack compress' reaches this file size, such as 500kB.",
-)
-@click.option(
-    "--preset", type=click.Choice(PRESETS), default="auto", show_default=True, help="Kind of scene; auto detects it."
-)
-@seed_option
+@settings_options(TrainConfig, "steps", "max_gaussians", "target_bytes", "preset", "seed")
 @scene_options
-@click.option("--background/--no-background", default=None, help="Train a background sphere.  [default: by preset]")
-@click.option(
-    "--background-color",
-    type=click.Choice(BACKGROUND_COLORS),
-    default="black",
-    show_default=True,
-    help="Colour behind transparent photos.",
-)
-@click.option(
-    "--exposure/--no-exposure",
-    default=None,
-    help="Exposure compensation: learn per-image gains and an exposure map.  [default: decided by pilot runs]",
-)
-@click.option("--antialiased", is_flag=True, help="Antialiasing: dim small Gaussians as the pixel filter widens them.")
-@click.option(
-    "--log2-table-size", type=click.IntRange(4, 24), metavar="B", help="Rows per level of the hash grid: 2^B."
-)
+@settings_options(TrainConfig, "background", "background_color", "exposure", "antialiased", "log2_table_size")
 @click.option(
     "--cache-mb",
     type=click.IntRange(min=1),
@@ -145,7 +106,6 @@ def train(
     from hyrfpack.data import PictureCache
     from hyrfpack.device import describe_device
     from hyrfpack.format.run_folder import MODEL_FILE
-    from hyrfpack.train import TrainConfig
     from hyrfpack.train import train_model as run
     from hyrfpack.train.run import is_begun, resuming
 

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import click
 
-from hyrfpack.cli.common import PATH, json_option, note, print_json
+from hyrfpack.cli.common import json_option, note, print_json
+from hyrfpack.cli.types import PATH
 
 
 @click.command(short_help="Show a model in a browser.")

@@ -25,10 +25,19 @@ def use_option_names(message: str) -> str:
     return _ARGUMENT_PATTERN.sub(_option, message)
 
 
+def option_of_argument(name: str) -> str:
+    """Return the option that sets a Python argument.
+
+    Example:
+        >>> option_of_argument("target_bytes"), option_of_argument("max_gaussians")
+        ('--target-size', '--max-gaussians')
+    """
+    return _OPTION_OF_ARGUMENT.get(name, f"--{name.replace('_', '-')}")
+
+
 def _option(match: re.Match[str]) -> str:
     """Return the option for an argument that the pattern has found."""
-    name, value = match[1], match[2]
-    option = _OPTION_OF_ARGUMENT.get(name, f"--{name.replace('_', '-')}")
+    value, option = match[2], option_of_argument(match[1])
     if value is None or value == "True":
         return option
     if value == "False":

@@ -14,6 +14,7 @@ from hyrfpack.compress.plan import replan_moved, snap_to_lattice
 from hyrfpack.compress.quantize import quantize
 from hyrfpack.compress.rate_distortion import LAMBDA_PER_DISTORTION
 from hyrfpack.compress.sensitivity import Sensitivity
+from hyrfpack.config.train import LearningRates
 from hyrfpack.data import PictureCache
 from hyrfpack.device import Photos, upload
 from hyrfpack.errors import HyrfError, HyrfTrainingError
@@ -30,7 +31,6 @@ from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.quant.steps import FIXED_POINT_ONE, decode_step
 from hyrfpack.render import render_view
 from hyrfpack.scene import Picture, View
-from hyrfpack.train.config import LearningRates
 from hyrfpack.train.distributed import average_gradients
 from hyrfpack.train.optimizer import Optimizer
 from hyrfpack.train.trainer import shuffled

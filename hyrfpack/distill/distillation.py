@@ -10,8 +10,10 @@ import numpy as np
 import torch
 
 from hyrfpack.cameras.view_sampling import sample_views, shrink_camera
+from hyrfpack.config.distill import DistillConfig
+from hyrfpack.config.settings import LARGEST_SEED
+from hyrfpack.config.train import DensityConfig, LearningRates, TrainConfig
 from hyrfpack.data import PictureCache
-from hyrfpack.distill.config import DistillConfig
 from hyrfpack.distill.initialize import initial_model
 from hyrfpack.distill.reference import ReferenceViews, mean_sent_light, reference_scene
 from hyrfpack.errors import HyrfDataError
@@ -22,7 +24,6 @@ from hyrfpack.scene import Camera, Scene, evenly_spaced
 from hyrfpack.splats.draw import Drawable
 from hyrfpack.splats.splats import Splats
 from hyrfpack.splats.viewpoints import WeightedSplats, has_enclosed_places, sample_viewpoints
-from hyrfpack.train.config import LARGEST_SEED, DensityConfig, LearningRates, TrainConfig
 from hyrfpack.train.trainer import Trainer
 
 _LOG = logging.getLogger(__name__)

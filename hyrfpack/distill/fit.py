@@ -16,8 +16,8 @@ import torch
 from hyrfpack import format as hyrf_format
 from hyrfpack.atomic import write_atomic
 from hyrfpack.checks import check_type
+from hyrfpack.config.distill import DistillConfig
 from hyrfpack.device import choose_device
-from hyrfpack.distill.config import DistillConfig
 from hyrfpack.distill.distillation import distill_model
 from hyrfpack.distill.pack import pack
 from hyrfpack.outputs import Outputs

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from hyrfpack.config.train import LearningRates
 from hyrfpack.model import HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians, logit
 from hyrfpack.model.hybrid import scale_bounds
@@ -23,7 +24,6 @@ from hyrfpack.progress import Report, no_report
 from hyrfpack.scene import Camera
 from hyrfpack.splats.draw import Drawable
 from hyrfpack.splats.harmonics import SH_C0
-from hyrfpack.train.config import LearningRates
 from hyrfpack.train.optimizer import Optimizer
 
 # The number of Gaussians for each row of a level determines the size of the hash tables. With harmonics the tables are

@@ -13,6 +13,7 @@ from time import monotonic, perf_counter
 import numpy as np
 import torch
 
+from hyrfpack.config.train import FULL_STEPS
 from hyrfpack.data import PictureCache
 from hyrfpack.make.plan import (
     BACKGROUND_SEARCH_PASSES,
@@ -28,7 +29,6 @@ from hyrfpack.model import HybridModel
 from hyrfpack.render import render_view
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Camera, Scene, evenly_spaced
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer
-from hyrfpack.train.config import FULL_STEPS
 from hyrfpack.train.decisions import decide, is_budget_open, max_pilot_steps
 from hyrfpack.train.setup import budget_for
 

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from hyrfpack.compress.sensitivity import MAX_SENSITIVITY_VIEWS, MIN_SENSITIVITY_VIEWS, TARGET_DRAWN_GAUSSIANS
+from hyrfpack.config.train import FULL_STEPS, TrainConfig
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Scene
-from hyrfpack.train.config import FULL_STEPS, TrainConfig
 from hyrfpack.train.decisions import (
     MAX_BUDGET_PILOT_STEPS,
     MIN_BUDGET_STEPS,

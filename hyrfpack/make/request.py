@@ -8,6 +8,7 @@ from pathlib import Path
 
 import torch
 
+from hyrfpack.config.train import TrainConfig
 from hyrfpack.data.folder import list_photos
 from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.export.folder import check_folder
@@ -17,7 +18,6 @@ from hyrfpack.make.source import LoadSettings, Source
 from hyrfpack.make.stages import EXPORT_FOLDER, PACKED_MODEL
 from hyrfpack.make.state import RECORD_NAME, WorkFolderState, file_digest
 from hyrfpack.outputs import Outputs
-from hyrfpack.train.config import TrainConfig
 from hyrfpack.train.setup import check_target
 
 _SCENE_STAGES = ("training", "compression", "scoring", "export")

@@ -13,6 +13,8 @@ from typing import Any
 import torch
 
 from hyrfpack.checks import check_choice, check_float, check_int
+from hyrfpack.choices import PRESETS
+from hyrfpack.config.settings import LARGEST_SEED
 from hyrfpack.data import PictureCache
 from hyrfpack.data.folder import first_readable_photo, list_photos
 from hyrfpack.device import choose_device
@@ -30,7 +32,6 @@ from hyrfpack.make.state import files_digest
 from hyrfpack.outputs import StrPath
 from hyrfpack.scene import Scene
 from hyrfpack.train import Trainer
-from hyrfpack.train.config import LARGEST_SEED, PRESETS
 
 _LOG = logging.getLogger(__name__)
 

@@ -1,6 +1,7 @@
 """Train a HybridModel on posed photos, and write it into a run folder."""
 
-from hyrfpack.train.config import PRESETS, DensityConfig, LearningRates, TrainConfig
+from hyrfpack.choices import PRESETS
+from hyrfpack.config.train import DensityConfig, LearningRates, TrainConfig
 from hyrfpack.train.density import DensityControl
 from hyrfpack.train.photos import load_training_scene
 from hyrfpack.train.run import TrainResult, train_model

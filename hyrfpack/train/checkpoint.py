@@ -13,9 +13,9 @@ from pathlib import Path
 import torch
 
 from hyrfpack.atomic import write_atomic
-from hyrfpack.checks import check_float
+from hyrfpack.config.settings import list_settings
+from hyrfpack.config.train import TrainConfig
 from hyrfpack.errors import HyrfTrainingError
-from hyrfpack.train.config import BUDGET_FACTOR_RANGE
 
 CHECKPOINT_VERSION = 2
 DIGEST_BYTES = 32  # The file ends with the SHA-256 digest of everything before it.
@@ -54,11 +54,10 @@ def saved_decisions(path: Path) -> tuple[float | None, bool]:
     """
     saved = _read(path)[0]
     factor, exposure = saved.get("budget_factor"), saved.get("exposure", False)
-    if factor is not None:
-        try:
-            check_float("budget_factor", factor, *BUDGET_FACTOR_RANGE)
-        except ValueError as error:
-            raise _damaged(path) from error
+    try:
+        list_settings(TrainConfig)["budget_factor"].check(factor)
+    except ValueError as error:
+        raise _damaged(path) from error
     if not isinstance(exposure, bool):
         raise _damaged(path)
     return factor, exposure

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import torch
 
+from hyrfpack.config.train import TrainConfig
 from hyrfpack.data import PictureCache
 from hyrfpack.scene import Scene
 from hyrfpack.train.budget_pilots import BUDGET_PILOT_STEPS, MAX_BUDGET_ROUNDS, measure_budget
-from hyrfpack.train.config import TrainConfig
 from hyrfpack.train.exposure_pilots import (
     exposure_pilot_steps,
     exposure_rounds,

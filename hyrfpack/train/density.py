@@ -11,13 +11,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from hyrfpack.config.train import DensityConfig
 from hyrfpack.model import Geometry, HybridModel
 from hyrfpack.model.gaussians import Gaussians, logit
 from hyrfpack.ops.transfer import tensor_like
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.render import Rendering
 from hyrfpack.scene import Camera
-from hyrfpack.train.config import DensityConfig
 from hyrfpack.train.optimizer import Optimizer
 
 SPLIT_SHRINK = 1.6

@@ -18,6 +18,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import cg
 from torch import Tensor, nn
 
+from hyrfpack.config.train import TrainConfig
 from hyrfpack.data import PictureCache
 from hyrfpack.errors import HyrfTrainingError
 from hyrfpack.format.exposure_header import STOPS_PER_LOG_GAIN
@@ -25,7 +26,6 @@ from hyrfpack.model.exposure import apply_exposure_gains
 from hyrfpack.model.frame import Frame
 from hyrfpack.ops.adam import adam_step
 from hyrfpack.scene import Camera, Picture, Scene, View
-from hyrfpack.train.config import TrainConfig
 from hyrfpack.train.exposure_map import ExposureFit, fit_exposure_map
 
 GAIN_DECAY = 1e-4  # Weight decay: this multiple of each log gain is added to its gradient.

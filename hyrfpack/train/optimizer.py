@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from hyrfpack.config.train import LearningRates
 from hyrfpack.model import HybridModel
 from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.ops.adam import adam_step
-from hyrfpack.train.config import LearningRates
 
 MOMENT_NAMES = ("exp_avg", "exp_avg_sq")
 ADAM_BETAS = 0.9, 0.999

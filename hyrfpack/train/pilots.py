@@ -11,10 +11,10 @@ from dataclasses import dataclass, field
 
 import torch
 
+from hyrfpack.config.train import TrainConfig
 from hyrfpack.data import PictureCache
 from hyrfpack.evaluate import Evaluation, evaluate_model
 from hyrfpack.scene import Picture, Scene, View, evenly_spaced
-from hyrfpack.train.config import TrainConfig
 from hyrfpack.train.setup import budget_for
 from hyrfpack.train.trainer import Trainer
 

@@ -22,6 +22,7 @@ import torch
 from hyrfpack import format as hyrf_format
 from hyrfpack.atomic import write_atomic
 from hyrfpack.cameras.capture import scene_provenance
+from hyrfpack.config.train import TrainConfig
 from hyrfpack.device import describe_device
 from hyrfpack.errors import HyrfError, HyrfTrainingError
 from hyrfpack.evaluate import evaluate_model, picture_names
@@ -31,7 +32,6 @@ from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
 from hyrfpack.model import HybridModel
 from hyrfpack.render import render_view
 from hyrfpack.scene import Scene, evenly_spaced
-from hyrfpack.train.config import TrainConfig
 from hyrfpack.train.decisions import is_budget_open
 from hyrfpack.train.trainer import Trainer
 

@@ -15,6 +15,7 @@ from pathlib import Path
 import torch
 
 from hyrfpack.checks import check_type
+from hyrfpack.config.train import TrainConfig
 from hyrfpack.data import PictureCache
 from hyrfpack.data.cache import memory_bytes
 from hyrfpack.device import choose_own_device
@@ -26,7 +27,6 @@ from hyrfpack.outputs import Outputs
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.scene import Scene, View
 from hyrfpack.train.checkpoint import saved_decisions
-from hyrfpack.train.config import TrainConfig
 from hyrfpack.train.decisions import (
     Decisions,
     decide,

@@ -13,6 +13,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from hyrfpack.cameras.capture import quantized_provenance, scene_provenance
+from hyrfpack.config.train import FULL_STEPS, TrainConfig
 from hyrfpack.data.preset import detect_preset
 from hyrfpack.errors import HyrfTrainingError
 from hyrfpack.format.min_file_size import check_target_bytes
@@ -20,7 +21,6 @@ from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians, logit
 from hyrfpack.model.hybrid import scale_bounds
 from hyrfpack.scene import Scene
-from hyrfpack.train.config import FULL_STEPS, TrainConfig
 from hyrfpack.train.silhouette import inside_silhouettes
 
 SYNTHETIC_HALF_BOX = 1.3  # NeRF-synthetic objects lie in [-1.3, 1.3]^3.

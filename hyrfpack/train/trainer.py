@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from hyrfpack.choices import CONSISTENT_EXPOSURE
+from hyrfpack.config.train import TrainConfig
 from hyrfpack.data import PictureCache
 from hyrfpack.device import Photos, upload_array
 from hyrfpack.errors import HyrfError, HyrfTrainingError
@@ -28,7 +29,6 @@ from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.scene import Picture, Scene, View
 from hyrfpack.train.checkpoint import load_checkpoint, save_checkpoint
-from hyrfpack.train.config import TrainConfig
 from hyrfpack.train.density import DensityControl
 from hyrfpack.train.distributed import StepStats, average_gradients, check_settings, digest, pack_step_stats
 from hyrfpack.train.exposure import exposures_for

@@ -16,7 +16,7 @@ from commands import hyrfpack, refused, succeeded
 from PIL import Image
 
 from hyrfpack.cli.compress import DEFAULT_PROFILE, PROFILES
-from hyrfpack.cli.train import PRESETS, train
+from hyrfpack.cli.train import train
 from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.format import load_model
 from hyrfpack.train import Trainer
@@ -457,11 +457,10 @@ def test_all_commands_are_listed():
 
 def test_the_command_line_offers_the_choices_of_the_library():
     from hyrfpack.format import codec
-    from hyrfpack.train import config
+    from hyrfpack.train import TrainConfig
 
-    assert PRESETS == config.PRESETS
     assert (PROFILES, DEFAULT_PROFILE) == (tuple(codec.PROFILES), codec.DEFAULT_PROFILE)
-    defaults = config.TrainConfig().to_dict()
+    defaults = TrainConfig().to_dict()
     options = {option.name: option.default for option in train.params if option.name in defaults}
     assert {"steps", "seed", "preset", "max_gaussians", "antialiased", "background", "log2_table_size"} <= set(options)
     with train.make_context("train", ["data", "-o", "run"]) as context:

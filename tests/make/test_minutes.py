@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from hyrfpack.config.train import FULL_STEPS
 from hyrfpack.data import PictureCache, load_scene
 from hyrfpack.make import make_scene, minutes
 from hyrfpack.make.minutes import SceneCost, fit_plan_to_minutes
@@ -16,7 +17,6 @@ from hyrfpack.make.plan import Plan
 from hyrfpack.make.progress import Reporter
 from hyrfpack.make.source import LoadSettings
 from hyrfpack.train import decisions
-from hyrfpack.train.config import FULL_STEPS
 
 
 def make_plan(target_bytes: int | None = None, max_gaussians: int | None = None) -> Plan:

@@ -8,8 +8,8 @@ import pytest
 import torch
 from scenes import ball_points, small_model
 
+from hyrfpack.config.train import DensityConfig, LearningRates
 from hyrfpack.model.gaussians import Gaussians
-from hyrfpack.train.config import DensityConfig, LearningRates
 from hyrfpack.train.density import DensityControl, rotate
 from hyrfpack.train.optimizer import Optimizer
 

@@ -5,8 +5,8 @@ import pytest
 import torch
 from scenes import ball_points, small_model
 
+from hyrfpack.config.train import LearningRates
 from hyrfpack.model.gaussians import Gaussians
-from hyrfpack.train.config import LearningRates
 from hyrfpack.train.optimizer import Optimizer
 
 LEARNING_RATES = LearningRates(

@@ -7,11 +7,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from statistics import fmean
 
+from hyrfpack.config.train import FULL_STEPS
 from hyrfpack.evaluate.metrics import psnr_from_mse
 from hyrfpack.model import HybridModel
 from hyrfpack.scene import Scene
 from hyrfpack.train import TrainConfig, Trainer
-from hyrfpack.train.config import FULL_STEPS
 from tools.gpu.rows import Row, goal_row, kernel_rows
 from tools.gpu.setup import GOAL_ROOM_NAME, Setup
 from tools.gpu.timing import Profile, profile_task, read_peak_memory_mb, reset_peak_memory, synchronize

@@ -11,13 +11,13 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor, nn
 
+from hyrfpack.config.train import LearningRates, TrainConfig
 from hyrfpack.data import PictureCache
 from hyrfpack.model import Decoded, Geometry, HybridModel, ModelConfig
 from hyrfpack.model.field import Field
 from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.ops.shade import DIRECTION_FEATURES, spherical_harmonics
 from hyrfpack.scene import Scene
-from hyrfpack.train.config import LearningRates, TrainConfig
 from hyrfpack.train.optimizer import Optimizer
 from hyrfpack.train.trainer import Trainer
 

@@ -5,15 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import asdict, dataclass, field, fields
 from itertools import pairwise
+from typing import Annotated
 
-from hyrfpack.checks import check_bool, check_choice, check_float, check_int, check_pair
+from hyrfpack.checks import check_float, check_int, check_pair
 from hyrfpack.choices import PRECISIONS, PRESETS
+from hyrfpack.config.settings import OneOf, Range, Seed, check_settings
 
-BACKGROUND_COLORS = ("black", "white", "random")
-LARGEST_SEED = 2**64 - 1  # torch's generators take seeds of 64 bits.
 FULL_STEPS = 30_000  # The paper's schedules are written for runs of this length.
 MIN_RATE_SCALING_STEPS = 1_000  # Shorter runs use the learning rates of a run of this length.
-BUDGET_FACTOR_RANGE = 1e-3, 1e3
 MIN_LEARNING_RATE = 1e-30  # It is above 0, because the schedule divides by the first rate.
 
 
@@ -69,27 +68,20 @@ class DensityConfig:
         reset_opacity: opacity that a reset caps all Gaussians at, between 0 and 1.
     """
 
-    start: float = 0.02
-    stop: float = 0.65
-    peak: float = 0.35
-    excess: float = 2.0
-    rounds: int = 30
-    gradient: float = 2e-4
-    split_scale: float = 0.01
-    prune_opacity: float = 0.005
-    prune_scale: float = 0.5
-    resets: int = 0
-    reset_opacity: float = 0.01
+    start: Annotated[float, Range(0, 1)] = 0.02
+    stop: Annotated[float, Range(0, 1)] = 0.65
+    peak: Annotated[float, Range(0, 1)] = 0.35
+    excess: Annotated[float, Range(1)] = 2.0
+    rounds: Annotated[int, Range(1)] = 30
+    gradient: Annotated[float, Range(0)] = 2e-4
+    split_scale: Annotated[float, Range(0)] = 0.01
+    prune_opacity: Annotated[float, Range(0, 1)] = 0.005
+    prune_scale: Annotated[float, Range(0)] = 0.5
+    resets: Annotated[int, Range(0)] = 0
+    reset_opacity: Annotated[float, Range(1e-6, 1 - 1e-6)] = 0.01  # limited so that its logit is finite
 
     def __post_init__(self) -> None:
-        for name in ("start", "stop", "peak", "prune_opacity"):
-            check_float(name, getattr(self, name), 0, 1)
-        for name in ("gradient", "split_scale", "prune_scale"):
-            check_float(name, getattr(self, name))
-        check_float("excess", self.excess, 1)
-        check_int("rounds", self.rounds, 1)
-        check_int("resets", self.resets, 0)
-        check_float("reset_opacity", self.reset_opacity, 1e-6, 1 - 1e-6)  # so that its logit is finite
+        check_settings(self)
 
     def mean_count(self, initial: int, budget: int) -> float:
         """Return the mean number of Gaussians over a run in which each round reaches its target number."""
@@ -102,61 +94,59 @@ class DensityConfig:
 class TrainConfig:
     """Everything that decides the outcome of a run, besides the scene.
 
+    Each step renders one view, and every schedule scales with `steps`. `max_gaussians`, `target_bytes` and
+    `budget_factor` exclude each other. Without them, the budget follows from the photos' pixels and the steps;
+    `hyrfpack.train_model` also measures the factor before a run of at least 2,000 steps on at least eight photos
+    (`hyrfpack.train.budget_pilots`). During the run there may be `DensityConfig.excess` times as many Gaussians. Pilot
+    runs decide `exposure`, too (`hyrfpack.train.exposure_pilots`); a `Trainer` by itself then learns no gains. The hash
+    grid whose rows `log2_table_size` states is that of radiance (None: by the budget); the geometry grid has half as
+    many. The background colour "random" is a new one in each step, and the model's own background is then black.
+
     Attributes:
-        steps: optimiser steps, one view each; every schedule scales with it.
-        seed: random seed of view order, initialisation and density control; 0 to LARGEST_SEED.
-        preset: the paper's regime, one of PRESETS; "auto" chooses by the scene.
-        max_gaussians: budget, the most Gaussians that a run ends with, at least 1. During the run there may be
-            `DensityConfig.excess` times as many. None chooses the budget by the photos' pixels, the steps,
-            `target_bytes` and `budget_factor`.
-        budget_factor: the budget as a multiple of what pixels and steps suggest, instead of `max_gaussians`; 0.001 to
-            1000. None means 1, but `hyrfpack.train_model` measures the factor before a run of at least 2,000 steps on
-            at least eight photos, see `hyrfpack.train.budget_pilots`.
-        target_bytes: size in bytes of the packed file to train for, instead of `max_gaussians`; None for no limit.
-        log2_table_size: log2 of the radiance grid's rows per level, 4 to 24 (the geometry grid has half as many rows);
-            None chooses it by the budget.
-        background: whether a background sphere is trained; None lets the preset decide.
-        exposure: whether per-image gains (exposure compensation) and an exposure map, which the file stores, are learnt
-            beside the model. None leaves the decision to pilot runs, see `hyrfpack.train.exposure_pilots`; a `Trainer`
-            by itself then learns none.
-        background_color: colour that transparent pictures are composited over: "black", "white", or "random" (a new
-            colour in each step; the model's own background is then black).
-        ssim_weight: weight w of SSIM in the loss (1 - w) L1 + w (1 - SSIM), 0 to 1.
-        checkpoint_every: steps between checkpoints; None for a twentieth of the run.
-        precision: number format of products in GPU kernels, "mixed" or "float32", see `HybridModel.precision`.
-        scale_rule, scale_grows, direction_encoding, position_gradients, antialiased: as in ModelConfig.
+        steps: training steps.
+        seed: random seed. On a CPU, the same seed gives the same file.
+        preset: kind of scene; auto detects it.
+        max_gaussians: budget: the maximum number of Gaussians. Default: measured by pilot runs.
+        budget_factor: the budget as a multiple of what pixels and steps suggest. Default: measured by pilot runs.
+        target_bytes: choose the budget so that 'hyrfpack compress' reaches this file size, such as 500kB.
+        log2_table_size: rows per level of the hash grid: 2^B.
+        background: train a background sphere. Default: by preset.
+        exposure: exposure compensation: learn per-image gains and an exposure map. Default: decided by pilot runs.
+        background_color: colour behind transparent photos.
+        antialiased: antialiasing: dim small Gaussians as the pixel filter widens them.
+        ssim_weight: weight w of SSIM in the loss (1 - w) L1 + w (1 - SSIM).
+        checkpoint_every: steps between checkpoints. Default: a twentieth of the run.
+        precision: precision of matrix products on a GPU: bfloat16 with float32 sums (mixed), or float32. The CPU always
+            uses float32.
+        scale_rule, scale_grows, direction_encoding, position_gradients: as in ModelConfig.
         learning_rates, density: see LearningRates and DensityConfig.
         grid_resolutions: vertices per axis of the coarsest and the finest level of both hash grids, 2 to 65536.
     """
 
-    steps: int = 3000
-    seed: int = 0
-    preset: str = "auto"
-    max_gaussians: int | None = None
-    budget_factor: float | None = None
-    target_bytes: int | None = None
-    log2_table_size: int | None = None
+    steps: Annotated[int, Range(1)] = 3000
+    seed: Seed = 0
+    preset: Annotated[str, OneOf(PRESETS)] = "auto"
+    max_gaussians: Annotated[int | None, Range(1)] = None
+    budget_factor: Annotated[float | None, Range(1e-3, 1e3)] = None
+    target_bytes: Annotated[int | None, Range(1, unit="bytes")] = None
+    log2_table_size: Annotated[int | None, Range(4, 24, unit="b")] = None
     background: bool | None = None
     exposure: bool | None = None
-    background_color: str = "black"
+    background_color: Annotated[str, OneOf(("black", "white", "random"))] = "black"
     antialiased: bool = False
-    ssim_weight: float = 0.2
-    checkpoint_every: int | None = None
-    precision: str = "mixed"
-    scale_rule: str = "sum"
+    ssim_weight: Annotated[float, Range(0, 1)] = 0.2
+    checkpoint_every: Annotated[int | None, Range(1, unit="steps")] = None
+    precision: Annotated[str, OneOf(PRECISIONS)] = "mixed"
+    scale_rule: Annotated[str, OneOf(("sum", "product"))] = "sum"
     scale_grows: bool = True
-    direction_encoding: str = "frequency"
+    direction_encoding: Annotated[str, OneOf(("frequency", "sh"))] = "frequency"
     grid_resolutions: tuple[int, int] = (8, 512)
     position_gradients: bool = False
     learning_rates: LearningRates = field(default_factory=LearningRates)
     density: DensityConfig = field(default_factory=DensityConfig)
 
     def __post_init__(self) -> None:
-        check_int("steps", self.steps, 1)
-        check_int("seed", self.seed, 0, LARGEST_SEED)
-        for name in ("max_gaussians", "target_bytes", "checkpoint_every"):
-            if getattr(self, name) is not None:
-                check_int(name, getattr(self, name), 1)
+        check_settings(self)
         sizes = {
             "a number of Gaussians": self.max_gaussians,
             "a target size": self.target_bytes,
@@ -164,21 +154,6 @@ class TrainConfig:
         }
         if len(given := [name for name, value in sizes.items() if value is not None]) > 1:
             raise ValueError(f"{' and '.join(given)} each decide how large the model is; give one")
-        if self.budget_factor is not None:
-            check_float("budget_factor", self.budget_factor, *BUDGET_FACTOR_RANGE)
-        if self.log2_table_size is not None:
-            check_int("log2_table_size", self.log2_table_size, 4, 24)
-        check_choice("preset", self.preset, PRESETS)
-        check_choice("precision", self.precision, PRECISIONS)
-        check_choice("background_color", self.background_color, BACKGROUND_COLORS)
-        check_choice("scale_rule", self.scale_rule, ("sum", "product"))
-        check_choice("direction_encoding", self.direction_encoding, ("frequency", "sh"))
-        for name in ("background", "exposure"):
-            if getattr(self, name) is not None:
-                check_bool(name, getattr(self, name))
-        for name in ("antialiased", "scale_grows", "position_gradients"):
-            check_bool(name, getattr(self, name))
-        check_float("ssim_weight", self.ssim_weight, 0, 1)
         check_pair("grid_resolutions", self.grid_resolutions)
         coarsest, finest = self.grid_resolutions
         check_int("the finest of grid_resolutions", finest, 2, 65536)

@@ -11,8 +11,8 @@ import pytest
 import torch
 from scenes import ball_scene
 
+from hyrfpack.config.settings import LARGEST_SEED
 from hyrfpack.train import DensityConfig, DensityControl, LearningRates, TrainConfig, Trainer
-from hyrfpack.train.config import LARGEST_SEED
 
 NON_INTEGERS = (2.5, math.nan, math.inf, True, "3", (3,), np.int64(3))
 NON_FLOATS = (math.nan, math.inf, -math.inf, True, "0.1", None, np.float32(0.1))
@@ -85,6 +85,7 @@ def test_the_limits_of_each_range_are_valid():
     DensityConfig(start=1, stop=0, gradient=0, split_scale=0, prune_opacity=0, resets=0, rounds=1)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("seed", [2**32, 18_446_744_073_710, 2**63, LARGEST_SEED])
 def test_training_with_any_seed_of_64_bits_splits_gaussians_and_ends(seed):
     """Splitting draws from a generator of the seed and the step."""

@@ -1,0 +1,34 @@
+"""Settings of a distillation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from hyrfpack.config.settings import Range, Seed, check_settings
+
+
+@dataclass(frozen=True)
+class DistillConfig:
+    """Settings that, with the splats, determine the result of a distillation.
+
+    The model is fitted to reference renders of the splats, one a step. The renders, at most `train_views`, are taken
+    from sampled viewpoints; `test_views` others score the file.
+
+    Attributes:
+        steps: training steps.
+        psnr: PSNR of renders of FILE against renders of SOURCE; more dB take more bytes.
+        size: longer side of the reference renders.
+        train_views, test_views: number of sampled viewpoints to train at and to score at.
+        seed: random seed. On a CPU, the same seed gives the same file.
+    """
+
+    steps: Annotated[int, Range(1)] = 300
+    psnr: Annotated[float, Range(10, 60, unit="dB")] = 37.0
+    size: Annotated[int, Range(16, 4096, unit="pixels")] = 400
+    train_views: Annotated[int, Range(1)] = 240
+    test_views: Annotated[int, Range(1)] = 16
+    seed: Seed = 0
+
+    def __post_init__(self) -> None:
+        check_settings(self)
