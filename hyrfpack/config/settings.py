@@ -130,7 +130,8 @@ def check_settings(config: object) -> None:
     Raises:
         ValueError: one is wrong; the message names it.
     """
-    for name, setting in list_settings(type(config)).items():
+    config_class: type = type(config)
+    for name, setting in list_settings(config_class).items():
         setting.check(getattr(config, name))
 
 
