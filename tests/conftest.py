@@ -102,8 +102,8 @@ def quick_calibration() -> Iterator[None]:
     """Measure sensitivities of profile "compact" in few small views and correct them once, in all tests of a module."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("hyrfpack.compress.sensitivity.MAX_SENSITIVITY_VIEWS", 8)
-        patch.setattr("hyrfpack.compress.calibrate.MIN_COMPARISON_VIEWS", 4)
-        patch.setattr("hyrfpack.compress.calibrate.MAX_COMPARISON_VIEWS", 4)
+        patch.setattr("hyrfpack.compress.reference_renders.MIN_COMPARISON_VIEWS", 4)
+        patch.setattr("hyrfpack.compress.reference_renders.MAX_COMPARISON_VIEWS", 4)
         patch.setattr("hyrfpack.compress.calibrate.MAX_CORRECTION_ROUNDS", 1)
         yield
 

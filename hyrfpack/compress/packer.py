@@ -15,11 +15,13 @@ import torch
 
 from hyrfpack.cameras.capture import Capture, has_mean_exposure, quantized_provenance
 from hyrfpack.checks import check_type
-from hyrfpack.compress.calibrate import ReferenceRenders, measure_calibrated_sensitivity, predict_errors
+from hyrfpack.compress.calibrate import measure_calibrated_sensitivity
 from hyrfpack.compress.distortion import DEFAULT_PSNR_DROP_DB, DISTORTION_RANGE, default_distortion
 from hyrfpack.compress.finetune import finetune, fit_residual_gains
+from hyrfpack.compress.part_errors import predict_errors
 from hyrfpack.compress.plan import make_plan
 from hyrfpack.compress.quantize import quantize
+from hyrfpack.compress.reference_renders import ReferenceRenders
 from hyrfpack.compress.search import find_coarsest, find_fullest
 from hyrfpack.compress.sensitivity import Sensitivity
 from hyrfpack.data import PictureCache

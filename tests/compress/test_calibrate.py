@@ -9,18 +9,12 @@ import pytest
 import torch
 from scenes import ball_points, ring, small_model
 
-from hyrfpack.compress.calibrate import (
-    CALIBRATED_PARTS,
-    MAX_CORRECTION_ROUNDS,
-    PREDICTION_TOLERANCE_RATIO,
-    CorrectionFactor,
-    ReferenceRenders,
-    _update_decoded,
-    calibrate,
-    predict_errors,
-)
+from hyrfpack.compress.calibrate import MAX_CORRECTION_ROUNDS, calibrate
+from hyrfpack.compress.correction import PREDICTION_TOLERANCE_RATIO, CorrectionFactor
+from hyrfpack.compress.part_errors import QUANTIZED_PARTS, predict_errors, update_decoded
 from hyrfpack.compress.plan import make_plan
 from hyrfpack.compress.quantize import decide
+from hyrfpack.compress.reference_renders import ReferenceRenders
 from hyrfpack.compress.sensitivity import PRUNED, Sensitivity, measure_sensitivity
 from hyrfpack.format import decode_model, encode_model
 from hyrfpack.format.arrays import iter_parameters, to_arrays
@@ -177,7 +171,7 @@ def test_the_correction_stays_finite_for_constant_errors(ratio):
         assert np.isfinite(factor.final) and factor.final >= 0
 
 
-@pytest.mark.parametrize("part", CALIBRATED_PARTS[1:], ids="".join)
+@pytest.mark.parametrize("part", QUANTIZED_PARTS[1:], ids="".join)
 @pytest.mark.parametrize("decoder_scale", [0.2, 0.0])
 def test_updating_changed_parts_equals_decoding_the_whole_model(part, decoder_scale):
     before = overlapping_model(200)
@@ -190,7 +184,7 @@ def test_updating_changed_parts_equals_decoding_the_whole_model(part, decoder_sc
     changed.load_state_dict(dict(iter_parameters(other, changed)), strict=False)
 
     measured = ReferenceRenders.from_model(before, CALIBRATION_CAMERAS).measure_error(
-        changed, _update_decoded(changed, before.decode(), part)
+        changed, update_decoded(changed, before.decode(), part)
     )
 
     expected = ReferenceRenders.from_model(before, CALIBRATION_CAMERAS).measure_error(changed)

@@ -20,9 +20,10 @@ from pathlib import Path
 
 import hyrfpack
 from hyrfpack.cameras.capture import quantized_provenance
-from hyrfpack.compress.calibrate import ReferenceRenders, calibrate
+from hyrfpack.compress.calibrate import calibrate
 from hyrfpack.compress.distortion import default_distortion
 from hyrfpack.compress.packer import EncodedCandidate, Packer
+from hyrfpack.compress.reference_renders import ReferenceRenders
 from hyrfpack.compress.search import find_coarsest
 from hyrfpack.compress.sensitivity import measure_sensitivity
 from hyrfpack.format import decode_model, encode_model

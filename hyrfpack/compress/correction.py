@@ -1,0 +1,106 @@
+"""Correction of sensitivities: a factor for each part, found from measured and predicted errors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hyrfpack.compress.part_errors import ErrorMeasurement, Part
+from hyrfpack.compress.sensitivity import PRUNED, Sensitivity
+from hyrfpack.format.sections import POSITIONS
+
+PREDICTION_TOLERANCE_RATIO = 1.2
+MAX_CORRECTION_RATIO = 64.0
+# A correction multiplies the sensitivities by (measured error / predicted error)^exponent. The exponent is 1 if the
+# error falls with the square of the step, as for small independent perturbations. It is up to 2 if the error falls with
+# the step, as for swapped depth orders. It is down to 1/2 for pruning, whose errors add up.
+CORRECTION_EXPONENTS: dict[Part, float] = {(POSITIONS,): 1.5, (PRUNED,): 0.7}
+# An exponent estimated from two factors is used only within these bounds: factors close to each other give noise.
+MIN_CORRECTION_EXPONENT = 0.25
+MAX_CORRECTION_EXPONENT = 3.0
+
+
+@dataclass
+class CorrectionFactor:
+    """Iterative search for the factor that a part's sensitivities are multiplied by.
+
+    Attributes:
+        exponent: power of measured over predicted error to multiply by; re-estimated once two factors were measured.
+        value: the factor to measure next.
+        low, high: the largest factor measured to be too small, and the smallest measured to be large enough.
+        converged: whether predicted and measured error agree within PREDICTION_TOLERANCE_RATIO.
+        last: the factor measured last, and its ratio of measured to predicted error; None before the first.
+    """
+
+    exponent: float
+    value: float = 1.0
+    low: float = 0.0
+    high: float = np.inf
+    converged: bool = False
+    last: tuple[float, float] | None = None
+
+    def update(self, ratio: float) -> None:
+        """Choose the next factor, given the ratio of measured to predicted error with the present `value`."""
+        if self.last is not None and ratio > 0:  # The exponent follows by the secant method on logarithms.
+            value, before = self.last
+            estimate = np.log(self.value / value) / (np.log(before / ratio) or np.inf)
+            self.exponent = (
+                float(estimate) if MIN_CORRECTION_EXPONENT < estimate < MAX_CORRECTION_EXPONENT else self.exponent
+            )
+        self.last = (self.value, ratio) if ratio > 0 else None
+        if ratio > 1:
+            self.low = max(self.low, self.value)
+        else:
+            self.high = min(self.high, self.value)
+        if 1 / PREDICTION_TOLERANCE_RATIO < ratio < PREDICTION_TOLERANCE_RATIO:
+            self.converged = True
+        elif self.high < PREDICTION_TOLERANCE_RATIO * self.low:
+            self.value, self.converged = self.high, True
+        else:
+            corrected = self.value * min(max(ratio, 1 / MAX_CORRECTION_RATIO), MAX_CORRECTION_RATIO) ** self.exponent
+            self.value = corrected if self.low < corrected < self.high else (self.low * self.high) ** 0.5
+
+    @property
+    def final(self) -> float:
+        """Return the factor to use, which is one that was measured to be large enough, if there is one."""
+        return self.value if self.converged or self.high == np.inf else self.high
+
+
+class SensitivityCorrection:
+    """Search for the factors by which the sensitivities of several parts are multiplied, one factor for each part."""
+
+    def __init__(self, sensitivity: Sensitivity, parts: Sequence[Part]) -> None:
+        """Start from factors of 1 for `parts`, the groups of sections that share a factor."""
+        self._sensitivity = sensitivity
+        self._factors = {part: CorrectionFactor(CORRECTION_EXPONENTS.get(part, 1.0)) for part in parts}
+
+    @property
+    def remaining(self) -> list[Part]:
+        """Return the parts whose factors have not converged."""
+        return [part for part, factor in self._factors.items() if not factor.converged]
+
+    def candidate(self) -> Sensitivity:
+        """Return the sensitivities with the factors to measure next."""
+        return self._scaled({part: factor.value for part, factor in self._factors.items()})
+
+    def update(self, errors: Mapping[Part, ErrorMeasurement], min_error: float) -> None:
+        """Choose the next factors, given the errors that parts have with the present candidate.
+
+        Args:
+            errors: errors of the parts that were measured.
+            min_error: mean squared error; parts that are predicted and measured below it keep their factor.
+        """
+        for part, error in errors.items():
+            if error.predicted > 0 and max(error.measured, error.predicted) > min_error:
+                self._factors[part].update(error.measured / error.predicted)
+            else:
+                self._factors[part].converged = True
+
+    def result(self) -> Sensitivity:
+        """Return the sensitivities with the final factors."""
+        return self._scaled({part: factor.final for part, factor in self._factors.items()})
+
+    def _scaled(self, factors: Mapping[Part, float]) -> Sensitivity:
+        return self._sensitivity.scaled_by({name: factor for part, factor in factors.items() for name in part})

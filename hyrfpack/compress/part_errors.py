@@ -1,0 +1,209 @@
+"""The error that compressing a single part of a model adds to pictures: predicted, and measured on renders."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, Protocol
+
+import numpy as np
+import torch
+
+from hyrfpack.compress.plan import distortion_per_number, indices_to_keep, make_plan
+from hyrfpack.compress.quantize import opacity_error_model, quantize
+from hyrfpack.compress.reference_renders import ReferenceRenders
+from hyrfpack.compress.sensitivity import PRUNED, Sensitivity
+from hyrfpack.format.arrays import iter_parameters, to_arrays
+from hyrfpack.format.compact.plan import Plan
+from hyrfpack.format.compact.quantized import QuantizedModel
+from hyrfpack.format.sections import (
+    COLORS,
+    DECODER_SECTIONS,
+    GEOMETRY_TABLE,
+    LOGIT_SECTIONS,
+    OPACITIES,
+    POSITIONS,
+    RADIANCE_TABLE,
+    SCALES,
+    SECTION_CONTENTS,
+    TABLE_SECTIONS,
+)
+from hyrfpack.model import Decoded, HybridModel
+from hyrfpack.progress import Report
+
+# The sections that are quantised and compared together. A decoder has so few numbers that its error depends on chance,
+# so it is calibrated together with its table.
+Part = tuple[str, ...]
+QUANTIZED_PARTS: tuple[Part, ...] = (
+    (POSITIONS,),
+    (COLORS,),
+    (SCALES, OPACITIES),
+    *zip(TABLE_SECTIONS, DECODER_SECTIONS, strict=True),
+)
+
+
+@dataclass(frozen=True)
+class ErrorMeasurement:
+    """The mean squared error that a part adds to pictures: measured on renders, and predicted by sensitivities."""
+
+    measured: float
+    predicted: float
+
+
+class PartErrors(Protocol):
+    """Predicts and measures the errors of some parts of a model.
+
+    Attributes:
+        parts: the parts, in the order of measurement.
+    """
+
+    parts: ClassVar[tuple[Part, ...]]
+
+    def measure(self, sensitivity: Sensitivity, parts: list[Part], report: Report) -> dict[Part, ErrorMeasurement]:
+        """Compress each of `parts` alone, as `sensitivity` asks for, and return its errors.
+
+        Args:
+            sensitivity: sensitivities of all Gaussians of the model.
+            parts: some of the parts of this object.
+            report: called with the name of the current task and the completed share of these measurements, 0 to 1.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class PruningErrors:
+    """Errors of pruning alone.
+
+    Attributes:
+        model: the model to compress.
+        decoded: the result of `model.decode()`.
+        references: renders of the model.
+        distortion: as in `make_plan`.
+    """
+
+    parts: ClassVar[tuple[Part, ...]] = ((PRUNED,),)
+    model: HybridModel
+    decoded: Decoded
+    references: ReferenceRenders
+    distortion: float
+
+    def measure(self, sensitivity: Sensitivity, parts: list[Part], report: Report) -> dict[Part, ErrorMeasurement]:
+        """Measure the error of pruning, see `PartErrors.measure`."""
+        report("calibrating the prediction of pruning errors", 0.0)
+        kept = indices_to_keep(sensitivity, distortion_per_number(self.model, self.distortion))
+        predicted = float(np.delete(sensitivity.removals, kept).sum())
+        measured = self.references.measure_error(*subset_decoded(self.model, self.decoded, kept))
+        return {part: ErrorMeasurement(measured, predicted) for part in parts}
+
+
+@dataclass
+class QuantizationErrors:
+    """Errors of quantising the Gaussians and fields that are left after pruning.
+
+    Attributes:
+        model: the model to compress, before pruning.
+        pruned: the model after pruning.
+        decoded: the result of `pruned.decode()`.
+        references: renders of the pruned model.
+        distortion, prune: as in `make_plan`.
+    """
+
+    parts: ClassVar[tuple[Part, ...]] = QUANTIZED_PARTS
+    model: HybridModel
+    pruned: HybridModel
+    decoded: Decoded
+    references: ReferenceRenders
+    distortion: float
+    prune: bool
+    # The sensitivities of positions that the last plan was made for, the plan, and the planned model.
+    _last_plan: tuple[np.ndarray, Plan, HybridModel] | None = field(default=None, init=False)
+
+    def measure(self, sensitivity: Sensitivity, parts: list[Part], report: Report) -> dict[Part, ErrorMeasurement]:
+        """Quantise all of `parts` and measure the error of each one alone, see `PartErrors.measure`."""
+        plan, planned = self._plan(sensitivity)
+        quantized = quantize(planned, plan, sensitivity, sections=[name for part in parts for name in part])
+        predicted = _predict_quantization_errors(planned, quantized, sensitivity)
+        arrays = _undo_plan_order(quantized)
+        errors = {}
+        for number, part in enumerate(parts):
+            contents = " and ".join(SECTION_CONTENTS[name] for name in part)
+            report(f"calibrating predicted errors of {contents}", number / len(parts))
+            measured = self._measure_part(part, planned, arrays)
+            errors[part] = ErrorMeasurement(measured, sum(predicted[name] for name in part))
+        return errors
+
+    def _plan(self, sensitivity: Sensitivity) -> tuple[Plan, HybridModel]:
+        """Return a plan and the planned model; they are made again only if the sensitivities of positions changed."""
+        if self._last_plan is None or not np.array_equal(self._last_plan[0], sensitivity.positions):
+            plan = make_plan(self.model, sensitivity, self.distortion, self.prune)
+            self._last_plan = sensitivity.positions, plan, plan.apply(self.model)
+        return self._last_plan[1:]
+
+    def _measure_part(self, part: Part, planned: HybridModel, arrays: dict[str, np.ndarray]) -> float:
+        """Measure the error of the pruned model with the quantised numbers `arrays` of one part, or on the lattice."""
+        if part == (POSITIONS,):
+            return self.references.measure_error(planned)
+        changed = _replace_arrays(self.pruned, {name: arrays[name] for name in part})
+        return self.references.measure_error(changed, update_decoded(changed, self.decoded, part))
+
+
+def subset_decoded(model: HybridModel, decoded: Decoded, kept: np.ndarray) -> tuple[HybridModel, Decoded]:
+    """Return the Gaussians at the indices `kept` (n,) of a model, and of the result of its `decode()`."""
+    index = torch.as_tensor(kept, device=model.gaussians.positions.device)
+    return model.subset(index), decoded[index]
+
+
+def predict_errors(
+    model: HybridModel, planned: HybridModel, quantized: QuantizedModel, sensitivity: Sensitivity
+) -> dict[str, float]:
+    """Predict the mean squared error that compression adds to pictures, for each section and for PRUNED."""
+    removed = np.delete(sensitivity.removals, quantized.plan.kept)
+    return {PRUNED: float(removed.sum()), **_predict_quantization_errors(planned, quantized, sensitivity)}
+
+
+def _predict_quantization_errors(
+    planned: HybridModel, quantized: QuantizedModel, sensitivity: Sensitivity
+) -> dict[str, float]:
+    """Predict the mean squared error that each quantised section and the positions add to pictures."""
+    plan = quantized.plan
+    wanted, stored, s = to_arrays(planned), quantized.arrays(), sensitivity.subset(plan.kept)
+    weights = {COLORS: np.repeat(s.colors, 3), SCALES: s.scales, **s.fields}
+    # Positions are uniform within their lattice cell: variance 1/12 of the squared step for each of the three axes.
+    bits = np.concatenate([layer.points.bits[layer.points.classes] for layer in plan.layers])
+    errors = {POSITIONS: float((s.positions * 3 / 12 * 4.0**-bits).sum())}
+    for group, values in stored.items():
+        if group == OPACITIES:
+            _, error = opacity_error_model(planned, wanted[group][:, 0].astype(np.float64), s.opacities)
+            errors[group] = float(error(slice(None), values[:, 0]).sum())
+        else:
+            difference = values.ravel().astype(np.float64) - wanted[group].ravel()
+            errors[group] = float((weights[group] * difference**2).sum())
+    return errors
+
+
+def _undo_plan_order(quantized: QuantizedModel) -> dict[str, np.ndarray]:
+    """Return the quantised numbers by section, with Gaussians in the order of the pruned model.
+
+    So the decoded values of that model can be used for the parts that did not change.
+    """
+    order = np.argsort(quantized.plan.kept)
+    arrays = quantized.arrays()
+    return {name: values[order] if name in LOGIT_SECTIONS else values for name, values in arrays.items()}
+
+
+def _replace_arrays(model: HybridModel, arrays: dict[str, np.ndarray]) -> HybridModel:
+    """Return a copy of a model in which some sections have the numbers of `arrays` (by section)."""
+    changed = deepcopy(model)
+    changed.load_state_dict(dict(iter_parameters(arrays, changed)), strict=False)
+    return changed
+
+
+def update_decoded(model: HybridModel, before: Decoded, part: Part) -> Decoded:
+    """Decode a model again after one part changed, reusing the results `before` that do not depend on this part."""
+    if GEOMETRY_TABLE in part or OPACITIES in part:
+        return replace(before, geometry=model.decode_geometry())
+    if before.shading is None:
+        return before
+    if RADIANCE_TABLE in part:
+        return replace(before, shading=model.shading())
+    return replace(before, shading=replace(before.shading, color_logits=model.gaussians.color_logits.detach()))

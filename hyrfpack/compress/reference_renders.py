@@ -1,0 +1,72 @@
+"""Renders of a model before compression, against which compressed versions are compared."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hyrfpack.cameras.view_sampling import sample_views
+from hyrfpack.model import Decoded, HybridModel
+from hyrfpack.parallel.pool import parallel_map
+from hyrfpack.render import render_view
+from hyrfpack.scene import Camera
+
+# The number of views of one comparison is chosen so that about this many Gaussians are drawn in all of them together.
+TARGET_DRAWN_GAUSSIANS = 1_000_000
+# Half of the views are at cameras and half between them.
+MIN_COMPARISON_VIEWS = 6
+MAX_COMPARISON_VIEWS = 10
+
+
+@dataclass(frozen=True)
+class ReferenceRenders:
+    """Renders of a model before compression, against which compressed versions are compared.
+
+    Attributes:
+        views: the cameras that were rendered.
+        pictures: the render of each view, (H, W, 3) in [0, 1].
+    """
+
+    views: list[Camera]
+    pictures: list[Tensor]
+
+    @classmethod
+    def from_model(cls, model: HybridModel, cameras: Sequence[Camera], seed: int = 1) -> ReferenceRenders:
+        """Render a model, half of the views at some of its cameras and half between them."""
+        count = (
+            int(np.clip(TARGET_DRAWN_GAUSSIANS // max(len(model), 1), MIN_COMPARISON_VIEWS, MAX_COMPARISON_VIEWS)) // 2
+        )
+        at, between = sample_views(cameras, count, seed)
+        return cls.from_views([*at, *between], model)
+
+    @classmethod
+    def from_views(cls, views: list[Camera], model: HybridModel, decoded: Decoded | None = None) -> ReferenceRenders:
+        """Render a model at the given views; `decoded` is as in `measure_error`."""
+        return cls(views, _render_views(model, views, decoded))
+
+    def measure_error(self, model: HybridModel, decoded: Decoded | None = None) -> float:
+        """Render a model at the same views and return the median over views of the mean squared colour difference.
+
+        The median ignores single views in which a Gaussian comes very close to the camera.
+
+        Args:
+            model: the model to compare with the references.
+            decoded: the result of `model.decode()`, if it is known already.
+        """
+        pairs = zip(_render_views(model, self.views, decoded), self.pictures, strict=True)
+        return float(np.median([float((shown - reference).square().mean()) for shown, reference in pairs]))
+
+
+@torch.no_grad()
+def _render_views(model: HybridModel, cameras: Sequence[Camera], decoded: Decoded | None = None) -> list[Tensor]:
+    decoded = decoded or model.decode()
+
+    @torch.no_grad()  # gradient mode is kept per thread
+    def picture(camera: Camera) -> Tensor:
+        return render_view(model, camera, decoded=decoded).rgb
+
+    return parallel_map(picture, cameras, model.gaussians.positions.device)
