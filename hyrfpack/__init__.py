@@ -41,8 +41,7 @@ if _TOO_LATE:
 if TYPE_CHECKING:
     from hyrfpack.bench import BenchReport as BenchReport
     from hyrfpack.bench import benchmark_model as benchmark_model
-    from hyrfpack.compare import ComparisonReport as ComparisonReport
-    from hyrfpack.compare import compare_runs as compare_runs
+    from hyrfpack.compress import CompressionReport as CompressionReport
     from hyrfpack.compress import compress_model as compress_model
     from hyrfpack.data import load_scene as load_scene
     from hyrfpack.distill import DistillConfig as DistillConfig
@@ -61,8 +60,8 @@ if TYPE_CHECKING:
     from hyrfpack.export import export_gallery as export_gallery
     from hyrfpack.export import export_model as export_model
     from hyrfpack.export import export_player as export_player
+    from hyrfpack.format import FileReport as FileReport
     from hyrfpack.format import describe_file as describe_file
-    from hyrfpack.format.codec import CompressionReport as CompressionReport
     from hyrfpack.format.codec import load_model as load_model
     from hyrfpack.format.codec import save_model as save_model
     from hyrfpack.make import MakeResult as MakeResult
@@ -74,6 +73,8 @@ if TYPE_CHECKING:
     from hyrfpack.render import Rendering as Rendering
     from hyrfpack.render import RenderSettings as RenderSettings
     from hyrfpack.render import render_view as render_view
+    from hyrfpack.report import ComparisonReport as ComparisonReport
+    from hyrfpack.report import compare_runs as compare_runs
     from hyrfpack.scene import Camera as Camera
     from hyrfpack.scene import Picture as Picture
     from hyrfpack.scene import Scene as Scene
@@ -88,8 +89,9 @@ if TYPE_CHECKING:
 _PUBLIC = {
     "BenchReport": "hyrfpack.bench",
     "benchmark_model": "hyrfpack.bench",
-    "ComparisonReport": "hyrfpack.compare",
-    "compare_runs": "hyrfpack.compare",
+    "ComparisonReport": "hyrfpack.report",
+    "compare_runs": "hyrfpack.report",
+    "CompressionReport": "hyrfpack.compress",
     "compress_model": "hyrfpack.compress",
     "load_scene": "hyrfpack.data",
     "DistillConfig": "hyrfpack.distill",
@@ -109,7 +111,7 @@ _PUBLIC = {
     "export_model": "hyrfpack.export",
     "export_player": "hyrfpack.export",
     "describe_file": "hyrfpack.format",
-    "CompressionReport": "hyrfpack.format",
+    "FileReport": "hyrfpack.format",
     "load_model": "hyrfpack.format",
     "save_model": "hyrfpack.format",
     "MakeResult": "hyrfpack.make",

@@ -27,7 +27,7 @@ def compare(runs: tuple[Path, ...], output: Path, overwrite: bool, as_json: bool
       hyrfpack compare runs/a runs/b -o comparison.html
       hyrfpack compare runs/* -o comparison.html --overwrite
     """
-    from hyrfpack.compare import compare_runs as run
+    from hyrfpack.report import compare_runs as run
 
     report = run(runs, output, overwrite=overwrite)
     for sentence in report.doubts:

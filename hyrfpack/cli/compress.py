@@ -30,7 +30,8 @@ from hyrfpack.outputs import Outputs
 from hyrfpack.progress import report_part
 
 if TYPE_CHECKING:
-    from hyrfpack.format import CompressionReport
+    from hyrfpack.compress import CompressionReport
+    from hyrfpack.format import FileReport
     from hyrfpack.parallel.ranks import Ranks
     from hyrfpack.progress import Report
     from hyrfpack.scene import Scene
@@ -118,8 +119,8 @@ def compress(
     if data is not None and no_data:
         raise click.UsageError("--data and --no-data contradict each other; give one of them")
     from hyrfpack.compress import compress_model as pack
-    from hyrfpack.compress.report_page import REPORT_FILES
     from hyrfpack.format import describe_file
+    from hyrfpack.report.compression_page import REPORT_FILES
 
     model = resolve_model_file(model)
     torch_device = choose_command_device(device, ranks)
@@ -156,11 +157,14 @@ def compress(
         scores = _score_both_files(model, Path(result.file), scene, report_part(progress, 0.9, 1.0))
     written = note_rename(output, result.file)
     if report is not None:
-        from hyrfpack.compress.report import write_report
+        from hyrfpack.report.compression import write_compression_report
 
         command = _command_as_typed(click.get_current_context())
-        write_report(report, model, written, result, scene, command=command, overwrite=overwrite)
-    _print_report(result, scores, as_json)
+        write_compression_report(report, model, written, result, scene, command=command, overwrite=overwrite)
+    if as_json:
+        print_json({**result.to_dict(), **scores})
+    else:
+        _print_compression(result, scores)
 
 
 @click.command(short_help="Decompress a file to exact float32.")
@@ -192,7 +196,10 @@ def decompress(file: Path, output: Path, fraction: float | None, overwrite: bool
     Outputs(file, overwrite=overwrite).file(output, ".hyrf")
     result = repack(file, output, fraction=fraction, overwrite=overwrite)
     note_rename(output, result.file)
-    _print_report(result, {}, as_json)
+    if as_json:
+        print_json(result.to_dict())
+    else:
+        _print_file(result)
 
 
 def _command_as_typed(context: click.Context) -> str:
@@ -239,15 +246,16 @@ def _score_both_files(before: Path, after: Path, scene: Scene | None, report: Re
     return {"psnr_before": old.psnr, "psnr": new.psnr, "ssim_before": old.ssim, "ssim": new.ssim}
 
 
-def _print_report(report: CompressionReport, scores: dict[str, float], as_json: bool) -> None:
-    if as_json:
-        print_json({**report.to_dict(), **scores})
-        return
+def _print_file(report: FileReport, shares: dict[str, float] | None = None) -> None:
     sections = [asdict(part) for part in report.sections]
-    click.echo(format_section_table(sections, report.bytes_after, report.gaussians, report.shares))
+    click.echo(format_section_table(sections, report.bytes_after, report.gaussians, shares))
     ratio = report.bytes_before / report.bytes_after
     outcome = "all numbers as float32" if report.profile == "raw" else f"{ratio:.2f} times smaller than float32"
     click.echo(f"{report.file}: {report.bytes_after:,} bytes, {report.gaussians:,} Gaussians, {outcome}")
+
+
+def _print_compression(report: CompressionReport, scores: dict[str, float]) -> None:
+    _print_file(report, report.shares)
     if report.found:
         click.echo(report.found)
     if report.error is not None:

@@ -22,6 +22,7 @@ from hyrfpack.compress.part_errors import predict_errors
 from hyrfpack.compress.plan import make_plan
 from hyrfpack.compress.quantize import quantize
 from hyrfpack.compress.reference_renders import ReferenceRenders
+from hyrfpack.compress.report import CompressionReport
 from hyrfpack.compress.search import find_coarsest, find_fullest
 from hyrfpack.compress.sensitivity import Sensitivity
 from hyrfpack.data import PictureCache
@@ -30,14 +31,13 @@ from hyrfpack.errors import HyrfError, HyrfSizeError
 from hyrfpack.evaluate import evaluate_model
 from hyrfpack.format.codec import (
     DEFAULT_PROFILE,
-    CompressionReport,
     decode_model,
     encode_model,
     load_with_provenance,
     repack,
     write_model,
 )
-from hyrfpack.format.info import describe_file
+from hyrfpack.format.info import FileReport, describe_file
 from hyrfpack.format.min_file_size import check_target_bytes
 from hyrfpack.format.run_folder import find_model
 from hyrfpack.model import HybridModel
@@ -155,7 +155,7 @@ def compress_model(
         repacked = ranks.run_on_all(
             lambda: repack(source, target, profile, overwrite=overwrite, **settings) if ranks.is_main else None
         )
-        return cast(CompressionReport, ranks.broadcast(repacked))
+        return CompressionReport(**vars(cast(FileReport, ranks.broadcast(repacked))))
     if settings:
         raise HyrfError(f"profile 'compact' has no setting '{next(iter(settings))}'", fix="leave it out")
     if data is None and (finetune_steps or max_psnr_drop is not None):
@@ -209,12 +209,10 @@ def compress_model(
     written = ranks.run_on_all(
         lambda: write_model(candidate.data, target, overwrite=overwrite) if ranks.is_main else None
     )
-    result = cast(CompressionReport, ranks.broadcast(written))
     total = sum(candidate.predicted_errors.values())
-    shares = {part: error / (total or 1.0) for part, error in candidate.predicted_errors.items()}
-    return dataclasses.replace(
-        result,
-        shares=shares,
+    return CompressionReport(
+        **vars(cast(FileReport, ranks.broadcast(written))),
+        shares={part: error / (total or 1.0) for part, error in candidate.predicted_errors.items()},
         error=candidate.measured_error or total,
         found=search_result,
         finetuned=finetune_steps > 0,

@@ -1,291 +1,36 @@
-"""The compression report: measure a compressed file and its alternatives, and write the page about them."""
+"""The report of a compression: the file that was written, and what compression did to the model."""
 
 from __future__ import annotations
 
-import logging
-import math
-import os
-from collections.abc import Sequence
-from contextlib import suppress
-from fractions import Fraction
-from functools import partial
-from pathlib import Path
+from dataclasses import asdict, dataclass, field, replace
 
-import numpy as np
-import torch
-
-from hyrfpack.atomic import write_atomic
-from hyrfpack.cameras.capture import Capture, quantized_provenance
-from hyrfpack.compress.calibrate import measure_calibrated_sensitivity
-from hyrfpack.compress.distortion import DISTORTION_RANGE, default_distortion
-from hyrfpack.compress.quantize import decide
-from hyrfpack.compress.report_page import (
-    MAX_SHOWN_VIEWS,
-    PAGE_FILE,
-    PLOT_FILE,
-    REPORT_FILES,
-    Findings,
-    MeasuredFile,
-    ShownView,
-    build_page,
-    picture_names,
-)
-from hyrfpack.compress.report_plot import draw_plot
 from hyrfpack.compress.sensitivity import Sensitivity
-from hyrfpack.errors import HyrfError
-from hyrfpack.evaluate import Evaluation, evaluate_model
-from hyrfpack.evaluate.metrics import psnr, to_8bit
-from hyrfpack.format.codec import (
-    CompressionReport,
-    decode_model,
-    encode_model,
-    load_with_provenance,
-)
-from hyrfpack.format.info import describe_file
-from hyrfpack.lock import exclusive_folder
-from hyrfpack.measure.machine import describe_machine, format_machine
-from hyrfpack.measure.timing import time_alternately
-from hyrfpack.model import HybridModel
-from hyrfpack.outputs import Outputs
-from hyrfpack.render import render_view
-from hyrfpack.render.files import save_picture, to_image
-from hyrfpack.scene import Picture, Scene, View, evenly_spaced
-
-_LOG = logging.getLogger(__name__)
-
-# Distortions of the rate-distortion curve, relative to that of the file.
-CURVE_DISTORTION_RATIOS = (1 / 16, 1 / 4, 1, 4, 16)
-# With this many Gaussians or more, the curve has only the middle three points: each takes long to encode and score.
-SHORT_CURVE_MIN_GAUSSIANS = 200_000
-MAX_SCORED_PHOTOS = 24
-MAX_SCORED_VIEWPOINTS = 12
-# The RMS of the worst shown difference picture is at most this after amplification.
-MAX_AMPLIFIED_RMS = 0.4
-MAX_AMPLIFICATION = 64
-DECODE_TIMING_TURNS = 3
-WRITTEN_FILE_NAME = "this file"
-SAME_DISTORTION_NAME = "compact, the same distortion"
+from hyrfpack.format import FileReport
 
 
-def write_report(
-    folder: str | os.PathLike[str],
-    source: str | os.PathLike[str],
-    packed: str | os.PathLike[str],
-    report: CompressionReport,
-    scene: Scene | None = None,
-    *,
-    command: str = "",
-    overwrite: bool = True,
-) -> Path:
-    """Write `folder/index.html` about a compressed file, and its pictures beside it.
+@dataclass(frozen=True)
+class CompressionReport(FileReport):
+    """Contents and size of a compressed file, and the error that compression added.
 
-    Decoded files are scored on the held-out photos of the scene, or on its training photos if none are held out.
-    Without photos they are scored against renders of the uncompressed model.
-
-    Args:
-        folder: folder of the report; created if missing.
-        source: the file that was compressed.
-        packed: the compressed file.
-        report: the result of `hyrfpack.compress_model`.
-        scene: photos of the scene.
-        command: command line shown on the page as the way to make the file again.
-        overwrite: replace files of an earlier page; if False, they are an error.
-
-    Returns:
-        The path of the page. It is written last, so if it exists, all pictures that it shows exist.
-
-    Raises:
-        HyrfError: a file cannot be read, the folder cannot be written, or another call is writing into it.
+    Attributes:
+        shares: profile "compact" only: the fraction of the error in renders that comes from each section, and from
+            the "pruned" Gaussians.
+        error: profile "compact" only: the mean squared error of renders, colours in [0, 1]; an estimate where the file
+            was not rendered.
+        found: the outcome of a search for a target size or quality, as a sentence.
+        finetuned: profile "compact" only: whether the quantised numbers were fine-tuned on photos.
+        sensitivity: profile "compact" only: how much each number changes renders, by which the steps were chosen. It is
+            kept so that a report page need not measure it again.
     """
-    folder, source, packed = Path(folder), Path(source), Path(packed)
-    Outputs(source, packed, scene=scene, overwrite=True).folder(folder, REPORT_FILES)
-    with exclusive_folder(folder, "another folder with `report`"):
-        Outputs(source, packed, scene=scene, overwrite=overwrite).folder(folder, REPORT_FILES)
-        return _write_report(folder, source, packed, report, scene, command, overwrite)
 
+    shares: dict[str, float] = field(default_factory=dict)
+    error: float | None = None
+    found: str = ""
+    finetuned: bool = False
+    sensitivity: Sensitivity | None = field(default=None, repr=False, compare=False)
 
-def _write_report(
-    folder: Path,
-    source: Path,
-    packed: Path,
-    report: CompressionReport,
-    scene: Scene | None,
-    command: str,
-    overwrite: bool,
-) -> Path:
-    """Do the work of `write_report` in a folder that this call has locked."""
-    model, provenance = load_with_provenance(source)
-    views, views_in_words = _views_to_score(model, source, scene)
-    _LOG.info(f"comparing renders with {views_in_words} for the report")
-    before = evaluate_model(model, views)
-    facts, data = describe_file(packed), _read_bytes(packed)
-    scored = [view for view in views if view.name not in before.skipped]
-
-    profiles = _encode_other_profiles(model, provenance, report.profile)
-    curve = {}
-    if len(model):
-        distortion = _distortion_of_file(facts, model, provenance)
-        sensitivity = report.sensitivity
-        if sensitivity is None:
-            sensitivity, _ = measure_calibrated_sensitivity(
-                model, Capture(describe_file(source), scene).cameras, distortion
-            )
-        # The written file is the curve's point at its distortion, unless fine-tuning moved it off the curve.
-        written_file = data if report.profile == "compact" and not report.finetuned else None
-        curve = _encode_curve(model, provenance, sensitivity, distortion, written_file)
-    at_same_distortion = [name for name, other in curve.items() if other is data]
-    files = {
-        WRITTEN_FILE_NAME: data,
-        **profiles,
-        **{name: other for name, other in curve.items() if name not in at_same_distortion},
-    }
-    points, decoded = _measure_files(files, scored)
-
-    shown, amplified = _write_pictures(
-        folder, model, decoded[WRITTEN_FILE_NAME], scored, before, points[WRITTEN_FILE_NAME].scores, overwrite
-    )
-    findings = Findings(
-        views=views_in_words,
-        has_photos=scene is not None,
-        before=before,
-        chosen=points[WRITTEN_FILE_NAME],
-        profiles=[points[name] for name in profiles],
-        curve=[points[WRITTEN_FILE_NAME if name in at_same_distortion else name] for name in curve],
-        shown=shown,
-        amplified=amplified,
-        gaussians=len(model),
-        machine=format_machine(describe_machine()),
-        writer=facts["writer"],
-    )
-    draw_plot(findings, folder / PLOT_FILE, overwrite=overwrite)
-    path = folder / PAGE_FILE
-    text = build_page(source, packed, report, findings, command).encode()
-    return write_atomic(path, text, overwrite=overwrite, rename=False)
-
-
-def _views_to_score(model: HybridModel, source: Path, scene: Scene | None) -> tuple[list[View], str]:
-    """Return the views to score against, and a description of them."""
-    if scene is None:
-        with torch.no_grad():
-            decoded = model.decode()
-            cameras = evenly_spaced(Capture(describe_file(source)).cameras, MAX_SCORED_VIEWPOINTS)
-            renders = [to_image(render_view(model, camera, decoded=decoded).rgb) for camera in cameras]
-        views = [
-            View(f"viewpoint {number}", camera, partial(Picture, np.asarray(picture)))
-            for number, (camera, picture) in enumerate(zip(cameras, renders, strict=True), 1)
-        ]
-        return views, f"renders of the uncompressed model from {len(views)} viewpoints"
-    views, kind = (scene.test, "held-out") if scene.test else (scene.train, "training")
-    chosen = evenly_spaced(views, MAX_SCORED_PHOTOS)
-    count = f"{len(chosen)}" if len(chosen) == len(views) else f"{len(chosen)} of {len(views)}"
-    return chosen, f"{count} {kind} {'photo' if len(views) == 1 else 'photos'}"
-
-
-def _distortion_of_file(facts: dict, model: HybridModel, provenance: dict) -> float:
-    """Return the distortion that the file was planned for, or the default if it has another profile than "compact"."""
-    per_number = facts["settings"].get("distortion")
-    if not isinstance(per_number, float) or not per_number > 0:
-        return default_distortion(provenance)
-    return per_number * sum(parameter.numel() for parameter in model.parameters())
-
-
-def _encode_other_profiles(model: HybridModel, provenance: dict, written_profile: str) -> dict[str, bytes]:
-    """Encode the model in the profiles that have no settings, except the profile that was written already."""
-    files = {}
-    for profile, kept in (("raw", provenance), ("paper", quantized_provenance(provenance, model.config.frame.scale))):
-        with suppress(HyrfError):  # half precision cannot represent every model
-            if profile != written_profile:
-                files[profile] = encode_model(model, profile, kept)
-    return files
-
-
-def _encode_curve(
-    model: HybridModel, provenance: dict, sensitivity: Sensitivity, distortion: float, at_same_distortion: bytes | None
-) -> dict[str, bytes]:
-    """Encode the model in profile "compact" at each distortion of the curve, smallest distortion first.
-
-    Args:
-        at_same_distortion: the file of exactly this distortion, if it exists already.
-    """
-    files = {}
-    for factor in CURVE_DISTORTION_RATIOS if len(model) < SHORT_CURVE_MIN_GAUSSIANS else CURVE_DISTORTION_RATIOS[1:-1]:
-        if factor == 1 and at_same_distortion is not None:
-            files[SAME_DISTORTION_NAME] = at_same_distortion
-            continue
-        share = f"{Fraction(factor)} of the distortion" if factor < 1 else f"{factor} times the distortion"
-        quantized = decide(model, sensitivity, float(np.clip(factor * distortion, *DISTORTION_RANGE)))
-        name = SAME_DISTORTION_NAME if factor == 1 else f"compact, {share}"
-        files[name] = encode_model(
-            model, "compact", quantized_provenance(provenance, model.config.frame.scale), quantized=quantized
-        )
-    return files
-
-
-def _measure_files(
-    files: dict[str, bytes], views: Sequence[View]
-) -> tuple[dict[str, MeasuredFile], dict[str, HybridModel]]:
-    """Time the decoding of all files in turns, and score the decoded models."""
-    times, decoded = time_alternately(
-        {name: partial(decode_model, data) for name, data in files.items()}, DECODE_TIMING_TURNS
-    )
-    points = {
-        name: MeasuredFile(name, len(data), evaluate_model(decoded[name], views), times[name].ms)
-        for name, data in files.items()
-    }
-    return points, decoded
-
-
-@torch.no_grad()
-def _write_pictures(
-    folder: Path,
-    model: HybridModel,
-    packed: HybridModel,
-    views: Sequence[View],
-    before: Evaluation,
-    after: Evaluation,
-    overwrite: bool,
-) -> tuple[list[ShownView], int]:
-    """Write renders of both models and their difference, from the view that loses most to the one that loses least.
-
-    Returns:
-        The shown views, and the amplification of the differences.
-    """
-    scored = sorted(zip(views, before.views, after.views, strict=True), key=lambda item: item[2].psnr - item[1].psnr)
-    chosen = evenly_spaced(scored, MAX_SHOWN_VIEWS)
-    decoded_models = model.decode(), packed.decode()
-    pairs = [
-        (
-            to_8bit(render_view(model, view.camera, decoded=decoded_models[0]).rgb),
-            to_8bit(render_view(packed, view.camera, decoded=decoded_models[1]).rgb),
-        )
-        for view, *_ in chosen
-    ]
-    psnr_between = [psnr(new, old) for old, new in pairs]
-    amplified = amplification(min(psnr_between))
-    shown = []
-    for number, ((view, old, new), pair, distance) in enumerate(zip(chosen, pairs, psnr_between, strict=True), 1):
-        names = picture_names(number)
-        for name, picture in zip(names, (*pair, amplified * (pair[1] - pair[0]).abs()), strict=True):
-            save_picture(folder / name, to_image(picture), overwrite=overwrite, rename=False)
-        shown.append(ShownView(view.name, old.psnr, new.psnr, distance, names))
-    return shown, amplified
-
-
-def amplification(psnr_between: float) -> int:
-    """Return the amplification that makes the difference between two renders visible.
-
-    Args:
-        psnr_between: PSNR between the renders, dB.
-
-    Returns:
-        A power of two, 1 to MAX_AMPLIFICATION.
-    """
-    rms = 10 ** (-psnr_between / 20)
-    return 2 ** max(0, min(math.floor(math.log2(MAX_AMPLIFIED_RMS / rms)), int(math.log2(MAX_AMPLIFICATION))))
-
-
-def _read_bytes(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise HyrfError(f"{path}: the file cannot be read ({error.strerror or error})", fix="write it again") from error
+    def to_dict(self) -> dict:
+        """Return all fields except the sensitivity as plain numbers, strings, lists and dictionaries for JSON."""
+        values = asdict(replace(self, sensitivity=None))
+        del values["sensitivity"]
+        return values

@@ -22,7 +22,7 @@ from hyrfpack.evaluate import evaluate_model
 from hyrfpack.evaluate.figures import draw_comparison, draw_contact_sheet
 from hyrfpack.evaluate.metrics import psnr, to_8bit
 from hyrfpack.export import ExportReport, export_model
-from hyrfpack.format import CompressionReport, load_model, repack
+from hyrfpack.format import FileReport, load_model, repack
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.model import HybridModel
 from hyrfpack.outputs import Outputs
@@ -201,7 +201,7 @@ def _draw(model: HybridModel, scene: Scene, result: DemoResult) -> Image.Image:
     return draw_contact_sheet(rows, title, result.table())
 
 
-def _timed(action: Callable[[], CompressionReport]) -> tuple[CompressionReport, float]:
+def _timed(action: Callable[[], FileReport]) -> tuple[FileReport, float]:
     """Return the result of an action, and the seconds that it took."""
     start = time.perf_counter()
     report = action()

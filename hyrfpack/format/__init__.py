@@ -8,14 +8,14 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from hyrfpack.format.info import SectionSize, describe_file
+from hyrfpack.format.info import FileReport, SectionSize, describe_file
 from hyrfpack.format.run_folder import RunStatus, find_model, read_run_status
 
 if TYPE_CHECKING:
-    from hyrfpack.format.codec import CompressionReport, decode_model, encode_model, load_model, repack, save_model
+    from hyrfpack.format.codec import decode_model, encode_model, load_model, repack, save_model
 
 __all__ = [
-    "CompressionReport",
+    "FileReport",
     "RunStatus",
     "SectionSize",
     "decode_model",

@@ -29,6 +29,31 @@ class SectionSize:
     after: int
 
 
+@dataclass(frozen=True)
+class FileReport:
+    """Contents and size of a file that was written.
+
+    Attributes:
+        file: path of the file.
+        profile: "raw", "paper" or "compact".
+        gaussians: number of Gaussians in the file.
+        bytes_before: bytes of all parameters as float32.
+        bytes_after: bytes of the file.
+        sections: bytes of each section before and after; header, table of contents and padding are the rest.
+    """
+
+    file: str
+    profile: str
+    gaussians: int
+    bytes_before: int
+    bytes_after: int
+    sections: list[SectionSize]
+
+    def to_dict(self) -> dict:
+        """Return the report as numbers, strings, lists and dictionaries for JSON."""
+        return asdict(self)
+
+
 def section_sizes(container: Container) -> list[SectionSize]:
     """Return the sizes of all sections in file order, unknown optional ones included."""
     return [

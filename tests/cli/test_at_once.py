@@ -21,21 +21,23 @@ from explicit_balls import ball_splats
 from scenes import ring
 
 import hyrfpack
-from hyrfpack.compress.report import write_report
+from hyrfpack.compress import CompressionReport
 from hyrfpack.data import load_scene
 from hyrfpack.demo.run import run_demo
 from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.errors import HyrfError
-from hyrfpack.format import CompressionReport, load_model, repack
+from hyrfpack.format import load_model, repack
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.make.auto_pose import auto_pose
 from hyrfpack.render.files import render_files
+from hyrfpack.report.compression import write_compression_report
 from hyrfpack.splats.formats import ply
 from hyrfpack.train import TrainConfig
 
 pytest.importorskip("fcntl", reason="locks are of Unix")
 FOREIGN_BYTES = b"of another program"
 BUSY_FOLDER_ERROR = "another hyrfpack command is at work in this folder; wait until it has ended, or name another"
+PAPER_REPORT = CompressionReport("packed.hyrf", "paper", 1, 1, 1, [])
 TINY_TRAINING_OPTIONS = "--steps 2 --max-gaussians 40"
 
 
@@ -325,7 +327,7 @@ CALLS_THAT_WRITE_A_FOLDER = {
     "make": lambda: hyrfpack.make_scene("packed.hyrf", "out", work="made"),
     "make work": lambda: hyrfpack.make_scene("packed.hyrf", "new.html", work="out"),
     "render_files": lambda: list(render_files(load_model("model.hyrf"), two_ring_cameras(), "out")),
-    "write_report": lambda: write_report("out", "model.hyrf", "packed.hyrf", CompressionReport("paper", 1, 1, 1, [])),
+    "write_compression_report": lambda: write_compression_report("out", "model.hyrf", "packed.hyrf", PAPER_REPORT),
     "run_demo": lambda: run_demo("out", steps=1),
     "posed": lambda: auto_pose(Path("photos"), Path("out")),
 }

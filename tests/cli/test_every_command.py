@@ -284,8 +284,8 @@ def _make_blender(root: Path, photos: list[Path], frames: list[dict]) -> None:
 
 def _make_foreign(folder: Path, photo: str) -> None:
     """Write files of other programs under the names that commands use."""
-    from hyrfpack.compress.report_page import REPORT_FILES
     from hyrfpack.demo.run import RESULT_FILES as DEMO
+    from hyrfpack.report.compression_page import REPORT_FILES
 
     scored = f"{Path(photo).stem}.png"
     names = [f"a{ending}" for ending in (".hyrf", ".png", ".json", ".md", *OUTPUT_ENDINGS)]

@@ -27,11 +27,11 @@ from PIL import Image
 import hyrfpack
 from hyrfpack.atomic import write_atomic
 from hyrfpack.cameras.capture import Capture
+from hyrfpack.compress import CompressionReport
 from hyrfpack.compress.plan import make_plan
 from hyrfpack.compress.quantize import quantize
 from hyrfpack.compress.sensitivity import Sensitivity
 from hyrfpack.evaluate.figures import blank_figure
-from hyrfpack.format import CompressionReport
 from hyrfpack.format.codec import PROFILES
 from hyrfpack.format.compact.groups import encode_groups
 from hyrfpack.format.compact.quantized import QuantizedModel

@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from hyrfpack.compare.curves import LINE_COLORS, LINE_DASHES, line_style
-from hyrfpack.compare.page import encode_comparison
-from hyrfpack.compare.run import Record, Run, Score
-from hyrfpack.compare.views import ComparedView
+from hyrfpack.report.comparison_page import encode_comparison
+from hyrfpack.report.curves import LINE_COLORS, LINE_DASHES, line_style
+from hyrfpack.report.run import Record, Run, Score
+from hyrfpack.report.views import ComparedView
 from tools.browser import chromium
 
 RUN_NAMES = ["first", 'the "other"']
@@ -82,7 +82,7 @@ def test_pictures_can_be_chosen_split_by_keys_and_pointer_and_subtracted(page: P
 
 
 def test_node_can_parse_the_script_and_a_page_can_embed_it(tmp_path: Path):
-    script = files("hyrfpack.compare").joinpath("script.js").read_text("utf-8")
+    script = files("hyrfpack.report").joinpath("comparison.js").read_text("utf-8")
     assert "</script" not in script.lower() and "<!--" not in script
     if shutil.which("node") is None:
         pytest.skip("node is not on this machine")

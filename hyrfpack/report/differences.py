@@ -5,8 +5,8 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 
-from hyrfpack.compare.run import Run
 from hyrfpack.errors import HyrfDataError
+from hyrfpack.report.run import Run
 
 ALWAYS_SHOWN_SETTINGS = ("steps", "seed")
 

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from hyrfpack.compare.run import Run
 from hyrfpack.data.pictures import read_pixels
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.evaluate.figures import split_comparison
+from hyrfpack.report.run import Run
 
 # Mean difference, in levels of 255, up to which two pictures count as the same photo: decoders round differently.
 MAX_MEAN_DIFFERENCE_LEVELS = 0.5

@@ -8,10 +8,10 @@ from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
+from hyrfpack.compress import CompressionReport
 from hyrfpack.errors import printable
 from hyrfpack.evaluate import Evaluation
 from hyrfpack.evaluate.metrics import IDENTICAL_PSNR
-from hyrfpack.format import CompressionReport
 from hyrfpack.format.sections import NON_PARAMETER_SECTIONS, group_and_layer
 
 PLOT_FILE = "size_against_loss.png"

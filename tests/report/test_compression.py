@@ -14,13 +14,13 @@ from PIL import Image
 from scenes import ball_points, ball_scene, ring, small_model
 
 from hyrfpack.cameras.capture import provenance_cameras
-from hyrfpack.compress import compress_model
+from hyrfpack.compress import CompressionReport, compress_model
 from hyrfpack.compress.calibrate import measure_calibrated_sensitivity
-from hyrfpack.compress.report import amplification, write_report
-from hyrfpack.compress.report_page import size_in_words
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import evaluate_model
-from hyrfpack.format import CompressionReport, load_model, save_model
+from hyrfpack.format import load_model, save_model
+from hyrfpack.report.compression import amplification, write_compression_report
+from hyrfpack.report.compression_page import size_in_words
 from hyrfpack.scene import Scene
 
 pytestmark = pytest.mark.usefixtures("quick_calibration")
@@ -70,7 +70,7 @@ class ParsedReport(HTMLParser):
 def use_quick_timing() -> Iterator[None]:
     """Time each file once, because these tests need no exact times."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("hyrfpack.compress.report.DECODE_TIMING_TURNS", 1)
+        patch.setattr("hyrfpack.report.compression.DECODE_TIMING_TURNS", 1)
         yield
 
 
@@ -102,7 +102,9 @@ def compress_and_report(
     return (
         packed,
         report,
-        ParsedReport(write_report(folder / "page", model_file, packed, report, scene, command="make <it> \udcff")),
+        ParsedReport(
+            write_compression_report(folder / "page", model_file, packed, report, scene, command="make <it> \udcff")
+        ),
     )
 
 
@@ -119,7 +121,7 @@ def test_the_report_reuses_the_sensitivity_measured_for_packing(profile, measure
         asked.append(args)
         return measure_calibrated_sensitivity(*args)
 
-    monkeypatch.setattr("hyrfpack.compress.report.measure_calibrated_sensitivity", spy)
+    monkeypatch.setattr("hyrfpack.report.compression.measure_calibrated_sensitivity", spy)
     _, report, _ = compress_and_report(model_file, tmp_path, profile)
     assert len(asked) == measured
     assert (report.sensitivity is None) == bool(measured)
@@ -150,15 +152,16 @@ def test_names_of_files_are_escaped(report_with_photos):
 
 def test_an_unwritable_folder_is_refused_before_the_work(model_file, tmp_path):
     (tmp_path / "file").write_bytes(b"")
+    report = CompressionReport("model.hyrf", "raw", 1, 1, 1, [])
     with pytest.raises(HyrfError, match="file is a file, not a folder"):
-        write_report(tmp_path / "file" / "page", model_file, model_file, CompressionReport("raw", 1, 1, 1, []))
+        write_compression_report(tmp_path / "file" / "page", model_file, model_file, report)
 
 
 def test_the_page_is_written_after_its_pictures(model_file, tmp_path, monkeypatch):
     def full(path, image, **options):
         raise HyrfError("the disk is full", fix="free some space")
 
-    monkeypatch.setattr("hyrfpack.compress.report.save_picture", full)
+    monkeypatch.setattr("hyrfpack.report.compression.save_picture", full)
     with pytest.raises(HyrfError, match="full"):
         compress_and_report(model_file, tmp_path, "raw")
     assert not (tmp_path / "page").exists()
@@ -194,7 +197,9 @@ def test_layers_of_a_section_are_reported_as_one_part(model_file, tmp_path):
         for type in ("POSI", "POS1")
     ]
     sections = [*halves, *(part for part in report.sections if part.type != "POSI")]
-    path = write_report(tmp_path / "page", model_file, packed, dataclasses.replace(report, sections=sections))
+    path = write_compression_report(
+        tmp_path / "page", model_file, packed, dataclasses.replace(report, sections=sections)
+    )
     (row,) = [row for row in ParsedReport(path).tables[0] if row[0].startswith("positions")]
     assert row[:3] == ["positions", f"{positions.before:,}", f"{positions.after:,}"]
 

@@ -19,9 +19,9 @@ from PIL import Image
 from scenes import ball_scene
 
 import hyrfpack
-from hyrfpack.compare.run import read_run, short_names
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate.figures import PAPER_COLOR
+from hyrfpack.report.run import read_run, short_names
 from hyrfpack.scene import Scene
 from hyrfpack.train import TrainConfig
 

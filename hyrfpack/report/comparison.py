@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hyrfpack.atomic import write_atomic
-from hyrfpack.compare.differences import check_scores, comparability_warnings
-from hyrfpack.compare.page import encode_comparison
-from hyrfpack.compare.run import read_run, short_names
-from hyrfpack.compare.views import read_views
 from hyrfpack.errors import HyrfError
 from hyrfpack.format.run_folder import METRICS_FILE, MODEL_FILE
 from hyrfpack.outputs import Outputs, StrPath
+from hyrfpack.report.comparison_page import encode_comparison
+from hyrfpack.report.differences import check_scores, comparability_warnings
+from hyrfpack.report.run import read_run, short_names
+from hyrfpack.report.views import read_views
 
 
 @dataclass(frozen=True)

@@ -9,12 +9,12 @@ from importlib.resources import files
 
 import numpy as np
 
-from hyrfpack.compare.curves import LIGHT_TEXT_COLOR, draw_curves, has_times, line_style
-from hyrfpack.compare.differences import choices_that_differ, notes_that_differ, settings_that_differ
-from hyrfpack.compare.run import Run
-from hyrfpack.compare.views import ComparedView, webp_data_uri
 from hyrfpack.errors import printable
 from hyrfpack.evaluate.figures import ERROR_LIMIT, SMOOTHING_RADIUS_RECORDS, error_colors
+from hyrfpack.report.curves import LIGHT_TEXT_COLOR, draw_curves, has_times, line_style
+from hyrfpack.report.differences import choices_that_differ, notes_that_differ, settings_that_differ
+from hyrfpack.report.run import Run
+from hyrfpack.report.views import ComparedView, webp_data_uri
 from hyrfpack.version import __version__
 from hyrfpack.web.player import content_security_policy, fill_template, json_element
 
@@ -36,7 +36,7 @@ def encode_comparison(
     Returns:
         The HTML file, UTF-8. The same arguments give the same bytes.
     """
-    style, script = _read_asset("style.css"), _read_asset("script.js")
+    style, script = _read_asset("style.css"), _read_asset("comparison.js")
     values = {
         "policy": content_security_policy(style, [script]),
         "version": __version__,
@@ -51,7 +51,7 @@ def encode_comparison(
         "texts": json_element("compared", _view_data(runs, names, views)) if views else "",
         "script": script,
     }
-    return fill_template(_read_asset("page.html"), values).encode()
+    return fill_template(_read_asset("comparison.html"), values).encode()
 
 
 def _tables(runs: Sequence[Run], names: Sequence[str], ranked: bool) -> list[str]:
@@ -171,7 +171,7 @@ def _view_data(runs: Sequence[Run], names: Sequence[str], views: Sequence[Compar
 
 
 def _read_asset(name: str) -> str:
-    return files("hyrfpack.compare").joinpath(name).read_text("utf-8")
+    return files("hyrfpack.report").joinpath(name).read_text("utf-8")
 
 
 def _escape(text: str) -> str:

@@ -7,8 +7,8 @@ import os
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from hyrfpack.compress.report_page import Findings, MeasuredFile, size_in_words
 from hyrfpack.evaluate.figures import blank_figure, save_figure
+from hyrfpack.report.compression_page import Findings, MeasuredFile, size_in_words
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

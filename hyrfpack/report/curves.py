@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from hyrfpack.compare.run import Run
 from hyrfpack.evaluate.figures import blank_figure, figure_to_svg, running_mean
+from hyrfpack.report.run import Run
 
 # Okabe and Ito's colours for all kinds of colour vision, those that are visible on white and on black.
 LINE_COLORS = ("#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#56b4e9")

@@ -1,0 +1,177 @@
+"""Decoding of a container to a HybridModel, after all sizes that it declares have been checked."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+
+from hyrfpack.errors import HyrfFormatError
+from hyrfpack.format import compact, paper, raw
+from hyrfpack.format.arrays import check_rules, group_shapes, parse_config, to_model
+from hyrfpack.format.container import Container
+from hyrfpack.format.exposure import decode_exposure
+from hyrfpack.format.metadata import read_metadata
+from hyrfpack.format.sections import EXPOSURE, LAYERED_SECTIONS, POSITIONS, group_and_layer, layer_section
+from hyrfpack.model.config import ModelConfig
+from hyrfpack.model.hybrid import HybridModel
+from hyrfpack.parallel.pool import run_tasks
+from hyrfpack.quant import DamagedDataError
+
+# A file may declare this many Gaussians for each of its bytes, plus a constant, because equal Gaussians take no bytes.
+MAX_GAUSSIANS_PER_FILE_BYTE = 32
+EXTRA_GAUSSIANS_PER_FILE = 1 << 18
+# Decoders of the codecs that read no other section; `compact` has those that need the positions.
+DECODER_BY_CODEC = {**raw.DECODER_BY_CODEC, **paper.DECODER_BY_CODEC}
+
+
+@dataclass(frozen=True)
+class ModelLayout:
+    """The parts of a file that are decoded.
+
+    Attributes:
+        config: configuration of the model.
+        layers: number of Gaussians in each layer.
+        shapes: (rows, columns) of the numbers of each section, by its type, in the order of decoding.
+    """
+
+    config: ModelConfig
+    layers: list[int]
+    shapes: dict[str, tuple[int, int]]
+
+
+def gaussian_limit(file_length: int) -> int:
+    """Return the largest number of Gaussians that a file of `file_length` bytes may hold."""
+    return MAX_GAUSSIANS_PER_FILE_BYTE * file_length + EXTRA_GAUSSIANS_PER_FILE
+
+
+def decode_container(container: Container) -> HybridModel:
+    """Decode the model of an open file; it is safe on untrusted input.
+
+    Raises:
+        HyrfFormatError: the file is damaged, inconsistent, or incomplete.
+    """
+    layout = read_layout(container)
+    arrays = _decode_sections(container, layout)
+    for tag, values in arrays.items():
+        if not np.isfinite(values).all():
+            raise HyrfFormatError(
+                f"{container.name}: section '{tag}' holds numbers that are not finite",
+                fix="write the file again",
+            )
+    if (layer_count := len(layout.layers)) > 1:
+        for group in LAYERED_SECTIONS:
+            arrays[group] = np.concatenate([arrays.pop(layer_section(group, layer)) for layer in range(layer_count)])
+    model = to_model(layout.config, arrays).requires_grad_(False)
+    if EXPOSURE in container:
+        section = container[EXPOSURE]
+        with _add_error_context(container.name, EXPOSURE):
+            model.exposure = decode_exposure(section.codec, memoryview(section.data), section.raw_length)
+    return model
+
+
+def read_layout(container: Container) -> ModelLayout:
+    """Check all sizes that a file declares, and return what is decoded of it.
+
+    No section is decoded, so that a forged file cannot cause large allocations. Of a partial file, the first layer must
+    be complete; further layers are used up to the first incomplete one.
+
+    Raises:
+        HyrfFormatError: a section is missing, has an unknown codec or another size than the metadata asks for, or there
+            are more Gaussians than the size of the file allows.
+    """
+    name, metadata = container.name, read_metadata(container)
+    try:
+        check_rules(metadata.rules)
+        config = parse_config(metadata.config)
+    except HyrfFormatError as error:
+        raise error.with_text(f"{name}: {error.problem}") from error
+    layers = metadata.layers or [metadata.gaussians]
+    shapes = {}
+    for layer, count in enumerate(layers):
+        for group, shape in group_shapes(config, count).items():
+            if layer == 0 or group in LAYERED_SECTIONS:
+                shapes[layer_section(group, layer)] = shape
+    _check_sections(container, shapes)
+    layer_count = 1
+    while layer_count < len(layers) and all(
+        layer_section(group, layer_count) in container for group in LAYERED_SECTIONS
+    ):
+        layer_count += 1
+    layers = layers[:layer_count]
+    shapes = {tag: shape for tag, shape in shapes.items() if group_and_layer(tag)[1] < layer_count}
+    if any(tag not in container for tag in shapes) and container.available < container.length:
+        needed = max(container.entries[tag].end for tag in shapes)
+        raise HyrfFormatError(
+            f"{name}: the model needs the first {needed:,} of {container.length:,} bytes, but only "
+            f"{container.available:,} are available or allowed",
+            fix="read a larger part of the file",
+        )
+    if sum(layers) > (limit := gaussian_limit(container.available)):
+        raise HyrfFormatError(
+            f"{name}: the file claims {sum(layers):,} Gaussians, but its size allows at most {limit:,} Gaussians",
+            fix="the file is damaged, copy or write it again",
+        )
+    return ModelLayout(config, layers, shapes)
+
+
+def _check_sections(container: Container, shapes: dict[str, tuple[int, int]]) -> None:
+    """Check the codec and the decoded size of each section that the metadata asks for."""
+    name = container.name
+    for tag, (rows, columns) in shapes.items():
+        entry = container.entries.get(tag)
+        if entry is None:
+            raise HyrfFormatError(f"{name}: there is no section '{tag}'", fix="the file is incomplete, write it again")
+        if entry.codec not in DECODER_BY_CODEC and entry.codec not in compact.SECTIONS_BY_CODEC:
+            raise HyrfFormatError(f"{name}: section '{tag}' has the unknown codec {entry.codec}", fix="update hyrfpack")
+        if entry.raw_length != 4 * rows * columns:
+            raise HyrfFormatError(
+                f"{name}: section '{tag}' says it decodes to {entry.raw_length} bytes and the metadata asks for "
+                f"{4 * rows * columns}",
+                fix="the file is damaged, write it again",
+            )
+
+
+def _decode_sections(container: Container, layout: ModelLayout) -> dict[str, np.ndarray]:
+    """Decode the sections of a layout in parallel; return their numbers by the type of the section."""
+    config, shapes, name = layout.config, layout.shapes, container.name
+    sections = {tag: container[tag] for tag in shapes}
+    arrays: dict[str, np.ndarray] = {}
+    points = {}  # lattice points by layer, if positions are on a lattice; other sections need them for decoding
+
+    def decode_positions(layer: int) -> None:
+        tag = layer_section(POSITIONS, layer)
+        if sections[tag].codec == compact.CODEC_POINTS:
+            with _add_error_context(name, tag):
+                arrays[tag], points[layer] = compact.decode_positions(
+                    memoryview(sections[tag].data), layout.layers[layer], config
+                )
+
+    run_tasks(decode_positions, len(layout.layers))
+    rest = [tag for tag in shapes if tag not in arrays]
+
+    def decode(index: int) -> None:
+        tag = rest[index]
+        group, layer = group_and_layer(tag)
+        codec, data = sections[tag].codec, memoryview(sections[tag].data)
+        with _add_error_context(name, tag):
+            if codec in DECODER_BY_CODEC:
+                arrays[tag] = DECODER_BY_CODEC[codec](data, shapes[tag])
+            else:
+                arrays[tag] = compact.decode_section(group, codec, data, shapes[tag], config, points.get(layer))
+
+    run_tasks(decode, len(rest))
+    return arrays
+
+
+@contextmanager
+def _add_error_context(name: str, group: str) -> Iterator[None]:
+    """Add the file and the section to the message of a format error."""
+    try:
+        yield
+    except HyrfFormatError as error:
+        raise error.with_text(f"{name}: section '{group}': {error.problem}") from error
+    except DamagedDataError as error:
+        raise HyrfFormatError(f"{name}: section '{group}': {error}", fix="copy or write the file again") from error
