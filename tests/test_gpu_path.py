@@ -82,6 +82,7 @@ def test_mixed_precision_starts_near_the_loss_of_float32(gpu):
     assert loss == pytest.approx(expected, rel=1e-2) and loss != expected
 
 
+@pytest.mark.acceptance
 def test_a_run_resumes_on_another_device(gpu, tmp_path):
     first = Trainer(make_scene(), TRAIN_CONFIG, device=gpu)
     assert not first.run(checkpoint=tmp_path / "c.pt", stop=lambda: first.step == 2)
@@ -159,6 +160,7 @@ def few_pictures(monkeypatch):
         monkeypatch.setattr(f"hyrfpack.compress.reference_renders.{name}", 2)
 
 
+@pytest.mark.acceptance
 def test_a_model_is_measured_packed_and_fine_tuned_on_a_gpu(gpu, few_pictures, tmp_path):
     scene = ball_scene(views=2, points=12, side=8)
     config = TrainConfig(steps=1, max_gaussians=12, log2_table_size=4, background=False)

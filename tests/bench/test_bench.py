@@ -212,6 +212,7 @@ def test_every_setting_of_the_paper_profile_is_measured_with_its_default_marked(
     assert few.parts["scale logits"] == rows["profile"]["paper"].parts["scale logits"]
 
 
+@pytest.mark.acceptance
 def test_every_setting_of_the_compact_profile_is_measured_with_its_default_marked():
     notes = []
     rows = rows_by_setting(codec_rows(make_subject(make_model(300, scale_logits=-4.0)), 1, notes))
@@ -231,6 +232,7 @@ def test_every_setting_of_the_compact_profile_is_measured_with_its_default_marke
     assert "no time in the table includes this" in measuring
 
 
+@pytest.mark.acceptance
 def test_a_new_profile_is_measured_automatically_and_may_reorder_gaussians(monkeypatch):
     def shuffled(model):
         order = torch.from_numpy(np.random.default_rng(0).permutation(len(model)))

@@ -105,6 +105,7 @@ def test_every_row_and_codec_size_is_drawn():
     assert size.x_value(size.rows[0]) == 900 / 4000
 
 
+@pytest.mark.acceptance
 def test_the_plot_is_a_picture_in_the_format_of_its_name(tmp_path):
     plot(make_rows(), tmp_path / "new" / "plot.png")
     assert Image.open(tmp_path / "new" / "plot.png").size[0] > 1000

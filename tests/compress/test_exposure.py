@@ -121,6 +121,7 @@ def test_finetuning_keeps_the_map_and_the_consistent_exposure_and_improves_the_f
     assert scores.psnr > scores.psnr_consistent + 1
 
 
+@pytest.mark.acceptance
 def test_finetuning_does_not_compensate_errors_of_the_map(model_file, scene, tmp_path):
     source = write_model_with_map(model_file, scene, 1.5 * PHOTO_GAINS / MEAN_GAIN, tmp_path / "light.hyrf")
     compress_model(source, tmp_path / "fitted.hyrf", data=scene, finetune_steps=FINETUNE_STEPS)
@@ -141,6 +142,7 @@ def test_gains_are_fitted_once_per_search_and_only_with_learned_exposures(
         assert len(fitted) == calls
 
 
+@pytest.mark.acceptance
 def test_max_psnr_drop_limits_the_psnr_of_renders_as_photographed(file_with_map, scene, tmp_path):
     report = compress_model(file_with_map, tmp_path / "small.hyrf", data=scene, max_psnr_drop=0.5)
 

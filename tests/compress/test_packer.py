@@ -119,6 +119,7 @@ def test_the_report_matches_the_file_and_predicts_the_error(compact_file_and_rep
     assert report.error / 1.5 < measured < 1.5 * report.error
 
 
+@pytest.mark.acceptance
 def test_the_measured_error_is_close_to_the_requested_distortion(scene, tmp_path):
     cameras = [view.camera for view in scene.train]
     sizes, errors = [], []

@@ -34,6 +34,7 @@ def test_the_report_describes_the_file(tmp_path: Path) -> None:
     assert hyrfpack.describe_file(target)["profile"] == "compact"
 
 
+@pytest.mark.acceptance
 def test_more_steps_raise_the_psnr(tmp_path: Path) -> None:
     splats = ball_splats(200)
     few, many = (
@@ -54,6 +55,7 @@ def test_the_largest_seed_is_accepted(tmp_path: Path) -> None:
     assert hyrfpack.describe_file(tmp_path / "x.hyrf")["provenance"]["seed"] == 2**64 - 1 and report.psnr > 10
 
 
+@pytest.mark.acceptance
 @pytest.mark.parametrize("unit, offset", [(1, 1e6), (1e-6, 0)])
 def test_the_result_does_not_depend_on_origin_and_unit(tmp_path: Path, unit: float, offset: float) -> None:
     splats = ball_splats(100)
@@ -184,6 +186,7 @@ def _interrupt(*args):
     raise KeyboardInterrupt
 
 
+@pytest.mark.acceptance
 def test_a_psnr_below_the_target_is_reported(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     report = distill_splats(ball_splats(60), tmp_path / "x.hyrf", replace(TINY_DISTILL_CONFIG, psnr=60))
     assert report.psnr_asked == 60

@@ -244,7 +244,7 @@ def test_a_group_may_have_16_stages_but_not_17():
 def test_forged_exposure_maps_trigger_every_check_of_the_reader():
     """The forged maps produce each error message of codec 9, and some are decoded."""
     outcomes = Counter()
-    for number in range(500):
+    for number in range(250):
         outcome = decode(INPUT_KINDS["forged exposure map"][1](Random(number)))
         if isinstance(outcome, str):
             assert "section 'EXPO'" in outcome or "decode to" in outcome, outcome
@@ -253,7 +253,7 @@ def test_forged_exposure_maps_trigger_every_check_of_the_reader():
             assert outcome.exposure is not None
         outcomes[message_pattern(outcome) if isinstance(outcome, str) else "decoded"] += 1
 
-    assert outcomes["decoded"] > 50
+    assert outcomes["decoded"] > 25
     sentences = " | ".join(outcomes)
     for words in (
         "do not fit an exposure map",

@@ -180,6 +180,7 @@ def test_train_updates_the_live_view_with_the_option(data, observed_steps, tmp_p
     assert observed_steps == [] and "http" not in result.stderr
 
 
+@pytest.mark.acceptance
 def test_make_updates_the_live_view_with_the_option(data, observed_steps, monkeypatch, tmp_path):
     from hyrfpack.make import plan
 

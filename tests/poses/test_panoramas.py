@@ -28,6 +28,7 @@ def panoramas(tmp_path_factory):
     return folder, truth
 
 
+@pytest.mark.acceptance
 def test_the_faces_of_panoramas_are_posed(panoramas, tmp_path):
     folder, truth = panoramas
     found = hyrfpack.estimate_poses(folder, tmp_path / "scene")

@@ -252,6 +252,7 @@ def test_a_job_is_read_as_it_was_written(tmp_path):
     assert Job.load(tmp_path / "job.json") == job
 
 
+@pytest.mark.acceptance
 def test_photos_of_two_cameras_some_of_them_rotated_become_one_scene(tmp_path):
     folder = tmp_path / "photos"
     known = write_photos(folder)

@@ -244,7 +244,10 @@ def test_a_signal_that_is_ignored_stays_ignored(number):
 
 
 @pytest.mark.usefixtures("signals")
-@pytest.mark.parametrize("number", STOP_SIGNALS)
+@pytest.mark.parametrize(
+    "number",
+    [STOP_SIGNALS[0], *(pytest.param(number, marks=pytest.mark.acceptance) for number in STOP_SIGNALS[1:])],
+)
 def test_an_interrupt_saves_exits_cleanly_and_resumes_to_the_same_model(number, uninterrupted_trainer, tmp_path):
     child = start_child(tmp_path, "train")
     checkpoint = tmp_path / "checkpoint.pt"

@@ -493,7 +493,12 @@ def opaque_object_on_a_plain_wall() -> Scene:
     [
         (lambda: ball_scene(points=30), TrainConfig(steps=300, max_gaussians=500), 12),
         (lambda: ball_scene(points=12), TrainConfig(steps=200, max_gaussians=12), 6),
-        (lambda: ball_scene(points=30), TrainConfig(steps=300, max_gaussians=500, background=False), 6),
+        pytest.param(
+            lambda: ball_scene(points=30),
+            TrainConfig(steps=300, max_gaussians=500, background=False),
+            6,
+            marks=pytest.mark.acceptance,
+        ),
         (opaque_object_on_a_plain_wall, TrainConfig(steps=400, max_gaussians=500), 6),
     ],
     ids=["sphere", "no room", "no sphere", "object"],

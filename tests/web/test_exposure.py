@@ -317,6 +317,7 @@ def test_scripts_cannot_set_an_unknown_exposure(browser: Browser, tmp_path: Path
 # ---- addresses and other pages
 
 
+@pytest.mark.acceptance
 @pytest.mark.integration
 @pytest.mark.in_turn
 @pytest.mark.parametrize("exposure", RENDER_EXPOSURES)

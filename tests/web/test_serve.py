@@ -144,6 +144,7 @@ def test_a_file_that_shrinks_while_it_is_sent_closes_the_connection_early(port, 
     connection.close()
 
 
+@pytest.mark.acceptance
 def test_a_large_file_is_not_held_in_memory(tmp_path):
     large = tmp_path / "large.hyrf"
     with large.open("wb") as file:

@@ -139,6 +139,7 @@ def test_a_file_beside_the_player_is_the_default(browser: Browser, host: Site):
     assert browser.evaluate(LOADED_COUNT_JS) == 300
 
 
+@pytest.mark.acceptance
 @pytest.mark.integration
 def test_a_failed_fetch_is_reported_in_one_sentence(browser: Browser, host: Site):
     browser.open(f"{host.address}/index.html?content=not%20there.hyrf")

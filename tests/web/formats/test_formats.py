@@ -160,6 +160,7 @@ def test_damaged_files_are_read_or_refused_as_in_python(tmp_path: Path) -> None:
     assert len(files) / 4 < refused < len(files)
 
 
+@pytest.mark.acceptance
 def test_small_files_that_declare_many_splats_take_little_memory(tmp_path: Path) -> None:
     _, usual = read_in_node(tmp_path, [("a.splat", bytes(32))])
     bombs = [
