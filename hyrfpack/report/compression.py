@@ -40,15 +40,15 @@ from hyrfpack.render.files import save_picture, to_image
 from hyrfpack.report.compression_page import (
     MAX_SHOWN_VIEWS,
     PAGE_FILE,
-    PLOT_FILE,
     REPORT_FILES,
     Findings,
     MeasuredFile,
     ShownView,
-    build_page,
+    encode_compression_page,
     picture_names,
 )
 from hyrfpack.report.compression_plot import draw_plot
+from hyrfpack.report.page import embed_figure
 from hyrfpack.scene import Picture, Scene, View, evenly_spaced
 
 _LOG = logging.getLogger(__name__)
@@ -157,10 +157,9 @@ def _write_report(
         machine=format_machine(describe_machine()),
         writer=facts["writer"],
     )
-    draw_plot(findings, folder / PLOT_FILE, overwrite=overwrite)
-    path = folder / PAGE_FILE
-    text = build_page(source, packed, report, findings, command).encode()
-    return write_atomic(path, text, overwrite=overwrite, rename=False)
+    plot = embed_figure(draw_plot(findings), "Bytes of each file against its loss, and against the time to decode it")
+    page = encode_compression_page(source, packed, report, findings, plot, command)
+    return write_atomic(folder / PAGE_FILE, page, overwrite=overwrite, rename=False)
 
 
 def _views_to_score(model: HybridModel, source: Path, scene: Scene | None) -> tuple[list[View], str]:

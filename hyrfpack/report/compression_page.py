@@ -2,37 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from xml.etree import ElementTree
-from xml.etree.ElementTree import Element
 
 from hyrfpack.compress import CompressionReport
-from hyrfpack.errors import printable
 from hyrfpack.evaluate import Evaluation
 from hyrfpack.evaluate.metrics import IDENTICAL_PSNR
 from hyrfpack.format.sections import NON_PARAMETER_SECTIONS, group_and_layer
+from hyrfpack.report.page import encode_page, escape, paragraph, section, table, table_row
 
-PLOT_FILE = "size_against_loss.png"
 MAX_SHOWN_VIEWS = 4
 PICTURE_KINDS = ("before", "after", "difference")
-PAGE_CSS = """
-body { font: 16px/1.5 system-ui, sans-serif; color: #202124; max-width: 68rem; margin: 2rem auto; padding: 0 1rem; }
-h1 { font-size: 2rem; margin-bottom: 0; }
-h2 { font-size: 1.3rem; margin-top: 2.5rem; }
-p, figcaption { max-width: 48rem; }
-figcaption { color: #5f6368; margin-top: .3rem; }
-figure { margin: 1rem 0 2rem; }
-img { max-width: 100%; height: auto; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
-th, td { text-align: right; padding: .25rem .8rem; border-bottom: 1px solid #dadce0; }
-th:first-child, td:first-child { text-align: left; padding-left: 0; }
-tr.chosen td { font-weight: bold; }
-pre { background: #f1f3f4; padding: .8rem; white-space: pre-wrap; overflow-wrap: anywhere; }
-.views { display: grid; grid-template-columns: repeat(3, 1fr); gap: .5rem; text-align: center; }
-.views img { width: 100%; }
-"""
 
 
 def picture_names(number: int) -> list[str]:
@@ -43,7 +23,6 @@ def picture_names(number: int) -> list[str]:
 PAGE_FILE = "index.html"
 REPORT_FILES = (
     PAGE_FILE,
-    PLOT_FILE,
     *(name for number in range(1, MAX_SHOWN_VIEWS + 1) for name in picture_names(number)),
 )
 
@@ -128,32 +107,31 @@ class Findings:
         return self.before.psnr - scores.psnr if self.has_photos else scores.psnr
 
 
-def build_page(source: Path, packed: Path, report: CompressionReport, findings: Findings, command: str) -> str:
-    """Return the page as HTML. Texts from files become text nodes of an element tree, so they cannot inject markup."""
-    title = headline(report, findings)
-    head = _element(
-        "head",
-        _element("meta", charset="utf-8"),
-        _element("meta", name="viewport", content="width=device-width, initial-scale=1"),
-        _element("title", f"{packed.name}: {title}"),
-        _element("style", PAGE_CSS),
-    )
-    body = _element(
-        "body",
-        _element("h1", title),
-        *_summary(source, packed, report, findings),
-        _element("h2", "Size of each part"),
-        *_section_sizes(report),
-        _element("h2", "Size, loss and speed"),
-        *_alternatives(findings),
-        _element("h2", "Before and after"),
-        *_view_pictures(findings),
-        *([_element("h2", "Command that makes this file again"), _element("pre", command)] if command else []),
-        _element("p", f"Written by {findings.writer}. Times were measured on this machine: {findings.machine}."),
-    )
-    document = _element("html", head, body, lang="en")
-    ElementTree.indent(document)
-    return "<!DOCTYPE html>\n" + ElementTree.tostring(document, encoding="unicode", method="html") + "\n"
+def encode_compression_page(
+    source: Path, packed: Path, report: CompressionReport, findings: Findings, plot: str, command: str
+) -> bytes:
+    """Encode the page as HTML.
+
+    Args:
+        source: the file that was compressed.
+        packed: the compressed file.
+        report: the result of `hyrfpack.compress_model`.
+        findings: the measurements.
+        plot: HTML of the plot of all files.
+        command: command line that makes the file again; empty if unknown.
+    """
+    heading = headline(report, findings)
+    content = [
+        *map(paragraph, _summarize(source, packed, report, findings)),
+        section("sizes", "Size of each part", *_section_sizes(report)),
+        section("files", "Size, loss and speed", *_alternatives(findings, plot)),
+        section("pictures", "Before and after", *_view_pictures(findings)),
+    ]
+    if command:
+        content.append(section("command", "Command that makes this file again", f"<pre>{escape(command)}</pre>"))
+    written = f"Written by {findings.writer}. Times were measured on this machine: {findings.machine}."
+    content.append(paragraph(written, "small"))
+    return encode_page(heading, content, title=f"{packed.name}: {heading}", pictures="'self'")
 
 
 def headline(report: CompressionReport, findings: Findings) -> str:
@@ -183,7 +161,8 @@ def _loss_in_words(findings: Findings) -> str:
     return f"{abs(value):.2f} dB {'lost' if value > 0 else 'gained'}"
 
 
-def _summary(source: Path, packed: Path, report: CompressionReport, findings: Findings) -> list[Element]:
+def _summarize(source: Path, packed: Path, report: CompressionReport, findings: Findings) -> list[str]:
+    """Return plain paragraphs about the file and its loss."""
     kept = f"{report.gaussians:,} Gaussians"
     if report.gaussians < findings.gaussians:
         kept += f" out of {findings.gaussians:,} (the others hardly affect renders and were pruned)"
@@ -210,10 +189,10 @@ def _summary(source: Path, packed: Path, report: CompressionReport, findings: Fi
         )
     if report.found:
         sentences.append(f"Result of the search: {report.found}.")
-    return [_element("p", sentence) for sentence in sentences]
+    return sentences
 
 
-def _section_sizes(report: CompressionReport) -> list[Element]:
+def _section_sizes(report: CompressionReport) -> list[str]:
     """Return a table of the bytes of each section, summed over layers, and a note on it."""
     sizes: dict[str, list[int]] = {}
     names = {part.type: part.holds for part in report.sections}
@@ -242,20 +221,24 @@ def _section_sizes(report: CompressionReport) -> list[Element]:
     if report.shares:
         header.append("share of the loss")
         note += " The share of the loss estimates how much of the change in renders each part causes."
-    return [_table(header, [row[: len(header)] for row in rows]), _element("p", note)]
+    formatted = [table_row(name, cells[: len(header) - 1]) for name, *cells in rows]
+    return [table([*map(escape, header)], formatted), paragraph(note)]
 
 
-def _alternatives(findings: Findings) -> list[Element]:
+def _alternatives(findings: Findings, plot: str) -> list[str]:
     """Return the plot of all files, and the same numbers as a table."""
     measure = "PSNR lost (dB)" if findings.has_photos else "PSNR (dB)"
     rows = [
-        [
+        table_row(
             point.name,
-            f"{point.bytes:,}",
-            "exact" if findings.is_exact(point.scores) else f"{findings.fidelity(point.scores):.3f}",
-            f"{point.scores.ssim:.4f}",
-            f"{point.decode_ms:.1f}",
-        ]
+            [
+                f"{point.bytes:,}",
+                "exact" if findings.is_exact(point.scores) else f"{findings.fidelity(point.scores):.3f}",
+                f"{point.scores.ssim:.4f}",
+                f"{point.decode_ms:.1f}",
+            ],
+            chosen=point is findings.chosen,
+        )
         for point in findings.points
     ]
     caption = (
@@ -264,23 +247,11 @@ def _alternatives(findings: Findings) -> list[Element]:
         "profile raw stores every number exactly. The plot below shows the time to decode each file. To get another "
         "file on the line, compress the model again with its size as the target size."
     )
-    return [
-        _element(
-            "figure",
-            _element(
-                "img", src=PLOT_FILE, alt="Bytes of each file against its loss, and against the time to decode it"
-            ),
-            _element("figcaption", caption),
-        ),
-        _table(
-            ["file", "bytes", measure, "SSIM", "decoding (ms)"],
-            rows,
-            chosen=findings.points.index(findings.chosen),
-        ),
-    ]
+    header = ["file", "bytes", measure, "SSIM", "decoding (ms)"]
+    return [f"<figure>{plot}<figcaption>{escape(caption)}</figcaption></figure>", table(header, rows)]
 
 
-def _view_pictures(findings: Findings) -> list[Element]:
+def _view_pictures(findings: Findings) -> list[str]:
     labels = ("before", "after", f"difference, amplified {findings.amplified} times")
     figures = []
     for view in findings.shown:
@@ -289,45 +260,16 @@ def _view_pictures(findings: Findings) -> list[Element]:
             caption = f"{view.name}: before and after are identical"
         if findings.has_photos:
             caption += f"; {view.before:.2f} dB before and {view.after:.2f} dB after against the photo"
-        pictures = [
-            _element("a", _element("img", src=file, alt=f"{view.name}, {label}"), _element("div", label), href=file)
+        pictures = "".join(
+            f'<a href="{escape(file)}"><img src="{escape(file)}" alt="{escape(f"{view.name}, {label}")}">'
+            f"<div>{label}</div></a>"
             for file, label in zip(view.files, labels, strict=True)
-        ]
-        figures.append(
-            _element("figure", _element("div", *pictures, **{"class": "views"}), _element("figcaption", caption))
         )
+        caption = f"<figcaption>{escape(caption)}</figcaption>"
+        figures.append(f'<figure><div class="triple">{pictures}</div>{caption}</figure>')
     intro = (
         "Renders of the model before compression and of the compressed file. The third picture is the absolute "
         f"difference in each colour channel, amplified {findings.amplified} times; black means no difference. The "
         "views are sorted from the largest loss to the smallest. Select a picture to see it in full size."
     )
-    return [_element("p", intro), *figures]
-
-
-def _table(header: Sequence[str], rows: Sequence[Sequence[str]], chosen: int | None = None) -> Element:
-    return _element(
-        "table",
-        _element("thead", _element("tr", *(_element("th", cell) for cell in header))),
-        _element(
-            "tbody",
-            *(
-                _element(
-                    "tr",
-                    *(_element("td", cell) for cell in row),
-                    **({"class": "chosen"} if number == chosen else {}),
-                )
-                for number, row in enumerate(rows)
-            ),
-        ),
-    )
-
-
-def _element(tag: str, *content: str | Element, **attributes: str) -> Element:
-    """Return an element that contains text or other elements."""
-    element = Element(tag, {name: printable(value) for name, value in attributes.items()})
-    for part in content:
-        if isinstance(part, Element):
-            element.append(part)
-        else:
-            element.text = part if tag == "style" else printable(part)
-    return element
+    return [paragraph(intro), *figures]

@@ -3,27 +3,24 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from hyrfpack.evaluate.figures import blank_figure, save_figure
+from hyrfpack.evaluate.figures import blank_figure
 from hyrfpack.report.compression_page import Findings, MeasuredFile, size_in_words
+from hyrfpack.report.page import LIGHT_TEXT_COLOR, style_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 CURVE_COLOR = "#1a73e8"
 PAPER_COLOR = "#d93025"
-RAW_COLOR = "#5f6368"
+RAW_COLOR = LIGHT_TEXT_COLOR  # becomes DARK_TEXT_COLOR on dark backgrounds, as text does
 
 
-def draw_plot(findings: Findings, path: str | os.PathLike[str], *, overwrite: bool = True) -> None:
-    """Plot loss and decoding time over bytes. A line joins the "compact" files, and a ring marks the written file.
-
-    Raises:
-        HyrfError: the file cannot be written, or not without `overwrite`.
-    """
+def draw_plot(findings: Findings) -> Figure:
+    """Plot loss and decoding time over bytes. A line joins the "compact" files, and a ring marks the written file."""
     figure = blank_figure(9, 6.5)
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
     exact = [point for point in findings.points if findings.is_exact(point.scores)]
@@ -41,7 +38,7 @@ def draw_plot(findings: Findings, path: str | os.PathLike[str], *, overwrite: bo
     ticks = _round_sizes(*below.get_xlim())
     below.set_xticks(ticks, [size_in_words(tick) for tick in ticks])
     below.set_xticks([], minor=True)
-    save_figure(path, figure, overwrite=overwrite, rename=False, format="png", metadata={"Software": None})
+    return figure
 
 
 def _scatter(
@@ -54,8 +51,7 @@ def _scatter(
         axes.scatter(point.bytes, height(point), s=25, color=color, zorder=3)
         if point is findings.chosen:
             axes.scatter(point.bytes, height(point), s=140, facecolors="none", edgecolors=color, linewidths=1.5)
-    axes.grid(alpha=0.3)
-    axes.spines[["top", "right"]].set_visible(False)
+    style_axes(axes)
     axes.margins(x=0.12, y=0.15)
 
 

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
-from hyrfpack.evaluate.figures import blank_figure, figure_to_svg, running_mean
+from hyrfpack.evaluate.figures import blank_figure, running_mean
+from hyrfpack.report.page import style_axes
 from hyrfpack.report.run import Run
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 # Okabe and Ito's colours for all kinds of colour vision, those that are visible on white and on black.
 LINE_COLORS = ("#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#56b4e9")
 # Dash patterns of SVG. Runs take the colours in turn with the first pattern, then with the next one.
 LINE_DASHES = ("", "6 3", "2 3")
-# The value of --dim in style.css for light backgrounds.
-LIGHT_TEXT_COLOR = "#5a6068"
 
 
 def line_style(number: int) -> tuple[str, str]:
@@ -20,13 +23,9 @@ def line_style(number: int) -> tuple[str, str]:
     return LINE_COLORS[number % len(LINE_COLORS)], LINE_DASHES[number // len(LINE_COLORS) % len(LINE_DASHES)]
 
 
-def draw_curves(runs: Sequence[Run]) -> str:
-    """Draw PSNR over steps and seconds, and Gaussians over steps, as SVG.
-
-    The background is transparent and text has the colour LIGHT_TEXT_COLOR. The figure contains no text from files.
-    """
+def draw_curves(runs: Sequence[Run]) -> Figure:
+    """Draw PSNR over steps and seconds, and Gaussians over steps. The figure contains no text from files."""
     figure = blank_figure(12, 3.7)
-    figure.patch.set_alpha(0)
     by_step, by_time, counts = figure.subplots(1, 3)
     for number, run in enumerate(runs):
         color, dashes = line_style(number)
@@ -41,15 +40,9 @@ def draw_curves(runs: Sequence[Run]) -> str:
     by_time.set(xlabel="seconds of training", ylabel="training PSNR (dB)")
     counts.set(xlabel="step", ylabel="Gaussians")
     counts.set_ylim(bottom=0)
-    for axis in (by_step, by_time, counts):
-        axis.patch.set_alpha(0)
-        axis.grid(alpha=0.25)
-        axis.spines[["top", "right"]].set_visible(False)
-        axis.spines[["left", "bottom"]].set_color(LIGHT_TEXT_COLOR)
-        axis.tick_params(colors=LIGHT_TEXT_COLOR)
-        axis.xaxis.label.set_color(LIGHT_TEXT_COLOR)
-        axis.yaxis.label.set_color(LIGHT_TEXT_COLOR)
-    return figure_to_svg(figure)
+    for axes in (by_step, by_time, counts):
+        style_axes(axes)
+    return figure
 
 
 def record_seconds(run: Run) -> list[float]:

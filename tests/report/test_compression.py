@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import json
 from collections.abc import Iterator
 from html.parser import HTMLParser
@@ -22,13 +23,17 @@ from hyrfpack.format import load_model, save_model
 from hyrfpack.report.compression import amplification, write_compression_report
 from hyrfpack.report.compression_page import size_in_words
 from hyrfpack.scene import Scene
+from tools.browser import chromium, firefox
 
 pytestmark = pytest.mark.usefixtures("quick_calibration")
 NAME_WITH_MARKUP = "<script>alert(1)</script>&amp;.png"
 
 
 class ParsedReport(HTMLParser):
-    """The tags, links, texts and tables of a report page, as a browser would parse them."""
+    """The tags, links, texts and tables of a report page, as a browser would parse them.
+
+    Addresses that contain their data are not among the links.
+    """
 
     def __init__(self, path: Path) -> None:
         super().__init__()
@@ -42,8 +47,9 @@ class ParsedReport(HTMLParser):
 
     def handle_starttag(self, tag, attrs):
         self.tags.append(tag)
-        self.links += [value for name, value in attrs if name in ("src", "href")]
-        if tag not in ("meta", "img"):
+        addresses = [value for name, value in attrs if name in ("src", "href", "srcset")]
+        self.links += [address for address in addresses if not address.startswith("data:")]
+        if tag not in ("meta", "link", "img", "source"):
             self.open.append(tag)
         if tag == "table":
             self.tables.append([])
@@ -137,9 +143,20 @@ def test_the_page_is_valid_and_refers_only_to_its_own_pictures(report_with_photo
     packed, _, page = report_with_photos
     folder = packed.parent / "page"
     assert page.open == []  # every element is closed in the right order
-    assert not {"script", "link", "iframe", "object"} & set(page.tags)
+    assert not {"script", "iframe", "object"} & set(page.tags)
     assert "url(" not in "".join(page.texts["style"]) and "@import" not in "".join(page.texts["style"])
     assert {"index.html", *page.links} == {path.name for path in folder.iterdir()}
+
+
+@pytest.mark.acceptance
+@pytest.mark.parametrize("program", [chromium.Chromium, firefox.Firefox])
+def test_browsers_show_all_pictures_under_the_content_security_policy(program, report_with_photos, tmp_path):
+    if importlib.import_module(program.__module__).find() is None:
+        pytest.skip(f"{program.__name__} is not on this machine")
+    with program(tmp_path) as browser:
+        browser.open((report_with_photos[0].parent / "page" / "index.html").as_uri())
+        assert browser.evaluate("[...document.images].map((image) => image.naturalWidth > 0)") == [True] * 7
+        assert browser.list_errors() == []
 
 
 def test_names_of_files_are_escaped(report_with_photos):
