@@ -157,7 +157,10 @@ if not TYPE_CHECKING:  # Type checkers read the imports above, so that they repo
 
     def __getattr__(name: str) -> Any:
         if name in _PUBLIC:
-            value = getattr(import_module(_PUBLIC[name]), name)
+            from hyrfpack.errors import needs_package
+
+            with needs_package(f"hyrfpack.{name}"):
+                value = getattr(import_module(_PUBLIC[name]), name)
             globals()[name] = value
             return value
         hint = f"; the function is now hyrfpack.{_RENAMED[name]}" if name in _RENAMED else ""

@@ -13,6 +13,11 @@ from typing import TypeVar
 
 ErrorT = TypeVar("ErrorT", bound="HyrfError")
 
+# pip's names of packages that differ from the names of their modules.
+_PACKAGE_BY_MODULE = {"PIL": "pillow", "pillow_heif": "pillow-heif", "pxr": "usd-core"}
+# The extra of pyproject.toml that stands for the use of a package, if that is its only use.
+_EXTRA_BY_PACKAGE = {"av": "video", "pillow-heif": "heic", "pycolmap": "poses", "usd-core": "usd"}
+
 
 def printable(text: str) -> str:
     """Return text from a file as one line that any terminal can show; unprintable characters become escapes ("\\n")."""
@@ -88,18 +93,29 @@ def short_reason(error: Exception, max_length: int = 120) -> str:
     return str(error).splitlines()[0][:max_length] if str(error) else type(error).__name__
 
 
+def missing_package(error: ModuleNotFoundError) -> str | None:
+    """Return pip's name of the package that an import did not find; None for a module of hyrfpack itself."""
+    module = (error.name or "").partition(".")[0]
+    return None if module in ("", "hyrfpack") else _PACKAGE_BY_MODULE.get(module, module)
+
+
 @contextmanager
-def needs_package(package: str, task: str) -> Iterator[None]:
-    """Turn a failed import inside the block into a HyrfError that says which package to install.
+def needs_package(task: str) -> Iterator[None]:
+    """Turn a failed import of another package inside the block into a HyrfError that says how to install it.
 
     Args:
-        package: name of the package for pip.
         task: what needs the package, as the start of the message: "model.hyrf: drawing figures".
 
     Raises:
-        HyrfError: a module that is imported in the block is not installed.
+        HyrfError: a module that is imported in the block is not installed. Its fix names the extra of hyrfpack that
+            installs the package if there is one.
     """
     try:
         yield
     except ModuleNotFoundError as error:
-        raise HyrfError(f"{task} needs {package}", fix=f"run 'pip install {package}'") from error
+        package = missing_package(error)
+        if package is None:
+            raise
+        extra = _EXTRA_BY_PACKAGE.get(package)
+        command = f'pip install "hyrfpack[{extra}]"' if extra else f"pip install {package}"
+        raise HyrfError(f"{task} needs {package}", fix=f"run '{command}'") from error

@@ -49,6 +49,7 @@ LAYER_BY_PATH = {
     "test_examples.py": "acceptance",
     "test_no_home.py": "acceptance",
     "test_outputs.py": "unit",
+    "test_package.py": "acceptance",
     "test_progress.py": "unit",
     "test_public.py": "acceptance",
     "test_pycolmap.py": "acceptance",

@@ -7,12 +7,16 @@ import pickle
 import sys
 from collections.abc import Iterator
 from copy import copy
+from importlib import import_module
 from pathlib import Path
 
+import click
 import pytest
+from commands import refused
 from scenes import small_model
 
 import hyrfpack
+from hyrfpack.cli import main
 from hyrfpack.data import load_scene
 from hyrfpack.errors import HyrfDataError, HyrfError, HyrfSizeError, needs_package, strip_path
 from hyrfpack.evaluate.figures import draw_training_curve
@@ -86,10 +90,36 @@ def hide_package(monkeypatch):
     return hide
 
 
-def test_a_missing_package_is_named_with_its_task_and_how_to_install_it():
-    with pytest.raises(HyrfError, match="^flying needs nowhere-at-all; run 'pip install nowhere-at-all'$"):
-        with needs_package("nowhere-at-all", "flying"):
-            import nowhere_at_all  # noqa: F401
+@pytest.mark.parametrize(
+    ("module", "sentence"),
+    [
+        ("nowhere.at.all", "flying needs nowhere; run 'pip install nowhere'"),
+        ("PIL", "flying needs pillow; run 'pip install pillow'"),
+        ("av", "flying needs av; run 'pip install \"hyrfpack[video]\"'"),
+        ("pillow_heif", "flying needs pillow-heif; run 'pip install \"hyrfpack[heic]\"'"),
+        ("pxr", "flying needs usd-core; run 'pip install \"hyrfpack[usd]\"'"),
+        ("pycolmap", "flying needs pycolmap; run 'pip install \"hyrfpack[poses]\"'"),
+    ],
+)
+def test_a_missing_package_is_named_with_its_task_and_how_to_install_it(module, sentence, hide_package):
+    hide_package(module)
+    with pytest.raises(HyrfError) as caught, needs_package("flying"):
+        import_module(module)
+    assert str(caught.value) == sentence
+
+
+def test_a_missing_module_of_hyrfpack_is_no_error_of_the_user():
+    with pytest.raises(ModuleNotFoundError), needs_package("flying"):
+        import_module("hyrfpack.nowhere")
+
+
+def test_a_command_without_its_package_ends_with_one_line(monkeypatch):
+    @click.command
+    def fly():
+        import nowhere_at_all  # noqa: F401
+
+    monkeypatch.setitem(main.commands, "fly", fly)
+    assert refused("fly") == "Error: this command needs nowhere_at_all; run 'pip install nowhere_at_all'"
 
 
 def test_profile_paper_without_dahuffman_writes_nothing(hide_package, tmp_path):

@@ -94,7 +94,7 @@ def benchmark_model(
         raise ValueError("a scene was given without the model of it; the built-in model has its own photos")
     if scene is not None:
         check_type("scene", scene, Scene)
-    with needs_package("numba", "measuring the compiled kernels"):
+    with needs_package("measuring the compiled kernels"):
         import numba  # noqa: F401 - imported here, so that it fails before the work starts
     subject = built_in_subject() if model is None else read_subject(model, scene)
     notes: list[str] = []

@@ -41,7 +41,7 @@ from hyrfpack.cli.render import render
 from hyrfpack.cli.train import train
 from hyrfpack.cli.view import view
 from hyrfpack.cli.wording import use_option_names
-from hyrfpack.errors import HyrfError, printable
+from hyrfpack.errors import HyrfError, needs_package, printable
 from hyrfpack.version import __version__
 
 
@@ -68,7 +68,8 @@ class _CommandGroup(click.Group):
 
     def _invoke(self, ctx: click.Context) -> Any:
         try:
-            result = super().invoke(ctx)
+            with needs_package("this command"):
+                result = super().invoke(ctx)
         except HyrfError as error:
             if is_verbose():
                 traceback.print_exc()

@@ -195,7 +195,7 @@ def _read_model(model: Path) -> tuple[dict[int, Lens], list[_Image], int, np.nda
     kind = _model_kind(model)
     if kind == ".bin":
         check_binary_model(model)
-    with needs_package("pycolmap", f"{model}: reading COLMAP models"):
+    with needs_package(f"{model}: reading COLMAP models"):
         import pycolmap
     names = read_image_names(model / "images.txt") if kind == ".txt" else {}
     try:

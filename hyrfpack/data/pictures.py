@@ -124,7 +124,7 @@ def open_picture(path: Path) -> ImageFile:
         HyrfDataError: the file is missing, empty, raw, or no picture, or it is HEIC and pillow-heif is not installed.
     """
     shown = display_path(path)
-    with needs_package("pillow", f"{shown}: reading pictures"):
+    with needs_package(f"{shown}: reading pictures"):
         from PIL import Image, UnidentifiedImageError
 
     try:

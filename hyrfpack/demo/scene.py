@@ -72,7 +72,7 @@ def write_demo_scene(
         ValueError: fewer than two views or a size below 8.
         HyrfError: the folder or a file cannot be written.
     """
-    with needs_package("pillow", "making photos"):
+    with needs_package("making photos"):
         from PIL import Image
 
     if views < 2 or size < 8:

@@ -152,7 +152,7 @@ def _quiet_matplotlib() -> Iterator[None]:
     level = logger.level
     logger.setLevel(logging.ERROR)
     try:
-        with needs_package("matplotlib", "drawing figures"):
+        with needs_package("drawing figures"):
             yield
     finally:
         logger.setLevel(level)

@@ -45,7 +45,7 @@ def write_colmap(
     Raises:
         HyrfError: pycolmap is missing, a file cannot be written, or a table exists and `overwrite` is False.
     """
-    with needs_package("pycolmap", f"{folder}: writing a COLMAP model"):
+    with needs_package(f"{folder}: writing a COLMAP model"):
         import pycolmap
 
     model = pycolmap.Reconstruction()

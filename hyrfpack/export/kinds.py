@@ -25,9 +25,9 @@ HTML_PAGE = FileKind(ending=".html", stores_antialiased=True)
 TRANSFORMS_JSON = FileKind(ending=".json", max_degree=0)
 POINT_FILES = (
     FileKind(ending=".points.ply", max_degree=0),
-    FileKind(ending=".points.glb", max_degree=0, package=("trimesh", "trimesh")),
+    FileKind(ending=".points.glb", max_degree=0, module="trimesh"),
 )
-COLMAP_FOLDER = FileKind(ending="", max_degree=0, package=("pycolmap", "pycolmap"))
+COLMAP_FOLDER = FileKind(ending="", max_degree=0, module="pycolmap")
 PLAYER_FOLDER = FileKind(ending="")
 _KINDS_BY_ENDING = {kind.ending: kind for kind in (*POINT_FILES, *FORMATS.values(), HTML_PAGE, TRANSFORMS_JSON)}
 ENDINGS = tuple(_KINDS_BY_ENDING)
@@ -113,10 +113,9 @@ def check_request(
             f"{target}: the output holds the whole model, which these settings cannot change",
             fix=f"leave out {names}, or write baked splats into a page with `baked=True`",
         )
-    if kind.package:
-        module, package = kind.package
-        with needs_package(package, f"{target}: writing this format"):
-            import_module(module)
+    if kind.module:
+        with needs_package(f"{target}: writing this format"):
+            import_module(kind.module)
 
 
 def check_place(target: str | os.PathLike[str], outputs: Outputs, colmap: bool = False) -> None:

@@ -47,7 +47,7 @@ def encode_points(splats: Splats, cameras: Sequence[Camera], extension: Literal[
 
 
 def _encode_glb(splats: Splats, frusta: np.ndarray, origin: np.ndarray, up: np.ndarray) -> bytes:
-    with needs_package("trimesh", "writing points as .glb"):
+    with needs_package("writing points as .glb"):
         import trimesh
         from trimesh.path.entities import Line
 

@@ -82,7 +82,7 @@ def encode(model: HybridModel, **settings: Any) -> tuple[list[Section], dict]:
             precision; a setting is out of range; or dahuffman is not installed.
     """
     chosen = PaperSettings(**settings)
-    with needs_package("dahuffman", "profile 'paper'"):
+    with needs_package("profile 'paper'"):
         import dahuffman  # noqa: F401 - builds the Huffman codes; imported here to fail early if it is missing
     arrays = to_arrays(model)
     # Halves are encoded first. They reject values that would overflow the geometry field, whose outputs are needed to

@@ -93,7 +93,7 @@ def open_video(path: Path) -> Iterator[Video]:
         HyrfDataError: the file is missing, unreadable, cut off before its table of contents, or has no video stream.
         HyrfError: PyAV is not installed.
     """
-    with needs_package("av", f"{path}: reading videos"):
+    with needs_package(f"{path}: reading videos"):
         import av
     if not path.is_file():
         what = "this is a folder, not a video" if path.is_dir() else "there is no such file"

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import hyrfpack  # must come first, because it imports zlib before pycolmap  # noqa: F401
-from hyrfpack.errors import HyrfError
+from hyrfpack.errors import HyrfError, needs_package
 from hyrfpack.poses.job import Job
 
 _output_lock = threading.Lock()  # a second thread reports progress during long calls, see `watch`
@@ -60,7 +60,8 @@ def main(job: str, stage: str, *models: str) -> None:
     """Run one stage of a saved job and send its answer."""
     _exit_with_parent()
     try:
-        answer = run(Job.load(Path(job)), stage, list(models))
+        with needs_package("estimating poses"):
+            answer = run(Job.load(Path(job)), stage, list(models))
     except HyrfError as error:
         answer = {"refused": [error.problem, error.fix]}
     send_message({"answer": answer})

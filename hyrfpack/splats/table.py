@@ -20,7 +20,7 @@ class FileKind:
     Attributes:
         ending: ending of the file names, in lower case.
         max_degree: highest degree of spherical harmonics that the file can hold.
-        package: the module and the pip name of a package that only this kind needs, or None.
+        module: a module of another package that only this kind needs, or None.
         max_coordinate: largest absolute coordinate of a position, world units. Infinite means the range of float32 or
             more.
         max_scale: largest scale, world units.
@@ -29,7 +29,7 @@ class FileKind:
 
     ending: str
     max_degree: int = MAX_DEGREE
-    package: tuple[str, str] | None = None
+    module: str | None = None
     max_coordinate: float = math.inf
     max_scale: float = math.inf
     stores_antialiased: bool = False
@@ -53,7 +53,7 @@ class SplatFormat(FileKind):
 
 def _usd_format(extension: usd.Extension) -> SplatFormat:
     encode, decode = partial(usd.encode, extension=extension), partial(usd.decode, extension=extension)
-    return SplatFormat(ending=f".{extension}", encode=encode, decode=decode, package=usd.REQUIRED_PACKAGE)
+    return SplatFormat(ending=f".{extension}", encode=encode, decode=decode, module=usd.REQUIRED_MODULE)
 
 
 _FORMAT_ROWS = (

@@ -36,8 +36,8 @@ def write_splats(folder: Path, ending: str, splats: Splats) -> Path:
 @pytest.mark.parametrize("after", FORMATS)
 @pytest.mark.parametrize("before", READABLE_ENDINGS)
 def test_every_pair_of_formats_keeps_positions_and_appearance(before, after, tmp_path):
-    if FORMATS[after].package:
-        pytest.importorskip(FORMATS[after].package[0])
+    if FORMATS[after].module:
+        pytest.importorskip(FORMATS[after].module)
     source, target = write_splats(tmp_path, before, ball_splats(GAUSSIAN_COUNT)), tmp_path / f"after{after}"
     report = hyrfpack.convert_splats(source, target)
     original, converted = (

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 import hyrfpack
+from hyrfpack.poses import worker
 
 
 def save_pictures(folder: Path, pictures: list[np.ndarray]) -> Path:
@@ -112,3 +115,15 @@ def test_a_scene_folder_that_cannot_be_created_is_a_clear_error(photos_and_poses
     shutil.copytree(photos_and_poses[0], tmp_path / "scene" / "images")
     (tmp_path / "scene" / "images" / "other.png").touch()
     assert "do not belong to these photos" in refused("poses", photos_and_poses[0], "-o", tmp_path / "scene")
+
+
+def test_without_pycolmap_a_stage_says_what_to_install(monkeypatch, capsys):
+    monkeypatch.setattr(worker, "_exit_with_parent", lambda: None)
+    monkeypatch.setattr(worker.Job, "load", lambda path: None)
+    monkeypatch.delitem(sys.modules, "hyrfpack.poses.features", raising=False)
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+
+    worker.main("job", "features")
+
+    problem, fix = json.loads(capsys.readouterr().out)["answer"]["refused"]
+    assert (problem, fix) == ("estimating poses needs pycolmap", "run 'pip install \"hyrfpack[poses]\"'")

@@ -242,7 +242,7 @@ def test_without_pyav_the_error_names_it(tmp_path, monkeypatch):
 
     (tmp_path / "clip.mp4").write_bytes(b"x")
     monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(HyrfError, match="pip install av"):
+    with pytest.raises(HyrfError, match=r"pip install \"hyrfpack\[video\]\""):
         choose_frames(tmp_path / "clip.mp4", tmp_path / "frames")
 
 

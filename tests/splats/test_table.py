@@ -28,8 +28,8 @@ MAX_ERRORS_BY_SUFFIX = dict.fromkeys((".ply", ".glb", ".usda", ".usdc", ".usdz")
 
 
 def encode_with(row: SplatFormat, splats) -> bytes:
-    if row.package:
-        pytest.importorskip(row.package[0])
+    if row.module:
+        pytest.importorskip(row.module)
     return row.encode(splats, NO_HINTS)
 
 

@@ -241,7 +241,7 @@ def test_missing_packages_are_distinguished_from_internal_modules() -> None:
     assert (
         find_missing_package(ModuleNotFoundError("no name")) is find_missing_package(ImportError(name="scipy")) is None
     )
-    with pytest.raises(HyrfError) as caught, needs_package("trimesh", "hyrfpack/a.ply: reading points"):
+    with pytest.raises(HyrfError) as caught, needs_package("hyrfpack/a.ply: reading points"):
         raise lacks
     assert failure_row(caught.value) == {"status": "left out", "note": "it needs trimesh, which is not installed here"}
 

@@ -17,10 +17,10 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 
+from hyrfpack.errors import missing_package
 from tools.gpu.rows import Row
 
 OWN_PACKAGES = ("hyrfpack", "tools", "tests")
-PIP_NAME_BY_MODULE = {"PIL": "pillow"}  # modules whose package has another name
 # Prefixes of the lines by which a child reports to its parent.
 ROW_PREFIX, BEGUN_PREFIX, DONE_PREFIX = "@row ", "@begun ", "@done "
 
@@ -65,8 +65,8 @@ def find_missing_package(error: BaseException | None) -> str | None:
     """
     while error is not None and not isinstance(error, ModuleNotFoundError):
         error = error.__cause__
-    module = (error.name or "").partition(".")[0] if error else ""
-    return None if module in ("", *OWN_PACKAGES) else PIP_NAME_BY_MODULE.get(module, module)
+    package = missing_package(error) if error else None
+    return None if package in OWN_PACKAGES else package
 
 
 def run_in_children(command: Callable[[list[str]], list[str]], items: Sequence[str], seconds: float) -> Iterator[Row]:

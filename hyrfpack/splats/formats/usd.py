@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 Extension = Literal["usda", "usdc", "usdz"]
 EXTENSIONS: tuple[Extension, ...] = get_args(Extension)
-REQUIRED_PACKAGE = "pxr", "usd-core"
+REQUIRED_MODULE = "pxr"
 _SPLATS_TYPE_NAME = "ParticleField3DGaussianSplat"
 # In tenths of a scene unit, like USD's focal lengths. Only its ratio to the focal length matters.
 _HORIZONTAL_APERTURE = 36.0
@@ -71,7 +71,7 @@ def encode(
         HyrfError: usd-core is missing.
         HyrfDataError: the splats do not fit into float32, or into 4 GiB of a package.
     """
-    with needs_package("usd-core", f"writing .{extension} files"):
+    with needs_package(f"writing .{extension} files"):
         from pxr import Kind, Usd, UsdGeom
 
     stage = Usd.Stage.CreateInMemory()
@@ -113,7 +113,7 @@ def decode(data: bytes, name: str, extension: Extension, *, upright: bool = Fals
         HyrfError: usd-core is missing.
         HyrfDataError: the bytes are not such a file.
     """
-    with needs_package("usd-core", f"{name}: reading it"):
+    with needs_package(f"{name}: reading it"):
         from pxr import Sdf, Tf, Usd
 
     with tempfile.TemporaryDirectory() as folder:

@@ -158,5 +158,5 @@ def test_inconsistent_fields_are_refused_with_the_reason(pxr, old, new, sentence
 
 def test_the_error_without_usd_core_says_what_to_install(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "pxr", None)
-    with pytest.raises(HyrfError, match="pip install usd-core"):
+    with pytest.raises(HyrfError, match=r"pip install \"hyrfpack\[usd\]\""):
         usd.encode(random_splats(), Hints(Y_DOWN), extension="usda")
