@@ -39,8 +39,8 @@ if _TOO_LATE:
     )
 
 if TYPE_CHECKING:
-    from hyrfpack.bench import BenchReport as BenchReport
-    from hyrfpack.bench import benchmark_model as benchmark_model
+    from hyrfpack.bench.suite import BenchReport as BenchReport
+    from hyrfpack.bench.suite import benchmark_model as benchmark_model
     from hyrfpack.compress import CompressionReport as CompressionReport
     from hyrfpack.compress import compress_model as compress_model
     from hyrfpack.data import load_scene as load_scene
@@ -87,8 +87,8 @@ if TYPE_CHECKING:
 
 # The module that defines or re-exports each public name.
 _PUBLIC = {
-    "BenchReport": "hyrfpack.bench",
-    "benchmark_model": "hyrfpack.bench",
+    "BenchReport": "hyrfpack.bench.suite",
+    "benchmark_model": "hyrfpack.bench.suite",
     "ComparisonReport": "hyrfpack.report",
     "compare_runs": "hyrfpack.report",
     "CompressionReport": "hyrfpack.compress",

@@ -8,12 +8,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from hyrfpack.bench.rows import Row
-from hyrfpack.bench.subject import Subject
-from hyrfpack.measure.error import Error, largest_error, measure_error, measure_relative_error
-from hyrfpack.measure.timing import time_alternately
-from hyrfpack.model import HybridModel
-from hyrfpack.model.operation_calls import (
+from hyrfpack.bench.operation_calls import (
     OperationCall,
     decoder_inputs,
     hash_encode_call,
@@ -22,6 +17,11 @@ from hyrfpack.model.operation_calls import (
     rasterize_call,
     splat_inputs,
 )
+from hyrfpack.bench.rows import Row
+from hyrfpack.bench.subject import Subject
+from hyrfpack.measure.error import Error, largest_error, measure_error, measure_relative_error
+from hyrfpack.measure.timing import time_alternately
+from hyrfpack.model import HybridModel
 from hyrfpack.ops.poses import camera_center
 from hyrfpack.scene import Camera
 

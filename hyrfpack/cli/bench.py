@@ -24,7 +24,7 @@ from hyrfpack.cli.types import OUTPUT, PATH
 from hyrfpack.errors import HyrfError
 from hyrfpack.outputs import Outputs
 
-# The same as `hyrfpack.bench.GROUPS`, which cannot be imported without torch.
+# The same as `hyrfpack.bench.suite.GROUPS`, which cannot be imported without torch.
 GROUPS = ("rasterize", "hash_encode", "mlp", "render", "codec")
 
 
@@ -85,9 +85,9 @@ def bench(
     # The references run on torch's own threads, which would keep spinning on the cores of the kernels timed next.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     from hyrfpack.atomic import write_atomic
-    from hyrfpack.bench import benchmark_model as measure
     from hyrfpack.bench import tables
     from hyrfpack.bench.figure import plot, plot_format
+    from hyrfpack.bench.suite import benchmark_model as measure
     from hyrfpack.format import describe_file
     from hyrfpack.measure.machine import format_machine
 

@@ -11,18 +11,19 @@ import torch
 from scenes import ball_points, ball_scene, ring, small_model
 
 import hyrfpack
-from hyrfpack.bench import GROUPS, benchmark_model, rendering, subject
+from hyrfpack.bench import operation_calls, rendering, subject
 from hyrfpack.bench.codec import PROFILE_SETTING_VALUES, codec_rows, parameter_errors
 from hyrfpack.bench.operations import hash_encode_rows, mlp_rows, rasterize_rows
 from hyrfpack.bench.rendering import EXACT_SETTINGS, RENDER_SETTING_VALUES, render_rows
 from hyrfpack.bench.subject import Subject
+from hyrfpack.bench.suite import GROUPS, benchmark_model
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import encode_model, save_model
 from hyrfpack.format.arrays import to_arrays
 from hyrfpack.format.codec import PROFILES
 from hyrfpack.format.paper import PaperSettings
 from hyrfpack.measure import timing
-from hyrfpack.model import HybridModel, operation_calls
+from hyrfpack.model import HybridModel
 from hyrfpack.ops.hash_encode import hash_encode
 from hyrfpack.ops.mlp import mlp
 from hyrfpack.ops.rasterize import rasterize

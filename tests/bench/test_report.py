@@ -10,8 +10,9 @@ from commands import hyrfpack, refused
 from PIL import Image
 from scenes import ball_points, small_model
 
-from hyrfpack.bench import GROUPS, BenchReport, Error, Row
 from hyrfpack.bench.figure import build_panels, plot
+from hyrfpack.bench.rows import Error, Row
+from hyrfpack.bench.suite import GROUPS, BenchReport
 from hyrfpack.bench.tables import build_tables, fill_page, format_markdown
 from hyrfpack.cli.bench import GROUPS as CHOICES
 from hyrfpack.errors import HyrfError

@@ -178,7 +178,7 @@ def test_json_of_render_names_the_pictures_that_were_actually_written(working_fo
 
 def test_bench_keeps_files_that_appear_meanwhile_and_updates_the_current_page(working_folder, monkeypatch):
     words = import_module("hyrfpack.bench.tables")
-    measure = import_module("hyrfpack.bench").benchmark_model
+    measure = import_module("hyrfpack.bench.suite").benchmark_model
     Path("page.md").write_text(words.empty_page({"machine": "", "codec": ""}))
 
     def edited_meanwhile(*arguments, **options):
@@ -186,7 +186,7 @@ def test_bench_keeps_files_that_appear_meanwhile_and_updates_the_current_page(wo
         Path("out.png").write_bytes(FOREIGN_BYTES)
         return measure(*arguments, **options)
 
-    monkeypatch.setattr(import_module("hyrfpack.bench"), "benchmark_model", edited_meanwhile)
+    monkeypatch.setattr(import_module("hyrfpack.bench.suite"), "benchmark_model", edited_meanwhile)
     monkeypatch.setattr("hyrfpack.bench.codec.PROFILE_SETTING_VALUES", {})
     options = "--only codec --repeats 1 -o out.png --markdown page.md"
     result = succeeded("bench", "packed.hyrf", *options.split())

@@ -359,7 +359,7 @@ def _replace_work(patch: pytest.MonkeyPatch) -> None:
     def begin(*arguments: object, **options: object) -> None:
         raise HyrfError(WORK_BEGAN_PROBLEM, fix=WORK_BEGAN_FIX)
 
-    patch.setattr(import_module("hyrfpack.bench"), "benchmark_model", begin)
+    patch.setattr(import_module("hyrfpack.bench.suite"), "benchmark_model", begin)
     patch.setattr(import_module("hyrfpack.demo.run"), "run_demo", begin)
 
 

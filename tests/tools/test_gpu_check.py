@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from hyrfpack.bench.operation_calls import OperationCall
 from hyrfpack.errors import HyrfError, needs_package
-from hyrfpack.model.operation_calls import OperationCall
 from hyrfpack.ops.dispatch import has_triton
 from hyrfpack.ops.rasterize import rasterize
 from hyrfpack.ops.rasterize.reference import project

@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from hyrfpack.bench.operation_calls import OperationCall, hash_encode_call, mlp_call
 from hyrfpack.measure.error import measure_relative_error
 from hyrfpack.measure.timing import time_alternately
-from hyrfpack.model.operation_calls import OperationCall, hash_encode_call, mlp_call
 from hyrfpack.ops.hash_encode import level_offsets, level_resolutions
 
 TIMING_REPEATS = 5

@@ -15,8 +15,8 @@ from time import perf_counter, process_time
 import torch
 from torch import Tensor
 
+from hyrfpack.bench.operation_calls import random_cotangent, rasterize_call
 from hyrfpack.measure.error import largest_error, measure_error, measure_relative_error
-from hyrfpack.model.operation_calls import random_cotangent, rasterize_call
 from hyrfpack.ops.rasterize import INPUT_SHAPES, rasterize
 from hyrfpack.parallel.pool import thread_count
 

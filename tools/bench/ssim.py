@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from hyrfpack.bench.operation_calls import loss_call
 from hyrfpack.measure.error import measure_error, measure_relative_error
 from hyrfpack.measure.timing import time_alternately
-from hyrfpack.model.operation_calls import loss_call
 
 TIMING_REPEATS = 7
 PICTURE_SIZES = ((200, 200), (240, 320), (800, 800))  # (height, width) in pixels

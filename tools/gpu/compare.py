@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from hyrfpack.bench.operation_calls import OperationCall
 from hyrfpack.errors import HyrfError
 from hyrfpack.measure.error import measure_relative_error
-from hyrfpack.model.operation_calls import OperationCall
 
 
 def check_call(call: OperationCall, implementation: str) -> dict[str, object]:

@@ -9,8 +9,8 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from hyrfpack.bench.operation_calls import OperationCall
 from hyrfpack.model import HybridModel
-from hyrfpack.model.operation_calls import OperationCall
 from hyrfpack.ops.rasterize import rasterize
 from hyrfpack.render import render_view
 from hyrfpack.scene import Camera

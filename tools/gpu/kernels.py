@@ -10,8 +10,7 @@ from functools import cache, partial
 import torch
 from torch import Tensor
 
-from hyrfpack.model import HybridModel
-from hyrfpack.model.operation_calls import (
+from hyrfpack.bench.operation_calls import (
     OperationCall,
     decoder_inputs,
     hash_encode_call,
@@ -21,6 +20,7 @@ from hyrfpack.model.operation_calls import (
     named_fields,
     rasterize_call,
 )
+from hyrfpack.model import HybridModel
 from hyrfpack.ops.adam import adam_step
 from hyrfpack.ops.rasterize import Rasterization, rasterize
 from hyrfpack.ops.rasterize.shaded import rasterize_shaded

@@ -15,10 +15,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hyrfpack.bench.operation_calls import splat_inputs
 from hyrfpack.cameras.paths import look_at
 from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians, logit
-from hyrfpack.model.operation_calls import splat_inputs
 from hyrfpack.ops.poses import camera_center
 from hyrfpack.ops.rasterize.reference import ALPHA_MAX, ALPHA_MIN, TILE_SIZE, TRANSMITTANCE_MIN, project
 from hyrfpack.render import render_view

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 import torch
 from torch import Tensor
 
-from hyrfpack.model.operation_calls import OperationCall, hash_encode_call, loss_call, mlp_call, rasterize_call
+from hyrfpack.bench.operation_calls import OperationCall, hash_encode_call, loss_call, mlp_call, rasterize_call
 from hyrfpack.ops.hash_encode import level_offsets, level_resolutions
 from tools.gpu.compare import check_call
 from tools.gpu.rows import Row
