@@ -58,7 +58,7 @@ docs: $(VENV_STAMP) ## build the documentation site in site/; a broken link is a
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 player: $(VENV_STAMP) $(NODE_STAMP) ## minify the web player's scripts again after a change
-	$(BIN)/python -m tools.browser.shorten
+	$(BIN)/python -m tools.browser.build_player
 
 golden: $(VENV_STAMP) ## train the golden models of the tests again, after a change that improves training (a minute)
 	$(BIN)/python -m tools.safety.train_golden

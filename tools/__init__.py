@@ -2,5 +2,5 @@
 
 gpu/ checks and measures the GPU kernels, and bench/ times operations against their references. studies/ holds the
 experiments behind the documentation's tables. safety/ damages files and interrupts processes on purpose, and tests
-other versions of the dependencies. browser/ drives browsers and minifies the web player.
+other versions of the dependencies. browser/ drives browsers and builds the web player.
 """

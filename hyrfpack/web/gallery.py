@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from urllib.parse import quote, urlencode
 
 from hyrfpack.version import __version__
-from hyrfpack.web.bundle import read_web_file
+from hyrfpack.web.assets import read_web_file
 from hyrfpack.web.player import content_security_policy, fill_template, meta_tags
 
 

@@ -10,15 +10,15 @@ import re
 import zlib
 from collections.abc import Mapping, Sequence
 from functools import cache
-from importlib.resources import files
 
 from hyrfpack.splats.names import SPLATS_SUFFIXES
 from hyrfpack.version import __version__
-from hyrfpack.web.bundle import bundle, read_web_file, script_digest, strip_comments
+from hyrfpack.web.assets import list_web_files, read_web_file
+from hyrfpack.web.scripts import read_script, read_style
 
-SCRIPT_NAMES = ("boot.js", "element.js", "main.js", "worker.js", "worker_model.js")
 MODEL_SUFFIX = ".hyrf"
 SHADER_SUFFIXES = (".vert", ".frag", ".glsl")
+_SHADER_COMMENT = re.compile(r"\s*//.*")
 # The browser decodes one base64 block while it loads the next one. A multiple of 3 needs no padding.
 PAYLOAD_BLOCK_BYTES = 3 << 20
 GZIP_WINDOW_BITS = 31  # zlib's value for the largest window with a gzip header, which holds no time and no name
@@ -84,7 +84,7 @@ def assemble_player_page(
         fetches: sources that the page may fetch from, in the syntax of a content security policy.
         readers: include the readers of splats, which make the page a third larger.
     """
-    style, script = read_web_file("viewer/style.css"), read_script("boot.js")
+    style, script = read_style(), read_script("boot.js")
     main, packed = _pack_scripts("worker.js" if readers else "worker_model.js")
     view = memoryview(payload)
     blocks = (
@@ -135,7 +135,7 @@ def meta_tags(title: str, description: str, image: str | None = None) -> str:
 
 def encode_element_script() -> bytes:
     """Return the script that defines <hyrf-viewer> for pages of other authors and adds no global names to them."""
-    return f"(() => {{\n{read_script('element.js')}\n}})();\n".encode()
+    return read_script("element.js").encode()
 
 
 def encode_readme(title: str, entry: str, index: str, *, element: str | None = None) -> bytes:
@@ -166,18 +166,18 @@ def _pack_scripts(worker: str) -> tuple[str, str]:
     Args:
         worker: name of the script of the worker.
     """
-    names = sorted(entry.name for entry in files("hyrfpack.web").joinpath("viewer").iterdir())
-    texts = {name: strip_comments(read_web_file(f"viewer/{name}")) for name in names if name.endswith(SHADER_SUFFIXES)}
+    paths = list_web_files("viewer", *SHADER_SUFFIXES)
+    texts = {path.removeprefix("viewer/"): strip_shader_comments(read_web_file(path)) for path in paths}
     texts |= {"worker.js": read_script(worker), "main.js": read_script("main.js")}
     packer = zlib.compressobj(9, zlib.DEFLATED, GZIP_WINDOW_BITS, 9)
     packed = packer.compress(json.dumps(texts).encode()) + packer.flush()
     return texts["main.js"], base64.b64encode(packed).decode()
 
 
-def read_script(name: str) -> str:
-    """Return one of SCRIPT_NAMES, in its shortened form if `make player` has been run since it last changed."""
-    script, short = bundle(f"viewer/{name}"), json.loads(read_web_file("shortened.json")).get(name, {})
-    return short["script"] if short.get("of") == script_digest(script) else script
+def strip_shader_comments(text: str) -> str:
+    """Return GLSL without indentation, empty lines and comments, all of which begin with "//"."""
+    lines = (_SHADER_COMMENT.sub("", line.strip()) for line in text.splitlines())
+    return "\n".join(line for line in lines if line)
 
 
 def _hash_source(text: str) -> str:

@@ -21,7 +21,7 @@ from hyrfpack.model import Frame
 from hyrfpack.scene import Camera
 from hyrfpack.splats.splats import Splats, normalized_quats
 from hyrfpack.web.html import decode_splats_page, encode_model_page, encode_splats_page, extract_payload
-from hyrfpack.web.player import assemble_player_page, encode_player
+from hyrfpack.web.player import assemble_player_page, encode_player, strip_shader_comments
 
 UP_DIRECTION, SCENE_CENTER = np.array([0.0, -1.0, 0.0]), np.array([1000.0, -50.0, 20.0])
 SCENE_FRAME = Frame((1000.0, -50.0, 20.0), 4.0, (1.0, 1.0, 1.0))
@@ -129,7 +129,12 @@ def test_a_player_page_refers_to_its_content_and_poster():
     assert 'id="content"' not in empty and 'id="poster"' not in empty and 'id="scene"' not in empty
 
 
-@pytest.mark.parametrize(("readers", "most"), [(False, 51_800), (True, 59_400)])
+def test_comments_and_indentation_are_removed_from_shaders():
+    text = "// first\nvoid main() { // second\n  x = a / b; // third\n\n}\n"
+    assert strip_shader_comments(text) == "void main() {\nx = a / b;\n}"
+
+
+@pytest.mark.parametrize(("readers", "most"), [(False, 51_700), (True, 59_300)])
 def test_the_compressed_player_stays_below_its_size_limit(readers, most):
     assert len(gzip.compress(assemble_player_page("hyrfpack", [], "a player", readers=readers))) <= most
 
