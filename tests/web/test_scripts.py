@@ -22,13 +22,14 @@ from web.pages import (
 )
 
 from hyrfpack.web import modules, player, scripts
-from hyrfpack.web.assets import read_web_file
+from hyrfpack.web.assets import list_web_files, read_web_file
 from hyrfpack.web.html import decode_splats_page
 from hyrfpack.web.player import encode_player
 from hyrfpack.web.scripts import DIGEST_NAME, SCRIPT_NAMES, is_minified_current, read_script, source_digest
 from tools.browser.build_player import PROGRAMS_FOLDER, build_player
 
 CACHES = (scripts.read_script, scripts.read_style, scripts.is_minified_current, player._pack_scripts)
+MAX_LINE_LENGTH = 120
 
 
 @pytest.fixture
@@ -124,3 +125,14 @@ def test_a_page_of_plain_modules_opened_from_disk_draws_the_same_picture(
     picture = render_in_page(browser, make_camera())
     assert psnr(picture, rasterize_reference(decode_splats_page(page, "page")[0], make_camera())) > 45
     assert browser.list_errors() == []
+
+
+@pytest.mark.unit
+def test_no_line_of_the_modules_is_longer_than_120_columns():
+    long = [
+        f"{path}:{number}"
+        for path in list_web_files("viewer", ".js") + list_web_files("hyrf", ".js")
+        for number, line in enumerate(read_web_file(path).splitlines(), 1)
+        if len(line) > MAX_LINE_LENGTH
+    ]
+    assert long == []

@@ -13,7 +13,7 @@ const MIN_MAX_HEADER_BYTES = 9;
  * Converts an IEEE 754 binary16 to a number.
  * @param {number} bits 16 bits
  */
-const halfToNumber = (bits) => {
+export const halfToNumber = (bits) => {
   const sign = bits & 0x8000 ? -1 : 1, exponent = (bits >> 10) & 31, fraction = bits & 1023;
   if (exponent === 31) return fraction ? NaN : sign * Infinity;
   return exponent ? sign * 2 ** (exponent - 15) * (1 + fraction / 1024) : sign * 2 ** -24 * fraction;

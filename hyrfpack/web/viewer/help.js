@@ -26,7 +26,8 @@ export class Help {
   constructor() {
     const coarse = matchMedia("(pointer: coarse)").matches;
     this.used = new Set(coarse ? ["touch"] : ["mouse", "keys"]);
-    addEventListener("pointerdown", ({ pointerType }) => this.used.add(pointerType === "mouse" ? "mouse" : "touch"), true);
+    const usePointer = ({ pointerType }) => this.used.add(pointerType === "mouse" ? "mouse" : "touch");
+    addEventListener("pointerdown", usePointer, true);
     addEventListener("keydown", () => this.used.add("keys"), true);
     this.hint = element("hint");
     this.hint.textContent = HINTS[coarse ? "touch" : "mouse"];

@@ -52,6 +52,13 @@ function showRing(x, y) {
   ring.onanimationend = () => (ring.hidden = true);
 }
 
+// Fills the screen with the page, or ends that; a browser may refuse it.
+function toggleFullscreen() {
+  const page = document.documentElement;
+  const changed = document.fullscreenElement ? document.exitFullscreen() : page.requestFullscreen?.();
+  changed?.catch(() => {});
+}
+
 function start() {
   const parameters = parseSearch(location.search);
   document.body.classList.toggle("bare", parameters.noui);
@@ -126,7 +133,7 @@ function start() {
     R: () => choose(player.camera),
     O: () => pick(player.canvas.clientWidth / 2, player.canvas.clientHeight / 2),
     T: () => setTurning(!turntable.on),
-    F: () => (document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen?.())?.catch(() => {}),
+    F: toggleFullscreen,
     X: ifLoaded(switchExposure),
     L: ifLoaded(share),
     C: ifLoaded(async () => savePicture(await player.capture(), title)),

@@ -270,7 +270,9 @@ export class Player extends EventTarget {
   }
 
   set exposure(exposure) {
-    if (!EXPOSURES.includes(exposure)) throw new Error(`The exposure must be ${EXPOSURES.join(" or ")}, not ${exposure}.`);
+    if (!EXPOSURES.includes(exposure)) {
+      throw new Error(`The exposure must be ${EXPOSURES.join(" or ")}, not ${exposure}.`);
+    }
     this.mode = exposure;
     this.emit("exposure");
     this.redraw();

@@ -33,4 +33,5 @@ export function savePicture(blob, title) {
   toast(`Saved as ${link.download}.`);
 }
 
-const fileName = (title) => title.replace(/[^\p{L}\p{N}\x20._-]+/gu, "_").replace(/^[.\x20]+/, "").slice(0, 80) || "scene";
+const fileName = (title) =>
+  title.replace(/[^\p{L}\p{N}\x20._-]+/gu, "_").replace(/^[.\x20]+/, "").slice(0, 80) || "scene";

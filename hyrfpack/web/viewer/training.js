@@ -40,4 +40,5 @@ export async function followTraining(address, { show, waiting, isWanted }) {
   }
 }
 
-export const trainingTitle = (title, { step, steps }) => `${title}, step ${step.toLocaleString("en")} of ${steps.toLocaleString("en")}`;
+export const trainingTitle = (title, { step, steps }) =>
+  `${title}, step ${step.toLocaleString("en")} of ${steps.toLocaleString("en")}`;

@@ -4,5 +4,7 @@ import { HyrfFormatError } from "../hyrf/errors.js";
 import { startWorker } from "./worker_tasks.js";
 
 startWorker(() => {
-  throw new HyrfFormatError("this page takes .hyrf files only; drop others on a player from 'hyrfpack export -o player/'.");
+  throw new HyrfFormatError(
+    "this page takes .hyrf files only; drop others on a player from 'hyrfpack export -o player/'.",
+  );
 });

@@ -14,171 +14,132 @@
 //     {order: {ticket, number, order, drawn}}
 //     {error}                                the reason, as soon as it is certain that the file cannot be read
 
-import { ENTRY_BYTES, HEADER_BYTES, MAGIC_BYTES, MAX_SECTIONS } from "../hyrf/container.js";
 import { fitHarmonics } from "../hyrf/harmonics.js";
-import { describe, read } from "../hyrf/index.js";
+import { read } from "../hyrf/index.js";
 import { viewpointOf } from "../hyrf/viewpoint.js";
 import { TEXTURE_WIDTH } from "./constants.js";
 import { packModel, packSplats } from "./pack.js";
+import { ReceivedFile } from "./received_file.js";
 import { backgroundPicture, modelScene, splatsScene } from "./scene.js";
 import { DepthSort } from "./sort.js";
 
 const FIRST_LAYER_DELAY_MS = 150; // if the rest of the file arrives in this time, the first layer is not shown alone
-const MAX_FIRST_LAYER_RATIO = 0.8; // a first layer that is a larger part of its file is not shown alone
 const HARMONICS_DEGREE = 3;
-const MAX_UNSIZED_FILE_BYTES = 2 ** 32; // the limit for formats whose header does not give the file's length
-// The magic bytes without the line ends, which a transfer may damage; the reader has a better message for that.
-const MODEL_SIGNATURE = MAGIC_BYTES.slice(0, 5);
 
-let readSplats = null;
-let request = null;
-let pieces = [];
-let length = 0;
-let firstBytes = new Uint8Array(HEADER_BYTES + ENTRY_BYTES * MAX_SECTIONS); // null once the format is known
-let kind = null; // "model" or "other"; null until the format is known
-let maxLength = Infinity; // in bytes
-let firstLayerLength = Infinity; // in bytes; finite if a model's first layer may be shown alone
-let ended = false;
-let broken = false; // whether a part of the file is missing or damaged
-let decodedLength = 0; // the number of bytes in the last decoding
-let isRejected = false; // whether the whole file is useless
-let queue = Promise.resolve();
-let number = 0;
-const sorters = new Map(); // number of a content -> its DepthSort
-let sortedContent = null;
-
-// Starts to handle messages. `reader(name, bytes)` decodes files of splats, like decodeSplats in formats/index.js.
-export function startWorker(reader) {
-  readSplats = reader;
-  onmessage = (event) => handleMessage(event.data);
-}
-
-function handleMessage(data) {
-  if (data.start) request = data.start;
-  if (data.bytes) receiveBytes(data.bytes);
-  if (data.end) {
-    ended = true;
-    queueDecoding(false);
-  }
-  if (data.broken) broken = ended = true;
-  if (data.again) {
-    request.plain ||= data.again.plain;
-    if (ended) queueDecoding(broken); // otherwise the file is decoded at its end
-  }
-  if (data.use !== undefined) selectContent(data.use);
-  if (data.sort) sortContent(data.sort);
+// Starts to handle messages. `readSplats(name, bytes)` decodes files of splats, like decodeSplats in formats/index.js.
+export function startWorker(readSplats) {
+  const sorter = new ContentSorter();
+  let reader = null;
+  onmessage = ({ data }) => {
+    if (data.start) reader = new SceneReader(data.start, readSplats, sorter);
+    if (data.bytes) reader.receive(data.bytes);
+    if (data.end) reader.end();
+    if (data.broken) reader.interrupt();
+    if (data.again) reader.decodeAgain(data.again.plain);
+    if (data.use !== undefined) sorter.use(data.use);
+    if (data.sort) sorter.sort(data.sort);
+  };
 }
 
 const reportProgress = (what, part) => postMessage({ progress: { what, part } });
-
-// Decodes the bytes so far, after any earlier decoding has ended. `partial` is true if the file is not complete.
-function queueDecoding(partial) {
-  if (isRejected) return;
-  queue = queue
-    .then(() => (partial && ended && !broken ? null : decode(partial)))
-    .catch((error) => {
-      broken = true; // `again` then decodes only bytes that could be decoded before
-      reportError(error);
-    });
-}
 
 function reportError(error) {
   const isOutOfMemory = error instanceof RangeError; // thrown for arrays that are too long
   postMessage({ error: isOutOfMemory ? "There is not enough memory; open a smaller file." : error.message });
 }
 
-// Stores a piece of the file, and starts to decode the first layer when it is complete.
-function receiveBytes(bytes) {
-  if (isRejected) return;
-  const before = length;
-  pieces.push(bytes);
-  length += bytes.length;
-  try {
-    if (kind === null) identifyFile(bytes, before);
-    if (length > maxLength) rejectLongFile();
-  } catch (error) {
-    isRejected = true;
-    pieces = [];
-    reportError(error);
-    return;
+// Reads one file and posts its contents: the first layer alone if the rest takes long, and the whole.
+class SceneReader {
+  // `request` is that of the message `start`.
+  constructor(request, readSplats, sorter) {
+    Object.assign(this, { request, readSplats, sorter });
+    this.file = new ReceivedFile(!request.plain);
+    this.ended = false;
+    this.broken = false; // whether a part of the file is missing or damaged
+    this.isRejected = false; // whether the whole file is useless
+    this.decodedLength = 0; // the number of bytes in the last decoding
+    this.contents = 0; // the number of the last content
+    this.queue = Promise.resolve();
   }
-  const hasFirstLayer = before < firstLayerLength && length >= firstLayerLength;
-  if (hasFirstLayer) setTimeout(() => queueDecoding(true), FIRST_LAYER_DELAY_MS);
-}
 
-// Identifies the format from the first bytes. Throws an error if a model's header is invalid.
-function identifyFile(bytes, before) {
-  if (before < firstBytes.length) firstBytes.set(bytes.subarray(0, firstBytes.length - before), before);
-  const available = firstBytes.subarray(0, length);
-  if (!MODEL_SIGNATURE.every((byte, k) => k >= length || available[k] === byte)) {
-    kind = "other";
-    maxLength = MAX_UNSIZED_FILE_BYTES;
-    firstBytes = null;
-    return;
-  }
-  if (length < HEADER_BYTES) return;
-  const parts = new DataView(firstBytes.buffer).getUint32(36, true);
-  if (parts <= MAX_SECTIONS && length < HEADER_BYTES + ENTRY_BYTES * parts) return;
-  const description = describe(available);
-  kind = "model";
-  maxLength = description.length;
-  if (!request.plain && description.firstLayer < MAX_FIRST_LAYER_RATIO * description.length) {
-    firstLayerLength = description.firstLayer;
-  }
-  firstBytes = null;
-}
-
-// Throws the error for a file that is too long.
-function rejectLongFile() {
-  if (kind === "model") describe(gatherBytes()); // throws an error about the length
-  throw new Error("It is larger than 4 GiB; open a smaller one.");
-}
-
-// Returns all bytes so far as one array.
-function gatherBytes() {
-  if (pieces.length !== 1) {
-    const all = new Uint8Array(length);
-    pieces.reduce((at, piece) => (all.set(piece, at), at + piece.length), 0);
-    pieces = [all];
-  }
-  return pieces[0];
-}
-
-// Decodes the file and posts its content.
-async function decode(partial) {
-  const all = gatherBytes(), bytes = partial && broken ? all.subarray(0, decodedLength || length) : all;
-  const { name, scene, stage, plain } = request, content = { number: ++number, whole: !partial };
-  reportProgress("unpacking", 0);
-  const transferred = [];
-  let positions;
-  if (kind !== "other" && length >= MODEL_SIGNATURE.length) {
-    const model = await read(bytes, { partial });
-    content.scene = { ...(scene ?? { ...modelScene(model, name), ...stage }), exposure: model.exposure };
-    positions = model.positions;
-    if (plain) {
-      reportProgress("unpacking", 1);
-      const report = ({ done }) => reportProgress("preparing", done);
-      const { fitted } = viewpointOf(model.metadata);
-      content.splats = packSplats(await fitHarmonics(model, fitted, HARMONICS_DEGREE, report));
-      content.picture = backgroundPicture(model);
-    } else {
-      content.model = packModel(model);
+  // Stores a piece of the file, and starts to decode the first layer when it is complete.
+  receive(bytes) {
+    if (this.isRejected) return;
+    try {
+      if (this.file.add(bytes)) setTimeout(() => this.queueDecoding(true), FIRST_LAYER_DELAY_MS);
+    } catch (error) {
+      this.isRejected = true;
+      reportError(error);
     }
-  } else {
-    const splats = await readSplats(name, bytes);
-    if (scene) convertToScene(splats, scene);
-    content.scene = scene ?? splatsScene(splats, name);
-    positions = splats.positions;
-    content.splats = packSplats(splats);
   }
-  sorters.set(content.number, new DepthSort(positions, TEXTURE_WIDTH));
-  decodedLength = bytes.length;
-  reportProgress("unpacking", 1);
-  const { splats, model, picture } = content;
-  for (const part of [splats, model, model?.geometry, model?.radiance, picture]) {
-    for (const value of Object.values(part ?? {})) if (ArrayBuffer.isView(value)) transferred.push(value.buffer);
+
+  // Decodes the complete file.
+  end() {
+    this.ended = true;
+    this.queueDecoding(false);
   }
-  postMessage({ content }, [...new Set(transferred)]);
+
+  // Records that no more of the file can be read.
+  interrupt() {
+    this.broken = this.ended = true;
+  }
+
+  // Decodes the same bytes again, as splats if `plain`. A file that is still arriving is decoded at its end.
+  decodeAgain(plain) {
+    this.request.plain ||= plain;
+    if (this.ended) this.queueDecoding(this.broken);
+  }
+
+  // Decodes the bytes so far, after any earlier decoding has ended. `partial` is true if the file is not complete.
+  queueDecoding(partial) {
+    if (this.isRejected) return;
+    this.queue = this.queue
+      .then(() => (partial && this.ended && !this.broken ? null : this.decode(partial)))
+      .catch((error) => {
+        this.broken = true; // `decodeAgain` then decodes only bytes that could be decoded before
+        reportError(error);
+      });
+  }
+
+  // Decodes the file and posts its content.
+  async decode(partial) {
+    const { file, request: { name, scene, stage, plain } } = this, all = file.gather();
+    const bytes = partial && this.broken ? all.subarray(0, this.decodedLength || file.length) : all;
+    const content = { number: ++this.contents, whole: !partial };
+    reportProgress("unpacking", 0);
+    let positions;
+    if (file.isModel) {
+      const model = await read(bytes, { partial });
+      content.scene = { ...(scene ?? { ...modelScene(model, name), ...stage }), exposure: model.exposure };
+      positions = model.positions;
+      if (plain) {
+        reportProgress("unpacking", 1);
+        const report = ({ done }) => reportProgress("preparing", done);
+        const { fitted } = viewpointOf(model.metadata);
+        content.splats = packSplats(await fitHarmonics(model, fitted, HARMONICS_DEGREE, report));
+        content.picture = backgroundPicture(model);
+      } else {
+        content.model = packModel(model);
+      }
+    } else {
+      const splats = await this.readSplats(name, bytes);
+      if (scene) convertToScene(splats, scene);
+      content.scene = scene ?? splatsScene(splats, name);
+      positions = splats.positions;
+      content.splats = packSplats(splats);
+    }
+    this.sorter.add(content.number, positions);
+    this.decodedLength = bytes.length;
+    reportProgress("unpacking", 1);
+    postMessage({ content }, listBuffers(content));
+  }
+}
+
+// Returns the buffers of all arrays of a content, which are transferred with its message.
+function listBuffers({ splats, model, picture }) {
+  const parts = [splats, model, model?.geometry, model?.radiance, picture];
+  const values = parts.flatMap((part) => Object.values(part ?? {}));
+  return [...new Set(values.filter(ArrayBuffer.isView).map(({ buffer }) => buffer))];
 }
 
 // Converts splats to the origin and the unit of the page's scene.
@@ -191,14 +152,27 @@ function convertToScene(splats, scene) {
   Object.assign(splats, { center: scene.center, unit: scene.unit });
 }
 
-// Selects the content to sort, and drops older ones.
-function selectContent(content) {
-  sortedContent = content;
-  for (const other of sorters.keys()) if (other < content) sorters.delete(other);
-}
+// Sorts the splats of the content that the page shows.
+class ContentSorter {
+  constructor() {
+    this.sorters = new Map(); // number of a content -> its DepthSort
+    this.selected = null;
+  }
 
-// Posts the order of the splats for a request.
-function sortContent({ ticket, row, sides, near, order: spare }) {
-  const { order: sorted, drawn } = sorters.get(sortedContent).sort(row, sides, near, spare);
-  postMessage({ order: { ticket, number: sortedContent, order: sorted, drawn } }, [sorted.buffer]);
+  // Adds a content by its number and the positions of its splats (3 N).
+  add(number, positions) {
+    this.sorters.set(number, new DepthSort(positions, TEXTURE_WIDTH));
+  }
+
+  // Selects the content to sort, and drops older ones.
+  use(number) {
+    this.selected = number;
+    for (const other of this.sorters.keys()) if (other < number) this.sorters.delete(other);
+  }
+
+  // Posts the order of the splats for a request.
+  sort({ ticket, row, sides, near, order: spare }) {
+    const { order, drawn } = this.sorters.get(this.selected).sort(row, sides, near, spare);
+    postMessage({ order: { ticket, number: this.selected, order, drawn } }, [order.buffer]);
+  }
 }

@@ -15,6 +15,7 @@
 
 import { groupedDigits } from "../../hyrf/errors.js";
 import { HIGHER_HARMONICS_BY_DEGREE, SH_BAND_0 } from "../../hyrf/harmonics.js";
+import { halfToNumber } from "../../hyrf/plain.js";
 import { normalizeSplats, rejectSplats } from "./normalize.js";
 import { writeQuat } from "./smallest_three.js";
 import { Unpacker } from "./unpack.js";
@@ -57,7 +58,7 @@ function decodeSections({ version, count, degree, bits, flags }, [places, alphas
   for (let i = 0; i < count; i++) {
     for (let k = 0; k < 3; k++) {
       const from = 3 * i + k, sign = k ? -1 : 1, at = 3 * from;
-      const place = version === 1 ? decodeFloat16Bits(halfs.getUint16(2 * from, true)) : decodeInt24(places, at) * step;
+      const place = version === 1 ? halfToNumber(halfs.getUint16(2 * from, true)) : decodeInt24(places, at) * step;
       positions[from] = sign * place;
       scales[from] = Math.exp(sizes[from] / 16 - 10);
       colors[from] = 0.5 + (SH_BAND_0 * (tints[from] / 255 - 0.5)) / 0.15;
@@ -86,13 +87,6 @@ const decodeInt24 = (bytes, at) => ((bytes[at] << 8) | (bytes[at + 1] << 16) | (
 
 // Decodes a component of a rotation: a sign, and 9 bits of magnitude in units of sqrt(1/2) / 511.
 const decodeQuatComponent = (code) => ((code & 512 ? -1 : 1) * (code & 511)) / (511 * Math.SQRT2);
-
-// Converts an IEEE 754 binary16 to a number.
-function decodeFloat16Bits(bits) {
-  const sign = bits >> 15 ? -1 : 1, exponent = (bits >> 10) & 31, fraction = bits & 1023;
-  if (exponent === 31) return fraction ? NaN : sign * Infinity;
-  return sign * (exponent ? 2 ** (exponent - 15) * (1 + fraction / 1024) : 2 ** -24 * fraction);
-}
 
 // --- containers ------------------------------------------------------------------------------------------------------
 
