@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from hyrfpack.bench.suite import benchmark_model as benchmark_model
     from hyrfpack.compress import CompressionReport as CompressionReport
     from hyrfpack.compress import compress_model as compress_model
+    from hyrfpack.context import RunContext as RunContext
     from hyrfpack.data import load_scene as load_scene
     from hyrfpack.distill import DistillConfig as DistillConfig
     from hyrfpack.distill import DistillReport as DistillReport
@@ -93,6 +94,7 @@ _PUBLIC = {
     "compare_runs": "hyrfpack.report",
     "CompressionReport": "hyrfpack.compress",
     "compress_model": "hyrfpack.compress",
+    "RunContext": "hyrfpack.context",
     "load_scene": "hyrfpack.data",
     "DistillConfig": "hyrfpack.distill",
     "DistillReport": "hyrfpack.distill",

@@ -40,6 +40,7 @@ LAYER_BY_PATH = {
     "parallel/test_fork.py": "acceptance",
     "parallel/test_ranks.py": "acceptance",
     "poses/test_interruptions.py": "acceptance",
+    "progress": "unit",
     "quant": "unit",
     "render": "unit",
     "splats": "unit",
@@ -50,12 +51,12 @@ LAYER_BY_PATH = {
     "test_no_home.py": "acceptance",
     "test_outputs.py": "unit",
     "test_package.py": "acceptance",
-    "test_progress.py": "unit",
     "test_public.py": "acceptance",
     "test_pycolmap.py": "acceptance",
     "test_scene.py": "unit",
     "test_site.py": "acceptance",
     "tools": "acceptance",
+    "train/test_advice.py": "unit",
     "train/test_distributed.py": "acceptance",
 }
 

@@ -15,8 +15,10 @@ import torch
 import torch.distributed as dist
 from scenes import alternating_gains, ball_scene, exposed_scene
 
+from hyrfpack.context import RunContext
 from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.parallel.ranks import Ranks, join_processes
+from hyrfpack.progress import Event, Progress, StepEvent
 from hyrfpack.scene import Picture, Scene
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer, train_model
 from hyrfpack.train import trainer as trainers
@@ -119,18 +121,18 @@ def train_both_scenes(ranks: Ranks) -> list[dict]:
     ]
 
 
-def signal_at_step(number: int, at: int) -> Callable[[int, float, float, int], None]:
-    """Return a report function that sends its own process a signal after a step."""
+def signal_at_step(number: int, at: int) -> Progress:
+    """Return a progress function that sends its own process a signal after a step."""
 
-    def report(step: int, loss: float, error: float, gaussians: int) -> None:
-        if step == at:
+    def progress(event: Event) -> None:
+        if isinstance(event, StepEvent) and event.step == at:
             os.kill(os.getpid(), number)
 
-    return report
+    return progress
 
 
-def report_nothing(step: int, loss: float, error: float, gaussians: int) -> None:
-    pass
+def cpu_context(ranks: Ranks, progress: Progress | None = None, device: str = "cpu") -> RunContext:
+    return RunContext(device=device, ranks=ranks, progress=progress)
 
 
 def train_run(ranks: Ranks, out: Path, resume: bool = False, overwrite: bool = False) -> tuple[bool, int, bool]:
@@ -138,18 +140,16 @@ def train_run(ranks: Ranks, out: Path, resume: bool = False, overwrite: bool = F
         held_out_scene(),
         out,
         RUN_CONFIG,
-        ranks=ranks,
         resume=resume,
         overwrite=overwrite,
-        device="cpu",
-        report=report_nothing,
+        context=cpu_context(ranks),
     )
     return result.complete, result.step, bool(result.metrics)
 
 
 def train_and_kill(ranks: Ranks, out: Path, who: int, step: int) -> None:
-    report = signal_at_step(signal.SIGKILL, step) if ranks.rank == who else report_nothing
-    train_model(held_out_scene(), out, RUN_CONFIG, ranks=ranks, device="cpu", report=report)
+    progress = signal_at_step(signal.SIGKILL, step) if ranks.rank == who else None
+    train_model(held_out_scene(), out, RUN_CONFIG, context=cpu_context(ranks, progress))
 
 
 def stop_and_resume(ranks: Ranks, whole: Path, parts: Path, alone: Path) -> dict:
@@ -163,10 +163,8 @@ def stop_and_resume(ranks: Ranks, whole: Path, parts: Path, alone: Path) -> dict
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     # All ranks receive the stop with the next step: before the first regular checkpoint, and between density rounds.
     for name, step in (("first", 2), ("second", 16)):
-        report = signal_at_step(signal.SIGTERM, step) if ranks.rank == 1 else report_nothing
-        result = train_model(
-            held_out_scene(), parts, RUN_CONFIG, ranks=ranks, resume=name == "second", device="cpu", report=report
-        )
+        context = cpu_context(ranks, signal_at_step(signal.SIGTERM, step) if ranks.rank == 1 else None)
+        result = train_model(held_out_scene(), parts, RUN_CONFIG, resume=name == "second", context=context)
         said[name] = result.complete, result.step, bool(result.metrics)
     said["other size"] = error_message(lambda: train_run(ranks, alone, resume=True))
     said["there already"] = error_message(lambda: train_run(ranks, whole))
@@ -189,21 +187,21 @@ def train_after_restart(ranks: Ranks, out: Path) -> list[tuple[bool, int, bool]]
     """Train as after a restart by torchrun, first in an empty folder, then in one with a checkpoint."""
     again = dataclasses.replace(ranks, restarts=1)
     steps: list[int] = []
+
+    def record_step(event: Event) -> None:
+        steps.extend([event.step] if isinstance(event, StepEvent) else [])
+
     first = train_model(
         held_out_scene(),
         out / "none",
         dataclasses.replace(RUN_CONFIG, steps=4),
-        ranks=again,
-        device="cpu",
-        report=report_nothing,
+        context=cpu_context(again),
     )
     train_model(
         held_out_scene(),
         out / "some",
         RUN_CONFIG,
-        ranks=again,
-        device="cpu",
-        report=lambda step, *_: steps.append(step),
+        context=cpu_context(again, record_step),
     )
     return [first.step, steps]
 
@@ -254,18 +252,14 @@ def collect_setup_errors(ranks: Ranks, out: Path) -> dict[str, str | None]:
     held_out = [dataclasses.replace(scene.test[0], load=_unreadable)]
     bad = dataclasses.replace(scene, test=held_out)
     return {
-        "held out": error_message(
-            lambda: train_model(bad, out, RUN_CONFIG, ranks=ranks, device="cpu", report=report_nothing)
-        ),
+        "held out": error_message(lambda: train_model(bad, out, RUN_CONFIG, context=cpu_context(ranks))),
         "nothing to resume": error_message(lambda: train_run(ranks, out, resume=True)),
         "device": error_message(
             lambda: train_model(
                 held_out_scene(),
                 out,
                 RUN_CONFIG,
-                ranks=ranks,
-                device="what" if ranks.rank else "cpu",
-                report=report_nothing,
+                context=cpu_context(ranks, device="what" if ranks.rank else "cpu"),
             )
         ),
     }

@@ -7,10 +7,12 @@ import dataclasses
 import numpy as np
 import torch
 
+from hyrfpack.context import RunContext
 from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.scene import Camera, Picture, Scene, View
 
+QUIET_CONTEXT = RunContext(progress=None)
 BALL_CENTERS = np.array([[-0.5, 0.0, 0.0], [0.45, 0.3, 0.1], [0.1, -0.5, -0.2]])
 BALL_RADII = np.array([0.45, 0.35, 0.3])
 BALL_COLORS = np.array([[0.9, 0.2, 0.1], [0.1, 0.8, 0.3], [0.2, 0.3, 0.9]])

@@ -53,7 +53,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory, data: Path) -> Path:
     (root / "photos" / "bonsai").symlink_to(data)
     write_photos(root / "photos" / "corner", 5)
     scene = hyrfpack.load_scene(data)
-    hyrfpack.train_model(scene, root / "runs" / "bonsai", hyrfpack.TrainConfig(steps=20, max_gaussians=300), quiet=True)
+    hyrfpack.train_model(
+        scene,
+        root / "runs" / "bonsai",
+        hyrfpack.TrainConfig(steps=20, max_gaussians=300),
+        context=hyrfpack.RunContext(progress=None),
+    )
     shutil.copytree(root / "runs" / "bonsai", root / "runs" / "again")
     hyrfpack.compress_model(root / "runs" / "bonsai" / "model.hyrf", root / "bonsai.hyrf")
     hyrfpack.export_model(root / "bonsai.hyrf", root / "bonsai.ply", degree=0, background=False)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 
 import pytest
+from scenes import QUIET_CONTEXT
 
 from hyrfpack.compress import compress_model
 from hyrfpack.evaluate import evaluate_model
@@ -25,7 +26,7 @@ RECORDED_SIZES_FILE = TRAINED_FOLDER.parent / "trained_sizes.json"
 def test_a_new_training_reaches_the_quality_and_sizes_of_the_golden_model(golden_file, tmp_path):
     scene = make_golden_scene(golden_file, tmp_path / "photos")
 
-    trained = train_model(scene, tmp_path / "run", TRAIN_CONFIGS[golden_file], quiet=True).model
+    trained = train_model(scene, tmp_path / "run", TRAIN_CONFIGS[golden_file], context=QUIET_CONTEXT).model
 
     new, golden = (evaluate_model(load_model(path), scene.train).psnr for path in (trained, golden_file))
     assert new > golden - MAX_PSNR_LOSS_DB

@@ -18,6 +18,7 @@ from ops.device import needs_triton
 from scenes import ball_points, ball_scene, camera_at, small_model
 
 import hyrfpack
+from hyrfpack.context import RunContext
 from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.distill import DistillConfig, distill_splats
 from hyrfpack.distill.pack import pack
@@ -164,7 +165,7 @@ def few_pictures(monkeypatch):
 def test_a_model_is_measured_packed_and_fine_tuned_on_a_gpu(gpu, few_pictures, tmp_path):
     scene = ball_scene(views=2, points=12, side=8)
     config = TrainConfig(steps=1, max_gaussians=12, log2_table_size=4, background=False)
-    model = hyrfpack.train_model(scene, tmp_path / "run", config, quiet=True, device="cpu").model
+    model = hyrfpack.train_model(scene, tmp_path / "run", config, context=RunContext(device="cpu", progress=None)).model
     sizes = {}
     for device in ("cpu", "cuda"):
         target = tmp_path / f"{device}.hyrf"

@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 
 import pytest
+from scenes import QUIET_CONTEXT
 
 from hyrfpack.data import load_scene
 from hyrfpack.demo.scene import write_demo_scene
@@ -173,7 +174,7 @@ def test_training_never_writes_into_the_folder_of_its_photos(overwrite, photos):
 
     for place in (photos, photos / "images"):
         with pytest.raises(HyrfError, match="the same command reads"):
-            train_model(scene, place, TINY_TRAIN_CONFIG, overwrite=overwrite, quiet=True)
+            train_model(scene, place, TINY_TRAIN_CONFIG, overwrite=overwrite, context=QUIET_CONTEXT)
 
     assert {path: path.read_bytes() for path in photos.rglob("*") if path.is_file()} == before
 
@@ -184,7 +185,7 @@ def test_training_never_replaces_photos_in_its_output_folder(photos):
     poses.write_text(poses.read_text().replace("images/", "views/"))
 
     with pytest.raises(HyrfError, match="the same command reads"):
-        train_model(load_scene(photos, test_every=2), photos, TINY_TRAIN_CONFIG, overwrite=True, quiet=True)
+        train_model(load_scene(photos, test_every=2), photos, TINY_TRAIN_CONFIG, overwrite=True, context=QUIET_CONTEXT)
 
 
 @pytest.mark.integration
@@ -195,8 +196,8 @@ def test_training_keeps_a_foreign_metrics_json_without_overwrite(photos, tmp_pat
     scene = dataclasses.replace(load_scene(photos), test=[])
 
     with pytest.raises(HyrfError, match="metrics.json of the files to be written is there"):
-        train_model(scene, out, TINY_TRAIN_CONFIG, quiet=True)
+        train_model(scene, out, TINY_TRAIN_CONFIG, context=QUIET_CONTEXT)
     assert (out / "metrics.json").read_text() == "mine"
 
-    train_model(scene, out, TINY_TRAIN_CONFIG, overwrite=True, quiet=True)
+    train_model(scene, out, TINY_TRAIN_CONFIG, overwrite=True, context=QUIET_CONTEXT)
     assert (out / "metrics.json").read_text() != "mine"

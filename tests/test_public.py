@@ -102,14 +102,14 @@ def test_messages_are_printed_only_if_the_program_asks_for_them(asking, printed)
 
 def test_sub_packages_support_every_form_of_import():
     code = (
-        "import hyrfpack.train.progress as progress, hyrfpack.train as t, hyrfpack.evaluate\n"
-        "from hyrfpack.train import Trainer, progress as again\n"
+        "import hyrfpack.train.advice as advice, hyrfpack.train as t, hyrfpack.evaluate\n"
+        "from hyrfpack.train import Trainer, advice as again\n"
         "import hyrfpack.cameras.paths, sys\n"
-        "assert progress is again is sys.modules['hyrfpack.train.progress'] is hyrfpack.train.progress\n"
+        "assert advice is again is sys.modules['hyrfpack.train.advice'] is hyrfpack.train.advice\n"
         "assert t is hyrfpack.train is sys.modules['hyrfpack.train'] and t.train_model is hyrfpack.train_model\n"
         "assert t.Trainer is Trainer and hyrfpack.cameras.paths.orbit\n"
-        "progress.LOG_INTERVAL_SECONDS = 7\n"
-        "assert hyrfpack.train.progress.LOG_INTERVAL_SECONDS == 7\n"
+        "advice.MIN_ADVICE_STEPS = 7\n"
+        "assert hyrfpack.train.advice.MIN_ADVICE_STEPS == 7\n"
         "try: hyrfpack.nothing\n"
         "except AttributeError: print('and nothing else')"
     )

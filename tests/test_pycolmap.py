@@ -33,7 +33,8 @@ sys.meta_path.insert(0, Watch())
 READ_SCENE_CODE = "import hyrfpack\nscene = hyrfpack.load_scene('scene')\n"
 CODE_BY_CALL = {
     "load_scene": "import zlib\nassert zlib.decompress(zlib.compress(bytes(10**6))) == bytes(10**6)",
-    "train": "assert hyrfpack.train_model(scene, 'run', hyrfpack.TrainConfig(steps=3), quiet=True).complete",
+    "train": "quiet = hyrfpack.RunContext(progress=None)\n"
+    "assert hyrfpack.train_model(scene, 'run', hyrfpack.TrainConfig(steps=3), context=quiet).complete",
     "compress": "hyrfpack.compress_model('model.hyrf', 'a.hyrf', data=scene)",
     "evaluate, render, save": "model = hyrfpack.load_model('model.hyrf')\n"
     "hyrfpack.evaluate_model(model, scene.test, pictures='views')\n"

@@ -18,6 +18,7 @@ from torch import Tensor
 from hyrfpack.cameras.capture import Capture
 from hyrfpack.cameras.paths import orbit
 from hyrfpack.compress.distortion import default_distortion
+from hyrfpack.context import RunContext
 from hyrfpack.data import load_scene
 from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.device import upload
@@ -138,7 +139,9 @@ def built_in_subject() -> Subject:
         scene = load_scene(
             write_demo_scene(Path(folder) / "scene", views=BUILT_IN_PHOTOS, size=BUILT_IN_PHOTO_SIDE_PIXELS)
         )
-        trained = train_model(scene, Path(folder) / "run", TrainConfig(steps=BUILT_IN_STEPS), quiet=True)
+        trained = train_model(
+            scene, Path(folder) / "run", TrainConfig(steps=BUILT_IN_STEPS), context=RunContext(progress=None)
+        )
         if trained.model is None:  # training treats Ctrl-C as a request to stop
             raise KeyboardInterrupt
         subject = read_subject(trained.model, scene)

@@ -116,15 +116,14 @@ def make(
         raise click.UsageError("--quality and --minutes each decide how long to work; give one of them")
     if target_size is not None and max_gaussians is not None:
         raise click.UsageError("--max-gaussians and --target-size each decide how large the model is; give one of them")
+    from hyrfpack.context import RunContext
     from hyrfpack.make import Stopped
     from hyrfpack.make import make_scene as run
-    from hyrfpack.make.display import Display
 
     torch_device = choose_command_device(device)
     try:
         with (
             notes_only_of("hyrfpack.make", "hyrfpack.poses", "hyrfpack.live"),
-            Display() as display,
             serve_training_view(output.name, view, view_port) as observer,
         ):
             result = run(
@@ -141,10 +140,9 @@ def make(
                 max_gaussians=max_gaussians,
                 preset=preset,
                 seed=seed,
-                device=torch_device,
                 overwrite=overwrite,
-                report=display.show,
                 observer=observer,
+                context=RunContext(device=torch_device),
             )
     except Stopped as stop:
         note(f"stopped in {stop.stage}; the same command resumes")

@@ -11,6 +11,7 @@ import click
 
 from hyrfpack.choices import MATCHING_METHODS
 from hyrfpack.cli.common import json_option, note, note_if_verbose, print_json
+from hyrfpack.cli.progress import show_progress
 from hyrfpack.cli.types import OUTPUT, PATH
 from hyrfpack.config.settings import LARGEST_SEED
 
@@ -52,14 +53,10 @@ def poses(
       hyrfpack poses clip.mp4 -o scenes/clip
       hyrfpack train scenes/garden -o runs/garden
     """
-    from hyrfpack.make.display import Display
-    from hyrfpack.make.progress import Reporter
     from hyrfpack.poses import estimate_poses
 
     try:
-        with Display() as display:
-            reporter = Reporter(["poses"], display.show)
-            reporter.begin("poses")
+        with show_progress("poses") as report:
             result = estimate_poses(
                 photos,
                 out,
@@ -67,7 +64,7 @@ def poses(
                 masks=masks,
                 seed=seed,
                 overwrite=overwrite,
-                report=lambda doing, share: reporter.update(share, doing),
+                report=report,
             )
     except KeyboardInterrupt:
         note("stopped; the same command resumes from here")

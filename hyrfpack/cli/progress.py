@@ -19,13 +19,10 @@ def show_progress(command: str) -> Iterator[Report]:
     Yields:
         The function that the work reports its progress to. Sentences printed meanwhile appear above the line.
     """
-    from hyrfpack.make.display import Display
-    from hyrfpack.make.progress import Reporter
+    from hyrfpack.progress import open_display, report_to
 
-    with Display() as display:
-        reporter = Reporter([command], display.show)
-        reporter.begin(command)
-        yield lambda doing, share: reporter.update(share, doing)
+    with open_display("auto", command) as progress:
+        yield report_to(progress)
 
 
 def show_item_progress(items: Iterable[T], count: int, command: str, noun: str) -> Iterator[T]:

@@ -103,6 +103,7 @@ def train(
         raise click.UsageError(
             "--poses runs in one process only; run 'hyrfpack poses' first, then train from its folder"
         )
+    from hyrfpack.context import RunContext
     from hyrfpack.data import PictureCache
     from hyrfpack.device import describe_device
     from hyrfpack.format.run_folder import MODEL_FILE
@@ -121,13 +122,12 @@ def train(
     where = describe_device(torch_device) + ("" if ranks.is_single else f" in each of {ranks.size} processes")
     note(f"{scene.layout} scene: {len(scene.train)} photos to train on, {len(scene.test)} held out; on {where}")
     cache = None if cache_mb is None else PictureCache(cache_mb * 2**20 // ranks.local_size)
-    config = TrainConfig(**settings)
+    config, context = TrainConfig(**settings), RunContext(device=torch_device, ranks=ranks, cache=cache)
     with serve_training_view(out.name, view and ranks.is_main, view_port) as observer:
         try:
             result = run(
-                scene, out, config, resume=resume, overwrite=overwrite, cache=cache, device=torch_device,
-                observer=observer, log=log, ranks=ranks,
-            )  # fmt: skip
+                scene, out, config, resume=resume, overwrite=overwrite, observer=observer, log=log, context=context
+            )
         except KeyboardInterrupt:
             if not is_begun(out):
                 raise
@@ -164,11 +164,9 @@ def train(
 def _estimate_poses(photos: Path, run: Path, images: str | None, resume: bool, overwrite: bool) -> Path:
     """Estimate the poses of photos and return the folder of the scene, which lies in the folder of the run."""
     from hyrfpack.make.auto_pose import SCENE_FOLDER, auto_pose
-    from hyrfpack.make.display import Display
 
     try:
-        with Display() as display:
-            return auto_pose(photos, run, images=images, resume=resume, overwrite=overwrite, report=display.show)
+        return auto_pose(photos, run, images=images, resume=resume, overwrite=overwrite)
     except KeyboardInterrupt:
         note(f"stopped in poses; the same command resumes with {run / SCENE_FOLDER}")
         click.get_current_context().exit(1)

@@ -17,7 +17,7 @@ from hyrfpack.data import PictureCache
 from hyrfpack.distill.initialize import initial_model
 from hyrfpack.distill.reference import ReferenceViews, mean_sent_light, reference_scene
 from hyrfpack.errors import HyrfDataError
-from hyrfpack.evaluate.metrics import psnr_from_mse
+from hyrfpack.measure.psnr import psnr_from_mse
 from hyrfpack.model import HybridModel
 from hyrfpack.progress import Report, no_report, report_part
 from hyrfpack.scene import Camera, Scene, evenly_spaced

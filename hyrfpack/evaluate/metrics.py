@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 from torch import Tensor
 
+from hyrfpack.measure.psnr import IDENTICAL_PSNR, psnr_from_mse
 from hyrfpack.ops.ssim import photometric_loss
 
-# PSNR in dB of two identical pictures, for which the formula gives infinity; also the upper limit of other PSNRs.
-IDENTICAL_PSNR = 100.0
 # PSNR in dB assumed for a model whose provenance does not state how well it fits its photos.
 ASSUMED_PSNR = 30.0
 
@@ -37,11 +35,6 @@ def psnr(image: Tensor, reference: Tensor, mask: Tensor | None = None) -> float:
     """
     squares = (image.double() - reference.double()) ** 2
     return psnr_from_mse(float(squares.mean() if mask is None else squares[mask].mean()))
-
-
-def psnr_from_mse(mse: float) -> float:
-    """Convert a mean squared error of colours in [0, 1] to PSNR in dB, at most `IDENTICAL_PSNR`."""
-    return min(float(-10 * np.log10(mse)), IDENTICAL_PSNR) if mse > 0 else IDENTICAL_PSNR
 
 
 def provenance_mse(provenance: dict) -> float:

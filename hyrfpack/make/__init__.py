@@ -1,7 +1,6 @@
 """Make a scene from photos end to end, in stages whose products are cached and resumed."""
 
 from hyrfpack.make.plan import QUALITIES
-from hyrfpack.make.progress import Progress
 from hyrfpack.make.run import MakeResult, Stopped, make_scene
 
-__all__ = ["QUALITIES", "MakeResult", "Progress", "Stopped", "make_scene"]
+__all__ = ["QUALITIES", "MakeResult", "Stopped", "make_scene"]

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable
 from pathlib import Path
 
+from hyrfpack.context import RunContext
 from hyrfpack.errors import HyrfError
 from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
 from hyrfpack.lock import exclusive_folder
-from hyrfpack.make.progress import Progress, Reporter
 from hyrfpack.make.source import LoadSettings, Source
 from hyrfpack.make.stage_cache import interruptible
 from hyrfpack.make.stages import SCENE_FOLDER, is_posed
+from hyrfpack.progress import report_to
 
 _LOG = logging.getLogger(__name__)
 
@@ -25,7 +25,7 @@ def auto_pose(
     images: str | None = None,
     resume: bool = False,
     overwrite: bool = False,
-    report: Callable[[Progress], None] | None = None,
+    context: RunContext = RunContext(),  # noqa: B008 - frozen
 ) -> Path:
     """Estimate the poses of photos into the folder of a training run, unless an earlier call has done so.
 
@@ -35,7 +35,7 @@ def auto_pose(
         images: sub-folder of the photos to use.
         resume: the run is resumed, so the folder may have a run.
         overwrite: estimate again if there are poses.
-        report: called with the progress.
+        context: progress and stop.
 
     Returns:
         The folder of the scene.
@@ -51,7 +51,7 @@ def auto_pose(
         raise HyrfError(f"{run}: the run would lie among the photos", fix="name another folder")
     with exclusive_folder(run):
         _check_run_folder(source, run, overwrite=overwrite or resume)
-        _estimate_unless_posed(source.path, scene, overwrite, report)
+        _estimate_unless_posed(source.path, scene, overwrite, context)
     return scene
 
 
@@ -61,9 +61,7 @@ def _check_run_folder(source: Source, run: Path, *, overwrite: bool) -> None:
         outputs.folder(run, [MODEL_FILE, CHECKPOINT_FILE, METRICS_FILE])
 
 
-def _estimate_unless_posed(
-    photos: Path, scene: Path, overwrite: bool, report: Callable[[Progress], None] | None
-) -> None:
+def _estimate_unless_posed(photos: Path, scene: Path, overwrite: bool, context: RunContext) -> None:
     """Estimate poses into the folder of a scene, unless it has poses and `overwrite` is not set."""
     from hyrfpack.poses import estimate_poses
 
@@ -72,7 +70,5 @@ def _estimate_unless_posed(
             f"poses are taken from {scene}, where they were estimated before; `overwrite=True` estimates them anew"
         )
         return
-    reporter = Reporter(["poses"], report)
-    reporter.begin("poses")
-    with interruptible():
-        estimate_poses(photos, scene, overwrite=overwrite, report=reporter.report_share)
+    with interruptible(), context.open_progress("poses") as progress:
+        estimate_poses(photos, scene, overwrite=overwrite, report=report_to(progress))

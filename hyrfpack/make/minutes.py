@@ -26,10 +26,11 @@ from hyrfpack.make.plan import (
 from hyrfpack.make.progress import Reporter
 from hyrfpack.make.source import LoadSettings
 from hyrfpack.model import HybridModel
+from hyrfpack.progress import part_of_progress
 from hyrfpack.render import render_view
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Camera, Scene, evenly_spaced
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer
-from hyrfpack.train.decisions import decide, is_budget_open, max_pilot_steps
+from hyrfpack.train.decisions import decide, is_budget_open
 from hyrfpack.train.setup import budget_for
 
 _LOG = logging.getLogger(__name__)
@@ -167,12 +168,7 @@ def fit_plan_to_minutes(
     config = dataclasses.replace(requested, steps=cost.max_steps_within(chosen_scene, end - monotonic())).train_config(
         seed
     )
-    max_steps = max(max_pilot_steps(chosen_scene, config), 1)
-
-    def report_pilot_step(step: int, loss: float, mse: float, gaussians: int) -> None:
-        reporter.update(0.6 + 0.4 * step / max_steps, "pilot runs for exposure compensation and Gaussian budget")
-
-    decisions = decide(chosen_scene, config, cache, device, report_pilot_step)
+    decisions = decide(chosen_scene, config, cache, device, part_of_progress(reporter.report_event, 0.6, 1.0))
     assert decisions is not None  # None is only returned if the run is stopped, which nothing does here
     factor = decisions.config.budget_factor
     if is_budget_open(config) and factor is None:

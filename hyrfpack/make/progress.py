@@ -4,46 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from time import monotonic
+
+from hyrfpack.progress import Event, Progress, StageEvent, TaskEvent
+from hyrfpack.progress.pace import SharePace
+from hyrfpack.progress.status import OVERDUE_TIME_RATIO
 
 # Training consists of pilot runs that decide settings, the run itself, and its scores and pictures.
 STAGE_PARTS = {"training": ("pilots", "training", "results")}
 PACED_PARTS = ("pilots", "training")  # all steps are alike, so their pace shows how fast the machine is
 UNPACED_PARTS = ("poses", "measurement")  # their time does not depend on the pace of training
-# The pace of a part is used once at least this share of the part and this time have passed.
-MIN_PACE_SHARE = 0.01
-MIN_PACE_SECONDS = 2.0
-MIN_SAMPLE_INTERVAL_SECONDS = 0.5
-MAX_SAMPLES = 200  # number of evenly spaced samples; there may be more, because the first ones are closer together
 FULL_TRUST_SECONDS = 20.0  # after this time only the measured pace counts, not the forecast
-OVERDUE_TIME_RATIO = 0.25  # an overdue part is expected to take this ratio of its elapsed time in addition
 # Limits of the slowdown, the ratio of measured to forecast seconds.
 MIN_SLOWDOWN = 0.1
 MAX_SLOWDOWN = 20.0
 # A busy machine slows training more than the stages after it, because a training step waits for all threads many times.
 SLOWDOWN_EXPONENT = 0.7
-
-
-@dataclass(frozen=True)
-class Progress:
-    """Progress of a pipeline.
-
-    Attributes:
-        stage: "poses", "measurement", "training", "compression", "export", "scoring" or "import".
-        place: number of the stage, counted from 1.
-        of: number of all stages.
-        share: share of the stage that is done, 0 to 1; 0 if it is unknown.
-        left: estimated seconds until all stages are done; None if there is no estimate yet.
-        words: descriptions of the current work, the most important first.
-    """
-
-    stage: str
-    place: int
-    of: int
-    share: float
-    left: float | None
-    words: tuple[str, ...] = ()
 
 
 class Reporter:
@@ -57,14 +33,15 @@ class Reporter:
         estimates: forecast seconds of parts by name, as far as known.
     """
 
-    def __init__(self, stages: Sequence[str], report: Callable[[Progress], None] | None) -> None:
+    def __init__(self, stages: Sequence[str], progress: Progress) -> None:
+        """Prepare to report the stages, whose names are in the order in which they run."""
         self.estimates: dict[str, float] = {}
         self._stages = tuple(stages)
-        self._report = report
+        self._progress = progress
         self._call_watcher: Callable[[], None] = lambda: None
         self._part = parts_of(stages[0])[0]
-        self._samples: list[tuple[float, float]] = []  # (time, share) of the current part
-        self._began, self._share, self._shown, self._slowdown = monotonic(), 0.0, 0.0, 1.0
+        self._pace = SharePace(monotonic())  # of the current part
+        self._share, self._shown, self._slowdown = 0.0, 0.0, 1.0
 
     @contextmanager
     def watched_by(self, watcher: Callable[[], None]) -> Iterator[None]:
@@ -82,7 +59,7 @@ class Reporter:
 
     def begin_part(self, part: str, *words: str) -> None:
         """Report that a part of the current stage begins or is restarted; its pace is measured from now on."""
-        self._part, self._began, self._samples = part, monotonic(), []
+        self._part, self._pace = part, SharePace(monotonic())
         self.update(0.0, *words)
 
     def skip(self, stage: str, seconds: float) -> None:
@@ -100,32 +77,29 @@ class Reporter:
         """
         self._call_watcher()
         self._share = share
-        if self._report is None:
-            return
         now = monotonic()
-        least = max(MIN_SAMPLE_INTERVAL_SECONDS, (now - self._began) / MAX_SAMPLES)
-        if share > 0 and (not self._samples or now - self._samples[-1][0] >= least):
-            self._samples.append((now, share))
+        self._pace.add(share, now)
         stage = stage_of(self._part)
         index, left = self._stages.index(stage), self._estimate_part_seconds(share, now)
         self._shown = max(self._shown, self._share_of_stage(share))
         if left is not None:
             left += sum(self._forecast(part) for part in self._later_parts())
-        self._report(Progress(stage, index + 1, len(self._stages), self._shown, left, words))
+        self._progress(StageEvent(stage, index + 1, len(self._stages), self._shown, left, words))
+
+    def report_event(self, event: Event) -> None:
+        """Report the progress of a call that does the current part; without a share, only its description."""
+        if isinstance(event, TaskEvent):
+            self.update(self._share if event.share is None else event.share, str(event))
 
     def report_share(self, doing: str, share: float) -> None:
         """Report progress with the arguments of a `hyrfpack.progress.Report`."""
         self.update(share, doing)
 
-    def say(self, sentence: str) -> None:
-        """Report a description of the current work without changing the share."""
-        self.update(self._share, sentence)
-
     def _estimate_part_seconds(self, share: float, now: float) -> float | None:
         """Estimate the seconds until the current part is done; None if there is neither a forecast nor a pace."""
-        elapsed = now - self._began
+        elapsed = now - self._pace.start
         forecast = self._forecast(self._part) if self._part in self.estimates else None
-        if (pace := self._pace(share, now)) is not None:
+        if (pace := self._pace.at(share, now)) is not None:
             measured, trust = (1 - share) / pace, min(1.0, elapsed / FULL_TRUST_SECONDS)
             if self._part in PACED_PARTS:
                 self._set_slowdown(1 / pace, self.estimates.get(self._part, 0.0))
@@ -136,14 +110,6 @@ class Reporter:
             return None
         # The longer a part has outlasted its forecast, the longer it is expected to take.
         return max(forecast * (1 - share) - (elapsed if share == 0 else 0.0), OVERDUE_TIME_RATIO * elapsed)
-
-    def _pace(self, share: float, now: float) -> float | None:
-        """Return the shares per second during the last half of the current part; None if too little is done."""
-        middle = now - (now - self._began) / 2
-        samples = self._samples or [(now, share)]
-        since, first = next((sample for sample in reversed(samples) if sample[0] <= middle), samples[0])
-        elapsed, done = now - since, share - first
-        return done / elapsed if done >= MIN_PACE_SHARE and elapsed >= MIN_PACE_SECONDS else None
 
     def _set_slowdown(self, seconds: float, forecast: float) -> None:
         """Set the slowdown of the machine from the measured and the forecast seconds of a paced part."""

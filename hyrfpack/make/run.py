@@ -10,26 +10,25 @@ from pathlib import Path
 from time import monotonic
 from typing import Any
 
-import torch
-
 from hyrfpack.checks import check_choice, check_float, check_int
 from hyrfpack.choices import PRESETS
 from hyrfpack.config.settings import LARGEST_SEED
+from hyrfpack.context import RunContext
 from hyrfpack.data import PictureCache
 from hyrfpack.data.folder import first_readable_photo, list_photos
-from hyrfpack.device import choose_device
 from hyrfpack.format import describe_file
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.make import stages
 from hyrfpack.make.held_out import score_note
 from hyrfpack.make.minutes import fit_plan_to_minutes
 from hyrfpack.make.plan import QUALITIES, Plan, estimate_photos_seconds, estimate_scene_seconds
-from hyrfpack.make.progress import Progress, Reporter
+from hyrfpack.make.progress import Reporter
 from hyrfpack.make.request import Request, default_work_folder
 from hyrfpack.make.source import LoadSettings, Source
 from hyrfpack.make.stage_cache import StageCache, Stopped, interruptible
 from hyrfpack.make.state import files_digest
 from hyrfpack.outputs import StrPath
+from hyrfpack.progress import Progress
 from hyrfpack.scene import Scene
 from hyrfpack.train import Trainer
 
@@ -100,10 +99,9 @@ def make_scene(
     max_gaussians: int | None = None,
     preset: str = "auto",
     seed: int = 0,
-    device: str | torch.device = "auto",
     overwrite: bool = False,
-    report: Callable[[Progress], None] | None = None,
     observer: Callable[[Trainer], None] | None = None,
+    context: RunContext = RunContext(),  # noqa: B008 - frozen
 ) -> MakeResult:
     """Make a scene from photos: estimate missing poses, train, compress, score on held-out photos, and export.
 
@@ -129,11 +127,10 @@ def make_scene(
         max_gaussians: see `hyrfpack.TrainConfig`; excludes `target_bytes`.
         preset: see `hyrfpack.TrainConfig`.
         seed: random seed, 0 to 2^64 - 1.
-        device: device for training and packing, see `hyrfpack.device.choose_device`.
         overwrite: replace an existing output. Without it, an output that appears during the call is also kept. A file
             then gets a free name beside it, which the result reports; a folder is an error.
-        report: called with the progress.
         observer: observer of the training, see `hyrfpack.train_model`.
+        context: device for training and packing, progress (`StageEvent`s), cache and stop; this process does all work.
 
     Returns:
         The output, the scores, and the reports of the stages.
@@ -174,7 +171,7 @@ def make_scene(
                 max_gaussians=max_gaussians,
                 preset=preset,
                 seed=seed,
-                device=choose_device(device),
+                device=context.choose_device(),
                 overwrite=overwrite,
             )
             request.check()
@@ -182,7 +179,8 @@ def make_scene(
                 exclusive_folder(request.work, "another folder with `work`"),
                 exclusive_folder(request.output) if request.makes_folder else nullcontext(),
             ):
-                return _Pipeline(request, began, report, observer).run()
+                with context.open_progress(interruptible=False) as progress:
+                    return _Pipeline(request, began, observer, context, progress).run()
         except Stopped:
             raise
         except KeyboardInterrupt as error:  # interrupted before or between the stages
@@ -196,15 +194,26 @@ class _Pipeline:
         self,
         request: Request,
         began: float,
-        report: Callable[[Progress], None] | None,
         observer: Callable[[Trainer], None] | None,
+        context: RunContext,
+        progress: Progress,
     ) -> None:
-        """Prepare the stages; `began` is the start of the call by the monotonic clock, in seconds."""
+        """Prepare the stages.
+
+        Args:
+            request: the checked arguments of the call.
+            began: start of the call by the monotonic clock, in seconds.
+            observer: observer of the training.
+            context: context of the call.
+            progress: function that gets the progress of all stages.
+        """
         self.observer = observer
         self.request = request
         self.source = request.source
         self.began = began
-        self.reporter = Reporter(request.stages, report)
+        self.reporter = Reporter(request.stages, progress)
+        self.cache = context.cache or PictureCache()
+        self.context = replace(context, device=request.device, progress=self.reporter.report_event, cache=self.cache)
         self.stage_cache = StageCache(request.work, self.reporter, request.check_replacing)
 
     def run(self) -> MakeResult:
@@ -232,12 +241,11 @@ class _Pipeline:
         else:
             for sentence in scene.notes:
                 _LOG.info(sentence)
-        cache = PictureCache()
-        plan, scene = self._decide_plan(path, reading, scene, cache)
+        plan, scene = self._decide_plan(path, reading, scene)
         if request.minutes is None:
             self.reporter.estimates |= estimate_scene_seconds(scene, plan, request.device)
         training = stages.run_training_stage(
-            stage_cache, scene, self._scene_digest(scene), plan, request.seed, request.device, cache, self.observer
+            stage_cache, scene, self._scene_digest(scene), plan, request.seed, self.observer, self.context
         )
         stages.run_compression_stage(stage_cache, scene, plan, request.device)
         return self._finish(stage_cache.folder / stages.PACKED_MODEL, scene, poses=poses, training=training)
@@ -274,7 +282,7 @@ class _Pipeline:
             request.preset,
         )
 
-    def _decide_plan(self, path: Path, reading: LoadSettings, scene: Scene, cache: PictureCache) -> tuple[Plan, Scene]:
+    def _decide_plan(self, path: Path, reading: LoadSettings, scene: Scene) -> tuple[Plan, Scene]:
         """Return the requested plan or the one that fits the minutes, and the scene at the plan's photo size."""
         request = self.request
         if request.minutes is None:
@@ -287,7 +295,7 @@ class _Pipeline:
         def execute(resuming: bool) -> tuple[dict[str, Any], list[str]]:
             requested = replace(self._requested_plan(), finetune_steps=0)
             plan = fit_plan_to_minutes(
-                path, reading, scene, requested, request.device, end, request.seed, cache, self.reporter
+                path, reading, scene, requested, request.device, end, request.seed, self.cache, self.reporter
             )
             return asdict(plan), []
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import math
 import os
 import shutil
 from collections.abc import Callable, Sequence
@@ -16,8 +15,8 @@ import torch
 
 from hyrfpack.atomic import pending_file
 from hyrfpack.compress import compress_model
+from hyrfpack.context import RunContext
 from hyrfpack.copying import copy_file
-from hyrfpack.data import PictureCache
 from hyrfpack.device import describe_device
 from hyrfpack.distill import DistillConfig, import_splats
 from hyrfpack.errors import HyrfError, HyrfSizeError
@@ -30,10 +29,10 @@ from hyrfpack.make.progress import Reporter
 from hyrfpack.make.stage_cache import PRODUCT_NAMES, StageCache
 from hyrfpack.make.state import file_digest, files_digest
 from hyrfpack.outputs import Outputs
+from hyrfpack.progress import Event, StepEvent, TaskEvent
+from hyrfpack.progress.status import StepMeans, format_psnr
 from hyrfpack.scene import Scene
 from hyrfpack.train import Trainer, train_model
-from hyrfpack.train.decisions import max_pilot_steps
-from hyrfpack.train.progress import RUNNING_MEAN_WEIGHT, format_psnr
 from hyrfpack.train.run import is_begun
 
 _LOG = logging.getLogger(__name__)
@@ -89,9 +88,8 @@ def run_training_stage(
     data: str,
     plan: Plan,
     seed: int,
-    device: torch.device,
-    picture_cache: PictureCache,
     observer: Callable[[Trainer], None] | None,
+    context: RunContext,
 ) -> dict[str, Any]:
     """Train into `run/`; return the numbers of steps and Gaussians, the decisions made, and other facts.
 
@@ -115,14 +113,14 @@ def run_training_stage(
         if not (resuming and _is_run_finished(run)):
             _LOG.info(
                 f"training: {plan.steps:,} steps on {len(scene.train)} photos, {len(scene.test)} held out; "
-                f"on {describe_device(device)}"
+                f"on {describe_device(context.choose_device())}"
             )
             resume = resuming and is_begun(run)
-            progress = _TrainingProgress(stage_cache.reporter, plan.steps, max_pilot_steps(scene, config))
+            progress = _TrainingProgress(stage_cache.reporter).report_event
             try:
                 trained = train_model(
-                    scene, run, config, resume=resume, overwrite=True, cache=picture_cache, device=device, quiet=True,
-                    report=progress.step, phase=progress.phase, observer=observer,
+                    scene, run, config, resume=resume, overwrite=True, observer=observer,
+                    context=replace(context, progress=progress),
                 )  # fmt: skip
             except HyrfError as error:  # the fix of this error refers to the command `train`
                 raise error.__cause__ if isinstance(error.__cause__, HyrfError) else error from None
@@ -158,32 +156,24 @@ def _split_inputs(scene: Scene) -> dict[str, Any]:
 class _TrainingProgress:
     """Reports the parts of a training run: pilot runs, steps, then scores and pictures."""
 
-    def __init__(self, reporter: Reporter, steps: int, max_pilot_steps: int) -> None:
-        """Prepare for `steps` training steps, and at most `max_pilot_steps` steps of all pilot runs together."""
-        self._reporter, self._steps, self._max_pilot_steps = reporter, steps, max_pilot_steps
-        self._part, self._pilot_steps, self._mse = "pilots", 0, math.nan
+    def __init__(self, reporter: Reporter) -> None:
+        self._reporter, self._part, self._means = reporter, "pilots", StepMeans()
 
-    def step(self, step: int, loss: float, mse: float, gaussians: int) -> None:
-        """Report a step, as the `report` argument of `hyrfpack.train_model`; its number is 0 during pilot runs."""
-        if step == 0:
-            self._pilot_steps += 1
-            self._reporter.update(min(1.0, self._pilot_steps / max(self._max_pilot_steps, 1)), "pilot runs")
-            return
-        self._begin("training")
-        if not math.isnan(mse):
-            weight = 1.0 if math.isnan(self._mse) else RUNNING_MEAN_WEIGHT
-            self._mse = mse if weight == 1 else weight * mse + (1 - weight) * self._mse
-        quality = () if math.isnan(self._mse) else (format_psnr(self._mse),)
-        self._reporter.update(step / self._steps, f"step {step}/{self._steps}", *quality, f"{gaussians:,} Gaussians")
-        if step == self._steps:
-            self._begin("results")
-
-    def phase(self, what: str, done: int, total: int) -> None:
-        """Report other work, as the `phase` argument of `train_model`; after the last step it sets the progress."""
-        if self._part == "results" and total:
-            self._reporter.update(done / total, f"{what} {done}/{total}")
-        else:
-            self._reporter.say(f"{what} {done}/{total}" if total else what)
+    def report_event(self, event: Event) -> None:
+        """Report an event of `hyrfpack.train_model`."""
+        if isinstance(event, StepEvent):
+            self._begin("training")
+            self._means.add(event)
+            quality = () if self._means.mse is None else (format_psnr(self._means.mse),)
+            self._reporter.update(
+                event.step / event.steps, f"step {event.step}/{event.steps}", *quality, f"{event.gaussians:,} Gaussians"
+            )
+            if event.step == event.steps:
+                self._begin("results")
+        elif isinstance(event, TaskEvent):
+            if self._part == "results" and event.total:
+                event = replace(event, share=event.done / event.total)
+            self._reporter.report_event(event)
 
     def _begin(self, part: str) -> None:
         if part != self._part:  # each part has a pace of its own

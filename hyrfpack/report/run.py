@@ -14,7 +14,7 @@ from hyrfpack.format import describe_file
 from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
 from hyrfpack.outputs import StrPath
 from hyrfpack.render.files import unique_stems
-from hyrfpack.train.run import VIEWS_FOLDER
+from hyrfpack.train.results import VIEWS_FOLDER
 
 # Steps, counts, sizes and times of real runs are smaller; a larger number means that the metrics are damaged.
 MAX_NUMBER = 1e15

@@ -3,8 +3,9 @@
 from hyrfpack.choices import PRESETS
 from hyrfpack.config.train import DensityConfig, LearningRates, TrainConfig
 from hyrfpack.train.density import DensityControl
+from hyrfpack.train.finish import TrainResult
 from hyrfpack.train.photos import load_training_scene
-from hyrfpack.train.run import TrainResult, train_model
+from hyrfpack.train.run import train_model
 from hyrfpack.train.strategy import Strategy
 from hyrfpack.train.trainer import Trainer
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -16,9 +17,15 @@ from hyrfpack.atomic import write_atomic
 from hyrfpack.config.settings import list_settings
 from hyrfpack.config.train import TrainConfig
 from hyrfpack.errors import HyrfTrainingError
+from hyrfpack.scene import View
 
 CHECKPOINT_VERSION = 2
 DIGEST_BYTES = 32  # The file ends with the SHA-256 digest of everything before it.
+
+
+def names_and_sizes(views: Sequence[View]) -> list[list]:
+    """Return [name, width, height] of each photo, in pixels, to recognise the photos of a run."""
+    return [[view.name, view.camera.width, view.camera.height] for view in views]
 
 
 def save_checkpoint(

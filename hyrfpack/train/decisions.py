@@ -10,6 +10,7 @@ import torch
 
 from hyrfpack.config.train import TrainConfig
 from hyrfpack.data import PictureCache
+from hyrfpack.progress import Progress, ignore_progress
 from hyrfpack.scene import Scene
 from hyrfpack.train.budget_pilots import BUDGET_PILOT_STEPS, MAX_BUDGET_ROUNDS, measure_budget
 from hyrfpack.train.exposure_pilots import (
@@ -17,7 +18,7 @@ from hyrfpack.train.exposure_pilots import (
     exposure_rounds,
     measure_exposure,
 )
-from hyrfpack.train.pilots import MIN_TRAINING_VIEWS, Phase, PilotScore, PilotsStopped, Report, ScenePilots
+from hyrfpack.train.pilots import MIN_TRAINING_VIEWS, PilotScore, PilotsStopped, ScenePilots
 
 # Shorter runs have no pilots, which would take too large a part of their time.
 MIN_BUDGET_STEPS = 2_000
@@ -77,14 +78,13 @@ def decide(
     config: TrainConfig,
     cache: PictureCache,
     device: torch.device,
-    report: Report = lambda step, loss, mse, gaussians: None,
+    progress: Progress = ignore_progress,
     stop: Callable[[], bool] = lambda: False,
-    phase: Phase = lambda what, done, total: None,
 ) -> Decisions | None:
     """Decide by pilot runs what the settings leave open: first exposure compensation, then the budget.
 
     Args:
-        scene, config, cache, device, report, stop, phase: see `ScenePilots`.
+        scene, config, cache, device, progress, stop: see `ScenePilots`.
 
     Returns:
         The decisions; None if `stop` ended the pilots.
@@ -93,7 +93,7 @@ def decide(
         HyrfError: as `Trainer.run`; a photo cannot be read.
     """
     decided = without_pilots(config).config
-    pilots = ScenePilots(scene, decided, cache, device, report, stop, phase)
+    pilots = ScenePilots(scene, decided, cache, device, progress, stop, max_pilot_steps(scene, config))
     reasons: dict[str, str] = {}
     try:
         if measures_exposure(scene, config):

@@ -16,8 +16,9 @@ import torch
 
 from hyrfpack.atomic import describe_rename, numbered_names
 from hyrfpack.errors import HyrfError
-from hyrfpack.evaluate.metrics import psnr_from_mse
-from hyrfpack.train.progress import Pace
+from hyrfpack.measure.psnr import psnr_from_mse
+from hyrfpack.progress import StepEvent
+from hyrfpack.progress.pace import StepPace
 from hyrfpack.train.trainer import is_recorded
 
 _LOG = logging.getLogger(__name__)
@@ -55,8 +56,8 @@ class TrainingLog:
             HyrfError: the file cannot be written.
         """
         self.steps, self.device = steps, device
-        self.pace = Pace(steps, done)
         self.start = self.last = time.monotonic()
+        self.pace = StepPace(steps, done, self.start)
         self.losses: list[float] = []
         self.errors: list[float] = []
         try:
@@ -72,23 +73,23 @@ class TrainingLog:
             _LOG.warning(describe_rename(path, self.path))
         self.scalars = _summary_writer(self.path)
 
-    def step(self, step: int, loss: float, mse: float, gaussians: int) -> None:
+    def step(self, event: StepEvent) -> None:
         """Add a finished step, and write a record if one is due."""
         now = time.monotonic()
-        speed, left = self.pace.at(step, now)
-        if mse == mse:  # The mean squared error is NaN if all of the photo is masked.
-            self.losses.append(loss)
-            self.errors.append(mse)
-        if not (is_recorded(step, self.steps) or now - self.last >= MAX_RECORD_INTERVAL_SECONDS):
+        speed, left = self.pace.at(event.step, now)
+        if event.mse == event.mse:  # The mean squared error is NaN if all of the photo is masked.
+            self.losses.append(event.loss)
+            self.errors.append(event.mse)
+        if not (is_recorded(event.step, self.steps) or now - self.last >= MAX_RECORD_INTERVAL_SECONDS):
             return
         count = len(self.errors)
         record = {
             "event": "step",
-            "step": step,
+            "step": event.step,
             "steps": self.steps,
             "loss": sum(self.losses) / count if count else None,
             "psnr": psnr_from_mse(sum(self.errors) / count) if count else None,
-            "gaussians": gaussians,
+            "gaussians": event.gaussians,
             "memory_bytes": peak_memory(),
             "gpu_memory_bytes": torch.cuda.max_memory_allocated(self.device) if self.device.type == "cuda" else None,
             "steps_per_second": speed,
@@ -102,7 +103,7 @@ class TrainingLog:
         if self.scalars is not None:
             for name in SCALAR_NAMES:
                 if record[name] is not None:
-                    self.scalars.add_scalar(f"train/{name}", record[name], step)
+                    self.scalars.add_scalar(f"train/{name}", record[name], event.step)
 
     def end(self, *, complete: bool, step: int, **facts: Any) -> None:
         """Write the last record: whether the run is complete, and facts about the result."""

@@ -14,6 +14,7 @@ import torch
 from hyrfpack.config.train import TrainConfig
 from hyrfpack.data import PictureCache
 from hyrfpack.evaluate import Evaluation, evaluate_model
+from hyrfpack.progress import Progress, TaskEvent, ignore_progress
 from hyrfpack.scene import Picture, Scene, View, evenly_spaced
 from hyrfpack.train.setup import budget_for
 from hyrfpack.train.trainer import Trainer
@@ -22,11 +23,6 @@ BUDGET_REFERENCE_STEPS = 500  # By default a pilot has the budget of a run of th
 MAX_TRAINING_VIEWS = 150  # The shortest pilots have too few steps for more photos.
 MAX_VALIDATION_VIEWS = 8
 MIN_TRAINING_VIEWS = 8  # With fewer photos, none can be spared for validation.
-
-# Called with step, loss, mean squared error and number of Gaussians.
-Report = Callable[[int, float, float, int], None]
-# Called with the name of the current task, the number of items done, and that of all items (0 if unknown).
-Phase = Callable[[str, int, int], None]
 
 
 class PilotsStopped(Exception):
@@ -85,9 +81,9 @@ class ScenePilots:
         config: TrainConfig,
         cache: PictureCache,
         device: torch.device,
-        report: Report = lambda step, loss, mse, gaussians: None,
+        progress: Progress = ignore_progress,
         stop: Callable[[], bool] = lambda: False,
-        phase: Phase = lambda what, done, total: None,
+        max_steps: int = 0,
     ) -> None:
         """Start without any scores.
 
@@ -96,13 +92,12 @@ class ScenePilots:
             config: settings of the main run.
             cache: cache of decoded photos.
             device: where to train.
-            report: called after each step with its number, counted over all pilots, the loss and mean squared error of
-                its view, and the number of Gaussians.
+            progress: called with `TaskEvent`s, which have the number of steps, photos or views done, and that of all.
             stop: called after each step; True ends the pilots.
-            phase: called with the name of the current task, the number of steps, photos or views done, and that of all.
+            max_steps: most steps that all pilots take; if given, the events of steps have the share of them.
         """
         self.scene, self.config, self.cache = scene, config, cache
-        self._device, self._report, self._stop, self._phase = device, report, stop, phase
+        self._device, self._progress, self._stop, self._max_steps = device, progress, stop, max_steps
         self.scores: list[PilotScore] = []
         self.steps = 0
 
@@ -118,7 +113,7 @@ class ScenePilots:
         training, views = split(self.scene.train, every, max_validation, number)
         validation: list[View] = []
         for done, view in enumerate(views):
-            self._phase("reading validation photos", done, len(views))
+            self._progress(TaskEvent("reading validation photos", done=done, total=len(views)))
             if is_usable(self.cache.get(view)):
                 validation.append(view)
         scene = dataclasses.replace(self.scene, train=training, test=[])
@@ -149,14 +144,14 @@ class ScenePilots:
             budget_factor=None,
             target_bytes=None,
         )
-        self._phase(f"{name}: reading photos", 0, 0)
+        self._progress(TaskEvent(f"{name}: reading photos"))
         trainer = Trainer(fold.scene, settings, self.cache, self._device)
         before = self.steps
 
         def report_step(trainer: Trainer, loss: float, mse: float) -> None:
             self.steps = before + trainer.step
-            self._report(self.steps, loss, mse, len(trainer.model))
-            self._phase(f"{name}: training", trainer.step, steps)
+            share = min(1.0, self.steps / self._max_steps) if self._max_steps else None
+            self._progress(TaskEvent(f"{name}: training", share, trainer.step, steps))
 
         trainer.run(report=report_step, stop=self._stop)
         if self._stop():
@@ -165,7 +160,9 @@ class ScenePilots:
         result: Evaluation = evaluate_model(
             trainer.model,
             fold.validation,
-            report=lambda _, share: self._phase(f"{name}: scoring", round(share * count), count),
+            report=lambda _, share: self._progress(
+                TaskEvent(f"{name}: scoring", done=round(share * count), total=count)
+            ),
         )
         score = PilotScore(
             steps=steps,

@@ -11,7 +11,6 @@ import dataclasses
 import hashlib
 import json
 import statistics
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,8 +29,10 @@ from hyrfpack.evaluate.figures import draw_training_curve
 from hyrfpack.format.codec import write_model
 from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
 from hyrfpack.model import HybridModel
+from hyrfpack.progress import Progress, TaskEvent
 from hyrfpack.render import render_view
 from hyrfpack.scene import Scene, evenly_spaced
+from hyrfpack.train.checkpoint import names_and_sizes
 from hyrfpack.train.decisions import is_budget_open
 from hyrfpack.train.trainer import Trainer
 
@@ -39,9 +40,6 @@ CURVE_FILE, VIEWS_FOLDER, RECORD_FILE = "curve.png", "views", "training.json"
 RECORD_VERSION = 1
 MIN_BACKGROUND_LIGHT_SHARE = 1e-3  # A background sphere is removed if every view gets less of its light from it.
 MAX_BACKGROUND_VIEWS = 16  # At most this many training views decide whether it is removed.
-
-# Called with the name of the current task, the number of items done, and that of all items (0 if unknown).
-Phase = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)
@@ -110,7 +108,7 @@ def changed_settings(record: TrainingRecord, scene: Scene, config: TrainConfig) 
     return sorted(key for key in keys if asked.get(key) != record.settings.get(key))
 
 
-def save_model(trainer: Trainer, out: Path, phase: Phase, *, overwrite: bool) -> TrainingRecord:
+def save_model(trainer: Trainer, out: Path, progress: Progress, *, overwrite: bool) -> TrainingRecord:
     """Write the model of a finished run and its training record, and remove results of an earlier model.
 
     The record is written first, so that a model has its record even if the disk becomes full. If only the record cannot
@@ -119,7 +117,7 @@ def save_model(trainer: Trainer, out: Path, phase: Phase, *, overwrite: bool) ->
     Args:
         trainer: the trainer of the finished run.
         out: the run's folder.
-        phase: called with the name of the current task, the number of items done, and that of all items.
+        progress: called with `TaskEvent`s.
         overwrite: replace and remove files of an earlier run. Without it, a file that appeared at the model's name
             during the run is kept, and the model gets a free name beside it.
 
@@ -133,8 +131,8 @@ def save_model(trainer: Trainer, out: Path, phase: Phase, *, overwrite: bool) ->
             f"{scene.path}: the masks leave no pixels in the photos of all {trainer.steps:,} steps",
             fix="use at least as many `steps` as there are photos",
         )
-    model = _drop_unseen_background(trainer, phase)
-    phase("writing the model", 0, 0)
+    model = _drop_unseen_background(trainer, progress)
+    progress(TaskEvent("writing the model"))
     provenance = {
         "steps": config.steps,
         "seed": config.seed,
@@ -196,7 +194,7 @@ def write_results(
     out: Path,
     config: TrainConfig,
     device: torch.device,
-    phase: Phase,
+    progress: Progress,
     *,
     overwrite: bool,
 ) -> Results:
@@ -210,7 +208,7 @@ def write_results(
         out: the run's folder.
         config: settings of the run.
         device: where to render.
-        phase: called with the name of the current task, the number of items done, and that of all items.
+        progress: called with `TaskEvent`s.
         overwrite: replace files at the results' names; without it they are kept.
     """
     metrics, missing, reasons = dict(record.metrics), [], []
@@ -227,7 +225,9 @@ def write_results(
                 scene.test,
                 pictures=out / VIEWS_FOLDER,
                 overwrite=overwrite,
-                report=lambda _, share: phase("scoring held-out photos", round(share * photos), photos),
+                report=lambda _, share: progress(
+                    TaskEvent("scoring held-out photos", done=round(share * photos), total=photos)
+                ),
                 unwritten=unwritten,
             )
             metrics["evaluation"] = scores.to_dict()
@@ -237,7 +237,7 @@ def write_results(
         if unwritten or not is_scored:
             missing.append(VIEWS_FOLDER)
             reasons += unwritten
-    phase(f"drawing {CURVE_FILE}", 0, 0)
+    progress(TaskEvent(f"drawing {CURVE_FILE}"))
     try:
         draw_training_curve(metrics["curve"], out / CURVE_FILE, overwrite=overwrite)
     except HyrfError as error:
@@ -258,8 +258,8 @@ def write_results(
 
 def _settings_of(scene: Scene, config: TrainConfig) -> dict[str, Any]:
     """Return the plain values that must be the same when a later call completes the results."""
-    views = [[view.name, view.camera.width, view.camera.height] for view in scene.train]
-    return {**config.to_dict(), "views": views, "held-out views": [view.name for view in scene.test]}
+    held_out = [view.name for view in scene.test]
+    return {**config.to_dict(), "views": names_and_sizes(scene.train), "held-out views": held_out}
 
 
 def _picture_files(scene: Scene) -> list[str]:
@@ -273,7 +273,7 @@ def _remove(path: Path) -> None:
 
 
 @torch.no_grad()
-def _drop_unseen_background(trainer: Trainer, phase: Phase) -> HybridModel:
+def _drop_unseen_background(trainer: Trainer, progress: Progress) -> HybridModel:
     """Return the model, without its background sphere if the training cameras get hardly any light from it."""
     model = trainer.model
     if not model.config.background:
@@ -281,7 +281,7 @@ def _drop_unseen_background(trainer: Trainer, phase: Phase) -> HybridModel:
     views = evenly_spaced(trainer.scene.train, MAX_BACKGROUND_VIEWS)
     seen = 0.0
     for done, view in enumerate(views):
-        phase("measuring the share of the background", done, len(views))
+        progress(TaskEvent("measuring the share of the background", done=done, total=len(views)))
         seen = max(seen, float((1 - render_view(model, view.camera, background=False).alpha).mean()))
     if seen >= MIN_BACKGROUND_LIGHT_SHARE:
         trainer.choices["background"] += f"; up to {seen:.1%} of a view's light comes from it"

@@ -19,8 +19,8 @@ from hyrfpack.config.train import TrainConfig
 from hyrfpack.data import PictureCache
 from hyrfpack.device import Photos, upload_array
 from hyrfpack.errors import HyrfError, HyrfTrainingError
-from hyrfpack.evaluate.metrics import psnr_from_mse
 from hyrfpack.format.exposure_header import STOPS_PER_LOG_GAIN
+from hyrfpack.measure.psnr import psnr_from_mse
 from hyrfpack.model import HybridModel
 from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.ops.ssim import photometric_loss
@@ -28,7 +28,7 @@ from hyrfpack.parallel.pool import keep_freed_memory, torch_on_one_thread
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.scene import Picture, Scene, View
-from hyrfpack.train.checkpoint import load_checkpoint, save_checkpoint
+from hyrfpack.train.checkpoint import load_checkpoint, names_and_sizes, save_checkpoint
 from hyrfpack.train.density import DensityControl
 from hyrfpack.train.distributed import StepStats, average_gradients, check_settings, digest, pack_step_stats
 from hyrfpack.train.exposure import exposures_for
@@ -327,7 +327,7 @@ class Trainer:
     # -- state ---------------------------------------------------------------------------------------------------
 
     def _settings(self) -> dict:
-        views = [[view.name, view.camera.width, view.camera.height] for view in self.scene.train]
+        views = names_and_sizes(self.scene.train)
         chosen = {"exposure": self.exposures is not None, "model": self.model.config.to_dict()}
         if not self.ranks.is_single:
             chosen["processes"] = self.ranks.size

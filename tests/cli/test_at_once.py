@@ -18,7 +18,7 @@ import pytest
 from commands import hyrfpack as run_command
 from commands import refused, succeeded
 from explicit_balls import ball_splats
-from scenes import ring
+from scenes import QUIET_CONTEXT, ring
 
 import hyrfpack
 from hyrfpack.compress import CompressionReport
@@ -317,7 +317,7 @@ def test_a_command_is_rejected_in_a_locked_folder_and_changes_nothing(command, w
 
 # Functions of the library that write into a folder.
 CALLS_THAT_WRITE_A_FOLDER = {
-    "train": lambda: hyrfpack.train_model(load_scene("data"), "out", TrainConfig(steps=2), quiet=True),
+    "train": lambda: hyrfpack.train_model(load_scene("data"), "out", TrainConfig(steps=2), context=QUIET_CONTEXT),
     "estimate_poses": lambda: hyrfpack.estimate_poses("photos", "out"),
     "evaluate": lambda: hyrfpack.evaluate_model(load_model("model.hyrf"), load_scene("data").test, pictures="out"),
     "export": lambda: hyrfpack.export_model("model.hyrf", "out"),

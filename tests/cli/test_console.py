@@ -233,7 +233,7 @@ def test_progress_that_cannot_be_printed_does_not_end_the_work(monkeypatch):
     disk, failures = FullDisk(), []
     monkeypatch.setattr(sys, "stderr", disk)
     monkeypatch.setattr("threading.excepthook", failures.append)
-    monkeypatch.setattr("hyrfpack.make.display.LOG_INTERVAL_SECONDS", 0.01)
+    monkeypatch.setattr("hyrfpack.progress.lines.LOG_INTERVAL_SECONDS", 0.01)
     shown = [number for number in show_item_progress(range(2), 2, "render", "picture") if disk.tried.wait(10)]
     assert shown == [0, 1] and not failures
 

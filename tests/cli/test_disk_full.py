@@ -23,9 +23,10 @@ import numpy as np
 import pytest
 from commands import hyrfpack
 from PIL import Image
-from scenes import ball_scene
+from scenes import QUIET_CONTEXT, ball_scene
 
 from hyrfpack import format as hyrf_format
+from hyrfpack.context import RunContext
 from hyrfpack.data import PictureCache
 from hyrfpack.errors import HyrfError
 from hyrfpack.train import TrainConfig, Trainer, train_model
@@ -231,13 +232,13 @@ def test_a_disk_that_fills_in_training_keeps_the_checkpoint_and_resumes_to_the_s
             SHORT_CONFIG,
             overwrite=True,
             cache=PictureCache(0),
-            quiet=True,
+            context=QUIET_CONTEXT,
         )
 
     assert files_in(out).keys() == {"model.hyrf", "checkpoint.pt"} and (out / "model.hyrf").read_bytes() == b"old"
     assert 10 <= int(re.search(r"checkpoint of step (\d+)", str(e.value))[1]) <= 30
     (disk / "ballast").unlink()
-    result = train_model(balls_with_counted_loads(), out, SHORT_CONFIG, resume=True, quiet=True)
+    result = train_model(balls_with_counted_loads(), out, SHORT_CONFIG, resume=True, context=QUIET_CONTEXT)
     for name, parameter in hyrf_format.load_model(result.model).named_parameters():
         np.testing.assert_array_equal(parameter.detach(), dict(whole.model.named_parameters())[name].detach())
 
@@ -271,7 +272,7 @@ def test_a_folder_removed_while_training_is_created_again_for_the_model(tmp_path
     out = tmp_path / "run"
     scene = balls_with_counted_loads(lambda count: shutil.rmtree(out, ignore_errors=True) if count >= 20 else None)
 
-    result = train_model(scene, out, SHORT_CONFIG, cache=PictureCache(0), quiet=True)
+    result = train_model(scene, out, SHORT_CONFIG, context=RunContext(cache=PictureCache(0), progress=None))
 
     assert result.complete and hyrf_format.load_model(out / "model.hyrf") is not None
     assert json.loads((out / "metrics.json").read_text())["settings"]["seed"] == 1
@@ -300,7 +301,7 @@ class FullLog(io.StringIO):
 
 
 def test_log_on_a_full_disk_does_not_end_the_training(monkeypatch, tmp_path):
-    monkeypatch.setattr("hyrfpack.train.progress.LOG_INTERVAL_SECONDS", 0.0)
+    monkeypatch.setattr("hyrfpack.progress.lines.LOG_INTERVAL_SECONDS", 0.0)
     monkeypatch.setattr("sys.stderr", FullLog())
 
     result = train_model(balls_with_counted_loads(), tmp_path, dataclasses.replace(SHORT_CONFIG, steps=2))

@@ -22,7 +22,8 @@ from hyrfpack.evaluate.figures import (
     split_comparison,
 )
 from hyrfpack.evaluate.lpips import LPIPS
-from hyrfpack.evaluate.metrics import IDENTICAL_PSNR, psnr, ssim, to_8bit
+from hyrfpack.evaluate.metrics import psnr, ssim, to_8bit
+from hyrfpack.measure.psnr import IDENTICAL_PSNR
 from hyrfpack.render.files import render_files
 from hyrfpack.scene import Picture, View
 

@@ -12,7 +12,8 @@ from scenes import ball_points, ball_scene, small_model
 
 from hyrfpack.evaluate import evaluate_model
 from hyrfpack.evaluate.exposure import correct_colors, fit_gains
-from hyrfpack.evaluate.metrics import IDENTICAL_PSNR, psnr, ssim, to_8bit
+from hyrfpack.evaluate.metrics import psnr, ssim, to_8bit
+from hyrfpack.measure.psnr import IDENTICAL_PSNR
 from hyrfpack.model import HybridModel
 from hyrfpack.model.exposure import apply_exposure_gains
 from hyrfpack.render import RenderSettings, render_view

@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from scenes import ball_scene
+from scenes import QUIET_CONTEXT, ball_scene
 
 from hyrfpack import compress_model
 from hyrfpack.cameras.capture import quantized_provenance
@@ -24,7 +24,7 @@ def tiny_file_and_provenance(tmp_path_factory):
     """Pack a model of few Gaussians as coarsely as possible; return its file and the provenance in it."""
     folder = tmp_path_factory.mktemp("tiny")
     scene = ball_scene(6)
-    train_model(scene, folder, TrainConfig(steps=3, max_gaussians=20), quiet=True)
+    train_model(scene, folder, TrainConfig(steps=3, max_gaussians=20), context=QUIET_CONTEXT)
     compress_model(folder / "model.hyrf", folder / "small.hyrf", data=scene, distortion=DISTORTION_RANGE[1])
     model, provenance = load_with_provenance(folder / "model.hyrf")
     return folder / "small.hyrf", quantized_provenance(provenance, model.config.frame.scale)
@@ -62,7 +62,9 @@ def test_a_target_at_the_bound_is_allowed():
 def test_training_for_an_impossible_file_size_is_refused_before_anything_is_written(tiny_file_and_provenance, tmp_path):
     scene = dataclasses.replace(ball_scene(6), points=np.zeros((0, 3)), point_colors=np.zeros((0, 3), np.float32))
     with pytest.raises(HyrfError, match="did you mean 10MB"):
-        train_model(scene, tmp_path / "run", TrainConfig(steps=3, target_bytes=10), quiet=True)
+        train_model(scene, tmp_path / "run", TrainConfig(steps=3, target_bytes=10), context=QUIET_CONTEXT)
     assert not (tmp_path / "run").exists()
     with pytest.raises(HyrfError, match="below the smallest possible file"):  # the file would contain cameras too
-        train_model(scene, tmp_path / "run", TrainConfig(steps=3, target_bytes=min_file_bytes() + 1), quiet=True)
+        train_model(
+            scene, tmp_path / "run", TrainConfig(steps=3, target_bytes=min_file_bytes() + 1), context=QUIET_CONTEXT
+        )

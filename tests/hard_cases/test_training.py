@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pytest
 import torch
-from scenes import ball_scene, camera_at, photograph, ring, view_of, visible_points_by_photo
+from scenes import QUIET_CONTEXT, ball_scene, camera_at, photograph, ring, view_of, visible_points_by_photo
 
 from hyrfpack import TrainConfig, evaluate_model, load_scene, train_model
 from hyrfpack.compress import compress_model
@@ -350,6 +350,8 @@ def test_photos_that_are_all_masked_are_rejected_with_a_clear_error(tmp_path):
         HyrfTrainingError,
         match="balls: the masks of all [0-9]+ photos to train on leave no pixels .for example, 000.png.; check",
     ):
-        train_model(scene_with_edited_photos(mask_all), tmp_path, TrainConfig(steps=8, max_gaussians=60), quiet=True)
+        train_model(
+            scene_with_edited_photos(mask_all), tmp_path, TrainConfig(steps=8, max_gaussians=60), context=QUIET_CONTEXT
+        )
 
     assert not (tmp_path / "model.hyrf").exists()

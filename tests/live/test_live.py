@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 from commands import refused, succeeded
-from scenes import ball_scene
+from scenes import QUIET_CONTEXT, ball_scene
 
 from hyrfpack.format import decode_model, describe_file
 from hyrfpack.live import LiveView, live_view
@@ -57,7 +57,7 @@ class Clock:
 @pytest.mark.parametrize(("exposure", "background"), [(False, True), (True, False)])
 def test_training_with_a_live_view_gives_the_same_model_bit_by_bit(exposure, background, tmp_path):
     config = dataclasses.replace(TRAIN_CONFIG, steps=20, exposure=exposure, background=background)
-    plain = train_model(make_scene(), tmp_path / "plain", config, quiet=True)
+    plain = train_model(make_scene(), tmp_path / "plain", config, context=QUIET_CONTEXT)
     clock = Clock(look=MIN_INTERVAL_SECONDS * MIN_INTERVAL_RATIO)
     view = LiveView(clock)
 
@@ -65,7 +65,7 @@ def test_training_with_a_live_view_gives_the_same_model_bit_by_bit(exposure, bac
         clock.now += 1e9  # makes a snapshot due after each step
         view.observe(trainer)
 
-    viewed = train_model(make_scene(), tmp_path / "viewed", config, quiet=True, observer=observe)
+    viewed = train_model(make_scene(), tmp_path / "viewed", config, context=QUIET_CONTEXT, observer=observe)
     assert read_progress(view)["snapshot"] == config.steps
     assert plain.model.read_bytes() == viewed.model.read_bytes()
     curves = [[{**record, "seconds": 0} for record in run.metrics["curve"]] for run in (plain, viewed)]

@@ -14,7 +14,7 @@ from scenes import ball_points, small_model
 from hyrfpack import save_model
 from hyrfpack.atomic import write_atomic
 from hyrfpack.cameras.capture import scene_provenance
-from hyrfpack.compress import sensitivity
+from hyrfpack.compress import CompressionReport, sensitivity
 from hyrfpack.data import load_scene
 from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.distill import DistillConfig
@@ -25,8 +25,9 @@ from hyrfpack.make import make_scene, minutes, stages
 from hyrfpack.make.minutes import SceneCost
 from hyrfpack.make.plan import QUALITIES, Quality
 from hyrfpack.model import HybridModel
+from hyrfpack.progress import StepEvent, TaskEvent
+from hyrfpack.train import TrainResult
 from hyrfpack.train.results import RECORD_FILE, TrainingRecord, read_record
-from hyrfpack.train.run import TrainResult
 
 QUICK_QUALITIES = {
     "draft": Quality(steps=6, gpu_steps=6, max_size=40, finetune_steps=0, import_steps=2),
@@ -68,7 +69,7 @@ def tiny_model(gaussians: int) -> HybridModel:
     return small_model(ball_points(gaussians)[0])
 
 
-def fake_train_model(scene, run, config, *, resume, report, phase, **options) -> TrainResult:
+def fake_train_model(scene, run, config, *, resume, context, **options) -> TrainResult:
     """Write a checkpoint before each report and then the results, in the order of the real training.
 
     The model's file depends on the scene and on all settings.
@@ -79,7 +80,7 @@ def fake_train_model(scene, run, config, *, resume, report, phase, **options) ->
         done = int(checkpoint.read_text()) if resume else 0
         for step in range(done + 1, config.steps + 1):
             write_atomic(checkpoint, str(step).encode())
-            report(step, 0.1, 0.01, 400)
+            context.progress(StepEvent(step, config.steps, 0.1, 0.01, 400))
         provenance = {"settings": config.to_dict(), **scene_provenance(scene), "psnr": 25.0}
         data = encode_model(tiny_model(400), "raw", provenance)
         choices = {name: f"{getattr(config, name)}: as asked for" for name in ("max_gaussians", "preset")}
@@ -88,7 +89,7 @@ def fake_train_model(scene, run, config, *, resume, report, phase, **options) ->
         write_atomic(record_file, record.encode())
         write_atomic(run / "model.hyrf", data)
         checkpoint.unlink()
-    phase("scoring held-out photos", 1, 2)
+    context.progress(TaskEvent("scoring held-out photos", done=1, total=2))
     metrics, missing = read_record(run).metrics, ""
     try:
         write_atomic(run / "metrics.json", json.dumps(metrics).encode())
@@ -103,7 +104,8 @@ def fake_compress_model(source, target, *, finetune_steps, target_bytes, report,
     report("compressing", 0.5)
     digest = hashlib.sha256(source.read_bytes()).hexdigest()
     model = tiny_model(20 if target_bytes else 400)
-    return save_model(model, target, provenance={"of": digest, "settings": [finetune_steps, target_bytes]})
+    written = save_model(model, target, provenance={"of": digest, "settings": [finetune_steps, target_bytes]})
+    return CompressionReport(**vars(written))
 
 
 def fake_evaluate_model(model, views, *, report):

@@ -8,6 +8,7 @@ import shutil
 import numpy as np
 import pytest
 from commands import succeeded
+from scenes import QUIET_CONTEXT
 
 from hyrfpack import load_scene
 from hyrfpack.make.held_out import MAX_PSNR_GAP_DB, choose_inner_view, score_note
@@ -91,7 +92,7 @@ def test_a_split_defined_by_the_set_is_used(posed, tmp_path):
 
 def test_photos_of_a_run_on_a_small_set_have_the_same_held_out_photo(posed, tmp_path):
     scene = LoadSettings().load(copy_first_photos(posed, tmp_path, 9))
-    train_model(scene, tmp_path / "run", TrainConfig(steps=1, max_gaussians=50), quiet=True)
+    train_model(scene, tmp_path / "run", TrainConfig(steps=1, max_gaussians=50), context=QUIET_CONTEXT)
     again = load_training_scene(tmp_path / "run" / "model.hyrf")
     assert [view.name for view in again.test] == [choose_inner_view(again).name]
 

@@ -14,9 +14,11 @@ from pathlib import Path
 import pytest
 
 from hyrfpack.atomic import TEMPORARY_PREFIX
+from hyrfpack.context import RunContext
 from hyrfpack.errors import HyrfError
-from hyrfpack.make import Progress, Stopped, make_scene, stages
+from hyrfpack.make import Stopped, make_scene, stages
 from hyrfpack.make.stage_cache import interruptible
+from hyrfpack.progress import StageEvent, StepEvent
 
 pytestmark = pytest.mark.usefixtures("fake_stages")
 
@@ -76,12 +78,17 @@ def test_an_interrupt_in_each_stage_loses_no_work(after, uninterrupted_products,
     assert list(result.kept) == done[:-1]
 
 
+def record_details(details: list[str]) -> RunContext:
+    """Return a context that adds the most important description of each event to a list."""
+    return RunContext(progress=lambda event: details.extend(event.details[:1]))
+
+
 def test_an_interrupted_estimation_of_poses_resumes(photos, poses, tmp_path, monkeypatch):
     def stop(progress):
         raise KeyboardInterrupt
 
     with pytest.raises(Stopped, match="stopped in poses"):
-        make_scene(photos, tmp_path / "scene.html", quality="draft", report=stop)
+        make_scene(photos, tmp_path / "scene.html", quality="draft", context=RunContext(progress=stop))
     assert make_scene(photos, tmp_path / "scene.html", quality="draft").kept == ()
     assert make_scene(photos, tmp_path / "scene.ply", quality="draft").kept[0] == "poses"
 
@@ -156,7 +163,7 @@ def test_the_time_of_interrupted_and_killed_calls_is_included(posed, tmp_path, m
     def end(seconds: float, error: BaseException):
         def train(*arguments, **options):
             clock[0] += seconds
-            options["report"](1, 0.1, 0.01, 500)  # this call records the time so far
+            options["context"].progress(StepEvent(1, 9, 0.1, 0.01, 500))  # this call records the time so far
             clock[0] += 5  # shorter than the interval between records
             raise error
 
@@ -172,34 +179,34 @@ def test_the_time_of_interrupted_and_killed_calls_is_included(posed, tmp_path, m
 
 def test_a_kill_at_any_report_loses_no_finished_work(uninterrupted_products, posed, tmp_path):
     """A copy of the work folder during a report is what a process that was killed there leaves."""
-    killed: list[tuple[Progress, Path]] = []
+    killed: list[tuple[StageEvent, Path]] = []
 
-    def copy_work(progress: Progress) -> None:
+    def copy_work(event: StageEvent) -> None:
         output = tmp_path / str(len(killed)) / "scene.html"
         shutil.copytree(tmp_path / "scene.work", output.with_suffix(".work"))
-        killed.append((progress, output))
+        killed.append((event, output))
 
-    make_scene(posed, tmp_path / "scene.html", report=copy_work)
-    for progress, output in killed:
+    make_scene(posed, tmp_path / "scene.html", context=RunContext(progress=copy_work))
+    for event, output in killed:
         words: list[str] = []
-        again = make_scene(posed, output, report=lambda progress, words=words: words.extend(progress.words[:1]))
-        assert again.kept == tuple(STAGE_FUNCTIONS)[: progress.place - 1]
-        if match := re.match(r"step (\d)/9", "".join(progress.words[:1])):
+        again = make_scene(posed, output, context=record_details(words))
+        assert again.kept == tuple(STAGE_FUNCTIONS)[: event.number - 1]
+        if match := re.match(r"step (\d)/9", "".join(event.details[:1])):
             steps = [word for word in words if word.startswith("step ")]
             assert steps == [f"step {step}/9" for step in range(int(match[1]) + 1, 10)]
         assert read_products(again.work) == uninterrupted_products
-    assert {progress.stage for progress, _ in killed} == set(STAGE_FUNCTIONS)
+    assert {event.stage for event, _ in killed} == set(STAGE_FUNCTIONS)
 
 
 def test_an_interrupted_training_is_not_resumed_with_other_settings(posed, tmp_path):
-    def stop(progress: Progress) -> None:
-        if progress.words[:1] == ("step 5/9",):
+    def stop(event: StageEvent) -> None:
+        if event.details[:1] == ("step 5/9",):
             raise KeyboardInterrupt
 
     with pytest.raises(Stopped):
-        make_scene(posed, tmp_path / "scene.html", report=stop)
+        make_scene(posed, tmp_path / "scene.html", context=RunContext(progress=stop))
     words: list[str] = []
-    make_scene(posed, tmp_path / "scene.html", seed=1, report=lambda progress: words.extend(progress.words[:1]))
+    make_scene(posed, tmp_path / "scene.html", seed=1, context=record_details(words))
     assert "step 1/9" in words
 
 
@@ -219,6 +226,6 @@ def test_missing_metrics_after_a_full_disk_are_completed_by_the_next_call(posed,
     assert (run / "model.hyrf").is_file() and not (run / "metrics.json").exists()
 
     words: list[str] = []
-    result = make_scene(posed, tmp_path / "scene.html", report=lambda progress: words.extend(progress.words[:1]))
+    result = make_scene(posed, tmp_path / "scene.html", context=record_details(words))
     assert result.output.is_file() and (run / "metrics.json").is_file()
     assert not any(word.startswith("step ") for word in words), "it was trained again"

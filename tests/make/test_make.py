@@ -12,11 +12,13 @@ from commands import hyrfpack, refused, succeeded
 from PIL import Image
 
 from hyrfpack import load_model, load_scene
+from hyrfpack.context import RunContext
 from hyrfpack.errors import HyrfError
 from hyrfpack.format.min_file_size import min_file_bytes
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.make import Stopped, make_scene, stages
-from hyrfpack.make.progress import Progress, Reporter
+from hyrfpack.make.progress import Reporter
+from hyrfpack.progress import StageEvent, StepEvent, TaskEvent
 
 # One ending of each kind; tests/export covers the others.
 OUTPUT_ENDINGS = (".hyrf", ".html", ".spz", ".points.ply", "")
@@ -28,31 +30,32 @@ pytestmark = pytest.mark.usefixtures("fake_stages")
 def test_pilot_runs_do_not_count_in_the_forecast_of_training(monkeypatch):
     clock = [0.0]
     monkeypatch.setattr("hyrfpack.make.progress.monotonic", lambda: clock[0])
-    messages: list[Progress] = []
+    messages: list[StageEvent] = []
     reporter = Reporter(["training"], messages.append)
     reporter.estimates |= {"pilots": 10.0, "training": 30.0, "results": 0.0}
     reporter.begin("training")
-    shown = stages._TrainingProgress(reporter, 1000, 480)
-    for step in [0] * 240 + list(range(1, 301)):
+    shown = stages._TrainingProgress(reporter)
+    pilots = [TaskEvent("pilot run", share=step / 480) for step in range(1, 241)]
+    for event in [*pilots, *(StepEvent(step, 1000, 0.1, 0.01, 500) for step in range(1, 301))]:
         clock[0] += 0.1
-        shown.step(step, 0.1, 0.01, 500)
-    assert messages[240].words == ("pilot runs",)
+        shown.report_event(event)
+    assert messages[240].details == ("pilot run",)
     assert messages[240].share == pytest.approx(0.125)  # half of the pilots, which are a quarter of all steps
-    assert messages[-1].share == pytest.approx((10 + 0.3 * 30) / 40) and messages[-1].left == pytest.approx(
+    assert messages[-1].share == pytest.approx((10 + 0.3 * 30) / 40) and messages[-1].seconds_left == pytest.approx(
         70.0, rel=0.02
     )
 
 
 def test_scoring_after_the_last_step_is_part_of_the_training_progress():
-    messages: list[Progress] = []
+    messages: list[StageEvent] = []
     reporter = Reporter(["training"], messages.append)
     reporter.estimates |= {"pilots": 0.0, "training": 30.0, "results": 10.0}
     reporter.begin("training")
-    shown = stages._TrainingProgress(reporter, 1, 0)
-    shown.step(1, 0.1, 0.01, 500)
-    assert messages[-1].share == 0.75 and messages[-1].left > 0
-    shown.phase("scoring held-out photos", 1, 2)
-    assert messages[-1].share == 0.875 and messages[-1].words == ("scoring held-out photos 1/2",)
+    shown = stages._TrainingProgress(reporter)
+    shown.report_event(StepEvent(1, 1, 0.1, 0.01, 500))
+    assert messages[-1].share == 0.75 and messages[-1].seconds_left > 0
+    shown.report_event(TaskEvent("scoring held-out photos", done=1, total=2))
+    assert messages[-1].share == 0.875 and messages[-1].details == ("scoring held-out photos 1/2",)
 
 
 # -- inputs and outputs ----------------------------------------------------------------------------------------------
@@ -68,14 +71,14 @@ def test_every_kind_of_output_is_written_without_repeating_other_stages(ending, 
 
 
 def test_poses_of_photos_without_poses_are_estimated(photos, poses, tmp_path):
-    shares: list[Progress] = []
-    result = make_scene(photos, tmp_path / "scene.hyrf", report=shares.append)
+    shares: list[StageEvent] = []
+    result = make_scene(photos, tmp_path / "scene.hyrf", context=RunContext(progress=shares.append))
     assert poses == [photos]
     assert list(result.seconds) == ["poses", *STAGE_NAMES]
     assert result.poses["left_out"] == {"dark.jpg": "blurred"}
     assert {progress.stage for progress in shares} == {"poses", *STAGE_NAMES}
     for progress in shares:
-        assert 0 <= progress.share <= 1 and progress.left is not None and progress.left >= 0, progress
+        assert 0 <= progress.share <= 1 and progress.seconds_left is not None and progress.seconds_left >= 0, progress
     assert len(load_scene(result.work / "scene").views) == 18
 
 

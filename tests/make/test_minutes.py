@@ -16,6 +16,7 @@ from hyrfpack.make.minutes import SceneCost, fit_plan_to_minutes
 from hyrfpack.make.plan import Plan
 from hyrfpack.make.progress import Reporter
 from hyrfpack.make.source import LoadSettings
+from hyrfpack.progress import ignore_progress
 from hyrfpack.train import decisions
 
 
@@ -104,7 +105,7 @@ def test_large_photos_are_reduced_when_time_is_short(posed, scene, monkeypatch, 
             0,
             PictureCache(),
         )
-        return fit_plan_to_minutes(*arguments, Reporter(["training"], None))
+        return fit_plan_to_minutes(*arguments, Reporter(["training"], ignore_progress))
 
     plans = [planned(seconds) for seconds in (3000.0, 300.0, 100.0)]
     assert [plan.max_size for plan in plans] == [1600, 16, 8] and {plan.target_bytes for plan in plans} == {90_000}
@@ -126,7 +127,7 @@ def test_a_long_run_has_the_measured_budget_and_a_short_one_the_default(posed, s
             0,
             PictureCache(),
         )
-        return fit_plan_to_minutes(*arguments, Reporter(["training"], None))
+        return fit_plan_to_minutes(*arguments, Reporter(["training"], ignore_progress))
 
     short, long, targeted = planned(60.0), planned(600.0), planned(600.0, 90_000)
     assert short.steps < decisions.MIN_BUDGET_STEPS <= long.steps
@@ -147,7 +148,7 @@ def test_too_little_time_gives_a_draft_with_a_note(posed, scene, caplog):
             0,
             PictureCache(),
         )
-        plan = fit_plan_to_minutes(*arguments, Reporter(["training"], None))
+        plan = fit_plan_to_minutes(*arguments, Reporter(["training"], ignore_progress))
         assert (plan.steps, plan.target_bytes) == (6, 20_000)
     first, *_, last = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
     assert "no time is left for training" in first and "the time is short" in last
@@ -166,7 +167,7 @@ def test_an_explicit_number_of_gaussians_replaces_the_measured_budget(posed, sce
         0,
         PictureCache(),
     )
-    plan = fit_plan_to_minutes(*arguments, Reporter(["training"], None))
+    plan = fit_plan_to_minutes(*arguments, Reporter(["training"], ignore_progress))
     assert (plan.train_config(0).max_gaussians, plan.budget_factor) == (700, None)
 
 
@@ -184,7 +185,7 @@ def test_photos_are_never_larger_than_asked_for(posed, scene, monkeypatch):
             0,
             PictureCache(),
         )
-        assert fit_plan_to_minutes(*arguments, Reporter(["training"], None)).max_size == 24
+        assert fit_plan_to_minutes(*arguments, Reporter(["training"], ignore_progress)).max_size == 24
 
 
 @pytest.mark.usefixtures("fake_stages")

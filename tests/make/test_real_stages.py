@@ -18,16 +18,18 @@ from explicit_balls import ball_splats
 from exposures import random_map
 
 from hyrfpack import evaluate_model, load_model, load_scene, save_model
+from hyrfpack.context import RunContext
 from hyrfpack.make import make_scene, stages
-from hyrfpack.make.display import Display
-from hyrfpack.make.progress import Progress, Reporter
+from hyrfpack.make.progress import Reporter
+from hyrfpack.progress import StageEvent, ignore_progress
+from hyrfpack.progress.lines import LineDisplay
 from hyrfpack.splats.formats import ply
 
 PRODUCTS = ("model.hyrf", "run/model.hyrf", "export/scene.html")
 
 
 @pytest.fixture(scope="module")
-def reports() -> list[Progress]:
+def reports() -> list[StageEvent]:
     """The progress that the call of `finished_work` reported."""
     return []
 
@@ -35,7 +37,9 @@ def reports() -> list[Progress]:
 @pytest.fixture(scope="module")
 def finished_work(reports, posed, tmp_path_factory) -> Path:
     """The work folder of a scene that was made with the real stages. Tests must not change it."""
-    return make_scene(posed, tmp_path_factory.mktemp("made") / "scene.html", report=reports.append).work
+    return make_scene(
+        posed, tmp_path_factory.mktemp("made") / "scene.html", context=RunContext(progress=reports.append)
+    ).work
 
 
 def test_every_stage_reports_its_progress_and_the_remaining_time(finished_work, reports):
@@ -43,7 +47,7 @@ def test_every_stage_reports_its_progress_and_the_remaining_time(finished_work, 
         "training", "compression", "scoring", "export"
     ]  # fmt: skip
     for progress in reports:
-        assert 0 <= progress.share <= 1 and progress.left is not None and progress.left >= 0, progress
+        assert 0 <= progress.share <= 1 and progress.seconds_left is not None and progress.seconds_left >= 0, progress
     for stage in ("training", "compression", "scoring"):
         assert max(progress.share for progress in reports if progress.stage == stage) > 0.5
 
@@ -53,12 +57,12 @@ def test_an_interrupted_command_resumes_from_its_checkpoint_to_the_same_products
 ):
     words: list[str] = []
 
-    def show(display: Display, progress: Progress) -> None:
-        words.extend(progress.words[:1])
+    def show(display: LineDisplay, event: StageEvent) -> None:
+        words.extend(event.details[:1])
         if words[-1:] == ["step 5/9"]:
             signal.raise_signal(signal.SIGTERM)
 
-    monkeypatch.setattr(Display, "show", show)
+    monkeypatch.setattr(LineDisplay, "__call__", show)
     arguments = ("make", posed, "-o", tmp_path / "scene.html")
     stopped = hyrfpack(*arguments)
     assert stopped.exit_code == 1 and stopped.stderr.endswith("stopped in training; the same command resumes\n")
@@ -87,7 +91,7 @@ def test_a_model_with_an_exposure_map_is_scored_as_render_shows_it_and_at_one_ex
     model.exposure = random_map(3, centers=6)
     save_model(model, tmp_path / "model.hyrf")
     state = SimpleNamespace(inputs=lambda stage: {"photos and poses": ""})
-    reporter = Reporter(["scoring"], None)
+    reporter = Reporter(["scoring"], ignore_progress)
     stage = lambda name, inputs, act: act(False)[0]  # noqa: E731
     work = SimpleNamespace(folder=tmp_path, state=state, reporter=reporter, run_stage=stage)
     scene = load_scene(posed)

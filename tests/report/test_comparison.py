@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from commands import refused, succeeded
 from PIL import Image
-from scenes import ball_scene
+from scenes import QUIET_CONTEXT, ball_scene
 
 import hyrfpack
 from hyrfpack.errors import HyrfError
@@ -35,7 +35,9 @@ def make_scene(**options) -> Scene:
 
 
 def train_run(folder: Path, of: Scene | None = None, **settings) -> Path:
-    hyrfpack.train_model(of or make_scene(), folder, TrainConfig(steps=12, max_gaussians=60, **settings), quiet=True)
+    hyrfpack.train_model(
+        of or make_scene(), folder, TrainConfig(steps=12, max_gaussians=60, **settings), context=QUIET_CONTEXT
+    )
     return folder
 
 

@@ -6,7 +6,7 @@ import json
 from dataclasses import replace
 
 import pytest
-from scenes import ball_scene
+from scenes import QUIET_CONTEXT, ball_scene
 
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.train import TrainResult
@@ -60,7 +60,7 @@ def test_a_stopped_run_resumes_from_its_checkpoint(run_tool, monkeypatch):
             (folder / "checkpoint.pt").touch()
             return TrainResult(False, 5, None, {})
         (folder / "checkpoint.pt").unlink(missing_ok=True)
-        return train(scene, folder, config, quiet=True)
+        return train(scene, folder, config, context=QUIET_CONTEXT)
 
     monkeypatch.setattr(long_runs.hyrfpack, "train_model", stop_once)
     with pytest.raises(SystemExit, match="resumes"):

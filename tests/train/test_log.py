@@ -11,9 +11,10 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from scenes import ball_scene
+from scenes import QUIET_CONTEXT, ball_scene
 
 from hyrfpack.errors import HyrfError
+from hyrfpack.progress import StepEvent
 from hyrfpack.scene import Scene
 from hyrfpack.train import TrainConfig, log, train_model
 from hyrfpack.train.log import TrainingLog, peak_memory
@@ -38,7 +39,9 @@ def read_log(path: Path) -> list[dict]:
 
 
 def test_each_log_line_reports_progress_and_the_last_one_the_results(tmp_path: Path) -> None:
-    result = train_model(make_scene(), tmp_path / "run", LOGGED_CONFIG, quiet=True, log=tmp_path / "new" / "log.jsonl")
+    result = train_model(
+        make_scene(), tmp_path / "run", LOGGED_CONFIG, context=QUIET_CONTEXT, log=tmp_path / "new" / "log.jsonl"
+    )
 
     *steps, end = read_log(tmp_path / "new" / "log.jsonl")
     assert [record["step"] for record in steps] == list(range(1, LOGGED_CONFIG.steps + 1))
@@ -57,7 +60,7 @@ def test_a_long_run_logs_few_records_of_means(tmp_path: Path) -> None:
     steps = 5 * MIN_CURVE_RECORDS
     with TrainingLog(tmp_path / "log.jsonl", steps, 0, CPU_DEVICE) as written:
         for step in range(1, steps + 1):
-            written.step(step, loss=step, mse=0.01 if step % 2 else math.nan, gaussians=7)
+            written.step(StepEvent(step, steps, step, 0.01 if step % 2 else math.nan, 7))
 
     records = read_log(tmp_path / "log.jsonl")
     assert len(records) == MIN_CURVE_RECORDS
@@ -71,15 +74,15 @@ def test_a_slow_run_is_logged_every_few_seconds(tmp_path: Path, monkeypatch: pyt
     with TrainingLog(tmp_path / "log.jsonl", 10**6, 0, CPU_DEVICE) as written:
         for step in range(1, 13):
             now[0] += 2.5
-            written.step(step, 1.0, 0.1, 7)
+            written.step(StepEvent(step, 10**6, 1.0, 0.1, 7))
 
     assert [record["step"] for record in read_log(tmp_path / "log.jsonl")] == [4, 8, 12]
 
 
 def test_the_psnr_of_a_completely_masked_photo_is_null(tmp_path: Path) -> None:
     with TrainingLog(tmp_path / "log.jsonl", 2, 0, CPU_DEVICE) as written:
-        written.step(1, math.nan, math.nan, 7)
-        written.step(2, 0.0, 0.0, 7)
+        written.step(StepEvent(1, 2, math.nan, math.nan, 7))
+        written.step(StepEvent(2, 2, 0.0, 0.0, 7))
 
     first, second = read_log(tmp_path / "log.jsonl")
     assert first["loss"] is first["psnr"] is None and second["loss"] == 0 and second["psnr"] == 100
@@ -91,14 +94,14 @@ def test_a_resumed_run_appends_to_its_log_and_a_new_run_replaces_it(tmp_path: Pa
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("hyrfpack.train.trainer.Trainer._record", lambda *_: next(stop) and _interrupt())
         with pytest.raises(KeyboardInterrupt):
-            train_model(make_scene(), where, LOGGED_CONFIG, quiet=True, log=file)
-    train_model(make_scene(), where, LOGGED_CONFIG, quiet=True, log=file, resume=True)
+            train_model(make_scene(), where, LOGGED_CONFIG, context=QUIET_CONTEXT, log=file)
+    train_model(make_scene(), where, LOGGED_CONFIG, context=QUIET_CONTEXT, log=file, resume=True)
 
     steps = [record["step"] for record in read_log(file) if record["event"] == "step"]
     assert steps == [*range(1, 10), *range(10, LOGGED_CONFIG.steps + 1)]
     with pytest.raises(HyrfError, match="log"):
-        train_model(make_scene(), tmp_path / "other", LOGGED_CONFIG, quiet=True, log=file)
-    train_model(make_scene(), tmp_path / "other", TrainConfig(steps=2), quiet=True, log=file, overwrite=True)
+        train_model(make_scene(), tmp_path / "other", LOGGED_CONFIG, context=QUIET_CONTEXT, log=file)
+    train_model(make_scene(), tmp_path / "other", TrainConfig(steps=2), context=QUIET_CONTEXT, log=file, overwrite=True)
     assert [record["step"] for record in read_log(file)] == [1, 2, 2]
 
 
@@ -112,7 +115,7 @@ def test_a_failed_run_logs_the_reason(tmp_path: Path, monkeypatch: pytest.Monkey
 
     monkeypatch.setattr("hyrfpack.train.trainer.Trainer._train_step", fail)
     with pytest.raises(HyrfError):
-        train_model(make_scene(), tmp_path / "run", LOGGED_CONFIG, quiet=True, log=tmp_path / "log.jsonl")
+        train_model(make_scene(), tmp_path / "run", LOGGED_CONFIG, context=QUIET_CONTEXT, log=tmp_path / "log.jsonl")
 
     assert read_log(tmp_path / "log.jsonl") == [{"event": "end", "complete": False, "error": "it is broken; repair it"}]
 
@@ -120,7 +123,9 @@ def test_a_failed_run_logs_the_reason(tmp_path: Path, monkeypatch: pytest.Monkey
 def test_a_log_that_cannot_be_written_is_an_error_before_the_first_step(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(HyrfError, match="file"):
-        train_model(make_scene(), tmp_path / "run", LOGGED_CONFIG, quiet=True, log=tmp_path / "file" / "log.jsonl")
+        train_model(
+            make_scene(), tmp_path / "run", LOGGED_CONFIG, context=QUIET_CONTEXT, log=tmp_path / "file" / "log.jsonl"
+        )
     assert not (tmp_path / "run" / "model.hyrf").exists()
 
 
@@ -128,7 +133,7 @@ def test_a_log_that_cannot_be_written_is_an_error_before_the_first_step(tmp_path
 def test_a_full_disk_ends_the_log_and_not_the_run(caplog: pytest.LogCaptureFixture) -> None:
     with TrainingLog(Path("/dev/full"), 3, 0, CPU_DEVICE) as written:
         for step in (1, 2, 3):
-            written.step(step, 1.0, 0.1, 7)
+            written.step(StepEvent(step, 3, 1.0, 0.1, 7))
         written.end(complete=True, step=3)
     assert len(caplog.messages) == 1 and "training continues without it" in caplog.messages[0]
 
@@ -151,8 +156,8 @@ def test_scalars_are_written_to_tensorboard_where_it_is_installed(
     monkeypatch.setattr(log, "find_spec", lambda name: name == "tensorboard")
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", SimpleNamespace(SummaryWriter=Writer))
     with TrainingLog(tmp_path / "log.jsonl", 2, 0, CPU_DEVICE) as written:
-        written.step(1, 0.5, 0.1, 7)
-        written.step(2, 0.25, 0.01, 8)
+        written.step(StepEvent(1, 2, 0.5, 0.1, 7))
+        written.step(StepEvent(2, 2, 0.25, 0.01, 8))
         written.end(complete=True, step=2, psnr=21.5, gaussians=8)
 
     assert scalars["train/loss"] == [(1, 0.5), (2, 0.25)] and scalars["train/gaussians"] == [(1, 7), (2, 8)]

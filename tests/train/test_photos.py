@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from commands import refused
 from PIL import Image
-from scenes import ball_scene
+from scenes import QUIET_CONTEXT, ball_scene
 
+from hyrfpack.context import RunContext
 from hyrfpack.data import PictureCache, load_scene
 from hyrfpack.errors import HyrfDataError, HyrfTrainingError
 from hyrfpack.scene import Picture, Scene, View
@@ -49,12 +50,12 @@ def make_split_scene(train=lambda view: view, test=lambda view: view) -> Scene:
 
 def test_black_masks_of_all_photos_are_rejected_before_the_first_step(fail_at_first_step, tmp_path):
     with pytest.raises(HyrfTrainingError, match=r"all 4 photos to train on leave no pixels \(for example, 002\.png\)"):
-        train_model(make_split_scene(train=mask_all_pixels), tmp_path, TINY_TRAIN_CONFIG, quiet=True)
+        train_model(make_split_scene(train=mask_all_pixels), tmp_path, TINY_TRAIN_CONFIG, context=QUIET_CONTEXT)
 
 
 def test_black_masks_of_all_held_out_photos_are_rejected_before_the_first_step(fail_at_first_step, tmp_path):
     with pytest.raises(HyrfTrainingError, match=r"all 2 photos to score leave no pixels \(for example, 000\.png\)"):
-        train_model(make_split_scene(test=mask_all_pixels), tmp_path, TINY_TRAIN_CONFIG, quiet=True)
+        train_model(make_split_scene(test=mask_all_pixels), tmp_path, TINY_TRAIN_CONFIG, context=QUIET_CONTEXT)
 
 
 def test_a_black_mask_file_for_every_photo_is_rejected_by_the_command(fail_at_first_step, photos, tmp_path):
@@ -72,7 +73,7 @@ def test_one_photo_with_a_pixel_to_train_on_and_one_to_score_are_enough(tmp_path
         scene, train=[mask_all_pixels(first), *others], test=[mask_all_pixels(scene.test[0]), scene.test[1]], notes=[]
     )
 
-    result = train_model(scene, tmp_path, dataclasses.replace(TINY_TRAIN_CONFIG, steps=8), quiet=True)
+    result = train_model(scene, tmp_path, dataclasses.replace(TINY_TRAIN_CONFIG, steps=8), context=QUIET_CONTEXT)
 
     assert result.metrics["evaluation"]["skipped"] == ["000.png"]
 
@@ -82,7 +83,7 @@ def test_a_truncated_held_out_photo_is_rejected_before_the_first_step_and_named(
     (photos / "images" / "0008.png").write_bytes(whole[: len(whole) // 2])
 
     with pytest.raises(HyrfDataError, match=r"0008\.png: cannot decode the picture"):
-        train_model(load_scene(photos), tmp_path / "run", TINY_TRAIN_CONFIG, quiet=True)
+        train_model(load_scene(photos), tmp_path / "run", TINY_TRAIN_CONFIG, context=QUIET_CONTEXT)
 
 
 def test_training_photos_are_not_all_read_before_the_first_step(tmp_path):
@@ -92,6 +93,11 @@ def test_training_photos_are_not_all_read_before_the_first_step(tmp_path):
         return dataclasses.replace(view, load=lambda: read.append(view.name) or view.load())
 
     scene = dataclasses.replace(make_split_scene(train=counted), test=[])
-    train_model(scene, tmp_path, dataclasses.replace(TINY_TRAIN_CONFIG, steps=1), cache=PictureCache(), quiet=True)
+    train_model(
+        scene,
+        tmp_path,
+        dataclasses.replace(TINY_TRAIN_CONFIG, steps=1),
+        context=RunContext(cache=PictureCache(), progress=None),
+    )
 
     assert len(read) <= 2  # the first photo with an unmasked pixel, and the photo of the step

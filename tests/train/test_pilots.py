@@ -9,13 +9,15 @@ import signal
 import numpy as np
 import pytest
 import torch
-from scenes import ball_scene
+from scenes import QUIET_CONTEXT, ball_scene
 
+from hyrfpack.context import RunContext
 from hyrfpack.data import PictureCache
 from hyrfpack.errors import HyrfTrainingError
 from hyrfpack.evaluate import Evaluation, ViewScore
 from hyrfpack.format.exposure_header import STOPS_PER_LOG_GAIN
 from hyrfpack.model.exposure import apply_exposure_gains
+from hyrfpack.progress import Event, StepEvent, TaskEvent
 from hyrfpack.scene import Scene, View
 from hyrfpack.train import TrainConfig, budget_pilots, decisions, exposure_pilots, pilots, train_model
 from hyrfpack.train.budget_pilots import BUDGET_FACTORS, measure_budget
@@ -134,22 +136,24 @@ def test_validation_photos_are_not_trained_on_and_lie_between_training_photos(vi
 
 @pytest.mark.usefixtures("short_pilots")
 def test_pilots_are_deterministic_and_report_each_step():
-    messages: list[tuple] = []
-    first = measure_scene_budget(make_scene(), report=lambda *facts: messages.append(facts))
+    events: list[TaskEvent] = []
+    first = measure_scene_budget(make_scene(), progress=events.append, max_steps=24)
     assert first == measure_scene_budget(make_scene())
     assert first is not None and first[0] in BUDGET_FACTORS
-    assert [step for step, *_ in messages] in (list(range(1, 13)), list(range(1, 25)))
-    assert all(np.isfinite(loss) and mse > 0 and gaussians > 0 for _, loss, mse, gaussians in messages)
+    shares = [event.share for event in events if event.share is not None]
+    assert shares in ([step / 24 for step in range(1, 13)], [step / 24 for step in range(1, 25)])
 
 
 @pytest.mark.usefixtures("short_pilots")
 def test_pilots_stop_when_requested():
-    messages: list[int] = []
+    steps: list[TaskEvent] = []
+
+    def follow(event: TaskEvent) -> None:
+        steps.extend([event] * event.task.endswith("training"))
+
     with pytest.raises(PilotsStopped):
-        measure_scene_budget(
-            make_scene(), report=lambda step, *_: messages.append(step), stop=lambda: len(messages) >= 8
-        )
-    assert messages[-1] == 8
+        measure_scene_budget(make_scene(), progress=follow, stop=lambda: len(steps) >= 8)
+    assert len(steps) == 8
 
 
 @pytest.mark.usefixtures("short_pilots")
@@ -188,29 +192,36 @@ def test_a_run_takes_the_budget_of_its_pilots_and_records_the_reason(tmp_path, m
     assert f"Gaussian budget: {reason}" in caplog.messages
 
 
-def interrupt_at(step: int):
-    """Return a report function that sends SIGTERM once, as a user would."""
+def interrupt_at(step: int) -> RunContext:
+    """Return a context that sends SIGTERM once, as a user would, after a step; 0 means the first step of a pilot."""
     left = [step]
 
-    def report(step: int, loss: float, mse: float, gaussians: int) -> None:
-        if left and step == left[0]:
+    def interrupt(event: Event) -> None:
+        is_pilot = isinstance(event, TaskEvent) and event.task.endswith(": training")
+        if left and (is_pilot if step == 0 else isinstance(event, StepEvent) and event.step == step):
             left.clear()
             signal.raise_signal(signal.SIGTERM)
 
-    return report
+    return RunContext(progress=interrupt)
 
 
 @pytest.mark.usefixtures("short_pilots", "signals")
 def test_a_run_that_continues_keeps_its_budget_and_the_reason(tmp_path, monkeypatch):
     config = TrainConfig(steps=10)
-    train_model(make_scene(), tmp_path / "whole", config, quiet=True)
-    assert train_model(make_scene(), tmp_path / "again", config, report=interrupt_at(6)).step == 6
+    train_model(make_scene(), tmp_path / "whole", config, context=QUIET_CONTEXT)
+    assert train_model(make_scene(), tmp_path / "again", config, context=interrupt_at(6)).step == 6
 
     monkeypatch.setattr(decisions, "measure_budget", lambda *_: pytest.fail("measured again"))
     for asked in ({"max_gaussians": 5_000}, {"target_bytes": 20_000}, {"budget_factor": 0.9}):
         with pytest.raises(HyrfTrainingError, match="started with other settings"):
-            train_model(make_scene(), tmp_path / "again", dataclasses.replace(config, **asked), resume=True, quiet=True)
-    train_model(make_scene(), tmp_path / "again", config, resume=True, quiet=True)
+            train_model(
+                make_scene(),
+                tmp_path / "again",
+                dataclasses.replace(config, **asked),
+                resume=True,
+                context=QUIET_CONTEXT,
+            )
+    train_model(make_scene(), tmp_path / "again", config, resume=True, context=QUIET_CONTEXT)
 
     whole, again = (json.loads((tmp_path / name / "metrics.json").read_bytes()) for name in ("whole", "again"))
     assert whole["settings"] == again["settings"] and whole["choices"] == again["choices"]
@@ -220,28 +231,32 @@ def test_a_run_that_continues_keeps_its_budget_and_the_reason(tmp_path, monkeypa
 
 @pytest.mark.usefixtures("short_pilots", "signals")
 def test_an_interrupt_before_the_first_step_leaves_nothing(tmp_path):
-    result = train_model(make_scene(), tmp_path, TrainConfig(steps=10), report=interrupt_at(0))
+    result = train_model(make_scene(), tmp_path, TrainConfig(steps=10), context=interrupt_at(0))
     assert (result.complete, result.step, result.model, result.metrics) == (False, 0, None, {})
     assert not any(tmp_path.iterdir())
 
 
 @pytest.mark.usefixtures("short_pilots")
-def test_pilots_are_reported_as_step_0(tmp_path):
-    steps: list[int] = []
-    train_model(make_scene(), tmp_path, TrainConfig(steps=10), report=lambda step, *_: steps.append(step))
-    assert steps[-10:] == list(range(1, 11)) and steps[:-10] in ([0] * 12, [0] * 24)
+def test_pilots_are_reported_as_tasks_before_the_steps(tmp_path):
+    events: list[Event] = []
+    train_model(make_scene(), tmp_path, TrainConfig(steps=10), context=RunContext(progress=events.append))
+    steps = [event for event in events if isinstance(event, StepEvent)]
+    assert [(event.step, event.steps) for event in steps] == [(step, 10) for step in range(1, 11)]
+    pilots = [event for event in events if isinstance(event, TaskEvent) and event.share is not None]
+    most = max_pilot_steps(make_scene(), TrainConfig(steps=10))
+    assert [event.share for event in pilots] == [n / most for n in range(1, len(pilots) + 1)]
+    assert len(pilots) in (12, 24) and events.index(pilots[-1]) < events.index(steps[0])
 
 
 @pytest.mark.usefixtures("short_pilots")
 def test_pilot_runs_report_each_step_and_each_scored_view():
-    messages: list[tuple[str, int, int]] = []
-    measure_scene_budget(make_scene(), phase=lambda *progress: messages.append(progress))
-    assert [row for row in messages if row[0] == "budget pilot run 1/2: training"] == [
-        ("budget pilot run 1/2: training", step, 6) for step in range(1, 7)
-    ]
-    assert [row for row in messages if row[0] == "budget pilot run 2/2: scoring"] == [
-        ("budget pilot run 2/2: scoring", done, 2) for done in range(3)
-    ]
+    events: list[TaskEvent] = []
+    measure_scene_budget(make_scene(), progress=events.append)
+    for task, counts in (("1/2: training", range(1, 7)), ("2/2: scoring", range(3))):
+        task = f"budget pilot run {task}"
+        assert [event for event in events if event.task == task] == [
+            TaskEvent(task, done=done, total=max(counts)) for done in counts
+        ]
 
 
 # -- exposure --------------------------------------------------------------------------------------------------------
@@ -370,10 +385,10 @@ def test_a_run_that_continues_keeps_its_exposure_compensation(tmp_path, monkeypa
     monkeypatch.setattr(decisions, "MIN_EXPOSURE_STEPS", 10)
     monkeypatch.setattr(decisions, "measure_exposure", lambda *_: (True, "by a coin"))
     scene, config = expose_scene(make_scene(), [0.5, -0.5]), TrainConfig(steps=10)
-    train_model(scene, tmp_path / "whole", config, quiet=True)
-    assert train_model(scene, tmp_path / "again", config, report=interrupt_at(6)).step == 6
+    train_model(scene, tmp_path / "whole", config, context=QUIET_CONTEXT)
+    assert train_model(scene, tmp_path / "again", config, context=interrupt_at(6)).step == 6
     monkeypatch.setattr(decisions, "measure_exposure", lambda *_: pytest.fail("measured again"))
-    train_model(scene, tmp_path / "again", config, resume=True, quiet=True)
+    train_model(scene, tmp_path / "again", config, resume=True, context=QUIET_CONTEXT)
 
     whole, again = (json.loads((tmp_path / name / "metrics.json").read_bytes()) for name in ("whole", "again"))
     assert whole["settings"]["exposure"] is again["settings"]["exposure"] is True

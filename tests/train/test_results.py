@@ -11,10 +11,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from scenes import ball_scene
+from scenes import QUIET_CONTEXT, ball_scene
 
+from hyrfpack.context import RunContext
 from hyrfpack.errors import HyrfDataError, HyrfError, HyrfTrainingError
 from hyrfpack.outputs import StrPath
+from hyrfpack.progress import Event, TaskEvent
 from hyrfpack.scene import Scene
 from hyrfpack.train import TrainConfig, Trainer, train_model
 from hyrfpack.train import run as runs
@@ -65,7 +67,7 @@ def fail_if_trained(monkeypatch):
 @pytest.fixture(scope="module")
 def uninterrupted_run(tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("runs") / "undisturbed"
-    train_model(make_scene(), out, SHORT_CONFIG, quiet=True)
+    train_model(make_scene(), out, SHORT_CONFIG, context=QUIET_CONTEXT)
     return out
 
 
@@ -74,7 +76,7 @@ def test_metrics_missing_after_a_full_disk_are_completed_without_training(
     full_disk_suffixes, fail_if_trained, uninterrupted_run, tmp_path, resume
 ):
     full_disk_suffixes.add("metrics.json")
-    result = train_model(make_scene(), tmp_path, SHORT_CONFIG, quiet=True)
+    result = train_model(make_scene(), tmp_path, SHORT_CONFIG, context=QUIET_CONTEXT)
     assert result.complete and result.model.is_file() and result.metrics["evaluation"]["psnr"] > 0
     assert "metrics.json: the disk is full" in result.missing
     assert file_names(tmp_path) == {"model.hyrf", "curve.png", "views", "training.json"}
@@ -82,7 +84,7 @@ def test_metrics_missing_after_a_full_disk_are_completed_without_training(
 
     full_disk_suffixes.clear()
     fail_if_trained()
-    completed = train_model(make_scene(), tmp_path, SHORT_CONFIG, resume=resume, quiet=True)
+    completed = train_model(make_scene(), tmp_path, SHORT_CONFIG, resume=resume, context=QUIET_CONTEXT)
 
     assert completed.complete and completed.step == 20 and completed.missing == ""
     assert file_names(tmp_path) == COMPLETE_RUN_FILES
@@ -109,7 +111,7 @@ def test_pictures_that_do_not_fit_do_not_fail_the_run(
 
     full_disk_suffixes.clear()
     fail_if_trained()
-    train_model(make_scene(), tmp_path, SHORT_CONFIG, quiet=True)
+    train_model(make_scene(), tmp_path, SHORT_CONFIG, context=QUIET_CONTEXT)
     assert file_names(tmp_path) == COMPLETE_RUN_FILES and len(list((tmp_path / "views").iterdir())) == 2
 
 
@@ -123,12 +125,12 @@ def test_a_held_out_photo_that_is_gone_after_the_last_step_does_not_fail_the_run
         return scene.train[0].load()
 
     test = [dataclasses.replace(scene.test[0], load=vanishing), scene.test[1]]
-    result = train_model(dataclasses.replace(scene, test=test), tmp_path, SHORT_CONFIG, quiet=True)
+    result = train_model(dataclasses.replace(scene, test=test), tmp_path, SHORT_CONFIG, context=QUIET_CONTEXT)
     assert result.complete and "photos/0000.png: the file is gone" in result.missing
     assert not (tmp_path / "metrics.json").exists()
 
     fail_if_trained()
-    train_model(make_scene(), tmp_path, SHORT_CONFIG, quiet=True)
+    train_model(make_scene(), tmp_path, SHORT_CONFIG, context=QUIET_CONTEXT)
     assert file_names(tmp_path) == COMPLETE_RUN_FILES
 
 
@@ -138,11 +140,11 @@ def test_an_interruption_while_scoring_is_completed_without_training(fail_if_tra
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr("hyrfpack.train.results.evaluate_model", interrupted)
-        train_model(make_scene(), tmp_path, SHORT_CONFIG, quiet=True)
+        train_model(make_scene(), tmp_path, SHORT_CONFIG, context=QUIET_CONTEXT)
     assert file_names(tmp_path) == {"model.hyrf", "training.json"} and runs.is_begun(tmp_path)
 
     fail_if_trained()
-    train_model(make_scene(), tmp_path, SHORT_CONFIG, quiet=True)
+    train_model(make_scene(), tmp_path, SHORT_CONFIG, context=QUIET_CONTEXT)
     assert file_names(tmp_path) == COMPLETE_RUN_FILES and not runs.is_begun(tmp_path)
 
 
@@ -153,47 +155,49 @@ def test_a_model_that_does_not_fit_leaves_the_checkpoint_and_resuming_completes_
     with pytest.raises(
         HyrfError, match=r"model.hyrf: the disk is full.*checkpoint of step 19 is kept.*`resume=True` continues"
     ):
-        train_model(make_scene(), tmp_path, SHORT_CONFIG, quiet=True)
+        train_model(make_scene(), tmp_path, SHORT_CONFIG, context=QUIET_CONTEXT)
     assert file_names(tmp_path) == {"checkpoint.pt"}
 
     full_disk_suffixes.clear()
-    train_model(make_scene(), tmp_path, SHORT_CONFIG, resume=True, quiet=True)
+    train_model(make_scene(), tmp_path, SHORT_CONFIG, resume=True, context=QUIET_CONTEXT)
     assert file_names(tmp_path) == COMPLETE_RUN_FILES
     assert (tmp_path / "model.hyrf").read_bytes() == (uninterrupted_run / "model.hyrf").read_bytes()
 
 
 def test_without_space_for_the_training_record_the_checkpoint_stays_until_metrics_exist(full_disk_suffixes, tmp_path):
     full_disk_suffixes |= {"training.json", "metrics.json"}
-    result = train_model(make_scene(), tmp_path, SHORT_CONFIG, quiet=True)
+    result = train_model(make_scene(), tmp_path, SHORT_CONFIG, context=QUIET_CONTEXT)
     assert result.complete and file_names(tmp_path) == {"model.hyrf", "checkpoint.pt", "curve.png", "views"}
 
     full_disk_suffixes.clear()
-    train_model(make_scene(), tmp_path, SHORT_CONFIG, resume=True, quiet=True)
+    train_model(make_scene(), tmp_path, SHORT_CONFIG, resume=True, context=QUIET_CONTEXT)
     assert file_names(tmp_path) == COMPLETE_RUN_FILES and len(read_metrics(tmp_path)["curve"]) == 20
 
 
 def test_results_are_completed_with_the_settings_of_the_model_only(full_disk_suffixes, tmp_path):
     full_disk_suffixes.add("metrics.json")
-    train_model(make_scene(), tmp_path, SHORT_CONFIG, quiet=True)
+    train_model(make_scene(), tmp_path, SHORT_CONFIG, context=QUIET_CONTEXT)
     before = hashlib.sha256((tmp_path / "model.hyrf").read_bytes()).digest()
     full_disk_suffixes.clear()
     other = dataclasses.replace(SHORT_CONFIG, steps=30, seed=2)
     for resume in (False, True):
         with pytest.raises(HyrfTrainingError, match=r"other settings \(seed, steps\).*`overwrite=True`"):
-            train_model(make_scene(), tmp_path, other, resume=resume, quiet=True)
+            train_model(make_scene(), tmp_path, other, resume=resume, context=QUIET_CONTEXT)
     fewer = dataclasses.replace(make_scene(), test=make_scene().test[:1])
     with pytest.raises(HyrfTrainingError, match="other settings .held-out views."):
-        train_model(fewer, tmp_path, SHORT_CONFIG, quiet=True)
+        train_model(fewer, tmp_path, SHORT_CONFIG, context=QUIET_CONTEXT)
     assert hashlib.sha256((tmp_path / "model.hyrf").read_bytes()).digest() == before
 
-    train_model(make_scene(), tmp_path, other, overwrite=True, quiet=True)
+    train_model(make_scene(), tmp_path, other, overwrite=True, context=QUIET_CONTEXT)
     assert read_metrics(tmp_path)["settings"]["steps"] == 30 and file_names(tmp_path) == COMPLETE_RUN_FILES
 
 
 def test_metrics_of_an_earlier_model_do_not_stay_beside_a_new_one(full_disk_suffixes, tmp_path):
-    train_model(make_scene(), tmp_path, SHORT_CONFIG, quiet=True)
+    train_model(make_scene(), tmp_path, SHORT_CONFIG, context=QUIET_CONTEXT)
     full_disk_suffixes |= {"metrics.json", ".png"}
-    result = train_model(make_scene(), tmp_path, dataclasses.replace(SHORT_CONFIG, seed=5), overwrite=True, quiet=True)
+    result = train_model(
+        make_scene(), tmp_path, dataclasses.replace(SHORT_CONFIG, seed=5), overwrite=True, context=QUIET_CONTEXT
+    )
     assert "views, curve.png and metrics.json are missing" in result.missing
     assert file_names(tmp_path) == {"model.hyrf", "training.json", "views"} and not list((tmp_path / "views").iterdir())
 
@@ -201,23 +205,25 @@ def test_metrics_of_an_earlier_model_do_not_stay_beside_a_new_one(full_disk_suff
 @pytest.mark.parametrize("damage", [b"", b"[]", b"{}", b'{"version": 1}', None])
 def test_a_damaged_or_foreign_training_record_is_ignored(full_disk_suffixes, tmp_path, damage):
     full_disk_suffixes.add("metrics.json")
-    train_model(make_scene(), tmp_path, SHORT_CONFIG, quiet=True)
+    train_model(make_scene(), tmp_path, SHORT_CONFIG, context=QUIET_CONTEXT)
     full_disk_suffixes.clear()
     if damage is None:
         (tmp_path / "model.hyrf").write_bytes(b"another")
     else:
         (tmp_path / "training.json").write_bytes(damage)
     with pytest.raises(HyrfError, match="holds an earlier run"):
-        train_model(make_scene(), tmp_path, SHORT_CONFIG, quiet=True)
+        train_model(make_scene(), tmp_path, SHORT_CONFIG, context=QUIET_CONTEXT)
     with pytest.raises(HyrfError, match="no checkpoint to resume"):
-        train_model(make_scene(), tmp_path, SHORT_CONFIG, resume=True, quiet=True)
+        train_model(make_scene(), tmp_path, SHORT_CONFIG, resume=True, context=QUIET_CONTEXT)
 
 
 def test_the_log_of_a_completed_run_ends_with_its_scores(full_disk_suffixes, tmp_path):
     full_disk_suffixes.add("metrics.json")
-    train_model(make_scene(), tmp_path / "run", SHORT_CONFIG, quiet=True)
+    train_model(make_scene(), tmp_path / "run", SHORT_CONFIG, context=QUIET_CONTEXT)
     full_disk_suffixes.clear()
-    result = train_model(make_scene(), tmp_path / "run", SHORT_CONFIG, quiet=True, log=tmp_path / "log.jsonl")
+    result = train_model(
+        make_scene(), tmp_path / "run", SHORT_CONFIG, context=QUIET_CONTEXT, log=tmp_path / "log.jsonl"
+    )
     (end,) = map(json.loads, (tmp_path / "log.jsonl").read_text().splitlines())
     assert end["event"] == "end" and end["complete"] is True and end["step"] == 20
     assert end["psnr"] == pytest.approx(result.metrics["evaluation"]["psnr"], rel=1e-5)
@@ -227,18 +233,20 @@ def test_the_log_of_a_completed_run_ends_with_its_scores(full_disk_suffixes, tmp
 
 
 def test_phases_before_and_after_the_steps_report_their_progress(tmp_path):
-    messages: list[tuple[str, int, int]] = []
-    train_model(make_scene(), tmp_path, SHORT_CONFIG, quiet=True, phase=lambda *progress: messages.append(progress))
-    assert list(dict.fromkeys(what for what, _, _ in messages)) == [
+    events: list[Event] = []
+    train_model(make_scene(), tmp_path, SHORT_CONFIG, context=RunContext(progress=events.append))
+    tasks = [event for event in events if isinstance(event, TaskEvent)]
+    assert list(dict.fromkeys(event.task for event in tasks)) == [
         "reading held-out photos",
         "reading photos",
         "reading photos and setting up the model",
+        "preparing the first step",
         "measuring the share of the background",
         "writing the model",
         "scoring held-out photos",
         "drawing curve.png",
     ]
-    assert [row for row in messages if row[0].startswith("scoring")] == [
-        ("scoring held-out photos", done, 2) for done in range(3)
+    assert [event for event in tasks if event.task.startswith("scoring")] == [
+        TaskEvent("scoring held-out photos", done=done, total=2) for done in range(3)
     ]
-    assert all(0 <= done <= total for _, done, total in messages)
+    assert all(0 <= event.done <= event.total for event in tasks)

@@ -15,14 +15,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from scenes import ball_scene
+from scenes import QUIET_CONTEXT, ball_scene
 
 from hyrfpack import format as hyrf_format
 from hyrfpack.errors import HyrfError
 from hyrfpack.render import render_view
 from hyrfpack.scene import Scene
-from hyrfpack.train import DensityConfig, TrainConfig, Trainer, progress, train_model
-from hyrfpack.train.run import STOP_SIGNALS, _stop_requests
+from hyrfpack.train import DensityConfig, TrainConfig, Trainer, advice, train_model
+from hyrfpack.train.stop import STOP_SIGNALS, catch_stop_signals
 
 RUN_CONFIG = TrainConfig(
     steps=60,
@@ -37,14 +37,14 @@ CHILD_SCRIPT = """
 import json, sys, time
 from pathlib import Path
 sys.path.append(sys.argv[1])
-from scenes import ball_scene
+from scenes import QUIET_CONTEXT, ball_scene
 from hyrfpack.train import Trainer, train_model
-from test_run import RUN_CONFIG, make_scene
+from test_run import QUIET_CONTEXT, RUN_CONFIG, make_scene
 out = Path(sys.argv[2])
 if sys.argv[3] == "train":
     resume = (out / "checkpoint.pt").exists()
     slow = lambda trainer: time.sleep(0.05)
-    result = train_model(make_scene(), out, RUN_CONFIG, resume=resume, quiet=True, observer=slow)
+    result = train_model(make_scene(), out, RUN_CONFIG, resume=resume, context=QUIET_CONTEXT, observer=slow)
     print(json.dumps({"complete": result.complete, "step": result.step, "model": result.model}))
 else:
     trainer = Trainer(make_scene(), RUN_CONFIG)
@@ -88,7 +88,7 @@ def uninterrupted_trainer() -> Trainer:
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     out = tmp_path_factory.mktemp("runs") / "deep" / "balls"
-    return out, train_model(split_scene(), out, RUN_CONFIG, quiet=True)
+    return out, train_model(split_scene(), out, RUN_CONFIG, context=QUIET_CONTEXT)
 
 
 def test_a_run_leaves_model_metrics_curve_and_views(finished):
@@ -134,26 +134,26 @@ def test_a_folder_with_a_run_is_rejected_without_overwrite(finished):
     out, _ = finished
     before = (out / "model.hyrf").read_bytes()
     with pytest.raises(HyrfError, match="holds an earlier run.*`overwrite=True`"):
-        train_model(split_scene(), out, RUN_CONFIG, quiet=True)
+        train_model(split_scene(), out, RUN_CONFIG, context=QUIET_CONTEXT)
     assert (out / "model.hyrf").read_bytes() == before
 
 
 def test_overwriting_replaces_the_run(tmp_path):
     config = dataclasses.replace(RUN_CONFIG, steps=3)
-    train_model(make_scene(), tmp_path, config, quiet=True)
-    train_model(make_scene(), tmp_path, dataclasses.replace(config, seed=9), overwrite=True, quiet=True)
+    train_model(make_scene(), tmp_path, config, context=QUIET_CONTEXT)
+    train_model(make_scene(), tmp_path, dataclasses.replace(config, seed=9), overwrite=True, context=QUIET_CONTEXT)
     assert json.loads((tmp_path / "metrics.json").read_text())["settings"]["seed"] == 9
 
 
 def test_a_folder_that_cannot_be_made_is_a_clear_error(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(HyrfError, match="file is a file, not a folder"):
-        train_model(make_scene(), tmp_path / "file" / "run", RUN_CONFIG, quiet=True)
+        train_model(make_scene(), tmp_path / "file" / "run", RUN_CONFIG, context=QUIET_CONTEXT)
 
 
 def test_resuming_without_a_checkpoint_is_a_clear_error(tmp_path):
     with pytest.raises(HyrfError, match="no checkpoint to resume; leave out `resume=True`"):
-        train_model(make_scene(), tmp_path / "run", RUN_CONFIG, resume=True, quiet=True)
+        train_model(make_scene(), tmp_path / "run", RUN_CONFIG, resume=True, context=QUIET_CONTEXT)
     assert not (tmp_path / "run").exists()
 
 
@@ -166,8 +166,8 @@ def test_a_background_that_no_view_sees_is_dropped(tmp_path):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("hyrfpack.train.setup.INITIAL_OPACITY", 0.9999)
         patch.setattr("hyrfpack.train.setup.MIN_INITIAL_SIZE", 0.45)
-        closed = train_model(scene, tmp_path / "closed", one_step, quiet=True)
-    open_air = train_model(make_scene(), tmp_path / "open", one_step, quiet=True)
+        closed = train_model(scene, tmp_path / "closed", one_step, context=QUIET_CONTEXT)
+    open_air = train_model(make_scene(), tmp_path / "open", one_step, context=QUIET_CONTEXT)
 
     assert hyrf_format.load_model(closed.model).config.background is False
     assert closed.metrics["choices"]["background"].startswith("none: no training view")
@@ -184,7 +184,7 @@ def test_the_speed_of_a_resumed_run_covers_all_its_parts(finished, tmp_path):
     stopped.run(stop=lambda: stopped.step == 50)
     stopped.elapsed = 1e6
     stopped.save(tmp_path / "checkpoint.pt")
-    metrics = train_model(make_scene(), tmp_path, RUN_CONFIG, resume=True, quiet=True).metrics
+    metrics = train_model(make_scene(), tmp_path, RUN_CONFIG, resume=True, context=QUIET_CONTEXT).metrics
 
     assert 1e6 < metrics["seconds"] < 1e6 + 600
     assert metrics["steps_per_second"] == pytest.approx(60 / metrics["seconds"])
@@ -192,10 +192,17 @@ def test_the_speed_of_a_resumed_run_covers_all_its_parts(finished, tmp_path):
 
 def test_a_long_run_logs_once_how_to_shorten_it(tmp_path, caplog, monkeypatch):
     for name in ("MIN_ADVICE_STEPS", "MIN_ADVICE_SECONDS", "MIN_ADVICE_SECONDS_LEFT"):
-        monkeypatch.setattr(progress, name, 0)
+        monkeypatch.setattr(advice, name, 0)
     train_model(make_scene(), tmp_path, dataclasses.replace(RUN_CONFIG, steps=8))
     (message,) = [message for message in caplog.messages if "hours remain" in message]
     assert all(way in message for way in ("fewer steps", "smaller photos", "fewer Gaussians", "a GPU"))
+
+
+def test_a_silent_run_logs_no_advice(tmp_path, caplog, monkeypatch):
+    for name in ("MIN_ADVICE_STEPS", "MIN_ADVICE_SECONDS", "MIN_ADVICE_SECONDS_LEFT"):
+        monkeypatch.setattr(advice, name, 0)
+    train_model(make_scene(), tmp_path, dataclasses.replace(RUN_CONFIG, steps=8), context=QUIET_CONTEXT)
+    assert not [message for message in caplog.messages if "hours remain" in message]
 
 
 # -- stopping and resuming -------------------------------------------------------------------------------------------
@@ -204,7 +211,7 @@ def test_a_long_run_logs_once_how_to_shorten_it(tmp_path, caplog, monkeypatch):
 @pytest.mark.usefixtures("signals")
 def test_the_first_interrupt_requests_a_stop_and_the_second_interrupts():
     before = signal.getsignal(signal.SIGINT)
-    with pytest.raises(KeyboardInterrupt), _stop_requests() as stop:
+    with pytest.raises(KeyboardInterrupt), catch_stop_signals() as stop:
         assert not stop()
         signal.raise_signal(signal.SIGINT)
         assert stop()
@@ -217,7 +224,7 @@ def test_the_first_interrupt_requests_a_stop_and_the_second_interrupts():
 def test_sigterm_and_sighup_request_a_stop_too(name):
     number = getattr(signal, name, None) or pytest.skip(f"there is no {name} here")
     before = signal.getsignal(number)
-    with _stop_requests() as stop:
+    with catch_stop_signals() as stop:
         signal.raise_signal(number)
         assert stop()
     assert signal.getsignal(number) is before
@@ -226,7 +233,7 @@ def test_sigterm_and_sighup_request_a_stop_too(name):
 @pytest.mark.usefixtures("signals")
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="there is no SIGHUP here")
 def test_a_second_sighup_has_no_effect():
-    with _stop_requests() as stop:
+    with catch_stop_signals() as stop:
         signal.raise_signal(signal.SIGHUP)
         signal.raise_signal(signal.SIGHUP)
         assert stop()
@@ -237,7 +244,7 @@ def test_a_second_sighup_has_no_effect():
 def test_a_signal_that_is_ignored_stays_ignored(number):
     """SIGHUP is ignored under nohup, Ctrl-C in background jobs of a script."""
     signal.signal(number, signal.SIG_IGN)
-    with _stop_requests() as stop:
+    with catch_stop_signals() as stop:
         signal.raise_signal(number)
         assert not stop()
     assert signal.getsignal(number) is signal.SIG_IGN
@@ -260,7 +267,7 @@ def test_an_interrupt_saves_exits_cleanly_and_resumes_to_the_same_model(number, 
     said = json.loads(out)
     assert said["complete"] is False and said["model"] is None and 1 <= said["step"] < 60
     assert not (tmp_path / "model.hyrf").exists()
-    result = train_model(make_scene(), tmp_path, RUN_CONFIG, resume=True, quiet=True)
+    result = train_model(make_scene(), tmp_path, RUN_CONFIG, resume=True, context=QUIET_CONTEXT)
     assert result.complete and parameter_bytes(hyrf_format.load_model(result.model)) == parameter_bytes(
         uninterrupted_trainer.model
     )

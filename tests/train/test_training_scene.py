@@ -7,6 +7,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+from scenes import QUIET_CONTEXT
 
 import hyrfpack
 from hyrfpack.errors import HyrfDataError
@@ -18,7 +19,7 @@ def run(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A short run on photos that were split and resized in a way that is not the default."""
     folder = tmp_path_factory.mktemp("load_training_scene") / "run"
     scene = hyrfpack.load_scene(data, test_every=5, max_size=40)
-    hyrfpack.train_model(scene, folder, hyrfpack.TrainConfig(steps=3, max_gaussians=100), quiet=True)
+    hyrfpack.train_model(scene, folder, hyrfpack.TrainConfig(steps=3, max_gaussians=100), context=QUIET_CONTEXT)
     return folder
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from statistics import fmean
 
 from hyrfpack.config.train import FULL_STEPS
-from hyrfpack.evaluate.metrics import psnr_from_mse
+from hyrfpack.measure.psnr import psnr_from_mse
 from hyrfpack.model import HybridModel
 from hyrfpack.scene import Scene
 from hyrfpack.train import TrainConfig, Trainer

@@ -13,6 +13,7 @@ import tempfile
 from pathlib import Path
 
 from hyrfpack.compress import compress_model
+from hyrfpack.context import RunContext
 from hyrfpack.data import load_scene
 from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.scene import Scene
@@ -50,7 +51,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         for target, config in TRAIN_CONFIGS.items():
             scene = make_golden_scene(target, Path(folder) / "photos")
-            trained = train_model(scene, Path(folder) / target.stem, config, quiet=True)
+            trained = train_model(scene, Path(folder) / target.stem, config, context=RunContext(progress=None))
             target.write_bytes(trained.model.read_bytes())
             if target == DEMO_MODEL_FILE:
                 compress_model(target, DEMO_COMPACT_FILE, data=scene)

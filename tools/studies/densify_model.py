@@ -22,9 +22,9 @@ from hyrfpack.atomic import check_writable, make_folder
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.format.run_folder import MODEL_FILE
 from hyrfpack.model import HybridModel
+from hyrfpack.progress import StepEvent, open_display
 from hyrfpack.scene import Scene
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer
-from hyrfpack.train.progress import ProgressLine
 
 # A round can at most double the number, and it only splits Gaussians that were visible since the last round.
 SPLIT_ROUNDS, STEPS_PER_ROUND = 20, 6
@@ -59,10 +59,10 @@ def print_scores(label: str, model: HybridModel, scene: Scene, start: float) -> 
 def densify(scene: Scene, model: HybridModel, config: TrainConfig, start: float) -> HybridModel:
     """Split the Gaussians, train further, and return the model; print one line after each phase."""
     trainer = Trainer(scene, config, model=model)
-    with ProgressLine(config.steps, 0) as line:
+    with open_display() as progress:
 
         def after_step(trainer: Trainer, loss: float, mse: float) -> None:
-            line.update(trainer.step, loss, mse, len(trainer.model))
+            progress(StepEvent(trainer.step, trainer.steps, loss, mse, len(trainer.model)))
             if trainer.step == SPLIT_STEPS:
                 print_scores("after splitting", trainer.model, scene, start)
 

@@ -43,7 +43,11 @@ def select_common_photos(given: Scene, own: Scene) -> tuple[Scene, Scene, int]:
 def train_and_score(scene: Scene, out: Path, steps: int, seed: int) -> float:
     """Train a model; return its mean PSNR in dB on held-out photos."""
     result = hyrfpack.train_model(
-        scene, out, hyrfpack.TrainConfig(steps=steps, seed=seed, budget_factor=1.0), overwrite=True, quiet=True
+        scene,
+        out,
+        hyrfpack.TrainConfig(steps=steps, seed=seed, budget_factor=1.0),
+        overwrite=True,
+        context=hyrfpack.RunContext(progress=None),
     )
     return result.metrics["evaluation"]["psnr"]
 

@@ -62,7 +62,9 @@ def measure(run: QueuedRun, data: Path, out: Path, finetune_steps: int) -> None:
     if not (folder / METRICS_FILE).exists():
         config = TrainConfig(steps=run.steps, seed=run.seed, exposure=run.exposure)
         resume = (folder / CHECKPOINT_FILE).exists()
-        if not hyrfpack.train_model(scene, folder, config, resume=resume, overwrite=not resume, quiet=True).complete:
+        if not hyrfpack.train_model(
+            scene, folder, config, resume=resume, overwrite=not resume, context=hyrfpack.RunContext(progress=None)
+        ).complete:
             raise SystemExit("stopped; the same command resumes from the checkpoint")
     metrics = json.loads((folder / METRICS_FILE).read_text())
     model = hyrfpack.load_model(folder / MODEL_FILE)

@@ -1,4 +1,4 @@
-"""Progress reports of long work: calls with the name of the current task and the completed share of the whole work."""
+"""Report functions of two arguments: the name of the current task, and the completed share of the whole work."""
 
 from __future__ import annotations
 
@@ -6,13 +6,16 @@ from collections.abc import Callable
 from threading import Lock
 from typing import TypeVar
 
-# A function of two arguments: the name of the current task, and the completed share of the whole work, 0 to 1.
+from hyrfpack.progress.events import REMAINING_SHARE_PER_ROUND, Progress, TaskEvent
+
 Report = Callable[[str, float], None]
 S = TypeVar("S")
 T = TypeVar("T")
 
-# If the number of rounds is unknown, each round is assumed to do this share of the remaining work.
-REMAINING_SHARE_PER_ROUND = 0.4
+
+def report_to(progress: Progress) -> Report:
+    """Return a report function that reports to `progress`."""
+    return lambda doing, share: progress(TaskEvent(doing, share))
 
 
 def no_report(doing: str, share: float) -> None:
@@ -30,15 +33,7 @@ def report_part(report: Report, start: float, end: float) -> Report:
 
 
 def report_round(report: Report, number: int) -> Report:
-    """Return a report function for one round of work that takes an unknown number of rounds.
-
-    Each round is assumed to do REMAINING_SHARE_PER_ROUND of the remaining work, so that the share of the whole grows
-    and never reaches 1.
-
-    Args:
-        report: report function of the whole work.
-        number: the number of the round, from 0.
-    """
+    """Return a report function for one round of work that takes an unknown number of rounds."""
     return report_part(report, *(1 - (1 - REMAINING_SHARE_PER_ROUND) ** rounds for rounds in (number, number + 1)))
 
 

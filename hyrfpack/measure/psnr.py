@@ -1,0 +1,16 @@
+"""PSNR of a mean squared error."""
+
+from __future__ import annotations
+
+import numpy as np
+
+# PSNR in dB of two identical pictures, for which the formula gives infinity; also the upper limit of other PSNRs.
+IDENTICAL_PSNR = 100.0
+
+
+def psnr_from_mse(mse: float) -> float:
+    """Convert a mean squared error of colours in [0, 1] to PSNR in dB, at most `IDENTICAL_PSNR`.
+
+    PSNR = -10 log10(mse)
+    """
+    return min(float(-10 * np.log10(mse)), IDENTICAL_PSNR) if mse > 0 else IDENTICAL_PSNR

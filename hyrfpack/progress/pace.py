@@ -1,0 +1,55 @@
+"""Speed of long work, as it was measured so far, from which the remaining time follows."""
+
+from __future__ import annotations
+
+COMPILATION_STEPS = 2  # The first steps of a run compile kernels, so they do not count for the speed.
+# The pace of a work is known once at least this share of it and this time have passed.
+MIN_PACE_SHARE = 0.01
+MIN_PACE_SECONDS = 2.0
+MIN_SAMPLE_INTERVAL_SECONDS = 0.5
+MAX_SAMPLES = 200  # Number of evenly spaced samples; there may be more, because the first ones are closer together.
+
+
+class StepPace:
+    """Measures the speed of a training run since its kernels were compiled.
+
+    Attributes:
+        warm: time, in seconds, at which all kernels were compiled.
+        warm_step: the step after which all kernels were compiled.
+    """
+
+    def __init__(self, steps: int, done: int, start: float) -> None:
+        """Begin at time `start`, after `done` of `steps` steps."""
+        self.steps, self.first, self.warm_step = steps, done, done
+        self.start = self.warm = start
+
+    def at(self, step: int, now: float) -> tuple[float, float]:
+        """Return the speed in steps per second, and the seconds left, after a step that was finished at time `now`."""
+        since, taken = (self.warm, self.warm_step) if step > self.warm_step else (self.start, self.first)
+        speed = max(step - taken, 1) / max(now - since, 1e-9)
+        if step - self.first <= COMPILATION_STEPS:
+            self.warm, self.warm_step = now, step
+        return speed, (self.steps - step) / speed
+
+
+class SharePace:
+    """Measures how fast the completed share of a work grows, over the last half of its time."""
+
+    def __init__(self, start: float) -> None:
+        """Begin at time `start`, in seconds."""
+        self.start = start
+        self._samples: list[tuple[float, float]] = []  # (time, share)
+
+    def add(self, share: float, now: float) -> None:
+        """Add the share, 0 to 1, that is completed at time `now`."""
+        interval = max(MIN_SAMPLE_INTERVAL_SECONDS, (now - self.start) / MAX_SAMPLES)
+        if share > 0 and (not self._samples or now - self._samples[-1][0] >= interval):
+            self._samples.append((now, share))
+
+    def at(self, share: float, now: float) -> float | None:
+        """Return the shares per second until `share` at time `now`; None if too little is done."""
+        middle = now - (now - self.start) / 2
+        samples = self._samples or [(now, share)]
+        since, first = next((sample for sample in reversed(samples) if sample[0] <= middle), samples[0])
+        elapsed, done = now - since, share - first
+        return done / elapsed if done >= MIN_PACE_SHARE and elapsed >= MIN_PACE_SECONDS else None

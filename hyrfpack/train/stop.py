@@ -1,0 +1,49 @@
+"""Turn signals that ask a process to end into requests to stop after the present step."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+# These signals end a run early (Windows has no SIGHUP).
+STOP_SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+
+
+@contextmanager
+def catch_stop_signals(stop: Callable[[], bool] | None = None) -> Iterator[Callable[[], bool]]:
+    """Turn the first Ctrl-C, SIGTERM or SIGHUP into a request to stop; a second Ctrl-C or SIGTERM takes effect at once.
+
+    Signals that the parent process ignores stay ignored: SIGHUP under nohup, Ctrl-C in the background of a script. A
+    second SIGHUP has no effect, because closing a terminal sends two: one by the shell and one by the terminal.
+
+    Args:
+        stop: returns whether something else than a signal has asked to stop.
+
+    Yields:
+        A function that returns whether a stop was requested.
+    """
+    requested = threading.Event()
+
+    def is_requested() -> bool:
+        return requested.is_set() or (stop is not None and stop())
+
+    if threading.current_thread() is not threading.main_thread():  # Only the main thread can handle signals.
+        yield is_requested
+        return
+    found = {number: signal.getsignal(number) for number in STOP_SIGNALS}
+    previous = {number: handler for number, handler in found.items() if handler not in (signal.SIG_IGN, None)}
+
+    def handle(number: int, _frame: object) -> None:
+        requested.set()
+        if number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, previous[number])
+
+    try:
+        for number in previous:
+            signal.signal(number, handle)
+        yield is_requested
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
