@@ -104,7 +104,7 @@ def _colors(picture: Picture, camera: Camera, points: np.ndarray) -> tuple[np.nd
     return usable, np.log(colors / (1 - colors))
 
 
-def gains_from(observed: Observations, photos: int) -> np.ndarray:
+def estimate_log_gains(observed: Observations, photos: int) -> np.ndarray:
     """Estimate each photo's log gains, (photos, 3), from the colours of shared points.
 
     Photo i shows point p with the point's colour, changed by the photo's gains g:
@@ -219,16 +219,16 @@ class Exposures:
         self._steps = state["steps"].tolist()
 
 
-def exposure_spread(scene: Scene, cache: PictureCache) -> float:
+def estimate_exposure_spread(scene: Scene, cache: PictureCache) -> float:
     """Estimate the standard deviation of the training photos' exposures in stops, from their tracks; 0 without tracks.
 
     Raises:
         HyrfDataError: a photo cannot be read.
     """
-    return float(gains_from(observe(scene, cache), len(scene.train)).mean(1).std()) * STOPS_PER_LOG_GAIN
+    return float(estimate_log_gains(observe(scene, cache), len(scene.train)).mean(1).std()) * STOPS_PER_LOG_GAIN
 
 
-def exposures_for(
+def initialize_exposures(
     scene: Scene, config: TrainConfig, cache: PictureCache, device: torch.device
 ) -> tuple[Exposures | None, str]:
     """Estimate the per-image gains that a run starts from, if `config.exposure` is True.
@@ -248,7 +248,7 @@ def exposures_for(
             fix="leave out `exposure`",
         )
     observed = observe(scene, cache)
-    gains = gains_from(observed, len(scene.train))
+    gains = estimate_log_gains(observed, len(scene.train))
     known = len(np.unique(observed.photo))
     spread = float(gains.mean(1).std()) * STOPS_PER_LOG_GAIN
     found = (

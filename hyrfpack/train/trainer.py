@@ -31,7 +31,7 @@ from hyrfpack.scene import Picture, Scene, View
 from hyrfpack.train.checkpoint import load_checkpoint, names_and_sizes, save_checkpoint
 from hyrfpack.train.density import DensityControl
 from hyrfpack.train.distributed import StepStats, average_gradients, check_settings, digest, pack_step_stats
-from hyrfpack.train.exposure import exposures_for
+from hyrfpack.train.exposure import initialize_exposures
 from hyrfpack.train.optimizer import Optimizer
 from hyrfpack.train.setup import build_model
 from hyrfpack.train.strategy import Strategy
@@ -103,7 +103,7 @@ class Trainer:
             model, self.budget, self.choices = build_model(scene, config)
         else:
             self.budget = config.max_gaussians or len(model)
-        self.exposures, self.choices["exposure"] = exposures_for(scene, config, self.cache, device)
+        self.exposures, self.choices["exposure"] = initialize_exposures(scene, config, self.cache, device)
         self._take(model)
         self.strategy: Strategy = strategy or DensityControl(
             config.density, self.steps, self.budget, len(self.model), config.seed, device, ranks

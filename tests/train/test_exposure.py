@@ -14,7 +14,7 @@ from hyrfpack.errors import HyrfTrainingError
 from hyrfpack.evaluate import evaluate_model
 from hyrfpack.scene import Scene, View
 from hyrfpack.train import TrainConfig, Trainer
-from hyrfpack.train.exposure import GAIN_DECAY, MIN_PIXEL_LEVEL, Exposures, Observations, gains_from, observe
+from hyrfpack.train.exposure import GAIN_DECAY, MIN_PIXEL_LEVEL, Exposures, Observations, estimate_log_gains, observe
 
 CPU_DEVICE = torch.device("cpu")
 SHORT_CONFIG = TrainConfig(steps=30, seed=3, max_gaussians=160, exposure=True)
@@ -38,7 +38,7 @@ def test_gains_are_recovered_despite_occluded_points(occluded):
     wrong = rng.random(len(photo)) < occluded
     logits[wrong] = rng.normal(1, 1, (wrong.sum(), 3))
 
-    found = gains_from(Observations(photo, point, logits), 12)
+    found = estimate_log_gains(Observations(photo, point, logits), 12)
 
     np.testing.assert_allclose(found, logs - logs.mean(0), atol=0.04)
     np.testing.assert_allclose(found.mean(0), 0, atol=1e-12)
@@ -48,10 +48,10 @@ def test_photos_without_tracks_have_unit_gains_and_unconnected_groups_stay_separ
     photo, point = np.repeat([0, 1, 3, 4], 50), np.tile(np.arange(50), 4) + np.repeat([0, 50], 100)
     logits = np.repeat([0.3, -0.3, 0.1, -0.1], 50)[:, None] * np.ones(3) + np.linspace(-2, 2, 50)[point % 50, None]
 
-    found = gains_from(Observations(photo, point, logits), 5)
+    found = estimate_log_gains(Observations(photo, point, logits), 5)
 
     np.testing.assert_allclose(found, np.array([0.3, -0.3, 0, 0.1, -0.1])[:, None] * np.ones(3), atol=1e-3)
-    assert not gains_from(Observations(photo[:9], point[:9], logits[:9]), 2).any()
+    assert not estimate_log_gains(Observations(photo[:9], point[:9], logits[:9]), 2).any()
 
 
 def test_two_glossy_points_between_two_groups_of_photos_do_not_shift_their_gains():
@@ -63,7 +63,7 @@ def test_two_glossy_points_between_two_groups_of_photos_do_not_shift_their_gains
     logits = rng.normal(size=(402, 3))[point] + rng.normal(0, 0.05, (len(photo), 3))
     logits[(point >= 400) & (photo >= 10)] += 1
 
-    found = gains_from(Observations(photo, point, logits), 20)
+    found = estimate_log_gains(Observations(photo, point, logits), 20)
     assert abs(found[10:].mean() - found[:10].mean()) < 0.02
 
     # Forty points that agree are enough to believe them.
@@ -71,7 +71,7 @@ def test_two_glossy_points_between_two_groups_of_photos_do_not_shift_their_gains
     photo, point = np.concatenate((np.array(seen).T, shared), 1)
     logits = rng.normal(size=(440, 3))[point] + rng.normal(0, 0.05, (len(photo), 3))
     logits[photo >= 10] += 1
-    found = gains_from(Observations(photo, point, logits), 20)
+    found = estimate_log_gains(Observations(photo, point, logits), 20)
     assert found[10:].mean() - found[:10].mean() == pytest.approx(1, abs=0.05)
 
 

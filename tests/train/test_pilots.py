@@ -294,7 +294,7 @@ def expose_scene(scene: Scene, stops: list[float]) -> Scene:
 def test_gains_are_learnt_only_where_the_improvement_is_significant(
     scores, monkeypatch, compensated, apart, expected, rounds
 ):
-    monkeypatch.setattr(exposure_pilots, "exposure_spread", lambda *_: 1.0)
+    monkeypatch.setattr(exposure_pilots, "estimate_exposure_spread", lambda *_: 1.0)
     scores |= {False: [20.0, 20.0], True: compensated, "apart": apart}
     runs = ScenePilots(make_scene(20), LONG_CONFIG, PictureCache(), CPU_DEVICE)
     decision, reason = measure_exposure(runs)
@@ -312,7 +312,7 @@ def test_pilots_have_a_sixth_of_the_steps_of_the_run_within_limits(steps, pilot_
 
 @pytest.mark.parametrize("left", [0, 1, 3])
 def test_too_few_unmasked_validation_photos_decide_nothing(scores, monkeypatch, left):
-    monkeypatch.setattr(exposure_pilots, "exposure_spread", lambda *_: 1.0)
+    monkeypatch.setattr(exposure_pilots, "estimate_exposure_spread", lambda *_: 1.0)
     scores |= {False: [20.0] * 2, True: [25.0] * 2, "apart": (0.0,) * left}
     scene = make_scene(20)
     usable = {view.name for view in pilots.split(scene.train, 4, 16)[1][:left]}
@@ -331,7 +331,7 @@ def test_photos_of_one_exposure_need_no_pilots():
 
 @pytest.mark.parametrize(("photos", "rounds"), [(8, 3), (11, 3), (12, 2), (100, 2)])
 def test_few_photos_take_more_folds_so_that_six_photos_validate(scores, monkeypatch, photos, rounds):
-    monkeypatch.setattr(exposure_pilots, "exposure_spread", lambda *_: 1.0)
+    monkeypatch.setattr(exposure_pilots, "estimate_exposure_spread", lambda *_: 1.0)
     scores |= {False: [20.0] * 4, True: [20.3] * 4, "apart": (-0.9, 0.9, 0.0, 0.0, 0.0)}
     validated: list[list[str]] = []
     fold = ScenePilots.fold
