@@ -43,6 +43,8 @@ if TYPE_CHECKING:
     from hyrfpack.bench.suite import benchmark_model as benchmark_model
     from hyrfpack.compress import CompressionReport as CompressionReport
     from hyrfpack.compress import compress_model as compress_model
+    from hyrfpack.config.export import ConvertConfig as ConvertConfig
+    from hyrfpack.config.export import ExportConfig as ExportConfig
     from hyrfpack.context import RunContext as RunContext
     from hyrfpack.data import load_scene as load_scene
     from hyrfpack.distill import DistillConfig as DistillConfig
@@ -106,6 +108,8 @@ _PUBLIC = {
     "HyrfTrainingError": "hyrfpack.errors",
     "Evaluation": "hyrfpack.evaluate",
     "evaluate_model": "hyrfpack.evaluate",
+    "ConvertConfig": "hyrfpack.config.export",
+    "ExportConfig": "hyrfpack.config.export",
     "ConversionReport": "hyrfpack.export",
     "ExportReport": "hyrfpack.export",
     "convert_splats": "hyrfpack.export",

@@ -73,7 +73,10 @@ _REMEDIES = {
     "HybridModel": "hyrfpack.load_model reads it from a file",
     "Scene": "hyrfpack.load_scene reads it from a folder",
     "View": "a Scene has lists of them: scene.test",
-    **{name: f"make one: hyrfpack.{name}(...)" for name in ("DistillConfig", "RenderSettings", "TrainConfig")},
+    **{
+        name: f"make one: hyrfpack.{name}(...)"
+        for name in ("ConvertConfig", "DistillConfig", "ExportConfig", "RenderSettings", "TrainConfig")
+    },
 }
 
 

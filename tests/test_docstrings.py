@@ -61,7 +61,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, data: Path) -> Path:
     )
     shutil.copytree(root / "runs" / "bonsai", root / "runs" / "again")
     hyrfpack.compress_model(root / "runs" / "bonsai" / "model.hyrf", root / "bonsai.hyrf")
-    hyrfpack.export_model(root / "bonsai.hyrf", root / "bonsai.ply", degree=0, background=False)
+    hyrfpack.export_model(root / "bonsai.hyrf", root / "bonsai.ply", hyrfpack.ExportConfig(degree=0, background=False))
     return root
 
 

@@ -44,10 +44,10 @@ CODE_BY_CALL = {
     "hyrfpack.save_model(hyrfpack.load_model('model.hyrf'), 'a.hyrf', provenance=hyrfpack.describe_file('model.hyrf'))",
     "export": "for name in ('a.spz', 'a.ply', 'a.sog', 'a.html'):\n"
     "    hyrfpack.export_model('model.hyrf', name, data=scene)\n"
-    "hyrfpack.export_model('model.hyrf', 'colmap', data=scene, colmap=True)",
+    "hyrfpack.export_model('model.hyrf', 'colmap', hyrfpack.ExportConfig(colmap=True), data=scene)",
     "bench": "from hyrfpack.measure import timing\ntiming.WARM_UP_SECONDS = 0\n"
     "hyrfpack.benchmark_model('model.hyrf', scene, repeats=1, only=['codec'])",
-    "distill": "hyrfpack.export_model('model.hyrf', 'a.ply', data=scene, background=False)\n"
+    "distill": "hyrfpack.export_model('model.hyrf', 'a.ply', hyrfpack.ExportConfig(background=False), data=scene)\n"
     "hyrfpack.import_splats('a.ply', 'a.hyrf', hyrfpack.DistillConfig(1, 10, 16, 4, 2))",
 }
 

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from hyrfpack.cli.common import format_table, json_option, note_rename, overwrite_option, print_json
-from hyrfpack.cli.export import crop_option, min_opacity_option, spz_version_option
+from hyrfpack.cli.export import crop_option
 from hyrfpack.cli.progress import show_progress
+from hyrfpack.cli.settings import settings_options
 from hyrfpack.cli.types import OUTPUT, PATH
+from hyrfpack.config.export import ConvertConfig
 from hyrfpack.outputs import Outputs
 
 if TYPE_CHECKING:
@@ -20,27 +22,17 @@ if TYPE_CHECKING:
 @click.command(short_help="Convert splats between formats.")
 @click.argument("source", type=PATH)
 @click.argument("target", type=OUTPUT)
-@click.option(
-    "--sh-degree",
-    "degree",
-    type=click.IntRange(0, 3),
-    metavar="0-3",
-    help="Highest degree of spherical harmonics to keep.  [default: the highest that the format can store]",
-)
+@settings_options(ConvertConfig, "degree")
 @crop_option
-@min_opacity_option
-@spz_version_option
+@settings_options(ConvertConfig, "min_opacity", "spz_version")
 @overwrite_option
 @json_option
 def convert(
     source: Path,
     target: Path,
-    degree: int | None,
-    crop: tuple[float, ...] | None,
-    min_opacity: float,
-    spz_version: int,
     overwrite: bool,
     as_json: bool,
+    **settings: Any,
 ) -> None:
     """Convert SOURCE, 3D Gaussians of another program, to the format that the extension of TARGET names.
 
@@ -61,16 +53,7 @@ def convert(
     find_target_format(source, target)
     Outputs(source, folder=sog_folder(source), overwrite=overwrite).file(target)
     with show_progress("convert") as progress:
-        report = run(
-            source,
-            target,
-            degree=degree,
-            crop=crop,
-            min_opacity=min_opacity,
-            spz_version=spz_version,
-            overwrite=overwrite,
-            report=progress,
-        )
+        report = run(source, target, ConvertConfig(**settings), overwrite=overwrite, report=progress)
     note_rename(target, report.file)
     if as_json:
         print_json(report.to_dict())

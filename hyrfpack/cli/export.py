@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from hyrfpack.choices import DEFAULT_SPZ_VERSION, LOCAL_EXPOSURE, SPLAT_EXPOSURES, SPZ_VERSIONS
 from hyrfpack.cli.common import (
     format_table,
     json_option,
@@ -20,7 +18,9 @@ from hyrfpack.cli.common import (
     scene_options,
 )
 from hyrfpack.cli.progress import show_progress
-from hyrfpack.cli.types import OUTPUT, PATH
+from hyrfpack.cli.settings import settings_options
+from hyrfpack.cli.types import BOX, HARMONICS_DEGREE, OUTPUT, PATH
+from hyrfpack.config.export import ExportConfig
 from hyrfpack.errors import HyrfError
 from hyrfpack.outputs import Outputs
 
@@ -29,56 +29,11 @@ if TYPE_CHECKING:
     from hyrfpack.splats.table import FileKind
 
 
-class _Box(click.ParamType):
-    """An axis-aligned box as six numbers with commas between: minimum x, y, z, then maximum x, y, z."""
-
-    name = "box"
-
-    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, ...]:
-        try:
-            numbers = tuple(float(part) for part in str(value).split(","))
-        except ValueError:
-            numbers = ()
-        if len(numbers) != 6 or any(map(math.isnan, numbers)):
-            self.fail(f"'{value}' is not a box; write it as MINX,MINY,MINZ,MAXX,MAXY,MAXZ in world units", param, ctx)
-        if any(low > high for low, high in zip(numbers[:3], numbers[3:], strict=True)):
-            self.fail(f"'{value}' has a minimum above its maximum; give the minimum x, y and z first", param, ctx)
-        return numbers
-
-
-class _HarmonicsDegree(click.ParamType):
-    """A degree of spherical harmonics, or "auto", which becomes None."""
-
-    name = "degree"
-
-    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> int | None:
-        if value == "auto":
-            return None
-        if str(value) not in ("0", "1", "2", "3"):
-            self.fail(f"'{value}' is neither 0, 1, 2 or 3 nor auto", param, ctx)
-        return int(str(value))
-
-
 crop_option = click.option(
     "--crop",
-    type=_Box(),
+    type=BOX,
     metavar="BOX",
     help="Keep only the Gaussians inside MINX,MINY,MINZ,MAXX,MAXY,MAXZ (world units), without the background.",
-)
-min_opacity_option = click.option(
-    "--min-opacity",
-    type=click.FloatRange(0, 1),
-    default=0.0,
-    show_default=True,
-    help="Leave out Gaussians with a lower opacity.",
-)
-spz_version_option = click.option(
-    "--spz-version",
-    type=click.IntRange(SPZ_VERSIONS[0], SPZ_VERSIONS[-1]),
-    default=DEFAULT_SPZ_VERSION,
-    show_default=True,
-    metavar="3|4",
-    help="Version of .spz files; 3 is for programs that do not read version 4 yet.",
 )
 
 
@@ -92,12 +47,11 @@ spz_version_option = click.option(
     metavar="FILE",
     help="File or folder to write. Its extension names the format.",
 )
-@click.option("--baked", is_flag=True, help="Embed baked splats in an .html page instead of the neural model.")
-@click.option("--colmap", is_flag=True, help="Write a folder with a COLMAP model: cameras, and centres as points.")
+@settings_options(ExportConfig, "baked", "colmap")
 @click.option(
     "--sh-degree",
     "degree",
-    type=_HarmonicsDegree(),
+    type=HARMONICS_DEGREE,
     default="auto",
     show_default=True,
     metavar="0-3|auto",
@@ -105,16 +59,7 @@ spz_version_option = click.option(
     "best. A .splat has degree 0.",
 )
 @crop_option
-@min_opacity_option
-@click.option("--background/--no-background", default=True, help="Export the background sphere.  [default: background]")
-@click.option(
-    "--exposure",
-    type=click.Choice(SPLAT_EXPOSURES),
-    default=LOCAL_EXPOSURE,
-    show_default=True,
-    help="Exposure of baked splats: each as bright as in the photos that see it (local), or one exposure for all "
-    "(consistent). A model without an exposure map gives the same splats with both.",
-)
+@settings_options(ExportConfig, "min_opacity", "background", "exposure")
 @click.option(
     "--data",
     type=PATH,
@@ -122,25 +67,18 @@ spz_version_option = click.option(
     help="Photos and poses of the scene: cameras for a file that stores none, and held-out photos to score the result. "
     "For a gallery, give it once for each MODEL.",
 )
-@spz_version_option
+@settings_options(ExportConfig, "spz_version")
 @overwrite_option
 @scene_options
 @json_option
 def export(
     models: tuple[Path, ...],
     output: Path,
-    baked: bool,
-    colmap: bool,
-    degree: int | None,
-    crop: tuple[float, ...] | None,
-    min_opacity: float,
-    background: bool,
-    exposure: str,
-    spz_version: int,
     data: tuple[Path, ...],
     overwrite: bool,
     reader_options: dict[str, Any],
     as_json: bool,
+    **settings: Any,
 ) -> None:
     """Export MODEL, a .hyrf file or the folder of a run, to a format of other programs, and report the loss of quality.
 
@@ -171,7 +109,8 @@ def export(
     from hyrfpack.format import describe_file, find_model
     from hyrfpack.splats.names import is_splats
 
-    kind = find_file_kind(output, colmap)
+    config = ExportConfig(**settings)
+    kind = find_file_kind(output, config.colmap)
     if len(models) != 1 and kind is not PLAYER_FOLDER:
         what = "there is no MODEL to write" if not models else "several models make a gallery, which is a folder"
         raise HyrfError(f"{output}: {what}", fix="name one MODEL")
@@ -186,33 +125,20 @@ def export(
             f"--data is given {len(data)} times for {len(models)} models",
             fix="give it once for each model, or not at all",
         )
-    check_request(kind, output, degree, crop, min_opacity, background, baked, exposure)
+    check_request(kind, output, config)
     scenes = [read_scene(path, reader_options, describe_file(model)) for path, model in zip(data, files, strict=False)]
     if kind is PLAYER_FOLDER:
         check_folder(output, models, scenes, overwrite=overwrite, is_gallery=len(models) > 1)
     else:
-        check_place(output, Outputs(*files, scene=scenes[0] if scenes else None, overwrite=overwrite), colmap)
+        check_place(output, Outputs(*files, scene=scenes[0] if scenes else None, overwrite=overwrite), config.colmap)
     with show_progress("export") as progress:
         if len(models) > 1:
             report = export_gallery(models, output, data=scenes, overwrite=overwrite)
         elif not models:
             report = export_player(None, output, overwrite=overwrite)
         else:
-            report = write(
-                models[0],
-                output,
-                degree=degree,
-                data=scenes[0] if scenes else None,
-                crop=crop,
-                min_opacity=min_opacity,
-                background=background,
-                spz_version=spz_version,
-                baked=baked,
-                exposure=exposure,
-                colmap=colmap,
-                overwrite=overwrite,
-                report=progress,
-            )
+            scene = scenes[0] if scenes else None
+            report = write(models[0], output, config, data=scene, overwrite=overwrite, report=progress)
     note_rename(output, report.file)
     if as_json:
         print_json(asdict(report))

@@ -13,6 +13,8 @@ from hyrfpack.config.settings import OneOf, Range, Setting, list_settings
 
 Command = TypeVar("Command", bound=Callable)
 
+MAX_NAMED_INT = 9
+
 
 def settings_options(config_class: type, *names: str) -> Callable[[Command], Command]:
     """Return a decorator that adds an option for each of the named settings of a configuration class.
@@ -65,5 +67,12 @@ def _parameter_type(setting: Setting) -> tuple[click.ParamType, str | None]:
         return SIZE, "SIZE"
     unit = limits.unit.upper()
     if setting.kind is int:
-        return click.IntRange(*limits.as_ints()), unit or "N"
+        return click.IntRange(*limits.as_ints()), unit or _name_ints(*limits.as_ints())
     return click.FloatRange(limits.minimum, limits.maximum), unit or None
+
+
+def _name_ints(minimum: int, maximum: int | None) -> str:
+    """Return the name of the values of an option that takes ints: "3|4", "0-3" or "N"."""
+    if maximum is None or maximum > MAX_NAMED_INT:
+        return "N"
+    return f"{minimum}{'|' if maximum - minimum == 1 else '-'}{maximum}"

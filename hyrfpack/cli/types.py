@@ -45,6 +45,40 @@ class _Size(click.ParamType):
 SIZE = _Size()
 
 
+class _Box(click.ParamType):
+    """An axis-aligned box as six numbers with commas between: minimum x, y, z, then maximum x, y, z."""
+
+    name = "box"
+
+    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, ...]:
+        try:
+            numbers = tuple(float(part) for part in str(value).split(","))
+        except ValueError:
+            numbers = ()
+        if len(numbers) != 6 or any(map(math.isnan, numbers)):
+            self.fail(f"'{value}' is not a box; write it as MINX,MINY,MINZ,MAXX,MAXY,MAXZ in world units", param, ctx)
+        if any(low > high for low, high in zip(numbers[:3], numbers[3:], strict=True)):
+            self.fail(f"'{value}' has a minimum above its maximum; give the minimum x, y and z first", param, ctx)
+        return numbers
+
+
+class _HarmonicsDegree(click.ParamType):
+    """A degree of spherical harmonics, or "auto", which becomes None."""
+
+    name = "degree"
+
+    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> int | None:
+        if value == "auto":
+            return None
+        if str(value) not in ("0", "1", "2", "3"):
+            self.fail(f"'{value}' is neither 0, 1, 2 or 3 nor auto", param, ctx)
+        return int(str(value))
+
+
+BOX = _Box()
+HARMONICS_DEGREE = _HarmonicsDegree()
+
+
 def reject_nan(ctx: click.Context, param: click.Parameter, value: float | None) -> float | None:
     """Reject NaN, which click's ranges accept, as the callback of an option."""
     if value is not None and math.isnan(value):

@@ -101,7 +101,9 @@ class Setting:
 @cache
 def list_settings(config_class: type) -> dict[str, Setting]:
     """Return the settings of a dataclass by name; fields that are neither numbers, words nor bool are left out."""
-    hints, entries = get_type_hints(config_class, include_extras=True), _read_entries(config_class)
+    hints, entries = get_type_hints(config_class, include_extras=True), {}
+    for base in reversed(config_class.__mro__):
+        entries |= _read_entries(base)
     settings = {}
     for field in fields(config_class):
         hint = hints[field.name]
@@ -136,8 +138,8 @@ def check_settings(config: object) -> None:
 
 
 def _read_entries(config_class: type) -> dict[str, str]:
-    """Return the entries of the section "Attributes" of a class's docstring by name, each in one line."""
-    _, _, section = (inspect.getdoc(config_class) or "").partition("Attributes:\n")
+    """Return the entries of the section "Attributes" of a class's own docstring by name, each in one line."""
+    _, _, section = inspect.cleandoc(config_class.__doc__ or "").partition("Attributes:\n")
     return {
         name: " ".join(text.split()) for names, text in _ENTRY_PATTERN.findall(section) for name in names.split(", ")
     }

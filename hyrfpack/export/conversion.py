@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import fmean
@@ -13,9 +12,10 @@ import numpy as np
 
 from hyrfpack.atomic import write_atomic
 from hyrfpack.cameras.paths import Viewpoint
-from hyrfpack.choices import DEFAULT_SPZ_VERSION
+from hyrfpack.checks import check_type
+from hyrfpack.config.export import ConvertConfig
 from hyrfpack.errors import HyrfDataError, HyrfError
-from hyrfpack.export.kinds import check_request, select_splats
+from hyrfpack.export.kinds import check_package, select_splats
 from hyrfpack.export.measure import psnr_of_splats
 from hyrfpack.outputs import Outputs
 from hyrfpack.progress import Report, no_report, report_part
@@ -67,11 +67,8 @@ class ConversionReport:
 def convert_splats(
     source: str | os.PathLike[str],
     target: str | os.PathLike[str],
+    config: ConvertConfig | None = None,
     *,
-    degree: int | None = None,
-    crop: Sequence[float] | None = None,
-    min_opacity: float = 0.0,
-    spz_version: int = DEFAULT_SPZ_VERSION,
     overwrite: bool = True,
     report: Report = no_report,
 ) -> ConversionReport:
@@ -82,11 +79,7 @@ def convert_splats(
     Args:
         source: .ply (plain or compressed), .splat, .spz, .sog, or the folder of an unbundled SOG.
         target: the file to write; its ending names the format: .ply, .splat, .spz, .glb, .usda, .usdc, .usdz or .sog.
-        degree: highest degree of the spherical harmonics to keep, 0 to 3; None keeps all that the format can hold.
-        crop: (min x, min y, min z, max x, max y, max z) in world units; Gaussians whose centres lie outside are left
-            out. Infinite numbers leave a side open.
-        min_opacity: Gaussians with a lower opacity are left out.
-        spz_version: version of ".spz" files, 4 or 3 (for programs that do not read 4), see `Hints`.
+        config: what to keep, and how to write it; None for the defaults.
         overwrite: replace a file at `target`. If False, an existing file is an error. A file that appears during the
             conversion is kept, and the result gets a free name in its folder, which the report contains.
         report: called with the current activity and the share of the work that is done, 0 to 1.
@@ -102,7 +95,9 @@ def convert_splats(
         (0, True, True)
     """
     kind = find_target_format(source, target)
-    check_request(kind, target, degree, crop, min_opacity)
+    config = ConvertConfig() if config is None else config
+    check_type("config", config, ConvertConfig)
+    check_package(kind, target)
     Outputs(source, folder=sog_folder(source), overwrite=overwrite).file(target)
     report(f"reading {Path(source).name}", 0.0)
     splats = read_splats(source)
@@ -111,13 +106,13 @@ def convert_splats(
             f"{source}: there is no Gaussian in it, so there is nothing to convert",
             fix="name another file",
         )
-    whole = splats if crop is None else select_splats(splats, crop)
-    kept = select_splats(whole, None, min_opacity)
-    kept = kept.with_degree(min(kept.degree, kind.max_degree, kept.degree if degree is None else degree))
+    whole = splats if config.crop is None else select_splats(splats, config.crop)
+    kept = select_splats(whole, None, config.min_opacity)
+    kept = kept.with_degree(min(kept.degree, kind.max_degree, kept.degree if config.degree is None else config.degree))
     _check_limits(kind, splats, kept)
     weighted = WeightedSplats.from_splats(whole, str(source))
     camera = Viewpoint.from_frame(weighted.frame.center, weighted.frame.scale).camera
-    hints = Hints(camera=camera, spz_version=spz_version)
+    hints = Hints(camera=camera, spz_version=config.spz_version)
     report(f"writing {len(kept):,} Gaussians as {kind.ending}", 0.2)
     data = kind.encode(kept, hints)
     report("reading the file back", 0.5)

@@ -11,12 +11,12 @@ import numpy as np
 import torch
 
 from hyrfpack.choices import LOCAL_EXPOSURE
+from hyrfpack.config.export import ExportConfig
 from hyrfpack.errors import HyrfError, needs_package
 from hyrfpack.export.background import background_reach
 from hyrfpack.export.cameras import COLMAP_FILES
 from hyrfpack.export.source import Source
 from hyrfpack.outputs import Outputs
-from hyrfpack.splats.harmonics import MAX_DEGREE
 from hyrfpack.splats.splats import Splats
 from hyrfpack.splats.table import FORMATS, FileKind
 
@@ -28,6 +28,7 @@ POINT_FILES = (
     FileKind(ending=".points.glb", max_degree=0, module="trimesh"),
 )
 COLMAP_FOLDER = FileKind(ending="", max_degree=0, module="pycolmap")
+POSITION_KINDS = (COLMAP_FOLDER, *POINT_FILES)  # these hold the centres of Gaussians, and cameras
 PLAYER_FOLDER = FileKind(ending="")
 _KINDS_BY_ENDING = {kind.ending: kind for kind in (*POINT_FILES, *FORMATS.values(), HTML_PAGE, TRANSFORMS_JSON)}
 ENDINGS = tuple(_KINDS_BY_ENDING)
@@ -70,49 +71,40 @@ def find_file_kind(
     )
 
 
-def check_request(
-    kind: FileKind,
-    target: str | os.PathLike[str],
-    degree: int | None = None,
-    crop: Sequence[float] | None = None,
-    min_opacity: float = 0.0,
-    background: bool = True,
-    baked: bool = False,
-    exposure: str = LOCAL_EXPOSURE,
-) -> None:
-    """Check the arguments of `export_model` before any work. Raises HyrfError if they contradict each other."""
-    if degree is not None and degree not in range(MAX_DEGREE + 1):
-        raise HyrfError(f"spherical harmonics of degree {degree} are not supported", fix=f"use 0 to {MAX_DEGREE}")
-    if crop is not None and (np.shape(crop) != (6,) or np.isnan(crop).any()):
-        raise HyrfError(
-            f"the crop {crop} is not a box",
-            fix="give the minimum x, y and z, then the maximum, in world units",
-        )
-    if not 0 <= min_opacity <= 1:
-        raise HyrfError(f"the minimum opacity {min_opacity} is out of range", fix="use 0 to 1")
-    if kind is TRANSFORMS_JSON and (crop is not None or min_opacity > 0):
+def check_request(kind: FileKind, target: str | os.PathLike[str], config: ExportConfig) -> None:
+    """Check before any work that a kind of file can be written with these settings.
+
+    Raises:
+        HyrfError: the settings contradict the kind, or a package is missing.
+    """
+    if kind is TRANSFORMS_JSON and (config.crop is not None or config.min_opacity > 0):
         raise HyrfError(
             f"{target}: this file holds only cameras, so that Gaussians cannot be selected",
             fix="leave out `crop` and `min_opacity`",
         )
-    if baked and kind is PLAYER_FOLDER:
+    if config.baked and kind is PLAYER_FOLDER:
         raise HyrfError(
             f"{target}: the folder of a player holds the model file itself and no baked splats",
             fix="with `baked=True`, use a path that ends in .html",
         )
     asked = {
-        "`degree`": degree is not None,
-        "`crop`": crop is not None,
-        "`min_opacity`": min_opacity > 0,
-        "`background=False`": not background,
-        f"`exposure={exposure!r}`": exposure != LOCAL_EXPOSURE,
+        "`degree`": config.degree is not None,
+        "`crop`": config.crop is not None,
+        "`min_opacity`": config.min_opacity > 0,
+        "`background=False`": not config.background,
+        f"`exposure={config.exposure!r}`": config.exposure != LOCAL_EXPOSURE,
     }
-    if any(asked.values()) and (kind is PLAYER_FOLDER or (kind is HTML_PAGE and not baked)):
+    if any(asked.values()) and (kind is PLAYER_FOLDER or (kind is HTML_PAGE and not config.baked)):
         names = " and ".join(name for name, given in asked.items() if given)
         raise HyrfError(
             f"{target}: the output holds the whole model, which these settings cannot change",
             fix=f"leave out {names}, or write baked splats into a page with `baked=True`",
         )
+    check_package(kind, target)
+
+
+def check_package(kind: FileKind, target: str | os.PathLike[str]) -> None:
+    """Check that the package that a kind of file needs is installed. Raises HyrfError otherwise."""
     if kind.module:
         with needs_package(f"{target}: writing this format"):
             import_module(kind.module)
@@ -126,24 +118,26 @@ def check_place(target: str | os.PathLike[str], outputs: Outputs, colmap: bool =
         outputs.file(target)
 
 
+def includes_background(loaded: Source, kind: FileKind, config: ExportConfig) -> bool:
+    """Return whether an export includes the background sphere of the model."""
+    return config.background and config.crop is None and loaded.model.config.background and kind not in POSITION_KINDS
+
+
 @torch.no_grad()
-def check_model(loaded: Source, kind: FileKind, crop: Sequence[float] | None, min_opacity: float, sphere: bool) -> None:
+def check_model(loaded: Source, kind: FileKind, config: ExportConfig) -> None:
     """Check before the bake that Gaussians remain and that their positions fit into the kind of file.
 
-    Args:
-        loaded: the model.
-        kind: the kind of file.
-        crop, min_opacity: as in `export_model`.
-        sphere: whether the background sphere is exported, too.
-
     Raises:
-        HyrfError: the options leave no Gaussian, or the scene is too far from the origin.
+        HyrfError: the settings leave no Gaussian, or the scene is too far from the origin.
     """
     model, frame = loaded.model, loaded.model.config.frame
     positions = frame.to_world(model.gaussians.positions.numpy())
+    crop, min_opacity = config.crop, config.min_opacity
     if crop is not None or min_opacity > 0:  # certain before the bake, because it raises no opacity
         positions = positions[selection_mask(positions, model.decode_geometry().opacities.numpy(), crop, min_opacity)]
-    reach = max(float(np.abs(positions).max()), background_reach(frame) if sphere else 0.0)
+    reach = float(np.abs(positions).max())
+    if includes_background(loaded, kind, config):
+        reach = max(reach, background_reach(frame))
     if reach > kind.max_coordinate:
         raise HyrfError(
             f"the scene reaches {reach:,.0f} units from the origin with its background, but {kind.ending} is limited "
@@ -153,7 +147,7 @@ def check_model(loaded: Source, kind: FileKind, crop: Sequence[float] | None, mi
 
 
 def select_splats(splats: Splats, crop: Sequence[float] | None = None, min_opacity: float = 0.0) -> Splats:
-    """Return the splats with centres in the box `crop` and opacities of at least `min_opacity`; see `export_model`.
+    """Return the splats with centres in the box `crop` and opacities of at least `min_opacity`; see `ConvertConfig`.
 
     Raises:
         HyrfError: no splat is left.

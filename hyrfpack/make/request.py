@@ -8,6 +8,7 @@ from pathlib import Path
 
 import torch
 
+from hyrfpack.config.export import ExportConfig
 from hyrfpack.config.train import TrainConfig
 from hyrfpack.data.folder import list_photos
 from hyrfpack.errors import HyrfDataError, HyrfError
@@ -91,7 +92,7 @@ class Request:
         """Reject options that exclude each other or do not fit the source."""
         source = self.source
         if not self._is_model:
-            check_request(find_file_kind(self.output, other_endings=(".hyrf",)), self.output)
+            check_request(find_file_kind(self.output, other_endings=(".hyrf",)), self.output, ExportConfig())
         elif source.kind == "model":
             raise HyrfError(
                 f"{source.path}: this is a .hyrf file already", fix="make it smaller with 'hyrfpack compress'"

@@ -259,7 +259,7 @@ CALLS_THAT_WRITE_A_FILE = {
     "distill": lambda out: hyrfpack.import_splats(
         "ball.ply", out, hyrfpack.DistillConfig(steps=1, size=16), overwrite=False
     ),
-    "export": lambda out: hyrfpack.export_model("model.hyrf", out, degree=0, overwrite=False),
+    "export": lambda out: hyrfpack.export_model("model.hyrf", out, hyrfpack.ExportConfig(degree=0), overwrite=False),
     "compare": lambda out: hyrfpack.compare_runs(["first", "second"], out),
 }
 
@@ -321,7 +321,7 @@ CALLS_THAT_WRITE_A_FOLDER = {
     "estimate_poses": lambda: hyrfpack.estimate_poses("photos", "out"),
     "evaluate": lambda: hyrfpack.evaluate_model(load_model("model.hyrf"), load_scene("data").test, pictures="out"),
     "export": lambda: hyrfpack.export_model("model.hyrf", "out"),
-    "export colmap": lambda: hyrfpack.export_model("model.hyrf", "out", colmap=True),
+    "export colmap": lambda: hyrfpack.export_model("model.hyrf", "out", hyrfpack.ExportConfig(colmap=True)),
     "player": lambda: hyrfpack.export_player(None, "out"),
     "gallery": lambda: hyrfpack.export_gallery(["model.hyrf"], "out"),
     "make": lambda: hyrfpack.make_scene("packed.hyrf", "out", work="made"),

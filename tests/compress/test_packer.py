@@ -156,7 +156,7 @@ def test_sizes_after_packing_and_export_match_the_recorded_ones(
 ):
     """If a change is meant to change sizes, record the sizes in the message of this test as the new ones."""
     exported = tmp_path / "small.spz"
-    hyrfpack.export_model(compact_file_and_report[0], exported, degree=1)
+    hyrfpack.export_model(compact_file_and_report[0], exported, hyrfpack.ExportConfig(degree=1))
     files = {
         "raw": DEMO_MODEL_FILE,
         "paper": paper_file,

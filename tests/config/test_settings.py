@@ -9,10 +9,11 @@ from typing import Annotated
 import pytest
 
 from hyrfpack.config.distill import DistillConfig
+from hyrfpack.config.export import ConvertConfig, ExportConfig
 from hyrfpack.config.settings import OneOf, Range, check_settings, list_settings
 from hyrfpack.config.train import DensityConfig, TrainConfig
 
-CONFIG_CLASSES = (DensityConfig, DistillConfig, TrainConfig)
+CONFIG_CLASSES = (ConvertConfig, DensityConfig, ExportConfig, DistillConfig, TrainConfig)
 
 
 @dataclass(frozen=True)
@@ -91,3 +92,13 @@ def test_every_setting_is_described_and_every_number_has_a_range(config_class):
         assert setting.description, setting.name
         assert setting.kind not in (int, float) or isinstance(setting.limits, Range), setting.name
         setting.check(setting.default)
+
+
+def test_a_derived_class_has_the_settings_and_descriptions_of_its_base():
+    assert list_settings(ExportConfig)["min_opacity"] == list_settings(ConvertConfig)["min_opacity"]
+
+
+@pytest.mark.parametrize("crop", [(0, 0, 1, 1), (0, 0, 0, 1, 1, math.nan)])
+def test_a_crop_that_is_no_box_is_an_error(crop):
+    with pytest.raises(ValueError, match="^crop is .*; it must be six numbers"):
+        ExportConfig(crop=crop)

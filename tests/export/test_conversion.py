@@ -9,6 +9,7 @@ import pytest
 from explicit_balls import ball_splats
 
 import hyrfpack
+from hyrfpack.config.export import ConvertConfig
 from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.splats.files import READABLE_ENDINGS, read_splats
 from hyrfpack.splats.formats import sog
@@ -76,7 +77,7 @@ def test_degree_crop_and_min_opacity_reduce_the_splats(tmp_path):
     splats = ball_splats(GAUSSIAN_COUNT, degree=2)
     source = write_splats(tmp_path, ".ply", splats)
     box = (-9, -9, -9, 9, 9, 0)
-    report = hyrfpack.convert_splats(source, tmp_path / "a.ply", degree=1, crop=box, min_opacity=0.6)
+    report = hyrfpack.convert_splats(source, tmp_path / "a.ply", ConvertConfig(degree=1, crop=box, min_opacity=0.6))
     converted = read_splats(tmp_path / "a.ply")
     assert len(converted) == ((splats.positions[:, 2] <= 0) & (splats.opacities >= 0.6)).sum()
     assert (report.gaussians_before, report.gaussians_after) == (GAUSSIAN_COUNT, len(converted))
@@ -85,8 +86,8 @@ def test_degree_crop_and_min_opacity_reduce_the_splats(tmp_path):
 
 def test_a_crop_has_no_loss_but_min_opacity_has(tmp_path):
     source = write_splats(tmp_path, ".ply", ball_splats(GAUSSIAN_COUNT))
-    cropped = hyrfpack.convert_splats(source, tmp_path / "a.ply", crop=(-9, -9, -9, 9, 9, 0))
-    thinned = hyrfpack.convert_splats(source, tmp_path / "b.ply", min_opacity=0.6)
+    cropped = hyrfpack.convert_splats(source, tmp_path / "a.ply", ConvertConfig(crop=(-9, -9, -9, 9, 9, 0)))
+    thinned = hyrfpack.convert_splats(source, tmp_path / "b.ply", ConvertConfig(min_opacity=0.6))
     assert cropped.psnr == 100 and thinned.psnr < 40
 
 

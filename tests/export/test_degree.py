@@ -8,9 +8,9 @@ from scenes import ring, small_model
 
 from hyrfpack.cameras.capture import provenance_cameras
 from hyrfpack.cameras.paths import Viewpoint
-from hyrfpack.errors import HyrfError
+from hyrfpack.config.export import ExportConfig
+from hyrfpack.export import baked_scene, export_model
 from hyrfpack.export import degree as degrees
-from hyrfpack.export import export_model, pipeline
 from hyrfpack.export.bake import compute_visibility
 from hyrfpack.export.degree import choose_degree, lowest_degree_within_tolerance
 from hyrfpack.export.source import Source
@@ -47,14 +47,14 @@ def test_direction_dependent_colors_get_a_higher_degree_and_the_reason_is_report
 
 
 def test_a_given_degree_is_not_compared_with_others(tmp_path, monkeypatch):
-    monkeypatch.setattr(pipeline, "choose_degree", lambda *arguments: pytest.fail("it was chosen"))
+    monkeypatch.setattr(baked_scene, "choose_degree", lambda *arguments: pytest.fail("it was chosen"))
     source = write_model(tmp_path / "m.hyrf", 0.0, ring(20))
     assert (
-        export_model(source, tmp_path / "a.ply", degree=2).degree,
+        export_model(source, tmp_path / "a.ply", ExportConfig(degree=2)).degree,
         export_model(source, tmp_path / "a.splat").degree,
     ) == (2, 0)
-    with pytest.raises(HyrfError, match="degree 4"):
-        export_model(source, tmp_path / "a.ply", degree=4)
+    with pytest.raises(ValueError, match="degree is 4"):
+        ExportConfig(degree=4)
 
 
 @pytest.mark.parametrize(("scores", "lowest"), [
@@ -115,6 +115,6 @@ def test_a_crop_gets_the_degree_of_the_whole_scene(tmp_path):
     source = write_model(tmp_path / "m.hyrf", 4.0, ring(40))
     whole, part = (
         export_model(source, tmp_path / "a.ply"),
-        export_model(source, tmp_path / "b.ply", crop=(-9, -9, -9, -0.1, 9, 9)),
+        export_model(source, tmp_path / "b.ply", ExportConfig(crop=(-9, -9, -9, -0.1, 9, 9))),
     )
     assert part.degree == whole.degree and part.gaussians == 1 and part.chosen_by == whole.chosen_by

@@ -199,7 +199,7 @@ def test_an_identity_map_does_not_change_the_file(ending, tmp_path):
         source = write_model(tmp_path / f"{name}.hyrf", model, [LEFT_CAMERA, RIGHT_CAMERA])
         target = tmp_path / name / f"out{ending}"
         target.parent.mkdir()
-        hyrfpack.export_model(source, target, baked=ending == ".html")
+        hyrfpack.export_model(source, target, hyrfpack.ExportConfig(baked=ending == ".html"))
         files.append(target.read_bytes())
     assert files[0] == files[1]
 
@@ -209,7 +209,7 @@ def test_consistent_splats_equal_those_of_the_model_without_its_map(bright_half_
     plain.exposure = None
     bare = write_model(tmp_path / "plain.hyrf", plain, [LEFT_CAMERA, RIGHT_CAMERA])
     hyrfpack.export_model(bare, tmp_path / "plain.ply")
-    hyrfpack.export_model(bright_half_file, tmp_path / "consistent.ply", exposure="consistent")
+    hyrfpack.export_model(bright_half_file, tmp_path / "consistent.ply", hyrfpack.ExportConfig(exposure="consistent"))
     hyrfpack.export_model(bright_half_file, tmp_path / "local.ply")
     files = [(tmp_path / f"{name}.ply").read_bytes() for name in ("plain", "consistent", "local")]
     assert files[0] == files[1] != files[2]
@@ -221,9 +221,7 @@ def test_the_report_contains_the_loss_at_both_exposures(ending, bright_half_file
         hyrfpack.export_model(
             bright_half_file,
             tmp_path / f"{exposure_name}{ending}",
-            exposure=exposure_name,
-            degree=1,
-            baked=ending == ".html",
+            hyrfpack.ExportConfig(exposure=exposure_name, degree=1, baked=ending == ".html"),
         )
         for exposure_name in ("local", "consistent")
     ]
@@ -240,7 +238,10 @@ def test_the_report_contains_the_loss_at_both_exposures(ending, bright_half_file
 def test_both_exposures_are_measured_on_photos(bright_half_file, tmp_path):
     scene = ball_scene(4)
     report = hyrfpack.export_model(
-        bright_half_file, tmp_path / "a.ply", degree=0, data=replace(scene, train=scene.train[1:], test=scene.train[:1])
+        bright_half_file,
+        tmp_path / "a.ply",
+        hyrfpack.ExportConfig(degree=0),
+        data=replace(scene, train=scene.train[1:], test=scene.train[:1]),
     )
     assert list(report.photos_by_exposure) == ["local", "consistent"]
     assert report.photos_by_exposure["local"] == pytest.approx(report.photos_file, abs=0.01)
@@ -248,7 +249,7 @@ def test_both_exposures_are_measured_on_photos(bright_half_file, tmp_path):
 
 def test_a_model_without_a_map_reports_no_exposure(tmp_path):
     source = write_model(tmp_path / "plain.hyrf", small_model(LEFT_POSITIONS), [LEFT_CAMERA])
-    report = hyrfpack.export_model(source, tmp_path / "a.ply", degree=0)
+    report = hyrfpack.export_model(source, tmp_path / "a.ply", hyrfpack.ExportConfig(degree=0))
     assert (report.exposure, report.psnr_by_exposure, report.photos_by_exposure) == (None, {}, {})
 
 
@@ -261,13 +262,13 @@ def test_a_file_without_cameras_gets_finite_splats(tmp_path):
 @pytest.mark.parametrize("target", ["page.html", "player"])
 def test_pages_with_the_model_itself_refuse_another_exposure(target, bright_half_file, tmp_path):
     with pytest.raises(HyrfError, match="exposure='consistent'"):
-        hyrfpack.export_model(bright_half_file, tmp_path / target, exposure="consistent")
+        hyrfpack.export_model(bright_half_file, tmp_path / target, hyrfpack.ExportConfig(exposure="consistent"))
     assert not (tmp_path / target).exists()
 
 
 def test_an_unknown_exposure_is_refused(bright_half_file, tmp_path):
     with pytest.raises(ValueError, match="local"):
-        hyrfpack.export_model(bright_half_file, tmp_path / "a.ply", exposure="mean")
+        hyrfpack.export_model(bright_half_file, tmp_path / "a.ply", hyrfpack.ExportConfig(exposure="mean"))
 
 
 def test_posters_show_the_scene_as_photographed():

@@ -14,6 +14,7 @@ from scenes import ball_scene, ring, small_model
 import hyrfpack
 from hyrfpack.cameras.capture import provenance_cameras
 from hyrfpack.cameras.paths import Viewpoint
+from hyrfpack.config.export import ExportConfig
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import evaluate_model
 from hyrfpack.export import ExportReport, export_gallery, export_model, export_player
@@ -42,7 +43,7 @@ def model_file(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def splats_file(model_file) -> Path:
-    export_model(model_file, model_file.parent / "cloud.ply", degree=1)
+    export_model(model_file, model_file.parent / "cloud.ply", ExportConfig(degree=1))
     return model_file.parent / "cloud.ply"
 
 
@@ -125,7 +126,7 @@ def test_a_full_disk_leaves_no_partial_file(model_file, tmp_path, monkeypatch):
 
 def test_splats_without_extent_have_no_poster(tmp_path):
     save_model(small_model(np.zeros((3, 3))), tmp_path / "m.hyrf", provenance={"cameras": provenance_cameras(ring(2))})
-    export_model(tmp_path / "m.hyrf", tmp_path / "a.ply", degree=0)
+    export_model(tmp_path / "m.hyrf", tmp_path / "a.ply", ExportConfig(degree=0))
     export_player(tmp_path / "a.ply", tmp_path / "p")
     assert file_names(tmp_path / "p") == PLAYER_FILES | {"scene.ply"} and "poster" not in read_content_json(
         tmp_path / "p" / "index.html"

@@ -14,6 +14,7 @@ from scenes import ball_scene, ring, small_model
 import hyrfpack
 from hyrfpack.cameras.capture import provenance_cameras
 from hyrfpack.cameras.paths import Viewpoint
+from hyrfpack.config.export import ExportConfig
 from hyrfpack.errors import HyrfError, HyrfFormatError
 from hyrfpack.export import export_model
 from hyrfpack.export.pages import MAX_POSTER_BYTES
@@ -114,13 +115,13 @@ def test_an_uncompressed_file_is_embedded_with_a_note(model_file, compact_file, 
 )
 def test_options_that_change_the_model_are_refused_with_a_hint_at_baked(target, options, name, model_file, tmp_path):
     with pytest.raises(HyrfError, match=rf"^[^\n]*{target}: [^\n]* {name}, [^\n]*`baked=True`$"):
-        export_model(model_file, tmp_path / target, **options)
+        export_model(model_file, tmp_path / target, ExportConfig(**options))
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_baked_player_folder_is_refused(model_file, tmp_path):
     with pytest.raises(HyrfError, match=r"player: [^\n]*`baked=True`[^\n]*\.html$"):
-        export_model(model_file, tmp_path / "player", baked=True)
+        export_model(model_file, tmp_path / "player", ExportConfig(baked=True))
     assert list(tmp_path.iterdir()) == []
 
 

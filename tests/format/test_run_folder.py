@@ -102,7 +102,7 @@ def test_reading_a_run_equals_reading_its_model(run_folder, tmp_path):
     hyrfpack.compress_model(run_folder, tmp_path / "a.hyrf", "paper")
     hyrfpack.compress_model(run_folder / "model.hyrf", tmp_path / "b.hyrf", "paper")
     assert (tmp_path / "a.hyrf").read_bytes() == (tmp_path / "b.hyrf").read_bytes()
-    hyrfpack.export_model(run_folder, tmp_path / "a.ply", degree=0, background=False)
+    hyrfpack.export_model(run_folder, tmp_path / "a.ply", hyrfpack.ExportConfig(degree=0, background=False))
     assert len(read_splats(tmp_path / "a.ply")) == len(GAUSSIAN_POSITIONS)
 
 

@@ -58,7 +58,7 @@ def compress():
     return Path("compact.hyrf").read_bytes()
 
 def export():
-    hyrfpack.export_model("model.hyrf", "model.spz", degree=1)
+    hyrfpack.export_model("model.hyrf", "model.spz", hyrfpack.ExportConfig(degree=1))
     return Path("model.spz").read_bytes()
 
 def send_result(function, sender):

@@ -52,7 +52,7 @@ def write_pages(model: Path, folder: Path, data: Scene | None = None) -> dict[st
     """Write the native and the baked page of a model; baked colours are fitted at the cameras of `data`, if given."""
     paths = {"native": folder / f"{model.parent.name}.html", "baked": folder / f"{model.parent.name}.baked.html"}
     for name, path in paths.items():
-        hyrfpack.export_model(model, path, data=data, baked=name == "baked")
+        hyrfpack.export_model(model, path, hyrfpack.ExportConfig(baked=name == "baked"), data=data)
     return paths
 
 

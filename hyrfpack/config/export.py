@@ -1,0 +1,58 @@
+"""Settings of an export and of a conversion of splats."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+from hyrfpack.choices import DEFAULT_SPZ_VERSION, LOCAL_EXPOSURE, SPLAT_EXPOSURES, SPZ_VERSIONS
+from hyrfpack.config.settings import OneOf, Range, check_settings
+
+
+@dataclass(frozen=True)
+class ConvertConfig:
+    """Settings of a conversion of splats.
+
+    Attributes:
+        degree: highest degree of spherical harmonics to keep. Default: the highest that the format can store.
+        crop: keep only the Gaussians with centres inside (min x, min y, min z, max x, max y, max z), in world units.
+            Infinite numbers leave a side open.
+        min_opacity: leave out Gaussians with a lower opacity.
+        spz_version: version of .spz files; 3 is for programs that do not read version 4 yet.
+    """
+
+    degree: Annotated[int | None, Range(0, 3)] = None
+    crop: Sequence[float] | None = None
+    min_opacity: Annotated[float, Range(0, 1)] = 0.0
+    spz_version: Annotated[int, Range(*SPZ_VERSIONS)] = DEFAULT_SPZ_VERSION
+
+    def __post_init__(self) -> None:
+        check_settings(self)
+        if self.crop is not None and (len(self.crop) != 6 or any(map(math.isnan, self.crop))):
+            raise ValueError(
+                f"crop is {self.crop!r}; it must be six numbers, the minimum x, y and z, then the maximum, in world "
+                "units"
+            )
+
+
+@dataclass(frozen=True)
+class ExportConfig(ConvertConfig):
+    """Settings of an export of a model.
+
+    `degree` is the one that colours are baked to; a ".splat" has degree 0. None chooses the lowest degree that scores
+    about as well as the best at validation cameras. A cropped scene has no background.
+
+    Attributes:
+        background: export the background sphere.
+        baked: embed baked splats in an .html page instead of the neural model.
+        exposure: exposure of baked splats: each as bright as in the photos that see it (local), or one exposure for all
+            (consistent). A model without an exposure map gives the same splats with both.
+        colmap: write a folder with a COLMAP model: cameras, and centres as points.
+    """
+
+    background: bool = True
+    baked: bool = False
+    exposure: Annotated[str, OneOf(SPLAT_EXPOSURES)] = LOCAL_EXPOSURE
+    colmap: bool = False

@@ -1,0 +1,134 @@
+"""Bake of a whole scene: the choice of the degree, the fit of colours, the selection of splats, and the background."""
+
+from __future__ import annotations
+
+import copy
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from hyrfpack.choices import CONSISTENT_EXPOSURE, LOCAL_EXPOSURE, SPLAT_EXPOSURES
+from hyrfpack.config.export import ExportConfig
+from hyrfpack.export.background import background_picture, background_splats
+from hyrfpack.export.bake import CameraVisibility, bake, compute_visibility
+from hyrfpack.export.degree import choose_degree
+from hyrfpack.export.kinds import HTML_PAGE, POSITION_KINDS, includes_background, select_splats
+from hyrfpack.export.source import Source
+from hyrfpack.progress import Report, report_part
+from hyrfpack.splats.splats import Splats, concatenate
+from hyrfpack.splats.table import FileKind
+
+_LOG = logging.getLogger(__name__)
+
+# Splats, with the picture of their background or None.
+ShownSplats = tuple[Splats, np.ndarray | None]
+
+
+@dataclass(frozen=True)
+class BakedScene:
+    """A scene baked to splats.
+
+    Attributes:
+        source: the model with the exposure of the splats, and its cameras.
+        splats: the splats, those of the background last.
+        background_count: number of splats that represent the background.
+        picture: (H, 2H, 3) picture of the background, for kinds of files that hold one, else None.
+        sphere: whether the background is included.
+        degree: degree of the harmonics.
+        chosen_by: score of each degree in dB, if the degree was chosen.
+        exposure: exposure of the splats; None for a model without an exposure map.
+        by_exposure: splats of each exposure, to be compared; empty if there is nothing to compare.
+    """
+
+    source: Source
+    splats: Splats
+    background_count: int
+    picture: np.ndarray | None
+    sphere: bool
+    degree: int
+    chosen_by: dict[int, float] = field(default_factory=dict)
+    exposure: str | None = None
+    by_exposure: dict[str, ShownSplats] = field(default_factory=dict)
+
+
+def bake_scene(source: Source, kind: FileKind, config: ExportConfig, report: Report) -> BakedScene:
+    """Bake a model to the splats that a file of a kind needs.
+
+    Args:
+        source: the model with its cameras.
+        kind: kind of the file.
+        config: settings of the export.
+        report: called with the current activity and the share of the work that is done, 0 to 1.
+
+    Raises:
+        HyrfError: the settings leave no Gaussian.
+    """
+    by_exposure = {LOCAL_EXPOSURE: source, CONSISTENT_EXPOSURE: _without_exposure_map(source)}
+    loaded = by_exposure[config.exposure]
+    degree, chosen_by, visibility = _decide_degree(loaded, kind, config, report_part(report, 0.0, 0.7))
+    fit_report = report_part(report, 0.7 if chosen_by else 0.5, 0.8)
+    baked = _bake_at(loaded, kind, config, degree, visibility, fit_report)
+    has_map = source.model.exposure is not None
+    baked = replace(baked, chosen_by=chosen_by, exposure=config.exposure if has_map else None)
+    if not has_map or config.crop is not None or not source.measured_views or kind in POSITION_KINDS:
+        return baked
+    (other,) = set(SPLAT_EXPOSURES) - {config.exposure}
+    _LOG.info(f"fitting colours of {other} exposure for comparison")
+    rival = _bake_at(by_exposure[other], kind, config, degree, visibility, report_part(report, 0.8, 1.0))
+    shown = {config.exposure: (baked.splats, baked.picture), other: (rival.splats, rival.picture)}
+    return replace(baked, by_exposure=shown)
+
+
+def _decide_degree(
+    loaded: Source, kind: FileKind, config: ExportConfig, report: Report
+) -> tuple[int, dict[int, float], Sequence[CameraVisibility]]:
+    """Return the degree of the harmonics, the scores if it was chosen by these, and what the cameras see."""
+    places = f"{len(loaded.fit_cameras)} " + (
+        "cameras"
+        if loaded.cameras
+        else "viewpoints around the scene, because the file stores no cameras (name photos with `data`)"
+    )
+    highest = kind.max_degree if config.degree is None else min(config.degree, kind.max_degree)
+    degree, chosen_by = highest, {}
+    is_chosen = config.degree is None and highest > 0
+    if is_chosen:
+        _LOG.info(f"choosing the degree of the spherical harmonics at {places}")
+        visibility = compute_visibility(loaded.model, loaded.fit_cameras, report_part(report, 0.0, 0.43))
+        degree, chosen_by = choose_degree(
+            loaded.model, loaded.fit_cameras, highest, visibility, report_part(report, 0.43, 1.0)
+        )
+        scores = ", ".join(f"{score:.2f}" for score in chosen_by.values())
+        _LOG.info(f"chosen degree {degree}: {scores} dB against the model for degrees 0 to {highest}")
+    _LOG.info(f"fitting colours of degree {degree} at {places}")
+    if not is_chosen:
+        visibility = compute_visibility(loaded.model, loaded.fit_cameras, report_part(report, 0.0, 0.71))
+    return degree, chosen_by, visibility
+
+
+def _bake_at(
+    loaded: Source,
+    kind: FileKind,
+    config: ExportConfig,
+    degree: int,
+    visibility: Sequence[CameraVisibility],
+    report: Report,
+) -> BakedScene:
+    """Bake a model at a degree, select splats, and add the background."""
+    splats = bake(loaded.model, loaded.fit_cameras, (degree,), visibility, report)[degree]
+    sphere = includes_background(loaded, kind, config)
+    splats, picture, background_count = select_splats(splats, config.crop, config.min_opacity), None, 0
+    if sphere and kind is HTML_PAGE:
+        picture = background_picture(loaded.model, cameras=loaded.fit_cameras, visibility=visibility)
+    elif sphere:
+        distant = background_splats(loaded.model, loaded.fit_cameras, kind.max_scale, visibility)
+        splats, background_count = concatenate((splats, distant)), len(distant)
+    return BakedScene(loaded, splats, background_count, picture, sphere, degree)
+
+
+def _without_exposure_map(loaded: Source) -> Source:
+    """Return a copy without the exposure map, for renders and bakes of consistent exposure; parameters are shared."""
+    model = copy.copy(loaded.model)
+    model.exposure = None
+    return replace(loaded, model=model)
