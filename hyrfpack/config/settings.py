@@ -101,7 +101,8 @@ class Setting:
 @cache
 def list_settings(config_class: type) -> dict[str, Setting]:
     """Return the settings of a dataclass by name; fields that are neither numbers, words nor bool are left out."""
-    hints, entries = get_type_hints(config_class, include_extras=True), {}
+    hints = get_type_hints(config_class, include_extras=True)
+    entries: dict[str, str] = {}
     for base in reversed(config_class.__mro__):
         entries |= _read_entries(base)
     settings = {}

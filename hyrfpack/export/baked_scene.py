@@ -91,7 +91,7 @@ def _decide_degree(
         else "viewpoints around the scene, because the file stores no cameras (name photos with `data`)"
     )
     highest = kind.max_degree if config.degree is None else min(config.degree, kind.max_degree)
-    degree, chosen_by = highest, {}
+    degree, chosen_by = highest, dict[int, float]()
     is_chosen = config.degree is None and highest > 0
     if is_chosen:
         _LOG.info(f"choosing the degree of the spherical harmonics at {places}")

@@ -152,8 +152,8 @@ def _write_points(baked: BakedScene, target: Path, kind: FileKind, overwrite: bo
         write_colmap(named, target, baked.splats, overwrite=overwrite)
         size = sum(table.stat().st_size for table in Path(target, "sparse", "0").glob("*.bin"))
         return ExportReport(str(target), size, cameras=len(named))
-    file_format = "glb" if kind.ending.endswith("glb") else "ply"
-    data = encode_points(baked.splats, [camera for _, camera in named], file_format, up)
+    cameras = [camera for _, camera in named]
+    data = encode_points(baked.splats, cameras, "glb" if kind.ending.endswith("glb") else "ply", up)
     written = write_atomic(target, data, overwrite=overwrite)
     return ExportReport(str(written), len(data), len(baked.splats), cameras=len(named))
 

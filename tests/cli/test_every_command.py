@@ -1,7 +1,8 @@
-"""No command loses a user's files: every command is tried with every one of its inputs as its output.
+"""No command loses a user's files: every command is tried with its inputs as its output.
 
 No command writes over its inputs. Without --overwrite, no command writes into a folder with photos or poses, or over
-an existing file. Every command checks all its outputs before it works.
+an existing file. Every command checks all its outputs before it works. The rules themselves are tested in
+`tests/outputs`, and with every path of every set in `tests/test_protected_sets.py`.
 
 `python tests/cli/test_every_command.py` runs all cases and prints the table for the documentation.
 """
@@ -9,8 +10,6 @@ an existing file. Every command checks all its outputs before it works.
 from __future__ import annotations
 
 import hashlib
-import json
-import math
 import os
 import shutil
 import sys
@@ -20,11 +19,10 @@ from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 
-import numpy as np
 import pytest
 from click.testing import Result
 from commands import hyrfpack
-from PIL import Image
+from photo_sets import READ_PATHS_BY_SET, write_photo_sets
 
 OUTCOME_REFUSED = "refused"
 OUTCOME_REPLACED = "replaced"
@@ -35,28 +33,6 @@ WORK_BEGAN_FIX = "let it"
 
 # -- inputs of commands ------------------------------------------------------------------------------------------------
 
-# Folders of photos and poses (COLMAP, NeRF-synthetic, nerfstudio), and the paths below them that commands read.
-READ_PATHS_BY_SET = {
-    "hall": (
-        "",
-        "/images",
-        "/masks",
-        "/sparse/0",
-        "/images/0001.png",
-        "/masks/0001.png",
-        "/sparse/0/images.bin",
-    ),
-    "blender": (
-        "",
-        "/train",
-        "/test",
-        "/transforms_train.json",
-        "/transforms_test.json",
-        "/train/0.png",
-        "/test/0.png",
-    ),
-    "nerfstudio": ("", "/images", "/masks", "/transforms.json", "/points.ply", "/images/0001.png", "/masks/0001.png"),
-}
 OUTPUT_ENDINGS = (".ply", ".splat", ".spz", ".glb", ".sog", ".html", ".points.ply", ".points.glb", ".json")
 USD_ENDINGS = (".usda", ".usdc", ".usdz")
 
@@ -80,132 +56,53 @@ class Case:
         return self.command.format(self.output)
 
 
-def _input_cases(command: str, *outputs: str) -> list[Case]:
-    """Return cases whose outputs are inputs, which no command replaces."""
-    return [Case(command, output) for output in outputs]
-
-
-def _paths_of_set(name: str, new: str = "") -> list[str]:
-    """Return the paths of a set that commands read, and paths of a new name in its folders."""
-    paths = [name + part for part in READ_PATHS_BY_SET[name]]
-    return paths + [f"{path}/{new}" for path in paths if new and not Path(path).suffix]
-
-
-def _make_cases() -> list[Case]:
-    cases = []
-    for name in READ_PATHS_BY_SET:
-        cases += _input_cases(f"train {name} -o {{}} --steps 2", *_paths_of_set(name))
-        cases += _input_cases(f"poses {name} -o {{}}", *_paths_of_set(name))
-        cases += _input_cases(f"render model.hyrf --data {name} -o {{}}", "model.hyrf", *_paths_of_set(name))
-        cases += _input_cases(f"evaluate model.hyrf --data {name} --pictures {{}}", "model.hyrf", *_paths_of_set(name))
-        cases += _input_cases(
-            f"compress model.hyrf --data {name} -o {{}}", "model.hyrf", *_paths_of_set(name, "new.hyrf")
-        )
-        cases += _input_cases(
-            f"compress model.hyrf --data {name} -o small.hyrf --report {{}}", "model.hyrf", *_paths_of_set(name)
-        )
-        cases += _input_cases(f"export model.hyrf --data {name} -o {{}}", "model.hyrf", *_paths_of_set(name))
-        cases += _input_cases(f"bench model.hyrf --data {name} -o {{}}", "model.hyrf", *_paths_of_set(name, "new.png"))
-        cases += _input_cases(
-            f"bench model.hyrf --data {name} -o new.png --markdown {{}}", "model.hyrf", *_paths_of_set(name, "new.md")
-        )
-    for ending in (*OUTPUT_ENDINGS, *USD_ENDINGS):  # a file of each kind beside photos that are read
-        cases += _input_cases("export model.hyrf --data hall -o {}", f"hall/images/new{ending}", f"hall/new{ending}")
-    for name in READ_PATHS_BY_SET:  # an ending decides what is written, as for folders and the player
-        cases += _input_cases(
-            f"make {name} -o {{}}", *(path for path in _paths_of_set(name, "new.html") if "." not in path)
-        )
-        cases += _input_cases(
-            f"make {name} -o {{}}", *(path for path in _paths_of_set(name, "new.html") if path.endswith("html"))
-        )
-    cases += _input_cases("make photos -o {}", "photos", "photos/new.html", "photos/0001.png", "photos/made/new.html")
-    cases += _input_cases("make ball.ply -o {}", "ball.ply", "{world}/ball.ply")
-    cases += _input_cases("make packed.hyrf -o {}", "packed.hyrf", "named.json/a.html")
-    cases += _input_cases("train nerfstudio -o {} --steps 2", "nerfstudio/images/..", "{world}/nerfstudio")
-    cases += _input_cases("train link-to-set -o {} --steps 2", "link-to-set", "hall", "hall/images")
-    cases += _input_cases("train views-of-its-own -o {} --images views --steps 2", "views-of-its-own")
-    names = ("packed.hyrf", "soft.hyrf", "hard.hyrf", "old/../packed.hyrf", "{world}/packed.hyrf")
-    for command in ("compress packed.hyrf -o {}", "decompress packed.hyrf -o {}"):
-        cases += _input_cases(command, *names)
-        cases += _input_cases(command.replace("packed.hyrf", "soft.hyrf"), *names)
-    cases += _input_cases("render model.hyrf --cameras cameras.json -o {}", "model.hyrf", "cameras.json")
-    cases += _input_cases("render model.hyrf --cameras nerfstudio/transforms.json -o {}", "nerfstudio/transforms.json")
-    cases += _input_cases("evaluate model.hyrf --data blender --lpips-weights lpips.pth --pictures {}", "lpips.pth")
-    cases += _input_cases("export model.hyrf -o {}", "model.hyrf")
-    cases += _input_cases("export named.json -o {}", "named.json")  # a model under another name
-    cases += _input_cases("import ball.ply -o {}", "ball.ply", "{world}/ball.ply", "old/../ball.ply")
-    cases += _input_cases("import ball.hyrf.ply -o {}", "soft-ball.hyrf", "hard-ball.hyrf")
-    cases += _input_cases("import ball.ply --cameras cameras.json -o {}", "cameras.json")
-    cases += _input_cases("import ball.ply --cameras poses.hyrf -o {}", "poses.hyrf")
-    cases += _input_cases("import loose -o {}", "loose", "loose/meta.json", "loose/means_l.webp")
-    cases += _input_cases("import loose/meta.json -o {}", "loose", "loose/meta.json", "loose/means_l.webp")
-    cases += _input_cases("convert ball.ply {}", "ball.ply", "{world}/ball.ply", "old/../ball.ply")
-    cases += _input_cases("convert loose {}", "loose/new.ply")
-    cases += _input_cases("compress first --profile paper -o {}", "first/model.hyrf")
-    cases += _input_cases("decompress first -o {}", "first/model.hyrf")
-    cases += _input_cases(
-        "compare first second -o {}", "first", "first/metrics.json", "second/model.hyrf", "{world}/first"
-    )
+ALL_CASES = [
+    # An input as the output: of each command, each kind of input and each output at least once.
+    Case("make hall -o {}", "hall/new.html"),
+    Case("make photos -o {}", "photos/new.html"),
+    Case("make ball.ply -o {}", "{world}/ball.ply"),
+    Case("make packed.hyrf -o {}", "packed.hyrf"),
+    Case("poses hall -o {}", "hall/images"),
+    Case("poses blender -o {}", "blender"),
+    Case("train link-to-set -o {} --steps 2", "hall/images"),
+    Case("compress soft.hyrf -o {}", "hard.hyrf"),
+    Case("compress first --profile paper -o {}", "first/model.hyrf"),
+    Case("compress model.hyrf --data nerfstudio -o {}", "nerfstudio/images/new.hyrf"),
+    Case("compress model.hyrf --data hall -o small.hyrf --report {}", "hall/sparse/0"),
+    Case("decompress first -o {}", "first/model.hyrf"),
+    Case("render model.hyrf --data blender -o {}", "blender/train"),
+    Case("render model.hyrf --cameras nerfstudio/transforms.json -o {}", "nerfstudio/transforms.json"),
+    Case("evaluate model.hyrf --data blender --lpips-weights lpips.pth --pictures {}", "lpips.pth"),
+    Case("evaluate model.hyrf --data nerfstudio --pictures {}", "nerfstudio/masks"),
+    Case("export named.json -o {}", "named.json"),  # a model under another name
+    Case("export model.hyrf --data hall -o {}", "hall/images/new.spz"),
+    Case("export model.hyrf --data blender -o {}", "blender/test"),
+    Case("import ball.hyrf.ply -o {}", "hard-ball.hyrf"),
+    Case("import ball.ply --cameras poses.hyrf -o {}", "poses.hyrf"),
+    Case("import loose/meta.json -o {}", "loose/means_l.webp"),
+    Case("convert loose {}", "loose/new.ply"),
+    Case("compare first second -o {}", "second/model.hyrf"),
+    Case("bench model.hyrf --data hall -o {}", "hall/new.png"),
+    Case("bench model.hyrf --data hall -o new.png --markdown {}", "hall/images/new.md"),
     # Files of other programs, which only --overwrite replaces, and sets of photos that the command does not read.
-    cases += [
-        Case("train hall -o {} --steps 2 --max-gaussians 50", "run", OUTCOME_REFUSED, OUTCOME_REPLACED),
-        Case("compare first second -o {}", "old/a.html", OUTCOME_REFUSED, OUTCOME_REPLACED),
-        Case("compress packed.hyrf -o {} --profile paper", "old/a.hyrf", OUTCOME_REFUSED, OUTCOME_REPLACED),
-        Case("compress packed.hyrf -o {} --profile paper", "soft-to-old.hyrf", OUTCOME_REFUSED, OUTCOME_REPLACED),
-        Case(
-            "compress model.hyrf -o old/new.hyrf --profile paper --report {}",
-            "old/report",
-            OUTCOME_REFUSED,
-            OUTCOME_REPLACED,
-        ),
-        Case("decompress packed.hyrf -o {}", "old/a.hyrf", OUTCOME_REFUSED, OUTCOME_REPLACED),
-        Case("render model.hyrf --orbit 1 -o {}", "old/pictures", OUTCOME_REFUSED, OUTCOME_REPLACED),
-        Case("evaluate model.hyrf --data hall --pictures {}", "old/pictures", OUTCOME_REFUSED, OUTCOME_REPLACED),
-        *(
-            Case("export model.hyrf --baked --sh-degree 0 -o {}", f"old/a{ending}", OUTCOME_REFUSED, OUTCOME_REPLACED)
-            for ending in OUTPUT_ENDINGS
-        ),
-        Case("export model.hyrf -o {}", "old/a.html", OUTCOME_REFUSED, OUTCOME_REPLACED),
-        Case("export model.hyrf --colmap -o {}", "old/colmap", OUTCOME_REFUSED, OUTCOME_REPLACED),
-        Case("export model.hyrf -o {}", "old/player", OUTCOME_REFUSED, OUTCOME_REPLACED),
-        Case("export model.hyrf named.json -o {}", "old/gallery", OUTCOME_REFUSED, OUTCOME_REPLACED),
-        Case("import ball.ply --steps 1 --size 16 -o {}", "old/a.hyrf", OUTCOME_REFUSED, OUTCOME_REPLACED),
-        Case("convert ball.ply {}", "old/a.ply", OUTCOME_REFUSED, OUTCOME_REPLACED),
-        *(
-            Case("make packed.hyrf --work made -o {}", f"old/a{ending}", OUTCOME_REFUSED, OUTCOME_REPLACED)
-            for ending in (".html", ".ply")
-        ),
-        Case("make packed.hyrf --work made -o {}", "old/player", OUTCOME_REFUSED, OUTCOME_REPLACED),
-        Case("bench model.hyrf -o {}", "old/a.png", OUTCOME_REFUSED, OUTCOME_WRITTEN),
-        Case("bench model.hyrf -o new.png --markdown {}", "old/a.md"),  # the page has no placeholders for tables
-        Case("demo --steps 1 -o {}", "old/demo", OUTCOME_REFUSED, OUTCOME_WRITTEN),
-        *(Case("demo --steps 1 -o {}", name, OUTCOME_REFUSED, OUTCOME_WRITTEN) for name in READ_PATHS_BY_SET),
-        Case("train hall -o {} --steps 2 --max-gaussians 50", "nerfstudio", OUTCOME_REFUSED, OUTCOME_WRITTEN),
-        Case("render model.hyrf --orbit 1 -o {}", "hall/images", OUTCOME_REFUSED, OUTCOME_REPLACED),
-        Case("render model.hyrf --orbit 1 -o {}", "blender", OUTCOME_REFUSED, OUTCOME_WRITTEN),
-        Case("evaluate model.hyrf --data hall --pictures {}", "nerfstudio/images", OUTCOME_REFUSED, OUTCOME_REPLACED),
-        Case("export model.hyrf --colmap -o {}", "hall", OUTCOME_REFUSED, OUTCOME_REPLACED),
-        Case("export model.hyrf -o {}", "hall", OUTCOME_REFUSED, OUTCOME_WRITTEN),
-        Case("export model.hyrf packed.hyrf -o {}", "hall", OUTCOME_REFUSED, OUTCOME_WRITTEN),
-        Case("compare first second -o {}", "hall/new.html", OUTCOME_REFUSED, OUTCOME_WRITTEN),
-        Case("compress packed.hyrf -o {} --profile paper", "hall/small.hyrf", OUTCOME_REFUSED, OUTCOME_WRITTEN),
-        Case("decompress packed.hyrf -o {}", "nerfstudio/images/back.hyrf", OUTCOME_REFUSED, OUTCOME_WRITTEN),
-        Case("export model.hyrf --sh-degree 0 -o {}", "blender/train/a.ply", OUTCOME_REFUSED, OUTCOME_WRITTEN),
-        Case("import ball.ply --steps 1 --size 16 -o {}", "hall/ball.hyrf", OUTCOME_REFUSED, OUTCOME_WRITTEN),
-    ]
-    # Outputs that are allowed: a new folder, even inside the set, and new names.
-    cases += [
-        Case("train hall -o {} --steps 2 --max-gaussians 50", "hall/run", OUTCOME_WRITTEN, OUTCOME_WRITTEN),
-        Case("render model.hyrf --data hall -o {}", "hall/renders", OUTCOME_WRITTEN, OUTCOME_WRITTEN),
-        Case("compare first second -o {}", "first/comparison.html", OUTCOME_WRITTEN, OUTCOME_WRITTEN),
-        Case("decompress packed.hyrf -o {}", "back.hyrf", OUTCOME_WRITTEN, OUTCOME_WRITTEN),
-        Case("bench model.hyrf --data hall -o {}", "new.png", OUTCOME_WRITTEN, OUTCOME_WRITTEN),
-        Case("demo --steps 1 -o {}", "demo", OUTCOME_WRITTEN, OUTCOME_WRITTEN),
-    ]
-    return cases
-
-
-ALL_CASES = _make_cases()
+    Case("make packed.hyrf --work made -o {}", "old/a.html", OUTCOME_REFUSED, OUTCOME_REPLACED),
+    Case("train hall -o {} --steps 2 --max-gaussians 50", "run", OUTCOME_REFUSED, OUTCOME_REPLACED),
+    Case("compress packed.hyrf -o {} --profile paper", "soft-to-old.hyrf", OUTCOME_REFUSED, OUTCOME_REPLACED),
+    Case("decompress packed.hyrf -o {}", "nerfstudio/images/back.hyrf", OUTCOME_REFUSED, OUTCOME_WRITTEN),
+    Case("render model.hyrf --orbit 1 -o {}", "hall/images", OUTCOME_REFUSED, OUTCOME_REPLACED),
+    Case("evaluate model.hyrf --data hall --pictures {}", "old/pictures", OUTCOME_REFUSED, OUTCOME_REPLACED),
+    Case("export model.hyrf --sh-degree 0 -o {}", "old/a.ply", OUTCOME_REFUSED, OUTCOME_REPLACED),
+    Case("export model.hyrf --colmap -o {}", "old/colmap", OUTCOME_REFUSED, OUTCOME_REPLACED),
+    Case("export model.hyrf named.json -o {}", "old/gallery", OUTCOME_REFUSED, OUTCOME_REPLACED),
+    Case("import ball.ply --steps 1 --size 16 -o {}", "old/a.hyrf", OUTCOME_REFUSED, OUTCOME_REPLACED),
+    Case("convert ball.ply {}", "old/a.ply", OUTCOME_REFUSED, OUTCOME_REPLACED),
+    Case("compare first second -o {}", "old/a.html", OUTCOME_REFUSED, OUTCOME_REPLACED),
+    Case("bench model.hyrf -o {}", "old/a.png", OUTCOME_REFUSED, OUTCOME_WRITTEN),
+    Case("bench model.hyrf -o new.png --markdown {}", "old/a.md"),  # the page has no placeholders for tables
+    Case("demo --steps 1 -o {}", "old/demo", OUTCOME_REFUSED, OUTCOME_WRITTEN),
+    # Outputs that are allowed: a new folder, even inside the set.
+    Case("train hall -o {} --steps 2 --max-gaussians 50", "hall/run", OUTCOME_WRITTEN, OUTCOME_WRITTEN),
+]
 
 
 # -- files that a command could lose -----------------------------------------------------------------------------------
@@ -216,27 +113,10 @@ def make_input_folder(folder: Path) -> Path:
     from explicit_balls import ball_splats
 
     from hyrfpack.cameras.files import cameras_to_json
-    from hyrfpack.data import load_scene
-    from hyrfpack.demo.scene import write_demo_scene
-    from hyrfpack.export.cameras import write_colmap
     from hyrfpack.splats.formats import ply, sog
 
-    nerfstudio = write_demo_scene(folder / "nerfstudio", views=4, size=16)
-    poses = json.loads((nerfstudio / "transforms.json").read_text())
-    (nerfstudio / poses["ply_file_path"]).rename(nerfstudio / "points.ply")
-    poses["ply_file_path"] = "points.ply"
-    (nerfstudio / "transforms.json").write_text(json.dumps(poses))
-    photos = sorted((nerfstudio / "images").iterdir())
-
-    _add_masks(nerfstudio, photos)
-    scene = load_scene(nerfstudio)
-    named = [(f"{Path(view.name).stem}.png", view.camera) for view in scene.views]
-    for name, images in (("hall", "images"), ("views-of-its-own", "views")):
-        write_colmap(named, folder / name, None)
-        shutil.copytree(nerfstudio / "images", folder / name / images)
-    _add_masks(folder / "hall", photos)
-    _make_blender(folder / "blender", photos, poses["frames"])
-
+    named = write_photo_sets(folder)
+    nerfstudio = folder / "nerfstudio"
     _run_checked("train", nerfstudio, "-o", folder / "trained", "--steps", 3, "--max-gaussians", 40)
     shutil.copy(folder / "trained" / "model.hyrf", folder / "model.hyrf")
     (folder / "trained").rename(folder / "first")
@@ -258,28 +138,7 @@ def make_input_folder(folder: Path) -> Path:
     (folder / "soft-ball.hyrf").symlink_to("ball.hyrf.ply")
     os.link(folder / "ball.hyrf.ply", folder / "hard-ball.hyrf")
     (folder / "soft-to-old.hyrf").symlink_to("old/a.hyrf")
-    (folder / "link-to-set").symlink_to("hall")
     return folder
-
-
-def _add_masks(root: Path, photos: list[Path]) -> None:
-    (root / "masks").mkdir()
-    for photo in photos:
-        Image.fromarray(np.full((16, 16), 255, np.uint8)).save(root / "masks" / photo.name)
-
-
-def _make_blender(root: Path, photos: list[Path], frames: list[dict]) -> None:
-    """Write a NeRF-synthetic set with two splits."""
-    angle = 2 * math.atan(8 / frames[0]["fl_x"])
-    for split, numbers in (("train", (0, 1, 2)), ("test", (3,))):
-        (root / split).mkdir(parents=True)
-        listed = []
-        for place, number in enumerate(numbers):
-            shutil.copy(photos[number], root / split / f"{place}.png")
-            matrix = frames[number]["transform_matrix"]
-            listed.append({"file_path": f"./{split}/{place}", "transform_matrix": matrix})
-        content = {"camera_angle_x": angle, "frames": listed}
-        (root / f"transforms_{split}.json").write_text(json.dumps(content))
 
 
 def _make_foreign(folder: Path, photo: str) -> None:

@@ -3,9 +3,9 @@
 1. A file that is read is never replaced, and no file is written into a folder that photos or poses are read from.
 2. Without `overwrite`, no existing file is replaced, and no file is written into a folder of other photos or poses.
 
-The checks run before any work, so that a command does not fail after minutes. Files that appear during the work are
-kept as well, because `atomic` checks again in the step that gives a finished file its name. `lock` keeps a second call
-of hyrfpack out of a folder that the first one writes into.
+`rules` decides; this module collects what the rules ask for. The checks run before any work, so that a command does not
+fail after minutes. Files that appear during the work are kept as well, because `atomic` checks again in the step that
+gives a finished file its name. `lock` keeps a second call of hyrfpack out of a folder that the first one writes into.
 """
 
 from __future__ import annotations
@@ -17,40 +17,18 @@ from typing import TYPE_CHECKING
 
 from hyrfpack.atomic import MAX_NAME_BYTES, check_writable
 from hyrfpack.errors import HyrfError
+from hyrfpack.outputs.names import (
+    ARCHIVE_SUFFIXES,
+    COLMAP_MODEL_FOLDERS,
+    COLMAP_TABLE_NAMES,
+    PICTURE_SUFFIXES,
+    POSE_FILE_NAMES,
+)
+from hyrfpack.outputs.rules import FileFacts, Refusal, refuse_file
 
 if TYPE_CHECKING:
     from hyrfpack.scene import Scene
 
-# Suffixes of pictures that count as photos. A photo's name without a suffix means the first file with one of these.
-READABLE_PICTURE_SUFFIXES = (
-    ".png",
-    ".jpg",
-    ".jpeg",
-    ".webp",
-    ".tif",
-    ".tiff",
-    ".bmp",
-    ".avif",
-    ".jp2",
-    ".heic",
-    ".heif",
-    ".hif",
-)
-# Suffixes of cameras' raw photos. They are never read, but counted and reported to the user.
-RAW_PHOTO_SUFFIXES = (
-    *(".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dcr", ".dng", ".erf", ".fff", ".gpr", ".iiq", ".kdc", ".mos", ".mrw"),
-    *(".nef", ".nrw", ".orf", ".pef", ".raf", ".rw2", ".rwl", ".sr2", ".srf", ".srw", ".x3f"),
-)
-PICTURE_SUFFIXES = (*READABLE_PICTURE_SUFFIXES, *RAW_PHOTO_SUFFIXES)
-VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp", ".mts", ".m2ts", ".mpg", ".mpeg", ".wmv")
-ARCHIVE_SUFFIXES = (".zip", ".r3d")  # An archive may hold a whole set of photos and poses.
-COLMAP_TABLE_NAMES = tuple(f"{table}{kind}" for table in ("cameras", "images", "points3D") for kind in (".bin", ".txt"))
-# Names of files and folders that hold poses, besides the tables of COLMAP.
-POSE_FILE_NAMES = (
-    *("transforms.json", "transforms_train.json", "transforms_val.json", "transforms_test.json"),
-    *("poses_bounds.npy", "bundle.out", "cameras.xml", "metadata", "keyframes"),
-)
-COLMAP_MODEL_FOLDERS = ("sparse", "colmap/sparse")
 MAX_PATH_BYTES = 4095  # This is the limit of common systems.
 
 StrPath = str | os.PathLike[str]
@@ -101,22 +79,7 @@ class Outputs:
             endings: allowed suffixes of its name; if none are given, any name is allowed.
         """
         path = Path(path)
-        if os.path.isdir(path):
-            raise HyrfError(f"{path}: this is a folder", fix="name a file in it")
-        self._check(path)
-        if endings and not str(path).lower().endswith(endings):
-            raise HyrfError(f"{path}: the file extension must be {' or '.join(endings)}", fix="change the extension")
-        if os.path.lexists(path):
-            if not self.overwrite:
-                raise HyrfError(
-                    f"{path}: there is a file of this name",
-                    fix="name another, or replace it with `overwrite=True`",
-                )
-        elif not self.overwrite and _belongs_to_photo_set(_resolved_folder(path)):
-            raise HyrfError(
-                f"{path}: photos or poses lie in this folder",
-                fix="name another, or write there with `overwrite=True`",
-            )
+        self._raise_if_refused(path, self.overwrite, endings)
         _check_name_lengths([path])
         _check_folder(_resolved_folder(path))
 
@@ -132,10 +95,11 @@ class Outputs:
         paths = [Path(folder, name) for name in names]
         folders = list(dict.fromkeys((Path(folder), *(path.parent for path in paths))))
         for place in folders:
-            self._check_folder_not_read(place)
+            if self._is_read(place):
+                raise HyrfError(f"{place}: {Refusal.READ_FOLDER.problem}", fix=Refusal.READ_FOLDER.fix)
         existing = [path for path in paths if os.path.lexists(path)]
         for path in existing:
-            self._check(path)
+            self._raise_if_refused(path, overwrite=True)
         if not self.overwrite:
             if existing:
                 more = f" and {len(existing) - 1} more" if len(existing) > 1 else ""
@@ -146,30 +110,32 @@ class Outputs:
                 )
             for place in folders:
                 if _has_poses(place) or _has_pictures(place):
-                    raise HyrfError(
-                        f"{place}: photos or poses lie in this folder",
-                        fix="name another, or write there with `overwrite=True`",
-                    )
+                    raise HyrfError(f"{place}: {Refusal.PHOTO_SET.problem}", fix=Refusal.PHOTO_SET.fix)
         for place in folders:
             _check_folder(place)
         _check_name_lengths(paths)
 
-    def _check(self, path: StrPath) -> None:
-        """Raise an error for a path that is read, also under another name, or that exists and is not a file."""
-        if _file_ids([path]) & self._files:
-            raise HyrfError(f"{path}: the output is an input itself", fix="name another file")
-        if os.path.exists(path) and not os.path.isfile(path):
-            kind = "folder" if os.path.isdir(path) else "device or a pipe"
-            raise HyrfError(f"{path}: this is a {kind}", fix="name a file")
-        self._check_folder_not_read(_resolved_folder(path))
+    def _raise_if_refused(self, path: Path, overwrite: bool, endings: tuple[str, ...] = ()) -> None:
+        """Raise an error for a file that may not be written."""
+        folder, exists = _resolved_folder(path), os.path.exists(path)
+        facts = FileFacts(
+            is_folder=os.path.isdir(path),
+            is_device=exists and not os.path.isfile(path) and not os.path.isdir(path),
+            is_input=bool(_file_ids([path]) & self._files),
+            folder_is_read=self._is_read(folder),
+            has_ending=not endings or str(path).lower().endswith(endings),
+            exists=os.path.lexists(path),
+            in_photo_set=not overwrite and _belongs_to_photo_set(folder),
+        )
+        refusal = refuse_file(facts, overwrite)
+        if refusal is Refusal.ENDING:
+            raise HyrfError(f"{path}: the file extension must be {' or '.join(endings)}", fix="change the extension")
+        if refusal is not None:
+            raise HyrfError(f"{folder if refusal is Refusal.READ_FOLDER else path}: {refusal.problem}", fix=refusal.fix)
 
-    def _check_folder_not_read(self, folder: StrPath) -> None:
-        """Raise an error for a folder whose photos or poses are read."""
-        if _file_ids([folder]) & self._folders:
-            raise HyrfError(
-                f"{folder}: the same command reads what lies in this folder",
-                fix="name another to write into",
-            )
+    def _is_read(self, folder: StrPath) -> bool:
+        """Return whether photos or poses of a folder are read."""
+        return bool(_file_ids([folder]) & self._folders)
 
 
 def _folders_between(top: StrPath, files: Iterable[StrPath]) -> set[Path]:

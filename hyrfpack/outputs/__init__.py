@@ -1,0 +1,26 @@
+"""Outputs: which files may be written, and the names by which files of pictures, videos and poses are recognised."""
+
+from hyrfpack.outputs.checks import Outputs, StrPath
+from hyrfpack.outputs.names import (
+    ARCHIVE_SUFFIXES,
+    COLMAP_MODEL_FOLDERS,
+    COLMAP_TABLE_NAMES,
+    PICTURE_SUFFIXES,
+    POSE_FILE_NAMES,
+    RAW_PHOTO_SUFFIXES,
+    READABLE_PICTURE_SUFFIXES,
+    VIDEO_SUFFIXES,
+)
+
+__all__ = [
+    "ARCHIVE_SUFFIXES",
+    "COLMAP_MODEL_FOLDERS",
+    "COLMAP_TABLE_NAMES",
+    "PICTURE_SUFFIXES",
+    "POSE_FILE_NAMES",
+    "RAW_PHOTO_SUFFIXES",
+    "READABLE_PICTURE_SUFFIXES",
+    "VIDEO_SUFFIXES",
+    "Outputs",
+    "StrPath",
+]
