@@ -23,7 +23,7 @@ DOCUMENTED_OPERATIONS = (
 )  # fmt: skip
 # These functions are not for users. `background_grid` and `shade` take a whole decoder, which no short example makes.
 FUNCTIONS_WITHOUT_EXAMPLE = {
-    "background_colors", "background_grid", "check_inputs", "check_shading", "choose_shading_implementation", "shade",
+    "background_colors", "background_grid", "check_shading", "choose_shading_implementation", "shade",
 }  # fmt: skip
 
 

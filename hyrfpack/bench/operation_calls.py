@@ -6,7 +6,7 @@ no packages beyond those of the operations.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -18,9 +18,10 @@ from hyrfpack.model.field import Field
 from hyrfpack.model.hybrid import HybridModel
 from hyrfpack.ops.hash_encode import hash_encode
 from hyrfpack.ops.mlp import mlp
-from hyrfpack.ops.rasterize import Rasterization, rasterize
+from hyrfpack.ops.rasterize import Gaussians3D, Rasterization, RasterSettings, rasterize
 from hyrfpack.ops.shade import encode_views
 from hyrfpack.ops.ssim import photometric_loss
+from hyrfpack.ops.viewport import Viewport
 
 Gradients = tuple[Tensor, ...]
 
@@ -103,17 +104,22 @@ def random_cotangent(values: Tensor) -> Tensor:
     return torch.randn(values.shape, generator=generator).to(values.device, values.dtype)
 
 
-def rasterize_call(inputs: Mapping[str, Tensor], *view: Any, **options: Any) -> OperationCall:
+def rasterize_call(
+    inputs: Mapping[str, Tensor],
+    viewport: Viewport,
+    settings: RasterSettings = RasterSettings(),  # noqa: B008 - frozen
+) -> OperationCall:
     """Return the call of `rasterize`; its values are (H, W, 4) colours and transmittance.
 
     Args:
-        inputs: the Gaussians' tensors by name, in the order of the arguments of `rasterize`.
-        view, options: the other arguments of `rasterize`.
+        inputs: the Gaussians' tensors by name, see `splat_inputs`.
+        viewport, settings: as in `rasterize`.
     """
 
     def draw(implementation: str, **tensors: Tensor) -> Tensor:
-        splats: Iterable[Any] = tensors.values()
-        return join_color_and_transmittance(rasterize(*splats, *view, implementation=implementation, **options))
+        *gaussians, colors = tensors.values()
+        image = rasterize(Gaussians3D(*gaussians), colors, viewport, settings, implementation=implementation)
+        return join_color_and_transmittance(image)
 
     # In a few pixels, rounding moves alpha or transmittance across a threshold. These bounds allow for that.
     return OperationCall(draw, inputs, tuple(inputs), (1e-3, 1e-2))
@@ -166,15 +172,12 @@ def loss_call(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Oper
 
 @torch.no_grad()
 def splat_inputs(model: HybridModel, viewpoint: Tensor) -> dict[str, Tensor]:
-    """Return the arguments of `rasterize` for all Gaussians of a model, seen from a point (3,) in local units."""
-    geometry = model.decode_geometry()
-    return {
-        "means": model.gaussians.positions.detach(),
-        "quats": geometry.quats,
-        "scales": geometry.scales,
-        "opacities": geometry.opacities,
-        "colors": model.decode_colors(viewpoint.to(model.gaussians.positions)),
-    }
+    """Return the tensors of `Gaussians3D` and the colours by name, in this order, for all Gaussians of a model.
+
+    The colours are those seen from a point (3,) in local units.
+    """
+    gaussians = model.decode_geometry().at(model.gaussians.positions.detach())
+    return gaussians._asdict() | {"colors": model.decode_colors(viewpoint.to(gaussians.means))}
 
 
 @torch.no_grad()

@@ -23,7 +23,8 @@ from hyrfpack.measure.error import Error, largest_error, measure_error, measure_
 from hyrfpack.measure.timing import time_alternately
 from hyrfpack.model import HybridModel
 from hyrfpack.ops.poses import camera_center
-from hyrfpack.scene import Camera
+from hyrfpack.ops.rasterize import RasterSettings
+from hyrfpack.ops.viewport import Viewport
 
 
 @dataclass(frozen=True)
@@ -60,10 +61,10 @@ DEFAULT_VARIANT = "cpu"
 
 def rasterize_rows(subject: Subject, repeats: int, notes: list[str]) -> Iterator[Row]:
     """Measure the rasterisation of one view, with and without antialiasing, forward and with all gradients."""
-    model, camera, pose = _middle_view(subject)
-    inputs = splat_inputs(model, camera_center(pose))
+    model, viewport = _middle_view(subject)
+    inputs = splat_inputs(model, camera_center(viewport.pose))
     for antialiased in (False, True):
-        call = rasterize_call(inputs, pose, camera.intrinsics, camera.width, camera.height, antialiased=antialiased)
+        call = rasterize_call(inputs, viewport, RasterSettings(antialiased=antialiased))
         name = "antialiased, " if antialiased else ""
         yield from _compare("rasterize", name, call, RASTERIZE_VARIANTS, measure_error, repeats)
 
@@ -79,16 +80,16 @@ def hash_encode_rows(subject: Subject, repeats: int, notes: list[str]) -> Iterat
 
 def mlp_rows(subject: Subject, repeats: int, notes: list[str]) -> Iterator[Row]:
     """Measure both fields' decoders on the features of all Gaussians, seen from one camera."""
-    model, _, pose = _middle_view(subject)
-    for name, part, features in decoder_inputs(model, camera_center(pose)):
+    model, viewport = _middle_view(subject)
+    for name, part, features in decoder_inputs(model, camera_center(viewport.pose)):
         call = mlp_call(features, list(part.weights), list(part.biases))
         yield from _compare("mlp", f"{name}, ", call, MLP_VARIANTS, measure_relative_error, repeats)
 
 
-def _middle_view(subject: Subject) -> tuple[HybridModel, Camera, Tensor]:
-    """Return the model, the middle camera, and its (4, 4) float64 pose camera_from_local."""
+def _middle_view(subject: Subject) -> tuple[HybridModel, Viewport]:
+    """Return the model and the middle camera in local units, with a float64 pose."""
     camera = subject.cameras[len(subject.cameras) // 2]
-    return subject.model, camera, torch.as_tensor(subject.model.config.frame.local_pose(camera))
+    return subject.model, subject.model.config.frame.local_viewport(camera, torch.float64)
 
 
 def _compare(

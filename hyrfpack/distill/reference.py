@@ -56,15 +56,10 @@ def mean_sent_light(drawable: Drawable, cameras: Sequence[Camera]) -> Tensor:
     settings = RenderSettings()
 
     def light(camera: Camera) -> tuple[Tensor, Tensor]:
-        pose = torch.as_tensor(drawable.frame.local_pose(camera), dtype=torch.float32)
-        size = camera.intrinsics, camera.width, camera.height
-        index = frustum_cull(drawable.positions, pose, *size, settings.near, settings.cull_tolerance)
-        gaussians = (drawable.positions, drawable.quats, drawable.scales, drawable.opacities)
-        means, quats, scales, opacities = (part[index] for part in gaussians)
-        light, _ = sum_blend_weights(
-            means, quats, scales, opacities, pose, *size, near=settings.near, antialiased=drawable.antialiased
-        )
-        return index, light
+        viewport = drawable.frame.local_viewport(camera)
+        index = frustum_cull(drawable.positions, viewport, settings.near, settings.cull_tolerance)
+        raster_settings = settings.raster_settings(drawable.antialiased)
+        return index, sum_blend_weights(drawable.gaussians.select(index), viewport, raster_settings)[0]
 
     for first in range(0, len(cameras), LIGHT_VIEWS_IN_MEMORY):
         for index, sent in parallel_map(light, cameras[first : first + LIGHT_VIEWS_IN_MEMORY], drawable.device):

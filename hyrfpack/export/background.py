@@ -23,6 +23,7 @@ from hyrfpack.model.exposure import apply_exposure_gains
 from hyrfpack.ops.background import pixel_directions, sphere_points
 from hyrfpack.ops.poses import camera_center
 from hyrfpack.ops.shade import encode_directions
+from hyrfpack.ops.viewport import Viewport
 from hyrfpack.parallel.pool import torch_on_one_thread
 from hyrfpack.render import RenderSettings
 from hyrfpack.scene import Camera
@@ -247,13 +248,13 @@ class _SeenPixels(NamedTuple):
     """The pixels at which a camera sees light of the sphere.
 
     Attributes:
-        pose: (4, 4) camera_from_local.
-        points: (n, 2) pixel coordinates in the picture of `shrink_camera`.
+        viewport: the camera of `shrink_camera`, in local units.
+        points: (n, 2) pixel coordinates in its picture.
         places: (n, 3) points of the sphere that these pixels show, local units.
         weights: (n,) float64 squared transmittances.
     """
 
-    pose: Tensor
+    viewport: Viewport
     points: Tensor
     places: Tensor
     weights: np.ndarray
@@ -267,11 +268,11 @@ def _iterate_seen_pixels(
     for camera, camera_visibility in zip(map(shrink_camera, cameras), visibility, strict=True):
         check_finite("Gaussians", camera_visibility.transmittance)
         rows, columns = torch.nonzero(camera_visibility.transmittance > threshold).unbind(1)
-        pose = torch.as_tensor(model.config.frame.local_pose(camera), dtype=torch.float32)
+        viewport = model.config.frame.local_viewport(camera)
         points = torch.stack((columns, rows), -1) * TRANSMITTANCE_STRIDE_PIXELS + 0.5
-        places = sphere_points(camera_center(pose), pixel_directions(points, camera.intrinsics, pose))
+        places = sphere_points(camera_center(viewport.pose), pixel_directions(points, viewport))
         yield _SeenPixels(
-            pose, points, places, camera_visibility.transmittance[rows, columns].double().square().numpy()
+            viewport, points, places, camera_visibility.transmittance[rows, columns].double().square().numpy()
         )
 
 
@@ -299,7 +300,7 @@ def _accumulate_colors(
     largest = math.inf
     for camera, seen in zip(map(shrink_camera, cameras), _iterate_seen_pixels(model, cameras, visibility), strict=True):
         if len(seen.points):
-            colors = model.decode_background(seen.points, camera.intrinsics, seen.pose)
+            colors = model.decode_background(seen.points, seen.viewport)
             check_finite("background", colors)
             add(seen.places, colors, seen.weights)
             narrow = math.atan(min(camera.width / camera.fx, camera.height / camera.fy) / 2)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -166,25 +165,21 @@ def compute_visibility(
 def _compute_camera_visibility(model: HybridModel, geometry: Geometry, camera: Camera) -> CameraVisibility:
     settings, positions = RenderSettings(), model.gaussians.positions.detach()
     camera = shrink_camera(camera)
-    pose = torch.as_tensor(model.config.frame.local_pose(camera), dtype=torch.float32)
-    check_finite("camera poses", pose)
-    viewport = pose, camera.intrinsics, camera.width, camera.height
-    settings_of_light: dict[str, Any] = {"near": settings.near, "antialiased": model.config.antialiased}
-    drawn = frustum_cull(positions, *viewport, settings.near, settings.cull_tolerance)
-
-    def compute_light(means: Tensor, shapes: Geometry) -> tuple[Tensor, Tensor]:
-        return sum_blend_weights(means, shapes.quats, shapes.scales, shapes.opacities, *viewport, **settings_of_light)
-
-    culled_light, transmittance = compute_light(positions, geometry)
+    viewport = model.config.frame.local_viewport(camera)
+    check_finite("camera poses", viewport.pose)
+    raster_settings = settings.raster_settings(model.config.antialiased)
+    drawn = frustum_cull(positions, viewport, settings.near, settings.cull_tolerance)
+    gaussians = geometry.at(positions)
+    culled_light, transmittance = sum_blend_weights(gaussians, viewport, raster_settings)
     light = culled_light[drawn]
     culled_light[drawn] = 0
     culled_index = torch.nonzero(culled_light).squeeze(-1)
     if len(culled_index):  # the culled Gaussians no longer block the light of the others
-        light, transmittance = compute_light(positions[drawn], geometry[drawn])
+        light, transmittance = sum_blend_weights(gaussians.select(drawn), viewport, raster_settings)
     lit = light > 0
     stride = TRANSMITTANCE_STRIDE_PIXELS
     return CameraVisibility(
-        camera_center(pose),
+        camera_center(viewport.pose),
         drawn[lit].int(),
         light[lit],
         culled_index.int(),

@@ -13,6 +13,7 @@ from torch import Tensor
 from hyrfpack.evaluate.metrics import psnr, to_8bit
 from hyrfpack.model import HybridModel
 from hyrfpack.ops.background import pixel_directions
+from hyrfpack.ops.viewport import Viewport
 from hyrfpack.parallel.pool import parallel_map
 from hyrfpack.progress import Report, no_report, report_each_call
 from hyrfpack.render import render_view
@@ -95,7 +96,9 @@ def _equirect_colors(picture: Tensor, camera: Camera) -> Tensor:
     height, width, _ = picture.shape
     rows, columns = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
     points = torch.stack((columns, rows), -1).reshape(-1, 2) + 0.5
-    directions = pixel_directions(points.double(), camera.intrinsics, torch.from_numpy(camera.camera_from_world))
+    pose = torch.from_numpy(camera.camera_from_world)
+    viewport = Viewport(pose, camera.intrinsics, camera.width, camera.height)
+    directions = pixel_directions(points.double(), viewport)
     x, y, z = directions.float().unbind(-1)
     # The picture is extended by one column of the opposite side at each edge, so that interpolation wraps around.
     wrapped = torch.cat((picture[:, -1:], picture, picture[:, :1]), dim=1).permute(2, 0, 1)[None]

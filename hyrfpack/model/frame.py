@@ -14,10 +14,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.ops.transfer import tensor_like
+from hyrfpack.ops.viewport import Viewport
 from hyrfpack.scene import Camera
 
 # Flat boxes are widened to this fraction of the longest half-axis, because even a row of cameras sees a volume.
@@ -75,6 +77,11 @@ class Frame:
         pose = camera.camera_from_world.copy()
         pose[:3, 3] = (pose[:3, :3] @ np.array(self.center) + pose[:3, 3]) / self.scale
         return pose
+
+    def local_viewport(self, camera: Camera, dtype: torch.dtype = torch.float32) -> Viewport:
+        """Return the camera in local units, with its pose in `dtype` on the CPU."""
+        pose = torch.as_tensor(self.local_pose(camera), dtype=dtype)
+        return Viewport(pose, camera.intrinsics, camera.width, camera.height)
 
     def normalize(self, local: Tensor) -> Tensor:
         """Convert local positions (..., 3) to u = local / half_extent, where the box is [-1, 1]^3."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -13,10 +12,12 @@ from hyrfpack.model.exposure import ExposureMap
 from hyrfpack.model.field import Field
 from hyrfpack.model.gaussians import Gaussians, take_rows
 from hyrfpack.ops import activate
-from hyrfpack.ops.background import background_colors, background_grid
+from hyrfpack.ops.background import BackgroundField, background_colors, background_grid
 from hyrfpack.ops.contraction import contract
 from hyrfpack.ops.mlp import mlp
+from hyrfpack.ops.rasterize import Gaussians3D
 from hyrfpack.ops.shade import DIRECTION_FEATURES, Shading, encode_views
+from hyrfpack.ops.viewport import Viewport
 
 GAUSSIANS_PER_SHADING_BLOCK = 1 << 20  # This bounds the memory of hash features in `HybridModel.shading`.
 
@@ -37,6 +38,10 @@ class Geometry:
 
     def __getitem__(self, index: Tensor) -> Geometry:
         return Geometry(self.scales[index], self.quats[index], self.opacities[index])
+
+    def at(self, means: Tensor) -> Gaussians3D:
+        """Return the Gaussians with this geometry and these centres (N, 3)."""
+        return Gaussians3D(means, self.quats, self.scales, self.opacities)
 
 
 @dataclass(frozen=True)
@@ -177,45 +182,32 @@ class HybridModel(nn.Module):
         positions = self._field_positions(positions)
         return torch.sigmoid(self._radiance(positions, viewpoint) + logits)
 
-    def decode_background(self, points: Tensor, intrinsics: tuple[float, float, float, float], pose: Tensor) -> Tensor:
-        """Return background colours (n, 3) in (0, 1) at points of the image.
+    def decode_background(self, points: Tensor, viewport: Viewport) -> Tensor:
+        """Return background colours (n, 3) in (0, 1) at points (n, 2) of the image, in pixels.
 
         Args:
             points: (n, 2) in pixels.
-            intrinsics: fx, fy, cx, cy in pixels.
-            pose: (4, 4) camera_from_local.
+            viewport: the camera, in local units.
         """
-        return background_colors(points, **self._background_arguments(intrinsics, pose))
+        return background_colors(points, viewport, self._background_field())
 
-    def background_grid(
-        self,
-        transmittance: Tensor,
-        intrinsics: tuple[float, float, float, float],
-        pose: Tensor,
-        *,
-        threshold: float,
-        stride: int,
-    ) -> Tensor:
+    def background_grid(self, transmittance: Tensor, viewport: Viewport, *, threshold: float, stride: int) -> Tensor:
         """Return background colours (rows, columns, 3) of every stride-th pixel, see `ops.background`."""
-        return background_grid(
-            transmittance, threshold=threshold, stride=stride, **self._background_arguments(intrinsics, pose)
-        )
+        return background_grid(transmittance, viewport, self._background_field(), threshold=threshold, stride=stride)
 
-    def _background_arguments(self, intrinsics: tuple[float, float, float, float], pose: Tensor) -> dict[str, Any]:
-        """Return the arguments that both background operations share."""
+    def _background_field(self) -> BackgroundField:
+        """Return the radiance field as the background operations take it."""
         weights, biases = self._color_layers()
-        return {
-            "pose": pose,
-            "intrinsics": intrinsics,
-            "half_extent": self.config.frame.half_extent,
-            "table": self.radiance.grid.table,
-            "resolutions": self.radiance.grid.config.resolutions,
-            "log2_table_size": self.radiance.grid.config.log2_table_size,
-            "weights": weights,
-            "biases": biases,
-            "encoding": self.config.direction_encoding,
-            "mixed": self._mixed,
-        }
+        return BackgroundField(
+            half_extent=self.config.frame.half_extent,
+            table=self.radiance.grid.table,
+            resolutions=self.radiance.grid.config.resolutions,
+            log2_table_size=self.radiance.grid.config.log2_table_size,
+            weights=weights,
+            biases=biases,
+            encoding=self.config.direction_encoding,
+            mixed=self._mixed,
+        )
 
     def _color_layers(self) -> tuple[list[Tensor], list[Tensor]]:
         """Return weights and biases of the colour decoder."""

@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from math import inf
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,11 +20,10 @@ from hyrfpack.model.gaussians import take_rows
 from hyrfpack.ops.composite import composite
 from hyrfpack.ops.finite import all_finite
 from hyrfpack.ops.poses import camera_center
-from hyrfpack.ops.rasterize import rasterize
+from hyrfpack.ops.rasterize import RasterSettings, rasterize
 from hyrfpack.ops.rasterize.cull import frustum_cull
-from hyrfpack.ops.rasterize.reference import TRANSMITTANCE_MIN
+from hyrfpack.ops.rasterize.inputs import TRANSMITTANCE_MIN
 from hyrfpack.ops.rasterize.shaded import rasterize_shaded
-from hyrfpack.ops.shade import shade
 from hyrfpack.ops.transfer import tensor_like
 from hyrfpack.parallel.pool import torch_on_one_thread
 from hyrfpack.scene import Camera
@@ -64,6 +62,10 @@ class RenderSettings:
         if self.transmittance_min == 1:
             raise ValueError("transmittance_min is 1; it must lie in [0, 1), for at 1 nothing is drawn")
 
+    def raster_settings(self, antialiased: bool, depth: bool = False) -> RasterSettings:
+        """Return the settings of the rasteriser."""
+        return RasterSettings(self.near, antialiased, self.transmittance_min, depth)
+
 
 @dataclass(frozen=True)
 class Rendering:
@@ -74,7 +76,7 @@ class Rendering:
         alpha: (H, W) coverage by Gaussians, 1 - transmittance.
         depth: (H, W) expected depth along the view axis in world units, 0 where no Gaussian is hit; None unless
             requested.
-        indices: (n,) indices of the Gaussians that were decoded.
+        indices: (n,) indices of the Gaussians that were decoded: those in view, or all if `decoded` had their colours.
         visible: (n,) bool, whether each of these touches the image.
         absgrad: (n, 2) sums over pixels of |dL/d mean2d| in 1/px; zero until backward has run; None unless requested.
         pairs: number of blended tile-Gaussian pairs.
@@ -133,54 +135,40 @@ def render_view(
     check_type("settings", settings, RenderSettings)
     seconds: dict[str, float] = {}
     positions = model.gaussians.positions
-    pose_here = torch.as_tensor(model.config.frame.local_pose(camera), dtype=positions.dtype)
-    on_cpu = positions.device.type == "cpu"
-    _check_finite(pose=pose_here)
-    view = pose_here, camera.intrinsics, camera.width, camera.height
-    options: dict[str, Any] = {
-        "near": settings.near,
-        "antialiased": model.config.antialiased,
-        "transmittance_min": settings.transmittance_min,
-        "depth": depth,
-    }
-    gradients = None
-    shading = None if decoded is None else decoded.shading
-    if decoded is not None and shading is not None and not on_cpu:
-        geometry = decoded.geometry
-        explicit = positions, geometry.quats, geometry.scales, geometry.opacities
-        index = torch.arange(len(model), device=positions.device)
-        raster = rasterize_shaded(*explicit, shading, *view, cull_tolerance=settings.cull_tolerance, **options)
-    else:
-        with _record_seconds(seconds, "cull"), torch.no_grad():
-            try:
-                index = frustum_cull(positions, *view, settings.near, settings.cull_tolerance)
-            except FloatingPointError:
-                raise _nonfinite_error("positions") from None
-        with _record_seconds(seconds, "decode"):
-            geometry = model.decode_geometry(index) if decoded is None else decoded.geometry[index]
-            viewpoint = camera_center(pose_here).to(positions.device, non_blocking=positions.is_cuda)
-            if shading is None:
-                colors = model.decode_colors(viewpoint, index)
-            else:
-                colors = shade(positions, viewpoint, shading, index)
-        gradients = positions.new_zeros(len(index), 2) if absgrad else None
-        explicit = take_rows(positions, index), geometry.quats, geometry.scales, geometry.opacities
-        raster = rasterize(*explicit, colors, *view, absgrad=gradients, **options)
+    viewport = model.config.frame.local_viewport(camera, positions.dtype)
+    _check_finite(pose=viewport.pose)
+    raster_settings = settings.raster_settings(model.config.antialiased, depth)
+    try:
+        if decoded is None or decoded.shading is None:
+            with _record_seconds(seconds, "cull"), torch.no_grad():
+                index = frustum_cull(positions, viewport, settings.near, settings.cull_tolerance)
+            gradients = positions.new_zeros(len(index), 2) if absgrad else None
+            with _record_seconds(seconds, "decode"):
+                geometry = model.decode_geometry(index) if decoded is None else decoded.geometry[index]
+                viewpoint = camera_center(viewport.pose).to(positions.device, non_blocking=positions.is_cuda)
+                gaussians, colors = geometry.at(take_rows(positions, index)), model.decode_colors(viewpoint, index)
+            raster = rasterize(gaussians, colors, viewport, raster_settings, absgrad=gradients)
+        else:
+            index = torch.arange(len(model), device=positions.device)
+            gradients = positions.new_zeros(len(index), 2) if absgrad else None
+            gaussians, tolerance = decoded.geometry.at(positions), settings.cull_tolerance
+            raster = rasterize_shaded(gaussians, decoded.shading, viewport, raster_settings, cull_tolerance=tolerance)
+    except FloatingPointError:
+        raise _nonfinite_error("positions") from None
     if raster.nonfinite:
         raise _nonfinite_error(raster.nonfinite[0])
     seconds.update(raster.seconds)
     with _record_seconds(seconds, "background"):
         if model.config.background and background:
             stride, light = settings.background_stride, raster.transmittance
-            behind = model.background_grid(
-                light, camera.intrinsics, pose_here, threshold=settings.background_threshold, stride=stride
-            )
+            behind = model.background_grid(light, viewport, threshold=settings.background_threshold, stride=stride)
             rgb = composite(raster.rgb, light, behind, stride)
         else:
             behind = tensor_like(model.config.solid, positions) if solid is None else solid
             rgb = raster.rgb + raster.transmittance[..., None] * behind
         # Each check on a GPU waits for the device. So only the image is checked there, and not even the image in
         # training, where the caller checks the loss.
+        on_cpu = positions.device.type == "cpu"
         if on_cpu or not rgb.requires_grad:
             _check_finite(background=behind if on_cpu else rgb)
     if settings.exposure == AS_PHOTOGRAPHED:

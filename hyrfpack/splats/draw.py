@@ -10,7 +10,7 @@ from torch import Tensor
 
 from hyrfpack.model import Frame
 from hyrfpack.ops.poses import camera_center
-from hyrfpack.ops.rasterize import Rasterization, rasterize
+from hyrfpack.ops.rasterize import Gaussians3D, Rasterization, rasterize
 from hyrfpack.ops.rasterize.cull import frustum_cull
 from hyrfpack.parallel.pool import torch_on_one_thread
 from hyrfpack.render import RenderSettings
@@ -66,6 +66,11 @@ class Drawable:
         """The degree of the spherical harmonics."""
         return round(self.harmonics.shape[1] ** 0.5) - 1
 
+    @property
+    def gaussians(self) -> Gaussians3D:
+        """The splats without colours, as the rasteriser takes them."""
+        return Gaussians3D(self.positions, self.quats, self.scales, self.opacities)
+
     def evaluate_colors(self, viewpoint: Tensor, index: Tensor) -> Tensor:
         """Evaluate the colours (n, 3), not clamped, of splats `index` (n,) from `viewpoint` (3,) in local units."""
         directions = torch.nn.functional.normalize(self.positions[index] - viewpoint, dim=-1, eps=1e-12)
@@ -93,22 +98,11 @@ def draw(
         black: draw all splats black, which is faster where only the transmittance is needed.
         depth: also return the depth, (H, W) in world units.
     """
-    pose = torch.as_tensor(drawable.frame.local_pose(camera), dtype=torch.float32)
-    size = camera.intrinsics, camera.width, camera.height
-    index = frustum_cull(drawable.positions, pose, *size, settings.near, settings.cull_tolerance)
-    positions = drawable.positions[index]
-    viewpoint = camera_center(pose).to(positions.device, non_blocking=positions.is_cuda)
-    drawn = rasterize(
-        positions,
-        drawable.quats[index],
-        drawable.scales[index],
-        drawable.opacities[index],
-        torch.zeros_like(positions) if black else drawable.evaluate_colors(viewpoint, index).clamp_min(0),
-        pose,
-        *size,
-        near=settings.near,
-        antialiased=drawable.antialiased,
-        transmittance_min=settings.transmittance_min,
-        depth=depth,
-    )
+    viewport = drawable.frame.local_viewport(camera)
+    index = frustum_cull(drawable.positions, viewport, settings.near, settings.cull_tolerance)
+    gaussians = drawable.gaussians.select(index)
+    means = gaussians.means
+    viewpoint = camera_center(viewport.pose).to(means.device, non_blocking=means.is_cuda)
+    colors = torch.zeros_like(means) if black else drawable.evaluate_colors(viewpoint, index).clamp_min(0)
+    drawn = rasterize(gaussians, colors, viewport, settings.raster_settings(drawable.antialiased, depth))
     return drawn if drawn.depth is None else replace(drawn, depth=drawn.depth * drawable.frame.scale)

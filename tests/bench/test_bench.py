@@ -26,7 +26,7 @@ from hyrfpack.measure import timing
 from hyrfpack.model import HybridModel
 from hyrfpack.ops.hash_encode import hash_encode
 from hyrfpack.ops.mlp import mlp
-from hyrfpack.ops.rasterize import rasterize
+from hyrfpack.ops.rasterize import Gaussians3D, RasterSettings, rasterize
 from hyrfpack.render import RenderSettings, render_view
 
 RING_CAMERAS = ring(3, width=24, height=24)
@@ -69,17 +69,18 @@ def test_every_setting_has_one_reference_without_error_and_one_default(measure):
 
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_rasterize_errors_are_against_float64_with_the_same_antialiasing(antialiased):
-    model, camera = make_model(), RING_CAMERAS[1]
-    pose = torch.as_tensor(model.config.frame.local_pose(camera))
+    model = make_model()
+    viewport = model.config.frame.local_viewport(RING_CAMERAS[1], torch.float64)
+    pose = viewport.pose
     with torch.no_grad():
         geometry = model.decode_geometry()
         colors = model.decode_colors(-(pose[:3, :3].T @ pose[:3, 3]).float())
     tensors = (model.gaussians.positions.detach(), geometry.quats, geometry.scales, geometry.opacities, colors)
     found = []
     for dtype, implementation in ((torch.float32, "cpu"), (torch.float64, "reference")):
-        view = (pose, camera.intrinsics, camera.width, camera.height)
-        cast = [tensor.to(dtype) for tensor in tensors]
-        picture = rasterize(*cast, *view, antialiased=antialiased, implementation=implementation)
+        *gaussians, colors = (tensor.to(dtype) for tensor in tensors)
+        settings = RasterSettings(antialiased=antialiased)
+        picture = rasterize(Gaussians3D(*gaussians), colors, viewport, settings, implementation=implementation)
         found.append(np.concatenate([picture.rgb.flatten(), picture.transmittance.flatten()]).astype(np.float64))
 
     rows = rows_by_setting(rasterize_rows(make_subject(model), 1, []))

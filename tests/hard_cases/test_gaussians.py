@@ -16,14 +16,17 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from hyrfpack.ops.rasterize import Rasterization, rasterize
+from hyrfpack.ops.rasterize import Gaussians3D, Rasterization, RasterSettings, rasterize
 from hyrfpack.ops.rasterize.reference import project
+from hyrfpack.ops.viewport import Viewport
 
 PARAMETER_NAMES = ("means", "quats", "scales", "opacities", "colors")
 CAMERA_INTRINSICS = (10.0, 11.0, 5.2, 3.9)
 PICTURE_WIDTH = 10
 PICTURE_HEIGHT = 8
+IDENTITY_POSE = torch.eye(4, dtype=torch.float64)
 IDENTITY_QUATERNION = (1.0, 0.0, 0.0, 0.0)
+VIEWPORT = Viewport(IDENTITY_POSE, CAMERA_INTRINSICS, PICTURE_WIDTH, PICTURE_HEIGHT)
 
 
 @dataclass(frozen=True)
@@ -127,16 +130,18 @@ def _to_natural_units(gaussians: dict[str, Tensor], gradients: dict[str, Tensor]
 
 
 def _draw(case: Case, inputs: dict[str, Tensor], implementation: str) -> Rasterization:
-    camera = torch.eye(4, dtype=torch.float64)
-    return rasterize(
-        *inputs.values(),
-        camera,
-        CAMERA_INTRINSICS,
-        PICTURE_WIDTH,
-        PICTURE_HEIGHT,
-        implementation=implementation,
-        **case.options,
-    )
+    *gaussians, colors = inputs.values()
+    settings = RasterSettings(**case.options)
+    return rasterize(Gaussians3D(*gaussians), colors, VIEWPORT, settings, implementation=implementation)
+
+
+def _draw_square_pixels(
+    inputs: dict[str, Tensor], width: int, height: int, implementation: str, **options: float
+) -> Rasterization:
+    *gaussians, colors = inputs.values()
+    viewport = Viewport(IDENTITY_POSE, SQUARE_PIXEL_INTRINSICS, width, height)
+    settings = RasterSettings(**options)
+    return rasterize(Gaussians3D(*gaussians), colors, viewport, settings, implementation=implementation)
 
 
 def _loss(picture: Rasterization) -> Tensor:
@@ -246,7 +251,6 @@ def test_ten_thousand_layers_keep_their_gradients(opacity: float, transmittance_
 
 # -- closed forms ---------------------------------------------------------------------------------------------------
 
-IDENTITY_POSE = torch.eye(4, dtype=torch.float64)
 SQUARE_PIXEL_INTRINSICS = (10.0, 10.0, 5.0, 4.0)
 
 
@@ -280,14 +284,7 @@ def test_a_needle_is_drawn_as_a_line_of_the_low_pass_width(implementation: str, 
         "opacities": torch.tensor([0.9]),
         "colors": torch.ones(1, 3),
     }
-    found = rasterize(
-        *needle.values(),
-        IDENTITY_POSE,
-        SQUARE_PIXEL_INTRINSICS,
-        PICTURE_WIDTH,
-        PICTURE_HEIGHT,
-        implementation=implementation,
-    )
+    found = _draw_square_pixels(needle, PICTURE_WIDTH, PICTURE_HEIGHT, implementation)
 
     x, y = np.meshgrid(np.arange(PICTURE_WIDTH) + 0.5 - 5, np.arange(PICTURE_HEIGHT) + 0.5 - 4)
     along, across = x * math.cos(angle) + y * math.sin(angle), -x * math.sin(angle) + y * math.cos(angle)
@@ -309,15 +306,7 @@ def test_equal_layers_leave_a_power_of_the_light_and_blending_ends_early(
     order = np.argsort(sheets["means"][:, 2].numpy(), kind="stable")[:blended]
     color, left = _blend_sheets(np.full(10_000, opacity), sheets["colors"].double().numpy(), order)
 
-    found = rasterize(
-        *sheets.values(),
-        IDENTITY_POSE,
-        SQUARE_PIXEL_INTRINSICS,
-        2,
-        2,
-        transmittance_min=transmittance_min,
-        implementation=implementation,
-    )
+    found = _draw_square_pixels(sheets, 2, 2, implementation, transmittance_min=transmittance_min)
 
     np.testing.assert_allclose(found.transmittance.numpy(), left, rtol=2e-5)
     np.testing.assert_allclose(found.rgb.numpy(), np.broadcast_to(color, (2, 2, 3)), atol=5e-6)
@@ -328,15 +317,7 @@ def test_light_that_underflows_is_zero(implementation: str) -> None:
     sheets = _make_sheets(torch.full((300,), 1.0), torch.linspace(1, 4, 300))
     inputs = {name: values.requires_grad_() for name, values in sheets.items()}
 
-    found = rasterize(
-        *inputs.values(),
-        IDENTITY_POSE,
-        SQUARE_PIXEL_INTRINSICS,
-        2,
-        2,
-        transmittance_min=0.0,
-        implementation=implementation,
-    )
+    found = _draw_square_pixels(inputs, 2, 2, implementation, transmittance_min=0.0)
     (found.rgb.sum() + found.transmittance.sum()).backward()
 
     assert (found.transmittance >= 0).all() and found.transmittance.max() < 1e-37  # 0.01^300
@@ -356,15 +337,7 @@ def test_equal_depths_are_blended_in_the_order_of_the_input(implementation: str,
     order = np.argsort(sheets["means"][:, 2].numpy(), kind="stable")
     expected, left = _blend_sheets(sheets["opacities"].double().numpy(), sheets["colors"].double().numpy(), order)
 
-    found = rasterize(
-        *sheets.values(),
-        IDENTITY_POSE,
-        SQUARE_PIXEL_INTRINSICS,
-        3,
-        2,
-        transmittance_min=0.0,
-        implementation=implementation,
-    )
+    found = _draw_square_pixels(sheets, 3, 2, implementation, transmittance_min=0.0)
 
     np.testing.assert_allclose(found.rgb.numpy(), np.broadcast_to(expected, (2, 3, 3)), atol=2e-6)
     np.testing.assert_allclose(found.transmittance.numpy(), left, atol=1e-6)
@@ -374,7 +347,7 @@ def test_equal_depths_are_blended_in_the_order_of_the_input(implementation: str,
 def test_an_alpha_at_its_cap_passes_a_hundredth_of_the_light_and_no_gradient(implementation: str) -> None:
     inputs = {name: values.requires_grad_() for name, values in _make_sheets(torch.ones(1)).items()}
 
-    found = rasterize(*inputs.values(), IDENTITY_POSE, SQUARE_PIXEL_INTRINSICS, 4, 3, implementation=implementation)
+    found = _draw_square_pixels(inputs, 4, 3, implementation)
     found.rgb.sum().backward()
 
     np.testing.assert_allclose(found.transmittance.detach().numpy(), 0.01, atol=1e-7)
@@ -393,15 +366,7 @@ def test_antialiasing_leaves_no_less_than_half_a_percent_of_an_opacity(implement
         "opacities": torch.ones(1),
         "colors": torch.ones(1, 3),
     }
-    found = rasterize(
-        *dot.values(),
-        IDENTITY_POSE,
-        SQUARE_PIXEL_INTRINSICS,
-        PICTURE_WIDTH,
-        PICTURE_HEIGHT,
-        antialiased=True,
-        implementation=implementation,
-    )
+    found = _draw_square_pixels(dot, PICTURE_WIDTH, PICTURE_HEIGHT, implementation, antialiased=True)
     found.rgb.sum().backward()
 
     expected = torch.zeros(PICTURE_HEIGHT, PICTURE_WIDTH)
@@ -478,7 +443,7 @@ def _picture_and_allowance(gaussians: dict[str, Tensor]) -> tuple[np.ndarray, np
     the light that reaches it.
     """
     doubles = [gaussians[name].double() for name in PARAMETER_NAMES]
-    splats = project(*doubles[:4], IDENTITY_POSE, CAMERA_INTRINSICS, PICTURE_WIDTH, PICTURE_HEIGHT, 0.01, False)
+    splats = project(Gaussians3D(*doubles[:4]), VIEWPORT, RasterSettings())
     order = np.argsort(splats.depths.float().numpy(), kind="stable")
     mean, cov = splats.means2d.numpy()[order], splats.covs2d.numpy()[order]
     a, b, c = splats.conics.numpy()[order].T

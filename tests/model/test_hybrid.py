@@ -7,6 +7,7 @@ from scenes import look_at, small_model
 
 from hyrfpack.model import Frame
 from hyrfpack.model.gaussians import Gaussians
+from hyrfpack.ops.viewport import Viewport
 
 BOX_FRAME = Frame((0.0, 0.0, 0.0), 2.0, (1.0, 0.5, 0.25))
 CAMERA_POSITION = (0.3, -4.0, 1.5)
@@ -143,7 +144,8 @@ def test_background_is_the_radiance_field_on_the_sphere(encoding):
         model.radiance, contract_in_numpy(model, on_sphere), encode_directions_in_numpy(rays, encoding)
     )
 
-    colors = model.decode_background(torch.from_numpy(pixels).float(), intrinsics, torch.from_numpy(pose).float())
+    viewport = Viewport(torch.from_numpy(pose).float(), intrinsics, 6, 4)
+    colors = model.decode_background(torch.from_numpy(pixels).float(), viewport)
 
     np.testing.assert_allclose(as_float64(colors), sigmoid(raw), atol=2e-4)
 

@@ -15,6 +15,7 @@ from scenes import look_at
 
 from hyrfpack.ops.background import (
     BACKGROUND_RADIUS,
+    BackgroundField,
     background_colors,
     background_grid,
     grid_size,
@@ -23,6 +24,7 @@ from hyrfpack.ops.background import (
 )
 from hyrfpack.ops.hash_encode import level_offsets, level_resolutions
 from hyrfpack.ops.shade.directions import DIRECTION_FEATURES
+from hyrfpack.ops.viewport import Viewport
 
 TESTED_IMPLEMENTATIONS = ["reference", pytest.param("gpu", marks=needs_triton)]
 
@@ -60,7 +62,7 @@ class Case:
         return torch.full((self.height, self.width), float(self.light))
 
     def arguments(self) -> dict[str, Any]:
-        """Return the arguments of `background_grid` after the transmittance, in float32."""
+        """Return the arguments of `run_grid` after the transmittance, in float32."""
         resolutions = level_resolutions(self.levels, 4, self.finest)
         widths = [2 * self.levels + DIRECTION_FEATURES[self.encoding], *self.hidden, 3]
         generator = torch.Generator().manual_seed(1)
@@ -97,7 +99,7 @@ class Case:
         """Return the grid on the CPU, without gradients."""
         light, arguments = self.placed(dtype, implementation)
         with torch.no_grad():
-            return background_grid(light, **arguments, mixed=mixed, implementation=implementation).cpu()
+            return run_grid(light, **arguments, mixed=mixed, implementation=implementation).cpu()
 
     def learn(
         self, dtype: torch.dtype, implementation: str, mixed: bool = False
@@ -107,12 +109,27 @@ class Case:
         return grid_and_gradients(light, arguments | {"mixed": mixed}, implementation)
 
 
+def split_arguments(
+    light: torch.Tensor, pose: torch.Tensor, intrinsics: tuple[float, float, float, float], **field: Any
+) -> tuple[Viewport, BackgroundField]:
+    height, width = light.shape
+    return Viewport(pose, intrinsics, width, height), BackgroundField(**field)
+
+
+def run_grid(
+    light: torch.Tensor, *, threshold: float, stride: int, implementation: str = "auto", **arguments: Any
+) -> torch.Tensor:
+    """Return the result of `background_grid` for a flat list of arguments."""
+    options = {"threshold": threshold, "stride": stride, "implementation": implementation}
+    return background_grid(light, *split_arguments(light, **arguments), **options)
+
+
 def grid_and_gradients(
     light: torch.Tensor, arguments: dict[str, Any], implementation: str
 ) -> tuple[torch.Tensor, list[torch.Tensor]]:
     """Do what `Case.learn` does, for tensors that are on the right device."""
     field = [leaf.requires_grad_() for leaf in field_tensors(arguments)]
-    grid = background_grid(light, **arguments, implementation=implementation)
+    grid = run_grid(light, **arguments, implementation=implementation)
     upstream = torch.randn(grid.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
     gradients = torch.autograd.grad(grid, field, upstream.to(grid.device, grid.dtype))
     return grid.detach().cpu(), [gradient.cpu() for gradient in gradients]
@@ -215,9 +232,10 @@ def test_nodes_have_the_colours_at_their_pixel_centres() -> None:
     case = Case(light="1", stride=3)
     arguments = case.arguments()
     threshold, stride = arguments.pop("threshold"), arguments.pop("stride")
-    grid = background_grid(case.transmittance(), threshold=threshold, stride=stride, **arguments)
+    light = case.transmittance()
+    grid = run_grid(light, threshold=threshold, stride=stride, **arguments)
     points = [(3 * j + 0.5, 3 * i + 0.5) for i in range(grid.shape[0]) for j in range(grid.shape[1])]
-    expected = background_colors(torch.tensor(points), **arguments, mixed=False)
+    expected = background_colors(torch.tensor(points), *split_arguments(light, **arguments))
     torch.testing.assert_close(grid.reshape(-1, 3), expected)
 
 
@@ -229,7 +247,7 @@ def test_the_reference_passes_gradcheck_for_the_field() -> None:
 
     def run(table, *rest):
         light = case.transmittance().double()
-        return background_grid(light, table=table, weights=rest[:3], biases=rest[3:], **arguments)
+        return run_grid(light, table=table, weights=rest[:3], biases=rest[3:], **arguments)
 
     assert torch.autograd.gradcheck(run, inputs)
 
@@ -294,7 +312,7 @@ def test_gradients_of_a_part_of_the_field_can_be_requested(learnt: str, implemen
     light, arguments = case.placed(torch.float32, implementation)
     part = arguments[learnt] if learnt == "table" else arguments[learnt][1]
     part.requires_grad_()
-    grid = background_grid(light, **arguments, implementation=implementation)
+    grid = run_grid(light, **arguments, implementation=implementation)
     upstream = torch.randn(grid.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
     grid.backward(upstream.to(grid.device, grid.dtype))
     torch.testing.assert_close(grid.detach().cpu(), wanted)
@@ -309,7 +327,7 @@ def test_gradients_of_a_part_of_the_field_can_be_requested(learnt: str, implemen
 def test_pixels_without_transmittance_give_no_gradient(implementation: str) -> None:
     light, arguments = Case(light="0", threshold=0.0).placed(torch.float32, implementation)
     field = [leaf.requires_grad_() for leaf in field_tensors(arguments)]
-    grid = background_grid(light, **arguments, implementation=implementation)
+    grid = run_grid(light, **arguments, implementation=implementation)
     assert grid.shape == (7, 11, 3) and not grid.any()
     (grid.sum() + sum(0 * leaf.sum() for leaf in field)).backward()
     assert not any(leaf.grad.any() for leaf in field)
@@ -319,7 +337,7 @@ def test_pixels_without_transmittance_give_no_gradient(implementation: str) -> N
 def test_the_transmittance_gets_no_gradient(implementation: str) -> None:
     light, arguments = Case().placed(torch.float32, implementation)
     arguments["table"].requires_grad_()
-    background_grid(light.requires_grad_(), **arguments, implementation=implementation).sum().backward()
+    run_grid(light.requires_grad_(), **arguments, implementation=implementation).sum().backward()
     assert light.grad is None and arguments["table"].grad.any()
 
 
@@ -334,8 +352,8 @@ def test_the_kernels_are_not_used_for_unsupported_fields(case: Case, learnt: boo
     light, arguments = case.placed(torch.float32, "gpu")
     arguments["table"].requires_grad_(learnt)
     with pytest.raises(ValueError, match="no implementation 'gpu'"):
-        background_grid(light, **arguments, implementation="gpu")
-    assert background_grid(light, **arguments).requires_grad == learnt
+        run_grid(light, **arguments, implementation="gpu")
+    assert run_grid(light, **arguments).requires_grad == learnt
 
 
 @pytest.mark.parametrize(
@@ -351,7 +369,15 @@ def test_the_kernels_are_not_used_for_unsupported_fields(case: Case, learnt: boo
 )
 def test_inputs_that_do_not_fit_are_rejected(change: dict) -> None:
     with pytest.raises(ValueError):
-        background_grid(Case().transmittance(), **(Case().arguments() | change))
+        run_grid(Case().transmittance(), **(Case().arguments() | change))
+
+
+def test_a_transmittance_of_another_size_than_the_viewport_is_rejected() -> None:
+    light, arguments = Case().transmittance(), Case().arguments()
+    options = {"threshold": arguments.pop("threshold"), "stride": arguments.pop("stride")}
+    viewport, field = split_arguments(light, **arguments)
+    with pytest.raises(ValueError, match="make no grid"):
+        background_grid(light[1:], viewport, field, **options)
 
 
 # -- rays ------------------------------------------------------------------------------------------------------------
@@ -406,7 +432,7 @@ def test_pixel_directions_project_back_to_their_points():
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(50, 2, dtype=torch.float64, generator=generator) * torch.tensor([width, height])
 
-    directions = pixel_directions(points, intrinsics, pose)
+    directions = pixel_directions(points, Viewport(pose, intrinsics, width, height))
 
     x, y, z = (directions @ pose[:3, :3].T).unbind(1)
     np.testing.assert_allclose((fx * x / z + cx).numpy(), points[:, 0].numpy(), atol=1e-12)

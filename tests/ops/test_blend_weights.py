@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import pytest
 import torch
-from torch import Tensor
 
-from hyrfpack.ops.rasterize import rasterize
+from hyrfpack.ops.rasterize import Gaussians3D, RasterSettings, rasterize
 from hyrfpack.ops.rasterize.blend_weights import sum_blend_weights
+from hyrfpack.ops.viewport import Viewport
 
-# Intrinsics, width and height.
-CAMERA_AND_SIZE = ((50.0, 50.0, 24.0, 20.0), 48, 40)
+VIEWPORT = Viewport(torch.eye(4, dtype=torch.float64), (50.0, 50.0, 24.0, 20.0), 48, 40)
 
 
-def make_scene(kind: str, count: int = 300) -> tuple[Tensor, ...]:
+def make_scene(kind: str, count: int = 300) -> Gaussians3D:
     generator = torch.Generator().manual_seed(len(kind))
     means = torch.randn(count, 3, generator=generator) * 0.8
     means[:, 2] += 4.0
@@ -30,7 +29,7 @@ def make_scene(kind: str, count: int = 300) -> tuple[Tensor, ...]:
         scales[:, 0] *= 300
     if kind == "too faint":
         opacities[::2] = 1 / 256
-    return means, torch.randn(count, 4, generator=generator), scales, opacities
+    return Gaussians3D(means, torch.randn(count, 4, generator=generator), scales, opacities)
 
 
 SCENE_KINDS = [
@@ -46,20 +45,18 @@ SCENE_KINDS = [
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("kind", SCENE_KINDS)
 def test_one_pass_agrees_with_the_float64_derivative(kind: str, antialiased: bool) -> None:
-    gaussians, camera = make_scene(kind), torch.eye(4, dtype=torch.float64)
-    expected = sum_blend_weights(
-        *(part.double() for part in gaussians), camera, *CAMERA_AND_SIZE, antialiased=antialiased
-    )
-    found = sum_blend_weights(*gaussians, camera, *CAMERA_AND_SIZE, antialiased=antialiased, implementation="cpu")
+    gaussians, settings = make_scene(kind), RasterSettings(antialiased=antialiased)
+    expected = sum_blend_weights(Gaussians3D(*(part.double() for part in gaussians)), VIEWPORT, settings)
+    found = sum_blend_weights(gaussians, VIEWPORT, settings, implementation="cpu")
     assert expected[0].max() > 1 > expected[1].min()
     for tensor, wanted in zip(found, expected, strict=True):
         torch.testing.assert_close(tensor, wanted.float(), atol=2e-4, rtol=2e-4)
 
 
 def test_all_blend_weights_add_up_to_one_minus_the_transmittance() -> None:
-    gaussians, camera = make_scene("a cloud"), torch.eye(4)
-    picture = rasterize(*gaussians, torch.ones(300, 3), camera, *CAMERA_AND_SIZE)
-    light, passed = sum_blend_weights(*gaussians, camera, *CAMERA_AND_SIZE)
+    gaussians = make_scene("a cloud")
+    picture = rasterize(gaussians, torch.ones(300, 3), VIEWPORT)
+    light, passed = sum_blend_weights(gaussians, VIEWPORT)
     assert torch.equal(passed, picture.transmittance)
     assert float(light.sum()) == pytest.approx(float((1 - picture.transmittance).sum()), rel=1e-5)
     assert not light.requires_grad and not light[~picture.visible].any()
@@ -67,14 +64,12 @@ def test_all_blend_weights_add_up_to_one_minus_the_transmittance() -> None:
 
 @pytest.mark.parametrize("implementation", ["cpu", "reference"])
 def test_gaussians_that_are_not_drawn_have_no_weight(implementation: str) -> None:
-    means, *rest = make_scene("a cloud")
-    nothing, passed = sum_blend_weights(
-        means - torch.tensor([0.0, 0.0, 99.0]), *rest, torch.eye(4), *CAMERA_AND_SIZE, implementation=implementation
-    )
+    gaussians = make_scene("a cloud")
+    behind = gaussians._replace(means=gaussians.means - torch.tensor([0.0, 0.0, 99.0]))
+    nothing, passed = sum_blend_weights(behind, VIEWPORT, implementation=implementation)
     assert nothing.shape == (300,) and not nothing.any() and bool((passed == 1).all())
-    none, _ = sum_blend_weights(
-        *(part[:0] for part in make_scene("a cloud")), torch.eye(4), *CAMERA_AND_SIZE, implementation=implementation
-    )
+    empty = gaussians.select(torch.zeros(0, dtype=torch.int64))
+    none, _ = sum_blend_weights(empty, VIEWPORT, implementation=implementation)
     assert none.shape == (0,)
 
 
@@ -82,11 +77,11 @@ def test_bytes_do_not_depend_on_the_number_of_threads(monkeypatch: pytest.Monkey
     gaussians, found = make_scene("a cloud", 3000), set()
     for threads in (1, 2, 5):
         monkeypatch.setenv("HYRFPACK_THREADS", str(threads))
-        found.add(sum_blend_weights(*gaussians, torch.eye(4), *CAMERA_AND_SIZE)[0].numpy().tobytes())
+        found.add(sum_blend_weights(gaussians, VIEWPORT)[0].numpy().tobytes())
     assert len(found) == 1
 
 
 def test_shapes_that_do_not_fit_are_rejected() -> None:
-    means, quats, scales, opacities = make_scene("a cloud")
+    gaussians = make_scene("a cloud")
     with pytest.raises(ValueError, match="scales"):
-        sum_blend_weights(means, quats, scales[:9], opacities, torch.eye(4), *CAMERA_AND_SIZE)
+        sum_blend_weights(gaussians._replace(scales=gaussians.scales[:9]), VIEWPORT)

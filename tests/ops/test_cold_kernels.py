@@ -10,7 +10,7 @@ HASH_RESULTS_SCRIPT = """
 import hashlib
 import torch
 from hyrfpack.ops.hash_encode import hash_encode, level_offsets, level_resolutions
-from hyrfpack.ops.rasterize import rasterize
+from hyrfpack.ops.rasterize import Gaussians3D, Viewport, rasterize
 from hyrfpack.ops.ssim import photometric_loss
 
 g = torch.Generator().manual_seed(0)
@@ -20,8 +20,9 @@ features = hash_encode(torch.rand(count, 3, generator=g), table, resolutions, 10
 means = (torch.randn(count, 3, generator=g) + torch.tensor([0, 0, 4.0])).requires_grad_()
 scales, opacities = torch.rand(count, 3, generator=g) * 0.2, torch.rand(count, generator=g)
 colors, quats = torch.rand(count, 3, generator=g), torch.randn(count, 4, generator=g)
-camera = (torch.eye(4), (60.0, 60.0, 32.0, 32.0), 64, 64)
-picture = rasterize(means, quats, scales, opacities, colors, *camera, absgrad=torch.zeros(count, 2)).rgb
+gaussians = Gaussians3D(means, quats, scales, opacities)
+viewport = Viewport(torch.eye(4), (60.0, 60.0, 32.0, 32.0), 64, 64)
+picture = rasterize(gaussians, colors, viewport, absgrad=torch.zeros(count, 2)).rgb
 loss = photometric_loss(picture, torch.rand(64, 64, 3, generator=g)) + features.square().mean()
 loss.backward()
 for result in (features, picture, loss, table.grad, means.grad):

@@ -9,6 +9,7 @@ from ops.device import IS_INTERPRETED, gpu, needs_triton
 from scenes import look_at
 
 from hyrfpack.ops.rasterize.cull import frustum_cull
+from hyrfpack.ops.viewport import Viewport
 
 PICTURE_WIDTH = 64
 PICTURE_HEIGHT = 40
@@ -23,19 +24,15 @@ POINT_AHEAD = (0.0, -2.0, 0.0)
 POINT_BEHIND = (0.0, -4.0, 0.0)
 
 
+def make_viewport(pose: torch.Tensor) -> Viewport:
+    return Viewport(pose, CAMERA_INTRINSICS, PICTURE_WIDTH, PICTURE_HEIGHT)
+
+
 def cull(points, pose=CAMERA_POSE, implementation="reference", *, near=0.01, tolerance=0.3) -> torch.Tensor:
     positions = torch.as_tensor(np.asarray(points), dtype=torch.float32).reshape(-1, 3)
     positions = gpu(positions) if implementation == "gpu" else positions
-    index = frustum_cull(
-        positions,
-        torch.from_numpy(pose),
-        CAMERA_INTRINSICS,
-        PICTURE_WIDTH,
-        PICTURE_HEIGHT,
-        near,
-        tolerance,
-        implementation=implementation,
-    )
+    viewport = make_viewport(torch.from_numpy(pose))
+    index = frustum_cull(positions, viewport, near, tolerance, implementation=implementation)
     assert index.dtype == torch.int64 and index.ndim == 1 and index.device == positions.device
     return index.cpu()
 
@@ -125,10 +122,9 @@ def test_the_kernel_uses_a_float64_pose_at_full_precision():
     turned[:3, :3] = [[np.cos(angle), 0, -np.sin(angle)], [0, 1, 0], [np.sin(angle), 0, np.cos(angle)]]
     lens = (width, 60.0, 32.0, 25.0)  # the edge of the band is at x = z
     found = [
-        frustum_cull(gpu(torch.ones(1, 3) * torch.tensor([1.0, 0, 1])), torch.from_numpy(pose), lens, 64, 40, 0.01, 0.3,
-                     implementation="gpu").tolist()
-        for pose in (turned, turned.T.copy())
-    ]  # fmt: skip
+        frustum_cull(gpu(torch.tensor([[1.0, 0, 1]])), viewport, 0.01, 0.3, implementation="gpu").tolist()
+        for viewport in (Viewport(torch.from_numpy(pose), lens, 64, 40) for pose in (turned, turned.T.copy()))
+    ]
     assert found == [[0], []]
 
 
@@ -167,7 +163,7 @@ def test_the_largest_float32_values_are_supported(implementation):
 def test_layouts_and_gradients_of_positions_have_no_effect(implementation):
     points = torch.from_numpy(np.random.default_rng(1).normal(size=(60, 3))).float()
     points = gpu(points) if implementation == "gpu" else points
-    rest = torch.from_numpy(CAMERA_POSE).float(), CAMERA_INTRINSICS, PICTURE_WIDTH, PICTURE_HEIGHT, 0.01, 0.3
+    rest = make_viewport(torch.from_numpy(CAMERA_POSE).float()), 0.01, 0.3
     expected = frustum_cull(points, *rest, implementation=implementation)
     assert 0 < len(expected) < 60
     for other in (points.T.contiguous().T, points.repeat_interleave(2, 0)[::2], points.clone().requires_grad_()):
@@ -175,7 +171,7 @@ def test_layouts_and_gradients_of_positions_have_no_effect(implementation):
 
 
 def test_unknown_types_and_implementations_are_rejected():
-    rest = torch.eye(4), CAMERA_INTRINSICS, PICTURE_WIDTH, PICTURE_HEIGHT, 0.01, 0.3
+    rest = make_viewport(torch.eye(4)), 0.01, 0.3
     with pytest.raises(ValueError, match="float32"):
         frustum_cull(torch.zeros(2, 3).double(), *rest, implementation="gpu")
     with pytest.raises(ValueError, match="no implementation 'cpu'"):

@@ -15,8 +15,9 @@ from ops.device import IS_INTERPRETED, KERNEL_DEVICE, gpu, needs_triton
 from torch import Tensor
 
 from hyrfpack.ops.dispatch import has_triton
-from hyrfpack.ops.rasterize import Rasterization, rasterize
+from hyrfpack.ops.rasterize import Gaussians3D, Rasterization, RasterSettings, rasterize
 from hyrfpack.ops.rasterize.reference import blend, project
+from hyrfpack.ops.viewport import Viewport
 
 if has_triton():
     import triton
@@ -47,6 +48,10 @@ class Case:
     intrinsics: tuple[float, float, float, float] = (50.0, 50.0, 24.0, 20.0)
     camera: Tensor = field(default_factory=lambda: _camera(4.0))
     options: dict = field(default_factory=dict)
+
+    @property
+    def viewport(self) -> Viewport:
+        return Viewport(self.camera, self.intrinsics, self.width, self.height)
 
 
 def _camera(distance: float) -> Tensor:
@@ -228,16 +233,10 @@ def _inputs(case: Case, implementation: str, dtype: torch.dtype) -> tuple[list[T
 
 
 def _draw(case: Case, implementation: str, inputs: list[Tensor], absgrad: Tensor) -> Rasterization:
+    *gaussians, colors = inputs
+    settings = RasterSettings(depth=True, **case.options)
     picture = rasterize(
-        *inputs,
-        case.camera,
-        case.intrinsics,
-        case.width,
-        case.height,
-        depth=True,
-        absgrad=absgrad,
-        implementation=implementation,
-        **case.options,
+        Gaussians3D(*gaussians), colors, case.viewport, settings, absgrad=absgrad, implementation=implementation
     )
     return replace(picture, **{name: value.cpu() for name, value in vars(picture).items() if torch.is_tensor(value)})
 
@@ -305,8 +304,8 @@ def test_matches_the_float64_reference(implementation: str, name: str) -> None:
 def test_tiles_and_bounds_do_not_change_the_picture(implementation: str, name: str) -> None:
     case = _case(name, implementation)
     gaussians = {key: value.double() for key, value in case.gaussians.items()}
-    shapes = [gaussians[key] for key in PARAMETER_NAMES[:4]]
-    splats = project(*shapes, case.camera, case.intrinsics, case.width, case.height, 0.01, False)
+    shapes = Gaussians3D(*(gaussians[key] for key in PARAMETER_NAMES[:4]))
+    splats = project(shapes, case.viewport, RasterSettings())
     splats = splats.select(torch.argsort(splats.depths, stable=True))
     ys, xs = torch.meshgrid(torch.arange(case.height) + 0.5, torch.arange(case.width) + 0.5, indexing="ij")
     pixels = torch.stack([xs, ys], -1).view(-1, 2).double()
@@ -386,9 +385,8 @@ def test_reference_passes_gradcheck(antialiased: bool) -> None:
     inputs = [gaussians[name].double().requires_grad_() for name in PARAMETER_NAMES]
 
     def run(*tensors: Tensor) -> tuple[Tensor, Tensor]:
-        picture = rasterize(
-            *tensors, _camera(4.0), (4.0, 5.0, 2.0, 1.5), 4, 3, antialiased=antialiased, implementation="reference"
-        )
+        viewport, settings = Viewport(_camera(4.0), (4.0, 5.0, 2.0, 1.5), 4, 3), RasterSettings(antialiased=antialiased)
+        picture = rasterize(Gaussians3D(*tensors[:4]), tensors[4], viewport, settings, implementation="reference")
         return picture.rgb, picture.transmittance
 
     assert torch.autograd.gradcheck(run, inputs)
@@ -400,7 +398,7 @@ def test_absgrad_is_the_sum_of_absolute_gradients_of_single_pixels(implementatio
         Case(_gaussians(12), width=18, height=17, intrinsics=(18.0, 18.0, 9.0, 8.5)), implementation
     )
     gaussians = [case.gaussians[name].double() for name in PARAMETER_NAMES]
-    splats = project(*gaussians[:4], case.camera, case.intrinsics, 18, 17, 0.01, False)
+    splats = project(Gaussians3D(*gaussians[:4]), case.viewport, RasterSettings())
     splats = splats.select(torch.argsort(splats.depths, stable=True))
     colors = gaussians[4][splats.index]
     grad_rgb, grad_transmittance = _cotangents(17, 18, torch.float64)
@@ -427,7 +425,8 @@ def test_absgrad_is_added_to_what_the_buffer_holds(implementation: str) -> None:
     inputs = [place(case.gaussians[name]).requires_grad_() for name in PARAMETER_NAMES]
     buffer = place(torch.full((5, 4), 3.0))[:, ::2]  # a buffer with gaps
 
-    picture = rasterize(*inputs, case.camera, case.intrinsics, 18, 17, absgrad=buffer, implementation=implementation)
+    *gaussians, colors = inputs
+    picture = rasterize(Gaussians3D(*gaussians), colors, case.viewport, absgrad=buffer, implementation=implementation)
     cotangents = [place(tensor) for tensor in _cotangents(17, 18, torch.float32)]
     torch.autograd.backward([picture.rgb, picture.transmittance], cotangents)
 
@@ -526,10 +525,8 @@ def test_a_picture_can_be_drawn_without_gradients(implementation: str) -> None:
     case = _reduce_for_interpreter(Case(_gaussians(30)), implementation, few=4)
     inputs, _ = _inputs(case, implementation, torch.float32)
     with torch.no_grad():
-        picture = rasterize(
-            *(tensor.requires_grad_() for tensor in inputs), case.camera, case.intrinsics, 48, 40,
-            implementation=implementation,
-        )  # fmt: skip
+        *gaussians, colors = (tensor.requires_grad_() for tensor in inputs)
+        picture = rasterize(Gaussians3D(*gaussians), colors, case.viewport, implementation=implementation)
 
     assert picture.depth is None
     assert not picture.rgb.requires_grad
@@ -559,7 +556,7 @@ def test_the_gpu_frustum_is_the_picture_and_a_band_around_it(tolerance: float) -
     across, down = (30 * x / z + 20) / 24 - 1, (50 * y / z + 24) / 20 - 1  # -1 to 1 inside the picture
     expected = (z > 0.5) & (across.abs() < 1 + tolerance) & (down.abs() < 1 + tolerance)
 
-    numbers = pack_camera(camera, intrinsics, 48, 40, 0.5, torch.device(KERNEL_DEVICE), tolerance)
+    numbers = pack_camera(Viewport(camera, intrinsics, 48, 40), 0.5, torch.device(KERNEL_DEVICE), tolerance)
     inside = gpu(torch.zeros(512, dtype=torch.int32))
     _frustum_kernel[(4,)](gpu(positions), numbers, 400, inside, num_warps=4, enable_fp_fusion=True)
 
@@ -568,21 +565,25 @@ def test_the_gpu_frustum_is_the_picture_and_a_band_around_it(tolerance: float) -
 
 
 def test_unfit_arguments_are_rejected() -> None:
-    inputs = list(_gaussians(3).values())
-    camera, intrinsics = torch.eye(4), (10.0, 10.0, 5.0, 5.0)
+    *shapes, colors = _gaussians(3).values()
+    gaussians, camera, intrinsics = Gaussians3D(*shapes), torch.eye(4), (10.0, 10.0, 5.0, 5.0)
+    viewport = Viewport(camera, intrinsics, 10, 10)
     with pytest.raises(ValueError, match="quats is"):
-        rasterize(inputs[0], inputs[1][:, :3], *inputs[2:], camera, intrinsics, 10, 10)
-    with pytest.raises(ValueError, match="camera_from_world is"):
-        rasterize(*inputs, camera[:3], intrinsics, 10, 10)
+        rasterize(gaussians._replace(quats=gaussians.quats[:, :3]), colors, viewport)
+    with pytest.raises(ValueError, match="the pose is"):
+        Viewport(camera[:3], intrinsics, 10, 10)
     for transmittance_min in (-1e-3, 1.0, math.nan):
         with pytest.raises(ValueError, match="transmittance_min is"):
-            rasterize(*inputs, camera, intrinsics, 10, 10, transmittance_min=transmittance_min)
+            RasterSettings(transmittance_min=transmittance_min)
+    for near in (-1e-3, math.nan):
+        with pytest.raises(ValueError, match="near is"):
+            RasterSettings(near=near)
     with pytest.raises(ValueError, match="no pixels"):
-        rasterize(*inputs, camera, intrinsics, 0, 10)
+        Viewport(camera, intrinsics, 0, 10)
     with pytest.raises(ValueError, match="absgrad is"):
-        rasterize(*inputs, camera, intrinsics, 10, 10, absgrad=torch.zeros(3, 3))
+        rasterize(gaussians, colors, viewport, absgrad=torch.zeros(3, 3))
     with pytest.raises(ValueError, match="float32"):
-        rasterize(*(tensor.double() for tensor in inputs), camera, intrinsics, 10, 10, implementation="cpu")
+        rasterize(Gaussians3D(*(tensor.double() for tensor in shapes)), colors.double(), viewport, implementation="cpu")
 
 
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="reads x86 assembly")

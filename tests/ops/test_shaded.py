@@ -8,9 +8,10 @@ import pytest
 import torch
 from ops.device import gpu, needs_triton
 
-from hyrfpack.ops.rasterize import Rasterization
+from hyrfpack.ops.rasterize import Gaussians3D, Rasterization, RasterSettings
 from hyrfpack.ops.rasterize.shaded import rasterize_shaded
 from hyrfpack.ops.shade import DIRECTION_FEATURES, Shading
+from hyrfpack.ops.viewport import Viewport
 
 pytestmark = needs_triton
 CAMERA_INTRINSICS = (30.0, 32.0, 11.0, 9.5)
@@ -54,19 +55,22 @@ def camera(distance: float = 4.0) -> torch.Tensor:
     return pose
 
 
+def draw(
+    splats: list, colors: Shading, pose: torch.Tensor, implementation: str, cull_tolerance: float = 0.0, **options
+) -> Rasterization:
+    viewport, settings = Viewport(pose, CAMERA_INTRINSICS, 24, 20), RasterSettings(depth=True, **options)
+    how = {"cull_tolerance": cull_tolerance, "implementation": implementation}
+    return rasterize_shaded(Gaussians3D(*splats), colors, viewport, settings, **how)
+
+
 def draw_on_gpu(splats: list, colors: Shading, pose: torch.Tensor, **options) -> Rasterization:
-    options = {"depth": True, "cull_tolerance": 0.0, **options}
-    splats = [gpu(tensor) for tensor in splats]
-    return rasterize_shaded(
-        *splats, convert_tensors(colors, gpu), pose, CAMERA_INTRINSICS, 24, 20, implementation="gpu", **options
-    )
+    return draw([gpu(tensor) for tensor in splats], convert_tensors(colors, gpu), pose, "gpu", **options)
 
 
 def draw_reference(splats: list, colors: Shading, pose: torch.Tensor, **options) -> Rasterization:
-    options = {"depth": True, "cull_tolerance": 0.0, **options}
     splats = [tensor.double() for tensor in splats]
     colors = convert_tensors(colors, lambda tensor: tensor if tensor.dtype == torch.bfloat16 else tensor.double())
-    return rasterize_shaded(*splats, colors, pose, CAMERA_INTRINSICS, 24, 20, implementation="reference", **options)
+    return draw(splats, colors, pose, "reference", **options)
 
 
 # Name -> (number of Gaussians, distance of the camera, options of the shading, options).

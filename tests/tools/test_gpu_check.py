@@ -16,7 +16,7 @@ import torch
 from hyrfpack.bench.operation_calls import OperationCall
 from hyrfpack.errors import HyrfError, needs_package
 from hyrfpack.ops.dispatch import has_triton
-from hyrfpack.ops.rasterize import rasterize
+from hyrfpack.ops.rasterize import RasterSettings, rasterize
 from hyrfpack.ops.rasterize.reference import project
 from tools.gpu import check as gpu_check
 from tools.gpu import frames as gpu_frames
@@ -172,8 +172,7 @@ def test_the_count_of_blended_gaussians_matches_a_count_pixel_by_pixel() -> None
     whole = decode_splats(make_model(2000, torch.device("cpu")), make_cameras(4, 128, 128)[1])
     splats = gpu_kernels.crop_splats(whole, 16)
     splats.inputs["opacities"].fill_(0.97)  # so that all pixels are finished before the last Gaussian
-    values = [splats.inputs[name] for name in ("means", "quats", "scales", "opacities")]
-    seen = project(*values, *splats.view, 0.01, False)
+    seen = project(splats.gaussians, splats.viewport, RasterSettings())
     order = torch.argsort(seen.depths).tolist()
     pixels = torch.cartesian_prod(torch.arange(16), torch.arange(16)) + 0.5
     offsets = pixels[:, None] - seen.means2d
@@ -427,7 +426,7 @@ def test_a_model_like_a_trained_room_has_three_to_five_times_the_pairs() -> None
     @torch.no_grad()
     def pairs(look: Look) -> int:
         splats = decode_splats(make_model(60_000, torch.device("cpu"), look), make_cameras(4, 480, 270)[1])
-        return int(rasterize(*splats.inputs.values(), *splats.view).pairs)
+        return int(rasterize(splats.gaussians, splats.colors, splats.viewport).pairs)
 
     assert 3 <= pairs(TRAINED_LOOK) / pairs(TIDY_LOOK) <= 5
 

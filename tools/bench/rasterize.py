@@ -17,7 +17,8 @@ from torch import Tensor
 
 from hyrfpack.bench.operation_calls import random_cotangent, rasterize_call
 from hyrfpack.measure.error import largest_error, measure_error, measure_relative_error
-from hyrfpack.ops.rasterize import INPUT_SHAPES, rasterize
+from hyrfpack.ops.rasterize import INPUT_SHAPES, Gaussians3D, rasterize
+from hyrfpack.ops.viewport import Viewport
 from hyrfpack.parallel.pool import thread_count
 
 # Number of Gaussians, width and height in pixels, and standard deviation of a Gaussian in pixels.
@@ -27,8 +28,8 @@ REFERENCE_REPEATS = (1, 4)  # the reference runs in two of the repeats only, bec
 TIMED_STAGES = ("project", "sort", "bin", "blend", "forward", "backward")
 
 
-def make_workload(name: str) -> tuple[dict[str, Tensor], tuple]:
-    """Return the inputs of `rasterize`, spread over the picture at depths 2 to 8, and its camera arguments."""
+def make_workload(name: str) -> tuple[dict[str, Tensor], Viewport]:
+    """Return the tensors of `rasterize` by name, spread over the picture at depths 2 to 8, and the camera."""
     count, width, height, sigma = WORKLOAD_SIZES[name]
     generator = torch.Generator().manual_seed(0)
     focal = 1.2 * width
@@ -40,18 +41,17 @@ def make_workload(name: str) -> tuple[dict[str, Tensor], tuple]:
     scales = sigma * torch.exp(0.6 * torch.randn(count, 3, generator=generator)) * z / focal
     opacities = torch.sigmoid(1.5 * torch.randn(count, generator=generator) - 1)
     colors = torch.rand(count, 3, generator=generator)
-    camera = torch.eye(4, dtype=torch.float64), (focal, focal, width / 2, height / 2), width, height
-    return dict(zip(INPUT_SHAPES, (means, quats, scales, opacities, colors), strict=True)), camera
+    viewport = Viewport(torch.eye(4, dtype=torch.float64), (focal, focal, width / 2, height / 2), width, height)
+    return dict(zip(INPUT_SHAPES, (means, quats, scales, opacities, colors), strict=True)), viewport
 
 
-def time_stages(inputs: dict[str, Tensor], camera: tuple, implementation: str) -> dict[str, float]:
+def time_stages(inputs: dict[str, Tensor], viewport: Viewport, implementation: str) -> dict[str, float]:
     """Run one forward and one backward pass; return the pairs, and the ms of each stage and of CPU time ("_work")."""
-    leaves = [tensor.detach().clone().requires_grad_() for tensor in inputs.values()]
-    absgrad = torch.zeros(len(leaves[0]), 2)
-    width, height = camera[2:]
-    upstream = random_cotangent(torch.empty(height, width, 3)), random_cotangent(torch.empty(height, width))
+    *gaussians, colors = (tensor.detach().clone().requires_grad_() for tensor in inputs.values())
+    absgrad, size = torch.zeros(len(colors), 2), (viewport.height, viewport.width)
+    upstream = random_cotangent(torch.empty(*size, 3)), random_cotangent(torch.empty(size))
     started, work = perf_counter(), process_time()
-    picture = rasterize(*leaves, *camera, absgrad=absgrad, implementation=implementation)
+    picture = rasterize(Gaussians3D(*gaussians), colors, viewport, absgrad=absgrad, implementation=implementation)
     between, work_between = perf_counter(), process_time()
     torch.autograd.backward([picture.rgb, picture.transmittance], upstream)
     times = {**picture.seconds, "forward": between - started, "backward": perf_counter() - between}
@@ -94,14 +94,14 @@ def bench() -> list[dict]:
     return [rows[0] | measure_errors(*calls["A", "cpu"]), *rows[1:]]
 
 
-def measure_errors(inputs: dict[str, Tensor], camera: tuple) -> dict[str, float]:
+def measure_errors(inputs: dict[str, Tensor], viewport: Viewport) -> dict[str, float]:
     """Return the errors against the float64 reference.
 
     `value_error` is the largest error of picture and transmittance. `gradient_error` is the largest rms error of the
     five gradients, relative to each gradient's rms. Where alpha or T falls on the other side of its threshold, a few
     pixels differ by more than rounding; `share_beyond_1e-5` is the share of values that differ by more than 1e-5.
     """
-    call = rasterize_call(inputs, *camera)
+    call = rasterize_call(inputs, viewport)
     (values, gradients), (exact, slopes) = (
         call.forward_backward_task("cpu")(),
         call.forward_backward_task("reference", torch.float64)(),

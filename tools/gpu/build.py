@@ -25,11 +25,12 @@ import tempfile
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
+from typing import TYPE_CHECKING
 from unittest import mock
 
 os.environ.pop("TRITON_INTERPRET", None)  # Triton reads it when kernels are defined
@@ -41,6 +42,9 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from triton.backends.compiler import GPUTarget
 from triton.runtime.jit import JITFunction
+
+if TYPE_CHECKING:
+    from hyrfpack.ops.viewport import Viewport
 
 GPU_TARGETS = {
     "sm_90": GPUTarget("cuda", 90, 32),
@@ -81,6 +85,12 @@ class Build:
 # for size 1.
 
 
+def make_viewport(width: int, height: int) -> Viewport:
+    from hyrfpack.ops.viewport import Viewport
+
+    return Viewport(torch.eye(4), (50.0, 50.0, width / 2, height / 2), width, height)
+
+
 def ssim_runs(count: int, width: int, height: int) -> Iterator[Run]:
     from hyrfpack.ops.ssim import photometric_loss
 
@@ -117,21 +127,14 @@ def mlp_runs(count: int, width: int, height: int) -> Iterator[Run]:
 
 
 def rasterize_runs(count: int, width: int, height: int) -> Iterator[Run]:
-    from hyrfpack.ops.rasterize import rasterize
+    from hyrfpack.ops.rasterize import Gaussians3D, RasterSettings, rasterize
 
     def run(antialiased: bool, depth: bool, absgrad: bool) -> None:
         shapes = (count, 3), (count, 4), (count, 3), (count,), (count, 3)
         inputs = [torch.rand(shape, requires_grad=True) for shape in shapes]
-        drawn = rasterize(
-            *inputs,
-            torch.eye(4),
-            (50.0, 50.0, width / 2, height / 2),
-            width,
-            height,
-            antialiased=antialiased,
-            depth=depth,
-            absgrad=torch.zeros(count, 2) if absgrad else None,
-        )
+        settings = RasterSettings(antialiased=antialiased, depth=depth)
+        buffer = torch.zeros(count, 2) if absgrad else None
+        drawn = rasterize(Gaussians3D(*inputs[:4]), inputs[4], make_viewport(width, height), settings, absgrad=buffer)
         (drawn.rgb.sum() + drawn.transmittance.sum()).backward()
 
     for options in ((False, False, True), (False, True, False), (True, False, True), (True, True, False)):
@@ -150,6 +153,7 @@ def adam_runs(count: int, width: int, height: int) -> Iterator[Run]:
 
 
 def shade_runs(count: int, width: int, height: int) -> Iterator[Run]:
+    from hyrfpack.ops.rasterize import Gaussians3D, RasterSettings
     from hyrfpack.ops.rasterize.shaded import rasterize_shaded
     from hyrfpack.ops.shade import DIRECTION_FEATURES, Shading, shade
 
@@ -158,12 +162,10 @@ def shade_runs(count: int, width: int, height: int) -> Iterator[Run]:
         weights, biases = (torch.rand(64, 64), torch.rand(3, 64)), (torch.rand(64), torch.rand(3))
         directions = torch.rand(64, DIRECTION_FEATURES[encoding])
         shading = Shading(first, directions, weights, biases, torch.rand(count, 3), encoding, mixed)
-        means, quats, scales, opacities = (torch.rand(count, *shape) for shape in ((3,), (4,), (3,), ()))
-        shade(means, torch.zeros(3), shading)
-        lens = (50.0, 50.0, width / 2, height / 2)
-        rasterize_shaded(
-            means, quats, scales, opacities, shading, torch.eye(4), lens, width, height, antialiased=antialiased
-        )
+        gaussians = Gaussians3D(*(torch.rand(count, *shape) for shape in ((3,), (4,), (3,), ())))
+        shade(gaussians.means, torch.zeros(3), shading)
+        settings = RasterSettings(antialiased=antialiased)
+        rasterize_shaded(gaussians, shading, make_viewport(width, height), settings)
 
     for options in (("frequency", True, False), ("frequency", False, True), ("sh", True, True), ("sh", False, False)):
         yield partial(run, *options)
@@ -171,29 +173,27 @@ def shade_runs(count: int, width: int, height: int) -> Iterator[Run]:
 
 def background_runs(count: int, width: int, height: int) -> Iterator[Run]:
     from hyrfpack.model.hash_grid import HashGridConfig
-    from hyrfpack.ops.background import background_grid
+    from hyrfpack.ops.background import BackgroundField, background_grid
     from hyrfpack.ops.shade import DIRECTION_FEATURES
 
     grid = HashGridConfig(log2_table_size=10)
     for encoding, mixed in (("frequency", True), ("frequency", False), ("sh", True), ("sh", False)):
         widths = [2 * grid.levels + DIRECTION_FEATURES[encoding], 64, 64, 3]
-        settings = {
-            "threshold": 0.1,
-            "stride": 2 if mixed else 4,
-            "pose": torch.eye(4),
-            "intrinsics": (50.0, 50.0, width / 2, height / 2),
-            "half_extent": (1.0, 1.0, 1.0),
-            "table": torch.rand(grid.rows, 2),
-            "resolutions": grid.resolutions,
-            "log2_table_size": grid.log2_table_size,
-            "weights": [torch.rand(shape) for shape in zip(widths[1:], widths, strict=False)],
-            "biases": [torch.rand(size) for size in widths[1:]],
-            "encoding": encoding,
-            "mixed": mixed,
-        }
-        yield partial(background_grid, torch.rand(height, width), **settings)
-        learnt = settings | {"table": torch.rand(grid.rows, 2, requires_grad=True)}
-        yield lambda settings=learnt: background_grid(torch.rand(height, width), **settings).sum().backward()
+        field = BackgroundField(
+            half_extent=(1.0, 1.0, 1.0),
+            table=torch.rand(grid.rows, 2),
+            resolutions=grid.resolutions,
+            log2_table_size=grid.log2_table_size,
+            weights=[torch.rand(shape) for shape in zip(widths[1:], widths, strict=False)],
+            biases=[torch.rand(size) for size in widths[1:]],
+            encoding=encoding,
+            mixed=mixed,
+        )
+        draw = partial(background_grid, torch.rand(height, width), make_viewport(width, height))
+        draw = partial(draw, threshold=0.1, stride=2 if mixed else 4)
+        yield partial(draw, field)
+        learnt = replace(field, table=torch.rand(grid.rows, 2, requires_grad=True))
+        yield lambda draw=draw, field=learnt: draw(field).sum().backward()
 
 
 def contraction_runs(count: int, width: int, height: int) -> Iterator[Run]:
@@ -224,8 +224,7 @@ def activate_runs(count: int, width: int, height: int) -> Iterator[Run]:
 def cull_runs(count: int, width: int, height: int) -> Iterator[Run]:
     from hyrfpack.ops.rasterize.cull import frustum_cull
 
-    lens = (50.0, 50.0, width / 2, height / 2)
-    yield partial(frustum_cull, torch.rand(count, 3), torch.eye(4), lens, width, height, 0.01, 0.3)
+    yield partial(frustum_cull, torch.rand(count, 3), make_viewport(width, height), 0.01, 0.3)
 
 
 def composite_runs(count: int, width: int, height: int) -> Iterator[Run]:

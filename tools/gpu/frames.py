@@ -11,7 +11,7 @@ from torch import Tensor
 
 from hyrfpack.bench.operation_calls import OperationCall
 from hyrfpack.model import HybridModel
-from hyrfpack.ops.rasterize import rasterize
+from hyrfpack.ops.rasterize import Gaussians3D, RasterSettings, rasterize
 from hyrfpack.render import render_view
 from hyrfpack.scene import Camera
 from tools.gpu.rows import Row, goal_row, kernel_rows
@@ -72,7 +72,7 @@ def run(item: str, setup: Setup) -> Iterator[Row]:
 
 def _statistics_row(room: str, splats: Splats, model: HybridModel) -> Row:
     with torch.no_grad():
-        drawn = rasterize(*splats.inputs.values(), *splats.view)
+        drawn = rasterize(splats.gaussians, splats.colors, splats.viewport)
     pixels = drawn.transmittance.numel()
     blended, reached = count_blended(splats)
     return {
@@ -159,18 +159,19 @@ def _rasterizer_rows(room: str, splats: Splats, setup: Setup) -> Iterator[Row]:
 
 
 def _draw_with_hyrfpack(splats: Splats, implementation: str, **inputs: Tensor) -> Tensor:
-    how = {"transmittance_min": GSPLAT_TRANSMITTANCE_MIN, "implementation": implementation}
-    return rasterize(*inputs.values(), *splats.view, **how).rgb
+    *gaussians, colors = inputs.values()
+    settings = RasterSettings(transmittance_min=GSPLAT_TRANSMITTANCE_MIN)
+    return rasterize(Gaussians3D(*gaussians), colors, splats.viewport, settings, implementation=implementation).rgb
 
 
 def _make_gsplat_draw(splats: Splats) -> Callable[..., Tensor]:
     """Return gsplat's rasteriser as a draw function, with settings as close to ours as it allows."""
     from gsplat import rasterization
 
-    fx, fy, cx, cy = splats.camera.intrinsics
-    view = splats.pose.to(splats.inputs["means"])[None]
+    fx, fy, cx, cy = splats.viewport.intrinsics
+    view = splats.viewport.pose.to(splats.inputs["means"])[None]
     intrinsics = view.new_tensor([[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]])
-    size = splats.camera.width, splats.camera.height
+    size = splats.viewport.width, splats.viewport.height
 
     def draw(implementation: str, **inputs: Tensor) -> Tensor:
         return rasterization(*inputs.values(), view, intrinsics, *size, near_plane=0.01, packed=False)[0]

@@ -22,9 +22,10 @@ from hyrfpack.bench.operation_calls import (
 )
 from hyrfpack.model import HybridModel
 from hyrfpack.ops.adam import adam_step
-from hyrfpack.ops.rasterize import Rasterization, rasterize
+from hyrfpack.ops.rasterize import Gaussians3D, Rasterization, rasterize
 from hyrfpack.ops.rasterize.shaded import rasterize_shaded
 from hyrfpack.ops.shade import Shading, shade
+from hyrfpack.ops.viewport import Viewport
 from hyrfpack.render import RenderSettings
 from tools.gpu import roofline
 from tools.gpu.compare import check_call, relative_error, status_beyond
@@ -72,10 +73,10 @@ def rasterize_rows(name: str, look: Look, setup: Setup) -> Iterator[Row]:
     """Measure the whole rasteriser and its stages, forward and backward; the error is that of a crop of the picture."""
     splats = _splats(setup, look)
     call, crop = (
-        rasterize_call(view_splats.inputs, *view_splats.view)
+        rasterize_call(view_splats.inputs, view_splats.viewport)
         for view_splats in (splats, crop_splats(splats, setup.crop))
     )
-    raster = rasterize(*splats.inputs.values(), *splats.view, implementation=setup.implementation)
+    raster = rasterize(splats.gaussians, splats.colors, splats.viewport, implementation=setup.implementation)
     pairs, pixels, count = int(raster.pairs), setup.width * setup.height, len(splats.inputs["means"])
     blended, reached = count_blended(splats)
     tiles = -(-setup.width // 16) * -(-setup.height // 16)
@@ -231,15 +232,14 @@ def rasterize_shaded_rows(setup: Setup) -> Iterator[Row]:
     The error is that of a crop of the picture.
     """
     model, splats = _model(setup), _splats(setup)
-    explicit = [splats.inputs[name] for name in ("means", "quats", "scales", "opacities")]
-    exact = [tensor.double() for tensor in explicit]
+    exact = Gaussians3D(*(tensor.double() for tensor in splats.gaussians))
     blended, reached = count_blended(splats)
     tiles = -(-setup.width // 16) * -(-setup.height // 16)
     pixels = setup.width * setup.height
     for precision, shading in _shadings(model).items():
 
-        def draw(view: tuple = splats.view, shading: Shading = shading) -> Rasterization:
-            return rasterize_shaded(*explicit, shading, *view, implementation=setup.implementation)
+        def draw(viewport: Viewport = splats.viewport, shading: Shading = shading) -> Rasterization:
+            return rasterize_shaded(splats.gaussians, shading, viewport, implementation=setup.implementation)
 
         raster = draw()
         pairs, seen = int(raster.pairs), int(raster.visible.sum())
@@ -248,9 +248,9 @@ def rasterize_shaded_rows(setup: Setup) -> Iterator[Row]:
         # The decoder's arithmetic and the blending's run on different units, so only the decoder's own row counts it.
         total_work = Work(project.bytes, 0) + roofline.count_bin_pairs(seen, pairs, tiles)
         total_work += roofline.count_blend(pairs, pixels, reached, blended)
-        view = crop_splats(splats, setup.crop).view
-        expected = rasterize_shaded(*exact, _cast(shading, torch.float64), *view, implementation="reference")
-        error = relative_error(join_color_and_transmittance(draw(view)), join_color_and_transmittance(expected))
+        viewport = crop_splats(splats, setup.crop).viewport
+        expected = rasterize_shaded(exact, _cast(shading, torch.float64), viewport, implementation="reference")
+        error = relative_error(join_color_and_transmittance(draw(viewport)), join_color_and_transmittance(expected))
         size = f"{len(model):,} Gaussians, {seen:,} visible, {pairs:,} pairs, {setup.width} x {setup.height}"
         row = _row(f"rasterize shaded, {precision}", "forward", size, ms, total_work, setup)
         yield row | {"value error": error} | status_beyond(error, 3e-3 if shading.mixed else 1e-3)
@@ -264,12 +264,11 @@ def background_rows(setup: Setup) -> Iterator[Row]:
     """Measure the background's grid at the window for a frame; the error includes all rounding."""
     model, camera = _model(setup), make_cameras(setup.views, setup.width, setup.height)[0]
     splats, defaults = decode_splats(model, camera), RenderSettings()
-    light = rasterize(*splats.inputs.values(), *splats.view).transmittance
+    light = rasterize(splats.gaussians, splats.colors, splats.viewport).transmittance
     options = {"threshold": defaults.background_threshold, "stride": defaults.background_stride}
-    view = camera.intrinsics, splats.pose
     exact = copy.deepcopy(model).double()
     exact.precision = "float32"  # no factor of the reference's products is rounded to bfloat16
-    expected = exact.background_grid(light.double(), *view, **options)
+    expected = exact.background_grid(light.double(), splats.viewport, **options)
     on_gpu = setup.torch_device.type == "cuda"
     field, grid = model.radiance, model.radiance.grid.config
     widths = [field.weights[0].shape[1], *(weight.shape[0] for weight in field.weights)]
@@ -278,8 +277,8 @@ def background_rows(setup: Setup) -> Iterator[Row]:
     for precision in ("float32", "mixed") if on_gpu else ("mixed",):  # on a CPU both precisions are the same
         model.precision = precision  # "mixed" is the default, so the model ends in its initial precision
         mixed = on_gpu and precision == "mixed"
-        actual = model.background_grid(light, *view, **options)
-        task = {"grid": lambda: model.background_grid(light, *view, **options)}
+        actual = model.background_grid(light, splats.viewport, **options)
+        task = {"grid": lambda: model.background_grid(light, splats.viewport, **options)}
         ms = median_ms(task, setup.repeats, setup.torch_device)["grid"]
         work = roofline.count_background(light.numel(), nodes, needed, widths, grid.levels, grid.rows, mixed)
         error = relative_error(actual, expected)
@@ -358,13 +357,11 @@ def _row(name: str, pass_name: str, size: str, ms: float, work: Work, setup: Set
 
 def crop_splats(splats: Splats, side: int) -> Splats:
     """Return the same Gaussians with a camera for the middle of the picture, at most side x side pixels."""
-    camera = splats.camera
-    width, height = min(side, camera.width), min(side, camera.height)
-    middle = (camera.width - width) / 2, (camera.height - height) / 2
-    part = type(camera)(
-        width, height, camera.fx, camera.fy, camera.cx - middle[0], camera.cy - middle[1], camera.camera_from_world
-    )
-    return Splats(splats.inputs, splats.pose, part)
+    viewport = splats.viewport
+    width, height = min(side, viewport.width), min(side, viewport.height)
+    fx, fy, cx, cy = viewport.intrinsics
+    intrinsics = fx, fy, cx - (viewport.width - width) / 2, cy - (viewport.height - height) / 2
+    return Splats(splats.inputs, Viewport(viewport.pose, intrinsics, width, height))
 
 
 @cache

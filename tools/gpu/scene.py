@@ -20,7 +20,10 @@ from hyrfpack.cameras.paths import look_at
 from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians, logit
 from hyrfpack.ops.poses import camera_center
-from hyrfpack.ops.rasterize.reference import ALPHA_MAX, ALPHA_MIN, TILE_SIZE, TRANSMITTANCE_MIN, project
+from hyrfpack.ops.rasterize import Gaussians3D, RasterSettings
+from hyrfpack.ops.rasterize.inputs import TRANSMITTANCE_MIN
+from hyrfpack.ops.rasterize.reference import ALPHA_MAX, ALPHA_MIN, TILE_SIZE, project
+from hyrfpack.ops.viewport import Viewport
 from hyrfpack.render import render_view
 from hyrfpack.scene import Camera, Picture, Scene, View
 
@@ -38,7 +41,6 @@ PLANT_GAUSSIAN_RATIO = 0.2
 GAUSSIANS_PER_ROW = 20  # training sizes its hash tables by the same ratio
 FOCAL_LENGTH_TO_WIDTH_RATIO = 0.75
 MAX_SAMPLED_TILES = 48
-NEAR_PLANE = 0.01  # the default of the rasteriser
 
 
 @dataclass(frozen=True)
@@ -116,26 +118,29 @@ class Splats:
     """Arguments of the rasteriser for one view of a model.
 
     Attributes:
-        inputs: means, quaternions, scales, opacities and colours, in the order of the rasteriser's arguments.
-        pose: camera_from_world on the CPU, where the rasteriser expects it.
-        camera: the camera.
+        inputs: the tensors of `Gaussians3D` and the colours, by name and in this order.
+        viewport: the camera, with its pose on the CPU, where the rasteriser expects it.
     """
 
     inputs: dict[str, Tensor]
-    pose: Tensor
-    camera: Camera
+    viewport: Viewport
 
     @property
-    def view(self) -> tuple[Tensor, tuple[float, float, float, float], int, int]:
-        """The arguments of the rasteriser that follow the inputs."""
-        return self.pose, self.camera.intrinsics, self.camera.width, self.camera.height
+    def gaussians(self) -> Gaussians3D:
+        """The Gaussians without colours."""
+        return Gaussians3D(*(self.inputs[name] for name in Gaussians3D._fields))
+
+    @property
+    def colors(self) -> Tensor:
+        """The colours, (N, 3)."""
+        return self.inputs["colors"]
 
 
 def decode_splats(model: HybridModel, camera: Camera) -> Splats:
     """Decode all Gaussians of the model for one view."""
-    pose = torch.as_tensor(model.config.frame.local_pose(camera))
-    inputs = splat_inputs(model, camera_center(pose))
-    return Splats({name: tensor.contiguous() for name, tensor in inputs.items()}, pose, camera)
+    viewport = model.config.frame.local_viewport(camera, torch.float64)
+    inputs = splat_inputs(model, camera_center(viewport.pose))
+    return Splats({name: tensor.contiguous() for name, tensor in inputs.items()}, viewport)
 
 
 @torch.no_grad()
@@ -146,13 +151,12 @@ def count_blended(splats: Splats) -> tuple[float, float]:
         The mean number of Gaussians that contribute to a pixel, and the mean share of a tile's Gaussians that are
         processed before all its pixels are finished.
     """
-    camera = splats.camera
-    values = [splats.inputs[name] for name in ("means", "quats", "scales", "opacities")]
-    seen = project(*values, *splats.view, NEAR_PLANE, False)
+    viewport = splats.viewport
+    seen = project(splats.gaussians, viewport, RasterSettings())
     seen = seen.select(torch.argsort(seen.depths))
     reach = (2 * torch.log(255 * seen.opacities).clamp_min(0))[:, None] * seen.covs2d[:, [0, 2]]
     lower, upper = seen.means2d - reach.sqrt(), seen.means2d + reach.sqrt()
-    columns, rows = -(-camera.width // TILE_SIZE), -(-camera.height // TILE_SIZE)
+    columns, rows = -(-viewport.width // TILE_SIZE), -(-viewport.height // TILE_SIZE)
     tiles = torch.linspace(0, columns * rows - 1, min(MAX_SAMPLED_TILES, columns * rows)).long().tolist()
     corners = torch.stack(torch.meshgrid(torch.arange(TILE_SIZE), torch.arange(TILE_SIZE), indexing="xy"), -1).view(
         -1, 2

@@ -9,6 +9,8 @@ from torch import Tensor
 
 from hyrfpack.bench.operation_calls import OperationCall, hash_encode_call, loss_call, mlp_call, rasterize_call
 from hyrfpack.ops.hash_encode import level_offsets, level_resolutions
+from hyrfpack.ops.rasterize import RasterSettings
+from hyrfpack.ops.viewport import Viewport
 from tools.gpu.compare import check_call
 from tools.gpu.rows import Row
 from tools.gpu.setup import Setup
@@ -40,7 +42,7 @@ def _random_normal(seed: int, *shape: int) -> Tensor:
 
 
 def _rasterize(
-    count: int, width: int, height: int, size: float, **options: object
+    count: int, width: int, height: int, size: float, antialiased: bool = False
 ) -> Callable[[torch.device], OperationCall]:
     def make(device: torch.device) -> OperationCall:
         inputs = {
@@ -50,8 +52,10 @@ def _rasterize(
             "opacities": torch.sigmoid(1.5 * _random_normal(3, count)),
             "colors": torch.sigmoid(_random_normal(4, count, 3)),
         }
-        view = (torch.eye(4, dtype=torch.float64), (width, width, width / 2, height / 2), width, height)
-        return rasterize_call({name: tensor.to(device) for name, tensor in inputs.items()}, *view, **options)
+        pose = torch.eye(4, dtype=torch.float64)
+        viewport = Viewport(pose, (width, width, width / 2, height / 2), width, height)
+        placed = {name: tensor.to(device) for name, tensor in inputs.items()}
+        return rasterize_call(placed, viewport, RasterSettings(antialiased=antialiased))
 
     return make
 

@@ -13,8 +13,8 @@ from __future__ import annotations
 import json
 import sys
 from collections import defaultdict
-from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -29,6 +29,7 @@ from hyrfpack.errors import HyrfTrainingError
 from hyrfpack.format import encode_model, load_model, save_model
 from hyrfpack.measure.timing import time_alternately
 from hyrfpack.model import HybridModel
+from hyrfpack.ops.rasterize import shaded
 from hyrfpack.render import renderer
 from hyrfpack.scene import Scene, View, evenly_spaced
 from hyrfpack.train import TrainConfig
@@ -124,11 +125,13 @@ def time_frames(
     return 1000 / median(t["this"].ms for t in times), median(t["full"].ms / t["this"].ms for t in times)
 
 
-def patch_culling(variant: Variant) -> AbstractContextManager:
-    """Return the context in which a variant renders; without pre-culling, every Gaussian is decoded and projected."""
-    if variant.has_culling:
-        return nullcontext()
-    return patch.object(renderer, "frustum_cull", lambda positions, *_: torch.arange(len(positions)))
+@contextmanager
+def patch_culling(variant: Variant) -> Iterator[None]:
+    """Enter the context in which a variant renders; without pre-culling, every Gaussian is decoded and projected."""
+    with ExitStack() as stack:
+        for module in () if variant.has_culling else (renderer, shaded):
+            stack.enter_context(patch.object(module, "frustum_cull", lambda points, *_: torch.arange(len(points))))
+        yield
 
 
 # -- tables --------------------------------------------------------------------------------------------------------

@@ -136,10 +136,10 @@ def _background(model: HybridModel, camera: Camera) -> Tensor:
     """Return (H, W, 3), the background behind the Gaussians at every pixel."""
     if not model.config.background:
         return torch.tensor(model.config.solid).expand(camera.height, camera.width, 3)
-    pose = torch.as_tensor(model.config.frame.local_pose(camera), dtype=torch.float32)
     rows, columns = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
     points = torch.stack((columns, rows), -1).reshape(-1, 2) + 0.5
-    return model.decode_background(points, camera.intrinsics, pose).reshape(camera.height, camera.width, 3)
+    colors = model.decode_background(points, model.config.frame.local_viewport(camera))
+    return colors.reshape(camera.height, camera.width, 3)
 
 
 def draw_over_background(splats: Drawable, view: HeldOutView) -> Tensor:

@@ -34,7 +34,7 @@ from hyrfpack.evaluate import evaluate_model
 from hyrfpack.model import HybridModel
 from hyrfpack.ops.hash_encode import hash_encode
 from hyrfpack.ops.mlp import mlp
-from hyrfpack.ops.rasterize import Rasterization, rasterize
+from hyrfpack.ops.rasterize import Gaussians3D, Rasterization, rasterize
 from hyrfpack.ops.ssim import photometric_loss
 from hyrfpack.scene import Scene
 from hyrfpack.train import TrainConfig
@@ -61,12 +61,14 @@ def run_in_dtype(dtype: torch.dtype, operation: Callable) -> Callable:
     """Return the operation with inputs cast to `dtype` and results cast back to the inputs' dtype."""
 
     def cast(value: object, to: torch.dtype) -> object:
+        if isinstance(value, Gaussians3D):
+            return Gaussians3D(*(cast(tensor, to) for tensor in value))
         if isinstance(value, list):
             return [cast(item, to) for item in value]
         return value.to(to) if isinstance(value, Tensor) and value.is_floating_point() else value
 
     def run(*args: object, absgrad: Tensor | None = None, **options: object) -> object:
-        input_dtype = (args[0][0] if isinstance(args[0], list) else args[0]).dtype
+        input_dtype = (args[0] if isinstance(args[0], Tensor) else args[0][0]).dtype
         args = [cast(value, dtype) for value in args]
         if absgrad is not None:  # the backward pass fills it before the gradient of the means is ready
             buffer = torch.zeros_like(absgrad, dtype=dtype)
@@ -74,7 +76,7 @@ def run_in_dtype(dtype: torch.dtype, operation: Callable) -> Callable:
             def fill(_: Tensor) -> None:
                 absgrad.copy_(buffer)
 
-            args[0].register_hook(fill)
+            args[0].means.register_hook(fill)
             options["absgrad"] = buffer
         result = operation(*args, **options)
         if isinstance(result, Rasterization):

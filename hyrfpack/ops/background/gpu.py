@@ -12,14 +12,12 @@ each of a level's two features, and one for the encoded direction.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 import triton
 import triton.language as tl
 from torch import Tensor
 
-from hyrfpack.ops.background.reference import BACKGROUND_RADIUS, field_colors, grid_size
+from hyrfpack.ops.background.reference import BACKGROUND_RADIUS, BackgroundField, field_colors, grid_size
 from hyrfpack.ops.contraction.gpu import contract_block
 from hyrfpack.ops.gpu_pairs import unpack_pair
 from hyrfpack.ops.hash_encode.gpu import axis_vertices, level_parameters, rows_as_words, vertex_row
@@ -27,6 +25,7 @@ from hyrfpack.ops.mlp.tiles import multiply_add, product_precision, round_factor
 from hyrfpack.ops.poses import camera_center
 from hyrfpack.ops.shade.directions import DIRECTION_FEATURES
 from hyrfpack.ops.shade.gpu_directions import encode_block
+from hyrfpack.ops.viewport import Viewport
 
 _NODE_ROWS_PER_BLOCK = tl.constexpr(8)
 _NODES_PER_PROGRAM = 256  # This holds for `find_nodes_kernel` and `encode_nodes_kernel`, with one node per thread.
@@ -189,29 +188,20 @@ def background_kernel(
 
 
 def background_grid(
-    transmittance: Tensor,
-    threshold: float,
-    stride: int,
-    pose: Tensor,
-    intrinsics: tuple[float, float, float, float],
-    half_extent: tuple[float, float, float],
-    table: Tensor,
-    resolutions: tuple[int, ...],
-    log2_table_size: int,
-    weights: Sequence[Tensor],
-    biases: Sequence[Tensor],
-    encoding: str,
-    mixed: bool,
+    transmittance: Tensor, viewport: Viewport, field: BackgroundField, *, threshold: float, stride: int
 ) -> Tensor:
     """Compute `hyrfpack.ops.background.background_grid` without gradients, for a field that "gpu" supports."""
     height, width = transmittance.shape
     rows, columns = grid_size(height, width, stride)
-    weights, biases = (tuple(tensor.detach().contiguous() for tensor in layers) for layers in (weights, biases))
-    levels, encoding_width = len(resolutions), weights[0].shape[1] - 2 * len(resolutions)
+    weights, biases = (
+        tuple(tensor.detach().contiguous() for tensor in layers) for layers in (field.weights, field.biases)
+    )
+    levels = len(field.resolutions)
+    encoding_width = weights[0].shape[1] - 2 * levels
     hidden = [len(bias) for bias in biases[:2]]
     widths = [_padded_width(width) for width in hidden]
-    block_columns, warps, part = _launch_shape(mixed, max(widths))
-    colors = table.new_empty((3, rows, columns))
+    block_columns, warps, part = _launch_shape(field.mixed, max(widths))
+    colors = field.table.new_empty((3, rows, columns))
     background_kernel[(triton.cdiv(rows, _NODE_ROWS_PER_BLOCK.value) * triton.cdiv(columns, block_columns),)](
         transmittance.detach().contiguous(),
         height,
@@ -220,10 +210,10 @@ def background_grid(
         stride,
         rows,
         columns,
-        _camera_rays(pose, intrinsics, stride),
-        tuple(half_extent),
-        rows_as_words(table),
-        level_parameters(resolutions, log2_table_size, table.device),
+        _camera_rays(viewport, stride),
+        tuple(field.half_extent),
+        rows_as_words(field.table),
+        level_parameters(field.resolutions, field.log2_table_size, field.table.device),
         weights,
         biases,
         colors,
@@ -238,8 +228,8 @@ def background_grid(
         H2_P=widths[1],
         H2_SLICE=min(widths[1], part),
         BLOCK_COLUMNS=block_columns,
-        FREQUENCY=encoding == "frequency",
-        PRECISION=product_precision(mixed),
+        FREQUENCY=field.encoding == "frequency",
+        PRECISION=product_precision(field.mixed),
         num_warps=warps,
         enable_fp_fusion=True,
     )
@@ -280,19 +270,11 @@ def encode_nodes_kernel(
 
 
 def differentiable_grid(
-    transmittance: Tensor,
-    threshold: float,
-    stride: int,
-    pose: Tensor,
-    intrinsics: tuple[float, float, float, float],
-    half_extent: tuple[float, float, float],
-    encoding: str,
-    **field,
+    transmittance: Tensor, viewport: Viewport, field: BackgroundField, *, threshold: float, stride: int
 ) -> Tensor:
     """Compute `hyrfpack.ops.background.background_grid`, differentiable in the field's parameters.
 
-    `field` holds the arguments of `field_colors`. Synchronises with the device once, to read the number of needed
-    nodes.
+    Synchronises with the device once, to read the number of needed nodes.
     """
     height, width = transmittance.shape
     rows, columns = grid_size(height, width, stride)
@@ -304,22 +286,20 @@ def differentiable_grid(
     nodes = torch.nonzero(needed).squeeze(-1)
     colors = transmittance.new_zeros(3, rows * columns)
     if total := len(nodes):
-        coords, encoded = colors.new_empty(3, total), colors.new_empty(DIRECTION_FEATURES[encoding], total)
+        coords, encoded = colors.new_empty(3, total), colors.new_empty(DIRECTION_FEATURES[field.encoding], total)
         encode_nodes_kernel[(triton.cdiv(total, _NODES_PER_PROGRAM),)](
-            nodes, columns, total, _camera_rays(pose, intrinsics, stride), tuple(half_extent), coords, encoded,
-            ENCODING_WIDTH=len(encoded), FREQUENCY=encoding == "frequency", BLOCK=_NODES_PER_PROGRAM,
+            nodes, columns, total, _camera_rays(viewport, stride), tuple(field.half_extent), coords, encoded,
+            ENCODING_WIDTH=len(encoded), FREQUENCY=field.encoding == "frequency", BLOCK=_NODES_PER_PROGRAM,
             num_warps=4, enable_fp_fusion=True,
         )  # fmt: skip
-        colors.index_copy_(1, nodes, field_colors(coords.T, encoded.T, **field).T)
+        colors.index_copy_(1, nodes, field_colors(coords.T, encoded.T, field).T)
     return colors.view(3, rows, columns).permute(1, 2, 0)
 
 
-def _camera_rays(
-    pose: Tensor, intrinsics: tuple[float, float, float, float], stride: int
-) -> tuple[tuple[float, ...], ...]:
+def _camera_rays(viewport: Viewport, stride: int) -> tuple[tuple[float, ...], ...]:
     """Return the first node's ray, its increments per column and per row, and the origin, as tuples of 3 numbers."""
-    fx, fy, cx, cy = intrinsics
-    pose = pose.detach().cpu().double()
+    fx, fy, cx, cy = viewport.intrinsics
+    pose = viewport.pose.detach().cpu().double()
     seen = [[(0.5 - cx) / fx, (0.5 - cy) / fy, 1], [stride / fx, 0, 0], [0, stride / fy, 0]]
     rays = torch.tensor(seen, dtype=torch.float64) @ pose[:3, :3]
     return tuple(map(tuple, (*rays.tolist(), camera_center(pose).tolist())))

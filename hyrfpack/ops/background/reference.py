@@ -6,6 +6,7 @@ This reference defines the correct result.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -15,9 +16,32 @@ from hyrfpack.ops.hash_encode import hash_encode
 from hyrfpack.ops.mlp import mlp
 from hyrfpack.ops.poses import camera_center
 from hyrfpack.ops.shade.directions import encode_directions
+from hyrfpack.ops.viewport import Viewport
 
 # Radius of the background sphere around the frame's centre, in local units.
 BACKGROUND_RADIUS = 100.0
+
+
+@dataclass(frozen=True)
+class BackgroundField:
+    """The radiance field that colours the background sphere.
+
+    Attributes:
+        half_extent: half-axes of the box that the contraction maps linearly, local units.
+        table, resolutions, log2_table_size: the hash grid, as in `hash_encode`.
+        weights, biases: the decoder, as in `mlp`; three outputs.
+        encoding: the encoding of directions, "frequency" or "sh", see `encode_directions`.
+        mixed: as in `mlp`.
+    """
+
+    half_extent: tuple[float, float, float]
+    table: Tensor
+    resolutions: tuple[int, ...]
+    log2_table_size: int
+    weights: Sequence[Tensor]
+    biases: Sequence[Tensor]
+    encoding: str
+    mixed: bool = False
 
 
 def sphere_points(origin: Tensor, directions: Tensor) -> Tensor:
@@ -41,65 +65,41 @@ def sphere_points(origin: Tensor, directions: Tensor) -> Tensor:
     return nearest + inside.sqrt()[:, None] * directions
 
 
-def pixel_directions(points: Tensor, intrinsics: tuple[float, float, float, float], pose: Tensor) -> Tensor:
+def pixel_directions(points: Tensor, viewport: Viewport) -> Tensor:
     """Compute unit viewing directions through points of the image.
 
     Args:
         points: (N, 2) x and y in pixels; the first pixel's centre is (0.5, 0.5).
-        intrinsics: (fx, fy, cx, cy) in pixels.
-        pose: (4, 4) camera_from_local.
+        viewport: the camera, with its pose in the dtype and on the device of the points.
 
     Returns:
-        (N, 3) unit vectors in local axes.
+        (N, 3) unit vectors in world axes.
     """
-    fx, fy, cx, cy = intrinsics
+    fx, fy, cx, cy = viewport.intrinsics
     x, y = (points[:, 0] - cx) / fx, (points[:, 1] - cy) / fy
-    directions = torch.stack((x, y, torch.ones_like(x)), dim=-1) @ pose[:3, :3]
+    directions = torch.stack((x, y, torch.ones_like(x)), dim=-1) @ viewport.pose[:3, :3]
     return directions / torch.linalg.vector_norm(directions, dim=-1, keepdim=True)
 
 
-def background_colors(
-    points: Tensor,
-    *,
-    pose: Tensor,
-    intrinsics: tuple[float, float, float, float],
-    half_extent: tuple[float, float, float],
-    table: Tensor,
-    resolutions: tuple[int, ...],
-    log2_table_size: int,
-    weights: Sequence[Tensor],
-    biases: Sequence[Tensor],
-    encoding: str,
-    mixed: bool,
-) -> Tensor:
+def background_colors(points: Tensor, viewport: Viewport, field: BackgroundField) -> Tensor:
     """Compute the colours (N, 3) of the sphere at points (N, 2) of the image, in pixels.
 
         color = sigmoid(mlp([hash_encode(contract(p / half_extent)), e(d)]))
 
-    The ray of a point leaves the sphere at p along d. The other arguments are those of `background_grid`.
+    The ray of a point leaves the sphere at p along d.
     """
-    pose = pose.to(table, non_blocking=table.is_cuda)
-    directions = pixel_directions(points, intrinsics, pose)
-    coords = contract(sphere_points(camera_center(pose), directions), half_extent)
-    encoded = encode_directions(directions, encoding)
-    return field_colors(coords, encoded, table, resolutions, log2_table_size, weights, biases, mixed)
+    pose = viewport.pose.to(field.table, non_blocking=field.table.is_cuda)
+    directions = pixel_directions(points, replace(viewport, pose=pose))
+    coords = contract(sphere_points(camera_center(pose), directions), field.half_extent)
+    return field_colors(coords, encode_directions(directions, field.encoding), field)
 
 
-def field_colors(
-    coords: Tensor,
-    encoded: Tensor,
-    table: Tensor,
-    resolutions: tuple[int, ...],
-    log2_table_size: int,
-    weights: Sequence[Tensor],
-    biases: Sequence[Tensor],
-    mixed: bool,
-) -> Tensor:
+def field_colors(coords: Tensor, encoded: Tensor, field: BackgroundField) -> Tensor:
     """Compute the field's colours (N, 3) at coords (N, 3) of the cube for encoded directions (N, E)."""
-    features = hash_encode(coords, table, resolutions, log2_table_size)
+    features = hash_encode(coords, field.table, field.resolutions, field.log2_table_size)
     # Hash features are stored planar, so concatenating along the first axis is a plain copy.
     inputs = torch.cat((features.T, encoded.T)).T
-    return torch.sigmoid(mlp(inputs, weights, biases, mixed=mixed))
+    return torch.sigmoid(mlp(inputs, field.weights, field.biases, mixed=field.mixed))
 
 
 def grid_size(height: int, width: int, stride: int) -> tuple[int, int]:
@@ -107,8 +107,10 @@ def grid_size(height: int, width: int, stride: int) -> tuple[int, int]:
     return -(-(height - 1) // stride) + 1, -(-(width - 1) // stride) + 1
 
 
-def background_grid(transmittance: Tensor, *, threshold: float, stride: int, **sphere) -> Tensor:
-    """Compute `hyrfpack.ops.background.background_grid`; `sphere` holds the arguments of `background_colors`."""
+def background_grid(
+    transmittance: Tensor, viewport: Viewport, field: BackgroundField, *, threshold: float, stride: int
+) -> Tensor:
+    """Compute `hyrfpack.ops.background.background_grid`."""
     height, width = transmittance.shape
     rows, columns = grid_size(height, width, stride)
     # A node is needed if light passes at any pixel that is nearer to it than its neighbouring nodes are.
@@ -122,5 +124,5 @@ def background_grid(transmittance: Tensor, *, threshold: float, stride: int, **s
     if len(nodes):
         places = torch.stack((nodes % columns, torch.div(nodes, columns, rounding_mode="floor")), dim=-1)
         points = places.to(transmittance.dtype) * stride + 0.5
-        colors = colors.index_put((nodes,), background_colors(points, **sphere))
+        colors = colors.index_put((nodes,), background_colors(points, viewport, field))
     return colors.T.reshape(3, rows, columns).permute(1, 2, 0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -10,12 +10,10 @@ from torch import Tensor
 from hyrfpack.ops.dispatch import choose_implementation
 from hyrfpack.ops.finite import all_finite
 from hyrfpack.ops.rasterize import reference
-from hyrfpack.ops.rasterize.reference import TRANSMITTANCE_MIN
+from hyrfpack.ops.rasterize.inputs import INPUT_SHAPES, Gaussians3D, RasterSettings, check_shapes
+from hyrfpack.ops.viewport import Viewport
 
-__all__ = ["INPUT_SHAPES", "Rasterization", "check_inputs", "rasterize"]
-
-# The shape of each input for one Gaussian.
-INPUT_SHAPES = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "colors": (3,)}
+__all__ = ["INPUT_SHAPES", "Gaussians3D", "RasterSettings", "Rasterization", "Viewport", "rasterize"]
 
 
 @dataclass(frozen=True)
@@ -45,20 +43,11 @@ class Rasterization:
 
 
 def rasterize(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
+    gaussians: Gaussians3D,
     colors: Tensor,
-    camera_from_world: Tensor,
-    intrinsics: tuple[float, float, float, float],
-    width: int,
-    height: int,
+    viewport: Viewport,
+    settings: RasterSettings = RasterSettings(),  # noqa: B008 - frozen
     *,
-    near: float = 0.01,
-    antialiased: bool = False,
-    transmittance_min: float = TRANSMITTANCE_MIN,
-    depth: bool = False,
     absgrad: Tensor | None = None,
     implementation: str = "auto",
 ) -> Rasterization:
@@ -76,40 +65,31 @@ def rasterize(
     is clamped to 0.99, as in autograd; the 3DGS kernels let it pass. Results do not depend on the number of threads.
 
     Args:
-        means: (N, 3) centres in world units.
-        quats: (N, 4) wxyz of any length; they are normalised. Zero means no rotation.
-        scales: (N, 3) standard deviations along the rotated axes, in world units, > 0.
-        opacities: (N,) in [0, 1].
+        gaussians: N Gaussians.
         colors: (N, 3) RGB.
-        camera_from_world: (4, 4) rigid transform, preferably in float64; OpenCV axes.
-        intrinsics: (fx, fy, cx, cy) in pixels; the first pixel's centre is (0.5, 0.5).
-        width, height: image size in pixels.
-        near: distance of the near plane in world units, >= 0. Gaussians with camera z <= near are skipped.
-        antialiased: scale opacities by sqrt(det(Sigma) / det(Sigma + 0.3 I)), so that the low-pass adds no light.
-        transmittance_min: T at which a pixel is finished, in [0, 1); 0 blends all Gaussians.
-        depth: also compute depth.
+        viewport: the camera.
+        settings: near plane, antialiasing, transmittance_min and depth.
         absgrad: (N, 2) buffer to which backward adds the sums over pixels of |dL/d mean2d| (x, y) in 1/px,
             the criterion of densification by absolute gradients.
         implementation: "auto", "reference", "cpu" or "gpu".
 
     Raises:
-        ValueError: shapes, dtypes or devices do not match, a setting is out of range, or the image has no pixels.
+        ValueError: shapes, dtypes or devices do not match.
         MemoryError: there are more (Gaussian, tile) pairs than "cpu" (2^28) or "gpu" (2^31) can index.
 
     Example:
         >>> shape = torch.tensor([[0.0, 0.0, 2.0]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]]), torch.full((1, 3), 0.1)
-        >>> opacities, red = torch.tensor([0.9]), torch.tensor([[1.0, 0.0, 0.0]])
-        >>> image = rasterize(*shape, opacities, red, torch.eye(4), (32.0, 32.0, 16.0, 16.0), 32, 32)
+        >>> gaussians, red = Gaussians3D(*shape, torch.tensor([0.9])), torch.tensor([[1.0, 0.0, 0.0]])
+        >>> image = rasterize(gaussians, red, Viewport(torch.eye(4), (32.0, 32.0, 16.0, 16.0), 32, 32))
         >>> image.rgb.shape, bool(image.rgb[16, 16, 0] > 0.8)
         (torch.Size([32, 32, 3]), True)
     """
-    inputs = (means, quats, scales, opacities, colors)
-    inputs_by_name = dict(zip(INPUT_SHAPES, inputs, strict=True))
-    check_inputs(inputs_by_name, camera_from_world, width, height, near, transmittance_min)
-    if absgrad is not None and (absgrad.shape != (len(means), 2) or absgrad.dtype != means.dtype):
-        raise ValueError(f"absgrad is {absgrad.dtype} {tuple(absgrad.shape)}, expected {means.dtype} {(len(means), 2)}")
+    check_shapes(gaussians, colors)
+    count, dtype = len(gaussians.means), gaussians.means.dtype
+    if absgrad is not None and (absgrad.shape != (count, 2) or absgrad.dtype != dtype):
+        raise ValueError(f"absgrad is {absgrad.dtype} {tuple(absgrad.shape)}, expected {dtype} {(count, 2)}")
 
-    chosen = choose_implementation(implementation, ("reference", "cpu", "gpu"), *inputs)
+    chosen = choose_implementation(implementation, ("reference", "cpu", "gpu"), *gaussians, colors)
     run: Callable[..., tuple] = reference.rasterize
     if chosen == "gpu":
         from hyrfpack.ops.rasterize import gpu
@@ -119,41 +99,8 @@ def rasterize(
         from hyrfpack.ops.rasterize import cpu
 
         run = cpu.rasterize
-    results = run(
-        *inputs,
-        camera_from_world,
-        intrinsics,
-        width,
-        height,
-        near=near,
-        antialiased=antialiased,
-        transmittance_min=transmittance_min,
-        depth=depth,
-        absgrad=absgrad,
-    )
+    results = run(gaussians, colors, viewport, settings, absgrad)
     if chosen != "gpu":  # The GPU kernels check every number and have set this field already.
-        results += (tuple(name for name, tensor in inputs_by_name.items() if not all_finite(tensor)),)
+        inputs = zip(INPUT_SHAPES, (*gaussians, colors), strict=True)
+        results += (tuple(name for name, tensor in inputs if not all_finite(tensor)),)
     return Rasterization(*results)
-
-
-def check_inputs(
-    inputs: Mapping[str, Tensor],
-    camera_from_world: Tensor,
-    width: int,
-    height: int,
-    near: float,
-    transmittance_min: float,
-) -> None:
-    """Raise the ValueErrors of `rasterize` for some or all of its inputs, by name, and for a view."""
-    count = len(inputs["means"])
-    for name, tensor in inputs.items():
-        if tensor.shape != (count, *INPUT_SHAPES[name]):
-            raise ValueError(f"{name} is {tuple(tensor.shape)}, expected {(count, *INPUT_SHAPES[name])}")
-    if camera_from_world.shape != (4, 4):
-        raise ValueError(f"camera_from_world is {tuple(camera_from_world.shape)}, expected (4, 4)")
-    if not near >= 0:
-        raise ValueError(f"near is {near}, expected a distance in front of the camera")
-    if not 0 <= transmittance_min < 1:
-        raise ValueError(f"transmittance_min is {transmittance_min}; it must lie in [0, 1)")
-    if width < 1 or height < 1:
-        raise ValueError(f"a picture of {width} x {height} has no pixels")

@@ -11,7 +11,9 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from hyrfpack.ops.rasterize import cpu_bin, cpu_blend, cpu_project
+from hyrfpack.ops.rasterize.inputs import Gaussians3D, RasterSettings
 from hyrfpack.ops.rasterize.reference import TILE_SIZE, jacobian_limits
+from hyrfpack.ops.viewport import Viewport
 from hyrfpack.parallel.pool import run_ranges, run_tasks, thread_count
 
 # A thread blends about this many pairs in the time that another one takes to start. Shorter runs would not pay off.
@@ -26,7 +28,8 @@ class _View:
         axes: the rows of the camera's rotation.
         shift: the camera's translation.
         lens: fx, fy, cx, cy, then the limits of x/z (low, high) and of y/z in the Jacobian.
-        width, height, near, antialiased, transmittance_min, depth: as in `rasterize`.
+        width, height: as in `Viewport`.
+        near, antialiased, transmittance_min, depth: as in `RasterSettings`.
         absgrad: as in `rasterize`, or None.
     """
 
@@ -60,48 +63,20 @@ class _Tiles:
 
 
 def rasterize(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    camera_from_world: Tensor,
-    intrinsics: tuple[float, float, float, float],
-    width: int,
-    height: int,
-    *,
-    near: float,
-    antialiased: bool,
-    transmittance_min: float,
-    depth: bool,
-    absgrad: Tensor | None,
+    gaussians: Gaussians3D, colors: Tensor, viewport: Viewport, settings: RasterSettings, absgrad: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor | None, Tensor, int, dict[str, float]]:
     """Compute `hyrfpack.ops.rasterize.rasterize`; the result is a tuple of the fields of `Rasterization` in order."""
-    where = camera_from_world, intrinsics, width, height
-    view = _view(*where, near, antialiased, transmittance_min, depth, None if absgrad is None else absgrad.detach())
+    view = _view(viewport, settings, None if absgrad is None else absgrad.detach())
     report: dict = {}
-    rgb, transmittance, depths, visible = _Rasterize.apply(means, quats, scales, opacities, colors, view, report)
+    rgb, transmittance, depths, visible = _Rasterize.apply(*gaussians, colors, view, report)
     return rgb, transmittance, depths, visible, report["pairs"], report["seconds"]
 
 
 @torch.no_grad()
-def sum_blend_weights(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    camera_from_world: Tensor,
-    intrinsics: tuple[float, float, float, float],
-    width: int,
-    height: int,
-    *,
-    near: float,
-    antialiased: bool,
-    transmittance_min: float,
-) -> tuple[Tensor, Tensor]:
+def sum_blend_weights(gaussians: Gaussians3D, viewport: Viewport, settings: RasterSettings) -> tuple[Tensor, Tensor]:
     """Compute `hyrfpack.ops.rasterize.blend_weights.sum_blend_weights`."""
-    view = _view(camera_from_world, intrinsics, width, height, near, antialiased, transmittance_min)
-    inputs = (means, quats, scales, opacities, means)  # Colours are not used; `means` stands in for them.
+    view, means = _view(viewport, settings), gaussians.means
+    inputs = (*gaussians, means)  # Colours are not used; `means` stands in for them.
     records, keys, tile_count_bounds = _project(tuple(tensor.detach().contiguous().numpy() for tensor in inputs), view)
     tiles = _bin_pairs(cpu_bin.sort_by_depth(keys), records, tile_count_bounds, view)
     pair_weights, transmittance = (
@@ -114,29 +89,19 @@ def sum_blend_weights(
     return torch.from_numpy(sums), torch.from_numpy(transmittance)
 
 
-def _view(
-    camera_from_world: Tensor,
-    intrinsics: tuple[float, float, float, float],
-    width: int,
-    height: int,
-    near: float,
-    antialiased: bool,
-    transmittance_min: float,
-    depth: bool = False,
-    absgrad: Tensor | None = None,
-) -> _View:
+def _view(viewport: Viewport, settings: RasterSettings, absgrad: Tensor | None = None) -> _View:
     """Convert the arguments of `rasterize` that get no gradients to the types that the kernels take."""
-    camera = camera_from_world.detach().double().tolist()[:3]
+    camera = viewport.pose.detach().double().tolist()[:3]
     return _View(
         axes=tuple(tuple(row[:3]) for row in camera),
         shift=tuple(row[3] for row in camera),
-        lens=tuple(float(number) for number in (*intrinsics, *jacobian_limits(intrinsics, width, height))),
-        width=int(width),
-        height=int(height),
-        near=float(near),
-        antialiased=bool(antialiased),
-        transmittance_min=np.float32(transmittance_min),
-        depth=depth,
+        lens=tuple(float(number) for number in (*viewport.intrinsics, *jacobian_limits(viewport))),
+        width=int(viewport.width),
+        height=int(viewport.height),
+        near=float(settings.near),
+        antialiased=bool(settings.antialiased),
+        transmittance_min=np.float32(settings.transmittance_min),
+        depth=settings.depth,
         absgrad=None if absgrad is None else absgrad.numpy(),
     )
 

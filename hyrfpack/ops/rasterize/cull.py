@@ -7,26 +7,18 @@ from torch import Tensor
 
 from hyrfpack.ops.dispatch import choose_implementation
 from hyrfpack.ops.finite import all_finite
+from hyrfpack.ops.viewport import Viewport
 
 
 def frustum_cull(
-    positions: Tensor,
-    pose: Tensor,
-    intrinsics: tuple[float, float, float, float],
-    width: int,
-    height: int,
-    near: float,
-    tolerance: float,
-    *,
-    implementation: str = "auto",
+    positions: Tensor, viewport: Viewport, near: float, tolerance: float, *, implementation: str = "auto"
 ) -> Tensor:
     """Return the indices of points in front of the near plane that project into the image or a band around it.
 
     Args:
-        positions: (N, 3) local units.
-        pose: (4, 4) camera_from_local, preferably on the CPU, where "gpu" reads it.
-        intrinsics: (fx, fy, cx, cy) in pixels.
-        near: smallest depth kept (exclusive), local units.
+        positions: (N, 3) world units.
+        viewport: the camera.
+        near: smallest depth kept (exclusive), world units.
         tolerance: width of the band as a fraction of half the image's width and height (NDC units).
         implementation: "auto", "reference" or "gpu" (float32 positions; computes in float64).
 
@@ -40,11 +32,11 @@ def frustum_cull(
     if choose_implementation(implementation, ("reference", "gpu"), positions) == "gpu":
         from hyrfpack.ops.rasterize import gpu_cull
 
-        return gpu_cull.frustum_cull(positions, pose, intrinsics, width, height, near, tolerance)
+        return gpu_cull.frustum_cull(positions, viewport, near, tolerance)
     if not all_finite(positions):
         raise FloatingPointError("positions hold NaN or infinity")
-    pose = pose.to(positions)
-    fx, fy, cx, cy = intrinsics
+    pose, width, height = viewport.pose.to(positions), viewport.width, viewport.height
+    fx, fy, cx, cy = viewport.intrinsics
     x, y, z = (positions @ pose[:3, :3].T + pose[:3, 3]).unbind(-1)
     margin_x, margin_y = tolerance * width / 2, tolerance * height / 2
     u, v = fx * x, fy * y  # The limits are multiplied by z, because a division by z would need a guard against 0.

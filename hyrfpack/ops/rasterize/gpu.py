@@ -16,6 +16,8 @@ from torch.autograd.function import once_differentiable
 from hyrfpack.ops.rasterize import gpu_blend, gpu_project
 from hyrfpack.ops.rasterize.gpu_bin import Pairs, bin_pairs
 from hyrfpack.ops.rasterize.gpu_project import Projection
+from hyrfpack.ops.rasterize.inputs import Gaussians3D, RasterSettings
+from hyrfpack.ops.viewport import Viewport
 
 _SUM_GAUSSIANS_PER_PROGRAM = 8
 _SUM_ROWS_PER_LOAD = 16  # Most Gaussians lie in fewer tiles than this, so that one load gets all their gradient rows.
@@ -41,14 +43,13 @@ class BlendedImage:
     blended: Tensor
 
 
-def bin_and_blend(
-    projection: Projection, width: int, height: int, transmittance_min: float, depth: bool
-) -> BlendedImage:
+def bin_and_blend(projection: Projection, viewport: Viewport, settings: RasterSettings) -> BlendedImage:
     """Bin and blend projected Gaussians. Synchronises with the device once.
 
     Raises:
         MemoryError: there are more than 2^31 - 64 pairs.
     """
+    width, height, depth = int(viewport.width), int(viewport.height), bool(settings.depth)
     pairs = bin_pairs(projection, width, height)
     device = projection.keys.device
     rgb = torch.empty(height, width, 3, device=device)
@@ -57,7 +58,7 @@ def bin_and_blend(
     tiles = len(pairs.tile_starts) - 1
     blended = torch.empty(tiles, dtype=torch.int32, device=device)
     gpu_blend.blend[(tiles,)](
-        pairs.tile_starts, pairs.owners, projection.records, width, height, transmittance_min,
+        pairs.tile_starts, pairs.owners, projection.records, width, height, float(settings.transmittance_min),
         rgb, transmittance, depths, blended, DEPTH=depth, num_warps=gpu_blend.WARPS_PER_TILE, enable_fp_fusion=True,
     )  # fmt: skip
     return BlendedImage(rgb, transmittance, depths, pairs, blended)
@@ -68,37 +69,19 @@ class _View:
     """The arguments of `rasterize` that get no gradients; `camera` is the result of `gpu_project.pack_camera`."""
 
     camera: Tensor
-    width: int
-    height: int
-    antialiased: bool
-    transmittance_min: float
-    depth: bool
+    viewport: Viewport
+    settings: RasterSettings
     absgrad: Tensor | None
 
 
 def rasterize(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    camera_from_world: Tensor,
-    intrinsics: tuple[float, float, float, float],
-    width: int,
-    height: int,
-    *,
-    near: float,
-    antialiased: bool,
-    transmittance_min: float,
-    depth: bool,
-    absgrad: Tensor | None,
+    gaussians: Gaussians3D, colors: Tensor, viewport: Viewport, settings: RasterSettings, absgrad: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor | None, Tensor, int, dict[str, float], tuple[str, ...]]:
     """Compute `hyrfpack.ops.rasterize.rasterize`; the result is a tuple of the fields of `Rasterization` in order."""
-    camera = gpu_project.pack_camera(camera_from_world, intrinsics, width, height, near, means.device)
-    absgrad = None if absgrad is None else absgrad.detach()
-    view = _View(camera, int(width), int(height), bool(antialiased), float(transmittance_min), bool(depth), absgrad)
+    camera = gpu_project.pack_camera(viewport, settings.near, colors.device)
+    view = _View(camera, viewport, settings, None if absgrad is None else absgrad.detach())
     report: dict = {}
-    rgb, transmittance, depths, visible = _Rasterize.apply(means, quats, scales, opacities, colors, view, report)
+    rgb, transmittance, depths, visible = _Rasterize.apply(*gaussians, colors, view, report)
     return rgb, transmittance, depths, visible, report["pairs"], {}, report["nonfinite"]
 
 
@@ -108,9 +91,9 @@ def _project(inputs: tuple[Tensor, ...], view: _View) -> Projection:
     projection = Projection.empty(total, inputs[0].device)
     if total:
         gpu_project.project[(triton.cdiv(total, gpu_project.GAUSSIANS_PER_PROGRAM),)](
-            *inputs, view.camera, total, view.width, view.height,
+            *inputs, view.camera, total, int(view.viewport.width), int(view.viewport.height),
             projection.records, projection.keys, projection.counts, projection.visible, projection.flags_and_ends,
-            ANTIALIASED=view.antialiased, BLOCK=gpu_project.GAUSSIANS_PER_PROGRAM,
+            ANTIALIASED=bool(view.settings.antialiased), BLOCK=gpu_project.GAUSSIANS_PER_PROGRAM,
             num_warps=gpu_project.WARPS_PER_PROGRAM, enable_fp_fusion=True,
         )  # fmt: skip
     return projection
@@ -125,7 +108,7 @@ class _Rasterize(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor, Tensor | None, Tensor]:
         inputs = tuple(tensor.detach().contiguous() for tensor in (means, quats, scales, opacities, colors))
         projection = _project(inputs, view)
-        image = bin_and_blend(projection, view.width, view.height, view.transmittance_min, view.depth)
+        image = bin_and_blend(projection, view.viewport, view.settings)
         report["pairs"], report["nonfinite"] = len(image.pairs.owners), image.pairs.nonfinite
         visible = projection.visible.view(torch.bool)
         ctx.save_for_backward(*inputs[:4], image.rgb, image.transmittance)
@@ -149,7 +132,7 @@ class _Rasterize(torch.autograd.Function):
         if count:
             gpu_blend.blend_backward[(len(ctx.blended),)](
                 pairs.tile_starts, pairs.owners, pairs.slots, ctx.blended, projection.records,
-                view.width, view.height, view.transmittance_min,
+                int(view.viewport.width), int(view.viewport.height), float(view.settings.transmittance_min),
                 rgb, transmittance, grad_rgb.contiguous(), grad_transmittance.contiguous(), rows,
                 ABSGRAD=with_absgrad, num_warps=gpu_blend.WARPS_PER_TILE, enable_fp_fusion=True,
             )  # fmt: skip
@@ -161,7 +144,7 @@ class _Rasterize(torch.autograd.Function):
         gpu_project.project_backward[(triton.cdiv(total, gpu_project.GAUSSIANS_PER_PROGRAM),)](
             sums, pairs.slot_starts, projection.counts, *inputs, view.camera, total, *grads,
             view.absgrad, *(view.absgrad.stride() if with_absgrad else (0, 0)),
-            ANTIALIASED=view.antialiased, ABSGRAD=with_absgrad,
+            ANTIALIASED=bool(view.settings.antialiased), ABSGRAD=with_absgrad,
             BLOCK=gpu_project.GAUSSIANS_PER_PROGRAM, num_warps=gpu_project.WARPS_PER_PROGRAM, enable_fp_fusion=True,
         )  # fmt: skip
         return *grads, None, None

@@ -19,6 +19,7 @@ from hyrfpack.ops.rasterize.gpu_project import (
     load_rows_3,
     pack_camera,
 )
+from hyrfpack.ops.viewport import Viewport
 
 
 @triton.jit(do_not_specialize=["total"])
@@ -45,20 +46,12 @@ def list_inside_kernel(inside, ends, total, indices, BLOCK: tl.constexpr):
     tl.store(indices + tl.load(ends + index, mask=chosen, other=1) - 1, index.to(tl.int64), mask=chosen)
 
 
-def frustum_cull(
-    positions: Tensor,
-    pose: Tensor,
-    intrinsics: tuple[float, float, float, float],
-    width: int,
-    height: int,
-    near: float,
-    tolerance: float,
-) -> Tensor:
+def frustum_cull(positions: Tensor, viewport: Viewport, near: float, tolerance: float) -> Tensor:
     """Compute `hyrfpack.ops.rasterize.cull.frustum_cull`. Synchronises with the device once."""
     total, device = len(positions), positions.device
     if not total:
         return torch.empty(0, dtype=torch.int64, device=device)
-    camera = pack_camera(pose, intrinsics, width, height, near, device, tolerance)
+    camera = pack_camera(viewport, near, device, tolerance)
     inside = torch.empty(total, dtype=torch.uint8, device=device)
     flag_and_ends = torch.empty(1 + total, dtype=torch.int64, device=device)
     flag_and_ends[:1].zero_()  # An assignment of 0 would copy it from the host and block.

@@ -26,6 +26,7 @@ from hyrfpack.ops.rasterize.gpu_ellipse import (
     touched_pixel_rows,
     touched_tile_columns,
 )
+from hyrfpack.ops.viewport import Viewport
 
 # Words of a record, which holds one projected Gaussian in 16 float32, read and written in pairs (see gpu_pairs). With
 # Sigma = its 2D covariance and d = pixel - mean,
@@ -96,20 +97,11 @@ class Projection:
         return cls(records, keys, counts, visible, flags_and_ends)
 
 
-def pack_camera(
-    camera_from_world: Tensor,
-    intrinsics: tuple[float, float, float, float],
-    width: int,
-    height: int,
-    near: float,
-    device: torch.device,
-    tolerance: float = 0.0,
-) -> Tensor:
+def pack_camera(viewport: Viewport, near: float, device: torch.device, tolerance: float = 0.0) -> Tensor:
     """Pack the camera's parameters for the kernels into one small float64 tensor on the device.
 
     Args:
-        camera_from_world: (4, 4), preferably on the CPU; reading it from the device synchronises.
-        intrinsics: (fx, fy, cx, cy) in pixels.
+        viewport: the camera; reading its pose from the device synchronises.
         near: distance of the near plane in world units.
         tolerance: width of the band of `in_frustum`, as a fraction of half the image's size.
 
@@ -118,12 +110,13 @@ def pack_camera(
         and of y/z in the Jacobian; the limits of fx x/z (low, high) and of fy y/z in the frustum; and, from
         VIEWPOINT_OFFSET on, the camera's centre.
     """
-    fx, fy, cx, cy = (float(number) for number in intrinsics)
-    pose = camera_from_world.detach().to("cpu", torch.float64)
+    fx, fy, cx, cy = (float(number) for number in viewport.intrinsics)
+    width, height = viewport.width, viewport.height
+    pose = viewport.pose.detach().to("cpu", torch.float64)
     margin_x, margin_y = tolerance * width / 2, tolerance * height / 2
     numbers = [
         *pose[:3, :3].flatten().tolist(), *pose[:3, 3].tolist(), fx, fy, cx, cy, near,
-        *reference.jacobian_limits((fx, fy, cx, cy), width, height),
+        *reference.jacobian_limits(viewport),
         -margin_x - cx, width + margin_x - cx, -margin_y - cy, height + margin_y - cy,
         *camera_center(pose).tolist(),
     ]  # fmt: skip

@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 import triton
 import triton.language as tl
-from torch import Tensor
 
 from hyrfpack.ops.rasterize import Rasterization
 from hyrfpack.ops.rasterize.gpu import bin_and_blend
@@ -23,8 +22,10 @@ from hyrfpack.ops.rasterize.gpu_project import (
     store_colors,
     store_records,
 )
+from hyrfpack.ops.rasterize.inputs import Gaussians3D, RasterSettings
 from hyrfpack.ops.shade import Shading
 from hyrfpack.ops.shade.gpu import launch_size, shade_block
+from hyrfpack.ops.viewport import Viewport
 
 
 @triton.jit(do_not_specialize=["total", "width", "height"])
@@ -66,36 +67,22 @@ def project_shaded_kernel(
 
 
 def rasterize_shaded(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    shading: Shading,
-    camera_from_world: Tensor,
-    intrinsics: tuple[float, float, float, float],
-    width: int,
-    height: int,
-    *,
-    near: float,
-    cull_tolerance: float,
-    antialiased: bool,
-    transmittance_min: float,
-    depth: bool,
+    gaussians: Gaussians3D, shading: Shading, viewport: Viewport, settings: RasterSettings, cull_tolerance: float
 ) -> Rasterization:
     """Compute `hyrfpack.ops.rasterize.shaded.rasterize_shaded`."""
-    total, device = len(means), means.device
-    inputs = (tensor.detach().contiguous() for tensor in (means, quats, scales, opacities))
-    camera = pack_camera(camera_from_world, intrinsics, width, height, near, device, cull_tolerance)
+    total, device = len(gaussians.means), gaussians.means.device
+    inputs = (tensor.detach().contiguous() for tensor in gaussians)
+    camera = pack_camera(viewport, settings.near, device, cull_tolerance)
     tensors, constants = shading.kernel_arguments
     projection = Projection.empty(total, device)
     if total:
         block, warps = launch_size(shading.mixed)
         project_shaded_kernel[(triton.cdiv(total, block),)](
-            *inputs, *tensors, camera, total, int(width), int(height),
+            *inputs, *tensors, camera, total, int(viewport.width), int(viewport.height),
             projection.records, projection.keys, projection.counts, projection.visible, projection.flags_and_ends,
-            **constants, ANTIALIASED=bool(antialiased), BLOCK=block, num_warps=warps, enable_fp_fusion=True,
+            **constants, ANTIALIASED=bool(settings.antialiased), BLOCK=block, num_warps=warps, enable_fp_fusion=True,
         )  # fmt: skip
-    image = bin_and_blend(projection, int(width), int(height), float(transmittance_min), bool(depth))
+    image = bin_and_blend(projection, viewport, settings)
     pairs = image.pairs
     visible = projection.visible.view(torch.bool)
     return Rasterization(image.rgb, image.transmittance, image.depth, visible, len(pairs.owners), {}, pairs.nonfinite)

@@ -15,12 +15,14 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
+from hyrfpack.ops.rasterize.inputs import TRANSMITTANCE_MIN, Gaussians3D, RasterSettings
+from hyrfpack.ops.viewport import Viewport
+
 TILE_SIZE = 16  # Tiles are squares; this is the side in pixels.
 # Variance in px^2 that is added to the diagonal of every 2D covariance.
 LOW_PASS_VARIANCE = 0.3
 ALPHA_MAX = 0.99
 ALPHA_MIN = 1 / 255
-TRANSMITTANCE_MIN = 1 / 512  # This is half a quantisation step of 8-bit images.
 # Lower bound of det(Sigma) / det(Sigma + 0.3 I) in the compensation of opacities for the low-pass.
 DETERMINANT_RATIO_MIN = 2.5e-5
 QUAT_NORM_MIN = 1e-12
@@ -52,46 +54,35 @@ class Projected:
         return Projected(*(getattr(self, name)[which] for name in self.__dataclass_fields__))
 
 
-def jacobian_limits(
-    intrinsics: tuple[float, float, float, float], width: int, height: int
-) -> tuple[float, float, float, float]:
+def jacobian_limits(viewport: Viewport) -> tuple[float, float, float, float]:
     """Return the ranges of x/z (min, max) and y/z (min, max) to which the projection's Jacobian is clamped.
 
     They are the field of view, widened by 0.15 of its size on each side (the 3DGS rule, about the principal point).
     """
-    fx, fy, cx, cy = intrinsics
+    fx, fy, cx, cy = viewport.intrinsics
+    width, height = viewport.width, viewport.height
     slack_x, slack_y = 0.15 * width / fx, 0.15 * height / fy
     return -cx / fx - slack_x, (width - cx) / fx + slack_x, -cy / fy - slack_y, (height - cy) / fy + slack_y
 
 
-def project(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    camera_from_world: Tensor,
-    intrinsics: tuple[float, float, float, float],
-    width: int,
-    height: int,
-    near: float,
-    antialiased: bool,
-) -> Projected:
+def project(gaussians: Gaussians3D, viewport: Viewport, settings: RasterSettings) -> Projected:
     """Project 3D Gaussians to 2D Gaussians (EWA splatting).
 
     The 2D covariance is J R Q diag(s^2) Q^T R^T J^T + 0.3 I. Here J is the Jacobian of the pinhole projection at the
     mean in the camera's frame, p = R m + t, evaluated with x/z and y/z clamped to `jacobian_limits`. Gaussians at
     z <= near are dropped. The arguments are those of `hyrfpack.ops.rasterize.rasterize`.
     """
-    fx, fy, cx, cy = intrinsics
+    means, quats, scales, opacities = gaussians
+    fx, fy, cx, cy = viewport.intrinsics
     # Far from the origin R m and t are large and cancel, so float64 is used where it exists (Apple's GPUs have none).
     exact = torch.float32 if means.device.type == "mps" else torch.float64
-    camera = camera_from_world.to(exact).to(means.device)
+    camera = viewport.pose.to(exact).to(means.device)
     seen = means.to(exact) @ camera[:3, :3].T + camera[:3, 3]
-    index = torch.nonzero(seen[:, 2] > near)[:, 0]
+    index = torch.nonzero(seen[:, 2] > settings.near)[:, 0]
     x, y, z = seen[index].to(means.dtype).unbind(-1)
     x_z, y_z = x / z, y / z
 
-    left, right, top, bottom = jacobian_limits(intrinsics, width, height)
+    left, right, top, bottom = jacobian_limits(viewport)
     clamped_x, clamped_y = x_z.clamp(left, right), y_z.clamp(top, bottom)
     zero = torch.zeros_like(z)
     jacobian = torch.stack([fx / z, zero, -fx * clamped_x / z, zero, fy / z, -fy * clamped_y / z], -1).view(-1, 2, 3)
@@ -102,7 +93,7 @@ def project(
     determinant = torch.linalg.cross(half[:, 0], half[:, 1]).square().sum(-1)
     filtered = determinant + LOW_PASS_VARIANCE * (xx + yy) + LOW_PASS_VARIANCE**2
     opacities = opacities[index]
-    if antialiased:
+    if settings.antialiased:
         opacities = opacities * (determinant / filtered).clamp_min(DETERMINANT_RATIO_MIN).sqrt()
     xx, yy = xx + LOW_PASS_VARIANCE, yy + LOW_PASS_VARIANCE
     return Projected(
@@ -162,27 +153,11 @@ def _transmittances(alphas: Tensor) -> Tensor:
 
 
 def rasterize(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    camera_from_world: Tensor,
-    intrinsics: tuple[float, float, float, float],
-    width: int,
-    height: int,
-    *,
-    near: float,
-    antialiased: bool,
-    transmittance_min: float,
-    depth: bool,
-    absgrad: Tensor | None,
+    gaussians: Gaussians3D, colors: Tensor, viewport: Viewport, settings: RasterSettings, absgrad: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor | None, Tensor, int, dict[str, float]]:
     """Compute `hyrfpack.ops.rasterize.rasterize`; the result is a tuple of the fields of `Rasterization` in order."""
     started = perf_counter()
-    projected = project(
-        means, quats, scales, opacities, camera_from_world, intrinsics, width, height, near, antialiased
-    )
+    projected = project(gaussians, viewport, settings)
     ended_project = perf_counter()
     # Depths are sorted in float32, so that the order is the same in every precision; ties keep the input's order.
     projected = projected.select(torch.argsort(projected.depths.detach().float(), stable=True))
@@ -195,6 +170,7 @@ def rasterize(
     values = torch.cat([colors[projected.index], projected.depths.detach()[:, None]], -1)
     ended_sort = perf_counter()
 
+    means, width, height = gaussians.means, viewport.width, viewport.height
     visible = torch.zeros(len(means), dtype=torch.bool, device=means.device)
     pairs = 0
     strips = []
@@ -205,7 +181,14 @@ def rasterize(
             first, last = means.new_tensor([left, top]), means.new_tensor([right, bottom])
             candidates = torch.nonzero(above_alpha_min & (lower <= last).all(-1) & (upper >= first).all(-1))[:, 0]
             tile, touched = _blend_tile(
-                projected.select(candidates), values[candidates], left, top, right, bottom, absgrad, transmittance_min
+                projected.select(candidates),
+                values[candidates],
+                left,
+                top,
+                right,
+                bottom,
+                absgrad,
+                settings.transmittance_min,
             )
             tiles.append(tile)
             visible[projected.index[candidates[touched]]] = True
@@ -214,7 +197,7 @@ def rasterize(
     picture = torch.cat(strips)
     rgb, depth_sum, transmittance = picture[..., :3], picture[..., 3].detach(), picture[..., 4]
     weight = 1 - transmittance.detach()
-    depths = torch.where(weight > 0, depth_sum / weight, 0) if depth else None
+    depths = torch.where(weight > 0, depth_sum / weight, 0) if settings.depth else None
     ended = perf_counter()
     seconds = {"project": ended_project - started, "sort": ended_sort - ended_project, "bin": 0.0}
     seconds["blend"] = ended - ended_sort

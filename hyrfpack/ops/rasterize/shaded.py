@@ -3,34 +3,26 @@
 from __future__ import annotations
 
 import dataclasses
+from time import perf_counter
 
 import torch
-from torch import Tensor
 
 from hyrfpack.ops.poses import camera_center
-from hyrfpack.ops.rasterize import Rasterization, check_inputs, rasterize
+from hyrfpack.ops.rasterize import Rasterization, rasterize
 from hyrfpack.ops.rasterize.cull import frustum_cull
-from hyrfpack.ops.rasterize.reference import TRANSMITTANCE_MIN
+from hyrfpack.ops.rasterize.inputs import Gaussians3D, RasterSettings, check_shapes
 from hyrfpack.ops.shade import Shading, check_shading, choose_shading_implementation, shade
+from hyrfpack.ops.viewport import Viewport
 
 
 @torch.no_grad()
 def rasterize_shaded(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
+    gaussians: Gaussians3D,
     shading: Shading,
-    camera_from_world: Tensor,
-    intrinsics: tuple[float, float, float, float],
-    width: int,
-    height: int,
+    viewport: Viewport,
+    settings: RasterSettings = RasterSettings(),  # noqa: B008 - frozen
     *,
-    near: float = 0.01,
     cull_tolerance: float = 0.3,
-    antialiased: bool = False,
-    transmittance_min: float = TRANSMITTANCE_MIN,
-    depth: bool = False,
     implementation: str = "auto",
 ) -> Rasterization:
     """Render the Gaussians whose centres a camera sees, with their view-dependent colours.
@@ -39,59 +31,33 @@ def rasterize_shaded(
     before binning in one kernel, which decodes a colour while it projects, and only for a Gaussian that is drawn.
 
     Args:
-        means, quats, scales, opacities: (N, 3), (N, 4), (N, 3), (N,) as in `rasterize`, of all Gaussians.
+        gaussians: N Gaussians.
         shading: the colour decoder of these N Gaussians.
-        camera_from_world: (4, 4), preferably on the CPU.
-        intrinsics, width, height, near, antialiased, transmittance_min, depth: as in `rasterize`.
+        viewport, settings: as in `rasterize`.
         cull_tolerance: how far outside the image a centre may project, as a fraction of half the image's size.
         implementation: "auto", "reference" or "gpu"; "reference" runs each step in its fastest implementation.
 
     Returns:
-        The image, not differentiable; its field `visible` is (N,).
+        The image, not differentiable; its field `visible` is (N,), and `seconds` also has the stages cull and decode.
 
     Raises:
+        FloatingPointError: a centre is NaN or infinite ("reference"; "gpu" reports it as `nonfinite`).
         ValueError, MemoryError: as `rasterize` and `shade`.
     """
-    geometry = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
-    check_inputs(geometry, camera_from_world, width, height, near, transmittance_min)
+    check_shapes(gaussians)
+    means = gaussians.means
     check_shading(shading, len(means))
-    if choose_shading_implementation(shading, implementation, *geometry.values()) == "gpu":
-        from hyrfpack.ops.rasterize.gpu_shaded import rasterize_shaded as run
+    if choose_shading_implementation(shading, implementation, *gaussians) == "gpu":
+        from hyrfpack.ops.rasterize import gpu_shaded
 
-        return run(
-            means,
-            quats,
-            scales,
-            opacities,
-            shading,
-            camera_from_world,
-            intrinsics,
-            width,
-            height,
-            near=near,
-            cull_tolerance=cull_tolerance,
-            antialiased=antialiased,
-            transmittance_min=transmittance_min,
-            depth=depth,
-        )
-    pose = camera_from_world.to(means)
-    index = frustum_cull(means, pose, intrinsics, width, height, near, cull_tolerance)
-    colors = shade(means, camera_center(pose), shading, index)
-    image = rasterize(
-        means[index],
-        quats[index],
-        scales[index],
-        opacities[index],
-        colors,
-        camera_from_world,
-        intrinsics,
-        width,
-        height,
-        near=near,
-        antialiased=antialiased,
-        transmittance_min=transmittance_min,
-        depth=depth,
-    )
+        return gpu_shaded.rasterize_shaded(gaussians, shading, viewport, settings, cull_tolerance)
+    started = perf_counter()
+    index = frustum_cull(means, viewport, settings.near, cull_tolerance)
+    culled = perf_counter()
+    drawn = gaussians.select(index)
+    colors = shade(means, camera_center(viewport.pose.to(means)), shading, index)
+    seconds = {"cull": culled - started, "decode": perf_counter() - culled}
+    image = rasterize(drawn, colors, viewport, settings)
     visible = torch.zeros(len(means), dtype=torch.bool, device=means.device)
     visible[index] = image.visible
-    return dataclasses.replace(image, visible=visible)
+    return dataclasses.replace(image, visible=visible, seconds=seconds | image.seconds)

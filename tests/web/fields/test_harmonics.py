@@ -68,9 +68,9 @@ def solve_least_squares(model: HybridModel, cameras: list[Camera], degree: int) 
     directions = torch.zeros(count, len(cameras), 3, dtype=torch.float64)
     settings = RenderSettings()
     for number, camera in enumerate(cameras):
-        pose = torch.from_numpy(model.config.frame.local_pose(camera))
-        size = camera.intrinsics, camera.width, camera.height
-        seen = frustum_cull(positions, pose, *size, settings.near, settings.cull_tolerance)
+        viewport = model.config.frame.local_viewport(camera, torch.float64)
+        pose = viewport.pose
+        seen = frustum_cull(positions, viewport, settings.near, settings.cull_tolerance)
         depths = positions @ pose[2, :3] + pose[2, 3]
         area = 2 * torch.pi * (camera.fx * camera.fy * scales[:, 1] * scales[:, 2] / depths.square() + 0.3)
         weights[seen, number] = area.clamp_max(camera.width * camera.height)[seen]
