@@ -113,6 +113,17 @@ class Camera:
         """Return (fx, fy, cx, cy) in pixels."""
         return self.fx, self.fy, self.cx, self.cy
 
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Project world points (N, 3) to the picture.
+
+        Returns:
+            x and y in pixels, (N,) each, and the camera z in world units, (N,). A point is in front of the camera if
+            z > 0; for others x and y have no meaning and may not be finite.
+        """
+        x, y, z = (points @ self.rotation.T + self.camera_from_world[:3, 3]).T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return self.fx * x / z + self.cx, self.fy * y / z + self.cy, z
+
 
 @dataclass(frozen=True, eq=False)
 class Picture:

@@ -25,6 +25,14 @@ def test_camera_intrinsics_have_the_order_fx_fy_cx_cy():
     assert Camera(8, 6, 1.0, 2.0, 3.0, 4.0, np.eye(4)).intrinsics == (1.0, 2.0, 3.0, 4.0)
 
 
+def test_project_agrees_with_the_pinhole_equation_and_marks_points_behind():
+    camera = Camera(8, 6, 10.0, 12.0, 3.5, 2.5, look_at((0, -3.0, 0), (0, 0, 0)))  # looks along y, its x axis is x
+    x, y, z = camera.project(np.array([[0.3, 0.0, 0.0], [0.0, 2.0, 0.5], [1.0, -3.0, 1.0], [0.0, -4.0, 0.0]]))
+    np.testing.assert_allclose(z, [3.0, 5.0, 0.0, -1.0], atol=1e-12)
+    np.testing.assert_allclose(x[:2], [3.5 + 10 * 0.3 / 3, 3.5])
+    np.testing.assert_allclose(y[:2], [2.5, 2.5 - 12 * 0.5 / 5])
+
+
 def test_look_at_is_a_rotation_with_y_down():
     """The tests' own helper needs a test, because all others rely on it."""
     pose = look_at((4.0, 1.0, 2.0), (0, 0, 0))

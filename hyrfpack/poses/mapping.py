@@ -21,7 +21,8 @@ from hyrfpack.poses.process import Report
 from hyrfpack.poses.watch import report_global_mapping_phase
 
 _GLOBAL_RUNS = 3  # each run starts from other random positions, with the focal lengths that the previous run found
-_FOCAL_CHANGE_THRESHOLD = 0.01  # pairs are verified again if the focal length changes by more than this ratio
+# Pairs are verified again if the mapper changes the focal length by more than this ratio.
+_MAPPED_FOCAL_CHANGE_RATIO = 0.01
 _MIN_POSE_INLIERS = 20  # pycolmap's own limit of 30 points leaves out many small photos
 # A focal length outside these ratios of the longer side means that the mapper has failed.
 _MIN_FOCAL_RATIO = 0.35
@@ -187,7 +188,7 @@ def _select_better_cameras(model: pycolmap.Reconstruction, cameras: Cameras) -> 
     for number, camera in model.cameras.items():
         focal, longer = camera.focal_length, max(camera.width, camera.height)
         likely = _MIN_FOCAL_RATIO < focal / longer < _MAX_FOCAL_RATIO and not camera.has_bogus_params(0.1, 10.0, 1.0)
-        if likely and abs(focal / cameras[number].focal_length - 1) > _FOCAL_CHANGE_THRESHOLD:
+        if likely and abs(focal / cameras[number].focal_length - 1) > _MAPPED_FOCAL_CHANGE_RATIO:
             better[number] = camera
     return better
 

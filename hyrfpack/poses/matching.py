@@ -38,7 +38,8 @@ _MIN_FOCAL_PAIR_MATCHES = 2 * MIN_PAIR_MATCHES
 _MAX_FOCAL_PAIRS = 40
 _MIN_FOCAL_PAIRS = 5
 _FOCAL_SEARCH_DESCRIPTION = "estimating focal lengths from matches"
-_FOCAL_CHANGE_THRESHOLD = 0.05  # pairs are verified again if the focal length changes by more than this ratio
+# Pairs are verified again if the estimate differs from the guess by more than this ratio.
+_ESTIMATED_FOCAL_CHANGE_RATIO = 0.05
 
 
 def match_photos(job: Job, report_progress: Report) -> dict[str, Any]:
@@ -148,7 +149,7 @@ def _estimate_focals(
     for number, device in enumerate(job.devices, start=1):
         if device.focal is None and typical is not None:
             now = camera_with_focal(cameras[number], found.get(number, typical))
-            if abs(now.focal_length / cameras[number].focal_length - 1) > _FOCAL_CHANGE_THRESHOLD:
+            if abs(now.focal_length / cameras[number].focal_length - 1) > _ESTIMATED_FOCAL_CHANGE_RATIO:
                 better[number] = now
     return better
 

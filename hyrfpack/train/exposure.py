@@ -85,9 +85,8 @@ def observe(scene: Scene, cache: PictureCache) -> Observations:
 
 def _colors(picture: Picture, camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return which of the points (M, 3) are usable, (M,) bool, and the logits of the usable ones' colours."""
-    x, y, z = (points @ camera.rotation.T + camera.camera_from_world[:3, 3]).T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        column, row = np.floor(camera.fx * x / z + camera.cx), np.floor(camera.fy * y / z + camera.cy)
+    x, y, z = camera.project(points)
+    column, row = np.floor(x), np.floor(y)
     inside = (z > 0) & (column >= COLOR_WINDOW_RADIUS_PIXELS) & (column < camera.width - COLOR_WINDOW_RADIUS_PIXELS)
     inside &= (row >= COLOR_WINDOW_RADIUS_PIXELS) & (row < camera.height - COLOR_WINDOW_RADIUS_PIXELS)
     around = np.arange(-COLOR_WINDOW_RADIUS_PIXELS, COLOR_WINDOW_RADIUS_PIXELS + 1)

@@ -32,9 +32,8 @@ def inside_silhouettes(
         covered = np.zeros(len(points))
         colors = np.zeros((len(points), 3))
         for camera, picture in pictures:
-            x, y, z = (world @ camera.rotation.T + camera.camera_from_world[:3, 3]).T
-            with np.errstate(divide="ignore", invalid="ignore"):
-                column, row = np.floor(camera.fx * x / z + camera.cx), np.floor(camera.fy * y / z + camera.cy)
+            x, y, z = camera.project(world)
+            column, row = np.floor(x), np.floor(y)
             inside = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
             column, row = column[inside].astype(np.int64), row[inside].astype(np.int64)
             coverage = np.ones(len(column)) if picture.alpha is None else picture.alpha[row, column] / 255
