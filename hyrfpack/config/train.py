@@ -118,7 +118,7 @@ class TrainConfig:
         checkpoint_every: steps between checkpoints. Default: a twentieth of the run.
         precision: precision of matrix products on a GPU: bfloat16 with float32 sums (mixed), or float32. The CPU always
             uses float32.
-        scale_rule, scale_grows, direction_encoding, position_gradients: as in ModelConfig.
+        direction_encoding: as in ModelConfig.
         learning_rates, density: see LearningRates and DensityConfig.
         grid_resolutions: vertices per axis of the coarsest and the finest level of both hash grids, 2 to 65536.
     """
@@ -137,11 +137,8 @@ class TrainConfig:
     ssim_weight: Annotated[float, Range(0, 1)] = 0.2
     checkpoint_every: Annotated[int | None, Range(1, unit="steps")] = None
     precision: Annotated[str, OneOf(PRECISIONS)] = "mixed"
-    scale_rule: Annotated[str, OneOf(("sum", "product"))] = "sum"
-    scale_grows: bool = True
     direction_encoding: Annotated[str, OneOf(("frequency", "sh"))] = "frequency"
     grid_resolutions: tuple[int, int] = (8, 512)
-    position_gradients: bool = False
     learning_rates: LearningRates = field(default_factory=LearningRates)
     density: DensityConfig = field(default_factory=DensityConfig)
 

@@ -185,18 +185,10 @@ class DensityControl:
         offsets = torch.randn(len(twice), 3, generator=generator).to(scales.device) * scales
         positions = explicit.positions[twice] + rotate(quats, offsets)
 
-        # The neural part stays the same, so the explicit logit alone must reduce the scale.
-        old = explicit.scale_logits[twice]
-        if model.config.scale_rule == "sum":
-            fraction = scales / bounds[twice]
-            shift = (logit(fraction / SPLIT_SHRINK) - logit(fraction)).mean(-1, keepdim=True)
-            scale_logits = old + shift
-        else:
-            scale_logits = logit(torch.sigmoid(old) / SPLIT_SHRINK)
         return {
             "positions": positions,
             "color_logits": explicit.color_logits[twice],
-            "scale_logits": scale_logits,
+            "scale_logits": _shrink(explicit.scale_logits[twice], scales / bounds[twice]),
             "opacity_logits": _dimmed(explicit, geometry, twice),
         }
 
@@ -216,6 +208,16 @@ class DensityControl:
         neural = model.geometry(model.cube_coords(explicit.positions))[:, :1]
         cap = logit(torch.tensor(self.config.reset_opacity))
         optimizer.reset("opacity_logits", torch.minimum(explicit.opacity_logits, cap - neural))
+
+
+def _shrink(scale_logits: Tensor, fractions: Tensor) -> Tensor:
+    """Return scale logits (n, 1) that divide decoded scales by `SPLIT_SHRINK`, in the mean over the axes.
+
+    Args:
+        scale_logits: (n, 1) stored logits. They alone must reduce the scales, because the neural part stays the same.
+        fractions: (n, 3) decoded scales as fractions of the largest scale S(p).
+    """
+    return scale_logits + (logit(fractions / SPLIT_SHRINK) - logit(fractions)).mean(-1, keepdim=True)
 
 
 def _dimmed(explicit: Gaussians, geometry: Geometry, parents: Tensor) -> Tensor:

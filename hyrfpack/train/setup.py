@@ -149,10 +149,7 @@ def build_model(scene: Scene, config: TrainConfig) -> tuple[HybridModel, int, di
         radiance=HashGridConfig(log2, base=base, finest=finest),
         background=background,
         solid=BACKGROUND_RGB[config.background_color],
-        scale_rule=config.scale_rule,
-        scale_grows=config.scale_grows,
         direction_encoding=config.direction_encoding,
-        position_gradients=config.position_gradients,
         antialiased=config.antialiased,
     )
     points, colors = initial_points(scene, frame, budget, config.seed)
@@ -202,8 +199,6 @@ def _gaussians(points: np.ndarray, colors: np.ndarray, config: ModelConfig) -> G
     else:
         sizes = np.full(len(points), 0.1)
     fraction = (torch.from_numpy(sizes).float()[:, None] / bounds).clamp(MIN_INITIAL_SIZE, MAX_INITIAL_SIZE)
-    if config.scale_rule == "product":
-        fraction = (2 * fraction).clamp(max=0.999)  # The neural factor is 1/2 at the start.
     return Gaussians(
         positions,
         logit(torch.from_numpy(np.clip(colors, 0.02, 0.98))),

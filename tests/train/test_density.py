@@ -95,12 +95,10 @@ def test_clone_or_split_depends_on_the_size_of_each_gaussian():
     assert len(model) == 20 + 2 + 2  # each clone and each split adds one
 
 
-@pytest.mark.parametrize("scale_rule", ["sum", "product"])
 @pytest.mark.parametrize("scale_logit", [-3.0, -1.0, 0.3])
-def test_children_are_decoded_as_their_parent_over_1_6(scale_rule, scale_logit):
+def test_children_are_decoded_as_their_parent_over_1_6(scale_logit):
     config = dataclasses.replace(GROWTH_CONFIG, split_scale=0.01, prune_scale=1.0)
-    settings = {"scale_logits": scale_logit, "scale_rule": scale_rule, "scale_grows": False}
-    model, optimizer, density = set_up(config=config, **settings)
+    model, optimizer, density = set_up(config=config, scale_logits=scale_logit, scale_grows=False)
     with torch.no_grad():
         parents = model.decode_geometry().scales
 
@@ -113,7 +111,7 @@ def test_children_are_decoded_as_their_parent_over_1_6(scale_rule, scale_logit):
 
 def test_children_shrink_by_1_6_where_the_field_stretches_the_parent():
     """The explicit logit is one number for three axes, so small children shrink alike, up to sigmoid curvature."""
-    model, optimizer, density = set_up(scale_logits=-2.5, scale_rule="sum", scale_grows=False)
+    model, optimizer, density = set_up(scale_logits=-2.5, scale_grows=False)
     with torch.no_grad():
         model.geometry.biases[-1][1:4] = torch.tensor([-1.0, 0.0, 0.5])
         parents = model.decode_geometry().scales

@@ -316,10 +316,9 @@ def test_empty_silhouettes_still_start_some_gaussians(budget):
 
 # The untrained radiance field adds logits of this standard deviation (tests/model/test_field.py).
 @pytest.mark.parametrize(("encoding", "noise"), [("sh", 0.08), ("frequency", 0.31)])
-@pytest.mark.parametrize("scale_rule", ["sum", "product"])
-def test_first_gaussians_look_like_the_points(scale_rule, encoding, noise):
+def test_first_gaussians_look_like_the_points(encoding, noise):
     scene = ball_scene(points=80)
-    model, _, _ = build_model(scene, TrainConfig(scale_rule=scale_rule, direction_encoding=encoding))
+    model, _, _ = build_model(scene, TrainConfig(direction_encoding=encoding))
     points = model.config.frame.to_local(scene.points)
     gaps = np.sort(np.linalg.norm(points[:, None] - points[None], axis=2), axis=1)[:, 1:4]
 
@@ -335,12 +334,11 @@ def test_first_gaussians_look_like_the_points(scale_rule, encoding, noise):
     np.testing.assert_allclose(colors.numpy(), stored.numpy(), atol=3 * noise / 4)  # a sigmoid's slope is 1/4 at most
 
 
-@pytest.mark.parametrize("scale_grows", [True, False])
-def test_initial_sizes_outside_the_box_follow_the_point_distances_too(scale_grows):
+def test_initial_sizes_outside_the_box_follow_the_point_distances_too():
     """S(p) grows there, so the stored fraction has to be smaller."""
     scene = ball_scene(points=60)
     far = Scene("far", "colmap", scene.train, [], scene.points + (30, 0, 0), scene.point_colors)
-    model, _, _ = build_model(far, TrainConfig(scale_grows=scale_grows))
+    model, _, _ = build_model(far, TrainConfig())
     points = model.config.frame.to_local(far.points)
     gaps = np.sort(np.linalg.norm(points[:, None] - points[None], axis=2), axis=1)[:, 1:4]
     with torch.no_grad():

@@ -10,23 +10,73 @@ views. A difference between rows is significant only if it is larger than the sp
 from __future__ import annotations
 
 import statistics
-from dataclasses import replace
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
+from unittest.mock import patch
 
-from hyrfpack.train import TrainConfig
+import torch
+from torch import Tensor
+
+from hyrfpack.model import HybridModel, ModelConfig
+from hyrfpack.model.gaussians import logit
+from hyrfpack.scene import Scene
+from hyrfpack.train import TrainConfig, density, setup, trainer
 from tools.studies.train_sets import make_study_parser, measure
 from tools.tables import markdown_row, markdown_table
 
-CHANGED_SETTINGS: dict[str, dict] = {
-    "default": {},
-    "scale S sigma(s_n) sigma(s_e), as the authors' code": {"scale_rule": "product"},
-    "S(p) constant": {"scale_grows": False},
-    "direction by spherical harmonics, as the authors' code": {"direction_encoding": "sh"},
-    "grids from 64 to 1024, as both": {"grid_resolutions": (64, 1024)},
-    "fields pass gradients to positions": {"position_gradients": True},
-    "no background sphere": {"background": False},
-    "antialiased": {"antialiased": True},
+
+@dataclass(frozen=True)
+class Choice:
+    """One row of the table.
+
+    Attributes:
+        training: changed settings of `TrainConfig`.
+        model: changed settings of `ModelConfig` that `TrainConfig` does not offer.
+    """
+
+    training: dict = field(default_factory=dict)
+    model: dict = field(default_factory=dict)
+
+
+CHOICES = {
+    "default": Choice(),
+    "scale S sigma(s_n) sigma(s_e), as the authors' code": Choice(model={"scale_rule": "product"}),
+    "S(p) constant": Choice(model={"scale_grows": False}),
+    "direction by spherical harmonics, as the authors' code": Choice({"direction_encoding": "sh"}),
+    "grids from 64 to 1024, as both": Choice({"grid_resolutions": (64, 1024)}),
+    "fields pass gradients to positions": Choice(model={"position_gradients": True}),
+    "no background sphere": Choice({"background": False}),
+    "antialiased": Choice({"antialiased": True}),
 }
+
+
+@contextmanager
+def train_models_with(**settings: Any) -> Iterator[None]:
+    """Enter the context in which training builds models with these settings of `ModelConfig`."""
+
+    def build(scene: Scene, config: TrainConfig) -> tuple[HybridModel, int, dict[str, str]]:
+        with patch.object(setup, "ModelConfig", partial(ModelConfig, **settings)):
+            model, budget, choices = setup.build_model(scene, config)
+        if model.config.scale_rule == "product":
+            with torch.no_grad():  # the neural factor is 1/2 at the start
+                stored = model.gaussians.scale_logits
+                stored.copy_(logit((2 * torch.sigmoid(stored)).clamp(max=0.999)))
+        return model, budget, choices
+
+    with ExitStack() as stack:
+        stack.enter_context(patch.object(trainer, "build_model", build))
+        if settings.get("scale_rule") == "product":
+            stack.enter_context(patch.object(density, "_shrink", _shrink_stored_factor))
+        yield
+
+
+def _shrink_stored_factor(scale_logits: Tensor, fractions: Tensor) -> Tensor:
+    """Return logits that divide the stored factor of a scale, and so the scale, by `SPLIT_SHRINK`."""
+    return logit(torch.sigmoid(scale_logits) / density.SPLIT_SHRINK)
 
 
 def main() -> None:
@@ -34,20 +84,21 @@ def main() -> None:
         __doc__, steps=2000, sets=["mipnerf360_bonsai", "gerrard_hall"], out=Path("runs/design")
     ).parse_args()
     print(markdown_table(("variant", "set", "PSNR", "spread", "SSIM", "Gaussians", "bytes", "steps/s"), []))
-    for number, (variant, changes) in enumerate(CHANGED_SETTINGS.items()):
+    for number, (variant, choice) in enumerate(CHOICES.items()):
         if args.only and not any(part in variant for part in args.only):
             continue
         for name in args.sets:
-            rows = [
-                measure(
-                    args.data,
-                    name,
-                    args.out / str(args.steps) / f"{number}-{name}-{seed}",
-                    replace(TrainConfig(steps=args.steps, seed=seed, budget_factor=1.0), **changes),
-                    reuse=True,
-                )
-                for seed in range(args.seeds)
-            ]
+            with train_models_with(**choice.model):
+                rows = [
+                    measure(
+                        args.data,
+                        name,
+                        args.out / str(args.steps) / f"{number}-{name}-{seed}",
+                        replace(TrainConfig(steps=args.steps, seed=seed, budget_factor=1.0), **choice.training),
+                        reuse=True,
+                    )
+                    for seed in range(args.seeds)
+                ]
             scores = [row["psnr_paper"] for row in rows]
             mean = {
                 key: statistics.fmean(row[key] for row in rows) for key in rows[0] if key != "set" and key != "preset"
