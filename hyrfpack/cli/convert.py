@@ -9,7 +9,6 @@ import click
 
 from hyrfpack.cli.common import format_table, json_option, note_rename, overwrite_option, print_json
 from hyrfpack.cli.export import crop_option
-from hyrfpack.cli.progress import show_progress
 from hyrfpack.cli.settings import settings_options
 from hyrfpack.cli.types import OUTPUT, PATH
 from hyrfpack.config.export import ConvertConfig
@@ -52,8 +51,7 @@ def convert(
 
     find_target_format(source, target)
     Outputs(source, folder=sog_folder(source), overwrite=overwrite).file(target)
-    with show_progress("convert") as progress:
-        report = run(source, target, ConvertConfig(**settings), overwrite=overwrite, report=progress)
+    report = run(source, target, ConvertConfig(**settings), overwrite=overwrite)
     note_rename(target, report.file)
     if as_json:
         print_json(report.to_dict())

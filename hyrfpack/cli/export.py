@@ -17,7 +17,6 @@ from hyrfpack.cli.common import (
     read_scene,
     scene_options,
 )
-from hyrfpack.cli.progress import show_progress
 from hyrfpack.cli.settings import settings_options
 from hyrfpack.cli.types import BOX, HARMONICS_DEGREE, OUTPUT, PATH
 from hyrfpack.config.export import ExportConfig
@@ -131,14 +130,12 @@ def export(
         check_folder(output, models, scenes, overwrite=overwrite, is_gallery=len(models) > 1)
     else:
         check_place(output, Outputs(*files, scene=scenes[0] if scenes else None, overwrite=overwrite), config.colmap)
-    with show_progress("export") as progress:
-        if len(models) > 1:
-            report = export_gallery(models, output, data=scenes, overwrite=overwrite)
-        elif not models:
-            report = export_player(None, output, overwrite=overwrite)
-        else:
-            scene = scenes[0] if scenes else None
-            report = write(models[0], output, config, data=scene, overwrite=overwrite, report=progress)
+    if len(models) > 1:
+        report = export_gallery(models, output, data=scenes, overwrite=overwrite)
+    elif not models:
+        report = export_player(None, output, overwrite=overwrite)
+    else:
+        report = write(models[0], output, config, data=scenes[0] if scenes else None, overwrite=overwrite)
     note_rename(output, report.file)
     if as_json:
         print_json(asdict(report))

@@ -14,11 +14,12 @@ from hyrfpack.atomic import write_atomic
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.checks import check_type
 from hyrfpack.config.export import ConvertConfig
+from hyrfpack.context import RunContext
 from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.export.kinds import check_package, select_splats
 from hyrfpack.export.measure import psnr_of_splats
 from hyrfpack.outputs import Outputs
-from hyrfpack.progress import Report, no_report, report_part
+from hyrfpack.progress import Report, report_part, report_to
 from hyrfpack.splats.draw import Drawable
 from hyrfpack.splats.files import READABLE_ENDINGS, read_splats
 from hyrfpack.splats.formats.hints import Hints
@@ -70,7 +71,7 @@ def convert_splats(
     config: ConvertConfig | None = None,
     *,
     overwrite: bool = True,
-    report: Report = no_report,
+    context: RunContext = RunContext(),  # noqa: B008 - frozen
 ) -> ConversionReport:
     """Convert splats between the formats of other programs, in their own axes and units, and measure the loss.
 
@@ -82,7 +83,7 @@ def convert_splats(
         config: what to keep, and how to write it; None for the defaults.
         overwrite: replace a file at `target`. If False, an existing file is an error. A file that appears during the
             conversion is kept, and the result gets a free name in its folder, which the report contains.
-        report: called with the current activity and the share of the work that is done, 0 to 1.
+        context: how progress is shown and the call is stopped.
 
     Raises:
         HyrfDataError: the source cannot be read, or nothing in it is visible.
@@ -99,6 +100,19 @@ def convert_splats(
     check_type("config", config, ConvertConfig)
     check_package(kind, target)
     Outputs(source, folder=sog_folder(source), overwrite=overwrite).file(target)
+    with context.open_progress("convert") as progress:
+        return _convert(source, target, kind, config, overwrite, report_to(progress))
+
+
+def _convert(
+    source: str | os.PathLike[str],
+    target: str | os.PathLike[str],
+    kind: SplatFormat,
+    config: ConvertConfig,
+    overwrite: bool,
+    report: Report,
+) -> ConversionReport:
+    """Read, select, write and measure splats."""
     report(f"reading {Path(source).name}", 0.0)
     splats = read_splats(source)
     if not len(splats):

@@ -10,6 +10,7 @@ from pathlib import Path
 from hyrfpack.atomic import write_atomic
 from hyrfpack.checks import check_type
 from hyrfpack.config.export import ExportConfig
+from hyrfpack.context import RunContext
 from hyrfpack.errors import HyrfError
 from hyrfpack.export.baked_scene import BakedScene, ShownSplats, bake_scene
 from hyrfpack.export.cameras import encode_transforms, write_colmap
@@ -33,7 +34,7 @@ from hyrfpack.export.source import Source
 from hyrfpack.format import find_model
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.outputs import Outputs
-from hyrfpack.progress import Report, no_report, report_part
+from hyrfpack.progress import Report, report_part, report_to
 from hyrfpack.scene import Scene
 from hyrfpack.splats.formats.hints import Hints
 from hyrfpack.splats.table import FileKind, SplatFormat
@@ -49,7 +50,7 @@ def export_model(
     *,
     data: Scene | None = None,
     overwrite: bool = True,
-    report: Report = no_report,
+    context: RunContext = RunContext(),  # noqa: B008 - frozen
 ) -> ExportReport:
     """Write a `.hyrf` model in a format of other programs, in its own axes and units, and measure the loss.
 
@@ -72,7 +73,7 @@ def export_model(
         overwrite: replace existing files. If False, an existing file is an error. A file that appears during the export
             is kept: a single file gets a free name in its folder, which the report contains; in a folder it is an
             error.
-        report: called with the current activity and the share of the work that is done, 0 to 1.
+        context: how progress is shown and the call is stopped.
 
     Raises:
         HyrfError: a file cannot be read or written, the options contradict each other, or another call is writing into
@@ -106,7 +107,8 @@ def export_model(
             _check_cameras(loaded, source)
         if kind is TRANSFORMS_JSON:
             return _write_cameras(loaded, target, overwrite)
-        return _export_gaussians(loaded, Path(target), kind, config, overwrite, report)
+        with context.open_progress("export") as progress:
+            return _export_gaussians(loaded, Path(target), kind, config, overwrite, report_to(progress))
 
 
 def _export_gaussians(

@@ -247,7 +247,8 @@ def run_export_stage(
             copy_if_different(model, target)
             report: dict[str, Any] = {"bytes": target.stat().st_size}
         else:
-            made = export_model(model, target, data=scene, report=stage_cache.reporter.report_share)
+            context = RunContext(progress=stage_cache.reporter.report_event)
+            made = export_model(model, target, data=scene, context=context)
             report = {**asdict(made), "file": name, "chosen_by": {}}
         files = sorted(target.rglob("*")) if target.is_dir() else [target]
         return report, [path.relative_to(stage_cache.folder).as_posix() for path in files if path.is_file()]

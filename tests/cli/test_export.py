@@ -46,7 +46,8 @@ def test_export_reports_its_steps_and_the_loss(model, tmp_path):
     assert result.stdout.splitlines()[0].split("  ")[0] == "against renders of the model, 4 views"
     last = f"{tmp_path / 'a.ply'}: {size:,} bytes, {len(splats):,} Gaussians, {len(splats) - 40:,} of them for the"
     assert result.stdout.splitlines()[-1] == f"{last} background"
-    assert [line.split()[0] for line in result.stderr.splitlines()] == ["fitting", "writing", "measuring"]
+    notes = [line for line in result.stderr.splitlines() if not line.startswith("export | ")]  # progress of a slow call
+    assert [line.split()[0] for line in notes] == ["fitting", "writing", "measuring"]
 
 
 def test_the_report_is_one_json_object(model, tmp_path):

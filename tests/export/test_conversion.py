@@ -98,8 +98,9 @@ def test_lost_harmonics_are_reported(tmp_path, caplog):
 
 def test_progress_is_reported_in_order(tmp_path):
     messages: list[tuple[str, float]] = []
+    context = hyrfpack.RunContext(progress=lambda event: messages.append((event.task, event.share)))
     source = write_splats(tmp_path, ".ply", ball_splats(GAUSSIAN_COUNT))
-    hyrfpack.convert_splats(source, tmp_path / "a.spz", report=lambda *said: messages.append(said))
+    hyrfpack.convert_splats(source, tmp_path / "a.spz", context=context)
     shares = [share for _, share in messages]
     assert shares == sorted(shares) and 0 <= shares[0] and shares[-1] <= 1
     assert messages[0][0] == "reading before.ply" and messages[-1][0] == "comparing view 2/2"
