@@ -189,7 +189,9 @@ def test_splats_of_other_programs_are_distilled_on_a_gpu(gpu, few_pictures, tmp_
     cameras = [camera_at(place, width=12, height=12) for place in ((0.0, -3, 0.5), (0.0, 3, 0.5), (3.0, 0, -0.5))]
     quick = DistillConfig(steps=1, test_views=2, psnr=12)
     reports = [
-        distill_splats(ball_splats(12), tmp_path / f"{device}.hyrf", quick, cameras=cameras, device=device)
+        distill_splats(
+            ball_splats(12), tmp_path / f"{device}.hyrf", quick, cameras=cameras, context=RunContext(device=device)
+        )
         for device in ("cpu", "cuda")
     ]
     places = [(t.model.gaussians.positions.device, t.test.pictures[0].device) for t in packed]

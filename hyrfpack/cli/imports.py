@@ -17,7 +17,6 @@ from hyrfpack.cli.common import (
     overwrite_option,
     print_json,
 )
-from hyrfpack.cli.progress import show_progress
 from hyrfpack.cli.settings import settings_options
 from hyrfpack.cli.types import OUTPUT, PATH
 from hyrfpack.config.distill import DistillConfig
@@ -66,16 +65,15 @@ def import_(
     """
     folder = source.parent if source.name == "meta.json" else source  # a SOG may be a folder that holds meta.json
     Outputs(source, cameras, folder=folder, overwrite=overwrite).file(output, ".hyrf")
+    from hyrfpack.context import RunContext
     from hyrfpack.distill import import_splats
 
     cameras = cameras or _find_training_cameras(source)
     given = None if cameras is None else _read_cameras(cameras)
     torch_device = choose_command_device(device)
     config = DistillConfig(**settings)
-    with show_progress("import") as progress:
-        report = import_splats(
-            source, output, config, cameras=given, overwrite=overwrite, device=torch_device, report=progress
-        )
+    context = RunContext(device=torch_device)
+    report = import_splats(source, output, config, cameras=given, overwrite=overwrite, context=context)
     written = note_rename(output, report.file)
     if as_json:
         print_json(report.to_dict())

@@ -9,7 +9,6 @@ import click
 
 from hyrfpack.cli.common import format_consistent_psnr, json_option, print_json
 from hyrfpack.cli.console import print_line
-from hyrfpack.cli.progress import show_progress
 from hyrfpack.cli.section_table import format_section_table
 from hyrfpack.cli.types import PATH
 from hyrfpack.cli.wording import use_option_names
@@ -59,8 +58,7 @@ def _print_photos(path: Path, as_json: bool) -> None:
     from hyrfpack.cli.survey import print_survey
     from hyrfpack.survey import describe_photos
 
-    with show_progress("info") as progress:
-        survey = describe_photos(path, report=progress)
+    survey = describe_photos(path)
     if as_json:
         print_json(asdict(survey))
     else:

@@ -11,7 +11,6 @@ import click
 
 from hyrfpack.choices import MATCHING_METHODS
 from hyrfpack.cli.common import json_option, note, note_if_verbose, print_json
-from hyrfpack.cli.progress import show_progress
 from hyrfpack.cli.types import OUTPUT, PATH
 from hyrfpack.config.settings import LARGEST_SEED
 
@@ -56,16 +55,7 @@ def poses(
     from hyrfpack.poses import estimate_poses
 
     try:
-        with show_progress("poses") as report:
-            result = estimate_poses(
-                photos,
-                out,
-                matching=matching,
-                masks=masks,
-                seed=seed,
-                overwrite=overwrite,
-                report=report,
-            )
+        result = estimate_poses(photos, out, matching=matching, masks=masks, seed=seed, overwrite=overwrite)
     except KeyboardInterrupt:
         note("stopped; the same command resumes from here")
         click.get_current_context().exit(1)

@@ -17,9 +17,9 @@ from hyrfpack.data import PictureCache
 from hyrfpack.distill.initialize import initial_model
 from hyrfpack.distill.reference import ReferenceViews, mean_sent_light, reference_scene
 from hyrfpack.errors import HyrfDataError
-from hyrfpack.measure.psnr import psnr_from_mse
 from hyrfpack.model import HybridModel
-from hyrfpack.progress import Report, no_report, report_part
+from hyrfpack.progress import Progress, TaskEvent, ignore_progress, part_of_progress
+from hyrfpack.progress.status import format_psnr
 from hyrfpack.scene import Camera, Scene, evenly_spaced
 from hyrfpack.splats.draw import Drawable
 from hyrfpack.splats.splats import Splats
@@ -71,7 +71,7 @@ def distill_model(
     name: str = "the splats",
     cameras: Sequence[Camera] | None = None,
     device: torch.device = torch.device("cpu"),  # noqa: B008 - a constant
-    report: Report = no_report,
+    progress: Progress = ignore_progress,
 ) -> DistilledModel:
     """Train a hybrid model to look like splats. Arguments and errors are those of `distill_splats`.
 
@@ -81,7 +81,7 @@ def distill_model(
         >>> len(distill_model(read_splats("bonsai.ply"), quick).model) > 0
         True
     """
-    report("choosing viewpoints", 0.0)
+    progress(TaskEvent("choosing viewpoints", 0.0))
     weighted = WeightedSplats.from_splats(splats, name)
     original = Drawable.from_splats(splats, weighted.frame, device)
     train, validation, test = _choose_cameras(weighted, original, config, cameras)
@@ -89,7 +89,7 @@ def distill_model(
         f"{len(splats):,} Gaussians, harmonics of degree {splats.degree}; {len(train)} "
         f"{'sampled' if cameras is None else 'given'} viewpoints for training, {len(test)} held out"
     )
-    report("measuring which Gaussians are visible", 0.05)
+    progress(TaskEvent("measuring which Gaussians are visible", 0.05))
     light = mean_sent_light(original, evenly_spaced(train, LIGHT_MEASUREMENT_VIEWS))
     kept = torch.from_numpy(_indices_without_faint(light.cpu().numpy())).to(device)
     if not len(kept):
@@ -98,10 +98,10 @@ def distill_model(
         f"{len(splats) - len(kept):,} Gaussians are hardly visible and are left out; fitting the fields to the others"
     )
     share = min(1.0, max(MIN_REGRESSION_SHARE, config.steps / FULL_REGRESSION_STEPS))
-    model = initial_model(original[kept], light[kept], train, config.seed, share, report_part(report, 0.1, 0.4))
+    model = initial_model(original[kept], light[kept], train, config.seed, share, part_of_progress(progress, 0.1, 0.4))
     scene, cache = reference_scene(name, original, train, test), PictureCache()
-    _fit_to_pictures(model, scene, config, cache, report_part(report, 0.4, 0.98))
-    report("rendering held-out views", 0.98)
+    _fit_to_pictures(model, scene, config, cache, part_of_progress(progress, 0.4, 0.98))
+    progress(TaskEvent("rendering held-out views", 0.98))
     return DistilledModel(
         model, train, *(ReferenceViews.from_splats(original, cameras) for cameras in (validation, test))
     )
@@ -144,7 +144,7 @@ def _indices_without_faint(light: np.ndarray) -> np.ndarray:
 
 
 def _fit_to_pictures(
-    model: HybridModel, scene: Scene, config: DistillConfig, cache: PictureCache, report: Report
+    model: HybridModel, scene: Scene, config: DistillConfig, cache: PictureCache, progress: Progress
 ) -> None:
     """Train a model on reference renders, starting from its present state."""
     # Density control is off: the Gaussians are in place already, and compression prunes those of low importance.
@@ -158,7 +158,7 @@ def _fit_to_pictures(
     trainer = Trainer(scene, settings, cache, model.gaussians.positions.device, model)
 
     def report_step(trainer: Trainer, loss: float, mse: float) -> None:
-        progress = f"training, step {trainer.step}/{config.steps}, PSNR {psnr_from_mse(mse):.1f} dB"
-        report(progress, trainer.step / config.steps)
+        task = f"training, step {trainer.step}/{config.steps}, {format_psnr(mse)}"
+        progress(TaskEvent(task, trainer.step / config.steps))
 
     trainer.run(report=report_step)

@@ -11,17 +11,16 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from hyrfpack import format as hyrf_format
 from hyrfpack.atomic import write_atomic
 from hyrfpack.checks import check_type
 from hyrfpack.config.distill import DistillConfig
-from hyrfpack.device import choose_device
+from hyrfpack.context import RunContext
 from hyrfpack.distill.distillation import distill_model
 from hyrfpack.distill.pack import pack
 from hyrfpack.outputs import Outputs
-from hyrfpack.progress import Report, no_report, report_part
+from hyrfpack.progress import TaskEvent, part_of_progress
 from hyrfpack.scene import Camera
 from hyrfpack.splats.files import read_splats
 from hyrfpack.splats.names import bytes_on_disk
@@ -76,8 +75,7 @@ def import_splats(
     *,
     cameras: Sequence[Camera] | None = None,
     overwrite: bool = True,
-    device: str | torch.device = "auto",
-    report: Report = no_report,
+    context: RunContext = RunContext(),  # noqa: B008 - frozen
 ) -> DistillReport:
     """Make a `.hyrf` file from a file of 3D Gaussians.
 
@@ -101,9 +99,8 @@ def import_splats(
     Outputs(source, overwrite=overwrite).file(target)
     splats = read_splats(source)
     result = distill_splats(
-        splats, target, config, name=str(source), cameras=cameras, overwrite=overwrite, device=device,
-        report=report,
-    )  # fmt: skip
+        splats, target, config, name=str(source), cameras=cameras, overwrite=overwrite, context=context
+    )
     return dataclasses.replace(result, bytes_source=bytes_on_disk(source))
 
 
@@ -115,8 +112,7 @@ def distill_splats(
     name: str = "the splats",
     cameras: Sequence[Camera] | None = None,
     overwrite: bool = True,
-    device: str | torch.device = "auto",
-    report: Report = no_report,
+    context: RunContext = RunContext(),  # noqa: B008 - frozen
 ) -> DistillReport:
     """Distil splats into a hybrid model of the same appearance, and compress it with profile "compact".
 
@@ -133,8 +129,7 @@ def distill_splats(
             TEST_EVERY is held out.
         overwrite: replace a file at `target`. If False, an existing file is an error. A file that appears in the
             meantime is kept, and the result is written beside it under a free name, which the report names.
-        device: device for rendering and training, see `hyrfpack.device.choose_device`.
-        report: called with the name of the current task and the completed share of the work, 0 to 1.
+        context: device for rendering and training, progress and stop.
 
     Raises:
         HyrfDataError: no view shows any of the splats.
@@ -142,20 +137,28 @@ def distill_splats(
     """
     started = time.perf_counter()
     Outputs(overwrite=overwrite).file(target)
-    torch_device = choose_device(device)
-    distilled = distill_model(
-        splats, config, name=name, cameras=cameras, device=torch_device, report=report_part(report, 0.0, 0.7)
-    )
-    unpacked_psnr = float(np.mean(distilled.test.psnr_per_view(distilled.model)))
-    _LOG.info(f"PSNR before compression: {unpacked_psnr:.2f} dB")
-    imported = f"{len(splats):,} Gaussians of degree {splats.degree} from {Path(name).name}, without photos"
-    provenance = {"steps": config.steps, "seed": config.seed, "psnr": unpacked_psnr, "choices": {"imported": imported}}
-    data = pack(distilled, config.psnr, provenance, report_part(report, 0.7, 0.97))
-    written = write_atomic(target, data, overwrite=overwrite)  # written last, so that an interrupt keeps the old file
-    report("scoring the file", 0.97)
-    decoded = hyrf_format.load_model(written).to(torch_device)
-    decoded.precision = distilled.model.precision
-    scores = distilled.test.psnr_per_view(decoded)
+    device = context.choose_device()
+    with context.open_progress("import") as progress:
+        distilled = distill_model(
+            splats,
+            config,
+            name=name,
+            cameras=cameras,
+            device=device,
+            progress=part_of_progress(progress, 0.0, 0.7),
+        )
+        unpacked_psnr = float(np.mean(distilled.test.psnr_per_view(distilled.model)))
+        _LOG.info(f"PSNR before compression: {unpacked_psnr:.2f} dB")
+        imported = f"{len(splats):,} Gaussians of degree {splats.degree} from {Path(name).name}, without photos"
+        choices = {"imported": imported}
+        provenance = {"steps": config.steps, "seed": config.seed, "psnr": unpacked_psnr, "choices": choices}
+        data = pack(distilled, config.psnr, provenance, part_of_progress(progress, 0.7, 0.97))
+        progress(TaskEvent("scoring the file", 0.97))
+        # The file is written after all else that an interrupt may end, so that an earlier file is kept.
+        written = write_atomic(target, data, overwrite=overwrite)
+        decoded = hyrf_format.load_model(written).to(device)
+        decoded.precision = distilled.model.precision
+        scores = distilled.test.psnr_per_view(decoded)
     reached_psnr = float(np.mean(scores))
     if _falls_short(reached_psnr, config.psnr):
         _LOG.warning(_shortfall(reached_psnr, unpacked_psnr, config, viewpoints_are_sampled=cameras is None))

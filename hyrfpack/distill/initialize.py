@@ -20,7 +20,7 @@ from hyrfpack.model.gaussians import Gaussians, logit
 from hyrfpack.model.hybrid import scale_bounds
 from hyrfpack.ops.poses import camera_center
 from hyrfpack.parallel.pool import keep_freed_memory, torch_on_one_thread
-from hyrfpack.progress import Report, no_report
+from hyrfpack.progress import Progress, TaskEvent, ignore_progress
 from hyrfpack.scene import Camera
 from hyrfpack.splats.draw import Drawable
 from hyrfpack.splats.harmonics import SH_C0
@@ -115,7 +115,7 @@ def initial_model(
     cameras: Sequence[Camera],
     seed: int,
     share: float = 1.0,
-    report: Report = no_report,
+    progress: Progress = ignore_progress,
 ) -> HybridModel:
     """Make a model of splats and fit its fields to them by regression, without rendering.
 
@@ -125,7 +125,7 @@ def initial_model(
         cameras: viewpoints at which view-dependent colours are fitted.
         seed: random seed of the initial weights and of the order.
         share: share of the usual number of regression steps, above 0.
-        report: called with the current step and the completed share of the work, 0 to 1.
+        progress: called with `TaskEvent`s.
     """
     degree = drawable.degree
     config = choose_model_config(drawable, degree)
@@ -140,7 +140,7 @@ def initial_model(
             values.zero_()
     if not degree:
         model.radiance.requires_grad_(False)
-    _fit_fields(model, drawable, shapes, light, cameras if degree else (), seed, share, report)
+    _fit_fields(model, drawable, shapes, light, cameras if degree else (), seed, share, progress)
     with torch.no_grad():  # the explicit logits of sizes and opacities compensate what the field adds to them
         raw = model.geometry(model.cube_coords(gaussians.positions))
         gaussians.scale_logits.copy_(shapes.sizes[:, None] - raw[:, 1:4].mean(1, keepdim=True))
@@ -162,7 +162,7 @@ def _fit_fields(
     cameras: Sequence[Camera],
     seed: int,
     share: float,
-    report: Report,
+    progress: Progress,
 ) -> None:
     """Fit the geometry field to shapes, and the radiance field and explicit colours to colours seen from cameras."""
     count = len(model)
@@ -186,7 +186,7 @@ def _fit_fields(
     with torch_on_one_thread():
         for step, index in zip(range(steps), _batches(count, batch, generator, coords.device), strict=False):
             if step % REPORT_EVERY_STEPS == 0:
-                report(f"fitting the fields, step {step}/{steps}", step / steps)
+                progress(TaskEvent(f"fitting the fields, step {step}/{steps}", step / steps))
             opacity, scales, turns = model.geometry(coords.index_select(0, index)).split((1, 3, 4), 1)
             predicted, target = _EllipsoidShapes.from_logits(scales, turns + identity_quat), shapes.subset(index)
             errors = (predicted.matrices - target.matrices).square().sum(0)

@@ -12,7 +12,14 @@ from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.compress.calibrate import measure_calibrated_sensitivity
 from hyrfpack.compress.packer import Packer
 from hyrfpack.distill.distillation import DistilledModel
-from hyrfpack.progress import Report, no_report, report_part, report_round
+from hyrfpack.progress import (
+    Progress,
+    TaskEvent,
+    ignore_progress,
+    part_of_progress,
+    report_to,
+    round_of_progress,
+)
 
 _LOG = logging.getLogger(__name__)
 
@@ -29,7 +36,7 @@ def pack(
     distilled: DistilledModel,
     psnr: float,
     provenance: dict,
-    report: Report = no_report,
+    progress: Progress = ignore_progress,
 ) -> bytes:
     """Encode the smallest file that reaches a target PSNR on the validation views.
 
@@ -37,7 +44,7 @@ def pack(
         distilled: the model, and reference renders of the original.
         psnr: target PSNR in dB against the reference renders.
         provenance: provenance to store in the file; the viewpoint is added to it.
-        report: called with the name of the current task and the completed share of the work, 0 to 1.
+        progress: called with `TaskEvent`s.
 
     Returns:
         The bytes of the file.
@@ -58,15 +65,15 @@ def pack(
     _LOG.info(f"measuring how each stored number affects renders, at {len(distilled.train)} cameras and between them")
     distortion = PLANNED_ERROR_SHARE * solve_added_error(_mse(psnrs), error + allowance)
     sensitivity, references = measure_calibrated_sensitivity(
-        model, distilled.train, distortion, report=report_part(report, 0.0, 0.7)
+        model, distilled.train, distortion, report=report_to(part_of_progress(progress, 0.0, 0.7))
     )
     provenance = {**provenance, "viewpoint": Viewpoint.from_cameras(distilled.train).to_json()}
-    encoding_report = report_part(report, 0.7, 0.85)
+    encoding_report = report_to(part_of_progress(progress, 0.7, 0.85))
     packer = Packer(model, provenance, sensitivity, scene=None, finetune_steps=0, prune=True, report=encoding_report)
     candidate = packer.encode_to_distortion(distortion, references)
     for number in range(MAX_TRIALS):
-        trial_report = report_round(report_part(report, 0.85, 1.0), number)
-        trial_report("comparing renders of the file with those of the original", 0.0)
+        trial_progress = round_of_progress(part_of_progress(progress, 0.85, 1.0), number)
+        trial_progress(TaskEvent("comparing renders of the file with those of the original", 0.0))
         added_error = _mse(np.mean(distilled.validation.psnr_per_view(packer.decode(candidate)))) - error
         if added_error <= allowance:
             break
@@ -75,7 +82,7 @@ def pack(
             f"packing adds a mean squared error of {added_error:.2g}, limit {allowance:.2g}; encoding again at "
             f"distortion {distortion:.2g}"
         )
-        candidate = packer.encode(distortion, report_part(trial_report, 0.5, 1.0))
+        candidate = packer.encode(distortion, report_to(part_of_progress(trial_progress, 0.5, 1.0)))
     return candidate.data
 
 

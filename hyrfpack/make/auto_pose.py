@@ -13,7 +13,6 @@ from hyrfpack.lock import exclusive_folder
 from hyrfpack.make.source import LoadSettings, Source
 from hyrfpack.make.stage_cache import interruptible
 from hyrfpack.make.stages import SCENE_FOLDER, is_posed
-from hyrfpack.progress import report_to
 
 _LOG = logging.getLogger(__name__)
 
@@ -70,5 +69,5 @@ def _estimate_unless_posed(photos: Path, scene: Path, overwrite: bool, context: 
             f"poses are taken from {scene}, where they were estimated before; `overwrite=True` estimates them anew"
         )
         return
-    with interruptible(), context.open_progress("poses") as progress:
-        estimate_poses(photos, scene, overwrite=overwrite, report=report_to(progress))
+    with interruptible():
+        estimate_poses(photos, scene, overwrite=overwrite, context=context)

@@ -223,7 +223,7 @@ class _Pipeline:
             return self._finish(self.source.path, scene=None)
         if kind == "splats":
             steps = QUALITIES[self.request.quality].import_steps
-            facts = stages.run_import_stage(self.stage_cache, self.source.path, steps, self.request.seed)
+            facts = stages.run_import_stage(self.stage_cache, self.source.path, steps, self.request.seed, self.context)
             return self._finish(self.stage_cache.folder / stages.PACKED_MODEL, scene=None, imported=facts)
         return self._make_from_photos()
 
@@ -262,7 +262,9 @@ class _Pipeline:
         self.reporter.estimates |= estimates
         if source.archive is not None:
             _LOG.info(f"{source.archive.name} was unpacked into {source.path} and is reused from there")
-        return stages.run_pose_stage(self.stage_cache, source.path, source.files(), request.matching, request.seed)
+        return stages.run_pose_stage(
+            self.stage_cache, source.path, source.files(), request.matching, request.seed, self.context
+        )
 
     def _scene_digest(self, scene: Scene) -> str:
         """Return the digest of all files of a scene; for an archive, that of its unpacked files."""

@@ -54,7 +54,7 @@ def is_posed(scene: Path) -> bool:
 
 
 def run_pose_stage(
-    stage_cache: StageCache, photos: Path, files: Sequence[Path], matching: str, seed: int
+    stage_cache: StageCache, photos: Path, files: Sequence[Path], matching: str, seed: int, context: RunContext
 ) -> dict[str, Any]:
     """Estimate poses into `scene/`; return the report of `hyrfpack.estimate_poses`."""
 
@@ -68,7 +68,7 @@ def run_pose_stage(
                 scene,
                 matching=matching,
                 seed=seed,
-                report=stage_cache.reporter.report_share,
+                context=context,
             )
         shutil.rmtree(scene / ".poses", ignore_errors=True)  # products in progress stay if a call is killed at its end
         files = sorted(path for path in scene.rglob("*") if path.is_file())
@@ -213,7 +213,9 @@ def run_compression_stage(stage_cache: StageCache, scene: Scene, plan: Plan, dev
     return stage_cache.run_stage("compression", inputs, execute)
 
 
-def run_import_stage(stage_cache: StageCache, source: Path, steps: int, seed: int) -> dict[str, Any]:
+def run_import_stage(
+    stage_cache: StageCache, source: Path, steps: int, seed: int, context: RunContext
+) -> dict[str, Any]:
     """Distil splats of another program into `model.hyrf`; return the report of `hyrfpack.import_splats`."""
     files = sorted(p for p in source.parent.iterdir() if p.is_file()) if source.name == "meta.json" else [source]
     if source.is_dir():
@@ -225,7 +227,7 @@ def run_import_stage(stage_cache: StageCache, source: Path, steps: int, seed: in
             source,
             stage_cache.folder / PACKED_MODEL,
             config,
-            report=stage_cache.reporter.report_share,
+            context=context,
         )
         return report.to_dict(), [PACKED_MODEL]
 

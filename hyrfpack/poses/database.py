@@ -12,8 +12,8 @@ import pycolmap
 
 from hyrfpack.atomic import write_atomic
 from hyrfpack.poses.job import Job
-from hyrfpack.poses.process import Report
 from hyrfpack.poses.watch import count_rows, report_new_rows
+from hyrfpack.progress import Progress, TaskEvent
 
 pycolmap.logging.minloglevel = 1  # only warnings and errors go into the log of a stage
 Cameras = dict[int, pycolmap.Camera]  # cameras by their numbers, which start at 1
@@ -81,7 +81,7 @@ def read_cameras(database: pycolmap.Database) -> Cameras:
     return {camera.camera_id: camera for camera in database.read_all_cameras()}
 
 
-def recalibrate(job: Job, step_name: str, decide: Callable[[Cameras], Cameras], report_progress: Report) -> bool:
+def recalibrate(job: Job, step_name: str, decide: Callable[[Cameras], Cameras], report_progress: Progress) -> bool:
     """Replace cameras in the database by better ones, and verify all pairs again with them.
 
     The decision is saved before the database is changed, so that a call after an interruption makes the same
@@ -91,7 +91,7 @@ def recalibrate(job: Job, step_name: str, decide: Callable[[Cameras], Cameras], 
         job: the estimation.
         step_name: name of this step, used in the names of its files.
         decide: maps the current cameras to the replacements, both by number.
-        report_progress: called with a description and the completed ratio of this step, in [0.5, 1].
+        report_progress: called with `TaskEvent`s, whose share of this step is in [0.5, 1].
 
     Returns:
         Whether any camera was replaced.
@@ -115,7 +115,7 @@ def recalibrate(job: Job, step_name: str, decide: Callable[[Cameras], Cameras], 
         def report_done(done: int) -> None:
             share = min(done / max(count, 1), 1.0)
             doing = f"verifying pairs with refined focal lengths {min(done, count)}/{count}"
-            report_progress(doing, 0.5 + 0.5 * share)
+            report_progress(TaskEvent(doing, 0.5 + 0.5 * share))
 
         with report_new_rows(job, "two_view_geometries", report_done):
             pycolmap.geometric_verification(job.database, two_view_geometry_options=verification_options(job.seed))

@@ -6,11 +6,13 @@ import logging
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from hyrfpack.checks import check_choice, check_int
 from hyrfpack.choices import MATCHING_METHODS
+from hyrfpack.context import RunContext
 from hyrfpack.data.archive import archive_paths_in_errors, is_archive, unpack
 from hyrfpack.data.equirectangular import FACES
 from hyrfpack.data.folder import list_photos, list_pictures, list_raw_photos
@@ -34,6 +36,7 @@ from hyrfpack.poses.prepare import (
     select_unreadable,
 )
 from hyrfpack.poses.process import StageCrashedError, run_stage
+from hyrfpack.progress import Event, Progress, TaskEvent, part_of_progress
 
 _LOG = logging.getLogger(__name__)
 
@@ -48,8 +51,6 @@ _STAGE_TIME_RATIOS = {
 }
 _VIDEO_FRAMES_TIME_RATIO = 0.3  # choosing the frames of a video takes this ratio of the time, all other stages the rest
 _MIN_RAY_ANGLE_DEGREES = 2.0  # with smaller triangulation angles, the camera hardly moved
-
-Report = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)
@@ -89,7 +90,7 @@ def estimate_poses(
     masks: StrPath | None = None,
     seed: int = 0,
     overwrite: bool = False,
-    report: Report | None = None,
+    context: RunContext = RunContext(),  # noqa: B008 - frozen
 ) -> PosesReport:
     """Estimate the camera poses of photos and write a scene that `load_scene` reads.
 
@@ -110,7 +111,7 @@ def estimate_poses(
         seed: random seed.
         overwrite: replace poses and photos that an earlier call wrote into `out`. Files of other origin are never
             replaced.
-        report: called with a description of the current work and the ratio of the whole work that is done.
+        context: progress and stop.
 
     Returns:
         The number of registered photos, the choice that was made, and doubts about it.
@@ -128,8 +129,8 @@ def estimate_poses(
     """
     check_choice("matching", matching, MATCHING_METHODS)
     check_int("seed", seed, 0, 2**64 - 1)
-    with explain_disk_errors(Path(out)), archive_paths_in_errors():
-        return _PoseEstimation(Path(photos), Path(out), matching, masks, seed, overwrite, report).run()
+    with explain_disk_errors(Path(out)), archive_paths_in_errors(), context.open_progress("poses") as progress:
+        return _PoseEstimation(Path(photos), Path(out), matching, masks, seed, overwrite, progress).run()
 
 
 @dataclass
@@ -142,7 +143,7 @@ class _PoseEstimation:
     masks: StrPath | None
     seed: int
     overwrite: bool
-    report: Report | None
+    progress: Progress
     photo_count: int = 0
     left_out: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
@@ -175,7 +176,7 @@ class _PoseEstimation:
 
     def _run_stages(self) -> PosesReport:
         began = time.monotonic()
-        self._report_progress("photos", "reading photos", 0.0)
+        self._report_progress("photos", TaskEvent("reading photos", 0.0))
         job = self._prepare_job()
         self.seconds["photos"] = time.monotonic() - began
         features = self._run_stage("features")
@@ -291,12 +292,10 @@ class _PoseEstimation:
 
     def _take_frames(self) -> Path:
         """Write the chosen frames of the video; return their folder."""
-
-        def report_frames(doing: str, share: float) -> None:
-            self._report_progress("photos", doing, 0.9 * share)
+        report_frames = part_of_progress(partial(self._report_progress, "photos"), 0.0, 0.9)
 
         def take(folder: Path) -> FrameReport:
-            return choose_frames(self.photos, folder, report=report_frames)
+            return choose_frames(self.photos, folder, progress=report_frames)
 
         folder = self.output.make_folder("images", take, resume_filling=True)
         frames = take(folder)  # reads the record of the frames, which are now all written
@@ -318,7 +317,8 @@ class _PoseEstimation:
         """Return a function that reports how many photos are done, as `first` to `last` of the first stage."""
 
         def progress(done: int) -> None:
-            self._report_progress("photos", f"{doing} {done}/{count}", first + (last - first) * done / max(count, 1))
+            share = first + (last - first) * done / max(count, 1)
+            self._report_progress("photos", TaskEvent(f"{doing} {done}/{count}", share))
 
         return progress
 
@@ -352,7 +352,7 @@ class _PoseEstimation:
         """Run a stage in its process and return its answer."""
         began, job = time.monotonic(), self.output.work / "job.json"
         try:
-            answer = run_stage(job, stage, lambda doing, share: self._report_progress(stage, doing, share), *more)
+            answer = run_stage(job, stage, partial(self._report_progress, stage), *more)
         finally:
             self.seconds[stage] = time.monotonic() - began
         self.has_products = True
@@ -418,16 +418,17 @@ class _PoseEstimation:
         self.notes.append(sentence)
         _LOG.log(level, sentence)
 
-    def _report_progress(self, stage: str, doing: str, share: float) -> None:
-        """Report the progress of a stage as a ratio of the whole work."""
-        if self.report is not None:
-            shares = dict(_STAGE_TIME_RATIOS)
-            if self.is_video:
-                rest = (1 - _VIDEO_FRAMES_TIME_RATIO) / (1 - _STAGE_TIME_RATIOS["photos"])
-                shares = {name: rest * value for name, value in _STAGE_TIME_RATIOS.items()} | {
-                    "photos": _VIDEO_FRAMES_TIME_RATIO
-                }
-            stages = list(shares)
-            before = sum(shares[earlier] for earlier in stages[: stages.index(stage)])
-            self.reported_ratio = max(self.reported_ratio, min(before + shares[stage] * share, 1.0))
-            self.report(doing, self.reported_ratio)
+    def _report_progress(self, stage: str, event: Event) -> None:
+        """Report a task of a stage, with its share of the whole work."""
+        if not isinstance(event, TaskEvent) or event.share is None:
+            return
+        shares = dict(_STAGE_TIME_RATIOS)
+        if self.is_video:
+            rest = (1 - _VIDEO_FRAMES_TIME_RATIO) / (1 - _STAGE_TIME_RATIOS["photos"])
+            shares = {name: rest * value for name, value in _STAGE_TIME_RATIOS.items()} | {
+                "photos": _VIDEO_FRAMES_TIME_RATIO
+            }
+        stages = list(shares)
+        before = sum(shares[earlier] for earlier in stages[: stages.index(stage)])
+        self.reported_ratio = max(self.reported_ratio, min(before + shares[stage] * event.share, 1.0))
+        self.progress(TaskEvent(event.task, self.reported_ratio))

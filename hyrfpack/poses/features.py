@@ -20,15 +20,15 @@ from hyrfpack.data.quality import measure_sharpness
 from hyrfpack.errors import HyrfDataError, strip_path
 from hyrfpack.poses.database import make_database, open_database
 from hyrfpack.poses.job import Job, chunks
-from hyrfpack.poses.process import Report
 from hyrfpack.poses.watch import report_new_rows
+from hyrfpack.progress import Progress, TaskEvent
 
 _MAX_FEATURES_PER_PHOTO = 8192
 _MAX_UPSAMPLED_SIDE_PIXELS = 1000  # in copies up to this size, features are also found at twice the resolution
 _PHOTOS_PER_CHUNK = 16  # results are saved after each chunk, so an interruption costs at most one chunk
 
 
-def find_features(job: Job, report_progress: Report) -> dict[str, Any]:
+def find_features(job: Job, report_progress: Progress) -> dict[str, Any]:
     """Find the features of all photos that have none yet in the database.
 
     Args:
@@ -50,7 +50,7 @@ def find_features(job: Job, report_progress: Report) -> dict[str, Any]:
 
     def report_done(done: int) -> None:
         number = min(done + 1, len(job.names))
-        report_progress(f"finding features in photo {number}/{len(job.names)}", done / len(job.names))
+        report_progress(TaskEvent(f"finding features in photo {number}/{len(job.names)}", done / len(job.names)))
 
     for camera, device in enumerate(job.devices, start=1):
         camera_photos = [

@@ -19,7 +19,7 @@ from hyrfpack.poses.database import open_database, verified_pairs
 from hyrfpack.poses.explained_matches import RayMatches, count_explained_matches
 from hyrfpack.poses.job import Job
 from hyrfpack.poses.mapping import MIN_PIECE_PHOTOS, SOLVER_THREADS, add_two_view_points, complete_model, read_pieces
-from hyrfpack.poses.process import Report
+from hyrfpack.progress import Progress, TaskEvent
 
 # Limits of the reprojection error with another lens model, relative to the error with one radial coefficient.
 _MAX_OPENCV_ERROR_RATIO = 0.99
@@ -30,7 +30,7 @@ _MIN_REFITTED_MATCH_RATIO = 0.997  # a refit with another lens model must keep t
 _COLOR_PICTURE_SIDE_PIXELS = 400  # points get their colours from pictures with this longer side
 
 
-def finish_reconstruction(job: Job, models: list[str], report_progress: Report) -> dict[str, Any]:
+def finish_reconstruction(job: Job, models: list[str], report_progress: Progress) -> dict[str, Any]:
     """Choose between the mappers' results, complete the chosen one, and save it as `job.model_folder("chosen")`.
 
     Args:
@@ -43,7 +43,7 @@ def finish_reconstruction(job: Job, models: list[str], report_progress: Report) 
         "mapper", "why" and "doubt": the choice and sentences about it. "angle": the median over points of the largest
         triangulation angle in degrees. If no photo is posed, only "registered", which is empty.
     """
-    report_progress("comparing both reconstructions", 0.0)
+    report_progress(TaskEvent("comparing both reconstructions", 0.0))
     pieces = {name: read_pieces(job.model_folder(name)) for name in models}
     pieces = {name: found for name, found in pieces.items() if found and found[0].num_reg_images() >= MIN_PIECE_PHOTOS}
     if not pieces:
@@ -66,7 +66,7 @@ def finish_reconstruction(job: Job, models: list[str], report_progress: Report) 
         ),
     ]
     for doing, share, refine, min_match_ratio in steps:
-        report_progress(doing, share)
+        report_progress(TaskEvent(doing, share))
         refined = refine(model)
         refined_poses = _read_poses(job, refined)
         refined_explained_count = count_explained_matches(refined_poses, _read_ray_matches(job, refined))
@@ -136,7 +136,7 @@ def _read_ray_matches(job: Job, model: pycolmap.Reconstruction) -> list[RayMatch
         ]
 
 
-def _choose_lens(model: pycolmap.Reconstruction, report_progress: Report) -> pycolmap.Reconstruction:
+def _choose_lens(model: pycolmap.Reconstruction, report_progress: Progress) -> pycolmap.Reconstruction:
     """Choose the lens model that fits the photos, and return a copy refined with it.
 
     COLMAP's OPENCV model, with four coefficients of distortion, is chosen if it fits clearly better than one radial
@@ -145,12 +145,12 @@ def _choose_lens(model: pycolmap.Reconstruction, report_progress: Report) -> pyc
     """
     error = _refit_with_lens(model, "SIMPLE_RADIAL").compute_mean_reprojection_error()
     photos = Counter(image.camera_id for image in model.images.values() if image.has_pose)
-    report_progress("estimating the lens distortion, model 2/3", 0.6)
+    report_progress(TaskEvent("estimating the lens distortion, model 2/3", 0.6))
     if min(photos.values()) >= _MIN_OPENCV_PHOTOS:
         opencv = _refit_with_lens(model, "OPENCV")
         if opencv.compute_mean_reprojection_error() < _MAX_OPENCV_ERROR_RATIO * error:
             return opencv
-    report_progress("estimating the lens distortion, model 3/3", 0.7)
+    report_progress(TaskEvent("estimating the lens distortion, model 3/3", 0.7))
     pinhole = _refit_with_lens(model, "SIMPLE_PINHOLE")
     return pinhole if pinhole.compute_mean_reprojection_error() <= _MAX_PINHOLE_ERROR_RATIO * error else model
 
@@ -190,11 +190,12 @@ def _rescale_to_photos(job: Job, model: pycolmap.Reconstruction) -> None:
             point.xy = point.xy * scale
 
 
-def _color_points(job: Job, model: pycolmap.Reconstruction, report_progress: Report) -> None:
+def _color_points(job: Job, model: pycolmap.Reconstruction, report_progress: Progress) -> None:
     """Give each point the mean colour of the pixels in which it is observed."""
     sums: dict[int, np.ndarray] = {}
     for number, image in enumerate(model.images.values(), start=1):
-        report_progress(f"colouring points, photo {number}/{len(model.images)}", 0.8 + 0.2 * number / len(model.images))
+        count = len(model.images)
+        report_progress(TaskEvent(f"colouring points, photo {number}/{count}", 0.8 + 0.2 * number / count))
         seen = [(point.point3D_id, point.xy) for point in image.points2D if point.has_point3D()]
         if not (image.has_pose and seen):
             continue

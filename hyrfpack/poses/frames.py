@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -18,10 +17,10 @@ from hyrfpack.errors import HyrfDataError
 from hyrfpack.outputs import StrPath
 from hyrfpack.poses.motion import TRACKING_SIDE_PIXELS, motion_distances, track_windows
 from hyrfpack.poses.video import Video, decode_gray, decode_upright, is_video, open_video
+from hyrfpack.progress import Progress, TaskEvent, ignore_progress
 
 __all__ = ["FrameReport", "choose_frames", "is_video", "survey_frames"]
 
-Report = Callable[[str, float], None]
 
 RECORD_NAME = "frames.json"  # this file beside the frames states their video and settings
 
@@ -91,7 +90,9 @@ class _VideoMeasurement:
     notes: tuple[str, ...]
 
 
-def choose_frames(video: StrPath, folder: StrPath, *, most: int = 150, report: Report | None = None) -> FrameReport:
+def choose_frames(
+    video: StrPath, folder: StrPath, *, most: int = 150, progress: Progress = ignore_progress
+) -> FrameReport:
     """Choose sharp, evenly spaced frames of a video and write them as photos.
 
     All frames are decoded once to measure their sharpness and the motion of the picture. The chosen frames are decoded
@@ -107,7 +108,7 @@ def choose_frames(video: StrPath, folder: StrPath, *, most: int = 150, report: R
         video: a video file that FFmpeg can read. High dynamic range is tone mapped to sRGB.
         folder: output folder; created if missing. Only frames of an earlier call are removed from it.
         most: maximum number of frames to take.
-        report: called with a description of the current work and the ratio of the work that is done, in [0, 1].
+        progress: called with `TaskEvent`s.
 
     Raises:
         HyrfDataError: the file is missing or is no video, or too few frames can be decoded, are sharp, or differ.
@@ -123,30 +124,29 @@ def choose_frames(video: StrPath, folder: StrPath, *, most: int = 150, report: R
     if most < _MIN_TAKEN_FRAMES:
         raise ValueError(f"most must be {_MIN_TAKEN_FRAMES} or more, not {most}")
     video, folder = Path(video), Path(folder)
-    report_progress = report or (lambda text, share: None)
     with open_video(video) as source:
         key = {"video": video.name, "bytes": video.stat().st_size, "modified": video.stat().st_mtime_ns, "most": most}
         record = _read_record(folder)
         if record is None or record["key"] != key:
-            measured = _measure_video(video, source, report_progress)
-            chosen, found = _choose_spaced_frames(video, measured, most, report_progress)
+            measured = _measure_video(video, source, progress)
+            chosen, found = _choose_spaced_frames(video, measured, most, progress)
             _remove_frames(folder, record)
             make_folder(folder)
             times = {_frame_name(number): seconds for number, seconds in chosen.items()}
             record = {"key": key, "frames": list(chosen), "times": times, "report": asdict(found)}
             write_atomic(folder / RECORD_NAME, json.dumps(record).encode())
-        _write_frames(source, folder, record["frames"], report_progress)
-    report_progress("frames written", 1.0)
+        _write_frames(source, folder, record["frames"], progress)
+    progress(TaskEvent("frames written", 1.0))
     return FrameReport(**{**record["report"], "notes": tuple(record["report"]["notes"])})
 
 
 def survey_frames(
-    video: StrPath, *, most: int = 150, report: Report | None = None
+    video: StrPath, *, most: int = 150, progress: Progress = ignore_progress
 ) -> tuple[FrameReport, tuple[int, int], int]:
     """Measure a video and report which frames `choose_frames` would take, without writing any file.
 
     Args:
-        video, most, report: see `choose_frames`.
+        video, most, progress: see `choose_frames`.
 
     Returns:
         The report, the (width, height) of the stored frames, and the number of measured frames.
@@ -159,16 +159,15 @@ def survey_frames(
     """
     video = Path(video)
     with open_video(video) as source:
-        report_progress = report or (lambda text, share: None)
-        measured = _measure_video(video, source, report_progress)
+        measured = _measure_video(video, source, progress)
         return (
-            _choose_spaced_frames(video, measured, most, report_progress)[1],
+            _choose_spaced_frames(video, measured, most, progress)[1],
             source.size,
             len(measured.numbers) + measured.repeated_count,
         )
 
 
-def _measure_video(path: Path, video: Video, report_progress: Report) -> _VideoMeasurement:
+def _measure_video(path: Path, video: Video, progress: Progress) -> _VideoMeasurement:
     """Decode a video once; measure the sharpness of its frames, and keep thumbnails on which motion is tracked."""
     step = max(1 / _MAX_MEASURED_FRAMES_PER_SECOND, video.seconds / _MAX_MEASURED_FRAMES)
     numbers: list[int] = []
@@ -199,7 +198,7 @@ def _measure_video(path: Path, video: Video, report_progress: Report) -> _VideoM
             times.append(time)
         length = f" of {video.seconds:.0f} s" if video.seconds else ""
         share = min(1.0, time / video.seconds) if video.seconds else 0.0
-        report_progress(f"measuring frame {decoded_count}, {time:.0f} s{length}", _MEASURED_PROGRESS * share)
+        progress(TaskEvent(f"measuring frame {decoded_count}, {time:.0f} s{length}", _MEASURED_PROGRESS * share))
     if decoded_count < _MIN_DECODED_FRAMES:
         can_be_decoded, copy_or = (
             (" that can be decoded", "copy it again in full, or ") if video.damaged_count else ("", "")
@@ -228,7 +227,7 @@ def _measure_video(path: Path, video: Video, report_progress: Report) -> _VideoM
 
 
 def _choose_spaced_frames(
-    path: Path, measured: _VideoMeasurement, most: int, report_progress: Report
+    path: Path, measured: _VideoMeasurement, most: int, progress: Progress
 ) -> tuple[dict[int, float], FrameReport]:
     """Return the frames to take, as number -> time in seconds, and the report about them."""
     blurred = is_blurred(measured.sharpness)
@@ -239,11 +238,11 @@ def _choose_spaced_frames(
         )
     sharp = np.flatnonzero(~blurred)
 
-    def progress(done: int) -> None:
+    def report_tracked(done: int) -> None:
         share = _MEASURED_PROGRESS + (_TRACKED_PROGRESS - _MEASURED_PROGRESS) * done / len(sharp)
-        report_progress(f"measuring the camera motion, frame {done}/{len(sharp)}", share)
+        progress(TaskEvent(f"measuring the camera motion, frame {done}/{len(sharp)}", share))
 
-    trajectories = track_windows([measured.thumbnails[index] for index in sharp], progress)
+    trajectories = track_windows([measured.thumbnails[index] for index in sharp], report_tracked)
     values = measured.sharpness[sharp]
     spacing = _DEFAULT_SPACING_RATIO
     picked = _pick_sharpest_frames(trajectories, values, spacing)
@@ -328,7 +327,7 @@ def _pick_sharpest_frames(trajectories: np.ndarray, sharp: np.ndarray, spacing: 
     return picked
 
 
-def _write_frames(video: Video, folder: Path, numbers: list[int], report_progress: Report) -> None:
+def _write_frames(video: Video, folder: Path, numbers: list[int], progress: Progress) -> None:
     """Write the frames of these numbers that are not yet in the folder."""
     missing = {number for number in numbers if not (folder / _frame_name(number)).is_file()}
     if not missing:
@@ -342,7 +341,8 @@ def _write_frames(video: Video, folder: Path, numbers: list[int], report_progres
             write_atomic(folder / _frame_name(number), data.getvalue())
             missing.remove(number)
         written = f"writing frames {left - len(missing)}/{left}"
-        report_progress(written, _TRACKED_PROGRESS + (1 - _TRACKED_PROGRESS) * min((number + 1) / (last + 1), 1.0))
+        share = min((number + 1) / (last + 1), 1.0)
+        progress(TaskEvent(written, _TRACKED_PROGRESS + (1 - _TRACKED_PROGRESS) * share))
         if not missing:
             break
 

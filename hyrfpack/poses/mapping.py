@@ -17,8 +17,8 @@ import pycolmap
 
 from hyrfpack.poses.database import MIN_PAIR_MATCHES, Cameras, recalibrate
 from hyrfpack.poses.job import Job
-from hyrfpack.poses.process import Report
 from hyrfpack.poses.watch import report_global_mapping_phase
+from hyrfpack.progress import Progress, TaskEvent, part_of_progress
 
 _GLOBAL_RUNS = 3  # each run starts from other random positions, with the focal lengths that the previous run found
 # Pairs are verified again if the mapper changes the focal length by more than this ratio.
@@ -31,7 +31,7 @@ SOLVER_THREADS = 1  # sums over several threads differ in their last bits from r
 MIN_PIECE_PHOTOS = 3
 
 
-def map_globally(job: Job, report_progress: Report) -> dict[str, Any]:
+def map_globally(job: Job, report_progress: Progress) -> dict[str, Any]:
     """Run the global mapper (GLOMAP) several times and keep all results.
 
     Verified pairs depend on the focal length they were verified with, and the resulting focal length depends on the
@@ -50,13 +50,13 @@ def map_globally(job: Job, report_progress: Report) -> dict[str, Any]:
         name = f"global-{run_index}"
         if not job.model_folder(name).exists():
             doing = f"global mapping, run {run_index + 1}/{_GLOBAL_RUNS}"
-            report_progress(doing, run_index / _GLOBAL_RUNS)
+            report_progress(TaskEvent(doing, run_index / _GLOBAL_RUNS))
             seed, options = (job.seed + run_index) % 2**31, pycolmap.GlobalPipelineOptions()
             options.random_seed = options.mapper.random_seed = seed
             options.num_threads = options.mapper.num_threads = SOLVER_THREADS
             options.mapper.global_positioning.random_seed = options.mapper.rotation_averaging.random_seed = seed
             options.min_num_matches, options.min_model_size = MIN_PAIR_MATCHES, MIN_PIECE_PHOTOS
-            log, report_mapping = job.work / "global.log", _run_part_report(report_progress, run_index, 0.0, 0.8)
+            log, report_mapping = job.work / "global.log", _part_of_run(report_progress, run_index, 0.0, 0.8)
             with _info_log_level(), report_global_mapping_phase(log, doing, report_mapping):
                 found = pycolmap.global_mapping(job.database, job.images, _make_scratch_folder(job), options)
             _save_pieces(job, name, found)
@@ -67,14 +67,14 @@ def map_globally(job: Job, report_progress: Report) -> dict[str, Any]:
                 job,
                 f"{name}.focal",
                 partial(_select_better_cameras, pieces[0]),
-                _run_part_report(report_progress, run_index, 0.6, 1.0),
+                _part_of_run(report_progress, run_index, 0.6, 1.0),
             )
     return {"models": names}
 
 
-def _run_part_report(report_progress: Report, run_index: int, first: float, last: float) -> Report:
-    """Return a report function for a part of one run, which maps its ratio from [0, 1] to [first, last] of that run."""
-    return lambda doing, share: report_progress(doing, (run_index + first + (last - first) * share) / _GLOBAL_RUNS)
+def _part_of_run(report_progress: Progress, run_index: int, first: float, last: float) -> Progress:
+    """Return a progress function for the part of one run from its share `first` to `last`."""
+    return part_of_progress(report_progress, (run_index + first) / _GLOBAL_RUNS, (run_index + last) / _GLOBAL_RUNS)
 
 
 @contextmanager
@@ -88,7 +88,7 @@ def _info_log_level() -> Iterator[None]:
         pycolmap.logging.minloglevel = before
 
 
-def map_incrementally(job: Job, report_progress: Report) -> dict[str, Any]:
+def map_incrementally(job: Job, report_progress: Progress) -> dict[str, Any]:
     """Run the incremental mapper, which poses photos one after the other.
 
     If the global mapper found poses, its cameras are kept fixed here, because focal lengths can diverge when they are
@@ -112,7 +112,7 @@ def map_incrementally(job: Job, report_progress: Report) -> dict[str, Any]:
             options.ba_refine_focal_length = options.ba_refine_extra_params = False
             options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
         count = len(job.names)
-        report_progress(f"incremental mapping, choosing the first 2/{count} photos", 0.0)
+        report_progress(TaskEvent(f"incremental mapping, choosing the first 2/{count} photos", 0.0))
         pieces = pycolmap.incremental_mapping(
             job.database,
             job.images,
@@ -124,7 +124,7 @@ def map_incrementally(job: Job, report_progress: Report) -> dict[str, Any]:
     return {"models": [name]}
 
 
-def _make_photo_callback(count: int, report_progress: Report) -> Callable[[], None]:
+def _make_photo_callback(count: int, report_progress: Progress) -> Callable[[], None]:
     """Return the function that the incremental mapper calls after each photo.
 
     The number of remaining photos is unknown, because some get no pose and discarded models are restarted. So the
@@ -135,9 +135,8 @@ def _make_photo_callback(count: int, report_progress: Report) -> Callable[[], No
     def report_next_photo() -> None:
         nonlocal posed
         posed += 1
-        report_progress(
-            f"incremental mapping, {min(posed, count)}/{count} photos registered", 0.95 * min(posed / count, 1.0)
-        )
+        task = f"incremental mapping, {min(posed, count)}/{count} photos registered"
+        report_progress(TaskEvent(task, 0.95 * min(posed / count, 1.0)))
 
     return report_next_photo
 

@@ -27,8 +27,8 @@ from hyrfpack.poses.database import (
     verified_pairs,
 )
 from hyrfpack.poses.job import Job
-from hyrfpack.poses.process import Report
 from hyrfpack.poses.watch import report_new_rows
+from hyrfpack.progress import Progress, TaskEvent, part_of_progress
 
 _PORTION_SECONDS = 2.0  # pairs are matched in portions that take about this time, and saved after each portion
 _FIRST_PORTION_PAIRS = 100
@@ -42,7 +42,7 @@ _FOCAL_SEARCH_DESCRIPTION = "estimating focal lengths from matches"
 _ESTIMATED_FOCAL_CHANGE_RATIO = 0.05
 
 
-def match_photos(job: Job, report_progress: Report) -> dict[str, Any]:
+def match_photos(job: Job, report_progress: Progress) -> dict[str, Any]:
     """Match the chosen pairs, estimate unknown focal lengths, and verify all pairs with them.
 
     Args:
@@ -59,18 +59,16 @@ def match_photos(job: Job, report_progress: Report) -> dict[str, Any]:
     if not (job.work / "focal.json").exists():  # focal lengths are estimated after all pairs are matched
         _match_pairs(job, _choose_pairs(job, report_progress), report_progress)
 
-    def report_part(doing: str, share: float) -> None:
-        report_progress(doing, 0.82 + 0.13 * share)
-
-    report_part(_FOCAL_SEARCH_DESCRIPTION, 0.0)
+    report_part = part_of_progress(report_progress, 0.82, 0.95)
+    report_part(TaskEvent(_FOCAL_SEARCH_DESCRIPTION, 0.0))
     recalibrate(job, "focal", lambda cameras: _estimate_focals(job, cameras, report_part), report_part)
-    report_progress("checking that the camera moved", 0.95)
+    report_progress(TaskEvent("checking that the camera moved", 0.95))
     answer = _summarize_matches(job)
     write_atomic(marker, json.dumps(answer).encode())
     return answer
 
 
-def _choose_pairs(job: Job, report_progress: Report) -> pairing.Pairs:
+def _choose_pairs(job: Job, report_progress: Progress) -> pairing.Pairs:
     """Choose the pairs to match, by the matching mode of the job."""
     count = len(job.names)
     if job.matching == "exhaustive":
@@ -82,14 +80,14 @@ def _choose_pairs(job: Job, report_progress: Report) -> pairing.Pairs:
             found.append(database.read_descriptors(number).data if there else np.zeros((0, 128), np.uint8))
 
     def progress(done: int) -> None:
-        report_progress(f"choosing pairs to match, photo {done}/{count}", 0.02 * done / count)
+        report_progress(TaskEvent(f"choosing pairs to match, photo {done}/{count}", 0.02 * done / count))
 
     similarity = pairing.compute_similarities(found, job.seed, progress)
     choose = pairing.sequential_pairs if job.matching == "sequential" else pairing.retrieval_pairs
     return choose(count, similarity)
 
 
-def _match_pairs(job: Job, pairs: pairing.Pairs, report_progress: Report) -> None:
+def _match_pairs(job: Job, pairs: pairing.Pairs, report_progress: Progress) -> None:
     """Match pairs of photos in portions, each of which the database keeps after an interruption."""
     names = [job.working_name(number) for number in range(1, len(job.names) + 1)]
     with open_database(job) as database:
@@ -109,7 +107,7 @@ def _match_pairs(job: Job, pairs: pairing.Pairs, report_progress: Report) -> Non
 
     def report_done(done: int) -> None:
         number, share = min(done + 1, len(matchable)), min(done / len(matchable), 1.0)
-        report_progress(f"matching pair {number}/{len(matchable)}", 0.02 + 0.8 * share)
+        report_progress(TaskEvent(f"matching pair {number}/{len(matchable)}", 0.02 + 0.8 * share))
 
     while remaining:
         report_done(done)
@@ -129,7 +127,7 @@ def _match_pairs(job: Job, pairs: pairing.Pairs, report_progress: Report) -> Non
 
 
 def _estimate_focals(
-    job: Job, cameras: dict[int, pycolmap.Camera], report_progress: Report
+    job: Job, cameras: dict[int, pycolmap.Camera], report_progress: Progress
 ) -> dict[int, pycolmap.Camera]:
     """Estimate focal lengths that EXIF lacks; return the cameras whose focal length differs from the guess."""
     with open_database(job) as database:
@@ -141,7 +139,8 @@ def _estimate_focals(
 
             def progress(share: float, number: int = number) -> None:
                 camera = f", camera {number}/{len(job.devices)}" if len(job.devices) > 1 else ""
-                report_progress(f"{_FOCAL_SEARCH_DESCRIPTION}{camera}", 0.5 * (number - 1 + share) / len(job.devices))
+                whole = 0.5 * (number - 1 + share) / len(job.devices)
+                report_progress(TaskEvent(f"{_FOCAL_SEARCH_DESCRIPTION}{camera}", whole))
 
             found[number] = search_focal_ratio(camera_pairs, cameras[number], job.seed, progress)
     typical = float(np.median(list(found.values()))) if found else None

@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from queue import Empty, Queue
@@ -15,6 +14,7 @@ from threading import Thread
 from typing import Any
 
 from hyrfpack.errors import HyrfDataError, HyrfError
+from hyrfpack.progress import Progress, TaskEvent
 
 MAX_SILENCE_SECONDS = 2.0  # the last message is reported again after this time, so that a display keeps counting
 _TERMINATION_TIMEOUT_SECONDS = 3.0  # a process that takes longer to terminate is killed
@@ -27,14 +27,12 @@ _STAGE_DESCRIPTIONS = {
 _FINISH_DESCRIPTION = "finishing the poses"
 _IMPORT_ROOT = str(Path(__file__).parents[2])  # the folder from which hyrfpack was imported
 
-Report = Callable[[str, float], None]
-
 
 class StageCrashedError(HyrfError):
     """The process of a stage ended without an answer."""
 
 
-def run_stage(job: Path, stage: str, report_progress: Report, *arguments: str) -> dict[str, Any]:
+def run_stage(job: Path, stage: str, report_progress: Progress, *arguments: str) -> dict[str, Any]:
     """Run one stage of an estimation in a process of its own and wait for its answer.
 
     An exception in this process, such as KeyboardInterrupt, terminates the stage's process before it is raised again.
@@ -43,8 +41,7 @@ def run_stage(job: Path, stage: str, report_progress: Report, *arguments: str) -
     Args:
         job: path of the saved Job.
         stage: name of the stage, see `worker.run`.
-        report_progress: called with a description of the current work and the ratio of the stage that is done, at least
-            every MAX_SILENCE_SECONDS.
+        report_progress: called with `TaskEvent`s, whose share is that of the stage, at least every MAX_SILENCE_SECONDS.
         arguments: further arguments of the stage.
 
     Returns:
@@ -83,18 +80,18 @@ def run_stage(job: Path, stage: str, report_progress: Report, *arguments: str) -
     return answer
 
 
-def _read_answer(process: subprocess.Popen, report_progress: Report, doing: str) -> dict[str, Any]:
+def _read_answer(process: subprocess.Popen, report_progress: Progress, doing: str) -> dict[str, Any]:
     """Report the progress messages of a process until it ends; return its answer, empty if it sent none."""
     answer: dict[str, Any] = {}
     latest: dict[str, Any] = {"doing": doing, "share": 0.0}
-    report_progress(latest["doing"], latest["share"])
+    report_progress(TaskEvent(latest["doing"], latest["share"]))
     lines: Queue[str | None] = Queue()
     Thread(target=_read_lines, args=(process, lines), daemon=True).start()
     while True:
         try:
             line = lines.get(timeout=MAX_SILENCE_SECONDS)
         except Empty:
-            report_progress(latest["doing"], latest["share"])
+            report_progress(TaskEvent(latest["doing"], latest["share"]))
             continue
         if line is None:
             return answer
@@ -102,7 +99,7 @@ def _read_answer(process: subprocess.Popen, report_progress: Report, doing: str)
             message = json.loads(line)
             if isinstance(message, dict) and "doing" in message:
                 latest = message
-                report_progress(latest["doing"], latest["share"])
+                report_progress(TaskEvent(latest["doing"], latest["share"]))
             elif isinstance(message, dict) and "answer" in message:
                 answer = message["answer"]
 

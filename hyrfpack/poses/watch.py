@@ -9,7 +9,7 @@ from pathlib import Path
 from threading import Event, Thread
 
 from hyrfpack.poses.job import Job
-from hyrfpack.poses.process import Report
+from hyrfpack.progress import Progress, TaskEvent
 
 POLL_INTERVAL_SECONDS = 1.0
 
@@ -68,13 +68,13 @@ def report_new_rows(job: Job, table: str, report_count: Callable[[int], None]) -
 
 
 @contextmanager
-def report_global_mapping_phase(log: Path, doing: str, report_progress: Report) -> Iterator[None]:
+def report_global_mapping_phase(log: Path, doing: str, report_progress: Progress) -> Iterator[None]:
     """While the block runs, report the phase of the global mapper, read from its log.
 
     Args:
         log: file of the library's messages.
         doing: description that comes before the phase.
-        report_progress: called with the description and the ratio of the mapping that is done.
+        report_progress: called with `TaskEvent`s, whose share is that of the mapping.
     """
     before = log.stat().st_size if log.exists() else 0
 
@@ -84,7 +84,7 @@ def report_global_mapping_phase(log: Path, doing: str, report_progress: Report) 
             text = file.read().decode("utf-8", "replace")
         phase, share = parse_global_mapping_phase(text)
         if phase:
-            report_progress(f"{doing}: {phase}", share)
+            report_progress(TaskEvent(f"{doing}: {phase}", share))
 
     with poll_in_background(poll):
         yield

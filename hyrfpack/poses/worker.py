@@ -20,6 +20,7 @@ from typing import Any
 import hyrfpack  # must come first, because it imports zlib before pycolmap  # noqa: F401
 from hyrfpack.errors import HyrfError, needs_package
 from hyrfpack.poses.job import Job
+from hyrfpack.progress import Event, TaskEvent
 
 _output_lock = threading.Lock()  # a second thread reports progress during long calls, see `watch`
 _PR_SET_PDEATHSIG = 1  # option of Linux's prctl: the signal that a process gets when its parent ends
@@ -32,9 +33,10 @@ def send_message(message: dict[str, Any]) -> None:
         sys.stdout.flush()
 
 
-def report_progress(doing: str, share: float) -> None:
-    """Send a description of the current work and the ratio of this stage that is done."""
-    send_message({"doing": doing, "share": share})
+def report_progress(event: Event) -> None:
+    """Send the description of the current task and the share of this stage that is done."""
+    if isinstance(event, TaskEvent):
+        send_message({"doing": event.task, "share": event.share})
 
 
 def run(job: Job, stage: str, models: list[str]) -> dict[str, Any]:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from hyrfpack.context import RunContext
 from hyrfpack.data import load_scene, pose_commands
 from hyrfpack.data.archive import is_archive, unpack
 from hyrfpack.data.folder import PhotoFacts, list_photos, list_raw_photos
@@ -24,6 +25,7 @@ from hyrfpack.data.unusable import (
 from hyrfpack.errors import HyrfDataError, HyrfNoPosesError
 from hyrfpack.outputs import VIDEO_SUFFIXES, StrPath
 from hyrfpack.poses.frames import survey_frames
+from hyrfpack.progress import Progress, TaskEvent
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Scene
 from hyrfpack.survey.measure import measure_pixels, read_header_facts, relative_name
 from hyrfpack.survey.problems import (
@@ -80,7 +82,7 @@ class PhotoSurvey:
     problems: tuple[str, ...]
 
 
-def describe_photos(path: StrPath, *, report: Callable[[str, float], None] | None = None) -> PhotoSurvey:
+def describe_photos(path: StrPath, *, context: RunContext = RunContext()) -> PhotoSurvey:  # noqa: B008 - frozen
     """Describe a folder of photos, with poses or without, a .zip of one, or a video.
 
     An evenly spaced selection of a large set is examined: the headers of 2,000 photos and the pixels of 150. A video is
@@ -88,7 +90,7 @@ def describe_photos(path: StrPath, *, report: Callable[[str, float], None] | Non
 
     Args:
         path: the folder or file.
-        report: called with a description of the current work and the ratio of the work that is done, in [0, 1].
+        context: progress and stop.
 
     Raises:
         HyrfDataError: the path does not exist, or has no photo that can be read.
@@ -100,14 +102,18 @@ def describe_photos(path: StrPath, *, report: Callable[[str, float], None] | Non
         >>> survey.problems[0]
         'there are only 10 photos; take 20 or more, from all around and with much overlap'
     """
-    path = Path(path)
-    report_progress = report or (lambda text, share: None)
+    with context.open_progress("info") as report_progress:
+        return _describe(Path(path), report_progress)
+
+
+def _describe(path: Path, report_progress: Progress) -> PhotoSurvey:
+    """Describe photos or a video as `describe_photos` does."""
     if path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES:
         return _describe_video(path, report_progress)
     raise_if_single_photo(path)
     folder = unpack(path) if is_archive(path) else path
     photos = list_photos(folder)
-    report_progress("reading poses", 0.0)
+    report_progress(TaskEvent("reading poses", 0.0))
     scene, problems = _load_scene_or_problem(path, folder)
     posed = _posed_files(scene)
     photos = sorted({*photos, *posed})
@@ -137,7 +143,7 @@ def describe_photos(path: StrPath, *, report: Callable[[str, float], None] | Non
     if len(measurements) + len(unreadable) < len(photos):
         notes.append(f"the pixels of {len(measurements)} of {len(photos)} photos were measured, evenly spaced")
     preset = ": ".join(detect_preset(scene)) if scene is not None and scene.train else ""
-    report_progress("described", 1.0)
+    report_progress(TaskEvent("described", 1.0))
     return PhotoSurvey(
         path=str(path),
         kind="photos",
@@ -159,9 +165,9 @@ def describe_photos(path: StrPath, *, report: Callable[[str, float], None] | Non
     )
 
 
-def _describe_video(path: Path, report_progress: Callable[[str, float], None]) -> PhotoSurvey:
+def _describe_video(path: Path, report_progress: Progress) -> PhotoSurvey:
     """Describe a video."""
-    found, size, looked = survey_frames(path, report=report_progress)
+    found, size, looked = survey_frames(path, progress=report_progress)
     problems = [f"a video has no poses; {pose_commands(path)}"]
     return PhotoSurvey(
         path=str(path),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ from hyrfpack.data.folder import PhotoFacts, read_photo_facts
 from hyrfpack.data.quality import Exposure, measure_exposure, measure_sharpness, read_gray
 from hyrfpack.errors import HyrfDataError, strip_path
 from hyrfpack.parallel.pool import thread_count
+from hyrfpack.progress import Progress, TaskEvent
 from hyrfpack.scene import evenly_spaced
 
 # An evenly spaced selection of larger sets is examined, so that a survey takes seconds and not minutes.
@@ -44,7 +44,7 @@ class PhotoMeasurement:
 
 
 def read_header_facts(
-    photos: list[Path], folder: Path, report_progress: Callable[[str, float], None]
+    photos: list[Path], folder: Path, report_progress: Progress
 ) -> tuple[list[PhotoFacts], dict[str, str]]:
     """Read the headers of photos; return their facts, and the reason for each photo that cannot be read, by name."""
     facts, unreadable = [], {}
@@ -55,12 +55,12 @@ def read_header_facts(
         except HyrfDataError as error:
             unreadable[relative_name(photo, folder)] = strip_path(error, display_path(photo))
         read = f"reading the headers of photos {done + 1}/{len(chosen)}"
-        report_progress(read, HEADERS_PROGRESS * (done + 1) / len(chosen))
+        report_progress(TaskEvent(read, HEADERS_PROGRESS * (done + 1) / len(chosen)))
     return facts, unreadable
 
 
 def measure_pixels(
-    photos: list[Path], folder: Path, report_progress: Callable[[str, float], None]
+    photos: list[Path], folder: Path, report_progress: Progress
 ) -> tuple[list[PhotoMeasurement], dict[str, str]]:
     """Measure the pixels of photos; also return the reason for each undecodable photo, by name."""
     chosen = evenly_spaced(photos, MAX_DECODED_PHOTOS)
@@ -72,7 +72,9 @@ def measure_pixels(
             else:
                 undecodable[relative_name(chosen[done], folder)] = found
             looked = f"measuring photo {done + 1}/{len(chosen)}"
-            report_progress(looked, HEADERS_PROGRESS + (PIXELS_PROGRESS - HEADERS_PROGRESS) * (done + 1) / len(chosen))
+            report_progress(
+                TaskEvent(looked, HEADERS_PROGRESS + (PIXELS_PROGRESS - HEADERS_PROGRESS) * (done + 1) / len(chosen))
+            )
     return measurements, undecodable
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import shlex
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +12,7 @@ from hyrfpack.data.folder import PhotoFacts
 from hyrfpack.data.quality import MIN_SHARPNESS
 from hyrfpack.data.unusable import format_file_names, format_photo_count
 from hyrfpack.outputs import PICTURE_SUFFIXES
+from hyrfpack.progress import Progress, TaskEvent
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Scene
 from hyrfpack.survey.measure import PIXELS_PROGRESS, PhotoMeasurement, relative_name
 
@@ -52,7 +52,7 @@ def find_copy_problems(
     photos: list[Path],
     measurements: list[PhotoMeasurement],
     folder: Path,
-    report_progress: Callable[[str, float], None],
+    report_progress: Progress,
 ) -> list[str]:
     """Describe copies of photos, or a set that shows the same picture throughout."""
     thumbnails = np.stack([measurement.thumbnail for measurement in measurements])
@@ -66,7 +66,7 @@ def find_copy_problems(
     suspects = [item for group in sizes.values() if len(group) > 1 for item in group]
     for done, photo in enumerate(suspects):
         compared = f"searching for identical photos {done + 1}/{len(suspects)}"
-        report_progress(compared, PIXELS_PROGRESS + (1 - PIXELS_PROGRESS) * done / len(suspects))
+        report_progress(TaskEvent(compared, PIXELS_PROGRESS + (1 - PIXELS_PROGRESS) * done / len(suspects)))
         digest = hashlib.sha256(photo.read_bytes()).digest()
         if digest in seen:
             copies.append((photo, seen[digest]))

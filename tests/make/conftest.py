@@ -132,10 +132,11 @@ def poses(posed, monkeypatch) -> list[Path]:
     """A list of the arguments of each call of `estimate_poses`, which gives the known poses instead of estimating."""
     calls: list[Path] = []
 
-    def estimate_poses(photos, out, *, matching="auto", masks=None, seed=0, overwrite=False, report=None):
+    def estimate_poses(photos, out, *, matching="auto", masks=None, seed=0, overwrite=False, context):
         out = Path(out)
         calls.append(Path(photos))
-        report("matching", 0.5)
+        with context.open_progress() as progress:
+            progress(TaskEvent("matching", 0.5))
         scene = load_scene(posed, test_every=0)
         shutil.copytree(posed / "images", out / "images", dirs_exist_ok=True)
         write_colmap([(view.name, view.camera) for view in scene.views], out, None)

@@ -9,6 +9,8 @@ import pytest
 from made_up_photos import write_photos
 
 import hyrfpack
+from hyrfpack.context import RunContext
+from hyrfpack.progress import Event
 
 
 @pytest.fixture(scope="session")
@@ -30,8 +32,8 @@ def photos_and_poses(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, di
 def estimated_scene(
     photos_and_poses, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, hyrfpack.PosesReport, list]:
-    """The estimated scene, its report and the progress that was reported. Tests must not change it."""
-    progress: list[tuple[str, float]] = []
+    """The estimated scene, its report and the events that were reported. Tests must not change it."""
+    progress: list[Event] = []
     out = tmp_path_factory.mktemp("posed") / "a scene"
-    report = hyrfpack.estimate_poses(photos_and_poses[0], out, report=lambda *now: progress.append(now))
+    report = hyrfpack.estimate_poses(photos_and_poses[0], out, context=RunContext(progress=progress.append))
     return out, report, progress

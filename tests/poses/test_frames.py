@@ -13,10 +13,12 @@ from PIL import Image
 from scipy import ndimage
 
 import hyrfpack
+from hyrfpack.context import RunContext
 from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.poses.frames import RECORD_NAME, choose_frames, frame_times, is_video
 from hyrfpack.poses.hdr import HLG_TRANSFER, PQ_TRANSFER, tone_map_to_srgb
 from hyrfpack.poses.motion import motion_distances, track_windows
+from hyrfpack.progress import TaskEvent, ignore_progress
 
 av = pytest.importorskip("av")
 
@@ -140,11 +142,11 @@ def test_a_repeated_call_does_nothing_and_an_interrupted_call_resumes(wall, tmp_
     removed = sorted(folder.glob("*.jpg"))[5]
     content = removed.read_bytes()
     removed.unlink()
-    said: list[tuple[str, float]] = []
-    assert choose_frames(video, folder, report=lambda text, share: said.append((text, share))) == first
+    events: list[TaskEvent] = []
+    assert choose_frames(video, folder, progress=events.append) == first
     assert removed.read_bytes() == content
     assert all(path.stat().st_mtime_ns == time for path, time in before.items() if path != removed)
-    assert "looking at the frames" not in dict(said) and said[-1][1] == 1.0
+    assert not any(event.task.startswith("measuring") for event in events) and events[-1].share == 1.0
     (folder / "mine.jpg").write_bytes(b"kept")
     fewer = choose_frames(video, folder, most=10)
     assert fewer.taken <= 10 and len(list(folder.glob("frame_*.jpg"))) == fewer.taken
@@ -153,9 +155,10 @@ def test_a_repeated_call_does_nothing_and_an_interrupted_call_resumes(wall, tmp_
 
 def test_progress_never_decreases(wall, tmp_path):
     video = write_video(tmp_path / "clip.mp4", [crop_wall(wall, 4.0 * number) for number in range(40)])
-    said: list[float] = []
-    choose_frames(video, tmp_path / "frames", report=lambda text, share: said.append(share))
-    assert said == sorted(said) and 0 <= said[0] and said[-1] == 1.0
+    events: list[TaskEvent] = []
+    choose_frames(video, tmp_path / "frames", progress=events.append)
+    shares = [event.share for event in events]
+    assert shares == sorted(shares) and 0 <= shares[0] and shares[-1] == 1.0
 
 
 @pytest.mark.parametrize("degrees", [90, 180, -90])
@@ -280,15 +283,15 @@ def test_high_dynamic_range_clips_nothing():
 def test_a_resumed_estimation_of_a_video_still_reports_its_number_of_frames(wall, tmp_path, caplog):
     video = write_video(tmp_path / "clip.mp4", [crop_wall(wall, 4.0 * number) for number in range(60)])
 
-    def stop(doing: str, share: float) -> None:
-        if "features" in doing:
+    def stop(event: TaskEvent) -> None:
+        if "features" in event.task:
             raise KeyboardInterrupt
 
     said: list[list[str]] = []
     for _ in range(2):
         caplog.clear()
         with pytest.raises(KeyboardInterrupt):
-            hyrfpack.estimate_poses(video, tmp_path / "scene", report=stop)
+            hyrfpack.estimate_poses(video, tmp_path / "scene", context=RunContext(progress=stop))
         said.append(caplog.messages)
     assert said[1] == ["resuming an interrupted estimation", *said[0]]
     assert "frames were taken" in said[0][0]
@@ -305,20 +308,20 @@ def test_frames_keep_their_times_so_that_messages_can_name_them(wall, tmp_path):
 
 
 def test_every_stage_of_a_video_reports_progress(wall, tmp_path):
-    messages: list[tuple[str, float]] = []
+    events: list[TaskEvent] = []
     video = write_video(tmp_path / "clip.mp4", [crop_wall(wall, 4 * number) for number in range(60)])
-    choose_frames(video, tmp_path / "frames", report=lambda *now: messages.append(now))
-    shares = [share for _, share in messages]
+    choose_frames(video, tmp_path / "frames", progress=events.append)
+    shares = [event.share for event in events]
     assert shares == sorted(shares) and shares[-1] == 1
     for words in ("measuring frame 60, 2 s of 2 s", "measuring the camera motion, frame 59/60", "writing frames "):
-        assert any(words in doing for doing, _ in messages), words
+        assert any(words in event.task for event in events), words
 
 
 def test_an_omitted_frame_is_named_with_its_time(wall, tmp_path):
     from hyrfpack.poses.estimate import _PoseEstimation
 
     video = write_video(tmp_path / "clip.mp4", [crop_wall(wall, 4 * number) for number in range(60)])
-    estimation = _PoseEstimation(video, tmp_path / "scene", "auto", None, 0, False, None, None)
+    estimation = _PoseEstimation(video, tmp_path / "scene", "auto", None, 0, False, ignore_progress)
     (tmp_path / "scene").mkdir()
     estimation.output.check_replaceable(video, overwrite=False)
     job = estimation._prepare_job()

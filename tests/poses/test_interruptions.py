@@ -9,14 +9,15 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from commands import succeeded
 
 import hyrfpack
+from hyrfpack.context import RunContext
 from hyrfpack.poses import process
+from hyrfpack.progress import TaskEvent
 
 REPOSITORY_ROOT = Path(__file__).parents[2]
 CRASH_AT_STAGE_CODE = """
@@ -44,14 +45,12 @@ def stage_processes(monkeypatch) -> list[subprocess.Popen]:
     return record_processes(monkeypatch)
 
 
-def stop_at(moment: str) -> Callable[[str, float], None]:
-    """Return a report function that interrupts when the progress text contains these words."""
-
-    def report(doing: str, share: float) -> None:
-        if moment in doing:
-            raise KeyboardInterrupt
-
-    return report
+def stop_at(moment: str) -> RunContext:
+    """Return a context that interrupts when the description of the task contains these words."""
+    tasks: list[str] = []
+    return RunContext(
+        progress=lambda event: tasks.append(event.task), stop=lambda: any(moment in task for task in tasks)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +59,7 @@ def stopped_after_matching(photos_and_poses, tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("stopped") / "scene"
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
         workers = record_processes(patch)
-        hyrfpack.estimate_poses(photos_and_poses[0], out, report=stop_at("global mapping"))
+        hyrfpack.estimate_poses(photos_and_poses[0], out, context=stop_at("global mapping"))
     assert len(workers) == 3 and all(worker.poll() is not None for worker in workers)
     return out
 
@@ -70,7 +69,7 @@ def test_a_stopped_estimation_resumes_after_its_last_finished_stage(photos_and_p
     shutil.copytree(stopped_after_matching, out)
     assert os.listdir(out) == [".poses"]
     with pytest.raises(KeyboardInterrupt):
-        hyrfpack.estimate_poses(photos_and_poses[0], out, report=stop_at("incremental"))
+        hyrfpack.estimate_poses(photos_and_poses[0], out, context=stop_at("incremental"))
     assert (out / ".poses" / "matches.json").stat().st_mtime_ns == kept
     assert (out / ".poses" / "global-0").is_dir()
 
@@ -80,12 +79,12 @@ def test_poses_in_place_are_completed_after_the_worker_was_killed(photos_and_pos
     before = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "images").iterdir()}
     (tmp_path / "poses.json").write_text("{}")  # as left by poses that were removed
 
-    def kill(doing: str, share: float) -> None:
-        if "matching pair" in doing:
+    def kill(event: TaskEvent) -> None:
+        if "matching pair" in event.task:
             stage_processes[-1].kill()
 
     with pytest.raises(hyrfpack.HyrfError, match="more memory than there is.*resumes here"):
-        hyrfpack.estimate_poses(tmp_path, tmp_path, overwrite=True, report=kill)
+        hyrfpack.estimate_poses(tmp_path, tmp_path, overwrite=True, context=RunContext(progress=kill))
     result = succeeded("poses", tmp_path, "-o", tmp_path, "--overwrite", "--json")
     assert "resuming an interrupted estimation" in result.stderr
     assert json.loads(result.stdout)["registered"] == len(before)

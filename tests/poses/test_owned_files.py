@@ -13,9 +13,11 @@ import pytest
 from PIL import Image
 
 import hyrfpack
+from hyrfpack.context import RunContext
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.poses.job import Job
 from hyrfpack.poses.owned_files import unchanged_files
+from hyrfpack.progress import TaskEvent
 
 
 def write_photos(folder: Path, seed: int = 0, count: int = 4) -> Path:
@@ -189,12 +191,12 @@ def test_a_second_call_for_the_same_scene_is_rejected(tmp_path):
 def test_poses_that_another_program_writes_meanwhile_are_kept_and_so_is_the_work(tmp_path, caplog):
     scene = tmp_path / "scene"
 
-    def appear(doing: str, share: float) -> None:
+    def appear(event: TaskEvent) -> None:
         (scene / "sparse" / "0").mkdir(parents=True, exist_ok=True)
         (scene / "sparse" / "0" / "cameras.bin").write_bytes(b"of another program")
 
     with pytest.raises(hyrfpack.HyrfError, match="poses of another program, which are kept"):
-        estimate_with_fake_stages(write_photos(tmp_path / "photos"), scene, report=appear)
+        estimate_with_fake_stages(write_photos(tmp_path / "photos"), scene, context=RunContext(progress=appear))
     assert (scene / "sparse" / "0" / "cameras.bin").read_bytes() == b"of another program"
     shutil.rmtree(scene / "sparse")
     caplog.clear()

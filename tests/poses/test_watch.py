@@ -13,6 +13,7 @@ import pytest
 from hyrfpack.poses import process, watch
 from hyrfpack.poses.job import Job
 from hyrfpack.poses.watch import count_rows, parse_global_mapping_phase, poll_in_background, report_new_rows
+from hyrfpack.progress import TaskEvent
 
 # Lines of pycolmap 4.2.1's global mapper, in the order of its work.
 MAPPER_LOG = [
@@ -103,23 +104,24 @@ def test_progress_of_a_silent_stage_is_repeated(tmp_path, monkeypatch):
         "print(json.dumps({'answer': {'found': 1}}), flush=True)"
     )
     worker = subprocess.Popen([sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-    messages: list[tuple[str, float]] = []
+    events: list[TaskEvent] = []
+    solving = TaskEvent("solving", 0.5)
 
-    def tell(doing: str, share: float) -> None:
-        messages.append((doing, share))
-        if messages.count(("solving", 0.5)) == 3:
+    def take(event: TaskEvent) -> None:
+        events.append(event)
+        if events.count(solving) == 3:
             assert worker.stdin is not None
             worker.stdin.write("x")
             worker.stdin.flush()
 
-    answer = process._read_answer(worker, tell, "starting")
+    answer = process._read_answer(worker, take, "starting")
     process._terminate(worker)
     assert answer == {"found": 1}
-    assert messages[0] == ("starting", 0.0) and messages.count(("solving", 0.5)) >= 3
+    assert events[0] == TaskEvent("starting", 0.0) and events.count(solving) >= 3
 
 
 def test_every_stage_reports_progress_in_its_own_units(estimated_scene):
-    doings = [doing for doing, _ in estimated_scene[2]]
+    tasks = [event.task for event in estimated_scene[2]]
     for words in (
         "reading the headers of photos 8/8",
         "copying photos 8/8",
@@ -133,17 +135,15 @@ def test_every_stage_reports_progress_in_its_own_units(estimated_scene):
         "estimating the lens distortion",
         "colouring points, photo 8/8",
     ):
-        assert any(words in doing for doing in doings), words
+        assert any(words in task for task in tasks), words
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5])
 def test_progress_reported_out_of_order_never_decreases(share, tmp_path):
     from hyrfpack.poses.estimate import _PoseEstimation
 
-    messages: list[float] = []
-    estimation = _PoseEstimation(
-        tmp_path, tmp_path / "scene", "auto", None, 0, False, lambda _, done: messages.append(done)
-    )
-    estimation._report_progress("matches", "matching", 0.9)
-    estimation._report_progress("matches", "matching", share)
-    assert messages[0] == messages[1]
+    events: list[TaskEvent] = []
+    estimation = _PoseEstimation(tmp_path, tmp_path / "scene", "auto", None, 0, False, events.append)
+    estimation._report_progress("matches", TaskEvent("matching", 0.9))
+    estimation._report_progress("matches", TaskEvent("matching", share))
+    assert events[0] == events[1]
