@@ -1,30 +1,21 @@
-// Connects the player, the controls, the panel and the source of the scene.
+// Connects the player, the controls, the panel and the opener of scenes.
 
-import { formatCamera, parseCamera, parseHash, parseSearch, resolveAddress } from "./address.js";
+import { formatCamera, parseCamera, parseHash, parseSearch } from "./address.js";
 import { Controls } from "./controls.js";
+import { element, elementText } from "./dom.js";
 import { AS_PHOTOGRAPHED, CONSISTENT } from "./exposure.js";
 import { Help } from "./help.js";
 import { Damper, Glide, Turntable, prefersReducedMotion } from "./motion.js";
 import { announce, dismiss, fail, progress, remark, toast } from "./notifications.js";
+import { Opener, postToParent } from "./opener.js";
 import { Panel } from "./panel.js";
-import { element, elementText } from "./dom.js";
-import { readPayload } from "./payload.js";
 import { Player } from "./player.js";
 import { savePicture, shareView } from "./share.js";
-import { chosenFile, fetchedFile } from "./source.js";
-import { followTraining, trainingTitle } from "./training.js";
 
 const FADE_MS = 600; // the duration in style.css
-const NOT_STARTED_TEXT = "The training has not taken its first step yet.";
-const TRAINING_ENDED_TEXT = "The training does not answer any more; this is its last snapshot.";
 const IGNORED_TEXTS = {
   wheel: "Click the scene, then the wheel zooms.",
   finger: "Tap the scene, then fingers move it.",
-};
-
-// Reports a load or an error to the page around this one, where <hyrf-viewer> handles it.
-const postToParent = (hyrf, message = "") => {
-  if (window.parent !== window) window.parent.postMessage({ hyrf, message }, "*");
 };
 
 // Shows a picture until the scene is drawn.
@@ -68,12 +59,6 @@ function start() {
 
   const player = new Player(element("view"), embedded);
   const damper = new Damper(player), glide = new Glide(player), turntable = new Turntable(player), help = new Help();
-  // Whether the shown scene and the loading one were named by the page or its address, and not chosen by the user.
-  let isOwn = true, isNextOwn = true;
-  let title = embedded ? (parameters.title ?? embedded.title) : document.title;
-  let nextTitle = title; // the title of the scene that is loading
-  let openCount = 0; // identifies the scene that was opened last
-  let lastPicture = null;
 
   // ---- cameras
 
@@ -109,6 +94,9 @@ function start() {
     }
   };
 
+  // Moves the eye to the camera that the page's address names, if it names one.
+  const followNamedCamera = () => followCamera(parseHash(location.hash) ?? parameters.camera, false);
+
   const setTurning = (isOn) => {
     turntable.turn(isOn);
     element("turn").setAttribute("aria-pressed", String(isOn));
@@ -122,7 +110,7 @@ function start() {
 
   const share = () => {
     const exposure = player.hasExposureMap && player.exposure === CONSISTENT ? CONSISTENT : null;
-    return shareView(formatCamera(player.eye, player.scene), exposure, isOwn);
+    return shareView(formatCamera(player.eye, player.scene), exposure, opener.shown.isOwn);
   };
 
   const ifLoaded = (action) => () => player.loaded && action();
@@ -136,11 +124,12 @@ function start() {
     F: toggleFullscreen,
     X: ifLoaded(switchExposure),
     L: ifLoaded(share),
-    C: ifLoaded(async () => savePicture(await player.capture(), title)),
+    C: ifLoaded(async () => savePicture(await player.capture(), opener.shown.title)),
     H: () => panel.toggle(),
     "?": () => help.show(),
     Escape: dismiss,
   });
+  const opener = new Opener(player, panel, embedded ? (parameters.title ?? embedded.title) : document.title);
   const acted = () => {
     glide.stop();
     turntable.pause();
@@ -163,99 +152,24 @@ function start() {
   });
   player.addEventListener("opened", ({ detail }) => {
     for (const mover of [damper, glide]) mover.stop();
-    [title, isOwn] = [nextTitle, isNextOwn];
-    panel.describe(detail, title);
-    if (isOwn) followCamera(parseHash(location.hash) ?? parameters.camera, false);
+    opener.shown = opener.loading;
+    panel.describe(detail, opener.shown.title);
+    if (opener.shown.isOwn) followNamedCamera();
   });
-  player.addEventListener("count", ({ detail }) => panel.describe(detail, title)); // more layers were loaded
+  player.addEventListener("count", ({ detail }) => panel.describe(detail, opener.shown.title));
   player.addEventListener("loaded", () => {
     document.body.classList.remove("empty"); // the page's own scene may be loaded after a file failed
     revealCanvas(player);
     help.greet();
     if (!player.whole) return;
     element("loading").hidden = true;
-    announce(`${title} is shown.`);
+    announce(`${opener.shown.title} is shown.`);
   });
 
   // ---- opening scenes
 
-  // Opens a scene. `fetchFile` returns a promise of {name, stream}. `name` is the scene's title; if it is null, the
-  // file's name is. `isGiven` is true if the page or its address names the scene.
-  const open = async (fetchFile, name = null, isGiven = true) => {
-    const thisOpen = ++openCount;
-    dismiss();
-    document.body.classList.remove("empty");
-    try {
-      progress({ what: "loading", part: 0 });
-      const file = await fetchFile();
-      if (thisOpen !== openCount) return;
-      [nextTitle, isNextOwn] = [name ?? file.name.replace(/\.\w+$/, ""), isGiven];
-      await player.open(file);
-      postToParent("load");
-    } catch (error) {
-      if (thisOpen !== openCount) return; // another scene was opened meanwhile
-      document.body.classList.toggle("empty", !player.loaded);
-      throw error;
-    }
-  };
-
-  const openFile = (file) => {
-    if (!file) return;
-    open(async () => chosenFile(file), null, false).catch(fail);
-  };
-
-  // Returns the cameras of a file in the page's folder, {cameras, up, target}, or null if the page has none for it.
-  const findStage = (address) => {
-    const stages = Object.entries(served?.stages ?? {});
-    return stages.find(([name]) => new URL(encodeURI(name), document.baseURI).href === address)?.[1] ?? null;
-  };
-
-  // Shows a model that is being trained. Newer snapshots replace it without moving the eye.
-  const watchTraining = (address, updates) => new Promise((shown, failed) => {
-    let thisOpen = openCount, isShown = false; // changes when the user opens a file
-    const isWanted = () => thisOpen === openCount;
-    const show = async (progress) => {
-      const name = trainingTitle(served.title, progress);
-      if (!isShown) {
-        remark("");
-        const opening = open(() => fetchedFile(address), name);
-        thisOpen = openCount;
-        await opening;
-        isShown = true;
-        return shown();
-      }
-      const file = await fetchedFile(address);
-      if (!isWanted()) return;
-      await player.open({ ...file, update: true });
-      if (!isWanted()) return;
-      title = nextTitle = name;
-      panel.setTitle(player.scene, title);
-    };
-    const ended = followTraining(updates, { show, waiting: () => remark(NOT_STARTED_TEXT), isWanted });
-    ended.then(() => isWanted() && remark(TRAINING_ENDED_TEXT), failed);
-  });
-
-  const openFirst = async () => {
-    if (embedded) {
-      panel.describe(embedded, title);
-      followCamera(parseHash(location.hash) ?? parameters.camera, false);
-      await player.load(readPayload(), element("background"));
-      postToParent("load");
-      return;
-    }
-    const address = parameters.content ?? (served?.content ? resolveAddress(served.content, "content") : null);
-    const updates = parameters.content || !served?.updates ? null : resolveAddress(served.updates, "content");
-    if (updates) return watchTraining(address, updates);
-    if (address) {
-      const name = parameters.title ?? (parameters.content ? null : served.title);
-      return open(async () => ({ ...(await fetchedFile(address)), stage: findStage(address) }), name);
-    }
-    element("loading").hidden = true;
-    document.body.classList.add("empty");
-  };
-
   element("file").onchange = ({ target }) => {
-    openFile(target.files[0]);
+    opener.openFile(target.files[0]);
     target.value = ""; // so that choosing the same file again fires an event
   };
   for (const button of document.querySelectorAll(".choose")) button.onclick = () => element("file").click();
@@ -268,13 +182,17 @@ function start() {
   addEventListener("drop", (event) => {
     event.preventDefault();
     document.body.classList.remove("dropping");
-    openFile(event.dataTransfer.files[0]);
+    opener.openFile(event.dataTransfer.files[0]);
   });
   addEventListener("hashchange", () => followCamera(parseHash(location.hash), true));
   element("dismiss").onclick = element("enough").onclick = dismiss;
   if (parameters.autorotate && !prefersReducedMotion()) setTurning(true);
 
-  const ready = openFirst();
+  if (embedded) {
+    panel.describe(embedded, opener.shown.title);
+    followNamedCamera();
+  }
+  const ready = opener.openFirst(Boolean(embedded), served, parameters);
   ready.catch((error) => {
     fail(error);
     postToParent("error", error.message);
@@ -283,6 +201,7 @@ function start() {
 
   // The interface for scripts. Cameras are {width, height, fx, fy, cx, cy, camera_from_world: 4 x 4}, with OpenCV axes;
   // poses are in world units, the rest in pixels.
+  let lastPicture = null;
   window.hyrfpack = {
     ready, // a promise that resolves when the scene is loaded
     show: async (camera) => { // moves the eye to a camera and draws its picture

@@ -1,0 +1,105 @@
+// Opens scenes in the player: the page's own, that of its address, a file that the user chose, and a training's
+// snapshots.
+
+import { resolveAddress } from "./address.js";
+import { element } from "./dom.js";
+import { dismiss, fail, progress, remark } from "./notifications.js";
+import { readPayload } from "./payload.js";
+import { chosenFile, fetchedFile } from "./source.js";
+import { followTraining, trainingTitle } from "./training.js";
+
+const NOT_STARTED_TEXT = "The training has not taken its first step yet.";
+const TRAINING_ENDED_TEXT = "The training does not answer any more; this is its last snapshot.";
+
+// Reports a load or an error to the page around this one, where <hyrf-viewer> handles it.
+export const postToParent = (hyrf, message = "") => {
+  if (window.parent !== window) window.parent.postMessage({ hyrf, message }, "*");
+};
+
+// Returns the cameras of a file in the page's folder, {cameras, up, target}, or null if the page has none for it.
+const findStage = (address, stages = {}) => {
+  const isAddressOf = (name) => new URL(encodeURI(name), document.baseURI).href === address;
+  return Object.entries(stages).find(([name]) => isAddressOf(name))?.[1] ?? null;
+};
+
+export class Opener {
+  // `title` is that of the scene in the page.
+  constructor(player, panel, title) {
+    Object.assign(this, { player, panel });
+    // `isOwn` is true if the page or its address names the scene, and not the user.
+    this.shown = this.loading = { title, isOwn: true };
+    this.openCount = 0; // identifies the scene that was opened last
+  }
+
+  // Opens the scene that the page or its address names, if there is one. `hasFile` is true if the page has a file, and
+  // `served` is the {content, title, stages, updates} of a hosted page, or null. `parameters` are those of parseSearch.
+  async openFirst(hasFile, served, parameters) {
+    if (hasFile) {
+      await this.player.load(readPayload(), element("background"));
+      postToParent("load");
+      return;
+    }
+    const address = parameters.content ?? (served?.content ? resolveAddress(served.content, "content") : null);
+    const updates = parameters.content || !served?.updates ? null : resolveAddress(served.updates, "content");
+    if (updates) return this.watchTraining(address, updates, served.title);
+    if (address) {
+      const name = parameters.title ?? (parameters.content ? null : served.title);
+      const fetchFile = async () => ({ ...(await fetchedFile(address)), stage: findStage(address, served?.stages) });
+      return this.open(fetchFile, name);
+    }
+    element("loading").hidden = true;
+    document.body.classList.add("empty");
+  }
+
+  // Opens a file that the user chose, if there is one.
+  openFile(file) {
+    if (file) this.open(async () => chosenFile(file), null, false).catch(fail);
+  }
+
+  // Opens a scene. `fetchFile` returns a promise of {name, stream}. `name` is the scene's title; if it is null, the
+  // file's name is.
+  async open(fetchFile, name = null, isOwn = true) {
+    const thisOpen = ++this.openCount;
+    dismiss();
+    document.body.classList.remove("empty");
+    try {
+      progress({ what: "loading", part: 0 });
+      const file = await fetchFile();
+      if (thisOpen !== this.openCount) return;
+      this.loading = { title: name ?? file.name.replace(/\.\w+$/, ""), isOwn };
+      await this.player.open(file);
+      postToParent("load");
+    } catch (error) {
+      if (thisOpen !== this.openCount) return; // another scene was opened meanwhile
+      document.body.classList.toggle("empty", !this.player.loaded);
+      throw error;
+    }
+  }
+
+  // Shows a model that is being trained. Newer snapshots replace it without moving the eye.
+  watchTraining(address, updates, sceneTitle) {
+    return new Promise((shown, failed) => {
+      let thisOpen = this.openCount, isShown = false; // changes when the user opens a file
+      const isWanted = () => thisOpen === this.openCount;
+      const show = async (training) => {
+        const title = trainingTitle(sceneTitle, training);
+        if (!isShown) {
+          remark("");
+          const opening = this.open(() => fetchedFile(address), title);
+          thisOpen = this.openCount;
+          await opening;
+          isShown = true;
+          return shown();
+        }
+        const file = await fetchedFile(address);
+        if (!isWanted()) return;
+        await this.player.open({ ...file, update: true });
+        if (!isWanted()) return;
+        this.shown = this.loading = { ...this.shown, title };
+        this.panel.setTitle(this.player.scene, title);
+      };
+      const ended = followTraining(updates, { show, waiting: () => remark(NOT_STARTED_TEXT), isWanted });
+      ended.then(() => isWanted() && remark(TRAINING_ENDED_TEXT), failed);
+    });
+  }
+}
