@@ -54,7 +54,7 @@ def wait_until(browser: chromium.Chromium, expression: str) -> None:
 def test_pictures_can_be_chosen_split_by_keys_and_pointer_and_subtracted(page: Path, tmp_path: Path):
     if chromium.find() is None:
         pytest.skip("there is no Chromium here")
-    with chromium.Chromium(tmp_path / "profile") as browser:
+    with chromium.Chromium() as browser:
         browser.resize(900, 700)
         browser.open(page.as_uri())
         messages = "document.getElementById('difference-name').textContent"

@@ -150,10 +150,10 @@ def test_the_page_is_valid_and_refers_only_to_its_own_pictures(report_with_photo
 
 @pytest.mark.acceptance
 @pytest.mark.parametrize("program", [chromium.Chromium, firefox.Firefox])
-def test_browsers_show_all_pictures_under_the_content_security_policy(program, report_with_photos, tmp_path):
+def test_browsers_show_all_pictures_under_the_content_security_policy(program, report_with_photos):
     if importlib.import_module(program.__module__).find() is None:
         pytest.skip(f"{program.__name__} is not on this machine")
-    with program(tmp_path) as browser:
+    with program() as browser:
         browser.open((report_with_photos[0].parent / "page" / "index.html").as_uri())
         assert browser.evaluate("[...document.images].map((image) => image.naturalWidth > 0)") == [True] * 7
         assert browser.list_errors() == []

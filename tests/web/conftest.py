@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 
 import pytest
-from web.pages import Browser
 
 from tools.browser import chromium, firefox
+from tools.browser.browser import Browser
 
 WINDOW_SIZE = (240, 180)
 BROWSER_NAMES = ["chromium", "firefox"]
@@ -37,7 +37,7 @@ def _is_turn_of_another_browser(item: pytest.Item) -> bool:
 
 
 @pytest.fixture(scope="session")
-def start_browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[str], Browser]]:
+def start_browser() -> Iterator[Callable[[str], Browser]]:
     """Return a function that returns a running browser by name, with a small window; all tests share it."""
     running: dict[str, Browser] = {}
 
@@ -47,12 +47,12 @@ def start_browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable
             if name not in running:
                 if name == "chromium":
                     if chromium.find() is None:
-                        pytest.skip("there is no Chromium here")
-                    running[name] = stack.enter_context(chromium.Chromium(tmp_path_factory.mktemp("profile")))
+                        pytest.skip("there is no Chromium here, or no Playwright to drive it")
+                    running[name] = stack.enter_context(chromium.Chromium())
                 else:
                     if firefox.find() is None:
                         pytest.skip("there is no Firefox here, or no Xvfb for it to draw on")
-                    running[name] = stack.enter_context(firefox.Firefox(tmp_path_factory.mktemp("profile")))
+                    running[name] = stack.enter_context(firefox.Firefox())
             running[name].resize(*WINDOW_SIZE)
             return running[name]
 

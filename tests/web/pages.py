@@ -16,10 +16,7 @@ from hyrfpack.scene import Camera
 from hyrfpack.splats.draw import Drawable, draw
 from hyrfpack.splats.splats import Splats, normalized_quats
 from hyrfpack.web.html import encode_splats_page
-from tools.browser.chromium import Chromium
-from tools.browser.firefox import Firefox
-
-Browser = Chromium | Firefox
+from tools.browser.browser import Browser
 
 UP_DIRECTION, SCENE_CENTER = np.array([0.0, -1.0, 0.0]), np.array([1000.0, -50.0, 20.0])
 SCENE_FRAME = Frame(tuple(SCENE_CENTER), 1.0, (1.0, 1.0, 1.0))

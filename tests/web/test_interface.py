@@ -199,7 +199,7 @@ def test_invalid_cameras_in_the_address_are_reported_and_the_scene_is_shown(brow
 def test_a_shared_link_restores_the_view(browser: Browser, tmp_path: Path):
     open_page(browser, tmp_path, make_splats_page(random_splats()))
     browser.drag((120, 90), (161, 103))
-    browser.mouse("mouseWheel", 60, 150, deltaX=0, deltaY=-150)
+    browser.wheel(60, 150, -150)
     browser.drag((120, 90), (107, 93), button="right")
     before = window_camera(browser)
     browser.press("l")

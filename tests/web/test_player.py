@@ -71,7 +71,7 @@ def test_mouse_and_keys_move_the_camera(browser: Browser, tmp_path: Path):
     assert panned @ home.rotation[0] < -0.1 and abs(panned @ home.forward) < 1e-9
 
     browser.press("r")
-    browser.mouse("mouseWheel", 120, 90, deltaX=0, deltaY=-300)
+    browser.wheel(120, 90, -300)
     assert np.linalg.norm(window_camera(browser).position - SCENE_CENTER) < 2.0
     browser.press("w", seconds=0.3)
     wait_until_still(browser)
@@ -113,7 +113,7 @@ def test_the_wheel_zooms_towards_the_pointer(browser: Browser, tmp_path: Path):
     home = window_camera(browser)
     ray = np.array([(60 - home.cx) / home.fx, (150 - home.cy) / home.fy, 1.0])
     point = home.position + 2.5 * ray @ home.rotation
-    browser.mouse("mouseWheel", 60, 150, deltaX=0, deltaY=-200)
+    browser.wheel(60, 150, -200)
     near = window_camera(browser)
     x, y, z = near.rotation @ point + near.camera_from_world[:3, 3]
     assert z < 2.2
@@ -146,9 +146,7 @@ def test_a_double_click_sets_the_center_of_the_orbit(browser: Browser, tmp_path:
     at = window_camera(browser)
     x, y, z = at.rotation @ current_position + at.camera_from_world[:3, 3]
     spot = at.fx * x / z + at.cx, at.fy * y / z + at.cy
-    for count in (1, 2):
-        for kind in ("mousePressed", "mouseReleased"):
-            browser.mouse(kind, *spot, button="left", clickCount=count)
+    browser.click(*spot, count=2)
     browser.drag((120, 90), (160, 100))
     after = window_camera(browser)
     assert np.linalg.norm(after.position - at.position) > 0.3
@@ -200,7 +198,7 @@ def test_a_damped_drag_ends_exactly_where_an_undamped_one_does(browser: Browser,
         open_page(browser, tmp_path, make_splats_page(random_splats(50)))
         browser.drag((120, 90), (150, 110))
         wait_until_at_rest(browser).drag((120, 90), (110, 93), button="right")
-        wait_until_at_rest(browser).mouse("mouseWheel", 60, 150, deltaX=0, deltaY=-200)
+        wait_until_at_rest(browser).wheel(60, 150, -200)
         ends[less_motion] = window_camera(browser).camera_from_world
     np.testing.assert_allclose(ends[True], ends[False], atol=1e-9)
 
@@ -208,7 +206,7 @@ def test_a_damped_drag_ends_exactly_where_an_undamped_one_does(browser: Browser,
 def test_no_frames_are_drawn_after_damping_ends(browser: Browser, tmp_path: Path):
     wait_until_still(open_page(browser, tmp_path, make_splats_page(random_splats(50))))
     before = browser.evaluate("hyrfpack.frames()")
-    browser.mouse("mouseWheel", 120, 90, deltaX=0, deltaY=-200)
+    browser.wheel(120, 90, -200)
     wait_until_still(browser)
     frames = browser.evaluate("hyrfpack.frames()")
     assert frames - before > 3
@@ -227,9 +225,9 @@ def test_the_glide_to_another_camera_stops_at_user_input(browser: Browser, tmp_p
     assert len(set(np.round(on_its_way, 6))) > 3
     browser.press("p")
     time.sleep(0.25)
-    browser.mouse("mousePressed", 120, 90, button="left", buttons=1, clickCount=1)
+    browser.button_down(120, 90)
     stopped = current_position(browser)
-    browser.mouse("mouseReleased", 120, 90, button="left", clickCount=1)
+    browser.button_up(120, 90)
     time.sleep(0.4)
     np.testing.assert_allclose(current_position(browser), stopped, atol=1e-9)
     assert np.linalg.norm(stopped - far) > 1e-3 and np.linalg.norm(stopped - near) > 1e-3
@@ -338,8 +336,7 @@ def test_a_short_key_press_moves_the_camera_at_any_frame_rate(browser: Browser, 
 def test_a_double_tap_marks_its_position(browser: Browser, tmp_path: Path):
     wait_until_still(open_page(browser, tmp_path, make_splats_page(random_splats())))
     for _ in range(2):
-        browser.mouse("mousePressed", 120, 90, button="left", buttons=1, clickCount=1)
-        browser.mouse("mouseReleased", 120, 90, button="left", clickCount=1)
+        browser.click(120, 90)
     box = browser.evaluate("(({ left, right, top, bottom }) => [left + right, top + bottom])"
                            "(document.getElementById('ring').getBoundingClientRect())")  # fmt: skip
     assert box == pytest.approx([240, 180], abs=3)

@@ -270,14 +270,13 @@ def test_in_a_frame_the_wheel_scrolls_the_page_until_the_scene_is_clicked(browse
     wait_until(browser, f"{inside}.hyrfpack?.player?.loaded")
     where = f"JSON.stringify({inside}.hyrfpack.camera())"
     home = browser.evaluate(where)
-    browser.mouse("mouseWheel", 120, 90, deltaX=0, deltaY=30)
+    browser.wheel(120, 90, 30)
     wait_until(browser, "scrollY > 0")
     assert browser.evaluate(where) == home
     assert "Click" in browser.evaluate(f"{inside}.document.getElementById('done').textContent")
     browser.evaluate("scrollTo(0, 0)")
-    for kind in ("mousePressed", "mouseReleased"):
-        browser.mouse(kind, 120, 90, button="left", clickCount=1)
-    browser.mouse("mouseWheel", 120, 90, deltaX=0, deltaY=30)
+    browser.click(120, 90)
+    browser.wheel(120, 90, 30)
     wait_until(browser, f"{where} !== '{home}'")
     assert browser.evaluate("scrollY") == 0
 

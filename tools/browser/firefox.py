@@ -1,6 +1,8 @@
-"""Drive Firefox on a virtual display by its Marionette protocol over a local socket, without any Python package.
+"""Drive an installed Firefox on a virtual display by its Marionette protocol over a local socket.
 
-Firefox's headless mode has no WebGL, so it runs on a virtual display (Debian's `xvfb`) and renders in software.
+Playwright drives only a Firefox of its own: Firefox 153 lacks a command (`emulation.setMediaFeaturesOverride`) that
+Playwright 1.65 sends over WebDriver BiDi, and BiDi cannot emulate pointers and reduced motion. Firefox's headless mode
+has no WebGL, so it runs on a virtual display (Debian's `xvfb`) and renders in software.
 """
 
 from __future__ import annotations
@@ -12,11 +14,13 @@ import os
 import shutil
 import socket
 import subprocess
+import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from types import TracebackType
 from typing import Any
+
+from tools.browser.browser import TIMEOUT_SECONDS, Browser
 
 PROGRAM_NAMES = ("firefox-esr", "firefox")
 DEFAULT_PREFERENCES = {
@@ -40,7 +44,7 @@ DEFAULT_PREFERENCES = {
     "webgl.force-enabled": True,
     "webgl.disable-fail-if-major-performance-caveat": True,
 }
-TIMEOUT_SECONDS = 60.0  # time limit for each answer of the browser
+MOUSE_BUTTONS = {"left": 0, "right": 2}
 WEBDRIVER_KEYS = {
     "Shift": "\ue008", "Enter": "\ue007", "Escape": "\ue00c", "Tab": "\ue004", "ArrowLeft": "\ue012",
     "ArrowUp": "\ue013", "ArrowRight": "\ue014", "ArrowDown": "\ue015", "Space": " ",
@@ -66,17 +70,18 @@ def _script_address(script: str) -> str:
     return "data:text/javascript;base64," + base64.b64encode(script.encode()).decode()
 
 
-class Firefox:
-    """A running browser with one page, with the same methods as `Chromium`.
+class Firefox(Browser):
+    """A running Firefox with an empty profile.
 
     Args:
-        profile: an empty folder for the browser's profile.
         preferences: preferences that add to or replace DEFAULT_PREFERENCES; "__" in a name stands for ".".
     """
 
     name = "firefox"
 
-    def __init__(self, profile: Path, **preferences: bool | int | str) -> None:
+    def __init__(self, **preferences: bool | int | str) -> None:
+        self._folder = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
+        profile = Path(self._folder.name)
         merged = {**DEFAULT_PREFERENCES, **{name.replace("__", "."): value for name, value in preferences.items()}}
         lines = (f"user_pref({json.dumps(name)}, {json.dumps(value)});\n" for name, value in merged.items())
         (profile / "user.js").write_text("".join(lines))
@@ -104,10 +109,7 @@ class Firefox:
             self._display.kill()
             raise
 
-    def __enter__(self) -> Firefox:
-        return self
-
-    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def close(self) -> None:
         with contextlib.suppress(OSError, TimeoutError, RuntimeError):
             self.call("Marionette:Quit", flags=["eForceQuit"])
         self._socket.close()
@@ -116,6 +118,7 @@ class Firefox:
         for process in (self._process, self._display):
             process.kill()
             process.wait()
+        self._folder.cleanup()
 
     def _connect(self, file: Path) -> socket.socket:
         deadline = time.monotonic() + TIMEOUT_SECONDS
@@ -181,20 +184,12 @@ class Firefox:
             _script_address(script),
         )
 
-    # ---- The same interface as `Chromium`.
-
     def open(self, address: str) -> None:
-        """Open an address and wait until its document is loaded."""
         self.call("WebDriver:Navigate", url="about:blank")  # a change of the fragment alone would not reload
         self._privileged("Services.console.reset(); window.said = [];")
         self.call("WebDriver:Navigate", url=address)
 
     def evaluate(self, expression: str) -> Any:
-        """Evaluate JavaScript and return its value; a promise is awaited.
-
-        Raises:
-            RuntimeError: the script throws an exception, whose text is the message.
-        """
         script = (
             "const done = arguments[0];"
             "(async () => {return (" + expression + "\n);})()"
@@ -206,7 +201,6 @@ class Firefox:
         return answer.get("value")
 
     def resize(self, width: int, height: int, *, dense: float = 1.0, phone: bool = False) -> None:
-        """Set the window's size in CSS pixels; `dense` is the device pixel ratio, `phone` emulates a touch screen."""
         self._privileged(
             "const [width, height, dense, phone] = arguments, browser = gBrowser.selectedBrowser;"
             "for (const [name, value] of Object.entries({width, height})) {"
@@ -231,30 +225,26 @@ class Firefox:
     def _act(self, *sources: dict) -> None:
         self.call("WebDriver:PerformActions", actions=list(sources))
 
-    def mouse(self, kind: str, x: float, y: float, **more: Any) -> None:
-        """Send a mouse event: mousePressed, mouseReleased, mouseMoved or mouseWheel."""
-        point = {"x": x, "y": y, "duration": 0, "origin": "viewport"}
-        if kind == "mouseWheel":
-            by = {"deltaX": more["deltaX"], "deltaY": more["deltaY"]}
-            self._act({"type": "wheel", "id": "wheel", "actions": [{"type": "scroll", **point, **by}]})
-            return
-        actions: list[dict] = [{"type": "pointerMove", **point}]
-        if kind != "mouseMoved":
-            number = {"left": 0, "middle": 1, "right": 2}[more.get("button", "left")]
-            actions.append(
-                {"type": {"mousePressed": "pointerDown", "mouseReleased": "pointerUp"}[kind], "button": number}
-            )
-        self._act({"type": "pointer", "id": "mouse", "parameters": {"pointerType": "mouse"}, "actions": actions})
+    def _point(self, x: float, y: float, *actions: dict) -> None:
+        """Move the mouse, then perform actions of its buttons."""
+        move = {"type": "pointerMove", "x": x, "y": y, "duration": 0, "origin": "viewport"}
+        mouse = {"type": "pointer", "id": "mouse", "parameters": {"pointerType": "mouse"}}
+        self._act({**mouse, "actions": [move, *actions]})
 
-    def drag(self, start: tuple[float, float], end: tuple[float, float], button: str = "left", steps: int = 4) -> None:
-        """Drag the mouse from one point to another, in CSS pixels."""
-        self.mouse("mousePressed", *start, button=button)
-        for step in range(1, steps + 1):
-            self.mouse("mouseMoved", *(a + (b - a) * step / steps for a, b in zip(start, end, strict=True)))
-        self.mouse("mouseReleased", *end, button=button)
+    def move(self, x: float, y: float) -> None:
+        self._point(x, y)
+
+    def button_down(self, x: float, y: float, button: str = "left", clicks: int = 1) -> None:
+        self._point(x, y, {"type": "pointerDown", "button": MOUSE_BUTTONS[button]})
+
+    def button_up(self, x: float, y: float, button: str = "left", clicks: int = 1) -> None:
+        self._point(x, y, {"type": "pointerUp", "button": MOUSE_BUTTONS[button]})
+
+    def wheel(self, x: float, y: float, delta: float) -> None:
+        scroll = {"type": "scroll", "x": x, "y": y, "duration": 0, "origin": "viewport", "deltaX": 0, "deltaY": delta}
+        self._act({"type": "wheel", "id": "wheel", "actions": [scroll]})
 
     def touch(self, kind: str, *points: tuple[float, float]) -> None:
-        """Send a touch event (touchStart, touchMove or touchEnd) with the points of all fingers that are down."""
         sources = []
         for number in range(max(len(points), len(self._fingers))):
             actions: list[dict] = []
@@ -271,7 +261,6 @@ class Firefox:
         self._act(*sources)
 
     def prefer(self, scheme: str = "light", *, less_motion: bool = False) -> None:
-        """Emulate the user's preferences for a colour scheme and for reduced motion."""
         self._privileged(
             'Services.prefs.setIntPref("layout.css.prefers-color-scheme.content-override", arguments[0]);'
             'Services.prefs.setIntPref("ui.prefersReducedMotion", arguments[1]);',
@@ -279,7 +268,6 @@ class Firefox:
         )  # fmt: skip
 
     def press(self, key: str, seconds: float = 0.0, *, shift: bool = False) -> None:
-        """Press a key, given as a letter or a key name, and release it after `seconds`."""
         values = [*([WEBDRIVER_KEYS["Shift"]] if shift else []), WEBDRIVER_KEYS.get(key, key)]
         for kind in ("keyDown", "keyUp"):
             actions = [{"type": kind, "value": value} for value in values[:: 1 if kind == "keyDown" else -1]]
@@ -288,7 +276,6 @@ class Firefox:
 
     @contextlib.contextmanager
     def before_every_page(self, script: str) -> Iterator[None]:
-        """Within this context, run a script before the scripts of every opened page; its variables are local."""
         text = (
             "{let on = true;"
             f'addMessageListener("forget {self._number}", () => {{ on = false; }});'
@@ -308,11 +295,9 @@ class Firefox:
             self._privileged(frames + remove, address, forget)
 
     def screenshot(self) -> bytes:
-        """Return a PNG of the window."""
         return base64.b64decode(self.call("WebDriver:TakeScreenshot", full=False)["value"])
 
     def list_errors(self) -> list[str]:
-        """Return the errors of the page since it was opened: console errors and warnings, refused loads, exceptions."""
         self.evaluate("new Promise((done) => setTimeout(done, 50))")  # earlier messages arrive within this time
         return self._privileged(
             "const found = Services.console.getMessageArray().filter((message) =>"

@@ -75,7 +75,7 @@ def measure_pictures(run: Path, data: Path, folder: Path) -> list[str]:
     cells = [run.name, f"{model.stat().st_size:,}"]
     pictures_by_source = {"hyrfpack": model_pictures}
     page_paths = write_pages(model, folder, scene)
-    with Chromium(Path(tempfile.mkdtemp(dir=folder))) as browser:
+    with Chromium() as browser:
         for name, page in page_paths.items():
             open_page(browser, page)
             pictures_by_source[name] = [draw_in_page(browser, view.camera) for view in views]
@@ -98,14 +98,14 @@ def measure_frame_ms(browser: Chromium) -> float:
     """Return the milliseconds per frame at full resolution while a mouse orbits."""
     browser.evaluate("document.getElementById('automatic').checked && document.getElementById('automatic').click()")
     x, y = WINDOW_SIZE[0] / 2, WINDOW_SIZE[1] / 2
-    browser.mouse("mousePressed", x, y, button="left", buttons=1, clickCount=1)
+    browser.button_down(x, y)
     drawn, started, step = browser.evaluate("hyrfpack.frames()"), time.perf_counter(), 0
     while time.perf_counter() < started + ORBIT_SECONDS:
         step += 1
-        browser.mouse("mouseMoved", x + 3 * (step % 60), y, button="left", buttons=1)
+        browser.move(x + 3 * (step % 60), y)
         time.sleep(0.02)
     frames, seconds = browser.evaluate("hyrfpack.frames()") - drawn, time.perf_counter() - started
-    browser.mouse("mouseReleased", x, y, button="left", clickCount=1)
+    browser.button_up(x, y)
     return 1000 * seconds / max(1, frames)
 
 
@@ -115,7 +115,7 @@ def measure_times(model: Path, folder: Path, repeats: int) -> list[list[str]]:
     samples: dict[str, list[tuple[float, float, float]]] = {name: [] for name in page_paths}
     for _ in range(repeats):
         for name, page in page_paths.items():
-            with Chromium(Path(tempfile.mkdtemp(dir=folder))) as browser:
+            with Chromium() as browser:
                 browser.resize(*WINDOW_SIZE)
                 open_page(browser, page)
                 browser.evaluate("hyrfpack.player.settled")

@@ -59,7 +59,7 @@ def reader(tmp_path_factory: pytest.TempPathFactory) -> Iterator[BrowserReader]:
         pytest.skip("there is no Chromium on this machine")
     folder = tmp_path_factory.mktemp("files")
     flags = ("--enable-unsafe-swiftshader", "--use-angle=swiftshader")
-    with serve_project(folder) as address, Chromium(tmp_path_factory.mktemp("profile"), *flags) as browser:
+    with serve_project(folder) as address, Chromium(*flags) as browser:
         yield BrowserReader(browser, address, folder)
 
 
@@ -170,7 +170,9 @@ def test_files_that_python_refuses_are_refused(reader: BrowserReader, name: str)
 
 
 def test_spz_4_is_read_where_the_browser_supports_zstd(reader: BrowserReader, shared_data: Path) -> None:
-    has_zstd = reader.browser.evaluate("try { !!new DecompressionStream('zstd') } catch { false }")
+    has_zstd = reader.browser.evaluate(
+        "(() => { try { return !!new DecompressionStream('zstd'); } catch { return false; } })()"
+    )
     data = FORMATS[".spz"].encode(random_splats(200, 3), Hints(spz_version=4))
     answer = reader.read("a.spz", data)
     if has_zstd:

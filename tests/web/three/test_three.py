@@ -150,7 +150,7 @@ def field_settings() -> dict[str, Any]:
 def test_the_example_page_shows_the_rendered_picture(app_folder: Path, tmp_path: Path) -> None:
     save_model(make_model(), app_folder / "scene.hyrf")
     flags = ("--enable-unsafe-swiftshader", "--use-angle=swiftshader")
-    with serve_project(app_folder) as address, Chromium(tmp_path / "profile", *flags) as browser:
+    with serve_project(app_folder) as address, Chromium(*flags) as browser:
         browser.resize(PICTURE_SIZE_PIXELS, PICTURE_SIZE_PIXELS)
         browser.open(f"{address}/own/index.html?webgl&file=scene.hyrf")
         ends = time.monotonic() + 60
