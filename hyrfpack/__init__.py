@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from hyrfpack.compress import compress_model as compress_model
     from hyrfpack.config.export import ConvertConfig as ConvertConfig
     from hyrfpack.config.export import ExportConfig as ExportConfig
+    from hyrfpack.config.make import MakeConfig as MakeConfig
     from hyrfpack.context import RunContext as RunContext
     from hyrfpack.data import load_scene as load_scene
     from hyrfpack.distill import DistillConfig as DistillConfig
@@ -120,6 +121,7 @@ _PUBLIC = {
     "FileReport": "hyrfpack.format",
     "load_model": "hyrfpack.format",
     "save_model": "hyrfpack.format",
+    "MakeConfig": "hyrfpack.config.make",
     "MakeResult": "hyrfpack.make",
     "make_scene": "hyrfpack.make",
     "HybridModel": "hyrfpack.model",

@@ -75,7 +75,7 @@ _REMEDIES = {
     "View": "a Scene has lists of them: scene.test",
     **{
         name: f"make one: hyrfpack.{name}(...)"
-        for name in ("ConvertConfig", "DistillConfig", "ExportConfig", "RenderSettings", "TrainConfig")
+        for name in ("ConvertConfig", "DistillConfig", "ExportConfig", "MakeConfig", "RenderSettings", "TrainConfig")
     },
 }
 

@@ -135,26 +135,23 @@ def main() -> None:
     """
 
 
-_COMMANDS = (
-    *(
-        make,
-        poses,
-        train,
-        compare,
-        compress,
-        decompress,
-        render,
-        evaluate,
-        export,
-        view,
-        import_,
-        convert,
-        bench,
-        info,
-        demo,
-    ),
-)
-for _command in _COMMANDS:
+for _command in (
+    make,
+    poses,
+    train,
+    compare,
+    compress,
+    decompress,
+    render,
+    evaluate,
+    export,
+    view,
+    import_,
+    convert,
+    bench,
+    info,
+    demo,
+):
     main.add_command(_command)
     add_verbosity_options(_command)
 add_verbosity_options(main)

@@ -8,6 +8,7 @@ from typing import Any
 
 import click
 
+from hyrfpack.choices import BENCH_GROUPS
 from hyrfpack.cli.common import (
     format_table,
     json_option,
@@ -24,9 +25,6 @@ from hyrfpack.cli.types import OUTPUT, PATH
 from hyrfpack.errors import HyrfError
 from hyrfpack.outputs import Outputs
 
-# The same as `hyrfpack.bench.suite.GROUPS`, which cannot be imported without torch.
-GROUPS = ("rasterize", "hash_encode", "mlp", "render", "codec")
-
 
 @click.command(short_help="Measure speed and error.")
 @click.argument("model", type=PATH, required=False)
@@ -40,7 +38,9 @@ GROUPS = ("rasterize", "hash_encode", "mlp", "render", "codec")
     show_default=True,
     help="Timed runs of each variant.",
 )
-@click.option("--only", type=click.Choice(GROUPS), multiple=True, help="Measure only this group. May be repeated.")
+@click.option(
+    "--only", type=click.Choice(BENCH_GROUPS), multiple=True, help="Measure only this group. May be repeated."
+)
 @click.option(
     "-o",
     "--output",
@@ -98,7 +98,7 @@ def bench(
     outputs.file(output)
     page = _read_page(markdown)
     if page:  # check before minutes of work that the page has a place for each table
-        tables.fill_page(page, dict.fromkeys(("machine", *(only or GROUPS)), ""), str(markdown))
+        tables.fill_page(page, dict.fromkeys(("machine", *(only or BENCH_GROUPS)), ""), str(markdown))
     if markdown is not None:  # an existing page with places is filled, which needs no permission to overwrite
         Outputs(model, scene=scene, overwrite=overwrite or bool(page)).file(markdown)
     with notes_only_of("hyrfpack.bench"):

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from hyrfpack.choices import MATCHING_METHODS, QUALITIES
 from hyrfpack.cli.common import (
     choose_command_device,
     format_consistent_psnr,
@@ -19,9 +18,9 @@ from hyrfpack.cli.common import (
 )
 from hyrfpack.cli.console import notes_only_of
 from hyrfpack.cli.live import serve_training_view, view_options
-from hyrfpack.cli.settings import settings_options
-from hyrfpack.cli.types import OUTPUT, PATH, SIZE, reject_nan
-from hyrfpack.config.train import TrainConfig
+from hyrfpack.cli.settings import reject_two_sizes, settings_options
+from hyrfpack.cli.types import OUTPUT, PATH
+from hyrfpack.config.make import MakeConfig
 
 if TYPE_CHECKING:
     from hyrfpack.make import MakeResult
@@ -33,69 +32,26 @@ MAX_LISTED_PHOTOS = 5
 @click.command(short_help="Make a scene from photos, end to end.")
 @click.argument("photos", type=PATH)
 @click.option("-o", "--output", type=OUTPUT, required=True, metavar="FILE", help="File or folder to make.")
-@click.option("--quality", type=click.Choice(QUALITIES), help="Quality; a better one takes longer.  [default: normal]")
-@click.option(
-    "--minutes",
-    type=click.FloatRange(min=0, min_open=True),
-    callback=reject_nan,
-    metavar="N",
-    help="Instead of --quality: finish in about N minutes, including poses.",
-)
-@click.option("--target-size", type=SIZE, metavar="SIZE", help="Best quality within this file size, such as 2MB.")
-@click.option(
-    "--max-gaussians",
-    type=click.IntRange(min=1),
-    metavar="N",
-    help="Budget: the maximum number of Gaussians, instead of --target-size.  [default: measured by pilot runs]",
-)
-@settings_options(TrainConfig, "preset")
-@click.option(
-    "--matching",
-    type=click.Choice(MATCHING_METHODS),
-    default="auto",
-    show_default=True,
-    help="Which pairs of photos are matched to estimate poses, see 'hyrfpack poses --help'.",
-)
-@click.option("--images", metavar="NAME", help="Folder of the photos within PHOTOS, such as images_4.")
-@click.option(
-    "--max-size",
-    type=click.IntRange(min=0),
-    metavar="PIXELS",
-    help="Shrink photos whose longer side exceeds this; 0 keeps their size.  [default: 1600; of a draft, 640]",
-)
-@click.option(
-    "--test-every",
-    type=click.IntRange(min=0),
-    metavar="N",
-    help="Hold out every Nth photo for scoring; 0 holds out none.  [default: 8; of fewer than 16 photos, one photo]",
-)
+@settings_options(MakeConfig, "quality", "minutes", "target_bytes", "max_gaussians", "preset", "matching")
+@settings_options(MakeConfig, "images", "max_size", "test_every")
 @click.option(
     "--work", type=OUTPUT, metavar="DIR", help="Folder of intermediate results.  [default: the name of FILE with .work]"
 )
 @click.option("--device", metavar="NAME", default="auto", show_default=True, help="Device: cpu, cuda, cuda:N.")
-@settings_options(TrainConfig, "seed")
+@settings_options(MakeConfig, "seed")
 @view_options
 @overwrite_option
 @json_option
 def make(
     photos: Path,
     output: Path,
-    quality: str | None,
-    minutes: float | None,
-    target_size: int | None,
-    max_gaussians: int | None,
-    preset: str,
-    matching: str,
-    images: str | None,
-    max_size: int | None,
-    test_every: int | None,
     work: Path | None,
     device: str,
-    seed: int,
     view: bool,
     view_port: int | None,
     overwrite: bool,
     as_json: bool,
+    **settings: Any,
 ) -> None:
     """Make a scene from PHOTOS: estimate poses if there are none, train, compress, score and export.
 
@@ -112,10 +68,10 @@ def make(
       hyrfpack make photos/bonsai -o bonsai.spz --quality best
       hyrfpack make other.ply -o scene.html
     """
-    if quality is not None and minutes is not None:
+    config = MakeConfig(**settings)
+    if config.quality is not None and config.minutes is not None:
         raise click.UsageError("--quality and --minutes each decide how long to work; give one of them")
-    if target_size is not None and max_gaussians is not None:
-        raise click.UsageError("--max-gaussians and --target-size each decide how large the model is; give one of them")
+    reject_two_sizes(**settings)
     from hyrfpack.context import RunContext
     from hyrfpack.make import Stopped
     from hyrfpack.make import make_scene as run
@@ -129,17 +85,8 @@ def make(
             result = run(
                 photos,
                 output,
-                quality=quality or "normal",
-                minutes=minutes,
+                config,
                 work=work,
-                images=images,
-                max_size=max_size,
-                test_every=test_every,
-                matching=matching,
-                target_bytes=target_size,
-                max_gaussians=max_gaussians,
-                preset=preset,
-                seed=seed,
                 overwrite=overwrite,
                 observer=observer,
                 context=RunContext(device=torch_device),

@@ -33,6 +33,16 @@ def settings_options(config_class: type, *names: str) -> Callable[[Command], Com
     return add
 
 
+def reject_two_sizes(*, max_gaussians: int | None, target_bytes: int | None, **others: object) -> None:
+    """Reject --max-gaussians together with --target-size; `others` are settings that do not matter here.
+
+    Raises:
+        UsageError: both are given.
+    """
+    if max_gaussians is not None and target_bytes is not None:
+        raise click.UsageError("--max-gaussians and --target-size each decide how large the model is; give one of them")
+
+
 def _make_option(setting: Setting) -> Callable[[Command], Command]:
     name = option_of_argument(setting.name)
     help, default = use_option_names(setting.description), setting.default_description
@@ -62,7 +72,7 @@ def _parameter_type(setting: Setting) -> tuple[click.ParamType, str | None]:
     if isinstance(limits, OneOf):
         return click.Choice(limits.words), None
     if not isinstance(limits, Range):
-        return click.STRING, None
+        return click.STRING, "NAME"
     if limits.unit == "bytes":
         return SIZE, "SIZE"
     unit = limits.unit.upper()

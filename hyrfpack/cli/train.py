@@ -21,7 +21,7 @@ from hyrfpack.cli.common import (
 )
 from hyrfpack.cli.live import serve_training_view, view_options
 from hyrfpack.cli.processes import processes_option
-from hyrfpack.cli.settings import settings_options
+from hyrfpack.cli.settings import reject_two_sizes, settings_options
 from hyrfpack.cli.types import OUTPUT, PATH
 from hyrfpack.config.train import TrainConfig
 from hyrfpack.errors import HyrfNoPosesError
@@ -97,8 +97,7 @@ def train(
     """
     if resume and overwrite:
         raise click.UsageError("--resume continues a run and --overwrite replaces it; give one of them")
-    if None not in (settings["max_gaussians"], settings["target_bytes"]):
-        raise click.UsageError("--max-gaussians and --target-size each decide how large the model is; give one of them")
+    reject_two_sizes(**settings)
     if poses and not ranks.is_single:
         raise click.UsageError(
             "--poses runs in one process only; run 'hyrfpack poses' first, then train from its folder"

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from hyrfpack.compress.sensitivity import MAX_SENSITIVITY_VIEWS, MIN_SENSITIVITY_VIEWS, TARGET_DRAWN_GAUSSIANS
+from hyrfpack.config.make import MakeConfig
 from hyrfpack.config.train import FULL_STEPS, TrainConfig
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Scene
 from hyrfpack.train.decisions import (
@@ -61,6 +62,11 @@ QUALITIES = {
         steps=10_000, gpu_steps=FULL_STEPS, max_size=DEFAULT_MAX_SIZE, finetune_steps=500, import_steps=1_500
     ),
 }
+
+
+def find_quality(config: MakeConfig) -> Quality:
+    """Return the settings of the requested quality, "normal" if none is."""
+    return QUALITIES[config.quality or "normal"]
 
 
 @dataclass(frozen=True)

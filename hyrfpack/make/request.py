@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 
 from hyrfpack.config.export import ExportConfig
+from hyrfpack.config.make import MakeConfig
 from hyrfpack.config.train import TrainConfig
 from hyrfpack.data.folder import list_photos
 from hyrfpack.errors import HyrfDataError, HyrfError
@@ -41,13 +42,7 @@ class Request:
     output: Path
     work: Path
     reading: LoadSettings
-    quality: str
-    minutes: float | None
-    matching: str
-    target_bytes: int | None
-    max_gaussians: int | None
-    preset: str
-    seed: int
+    config: MakeConfig
     device: torch.device
     overwrite: bool
 
@@ -55,7 +50,7 @@ class Request:
     def stages(self) -> list[str]:
         """Return the names of the stages to run, in order."""
         names = list(_STAGES_OF_SOURCE.get(self.source.kind, ("poses", *_SCENE_STAGES)))
-        if self.minutes is not None:
+        if self.config.minutes is not None:
             names.insert(names.index("training"), "measurement")
         return names
 
@@ -99,15 +94,15 @@ class Request:
             )
         if source.kind in ("model", "splats"):
             options = {
-                "minutes": self.minutes,
-                "a target size": self.target_bytes,
-                "a number of Gaussians": self.max_gaussians,
-                "a preset": None if self.preset == "auto" else self.preset,
+                "minutes": self.config.minutes,
+                "a target size": self.config.target_bytes,
+                "a number of Gaussians": self.config.max_gaussians,
+                "a preset": None if self.config.preset == "auto" else self.config.preset,
             }
             for name, value in options.items():
                 if value is not None:
                     raise HyrfError(f"{source.path}: {name} can be asked for with photos only", fix="leave it out")
-        if self.target_bytes is not None and self.max_gaussians is not None:
+        if self.config.target_bytes is not None and self.config.max_gaussians is not None:
             raise HyrfError(
                 "a target size and a number of Gaussians each decide how large the model is",
                 fix="give one of them (`target_bytes` or `max_gaussians`)",
@@ -118,12 +113,13 @@ class Request:
 
     def _check_target(self) -> None:
         """Reject a target size that no file of these photos can have; photos without poses get a weaker check."""
-        if self.target_bytes is None:
+        if self.config.target_bytes is None:
             return
         if self.source.scene is None:
-            check_target_bytes(self.target_bytes)
+            check_target_bytes(self.config.target_bytes)
         else:
-            check_target(self.source.scene, TrainConfig(preset=self.preset, target_bytes=self.target_bytes))
+            config = TrainConfig(preset=self.config.preset, target_bytes=self.config.target_bytes)
+            check_target(self.source.scene, config)
 
     def _check_places(self) -> None:
         """Reject an output or a work folder that may not be written, whether or not it exists."""

@@ -10,9 +10,8 @@ from pathlib import Path
 from time import monotonic
 from typing import Any
 
-from hyrfpack.checks import check_choice, check_float, check_int
-from hyrfpack.choices import PRESETS
-from hyrfpack.config.settings import LARGEST_SEED
+from hyrfpack.checks import check_type
+from hyrfpack.config.make import MakeConfig
 from hyrfpack.context import RunContext
 from hyrfpack.data import PictureCache
 from hyrfpack.data.folder import first_readable_photo, list_photos
@@ -21,7 +20,7 @@ from hyrfpack.lock import exclusive_folder
 from hyrfpack.make import stages
 from hyrfpack.make.held_out import score_note
 from hyrfpack.make.minutes import fit_plan_to_minutes
-from hyrfpack.make.plan import QUALITIES, Plan, estimate_photos_seconds, estimate_scene_seconds
+from hyrfpack.make.plan import Plan, estimate_photos_seconds, estimate_scene_seconds, find_quality
 from hyrfpack.make.progress import Reporter
 from hyrfpack.make.request import Request, default_work_folder
 from hyrfpack.make.source import LoadSettings, Source
@@ -87,18 +86,9 @@ class MakeResult:
 def make_scene(
     photos: StrPath,
     output: StrPath,
+    config: MakeConfig | None = None,
     *,
-    quality: str = "normal",
-    minutes: float | None = None,
     work: StrPath | None = None,
-    images: str | None = None,
-    max_size: int | None = None,
-    test_every: int | None = None,
-    matching: str = "auto",
-    target_bytes: int | None = None,
-    max_gaussians: int | None = None,
-    preset: str = "auto",
-    seed: int = 0,
     overwrite: bool = False,
     observer: Callable[[Trainer], None] | None = None,
     context: RunContext = RunContext(),  # noqa: B008 - frozen
@@ -113,20 +103,8 @@ def make_scene(
         photos: a folder of photos without poses, any path that `load_scene` reads, a video, a file of splats of
             another program (see `hyrfpack.import_splats`), or a `.hyrf` file to export.
         output: path of the output, whose ending selects the format (".hyrf", or one of `hyrfpack.export_model`).
-        quality: a key of QUALITIES.
-        minutes: time that the call may take, instead of a quality. The number of steps and the size of the photos are
-            chosen by a measurement.
+        config: settings; None for the defaults.
         work: the work folder. None puts it beside the output, with the output's name and the ending ".work".
-        images: see `load_scene`.
-        max_size: see `load_scene`; None for the default of the quality.
-        test_every: see `load_scene`. None holds out every 8th photo, but a single one if there are fewer than 16
-            photos, and none if there are fewer than 8.
-        matching: see `hyrfpack.estimate_poses`.
-        target_bytes: maximum size of the packed model in bytes. A later call with another size packs the trained model
-            again, without training.
-        max_gaussians: see `hyrfpack.TrainConfig`; excludes `target_bytes`.
-        preset: see `hyrfpack.TrainConfig`.
-        seed: random seed, 0 to 2^64 - 1.
         overwrite: replace an existing output. Without it, an output that appears during the call is also kept. A file
             then gets a free name beside it, which the result reports; a folder is an error.
         observer: observer of the training, see `hyrfpack.train_model`.
@@ -139,7 +117,6 @@ def make_scene(
         HyrfError: the source cannot be used, the output may not or cannot be written, or options exclude each other;
             all this is checked before any work. Or a stage fails; products of finished stages are kept.
         Stopped: the call was interrupted; a KeyboardInterrupt that names the stage.
-        ValueError: an argument is out of range or unknown.
 
     Example:
         >>> import hyrfpack
@@ -147,16 +124,10 @@ def make_scene(
         >>> result.output.name, result.bytes > 0, sorted(path.name for path in result.work.iterdir())
         ('bonsai.html', True, ['export', 'make.json'])
     """
-    check_choice("quality", quality, QUALITIES)
-    check_int("seed", seed, 0, LARGEST_SEED)
-    check_choice("preset", preset, PRESETS)
-    for name, value in {"target_bytes": target_bytes, "max_gaussians": max_gaussians}.items():
-        if value is not None:
-            check_int(name, value, 1)
-    if minutes is not None:
-        check_float("minutes", minutes, 0.0)
-    began = monotonic()
-    reading = LoadSettings(images, QUALITIES[quality].max_size if max_size is None else max_size, test_every)
+    config = MakeConfig() if config is None else config
+    check_type("config", config, MakeConfig)
+    began, max_size = monotonic(), find_quality(config).max_size if config.max_size is None else config.max_size
+    reading = LoadSettings(config.images, max_size, config.test_every)
     with interruptible():
         try:
             request = Request(
@@ -164,13 +135,7 @@ def make_scene(
                 output=Path(output),
                 work=default_work_folder(Path(output)) if work is None else Path(work),
                 reading=reading,
-                quality=quality,
-                minutes=minutes,
-                matching=matching,
-                target_bytes=target_bytes,
-                max_gaussians=max_gaussians,
-                preset=preset,
-                seed=seed,
+                config=config,
                 device=context.choose_device(),
                 overwrite=overwrite,
             )
@@ -222,8 +187,9 @@ class _Pipeline:
         if kind == "model":
             return self._finish(self.source.path, scene=None)
         if kind == "splats":
-            steps = QUALITIES[self.request.quality].import_steps
-            facts = stages.run_import_stage(self.stage_cache, self.source.path, steps, self.request.seed, self.context)
+            config = self.request.config
+            steps = find_quality(config).import_steps
+            facts = stages.run_import_stage(self.stage_cache, self.source.path, steps, config.seed, self.context)
             return self._finish(self.stage_cache.folder / stages.PACKED_MODEL, scene=None, imported=facts)
         return self._make_from_photos()
 
@@ -242,10 +208,10 @@ class _Pipeline:
             for sentence in scene.notes:
                 _LOG.info(sentence)
         plan, scene = self._decide_plan(path, reading, scene)
-        if request.minutes is None:
+        if request.config.minutes is None:
             self.reporter.estimates |= estimate_scene_seconds(scene, plan, request.device)
         training = stages.run_training_stage(
-            stage_cache, scene, self._scene_digest(scene), plan, request.seed, self.observer, self.context
+            stage_cache, scene, self._scene_digest(scene), plan, request.config.seed, self.observer, self.context
         )
         stages.run_compression_stage(stage_cache, scene, plan, request.device)
         return self._finish(stage_cache.folder / stages.PACKED_MODEL, scene, poses=poses, training=training)
@@ -257,13 +223,15 @@ class _Pipeline:
         facts = first_readable_photo(photos)
         sizes = [facts.size] * len(photos) if facts else []
         estimates = estimate_photos_seconds(sizes, self._requested_plan(), request.device)
-        if request.minutes is not None:
-            estimates = {"poses": estimates["poses"], "training": max(0.0, 60 * request.minutes - estimates["poses"])}
+        if request.config.minutes is not None:
+            left = 60 * request.config.minutes - estimates["poses"]
+            estimates = {"poses": estimates["poses"], "training": max(0.0, left)}
         self.reporter.estimates |= estimates
         if source.archive is not None:
             _LOG.info(f"{source.archive.name} was unpacked into {source.path} and is reused from there")
+        config = request.config
         return stages.run_pose_stage(
-            self.stage_cache, source.path, source.files(), request.matching, request.seed, self.context
+            self.stage_cache, source.path, source.files(), config.matching, config.seed, self.context
         )
 
     def _scene_digest(self, scene: Scene) -> str:
@@ -272,24 +240,24 @@ class _Pipeline:
 
     def _requested_plan(self) -> Plan:
         """Return the plan that the quality and the other arguments request."""
-        quality = QUALITIES[self.request.quality]
+        quality = find_quality(self.request.config)
         steps = quality.steps if self.request.device.type == "cpu" else quality.gpu_steps
         request = self.request
         return Plan(
             steps,
             request.reading.max_size,
             quality.finetune_steps,
-            request.target_bytes,
-            request.max_gaussians,
-            request.preset,
+            request.config.target_bytes,
+            request.config.max_gaussians,
+            request.config.preset,
         )
 
     def _decide_plan(self, path: Path, reading: LoadSettings, scene: Scene) -> tuple[Plan, Scene]:
         """Return the requested plan or the one that fits the minutes, and the scene at the plan's photo size."""
         request = self.request
-        if request.minutes is None:
+        if request.config.minutes is None:
             return self._requested_plan(), scene
-        end = self.began + 60 * request.minutes
+        end = self.began + 60 * request.config.minutes
         left = max(0.0, end - monotonic())
         measuring = MEASUREMENT_TIME_RATIO * left
         self.reporter.estimates |= {"measurement": measuring, "training": left - measuring}
@@ -297,25 +265,25 @@ class _Pipeline:
         def execute(resuming: bool) -> tuple[dict[str, Any], list[str]]:
             requested = replace(self._requested_plan(), finetune_steps=0)
             plan = fit_plan_to_minutes(
-                path, reading, scene, requested, request.device, end, request.seed, self.cache, self.reporter
+                path, reading, scene, requested, request.device, end, request.config.seed, self.cache, self.reporter
             )
             return asdict(plan), []
 
         inputs = {
             "photos and poses": self._scene_digest(scene),
-            "minutes": request.minutes,
+            "minutes": request.config.minutes,
             "size of photos": reading.max_size,
-            "seed": request.seed,
-            "target size": request.target_bytes,
-            "number of Gaussians": request.max_gaussians,
-            "preset": request.preset,
+            "seed": request.config.seed,
+            "target size": request.config.target_bytes,
+            "number of Gaussians": request.config.max_gaussians,
+            "preset": request.config.preset,
         }
         # A training run that was begun keeps its plan; for another target size, only packing runs again.
         earlier = {**inputs, "target size": stages.trained_target_bytes(self.stage_cache)}
         if self.stage_cache.state.facts("measurement", earlier) is not None:
             inputs = earlier
         plan = Plan(**self.stage_cache.run_stage("measurement", inputs, execute)).with_target_bytes(
-            request.target_bytes
+            request.config.target_bytes
         )
         return plan, scene if plan.max_size == reading.max_size else reading.load(path, plan.max_size)
 

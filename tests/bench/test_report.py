@@ -12,9 +12,8 @@ from scenes import ball_points, small_model
 
 from hyrfpack.bench.figure import build_panels, plot
 from hyrfpack.bench.rows import Error, Row
-from hyrfpack.bench.suite import GROUPS, BenchReport
+from hyrfpack.bench.suite import BenchReport
 from hyrfpack.bench.tables import build_tables, fill_page, format_markdown
-from hyrfpack.cli.bench import GROUPS as CHOICES
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import save_model
 from hyrfpack.measure.timing import Ratio, Timing
@@ -160,7 +159,3 @@ def test_a_page_without_placeholders_is_rejected_before_measuring(model, tmp_pat
     sentence = refused("bench", model, "--only", "mlp", "--markdown", tmp_path / "page.md", "-o", tmp_path / "b.png")
     assert "no place for machine" in sentence and (tmp_path / "page.md").read_text() == "# Nothing here"
     assert not (tmp_path / "b.png").exists()
-
-
-def test_the_command_lists_the_groups_without_loading_torch():
-    assert CHOICES == tuple(GROUPS)

@@ -10,10 +10,11 @@ import pytest
 
 from hyrfpack.config.distill import DistillConfig
 from hyrfpack.config.export import ConvertConfig, ExportConfig
+from hyrfpack.config.make import MakeConfig
 from hyrfpack.config.settings import OneOf, Range, check_settings, list_settings
 from hyrfpack.config.train import DensityConfig, TrainConfig
 
-CONFIG_CLASSES = (ConvertConfig, DensityConfig, ExportConfig, DistillConfig, TrainConfig)
+CONFIG_CLASSES = (ConvertConfig, DensityConfig, DistillConfig, ExportConfig, MakeConfig, TrainConfig)
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from hyrfpack.atomic import TEMPORARY_PREFIX
+from hyrfpack.config.make import MakeConfig
 from hyrfpack.context import RunContext
 from hyrfpack.errors import HyrfError
 from hyrfpack.make import Stopped, make_scene, stages
@@ -88,9 +89,9 @@ def test_an_interrupted_estimation_of_poses_resumes(photos, poses, tmp_path, mon
         raise KeyboardInterrupt
 
     with pytest.raises(Stopped, match="stopped in poses"):
-        make_scene(photos, tmp_path / "scene.html", quality="draft", context=RunContext(progress=stop))
-    assert make_scene(photos, tmp_path / "scene.html", quality="draft").kept == ()
-    assert make_scene(photos, tmp_path / "scene.ply", quality="draft").kept[0] == "poses"
+        make_scene(photos, tmp_path / "scene.html", MakeConfig(quality="draft"), context=RunContext(progress=stop))
+    assert make_scene(photos, tmp_path / "scene.html", MakeConfig(quality="draft")).kept == ()
+    assert make_scene(photos, tmp_path / "scene.ply", MakeConfig(quality="draft")).kept[0] == "poses"
 
 
 def test_a_partly_copied_output_is_completed(posed, tmp_path, monkeypatch):
@@ -105,9 +106,9 @@ def test_a_partly_copied_output_is_completed(posed, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(stages, "copy_if_different", stop)
         with pytest.raises(Stopped):
-            make_scene(posed, tmp_path / "player", quality="draft")
+            make_scene(posed, tmp_path / "player", MakeConfig(quality="draft"))
     assert len(list((tmp_path / "player").iterdir())) == 2
-    assert len(list(make_scene(posed, tmp_path / "player", quality="draft").output.iterdir())) == 5
+    assert len(list(make_scene(posed, tmp_path / "player", MakeConfig(quality="draft")).output.iterdir())) == 5
 
 
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
@@ -147,12 +148,12 @@ def test_a_full_disk_in_any_stage_is_a_clear_error_and_the_same_call_resumes(
     work = tmp_path / "work"
     if limit > 500:
         shutil.copytree(uninterrupted_work, work)
-    changes = {"output": "scene.html", **changes, "work": work}
-    output = tmp_path / changes.pop("output")
+    changes = {"output": "scene.html", **changes}
+    output, config = tmp_path / changes.pop("output"), MakeConfig(**changes)
     with file_limit(limit), pytest.raises(HyrfError, match=f"{sentence}.*not allowed here"):
-        make_scene(posed, output, **changes)
+        make_scene(posed, output, config, work=work)
     assert not output.exists()
-    assert make_scene(posed, output, **changes).output.exists()
+    assert make_scene(posed, output, config, work=work).output.exists()
     assert not [path for path in tmp_path.rglob("*") if path.name.startswith(TEMPORARY_PREFIX)]
 
 
@@ -206,7 +207,7 @@ def test_an_interrupted_training_is_not_resumed_with_other_settings(posed, tmp_p
     with pytest.raises(Stopped):
         make_scene(posed, tmp_path / "scene.html", context=RunContext(progress=stop))
     words: list[str] = []
-    make_scene(posed, tmp_path / "scene.html", seed=1, context=record_details(words))
+    make_scene(posed, tmp_path / "scene.html", MakeConfig(seed=1), context=record_details(words))
     assert "step 1/9" in words
 
 

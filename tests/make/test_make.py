@@ -12,6 +12,7 @@ from commands import hyrfpack, refused, succeeded
 from PIL import Image
 
 from hyrfpack import load_model, load_scene
+from hyrfpack.config.make import MakeConfig
 from hyrfpack.context import RunContext
 from hyrfpack.errors import HyrfError
 from hyrfpack.format.min_file_size import min_file_bytes
@@ -88,11 +89,11 @@ def test_photos_without_poses_may_come_in_an_archive(top, photos, poses, tmp_pat
     with zipfile.ZipFile(tmp_path / "photos.zip", "w") as archive:
         for photo in photos.iterdir():
             archive.write(photo, f"{top}{photo.name}")
-    make_scene(tmp_path / "photos.zip", tmp_path / "scene.hyrf", quality="draft")
+    make_scene(tmp_path / "photos.zip", tmp_path / "scene.hyrf", MakeConfig(quality="draft"))
     (folder,) = poses
     assert folder.is_relative_to(tmp_path / "cache") and len(list(folder.rglob("*.png"))) == 18
     assert sum(str(folder) in sentence for sentence in caplog.messages) == 1
-    assert len(make_scene(tmp_path / "photos.zip", tmp_path / "scene.hyrf", quality="draft").kept) == 5
+    assert len(make_scene(tmp_path / "photos.zip", tmp_path / "scene.hyrf", MakeConfig(quality="draft")).kept) == 5
 
 
 def test_photos_with_poses_need_no_estimation(posed, poses, tmp_path):
@@ -102,7 +103,7 @@ def test_photos_with_poses_need_no_estimation(posed, poses, tmp_path):
 
 def test_poses_of_a_video_are_estimated(poses, tmp_path):
     (tmp_path / "clip.MP4").write_bytes(b"frames")
-    make_scene(tmp_path / "clip.MP4", tmp_path / "scene.hyrf", quality="draft")
+    make_scene(tmp_path / "clip.MP4", tmp_path / "scene.hyrf", MakeConfig(quality="draft"))
     assert poses == [tmp_path / "clip.MP4"]
 
 
@@ -118,7 +119,7 @@ def test_small_sets_hold_out_few_photos(count, held_out, posed, tmp_path):
     content = json.loads(table.read_text())
     content["frames"] = content["frames"][:count]
     table.write_text(json.dumps(content))
-    result = make_scene(tmp_path / "few", tmp_path / "scene.hyrf", quality="draft")
+    result = make_scene(tmp_path / "few", tmp_path / "scene.hyrf", MakeConfig(quality="draft"))
     assert result.views == held_out and (result.psnr is None) == (held_out == 0)
 
 
@@ -149,7 +150,7 @@ def test_another_target_size_packs_the_trained_model_again_and_says_how_to_train
 ):
     before = (finished_work / "model.hyrf").read_bytes()
     target = len(before) * 3 // 4
-    result = make_scene(posed, tmp_path / "a.hyrf", work=finished_work, target_bytes=target)
+    result = make_scene(posed, tmp_path / "a.hyrf", MakeConfig(target_bytes=target), work=finished_work)
     assert result.kept == ("training",) and result.bytes <= target
     assert any("trained without a target size" in sentence and "`work`" in sentence for sentence in caplog.messages)
     assert make_scene(posed, tmp_path / "b.hyrf", work=finished_work).kept == ("training",)
@@ -170,17 +171,17 @@ def test_a_stopped_training_resumes_unchanged_with_another_target_size(posed, tm
         for target in (30_000, 50_000):
             (tmp_path / "scene.work" / "run" / "metrics.json").unlink(missing_ok=True)
             with pytest.raises(Stopped):
-                make_scene(posed, tmp_path / "scene.hyrf", target_bytes=target)
+                make_scene(posed, tmp_path / "scene.hyrf", MakeConfig(target_bytes=target))
     assert [config.target_bytes for config in configs] == [30_000, 30_000]
-    result = make_scene(posed, tmp_path / "scene.hyrf", target_bytes=50_000)
+    result = make_scene(posed, tmp_path / "scene.hyrf", MakeConfig(target_bytes=50_000))
     assert result.training["target_bytes"] == 30_000 and any(
         "for 30,000 bytes" in sentence for sentence in caplog.messages
     )
 
 
 def test_with_minutes_another_target_size_keeps_the_measurement_and_the_training(posed, tmp_path):
-    make_scene(posed, tmp_path / "scene.hyrf", minutes=0.01, target_bytes=30_000)
-    result = make_scene(posed, tmp_path / "scene.hyrf", minutes=0.01, target_bytes=50_000, overwrite=True)
+    make_scene(posed, tmp_path / "scene.hyrf", MakeConfig(minutes=0.01, target_bytes=30_000))
+    result = make_scene(posed, tmp_path / "scene.hyrf", MakeConfig(minutes=0.01, target_bytes=50_000), overwrite=True)
     assert result.kept == ("measurement", "training")
 
 
@@ -211,28 +212,30 @@ def test_a_work_folder_of_an_earlier_version_is_trained_again_once(finished_work
     ],
 )
 def test_changed_settings_repeat_the_stages_that_depend_on_them(settings, kept, finished_work, posed, tmp_path):
-    result = make_scene(posed, tmp_path / "scene.hyrf", work=finished_work, **settings)
+    result = make_scene(posed, tmp_path / "scene.hyrf", MakeConfig(**settings), work=finished_work)
     assert result.kept == kept
 
 
 def test_a_changed_photo_repeats_all_stages_and_a_moved_folder_none(photos, poses, tmp_path, caplog):
-    make_scene(photos, tmp_path / "a.hyrf", work=tmp_path / "work", quality="draft")
+    make_scene(photos, tmp_path / "a.hyrf", MakeConfig(quality="draft"), work=tmp_path / "work")
     moved = photos.rename(tmp_path / "elsewhere")
-    assert len(make_scene(moved, tmp_path / "a.hyrf", work=tmp_path / "work", quality="draft").kept) == 5
+    assert len(make_scene(moved, tmp_path / "a.hyrf", MakeConfig(quality="draft"), work=tmp_path / "work").kept) == 5
     Image.new("RGB", (32, 32), "red").save(moved / "0003.png")
-    result = make_scene(moved, tmp_path / "b.hyrf", work=tmp_path / "work", quality="draft")
+    result = make_scene(moved, tmp_path / "b.hyrf", MakeConfig(quality="draft"), work=tmp_path / "work")
     assert "poses" not in result.kept and "poses: running again, because photos changed" in caplog.messages
 
 
 def test_poses_are_kept_from_a_draft_to_another_quality_and_back(photos, poses, tmp_path):
     for quality in ("draft", "normal", "draft"):
-        make_scene(photos, tmp_path / "scene.hyrf", quality=quality, overwrite=True)
+        make_scene(photos, tmp_path / "scene.hyrf", MakeConfig(quality=quality), overwrite=True)
     assert poses == [photos]
 
 
 def test_the_matching_setting_is_passed_on_and_repeats_the_poses(photos, poses, tmp_path):
-    make_scene(photos, tmp_path / "a.hyrf", quality="draft")
-    result = make_scene(photos, tmp_path / "b.hyrf", work=tmp_path / "a.work", quality="draft", matching="sequential")
+    make_scene(photos, tmp_path / "a.hyrf", MakeConfig(quality="draft"))
+    result = make_scene(
+        photos, tmp_path / "b.hyrf", MakeConfig(quality="draft", matching="sequential"), work=tmp_path / "a.work"
+    )
     assert len(poses) == 2 and result.kept == ("training", "compression", "scoring")  # the poses did not change
 
 
@@ -248,9 +251,9 @@ def test_a_damaged_product_is_made_again(name, kept, finished_work, posed, tmp_p
 
 
 def test_poses_without_their_photos_are_estimated_again(photos, poses, tmp_path, caplog):
-    work = make_scene(photos, tmp_path / "scene.hyrf", quality="draft").work
+    work = make_scene(photos, tmp_path / "scene.hyrf", MakeConfig(quality="draft")).work
     (work / "scene" / "images" / "0004.png").unlink()
-    result = make_scene(photos, tmp_path / "other.hyrf", work=work, quality="draft")
+    result = make_scene(photos, tmp_path / "other.hyrf", MakeConfig(quality="draft"), work=work)
     assert (
         len(poses) == 2
         and result.kept == tuple(STAGE_NAMES[:-1])
@@ -264,9 +267,9 @@ def test_a_repeated_call_keeps_everything_and_a_changed_output_needs_overwrite(f
     before = output.read_bytes()
     assert len(make_scene(posed, output, work=finished_work).kept) == 4
     with pytest.raises(HyrfError, match="other photos or with other settings.*`overwrite=True`"):
-        make_scene(posed, output, work=finished_work, target_bytes=1_000_000)
+        make_scene(posed, output, MakeConfig(target_bytes=1_000_000), work=finished_work)
     assert output.read_bytes() == before
-    make_scene(posed, output, work=finished_work, seed=3, overwrite=True)
+    make_scene(posed, output, MakeConfig(seed=3), work=finished_work, overwrite=True)
     assert output.read_bytes() != before
 
 
@@ -317,7 +320,7 @@ def test_a_failed_stage_names_its_folder_and_keeps_finished_stages(posed, tmp_pa
         patch.setattr("hyrfpack.make.stages.compress_model", full)
         sentence = refused("make", posed, "-o", tmp_path / "scene.html", "--quality", "draft")
     assert "compression failed: the disk is full; free some space; what is finished is kept in" in sentence
-    assert make_scene(posed, tmp_path / "scene.html", quality="draft").kept == ("training",)
+    assert make_scene(posed, tmp_path / "scene.html", MakeConfig(quality="draft")).kept == ("training",)
 
 
 @pytest.mark.parametrize("given", ["clip.mp4", "one photo"])

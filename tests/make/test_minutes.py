@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from hyrfpack.config.make import MakeConfig
 from hyrfpack.config.train import FULL_STEPS
 from hyrfpack.data import PictureCache, load_scene
 from hyrfpack.make import make_scene, minutes
@@ -190,7 +191,7 @@ def test_photos_are_never_larger_than_asked_for(posed, scene, monkeypatch):
 
 @pytest.mark.usefixtures("fake_stages")
 def test_the_measured_cost_is_kept_by_the_next_call(posed, tmp_path, monkeypatch):
-    first = make_scene(posed, tmp_path / "scene.hyrf", minutes=0.01)
+    first = make_scene(posed, tmp_path / "scene.hyrf", MakeConfig(minutes=0.01))
     assert list(first.seconds)[0] == "measurement"
     monkeypatch.setattr(minutes, "measure_scene_cost", None)
-    assert "measurement" in make_scene(posed, tmp_path / "scene.ply", minutes=0.01).kept
+    assert "measurement" in make_scene(posed, tmp_path / "scene.ply", MakeConfig(minutes=0.01)).kept

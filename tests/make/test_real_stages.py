@@ -18,6 +18,7 @@ from explicit_balls import ball_splats
 from exposures import random_map
 
 from hyrfpack import evaluate_model, load_model, load_scene, save_model
+from hyrfpack.config.make import MakeConfig
 from hyrfpack.context import RunContext
 from hyrfpack.make import make_scene, stages
 from hyrfpack.make.progress import Reporter
@@ -124,7 +125,7 @@ def test_an_unreachable_target_size_names_a_reachable_one_which_is_met(finished_
 @pytest.mark.usefixtures("quick_distillation")
 def test_splats_of_other_programs_are_imported(tmp_path):
     (tmp_path / "ball.ply").write_bytes(ply.encode(ball_splats(40)))
-    result = make_scene(tmp_path / "ball.ply", tmp_path / "scene.html", quality="draft")
+    result = make_scene(tmp_path / "ball.ply", tmp_path / "scene.html", MakeConfig(quality="draft"))
     assert list(result.seconds) == ["import", "export"] and result.export["import"]["gaussians_before"] == 40
-    again = make_scene(tmp_path / "ball.ply", tmp_path / "scene.spz", quality="draft")
+    again = make_scene(tmp_path / "ball.ply", tmp_path / "scene.spz", MakeConfig(quality="draft"))
     assert again.kept == ("import",)
