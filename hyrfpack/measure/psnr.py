@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 # PSNR in dB of two identical pictures, for which the formula gives infinity; also the upper limit of other PSNRs.
 IDENTICAL_PSNR = 100.0
 
@@ -13,4 +11,6 @@ def psnr_from_mse(mse: float) -> float:
 
     PSNR = -10 log10(mse)
     """
+    import numpy as np  # not at the top, because the command line imports the displays of progress, which import this
+
     return min(float(-10 * np.log10(mse)), IDENTICAL_PSNR) if mse > 0 else IDENTICAL_PSNR
