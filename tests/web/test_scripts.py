@@ -128,10 +128,10 @@ def test_a_page_of_plain_modules_opened_from_disk_draws_the_same_picture(
 
 
 @pytest.mark.unit
-def test_no_line_of_the_modules_is_longer_than_120_columns():
+def test_no_line_of_the_sources_is_longer_than_120_columns():
     long = [
         f"{path}:{number}"
-        for path in list_web_files("viewer", ".js") + list_web_files("hyrf", ".js")
+        for path in list_web_files("viewer", ".js", ".css") + list_web_files("hyrf", ".js")
         for number, line in enumerate(read_web_file(path).splitlines(), 1)
         if len(line) > MAX_LINE_LENGTH
     ]
