@@ -47,6 +47,7 @@ LAYER_BY_PATH = {
     "splats": "unit",
     "test_architecture.py": "unit",
     "test_choices.py": "unit",
+    "test_context.py": "unit",
     "test_errors.py": "unit",
     "test_examples.py": "acceptance",
     "test_no_home.py": "acceptance",

@@ -7,16 +7,16 @@ from time import monotonic
 
 from hyrfpack.measure.psnr import psnr_from_mse
 from hyrfpack.progress.events import Event, StepEvent
-from hyrfpack.progress.status import Status
+from hyrfpack.progress.status import Status, StatusLine
 
 MIN_REDRAW_SECONDS = 0.5
 MAX_CURVE_POINTS = 400
 CURVE_WIDTH, CURVE_HEIGHT = 320, 80  # pixels
-CURVE_COLORS = {"loss": "#c44e52", "PSNR": "#4c72b0"}
+CURVE_COLORS = {"loss": "#c44e52", "PSNR (dB)": "#4c72b0"}
 
 
 class NotebookDisplay:
-    """Redraws the output of a notebook's cell at events, and leaves the last state in it."""
+    """Redraws the output of a notebook's cell at events; the last training step and the curves stay in it."""
 
     def __init__(self, status: Status) -> None:
         from IPython.display import HTML, display
@@ -24,27 +24,36 @@ class NotebookDisplay:
         self._html, self._status = HTML, status
         self._curves = Curves()
         self._drawn = monotonic()
+        self._last_step: StatusLine | None = None
         self._handle = display(HTML(""), display_id=True)
 
     def __enter__(self) -> NotebookDisplay:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._draw()
+        self._keep_last_step()
+        self._draw(self._last_step)
 
     def __call__(self, event: Event) -> None:
+        if not isinstance(event, StepEvent):
+            self._keep_last_step()
         self._status.update(event)
         means = self._status.means
         if isinstance(event, StepEvent) and means.loss is not None and means.mse is not None:
             self._curves.add(event.step, means.loss, psnr_from_mse(means.mse))
         if monotonic() - self._drawn >= MIN_REDRAW_SECONDS:
-            self._draw()
+            self._draw(self._status.line())
 
-    def _draw(self) -> None:
-        self._drawn = monotonic()
-        if line := self._status.line():
+    def _keep_last_step(self) -> None:
+        if isinstance(self._status.event, StepEvent):
+            self._last_step = self._status.line()
+
+    def _draw(self, line: StatusLine | None) -> None:
+        self._drawn, page = monotonic(), ""
+        if line is not None:
             bar = f'<progress value="{line.share:.4f}" max="1" style="width: 20em"></progress>'
-            self._handle.update(self._html(f"<div>{bar} <code>{escape(str(line))}</code></div>{self._curves.svg()}"))
+            page = f"<div>{bar} <code>{escape(str(line))}</code></div>{self._curves.svg()}"
+        self._handle.update(self._html(page))
 
 
 class Curves:
@@ -68,12 +77,12 @@ class Curves:
         if len(self._points) < 2:
             return ""
         steps, losses, psnrs = zip(*self._points, strict=True)
-        curves = [_curve_svg(name, steps, values) for name, values in (("loss", losses), ("PSNR", psnrs))]
+        curves = [_curve_svg(name, steps, values) for name, values in (("loss", losses), ("PSNR (dB)", psnrs))]
         return f"<div>{''.join(curves)}</div>"
 
 
 def _curve_svg(name: str, steps: tuple[int, ...], values: tuple[float, ...]) -> str:
-    """Return one curve, with its range in the title."""
+    """Return one curve, with its range in the caption."""
     low, high = min(values), max(values)
     across, up = CURVE_WIDTH / (steps[-1] - steps[0]), CURVE_HEIGHT / ((high - low) or 1.0)
     points = " ".join(

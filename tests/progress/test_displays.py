@@ -435,10 +435,19 @@ def test_a_notebook_shows_a_bar_the_line_and_the_curves(notebook, monkeypatch, c
         progress(TaskEvent("reading <photos>"))
         for step in range(1, 6):
             progress(step_event(step, 10, loss=1 / step, mse=0.1**step))
+        progress(TaskEvent("writing the model"))
     assert "reading &lt;photos&gt;" in notebook[1] and "<svg" not in notebook[1]
+    assert "writing the model" in notebook[-2]
     assert 'value="0.5000"' in notebook[-1] and "step 5/10" in notebook[-1]
-    assert notebook[-1].count("<polyline") == 2 and "PSNR 10 to" in notebook[-1]
+    assert notebook[-1].count("<polyline") == 2 and "PSNR (dB) 10 to" in notebook[-1]
     assert capsys.readouterr() == ("", "")
+
+
+def test_a_notebook_keeps_nothing_of_work_without_steps(notebook, monkeypatch):
+    monkeypatch.setattr("hyrfpack.progress.notebook.MIN_REDRAW_SECONDS", 0.0)
+    with open_display("auto", "compress") as progress:
+        progress(TaskEvent("measuring", 0.5))
+    assert "compress | measuring" in notebook[-2] and notebook[-1] == ""
 
 
 def test_a_notebook_without_ipython_display_gets_plain_lines(notebook, monkeypatch, capsys):

@@ -18,7 +18,9 @@ import torch
 from scenes import QUIET_CONTEXT, ball_scene
 
 from hyrfpack import format as hyrf_format
+from hyrfpack.context import RunContext
 from hyrfpack.errors import HyrfError
+from hyrfpack.progress import StepEvent
 from hyrfpack.render import render_view
 from hyrfpack.scene import Scene
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer, advice, train_model
@@ -237,6 +239,19 @@ def test_a_second_sighup_has_no_effect():
         signal.raise_signal(signal.SIGHUP)
         signal.raise_signal(signal.SIGHUP)
         assert stop()
+
+
+def test_a_stop_asked_by_the_context_saves_a_checkpoint_after_the_step(tmp_path, uninterrupted_trainer):
+    steps: list[int] = []
+    context = RunContext(
+        progress=lambda event: steps.extend([event.step] if isinstance(event, StepEvent) else []),
+        stop=lambda: len(steps) >= 20,
+    )
+    stopped = train_model(make_scene(), tmp_path, RUN_CONFIG, context=context)
+    assert (stopped.complete, stopped.step) == (False, 20) and (tmp_path / "checkpoint.pt").is_file()
+    resumed = train_model(make_scene(), tmp_path, RUN_CONFIG, resume=True, context=QUIET_CONTEXT)
+    loaded = hyrf_format.load_model(resumed.model)
+    assert parameter_bytes(loaded) == parameter_bytes(uninterrupted_trainer.model)
 
 
 @pytest.mark.usefixtures("signals")
