@@ -22,7 +22,7 @@ from hyrfpack.ops.rasterize.cull import frustum_cull
 from hyrfpack.ops.rasterize.reference import ALPHA_MIN
 from hyrfpack.ops.shade import Shading, encode_directions
 from hyrfpack.parallel.pool import parallel_map, run_tasks, torch_on_one_thread
-from hyrfpack.progress import Report, no_report, report_each_call
+from hyrfpack.progress import Progress, count_calls, ignore_progress
 from hyrfpack.render import RenderSettings
 from hyrfpack.scene import Camera
 from hyrfpack.splats.harmonics import fibonacci_sphere, harmonics_basis, num_sh_bases
@@ -50,7 +50,7 @@ def bake(
     cameras: Sequence[Camera],
     degrees: Sequence[int] = (3,),
     visibility: Sequence[CameraVisibility] | None = None,
-    report: Report = no_report,
+    progress: Progress = ignore_progress,
 ) -> dict[int, Splats]:
     """Bake a model to explicit Gaussians in world units, in the model's order, for each degree of spherical harmonics.
 
@@ -80,7 +80,7 @@ def bake(
             sphere alone, at the mean gains of the exposure map if there is one, and opacities do not change.
         degrees: degrees of the harmonics, each 0 to 3. Several degrees take little longer than one.
         visibility: result of `compute_visibility` for these cameras, if it is known already.
-        report: called with the current activity and the share of the work that is done, 0 to 1.
+        progress: called with `TaskEvent`s.
 
     Raises:
         HyrfError: a number of the model, or a camera's pose, is NaN, infinite or beyond float32.
@@ -104,7 +104,7 @@ def bake(
         normalized_quats(geometry.quats.numpy()),
         opacities.numpy(),
     )
-    fitted = _fit_harmonics(model, visibility, light, BakeGains.predict(model, cameras, visibility), degrees, report)
+    fitted = _fit_harmonics(model, visibility, light, BakeGains.predict(model, cameras, visibility), degrees, progress)
     baked = {}
     for degree in list(fitted):  # one at a time, because the harmonics of many Gaussians take much memory
         harmonics = fitted.pop(degree)
@@ -139,22 +139,22 @@ class CameraVisibility:
 @torch_on_one_thread()
 @torch.no_grad()
 def compute_visibility(
-    model: HybridModel, cameras: Sequence[Camera], report: Report = no_report
+    model: HybridModel, cameras: Sequence[Camera], progress: Progress = ignore_progress
 ) -> list[CameraVisibility]:
     """Compute the light that the Gaussians of a model send to each camera.
 
     Args:
         model: a model on the CPU.
         cameras: cameras in world units.
-        report: called after each camera with the share of the work that is done, 0 to 1.
+        progress: called with `TaskEvent`s.
 
     Raises:
         HyrfError: a camera's pose is NaN, infinite or beyond float32.
     """
     # Cameras are processed in parallel, because much of the work for one camera uses one core only.
-    see = report_each_call(
+    see = count_calls(
         partial(_compute_camera_visibility, model, model.decode_geometry()),
-        report,
+        progress,
         "measuring visibility from each camera",
         len(cameras),
     )
@@ -194,7 +194,7 @@ def _fit_harmonics(
     light: Tensor,
     gains: BakeGains | None,
     degrees: Iterable[int],
-    report: Report,
+    progress: Progress,
 ) -> dict[int, Tensor]:
     """Fit the harmonics (N, K, 3) of all Gaussians for each degree."""
     shading, positions = model.shading(), model.gaussians.positions.detach()
@@ -249,7 +249,7 @@ def _fit_harmonics(
             )
 
     blocks = len(edges) - 1
-    run_tasks(report_each_call(fit_block, report, "fitting colours", blocks), blocks)
+    run_tasks(count_calls(fit_block, progress, "fitting colours", blocks), blocks)
     return fitted
 
 

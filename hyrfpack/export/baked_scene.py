@@ -16,7 +16,7 @@ from hyrfpack.export.bake import CameraVisibility, bake, compute_visibility
 from hyrfpack.export.degree import choose_degree
 from hyrfpack.export.kinds import HTML_PAGE, POSITION_KINDS, includes_background, select_splats
 from hyrfpack.export.source import Source
-from hyrfpack.progress import Report, report_part
+from hyrfpack.progress import Progress, part_of_progress
 from hyrfpack.splats.splats import Splats, concatenate
 from hyrfpack.splats.table import FileKind
 
@@ -53,36 +53,36 @@ class BakedScene:
     by_exposure: dict[str, ShownSplats] = field(default_factory=dict)
 
 
-def bake_scene(source: Source, kind: FileKind, config: ExportConfig, report: Report) -> BakedScene:
+def bake_scene(source: Source, kind: FileKind, config: ExportConfig, progress: Progress) -> BakedScene:
     """Bake a model to the splats that a file of a kind needs.
 
     Args:
         source: the model with its cameras.
         kind: kind of the file.
         config: settings of the export.
-        report: called with the current activity and the share of the work that is done, 0 to 1.
+        progress: called with `TaskEvent`s.
 
     Raises:
         HyrfError: the settings leave no Gaussian.
     """
     by_exposure = {LOCAL_EXPOSURE: source, CONSISTENT_EXPOSURE: _without_exposure_map(source)}
     loaded = by_exposure[config.exposure]
-    degree, chosen_by, visibility = _decide_degree(loaded, kind, config, report_part(report, 0.0, 0.7))
-    fit_report = report_part(report, 0.7 if chosen_by else 0.5, 0.8)
-    baked = _bake_at(loaded, kind, config, degree, visibility, fit_report)
+    degree, chosen_by, visibility = _decide_degree(loaded, kind, config, part_of_progress(progress, 0.0, 0.7))
+    fit_progress = part_of_progress(progress, 0.7 if chosen_by else 0.5, 0.8)
+    baked = _bake_at(loaded, kind, config, degree, visibility, fit_progress)
     has_map = source.model.exposure is not None
     baked = replace(baked, chosen_by=chosen_by, exposure=config.exposure if has_map else None)
     if not has_map or config.crop is not None or not source.measured_views or kind in POSITION_KINDS:
         return baked
     (other,) = set(SPLAT_EXPOSURES) - {config.exposure}
     _LOG.info(f"fitting colours of {other} exposure for comparison")
-    rival = _bake_at(by_exposure[other], kind, config, degree, visibility, report_part(report, 0.8, 1.0))
+    rival = _bake_at(by_exposure[other], kind, config, degree, visibility, part_of_progress(progress, 0.8, 1.0))
     shown = {config.exposure: (baked.splats, baked.picture), other: (rival.splats, rival.picture)}
     return replace(baked, by_exposure=shown)
 
 
 def _decide_degree(
-    loaded: Source, kind: FileKind, config: ExportConfig, report: Report
+    loaded: Source, kind: FileKind, config: ExportConfig, progress: Progress
 ) -> tuple[int, dict[int, float], Sequence[CameraVisibility]]:
     """Return the degree of the harmonics, the scores if it was chosen by these, and what the cameras see."""
     places = f"{len(loaded.fit_cameras)} " + (
@@ -95,15 +95,15 @@ def _decide_degree(
     is_chosen = config.degree is None and highest > 0
     if is_chosen:
         _LOG.info(f"choosing the degree of the spherical harmonics at {places}")
-        visibility = compute_visibility(loaded.model, loaded.fit_cameras, report_part(report, 0.0, 0.43))
+        visibility = compute_visibility(loaded.model, loaded.fit_cameras, part_of_progress(progress, 0.0, 0.43))
         degree, chosen_by = choose_degree(
-            loaded.model, loaded.fit_cameras, highest, visibility, report_part(report, 0.43, 1.0)
+            loaded.model, loaded.fit_cameras, highest, visibility, part_of_progress(progress, 0.43, 1.0)
         )
         scores = ", ".join(f"{score:.2f}" for score in chosen_by.values())
         _LOG.info(f"chosen degree {degree}: {scores} dB against the model for degrees 0 to {highest}")
     _LOG.info(f"fitting colours of degree {degree} at {places}")
     if not is_chosen:
-        visibility = compute_visibility(loaded.model, loaded.fit_cameras, report_part(report, 0.0, 0.71))
+        visibility = compute_visibility(loaded.model, loaded.fit_cameras, part_of_progress(progress, 0.0, 0.71))
     return degree, chosen_by, visibility
 
 
@@ -113,10 +113,10 @@ def _bake_at(
     config: ExportConfig,
     degree: int,
     visibility: Sequence[CameraVisibility],
-    report: Report,
+    progress: Progress,
 ) -> BakedScene:
     """Bake a model at a degree, select splats, and add the background."""
-    splats = bake(loaded.model, loaded.fit_cameras, (degree,), visibility, report)[degree]
+    splats = bake(loaded.model, loaded.fit_cameras, (degree,), visibility, progress)[degree]
     sphere = includes_background(loaded, kind, config)
     splats, picture, background_count = select_splats(splats, config.crop, config.min_opacity), None, 0
     if sphere and kind is HTML_PAGE:

@@ -19,7 +19,7 @@ from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.export.kinds import check_package, select_splats
 from hyrfpack.export.measure import psnr_of_splats
 from hyrfpack.outputs import Outputs
-from hyrfpack.progress import Report, report_part, report_to
+from hyrfpack.progress import Progress, TaskEvent, part_of_progress
 from hyrfpack.splats.draw import Drawable
 from hyrfpack.splats.files import READABLE_ENDINGS, read_splats
 from hyrfpack.splats.formats.hints import Hints
@@ -101,7 +101,7 @@ def convert_splats(
     check_package(kind, target)
     Outputs(source, folder=sog_folder(source), overwrite=overwrite).file(target)
     with context.open_progress("convert") as progress:
-        return _convert(source, target, kind, config, overwrite, report_to(progress))
+        return _convert(source, target, kind, config, overwrite, progress)
 
 
 def _convert(
@@ -110,10 +110,10 @@ def _convert(
     kind: SplatFormat,
     config: ConvertConfig,
     overwrite: bool,
-    report: Report,
+    progress: Progress,
 ) -> ConversionReport:
     """Read, select, write and measure splats."""
-    report(f"reading {Path(source).name}", 0.0)
+    progress(TaskEvent(f"reading {Path(source).name}", 0.0))
     splats = read_splats(source)
     if not len(splats):
         raise HyrfDataError(
@@ -127,11 +127,11 @@ def _convert(
     weighted = WeightedSplats.from_splats(whole, str(source))
     camera = Viewpoint.from_frame(weighted.frame.center, weighted.frame.scale).camera
     hints = Hints(camera=camera, spz_version=config.spz_version)
-    report(f"writing {len(kept):,} Gaussians as {kind.ending}", 0.2)
+    progress(TaskEvent(f"writing {len(kept):,} Gaussians as {kind.ending}", 0.2))
     data = kind.encode(kept, hints)
-    report("reading the file back", 0.5)
+    progress(TaskEvent("reading the file back", 0.5))
     after = kind.decode(data, str(target))
-    psnr = _measure_psnr(whole, after, weighted, report_part(report, 0.6, 1.0))
+    psnr = _measure_psnr(whole, after, weighted, part_of_progress(progress, 0.6, 1.0))
     written = write_atomic(target, data, overwrite=overwrite)
     return ConversionReport(
         file=str(written),
@@ -206,13 +206,13 @@ def _check_limits(kind: SplatFormat, splats: Splats, kept: Splats) -> None:
         )
 
 
-def _measure_psnr(before: Splats, after: Splats, weighted: WeightedSplats, report: Report) -> list[float]:
+def _measure_psnr(before: Splats, after: Splats, weighted: WeightedSplats, progress: Progress) -> list[float]:
     """Measure the PSNR in dB of the pictures of `after` against those of `before`, for each view."""
     original, converted = (Drawable.from_splats(splats, weighted.frame) for splats in (before, after))
-    report("choosing viewpoints", 0.0)
+    progress(TaskEvent("choosing viewpoints", 0.0))
     cameras = sample_viewpoints(weighted, original, MEASURED_VIEWS, MEASURED_SIZE_PIXELS, seed=0)
     scores = []
     for number, camera in enumerate(cameras):
-        report(f"comparing view {number + 1}/{len(cameras)}", 0.3 + 0.7 * number / len(cameras))
+        progress(TaskEvent(f"comparing view {number + 1}/{len(cameras)}", 0.3 + 0.7 * number / len(cameras)))
         scores.append(psnr_of_splats(original, converted, camera))
     return scores

@@ -11,7 +11,7 @@ from hyrfpack.export.bake import CameraVisibility, bake
 from hyrfpack.export.measure import measure_psnr
 from hyrfpack.export.source import MAX_MEASURED_VIEWS, MIN_CAMERAS_TO_HOLD_OUT
 from hyrfpack.model import HybridModel
-from hyrfpack.progress import Report, no_report, report_part
+from hyrfpack.progress import Progress, ignore_progress, part_of_progress
 from hyrfpack.scene import Camera, evenly_spaced
 
 # Every ninth camera, from the fifth on, is a validation camera. `Source` makes up cameras at three heights in turn, of
@@ -27,7 +27,7 @@ def choose_degree(
     cameras: Sequence[Camera],
     highest: int,
     visibility: Sequence[CameraVisibility] | None = None,
-    report: Report = no_report,
+    progress: Progress = ignore_progress,
 ) -> tuple[int, dict[int, float]]:
     """Choose the lowest degree of harmonics, 0 to `highest`, whose score is within SCORE_TOLERANCE_DB of the best.
 
@@ -41,7 +41,7 @@ def choose_degree(
         cameras: cameras at which colours may be fitted, world units, without those that will measure the result.
         highest: highest degree to consider, 0 to 3.
         visibility: result of `compute_visibility` for the cameras, if it is known already.
-        report: called with the current activity and the share of the work that is done, 0 to 1.
+        progress: called with `TaskEvent`s.
 
     Returns:
         The degree, and the score in dB of each degree.
@@ -55,10 +55,10 @@ def choose_degree(
         validation = fit_cameras[VALIDATION_CAMERAS]
         for items in (fit_cameras, fit_visibility or []):
             del items[VALIDATION_CAMERAS]
-    baked = bake(model, fit_cameras, range(highest + 1), fit_visibility, report_part(report, 0.0, 0.6))
+    baked = bake(model, fit_cameras, range(highest + 1), fit_visibility, part_of_progress(progress, 0.0, 0.6))
     candidates = {str(degree): (splats, None) for degree, splats in baked.items()}
     views = [(shrink_camera(camera), None) for camera in evenly_spaced(validation, MAX_MEASURED_VIEWS)]
-    measured = measure_psnr(model, candidates, views, sphere=False, report=report_part(report, 0.6, 1.0))
+    measured = measure_psnr(model, candidates, views, sphere=False, progress=part_of_progress(progress, 0.6, 1.0))
     scores = {degree: measured[str(degree)].model for degree in baked}
     return lowest_degree_within_tolerance(scores), scores
 

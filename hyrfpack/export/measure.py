@@ -15,7 +15,7 @@ from hyrfpack.model import HybridModel
 from hyrfpack.ops.background import pixel_directions
 from hyrfpack.ops.viewport import Viewport
 from hyrfpack.parallel.pool import parallel_map
-from hyrfpack.progress import Report, no_report, report_each_call
+from hyrfpack.progress import Progress, count_calls, ignore_progress
 from hyrfpack.render import render_view
 from hyrfpack.scene import Camera, View
 from hyrfpack.splats.draw import Drawable, draw
@@ -44,7 +44,7 @@ def measure_psnr(
     views: Sequence[tuple[Camera, View | None]],
     *,
     sphere: bool,
-    report: Report = no_report,
+    progress: Progress = ignore_progress,
 ) -> dict[str, PsnrScores]:
     """Measure the PSNR of pictures of splats against those of a model, and against photos.
 
@@ -54,7 +54,7 @@ def measure_psnr(
             `background_picture` makes it, or None for the model's solid colour.
         views: cameras, with their photos or None. Photos are scored if all views have them.
         sphere: whether the model is rendered with its background sphere.
-        report: called after each view with the share of the work that is done, 0 to 1.
+        progress: called with `TaskEvent`s.
 
     Returns:
         Scores by candidate, and those of the model as "model"; empty if the masks of the photos leave no pixel.
@@ -82,7 +82,7 @@ def measure_psnr(
             for name, picture in pictures.items()
         }
 
-    compare = report_each_call(scores_at, report, "comparing renders with those of the model", len(views))
+    compare = count_calls(scores_at, progress, "comparing renders with those of the model", len(views))
     scores = [view_scores for view_scores in parallel_map(compare, views) if view_scores]
     return (
         {name: _mean_scores([view_scores[name] for view_scores in scores]) for name in ("model", *drawables)}

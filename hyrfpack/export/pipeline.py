@@ -34,7 +34,7 @@ from hyrfpack.export.source import Source
 from hyrfpack.format import find_model
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.outputs import Outputs
-from hyrfpack.progress import Report, report_part, report_to
+from hyrfpack.progress import Progress, TaskEvent, part_of_progress
 from hyrfpack.scene import Scene
 from hyrfpack.splats.formats.hints import Hints
 from hyrfpack.splats.table import FileKind, SplatFormat
@@ -108,25 +108,25 @@ def export_model(
         if kind is TRANSFORMS_JSON:
             return _write_cameras(loaded, target, overwrite)
         with context.open_progress("export") as progress:
-            return _export_gaussians(loaded, Path(target), kind, config, overwrite, report_to(progress))
+            return _export_gaussians(loaded, Path(target), kind, config, overwrite, progress)
 
 
 def _export_gaussians(
-    loaded: Source, target: Path, kind: FileKind, config: ExportConfig, overwrite: bool, report: Report
+    loaded: Source, target: Path, kind: FileKind, config: ExportConfig, overwrite: bool, progress: Progress
 ) -> ExportReport:
     """Export Gaussians: bake, write and measure."""
     check_model(loaded, kind, config)
-    baked = bake_scene(loaded, kind, config, report_part(report, 0.0, 0.5))
+    baked = bake_scene(loaded, kind, config, part_of_progress(progress, 0.0, 0.5))
     if kind in POSITION_KINDS:
         return _write_points(baked, target, kind, overwrite)
     count = len(baked.splats) - baked.background_count
     _LOG.info(f"writing {count:,} Gaussians{' and the background' if baked.sphere else ''}")
-    report(f"writing {count:,} Gaussians", 0.5)
+    progress(TaskEvent(f"writing {count:,} Gaussians", 0.5))
     result, written = _write_splats(baked, target, kind, config, overwrite)
     if config.crop is not None:
         _LOG.info("quality is not measured, because a part of the scene was cropped")
         return result
-    return measure_export(result, loaded, baked, written, kind, report_part(report, 0.65, 1.0))
+    return measure_export(result, loaded, baked, written, kind, part_of_progress(progress, 0.65, 1.0))
 
 
 def _check_cameras(loaded: Source, source: str | os.PathLike[str]) -> None:

@@ -11,7 +11,7 @@ from hyrfpack.export.baked_scene import BakedScene, ShownSplats
 from hyrfpack.export.measure import PsnrScores, measure_psnr
 from hyrfpack.export.report import ExportReport
 from hyrfpack.export.source import Source
-from hyrfpack.progress import Report, report_part
+from hyrfpack.progress import Progress, part_of_progress
 from hyrfpack.splats.table import FORMATS, FileKind
 
 _LOG = logging.getLogger(__name__)
@@ -20,7 +20,7 @@ MIN_REPORTED_COST_DB = 1.0
 
 
 def measure_export(
-    result: ExportReport, loaded: Source, baked: BakedScene, written: ShownSplats, kind: FileKind, report: Report
+    result: ExportReport, loaded: Source, baked: BakedScene, written: ShownSplats, kind: FileKind, progress: Progress
 ) -> ExportReport:
     """Measure the loss of an export, and return its report with the PSNR fields filled in.
 
@@ -30,25 +30,25 @@ def measure_export(
         baked: the scene that was written.
         written: the splats as read back from the file.
         kind: kind of the file.
-        report: called with the current activity and the share of the work that is done, 0 to 1.
+        progress: called with `TaskEvent`s.
     """
     if not loaded.measured_views:
         _LOG.info("quality is not measured, because no photo is held out")
         return result
     _LOG.info(f"measuring at {len(loaded.measured_views)} views")
     file_share = 0.57 if baked.by_exposure else 1.0
-    result = _add_file_scores(result, baked, written, kind, report_part(report, 0.0, file_share))
+    result = _add_file_scores(result, baked, written, kind, part_of_progress(progress, 0.0, file_share))
     if not baked.by_exposure:
         return result
-    return _add_exposure_scores(result, loaded, baked, report_part(report, file_share, 1.0))
+    return _add_exposure_scores(result, loaded, baked, part_of_progress(progress, file_share, 1.0))
 
 
 def _add_file_scores(
-    result: ExportReport, baked: BakedScene, written: ShownSplats, kind: FileKind, report: Report
+    result: ExportReport, baked: BakedScene, written: ShownSplats, kind: FileKind, progress: Progress
 ) -> ExportReport:
     """Add the scores of the baked splats and of the file, and log a warning if the format costs much."""
     loaded, shown = baked.source, {"baked": (baked.splats, baked.picture), "file": written}
-    scores = measure_psnr(loaded.model, shown, loaded.measured_views, sphere=baked.sphere, report=report)
+    scores = measure_psnr(loaded.model, shown, loaded.measured_views, sphere=baked.sphere, progress=progress)
     if not scores:
         _LOG.warning("quality is not measured, because the masks leave no pixel of the held-out photos")
         return result
@@ -82,9 +82,11 @@ def _warn_of_cost(cost: float, loaded: Source, kind: FileKind) -> None:
     )
 
 
-def _add_exposure_scores(result: ExportReport, loaded: Source, baked: BakedScene, report: Report) -> ExportReport:
+def _add_exposure_scores(result: ExportReport, loaded: Source, baked: BakedScene, progress: Progress) -> ExportReport:
     """Add the scores of splats of both exposures, against the model as photographed and against photos."""
-    scores = measure_psnr(loaded.model, baked.by_exposure, loaded.measured_views, sphere=baked.sphere, report=report)
+    scores = measure_psnr(
+        loaded.model, baked.by_exposure, loaded.measured_views, sphere=baked.sphere, progress=progress
+    )
     by_exposure = {name: scores[name] for name in SPLAT_EXPOSURES if name in scores}
     return replace(
         result,
