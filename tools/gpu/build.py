@@ -347,12 +347,17 @@ def _format_error(error: Exception) -> str:
 
 def _describe_build(kernel: JITFunction, target: str, built: object) -> Build:
     source = built.src
-    constants = [f"{source.fn.arg_names[path[0]]}={value}" for path, value in source.constants.items()]
-    aligned = [source.fn.arg_names[path[0]] for path in source.attrs]
+    constants = [f"{_argument_name(kernel, path)}={value}" for path, value in source.constants.items()]
+    aligned = [_argument_name(kernel, path) for path in source.attrs]
     registers, spills = _read_resources(built)
     metadata = built.metadata
     described = " ".join(constants) + " /16: " + " ".join(aligned)
     return Build(_kernel_name(kernel), target, described, metadata.num_warps, registers, metadata.shared, spills)
+
+
+def _argument_name(kernel: JITFunction, path: tuple[int, ...]) -> str:
+    """Return the name of an argument, with its place if it is an element of a tuple, such as "biases.1"."""
+    return ".".join((kernel.arg_names[path[0]], *map(str, path[1:])))
 
 
 def _read_resources(built: object) -> tuple[int, int]:

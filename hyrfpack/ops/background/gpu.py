@@ -21,7 +21,7 @@ from hyrfpack.ops.background.reference import BACKGROUND_RADIUS, BackgroundField
 from hyrfpack.ops.contraction.gpu import contract_block
 from hyrfpack.ops.gpu_pairs import unpack_pair
 from hyrfpack.ops.hash_encode.gpu import axis_vertices, level_parameters, rows_as_words, vertex_row
-from hyrfpack.ops.mlp.tiles import multiply_add, product_precision, round_factor, round_relu
+from hyrfpack.ops.mlp.tiles import multiply_add, pad_width, product_precision, round_factor, round_relu
 from hyrfpack.ops.poses import camera_center
 from hyrfpack.ops.shade.directions import DIRECTION_FEATURES
 from hyrfpack.ops.shade.gpu_directions import encode_block
@@ -199,7 +199,7 @@ def background_grid(
     levels = len(field.resolutions)
     encoding_width = weights[0].shape[1] - 2 * levels
     hidden = [len(bias) for bias in biases[:2]]
-    widths = [_padded_width(width) for width in hidden]
+    widths = [pad_width(width) for width in hidden]
     block_columns, warps, part = _launch_shape(field.mixed, max(widths))
     colors = field.table.new_empty((3, rows, columns))
     background_kernel[(triton.cdiv(rows, _NODE_ROWS_PER_BLOCK.value) * triton.cdiv(columns, block_columns),)](
@@ -222,8 +222,8 @@ def background_grid(
         ENCODING_WIDTH=encoding_width,
         H1=hidden[0],
         H2=hidden[1],
-        LEVELS_P=_padded_width(levels),
-        ENCODING_WIDTH_P=_padded_width(encoding_width),
+        LEVELS_P=pad_width(levels),
+        ENCODING_WIDTH_P=pad_width(encoding_width),
         H1_P=widths[0],
         H2_P=widths[1],
         H2_SLICE=min(widths[1], part),
@@ -303,8 +303,3 @@ def _camera_rays(viewport: Viewport, stride: int) -> tuple[tuple[float, ...], ..
     seen = [[(0.5 - cx) / fx, (0.5 - cy) / fy, 1], [stride / fx, 0, 0], [0, stride / fy, 0]]
     rays = torch.tensor(seen, dtype=torch.float64) @ pose[:3, :3]
     return tuple(map(tuple, (*rays.tolist(), camera_center(pose).tolist())))
-
-
-def _padded_width(width: int) -> int:
-    """Return the side of a tile that holds this many elements, a power of two of at least 16 for the matrix units."""
-    return max(16, triton.next_power_of_2(width))

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache
+from typing import NamedTuple
 
 import torch
 import triton
@@ -23,6 +24,7 @@ from hyrfpack.ops.mlp.tiles import (
     load_tile_transposed,
     multiply_add,
     pack_weights,
+    pad_width,
     product_precision,
     round_factor,
     round_relu,
@@ -36,28 +38,35 @@ _FORWARD_POINTS_PER_BLOCK_MIXED = 128
 _FORWARD_POINTS_PER_BLOCK_FLOAT32 = 32
 
 
+class Rows(NamedTuple):
+    """A matrix of points and features as an argument of kernels."""
+
+    data: Tensor
+    point_stride: int
+    feature_stride: int
+
+
 def forward(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], mixed: bool) -> tuple[Tensor, Tensor]:
     """Compute the outputs (N, O) of rows (N, I), and the packed weights for `backward`."""
-    constants = kernel_widths([x.shape[1], *(weight.shape[0] for weight in weights)])
+    widths = [x.shape[1], *(weight.shape[0] for weight in weights)]
     multiplication = product_precision(mixed)
     packed = pack_weights(weights, multiplication)
-    result = x.new_empty(x.shape[0], constants["OUT"])
+    result = x.new_empty(x.shape[0], widths[-1])
     block = _FORWARD_POINTS_PER_BLOCK_MIXED if mixed else _FORWARD_POINTS_PER_BLOCK_FLOAT32
     programs = _program_count(x, block, _FORWARD_PROGRAMS_PER_PROCESSOR)
     if programs:
         forward_kernel[(programs,)](
-            x,
-            *x.stride(),
+            Rows(x, *x.stride()),
             packed,
-            *(bias.contiguous() for bias in biases),
+            tuple(bias.contiguous() for bias in biases),
             result,
             x.shape[0],
-            **constants,
+            W=kernel_widths(widths),
             PLANAR=x.stride(0) == 1,
             NEEDS_INT64=_needs_int64_offsets(x),
             BLOCK=block,
             PRECISION=multiplication,
-            num_warps=_warps_per_program(constants),
+            num_warps=_warps_per_program(widths),
             enable_fp_fusion=True,
         )
     return result, packed
@@ -83,7 +92,6 @@ def backward(
     Returns:
         The gradients of x, in its layout, of the weights and of the biases.
     """
-    constants = kernel_widths(widths)
     multiplication = product_precision(mixed)
     planar = x.stride(0) == 1
     grad_x = None
@@ -97,25 +105,23 @@ def backward(
     launches = [{"UPPER_LAYERS": True, "FIRST_LAYER": True, "NEEDS_X": needs_x}]
     if multiplication == "tf32x3":  # Products hold three times as many factors, so one kernel for all would spill.
         launches = [{name: name == part for name in launches[0]} for part, needed in launches[0].items() if needed]
+    written = x if grad_x is None else grad_x
     for launch in launches if programs else []:
         backward_kernel[(programs,)](
-            x,
-            *x.stride(),
+            Rows(x, *x.stride()),
             packed,
-            *(bias.contiguous() for bias in biases[:2]),
-            grad,
-            *grad.stride(),
-            x if grad_x is None else grad_x,
-            *(x if grad_x is None else grad_x).stride(),
+            tuple(bias.contiguous() for bias in biases[:2]),
+            Rows(grad, *grad.stride()),
+            Rows(written, *written.stride()),
             partials,
             x.shape[0],
-            **constants,
+            W=kernel_widths(widths),
             **launch,
             PLANAR=planar,
             NEEDS_INT64=_needs_int64_offsets(x) or _needs_int64_offsets(grad),
             BLOCK=block,
             PRECISION=multiplication,
-            num_warps=_warps_per_program(constants),
+            num_warps=_warps_per_program(widths),
             enable_fp_fusion=True,
         )
     w1, w2, w3, b1, b2, b3 = partials.sum(0).split(lengths)
@@ -126,9 +132,9 @@ def backward(
     )
 
 
-def _warps_per_program(constants: dict[str, int]) -> int:
+def _warps_per_program(widths: Sequence[int]) -> int:
     """Return the warps per program; wide layers need the registers of twice as many threads."""
-    return 8 if max(constants["IN_P"], constants["H1_P"], constants["H2_P"]) > 64 else 4
+    return 8 if max(map(pad_width, widths[:3])) > 64 else 4
 
 
 @cache
@@ -208,67 +214,75 @@ def _opaque_zero(start, count):
 
 @triton.jit(do_not_specialize=["count"])
 def forward_kernel(
-    x, stride_point, stride_feature, packed, b1, b2, b3, y, count,
-    IN: tl.constexpr, H1: tl.constexpr, H2: tl.constexpr, OUT: tl.constexpr,
-    IN_P: tl.constexpr, H1_P: tl.constexpr, H2_P: tl.constexpr, OUT_P: tl.constexpr,
-    PLANAR: tl.constexpr, NEEDS_INT64: tl.constexpr, BLOCK: tl.constexpr, PRECISION: tl.constexpr,
+    x, packed, biases, y, count,
+    W: tl.constexpr, PLANAR: tl.constexpr, NEEDS_INT64: tl.constexpr, BLOCK: tl.constexpr, PRECISION: tl.constexpr,
 ):  # fmt: skip
-    """Compute y (count, OUT) from x (count, IN). PLANAR: whether the stride between points of x is 1."""
-    w2 = packed + H1_P * IN_P
-    w3 = w2 + H2_P * H1_P
+    """Compute y (count, OUT) from the `Rows` x (count, IN).
+
+    W: `KernelWidths`. PLANAR: whether the stride between points of x is 1.
+    """
+    b1, b2, b3 = biases
+    w2 = packed + W.H1_P * W.IN_P
+    w3 = w2 + W.H2_P * W.H1_P
     start = tl.program_id(0) * BLOCK
     while start < count:
-        step = stride_feature
+        step = x.feature_stride
         if PLANAR:
             step += _opaque_zero(start, count)
-        tile = round_factor(_load_tile(x, stride_point, step, start, count, IN, IN_P, BLOCK, NEEDS_INT64), PRECISION)
-        tile = round_relu(linear(packed, b1, tile, H1, H1_P, IN_P, PRECISION), PRECISION)
-        tile = round_relu(linear(w2, b2, tile, H2, H2_P, H1_P, PRECISION), PRECISION)
-        tile = linear(w3, b3, tile, OUT, OUT_P, H2_P, PRECISION)
-        _store_tile(tile, y, OUT, 1, start, count, OUT, OUT_P, BLOCK, False)
+        tile = round_factor(
+            _load_tile(x.data, x.point_stride, step, start, count, W.IN, W.IN_P, BLOCK, NEEDS_INT64), PRECISION
+        )
+        tile = round_relu(linear(packed, b1, tile, W.H1, W.H1_P, W.IN_P, PRECISION), PRECISION)
+        tile = round_relu(linear(w2, b2, tile, W.H2, W.H2_P, W.H1_P, PRECISION), PRECISION)
+        tile = linear(w3, b3, tile, W.OUT, W.OUT_P, W.H2_P, PRECISION)
+        _store_tile(tile, y, W.OUT, 1, start, count, W.OUT, W.OUT_P, BLOCK, False)
         start += tl.num_programs(0) * BLOCK
 
 
 @triton.jit(do_not_specialize=["count"])
 def backward_kernel(
-    x, stride_point, stride_feature, packed, b1, b2, grad, grad_stride_point, grad_stride_output,
-    grad_x, grad_x_stride_point, grad_x_stride_feature, partials, count,
-    IN: tl.constexpr, H1: tl.constexpr, H2: tl.constexpr, OUT: tl.constexpr,
-    IN_P: tl.constexpr, H1_P: tl.constexpr, H2_P: tl.constexpr, OUT_P: tl.constexpr,
-    UPPER_LAYERS: tl.constexpr, FIRST_LAYER: tl.constexpr, NEEDS_X: tl.constexpr,
+    x, packed, biases, grad, grad_x, partials, count,
+    W: tl.constexpr, UPPER_LAYERS: tl.constexpr, FIRST_LAYER: tl.constexpr, NEEDS_X: tl.constexpr,
     PLANAR: tl.constexpr, NEEDS_INT64: tl.constexpr, BLOCK: tl.constexpr, PRECISION: tl.constexpr,
 ):  # fmt: skip
     """Compute gradients of layers 2 and 3 (UPPER_LAYERS), of layer 1 (FIRST_LAYER), and of x (NEEDS_X).
 
-    Each program writes its sums to its row of `partials` (programs, parameters): W1, W2, W3, b1, b2, b3, flattened.
+    x, grad and grad_x are `Rows`. Each program writes its sums to its row of `partials` (programs, parameters): W1, W2,
+    W3, b1, b2, b3, flattened.
     """
-    w2 = packed + H1_P * IN_P
-    w3 = w2 + H2_P * H1_P
-    grad_w1 = tl.zeros([H1_P, IN_P], tl.float32)
-    grad_w2 = tl.zeros([H2_P, H1_P], tl.float32)
-    grad_w3 = tl.zeros([H2_P, OUT_P], tl.float32)
-    grad_b1 = tl.zeros([H1_P], tl.float32)
-    grad_b2 = tl.zeros([H2_P], tl.float32)
-    grad_b3 = tl.zeros([OUT_P], tl.float32)
+    b1, b2 = biases
+    w2 = packed + W.H1_P * W.IN_P
+    w3 = w2 + W.H2_P * W.H1_P
+    grad_w1 = tl.zeros([W.H1_P, W.IN_P], tl.float32)
+    grad_w2 = tl.zeros([W.H2_P, W.H1_P], tl.float32)
+    grad_w3 = tl.zeros([W.H2_P, W.OUT_P], tl.float32)
+    grad_b1 = tl.zeros([W.H1_P], tl.float32)
+    grad_b2 = tl.zeros([W.H2_P], tl.float32)
+    grad_b3 = tl.zeros([W.OUT_P], tl.float32)
     start = tl.program_id(0) * BLOCK
     while start < count:
-        step, grad_x_step = stride_feature, grad_x_stride_feature
+        step, grad_x_step = x.feature_stride, grad_x.feature_stride
         if PLANAR:
             step += _opaque_zero(start, count)
             grad_x_step += _opaque_zero(start, count)
-        upstream = _load_tile(grad, grad_stride_point, grad_stride_output, start, count, OUT, OUT_P, BLOCK, NEEDS_INT64)
+        upstream = _load_tile(
+            grad.data, grad.point_stride, grad.feature_stride, start, count, W.OUT, W.OUT_P, BLOCK, NEEDS_INT64
+        )
         if tl.max(tl.max((upstream != 0).to(tl.int32), 1), 0) > 0:
             tile = round_factor(
-                _load_tile(x, stride_point, step, start, count, IN, IN_P, BLOCK, NEEDS_INT64), PRECISION
+                _load_tile(x.data, x.point_stride, step, start, count, W.IN, W.IN_P, BLOCK, NEEDS_INT64), PRECISION
             )
-            hidden1 = round_relu(linear(packed, b1, tile, H1, H1_P, IN_P, PRECISION), PRECISION)
-            hidden2 = round_relu(linear(w2, b2, hidden1, H2, H2_P, H1_P, PRECISION), PRECISION)
+            hidden1 = round_relu(linear(packed, b1, tile, W.H1, W.H1_P, W.IN_P, PRECISION), PRECISION)
+            hidden2 = round_relu(linear(w2, b2, hidden1, W.H2, W.H2_P, W.H1_P, PRECISION), PRECISION)
             grad3_factor = round_factor(upstream, PRECISION)
             if UPPER_LAYERS:
                 grad_w3 = multiply_add(hidden2, tl.trans(grad3_factor), grad_w3, PRECISION)
                 grad_b3 += tl.sum(upstream, 1)
             grad2 = multiply_add(
-                load_tile_transposed(w3, OUT_P, H2_P), grad3_factor, tl.zeros([H2_P, BLOCK], tl.float32), PRECISION
+                load_tile_transposed(w3, W.OUT_P, W.H2_P),
+                grad3_factor,
+                tl.zeros([W.H2_P, BLOCK], tl.float32),
+                PRECISION,
             )
             grad2 = tl.where(hidden2 > 0, grad2, 0.0)
             grad2_factor = round_factor(grad2, PRECISION)
@@ -277,7 +291,10 @@ def backward_kernel(
                 grad_b2 += tl.sum(grad2, 1)
             if FIRST_LAYER or NEEDS_X:
                 grad1 = multiply_add(
-                    load_tile_transposed(w2, H2_P, H1_P), grad2_factor, tl.zeros([H1_P, BLOCK], tl.float32), PRECISION
+                    load_tile_transposed(w2, W.H2_P, W.H1_P),
+                    grad2_factor,
+                    tl.zeros([W.H1_P, BLOCK], tl.float32),
+                    PRECISION,
                 )
                 grad1 = tl.where(hidden1 > 0, grad1, 0.0)
                 grad1_factor = round_factor(grad1, PRECISION)
@@ -286,32 +303,43 @@ def backward_kernel(
                     grad_b1 += tl.sum(grad1, 1)
                 if NEEDS_X:
                     grad_tile = multiply_add(
-                        load_tile_transposed(packed, H1_P, IN_P),
+                        load_tile_transposed(packed, W.H1_P, W.IN_P),
                         grad1_factor,
-                        tl.zeros([IN_P, BLOCK], tl.float32),
+                        tl.zeros([W.IN_P, BLOCK], tl.float32),
                         PRECISION,
                     )
                     _store_tile(
-                        grad_tile, grad_x, grad_x_stride_point, grad_x_step, start, count, IN, IN_P, BLOCK, NEEDS_INT64
+                        grad_tile,
+                        grad_x.data,
+                        grad_x.point_stride,
+                        grad_x_step,
+                        start,
+                        count,
+                        W.IN,
+                        W.IN_P,
+                        BLOCK,
+                        NEEDS_INT64,
                     )
         elif NEEDS_X:
-            zero_tile = tl.zeros([IN_P, BLOCK], tl.float32)
-            _store_tile(zero_tile, grad_x, grad_x_stride_point, grad_x_step, start, count, IN, IN_P, BLOCK, NEEDS_INT64)
+            zero_tile = tl.zeros([W.IN_P, BLOCK], tl.float32)
+            _store_tile(
+                zero_tile, grad_x.data, grad_x.point_stride, grad_x_step, start, count, W.IN, W.IN_P, BLOCK, NEEDS_INT64
+            )
         start += tl.num_programs(0) * BLOCK
-    partials += tl.program_id(0).to(tl.int64) * (H1 * IN + H2 * H1 + OUT * H2 + H1 + H2 + OUT)
-    in_b1, in_b2, in_b3 = tl.arange(0, H1_P), tl.arange(0, H2_P), tl.arange(0, OUT_P)
-    in_w1, in_w2 = tl.arange(0, IN_P)[None, :], tl.arange(0, H1_P)[None, :]
+    partials += tl.program_id(0).to(tl.int64) * (W.H1 * W.IN + W.H2 * W.H1 + W.OUT * W.H2 + W.H1 + W.H2 + W.OUT)
+    in_b1, in_b2, in_b3 = tl.arange(0, W.H1_P), tl.arange(0, W.H2_P), tl.arange(0, W.OUT_P)
+    in_w1, in_w2 = tl.arange(0, W.IN_P)[None, :], tl.arange(0, W.H1_P)[None, :]
     if FIRST_LAYER:
-        tl.store(partials + in_b1[:, None] * IN + in_w1, grad_w1, mask=(in_b1[:, None] < H1) & (in_w1 < IN))
-    partials += H1 * IN
+        tl.store(partials + in_b1[:, None] * W.IN + in_w1, grad_w1, mask=(in_b1[:, None] < W.H1) & (in_w1 < W.IN))
+    partials += W.H1 * W.IN
     if UPPER_LAYERS:
-        tl.store(partials + in_b2[:, None] * H1 + in_w2, grad_w2, mask=(in_b2[:, None] < H2) & (in_w2 < H1))
-        at = partials + H2 * H1
-        inside = (in_b3[None, :] < OUT) & (in_b2[:, None] < H2)
-        tl.store(at + in_b3[None, :] * H2 + in_b2[:, None], grad_w3, mask=inside)
-    partials += H2 * H1 + OUT * H2
+        tl.store(partials + in_b2[:, None] * W.H1 + in_w2, grad_w2, mask=(in_b2[:, None] < W.H2) & (in_w2 < W.H1))
+        at = partials + W.H2 * W.H1
+        inside = (in_b3[None, :] < W.OUT) & (in_b2[:, None] < W.H2)
+        tl.store(at + in_b3[None, :] * W.H2 + in_b2[:, None], grad_w3, mask=inside)
+    partials += W.H2 * W.H1 + W.OUT * W.H2
     if FIRST_LAYER:
-        tl.store(partials + in_b1, grad_b1, mask=in_b1 < H1)
+        tl.store(partials + in_b1, grad_b1, mask=in_b1 < W.H1)
     if UPPER_LAYERS:
-        tl.store(partials + H1 + in_b2, grad_b2, mask=in_b2 < H2)
-        tl.store(partials + H1 + H2 + in_b3, grad_b3, mask=in_b3 < OUT)
+        tl.store(partials + W.H1 + in_b2, grad_b2, mask=in_b2 < W.H2)
+        tl.store(partials + W.H1 + W.H2 + in_b3, grad_b3, mask=in_b3 < W.OUT)

@@ -1,12 +1,14 @@
 """Provides matrix products and packed weights for all kernels that evaluate perceptrons of two hidden layers.
 
 A tile holds one column per point. Its height is a power of two of at least 16, the minimum of the matrix units; padding
-rows are zero. Kernels are compiled for the widths IN -> H1 -> H2 -> OUT and for the padded widths IN_P, H1_P, ...
+rows are zero.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
+from typing import NamedTuple
 
 import torch
 import triton
@@ -16,11 +18,32 @@ from torch import Tensor
 from hyrfpack.ops.dispatch import is_interpreting
 
 
-def kernel_widths(widths: Sequence[int]) -> dict[str, int]:
-    """Return the compile-time constants of kernels for these widths (inputs, hidden, hidden, outputs), also padded."""
-    names = ("IN", "H1", "H2", "OUT")
-    padded = {f"{name}_P": max(16, triton.next_power_of_2(width)) for name, width in zip(names, widths, strict=True)}
-    return dict(zip(names, widths, strict=True)) | padded
+class KernelWidths(NamedTuple):
+    """The widths of a perceptron's layers, for which kernels are compiled.
+
+    Attributes:
+        IN, H1, H2, OUT: numbers of inputs, neurons of both hidden layers, and outputs.
+        IN_P, H1_P, H2_P, OUT_P: heights of the tiles that hold them, see `pad_width`.
+    """
+
+    IN: tl.constexpr
+    H1: tl.constexpr
+    H2: tl.constexpr
+    OUT: tl.constexpr
+    IN_P: tl.constexpr
+    H1_P: tl.constexpr
+    H2_P: tl.constexpr
+    OUT_P: tl.constexpr
+
+
+def pad_width(width: int) -> int:
+    """Return the height of a tile that holds this many numbers per point."""
+    return max(16, triton.next_power_of_2(width))
+
+
+def kernel_widths(widths: Sequence[int]) -> KernelWidths:
+    """Return the compile-time constant of kernels for these widths (inputs, hidden, hidden, outputs)."""
+    return KernelWidths(*map(tl.constexpr, (*widths, *map(pad_width, widths))))
 
 
 def product_precision(mixed: bool) -> str:
@@ -41,14 +64,13 @@ def pack_weights(weights: Sequence[Tensor], precision: str) -> Tensor:
 
     Kernels reload the weights for every block of points, so these loads must be fast and use few registers.
     """
-    constants = kernel_widths([weights[0].shape[1], *(weight.shape[0] for weight in weights)])
-    shapes = ("H1_P", "IN_P"), ("H2_P", "H1_P"), ("OUT_P", "H2_P")
-    total = sum(constants[height] * constants[width] for height, width in shapes)
+    widths = [weights[0].shape[1], *(weight.shape[0] for weight in weights)]
+    total = sum(pad_width(height) * pad_width(width) for width, height in pairwise(widths))
     packed = weights[0].new_empty(total, dtype=torch.bfloat16 if precision == "bf16" else torch.float32)
     _pack_kernel[(3,)](
         *(weight.contiguous() for weight in weights),
         packed,
-        **constants,
+        W=kernel_widths(widths),
         PRECISION=precision,
         num_warps=4,
         enable_fp_fusion=True,
@@ -124,17 +146,12 @@ def _pack_matrix(
 
 
 @triton.jit
-def _pack_kernel(
-    w1, w2, w3, packed,
-    IN: tl.constexpr, H1: tl.constexpr, H2: tl.constexpr, OUT: tl.constexpr,
-    IN_P: tl.constexpr, H1_P: tl.constexpr, H2_P: tl.constexpr, OUT_P: tl.constexpr,
-    PRECISION: tl.constexpr,
-):  # fmt: skip
+def _pack_kernel(w1, w2, w3, packed, W: tl.constexpr, PRECISION: tl.constexpr):
     """Write one weight matrix per program, see `pack_weights`."""
     layer = tl.program_id(0)
     if layer == 0:
-        _pack_matrix(w1, packed, H1, IN, H1_P, IN_P, PRECISION)
+        _pack_matrix(w1, packed, W.H1, W.IN, W.H1_P, W.IN_P, PRECISION)
     elif layer == 1:
-        _pack_matrix(w2, packed + H1_P * IN_P, H2, H1, H2_P, H1_P, PRECISION)
+        _pack_matrix(w2, packed + W.H1_P * W.IN_P, W.H2, W.H1, W.H2_P, W.H1_P, PRECISION)
     else:
-        _pack_matrix(w3, packed + H1_P * IN_P + H2_P * H1_P, OUT, H2, OUT_P, H2_P, PRECISION)
+        _pack_matrix(w3, packed + W.H1_P * W.IN_P + W.H2_P * W.H1_P, W.OUT, W.H2, W.OUT_P, W.H2_P, PRECISION)

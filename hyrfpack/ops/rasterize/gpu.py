@@ -85,14 +85,13 @@ def rasterize(
     return rgb, transmittance, depths, visible, report["pairs"], {}, report["nonfinite"]
 
 
-def _project(inputs: tuple[Tensor, ...], view: _View) -> Projection:
+def _project(gaussians: Gaussians3D, colors: Tensor, view: _View) -> Projection:
     """Project all Gaussians."""
-    total = len(inputs[0])
-    projection = Projection.empty(total, inputs[0].device)
+    total = len(colors)
+    projection = Projection.empty(total, colors.device)
     if total:
         gpu_project.project[(triton.cdiv(total, gpu_project.GAUSSIANS_PER_PROGRAM),)](
-            *inputs, view.camera, total, int(view.viewport.width), int(view.viewport.height),
-            projection.records, projection.keys, projection.counts, projection.visible, projection.flags_and_ends,
+            gaussians, colors, view.camera, total, int(view.viewport.width), int(view.viewport.height), projection,
             ANTIALIASED=bool(view.settings.antialiased), BLOCK=gpu_project.GAUSSIANS_PER_PROGRAM,
             num_warps=gpu_project.WARPS_PER_PROGRAM, enable_fp_fusion=True,
         )  # fmt: skip
@@ -107,7 +106,7 @@ class _Rasterize(torch.autograd.Function):
         ctx, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, view: _View, report: dict
     ) -> tuple[Tensor, Tensor, Tensor | None, Tensor]:
         inputs = tuple(tensor.detach().contiguous() for tensor in (means, quats, scales, opacities, colors))
-        projection = _project(inputs, view)
+        projection = _project(Gaussians3D(*inputs[:4]), inputs[4], view)
         image = bin_and_blend(projection, view.viewport, view.settings)
         report["pairs"], report["nonfinite"] = len(image.pairs.owners), image.pairs.nonfinite
         visible = projection.visible.view(torch.bool)
@@ -142,7 +141,8 @@ class _Rasterize(torch.autograd.Function):
                 num_warps=_SUM_WARPS_PER_PROGRAM, enable_fp_fusion=True,
             )  # fmt: skip
         gpu_project.project_backward[(triton.cdiv(total, gpu_project.GAUSSIANS_PER_PROGRAM),)](
-            sums, pairs.slot_starts, projection.counts, *inputs, view.camera, total, *grads,
+            sums, pairs.slot_starts, projection.counts, Gaussians3D(*inputs), view.camera, total,
+            Gaussians3D(*grads[:4]), grads[4],
             view.absgrad, *(view.absgrad.stride() if with_absgrad else (0, 0)),
             ANTIALIASED=bool(view.settings.antialiased), ABSGRAD=with_absgrad,
             BLOCK=gpu_project.GAUSSIANS_PER_PROGRAM, num_warps=gpu_project.WARPS_PER_PROGRAM, enable_fp_fusion=True,

@@ -9,7 +9,7 @@ storing them first.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 import triton
@@ -64,8 +64,7 @@ _MAX_MAGNITUDE = tl.constexpr(1e30)
 _FLOAT32_MAX = tl.constexpr(3.4028234663852886e38)
 
 
-@dataclass(frozen=True)
-class Projection:
+class Projection(NamedTuple):
     """The outputs of a projection kernel for N Gaussians.
 
     Attributes:
@@ -161,6 +160,17 @@ def load_rows_4(pointer, index, live):
     at = pointer + index.to(tl.int64) * 4
     first, second = tl.load(at, mask=live, other=0.0), tl.load(at + 1, mask=live, other=0.0)
     return first, second, tl.load(at + 2, mask=live, other=0.0), tl.load(at + 3, mask=live, other=0.0)
+
+
+@triton.jit
+def load_gaussians(gaussians, index, live):
+    """Load means, quats and scales (tuples of blocks) and opacities (a block) of `Gaussians3D`, 0 where not live."""
+    mean, quat = load_rows_3(gaussians.means, index, live), load_rows_4(gaussians.quats, index, live)
+    scale, opacity = (
+        load_rows_3(gaussians.scales, index, live),
+        tl.load(gaussians.opacities + index, mask=live, other=0.0),
+    )
+    return mean, quat, scale, opacity
 
 
 @triton.jit
@@ -359,6 +369,14 @@ def store_colors(records, index, drawn, color, depth):
 
 
 @triton.jit
+def store_counts(projection, index, live, key, count):
+    """Write the sort keys, the tile counts and the visibility of Gaussians `index` where live."""
+    tl.store(projection.keys + index, key, mask=live)
+    tl.store(projection.counts + index, count, mask=live)
+    tl.store(projection.visible + index, (count > 0).to(tl.uint8), mask=live)
+
+
+@triton.jit
 def is_finite(a):
     """Return whether numbers are neither NaN nor infinite."""
     return tl.abs(a) <= _FLOAT32_MAX
@@ -389,27 +407,19 @@ def flag_colors(flags, color):
 
 @triton.jit(do_not_specialize=["total", "width", "height"])
 def project(
-    means, quats, scales, opacities, colors, camera, total, width, height, records, keys, counts, visible, flags,
-    ANTIALIASED: tl.constexpr, BLOCK: tl.constexpr,
-):  # fmt: skip
-    """Project a block of Gaussians. A record is written only for a Gaussian that is drawn.
-
-    The outputs are the fields of `Projection`: records (N, 8) int64, keys (N,) int32, counts (N,) int32 and visible
-    (N,) uint8. `flags`, int64 and zero before the launch, gets a bit for each input with NaN or infinity.
-    """
+    gaussians, colors, camera, total, width, height, projection, ANTIALIASED: tl.constexpr, BLOCK: tl.constexpr
+):
+    """Project a block of `Gaussians3D` to a `Projection`. A record is written only for a Gaussian that is drawn."""
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = index < total
-    mean, quat = load_rows_3(means, index, live), load_rows_4(quats, index, live)
-    scale, color = load_rows_3(scales, index, live), load_rows_3(colors, index, live)
-    opacity = tl.load(opacities + index, mask=live, other=0.0)
-    flag_geometry(flags, mean, quat, scale, opacity)
-    flag_colors(flags, color)
+    mean, quat, scale, opacity = load_gaussians(gaussians, index, live)
+    color = load_rows_3(colors, index, live)
+    flag_geometry(projection.flags_and_ends, mean, quat, scale, opacity)
+    flag_colors(projection.flags_and_ends, color)
     words, key, count = project_block(mean, quat, scale, opacity, load_camera(camera), width, height, ANTIALIASED)
-    store_records(records, index, count > 0, words)
-    store_colors(records, index, count > 0, color, words[4])
-    tl.store(keys + index, key, mask=live)
-    tl.store(counts + index, count, mask=live)
-    tl.store(visible + index, (count > 0).to(tl.uint8), mask=live)
+    store_records(projection.records, index, count > 0, words)
+    store_colors(projection.records, index, count > 0, color, words[4])
+    store_counts(projection, index, live, key, count)
 
 
 @triton.jit
@@ -423,8 +433,7 @@ def _store_rows_3(pointer, index, live, a):
 
 @triton.jit(do_not_specialize=["total", "absgrad_row", "absgrad_column"])
 def project_backward(
-    rows, slot_starts, counts, means, quats, scales, opacities, camera, total,
-    grad_means, grad_quats, grad_scales, grad_opacities, grad_colors, absgrad, absgrad_row, absgrad_column,
+    rows, slot_starts, counts, gaussians, camera, total, grads, grad_colors, absgrad, absgrad_row, absgrad_column,
     ANTIALIASED: tl.constexpr, ABSGRAD: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Backpropagate the gradient row of each Gaussian, summed over tiles, through the projection.
@@ -432,7 +441,7 @@ def project_backward(
     Args:
         rows: (P, 12) gradient rows; that of Gaussian i is rows[slot_starts[i]].
         slot_starts, counts: (N,) int32.
-        grad_means, grad_quats, grad_scales, grad_opacities, grad_colors: the gradients, written.
+        grads, grad_colors: the gradients, written; `grads` are those of the `Gaussians3D`.
         absgrad: (N, 2) with the strides absgrad_row and absgrad_column, incremented.
     """
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -445,17 +454,17 @@ def project_backward(
     red, green = tl.load(at + SUM_RED, mask=drawn, other=0.0), tl.load(at + SUM_GREEN, mask=drawn, other=0.0)
     blue = tl.load(at + SUM_BLUE, mask=drawn, other=0.0)
     _store_rows_3(grad_colors, index, live, (red, green, blue))
-    opacity = tl.load(opacities + index, mask=drawn, other=1.0)
-    tl.store(grad_opacities + index, sum_p / opacity, mask=live)
+    opacity = tl.load(gaussians.opacities + index, mask=drawn, other=1.0)
+    tl.store(grads.opacities + index, sum_p / opacity, mask=live)
 
     axes, shift, lens, _, limits, _ = load_camera(camera)
     # Gaussians that are not drawn may hold any numbers. They are replaced by zeros at z = 1 and get zero gradients.
-    x, y, z = _to_camera(load_rows_3(means, index, drawn), axes, shift)
+    x, y, z = _to_camera(load_rows_3(gaussians.means, index, drawn), axes, shift)
     inv_z = 1 / tl.where(drawn, z, 1.0)
     x_z, y_z = x * inv_z, y * inv_z
-    quat = load_rows_4(quats, index, drawn)
+    quat = load_rows_4(gaussians.quats, index, drawn)
     a, b, e, f, columns, q, norm = _covariance_factors(x_z, y_z, inv_z, quat, axes, lens, limits)
-    scale = _to_float64_3(load_rows_3(scales, index, drawn))
+    scale = _to_float64_3(load_rows_3(gaussians.scales, index, drawn))
     g, h = _multiply(e, scale), _multiply(f, scale)
     xx, xy, yy, raw, det = _covariance(g, h)
     u_x, u_y, v_x = _triangular_form(xx, xy, det)
@@ -485,7 +494,7 @@ def project_backward(
 
     grad_g, grad_h = _combine(2 * grad_xx, g, grad_xy, h), _combine(2 * grad_yy, h, grad_xy, g)
     by_e, by_f = _multiply(grad_g, e), _multiply(grad_h, f)
-    _store_rows_3(grad_scales, index, live, (by_e[0] + by_f[0], by_e[1] + by_f[1], by_e[2] + by_f[2]))
+    _store_rows_3(grads.scales, index, live, (by_e[0] + by_f[0], by_e[1] + by_f[1], by_e[2] + by_f[2]))
     grad_e, grad_f = _multiply(grad_g, scale), _multiply(grad_h, scale)
 
     # Backpropagate through e = a Q and f = b Q to the rotation matrix, the unit quaternion, and its length.
@@ -499,7 +508,7 @@ def project_backward(
     w3 = 2 * (q[0] * z_turn + q[1] * (d0[2] + d2[0]) + q[2] * (d1[2] + d2[1]) - 2 * q[3] * (d0[0] + d1[1]))
     along = tl.where(norm > _QUAT_NORM_MIN, q[0] * w0 + q[1] * w1 + q[2] * w2 + q[3] * w3, 0.0)
     inv_norm = 1 / tl.maximum(norm, _QUAT_NORM_MIN)
-    to = grad_quats + index.to(tl.int64) * 4
+    to = grads.quats + index.to(tl.int64) * 4
     tl.store(to, ((w0 - along * q[0]) * inv_norm).to(tl.float32), mask=live)
     tl.store(to + 1, ((w1 - along * q[1]) * inv_norm).to(tl.float32), mask=live)
     tl.store(to + 2, ((w2 - along * q[2]) * inv_norm).to(tl.float32), mask=live)
@@ -518,4 +527,4 @@ def project_backward(
     by_j_y = _dot(grad_b, down) - _clamp(y_z, limits[2], limits[3]) * towards_y
     grad_z = -(by_j_x * j_x + by_j_y * j_y + grad_x_z * x_z + grad_y_z * y_z) * inv_z
     in_plane = _combine(grad_x_z * inv_z, right, grad_y_z * inv_z, down)
-    _store_rows_3(grad_means, index, live, _combine(1.0, in_plane, grad_z, forward))
+    _store_rows_3(grads.means, index, live, _combine(1.0, in_plane, grad_z, forward))

@@ -15,11 +15,11 @@ from hyrfpack.ops.rasterize.gpu_project import (
     flag_geometry,
     in_frustum,
     load_camera,
-    load_rows_3,
-    load_rows_4,
+    load_gaussians,
     pack_camera,
     project_block,
     store_colors,
+    store_counts,
     store_records,
 )
 from hyrfpack.ops.rasterize.inputs import Gaussians3D, RasterSettings
@@ -30,40 +30,31 @@ from hyrfpack.ops.viewport import Viewport
 
 @triton.jit(do_not_specialize=["total", "width", "height"])
 def project_shaded_kernel(
-    means, quats, scales, opacities, first_layer, packed, b2, b3, color_logits, camera, total, width, height,
-    records, keys, counts, visible, flags,
-    IN: tl.constexpr, H1: tl.constexpr, H2: tl.constexpr, OUT: tl.constexpr,
-    IN_P: tl.constexpr, H1_P: tl.constexpr, H2_P: tl.constexpr, OUT_P: tl.constexpr,
-    FREQUENCY: tl.constexpr, PRECISION: tl.constexpr, ANTIALIASED: tl.constexpr, BLOCK: tl.constexpr,
+    gaussians, decoder, camera, total, width, height, projection,
+    W: tl.constexpr, FREQUENCY: tl.constexpr, PRECISION: tl.constexpr, ANTIALIASED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Project the Gaussians in the frustum as `gpu_project.project` does, with colours from `shade_block`."""
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = index < total
-    mean, quat = load_rows_3(means, index, live), load_rows_4(quats, index, live)
-    scale, opacity = load_rows_3(scales, index, live), tl.load(opacities + index, mask=live, other=0.0)
+    mean, quat, scale, opacity = load_gaussians(gaussians, index, live)
     loaded_camera = load_camera(camera)
     opacity_in_frustum = tl.where(in_frustum(mean, loaded_camera), opacity, 0.0)
     words, key, count = project_block(mean, quat, scale, opacity_in_frustum, loaded_camera, width, height, ANTIALIASED)
     drawn = count > 0
     # Records are stored before colours are computed, which takes all registers.
-    store_records(records, index, drawn, words)
-    flag_geometry(flags, mean, quat, scale, opacity)
-    tl.store(keys + index, key, mask=live)
-    tl.store(counts + index, count, mask=live)
-    tl.store(visible + index, drawn.to(tl.uint8), mask=live)
+    store_records(projection.records, index, drawn, words)
+    flag_geometry(projection.flags_and_ends, mean, quat, scale, opacity)
+    store_counts(projection, index, live, key, count)
     if tl.max(count, 0) > 0:
         viewpoint = (
             tl.load(camera + VIEWPOINT_OFFSET).to(tl.float32),
             tl.load(camera + VIEWPOINT_OFFSET + 1).to(tl.float32),
             tl.load(camera + VIEWPOINT_OFFSET + 2).to(tl.float32),
         )
-        color = shade_block(
-            mean, index, drawn, viewpoint, first_layer, packed, b2, b3, color_logits,
-            IN, H1, H2, OUT, IN_P, H1_P, H2_P, OUT_P, FREQUENCY, PRECISION,
-        )  # fmt: skip
+        color = shade_block(mean, index, drawn, viewpoint, decoder, W, FREQUENCY, PRECISION)
         color = (tl.where(drawn, color[0], 0.0), tl.where(drawn, color[1], 0.0), tl.where(drawn, color[2], 0.0))
-        store_colors(records, index, drawn, color, words[4])
-        flag_colors(flags, color)
+        store_colors(projection.records, index, drawn, color, words[4])
+        flag_colors(projection.flags_and_ends, color)
 
 
 def rasterize_shaded(
@@ -71,15 +62,14 @@ def rasterize_shaded(
 ) -> Rasterization:
     """Compute `hyrfpack.ops.rasterize.shaded.rasterize_shaded`."""
     total, device = len(gaussians.means), gaussians.means.device
-    inputs = (tensor.detach().contiguous() for tensor in gaussians)
+    inputs = Gaussians3D(*(tensor.detach().contiguous() for tensor in gaussians))
     camera = pack_camera(viewport, settings.near, device, cull_tolerance)
-    tensors, constants = shading.kernel_arguments
+    decoder, constants = shading.kernel_arguments
     projection = Projection.empty(total, device)
     if total:
         block, warps = launch_size(shading.mixed)
         project_shaded_kernel[(triton.cdiv(total, block),)](
-            *inputs, *tensors, camera, total, int(viewport.width), int(viewport.height),
-            projection.records, projection.keys, projection.counts, projection.visible, projection.flags_and_ends,
+            inputs, decoder, camera, total, int(viewport.width), int(viewport.height), projection,
             **constants, ANTIALIASED=bool(settings.antialiased), BLOCK=block, num_warps=warps, enable_fp_fusion=True,
         )  # fmt: skip
     image = bin_and_blend(projection, viewport, settings)

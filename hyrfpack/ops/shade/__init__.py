@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -19,6 +20,9 @@ from hyrfpack.ops.shade.directions import (
     frequency_encoding,
     spherical_harmonics,
 )
+
+if TYPE_CHECKING:
+    from hyrfpack.ops.shade.gpu import DecoderTensors
 
 __all__ = [
     "DIRECTION_FEATURES",
@@ -63,7 +67,7 @@ class Shading:
         return replace(self, first_layer=self.first_layer[index], color_logits=self.color_logits[index])
 
     @cached_property
-    def kernel_arguments(self) -> tuple[tuple[Tensor, ...], dict]:
+    def kernel_arguments(self) -> tuple[DecoderTensors, dict[str, Any]]:
         """The tensors and named constants that GPU kernels take, packed once for all views."""
         from hyrfpack.ops.shade import gpu
 
