@@ -141,6 +141,22 @@ _PUBLIC = {
     "TrainResult": "hyrfpack.train",
     "train_model": "hyrfpack.train",
 }
+# The present name of each renamed public function, for the error message.
+_RENAMED = {
+    "bench": "benchmark_model",
+    "compare": "compare_runs",
+    "compress": "compress_model",
+    "convert": "convert_splats",
+    "describe": "describe_file",
+    "distill": "import_splats",
+    "evaluate": "evaluate_model",
+    "export": "export_model",
+    "load": "load_model",
+    "save": "save_model",
+    "make": "make_scene",
+    "render": "render_view",
+    "train": "train_model",
+}
 
 __all__ = ["__version__", *_PUBLIC]
 
@@ -155,7 +171,8 @@ if not TYPE_CHECKING:  # Type checkers read the imports above, so that they repo
                 value = getattr(import_module(_PUBLIC[name]), name)
             globals()[name] = value
             return value
-        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+        hint = f"; the function is now hyrfpack.{_RENAMED[name]}" if name in _RENAMED else ""
+        raise AttributeError(f"module '{__name__}' has no attribute '{name}'{hint}")
 
 
 def __dir__() -> list[str]:

@@ -116,6 +116,13 @@ def test_sub_packages_support_every_form_of_import():
     assert run_in_new_interpreter(code).stdout == "and nothing else\n", run_in_new_interpreter(code).stderr
 
 
+def test_a_former_function_name_raises_an_error_with_the_present_name():
+    with pytest.raises(AttributeError, match="the function is now hyrfpack.load_model"):
+        _ = hyrfpack.load
+    stderr = run_in_new_interpreter("import hyrfpack\nhyrfpack.train()").stderr
+    assert "AttributeError" in stderr and "the function is now hyrfpack.train_model" in stderr
+
+
 # A mistaken call, and its error message.
 MISTAKEN_CALLS = [
     (lambda model, scene: hyrfpack.train_model("photos", "run"), "scene must be a Scene, not a str; .*load_scene"),
