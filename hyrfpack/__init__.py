@@ -43,6 +43,8 @@ if TYPE_CHECKING:
     from hyrfpack.bench.suite import benchmark_model as benchmark_model
     from hyrfpack.compress import CompressionReport as CompressionReport
     from hyrfpack.compress import compress_model as compress_model
+    from hyrfpack.config.compress import CompressConfig as CompressConfig
+    from hyrfpack.config.compress import PaperSettings as PaperSettings
     from hyrfpack.config.export import ConvertConfig as ConvertConfig
     from hyrfpack.config.export import ExportConfig as ExportConfig
     from hyrfpack.config.make import MakeConfig as MakeConfig
@@ -97,6 +99,8 @@ _PUBLIC = {
     "compare_runs": "hyrfpack.report",
     "CompressionReport": "hyrfpack.compress",
     "compress_model": "hyrfpack.compress",
+    "CompressConfig": "hyrfpack.config.compress",
+    "PaperSettings": "hyrfpack.config.compress",
     "RunContext": "hyrfpack.context",
     "load_scene": "hyrfpack.data",
     "DistillConfig": "hyrfpack.distill",

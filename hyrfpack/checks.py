@@ -67,26 +67,22 @@ def check_pair(name: str, value: Any) -> None:
         raise ValueError(f"{name} is {value!r}; it must be a tuple of two numbers")
 
 
-# For each type, by its name, how to get an argument of that type.
+# How to get an argument of types that are not made directly, by their names.
 _REMEDIES = {
     "Camera": "a View has one: view.camera",
     "HybridModel": "hyrfpack.load_model reads it from a file",
     "Scene": "hyrfpack.load_scene reads it from a folder",
     "View": "a Scene has lists of them: scene.test",
-    **{
-        name: f"make one: hyrfpack.{name}(...)"
-        for name in ("ConvertConfig", "DistillConfig", "ExportConfig", "MakeConfig", "RenderSettings", "TrainConfig")
-    },
 }
 
 
 def check_type(argument: str, value: object, expected: type) -> None:
-    """Check that an argument of a call has the expected type, one of those in `_REMEDIES`.
+    """Check that an argument of a call has the expected type.
 
     Raises:
         TypeError: it has another type; the message says how to get the right one.
     """
     if not isinstance(value, expected):
-        raise TypeError(
-            f"{argument} must be a {expected.__name__}, not a {type(value).__name__}; {_REMEDIES[expected.__name__]}"
-        )
+        name = expected.__name__
+        remedy = _REMEDIES.get(name, f"make one: hyrfpack.{name}(...)")
+        raise TypeError(f"{argument} must be a {name}, not a {type(value).__name__}; {remedy}")

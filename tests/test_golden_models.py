@@ -11,6 +11,7 @@ import pytest
 from scenes import QUIET_CONTEXT
 
 from hyrfpack.compress import compress_model
+from hyrfpack.config.compress import CompressConfig
 from hyrfpack.evaluate import evaluate_model
 from hyrfpack.format import load_model
 from hyrfpack.train import train_model
@@ -34,7 +35,7 @@ def test_a_new_training_reaches_the_quality_and_sizes_of_the_golden_model(golden
     if golden_file == DEMO_MODEL_FILE:
         recorded = json.loads(RECORDED_SIZES_FILE.read_text())
         compact = compress_model(trained, tmp_path / "compact.hyrf", data=scene)
-        paper = compress_model(trained, tmp_path / "paper.hyrf", "paper")
+        paper = compress_model(trained, tmp_path / "paper.hyrf", CompressConfig(profile="paper"))
         sizes = {"raw": trained.stat().st_size, "paper": paper.bytes_after, "compact": compact.bytes_after}
         assert sizes == pytest.approx({name: recorded[name] for name in sizes}, rel=0.01)
 

@@ -169,7 +169,9 @@ def test_a_model_is_measured_packed_and_fine_tuned_on_a_gpu(gpu, few_pictures, t
     sizes = {}
     for device in ("cpu", "cuda"):
         target = tmp_path / f"{device}.hyrf"
-        sizes[device] = hyrfpack.compress_model(model, target, data=scene, finetune_steps=1, device=device).bytes_after
+        sizes[device] = hyrfpack.compress_model(
+            model, target, hyrfpack.CompressConfig(finetune_steps=1), data=scene, context=hyrfpack.RunContext(device)
+        ).bytes_after
     assert sizes["cuda"] == pytest.approx(sizes["cpu"], rel=0.02)
 
 

@@ -132,6 +132,7 @@ MISTAKEN_CALLS = [
         "data must be a Scene.*load_scene",
     ),
     (lambda model, scene: hyrfpack.compress_model(model, "a.hyrf"), "str.*not HybridModel"),
+    (lambda model, scene: hyrfpack.compress_model("m.hyrf", "a.hyrf", "paper"), "hyrfpack.CompressConfig"),
     (lambda model, scene: hyrfpack.export_model("m.hyrf", "a.ply", data="photos"), "data must be a Scene.*load_scene"),
     (lambda model, scene: hyrfpack.benchmark_model("m.hyrf", "photos"), "scene must be a Scene.*load_scene"),
     (lambda model, scene: hyrfpack.evaluate_model("m.hyrf", scene.train), "model must be a HybridModel.*hyrfpack.load"),

@@ -16,10 +16,11 @@ from hyrfpack.bench.rows import Row, format_value
 from hyrfpack.bench.subject import Subject
 from hyrfpack.compress.quantize import decide
 from hyrfpack.compress.sensitivity import measure_sensitivity
+from hyrfpack.config.compress import CompressConfig
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import decode_model, encode_model
 from hyrfpack.format.arrays import to_arrays
-from hyrfpack.format.codec import DEFAULT_PROFILE, PROFILES
+from hyrfpack.format.codec import PROFILES
 from hyrfpack.format.container import read_container
 from hyrfpack.format.metadata import read_metadata
 from hyrfpack.format.sections import LAYERED_SECTIONS, POSITIONS, SECTION_CONTENTS
@@ -140,7 +141,7 @@ def _encoding_cases(subject: Subject, profile: str, notes: list[str]) -> Iterato
         encode, defaults = _compact_encoder(subject, notes)
     else:
         encode, defaults = _encoder(subject.model, profile)
-    itself = EncodingCase("profile", profile, profile == DEFAULT_PROFILE, encode)
+    itself = EncodingCase("profile", profile, profile == CompressConfig.profile, encode)
     yield itself
     for name, values in PROFILE_SETTING_VALUES.get(profile, {}).items():
         default = defaults[name]

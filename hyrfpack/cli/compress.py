@@ -23,57 +23,31 @@ from hyrfpack.cli.common import (
     scene_options,
 )
 from hyrfpack.cli.processes import processes_option
-from hyrfpack.cli.progress import show_progress
 from hyrfpack.cli.section_table import format_section_table
-from hyrfpack.cli.types import OUTPUT, PATH, SIZE, reject_nan
+from hyrfpack.cli.settings import settings_options
+from hyrfpack.cli.types import OUTPUT, PATH, reject_nan
+from hyrfpack.config.compress import CompressConfig
 from hyrfpack.outputs import Outputs
-from hyrfpack.progress import report_part
 
 if TYPE_CHECKING:
     from hyrfpack.compress import CompressionReport
     from hyrfpack.format import FileReport
     from hyrfpack.parallel.ranks import Ranks
-    from hyrfpack.progress import Report
+    from hyrfpack.progress import Progress
     from hyrfpack.scene import Scene
-
-# The same as in `hyrfpack.format.codec`, which cannot be imported without torch.
-PROFILES = ("raw", "paper", "compact")
-DEFAULT_PROFILE = "compact"
 
 
 @click.command(short_help="Compress a model to a small file.")
 @click.argument("model", type=PATH)
 @click.option("-o", "--output", type=OUTPUT, required=True, metavar="FILE", help="The .hyrf file to write.")
-@click.option(
-    "--profile",
-    type=click.Choice(PROFILES),
-    default=DEFAULT_PROFILE,
-    show_default=True,
-    help="compact is the smallest and spends bits where renders need them, paper follows the HyRF paper, raw is exact "
-    "float32.",
-)
+@settings_options(CompressConfig, "profile")
 @click.option(
     "--data",
     type=PATH,
     help="Photos and poses for --finetune, --max-psnr-drop and scores.  [default: those that MODEL was trained on]",
 )
 @click.option("--no-data", is_flag=True, help="Do not use the photos that MODEL was trained on.")
-@click.option(
-    "--finetune",
-    "finetune_steps",
-    type=click.IntRange(1),
-    metavar="N",
-    help="Fine-tune the quantised model on the photos for N steps: slower, but a smaller file.",
-)
-@click.option("--prune/--no-prune", default=True, help="Prune Gaussians that renders do not need.  [default: prune]")
-@click.option("--target-size", type=SIZE, metavar="SIZE", help="Best quality within this file size, such as 2MB.")
-@click.option(
-    "--max-psnr-drop",
-    type=click.FloatRange(min=0),
-    callback=reject_nan,
-    metavar="DB",
-    help="Smallest file that loses at most this PSNR, in dB, on the held-out photos of --data.",
-)
+@settings_options(CompressConfig, "finetune_steps", "prune", "target_bytes", "max_psnr_drop")
 @click.option(
     "--report",
     type=OUTPUT,
@@ -88,19 +62,15 @@ DEFAULT_PROFILE = "compact"
 def compress(
     model: Path,
     output: Path,
-    profile: str,
     data: Path | None,
     no_data: bool,
-    finetune_steps: int | None,
-    prune: bool,
-    target_size: int | None,
-    max_psnr_drop: float | None,
     report: Path | None,
     overwrite: bool,
     reader_options: dict[str, Any],
     device: str,
     as_json: bool,
     ranks: Ranks,
+    **settings: Any,
 ) -> None:
     """Compress MODEL, a .hyrf file or the folder of a run, to a smaller file, and print the bytes of each section.
 
@@ -119,17 +89,19 @@ def compress(
     if data is not None and no_data:
         raise click.UsageError("--data and --no-data contradict each other; give one of them")
     from hyrfpack.compress import compress_model as pack
+    from hyrfpack.context import RunContext
     from hyrfpack.format import describe_file
+    from hyrfpack.progress import open_display, part_of_progress
     from hyrfpack.report.compression_page import REPORT_FILES
 
-    model = resolve_model_file(model)
+    model, config = resolve_model_file(model), CompressConfig(**settings)
     torch_device = choose_command_device(device, ranks)
 
     def read() -> Scene | None:
         if data is not None:
             scene: Scene | None = read_scene(data, reader_options, describe_file(model))
         else:
-            scene = None if no_data or profile != DEFAULT_PROFILE else _load_training_photos(model)
+            scene = None if no_data or config.profile != "compact" else _load_training_photos(model)
         outputs = Outputs(model, scene=scene, overwrite=overwrite)
         outputs.file(output, ".hyrf")
         if report is not None:
@@ -137,24 +109,18 @@ def compress(
         return scene
 
     scene = ranks.run_on_all(read)
-    with show_progress("compress") as progress:
+    with open_display("auto", "compress") as progress:
         result = pack(
             model,
             output,
-            profile,
+            config,
             data=scene,
-            finetune_steps=finetune_steps or 0,
-            prune=prune,
-            target_bytes=target_size,
-            max_psnr_drop=max_psnr_drop,
             overwrite=overwrite,
-            device=torch_device,
-            report=report_part(progress, 0.0, 0.9),
-            ranks=ranks,
+            context=RunContext(torch_device, ranks, part_of_progress(progress, 0.0, 0.9)),
         )
         if not ranks.is_main:
             return
-        scores = _score_both_files(model, Path(result.file), scene, report_part(progress, 0.9, 1.0))
+        scores = _score_both_files(model, Path(result.file), scene, part_of_progress(progress, 0.9, 1.0))
     written = note_rename(output, result.file)
     if report is not None:
         from hyrfpack.report.compression import write_compression_report
@@ -234,13 +200,15 @@ def _load_training_photos(model: Path) -> Scene | None:
     return scene
 
 
-def _score_both_files(before: Path, after: Path, scene: Scene | None, report: Report) -> dict[str, float]:
+def _score_both_files(before: Path, after: Path, scene: Scene | None, progress: Progress) -> dict[str, float]:
     """Return mean PSNR and SSIM of both files on the held-out photos; empty if there are none."""
     if scene is None or not scene.test:
         return {}
     from hyrfpack.evaluate import evaluate_model
     from hyrfpack.format import load_model
+    from hyrfpack.progress import report_part, report_to
 
+    report = report_to(progress)
     old = evaluate_model(load_model(before), scene.test, report=report_part(report, 0.0, 0.5))
     new = evaluate_model(load_model(after), scene.test, report=report_part(report, 0.5, 1.0))
     return {"psnr_before": old.psnr, "psnr": new.psnr, "ssim_before": old.ssim, "ssim": new.ssim}

@@ -1,47 +1,29 @@
-"""Compress a file: measure sensitivities, plan, fine-tune or search if requested, and write."""
+"""Encoding of a model with measured sensitivities: once, to a distortion, or by a search for a size or a loss."""
 
 from __future__ import annotations
 
 import dataclasses
 import logging
-import os
-import warnings
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from itertools import count
-from typing import Any, cast
 
 import torch
 
-from hyrfpack.cameras.capture import Capture, has_mean_exposure, quantized_provenance
-from hyrfpack.checks import check_type
-from hyrfpack.compress.calibrate import measure_calibrated_sensitivity
-from hyrfpack.compress.distortion import DEFAULT_PSNR_DROP_DB, DISTORTION_RANGE, default_distortion
+from hyrfpack.cameras.capture import has_mean_exposure
+from hyrfpack.compress.distortion import DISTORTION_RANGE
 from hyrfpack.compress.finetune import finetune, fit_residual_gains
 from hyrfpack.compress.part_errors import predict_errors
 from hyrfpack.compress.plan import make_plan
 from hyrfpack.compress.quantize import quantize
 from hyrfpack.compress.reference_renders import ReferenceRenders
-from hyrfpack.compress.report import CompressionReport
 from hyrfpack.compress.search import find_coarsest, find_fullest
 from hyrfpack.compress.sensitivity import Sensitivity
 from hyrfpack.data import PictureCache
-from hyrfpack.device import choose_own_device
 from hyrfpack.errors import HyrfError, HyrfSizeError
 from hyrfpack.evaluate import evaluate_model
-from hyrfpack.format.codec import (
-    DEFAULT_PROFILE,
-    decode_model,
-    encode_model,
-    load_with_provenance,
-    repack,
-    write_model,
-)
-from hyrfpack.format.info import FileReport, describe_file
-from hyrfpack.format.min_file_size import check_target_bytes
-from hyrfpack.format.run_folder import find_model
+from hyrfpack.format.codec import decode_model, encode_model
 from hyrfpack.model import HybridModel
-from hyrfpack.outputs import Outputs
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.progress import Report, no_report, report_part, report_round
 from hyrfpack.scene import Scene, evenly_spaced
@@ -61,9 +43,6 @@ MAX_REFINING_RATIO = 16.0
 # Fine-tuning takes long, so a search over fine-tuned files makes fewer trials.
 SEARCH_TRIALS = 9
 FINETUNED_SEARCH_TRIALS = 4
-# Share of the progress at which sensitivities are measured and encoding starts, for a single file and for a search.
-ENCODING_START_SHARE = 0.7
-SEARCH_ENCODING_START_SHARE = 0.3
 
 
 @dataclass(frozen=True)
@@ -81,143 +60,6 @@ class EncodedCandidate:
     predicted_errors: dict[str, float]
     measured_error: float = 0.0
     psnr_drop: float = 0.0
-
-
-def compress_model(
-    source: str | os.PathLike[str],
-    target: str | os.PathLike[str],
-    profile: str = DEFAULT_PROFILE,
-    *,
-    data: Scene | None = None,
-    finetune_steps: int = 0,
-    prune: bool = True,
-    target_bytes: int | None = None,
-    max_psnr_drop: float | None = None,
-    distortion: float | None = None,
-    overwrite: bool = True,
-    device: str | torch.device = "auto",
-    report: Report = no_report,
-    ranks: Ranks = SINGLE_PROCESS,
-    **settings: Any,
-) -> CompressionReport:
-    """Compress a `.hyrf` file into a smaller one.
-
-    Profile "compact" measures how much each number of the model affects pictures and spends bits accordingly. It
-    measures at the cameras of `data`, or at those stored in the file. By default it aims at a loss of
-    `hyrfpack.compress.distortion.DEFAULT_PSNR_DROP_DB`. Profiles "paper" and "raw" have fixed recipes and accept none
-    of `data`, `finetune_steps`, `target_bytes`, `max_psnr_drop` and `distortion`.
-
-    Args:
-        source: a file of any profile, best "raw", or the folder of a run.
-        target: the file to write.
-        profile: "compact", "paper" or "raw".
-        data: photos of the scene.
-        finetune_steps: steps of fitting the quantised model to the photos of `data`; more steps give smaller files.
-        prune: leave out Gaussians whose removal saves more rate than it costs in distortion.
-        target_bytes: write the best file of at most this many bytes.
-        max_psnr_drop: write the smallest file that loses at most this many dB of mean PSNR on the held-out photos of
-            `data`.
-        distortion: estimated mean squared error that compression may add to pictures; replaces a search.
-        overwrite: replace a file at `target`. If False, an existing file is an error. A file that appears in the
-            meantime is kept, and the result is written beside it under a free name, which the report names.
-        device: device that renders, see `hyrfpack.device.choose_device`. On the CPU the same input gives the same
-            bytes. On a GPU sums of gradients vary in their last bits, and so may the bytes.
-        report: called with the name of the current task and the completed share of the work, 0 to 1.
-        ranks: processes that share the photos of fine-tuning; rank 0 writes the file.
-        settings: settings of "paper", see `hyrfpack.format.paper`; `noise` is the deprecated name of `distortion`.
-
-    Raises:
-        HyrfError: a file cannot be read or written, the target would replace an input, the options exclude each
-            other, or no file meets the limits.
-        TypeError: `data` is not a Scene.
-
-    Example:
-        >>> import hyrfpack
-        >>> report = hyrfpack.compress_model("runs/bonsai", "small.hyrf")
-        >>> report.profile, report.bytes_after < report.bytes_before
-        ('compact', True)
-    """
-    if "noise" in settings:
-        warnings.warn("compress(noise=...) is now compress(distortion=...)", DeprecationWarning, stacklevel=2)
-        distortion = settings.pop("noise")
-    if data is not None:
-        check_type("data", data, Scene)
-    source = find_model(source)
-    # Only the main process checks the target, while the others wait. They must not mistake its output for an old file.
-    outputs = Outputs(source, scene=data, overwrite=overwrite)
-    ranks.run_on_all(lambda: outputs.file(target) if ranks.is_main else None)
-    if profile != "compact":
-        if data is not None or finetune_steps or target_bytes or max_psnr_drop is not None or distortion:
-            raise HyrfError(
-                f"profile '{profile}' cannot be fitted to photos, a target size or a limit on the loss",
-                fix="use profile 'compact'",
-            )
-        repacked = ranks.run_on_all(
-            lambda: repack(source, target, profile, overwrite=overwrite, **settings) if ranks.is_main else None
-        )
-        return CompressionReport(**vars(cast(FileReport, ranks.broadcast(repacked))))
-    if settings:
-        raise HyrfError(f"profile 'compact' has no setting '{next(iter(settings))}'", fix="leave it out")
-    if data is None and (finetune_steps or max_psnr_drop is not None):
-        raise HyrfError("fine-tuning and limits on PSNR need photos", fix="name their folder with `data`")
-    if sum(option is not None for option in (target_bytes, max_psnr_drop, distortion)) > 1:
-        raise HyrfError(
-            "a target size and a largest loss of PSNR each decide how fine the file is",
-            fix="give one of them",
-        )
-    if data is not None and not data.train:
-        raise HyrfError(
-            f"{data.path}: all photos are held out, so that none is left to measure with",
-            fix="use a larger `test_every`",
-        )
-    model, provenance = load_with_provenance(source)
-    kept = quantized_provenance(provenance, model.config.frame.scale)
-    if target_bytes is not None:
-        check_target_bytes(target_bytes, kept, model.exposure)
-    model = model.to(choose_own_device(device, ranks))
-    model.precision = "float32"  # quantisation errors are smaller than the rounding of lower precisions on a GPU
-    if len(model) == 0:
-        raise HyrfError(
-            f"{source}: there is no Gaussian in it, so there is nothing to measure",
-            fix="use profile 'paper'",
-        )
-    cameras = Capture(describe_file(source), data).cameras
-    _LOG.info(f"measuring how each stored number affects renders, at {len(cameras)} cameras and between them")
-    start = distortion or default_distortion(provenance, finetune_steps)
-    encoding_start = (
-        SEARCH_ENCODING_START_SHARE
-        if finetune_steps or target_bytes or max_psnr_drop is not None
-        else ENCODING_START_SHARE
-    )
-    measuring_report = report_part(report, 0.0, encoding_start)
-    sensitivity, references = measure_calibrated_sensitivity(model, cameras, start, prune, measuring_report)
-    sensitivity = ranks.broadcast(sensitivity)  # on GPUs the other ranks' values differ in their last bits
-    encoding_report = report_part(report, encoding_start, 1.0)
-    packer = Packer(model, kept, sensitivity, data, finetune_steps, prune, encoding_report, ranks=ranks)
-    if target_bytes is not None:
-        candidate, search_result = packer.encode_within_bytes(target_bytes, start)
-    elif max_psnr_drop is not None:
-        candidate, search_result = packer.encode_within_psnr_drop(max_psnr_drop, start)
-    else:
-        target_drop = DEFAULT_PSNR_DROP_DB if distortion is None else None
-        candidate = (
-            packer.encode(start, encoding_report)
-            if finetune_steps
-            else packer.encode_to_distortion(start, references, target_drop)
-        )
-        search_result = ""
-    written = ranks.run_on_all(
-        lambda: write_model(candidate.data, target, overwrite=overwrite) if ranks.is_main else None
-    )
-    total = sum(candidate.predicted_errors.values())
-    return CompressionReport(
-        **vars(cast(FileReport, ranks.broadcast(written))),
-        shares={part: error / (total or 1.0) for part, error in candidate.predicted_errors.items()},
-        error=candidate.measured_error or total,
-        found=search_result,
-        finetuned=finetune_steps > 0,
-        sensitivity=sensitivity,
-    )
 
 
 @dataclass
@@ -239,9 +81,9 @@ class Packer:
     model: HybridModel
     provenance: dict
     sensitivity: Sensitivity
-    scene: Scene | None
-    finetune_steps: int
-    prune: bool
+    scene: Scene | None = None
+    finetune_steps: int = 0
+    prune: bool = True
     report: Report = no_report
     cache: PictureCache = field(default_factory=PictureCache)
     ranks: Ranks = SINGLE_PROCESS

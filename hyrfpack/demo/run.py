@@ -16,6 +16,8 @@ import torch
 from PIL import Image
 
 from hyrfpack.compress import compress_model
+from hyrfpack.config.compress import CompressConfig
+from hyrfpack.context import RunContext
 from hyrfpack.data import load_scene
 from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.evaluate import evaluate_model
@@ -157,9 +159,9 @@ def _run_demo(folder: Path, steps: int, views: int, size: int, overwrite: bool) 
     for profile in ("raw", *PACKED_FILES):
         path, compress_seconds = trained.model, None
         if profile != "raw":
-            packed, compress_seconds = _timed(
-                partial(compress_model, trained.model, folder / PACKED_FILES[profile], profile, overwrite=overwrite)
-            )
+            config, context = CompressConfig(profile=profile), RunContext(progress=None)
+            compress = partial(compress_model, trained.model, folder / PACKED_FILES[profile], config, context=context)
+            packed, compress_seconds = _timed(partial(compress, overwrite=overwrite))
             path = Path(packed.file)
         unpacked, decompress_seconds = _timed(partial(repack, path, unpacked_path, overwrite=replace))
         unpacked_path, replace = Path(unpacked.file), True  # this call has written the file and may replace it

@@ -30,7 +30,6 @@ PROFILES: dict[str, Callable[..., tuple[list[Section], dict]]] = {
     "paper": paper.encode,
     "compact": compact.encode,
 }
-DEFAULT_PROFILE = "compact"  # `hyrfpack.compress_model` and the command line use it where no profile is named
 
 
 def encode_model(model: HybridModel, profile: str = "raw", provenance: dict | None = None, **settings: Any) -> bytes:
@@ -40,7 +39,7 @@ def encode_model(model: HybridModel, profile: str = "raw", provenance: dict | No
         model: the model, on any device.
         profile: "raw" (float32, exact), "paper" (see `hyrfpack.format.paper`) or "compact" (`hyrfpack.format.compact`).
         provenance: any JSON object that says where the model comes from. It is stored for readers of the file.
-        settings: settings of the profile: for "paper" the fields of `paper.PaperSettings`, for "compact" the
+        settings: settings of the profile: for "paper" the fields of `hyrfpack.PaperSettings`, for "compact" the
             `quantized` numbers from `hyrfpack.compress_model`; "raw" has none.
 
     Raises:

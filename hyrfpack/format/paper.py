@@ -9,12 +9,13 @@ hash tables                        8 bits between the table's extremes, Huffman 
 from __future__ import annotations
 
 import struct
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 import torch
 
+from hyrfpack.config.compress import MAX_VQ_STAGES, PaperSettings
 from hyrfpack.errors import HyrfError, HyrfFormatError, needs_package
 from hyrfpack.format import sections
 from hyrfpack.format.arrays import to_arrays
@@ -36,38 +37,9 @@ CODEC_RESIDUAL_VQ = 3
 CODEC_MIN_MAX = 4
 FLOAT16_MAX = 65504.0
 TABLE_CODE_BITS = 8
-MAX_VQ_STAGES = 16  # bounds the decoding time: each stage takes some milliseconds, even for few rows
 
 _VQ_HEADER_STRUCT = struct.Struct("<BBH")  # stages, columns, codewords per stage
 _STREAM_LENGTH_STRUCT = struct.Struct("<Q")
-
-
-@dataclass(frozen=True)
-class PaperSettings:
-    """Settings of profile `paper`.
-
-    The defaults take 26 to 27 bits per Gaussian in scenes of 8,000 Gaussians and more. On the six trained scenes (15
-    to 32 dB) on which they were chosen, the whole profile lost at most 0.08 dB. One quantiser for all five numbers
-    needs more bits for the same error: the colour channels are correlated, scales and opacities are not.
-
-    Attributes:
-        color, scale, opacity: (stages, codewords per stage) of the residual quantiser of these logits; 1 to 16 stages
-            of 1 to 256 codewords.
-        seed: random seed of the quantisers' k-means.
-    """
-
-    color: tuple[int, int] = (2, 128)
-    scale: tuple[int, int] = (1, 128)
-    opacity: tuple[int, int] = (1, 32)
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        for stages, size in (self.color, self.scale, self.opacity):
-            if not (1 <= stages <= MAX_VQ_STAGES and 1 <= size <= 256):
-                raise HyrfError(
-                    f"the paper profile was asked for {stages} stages of {size} codewords",
-                    fix=f"use 1 to {MAX_VQ_STAGES} stages of 1 to 256",
-                )
 
 
 def encode(model: HybridModel, **settings: Any) -> tuple[list[Section], dict]:

@@ -213,7 +213,7 @@ class _Pipeline:
         training = stages.run_training_stage(
             stage_cache, scene, self._scene_digest(scene), plan, request.config.seed, self.observer, self.context
         )
-        stages.run_compression_stage(stage_cache, scene, plan, request.device)
+        stages.run_compression_stage(stage_cache, scene, plan, self.context)
         return self._finish(stage_cache.folder / stages.PACKED_MODEL, scene, poses=poses, training=training)
 
     def _estimate_poses(self) -> dict[str, Any]:

@@ -15,6 +15,7 @@ import torch
 
 from hyrfpack.atomic import pending_file
 from hyrfpack.compress import compress_model
+from hyrfpack.config.compress import CompressConfig
 from hyrfpack.context import RunContext
 from hyrfpack.copying import copy_file
 from hyrfpack.device import describe_device
@@ -184,16 +185,14 @@ class _TrainingProgress:
 # -- packing -------------------------------------------------------------------------------------------------------
 
 
-def run_compression_stage(stage_cache: StageCache, scene: Scene, plan: Plan, device: torch.device) -> dict[str, Any]:
+def run_compression_stage(stage_cache: StageCache, scene: Scene, plan: Plan, context: RunContext) -> dict[str, Any]:
     """Compress into `model.hyrf`; return its size in bytes, the number of Gaussians, and the result of the search."""
 
     def execute(resuming: bool) -> tuple[dict, list[str]]:
         source, target = stage_cache.folder / RUN_FOLDER / MODEL_FILE, stage_cache.folder / PACKED_MODEL
         try:
-            report = compress_model(
-                source, target, data=scene, finetune_steps=plan.finetune_steps, target_bytes=plan.target_bytes,
-                device=device, report=stage_cache.reporter.report_share,
-            )  # fmt: skip
+            config = CompressConfig(finetune_steps=plan.finetune_steps or None, target_bytes=plan.target_bytes)
+            report = compress_model(source, target, config, data=scene, context=context)
         except HyrfSizeError as error:
             advice = ", or name another work folder (`work`) to train a smaller model for this size"
             raise HyrfError(

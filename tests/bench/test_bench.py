@@ -17,11 +17,11 @@ from hyrfpack.bench.operations import hash_encode_rows, mlp_rows, rasterize_rows
 from hyrfpack.bench.rendering import EXACT_SETTINGS, RENDER_SETTING_VALUES, render_rows
 from hyrfpack.bench.subject import Subject
 from hyrfpack.bench.suite import GROUPS, benchmark_model
+from hyrfpack.config.compress import PaperSettings
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import encode_model, save_model
 from hyrfpack.format.arrays import to_arrays
 from hyrfpack.format.codec import PROFILES
-from hyrfpack.format.paper import PaperSettings
 from hyrfpack.measure import timing
 from hyrfpack.model import HybridModel
 from hyrfpack.ops.hash_encode import hash_encode

@@ -37,6 +37,7 @@ from hyrfpack.train import TrainConfig
 pytest.importorskip("fcntl", reason="locks are of Unix")
 FOREIGN_BYTES = b"of another program"
 BUSY_FOLDER_ERROR = "another hyrfpack command is at work in this folder; wait until it has ended, or name another"
+PAPER_PROFILE = hyrfpack.CompressConfig(profile="paper")
 PAPER_REPORT = CompressionReport("packed.hyrf", "paper", 1, 1, 1, [])
 TINY_TRAINING_OPTIONS = "--steps 2 --max-gaussians 40"
 
@@ -255,7 +256,7 @@ def error_after_work(command: str) -> str:
 CALLS_THAT_WRITE_A_FILE = {
     "save": lambda out: hyrfpack.save_model(load_model("model.hyrf"), out, overwrite=False),
     "repack": lambda out: repack("packed.hyrf", out, overwrite=False),
-    "compress": lambda out: hyrfpack.compress_model("model.hyrf", out, "paper", overwrite=False),
+    "compress": lambda out: hyrfpack.compress_model("model.hyrf", out, PAPER_PROFILE, overwrite=False),
     "distill": lambda out: hyrfpack.import_splats(
         "ball.ply", out, hyrfpack.DistillConfig(steps=1, size=16), overwrite=False
     ),

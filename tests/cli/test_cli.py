@@ -15,8 +15,8 @@ import torch
 from commands import hyrfpack, refused, succeeded
 from PIL import Image
 
-from hyrfpack.cli.compress import DEFAULT_PROFILE, PROFILES
 from hyrfpack.cli.train import train
+from hyrfpack.config.compress import PROFILES
 from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.format import load_model
 from hyrfpack.train import Trainer
@@ -459,7 +459,7 @@ def test_the_command_line_offers_the_choices_of_the_library():
     from hyrfpack.format import codec
     from hyrfpack.train import TrainConfig
 
-    assert (PROFILES, DEFAULT_PROFILE) == (tuple(codec.PROFILES), codec.DEFAULT_PROFILE)
+    assert PROFILES == tuple(codec.PROFILES)
     defaults = TrainConfig().to_dict()
     options = {option.name: option.default for option in train.params if option.name in defaults}
     assert {"steps", "seed", "preset", "max_gaussians", "antialiased", "background", "log2_table_size"} <= set(options)

@@ -12,6 +12,7 @@ from commands import hyrfpack
 from hyrfpack.cli import main
 from hyrfpack.cli.settings import settings_options
 from hyrfpack.cli.wording import option_of_argument
+from hyrfpack.config.compress import CompressConfig
 from hyrfpack.config.distill import DistillConfig
 from hyrfpack.config.settings import list_settings
 from hyrfpack.config.train import TrainConfig
@@ -39,6 +40,11 @@ def run(config_class: type, name: str, *arguments: str) -> click.testing.Result:
         (TrainConfig, "preset", ("--preset", "street"), "'street'"),
         (TrainConfig, "ssim_weight", ("--ssim-weight", "0.5"), "0.5"),
         (DistillConfig, "psnr", ("--psnr", "40"), "40.0"),
+        (CompressConfig, "profile", (), "'compact'"),
+        (CompressConfig, "finetune_steps", ("--finetune", "500"), "500"),
+        (CompressConfig, "prune", ("--no-prune",), "False"),
+        (CompressConfig, "target_bytes", ("--target-size", "150kB"), "150000"),
+        (CompressConfig, "max_psnr_drop", ("--max-psnr-drop", "0.1"), "0.1"),
     ],
 )
 def test_an_option_gives_the_value_of_its_setting(config_class, name, arguments, printed):
@@ -54,6 +60,9 @@ def test_an_option_gives_the_value_of_its_setting(config_class, name, arguments,
         (TrainConfig, "preset", ("--preset", "indoor")),
         (TrainConfig, "antialiased", ("--no-antialiased",)),
         (DistillConfig, "psnr", ("--psnr", "nan")),
+        (CompressConfig, "finetune_steps", ("--finetune", "0")),
+        (CompressConfig, "max_psnr_drop", ("--max-psnr-drop", "nan")),
+        (CompressConfig, "profile", ("--profile", "zip")),
         (DistillConfig, "psnr", ("--psnr", "61")),
     ],
 )

@@ -13,6 +13,7 @@ from scenes import alternating_gains, ball_scene, expose_picture, exposed_scene,
 from hyrfpack.cameras.capture import has_mean_exposure
 from hyrfpack.compress import compress_model, packer
 from hyrfpack.compress.finetune import fit_residual_gains
+from hyrfpack.config.compress import CompressConfig
 from hyrfpack.evaluate import evaluate_model
 from hyrfpack.evaluate.exposure import fit_gains
 from hyrfpack.format import describe_file, load_model, save_model
@@ -100,7 +101,7 @@ def test_finetuning_keeps_the_mean_exposure_and_its_note_in_the_file(
 ):
     scores, notes_found = [], []
     for source in (model_file, file_without_exposure_note):
-        compress_model(source, tmp_path / "small.hyrf", data=scene, finetune_steps=FINETUNE_STEPS)
+        compress_model(source, tmp_path / "small.hyrf", CompressConfig(finetune_steps=FINETUNE_STEPS), data=scene)
         scores.append(evaluate_model(load_model(tmp_path / "small.hyrf"), mean_exposure_views).psnr)
         notes_found.append(has_mean_exposure(describe_file(tmp_path / "small.hyrf")["provenance"]))
 
@@ -109,8 +110,13 @@ def test_finetuning_keeps_the_mean_exposure_and_its_note_in_the_file(
 
 
 def test_finetuning_keeps_the_map_and_the_consistent_exposure_and_improves_the_fit(file_with_map, scene, tmp_path):
-    compress_model(file_with_map, tmp_path / "coarse.hyrf", data=scene, distortion=2e-4)
-    compress_model(file_with_map, tmp_path / "fitted.hyrf", data=scene, distortion=2e-4, finetune_steps=FINETUNE_STEPS)
+    compress_model(file_with_map, tmp_path / "coarse.hyrf", CompressConfig(distortion=2e-4), data=scene)
+    compress_model(
+        file_with_map,
+        tmp_path / "fitted.hyrf",
+        CompressConfig(distortion=2e-4, finetune_steps=FINETUNE_STEPS),
+        data=scene,
+    )
 
     tuned = load_model(tmp_path / "fitted.hyrf")
     for name, values in vars(load_model(file_with_map).exposure).items():
@@ -124,7 +130,7 @@ def test_finetuning_keeps_the_map_and_the_consistent_exposure_and_improves_the_f
 @pytest.mark.acceptance
 def test_finetuning_does_not_compensate_errors_of_the_map(model_file, scene, tmp_path):
     source = write_model_with_map(model_file, scene, 1.5 * PHOTO_GAINS / MEAN_GAIN, tmp_path / "light.hyrf")
-    compress_model(source, tmp_path / "fitted.hyrf", data=scene, finetune_steps=FINETUNE_STEPS)
+    compress_model(source, tmp_path / "fitted.hyrf", CompressConfig(finetune_steps=FINETUNE_STEPS), data=scene)
     # The map is wrong by log 1.5 = 0.41.
     assert abs(mean_log_gain_between(source, tmp_path / "fitted.hyrf", scene)) < 0.03
 
@@ -138,13 +144,15 @@ def test_gains_are_fitted_once_per_search_and_only_with_learned_exposures(
         file_without_exposure_note, scene, PHOTO_GAINS / MEAN_GAIN, tmp_path / "mapped.hyrf"
     )
     for source, calls in ((file_without_exposure_note, 0), (model_file, 1), (file_with_map, 2)):
-        compress_model(source, tmp_path / "small.hyrf", data=scene, finetune_steps=1, target_bytes=12_000)
+        compress_model(
+            source, tmp_path / "small.hyrf", CompressConfig(finetune_steps=1, target_bytes=12_000), data=scene
+        )
         assert len(fitted) == calls
 
 
 @pytest.mark.acceptance
 def test_max_psnr_drop_limits_the_psnr_of_renders_as_photographed(file_with_map, scene, tmp_path):
-    report = compress_model(file_with_map, tmp_path / "small.hyrf", data=scene, max_psnr_drop=0.5)
+    report = compress_model(file_with_map, tmp_path / "small.hyrf", CompressConfig(max_psnr_drop=0.5), data=scene)
 
     before, after = (evaluate_model(load_model(path), scene.train) for path in (file_with_map, tmp_path / "small.hyrf"))
     lost = before.psnr - after.psnr

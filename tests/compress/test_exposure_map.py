@@ -13,6 +13,7 @@ from scenes import ball_points, ball_scene, small_model, view_of
 
 from hyrfpack.choices import CONSISTENT_EXPOSURE
 from hyrfpack.compress import compress_model
+from hyrfpack.config.compress import CompressConfig
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import evaluate_model
 from hyrfpack.format import describe_file, load_model, save_model
@@ -72,7 +73,7 @@ def source(model, tmp_path_factory) -> Path:
 )
 def test_a_packed_file_keeps_the_map(options, source, scene, tmp_path):
     data = None if "profile" in options else scene
-    report = compress_model(source, tmp_path / "small.hyrf", data=data, **options)
+    report = compress_model(source, tmp_path / "small.hyrf", CompressConfig(**options), data=data)
 
     assert maps_equal(load_model(tmp_path / "small.hyrf").exposure, constant_map())
     assert describe_file(tmp_path / "small.hyrf")["version"] == "1.2"
@@ -80,7 +81,7 @@ def test_a_packed_file_keeps_the_map(options, source, scene, tmp_path):
 
 
 def test_the_error_is_measured_on_renders_as_photographed(model, source, scene, tmp_path):
-    report = compress_model(source, tmp_path / "small.hyrf", data=scene, distortion=3e-5)
+    report = compress_model(source, tmp_path / "small.hyrf", CompressConfig(distortion=3e-5), data=scene)
 
     packed, errors = load_model(tmp_path / "small.hyrf"), {}
     for exposure in ("as-photographed", CONSISTENT_EXPOSURE):
@@ -98,7 +99,7 @@ def test_the_error_is_measured_on_renders_as_photographed(model, source, scene, 
 
 
 def test_fine_tuning_fits_renders_as_photographed_and_leaves_the_exposure_to_the_map(model, source, scene, tmp_path):
-    compress_model(source, tmp_path / "tuned.hyrf", data=scene, finetune_steps=40)
+    compress_model(source, tmp_path / "tuned.hyrf", CompressConfig(finetune_steps=40), data=scene)
 
     tuned = load_model(tmp_path / "tuned.hyrf")
     assert evaluate_model(tuned, scene.train).psnr > 28
@@ -111,5 +112,5 @@ def test_fine_tuning_fits_renders_as_photographed_and_leaves_the_exposure_to_the
 def test_a_target_size_below_the_minimum_with_a_map_is_refused(source, tmp_path):
     assert min_file_bytes(exposure=constant_map()) > min_file_bytes() + 84
     with pytest.raises(HyrfError, match=f"about {min_file_bytes(exposure=constant_map()):,} bytes"):
-        compress_model(source, tmp_path / "small.hyrf", target_bytes=min_file_bytes() + 1)
+        compress_model(source, tmp_path / "small.hyrf", CompressConfig(target_bytes=min_file_bytes() + 1))
     assert not (tmp_path / "small.hyrf").exists()

@@ -14,10 +14,12 @@ from scenes import ball_points, ball_scene, small_model
 
 import hyrfpack
 from hyrfpack.cameras.capture import MAX_COARSE_CAMERAS, provenance_cameras, quantized_provenance
-from hyrfpack.compress import compress_model
+from hyrfpack.compress import compress_model, run
 from hyrfpack.compress import packer as running
 from hyrfpack.compress.calibrate import measure_calibrated_sensitivity
 from hyrfpack.compress.distortion import default_distortion
+from hyrfpack.config.compress import CompressConfig, PaperSettings
+from hyrfpack.context import RunContext
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import evaluate_model
 from hyrfpack.format import describe_file, load_model, save_model
@@ -38,7 +40,7 @@ def scene(data) -> Scene:
 @pytest.fixture(scope="module")
 def paper_file(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("packed") / "paper.hyrf"
-    compress_model(DEMO_MODEL_FILE, path, "paper")
+    compress_model(DEMO_MODEL_FILE, path, CompressConfig(profile="paper"))
     return path
 
 
@@ -68,7 +70,7 @@ def ball_file(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def finetuned_file(scene, tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("packed") / "tuned.hyrf"
-    compress_model(DEMO_MODEL_FILE, path, data=scene, finetune_steps=60)
+    compress_model(DEMO_MODEL_FILE, path, CompressConfig(finetune_steps=60), data=scene)
     return path
 
 
@@ -124,7 +126,9 @@ def test_the_measured_error_is_close_to_the_requested_distortion(scene, tmp_path
     cameras = [view.camera for view in scene.train]
     sizes, errors = [], []
     for distortion in (1e-4, 1e-6):
-        report = compress_model(DEMO_MODEL_FILE, tmp_path / "small.hyrf", data=scene, distortion=distortion)
+        report = compress_model(
+            DEMO_MODEL_FILE, tmp_path / "small.hyrf", CompressConfig(distortion=distortion), data=scene
+        )
         errors.append(mean_squared_error(DEMO_MODEL_FILE, tmp_path / "small.hyrf", cameras))
         sizes.append(report.bytes_after)
         assert distortion / 1.75 < errors[-1] < 1.75 * distortion
@@ -180,7 +184,8 @@ def test_results_do_not_depend_on_the_number_of_threads(compact_file_and_report,
 
 @pytest.mark.parametrize("limit", [{"target_bytes": 9000}, {"max_psnr_drop": 0.3}], ids=["size", "loss"])
 def test_finetuning_respects_limits(limit, scene, tmp_path):
-    report = compress_model(DEMO_MODEL_FILE, tmp_path / "small.hyrf", data=scene, finetune_steps=5, **limit)
+    config = CompressConfig(finetune_steps=5, **limit)
+    report = compress_model(DEMO_MODEL_FILE, tmp_path / "small.hyrf", config, data=scene)
 
     if "target_bytes" in limit:
         assert 0.6 * 9000 < report.bytes_after <= 9000
@@ -195,8 +200,8 @@ def test_pruning_removes_gaussians_and_bytes_and_can_be_disabled(ball_file, tmp_
         model.gaussians.opacity_logits[: every // 3] -= 20  # makes them almost invisible
     save_model(model, tmp_path / "some.hyrf", provenance=provenance)
 
-    kept = compress_model(tmp_path / "some.hyrf", tmp_path / "all.hyrf", distortion=1e-4, prune=False)
-    pruned = compress_model(tmp_path / "some.hyrf", tmp_path / "fewer.hyrf", distortion=1e-4)
+    kept = compress_model(tmp_path / "some.hyrf", tmp_path / "all.hyrf", CompressConfig(distortion=1e-4, prune=False))
+    pruned = compress_model(tmp_path / "some.hyrf", tmp_path / "fewer.hyrf", CompressConfig(distortion=1e-4))
 
     assert kept.gaussians == every > every - every // 3 >= pruned.gaussians > every / 4
     assert pruned.bytes_after < kept.bytes_after
@@ -293,7 +298,7 @@ def test_without_photos_the_stored_cameras_and_the_stored_psnr_are_used(ball_fil
         distortions.append(distortion)
         return measure_calibrated_sensitivity(model, cameras, distortion, *rest)
 
-    monkeypatch.setattr(running, "measure_calibrated_sensitivity", measure_and_record)
+    monkeypatch.setattr(run, "measure_calibrated_sensitivity", measure_and_record)
     compress_model(ball_file, tmp_path / "small.hyrf")
 
     assert distortions == pytest.approx([2.33e-4], rel=0.01)
@@ -322,7 +327,7 @@ def test_provenance_is_kept_with_a_sample_of_cameras(compact_file_and_report, pa
 
 def test_a_compressed_file_can_be_recompressed_and_unpacked_exactly(paper_file, scene, tmp_path):
     from_paper = compress_model(paper_file, tmp_path / "small.hyrf", data=scene)
-    compress_model(DEMO_COMPACT_FILE, tmp_path / "back.hyrf", "raw")
+    compress_model(DEMO_COMPACT_FILE, tmp_path / "back.hyrf", CompressConfig(profile="raw"))
 
     assert from_paper.bytes_after < paper_file.stat().st_size
     models = load_model(DEMO_COMPACT_FILE), load_model(tmp_path / "back.hyrf")
@@ -341,14 +346,6 @@ def test_the_default_distortion_costs_a_tenth_of_a_db(recorded_psnr, expected):
     )
 
 
-def test_the_deprecated_option_noise_is_accepted_with_a_warning(ball_file, tmp_path):
-    compress_model(ball_file, tmp_path / "new.hyrf", distortion=1e-4)
-    with pytest.warns(DeprecationWarning, match="distortion"):
-        compress_model(ball_file, tmp_path / "old.hyrf", noise=1e-4)
-
-    assert (tmp_path / "old.hyrf").read_bytes() == (tmp_path / "new.hyrf").read_bytes()
-
-
 # -- refused options ---------------------------------------------------------------------------------------------------
 
 
@@ -358,17 +355,31 @@ def test_the_deprecated_option_noise_is_accepted_with_a_warning(ball_file, tmp_p
         ({"finetune_steps": 5}, "need photos"),
         ({"max_psnr_drop": 0.1}, "need photos"),
         ({"target_bytes": 10_000, "distortion": 1e-5}, "give one of them"),
-        ({"color": (2, 64)}, "no setting 'color'"),
+        (
+            {"paper": PaperSettings(color=(2, 64))},
+            "none of the settings of 'paper'; leave them out",
+        ),
         ({"profile": "paper", "distortion": 1e-5}, "profile 'paper' cannot be fitted"),
         ({"profile": "raw", "finetune_steps": 5}, "profile 'raw' cannot be fitted"),
-        ({"profile": "zip"}, "no profile 'zip'"),
         ({"target_bytes": 500}, "500 bytes is below the smallest possible file"),
     ],
 )
 def test_invalid_combinations_of_options_are_refused_and_nothing_is_written(options, words, tmp_path):
     with pytest.raises(HyrfError, match=words):
-        compress_model(DEMO_MODEL_FILE, tmp_path / "small.hyrf", **options)
+        compress_model(DEMO_MODEL_FILE, tmp_path / "small.hyrf", CompressConfig(**options))
 
+    assert not list(tmp_path.iterdir())
+
+
+def test_progress_grows_and_the_work_ends_when_it_is_stopped(ball_file, tmp_path):
+    events = []
+    context = RunContext(progress=events.append, stop=lambda: len(events) > 3)
+
+    with pytest.raises(KeyboardInterrupt):
+        compress_model(ball_file, tmp_path / "small.hyrf", context=context)
+
+    shares = [event.share for event in events]
+    assert len(events) == 4 and shares == sorted(shares)
     assert not list(tmp_path.iterdir())
 
 
@@ -383,7 +394,7 @@ def test_an_unreachable_max_psnr_drop_is_refused(ball_file, tmp_path, monkeypatc
     monkeypatch.setattr(running, "evaluate_model", worse_each_time)
 
     with pytest.raises(HyrfError, match="even the finest file loses more than 0.5 dB of PSNR"):
-        compress_model(ball_file, tmp_path / "small.hyrf", data=ball_scene(), max_psnr_drop=0.5)
+        compress_model(ball_file, tmp_path / "small.hyrf", CompressConfig(max_psnr_drop=0.5), data=ball_scene())
 
     assert not list(tmp_path.iterdir())
 
@@ -394,7 +405,7 @@ def test_a_scene_without_training_photos_is_refused(options, scene, tmp_path):
     held_out = dataclasses.replace(scene, train=[], test=scene.train)
 
     with pytest.raises(HyrfError):
-        compress_model(DEMO_MODEL_FILE, tmp_path / "small.hyrf", data=held_out, **options)
+        compress_model(DEMO_MODEL_FILE, tmp_path / "small.hyrf", CompressConfig(**options), data=held_out)
 
 
 def test_an_invisible_model_is_compressed(tmp_path, scene):

@@ -11,6 +11,7 @@ from scenes import QUIET_CONTEXT, ball_scene
 from hyrfpack import compress_model
 from hyrfpack.cameras.capture import quantized_provenance
 from hyrfpack.compress.distortion import DISTORTION_RANGE
+from hyrfpack.config.compress import CompressConfig
 from hyrfpack.errors import HyrfError
 from hyrfpack.format.codec import load_with_provenance
 from hyrfpack.format.min_file_size import check_target_bytes, min_file_bytes
@@ -25,7 +26,9 @@ def tiny_file_and_provenance(tmp_path_factory):
     folder = tmp_path_factory.mktemp("tiny")
     scene = ball_scene(6)
     train_model(scene, folder, TrainConfig(steps=3, max_gaussians=20), context=QUIET_CONTEXT)
-    compress_model(folder / "model.hyrf", folder / "small.hyrf", data=scene, distortion=DISTORTION_RANGE[1])
+    compress_model(
+        folder / "model.hyrf", folder / "small.hyrf", CompressConfig(distortion=DISTORTION_RANGE[1]), data=scene
+    )
     model, provenance = load_with_provenance(folder / "model.hyrf")
     return folder / "small.hyrf", quantized_provenance(provenance, model.config.frame.scale)
 

@@ -99,8 +99,8 @@ def test_every_function_reports_an_unfinished_run(call, unfinished_folder, tmp_p
 def test_reading_a_run_equals_reading_its_model(run_folder, tmp_path):
     assert len(hyrfpack.load_model(run_folder)) == len(GAUSSIAN_POSITIONS)
     assert hyrfpack.describe_file(run_folder) == hyrfpack.describe_file(run_folder / "model.hyrf")
-    hyrfpack.compress_model(run_folder, tmp_path / "a.hyrf", "paper")
-    hyrfpack.compress_model(run_folder / "model.hyrf", tmp_path / "b.hyrf", "paper")
+    hyrfpack.compress_model(run_folder, tmp_path / "a.hyrf", hyrfpack.CompressConfig(profile="paper"))
+    hyrfpack.compress_model(run_folder / "model.hyrf", tmp_path / "b.hyrf", hyrfpack.CompressConfig(profile="paper"))
     assert (tmp_path / "a.hyrf").read_bytes() == (tmp_path / "b.hyrf").read_bytes()
     hyrfpack.export_model(run_folder, tmp_path / "a.ply", hyrfpack.ExportConfig(degree=0, background=False))
     assert len(read_splats(tmp_path / "a.ply")) == len(GAUSSIAN_POSITIONS)

@@ -17,6 +17,7 @@ from scenes import QUIET_CONTEXT, ball_scene, camera_at, photograph, ring, view_
 
 from hyrfpack import TrainConfig, evaluate_model, load_scene, train_model
 from hyrfpack.compress import compress_model
+from hyrfpack.config.compress import CompressConfig
 from hyrfpack.errors import HyrfTrainingError
 from hyrfpack.format import decode_model, save_model
 from hyrfpack.format.codec import PROFILES
@@ -141,7 +142,7 @@ def compress_to_bytes(profile: str, trainer: Trainer) -> bytes:
     with TemporaryDirectory() as folder:
         raw, packed = Path(folder) / "model.hyrf", Path(folder) / "packed.hyrf"
         save_model(trainer.model, raw, "raw", {"psnr": min(mean_psnr(trainer.model, trainer.scene.train), 99.0)})
-        compress_model(raw, packed, profile, data=photos if profile == "compact" else None)
+        compress_model(raw, packed, CompressConfig(profile=profile), data=photos if profile == "compact" else None)
         return packed.read_bytes()
 
 

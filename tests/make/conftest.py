@@ -99,12 +99,13 @@ def fake_train_model(scene, run, config, *, resume, context, **options) -> Train
     return TrainResult(True, config.steps, run / "model.hyrf", metrics, missing)
 
 
-def fake_compress_model(source, target, *, finetune_steps, target_bytes, report, **options):
+def fake_compress_model(source, target, config, *, context, **options):
     """Write a model whose file depends on that of the trained one and on the settings; a target size makes it small."""
-    report("compressing", 0.5)
+    context.progress(TaskEvent("compressing", 0.5))
     digest = hashlib.sha256(source.read_bytes()).hexdigest()
-    model = tiny_model(20 if target_bytes else 400)
-    written = save_model(model, target, provenance={"of": digest, "settings": [finetune_steps, target_bytes]})
+    model = tiny_model(20 if config.target_bytes else 400)
+    settings = [config.finetune_steps, config.target_bytes]
+    written = save_model(model, target, provenance={"of": digest, "settings": settings})
     return CompressionReport(**vars(written))
 
 

@@ -54,7 +54,7 @@ def train():
     return hyrfpack.train_model(scene, "run", hyrfpack.TrainConfig(steps=3), overwrite=True).model.read_bytes()
 
 def compress():
-    hyrfpack.compress_model("model.hyrf", "compact.hyrf", data=scene, finetune_steps=2)
+    hyrfpack.compress_model("model.hyrf", "compact.hyrf", hyrfpack.CompressConfig(finetune_steps=2), data=scene)
     return Path("compact.hyrf").read_bytes()
 
 def export():

@@ -17,6 +17,7 @@ from scenes import ball_points, ball_scene, ring, small_model
 from hyrfpack.cameras.capture import provenance_cameras
 from hyrfpack.compress import CompressionReport, compress_model
 from hyrfpack.compress.calibrate import measure_calibrated_sensitivity
+from hyrfpack.config.compress import CompressConfig
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import evaluate_model
 from hyrfpack.format import load_model, save_model
@@ -104,7 +105,7 @@ def compress_and_report(
 ) -> tuple[Path, CompressionReport, ParsedReport]:
     """Compress a model and write its report page; return the packed file, the report and the parsed page."""
     packed = folder / "packed.hyrf"
-    report = compress_model(model_file, packed, profile, data=scene, **options)
+    report = compress_model(model_file, packed, CompressConfig(profile=profile, **options), data=scene)
     return (
         packed,
         report,

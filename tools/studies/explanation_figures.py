@@ -109,7 +109,10 @@ def draw_figures(run: Path, folder: Path, *, camera: int = 0, size: int = 300) -
     cameras = Capture(hyrfpack.describe_file(run)).cameras
     with tempfile.TemporaryDirectory() as scratch:
         files = {profile: Path(scratch) / f"{profile}.hyrf" for profile in PROFILES}
-        reports = {profile: hyrfpack.compress_model(run, path, profile) for profile, path in files.items()}
+        reports = {
+            profile: hyrfpack.compress_model(run, path, hyrfpack.CompressConfig(profile=profile))
+            for profile, path in files.items()
+        }
         return [
             draw_method(model, resized(cameras[camera % len(cameras)], size), folder / "how-method.png"),
             draw_file(files, folder / "how-file.png"),

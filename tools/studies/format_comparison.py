@@ -253,7 +253,11 @@ def compress_with_profiles(trained: Path, given: Sequence[Path], folder: Path) -
         for number, settings in enumerate(PROFILE_SETTINGS.get(profile, [{}])):
             if profile not in UNCOMPRESSED_PROFILES:
                 path = folder / f"{profile}-{number}.hyrf"
-                hyrfpack.compress_model(trained, path, profile, **settings)
+                if profile == "paper":
+                    config = hyrfpack.CompressConfig(profile=profile, paper=hyrfpack.PaperSettings(**settings))
+                else:
+                    config = hyrfpack.CompressConfig(profile=profile, **settings)
+                hyrfpack.compress_model(trained, path, config)
                 yield path, ", ".join(f"{name} {value}" for name, value in settings.items()) or "default"
     for path in given:
         yield path, path.stem

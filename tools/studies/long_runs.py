@@ -86,11 +86,11 @@ def measure(run: QueuedRun, data: Path, out: Path, finetune_steps: int) -> None:
     (folder / MEASUREMENT_FILE).write_text(json.dumps(row, indent=1))
 
 
-def _compress_and_score(folder: Path, scene: Scene, profile: str, finetune_steps: int = 0) -> dict:
+def _compress_and_score(folder: Path, scene: Scene, profile: str, finetune_steps: int | None = None) -> dict:
     """Compress the run's model and score the file on the held-out photos."""
     path = folder / f"{'finetuned' if finetune_steps else profile}.hyrf"
-    settings = {"data": scene, "finetune_steps": finetune_steps} if finetune_steps else {}
-    hyrfpack.compress_model(folder / MODEL_FILE, path, profile=profile, **settings)
+    config = hyrfpack.CompressConfig(profile=profile, finetune_steps=finetune_steps)
+    hyrfpack.compress_model(folder / MODEL_FILE, path, config, data=scene if finetune_steps else None)
     scores = hyrfpack.evaluate_model(hyrfpack.load_model(path), scene.test)
     return {"bytes": path.stat().st_size, "psnr": scores.psnr, "ssim": scores.ssim}
 

@@ -40,7 +40,7 @@ def measure(data: Path, name: str, out: Path, config: TrainConfig, reuse: bool) 
     for profile in COMPRESSED_PROFILES:
         path = out / f"{profile}.hyrf"
         started = time.perf_counter()
-        hyrfpack.compress_model(model, path, profile=profile)
+        hyrfpack.compress_model(model, path, hyrfpack.CompressConfig(profile=profile))
         seconds = time.perf_counter() - started
         scores = hyrfpack.evaluate_model(hyrfpack.load_model(path), scene.test)
         packed |= {f"psnr_{profile}": scores.psnr, f"ssim_{profile}": scores.ssim}

@@ -1,0 +1,160 @@
+"""Compress a file: measure sensitivities, plan, fine-tune or search if requested, and write."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import cast
+
+from hyrfpack.cameras.capture import Capture, quantized_provenance
+from hyrfpack.checks import check_type
+from hyrfpack.compress.calibrate import measure_calibrated_sensitivity
+from hyrfpack.compress.distortion import DEFAULT_PSNR_DROP_DB, default_distortion
+from hyrfpack.compress.packer import EncodedCandidate, Packer
+from hyrfpack.compress.report import CompressionReport
+from hyrfpack.compress.sensitivity import Sensitivity
+from hyrfpack.config.compress import CompressConfig
+from hyrfpack.context import RunContext
+from hyrfpack.data import PictureCache
+from hyrfpack.errors import HyrfError
+from hyrfpack.format.codec import load_with_provenance, repack, write_model
+from hyrfpack.format.info import FileReport, describe_file
+from hyrfpack.format.min_file_size import check_target_bytes
+from hyrfpack.format.run_folder import find_model
+from hyrfpack.outputs import Outputs, StrPath
+from hyrfpack.parallel.ranks import SINGLE_PROCESS
+from hyrfpack.progress import Report, report_part, report_to
+from hyrfpack.scene import Scene
+
+_LOG = logging.getLogger(__name__)
+
+# Share of the progress at which sensitivities are measured and encoding starts, for a single file and for a search.
+ENCODING_START_SHARE = 0.7
+SEARCH_ENCODING_START_SHARE = 0.3
+
+
+def compress_model(
+    source: StrPath,
+    target: StrPath,
+    config: CompressConfig = CompressConfig(),  # noqa: B008 - frozen
+    *,
+    data: Scene | None = None,
+    overwrite: bool = True,
+    context: RunContext = RunContext(),  # noqa: B008 - frozen
+) -> CompressionReport:
+    """Compress a `.hyrf` file into a smaller one.
+
+    Profile "compact" measures at the cameras of `data`, or at those stored in the file. On the CPU the same input gives
+    the same bytes. On a GPU sums of gradients vary in their last bits, and so may the bytes.
+
+    Args:
+        source: a file of any profile, best "raw", or the folder of a run.
+        target: the file to write.
+        config: the settings.
+        data: photos of the scene, for profile "compact" only. Fine-tuning and limits on PSNR need them.
+        overwrite: replace a file at `target`. If False, an existing file is an error. A file that appears in the
+            meantime is kept, and the result is written beside it under a free name, which the report names.
+        context: device, processes and progress. The processes share the photos of fine-tuning.
+
+    Raises:
+        HyrfError: a file cannot be read or written, the target would replace an input, the settings exclude each
+            other, or no file meets the limits.
+        TypeError: `config` is not a CompressConfig, or `data` is not a Scene.
+
+    Example:
+        >>> import hyrfpack
+        >>> report = hyrfpack.compress_model("runs/bonsai", "small.hyrf", hyrfpack.CompressConfig(target_bytes=20_000))
+        >>> report.profile, report.bytes_after < report.bytes_before
+        ('compact', True)
+    """
+    check_type("config", config, CompressConfig)
+    if data is not None:
+        check_type("data", data, Scene)
+    source, ranks = find_model(source), context.ranks or SINGLE_PROCESS
+    # Only the main process checks the target, while the others wait. They must not mistake its output for an old file.
+    outputs = Outputs(source, scene=data, overwrite=overwrite)
+    ranks.run_on_all(lambda: outputs.file(target) if ranks.is_main else None)
+    _check_request(config, data)
+    if config.profile != "compact":
+        settings = config.encoder_settings()
+        repacked = ranks.run_on_all(
+            lambda: repack(source, target, config.profile, overwrite=overwrite, **settings) if ranks.is_main else None
+        )
+        return CompressionReport(**vars(cast(FileReport, ranks.broadcast(repacked))))
+    with context.open_progress("compress") as progress:
+        candidate, search_result, sensitivity = _encode_compact(source, config, data, context, report_to(progress))
+    written = ranks.run_on_all(
+        lambda: write_model(candidate.data, target, overwrite=overwrite) if ranks.is_main else None
+    )
+    total = sum(candidate.predicted_errors.values())
+    return CompressionReport(
+        **vars(cast(FileReport, ranks.broadcast(written))),
+        shares={part: error / (total or 1.0) for part, error in candidate.predicted_errors.items()},
+        error=candidate.measured_error or total,
+        found=search_result,
+        finetuned=config.finetune_steps is not None,
+        sensitivity=sensitivity,
+    )
+
+
+def _encode_compact(
+    source: Path, config: CompressConfig, data: Scene | None, context: RunContext, report: Report
+) -> tuple[EncodedCandidate, str, Sensitivity]:
+    """Encode a file with profile "compact"; return it, the outcome of a search as a sentence, and the sensitivities."""
+    ranks = context.ranks or SINGLE_PROCESS
+    model, provenance = load_with_provenance(source)
+    kept = quantized_provenance(provenance, model.config.frame.scale)
+    if config.target_bytes is not None:
+        check_target_bytes(config.target_bytes, kept, model.exposure)
+    model = model.to(context.choose_device())
+    model.precision = "float32"  # quantisation errors are smaller than the rounding of lower precisions on a GPU
+    if len(model) == 0:
+        raise HyrfError(
+            f"{source}: there is no Gaussian in it, so there is nothing to measure",
+            fix="use profile 'paper'",
+        )
+    cameras = Capture(describe_file(source), data).cameras
+    _LOG.info(f"measuring how each stored number affects renders, at {len(cameras)} cameras and between them")
+    steps = config.finetune_steps or 0
+    start = config.distortion or default_distortion(provenance, steps)
+    searches = config.target_bytes is not None or config.max_psnr_drop is not None
+    encoding_start = SEARCH_ENCODING_START_SHARE if steps or searches else ENCODING_START_SHARE
+    measuring_report = report_part(report, 0.0, encoding_start)
+    sensitivity, references = measure_calibrated_sensitivity(model, cameras, start, config.prune, measuring_report)
+    sensitivity = ranks.broadcast(sensitivity)  # on GPUs the other ranks' values differ in their last bits
+    encoding_report = report_part(report, encoding_start, 1.0)
+    cache = context.cache or PictureCache()
+    packer = Packer(model, kept, sensitivity, data, steps, config.prune, encoding_report, cache, ranks)
+    if config.target_bytes is not None:
+        return *packer.encode_within_bytes(config.target_bytes, start), sensitivity
+    if config.max_psnr_drop is not None:
+        return *packer.encode_within_psnr_drop(config.max_psnr_drop, start), sensitivity
+    if steps:
+        return packer.encode(start, encoding_report), "", sensitivity
+    target_drop = DEFAULT_PSNR_DROP_DB if config.distortion is None else None
+    return packer.encode_to_distortion(start, references, target_drop), "", sensitivity
+
+
+def _check_request(config: CompressConfig, data: Scene | None) -> None:
+    """Raise an error if settings exclude each other, or photos are missing or cannot be used."""
+    limits = (config.target_bytes, config.max_psnr_drop, config.distortion)
+    limit_count = sum(limit is not None for limit in limits)
+    if config.profile != "compact" and (data is not None or config.finetune_steps or limit_count):
+        raise HyrfError(
+            f"profile '{config.profile}' cannot be fitted to photos, a target size or a limit on the loss",
+            fix="use profile 'compact'",
+        )
+    if config.profile != "paper" and config.paper is not None:
+        raise HyrfError(f"profile '{config.profile}' has none of the settings of 'paper'", fix="leave them out")
+    if data is None and (config.finetune_steps or config.max_psnr_drop is not None):
+        raise HyrfError("fine-tuning and limits on PSNR need photos", fix="name their folder with `data`")
+    if limit_count > 1:
+        raise HyrfError(
+            "a target size and a largest loss of PSNR each decide how fine the file is",
+            fix="give one of them",
+        )
+    if data is not None and not data.train:
+        raise HyrfError(
+            f"{data.path}: all photos are held out, so that none is left to measure with",
+            fix="use a larger `test_every`",
+        )
