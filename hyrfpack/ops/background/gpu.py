@@ -12,6 +12,8 @@ each of a level's two features, and one for the encoded direction.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 import triton
 import triton.language as tl
@@ -32,6 +34,40 @@ _NODES_PER_PROGRAM = 256  # This holds for `find_nodes_kernel` and `encode_nodes
 _BACKGROUND_RADIUS = tl.constexpr(BACKGROUND_RADIUS)
 _CHANNELS = tl.constexpr(3)
 _PADDED_CHANNELS = tl.constexpr(16)
+
+
+class FieldTensors(NamedTuple):
+    """The tensors of a `BackgroundField` as an argument of kernels.
+
+    Attributes:
+        table, levels: the results of `rows_as_words` and `level_parameters`.
+        weights, biases: of the three layers.
+    """
+
+    table: Tensor
+    levels: Tensor
+    weights: tuple[Tensor, ...]
+    biases: tuple[Tensor, ...]
+
+
+class FieldSizes(NamedTuple):
+    """The sizes of a `BackgroundField`, for which kernels are compiled.
+
+    Attributes:
+        LEVELS, ENCODING, H1, H2: numbers of levels, of features of a direction, and of neurons of both hidden layers.
+        LEVELS_P, ENCODING_P, H1_P, H2_P: heights of the tiles that hold them, see `pad_width`.
+        H2_SLICE: neurons of the second layer that are computed at once.
+    """
+
+    LEVELS: tl.constexpr
+    ENCODING: tl.constexpr
+    H1: tl.constexpr
+    H2: tl.constexpr
+    LEVELS_P: tl.constexpr
+    ENCODING_P: tl.constexpr
+    H1_P: tl.constexpr
+    H2_P: tl.constexpr
+    H2_SLICE: tl.constexpr
 
 
 def _launch_shape(mixed: bool, hidden: int) -> tuple[int, int, int]:
@@ -137,22 +173,19 @@ def _load_bias(bias, start, OUTPUTS: tl.constexpr, WIDTH: tl.constexpr, BLOCK: t
 
 @triton.jit(do_not_specialize=["height", "width", "stride", "rows", "columns"])
 def background_kernel(
-    transmittance, height, width, threshold, stride, rows, columns, rays, half_extent, table, levels, weights, biases,
-    out,
-    STRIDE: tl.constexpr, LEVELS: tl.constexpr, ENCODING_WIDTH: tl.constexpr, H1: tl.constexpr, H2: tl.constexpr,
-    LEVELS_P: tl.constexpr, ENCODING_WIDTH_P: tl.constexpr, H1_P: tl.constexpr, H2_P: tl.constexpr,
-    H2_SLICE: tl.constexpr, BLOCK_COLUMNS: tl.constexpr, FREQUENCY: tl.constexpr, PRECISION: tl.constexpr,
+    transmittance, height, width, threshold, stride, rows, columns, rays, half_extent, field, out,
+    STRIDE: tl.constexpr, S: tl.constexpr, BLOCK_COLUMNS: tl.constexpr, FREQUENCY: tl.constexpr,
+    PRECISION: tl.constexpr,
 ):  # fmt: skip
     """Write the colours of a block of nodes to `out` (3, rows, columns).
 
-    `rays` (the result of `_camera_rays`), half_extent, and the weights and biases of the three layers are tuples.
-    Integers are not put into tuples, because Triton would compile another kernel for each that is 1 or a multiple of
-    16.
+    `rays` is the result of `_camera_rays`, half_extent a tuple, `field` `FieldTensors` and S `FieldSizes`. Sizes of the
+    picture are not put into tuples, because Triton would compile another kernel for each that is 1 or a multiple of 16.
     """
-    w1, w2, w3 = weights
-    b1, b2, b3 = biases
+    w1, w2, w3 = field.weights
+    b1, b2, b3 = field.biases
     BLOCK: tl.constexpr = _NODE_ROWS_PER_BLOCK * BLOCK_COLUMNS
-    INPUTS: tl.constexpr = 2 * LEVELS + ENCODING_WIDTH
+    INPUTS: tl.constexpr = 2 * S.LEVELS + S.ENCODING
     blocks = tl.cdiv(columns, BLOCK_COLUMNS)
     lane = tl.arange(0, BLOCK)
     i = tl.program_id(0) // blocks * _NODE_ROWS_PER_BLOCK + lane // BLOCK_COLUMNS
@@ -162,24 +195,26 @@ def background_kernel(
     colors = tl.zeros([BLOCK, _PADDED_CHANNELS], tl.float32)
     if tl.max(needed.to(tl.int32), 0) > 0:
         u, v, w, x, y, z = _cast_rays(i, j, rays, half_extent)
-        features0, features1 = _hash_features(u, v, w, table, levels, needed, LEVELS, LEVELS_P)
+        features0, features1 = _hash_features(u, v, w, field.table, field.levels, needed, S.LEVELS, S.LEVELS_P)
 
-        hidden = _load_bias(b1, 0, H1, H1_P, BLOCK)
-        weight = _load_weight(w1, 0, INPUTS, 0, 2, LEVELS, H1, LEVELS_P, H1_P, PRECISION)
+        hidden = _load_bias(b1, 0, S.H1, S.H1_P, BLOCK)
+        weight = _load_weight(w1, 0, INPUTS, 0, 2, S.LEVELS, S.H1, S.LEVELS_P, S.H1_P, PRECISION)
         hidden = multiply_add(tl.trans(round_factor(features0, PRECISION)), weight, hidden, PRECISION)
-        weight = _load_weight(w1, 0, INPUTS, 1, 2, LEVELS, H1, LEVELS_P, H1_P, PRECISION)
+        weight = _load_weight(w1, 0, INPUTS, 1, 2, S.LEVELS, S.H1, S.LEVELS_P, S.H1_P, PRECISION)
         hidden = multiply_add(tl.trans(round_factor(features1, PRECISION)), weight, hidden, PRECISION)
-        weight = _load_weight(w1, 0, INPUTS, 2 * LEVELS, 1, ENCODING_WIDTH, H1, ENCODING_WIDTH_P, H1_P, PRECISION)
-        encoded = round_factor(encode_block(x, y, z, FREQUENCY, 0, ENCODING_WIDTH_P), PRECISION)
+        weight = _load_weight(w1, 0, INPUTS, 2 * S.LEVELS, 1, S.ENCODING, S.H1, S.ENCODING_P, S.H1_P, PRECISION)
+        encoded = round_factor(encode_block(x, y, z, FREQUENCY, 0, S.ENCODING_P), PRECISION)
         hidden = round_relu(multiply_add(tl.trans(encoded), weight, hidden, PRECISION), PRECISION)
 
         logits = _load_bias(b3, 0, _CHANNELS, _PADDED_CHANNELS, BLOCK)
-        for start in range(0, H2_P, H2_SLICE):
-            second = _load_weight(w2, start, H1, 0, 1, H1, H2, H1_P, H2_SLICE, PRECISION)
+        for start in range(0, S.H2_P, S.H2_SLICE):
+            second = _load_weight(w2, start, S.H1, 0, 1, S.H1, S.H2, S.H1_P, S.H2_SLICE, PRECISION)
             part = round_relu(
-                multiply_add(hidden, second, _load_bias(b2, start, H2, H2_SLICE, BLOCK), PRECISION), PRECISION
+                multiply_add(hidden, second, _load_bias(b2, start, S.H2, S.H2_SLICE, BLOCK), PRECISION), PRECISION
             )
-            third = _load_weight(w3 + start, 0, H2, 0, 1, H2 - start, _CHANNELS, H2_SLICE, _PADDED_CHANNELS, PRECISION)
+            third = _load_weight(
+                w3 + start, 0, S.H2, 0, 1, S.H2 - start, _CHANNELS, S.H2_SLICE, _PADDED_CHANNELS, PRECISION
+            )
             logits = multiply_add(part, third, logits, PRECISION)
         colors = tl.where(needed[:, None], tl.sigmoid(logits), 0.0)
     channel = tl.arange(0, _PADDED_CHANNELS)[None, :]
@@ -196,9 +231,9 @@ def background_grid(
     weights, biases = (
         tuple(tensor.detach().contiguous() for tensor in layers) for layers in (field.weights, field.biases)
     )
-    levels = len(field.resolutions)
-    encoding_width = weights[0].shape[1] - 2 * levels
+    levels = level_parameters(field.resolutions, field.log2_table_size, field.table.device)
     hidden = [len(bias) for bias in biases[:2]]
+    sizes = [len(field.resolutions), weights[0].shape[1] - 2 * len(field.resolutions), *hidden]
     widths = [pad_width(width) for width in hidden]
     block_columns, warps, part = _launch_shape(field.mixed, max(widths))
     colors = field.table.new_empty((3, rows, columns))
@@ -212,21 +247,10 @@ def background_grid(
         columns,
         _camera_rays(viewport, stride),
         tuple(field.half_extent),
-        rows_as_words(field.table),
-        level_parameters(field.resolutions, field.log2_table_size, field.table.device),
-        weights,
-        biases,
+        FieldTensors(rows_as_words(field.table), levels, weights, biases),
         colors,
         STRIDE=stride,
-        LEVELS=levels,
-        ENCODING_WIDTH=encoding_width,
-        H1=hidden[0],
-        H2=hidden[1],
-        LEVELS_P=pad_width(levels),
-        ENCODING_WIDTH_P=pad_width(encoding_width),
-        H1_P=widths[0],
-        H2_P=widths[1],
-        H2_SLICE=min(widths[1], part),
+        S=FieldSizes(*map(tl.constexpr, (*sizes, *map(pad_width, sizes), min(widths[1], part)))),
         BLOCK_COLUMNS=block_columns,
         FREQUENCY=field.encoding == "frequency",
         PRECISION=product_precision(field.mixed),
