@@ -1,4 +1,4 @@
-"""`browser.complaints()`, on which other tests rely, returns the errors of a page."""
+"""`Browser.list_errors`, on which other tests rely, returns the errors of a page."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ console.error("an error of the page"); setTimeout(() => { throw new Error("throw
 </script>"""
 
 
-def test_complaints_contain_console_and_thrown_errors(browser: Browser, tmp_path: Path) -> None:
+def test_listed_errors_contain_console_and_thrown_errors(browser: Browser, tmp_path: Path) -> None:
     (tmp_path / "page.html").write_text(PAGE_WITH_ERRORS)
     browser.open((tmp_path / "page.html").as_uri())
     errors = " ".join(browser.list_errors())
