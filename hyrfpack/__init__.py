@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from hyrfpack.config.export import ConvertConfig as ConvertConfig
     from hyrfpack.config.export import ExportConfig as ExportConfig
     from hyrfpack.config.make import MakeConfig as MakeConfig
+    from hyrfpack.config.poses import PosesConfig as PosesConfig
     from hyrfpack.context import RunContext as RunContext
     from hyrfpack.data import load_scene as load_scene
     from hyrfpack.distill import DistillConfig as DistillConfig
@@ -130,6 +131,7 @@ _PUBLIC = {
     "make_scene": "hyrfpack.make",
     "HybridModel": "hyrfpack.model",
     "ModelConfig": "hyrfpack.model",
+    "PosesConfig": "hyrfpack.config.poses",
     "PosesReport": "hyrfpack.poses",
     "estimate_poses": "hyrfpack.poses",
     "Rendering": "hyrfpack.render",

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from hyrfpack.choices import MATCHING_METHODS
 from hyrfpack.cli.common import json_option, note, note_if_verbose, print_json
+from hyrfpack.cli.settings import settings_options
 from hyrfpack.cli.types import OUTPUT, PATH
-from hyrfpack.config.settings import LARGEST_SEED
+from hyrfpack.config.poses import PosesConfig
 
 if TYPE_CHECKING:
     from hyrfpack.poses import PosesReport
@@ -24,23 +24,12 @@ _MAX_NAMED_PHOTOS = 5
 @click.command(short_help="Estimate the camera poses of photos or a video.")
 @click.argument("photos", type=PATH)
 @click.option("-o", "--output", "out", type=OUTPUT, required=True, metavar="SCENE", help="Folder of the scene.")
-@click.option(
-    "--matching",
-    type=click.Choice(MATCHING_METHODS),
-    default="auto",
-    show_default=True,
-    help="Which pairs of photos are matched: all (exhaustive), neighbours in order (sequential), or photos that look "
-    "alike (retrieval). auto decides by the kind and number of photos.",
-)
+@settings_options(PosesConfig, "matching")
 @click.option("--masks", type=PATH, metavar="FOLDER", help="Masks, named like the photos; black pixels are ignored.")
-@click.option(
-    "--seed", type=click.IntRange(0, LARGEST_SEED), metavar="N", default=0, show_default=True, help="Random seed."
-)
+@settings_options(PosesConfig, "seed")
 @click.option("--overwrite", is_flag=True, help="Replace poses that an earlier run wrote to SCENE.")
 @json_option
-def poses(
-    photos: Path, out: Path, matching: str, masks: Path | None, seed: int, overwrite: bool, as_json: bool
-) -> None:
+def poses(photos: Path, out: Path, masks: Path | None, overwrite: bool, as_json: bool, **settings: Any) -> None:
     """Estimate the poses of PHOTOS, a folder of photos, its .zip, or a video, and write a scene for 'hyrfpack train'.
 
     SCENE gets images/ (copies of the photos), sparse/0 (a COLMAP model) and poses.json (a report). PHOTOS may be SCENE
@@ -55,7 +44,7 @@ def poses(
     from hyrfpack.poses import estimate_poses
 
     try:
-        result = estimate_poses(photos, out, matching=matching, masks=masks, seed=seed, overwrite=overwrite)
+        result = estimate_poses(photos, out, PosesConfig(**settings), masks=masks, overwrite=overwrite)
     except KeyboardInterrupt:
         note("stopped; the same command resumes from here")
         click.get_current_context().exit(1)

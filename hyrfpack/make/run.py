@@ -12,6 +12,7 @@ from typing import Any
 
 from hyrfpack.checks import check_type
 from hyrfpack.config.make import MakeConfig
+from hyrfpack.config.poses import PosesConfig
 from hyrfpack.context import RunContext
 from hyrfpack.data import PictureCache
 from hyrfpack.data.folder import first_readable_photo, list_photos
@@ -229,10 +230,8 @@ class _Pipeline:
         self.reporter.estimates |= estimates
         if source.archive is not None:
             _LOG.info(f"{source.archive.name} was unpacked into {source.path} and is reused from there")
-        config = request.config
-        return stages.run_pose_stage(
-            self.stage_cache, source.path, source.files(), config.matching, config.seed, self.context
-        )
+        config = PosesConfig(request.config.matching, request.config.seed)
+        return stages.run_pose_stage(self.stage_cache, source.path, source.files(), config, self.context)
 
     def _scene_digest(self, scene: Scene) -> str:
         """Return the digest of all files of a scene; for an archive, that of its unpacked files."""

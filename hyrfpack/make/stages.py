@@ -16,6 +16,7 @@ import torch
 from hyrfpack.atomic import pending_file
 from hyrfpack.compress import compress_model
 from hyrfpack.config.compress import CompressConfig
+from hyrfpack.config.poses import PosesConfig
 from hyrfpack.context import RunContext
 from hyrfpack.copying import copy_file
 from hyrfpack.device import describe_device
@@ -55,7 +56,7 @@ def is_posed(scene: Path) -> bool:
 
 
 def run_pose_stage(
-    stage_cache: StageCache, photos: Path, files: Sequence[Path], matching: str, seed: int, context: RunContext
+    stage_cache: StageCache, photos: Path, files: Sequence[Path], config: PosesConfig, context: RunContext
 ) -> dict[str, Any]:
     """Estimate poses into `scene/`; return the report of `hyrfpack.estimate_poses`."""
 
@@ -64,19 +65,13 @@ def run_pose_stage(
 
         scene = stage_cache.folder / SCENE_FOLDER
         if not (resuming and is_posed(scene)):
-            estimate_poses(
-                photos,
-                scene,
-                matching=matching,
-                seed=seed,
-                context=context,
-            )
+            estimate_poses(photos, scene, config, context=context)
         shutil.rmtree(scene / ".poses", ignore_errors=True)  # products in progress stay if a call is killed at its end
         files = sorted(path for path in scene.rglob("*") if path.is_file())
         report = json.loads((scene / POSES_REPORT_NAME).read_bytes())
         return report, [path.relative_to(stage_cache.folder).as_posix() for path in files]
 
-    inputs = {"photos": files_digest(files, photos), "matching": matching, "seed": seed}
+    inputs = {"photos": files_digest(files, photos), **asdict(config)}
     return stage_cache.run_stage("poses", inputs, execute)
 
 

@@ -10,8 +10,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from hyrfpack.checks import check_choice, check_int
-from hyrfpack.choices import MATCHING_METHODS
+from hyrfpack.checks import check_type
+from hyrfpack.config.poses import PosesConfig
 from hyrfpack.context import RunContext
 from hyrfpack.data.archive import archive_paths_in_errors, is_archive, unpack
 from hyrfpack.data.equirectangular import FACES
@@ -85,10 +85,9 @@ class PosesReport:
 def estimate_poses(
     photos: StrPath,
     out: StrPath,
+    config: PosesConfig | None = None,
     *,
-    matching: str = "auto",
     masks: StrPath | None = None,
-    seed: int = 0,
     overwrite: bool = False,
     context: RunContext = RunContext(),  # noqa: B008 - frozen
 ) -> PosesReport:
@@ -103,12 +102,9 @@ def estimate_poses(
         photos: a folder of photos (each sub-folder is a camera of its own), a .zip of one, or a video.
         out: folder of the scene. It gets images/ (copies of the photos, turned upright), sparse/0 and poses.json. A
             folder whose photos are in images/ may be both `photos` and `out`; its photos are not changed.
-        matching: "exhaustive" (all pairs), "sequential" (photos that follow each other, and loops), "retrieval"
-            (similar photos) or "auto". "auto" means exhaustive for up to 200 photos, sequential for videos and larger
-            numbered bursts, and retrieval for other large sets.
+        config: settings; None for the defaults.
         masks: folder of masks, named like the photos, black where a photo is ignored. None searches for masks/ in or
             beside the folder of photos.
-        seed: random seed.
         overwrite: replace poses and photos that an earlier call wrote into `out`. Files of other origin are never
             replaced.
         context: progress and stop.
@@ -119,7 +115,6 @@ def estimate_poses(
     Raises:
         HyrfDataError: there are too few photos, they do not overlap, or they show the scene from one place only.
         HyrfError: the folder cannot be written, already has poses, or is in use by another call; or pycolmap failed.
-        ValueError: `matching` or `seed` is out of range.
 
     Example:
         >>> import hyrfpack
@@ -127,10 +122,10 @@ def estimate_poses(
         >>> len(hyrfpack.load_scene("scenes/corner").views) == found.registered
         True
     """
-    check_choice("matching", matching, MATCHING_METHODS)
-    check_int("seed", seed, 0, 2**64 - 1)
+    config = PosesConfig() if config is None else config
+    check_type("config", config, PosesConfig)
     with explain_disk_errors(Path(out)), archive_paths_in_errors(), context.open_progress("poses") as progress:
-        return _PoseEstimation(Path(photos), Path(out), matching, masks, seed, overwrite, progress).run()
+        return _PoseEstimation(Path(photos), Path(out), config, masks, overwrite, progress).run()
 
 
 @dataclass
@@ -139,9 +134,8 @@ class _PoseEstimation:
 
     photos: Path
     out: Path
-    matching: str
+    config: PosesConfig
     masks: StrPath | None
-    seed: int
     overwrite: bool
     progress: Progress
     photo_count: int = 0
@@ -247,8 +241,8 @@ class _PoseEstimation:
             devices,
             device_of,
             {name: str(path.resolve()) for name, path in masks.items()},
-            choose_matching(len(photos), ordered) if self.matching == "auto" else self.matching,
-            self.seed,
+            choose_matching(len(photos), ordered) if self.config.matching == "auto" else self.config.matching,
+            self.config.seed,
         )
         job.save(self.output.work / "job.json")
         return job
@@ -285,7 +279,7 @@ class _PoseEstimation:
 
     def _claim_work_folder(self) -> None:
         """Create the folder of products in progress, or take over that of an interrupted call."""
-        self.has_products = self.output.claim_work_folder([self.matching, self.seed])
+        self.has_products = self.output.claim_work_folder([self.config.matching, self.config.seed])
         self.has_work_folder = True
         if self.has_products:
             _LOG.info("resuming an interrupted estimation")

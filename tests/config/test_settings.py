@@ -11,10 +11,11 @@ import pytest
 from hyrfpack.config.distill import DistillConfig
 from hyrfpack.config.export import ConvertConfig, ExportConfig
 from hyrfpack.config.make import MakeConfig
+from hyrfpack.config.poses import PosesConfig
 from hyrfpack.config.settings import OneOf, Range, check_settings, list_settings
 from hyrfpack.config.train import DensityConfig, TrainConfig
 
-CONFIG_CLASSES = (ConvertConfig, DensityConfig, DistillConfig, ExportConfig, MakeConfig, TrainConfig)
+CONFIG_CLASSES = (ConvertConfig, DensityConfig, DistillConfig, ExportConfig, MakeConfig, PosesConfig, TrainConfig)
 
 
 @dataclass(frozen=True)

@@ -133,7 +133,7 @@ def poses(posed, monkeypatch) -> list[Path]:
     """A list of the arguments of each call of `estimate_poses`, which gives the known poses instead of estimating."""
     calls: list[Path] = []
 
-    def estimate_poses(photos, out, *, matching="auto", masks=None, seed=0, overwrite=False, context):
+    def estimate_poses(photos, out, config=None, *, masks=None, overwrite=False, context):
         out = Path(out)
         calls.append(Path(photos))
         with context.open_progress() as progress:

@@ -54,9 +54,9 @@ def test_photos_are_copied_and_intermediate_files_are_removed(photos_and_poses, 
 
 
 def test_progress_runs_from_0_to_1(estimated_scene):
-    shares = [share for _, share in estimated_scene[2]]
+    shares = [event.share for event in estimated_scene[2]]
     assert shares[0] == 0 and shares == sorted(shares) and 0.9 < shares[-1] <= 1
-    assert any("matching pair" in doing for doing, _ in estimated_scene[2])
+    assert any("matching pair" in event.task for event in estimated_scene[2])
 
 
 def test_existing_poses_are_replaced_only_with_overwrite(photos_and_poses, estimated_scene, tmp_path):
@@ -83,5 +83,5 @@ def test_the_command_prints_its_result_and_the_next_command(estimated_scene, mon
 @pytest.mark.parametrize("wrong", [{"matching": "guess"}, {"seed": -1}])
 def test_a_wrong_setting_is_rejected_at_once(wrong, photos_and_poses, tmp_path):
     with pytest.raises(ValueError, match="matching is 'guess'|seed is -1"):
-        hyrfpack.estimate_poses(photos_and_poses[0], tmp_path / "scene", **wrong)
+        hyrfpack.estimate_poses(photos_and_poses[0], tmp_path / "scene", hyrfpack.PosesConfig(**wrong))
     assert not (tmp_path / "scene").exists()

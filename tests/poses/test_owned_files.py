@@ -85,8 +85,8 @@ def test_an_estimation_resumes_from_the_original_photos_beside_their_copies(tmp_
     caplog.clear()
     prepare_photos(scene, scene)
     assert caplog.messages[0] == "resuming an interrupted estimation"
-    prepare_photos(scene, scene, seed=1)
-    estimate_with_fake_stages(scene, scene, seed=1)
+    prepare_photos(scene, scene, config=hyrfpack.PosesConfig(seed=1))
+    estimate_with_fake_stages(scene, scene, config=hyrfpack.PosesConfig(seed=1))
     assert png_names(scene) == png_names(scene / "images") == ["0.png", "1.png", "2.png", "3.png"]
 
 

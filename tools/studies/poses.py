@@ -62,7 +62,7 @@ def measure(folder: Path, out: Path, seed: int) -> dict:
 
     shutil.rmtree = inspect_before_removal  # type: ignore[assignment]
     try:
-        report = hyrfpack.estimate_poses(folder / "images", out, seed=seed, overwrite=True)
+        report = hyrfpack.estimate_poses(folder / "images", out, hyrfpack.PosesConfig(seed=seed), overwrite=True)
     finally:
         shutil.rmtree = remove_tree
     estimated = read_poses(pycolmap.Reconstruction(out / "sparse" / "0"))
