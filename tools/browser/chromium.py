@@ -34,11 +34,13 @@ class Chromium(Browser):
 
     Args:
         flags: further command-line flags.
+        timeout_seconds: time limit for loading a page and for each answer of it.
     """
 
     name = "chromium"
 
-    def __init__(self, *flags: str) -> None:
+    def __init__(self, *flags: str, timeout_seconds: float = TIMEOUT_SECONDS) -> None:
+        self._timeout_seconds = timeout_seconds
         self._errors: list[str] = []
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
@@ -60,9 +62,9 @@ class Chromium(Browser):
         """Return the result of a call of Playwright.
 
         Raises:
-            TimeoutError: it takes longer than TIMEOUT_SECONDS.
+            TimeoutError: it takes longer than `timeout_seconds`.
         """
-        return asyncio.run_coroutine_threadsafe(call, self._loop).result(TIMEOUT_SECONDS)
+        return asyncio.run_coroutine_threadsafe(call, self._loop).result(self._timeout_seconds)
 
     def _collect_message(self, message: ConsoleMessage) -> None:
         # Warnings of the browser itself have no arguments, unlike those of scripts.
@@ -79,7 +81,7 @@ class Chromium(Browser):
     def open(self, address: str) -> None:
         self._wait(self._page.goto("about:blank"))  # a change of the fragment alone would not reload
         self._errors.clear()
-        self._wait(self._page.goto(address, timeout=1000 * TIMEOUT_SECONDS))
+        self._wait(self._page.goto(address, timeout=1000 * self._timeout_seconds))
 
     def evaluate(self, expression: str) -> Any:
         from playwright.async_api import Error

@@ -25,7 +25,7 @@ import numpy as np
 import hyrfpack
 from hyrfpack.cameras.files import camera_to_json
 from hyrfpack.scene import Camera, Scene, evenly_spaced
-from tools.browser import chromium
+from tools.browser.browser import Browser
 from tools.browser.chromium import Chromium
 from tools.tables import markdown_table
 
@@ -41,7 +41,7 @@ def psnr(first: np.ndarray, second: np.ndarray) -> float:
     return float(-10 * np.log10(max(np.mean((first - second) ** 2), 1e-12)))
 
 
-def draw_in_page(browser: Chromium, camera: Camera) -> np.ndarray:
+def draw_in_page(browser: Browser, camera: Camera) -> np.ndarray:
     """Draw the view of a camera in the page; return (H, W, 3) in [0, 1]."""
     browser.evaluate(f"hyrfpack.show({json.dumps(camera_to_json(camera))})")
     data = base64.b64decode(browser.evaluate(READ_PIXELS_SCRIPT))
@@ -56,7 +56,7 @@ def write_pages(model: Path, folder: Path, data: Scene | None = None) -> dict[st
     return paths
 
 
-def open_page(browser: Chromium, page: Path) -> None:
+def open_page(browser: Browser, page: Path) -> None:
     """Open a page and wait until it is ready."""
     browser.open(page.as_uri())
     browser.evaluate("hyrfpack.ready")
@@ -75,7 +75,7 @@ def measure_pictures(run: Path, data: Path, folder: Path) -> list[str]:
     cells = [run.name, f"{model.stat().st_size:,}"]
     pictures_by_source = {"hyrfpack": model_pictures}
     page_paths = write_pages(model, folder, scene)
-    with Chromium() as browser:
+    with Chromium(timeout_seconds=PAGE_TIMEOUT_SECONDS) as browser:
         for name, page in page_paths.items():
             open_page(browser, page)
             pictures_by_source[name] = [draw_in_page(browser, view.camera) for view in views]
@@ -94,7 +94,7 @@ def measure_pictures(run: Path, data: Path, folder: Path) -> list[str]:
     return cells
 
 
-def measure_frame_ms(browser: Chromium) -> float:
+def measure_frame_ms(browser: Browser) -> float:
     """Return the milliseconds per frame at full resolution while a mouse orbits."""
     browser.evaluate("document.getElementById('automatic').checked && document.getElementById('automatic').click()")
     x, y = WINDOW_SIZE[0] / 2, WINDOW_SIZE[1] / 2
@@ -115,7 +115,7 @@ def measure_times(model: Path, folder: Path, repeats: int) -> list[list[str]]:
     samples: dict[str, list[tuple[float, float, float]]] = {name: [] for name in page_paths}
     for _ in range(repeats):
         for name, page in page_paths.items():
-            with Chromium() as browser:
+            with Chromium(timeout_seconds=PAGE_TIMEOUT_SECONDS) as browser:
                 browser.resize(*WINDOW_SIZE)
                 open_page(browser, page)
                 browser.evaluate("hyrfpack.player.settled")
@@ -139,7 +139,6 @@ def main() -> None:
     parser.add_argument("--large", type=Path, nargs="*", default=[], help="models to time")
     parser.add_argument("--repeats", type=int, default=3, help="number of repeats of each time (3)")
     arguments = parser.parse_args()
-    chromium.TIMEOUT_SECONDS = PAGE_TIMEOUT_SECONDS
     with tempfile.TemporaryDirectory() as folder:
         if arguments.runs:
             runs = [arguments.runs / name for name in arguments.sets or []] or sorted(
