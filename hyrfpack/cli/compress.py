@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import shlex
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -215,8 +214,7 @@ def _score_both_files(before: Path, after: Path, scene: Scene | None, progress: 
 
 
 def _print_file(report: FileReport, shares: dict[str, float] | None = None) -> None:
-    sections = [asdict(part) for part in report.sections]
-    click.echo(format_section_table(sections, report.bytes_after, report.gaussians, shares))
+    click.echo(format_section_table(report.sections, report.bytes_after, report.gaussians, shares))
     ratio = report.bytes_before / report.bytes_after
     outcome = "all numbers as float32" if report.profile == "raw" else f"{ratio:.2f} times smaller than float32"
     click.echo(f"{report.file}: {report.bytes_after:,} bytes, {report.gaussians:,} Gaussians, {outcome}")

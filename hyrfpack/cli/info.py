@@ -12,6 +12,7 @@ from hyrfpack.cli.console import print_line
 from hyrfpack.cli.section_table import format_section_table
 from hyrfpack.cli.types import PATH
 from hyrfpack.cli.wording import use_option_names
+from hyrfpack.format.info import SectionSize
 from hyrfpack.outputs import ARCHIVE_SUFFIXES, PICTURE_SUFFIXES, VIDEO_SUFFIXES
 
 
@@ -125,7 +126,9 @@ def _print_model_facts(file: Path, facts: dict) -> None:
     config, provenance = facts["config"], facts["provenance"]
     click.echo(f"{file}: {facts['bytes']:,} bytes, {facts['gaussians']:,} Gaussians")
     print_line(f"written by {facts['writer']}, format {facts['version']}, profile {facts['profile']}")
-    click.echo("\n" + format_section_table(facts["sections"], facts["bytes"], facts["gaussians"]))
+    names = ("type", "holds", "before", "after")
+    sections = [SectionSize(*(part[name] for name in names)) for part in facts["sections"]]
+    click.echo("\n" + format_section_table(sections, facts["bytes"], facts["gaussians"]))
     click.echo("\nmodel")
     frame = config["frame"]
     center = ", ".join(f"{value:.4g}" for value in frame["center"])

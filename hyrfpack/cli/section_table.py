@@ -2,39 +2,40 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from hyrfpack.cli.common import format_table
+from hyrfpack.format.info import SectionSize, sum_layers
 
 
 def format_section_table(
-    sections: list[dict], total: int, gaussians: int, shares: dict[str, float] | None = None
+    sections: Iterable[SectionSize], total: int, gaussians: int, shares: dict[str, float] | None = None
 ) -> str:
-    """Format a table of the bytes of each section, summed over its layers, and of its share of the loss if known."""
-    from hyrfpack.format.sections import NON_PARAMETER_SECTIONS, SECTION_CONTENTS, group_and_layer
+    """Format a table of the bytes of each section, summed over its layers, and of its share of the loss if known.
 
-    together: dict[str, list] = {}
-    for part in sections:
-        tag = group_and_layer(part["type"])[0]
-        sizes = together.setdefault(tag, [SECTION_CONTENTS.get(tag, part["holds"]), 0, 0])
-        sizes[1] += part["before"]
-        sizes[2] += part["after"]
-    parts = [(tag, holds, f"{before:,}", after) for tag, (holds, before, after) in together.items()]
-    parts.append(("", "header, table of contents, padding", "", total - sum(after for *_, after in parts)))
-    rows, header = [], ["section", "unpacked bytes", "stored bytes", "share", "bits/Gaussian", "bits/number"]
-    for tag, holds, before, after in parts:
-        numbers = int(before.replace(",", "") or 0) / 4 if tag not in (*NON_PARAMETER_SECTIONS, "") else 0
-        rows.append(
-            [
-                f"{tag} {holds}".strip(),
-                before,
-                f"{after:,}",
-                f"{after / total:.1%}",
-                f"{8 * after / max(gaussians, 1):.2f}",
-                f"{8 * after / numbers:.2f}" if numbers else "",
-            ]
-        )
-        if shares:
-            rows[-1].append(f"{shares[tag]:.1%}" if tag in shares else "")
+    Args:
+        sections: sizes of all sections of a file.
+        total: bytes of the file.
+        gaussians: number of its Gaussians.
+        shares: shares of the loss by section, as in `hyrfpack.CompressionReport`.
+    """
+    parts = sum_layers(sections)
+    rest = SectionSize("", "header, table of contents, padding", 0, total - sum(part.after for part in parts))
+    header = ["section", "unpacked bytes", "stored bytes", "share", "bits/Gaussian", "bits/number"]
+    rows = []
+    for part in (*parts, rest):
+        row = [
+            f"{part.type} {part.holds}".strip(),
+            f"{part.before:,}" if part.type else "",
+            f"{part.after:,}",
+            f"{part.after / total:.1%}",
+            f"{8 * part.after / max(gaussians, 1):.2f}",
+            f"{8 * part.after / part.parameters:.2f}" if part.parameters else "",
+        ]
+        rows.append([*row, f"{shares[part.type]:.1%}" if part.type in shares else ""] if shares else row)
     if shares:
-        left_out = sum(share for part, share in shares.items() if part not in together)
+        header.append("of the loss")
+        stored = {part.type for part in parts}
+        left_out = sum(share for part, share in shares.items() if part not in stored)
         rows.append(["Gaussians left out", "", "", "", "", "", f"{left_out:.1%}"])
-    return format_table([*header, *(["of the loss"] if shares else [])], rows)
+    return format_table(header, rows)

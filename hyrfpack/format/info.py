@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, replace
 
 from hyrfpack.errors import HyrfFormatError
 from hyrfpack.format.container import Container
 from hyrfpack.format.exposure_header import read_exposure_header
 from hyrfpack.format.metadata import read_metadata
-from hyrfpack.format.sections import EXPOSURE, SECTION_CONTENTS
+from hyrfpack.format.sections import EXPOSURE, NON_PARAMETER_SECTIONS, SECTION_CONTENTS, group_and_layer
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,11 @@ class SectionSize:
     holds: str
     before: int
     after: int
+
+    @property
+    def parameters(self) -> int:
+        """Return the number of the model's parameters in the section; 0 for metadata and exposure map."""
+        return 0 if self.type in NON_PARAMETER_SECTIONS else self.before // 4
 
 
 @dataclass(frozen=True)
@@ -60,6 +66,16 @@ def section_sizes(container: Container) -> list[SectionSize]:
         SectionSize(tag, SECTION_CONTENTS.get(tag, "unknown"), entry.raw_length, entry.length)
         for tag, entry in container.entries.items()
     ]
+
+
+def sum_layers(sections: Iterable[SectionSize]) -> list[SectionSize]:
+    """Return the sizes with the layers of each section added up, in the order of the first layers."""
+    groups: dict[str, SectionSize] = {}
+    for part in sections:
+        tag = group_and_layer(part.type)[0]
+        group = groups.get(tag, SectionSize(tag, SECTION_CONTENTS.get(tag, part.holds), 0, 0))
+        groups[tag] = replace(group, before=group.before + part.before, after=group.after + part.after)
+    return list(groups.values())
 
 
 def describe_file(path: str | os.PathLike[str], fraction: float | None = None) -> dict:

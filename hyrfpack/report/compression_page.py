@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hyrfpack.compress import CompressionReport
+from hyrfpack.compress.sensitivity import PRUNED
 from hyrfpack.evaluate import Evaluation
 from hyrfpack.evaluate.metrics import IDENTICAL_PSNR
-from hyrfpack.format.sections import NON_PARAMETER_SECTIONS, group_and_layer
+from hyrfpack.format.info import sum_layers
 from hyrfpack.report.page import encode_page, escape, paragraph, section, table, table_row
 
 MAX_SHOWN_VIEWS = 4
@@ -194,23 +195,16 @@ def _summarize(source: Path, packed: Path, report: CompressionReport, findings: 
 
 def _section_sizes(report: CompressionReport) -> list[str]:
     """Return a table of the bytes of each section, summed over layers, and a note on it."""
-    sizes: dict[str, list[int]] = {}
-    names = {part.type: part.holds for part in report.sections}
-    for part in report.sections:
-        size = sizes.setdefault(group_and_layer(part.type)[0], [0, 0])
-        size[0] += part.before
-        size[1] += part.after
+    sections, total = sum_layers(report.sections), report.bytes_after
     header = ["part", "bytes before", "bytes after", "share of the file", "bits per number"]
-    rows, total = [], report.bytes_after
-    for tag, (before, after) in sizes.items():
-        numbers = 0 if tag in NON_PARAMETER_SECTIONS else before // 4
-        bits = f"{8 * after / numbers:.2f}" if numbers else ""
-        loss = f"{report.shares[tag]:.1%}" if tag in report.shares else ""
-        rows.append([names.get(tag, tag), f"{before:,}", f"{after:,}", f"{after / total:.1%}", bits, loss])
+    rows = []
+    for part in sections:
+        bits = f"{8 * part.after / part.parameters:.2f}" if part.parameters else ""
+        loss = f"{report.shares[part.type]:.1%}" if part.type in report.shares else ""
+        rows.append([part.holds, f"{part.before:,}", f"{part.after:,}", f"{part.after / total:.1%}", bits, loss])
     if report.shares:
-        left_out = sum(share for part, share in report.shares.items() if part not in sizes)
-        rows.append(["Gaussians left out", "", "0", "0.0%", "", f"{left_out:.1%}"])
-    rest = total - sum(after for _, after in sizes.values())
+        rows.append(["Gaussians left out", "", "0", "0.0%", "", f"{report.shares.get(PRUNED, 0):.1%}"])
+    rest = total - sum(part.after for part in sections)
     rows.append(["header, table of contents, padding", "", f"{rest:,}", f"{rest / total:.1%}", "", ""])
     rows.append(["the whole file", f"{report.bytes_before:,}", f"{total:,}", "100.0%", "", ""])
     note = (

@@ -16,11 +16,13 @@ from scenes import small_model
 
 from hyrfpack.compress import plan
 from hyrfpack.errors import HyrfFormatError
-from hyrfpack.format import decode_model, describe_file, load_model
+from hyrfpack.format import SectionSize, decode_model, describe_file, load_model
 from hyrfpack.format.arrays import MODEL_RULES, to_arrays
 from hyrfpack.format.codec import repack
 from hyrfpack.format.container import MINOR_VERSION, Container, Section, read_container, write_container
+from hyrfpack.format.info import sum_layers
 from hyrfpack.format.metadata import Metadata, read_metadata
+from hyrfpack.format.sections import POSITIONS, layer_section
 from hyrfpack.model import HybridModel
 from tools.safety.synthetic_encoding import encode
 
@@ -493,3 +495,17 @@ def test_damaged_layers_with_valid_checksums_are_decoded_or_refused(data):
     except HyrfFormatError:
         return
     assert len(model) in np.cumsum(LAYER_COUNTS)
+
+
+def test_layers_of_a_section_are_summed():
+    sections = [
+        SectionSize("META", "metadata", 10, 5),
+        SectionSize("POSI", "positions", 120, 30),
+        SectionSize("ZZZZ", "unknown", 8, 8),
+        SectionSize(layer_section(POSITIONS, 1), "positions", 240, 50),
+    ]
+
+    summed = sum_layers(sections)
+
+    assert summed == [sections[0], SectionSize("POSI", "positions", 360, 80), sections[2]]
+    assert [part.parameters for part in summed[:2]] == [0, 90]
