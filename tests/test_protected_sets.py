@@ -9,10 +9,12 @@ from photo_sets import READ_PATHS_BY_SET, write_photo_sets
 
 from hyrfpack.data import load_scene
 from hyrfpack.errors import HyrfError
+from hyrfpack.export.folder import check_folder
 from hyrfpack.export.kinds import ENDINGS, check_place
 from hyrfpack.make.source import LoadSettings, Source
 from hyrfpack.outputs import Outputs
 from hyrfpack.poses import estimate_poses
+from hyrfpack.scene import Scene
 
 pytestmark = pytest.mark.unit
 PATHS = [(name, name + part) for name, parts in READ_PATHS_BY_SET.items() for part in parts]
@@ -91,6 +93,21 @@ def test_a_set_that_is_not_read_is_written_to_only_with_overwrite(name):
         Outputs("model.hyrf").file(f"{name}/new.hyrf")
     Outputs("model.hyrf", overwrite=True).folder(name, ["new.png"])
     Outputs("model.hyrf", overwrite=True).file(f"{name}/new.hyrf")
+
+
+@pytest.mark.parametrize("is_gallery", [False, True])
+@pytest.mark.parametrize(("name", "folder"), FOLDERS)
+def test_a_player_is_not_written_among_photos_and_poses(name, folder, is_gallery):
+    def check(scene: Scene | None, overwrite: bool) -> None:
+        check_folder(folder, [], [scene], overwrite=overwrite, is_gallery=is_gallery)
+
+    for overwrite in (False, True):
+        with pytest.raises(HyrfError, match="reads what lies in this folder"):
+            check(load_scene(name), overwrite)
+    if folder == name:  # of a set that is not read, each folder with photos or poses
+        with pytest.raises(HyrfError, match="photos or poses lie in this folder"):
+            check(None, overwrite=False)
+    check(None, overwrite=True)
 
 
 @pytest.mark.parametrize("overwrite", [False, True])

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import pytest
 
+from hyrfpack.config.compress import CompressConfig
 from hyrfpack.config.distill import DistillConfig
 from hyrfpack.config.export import ConvertConfig, ExportConfig
 from hyrfpack.config.make import MakeConfig
@@ -15,7 +16,16 @@ from hyrfpack.config.poses import PosesConfig
 from hyrfpack.config.settings import OneOf, Range, check_settings, list_settings
 from hyrfpack.config.train import DensityConfig, TrainConfig
 
-CONFIG_CLASSES = (ConvertConfig, DensityConfig, DistillConfig, ExportConfig, MakeConfig, PosesConfig, TrainConfig)
+CONFIG_CLASSES = (
+    CompressConfig,
+    ConvertConfig,
+    DensityConfig,
+    DistillConfig,
+    ExportConfig,
+    MakeConfig,
+    PosesConfig,
+    TrainConfig,
+)
 
 
 @dataclass(frozen=True)
