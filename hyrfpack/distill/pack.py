@@ -69,7 +69,7 @@ def pack(
     )
     provenance = {**provenance, "viewpoint": Viewpoint.from_cameras(distilled.train).to_json()}
     encoding_report = report_to(part_of_progress(progress, 0.7, 0.85))
-    packer = Packer(model, provenance, sensitivity, scene=None, finetune_steps=0, prune=True, report=encoding_report)
+    packer = Packer(model, provenance, sensitivity, report=encoding_report)
     candidate = packer.encode_to_distortion(distortion, references)
     for number in range(MAX_TRIALS):
         trial_progress = round_of_progress(part_of_progress(progress, 0.85, 1.0), number)

@@ -54,7 +54,7 @@ def compact_file_and_report(scene, tmp_path_factory) -> tuple[Path, object]:
 def demo_packer(scene, compact_file_and_report) -> running.Packer:
     """Return a packer of the golden model with the sensitivities that were measured for the compact file."""
     sensitivity = compact_file_and_report[1].sensitivity
-    return running.Packer(load_model(DEMO_MODEL_FILE), {}, sensitivity, scene, 0, True)
+    return running.Packer(load_model(DEMO_MODEL_FILE), {}, sensitivity, scene)
 
 
 @pytest.fixture(scope="module")
@@ -227,7 +227,7 @@ def test_the_distortion_is_adjusted_until_the_measured_error_matches(
 ):
     """The fake packer's candidates are distortions, whose measured error is `picture_error`."""
     tried: list[float] = []
-    packer = running.Packer(None, {}, None, None, 0, True)
+    packer = running.Packer(None, {}, None)
     monkeypatch.setattr(
         packer,
         "encode",
@@ -256,7 +256,7 @@ def test_the_distortion_is_lowered_until_the_drop_on_training_photos_is_met(
     """The fake packer's candidates lower the PSNR on training photos from 30 dB by `psnr_drop`."""
     tried: list[float] = []
     scene = SimpleNamespace(train=["a photo"])
-    packer = running.Packer(None, {}, None, scene, 0, True)
+    packer = running.Packer(None, {}, None, scene)
     monkeypatch.setattr(
         packer, "encode", lambda distortion, *_: tried.append(distortion) or running.EncodedCandidate(distortion, {})
     )
@@ -274,7 +274,7 @@ def test_the_distortion_is_lowered_until_the_drop_on_training_photos_is_met(
 
 
 def test_unreadable_photos_do_not_stop_packing(monkeypatch, caplog):
-    packer = running.Packer(None, {}, None, SimpleNamespace(train=["a photo"]), 0, True)
+    packer = running.Packer(None, {}, None, SimpleNamespace(train=["a photo"]))
     monkeypatch.setattr(packer, "encode", lambda distortion, *_: running.EncodedCandidate(distortion, {}))
     monkeypatch.setattr(running.Packer, "decode", lambda packer, trial: trial.data)
 

@@ -114,7 +114,7 @@ class TrainedSet:
         """Compress the model in profile compact as `hyrfpack compress` does, and measure the file."""
         start = time.perf_counter()
         sensitivity = calibrate(self.model, self.sensitivity, self.reference_renders, distortion)
-        packer = Packer(self.model, self.provenance, sensitivity, self.scene, steps, True)
+        packer = Packer(self.model, self.provenance, sensitivity, self.scene, steps)
         candidate = (
             packer.encode(distortion) if steps else packer.encode_to_distortion(distortion, self.reference_renders)
         )
