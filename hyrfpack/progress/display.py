@@ -22,9 +22,10 @@ def open_display(progress: Progress | Literal["auto"] | None = "auto", title: st
         title: name of the work, which begins the lines of its tasks.
 
     Example:
-        >>> with open_display(lambda event: print(event)) as progress:
-        ...     progress(TaskEvent("writing"))
-        writing
+        >>> from hyrfpack.progress import TaskEvent
+        >>> with open_display(print) as progress:
+        ...     progress(TaskEvent("scoring held-out photos", done=3, total=20))
+        scoring held-out photos 3/20
     """
     if progress == "auto":
         with _choose_display(Status(title)) as display:

@@ -86,8 +86,6 @@ def part_of_progress(progress: Progress, start: float, end: float) -> Progress:
     It maps the shares 0 to 1 of tasks to `start` to `end` of the whole.
 
     Example:
-        >>> part_of_progress(print, 0.5, 1.0)(TaskEvent("measuring", 0.5))
-        measuring
         >>> part_of_progress(lambda event: print(event.share), 0.5, 1.0)(TaskEvent("measuring", 0.5))
         0.75
     """
