@@ -205,11 +205,10 @@ def _score_both_files(before: Path, after: Path, scene: Scene | None, progress: 
         return {}
     from hyrfpack.evaluate import evaluate_model
     from hyrfpack.format import load_model
-    from hyrfpack.progress import report_part, report_to
+    from hyrfpack.progress import part_of_progress
 
-    report = report_to(progress)
-    old = evaluate_model(load_model(before), scene.test, report=report_part(report, 0.0, 0.5))
-    new = evaluate_model(load_model(after), scene.test, report=report_part(report, 0.5, 1.0))
+    old = evaluate_model(load_model(before), scene.test, progress=part_of_progress(progress, 0.0, 0.5))
+    new = evaluate_model(load_model(after), scene.test, progress=part_of_progress(progress, 0.5, 1.0))
     return {"psnr_before": old.psnr, "psnr": new.psnr, "ssim_before": old.ssim, "ssim": new.ssim}
 
 

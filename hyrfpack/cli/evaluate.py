@@ -82,7 +82,7 @@ def evaluate(
             settings=drawing.settings,
             pictures=pictures,
             overwrite=overwrite,
-            report=progress,
+            progress=progress,
             ranks=ranks,
         )
     if not ranks.is_main:

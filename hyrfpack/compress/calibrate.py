@@ -21,7 +21,7 @@ from hyrfpack.compress.plan import distortion_per_number, indices_to_keep
 from hyrfpack.compress.reference_renders import ReferenceRenders
 from hyrfpack.compress.sensitivity import Sensitivity, measure_sensitivity
 from hyrfpack.model import HybridModel
-from hyrfpack.progress import Report, no_report, report_part, report_round
+from hyrfpack.progress import Progress, TaskEvent, ignore_progress, part_of_progress, round_of_progress
 from hyrfpack.scene import Camera
 
 MAX_CORRECTION_ROUNDS = 5
@@ -34,22 +34,24 @@ def measure_calibrated_sensitivity(
     cameras: Sequence[Camera],
     distortion: float,
     prune: bool = True,
-    report: Report = no_report,
+    progress: Progress = ignore_progress,
 ) -> tuple[Sensitivity, ReferenceRenders]:
     """Measure a model's sensitivities, calibrate them for a distortion, and return them with the reference renders.
 
     Args:
         cameras: viewpoints typical of how the model will be viewed; world units.
         distortion, prune: as `make_plan` takes them.
-        report: called with the name of the current task and the completed share of the work, 0 to 1.
+        progress: called with `TaskEvent`s.
 
     Raises:
         HyrfError: a number of the model is NaN or infinite.
     """
-    sensitivity = measure_sensitivity(model, cameras, report=report_part(report, 0.0, 0.5))
-    report("rendering reference views", 0.5)
+    sensitivity = measure_sensitivity(model, cameras, progress=part_of_progress(progress, 0.0, 0.5))
+    progress(TaskEvent("rendering reference views", 0.5))
     references = ReferenceRenders.from_model(model, cameras)
-    return calibrate(model, sensitivity, references, distortion, prune, report_part(report, 0.55, 1.0)), references
+    return calibrate(
+        model, sensitivity, references, distortion, prune, part_of_progress(progress, 0.55, 1.0)
+    ), references
 
 
 def calibrate(
@@ -58,7 +60,7 @@ def calibrate(
     references: ReferenceRenders,
     distortion: float,
     prune: bool = True,
-    report: Report = no_report,
+    progress: Progress = ignore_progress,
 ) -> Sensitivity:
     """Scale sensitivities so that they predict the error measured on renders, for plans of about this distortion.
 
@@ -66,7 +68,7 @@ def calibrate(
         sensitivity: first-order sensitivities from `measure_sensitivity`.
         references: renders of the model.
         distortion, prune: as `make_plan` takes them.
-        report: called with the name of the current task and the completed share of the work, 0 to 1.
+        progress: called with `TaskEvent`s.
 
     Raises:
         HyrfError: a parameter is NaN or infinite.
@@ -75,20 +77,22 @@ def calibrate(
     # Pruning is calibrated first, because the errors of the other parts depend on which Gaussians are left.
     if prune:
         pruning = PruningErrors(model, decoded, references, distortion)
-        sensitivity = _match_measurements(sensitivity, pruning, distortion, report_part(report, 0.0, 0.2))
+        sensitivity = _match_measurements(sensitivity, pruning, distortion, part_of_progress(progress, 0.0, 0.2))
     kept = indices_to_keep(sensitivity, distortion_per_number(model, distortion), prune)
     pruned, decoded = subset_decoded(model, decoded, kept)
     references = ReferenceRenders.from_views(references.views, pruned, decoded)
     quantization = QuantizationErrors(model, pruned, decoded, references, distortion, prune)
-    return _match_measurements(sensitivity, quantization, distortion, report_part(report, 0.2, 1.0))
+    return _match_measurements(sensitivity, quantization, distortion, part_of_progress(progress, 0.2, 1.0))
 
 
-def _match_measurements(sensitivity: Sensitivity, errors: PartErrors, distortion: float, report: Report) -> Sensitivity:
+def _match_measurements(
+    sensitivity: Sensitivity, errors: PartErrors, distortion: float, progress: Progress
+) -> Sensitivity:
     """Multiply the sensitivities of each part by a factor, so that its predicted error matches the measured one."""
     correction = SensitivityCorrection(sensitivity, errors.parts)
     for number in range(MAX_CORRECTION_ROUNDS):
         if not correction.remaining:
             break
-        measured = errors.measure(correction.candidate(), correction.remaining, report_round(report, number))
+        measured = errors.measure(correction.candidate(), correction.remaining, round_of_progress(progress, number))
         correction.update(measured, min_error=MIN_CORRECTED_ERROR_RATIO * distortion)
     return correction.result()

@@ -25,7 +25,7 @@ from hyrfpack.evaluate import evaluate_model
 from hyrfpack.format.codec import decode_model, encode_model
 from hyrfpack.model import HybridModel
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
-from hyrfpack.progress import Report, no_report, report_part, report_round
+from hyrfpack.progress import Progress, TaskEvent, ignore_progress, part_of_progress, round_of_progress
 from hyrfpack.scene import Scene, evenly_spaced
 
 _LOG = logging.getLogger(__name__)
@@ -73,7 +73,7 @@ class Packer:
         scene: photos to fine-tune on and to measure losses on; None if there are none.
         finetune_steps: steps of fine-tuning for each file; 0 for none.
         prune: leave out Gaussians whose removal saves more rate than it costs in distortion.
-        report: called with the name of the current task and the completed share of encoding all files, 0 to 1.
+        progress: called with `TaskEvent`s.
         cache: cache of decoded photos.
         ranks: processes that fine-tune together.
     """
@@ -84,13 +84,13 @@ class Packer:
     scene: Scene | None = None
     finetune_steps: int = 0
     prune: bool = True
-    report: Report = no_report
+    progress: Progress = ignore_progress
     cache: PictureCache = field(default_factory=PictureCache)
     ranks: Ranks = SINGLE_PROCESS
 
-    def encode(self, distortion: float, report: Report = no_report) -> EncodedCandidate:
+    def encode(self, distortion: float, progress: Progress = ignore_progress) -> EncodedCandidate:
         """Encode a file that adds an estimated `distortion` to the mean squared error of pictures."""
-        report("planning quantisation", 0.0)
+        progress(TaskEvent("planning quantisation", 0.0))
         model, steps = self.model, self.finetune_steps
         plan = make_plan(model, self.sensitivity, distortion, self.prune)
         if steps:
@@ -99,16 +99,16 @@ class Packer:
 
             own_steps = -(-steps // self.ranks.size)
 
-            def report_step(step: int, loss: float) -> None:
-                report(f"fine-tuning, step {step}/{own_steps}", 0.9 * step / own_steps)
+            def follow_step(step: int, loss: float) -> None:
+                progress(TaskEvent(f"fine-tuning, step {step}/{own_steps}", 0.9 * step / own_steps))
 
-            fit = partial(finetune, gains=self._gains, cache=self.cache, report=report_step, ranks=self.ranks)
+            fit = partial(finetune, gains=self._gains, cache=self.cache, report=follow_step, ranks=self.ranks)
             planned, plan = fit(model, plan, self.sensitivity, self.scene.train, steps)
         else:
             planned = plan.apply(model)
-        report("quantising", 0.9 if steps else 0.1)
+        progress(TaskEvent("quantising", 0.9 if steps else 0.1))
         quantized = quantize(planned, plan, self.sensitivity, reach=0 if steps else 1)
-        report("entropy coding", 0.95 if steps else 0.6)
+        progress(TaskEvent("entropy coding", 0.95 if steps else 0.6))
         data = encode_model(planned, "compact", self.provenance, quantized=quantized)
         return EncodedCandidate(data, predict_errors(self.model, planned, quantized, self.sensitivity))
 
@@ -123,14 +123,16 @@ class Packer:
         PSNR_DROP_TOLERANCE_RATIO times `target_drop` (dB) is encoded again with a smaller distortion.
         """
         if self.scene is None or target_drop is None:
-            return self._encode_to_distortion(target, references, self.report)[0]
-        candidate, distortion = self._encode_to_distortion(target, references, report_part(self.report, 0.0, 0.3))
+            return self._encode_to_distortion(target, references, self.progress)[0]
+        candidate, distortion = self._encode_to_distortion(
+            target, references, part_of_progress(self.progress, 0.0, 0.3)
+        )
         views = evenly_spaced(self.scene.train, PSNR_DROP_VIEWS)
         try:
-            before = evaluate_model(self.model, views, report=report_part(self.report, 0.3, 0.6)).psnr
+            before = evaluate_model(self.model, views, progress=part_of_progress(self.progress, 0.3, 0.6)).psnr
             for number in range(MAX_CORRECTIONS):
-                report = report_round(report_part(self.report, 0.6, 1.0), number)
-                psnr_drop = before - evaluate_model(self.decode(candidate), views, report=report).psnr
+                progress = round_of_progress(part_of_progress(self.progress, 0.6, 1.0), number)
+                psnr_drop = before - evaluate_model(self.decode(candidate), views, progress=progress).psnr
                 if psnr_drop <= PSNR_DROP_TOLERANCE_RATIO * target_drop:
                     break
                 distortion *= max(target_drop / psnr_drop, 1 / MAX_REFINING_RATIO)
@@ -147,7 +149,7 @@ class Packer:
         return candidate
 
     def _encode_to_distortion(
-        self, target: float, references: ReferenceRenders, report: Report
+        self, target: float, references: ReferenceRenders, progress: Progress
     ) -> tuple[EncodedCandidate, float]:
         """Encode a file whose measured error is about `target`; return it and the distortion it was planned for.
 
@@ -155,9 +157,9 @@ class Packer:
         """
 
         def encode_candidate(distortion: float, number: int) -> EncodedCandidate:
-            candidate_report = report_round(report, number)
-            candidate = self.encode(distortion, report_part(candidate_report, 0.0, 0.5))
-            candidate_report("comparing renders of the file with those of the model", 0.5)
+            candidate_progress = round_of_progress(progress, number)
+            candidate = self.encode(distortion, part_of_progress(candidate_progress, 0.0, 0.5))
+            candidate_progress(TaskEvent("comparing renders of the file with those of the model", 0.5))
             return dataclasses.replace(candidate, measured_error=references.measure_error(self.decode(candidate)))
 
         candidate, distortion = encode_candidate(target, 0), target
@@ -193,7 +195,7 @@ class Packer:
         rounds = count()
 
         def encode_candidate(distortion: float) -> EncodedCandidate:
-            candidate = self.encode(distortion, report_round(self.report, next(rounds)))
+            candidate = self.encode(distortion, round_of_progress(self.progress, next(rounds)))
             _LOG.info(f"distortion {distortion:.2g}: {len(candidate.data):,} bytes")
             return candidate
 
@@ -221,14 +223,14 @@ class Packer:
         """
         assert self.scene is not None
         views = self.scene.test or self.scene.train
-        self.report("scoring the model", 0.0)
+        self.progress(TaskEvent("scoring the model", 0.0))
         before = evaluate_model(self.model, views).psnr
         rounds = count()
 
         def encode_candidate(distortion: float) -> EncodedCandidate:
-            report = report_round(self.report, next(rounds))
-            candidate = self.encode(distortion, report_part(report, 0.0, 0.7))
-            report("scoring the file", 0.7)
+            progress = round_of_progress(self.progress, next(rounds))
+            candidate = self.encode(distortion, part_of_progress(progress, 0.0, 0.7))
+            progress(TaskEvent("scoring the file", 0.7))
             psnr_drop = before - evaluate_model(self.decode(candidate), views).psnr
             candidate = dataclasses.replace(candidate, psnr_drop=psnr_drop)
             _LOG.info(f"distortion {distortion:.2g}: {len(candidate.data):,} bytes, {psnr_drop:+.3f} dB lost")

@@ -29,7 +29,7 @@ from hyrfpack.format.sections import (
     TABLE_SECTIONS,
 )
 from hyrfpack.model import Decoded, HybridModel
-from hyrfpack.progress import Report
+from hyrfpack.progress import Progress, TaskEvent
 
 # The sections that are quantised and compared together. A decoder has so few numbers that its error depends on chance,
 # so it is calibrated together with its table.
@@ -59,13 +59,13 @@ class PartErrors(Protocol):
 
     parts: ClassVar[tuple[Part, ...]]
 
-    def measure(self, sensitivity: Sensitivity, parts: list[Part], report: Report) -> dict[Part, ErrorMeasurement]:
+    def measure(self, sensitivity: Sensitivity, parts: list[Part], progress: Progress) -> dict[Part, ErrorMeasurement]:
         """Compress each of `parts` alone, as `sensitivity` asks for, and return its errors.
 
         Args:
             sensitivity: sensitivities of all Gaussians of the model.
             parts: some of the parts of this object.
-            report: called with the name of the current task and the completed share of these measurements, 0 to 1.
+            progress: called with `TaskEvent`s.
         """
         ...
 
@@ -87,9 +87,9 @@ class PruningErrors:
     references: ReferenceRenders
     distortion: float
 
-    def measure(self, sensitivity: Sensitivity, parts: list[Part], report: Report) -> dict[Part, ErrorMeasurement]:
+    def measure(self, sensitivity: Sensitivity, parts: list[Part], progress: Progress) -> dict[Part, ErrorMeasurement]:
         """Measure the error of pruning, see `PartErrors.measure`."""
-        report("calibrating the prediction of pruning errors", 0.0)
+        progress(TaskEvent("calibrating the prediction of pruning errors", 0.0))
         kept = indices_to_keep(sensitivity, distortion_per_number(self.model, self.distortion))
         predicted = float(np.delete(sensitivity.removals, kept).sum())
         measured = self.references.measure_error(*subset_decoded(self.model, self.decoded, kept))
@@ -118,7 +118,7 @@ class QuantizationErrors:
     # The sensitivities of positions that the last plan was made for, the plan, and the planned model.
     _last_plan: tuple[np.ndarray, Plan, HybridModel] | None = field(default=None, init=False)
 
-    def measure(self, sensitivity: Sensitivity, parts: list[Part], report: Report) -> dict[Part, ErrorMeasurement]:
+    def measure(self, sensitivity: Sensitivity, parts: list[Part], progress: Progress) -> dict[Part, ErrorMeasurement]:
         """Quantise all of `parts` and measure the error of each one alone, see `PartErrors.measure`."""
         plan, planned = self._plan(sensitivity)
         quantized = quantize(planned, plan, sensitivity, sections=[name for part in parts for name in part])
@@ -127,7 +127,7 @@ class QuantizationErrors:
         errors = {}
         for number, part in enumerate(parts):
             contents = " and ".join(SECTION_CONTENTS[name] for name in part)
-            report(f"calibrating predicted errors of {contents}", number / len(parts))
+            progress(TaskEvent(f"calibrating predicted errors of {contents}", number / len(parts)))
             measured = self._measure_part(part, planned, arrays)
             errors[part] = ErrorMeasurement(measured, sum(predicted[name] for name in part))
         return errors

@@ -23,7 +23,7 @@ from hyrfpack.format.min_file_size import check_target_bytes
 from hyrfpack.format.run_folder import find_model
 from hyrfpack.outputs import Outputs, StrPath
 from hyrfpack.parallel.ranks import SINGLE_PROCESS
-from hyrfpack.progress import Report, report_part, report_to
+from hyrfpack.progress import Progress, part_of_progress
 from hyrfpack.scene import Scene
 
 _LOG = logging.getLogger(__name__)
@@ -82,7 +82,7 @@ def compress_model(
         )
         return CompressionReport(**vars(cast(FileReport, ranks.broadcast(repacked))))
     with context.open_progress("compress") as progress:
-        candidate, search_result, sensitivity = _encode_compact(source, config, data, context, report_to(progress))
+        candidate, search_result, sensitivity = _encode_compact(source, config, data, context, progress)
     written = ranks.run_on_all(
         lambda: write_model(candidate.data, target, overwrite=overwrite) if ranks.is_main else None
     )
@@ -98,7 +98,7 @@ def compress_model(
 
 
 def _encode_compact(
-    source: Path, config: CompressConfig, data: Scene | None, context: RunContext, report: Report
+    source: Path, config: CompressConfig, data: Scene | None, context: RunContext, progress: Progress
 ) -> tuple[EncodedCandidate, str, Sensitivity]:
     """Encode a file with profile "compact"; return it, the outcome of a search as a sentence, and the sensitivities."""
     ranks = context.ranks or SINGLE_PROCESS
@@ -119,18 +119,18 @@ def _encode_compact(
     start = config.distortion or default_distortion(provenance, steps)
     searches = config.target_bytes is not None or config.max_psnr_drop is not None
     encoding_start = SEARCH_ENCODING_START_SHARE if steps or searches else ENCODING_START_SHARE
-    measuring_report = report_part(report, 0.0, encoding_start)
-    sensitivity, references = measure_calibrated_sensitivity(model, cameras, start, config.prune, measuring_report)
+    measuring_progress = part_of_progress(progress, 0.0, encoding_start)
+    sensitivity, references = measure_calibrated_sensitivity(model, cameras, start, config.prune, measuring_progress)
     sensitivity = ranks.broadcast(sensitivity)  # on GPUs the other ranks' values differ in their last bits
-    encoding_report = report_part(report, encoding_start, 1.0)
+    encoding_progress = part_of_progress(progress, encoding_start, 1.0)
     cache = context.cache or PictureCache()
-    packer = Packer(model, kept, sensitivity, data, steps, config.prune, encoding_report, cache, ranks)
+    packer = Packer(model, kept, sensitivity, data, steps, config.prune, encoding_progress, cache, ranks)
     if config.target_bytes is not None:
         return *packer.encode_within_bytes(config.target_bytes, start), sensitivity
     if config.max_psnr_drop is not None:
         return *packer.encode_within_psnr_drop(config.max_psnr_drop, start), sensitivity
     if steps:
-        return packer.encode(start, encoding_report), "", sensitivity
+        return packer.encode(start, encoding_progress), "", sensitivity
     target_drop = DEFAULT_PSNR_DROP_DB if config.distortion is None else None
     return packer.encode_to_distortion(start, references, target_drop), "", sensitivity
 

@@ -12,7 +12,7 @@ from hyrfpack.cameras.view_sampling import sample_views
 from hyrfpack.format.arrays import SECTION_PARAMETERS
 from hyrfpack.format.sections import COLORS, DECODER_SECTIONS, OPACITIES, POSITIONS, SCALES, TABLE_SECTIONS
 from hyrfpack.model import Geometry, HybridModel, expand
-from hyrfpack.progress import Report, no_report
+from hyrfpack.progress import Progress, TaskEvent, ignore_progress
 from hyrfpack.render import render_view
 from hyrfpack.scene import Camera
 
@@ -79,7 +79,7 @@ class Sensitivity:
 
 
 def measure_sensitivity(
-    model: HybridModel, cameras: Sequence[Camera], seed: int = 0, report: Report = no_report
+    model: HybridModel, cameras: Sequence[Camera], seed: int = 0, progress: Progress = ignore_progress
 ) -> Sensitivity:
     """Estimate the mean squared derivatives of pictures with respect to every number of a model.
 
@@ -94,7 +94,7 @@ def measure_sensitivity(
         model: the model to measure.
         cameras: viewpoints typical of how the model will be viewed; world units.
         seed: random seed of the signs and of the views between cameras.
-        report: called before each view with a description and the completed share of the work, 0 to 1.
+        progress: called with `TaskEvent`s.
 
     Raises:
         HyrfError: a number of the model is NaN or infinite.
@@ -111,7 +111,7 @@ def measure_sensitivity(
     required = {name: parameter.requires_grad for name, parameter in model.named_parameters()}
     pixels, field_pixels = 0, 0
     for number, camera in enumerate(views):
-        report(f"measuring sensitivities, view {number + 1}/{len(views)}", number / len(views))
+        progress(TaskEvent(f"measuring sensitivities, view {number + 1}/{len(views)}", number / len(views)))
         # Views at and between cameras alternate, so both kinds are among the views of the fields.
         with_fields = number % (2 * field_interval) < 2
         for name, parameter in model.named_parameters():

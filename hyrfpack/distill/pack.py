@@ -17,7 +17,6 @@ from hyrfpack.progress import (
     TaskEvent,
     ignore_progress,
     part_of_progress,
-    report_to,
     round_of_progress,
 )
 
@@ -65,11 +64,10 @@ def pack(
     _LOG.info(f"measuring how each stored number affects renders, at {len(distilled.train)} cameras and between them")
     distortion = PLANNED_ERROR_SHARE * solve_added_error(_mse(psnrs), error + allowance)
     sensitivity, references = measure_calibrated_sensitivity(
-        model, distilled.train, distortion, report=report_to(part_of_progress(progress, 0.0, 0.7))
+        model, distilled.train, distortion, progress=part_of_progress(progress, 0.0, 0.7)
     )
     provenance = {**provenance, "viewpoint": Viewpoint.from_cameras(distilled.train).to_json()}
-    encoding_report = report_to(part_of_progress(progress, 0.7, 0.85))
-    packer = Packer(model, provenance, sensitivity, report=encoding_report)
+    packer = Packer(model, provenance, sensitivity, progress=part_of_progress(progress, 0.7, 0.85))
     candidate = packer.encode_to_distortion(distortion, references)
     for number in range(MAX_TRIALS):
         trial_progress = round_of_progress(part_of_progress(progress, 0.85, 1.0), number)
@@ -82,7 +80,7 @@ def pack(
             f"packing adds a mean squared error of {added_error:.2g}, limit {allowance:.2g}; encoding again at "
             f"distortion {distortion:.2g}"
         )
-        candidate = packer.encode(distortion, report_to(part_of_progress(trial_progress, 0.5, 1.0)))
+        candidate = packer.encode(distortion, part_of_progress(trial_progress, 0.5, 1.0))
     return candidate.data
 
 

@@ -24,7 +24,7 @@ from hyrfpack.evaluate.metrics import psnr, ssim, to_8bit
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.model import HybridModel
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
-from hyrfpack.progress import Report, no_report
+from hyrfpack.progress import Progress, TaskEvent, ignore_progress
 from hyrfpack.render import RenderSettings, apply_exposure_map, render_view
 from hyrfpack.render.files import save_picture, unique_stems
 from hyrfpack.scene import Camera, View, evenly_spaced
@@ -97,7 +97,7 @@ def evaluate_model(
     pictures: str | os.PathLike[str] | None = None,
     picture_count: int = DEFAULT_PICTURE_COUNT,
     overwrite: bool = True,
-    report: Report = no_report,
+    progress: Progress = ignore_progress,
     unwritten: list[str] | None = None,
     ranks: Ranks = SINGLE_PROCESS,
 ) -> Evaluation:
@@ -115,8 +115,7 @@ def evaluate_model(
         pictures: folder for pictures of photo | render | error.
         picture_count: number of views with a picture, spread evenly over `views`.
         overwrite: replace files in `pictures`; if False, an existing file is an error.
-        report: called before each view with a description and the completed share of the work, 0 to 1. Each of several
-            processes reports its own share.
+        progress: called with `TaskEvent`s; each of several processes reports its own share of the views.
         unwritten: gets a message for each picture that cannot be written, while scoring continues. Without it, such a
             picture is an error.
         ranks: processes that share the views; each of them gets all scores.
@@ -155,7 +154,7 @@ def evaluate_model(
         scores: list[tuple[int, ViewScore | None, float]] = []
         own = ranks.share(list(enumerate(views)))
         for done, (number, view) in enumerate(own):
-            report(f"scoring photo {done + 1}/{len(own)}", done / len(own))
+            progress(TaskEvent(f"scoring photo {done + 1}/{len(own)}", done / len(own)))
             photo = view.load()
             reference, mask = upload(photo, solid, device)
             if mask is not None and not mask.any():
@@ -186,7 +185,7 @@ def evaluate_model(
                     if unwritten is None:
                         raise
                     unwritten.append(str(error))
-        report(f"scored {len(own)} photos", 1.0)
+        progress(TaskEvent(f"scored {len(own)} photos", 1.0))
         return scores
 
     with nullcontext() if pictures is None else exclusive_folder(pictures, ranks=ranks):

@@ -91,10 +91,6 @@ class Reporter:
         if isinstance(event, TaskEvent):
             self.update(self._share if event.share is None else event.share, str(event))
 
-    def report_share(self, doing: str, share: float) -> None:
-        """Report progress with the arguments of a `hyrfpack.progress.Report`."""
-        self.update(share, doing)
-
     def _estimate_part_seconds(self, share: float, now: float) -> float | None:
         """Estimate the seconds until the current part is done; None if there is neither a forecast nor a pace."""
         elapsed = now - self._pace.start

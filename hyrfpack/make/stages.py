@@ -262,7 +262,7 @@ def run_scoring_stage(stage_cache: StageCache, scene: Scene, device: torch.devic
     def execute(resuming: bool) -> tuple[dict, list[str]]:
         if not scene.test:
             return {"views": 0}, []
-        scores = evaluate_model(load_model(model, device), scene.test, report=stage_cache.reporter.report_share)
+        scores = evaluate_model(load_model(model, device), scene.test, progress=stage_cache.reporter.report_event)
         means = {name: getattr(scores, name) for name in ("psnr", "psnr_consistent", "ssim")}
         return {"views": len(scores.views), **means}, []
 

@@ -13,26 +13,21 @@ from hyrfpack.progress.events import (
     TaskEvent,
     count_calls,
     ignore_progress,
+    items_of_progress,
     part_of_progress,
     round_of_progress,
 )
-from hyrfpack.progress.reports import Report, no_report, report_each_call, report_part, report_round, report_to
 
 __all__ = [
     "Event",
     "Progress",
-    "Report",
     "StageEvent",
     "StepEvent",
     "TaskEvent",
     "count_calls",
     "ignore_progress",
-    "no_report",
+    "items_of_progress",
     "open_display",
     "part_of_progress",
-    "report_each_call",
-    "report_part",
-    "report_round",
-    "report_to",
     "round_of_progress",
 ]

@@ -113,6 +113,21 @@ def round_of_progress(progress: Progress, number: int) -> Progress:
     )
 
 
+def items_of_progress(progress: Progress, task: str, count: int) -> Progress:
+    """Return a progress function for one task, which reports shares as numbers of `count` items.
+
+    Example:
+        >>> items_of_progress(print, "scoring held-out photos", 20)(TaskEvent("scoring", 0.25))
+        scoring held-out photos 5/20
+    """
+
+    def report(event: Event) -> None:
+        if isinstance(event, TaskEvent) and event.share is not None:
+            progress(TaskEvent(task, done=round(event.share * count), total=count))
+
+    return report
+
+
 def count_calls(function: Callable[[S], T], progress: Progress, task: str, count: int) -> Callable[[S], T]:
     """Return a function that does the same as `function` and reports after each of `count` calls, from any thread."""
     lock, done = Lock(), 0

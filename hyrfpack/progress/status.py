@@ -12,9 +12,8 @@ from hyrfpack.progress.events import Event, StageEvent, StepEvent, TaskEvent
 from hyrfpack.progress.pace import SharePace, StepPace
 
 RUNNING_MEAN_WEIGHT = 0.05  # The newest step has this weight in the running means of loss and squared error.
-MIN_ETA_SECONDS = (
-    1.0  # The remaining time of a task's items is shown if this and the elapsed time are at least so long.
-)
+# The remaining time of a task's items is shown if it and the elapsed time are at least this long.
+MIN_ETA_SECONDS = 1.0
 OVERDUE_TIME_RATIO = 0.25  # Overdue work is expected to take this ratio of its elapsed time in addition.
 PART_SEPARATOR = " | "
 # Parts of a step that are left out on a narrow terminal, the least important ones first.

@@ -14,7 +14,7 @@ import torch
 from hyrfpack.config.train import TrainConfig
 from hyrfpack.data import PictureCache
 from hyrfpack.evaluate import Evaluation, evaluate_model
-from hyrfpack.progress import Progress, TaskEvent, ignore_progress
+from hyrfpack.progress import Progress, TaskEvent, ignore_progress, items_of_progress
 from hyrfpack.scene import Picture, Scene, View, evenly_spaced
 from hyrfpack.train.setup import budget_for
 from hyrfpack.train.trainer import Trainer
@@ -160,9 +160,7 @@ class ScenePilots:
         result: Evaluation = evaluate_model(
             trainer.model,
             fold.validation,
-            report=lambda _, share: self._progress(
-                TaskEvent(f"{name}: scoring", done=round(share * count), total=count)
-            ),
+            progress=items_of_progress(self._progress, f"{name}: scoring", count),
         )
         score = PilotScore(
             steps=steps,

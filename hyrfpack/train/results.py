@@ -29,7 +29,7 @@ from hyrfpack.evaluate.figures import draw_training_curve
 from hyrfpack.format.codec import write_model
 from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
 from hyrfpack.model import HybridModel
-from hyrfpack.progress import Progress, TaskEvent
+from hyrfpack.progress import Progress, TaskEvent, items_of_progress
 from hyrfpack.render import render_view
 from hyrfpack.scene import Scene, evenly_spaced
 from hyrfpack.train.checkpoint import names_and_sizes
@@ -215,7 +215,6 @@ def write_results(
     is_scored = True
     if scene.test:
         unwritten: list[str] = []
-        photos = len(scene.test)
         try:
             # The written file is scored, not the model in memory.
             model = hyrf_format.load_model(out / record.model, device)
@@ -225,9 +224,7 @@ def write_results(
                 scene.test,
                 pictures=out / VIEWS_FOLDER,
                 overwrite=overwrite,
-                report=lambda _, share: progress(
-                    TaskEvent("scoring held-out photos", done=round(share * photos), total=photos)
-                ),
+                progress=items_of_progress(progress, "scoring held-out photos", len(scene.test)),
                 unwritten=unwritten,
             )
             metrics["evaluation"] = scores.to_dict()

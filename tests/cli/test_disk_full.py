@@ -231,8 +231,7 @@ def test_a_disk_that_fills_in_training_keeps_the_checkpoint_and_resumes_to_the_s
             out,
             SHORT_CONFIG,
             overwrite=True,
-            cache=PictureCache(0),
-            context=QUIET_CONTEXT,
+            context=RunContext(cache=PictureCache(0), progress=None),
         )
 
     assert files_in(out).keys() == {"model.hyrf", "checkpoint.pt"} and (out / "model.hyrf").read_bytes() == b"old"

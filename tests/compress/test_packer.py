@@ -231,7 +231,7 @@ def test_the_distortion_is_adjusted_until_the_measured_error_matches(
     monkeypatch.setattr(
         packer,
         "encode",
-        lambda distortion, report: tried.append(distortion) or running.EncodedCandidate(distortion, {}),
+        lambda distortion, progress: tried.append(distortion) or running.EncodedCandidate(distortion, {}),
     )
     monkeypatch.setattr(running.Packer, "decode", lambda packer, trial: trial.data)
 
@@ -264,7 +264,7 @@ def test_the_distortion_is_lowered_until_the_drop_on_training_photos_is_met(
     monkeypatch.setattr(
         running,
         "evaluate_model",
-        lambda shown, views, report: SimpleNamespace(psnr=30.0 if shown is None else 30.0 - psnr_drop(shown)),
+        lambda shown, views, progress: SimpleNamespace(psnr=30.0 if shown is None else 30.0 - psnr_drop(shown)),
     )
 
     trial = packer.encode_to_distortion(1e-3, SimpleNamespace(measure_error=lambda distortion: distortion), 0.1)
@@ -278,7 +278,7 @@ def test_unreadable_photos_do_not_stop_packing(monkeypatch, caplog):
     monkeypatch.setattr(packer, "encode", lambda distortion, *_: running.EncodedCandidate(distortion, {}))
     monkeypatch.setattr(running.Packer, "decode", lambda packer, trial: trial.data)
 
-    def fail(shown, views, report):
+    def fail(shown, views, progress):
         raise HyrfError("a.png: the file is gone", fix="copy it again")
 
     monkeypatch.setattr(running, "evaluate_model", fail)

@@ -109,9 +109,9 @@ def fake_compress_model(source, target, config, *, context, **options):
     return CompressionReport(**vars(written))
 
 
-def fake_evaluate_model(model, views, *, report):
+def fake_evaluate_model(model, views, *, progress):
     """Return the same scores for any model."""
-    report("scoring", 0.5)
+    progress(TaskEvent("scoring", 0.5))
     return SimpleNamespace(views=views, psnr=25.0, psnr_consistent=None, ssim=0.9)
 
 

@@ -5,7 +5,15 @@ from __future__ import annotations
 import pytest
 
 from hyrfpack.parallel.pool import parallel_map
-from hyrfpack.progress import Event, StepEvent, TaskEvent, count_calls, part_of_progress, round_of_progress
+from hyrfpack.progress import (
+    Event,
+    StepEvent,
+    TaskEvent,
+    count_calls,
+    items_of_progress,
+    part_of_progress,
+    round_of_progress,
+)
 
 
 def test_nested_parts_report_their_share_of_the_whole():
@@ -22,6 +30,13 @@ def test_events_without_a_share_pass_unchanged_through_parts():
     for event in given:
         part_of_progress(events.append, 0.5, 1.0)(event)
     assert events == given
+
+
+def test_shares_become_numbers_of_items():
+    events: list[Event] = []
+    for share in (0, 1 / 3, 1):
+        items_of_progress(events.append, "scoring held-out photos", 3)(TaskEvent("scoring", share))
+    assert events == [TaskEvent("scoring held-out photos", done=done, total=3) for done in (0, 1, 3)]
 
 
 def test_progress_of_rounds_increases_and_stays_below_1():

@@ -69,7 +69,7 @@ def scores(monkeypatch) -> dict:
         def run(self, report, stop):
             pass
 
-    def evaluate(config, views, report):
+    def evaluate(config, views, progress):
         if config.exposure in table:
             return make_evaluation(
                 table[config.exposure][config.seed],
@@ -105,7 +105,7 @@ def test_a_smaller_budget_needs_two_seeds(monkeypatch, scores, first, second, fa
             seeds.append(config.seed)
 
     monkeypatch.setattr(pilots, "Trainer", Seeded)
-    monkeypatch.setattr(pilots, "evaluate_model", lambda model, views, report: make_evaluation(0.0, model))
+    monkeypatch.setattr(pilots, "evaluate_model", lambda model, views, progress: make_evaluation(0.0, model))
     assert measure_scene_budget(make_scene())[0] == factor
     assert seeds == ([0, 0] if first >= 1 else [0, 0, 1, 1])
 
@@ -163,7 +163,7 @@ def test_completely_masked_photos_are_no_validation_photos(left, monkeypatch):
     monkeypatch.setattr(
         pilots,
         "evaluate_model",
-        lambda _, views, report: judged.append([view.name for view in views]) or make_evaluation(0.0, 20.0),
+        lambda _, views, progress: judged.append([view.name for view in views]) or make_evaluation(0.0, 20.0),
     )
     scene = make_scene()
     judges = [view.name for view in pilots.split(scene.train)[1]]
