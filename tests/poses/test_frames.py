@@ -318,10 +318,11 @@ def test_every_stage_of_a_video_reports_progress(wall, tmp_path):
 
 
 def test_an_omitted_frame_is_named_with_its_time(wall, tmp_path):
+    from hyrfpack.config.poses import PosesConfig
     from hyrfpack.poses.estimate import _PoseEstimation
 
     video = write_video(tmp_path / "clip.mp4", [crop_wall(wall, 4 * number) for number in range(60)])
-    estimation = _PoseEstimation(video, tmp_path / "scene", "auto", None, 0, False, ignore_progress)
+    estimation = _PoseEstimation(video, tmp_path / "scene", PosesConfig(), None, False, ignore_progress)
     (tmp_path / "scene").mkdir()
     estimation.output.check_replaceable(video, overwrite=False)
     job = estimation._prepare_job()

@@ -25,6 +25,7 @@ from hyrfpack.poses.prepare import (
     make_masks,
     read_headers,
 )
+from hyrfpack.progress import ignore_progress
 
 # EXIF orientation -> counter-clockwise quarter turns from the upright picture to the stored one.
 QUARTER_TURNS_BY_ORIENTATION = {3: 2, 6: 1, 8: 3}
@@ -231,7 +232,7 @@ def test_masked_parts_have_no_features_and_photos_without_masks_keep_theirs(tmp_
     job = Job(
         tmp_path / "images", tmp_path / "work", tuple(names), (Device(PHOTO_SIZE),), (0, 0, 0), masks, "exhaustive", 0
     )
-    find_features(job, lambda doing, share: None)
+    find_features(job, ignore_progress)
     with pycolmap.Database.open(job.database) as database:
         masked, free = (np.asarray(database.read_keypoints(number))[:, 0] for number in (1, 2))
     assert masked.min() >= PHOTO_SIZE[0] // 2 - 1 > free.min()

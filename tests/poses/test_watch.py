@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from hyrfpack.config.poses import PosesConfig
 from hyrfpack.poses import process, watch
 from hyrfpack.poses.job import Job
 from hyrfpack.poses.watch import count_rows, parse_global_mapping_phase, poll_in_background, report_new_rows
@@ -143,7 +144,7 @@ def test_progress_reported_out_of_order_never_decreases(share, tmp_path):
     from hyrfpack.poses.estimate import _PoseEstimation
 
     events: list[TaskEvent] = []
-    estimation = _PoseEstimation(tmp_path, tmp_path / "scene", "auto", None, 0, False, events.append)
+    estimation = _PoseEstimation(tmp_path, tmp_path / "scene", PosesConfig(), None, False, events.append)
     estimation._report_progress("matches", TaskEvent("matching", 0.9))
     estimation._report_progress("matches", TaskEvent("matching", share))
     assert events[0] == events[1]
