@@ -6,6 +6,7 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
+from importlib.util import find_spec
 from typing import Any, Literal
 
 from hyrfpack.progress.events import Progress, ignore_progress
@@ -63,7 +64,9 @@ def _is_in_notebook() -> bool:
 
 
 def _can_redraw() -> bool:
-    """Return whether standard error is a terminal that can redraw a line."""
+    """Return whether standard error is a terminal that can redraw a line, and rich, which draws it, is installed."""
+    if find_spec("rich") is None:
+        return False
     try:
         is_terminal = sys.stderr.isatty()
     except ValueError:  # It is closed.

@@ -188,6 +188,17 @@ def test_a_terminal_gets_one_line_that_is_redrawn(width, monkeypatch):
     )
 
 
+def test_a_terminal_gets_plain_lines_if_rich_is_missing(monkeypatch):
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setitem(sys.modules, "rich", None)
+    with open_display() as progress:
+        progress(step_event(3000, 3000, mse=0.001))
+    (line,) = terminal.getvalue().splitlines()
+    assert line.startswith("step 3000/3000 | ") and "PSNR 30.0 dB" in line
+
+
 @pytest.mark.parametrize(
     "width, words",
     [
