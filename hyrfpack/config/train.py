@@ -98,12 +98,15 @@ class TrainConfig:
     `budget_factor` exclude each other. Without them, the budget follows from the photos' pixels and the steps;
     `hyrfpack.train_model` also measures the factor before a run of at least 2,000 steps on at least eight photos
     (`hyrfpack.train.budget_pilots`). During the run there may be `DensityConfig.excess` times as many Gaussians. Pilot
-    runs decide `exposure`, too (`hyrfpack.train.exposure_pilots`); a `Trainer` by itself then learns no gains. The hash
-    grid whose rows `log2_table_size` states is that of radiance (None: by the budget); the geometry grid has half as
-    many. The background colour "random" is a new one in each step, and the model's own background is then black.
+    runs decide `exposure`, too (`hyrfpack.train.exposure_pilots`), and before a run of more than 3,000 steps on 8 to 30
+    photos whether fewer steps are enough (`hyrfpack.train.length_pilots`). A `Trainer` by itself makes no pilot runs:
+    it takes all steps, and learns no gains unless `exposure` is True. The hash grid whose rows `log2_table_size` states
+    is that of radiance (None: by the budget); the geometry grid has half as many. The background colour "random" is a
+    new one in each step, and the model's own background is then black.
 
     Attributes:
         steps: training steps.
+        early_stop: with few photos, take fewer steps than a long run has if pilot runs show that more do not help.
         seed: random seed. On a CPU, the same seed gives the same file.
         preset: kind of scene; auto detects it.
         max_gaussians: budget: the maximum number of Gaussians. Default: measured by pilot runs.
@@ -124,6 +127,7 @@ class TrainConfig:
     """
 
     steps: Annotated[int, Range(1)] = 3000
+    early_stop: bool = True
     seed: Seed = 0
     preset: Annotated[str, OneOf(PRESETS)] = "auto"
     max_gaussians: Annotated[int | None, Range(1)] = None

@@ -144,6 +144,8 @@ def fit_plan_to_minutes(
         reporter: reports progress, and gets the estimates of the plan.
     """
     draft = QUALITIES["draft"]
+    # The pilots that choose a number of steps take as long as the training itself, so the time limit alone chooses it.
+    requested = dataclasses.replace(requested, early_stop=False)
     if (remaining := end - monotonic()) <= 0:
         _LOG.warning(f"no time is left for training: making a draft of {draft.steps} steps")
         draft_max_size = min(reading.max_size or draft.max_size, draft.max_size)

@@ -16,6 +16,7 @@ from hyrfpack.train.decisions import (
     MAX_BUDGET_PILOT_STEPS,
     MIN_BUDGET_STEPS,
     max_exposure_pilot_steps,
+    max_length_pilot_steps,
     max_pilot_steps,
 )
 from hyrfpack.train.setup import budget_for
@@ -78,7 +79,7 @@ class Plan:
         max_size: maximum size of the photos, see `load_scene`.
         finetune_steps: fine-tuning steps during packing.
         target_bytes: maximum size of the packed model in bytes; None for no limit.
-        max_gaussians, preset, budget_factor, exposure: see `TrainConfig`.
+        max_gaussians, preset, budget_factor, exposure, early_stop: see `TrainConfig`.
     """
 
     steps: int
@@ -89,6 +90,7 @@ class Plan:
     preset: str = "auto"
     budget_factor: float | None = None
     exposure: bool | None = None
+    early_stop: bool = True
 
     def train_config(self, seed: int) -> TrainConfig:
         """Return the training settings of the plan."""
@@ -100,6 +102,7 @@ class Plan:
             max_gaussians=self.max_gaussians,
             budget_factor=self.budget_factor,
             exposure=self.exposure,
+            early_stop=self.early_stop,
         )
 
     def with_target_bytes(self, target_bytes: int | None) -> Plan:
@@ -162,8 +165,10 @@ def estimate_photos_seconds(sizes: Sequence[tuple[int, int]], plan: Plan, device
     width, height = sizes[0] if sizes else (1920, 1080)
     shrunk = min(1.0, plan.max_size / max(width, height)) if plan.max_size else 1.0
     pixels, count = width * height * shrunk**2 / 1e6, len(sizes) or ASSUMED_VIDEO_PHOTOS
-    pilot_steps = MAX_BUDGET_PILOT_STEPS + max_exposure_pilot_steps(count - count // 8, plan.steps)
+    trained = count - count // 8
+    pilot_steps = MAX_BUDGET_PILOT_STEPS + max_exposure_pilot_steps(trained, plan.steps)
     pilot_steps *= plan.steps >= MIN_BUDGET_STEPS
+    pilot_steps += max_length_pilot_steps(trained, plan.steps) * plan.early_stop
     return {
         "poses": POSE_SECONDS_PER_PHOTO * count,
         **estimate_seconds(pixels, plan, 20_000, count // 8, pilot_steps, device),

@@ -35,6 +35,7 @@ from hyrfpack.progress import Event, StepEvent, TaskEvent
 from hyrfpack.progress.status import StepMeans, format_psnr
 from hyrfpack.scene import Scene
 from hyrfpack.train import Trainer, train_model
+from hyrfpack.train.decisions import measures_length
 from hyrfpack.train.run import is_begun
 
 _LOG = logging.getLogger(__name__)
@@ -107,8 +108,9 @@ def run_training_stage(
 
     def execute(resuming: bool) -> tuple[dict, list[str]]:
         if not (resuming and _is_run_finished(run)):
+            at_most = "at most " if measures_length(scene, config) else ""
             _LOG.info(
-                f"training: {plan.steps:,} steps on {len(scene.train)} photos, {len(scene.test)} held out; "
+                f"training: {at_most}{plan.steps:,} steps on {len(scene.train)} photos, {len(scene.test)} held out; "
                 f"on {describe_device(context.choose_device())}"
             )
             resume = resuming and is_begun(run)
@@ -126,8 +128,9 @@ def run_training_stage(
                 raise HyrfError(trained.missing, fix="run it again, which writes what is missing")
         metrics = json.loads((run / METRICS_FILE).read_bytes())
         facts = {key: metrics[key] for key in ("gaussians", "bytes", "choices", "device")}
-        psnr = describe_file(run / MODEL_FILE)["provenance"]["psnr"]
-        facts |= {"steps": plan.steps, "target_bytes": config.target_bytes, "psnr": psnr}
+        provenance = describe_file(run / MODEL_FILE)["provenance"]
+        facts |= {name: provenance[name] for name in ("steps", "psnr")}
+        facts["target_bytes"] = config.target_bytes
         return facts, [f"{RUN_FOLDER}/{name}" for name in (MODEL_FILE, METRICS_FILE)]
 
     return stage_cache.run_stage("training", inputs, execute, {name: getattr(config, name) for name in FIXED_SETTINGS})

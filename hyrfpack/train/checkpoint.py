@@ -9,6 +9,7 @@ import hashlib
 import io
 import json
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -53,21 +54,32 @@ def save_checkpoint(
     write_atomic(path, buffer.getbuffer(), overwrite=overwrite, rename=False)
 
 
-def saved_decisions(path: Path) -> tuple[float | None, bool]:
-    """Read the decisions of pilot runs from a checkpoint: the budget factor, and whether per-image gains are learnt.
+@dataclass(frozen=True)
+class SavedDecisions:
+    """What pilot runs may have decided for the run of a checkpoint: settings of `TrainConfig`."""
+
+    budget_factor: float | None
+    exposure: bool
+    steps: int
+
+
+def saved_decisions(path: Path) -> SavedDecisions:
+    """Read from a checkpoint what pilot runs may have decided.
 
     Raises:
         HyrfTrainingError: the checkpoint is missing, damaged or of another version.
     """
     saved = _read(path)[0]
-    factor, exposure = saved.get("budget_factor"), saved.get("exposure", False)
+    decisions = SavedDecisions(saved.get("budget_factor"), saved.get("exposure", False), saved.get("steps", 0))
+    settings = list_settings(TrainConfig)
     try:
-        list_settings(TrainConfig)["budget_factor"].check(factor)
+        settings["budget_factor"].check(decisions.budget_factor)
+        settings["steps"].check(decisions.steps)
     except ValueError as error:
         raise _damaged(path) from error
-    if not isinstance(exposure, bool):
+    if not isinstance(decisions.exposure, bool):
         raise _damaged(path)
-    return factor, exposure
+    return decisions
 
 
 def load_checkpoint(path: Path, settings: dict) -> tuple[dict[str, torch.Tensor], dict]:

@@ -1,4 +1,4 @@
-"""Decide by pilot runs, before a scene is trained, whether per-image gains are learnt, and the Gaussian budget."""
+"""Decide by pilot runs, before a scene is trained, on per-image gains, the Gaussian budget and the number of steps."""
 
 from __future__ import annotations
 
@@ -18,11 +18,15 @@ from hyrfpack.train.exposure_pilots import (
     exposure_rounds,
     measure_exposure,
 )
+from hyrfpack.train.length_pilots import measure_length, pilot_lengths
 from hyrfpack.train.pilots import MIN_TRAINING_VIEWS, PilotScore, PilotsStopped, ScenePilots
 
 # Shorter runs have no pilots, which would take too large a part of their time.
 MIN_BUDGET_STEPS = 2_000
 MIN_EXPOSURE_STEPS = 1_000
+# Longer pilots take as long as the run itself. They pay only where a longer run is likely to overfit.
+MAX_UNMEASURED_STEPS = 3_000
+MAX_LENGTH_TRAINING_VIEWS = 30
 MAX_BUDGET_PILOT_STEPS = 2 * MAX_BUDGET_ROUNDS * BUDGET_PILOT_STEPS
 
 
@@ -32,7 +36,7 @@ class Decisions:
 
     Attributes:
         config: the settings of the run, including the decisions.
-        reasons: the reason for each decision in words, by setting: "exposure", "max_gaussians".
+        reasons: the reason for each decision in words, by setting: "exposure", "max_gaussians", "steps".
         scores: the scores of each pilot.
     """
 
@@ -57,15 +61,42 @@ def measures_exposure(scene: Scene, config: TrainConfig) -> bool:
     return is_open and config.steps >= MIN_EXPOSURE_STEPS and len(scene.train) >= MIN_TRAINING_VIEWS
 
 
+def measures_length(scene: Scene, config: TrainConfig) -> bool:
+    """Return whether pilots choose the number of steps: `early_stop` is on, the run is long and photos are few."""
+    return config.early_stop and max_length_pilot_steps(len(scene.train), config.steps) > 0
+
+
+def chosen_steps(scene: Scene, config: TrainConfig, steps: object) -> int:
+    """Return the number of steps with which a call completes an earlier run.
+
+    Args:
+        scene, config: photos and settings of the call.
+        steps: number of steps of the earlier run, as read from a file.
+
+    Returns:
+        `steps` if pilots may have chosen it for a run with these settings, else `config.steps`.
+    """
+    could_be_chosen = measures_length(scene, config) and steps in pilot_lengths(config.steps)
+    return steps if could_be_chosen and isinstance(steps, int) else config.steps
+
+
 def max_pilot_steps(scene: Scene, config: TrainConfig) -> int:
     """Return the most steps that all pilots of a run take."""
     budget = MAX_BUDGET_PILOT_STEPS * measures_budget(scene, config)
-    return budget + max_exposure_pilot_steps(len(scene.train), config.steps) * measures_exposure(scene, config)
+    exposure = max_exposure_pilot_steps(len(scene.train), config.steps) * measures_exposure(scene, config)
+    length = max_length_pilot_steps(len(scene.train), config.steps) * config.early_stop
+    return budget + exposure + length
 
 
 def max_exposure_pilot_steps(count: int, steps: int) -> int:
     """Return the most steps that the pilots for exposure take before a run of `steps` steps on `count` photos."""
     return 2 * exposure_rounds(count) * exposure_pilot_steps(steps)
+
+
+def max_length_pilot_steps(count: int, steps: int) -> int:
+    """Return the most steps that the pilots for the length take before a run of `steps` steps on `count` photos."""
+    is_measured = steps > MAX_UNMEASURED_STEPS and MIN_TRAINING_VIEWS <= count <= MAX_LENGTH_TRAINING_VIEWS
+    return sum(pilot_lengths(steps)) * is_measured
 
 
 def without_pilots(config: TrainConfig) -> Decisions:
@@ -81,7 +112,7 @@ def decide(
     progress: Progress = ignore_progress,
     stop: Callable[[], bool] = lambda: False,
 ) -> Decisions | None:
-    """Decide by pilot runs what the settings leave open: first exposure compensation, then the budget.
+    """Decide by pilot runs what the settings leave open: first exposure compensation, then the budget, then the length.
 
     Args:
         scene, config, cache, device, progress, stop: see `ScenePilots`.
@@ -102,6 +133,9 @@ def decide(
         if measures_budget(scene, config):
             factor, reasons["max_gaussians"] = measure_budget(pilots, bool(decided.exposure))
             decided = dataclasses.replace(decided, budget_factor=factor)
+        if measures_length(scene, config):
+            steps, reasons["steps"] = measure_length(pilots, bool(decided.exposure), decided.budget_factor)
+            decided = dataclasses.replace(decided, steps=steps)
     except PilotsStopped:
         return None
     return None if stop() else Decisions(decided, reasons, pilots.scores)

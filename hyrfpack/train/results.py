@@ -33,7 +33,7 @@ from hyrfpack.progress import Progress, TaskEvent, items_of_progress
 from hyrfpack.render import render_view
 from hyrfpack.scene import Scene, evenly_spaced
 from hyrfpack.train.checkpoint import names_and_sizes
-from hyrfpack.train.decisions import is_budget_open
+from hyrfpack.train.decisions import chosen_steps, is_budget_open
 from hyrfpack.train.trainer import Trainer
 
 CURVE_FILE, VIEWS_FOLDER, RECORD_FILE = "curve.png", "views", "training.json"
@@ -104,6 +104,7 @@ def changed_settings(record: TrainingRecord, scene: Scene, config: TrainConfig) 
         asked["budget_factor"] = record.settings.get("budget_factor")
     if config.exposure is None:
         asked["exposure"] = record.settings.get("exposure")
+    asked["steps"] = chosen_steps(scene, config, record.settings.get("steps"))
     keys = asked.keys() | record.settings.keys()
     return sorted(key for key in keys if asked.get(key) != record.settings.get(key))
 

@@ -29,10 +29,12 @@ from hyrfpack.train.checkpoint import saved_decisions
 from hyrfpack.train.checks import check_folder, check_outputs, check_photos
 from hyrfpack.train.decisions import (
     Decisions,
+    chosen_steps,
     decide,
     is_budget_open,
     measures_budget,
     measures_exposure,
+    measures_length,
     without_pilots,
 )
 from hyrfpack.train.finish import TrainResult, finish_run
@@ -46,7 +48,11 @@ __all__ = ["TrainResult", "is_begun", "resuming", "train_model"]
 
 _LOG = logging.getLogger(__name__)
 
-CHOICE_LABELS = {"exposure": "Exposure compensation", "max_gaussians": "Gaussian budget"}
+CHOICE_LABELS = {
+    "exposure": "exposure compensation",
+    "max_gaussians": "Gaussian budget",
+    "steps": "number of steps",
+}
 Observer = Callable[[Trainer], None]
 
 
@@ -199,12 +205,16 @@ class _Run:
         if self.resume:
             saved = self.ranks.run_on_all(self._with_saved_decisions)
             return Decisions(self.ranks.broadcast(saved), {}, [])
-        questions = ["choosing exposure compensation"] * measures_exposure(self.scene, self.config)
-        questions += ["estimating the Gaussian budget"] * measures_budget(self.scene, self.config)
-        if not questions:
+        measured = {
+            "exposure": measures_exposure(self.scene, self.config),
+            "max_gaussians": measures_budget(self.scene, self.config),
+            "steps": measures_length(self.scene, self.config),
+        }
+        if not any(measured.values()):
             return without_pilots(self.config)
         if self.ranks.is_main:
-            _LOG.info(f"{' and '.join(questions)} with short pilot runs, scored on validation photos")
+            labels = [CHOICE_LABELS[choice] for choice, is_measured in measured.items() if is_measured]
+            _LOG.info(f"pilot runs, scored on validation photos, choose: {', '.join(labels)}")
         with catch_stop_signals(self.context.stop) as stop:
             # Every rank runs all pilots, so that no rank waits for another.
             pilots = partial(decide, self.scene, self.config, self.cache, self.device, self.progress, stop)
@@ -216,10 +226,11 @@ class _Run:
         config = self.config
         if not self.ranks.is_main:
             return config
-        factor, exposure = saved_decisions(self._checkpoint)
-        if is_budget_open(config):
-            config = dataclasses.replace(config, budget_factor=factor)
-        return config if config.exposure is not None else dataclasses.replace(config, exposure=exposure)
+        saved = saved_decisions(self._checkpoint)
+        factor = saved.budget_factor if is_budget_open(config) else config.budget_factor
+        exposure = saved.exposure if config.exposure is None else config.exposure
+        steps = chosen_steps(self.scene, config, saved.steps)
+        return dataclasses.replace(config, budget_factor=factor, exposure=exposure, steps=steps)
 
     def _set_up(self, decisions: Decisions) -> Trainer:
         """Return the trainer, at the step of the checkpoint if the run is resumed."""
@@ -228,7 +239,7 @@ class _Run:
             lambda: Trainer(self.scene, decisions.config, self.cache, self.device, ranks=self.ranks)
         )
         for choice, reason in decisions.reasons.items():
-            trainer.choices[choice] += f"; {reason}"
+            trainer.choices[choice] = "; ".join(filter(None, (trainer.choices.get(choice), reason)))
         trainer.pilots = [dataclasses.asdict(score) for score in decisions.scores]
         if self.resume:
             trainer.load(self._checkpoint)
@@ -243,7 +254,8 @@ class _Run:
             with _checkpoint_named_in_errors(trainer, self.overwrite):
                 if self.ranks.is_main:
                     for choice in decisions.reasons:
-                        _LOG.info(f"{CHOICE_LABELS[choice]}: {trainer.choices[choice]}")
+                        label = CHOICE_LABELS[choice]
+                        _LOG.info(f"{label[0].upper()}{label[1:]}: {trainer.choices[choice]}")
                 log = None
                 if self.log is not None and self.ranks.is_main:
                     log = stack.enter_context(

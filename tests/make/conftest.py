@@ -81,7 +81,7 @@ def fake_train_model(scene, run, config, *, resume, context, **options) -> Train
         for step in range(done + 1, config.steps + 1):
             write_atomic(checkpoint, str(step).encode())
             context.progress(StepEvent(step, config.steps, 0.1, 0.01, 400))
-        provenance = {"settings": config.to_dict(), **scene_provenance(scene), "psnr": 25.0}
+        provenance = {"steps": config.steps, "settings": config.to_dict(), **scene_provenance(scene), "psnr": 25.0}
         data = encode_model(tiny_model(400), "raw", provenance)
         choices = {name: f"{getattr(config, name)}: as asked for" for name in ("max_gaussians", "preset")}
         metrics = {"gaussians": 400, "bytes": len(data), "choices": choices, "device": "none"}

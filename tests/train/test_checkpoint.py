@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from hyrfpack.errors import HyrfTrainingError
-from hyrfpack.train.checkpoint import load_checkpoint, save_checkpoint, saved_decisions
+from hyrfpack.train.checkpoint import SavedDecisions, load_checkpoint, save_checkpoint, saved_decisions
 
 STORED_SETTINGS = {"steps": 40, "rates": (1e-3, 1e-5), "views": [["a.png", 4, 3]], "budget": None}
 STORED_PROGRESS = {"step": 12, "records": [{"step": 1, "loss": 0.25}], "seconds": {"data": 0.5}}
@@ -47,11 +47,11 @@ def test_a_saved_checkpoint_is_loaded_unchanged(path):
 def test_decisions_of_pilot_runs_can_be_read_back(path, factor, exposure):
     decided = {"budget_factor": factor, "exposure": exposure}
     save_checkpoint(path, settings={**STORED_SETTINGS, **decided}, tensors={}, progress=STORED_PROGRESS)
-    assert saved_decisions(path) == (factor, exposure)
+    assert saved_decisions(path) == SavedDecisions(factor, exposure, steps=40)
 
 
 def test_an_older_checkpoint_has_no_pilot_decisions(path):
-    assert saved_decisions(path) == (None, False)
+    assert saved_decisions(path) == SavedDecisions(None, False, steps=40)
 
 
 def test_an_invalid_exposure_decision_counts_as_damage(path):
@@ -63,6 +63,13 @@ def test_an_invalid_exposure_decision_counts_as_damage(path):
 @pytest.mark.parametrize("factor", ["1", -1.0, float("nan"), float("inf"), [1.0], True])
 def test_an_invalid_budget_factor_counts_as_damage(path, factor):
     save_checkpoint(path, settings={**STORED_SETTINGS, "budget_factor": factor}, tensors={}, progress=STORED_PROGRESS)
+    with pytest.raises(HyrfTrainingError, match="damaged"):
+        saved_decisions(path)
+
+
+@pytest.mark.parametrize("steps", ["8", 0, -1, 2.5, True, [8], None])
+def test_an_invalid_number_of_steps_counts_as_damage(path, steps):
+    save_checkpoint(path, settings={**STORED_SETTINGS, "steps": steps}, tensors={}, progress=STORED_PROGRESS)
     with pytest.raises(HyrfTrainingError, match="damaged"):
         saved_decisions(path)
 

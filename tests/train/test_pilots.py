@@ -19,7 +19,7 @@ from hyrfpack.format.exposure_header import STOPS_PER_LOG_GAIN
 from hyrfpack.model.exposure import apply_exposure_gains
 from hyrfpack.progress import Event, StepEvent, TaskEvent
 from hyrfpack.scene import Scene, View
-from hyrfpack.train import TrainConfig, budget_pilots, decisions, exposure_pilots, pilots, train_model
+from hyrfpack.train import TrainConfig, budget_pilots, decisions, exposure_pilots, length_pilots, pilots, train_model
 from hyrfpack.train.budget_pilots import BUDGET_FACTORS, measure_budget
 from hyrfpack.train.decisions import (
     MIN_BUDGET_STEPS,
@@ -29,9 +29,12 @@ from hyrfpack.train.decisions import (
     max_pilot_steps,
     measures_budget,
     measures_exposure,
+    measures_length,
 )
 from hyrfpack.train.exposure_pilots import measure_exposure
+from hyrfpack.train.length_pilots import measure_length
 from hyrfpack.train.pilots import PilotsStopped, ScenePilots
+from hyrfpack.train.setup import budget_for
 
 CPU_DEVICE = torch.device("cpu")
 LONG_CONFIG = TrainConfig(steps=MIN_BUDGET_STEPS)
@@ -394,4 +397,108 @@ def test_a_run_that_continues_keeps_its_exposure_compensation(tmp_path, monkeypa
     assert whole["settings"]["exposure"] is again["settings"]["exposure"] is True
     assert whole["choices"] == again["choices"] and whole["pilots"] == again["pilots"]
     assert "by a coin" in whole["choices"]["exposure"] and "centers" in whole["choices"]["exposure_map"]
+    assert (tmp_path / "whole/model.hyrf").read_bytes() == (tmp_path / "again/model.hyrf").read_bytes()
+
+
+# -- number of steps -------------------------------------------------------------------------------------------------
+
+
+def measure_scene_length(scores: dict[int, float], steps: int, monkeypatch) -> tuple[int, str, ScenePilots]:
+    """Choose the number of steps of a run whose pilots score as in the table by their number of steps."""
+
+    class Untrained:
+        def __init__(self, scene, config, cache, device):
+            self.model = config
+
+        def run(self, report, stop):
+            pass
+
+    monkeypatch.setattr(pilots, "Trainer", Untrained)
+    monkeypatch.setattr(pilots, "evaluate_model", lambda config, *_, **__: make_evaluation(scores[config.steps]))
+    runs = ScenePilots(make_scene(), TrainConfig(steps=steps), PictureCache(), CPU_DEVICE)
+    return *measure_length(runs, exposure=True, budget_factor=0.5), runs
+
+
+@pytest.mark.parametrize(
+    ("scores", "steps", "chosen", "measured"),
+    [
+        ({1000: 20.0, 3000: 19.8}, 7_000, 1_000, [1_000, 3_000]),
+        ({1000: 20.0, 3000: 20.0}, 7_000, 1_000, [1_000, 3_000]),
+        ({1000: 20.0, 3000: 20.1, 7000: 20.0}, 7_000, 3_000, [1_000, 3_000, 7_000]),
+        ({1000: 20.0, 3000: 20.1, 7000: 20.2}, 7_000, 7_000, [1_000, 3_000, 7_000]),
+        ({1000: 20.0, 3000: 20.1, 10000: 20.2, 30000: 19.0}, 30_000, 10_000, [1_000, 3_000, 10_000, 30_000]),
+    ],
+)
+def test_a_longer_run_is_chosen_only_while_validation_photos_score_higher(scores, steps, chosen, measured, monkeypatch):
+    choice, reason, runs = measure_scene_length(scores, steps, monkeypatch)
+    assert choice == chosen
+    assert [score.steps for score in runs.scores] == measured and all(score.exposure for score in runs.scores)
+    assert all(f"{length:,} steps {scores[length]:.2f} dB" in reason for length in measured)
+
+
+def test_each_length_pilot_has_the_budget_of_a_run_of_its_length(monkeypatch):
+    _, _, runs = measure_scene_length({1000: 20.0, 3000: 20.1, 7000: 20.2}, 7_000, monkeypatch)
+    training = runs.fold(4).scene
+    assert [score.max_gaussians for score in runs.scores] == [
+        budget_for(training, TrainConfig(steps=steps, budget_factor=0.5))[0] for steps in (1_000, 3_000, 7_000)
+    ]
+
+
+def test_photos_without_validation_photos_get_the_whole_run():
+    scene = make_scene()
+    masked = dataclasses.replace(scene, train=[mask_all_pixels(view) for view in scene.train])
+    runs = ScenePilots(masked, TrainConfig(steps=7_000), PictureCache(), CPU_DEVICE)
+    assert measure_length(runs, exposure=False, budget_factor=None) == (
+        7_000,
+        "masks leave nothing of the photos to judge by",
+    )
+    assert not runs.scores
+
+
+@pytest.mark.parametrize(("steps", "lengths"), [(3_001, [1_000, 3_001]), (6_000, [1_000, 3_000, 6_000])])
+def test_pilots_are_at_most_half_as_long_as_the_run(steps, lengths):
+    assert length_pilots.pilot_lengths(steps) == lengths
+
+
+@pytest.mark.parametrize(
+    ("change", "views", "expected"),
+    [
+        ({}, 8, True),
+        ({}, 30, True),
+        ({}, 7, False),
+        ({}, 31, False),
+        ({"steps": 3_000}, 8, False),
+        ({"early_stop": False}, 8, False),
+    ],
+)
+def test_only_long_runs_on_few_photos_may_be_shortened(change, views, expected):
+    config = dataclasses.replace(TrainConfig(steps=7_000), **change)
+    assert measures_length(make_scene(views), config) is expected
+
+
+@pytest.mark.usefixtures("signals")
+def test_a_shortened_run_resumes_to_the_same_bytes_and_names_the_reason(tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(decisions, "MAX_UNMEASURED_STEPS", 10)
+    monkeypatch.setattr(length_pilots, "PILOT_LENGTHS_STEPS", (8,))
+    monkeypatch.setattr(decisions, "measure_length", lambda *_: (8, "8: by a coin"))
+    config = TrainConfig(steps=20)
+    whole = train_model(make_scene(), tmp_path / "whole", config)
+    assert whole.step == 8 and "Number of steps: 8: by a coin" in caplog.messages
+    assert train_model(make_scene(), tmp_path / "again", config, context=interrupt_at(6)).step == 6
+
+    monkeypatch.setattr(decisions, "measure_length", lambda *_: pytest.fail("measured again"))
+    for asked in ({"early_stop": False}, {"steps": 30, "early_stop": False}):
+        with pytest.raises(HyrfTrainingError, match="started with other settings"):
+            train_model(
+                make_scene(),
+                tmp_path / "again",
+                dataclasses.replace(config, **asked),
+                resume=True,
+                context=QUIET_CONTEXT,
+            )
+    again = train_model(make_scene(), tmp_path / "again", config, resume=True, context=QUIET_CONTEXT)
+
+    assert (
+        again.metrics["settings"] == whole.metrics["settings"] and again.metrics["choices"]["steps"] == "8: by a coin"
+    )
     assert (tmp_path / "whole/model.hyrf").read_bytes() == (tmp_path / "again/model.hyrf").read_bytes()
