@@ -124,7 +124,7 @@ def test_a_page_embeds_the_model_unless_it_is_baked(model, tmp_path):
     result = succeeded("export", model, "-o", tmp_path / "a.html", "--overwrite")
     size = (tmp_path / "a.html").stat().st_size
     assert result.stdout == f"{tmp_path / 'a.html'}: {size:,} bytes, 40 Gaussians, unchanged: nothing is baked\n"
-    assert "goes along as it is" in result.stderr
+    assert "is copied unchanged" in result.stderr
 
 
 def test_folders_are_players_and_galleries(model, data, tmp_path):
