@@ -202,10 +202,10 @@ def test_a_file_without_a_model_is_a_clear_error(tmp_path):
 
 
 def test_help_names_every_ending():
-    from hyrfpack.export.kinds import ENDINGS
+    from hyrfpack.export.kinds import EXPORT_ENDINGS
 
     printed = succeeded("export", "--help").stdout
-    assert all(re.search(rf"{re.escape(ending)}\b", printed) for ending in ENDINGS)
+    assert all(re.search(rf"{re.escape(ending)}\b", printed) for ending in EXPORT_ENDINGS)
     assert "export" in succeeded("--help").stdout and "view" in succeeded("--help").stdout
 
 
