@@ -93,7 +93,7 @@ if TYPE_CHECKING:
     from hyrfpack.train import train_model as train_model
 
 # The module that defines or re-exports each public name.
-_PUBLIC = {
+_MODULES_BY_PUBLIC_NAME = {
     "BenchReport": "hyrfpack.bench.suite",
     "benchmark_model": "hyrfpack.bench.suite",
     "ComparisonReport": "hyrfpack.report",
@@ -147,8 +147,8 @@ _PUBLIC = {
     "TrainResult": "hyrfpack.train",
     "train_model": "hyrfpack.train",
 }
-# The present name of each renamed public function, for the error message.
-_RENAMED = {
+# The new name of each renamed public function, for the error message.
+_NEW_NAMES_BY_OLD_NAME = {
     "bench": "benchmark_model",
     "compare": "compare_runs",
     "compress": "compress_model",
@@ -164,20 +164,22 @@ _RENAMED = {
     "train": "train_model",
 }
 
-__all__ = ["__version__", *_PUBLIC]
+__all__ = ["__version__", *_MODULES_BY_PUBLIC_NAME]
 
 
 if not TYPE_CHECKING:  # Type checkers read the imports above, so that they report unknown names.
 
     def __getattr__(name: str) -> Any:
-        if name in _PUBLIC:
+        if name in _MODULES_BY_PUBLIC_NAME:
             from hyrfpack.errors import needs_package
 
             with needs_package(f"hyrfpack.{name}"):
-                value = getattr(import_module(_PUBLIC[name]), name)
+                value = getattr(import_module(_MODULES_BY_PUBLIC_NAME[name]), name)
             globals()[name] = value
             return value
-        hint = f"; the function is now hyrfpack.{_RENAMED[name]}" if name in _RENAMED else ""
+        hint = (
+            f"; the function is now hyrfpack.{_NEW_NAMES_BY_OLD_NAME[name]}" if name in _NEW_NAMES_BY_OLD_NAME else ""
+        )
         raise AttributeError(f"module '{__name__}' has no attribute '{name}'{hint}")
 
 

@@ -68,7 +68,7 @@ def check_pair(name: str, value: Any) -> None:
 
 
 # How to get an argument of types that are not made directly, by their names.
-_REMEDIES = {
+_REMEDIES_BY_TYPE_NAME = {
     "Camera": "a View has one: view.camera",
     "HybridModel": "hyrfpack.load_model reads it from a file",
     "Scene": "hyrfpack.load_scene reads it from a folder",
@@ -84,5 +84,5 @@ def check_type(argument: str, value: object, expected: type) -> None:
     """
     if not isinstance(value, expected):
         name = expected.__name__
-        remedy = _REMEDIES.get(name, f"make one: hyrfpack.{name}(...)")
+        remedy = _REMEDIES_BY_TYPE_NAME.get(name, f"make one: hyrfpack.{name}(...)")
         raise TypeError(f"{argument} must be a {name}, not a {type(value).__name__}; {remedy}")

@@ -34,5 +34,5 @@ PRESETS = ("auto", "synthetic", "standard", "large", "street")
 PRECISIONS = ("mixed", "float32")
 # Trade-offs of time and quality of `make`. They are the keys of `hyrfpack.make.QUALITIES`.
 QUALITIES = ("draft", "normal", "best")
-# Groups of measurements of `bench`. They are the keys of `hyrfpack.bench.suite.GROUPS`.
+# Groups of measurements of `bench`. They are the keys of `hyrfpack.bench.suite.ROW_FUNCTIONS_BY_GROUP`.
 BENCH_GROUPS = ("rasterize", "hash_encode", "mlp", "render", "codec")

@@ -18,15 +18,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RunContext:
-    """What does not change the result of a long call, only how it runs. All of these calls take one as `context`.
+    """Settings of how a long call runs, which do not change its result. Each long call takes one as `context`.
 
     Attributes:
-        device: where to compute, see `hyrfpack.device.choose_device`. A call without need of a device ignores it.
+        device: where to compute, see `hyrfpack.device.choose_device`. A call that needs no device ignores it.
         ranks: processes that work together, from `hyrfpack.parallel.ranks.join_processes`; None for this process alone.
             All of them make the same call, and only rank 0 writes, prints and logs.
         progress: "auto" shows a bar and curves in Jupyter, a line that is redrawn on a terminal, and plain lines on
             standard error elsewhere. None shows nothing. A function gets each event instead
-            (`hyrfpack.progress.StepEvent`, `TaskEvent` or `StageEvent`), in each of several processes its own ones.
+            (`hyrfpack.progress.StepEvent`, `TaskEvent` or `StageEvent`), and each of several processes reports its own.
         cache: cache of decoded photos; None for one that takes a quarter of the memory.
         stop: asked during the work; once it returns True, the call ends as after Ctrl-C. `train_model` saves a
             checkpoint and returns; other calls raise KeyboardInterrupt.
@@ -73,7 +73,7 @@ class RunContext:
         Args:
             title: name of the work, which begins the lines of its tasks.
             interruptible: let that function raise KeyboardInterrupt if `stop` returns True. A call that asks `stop`
-                itself, to end in another way, sets it to False.
+                itself, to end differently, sets it to False.
         """
         stop = self.stop if interruptible else None
         is_silent = self.progress == "auto" and not self.is_shown

@@ -1,4 +1,4 @@
-"""Building the wheel and the sdist from a clean copy, and environments that hold only some packages."""
+"""Build the wheel and the sdist from a clean copy, and make environments that hold only some packages."""
 
 from __future__ import annotations
 

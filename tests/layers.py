@@ -64,7 +64,7 @@ LAYER_BY_PATH = {
 
 def layer_of(item: pytest.Item) -> str:
     """Return the layer of a test, one of LAYERS."""
-    for mark in item.iter_markers():  # the closest first, so that a test can differ from its module
+    for mark in item.iter_markers():  # the closest mark comes first, so a test can differ from its module
         if mark.name in LAYERS:
             return mark.name
     if BROWSER_FIXTURES & set(getattr(item, "fixturenames", ())):

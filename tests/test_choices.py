@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from hyrfpack import choices
-from hyrfpack.bench.suite import GROUPS
+from hyrfpack.bench.suite import ROW_FUNCTIONS_BY_GROUP
 from hyrfpack.data import LAYOUTS
 from hyrfpack.make import QUALITIES
 
@@ -11,4 +11,4 @@ from hyrfpack.make import QUALITIES
 def test_the_choices_are_those_of_the_packages_that_define_them():
     assert choices.LAYOUTS == tuple(LAYOUTS)
     assert choices.QUALITIES == tuple(QUALITIES)
-    assert choices.BENCH_GROUPS == tuple(GROUPS)
+    assert choices.BENCH_GROUPS == tuple(ROW_FUNCTIONS_BY_GROUP)

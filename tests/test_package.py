@@ -23,7 +23,9 @@ from distributions import (
 
 import hyrfpack
 
-DOCUMENTS = ("CHANGELOG.md", "CITATION.cff", "LICENSE", "MANIFEST.in", "README.md", "SECURITY.md", "pyproject.toml")
+DISTRIBUTED_DOCUMENTS = (
+    *("CHANGELOG.md", "CITATION.cff", "LICENSE", "MANIFEST.in", "README.md", "SECURITY.md", "pyproject.toml"),
+)
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +74,7 @@ def test_the_sdist_holds_the_package_and_its_documents_and_no_tests(built):
     with tarfile.open(built["sdist"]) as archive:
         names = {member.name.partition("/")[2] for member in archive.getmembers() if member.isfile()}
     generated = {name for name in names if name in ("PKG-INFO", "setup.cfg") or name.startswith("hyrfpack.egg-info/")}
-    assert names - generated == {*package_files(), *DOCUMENTS}
+    assert names - generated == {*package_files(), *DISTRIBUTED_DOCUMENTS}
 
 
 def test_the_metadata_is_complete(metadata):

@@ -10,15 +10,15 @@ from photo_sets import READ_PATHS_BY_SET, write_photo_sets
 from hyrfpack.data import load_scene
 from hyrfpack.errors import HyrfError
 from hyrfpack.export.folder import check_folder
-from hyrfpack.export.kinds import ENDINGS, check_place
+from hyrfpack.export.kinds import EXPORT_ENDINGS, check_place
 from hyrfpack.make.source import LoadSettings, Source
 from hyrfpack.outputs import Outputs
 from hyrfpack.poses import estimate_poses
 from hyrfpack.scene import Scene
 
 pytestmark = pytest.mark.unit
-PATHS = [(name, name + part) for name, parts in READ_PATHS_BY_SET.items() for part in parts]
-FOLDERS = [(name, path) for name, path in PATHS if not Path(path).suffix]
+PROTECTED_PATHS = [(name, name + part) for name, parts in READ_PATHS_BY_SET.items() for part in parts]
+PROTECTED_FOLDERS = [(name, path) for name, path in PROTECTED_PATHS if not Path(path).suffix]
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +34,7 @@ def working_folder(sets_folder, monkeypatch):
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
-@pytest.mark.parametrize(("name", "path"), PATHS)
+@pytest.mark.parametrize(("name", "path"), PROTECTED_PATHS)
 def test_no_file_or_folder_replaces_what_a_scene_is_read_from(name, path, overwrite):
     outputs = Outputs("model.hyrf", scene=load_scene(name), overwrite=overwrite)
 
@@ -45,14 +45,14 @@ def test_no_file_or_folder_replaces_what_a_scene_is_read_from(name, path, overwr
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
-@pytest.mark.parametrize(("name", "folder"), FOLDERS)
+@pytest.mark.parametrize(("name", "folder"), PROTECTED_FOLDERS)
 def test_nothing_new_is_written_beside_what_a_scene_is_read_from(name, folder, overwrite):
     outputs = Outputs(scene=load_scene(name), overwrite=overwrite)
 
     for ending in (".hyrf", ".png", ".md"):
         with pytest.raises(HyrfError):
             outputs.file(f"{folder}/new{ending}")
-    for ending in ENDINGS:
+    for ending in EXPORT_ENDINGS:
         with pytest.raises(HyrfError):
             check_place(f"{folder}/new{ending}", outputs)
 
@@ -76,7 +76,7 @@ def test_a_set_is_protected_under_each_of_its_names(read, images, output, overwr
             outputs.folder(folder, ["model.hyrf"])
 
 
-@pytest.mark.parametrize("ending", ENDINGS)
+@pytest.mark.parametrize("ending", EXPORT_ENDINGS)
 def test_an_existing_export_is_replaced_only_with_overwrite(ending, tmp_path):
     (tmp_path / f"a{ending}").write_bytes(b"of another program")
 
@@ -96,7 +96,7 @@ def test_a_set_that_is_not_read_is_written_to_only_with_overwrite(name):
 
 
 @pytest.mark.parametrize("is_gallery", [False, True])
-@pytest.mark.parametrize(("name", "folder"), FOLDERS)
+@pytest.mark.parametrize(("name", "folder"), PROTECTED_FOLDERS)
 def test_a_player_is_not_written_among_photos_and_poses(name, folder, is_gallery):
     def check(scene: Scene | None, overwrite: bool) -> None:
         check_folder(folder, [], [scene], overwrite=overwrite, is_gallery=is_gallery)
@@ -111,7 +111,7 @@ def test_a_player_is_not_written_among_photos_and_poses(name, folder, is_gallery
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
-@pytest.mark.parametrize(("name", "folder"), FOLDERS)
+@pytest.mark.parametrize(("name", "folder"), PROTECTED_FOLDERS)
 def test_make_protects_the_photos_and_poses_of_its_source(name, folder, overwrite):
     source = Source.from_path(Path(name), LoadSettings(None, 0, None))
 
@@ -122,7 +122,7 @@ def test_make_protects_the_photos_and_poses_of_its_source(name, folder, overwrit
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
-@pytest.mark.parametrize(("name", "path"), PATHS)
+@pytest.mark.parametrize(("name", "path"), PROTECTED_PATHS)
 def test_poses_are_not_written_over_photos_and_poses_of_others(name, path, overwrite):
     with pytest.raises(HyrfError):
         estimate_poses(name, path, overwrite=overwrite)

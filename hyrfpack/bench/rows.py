@@ -16,7 +16,7 @@ class Row:
     """Time and error of one value of one setting.
 
     Attributes:
-        group: the group of measurements, one of `hyrfpack.bench.suite.GROUPS`.
+        group: the group of measurements, one of `hyrfpack.bench.suite.ROW_FUNCTIONS_BY_GROUP`.
         setting: the setting that is varied, such as "background_threshold".
         value: the formatted value of the setting.
         is_reference: whether errors and ratios of other rows refer to this row.

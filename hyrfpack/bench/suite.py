@@ -22,7 +22,7 @@ _LOG = logging.getLogger(__name__)
 
 # Groups in order of measurement. Each function takes a subject, the number of repeats, and a list, to which it appends
 # a sentence for each part that is left out.
-GROUPS: dict[str, Callable[[Subject, int, list[str]], Iterator[Row]]] = {
+ROW_FUNCTIONS_BY_GROUP: dict[str, Callable[[Subject, int, list[str]], Iterator[Row]]] = {
     "rasterize": rasterize_rows,
     "hash_encode": hash_encode_rows,
     "mlp": mlp_rows,
@@ -72,7 +72,7 @@ def benchmark_model(
         scene: held-out photos to measure quality against. Without it, quality is measured against the model's own
             pictures, from an orbit around the viewpoint stored in the file.
         repeats: measured runs of each value, at least 1; tasks that take seconds get fewer.
-        only: names of the groups to measure, out of `GROUPS`; None for all.
+        only: names of the groups to measure, out of `ROW_FUNCTIONS_BY_GROUP`; None for all.
 
     Raises:
         HyrfError: the model or the photos cannot be used, a result is not finite, or Numba is missing.
@@ -86,8 +86,8 @@ def benchmark_model(
         ['mlp']
     """
     for name in only or ():
-        if name not in GROUPS:
-            raise ValueError(f"there is no group '{name}'; there are {', '.join(GROUPS)}")
+        if name not in ROW_FUNCTIONS_BY_GROUP:
+            raise ValueError(f"there is no group '{name}'; there are {', '.join(ROW_FUNCTIONS_BY_GROUP)}")
     if repeats < 1:
         raise ValueError(f"repeats is {repeats}; it must be at least 1")
     if scene is not None and model is None:
@@ -99,10 +99,10 @@ def benchmark_model(
     subject = built_in_subject() if model is None else read_subject(model, scene)
     notes: list[str] = []
     rows: list[Row] = []
-    for name in GROUPS:
-        if name in (only or GROUPS):
+    for name in ROW_FUNCTIONS_BY_GROUP:
+        if name in (only or ROW_FUNCTIONS_BY_GROUP):
             _LOG.info(f"measuring {name}")
-            rows += GROUPS[name](subject, repeats, notes)
+            rows += ROW_FUNCTIONS_BY_GROUP[name](subject, repeats, notes)
     if any(row.time.repeats < repeats for row in rows):
         notes.append(f"a variant that has been measured for {MAX_SECONDS_PER_TASK:g} s is not measured again")
     return BenchReport(describe_machine(), subject.describe(), notes, rows)

@@ -110,7 +110,7 @@ class _NoteHandler(logging.Handler):
         note(record.getMessage())
 
 
-_HANDLER = _NoteHandler()
+_NOTE_HANDLER = _NoteHandler()
 
 
 @contextmanager
@@ -118,13 +118,13 @@ def log_as_notes() -> Iterator[None]:
     """Print the messages that the library logs in the block as notes."""
     logger = logging.getLogger("hyrfpack")
     level, propagate = logger.level, logger.propagate
-    logger.addHandler(_HANDLER)
+    logger.addHandler(_NOTE_HANDLER)
     logger.setLevel(logging.INFO)
     logger.propagate = False  # a handler of another library would print the messages again
     try:
         yield
     finally:
-        logger.removeHandler(_HANDLER)
+        logger.removeHandler(_NOTE_HANDLER)
         logger.setLevel(level)
         logger.propagate = propagate
 
@@ -136,11 +136,11 @@ def notes_only_of(*packages: str) -> Iterator[None]:
     def is_shown(record: logging.LogRecord) -> bool:
         return record.name.startswith(packages)
 
-    _HANDLER.addFilter(is_shown)
+    _NOTE_HANDLER.addFilter(is_shown)
     try:
         yield
     finally:
-        _HANDLER.removeFilter(is_shown)
+        _NOTE_HANDLER.removeFilter(is_shown)
 
 
 def repair_std_streams() -> None:

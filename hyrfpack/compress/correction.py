@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hyrfpack.compress.part_errors import ErrorMeasurement, Part
-from hyrfpack.compress.sensitivity import PRUNED, Sensitivity
+from hyrfpack.compress.sensitivity import PRUNED_KEY, Sensitivity
 from hyrfpack.format.sections import POSITIONS
 
 PREDICTION_TOLERANCE_RATIO = 1.2
@@ -16,7 +16,7 @@ MAX_CORRECTION_RATIO = 64.0
 # A correction multiplies the sensitivities by (measured error / predicted error)^exponent. The exponent is 1 if the
 # error falls with the square of the step, as for small independent perturbations. It is up to 2 if the error falls with
 # the step, as for swapped depth orders. It is down to 1/2 for pruning, whose errors add up.
-CORRECTION_EXPONENTS: dict[Part, float] = {(POSITIONS,): 1.5, (PRUNED,): 0.7}
+CORRECTION_EXPONENTS: dict[Part, float] = {(POSITIONS,): 1.5, (PRUNED_KEY,): 0.7}
 # An exponent estimated from two factors is used only within these bounds: factors close to each other give noise.
 MIN_CORRECTION_EXPONENT = 0.25
 MAX_CORRECTION_EXPONENT = 3.0
@@ -42,7 +42,7 @@ class CorrectionFactor:
     last: tuple[float, float] | None = None
 
     def update(self, ratio: float) -> None:
-        """Choose the next factor, given the ratio of measured to predicted error with the present `value`."""
+        """Choose the next factor, given the ratio of measured to predicted error at the current `value`."""
         if self.last is not None and ratio > 0:  # The exponent follows by the secant method on logarithms.
             value, before = self.last
             estimate = np.log(self.value / value) / (np.log(before / ratio) or np.inf)
@@ -86,7 +86,7 @@ class SensitivityCorrection:
         return self._scaled({part: factor.value for part, factor in self._factors.items()})
 
     def update(self, errors: Mapping[Part, ErrorMeasurement], min_error: float) -> None:
-        """Choose the next factors, given the errors that parts have with the present candidate.
+        """Choose the next factors, given the errors that parts have with the current candidate.
 
         Args:
             errors: errors of the parts that were measured.

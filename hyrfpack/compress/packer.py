@@ -51,7 +51,7 @@ class EncodedCandidate:
 
     Attributes:
         data: the bytes of the file.
-        predicted_errors: predicted mean squared error that compression adds to pictures, by section and for PRUNED.
+        predicted_errors: predicted mean squared error that compression adds to pictures, by section and for PRUNED_KEY.
         measured_error: mean squared error measured on renders; 0 if it was not measured.
         psnr_drop: measured loss of PSNR in dB; 0 if it was not measured.
     """

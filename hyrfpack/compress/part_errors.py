@@ -12,7 +12,7 @@ import torch
 from hyrfpack.compress.plan import distortion_per_number, indices_to_keep, make_plan
 from hyrfpack.compress.quantize import opacity_error_model, quantize
 from hyrfpack.compress.reference_renders import ReferenceRenders
-from hyrfpack.compress.sensitivity import PRUNED, Sensitivity
+from hyrfpack.compress.sensitivity import PRUNED_KEY, Sensitivity
 from hyrfpack.format.arrays import iter_parameters, to_arrays
 from hyrfpack.format.compact.plan import Plan
 from hyrfpack.format.compact.quantized import QuantizedModel
@@ -81,7 +81,7 @@ class PruningErrors:
         distortion: as in `make_plan`.
     """
 
-    parts: ClassVar[tuple[Part, ...]] = ((PRUNED,),)
+    parts: ClassVar[tuple[Part, ...]] = ((PRUNED_KEY,),)
     model: HybridModel
     decoded: Decoded
     references: ReferenceRenders
@@ -156,9 +156,9 @@ def subset_decoded(model: HybridModel, decoded: Decoded, kept: np.ndarray) -> tu
 def predict_errors(
     model: HybridModel, planned: HybridModel, quantized: QuantizedModel, sensitivity: Sensitivity
 ) -> dict[str, float]:
-    """Predict the mean squared error that compression adds to pictures, for each section and for PRUNED."""
+    """Predict the mean squared error that compression adds to pictures, for each section and for PRUNED_KEY."""
     removed = np.delete(sensitivity.removals, quantized.plan.kept)
-    return {PRUNED: float(removed.sum()), **_predict_quantization_errors(planned, quantized, sensitivity)}
+    return {PRUNED_KEY: float(removed.sum()), **_predict_quantization_errors(planned, quantized, sensitivity)}
 
 
 def _predict_quantization_errors(

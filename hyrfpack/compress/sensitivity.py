@@ -32,7 +32,7 @@ MIN_RELATIVE_DECODER_SENSITIVITY = 1e-2
 # Setting a whole decoder to zero is assumed to add at least this error, because gradients vanish under saturation.
 MIN_ZEROED_DECODER_ERROR = 1e-6
 # Key of the Gaussians that are left out, beside the names of the sections.
-PRUNED = "pruned"
+PRUNED_KEY = "pruned"
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Sensitivity:
         return Sensitivity(positions, colors, scales, self.opacities[index], self.removals[index], self.fields)
 
     def scaled_by(self, factors: dict[str, float]) -> Sensitivity:
-        """Multiply each section, and the removals (PRUNED), by its factor; sections without a factor stay the same."""
+        """Multiply each section, and the removals (PRUNED_KEY), by its factor, which is 1 if it is not given."""
         positions, colors, scales, opacities, removals = (
             values * factors.get(group, 1.0)
             for group, values in (
@@ -71,7 +71,7 @@ class Sensitivity:
                 (COLORS, self.colors),
                 (SCALES, self.scales),
                 (OPACITIES, self.opacities),
-                (PRUNED, self.removals),
+                (PRUNED_KEY, self.removals),
             )
         )
         fields = {group: values * factors.get(group, 1.0) for group, values in self.fields.items()}

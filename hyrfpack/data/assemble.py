@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from hyrfpack.data.equirectangular import FACES, Face, FaceFile, face_lens, face_size
+from hyrfpack.data.equirectangular import CUBE_FACES, Face, FaceFile, face_lens, face_size
 from hyrfpack.data.folder import is_raw_name, list_pictures
 from hyrfpack.data.masks import find_masks
 from hyrfpack.data.names import find_similar_file
@@ -189,7 +189,7 @@ def missing_photos_notes(
         raise HyrfDataError(
             f"{path}: none of the {len(missing)} photos that {where} lists is on disk (looked for {min(missing)}; "
             f"{_describe_folder(path, min(missing))})",
-            fix="put them where the poses name them, as JPEG or PNG",
+            fix="put them at the paths that the poses name, as JPEG or PNG",
         )
     if not missing:
         return []
@@ -265,7 +265,7 @@ def _panorama_faces(photo: Photo) -> list[Photo]:
     size = face_size(photo.header.width)
     name = photo.name.removesuffix(photo.path.suffix)
     faces = []
-    for face in FACES:
+    for face in CUBE_FACES:
         pose = photo.camera_from_world.copy()
         with np.errstate(invalid="ignore", over="ignore"):
             pose[:3] = face.rotation @ pose[:3]

@@ -158,7 +158,9 @@ def _parse_numbers(lines: list[str], file: Path) -> np.ndarray:
     except ValueError:
         rows = [()]
     if any(len(row) != 3 for row in rows):
-        raise HyrfDataError(f"{file}: a line that should have three numbers has not", fix="export it again")
+        raise HyrfDataError(
+            f"{file}: a line has no three numbers where the format requires them", fix="export it again"
+        )
     return np.array(rows, np.float64).reshape(-1, 3)
 
 

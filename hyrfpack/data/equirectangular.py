@@ -56,7 +56,7 @@ class Face:
         return np.array(self.axes, np.float64)
 
 
-FACES = (
+CUBE_FACES = (
     Face("front", ((1, 0, 0), (0, 1, 0), (0, 0, 1))),
     Face("right", ((0, 0, -1), (0, 1, 0), (1, 0, 0))),
     Face("back", ((-1, 0, 0), (0, 1, 0), (0, 0, -1))),
@@ -131,7 +131,7 @@ def cut_face(panorama: np.ndarray, face: Face, size: int) -> np.ndarray:
 
     Args:
         panorama: (H, 2 H, C) uint8.
-        face: one of FACES.
+        face: one of CUBE_FACES.
         size: side of the face in pixels.
 
     Returns:
@@ -141,9 +141,9 @@ def cut_face(panorama: np.ndarray, face: Face, size: int) -> np.ndarray:
         ValueError: the panorama is not twice as wide as high.
 
     Example:
-        >>> from hyrfpack.data.equirectangular import FACES, cut_face
+        >>> from hyrfpack.data.equirectangular import CUBE_FACES, cut_face
         >>> sky = np.full((64, 128, 3), 200, np.uint8)
-        >>> cut_face(sky, FACES[4], 32).shape
+        >>> cut_face(sky, CUBE_FACES[4], 32).shape
         (32, 32, 3)
     """
     if not has_same_aspect(panorama.shape[1], panorama.shape[0], 2, 1):
@@ -170,11 +170,11 @@ def cut_panorama(
     folder: str | os.PathLike[str],
     *,
     size: int | None = None,
-    faces: Sequence[Face] = FACES,
+    faces: Sequence[Face] = CUBE_FACES,
 ) -> list[Path]:
     """Write the faces of a panorama as JPEG files, "pano_front.jpg" and so on, for structure-from-motion.
 
-    All faces share the lens `face_lens(size)` and the centre of projection; FACES gives the rotations between them.
+    All faces share the lens `face_lens(size)` and the centre of projection; CUBE_FACES has their rotations.
 
     Args:
         path: the panorama.

@@ -123,16 +123,15 @@ class PictureIndex:
     def _find_exact(self, name: str) -> Path | None:
         """Find the file at exactly this path; if the name has no extension of a picture, the file may have one."""
         path = self.folder / name.replace("\\", "/")
-        if is_raw_name(
-            path.name
-        ):  # raw files are not read; the rules may find a picture that was exported from this one
+        # Raw files are not read; the rules may find a picture that was exported from this one.
+        if is_raw_name(path.name):
             return None
         candidates = [path] if path.name.lower().endswith(PICTURE_SUFFIXES) else [path, *_with_extensions(path)]
         return next((candidate for candidate in candidates if os.path.isfile(candidate)), None)
 
     @cached_property
     def _rules(self) -> list[Callable[[str], list[Path]]]:
-        """The matching rules, the strictest first; each returns the files that a name may refer to."""
+        """Return the matching rules, the strictest first; each rule returns the files that a name may refer to."""
         paths, stems, suffixes = defaultdict(list), defaultdict(list), defaultdict(list)
         for file in self.files:
             key = _key(file.relative_to(self.folder).as_posix())

@@ -146,7 +146,7 @@ def _indices_without_faint(light: np.ndarray) -> np.ndarray:
 def _fit_to_pictures(
     model: HybridModel, scene: Scene, config: DistillConfig, cache: PictureCache, progress: Progress
 ) -> None:
-    """Train a model on reference renders, starting from its present state."""
+    """Train a model on reference renders, starting from its current state."""
     # Density control is off: the Gaussians are in place already, and compression prunes those of low importance.
     settings = TrainConfig(
         steps=config.steps,

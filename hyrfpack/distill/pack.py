@@ -88,7 +88,7 @@ def solve_added_error(errors: np.ndarray, mean: float) -> float:
     """Solve for the error that, added to the error of each view, brings their geometric mean to `mean`.
 
     The geometric mean of the errors is the error of the mean PSNR. The solution is smaller than the difference of
-    `mean` and the present geometric mean, because the PSNR of the best views drops most.
+    `mean` and the current geometric mean, because the PSNR of the best views drops most.
 
     Args:
         errors: (n,) mean squared error of each view.

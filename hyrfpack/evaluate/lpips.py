@@ -45,7 +45,7 @@ class Network:
     min_size_pixels: int
 
 
-NETWORKS = {
+NETWORKS_BY_NAME = {
     "alex": Network(
         ((0,), (3,), (6,), (8,), (10,)),
         (64, 192, 384, 256, 256),
@@ -89,7 +89,7 @@ class LPIPS:
         if shape not in shapes:
             raise ValueError("'net.slice1.0.weight' is not a first convolution of AlexNet or VGG-16")
         self.name = shapes[shape]
-        self.network = NETWORKS[self.name]
+        self.network = NETWORKS_BY_NAME[self.name]
         self._convolutions: dict[int, tuple[Tensor, Tensor]] = {}
         self._channel_weights: list[Tensor] = []
         width = 3

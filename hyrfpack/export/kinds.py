@@ -31,7 +31,7 @@ COLMAP_FOLDER = FileKind(ending="", max_degree=0, module="pycolmap")
 POSITION_KINDS = (COLMAP_FOLDER, *POINT_FILES)  # these hold the centres of Gaussians, and cameras
 PLAYER_FOLDER = FileKind(ending="")
 _KINDS_BY_ENDING = {kind.ending: kind for kind in (*POINT_FILES, *FORMATS.values(), HTML_PAGE, TRANSFORMS_JSON)}
-ENDINGS = tuple(_KINDS_BY_ENDING)
+EXPORT_ENDINGS = tuple(_KINDS_BY_ENDING)
 
 
 def find_file_kind(
@@ -45,11 +45,11 @@ def find_file_kind(
         other_endings: further endings that the caller accepts, to be named in the error message.
 
     Raises:
-        HyrfError: the ending is none of ENDINGS, or contradicts `colmap`.
+        HyrfError: the ending is none of EXPORT_ENDINGS, or contradicts `colmap`.
     """
     name = Path(target).name.lower()
     if colmap:
-        if name.endswith(ENDINGS) and not os.path.isdir(target):
+        if name.endswith(EXPORT_ENDINGS) and not os.path.isdir(target):
             raise HyrfError(
                 f"{target}: a COLMAP model is a folder of tables, not a file",
                 fix="use a path without a file extension with `colmap=True`",
@@ -67,7 +67,7 @@ def find_file_kind(
         return PLAYER_FOLDER
     raise HyrfError(
         f"{target}: the file extension does not name a known format",
-        fix=f"use one of {', '.join((*other_endings, *ENDINGS))}, or give a folder for a player",
+        fix=f"use one of {', '.join((*other_endings, *EXPORT_ENDINGS))}, or give a folder for a player",
     )
 
 

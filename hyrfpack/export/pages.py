@@ -82,7 +82,7 @@ def write_native_page(
 def suggest_compression(source: str | os.PathLike[str], length: int) -> None:
     """Suggest `hyrfpack compress` if a model file of `length` bytes is large or uncompressed."""
     if length > LARGE_FILE_BYTES or describe_file(source)["profile"] == "raw":
-        _LOG.info(f"{source} goes along as it is, {length:,} bytes; 'hyrfpack compress' makes it smaller")
+        _LOG.info(f"{source} is copied unchanged, {length:,} bytes; 'hyrfpack compress' makes it smaller")
 
 
 def _page_settings(loaded: Source, title: str) -> dict[str, Any]:

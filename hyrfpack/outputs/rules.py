@@ -19,21 +19,21 @@ class Refusal(Enum):
 
     @property
     def problem(self) -> str:
-        """What is wrong."""
+        """The problem, as in `HyrfError`."""
         return self.value[0]
 
     @property
     def fix(self) -> str:
-        """What to do."""
+        """The fix, as in `HyrfError`."""
         return self.value[1]
 
 
 @dataclass(frozen=True)
 class FileFacts:
-    """What decides whether a file may be written.
+    """The facts that decide whether a file may be written.
 
     Attributes:
-        is_folder, is_device: what exists at the path, if that is no file.
+        is_folder, is_device: what exists at the path, if that is not a file.
         is_input: a file that is read has this path, or another name or a link of it.
         folder_is_read: photos or poses are read from the folder of the path, with all links followed.
         has_ending: the name has an allowed ending.
@@ -53,7 +53,7 @@ class FileFacts:
 def refuse_file(facts: FileFacts, overwrite: bool) -> Refusal | None:
     """Return the first reason for which a file may not be written, or None if it may.
 
-    What a command reads is never replaced. `overwrite` allows to replace other files, and to write into sets of photos
+    What a command reads is never replaced. `overwrite` allows replacing other files, and writing into sets of photos
     that the command does not read.
     """
     refusals = {

@@ -16,7 +16,8 @@ from hyrfpack.poses.prepare import COPY_REASON_PREFIX, select_unreadable
 MIN_PHOTOS = 3
 _MIN_TYPICAL_FEATURES = 60  # photos with fewer features cannot be matched
 _MIN_CONTENT_SHARPNESS = 0.1  # a blurred photo that shows something is sharper than this
-_PANORAMA_PAIR_RATIO = 0.8  # with this ratio of pairs without translation or more, the photos were taken from one place
+# Photos were taken from one place if at least this ratio of their pairs has no translation.
+_MIN_PANORAMA_PAIR_RATIO = 0.8
 
 
 def check_photo_count(given: Path, folder: Path, usable: int, left_out: Mapping[str, str]) -> None:
@@ -86,7 +87,7 @@ def check_matches(folder: Path, count: int, matches: Mapping[str, Any]) -> None:
             f"{folder}: {matches['pairs'] or 'no'} pairs of these {count} photos show the same thing",
             fix="take sharp photos of one scene, each sharing two thirds of its view with the next",
         )
-    if matches["turned"] >= _PANORAMA_PAIR_RATIO:
+    if matches["turned"] >= _MIN_PANORAMA_PAIR_RATIO:
         raise HyrfDataError(
             f"{folder}: all photos were taken from one place, so that they show no depth",
             fix="walk around the scene, with a step to the side between photos",

@@ -14,7 +14,7 @@ from hyrfpack.checks import check_type
 from hyrfpack.config.poses import PosesConfig
 from hyrfpack.context import RunContext
 from hyrfpack.data.archive import archive_paths_in_errors, is_archive, unpack
-from hyrfpack.data.equirectangular import FACES
+from hyrfpack.data.equirectangular import CUBE_FACES
 from hyrfpack.data.folder import list_photos, list_pictures, list_raw_photos
 from hyrfpack.data.unusable import raise_if_single_photo, raw_photos_notes, unreadable_sentences
 from hyrfpack.errors import HyrfDataError
@@ -335,7 +335,7 @@ class _PoseEstimation:
         if masks:
             self._add_note(f"{len(masks)} of {len(photos)} photos have a mask")
         if faces := sum(photo.face is not None for photo in photos):
-            self._add_note(f"{faces // len(FACES)} panoramas were cut into {faces} photos")
+            self._add_note(f"{faces // len(CUBE_FACES)} panoramas were cut into {faces} photos")
         sideways = sum(photo.facts.orientation != 1 for photo in photos)
         if sideways and turned:
             self._add_note(f"{sideways} photos that the camera stored on their side were turned upright")

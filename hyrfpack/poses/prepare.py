@@ -17,7 +17,7 @@ from PIL import Image, ImageOps
 from hyrfpack.copying import copy_file
 from hyrfpack.data import masks as mask_files
 from hyrfpack.data.archive import display_path
-from hyrfpack.data.equirectangular import FACES, Face, FaceFile, cut_panorama, face_lens, face_size, is_panorama
+from hyrfpack.data.equirectangular import CUBE_FACES, Face, FaceFile, cut_panorama, face_lens, face_size, is_panorama
 from hyrfpack.data.folder import PhotoFacts, read_photo_facts
 from hyrfpack.data.pictures import open_picture, read_header
 from hyrfpack.errors import HyrfDataError, short_reason, strip_path
@@ -183,7 +183,7 @@ def make_images(photos: Sequence[Photo], folder: Path, progress: CountCallback =
     panoramas = {photo.facts.path: (folder / photo.name).parent for photo in photos if photo.face}
     for number, (path, target_folder) in enumerate(panoramas.items(), start=1):
         cut_panorama(path, target_folder)
-        progress(len(whole) + number * len(FACES))
+        progress(len(whole) + number * len(CUBE_FACES))
 
 
 def find_masks(photos: Sequence[Photo], folder: Path) -> dict[str, Path]:
@@ -261,7 +261,7 @@ def _make_faces(facts: PhotoFacts, source: str) -> list[Photo]:
     size = face_size(facts.size[0])
     face_facts = replace(facts, size=(size, size), orientation=1, focal=face_lens(size).fx, device="panorama")
     stem = PurePosixPath(source).with_suffix("").as_posix()
-    return [Photo(f"{stem}_{face.name}.jpg", face_facts, source, face) for face in FACES]
+    return [Photo(f"{stem}_{face.name}.jpg", face_facts, source, face) for face in CUBE_FACES]
 
 
 def _rewritten_name(source: str, taken: set[str]) -> str:

@@ -1,4 +1,4 @@
-"""Progress where standard error is no terminal, as in a log file: a plain line now and then."""
+"""Progress where standard error is not a terminal, as in a log file: a plain line now and then."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CHECK_INTERVAL_SECONDS = 0.25
 
 
 class LineDisplay:
-    """Prints the line of the present work on standard error every LOG_INTERVAL_SECONDS.
+    """Prints the line of the current work on standard error every LOG_INTERVAL_SECONDS.
 
     The last step of a training run is always printed. If standard error is closed or its disk is full, the work
     continues.

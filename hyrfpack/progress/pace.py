@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 COMPILATION_STEPS = 2  # The first steps of a run compile kernels, so they do not count for the speed.
-# The pace of a work is known once at least this share of it and this time have passed.
+# A pace is known once at least this share of the work is done and this time has passed.
 MIN_PACE_SHARE = 0.01
 MIN_PACE_SECONDS = 2.0
 MIN_SAMPLE_INTERVAL_SECONDS = 0.5
@@ -33,7 +33,7 @@ class StepPace:
 
 
 class SharePace:
-    """Measures how fast the completed share of a work grows, over the last half of its time."""
+    """Measures how fast the completed share of some work grows, over the last half of its time."""
 
     def __init__(self, start: float) -> None:
         """Begin at time `start`, in seconds."""

@@ -97,7 +97,7 @@ class Status:
         self.event, self._time = event, now
 
     def line(self) -> StatusLine | None:
-        """Return the present line; None if there is nothing to show."""
+        """Return the current line; None if there is nothing to show."""
         now, event = monotonic(), self.event
         if isinstance(event, StepEvent):
             return self._step_line(event, now)

@@ -63,7 +63,7 @@ MAX_SCORED_VIEWPOINTS = 12
 MAX_AMPLIFIED_RMS = 0.4
 MAX_AMPLIFICATION = 64
 DECODE_TIMING_TURNS = 3
-WRITTEN_FILE_NAME = "this file"
+WRITTEN_FILE_LABEL = "this file"
 SAME_DISTORTION_NAME = "compact, the same distortion"
 
 
@@ -135,22 +135,22 @@ def _write_report(
         curve = _encode_curve(model, provenance, sensitivity, distortion, written_file)
     at_same_distortion = [name for name, other in curve.items() if other is data]
     files = {
-        WRITTEN_FILE_NAME: data,
+        WRITTEN_FILE_LABEL: data,
         **profiles,
         **{name: other for name, other in curve.items() if name not in at_same_distortion},
     }
     points, decoded = _measure_files(files, scored)
 
     shown, amplified = _write_pictures(
-        folder, model, decoded[WRITTEN_FILE_NAME], scored, before, points[WRITTEN_FILE_NAME].scores, overwrite
+        folder, model, decoded[WRITTEN_FILE_LABEL], scored, before, points[WRITTEN_FILE_LABEL].scores, overwrite
     )
     findings = Findings(
         views=views_in_words,
         has_photos=scene is not None,
         before=before,
-        chosen=points[WRITTEN_FILE_NAME],
+        chosen=points[WRITTEN_FILE_LABEL],
         profiles=[points[name] for name in profiles],
-        curve=[points[WRITTEN_FILE_NAME if name in at_same_distortion else name] for name in curve],
+        curve=[points[WRITTEN_FILE_LABEL if name in at_same_distortion else name] for name in curve],
         shown=shown,
         amplified=amplified,
         gaussians=len(model),

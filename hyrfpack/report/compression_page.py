@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hyrfpack.compress import CompressionReport
-from hyrfpack.compress.sensitivity import PRUNED
+from hyrfpack.compress.sensitivity import PRUNED_KEY
 from hyrfpack.evaluate import Evaluation
 from hyrfpack.evaluate.metrics import IDENTICAL_PSNR
 from hyrfpack.format.info import sum_layers
@@ -203,7 +203,7 @@ def _section_sizes(report: CompressionReport) -> list[str]:
         loss = f"{report.shares[part.type]:.1%}" if part.type in report.shares else ""
         rows.append([part.holds, f"{part.before:,}", f"{part.after:,}", f"{part.after / total:.1%}", bits, loss])
     if report.shares:
-        rows.append(["Gaussians left out", "", "0", "0.0%", "", f"{report.shares.get(PRUNED, 0):.1%}"])
+        rows.append(["Gaussians left out", "", "0", "0.0%", "", f"{report.shares.get(PRUNED_KEY, 0):.1%}"])
     rest = total - sum(part.after for part in sections)
     rows.append(["header, table of contents, padding", "", f"{rest:,}", f"{rest / total:.1%}", "", ""])
     rows.append(["the whole file", f"{report.bytes_before:,}", f"{total:,}", "100.0%", "", ""])

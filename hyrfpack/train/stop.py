@@ -1,4 +1,4 @@
-"""Turn signals that ask a process to end into requests to stop after the present step."""
+"""Turn signals that ask a process to end into requests to stop after the current step."""
 
 from __future__ import annotations
 

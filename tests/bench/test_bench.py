@@ -16,7 +16,7 @@ from hyrfpack.bench.codec import PROFILE_SETTING_VALUES, codec_rows, parameter_e
 from hyrfpack.bench.operations import hash_encode_rows, mlp_rows, rasterize_rows
 from hyrfpack.bench.rendering import EXACT_SETTINGS, RENDER_SETTING_VALUES, render_rows
 from hyrfpack.bench.subject import Subject
-from hyrfpack.bench.suite import GROUPS, benchmark_model
+from hyrfpack.bench.suite import ROW_FUNCTIONS_BY_GROUP, benchmark_model
 from hyrfpack.config.compress import PaperSettings
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import encode_model, save_model
@@ -352,7 +352,7 @@ def test_wrong_calls_are_value_errors():
         benchmark_model(repeats=0)
     with pytest.raises(ValueError, match="without the model"):
         benchmark_model(scene=ball_scene(views=2))
-    assert callable(hyrfpack.benchmark_model) and tuple(GROUPS) == (
+    assert callable(hyrfpack.benchmark_model) and tuple(ROW_FUNCTIONS_BY_GROUP) == (
         "rasterize",
         "hash_encode",
         "mlp",

@@ -124,7 +124,7 @@ def test_a_page_embeds_the_model_unless_it_is_baked(model, tmp_path):
     result = succeeded("export", model, "-o", tmp_path / "a.html", "--overwrite")
     size = (tmp_path / "a.html").stat().st_size
     assert result.stdout == f"{tmp_path / 'a.html'}: {size:,} bytes, 40 Gaussians, unchanged: nothing is baked\n"
-    assert "goes along as it is" in result.stderr
+    assert "is copied unchanged" in result.stderr
 
 
 def test_folders_are_players_and_galleries(model, data, tmp_path):
@@ -202,10 +202,10 @@ def test_a_file_without_a_model_is_a_clear_error(tmp_path):
 
 
 def test_help_names_every_ending():
-    from hyrfpack.export.kinds import ENDINGS
+    from hyrfpack.export.kinds import EXPORT_ENDINGS
 
     printed = succeeded("export", "--help").stdout
-    assert all(re.search(rf"{re.escape(ending)}\b", printed) for ending in ENDINGS)
+    assert all(re.search(rf"{re.escape(ending)}\b", printed) for ending in EXPORT_ENDINGS)
     assert "export" in succeeded("--help").stdout and "view" in succeeded("--help").stdout
 
 

@@ -15,7 +15,7 @@ from hyrfpack.compress.part_errors import QUANTIZED_PARTS, predict_errors, updat
 from hyrfpack.compress.plan import make_plan
 from hyrfpack.compress.quantize import decide
 from hyrfpack.compress.reference_renders import ReferenceRenders
-from hyrfpack.compress.sensitivity import PRUNED, Sensitivity, measure_sensitivity
+from hyrfpack.compress.sensitivity import PRUNED_KEY, Sensitivity, measure_sensitivity
 from hyrfpack.format import decode_model, encode_model
 from hyrfpack.format.arrays import iter_parameters, to_arrays
 from hyrfpack.format.sections import COLORS, OPACITIES, POSITIONS
@@ -83,7 +83,7 @@ def test_calibrating_twice_changes_little(model, first_order):
 def test_scaled_by_multiplies_each_part_by_its_factor():
     sensitivity = Sensitivity(*np.ones((5, 3)), {"RTAB": np.ones(4)})
 
-    scaled = sensitivity.scaled_by({POSITIONS: 2.0, OPACITIES: 4.0, "RTAB": 3.0, PRUNED: 5.0})
+    scaled = sensitivity.scaled_by({POSITIONS: 2.0, OPACITIES: 4.0, "RTAB": 3.0, PRUNED_KEY: 5.0})
 
     assert [values.tolist() for values in (scaled.positions, scaled.colors, scaled.opacities)] == [
         [2.0] * 3,

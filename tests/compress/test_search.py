@@ -44,62 +44,62 @@ def worst_ratio(limit: float, start: float, trials: int) -> float:
 
 @given(limit=distortions, start=distortions, trials=st.integers(2, 14))
 def test_the_coarsest_fitting_distortion_is_found_within_the_trials(limit, start, trials):
-    attempts = RecordingTrials()
+    recorded = RecordingTrials()
 
-    answer = find_coarsest(attempts, lambda trial: trial <= limit, start, trials, DISTORTION_RANGE)
+    answer = find_coarsest(recorded, lambda trial: trial <= limit, start, trials, DISTORTION_RANGE)
 
-    assert len(attempts.made) <= trials + 1 and all(
-        DISTORTION_RANGE[0] <= noise <= DISTORTION_RANGE[1] for noise in attempts.made
+    assert len(recorded.made) <= trials + 1 and all(
+        DISTORTION_RANGE[0] <= noise <= DISTORTION_RANGE[1] for noise in recorded.made
     )
     noise, trial = answer
     assert noise == trial <= limit
-    assert noise == max(noise for noise in attempts.made if noise <= limit)
+    assert noise == max(noise for noise in recorded.made if noise <= limit)
     assert limit / noise <= worst_ratio(limit, start, trials) * (1 + 1e-9)
 
 
 @given(start=distortions, trials=st.integers(2, 14))
 def test_the_search_returns_none_if_nothing_fits(start, trials):
-    attempts = RecordingTrials()
+    recorded = RecordingTrials()
 
-    assert find_coarsest(attempts, lambda trial: False, start, trials, DISTORTION_RANGE) is None
+    assert find_coarsest(recorded, lambda trial: False, start, trials, DISTORTION_RANGE) is None
 
-    assert min(attempts.made) == DISTORTION_RANGE[0] and attempts.made.count(DISTORTION_RANGE[0]) == 1
+    assert min(recorded.made) == DISTORTION_RANGE[0] and recorded.made.count(DISTORTION_RANGE[0]) == 1
 
 
 @given(start=distortions)
 def test_the_search_returns_the_coarsest_end_if_everything_fits(start):
-    attempts = RecordingTrials()
+    recorded = RecordingTrials()
 
-    assert find_coarsest(attempts, lambda trial: True, start, 14, DISTORTION_RANGE) == (
+    assert find_coarsest(recorded, lambda trial: True, start, 14, DISTORTION_RANGE) == (
         DISTORTION_RANGE[1],
         DISTORTION_RANGE[1],
     )
 
-    assert attempts.made.count(DISTORTION_RANGE[1]) == 1
+    assert recorded.made.count(DISTORTION_RANGE[1]) == 1
 
 
 @pytest.mark.parametrize("start", [0.0, 1e-30, 1e-8, 1e-2, 7.0, math.inf])
 def test_a_start_outside_the_range_is_clipped(start):
-    attempts = RecordingTrials()
+    recorded = RecordingTrials()
 
-    find_coarsest(attempts, lambda trial: trial <= 1e-5, start, 12, DISTORTION_RANGE)
+    find_coarsest(recorded, lambda trial: trial <= 1e-5, start, 12, DISTORTION_RANGE)
 
-    assert attempts.made[0] == min(max(start, DISTORTION_RANGE[0]), DISTORTION_RANGE[1])
+    assert recorded.made[0] == min(max(start, DISTORTION_RANGE[0]), DISTORTION_RANGE[1])
 
 
 @given(limit=distortions, start=distortions)
 def test_the_returned_trial_is_one_that_was_made(limit, start):
     """Trials are files, so that the result must be one of them and not a new one."""
     assume(limit > DISTORTION_RANGE[0])
-    trials_made = []
+    recorded = []
 
-    def attempt(noise: float) -> list[float]:
-        trials_made.append([noise])
-        return trials_made[-1]
+    def make_trial(noise: float) -> list[float]:
+        recorded.append([noise])
+        return recorded[-1]
 
-    _, trial = find_coarsest(attempt, lambda trial: trial[0] <= limit, start, 10, DISTORTION_RANGE)
+    _, trial = find_coarsest(make_trial, lambda trial: trial[0] <= limit, start, 10, DISTORTION_RANGE)
 
-    assert any(trial is other for other in trials_made)
+    assert any(trial is other for other in recorded)
 
 
 # -- bytes -----------------------------------------------------------------------------------------------------------
@@ -112,40 +112,40 @@ def power_law_bytes(slope: float, at_start: float = 1e5, start: float = 1e-5):
 
 @given(limit=st.floats(6e4, 1.6e5), slope=st.floats(-0.4, -0.15))
 def test_three_trials_nearly_reach_the_limit_for_power_law_sizes(limit, slope):
-    attempts, size = RecordingTrials(), power_law_bytes(slope)
+    recorded, size = RecordingTrials(), power_law_bytes(slope)
     assume(size(DISTORTION_RANGE[0]) > limit > size(DISTORTION_RANGE[1]))
 
-    noise, trial = find_fullest(attempts, size, limit, 1e-5, 9, DISTORTION_RANGE)
+    noise, trial = find_fullest(recorded, size, limit, 1e-5, 9, DISTORTION_RANGE)
 
     assert noise == trial and ACCEPTED_SIZE_RATIO * limit <= size(trial) <= limit
-    assert len(attempts.made) <= 3
+    assert len(recorded.made) <= 3
 
 
 @given(limit=st.floats(1e3, 1e6), slope=st.floats(-2, -0.02), jump=st.floats(1, 1.5), start=distortions)
 def test_the_search_returns_the_largest_fitting_trial(limit, slope, jump, start):
-    attempts, smooth = RecordingTrials(), power_law_bytes(slope)
+    recorded, smooth = RecordingTrials(), power_law_bytes(slope)
 
     def size(noise: float) -> int:
         return int(smooth(noise) * (jump if noise < 3e-5 else 1))
 
-    answer = find_fullest(attempts, size, limit, start, 9, DISTORTION_RANGE)
+    answer = find_fullest(recorded, size, limit, start, 9, DISTORTION_RANGE)
 
-    fitting = [noise for noise in attempts.made if size(noise) <= limit]
-    assert len(attempts.made) <= 9 and all(
-        0.99 * DISTORTION_RANGE[0] < noise < 1.01 * DISTORTION_RANGE[1] for noise in attempts.made
+    fitting = [noise for noise in recorded.made if size(noise) <= limit]
+    assert len(recorded.made) <= 9 and all(
+        0.99 * DISTORTION_RANGE[0] < noise < 1.01 * DISTORTION_RANGE[1] for noise in recorded.made
     )
     assert answer == ((min(fitting),) * 2 if fitting else None)
-    if not fitting and len(attempts.made) < 9:
-        assert max(attempts.made) == pytest.approx(DISTORTION_RANGE[1])
+    if not fitting and len(recorded.made) < 9:
+        assert max(recorded.made) == pytest.approx(DISTORTION_RANGE[1])
 
 
 def test_a_jump_in_the_sizes_ends_the_search():
     """Where sizes jump, no trials are wasted between the two sides of the jump."""
-    attempts = RecordingTrials()
+    recorded = RecordingTrials()
 
     noise, _ = find_fullest(
-        attempts, lambda noise: 200_000 if noise < 2e-5 else 90_000, 100_000, 1e-5, 50, DISTORTION_RANGE
+        recorded, lambda noise: 200_000 if noise < 2e-5 else 90_000, 100_000, 1e-5, 50, DISTORTION_RANGE
     )
 
-    assert 2e-5 <= noise < 2.1e-5 and len(attempts.made) < 16
+    assert 2e-5 <= noise < 2.1e-5 and len(recorded.made) < 16
     assert TARGET_SIZE_RATIO > ACCEPTED_SIZE_RATIO

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from hyrfpack.data import load_scene
-from hyrfpack.data.equirectangular import FACES, cut_face, cut_panorama, face_lens, face_size, is_panorama
+from hyrfpack.data.equirectangular import CUBE_FACES, cut_face, cut_panorama, face_lens, face_size, is_panorama
 from hyrfpack.errors import HyrfDataError
 
 
@@ -37,7 +37,7 @@ def render_face(face, size: int) -> np.ndarray:
     return sky_colors(rays @ face.rotation)  # the transpose maps columns from the face to the panorama's camera
 
 
-@pytest.mark.parametrize("face", FACES, ids=lambda face: face.name)
+@pytest.mark.parametrize("face", CUBE_FACES, ids=lambda face: face.name)
 @pytest.mark.parametrize(("height", "size"), [(256, 163), (256, 64), (100, 200)])
 def test_a_face_matches_the_view_of_a_pinhole_camera(face, height, size):
     error = cut_face(render_panorama(height), face, size).astype(float) - render_face(face, size)
@@ -50,10 +50,10 @@ def test_a_face_matches_the_view_of_a_pinhole_camera(face, height, size):
 def test_faces_are_proper_rotations_that_cover_all_directions():
     rays = np.random.default_rng(0).normal(size=(500, 3))
 
-    for face in FACES:
+    for face in CUBE_FACES:
         assert np.linalg.det(face.rotation) == pytest.approx(1)
         np.testing.assert_array_equal(face.rotation @ face.rotation.T, np.eye(3))
-    local = np.stack([rays @ face.rotation.T for face in FACES])
+    local = np.stack([rays @ face.rotation.T for face in CUBE_FACES])
     inside = (local[..., 2] > 0) & (np.abs(local[..., :2]) <= local[..., 2:]).all(axis=-1)
     assert (inside.sum(axis=0) == 1).all()
 
@@ -63,7 +63,7 @@ def test_forward_is_the_middle_of_the_panorama_and_up_its_top():
     picture[28:36, 60:68] = (255, 0, 0)  # the forward direction
     picture[28:36, 92:100] = (0, 255, 0)  # a quarter turn to the right
     picture[:3] = (0, 0, 255)
-    middles = {face.name: tuple(cut_face(picture, face, 41)[20, 20]) for face in FACES}
+    middles = {face.name: tuple(cut_face(picture, face, 41)[20, 20]) for face in CUBE_FACES}
 
     assert middles["front"] == (255, 0, 0) and middles["right"] == (0, 255, 0) and middles["up"] == (0, 0, 255)
     assert middles["down"] == middles["back"] == middles["left"] == (0, 0, 0)
@@ -74,21 +74,23 @@ def test_detail_finer_than_a_face_is_averaged():
     stripes = np.zeros((512, 1024, 3), np.uint8)
     stripes[:, ::2] = 255
 
-    for face in FACES:
+    for face in CUBE_FACES:
         inner = cut_face(stripes, face, 40)[4:-4, 4:-4].astype(float)
         assert np.abs(inner - 127.5).max() < 12, face.name
 
 
 @pytest.mark.parametrize("channels", [1, 4])
 def test_faces_keep_the_number_of_channels(channels):
-    assert cut_face(np.full((32, 64, channels), 9, np.uint8), FACES[0], 20).tolist() == [[[9] * channels] * 20] * 20
+    assert (
+        cut_face(np.full((32, 64, channels), 9, np.uint8), CUBE_FACES[0], 20).tolist() == [[[9] * channels] * 20] * 20
+    )
 
 
 def test_a_picture_of_another_shape_is_rejected_as_a_panorama(tmp_path):
     Image.new("RGB", (90, 60)).save(tmp_path / "a.png")
 
     with pytest.raises(ValueError, match="90 x 60"):
-        cut_face(np.zeros((60, 90, 3), np.uint8), FACES[0], 8)
+        cut_face(np.zeros((60, 90, 3), np.uint8), CUBE_FACES[0], 8)
     with pytest.raises(HyrfDataError, match="twice as wide as high, but this one is 90 x 60"):
         cut_panorama(tmp_path / "a.png", tmp_path)
 
@@ -98,8 +100,8 @@ def test_faces_are_written_as_files(tmp_path):
 
     files = cut_panorama(tmp_path / "street.png", tmp_path / "faces")
 
-    assert [file.name for file in files] == [f"street_{face.name}.jpg" for face in FACES]
-    for file, face in zip(files, FACES, strict=True):
+    assert [file.name for file in files] == [f"street_{face.name}.jpg" for face in CUBE_FACES]
+    for file, face in zip(files, CUBE_FACES, strict=True):
         picture = np.asarray(Image.open(file)).astype(float)
         assert picture.shape == (face_size(256), face_size(256), 3)
         assert np.abs(picture - render_face(face, len(picture))).mean() < 2
@@ -145,7 +147,7 @@ def test_posed_panoramas_become_views_with_the_right_directions(tmp_path):
     views = {view.name: view for view in load_scene(tmp_path, test_every=0).views}
 
     assert len(views) == 12
-    for face in FACES:
+    for face in CUBE_FACES:
         view = views[f"a_{face.name}.png"]
         # In the OpenGL world, the panorama's down is the world's -y and its forward is the world's -z.
         np.testing.assert_allclose(view.camera.rotation, face.rotation @ np.diag([1.0, -1, -1]), atol=1e-12)

@@ -98,7 +98,7 @@ def test_an_uncompressed_file_is_embedded_with_a_note(model_file, compact_file, 
     export_model(model_file, tmp_path / "a.html")
     size = model_file.stat().st_size
     assert caplog.messages == [
-        f"{model_file} goes along as it is, {size:,} bytes; 'hyrfpack compress' makes it smaller"
+        f"{model_file} is copied unchanged, {size:,} bytes; 'hyrfpack compress' makes it smaller"
     ]
 
 

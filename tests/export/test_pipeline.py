@@ -20,7 +20,7 @@ from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import evaluate_model
 from hyrfpack.export import ExportReport, baked_scene, pipeline, scores
 from hyrfpack.export.bake import bake
-from hyrfpack.export.kinds import COLMAP_FOLDER, ENDINGS, PLAYER_FOLDER, find_file_kind, select_splats
+from hyrfpack.export.kinds import COLMAP_FOLDER, EXPORT_ENDINGS, PLAYER_FOLDER, find_file_kind, select_splats
 from hyrfpack.export.measure import PsnrScores, measure_psnr
 from hyrfpack.export.source import Source
 from hyrfpack.format import load_model, save_model
@@ -369,7 +369,7 @@ def test_a_file_without_cameras_is_baked_and_measured_on_an_orbit(plain_file, tm
 
 
 def test_the_suffix_selects_the_format():
-    assert [find_file_kind(f"a/b{ending}").ending for ending in ENDINGS] == list(ENDINGS)
+    assert [find_file_kind(f"a/b{ending}").ending for ending in EXPORT_ENDINGS] == list(EXPORT_ENDINGS)
     assert find_file_kind("a/b") is PLAYER_FOLDER and find_file_kind("a/b", colmap=True) is COLMAP_FOLDER
     for name, ending in {"A/B.PLY": ".ply", "a.b/c": "", "my.scene.spz": ".spz"}.items():
         assert find_file_kind(name).ending == ending

@@ -26,7 +26,7 @@ from hyrfpack.progress import StageEvent, ignore_progress
 from hyrfpack.progress.lines import LineDisplay
 from hyrfpack.splats.formats import ply
 
-PRODUCTS = ("model.hyrf", "run/model.hyrf", "export/scene.html")
+PRODUCT_PATHS = ("model.hyrf", "run/model.hyrf", "export/scene.html")
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +74,7 @@ def test_an_interrupted_command_resumes_from_its_checkpoint_to_the_same_products
     (sentence,) = succeeded(*arguments).stderr.splitlines()  # everything else is shown as progress
     assert sentence.startswith("training: 9 steps") and sentence.endswith("; on cpu")
     assert "step 6/9" in words and "step 5/9" not in words
-    for name in PRODUCTS:
+    for name in PRODUCT_PATHS:
         assert (work / name).read_bytes() == (finished_work / name).read_bytes(), name
     assert (tmp_path / "scene.html").read_bytes() == (finished_work / "export" / "scene.html").read_bytes()
 

@@ -19,7 +19,7 @@ CAMERA_POSE = look_at((0.0, -3.0, 0.0), (0.0, 0.0, 0.0))
 # Relative widths of the band in which rounding decides. The kernel works in float64.
 UNDECIDED_RATIO = {"reference": 1e-4, "gpu": 1e-12}
 # The warning is numpy's, in the interpreter.
-INFINITY_TIMES_ZERO = pytest.mark.filterwarnings("ignore:invalid value encountered in multiply")
+IGNORE_INVALID_PRODUCT_WARNING = pytest.mark.filterwarnings("ignore:invalid value encountered in multiply")
 POINT_AHEAD = (0.0, -2.0, 0.0)
 POINT_BEHIND = (0.0, -4.0, 0.0)
 
@@ -128,7 +128,7 @@ def test_the_kernel_uses_a_float64_pose_at_full_precision():
     assert found == [[0], []]
 
 
-@INFINITY_TIMES_ZERO
+@IGNORE_INVALID_PRODUCT_WARNING
 @pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 @pytest.mark.parametrize("place", [0, 128, 129])
 @pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf])
@@ -144,7 +144,7 @@ def test_cull_rejects_points_that_are_not_finite(number, place, implementation):
         cull(points, implementation=implementation)
 
 
-@INFINITY_TIMES_ZERO
+@IGNORE_INVALID_PRODUCT_WARNING
 @pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 @pytest.mark.parametrize("number", [np.nan, np.inf])
 def test_cull_rejects_the_only_point(number, implementation):

@@ -10,7 +10,7 @@ import pytest
 from hyrfpack.outputs.rules import FileFacts, Refusal, refuse_file
 
 # (facts, refusal without overwrite, refusal with it)
-RULES = [
+REFUSALS_BY_FACTS = [
     ({}, None, None),
     ({"is_folder": True, "exists": True}, Refusal.FOLDER, Refusal.FOLDER),
     ({"is_input": True, "exists": True}, Refusal.INPUT, Refusal.INPUT),
@@ -25,7 +25,7 @@ RULES = [
 ALL_FACTS = [FileFacts(*values) for values in itertools.product((False, True), repeat=len(fields(FileFacts)))]
 
 
-@pytest.mark.parametrize(("facts", "plain", "overwriting"), RULES, ids=str)
+@pytest.mark.parametrize(("facts", "plain", "overwriting"), REFUSALS_BY_FACTS, ids=str)
 def test_a_file_is_refused_for_the_stated_reason(facts, plain, overwriting):
     assert (refuse_file(FileFacts(**facts), False), refuse_file(FileFacts(**facts), True)) == (plain, overwriting)
 

@@ -8,7 +8,7 @@ from made_up_photos import arc_pose, render_panorama, wall_textures
 from PIL import Image
 
 import hyrfpack
-from hyrfpack.data.equirectangular import FACES
+from hyrfpack.data.equirectangular import CUBE_FACES
 from hyrfpack.poses.alignment import align_poses
 from hyrfpack.poses.prepare import find_masks, make_masks, read_headers
 
@@ -32,9 +32,9 @@ def panoramas(tmp_path_factory):
 def test_the_faces_of_panoramas_are_posed(panoramas, tmp_path):
     folder, truth = panoramas
     found = hyrfpack.estimate_poses(folder, tmp_path / "scene")
-    assert found.photos == PANORAMA_COUNT * len(FACES)
-    assert f"{PANORAMA_COUNT} panoramas were cut into {PANORAMA_COUNT * len(FACES)} photos" in found.notes
-    expected = {f"{name}_{face.name}.jpg": face.rotation @ pose for name, pose in truth.items() for face in FACES}
+    assert found.photos == PANORAMA_COUNT * len(CUBE_FACES)
+    assert f"{PANORAMA_COUNT} panoramas were cut into {PANORAMA_COUNT * len(CUBE_FACES)} photos" in found.notes
+    expected = {f"{name}_{face.name}.jpg": face.rotation @ pose for name, pose in truth.items() for face in CUBE_FACES}
     views = hyrfpack.load_scene(tmp_path / "scene").views
     assert {f"p{number}_front.jpg" for number in range(PANORAMA_COUNT)} <= {view.name for view in views}
     poses = {view.name: view.camera.camera_from_world[:3] for view in views}
@@ -60,7 +60,7 @@ def test_masks_of_panoramas_are_cut_with_them(panoramas, tmp_path):
     (tmp_path / "masks").mkdir()
     Image.fromarray(mask).save(tmp_path / "masks" / "p0.png")
     photos, left_out = read_headers(folder, [folder / "p0.jpg"], in_place=False)
-    assert len(photos) == len(FACES) and not left_out
+    assert len(photos) == len(CUBE_FACES) and not left_out
     made = make_masks(photos, find_masks(photos, tmp_path / "masks"), tmp_path / "made")
     usable = {name: np.asarray(Image.open(path).convert("L")) > 0 for name, path in made.items()}
     assert usable["p0_up.jpg"].all() and not usable["p0_down.jpg"].any()

@@ -93,9 +93,9 @@ def suffixes_in_docs(page: str, start: str, stop: str) -> set[str]:
 
 
 def test_the_docs_list_the_suffixes_of_the_table():
-    from hyrfpack.export.kinds import ENDINGS
+    from hyrfpack.export.kinds import EXPORT_ENDINGS
 
-    assert suffixes_in_docs("export.md", "| ending |", "\n\n") == set(ENDINGS) > set(FORMATS)
+    assert suffixes_in_docs("export.md", "| ending |", "\n\n") == set(EXPORT_ENDINGS) > set(FORMATS)
     assert suffixes_in_docs("import.md", "| read |", "\n\n") == {
         row.ending for row in FORMATS.values() if row.is_readable
     }

@@ -14,7 +14,7 @@ from hyrfpack.scene import Scene
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer
 from hyrfpack.train.density import DensityControl
 from hyrfpack.train.optimizer import Optimizer
-from tools.studies.design_choices import CHOICES, train_models_with
+from tools.studies.design_choices import CHOICES_BY_VARIANT, train_models_with
 
 
 def point_sizes(points: np.ndarray) -> np.ndarray:
@@ -53,9 +53,9 @@ def test_children_of_the_product_rule_are_decoded_as_their_parent_over_1_6(scale
     torch.testing.assert_close(children, parents.repeat(2, 1) / 1.6, rtol=1e-4, atol=0)
 
 
-@pytest.mark.parametrize("name", [name for name, choice in CHOICES.items() if choice.model])
+@pytest.mark.parametrize("name", [name for name, choice in CHOICES_BY_VARIANT.items() if choice.model])
 def test_every_choice_of_the_model_trains(name: str) -> None:
-    choice = CHOICES[name]
+    choice = CHOICES_BY_VARIANT[name]
     config = dataclasses.replace(TrainConfig(steps=20, log2_table_size=6, max_gaussians=60), **choice.training)
     with train_models_with(**choice.model):
         trainer = Trainer(ball_scene(3, 40, side=16), config)

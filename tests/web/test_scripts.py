@@ -28,7 +28,7 @@ from hyrfpack.web.player import encode_player
 from hyrfpack.web.scripts import DIGEST_NAME, SCRIPT_NAMES, is_minified_current, read_script, source_digest
 from tools.browser.build_player import PROGRAMS_FOLDER, build_player
 
-CACHES = (scripts.read_script, scripts.read_style, scripts.is_minified_current, player._pack_scripts)
+CACHED_FUNCTIONS = (scripts.read_script, scripts.read_style, scripts.is_minified_current, player._pack_scripts)
 MAX_LINE_LENGTH = 120
 
 
@@ -45,10 +45,10 @@ def replaced_files(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, str | 
 
     for module in (scripts, modules):
         monkeypatch.setattr(module, "read_web_file", read)
-    for function in CACHES:
+    for function in CACHED_FUNCTIONS:
         function.cache_clear()
     yield replaced
-    for function in CACHES:
+    for function in CACHED_FUNCTIONS:
         function.cache_clear()
 
 

@@ -28,7 +28,7 @@ const peakBytes = () => {
 
 const readVerdict = async (bytes, partial) => {
   const start = process.cpuUsage();
-  const spent = () => {
+  const elapsedCpuMs = () => {
     const { user, system } = process.cpuUsage(start);
     return (user + system) / 1000;
   };
@@ -36,22 +36,22 @@ const readVerdict = async (bytes, partial) => {
     const { layers, whole, positions, colorLogits, scaleLogits, opacityLogits, geometry, radiance } = await read(
       bytes, { partial },
     );
-    const ms = spent();
+    const ms = elapsedCpuMs();
     const numbers = { POSI: positions, COLO: colorLogits, SCAL: scaleLogits, OPAC: opacityLogits };
     Object.assign(numbers, { GTAB: geometry.table, GMLP: geometry.decoder });
     Object.assign(numbers, { RTAB: radiance.table, RMLP: radiance.decoder });
     const groups = Object.fromEntries(Object.entries(numbers).map(([group, array]) => [group, hashOf(array)]));
     return { ms, layers, whole, groups, peak: peakBytes() };
   } catch (error) {
-    const ms = spent();
+    const ms = elapsedCpuMs();
     return error instanceof HyrfFormatError ? { ms, refused: error.message } : { ms, failed: String(error.stack) };
   }
 };
 
 const all = readFileSync(process.argv[2]);
-for (let at = 0; at < all.length; ) {
-  const length = all.readUInt32LE(at), partial = all[at + 4] === 1;
-  const bytes = new Uint8Array(all.subarray(at + 5, at + 5 + length));
+for (let offset = 0; offset < all.length; ) {
+  const length = all.readUInt32LE(offset), partial = all[offset + 4] === 1;
+  const bytes = new Uint8Array(all.subarray(offset + 5, offset + 5 + length));
   console.log(JSON.stringify(await readVerdict(bytes, partial)));
-  at += 5 + length;
+  offset += 5 + length;
 }

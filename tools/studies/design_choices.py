@@ -42,7 +42,7 @@ class Choice:
     model: dict = field(default_factory=dict)
 
 
-CHOICES = {
+CHOICES_BY_VARIANT = {
     "default": Choice(),
     "scale S sigma(s_n) sigma(s_e), as the authors' code": Choice(model={"scale_rule": "product"}),
     "S(p) constant": Choice(model={"scale_grows": False}),
@@ -84,7 +84,7 @@ def main() -> None:
         __doc__, steps=2000, sets=["mipnerf360_bonsai", "gerrard_hall"], out=Path("runs/design")
     ).parse_args()
     print(markdown_table(("variant", "set", "PSNR", "spread", "SSIM", "Gaussians", "bytes", "steps/s"), []))
-    for number, (variant, choice) in enumerate(CHOICES.items()):
+    for number, (variant, choice) in enumerate(CHOICES_BY_VARIANT.items()):
         if args.only and not any(part in variant for part in args.only):
             continue
         for name in args.sets:

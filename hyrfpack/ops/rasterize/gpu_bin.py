@@ -17,9 +17,9 @@ from torch import Tensor
 from hyrfpack.ops.gpu_pairs import unpack_pair
 from hyrfpack.ops.rasterize.gpu_ellipse import TILE_SIZE, make_ellipse, touched_pixel_rows, touched_tile_columns
 from hyrfpack.ops.rasterize.gpu_project import (
-    COVARIANCE,
+    COVARIANCE_XX_YY,
     FLAGGED_INPUTS,
-    MEAN,
+    MEAN_XY,
     RECORD_WORDS,
     U_SLOPES,
     V_SLOPE_OPACITY,
@@ -87,8 +87,8 @@ def _list_pairs_kernel(
     record = records + owner * RECORD_WORDS
     u_x, u_y = unpack_pair(tl.load(record + U_SLOPES, mask=drawn, other=0))
     _, log_opacity = unpack_pair(tl.load(record + V_SLOPE_OPACITY, mask=drawn, other=0))
-    x, y = unpack_pair(tl.load(record + MEAN, mask=drawn, other=0))
-    xx, yy = unpack_pair(tl.load(record + COVARIANCE, mask=drawn, other=0))
+    x, y = unpack_pair(tl.load(record + MEAN_XY, mask=drawn, other=0))
+    xx, yy = unpack_pair(tl.load(record + COVARIANCE_XX_YY, mask=drawn, other=0))
     # Gaussians that are not drawn get some valid ellipse, so that nothing divides by zero.
     u_y, xx, yy = tl.where(drawn, u_y, 1.0), tl.where(drawn, xx, 1.0), tl.where(drawn, yy, 1.0)
     shape = make_ellipse(x, y, xx, yy, u_x, u_y, log_opacity)

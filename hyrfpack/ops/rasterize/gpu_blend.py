@@ -17,11 +17,11 @@ from hyrfpack.ops.rasterize import reference
 from hyrfpack.ops.rasterize.gpu_ellipse import LOG2_ALPHA_MIN, TILE_SIZE
 from hyrfpack.ops.rasterize.gpu_project import (
     BLUE_DEPTH,
+    CONSTANT_TERMS,
     GRADIENT_ROW_FLOATS,
-    OFFSET,
     RECORD_WORDS,
     RED_GREEN,
-    REFERENCE,
+    REFERENCE_MEAN,
     SUM_ABS_Y,
     SUM_BLUE,
     U_SLOPES,
@@ -81,7 +81,7 @@ def _load_record(records, owner, live):
     at = records + owner.to(tl.int64) * RECORD_WORDS
     # All words are loaded before the first is used, so that their latencies overlap. They are unpacked inline, since
     # calls of `unpack_pair` are slow in Triton's interpreter.
-    ref, offset, slopes = tl.load(at + REFERENCE), tl.load(at + OFFSET), tl.load(at + U_SLOPES)
+    ref, offset, slopes = tl.load(at + REFERENCE_MEAN), tl.load(at + CONSTANT_TERMS), tl.load(at + U_SLOPES)
     opacity, color, depth = tl.load(at + V_SLOPE_OPACITY), tl.load(at + RED_GREEN), tl.load(at + BLUE_DEPTH)
     log_opacity = (opacity >> 32).to(tl.int32).to(tl.float32, bitcast=True)
     return (

@@ -35,7 +35,9 @@ from hyrfpack.ops.viewport import Viewport
 # negative. REF is the mean, clamped to the image, so that the form of a needle whose mean is far outside is exact where
 # the needle is visible. The pairs are:
 #     REF_X REF_Y | U_0 V_0 | U_X U_Y | V_X LOG_OPACITY | RED GREEN | BLUE DEPTH | MEAN_X MEAN_Y | COV_XX COV_YY
-REFERENCE, OFFSET, U_SLOPES, V_SLOPE_OPACITY, RED_GREEN, BLUE_DEPTH, MEAN, COVARIANCE = map(tl.constexpr, range(8))
+REFERENCE_MEAN, CONSTANT_TERMS, U_SLOPES, V_SLOPE_OPACITY, RED_GREEN, BLUE_DEPTH, MEAN_XY, COVARIANCE_XX_YY = map(
+    tl.constexpr, range(8)
+)
 RECORD_WORDS = tl.constexpr(8)
 
 # Columns of the gradient row of a (Gaussian, tile) pair: sums over pixels of p = dL/d(ln alpha) times u, v, uu, uv, vv
@@ -352,12 +354,12 @@ def store_records(records, index, drawn, words):
     """
     reference, offset, u_slopes, v_slope_opacity, depth, mean, covariance = words
     at = records + index.to(tl.int64) * RECORD_WORDS
-    tl.store(at + REFERENCE, pack_pair(reference[0], reference[1]), mask=drawn)
-    tl.store(at + OFFSET, pack_pair(offset[0], offset[1]), mask=drawn)
+    tl.store(at + REFERENCE_MEAN, pack_pair(reference[0], reference[1]), mask=drawn)
+    tl.store(at + CONSTANT_TERMS, pack_pair(offset[0], offset[1]), mask=drawn)
     tl.store(at + U_SLOPES, pack_pair(u_slopes[0], u_slopes[1]), mask=drawn)
     tl.store(at + V_SLOPE_OPACITY, pack_pair(v_slope_opacity[0], v_slope_opacity[1]), mask=drawn)
-    tl.store(at + MEAN, pack_pair(mean[0], mean[1]), mask=drawn)
-    tl.store(at + COVARIANCE, pack_pair(covariance[0], covariance[1]), mask=drawn)
+    tl.store(at + MEAN_XY, pack_pair(mean[0], mean[1]), mask=drawn)
+    tl.store(at + COVARIANCE_XX_YY, pack_pair(covariance[0], covariance[1]), mask=drawn)
 
 
 @triton.jit

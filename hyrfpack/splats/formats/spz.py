@@ -339,7 +339,7 @@ def _choose_fractional_bits(positions: np.ndarray) -> int:
             return bits
     raise HyrfDataError(
         f"a Gaussian lies {farthest:,.0f} units from the origin, and SPZ reaches {MAX_COORDINATE:,}",
-        fix="export another format (PLY)",
+        fix="export to another format, such as PLY",
     )
 
 

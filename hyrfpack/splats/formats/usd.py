@@ -228,7 +228,9 @@ def _read_splats(prim: Usd.Prim, name: str, upright: bool) -> Splats:
     def read(attribute: Usd.Attribute, *shape: int) -> np.ndarray:
         values = np.array(attribute.Get() if attribute.HasValue() else (), np.float32)
         if values.size % int(np.prod(shape)):
-            raise HyrfDataError(f"{name}: {attribute.GetName()} has a wrong length", fix="export it again")
+            raise HyrfDataError(
+                f"{name}: {attribute.GetName()} has a length that does not fit its type", fix="export it again"
+            )
         return values.reshape(-1, *shape)
 
     if not 0 <= degree <= MAX_DEGREE:

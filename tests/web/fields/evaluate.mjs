@@ -17,7 +17,7 @@ const numbers = new Float32Array(buffer), { count } = model;
 const pointsEnd = 3 * count + (numbers.length - 3 * count) / 2;
 const points = numbers.subarray(3 * count, pointsEnd), pointDirections = numbers.subarray(pointsEnd);
 
-const cut = Math.floor(count / 3), parts = [[0, cut], [cut, count]];
+const partEnd = Math.floor(count / 3), parts = [[0, partEnd], [partEnd, count]];
 const shapes = parts.map(([start, stop]) => decodeGeometry(model, start, stop));
 const colors = parts.map(([start, stop]) => {
   const layers = firstLayers(model, start, stop);

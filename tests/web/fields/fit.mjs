@@ -13,10 +13,10 @@ import { viewpointOf } from "../../../hyrfpack/web/hyrf/viewpoint.js";
 
 const [file, cameras, degree, outputs] = process.argv.slice(2);
 const model = await read(new Uint8Array(await readFile(file)));
-const given = JSON.parse(await readFile(cameras, "utf-8"));
+const givenCameras = JSON.parse(await readFile(cameras, "utf-8"));
 const progress = [], started = performance.now();
 let coarse = null;
-const splats = await fitHarmonics(model, given ?? viewpointOf(model.metadata).fitted, Number(degree), (step) => {
+const splats = await fitHarmonics(model, givenCameras ?? viewpointOf(model.metadata).fitted, Number(degree), (step) => {
   progress.push(step.done);
   if (step.coarse) coarse = { after: progress.length, colors: Array.from(step.splats.colors.slice(0, 30)) };
 });
