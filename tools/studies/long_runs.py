@@ -6,7 +6,8 @@
 Short runs come first. If a call is stopped, the next one resumes from the checkpoint and does not repeat finished runs.
 Several calls can share one queue, because each run's folder is locked while it is trained and measured. The table has
 PSNR in dB and SSIM of the raw file on held-out photos, and the gap, which is PSNR on up to 16 training photos minus
-that. It also has bytes and scores of the compressed files as decoded from disk, and seconds of training.
+that. It also has bytes and scores of the compressed files as decoded from disk, and seconds of training. Fewer steps
+are taken than asked for if pilot runs say so.
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ from tools.tables import markdown_table
 MEASUREMENT_FILE = "measured.json"
 MAX_TRAINING_VIEWS_SCORED = 16
 TABLE_COLUMNS = (
-    "set", "steps", "seed", "gains", "PSNR", "SSIM", "gap", "Gaussians", "raw", "paper", "compact", "compact PSNR",
-    "compact SSIM", "fine-tuned", "fine-tuned PSNR", "training s",
+    "set", "steps", "taken", "seed", "gains", "PSNR", "SSIM", "gap", "Gaussians", "raw", "paper", "compact",
+    "compact PSNR", "compact SSIM", "fine-tuned", "fine-tuned PSNR", "training s",
 )  # fmt: skip
 
 
@@ -72,6 +73,7 @@ def measure(run: QueuedRun, data: Path, out: Path, finetune_steps: int) -> None:
     row = {
         **asdict(run),
         "gains": metrics["settings"]["exposure"],
+        "steps_taken": metrics["settings"]["steps"],
         "psnr": metrics["evaluation"]["psnr"],
         "ssim": metrics["evaluation"]["ssim"],
         "training_psnr": training.psnr,
@@ -110,6 +112,7 @@ def format_table(rows: list[dict]) -> str:
             [
                 row["name"],
                 f"{row['steps']:,}",
+                f"{row['steps_taken']:,}",
                 str(row["seed"]),
                 "yes" if row["gains"] else "no",
                 f"{row['psnr']:.2f}",
