@@ -66,7 +66,7 @@ def scores(monkeypatch) -> dict:
         def __init__(self, scene, config, cache, device):
             self.model = config
 
-        def run(self, report, stop):
+        def run(self, progress, stop):
             pass
 
     def evaluate(config, views, progress):
