@@ -40,7 +40,7 @@ demo: $(VENV_STAMP) ## train, compress and render a small synthetic scene; resul
 	$(BIN)/hyrfpack demo -o demo --overwrite
 
 test: lint $(NODE_STAMP) ## check style and types, then run the tests of every change (see tests/layers.py)
-	$(PYTEST) -m "not acceptance"
+	$(PYTEST) -m "not acceptance or smoke"
 
 test-all: lint $(NODE_STAMP) ## check style and types, then run all tests
 	$(PYTEST)

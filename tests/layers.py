@@ -4,8 +4,9 @@
 - `integration` tests may train on tiny scenes, run commands and start short scripts.
 - `acceptance` tests run browsers, several processes, kills, compilers and maintainers' tools.
 
-`make test` runs the first two, `make test-all` everything. A mark at the test or its module decides; otherwise a test
-that opens a browser is an acceptance test, and the longest matching path below decides for the others.
+`make test` runs the first two and those acceptance tests that have the mark `smoke`, too: a thin slice with browsers,
+several processes and a kill. `make test-all` runs everything. A mark at the test or its module decides on the layer;
+otherwise a test that opens a browser is an acceptance test, and the longest matching path below decides for the others.
 """
 
 from __future__ import annotations

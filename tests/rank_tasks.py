@@ -104,11 +104,11 @@ def record_training(ranks: Ranks, scene: Scene, config: TrainConfig) -> dict:
     """Train a run and return its curve, a digest of the parameters after each step and the final parameters."""
     trainer, rows, digests = Trainer(scene, config, ranks=ranks), [], []
 
-    def report(trainer: Trainer, loss: float, error: float) -> None:
-        rows.append((loss, error, len(trainer.model)))
+    def report(event: StepEvent) -> None:
+        rows.append((event.loss, event.mse, event.gaussians))
         digests.append(digest(trainer.model.parameters()))
 
-    assert trainer.run(report=report)
+    assert trainer.run(progress=report)
     gains = None if trainer.exposures is None else trainer.exposures.values.detach().numpy()
     parameters = {name: p.detach().numpy() for name, p in trainer.model.named_parameters()}
     return {"rows": rows, "digests": digests, "gains": gains, "records": trainer.records, "parameters": parameters}

@@ -57,7 +57,7 @@ def make_scene():
 def record_curve(trainer: Trainer) -> list[tuple[float, float, int]]:
     """Return loss, mean squared error and number of Gaussians of each step."""
     found = []
-    trainer.run(report=lambda trainer, loss, mse: found.append((loss, mse, len(trainer.model))))
+    trainer.run(progress=lambda event: found.append((event.loss, event.mse, event.gaussians)))
     return found
 
 

@@ -28,6 +28,13 @@ def test_a_mark_at_the_test_decides(request):
     assert layer_of(request.node) == "unit"
 
 
+@pytest.mark.smoke
+@pytest.mark.acceptance
+def test_every_smoke_test_is_an_acceptance_test(request):
+    smoke_tests = [item for item in request.session.items if item.get_closest_marker("smoke")]
+    assert {layer_of(item) for item in smoke_tests} == {"acceptance"}
+
+
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork")
 def test_training_and_processes_are_errors_where_they_are_forbidden():
     trainer = Trainer(ball_scene(views=2, side=16), TrainConfig(steps=1, max_gaussians=50))

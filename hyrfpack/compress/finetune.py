@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 
 import numpy as np
@@ -28,6 +28,7 @@ from hyrfpack.model.exposure import apply_exposure_gains
 from hyrfpack.ops.ssim import photometric_loss
 from hyrfpack.parallel.pool import keep_freed_memory, torch_on_one_thread
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
+from hyrfpack.progress import Progress, TaskEvent, ignore_progress
 from hyrfpack.quant.steps import FIXED_POINT_ONE, decode_step
 from hyrfpack.render import render_view
 from hyrfpack.scene import Picture, View
@@ -59,7 +60,7 @@ def finetune(
     seed: int = 0,
     gains: Mapping[str, Tensor] | None = None,
     cache: PictureCache | None = None,
-    report: Callable[[int, float], None] = lambda step, loss: None,
+    progress: Progress = ignore_progress,
     ranks: Ranks = SINGLE_PROCESS,
 ) -> tuple[HybridModel, Plan]:
     """Fit a model to the photos with its numbers quantised as in the file.
@@ -82,7 +83,7 @@ def finetune(
         gains: residual gains of each photo, applied to the render before it is compared, see `fit_residual_gains`; None
             compares renders as they are.
         cache: cache of decoded photos.
-        report: called after each step with its number, from 1, and the photometric loss.
+        progress: called with a `TaskEvent` after each step.
         ranks: processes that fit the same model together, as in `Trainer`; all get the same result.
 
     Returns:
@@ -133,7 +134,7 @@ def finetune(
                     f"{' or '.join(repr(view.name) for view in views_of_step)}: the loss or a gradient is not finite",
                     fix="compress without `finetune_steps`",
                 )
-            report(step + 1, float(loss))
+            progress(TaskEvent(f"fine-tuning, step {step + 1}/{steps}", (step + 1) / steps))
     plan, placed = replan_moved(plan, tuned)
     return placed, plan
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import count
 
 import torch
@@ -96,14 +96,17 @@ class Packer:
         if steps:
             assert self.scene is not None
             _LOG.info(f"fine-tuning for {steps:,} steps")
-
-            own_steps = -(-steps // self.ranks.size)
-
-            def follow_step(step: int, loss: float) -> None:
-                progress(TaskEvent(f"fine-tuning, step {step}/{own_steps}", 0.9 * step / own_steps))
-
-            fit = partial(finetune, gains=self._gains, cache=self.cache, report=follow_step, ranks=self.ranks)
-            planned, plan = fit(model, plan, self.sensitivity, self.scene.train, steps)
+            planned, plan = finetune(
+                model,
+                plan,
+                self.sensitivity,
+                self.scene.train,
+                steps,
+                gains=self._gains,
+                cache=self.cache,
+                progress=part_of_progress(progress, 0.0, 0.9),
+                ranks=self.ranks,
+            )
         else:
             planned = plan.apply(model)
         progress(TaskEvent("quantising", 0.9 if steps else 0.1))

@@ -18,7 +18,7 @@ from hyrfpack.distill.initialize import initial_model
 from hyrfpack.distill.reference import ReferenceViews, mean_sent_light, reference_scene
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.model import HybridModel
-from hyrfpack.progress import Progress, TaskEvent, ignore_progress, part_of_progress
+from hyrfpack.progress import Progress, StepEvent, TaskEvent, ignore_progress, part_of_progress
 from hyrfpack.progress.status import format_psnr
 from hyrfpack.scene import Camera, Scene, evenly_spaced
 from hyrfpack.splats.draw import Drawable
@@ -157,8 +157,8 @@ def _fit_to_pictures(
     )
     trainer = Trainer(scene, settings, cache, model.gaussians.positions.device, model)
 
-    def report_step(trainer: Trainer, loss: float, mse: float) -> None:
-        task = f"training, step {trainer.step}/{config.steps}, {format_psnr(mse)}"
-        progress(TaskEvent(task, trainer.step / config.steps))
+    def report_step(event: StepEvent) -> None:
+        task = f"training, step {event.step}/{event.steps}, {format_psnr(event.mse)}"
+        progress(TaskEvent(task, event.step / event.steps))
 
-    trainer.run(report=report_step)
+    trainer.run(progress=report_step)

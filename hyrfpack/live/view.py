@@ -39,7 +39,7 @@ class LiveView:
 
     Example:
         >>> view = LiveView()
-        >>> trainer.run(report=lambda trainer, loss, mse: view.observe(trainer))
+        >>> trainer.run(progress=lambda event: view.observe(trainer))
     """
 
     def __init__(self, clock: Callable[[], float] = monotonic) -> None:

@@ -26,7 +26,7 @@ from hyrfpack.make.plan import (
 from hyrfpack.make.progress import Reporter
 from hyrfpack.make.source import LoadSettings
 from hyrfpack.model import HybridModel
-from hyrfpack.progress import part_of_progress
+from hyrfpack.progress import StepEvent, part_of_progress
 from hyrfpack.render import render_view
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Camera, Scene, evenly_spaced
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer
@@ -227,13 +227,13 @@ def measure_scene_cost(
     waiting: list[float] = []
     end = monotonic() + seconds
 
-    def report(trainer: Trainer, loss: float, mse: float) -> None:
+    def measure_step(event: StepEvent) -> None:
         waited = trainer.seconds["data"] - sum(waiting)
         working.append(trainer.elapsed - sum(working) - sum(waiting) - waited)
         waiting.append(waited)
-        counts.append(len(trainer.model))
+        counts.append(event.gaussians)
 
-    trainer.run(report=report, stop=lambda: len(working) > 2 * PROBE_WARM_UP_STEPS and monotonic() > end)
+    trainer.run(progress=measure_step, stop=lambda: len(working) > 2 * PROBE_WARM_UP_STEPS and monotonic() > end)
     step, per_gaussian_seconds = _fit_line(counts[PROBE_WARM_UP_STEPS:], working[PROBE_WARM_UP_STEPS:])
     views = [view.camera for view in evenly_spaced(scene.train, 4)]
     cpu_pass_seconds = _measure_cpu_pass(trainer.model, views)

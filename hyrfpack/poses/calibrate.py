@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import pycolmap
 
 from hyrfpack.poses.job import DEFAULT_FOCAL_RATIO
+from hyrfpack.progress import Progress, TaskEvent, ignore_progress
+
+FOCAL_SEARCH_TASK = "estimating focal lengths from matches"
 
 # Focal lengths over the longer side of the picture, from the wide angles of phones to short telephoto lenses.
 CANDIDATE_FOCAL_RATIOS = np.geomspace(0.45, 2.8, 17)
@@ -38,7 +41,8 @@ def search_focal_ratio(
     pairs: Sequence[PixelMatches],
     camera: pycolmap.Camera,
     seed: int,
-    progress: Callable[[float], None] = lambda share: None,
+    progress: Progress = ignore_progress,
+    task: str = FOCAL_SEARCH_TASK,
 ) -> float:
     """Search the focal length, over the longer side, with which calibrated geometry explains the most matches.
 
@@ -50,14 +54,15 @@ def search_focal_ratio(
         pairs: matches between photos of the camera.
         camera: the camera, of which only size and model are used.
         seed: random seed of RANSAC.
-        progress: called with the completed ratio of the search, in [0, 1).
+        progress: called with a `TaskEvent` before each candidate.
+        task: description of these events.
     """
     options = pycolmap.RANSACOptions()
     options.max_error, options.random_seed = _RANSAC_ERROR_PIXELS, seed % 2**31
     options.min_num_trials, options.max_num_trials = _MAX_RANSAC_TRIALS // 3, _MAX_RANSAC_TRIALS
     scores = []
     for index, focal in enumerate(CANDIDATE_FOCAL_RATIOS):
-        progress(index / len(CANDIDATE_FOCAL_RATIOS))
+        progress(TaskEvent(task, index / len(CANDIDATE_FOCAL_RATIOS)))
         candidate = camera_with_focal(camera, focal)
         found = [pycolmap.estimate_essential_matrix(p.pixels1, p.pixels2, candidate, candidate, options) for p in pairs]
         shares = [0.0 if f is None else f["num_inliers"] / len(p.pixels1) for f, p in zip(found, pairs, strict=True)]

@@ -201,10 +201,9 @@ class _PoseEstimation:
             root = self._take_frames()
             source_files = list_photos(root)
         copies_photos = not (in_place or is_video)
-        looking = self._photo_counter(
-            "reading the headers of photos", len(source_files), 0.9 if is_video else 0.0, 0.5 if copies_photos else 1
-        )
-        photos, self.left_out = read_headers(root, source_files, in_place=not copies_photos, progress=looking)
+        report_photos = partial(self._report_progress, "photos")
+        report_reading = part_of_progress(report_photos, 0.9 if is_video else 0.0, 0.5 if copies_photos else 1.0)
+        photos, self.left_out = read_headers(root, source_files, in_place=not copies_photos, progress=report_reading)
         self.photo_count = len(photos) + len(self.left_out)
         diagnosis.check_photo_count(self.given_path, root, len(photos), self.left_out)
         self.user_names = self._map_user_names(photos)
@@ -220,8 +219,8 @@ class _PoseEstimation:
         if not is_video:
             self._claim_work_folder()  # only now, so that rejected photos do not remove products of an earlier call
         if copies_photos:
-            copying = self._photo_counter("copying photos", len(photos), 0.5, 1.0)
-            root = self.output.make_folder("images", lambda folder: make_images(photos, folder, copying))
+            report_copying = part_of_progress(report_photos, 0.5, 1.0)
+            root = self.output.make_folder("images", lambda folder: make_images(photos, folder, report_copying))
         if copies_masks:
             folder = self.output.make_folder("masks", lambda folder: make_masks(photos, masks, folder))
             masks = {name: folder / f"{name}.png" for name in masks}
@@ -306,15 +305,6 @@ class _PoseEstimation:
 
     def _user_name(self, name: str) -> str:
         return self.user_names.get(name, name)
-
-    def _photo_counter(self, doing: str, count: int, first: float, last: float) -> Callable[[int], None]:
-        """Return a function that reports how many photos are done, as `first` to `last` of the first stage."""
-
-        def progress(done: int) -> None:
-            share = first + (last - first) * done / max(count, 1)
-            self._report_progress("photos", TaskEvent(f"{doing} {done}/{count}", share))
-
-        return progress
 
     def _note_photos(self, photos: list[Photo], masks: dict[str, Path], copies_photos: bool, turned: bool) -> None:
         """Add notes about the treatment of the photos.

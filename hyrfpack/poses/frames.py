@@ -17,7 +17,7 @@ from hyrfpack.errors import HyrfDataError
 from hyrfpack.outputs import StrPath
 from hyrfpack.poses.motion import TRACKING_SIDE_PIXELS, motion_distances, track_windows
 from hyrfpack.poses.video import Video, decode_gray, decode_upright, is_video, open_video
-from hyrfpack.progress import Progress, TaskEvent, ignore_progress
+from hyrfpack.progress import Progress, TaskEvent, ignore_progress, part_of_progress
 
 __all__ = ["FrameReport", "choose_frames", "is_video", "survey_frames"]
 
@@ -237,12 +237,8 @@ def _choose_spaced_frames(
             fix="film again, slower and with more light",
         )
     sharp = np.flatnonzero(~blurred)
-
-    def report_tracked(done: int) -> None:
-        share = _MEASURED_PROGRESS + (_TRACKED_PROGRESS - _MEASURED_PROGRESS) * done / len(sharp)
-        progress(TaskEvent(f"measuring the camera motion, frame {done}/{len(sharp)}", share))
-
-    trajectories = track_windows([measured.thumbnails[index] for index in sharp], report_tracked)
+    thumbnails = [measured.thumbnails[index] for index in sharp]
+    trajectories = track_windows(thumbnails, part_of_progress(progress, _MEASURED_PROGRESS, _TRACKED_PROGRESS))
     values = measured.sharpness[sharp]
     spacing = _DEFAULT_SPACING_RATIO
     picked = _pick_sharpest_frames(trajectories, values, spacing)

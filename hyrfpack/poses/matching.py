@@ -13,6 +13,7 @@ from hyrfpack.atomic import write_atomic
 from hyrfpack.poses import pairs as pairing
 from hyrfpack.poses.calibrate import (
     CANDIDATE_FOCAL_RATIOS,
+    FOCAL_SEARCH_TASK,
     PixelMatches,
     camera_with_focal,
     rotation_only_share,
@@ -37,7 +38,6 @@ _MAX_PORTION_PAIRS = 2000
 _MIN_FOCAL_PAIR_MATCHES = 2 * MIN_PAIR_MATCHES
 _MAX_FOCAL_PAIRS = 40
 _MIN_FOCAL_PAIRS = 5
-_FOCAL_SEARCH_DESCRIPTION = "estimating focal lengths from matches"
 # Pairs are verified again if the estimate differs from the guess by more than this ratio.
 _ESTIMATED_FOCAL_CHANGE_RATIO = 0.05
 
@@ -60,7 +60,7 @@ def match_photos(job: Job, report_progress: Progress) -> dict[str, Any]:
         _match_pairs(job, _choose_pairs(job, report_progress), report_progress)
 
     report_part = part_of_progress(report_progress, 0.82, 0.95)
-    report_part(TaskEvent(_FOCAL_SEARCH_DESCRIPTION, 0.0))
+    report_part(TaskEvent(FOCAL_SEARCH_TASK, 0.0))
     recalibrate(job, "focal", lambda cameras: _estimate_focals(job, cameras, report_part), report_part)
     report_progress(TaskEvent("checking that the camera moved", 0.95))
     answer = _summarize_matches(job)
@@ -78,11 +78,7 @@ def _choose_pairs(job: Job, report_progress: Progress) -> pairing.Pairs:
         for number in range(1, count + 1):
             there = database.exists_descriptors(number)
             found.append(database.read_descriptors(number).data if there else np.zeros((0, 128), np.uint8))
-
-    def progress(done: int) -> None:
-        report_progress(TaskEvent(f"choosing pairs to match, photo {done}/{count}", 0.02 * done / count))
-
-    similarity = pairing.compute_similarities(found, job.seed, progress)
+    similarity = pairing.compute_similarities(found, job.seed, part_of_progress(report_progress, 0.0, 0.02))
     choose = pairing.sequential_pairs if job.matching == "sequential" else pairing.retrieval_pairs
     return choose(count, similarity)
 
@@ -133,16 +129,13 @@ def _estimate_focals(
     with open_database(job) as database:
         strong = _sample_strong_pairs(job, database)
     found: dict[int, float] = {}
+    count = len(job.devices)
     for number, device in enumerate(job.devices, start=1):
         camera_pairs = strong.get(number, [])
         if device.focal is None and len(camera_pairs) >= _MIN_FOCAL_PAIRS:
-
-            def progress(share: float, number: int = number) -> None:
-                camera = f", camera {number}/{len(job.devices)}" if len(job.devices) > 1 else ""
-                whole = 0.5 * (number - 1 + share) / len(job.devices)
-                report_progress(TaskEvent(f"{_FOCAL_SEARCH_DESCRIPTION}{camera}", whole))
-
-            found[number] = search_focal_ratio(camera_pairs, cameras[number], job.seed, progress)
+            report_search = part_of_progress(report_progress, 0.5 * (number - 1) / count, 0.5 * number / count)
+            task = f"{FOCAL_SEARCH_TASK}, camera {number}/{count}" if count > 1 else FOCAL_SEARCH_TASK
+            found[number] = search_focal_ratio(camera_pairs, cameras[number], job.seed, report_search, task)
     typical = float(np.median(list(found.values()))) if found else None
     better = {}
     for number, device in enumerate(job.devices, start=1):

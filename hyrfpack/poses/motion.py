@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from scipy import fft
+
+from hyrfpack.progress import Progress, TaskEvent, ignore_progress
 
 TRACKING_SIDE_PIXELS = 160  # longer side of the frames on which motion is measured
 
@@ -21,7 +23,7 @@ _LOST_MOTION_PIXELS = 24.0  # motion assumed between frames that cannot be compa
 _MOTION_QUANTILE = 0.75  # near objects move more than most windows, and they must be seen from all sides
 
 
-def track_windows(frames: Sequence[np.ndarray], progress: Callable[[int], None] = lambda done: None) -> np.ndarray:
+def track_windows(frames: Sequence[np.ndarray], progress: Progress = ignore_progress) -> np.ndarray:
     """Track windows of the picture from the first frame on.
 
     Each frame is compared by phase correlation with a reference frame, which is often older than the previous frame. So
@@ -29,7 +31,7 @@ def track_windows(frames: Sequence[np.ndarray], progress: Callable[[int], None] 
 
     Args:
         frames: (H, W) uint8 frames with TRACKING_SIDE_PIXELS on the longer side.
-        progress: called with the number of frames tracked so far.
+        progress: called with a `TaskEvent` before each frame.
 
     Returns:
         (N, windows, 2) float32 displacement of each window since the first frame, right and down, as a ratio of the
@@ -39,7 +41,7 @@ def track_windows(frames: Sequence[np.ndarray], progress: Callable[[int], None] 
     trajectories = np.zeros((len(frames), windows, 2), np.float32)
     reference, reference_spectra, last = 0, _window_spectra(frames[0]), _window_spectra(frames[0])
     for number in range(1, len(frames)):
-        progress(number)
+        progress(TaskEvent(f"measuring the camera motion, frame {number}/{len(frames)}", number / len(frames)))
         current = _window_spectra(frames[number])
         moved = _measure_shift(reference_spectra, current)
         if moved is None and reference != number - 1:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
+
+from hyrfpack.progress import Progress, TaskEvent, ignore_progress
 
 MAX_EXHAUSTIVE_PHOTOS = 200  # in larger unordered sets, only similar photos are matched
 _VOCABULARY_WORDS = 64
@@ -65,9 +65,7 @@ def _most_similar_pairs(similarity: np.ndarray, most: int) -> set[tuple[int, int
     return pairs
 
 
-def compute_similarities(
-    descriptors: list[np.ndarray], seed: int, progress: Callable[[int], None] = lambda done: None
-) -> np.ndarray:
+def compute_similarities(descriptors: list[np.ndarray], seed: int, progress: Progress = ignore_progress) -> np.ndarray:
     """Compute the similarity of each pair of photos from their feature descriptors (VLAD, Jegou et al. 2010).
 
     The vocabulary is learned from the set itself. The vector of a photo sums the differences between its descriptors
@@ -76,22 +74,22 @@ def compute_similarities(
     Args:
         descriptors: (N, 128) uint8 descriptors of each photo; N may be 0.
         seed: random seed of the descriptor sample and of k-means.
-        progress: called with the number of photos that are done.
+        progress: called with a `TaskEvent` after each photo.
 
     Returns:
         (photos, photos) cosines in [-1, 1]; 0 for photos without features.
     """
-    rng = np.random.default_rng(seed)
-    sample_per_photo = max(1, _VOCABULARY_SAMPLE_DESCRIPTORS // max(len(descriptors), 1))
+    rng, count = np.random.default_rng(seed), len(descriptors)
+    sample_per_photo = max(1, _VOCABULARY_SAMPLE_DESCRIPTORS // max(count, 1))
     sample = [found[rng.permutation(len(found))[:sample_per_photo]] for found in descriptors]
     words = _k_means(np.concatenate(sample).astype(np.float32), rng)
-    sums = np.zeros((len(descriptors), *words.shape), np.float32)
+    sums = np.zeros((count, *words.shape), np.float32)
     for photo, found in enumerate(descriptors):
         if len(found):
             values = found.astype(np.float32)
             nearest = _nearest_words(values, words)
             np.add.at(sums[photo], nearest, values - words[nearest])
-        progress(photo + 1)
+        progress(TaskEvent(f"choosing pairs to match, photo {photo + 1}/{count}", (photo + 1) / count))
     sums /= np.maximum(np.linalg.norm(sums, axis=2, keepdims=True), 1e-6)
     flat = sums.reshape(len(sums), -1)
     flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-6)

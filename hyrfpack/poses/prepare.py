@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
@@ -22,6 +22,7 @@ from hyrfpack.data.folder import PhotoFacts, read_photo_facts
 from hyrfpack.data.pictures import open_picture, read_header
 from hyrfpack.errors import HyrfDataError, short_reason, strip_path
 from hyrfpack.poses.job import Device
+from hyrfpack.progress import Progress, TaskEvent, ignore_progress
 
 # Photos with these endings are copied, because other programs that read scenes know these formats.
 _COPIED_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")
@@ -32,10 +33,10 @@ _EXIF_ORIENTATION_TAG = 0x0112
 _MAX_BURST_GAP_SECONDS = 2.0  # the median gap between the photos of a sequence is at most this long
 
 _FACE_NAME_TAKEN_REASON = "another picture has the name of one of its faces"
+_COPYING_TASK = "copying photos"
 COPY_REASON_PREFIX = "a copy of"  # the reason for leaving out a copy begins with these words
 
 Item = TypeVar("Item")
-CountCallback = Callable[[int], None]  # called with the number of photos that are done
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,7 @@ class Photo:
 
 
 def read_headers(
-    root: Path, files: Sequence[Path], in_place: bool, progress: CountCallback = lambda done: None
+    root: Path, files: Sequence[Path], in_place: bool, progress: Progress = ignore_progress
 ) -> tuple[list[Photo], dict[str, str]]:
     """Read the headers of all photos; a panorama of the whole sphere becomes six photos, its faces.
 
@@ -69,7 +70,7 @@ def read_headers(
         root: folder to which names are relative.
         files: photos in that folder.
         in_place: the photos are used where they are, without copying or changing them.
-        progress: called with the number of files read so far.
+        progress: called with a `TaskEvent` after each file.
 
     Returns:
         The usable photos, sorted by name, and the reason for each photo that is left out, by its path below `root`.
@@ -83,7 +84,8 @@ def read_headers(
     first_with: dict[tuple[int, str], str] = {}
     sizes = Counter(path.stat().st_size for path in files)
     with ThreadPoolExecutor() as pool:
-        found = list(_report_counts(pool.map(_read_facts_or_reason, files), progress))
+        reading = pool.map(_read_facts_or_reason, files)
+        found = list(_report_counts(reading, progress, "reading the headers of photos", len(files)))
     for path, facts in zip(files, found, strict=True):
         source = path.relative_to(root).as_posix()
         if isinstance(facts, str):
@@ -167,23 +169,24 @@ def is_ordered_sequence(photos: Sequence[Photo]) -> bool:
     return len(stems) == 1 and len(set(numbers)) == len(numbers)
 
 
-def make_images(photos: Sequence[Photo], folder: Path, progress: CountCallback = lambda done: None) -> None:
+def make_images(photos: Sequence[Photo], folder: Path, progress: Progress = ignore_progress) -> None:
     """Write photos into a new folder: copies of usable files, upright pictures of others, and faces of panoramas.
 
     Args:
         photos: photos to write, each under its name.
         folder: the new folder.
-        progress: called with the number of photos written so far.
+        progress: called with `TaskEvent`s.
     """
     for parent in {(folder / photo.name).parent for photo in photos}:
         parent.mkdir(parents=True, exist_ok=True)
     whole = [photo for photo in photos if photo.face is None]
     with ThreadPoolExecutor() as pool:
-        list(_report_counts(pool.map(lambda photo: _write_photo(photo, folder / photo.name), whole), progress))
+        writing = pool.map(lambda photo: _write_photo(photo, folder / photo.name), whole)
+        list(_report_counts(writing, progress, _COPYING_TASK, len(photos)))
     panoramas = {photo.facts.path: (folder / photo.name).parent for photo in photos if photo.face}
     for number, (path, target_folder) in enumerate(panoramas.items(), start=1):
         cut_panorama(path, target_folder)
-        progress(len(whole) + number * len(CUBE_FACES))
+        progress(_count_event(_COPYING_TASK, len(whole) + number * len(CUBE_FACES), len(photos)))
 
 
 def find_masks(photos: Sequence[Photo], folder: Path) -> dict[str, Path]:
@@ -245,11 +248,15 @@ def _is_panorama_or_reason(path: Path) -> bool | str:
         return strip_path(error, display_path(path))
 
 
-def _report_counts(items: Iterable[Item], progress: CountCallback) -> Iterator[Item]:
-    """Yield the items and report how many were yielded so far."""
+def _report_counts(items: Iterable[Item], progress: Progress, task: str, count: int) -> Iterator[Item]:
+    """Yield the items and report how many of `count` were yielded so far."""
     for number, item in enumerate(items, start=1):
-        progress(number)
+        progress(_count_event(task, number, count))
         yield item
+
+
+def _count_event(task: str, done: int, count: int) -> TaskEvent:
+    return TaskEvent(f"{task} {done}/{count}", done / count)
 
 
 def _hash_file(path: Path) -> str:

@@ -20,10 +20,10 @@ from hyrfpack.model.gaussians import take_rows
 from hyrfpack.ops.composite import composite
 from hyrfpack.ops.finite import all_finite
 from hyrfpack.ops.poses import camera_center
-from hyrfpack.ops.rasterize import RasterSettings, rasterize
+from hyrfpack.ops.rasterize import Gaussians3D, RasterSettings, Viewport, rasterize
 from hyrfpack.ops.rasterize.cull import frustum_cull
 from hyrfpack.ops.rasterize.inputs import TRANSMITTANCE_MIN
-from hyrfpack.ops.rasterize.shaded import rasterize_shaded
+from hyrfpack.ops.shade import Shading
 from hyrfpack.ops.transfer import tensor_like
 from hyrfpack.parallel.pool import torch_on_one_thread
 from hyrfpack.scene import Camera
@@ -64,7 +64,7 @@ class RenderSettings:
 
     def raster_settings(self, antialiased: bool, depth: bool = False) -> RasterSettings:
         """Return the settings of the rasteriser."""
-        return RasterSettings(self.near, antialiased, self.transmittance_min, depth)
+        return RasterSettings(self.near, antialiased, self.transmittance_min, depth, self.cull_tolerance)
 
 
 @dataclass(frozen=True)
@@ -137,22 +137,11 @@ def render_view(
     positions = model.gaussians.positions
     viewport = model.config.frame.local_viewport(camera, positions.dtype)
     _check_finite(pose=viewport.pose)
-    raster_settings = settings.raster_settings(model.config.antialiased, depth)
     try:
-        if decoded is None or decoded.shading is None:
-            with _record_seconds(seconds, "cull"), torch.no_grad():
-                index = frustum_cull(positions, viewport, settings.near, settings.cull_tolerance)
-            gradients = positions.new_zeros(len(index), 2) if absgrad else None
-            with _record_seconds(seconds, "decode"):
-                geometry = model.decode_geometry(index) if decoded is None else decoded.geometry[index]
-                viewpoint = camera_center(viewport.pose).to(positions.device, non_blocking=positions.is_cuda)
-                gaussians, colors = geometry.at(take_rows(positions, index)), model.decode_colors(viewpoint, index)
-            raster = rasterize(gaussians, colors, viewport, raster_settings, absgrad=gradients)
-        else:
-            index = torch.arange(len(model), device=positions.device)
-            gradients = positions.new_zeros(len(index), 2) if absgrad else None
-            gaussians, tolerance = decoded.geometry.at(positions), settings.cull_tolerance
-            raster = rasterize_shaded(gaussians, decoded.shading, viewport, raster_settings, cull_tolerance=tolerance)
+        index, gaussians, colors = _select_gaussians(model, viewport, settings, decoded, seconds)
+        gradients = positions.new_zeros(len(index), 2) if absgrad else None
+        raster_settings = settings.raster_settings(model.config.antialiased, depth)
+        raster = rasterize(gaussians, colors, viewport, raster_settings, absgrad=gradients)
     except FloatingPointError:
         raise _nonfinite_error("positions") from None
     if raster.nonfinite:
@@ -183,6 +172,27 @@ def render_view(
         pairs=raster.pairs,
         seconds=seconds,
     )
+
+
+def _select_gaussians(
+    model: HybridModel, viewport: Viewport, settings: RenderSettings, decoded: Decoded | None, seconds: dict[str, float]
+) -> tuple[Tensor, Gaussians3D, Tensor | Shading]:
+    """Return indices (n,) of the Gaussians to rasterise, these Gaussians, and their colours as `rasterize` takes them.
+
+    Without precomputed shading only Gaussians in view are decoded. With it `rasterize` gets all and culls them itself.
+
+    Raises:
+        FloatingPointError: a position is NaN or infinite.
+    """
+    positions = model.gaussians.positions
+    if decoded is not None and decoded.shading is not None:
+        return torch.arange(len(model), device=positions.device), decoded.geometry.at(positions), decoded.shading
+    with _record_seconds(seconds, "cull"), torch.no_grad():
+        index = frustum_cull(positions, viewport, settings.near, settings.cull_tolerance)
+    with _record_seconds(seconds, "decode"):
+        geometry = model.decode_geometry(index) if decoded is None else decoded.geometry[index]
+        viewpoint = camera_center(viewport.pose).to(positions.device, non_blocking=positions.is_cuda)
+        return index, geometry.at(take_rows(positions, index)), model.decode_colors(viewpoint, index)
 
 
 def apply_exposure_map(model: HybridModel, camera: Camera, rgb: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ import torch
 from hyrfpack.config.train import TrainConfig
 from hyrfpack.data import PictureCache
 from hyrfpack.evaluate import Evaluation, evaluate_model
-from hyrfpack.progress import Progress, TaskEvent, ignore_progress, items_of_progress
+from hyrfpack.progress import Progress, StepEvent, TaskEvent, ignore_progress, items_of_progress
 from hyrfpack.scene import Picture, Scene, View, evenly_spaced
 from hyrfpack.train.setup import budget_for
 from hyrfpack.train.trainer import Trainer
@@ -148,12 +148,12 @@ class ScenePilots:
         trainer = Trainer(fold.scene, settings, self.cache, self._device)
         before = self.steps
 
-        def report_step(trainer: Trainer, loss: float, mse: float) -> None:
-            self.steps = before + trainer.step
+        def report_step(event: StepEvent) -> None:
+            self.steps = before + event.step
             share = min(1.0, self.steps / self._max_steps) if self._max_steps else None
-            self._progress(TaskEvent(f"{name}: training", share, trainer.step, steps))
+            self._progress(TaskEvent(f"{name}: training", share, event.step, steps))
 
-        trainer.run(report=report_step, stop=self._stop)
+        trainer.run(progress=report_step, stop=self._stop)
         if self._stop():
             raise PilotsStopped
         count = len(fold.validation)

@@ -281,15 +281,14 @@ class _Run:
         if self.context.is_shown:
             reports.append(LongRunAdvice(trainer.steps, trainer.step, self.device).step)
 
-        def report_step(trainer: Trainer, loss: float, mse: float) -> None:
-            event = StepEvent(trainer.step, trainer.steps, loss, mse, len(trainer.model))
+        def report_step(event: StepEvent) -> None:
             for report in reports:
                 report(event)
             if self.observer is not None and self.ranks.is_main:
                 self.observer(trainer)
 
         with catch_stop_signals(self.context.stop) as stop:
-            return trainer.run(checkpoint=self._checkpoint, report=report_step, stop=stop, overwrite=self._replaces)
+            return trainer.run(checkpoint=self._checkpoint, progress=report_step, stop=stop, overwrite=self._replaces)
 
 
 def is_begun(out: Path) -> bool:

@@ -26,6 +26,7 @@ from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.ops.ssim import photometric_loss
 from hyrfpack.parallel.pool import keep_freed_memory, torch_on_one_thread
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
+from hyrfpack.progress import StepEvent, ignore_progress
 from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.scene import Picture, Scene, View
 from hyrfpack.train.checkpoint import load_checkpoint, names_and_sizes, save_checkpoint
@@ -128,7 +129,7 @@ class Trainer:
         self,
         *,
         checkpoint: Path | None = None,
-        report: Callable[[Trainer, float, float], None] = lambda trainer, loss, mse: None,
+        progress: Callable[[StepEvent], None] = ignore_progress,
         stop: Callable[[], bool] = lambda: False,
         overwrite: bool = True,
     ) -> bool:
@@ -139,8 +140,7 @@ class Trainer:
 
         Args:
             checkpoint: path of the checkpoint; written every `checkpoint_every` steps and when stopped early.
-            report: called after each step with the trainer, and the loss and mean squared error of the step's view (NaN
-                if all of its photo is masked).
+            progress: called after each step.
             stop: called in each step; the run ends after the step in which it returns True.
             overwrite: replace a file at `checkpoint` that belongs to another run.
 
@@ -166,7 +166,7 @@ class Trainer:
                 complete = self.step == self.steps
                 if complete:
                     self._fit_exposure_map()
-                report(self, loss, mse)
+                progress(StepEvent(self.step, self.steps, loss, mse, len(self.model)))
                 stopped = (stop() if self.ranks.is_single else stopped) and not complete
                 if checkpoint and (stopped or (self.step % every == 0 and not complete)):
                     try:

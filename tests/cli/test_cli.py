@@ -238,12 +238,12 @@ def test_a_video_without_ffmpeg_gives_pictures_and_a_note(packed, tmp_path, monk
 def test_interrupted_training_saves_exits_with_1_and_says_how_to_resume(options, messages, data, tmp_path, monkeypatch):
     before, run = signal.getsignal(signal.SIGINT), Trainer.run
 
-    def run_interrupted(trainer, *, report, **rest):
-        def report_and_interrupt(*step):
-            report(*step)
+    def run_interrupted(trainer, *, progress, **rest):
+        def report_and_interrupt(event):
+            progress(event)
             signal.raise_signal(signal.SIGINT)
 
-        return run(trainer, report=report_and_interrupt, **rest)
+        return run(trainer, progress=report_and_interrupt, **rest)
 
     monkeypatch.setattr(Trainer, "run", run_interrupted)
     result = hyrfpack("train", data, "-o", tmp_path, "--steps", 100, "--max-gaussians", 200, "--json", *options)

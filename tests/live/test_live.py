@@ -75,7 +75,7 @@ def test_training_with_a_live_view_gives_the_same_model_bit_by_bit(exposure, bac
 def test_a_snapshot_holds_the_model_of_its_step_and_the_cameras_of_the_photos():
     trainer, view = Trainer(make_scene(), TRAIN_CONFIG), LiveView(Clock())
     for wanted in (1, 40):
-        trainer.run(report=lambda trainer, *_: view.observe(trainer), stop=lambda wanted=wanted: trainer.step == wanted)
+        trainer.run(progress=lambda _: view.observe(trainer), stop=lambda wanted=wanted: trainer.step == wanted)
         assert read_progress(view) == {"snapshot": 1 if wanted == 1 else 2, "step": wanted, "steps": 40}
         shown = dict(decode_model(read_content(view.scene)).named_parameters())
         assert shown.keys() == dict(trainer.model.named_parameters()).keys()
@@ -85,7 +85,7 @@ def test_a_snapshot_holds_the_model_of_its_step_and_the_cameras_of_the_photos():
 
 def test_a_snapshot_keeps_the_cameras_for_the_page_to_start_from(tmp_path):
     trainer, view = Trainer(make_scene(), dataclasses.replace(TRAIN_CONFIG, steps=1)), LiveView()
-    trainer.run(report=lambda trainer, *_: view.observe(trainer))
+    trainer.run(progress=lambda _: view.observe(trainer))
     file = tmp_path / "snapshot.hyrf"
     file.write_bytes(read_content(view.scene))
     kept = describe_file(file)["provenance"]
@@ -131,7 +131,7 @@ def test_the_first_step_and_the_last_one_are_always_shown(monkeypatch):
 
 def test_a_model_that_is_not_finite_keeps_the_previous_snapshot():
     trainer, view = Trainer(make_scene(), TRAIN_CONFIG), LiveView(lambda: 0.0)
-    trainer.run(report=lambda trainer, *_: view.observe(trainer), stop=lambda: trainer.step == 1)
+    trainer.run(progress=lambda _: view.observe(trainer), stop=lambda: trainer.step == 1)
     before = read_content(view.scene)
     with torch.no_grad():
         trainer.model.gaussians.positions[0] = float("nan")
@@ -151,7 +151,7 @@ def test_the_page_and_its_files_are_served_while_the_block_runs_and_not_after(ca
         assert b"<title>a &lt;scene&gt;</title>" in fetched("")
         assert json.loads(fetched("training.json")) == {"snapshot": 0, "step": 0, "steps": 0}
         trainer = Trainer(make_scene(), dataclasses.replace(TRAIN_CONFIG, steps=2))
-        trainer.run(report=lambda trainer, *_: view.observe(trainer))
+        trainer.run(progress=lambda _: view.observe(trainer))
         assert json.loads(fetched("training.json")) == {"snapshot": 2, "step": 2, "steps": 2}
         assert len(decode_model(fetched("scene.hyrf"))) == len(trainer.model)
     with pytest.raises(urllib.error.URLError):

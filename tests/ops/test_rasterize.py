@@ -578,6 +578,9 @@ def test_unfit_arguments_are_rejected() -> None:
     for near in (-1e-3, math.nan):
         with pytest.raises(ValueError, match="near is"):
             RasterSettings(near=near)
+    for cull_tolerance in (-1e-3, math.nan):
+        with pytest.raises(ValueError, match="cull_tolerance is"):
+            RasterSettings(cull_tolerance=cull_tolerance)
     with pytest.raises(ValueError, match="no pixels"):
         Viewport(camera, intrinsics, 0, 10)
     with pytest.raises(ValueError, match="absgrad is"):

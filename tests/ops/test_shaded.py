@@ -1,4 +1,4 @@
-"""rasterize_shaded: the combined kernel against culling, shading and rasterising in sequence, in float64."""
+"""rasterize with a Shading: the combined kernel against culling, shading and rasterising in sequence, in float64."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ import pytest
 import torch
 from ops.device import gpu, needs_triton
 
-from hyrfpack.ops.rasterize import Gaussians3D, Rasterization, RasterSettings
-from hyrfpack.ops.rasterize.shaded import rasterize_shaded
+from hyrfpack.ops.rasterize import Gaussians3D, Rasterization, RasterSettings, rasterize
 from hyrfpack.ops.shade import DIRECTION_FEATURES, Shading
 from hyrfpack.ops.viewport import Viewport
 
@@ -58,9 +57,9 @@ def camera(distance: float = 4.0) -> torch.Tensor:
 def draw(
     splats: list, colors: Shading, pose: torch.Tensor, implementation: str, cull_tolerance: float = 0.0, **options
 ) -> Rasterization:
-    viewport, settings = Viewport(pose, CAMERA_INTRINSICS, 24, 20), RasterSettings(depth=True, **options)
-    how = {"cull_tolerance": cull_tolerance, "implementation": implementation}
-    return rasterize_shaded(Gaussians3D(*splats), colors, viewport, settings, **how)
+    viewport = Viewport(pose, CAMERA_INTRINSICS, 24, 20)
+    settings = RasterSettings(depth=True, cull_tolerance=cull_tolerance, **options)
+    return rasterize(Gaussians3D(*splats), colors, viewport, settings, implementation=implementation)
 
 
 def draw_on_gpu(splats: list, colors: Shading, pose: torch.Tensor, **options) -> Rasterization:

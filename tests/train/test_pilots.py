@@ -69,7 +69,7 @@ def scores(monkeypatch) -> dict:
         def __init__(self, scene, config, cache, device):
             self.model = config
 
-        def run(self, report, stop):
+        def run(self, progress, stop):
             pass
 
     def evaluate(config, views, progress):
@@ -410,7 +410,7 @@ def measure_scene_length(scores: dict[int, float], steps: int, monkeypatch) -> t
         def __init__(self, scene, config, cache, device):
             self.model = config
 
-        def run(self, report, stop):
+        def run(self, progress, stop):
             pass
 
     monkeypatch.setattr(pilots, "Trainer", Untrained)

@@ -52,7 +52,7 @@ else:
     trainer = Trainer(make_scene(), RUN_CONFIG)
     if (out / "checkpoint.pt").exists():
         trainer.load(out / "checkpoint.pt")
-    trainer.run(checkpoint=out / "checkpoint.pt", report=lambda t, loss, mse: print(t.step, flush=True))
+    trainer.run(checkpoint=out / "checkpoint.pt", progress=lambda event: print(event.step, flush=True))
 """
 
 

@@ -62,7 +62,7 @@ def test_training_reduces_the_loss_and_raises_the_psnr():
     trainer = Trainer(make_scene(side=32), TrainConfig(steps=60, max_gaussians=160))
     before, losses = mean_training_psnr(trainer), []
 
-    trainer.run(report=lambda trainer, loss, mse: losses.append(loss))
+    trainer.run(progress=lambda event: losses.append(event.loss))
 
     assert len(losses) == trainer.step == 60
     assert np.mean(losses[-6:]) < 0.5 * np.mean(losses[:6])
@@ -74,7 +74,7 @@ def test_objects_with_coverage_train_over_any_colour(alpha_color):
     config = TrainConfig(steps=40, max_gaussians=160, background_color=alpha_color)
     trainer = Trainer(make_scene(alpha=True), config)
     losses = []
-    trainer.run(report=lambda trainer, loss, mse: losses.append(loss))
+    trainer.run(progress=lambda event: losses.append(event.loss))
     assert trainer.model.config.background is False
     assert np.mean(losses[-6:]) < 0.9 * np.mean(losses[:6])
 
@@ -91,7 +91,7 @@ def test_another_seed_gives_another_model(uninterrupted_trainer):
 def test_the_budget_is_kept_at_every_step():
     counts = []
     trainer = Trainer(make_scene(), dataclasses.replace(SHORT_CONFIG, max_gaussians=75))
-    trainer.run(report=lambda trainer, loss, mse: counts.append(len(trainer.model)))
+    trainer.run(progress=lambda event: counts.append(event.gaussians))
     assert max(counts) <= 75 and counts[-1] > 60
 
 
@@ -167,12 +167,12 @@ def test_elapsed_seconds_are_those_of_the_steps_over_all_parts_of_a_run(tmp_path
 
     first, second = Trainer(make_scene(), config), Trainer(make_scene(), config)
     use_clock(first, clock, monkeypatch)
-    first.run(checkpoint=path, report=meanwhile, stop=lambda: first.step == 5)
+    first.run(checkpoint=path, progress=meanwhile, stop=lambda: first.step == 5)
     assert first.elapsed == 10
     second.load(path)
     assert second.elapsed == 10 and second.seconds["optimizer"] == 10
     use_clock(second, clock, monkeypatch)
-    second.run(report=meanwhile)
+    second.run(progress=meanwhile)
 
     assert second.elapsed == 24 and second.seconds["optimizer"] == 24 and second.seconds["backward"] == 0
 
@@ -193,7 +193,7 @@ def test_torch_computes_on_one_thread_while_training_and_on_as_many_as_before_af
     try:
         torch.set_num_threads(2)
         with pytest.raises(KeyboardInterrupt) if fails else nullcontext():
-            trainer.run(report=look)
+            trainer.run(progress=look)
         assert set(seen) == {1} and torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(before)
@@ -203,7 +203,7 @@ def test_reported_errors_are_those_of_the_picture():
     """With one view and no learning, step 1 reports the mean squared error of the untrained model."""
     trainer = Trainer(make_scene(views=1), TrainConfig(steps=1, max_gaussians=80))
     before, seen = mean_training_psnr(trainer), []
-    trainer.run(report=lambda trainer, loss, mse: seen.append(mse))
+    trainer.run(progress=lambda event: seen.append(event.mse))
     assert -10 * np.log10(seen[0]) == pytest.approx(before, abs=1e-3)
 
 
@@ -256,7 +256,7 @@ def test_reported_errors_are_those_outside_the_mask():
     with torch.no_grad():
         rgb = render_view(trainer.model, view.camera).rgb.double().numpy()
     seen = []
-    trainer.run(report=lambda trainer, loss, mse: seen.append(mse))
+    trainer.run(progress=lambda event: seen.append(event.mse))
     errors = (rgb - view.load().rgb / 255) ** 2
     assert seen[0] == pytest.approx(errors[4:15, 7:20].mean(), rel=1e-4)
     assert abs(seen[0] - errors.mean()) > 0.01 * errors.mean()  # otherwise the mask would make no difference
@@ -268,7 +268,7 @@ def test_a_completely_masked_photo_does_not_change_the_model():
     masked = view_of(view.name, view.camera, Picture(view.load().rgb, None, np.zeros((24, 24), bool)))
     trainer = Trainer(dataclasses.replace(scene, train=[masked]), dataclasses.replace(SHORT_CONFIG, steps=1))
     before, said = parameter_bytes(trainer), []
-    trainer.run(report=lambda trainer, loss, mse: said.append((loss, mse)))
+    trainer.run(progress=lambda event: said.append((event.loss, event.mse)))
     assert said[0][0] == 0 and np.isnan(said[0][1])
     assert trainer.records == [] and parameter_bytes(trainer) == before
 
@@ -324,7 +324,7 @@ def test_random_backgrounds_resume_too(tmp_path):
 def test_regular_checkpoints_are_written_while_running(tmp_path):
     path, found = tmp_path / "checkpoint.pt", []
     trainer = Trainer(make_scene(), dataclasses.replace(SHORT_CONFIG, steps=12, checkpoint_every=5))
-    trainer.run(checkpoint=path, report=lambda trainer, loss, mse: found.append(path.exists()))
+    trainer.run(checkpoint=path, progress=lambda _: found.append(path.exists()))
     assert found == [step > 5 for step in range(1, 13)]
     trainer.load(path)
     assert trainer.step == 10
@@ -477,7 +477,7 @@ HARD_STARTS = {
 def test_hard_starts_train_to_finite_parameters(start):
     trainer = Trainer(HARD_STARTS[start](), dataclasses.replace(SHORT_CONFIG, steps=20))
     losses = []
-    trainer.run(report=lambda trainer, loss, mse: losses.append(loss))
+    trainer.run(progress=lambda event: losses.append(event.loss))
     assert 1 <= len(trainer.model) <= 160
     assert all(torch.isfinite(p).all() for p in trainer.model.parameters())
     assert np.mean(losses[-4:]) <= np.mean(losses[:4])
@@ -506,7 +506,7 @@ def opaque_object_on_a_plain_wall() -> Scene:
 def test_sparse_opaque_scenes_do_not_collapse(make, config, gain):
     trainer = Trainer(make(), config)
     first, before, counts = len(trainer.model), mean_training_psnr(trainer), []
-    trainer.run(report=lambda trainer, loss, mse: counts.append(len(trainer.model)))
+    trainer.run(progress=lambda event: counts.append(event.gaussians))
     assert min(counts) > first / 2
     assert mean_training_psnr(trainer) > before + gain
 

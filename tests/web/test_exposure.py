@@ -112,7 +112,7 @@ def test_both_exposures_look_as_in_hyrfpack_render(browser: Browser, tmp_path: P
     assert browser.list_errors() == []
 
 
-@pytest.mark.integration
+@pytest.mark.smoke
 @pytest.mark.in_turn
 def test_a_consistent_picture_equals_that_of_the_model_without_its_map(browser: Browser, tmp_path: Path):
     model = random_model_with_map()
@@ -318,7 +318,7 @@ def test_scripts_cannot_set_an_unknown_exposure(browser: Browser, tmp_path: Path
 
 
 @pytest.mark.acceptance
-@pytest.mark.integration
+@pytest.mark.smoke
 @pytest.mark.in_turn
 @pytest.mark.parametrize("exposure", RENDER_EXPOSURES)
 def test_the_address_chooses_the_exposure(browser: Browser, tmp_path: Path, exposure: str):

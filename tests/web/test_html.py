@@ -28,7 +28,7 @@ from hyrfpack.splats.formats import ply
 from hyrfpack.web.html import decode_splats_page
 
 
-@pytest.mark.integration
+@pytest.mark.smoke
 def test_pictures_equal_those_of_our_rasterizer(browser: Browser, tmp_path: Path):
     splats = random_splats()
     page = make_splats_page(splats, sky_panorama())

@@ -195,7 +195,7 @@ def test_invalid_cameras_in_the_address_are_reported_and_the_scene_is_shown(brow
 # ---- the address and shared links
 
 
-@pytest.mark.integration
+@pytest.mark.smoke
 def test_a_shared_link_restores_the_view(browser: Browser, tmp_path: Path):
     open_page(browser, tmp_path, make_splats_page(random_splats()))
     browser.drag((120, 90), (161, 103))
@@ -423,7 +423,7 @@ def test_every_button_has_a_working_key(browser: Browser, tmp_path: Path):
     wait_until(browser, "!document.getElementById('help').open")
 
 
-@pytest.mark.integration
+@pytest.mark.smoke
 def test_screen_readers_get_labels_and_status_messages(browser: Browser, tmp_path: Path):
     watch = (
         "addEventListener('DOMContentLoaded', () => { window.heard = [];"

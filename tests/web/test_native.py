@@ -131,7 +131,7 @@ def read_texture(browser: Browser, name: str, width: int, words: int) -> np.ndar
 
 @pytest.mark.parametrize(
     "case",
-    [pytest.param("usual", marks=pytest.mark.integration), *(name for name in MODEL_SETTINGS if name != "usual")],
+    [pytest.param("usual", marks=pytest.mark.smoke), *(name for name in MODEL_SETTINGS if name != "usual")],
 )
 def test_pictures_geometry_and_colors_equal_those_of_the_model(browser: Browser, tmp_path: Path, case: str):
     model = random_model(**MODEL_SETTINGS[case])
@@ -315,7 +315,7 @@ def test_a_weak_device_draws_fitted_harmonics(browser: Browser, tmp_path: Path, 
     assert min(scores) > 28 and browser.list_errors() == [], scores
 
 
-@pytest.mark.integration
+@pytest.mark.smoke
 @pytest.mark.in_turn
 def test_the_first_layer_is_shown_while_the_rest_is_loading(browser: Browser, tmp_path: Path):
     model, data = random_model(200), encode(random_model(14000), "compact")

@@ -46,7 +46,7 @@ def test_the_window_starts_at_the_first_camera_and_draws_only_when_something_cha
     assert browser.evaluate("hyrfpack.frames()") == frames
 
 
-@pytest.mark.integration
+@pytest.mark.smoke
 def test_mouse_and_keys_move_the_camera(browser: Browser, tmp_path: Path):
     browser.prefer(less_motion=True)  # the camera jumps to its target, which a test below shows to be the same
     open_page(browser, tmp_path, make_splats_page(random_splats()))

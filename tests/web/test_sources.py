@@ -140,7 +140,7 @@ def test_a_file_beside_the_player_is_the_default(browser: Browser, host: Site):
 
 
 @pytest.mark.acceptance
-@pytest.mark.integration
+@pytest.mark.smoke
 def test_a_failed_fetch_is_reported_in_one_sentence(browser: Browser, host: Site):
     browser.open(f"{host.address}/index.html?content=not%20there.hyrf")
     assert wait_for_message(browser).startswith("not there.hyrf could not be fetched (404 Not Found); check")
@@ -322,7 +322,7 @@ ELEMENT_JS = "document.querySelector('hyrf-viewer')"
 ELEMENT_WINDOW_JS = f"{ELEMENT_JS}.shadowRoot.querySelector('iframe').contentWindow"
 
 
-@pytest.mark.integration
+@pytest.mark.smoke
 @pytest.mark.parametrize("kind", ["", ' type="module"'])
 def test_the_element_shows_a_file_and_follows_its_attributes(browser: Browser, host: Site, kind: str):
     host.files["/blog/post.html"] = (

@@ -153,8 +153,7 @@ def adam_runs(count: int, width: int, height: int) -> Iterator[Run]:
 
 
 def shade_runs(count: int, width: int, height: int) -> Iterator[Run]:
-    from hyrfpack.ops.rasterize import Gaussians3D, RasterSettings
-    from hyrfpack.ops.rasterize.shaded import rasterize_shaded
+    from hyrfpack.ops.rasterize import Gaussians3D, RasterSettings, rasterize
     from hyrfpack.ops.shade import DIRECTION_FEATURES, Shading, shade
 
     def run(encoding: str, mixed: bool, antialiased: bool) -> None:
@@ -165,7 +164,7 @@ def shade_runs(count: int, width: int, height: int) -> Iterator[Run]:
         gaussians = Gaussians3D(*(torch.rand(count, *shape) for shape in ((3,), (4,), (3,), ())))
         shade(gaussians.means, torch.zeros(3), shading)
         settings = RasterSettings(antialiased=antialiased)
-        rasterize_shaded(gaussians, shading, make_viewport(width, height), settings)
+        rasterize(gaussians, shading, make_viewport(width, height), settings)
 
     for options in (("frequency", True, False), ("frequency", False, True), ("sh", True, True), ("sh", False, False)):
         yield partial(run, *options)

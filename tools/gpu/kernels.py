@@ -23,7 +23,6 @@ from hyrfpack.bench.operation_calls import (
 from hyrfpack.model import HybridModel
 from hyrfpack.ops.adam import adam_step
 from hyrfpack.ops.rasterize import Gaussians3D, Rasterization, rasterize
-from hyrfpack.ops.rasterize.shaded import rasterize_shaded
 from hyrfpack.ops.shade import Shading, shade
 from hyrfpack.ops.viewport import Viewport
 from hyrfpack.render import RenderSettings
@@ -239,7 +238,7 @@ def rasterize_shaded_rows(setup: Setup) -> Iterator[Row]:
     for precision, shading in _shadings(model).items():
 
         def draw(viewport: Viewport = splats.viewport, shading: Shading = shading) -> Rasterization:
-            return rasterize_shaded(splats.gaussians, shading, viewport, implementation=setup.implementation)
+            return rasterize(splats.gaussians, shading, viewport, implementation=setup.implementation)
 
         raster = draw()
         pairs, seen = int(raster.pairs), int(raster.visible.sum())
@@ -249,7 +248,7 @@ def rasterize_shaded_rows(setup: Setup) -> Iterator[Row]:
         total_work = Work(project.bytes, 0) + roofline.count_bin_pairs(seen, pairs, tiles)
         total_work += roofline.count_blend(pairs, pixels, reached, blended)
         viewport = crop_splats(splats, setup.crop).viewport
-        expected = rasterize_shaded(exact, _cast(shading, torch.float64), viewport, implementation="reference")
+        expected = rasterize(exact, _cast(shading, torch.float64), viewport, implementation="reference")
         error = relative_error(join_color_and_transmittance(draw(viewport)), join_color_and_transmittance(expected))
         size = f"{len(model):,} Gaussians, {seen:,} visible, {pairs:,} pairs, {setup.width} x {setup.height}"
         row = _row(f"rasterize shaded, {precision}", "forward", size, ms, total_work, setup)

@@ -102,6 +102,6 @@ def advance(trainer: Trainer, steps: int, seconds: float, errors: list[float]) -
     """Take `steps` steps, or as many as fit into `seconds`; append each step's mean squared error to `errors`."""
     last, end = trainer.step + steps, time.perf_counter() + seconds
     trainer.run(
-        report=lambda trainer, loss, mse: errors.append(mse),
+        progress=lambda event: errors.append(event.mse),
         stop=lambda: trainer.step >= last or time.perf_counter() >= end,
     )

@@ -61,12 +61,12 @@ def densify(scene: Scene, model: HybridModel, config: TrainConfig, start: float)
     trainer = Trainer(scene, config, model=model)
     with open_display() as progress:
 
-        def after_step(trainer: Trainer, loss: float, mse: float) -> None:
-            progress(StepEvent(trainer.step, trainer.steps, loss, mse, len(trainer.model)))
-            if trainer.step == SPLIT_STEPS:
+        def after_step(event: StepEvent) -> None:
+            progress(event)
+            if event.step == SPLIT_STEPS:
                 print_scores("after splitting", trainer.model, scene, start)
 
-        trainer.run(report=after_step)
+        trainer.run(progress=after_step)
     print_scores("after settling", trainer.model, scene, start)
     return trainer.model
 

@@ -62,7 +62,7 @@ def measure_steps(scene: Scene, model: HybridModel, steps: int) -> dict:
     before = peak_memory() or 0
     trainer = Trainer(scene, config, model=model)
     ends = [time.perf_counter()]
-    trainer.run(report=lambda *_: ends.append(time.perf_counter()))
+    trainer.run(progress=lambda _: ends.append(time.perf_counter()))
     seconds = np.diff(ends)[2:]  # the first steps compile kernels
     peak = peak_memory() or 0
     parts = {name: round(value / steps, 3) for name, value in sorted(trainer.seconds.items())}

@@ -11,6 +11,7 @@ from hyrfpack.ops.dispatch import choose_implementation
 from hyrfpack.ops.finite import all_finite
 from hyrfpack.ops.rasterize import reference
 from hyrfpack.ops.rasterize.inputs import INPUT_SHAPES, Gaussians3D, RasterSettings, check_shapes
+from hyrfpack.ops.shade import Shading
 from hyrfpack.ops.viewport import Viewport
 
 __all__ = ["INPUT_SHAPES", "Gaussians3D", "RasterSettings", "Rasterization", "Viewport", "rasterize"]
@@ -27,8 +28,8 @@ class Rasterization:
             None unless requested.
         visible: (N,) bool, whether a Gaussian is in front of the near plane and reaches alpha >= 1/255 in some tile.
         pairs: number of (Gaussian, tile) pairs blended.
-        seconds: wall time of the stages project, sort, bin and blend; empty on the GPU, where the stages run
-            asynchronously.
+        seconds: wall time of the stages project, sort, bin and blend, and of cull and decode if colours were decoded;
+            empty on the GPU, where the stages run asynchronously.
         nonfinite: names of the inputs (means, quats, scales, opacities, colors) that contain NaN or infinity. Such
             Gaussians are skipped or corrupt the pixels they cover; callers must check this field.
     """
@@ -44,7 +45,7 @@ class Rasterization:
 
 def rasterize(
     gaussians: Gaussians3D,
-    colors: Tensor,
+    colors: Tensor | Shading,
     viewport: Viewport,
     settings: RasterSettings = RasterSettings(),  # noqa: B008 - frozen
     *,
@@ -64,16 +65,23 @@ def rasterize(
     flow to means, quats, scales, opacities and colors, but not to the camera. No gradient passes through an alpha that
     is clamped to 0.99, as in autograd; the 3DGS kernels let it pass. Results do not depend on the number of threads.
 
+    With a `Shading` in place of colours, the result equals that of `frustum_cull`, `shade` from the camera's centre and
+    this function, and is not differentiable. "gpu" runs all steps before binning in one kernel, which decodes a colour
+    while it projects, and only for a Gaussian that is drawn.
+
     Args:
         gaussians: N Gaussians.
-        colors: (N, 3) RGB.
+        colors: (N, 3) RGB, or the colour decoder of these N Gaussians.
         viewport: the camera.
-        settings: near plane, antialiasing, transmittance_min and depth.
+        settings: near plane, antialiasing, transmittance_min, depth and culling.
         absgrad: (N, 2) buffer to which backward adds the sums over pixels of |dL/d mean2d| (x, y) in 1/px,
             the criterion of densification by absolute gradients.
-        implementation: "auto", "reference", "cpu" or "gpu".
+        implementation: "auto", "reference", "cpu" or "gpu"; with a `Shading` "reference" runs each step in its fastest
+            implementation, and there is no "cpu".
 
     Raises:
+        FloatingPointError: with a `Shading`, a centre is NaN or infinite ("reference"; "gpu" reports it as
+            `nonfinite`).
         ValueError: shapes, dtypes or devices do not match.
         MemoryError: there are more (Gaussian, tile) pairs than "cpu" (2^28) or "gpu" (2^31) can index.
 
@@ -84,6 +92,10 @@ def rasterize(
         >>> image.rgb.shape, bool(image.rgb[16, 16, 0] > 0.8)
         (torch.Size([32, 32, 3]), True)
     """
+    if isinstance(colors, Shading):
+        from hyrfpack.ops.rasterize.shaded import rasterize_shaded
+
+        return rasterize_shaded(gaussians, colors, viewport, settings, implementation)
     check_shapes(gaussians, colors)
     count, dtype = len(gaussians.means), gaussians.means.dtype
     if absgrad is not None and (absgrad.shape != (count, 2) or absgrad.dtype != dtype):

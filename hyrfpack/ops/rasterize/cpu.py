@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from hyrfpack.ops.rasterize import cpu_bin, cpu_blend, cpu_project
+from hyrfpack.ops.rasterize.cpu_project import GaussianArrays, Projection, ProjectionSettings
 from hyrfpack.ops.rasterize.inputs import Gaussians3D, RasterSettings
 from hyrfpack.ops.rasterize.reference import TILE_SIZE, jacobian_limits
 from hyrfpack.ops.viewport import Viewport
@@ -25,24 +26,20 @@ class _View:
     """The arguments of `rasterize` that get no gradients. Each has one fixed type, since kernels are compiled per type.
 
     Attributes:
-        axes: the rows of the camera's rotation.
-        shift: the camera's translation.
-        lens: fx, fy, cx, cy, then the limits of x/z (low, high) and of y/z in the Jacobian.
-        width, height: as in `Viewport`.
-        near, antialiased, transmittance_min, depth: as in `RasterSettings`.
+        projection: the camera, and the settings of the projection.
+        transmittance_min, depth: as in `RasterSettings`.
         absgrad: as in `rasterize`, or None.
     """
 
-    axes: tuple[tuple[float, ...], ...]
-    shift: tuple[float, ...]
-    lens: tuple[float, ...]
-    width: int
-    height: int
-    near: float
-    antialiased: bool
+    projection: ProjectionSettings
     transmittance_min: np.float32
     depth: bool
     absgrad: np.ndarray | None
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Return height and width of the image."""
+        return self.projection.height, self.projection.width
 
 
 @dataclass(frozen=True)
@@ -75,14 +72,11 @@ def rasterize(
 @torch.no_grad()
 def sum_blend_weights(gaussians: Gaussians3D, viewport: Viewport, settings: RasterSettings) -> tuple[Tensor, Tensor]:
     """Compute `hyrfpack.ops.rasterize.blend_weights.sum_blend_weights`."""
-    view, means = _view(viewport, settings), gaussians.means
-    inputs = (*gaussians, means)  # Colours are not used; `means` stands in for them.
-    records, keys, tile_count_bounds = _project(tuple(tensor.detach().contiguous().numpy() for tensor in inputs), view)
-    tiles = _bin_pairs(cpu_bin.sort_by_depth(keys), records, tile_count_bounds, view)
-    pair_weights, transmittance = (
-        np.zeros(len(tiles.pairs), np.float32),
-        np.empty((view.height, view.width), np.float32),
-    )
+    view = _view(viewport, settings)
+    means, quats, scales, opacities = (tensor.detach().contiguous().numpy() for tensor in gaussians)
+    projection = _project(GaussianArrays(means, quats, scales, opacities, means), view)  # Colours are not used.
+    tiles = _bin_pairs(cpu_bin.sort_by_depth(projection.keys), projection, view)
+    pair_weights, transmittance = np.zeros(len(tiles.pairs), np.float32), np.empty(view.size, np.float32)
     _blend_into(tiles, view, None, transmittance, None, pair_weights)
     sums = np.empty(len(means), np.float32)
     run_ranges(lambda start, stop: cpu_blend.sum_slots(start, stop, tiles.slot_starts, pair_weights, sums), len(means))
@@ -92,7 +86,7 @@ def sum_blend_weights(gaussians: Gaussians3D, viewport: Viewport, settings: Rast
 def _view(viewport: Viewport, settings: RasterSettings, absgrad: Tensor | None = None) -> _View:
     """Convert the arguments of `rasterize` that get no gradients to the types that the kernels take."""
     camera = viewport.pose.detach().double().tolist()[:3]
-    return _View(
+    projection = ProjectionSettings(
         axes=tuple(tuple(row[:3]) for row in camera),
         shift=tuple(row[3] for row in camera),
         lens=tuple(float(number) for number in (*viewport.intrinsics, *jacobian_limits(viewport))),
@@ -100,6 +94,9 @@ def _view(viewport: Viewport, settings: RasterSettings, absgrad: Tensor | None =
         height=int(viewport.height),
         near=float(settings.near),
         antialiased=bool(settings.antialiased),
+    )
+    return _View(
+        projection,
         transmittance_min=np.float32(settings.transmittance_min),
         depth=settings.depth,
         absgrad=None if absgrad is None else absgrad.numpy(),
@@ -112,13 +109,13 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx, means, quats, scales, opacities, colors, view, report):
         inputs = tuple(tensor.contiguous() for tensor in (means, quats, scales, opacities, colors))
-        arrays = tuple(tensor.detach().numpy() for tensor in inputs)
+        arrays = GaussianArrays(*(tensor.detach().numpy() for tensor in inputs))
         clock = [perf_counter()]
-        records, keys, tile_count_bounds = _project(arrays, view)
+        projection = _project(arrays, view)
         clock.append(perf_counter())
-        order = cpu_bin.sort_by_depth(keys)
+        order = cpu_bin.sort_by_depth(projection.keys)
         clock.append(perf_counter())
-        tiles = _bin_pairs(order, records, tile_count_bounds, view)
+        tiles = _bin_pairs(order, projection, view)
         clock.append(perf_counter())
         rgb, transmittance, depths, blended = _blend(tiles, view)
         clock.append(perf_counter())
@@ -139,9 +136,9 @@ class _Rasterize(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, grad_rgb, grad_transmittance, _grad_depth, _grad_visible):
         *inputs, rgb, transmittance = (tensor.detach().numpy() for tensor in ctx.saved_tensors)
-        gradients = grad_rgb.contiguous().numpy(), grad_transmittance.contiguous().numpy()
-        rows = _blend_backward(ctx.tiles, ctx.blended, ctx.view, rgb, transmittance, *gradients)
-        grads = _project_backward(ctx.tiles, ctx.view, rows, inputs)
+        gradient = grad_rgb.contiguous().numpy(), grad_transmittance.contiguous().numpy()
+        rows = _blend_backward(ctx.tiles, ctx.blended, ctx.view, (rgb, transmittance), gradient)
+        grads = _project_backward(ctx.tiles, ctx.view, rows, GaussianArrays(*inputs, inputs[0]))
         return *(torch.from_numpy(grad) for grad in grads), None, None
 
 
@@ -152,28 +149,28 @@ def _cache_line_rows(count: int) -> np.ndarray:
     return numbers[skip : skip + 16 * count].reshape(count, 16)
 
 
-def _project(arrays: tuple[np.ndarray, ...], view: _View) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Project all Gaussians; returns records, sort keys and bounds of the tile counts, see `cpu_project.project`."""
-    count = len(arrays[0])
-    records = _cache_line_rows(count)
-    keys, tile_count_bounds = np.empty(count, np.uint32), np.empty(count, np.uint32)
-    where = view.axes, view.shift, view.lens, view.width, view.height, view.near, view.antialiased
-
-    def task(start: int, stop: int) -> None:
-        cpu_project.project(start, stop, *arrays, *where, records, keys, tile_count_bounds)
-
-    run_ranges(task, count)
-    return records, keys, tile_count_bounds
+def _as_tuples(*values: tuple) -> list[tuple]:
+    """Convert named tuples to tuples, whose types Numba recognises in a fraction of the time."""
+    return [tuple(value) for value in values]
 
 
-def _bin_pairs(order: np.ndarray, records: np.ndarray, tile_count_bounds: np.ndarray, view: _View) -> _Tiles:
+def _project(gaussians: GaussianArrays, view: _View) -> Projection:
+    """Project all Gaussians."""
+    count = len(gaussians.means)
+    projection = Projection(_cache_line_rows(count), np.empty(count, np.uint32), np.empty(count, np.uint32))
+    arguments = _as_tuples(gaussians, view.projection, projection)
+    run_ranges(lambda start, stop: cpu_project.project(start, stop, *arguments), count)
+    return projection
+
+
+def _bin_pairs(order: np.ndarray, projection: Projection, view: _View) -> _Tiles:
     """List the pairs of each tile in depth order.
 
     Raises:
         MemoryError: there are cpu_bin.MAX_PAIRS pairs or more.
     """
-    count = len(order)
-    tile_total = -(-view.width // TILE_SIZE) * -(-view.height // TILE_SIZE)
+    count, records, (height, width) = len(order), projection.records, view.size
+    tile_total = -(-width // TILE_SIZE) * -(-height // TILE_SIZE)
     chunks = max(1, min(4 * thread_count(), count // 256))
     edges = [count * i // chunks for i in range(chunks + 1)]
     tile_counts = np.zeros((chunks, tile_total), np.int64)
@@ -183,7 +180,7 @@ def _bin_pairs(order: np.ndarray, records: np.ndarray, tile_count_bounds: np.nda
 
     def find(chunk: int) -> None:
         chunk_pairs[chunk] = cpu_bin.find_pairs(
-            edges[chunk], edges[chunk + 1], order, tile_count_bounds, records, view.width, view.height,
+            edges[chunk], edges[chunk + 1], order, projection.tile_count_bounds, records, width, height,
             tile_counts[chunk], slot_starts[1:], sorted_records,
         )  # fmt: skip
 
@@ -217,9 +214,8 @@ def _tile_runs(starts: np.ndarray) -> list[tuple[int, int]]:
 
 def _blend(tiles: _Tiles, view: _View) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray]:
     """Blend all tiles; returns rgb, transmittance, depth if requested, and the pairs blended in each tile."""
-    size = view.height, view.width
-    rgb, transmittance = np.empty((*size, 3), np.float32), np.empty(size, np.float32)
-    depths = np.empty(size, np.float32) if view.depth else None
+    rgb, transmittance = np.empty((*view.size, 3), np.float32), np.empty(view.size, np.float32)
+    depths = np.empty(view.size, np.float32) if view.depth else None
     return rgb, transmittance, depths, _blend_into(tiles, view, rgb, transmittance, depths, None)
 
 
@@ -237,8 +233,8 @@ def _blend_into(
 
     def task(run: int) -> None:
         cpu_blend.blend_tiles(
-            *runs[run], tiles.starts, tiles.pairs, tiles.records, view.width, view.height, view.transmittance_min,
-            rgb, transmittance, depths, pair_weights, blended,
+            *runs[run], tiles.starts, tiles.pairs, tiles.records, view.transmittance_min, rgb, transmittance, depths,
+            pair_weights, blended,
         )  # fmt: skip
 
     run_tasks(task, len(runs))
@@ -249,35 +245,30 @@ def _blend_backward(
     tiles: _Tiles,
     blended: np.ndarray,
     view: _View,
-    rgb: np.ndarray,
-    transmittance: np.ndarray,
-    grad_rgb: np.ndarray,
-    grad_transmittance: np.ndarray,
+    image: tuple[np.ndarray, np.ndarray],
+    gradient: tuple[np.ndarray, np.ndarray],
 ) -> np.ndarray:
-    """Return the gradient row of each pair, (P, 16), at its slot."""
+    """Return the gradient row of each pair, (P, 16), at its slot; see `cpu_blend.blend_tiles_backward`."""
     gradient_rows = _cache_line_rows(len(tiles.pairs))
     runs = _tile_runs(tiles.starts)
 
     def task(run: int) -> None:
         cpu_blend.blend_tiles_backward(
-            *runs[run], tiles.starts, tiles.pairs, blended, tiles.records, view.width, view.height,
-            view.transmittance_min, rgb, transmittance, grad_rgb, grad_transmittance, view.absgrad, gradient_rows,
+            *runs[run], tiles.starts, tiles.pairs, blended, tiles.records, view.transmittance_min, image, gradient,
+            view.absgrad, gradient_rows,
         )  # fmt: skip
 
     run_tasks(task, len(runs))
     return gradient_rows
 
 
-def _project_backward(tiles: _Tiles, view: _View, rows: np.ndarray, inputs: list[np.ndarray]) -> tuple[np.ndarray, ...]:
-    """Return the gradients of means, quats, scales, opacities and colors."""
-    means, quats, scales, opacities = inputs
-    grads = tuple(np.empty_like(array) for array in (means, quats, scales, opacities, means))
+def _project_backward(tiles: _Tiles, view: _View, rows: np.ndarray, gaussians: GaussianArrays) -> GaussianArrays:
+    """Return the gradients of all arrays of Gaussians. Colours are not used; any array of their shape will do."""
+    gradients = GaussianArrays(*map(np.empty_like, gaussians))
+    arguments = _as_tuples(gaussians, view.projection, gradients)
 
     def task(start: int, stop: int) -> None:
-        cpu_project.project_backward(
-            start, stop, tiles.slot_starts, rows, means, quats, scales, opacities,
-            view.axes, view.shift, view.lens, view.antialiased, *grads, view.absgrad,
-        )  # fmt: skip
+        cpu_project.project_backward(start, stop, tiles.slot_starts, rows, *arguments, view.absgrad)
 
-    run_ranges(task, len(means))
-    return grads
+    run_ranges(task, len(gaussians.means))
+    return gradients

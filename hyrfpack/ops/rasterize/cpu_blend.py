@@ -83,8 +83,8 @@ def _scratch(planes):
 
 @_kernel
 def blend_tiles(
-    first_tile, last_tile, tile_starts, pairs, records, width, height, transmittance_min,
-    rgb, transmittance, depth, pair_weights, blended,
+    first_tile, last_tile, tile_starts, pairs, records, transmittance_min, rgb, transmittance, depth, pair_weights,
+    blended,
 ):  # fmt: skip
     """Blend tiles first_tile to last_tile into rgb (H, W, 3), transmittance (H, W) and depth (H, W).
 
@@ -93,6 +93,7 @@ def blend_tiles(
         pair_weights: (P,) zeros. The sum of T alpha over pixels is written to each pair's slot. None if not needed.
         blended: (tiles,), written: the number of pairs after which each tile was finished.
     """
+    height, width = transmittance.shape
     s = _scratch(7)
     tiles_x = (width + TILE_SIZE - 1) // TILE_SIZE
     for tile in range(first_tile, last_tile):
@@ -172,15 +173,19 @@ def sum_slots(start, stop, slot_starts, values, sums):
 
 @_kernel
 def blend_tiles_backward(
-    first_tile, last_tile, tile_starts, pairs, blended, records, width, height, transmittance_min,
-    rgb, transmittance, grad_rgb, grad_transmittance, absgrad, gradient_rows,
+    first_tile, last_tile, tile_starts, pairs, blended, records, transmittance_min, image, gradient, absgrad,
+    gradient_rows,
 ):  # fmt: skip
     """Write the gradient row of each pair of tiles first_tile to last_tile at the pair's slot.
+
+    `image` and `gradient` are rgb (H, W, 3) and transmittance (H, W) of the image, and the gradients of both.
 
     Blending is replayed front to back with the rest R, the contribution to g . rgb of everything behind a Gaussian.
     Then dL/d(alpha) = T (color . g) - R / (1 - alpha) needs no values stored by forward. The sums for absgrad take a
     tenth of the time and are skipped if it is None; the array itself is not accessed.
     """
+    (rgb, transmittance), (grad_rgb, grad_transmittance) = image, gradient
+    height, width = transmittance.shape
     s = _scratch(7)
     tiles_x = (width + TILE_SIZE - 1) // TILE_SIZE
     for tile in range(first_tile, last_tile):

@@ -7,6 +7,7 @@ records are float32. A Gaussian whose numbers overflow is skipped, like one behi
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -38,6 +39,52 @@ _MAX_MAGNITUDE = 1e30
 _COMPILE_OPTIONS = {"fastmath": {"contract", "nsz"}, "error_model": "numpy"}
 _kernel = compiled(**_COMPILE_OPTIONS)
 _inlined = compiled(**_COMPILE_OPTIONS, inline="always")  # LLVM does not inline functions of this size by itself.
+
+
+class ProjectionSettings(NamedTuple):
+    """The camera and the settings of a projection, in the types that kernels take.
+
+    The camera is tuples of float, because the compiler would not move loads from arrays out of a loop.
+
+    Attributes:
+        axes: the rows of the camera's rotation.
+        shift: the camera's translation.
+        lens: fx, fy, cx, cy, then the limits of x/z (low, high) and of y/z in the Jacobian.
+        width, height: as in `Viewport`.
+        near, antialiased: as in `RasterSettings`.
+    """
+
+    axes: tuple[tuple[float, ...], ...]
+    shift: tuple[float, ...]
+    lens: tuple[float, ...]
+    width: int
+    height: int
+    near: float
+    antialiased: bool
+
+
+class Projection(NamedTuple):
+    """N projected Gaussians.
+
+    Attributes:
+        records: (N, 16); a record is written only for a Gaussian that is drawn.
+        keys: (N,) uint32 sort keys by depth.
+        tile_count_bounds: (N,) uint32, the number of tiles that the bounding box meets.
+    """
+
+    records: np.ndarray
+    keys: np.ndarray
+    tile_count_bounds: np.ndarray
+
+
+class GaussianArrays(NamedTuple):
+    """The arrays of N Gaussians with colours (N, 3), or the gradients of these arrays; see `Gaussians3D`."""
+
+    means: np.ndarray
+    quats: np.ndarray
+    scales: np.ndarray
+    opacities: np.ndarray
+    colors: np.ndarray
 
 
 @_kernel
@@ -134,21 +181,15 @@ def _triangular_form(xx, xy, yy, det):
 
 
 @_kernel
-def project(
-    start, stop, means, quats, scales, opacities, colors, axes, shift, lens, width, height, near, antialiased,
-    records, keys, tile_count_bounds,
-):  # fmt: skip
-    """Project Gaussians start to stop. A record is written only for a Gaussian that is drawn.
+def project(start, stop, gaussians, settings, projection):
+    """Project Gaussians start to stop, and write their projection.
 
     Args:
-        axes: the rows of the camera's rotation. All camera arguments are tuples of float64, because the compiler would
-            not move loads from arrays out of the loop.
-        shift: the camera's translation.
-        lens: fx, fy, cx, cy, then the limits of x/z (low, high) and of y/z in the Jacobian.
-        records: (N, 16), written.
-        keys: (N,) uint32, written: sort keys by depth.
-        tile_count_bounds: (N,), written: the number of tiles that the bounding box meets.
+        gaussians, settings, projection: the fields of `GaussianArrays`, `ProjectionSettings` and `Projection`.
     """
+    means, quats, scales, opacities, colors = gaussians
+    axes, shift, lens, width, height, near, antialiased = settings
+    records, keys, tile_count_bounds = projection
     for i in range(np.uint64(start), np.uint64(stop)):
         keys[i] = HIDDEN_KEY
         tile_count_bounds[i] = 0
@@ -190,18 +231,19 @@ def project(
 
 
 @_kernel
-def project_backward(
-    start, stop, slot_starts, rows, means, quats, scales, opacities, axes, shift, lens, antialiased,
-    grad_means, grad_quats, grad_scales, grad_opacities, grad_colors, absgrad,
-):  # fmt: skip
+def project_backward(start, stop, slot_starts, rows, gaussians, settings, gradients, absgrad):
     """Sum the gradient rows of Gaussians start to stop and backpropagate them through the projection.
 
     Args:
         slot_starts: (N + 1,) the first slot of each Gaussian.
         rows: (P, 16) the gradient rows, by slot.
-        grad_means, grad_quats, grad_scales, grad_opacities, grad_colors: the gradients, written.
+        gaussians, settings: as in `project`; colours are not used.
+        gradients: the fields of a `GaussianArrays`, written.
         absgrad: (N, 2), incremented; None if not needed.
     """
+    means, quats, scales, opacities, _ = gaussians
+    axes, shift, lens, _, _, _, antialiased = settings
+    grad_means, grad_quats, grad_scales, grad_opacities, grad_colors = gradients
     sums = np.empty(GRADIENT_ROW_FLOATS, np.float32)
     for i in range(np.uint64(start), np.uint64(stop)):
         begin, end = np.uint64(slot_starts[i]), np.uint64(slot_starts[i + np.uint64(1)])

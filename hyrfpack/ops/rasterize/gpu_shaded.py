@@ -58,12 +58,12 @@ def project_shaded_kernel(
 
 
 def rasterize_shaded(
-    gaussians: Gaussians3D, shading: Shading, viewport: Viewport, settings: RasterSettings, cull_tolerance: float
+    gaussians: Gaussians3D, shading: Shading, viewport: Viewport, settings: RasterSettings
 ) -> Rasterization:
-    """Compute `hyrfpack.ops.rasterize.shaded.rasterize_shaded`."""
+    """Compute `hyrfpack.ops.rasterize.rasterize` with a `Shading`."""
     total, device = len(gaussians.means), gaussians.means.device
     inputs = Gaussians3D(*(tensor.detach().contiguous() for tensor in gaussians))
-    camera = pack_camera(viewport, settings.near, device, cull_tolerance)
+    camera = pack_camera(viewport, settings.near, device, settings.cull_tolerance)
     decoder, constants = shading.kernel_arguments
     projection = Projection.empty(total, device)
     if total:

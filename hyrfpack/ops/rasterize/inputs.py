@@ -41,6 +41,8 @@ class RasterSettings:
         antialiased: scale opacities by sqrt(det(Sigma) / det(Sigma + 0.3 I)), so that the low-pass adds no light.
         transmittance_min: transmittance at which a pixel is finished, in [0, 1); 0 blends all Gaussians.
         depth: also compute depth.
+        cull_tolerance: how far outside the image the centre of a Gaussian may project, as a fraction of half the
+            image's size. Only Gaussians whose colours are decoded while they are drawn are culled by it.
 
     Raises:
         ValueError: a setting is out of range.
@@ -50,12 +52,15 @@ class RasterSettings:
     antialiased: bool = False
     transmittance_min: float = TRANSMITTANCE_MIN
     depth: bool = False
+    cull_tolerance: float = 0.3
 
     def __post_init__(self) -> None:
         if not self.near >= 0:
             raise ValueError(f"near is {self.near}, expected a distance in front of the camera")
         if not 0 <= self.transmittance_min < 1:
             raise ValueError(f"transmittance_min is {self.transmittance_min}; it must lie in [0, 1)")
+        if not self.cull_tolerance >= 0:
+            raise ValueError(f"cull_tolerance is {self.cull_tolerance}, expected 0 or more")
 
 
 def check_shapes(gaussians: Gaussians3D, colors: Tensor | None = None) -> None:

@@ -20,39 +20,19 @@ def rasterize_shaded(
     gaussians: Gaussians3D,
     shading: Shading,
     viewport: Viewport,
-    settings: RasterSettings = RasterSettings(),  # noqa: B008 - frozen
-    *,
-    cull_tolerance: float = 0.3,
-    implementation: str = "auto",
+    settings: RasterSettings,
+    implementation: str,
 ) -> Rasterization:
-    """Render the Gaussians whose centres a camera sees, with their view-dependent colours.
-
-    The result equals that of `frustum_cull`, `shade` from the camera's centre and `rasterize`. "gpu" runs all steps
-    before binning in one kernel, which decodes a colour while it projects, and only for a Gaussian that is drawn.
-
-    Args:
-        gaussians: N Gaussians.
-        shading: the colour decoder of these N Gaussians.
-        viewport, settings: as in `rasterize`.
-        cull_tolerance: how far outside the image a centre may project, as a fraction of half the image's size.
-        implementation: "auto", "reference" or "gpu"; "reference" runs each step in its fastest implementation.
-
-    Returns:
-        The image, not differentiable; its field `visible` is (N,), and `seconds` also has the stages cull and decode.
-
-    Raises:
-        FloatingPointError: a centre is NaN or infinite ("reference"; "gpu" reports it as `nonfinite`).
-        ValueError, MemoryError: as `rasterize` and `shade`.
-    """
+    """Compute `hyrfpack.ops.rasterize.rasterize` with a `Shading`."""
     check_shapes(gaussians)
     means = gaussians.means
     check_shading(shading, len(means))
     if choose_shading_implementation(shading, implementation, *gaussians) == "gpu":
         from hyrfpack.ops.rasterize import gpu_shaded
 
-        return gpu_shaded.rasterize_shaded(gaussians, shading, viewport, settings, cull_tolerance)
+        return gpu_shaded.rasterize_shaded(gaussians, shading, viewport, settings)
     started = perf_counter()
-    index = frustum_cull(means, viewport, settings.near, cull_tolerance)
+    index = frustum_cull(means, viewport, settings.near, settings.cull_tolerance)
     culled = perf_counter()
     drawn = gaussians.select(index)
     colors = shade(means, camera_center(viewport.pose.to(means)), shading, index)
