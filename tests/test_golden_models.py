@@ -19,6 +19,9 @@ from tools.safety.train_golden import DEMO_MODEL_FILE, TRAIN_CONFIGS, TRAINED_FO
 
 # The PSNR on training photos differs by up to 0.25 dB between five seeds, and that on the two held-out ones by 1 dB.
 MAX_PSNR_LOSS_DB = 0.4
+# The size of the compact file differs by up to 6.5 % between five seeds, that of the others by less than 1 %. Rounding
+# on another machine changes a training run as another seed does.
+MAX_SIZE_CHANGES = {"raw": 0.01, "paper": 0.01, "compact": 0.08}
 MAX_TOTAL_BYTES = 300_000
 RECORDED_SIZES_FILE = TRAINED_FOLDER.parent / "trained_sizes.json"
 
@@ -37,7 +40,8 @@ def test_a_new_training_reaches_the_quality_and_sizes_of_the_golden_model(golden
         compact = compress_model(trained, tmp_path / "compact.hyrf", data=scene)
         paper = compress_model(trained, tmp_path / "paper.hyrf", CompressConfig(profile="paper"))
         sizes = {"raw": trained.stat().st_size, "paper": paper.bytes_after, "compact": compact.bytes_after}
-        assert sizes == pytest.approx({name: recorded[name] for name in sizes}, rel=0.01)
+        for name, size in sizes.items():
+            assert size == pytest.approx(recorded[name], rel=MAX_SIZE_CHANGES[name]), name
 
 
 def test_the_golden_models_are_small():
