@@ -10,7 +10,7 @@ from hyrfpack.measure.psnr import IDENTICAL_PSNR, psnr_from_mse
 from hyrfpack.ops.ssim import photometric_loss
 
 # PSNR in dB assumed for a model whose provenance does not state how well it fits its photos.
-ASSUMED_PSNR = 30.0
+ASSUMED_PSNR_DB = 30.0
 
 
 def to_8bit(image: Tensor) -> Tensor:
@@ -43,11 +43,11 @@ def provenance_mse(provenance: dict) -> float:
     The error that compression or a file format adds is independent of it, so the two errors add up.
 
     Args:
-        provenance: provenance of the file. Its `psnr` is used, or ASSUMED_PSNR if that is missing or out of range.
+        provenance: provenance of the file. Its `psnr` is used, or ASSUMED_PSNR_DB if that is missing or out of range.
     """
     stated = provenance.get("psnr")
     if not isinstance(stated, int | float) or not 0 < stated < IDENTICAL_PSNR:
-        stated = ASSUMED_PSNR
+        stated = ASSUMED_PSNR_DB
     return math.exp(-stated / 10 * math.log(10))
 
 

@@ -144,7 +144,7 @@ def _decode_residual_vq(data: memoryview, shape: tuple[int, int]) -> np.ndarray:
     position = _VQ_HEADER_STRUCT.size + 2 * stages * size * columns
     if not (1 <= stages <= MAX_VQ_STAGES and size) or columns != shape[1] or position > len(data):
         raise HyrfFormatError(
-            f"it says {stages} codebooks of {size} codewords of {columns} numbers",
+            f"it declares {stages} codebooks of {size} codewords of {columns} numbers, which do not fit its size",
             fix="the file is damaged, copy or write it again",
         )
     codebooks = np.frombuffer(data[_VQ_HEADER_STRUCT.size : position], "<f2").reshape(stages, size, columns)

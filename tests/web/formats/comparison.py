@@ -23,7 +23,7 @@ class PageSplats:
     data: bytes
 
     def assert_equal(self, expected: Splats) -> None:
-        """Assert that they equal Python's splats, up to float32 in the page's frame and to bytes for harmonics."""
+        """Assert that the page's splats equal those read by Python, up to float32, and to a byte for harmonics."""
         facts, count, terms = self.facts, len(expected), num_sh_bases(expected.degree)
         assert (facts["count"], facts["degree"]) == (count, expected.degree)
         assert facts["antialiased"] is expected.antialiased
