@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import signal
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -62,7 +63,7 @@ def make_evaluation(psnr: float, corrected: float = 0.0, apart: tuple[float, ...
 
 @pytest.fixture
 def scores(monkeypatch) -> dict:
-    """Scores of models by their maximum number of Gaussians, or by whether they learn gains. No model is trained."""
+    """Scores of models by their steps, by their budget, or by whether they learn gains. No model is trained."""
     table: dict = {}
 
     class Untrained:
@@ -73,6 +74,8 @@ def scores(monkeypatch) -> dict:
             pass
 
     def evaluate(config, views, progress):
+        if config.steps in table:
+            return make_evaluation(table[config.steps])
         if config.exposure in table:
             return make_evaluation(
                 table[config.exposure][config.seed],
@@ -208,6 +211,12 @@ def interrupt_at(step: int) -> RunContext:
     return RunContext(progress=interrupt)
 
 
+def assert_resume_is_rejected(folder: Path, config: TrainConfig) -> None:
+    """Assert that the run in a folder cannot be resumed with these settings."""
+    with pytest.raises(HyrfTrainingError, match="started with other settings"):
+        train_model(make_scene(), folder, config, resume=True, context=QUIET_CONTEXT)
+
+
 @pytest.mark.usefixtures("short_pilots", "signals")
 def test_a_run_that_continues_keeps_its_budget_and_the_reason(tmp_path, monkeypatch):
     config = TrainConfig(steps=10)
@@ -216,14 +225,7 @@ def test_a_run_that_continues_keeps_its_budget_and_the_reason(tmp_path, monkeypa
 
     monkeypatch.setattr(decisions, "measure_budget", lambda *_: pytest.fail("measured again"))
     for asked in ({"max_gaussians": 5_000}, {"target_bytes": 20_000}, {"budget_factor": 0.9}):
-        with pytest.raises(HyrfTrainingError, match="started with other settings"):
-            train_model(
-                make_scene(),
-                tmp_path / "again",
-                dataclasses.replace(config, **asked),
-                resume=True,
-                context=QUIET_CONTEXT,
-            )
+        assert_resume_is_rejected(tmp_path / "again", dataclasses.replace(config, **asked))
     train_model(make_scene(), tmp_path / "again", config, resume=True, context=QUIET_CONTEXT)
 
     whole, again = (json.loads((tmp_path / name / "metrics.json").read_bytes()) for name in ("whole", "again"))
@@ -403,24 +405,14 @@ def test_a_run_that_continues_keeps_its_exposure_compensation(tmp_path, monkeypa
 # -- number of steps -------------------------------------------------------------------------------------------------
 
 
-def measure_scene_length(scores: dict[int, float], steps: int, monkeypatch) -> tuple[int, str, ScenePilots]:
-    """Choose the number of steps of a run whose pilots score as in the table by their number of steps."""
-
-    class Untrained:
-        def __init__(self, scene, config, cache, device):
-            self.model = config
-
-        def run(self, progress, stop):
-            pass
-
-    monkeypatch.setattr(pilots, "Trainer", Untrained)
-    monkeypatch.setattr(pilots, "evaluate_model", lambda config, *_, **__: make_evaluation(scores[config.steps]))
+def measure_scene_length(steps: int) -> tuple[int, str, ScenePilots]:
+    """Choose the number of steps of a run of at most `steps`; also return its pilots."""
     runs = ScenePilots(make_scene(), TrainConfig(steps=steps), PictureCache(), CPU_DEVICE)
     return *measure_length(runs, exposure=True, budget_factor=0.5), runs
 
 
 @pytest.mark.parametrize(
-    ("scores", "steps", "chosen", "measured"),
+    ("by_steps", "steps", "chosen", "measured"),
     [
         ({1000: 20.0, 3000: 19.8}, 7_000, 1_000, [1_000, 3_000]),
         ({1000: 20.0, 3000: 20.0}, 7_000, 1_000, [1_000, 3_000]),
@@ -429,15 +421,17 @@ def measure_scene_length(scores: dict[int, float], steps: int, monkeypatch) -> t
         ({1000: 20.0, 3000: 20.1, 10000: 20.2, 30000: 19.0}, 30_000, 10_000, [1_000, 3_000, 10_000, 30_000]),
     ],
 )
-def test_a_longer_run_is_chosen_only_while_validation_photos_score_higher(scores, steps, chosen, measured, monkeypatch):
-    choice, reason, runs = measure_scene_length(scores, steps, monkeypatch)
+def test_a_longer_run_is_chosen_only_while_validation_photos_score_higher(scores, by_steps, steps, chosen, measured):
+    scores |= by_steps
+    choice, reason, runs = measure_scene_length(steps)
     assert choice == chosen
     assert [score.steps for score in runs.scores] == measured and all(score.exposure for score in runs.scores)
-    assert all(f"{length:,} steps {scores[length]:.2f} dB" in reason for length in measured)
+    assert all(f"{length:,} steps {by_steps[length]:.2f} dB" in reason for length in measured)
 
 
-def test_each_length_pilot_has_the_budget_of_a_run_of_its_length(monkeypatch):
-    _, _, runs = measure_scene_length({1000: 20.0, 3000: 20.1, 7000: 20.2}, 7_000, monkeypatch)
+def test_each_length_pilot_has_the_budget_of_a_run_of_its_length(scores):
+    scores |= {1000: 20.0, 3000: 20.1, 7000: 20.2}
+    _, _, runs = measure_scene_length(7_000)
     training = runs.fold(4).scene
     assert [score.max_gaussians for score in runs.scores] == [
         budget_for(training, TrainConfig(steps=steps, budget_factor=0.5))[0] for steps in (1_000, 3_000, 7_000)
@@ -488,14 +482,7 @@ def test_a_shortened_run_resumes_to_the_same_bytes_and_names_the_reason(tmp_path
 
     monkeypatch.setattr(decisions, "measure_length", lambda *_: pytest.fail("measured again"))
     for asked in ({"early_stop": False}, {"steps": 30, "early_stop": False}):
-        with pytest.raises(HyrfTrainingError, match="started with other settings"):
-            train_model(
-                make_scene(),
-                tmp_path / "again",
-                dataclasses.replace(config, **asked),
-                resume=True,
-                context=QUIET_CONTEXT,
-            )
+        assert_resume_is_rejected(tmp_path / "again", dataclasses.replace(config, **asked))
     again = train_model(make_scene(), tmp_path / "again", config, resume=True, context=QUIET_CONTEXT)
 
     assert (
