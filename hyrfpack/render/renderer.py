@@ -22,11 +22,13 @@ from hyrfpack.ops.finite import all_finite
 from hyrfpack.ops.poses import camera_center
 from hyrfpack.ops.rasterize import Gaussians3D, RasterSettings, Viewport, rasterize
 from hyrfpack.ops.rasterize.cull import frustum_cull
-from hyrfpack.ops.rasterize.inputs import TRANSMITTANCE_MIN
+from hyrfpack.ops.rasterize.inputs import LOW_PASS_VARIANCE, TRANSMITTANCE_MIN
 from hyrfpack.ops.shade import Shading
 from hyrfpack.ops.transfer import tensor_like
 from hyrfpack.parallel.pool import torch_on_one_thread
 from hyrfpack.scene import Camera
+
+MIN_LOW_PASS_VARIANCE = 1e-3  # Narrower filters let Gaussians fall between pixel centres.
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,8 @@ class RenderSettings:
         transmittance_min: blending of a pixel stops when its transmittance is at most this; 0 blends every Gaussian.
         exposure: "as-photographed" applies the model's exposure map, so that a view looks like the photos taken near
             it; "consistent" renders all views at the model's own exposure. Without a map, both are the same.
+        low_pass_variance: variance in px^2 of the filter that widens projected Gaussians. Models are trained for the
+            default; a reduced image needs less, see `hyrfpack.train.resolution.reduced_low_pass_variance`.
     """
 
     near: float = 0.01
@@ -51,10 +55,12 @@ class RenderSettings:
     background_stride: int = 2
     transmittance_min: float = TRANSMITTANCE_MIN
     exposure: str = AS_PHOTOGRAPHED
+    low_pass_variance: float = LOW_PASS_VARIANCE
 
     def __post_init__(self) -> None:
         for name in ("near", "background_threshold"):
             check_float(name, getattr(self, name))
+        check_float("low_pass_variance", self.low_pass_variance, MIN_LOW_PASS_VARIANCE)
         check_float("cull_tolerance", self.cull_tolerance, maximum=inf)
         check_int("background_stride", self.background_stride, 1)
         check_choice("exposure", self.exposure, RENDER_EXPOSURES)
@@ -64,7 +70,9 @@ class RenderSettings:
 
     def raster_settings(self, antialiased: bool, depth: bool = False) -> RasterSettings:
         """Return the settings of the rasteriser."""
-        return RasterSettings(self.near, antialiased, self.transmittance_min, depth, self.cull_tolerance)
+        return RasterSettings(
+            self.near, antialiased, self.transmittance_min, depth, self.cull_tolerance, self.low_pass_variance
+        )
 
 
 @dataclass(frozen=True)

@@ -169,6 +169,10 @@ def _wide_angle() -> Case:
 CASE_MAKERS: dict[str, Callable[[], Case]] = {
     "random scene": lambda: Case(_gaussians(500)),
     "random scene, antialiased": lambda: Case(_gaussians(500, size=0.03), options={"antialiased": True}),
+    "narrow low-pass filter": lambda: Case(_gaussians(500, size=0.02), options={"low_pass_variance": 0.1}),
+    "wide low-pass filter, antialiased": lambda: Case(
+        _gaussians(500, size=0.03), options={"low_pass_variance": 2.0, "antialiased": True}
+    ),
     "off-centre principal point, fx != fy": lambda: Case(_gaussians(200), intrinsics=(45.0, 70.0, 5.5, 33.25)),
     "Jacobian clamped at a wide angle": _wide_angle,
     "behind, at and across the near plane": _across_near_plane,
@@ -581,6 +585,9 @@ def test_unfit_arguments_are_rejected() -> None:
     for cull_tolerance in (-1e-3, math.nan):
         with pytest.raises(ValueError, match="cull_tolerance is"):
             RasterSettings(cull_tolerance=cull_tolerance)
+    for low_pass_variance in (0.0, -0.3, math.nan):
+        with pytest.raises(ValueError, match="low_pass_variance is"):
+            RasterSettings(low_pass_variance=low_pass_variance)
     with pytest.raises(ValueError, match="no pixels"):
         Viewport(camera, intrinsics, 0, 10)
     with pytest.raises(ValueError, match="absgrad is"):

@@ -54,8 +54,8 @@ def rasterize(
 ) -> Rasterization:
     """Render 3D Gaussians from a camera (3D Gaussian Splatting, Kerbl et al. 2023).
 
-    Each Gaussian is projected to a 2D Gaussian (EWA, with a low-pass filter of 0.3 px^2). The 2D Gaussians are blended
-    front to back, in the order of camera z and then of index:
+    Each Gaussian is projected to a 2D Gaussian (EWA, with a low-pass filter of 0.3 px^2 by default). The 2D Gaussians
+    are blended front to back, in the order of camera z and then of index:
 
         alpha = min(0.99, opacity exp(-1/2 d^T Sigma^-1 d)),  skipped below 1/255
         rgb = sum_i T_i alpha_i color_i,   T_i = product over j < i of (1 - alpha_j)
@@ -73,7 +73,7 @@ def rasterize(
         gaussians: N Gaussians.
         colors: (N, 3) RGB, or the colour decoder of these N Gaussians.
         viewport: the camera.
-        settings: near plane, antialiasing, transmittance_min, depth and culling.
+        settings: near plane, antialiasing, transmittance_min, depth, culling and low-pass filter.
         absgrad: (N, 2) buffer to which backward adds the sums over pixels of |dL/d mean2d| (x, y) in 1/px,
             the criterion of densification by absolute gradients.
         implementation: "auto", "reference", "cpu" or "gpu"; with a `Shading` "reference" runs each step in its fastest

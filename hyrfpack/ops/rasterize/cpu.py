@@ -94,6 +94,7 @@ def _view(viewport: Viewport, settings: RasterSettings, absgrad: Tensor | None =
         height=int(viewport.height),
         near=float(settings.near),
         antialiased=bool(settings.antialiased),
+        low_pass_variance=float(settings.low_pass_variance),
     )
     return _View(
         projection,

@@ -14,7 +14,6 @@ import numpy as np
 from hyrfpack.ops.rasterize.reference import (
     ALPHA_MIN,
     DETERMINANT_RATIO_MIN,
-    LOW_PASS_VARIANCE,
     QUAT_NORM_MIN,
     TILE_SIZE,
 )
@@ -51,7 +50,7 @@ class ProjectionSettings(NamedTuple):
         shift: the camera's translation.
         lens: fx, fy, cx, cy, then the limits of x/z (low, high) and of y/z in the Jacobian.
         width, height: as in `Viewport`.
-        near, antialiased: as in `RasterSettings`.
+        near, antialiased, low_pass_variance: as in `RasterSettings`.
     """
 
     axes: tuple[tuple[float, ...], ...]
@@ -61,6 +60,7 @@ class ProjectionSettings(NamedTuple):
     height: int
     near: float
     antialiased: bool
+    low_pass_variance: float
 
 
 class Projection(NamedTuple):
@@ -158,7 +158,7 @@ def _covariance_factors(x_z, y_z, z, quat, axes, lens):
 
 
 @_inlined
-def _covariance(g, h):
+def _covariance(g, h, low_pass):
     """Compute the low-pass filtered covariance from its square root with rows g and h.
 
     Returns:
@@ -168,8 +168,8 @@ def _covariance(g, h):
     # |g x h|^2 equals xx yy - xy^2, but does not cancel on needles.
     normal = _cross(g, h)
     raw = _dot(normal, normal)
-    det = raw + LOW_PASS_VARIANCE * (xx + yy) + LOW_PASS_VARIANCE * LOW_PASS_VARIANCE
-    return xx + LOW_PASS_VARIANCE, xy, yy + LOW_PASS_VARIANCE, raw, det
+    det = raw + low_pass * (xx + yy) + low_pass * low_pass
+    return xx + low_pass, xy, yy + low_pass, raw, det
 
 
 @_kernel
@@ -188,7 +188,7 @@ def project(start, stop, gaussians, settings, projection):
         gaussians, settings, projection: the fields of `GaussianArrays`, `ProjectionSettings` and `Projection`.
     """
     means, quats, scales, opacities, colors = gaussians
-    axes, shift, lens, width, height, near, antialiased = settings
+    axes, shift, lens, width, height, near, antialiased, low_pass = settings
     records, keys, tile_count_bounds = projection
     for i in range(np.uint64(start), np.uint64(stop)):
         keys[i] = HIDDEN_KEY
@@ -201,7 +201,7 @@ def project(start, stop, gaussians, settings, projection):
         quat = np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3])
         _, _, e, f, _, _ = _covariance_factors(x_z, y_z, z, quat, axes, lens)
         scale = _to_float64(scales[i, 0], scales[i, 1], scales[i, 2])
-        xx, xy, yy, raw, det = _covariance(_multiply(e, scale), _multiply(f, scale))
+        xx, xy, yy, raw, det = _covariance(_multiply(e, scale), _multiply(f, scale), low_pass)
         if antialiased:
             opacity *= math.sqrt(max(raw / det, DETERMINANT_RATIO_MIN))
         mean_x, mean_y = lens[0] * x_z + lens[2], lens[1] * y_z + lens[3]
@@ -242,7 +242,7 @@ def project_backward(start, stop, slot_starts, rows, gaussians, settings, gradie
         absgrad: (N, 2), incremented; None if not needed.
     """
     means, quats, scales, opacities, _ = gaussians
-    axes, shift, lens, _, _, _, antialiased = settings
+    axes, shift, lens, _, _, _, antialiased, low_pass = settings
     grad_means, grad_quats, grad_scales, grad_opacities, grad_colors = gradients
     sums = np.empty(GRADIENT_ROW_FLOATS, np.float32)
     for i in range(np.uint64(start), np.uint64(stop)):
@@ -268,7 +268,7 @@ def project_backward(start, stop, slot_starts, rows, gaussians, settings, gradie
         a, b, e, f, q, norm = _covariance_factors(x_z, y_z, z, quat, axes, lens)
         scale = _to_float64(scales[i, 0], scales[i, 1], scales[i, 2])
         g, h = _multiply(e, scale), _multiply(f, scale)
-        xx, xy, yy, raw, det = _covariance(g, h)
+        xx, xy, yy, raw, det = _covariance(g, h, low_pass)
         u_x, u_y, v_y = _triangular_form(xx, xy, yy, det)
 
         # Sigma^-1 d = 16 (U_X u, U_Y u + V_Y v), and dL/dSigma = 1/2 sum p (Sigma^-1 d)(Sigma^-1 d)^T.
@@ -283,8 +283,8 @@ def project_backward(start, stop, slot_starts, rows, gaussians, settings, gradie
             absgrad[i, 1] += np.float32(16 * sums[SUM_ABS_V])
         if antialiased and raw / det >= DETERMINANT_RATIO_MIN:
             # The compensated opacity adds 1/2 log(raw / det) to the exponent.
-            grad_xx += 0.5 * sum_p * ((yy - LOW_PASS_VARIANCE) / raw - yy / det)
-            grad_yy += 0.5 * sum_p * ((xx - LOW_PASS_VARIANCE) / raw - xx / det)
+            grad_xx += 0.5 * sum_p * ((yy - low_pass) / raw - yy / det)
+            grad_yy += 0.5 * sum_p * ((xx - low_pass) / raw - xx / det)
             grad_xy -= sum_p * xy * (1 / raw - 1 / det)
 
         grad_g, grad_h = _combine(2 * grad_xx, g, grad_xy, h), _combine(2 * grad_yy, h, grad_xy, g)

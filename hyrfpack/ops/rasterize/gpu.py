@@ -78,7 +78,9 @@ def rasterize(
     gaussians: Gaussians3D, colors: Tensor, viewport: Viewport, settings: RasterSettings, absgrad: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor | None, Tensor, int, dict[str, float], tuple[str, ...]]:
     """Compute `hyrfpack.ops.rasterize.rasterize`; the result is a tuple of the fields of `Rasterization` in order."""
-    camera = gpu_project.pack_camera(viewport, settings.near, colors.device)
+    camera = gpu_project.pack_camera(
+        viewport, settings.near, colors.device, low_pass_variance=settings.low_pass_variance
+    )
     view = _View(camera, viewport, settings, None if absgrad is None else absgrad.detach())
     report: dict = {}
     rgb, transmittance, depths, visible = _Rasterize.apply(*gaussians, colors, view, report)

@@ -26,6 +26,7 @@ from hyrfpack.ops.rasterize.gpu_ellipse import (
     touched_pixel_rows,
     touched_tile_columns,
 )
+from hyrfpack.ops.rasterize.inputs import LOW_PASS_VARIANCE
 from hyrfpack.ops.viewport import Viewport
 
 # Words of a record, which holds one projected Gaussian in 16 float32, read and written in pairs (see gpu_pairs). With
@@ -49,6 +50,7 @@ GRADIENT_ROW_FLOATS = tl.constexpr(12)
 
 # Index of the camera's centre in the result of `pack_camera`.
 VIEWPOINT_OFFSET = tl.constexpr(25)
+_LOW_PASS_OFFSET = tl.constexpr(28)
 # Sort key of a Gaussian that is not drawn.
 HIDDEN_KEY = tl.constexpr(2**31 - 1)
 # Inputs in the order of their bits in the flags of non-finite inputs.
@@ -56,7 +58,6 @@ FLAGGED_INPUTS = "means", "quats", "scales", "opacities", "colors"
 GAUSSIANS_PER_PROGRAM = 128  # float64 takes many registers; small programs then give the best occupancy.
 WARPS_PER_PROGRAM = 4
 
-_LOW_PASS_VARIANCE = tl.constexpr(reference.LOW_PASS_VARIANCE)
 _ALPHA_MIN = tl.constexpr(reference.ALPHA_MIN)
 _DETERMINANT_RATIO_MIN = tl.constexpr(reference.DETERMINANT_RATIO_MIN)
 _QUAT_NORM_MIN = tl.constexpr(reference.QUAT_NORM_MIN)
@@ -98,18 +99,25 @@ class Projection(NamedTuple):
         return cls(records, keys, counts, visible, flags_and_ends)
 
 
-def pack_camera(viewport: Viewport, near: float, device: torch.device, tolerance: float = 0.0) -> Tensor:
+def pack_camera(
+    viewport: Viewport,
+    near: float,
+    device: torch.device,
+    tolerance: float = 0.0,
+    low_pass_variance: float = LOW_PASS_VARIANCE,
+) -> Tensor:
     """Pack the camera's parameters for the kernels into one small float64 tensor on the device.
 
     Args:
         viewport: the camera; reading its pose from the device synchronises.
         near: distance of the near plane in world units.
         tolerance: width of the band of `in_frustum`, as a fraction of half the image's size.
+        low_pass_variance: variance of the low-pass filter in px^2.
 
     Returns:
-        (28,): the rows of the rotation and the translation (12); fx, fy, cx, cy; near; the limits of x/z (low, high)
+        (29,): the rows of the rotation and the translation (12); fx, fy, cx, cy; near; the limits of x/z (low, high)
         and of y/z in the Jacobian; the limits of fx x/z (low, high) and of fy y/z in the frustum; and, from
-        VIEWPOINT_OFFSET on, the camera's centre.
+        VIEWPOINT_OFFSET on, the camera's centre; and the variance of the low-pass filter.
     """
     fx, fy, cx, cy = (float(number) for number in viewport.intrinsics)
     width, height = viewport.width, viewport.height
@@ -119,7 +127,7 @@ def pack_camera(viewport: Viewport, near: float, device: torch.device, tolerance
         *pose[:3, :3].flatten().tolist(), *pose[:3, 3].tolist(), fx, fy, cx, cy, near,
         *reference.jacobian_limits(viewport),
         -margin_x - cx, width + margin_x - cx, -margin_y - cy, height + margin_y - cy,
-        *camera_center(pose).tolist(),
+        *camera_center(pose).tolist(), low_pass_variance,
     ]  # fmt: skip
     # A blocking copy would wait for the device. This one stages its source at once, so the source may be freed.
     return torch.tensor(numbers, dtype=torch.float64).to(device, non_blocking=True)
@@ -141,11 +149,12 @@ def load_camera(camera):
 
     Returns:
         axes (three rows of the rotation), shift (the translation), lens (fx, fy, cx, cy), near, the limits in the
-        Jacobian (4) and those of the frustum (4).
+        Jacobian (4) and those of the frustum (4), and the variance of the low-pass filter.
     """
     axes = _load_3(camera), _load_3(camera + 3), _load_3(camera + 6)
     shift, lens, near = _load_3(camera + 9), _load_4(camera + 12), tl.load(camera + 16)
-    return axes, shift, lens, near, _load_4(camera + 17), _load_4(camera + 21)
+    low_pass = tl.load(camera + _LOW_PASS_OFFSET)
+    return axes, shift, lens, near, _load_4(camera + 17), _load_4(camera + 21), low_pass
 
 
 @triton.jit
@@ -234,7 +243,7 @@ def in_frustum(mean, camera):
 
     The `tolerance` of `pack_camera` sets the width of the band.
     """
-    axes, shift, lens, near, _, limits = camera
+    axes, shift, lens, near, _, limits, _ = camera
     x, y, z = _to_camera(mean, axes, shift)
     u, v = lens[0] * x, lens[1] * y  # The limits are multiplied by z; a division by z would need a guard against 0.
     inside = (u > limits[0] * z) & (u < limits[1] * z) & (v > limits[2] * z) & (v < limits[3] * z)
@@ -263,7 +272,7 @@ def _covariance_factors(x_z, y_z, inv_z, quat, axes, lens, limits):
 
 
 @triton.jit
-def _covariance(g, h):
+def _covariance(g, h, low_pass):
     """Compute the low-pass filtered covariance from its square root with rows g and h.
 
     Returns:
@@ -273,8 +282,8 @@ def _covariance(g, h):
     # |g x h|^2 equals xx yy - xy^2, but does not cancel on needles.
     normal = _cross(g, h)
     raw = _dot(normal, normal)
-    det = raw + (xx + yy) * _LOW_PASS_VARIANCE + _LOW_PASS_VARIANCE * _LOW_PASS_VARIANCE
-    return xx + _LOW_PASS_VARIANCE, xy, yy + _LOW_PASS_VARIANCE, raw, det
+    det = raw + (xx + yy) * low_pass + low_pass * low_pass
+    return xx + low_pass, xy, yy + low_pass, raw, det
 
 
 @triton.jit
@@ -299,7 +308,7 @@ def project_block(mean, quat, scale, opacity, camera, width, height, ANTIALIASED
         The float32 pairs of a record, without the colours, for `store_records`; int32 sort keys by depth, HIDDEN_KEY
         for Gaussians that are not drawn; int32 counts of tiles that the ellipse alpha >= 1/255 touches.
     """
-    axes, shift, lens, near, limits, _ = camera
+    axes, shift, lens, near, limits, _, low_pass = camera
     x, y, z = _to_camera(mean, axes, shift)
     opacity = opacity.to(tl.float64)
     # The comparisons are written so that they fail for NaN, which is then not drawn.
@@ -309,7 +318,7 @@ def project_block(mean, quat, scale, opacity, camera, width, height, ANTIALIASED
     x_z, y_z = x * inv_z, y * inv_z
     _, _, e, f, _, _, _ = _covariance_factors(x_z, y_z, inv_z, quat, axes, lens, limits)
     scale = _to_float64_3(scale)
-    xx, xy, yy, raw, det = _covariance(_multiply(e, scale), _multiply(f, scale))
+    xx, xy, yy, raw, det = _covariance(_multiply(e, scale), _multiply(f, scale), low_pass)
     if ANTIALIASED:
         opacity *= tl.sqrt(tl.maximum(raw / det, _DETERMINANT_RATIO_MIN))
     mean_x, mean_y = lens[0] * x_z + lens[2], lens[1] * y_z + lens[3]
@@ -459,7 +468,7 @@ def project_backward(
     opacity = tl.load(gaussians.opacities + index, mask=drawn, other=1.0)
     tl.store(grads.opacities + index, sum_p / opacity, mask=live)
 
-    axes, shift, lens, _, limits, _ = load_camera(camera)
+    axes, shift, lens, _, limits, _, low_pass = load_camera(camera)
     # Gaussians that are not drawn may hold any numbers. They are replaced by zeros at z = 1 and get zero gradients.
     x, y, z = _to_camera(load_rows_3(gaussians.means, index, drawn), axes, shift)
     inv_z = 1 / tl.where(drawn, z, 1.0)
@@ -468,7 +477,7 @@ def project_backward(
     a, b, e, f, columns, q, norm = _covariance_factors(x_z, y_z, inv_z, quat, axes, lens, limits)
     scale = _to_float64_3(load_rows_3(gaussians.scales, index, drawn))
     g, h = _multiply(e, scale), _multiply(f, scale)
-    xx, xy, yy, raw, det = _covariance(g, h)
+    xx, xy, yy, raw, det = _covariance(g, h, low_pass)
     u_x, u_y, v_x = _triangular_form(xx, xy, det)
     if ABSGRAD:
         to = absgrad + index.to(tl.int64) * absgrad_row
@@ -490,8 +499,8 @@ def project_backward(
         compensated = raw >= det * _DETERMINANT_RATIO_MIN
         by_p = tl.where(compensated, sum_p, 0.0)
         inv_raw, inv_det = 1 / tl.where(compensated, raw, 1.0), 1 / det
-        grad_xx += 0.5 * by_p * ((yy - _LOW_PASS_VARIANCE) * inv_raw - yy * inv_det)
-        grad_yy += 0.5 * by_p * ((xx - _LOW_PASS_VARIANCE) * inv_raw - xx * inv_det)
+        grad_xx += 0.5 * by_p * ((yy - low_pass) * inv_raw - yy * inv_det)
+        grad_yy += 0.5 * by_p * ((xx - low_pass) * inv_raw - xx * inv_det)
         grad_xy -= by_p * xy * (inv_raw - inv_det)
 
     grad_g, grad_h = _combine(2 * grad_xx, g, grad_xy, h), _combine(2 * grad_yy, h, grad_xy, g)

@@ -63,7 +63,7 @@ def rasterize_shaded(
     """Compute `hyrfpack.ops.rasterize.rasterize` with a `Shading`."""
     total, device = len(gaussians.means), gaussians.means.device
     inputs = Gaussians3D(*(tensor.detach().contiguous() for tensor in gaussians))
-    camera = pack_camera(viewport, settings.near, device, settings.cull_tolerance)
+    camera = pack_camera(viewport, settings.near, device, settings.cull_tolerance, settings.low_pass_variance)
     decoder, constants = shading.kernel_arguments
     projection = Projection.empty(total, device)
     if total:

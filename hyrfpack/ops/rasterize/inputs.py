@@ -8,6 +8,7 @@ from typing import NamedTuple
 from torch import Tensor
 
 TRANSMITTANCE_MIN = 1 / 512  # This is half a quantisation step of 8-bit images.
+LOW_PASS_VARIANCE = 0.3  # in squared pixels, as in 3DGS
 # The shape of each input tensor for one Gaussian.
 INPUT_SHAPES = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "colors": (3,)}
 
@@ -38,11 +39,13 @@ class RasterSettings:
 
     Attributes:
         near: distance of the near plane in world units, >= 0. Gaussians with camera z <= near are skipped.
-        antialiased: scale opacities by sqrt(det(Sigma) / det(Sigma + 0.3 I)), so that the low-pass adds no light.
+        antialiased: scale opacities by sqrt(det(Sigma) / det(Sigma + v I)), so that the low-pass filter adds no light;
+            v is `low_pass_variance`.
         transmittance_min: transmittance at which a pixel is finished, in [0, 1); 0 blends all Gaussians.
         depth: also compute depth.
         cull_tolerance: how far outside the image the centre of a Gaussian may project, as a fraction of half the
             image's size. Only Gaussians whose colours are decoded while they are drawn are culled by it.
+        low_pass_variance: variance in px^2 that is added to the diagonal of every 2D covariance, > 0.
 
     Raises:
         ValueError: a setting is out of range.
@@ -53,6 +56,7 @@ class RasterSettings:
     transmittance_min: float = TRANSMITTANCE_MIN
     depth: bool = False
     cull_tolerance: float = 0.3
+    low_pass_variance: float = LOW_PASS_VARIANCE
 
     def __post_init__(self) -> None:
         if not self.near >= 0:
@@ -61,6 +65,8 @@ class RasterSettings:
             raise ValueError(f"transmittance_min is {self.transmittance_min}; it must lie in [0, 1)")
         if not self.cull_tolerance >= 0:
             raise ValueError(f"cull_tolerance is {self.cull_tolerance}, expected 0 or more")
+        if not self.low_pass_variance > 0:
+            raise ValueError(f"low_pass_variance is {self.low_pass_variance}, expected more than 0")
 
 
 def check_shapes(gaussians: Gaussians3D, colors: Tensor | None = None) -> None:

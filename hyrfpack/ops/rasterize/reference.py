@@ -19,11 +19,9 @@ from hyrfpack.ops.rasterize.inputs import TRANSMITTANCE_MIN, Gaussians3D, Raster
 from hyrfpack.ops.viewport import Viewport
 
 TILE_SIZE = 16  # Tiles are squares; this is the side in pixels.
-# Variance in px^2 that is added to the diagonal of every 2D covariance.
-LOW_PASS_VARIANCE = 0.3
 ALPHA_MAX = 0.99
 ALPHA_MIN = 1 / 255
-# Lower bound of det(Sigma) / det(Sigma + 0.3 I) in the compensation of opacities for the low-pass.
+# Lower bound of det(Sigma) / det(Sigma + v I) in the compensation of opacities for the low-pass.
 DETERMINANT_RATIO_MIN = 2.5e-5
 QUAT_NORM_MIN = 1e-12
 _MAX_PIXEL_PAIRS_PER_CHUNK = 1 << 21
@@ -68,9 +66,10 @@ def jacobian_limits(viewport: Viewport) -> tuple[float, float, float, float]:
 def project(gaussians: Gaussians3D, viewport: Viewport, settings: RasterSettings) -> Projected:
     """Project 3D Gaussians to 2D Gaussians (EWA splatting).
 
-    The 2D covariance is J R Q diag(s^2) Q^T R^T J^T + 0.3 I. Here J is the Jacobian of the pinhole projection at the
-    mean in the camera's frame, p = R m + t, evaluated with x/z and y/z clamped to `jacobian_limits`. Gaussians at
-    z <= near are dropped. The arguments are those of `hyrfpack.ops.rasterize.rasterize`.
+    The 2D covariance is J R Q diag(s^2) Q^T R^T J^T + v I, where v is `low_pass_variance`. Here J is the Jacobian of
+    the pinhole projection at the mean in the camera's frame, p = R m + t, evaluated with x/z and y/z clamped to
+    `jacobian_limits`. Gaussians at z <= near are dropped. The arguments are those of
+    `hyrfpack.ops.rasterize.rasterize`.
     """
     means, quats, scales, opacities = gaussians
     fx, fy, cx, cy = viewport.intrinsics
@@ -91,11 +90,12 @@ def project(gaussians: Gaussians3D, viewport: Viewport, settings: RasterSettings
     xx, xy, yy = (half[:, 0] ** 2).sum(-1), (half[:, 0] * half[:, 1]).sum(-1), (half[:, 1] ** 2).sum(-1)
     # |a x b|^2 = |a|^2 |b|^2 - (a . b)^2 without the cancellation that needles suffer from.
     determinant = torch.linalg.cross(half[:, 0], half[:, 1]).square().sum(-1)
-    filtered = determinant + LOW_PASS_VARIANCE * (xx + yy) + LOW_PASS_VARIANCE**2
+    low_pass = settings.low_pass_variance
+    filtered = determinant + low_pass * (xx + yy) + low_pass**2
     opacities = opacities[index]
     if settings.antialiased:
         opacities = opacities * (determinant / filtered).clamp_min(DETERMINANT_RATIO_MIN).sqrt()
-    xx, yy = xx + LOW_PASS_VARIANCE, yy + LOW_PASS_VARIANCE
+    xx, yy = xx + low_pass, yy + low_pass
     return Projected(
         index=index,
         means2d=torch.stack([fx * x_z + cx, fy * y_z + cy], -1),
