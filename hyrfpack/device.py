@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
+from collections.abc import Hashable
 
 import numpy as np
 import torch
@@ -164,17 +165,17 @@ class Photos:
         on_gpu = device.type == "cuda"
         self.limit_bytes = torch.cuda.get_device_properties(device).total_memory // 8 if on_gpu else 0
         self.nbytes = 0
-        self._kept: dict[str, tuple[Tensor, Tensor | None, Tensor | None]] = {}
+        self._kept: dict[Hashable, tuple[Tensor, Tensor | None, Tensor | None]] = {}
 
-    def get(self, name: str, picture: Picture, solid: np.ndarray | None) -> tuple[Tensor, Tensor | None]:
-        """Return what `upload` returns for a photo; the same name must mean the same photo in every call."""
+    def get(self, key: Hashable, picture: Picture, solid: np.ndarray | None) -> tuple[Tensor, Tensor | None]:
+        """Return what `upload` returns for a photo; the same key must mean the same photo in every call."""
         if self.device.type != "cuda":
             return upload(picture, solid, self.device)
-        sent = self._kept.get(name)
+        sent = self._kept.get(key)
         if sent is None:
             sent = _upload_bytes(picture, self.device)
             if self.nbytes + picture.nbytes <= self.limit_bytes:
-                self._kept[name] = sent
+                self._kept[key] = sent
                 self.nbytes += picture.nbytes
         return _composite(*sent, solid)
 

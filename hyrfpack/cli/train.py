@@ -33,7 +33,9 @@ if TYPE_CHECKING:
 @click.command(short_help="Train a model on photos with poses.")
 @click.argument("data", type=PATH)
 @click.option("-o", "--output", "out", type=OUTPUT, required=True, metavar="RUN", help="Folder of the run.")
-@settings_options(TrainConfig, "steps", "early_stop", "max_gaussians", "target_bytes", "preset", "seed")
+@settings_options(
+    TrainConfig, "steps", "early_stop", "resolution_schedule", "max_gaussians", "target_bytes", "preset", "seed"
+)
 @scene_options
 @settings_options(TrainConfig, "background", "background_color", "exposure", "antialiased", "log2_table_size")
 @click.option(

@@ -144,7 +144,7 @@ def _backpropagate_view(
 ) -> Tensor:
     """Backpropagate the photometric loss of a view and return the loss, a detached scalar."""
     solid = None if model.config.background else np.array(model.config.solid, np.float32)
-    target, mask = photos.get(view.name, picture, solid)
+    target, mask = photos.get(view.load, picture, solid)
     image = render_view(model, view.camera).rgb
     if gains is not None:
         image = apply_exposure_gains(image, gains[view.name])

@@ -83,11 +83,15 @@ class DensityConfig:
     def __post_init__(self) -> None:
         check_settings(self)
 
+    def planned_counts(self, initial: int, budget: int) -> list[tuple[float, float]]:
+        """Return the corners (time, number of Gaussians) of a run in which each round reaches its target number."""
+        most = self.excess * budget
+        return [(0, initial), (self.start, initial), (self.peak, most), (self.stop, budget), (1, budget)]
+
     def mean_count(self, initial: int, budget: int) -> float:
         """Return the mean number of Gaussians over a run in which each round reaches its target number."""
-        most = self.excess * budget
-        corners = (0, initial), (self.start, initial), (self.peak, most), (self.stop, budget), (1, budget)
-        return sum((t1 - t0) * (n0 + n1) / 2 for (t0, n0), (t1, n1) in pairwise(corners))
+        corners = pairwise(self.planned_counts(initial, budget))
+        return sum((t1 - t0) * (n0 + n1) / 2 for (t0, n0), (t1, n1) in corners)
 
 
 @dataclass(frozen=True)
@@ -107,6 +111,7 @@ class TrainConfig:
     Attributes:
         steps: training steps.
         early_stop: shorten a run of over 3,000 steps on 8 to 30 photos where pilot runs show that more do not help.
+        resolution_schedule: train most steps on reduced photos if photos are large and Gaussians few.
         seed: random seed. On a CPU, the same seed gives the same file.
         preset: kind of scene; auto detects it.
         max_gaussians: budget: the maximum number of Gaussians. Default: measured by pilot runs.
@@ -128,6 +133,7 @@ class TrainConfig:
 
     steps: Annotated[int, Range(1)] = 3000
     early_stop: bool = True
+    resolution_schedule: bool = True
     seed: Seed = 0
     preset: Annotated[str, OneOf(PRESETS)] = "auto"
     max_gaussians: Annotated[int | None, Range(1)] = None

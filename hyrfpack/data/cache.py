@@ -12,6 +12,8 @@ from threading import Lock
 
 from hyrfpack.scene import Picture, View
 
+PREFETCH_DEPTH = 4  # By default so many pictures are decoded in advance.
+
 
 class PictureCache:
     """A cache of the most recently used pictures, limited in bytes. Threads may share it.
@@ -49,7 +51,7 @@ class PictureCache:
                     self.nbytes -= self._pictures.popitem(last=False)[1].nbytes
         return picture
 
-    def stream(self, views: Iterable[View], depth: int = 4) -> Generator[tuple[View, Picture]]:
+    def stream(self, views: Iterable[View], depth: int = PREFETCH_DEPTH) -> Generator[tuple[View, Picture]]:
         """Yield each view with its picture, while another thread decodes the next pictures.
 
         Leaving the loop or closing the iterator ends the thread.

@@ -150,6 +150,7 @@ def _fit_to_pictures(
     # Density control is off: the Gaussians are in place already, and compression prunes those of low importance.
     settings = TrainConfig(
         steps=config.steps,
+        resolution_schedule=False,
         seed=config.seed,
         learning_rates=WARM_START_RATES,
         density=DensityConfig(stop=0.0),

@@ -31,6 +31,7 @@ from hyrfpack.render import render_view
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Camera, Scene, evenly_spaced
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer
 from hyrfpack.train.decisions import decide, is_budget_open
+from hyrfpack.train.resolution import PhotoSize
 from hyrfpack.train.setup import budget_for
 
 _LOG = logging.getLogger(__name__)
@@ -55,7 +56,7 @@ class SceneCost:
     """Times that a scene takes on this machine, at one size of its photos.
 
     Attributes:
-        step_seconds: seconds of a training step without Gaussians.
+        step_seconds: seconds of a training step at full resolution without Gaussians.
         step_seconds_per_gaussian: further seconds of a training step for each Gaussian.
         decoding_seconds: seconds that training waits until a photo is decoded.
         cpu_pass_seconds: seconds of a pass on the CPU with `gaussians`.
@@ -82,8 +83,10 @@ class SceneCost:
     def training_seconds(self, scene: Scene, steps: int) -> float:
         """Estimate the seconds of a training run from its mean number of Gaussians."""
         budget = self._budget(scene, steps)
-        mean = DensityConfig().mean_count(min(budget, len(scene.points) or budget // 2), budget)
-        step = self.step_seconds + self.step_seconds_per_gaussian * mean
+        initial, density = min(budget, len(scene.points) or budget // 2), DensityConfig()
+        step = self.step_seconds + self.step_seconds_per_gaussian * density.mean_count(initial, budget)
+        sizes = [(view.camera.width, view.camera.height) for view in scene.train]
+        step *= PhotoSize.of(sizes).mean_step_cost(density, initial, budget)
         return TRAINED_PACE_RATIO * steps * step + self.decoding_seconds * min(steps, len(scene.train))
 
     def seconds_after_training(self, scene: Scene, steps: int) -> dict[str, float]:
@@ -219,7 +222,12 @@ def measure_scene_cost(
     default_config = dataclasses.replace(requested, steps=TrainConfig.steps).train_config(seed)
     budget, _ = budget_for(scene, default_config)
     config = TrainConfig(
-        steps=PROBE_STEPS, seed=seed, preset=requested.preset, max_gaussians=budget, density=PROBE_DENSITY
+        steps=PROBE_STEPS,
+        resolution_schedule=False,
+        seed=seed,
+        preset=requested.preset,
+        max_gaussians=budget,
+        density=PROBE_DENSITY,
     )
     trainer = Trainer(scene, config, cache, device)
     counts: list[int] = []

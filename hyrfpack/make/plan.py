@@ -10,7 +10,7 @@ import torch
 
 from hyrfpack.compress.sensitivity import MAX_SENSITIVITY_VIEWS, MIN_SENSITIVITY_VIEWS, TARGET_DRAWN_GAUSSIANS
 from hyrfpack.config.make import MakeConfig
-from hyrfpack.config.train import FULL_STEPS, TrainConfig
+from hyrfpack.config.train import FULL_STEPS, DensityConfig, TrainConfig
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Scene
 from hyrfpack.train.decisions import (
     MAX_BUDGET_PILOT_STEPS,
@@ -19,6 +19,7 @@ from hyrfpack.train.decisions import (
     max_length_pilot_steps,
     max_pilot_steps,
 )
+from hyrfpack.train.resolution import PhotoSize
 from hyrfpack.train.setup import budget_for
 
 # Measured on two CPU cores, for the first estimate only; during the work, measured times replace it.
@@ -121,14 +122,20 @@ def mean_megapixels(scene: Scene) -> float:
 
 
 def estimate_seconds(
-    pixels: float, plan: Plan, gaussians: int, held_out: int, pilot_steps: int, device: torch.device
+    size: PhotoSize,
+    plan: Plan,
+    initial: int,
+    gaussians: int,
+    held_out: int,
+    pilot_steps: int,
+    device: torch.device,
 ) -> dict[str, float]:
     """Estimate roughly how many seconds the stages after the poses take.
 
     Args:
-        pixels: megapixels of a photo.
+        size: size of the photos.
         plan: the plan.
-        gaussians: expected number of Gaussians.
+        initial, gaussians: expected number of Gaussians at the start and at the end.
         held_out: number of photos that are scored.
         pilot_steps: number of steps of all pilot runs.
         device: device of the training.
@@ -136,10 +143,9 @@ def estimate_seconds(
     Returns:
         Seconds by part of a stage (`hyrfpack.make.progress.STAGE_PARTS`) or by stage.
     """
-    step_seconds, scoring_passes = (
-        pixels * (CPU_STEP_SECONDS_PER_MEGAPIXEL if device.type == "cpu" else GPU_STEP_SECONDS_PER_MEGAPIXEL),
-        PASSES_PER_SCORED_VIEW * held_out,
-    )
+    pixels, scoring_passes = size.pixels / 1e6, PASSES_PER_SCORED_VIEW * held_out
+    step_seconds = pixels * (CPU_STEP_SECONDS_PER_MEGAPIXEL if device.type == "cpu" else GPU_STEP_SECONDS_PER_MEGAPIXEL)
+    step_seconds *= size.mean_step_cost(DensityConfig(), initial, gaussians)
     return {
         "pilots": pilot_steps * step_seconds,
         "training": 2 + plan.steps * step_seconds,
@@ -155,21 +161,21 @@ def estimate_scene_seconds(scene: Scene, plan: Plan, device: torch.device) -> di
     """Return `estimate_seconds` for a loaded scene."""
     config = plan.train_config(seed=0)
     gaussians, _ = budget_for(scene, config)
-    return estimate_seconds(
-        mean_megapixels(scene), plan, gaussians, len(scene.test), max_pilot_steps(scene, config), device
-    )
+    initial = min(gaussians, len(scene.points) or gaussians // 2)
+    size = PhotoSize.of([(view.camera.width, view.camera.height) for view in scene.train])
+    return estimate_seconds(size, plan, initial, gaussians, len(scene.test), max_pilot_steps(scene, config), device)
 
 
 def estimate_photos_seconds(sizes: Sequence[tuple[int, int]], plan: Plan, device: torch.device) -> dict[str, float]:
     """Return `estimate_seconds` and the time for poses, for photos of these (width, height); no sizes mean a video."""
     width, height = sizes[0] if sizes else (1920, 1080)
     shrunk = min(1.0, plan.max_size / max(width, height)) if plan.max_size else 1.0
-    pixels, count = width * height * shrunk**2 / 1e6, len(sizes) or ASSUMED_VIDEO_PHOTOS
+    size, count = PhotoSize.of([(round(width * shrunk), round(height * shrunk))]), len(sizes) or ASSUMED_VIDEO_PHOTOS
     trained = count - count // 8
     pilot_steps = MAX_BUDGET_PILOT_STEPS + max_exposure_pilot_steps(trained, plan.steps)
     pilot_steps *= plan.steps >= MIN_BUDGET_STEPS
     pilot_steps += max_length_pilot_steps(trained, plan.steps) * plan.early_stop
     return {
         "poses": POSE_SECONDS_PER_PHOTO * count,
-        **estimate_seconds(pixels, plan, 20_000, count // 8, pilot_steps, device),
+        **estimate_seconds(size, plan, 10_000, 20_000, count // 8, pilot_steps, device),
     }

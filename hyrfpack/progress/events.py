@@ -24,6 +24,7 @@ class StepEvent:
         loss: loss of the step's view.
         mse: mean squared error of the view's colours in [0, 1]; NaN if all of its photo is masked.
         gaussians: number of Gaussians of the model.
+        share: estimated share of the run's work that is done, 0 to 1; None if all steps take equally long.
     """
 
     step: int
@@ -31,6 +32,12 @@ class StepEvent:
     loss: float
     mse: float
     gaussians: int
+    share: float | None = None
+
+    @property
+    def share_done(self) -> float:
+        """Return the share of the run's work that is done, 0 to 1."""
+        return self.step / self.steps if self.share is None else self.share
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from hyrfpack.progress.events import StepEvent
+
 COMPILATION_STEPS = 2  # The first steps of a run compile kernels, so they do not count for the speed.
 # A pace is known once at least this share of the work is done and this time has passed.
 MIN_PACE_SHARE = 0.01
@@ -11,25 +13,30 @@ MAX_SAMPLES = 200  # Number of evenly spaced samples; there may be more, because
 
 
 class StepPace:
-    """Measures the speed of a training run since its kernels were compiled.
+    """Measures the pace of a training run since its kernels were compiled.
 
     Attributes:
         warm: time, in seconds, at which all kernels were compiled.
         warm_step: the step after which all kernels were compiled.
     """
 
-    def __init__(self, steps: int, done: int, start: float) -> None:
-        """Begin at time `start`, after `done` of `steps` steps."""
-        self.steps, self.first, self.warm_step = steps, done, done
+    def __init__(self, done: int, start: float) -> None:
+        """Begin at time `start`, after `done` steps."""
+        self.first, self.warm_step = done, done
         self.start = self.warm = start
+        self._warm_share: float | None = None
 
-    def at(self, step: int, now: float) -> tuple[float, float]:
+    def at(self, event: StepEvent, now: float) -> tuple[float, float]:
         """Return the speed in steps per second, and the seconds left, after a step that was finished at time `now`."""
-        since, taken = (self.warm, self.warm_step) if step > self.warm_step else (self.start, self.first)
-        speed = max(step - taken, 1) / max(now - since, 1e-9)
-        if step - self.first <= COMPILATION_STEPS:
-            self.warm, self.warm_step = now, step
-        return speed, (self.steps - step) / speed
+        since, taken = (self.warm, self.warm_step) if event.step > self.warm_step else (self.start, self.first)
+        done = event.share_done
+        # Before the pace is measured, the work so far is assumed to be in proportion to the steps.
+        done_before = done * taken / event.step if self._warm_share is None else self._warm_share
+        elapsed = max(now - since, 1e-9)
+        if event.step - self.first <= COMPILATION_STEPS:
+            self.warm, self.warm_step, self._warm_share = now, event.step, done
+        seconds_left = (1 - done) * elapsed / max(done - done_before, 1e-9)
+        return max(event.step - taken, 1) / elapsed, seconds_left
 
 
 class SharePace:

@@ -78,7 +78,7 @@ class Status:
         self.event: Event | None = None
         self.means = StepMeans()
         self._share_pace = SharePace(self.start)
-        self._step_pace = StepPace(0, 0, self.start)
+        self._step_pace = StepPace(0, self.start)
         self._speed = self._seconds_left = 0.0
 
     def update(self, event: Event) -> None:
@@ -86,9 +86,9 @@ class Status:
         now = monotonic()
         if isinstance(event, StepEvent):
             if not isinstance(self.event, StepEvent):
-                self.means, self._step_pace = StepMeans(), StepPace(event.steps, event.step - 1, self.task_start)
+                self.means, self._step_pace = StepMeans(), StepPace(event.step - 1, self.task_start)
             self.means.add(event)
-            self._speed, self._seconds_left = self._step_pace.at(event.step, now)
+            self._speed, self._seconds_left = self._step_pace.at(event, now)
         elif isinstance(event, TaskEvent):
             if not (isinstance(self.event, TaskEvent) and self.event.task == event.task):
                 self.task_start = now
@@ -124,7 +124,7 @@ class Status:
         }
         if event.step == event.steps:
             del parts["eta"]
-        return StatusLine(parts, event.step / event.steps, OPTIONAL_STEP_PARTS)
+        return StatusLine(parts, event.share_done, OPTIONAL_STEP_PARTS)
 
     def _task_line(self, event: TaskEvent, now: float) -> StatusLine:
         texts = [self.title] * bool(self.title) + [event.task]

@@ -22,9 +22,9 @@ MIN_ADVICE_SECONDS_LEFT = 3600.0
 class LongRunAdvice:
     """Logs once how to shorten a run of which more than an hour remains."""
 
-    def __init__(self, steps: int, done: int, device: torch.device) -> None:
-        """Begin after `done` of `steps` steps on a device."""
-        self._pace = StepPace(steps, done, monotonic())
+    def __init__(self, done: int, device: torch.device) -> None:
+        """Begin after `done` steps on a device."""
+        self._pace = StepPace(done, monotonic())
         ways = ["fewer steps", "smaller photos", "fewer Gaussians"] + ["a GPU"] * (device.type == "cpu")
         self._advice = f"{', '.join(ways[:-1])} or {ways[-1]}"
         self._is_given = False
@@ -32,7 +32,7 @@ class LongRunAdvice:
     def step(self, event: StepEvent) -> None:
         """Take a finished step."""
         now = monotonic()
-        _, left = self._pace.at(event.step, now)
+        _, left = self._pace.at(event, now)
         steps, seconds = event.step - self._pace.warm_step, now - self._pace.warm
         is_speed_known = steps >= MIN_ADVICE_STEPS and seconds >= MIN_ADVICE_SECONDS
         if is_speed_known and left > MIN_ADVICE_SECONDS_LEFT and not self._is_given:

@@ -57,7 +57,7 @@ class TrainingLog:
         """
         self.steps, self.device = steps, device
         self.start = self.last = time.monotonic()
-        self.pace = StepPace(steps, done, self.start)
+        self.pace = StepPace(done, self.start)
         self.losses: list[float] = []
         self.errors: list[float] = []
         try:
@@ -76,7 +76,7 @@ class TrainingLog:
     def step(self, event: StepEvent) -> None:
         """Add a finished step, and write a record if one is due."""
         now = time.monotonic()
-        speed, left = self.pace.at(event.step, now)
+        speed, left = self.pace.at(event, now)
         if event.mse == event.mse:  # The mean squared error is NaN if all of the photo is masked.
             self.losses.append(event.loss)
             self.errors.append(event.mse)

@@ -279,7 +279,7 @@ class _Run:
         if log is not None:
             reports.append(log.step)
         if self.context.is_shown:
-            reports.append(LongRunAdvice(trainer.steps, trainer.step, self.device).step)
+            reports.append(LongRunAdvice(trainer.step, self.device).step)
 
         def report_step(event: StepEvent) -> None:
             for report in reports:

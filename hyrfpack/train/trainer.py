@@ -14,7 +14,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from hyrfpack.choices import CONSISTENT_EXPOSURE
 from hyrfpack.config.train import TrainConfig
 from hyrfpack.data import PictureCache
 from hyrfpack.device import Photos, upload_array
@@ -27,13 +26,14 @@ from hyrfpack.ops.ssim import photometric_loss
 from hyrfpack.parallel.pool import keep_freed_memory, torch_on_one_thread
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.progress import StepEvent, ignore_progress
-from hyrfpack.render import RenderSettings, render_view
+from hyrfpack.render import render_view
 from hyrfpack.scene import Picture, Scene, View
 from hyrfpack.train.checkpoint import load_checkpoint, names_and_sizes, save_checkpoint
 from hyrfpack.train.density import DensityControl
 from hyrfpack.train.distributed import StepStats, average_gradients, check_settings, digest, pack_step_stats
 from hyrfpack.train.exposure import initialize_exposures
 from hyrfpack.train.optimizer import Optimizer
+from hyrfpack.train.resolution import ResolutionSchedule
 from hyrfpack.train.setup import build_model
 from hyrfpack.train.strategy import Strategy
 from hyrfpack.version import __version__
@@ -109,6 +109,7 @@ class Trainer:
         self.strategy: Strategy = strategy or DensityControl(
             config.density, self.steps, self.budget, len(self.model), config.seed, device, ranks
         )
+        self.resolution = ResolutionSchedule(scene.train, self.steps, len(self.model), is_on=config.resolution_schedule)
         self.step = 0
         self.saved: int | None = None  # The step of the checkpoint on disk.
         self.records: list[dict] = []
@@ -165,8 +166,11 @@ class Trainer:
                 self._record(loss, mse)
                 complete = self.step == self.steps
                 if complete:
-                    self._fit_exposure_map()
-                progress(StepEvent(self.step, self.steps, loss, mse, len(self.model)))
+                    self.fit_exposure_map()
+                    if reduced := self.resolution.describe():
+                        self.choices["resolution"] = reduced
+                share = self.resolution.share_done(self.step)
+                progress(StepEvent(self.step, self.steps, loss, mse, len(self.model), share))
                 stopped = (stop() if self.ranks.is_single else stopped) and not complete
                 if checkpoint and (stopped or (self.step % every == 0 and not complete)):
                     try:
@@ -183,9 +187,11 @@ class Trainer:
         return True
 
     def _order(self) -> Iterator[View]:
-        """Yield this rank's views of the remaining steps."""
+        """Return an iterator over this rank's views of the remaining steps, at the resolutions of these steps."""
         first, count = self.step * self.ranks.size, self.steps * self.ranks.size
-        return shuffled(self.scene.train, self.config.seed, range(first + self.ranks.rank, count, self.ranks.size))
+        places = range(first + self.ranks.rank, count, self.ranks.size)
+        views = shuffled(self.scene.train, self.config.seed, places)
+        return map(self.resolution.reduce_view, views, range(self.step + 1, self.steps + 1))
 
     def _train_step(self, views: Iterator[tuple[View, Picture]], stop: Callable[[], bool]) -> tuple[float, float, bool]:
         """Take one optimiser step, and add and prune Gaussians if a round is due.
@@ -229,6 +235,7 @@ class Trainer:
         with self._timed("density"):
             before = self.model.gaussians.positions
             self.strategy.act(self.step, self.model, self.optimizer)
+            self.resolution.update(self.step, len(self.model))
             if not self.ranks.is_single and self.model.gaussians.positions is not before:
                 self._synchronize()
         return stats.loss, stats.error, stats.stop
@@ -241,12 +248,12 @@ class Trainer:
         """
         with self._timed("data"):
             solid = self._solid()
-            target, mask = self.photos.get(view.name, picture, solid)
+            target, mask = self.photos.get(view.load, picture, solid)
         try:
             rendering = render_view(
                 self.model,
                 view.camera,
-                RenderSettings(exposure=CONSISTENT_EXPOSURE),  # The photo's own gains are applied below.
+                self.resolution.render_settings(view.camera, self.step),
                 absgrad=self.strategy.watching(self.step),
                 solid=None if solid is None else upload_array(solid, self.device),
             )
@@ -264,7 +271,7 @@ class Trainer:
         with self._timed("loss"):
             return loss.detach(), _mean_square(image.detach() - target, mask)
 
-    def _fit_exposure_map(self) -> None:
+    def fit_exposure_map(self) -> None:
         """Fit the exposure map to the learnt per-image gains, if any, and store it in the model."""
         if self.exposures is None:
             return
@@ -371,6 +378,7 @@ class Trainer:
             "seconds": dict(self.seconds),
             "elapsed": self.elapsed,
             "choices": self.choices,
+            "resolution": self.resolution.changes,
             "pilots": self.pilots,
         }
         save_checkpoint(path, settings=self._settings(), tensors=tensors, progress=progress, overwrite=overwrite)
@@ -394,6 +402,7 @@ class Trainer:
         self.saved = self.step
         self.seconds, self.elapsed = defaultdict(float, progress["seconds"]), progress["elapsed"]
         self.choices |= progress.get("choices", {})
+        self.resolution.changes = [(first, factor) for first, factor in progress["resolution"]]
         self.pilots = progress.get("pilots", [])
 
 

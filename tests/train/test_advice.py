@@ -20,7 +20,7 @@ def messages(caplog, monkeypatch):
         caplog.set_level(logging.INFO, "hyrfpack")
         clock = [0.0]
         monkeypatch.setattr(advice, "monotonic", lambda: clock[0])
-        given = LongRunAdvice(steps, 0, torch.device("cpu"))
+        given = LongRunAdvice(0, torch.device("cpu"))
         for step in range(1, count + 1):
             clock[0] += seconds * (10 if step == 1 else 1)
             given.step(StepEvent(step, steps, 0.05, 0.001, 4850))

@@ -1,0 +1,168 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scenes import ball_points, small_model
+
+from hyrfpack.config.train import DensityConfig, TrainConfig
+from hyrfpack.data.cache import PREFETCH_DEPTH
+from hyrfpack.data.reduced import reduce_camera
+from hyrfpack.render import RenderSettings, render_view
+from hyrfpack.scene import Camera, Picture, Scene, View
+from hyrfpack.train import resolution
+from hyrfpack.train.resolution import PhotoSize, ResolutionSchedule, background_stride, reduced_low_pass_variance
+from hyrfpack.train.trainer import Trainer
+
+LARGE = PhotoSize(1600 * 1066, 1066)
+
+
+def make_view(width: int, height: int, name: str = "a.png", distance: float = 3.0) -> View:
+    pose = np.eye(4)
+    pose[2, 3] = distance
+    camera = Camera(width, height, float(width), float(width), width / 2, height / 2, pose)
+    values = np.random.default_rng(len(name)).integers(0, 256, (height, width, 3), dtype=np.uint8)
+    return View(name, camera, lambda: Picture(values))
+
+
+def test_a_reduced_step_has_enough_pixels_for_each_gaussian() -> None:
+    limits = [LARGE.pixels / factor**2 / resolution.MIN_PIXELS_PER_GAUSSIAN for factor in (2, 4)]
+
+    assert LARGE.reduction_for(limits[0]) == 2 and LARGE.reduction_for(limits[0] + 1) == 1
+    assert LARGE.reduction_for(limits[1]) == 4 and LARGE.reduction_for(limits[1] + 1) == 2
+    assert PhotoSize(10**12, 10**6).reduction_for(1) == resolution.MAX_REDUCTION
+
+
+def test_small_photos_are_not_reduced() -> None:
+    side = 2 * resolution.MIN_REDUCED_SIDE_PIXELS
+
+    assert PhotoSize(side**2, side).reduction_for(1) == 2
+    assert PhotoSize(10 * side**2, side - 1).reduction_for(1) == 1
+
+
+def test_the_resolution_grows_with_the_gaussians_and_never_falls() -> None:
+    schedule = ResolutionSchedule([make_view(1600, 1066)], 1000, 100)
+    coarsest = schedule.factor(1)
+    few, many = 100, 10**7
+
+    schedule.update(100, few)
+    schedule.update(200, many)
+    schedule.update(300, few)
+
+    assert coarsest == LARGE.reduction_for(100) > 1
+    assert [schedule.factor(step) for step in (100, 200, 200 + PREFETCH_DEPTH)] == [coarsest] * 3
+    assert [schedule.factor(step) for step in (201 + PREFETCH_DEPTH, 400, 1000)] == [1] * 3
+
+
+def test_the_last_steps_are_at_full_resolution() -> None:
+    schedule = ResolutionSchedule([make_view(1600, 1066)], 1000, 100)
+    last = int(resolution.FULL_RESOLUTION_START * 1000)
+
+    assert schedule.factor(last) > 1 and schedule.factor(last + 1) == 1
+
+
+def test_a_schedule_that_is_off_reduces_nothing() -> None:
+    schedule = ResolutionSchedule([make_view(1600, 1066)], 10, 100, is_on=False)
+
+    assert {schedule.factor(step) for step in range(1, 11)} == {1}
+    assert [schedule.share_done(step) for step in (1, 5, 10)] == pytest.approx([0.1, 0.5, 1.0])
+
+
+@pytest.mark.parametrize("steps", [1, 2, 7, 1000])
+def test_the_share_of_work_grows_to_one_and_counts_full_steps_for_more(steps: int) -> None:
+    schedule = ResolutionSchedule([make_view(1600, 1066)], steps, 100)
+    shares = [0.0, *(schedule.share_done(step) for step in range(1, steps + 1))]
+
+    costs = np.diff(shares)
+    assert shares[-1] == pytest.approx(1.0) and (costs > 0).all()
+    if steps == 1000:
+        full = resolution.FIXED_STEP_COST + 1
+        coarse = resolution.FIXED_STEP_COST + 1 / schedule.factor(1) ** 2
+        assert costs[-1] / costs[0] == pytest.approx(full / coarse)
+
+
+def test_the_estimated_cost_is_that_of_the_steps_taken() -> None:
+    density, initial, budget, steps = DensityConfig(), 5_000, 20_000, 2000
+    schedule = ResolutionSchedule([make_view(1600, 1066)], steps, initial)
+    times, counts = zip(*density.planned_counts(initial, budget), strict=True)
+    costs = []
+    for step in range(1, steps + 1):
+        costs.append(resolution.step_cost(schedule.factor(step)))
+        schedule.update(step, int(np.interp(step / steps, times, counts)))
+
+    assert LARGE.mean_step_cost(density, initial, budget) == pytest.approx(np.mean(costs), rel=0.05)
+    assert PhotoSize(40_000, 200).mean_step_cost(density, initial, budget) == 1
+
+
+def test_a_reduced_image_is_the_mean_of_blocks_of_the_full_image() -> None:
+    model, factor = small_model(ball_points(300)[0]), 4
+    camera = make_view(128, 96).camera
+    everything = {"transmittance_min": 0.0, "background_stride": 1, "background_threshold": 0.0}
+
+    with torch.no_grad():
+        full = render_view(model, camera, RenderSettings(**everything)).alpha
+        expected = full.reshape(24, factor, 32, factor).mean((1, 3))
+        errors = {
+            variance: float(
+                (
+                    render_view(
+                        model, reduce_camera(camera, factor), RenderSettings(low_pass_variance=variance, **everything)
+                    ).alpha
+                    - expected
+                )
+                .square()
+                .mean()
+            )
+            for variance in (reduced_low_pass_variance(factor), RenderSettings().low_pass_variance)
+        }
+
+    consistent, usual = errors.values()
+    assert float(expected.max()) > 0.3 and consistent < 0.2 * usual
+
+
+def test_a_full_image_keeps_its_filter() -> None:
+    assert reduced_low_pass_variance(1) == RenderSettings().low_pass_variance
+
+
+def test_large_steps_evaluate_the_background_at_few_pixels() -> None:
+    for width, height in ((1600, 1066), (4000, 3000)):
+        stride = background_stride(make_view(width, height).camera)
+        assert width * height / stride**2 <= resolution.MAX_BACKGROUND_NODES < width * height / (stride - 1) ** 2
+    assert background_stride(make_view(400, 266).camera) == RenderSettings().background_stride
+
+
+def make_large_scene() -> Scene:
+    side = 2 * resolution.MIN_REDUCED_SIDE_PIXELS
+    views = [make_view(side, side, f"{number}.png", distance=3 + number / 10) for number in range(4)]
+    points = np.random.default_rng(0).normal(size=(60, 3)) * 0.3
+    return Scene("made up", "colmap", views, [], points, np.full((60, 3), 0.5, np.float32))
+
+
+CONFIG = TrainConfig(steps=24, max_gaussians=60, exposure=False, density=DensityConfig(stop=0.9, peak=0.5))
+
+
+def test_training_reduces_photos_and_renders_at_their_size() -> None:
+    trainer = Trainer(make_large_scene(), CONFIG)
+    trainer.run()
+
+    assert trainer.resolution.changes[0] == (1, 2)
+    assert all(np.isfinite(record["loss"]) for record in trainer.records)
+
+
+def test_a_resumed_run_takes_the_same_steps_when_the_resolution_changes(tmp_path, monkeypatch) -> None:
+    # The first rounds add Gaussians beyond the limit for reduced photos.
+    side = 2 * resolution.MIN_REDUCED_SIDE_PIXELS
+    monkeypatch.setattr(resolution, "MIN_PIXELS_PER_GAUSSIAN", side**2 / 4 / 65)
+    whole, first, second = (Trainer(make_large_scene(), CONFIG) for _ in range(3))
+    whole.run()
+    changed = whole.resolution.changes[1][0]
+    for stop in range(max(1, changed - PREFETCH_DEPTH - 1), changed + 1):
+        first = Trainer(make_large_scene(), CONFIG)
+        first.run(checkpoint=tmp_path / "c.pt", stop=lambda trainer=first, stop=stop: trainer.step >= stop)
+        second = Trainer(make_large_scene(), CONFIG)
+        second.load(tmp_path / "c.pt")
+        second.run()
+
+        assert second.resolution.changes == whole.resolution.changes
+        for (name, expected), actual in zip(whole.model.named_parameters(), second.model.parameters(), strict=True):
+            assert torch.equal(expected, actual), (stop, name)
