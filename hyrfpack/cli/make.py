@@ -59,7 +59,8 @@ def make(
     The extension of FILE names the format: .hyrf, .html or any other that 'hyrfpack export' writes. A FILE without an
     extension becomes a folder with a player.
 
-    The results of each stage are kept. After an interruption (Ctrl-C, exit code 1), the same command resumes.
+    The results of each stage are kept. After an interruption (Ctrl-C, exit code 1), the same command resumes. If the
+    training was interrupted, the scene so far is packed first.
 
     \b
     Examples:
@@ -92,7 +93,8 @@ def make(
                 context=RunContext(device=torch_device),
             )
     except Stopped as stop:
-        note(f"stopped in {stop.stage}; the same command resumes")
+        so_far = f"; the scene so far: {stop.preview}" if stop.preview else ""
+        note(f"stopped in {stop.stage}; the same command resumes{so_far}")
         click.get_current_context().exit(1)
     note_rename(output, result.output)
     if as_json:

@@ -35,11 +35,13 @@ class Stopped(KeyboardInterrupt):
 
     Attributes:
         stage: name of the interrupted stage.
+        preview: file with the scene as far as it is trained; None if there is none.
     """
 
-    def __init__(self, stage: str) -> None:
+    def __init__(self, stage: str, preview: Path | None = None) -> None:
         super().__init__(f"stopped in {stage}")
         self.stage = stage
+        self.preview = preview
 
 
 class StageCache:
@@ -108,7 +110,7 @@ class StageCache:
                 facts, files = execute(resuming)
         except KeyboardInterrupt as error:
             self.state.add_seconds(name, clock.unrecorded_seconds())
-            raise Stopped(name) from error
+            raise Stopped(name, getattr(error, "preview", None)) from error
         except HyrfError as error:
             kept = self._describe_kept_products(name, clock)
             raise error.with_text(f"{name} failed: {error.problem}", f"{error.fix}{kept}") from error

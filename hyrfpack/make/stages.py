@@ -27,8 +27,9 @@ from hyrfpack.export import export_model
 from hyrfpack.format import describe_file, load_model
 from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
 from hyrfpack.make.plan import Plan
+from hyrfpack.make.preview import write_preview
 from hyrfpack.make.progress import Reporter
-from hyrfpack.make.stage_cache import PRODUCT_NAMES, StageCache
+from hyrfpack.make.stage_cache import PRODUCT_NAMES, StageCache, Stopped
 from hyrfpack.make.state import file_digest, files_digest
 from hyrfpack.outputs import Outputs
 from hyrfpack.progress import Event, StepEvent, TaskEvent
@@ -115,15 +116,22 @@ def run_training_stage(
             )
             resume = resuming and is_begun(run)
             progress = _TrainingProgress(stage_cache.reporter).report_event
+            trainers: list[Trainer] = []
+
+            def observe(trainer: Trainer) -> None:
+                trainers[:] = [trainer]
+                if observer is not None:
+                    observer(trainer)
+
             try:
                 trained = train_model(
-                    scene, run, config, resume=resume, overwrite=True, observer=observer,
+                    scene, run, config, resume=resume, overwrite=True, observer=observe,
                     context=replace(context, progress=progress),
                 )  # fmt: skip
             except HyrfError as error:  # the fix of this error refers to the command `train`
                 raise error.__cause__ if isinstance(error.__cause__, HyrfError) else error from None
             if not trained.complete:
-                raise KeyboardInterrupt
+                raise Stopped("training", write_preview(stage_cache, trainers[-1], context) if trainers else None)
             if not (run / METRICS_FILE).is_file():  # the disk was full; the next call writes them
                 raise HyrfError(trained.missing, fix="run it again, which writes what is missing")
         metrics = json.loads((run / METRICS_FILE).read_bytes())
@@ -165,7 +173,7 @@ class _TrainingProgress:
             self._means.add(event)
             quality = () if self._means.mse is None else (format_psnr(self._means.mse),)
             self._reporter.update(
-                event.step / event.steps, f"step {event.step}/{event.steps}", *quality, f"{event.gaussians:,} Gaussians"
+                event.share_done, f"step {event.step}/{event.steps}", *quality, f"{event.gaussians:,} Gaussians"
             )
             if event.step == event.steps:
                 self._begin("results")

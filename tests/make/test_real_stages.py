@@ -20,6 +20,7 @@ from exposures import random_map
 from hyrfpack import evaluate_model, load_model, load_scene, save_model
 from hyrfpack.config.make import MakeConfig
 from hyrfpack.context import RunContext
+from hyrfpack.format import describe_file
 from hyrfpack.make import make_scene, stages
 from hyrfpack.make.progress import Reporter
 from hyrfpack.progress import StageEvent, ignore_progress
@@ -66,9 +67,14 @@ def test_an_interrupted_command_resumes_from_its_checkpoint_to_the_same_products
     monkeypatch.setattr(LineDisplay, "__call__", show)
     arguments = ("make", posed, "-o", tmp_path / "scene.html")
     stopped = hyrfpack(*arguments)
-    assert stopped.exit_code == 1 and stopped.stderr.endswith("stopped in training; the same command resumes\n")
     work = tmp_path / "scene.work"
+    preview = work / "preview.hyrf"
+    sentence = f"stopped in training; the same command resumes; the scene so far: {preview}\n"
+    assert stopped.exit_code == 1 and stopped.stderr.endswith(sentence)
     assert (work / "run" / "checkpoint.pt").is_file()
+    facts = describe_file(preview)
+    assert facts["profile"] == "compact" and facts["provenance"]["steps"] == 5
+    assert sorted(path.name for path in work.iterdir()) == ["make.json", "preview.hyrf", "run"]
 
     words.clear()
     (sentence,) = succeeded(*arguments).stderr.splitlines()  # everything else is shown as progress

@@ -1,0 +1,53 @@
+"""Pack the scene of an interrupted training run, so that it can be looked at before the run is resumed."""
+
+from __future__ import annotations
+
+import logging
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+from hyrfpack.cameras.capture import scene_provenance
+from hyrfpack.compress import compress_model
+from hyrfpack.context import RunContext
+from hyrfpack.errors import HyrfError
+from hyrfpack.format import save_model
+from hyrfpack.make.stage_cache import StageCache
+from hyrfpack.train import Trainer
+
+_LOG = logging.getLogger(__name__)
+
+PREVIEW_FILE = "preview.hyrf"
+_TRAINED_FILE = "preview.raw.hyrf"  # the model before it is compressed
+
+
+def write_preview(stage_cache: StageCache, trainer: Trainer, context: RunContext) -> Path | None:
+    """Compress the model of an interrupted run into `preview.hyrf` in the work folder.
+
+    The model has the quality of its last step: it was trained at a lower resolution and has more Gaussians than at the
+    end. The checkpoint stays, so the run can be resumed.
+
+    Args:
+        stage_cache: the stages of the pipeline.
+        trainer: the trainer of the interrupted run.
+        context: context of the call.
+
+    Returns:
+        The file; None if it cannot be written, which is logged, or if a further interruption skips it.
+    """
+    target, trained = stage_cache.folder / PREVIEW_FILE, stage_cache.folder / _TRAINED_FILE
+    _LOG.info("stopping: compressing the scene as it is now; a second interruption skips this")
+    provenance = {"steps": trainer.step, "choices": trainer.choices, **scene_provenance(trainer.scene)}
+    try:
+        trainer.fit_exposure_map()
+        save_model(trainer.model, trained, profile="raw", provenance=provenance)
+        compress_model(trained, target, context=replace(context, progress=stage_cache.reporter.report_event))
+    except HyrfError as error:
+        _LOG.warning(f"the scene so far cannot be written: {error}")
+        return None
+    except KeyboardInterrupt:
+        return None
+    finally:
+        with suppress(OSError):
+            trained.unlink(missing_ok=True)
+    return target
