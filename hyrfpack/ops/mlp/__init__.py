@@ -69,6 +69,12 @@ def mlp(
     return reference.mlp(x, weights, biases, mixed)
 
 
+def _halves(parameters: Sequence[Tensor]) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
+    """Split the parameters into weights and biases."""
+    layers = len(parameters) // 2
+    return parameters[:layers], parameters[layers:]
+
+
 class _CpuMlp(torch.autograd.Function):
     """Autograd function of `mlp` on the CPU."""
 
@@ -76,9 +82,11 @@ class _CpuMlp(torch.autograd.Function):
     def forward(ctx, x: Tensor, *parameters: Tensor) -> Tensor:
         from hyrfpack.ops.mlp import cpu
 
+        weights, biases = _halves(parameters)
+        hidden = cpu.allocate_hidden(len(x), weights) if any(ctx.needs_input_grad) else []
         ctx.save_for_backward(x, *parameters)
-        layers = len(parameters) // 2
-        return cpu.forward(x, parameters[:layers], parameters[layers:])
+        ctx.hidden = hidden
+        return cpu.forward(x, weights, biases, hidden)
 
     @staticmethod
     @once_differentiable
@@ -86,9 +94,8 @@ class _CpuMlp(torch.autograd.Function):
         from hyrfpack.ops.mlp import cpu
 
         x, *parameters = ctx.saved_tensors
-        layers = len(parameters) // 2
         needs_x = ctx.needs_input_grad[0]
-        grad_x, grad_weights, grad_biases = cpu.backward(x, parameters[:layers], parameters[layers:], grad, needs_x)
+        grad_x, grad_weights, grad_biases = cpu.backward(x, *_halves(parameters), ctx.hidden, grad, needs_x)
         return grad_x, *grad_weights, *grad_biases
 
 

@@ -1,8 +1,8 @@
 """Evaluates the multilayer perceptron on the CPU with torch's matrix products, one chunk of rows per thread at a time.
 
 Chunk boundaries depend only on the number of rows, and partial sums are added in order, so the result does not depend
-on the number of threads. Hidden activations never leave the cache: the backward pass recomputes them for rows with a
-non-zero gradient. This costs no more than storing them for all rows, because touching new memory is slow.
+on the number of threads. The forward pass stores the hidden activations that a backward pass will need, unless there
+are so many rows that they would take too much memory. Then the backward pass recomputes them.
 """
 
 from __future__ import annotations
@@ -19,6 +19,9 @@ _MIN_ROWS_PER_CHUNK = 256
 # Above this ratio of rows without a gradient, gathering the other rows is faster than computing all of them.
 _MIN_IDLE_ROW_RATIO = 0.1
 
+# Hidden activations of more rows are not stored; at width 64 and two hidden layers they would take 128 MiB.
+MAX_STORED_ROWS = 1 << 18
+
 _relu_backward = torch.ops.aten.threshold_backward.grad_input
 
 
@@ -34,35 +37,55 @@ def _run_chunks(task: Callable[[int], None], count: int) -> None:
         run_tasks(task, count)
 
 
-def _layer_inputs(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> list[Tensor]:
-    """Return the input of each layer: x, then the ReLU output of every layer but the last."""
-    inputs = [x]
-    for weight, bias in zip(weights[:-1], biases[:-1], strict=True):
-        inputs.append(torch.addmm(bias, inputs[-1], weight.T).relu_())
-    return inputs
+def allocate_hidden(rows: int, weights: Sequence[Tensor]) -> list[Tensor]:
+    """Allocate the outputs (N, width) of each hidden layer, or return an empty list if there are too many rows."""
+    return [torch.empty(rows, weight.shape[0]) for weight in weights[:-1]] if rows <= MAX_STORED_ROWS else []
 
 
-def forward(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> Tensor:
-    """Compute the outputs (N, O) of rows (N, I)."""
+def forward(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], hidden: Sequence[Tensor] = ()) -> Tensor:
+    """Compute the outputs (N, O) of rows (N, I).
+
+    Args:
+        hidden: receives the outputs of the hidden layers after ReLU, see `allocate_hidden`; empty if not needed.
+    """
     edges = _chunk_edges(x.shape[0])
     result = torch.empty(x.shape[0], weights[-1].shape[0])
 
     def task(chunk: int) -> None:
         start, stop = edges[chunk]
         with torch.no_grad():
-            last = _layer_inputs(x[start:stop], weights, biases)[-1]
+            last = _hidden_layers(x[start:stop], weights, biases, [layer[start:stop] for layer in hidden])[-1]
             torch.addmm(biases[-1], last, weights[-1].T, out=result[start:stop])
 
     _run_chunks(task, len(edges))
     return result
 
 
+def _hidden_layers(
+    x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], hidden: Sequence[Tensor] = ()
+) -> list[Tensor]:
+    """Return x and the outputs of each hidden layer after ReLU, which are written to `hidden` if that is not empty."""
+    inputs = [x]
+    for layer, (weight, bias) in enumerate(zip(weights[:-1], biases[:-1], strict=True)):
+        out = hidden[layer] if hidden else x.new_empty(len(x), len(bias))
+        inputs.append(torch.addmm(bias, inputs[-1], weight.T, out=out).relu_())
+    return inputs
+
+
 def backward(
-    x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], grad: Tensor, needs_x: bool
+    x: Tensor,
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor],
+    hidden: Sequence[Tensor],
+    grad: Tensor,
+    needs_x: bool,
 ) -> tuple[Tensor | None, list[Tensor], list[Tensor]]:
     """Compute the gradients of x, weights and biases from the gradient (N, O) of the outputs.
 
     The gradient of x has the layout of x; it is None unless `needs_x`.
+
+    Args:
+        hidden: what `forward` wrote; if empty, the hidden layers are computed again for rows with a gradient.
     """
     edges = _chunk_edges(x.shape[0])
     grad_x = torch.empty_like(x) if needs_x else None
@@ -72,12 +95,14 @@ def backward(
     def task(chunk: int) -> None:
         start, stop = edges[chunk]
         with torch.no_grad():
-            rows, grads = x[start:stop], grad[start:stop]
+            grads = grad[start:stop]
+            inputs = [tensor[start:stop] for tensor in (x, *hidden)]
             active = grads.any(dim=1).nonzero().squeeze(1)
             gathered = len(active) < (1 - _MIN_IDLE_ROW_RATIO) * (stop - start)
             if gathered:
-                rows, grads = rows[active], grads[active]
-            inputs = _layer_inputs(rows, weights, biases)
+                grads, inputs = grads[active], [tensor[active] for tensor in inputs]
+            if not hidden:
+                inputs = _hidden_layers(inputs[0], weights, biases)
             for layer in reversed(range(len(weights))):
                 torch.mm(grads.T, inputs[layer], out=grad_weights[layer][chunk])
                 torch.sum(grads, dim=0, out=grad_biases[layer][chunk])
