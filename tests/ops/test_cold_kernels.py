@@ -9,6 +9,7 @@ import sys
 HASH_RESULTS_SCRIPT = """
 import hashlib
 import torch
+from hyrfpack.ops.composite import composite
 from hyrfpack.ops.hash_encode import hash_encode, level_offsets, level_resolutions
 from hyrfpack.ops.rasterize import Gaussians3D, Viewport, rasterize
 from hyrfpack.ops.ssim import photometric_loss
@@ -22,10 +23,12 @@ scales, opacities = torch.rand(count, 3, generator=g) * 0.2, torch.rand(count, g
 colors, quats = torch.rand(count, 3, generator=g), torch.randn(count, 4, generator=g)
 gaussians = Gaussians3D(means, quats, scales, opacities)
 viewport = Viewport(torch.eye(4), (60.0, 60.0, 32.0, 32.0), 64, 64)
-picture = rasterize(gaussians, colors, viewport, absgrad=torch.zeros(count, 2)).rgb
+raster = rasterize(gaussians, colors, viewport, absgrad=torch.zeros(count, 2))
+grid = torch.rand(22, 22, 3, generator=g).requires_grad_()
+picture = composite(raster.rgb, raster.transmittance, grid, 3)
 loss = photometric_loss(picture, torch.rand(64, 64, 3, generator=g)) + features.square().mean()
 loss.backward()
-for result in (features, picture, loss, table.grad, means.grad):
+for result in (features, picture, loss, table.grad, means.grad, grid.grad):
     print(hashlib.sha256(result.detach().contiguous().numpy().tobytes()).hexdigest())
 """
 
@@ -40,4 +43,4 @@ def test_compiled_and_cached_kernels_agree_in_every_bit(tmp_path):
         for _ in range(2)
     )
 
-    assert len(cold.split()) == 5 and cold == warm
+    assert len(cold.split()) == 6 and cold == warm

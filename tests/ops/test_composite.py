@@ -9,8 +9,13 @@ from torch import Tensor
 
 from hyrfpack.ops.background import grid_size
 from hyrfpack.ops.composite import composite
+from hyrfpack.parallel import has_numba
 
-TESTED_IMPLEMENTATIONS = ["reference", pytest.param("gpu", marks=needs_triton)]
+TESTED_IMPLEMENTATIONS = [
+    "reference",
+    pytest.param("cpu", marks=pytest.mark.skipif(not has_numba(), reason="no numba")),
+    pytest.param("gpu", marks=needs_triton),
+]
 NODE_STRIDES = [1, 2, 3, 5]
 # Picture sizes (H, W). At some strides the last node is at the picture's edge, at others past it. The last size is more
 # than one block, also of nodes.
@@ -170,8 +175,22 @@ def test_a_nan_node_affects_only_the_pixels_that_use_it(
     spoilt = picture.isnan()
     assert spoilt[..., 1][apart < stride].all()
     assert not spoilt[..., 1][apart > stride].any() and not spoilt[..., [0, 2]].any()
-    if implementation == "gpu":
+    if implementation != "reference":
         assert torch.equal(spoilt[..., 1], apart < stride)
+
+
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS[:2])  # "gpu" subtracts nodes, which gives NaN.
+@pytest.mark.parametrize("stride", NODE_STRIDES)
+def test_an_infinite_node_makes_the_pixels_around_it_infinite(stride: int, implementation: str) -> None:
+    rgb, transmittance, grid = place_float32(make_inputs(16, 16, stride), implementation)
+    grid[1, 1, 0] = -float("inf")
+
+    picture = composite(rgb, transmittance, grid, stride, implementation=implementation)
+
+    apart = (torch.arange(16) - stride).abs()
+    apart = torch.maximum(apart[:, None], apart[None, :])
+    assert (picture[..., 0][apart < stride] == -float("inf")).all()
+    assert picture[..., 0][apart > stride].isfinite().all() and picture[..., 1:].isfinite().all()
 
 
 @pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
@@ -219,10 +238,27 @@ def test_unsupported_types_and_implementations_are_rejected() -> None:
     rgb, transmittance, grid = make_inputs(5, 8, 2)
     with pytest.raises(ValueError, match="tensors disagree"):
         composite(rgb, transmittance, grid.float(), 2)
-    with pytest.raises(ValueError, match="float32"):
-        composite(rgb, transmittance, grid, 2, implementation="gpu")
-    with pytest.raises(ValueError, match="no implementation 'cpu'"):
-        composite(rgb.float(), transmittance.float(), grid.float(), 2, implementation="cpu")
+    for implementation in ("cpu", "gpu"):
+        with pytest.raises(ValueError, match="float32"):
+            composite(rgb, transmittance, grid, 2, implementation=implementation)
+    with pytest.raises(ValueError, match="no implementation 'cuda'"):
+        composite(rgb.float(), transmittance.float(), grid.float(), 2, implementation="cuda")
+
+
+@pytest.mark.skipif(not has_numba(), reason="no numba")
+@pytest.mark.parametrize("stride", NODE_STRIDES)
+def test_bytes_of_the_cpu_do_not_depend_on_threads_or_on_the_run(stride: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    leaves = [leaf.float().requires_grad_() for leaf in make_inputs(211, 403, stride)]  # several tasks
+    upstream = random_values(211, 403, 3, seed=3).float()
+
+    def run(threads: int) -> list[Tensor]:
+        monkeypatch.setenv("HYRFPACK_THREADS", str(threads))
+        picture = composite(*leaves, stride, implementation="cpu")
+        return [picture.detach(), *torch.autograd.grad(picture, leaves, upstream)]
+
+    first = run(1)
+    for threads in (1, 2, 5):
+        assert all(map(torch.equal, first, run(threads)))
 
 
 @pytest.mark.gpu

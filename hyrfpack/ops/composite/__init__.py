@@ -22,8 +22,9 @@ def composite(rgb: Tensor, transmittance: Tensor, grid: Tensor, stride: int, *, 
         grid: (R, S, 3), in any layout, B at the pixels 0, stride, 2 stride, ... of both axes, as returned by
             `background_grid`. The last node of an axis lies at or past the image's edge.
         stride: pixels between neighbouring nodes, at least 1.
-        implementation: "auto", "reference" or "gpu" (float32). On CUDA the reference accumulates its gradient by
-            atomics, so that equal runs differ; "gpu" gathers each node's gradient in a fixed order.
+        implementation: "auto", "reference", "cpu" or "gpu" (the last two take float32). On CUDA the reference
+            accumulates its gradient by atomics, so that equal runs differ; "gpu" gathers each node's gradient in a
+            fixed order, and so does "cpu", for any number of threads.
 
     Returns:
         (H, W, 3). Differentiable once in `rgb`, `transmittance` and `grid`.
@@ -45,8 +46,13 @@ def composite(rgb: Tensor, transmittance: Tensor, grid: Tensor, stride: int, *, 
             f"{stride}-th pixel do not fit together"
         )
     run: Callable[..., Tensor] = reference.composite
-    if choose_implementation(implementation, ("reference", "gpu"), rgb, transmittance, grid) == "gpu":
+    chosen = choose_implementation(implementation, ("reference", "cpu", "gpu"), rgb, transmittance, grid)
+    if chosen == "gpu":
         from hyrfpack.ops.composite import gpu
 
         run = gpu.composite
+    elif chosen == "cpu":
+        from hyrfpack.ops.composite import cpu
+
+        run = cpu.composite
     return run(rgb, transmittance, grid, stride)
