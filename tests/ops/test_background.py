@@ -25,8 +25,14 @@ from hyrfpack.ops.background import (
 from hyrfpack.ops.hash_encode import level_offsets, level_resolutions
 from hyrfpack.ops.shade.directions import DIRECTION_FEATURES
 from hyrfpack.ops.viewport import Viewport
+from hyrfpack.parallel import has_numba
 
-TESTED_IMPLEMENTATIONS = ["reference", pytest.param("gpu", marks=needs_triton)]
+needs_numba = pytest.mark.skipif(not has_numba(), reason="no numba")
+TESTED_IMPLEMENTATIONS = [
+    "reference",
+    pytest.param("cpu", marks=needs_numba),
+    pytest.param("gpu", marks=needs_triton),
+]
 
 
 def uniform(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -226,6 +232,34 @@ def test_nan_inputs_give_nan_outputs(implementation: str, part: str, monkeypatch
     assert case.run(torch.float32, implementation).isnan().all()
     grid, gradients = case.learn(torch.float32, implementation)
     assert grid.isnan().all() and any(gradient.isnan().any() for gradient in gradients)
+
+
+@needs_numba
+@pytest.mark.parametrize("stride", [1, 2, 3])
+def test_the_cpu_finds_the_nodes_of_the_reference_around_nan_and_infinity(stride: int) -> None:
+    """A node with NaN at a pixel near it is not needed, whatever the other pixels are."""
+    case = Case(height=23, width=31, stride=stride, threshold=0.9)
+    light = uniform(23, 31, seed=5)
+    light[uniform(23, 31, seed=6) < 0.02], light[uniform(23, 31, seed=7) < 0.02] = math.nan, math.inf
+    found, expected = (run_grid(light, **case.arguments(), implementation=name) for name in ("cpu", "reference"))
+    assert torch.equal(found == 0, expected == 0) and 0 < found.any(-1).sum() < found[..., 0].numel()
+
+
+@needs_numba
+@pytest.mark.parametrize("encoding", ["frequency", "sh"])
+def test_bytes_of_the_cpu_do_not_depend_on_threads_or_on_the_run(
+    encoding: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    case = Case(height=201, width=303, encoding=encoding)  # several tasks
+
+    def run(threads: int) -> list[torch.Tensor]:
+        monkeypatch.setenv("HYRFPACK_THREADS", str(threads))
+        grid, gradients = case.learn(torch.float32, "cpu")
+        return [grid, *gradients]
+
+    first = run(1)
+    for threads in (1, 2, 5):
+        assert all(map(torch.equal, first, run(threads)))
 
 
 def test_nodes_have_the_colours_at_their_pixel_centres() -> None:

@@ -9,6 +9,7 @@ import sys
 HASH_RESULTS_SCRIPT = """
 import hashlib
 import torch
+from hyrfpack.ops.background import BackgroundField, background_grid
 from hyrfpack.ops.composite import composite
 from hyrfpack.ops.hash_encode import hash_encode, level_offsets, level_resolutions
 from hyrfpack.ops.rasterize import Gaussians3D, Viewport, rasterize
@@ -24,7 +25,10 @@ colors, quats = torch.rand(count, 3, generator=g), torch.randn(count, 4, generat
 gaussians = Gaussians3D(means, quats, scales, opacities)
 viewport = Viewport(torch.eye(4), (60.0, 60.0, 32.0, 32.0), 64, 64)
 raster = rasterize(gaussians, colors, viewport, absgrad=torch.zeros(count, 2))
-grid = torch.rand(22, 22, 3, generator=g).requires_grad_()
+layers = [torch.randn(16, 32, generator=g), torch.randn(3, 16, generator=g)], [torch.zeros(16), torch.zeros(3)]
+field = BackgroundField((1.0, 0.5, 0.25), table, resolutions, 10, *layers, "frequency")
+grid = background_grid(raster.transmittance, viewport, field, threshold=0.01, stride=3)
+grid.retain_grad()
 picture = composite(raster.rgb, raster.transmittance, grid, 3)
 loss = photometric_loss(picture, torch.rand(64, 64, 3, generator=g)) + features.square().mean()
 loss.backward()

@@ -243,13 +243,13 @@ def test_a_background_stride_interpolates_between_exact_pixels(stride, width, he
 def test_every_second_pixel_of_the_background_is_evaluated_by_default(monkeypatch):
     model, camera = small_model(np.zeros((0, 3)), background=True), camera_at((0, -3.0, 0), width=31, height=18)
     asked = []
-    decode = reference.background_colors
-    monkeypatch.setattr(
-        reference, "background_colors", lambda points, *sphere: asked.append(points) or decode(points, *sphere)
-    )
+    encode = reference.hash_encode
+    monkeypatch.setattr(reference, "hash_encode", lambda coords, *grid: asked.append(coords) or encode(coords, *grid))
     render_rgb(model, camera)
-    expected = [(x + 0.5, y + 0.5) for y in range(0, 20, 2) for x in range(0, 32, 2)]
-    assert [tuple(point) for point in asked[0].tolist()] == expected and len(asked) == 1
+    points = torch.tensor([(x + 0.5, y + 0.5) for y in range(0, 20, 2) for x in range(0, 32, 2)])
+    model.decode_background(points, model.config.frame.local_viewport(camera, torch.float32))
+    coords, expected = asked
+    torch.testing.assert_close(coords, expected, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("stride", [1, 2, 3])

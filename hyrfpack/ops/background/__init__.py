@@ -57,9 +57,9 @@ def background_grid(
         field: the radiance field.
         threshold: the transmittance above which a pixel needs the background, 0 or more.
         stride: pixels between neighbouring nodes, at least 1.
-        implementation: "auto", "reference" or "gpu" (float32, two features per level, at most 16 levels, two hidden
-            layers of width 128 or less). Without gradients "gpu" is one launch; with gradients it synchronises with
-            the device once.
+        implementation: "auto", "reference", "cpu" (float32) or "gpu" (float32, two features per level, at most 16
+            levels, two hidden layers of width 128 or less). Without gradients "gpu" is one launch; with gradients it
+            synchronises with the device once.
 
     Returns:
         (rows, columns, 3) in (0, 1), see `grid_size`; 0 at nodes that are not needed, NaN where the field is NaN.
@@ -84,10 +84,15 @@ def background_grid(
     is_gpu_supported = table.shape[1] == 2 and len(field.resolutions) <= 16 and len(weights) == 3
     is_gpu_supported = is_gpu_supported and max(weight.shape[0] for weight in weights) <= MAX_GPU_LAYER_WIDTH
     needs_grad = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in parameters)
-    available = ("reference", "gpu") if is_gpu_supported else ("reference",)
+    available = ("reference", "cpu", "gpu") if is_gpu_supported else ("reference", "cpu")
     run: Callable[..., Tensor] = reference.background_grid
-    if choose_implementation(implementation, available, transmittance, *parameters) == "gpu":
+    chosen = choose_implementation(implementation, available, transmittance, *parameters)
+    if chosen == "gpu":
         from hyrfpack.ops.background import gpu
 
         run = gpu.differentiable_grid if needs_grad else gpu.background_grid
+    elif chosen == "cpu":
+        from hyrfpack.ops.background import cpu
+
+        run = cpu.background_grid
     return run(transmittance, viewport, field, threshold=threshold, stride=stride)

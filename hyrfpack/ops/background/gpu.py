@@ -19,12 +19,17 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from hyrfpack.ops.background.reference import BACKGROUND_RADIUS, BackgroundField, field_colors, grid_size
+from hyrfpack.ops.background.reference import (
+    BACKGROUND_RADIUS,
+    BackgroundField,
+    camera_rays,
+    field_colors,
+    grid_size,
+)
 from hyrfpack.ops.contraction.gpu import contract_block
 from hyrfpack.ops.gpu_pairs import unpack_pair
 from hyrfpack.ops.hash_encode.gpu import axis_vertices, level_parameters, rows_as_words, vertex_row
 from hyrfpack.ops.mlp.tiles import multiply_add, pad_width, product_precision, round_factor, round_relu
-from hyrfpack.ops.poses import camera_center
 from hyrfpack.ops.shade.directions import DIRECTION_FEATURES
 from hyrfpack.ops.shade.gpu_directions import encode_block
 from hyrfpack.ops.viewport import Viewport
@@ -104,7 +109,7 @@ def _sees_background(transmittance, height, width, y, x, threshold, stride, STRI
 def _cast_rays(i, j, rays, half_extent):
     """Return the contracted points where the rays of nodes (i, j) leave the sphere, and the rays' directions.
 
-    `rays` is the result of `_camera_rays`.
+    `rays` is the result of `camera_rays`.
     """
     corner, right, down, origin = rays
     row, column = i.to(tl.float32), j.to(tl.float32)
@@ -179,7 +184,7 @@ def background_kernel(
 ):  # fmt: skip
     """Write the colours of a block of nodes to `out` (3, rows, columns).
 
-    `rays` is the result of `_camera_rays`, half_extent a tuple, `field` `FieldTensors` and S `FieldSizes`. Sizes of the
+    `rays` is the result of `camera_rays`, half_extent a tuple, `field` `FieldTensors` and S `FieldSizes`. Sizes of the
     picture are not put into tuples, because Triton would compile another kernel for each that is 1 or a multiple of 16.
     """
     w1, w2, w3 = field.weights
@@ -245,7 +250,7 @@ def background_grid(
         stride,
         rows,
         columns,
-        _camera_rays(viewport, stride),
+        camera_rays(viewport, stride),
         tuple(field.half_extent),
         FieldTensors(rows_as_words(field.table), levels, weights, biases),
         colors,
@@ -312,18 +317,9 @@ def differentiable_grid(
     if total := len(nodes):
         coords, encoded = colors.new_empty(3, total), colors.new_empty(DIRECTION_FEATURES[field.encoding], total)
         encode_nodes_kernel[(triton.cdiv(total, _NODES_PER_PROGRAM),)](
-            nodes, columns, total, _camera_rays(viewport, stride), tuple(field.half_extent), coords, encoded,
+            nodes, columns, total, camera_rays(viewport, stride), tuple(field.half_extent), coords, encoded,
             ENCODING_WIDTH=len(encoded), FREQUENCY=field.encoding == "frequency", BLOCK=_NODES_PER_PROGRAM,
             num_warps=4, enable_fp_fusion=True,
         )  # fmt: skip
         colors.index_copy_(1, nodes, field_colors(coords.T, encoded.T, field).T)
     return colors.view(3, rows, columns).permute(1, 2, 0)
-
-
-def _camera_rays(viewport: Viewport, stride: int) -> tuple[tuple[float, ...], ...]:
-    """Return the first node's ray, its increments per column and per row, and the origin, as tuples of 3 numbers."""
-    fx, fy, cx, cy = viewport.intrinsics
-    pose = viewport.pose.detach().cpu().double()
-    seen = [[(0.5 - cx) / fx, (0.5 - cy) / fy, 1], [stride / fx, 0, 0], [0, stride / fy, 0]]
-    rays = torch.tensor(seen, dtype=torch.float64) @ pose[:3, :3]
-    return tuple(map(tuple, (*rays.tolist(), camera_center(pose).tolist())))

@@ -81,6 +81,15 @@ def pixel_directions(points: Tensor, viewport: Viewport) -> Tensor:
     return directions / torch.linalg.vector_norm(directions, dim=-1, keepdim=True)
 
 
+def camera_rays(viewport: Viewport, stride: int) -> tuple[tuple[float, ...], ...]:
+    """Return the first node's ray, its increments per column and per row, and the origin, as tuples of 3 numbers."""
+    fx, fy, cx, cy = viewport.intrinsics
+    pose = viewport.pose.detach().cpu().double()
+    seen = [[(0.5 - cx) / fx, (0.5 - cy) / fy, 1], [stride / fx, 0, 0], [0, stride / fy, 0]]
+    rays = torch.tensor(seen, dtype=torch.float64) @ pose[:3, :3]
+    return tuple(map(tuple, (*rays.tolist(), camera_center(pose).tolist())))
+
+
 def background_colors(points: Tensor, viewport: Viewport, field: BackgroundField) -> Tensor:
     """Compute the colours (N, 3) of the sphere at points (N, 2) of the image, in pixels.
 
