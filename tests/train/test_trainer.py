@@ -499,7 +499,9 @@ def opaque_object_on_a_plain_wall() -> Scene:
             6,
             marks=pytest.mark.acceptance,
         ),
-        (opaque_object_on_a_plain_wall, TrainConfig(steps=400, max_gaussians=500), 6),
+        # Of seeds 0 to 5, this one depends least on rounding: seed 0 gains 5 to 15 dB, depending on the last bits of
+        # the photos, and seed 2 only 2 dB.
+        (opaque_object_on_a_plain_wall, TrainConfig(steps=400, max_gaussians=500, seed=1), 12),
     ],
     ids=["sphere", "no room", "no sphere", "object"],
 )
