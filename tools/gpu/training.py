@@ -75,7 +75,9 @@ class TimedTraining:
 def time_training(room: str, scene: Scene, model: HybridModel, setup: Setup) -> TimedTraining:
     """Train `model` on the scene: first warm-up steps, then timed steps, then a few steps under the profiler."""
     device, count = setup.torch_device, len(model)
-    trainer = Trainer(scene, TrainConfig(steps=FULL_STEPS, max_gaussians=count), device=device, model=model)
+    trainer = Trainer(
+        scene, TrainConfig(steps=FULL_STEPS, max_gaussians=count, resolution_schedule=False), device=device, model=model
+    )
     errors: list[float] = []
     advance(trainer, setup.warm_steps, setup.step_seconds / 3, errors)
     reset_peak_memory(device)

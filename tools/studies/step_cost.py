@@ -58,7 +58,9 @@ def scale_view(view: View, width: int, height: int) -> View:
 def measure_steps(scene: Scene, model: HybridModel, steps: int) -> dict:
     """Train `steps` steps; return the median and the largest seconds of a step, and peak and added bytes."""
     density = DensityConfig(start=0.5, stop=0.5, peak=0.5, rounds=1)
-    config = TrainConfig(steps=steps, max_gaussians=len(model), density=density, exposure=False)
+    config = TrainConfig(
+        steps=steps, resolution_schedule=False, max_gaussians=len(model), density=density, exposure=False
+    )
     before = peak_memory() or 0
     trainer = Trainer(scene, config, model=model)
     ends = [time.perf_counter()]

@@ -65,9 +65,10 @@ from hyrfpack.ops.rasterize.reference import TILE_SIZE
 from hyrfpack.ops.ssim import photometric_loss
 from hyrfpack.parallel.pool import run_tasks, thread_count, torch_on_one_thread
 from hyrfpack.progress import StepEvent
-from hyrfpack.render import Rendering, RenderSettings, render_view
+from hyrfpack.render import Rendering, render_view
 from hyrfpack.scene import Camera, Scene
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer
+from hyrfpack.train.resolution import background_stride
 from tools.gpu.roofline import Work
 from tools.gpu.scene import count_blended, decode_splats
 from tools.gpu.timing import Rates
@@ -174,7 +175,7 @@ class StepRecorder:
             reached=len(reached),
             evaluations=count_evaluations(reached),
             blended=count_blended(decode_splats(model, camera))[0],
-            nodes=int(np.prod(grid_size(camera.height, camera.width, RenderSettings().background_stride))),
+            nodes=int(np.prod(grid_size(camera.height, camera.width, background_stride(camera)))),
             needed=self._needed,
         )
 
@@ -336,6 +337,7 @@ def profile_steps(scene: Scene, model: HybridModel, steps: int) -> StepProfile:
     scene = dataclasses.replace(scene, train=[scene.train[len(scene.train) * i // count] for i in range(count)])
     last = WARM_UP_STEPS + steps
     config = TrainConfig(
+        resolution_schedule=False,
         steps=last + 1,  # A round of density control is due at the last step, which is not reached.
         max_gaussians=len(model),
         density=DensityConfig(start=1, stop=1, peak=1, rounds=1),
