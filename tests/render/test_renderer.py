@@ -296,11 +296,18 @@ def test_antialiasing_dims_small_gaussians_by_what_the_low_pass_adds():
     "wrong",
     [
         {name: value}
-        for name in ("near", "cull_tolerance", "background_threshold", "background_stride", "transmittance_min")
+        for name in (
+            "near",
+            "cull_tolerance",
+            "background_threshold",
+            "background_stride",
+            "transmittance_min",
+            "low_pass_variance",
+        )
         for value in (-0.1, math.nan, math.inf, True, "2", None)
         if (name, value) != ("cull_tolerance", math.inf)
     ]
-    + [{"background_stride": 0}, {"background_stride": 1.5}, {"transmittance_min": 1.0}],
+    + [{"low_pass_variance": 0.0}, {"background_stride": 0}, {"background_stride": 1.5}, {"transmittance_min": 1.0}],
     ids=str,
 )
 def test_impossible_settings_are_rejected(wrong):
