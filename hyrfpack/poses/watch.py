@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import sqlite3
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from threading import Event, Thread
 
+from hyrfpack.poses import count_rows as count_rows_script
 from hyrfpack.poses.job import Job
 from hyrfpack.progress import Progress, TaskEvent
 
@@ -46,25 +49,61 @@ def poll_in_background(poll: Callable[[], None]) -> Iterator[None]:
         thread.join()
 
 
+class RowCounter:
+    """Counts the rows of a table of the database, also while pycolmap writes to it.
+
+    A process of its own counts, see `count_rows.py` for the reason.
+    """
+
+    def __init__(self, job: Job, table: str) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, "-I", count_rows_script.__file__, job.database, table],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            encoding="utf-8",
+        )
+
+    def count(self) -> int:
+        """Return the number of rows.
+
+        Raises:
+            sqlite3.Error: the table cannot be read at the moment.
+            OSError: the counting process has ended.
+        """
+        assert self._process.stdin is not None and self._process.stdout is not None
+        self._process.stdin.write("\n")
+        self._process.stdin.flush()
+        answer = self._process.stdout.readline().strip()
+        if not answer.isdigit():
+            raise sqlite3.OperationalError(answer or "the process that counts rows has ended")
+        return int(answer)
+
+    def __enter__(self) -> RowCounter:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with suppress(OSError):  # a broken pipe, if the process has ended
+            self._process.communicate()
+
+
 def count_rows(job: Job, table: str) -> int:
-    """Return the number of rows in a table of the database, also while the library writes to it.
+    """Return the number of rows in a table of the database.
 
     Raises:
         sqlite3.Error: the table cannot be read at the moment.
     """
-    connection = sqlite3.connect(f"{job.database.resolve().as_uri()}?mode=ro", uri=True, timeout=0.5)
-    try:
-        return int(connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])
-    finally:
-        connection.close()
+    with RowCounter(job, table) as counter:
+        return counter.count()
 
 
 @contextmanager
 def report_new_rows(job: Job, table: str, report_count: Callable[[int], None]) -> Iterator[None]:
     """While the block runs, report how many rows a table has gained since the block began."""
-    before = count_rows(job, table)
-    with poll_in_background(lambda: report_count(max(count_rows(job, table) - before, 0))):
-        yield
+    with RowCounter(job, table) as counter:
+        before = counter.count()
+        with poll_in_background(lambda: report_count(max(counter.count() - before, 0))):
+            yield
 
 
 @contextmanager

@@ -67,6 +67,29 @@ def test_rows_are_counted_while_another_connection_writes(tmp_path):
     writer.close()
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="closing a file drops locks on POSIX systems only")
+def test_counting_keeps_the_locks_that_the_library_holds_on_the_database(tmp_path):
+    # pycolmap has a copy of SQLite of its own. If this process closed the database elsewhere, the system would drop
+    # the locks of that copy, and the two would damage the file.
+    import fcntl
+
+    job, place = job_with_pairs(tmp_path, 5), 1 << 20
+    take_lock = f"import fcntl, sys; fcntl.lockf(open(sys.argv[1], 'r+b'), {fcntl.LOCK_EX | fcntl.LOCK_NB}, 1, {place})"
+    with job.database.open("r+b") as file:
+        fcntl.lockf(file, fcntl.LOCK_EX, 1, place)
+        counts: list[int] = []
+        with report_new_rows(job, "two_view_geometries", counts.append):
+            assert count_rows(job, "two_view_geometries") == 5
+        other = subprocess.run([sys.executable, "-c", take_lock, job.database], capture_output=True, check=False)
+
+    assert other.returncode != 0 and b"BlockingIOError" in other.stderr
+
+
+def test_a_missing_table_is_an_error_of_the_database(tmp_path):
+    with pytest.raises(sqlite3.Error, match="no such table: matches"):
+        count_rows(job_with_pairs(tmp_path, 5), "matches")
+
+
 def test_rows_that_a_long_call_writes_are_reported_while_it_runs(tmp_path, monkeypatch):
     monkeypatch.setattr(watch, "POLL_INTERVAL_SECONDS", 0.01)
     job, messages, seen = job_with_pairs(tmp_path, 5), [], threading.Event()
