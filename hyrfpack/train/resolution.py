@@ -1,8 +1,8 @@
 """The resolution of each training step: coarse while there are few Gaussians, full for the last steps.
 
-The time of a step grows with its pixels. As long as there are more pixels than Gaussians, the mean of a block of pixels
-tells a Gaussian nearly as much as the block itself. So most steps on large photos render reduced photos, and the
-resolution grows with the number of Gaussians, as in DashGaussian (2025).
+The time of a step grows with its pixels. As long as there are more pixels than Gaussians, a Gaussian learns nearly as
+much from the mean of a block of pixels as from the block itself. So most steps on large photos render reduced photos,
+and the resolution grows with the number of Gaussians, as in DashGaussian (2025).
 """
 
 from __future__ import annotations
@@ -27,8 +27,9 @@ MIN_PIXELS_PER_GAUSSIAN = 1.0  # A reduced photo has at least this many.
 MIN_REDUCED_SIDE_PIXELS = 200
 MAX_REDUCTION = 8
 FULL_RESOLUTION_START = 0.8  # From this share of the run on, photos are not reduced.
-FIXED_STEP_COST = 0.05  # A step takes this share of the time of one at full resolution, whatever its own.
-COST_SAMPLES = 100
+# Time of a step that does not depend on its pixels, as a share of the time that pixels take at full resolution.
+FIXED_STEP_COST = 0.05
+COST_SAMPLE_COUNT = 100
 # A training step evaluates the background at about this many pixels at most. Smaller photos keep the usual stride.
 MAX_BACKGROUND_NODES = 40_000
 
@@ -137,7 +138,7 @@ class PhotoSize:
         """Estimate the mean time of a run's steps, as a share of that of a step at full resolution."""
         times, counts = zip(*density.planned_counts(initial, budget), strict=True)
         costs, most = [], 0.0
-        for time in np.linspace(0, 1, COST_SAMPLES):
+        for time in np.linspace(0, 1, COST_SAMPLE_COUNT):
             most = max(most, float(np.interp(time, times, counts)))
             costs.append(step_cost(self.reduction_for(most) if time <= FULL_RESOLUTION_START else 1))
         return fmean(costs)
