@@ -85,8 +85,7 @@ class SceneCost:
         budget = self._budget(scene, steps)
         initial, density = min(budget, len(scene.points) or budget // 2), DensityConfig()
         step = self.step_seconds + self.step_seconds_per_gaussian * density.mean_count(initial, budget)
-        sizes = [(view.camera.width, view.camera.height) for view in scene.train]
-        step *= PhotoSize.of(sizes).mean_step_cost(density, initial, budget)
+        step *= PhotoSize.of_views(scene.train).mean_step_cost(density, initial, budget)
         return TRAINED_PACE_RATIO * steps * step + self.decoding_seconds * min(steps, len(scene.train))
 
     def seconds_after_training(self, scene: Scene, steps: int) -> dict[str, float]:

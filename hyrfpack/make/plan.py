@@ -162,7 +162,7 @@ def estimate_scene_seconds(scene: Scene, plan: Plan, device: torch.device) -> di
     config = plan.train_config(seed=0)
     gaussians, _ = budget_for(scene, config)
     initial = min(gaussians, len(scene.points) or gaussians // 2)
-    size = PhotoSize.of([(view.camera.width, view.camera.height) for view in scene.train])
+    size = PhotoSize.of_views(scene.train)
     return estimate_seconds(size, plan, initial, gaussians, len(scene.test), max_pilot_steps(scene, config), device)
 
 

@@ -53,7 +53,7 @@ class ResolutionSchedule:
             gaussians: number of Gaussians at the start.
             is_on: False for steps that are all at full resolution.
         """
-        self._size = PhotoSize.of([(view.camera.width, view.camera.height) for view in views])
+        self._size = PhotoSize.of_views(views)
         self._steps, self._last_coarse_step = steps, int(FULL_RESOLUTION_START * steps)
         self.changes = [(1, self._size.reduction_for(gaussians) if is_on else 1)]
 
@@ -122,6 +122,11 @@ class PhotoSize:
     def of(cls, sizes: Sequence[tuple[int, int]]) -> PhotoSize:
         """Return the size of photos of these widths and heights."""
         return cls(fmean(width * height for width, height in sizes), min(map(min, sizes)))
+
+    @classmethod
+    def of_views(cls, views: Sequence[View]) -> PhotoSize:
+        """Return the size of the photos of views."""
+        return cls.of([(view.camera.width, view.camera.height) for view in views])
 
     def reduction_for(self, gaussians: float) -> int:
         """Return the largest factor, a power of two, that leaves enough pixels for each Gaussian and a large photo."""

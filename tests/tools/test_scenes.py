@@ -20,19 +20,19 @@ from tools.scenes.geometry import BOX, CYLINDER_Y, ELLIPSOID, SceneArrays
 from tools.scenes.render import render_depth, render_picture
 from tools.scenes.write_set import write_set
 
-PHOTOS, WIDTH, HEIGHT = 12, 96, 64
+PHOTO_COUNT, PHOTO_WIDTH, PHOTO_HEIGHT = 12, 96, 64
 
 
 @pytest.fixture(scope="module")
 def written_set(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("sets") / "object"
-    write_set(folder, "object", photos=PHOTOS, width=WIDTH, seed=3)
+    write_set(folder, "object", photos=PHOTO_COUNT, width=PHOTO_WIDTH, seed=3)
     return folder
 
 
 @pytest.fixture(scope="module")
 def scenes() -> dict[str, SceneDescription]:
-    return {name: make_scene(name, PHOTOS, WIDTH, HEIGHT, 3) for name in LAYOUTS}
+    return {name: make_scene(name, PHOTO_COUNT, PHOTO_WIDTH, PHOTO_HEIGHT, 3) for name in LAYOUTS}
 
 
 @pytest.fixture
@@ -77,21 +77,21 @@ def nearest_hits(scene: SceneArrays, origin: np.ndarray, direction: np.ndarray) 
 
 def test_the_set_loads_with_its_cameras_and_points(written_set, scenes):
     scene = hyrfpack.load_scene(written_set)
-    assert len(scene.views) == PHOTOS and len(scene.points) > 100
+    assert len(scene.views) == PHOTO_COUNT and len(scene.points) > 100
     for view, camera in zip(sorted(scene.views, key=lambda view: view.name), scenes["object"].cameras, strict=True):
         np.testing.assert_allclose(view.camera.camera_from_world, camera.camera_from_world, atol=1e-9)
         np.testing.assert_allclose(view.camera.intrinsics, camera.intrinsics)
-        assert view.load().rgb.shape == (HEIGHT, WIDTH, 3)
+        assert view.load().rgb.shape == (PHOTO_HEIGHT, PHOTO_WIDTH, 3)
 
 
 def test_the_same_seed_writes_the_same_bytes_with_any_number_of_threads(written_set, tmp_path, monkeypatch):
     monkeypatch.setenv("HYRFPACK_THREADS", "3" if thread_count() == 1 else "1")
-    write_set(tmp_path / "again", "object", photos=PHOTOS, width=WIDTH, seed=3)
+    write_set(tmp_path / "again", "object", photos=PHOTO_COUNT, width=PHOTO_WIDTH, seed=3)
     assert contents(tmp_path / "again") == contents(written_set)
 
 
 def test_another_seed_writes_other_photos(written_set, tmp_path):
-    write_set(tmp_path / "other", "object", photos=PHOTOS, width=WIDTH, seed=4)
+    write_set(tmp_path / "other", "object", photos=PHOTO_COUNT, width=PHOTO_WIDTH, seed=4)
     first, other = contents(written_set), contents(tmp_path / "other")
     assert first.keys() == other.keys() and all(first[name] != other[name] for name in first if "cameras" not in name)
 
@@ -102,7 +102,7 @@ def test_depth_maps_agree_with_the_equations_of_the_surfaces(scenes, name):
     for camera in scene.cameras[::5]:
         depth = render_depth(scene.arrays, camera)
         assert depth.dtype == np.float32
-        for x, y in zip(rng.integers(0, WIDTH, 8), rng.integers(0, HEIGHT, 8), strict=True):
+        for x, y in zip(rng.integers(0, PHOTO_WIDTH, 8), rng.integers(0, PHOTO_HEIGHT, 8), strict=True):
             local = np.array([(x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy, 1.0])
             # A vector with the view axis's component 1 makes the distance a depth.
             expected = nearest_hits(scene.arrays, camera.position, camera.rotation.T @ local)
@@ -158,11 +158,16 @@ def test_points_lie_near_a_surface(reconstruction, scenes):
 def test_details_are_close_to_the_average_of_details_of_twice_the_size(scenes, name):
     scene = scenes[name]
     for camera in scene.cameras[::4]:
-        fx, fy = 1600 / WIDTH * camera.fx, 1600 / WIDTH * camera.fy  # the middle of a photo that is 1,600 pixels wide
+        fx, fy = (
+            1600 / PHOTO_WIDTH * camera.fx,
+            1600 / PHOTO_WIDTH * camera.fy,
+        )  # the middle of a photo that is 1,600 pixels wide
         small = replace(camera, fx=fx, fy=fy)
-        large = Camera(2 * WIDTH, 2 * HEIGHT, 2 * fx, 2 * fy, WIDTH, HEIGHT, camera.camera_from_world)
+        large = Camera(
+            2 * PHOTO_WIDTH, 2 * PHOTO_HEIGHT, 2 * fx, 2 * fy, PHOTO_WIDTH, PHOTO_HEIGHT, camera.camera_from_world
+        )
         fine = render_picture(scene.arrays, large, scene.exposure)
-        average = fine.reshape(HEIGHT, 2, WIDTH, 2, 3).mean(axis=(1, 3))
+        average = fine.reshape(PHOTO_HEIGHT, 2, PHOTO_WIDTH, 2, 3).mean(axis=(1, 3))
         difference = np.abs(render_picture(scene.arrays, small, scene.exposure) - average).mean()
         # Every other pixel of the larger picture has the aliases of a picture without a filter.
         assert difference < 0.8 * np.abs(fine[::2, ::2] - average).mean() and difference < 0.01
@@ -171,7 +176,7 @@ def test_details_are_close_to_the_average_of_details_of_twice_the_size(scenes, n
 def test_existing_files_are_kept_without_overwrite(written_set, capsys):
     before = contents(written_set)
     with pytest.raises(HyrfError, match="this folder holds files"):
-        write_set(written_set, "object", photos=PHOTOS, width=WIDTH)
+        write_set(written_set, "object", photos=PHOTO_COUNT, width=PHOTO_WIDTH)
     with pytest.raises(SystemExit, match="--overwrite"):
         command.main(["--out", str(written_set.parent), "--scenes", "object"])
     assert contents(written_set) == before

@@ -17,7 +17,7 @@ from tools.gpu.scene import decode_splats
 from tools.gpu.timing import Rates
 from tools.studies import step_profile
 from tools.studies.step_profile import (
-    ROWS,
+    OPERATION_ROWS,
     StepProfile,
     StepRecorder,
     backward_row,
@@ -29,9 +29,9 @@ from tools.studies.step_profile import (
 )
 from tools.studies.step_work import FieldSizes, ModelSizes, ViewSizes, count_step, measure_model_sizes
 
-STEPS = 3
+PROFILED_STEPS = 3
 # A thread that copies 1 GB/s and computes 10 GFLOP/s.
-RATES = Rates(copy=1e9, bf16=1e10, fp32=1e10)
+MADE_UP_RATES = Rates(copy=1e9, bf16=1e10, fp32=1e10)
 
 
 def make_scene() -> Scene:
@@ -44,23 +44,23 @@ def make_model(*, background: bool) -> HybridModel:
 
 @pytest.fixture(scope="module")
 def profile() -> StepProfile:
-    return profile_steps(make_scene(), make_model(background=True), STEPS)
+    return profile_steps(make_scene(), make_model(background=True), PROFILED_STEPS)
 
 
 def test_each_step_has_every_row_with_a_positive_time(profile: StepProfile) -> None:
-    assert [tuple(step) for step in profile.steps] == STEPS * [ROWS]
+    assert [tuple(step) for step in profile.steps] == PROFILED_STEPS * [OPERATION_ROWS]
     assert all(seconds > 0 for step in profile.steps for seconds in step.values())
 
 
 def test_a_model_without_a_background_sphere_has_no_rows_of_it() -> None:
     steps = profile_steps(make_scene(), make_model(background=False), 1).steps
-    assert [tuple(step) for step in steps] == [tuple(row for row in ROWS if not row.startswith("background"))]
+    assert [tuple(step) for step in steps] == [tuple(row for row in OPERATION_ROWS if not row.startswith("background"))]
     assert all(seconds > 0 for seconds in steps[0].values())
 
 
 def test_every_row_but_the_remainders_has_a_positive_count(profile: StepProfile) -> None:
     works = profile.median_works()
-    assert set(ROWS) - set(works) == {"backward: autograd", "other"} and set(works) < set(ROWS)
+    assert set(OPERATION_ROWS) - set(works) == {"backward: autograd", "other"} and set(works) < set(OPERATION_ROWS)
     assert all(work.bytes > 0 and work.flops > 0 for work in works.values())
 
 
@@ -187,8 +187,8 @@ def test_sizes_of_a_model_are_those_of_its_tensors() -> None:
 
 
 def test_the_table_divides_measured_time_by_the_bound(profile: StepProfile) -> None:
-    cells = {row[0]: row for row in table_rows(profile, RATES)}
-    assert list(cells) == [*ROWS, "total"]
+    cells = {row[0]: row for row in table_rows(profile, MADE_UP_RATES)}
+    assert list(cells) == [*OPERATION_ROWS, "total"]
     work = profile.median_works()["Adam"]
     bound = 1e3 * max(work.bytes / 1e9, work.flops / 1e10)
     assert float(cells["Adam"][5]) == pytest.approx(bound, abs=0.01) and cells["Adam"][6] == "memory"
@@ -206,7 +206,7 @@ def test_the_command_prints_the_sizes_above_the_table(monkeypatch, capsys) -> No
     step_profile.main(["--data", "balls", "--model", "balls.hyrf", "--steps", "1", "--threads", "1"])
     heading, empty, *table = capsys.readouterr().out.splitlines()
     assert heading.startswith("photos of 32 x 32, 50 Gaussians, ") and "1 thread, " in heading and empty == ""
-    assert [line.split(" | ")[0] for line in table[2:]] == [f"| {row}" for row in (*ROWS, "total")]
+    assert [line.split(" | ")[0] for line in table[2:]] == [f"| {row}" for row in (*OPERATION_ROWS, "total")]
 
 
 def test_a_missing_model_is_an_error_of_one_line(tmp_path, capsys) -> None:

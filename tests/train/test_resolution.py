@@ -14,7 +14,7 @@ from hyrfpack.train import resolution
 from hyrfpack.train.resolution import PhotoSize, ResolutionSchedule, background_stride, reduced_low_pass_variance
 from hyrfpack.train.trainer import Trainer
 
-LARGE = PhotoSize(1600 * 1066, 1066)
+LARGE_PHOTO = PhotoSize(1600 * 1066, 1066)
 
 
 def make_view(width: int, height: int, name: str = "a.png", distance: float = 3.0) -> View:
@@ -26,10 +26,10 @@ def make_view(width: int, height: int, name: str = "a.png", distance: float = 3.
 
 
 def test_a_reduced_step_has_enough_pixels_for_each_gaussian() -> None:
-    limits = [LARGE.pixels / factor**2 / resolution.MIN_PIXELS_PER_GAUSSIAN for factor in (2, 4)]
+    limits = [LARGE_PHOTO.pixels / factor**2 / resolution.MIN_PIXELS_PER_GAUSSIAN for factor in (2, 4)]
 
-    assert LARGE.reduction_for(limits[0]) == 2 and LARGE.reduction_for(limits[0] + 1) == 1
-    assert LARGE.reduction_for(limits[1]) == 4 and LARGE.reduction_for(limits[1] + 1) == 2
+    assert LARGE_PHOTO.reduction_for(limits[0]) == 2 and LARGE_PHOTO.reduction_for(limits[0] + 1) == 1
+    assert LARGE_PHOTO.reduction_for(limits[1]) == 4 and LARGE_PHOTO.reduction_for(limits[1] + 1) == 2
     assert PhotoSize(10**12, 10**6).reduction_for(1) == resolution.MAX_REDUCTION
 
 
@@ -49,7 +49,7 @@ def test_the_resolution_grows_with_the_gaussians_and_never_falls() -> None:
     schedule.update(200, many)
     schedule.update(300, few)
 
-    assert coarsest == LARGE.reduction_for(100) > 1
+    assert coarsest == LARGE_PHOTO.reduction_for(100) > 1
     assert [schedule.factor(step) for step in (100, 200, 200 + PREFETCH_DEPTH)] == [coarsest] * 3
     assert [schedule.factor(step) for step in (201 + PREFETCH_DEPTH, 400, 1000)] == [1] * 3
 
@@ -90,7 +90,7 @@ def test_the_estimated_cost_is_that_of_the_steps_taken() -> None:
         costs.append(resolution.step_cost(schedule.factor(step)))
         schedule.update(step, int(np.interp(step / steps, times, counts)))
 
-    assert LARGE.mean_step_cost(density, initial, budget) == pytest.approx(np.mean(costs), rel=0.05)
+    assert LARGE_PHOTO.mean_step_cost(density, initial, budget) == pytest.approx(np.mean(costs), rel=0.05)
     assert PhotoSize(40_000, 200).mean_step_cost(density, initial, budget) == 1
 
 
@@ -138,11 +138,11 @@ def make_large_scene() -> Scene:
     return Scene("made up", "colmap", views, [], points, np.full((60, 3), 0.5, np.float32))
 
 
-CONFIG = TrainConfig(steps=24, max_gaussians=60, exposure=False, density=DensityConfig(stop=0.9, peak=0.5))
+SHORT_RUN = TrainConfig(steps=24, max_gaussians=60, exposure=False, density=DensityConfig(stop=0.9, peak=0.5))
 
 
 def test_training_reduces_photos_and_renders_at_their_size() -> None:
-    trainer = Trainer(make_large_scene(), CONFIG)
+    trainer = Trainer(make_large_scene(), SHORT_RUN)
     trainer.run()
 
     assert trainer.resolution.changes[0] == (1, 2)
@@ -153,13 +153,13 @@ def test_a_resumed_run_takes_the_same_steps_when_the_resolution_changes(tmp_path
     # The first rounds add Gaussians beyond the limit for reduced photos.
     side = 2 * resolution.MIN_REDUCED_SIDE_PIXELS
     monkeypatch.setattr(resolution, "MIN_PIXELS_PER_GAUSSIAN", side**2 / 4 / 65)
-    whole, first, second = (Trainer(make_large_scene(), CONFIG) for _ in range(3))
+    whole, first, second = (Trainer(make_large_scene(), SHORT_RUN) for _ in range(3))
     whole.run()
     changed = whole.resolution.changes[1][0]
     for stop in range(max(1, changed - PREFETCH_DEPTH - 1), changed + 1):
-        first = Trainer(make_large_scene(), CONFIG)
+        first = Trainer(make_large_scene(), SHORT_RUN)
         first.run(checkpoint=tmp_path / "c.pt", stop=lambda trainer=first, stop=stop: trainer.step >= stop)
-        second = Trainer(make_large_scene(), CONFIG)
+        second = Trainer(make_large_scene(), SHORT_RUN)
         second.load(tmp_path / "c.pt")
         second.run()
 

@@ -60,4 +60,4 @@ def make_scene(name: str, photos: int, width: int, height: int, seed: int) -> Sc
     cameras = [Camera(width, height, focal, focal, width / 2, height / 2, pose) for pose in poses]
     arrays = add_indirect_light(arrays, _GATHER_RAYS, _BOUNCES)
     arrays.light[...] += np.float32(layout.FILL_LIGHT)
-    return SceneDescription(arrays, cameras, layout.EXPOSURE)
+    return SceneDescription(arrays, cameras, layout.EXPOSURE_FACTOR)

@@ -14,7 +14,7 @@ from tools.scenes.parts import add_books, add_bush, add_chair, add_tree, book_co
 TABLE_HEIGHT = 0.74
 TEXEL_METRES = 0.04
 FILL_LIGHT = 0.0
-EXPOSURE = 0.95
+EXPOSURE_FACTOR = 0.95
 _UP = np.array([0.0, 0.0, 1.0])
 
 

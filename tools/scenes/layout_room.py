@@ -11,9 +11,9 @@ from tools.scenes import textures
 from tools.scenes.build import Frame, SceneBuilder, make_sky
 from tools.scenes.parts import add_books, add_bush, add_chair, add_tree, book_covers, foliage
 
-WIDTH, DEPTH, HEIGHT = 5.2, 4.4, 2.6  # metres along x, y, z
+ROOM_WIDTH, ROOM_DEPTH, ROOM_HEIGHT = 5.2, 4.4, 2.6  # metres along x, y, z
 TEXEL_METRES = 0.08
-EXPOSURE = 8.5
+EXPOSURE_FACTOR = 8.5
 FILL_LIGHT = 0.015  # light of lamps, and the lift of shadows that phones apply indoors
 _UP = np.array([0.0, 0.0, 1.0])
 _ACROSS_SHARE = 0.6  # of the photos look across the room, the others at the nearest wall
@@ -86,12 +86,12 @@ def _add_walls(world: Frame, wood: int, white: int) -> None:
         stagger=0.5,
     )  # fmt: skip
     glass = b.material(textures.PLAIN, (0.02, 0.02, 0.02), contrast=0.1, reflectance=0.05, shininess=500)
-    w, d, h, t = WIDTH, DEPTH, HEIGHT, 0.25
+    w, d, h, t = ROOM_WIDTH, ROOM_DEPTH, ROOM_HEIGHT, 0.25
     world.box((-t, -t, -0.2), (w + t, d + t, 0.0), floor)
     world.box((-t, -t, h), (w + t, d + t, h + 0.25), white)
     world.box((-t, -t, 0), (0.0, d + t, h), plaster)
     world.box((0, -t, 0), (w, 0.0, h), brick)
-    # The wall y = DEPTH has a window, the wall x = WIDTH a glass door.
+    # The wall y = ROOM_DEPTH has a window, the wall x = ROOM_WIDTH a glass door.
     world.box((0, d, 0), (1.3, d + t, h), paper)
     world.box((3.7, d, 0), (w, d + t, h), paper)
     world.box((1.3, d, 0), (3.7, d + t, 0.85), paper)
@@ -165,8 +165,11 @@ def _add_pictures(world: Frame, wood: int, glass: int) -> None:
                 (0.62, 1.75, 0.42, 0.42, print_),
             ],
         ),
-        "right": (world.frame(WIDTH, 0.0, 0.0, math.pi / 2), [(2.4, 1.6, 0.6, 0.8, art), (3.75, 1.62, 0.7, 0.5, map_)]),
-        "front": (world.frame(0.0, DEPTH, 0.0, 0.0), [(0.5, 1.6, 0.55, 0.75, art), (4.6, 1.6, 0.6, 0.6, print_)]),
+        "right": (
+            world.frame(ROOM_WIDTH, 0.0, 0.0, math.pi / 2),
+            [(2.4, 1.6, 0.6, 0.8, art), (3.75, 1.62, 0.7, 0.5, map_)],
+        ),
+        "front": (world.frame(0.0, ROOM_DEPTH, 0.0, 0.0), [(0.5, 1.6, 0.55, 0.75, art), (4.6, 1.6, 0.6, 0.6, print_)]),
     }
     for name, (wall, pictures) in walls.items():
         side = {"left": -1, "back": 1, "right": 1, "front": -1}[name]
@@ -202,9 +205,9 @@ def _add_outside(world: Frame) -> None:
     dark = b.material(textures.PLAIN, (0.03, 0.035, 0.05), contrast=0.2, reflectance=0.1, shininess=500)
     world.box((-40, -40, -0.6), (60, 60, -0.35), lawn)
     for n in range(12):
-        add_bush(world.frame(-3 + 1.1 * n, DEPTH + 5.5, -0.35), 1.7, 1.1 + 0.25 * (n % 3), leaves, 9)
+        add_bush(world.frame(-3 + 1.1 * n, ROOM_DEPTH + 5.5, -0.35), 1.7, 1.1 + 0.25 * (n % 3), leaves, 9)
         if n < 8:
-            add_bush(world.frame(WIDTH + 5.5, -2.5 + 1.1 * n, -0.35), 1.7, 1.2 + 0.25 * (n % 2), leaves, 9)
+            add_bush(world.frame(ROOM_WIDTH + 5.5, -2.5 + 1.1 * n, -0.35), 1.7, 1.2 + 0.25 * (n % 2), leaves, 9)
     for x, y, height in ((0.5, 15.0, 7.0), (5.5, 19.0, 9.0), (13.0, 3.5, 7.0), (15, -3.0, 8.0)):
         add_tree(world.frame(x, y, -0.35), height, 0.6 * height, bark, leaves)
     world.box((-6, 26, -0.4), (8, 30, 3.8), house)
@@ -388,7 +391,7 @@ def _add_corners(world: Frame, wood: int, white: int) -> None:
     chest.block((0.22, 0.0, 0.4), (0.38, 0.3, 0.28), carton, -0.15)
     chest.block((0.18, 0.0, 0.68), (0.26, 0.2, 0.12), carton, 0.3)
     chest.block((-0.4, 0.05, 0), (0.4, 0.34, 0.26), basket, 0.0)
-    sill = world.frame(0, DEPTH - 0.03, 0.85)
+    sill = world.frame(0, ROOM_DEPTH - 0.03, 0.85)
     for n, x in enumerate((1.5, 2.05, 2.9, 3.4)):
         sill.post((x, 0, 0), 0.12, 0.12, basket if n % 2 else white)
         add_bush(sill.frame(x, 0, 0.1), 0.24, 0.26, leaves, 8)

@@ -13,7 +13,7 @@ from tools.scenes.parts import add_bush, add_tree, foliage
 
 TEXEL_METRES = 0.25
 FILL_LIGHT = 0.0
-EXPOSURE = 0.95
+EXPOSURE_FACTOR = 0.95
 _UP = np.array([0.0, 0.0, 1.0])
 _HOUSE_WIDTHS = (6.2, 5.2, 7.4, 5.6, 6.6, 5.8, 7.0)  # metres
 _ROW_START = -22.0

@@ -13,7 +13,7 @@ import numpy as np
 from hyrfpack.parallel.pool import run_tasks
 from tools.scenes.geometry import SceneArrays, is_inside_any, locate_on_face
 from tools.scenes.noise import hash_unit, kernel
-from tools.scenes.shading import LIFT, trace_matte
+from tools.scenes.shading import SURFACE_OFFSET_METRES, trace_matte
 
 _TEXELS_PER_TASK = 256
 _GATHER_FOOTPRINT = 0.15  # metres; finer texture does not change the light that surfaces exchange
@@ -32,7 +32,11 @@ def _gather(scene, texels, first, last, rays, light):
         s = (texels[n, 2] + 0.5) / scene.light_size[i, face, 0]
         t = (texels[n, 3] + 0.5) / scene.light_size[i, face, 1]
         x, y, z, nx, ny, nz = locate_on_face(scene, i, face, s, t)
-        x, y, z = x + 20 * LIFT * nx, y + 20 * LIFT * ny, z + 20 * LIFT * nz
+        x, y, z = (
+            x + 20 * SURFACE_OFFSET_METRES * nx,
+            y + 20 * SURFACE_OFFSET_METRES * ny,
+            z + 20 * SURFACE_OFFSET_METRES * nz,
+        )
         if is_inside_any(scene, x, y, z):
             light[n] = np.nan
             continue

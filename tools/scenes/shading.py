@@ -9,8 +9,8 @@ from tools.scenes.noise import inlined_kernel, kernel
 from tools.scenes.sky import SUN_COLOR, SUN_DIRECTION, SUN_RADIUS, evaluate_sky
 from tools.scenes.textures import COLOR_A, IS_METAL, REFLECTANCE, SHININESS, evaluate_albedo
 
-LIFT = 1e-4  # metres by which secondary rays start above their surface
-FAR = 1e9
+SURFACE_OFFSET_METRES = 1e-4  # Secondary rays start this far above their surface, so that they do not hit it.
+MAX_RAY_METRES = 1e9
 _MIN_FOOTPRINT_COSINE = 0.05
 MAX_FAINT_FRESNEL = 0.1  # weaker reflections need fewer samples
 
@@ -54,8 +54,8 @@ def sees_sun(scene, x, y, z, nx, ny, nz, across, up):
     r = sky[SUN_RADIUS]
     dx, dy, dz = lx + r * (across * ax + up * bx), ly + r * (across * ay + up * by), lz + r * up * bz
     norm = 1.0 / math.sqrt(dx * dx + dy * dy + dz * dz)
-    ox, oy, oz = x + LIFT * nx, y + LIFT * ny, z + LIFT * nz
-    return not is_blocked(scene, ox, oy, oz, dx * norm, dy * norm, dz * norm, FAR)
+    ox, oy, oz = x + SURFACE_OFFSET_METRES * nx, y + SURFACE_OFFSET_METRES * ny, z + SURFACE_OFFSET_METRES * nz
+    return not is_blocked(scene, ox, oy, oz, dx * norm, dy * norm, dz * norm, MAX_RAY_METRES)
 
 
 @kernel
@@ -112,7 +112,7 @@ def shade(scene, i, ox, oy, oz, dx, dy, dz, t, sunlit, spread, faint_weight):
     weight = faint_weight if fresnel < MAX_FAINT_FRESNEL else 1.0
     mr, mg, mb = 0.0, 0.0, 0.0
     if weight > 0.0:
-        px, py, pz = x + LIFT * nx, y + LIFT * ny, z + LIFT * nz
+        px, py, pz = x + SURFACE_OFFSET_METRES * nx, y + SURFACE_OFFSET_METRES * ny, z + SURFACE_OFFSET_METRES * nz
         mr, mg, mb = trace_matte(scene, px, py, pz, rx, ry, rz, footprint, 2.0 * spread, False)
         mr, mg, mb = mr * weight, mg * weight, mb * weight
     shininess = materials[m, SHININESS]

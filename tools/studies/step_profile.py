@@ -21,7 +21,7 @@ has the system's load.
 How the step is split. Most forward rows are the trainer's own clock. Those of hash encoding, MLPs, composite and loss
 are timed around calls, and "rest" is the remainder of a stage. In the backward pass, hooks of autograd read the clock
 before and after each node of the graph. A node belongs to the operation whose result it first led to, and hash encoding
-and MLPs are told apart by name, so that the background's share is measured and not estimated. The rasteriser is one
+and MLPs are distinguished by name, so that the background's share is measured and not estimated. The rasteriser is one
 node, so its two parts are timed around calls. What lies between nodes (autograd itself, the sum of the two gradients of
 the radiance table, which decoding and background share, and the hooks) is the row "backward: autograd". "other" is the
 rest of the step, mostly checks for finite numbers. So the rows of one step add up to its duration.
@@ -82,7 +82,7 @@ COPIED_FLOATS_PER_THREAD = 1 << 25
 MATRIX_SIDE = 1024
 RATE_REPEATS = 15
 
-ROWS = (
+OPERATION_ROWS = (
     "data",
     "cull",
     "decode: hash encoding",
@@ -118,8 +118,8 @@ ROW_BY_STAGE = {
     "density": "density observation",
     "optimizer": "Adam",
 }
-COLUMNS = ("operation", "ms", "share", "MB", "MFLOP", "bound, ms", "limited by", "time / bound")
-RULER = ("---", "--:", "--:", "--:", "--:", "--:", "---", "--:")
+TABLE_COLUMNS = ("operation", "ms", "share", "MB", "MFLOP", "bound, ms", "limited by", "time / bound")
+COLUMN_ALIGNMENTS = ("---", "--:", "--:", "--:", "--:", "--:", "---", "--:")
 
 
 class StepRecorder:
@@ -292,7 +292,9 @@ def split_step(seconds: dict[str, float], step: float, recorder: StepRecorder, b
     backward = sum(value for row, value in rows.items() if "backward" in row)
     rows["backward: autograd"] = seconds["backward"] - backward
     rows["other"] = step - recorder.overhead - sum(rows.values())
-    return {row: rows[row] for row in ROWS if row in rows and (background or not row.startswith("background"))}
+    return {
+        row: rows[row] for row in OPERATION_ROWS if row in rows and (background or not row.startswith("background"))
+    }
 
 
 @dataclass(frozen=True)
@@ -445,7 +447,7 @@ def table_rows(profile: StepProfile, rates: Rates) -> list[list[str]]:
                 limit,
                 f"{ms / bound:.1f}",
             ]
-        rows.append(cells + [""] * (len(COLUMNS) - len(cells)))
+        rows.append(cells + [""] * (len(TABLE_COLUMNS) - len(cells)))
     bound = sum(work.min_ms(rates) for work in works.values())
     sums = (sum(getattr(work, name) for work in works.values()) / 1e6 for name in ("bytes", "flops"))
     cells = ["total", f"{total:.2f}", "100.0%", *(f"{number:,.1f}" for number in sums)]
@@ -471,7 +473,7 @@ def main(arguments: list[str] | None = None) -> None:
     except HyrfError as error:
         parser.error(str(error))
     rates = measure_core_rates()
-    table = markdown_table(COLUMNS, table_rows(profile, rates), RULER)
+    table = markdown_table(TABLE_COLUMNS, table_rows(profile, rates), COLUMN_ALIGNMENTS)
     print(f"{describe(profile, [view.camera for view in scene.train], rates)}\n\n{table}")
 
 
