@@ -13,6 +13,11 @@ from hyrfpack.config.settings import OneOf, Range, Seed, check_settings
 
 FULL_STEPS = 30_000  # The paper's schedules are written for runs of this length.
 MIN_RATE_SCALING_STEPS = 1_000  # Shorter runs use the learning rates of a run of this length.
+# The learning rate of untrained fields rises linearly over the first steps. At the full rate, the first steps of Adam,
+# which all have about the same direction, can make every Gaussian as large and opaque as it can be. The sigmoids then
+# have no gradient, and the scene stays empty. A rise over 10 steps prevents most such runs, one over 20 steps all known
+# ones.
+FIELD_WARMUP_STEPS = 20
 MIN_LEARNING_RATE = 1e-30  # It is above 0, because the schedule divides by the first rate.
 
 

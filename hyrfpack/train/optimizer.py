@@ -36,11 +36,18 @@ class Optimizer:
         groups: the parameters of each group by its name, which is also the name of its learning rate.
     """
 
-    def __init__(self, model: HybridModel, rates: LearningRates, views: int = 1) -> None:
-        """Start without any state; `views` is W, the number of views of each step."""
+    def __init__(self, model: HybridModel, rates: LearningRates, views: int = 1, warmup_steps: int = 0) -> None:
+        """Start without any state.
+
+        Args:
+            views: W, the number of views of each step.
+            warmup_steps: number of first steps over which the learning rate of the fields rises linearly to the
+                scheduled one; 0 for none.
+        """
         self.model = model
         self.rates = rates
         self.views = views
+        self.warmup_steps = warmup_steps
         first, second = (beta if views == 1 else max(0.0, 1 - views * (1 - beta)) for beta in ADAM_BETAS)
         self.betas = first, second
         self.groups: dict[str, list[nn.Parameter]] = {
@@ -74,12 +81,19 @@ class Optimizer:
             [state.exp_avg for state in states],
             [state.exp_avg_sq for state in states],
             step=[state.step for state in states],
-            rate=[self.rates.at(name, step, steps, self.views) for name, _ in stepped],
+            rate=[self._rate(name, step, steps) for name, _ in stepped],
             betas=self.betas,
         )
         for _, parameter in stepped:
             parameter.grad = None
         return broken.float()
+
+    def _rate(self, name: str, step: int, steps: int) -> float:
+        """Return the learning rate of the group `name` at `step` (from 0) of `steps`."""
+        rate = self.rates.at(name, step, steps, self.views)
+        if name == "fields" and step < self.warmup_steps:
+            rate *= (step + 1) / self.warmup_steps
+        return rate
 
     def names(self, broken: Sequence[float]) -> list[str]:
         """Return the names of the groups that the last `step` flagged as broken."""

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from hyrfpack.config.train import TrainConfig
+from hyrfpack.config.train import FIELD_WARMUP_STEPS, TrainConfig
 from hyrfpack.data import PictureCache
 from hyrfpack.device import Photos, upload_array
 from hyrfpack.errors import HyrfError, HyrfTrainingError
@@ -87,7 +87,8 @@ class Trainer:
         """Set up a run.
 
         Args:
-            model: the model to continue training, changed in place; None builds an untrained one for the scene.
+            model: the model to continue training, changed in place; None builds an untrained one for the scene, whose
+                fields start at lower learning rates (`FIELD_WARMUP_STEPS`).
             strategy: adds and removes Gaussians; None for `DensityControl` with the settings of `config.density`.
             ranks: the processes that train together; each of them sets up the same run.
         """
@@ -100,6 +101,7 @@ class Trainer:
         self.photos = Photos(device)
         self.choices: dict[str, str] = {}  # For each setting, the choice and its reason.
         self.pilots: list[dict] = []  # The scores of the pilot runs, see `PilotScore`.
+        self._warmup_steps = FIELD_WARMUP_STEPS if model is None else 0
         if model is None:
             model, self.budget, self.choices = build_model(scene, config)
         else:
@@ -122,7 +124,7 @@ class Trainer:
         if not any(parameter.requires_grad for parameter in model.parameters()):  # A loaded model records none.
             model.requires_grad_(True)
         self.model = model.to(self.device)
-        self.optimizer = Optimizer(self.model, self.config.learning_rates, self.ranks.size)
+        self.optimizer = Optimizer(self.model, self.config.learning_rates, self.ranks.size, self._warmup_steps)
 
     # -- the loop ------------------------------------------------------------------------------------------------
 

@@ -110,6 +110,22 @@ def test_steps_match_adam_with_the_scheduled_rates(steps, pace):
         torch.testing.assert_close(parameter.detach(), plain[name].detach(), rtol=1e-5, atol=1e-6)
 
 
+def test_only_the_fields_have_a_warm_up_and_their_rate_rises_linearly():
+    model = make_model()
+    optimizer = Optimizer(model, LEARNING_RATES, warmup_steps=4)
+    moving = {"positions": model.gaussians.positions, "fields": model.geometry.weights[1]}
+    for step in range(6):
+        before = {name: parameter.detach().double() for name, parameter in moving.items()}
+        for parameter in model.parameters():
+            parameter.grad = torch.ones_like(parameter)
+        optimizer.step(step, 20)
+        for name, parameter in moving.items():
+            # With a constant gradient, each step of Adam moves every number by the learning rate.
+            moved = (before[name] - parameter.detach().double()).mean().item()
+            share = min(1, (step + 1) / 4) if name == "fields" else 1
+            assert moved == pytest.approx(share * LEARNING_RATES.at(name, step, 20), rel=1e-3)
+
+
 def test_a_step_clears_the_gradients():
     model = make_model()
     take_steps(model, Optimizer(model, LEARNING_RATES), range(1))

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor, nn
 
-from hyrfpack.config.train import LearningRates, TrainConfig
+from hyrfpack.config.train import FIELD_WARMUP_STEPS, LearningRates, TrainConfig
 from hyrfpack.data import PictureCache
 from hyrfpack.model import Decoded, Geometry, HybridModel, ModelConfig
 from hyrfpack.model.field import Field
@@ -140,7 +140,7 @@ class OptimizerWithoutLogits(Optimizer):
     """Adam for a model that lacks some explicit logits; these stay zero, also for new Gaussians."""
 
     def __init__(self, model: HybridModel, rates: LearningRates, missing_logits: tuple[str, ...]) -> None:
-        super().__init__(model, rates)
+        super().__init__(model, rates, warmup_steps=FIELD_WARMUP_STEPS)
         self.missing_logits = missing_logits
         for name in missing_logits:
             self.reset(name, torch.zeros_like(getattr(model.gaussians, name)))

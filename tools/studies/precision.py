@@ -30,6 +30,7 @@ import torch
 from torch import Tensor
 
 import hyrfpack
+from hyrfpack.config.train import FIELD_WARMUP_STEPS
 from hyrfpack.evaluate import evaluate_model
 from hyrfpack.model import HybridModel
 from hyrfpack.ops.hash_encode import hash_encode
@@ -97,7 +98,7 @@ def train_row(scene: Scene, config: TrainConfig, row: str) -> tuple[HybridModel,
             positions.mul_(1 + NUDGE_STD * torch.randn(positions.shape, generator=generator))
     if row in ("adam", "float64"):
         trainer.model.double()
-        trainer.optimizer = Optimizer(trainer.model, config.learning_rates)
+        trainer.optimizer = Optimizer(trainer.model, config.learning_rates, warmup_steps=FIELD_WARMUP_STEPS)
         dtype = torch.float32 if row == "adam" else torch.float64
         patches = {lookup: run_in_dtype(dtype, operation) for lookup, operation in OPERATION_BY_LOOKUP.items()}
     elif row == "mixed":
