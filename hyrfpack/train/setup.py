@@ -28,6 +28,8 @@ SYNTHETIC_HALF_BOX = 1.3  # NeRF-synthetic objects lie in [-1.3, 1.3]^3.
 # photos. For Mip-NeRF 360 at 1 megapixel they are 0.85 and 0.9 million; published models have up to 2.5 million.
 GAUSSIANS_PER_PIXEL_OF_ONE_PHOTO = 0.85
 GAUSSIANS_PER_PIXEL_OF_ALL_PHOTOS = 1 / 240
+# It limits the time of short runs on large photos; 2,000 steps reach it on photos of 830 x 550 pixels or more.
+MAX_GAUSSIANS_PER_STEP = 50
 MIN_BUDGET = 5_000
 # A packed file is assumed to take this many bytes for decoders and headers, and for each Gaussian with its table rows.
 # By default `compress` takes 2 to 6 bytes per Gaussian, most often 4 to 5. Of two files of equal size, the one with
@@ -73,16 +75,14 @@ def scene_frame(scene: Scene, preset: str) -> Frame:
 def budget_for(scene: Scene, config: TrainConfig) -> tuple[int, str]:
     """Return the Gaussian budget of a run and the reason in words.
 
-    The usual budget grows with the photos' pixels, and with the square root of the run's length, because a shorter run
-    can fit fewer Gaussians. It is multiplied by `config.budget_factor`. For a target size, the budget is the number of
-    Gaussians that fit, at most `MAX_TARGETED_BUDGET_RATIO` times the usual budget.
+    The usual budget (`usual_budget`) is multiplied by `config.budget_factor`. For a target size, the budget is the
+    number of Gaussians that fit, at most `MAX_TARGETED_BUDGET_RATIO` times the usual budget.
     """
     if config.max_gaussians is not None:
         return config.max_gaussians, "asked for"
     pixels = sum(view.camera.width * view.camera.height for view in scene.train)
-    full = max(GAUSSIANS_PER_PIXEL_OF_ONE_PHOTO * pixels / len(scene.train), GAUSSIANS_PER_PIXEL_OF_ALL_PHOTOS * pixels)
-    length = math.sqrt(min(1.0, config.steps / FULL_STEPS))
-    budget, why = max(MIN_BUDGET, round(full * length)), f"{pixels:,} pixels in all, {config.steps:,} steps"
+    budget = usual_budget(pixels / len(scene.train), pixels, config.steps)
+    why = f"{pixels:,} pixels in all, {config.steps:,} steps"
     if config.target_bytes is not None:
         fitting = max(
             MIN_TARGETED_BUDGET, round((config.target_bytes - PACKED_HEADER_BYTES) / PACKED_BYTES_PER_GAUSSIAN)
@@ -93,6 +93,22 @@ def budget_for(scene: Scene, config: TrainConfig) -> tuple[int, str]:
     if config.budget_factor not in (None, 1):
         return max(1, round(config.budget_factor * budget)), f"{config.budget_factor:g} times what suits {why}"
     return budget, why
+
+
+def usual_budget(photo_pixels: float, all_pixels: float, steps: int) -> int:
+    """Return the Gaussian budget that photos and the length of a run suggest.
+
+    It grows with the photos' pixels and with the square root of the run's length, because a shorter run can fit fewer
+    Gaussians. `MAX_GAUSSIANS_PER_STEP` limits the time of short runs on large photos.
+
+    Args:
+        photo_pixels: mean number of pixels of a training photo.
+        all_pixels: number of pixels of all training photos.
+        steps: number of optimiser steps.
+    """
+    full = max(GAUSSIANS_PER_PIXEL_OF_ONE_PHOTO * photo_pixels, GAUSSIANS_PER_PIXEL_OF_ALL_PHOTOS * all_pixels)
+    length = math.sqrt(min(1.0, steps / FULL_STEPS))
+    return max(MIN_BUDGET, min(round(full * length), MAX_GAUSSIANS_PER_STEP * steps))
 
 
 def check_target(scene: Scene, config: TrainConfig) -> None:

@@ -182,12 +182,16 @@ def test_a_camera_without_a_finite_position_is_rejected():
         (100, 800, 120_000, 0.85 * 800 * 800),  # a run of more than 30,000 steps gets the same budget
         (200, 800, 30_000, 0.85 * 800 * 800),  # up to 204 views of this size get the same budget
         (408, 800, 30_000, 408 * 800 * 800 / 240),  # beyond that, the budget grows with the number of pixels
-        (408, 800, 7_500, 408 * 800 * 800 / 240 / 2),
+        (408, 800, 10_000, 50 * 10_000),  # nor is it more than 50 Gaussians for each step
+        (100, 1600, 3_000, 50 * 3_000),
+        (100, 1600, 1_000, 50 * 1_000),
+        (100, 1600, 30_000, 50 * 30_000),
+        (100, 600, 3_000, 0.85 * 600 * 600 / 10**0.5),  # smaller photos do not reach that limit
         (4, 32, 30_000, 5000),
         (100, 800, 1, 5000),
     ],
 )
-def test_the_budget_follows_pixels_and_the_root_of_the_steps(views, side, steps, expected):
+def test_the_budget_follows_pixels_and_steps(views, side, steps, expected):
     budget, reason = budget_for(make_rig_scene(ring(views, width=side, height=side)), TrainConfig(steps=steps))
     assert budget == round(expected)
     assert f"{steps:,}" in reason
