@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,16 +11,18 @@ import torch
 from hyrfpack.compress.sensitivity import MAX_SENSITIVITY_VIEWS, MIN_SENSITIVITY_VIEWS, TARGET_DRAWN_GAUSSIANS
 from hyrfpack.config.make import MakeConfig
 from hyrfpack.config.train import FULL_STEPS, DensityConfig, TrainConfig
+from hyrfpack.data.pictures import fit_size
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Scene
 from hyrfpack.train.decisions import (
     MAX_BUDGET_PILOT_STEPS,
     MIN_BUDGET_STEPS,
+    MIN_EXPOSURE_STEPS,
     max_exposure_pilot_steps,
     max_length_pilot_steps,
     max_pilot_steps,
 )
 from hyrfpack.train.resolution import PhotoSize
-from hyrfpack.train.setup import budget_for
+from hyrfpack.train.setup import budget_for, usual_budget
 
 # Measured on two CPU cores, for the first estimate only; during the work, measured times replace it.
 CPU_STEP_SECONDS_PER_MEGAPIXEL = 0.7
@@ -29,7 +31,13 @@ CPU_PASS_SECONDS_PER_MEGAPIXEL = 0.6  # a pass renders a view and back-propagate
 BACKGROUND_SEARCH_PASSES = 8.0  # time of the search for a background in unseen directions
 PASSES_PER_SCORED_VIEW = 2.0  # time of scoring a held-out photo and writing its picture
 POSE_SECONDS_PER_PHOTO = 3.0
-ASSUMED_VIDEO_PHOTOS = 100  # before a video is decoded, the number of its photos is unknown
+# Before a video is decoded, number and size of its photos are unknown.
+ASSUMED_VIDEO_PHOTOS = 100
+ASSUMED_VIDEO_SIZE = (1920, 1080)
+# A run on large photos gets more Gaussians and takes fewer steps, because at equal time that scores higher.
+SMALL_PHOTO_PIXELS = 190_000
+LARGE_PHOTO_PIXELS = 1_700_000
+ASSUMED_POINTS = 10_000  # before poses are estimated, the number of points is unknown
 
 
 @dataclass(frozen=True)
@@ -37,7 +45,8 @@ class Quality:
     """Settings of one of the qualities that can be requested.
 
     Attributes:
-        steps: training steps on a CPU.
+        steps: training steps on a CPU, on photos of at most `SMALL_PHOTO_PIXELS`.
+        large_photo_steps: training steps on a CPU, on photos of `LARGE_PHOTO_PIXELS` or more.
         gpu_steps: training steps on a GPU.
         max_size: longer side in pixels to which larger photos are shrunk.
         finetune_steps: fine-tuning steps during packing.
@@ -45,23 +54,39 @@ class Quality:
     """
 
     steps: int
+    large_photo_steps: int
     gpu_steps: int
     max_size: int
     finetune_steps: int
     import_steps: int
 
+    def training_steps(self, pixels: float, device: torch.device) -> int:
+        """Return the training steps on photos of `pixels` pixels; between the two sizes they follow a power law."""
+        if device.type != "cpu":
+            return self.gpu_steps
+        share = math.log(pixels / SMALL_PHOTO_PIXELS) / math.log(LARGE_PHOTO_PIXELS / SMALL_PHOTO_PIXELS)
+        return round(self.steps * (self.large_photo_steps / self.steps) ** min(max(share, 0.0), 1.0))
+
 
 QUALITIES = {
-    "draft": Quality(steps=600, gpu_steps=1_000, max_size=640, finetune_steps=0, import_steps=150),
+    "draft": Quality(
+        steps=600, large_photo_steps=600, gpu_steps=1_000, max_size=640, finetune_steps=0, import_steps=150
+    ),
     "normal": Quality(
         steps=TrainConfig.steps,
+        large_photo_steps=2_000,
         gpu_steps=TrainConfig.steps,
         max_size=DEFAULT_MAX_SIZE,
         finetune_steps=0,
         import_steps=500,
     ),
     "best": Quality(
-        steps=10_000, gpu_steps=FULL_STEPS, max_size=DEFAULT_MAX_SIZE, finetune_steps=500, import_steps=1_500
+        steps=10_000,
+        large_photo_steps=10_000,
+        gpu_steps=FULL_STEPS,
+        max_size=DEFAULT_MAX_SIZE,
+        finetune_steps=500,
+        import_steps=1_500,
     ),
 }
 
@@ -166,16 +191,20 @@ def estimate_scene_seconds(scene: Scene, plan: Plan, device: torch.device) -> di
     return estimate_seconds(size, plan, initial, gaussians, len(scene.test), max_pilot_steps(scene, config), device)
 
 
-def estimate_photos_seconds(sizes: Sequence[tuple[int, int]], plan: Plan, device: torch.device) -> dict[str, float]:
-    """Return `estimate_seconds` and the time for poses, for photos of these (width, height); no sizes mean a video."""
-    width, height = sizes[0] if sizes else (1920, 1080)
-    shrunk = min(1.0, plan.max_size / max(width, height)) if plan.max_size else 1.0
-    size, count = PhotoSize.of([(round(width * shrunk), round(height * shrunk))]), len(sizes) or ASSUMED_VIDEO_PHOTOS
+def expected_photo_size(size: tuple[int, int] | None, max_size: int) -> PhotoSize:
+    """Return the size of photos of this (width, height) after they are shrunk; None means frames of a video."""
+    width, height = size or ASSUMED_VIDEO_SIZE
+    return PhotoSize.of([fit_size(width, height, max_size)])
+
+
+def estimate_photos_seconds(count: int, size: PhotoSize, plan: Plan, device: torch.device) -> dict[str, float]:
+    """Return `estimate_seconds` and the time for poses, for `count` photos of this size."""
     trained = count - count // 8
-    pilot_steps = MAX_BUDGET_PILOT_STEPS + max_exposure_pilot_steps(trained, plan.steps)
-    pilot_steps *= plan.steps >= MIN_BUDGET_STEPS
+    gaussians = usual_budget(size.pixels, trained * size.pixels, plan.steps)
+    pilot_steps = MAX_BUDGET_PILOT_STEPS * (plan.steps >= MIN_BUDGET_STEPS)
+    pilot_steps += max_exposure_pilot_steps(trained, plan.steps) * (plan.steps >= MIN_EXPOSURE_STEPS)
     pilot_steps += max_length_pilot_steps(trained, plan.steps) * plan.early_stop
     return {
         "poses": POSE_SECONDS_PER_PHOTO * count,
-        **estimate_seconds(size, plan, 10_000, 20_000, count // 8, pilot_steps, device),
+        **estimate_seconds(size, plan, ASSUMED_POINTS, gaussians, count // 8, pilot_steps, device),
     }

@@ -21,7 +21,14 @@ from hyrfpack.lock import exclusive_folder
 from hyrfpack.make import stages
 from hyrfpack.make.held_out import score_note
 from hyrfpack.make.minutes import fit_plan_to_minutes
-from hyrfpack.make.plan import Plan, estimate_photos_seconds, estimate_scene_seconds, find_quality
+from hyrfpack.make.plan import (
+    ASSUMED_VIDEO_PHOTOS,
+    Plan,
+    estimate_photos_seconds,
+    estimate_scene_seconds,
+    expected_photo_size,
+    find_quality,
+)
 from hyrfpack.make.progress import Reporter
 from hyrfpack.make.request import Request, default_work_folder
 from hyrfpack.make.source import LoadSettings, Source
@@ -31,6 +38,7 @@ from hyrfpack.outputs import StrPath
 from hyrfpack.progress import Progress
 from hyrfpack.scene import Scene
 from hyrfpack.train import Trainer
+from hyrfpack.train.resolution import PhotoSize
 
 _LOG = logging.getLogger(__name__)
 
@@ -222,8 +230,9 @@ class _Pipeline:
         request, source = self.request, self.source
         photos = list_photos(source.path) if source.kind == "photos" else []
         facts = first_readable_photo(photos)
-        sizes = [facts.size] * len(photos) if facts else []
-        estimates = estimate_photos_seconds(sizes, self._requested_plan(), request.device)
+        size = expected_photo_size(facts.size if facts else None, request.reading.max_size)
+        plan, count = self._requested_plan(size), len(photos) or ASSUMED_VIDEO_PHOTOS
+        estimates = estimate_photos_seconds(count, size, plan, request.device)
         if request.config.minutes is not None:
             left = 60 * request.config.minutes - estimates["poses"]
             estimates = {"poses": estimates["poses"], "training": max(0.0, left)}
@@ -237,13 +246,11 @@ class _Pipeline:
         """Return the digest of all files of a scene; for an archive, that of its unpacked files."""
         return files_digest((file for file in scene.files if Path(file) != self.source.path), Path(scene.path))
 
-    def _requested_plan(self) -> Plan:
-        """Return the plan that the quality and the other arguments request."""
-        quality = find_quality(self.request.config)
-        steps = quality.steps if self.request.device.type == "cpu" else quality.gpu_steps
-        request = self.request
+    def _requested_plan(self, size: PhotoSize) -> Plan:
+        """Return the plan that the quality and the other arguments request for photos of this size."""
+        request, quality = self.request, find_quality(self.request.config)
         return Plan(
-            steps,
+            quality.training_steps(size.pixels, request.device),
             request.reading.max_size,
             quality.finetune_steps,
             request.config.target_bytes,
@@ -253,18 +260,25 @@ class _Pipeline:
 
     def _decide_plan(self, path: Path, reading: LoadSettings, scene: Scene) -> tuple[Plan, Scene]:
         """Return the requested plan or the one that fits the minutes, and the scene at the plan's photo size."""
-        request = self.request
+        request, requested = self.request, self._requested_plan(PhotoSize.of_views(scene.views))
         if request.config.minutes is None:
-            return self._requested_plan(), scene
+            return requested, scene
         end = self.began + 60 * request.config.minutes
         left = max(0.0, end - monotonic())
         measuring = MEASUREMENT_TIME_RATIO * left
         self.reporter.estimates |= {"measurement": measuring, "training": left - measuring}
 
         def execute(resuming: bool) -> tuple[dict[str, Any], list[str]]:
-            requested = replace(self._requested_plan(), finetune_steps=0)
             plan = fit_plan_to_minutes(
-                path, reading, scene, requested, request.device, end, request.config.seed, self.cache, self.reporter
+                path,
+                reading,
+                scene,
+                replace(requested, finetune_steps=0),
+                request.device,
+                end,
+                request.config.seed,
+                self.cache,
+                self.reporter,
             )
             return asdict(plan), []
 

@@ -30,9 +30,9 @@ from hyrfpack.train import TrainResult
 from hyrfpack.train.results import RECORD_FILE, TrainingRecord, read_record
 
 QUICK_QUALITIES = {
-    "draft": Quality(steps=6, gpu_steps=6, max_size=40, finetune_steps=0, import_steps=2),
-    "normal": Quality(steps=9, gpu_steps=9, max_size=1600, finetune_steps=0, import_steps=3),
-    "best": Quality(steps=9, gpu_steps=9, max_size=1600, finetune_steps=3, import_steps=4),
+    "draft": Quality(steps=6, large_photo_steps=6, gpu_steps=6, max_size=40, finetune_steps=0, import_steps=2),
+    "normal": Quality(steps=9, large_photo_steps=9, gpu_steps=9, max_size=1600, finetune_steps=0, import_steps=3),
+    "best": Quality(steps=9, large_photo_steps=9, gpu_steps=9, max_size=1600, finetune_steps=3, import_steps=4),
 }
 
 

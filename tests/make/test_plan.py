@@ -1,0 +1,72 @@
+"""Plans of a pipeline: training steps by the size of the photos, and the first estimates of time."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from hyrfpack.make.plan import (
+    LARGE_PHOTO_PIXELS,
+    QUALITIES,
+    SMALL_PHOTO_PIXELS,
+    Plan,
+    estimate_photos_seconds,
+    expected_photo_size,
+)
+from hyrfpack.train.resolution import PhotoSize
+
+CPU, GPU = torch.device("cpu"), torch.device("cuda")
+REAL_QUALITIES = dict(QUALITIES)  # while tests run, quick ones replace them (conftest.py)
+
+
+@pytest.mark.parametrize("pixels", [1, 200 * 200, SMALL_PHOTO_PIXELS])
+def test_normal_quality_takes_3000_steps_on_small_photos(pixels):
+    assert REAL_QUALITIES["normal"].training_steps(pixels, CPU) == 3_000
+
+
+@pytest.mark.parametrize("pixels", [LARGE_PHOTO_PIXELS, 1600 * 1200, 4000 * 3000])
+def test_normal_quality_takes_2000_steps_on_large_photos(pixels):
+    assert REAL_QUALITIES["normal"].training_steps(pixels, CPU) == 2_000
+
+
+def test_training_steps_fall_steadily_between_small_and_large_photos():
+    normal = REAL_QUALITIES["normal"]
+    steps = [normal.training_steps(pixels, CPU) for pixels in range(SMALL_PHOTO_PIXELS, LARGE_PHOTO_PIXELS, 50_000)]
+    assert steps == sorted(steps, reverse=True) and len(set(steps)) == len(steps)
+    # Half-way on a logarithmic scale is the geometric mean.
+    middle = (SMALL_PHOTO_PIXELS * LARGE_PHOTO_PIXELS) ** 0.5
+    assert normal.training_steps(middle, CPU) == pytest.approx((3_000 * 2_000) ** 0.5, abs=1)
+
+
+@pytest.mark.parametrize(("quality", "steps"), [("draft", 600), ("best", 10_000)])
+@pytest.mark.parametrize("pixels", [SMALL_PHOTO_PIXELS, LARGE_PHOTO_PIXELS])
+def test_only_normal_quality_depends_on_the_size_of_photos(quality, steps, pixels):
+    assert REAL_QUALITIES[quality].training_steps(pixels, CPU) == steps
+
+
+@pytest.mark.parametrize("name", REAL_QUALITIES)
+def test_steps_on_a_gpu_do_not_depend_on_the_size_of_photos(name):
+    quality = REAL_QUALITIES[name]
+    assert {quality.training_steps(pixels, GPU) for pixels in (10_000, 2_000_000)} == {quality.gpu_steps}
+
+
+def test_photos_are_expected_at_the_size_to_which_they_are_shrunk():
+    assert expected_photo_size((4000, 3000), 1600) == PhotoSize(1600 * 1200, 1200)
+    assert expected_photo_size((4000, 3000), 0) == PhotoSize(4000 * 3000, 3000)
+    assert expected_photo_size((640, 480), 1600) == PhotoSize(640 * 480, 480)
+
+
+def test_frames_of_a_video_are_expected_in_full_hd():
+    assert expected_photo_size(None, 1600) == PhotoSize(1600 * 900, 900)
+
+
+def test_the_estimate_grows_with_photos_pixels_and_steps():
+    def seconds(count, side, steps):
+        plan = Plan(steps, max_size=1600)
+        return estimate_photos_seconds(count, expected_photo_size((side, side), 1600), plan, CPU)
+
+    usual = seconds(60, 800, 1_000)
+    assert all(value > 0 for value in usual.values())
+    assert seconds(120, 800, 1_000)["poses"] > usual["poses"]
+    assert seconds(60, 1600, 1_000)["training"] > usual["training"]
+    assert seconds(60, 800, 3_000)["training"] > usual["training"]
