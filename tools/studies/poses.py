@@ -2,29 +2,38 @@
 
     python -m tools.studies.poses                                   every COLMAP set below ../shared/data
     python -m tools.studies.poses --sets ngp_fox llff_fern --out runs/fox
+    python -m tools.studies.poses --data scenes/generated           every COLMAP set below another folder
 
 The estimation only gets the photos. Both sets of poses are first aligned by a robust similarity transform. A pose is
 correct if its position is then within 2 % of the cameras' extent from the known one, and its rotation within 5 degrees.
-The table has numbers of photos and seconds. It prints each row as JSON first. The scenes are kept in --out for
-training.
+The first table has numbers of photos and the choice between the mappers. The second has errors of the poses (median and
+largest, in degrees and in % of the cameras' extent), and CPU and wall seconds of each stage. The study prints each row
+as JSON first. The scenes are kept in --out for training.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import resource
 import shutil
 from pathlib import Path
+from typing import Any
+from unittest import mock
 
 import numpy as np
 import pycolmap
 
 import hyrfpack
+from hyrfpack.poses import estimate
 from hyrfpack.poses.alignment import Poses, align_poses
 from hyrfpack.poses.job import Job
 from hyrfpack.poses.mapping import read_pieces
+from hyrfpack.poses.process import run_stage
 from tools.studies.train_sets import DATA_FOLDER
 from tools.tables import markdown_table
+
+STAGES = ("features", "matches", "global", "incremental", "repeat", "finish")
 
 
 def read_poses(model: pycolmap.Reconstruction, job: Job | None = None) -> Poses:
@@ -37,15 +46,30 @@ def read_poses(model: pycolmap.Reconstruction, job: Job | None = None) -> Poses:
     return poses
 
 
+def children_cpu_seconds() -> float:
+    """Return the CPU seconds of all processes that this one has started and waited for."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
 def measure(folder: Path, out: Path, seed: int) -> dict:
     """Estimate the poses of one data set; compare them, and those of each mapper alone, with the known poses."""
     known = read_poses(pycolmap.Reconstruction(folder / "sparse" / "0"))
     mapper_results: dict[str, str] = {}
+    cpu_seconds: dict[str, float] = {}
     remove_tree = shutil.rmtree
 
-    def inspect_before_removal(path: Path, **options: bool) -> None:
+    def measure_stage(job: Path, stage: str, *arguments: Any) -> dict[str, Any]:
+        """Run a stage and keep its CPU seconds."""
+        before = children_cpu_seconds()
+        try:
+            return run_stage(job, stage, *arguments)
+        finally:
+            cpu_seconds[stage] = round(children_cpu_seconds() - before, 1)
+
+    def inspect_before_removal(path: Path, **options: Any) -> None:
         """Read the mappers' models before the estimation removes its work folder."""
-        if Path(path) == out / ".poses" and (out / "poses.json").exists():
+        if Path(path) == out / ".poses" and (out / "poses.json").exists() and Path(path).is_dir():
             job = Job.load(out / ".poses" / "job.json")
             for mapper in ("global", "incremental"):
                 runs = []
@@ -60,19 +84,22 @@ def measure(folder: Path, out: Path, seed: int) -> dict:
                 mapper_results[mapper] = "; ".join(runs)
         remove_tree(path, **options)
 
-    shutil.rmtree = inspect_before_removal  # type: ignore[assignment]
-    try:
-        report = hyrfpack.estimate_poses(folder / "images", out, hyrfpack.PosesConfig(seed=seed), overwrite=True)
-    finally:
-        shutil.rmtree = remove_tree
+    with mock.patch.object(shutil, "rmtree", inspect_before_removal):
+        with mock.patch.object(estimate, "run_stage", measure_stage):
+            report = hyrfpack.estimate_poses(folder / "images", out, hyrfpack.PosesConfig(seed=seed), overwrite=True)
     estimated = read_poses(pycolmap.Reconstruction(out / "sparse" / "0"))
+    aligned = align_poses(estimated, known)
     return {
         "set": folder.name,
         "photos": len(known),
         "registered": report.registered,
-        "right": len(align_poses(estimated, known).agreeing),
+        "right": len(aligned.agreeing),
         "sure": report.sure,
+        "angles": [float(np.median(aligned.angle)), float(np.max(aligned.angle))],
+        "distances": [float(np.median(aligned.distance)), float(np.max(aligned.distance))],
         "seconds": sum(report.seconds.values()),
+        "stage_seconds": report.seconds,
+        "cpu_seconds": cpu_seconds,
         "mapper": report.mapper,
         "why": report.why.rpartition(": ")[2],
         "alone": mapper_results,
@@ -95,23 +122,44 @@ def format_table(rows: list[dict]) -> str:
     return markdown_table(header, [[str(cell) for cell in line] for line in table_rows])
 
 
+def format_error_table(rows: list[dict]) -> str:
+    """Format errors of the poses and the seconds of each stage as a Markdown table."""
+    header = ["set", "rotation error, degrees", "position error, %", "CPU s", "wall s"]
+    header += [f"{stage}: CPU s (wall s)" for stage in STAGES]
+    table_rows = []
+    for row in rows:
+        if "error" in row:
+            continue
+        cells = [row["set"], "{:.4f}, {:.4f}".format(*row["angles"])]
+        cells += ["{:.4f}, {:.4f}".format(*(100 * distance for distance in row["distances"]))]
+        cells += [f"{sum(row['cpu_seconds'].values()):.0f}", f"{row['seconds']:.0f}"]
+        for stage in STAGES:
+            used, passed = row["cpu_seconds"].get(stage), row["stage_seconds"].get(stage)
+            cells.append("" if used is None else f"{used:.0f} ({passed:.0f})")
+        table_rows.append(cells)
+    return markdown_table(header, table_rows)
+
+
 def main() -> None:
     """Run the study."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sets", nargs="*")
+    parser.add_argument("--data", type=Path, default=DATA_FOLDER)
     parser.add_argument("--out", type=Path, default=Path("runs/poses"))
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
-    names = arguments.sets or sorted(path.parent.parent.name for path in DATA_FOLDER.glob("*/sparse/0"))
+    names = arguments.sets or sorted(path.parent.parent.name for path in arguments.data.glob("*/sparse/0"))
     rows = []
     for name in names:
         try:
-            rows.append(measure(DATA_FOLDER / name, arguments.out / name, arguments.seed))
+            rows.append(measure(arguments.data / name, arguments.out / name, arguments.seed))
         except hyrfpack.HyrfError as error:
-            known = read_poses(pycolmap.Reconstruction(DATA_FOLDER / name / "sparse" / "0"))
+            known = read_poses(pycolmap.Reconstruction(arguments.data / name / "sparse" / "0"))
             rows.append({"set": name, "photos": len(known), "error": str(error)})
         print(json.dumps(rows[-1]), flush=True)
     print(format_table(rows))
+    print()
+    print(format_error_table(rows))
 
 
 if __name__ == "__main__":
