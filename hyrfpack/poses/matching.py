@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from typing import Any
 
 import numpy as np
@@ -31,9 +30,8 @@ from hyrfpack.poses.job import Job
 from hyrfpack.poses.watch import report_new_rows
 from hyrfpack.progress import Progress, TaskEvent, part_of_progress
 
-_PORTION_SECONDS = 2.0  # pairs are matched in portions that take about this time, and saved after each portion
-_FIRST_PORTION_PAIRS = 100
-_MAX_PORTION_PAIRS = 2000
+# The library keeps the search index of so many photos in memory, about 2 MB each, and builds the others again.
+_MAX_CACHED_PHOTOS = 256
 # The focal length of a camera is estimated from pairs of its photos with many matches.
 _MIN_FOCAL_PAIR_MATCHES = 2 * MIN_PAIR_MATCHES
 _MAX_FOCAL_PAIRS = 40
@@ -84,7 +82,7 @@ def _choose_pairs(job: Job, report_progress: Progress) -> pairing.Pairs:
 
 
 def _match_pairs(job: Job, pairs: pairing.Pairs, report_progress: Progress) -> None:
-    """Match pairs of photos in portions, each of which the database keeps after an interruption."""
+    """Match pairs of photos; the database keeps those that were matched before an interruption."""
     names = [job.working_name(number) for number in range(1, len(job.names) + 1)]
     with open_database(job) as database:
         has_features = {number for number in range(1, len(names) + 1) if database.exists_keypoints(number)}
@@ -96,30 +94,24 @@ def _match_pairs(job: Job, pairs: pairing.Pairs, report_progress: Progress) -> N
         }
     matchable = [pair for pair in pairs if pair[0] + 1 in has_features and pair[1] + 1 in has_features]
     remaining = [pair for pair in matchable if pair not in matched]
-    done, size = len(matchable) - len(remaining), _FIRST_PORTION_PAIRS
-    portion = job.work / "pairs.txt"
-    options = pycolmap.ImportedPairingOptions()
-    options.match_list_path = portion
+    done = len(matchable) - len(remaining)
 
-    def report_done(done: int) -> None:
-        number, share = min(done + 1, len(matchable)), min(done / len(matchable), 1.0)
+    def report_new(found: int) -> None:
+        number, share = min(done + found + 1, len(matchable)), min((done + found) / len(matchable), 1.0)
         report_progress(TaskEvent(f"matching pair {number}/{len(matchable)}", 0.02 + 0.8 * share))
 
-    while remaining:
-        report_done(done)
-        now, remaining = remaining[:size], remaining[size:]
-        portion.write_text("".join(f"{names[first]} {names[second]}\n" for first, second in now), encoding="utf-8")
-        began = time.monotonic()
-        with report_new_rows(job, "two_view_geometries", lambda found, done=done: report_done(done + found)):  # type: ignore[misc]
+    if remaining:
+        report_new(0)
+        list_path = job.work / "pairs.txt"
+        lines = [f"{names[first]} {names[second]}\n" for first, second in remaining]
+        list_path.write_text("".join(lines), encoding="utf-8")
+        options = pycolmap.ImportedPairingOptions()
+        options.match_list_path, options.block_size = list_path, _MAX_CACHED_PHOTOS
+        with report_new_rows(job, "two_view_geometries", report_new):
             pycolmap.match_image_pairs(
                 job.database, pairing_options=options, verification_options=verification_options(job.seed)
             )
-        pace = len(now) / max(time.monotonic() - began, 1e-3)
-        done, size = (
-            done + len(now),
-            int(np.clip(pace * _PORTION_SECONDS, _FIRST_PORTION_PAIRS // 4, _MAX_PORTION_PAIRS)),
-        )
-    portion.unlink(missing_ok=True)
+        list_path.unlink()
 
 
 def _estimate_focals(
