@@ -82,7 +82,9 @@ def read_cameras(database: pycolmap.Database) -> Cameras:
 
 
 def recalibrate(job: Job, step_name: str, decide: Callable[[Cameras], Cameras], report_progress: Progress) -> bool:
-    """Replace cameras in the database by better ones, and verify all pairs again with them.
+    """Replace cameras in the database by better ones, and verify the pairs again with them.
+
+    Pairs that failed stay out. They were also tested without focal lengths, by uncalibrated geometry.
 
     The decision is saved before the database is changed, so that a call after an interruption makes the same
     replacements.
@@ -109,8 +111,9 @@ def recalibrate(job: Job, step_name: str, decide: Callable[[Cameras], Cameras], 
                 camera = cameras[int(number)]
                 camera.params, camera.has_prior_focal_length = parameters, True
                 database.update_camera(camera)
-            database.clear_two_view_geometries()
-        count = count_rows(job, "matches")
+            for first, second, _, _ in list(verified_pairs(database)):
+                database.delete_two_view_geometry(first, second)
+        count = count_rows(job, "matches") - count_rows(job, "two_view_geometries")
 
         def report_done(done: int) -> None:
             share = min(done / max(count, 1), 1.0)
