@@ -10,6 +10,7 @@ from hyrfpack.poses.alignment import Poses, align_poses
 _MAPPER_NAMES = {"incremental": "the incremental mapper", "global": "the global mapper"}
 _TIE_MATCH_RATIO = 0.002  # a lead of at most this ratio of all matches is not significant
 _MIN_CONFIRMED_RATIO = 0.9  # the report mentions it if the mappers agree on a smaller ratio of the photos
+_MIN_AGREEING_RATIO = 0.95  # two mappers that agree on this ratio of the photos confirm each other
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +68,20 @@ def confirmed_photos(poses: Poses, other: Candidate | None) -> frozenset[str]:
     """
     pieces = [] if other is None else [other.poses, *other.other_pieces]
     return max((align_poses(piece, poses).agreeing for piece in pieces), key=len, default=frozenset())
+
+
+def confirm_each_other(first: Sequence[Poses], second: Sequence[Poses], count: int) -> bool:
+    """Return whether two results agree on nearly all photos, so that further runs of the mappers are unnecessary.
+
+    Two mappers that work differently hardly ever make the same mistake.
+
+    Args:
+        first, second: the poses of each piece of a mapper's result.
+        count: number of photos that have matches and so could have a pose.
+    """
+    if len(first) != 1 or len(second) != 1:
+        return False
+    return len(align_poses(first[0], second[0]).agreeing) >= _MIN_AGREEING_RATIO * count
 
 
 def describe_doubt(poses: Poses, other: Candidate | None) -> str:

@@ -13,12 +13,18 @@ import numpy as np
 import pycolmap
 
 from hyrfpack.data.pictures import fit_size, read_pixels
-from hyrfpack.poses.alignment import Poses
 from hyrfpack.poses.choose import Candidate, choose_candidate, confirmed_photos, describe_doubt
 from hyrfpack.poses.database import open_database, verified_pairs
 from hyrfpack.poses.explained_matches import RayMatches, count_explained_matches
 from hyrfpack.poses.job import Job
-from hyrfpack.poses.mapping import MIN_PIECE_PHOTOS, SOLVER_THREADS, add_two_view_points, complete_model, read_pieces
+from hyrfpack.poses.mapping import (
+    MIN_PIECE_PHOTOS,
+    SOLVER_THREADS,
+    add_two_view_points,
+    complete_model,
+    read_pieces,
+    read_poses,
+)
 from hyrfpack.progress import Progress, TaskEvent
 
 # Limits of the reprojection error with another lens model, relative to the error with one radial coefficient.
@@ -69,7 +75,7 @@ def finish_reconstruction(job: Job, models: list[str], report_progress: Progress
     for doing, share, refine, min_match_ratio in steps:
         report_progress(TaskEvent(doing, share))
         refined = refine(model)
-        refined_poses = _read_poses(job, refined)
+        refined_poses = read_poses(job, refined)
         refined_explained_count = count_explained_matches(refined_poses, _read_ray_matches(job, refined))
         if len(refined_poses) >= len(poses) and refined_explained_count >= min_match_ratio * explained_count:
             model, poses, explained_count = refined, refined_poses, refined_explained_count
@@ -91,21 +97,15 @@ def finish_reconstruction(job: Job, models: list[str], report_progress: Progress
 def _make_candidate(job: Job, name: str, pieces: list[pycolmap.Reconstruction]) -> Candidate:
     """Describe the pieces of a result, the largest first, by the figures that are compared."""
     first, *others = pieces
-    poses = _read_poses(job, first)
+    poses = read_poses(job, first)
     return Candidate(
         name.partition("-")[0],
         poses,
-        [_read_poses(job, piece) for piece in others if piece.num_reg_images() >= MIN_PIECE_PHOTOS],
+        [read_poses(job, piece) for piece in others if piece.num_reg_images() >= MIN_PIECE_PHOTOS],
         count_explained_matches(poses, _read_ray_matches(job, first)),
         first.compute_mean_track_length(),
         first.compute_mean_reprojection_error(),
     )
-
-
-def _read_poses(job: Job, model: pycolmap.Reconstruction) -> Poses:
-    """Return the poses of a model by photo name."""
-    posed = (image for image in model.images.values() if image.has_pose)
-    return {job.names[image.image_id - 1]: np.asarray(image.cam_from_world().matrix()) for image in posed}
 
 
 def _count_matches(job: Job) -> int:

@@ -68,6 +68,11 @@ class Job:
         """Return the path of pycolmap's database of features and matches."""
         return self.work / "database.db"
 
+    @property
+    def matches(self) -> Path:
+        """Return the path of the answer of the stage that matches photos, see `matching.match_photos`."""
+        return self.work / "matches.json"
+
     def working_name(self, number: int) -> str:
         """Return the name of image `number` in the database, which is also the file name of its working copy.
 

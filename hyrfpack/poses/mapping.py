@@ -5,6 +5,7 @@ A mapper's result consists of pieces: models of photos that are connected by mat
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 from collections.abc import Callable, Iterator
@@ -13,8 +14,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pycolmap
 
+from hyrfpack.poses.alignment import Poses
+from hyrfpack.poses.choose import confirm_each_other
 from hyrfpack.poses.database import MIN_PAIR_MATCHES, Cameras, recalibrate
 from hyrfpack.poses.job import Job
 from hyrfpack.poses.watch import report_global_mapping_phase
@@ -32,7 +36,21 @@ MIN_PIECE_PHOTOS = 3
 
 
 def map_globally(job: Job, report_progress: Progress) -> dict[str, Any]:
-    """Run the global mapper (GLOMAP) several times and keep all results.
+    """Run the global mapper (GLOMAP) once, and verify all pairs again if it changes a focal length.
+
+    Args:
+        job: the estimation.
+        report_progress: see `run_stage`.
+
+    Returns:
+        "models": the name of the result.
+    """
+    _run_global_mapper(job, 0, "global", report_progress)
+    return {"models": [_global_name(0)]}
+
+
+def repeat_mapping(job: Job, report_progress: Progress) -> dict[str, Any]:
+    """Run the global mapper again from other starts, and the incremental mapper if focal lengths change by that.
 
     Verified pairs depend on the focal length they were verified with, and the resulting focal length depends on the
     verified pairs. So the pairs are verified again if a run changes the focal length. Each run starts from other random
@@ -43,38 +61,57 @@ def map_globally(job: Job, report_progress: Progress) -> dict[str, Any]:
         report_progress: see `run_stage`.
 
     Returns:
-        "models": the names of the results.
+        "models": the names of the further results.
     """
-    names = []
-    for run_index in range(_GLOBAL_RUNS):
-        name = f"global-{run_index}"
-        if not job.model_folder(name).exists():
-            doing = f"global mapping, run {run_index + 1}/{_GLOBAL_RUNS}"
-            report_progress(TaskEvent(doing, run_index / _GLOBAL_RUNS))
-            seed, options = (job.seed + run_index) % 2**31, pycolmap.GlobalPipelineOptions()
-            options.random_seed = options.mapper.random_seed = seed
-            options.num_threads = options.mapper.num_threads = SOLVER_THREADS
-            options.mapper.global_positioning.random_seed = options.mapper.rotation_averaging.random_seed = seed
-            options.min_num_matches, options.min_model_size = MIN_PAIR_MATCHES, MIN_PIECE_PHOTOS
-            log, report_mapping = job.work / "global.log", _part_of_run(report_progress, run_index, 0.0, 0.8)
-            with _info_log_level(), report_global_mapping_phase(log, doing, report_mapping):
-                found = pycolmap.global_mapping(job.database, job.images, _make_scratch_folder(job), options)
-            _save_pieces(job, name, found)
-        names.append(name)
-        pieces = read_pieces(job.model_folder(name))
-        if pieces and run_index < _GLOBAL_RUNS - 1:
-            recalibrate(
-                job,
-                f"{name}.focal",
-                partial(_select_better_cameras, pieces[0]),
-                _part_of_run(report_progress, run_index, 0.6, 1.0),
-            )
+    repeats = range(1, _GLOBAL_RUNS)
+    names, is_recalibrated = [], False
+    for index, run_index in enumerate(repeats):
+        report_run = part_of_progress(report_progress, index / _GLOBAL_RUNS, (index + 1) / _GLOBAL_RUNS)
+        is_recalibrated |= _run_global_mapper(job, run_index, "repeat", report_run)
+        names.append(_global_name(run_index))
+    if is_recalibrated:
+        report_run = part_of_progress(report_progress, len(repeats) / _GLOBAL_RUNS, 1.0)
+        names.append(_run_incremental_mapper(job, 1, report_run))
     return {"models": names}
 
 
-def _part_of_run(report_progress: Progress, run_index: int, first: float, last: float) -> Progress:
-    """Return a progress function for the part of one run from its share `first` to `last`."""
-    return part_of_progress(report_progress, (run_index + first) / _GLOBAL_RUNS, (run_index + last) / _GLOBAL_RUNS)
+def _global_name(run_index: int) -> str:
+    """Return the name of the result of a run of the global mapper."""
+    return f"global-{run_index}"
+
+
+def _run_global_mapper(job: Job, run_index: int, stage: str, report_progress: Progress) -> bool:
+    """Run the global mapper with the start `run_index`, unless its result exists.
+
+    If the run changes a focal length, the pairs are verified again with it, except after the last run.
+
+    Args:
+        job: the estimation.
+        run_index: index of the start.
+        stage: name of the stage, into whose log the library writes.
+        report_progress: called with `TaskEvent`s, whose share is that of this run.
+
+    Returns:
+        Whether pairs were verified again.
+    """
+    name = _global_name(run_index)
+    if not job.model_folder(name).exists():
+        doing = f"global mapping, run {run_index + 1}/{_GLOBAL_RUNS}" if run_index else "global mapping"
+        report_progress(TaskEvent(doing, 0.0))
+        seed, options = (job.seed + run_index) % 2**31, pycolmap.GlobalPipelineOptions()
+        options.random_seed = options.mapper.random_seed = seed
+        options.num_threads = options.mapper.num_threads = SOLVER_THREADS
+        options.mapper.global_positioning.random_seed = options.mapper.rotation_averaging.random_seed = seed
+        options.min_num_matches, options.min_model_size = MIN_PAIR_MATCHES, MIN_PIECE_PHOTOS
+        log, report_mapping = job.work / f"{stage}.log", part_of_progress(report_progress, 0.0, 0.8)
+        with _info_log_level(), report_global_mapping_phase(log, doing, report_mapping):
+            found = pycolmap.global_mapping(job.database, job.images, _make_scratch_folder(job), options)
+        _save_pieces(job, name, found)
+    pieces = read_pieces(job.model_folder(name))
+    if not pieces or run_index == _GLOBAL_RUNS - 1:
+        return False
+    select_better = partial(_select_better_cameras, pieces[0])
+    return recalibrate(job, f"{name}.focal", select_better, part_of_progress(report_progress, 0.6, 1.0))
 
 
 @contextmanager
@@ -89,19 +126,33 @@ def _info_log_level() -> Iterator[None]:
 
 
 def map_incrementally(job: Job, report_progress: Progress) -> dict[str, Any]:
-    """Run the incremental mapper, which poses photos one after the other.
-
-    If the global mapper found poses, its cameras are kept fixed here, because focal lengths can diverge when they are
-    refined with few photos. The result that is chosen in the end is refined together with its cameras.
+    """Run the incremental mapper, and compare its result with that of the global mapper.
 
     Args:
         job: the estimation.
         report_progress: see `run_stage`.
 
     Returns:
-        "models": the name of the result.
+        "models": the name of the result. "agrees": whether the global mapper's first run has the same poses.
     """
-    name = "incremental"
+    name = _run_incremental_mapper(job, 0, report_progress)
+    first, second = (_read_result(job, result) for result in (_global_name(0), name))
+    matched = json.loads(job.matches.read_text())["matched"]
+    return {"models": [name], "agrees": confirm_each_other(first, second, len(matched))}
+
+
+def _read_result(job: Job, name: str) -> list[Poses]:
+    """Return the poses of each piece of a mapper's result, the largest piece first."""
+    return [read_poses(job, piece) for piece in read_pieces(job.model_folder(name))]
+
+
+def _run_incremental_mapper(job: Job, run_index: int, report_progress: Progress) -> str:
+    """Run the incremental mapper, which poses photos one after the other, unless its result exists; return its name.
+
+    If the global mapper found poses, its cameras are kept fixed here, because focal lengths can diverge when they are
+    refined with few photos. The result that is chosen in the end is refined together with its cameras.
+    """
+    name = f"incremental-{run_index}"
     if not job.model_folder(name).exists():
         options = pycolmap.IncrementalPipelineOptions()
         options.random_seed, options.num_threads = job.seed % 2**31, SOLVER_THREADS
@@ -121,7 +172,7 @@ def map_incrementally(job: Job, report_progress: Progress) -> dict[str, Any]:
             next_image_callback=_make_photo_callback(count, report_progress),
         )
         _save_pieces(job, name, pieces)
-    return {"models": [name]}
+    return name
 
 
 def _make_photo_callback(count: int, report_progress: Progress) -> Callable[[], None]:
@@ -179,6 +230,12 @@ def read_pieces(folder: Path) -> list[pycolmap.Reconstruction]:
         return []
     pieces = [pycolmap.Reconstruction(piece) for piece in sorted(folder.iterdir()) if piece.is_dir()]
     return sorted(pieces, key=lambda piece: -piece.num_reg_images())
+
+
+def read_poses(job: Job, model: pycolmap.Reconstruction) -> Poses:
+    """Return the poses of a model by photo name."""
+    posed = (image for image in model.images.values() if image.has_pose)
+    return {job.names[image.image_id - 1]: np.asarray(image.cam_from_world().matrix()) for image in posed}
 
 
 def _select_better_cameras(model: pycolmap.Reconstruction, cameras: Cameras) -> Cameras:

@@ -51,9 +51,8 @@ def match_photos(job: Job, report_progress: Progress) -> dict[str, Any]:
         "pairs": the number of verified pairs; "matched": names of the photos in them; "turned": the share of pairs
         between which the camera only rotated, near 1 for photos from one place.
     """
-    marker = job.work / "matches.json"
-    if marker.exists():
-        return json.loads(marker.read_text())
+    if job.matches.exists():
+        return json.loads(job.matches.read_text())
     if not (job.work / "focal.json").exists():  # focal lengths are estimated after all pairs are matched
         _match_pairs(job, _choose_pairs(job, report_progress), report_progress)
 
@@ -62,7 +61,7 @@ def match_photos(job: Job, report_progress: Progress) -> dict[str, Any]:
     recalibrate(job, "focal", lambda cameras: _estimate_focals(job, cameras, report_part), report_part)
     report_progress(TaskEvent("checking that the camera moved", 0.95))
     answer = _summarize_matches(job)
-    write_atomic(marker, json.dumps(answer).encode())
+    write_atomic(job.matches, json.dumps(answer).encode())
     return answer
 
 

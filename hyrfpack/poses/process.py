@@ -23,6 +23,7 @@ _STAGE_DESCRIPTIONS = {
     "matches": "matching photos",
     "global": "global mapping",
     "incremental": "incremental mapping",
+    "repeat": "repeating the mapping",
 }
 _FINISH_DESCRIPTION = "finishing the poses"
 _IMPORT_ROOT = str(Path(__file__).parents[2])  # the folder from which hyrfpack was imported

@@ -53,9 +53,10 @@ def run(job: Job, stage: str, models: list[str]) -> dict[str, Any]:
         from hyrfpack.poses.finish import finish_reconstruction
 
         return finish_reconstruction(job, models, report_progress)
-    from hyrfpack.poses.mapping import map_globally, map_incrementally
+    from hyrfpack.poses.mapping import map_globally, map_incrementally, repeat_mapping
 
-    return {"global": map_globally, "incremental": map_incrementally}[stage](job, report_progress)
+    run_mapping = {"global": map_globally, "incremental": map_incrementally, "repeat": repeat_mapping}[stage]
+    return run_mapping(job, report_progress)
 
 
 def main(job: str, stage: str, *models: str) -> None:

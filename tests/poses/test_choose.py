@@ -4,7 +4,13 @@ from __future__ import annotations
 
 from made_up_poses import circle_poses, transform_poses
 
-from hyrfpack.poses.choose import Candidate, choose_candidate, confirmed_photos, describe_doubt
+from hyrfpack.poses.choose import (
+    Candidate,
+    choose_candidate,
+    confirm_each_other,
+    confirmed_photos,
+    describe_doubt,
+)
 
 
 def make_candidate(mapper: str, poses: dict, explained: int, track: float = 5.0, other_pieces: tuple = ()) -> Candidate:
@@ -50,3 +56,21 @@ def test_the_largest_agreeing_piece_of_the_other_mapper_confirms_poses():
     other = make_candidate("incremental", first, 500, other_pieces=(second,))
     assert confirmed_photos(poses, other) == set(names[9:])
     assert describe_doubt(poses, other).startswith("15 of 24 poses are confirmed")
+
+
+def test_two_results_that_agree_on_95_percent_of_the_photos_confirm_each_other():
+    poses = circle_poses(40)
+    lacking = {name: pose for name, pose in poses.items() if name < "038"}
+    assert confirm_each_other([poses], [transform_poses(lacking)], 40)
+    assert not confirm_each_other([poses], [transform_poses(lacking)], 41)
+    assert not confirm_each_other([poses], [], 40)
+
+
+def test_results_that_differ_or_have_several_pieces_do_not_confirm_each_other():
+    poses = circle_poses(40)
+    names = sorted(poses)
+    folded = {**poses, **{name: poses[onto] for name, onto in zip(names[30:], names[:10], strict=True)}}
+    piece = {name: poses[name] for name in names[:3]}
+    assert not confirm_each_other([poses], [transform_poses(folded)], 40)
+    assert not confirm_each_other([poses, piece], [transform_poses(poses)], 40)
+    assert not confirm_each_other([poses], [transform_poses(poses), piece], 40)

@@ -27,6 +27,14 @@ if sys.orig_argv[-1] == {stage!r} and "hyrfpack.poses.worker" in sys.orig_argv:
 """
 
 
+MAPPERS_DISAGREE_CODE = """
+import sys
+if "hyrfpack.poses.worker" in sys.orig_argv:
+    import hyrfpack.poses.choose
+    hyrfpack.poses.choose._MIN_AGREEING_RATIO = 2.0
+"""
+
+
 def record_processes(monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen]:
     """Record the processes in which stages run from now on."""
     found: list[subprocess.Popen] = []
@@ -72,6 +80,66 @@ def test_a_stopped_estimation_resumes_after_its_last_finished_stage(photos_and_p
         hyrfpack.estimate_poses(photos_and_poses[0], out, context=stop_at("incremental"))
     assert (out / ".poses" / "matches.json").stat().st_mtime_ns == kept
     assert (out / ".poses" / "global-0").is_dir()
+
+
+def test_mappers_that_agree_are_not_repeated(estimated_scene):
+    assert "repeat" not in estimated_scene[1].seconds
+    assert not any("run 2/3" in event.task for event in estimated_scene[2])
+
+
+@pytest.fixture(scope="module")
+def disagreeing_mappers(tmp_path_factory) -> str:
+    """A folder for PYTHONPATH with which the mappers never confirm each other."""
+    folder = tmp_path_factory.mktemp("disagree")
+    (folder / "sitecustomize.py").write_text(MAPPERS_DISAGREE_CODE)
+    return str(folder)
+
+
+@pytest.fixture(scope="module")
+def repeated_scene(
+    photos_and_poses, stopped_after_matching, disagreeing_mappers, tmp_path_factory
+) -> tuple[Path, list]:
+    """A scene for which the mappers were repeated, and the events that were reported. Tests must not change it."""
+    out, events = tmp_path_factory.mktemp("repeated") / "scene", []
+    shutil.copytree(stopped_after_matching, out)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", disagreeing_mappers)
+        hyrfpack.estimate_poses(photos_and_poses[0], out, context=RunContext(progress=events.append))
+    return out, events
+
+
+def test_mappers_that_disagree_are_repeated(repeated_scene):
+    shares = [event.share for event in repeated_scene[1]]
+    assert shares == sorted(shares) and shares[-1] <= 1
+    for words in ("global mapping, run 2/3", "global mapping, run 3/3"):
+        assert any(words in event.task for event in repeated_scene[1])
+
+
+def test_an_estimation_stopped_in_each_state_of_mapping_ends_with_the_same_bytes(
+    photos_and_poses, stopped_after_matching, disagreeing_mappers, repeated_scene, tmp_path, monkeypatch
+):
+    out = tmp_path / "scene"
+    shutil.copytree(stopped_after_matching, out)
+    monkeypatch.setenv("PYTHONPATH", disagreeing_mappers)
+    for moment in ("global mapping", "incremental mapping", "run 2/3", "run 3/3", "comparing both", "lens distortion"):
+        with pytest.raises(KeyboardInterrupt):
+            hyrfpack.estimate_poses(photos_and_poses[0], out, context=stop_at(moment))
+    hyrfpack.estimate_poses(photos_and_poses[0], out)
+    for name in ("cameras.bin", "images.bin", "points3D.bin"):
+        path = Path("sparse", "0", name)
+        assert (out / path).read_bytes() == (repeated_scene[0] / path).read_bytes()
+
+
+def test_when_repeated_mappers_crash_the_first_results_are_used(
+    photos_and_poses, stopped_after_matching, tmp_path, monkeypatch
+):
+    shutil.copytree(stopped_after_matching, tmp_path / "scene")
+    code = MAPPERS_DISAGREE_CODE + CRASH_AT_STAGE_CODE.format(stage="repeat")
+    (tmp_path / "sitecustomize.py").write_text(code)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    report = hyrfpack.estimate_poses(photos_and_poses[0], tmp_path / "scene")
+    assert report.registered == report.sure == len(photos_and_poses[1])
+    assert any("first results are used" in note for note in report.notes)
 
 
 def test_poses_in_place_are_completed_after_the_worker_was_killed(photos_and_poses, tmp_path, stage_processes):

@@ -152,7 +152,7 @@ def test_every_stage_reports_progress_in_its_own_units(estimated_scene):
         "finding features in photo ",
         "matching pair ",
         "estimating focal lengths",
-        "global mapping, run 1/3",
+        "global mapping",
         "incremental mapping, 8/8 photos registered",
         "comparing both reconstructions",
         "triangulating points",
@@ -171,3 +171,19 @@ def test_progress_reported_out_of_order_never_decreases(share, tmp_path):
     estimation._report_progress("matches", TaskEvent("matching", 0.9))
     estimation._report_progress("matches", TaskEvent("matching", share))
     assert events[0] == events[1]
+
+
+@pytest.mark.parametrize("is_video", [False, True])
+@pytest.mark.parametrize("is_repeated", [False, True])
+def test_the_shares_of_all_stages_that_run_join_without_a_gap(is_repeated, is_video, tmp_path):
+    from hyrfpack.poses.estimate import _PoseEstimation
+
+    estimation = _PoseEstimation(tmp_path, tmp_path / "scene", PosesConfig(), None, False, lambda event: None)
+    estimation.is_video = is_video
+    end = 0.0
+    for stage in ("photos", "features", "matches", "global", "incremental", *["repeat"] * is_repeated, "finish"):
+        start, length = estimation._stage_interval(stage)
+        assert start == pytest.approx(end)
+        end = start + length
+        estimation.seconds[stage] = 1.0
+    assert end == pytest.approx(1.0)
