@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
 
 import pytest
 
 from hyrfpack.web import modules
+from hyrfpack.web.assets import list_web_files, read_web_file
 from hyrfpack.web.modules import link_modules
 
 
@@ -104,3 +106,19 @@ console.log(text, raw, found, half, sum, less, n, new A().c);
 """
     expected = "a  bc  d e  a  bc  d\n  // f y 3 5 1 -1 1\n"
     assert run_in_node(link_modules("a.js")) == run_in_node(module_sources["a.js"]) == expected
+
+
+ARITHMETIC_PATTERN_BY_OWNER = {
+    "hyrf/vectors.js": r"\[1\] \* \w+\[2\]",  # a cross product
+    "hyrf/plain.js": r"2 \*\* -24|0x7c00",  # the smallest half, or the exponent's bits
+    "hyrf/basis.js": r"1\.09254843|0\.54627421|0\.28209479",
+    "viewer/rotation.js": r"1 - 2 \* \(y \* y \+ z \* z\)",
+}
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("owner", ARITHMETIC_PATTERN_BY_OWNER)
+def test_vectors_halves_harmonics_and_rotations_are_calculated_in_one_module_each(owner):
+    paths = list_web_files("viewer", ".js") + list_web_files("hyrf", ".js")
+    found = [path for path in paths if re.search(ARITHMETIC_PATTERN_BY_OWNER[owner], read_web_file(path))]
+    assert found == [owner]

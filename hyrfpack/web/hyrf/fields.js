@@ -1,6 +1,7 @@
 // Evaluates the two fields of a model on the CPU: hash grids with small decoders (docs/reference/format.md 2.3, 2.4 and
 // 2.7). Inputs and outputs are float32; all sums are computed in float64.
 
+import { evaluateBasis } from "./basis.js";
 import { HASH_FACTOR_Y, HASH_FACTOR_Z, decoderLayout, gridLevels } from "./grids.js";
 
 // Positions are evaluated in batches of this size, so that the data of a level or a layer stays in the cache.
@@ -312,7 +313,8 @@ function encodeDirections({ encoding, encoded }, directions, first, rows) {
 }
 
 /**
- * Writes the real spherical harmonics of degree 0 to 2 of a direction as a row of `encoded`.
+ * Writes the real spherical harmonics of degree 0 to 2 of a direction as a row of `encoded`. The models' harmonics have
+ * no Condon-Shortley phase, which half a turn about z cancels.
  * @param {Float64Array} encoded
  * @param {number} row
  * @param {number} x
@@ -320,16 +322,7 @@ function encodeDirections({ encoding, encoded }, directions, first, rows) {
  * @param {number} z
  */
 function encodeHarmonics(encoded, row, x, y, z) {
-  const at = 9 * row;
-  encoded[at] = 0.28209479177387814;
-  encoded[at + 1] = 0.4886025119029199 * y;
-  encoded[at + 2] = 0.4886025119029199 * z;
-  encoded[at + 3] = 0.4886025119029199 * x;
-  encoded[at + 4] = 1.0925484305920792 * x * y;
-  encoded[at + 5] = 1.0925484305920792 * y * z;
-  encoded[at + 6] = 0.31539156525252005 * (3 * z * z - 1);
-  encoded[at + 7] = 1.0925484305920792 * x * z;
-  encoded[at + 8] = 0.5462742152960396 * (x * x - y * y);
+  evaluateBasis(2, -x, -y, z, encoded, 9 * row);
 }
 
 /**

@@ -1,14 +1,13 @@
 // Converts a model to explicit splats by fitting spherical harmonics to the colours of its radiance field. Splats are
 // for browsers that cannot evaluate the field while the view moves, and for programs that read only splats.
 
+import { SH_BAND_0, evaluateBasis } from "./basis.js";
 import { HyrfFormatError } from "./errors.js";
 import { colorsAlong, colorsOfRows, decodeGeometry, firstLayers } from "./fields.js";
 import { cameraPosition } from "./viewpoint.js";
 
 /** The number of harmonics of degree 1 and higher, by the largest degree. */
 export const HIGHER_HARMONICS_BY_DEGREE = [0, 3, 8, 15];
-/** The harmonic of degree 0, which is constant: 1 / (2 sqrt(pi)). */
-export const SH_BAND_0 = 0.28209479177387814;
 
 const SPHERE_DIRECTION_COUNT = 32;
 const SPHERE_TOTAL_WEIGHT = 3e-3; // small against the cameras' weights, which add up to 1
@@ -384,35 +383,4 @@ function fibonacciDirections(count) {
     directions.set([radius * Math.cos(angle), radius * Math.sin(angle), height], 3 * k);
   }
   return directions;
-}
-
-/**
- * Evaluates the real spherical harmonics of a direction with the Condon-Shortley phase, the convention of splat files.
- * @param {number} degree the largest degree, 0 to 3
- * @param {number} x
- * @param {number} y
- * @param {number} z
- * @param {Float64Array} basis receives (degree + 1)^2 numbers
- */
-function evaluateBasis(degree, x, y, z, basis) {
-  basis[0] = SH_BAND_0;
-  if (degree < 1) return;
-  basis[1] = -0.4886025119029199 * y;
-  basis[2] = 0.4886025119029199 * z;
-  basis[3] = -0.4886025119029199 * x;
-  if (degree < 2) return;
-  const xx = x * x, yy = y * y, zz = z * z;
-  basis[4] = 1.0925484305920792 * x * y;
-  basis[5] = -1.0925484305920792 * y * z;
-  basis[6] = 0.31539156525252005 * (3 * zz - 1);
-  basis[7] = -1.0925484305920792 * x * z;
-  basis[8] = 0.5462742152960396 * (xx - yy);
-  if (degree < 3) return;
-  basis[9] = -0.5900435899266435 * y * (3 * xx - yy);
-  basis[10] = 2.890611442640554 * x * y * z;
-  basis[11] = -0.4570457994644658 * y * (5 * zz - 1);
-  basis[12] = 0.3731763325901154 * z * (5 * zz - 3);
-  basis[13] = -0.4570457994644658 * x * (5 * zz - 1);
-  basis[14] = 1.445305721320277 * z * (xx - yy);
-  basis[15] = -0.5900435899266435 * x * (xx - 3 * yy);
 }

@@ -1,6 +1,8 @@
 // Chooses the cameras from which a model is shown, from the provenance of its file. The provenance is not trusted:
 // invalid entries are ignored.
 
+import { add, cross, dot, mul, rotate, sub, unit } from "./vectors.js";
+
 const MAX_SHOWN_CAMERAS = 12;
 const MAX_FITTED_CAMERAS = 48;
 const ORBIT_CAMERA_COUNT = 48; // every other one of them is shown
@@ -36,7 +38,7 @@ export function viewpointOf(metadata) {
   const provenance = metadata.provenance ?? {}, { center, scale } = metadata.config.frame;
   const viewpoint = parseStoredViewpoint(provenance.viewpoint) ?? validateViewpoint(defaultViewpoint(center, scale)) ??
     defaultViewpoint([0, 0, 0], 1);
-  const up = unit3(viewpoint.up), { target } = viewpoint;
+  const up = unit(viewpoint.up), { target } = viewpoint;
   const [exact, coarse] = [provenance.cameras, provenance.coarse_cameras].map(parseStoredCameras);
   const kept = exact.length ? exact : coarse;
   if (!kept.length) {
@@ -145,9 +147,9 @@ function validateCamera({ width, height, fx, fy, cx, cy, camera_from_world: rows
   /** @type {(value: number, wanted: number) => boolean} */
   const near = (value, wanted) => Math.abs(value - wanted) <= RIGID_TOLERANCE;
   const axes = [right, down, forward];
-  const rigid = axes.every((a, i) => axes.every((b, j) => near(dot3(a, b), i === j ? 1 : 0)));
+  const rigid = axes.every((a, i) => axes.every((b, j) => near(dot(a, b), i === j ? 1 : 0)));
   if (!rigid || !last.every((value, k) => near(value, k === 3 ? 1 : 0))) return null;
-  if (dot3(cross3(right, down), forward) < 0) return null; // it mirrors the world
+  if (dot(cross(right, down), forward) < 0) return null; // it mirrors the world
   return { width, height, fx, fy, cx, cy, camera_from_world: pose };
 }
 
@@ -170,7 +172,7 @@ const isNumberList = (values, count) =>
  */
 function defaultViewpoint(center, scale) {
   const slope = (20 * Math.PI) / 180, up = [0, -1, 0], focal = 400 / Math.tan((25 * Math.PI) / 180);
-  const place = plus3(center, times3([0, -Math.sin(slope), -Math.cos(slope)], 2.5 * scale));
+  const place = add(center, mul([0, -Math.sin(slope), -Math.cos(slope)], 2.5 * scale));
   const pose = lookAtPose(place, center, up);
   const camera = { width: 800, height: 600, fx: focal, fy: focal, cx: 400, cy: 300, camera_from_world: pose };
   return { target: [...center], up, camera, arc: [0, 360] };
@@ -183,17 +185,17 @@ function defaultViewpoint(center, scale) {
  * @returns {Camera[]}
  */
 function orbitCameras({ target, up: stored, camera, arc: [first, last] }, count) {
-  const up = unit3(stored);
-  let offset = minus3(cameraPosition(camera), target);
-  const level = minus3(offset, times3(up, dot3(offset, up)));
+  const up = unit(stored);
+  let offset = sub(cameraPosition(camera), target);
+  const level = sub(offset, mul(up, dot(offset, up)));
   if (!(Math.hypot(...level) > 1e-9 * Math.hypot(...offset))) { // from straight above, the circle would be a point
-    offset = plus3(offset, times3(perpendicularTo(up), 0.5 * Math.max(Math.hypot(...offset), 1e-6)));
+    offset = add(offset, mul(perpendicularTo(up), 0.5 * Math.max(Math.hypot(...offset), 1e-6)));
   }
   return Array.from({ length: count }, (_, k) => {
     const part = k / count;
     const swing = (first + last) / 2 + ((last - first) / 2) * Math.sin(2 * Math.PI * part);
     const angle = last - first >= 360 ? first + (last - first) * part : swing;
-    const place = plus3(target, rotateAboutAxis(offset, up, (angle * Math.PI) / 180));
+    const place = add(target, rotate(offset, up, (angle * Math.PI) / 180));
     return { ...camera, camera_from_world: lookAtPose(place, target, up) };
   });
 }
@@ -207,9 +209,9 @@ function orbitCameras({ target, up: stored, camera, arc: [first, last] }, count)
 function ringCameras(viewpoint, up) {
   const { target } = viewpoint;
   return orbitCameras(viewpoint, CAMERAS_PER_RING).flatMap((camera) => {
-    const place = cameraPosition(camera), away = Math.hypot(...minus3(place, target));
+    const place = cameraPosition(camera), away = Math.hypot(...sub(place, target));
     return RING_HEIGHT_RATIOS.map((height) => {
-      const pose = lookAtPose(plus3(place, times3(up, height * away)), target, up);
+      const pose = lookAtPose(add(place, mul(up, height * away)), target, up);
       return { ...camera, camera_from_world: pose };
     });
   });
@@ -224,12 +226,12 @@ function ringCameras(viewpoint, up) {
  */
 function estimateUp(cameras, up) {
   const mean = (/** @type {number} */ row) => {
-    const sum = cameras.reduce((total, { camera_from_world: pose }) => plus3(total, pose[row]), [0, 0, 0]);
-    return times3(sum, 1 / cameras.length);
+    const sum = cameras.reduce((total, { camera_from_world: pose }) => add(total, pose[row]), [0, 0, 0]);
+    return mul(sum, 1 / cameras.length);
   };
   const forward = mean(2), agreement = Math.hypot(...forward);
   const keepsUp = agreement < MIN_MEAN_FORWARD_LENGTH || Math.hypot(...mean(1)) >= MAX_MEAN_DOWN_LENGTH;
-  return keepsUp ? up : times3(forward, -1 / agreement);
+  return keepsUp ? up : mul(forward, -1 / agreement);
 }
 
 /**
@@ -240,10 +242,10 @@ function estimateUp(cameras, up) {
  * @returns {number[][]}
  */
 function lookAtPose(place, target, up) {
-  const ahead = minus3(target, place), forward = Math.hypot(...ahead) > 1e-12 ? unit3(ahead) : [0, 0, 1];
-  const level = cross3(forward, up), right = Math.hypot(...level) > 1e-9 ? unit3(level) : perpendicularTo(forward);
-  const rows = [right, cross3(forward, right), forward];
-  return [...rows.map((row) => [...row, -dot3(row, place)]), [0, 0, 0, 1]];
+  const ahead = sub(target, place), forward = Math.hypot(...ahead) > 1e-12 ? unit(ahead) : [0, 0, 1];
+  const level = cross(forward, up), right = Math.hypot(...level) > 1e-9 ? unit(level) : perpendicularTo(forward);
+  const rows = [right, cross(forward, right), forward];
+  return [...rows.map((row) => [...row, -dot(row, place)]), [0, 0, 0, 1]];
 }
 
 /**
@@ -252,34 +254,5 @@ function lookAtPose(place, target, up) {
  */
 function perpendicularTo(axis) {
   const sizes = axis.map(Math.abs), least = sizes.indexOf(Math.min(...sizes));
-  return unit3(cross3(axis, [0, 1, 2].map((k) => (k === least ? 1 : 0))));
+  return unit(cross(axis, [0, 1, 2].map((k) => (k === least ? 1 : 0))));
 }
-
-/**
- * Rotates a vector about a unit axis by Rodrigues' formula; the angle is in radians.
- * @param {number[]} vector
- * @param {number[]} axis
- * @param {number} angle
- */
-function rotateAboutAxis(vector, axis, angle) {
-  const cosine = Math.cos(angle), along = times3(axis, dot3(axis, vector) * (1 - cosine));
-  return plus3(plus3(times3(vector, cosine), times3(cross3(axis, vector), Math.sin(angle))), along);
-}
-
-/** @typedef {(a: number[], b: number[]) => number[]} VectorSum */
-
-/** @type {VectorSum} */
-const plus3 = (a, b) => [a[0] + b[0], a[1] + b[1], a[2] + b[2]];
-/** @type {VectorSum} */
-const minus3 = (a, b) => [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
-/** @type {VectorSum} */
-const cross3 = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
-/** @type {(a: number[], b: number[]) => number} */
-const dot3 = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-/** @type {(a: number[], s: number) => number[]} */
-const times3 = (a, s) => [a[0] * s, a[1] * s, a[2] * s];
-/** @type {(a: number[]) => number[]} */
-const unit3 = (a) => {
-  const length = Math.hypot(...a);
-  return a.map((value) => value / length);
-};

@@ -2,18 +2,7 @@
 // world units). A view is a pinhole camera in these coordinates: rows (right, down, forward), translation, eye, and fx,
 // fy, cx, cy in pixels.
 
-export const add = (a, b) => [a[0] + b[0], a[1] + b[1], a[2] + b[2]];
-export const sub = (a, b) => [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
-export const mul = (a, s) => [a[0] * s, a[1] * s, a[2] * s];
-export const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-export const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
-export const unit = (a) => mul(a, 1 / (Math.hypot(...a) || 1));
-
-// Rotates a vector about a unit axis by an angle in radians (Rodrigues' formula).
-function rotate(vector, axis, angle) {
-  const c = Math.cos(angle);
-  return add(add(mul(vector, c), mul(cross(axis, vector), Math.sin(angle))), mul(axis, dot(axis, vector) * (1 - c)));
-}
+import { add, cross, dot, mul, rotate, sub, unit } from "../hyrf/vectors.js";
 
 const POSE_TOLERANCE = 1e-3; // the maximum error of the dot products of a pose's rows
 const MAX_ELEVATION_RADIANS = 1.55;

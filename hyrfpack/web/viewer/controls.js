@@ -1,6 +1,6 @@
 // Moves the eye by mouse, touch and keys.
 
-import { mul } from "./camera.js";
+import { mul } from "../hyrf/vectors.js";
 
 const MAX_TAP_MOVE_PIXELS = 8;
 const MAX_DOUBLE_TAP_DISTANCE_PIXELS = 30; // larger, because two taps of a finger are rarely at the same place

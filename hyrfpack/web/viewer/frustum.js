@@ -1,6 +1,6 @@
 // Tests whether a sphere may be visible in a view.
 
-import { add, mul } from "./camera.js";
+import { add, mul } from "../hyrf/vectors.js";
 
 // Returns the four planes through the eye and the sides of a view's picture: 4 numbers each, with unit normals that
 // point inwards. The picture is enlarged on each side by `margin` halves of its size.

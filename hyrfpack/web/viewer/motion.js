@@ -1,6 +1,6 @@
 // Moves the eye over time (see Player.movers): damped movements, glides between cameras, and a slow turn.
 
-import { dot, mul, sub } from "./camera.js";
+import { dot, mul, sub } from "../hyrf/vectors.js";
 import { quatOf, rowsOf, slerp } from "./rotation.js";
 
 const DAMPING_SECONDS = 0.07; // the remaining movement falls to 1/e in this time

@@ -1,6 +1,6 @@
 // Draws the background as an equirectangular picture: first a coarse one, then finer tiles, those in view first.
 
-import { dot } from "./camera.js";
+import { dot } from "../hyrf/vectors.js";
 import { frustumPlanes, intersectsFrustum } from "./frustum.js";
 import { WorkPacer } from "./graphics.js";
 import { BACKGROUND_RADIUS } from "./constants.js";

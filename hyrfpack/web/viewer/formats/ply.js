@@ -2,7 +2,8 @@
 // f_rest_0.. (higher ones, channel after channel), opacity (its logit), scale_0..2 (natural logarithms) and rot_0..3
 // (wxyz). Rows may be binary or text; properties may be in any order and of any type.
 
-import { HIGHER_HARMONICS_BY_DEGREE, SH_BAND_0 } from "../../hyrf/harmonics.js";
+import { SH_BAND_0 } from "../../hyrf/basis.js";
+import { HIGHER_HARMONICS_BY_DEGREE } from "../../hyrf/harmonics.js";
 import { normalizeSplats, rejectSplats } from "./normalize.js";
 import { decodeCompressedPly, isCompressedPly } from "./compressed_ply.js";
 import { readPlyHeader, readPlyRows } from "./ply_elements.js";

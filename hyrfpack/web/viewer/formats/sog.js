@@ -12,7 +12,8 @@
 //                                entries of shN.codebook
 
 import { groupedDigits, quotedText } from "../../hyrf/errors.js";
-import { HIGHER_HARMONICS_BY_DEGREE, SH_BAND_0 } from "../../hyrf/harmonics.js";
+import { SH_BAND_0 } from "../../hyrf/basis.js";
+import { HIGHER_HARMONICS_BY_DEGREE } from "../../hyrf/harmonics.js";
 import { normalizeSplats, rejectSplats } from "./normalize.js";
 import { readPicture } from "./picture.js";
 import { writeQuat } from "./smallest_three.js";

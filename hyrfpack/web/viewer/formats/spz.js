@@ -14,7 +14,8 @@
 // The axes are right, up, back. They are rotated by half a turn about x, as other converters do.
 
 import { groupedDigits } from "../../hyrf/errors.js";
-import { HIGHER_HARMONICS_BY_DEGREE, SH_BAND_0 } from "../../hyrf/harmonics.js";
+import { SH_BAND_0 } from "../../hyrf/basis.js";
+import { HIGHER_HARMONICS_BY_DEGREE } from "../../hyrf/harmonics.js";
 import { halfToNumber } from "../../hyrf/plain.js";
 import { normalizeSplats, rejectSplats } from "./normalize.js";
 import { writeQuat } from "./smallest_three.js";
