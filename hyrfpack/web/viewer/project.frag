@@ -15,6 +15,7 @@ uniform usampler2D u_colors; // instead: halves red, green; blue, from colors.fr
 uniform bool u_colored; // take these
 uniform int u_count;
 uniform bool u_antialiased;
+uniform vec2 u_low_pass; // variances in px^2: of the picture at full resolution, and with the mean over its blocks
 uniform mat3 u_rotation; // camera from page
 uniform vec3 u_translation;
 uniform vec3 u_eye;
@@ -27,7 +28,6 @@ uniform float u_pick; // > 0: instead of a colour, z / (z + u_pick)
 layout(location = 0) out uvec4 o_shape; // centre x, y in pixels; covariance xx, xy
 layout(location = 1) out uvec4 o_look; // covariance yy; its determinant; halves red, green; halves blue, opacity
 
-const float LOW_PASS = 0.3;
 const float COMPENSATION_MIN = 2.5e-5;
 
 float byte_of(uint word, int place) {
@@ -111,8 +111,9 @@ void main() {
     float xx = dot(first, first), xy = dot(first, second), yy = dot(second, second);
     vec3 normal = cross(first, second); // free of the cancellation in xx yy - xy^2
     float determinant = dot(normal, normal);
-    float filtered = determinant + LOW_PASS * (xx + yy) + LOW_PASS * LOW_PASS;
-    if (u_antialiased) opacity *= sqrt(max(determinant / filtered, COMPENSATION_MIN));
+    vec2 filtered = determinant + u_low_pass * (xx + yy + u_low_pass);
+    opacity *= sqrt(filtered.x / filtered.y); // 1 at full resolution
+    if (u_antialiased) opacity *= sqrt(max(determinant / filtered.x, COMPENSATION_MIN));
 
     vec3 color;
     if (u_colored) {
@@ -125,8 +126,8 @@ void main() {
     }
     color = u_pick > 0.0 ? vec3(p.z / (p.z + u_pick)) : clamp(color, 0.0, 100.0); // far below what halves hold
 
-    o_shape = uvec4(floatBitsToUint(focal * slope + principal), floatBitsToUint(vec2(xx + LOW_PASS, xy)));
+    o_shape = uvec4(floatBitsToUint(focal * slope + principal), floatBitsToUint(vec2(xx + u_low_pass.y, xy)));
     o_look = uvec4(
-        floatBitsToUint(vec2(yy + LOW_PASS, filtered)), packHalf2x16(color.rg), packHalf2x16(vec2(color.b, opacity))
+        floatBitsToUint(vec2(yy + u_low_pass.y, filtered.y)), packHalf2x16(color.rg), packHalf2x16(vec2(color.b, opacity))
     );
 }

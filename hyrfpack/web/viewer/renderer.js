@@ -6,6 +6,7 @@ import { BACKGROUND_RADIUS, TEXTURE_WIDTH } from "./constants.js";
 
 const MAX_READ_SIDE_PIXELS = 8192; // the limit of pictures that are read back
 const QUADS_PER_INSTANCE = 1024; // drivers are slow with many small instances
+const LOW_PASS_VARIANCE = 0.3; // px^2, as in hyrfpack render
 
 export class Renderer {
   // Throws an Error with a message for the user if the browser has no WebGL 2.
@@ -85,7 +86,7 @@ export class Renderer {
   // Draws a view to the canvas, with splats at `scale` times its resolution. `gains` are those of exposure.js.
   draw(view, scale, gains) {
     const size = [view.width, view.height].map((side) => Math.max(1, Math.round(side * scale)));
-    this.splats(resizeView(view, ...size));
+    this.splats({ ...resizeView(view, ...size), scale });
     this.over(view, size, null, gains);
   }
 
@@ -178,6 +179,7 @@ export class Renderer {
     gl.uniform1f(p.u_range, content.range ?? 1);
     gl.uniform1i(p.u_count, content.count);
     gl.uniform1i(p.u_antialiased, content.antialiased);
+    gl.uniform2fv(p.u_low_pass, lowPassVariances(view.scale ?? 1));
     gl.uniformMatrix3fv(p.u_rotation, true, view.rows.flat());
     gl.uniform3fv(p.u_translation, view.translation);
     gl.uniform3fv(p.u_eye, view.eye);
@@ -243,6 +245,14 @@ function backgroundSphere({ kind, sphere, center, unit }) {
   if (kind === "hyrf") return { center: [0, 0, 0], radius: BACKGROUND_RADIUS };
   if (!sphere) return { center: [0, 0, 0], radius: Infinity };
   return { center: sphere.center.map((value, axis) => (value - center[axis]) / unit), radius: sphere.radius / unit };
+}
+
+// Returns the variances of the low-pass filter at `scale` times the full resolution, in pixels of that resolution: that
+// of the full resolution, and the sum of that and the variance of the mean over 1 / scale pixels, which makes a picture
+// at this resolution nearly equal to the reduced picture at full resolution.
+function lowPassVariances(scale) {
+  const full = LOW_PASS_VARIANCE * scale ** 2;
+  return [full, full + (1 - scale ** 2) / 12];
 }
 
 // Returns a view at another resolution.
