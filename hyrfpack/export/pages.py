@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import logging
 import os
+from collections.abc import Sequence
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import numpy as np
+import torch
 
 from hyrfpack.atomic import write_atomic
+from hyrfpack.cameras.view_sampling import shrink_camera
 from hyrfpack.export.poster import encode_poster, render_model_poster
 from hyrfpack.export.report import ExportReport
 from hyrfpack.export.source import Source
 from hyrfpack.format import describe_file
-from hyrfpack.model import BACKGROUND_RADIUS
-from hyrfpack.render import RenderSettings
+from hyrfpack.model import BACKGROUND_RADIUS, HybridModel
+from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.scene import Camera, evenly_spaced
 from hyrfpack.splats.splats import Splats
 from hyrfpack.web.html import encode_model_page, encode_splats_page
@@ -24,14 +28,48 @@ _LOG = logging.getLogger(__name__)
 
 MAX_PAGE_CAMERAS = 12
 POSTER_LONGEST_SIDE_PIXELS = 480
+DETAIL_LONGEST_SIDE_PIXELS = 160
+# Pictures of training cameras of five real scenes have 0.55 to 2.2 times the median detail of their scene.
+MIN_START_DETAIL_RATIO = 0.5
 MAX_POSTER_BYTES = 9_000  # before base64, which adds a third
 LARGE_FILE_BYTES = 20_000_000  # larger files take long to load on many connections
 
 
 def page_cameras(loaded: Source) -> list[Camera]:
-    """Choose the cameras that a page steps through: up to MAX_PAGE_CAMERAS known ones, or made-up ones."""
-    cameras = [camera for _, camera in loaded.cameras] or [camera for camera, _ in loaded.measured_views]
-    return evenly_spaced(cameras, MAX_PAGE_CAMERAS)
+    """Choose the cameras that a page steps through: up to MAX_PAGE_CAMERAS known ones, or made-up ones.
+
+    The page starts at the first camera whose picture has enough detail, compared with the other pictures: a camera in
+    haze, or one that looks away from the scene, sees little. The cameras before it come last.
+    """
+    known = [camera for _, camera in loaded.cameras] or [camera for camera, _ in loaded.measured_views]
+    cameras = evenly_spaced(known, MAX_PAGE_CAMERAS)
+    start = choose_start(measure_detail(loaded.model, cameras))
+    return cameras[start:] + cameras[:start]
+
+
+def choose_start(details: Sequence[float]) -> int:
+    """Return the index of the first camera with at least MIN_START_DETAIL_RATIO of the median detail.
+
+    Args:
+        details: detail of the picture of each camera, see `measure_detail`; not empty.
+
+    Returns:
+        An index into `details`, 0 if no picture has any detail.
+    """
+    wanted = MIN_START_DETAIL_RATIO * median(details)
+    return next((index for index, detail in enumerate(details) if detail >= wanted), 0)
+
+
+@torch.no_grad()
+def measure_detail(model: HybridModel, cameras: Sequence[Camera]) -> list[float]:
+    """Return the mean difference between neighbouring pixels of a small picture of the model from each camera."""
+    decoded = model.decode()
+    details = []
+    for camera in cameras:
+        small = shrink_camera(camera, DETAIL_LONGEST_SIDE_PIXELS)
+        grey = render_view(model, small, decoded=decoded).rgb.clamp(0, 1).mean(-1)
+        details.append(float(sum(grey.diff(dim=axis).abs().sum() for axis in (0, 1))) / grey.numel())
+    return details
 
 
 def encode_baked_page(loaded: Source, splats: Splats, picture: np.ndarray | None, title: str) -> bytes:
