@@ -138,21 +138,30 @@ def test_two_fingers_pan_and_pinch(browser: Browser, tmp_path: Path):
         browser.resize(240, 180)
 
 
-def test_a_double_click_sets_the_center_of_the_orbit(browser: Browser, tmp_path: Path):
+@pytest.mark.parametrize("less_motion", [False, True], ids=["glide", "jump"])
+def test_a_double_click_brings_its_place_to_the_center_and_orbits_it(
+    browser: Browser, tmp_path: Path, less_motion: bool
+):
+    browser.prefer(less_motion=less_motion)
     one = random_splats(1, 0)
-    current_position = SCENE_CENTER + 0.4 * make_camera().rotation[0] - 0.5 * make_camera().forward
-    one = replace(one, positions=current_position[None], scales=np.full((1, 3), 0.05, np.float32), opacities=np.ones(1))
+    place = SCENE_CENTER + 0.4 * make_camera().rotation[0] - 0.5 * make_camera().forward
+    one = replace(one, positions=place[None], scales=np.full((1, 3), 0.05, np.float32), opacities=np.ones(1))
     wait_until_still(open_page(browser, tmp_path, make_splats_page(one)))
     at = window_camera(browser)
-    x, y, z = at.rotation @ current_position + at.camera_from_world[:3, 3]
+    x, y, z = at.rotation @ place + at.camera_from_world[:3, 3]
     spot = at.fx * x / z + at.cx, at.fy * y / z + at.cy
+    assert abs(spot[0] - 120) > 20
     browser.click(*spot, count=2)
+    near = window_camera(browser)
+    x, y, z = near.rotation @ place + near.camera_from_world[:3, 3]
+    assert (near.fx * x / z, near.fy * y / z) == pytest.approx((0, 0), abs=1.5)
+    distance = np.linalg.norm(near.position - place)
+    assert distance == pytest.approx(0.5 * np.linalg.norm(at.position - place), rel=0.02)
+    assert abs(near.rotation[0] @ UP_DIRECTION) < 1e-6, "the horizon is tilted"
     browser.drag((120, 90), (160, 100))
     after = window_camera(browser)
-    assert np.linalg.norm(after.position - at.position) > 0.3
-    assert np.linalg.norm(after.position - current_position) == pytest.approx(
-        np.linalg.norm(at.position - current_position), rel=0.01
-    )
+    assert np.linalg.norm(after.position - near.position) > 0.15
+    assert np.linalg.norm(after.position - place) == pytest.approx(distance, rel=0.01)
 
 
 def test_missing_webgl_damaged_pages_and_invalid_cameras_are_reported(browser: Browser, tmp_path: Path):

@@ -102,6 +102,20 @@ export class Eye {
     this.target = add(about, turn(sub(this.target, about)));
   }
 
+  // Turns the eye to a point, which becomes its target, and multiplies their distance by a factor. The eye keeps its
+  // roll about the view's axis.
+  approach(point, factor) {
+    const ahead = unit(sub(point, this.position)), level = (vector) => sub(vector, mul(this.up, dot(vector, this.up)));
+    const turnTo = (from, to, axis) => {
+      const angle = Math.atan2(dot(axis, cross(from, to)), dot(from, to));
+      this.rows = this.rows.map((row) => rotate(row, axis, angle));
+    };
+    turnTo(level(this.rows[2]), level(ahead), this.up);
+    turnTo(this.rows[2], ahead, unit(cross(this.rows[2], ahead)));
+    this.position = add(point, mul(sub(this.position, point), factor));
+    this.target = point;
+  }
+
   // Rotates the eye about its target.
   orbit(yaw, pitch) {
     this.turn(yaw, pitch, this.target);

@@ -17,11 +17,11 @@ const KEY_PRESS_SECONDS = 1 / 60; // a short press moves the eye this long, even
 const KEY_ALIASES = { "=": "+", _: "-", Add: "+", Subtract: "-" }; // keys with the same function
 
 export class Controls {
-  // Callbacks: `acted()` after any input; `pick(x, y)` after a double-click, in CSS pixels; `press(key)` for keys that
-  // do not move the eye; `ignored(kind)` when a "wheel" or a "finger" is left to the surrounding page.
-  constructor(player, damper, { acted, pick, press, ignored }) {
+  // Callbacks: `acted()` after any input; `approach(x, y)` after a double-click, in CSS pixels; `press(key)` for keys
+  // that do not move the eye; `ignored(kind)` when a "wheel" or a "finger" is left to the surrounding page.
+  constructor(player, damper, { acted, approach, press, ignored }) {
     const { canvas } = player;
-    Object.assign(this, { player, canvas, damper, acted, pick, press, ignored });
+    Object.assign(this, { player, canvas, damper, acted, approach, press, ignored });
     this.pointers = new Map();
     this.held = new Map(); // code of each pressed key -> its name
     this.tapped = null;
@@ -123,18 +123,18 @@ export class Controls {
     const { clientX: x, clientY: y, timeStamp: time } = event;
     const near = (to, pixels) => to && Math.hypot(x - to.x, y - to.y) < pixels && time - to.time < MAX_TAP_MS;
     const tap = event.type === "pointerup" && near(this.start, MAX_TAP_MOVE_PIXELS);
+    this.start = null;
+    this.acted();
     if (!tap) {
       this.tapped = null;
       if (!this.engaged) this.ignored("finger");
     } else if (near(this.tapped, MAX_DOUBLE_TAP_DISTANCE_PIXELS)) {
       this.tapped = null;
-      this.pick(x, y);
+      this.approach(x, y);
     } else {
       this.engage(true);
       this.tapped = { x, y, time };
     }
-    this.start = null;
-    this.acted();
   }
 
   wheel(event) {

@@ -13,6 +13,7 @@ import { Player } from "./player.js";
 import { savePicture, shareView } from "./share.js";
 
 const FADE_MS = 600; // the duration in style.css
+const APPROACH_FACTOR = 0.5; // of the distance to a place that was tapped twice
 const IGNORED_TEXTS = {
   wheel: "Click the scene, then the wheel zooms.",
   finger: "Tap the scene, then fingers move it.",
@@ -67,7 +68,17 @@ function start() {
   };
 
   const pick = (x, y) => {
-    if (player.pick(x, y)) showRing(x, y);
+    const isHit = player.pick(x, y);
+    if (isHit) showRing(x, y);
+    return isHit;
+  };
+
+  const approach = (x, y) => {
+    if (!pick(x, y)) return;
+    glide.to(() => {
+      player.eye.approach(player.eye.target, APPROACH_FACTOR);
+      player.changed();
+    });
   };
 
   // Moves the eye to the camera of a text from the address.
@@ -137,7 +148,7 @@ function start() {
     player.schedule();
   };
   const controls = new Controls(player, damper, {
-    acted, pick, press: (key) => panel.press(key), ignored: (kind) => toast(IGNORED_TEXTS[kind]),
+    acted, approach, press: (key) => panel.press(key), ignored: (kind) => toast(IGNORED_TEXTS[kind]),
   });
   player.movers.push(controls, damper, glide, turntable);
   if (parameters.exposure) player.exposure = parameters.exposure;
