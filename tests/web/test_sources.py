@@ -144,7 +144,8 @@ def test_a_file_beside_the_player_is_the_default(browser: Browser, host: Site):
 def test_a_failed_fetch_is_reported_in_one_sentence(browser: Browser, host: Site):
     browser.open(f"{host.address}/index.html?content=not%20there.hyrf")
     assert wait_for_message(browser).startswith("not there.hyrf could not be fetched (404 Not Found); check")
-    wait_until(browser, "document.getElementById('invitation').checkVisibility()")  # the user may choose another file
+    invitation = "document.getElementById('invitation').checkVisibility()"
+    assert not browser.evaluate(invitation), "visitors have no file to drop"
     with serve_site() as other_site:  # without CORS headers, other sites cannot read it
         other_site.files = {"/scene.hyrf": GOLDEN_FILE_DATA}
         browser.open(f"{host.address}/index.html?content={other_site.address}/scene.hyrf")

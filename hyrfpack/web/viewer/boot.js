@@ -3,12 +3,19 @@
 // promise that follows the player's own.
 
 {
+  const find = (name) => document.getElementById(name);
+
+  // Tells the page around this one, where <hyrf-viewer> waits for the first message.
+  const postToParent = (hyrf, message) => window.parent !== window && window.parent.postMessage({ hyrf, message }, "*");
+
   // Decompresses a JSON text in base64.
   const unpack = async (text) => {
     if (!window.DecompressionStream) throw new Error("This browser is too old for this page; use a newer one.");
     const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
     const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
-    return JSON.parse(await new Response(stream).text());
+    return new Response(stream).json().catch(() => {
+      throw new Error("The player in this page is damaged; load the page again.");
+    });
   };
 
   // Adds a script element to the page.
@@ -19,16 +26,25 @@
   };
 
   const boot = async () => {
-    const { "main.js": main, ...texts } = await unpack(document.getElementById("player").textContent);
+    const { "main.js": main, ...texts } = await unpack(find("player").textContent);
     for (const [name, text] of Object.entries(texts)) put("text/plain", name, text);
     put("text/javascript", "main.js", main);
+    if (window.hyrfpack !== loading || !find("message").hidden) return;
+    throw new Error("A Content-Security-Policy forbids the player's script; allow the scripts that this page allows.");
   };
+
+  document.body.classList.add("started");
+  find("page").hidden = false;
+  find("stalled").remove();
+  postToParent("start");
 
   const booted = boot(), loading = { ready: booted.then(() => window.hyrfpack !== loading && window.hyrfpack.ready) };
   window.hyrfpack = loading;
   loading.ready.catch(() => {}); // the page shows the error
   booted.catch(({ message }) => {
-    document.getElementById("sentence").textContent = message;
-    document.getElementById("message").hidden = false;
+    find("loading").hidden = true;
+    find("sentence").textContent = message;
+    find("message").hidden = false;
+    postToParent("error", message);
   });
 }

@@ -6,18 +6,29 @@ import { elementText } from "./dom.js";
 // The file is no longer needed, because another one was opened.
 export class SupersededError extends Error {}
 
+// The browser cannot read any file. The message is for the user.
+export class StartError extends Error {}
+
+const NO_WORKER_TEXT = "A Content-Security-Policy forbids the player's worker; it must allow worker-src blob:.";
+
 export class Loader {
   // `content(message)` is called with each content that was read (see worker_tasks.js), one after the other. Its
   // promise resolves to true if the content is shown. `progress({what, part})` is called with the fraction `part` of
   // the step `what`.
   constructor({ content, progress }) {
-    if (!window.DecompressionStream) throw new Error("This browser is too old to unpack the scene; use a newer one.");
+    if (!window.DecompressionStream) {
+      throw new StartError("This browser is too old to unpack the scene; use a newer one.");
+    }
     Object.assign(this, { content, progress });
     this.ticket = 0;
     this.waiting = new Map(); // ticket -> the function that resolves the promise of its order
     this.spare = null; // the array of an old order, for reuse
     const address = URL.createObjectURL(new Blob([elementText("worker.js")], { type: "text/javascript" }));
-    this.worker = new Worker(address);
+    try {
+      this.worker = new Worker(address);
+    } catch {
+      throw new StartError(NO_WORKER_TEXT);
+    }
     URL.revokeObjectURL(address);
     this.worker.onmessage = ({ data }) => {
       if (data.progress) this.progress(data.progress);
@@ -25,7 +36,8 @@ export class Loader {
       if (data.order) this.sorted(data.order);
       if (data.error) this.fail(new Error(data.error));
     };
-    this.worker.onerror = ({ message }) => this.fail(new Error(message));
+    // An error without a message means that the worker's script was not allowed to run.
+    this.worker.onerror = ({ message }) => this.fail(message ? new Error(message) : new StartError(NO_WORKER_TEXT));
     this.delivered = Promise.resolve();
     this.broken = false; // true if no more of the file will arrive; the part that was shown can be decoded again
     this.pending = []; // {resolve, reject} of the promises of `expect`

@@ -155,7 +155,7 @@ function start() {
 
   // ---- events of the player
 
-  player.addEventListener("progress", ({ detail }) => progress(detail));
+  player.addEventListener("progress", ({ detail }) => progress(detail.part));
   player.addEventListener("remark", ({ detail }) => remark(detail));
   player.addEventListener("failed", ({ detail }) => fail(detail));
   player.addEventListener("camera", ({ detail }) => {

@@ -3,7 +3,6 @@
 import { element } from "./dom.js";
 
 const TOAST_MS = 4000;
-const STEP_LABELS = { loading: "Loading", unpacking: "Unpacking", preparing: "Preparing" };
 let toastTimer = 0;
 
 // Shows the sentence of an error until it is dismissed.
@@ -42,11 +41,11 @@ export function remark(sentence) {
   element("remark").textContent = sentence;
 }
 
-// Shows the fraction `part` of the step `what`.
-export function progress({ what, part }) {
+// Shows the fraction `part` of the loading.
+export function progress(part) {
   element("loading").hidden = false;
   element("bar").value = part;
-  element("step").textContent = `${STEP_LABELS[what]} ${Math.floor(100 * part)} %`;
-  const quarter = `${STEP_LABELS[what]}, ${25 * Math.floor(4 * part)} percent`;
+  element("step").textContent = `Loading ${Math.floor(100 * part)} %`;
+  const quarter = `Loading, ${25 * Math.floor(4 * part)} percent`;
   if (element("status").textContent !== quarter) announce(quarter);
 }

@@ -29,6 +29,7 @@ export class Opener {
     // `isOwn` is true if the page or its address names the scene, and not the user.
     this.shown = this.loading = { title, isOwn: true };
     this.openCount = 0; // identifies the scene that was opened last
+    this.invites = false; // whether nothing names a scene, so that the page asks for one
   }
 
   // Opens the scene that the page or its address names, if there is one. `hasFile` is true if the page has a file, and
@@ -48,7 +49,13 @@ export class Opener {
       return this.open(fetchFile, name);
     }
     element("loading").hidden = true;
-    document.body.classList.add("empty");
+    this.invites = parameters.content === null;
+    this.invite();
+  }
+
+  // Asks for a file while there is none. A page that names its scene never does, because its visitors have no file.
+  invite() {
+    document.body.classList.toggle("empty", this.invites && !this.player.loaded);
   }
 
   // Opens a file that the user chose, if there is one.
@@ -63,7 +70,7 @@ export class Opener {
     dismiss();
     document.body.classList.remove("empty");
     try {
-      progress({ what: "loading", part: 0 });
+      progress(0);
       const file = await fetchFile();
       if (thisOpen !== this.openCount) return;
       this.loading = { title: name ?? file.name.replace(/\.\w+$/, ""), isOwn };
@@ -71,7 +78,7 @@ export class Opener {
       postToParent("load");
     } catch (error) {
       if (thisOpen !== this.openCount) return; // another scene was opened meanwhile
-      document.body.classList.toggle("empty", !this.player.loaded);
+      this.invite();
       throw error;
     }
   }

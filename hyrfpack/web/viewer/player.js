@@ -15,7 +15,7 @@ import { Eye, cameraOf, viewOf } from "./camera.js";
 import { AS_PHOTOGRAPHED, EXPOSURES, viewGains } from "./exposure.js";
 import { Fields, MEMORY_REASON, UnsupportedDeviceError } from "./fields.js";
 import { ContextLostError, countContextChange } from "./graphics.js";
-import { Loader, SupersededError } from "./loader.js";
+import { Loader, StartError, SupersededError } from "./loader.js";
 import { Renderer } from "./renderer.js";
 import { Splats } from "./splats.js";
 
@@ -100,9 +100,9 @@ export class Player extends EventTarget {
     try {
       await this.receive({ scene: this.scene, stream, picture });
     } catch (error) {
-      const { message } = error;
       if (error instanceof SupersededError) return;
-      throw new Error(`The scene cannot be unpacked; if this page is truncated, fetch it again (${message}).`);
+      if (error instanceof StartError) throw error;
+      throw new Error(`The scene cannot be unpacked; if this page is truncated, fetch it again (${error.message}).`);
     }
   }
 
@@ -111,8 +111,8 @@ export class Player extends EventTarget {
   async open({ name, stream, stage = null, update = false }) {
     try {
       await this.receive({ name, stream, stage, picture: null, update });
-    } catch ({ message }) {
-      throw new Error(`${name} cannot be opened: ${message}`);
+    } catch (error) {
+      throw error instanceof StartError ? error : new Error(`${name} cannot be opened: ${error.message}`);
     }
   }
 

@@ -1,6 +1,11 @@
 // Reads a scene's bytes from an address, or from a file that the user chose. Both give {name, stream}; the stream is an
 // async iterable of Uint8Array, whose `length` is the number of bytes, or 0 if that is unknown.
 
+const FROM_DISK_TEXT = "a page opened from the disk may not read files; drop the file on the page, or serve both";
+// A sandbox without allow-same-origin makes every server, even the page's own, another site.
+const OPAQUE_FRAME_TEXT = "the sandbox of the frame around this page forbids it; add allow-same-origin to the " +
+  "sandbox, or let the file's server send Access-Control-Allow-Origin: *";
+
 // Fetches a file. Throws an Error with a message for the user on failure.
 export async function fetchedFile(address) {
   const name = nameOfAddress(address), answer = await request(address, name);
@@ -29,17 +34,20 @@ const nameOfAddress = (address) => {
   }
 };
 
+// Returns why a request got no answer.
+function noAnswerReason({ origin, host }) {
+  if (location.protocol === "file:") return FROM_DISK_TEXT;
+  if (window.origin === "null") return OPAQUE_FRAME_TEXT;
+  if (origin === location.origin) return "its server does not answer, or a Content-Security-Policy forbids the request";
+  return `${host} does not answer, or does not let pages of other sites read it`;
+}
+
 // Sends a request. Throws an Error with a message for the user if the server does not answer.
 async function request(address, name, headers = {}) {
   try {
     return await fetch(address, { headers, credentials: "same-origin" });
   } catch {
-    const reason = location.protocol === "file:"
-      ? "a page opened from the disk may not read files; drop the file on the page, or serve both"
-      : new URL(address).origin === location.origin
-        ? "its server does not answer"
-        : `${new URL(address).host} does not answer, or does not let pages of other sites read it`;
-    throw new Error(`${name} could not be fetched: ${reason}.`);
+    throw new Error(`${name} could not be fetched: ${noAnswerReason(new URL(address))}.`);
   }
 }
 

@@ -18,6 +18,7 @@ import { fitHarmonics } from "../hyrf/harmonics.js";
 import { read } from "../hyrf/index.js";
 import { viewpointOf } from "../hyrf/viewpoint.js";
 import { TEXTURE_WIDTH } from "./constants.js";
+import { rejectOtherFiles } from "./other_files.js";
 import { packModel, packSplats } from "./pack.js";
 import { ReceivedFile } from "./received_file.js";
 import { backgroundPicture, modelScene, splatsScene } from "./scene.js";
@@ -122,6 +123,7 @@ class SceneReader {
         content.model = packModel(model);
       }
     } else {
+      rejectOtherFiles(bytes);
       const splats = await this.readSplats(name, bytes);
       if (scene) convertToScene(splats, scene);
       content.scene = scene ?? splatsScene(splats, name);

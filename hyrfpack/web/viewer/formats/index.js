@@ -9,6 +9,8 @@ import { decodeSpz } from "./spz.js";
 /** The endings of the names of files of splats. */
 export const SPLAT_ENDINGS = [".ply", ".spz", ".splat", ".sog"];
 
+const NO_FORMAT_TEXT =
+  `it is neither a .hyrf file nor one of ${SPLAT_ENDINGS.join(", ")}; fetch it again, or convert it`;
 const READERS_BY_ENDING = [decodePly, decodeSpz, decodeSplat, decodeSog];
 const READERS_BY_SIGNATURE = [["ply", decodePly], ["\x1f\x8b", decodeSpz], ["NGSP", decodeSpz], ["PK", decodeSog]];
 
@@ -23,5 +25,5 @@ export async function decodeSplats(name, bytes) {
   const ending = SPLAT_ENDINGS.findIndex((known) => name.toLowerCase().endsWith(known));
   const isAtStart = ([mark]) => [...mark].every((letter, k) => bytes[k] === letter.charCodeAt(0));
   const reader = READERS_BY_ENDING[ending] ?? READERS_BY_SIGNATURE.find(isAtStart)?.[1];
-  return reader ? reader(bytes) : rejectSplats(`it is none of ${SPLAT_ENDINGS.join(", ")}; convert it to one of them`);
+  return reader ? reader(bytes) : rejectSplats(NO_FORMAT_TEXT);
 }
