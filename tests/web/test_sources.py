@@ -2,108 +2,27 @@
 
 from __future__ import annotations
 
-import base64
-import threading
+import subprocess
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from urllib.parse import unquote
 
 import numpy as np
 import pytest
 from web.pages import SCENE_CENTER, Browser, make_splats_page, open_page, random_splats, wait_for_message, wait_until
+from web.site import GOLDEN_FILE_DATA, Site, drop_file, serve_player, serve_site
 
-from hyrfpack.splats.formats import spz
-from hyrfpack.splats.formats.hints import Hints
 from hyrfpack.web.player import encode_element_script, encode_player
+from tools.browser.build_player import PROGRAMS_FOLDER
 
 pytestmark = pytest.mark.in_turn
-GOLDEN_FILE_DATA = (Path(__file__).parents[1] / "golden" / "v1.1_compact.hyrf").read_bytes()
 LOADED_COUNT_JS = "hyrfpack.player.loaded && hyrfpack.player.scene.count"
-
-
-@dataclass
-class Site:
-    """The state of a server whose answers tests choose.
-
-    Attributes:
-        address: URL of the server, without a path.
-        files: content of each path; the suffix determines the content type.
-        headers: headers sent with every answer.
-        breaks: number of bytes of a .hyrf file after which the connection breaks, or None.
-        always: whether it breaks in every request and not only in those from the start of the file.
-        ranges: whether the server honours Range headers.
-        requests: (path, Range header or None) of each request, in order.
-    """
-
-    address: str = ""
-    files: dict[str, bytes] = field(default_factory=dict)
-    headers: dict[str, str] = field(default_factory=dict)
-    breaks: int | None = None
-    always: bool = False
-    ranges: bool = True
-    requests: list[tuple[str, str | None]] = field(default_factory=list)
-
-
-@contextmanager
-def serve_site() -> Iterator[Site]:
-    server_state = Site()
-
-    class Handler(BaseHTTPRequestHandler):
-        protocol_version = "HTTP/1.1"
-
-        def do_GET(self) -> None:
-            path, byte_range = unquote(self.path.partition("?")[0]), self.headers.get("Range")
-            server_state.requests.append((path, byte_range))
-            data = server_state.files.get(path)
-            if data is None:
-                self.send_error(404)
-                return
-            start = (byte_range or "bytes=0-").removeprefix("bytes=").removesuffix("-")
-            first = int(start) if server_state.ranges else 0
-            self.send_response(206 if first else 200)
-            kind = {"html": "text/html; charset=utf-8", "js": "text/javascript"}.get(path.rpartition(".")[2])
-            self.send_header("Content-Type", kind or "application/octet-stream")
-            self.send_header("Content-Length", str(len(data) - first))
-            if first:
-                self.send_header("Content-Range", f"bytes {first}-{len(data) - 1}/{len(data)}")
-            for name, value in server_state.headers.items():
-                self.send_header(name, value)
-            self.end_headers()
-            if path.endswith(".hyrf") and server_state.breaks is not None and (server_state.always or not first):
-                self.wfile.write(data[first : first + server_state.breaks])
-                self.wfile.flush()
-                time.sleep(0.2)
-                self.close_connection = True
-                self.connection.shutdown(2)
-            else:
-                self.wfile.write(data[first:])
-
-        def log_message(self, format: str, *arguments: object) -> None:
-            """Do not print requests."""
-
-    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
-        server_state.address = f"http://127.0.0.1:{server.server_port}"
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        try:
-            yield server_state
-        finally:
-            server.shutdown()
 
 
 @pytest.fixture
 def host() -> Iterator[Site]:
     """Yield a server that has a player and two files."""
-    with serve_site() as server_state:
-        server_state.files = {
-            "/index.html": encode_player("player"),
-            "/some scene.hyrf": GOLDEN_FILE_DATA,
-            "/cloud.spz": spz.encode(random_splats(300), Hints(spz_version=3)),
-            "/hyrf-viewer.js": encode_element_script(),
-        }
+    with serve_player() as server_state:
         yield server_state
 
 
@@ -202,22 +121,6 @@ def test_a_download_that_cannot_resume_is_reported_in_one_sentence(browser: Brow
 
 
 # ---- dropped files
-
-
-def drop_file(browser: Browser, data: bytes, name: str) -> None:
-    """Drop a file with this content and name on the page."""
-    browser.evaluate(
-        f"""(() => {{
-            const bytes = Uint8Array.from(atob("{base64.b64encode(data).decode()}"), (letter) => letter.charCodeAt(0));
-            const carried = new DataTransfer();
-            carried.items.add(new File([bytes], {name!r}));
-            for (const type of ["dragover", "drop"]) {{
-                const event = new DragEvent(type, {{ dataTransfer: carried, bubbles: true, cancelable: true }});
-                document.getElementById("view").dispatchEvent(event);
-                if (!event.defaultPrevented) throw new Error("the browser would leave the page");
-            }}
-        }})()"""
-    )
 
 
 def test_an_empty_player_asks_for_a_file_and_opens_dropped_files(browser: Browser, host: Site):
@@ -348,6 +251,65 @@ def test_the_element_shows_a_file_and_follows_its_attributes(browser: Browser, h
     assert not browser.evaluate(f"{ELEMENT_WINDOW_JS}.document.body.classList.contains('bare')")
     browser.evaluate(f"{ELEMENT_JS}.setAttribute('src', '../nothing.hyrf')")
     wait_until(browser, "fired.some(([name, detail]) => name === 'error' && String(detail).includes('404'))")
+
+
+WATCH_EVENTS_HTML = (
+    "<!DOCTYPE html><script>window.fired = []; for (const name of ['load', 'error'])"
+    " document.addEventListener(name, (event) => fired.push([name, event.detail]), true);</script>"
+)
+BUNDLED_SCRIPT_KINDS = {"module": " type=module", "classic": " defer"}
+
+
+def bundle_element(folder: Path, player_attribute: str) -> bytes:
+    """Bundle hyrf-viewer.js with a script that adds an element, by esbuild if it is here."""
+    add = f"document.body.innerHTML = `<hyrf-viewer src='cloud.spz' noui {player_attribute}></hyrf-viewer>`;"
+    (folder / "hyrf-viewer.js").write_bytes(encode_element_script())
+    (folder / "entry.js").write_text(f'import "./hyrf-viewer.js";\n{add}\n')
+    if not (PROGRAMS_FOLDER / "esbuild").exists():
+        return encode_element_script() + b"\n" + add.encode()
+    command = [PROGRAMS_FOLDER / "esbuild", folder / "entry.js", "--bundle", "--format=iife"]
+    return subprocess.run(command, stdout=subprocess.PIPE, check=True).stdout
+
+
+@pytest.mark.parametrize("kind", BUNDLED_SCRIPT_KINDS)
+def test_a_bundled_element_needs_the_address_of_its_player_and_says_so(
+    browser: Browser, host: Site, tmp_path: Path, kind: str
+):
+    host.files["/player/index.html"] = host.files["/index.html"]
+    host.files["/index.html"] = b"<!DOCTYPE html>another page"
+    for name, attribute in {"bad": "", "good": "player=player/index.html"}.items():
+        host.files[f"/{name}.js"] = bundle_element(tmp_path, attribute)
+        script = f"<script{BUNDLED_SCRIPT_KINDS[kind]} src=/{name}.js></script>"
+        host.files[f"/{name}.html"] = (WATCH_EVENTS_HTML + script + "<body>").encode()
+    browser.open(f"{host.address}/bad.html")
+    wait_until(browser, "fired.some(([name, detail]) => name === 'error' && /attribute player/.test(detail))")
+    assert kind != "module" or not any(path == "/index.html" for path, _ in host.requests)
+    browser.open(f"{host.address}/good.html")
+    wait_until(browser, "fired.some(([name, detail]) => name === 'load' && detail === '')")
+    browser.evaluate("new Promise((done) => setTimeout(done, 3500))")  # longer than the element waits for an answer
+    assert not browser.evaluate("fired.some(([name, detail]) => name === 'error')")
+
+
+def test_an_element_whose_player_may_not_run_fires_an_error(browser: Browser, host: Site):
+    host.headers = {"Content-Security-Policy": "script-src 'self'"}
+    host.files["/watch.js"] = WATCH_EVENTS_HTML.partition("<script>")[2].removesuffix("</script>").encode()
+    host.files["/post.html"] = (
+        b"<!DOCTYPE html><script src=watch.js></script><script src=hyrf-viewer.js></script>"
+        b'<hyrf-viewer src="cloud.spz"></hyrf-viewer>'
+    )
+    browser.open(f"{host.address}/post.html")
+    wait_until(browser, "fired.some(([name, detail]) => name === 'error' && /not allowed to run here/.test(detail))")
+
+
+def test_the_element_has_no_sandbox_which_would_protect_nothing(browser: Browser, host: Site):
+    host.files["/post.html"] = (
+        WATCH_EVENTS_HTML + '<script src=hyrf-viewer.js></script><hyrf-viewer src="cloud.spz"></hyrf-viewer>'
+    ).encode()
+    browser.open(f"{host.address}/post.html")
+    wait_until(browser, "fired.some(([name, detail]) => name === 'load' && detail === '')")
+    frame = f"{ELEMENT_JS}.shadowRoot.querySelector('iframe')"
+    assert not browser.evaluate(f"{frame}.hasAttribute('sandbox')")
+    assert "clipboard-write" in browser.evaluate(f"{frame}.allow")
 
 
 def test_the_element_adds_no_global_names(browser: Browser, host: Site):
