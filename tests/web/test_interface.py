@@ -33,6 +33,7 @@ from web.pages import (
 from web.scripts import run_script
 
 from hyrfpack.web.html import decode_splats_page
+from hyrfpack.web.serve import serve_in_thread
 
 pytestmark = pytest.mark.in_turn
 PHONE_OPTIONS = {"dense": 2.0, "phone": True}
@@ -243,9 +244,17 @@ def test_links_are_exact_for_any_unit_and_rotation(tmp_path: Path):
         assert answer["depth"] == pytest.approx(expected["depth"], rel=1e-4) and len(answer["text"]) < 140, answer
 
 
-def test_the_link_is_shown_selected_where_the_clipboard_is_unavailable(browser: Browser, tmp_path: Path):
+@pytest.fixture
+def served_page() -> Iterator[str]:
+    """Serve a page with a scene inside; yield its address."""
+    with serve_in_thread(make_splats_page(random_splats(50)), {}) as address:
+        yield address
+
+
+def test_the_link_is_shown_selected_where_the_clipboard_is_unavailable(browser: Browser, served_page: str):
     with browser.before_every_page("Object.defineProperty(Navigator.prototype, 'clipboard', { value: undefined })"):
-        open_page(browser, tmp_path, make_splats_page(random_splats(50)))
+        browser.open(served_page)
+        browser.evaluate("hyrfpack.ready")
         browser.press("l")
         wait_until(browser, "!document.getElementById('toast').hidden")
         selected = "((field) => field.value.slice(field.selectionStart, field.selectionEnd))(document.activeElement)"
@@ -257,10 +266,11 @@ def test_the_link_is_shown_selected_where_the_clipboard_is_unavailable(browser: 
         assert is_hidden(browser, "toast")
 
 
-def test_a_copied_link_equals_the_address(browser: Browser, tmp_path: Path):
+def test_a_copied_link_equals_the_address(browser: Browser, served_page: str):
     clipboard = "{ value: { writeText: async (text) => { window.copied = text; } } }"
     with browser.before_every_page(f"Object.defineProperty(Navigator.prototype, 'clipboard', {clipboard})"):
-        open_page(browser, tmp_path, make_splats_page(random_splats(50)))
+        browser.open(served_page)
+        browser.evaluate("hyrfpack.ready")
         browser.press("l")
         wait_until(browser, "window.copied !== undefined")
         assert browser.evaluate("copied === location.href && location.hash.startsWith('#camera=')")

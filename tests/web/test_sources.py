@@ -158,7 +158,7 @@ def test_a_page_with_a_scene_inside_opens_dropped_files(browser: Browser, tmp_pa
     drop_file(browser, GOLDEN_FILE_DATA, "model.hyrf")
     wait_until(browser, "hyrfpack.player.scene.kind === 'hyrf'")
     browser.press("l")
-    wait_until(browser, "/include the opened file|Copy this link/.test(document.getElementById('done').textContent)")
+    wait_until(browser, "/not include the opened file/.test(document.getElementById('done').textContent)")
 
 
 # ---- inside other pages

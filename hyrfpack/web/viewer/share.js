@@ -1,10 +1,15 @@
-// Copies the address of the view, and saves a picture of it.
+// Shares the address of the view, and saves a picture of it.
 
 import { toast } from "./notifications.js";
 
-// Copies the page's address with this camera and exposure (null for the default). `includesScene` is true if the
-// address also opens the scene.
+const NOT_INCLUDED_TEXT = "There is no link to share: it would not include the opened file. Send the file instead.";
+const NOT_ON_WEB_TEXT = "There is no link to share: this page is not on the web. Send its file instead.";
+const LOCAL_HOSTS = ["localhost", "127.0.0.1", "[::1]"];
+
+// Puts this camera and exposure (null for the default) into the page's address. Then shares the address where touch
+// screens can do so, or else copies it. `includesScene` is true if the address also opens the scene.
 export async function shareView(camera, exposure, includesScene) {
+  if (!includesScene) return toast(NOT_INCLUDED_TEXT);
   const address = new URL(location.href), { searchParams: parameters } = address;
   if (exposure) parameters.set("exposure", exposure);
   else if (parameters.has("exposure")) parameters.delete("exposure");
@@ -14,11 +19,18 @@ export async function shareView(camera, exposure, includesScene) {
   } catch {
     // pages without an address of their own (srcdoc) cannot change it
   }
-  const ending = includesScene ? "." : "; it does not include the opened file.";
-  const copied = `The link to this view is copied${ending}`;
+  if (!/^https?:$/.test(address.protocol)) return toast(NOT_ON_WEB_TEXT);
+  if (navigator.share && matchMedia("(pointer: coarse)").matches) {
+    try {
+      return await navigator.share({ title: document.title, url: address.href });
+    } catch ({ name }) {
+      if (name === "AbortError") return; // the user has closed the dialog
+    }
+  }
+  const ending = LOCAL_HOSTS.includes(address.hostname) ? "; it works on this device only." : ".";
   try {
     await navigator.clipboard.writeText(address.href);
-    toast(copied);
+    toast(`The link to this view is copied${ending}`);
   } catch {
     toast("Copy this link:", address.href);
   }
