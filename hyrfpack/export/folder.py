@@ -169,7 +169,7 @@ def _write_gallery(sources: Sequence[StrPath], output: _OutputFolder, scenes: Se
     title = _folder_title(output.path)
     pairs = zip(cards, contents, strict=True)
     stages = {card.content: shown.stage for card, shown in pairs if shown.stage}
-    output.write(GALLERY_PLAYER_NAME, encode_player(title, stages=stages))
+    output.write(GALLERY_PLAYER_NAME, encode_player(title, stages=stages, gallery=INDEX_NAME))
     output.write(README_NAME, encode_readme(title, GALLERY_PLAYER_NAME, INDEX_NAME))
     output.write(INDEX_NAME, encode_gallery(title, cards, GALLERY_PLAYER_NAME))
     return ExportReport(str(output.path), output.bytes, sum(card.count for card in cards), native=True)

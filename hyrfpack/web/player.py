@@ -17,6 +17,7 @@ from hyrfpack.web.assets import list_web_files, read_web_file
 from hyrfpack.web.scripts import read_script, read_style
 
 MODEL_SUFFIX = ".hyrf"
+BACK_LINK = '<a id="back" href="{}" aria-label="All scenes" title="All scenes">&#8249;</a>\n'
 SHADER_SUFFIXES = (".vert", ".frag", ".glsl")
 _SHADER_COMMENT = re.compile(r"\s*//.*")
 # The browser decodes one base64 block while it loads the next one. A multiple of 3 needs no padding.
@@ -35,6 +36,7 @@ def encode_player(
     fetches: str = ANY_SOURCE,
     stages: Mapping[str, dict] | None = None,
     updates: str | None = None,
+    gallery: str | None = None,
 ) -> bytes:
     """Return a page that plays a hosted file, a file that its address names (`?content=URL`), or a dropped file.
 
@@ -50,6 +52,7 @@ def encode_player(
         updates: address of a JSON file that says which snapshot of a training `content` is: {"snapshot": number from 1,
             0 while there is none, "step", "steps"}. The page requests it repeatedly and shows newer snapshots from the
             viewer's current viewpoint. None for a file that does not change.
+        gallery: address, relative to the page, of the list of scenes that a button leads back to; None for no button.
 
     Returns:
         The file, UTF-8. The same arguments give the same bytes.
@@ -60,7 +63,7 @@ def encode_player(
     texts = [json_element("content", settings)] if content is not None or stages else []
     if poster is not None:
         texts.append(f'<img id="poster" alt="" src="{html.escape(poster)}">')
-    return assemble_player_page(title, texts, description, image=poster, fetches=fetches)
+    return assemble_player_page(title, texts, description, image=poster, fetches=fetches, gallery=gallery)
 
 
 def assemble_player_page(
@@ -72,6 +75,7 @@ def assemble_player_page(
     image: str | None = None,
     fetches: str = "",
     readers: bool = True,
+    gallery: str | None = None,
 ) -> bytes:
     """Return the player's page around the elements of a scene, as UTF-8.
 
@@ -83,6 +87,7 @@ def assemble_player_page(
         image: address of a picture for those who share the page; None for none.
         fetches: sources that the page may fetch from, in the syntax of a content security policy.
         readers: include the readers of splats, which make the page a third larger.
+        gallery: address of the list of scenes that a button leads back to; None for no button.
     """
     style, script = read_style(), read_script("boot.js")
     main, packed = _pack_scripts("worker.js" if readers else "worker_model.js")
@@ -98,6 +103,7 @@ def assemble_player_page(
         "meta": meta_tags(title, description, image),
         "style": style,
         "accept": ",".join([MODEL_SUFFIX, *SPLATS_SUFFIXES] if readers else [MODEL_SUFFIX]),
+        "back": "" if gallery is None else BACK_LINK.format(html.escape(gallery)),
         "texts": "\n".join([*texts, text_element("player", packed)]),
         "script": script,
         "payload": "\n".join(f'<script type="text/plain" class="payload">{block}</script>' for block in blocks),

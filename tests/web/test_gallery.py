@@ -6,9 +6,13 @@ import re
 from html.parser import HTMLParser
 
 import pytest
+from web.pages import Browser, wait_for_message, wait_until
+from web.site import Site, serve_player
 
 from hyrfpack.web.gallery import Card, encode_gallery, format_bytes
+from hyrfpack.web.player import encode_player
 
+BACK_VISIBLE_JS = "document.getElementById('back').checkVisibility()"
 HOSTILE_TEXT = "\"><script>alert(1)</script>'&{{style}}"
 
 
@@ -93,3 +97,36 @@ def test_text_has_enough_contrast_in_light_and_dark():
 )
 def test_file_sizes_have_readable_units(length, text):
     assert format_bytes(length) == text
+
+
+@pytest.mark.in_turn
+def test_the_player_of_a_gallery_leads_back_to_it(browser: Browser):
+    with serve_player() as host:
+        check_way_back(browser, host)
+    browser.resize(240, 180)
+
+
+def check_way_back(browser: Browser, host: Site) -> None:
+    host.files["/player.html"] = encode_player("scenes", gallery="index.html")
+    host.files["/index.html"] = b"<!DOCTYPE html><title>scenes</title>"
+    for size in [(1280, 800), (390, 844)]:
+        browser.resize(*size)
+        browser.open(f"{host.address}/player.html?content=cloud.spz")
+        browser.evaluate("hyrfpack.ready")
+        wait_until(browser, "document.body.classList.contains('there')")
+        boxes = browser.evaluate(
+            "['back', 'toggle', 'panel'].map((name) => document.getElementById(name))"
+            ".map((part) => (part.hidden = false, part.getBoundingClientRect()))"
+            ".map(({ left, top, right, bottom }) => [left, top, right, bottom])"
+        )
+        back, *others = boxes
+        assert back[0] >= 0 and back[2] <= size[0]
+        assert all(back[2] <= b[0] or b[2] <= back[0] or back[3] <= b[1] or b[3] <= back[1] for b in others), boxes
+    browser.evaluate("(document.getElementById('back').click(), 0)")
+    wait_until(browser, "location.pathname === '/index.html'")
+    browser.open(f"{host.address}/player.html?content=gone.hyrf")
+    wait_for_message(browser)
+    assert browser.evaluate(BACK_VISIBLE_JS), "a scene that fails has no way back"
+    browser.open(f"{host.address}/player.html?content=cloud.spz&noui")
+    browser.evaluate("hyrfpack.ready")
+    assert not browser.evaluate(BACK_VISIBLE_JS)
