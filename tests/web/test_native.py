@@ -236,6 +236,22 @@ def test_a_restored_device_shows_the_same_view(browser: Browser, tmp_path: Path)
     assert psnr(render_in_page(browser, camera), render_reference(model, camera)) > 45
 
 
+def test_a_picture_is_not_complete_while_the_device_is_lost(browser: Browser, tmp_path: Path):
+    load_page(browser, tmp_path, make_model_page(random_model(300)))
+    run_statements(
+        browser,
+        "const { player } = hyrfpack; window.device = player.renderer.gl.getExtension('WEBGL_lose_context');"
+        "window.settled = []; device.loseContext();"
+        "player.settled.then(() => settled.push('at once'));"
+        "player.canvas.addEventListener('webglcontextlost', () => {"
+        "  player.settled.then(() => settled.push('after the event')); player.redraw(); }, {once: true});",
+    )
+    browser.evaluate("new Promise((done) => setTimeout(done, 600))")
+    assert browser.evaluate("settled") == []
+    run_statements(browser, "device.restoreContext();")
+    wait_until(browser, "settled.length === 2")
+
+
 def lose_and_restore_device(browser: Browser) -> None:
     """Lose and restore the WebGL device, and wait until the picture is complete."""
     browser.evaluate(

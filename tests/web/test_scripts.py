@@ -127,6 +127,16 @@ def test_a_page_of_plain_modules_opened_from_disk_draws_the_same_picture(
     assert browser.list_errors() == []
 
 
+def test_a_running_page_has_one_global_name(browser: Browser, tmp_path: Path):
+    names = "Object.getOwnPropertyNames(window).filter((name) => !/^\\d+$/.test(name)).sort()"
+    (tmp_path / "plain.html").write_text("<!DOCTYPE html>")
+    browser.open((tmp_path / "plain.html").as_uri())
+    plain = set(browser.evaluate(names))
+    open_page(browser, tmp_path, make_splats_page(random_splats(50)))
+    browser.drag((120, 90), (140, 95))
+    assert set(browser.evaluate(names)) - plain == {"hyrfpack"}
+
+
 @pytest.mark.unit
 def test_no_line_of_the_sources_is_longer_than_120_columns():
     long = [

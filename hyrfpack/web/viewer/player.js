@@ -306,7 +306,12 @@ export class Player extends EventTarget {
   // Returns a promise that resolves when the picture is complete: at full resolution, with the order and colours of
   // this view, and with the background.
   get settled() {
-    return this.idle ? Promise.resolve() : new Promise((resolve) => this.onIdle.push(resolve));
+    return this.idle && !this.lost ? Promise.resolve() : new Promise((resolve) => this.onIdle.push(resolve));
+  }
+
+  // Returns whether the graphics context is lost, which the browser reports only later by an event.
+  get lost() {
+    return this.renderer.gl.isContextLost();
   }
 
   // Sets the canvas to the window's size. A change blanks the canvas, so it must be redrawn in the same frame.
@@ -398,7 +403,7 @@ export class Player extends EventTarget {
       return true;
     });
     this.finishing = false;
-    if (!whole || !goOn() || this.stale || this.unsorted || this.loader.busy) return this.schedule();
+    if (!whole || !goOn() || this.lost || this.stale || this.unsorted || this.loader.busy) return this.schedule();
     if (!this.whole) return;
     this.idle = true;
     this.times.complete ??= performance.now();
