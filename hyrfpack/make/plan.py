@@ -21,11 +21,13 @@ from hyrfpack.train.decisions import (
     max_length_pilot_steps,
     max_pilot_steps,
 )
+from hyrfpack.train.pilots import BUDGET_REFERENCE_STEPS
 from hyrfpack.train.resolution import PhotoSize
 from hyrfpack.train.setup import budget_for, usual_budget
 
 # Measured on two CPU cores, for the first estimate only; during the work, measured times replace it.
-CPU_STEP_SECONDS_PER_MEGAPIXEL = 0.7
+CPU_STEP_SECONDS = 0.03  # time of a training step that does not depend on the photo's size
+CPU_STEP_SECONDS_PER_MEGAPIXEL = 0.2
 GPU_STEP_SECONDS_PER_MEGAPIXEL = 0.02
 CPU_PASS_SECONDS_PER_MEGAPIXEL = 0.6  # a pass renders a view and back-propagates through it
 BACKGROUND_SEARCH_PASSES = 8.0  # time of the search for a background in unseen directions
@@ -169,10 +171,18 @@ def estimate_seconds(
         Seconds by part of a stage (`hyrfpack.make.progress.STAGE_PARTS`) or by stage.
     """
     pixels, scoring_passes = size.pixels / 1e6, PASSES_PER_SCORED_VIEW * held_out
-    step_seconds = pixels * (CPU_STEP_SECONDS_PER_MEGAPIXEL if device.type == "cpu" else GPU_STEP_SECONDS_PER_MEGAPIXEL)
-    step_seconds *= size.mean_step_cost(DensityConfig(), initial, gaussians)
+    fixed, per_megapixel = (
+        (CPU_STEP_SECONDS, CPU_STEP_SECONDS_PER_MEGAPIXEL)
+        if device.type == "cpu"
+        else (0.0, GPU_STEP_SECONDS_PER_MEGAPIXEL)
+    )
+    pilot_gaussians = usual_budget(size.pixels, size.pixels, BUDGET_REFERENCE_STEPS)
+    step_seconds, pilot_step_seconds = (
+        fixed + pixels * per_megapixel * size.mean_step_cost(DensityConfig(), min(initial, most), most)
+        for most in (gaussians, pilot_gaussians)
+    )
     return {
-        "pilots": pilot_steps * step_seconds,
+        "pilots": pilot_steps * pilot_step_seconds,
         "training": 2 + plan.steps * step_seconds,
         "results": 2 + (BACKGROUND_SEARCH_PASSES + scoring_passes) * pixels * CPU_PASS_SECONDS_PER_MEGAPIXEL,
         "compression": 3
