@@ -192,4 +192,4 @@ def test_the_reader_is_chosen_by_suffix_or_first_bytes(tmp_path: Path) -> None:
     third.assert_equal(FORMATS[".spz"].decode(spz, ""))
     assert "zip" in zip_file
     for sentence in (other, nothing):
-        assert "it is none of .ply, .spz, .splat, .sog; convert it to one of them" in sentence
+        assert "it is neither a .hyrf file nor one of .ply, .spz, .splat, .sog; fetch it again" in sentence
