@@ -30,7 +30,7 @@ from hyrfpack.format.codec import write_model
 from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
 from hyrfpack.model import HybridModel
 from hyrfpack.progress import Progress, TaskEvent, items_of_progress
-from hyrfpack.render import render_view
+from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.scene import Scene, evenly_spaced
 from hyrfpack.train.checkpoint import names_and_sizes
 from hyrfpack.train.decisions import chosen_steps, is_budget_open
@@ -277,10 +277,14 @@ def _drop_unseen_background(trainer: Trainer, progress: Progress) -> HybridModel
     if not model.config.background:
         return model
     views = evenly_spaced(trainer.scene.train, MAX_BACKGROUND_VIEWS)
+    settings = RenderSettings()
     seen = 0.0
     for done, view in enumerate(views):
         progress(TaskEvent("measuring the share of the background", done=done, total=len(views)))
-        seen = max(seen, float((1 - render_view(model, view.camera, background=False).alpha).mean()))
+        transmittance = 1 - render_view(model, view.camera, settings, background=False).alpha
+        # Below the threshold a render shows no background. There blending stops early, which leaves up to 0.2 %.
+        light = torch.where(transmittance > settings.background_threshold, transmittance, 0)
+        seen = max(seen, float(light.mean()))
     if seen >= MIN_BACKGROUND_LIGHT_SHARE:
         trainer.choices["background"] += f"; up to {seen:.1%} of a view's light comes from it"
         return model

@@ -159,14 +159,15 @@ def test_resuming_without_a_checkpoint_is_a_clear_error(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_a_background_that_no_view_sees_is_dropped(tmp_path):
-    """A wall of large opaque Gaussians surrounds everything. Balls under a sky keep their background sphere."""
+@pytest.mark.parametrize("opacity", [0.9, 0.98, 0.9999])
+def test_a_background_that_no_view_sees_is_dropped(tmp_path, opacity):
+    """A wall of large Gaussians surrounds everything. Balls under a sky keep their background sphere."""
     wall = np.random.default_rng(0).normal(size=(500, 3))
     wall *= 4 / np.linalg.norm(wall, axis=1, keepdims=True)
     scene = dataclasses.replace(make_scene(), points=wall, point_colors=np.full((500, 3), 0.5, np.float32))
     one_step = dataclasses.replace(RUN_CONFIG, steps=1, max_gaussians=500)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("hyrfpack.train.setup.INITIAL_OPACITY", 0.9999)
+        patch.setattr("hyrfpack.train.setup.INITIAL_OPACITY", opacity)
         patch.setattr("hyrfpack.train.setup.MIN_INITIAL_SIZE", 0.45)
         closed = train_model(scene, tmp_path / "closed", one_step, context=QUIET_CONTEXT)
     open_air = train_model(make_scene(), tmp_path / "open", one_step, context=QUIET_CONTEXT)
