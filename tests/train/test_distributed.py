@@ -16,6 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rank_processes import ProcessOutcome, needs_ranks, run_on_ranks
 
+from hyrfpack.config.train import FIELD_WARMUP_STEPS
 from hyrfpack.errors import HyrfError
 from hyrfpack.ops.ssim import photometric_loss
 from hyrfpack.parallel.ranks import SINGLE_PROCESS
@@ -46,7 +47,7 @@ def train_on_one_process(scene: Scene, config: TrainConfig) -> tuple[list[StepRe
     """
     trainer = Trainer(scene, config)
     model, exposures = trainer.model, trainer.exposures
-    optimizer = Optimizer(model, config.learning_rates, WORLD_SIZE)
+    optimizer = Optimizer(model, config.learning_rates, WORLD_SIZE, FIELD_WARMUP_STEPS)
     steps = math.ceil(config.steps / WORLD_SIZE)
     density = DensityControl(config.density, steps, trainer.budget, len(model), config.seed)
     views, rows = list(shuffled(scene.train, config.seed, range(steps * WORLD_SIZE))), []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import json
 import time
 from dataclasses import replace
@@ -166,3 +167,13 @@ def wait_until(browser: Browser, expression: str, seconds: float = 10.0) -> None
     while not browser.evaluate(expression):
         assert time.monotonic() < ends, f"never: {expression}"
         time.sleep(0.02)
+
+
+def wait_for_path(browser: Browser, path: str, seconds: float = 10.0) -> None:
+    """Wait until the browser has gone to the page at a path of its server; fail after `seconds`."""
+    ends, now = time.monotonic() + seconds, None
+    while now != path:
+        assert time.monotonic() < ends, f"never at {path}, but at {now}"
+        time.sleep(0.02)
+        with contextlib.suppress(RuntimeError):  # a script cannot run while one page replaces the other
+            now = browser.evaluate("location.pathname")

@@ -6,7 +6,7 @@ import re
 from html.parser import HTMLParser
 
 import pytest
-from web.pages import Browser, wait_for_message, wait_until
+from web.pages import Browser, wait_for_message, wait_for_path, wait_until
 from web.site import Site, serve_player
 
 from hyrfpack.web.gallery import Card, encode_gallery, format_bytes
@@ -123,7 +123,7 @@ def check_way_back(browser: Browser, host: Site) -> None:
         assert back[0] >= 0 and back[2] <= size[0]
         assert all(back[2] <= b[0] or b[2] <= back[0] or back[3] <= b[1] or b[3] <= back[1] for b in others), boxes
     browser.evaluate("(document.getElementById('back').click(), 0)")
-    wait_until(browser, "location.pathname === '/index.html'")
+    wait_for_path(browser, "/index.html")
     browser.open(f"{host.address}/player.html?content=gone.hyrf")
     wait_for_message(browser)
     assert browser.evaluate(BACK_VISIBLE_JS), "a scene that fails has no way back"
