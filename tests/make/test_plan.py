@@ -15,39 +15,41 @@ from hyrfpack.make.plan import (
 )
 from hyrfpack.train.resolution import PhotoSize
 
-CPU, GPU = torch.device("cpu"), torch.device("cuda")
+CPU_DEVICE, GPU_DEVICE = torch.device("cpu"), torch.device("cuda")
 REAL_QUALITIES = dict(QUALITIES)  # while tests run, quick ones replace them (conftest.py)
 
 
 @pytest.mark.parametrize("pixels", [1, 200 * 200, SMALL_PHOTO_PIXELS])
 def test_normal_quality_takes_3000_steps_on_small_photos(pixels):
-    assert REAL_QUALITIES["normal"].training_steps(pixels, CPU) == 3_000
+    assert REAL_QUALITIES["normal"].training_steps(pixels, CPU_DEVICE) == 3_000
 
 
 @pytest.mark.parametrize("pixels", [LARGE_PHOTO_PIXELS, 1600 * 1200, 4000 * 3000])
 def test_normal_quality_takes_2000_steps_on_large_photos(pixels):
-    assert REAL_QUALITIES["normal"].training_steps(pixels, CPU) == 2_000
+    assert REAL_QUALITIES["normal"].training_steps(pixels, CPU_DEVICE) == 2_000
 
 
 def test_training_steps_fall_steadily_between_small_and_large_photos():
     normal = REAL_QUALITIES["normal"]
-    steps = [normal.training_steps(pixels, CPU) for pixels in range(SMALL_PHOTO_PIXELS, LARGE_PHOTO_PIXELS, 50_000)]
+    steps = [
+        normal.training_steps(pixels, CPU_DEVICE) for pixels in range(SMALL_PHOTO_PIXELS, LARGE_PHOTO_PIXELS, 50_000)
+    ]
     assert steps == sorted(steps, reverse=True) and len(set(steps)) == len(steps)
     # Half-way on a logarithmic scale is the geometric mean.
     middle = (SMALL_PHOTO_PIXELS * LARGE_PHOTO_PIXELS) ** 0.5
-    assert normal.training_steps(middle, CPU) == pytest.approx((3_000 * 2_000) ** 0.5, abs=1)
+    assert normal.training_steps(middle, CPU_DEVICE) == pytest.approx((3_000 * 2_000) ** 0.5, abs=1)
 
 
 @pytest.mark.parametrize(("quality", "steps"), [("draft", 600), ("best", 10_000)])
 @pytest.mark.parametrize("pixels", [SMALL_PHOTO_PIXELS, LARGE_PHOTO_PIXELS])
 def test_only_normal_quality_depends_on_the_size_of_photos(quality, steps, pixels):
-    assert REAL_QUALITIES[quality].training_steps(pixels, CPU) == steps
+    assert REAL_QUALITIES[quality].training_steps(pixels, CPU_DEVICE) == steps
 
 
 @pytest.mark.parametrize("name", REAL_QUALITIES)
 def test_steps_on_a_gpu_do_not_depend_on_the_size_of_photos(name):
     quality = REAL_QUALITIES[name]
-    assert {quality.training_steps(pixels, GPU) for pixels in (10_000, 2_000_000)} == {quality.gpu_steps}
+    assert {quality.training_steps(pixels, GPU_DEVICE) for pixels in (10_000, 2_000_000)} == {quality.gpu_steps}
 
 
 def test_photos_are_expected_at_the_size_to_which_they_are_shrunk():
@@ -63,7 +65,7 @@ def test_frames_of_a_video_are_expected_in_full_hd():
 def test_the_estimate_grows_with_photos_pixels_and_steps():
     def seconds(count, side, steps):
         plan = Plan(steps, max_size=1600)
-        return estimate_photos_seconds(count, expected_photo_size((side, side), 1600), plan, CPU)
+        return estimate_photos_seconds(count, expected_photo_size((side, side), 1600), plan, CPU_DEVICE)
 
     usual = seconds(60, 800, 1_000)
     assert all(value > 0 for value in usual.values())

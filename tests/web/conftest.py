@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 
 import pytest
+from web.site import Site, serve_player
 
 from tools.browser import chromium, firefox
 from tools.browser.browser import Browser
@@ -69,3 +70,18 @@ def browser(request: pytest.FixtureRequest, start_browser: Callable[[str], Brows
 def one_browser(start_browser: Callable[[str], Browser]) -> Browser:
     """Return Chromium, for tests that are slow or do not depend on the browser."""
     return start_browser("chromium")
+
+
+@pytest.fixture
+def host() -> Iterator[Site]:
+    """Yield a server that has a player and two files."""
+    with serve_player() as server_state:
+        yield server_state
+
+
+@pytest.fixture
+def reset_window(browser: Browser) -> Iterator[None]:
+    """Reset the window size and the user's preferences after each test."""
+    yield
+    browser.resize(*WINDOW_SIZE)
+    browser.prefer()

@@ -4,32 +4,17 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Iterator
 
 import pytest
 from PIL import Image
 from web.pages import Browser, make_splats_page, random_splats, wait_for_message, wait_until
-from web.site import Site, drop_file, serve_player
+from web.site import Site, drop_file
 
 from hyrfpack.web.player import encode_player
 
-pytestmark = pytest.mark.in_turn
+pytestmark = [pytest.mark.in_turn, pytest.mark.usefixtures("reset_window")]
 PHONE_OPTIONS = {"dense": 2.0, "phone": True}
 HTML_DATA = b"\xef\xbb\xbf\n<!doctype html><title>Sorry</title>" * 20
-
-
-@pytest.fixture
-def host() -> Iterator[Site]:
-    with serve_player() as server_state:
-        yield server_state
-
-
-@pytest.fixture(autouse=True)
-def reset_window(browser: Browser) -> Iterator[None]:
-    """Reset the window size and the user's preferences after each test."""
-    yield
-    browser.resize(240, 180)
-    browser.prefer()
 
 
 def is_visible(browser: Browser, name: str) -> bool:
@@ -185,16 +170,16 @@ def test_a_page_with_a_model_inside_reports_other_files_by_what_they_are(browser
 
 def test_a_sandboxed_frame_says_that_the_sandbox_forbids_the_request(browser: Browser, host: Site):
     host.files["/around.html"] = (
-        b"<!DOCTYPE html><script>window.told = []; onmessage = ({ data }) => told.push(data);</script>"
+        b"<!DOCTYPE html><script>window.messages = []; onmessage = ({ data }) => messages.push(data);</script>"
         b'<iframe sandbox="allow-scripts" src="index.html?content=cloud.spz"></iframe>'
     )
-    failed = "told.find(({ hyrf }) => hyrf === 'error')?.message ?? ''"
+    failed = "messages.find(({ hyrf }) => hyrf === 'error')?.message ?? ''"
     browser.open(f"{host.address}/around.html")
     wait_until(browser, f"{failed} !== ''")
     assert "allow-same-origin" in browser.evaluate(failed)
     host.headers = {"Access-Control-Allow-Origin": "*"}
     browser.open(f"{host.address}/around.html")
-    wait_until(browser, "told.some(({ hyrf }) => hyrf === 'load')")
+    wait_until(browser, "messages.some(({ hyrf }) => hyrf === 'load')")
 
 
 # ---- progress

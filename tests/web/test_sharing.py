@@ -2,27 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from web.pages import Browser, make_splats_page, random_splats, wait_until
-from web.site import GOLDEN_FILE_DATA, Site, drop_file, serve_player
+from web.site import GOLDEN_FILE_DATA, Site, drop_file
 
-pytestmark = pytest.mark.in_turn
+pytestmark = [pytest.mark.in_turn, pytest.mark.usefixtures("reset_window")]
 PHONE_OPTIONS = {"dense": 2.0, "phone": True}
-
-
-@pytest.fixture
-def host() -> Iterator[Site]:
-    with serve_player() as server_state:
-        yield server_state
-
-
-@pytest.fixture(autouse=True)
-def reset_window(browser: Browser) -> Iterator[None]:
-    yield
-    browser.resize(240, 180)
 
 
 RECORD_SHARING_JS = """(() => {

@@ -4,32 +4,18 @@ from __future__ import annotations
 
 import subprocess
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 from web.pages import SCENE_CENTER, Browser, make_splats_page, open_page, random_splats, wait_for_message, wait_until
-from web.site import GOLDEN_FILE_DATA, Site, drop_file, serve_player, serve_site
+from web.site import GOLDEN_FILE_DATA, Site, drop_file, serve_site
 
 from hyrfpack.web.player import encode_element_script, encode_player
 from tools.browser.build_player import PROGRAMS_FOLDER
 
-pytestmark = pytest.mark.in_turn
+pytestmark = [pytest.mark.in_turn, pytest.mark.usefixtures("reset_window")]
 LOADED_COUNT_JS = "hyrfpack.player.loaded && hyrfpack.player.scene.count"
-
-
-@pytest.fixture
-def host() -> Iterator[Site]:
-    """Yield a server that has a player and two files."""
-    with serve_player() as server_state:
-        yield server_state
-
-
-@pytest.fixture(autouse=True)
-def reset_window(browser: Browser) -> Iterator[None]:
-    yield
-    browser.resize(240, 180)
 
 
 # ---- the address

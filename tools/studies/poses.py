@@ -33,7 +33,7 @@ from hyrfpack.poses.process import run_stage
 from tools.studies.train_sets import DATA_FOLDER
 from tools.tables import markdown_table
 
-STAGES = ("features", "matches", "global", "incremental", "repeat", "finish")
+STAGE_NAMES = ("features", "matches", "global", "incremental", "repeat", "finish")
 
 
 def read_poses(model: pycolmap.Reconstruction, job: Job | None = None) -> Poses:
@@ -125,7 +125,7 @@ def format_table(rows: list[dict]) -> str:
 def format_error_table(rows: list[dict]) -> str:
     """Format errors of the poses and the seconds of each stage as a Markdown table."""
     header = ["set", "rotation error, degrees", "position error, %", "CPU s", "wall s"]
-    header += [f"{stage}: CPU s (wall s)" for stage in STAGES]
+    header += [f"{stage}: CPU s (wall s)" for stage in STAGE_NAMES]
     table_rows = []
     for row in rows:
         if "error" in row:
@@ -133,7 +133,7 @@ def format_error_table(rows: list[dict]) -> str:
         cells = [row["set"], "{:.4f}, {:.4f}".format(*row["angles"])]
         cells += ["{:.4f}, {:.4f}".format(*(100 * distance for distance in row["distances"]))]
         cells += [f"{sum(row['cpu_seconds'].values()):.0f}", f"{row['seconds']:.0f}"]
-        for stage in STAGES:
+        for stage in STAGE_NAMES:
             used, passed = row["cpu_seconds"].get(stage), row["stage_seconds"].get(stage)
             cells.append("" if used is None else f"{used:.0f} ({passed:.0f})")
         table_rows.append(cells)
