@@ -28,7 +28,7 @@ SYNTHETIC_HALF_BOX = 1.3  # NeRF-synthetic objects lie in [-1.3, 1.3]^3.
 # photos. For Mip-NeRF 360 at 1 megapixel they are 0.85 and 0.9 million; published models have up to 2.5 million.
 GAUSSIANS_PER_PIXEL_OF_ONE_PHOTO = 0.85
 GAUSSIANS_PER_PIXEL_OF_ALL_PHOTOS = 1 / 240
-# It limits the time of short runs on large photos; 2,000 steps reach it on photos of 830 x 550 pixels or more.
+# This bounds the time of short runs on large photos. Runs of 2,000 steps reach it on photos of 830 x 550 pixels.
 MAX_GAUSSIANS_PER_STEP = 50
 MIN_BUDGET = 5_000
 # A packed file is assumed to take this many bytes for decoders and headers, and for each Gaussian with its table rows.

@@ -5,7 +5,7 @@
 {
   const find = (name) => document.getElementById(name);
 
-  // Tells the page around this one, where <hyrf-viewer> waits for the first message.
+  // Sends a message to the page around this one, where <hyrf-viewer> waits for the first one.
   const postToParent = (hyrf, message) => window.parent !== window && window.parent.postMessage({ hyrf, message }, "*");
 
   // Decompresses a JSON text in base64.

@@ -26,20 +26,20 @@ class HyrfViewer extends HTMLElement {
     this.frame = document.createElement("iframe");
     this.frame.allow = "fullscreen; clipboard-write; web-share";
     this.frame.onload = () => {
-      if (!this.isAnswered) this.timer = setTimeout(() => this.tell("error", this.noPlayerText()), ANSWER_MS);
+      if (!this.isAnswered) this.timer = setTimeout(() => this.fireEvent("error", this.noPlayerText()), ANSWER_MS);
     };
     const root = this.attachShadow({ mode: "open" });
     root.adoptedStyleSheets = [style];
-    this.hear = this.hear.bind(this);
+    this.receiveMessage = this.receiveMessage.bind(this);
   }
 
   connectedCallback() {
-    addEventListener("message", this.hear);
+    addEventListener("message", this.receiveMessage);
     this.follow();
   }
 
   disconnectedCallback() {
-    removeEventListener("message", this.hear);
+    removeEventListener("message", this.receiveMessage);
     clearTimeout(this.timer);
   }
 
@@ -59,7 +59,7 @@ class HyrfViewer extends HTMLElement {
     try {
       address = player ? new URL(player, document.baseURI) : new URL("index.html", SCRIPT_URL);
     } catch {
-      return this.tell("error", `hyrf-viewer does not know where its player is; ${FIX_TEXT}`);
+      return this.fireEvent("error", `hyrf-viewer does not know where its player is; ${FIX_TEXT}`);
     }
     for (const [name, parameter] of [["src", "content"], ["poster", "poster"]]) {
       const value = this.getAttribute(name);
@@ -67,7 +67,7 @@ class HyrfViewer extends HTMLElement {
       try {
         address.searchParams.set(parameter, new URL(value, document.baseURI));
       } catch {
-        this.tell("error", `${name} is no address of a file: ${value}`);
+        this.fireEvent("error", `${name} is no address of a file: ${value}`);
       }
     }
     if (this.title) address.searchParams.set("title", this.title);
@@ -93,14 +93,14 @@ class HyrfViewer extends HTMLElement {
   }
 
   // Passes on the events of the player in the frame.
-  hear({ source, data }) {
+  receiveMessage({ source, data }) {
     if (source !== this.frame.contentWindow || !data?.hyrf) return;
     this.isAnswered = true;
     clearTimeout(this.timer);
-    if (["load", "error"].includes(data.hyrf)) this.tell(data.hyrf, String(data.message ?? ""));
+    if (["load", "error"].includes(data.hyrf)) this.fireEvent(data.hyrf, String(data.message ?? ""));
   }
 
-  tell(name, detail) {
+  fireEvent(name, detail) {
     this.dispatchEvent(new CustomEvent(name, { detail }));
   }
 }
