@@ -27,9 +27,10 @@ from hyrfpack.model import HybridModel
 from hyrfpack.outputs import Outputs
 from hyrfpack.scene import Scene
 from hyrfpack.splats.files import READABLE_ENDINGS, read_splats
-from hyrfpack.web.gallery import Card, encode_gallery
+from hyrfpack.web.gallery import STYLE_FILE_NAME as GALLERY_STYLE_NAME
+from hyrfpack.web.gallery import Card, encode_gallery, encode_gallery_style
 from hyrfpack.web.html import encode_stage
-from hyrfpack.web.player import encode_element_script, encode_player, encode_readme
+from hyrfpack.web.player import encode_element_script, encode_player, encode_player_files, encode_readme
 from hyrfpack.web.view import find_playable_file
 
 _LOG = logging.getLogger(__name__)
@@ -107,9 +108,10 @@ def _write_player(source: StrPath | None, output: _OutputFolder, data: Scene | N
         description = f"{count:,} Gaussians, {scene.length:,} bytes"
     output.write(ELEMENT_SCRIPT_NAME, encode_element_script())
     output.write(README_NAME, encode_readme(title, INDEX_NAME, INDEX_NAME, element=content or "URL"))
-    output.write(
-        INDEX_NAME, encode_player(title, content=content, poster=poster, description=description, stages=stages)
-    )
+    for name, encoded in encode_player_files().items():
+        output.write(name, encoded)
+    page = encode_player(title, content=content, poster=poster, description=description, stages=stages, in_folder=True)
+    output.write(INDEX_NAME, page)
     return ExportReport(str(output.path), output.bytes, count, native=source is not None)
 
 
@@ -169,7 +171,10 @@ def _write_gallery(sources: Sequence[StrPath], output: _OutputFolder, scenes: Se
     title = _folder_title(output.path)
     pairs = zip(cards, contents, strict=True)
     stages = {card.content: shown.stage for card, shown in pairs if shown.stage}
-    output.write(GALLERY_PLAYER_NAME, encode_player(title, stages=stages, gallery=INDEX_NAME))
+    for name, encoded in encode_player_files().items():
+        output.write(name, encoded)
+    output.write(GALLERY_PLAYER_NAME, encode_player(title, stages=stages, gallery=INDEX_NAME, in_folder=True))
+    output.write(GALLERY_STYLE_NAME, encode_gallery_style())
     output.write(README_NAME, encode_readme(title, GALLERY_PLAYER_NAME, INDEX_NAME))
     output.write(INDEX_NAME, encode_gallery(title, cards, GALLERY_PLAYER_NAME))
     return ExportReport(str(output.path), output.bytes, sum(card.count for card in cards), native=True)
@@ -189,7 +194,8 @@ def check_folder(
         HyrfError: a file must not be replaced or cannot be written.
     """
     names = [name for pair in _choose_file_names(sources, is_gallery=is_gallery) for name in pair]
-    names += [README_NAME, INDEX_NAME, GALLERY_PLAYER_NAME if is_gallery else ELEMENT_SCRIPT_NAME]
+    names += [README_NAME, INDEX_NAME, *encode_player_files()]
+    names += [GALLERY_PLAYER_NAME, GALLERY_STYLE_NAME] if is_gallery else [ELEMENT_SCRIPT_NAME]
     files = [find_playable_file(source) for source in sources]
     for scene in scenes or [None]:
         Outputs(*files, scene=scene, overwrite=overwrite).folder(folder, names)

@@ -11,6 +11,8 @@ from hyrfpack.version import __version__
 from hyrfpack.web.assets import read_web_file
 from hyrfpack.web.player import content_security_policy, fill_template, meta_tags
 
+STYLE_FILE_NAME = "gallery.css"
+
 
 @dataclass(frozen=True)
 class Card:
@@ -35,6 +37,8 @@ class Card:
 def encode_gallery(title: str, cards: Sequence[Card], player: str) -> bytes:
     """Return a page of cards without scripts; all texts are escaped, so that none is read as HTML.
 
+    Its style is the file STYLE_FILE_NAME beside it, see `encode_gallery_style`.
+
     Args:
         title: title of the page.
         cards: the entries, one for each scene.
@@ -43,18 +47,22 @@ def encode_gallery(title: str, cards: Sequence[Card], player: str) -> bytes:
     Returns:
         The file, UTF-8. The same arguments give the same bytes.
     """
-    style = read_web_file("hosted/gallery.css")
     posters = [quote(card.poster) for card in cards if card.poster]
     tags = meta_tags(title, f"{len(cards)} scenes in 3D", posters[0] if posters else None)
     values = {
-        "policy": content_security_policy(style, fetches="'self'"),
+        "policy": content_security_policy("'self'", fetches="'self'"),
         "version": __version__,
         "title": html.escape(title),
         "meta": tags,
-        "style": style,
+        "style": STYLE_FILE_NAME,
         "cards": "\n".join(_card(card, player) for card in cards),
     }
     return fill_template(read_web_file("hosted/gallery.html"), values).encode()
+
+
+def encode_gallery_style() -> bytes:
+    """Return the style sheet of a gallery."""
+    return read_web_file("hosted/gallery.css").encode()
 
 
 def _card(card: Card, player: str) -> str:

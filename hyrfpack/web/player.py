@@ -22,6 +22,7 @@ SHADER_SUFFIXES = (".vert", ".frag", ".glsl")
 _SHADER_COMMENT = re.compile(r"\s*//.*")
 # The browser decodes one base64 block while it loads the next one. A multiple of 3 needs no padding.
 PAYLOAD_BLOCK_BYTES = 3 << 20
+STYLE_FILE_NAME, SCRIPT_FILE_NAME, WORKER_FILE_NAME = "player.css", "player.js", "player-worker.js"
 GZIP_WINDOW_BITS = 31  # zlib's value for the largest window with a gzip header, which holds no time and no name
 # Content security policy sources of a player whose address may name a file on any server.
 ANY_SOURCE = "'self' https: http:"
@@ -37,6 +38,7 @@ def encode_player(
     stages: Mapping[str, dict] | None = None,
     updates: str | None = None,
     gallery: str | None = None,
+    in_folder: bool = False,
 ) -> bytes:
     """Return a page that plays a hosted file, a file that its address names (`?content=URL`), or a dropped file.
 
@@ -53,6 +55,8 @@ def encode_player(
             0 while there is none, "step", "steps"}. The page requests it repeatedly and shows newer snapshots from the
             viewer's current viewpoint. None for a file that does not change.
         gallery: address, relative to the page, of the list of scenes that a button leads back to; None for no button.
+        in_folder: use the scripts and the style of `encode_player_files`, which must be beside the page, so that the
+            page runs on servers whose content security policy is `default-src 'self'`.
 
     Returns:
         The file, UTF-8. The same arguments give the same bytes.
@@ -63,7 +67,17 @@ def encode_player(
     texts = [json_element("content", settings)] if content is not None or stages else []
     if poster is not None:
         texts.append(f'<img id="poster" alt="" src="{html.escape(poster)}">')
-    return assemble_player_page(title, texts, description, image=poster, fetches=fetches, gallery=gallery)
+    assemble = _assemble_page_in_folder if in_folder else assemble_player_page
+    return assemble(title, texts, description, image=poster, fetches=fetches, gallery=gallery)
+
+
+def encode_player_files() -> dict[str, bytes]:
+    """Return, by name, the files beside a page of `encode_player` with `in_folder`."""
+    return {
+        STYLE_FILE_NAME: read_style().encode(),
+        SCRIPT_FILE_NAME: _script_with_texts("main.js", embedded_texts()),
+        WORKER_FILE_NAME: read_script("worker.js").encode(),
+    }
 
 
 def assemble_player_page(
@@ -97,31 +111,63 @@ def assemble_player_page(
         for at in range(0, len(view), PAYLOAD_BLOCK_BYTES)
     )
     values = {
-        "policy": content_security_policy(style, [script, main], fetches),
+        "policy": content_security_policy(hash_source(style), [hash_source(text) for text in (script, main)], fetches),
+        "style": f"<style>{style}</style>",
+        "texts": "\n".join([*texts, text_element("player", packed)]),
+        "script": f"<script>{script}</script>",
+        "payload": "\n".join(f'<script type="text/plain" class="payload">{block}</script>' for block in blocks),
+    }
+    return _fill_page(title, description, image, gallery, values, readers=readers)
+
+
+def _assemble_page_in_folder(
+    title: str, texts: list[str], description: str, *, image: str | None, fetches: str, gallery: str | None
+) -> bytes:
+    """Return the player's page around the files of `encode_player_files`; arguments as for `assemble_player_page`."""
+    values = {
+        "policy": content_security_policy("'self'", ["'self'"], fetches, workers="'self'"),
+        "style": f'<link rel="stylesheet" href="{STYLE_FILE_NAME}">',
+        "texts": "\n".join(texts),
+        "script": f'<script src="{SCRIPT_FILE_NAME}"></script>',
+        "payload": "",
+    }
+    return _fill_page(title, description, image, gallery, values)
+
+
+def _fill_page(
+    title: str,
+    description: str,
+    image: str | None,
+    gallery: str | None,
+    values: dict[str, str],
+    *,
+    readers: bool = True,
+) -> bytes:
+    """Return the player's page from values of its template; other arguments as for `assemble_player_page`."""
+    values = values | {
         "version": __version__,
         "title": html.escape(title),
         "meta": meta_tags(title, description, image),
-        "style": style,
         "accept": ",".join([MODEL_SUFFIX, *SPLATS_SUFFIXES] if readers else [MODEL_SUFFIX]),
         "back": "" if gallery is None else BACK_LINK.format(html.escape(gallery)),
-        "texts": "\n".join([*texts, text_element("player", packed)]),
-        "script": script,
-        "payload": "\n".join(f'<script type="text/plain" class="payload">{block}</script>' for block in blocks),
     }
     return fill_template(read_web_file("viewer/page.html"), values).encode()
 
 
-def content_security_policy(style: str, scripts: Sequence[str] = (), fetches: str = "") -> str:
+def content_security_policy(
+    style: str, scripts: Sequence[str] = (), fetches: str = "", *, workers: str = "blob:"
+) -> str:
     """Return a content security policy that allows only the page's own scripts, and fetches only from `fetches`.
 
     Args:
-        style: text of the page's style element.
-        scripts: texts of its script elements.
+        style: source of the page's style, such as `hash_source` of its style element.
+        scripts: sources of its scripts.
         fetches: further sources of files and pictures, in addition to the page itself.
+        workers: sources of workers.
     """
-    allowed = {"default-src": "'none'", "style-src": _hash_source(style), "img-src": f"{fetches} data: blob:".strip()}
+    allowed = {"default-src": "'none'", "style-src": style, "img-src": f"{fetches} data: blob:".strip()}
     if scripts:
-        allowed |= {"script-src": " ".join(map(_hash_source, scripts)), "worker-src": "blob:"}
+        allowed |= {"script-src": " ".join(scripts), "worker-src": workers}
         allowed |= {"connect-src": fetches} if fetches else {}
     allowed |= {"base-uri": "'none'", "form-action": "'none'"}
     return "; ".join(f"{directive} {sources}" for directive, sources in allowed.items())
@@ -141,7 +187,13 @@ def meta_tags(title: str, description: str, image: str | None = None) -> str:
 
 def encode_element_script() -> bytes:
     """Return the script that defines <hyrf-viewer> for pages of other authors and adds no global names to them."""
-    return read_script("element.js").encode()
+    return _script_with_texts("element_script.js", embedded_texts("worker.js"))
+
+
+def _script_with_texts(name: str, texts: dict[str, str]) -> bytes:
+    """Return one of the scripts, with the texts that it reads by their names in front."""
+    constant = f"const EMBEDDED_TEXTS={json.dumps(texts, ensure_ascii=False)};"
+    return f'(() => {{"use strict";{constant}\n{read_script(name)}}})();\n'.encode()
 
 
 def encode_readme(title: str, entry: str, index: str, *, element: str | None = None) -> bytes:
@@ -172,12 +224,21 @@ def _pack_scripts(worker: str) -> tuple[str, str]:
     Args:
         worker: name of the script of the worker.
     """
-    paths = list_web_files("viewer", *SHADER_SUFFIXES)
-    texts = {path.removeprefix("viewer/"): strip_shader_comments(read_web_file(path)) for path in paths}
-    texts |= {"worker.js": read_script(worker), "main.js": read_script("main.js")}
+    texts = embedded_texts(worker) | {"main.js": read_script("main.js")}
     packer = zlib.compressobj(9, zlib.DEFLATED, GZIP_WINDOW_BITS, 9)
     packed = packer.compress(json.dumps(texts).encode()) + packer.flush()
     return texts["main.js"], base64.b64encode(packed).decode()
+
+
+def embedded_texts(worker: str | None = None) -> dict[str, str]:
+    """Return the texts that the player's scripts read by their names: the shaders, and the worker's script "worker.js".
+
+    Args:
+        worker: name of the script of the worker; None to leave it out.
+    """
+    paths = list_web_files("viewer", *SHADER_SUFFIXES)
+    shaders = {path.removeprefix("viewer/"): strip_shader_comments(read_web_file(path)) for path in paths}
+    return shaders | ({} if worker is None else {"worker.js": read_script(worker)})
 
 
 def strip_shader_comments(text: str) -> str:
@@ -186,7 +247,7 @@ def strip_shader_comments(text: str) -> str:
     return "\n".join(line for line in lines if line)
 
 
-def _hash_source(text: str) -> str:
+def hash_source(text: str) -> str:
     """Return the hash source by which a content security policy allows an inline script or style."""
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
 

@@ -12,7 +12,7 @@ from hyrfpack.web.modules import link_modules
 
 _LOG = logging.getLogger(__name__)
 
-SCRIPT_NAMES = ("boot.js", "element.js", "main.js", "worker.js", "worker_model.js")
+SCRIPT_NAMES = ("boot.js", "element_script.js", "main.js", "worker.js", "worker_model.js")
 STYLE_NAME = "style.css"
 MINIFIED_FOLDER = "minified"
 DIGEST_NAME = "sources.sha256"

@@ -21,7 +21,7 @@ from hyrfpack.export import ExportReport, export_gallery, export_model, export_p
 from hyrfpack.format import load_model, save_model
 
 GAUSSIAN_POSITIONS = np.random.default_rng(0).uniform(-0.6, 0.6, (40, 3))
-PLAYER_FILES = {"README.txt", "hyrf-viewer.js", "index.html"}
+PLAYER_FILES = {"README.txt", "hyrf-viewer.js", "index.html", "player.css", "player.js", "player-worker.js"}
 
 
 def write_model(path: Path, **provenance) -> Path:
@@ -139,7 +139,7 @@ def test_splats_without_extent_have_no_poster(tmp_path):
 def test_a_gallery_lists_its_scenes_and_links_to_its_player(model_file, splats_file, tmp_path):
     report = export_gallery([model_file, splats_file], tmp_path / "g")
     assert file_names(tmp_path / "g") == {
-        *("index.html", "player.html", "README.txt"),
+        *("index.html", "player.html", "README.txt", "gallery.css", "player.css", "player.js", "player-worker.js"),
         *("room.hyrf", "room.jpg", "cloud.ply", "cloud.jpg"),
     }
     page = (tmp_path / "g" / "index.html").read_text()

@@ -16,7 +16,7 @@ from web.pages import Browser, random_splats
 
 from hyrfpack.splats.formats import spz
 from hyrfpack.splats.formats.hints import Hints
-from hyrfpack.web.player import encode_element_script, encode_player
+from hyrfpack.web.player import encode_element_script, encode_player, encode_player_files
 
 GOLDEN_FILE_DATA = (Path(__file__).parents[1] / "golden" / "v1.1_compact.hyrf").read_bytes()
 
@@ -61,7 +61,9 @@ def serve_site() -> Iterator[Site]:
             start = (byte_range or "bytes=0-").removeprefix("bytes=").removesuffix("-")
             first = int(start) if server_state.ranges else 0
             self.send_response(206 if first else 200)
-            kind = {"html": "text/html; charset=utf-8", "js": "text/javascript"}.get(path.rpartition(".")[2])
+            kind = {"html": "text/html; charset=utf-8", "js": "text/javascript", "css": "text/css"}.get(
+                path.rpartition(".")[2]
+            )
             self.send_header("Content-Type", kind or "application/octet-stream")
             self.send_header("Content-Length", str(len(data) - first))
             if first:
@@ -99,6 +101,7 @@ def serve_player() -> Iterator[Site]:
             "/some scene.hyrf": GOLDEN_FILE_DATA,
             "/cloud.spz": spz.encode(random_splats(300), Hints(spz_version=3)),
             "/hyrf-viewer.js": encode_element_script(),
+            **{f"/{name}": data for name, data in encode_player_files().items()},
         }
         yield server_state
 

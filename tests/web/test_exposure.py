@@ -144,7 +144,7 @@ def test_moving_and_switching_decode_nothing_and_a_still_picture_draws_nothing(b
     run_statements(
         browser,
         "const { player } = hyrfpack; window.content = player.renderer.content; window.messages = [];"
-        "const { worker } = player.loader, post = worker.postMessage.bind(worker);"
+        "const { worker } = player.loader.connection.shared, post = worker.postMessage.bind(worker);"
         "worker.postMessage = (data, ...rest) => (messages.push(...Object.keys(data)), post(data, ...rest));",
     )
     browser.drag((120, 90), (200, 110))
@@ -375,7 +375,7 @@ def host():
 def test_the_element_has_an_exposure_attribute(browser: Browser, host: Site):
     host.files["/post.html"] = (
         b"<!DOCTYPE html><script src=hyrf-viewer.js></script>"
-        b'<hyrf-viewer src="scene.hyrf" exposure="consistent"></hyrf-viewer>'
+        b'<hyrf-viewer frame src="scene.hyrf" exposure="consistent"></hyrf-viewer>'
     )
     element = "document.querySelector('hyrf-viewer')"
     inside = f"{element}.shadowRoot.querySelector('iframe').contentWindow.hyrfpack?.player"

@@ -9,7 +9,7 @@ import pytest
 from web.pages import Browser, wait_for_message, wait_for_path, wait_until
 from web.site import Site, serve_player
 
-from hyrfpack.web.gallery import Card, encode_gallery, format_bytes
+from hyrfpack.web.gallery import Card, encode_gallery, encode_gallery_style, format_bytes
 from hyrfpack.web.player import encode_player
 
 BACK_VISIBLE_JS = "document.getElementById('back').checkVisibility()"
@@ -68,7 +68,7 @@ def test_a_gallery_has_a_preview_picture_and_light_and_dark_colors():
     cards = [Card("a", "a.hyrf", None, 1, 1), Card("b", "b.hyrf", "b.jpg", 1, 1)]
     data = encode_gallery("scenes", cards, "player.html").decode()
     assert '<meta property="og:image" content="b.jpg">' in data and "2 scenes" in data
-    assert "prefers-color-scheme: dark" in data
+    assert "prefers-color-scheme: dark" in encode_gallery_style().decode()
 
 
 def luminance(color: str) -> float:
@@ -80,7 +80,7 @@ def luminance(color: str) -> float:
 
 
 def test_text_has_enough_contrast_in_light_and_dark():
-    data = encode_gallery("scenes", [], "player.html").decode()
+    data = encode_gallery_style().decode()
     schemes = re.findall(r":root \{([^}]*)\}", data)
     assert len(schemes) == 2
     for scheme in schemes:

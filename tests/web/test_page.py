@@ -21,7 +21,13 @@ from hyrfpack.model import Frame
 from hyrfpack.scene import Camera
 from hyrfpack.splats.splats import Splats, normalized_quats
 from hyrfpack.web.html import decode_splats_page, encode_model_page, encode_splats_page, extract_payload
-from hyrfpack.web.player import assemble_player_page, encode_player, strip_shader_comments
+from hyrfpack.web.player import (
+    assemble_player_page,
+    encode_element_script,
+    encode_player,
+    encode_player_files,
+    strip_shader_comments,
+)
 
 UP_DIRECTION, SCENE_CENTER = np.array([0.0, -1.0, 0.0]), np.array([1000.0, -50.0, 20.0])
 SCENE_FRAME = Frame((1000.0, -50.0, 20.0), 4.0, (1.0, 1.0, 1.0))
@@ -77,11 +83,12 @@ PAGE_ENCODERS = {
     "player": lambda: encode_player(
         HOSTILE_TITLE, content="scene.hyrf", poster="poster.jpg", description=HOSTILE_TITLE
     ),
+    "in a folder": lambda: encode_player(HOSTILE_TITLE, content="scene.hyrf", poster="poster.jpg", in_folder=True),
     "served": lambda: encode_player(HOSTILE_TITLE, content="scene.hyrf", fetches="'self'"),
 }
 
 
-@pytest.mark.parametrize("kind", PAGE_ENCODERS)
+@pytest.mark.parametrize("kind", ["native", "baked", "player", "served"])
 def test_a_page_is_reproducible_and_runs_only_scripts_in_its_policy(kind):
     page = PAGE_ENCODERS[kind]()
     assert page == PAGE_ENCODERS[kind]()
@@ -94,6 +101,17 @@ def test_a_page_is_reproducible_and_runs_only_scripts_in_its_policy(kind):
     assert allowed["script-src"] == " ".join(f"'sha256-{value}'" for value in hashes)
     assert allowed["default-src"] == "'none'" and "unsafe" not in str(allowed)
     assert not re.search(r"\son\w+=", page.decode()), "an inline handler"
+
+
+def test_a_page_in_a_folder_has_no_script_or_style_inside_and_allows_only_files_beside_it():
+    page = PAGE_ENCODERS["in a folder"]()
+    assert page == PAGE_ENCODERS["in a folder"]()
+    text, allowed = page.decode(), parse_policy(page)
+    assert "<style" not in text and not re.search(r"\s(on\w+|style)=", text)
+    scripts = re.findall(r"<script([^>]*)>", text)
+    assert [tag for tag in scripts if "text/plain" not in tag] == [' src="player.js"']
+    assert allowed["script-src"] == allowed["style-src"] == allowed["worker-src"] == "'self'"
+    assert set(encode_player_files()) == {"player.css", "player.js", "player-worker.js"}
 
 
 @pytest.mark.parametrize("kind", PAGE_ENCODERS)
@@ -134,7 +152,13 @@ def test_comments_and_indentation_are_removed_from_shaders():
     assert strip_shader_comments(text) == "void main() {\nx = a / b;\n}"
 
 
-@pytest.mark.parametrize(("readers", "most"), [(False, 53_400), (True, 61_000)])
+def test_the_elements_script_holds_all_that_it_needs():
+    script = encode_element_script().decode()
+    assert script.startswith('(() => {"use strict";const EMBEDDED_TEXTS=')
+    assert all(f'"{name}"' in script for name in ("blend.frag", "worker.js"))
+
+
+@pytest.mark.parametrize(("readers", "most"), [(False, 54_500), (True, 62_100)])
 def test_the_compressed_player_stays_below_its_size_limit(readers, most):
     assert len(gzip.compress(assemble_player_page("hyrfpack", [], "a player", readers=readers))) <= most
 

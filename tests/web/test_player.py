@@ -344,9 +344,16 @@ def test_a_short_key_press_moves_the_camera_at_any_frame_rate(browser: Browser, 
 
 def test_a_double_tap_marks_its_position(browser: Browser, tmp_path: Path):
     wait_until_still(open_page(browser, tmp_path, make_splats_page(random_splats())))
+    # The ring stays for a moment only, so the page itself measures it when it is shown.
+    browser.evaluate("""{
+      const ring = document.getElementById('ring');
+      new MutationObserver(() => {
+        const { left, right, top, bottom } = ring.getBoundingClientRect();
+        if (!ring.hidden) window.ringSums ??= [left + right, top + bottom];
+      }).observe(ring, { attributes: true });
+    }""")
     for _ in range(2):
         browser.click(120, 90)
-    box = browser.evaluate("(({ left, right, top, bottom }) => [left + right, top + bottom])"
-                           "(document.getElementById('ring').getBoundingClientRect())")  # fmt: skip
-    assert box == pytest.approx([240, 180], abs=3)
+    wait_until(browser, "window.ringSums")
+    assert browser.evaluate("window.ringSums") == pytest.approx([240, 180], abs=3)
     wait_until(browser, "document.getElementById('ring').hidden")

@@ -220,7 +220,7 @@ def test_the_element_shows_a_file_and_follows_its_attributes(browser: Browser, h
         f"<script{kind} src=../hyrf-viewer.js></script>"
         "<script>window.fired = []; for (const name of ['load', 'error'])"
         " document.addEventListener(name, (event) => fired.push([name, event.detail]), true);</script>"
-        '<hyrf-viewer src="../cloud.spz" camera="1" title="A cloud" noui></hyrf-viewer>'
+        '<hyrf-viewer frame src="../cloud.spz" camera="1" title="A cloud" noui></hyrf-viewer>'
     ).encode()
     browser.open(f"{host.address}/blog/post.html")
     wait_until(browser, "fired.some(([name, detail]) => name === 'load' && detail === '')")
@@ -248,7 +248,7 @@ BUNDLED_SCRIPT_KINDS = {"module": " type=module", "classic": " defer"}
 
 def bundle_element(folder: Path, player_attribute: str) -> bytes:
     """Bundle hyrf-viewer.js with a script that adds an element, by esbuild if it is here."""
-    add = f"document.body.innerHTML = `<hyrf-viewer src='cloud.spz' noui {player_attribute}></hyrf-viewer>`;"
+    add = f"document.body.innerHTML = `<hyrf-viewer frame src='cloud.spz' noui {player_attribute}></hyrf-viewer>`;"
     (folder / "hyrf-viewer.js").write_bytes(encode_element_script())
     (folder / "entry.js").write_text(f'import "./hyrf-viewer.js";\n{add}\n')
     if not (PROGRAMS_FOLDER / "esbuild").exists():
@@ -281,7 +281,7 @@ def test_an_element_whose_player_may_not_run_fires_an_error(browser: Browser, ho
     host.files["/watch.js"] = WATCH_EVENTS_HTML.partition("<script>")[2].removesuffix("</script>").encode()
     host.files["/post.html"] = (
         b"<!DOCTYPE html><script src=watch.js></script><script src=hyrf-viewer.js></script>"
-        b'<hyrf-viewer src="cloud.spz"></hyrf-viewer>'
+        b'<hyrf-viewer frame src="cloud.spz"></hyrf-viewer>'
     )
     browser.open(f"{host.address}/post.html")
     wait_until(browser, "fired.some(([name, detail]) => name === 'error' && /not allowed to run here/.test(detail))")
@@ -289,7 +289,7 @@ def test_an_element_whose_player_may_not_run_fires_an_error(browser: Browser, ho
 
 def test_the_element_has_no_sandbox_which_would_protect_nothing(browser: Browser, host: Site):
     host.files["/post.html"] = (
-        WATCH_EVENTS_HTML + '<script src=hyrf-viewer.js></script><hyrf-viewer src="cloud.spz"></hyrf-viewer>'
+        WATCH_EVENTS_HTML + '<script src=hyrf-viewer.js></script><hyrf-viewer frame src="cloud.spz"></hyrf-viewer>'
     ).encode()
     browser.open(f"{host.address}/post.html")
     wait_until(browser, "fired.some(([name, detail]) => name === 'load' && detail === '')")

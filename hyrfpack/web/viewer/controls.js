@@ -17,28 +17,39 @@ const KEY_PRESS_SECONDS = 1 / 60; // a short press moves the eye this long, even
 const KEY_ALIASES = { "=": "+", _: "-", Add: "+", Subtract: "-" }; // keys with the same function
 
 export class Controls {
-  // Callbacks: `acted()` after any input; `approach(x, y)` after a double-click, in CSS pixels; `press(key)` for keys
-  // that do not move the eye; `ignored(kind)` when a "wheel" or a "finger" is left to the surrounding page.
-  constructor(player, damper, { acted, approach, press, ignored }) {
+  // `keyTarget` is the object whose keys are used: the window, or the canvas while it has the focus. If `isEmbedded`,
+  // wheel and fingers scroll the surrounding page until the canvas is clicked. Callbacks: `acted()` after any input;
+  // `approach(x, y)` after a double-click, in CSS pixels; `press(key)` for keys that do not move the eye;
+  // `ignored(kind)` when a "wheel" or a "finger" is left to the surrounding page.
+  constructor(player, damper, { keyTarget, isEmbedded, acted, approach, press, ignored }) {
     const { canvas } = player;
     Object.assign(this, { player, canvas, damper, acted, approach, press, ignored });
     this.pointers = new Map();
     this.held = new Map(); // code of each pressed key -> its name
     this.tapped = null;
-    this.framed = window.parent !== window;
-    this.engage(!this.framed); // in a frame, wheel and fingers scroll the surrounding page until the canvas is clicked
-    canvas.addEventListener("pointerdown", (event) => this.down(event));
-    canvas.addEventListener("pointermove", (event) => this.drag(event));
-    for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, (event) => this.lift(event));
-    canvas.addEventListener("lostpointercapture", (event) => this.pointers.delete(event.pointerId));
-    canvas.addEventListener("wheel", (event) => this.wheel(event), { passive: false });
-    canvas.addEventListener("contextmenu", (event) => event.preventDefault());
-    addEventListener("keydown", (event) => this.key(event));
-    addEventListener("keyup", (event) => this.release(event));
-    addEventListener("blur", () => {
+    this.engage(!isEmbedded);
+    this.aborter = new AbortController();
+    const { signal } = this.aborter;
+    canvas.addEventListener("pointerdown", (event) => this.down(event), { signal });
+    canvas.addEventListener("pointermove", (event) => this.drag(event), { signal });
+    for (const name of ["pointerup", "pointercancel"]) {
+      canvas.addEventListener(name, (event) => this.lift(event), { signal });
+    }
+    canvas.addEventListener("lostpointercapture", (event) => this.pointers.delete(event.pointerId), { signal });
+    canvas.addEventListener("wheel", (event) => this.wheel(event), { passive: false, signal });
+    canvas.addEventListener("contextmenu", (event) => event.preventDefault(), { signal });
+    keyTarget.addEventListener("keydown", (event) => this.key(event), { signal });
+    keyTarget.addEventListener("keyup", (event) => this.release(event), { signal });
+    const leave = () => {
       this.held.clear();
-      this.engage(!this.framed);
-    });
+      this.engage(!isEmbedded);
+    };
+    for (const target of new Set([window, keyTarget])) target.addEventListener("blur", leave, { signal });
+  }
+
+  // Stops to listen to input.
+  dispose() {
+    this.aborter.abort();
   }
 
   get eye() {
@@ -48,7 +59,7 @@ export class Controls {
   // Sets whether the canvas uses wheel and fingers, or leaves them to the surrounding page.
   engage(engaged) {
     this.engaged = engaged;
-    this.canvas.classList.toggle("engaged", engaged);
+    this.canvas.style.touchAction = engaged ? "none" : "pan-x pan-y";
   }
 
   // Returns whether a key that moves the eye, a mouse button or a finger is down.
@@ -84,6 +95,12 @@ export class Controls {
     return 1 / (this.eye.focal * Math.sqrt(clientWidth * clientHeight));
   }
 
+  // Returns the position of an event on the canvas, in CSS pixels.
+  placeOf({ clientX, clientY }) {
+    const { left, top } = this.canvas.getBoundingClientRect();
+    return [clientX - left, clientY - top];
+  }
+
   // Converts a position in CSS pixels to units of the focal length, measured from the canvas' centre.
   fromMiddle(x, y) {
     const { clientWidth, clientHeight } = this.canvas;
@@ -93,7 +110,7 @@ export class Controls {
   down(event) {
     if (event.pointerType === "mouse") this.engage(true);
     if (this.engaged) this.canvas.setPointerCapture(event.pointerId);
-    const { clientX: x, clientY: y, timeStamp: time } = event;
+    const [x, y] = this.placeOf(event), { timeStamp: time } = event;
     this.pointers.set(event.pointerId, { x, y });
     this.start = this.pointers.size === 1 && event.button === 0 ? { x, y, time } : null;
     this.acted();
@@ -103,7 +120,7 @@ export class Controls {
     const pointer = this.pointers.get(event.pointerId);
     if (!pointer || !this.engaged || !this.eye) return;
     const before = measureGesture(this.pointers);
-    [pointer.x, pointer.y] = [event.clientX, event.clientY];
+    [pointer.x, pointer.y] = this.placeOf(event);
     const after = measureGesture(this.pointers);
     const dx = (after.x - before.x) * this.pixel, dy = (after.y - before.y) * this.pixel;
     this.acted();
@@ -120,7 +137,7 @@ export class Controls {
 
   lift(event) {
     this.pointers.delete(event.pointerId);
-    const { clientX: x, clientY: y, timeStamp: time } = event;
+    const [x, y] = this.placeOf(event), { timeStamp: time } = event;
     const near = (to, pixels) => to && Math.hypot(x - to.x, y - to.y) < pixels && time - to.time < MAX_TAP_MS;
     const tap = event.type === "pointerup" && near(this.start, MAX_TAP_MOVE_PIXELS);
     this.start = null;
@@ -144,7 +161,7 @@ export class Controls {
     const step = Math.max(-0.5, Math.min(0.5, event.deltaY * lines * speed));
     event.preventDefault();
     this.acted();
-    if (this.eye) this.damper.zoom(step, ...this.fromMiddle(event.clientX, event.clientY));
+    if (this.eye) this.damper.zoom(step, ...this.fromMiddle(...this.placeOf(event)));
   }
 
   release(event) {

@@ -1,103 +1,79 @@
-// Defines <hyrf-viewer src="scene.hyrf" camera="2" poster="scene.jpg" exposure="consistent" autorotate noui
-// player="player/index.html">, which shows the player in a frame. `player` is by default index.html in the folder of
-// this script, which is unknown where the script is part of a bundle. `src`, `poster` and `player` are relative to the
-// page of the element. It fires the events "load" and "error" (detail: a sentence for the user).
+// Defines <hyrf-viewer src="scene.hyrf">, which draws a scene in the page itself or, with the attribute `frame`, shows
+// the whole player in an iframe. npm/hyrf-viewer/README.md has its attributes, properties and events.
 
-const SCRIPT_URL = document.currentScript?.src || findScriptAddress();
-const ANSWER_MS = 3000; // a player answers long before its page has loaded
-const FIX_TEXT = 'set its attribute player to the address of the player, such as player="player/index.html".';
-const ELEMENT_CSS = ":host { display: block; aspect-ratio: 4 / 3; } :host([hidden]) { display: none; } " +
-  "iframe { display: block; width: 100%; height: 100%; border: 0; }";
+import { FRAME_ATTRIBUTES, FrameView } from "./element_frame.js";
+import { INLINE_ATTRIBUTES, InlineView } from "./element_inline.js";
 
-// Finds this script's address among the page's scripts, because modules have no document.currentScript. Returns
-// undefined if it is not there.
-function findScriptAddress() {
-  const scripts = [...document.querySelectorAll("script[src]")].map(({ src }) => src);
-  return scripts.find((address) => new URL(address).pathname.endsWith("/hyrf-viewer.js"));
-}
+const ELEMENT_CSS = `
+  :host { display: block; position: relative; overflow: hidden; aspect-ratio: 4 / 3; background: #000; }
+  :host([hidden]) { display: none; }
+  iframe { display: block; width: 100%; height: 100%; border: 0; }
+  div, img { position: absolute; inset: 0; width: 100%; height: 100%; }
+  img { object-fit: cover; }
+  .scene { opacity: 0; transition: opacity .4s; }
+  .drawn .scene { opacity: 1; }
+  canvas { cursor: grab; outline-offset: -3px; -webkit-user-select: none; user-select: none; }
+  canvas:active { cursor: grabbing; }
+  progress {
+    position: absolute; left: 0; bottom: 0; width: 100%; height: 4px; appearance: none; border: 0;
+    background: rgb(0 0 0 / 40%);
+  }
+  progress::-webkit-progress-bar { background: none; }
+  progress::-webkit-progress-value { background: #8ab4f8; }
+  progress::-moz-progress-bar { background: #8ab4f8; }
+  p {
+    position: absolute; left: 50%; bottom: 14px; transform: translateX(-50%); box-sizing: border-box; margin: 0;
+    max-width: calc(100% - 24px); padding: 6px 14px; border-radius: 10px; overflow-wrap: anywhere;
+    background: rgb(22 24 28 / 90%); color: #e8eaed; font: 14px/1.4 system-ui, sans-serif; pointer-events: none;
+  }
+  [hidden] { display: none; }
+  @media (prefers-reduced-motion: reduce) { .scene { transition: none; } }
+`;
 
-class HyrfViewer extends HTMLElement {
-  static observedAttributes = ["src", "camera", "poster", "title", "exposure", "autorotate", "noui", "player"];
+// The class exists without a browser, too, so that servers can import the package.
+class HyrfViewerElement extends (globalThis.HTMLElement ?? class {}) {
+  static observedAttributes = [...new Set(["frame", ...INLINE_ATTRIBUTES, ...FRAME_ATTRIBUTES])];
 
   constructor() {
     super();
     const style = new CSSStyleSheet(); // unlike style elements, no page's security policy forbids it
     style.replaceSync(ELEMENT_CSS);
-    this.frame = document.createElement("iframe");
-    this.frame.allow = "fullscreen; clipboard-write; web-share";
-    this.frame.onload = () => {
-      if (!this.isAnswered) this.timer = setTimeout(() => this.fireEvent("error", this.noPlayerText()), ANSWER_MS);
-    };
-    const root = this.attachShadow({ mode: "open" });
-    root.adoptedStyleSheets = [style];
-    this.receiveMessage = this.receiveMessage.bind(this);
+    this.attachShadow({ mode: "open" }).adoptedStyleSheets = [style];
+    this.view = null;
+    this.isScheduled = false;
+  }
+
+  // Returns the viewer of createViewer, or null: in a frame, without a `src`, or while the element is in no page.
+  get viewer() {
+    return this.view?.viewer ?? null;
   }
 
   connectedCallback() {
-    addEventListener("message", this.receiveMessage);
-    this.follow();
+    this.schedule();
   }
 
   disconnectedCallback() {
-    removeEventListener("message", this.receiveMessage);
-    clearTimeout(this.timer);
+    this.schedule();
   }
 
   attributeChangedCallback() {
-    if (this.isConnected) this.follow();
+    this.schedule();
   }
 
-  // Updates the frame's address, once for all attributes that change together. A new camera changes only what follows
-  // "#", so that the frame is not reloaded.
-  async follow() {
-    if (this.following) return;
-    this.following = true;
+  // Updates the view once for all changes of the same moment. An element that is moved in the page keeps its view.
+  async schedule() {
+    if (this.isScheduled) return;
+    this.isScheduled = true;
     await null;
-    this.following = false;
-    const player = this.getAttribute("player");
-    let address;
-    try {
-      address = player ? new URL(player, document.baseURI) : new URL("index.html", SCRIPT_URL);
-    } catch {
-      return this.fireEvent("error", `hyrf-viewer does not know where its player is; ${FIX_TEXT}`);
+    this.isScheduled = false;
+    const View = this.hasAttribute("frame") ? FrameView : InlineView;
+    if (this.view && (!this.isConnected || !(this.view instanceof View))) {
+      this.view.dispose();
+      this.view = null;
     }
-    for (const [name, parameter] of [["src", "content"], ["poster", "poster"]]) {
-      const value = this.getAttribute(name);
-      if (!value) continue;
-      try {
-        address.searchParams.set(parameter, new URL(value, document.baseURI));
-      } catch {
-        this.fireEvent("error", `${name} is no address of a file: ${value}`);
-      }
-    }
-    if (this.title) address.searchParams.set("title", this.title);
-    if (this.hasAttribute("exposure")) address.searchParams.set("exposure", this.getAttribute("exposure"));
-    for (const name of ["autorotate", "noui"]) {
-      if (this.hasAttribute(name)) address.searchParams.set(name, "");
-    }
-    if (this.hasAttribute("camera")) address.hash = `camera=${this.getAttribute("camera")}`;
-    this.frame.title = this.title || "3D scene";
-    if (this.frame.src === address.href) return;
-    if (this.frame.src.split("#")[0] !== address.href.split("#")[0]) {
-      this.isAnswered = false;
-      clearTimeout(this.timer);
-    }
-    this.frame.src = address;
-    // Added only now, so that no empty page loads before, and only once, because moving a frame reloads it.
-    if (!this.frame.isConnected) this.shadowRoot.append(this.frame);
-  }
-
-  noPlayerText() {
-    const address = this.frame.src.split(/[?#]/)[0];
-    return `${address} is no player, or is not allowed to run here; ${FIX_TEXT}`;
-  }
-
-  // Passes on the events of the player in the frame.
-  receiveMessage({ source, data }) {
-    if (source !== this.frame.contentWindow || !data?.hyrf) return;
-    this.isAnswered = true;
-    clearTimeout(this.timer);
-    if (["load", "error"].includes(data.hyrf)) this.fireEvent(data.hyrf, String(data.message ?? ""));
+    if (!this.isConnected) return;
+    this.view ??= new View(this);
+    this.view.update();
   }
 
   fireEvent(name, detail) {
@@ -105,4 +81,8 @@ class HyrfViewer extends HTMLElement {
   }
 }
 
-if (!customElements.get("hyrf-viewer")) customElements.define("hyrf-viewer", HyrfViewer);
+// Defines the element, once for a page.
+export function defineElement() {
+  const registry = globalThis.customElements;
+  if (registry && !registry.get("hyrf-viewer")) registry.define("hyrf-viewer", HyrfViewerElement);
+}

@@ -4,7 +4,7 @@ import { frustumPlanes } from "./frustum.js";
 import { ContextLostError, Graphics, WorkPacer } from "./graphics.js";
 import { TEXTURE_WIDTH } from "./constants.js";
 import { Panorama } from "./panorama.js";
-import { elementText } from "./dom.js";
+import { readText } from "./texts.js";
 import { RowStates } from "./row_states.js";
 
 const MAX_CELLS = 32; // a cell is 8 hidden units; the shaders hold all cells in variables
@@ -54,7 +54,7 @@ export class Fields {
     this.checkMemory();
 
     const shaders = this.shaders(), programs = {};
-    const vertexText = elementText("whole.vert");
+    const vertexText = readText("whole.vert");
     for (const name of Object.keys(shaders)) programs[name] = graphics.compile(vertexText, shaders[name]);
     for (const name of Object.keys(shaders)) await graphics.compiled(programs[name], `${name}.frag`);
     this.programs = programs;
@@ -286,7 +286,7 @@ export class Fields {
 function buildFieldShader(name, constants) {
   const lines = Object.entries(constants).map(([key, value]) => `#define ${key} ${value}`);
   const cells = Array.from({ length: constants.CELLS }, (_, cell) => cell);
-  const text = `${elementText("field.glsl")}\n${elementText(name)}`;
+  const text = `${readText("field.glsl")}\n${readText(name)}`;
   const whole = text.replace(/^EACH (.*)$/gm, (_, line) => cells.map((cell) => line.replaceAll("$", cell)).join("\n"));
   return ["#version 300 es", ...lines, whole].join("\n");
 }

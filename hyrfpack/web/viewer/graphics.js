@@ -1,6 +1,6 @@
 // Wraps WebGL 2. All objects that a Graphics creates are freed together.
 
-import { elementText } from "./dom.js";
+import { readText } from "./texts.js";
 
 const POLL_INTERVAL_MS = 4;
 
@@ -128,7 +128,7 @@ export class Graphics {
 
   // Compiles a program of two shader files.
   program(vertex, fragment) {
-    return this.link(this.compile(elementText(vertex), elementText(fragment)), `${vertex} and ${fragment}`);
+    return this.link(this.compile(readText(vertex), readText(fragment)), `${vertex} and ${fragment}`);
   }
 
   // Finishes a program like `link`, without blocking the page if the driver compiles in parallel.

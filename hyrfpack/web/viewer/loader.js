@@ -1,7 +1,7 @@
 // Connects the page with the worker that reads files and sorts splats.
 
 import { frustumPlanes } from "./frustum.js";
-import { elementText } from "./dom.js";
+import { Connection } from "./worker_pool.js";
 
 // The file is no longer needed, because another one was opened.
 export class SupersededError extends Error {}
@@ -9,13 +9,15 @@ export class SupersededError extends Error {}
 // The browser cannot read any file. The message is for the user.
 export class StartError extends Error {}
 
-const NO_WORKER_TEXT = "A Content-Security-Policy forbids the player's worker; it must allow worker-src blob:.";
+const NO_EMBEDDED_WORKER_TEXT =
+  "A Content-Security-Policy forbids the player's worker; it must allow worker-src blob:.";
 
 export class Loader {
   // `content(message)` is called with each content that was read (see worker_tasks.js), one after the other. Its
   // promise resolves to true if the content is shown. `progress({what, part})` is called with the fraction `part` of
   // the step `what`.
-  constructor({ content, progress }) {
+  // `workerAddress` is that of the worker's script, or null for the embedded one.
+  constructor({ content, progress, workerAddress = null }) {
     if (!window.DecompressionStream) {
       throw new StartError("This browser is too old to unpack the scene; use a newer one.");
     }
@@ -23,21 +25,22 @@ export class Loader {
     this.ticket = 0;
     this.waiting = new Map(); // ticket -> the function that resolves the promise of its order
     this.spare = null; // the array of an old order, for reuse
-    const address = URL.createObjectURL(new Blob([elementText("worker.js")], { type: "text/javascript" }));
-    try {
-      this.worker = new Worker(address);
-    } catch {
-      throw new StartError(NO_WORKER_TEXT);
-    }
-    URL.revokeObjectURL(address);
-    this.worker.onmessage = ({ data }) => {
-      if (data.progress) this.progress(data.progress);
-      if (data.content) this.deliver(data.content);
-      if (data.order) this.sorted(data.order);
-      if (data.error) this.fail(new Error(data.error));
+    const refusal = workerAddress
+      ? `The player's worker ${workerAddress} cannot be started; it must be a script on the same site as the page.`
+      : NO_EMBEDDED_WORKER_TEXT;
+    const receive = (message) => {
+      if (message.progress) this.progress(message.progress);
+      if (message.content) this.deliver(message.content);
+      if (message.order) this.sorted(message.order);
+      if (message.error) this.fail(new Error(message.error));
     };
     // An error without a message means that the worker's script was not allowed to run.
-    this.worker.onerror = ({ message }) => this.fail(message ? new Error(message) : new StartError(NO_WORKER_TEXT));
+    const fail = (message) => this.fail(message ? new Error(message) : new StartError(refusal));
+    try {
+      this.connection = new Connection(workerAddress, receive, fail);
+    } catch {
+      throw new StartError(refusal);
+    }
     this.delivered = Promise.resolve();
     this.broken = false; // true if no more of the file will arrive; the part that was shown can be decoded again
     this.pending = []; // {resolve, reject} of the promises of `expect`
@@ -68,7 +71,7 @@ export class Loader {
   // if it is unknown.
   async read({ name, scene, stage, plain = false, stream, length = stream.length }) {
     const shown = this.expect(), source = stream[Symbol.asyncIterator]();
-    this.worker.postMessage({ start: { name, scene, stage, plain } });
+    this.connection.post({ start: { name, scene, stage, plain } });
     try {
       for (let part = 0;;) {
         const { done, value: bytes } = await Promise.race([source.next(), shown]); // `shown` may fail before the end
@@ -76,28 +79,28 @@ export class Loader {
         part += bytes.length;
         if (length) this.progress({ what: "loading", part: Math.min(1, part / length) });
         const own = bytes.byteLength === bytes.buffer.byteLength ? bytes : bytes.slice();
-        this.worker.postMessage({ bytes: own }, [own.buffer]);
+        this.connection.post({ bytes: own }, [own.buffer]);
       }
     } catch (error) {
       source.return?.().catch(() => {}); // not awaited, because the source may be busy
-      this.worker.postMessage({ broken: true });
+      this.connection.post({ broken: true });
       this.fail(error);
       throw error;
     }
     this.progress({ what: "loading", part: 1 });
-    this.worker.postMessage({ end: true });
+    this.connection.post({ end: true });
     return shown;
   }
 
   // Decodes the same bytes again, as splats if `plain`.
   again(plain) {
-    this.worker.postMessage({ again: { plain } });
+    this.connection.post({ again: { plain } });
   }
 
   // Selects the content that later calls of `sort` sort.
   use(number) {
     this.current = number;
-    this.worker.postMessage({ use: number });
+    this.connection.post({ use: number });
   }
 
   get busy() {
@@ -111,7 +114,7 @@ export class Loader {
     const sides = frustumPlanes(view, 1 + tolerance), row = [...view.rows[2], view.translation[2]];
     const ticket = ++this.ticket, order = this.spare;
     this.spare = null;
-    this.worker.postMessage({ sort: { ticket, row, sides, near, order } }, order ? [order.buffer] : []);
+    this.connection.post({ sort: { ticket, row, sides, near, order } }, order ? [order.buffer] : []);
     return new Promise((resolve) => this.waiting.set(ticket, resolve));
   }
 
@@ -126,7 +129,7 @@ export class Loader {
   }
 
   dispose() {
-    this.worker.terminate();
+    this.connection.close();
     this.fail(new SupersededError("another file was opened instead"));
     for (const answer of this.waiting.values()) answer(null);
     this.waiting.clear();

@@ -1,19 +1,19 @@
-// Connects the player, the controls, the panel and the opener of scenes.
+// Connects the player, its navigation, the panel and the opener of scenes.
 
-import { formatCamera, parseCamera, parseHash, parseSearch } from "./address.js";
-import { Controls } from "./controls.js";
+import { formatCamera, parseCamera, parseHash, parseSearch, resolveAddress } from "./address.js";
 import { element, elementText } from "./dom.js";
 import { AS_PHOTOGRAPHED, CONSISTENT } from "./exposure.js";
 import { Help } from "./help.js";
-import { Damper, Glide, Turntable, prefersReducedMotion } from "./motion.js";
+import { prefersReducedMotion } from "./motion.js";
+import { Navigation } from "./navigation.js";
 import { announce, dismiss, fail, progress, remark, toast } from "./notifications.js";
 import { Opener, postToParent } from "./opener.js";
 import { Panel } from "./panel.js";
 import { Player } from "./player.js";
 import { savePicture, shareView } from "./share.js";
+import { setTextSource } from "./texts.js";
 
 const FADE_MS = 600; // the duration in style.css
-const APPROACH_FACTOR = 0.5; // of the distance to a place that was tapped twice
 const IGNORED_TEXTS = {
   wheel: "Click the scene, then the wheel zooms.",
   finger: "Tap the scene, then fingers move it.",
@@ -51,54 +51,44 @@ function toggleFullscreen() {
   changed?.catch(() => {});
 }
 
+// Shows the page in place of its text that the player has not started. In pages of one file, boot.js has done so.
+function showPage() {
+  if (!element("stalled")) return;
+  document.body.classList.add("started");
+  element("page").hidden = false;
+  element("stalled").remove();
+  postToParent("start");
+}
+
 function start() {
+  showPage();
+  // In a folder, hyrfpack.web.player writes the constant EMBEDDED_TEXTS in front of this script.
+  const isInFolder = typeof EMBEDDED_TEXTS !== "undefined";
+  setTextSource(isInFolder ? (name) => EMBEDDED_TEXTS[name] : elementText);
+  const workerAddress = isInFolder ? resolveAddress("player-worker.js", "worker") : null;
   const parameters = parseSearch(location.search);
   document.body.classList.toggle("bare", parameters.noui);
   showPoster(parameters.poster);
   const embedded = element("scene") ? JSON.parse(elementText("scene")) : null;
   const served = element("content") ? JSON.parse(elementText("content")) : null;
 
-  const player = new Player(element("view"), embedded);
-  const damper = new Damper(player), glide = new Glide(player), turntable = new Turntable(player), help = new Help();
+  const player = new Player(element("view"), { scene: embedded, workerAddress }), help = new Help();
+  const navigation = new Navigation(player, {
+    keyTarget: window,
+    isEmbedded: window.parent !== window,
+    press: (key) => panel.press(key),
+    ignored: (kind) => toast(IGNORED_TEXTS[kind]),
+    acted: () => help.acted(),
+    picked: showRing,
+  });
 
   // ---- cameras
-
-  const choose = (camera) => {
-    if (player.scene && camera < player.cameras.length) glide.to(() => player.choose(camera));
-  };
-
-  const pick = (x, y) => {
-    const isHit = player.pick(x, y);
-    if (isHit) showRing(x, y);
-    return isHit;
-  };
-
-  const approach = (x, y) => {
-    if (!pick(x, y)) return;
-    glide.to(() => {
-      player.eye.approach(player.eye.target, APPROACH_FACTOR);
-      player.changed();
-    });
-  };
-
-  // Moves the eye to the camera of a text from the address.
-  const moveTo = (text, smoothly) => {
-    const { number: camera, view, depth } = parseCamera(text, player.scene);
-    const move = () => {
-      if (camera !== undefined) return player.choose(camera);
-      player.eye.setView(view);
-      if (depth) player.eye.target = player.eye.point(0, 0, depth);
-      player.changed();
-    };
-    if (smoothly) glide.to(move);
-    else move();
-  };
 
   // Moves the eye to the camera of a text from the address (null for none), and shows an error if it is invalid.
   const followCamera = (text, smoothly) => {
     if (text === null || !player.scene) return;
     try {
-      moveTo(text, smoothly);
+      navigation.moveTo(parseCamera(text, player.scene), smoothly ? undefined : 0);
       if (smoothly) dismiss();
     } catch (error) {
       fail(error);
@@ -109,7 +99,7 @@ function start() {
   const followNamedCamera = () => followCamera(parseHash(location.hash) ?? parameters.camera, false);
 
   const setTurning = (isOn) => {
-    turntable.turn(isOn);
+    navigation.turntable.turn(isOn);
     element("turn").setAttribute("aria-pressed", String(isOn));
   };
 
@@ -125,13 +115,17 @@ function start() {
   };
 
   const ifLoaded = (action) => () => player.loaded && action();
+  const chooseNext = (step) => {
+    const { length } = player.cameras;
+    navigation.choose((player.camera + length + step) % length);
+  };
   const panel = new Panel(player, {
-    choose,
-    N: () => choose((player.camera + 1) % player.cameras.length),
-    P: () => choose((player.camera + player.cameras.length - 1) % player.cameras.length),
-    R: () => choose(player.camera),
-    O: () => pick(player.canvas.clientWidth / 2, player.canvas.clientHeight / 2),
-    T: () => setTurning(!turntable.on),
+    choose: (number) => navigation.choose(number),
+    N: () => chooseNext(1),
+    P: () => chooseNext(-1),
+    R: () => chooseNext(0),
+    O: () => navigation.pick(player.canvas.clientWidth / 2, player.canvas.clientHeight / 2),
+    T: () => setTurning(!navigation.turntable.on),
     F: toggleFullscreen,
     X: ifLoaded(switchExposure),
     L: ifLoaded(share),
@@ -141,16 +135,6 @@ function start() {
     Escape: dismiss,
   });
   const opener = new Opener(player, panel, embedded ? (parameters.title ?? embedded.title) : document.title);
-  const acted = () => {
-    glide.stop();
-    turntable.pause();
-    help.acted();
-    player.schedule();
-  };
-  const controls = new Controls(player, damper, {
-    acted, approach, press: (key) => panel.press(key), ignored: (kind) => toast(IGNORED_TEXTS[kind]),
-  });
-  player.movers.push(controls, damper, glide, turntable);
   if (parameters.exposure) player.exposure = parameters.exposure;
 
   // ---- events of the player
@@ -162,7 +146,7 @@ function start() {
     if (player.loaded) announce(`Camera ${detail + 1} of ${player.cameras.length}`);
   });
   player.addEventListener("opened", ({ detail }) => {
-    for (const mover of [damper, glide]) mover.stop();
+    navigation.stop();
     opener.shown = opener.loading;
     panel.describe(detail, opener.shown.title);
     if (opener.shown.isOwn) followNamedCamera();

@@ -9,8 +9,7 @@ const GLIDE_SECONDS = 0.8;
 const TURN_RADIANS_PER_SECOND = 0.25;
 const TURN_RESUME_MS = 4000; // after the last input
 
-const reducedMotion = matchMedia("(prefers-reduced-motion: reduce)");
-export const prefersReducedMotion = () => reducedMotion.matches;
+export const prefersReducedMotion = () => matchMedia("(prefers-reduced-motion: reduce)").matches;
 
 // Spreads movements over time with an exponential decay. Their sum is exact at every frame rate.
 export class Damper {
@@ -76,22 +75,22 @@ export class Glide {
     this.path = null;
   }
 
-  // Glides to the pose that `move` sets.
-  to(move) {
+  // Glides to the pose that `move` sets, in `seconds`.
+  to(move, seconds = GLIDE_SECONDS) {
     const { eye } = this.player, from = eye.pose;
     move();
     this.stop();
-    if (prefersReducedMotion()) return;
+    if (prefersReducedMotion() || !(seconds > 0)) return;
     const to = eye.pose;
     Object.assign(eye, from);
-    this.path = { from: blendablePose(from), to: blendablePose(to), end: to, time: 0 };
+    this.path = { from: blendablePose(from), to: blendablePose(to), end: to, seconds, time: 0 };
     this.player.changed();
   }
 
   advance(seconds) {
     if (!this.path) return false;
-    const { from, to, end } = this.path, { eye } = this.player;
-    const time = (this.path.time += seconds) / GLIDE_SECONDS;
+    const { from, to, end, seconds: duration } = this.path, { eye } = this.player;
+    const time = (this.path.time += seconds) / duration;
     if (time >= 1) {
       Object.assign(eye, end);
       this.stop();
@@ -139,6 +138,10 @@ export class Turntable {
     this.resumesAt = performance.now() + TURN_RESUME_MS;
     clearTimeout(this.timer);
     this.timer = setTimeout(() => this.player.changed(), TURN_RESUME_MS + 1);
+  }
+
+  dispose() {
+    clearTimeout(this.timer);
   }
 
   advance(seconds) {

@@ -9,6 +9,7 @@
 //     "remark"     detail: a remark about the scene, "" for none
 //     "frame"      detail: ms per frame while moving
 //     "camera"     detail: the index of the scene's camera to which the eye was moved
+//     "moved"      a frame was drawn from another viewpoint
 //     "failed"     detail: an Error
 
 import { Eye, cameraOf, viewOf } from "./camera.js";
@@ -31,11 +32,12 @@ const PROGRESS_RANGES = { loading: [0, 0.3], unpacking: [0.3, 0.6], preparing: [
 const DEVICE_LOST_TEXT = "Meanwhile the graphics device was lost, or another scene opened; try again.";
 
 export class Player extends EventTarget {
-  // A player without a scene gets one from `open`. Throws an Error with a message for the user if the browser cannot
-  // draw.
-  constructor(canvas, scene = null) {
+  // A player without a scene gets one from `open`. `workerAddress` is that of the worker's script, or null for the
+  // embedded one. Throws an Error with a message for the user if the browser cannot draw.
+  constructor(canvas, { scene = null, workerAddress = null } = {}) {
     super();
     this.canvas = canvas;
+    this.workerAddress = workerAddress;
     this.renderer = new Renderer(canvas);
     this.loader = null; // the loader of the file that is drawn
     this.next = null; // the loader of the file that is being loaded
@@ -58,6 +60,8 @@ export class Player extends EventTarget {
     this.took = null; // the running mean of ms per frame
     this.coarse = 1; // the factor of the resolution while moving
     this.scheduled = false;
+    this.paused = false; // whether no frames are drawn
+    this.drawnMoves = 0; // `moves` at the last frame
     this.loaded = false;
     this.whole = false; // whether all layers of the file are loaded
     this.stale = true; // whether the canvas must be redrawn
@@ -112,7 +116,8 @@ export class Player extends EventTarget {
     try {
       await this.receive({ name, stream, stage, picture: null, update });
     } catch (error) {
-      throw error instanceof StartError ? error : new Error(`${name} cannot be opened: ${error.message}`);
+      const isForUser = error instanceof StartError || error instanceof SupersededError;
+      throw isForUser ? error : new Error(`${name} cannot be opened: ${error.message}`);
     }
   }
 
@@ -124,6 +129,7 @@ export class Player extends EventTarget {
     const loader = new Loader({
       content: (content) => this.install(loader, content),
       progress: ({ what, part }) => this.progress(loader, what, part),
+      workerAddress: this.workerAddress,
     });
     Object.assign(loader, { picture, part: 0, scene, remark: "", update });
     this.next = loader;
@@ -341,9 +347,20 @@ export class Player extends EventTarget {
     this.schedule();
   }
 
+  // Stops drawing until `resume`. Loading goes on.
+  pause() {
+    this.paused = true;
+  }
+
+  resume() {
+    this.paused = false;
+    this.before = null; // the time of the pause moves nothing
+    this.schedule();
+  }
+
   // Requests an animation frame.
   schedule() {
-    if (this.scheduled || !this.loaded) return;
+    if (this.scheduled || !this.loaded || this.paused) return;
     this.scheduled = true;
     requestAnimationFrame((now) => this.frame(now));
   }
@@ -351,7 +368,7 @@ export class Player extends EventTarget {
   // Moves the eye, and draws a frame if the picture has changed.
   frame(now) {
     this.scheduled = false;
-    if (!this.loaded) return;
+    if (!this.loaded || this.paused) return;
     if (this.renderer.busy()) return this.schedule();
     this.resize();
     if (this.began !== null) this.measure(now - this.began);
@@ -371,6 +388,8 @@ export class Player extends EventTarget {
       this.began = now;
       this.stale = false;
       this.shown = scale;
+      if (this.drawnMoves !== this.moves) this.emit("moved");
+      this.drawnMoves = this.moves;
     }
     if (moving || this.began !== null) return this.schedule();
     this.took = null;
@@ -395,7 +414,7 @@ export class Player extends EventTarget {
     if (this.finishing || this.idle) return;
     this.finishing = true;
     const { moves } = this, { content } = this.renderer;
-    const goOn = () => this.loaded && this.moves === moves && this.renderer.content === content;
+    const goOn = () => this.loaded && !this.paused && this.moves === moves && this.renderer.content === content;
     const options = { goOn, changed: () => this.redraw() };
     const work = () => content.complete(this.view(), this.scene.tolerance, options);
     const whole = await this.enqueue(work).catch((error) => {
@@ -456,23 +475,30 @@ export class Player extends EventTarget {
     this.changed();
   }
 
-  // Sets the target to the visible point at a position of the canvas, in CSS pixels. Returns whether there is a point.
-  pick(x, y) {
-    if (!this.loaded) return false;
+  // Returns the visible point (page's units) at a position of the canvas (CSS pixels), or null if there is none.
+  findPoint(x, y) {
+    if (!this.loaded) return null;
     const { width, height, clientWidth, clientHeight } = this.canvas, view = this.view();
     const [across, down] = [(x * width) / clientWidth, (y * height) / clientHeight];
     const depth = this.renderer.pick(view, across, down, this.eye.depth);
+    this.redraw(); // the pick has changed the projection
     const [right, below] = [(across - view.cx) / view.fx, (down - view.cy) / view.fy];
-    if (depth !== null) this.eye.target = this.eye.point(right, below, depth);
-    this.changed();
-    return depth !== null;
+    return depth === null ? null : this.eye.point(right, below, depth);
   }
 
-  // Returns a promise of a PNG file (Blob) of the window's picture at full size.
-  capture() {
+  // Makes the visible point at a position of the canvas, in CSS pixels, the target. Returns whether there is a point.
+  pick(x, y) {
+    const point = this.findPoint(x, y);
+    if (point) this.eye.target = point;
+    this.changed();
+    return point !== null;
+  }
+
+  // Returns a promise of a picture file (Blob) of the canvas at full size. `type` and `quality` are those of toBlob.
+  capture(type = "image/png", quality = undefined) {
     const view = this.view();
     this.renderer.draw(view, this.resolution, this.gains(view));
-    return new Promise((resolve) => this.canvas.toBlob(resolve, "image/png"));
+    return new Promise((resolve) => this.canvas.toBlob(resolve, type, quality));
   }
 
   // Moves the eye to a camera in world units and draws its picture. Returns its RGB bytes, top row first. If that is

@@ -1,10 +1,38 @@
-// Reads a scene's bytes from an address, or from a file that the user chose. Both give {name, stream}; the stream is an
-// async iterable of Uint8Array, whose `length` is the number of bytes, or 0 if that is unknown.
+// Reads a scene's bytes from an address, a file or memory, as {name, stream}; the stream is an async iterable of
+// Uint8Array, whose `length` is the number of bytes, or 0 if that is unknown.
 
 const FROM_DISK_TEXT = "a page opened from the disk may not read files; drop the file on the page, or serve both";
 // A sandbox without allow-same-origin makes every server, even the page's own, another site.
 const OPAQUE_FRAME_TEXT = "the sandbox of the frame around this page forbids it; add allow-same-origin to the " +
   "sandbox, or let the file's server send Access-Control-Allow-Origin: *";
+
+const UNNAMED_FILE = "the scene";
+
+// Opens an address (string or URL), a Blob or a File, bytes (ArrayBuffer or Uint8Array), or a ReadableStream of bytes.
+// `name` replaces the file's. Throws an Error with a message for the user on failure.
+export async function openSource(source, name) {
+  const file = await openUnnamed(source);
+  return { ...file, name: name ?? file.name };
+}
+
+async function openUnnamed(source) {
+  if (typeof source === "string" || source instanceof URL) return fetchedFile(absoluteAddress(source));
+  if (source instanceof Blob) return chosenFile(source);
+  if (source instanceof ReadableStream) {
+    return { name: UNNAMED_FILE, stream: Object.assign(pieces(source), { length: 0 }) };
+  }
+  const isArray = source instanceof ArrayBuffer || ArrayBuffer.isView(source);
+  if (isArray) return chosenFile(new Blob([source])); // a copy, because the bytes are transferred to the worker
+  throw new Error("A scene is an address, a Blob, an ArrayBuffer, a Uint8Array or a ReadableStream.");
+}
+
+function absoluteAddress(source) {
+  try {
+    return new URL(source, document.baseURI).href;
+  } catch {
+    throw new Error(`${source} is no address of a file.`);
+  }
+}
 
 // Fetches a file. Throws an Error with a message for the user on failure.
 export async function fetchedFile(address) {
@@ -21,7 +49,7 @@ export async function fetchedFile(address) {
 
 // Returns a file that the user chose.
 export function chosenFile(file) {
-  return { name: file.name, stream: Object.assign(pieces(file.stream()), { length: file.size }) };
+  return { name: file.name ?? UNNAMED_FILE, stream: Object.assign(pieces(file.stream()), { length: file.size }) };
 }
 
 // Returns the file name in an address.

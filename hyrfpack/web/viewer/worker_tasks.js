@@ -1,5 +1,7 @@
 // Reads a file and sorts its splats by depth, in a worker, so that the page's own thread stays responsive.
 //
+// Every message has the number of the `reader` that it is for, or from.
+//
 // Messages to the worker:
 //     {start: {name, scene, stage, plain}}   a file follows; `scene` or `stage` (cameras, up, target) if the page has
 //                                            them; `plain`: decode it as splats
@@ -8,6 +10,7 @@
 //     {again: {plain}}                       decode the same bytes again
 //     {use: number}                          select the content to sort
 //     {sort: {ticket, row, sides, near, order}}
+//     {close}                                the reader is no longer needed
 // Messages from the worker:
 //     {progress: {what, part}}
 //     {content: {number, whole, scene, model | splats, picture}}   see pack.js
@@ -29,31 +32,51 @@ const HARMONICS_DEGREE = 3;
 
 // Starts to handle messages. `readSplats(name, bytes)` decodes files of splats, like decodeSplats in formats/index.js.
 export function startWorker(readSplats) {
-  const sorter = new ContentSorter();
-  let reader = null;
-  onmessage = ({ data }) => {
-    if (data.start) reader = new SceneReader(data.start, readSplats, sorter);
-    if (data.bytes) reader.receive(data.bytes);
-    if (data.end) reader.end();
-    if (data.broken) reader.interrupt();
-    if (data.again) reader.decodeAgain(data.again.plain);
-    if (data.use !== undefined) sorter.use(data.use);
-    if (data.sort) sorter.sort(data.sort);
+  const services = new Map(); // number of a reader -> its Service
+  onmessage = ({ data: { reader, ...message } }) => {
+    if (!services.has(reader)) {
+      services.set(reader, new Service(readSplats, (answer, buffers) => postMessage({ reader, ...answer }, buffers)));
+    }
+    const service = services.get(reader);
+    if (message.close) services.delete(reader);
+    service.handle(message);
   };
 }
 
-const reportProgress = (what, part) => postMessage({ progress: { what, part } });
+// Reads files and sorts their splats for one player. `post(message, buffers)` sends a message to it.
+class Service {
+  constructor(readSplats, post) {
+    this.readSplats = readSplats;
+    this.isClosed = false;
+    this.post = (message, buffers) => {
+      if (!this.isClosed) post(message, buffers);
+    };
+    this.sorter = new ContentSorter(this.post);
+    this.reader = null;
+  }
 
-function reportError(error) {
+  handle(message) {
+    if (message.start) this.reader = new SceneReader(message.start, this.readSplats, this.sorter, this.post);
+    if (message.bytes) this.reader.receive(message.bytes);
+    if (message.end) this.reader.end();
+    if (message.broken) this.reader.interrupt();
+    if (message.again) this.reader.decodeAgain(message.again.plain);
+    if (message.use !== undefined) this.sorter.use(message.use);
+    if (message.sort) this.sorter.sort(message.sort);
+    if (message.close) this.isClosed = true;
+  }
+}
+
+function describeError(error) {
   const isOutOfMemory = error instanceof RangeError; // thrown for arrays that are too long
-  postMessage({ error: isOutOfMemory ? "There is not enough memory; open a smaller file." : error.message });
+  return isOutOfMemory ? "There is not enough memory; open a smaller file." : error.message;
 }
 
 // Reads one file and posts its contents: the first layer alone if the rest takes long, and the whole.
 class SceneReader {
   // `request` is that of the message `start`.
-  constructor(request, readSplats, sorter) {
-    Object.assign(this, { request, readSplats, sorter });
+  constructor(request, readSplats, sorter, post) {
+    Object.assign(this, { request, readSplats, sorter, post });
     this.file = new ReceivedFile(!request.plain);
     this.ended = false;
     this.broken = false; // whether a part of the file is missing or damaged
@@ -63,6 +86,10 @@ class SceneReader {
     this.queue = Promise.resolve();
   }
 
+  reportProgress(what, part) {
+    this.post({ progress: { what, part } });
+  }
+
   // Stores a piece of the file, and starts to decode the first layer when it is complete.
   receive(bytes) {
     if (this.isRejected) return;
@@ -70,7 +97,7 @@ class SceneReader {
       if (this.file.add(bytes)) setTimeout(() => this.queueDecoding(true), FIRST_LAYER_DELAY_MS);
     } catch (error) {
       this.isRejected = true;
-      reportError(error);
+      this.post({ error: describeError(error) });
     }
   }
 
@@ -98,7 +125,7 @@ class SceneReader {
       .then(() => (partial && this.ended && !this.broken ? null : this.decode(partial)))
       .catch((error) => {
         this.broken = true; // `decodeAgain` then decodes only bytes that could be decoded before
-        reportError(error);
+        this.post({ error: describeError(error) });
       });
   }
 
@@ -107,15 +134,15 @@ class SceneReader {
     const { file, request: { name, scene, stage, plain } } = this, all = file.gather();
     const bytes = partial && this.broken ? all.subarray(0, this.decodedLength || file.length) : all;
     const content = { number: ++this.contents, whole: !partial };
-    reportProgress("unpacking", 0);
+    this.reportProgress("unpacking", 0);
     let positions;
     if (file.isModel) {
       const model = await read(bytes, { partial });
       content.scene = { ...(scene ?? { ...modelScene(model, name), ...stage }), exposure: model.exposure };
       positions = model.positions;
       if (plain) {
-        reportProgress("unpacking", 1);
-        const report = ({ done }) => reportProgress("preparing", done);
+        this.reportProgress("unpacking", 1);
+        const report = ({ done }) => this.reportProgress("preparing", done);
         const { fitted } = viewpointOf(model.metadata);
         content.splats = packSplats(await fitHarmonics(model, fitted, HARMONICS_DEGREE, report));
         content.picture = backgroundPicture(model);
@@ -132,8 +159,8 @@ class SceneReader {
     }
     this.sorter.add(content.number, positions);
     this.decodedLength = bytes.length;
-    reportProgress("unpacking", 1);
-    postMessage({ content }, listBuffers(content));
+    this.reportProgress("unpacking", 1);
+    this.post({ content }, listBuffers(content));
   }
 }
 
@@ -156,7 +183,8 @@ function convertToScene(splats, scene) {
 
 // Sorts the splats of the content that the page shows.
 class ContentSorter {
-  constructor() {
+  constructor(post) {
+    this.post = post;
     this.sorters = new Map(); // number of a content -> its DepthSort
     this.selected = null;
   }
@@ -175,6 +203,6 @@ class ContentSorter {
   // Posts the order of the splats for a request.
   sort({ ticket, row, sides, near, order: spare }) {
     const { order, drawn } = this.sorters.get(this.selected).sort(row, sides, near, spare);
-    postMessage({ order: { ticket, number: this.selected, order, drawn } }, [order.buffer]);
+    this.post({ order: { ticket, number: this.selected, order, drawn } }, [order.buffer]);
   }
 }

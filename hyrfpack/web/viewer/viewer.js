@@ -1,0 +1,244 @@
+// Shows scenes in an element of any page: the interface of the package hyrf-viewer, see npm/hyrf-viewer/index.d.ts.
+
+import { formatCamera, parseCamera } from "./address.js";
+import { cameraOf, viewOf } from "./camera.js";
+import { AS_PHOTOGRAPHED, EXPOSURES } from "./exposure.js";
+import { SupersededError } from "./loader.js";
+import { Navigation } from "./navigation.js";
+import { Player } from "./player.js";
+import { openSource } from "./source.js";
+
+const EVENTS = ["ready", "progress", "error", "camera", "ignored"];
+const INTERACTIONS = ["after-click", "always", "none"];
+const LOADINGS = ["eager", "lazy"];
+const LAZY_MARGIN = "300px"; // a lazy scene is loaded when its container is this near to the window
+const CANVAS_STYLE = { display: "block", width: "100%", height: "100%" };
+
+// Creates a viewer in an element. `options` are those that the constructor lists. Throws an Error with a message for
+// the user if one is invalid, or if the browser cannot draw.
+export const createViewer = (options) => new Viewer(options);
+
+class Viewer {
+  constructor({
+    container, src = null, name, camera = null, exposure = AS_PHOTOGRAPHED, autorotate = false,
+    interaction = "after-click", loading = "eager", title = "3D scene", workerUrl = null,
+  }) {
+    this.container = typeof container === "string" ? document.querySelector(container) : container;
+    if (!(this.container instanceof Element)) throw new Error("createViewer needs a container: element or selector.");
+    checkChoice("exposure", exposure, EXPOSURES);
+    checkChoice("interaction", interaction, INTERACTIONS);
+    checkChoice("loading", loading, LOADINGS);
+    this.canvas = document.createElement("canvas");
+    Object.assign(this.canvas.style, CANVAS_STYLE);
+    this.canvas.tabIndex = interaction === "none" ? -1 : 0;
+    this.canvas.setAttribute("role", interaction === "none" ? "img" : "application");
+    this.canvas.setAttribute("aria-label", title);
+    const workerAddress = workerUrl && new URL(workerUrl, document.baseURI).href;
+    this.player = new Player(this.canvas, { workerAddress });
+    this.player.exposure = exposure;
+    this.navigation = new Navigation(this.player, {
+      keyTarget: interaction === "none" ? null : this.canvas,
+      isEmbedded: interaction === "after-click",
+      press: (key) => this.press(key),
+      ignored: (kind) => this.emit("ignored", { kind }),
+    });
+    this.listeners = new Map(EVENTS.map((event) => [event, new Set()]));
+    this.firstCamera = camera; // for the first scene
+    this.progress = 0;
+    this.lastLoad = 0; // the number of the last load
+    this.isReady = false;
+    this.isDestroyed = false;
+    this.isPaused = false; // by `pause`
+    this.isVisible = true; // whether the container is in the window, or near it
+    this.forward();
+    this.container.append(this.canvas);
+    this.pending = src !== null && loading === "lazy" ? { src, name } : null; // what is loaded when it becomes visible
+    this.observer = new IntersectionObserver((entries) => this.watch(entries.at(-1).isIntersecting), {
+      rootMargin: LAZY_MARGIN,
+    });
+    this.observer.observe(this.container);
+    if (autorotate) this.autorotate = true;
+    if (src !== null && !this.pending) this.load(src, { name }).catch(() => {}); // `load` has emitted the error
+  }
+
+  // Handles a key that does not move the eye.
+  press(key) {
+    const { player, navigation } = this, { clientWidth, clientHeight } = this.canvas;
+    if (!player.loaded) return;
+    if (/^[1-9]$/.test(key)) navigation.choose(Number(key) - 1);
+    if (key === "N" || key === "P") {
+      const { length } = player.cameras;
+      navigation.choose((player.camera + (key === "N" ? 1 : length - 1)) % length);
+    }
+    if (key === "R") navigation.choose(player.camera);
+    if (key === "O") navigation.pick(clientWidth / 2, clientHeight / 2);
+    if (key === "T") this.autorotate = !this.autorotate;
+  }
+
+  // Translates the player's events.
+  forward() {
+    const { player } = this;
+    player.addEventListener("progress", ({ detail }) => {
+      this.progress = detail.part;
+      this.emit("progress", { progress: detail.part });
+    });
+    player.addEventListener("failed", ({ detail }) => this.emit("error", { error: detail }));
+    player.addEventListener("moved", () => this.emit("camera", {}));
+    player.addEventListener("opened", () => {
+      this.navigation.stop();
+      const camera = this.firstCamera;
+      this.firstCamera = null;
+      if (camera === null) return;
+      try {
+        this.camera = camera;
+      } catch (error) {
+        this.emit("error", { error });
+      }
+    });
+  }
+
+  emit(event, detail) {
+    for (const listener of [...this.listeners.get(event)]) listener(detail);
+  }
+
+  on(event, listener) {
+    checkChoice("event", event, EVENTS);
+    this.listeners.get(event).add(listener);
+    return () => this.off(event, listener);
+  }
+
+  off(event, listener) {
+    this.listeners.get(event)?.delete(listener);
+  }
+
+  // Starts a lazy load when the container comes near the window, and draws only there.
+  watch(isVisible) {
+    this.isVisible = isVisible;
+    if (isVisible && this.pending) {
+      const { src, name } = this.pending;
+      this.pending = null;
+      this.load(src, { name }).catch(() => {});
+    }
+    this.applyPause();
+  }
+
+  applyPause() {
+    if (this.isPaused || !this.isVisible) this.player.pause();
+    else this.player.resume();
+  }
+
+  async load(src, { name } = {}) {
+    if (this.isDestroyed) throw new Error("The viewer has been destroyed; create another one.");
+    const thisLoad = ++this.lastLoad;
+    this.pending = null;
+    this.isReady = false;
+    this.progress = 0;
+    try {
+      const file = await openSource(src, name);
+      if (thisLoad === this.lastLoad) await this.player.open(file);
+    } catch (error) {
+      if (thisLoad === this.lastLoad && !(error instanceof SupersededError)) {
+        this.emit("error", { error });
+        throw error;
+      }
+    }
+    if (thisLoad !== this.lastLoad) throw new DOMException("Another scene was loaded instead.", "AbortError");
+    this.isReady = true;
+    this.emit("ready", { scene: this.scene });
+  }
+
+  get scene() {
+    const { scene, cameras } = this.player;
+    if (!scene) return null;
+    const { title, kind, count, up, target } = scene;
+    const hasExposureMap = this.player.hasExposureMap;
+    return { title, kind, count, up, target, hasExposureMap, cameras: cameras.map((view) => cameraOf(view, scene)) };
+  }
+
+  get camera() {
+    return this.player.scene && this.player.viewed;
+  }
+
+  set camera(camera) {
+    this.moveTo(camera, { seconds: 0 });
+  }
+
+  // The text by which links name the camera, or null while there is no scene.
+  get cameraText() {
+    return this.player.scene && formatCamera(this.player.eye, this.player.scene);
+  }
+
+  moveTo(camera, { seconds } = {}) {
+    const { player } = this;
+    if (!player.scene) throw new Error("The viewer has no scene yet; wait for 'ready'.");
+    this.navigation.moveTo(readCamera(camera, player.scene), seconds);
+  }
+
+  // Whether the eye turns slowly about its target.
+  get autorotate() {
+    return this.navigation.turntable.on;
+  }
+
+  set autorotate(isOn) {
+    this.navigation.turntable.turn(isOn);
+  }
+
+  get exposure() {
+    return this.player.exposure;
+  }
+
+  set exposure(exposure) {
+    this.player.exposure = exposure;
+  }
+
+  pick(x, y) {
+    const { scene } = this.player, point = this.player.findPoint(x, y);
+    return point && point.map((value, axis) => scene.center[axis] + scene.unit * value);
+  }
+
+  async screenshot({ type = "image/png", quality } = {}) {
+    if (!this.player.loaded) throw new Error("The viewer has no scene yet; wait for 'ready'.");
+    this.player.resume();
+    try {
+      await this.player.settled;
+      return await this.player.capture(type, quality);
+    } finally {
+      this.applyPause();
+    }
+  }
+
+  pause() {
+    this.isPaused = true;
+    this.applyPause();
+  }
+
+  resume() {
+    this.isPaused = false;
+    this.applyPause();
+  }
+
+  destroy() {
+    if (this.isDestroyed) return;
+    this.isDestroyed = true;
+    this.lastLoad++;
+    this.pending = null;
+    this.observer.disconnect();
+    this.navigation.dispose();
+    this.player.dispose();
+    this.canvas.remove();
+    for (const listeners of this.listeners.values()) listeners.clear();
+  }
+}
+
+// Throws an Error if a value is not one of the allowed ones.
+function checkChoice(name, value, allowed) {
+  if (!allowed.includes(value)) throw new Error(`${name} must be ${allowed.join(", ")}, not ${String(value)}.`);
+}
+
+// Returns {number} or {view, depth} of a camera: its index from 0, its text in a link, or a camera in world units.
+function readCamera(camera, scene) {
+  if (typeof camera === "string") return parseCamera(camera, scene);
+  if (typeof camera !== "number") return { view: viewOf(camera, scene) };
+  if (Number.isInteger(camera) && camera >= 0 && camera < scene.cameras.length) return { number: camera };
+  throw new Error(`There is no camera ${camera}; the scene has cameras 0 to ${scene.cameras.length - 1}.`);
+}

@@ -1,0 +1,143 @@
+"""<hyrf-viewer> draws a scene in the page itself, without an iframe."""
+
+from __future__ import annotations
+
+import io
+
+import pytest
+from PIL import Image
+from web.pages import Browser, wait_until
+from web.site import GOLDEN_FILE_DATA, Site
+
+pytestmark = [pytest.mark.in_turn, pytest.mark.usefixtures("reset_window")]
+ELEMENT_JS = "document.querySelector('hyrf-viewer')"
+PAGE = (
+    '<!DOCTYPE html><link rel="icon" href="data:,">'
+    "<script>window.fired = []; for (const name of ['load', 'error', 'progress', 'camera'])"
+    " document.addEventListener(name, (event) =>"
+    " event instanceof CustomEvent && fired.push([name, event.detail]), true);</script>"
+    '<script src="/hyrf-viewer.js"></script>{body}'
+)
+LOADED_JS = "fired.some(([name, detail]) => name === 'load' && detail === '')"
+
+
+def open_element(browser: Browser, host: Site, attributes: str = 'src="cloud.spz"') -> None:
+    host.files["/post.html"] = PAGE.format(body=f"<hyrf-viewer {attributes}></hyrf-viewer>").encode()
+    browser.open(f"{host.address}/post.html")
+
+
+def is_shown(browser: Browser, selector: str) -> bool:
+    return browser.evaluate(f"{ELEMENT_JS}.shadowRoot.querySelector('{selector}').checkVisibility()")
+
+
+def test_the_element_draws_in_the_page_and_fires_events(browser: Browser, host: Site):
+    open_element(browser, host)
+    wait_until(browser, LOADED_JS)
+    assert not browser.evaluate(f"{ELEMENT_JS}.shadowRoot.querySelector('iframe')")
+    assert browser.evaluate(f"{ELEMENT_JS}.viewer.scene.count") == 300
+    wait_until(browser, "fired.some(([name]) => name === 'camera')")
+    parts = browser.evaluate("fired.filter(([name]) => name === 'progress').map(([, part]) => part)")
+    assert parts == sorted(parts) and parts[-1] == 1
+    wait_until(browser, f"getComputedStyle({ELEMENT_JS}.shadowRoot.querySelector('.scene')).opacity === '1'")
+    assert not is_shown(browser, "progress") and not is_shown(browser, "p")
+    box = browser.evaluate(f"(({{ width, height }}) => [width, height])({ELEMENT_JS}.getBoundingClientRect())")
+    assert box[0] / box[1] == pytest.approx(4 / 3, rel=0.01)
+    assert browser.list_errors() == []
+
+
+def test_changed_attributes_are_followed_without_a_new_viewer(browser: Browser, host: Site):
+    open_element(browser, host)
+    wait_until(browser, LOADED_JS)
+    browser.evaluate(f"window.viewer = {ELEMENT_JS}.viewer, fired.length = 0")
+    browser.evaluate(
+        f"(({{ attributes }} = {ELEMENT_JS}) => {{ {ELEMENT_JS}.setAttribute('src', 'some scene.hyrf');"
+        f" {ELEMENT_JS}.setAttribute('exposure', 'consistent'); {ELEMENT_JS}.toggleAttribute('autorotate'); }})()"
+    )
+    wait_until(browser, LOADED_JS)
+    assert browser.evaluate(f"{ELEMENT_JS}.viewer === viewer && viewer.scene.kind === 'hyrf'")
+    assert browser.evaluate("[viewer.exposure, viewer.autorotate]") == ["consistent", True]
+    browser.evaluate(f"{ELEMENT_JS}.setAttribute('camera', '77')")
+    wait_until(browser, "fired.some(([name, detail]) => name === 'error' && detail.includes('no camera 77'))")
+    browser.evaluate(f"{ELEMENT_JS}.setAttribute('exposure', 'dark')")
+    wait_until(browser, "fired.some(([name, detail]) => name === 'error' && detail.startsWith('The exposure must be'))")
+
+
+def test_the_first_camera_is_that_of_the_attribute(browser: Browser, host: Site):
+    open_element(browser, host, "src='some scene.hyrf'")
+    wait_until(browser, LOADED_JS)
+    text = browser.evaluate(f"{ELEMENT_JS}.viewer.moveTo(0, {{ seconds: 0 }}), {ELEMENT_JS}.viewer.cameraText")
+    moved = ",".join([str(float(text.split(",")[0]) + 0.25), *text.split(",")[1:]])
+    open_element(browser, host, f"src='some scene.hyrf' camera='{moved}'")
+    wait_until(browser, LOADED_JS)
+    found = browser.evaluate(f"{ELEMENT_JS}.viewer.cameraText")
+    assert float(found.split(",")[0]) == pytest.approx(float(moved.split(",")[0]), abs=1e-3)
+
+
+def test_a_failed_load_is_shown_as_one_sentence_over_the_poster(browser: Browser, host: Site):
+    file = io.BytesIO()
+    Image.new("RGB", (8, 6), (0, 90, 0)).save(file, "PNG")
+    host.files["/poster.png"] = file.getvalue()
+    open_element(browser, host, 'src="gone.hyrf" poster="poster.png"')
+    wait_until(browser, "fired.some(([name]) => name === 'error')")
+    message = browser.evaluate(f"{ELEMENT_JS}.shadowRoot.querySelector('p').textContent")
+    assert message.startswith("gone.hyrf could not be fetched (404")
+    assert is_shown(browser, "p") and is_shown(browser, "img") and not is_shown(browser, "progress")
+    assert browser.evaluate(f"getComputedStyle({ELEMENT_JS}.shadowRoot.querySelector('.scene')).opacity") == "0"
+    host.files["/gone.hyrf"] = GOLDEN_FILE_DATA
+    browser.evaluate(f"{ELEMENT_JS}.viewer.load('gone.hyrf')")
+    assert not is_shown(browser, "p"), "the sentence stays after a later success"
+
+
+def test_an_element_that_is_removed_is_freed_and_one_that_is_moved_stays(browser: Browser, host: Site):
+    open_element(browser, host)
+    wait_until(browser, LOADED_JS)
+    browser.evaluate(f"window.element = {ELEMENT_JS}, window.viewer = element.viewer, 0")
+    browser.evaluate(
+        "document.body.append(document.createElement('main')), document.querySelector('main').append(element)"
+    )
+    browser.evaluate("new Promise((done) => setTimeout(done, 50))")
+    assert browser.evaluate("element.viewer === viewer && viewer.isReady")
+    browser.evaluate("window.gl = viewer.player.renderer.gl, element.remove(), fired.length = 0")
+    wait_until(browser, "element.viewer === null && gl.isContextLost()")
+    browser.evaluate("document.body.append(element)")
+    wait_until(browser, LOADED_JS)
+    assert browser.evaluate("element.viewer.scene.count") == 300
+
+
+def test_an_element_switches_between_page_and_frame(browser: Browser, host: Site):
+    open_element(browser, host, 'src="cloud.spz" frame')
+    wait_until(browser, LOADED_JS)
+    assert browser.evaluate(f"Boolean({ELEMENT_JS}.shadowRoot.querySelector('iframe')) && {ELEMENT_JS}.viewer === null")
+    browser.evaluate(f"fired.length = 0, {ELEMENT_JS}.removeAttribute('frame')")
+    wait_until(browser, LOADED_JS)
+    assert browser.evaluate(f"!{ELEMENT_JS}.shadowRoot.querySelector('iframe') && {ELEMENT_JS}.viewer.isReady")
+
+
+def test_an_element_without_src_shows_nothing_and_waits(browser: Browser, host: Site):
+    open_element(browser, host, "")
+    browser.evaluate("new Promise((done) => setTimeout(done, 50))")
+    assert browser.evaluate("fired") == []
+    browser.evaluate(f"{ELEMENT_JS}.setAttribute('src', 'cloud.spz')")
+    wait_until(browser, LOADED_JS)
+
+
+def test_a_wheel_that_scrolls_the_page_is_explained_for_a_moment(browser: Browser, host: Site):
+    open_element(browser, host)
+    wait_until(browser, LOADED_JS)
+    browser.wheel(60, 60, 100)
+    wait_until(browser, f"!{ELEMENT_JS}.shadowRoot.querySelector('p').hidden")
+    assert "Click the scene" in browser.evaluate(f"{ELEMENT_JS}.shadowRoot.querySelector('p').textContent")
+    wait_until(browser, f"{ELEMENT_JS}.shadowRoot.querySelector('p').hidden")
+
+
+def test_the_element_works_under_a_policy_of_self(browser: Browser, host: Site):
+    script = PAGE.partition("<script>")[2].partition("</script>")[0]
+    host.files["/watch.js"] = script.encode()
+    host.files["/strict.html"] = (
+        b'<!DOCTYPE html><script src="watch.js"></script><script src="hyrf-viewer.js"></script>'
+        b'<hyrf-viewer src="some scene.hyrf"></hyrf-viewer>'
+    )
+    host.headers = {"Content-Security-Policy": "default-src 'self'"}
+    browser.open(f"{host.address}/strict.html")
+    wait_until(browser, LOADED_JS)
+    assert not browser.evaluate("fired.some(([name]) => name === 'error')")
