@@ -10,8 +10,9 @@ PYTEST := $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal
 # Each stamp file is newer than the files from which its environment was made.
 VENV_STAMP := .venv/.ready
 NODE_STAMP := tests/node/node_modules/.ready
+BUNDLERS_STAMP := tests/bundlers/node_modules/.ready
 
-.PHONY: help demo test test-all test-browsers test-newest test-oldest docs player golden bench gpu speed sets choices ablations precision kill races fuzz fuzz-browser lint format clean
+.PHONY: help demo test test-all test-browsers test-newest test-oldest docs player package golden bench gpu speed sets choices ablations precision kill races fuzz fuzz-browser lint format clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z.-]+:.*## / { printf "  make %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -36,13 +37,19 @@ $(NODE_STAMP): tests/node/package.json tests/node/package-lock.json
 	then touch $@; \
 	else echo "npm could not install the node programs, so the tests that need them will skip"; test -z "$${CI:-}"; fi
 
+# Bundlers, in which tests use the package hyrf-viewer. Without npm or a network, these tests skip.
+$(BUNDLERS_STAMP): tests/bundlers/package.json tests/bundlers/package-lock.json
+	@if command -v npm >/dev/null && echo "Installing bundlers into tests/bundlers ..." \
+		&& npm ci --prefix tests/bundlers --loglevel error; then touch $@; \
+	else echo "npm could not install the bundlers, so the tests that need them will skip"; fi
+
 demo: $(VENV_STAMP) ## train, compress and render a small synthetic scene; results in demo/
 	$(BIN)/hyrfpack demo -o demo --overwrite
 
 test: lint $(NODE_STAMP) ## check style and types, then run the tests of every change (see tests/layers.py)
 	$(PYTEST) -m "not acceptance or smoke"
 
-test-all: lint $(NODE_STAMP) ## check style and types, then run all tests
+test-all: lint $(NODE_STAMP) $(BUNDLERS_STAMP) ## check style and types, then run all tests
 	$(PYTEST)
 
 test-browsers: $(VENV_STAMP) ## run the web player's tests in every installed browser (5 minutes)
@@ -59,6 +66,9 @@ docs: $(VENV_STAMP) ## build the documentation site in site/; a broken link is a
 
 player: $(VENV_STAMP) $(NODE_STAMP) ## minify the web player's scripts again after a change
 	$(BIN)/python -m tools.browser.build_player
+
+package: player ## build the npm package hyrf-viewer into dist/hyrf-viewer
+	$(BIN)/python -m tools.browser.build_package dist/hyrf-viewer
 
 golden: $(VENV_STAMP) ## train the golden models of the tests again, after a change that improves training (a minute)
 	$(BIN)/python -m tools.safety.train_golden

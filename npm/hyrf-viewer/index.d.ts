@@ -1,0 +1,129 @@
+/**
+ * A pinhole camera. Lengths of the pose are in the file's world units, the rest in pixels.
+ */
+export interface Camera {
+  /** Size of the picture. */
+  width: number;
+  height: number;
+  /** Focal lengths and principal point. */
+  fx: number;
+  fy: number;
+  cx: number;
+  cy: number;
+  /** 4 x 4, row by row, with OpenCV axes: x right, y down, z forward. The last row may be absent. */
+  camera_from_world: number[][];
+}
+
+/**
+ * Names a camera: its index in `scene.cameras` (from 0), the text of a link as `cameraText` has it (its plain numbers
+ * count from 1), or a camera.
+ */
+export type CameraName = number | string | Camera;
+
+/** "as-photographed" has the exposure of the photos taken near the viewpoint, "consistent" one exposure everywhere. */
+export type Exposure = "as-photographed" | "consistent";
+
+/** A `.hyrf`, `.ply`, `.spz`, `.splat` or `.sog` file: its address, or its content. */
+export type Source = string | URL | Blob | ArrayBuffer | ArrayBufferView | ReadableStream<Uint8Array>;
+
+export interface ViewerOptions {
+  /** The element, or a selector of it, that the canvas fills. It needs a height. */
+  container: Element | string;
+  /** The first scene. */
+  src?: Source | null;
+  /** File name of the first scene if `src` has none. Endings tell formats of splats apart. */
+  name?: string;
+  /** The first camera of the first scene. */
+  camera?: CameraName | null;
+  exposure?: Exposure;
+  /** Turn slowly while the user makes no input. */
+  autorotate?: boolean;
+  /**
+   * "after-click" (the default): wheel and fingers scroll the page until the scene is clicked. "always": they move the
+   * scene at once. "none": the scene takes no input.
+   */
+  interaction?: "after-click" | "always" | "none";
+  /** "lazy": the first scene is loaded when the container comes near the window. */
+  loading?: "eager" | "lazy";
+  /** Accessible name of the canvas. */
+  title?: string;
+  /**
+   * Address of the package's `worker.js` on the page's own site. It is needed only where a Content-Security-Policy
+   * forbids `worker-src blob:`.
+   */
+  workerUrl?: string | URL | null;
+}
+
+export interface SceneInfo {
+  /** Name of the file. */
+  title: string;
+  /** "hyrf" for a model whose fields are evaluated, "splats" for a file of splats. */
+  kind: "hyrf" | "splats";
+  /** Number of Gaussians. */
+  count: number;
+  /** Upward direction and centre of the scene, in the file's world units. */
+  up: [number, number, number];
+  target: [number, number, number];
+  /** Whether `exposure` makes a difference. */
+  hasExposureMap: boolean;
+  /** The file's cameras, or a made-up one. */
+  cameras: Camera[];
+}
+
+export interface ViewerEvents {
+  /** A scene is loaded. */
+  ready: { scene: SceneInfo };
+  /** The part of the scene that is loaded, 0 to 1. */
+  progress: { progress: number };
+  /** Something failed. The message is a sentence for the user. */
+  error: { error: Error };
+  /** A frame was drawn from another viewpoint; `viewer.camera` has it. */
+  camera: Record<string, never>;
+  /** A wheel or a finger was left to the page, see `interaction`. */
+  ignored: { kind: "wheel" | "finger" };
+}
+
+/** Shows a scene in an element. Frames are drawn only if something changes, and only near the window. */
+export interface Viewer {
+  readonly canvas: HTMLCanvasElement;
+  /** The part of the scene that is loaded, 0 to 1. */
+  readonly progress: number;
+  /** Whether a scene is loaded and none is being loaded. */
+  readonly isReady: boolean;
+  /** The scene that is shown, or null. */
+  readonly scene: SceneInfo | null;
+  /** The camera of the canvas, or null without a scene. Setting it moves there at once. */
+  get camera(): Camera | null;
+  set camera(camera: CameraName);
+  /** The camera as a short text, for links, or null without a scene. */
+  readonly cameraText: string | null;
+  exposure: Exposure;
+  autorotate: boolean;
+
+  /**
+   * Loads another scene; the present one stays until it is ready. Rejects with a sentence for the user, which the event
+   * "error" has, too, or with an AbortError if yet another scene is loaded.
+   */
+  load(source: Source, options?: { name?: string }): Promise<void>;
+  /** Glides to a camera. Throws an error if it is invalid or there is no scene. */
+  moveTo(camera: CameraName, options?: { seconds?: number }): void;
+  /** Returns the visible point at a place of the canvas in CSS pixels, in world units, or null if there is none. */
+  pick(x: number, y: number): [number, number, number] | null;
+  /** Returns the complete picture of the canvas as a file. `type` and `quality` are those of `canvas.toBlob`. */
+  screenshot(options?: { type?: string; quality?: number }): Promise<Blob>;
+  /** Stops drawing until `resume`. */
+  pause(): void;
+  resume(): void;
+  /** Calls a listener with each event of a kind. Returns a function that ends this. */
+  on<Name extends keyof ViewerEvents>(event: Name, listener: (detail: ViewerEvents[Name]) => void): () => void;
+  off<Name extends keyof ViewerEvents>(event: Name, listener: (detail: ViewerEvents[Name]) => void): void;
+  /** Removes the canvas and frees workers and graphics memory. */
+  destroy(): void;
+}
+
+/**
+ * Creates a viewer in an element.
+ *
+ * @throws {Error} an option is invalid, or the browser has no WebGL 2; the message is a sentence for the user
+ */
+export function createViewer(options: ViewerOptions): Viewer;
