@@ -152,7 +152,7 @@ def test_moving_and_switching_decode_nothing_and_a_still_picture_draws_nothing(b
     browser.press("x")
     wait_until_complete(browser)
     assert browser.evaluate("hyrfpack.player.renderer.content === content")
-    assert set(browser.evaluate("messages")) == {"sort"}
+    assert set(browser.evaluate("messages")) == {"reader", "sort"}
     frames = browser.evaluate("hyrfpack.frames()")
     browser.evaluate("new Promise((done) => setTimeout(done, 400))")
     assert browser.evaluate("hyrfpack.frames()") == frames
