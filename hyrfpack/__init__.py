@@ -54,6 +54,9 @@ if TYPE_CHECKING:
     from hyrfpack.distill import DistillConfig as DistillConfig
     from hyrfpack.distill import DistillReport as DistillReport
     from hyrfpack.distill import import_splats as import_splats
+    from hyrfpack.edit import EditReport as EditReport
+    from hyrfpack.edit import edit_model as edit_model
+    from hyrfpack.edit import plan_edit as plan_edit
     from hyrfpack.errors import HyrfDataError as HyrfDataError
     from hyrfpack.errors import HyrfError as HyrfError
     from hyrfpack.errors import HyrfFormatError as HyrfFormatError
@@ -107,6 +110,9 @@ _MODULES_BY_PUBLIC_NAME = {
     "DistillConfig": "hyrfpack.distill",
     "DistillReport": "hyrfpack.distill",
     "import_splats": "hyrfpack.distill",
+    "EditReport": "hyrfpack.edit",
+    "edit_model": "hyrfpack.edit",
+    "plan_edit": "hyrfpack.edit",
     "HyrfDataError": "hyrfpack.errors",
     "HyrfError": "hyrfpack.errors",
     "HyrfFormatError": "hyrfpack.errors",

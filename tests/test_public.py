@@ -19,6 +19,7 @@ import torch
 from scenes import ball_scene, small_model
 
 import hyrfpack
+from hyrfpack.config.edit import Center
 
 PUBLIC_FUNCTIONS = [name for name in hyrfpack.__all__ if inspect.isfunction(getattr(hyrfpack, name))]
 # Arguments that each function rejects at once.
@@ -29,12 +30,14 @@ REJECTED_ARGUMENTS = {
     "convert_splats": ("missing.ply", "out.spz"),
     "describe_file": ("missing.hyrf",),
     "describe_photos": ("missing",),
+    "edit_model": ("missing.hyrf", "out.hyrf", [Center()]),
     "import_splats": ("missing.ply", "out.hyrf"),
     "estimate_poses": ("missing", "out"),
     "export_model": ("missing.hyrf", "out.spz"),
     "load_model": ("missing.hyrf",),
     "load_scene": ("missing",),
     "make_scene": ("missing", "out.html"),
+    "plan_edit": ("missing.hyrf", [Center()]),
 }
 
 

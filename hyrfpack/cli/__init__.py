@@ -31,6 +31,7 @@ from hyrfpack.cli.console import (
 )
 from hyrfpack.cli.convert import convert
 from hyrfpack.cli.demo import demo
+from hyrfpack.cli.edit import edit
 from hyrfpack.cli.evaluate import evaluate
 from hyrfpack.cli.export import export
 from hyrfpack.cli.imports import import_
@@ -148,6 +149,7 @@ for _command in (
     view,
     import_,
     convert,
+    edit,
     bench,
     info,
     demo,

@@ -62,6 +62,27 @@ class _Box(click.ParamType):
         return numbers
 
 
+class Numbers(click.ParamType):
+    """A fixed number of finite numbers with commas between. `form` shows their meaning in help and messages."""
+
+    name = "numbers"
+
+    def __init__(self, count: int, form: str) -> None:
+        self._count, self._form = count, form
+
+    def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
+        return self._form
+
+    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, ...]:
+        try:
+            numbers = tuple(float(part) for part in str(value).split(","))
+        except ValueError:
+            numbers = ()
+        if len(numbers) != self._count or not all(map(math.isfinite, numbers)):
+            self.fail(f"'{value}' is not {self._count} numbers; write it as {self._form}", param, ctx)
+        return numbers
+
+
 class _HarmonicsDegree(click.ParamType):
     """A degree of spherical harmonics, or "auto", which becomes None."""
 

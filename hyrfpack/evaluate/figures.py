@@ -37,13 +37,20 @@ LABEL_COLOR = (128, 130, 134)
 GAP_PIXELS = 8
 
 
-def draw_comparison(photo: Tensor, render: Tensor, mask: Tensor | None = None, caption: str = "") -> Image.Image:
+def draw_comparison(
+    photo: Tensor,
+    render: Tensor,
+    mask: Tensor | None = None,
+    caption: str = "",
+    labels: tuple[str, str] = ("photo", "render"),
+) -> Image.Image:
     """Draw photo | render | error map in a row, with a caption above and the error's colour bar below.
 
     Args:
         photo, render: (H, W, 3) in [0, 1].
         mask: (H, W) bool, False where a pixel is ignored; ignored pixels are dimmed in the photo and show no error.
         caption: one line of text.
+        labels: texts below the first two pictures.
     """
     dimmed_photo = photo.cpu().numpy()
     error = (render - photo).abs().mean(dim=-1).cpu().numpy()
@@ -59,7 +66,7 @@ def draw_comparison(photo: Tensor, render: Tensor, mask: Tensor | None = None, c
     sheet = Image.new("RGB", (3 * size[0] + 2 * GAP_PIXELS, size[1] + 2 * line + GAP_PIXELS), PAPER_COLOR)
     draw = ImageDraw.Draw(sheet)
     draw.text((GAP_PIXELS, line / 2), caption, TEXT_COLOR, text, anchor="lm")
-    for column, (panel, label) in enumerate(zip(panels, ("photo", "render", ""), strict=True)):
+    for column, (panel, label) in enumerate(zip(panels, (*labels, ""), strict=True)):
         left = column * (size[0] + GAP_PIXELS)
         sheet.paste(panel, (left, line))
         draw.text((left + size[0] / 2, line + size[1] + line / 2), label, LABEL_COLOR, text, anchor="mm")

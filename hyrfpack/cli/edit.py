@@ -1,0 +1,195 @@
+"""The command `hyrfpack edit`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from hyrfpack.cli.common import (
+    format_table,
+    json_option,
+    note_rename,
+    overwrite_option,
+    print_json,
+    read_scene,
+    resolve_model_file,
+    scene_options,
+)
+from hyrfpack.cli.types import BOX, OUTPUT, PATH, Numbers
+from hyrfpack.config.compress import PROFILES
+from hyrfpack.config.edit import (
+    Action,
+    Background,
+    Center,
+    CropBox,
+    CropCameras,
+    CropSphere,
+    KeepGaussians,
+    MaxScale,
+    MinOpacity,
+    Remove,
+    Scale,
+    Translate,
+)
+
+if TYPE_CHECKING:
+    from hyrfpack.edit import EditReport
+
+_ORDER_KEY = "hyrfpack.cli.edit.order"
+# How the value of each option becomes an action.
+_ACTION_BY_OPTION: dict[str, Callable[[Any], Action]] = {
+    "crop_box": lambda box: CropBox(tuple(box[:3]), tuple(box[3:])),
+    "crop_sphere": lambda numbers: CropSphere(tuple(numbers[:3]), numbers[3]),
+    "crop_cameras": CropCameras,
+    "min_opacity": MinOpacity,
+    "max_scale": MaxScale,
+    "gaussians": KeepGaussians,
+    "background_color": Background,
+    "translate": Translate,
+    "scale": Scale,
+    "center": lambda _: Center(),
+}
+
+
+class _OrderedCommand(click.Command):
+    """A command that keeps the order in which its options were given."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        _, _, given = self.make_parser(ctx).parse_args(args=list(args))
+        ctx.meta[_ORDER_KEY] = [str(parameter.name) for parameter in given]
+        return super().parse_args(ctx, args)
+
+
+@click.command(short_help="Crop, clean, reduce and move a model.", cls=_OrderedCommand)
+@click.argument("model", type=PATH)
+@click.option("-o", "--output", type=OUTPUT, metavar="FILE", help="The .hyrf file to write.")
+@click.option("--plan", is_flag=True, help="Print what the actions would do, and write no model.")
+@click.option("--picture", type=OUTPUT, metavar="FILE", help="Write a .png or .jpg of the scene before and after.")
+@click.option("--crop-box", type=BOX, multiple=True, help="Keep the Gaussians inside MINX,MINY,MINZ,MAXX,MAXY,MAXZ.")
+@click.option(
+    "--crop-sphere", type=Numbers(4, "X,Y,Z,RADIUS"), multiple=True, help="Keep the Gaussians inside a sphere."
+)
+@click.option(
+    "--crop-cameras",
+    type=float,
+    multiple=True,
+    metavar="MARGIN",
+    help="Keep the Gaussians that the cameras surround, seen from above. The margin enlarges this area by a fraction "
+    "of its size; 0 for none.",
+)
+@click.option("--invert", count=True, help="After a crop: remove the Gaussians that it would keep.")
+@click.option("--min-opacity", type=float, multiple=True, metavar="OPACITY", help="Remove lower opacities, 0 to 1.")
+@click.option(
+    "--max-scale", type=float, multiple=True, metavar="LENGTH", help="Remove Gaussians with a longer axis (std. dev.)."
+)
+@click.option(
+    "--gaussians",
+    type=int,
+    multiple=True,
+    metavar="N",
+    help="Keep the N Gaussians whose removal would change renders at the cameras most.",
+)
+@click.option(
+    "--background-color",
+    type=Numbers(3, "R,G,B"),
+    multiple=True,
+    help="Replace the background by a colour, each number 0 to 1.",
+)
+@click.option("--translate", type=Numbers(3, "X,Y,Z"), multiple=True, help="Move the scene.")
+@click.option("--scale", type=float, multiple=True, metavar="FACTOR", help="Scale the scene about the origin.")
+@click.option("--center", count=True, help="Move the point that the cameras look at to the origin.")
+@click.option("--profile", type=click.Choice(PROFILES), help="Profile of the file to write.  [default: that of MODEL]")
+@click.option("--data", type=PATH, help="Photos and poses of MODEL, for scores on held-out photos before and after.")
+@overwrite_option
+@scene_options
+@json_option
+@click.pass_context
+def edit(
+    ctx: click.Context,
+    model: Path,
+    output: Path | None,
+    plan: bool,
+    picture: Path | None,
+    profile: str | None,
+    data: Path | None,
+    overwrite: bool,
+    reader_options: dict[str, Any],
+    as_json: bool,
+    **values: Any,
+) -> None:
+    """Edit MODEL, a .hyrf file or the folder of a run, and report how much its pictures change.
+
+    Actions are applied in the order in which they are given, and may be repeated. Positions and lengths are in world
+    units, after the moves before them. The file that is written has the profile of MODEL.
+
+    \b
+    Examples:
+      hyrfpack edit bonsai.hyrf --plan --crop-sphere 0,0,0,1.5
+      hyrfpack edit bonsai.hyrf -o table.hyrf --center --crop-sphere 0,0,0,1.5 --background-color 1,1,1
+      hyrfpack edit garden.hyrf -o clean.hyrf --min-opacity 0.02 --crop-cameras 0.5
+      hyrfpack edit room.hyrf -o hole.hyrf --crop-box=-1,-1,-1,1,1,1 --invert
+      hyrfpack edit survey.hyrf -o meters.hyrf --scale 2.54
+    """
+    actions = _read_actions(ctx.meta[_ORDER_KEY], values)
+    if plan == (output is not None):
+        raise click.UsageError("give either -o FILE to write the edited model, or --plan to see what would change")
+    from hyrfpack.edit import edit_model, plan_edit
+    from hyrfpack.format import describe_file
+
+    model = resolve_model_file(model)
+    scene = None if data is None else read_scene(data, reader_options, describe_file(model))
+    if plan:
+        report = plan_edit(model, actions, data=scene, picture=picture, overwrite=overwrite)
+    else:
+        assert output is not None
+        report = edit_model(model, output, actions, profile=profile, data=scene, picture=picture, overwrite=overwrite)
+        note_rename(output, report.file)
+    if as_json:
+        print_json(report.to_dict())
+    else:
+        _print_report(report)
+
+
+def _read_actions(order: Sequence[str], values: dict[str, Any]) -> list[Action]:
+    """Return the actions that the options name, in the order in which these were given.
+
+    Raises:
+        UsageError: there is no action, a number is out of its range, or --invert does not follow a crop.
+    """
+    left = {name: list(given) if isinstance(given, tuple) else [None] * given for name, given in values.items()}
+    actions: list[Action] = []
+    for name in order:
+        if name == "invert":
+            if not actions or not isinstance(actions[-1], CropBox | CropSphere | CropCameras):
+                raise click.UsageError("--invert must follow --crop-box, --crop-sphere or --crop-cameras")
+            actions[-1] = Remove(actions[-1])
+        elif name in _ACTION_BY_OPTION:
+            try:
+                actions.append(_ACTION_BY_OPTION[name](left[name].pop(0)))
+            except ValueError as error:
+                raise click.UsageError(f"--{name.replace('_', '-')}: {error}") from error
+    if not actions:
+        raise click.UsageError("there is nothing to do; give at least one action, such as --crop-sphere 0,0,0,1")
+    return actions
+
+
+def _print_report(report: EditReport) -> None:
+    rows = [
+        [step.action, f"{step.gaussians_before:,}", f"{step.gaussians_after - step.gaussians_before:+,}"]
+        for step in report.actions
+    ]
+    click.echo(format_table(["action", "Gaussians", "change"], rows))
+    click.echo(
+        f"renders before and after, {report.views} views: PSNR mean {report.psnr_change:.2f} dB, lowest "
+        f"{report.psnr_change_worst:.2f} dB"
+    )
+    if report.psnr_before is not None:
+        click.echo(
+            f"held-out photos: PSNR {report.psnr_before:.3f} to {report.psnr_after:.3f} dB, SSIM "
+            f"{report.ssim_before:.4f} to {report.ssim_after:.4f}"
+        )
+    if report.file:
+        click.echo(f"{report.file}: {report.bytes_after:,} bytes, {report.bytes_before:,} before")

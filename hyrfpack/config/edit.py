@@ -1,0 +1,220 @@
+"""Actions that edit a model, as values: what each does and its numbers, without torch.
+
+Positions and lengths are in the world units of the file that is edited. `hyrfpack.edit_model` applies actions.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from hyrfpack.checks import check_float, check_int
+
+Vector = tuple[float, float, float]
+MIN_MARGIN = -0.99  # a hull of no size would keep nothing
+
+
+def _check_vector(name: str, values: Sequence[float], *, may_be_infinite: bool = False) -> None:
+    if len(values) != 3 or any(math.isnan(value) or (math.isinf(value) and not may_be_infinite) for value in values):
+        raise ValueError(f"{name} is {values!r}; it must be three {'' if may_be_infinite else 'finite '}numbers")
+
+
+@dataclass(frozen=True)
+class CropBox:
+    """Keep the Gaussians whose centres lie in a box.
+
+    Attributes:
+        low, high: minimum and maximum corner. Infinite numbers leave a side open.
+    """
+
+    low: Vector
+    high: Vector
+
+    def __post_init__(self) -> None:
+        for name in ("low", "high"):
+            _check_vector(name, getattr(self, name), may_be_infinite=True)
+        if any(low > high for low, high in zip(self.low, self.high, strict=True)):
+            raise ValueError(f"the box from {self.low} to {self.high} has a minimum above its maximum")
+
+    def __str__(self) -> str:
+        return f"crop to the box from {_format(self.low)} to {_format(self.high)}"
+
+
+@dataclass(frozen=True)
+class CropSphere:
+    """Keep the Gaussians whose centres lie in a sphere.
+
+    Attributes:
+        center: its centre.
+        radius: its radius, above 0.
+    """
+
+    center: Vector
+    radius: float
+
+    def __post_init__(self) -> None:
+        _check_vector("center", self.center)
+        check_float("radius", self.radius)
+        if self.radius == 0:
+            raise ValueError("radius is 0; it must be above 0")
+
+    def __str__(self) -> str:
+        return f"crop to the sphere of radius {self.radius:g} around {_format(self.center)}"
+
+
+@dataclass(frozen=True)
+class CropCameras:
+    """Keep the Gaussians that the training cameras surround.
+
+    Seen from above, these are the Gaussians in the convex hull of the cameras' positions. Their height does not matter.
+
+    Attributes:
+        margin: enlarges the hull about its centre by this fraction of its size; -0.2 makes it smaller.
+    """
+
+    margin: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_float("margin", self.margin, MIN_MARGIN)
+
+    def __str__(self) -> str:
+        return f"crop to what the cameras surround, with a margin of {self.margin:g}"
+
+
+Crop = CropBox | CropSphere | CropCameras
+
+
+@dataclass(frozen=True)
+class Remove:
+    """Remove the Gaussians that a crop would keep.
+
+    Attributes:
+        crop: the crop.
+    """
+
+    crop: Crop
+
+    def __str__(self) -> str:
+        return str(self.crop).replace("crop to", "remove", 1)
+
+
+@dataclass(frozen=True)
+class MinOpacity:
+    """Remove the Gaussians with a lower opacity.
+
+    Attributes:
+        opacity: the limit, in [0, 1].
+    """
+
+    opacity: float
+
+    def __post_init__(self) -> None:
+        check_float("opacity", self.opacity, 0, 1)
+
+    def __str__(self) -> str:
+        return f"remove opacities below {self.opacity:g}"
+
+
+@dataclass(frozen=True)
+class MaxScale:
+    """Remove the Gaussians whose longest axis is longer.
+
+    Attributes:
+        scale: the limit, a standard deviation.
+    """
+
+    scale: float
+
+    def __post_init__(self) -> None:
+        check_float("scale", self.scale)
+
+    def __str__(self) -> str:
+        return f"remove Gaussians longer than {self.scale:g}"
+
+
+@dataclass(frozen=True)
+class KeepGaussians:
+    """Keep a number of Gaussians: those whose removal would change renders at the training cameras most.
+
+    Attributes:
+        count: the number to keep, at least 1. A model with fewer Gaussians stays as it is.
+    """
+
+    count: int
+
+    def __post_init__(self) -> None:
+        check_int("count", self.count, 1)
+
+    def __str__(self) -> str:
+        return f"keep the {self.count:,} most important Gaussians"
+
+
+@dataclass(frozen=True)
+class Background:
+    """Replace the background sphere, or the background colour, by a colour.
+
+    Attributes:
+        color: RGB in [0, 1].
+    """
+
+    color: Vector = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        _check_vector("color", self.color)
+        for value in self.color:
+            check_float("color", value, 0, 1)
+
+    def __str__(self) -> str:
+        return f"use the background colour {_format(self.color)}"
+
+
+@dataclass(frozen=True)
+class Translate:
+    """Move the scene.
+
+    Attributes:
+        offset: added to all positions.
+    """
+
+    offset: Vector
+
+    def __post_init__(self) -> None:
+        _check_vector("offset", self.offset)
+
+    def __str__(self) -> str:
+        return f"move by {_format(self.offset)}"
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Scale the scene about the origin, such as to metres.
+
+    Attributes:
+        factor: multiplies all positions and lengths, above 0.
+    """
+
+    factor: float
+
+    def __post_init__(self) -> None:
+        check_float("factor", self.factor)
+        if self.factor == 0:
+            raise ValueError("factor is 0; it must be above 0")
+
+    def __str__(self) -> str:
+        return f"scale by {self.factor:g}"
+
+
+@dataclass(frozen=True)
+class Center:
+    """Move the scene so that the point that its cameras look at becomes the origin."""
+
+    def __str__(self) -> str:
+        return "move the centre to the origin"
+
+
+Action = Crop | Remove | MinOpacity | MaxScale | KeepGaussians | Background | Translate | Scale | Center
+
+
+def _format(values: Sequence[float]) -> str:
+    return f"({', '.join(f'{value:g}' for value in values)})"

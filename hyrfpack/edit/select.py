@@ -1,0 +1,86 @@
+"""Which Gaussians an action keeps."""
+
+from __future__ import annotations
+
+from functools import singledispatch
+
+import numpy as np
+from scipy.spatial import ConvexHull, QhullError
+
+from hyrfpack.compress.sensitivity import measure_sensitivity
+from hyrfpack.config.edit import CropBox, CropCameras, CropSphere, KeepGaussians, MaxScale, MinOpacity, Remove
+from hyrfpack.edit.state import EditState
+from hyrfpack.errors import HyrfError
+
+
+@singledispatch
+def keep_mask(action: object, state: EditState) -> np.ndarray:
+    """Return a mask (N,) of the Gaussians that an action of selection keeps.
+
+    Raises:
+        HyrfError: the cameras of the scene do not surround anything.
+    """
+    raise TypeError(f"{action!r} selects no Gaussians")
+
+
+@keep_mask.register
+def _(action: CropBox, state: EditState) -> np.ndarray:
+    positions = state.world_positions()
+    return np.asarray(((positions >= action.low) & (positions <= action.high)).all(axis=1))
+
+
+@keep_mask.register
+def _(action: CropSphere, state: EditState) -> np.ndarray:
+    distances = np.linalg.norm(state.world_positions() - action.center, axis=1)
+    return np.asarray(distances <= action.radius)
+
+
+@keep_mask.register
+def _(action: CropCameras, state: EditState) -> np.ndarray:
+    east, north = _horizontal_axes(state.up)
+    plan = np.stack((east, north), axis=1)
+    corners = np.array([camera.position for camera in state.cameras]) @ plan
+    try:
+        hull = ConvexHull(corners)
+    except (QhullError, ValueError):
+        raise HyrfError(
+            f"the {len(corners)} cameras of the scene stand at one place or in a row, so they surround nothing",
+            fix="crop to a box or a sphere instead",
+        ) from None
+    center = corners[hull.vertices].mean(axis=0)
+    # A point p is inside if normal . p + offset <= 0 for each side; the margin moves sides away from the centre.
+    points = (state.world_positions() @ plan - center) / (1 + action.margin) + center
+    normals, offsets = hull.equations[:, :2], hull.equations[:, 2]
+    return (points @ normals.T + offsets <= 0).all(axis=1)
+
+
+@keep_mask.register
+def _(action: Remove, state: EditState) -> np.ndarray:
+    return ~keep_mask(action.crop, state)
+
+
+@keep_mask.register
+def _(action: MinOpacity, state: EditState) -> np.ndarray:
+    return state.model.decode_geometry().opacities.numpy() >= action.opacity
+
+
+@keep_mask.register
+def _(action: MaxScale, state: EditState) -> np.ndarray:
+    longest = state.model.decode_geometry().scales.amax(dim=1).numpy()
+    return longest * state.model.config.frame.scale <= action.scale
+
+
+@keep_mask.register
+def _(action: KeepGaussians, state: EditState) -> np.ndarray:
+    keep = np.ones(len(state.model), bool)
+    if action.count < len(keep):
+        removals = measure_sensitivity(state.model, state.cameras, progress=state.progress).removals
+        keep[np.argsort(-removals, kind="stable")[action.count :]] = False
+    return keep
+
+
+def _horizontal_axes(up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return two unit vectors that are perpendicular to `up` (3,) and to each other."""
+    east = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    east /= np.linalg.norm(east)
+    return east, np.cross(up, east) / np.linalg.norm(up)

@@ -1,0 +1,49 @@
+"""The scene between two actions of an edit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hyrfpack.edit.transform import Placement
+from hyrfpack.model import HybridModel
+from hyrfpack.progress import Progress, ignore_progress
+from hyrfpack.scene import Camera
+
+
+@dataclass(frozen=True, eq=False)
+class EditState:
+    """A scene in the middle of an edit.
+
+    Attributes:
+        model: the model.
+        cameras: the training cameras, in the model's world coordinates.
+        center: (3,) the point that the cameras look at, likewise.
+        up: (3,) the up direction.
+        placement: the map from the world coordinates of the file that is edited.
+        progress: called with `TaskEvent`s.
+    """
+
+    model: HybridModel
+    cameras: list[Camera]
+    center: np.ndarray
+    up: np.ndarray
+    placement: Placement
+    progress: Progress = ignore_progress
+
+    def move(self, factor: float, offset: Sequence[float] | np.ndarray) -> EditState:
+        """Return the scene with positions p' = factor p + offset."""
+        step = Placement.identity().then(factor, offset)
+        return replace(
+            self,
+            model=step.move_model(self.model),
+            cameras=[step.move_camera(camera) for camera in self.cameras],
+            center=step.move_point(self.center),
+            placement=self.placement.then(factor, offset),
+        )
+
+    def world_positions(self) -> np.ndarray:
+        """Return the Gaussians' centres (N, 3) in world units, float64."""
+        return self.model.config.frame.to_world(self.model.gaussians.positions.numpy())

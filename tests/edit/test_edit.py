@@ -1,0 +1,227 @@
+"""Edits keep what they should, move scenes exactly, and lose no file."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commands import hyrfpack, refused, succeeded
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+from scenes import QUIET_CONTEXT, ring
+
+from hyrfpack.cameras.capture import Capture, provenance_cameras
+from hyrfpack.config.edit import (
+    Background,
+    Center,
+    CropBox,
+    CropCameras,
+    CropSphere,
+    KeepGaussians,
+    MaxScale,
+    MinOpacity,
+    Remove,
+    Scale,
+    Translate,
+)
+from hyrfpack.edit import edit_model, plan_edit
+from hyrfpack.edit.transform import Placement
+from hyrfpack.evaluate.metrics import IDENTICAL_PSNR
+from hyrfpack.format import describe_file, load_model, save_model
+from hyrfpack.format.codec import load_with_provenance
+from hyrfpack.format.container import Container
+from hyrfpack.render import render_view
+
+GOLDEN_FOLDER = Path(__file__).parents[1] / "golden"
+COMPACT_FILE = GOLDEN_FOLDER / "trained" / "demo_compact.hyrf"
+RAW_FILE = GOLDEN_FOLDER / "trained" / "demo.hyrf"
+MAP_FILE = GOLDEN_FOLDER / "trained" / "exposed_balls.hyrf"
+
+
+def world_positions(path: Path) -> np.ndarray:
+    model = load_model(path)
+    return model.gaussians.positions.double().numpy() * model.config.frame.scale + model.config.frame.center
+
+
+def edited(path: Path, tmp_path: Path, *actions, **settings) -> Path:
+    return Path(edit_model(path, tmp_path / "edited.hyrf", actions, context=QUIET_CONTEXT, **settings).file)
+
+
+def rows(positions: np.ndarray) -> set[tuple[float, ...]]:
+    return {tuple(row) for row in positions.round(5).tolist()}
+
+
+@pytest.mark.parametrize("file", [COMPACT_FILE, RAW_FILE, MAP_FILE], ids=lambda path: path.stem)
+def test_a_moved_scene_renders_as_before_from_moved_cameras(file, tmp_path):
+    moved = edited(file, tmp_path, Scale(2.5), Translate((300.0, -20.0, 7.0)))
+    before, after = load_model(file), load_model(moved)
+    cameras = zip(Capture(describe_file(file)).cameras[:3], Capture(describe_file(moved)).cameras[:3], strict=True)
+    for camera, moved_camera in cameras:
+        assert_allclose(
+            moved_camera.position, 2.5 * camera.position + (300, -20, 7), atol=0.03
+        )  # rotations are rounded
+        exact = Placement(2.5, np.array([300.0, -20.0, 7.0])).move_camera(camera)
+        pictures = [render_view(model, view).rgb.numpy() for model, view in ((before, camera), (after, exact))]
+        assert_allclose(pictures[1], pictures[0], atol=1e-4)
+
+
+def test_a_move_copies_all_other_sections_byte_for_byte(tmp_path):
+    moved = edited(COMPACT_FILE, tmp_path, Translate((1.0, 2.0, 3.0)), Background((1.0, 0.5, 0.0)))
+    with Container.open(COMPACT_FILE) as old, Container.open(moved) as new:
+        assert list(old.entries) == list(new.entries) and old.version == new.version
+        assert all(bytes(old[name].data) == bytes(new[name].data) for name in old.entries if name != "META")
+    assert load_model(moved).config.solid == (1.0, 0.5, 0.0) and not load_model(moved).config.background
+
+
+def test_center_moves_the_point_of_interest_to_the_origin(tmp_path):
+    moved = edited(RAW_FILE, tmp_path, Center())
+    assert_allclose(Capture(describe_file(moved)).viewpoint.center, 0, atol=1e-4)
+
+
+offsets = st.tuples(*[st.floats(-100, 100)] * 3)
+
+
+@given(st.lists(st.tuples(st.floats(0.1, 10), offsets), max_size=5))
+def test_placements_compose_as_the_moves_in_turn(moves):
+    placement, point = Placement.identity(), np.array([3.0, -2.0, 0.5])
+    for factor, offset in moves:
+        placement, point = placement.then(factor, offset), factor * point + np.array(offset)
+    assert_allclose(placement.move_point((3.0, -2.0, 0.5)), point, rtol=1e-9, atol=1e-6)
+
+
+@pytest.mark.parametrize("file", [COMPACT_FILE, RAW_FILE], ids=["compact", "raw"])
+def test_a_crop_keeps_the_gaussians_inside_and_remove_the_others(file, tmp_path):
+    positions = world_positions(file)
+    box = CropBox(tuple(np.quantile(positions, 0.2, axis=0)), (np.inf, np.inf, np.inf))
+    inside = (positions >= box.low).all(axis=1)
+    kept = plan_edit(file, [box], context=QUIET_CONTEXT)
+    removed = plan_edit(file, [Remove(box)], context=QUIET_CONTEXT)
+    assert 0 < inside.sum() < len(inside)
+    assert kept.actions[0].gaussians_after == inside.sum()
+    assert removed.actions[0].gaussians_after == (~inside).sum()
+
+
+def test_a_raw_file_keeps_the_numbers_and_cameras_of_what_is_left(tmp_path):
+    positions = world_positions(RAW_FILE)
+    center = tuple(np.median(positions, axis=0))
+    cut = edited(RAW_FILE, tmp_path, CropSphere(center, 0.6))
+    inside = np.linalg.norm(positions - center, axis=1) <= 0.6
+    assert 0 < inside.sum() < len(inside)
+    assert rows(world_positions(cut)) == rows(positions[inside])
+    assert load_with_provenance(cut)[1] == load_with_provenance(RAW_FILE)[1]
+
+
+def test_actions_see_the_result_of_those_before_them(tmp_path):
+    positions = world_positions(RAW_FILE)
+    box = CropBox((-np.inf, -np.inf, -np.inf), tuple(np.median(positions, axis=0) + 5.0))
+    moved_first = plan_edit(RAW_FILE, [Translate((5.0, 5.0, 5.0)), box], context=QUIET_CONTEXT)
+    cropped_first = plan_edit(RAW_FILE, [box, Translate((5.0, 5.0, 5.0))], context=QUIET_CONTEXT)
+    assert moved_first.actions[1].gaussians_after == (positions <= np.median(positions, axis=0)).all(axis=1).sum()
+    assert cropped_first.actions[0].gaussians_after == (positions <= box.high).all(axis=1).sum()
+
+
+@pytest.mark.parametrize(("margin", "half_side"), [(0.0, 1.0), (0.5, 1.5), (-0.5, 0.5)])
+def test_cameras_surround_the_inside_of_their_hull_at_any_height(margin, half_side, tmp_path):
+    # Four cameras at (+-1, 0) and (0, +-1), with z up, span the square |x| + |y| <= 1.
+    model = load_model(RAW_FILE)
+    provenance = {"cameras": provenance_cameras(ring(4, radius=1.0))}
+    save_model(model, tmp_path / "ring.hyrf", provenance={**load_with_provenance(RAW_FILE)[1], **provenance})
+    provenance = load_with_provenance(tmp_path / "ring.hyrf")[1]
+    provenance["viewpoint"]["up"] = [0, 0, 1]
+    save_model(model, tmp_path / "ring.hyrf", provenance=provenance)
+    positions = world_positions(RAW_FILE)
+    inside = np.abs(positions[:, :2]).sum(axis=1) <= half_side
+    report = plan_edit(tmp_path / "ring.hyrf", [CropCameras(margin)], context=QUIET_CONTEXT)
+    assert report.actions[0].gaussians_after == pytest.approx(inside.sum(), abs=2)
+    assert 0 < inside.sum() < len(inside)
+
+
+def test_opacities_and_scales_are_compared_with_the_limits():
+    model = load_model(RAW_FILE)
+    geometry = model.decode_geometry()
+    scales = geometry.scales.amax(dim=1).numpy() * model.config.frame.scale
+    opacity, scale = float(geometry.opacities.quantile(0.3)), float(np.quantile(scales, 0.8))
+    faint, long = (
+        plan_edit(RAW_FILE, [action], context=QUIET_CONTEXT) for action in (MinOpacity(opacity), MaxScale(scale))
+    )
+    assert faint.actions[0].gaussians_after == (geometry.opacities.numpy() >= opacity).sum()
+    assert long.actions[0].gaussians_after == (scales <= scale).sum()
+
+
+def test_reducing_removes_first_what_pictures_do_not_show():
+    model = load_model(RAW_FILE)
+    count = len(model)
+    few, most = (
+        plan_edit(RAW_FILE, [KeepGaussians(n)], context=QUIET_CONTEXT) for n in (count // 2, count - count // 20)
+    )
+    faintest = float(model.decode_geometry().opacities.quantile(0.05))
+    by_opacity = plan_edit(RAW_FILE, [MinOpacity(faintest)], context=QUIET_CONTEXT)
+    assert (few.actions[0].gaussians_after, most.actions[0].gaussians_after) == (count // 2, count - count // 20)
+    assert most.psnr_change > few.psnr_change
+    assert most.psnr_change >= by_opacity.psnr_change
+
+
+def test_a_plan_of_moves_changes_no_picture():
+    report = plan_edit(RAW_FILE, [Translate((1.0, 0.0, 0.0))], context=QUIET_CONTEXT)
+    assert report.psnr_change > 90 and report.psnr_change <= IDENTICAL_PSNR
+    assert (report.file, report.bytes_after) == ("", 0)
+
+
+def test_the_command_applies_its_options_in_order_and_reports_in_json(tmp_path):
+    before = COMPACT_FILE.read_bytes()
+    result = succeeded(
+        "edit", COMPACT_FILE, "-o", tmp_path / "out.hyrf", "--scale", 2, "--translate", "1,0,0", "--scale", "0.5",
+        "--crop-box", "-inf,-inf,-inf,inf,inf,inf", "--picture", tmp_path / "out.png", "--json",
+    )  # fmt: skip
+    report = json.loads(result.stdout)
+    assert [step["action"].split()[0] for step in report["actions"]] == ["scale", "move", "scale", "crop"]
+    assert report["file"] == str(tmp_path / "out.hyrf") and (tmp_path / "out.png").stat().st_size > 1000
+    assert_allclose(
+        np.array(load_model(tmp_path / "out.hyrf").config.frame.center) - load_model(COMPACT_FILE).config.frame.center,
+        (0.5, 0, 0),
+        atol=1e-9,
+    )
+    assert COMPACT_FILE.read_bytes() == before
+
+
+def test_a_plan_writes_no_model(tmp_path):
+    result = succeeded("edit", COMPACT_FILE, "--plan", "--min-opacity", 0.1)
+    assert "remove opacities below 0.1" in result.stdout and "PSNR mean" in result.stdout
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_edit_that_leaves_nothing_is_refused_and_writes_nothing(tmp_path):
+    sentence = refused("edit", COMPACT_FILE, "-o", tmp_path / "out.hyrf", "--crop-box", "90,90,90,91,91,91")
+    assert "would leave no Gaussian; their centres lie between" in sentence
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("options", "problem"),
+    [
+        (["--plan"], "there is nothing to do"),
+        (["--plan", "--invert"], "--invert must follow"),
+        (["--plan", "--min-opacity", "0.1", "--invert"], "--invert must follow"),
+        (["--plan", "--min-opacity", "2"], "--min-opacity: opacity is 2.0"),
+        (["--plan", "--scale", "0"], "--scale: factor is 0"),
+        (["--plan", "--crop-sphere", "0,0,0"], "is not 4 numbers"),
+        (["--plan", "--translate", "nan,0,0"], "is not 3 numbers"),
+        (["--plan", "--crop-cameras", "-1"], "--crop-cameras: margin is -1.0"),
+        (["--center"], "give either -o FILE"),
+        (["--plan", "-o", "out.hyrf", "--center"], "give either -o FILE"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else None,
+)
+def test_options_that_make_no_sense_are_refused(options, problem):
+    result = hyrfpack("edit", COMPACT_FILE, *options)
+    assert result.exit_code == 2 and problem in result.stderr and "Traceback" not in result.stderr
+
+
+def test_edit_model_checks_its_actions(tmp_path):
+    with pytest.raises(ValueError, match="no actions"):
+        edit_model(COMPACT_FILE, tmp_path / "out.hyrf", [])
+    with pytest.raises(TypeError, match="no action of hyrfpack.config.edit"):
+        edit_model(COMPACT_FILE, tmp_path / "out.hyrf", ["crop"])
