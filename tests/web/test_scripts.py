@@ -67,7 +67,7 @@ def test_make_player_gives_the_same_bytes_again():
 
 
 @pytest.mark.unit
-@pytest.mark.parametrize("path", ["viewer/sort.js", "viewer/formats/zip.js", "hyrf/rans.js", "viewer/style.css"])
+@pytest.mark.parametrize("path", ["viewer/player.js", "viewer/formats/zip.js", "hyrf/rans.js", "viewer/style.css"])
 def test_the_digest_of_the_sources_depends_on_every_script_and_the_style(path, replaced_files):
     before = source_digest()
     replaced_files[path] = read_web_file(path) + "\n"

@@ -1,11 +1,11 @@
 // Evaluates a model on the graphics device: view-independent numbers once, and colours again when the view moves.
 
-import { frustumPlanes } from "./frustum.js";
+import { frustumPlanes } from "../hyrf/frustum.js";
 import { ContextLostError, Graphics, WorkPacer } from "./graphics.js";
 import { TEXTURE_WIDTH } from "./constants.js";
 import { Panorama } from "./panorama.js";
 import { readText } from "./texts.js";
-import { RowStates } from "./row_states.js";
+import { RowStates } from "../hyrf/row_states.js";
 
 const MAX_CELLS = 32; // a cell is 8 hidden units; the shaders hold all cells in variables
 const WEIGHTS_TEXTURE_WIDTH = 1024; // of the texture for a decoder's numbers if no uniform block is used

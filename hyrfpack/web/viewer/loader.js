@@ -1,6 +1,6 @@
 // Connects the page with the worker that reads files and sorts splats.
 
-import { frustumPlanes } from "./frustum.js";
+import { frustumPlanes } from "../hyrf/frustum.js";
 import { Connection } from "./worker_pool.js";
 
 // The file is no longer needed, because another one was opened.

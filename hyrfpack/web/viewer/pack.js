@@ -1,6 +1,7 @@
 // Packs splats and models into the textures that the shaders read. Textures are TEXTURE_WIDTH wide.
 
 import { decoderLayout, gridLevels } from "../hyrf/grids.js";
+import { rowBalls } from "../hyrf/row_states.js";
 import { TEXTURE_WIDTH } from "./constants.js";
 
 const UNITS_PER_CELL = 8; // hidden units that the shaders process together
@@ -61,7 +62,7 @@ export function packModel({ config, count, positions, colorLogits, scaleLogits, 
   });
   return {
     count, height, explicit, logits,
-    balls: rowBalls(positions, count),
+    balls: rowBalls(positions, TEXTURE_WIDTH),
     geometry: field("geometry", geometry),
     radiance: field("radiance", radiance),
     cells: Math.ceil(config.hidden / UNITS_PER_CELL),
@@ -101,20 +102,4 @@ function packDecoder(decoder, [first, second, last]) {
     }
   }
   return { numbers, places: { ...places, WEIGHTS } };
-}
-
-// Returns, for each row of a texture, a ball around the positions of its Gaussians: x, y, z, radius.
-function rowBalls(positions, count) {
-  const balls = new Float32Array(4 * countRows(count));
-  for (let row = 0; row * TEXTURE_WIDTH < count; row++) {
-    const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
-    const end = 3 * Math.min(count, (row + 1) * TEXTURE_WIDTH);
-    for (let p = 3 * row * TEXTURE_WIDTH; p < end; p++) {
-      low[p % 3] = Math.min(low[p % 3], positions[p]);
-      high[p % 3] = Math.max(high[p % 3], positions[p]);
-    }
-    const half = [0, 1, 2].map((axis) => high[axis] / 2 - low[axis] / 2);
-    balls.set([...half.map((side, axis) => low[axis] + side), Math.hypot(...half)], 4 * row);
-  }
-  return balls;
 }

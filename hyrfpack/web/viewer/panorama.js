@@ -1,7 +1,7 @@
 // Draws the background as an equirectangular picture: first a coarse one, then finer tiles, those in view first.
 
 import { dot } from "../hyrf/vectors.js";
-import { frustumPlanes, intersectsFrustum } from "./frustum.js";
+import { frustumPlanes, intersectsFrustum } from "../hyrf/frustum.js";
 import { WorkPacer } from "./graphics.js";
 import { BACKGROUND_RADIUS } from "./constants.js";
 

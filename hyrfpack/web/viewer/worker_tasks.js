@@ -25,7 +25,7 @@ import { rejectOtherFiles } from "./other_files.js";
 import { packModel, packSplats } from "./pack.js";
 import { ReceivedFile } from "./received_file.js";
 import { backgroundPicture, modelScene, splatsScene } from "./scene.js";
-import { DepthSort } from "./sort.js";
+import { DepthSort } from "../hyrf/sort.js";
 
 const FIRST_LAYER_DELAY_MS = 150; // if the rest of the file arrives in this time, the first layer is not shown alone
 const HARMONICS_DEGREE = 3;

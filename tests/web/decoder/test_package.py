@@ -19,7 +19,17 @@ from hyrfpack.model import HashGridConfig
 PROJECT_FOLDER = Path(__file__).parents[3]
 PACKAGE_FOLDER = PROJECT_FOLDER / "hyrfpack" / "web" / "hyrf"
 GOLDEN_FOLDER = PROJECT_FOLDER / "tests" / "golden"
-PUBLIC_MODULES = ("index", "grids", "exposure", "fields", "harmonics", "viewpoint")
+PUBLIC_MODULES = (
+    "index",
+    "grids",
+    "exposure",
+    "fields",
+    "frustum",
+    "harmonics",
+    "row_states",
+    "sort",
+    "viewpoint",
+)
 
 
 def run_module(code: str, folder: Path, *arguments: str) -> object:

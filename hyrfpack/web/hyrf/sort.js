@@ -3,21 +3,30 @@
 const RADIX_BINS = 1 << 16;
 
 export class DepthSort {
-  // `positions` are those of the splats (3 N). Orders fill whole rows of a texture that is `width` texels wide.
+  /**
+   * @param {Float32Array} positions those of the splats (3 N)
+   * @param {number} width orders fill whole rows of a texture that is `width` texels wide
+   */
   constructor(positions, width) {
     this.positions = positions;
     this.count = positions.length / 3;
     this.capacity = width * Math.ceil(this.count / width);
     this.depths = new Float32Array(this.count);
     this.bits = new Uint32Array(this.depths.buffer);
-    [this.indices, this.others] = [new Uint32Array(this.count), new Uint32Array(this.count)];
+    this.indices = new Uint32Array(this.count);
+    this.others = new Uint32Array(this.count);
     this.counts = new Uint32Array(RADIX_BINS);
   }
 
-  // Returns {order, drawn}: indices of splats, of which the first `drawn` are valid. Uses a radix sort of the float32
-  // depths in two passes of 16 bits. `row` is the third row of the camera's pose. Splats nearer than the near plane or
-  // outside the planes `sides` (see frustum.js) are omitted. At equal depth the splat with the larger index comes
-  // first, as in the rasteriser. `order` is reused if its length fits.
+  /**
+   * Sorts by a radix sort of the float32 depths in two passes of 16 bits. Splats nearer than the near plane or outside
+   * the planes `sides` are omitted. At equal depth the splat with the larger index comes first, as in the rasteriser.
+   * @param {number[]} row the third row of the camera's pose
+   * @param {number[]} sides from `frustumPlanes`
+   * @param {number} near the depth of the near plane
+   * @param {Uint32Array | null} [order] an array to reuse, if its length fits
+   * @returns {{order: Uint32Array, drawn: number}} indices of splats, of which the first `drawn` are valid
+   */
   sort(row, sides, near, order) {
     const { positions, depths, bits, indices, others, counts } = this;
     const [a, b, c, d] = row;
@@ -45,7 +54,14 @@ export class DepthSort {
   }
 }
 
-// Distributes indices by their keys in a stable order, which is one pass of the radix sort.
+/**
+ * Distributes indices by their keys in a stable order, which is one pass of the radix sort.
+ * @param {Uint32Array} from
+ * @param {Uint32Array} to
+ * @param {number} length the number of indices
+ * @param {Uint32Array} counts the number of indices with each key; overwritten
+ * @param {(index: number) => number} key
+ */
 function scatter(from, to, length, counts, key) {
   let start = 0;
   for (let k = 0; k < counts.length; k++) {
