@@ -64,8 +64,9 @@ test-oldest: ## run the tests with the oldest dependencies that pyproject.toml a
 docs: $(VENV_STAMP) ## build the documentation site in site/; a broken link is an error
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
-player: $(VENV_STAMP) $(NODE_STAMP) ## minify the web player's scripts again after a change
+player: $(VENV_STAMP) $(NODE_STAMP) ## minify the web player's scripts again after a change, and declare the types of hyrf.js
 	$(BIN)/python -m tools.browser.build_player
+	$(BIN)/python -m tools.browser.build_types
 
 package: player ## build the npm package hyrf-viewer into dist/hyrf-viewer
 	$(BIN)/python -m tools.browser.build_package dist/hyrf-viewer

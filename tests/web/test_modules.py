@@ -112,7 +112,7 @@ ARITHMETIC_PATTERN_BY_OWNER = {
     "hyrf/vectors.js": r"\[1\] \* \w+\[2\]",  # a cross product
     "hyrf/plain.js": r"2 \*\* -24|0x7c00",  # the smallest half, or the exponent's bits
     "hyrf/basis.js": r"1\.09254843|0\.54627421|0\.28209479",
-    "viewer/rotation.js": r"1 - 2 \* \(y \* y \+ z \* z\)",
+    "hyrf/rotation.js": r"1 - 2 \* \(y \* y \+ z \* z\)",
 }
 
 

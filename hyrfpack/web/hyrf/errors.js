@@ -1,7 +1,16 @@
 // The errors of the reader, and functions that format their messages.
 
-/** The file cannot be read. The message is one sentence for the user. */
-export class HyrfFormatError extends Error {
+/** Something failed for a reason that the user can understand. The message is one sentence for the user. */
+export class HyrfError extends Error {
+  /** @param {string} message */
+  constructor(message) {
+    super(message);
+    this.name = "HyrfError";
+  }
+}
+
+/** The file cannot be read. */
+export class HyrfFormatError extends HyrfError {
   /** @param {string} message */
   constructor(message) {
     super(message);

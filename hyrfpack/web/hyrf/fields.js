@@ -4,6 +4,8 @@
 import { evaluateBasis } from "./basis.js";
 import { HASH_FACTOR_Y, HASH_FACTOR_Z, decoderLayout, gridLevels } from "./grids.js";
 
+export const BACKGROUND_RADIUS = 100; // of the background sphere, in local units (docs/reference/format.md 2.7)
+
 // Positions are evaluated in batches of this size, so that the data of a level or a layer stays in the cache.
 const ROWS_PER_BATCH = 256;
 // Outputs of a layer are computed in groups of this size, so that one pass over the inputs serves all of a group.

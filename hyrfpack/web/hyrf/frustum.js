@@ -2,6 +2,11 @@
 
 import { add, mul } from "./vectors.js";
 
+export const NEAR_PLANE_LOCAL = 0.01; // Gaussians nearer than this are not drawn; the default of hyrfpack.render_view
+// Centres of Gaussians may project outside the picture, by this part of half its size; the default of
+// hyrfpack.render_view.
+export const CULL_MARGIN_RATIO = 0.3;
+
 /**
  * A pinhole view. `rows` are the three rows of the rotation from the world (or the model's local axes) to the camera, x
  * right, y down, z forward; a point p is at rows p + translation. Focal lengths and the principal point are in pixels.

@@ -2,7 +2,7 @@
 
 import { decodeChannels } from "./channels.js";
 import { Container, EXPOSURE_TYPE, FIELD_TYPES, LAYERED_TYPES, layerType, rejectIncomplete } from "./container.js";
-import { DamagedData, HyrfFormatError, rejectDamaged, rejectNewer } from "./errors.js";
+import { DamagedData, HyrfError, HyrfFormatError, rejectDamaged, rejectNewer } from "./errors.js";
 import { decodeExposure } from "./exposure.js";
 import { FEATURES_PER_ROW, decoderSize, tableRows } from "./grids.js";
 import { decodeGroups, decoderGroups, tableGroups } from "./groups.js";
@@ -10,7 +10,7 @@ import { decodeLattice, latticePositions } from "./lattice.js";
 import { readMetadata } from "./metadata.js";
 import { decodeFloat16, decodeFloat32, decodeMinMax, decodeVectors } from "./plain.js";
 
-export { HyrfFormatError };
+export { HyrfError, HyrfFormatError };
 
 // A file of n bytes may have at most MAX_GAUSSIANS_PER_BYTE n + BASE_GAUSSIANS Gaussians, which bounds the memory.
 const MAX_GAUSSIANS_PER_BYTE = 32;

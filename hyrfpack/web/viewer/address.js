@@ -3,7 +3,7 @@
 
 import { cameraOf, viewOf } from "./camera.js";
 import { EXPOSURES } from "./exposure.js";
-import { normalizedQuat, quatOf, rowsOf } from "./rotation.js";
+import { normalizedQuat, quatOf, rowsOf } from "../hyrf/rotation.js";
 
 const LINK_SIDE_PIXELS = 1000; // links do not store a picture's size
 // Limits of the focal length divided by the square root of the picture's area.

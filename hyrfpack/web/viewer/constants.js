@@ -1,4 +1,7 @@
 // Defines constants that the worker and the page share.
 
+import { BACKGROUND_RADIUS } from "../hyrf/fields.js";
+
 export const TEXTURE_WIDTH = 2048; // for textures with one texel per splat; all WebGL 2 devices support it
-export const BACKGROUND_RADIUS = 100; // local units of the model (docs/reference/format.md 2.7)
+
+export { BACKGROUND_RADIUS };

@@ -1,7 +1,7 @@
 // Moves the eye over time (see Player.movers): damped movements, glides between cameras, and a slow turn.
 
 import { dot, mul, sub } from "../hyrf/vectors.js";
-import { quatOf, rowsOf, slerp } from "./rotation.js";
+import { quatOf, rowsOf, slerp } from "../hyrf/rotation.js";
 
 const DAMPING_SECONDS = 0.07; // the remaining movement falls to 1/e in this time
 const REST_THRESHOLD = 1e-4; // in radians or focal lengths; smaller movements are invisible

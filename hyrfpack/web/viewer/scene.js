@@ -1,11 +1,10 @@
 // Describes the scene of a file that has no page of its own, in the same form as the JSON in pages.
 
 import { backgroundColors } from "../hyrf/fields.js";
+import { CULL_MARGIN_RATIO, NEAR_PLANE_LOCAL } from "../hyrf/frustum.js";
 import { viewpointOf } from "../hyrf/viewpoint.js";
 import { BACKGROUND_RADIUS } from "./constants.js";
 
-const NEAR_PLANE_LOCAL = 0.01; // the default of hyrfpack.render_view
-const CULL_MARGIN_RATIO = 0.3; // in halves of the picture's size; the default of hyrfpack.render_view
 const MIN_SAMPLED_SPLATS = 10000;
 const BACKGROUND_HEIGHT_PIXELS = 128;
 

@@ -26,6 +26,8 @@ PUBLIC_MODULES = (
     "fields",
     "frustum",
     "harmonics",
+    "remote",
+    "remote_worker",
     "row_states",
     "sort",
     "viewpoint",
@@ -62,8 +64,11 @@ def test_the_package_has_the_version_and_license_of_hyrfpack():
 def test_public_modules_are_exported():
     exports = json.loads((PACKAGE_FOLDER / "package.json").read_text())["exports"]
 
-    assert exports == {("." if name == "index" else f"./{name}.js"): f"./{name}.js" for name in PUBLIC_MODULES}
-    assert all((PACKAGE_FOLDER / file).exists() for file in exports.values())
+    assert exports == {
+        ("." if name == "index" else f"./{name}.js"): {"types": f"./types/{name}.d.ts", "default": f"./{name}.js"}
+        for name in PUBLIC_MODULES
+    }
+    assert all((PACKAGE_FOLDER / file).exists() for files in exports.values() for file in files.values())
 
 
 def test_modules_import_only_each_other_and_use_no_browser_objects():
@@ -84,8 +89,9 @@ def test_the_packed_and_installed_package_reads_a_file(npm, tmp_path):
     )
     (pack,) = json.loads(listed.stdout)
     modules = {path.name for path in PACKAGE_FOLDER.glob("*.js")}
-    assert {file["path"] for file in pack["files"]} == modules | {"package.json", "README.md", "LICENSE"}
-    assert pack["size"] < 60_000
+    types = {f"types/{path.name}" for path in (PACKAGE_FOLDER / "types").iterdir()}
+    assert {file["path"] for file in pack["files"]} == modules | types | {"package.json", "README.md", "LICENSE"}
+    assert pack["size"] < 80_000
 
     subprocess.run(
         [npm, "pack", "--pack-destination", str(tmp_path)], cwd=PACKAGE_FOLDER, capture_output=True, check=True

@@ -1,6 +1,9 @@
 // Rotations as unit quaternions (w, x, y, z), for interpolation and for short addresses.
 
-// Returns the quaternion of a rotation matrix, given by its rows.
+/**
+ * Returns the quaternion of a rotation matrix, given by its rows.
+ * @param {number[][]} rows
+ */
 export function quatOf([[a, b, c], [d, e, f], [g, h, i]]) {
   // The formula of the largest component avoids divisions by small numbers.
   const squares = [1 + a + e + i, 1 + a - e - i, 1 - a + e - i, 1 - a - e + i];
@@ -14,8 +17,11 @@ export function quatOf([[a, b, c], [d, e, f], [g, h, i]]) {
   return normalizedQuat(quat[0] < 0 ? quat.map((value) => -value) : quat);
 }
 
-// Returns the rows of a quaternion's rotation matrix.
-export function rowsOf([w, x, y, z]) {
+/**
+ * Returns the rows of a quaternion's rotation matrix.
+ * @param {ArrayLike<number>} quat of unit length
+ */
+export function rowsOf({ 0: w, 1: x, 2: y, 3: z }) {
   return [
     [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
     [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
@@ -23,12 +29,18 @@ export function rowsOf([w, x, y, z]) {
   ];
 }
 
+/** @param {number[]} quat */
 export function normalizedQuat(quat) {
   const length = Math.hypot(...quat);
   return quat.map((value) => value / length);
 }
 
-// Interpolates between two rotations along the shorter arc; `part` is in [0, 1].
+/**
+ * Interpolates between two rotations along the shorter arc.
+ * @param {number[]} from
+ * @param {number[]} to
+ * @param {number} part in [0, 1]
+ */
 export function slerp(from, to, part) {
   const cosine = from.reduce((sum, value, k) => sum + value * to[k], 0), sign = cosine < 0 ? -1 : 1;
   const angle = Math.acos(Math.min(1, Math.abs(cosine)));

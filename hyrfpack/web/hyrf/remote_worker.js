@@ -1,0 +1,128 @@
+// The script of the worker that remote.js starts: reads a model and evaluates it for the latest view.
+//
+// Messages to the worker:
+//     {open: {name, address | bytes}}   the model: an address to fetch, or its bytes
+//     {look: {ticket, view}}            the view to evaluate; it replaces earlier ones
+//     {spare}                           the array of an order that is no longer needed
+// Messages from the worker:
+//     {progress: {step, part}}          the part of "loading" or "decoding" that is done
+//     {opened: {...}}                   what remote.js knows about a model
+//     {order: {order, drawn}}           the sorted Gaussians of a view
+//     {row} or {tile}                   see view_evaluator.js
+//     {complete: ticket}                everything that the view needs was sent
+//     {error: {message, isFormat}}      a sentence for the user
+
+import { HyrfError, HyrfFormatError } from "./errors.js";
+import { read } from "./index.js";
+import { ViewEvaluator } from "./view_evaluator.js";
+
+const PROGRESS_INTERVAL_MS = 50;
+
+/** @typedef {import("./frustum.js").View} View */
+
+/** @type {ViewEvaluator | null} */
+let evaluator = null;
+/** @type {{ticket: number, view: View} | null} */
+let latest = null; // the view that was not begun yet
+/** @type {Uint32Array | null} */
+let spare = null;
+let isRunning = false;
+
+/**
+ * Sends a message, with the buffers of its arrays.
+ * @param {object} message
+ * @param {ArrayBufferView[]} arrays
+ */
+const post = (message, arrays = []) => self.postMessage(message, { transfer: arrays.map(({ buffer }) => buffer) });
+
+/** Waits until the messages that have arrived are handled. A timer would wait for 4 ms. */
+const { port1, port2 } = new MessageChannel();
+const handleMessages = () => new Promise((resolve) => {
+  port1.onmessage = resolve;
+  port2.postMessage(null);
+});
+
+self.onmessage = ({ data: message }) => {
+  if (message.open) report(open(message.open));
+  if (message.spare) spare = message.spare;
+  if (!message.look) return;
+  latest = message.look;
+  if (!isRunning) report(run());
+};
+
+/**
+ * Sends the error with which a promise is rejected.
+ * @param {Promise<void>} work
+ */
+function report(work) {
+  work.catch((/** @type {Error} */ error) => {
+    const isOutOfMemory = error instanceof RangeError; // thrown for arrays that are too long
+    const message = isOutOfMemory ? "The model takes more memory than there is; open a smaller one." : error.message;
+    post({ error: { message, isFormat: error instanceof HyrfFormatError } });
+  });
+}
+
+/**
+ * Reads the model.
+ * @param {{address?: string, bytes?: Uint8Array}} source
+ */
+async function open({ address, bytes = new Uint8Array(0) }) {
+  const data = address === undefined ? bytes : await fetchBytes(address);
+  post({ progress: { step: "decoding", part: 0 } });
+  const model = await read(data);
+  evaluator = new ViewEvaluator(model);
+  const { metadata, config, count, exposure } = model;
+  post({ opened: { metadata, config, count, exposure, sky: evaluator.sky } });
+}
+
+/**
+ * Fetches a file and reports the progress.
+ * @param {string} address
+ */
+async function fetchBytes(address) {
+  const unreachable = () =>
+    new HyrfError("It cannot be fetched; check the address, and whether its server allows this page to read it.");
+  const response = await fetch(address).catch(() => Promise.reject(unreachable()));
+  if (!response.ok || !response.body) {
+    throw new HyrfError(`Its server answers with the status ${response.status}; check the address.`);
+  }
+  const length = Number(response.headers.get("Content-Length")), reader = response.body.getReader();
+  /** @type {Uint8Array[]} */
+  const parts = [];
+  let received = 0, reported = 0;
+  for (;;) {
+    const { done, value } = await reader.read().catch(() => Promise.reject(unreachable()));
+    if (done) break;
+    parts.push(value);
+    received += value.length;
+    if (!length || performance.now() < reported + PROGRESS_INTERVAL_MS) continue;
+    reported = performance.now();
+    post({ progress: { step: "loading", part: Math.min(1, received / length) } });
+  }
+  const bytes = new Uint8Array(received);
+  let at = 0;
+  for (const part of parts) {
+    bytes.set(part, at);
+    at += part.length;
+  }
+  return bytes;
+}
+
+/** Evaluates the latest view, until everything is evaluated. */
+async function run() {
+  isRunning = true;
+  while (latest && evaluator) {
+    const { ticket, view } = latest;
+    latest = null;
+    const { order, drawn } = evaluator.sort(view, spare);
+    spare = null;
+    post({ order: { order, drawn } }, [order]);
+    for (const part of evaluator.evaluate(view, () => post({ complete: ticket }))) {
+      if ("row" in part) post({ row: part }, part.shapes ? [part.shapes, part.colors] : [part.colors]);
+      else post({ tile: part }, [part.pixels]);
+      await handleMessages();
+      if (latest) break;
+    }
+  }
+  isRunning = false;
+}

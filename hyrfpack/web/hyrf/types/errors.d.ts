@@ -1,0 +1,41 @@
+/** Something failed for a reason that the user can understand. The message is one sentence for the user. */
+export declare class HyrfError extends Error {
+    /** @param {string} message */
+    constructor(message: string);
+}
+/** The file cannot be read. */
+export declare class HyrfFormatError extends HyrfError {
+    /** @param {string} message */
+    constructor(message: string);
+}
+/** The bytes of a section are invalid. A caller that knows the section's name converts this to a HyrfFormatError. */
+export declare class DamagedData extends Error {
+}
+/**
+ * Throws the error for a damaged file.
+ * @param {string} what the reason
+ * @returns {never}
+ */
+export declare const rejectDamaged: (what: string) => never;
+/**
+ * Throws the error for a file that needs a newer reader.
+ * @param {string} what the reason
+ * @returns {never}
+ */
+export declare const rejectNewer: (what: string) => never;
+/**
+ * Throws DamagedData unless a condition holds.
+ * @param {boolean} holds whether the condition holds
+ * @param {string} what the reason
+ */
+export declare const assertValid: (holds: boolean, what: string) => void;
+/**
+ * Quotes text from a file for a message: at most 40 characters, on one line, in ASCII.
+ * @param {string} text
+ */
+export declare const quotedText: (text: string) => string;
+/**
+ * Formats a number with commas between groups of three digits.
+ * @param {number} number
+ */
+export declare const groupedDigits: (number: number) => string;

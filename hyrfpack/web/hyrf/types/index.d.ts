@@ -1,0 +1,62 @@
+import { HyrfError, HyrfFormatError } from "./errors.js";
+export { HyrfError, HyrfFormatError };
+export type Entry = import("./container.js").Entry;
+export type ExposureMap = import("./exposure.js").ExposureMap;
+export type FieldName = import("./grids.js").FieldName;
+export type LatticePoints = import("./lattice.js").LatticePoints;
+export type Config = import("./metadata.js").Config;
+export type Metadata = import("./metadata.js").Metadata;
+export type Field = {
+    table: Float32Array;
+    decoder: Float32Array;
+};
+export type Model = {
+    metadata: Metadata;
+    config: Config;
+    count: number;
+    layers: number[];
+    whole: boolean;
+    positions: Float32Array;
+    colorLogits: Float32Array;
+    scaleLogits: Float32Array;
+    opacityLogits: Float32Array;
+    geometry: Field;
+    radiance: Field;
+    exposure: ExposureMap | null;
+};
+export type Description = {
+    version: [number, number];
+    length: number;
+    sections: {
+        type: string;
+        codec: number;
+        offset: number;
+        stored: number;
+        raw: number;
+    }[];
+    firstLayer: number;
+};
+export type ExpectedSection = {
+    type: string;
+    group: string;
+    layer: number;
+    rows: number;
+    columns: number;
+};
+/**
+ * Describes a file by its header and its table of contents.
+ * @param {Uint8Array} bytes the start of a file, or all of it
+ * @returns {Description} all lengths in bytes; a model of the first layer needs the first `firstLayer` bytes
+ * @throws {HyrfFormatError} the header or the table of contents is invalid
+ */
+export declare const describe: (bytes: Uint8Array) => Description;
+/**
+ * Decodes a file.
+ * @param {Uint8Array} bytes the file, or its start if `partial` is true
+ * @param {{partial?: boolean}} [options] `partial`: accept the start of a file, and read the layers that are complete
+ * @returns {Promise<Model>}
+ * @throws {HyrfFormatError} the file is damaged, truncated or too new; or `bytes` has no complete layer
+ */
+export declare const read: (bytes: Uint8Array, { partial }?: {
+    partial?: boolean;
+}) => Promise<Model>;

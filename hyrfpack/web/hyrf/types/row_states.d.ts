@@ -1,0 +1,36 @@
+export declare class RowStates {
+    balls: Float32Array<ArrayBufferLike>;
+    count: number;
+    eyes: Float64Array<ArrayBuffer>;
+    /** @param {Float32Array} balls a ball around each row, from `rowBalls` */
+    constructor(balls: Float32Array);
+    /**
+     * Lists the rows whose colours are out of date.
+     * @param {number[]} sides from `frustumPlanes`
+     * @param {number[]} eye
+     * @param {number} angle in radians
+     * @returns {{visible: number, fresh: number, rows: number[]}} `visible` is the number of rows within the planes
+     *   `sides`. `rows` are those among them whose viewing direction has turned by more than `angle` since they were
+     *   coloured, largest turns first. `fresh` is the number of these that have no colours yet.
+     */
+    stale(sides: number[], eye: number[], angle: number): {
+        visible: number;
+        fresh: number;
+        rows: number[];
+    };
+    /** Returns the rows that have no colours yet. */
+    fresh(): number[];
+    /**
+     * Records that a row was coloured.
+     * @param {number} row
+     * @param {number[]} eye
+     */
+    colored(row: number, eye: number[]): void;
+}
+/**
+ * Returns a ball around the positions of each row.
+ * @param {Float32Array} positions 3 numbers per Gaussian
+ * @param {number} width the number of Gaussians of a row; the last row may have fewer
+ * @returns {Float32Array} x, y, z, radius of each row, at least one
+ */
+export declare function rowBalls(positions: Float32Array, width: number): Float32Array;
