@@ -1,39 +1,53 @@
-// Shows a file in the page `index.html?file=scene.hyrf`. With `&webgl`, uses WebGL 2 even if the browser has WebGPU.
+// Shows a file in the page `index.html?file=scene.hyrf`.
 
-import { Color, LinearSRGBColorSpace, PerspectiveCamera, Scene, Vector3, WebGPURenderer } from "three/webgpu";
+import { Color, PerspectiveCamera, SRGBColorSpace, Scene, Vector3, WebGLRenderer } from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 
-import { loadHyrf, lookFrom } from "./hyrf-three.js";
+import { HyrfObject } from "./hyrf-object.js";
+import { lookFrom } from "./look-from.js";
 
-const params = new URLSearchParams(location.search), statusLine = document.getElementById("status");
-const renderer = new WebGPURenderer({ forceWebGL: params.has("webgl") });
-renderer.outputColorSpace = LinearSRGBColorSpace; // because the file's colours are display-referred
-renderer.setPixelRatio(devicePixelRatio);
+const file = new URLSearchParams(location.search).get("file") ?? "scene.hyrf";
+const statusLine = document.getElementById("status");
+const renderer = new WebGLRenderer({ antialias: true }), scene = new Scene(), camera = new PerspectiveCamera();
+const controls = new OrbitControls(camera, renderer.domElement);
 document.body.append(renderer.domElement);
-const scene = new Scene(), camera = new PerspectiveCamera(), controls = new OrbitControls(camera, renderer.domElement);
+
+// Frames are drawn only when something changes.
+let isRequested = false;
+const requestFrame = () => {
+  if (isRequested) return;
+  isRequested = true;
+  requestAnimationFrame(() => {
+    isRequested = false;
+    renderer.render(scene, camera);
+  });
+};
 
 const fit = () => {
   camera.aspect = innerWidth / innerHeight;
   camera.updateProjectionMatrix();
+  renderer.setPixelRatio(devicePixelRatio);
   renderer.setSize(innerWidth, innerHeight);
-};
-
-const show = (object) => {
-  const { target, solid } = object.userData.hyrf;
-  scene.add(object);
-  if (solid) scene.background = new Color(...solid);
-  lookFrom(camera, object);
-  controls.target.copy(object.localToWorld(new Vector3(...target)));
-  controls.update();
+  requestFrame();
 };
 
 addEventListener("resize", fit);
+controls.addEventListener("change", requestFrame);
 fit();
-renderer.setAnimationLoop(() => renderer.render(scene, camera));
 try {
-  const onProgress = (done) => (statusLine.textContent = `${Math.round(100 * done)} %`);
-  await loadHyrf(params.get("file") ?? "scene.hyrf", { onCoarse: show, onProgress });
+  const object = await HyrfObject.load(file, {
+    onProgress: ({ step, part }) => (statusLine.textContent = `${step} ${Math.round(100 * part)} %`),
+  });
+  const { target, solid } = object.userData.hyrf;
+  if (solid) scene.background = new Color().setRGB(...solid, SRGBColorSpace);
+  scene.add(object);
+  lookFrom(camera, object);
+  controls.target.copy(object.localToWorld(new Vector3(...target)));
+  controls.update();
+  object.addEventListener("change", requestFrame);
+  object.addEventListener("error", ({ error }) => (statusLine.textContent = error.message));
   statusLine.textContent = "";
+  fit();
 } catch (error) {
   statusLine.textContent = error.message;
 }

@@ -138,6 +138,11 @@ class Chromium(Browser):
     def screenshot(self) -> bytes:
         return self._wait(self._page.screenshot())
 
+    def list_workers(self) -> list[str]:
+        """Return the addresses of the scripts of the page's running workers."""
+        self.evaluate("0")
+        return [worker.url for worker in self._page.workers]
+
     def list_errors(self) -> list[str]:
         self.evaluate("0")  # all earlier messages arrive before this answer
         return list(self._errors)

@@ -1,12 +1,13 @@
-// Describes the objects that hyrf-three.js adds to a scene: `node describe.mjs MODEL.hyrf DEGREE`, in a folder with
-// three, hyrf.js and hyrf-three.js. Prints, as JSON, the splats in the axes of the file's world, and the pose of
+// Describes the objects that hyrf-harmonics.js adds to a scene: `node describe.mjs MODEL.hyrf DEGREE`, in a folder with
+// three, hyrf.js and the example's modules. Prints, as JSON, the splats in the axes of the file's world, and the pose of
 // three's camera after `lookFrom`.
 
 import { readFile } from "node:fs/promises";
 
 import { PerspectiveCamera, Scene, Vector3 } from "three/webgpu";
 
-import { loadHyrf, lookFrom } from "./hyrf-three.js";
+import { loadHyrf } from "./hyrf-harmonics.js";
+import { lookFrom } from "./look-from.js";
 
 const [file, degree] = process.argv.slice(2), scene = new Scene(), progress = [];
 let early = null;

@@ -152,7 +152,7 @@ def test_the_example_page_shows_the_rendered_picture(app_folder: Path, tmp_path:
     flags = ("--enable-unsafe-swiftshader", "--use-angle=swiftshader")
     with serve_project(app_folder) as address, Chromium(*flags) as browser:
         browser.resize(PICTURE_SIZE_PIXELS, PICTURE_SIZE_PIXELS)
-        browser.open(f"{address}/own/index.html?webgl&file=scene.hyrf")
+        browser.open(f"{address}/own/harmonics.html?webgl&file=scene.hyrf")
         ends = time.monotonic() + 60
         while (status := browser.evaluate("document.getElementById('status').textContent")) != "" or browser.evaluate(
             "!document.querySelector('canvas')"

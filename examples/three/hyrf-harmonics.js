@@ -1,8 +1,8 @@
-// Shows `.hyrf` files in scenes of three.js with its GaussianSplat. The spherical harmonics are fitted to the model's
-// colours in the page.
+// Shows `.hyrf` files in scenes of three.js as its own GaussianSplat, for WebGPURenderer. Spherical harmonics are
+// fitted to the model's colours in the page. `hyrf-object.js` shows the model itself.
 
 import {
-  BackSide, DataTexture, Group, LinearFilter, Matrix4, Mesh, MeshBasicNodeMaterial, Quaternion, RepeatWrapping,
+  BackSide, DataTexture, Group, LinearFilter, Mesh, MeshBasicNodeMaterial, Quaternion, RepeatWrapping,
   SphereGeometry, Vector3,
 } from "three/webgpu";
 import { GaussianSplat } from "three/addons/objects/GaussianSplat.js";
@@ -10,12 +10,11 @@ import {
   createGaussianSplatGeometry, createPackedSphericalHarmonicsBand, writeCovariance,
 } from "three/addons/utils/GaussianSplatUtils.js";
 import { read } from "hyrf.js";
-import { backgroundColors } from "hyrf.js/fields.js";
+import { BACKGROUND_RADIUS, backgroundColors } from "hyrf.js/fields.js";
 import { fitHarmonics } from "hyrf.js/harmonics.js";
 import { viewpointOf } from "hyrf.js/viewpoint.js";
 
 // Lengths are in the model's units.
-const BACKGROUND_RADIUS = 100;
 const BACKGROUND_WIDTH_PX = 1024, BACKGROUND_HEIGHT_PX = 512;
 const NEAR_PLANE = 0.01;
 const WORK_SLICE_MS = 12; // then the page can react and render a frame
@@ -68,27 +67,6 @@ export async function loadHyrf(source, { degree = 2, onCoarse = () => {}, onProg
   show(splats);
   if (config.background && !splats.count) frame.add(backgroundSphere(model));
   return object;
-}
-
-/**
- * Moves a perspective camera to the pose of one of the file's cameras, and sets its vertical field of view.
- * @param {import("three/webgpu").PerspectiveCamera} camera
- * @param {Group} object from `loadHyrf`
- * @param {import("hyrf.js/viewpoint.js").Camera} [from] by default the first of `userData.hyrf.cameras`
- */
-export function lookFrom(camera, object, from = object.userData.hyrf.cameras[0]) {
-  const { near, far } = object.userData.hyrf;
-  object.updateWorldMatrix(true, false);
-  const pose = new Matrix4().set(...from.camera_from_world.flat()).invert();
-  // OpenCV's cameras look along +z with y down; those of three.js look along -z with y up.
-  pose.premultiply(object.matrixWorld).multiply(new Matrix4().makeScale(1, -1, -1));
-  pose.decompose(camera.position, camera.quaternion, new Vector3());
-  const size = Math.cbrt(Math.abs(object.matrixWorld.determinant()));
-  camera.fov = (2 * Math.atan(from.height / (2 * from.fy)) * 180) / Math.PI;
-  camera.near = near * size;
-  camera.far = far * size;
-  camera.updateProjectionMatrix();
-  camera.updateMatrixWorld();
 }
 
 /**
