@@ -7,8 +7,9 @@ Each version trains and compresses each data set at several budgets, given as sh
 version scores the decoded files on held-out photos by PSNR and SSIM. For each data set the table has the change of
 bytes at equal PSNR in percent (BD-rate over the common range of PSNR, by monotone cubics). It also has the change of
 PSNR in dB and of SSIM at the largest common number of bytes, and the ratio of training times. The share `measured` is
-the budget that a version chooses itself. Runs are kept in --out and are not repeated; a run with scores.json is not
-scored again. The other version runs with the packages of this environment.
+the budget that a version chooses itself. With that share alone, the table has PSNR, SSIM and bytes of both versions and
+their differences instead. Runs are kept in --out and are not repeated; a run with scores.json is not scored again. The
+other version runs with the packages of this environment, and with --against-options for `train`.
 """
 
 from __future__ import annotations
@@ -51,17 +52,23 @@ SCORE_KEYS = ("bytes", "psnr", "ssim", "seconds", "gaussians")
 
 
 def train_and_score(
-    version: Path, scene: Scene, steps: int, gaussians: int | None, seed: int, out: Path
+    version: Path,
+    scene: Scene,
+    steps: int,
+    gaussians: int | None,
+    seed: int,
+    out: Path,
+    options: Sequence[str] = (),
 ) -> dict[str, float]:
     """Train and compress with one version, score with this one, and return bytes, scores, seconds and Gaussians.
 
-    With `gaussians` None, the version chooses its budget.
+    With `gaussians` None, the version chooses its budget. `options` are further options of its command `train`.
     """
     scores_file = out / "scores.json"
     if scores_file.exists():
         return json.loads(scores_file.read_text())
     if not (out / "metrics.json").exists():
-        settings = ["--steps", str(steps), "--seed", str(seed), "--overwrite"]
+        settings = ["--steps", str(steps), "--seed", str(seed), "--overwrite", *options]
         budget = [] if gaussians is None else ["--max-gaussians", str(gaussians)]
         _run_command(version, "train", str(scene.path), "-o", str(out), *settings, *budget)
     packed = out / "compact.hyrf"
@@ -148,6 +155,18 @@ _SCORE_DIGITS = {"psnr": 2, "ssim": 3}
 _TABLE_HEADER = ["set", "bytes at equal PSNR", "dB", "SSIM", "time", "before, kB: dB", "now, kB: dB"]
 
 
+def format_scores_row(name: str, ours: dict[str, float], theirs: dict[str, float]) -> list[str]:
+    """Format one row of the table of both versions' scores at their own budgets."""
+    cells = [name]
+    for scores in (theirs, ours):
+        cells.append(f"{scores['psnr']:.2f}, {scores['ssim']:.3f}, {scores['bytes'] / 1000:.0f}")
+    cells += [f"{ours['psnr'] - theirs['psnr']:+.2f}", f"{ours['ssim'] - theirs['ssim']:+.4f}"]
+    return [*cells, f"{100 * (ours['bytes'] / theirs['bytes'] - 1):+.0f} %"]
+
+
+_SCORES_HEADER = ["set", "before: dB, SSIM, kB", "now", "dB", "SSIM", "bytes"]
+
+
 def mean_over_seeds(points: Sequence[dict[str, float]]) -> dict[str, float]:
     """Return the mean of each score over the seeds."""
     return {key: float(np.mean([point[key] for point in points])) for key in SCORE_KEYS}
@@ -159,7 +178,10 @@ def main() -> None:
     parser.add_argument(
         "--shares", nargs="+", default=["0.25", "0.5", "1", "2"], help="shares of the budget, or 'measured'"
     )
+    parser.add_argument("--against-options", nargs="*", default=[], help="options of `train` for the other version")
     args = parser.parse_args()
+    shows_scores = args.shares == [ESTIMATED_BUDGET_SHARE]
+    header = _SCORES_HEADER if shows_scores else _TABLE_HEADER
     versions = {"now": REPOSITORY_ROOT, "before": args.against.resolve()}
     warnings.simplefilter("ignore")
     rows = []
@@ -174,11 +196,13 @@ def main() -> None:
                     out = args.out.resolve() / f"{args.steps}" / name / f"{version}-{share}-{seed}"
                     out.mkdir(parents=True, exist_ok=True)
                     gaussians = None if share == ESTIMATED_BUDGET_SHARE else round(float(share) * budget)
-                    seeds.append(train_and_score(folder, scene, args.steps, gaussians, seed, out))
+                    options = args.against_options if version == "before" else []
+                    seeds.append(train_and_score(folder, scene, args.steps, gaussians, seed, out, options))
                 points[version].append(mean_over_seeds(seeds))
-        rows.append(format_row(name, points["now"], points["before"]))
-        print(markdown_table(_TABLE_HEADER, rows[-1:]).splitlines()[-1], flush=True)
-    print("\n" + markdown_table(_TABLE_HEADER, rows))
+        now, before = points["now"], points["before"]
+        rows.append(format_scores_row(name, now[0], before[0]) if shows_scores else format_row(name, now, before))
+        print(markdown_table(header, rows[-1:]).splitlines()[-1], flush=True)
+    print("\n" + markdown_table(header, rows))
 
 
 if __name__ == "__main__":
