@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import base64
 import contextlib
 import importlib.util
 import shutil
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from playwright.async_api import ConsoleMessage
 
 Result = TypeVar("Result")
+SCREENCAST_SIZE = {"maxWidth": 640, "maxHeight": 400}  # pixels
 PROGRAM_NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 
 
@@ -137,6 +139,43 @@ class Chromium(Browser):
 
     def screenshot(self) -> bytes:
         return self._wait(self._page.screenshot())
+
+    @contextlib.contextmanager
+    def record_screen(self) -> Iterator[list[tuple[float, bytes]]]:
+        """Within this context, record the screen: (Unix time in seconds, PNG scaled down) of each change of it."""
+        frames: list[tuple[float, bytes]] = []
+
+        def receive(event: dict[str, Any]) -> None:
+            picture = base64.b64decode(event["data"])
+            if not frames or frames[-1][1] != picture:  # some pages draw the same picture again and again
+                frames.append((event["metadata"]["timestamp"], picture))
+            acknowledgement = {"sessionId": event["sessionId"]}
+            asyncio.ensure_future(self._devtools.send("Page.screencastFrameAck", acknowledgement), loop=self._loop)
+
+        self._devtools.on("Page.screencastFrame", receive)
+        self._wait(self._devtools.send("Page.startScreencast", {"format": "png", **SCREENCAST_SIZE}))
+        try:
+            yield frames
+        finally:
+            self._wait(self._devtools.send("Page.stopScreencast"))
+            self._devtools.remove_listener("Page.screencastFrame", receive)
+
+    def cpu_seconds(self) -> float:
+        """Return the CPU seconds of all processes of the browser since its start."""
+
+        async def measure() -> float:
+            devtools = await self._browser.new_browser_cdp_session()
+            processes = await devtools.send("SystemInfo.getProcessInfo")
+            await devtools.detach()
+            return sum(process["cpuTime"] for process in processes["processInfo"])
+
+        return self._wait(measure())
+
+    def collect_garbage(self) -> int:
+        """Free unused memory of the page's scripts; return the bytes of objects and buffers that are left."""
+        self._wait(self._devtools.send("HeapProfiler.collectGarbage"))
+        used = self._wait(self._devtools.send("Runtime.getHeapUsage"))
+        return used["usedSize"] + used.get("backingStorageSize", 0)
 
     def list_workers(self) -> list[str]:
         """Return the addresses of the scripts of the page's running workers."""
