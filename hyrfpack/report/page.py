@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from hyrfpack.errors import printable
 from hyrfpack.evaluate.figures import figure_to_svg
 from hyrfpack.version import __version__
-from hyrfpack.web.player import content_security_policy, fill_template
+from hyrfpack.web.player import content_security_policy, fill_template, hash_source
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -40,7 +40,7 @@ def encode_page(
     """
     style = read_asset("style.css")
     values = {
-        "policy": content_security_policy(style, [script] if script else [], pictures),
+        "policy": content_security_policy(hash_source(style), [hash_source(script)] if script else [], pictures),
         "version": __version__,
         "title": escape(title or heading),
         "style": style,

@@ -45,7 +45,7 @@ def page(tmp_path: Path) -> Path:
 
 
 def wait_until(browser: chromium.Chromium, expression: str) -> None:
-    ends = time.monotonic() + 10
+    ends = time.monotonic() + 30
     while not browser.evaluate(expression):
         assert time.monotonic() < ends, f"never: {expression}"
         time.sleep(0.02)
