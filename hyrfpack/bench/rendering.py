@@ -22,7 +22,7 @@ from hyrfpack.render import RenderSettings, render_view
 # smears Gaussians far outside the picture across it. Training culls these and never optimises them for such views.
 RENDER_SETTING_VALUES: dict[str, tuple[Any, ...]] = {
     "background_threshold": (0.0, 1 / 512, 1 / 255, 0.01, 0.03, 0.1, 0.2, 0.3),
-    "background_stride": (1, 2, 3, 4),
+    "background_stride": (1, 2, 3, 4, None),
     "cull_tolerance": (1.0, 0.0, 0.1, 0.2, 0.3, 0.5, math.inf),
     "transmittance_min": (0.0, 1e-5, 1e-4, 1e-3, 1 / 255, 0.01, 0.03),
 }
@@ -52,7 +52,7 @@ def render_rows(subject: Subject, repeats: int, notes: list[str]) -> Iterator[Ro
             notes.append(f"the model has no background sphere, so {name} is left out")
             continue
         default = getattr(defaults, name)
-        exact, others = values[0], sorted({*values[1:], default})
+        exact, others = values[0], list(dict.fromkeys((*values[1:], default)))
         tasks = {format_value(value): render_task(replace(defaults, **{name: value})) for value in (exact, *others)}
         yield from _compare(subject, name, tasks, format_value(default), repeats)
     tasks = {"for each view": render_task(defaults, reuse_decoded=False), "once": render_task(defaults)}

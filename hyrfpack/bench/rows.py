@@ -53,7 +53,9 @@ class Row:
 
 
 def format_value(value: object) -> str:
-    """Format the value of a setting for tables: 0.3, 1/255, none (for infinity), 2 x 128."""
+    """Format the value of a setting for tables: 0.3, 1/255, none (for infinity), auto (for None), 2 x 128."""
+    if value is None:
+        return "auto"
     if isinstance(value, (list, tuple)):
         return " x ".join(format_value(part) for part in value)
     if isinstance(value, float):

@@ -26,6 +26,7 @@ from hyrfpack.ops.rasterize.inputs import LOW_PASS_VARIANCE, TRANSMITTANCE_MIN
 from hyrfpack.ops.shade import Shading
 from hyrfpack.ops.transfer import tensor_like
 from hyrfpack.parallel.pool import torch_on_one_thread
+from hyrfpack.render.background_stride import choose_background_stride
 from hyrfpack.scene import Camera
 
 MIN_LOW_PASS_VARIANCE = 1e-3  # Narrower filters let Gaussians fall between pixel centres.
@@ -41,7 +42,7 @@ class RenderSettings:
             keeps every Gaussian in front of the camera.
         background_threshold: pixels with at most this transmittance get no background (tau in the paper).
         background_stride: the background is evaluated at every background_stride-th pixel of each axis and
-            interpolated between them; 1 is exact.
+            interpolated between them; 1 is exact. None chooses 1, 2 or 4 for each view, by the predicted error.
         transmittance_min: blending of a pixel stops when its transmittance is at most this; 0 blends every Gaussian.
         exposure: "as-photographed" applies the model's exposure map, so that a view looks like the photos taken near
             it; "consistent" renders all views at the model's own exposure. Without a map, both are the same.
@@ -52,7 +53,7 @@ class RenderSettings:
     near: float = 0.01
     cull_tolerance: float = 0.3
     background_threshold: float = 1 / 512
-    background_stride: int = 2
+    background_stride: int | None = None
     transmittance_min: float = TRANSMITTANCE_MIN
     exposure: str = AS_PHOTOGRAPHED
     low_pass_variance: float = LOW_PASS_VARIANCE
@@ -62,7 +63,8 @@ class RenderSettings:
             check_float(name, getattr(self, name))
         check_float("low_pass_variance", self.low_pass_variance, MIN_LOW_PASS_VARIANCE)
         check_float("cull_tolerance", self.cull_tolerance, maximum=inf)
-        check_int("background_stride", self.background_stride, 1)
+        if self.background_stride is not None:
+            check_int("background_stride", self.background_stride, 1)
         check_choice("exposure", self.exposure, RENDER_EXPOSURES)
         check_float("transmittance_min", self.transmittance_min, 0, 1)
         if self.transmittance_min == 1:
@@ -157,8 +159,9 @@ def render_view(
     seconds.update(raster.seconds)
     with _record_seconds(seconds, "background"):
         if model.config.background and background:
-            stride, light = settings.background_stride, raster.transmittance
-            behind = model.background_grid(light, viewport, threshold=settings.background_threshold, stride=stride)
+            light, threshold = raster.transmittance, settings.background_threshold
+            stride = settings.background_stride or choose_background_stride(model, light, viewport, threshold=threshold)
+            behind = model.background_grid(light, viewport, threshold=threshold, stride=stride)
             rgb = composite(raster.rgb, light, behind, stride)
         else:
             behind = tensor_like(model.config.solid, positions) if solid is None else solid

@@ -30,8 +30,9 @@ FULL_RESOLUTION_START = 0.8  # From this share of the run on, photos are not red
 # Time of a step that does not depend on its pixels, as a share of the time that pixels take at full resolution.
 FIXED_STEP_COST = 0.05
 COST_SAMPLE_COUNT = 100
-# A training step evaluates the background at about this many pixels at most. Smaller photos keep the usual stride.
+# A training step evaluates the background at about this many pixels at most, and at every second one of small photos.
 MAX_BACKGROUND_NODES = 40_000
+MIN_BACKGROUND_STRIDE = 2
 
 
 class ResolutionSchedule:
@@ -165,5 +166,4 @@ def reduced_low_pass_variance(factor: int) -> float:
 
 def background_stride(camera: Camera) -> int:
     """Return the stride at which a training step evaluates the background."""
-    least = RenderSettings().background_stride
-    return max(least, math.ceil(math.sqrt(camera.width * camera.height / MAX_BACKGROUND_NODES)))
+    return max(MIN_BACKGROUND_STRIDE, math.ceil(math.sqrt(camera.width * camera.height / MAX_BACKGROUND_NODES)))

@@ -240,12 +240,12 @@ def test_a_background_stride_interpolates_between_exact_pixels(stride, width, he
     np.testing.assert_allclose(found.numpy(), expected, atol=1e-5)
 
 
-def test_every_second_pixel_of_the_background_is_evaluated_by_default(monkeypatch):
+def test_a_stride_of_two_evaluates_every_second_pixel_of_the_background(monkeypatch):
     model, camera = small_model(np.zeros((0, 3)), background=True), camera_at((0, -3.0, 0), width=31, height=18)
     asked = []
     encode = reference.hash_encode
     monkeypatch.setattr(reference, "hash_encode", lambda coords, *grid: asked.append(coords) or encode(coords, *grid))
-    render_rgb(model, camera)
+    render_rgb(model, camera, settings=RenderSettings(background_stride=2))
     points = torch.tensor([(x + 0.5, y + 0.5) for y in range(0, 20, 2) for x in range(0, 32, 2)])
     model.decode_background(points, model.config.frame.local_viewport(camera, torch.float32))
     coords, expected = asked
@@ -305,7 +305,7 @@ def test_antialiasing_dims_small_gaussians_by_what_the_low_pass_adds():
             "low_pass_variance",
         )
         for value in (-0.1, math.nan, math.inf, True, "2", None)
-        if (name, value) != ("cull_tolerance", math.inf)
+        if (name, value) not in (("cull_tolerance", math.inf), ("background_stride", None))
     ]
     + [{"low_pass_variance": 0.0}, {"background_stride": 0}, {"background_stride": 1.5}, {"transmittance_min": 1.0}],
     ids=str,

@@ -128,7 +128,7 @@ def test_large_steps_evaluate_the_background_at_few_pixels() -> None:
     for width, height in ((1600, 1066), (4000, 3000)):
         stride = background_stride(make_view(width, height).camera)
         assert width * height / stride**2 <= resolution.MAX_BACKGROUND_NODES < width * height / (stride - 1) ** 2
-    assert background_stride(make_view(400, 266).camera) == RenderSettings().background_stride
+    assert background_stride(make_view(400, 266).camera) == resolution.MIN_BACKGROUND_STRIDE
 
 
 def make_large_scene() -> Scene:

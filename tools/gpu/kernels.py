@@ -44,6 +44,7 @@ from tools.gpu.setup import Setup
 from tools.gpu.timing import group_kernels, measure_rates, median_ms, profile_task
 
 TABLE_NAME = "Kernels"
+BACKGROUND_STRIDE = 2
 # Words in the kernels' names that identify their stage of the rasteriser. All other kernels of a forward pass, such as
 # torch's sorts and prefix sums, belong to binning.
 STAGE_KERNEL_WORDS = {"project": ("project",), "blend": ("blend", "sum_rows")}
@@ -264,7 +265,7 @@ def background_rows(setup: Setup) -> Iterator[Row]:
     model, camera = _model(setup), make_cameras(setup.views, setup.width, setup.height)[0]
     splats, defaults = decode_splats(model, camera), RenderSettings()
     light = rasterize(splats.gaussians, splats.colors, splats.viewport).transmittance
-    options = {"threshold": defaults.background_threshold, "stride": defaults.background_stride}
+    options = {"threshold": defaults.background_threshold, "stride": BACKGROUND_STRIDE}
     exact = copy.deepcopy(model).double()
     exact.precision = "float32"  # no factor of the reference's products is rounded to bfloat16
     expected = exact.background_grid(light.double(), splats.viewport, **options)

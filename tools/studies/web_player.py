@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 
 import hyrfpack
+from hyrfpack.cameras.capture import Capture
 from hyrfpack.cameras.files import camera_to_json
 from hyrfpack.scene import Camera, Scene, evenly_spaced
 from tools.browser.browser import Browser
@@ -39,6 +40,11 @@ READ_PIXELS_SCRIPT = "btoa(Array.from(hyrfpack.pixels(), (byte) => String.fromCh
 def psnr(first: np.ndarray, second: np.ndarray) -> float:
     """Return the PSNR in dB of two pictures in [0, 1]."""
     return float(-10 * np.log10(max(np.mean((first - second) ** 2), 1e-12)))
+
+
+def stored_cameras(model: Path, count: int) -> list[Camera]:
+    """Return at most `count` evenly spaced cameras of those that a model stores."""
+    return evenly_spaced(Capture(hyrfpack.describe_file(model)).cameras, count)
 
 
 def draw_in_page(browser: Browser, camera: Camera) -> np.ndarray:
