@@ -125,3 +125,18 @@ EACH sum += MATRIX(at + 8 * $) * a$ + MATRIX(at + 8 * $ + 4) * b$;
 vec3 sigmoid(vec3 x) {
     return 1.0 / (1.0 + exp(-x));
 }
+
+#ifdef BACKGROUND
+const float RADIUS = 100.0; // of the background's sphere, in local units
+
+// The background at a place on its sphere, seen along a unit vector.
+vec3 background(vec3 place, vec3 d) {
+    begin(BIAS_1);
+    add_place(place, INPUTS, 2 * CELLS);
+    add_direction(d);
+    rectify();
+    vec4 sum = WEIGHT(BIAS_3);
+    for (int group = 0; group < 2 * CELLS; ++group) sum += MATRIX(MATRIX_3 + 4 * group) * second(group);
+    return sigmoid(sum.xyz);
+}
+#endif

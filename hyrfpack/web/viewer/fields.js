@@ -4,6 +4,7 @@ import { frustumPlanes } from "../hyrf/frustum.js";
 import { ContextLostError, Graphics, WorkPacer } from "./graphics.js";
 import { TEXTURE_WIDTH } from "./constants.js";
 import { Panorama } from "./panorama.js";
+import { Sky } from "./sky.js";
 import { readText } from "./texts.js";
 import { RowStates } from "../hyrf/row_states.js";
 
@@ -36,9 +37,9 @@ export class Fields {
     this.pace = new WorkPacer();
   }
 
-  // Evaluates everything that does not depend on the view. `report` is called with the fraction done; it may throw an
-  // error to stop the work.
-  async prepare(report) {
+  // Evaluates everything that does not depend on the view. `eye` is where the first view's is. `report` is called with
+  // the fraction done; it may throw an error to stop the work.
+  async prepare(eye, report) {
     const { gl, graphics, model, height } = this, size = [TEXTURE_WIDTH, height];
     Fields.check(gl, model);
     const words = (...more) => graphics.texture(gl.TEXTURE_2D, gl.RGBA32UI, ...size, ...more);
@@ -68,8 +69,9 @@ export class Fields {
     this.target = graphics.framebuffer(this.colors);
     this.radiance = radiance;
     if (model.background) {
-      this.panorama = new Panorama(graphics, model.finest, (...area) => this.drawSky(...area));
-      await this.panorama.begin();
+      this.panorama = new Panorama(graphics, model, (...area) => this.drawPanorama(...area));
+      await this.panorama.begin(eye);
+      this.sky = new Sky(graphics, (...area) => this.drawSky(...area));
     } else {
       radiance.freeTable();
     }
@@ -143,8 +145,9 @@ export class Fields {
       colors: buildFieldShader("colors.frag", { ...deep(radiance), ...turned }),
     };
     if (!background) return shaders;
-    const constants = { ...deep(radiance), ...placed(radiance), ...turned };
-    return { ...shaders, panorama: buildFieldShader("panorama.frag", constants) };
+    const constants = { ...deep(radiance), ...placed(radiance), ...turned, BACKGROUND: 1 };
+    for (const name of ["panorama", "sky"]) shaders[name] = buildFieldShader(`${name}.frag`, constants);
+    return shaders;
   }
 
   // Returns whether the device can draw to `count` layers in one pass.
@@ -216,11 +219,22 @@ export class Fields {
     }
   }
 
-  // Draws a part (x, y, width, height in pixels) of a picture of the background.
-  drawSky(target, size, part) {
+  // Draws a part (x, y, width, height in pixels) of a panorama.
+  drawPanorama(target, size, part, eye) {
     const { gl } = this, p = this.use("panorama", this.radiance);
     gl.uniform2f(p.u_size, ...size);
+    gl.uniform3fv(p.u_eye, eye);
     this.area(target, size, part);
+  }
+
+  // Draws a part of the background of a view, where `needed` is 1.
+  drawSky(target, part, view, needed) {
+    const { gl, graphics } = this, p = this.use("sky", this.radiance);
+    graphics.bind(p, { u_needed: needed }, gl.TEXTURE_2D, 1);
+    gl.uniform3fv(p.u_eye, view.eye);
+    gl.uniformMatrix3fv(p.u_world, false, view.rows.flat()); // rows read as columns: transposed
+    gl.uniform4f(p.u_intrinsics, view.fx, view.fy, view.cx, view.cy);
+    this.area(target, [view.width, view.height], part);
   }
 
   // Evaluates the colours of rows. Adjacent rows are drawn together.
@@ -238,16 +252,18 @@ export class Fields {
     }
   }
 
-  // Colours, while the view moves, all rows without colours and then the stalest rows, for about `ms`.
+  // Colours, while the view moves, all rows without colours and then the stalest rows, for about `ms`; then draws the
+  // background for about `ms`.
   recolor(view, margin, ms) {
     const { visible, rows, fresh } = this.rows.stale(frustumPlanes(view, margin), view.eye, MAX_FRESH_TURN_RADIANS);
     const most = Math.max(fresh, Math.min(this.pace.within(ms), Math.ceil(visible / MOVING_ROWS_DIVISOR)));
     if (rows.length) this.color(rows.slice(0, most), view.eye);
+    this.panorama?.advance(view, ms);
   }
 
   // Colours all stale rows in view while `goOn()` is true. If `exact`, any turn of the viewing direction makes colours
   // stale. Returns {rows: their number, done: whether all were coloured}.
-  async coloured(view, margin, { goOn, exact = false } = {}) {
+  async coloured(view, margin, { goOn, exact = false }) {
     const { rows } = this.rows.stale(frustumPlanes(view, margin), view.eye, exact ? 0 : MAX_FRESH_TURN_RADIANS);
     return { rows: rows.length, done: await this.coloring(rows, view.eye, goOn) };
   }
@@ -258,22 +274,20 @@ export class Fields {
     return this.pace.run(this.graphics, rows.length, work, { goOn });
   }
 
-  // Completes the picture of a still view while `goOn()` is true: colours all rows in view, draws the background, then
-  // colours the rows without colours. `changed` is called when the picture has improved. Returns whether it is
-  // complete.
-  async complete(view, margin, { goOn, changed = () => {}, exact = false }) {
+  // Completes the picture of a still view while `goOn()` is true: colours all rows in view, and evaluates the
+  // background. `blended` has the splats of this view, {texture, used: its size in use}. `changed` is called when the
+  // picture has improved. Returns whether it is complete.
+  async complete(view, margin, { blended, goOn = () => true, changed = () => {}, exact = false }) {
+    this.sky?.begin(view, blended);
     const { rows, done } = await this.coloured(view, margin, { goOn, exact });
     if (rows) changed();
-    if (!done) return false;
-    const options = { goOn, changed, done: () => this.freeSky() };
-    if (this.panorama && !(await this.panorama.complete(view, options))) return false;
-    return this.coloring(this.rows.fresh(), view.eye, goOn);
+    return done && (!this.sky || this.sky.complete({ goOn, changed }));
   }
 
-  // Frees the objects that only the background needs.
-  freeSky() {
-    this.radiance.freeTable();
-    this.graphics.free(this.programs.panorama.program);
+  // Evaluates, while `goOn()` is true, what other views will need: the panorama, and colours of rows out of view.
+  async lookAhead(view, goOn) {
+    await this.panorama?.complete(view, goOn);
+    await this.coloring(this.rows.fresh(), view.eye, goOn);
   }
 
   dispose() {

@@ -1,6 +1,8 @@
-// Draws the background as an equirectangular picture: first a coarse one, then finer tiles, those in view first.
+// Draws the background as an equirectangular picture, which is shown while the view moves: first a coarse one, then
+// finer tiles, those in view first. A tile has the colours that an eye sees from one place. It is drawn again when the
+// eye has moved far enough.
 
-import { dot } from "../hyrf/vectors.js";
+import { dot, sub } from "../hyrf/vectors.js";
 import { frustumPlanes, intersectsFrustum } from "../hyrf/frustum.js";
 import { WorkPacer } from "./graphics.js";
 import { BACKGROUND_RADIUS } from "./constants.js";
@@ -11,15 +13,17 @@ const MIN_HEIGHT_TEXELS = 256;
 const MAX_HEIGHT_TEXELS = 1024;
 const TILE_SIZE_TEXELS = [64, 32];
 const MAX_EAGER_TILE_MS = 5; // devices that draw a tile in this time draw tiles out of view, too
+const MAX_FRESH_TURN_RADIANS = 1e-2; // a larger turn of the rays to a tile makes its colours stale
 
 export class Panorama {
-  // `paint(framebuffer, size, part)` draws a part (x, y, width, height) of a picture. `finest` is the finest resolution
-  // of the hash grid. An arc from pole to pole crosses about pi / 2 times as many cells, and two texels per cell are
-  // enough.
-  constructor(graphics, finest, paint) {
+  // `paint(framebuffer, size, part, eye)` draws a part (x, y, width, height) of a picture. `finest` is the finest
+  // resolution of the hash grid, and `halfExtent` the half-axes of its frame. An arc from pole to pole crosses about
+  // pi / 2 times as many cells, more where a half-axis is short, and two texels per cell are enough.
+  constructor(graphics, { finest, halfExtent }, paint) {
     Object.assign(this, { graphics, paint });
     this.pace = new WorkPacer();
-    this.height = Math.min(MAX_HEIGHT_TEXELS, Math.max(MIN_HEIGHT_TEXELS, Math.ceil(Math.PI * finest)));
+    const enough = Math.ceil((Math.PI * finest) / Math.min(...halfExtent));
+    this.height = Math.min(MAX_HEIGHT_TEXELS, Math.max(MIN_HEIGHT_TEXELS, enough));
   }
 
   get size() {
@@ -29,17 +33,17 @@ export class Panorama {
   // Creates the texture of a picture.
   picture(height) {
     const { graphics } = this, { gl } = graphics;
-    const texture = graphics.texture(gl.TEXTURE_2D, gl.RGBA8, 2 * height, height);
+    const texture = graphics.texture(gl.TEXTURE_2D, gl.RGB10_A2, 2 * height, height);
     graphics.setLinear();
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_S, gl.REPEAT);
     return texture;
   }
 
-  // Draws the coarse picture and enlarges it.
-  async begin() {
+  // Draws the coarse picture, as an eye sees it, and enlarges it.
+  async begin(eye) {
     const { graphics, height } = this, { gl } = graphics, size = [2 * COARSE_HEIGHT_TEXELS, COARSE_HEIGHT_TEXELS];
-    const small = this.picture(COARSE_HEIGHT_TEXELS), target = graphics.framebuffer(small);
-    const work = (first, last) => this.paint(target, size, [0, first, size[0], last - first]);
+    const small = this.picture(COARSE_HEIGHT_TEXELS), coarse = graphics.framebuffer(small);
+    const work = (first, last) => this.paint(coarse, size, [0, first, size[0], last - first], eye);
     await new WorkPacer().run(graphics, COARSE_HEIGHT_TEXELS, work);
     this.texture = this.picture(height);
     this.target = graphics.framebuffer(this.texture);
@@ -49,11 +53,12 @@ export class Panorama {
     graphics.bind(enlarge, { u_picture: small });
     gl.uniform2f(enlarge.u_size, ...this.size);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
-    for (const object of [enlarge.program, target, small]) graphics.free(object);
+    for (const object of [enlarge.program, coarse, small]) graphics.free(object);
     this.tiles = this.cut();
   }
 
-  // Returns the tiles. Each has its part of the picture, and a ball around that part of the sphere.
+  // Returns the tiles. Each has its part of the picture, a ball around that part of the sphere, and the `eye` from
+  // which it was drawn, or null.
   cut() {
     const { height } = this, tiles = [], [wide, high] = TILE_SIZE_TEXELS, angle = Math.PI / height; // per texel
     const radius = (BACKGROUND_RADIUS * angle * Math.hypot(wide, high)) / 2;
@@ -62,33 +67,42 @@ export class Panorama {
         const longitude = angle * (x + wide / 2) - Math.PI, latitude = Math.PI / 2 - angle * (y + high / 2);
         const [across, ahead] = [Math.sin(longitude), Math.cos(longitude)].map((side) => side * Math.cos(latitude));
         const middle = [across, -Math.sin(latitude), ahead].map((side) => BACKGROUND_RADIUS * side);
-        tiles.push({ part: [x, y, Math.min(wide, 2 * height - x), Math.min(high, height - y)], middle, radius });
+        const part = [x, y, Math.min(wide, 2 * height - x), Math.min(high, height - y)];
+        tiles.push({ part, middle, radius, eye: null });
       }
     }
     return tiles;
   }
 
-  // Draws all tiles that a view shows; for the callbacks see Fields.complete. `done` is called when all tiles are
-  // drawn.
-  async complete(view, { goOn, changed, done }) {
+  // Returns the tiles in view that are stale for its eye, those without colours first and then those in the middle.
+  stale(view) {
     const sides = frustumPlanes(view, 0), ahead = ({ middle }) => dot(view.rows[2], middle);
-    const make = async (tiles) => {
-      const left = new Set(this.tiles);
-      const whole = await this.pace.run(this.graphics, tiles.length, (first, last) => {
-        for (const tile of tiles.slice(first, last)) {
-          this.paint(this.target, this.size, tile.part);
-          left.delete(tile);
-        }
-      }, { goOn });
-      if (left.size < this.tiles.length) changed();
-      this.tiles = [...left];
-      return whole;
+    return this.tiles
+      .filter((tile) => isStale(tile, view.eye) && intersectsFrustum(sides, ...tile.middle, tile.radius))
+      .sort((a, b) => Boolean(a.eye) - Boolean(b.eye) || ahead(b) - ahead(a));
+  }
+
+  draw(tiles, eye) {
+    for (const tile of tiles) {
+      this.paint(this.target, this.size, tile.part, eye);
+      tile.eye = eye;
+    }
+  }
+
+  // Draws, while the view moves, as many stale tiles as take about `ms`, or none.
+  advance(view, ms) {
+    if (this.pace.unit < ms) this.draw(this.stale(view).slice(0, this.pace.within(ms)), view.eye);
+  }
+
+  // Draws all stale tiles that a view shows while `goOn()` is true; fast devices then draw those out of view.
+  async complete(view, goOn) {
+    const make = (tiles) => {
+      const work = (first, last) => this.draw(tiles.slice(first, last), view.eye);
+      return this.pace.run(this.graphics, tiles.length, work, { goOn });
     };
-    if (!this.tiles.length) return true;
-    const seen = this.tiles.filter(({ middle, radius }) => intersectsFrustum(sides, ...middle, radius));
-    if (!(await make(seen.sort((a, b) => ahead(b) - ahead(a))))) return false;
-    if (this.pace.unit !== null && this.pace.unit < MAX_EAGER_TILE_MS && !(await make(this.tiles))) return false;
-    if (!this.tiles.length) done();
-    return true;
+    const whole = await make(this.stale(view));
+    if (whole && this.pace.unit < MAX_EAGER_TILE_MS) await make(this.tiles.filter(({ eye }) => !eye));
   }
 }
+
+const isStale = ({ eye }, from) => !eye || Math.hypot(...sub(eye, from)) > MAX_FRESH_TURN_RADIANS * BACKGROUND_RADIUS;

@@ -182,11 +182,11 @@ export class Player extends EventTarget {
       gl.getError(); // clears earlier errors
       if (model) {
         content = new Fields(gl, model);
-        await content.prepare((part) => {
+        const view = this.view(loader.update && sameAxes(this.scene, scene) ? this.eye : initial?.eye);
+        await content.prepare(view.eye, (part) => {
           if (!this.wanted(loader)) throw new SupersededError();
           this.progress(loader, "preparing", part);
         });
-        const view = this.view(loader.update && sameAxes(this.scene, scene) ? this.eye : initial?.eye);
         await content.coloured(view, scene.tolerance, { goOn: () => this.wanted(loader) });
       } else {
         content = new Splats(gl, splats);
@@ -415,7 +415,7 @@ export class Player extends EventTarget {
     this.finishing = true;
     const { moves } = this, { content } = this.renderer;
     const goOn = () => this.loaded && !this.paused && this.moves === moves && this.renderer.content === content;
-    const options = { goOn, changed: () => this.redraw() };
+    const options = { goOn, changed: () => this.redraw(), blended: this.renderer.blended };
     const work = () => content.complete(this.view(), this.scene.tolerance, options);
     const whole = await this.enqueue(work).catch((error) => {
       this.emit("failed", error);
@@ -427,6 +427,7 @@ export class Player extends EventTarget {
     this.idle = true;
     this.times.complete ??= performance.now();
     for (const resolve of this.onIdle.splice(0)) resolve();
+    this.enqueue(() => content.lookAhead(this.view(), goOn)).catch((error) => this.emit("failed", error));
   }
 
   // Runs work on the content after all earlier work on it. Returns a promise of its result, or of null if the context
@@ -510,10 +511,15 @@ export class Player extends EventTarget {
     this.eye.setView(view);
     this.changed();
     const picture = await this.enqueue(async () => {
-      await content.complete(view, this.scene.tolerance, { exact: true });
-      const sorted = await this.loader.sort(view, this.scene);
-      if (!sorted || !this.loaded || content !== this.renderer.content) throw new ContextLostError();
-      this.setOrder(sorted);
+      const sort = async () => {
+        const sorted = await this.loader.sort(view, this.scene);
+        if (!sorted || !this.loaded || content !== this.renderer.content) throw new ContextLostError();
+        this.setOrder(sorted);
+      };
+      await sort();
+      this.renderer.splats(view);
+      await content.complete(view, this.scene.tolerance, { exact: true, blended: this.renderer.blended });
+      await sort(); // meanwhile frames of the window may have got another order
       return this.renderer.read(view, this.gains(view));
     });
     this.unsorted = true;

@@ -144,6 +144,7 @@ export class Renderer {
     const { gl, graphics, blend } = this, { width, height } = view;
     this.projections(view, pick);
     this.reserve(width, height);
+    this.used = [width, height];
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.layers);
     gl.viewport(0, 0, width, height);
     gl.enable(gl.SCISSOR_TEST);
@@ -163,6 +164,11 @@ export class Renderer {
     gl.bindVertexArray(null);
     gl.disable(gl.BLEND);
     gl.disable(gl.SCISSOR_TEST);
+  }
+
+  // Returns the picture of the splats that was blended last, and its size in use.
+  get blended() {
+    return { texture: this.layered, used: this.used };
   }
 
   // Projects all splats of a view.
@@ -194,13 +200,15 @@ export class Renderer {
   // Composites the blended splats, which fill the size `used`, over the background. Draws to a target or the canvas.
   over(view, used, target, gains) {
     const { gl, graphics, resolve: r, scene, content } = this, picture = content.panorama?.texture ?? this.picture;
+    const sky = content.sky?.of(view);
     const { center, radius } = backgroundSphere(scene);
     gl.bindFramebuffer(gl.FRAMEBUFFER, target);
     gl.viewport(0, 0, view.width, view.height);
     gl.useProgram(r.program);
-    graphics.bind(r, { u_splats: this.layered, u_background: picture ?? this.plain });
+    graphics.bind(r, { u_splats: this.layered, u_background: picture ?? this.plain, u_sky: sky ?? this.plain });
     gl.uniform2f(r.u_used, ...used);
     gl.uniform1i(r.u_pictured, picture ? 1 : 0);
+    gl.uniform1i(r.u_exact, sky ? 1 : 0);
     gl.uniform3fv(r.u_from, view.eye.map((value, axis) => (value - center[axis]) / radius));
     gl.uniform3fv(r.u_solid, scene.solid);
     gl.uniform3fv(r.u_gains, gains);

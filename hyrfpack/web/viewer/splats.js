@@ -21,6 +21,8 @@ export class Splats {
     return true;
   }
 
+  async lookAhead() {}
+
   dispose() {
     this.graphics.dispose();
   }
