@@ -14,11 +14,17 @@ from pathlib import Path
 from PIL import Image
 
 from hyrfpack.atomic import pending_file, write_atomic
+from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.checks import check_type
 from hyrfpack.evaluate import evaluate_model
 from hyrfpack.evaluate.metrics import IDENTICAL_PSNR
 from hyrfpack.export.pages import page_cameras, suggest_compression
-from hyrfpack.export.poster import encode_poster, render_model_poster, render_splats_poster
+from hyrfpack.export.poster import (
+    encode_poster,
+    frame_splats,
+    render_model_poster,
+    render_splats_poster,
+)
 from hyrfpack.export.report import ExportReport
 from hyrfpack.export.source import Source
 from hyrfpack.format import describe_file
@@ -210,7 +216,7 @@ class _PlayableContent:
         length: size in bytes.
         poster: a picture of the scene, or None if none can be made.
         quality: quality of the model in words; empty if unknown.
-        stage: initial cameras for the page, see `hyrfpack.web.html.encode_stage`; None for splats.
+        stage: initial cameras for the page, see `hyrfpack.web.html.encode_stage`; None if there is no poster.
     """
 
     count: int
@@ -233,7 +239,13 @@ class _PlayableContent:
         length = os.path.getsize(path) if os.path.isfile(path) else 0
         if _playable_ending(path) != HYRF_ENDING:
             splats = read_splats(path)
-            return cls(len(splats), length, render_splats_poster(splats, POSTER_LONGEST_SIDE_PIXELS))
+            frame = frame_splats(splats)
+            if frame is None:
+                return cls(len(splats), length, None)
+            viewpoint = Viewpoint.from_frame(frame.center, frame.scale)
+            poster = render_splats_poster(splats, frame, viewpoint.camera, POSTER_LONGEST_SIDE_PIXELS)
+            stage = encode_stage([viewpoint.camera], viewpoint.up, viewpoint.center)
+            return cls(len(splats), length, poster, stage=stage)
         loaded = Source.read(path, data)
         suggest_compression(path, length)
         quality = _describe_quality(path, loaded.model, data) if with_quality else ""

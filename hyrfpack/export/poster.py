@@ -7,9 +7,7 @@ import io
 import numpy as np
 from PIL import Image
 
-from hyrfpack.cameras.paths import Viewpoint, orbit
 from hyrfpack.cameras.view_sampling import shrink_camera
-from hyrfpack.errors import HyrfDataError
 from hyrfpack.model import Frame, HybridModel
 from hyrfpack.render import render_view
 from hyrfpack.render.files import to_image
@@ -18,7 +16,7 @@ from hyrfpack.splats.draw import Drawable, draw
 from hyrfpack.splats.splats import Splats
 
 ENCODER_QUALITIES = (80, 65, 50, 35, 20, 10)
-FRAME_PERCENTILES = (1, 99)
+REACH_PERCENTILE = 90
 
 
 def render_model_poster(model: HybridModel, camera: Camera, longest_side: int) -> Image.Image:
@@ -26,18 +24,17 @@ def render_model_poster(model: HybridModel, camera: Camera, longest_side: int) -
     return to_image(render_view(model, shrink_camera(camera, longest_side)).rgb)
 
 
-def render_splats_poster(splats: Splats, longest_side: int) -> Image.Image | None:
-    """Render splats from slightly above, over black; None if there are none or all lie at one place.
-
-    The scene is assumed to be upright with y downwards, as most reconstructions are.
-    """
+def frame_splats(splats: Splats) -> Frame | None:
+    """Return the frame of most splats, around their median position; None if there are none or all lie at one place."""
     if not len(splats):
         return None
-    try:
-        frame = Frame.from_box(*np.percentile(splats.positions, FRAME_PERCENTILES, axis=0))
-    except HyrfDataError:
-        return None
-    camera = orbit(Viewpoint.from_frame(frame.center, frame.scale), 1)[0]
+    center = np.median(splats.positions, axis=0)
+    reach = float(np.percentile(np.abs(splats.positions - center), REACH_PERCENTILE, axis=0).max())
+    return Frame(tuple(center.tolist()), reach, (1.0, 1.0, 1.0)) if reach > 0 else None
+
+
+def render_splats_poster(splats: Splats, frame: Frame, camera: Camera, longest_side: int) -> Image.Image:
+    """Render splats over black, in a picture of at most `longest_side` pixels a side."""
     return to_image(draw(Drawable.from_splats(splats, frame), shrink_camera(camera, longest_side)).rgb)
 
 

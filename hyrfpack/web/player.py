@@ -49,8 +49,7 @@ def encode_player(
         poster: address, relative to the page, of the picture that is shown while that file loads; None for none.
         description: description for those who share the page.
         fetches: sources that the page may fetch from, in the syntax of a content security policy.
-        stages: initial cameras for `.hyrf` files, by the file's address relative to the page; see
-            `html.encode_stage`.
+        stages: initial cameras for files, by the file's address relative to the page; see `html.encode_stage`.
         updates: address of a JSON file that says which snapshot of a training `content` is: {"snapshot": number from 1,
             0 while there is none, "step", "steps"}. The page requests it repeatedly and shows newer snapshots from the
             viewer's current viewpoint. None for a file that does not change.

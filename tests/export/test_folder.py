@@ -83,7 +83,8 @@ def test_a_player_of_splats_contains_the_file_unchanged(splats_file, tmp_path):
     assert file_names(tmp_path / "p") == PLAYER_FILES | {"scene.ply", "poster.jpg"} and report.gaussians == 40
     assert (tmp_path / "p" / "scene.ply").read_bytes() == splats_file.read_bytes()
     assert np.asarray(Image.open(tmp_path / "p" / "poster.jpg")).std() > 5  # the poster is not uniform
-    assert read_content_json(tmp_path / "p" / "index.html")["content"] == "scene.ply"
+    content = read_content_json(tmp_path / "p" / "index.html")
+    assert content["content"] == "scene.ply" and len(content["stages"]["scene.ply"]["cameras"]) == 1
 
 
 def test_a_player_without_a_scene_has_no_content(tmp_path):

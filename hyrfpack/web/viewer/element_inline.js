@@ -2,6 +2,7 @@
 
 import { createViewer } from "./viewer.js";
 import { AS_PHOTOGRAPHED } from "./exposure.js";
+import { keepPlaced } from "./poster.js";
 import { siblingAddress } from "./script_address.js";
 
 export const INLINE_ATTRIBUTES = [
@@ -24,6 +25,7 @@ export class InlineView {
     this.root = make("div");
     this.poster = make("img", { alt: "", part: "poster", hidden: "" });
     this.container = make("div", { class: "scene" });
+    this.placement = keepPlaced(this.poster, this.root);
     this.bar = make("progress", { max: 1, part: "progress", "aria-label": "Loading", hidden: "" });
     this.message = make("p", { role: "status", part: "message", hidden: "" });
     this.root.append(this.poster, this.container, this.bar, this.message);
@@ -34,6 +36,7 @@ export class InlineView {
     clearTimeout(this.hintTimer);
     this.viewer?.destroy();
     this.viewer = null;
+    this.placement.disconnect();
     this.root.remove();
   }
 

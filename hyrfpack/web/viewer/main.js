@@ -7,9 +7,10 @@ import { Help } from "./help.js";
 import { prefersReducedMotion } from "./motion.js";
 import { Navigation } from "./navigation.js";
 import { announce, dismiss, fail, progress, remark, toast } from "./notifications.js";
-import { Opener, postToParent } from "./opener.js";
+import { Opener, findFirstFile, postToParent } from "./opener.js";
 import { Panel } from "./panel.js";
 import { Player } from "./player.js";
+import { Poster } from "./poster.js";
 import { savePicture, shareView } from "./share.js";
 import { setTextSource } from "./texts.js";
 
@@ -19,20 +20,30 @@ const IGNORED_TEXTS = {
   finger: "Tap the scene, then fingers move it.",
 };
 
-// Shows a picture until the scene is drawn.
-function showPoster(address) {
-  if (!address) return;
-  const poster = element("poster") ?? Object.assign(document.createElement("img"), { id: "poster", alt: "" });
-  poster.src = address;
-  document.body.append(poster);
+// Shows the picture that the address names, or else the page's, and returns it. The page's is one of its own file from
+// the first camera; if the address names another file or camera, it is removed. Returns null without a picture.
+function showPoster(parameters, embedded, served) {
+  const { isOwn, stage } = findFirstFile(served, parameters), named = namedCamera(parameters);
+  const isFirstView = named === null || named === "1", picture = element("poster");
+  if (!parameters.poster && !(isFirstView && (embedded || isOwn))) picture?.remove();
+  else if (parameters.poster || picture) {
+    const image = picture ?? Object.assign(new Image(), { id: "poster", alt: "" });
+    if (parameters.poster) image.src = parameters.poster;
+    document.body.append(image);
+    return new Poster(image, element("view"), isFirstView ? (embedded ?? stage)?.cameras[0] : null);
+  }
+  return null;
 }
 
 // Fades in the canvas over the poster after the first frame.
-function revealCanvas(player) {
-  if (player.times.first === null && !player.idle) return requestAnimationFrame(() => revealCanvas(player));
+function revealCanvas(player, poster) {
+  if (player.times.first === null && !player.idle) return requestAnimationFrame(() => revealCanvas(player, poster));
   document.body.classList.add("there");
-  setTimeout(() => element("poster")?.remove(), FADE_MS);
+  setTimeout(() => poster?.remove(), FADE_MS);
 }
+
+// Returns the text of the camera that the page's address names, or null.
+const namedCamera = (parameters) => parseHash(location.hash) ?? parameters.camera;
 
 // Marks the picked point for a moment.
 function showRing(x, y) {
@@ -68,10 +79,10 @@ function start() {
   const workerAddress = isInFolder ? resolveAddress("player-worker.js", "worker") : null;
   const parameters = parseSearch(location.search);
   document.body.classList.toggle("bare", parameters.noui);
-  showPoster(parameters.poster);
   const embedded = element("scene") ? JSON.parse(elementText("scene")) : null;
   const served = element("content") ? JSON.parse(elementText("content")) : null;
 
+  const poster = showPoster(parameters, embedded, served);
   const player = new Player(element("view"), { scene: embedded, workerAddress }), help = new Help();
   const navigation = new Navigation(player, {
     keyTarget: window,
@@ -96,7 +107,7 @@ function start() {
   };
 
   // Moves the eye to the camera that the page's address names, if it names one.
-  const followNamedCamera = () => followCamera(parseHash(location.hash) ?? parameters.camera, false);
+  const followNamedCamera = () => followCamera(namedCamera(parameters), false);
 
   const setTurning = (isOn) => {
     navigation.turntable.turn(isOn);
@@ -154,7 +165,7 @@ function start() {
   player.addEventListener("count", ({ detail }) => panel.describe(detail, opener.shown.title));
   player.addEventListener("loaded", () => {
     document.body.classList.remove("empty"); // the page's own scene may be loaded after a file failed
-    revealCanvas(player);
+    revealCanvas(player, poster);
     help.greet();
     if (!player.whole) return;
     element("loading").hidden = true;
@@ -163,8 +174,12 @@ function start() {
 
   // ---- opening scenes
 
+  const openFile = (file) => {
+    if (file) poster?.remove();
+    opener.openFile(file);
+  };
   element("file").onchange = ({ target }) => {
-    opener.openFile(target.files[0]);
+    openFile(target.files[0]);
     target.value = ""; // so that choosing the same file again fires an event
   };
   for (const button of document.querySelectorAll(".choose")) button.onclick = () => element("file").click();
@@ -177,7 +192,7 @@ function start() {
   addEventListener("drop", (event) => {
     event.preventDefault();
     document.body.classList.remove("dropping");
-    opener.openFile(event.dataTransfer.files[0]);
+    openFile(event.dataTransfer.files[0]);
   });
   addEventListener("hashchange", () => followCamera(parseHash(location.hash), true));
   element("dismiss").onclick = element("enough").onclick = dismiss;

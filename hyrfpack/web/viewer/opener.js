@@ -22,6 +22,14 @@ const findStage = (address, stages = {}) => {
   return Object.entries(stages).find(([name]) => isAddressOf(name))?.[1] ?? null;
 };
 
+// Returns the file that the address or the page names: its address, null for none, "" for an invalid one; whether it is
+// the page's own; and its stage, null if the page has none. `served` and `parameters` are those of `openFirst`.
+export function findFirstFile(served, parameters) {
+  const own = served?.content ? resolveAddress(served.content, "content") : null;
+  const address = parameters.content ?? own;
+  return { address, isOwn: address === own, stage: address ? findStage(address, served?.stages) : null };
+}
+
 export class Opener {
   // `title` is that of the scene in the page.
   constructor(player, panel, title) {
@@ -40,13 +48,12 @@ export class Opener {
       postToParent("load");
       return;
     }
-    const address = parameters.content ?? (served?.content ? resolveAddress(served.content, "content") : null);
+    const { address, stage } = findFirstFile(served, parameters);
     const updates = parameters.content || !served?.updates ? null : resolveAddress(served.updates, "content");
     if (updates) return this.watchTraining(address, updates, served.title);
     if (address) {
       const name = parameters.title ?? (parameters.content ? null : served.title);
-      const fetchFile = async () => ({ ...(await fetchedFile(address)), stage: findStage(address, served?.stages) });
-      return this.open(fetchFile, name);
+      return this.open(async () => ({ ...(await fetchedFile(address)), stage }), name);
     }
     element("loading").hidden = true;
     this.invites = parameters.content === null;

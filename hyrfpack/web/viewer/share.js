@@ -13,6 +13,7 @@ export async function shareView(camera, exposure, includesScene) {
   const address = new URL(location.href), { searchParams: parameters } = address;
   if (exposure) parameters.set("exposure", exposure);
   else if (parameters.has("exposure")) parameters.delete("exposure");
+  if (parameters.has("poster")) parameters.delete("poster"); // it is of another view
   address.hash = `camera=${camera}`;
   try {
     history.replaceState(null, "", address);

@@ -153,7 +153,7 @@ class SceneReader {
       rejectOtherFiles(bytes);
       const splats = await this.readSplats(name, bytes);
       if (scene) convertToScene(splats, scene);
-      content.scene = scene ?? splatsScene(splats, name);
+      content.scene = scene ?? { ...splatsScene(splats, name), ...stage };
       positions = splats.positions;
       content.splats = packSplats(splats);
     }
