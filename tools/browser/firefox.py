@@ -196,6 +196,8 @@ class Firefox(Browser):
             ".then((value) => done({value}), (error) => done({error: String(error)}));"
         )
         answer = self.call("WebDriver:ExecuteAsyncScript", script=script, args=[])["value"]
+        if answer is None:
+            raise RuntimeError("the page was left before its script answered")
         if "error" in answer:
             raise RuntimeError(answer["error"])
         return answer.get("value")
