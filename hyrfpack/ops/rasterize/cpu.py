@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from hyrfpack.ops.rasterize import cpu_bin, cpu_blend, cpu_project
+from hyrfpack.ops.rasterize import cpu_bin, cpu_blend, cpu_median, cpu_project
 from hyrfpack.ops.rasterize.cpu_project import GaussianArrays, Projection, ProjectionSettings
 from hyrfpack.ops.rasterize.inputs import Gaussians3D, RasterSettings
 from hyrfpack.ops.rasterize.reference import TILE_SIZE, jacobian_limits
@@ -81,6 +81,30 @@ def sum_blend_weights(gaussians: Gaussians3D, viewport: Viewport, settings: Rast
     sums = np.empty(len(means), np.float32)
     run_ranges(lambda start, stop: cpu_blend.sum_slots(start, stop, tiles.slot_starts, pair_weights, sums), len(means))
     return torch.from_numpy(sums), torch.from_numpy(transmittance)
+
+
+@torch.no_grad()
+def median_depth(
+    gaussians: Gaussians3D, slopes: Tensor, max_ratio: float, viewport: Viewport, settings: RasterSettings
+) -> Tensor:
+    """Compute `hyrfpack.ops.rasterize.median_depth.median_depth`.
+
+    Args:
+        slopes: (N, 3) slopes dz/dx and dz/dy of each Gaussian's plane; the third column is not used.
+        max_ratio: limit of a depth in the plane relative to the depth of the centre.
+    """
+    view = _view(viewport, settings)
+    arrays = GaussianArrays(*(tensor.detach().contiguous().numpy() for tensor in (*gaussians, slopes)))
+    projection = _project(arrays, view)
+    tiles = _bin_pairs(cpu_bin.sort_by_depth(projection.keys), projection, view)
+    depth = np.empty(view.size, np.float32)
+    runs = _tile_runs(tiles.starts)
+
+    def task(run: int) -> None:
+        cpu_median.median_tiles(*runs[run], tiles.starts, tiles.pairs, tiles.records, np.float32(max_ratio), depth)
+
+    run_tasks(task, len(runs))
+    return torch.from_numpy(depth)
 
 
 def _view(viewport: Viewport, settings: RasterSettings, absgrad: Tensor | None = None) -> _View:

@@ -61,7 +61,7 @@ _EXP_3, _EXP_4, _EXP_5 = np.float32(0.16599276), np.float32(0.03980572), np.floa
 
 
 @_kernel
-def _exp8(x):
+def exp8(x):
     """Return exp(8 x) for x in [-ln 2, 0] to a relative error of 2e-6; for smaller x, a positive number or infinity."""
     e = ((((_EXP_5 * x + _EXP_4) * x + _EXP_3) * x + _EXP_2) * x + _EXP_1) * x + _EXP_0
     e *= e
@@ -122,7 +122,7 @@ def blend_tiles(
                 u = u_0 - u_x * s[k + _X_PLANE] - u_y * s[k + _Y_PLANE]
                 v = v_0 - v_y * s[k + _Y_PLANE]
                 x = -(u * u + v * v)
-                alpha = min(opacity * _exp8(x), _ALPHA_MAX)
+                alpha = min(opacity * exp8(x), _ALPHA_MAX)
                 alpha = alpha if x >= cut else _ZERO
                 t = s[k + _T_PLANE]
                 weight = alpha * t if t > transmittance_min else _ZERO
@@ -225,7 +225,7 @@ def blend_tiles_backward(
                 u = u_0 - u_x * s[k + _X_PLANE] - u_y * s[k + _Y_PLANE]
                 v = v_0 - v_y * s[k + _Y_PLANE]
                 x = -(u * u + v * v)
-                uncut = opacity * _exp8(x)
+                uncut = opacity * exp8(x)
                 alpha = min(uncut, _ALPHA_MAX)
                 t = s[k + _T_PLANE]
                 alpha = alpha if x >= cut and t > transmittance_min else _ZERO

@@ -80,12 +80,8 @@ def project(gaussians: Gaussians3D, viewport: Viewport, settings: RasterSettings
     index = torch.nonzero(seen[:, 2] > settings.near)[:, 0]
     x, y, z = seen[index].to(means.dtype).unbind(-1)
     x_z, y_z = x / z, y / z
-
-    left, right, top, bottom = jacobian_limits(viewport)
-    clamped_x, clamped_y = x_z.clamp(left, right), y_z.clamp(top, bottom)
-    zero = torch.zeros_like(z)
-    jacobian = torch.stack([fx / z, zero, -fx * clamped_x / z, zero, fy / z, -fy * clamped_y / z], -1).view(-1, 2, 3)
-    half = jacobian @ camera[:3, :3].to(means.dtype) @ _rotations(quats[index]) * scales[index, None, :]
+    axes = camera[:3, :3].to(means.dtype) @ _rotations(quats[index]) * scales[index, None, :]
+    half = _projection_jacobian(x_z, y_z, z, viewport) @ axes
 
     xx, xy, yy = (half[:, 0] ** 2).sum(-1), (half[:, 0] * half[:, 1]).sum(-1), (half[:, 1] ** 2).sum(-1)
     # |a x b|^2 = |a|^2 |b|^2 - (a . b)^2 without the cancellation that needles suffer from.
@@ -104,6 +100,32 @@ def project(gaussians: Gaussians3D, viewport: Viewport, settings: RasterSettings
         depths=z,
         opacities=opacities,
     )
+
+
+def depth_slopes(gaussians: Gaussians3D, viewport: Viewport, projected: Projected) -> Tensor:
+    """Return the slopes (M, 2) of the planes in which projected Gaussians lie: dz / d(pixel) along x and y.
+
+    With the local affine projection, image position and depth are jointly Gaussian. The mean of z given an offset d
+    from the 2D centre is z + s . d, with s = Cov(z, image) Sigma^-1 and Sigma the 2D covariance, low-pass included.
+    """
+    index = projected.index
+    rotation = viewport.pose[:3, :3].to(gaussians.means)
+    axes = rotation @ _rotations(gaussians.quats[index]) * gaussians.scales[index, None, :]
+    fx, fy, cx, cy = viewport.intrinsics
+    x_z, y_z = (projected.means2d[:, 0] - cx) / fx, (projected.means2d[:, 1] - cy) / fy
+    half = _projection_jacobian(x_z, y_z, projected.depths, viewport) @ axes
+    covariance_x, covariance_y = (half @ axes[:, 2, :, None])[..., 0].unbind(-1)
+    xx, xy, yy = projected.conics.unbind(-1)
+    return torch.stack([xx * covariance_x + xy * covariance_y, xy * covariance_x + yy * covariance_y], -1)
+
+
+def _projection_jacobian(x_z: Tensor, y_z: Tensor, z: Tensor, viewport: Viewport) -> Tensor:
+    """Return the Jacobians (M, 2, 3) of the projection to pixels, with x/z and y/z clamped to `jacobian_limits`."""
+    fx, fy, *_ = viewport.intrinsics
+    left, right, top, bottom = jacobian_limits(viewport)
+    clamped_x, clamped_y = x_z.clamp(left, right), y_z.clamp(top, bottom)
+    zero = torch.zeros_like(z)
+    return torch.stack([fx / z, zero, -fx * clamped_x / z, zero, fy / z, -fy * clamped_y / z], -1).view(-1, 2, 3)
 
 
 def blend(
