@@ -14,9 +14,22 @@ from typing import TypeVar
 ErrorT = TypeVar("ErrorT", bound="HyrfError")
 
 # pip's names of packages that differ from the names of their modules.
-_PACKAGE_BY_MODULE = {"PIL": "pillow", "pillow_heif": "pillow-heif", "pxr": "usd-core"}
+_PACKAGE_BY_MODULE = {
+    "PIL": "pillow",
+    "pillow_heif": "pillow-heif",
+    "pxr": "usd-core",
+    "fast_simplification": "fast-simplification",
+    "skimage": "scikit-image",
+}
 # The extra of pyproject.toml that stands for the use of a package, if that is its only use.
-_EXTRA_BY_PACKAGE = {"av": "video", "pillow-heif": "heic", "pycolmap": "poses", "usd-core": "usd"}
+_EXTRA_BY_PACKAGE = {
+    "av": "video",
+    "fast-simplification": "mesh",
+    "pillow-heif": "heic",
+    "pycolmap": "poses",
+    "scikit-image": "mesh",
+    "usd-core": "usd",
+}
 
 
 def printable(text: str) -> str:

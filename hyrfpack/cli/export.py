@@ -66,7 +66,7 @@ crop_option = click.option(
     help="Photos and poses of the scene: cameras for a file that stores none, and held-out photos to score the result. "
     "For a gallery, give it once for each MODEL.",
 )
-@settings_options(ExportConfig, "spz_version")
+@settings_options(ExportConfig, "spz_version", "voxel", "faces")
 @overwrite_option
 @scene_options
 @json_option
@@ -87,6 +87,7 @@ def export(
       a folder                                        the player and the model, for a web server
       .ply .splat .spz .sog .glb .usda .usdc .usdz    3D Gaussians with spherical harmonics
       .points.ply .points.glb                         centres as points, cameras as frusta
+      .mesh.glb .mesh.ply .obj .stl                   the surface as triangles with vertex colours
       .json, or a folder with --colmap                cameras: transforms.json, or a COLMAP model
 
     Several models exported to a folder make a gallery. Without a model, the folder gets a player that opens the files
@@ -101,6 +102,7 @@ def export(
       hyrfpack export runs/bonsai -o bonsai.spz --sh-degree 2
       hyrfpack export bonsai.hyrf -o bonsai.ply --data photos/bonsai --min-opacity 0.02
       hyrfpack export bonsai.hyrf -o table.glb --crop -1,-1,-1,1,1,1
+      hyrfpack export bonsai.hyrf -o bonsai.mesh.glb --faces 200000
     """
     from hyrfpack.export import export_model as write
     from hyrfpack.export.folder import check_folder, export_gallery, export_player
@@ -192,7 +194,9 @@ def _print_report(report: ExportReport) -> None:
     behind = f", {report.background:,} of them for the background" if report.background else ""
     holds = f", {report.gaussians:,} Gaussians{behind}" if report.gaussians else ""
     cameras = f", {report.cameras:,} cameras" if report.cameras else ""
-    click.echo(f"{report.file}: {report.bytes:,} bytes{holds}{cameras}")
+    mesh = f", {report.vertices:,} vertices, {report.faces:,} triangles" if report.faces else ""
+    voxels = f", voxels of {report.voxel:.4g} units" if report.voxel else ""
+    click.echo(f"{report.file}: {report.bytes:,} bytes{holds}{cameras}{mesh}{voxels}")
     if report.photos_model is not None:
         click.echo(
             f"PSNR against held-out photos: model {report.photos_model:.3f} dB, file {report.photos_file:.3f} dB"

@@ -10,6 +10,8 @@ from typing import Annotated
 from hyrfpack.choices import DEFAULT_SPZ_VERSION, LOCAL_EXPOSURE, SPLAT_EXPOSURES, SPZ_VERSIONS
 from hyrfpack.config.settings import OneOf, Range, check_settings
 
+MIN_VOXEL = 1e-12  # world units; smaller ones are not told from zero
+
 
 @dataclass(frozen=True)
 class ConvertConfig:
@@ -50,9 +52,14 @@ class ExportConfig(ConvertConfig):
         exposure: exposure of baked splats: each as bright as in the photos that see it (local), or one exposure for all
             (consistent). A model without an exposure map gives the same splats with both.
         colmap: write a folder with a COLMAP model: cameras, and centres as points.
+        voxel: side of the voxels in which a mesh is fused, in world units. Default: the size of a photo's pixel on the
+            surface, and at least 1/512 of the mesh.
+        faces: reduce a mesh to at most this number of triangles. Default: all.
     """
 
     background: bool = True
     baked: bool = False
     exposure: Annotated[str, OneOf(SPLAT_EXPOSURES)] = LOCAL_EXPOSURE
     colmap: bool = False
+    voxel: Annotated[float | None, Range(MIN_VOXEL, unit="length")] = None
+    faces: Annotated[int | None, Range(4)] = None

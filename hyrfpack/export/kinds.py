@@ -27,10 +27,14 @@ POINT_FILES = (
     FileKind(ending=".points.ply", max_degree=0),
     FileKind(ending=".points.glb", max_degree=0, module="trimesh"),
 )
+MESH_FILES = tuple(
+    FileKind(ending=ending, max_degree=0, module="skimage") for ending in (".mesh.glb", ".mesh.ply", ".obj", ".stl")
+)
 COLMAP_FOLDER = FileKind(ending="", max_degree=0, module="pycolmap")
 POSITION_KINDS = (COLMAP_FOLDER, *POINT_FILES)  # these hold the centres of Gaussians, and cameras
 PLAYER_FOLDER = FileKind(ending="")
-_KINDS_BY_ENDING = {kind.ending: kind for kind in (*POINT_FILES, *FORMATS.values(), HTML_PAGE, TRANSFORMS_JSON)}
+_FILE_KINDS = (*POINT_FILES, *MESH_FILES, *FORMATS.values(), HTML_PAGE, TRANSFORMS_JSON)
+_KINDS_BY_ENDING = {kind.ending: kind for kind in _FILE_KINDS}
 EXPORT_ENDINGS = tuple(_KINDS_BY_ENDING)
 
 
@@ -82,6 +86,12 @@ def check_request(kind: FileKind, target: str | os.PathLike[str], config: Export
             f"{target}: this file holds only cameras, so that Gaussians cannot be selected",
             fix="leave out `crop` and `min_opacity`",
         )
+    if kind not in MESH_FILES and (config.voxel is not None or config.faces is not None):
+        names = " and ".join(f"`{name}`" for name in ("voxel", "faces") if getattr(config, name) is not None)
+        raise HyrfError(
+            f"{target}: this is not a mesh, which has voxels and triangles",
+            fix=f"leave out {names}, or use one of {', '.join(kind.ending for kind in MESH_FILES)}",
+        )
     if config.baked and kind is PLAYER_FOLDER:
         raise HyrfError(
             f"{target}: the folder of a player holds the model file itself and no baked splats",
@@ -101,6 +111,9 @@ def check_request(kind: FileKind, target: str | os.PathLike[str], config: Export
             fix=f"leave out {names}, or write baked splats into a page with `baked=True`",
         )
     check_package(kind, target)
+    if config.faces is not None:
+        with needs_package(f"{target}: reducing the triangles of a mesh"):
+            import_module("fast_simplification")
 
 
 def check_package(kind: FileKind, target: str | os.PathLike[str]) -> None:

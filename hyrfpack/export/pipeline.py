@@ -18,6 +18,7 @@ from hyrfpack.export.folder import export_player
 from hyrfpack.export.kinds import (
     COLMAP_FOLDER,
     HTML_PAGE,
+    MESH_FILES,
     PLAYER_FOLDER,
     POSITION_KINDS,
     TRANSFORMS_JSON,
@@ -26,6 +27,7 @@ from hyrfpack.export.kinds import (
     check_request,
     find_file_kind,
 )
+from hyrfpack.export.meshes import write_mesh
 from hyrfpack.export.pages import encode_baked_page, write_native_page
 from hyrfpack.export.points import encode_points
 from hyrfpack.export.report import ExportReport
@@ -60,9 +62,11 @@ def export_model(
     - .html: a self-contained page that shows the scene in any browser, with the `.hyrf` file inside;
     - no ending: a folder with a player and the file, for a web server (see `hyrfpack.export_player`);
     - .points.ply, .points.glb: the Gaussians' centres as coloured points, and the cameras as frusta;
+    - .mesh.glb, .mesh.ply, .obj, .stl: the surface as a triangle mesh with vertex colours (needs scikit-image);
     - .json: the cameras as a transforms.json.
 
-    The loss is not measured for a cropped scene, nor for an output of only points, only cameras or the model itself.
+    The loss is not measured for a cropped scene, nor for an output of only points, only cameras, a mesh or the model
+    itself.
 
     Args:
         source: the model, a `.hyrf` file or the folder of a run.
@@ -108,6 +112,8 @@ def export_model(
         if kind is TRANSFORMS_JSON:
             return _write_cameras(loaded, target, overwrite)
         with context.open_progress("export") as progress:
+            if kind in MESH_FILES:
+                return write_mesh(loaded, target, kind, config, overwrite, progress)
             return _export_gaussians(loaded, Path(target), kind, config, overwrite, progress)
 
 

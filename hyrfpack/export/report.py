@@ -29,6 +29,8 @@ class ExportReport:
             model's pictures as photographed. Empty without an exposure map, or if it was not measured.
         photos_by_exposure: PSNR of the same splats against held-out photos, if given.
         cameras: number of cameras in a file of points or of cameras.
+        vertices, faces: number of vertices and of triangles of a mesh.
+        voxel: side of the voxels in which a mesh was fused, world units; None for other files.
     """
 
     file: str
@@ -47,3 +49,6 @@ class ExportReport:
     psnr_by_exposure: dict[str, float] = field(default_factory=dict)
     photos_by_exposure: dict[str, float] = field(default_factory=dict)
     cameras: int = 0
+    vertices: int = 0
+    faces: int = 0
+    voxel: float | None = None

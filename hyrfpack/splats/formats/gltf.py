@@ -190,9 +190,12 @@ def _harmonics_semantics(degree: int) -> list[str]:
 
 def linear_colors(splats: Splats) -> np.ndarray:
     """Return the colours of degree 0 as linear RGB, as glTF defines COLOR_0, with the opacities: (N, 4) uint8."""
-    srgb = splats.base_colors
-    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-    return np.round(255 * np.column_stack((linear, splats.opacities))).astype(np.uint8)
+    return np.round(255 * np.column_stack((linear_from_srgb(splats.base_colors), splats.opacities))).astype(np.uint8)
+
+
+def linear_from_srgb(srgb: np.ndarray) -> np.ndarray:
+    """Convert sRGB in [0, 1], display-referred, to linear RGB."""
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
 def _read_chunks(data: bytes, name: str) -> tuple[dict[str, Any], memoryview]:

@@ -1,0 +1,125 @@
+"""Meshes: files that other programs read in the right axes and colours, and requests that are refused."""
+
+from __future__ import annotations
+
+import io
+import sys
+
+import numpy as np
+import pytest
+import trimesh
+from scenes import ring, small_model
+
+import hyrfpack
+from hyrfpack.cameras.capture import provenance_cameras
+from hyrfpack.cameras.paths import Viewpoint
+from hyrfpack.errors import HyrfError
+from hyrfpack.format import save_model
+from hyrfpack.mesh import Mesh
+from hyrfpack.mesh.files import MESH_EXTENSIONS, encode_mesh
+from tools.safety.train_golden import DEMO_MODEL_FILE
+
+# A tetrahedron; the scene's up is -y, as in most reconstructions.
+TETRAHEDRON = Mesh(
+    np.array([[0, 0, 0], [1, 0, 0], [0, -2, 0], [0, 0, 3.0]]),
+    np.array([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]]),
+    np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [188, 188, 188]], np.uint8),
+    0.1,
+    0.3,
+    4,
+)
+UP = np.array([0.0, -1.0, 0.0])
+
+
+def read_mesh(data: bytes, extension: str) -> trimesh.Trimesh:
+    return trimesh.load_scene(io.BytesIO(data), file_type=extension, process=False).to_mesh()
+
+
+@pytest.mark.parametrize("extension", MESH_EXTENSIONS)
+def test_trimesh_reads_positions_in_world_units(extension):
+    read = read_mesh(encode_mesh(TETRAHEDRON, extension, UP), extension)
+    corners = np.asarray(read.vertices)[np.asarray(read.faces)]
+    expected = TETRAHEDRON.vertices[TETRAHEDRON.faces] * ((1, -1, -1) if extension == "glb" else (1, 1, 1))
+    np.testing.assert_allclose(corners, expected, atol=1e-6)
+    assert read.volume == pytest.approx(1)
+
+
+def test_a_glb_is_upright_with_linear_colours_and_no_light():
+    data = encode_mesh(TETRAHEDRON, "glb", UP)
+    read = read_mesh(data, "glb")
+    assert read.vertices[:, 1].max() == pytest.approx(2)  # the corner at y = -2, which is up
+    (stored,) = trimesh.load_scene(io.BytesIO(data), file_type="glb", process=False).geometry.values()
+    colors = stored.visual.vertex_attributes["color"]
+    np.testing.assert_array_equal(colors[:, :3], [[255, 0, 0], [0, 255, 0], [0, 0, 255], [128] * 3])  # 188 is half
+    assert b"KHR_materials_unlit" in data
+
+
+@pytest.mark.parametrize("extension", ["ply", "obj"])
+def test_ply_and_obj_have_srgb_colours(extension):
+    read = read_mesh(encode_mesh(TETRAHEDRON, extension, UP), extension)
+    np.testing.assert_array_equal(read.visual.vertex_colors[:, :3], TETRAHEDRON.colors)
+
+
+@pytest.mark.parametrize("extension", ["glb", "ply", "obj"])
+def test_a_mesh_far_from_the_origin_keeps_its_shape(extension):
+    shift = np.array([4e6, -3e6, 50.0])
+    far = Mesh(TETRAHEDRON.vertices + shift, *list(vars(TETRAHEDRON).values())[1:])
+    read = read_mesh(encode_mesh(far, extension, UP), extension)
+    edges = np.linalg.norm(read.vertices - read.vertices[0], axis=1)
+    np.testing.assert_allclose(edges, [0, 1, 2, 3], atol=0.02 if extension == "obj" else 1e-4)
+
+
+def test_export_writes_the_surface_of_a_model(tmp_path):
+    report = hyrfpack.export_model(DEMO_MODEL_FILE, tmp_path / "demo.mesh.ply")
+    mesh = trimesh.load(report.file, process=False)
+    assert (len(mesh.vertices), len(mesh.faces)) == (report.vertices, report.faces)
+    assert report.faces > 2000 and report.gaussians == 0 and report.voxel > 0
+    # The scene stands on the ground z = 0 and no object is higher than 1.34; the sky is not a surface.
+    assert -0.3 < np.quantile(mesh.vertices[:, 2], 0.1) < 0.2 and mesh.vertices[:, 2].max() < 1.6
+    again = hyrfpack.export_model(DEMO_MODEL_FILE, tmp_path / "again.mesh.ply")
+    assert (tmp_path / "again.mesh.ply").read_bytes() == (tmp_path / "demo.mesh.ply").read_bytes()
+    assert again.bytes == report.bytes
+
+
+def test_crop_voxel_and_faces_are_obeyed(tmp_path):
+    crop = (-1.5, -1.0, -0.2, 0.0, 0.5, 1.2)
+    config = hyrfpack.ExportConfig(crop=crop, voxel=0.04, faces=1500)
+    report = hyrfpack.export_model(DEMO_MODEL_FILE, tmp_path / "part.mesh.obj", config)
+    mesh = trimesh.load(report.file, process=False)
+    assert report.voxel == 0.04 and 1000 < len(mesh.faces) == report.faces <= 1500
+    assert (mesh.vertices >= np.array(crop[:3]) - 0.04).all() and (mesh.vertices <= np.array(crop[3:]) + 0.04).all()
+
+
+def test_faint_gaussians_can_be_left_out(tmp_path):
+    with pytest.raises(HyrfError, match="no Gaussian is left"):
+        hyrfpack.export_model(DEMO_MODEL_FILE, tmp_path / "x.stl", hyrfpack.ExportConfig(min_opacity=1.0))
+
+
+def test_a_model_that_shows_no_surface_is_refused(tmp_path):
+    cameras = ring(4)
+    model = small_model(np.random.default_rng(0).uniform(-0.6, 0.6, (40, 3)), fields=2.0)
+    model.gaussians.opacity_logits.data[:] = -40
+    kept = {"cameras": provenance_cameras(cameras), "viewpoint": Viewpoint.from_cameras(cameras).to_json()}
+    save_model(model, tmp_path / "faint.hyrf", provenance=kept)
+    with pytest.raises(HyrfError, match="no camera sees a surface"):
+        hyrfpack.export_model(tmp_path / "faint.hyrf", tmp_path / "faint.mesh.ply")
+    assert not (tmp_path / "faint.mesh.ply").exists()
+
+
+@pytest.mark.parametrize("settings", [{"voxel": 0.1}, {"faces": 100}])
+def test_settings_of_meshes_are_refused_for_other_files(settings, tmp_path):
+    with pytest.raises(HyrfError, match=f"this is not a mesh.*`{next(iter(settings))}`"):
+        hyrfpack.export_model(DEMO_MODEL_FILE, tmp_path / "demo.ply", hyrfpack.ExportConfig(**settings))
+
+
+@pytest.mark.parametrize("settings", [{"voxel": 0.0}, {"voxel": -1.0}, {"faces": 0}])
+def test_settings_without_meaning_are_refused(settings):
+    with pytest.raises(ValueError, match=next(iter(settings))):
+        hyrfpack.ExportConfig(**settings)
+
+
+@pytest.mark.parametrize("module, faces", [("skimage", None), ("fast_simplification", 100)])
+def test_a_missing_package_is_named_with_its_extra(module, faces, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(HyrfError, match=r'pip install "hyrfpack\[mesh\]"'):
+        hyrfpack.export_model(DEMO_MODEL_FILE, tmp_path / "demo.stl", hyrfpack.ExportConfig(faces=faces))
