@@ -21,6 +21,7 @@ from hyrfpack.cli.common import (
 from hyrfpack.cli.types import BOX, OUTPUT, PATH, Numbers
 from hyrfpack.config.compress import PROFILES
 from hyrfpack.config.edit import (
+    DEFAULT_MIN_OPACITY_SHARE,
     Action,
     Background,
     Center,
@@ -31,8 +32,10 @@ from hyrfpack.config.edit import (
     MaxScale,
     MinOpacity,
     Remove,
+    RemoveFloaters,
     Scale,
     Translate,
+    Up,
 )
 
 if TYPE_CHECKING:
@@ -46,10 +49,12 @@ _ACTION_BY_OPTION: dict[str, Callable[[Any], Action]] = {
     "crop_cameras": CropCameras,
     "min_opacity": MinOpacity,
     "max_scale": MaxScale,
+    "remove_floaters": RemoveFloaters,
     "gaussians": KeepGaussians,
     "background_color": Background,
     "translate": Translate,
     "scale": Scale,
+    "up": Up,
     "center": lambda _: Center(),
 }
 
@@ -86,6 +91,14 @@ class _OrderedCommand(click.Command):
     "--max-scale", type=float, multiple=True, metavar="LENGTH", help="Remove Gaussians with a longer axis (std. dev.)."
 )
 @click.option(
+    "--remove-floaters",
+    type=float,
+    multiple=True,
+    metavar="SHARE",
+    help="Remove Gaussians in the air whose light the photos contradict, so that they would keep less than SHARE (0 to "
+    f"1) of their opacity; needs --data. Begin with {DEFAULT_MIN_OPACITY_SHARE}; more removes more.",
+)
+@click.option(
     "--gaussians",
     type=int,
     multiple=True,
@@ -101,8 +114,15 @@ class _OrderedCommand(click.Command):
 @click.option("--translate", type=Numbers(3, "X,Y,Z"), multiple=True, help="Move the scene.")
 @click.option("--scale", type=float, multiple=True, metavar="FACTOR", help="Scale the scene about the origin.")
 @click.option("--center", count=True, help="Move the point that the cameras look at to the origin.")
+@click.option(
+    "--up", type=Numbers(3, "X,Y,Z"), multiple=True, help="State which direction is up, for viewers and exports."
+)
 @click.option("--profile", type=click.Choice(PROFILES), help="Profile of the file to write.  [default: that of MODEL]")
-@click.option("--data", type=PATH, help="Photos and poses of MODEL, for scores on held-out photos before and after.")
+@click.option(
+    "--data",
+    type=PATH,
+    help="Photos and poses of MODEL, for --remove-floaters, and for scores on held-out photos before and after.",
+)
 @overwrite_option
 @scene_options
 @json_option
@@ -130,6 +150,7 @@ def edit(
       hyrfpack edit bonsai.hyrf --plan --crop-sphere 0,0,0,1.5
       hyrfpack edit bonsai.hyrf -o table.hyrf --center --crop-sphere 0,0,0,1.5 --background-color 1,1,1
       hyrfpack edit garden.hyrf -o clean.hyrf --min-opacity 0.02 --crop-cameras 0.5
+      hyrfpack edit runs/garden -o clean.hyrf --remove-floaters 0.35 --data photos/garden
       hyrfpack edit room.hyrf -o hole.hyrf --crop-box=-1,-1,-1,1,1,1 --invert
       hyrfpack edit survey.hyrf -o meters.hyrf --scale 2.54
     """

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from hyrfpack.checks import check_float, check_int
 
 Vector = tuple[float, float, float]
+DEFAULT_MIN_OPACITY_SHARE = 0.35
 MIN_MARGIN = -0.99  # a hull of no size would keep nothing
 
 
@@ -134,6 +135,26 @@ class MaxScale:
 
 
 @dataclass(frozen=True)
+class RemoveFloaters:
+    """Remove floaters: Gaussians in front of the surfaces whose light the photos contradict. This needs photos.
+
+    Attributes:
+        min_opacity_share: a Gaussian may be a floater if the photos leave it less than this share of its opacity, in
+            (0, 1). A higher one removes more.
+    """
+
+    min_opacity_share: float = DEFAULT_MIN_OPACITY_SHARE
+
+    def __post_init__(self) -> None:
+        check_float("min_opacity_share", self.min_opacity_share, 0, 1)
+        if self.min_opacity_share in (0, 1):
+            raise ValueError(f"min_opacity_share is {self.min_opacity_share:g}; it must lie between 0 and 1")
+
+    def __str__(self) -> str:
+        return f"remove floaters that keep less than {self.min_opacity_share:g} of their opacity"
+
+
+@dataclass(frozen=True)
 class KeepGaussians:
     """Keep a number of Gaussians: those whose removal would change renders at the training cameras most.
 
@@ -213,7 +234,38 @@ class Center:
         return "move the centre to the origin"
 
 
-Action = Crop | Remove | MinOpacity | MaxScale | KeepGaussians | Background | Translate | Scale | Center
+@dataclass(frozen=True)
+class Up:
+    """State which direction is up. Viewers turn about it, and exports to formats with an up axis are turned by it.
+
+    Attributes:
+        direction: the direction in the file's axes, of any length above 0.
+    """
+
+    direction: Vector
+
+    def __post_init__(self) -> None:
+        _check_vector("direction", self.direction)
+        if not any(self.direction):
+            raise ValueError("direction is (0, 0, 0); it must have a length")
+
+    def __str__(self) -> str:
+        return f"take {_format(self.direction)} as up"
+
+
+Action = (
+    Crop
+    | Remove
+    | MinOpacity
+    | MaxScale
+    | RemoveFloaters
+    | KeepGaussians
+    | Background
+    | Translate
+    | Scale
+    | Center
+    | Up
+)
 
 
 def _format(values: Sequence[float]) -> str:

@@ -16,7 +16,7 @@ from hyrfpack.cameras.capture import Capture
 from hyrfpack.checks import check_type
 from hyrfpack.compress import compress_model
 from hyrfpack.config.compress import CompressConfig
-from hyrfpack.config.edit import Action, Background, Center, Scale, Translate
+from hyrfpack.config.edit import Action, Background, Center, Scale, Translate, Up
 from hyrfpack.context import RunContext
 from hyrfpack.edit.select import keep_mask
 from hyrfpack.edit.state import EditState
@@ -108,7 +108,7 @@ def edit_model(
         actions: at least one of the actions of `hyrfpack.config.edit`, in order. Each sees the result of the one before
             it, so positions after a move are new ones.
         profile: profile of the file to write; None keeps that of `source`.
-        data: photos of the scene. Held-out ones are scored before and after.
+        data: photos of the scene. Held-out ones are scored before and after, others decide what a floater is.
         picture: a .png or .jpg file to write: the scene before and after, side by side.
         overwrite: replace existing files. If False, an existing file is an error.
         context: progress. Edits run on the CPU.
@@ -132,7 +132,7 @@ def edit_model(
         outputs.file(picture, *PICTURE_ENDINGS)
     compression = CompressConfig(profile=profile or describe_file(path)["profile"])
     with context.open_progress("edit") as progress:
-        edit = _apply(path, actions, part_of_progress(progress, 0, 0.3))
+        edit = _apply(path, actions, data, part_of_progress(progress, 0, 0.3))
         written = _write(
             edit,
             target,
@@ -184,7 +184,7 @@ def plan_edit(
     if picture is not None:
         Outputs(path, scene=data, overwrite=overwrite).file(picture, *PICTURE_ENDINGS)
     with context.open_progress("edit") as progress:
-        edit = _apply(path, actions, part_of_progress(progress, 0, 0.5))
+        edit = _apply(path, actions, data, part_of_progress(progress, 0, 0.5))
         report = _measure(edit, data, part_of_progress(progress, 0.5, 1))
         if picture is not None:
             _save_comparison(picture, edit, overwrite)
@@ -208,7 +208,7 @@ def _check_request(source: StrPath, actions: Sequence[Action], data: Scene | Non
     return find_model(source)
 
 
-def _apply(path: Path, actions: Sequence[Action], progress: Progress) -> _Edit:
+def _apply(path: Path, actions: Sequence[Action], data: Scene | None, progress: Progress) -> _Edit:
     """Apply the actions to a file, and return both scenes.
 
     Raises:
@@ -220,7 +220,8 @@ def _apply(path: Path, actions: Sequence[Action], progress: Progress) -> _Edit:
         raise HyrfError(f"{path}: there is no Gaussian in it, so there is nothing to edit", fix="train it again")
     capture = Capture(facts)
     viewpoint = capture.viewpoint
-    before = EditState(model, capture.cameras, viewpoint.center, viewpoint.up, Placement.identity(), progress)
+    photos = [] if data is None else list(data.train)
+    before = EditState(model, capture.cameras, viewpoint.center, viewpoint.up, photos, Placement.identity(), progress)
     after, reports = before, []
     for action in actions:
         count = len(after.model)
@@ -228,6 +229,10 @@ def _apply(path: Path, actions: Sequence[Action], progress: Progress) -> _Edit:
         reports.append(ActionReport(str(action), count, len(after.model)))
     if not after.placement.is_identity:
         provenance = after.placement.move_provenance(provenance)
+    if after.up is not before.up:
+        camera = after.placement.move_camera(viewpoint.camera)
+        turned = replace(viewpoint, center=after.center, up=after.up, camera=camera)
+        provenance = {**provenance, "viewpoint": turned.to_json()}
     return _Edit(path, facts["profile"], before, after, reports, provenance)
 
 
@@ -240,6 +245,8 @@ def _apply_action(action: Action, state: EditState) -> EditState:
         return state.move(action.factor, (0.0, 0.0, 0.0))
     if isinstance(action, Center):
         return state.move(1.0, -state.center)
+    if isinstance(action, Up):
+        return replace(state, up=np.array(action.direction) / np.linalg.norm(action.direction))
     keep = keep_mask(action, state)
     if not keep.any():
         positions = state.world_positions()
@@ -284,7 +291,7 @@ def _measure(edit: _Edit, data: Scene | None, progress: Progress) -> EditReport:
     )
     if data is None or not data.test:
         return report
-    moved = [replace(view, camera=edit.after.placement.move_camera(view.camera)) for view in data.test]
+    moved = [edit.after.placement.move_view(view) for view in data.test]
     before = evaluate_model(edit.before.model, data.test, progress=part_of_progress(progress, 0.3, 0.65))
     after = evaluate_model(edit.after.model, moved, progress=part_of_progress(progress, 0.65, 1))
     return replace(

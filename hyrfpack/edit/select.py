@@ -8,7 +8,17 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from hyrfpack.compress.sensitivity import measure_sensitivity
-from hyrfpack.config.edit import CropBox, CropCameras, CropSphere, KeepGaussians, MaxScale, MinOpacity, Remove
+from hyrfpack.config.edit import (
+    CropBox,
+    CropCameras,
+    CropSphere,
+    KeepGaussians,
+    MaxScale,
+    MinOpacity,
+    Remove,
+    RemoveFloaters,
+)
+from hyrfpack.edit.floaters import find_floaters
 from hyrfpack.edit.state import EditState
 from hyrfpack.errors import HyrfError
 
@@ -18,7 +28,7 @@ def keep_mask(action: object, state: EditState) -> np.ndarray:
     """Return a mask (N,) of the Gaussians that an action of selection keeps.
 
     Raises:
-        HyrfError: the cameras of the scene do not surround anything.
+        HyrfError: the cameras of the scene do not surround anything, or there are no photos to find floaters by.
     """
     raise TypeError(f"{action!r} selects no Gaussians")
 
@@ -68,6 +78,16 @@ def _(action: MinOpacity, state: EditState) -> np.ndarray:
 def _(action: MaxScale, state: EditState) -> np.ndarray:
     longest = state.model.decode_geometry().scales.amax(dim=1).numpy()
     return longest * state.model.config.frame.scale <= action.scale
+
+
+@keep_mask.register
+def _(action: RemoveFloaters, state: EditState) -> np.ndarray:
+    if not state.photos:
+        raise HyrfError(
+            "floaters are found by comparing the model with its photos, and there are none",
+            fix="name the folder of the photos and poses with --data (in Python: data=hyrfpack.load_scene(...))",
+        )
+    return ~find_floaters(state.model, state.photos, action.min_opacity_share, state.progress)
 
 
 @keep_mask.register

@@ -10,7 +10,7 @@ import numpy as np
 from hyrfpack.edit.transform import Placement
 from hyrfpack.model import HybridModel
 from hyrfpack.progress import Progress, ignore_progress
-from hyrfpack.scene import Camera
+from hyrfpack.scene import Camera, View
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,6 +22,7 @@ class EditState:
         cameras: the training cameras, in the model's world coordinates.
         center: (3,) the point that the cameras look at, likewise.
         up: (3,) the up direction.
+        photos: the training photos, likewise; empty if they are not given.
         placement: the map from the world coordinates of the file that is edited.
         progress: called with `TaskEvent`s.
     """
@@ -30,6 +31,7 @@ class EditState:
     cameras: list[Camera]
     center: np.ndarray
     up: np.ndarray
+    photos: list[View]
     placement: Placement
     progress: Progress = ignore_progress
 
@@ -41,6 +43,7 @@ class EditState:
             model=step.move_model(self.model),
             cameras=[step.move_camera(camera) for camera in self.cameras],
             center=step.move_point(self.center),
+            photos=[step.move_view(view) for view in self.photos],
             placement=self.placement.then(factor, offset),
         )
 

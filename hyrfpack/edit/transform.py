@@ -13,7 +13,7 @@ from hyrfpack.cameras.files import camera_from_numbers, camera_to_numbers
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.model import HybridModel
 from hyrfpack.model.frame import Frame
-from hyrfpack.scene import Camera
+from hyrfpack.scene import Camera, View
 
 CAMERA_KEYS = ("cameras", "coarse_cameras")
 
@@ -51,6 +51,10 @@ class Placement:
         pose = camera.camera_from_world.copy()
         pose[:3, 3] = self.factor * pose[:3, 3] - pose[:3, :3] @ self.offset
         return replace(camera, camera_from_world=pose)
+
+    def move_view(self, view: View) -> View:
+        """Return the view of the moved scene that shows the same photo."""
+        return replace(view, camera=self.move_camera(view.camera))
 
     def move_model(self, model: HybridModel) -> HybridModel:
         """Return the moved model, which shares all parameters with `model`: only its frame differs."""

@@ -26,6 +26,7 @@ from hyrfpack.config.edit import (
     Remove,
     Scale,
     Translate,
+    Up,
 )
 from hyrfpack.edit import edit_model, plan_edit
 from hyrfpack.edit.transform import Placement
@@ -193,6 +194,16 @@ def test_a_plan_writes_no_model(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_the_up_direction_is_stored_for_viewers_and_exports(tmp_path):
+    turned = edited(COMPACT_FILE, tmp_path, Translate((3.0, 0.0, 0.0)), Up((0.0, 3.0, 4.0)))
+    before, after = (Capture(describe_file(path)).viewpoint for path in (COMPACT_FILE, turned))
+    assert_allclose(after.up, (0, 0.6, 0.8))
+    assert_allclose(after.center, before.center + (3, 0, 0))
+    assert_allclose(after.camera.position, before.camera.position + (3, 0, 0))
+    with Container.open(COMPACT_FILE) as old, Container.open(turned) as new:
+        assert all(bytes(old[name].data) == bytes(new[name].data) for name in old.entries if name != "META")
+
+
 def test_an_edit_that_leaves_nothing_is_refused_and_writes_nothing(tmp_path):
     sentence = refused("edit", COMPACT_FILE, "-o", tmp_path / "out.hyrf", "--crop-box", "90,90,90,91,91,91")
     assert "would leave no Gaussian; their centres lie between" in sentence
@@ -207,6 +218,7 @@ def test_an_edit_that_leaves_nothing_is_refused_and_writes_nothing(tmp_path):
         (["--plan", "--min-opacity", "0.1", "--invert"], "--invert must follow"),
         (["--plan", "--min-opacity", "2"], "--min-opacity: opacity is 2.0"),
         (["--plan", "--scale", "0"], "--scale: factor is 0"),
+        (["--plan", "--up", "0,0,0"], "--up: direction is (0, 0, 0)"),
         (["--plan", "--crop-sphere", "0,0,0"], "is not 4 numbers"),
         (["--plan", "--translate", "nan,0,0"], "is not 3 numbers"),
         (["--plan", "--crop-cameras", "-1"], "--crop-cameras: margin is -1.0"),

@@ -1,0 +1,124 @@
+"""Floaters: Gaussians that hang in front of the surfaces, and whose light the photos contradict.
+
+A model alone does not say whether something in the air was there. So all opacities are first adjusted to the photos,
+and nothing else. This is a small problem with a clear answer, because a pixel's colour is linear in each opacity: what
+the photos contradict fades. Of the Gaussians that fade, those are floaters that lie in front of the depth that the
+others show. The rest are needless parts of surfaces, which an edit should not touch.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hyrfpack.data.reduced import reduce_view
+from hyrfpack.device import upload
+from hyrfpack.model import HybridModel
+from hyrfpack.progress import Progress, TaskEvent, ignore_progress
+from hyrfpack.render import RenderSettings, render_view
+from hyrfpack.scene import Camera, View, evenly_spaced
+from hyrfpack.train.resolution import reduced_low_pass_variance
+
+MAX_PHOTOS = 128
+MAX_SIDE_PIXELS = 640  # of the reduced photos
+MIN_PASSES, MIN_STEPS = 8, 300  # passes over the photos; steps of one photo each
+LEARNING_RATE = 0.1  # of the opacity logits
+ADAM_BETAS = (0.9, 0.99)
+# A floater is nearer than the surface behind it by this fraction of the surface's depth, in this share of its views.
+MIN_GAP = 0.12
+MIN_VIEW_SHARE_IN_FRONT = 0.3
+MIN_SURFACE_ALPHA = 0.5  # pixels with less coverage show no surface: what is there lies in front of it
+_ADJUSTING_SHARE = 0.9  # of the time
+
+
+def find_floaters(
+    model: HybridModel, views: Sequence[View], min_opacity_share: float, progress: Progress = ignore_progress
+) -> np.ndarray:
+    """Return a mask (N,) of the floaters of a model.
+
+    Args:
+        model: the model. It stays as it is.
+        views: photos of the scene, at least one.
+        min_opacity_share: a Gaussian may be a floater if the photos leave it less than this share of its opacity, in
+            (0, 1).
+        progress: called with `TaskEvent`s.
+
+    Raises:
+        HyrfError: a photo cannot be read, or a number of the model is NaN or infinite.
+    """
+    longest = max(max(view.camera.width, view.camera.height) for view in views)
+    factor = math.ceil(longest / MAX_SIDE_PIXELS)
+    settings = RenderSettings(low_pass_variance=reduced_low_pass_variance(factor))
+    reduced = [reduce_view(view, factor) for view in evenly_spaced(views, MAX_PHOTOS)]
+    before = model.decode_geometry().opacities.detach().numpy()
+    after = _adjusted_opacities(model, reduced, settings, progress)
+    faded = after < min_opacity_share * before
+    if not faded.any():
+        return faded
+    progress(TaskEvent("comparing depths", _ADJUSTING_SHARE))
+    others = model.subset(torch.from_numpy(np.flatnonzero(~faded))).requires_grad_(False)
+    positions = model.config.frame.to_world(model.gaussians.positions.detach().numpy()[faded])
+    cameras = [view.camera for view in reduced]
+    faded[faded] = _share_in_front(positions, others, cameras, settings) > MIN_VIEW_SHARE_IN_FRONT
+    return faded
+
+
+def _adjusted_opacities(
+    model: HybridModel, views: Sequence[View], settings: RenderSettings, progress: Progress
+) -> np.ndarray:
+    """Return opacities (N,) that minimise the squared error of the photos, with all else as it is."""
+    adjusted = copy.deepcopy(model).requires_grad_(False)
+    logits = adjusted.gaussians.opacity_logits.requires_grad_(True)
+    optimizer = torch.optim.Adam([logits], lr=LEARNING_RATE, betas=ADAM_BETAS)
+    solid = np.array(model.config.solid, np.float32)
+    order = np.random.default_rng(0)
+    passes = max(MIN_PASSES, math.ceil(MIN_STEPS / len(views)))
+    steps = passes * len(views)
+    for step, view in enumerate(views[i] for _ in range(passes) for i in order.permutation(len(views))):
+        progress(TaskEvent("comparing with photos", _ADJUSTING_SHARE * step / steps))
+        photo, mask = upload(view.load(), solid, logits.device)
+        rgb = render_view(adjusted, view.camera, settings).rgb
+        if not rgb.requires_grad:  # no Gaussian is in view
+            continue
+        optimizer.zero_grad()
+        _squared_error(rgb, photo, mask).backward()
+        optimizer.step()
+    return adjusted.requires_grad_(False).decode_geometry().opacities.numpy()
+
+
+def _squared_error(rgb: Tensor, photo: Tensor, mask: Tensor | None) -> Tensor:
+    errors = (rgb - photo).square()
+    return errors.mean() if mask is None else (errors * mask[..., None]).mean()
+
+
+def _share_in_front(
+    positions: np.ndarray, others: HybridModel, cameras: Sequence[Camera], settings: RenderSettings
+) -> np.ndarray:
+    """Return the share (n,) of views in which points lie clearly in front of the surface that other Gaussians show.
+
+    Views in which a point is hidden or outside of the picture do not count; without any view the share is 0.
+
+    Args:
+        positions: (n, 3) world positions.
+        others: the Gaussians that show the surface.
+        cameras: cameras of the views.
+        settings: settings of the renders.
+    """
+    in_front, seen = np.zeros(len(positions)), np.zeros(len(positions))
+    for camera in cameras:
+        with torch.no_grad():
+            rendering = render_view(others, camera, replace(settings, transmittance_min=0), depth=True)
+        assert rendering.depth is not None
+        surface = torch.where(rendering.alpha < MIN_SURFACE_ALPHA, torch.inf, rendering.depth).numpy()
+        x, y, z = camera.project(positions)
+        inside = np.flatnonzero((z > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height))
+        depths, behind = z[inside], surface[y[inside].astype(np.int64), x[inside].astype(np.int64)]
+        in_front[inside] += depths < (1 - MIN_GAP) * behind
+        seen[inside] += depths < (1 + MIN_GAP) * behind
+    return in_front / np.maximum(seen, 1)
