@@ -11,7 +11,6 @@ import { RowStates } from "../hyrf/row_states.js";
 const MAX_CELLS = 32; // a cell is 8 hidden units; the shaders hold all cells in variables
 const WEIGHTS_TEXTURE_WIDTH = 1024; // of the texture for a decoder's numbers if no uniform block is used
 const WEIGHTS_TEXTURE_UNIT = 6;
-const TABLE_NUMBERS_PER_UPLOAD = 1 << 21;
 const MAX_FRESH_TURN_RADIANS = 2e-3; // a larger turn of its viewing direction makes a row's colours stale
 const MOVING_ROWS_DIVISOR = 8; // while moving, a frame colours at most this part of the visible rows
 
@@ -48,17 +47,19 @@ export class Fields {
     this.colors = graphics.texture(gl.TEXTURE_2D, gl.RG32UI, ...size);
     this.cached = graphics.texture(gl.TEXTURE_2D_ARRAY, gl.RGBA32UI, ...size, this.cells);
     const floats = [gl.RGBA32F, gl.RGBA, gl.FLOAT, 4];
-    const explicit = graphics.table(floats, TEXTURE_WIDTH, model.explicit);
-    this.logits = graphics.table(floats, TEXTURE_WIDTH, model.logits);
+    await graphics.whenDone();
+    const shaders = this.shaders(), programs = {}, vertexText = readText("whole.vert");
+    for (const name of Object.keys(shaders)) programs[name] = graphics.compile(vertexText, shaders[name]);
+    for (const name of ["enlarge", "needed"]) programs[name] = graphics.program("whole.vert", `${name}.frag`);
+    this.programs = programs;
+
+    const explicit = await graphics.table(floats, TEXTURE_WIDTH, model.explicit);
+    this.logits = await graphics.table(floats, TEXTURE_WIDTH, model.logits);
     model.explicit = model.logits = null; // frees memory; the worker can decode them again
     const geometry = await this.field(model.geometry), radiance = await this.field(model.radiance);
+    await graphics.whenDone();
     this.checkMemory();
-
-    const shaders = this.shaders(), programs = {};
-    const vertexText = readText("whole.vert");
-    for (const name of Object.keys(shaders)) programs[name] = graphics.compile(vertexText, shaders[name]);
-    for (const name of Object.keys(shaders)) await graphics.compiled(programs[name], `${name}.frag`);
-    this.programs = programs;
+    await graphics.compiled(programs);
 
     await this.shape(geometry, explicit, (part) => report(0.5 * part));
     graphics.free(explicit);
@@ -70,8 +71,8 @@ export class Fields {
     this.radiance = radiance;
     if (model.background) {
       this.panorama = new Panorama(graphics, model, (...area) => this.drawPanorama(...area));
-      await this.panorama.begin(eye);
-      this.sky = new Sky(graphics, (...area) => this.drawSky(...area));
+      await this.panorama.begin(eye, programs.enlarge);
+      this.sky = new Sky(graphics, programs.needed, (...area) => this.drawSky(...area));
     } else {
       radiance.freeTable();
     }
@@ -86,21 +87,12 @@ export class Fields {
 
   // Uploads a field's table and decoder.
   async field({ table, levels, decoder: { numbers, places } }) {
-    const { gl, graphics } = this, wide = 2 * TEXTURE_WIDTH, rows = Math.ceil(table.length / wide);
-    const texture = graphics.texture(gl.TEXTURE_2D, gl.RG32F, TEXTURE_WIDTH, rows);
-    for (let at = 0; at < table.length;) {
-      const rest = table.length - at, high = Math.floor(Math.min(rest, TABLE_NUMBERS_PER_UPLOAD) / wide);
-      const size = high ? [TEXTURE_WIDTH, high] : [rest / 2, 1]; // the last row may be short
-      gl.bindTexture(gl.TEXTURE_2D, texture);
-      const part = table.subarray(at, at + 2 * size[0] * size[1]);
-      gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, at / wide, ...size, gl.RG, gl.FLOAT, part);
-      at += part.length;
-      if (at < table.length) await graphics.whenDone();
-    }
+    const { gl, graphics } = this;
+    const texture = await graphics.table([gl.RG32F, gl.RG, gl.FLOAT, 2], TEXTURE_WIDTH, table);
     const block = this.fitsBlock(numbers), floats = [gl.RGBA32F, gl.RGBA, gl.FLOAT, 4];
     const weights = block
       ? graphics.track(gl.createBuffer(), "Buffer")
-      : graphics.table(floats, WEIGHTS_TEXTURE_WIDTH, numbers);
+      : await graphics.table(floats, WEIGHTS_TEXTURE_WIDTH, numbers);
     if (block) {
       gl.bindBuffer(gl.UNIFORM_BUFFER, weights);
       gl.bufferData(gl.UNIFORM_BUFFER, numbers, gl.STATIC_DRAW);

@@ -3,6 +3,7 @@
 import { readText } from "./texts.js";
 
 const POLL_INTERVAL_MS = 4;
+const NUMBERS_PER_UPLOAD = 1 << 19; // more would keep the page's thread for too long
 
 // The graphics context was lost during an operation. The canvas fires an event when it is restored.
 export class ContextLostError extends Error {}
@@ -63,13 +64,21 @@ export class Graphics {
   }
 
   // Creates a texture from an array of numbers, row by row; the last row may be short. The first argument has the
-  // internal format, the format, the type, and the number of components per texel.
-  table([internal, format, type, size], width, numbers) {
-    const { gl } = this, texels = numbers.length / size, rows = Math.floor(texels / width);
+  // internal format, the format, the type, and the number of components per texel. Large arrays are uploaded in pieces.
+  async table([internal, format, type, size], width, numbers) {
+    const { gl } = this, texels = numbers.length / size, whole = Math.floor(texels / width);
     const texture = this.texture(gl.TEXTURE_2D, internal, width, Math.max(1, Math.ceil(texels / width)));
-    if (rows) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, width, rows, format, type, numbers);
-    const rest = texels - rows * width;
-    if (rest) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, rows, rest, 1, format, type, numbers.subarray(rows * width * size));
+    const upload = (row, wide, high) => {
+      gl.bindTexture(gl.TEXTURE_2D, texture);
+      const part = numbers.subarray(row * width * size, (row * width + wide * high) * size);
+      gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, row, wide, high, format, type, part);
+    };
+    const step = Math.max(1, Math.floor(NUMBERS_PER_UPLOAD / (width * size)));
+    for (let row = 0; row < whole; row += step) {
+      upload(row, width, Math.min(step, whole - row));
+      if (row + step < whole) await this.whenDone();
+    }
+    if (texels > whole * width) upload(whole, texels - whole * width, 1);
     return texture;
   }
 
@@ -98,7 +107,7 @@ export class Graphics {
     gl.activeTexture(gl.TEXTURE7); // no program reads this unit, so that later bindings change no texture in use
   }
 
-  // Starts to compile a program from two texts. `link` or `compiled` finishes it.
+  // Starts to compile a program from two texts. `compiled` finishes it.
   compile(vertex, fragment) {
     const { gl } = this, program = this.track(gl.createProgram(), "Program");
     for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
@@ -126,18 +135,20 @@ export class Graphics {
     return found;
   }
 
-  // Compiles a program of two shader files.
+  // Starts to compile a program of two shader files.
   program(vertex, fragment) {
-    return this.link(this.compile(readText(vertex), readText(fragment)), `${vertex} and ${fragment}`);
+    return this.compile(readText(vertex), readText(fragment));
   }
 
-  // Finishes a program like `link`, without blocking the page if the driver compiles in parallel.
-  async compiled(found, what) {
+  // Finishes programs, {name: program}, like `link`. The page is not blocked if the driver compiles in parallel.
+  async compiled(programs) {
     const { gl } = this, parallel = gl.getExtension("KHR_parallel_shader_compile");
-    const pending = () => parallel && !gl.getProgramParameter(found.program, parallel.COMPLETION_STATUS_KHR);
-    while (!this.lost && pending()) await waitForPoll();
-    if (this.lost) throw new ContextLostError();
-    return this.link(found, what);
+    for (const found of Object.values(programs)) {
+      const pending = () => parallel && !gl.getProgramParameter(found.program, parallel.COMPLETION_STATUS_KHR);
+      while (!this.lost && pending()) await waitForPoll();
+    }
+    await this.whenDone(); // later calls ask the device, which would block the page while it works
+    for (const [name, found] of Object.entries(programs)) this.link(found, name);
   }
 
   // Waits until the device has finished all work so far.
@@ -156,9 +167,10 @@ export class Graphics {
 
 const waitForPoll = () => new Promise((resolve) => setTimeout(resolve, POLL_INTERVAL_MS));
 
-// Divides work into slices of about SLICE_MS of device time, so that the device can draw frames between them.
+// Divides work into slices of about SLICE_MS of device time, so that the device can draw frames between them, and that
+// the page never waits long for it.
 export class WorkPacer {
-  static SLICE_MS = 100;
+  static SLICE_MS = 30;
 
   constructor() {
     this.unit = null; // recent ms per unit of the work; null before the first slice

@@ -9,7 +9,7 @@ uniform vec2 u_size; // of the target
 
 out vec4 o_needed;
 
-const float THRESHOLD = 1.0 / 1024.0; // of the light that passes: less changes no picture of 8 bits
+const float THRESHOLD = 1.0 / 512.0; // of the light that passes, as in hyrfpack render
 
 void main() {
     vec2 texel = clamp(gl_FragCoord.xy / u_size * u_used, vec2(0.5), u_used - 0.5);

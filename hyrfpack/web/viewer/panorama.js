@@ -11,8 +11,8 @@ import { BACKGROUND_RADIUS } from "./constants.js";
 const COARSE_HEIGHT_TEXELS = 64;
 const MIN_HEIGHT_TEXELS = 256;
 const MAX_HEIGHT_TEXELS = 1024;
-const TILE_SIZE_TEXELS = [64, 32];
-const MAX_EAGER_TILE_MS = 5; // devices that draw a tile in this time draw tiles out of view, too
+const TILE_SIZE_TEXELS = [32, 32];
+const MAX_EAGER_TILE_MS = 2.5; // devices that draw a tile in this time draw tiles out of view, too
 const MAX_FRESH_TURN_RADIANS = 1e-2; // a larger turn of the rays to a tile makes its colours stale
 
 export class Panorama {
@@ -39,21 +39,20 @@ export class Panorama {
     return texture;
   }
 
-  // Draws the coarse picture, as an eye sees it, and enlarges it.
-  async begin(eye) {
+  // Draws the coarse picture, as an eye sees it, and enlarges it by a program.
+  async begin(eye, enlarge) {
     const { graphics, height } = this, { gl } = graphics, size = [2 * COARSE_HEIGHT_TEXELS, COARSE_HEIGHT_TEXELS];
     const small = this.picture(COARSE_HEIGHT_TEXELS), coarse = graphics.framebuffer(small);
     const work = (first, last) => this.paint(coarse, size, [0, first, size[0], last - first], eye);
     await new WorkPacer().run(graphics, COARSE_HEIGHT_TEXELS, work);
     this.texture = this.picture(height);
     this.target = graphics.framebuffer(this.texture);
-    const enlarge = graphics.program("whole.vert", "enlarge.frag");
     gl.viewport(0, 0, ...this.size);
     gl.useProgram(enlarge.program);
     graphics.bind(enlarge, { u_picture: small });
     gl.uniform2f(enlarge.u_size, ...this.size);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
-    for (const object of [enlarge.program, coarse, small]) graphics.free(object);
+    for (const object of [coarse, small]) graphics.free(object);
     this.tiles = this.cut();
   }
 

@@ -22,6 +22,7 @@ import { Splats } from "./splats.js";
 
 const SETTLE_MS = 200; // the wait after a movement before the picture is drawn at full resolution
 const TARGET_FRAME_MS = 33; // slower frames lower the resolution while moving
+const QUICK_FRAME_MS = 20; // frames that take less are shown at once
 const MIN_SCALE = 0.2;
 const MAX_PIXEL_RATIO = 2; // device pixels per CSS pixel
 const FIRST_STEP_SECONDS = 1 / 60; // for the first frame of a movement, which has no earlier one to measure from
@@ -64,7 +65,9 @@ export class Player extends EventTarget {
     this.drawnMoves = 0; // `moves` at the last frame
     this.loaded = false;
     this.whole = false; // whether all layers of the file are loaded
-    this.stale = true; // whether the canvas must be redrawn
+    this.stale = true; // whether the picture must be drawn again
+    this.blank = true; // whether the canvas shows nothing
+    this.quick = false; // whether the last frame took the device hardly any time
     this.unsorted = true; // whether the splats must be sorted for the view
     this.idle = false; // whether the picture is complete
     this.onIdle = []; // functions that resolve the promises of `settled`
@@ -178,6 +181,7 @@ export class Player extends EventTarget {
     let content = null, staged = null;
     try {
       await this.waitFor(loader);
+      await this.renderer.prepare();
       await loader.picture?.decode();
       gl.getError(); // clears earlier errors
       if (model) {
@@ -190,10 +194,11 @@ export class Player extends EventTarget {
         await content.coloured(view, scene.tolerance, { goOn: () => this.wanted(loader) });
       } else {
         content = new Splats(gl, splats);
+        await content.prepare();
       }
-      await this.waitFor(loader);
-      if (content.graphics.lost) throw new ContextLostError();
       staged = this.renderer.stage(content, scene, picture ?? loader.picture);
+      await content.graphics.whenDone(); // otherwise asking for errors would block the page
+      await this.waitFor(loader);
       const error = gl.getError();
       if (content.graphics.lost) throw new ContextLostError();
       if (error !== gl.NO_ERROR && model) throw new UnsupportedDeviceError(MEMORY_REASON);
@@ -327,6 +332,7 @@ export class Player extends EventTarget {
     const [width, height] = [clientWidth, clientHeight].map((side) => Math.max(1, Math.round(side * dense)));
     if (this.canvas.width === width && this.canvas.height === height) return;
     [this.canvas.width, this.canvas.height] = [width, height];
+    this.blank = true;
     this.moves++;
     this.idle = false;
     this.stale = this.unsorted = true;
@@ -365,11 +371,26 @@ export class Player extends EventTarget {
     requestAnimationFrame((now) => this.frame(now));
   }
 
-  // Moves the eye, and draws a frame if the picture has changed.
+  // Shows the last frame if it is complete, and then advances. The work of the next frame waits until the browser has
+  // shown this one, because it would wait for that work.
   frame(now) {
+    if (this.loaded && !this.paused && this.renderer.busy()) requestAnimationFrame((later) => this.frame(later));
+    else if (this.present()) setTimeout(() => this.advance(now));
+    else this.advance(now);
+  }
+
+  // Copies the last frame to the canvas. Returns whether there was one.
+  present() {
+    if (!this.loaded || !this.renderer.present()) return false;
+    this.blank = false;
+    if (this.renderer.drawn) this.times.first ??= performance.now();
+    return true;
+  }
+
+  // Moves the eye, and draws a frame if the picture has changed.
+  advance(now) {
     this.scheduled = false;
     if (!this.loaded || this.paused) return;
-    if (this.renderer.busy()) return this.schedule();
     this.resize();
     if (this.began !== null) this.measure(now - this.began);
     this.began = null;
@@ -383,7 +404,7 @@ export class Player extends EventTarget {
       const frameMs = Math.max(TARGET_FRAME_MS, this.took ?? 0);
       if (moving) content.recolor(view, this.scene.tolerance, COLORING_RATIO * frameMs);
       this.renderer.draw(view, scale, this.gains(view));
-      if (this.renderer.drawn) this.times.first ??= performance.now();
+      if (this.quick || (this.blank && this.times.first !== null)) this.present();
       this.frames++;
       this.began = now;
       this.stale = false;
@@ -398,6 +419,7 @@ export class Player extends EventTarget {
 
   // Adapts the resolution to the time that a frame took, in ms, including the wait for the screen.
   measure(took) {
+    this.quick = took < QUICK_FRAME_MS;
     this.took = 0.8 * (this.took ?? took) + 0.2 * took;
     if (!this.moving) return;
     this.emit("frame", this.took);
@@ -499,6 +521,7 @@ export class Player extends EventTarget {
   capture(type = "image/png", quality = undefined) {
     const view = this.view();
     this.renderer.draw(view, this.resolution, this.gains(view));
+    this.present();
     return new Promise((resolve) => this.canvas.toBlob(resolve, type, quality));
   }
 

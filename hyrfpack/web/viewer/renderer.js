@@ -14,7 +14,6 @@ export class Renderer {
     const contextOptions = { alpha: false, antialias: false, depth: false, powerPreference: "high-performance" };
     const gl = canvas.getContext("webgl2", contextOptions);
     if (!gl) throw new Error("This page needs WebGL 2, which this browser lacks; enable it or use another browser.");
-    gl.getError(); // clears the error that a lost context has left
     this.gl = gl;
     this.graphics = new Graphics(gl);
     const side = gl.getParameter(gl.MAX_TEXTURE_SIZE), sides = gl.getParameter(gl.MAX_VIEWPORT_DIMS) ?? [0, 0];
@@ -25,6 +24,9 @@ export class Renderer {
     this.project = this.graphics.program("whole.vert", "project.frag");
     this.blend = this.graphics.program("blend.vert", "blend.frag");
     this.resolve = this.graphics.program("whole.vert", "resolve.frag");
+    this.ready = null; // a promise that resolves when the programs are compiled
+    this.frame = null; // the picture of the last frame, {texture, target, size}
+    this.finished = false; // whether `frame` must be copied to the canvas
 
     // Two triangles for each of the quads of one instance.
     const corner = (k) => 4 * Math.floor(k / 6) + [0, 1, 2, 2, 1, 3][k % 6];
@@ -39,7 +41,14 @@ export class Renderer {
     this.noLayers = { u_harmonics: this.graphics.texture(gl.TEXTURE_2D_ARRAY, gl.RGBA32UI, 1, 1, 1) };
     this.plain = this.graphics.texture(gl.TEXTURE_2D, gl.RGBA8, 1, 1);
     this.content = null;
+    this.fence = null; // is signalled when the last frame is drawn
     this.drawn = 0;
+  }
+
+  // Finishes the programs. Throws an Error if the driver refuses them.
+  prepare() {
+    const { project, blend, resolve } = this;
+    return (this.ready ??= this.graphics.compiled({ project, blend, resolve }));
   }
 
   // Creates all objects for drawing a content (`Splats` or `Fields`), which `show` uses. They are freed with the
@@ -83,11 +92,37 @@ export class Renderer {
     this.drawn = drawn;
   }
 
-  // Draws a view to the canvas, with splats at `scale` times its resolution. `gains` are those of exposure.js.
+  // Draws a frame of a view, with splats at `scale` times its resolution. `gains` are those of exposure.js. `present`
+  // shows it, once `busy` is false: the browser waits for the device to show a canvas, and would keep the page waiting.
   draw(view, scale, gains) {
-    const size = [view.width, view.height].map((side) => Math.max(1, Math.round(side * scale)));
+    const { gl } = this, size = [view.width, view.height].map((side) => Math.max(1, Math.round(side * scale)));
     this.splats({ ...resizeView(view, ...size), scale });
-    this.over(view, size, null, gains);
+    this.over(view, size, this.frameTarget(view.width, view.height), gains);
+    gl.deleteSync(this.fence);
+    this.fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
+    this.finished = true;
+  }
+
+  // Copies the last frame to the canvas. Returns whether there was one that the canvas did not show.
+  present() {
+    if (!this.finished) return false;
+    const { gl, frame: { target, size: [width, height] } } = this;
+    this.finished = false;
+    gl.bindFramebuffer(gl.READ_FRAMEBUFFER, target);
+    gl.bindFramebuffer(gl.DRAW_FRAMEBUFFER, null);
+    gl.blitFramebuffer(0, 0, width, height, 0, height, width, 0, gl.COLOR_BUFFER_BIT, gl.NEAREST); // row 0 is on top
+    return true;
+  }
+
+  // Returns a target of this size for frames.
+  frameTarget(width, height) {
+    const { gl, graphics, frame } = this;
+    if (frame?.size[0] === width && frame.size[1] === height) return frame.target;
+    for (const object of [frame?.target, frame?.texture]) graphics.free(object);
+    const texture = graphics.texture(gl.TEXTURE_2D, gl.RGBA8, width, height);
+    this.frame = { texture, target: graphics.framebuffer(texture), size: [width, height] };
+    return this.frame.target;
   }
 
   // Draws a view and returns its RGB bytes, top row first. Throws an Error with a message for the user on failure.
@@ -197,7 +232,7 @@ export class Renderer {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  // Composites the blended splats, which fill the size `used`, over the background. Draws to a target or the canvas.
+  // Composites the blended splats, which fill the size `used`, over the background, to a target.
   over(view, used, target, gains) {
     const { gl, graphics, resolve: r, scene, content } = this, picture = content.panorama?.texture ?? this.picture;
     const sky = content.sky?.of(view);
@@ -215,12 +250,7 @@ export class Renderer {
     gl.uniformMatrix3fv(r.u_world, false, view.rows.flat()); // rows read as columns: transposed
     gl.uniform4f(r.u_intrinsics, view.fx, view.fy, view.cx, view.cy);
     gl.uniform2f(r.u_size, view.width, view.height);
-    gl.uniform1i(r.u_upright, target === null ? 1 : 0);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
-    if (target === null && !this.fence) {
-      this.fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
-      gl.flush();
-    }
   }
 
   // Provides a target for the splats of at least this size.
@@ -243,7 +273,7 @@ export class Renderer {
   dispose() {
     this.content?.dispose();
     this.graphics.dispose();
-    this.gl.deleteSync(this.fence ?? null);
+    this.gl.deleteSync(this.fence);
     this.content = this.fence = null;
   }
 }

@@ -15,7 +15,6 @@ uniform vec3 u_gains; // of the exposure; 1 changes nothing
 uniform mat3 u_world; // world from camera
 uniform vec4 u_intrinsics; // fx, fy, cx, cy in pixels of the target
 uniform vec2 u_size; // of the target
-uniform bool u_upright; // row 0 of the target is at the bottom
 
 out vec4 o_color;
 
@@ -30,7 +29,7 @@ vec3 background(vec3 ray) {
 }
 
 void main() {
-    vec2 pixel = vec2(gl_FragCoord.x, u_upright ? u_size.y - gl_FragCoord.y : gl_FragCoord.y);
+    vec2 pixel = gl_FragCoord.xy; // row 0 is on top
     vec2 texel = clamp(pixel / u_size * u_used, vec2(0.5), u_used - 0.5);
     vec4 splats = texture(u_splats, texel / vec2(textureSize(u_splats, 0)));
     vec3 behind = u_solid;

@@ -2,17 +2,16 @@
 
 import { WorkPacer } from "./graphics.js";
 
-const TILE_SIDE_PIXELS = 64;
+const TILE_SIDE_PIXELS = 32;
 // Tiles take very different times. In steps of this share of all tiles, consecutive slices of the work do not.
 const TILE_STEP_RATIO = 0.618;
 
 export class Sky {
-  // `paint(framebuffer, part, view, needed)` draws a part (x, y, width, height) of the background of a view, at pixels
-  // where the texture `needed` is 1.
-  constructor(graphics, paint) {
-    Object.assign(this, { graphics, paint });
+  // `mask` is the program that marks the pixels that show the background. `paint(framebuffer, part, view, needed)`
+  // draws a part (x, y, width, height) of the background of a view, at pixels where the texture `needed` is 1.
+  constructor(graphics, mask, paint) {
+    Object.assign(this, { graphics, mask, paint });
     this.pace = new WorkPacer();
-    this.mask = graphics.program("whole.vert", "needed.frag");
     this.size = [0, 0];
     this.key = null; // describes the view
     this.tiles = []; // those that are missing
