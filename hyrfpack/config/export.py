@@ -52,8 +52,8 @@ class ExportConfig(ConvertConfig):
         exposure: exposure of baked splats: each as bright as in the photos that see it (local), or one exposure for all
             (consistent). A model without an exposure map gives the same splats with both.
         colmap: write a folder with a COLMAP model: cameras, and centres as points.
-        voxel: side of the voxels in which a mesh is fused, in world units. Default: the size of a photo's pixel on the
-            surface, and at least 1/512 of the mesh.
+        voxel: side of the voxels in which a mesh is fused, in world units. Default: 1.5 times the size of a photo's
+            pixel on the surface, and at least 1/512 of the mesh.
         faces: reduce a mesh to at most this number of triangles. Default: all.
     """
 

@@ -20,7 +20,7 @@ from hyrfpack.atomic import write_atomic
 from hyrfpack.cameras.paths import look_at
 from hyrfpack.errors import needs_package
 
-_NO_HIT_DISTANCE = np.float32(1e9)
+NO_HIT_DISTANCE = np.float32(1e9)
 _SUN_DIRECTION = np.array([0.45, -0.55, 0.70]) / np.linalg.norm([0.45, -0.55, 0.70])
 _SUN_COLOR = np.array([[1.0], [0.90], [0.74]], np.float32) * 2.1
 _SUN_HALF_WIDTH_RADIANS = 0.012  # each subsample of a pixel sees another corner of the sun, which softens shadows
@@ -35,7 +35,7 @@ Texture = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
-class _Solid:
+class Solid:
     """A sphere (`box` False, half-extents equal) or a box that is rotated by `yaw` about z."""
 
     center: tuple[float, float, float]
@@ -149,11 +149,11 @@ def _radiance(
     origins: np.ndarray, directions: np.ndarray, sun: np.ndarray, noise: np.ndarray, bounces: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the linear light (3, N) along each ray, and the distance (N,) to the surface that it comes from."""
-    distance, hit = _find_nearest_hit(origins, directions)
+    distance, hit = find_nearest_hit(origins, directions)
     color = np.empty_like(directions)
     sky = hit < 0
     color[:, sky] = _sky_color(directions[:, sky], noise)
-    for index in range(len(_SOLIDS) + 1):
+    for index in range(len(SOLIDS) + 1):
         rays = np.flatnonzero(hit == index)
         if rays.size:
             points = origins[:, rays] + directions[:, rays] * distance[rays]
@@ -170,12 +170,12 @@ def _shade(
     noise: np.ndarray,
     bounces: int,
 ) -> np.ndarray:
-    """Return the linear light (3, N) from points of one surface, whose index is that of `_find_nearest_hit`."""
-    if index == len(_SOLIDS):
+    """Return the linear light (3, N) from points of one surface, whose index is that of `find_nearest_hit`."""
+    if index == len(SOLIDS):
         normals = np.broadcast_to(np.array([[0], [0], [1]], np.float32), points.shape)
         albedo, reflectance, metal = _ground_albedo(points, distance, noise), 0.0, False
     else:
-        solid = _SOLIDS[index]
+        solid = SOLIDS[index]
         normals, coordinates = _normals_and_coordinates(solid, points)
         albedo, reflectance, metal = solid.texture(coordinates, noise), solid.reflectance, solid.metal
     lifted = points + normals * np.float32(2e-3)
@@ -212,15 +212,15 @@ def _sky_color(directions: np.ndarray, noise: np.ndarray) -> np.ndarray:
     return color + _SUN_COLOR * (0.12 * toward**12 + 0.35 * toward**120 + 6 * (toward > math.cos(0.035)))
 
 
-def _find_nearest_hit(origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def find_nearest_hit(origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the distance to the nearest surface and its index, which is the number of solids for the ground.
 
-    Rays that hit the sky have index -1 and the distance _NO_HIT_DISTANCE.
+    Rays that hit the sky have index -1 and the distance NO_HIT_DISTANCE.
     """
     down = directions[2] < -1e-6
-    distance = np.where(down, -origins[2] / np.where(down, directions[2], -1), _NO_HIT_DISTANCE)
-    hit = np.where(down, len(_SOLIDS), -1)
-    for index, solid in enumerate(_SOLIDS):
+    distance = np.where(down, -origins[2] / np.where(down, directions[2], -1), NO_HIT_DISTANCE)
+    hit = np.where(down, len(SOLIDS), -1)
+    for index, solid in enumerate(SOLIDS):
         near = _intersect(solid, origins, directions)
         closer = near < distance
         distance[closer], hit[closer] = near[closer], index
@@ -230,23 +230,23 @@ def _find_nearest_hit(origins: np.ndarray, directions: np.ndarray) -> tuple[np.n
 def _is_blocked(origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Return whether a solid lies on each ray."""
     blocked = np.zeros(origins.shape[1], bool)
-    for solid in _SOLIDS:
-        blocked |= _intersect(solid, origins, directions) < _NO_HIT_DISTANCE
+    for solid in SOLIDS:
+        blocked |= _intersect(solid, origins, directions) < NO_HIT_DISTANCE
     return blocked
 
 
-def _intersect(solid: _Solid, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Return the distance (N,) along unit rays to the front of a solid, _NO_HIT_DISTANCE where they miss it."""
+def _intersect(solid: Solid, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Return the distance (N,) along unit rays to the front of a solid, NO_HIT_DISTANCE where they miss it."""
     center = np.array(solid.center, np.float32)[:, None]
     start = origins - center
     middle = -_dot(start, directions)
     offset = _dot(start, start) - middle * middle  # squared distance of the ray from the centre
-    result = np.full(origins.shape[1], _NO_HIT_DISTANCE)
+    result = np.full(origins.shape[1], NO_HIT_DISTANCE)
     bound = solid.half[0] if not solid.box else math.hypot(*solid.half)
     near = np.flatnonzero((offset < bound * bound) & (middle > -bound))
     if not solid.box:
         entry = middle[near] - np.sqrt(bound * bound - offset[near])
-        result[near] = np.where(entry > 1e-4, entry, _NO_HIT_DISTANCE)
+        result[near] = np.where(entry > 1e-4, entry, NO_HIT_DISTANCE)
         return result
     start, along = solid.object_from_world @ start[:, near], solid.object_from_world @ directions[:, near]
     inverse = 1 / np.where(np.abs(along) < 1e-7, np.float32(1e-7), along)
@@ -254,11 +254,11 @@ def _intersect(solid: _Solid, origins: np.ndarray, directions: np.ndarray) -> np
     first, second = (-half - start) * inverse, (half - start) * inverse
     entry = np.minimum(first, second).max(axis=0)
     leave = np.maximum(first, second).min(axis=0)
-    result[near] = np.where((entry < leave) & (entry > 1e-4), entry, _NO_HIT_DISTANCE)
+    result[near] = np.where((entry < leave) & (entry > 1e-4), entry, NO_HIT_DISTANCE)
     return result
 
 
-def _normals_and_coordinates(solid: _Solid, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _normals_and_coordinates(solid: Solid, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return outward normals (3, N) in the world, and surface coordinates (2, N) in world units."""
     local = solid.object_from_world @ (points - np.array(solid.center, np.float32)[:, None])
     if not solid.box:
@@ -278,7 +278,7 @@ def _normals_and_coordinates(solid: _Solid, points: np.ndarray) -> tuple[np.ndar
 def _open_sky_share(points: np.ndarray, normals: np.ndarray, index: int) -> np.ndarray:
     """Return the share (N,) of the sky that the other solids leave open, each approximated by a sphere."""
     free = np.ones(points.shape[1], np.float32)
-    for other, solid in enumerate(_SOLIDS):
+    for other, solid in enumerate(SOLIDS):
         if other != index:
             toward = np.array(solid.center, np.float32)[:, None] - points
             squared = np.maximum(_dot(toward, toward), 1e-4)
@@ -364,14 +364,14 @@ def _stripes(coordinates: np.ndarray, noise: np.ndarray) -> np.ndarray:
     )
 
 
-_SOLIDS = (
-    _Solid((-0.72, -0.28, 0.5), (0.5, 0.5, 0.5), _uniform_color((0.50, 0.015, 0.02)), reflectance=0.07),
-    _Solid((0.42, -0.78, 0.36), (0.36, 0.36, 0.36), _uniform_color((0.95, 0.60, 0.18)), metal=True),
-    _Solid((0.48, 0.48, 0.45), (0.27, 0.27, 0.45), _wood, box=True, yaw=0.5),
-    _Solid((0.48, 0.48, 1.12), (0.22, 0.22, 0.22), _stripes, reflectance=0.05),
-    _Solid((-0.38, 0.82, 0.32), (0.32, 0.32, 0.32), _marble, reflectance=0.04),
-    _Solid((1.18, -0.12, 0.16), (0.22, 0.16, 0.16), _tiles, box=True, yaw=-0.4),
-    _Solid((-0.30, -1.20, 0.17), (0.17, 0.17, 0.17), _tiles, box=True, yaw=0.9),
+SOLIDS = (
+    Solid((-0.72, -0.28, 0.5), (0.5, 0.5, 0.5), _uniform_color((0.50, 0.015, 0.02)), reflectance=0.07),
+    Solid((0.42, -0.78, 0.36), (0.36, 0.36, 0.36), _uniform_color((0.95, 0.60, 0.18)), metal=True),
+    Solid((0.48, 0.48, 0.45), (0.27, 0.27, 0.45), _wood, box=True, yaw=0.5),
+    Solid((0.48, 0.48, 1.12), (0.22, 0.22, 0.22), _stripes, reflectance=0.05),
+    Solid((-0.38, 0.82, 0.32), (0.32, 0.32, 0.32), _marble, reflectance=0.04),
+    Solid((1.18, -0.12, 0.16), (0.22, 0.16, 0.16), _tiles, box=True, yaw=-0.4),
+    Solid((-0.30, -1.20, 0.17), (0.17, 0.17, 0.17), _tiles, box=True, yaw=0.9),
 )
 
 

@@ -14,6 +14,7 @@ MAX_POINTS_PER_MAP = 5000
 BOX_QUANTILES = 0.002, 0.998
 # If less than this share of what the cameras see lies nearer to the centre than the cameras do, they look outwards.
 MIN_INNER_SHARE = 0.25
+DEFAULT_VOXEL_PIXELS = 1.5
 MAX_VOXELS_PER_DEFAULT_SIDE = 512
 # Positions along an axis must fit into the keys by which vertices are welded.
 MAX_VOXELS_PER_SIDE = 8000
@@ -41,8 +42,8 @@ def choose_grid(
     """Choose the box and the voxels of a mesh.
 
     The default box holds what the cameras see nearer to the centre than the median camera is, or nearly all that they
-    see if they look outwards. The default voxel is the median size of a pixel on the surfaces in the box, and at least
-    1/MAX_VOXELS_PER_DEFAULT_SIDE of the box.
+    see if they look outwards. The default voxel is DEFAULT_VOXEL_PIXELS times the median size of a pixel on the
+    surfaces in the box, and at least 1/MAX_VOXELS_PER_DEFAULT_SIDE of the box.
 
     Args:
         maps: depth maps.
@@ -75,7 +76,10 @@ def choose_grid(
     # A crop may be far larger than what is seen in it.
     low, high = np.maximum(low, points[inside].min(axis=0)), np.minimum(high, points[inside].max(axis=0))
     if voxel is None:
-        voxel = max(float(np.median(sizes[inside])), float((high - low).max()) / MAX_VOXELS_PER_DEFAULT_SIDE)
+        voxel = max(
+            DEFAULT_VOXEL_PIXELS * float(np.median(sizes[inside])),
+            float((high - low).max()) / MAX_VOXELS_PER_DEFAULT_SIDE,
+        )
     margin = 0.0 if crop is not None else 2 * voxel
     low, high = low - margin, high + margin
     counts = np.ceil((high - low) / voxel).clip(min=1)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.ndimage import minimum_filter
+from scipy.ndimage import median_filter, minimum_filter
 
 from hyrfpack.cameras.view_sampling import shrink_camera
 from hyrfpack.model import HybridModel
@@ -19,7 +19,10 @@ MAX_MAP_SIDE_PIXELS = 800  # bounds memory: a map takes 8 bytes a pixel
 # Pixels are rejected where the surface is seen at a smaller cosine, or where depth bends by more than this number of
 # pixel sizes: there lies an edge, at which a depth belongs to the surface in front or to the one behind.
 MIN_COSINE = 0.15
-MAX_BEND_PIXELS = 6.0
+MAX_BEND_PIXELS = 3.0
+# A median depth jumps where neighbouring pixels cross 1/2 at different Gaussians. A median over this square of pixels
+# removes such jumps and keeps edges.
+MEDIAN_FILTER_PIXELS = 5
 # Space is empty along rays through pixels that Gaussians cover less than this, at least EMPTY_MARGIN_PIXELS from other
 # pixels. Nearer to a silhouette such rays would shrink round objects, whose true distance they pass is small.
 MAX_EMPTY_COVERAGE = 0.1
@@ -88,6 +91,8 @@ def make_depth_map(camera: Camera, depth: np.ndarray, alpha: np.ndarray, colors:
         alpha: (H, W) coverage by Gaussians.
         colors: (H, W, 3) uint8 sRGB.
     """
+    is_whole = minimum_filter(depth > 0, MEDIAN_FILTER_PIXELS, mode="nearest")
+    depth = np.where(is_whole, median_filter(depth, MEDIAN_FILTER_PIXELS, mode="nearest"), depth)
     cosine = _surface_cosines(camera, depth)
     trusted = (depth > 0) & (cosine >= MIN_COSINE)
     weight = np.round(255 * np.where(trusted, alpha * cosine, 0).clip(0, 1)).astype(np.uint8)

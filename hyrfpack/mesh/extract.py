@@ -71,7 +71,7 @@ def extract_mesh(
         cameras: cameras from which the surface is seen; MAX_MAPS evenly spaced ones of them are used.
         center: (3,) centre of interest, world units.
         crop: box (min x, y, z, max x, y, z) of the mesh in world units; None for what the cameras see near the centre.
-        voxel: side of a voxel in world units; None for the size of a pixel, see `choose_grid`.
+        voxel: side of a voxel in world units; None for the default of `choose_grid`.
         faces: largest number of triangles; None for all.
         exposure: exposure of the colours, as in `RenderSettings`.
         progress: called with `TaskEvent`s.

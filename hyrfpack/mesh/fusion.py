@@ -18,7 +18,7 @@ from hyrfpack.mesh.kernels import MapArrays, fuse_block
 from hyrfpack.parallel.pool import parallel_map
 
 BLOCK_VOXELS = 32
-MIN_TRUNCATION_VOXELS, MAX_TRUNCATION_VOXELS = 3.0, 8.0
+MIN_TRUNCATION_VOXELS, MAX_TRUNCATION_VOXELS = 5.0, 8.0
 TRUNCATION_PER_NOISE = 3.0
 NOISE_VIEWS = 24
 # A voxel counts if the maps that see it have this sum of weights, where one map that sees a surface face on has 255.
@@ -54,8 +54,9 @@ def estimate_depth_noise(maps: Sequence[DepthMap], grid: Grid, limit: float) -> 
                 u, v, z = other.camera.project(points)
                 seen = (z > 0) & (u >= 0) & (v >= 0) & (u < other.camera.width) & (v < other.camera.height)
                 rows, columns = v[seen].astype(int), u[seen].astype(int)
-                away = np.abs(other.depth[rows, columns] - z[seen])[other.weight[rows, columns] > 0]
-                differences.append(away[away < limit])
+                away, weight = np.abs(other.depth[rows, columns] - z[seen]), other.weight[rows, columns] / 255
+                near = (weight > 0) & (away < limit)
+                differences.append(away[near] * weight[near])  # about the distance to the surface's plane
     all_differences = np.concatenate(differences)
     # The difference of two depths has sqrt(2) times the deviation of each.
     return 1.4826 / 2**0.5 * float(np.median(all_differences)) if len(all_differences) else 0.0

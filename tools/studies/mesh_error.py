@@ -1,0 +1,263 @@
+"""Measure the error of exported meshes on scenes of known geometry, and on held-out views of photos.
+
+    python -m tools.studies.mesh_error demo runs/demo.hyrf --photos runs/demo_photos
+    python -m tools.studies.mesh_error points runs/bonsai/model.hyrf --photos data/bonsai
+
+`demo` takes a model of the built-in scene, whose photos `hyrfpack.demo.scene.write_demo_scene` writes, and compares its
+mesh with the spheres, boxes and the ground that were photographed. Accuracy is the distance from the mesh to the
+nearest surface, completeness the distance from what the cameras see to the mesh, both in world units, and the normal
+error is the angle between a triangle and the nearest surface. A second table has the error of rendered depths.
+
+`points` compares depths in held-out views with the points of the reconstruction that were found there: of the mesh, and
+of the model's own expected and median depth. Points are trained on as initial Gaussians, so they are not independent.
+
+--mesh FILE measures another mesh in place of the export; --maps FILE writes the depth maps for other programs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numba
+import numpy as np
+import torch
+import trimesh
+from scipy.spatial import cKDTree
+
+import hyrfpack
+from hyrfpack.demo.scene import NO_HIT_DISTANCE, SOLIDS, find_nearest_hit
+from hyrfpack.export.source import Source
+from hyrfpack.mesh import Mesh, extract_mesh
+from hyrfpack.mesh.depth_maps import render_depth_maps
+from hyrfpack.mesh.extract import MAX_MAPS
+from hyrfpack.ops.rasterize import RasterSettings, cpu
+from hyrfpack.ops.rasterize.median_depth import MAX_PLANE_DEPTH_RATIO
+from hyrfpack.render import render_view
+from hyrfpack.render.median_depth import render_median_depth
+from hyrfpack.render.renderer import RenderSettings
+from hyrfpack.scene import Camera, Scene, evenly_spaced
+from tools.tables import format_cell, markdown_table
+
+MESH_SAMPLES = 500_000
+SURFACE_RAYS_PER_CAMERA = 6_000
+HIT_LIMIT = 0.02  # world units of the demo scene, about the size of a pixel
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("kind", choices=("demo", "points"))
+    parser.add_argument("model", type=Path, help="a .hyrf file")
+    parser.add_argument("--photos", type=Path, required=True, help="folder of the model's photos")
+    parser.add_argument("--voxel", type=float, help="side of a voxel, world units")
+    parser.add_argument("--faces", type=int, help="largest number of triangles")
+    parser.add_argument("--mesh", type=Path, help="measure this mesh instead of extracting one")
+    parser.add_argument("--coarse", action="store_true", help="use the cameras that the file keeps, not the photos'")
+    parser.add_argument("--maps", type=Path, help="write the depth maps to this .npz and stop")
+    arguments = parser.parse_args()
+
+    scene = hyrfpack.load_scene(arguments.photos)
+    source = Source.read(arguments.model, None if arguments.coarse else scene)
+    if arguments.maps:
+        write_maps(source, arguments.maps)
+        return
+    start, processor = time.perf_counter(), time.process_time()
+    if arguments.mesh:
+        read = trimesh.load(arguments.mesh, process=False)
+        mesh = Mesh(np.asarray(read.vertices), np.asarray(read.faces), np.zeros((0, 3), np.uint8), 0.0, 0.0, 0)
+    else:
+        mesh = extract_mesh(
+            source.model, source.fit_cameras, source.center, voxel=arguments.voxel, faces=arguments.faces
+        )
+    seconds, processor = time.perf_counter() - start, time.process_time() - processor
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    print(
+        f"{arguments.model}: {len(source.model):,} Gaussians, {mesh.maps} maps, {len(mesh.faces):,} triangles, voxel "
+        f"{mesh.voxel:.4g}, truncation {mesh.truncation:.4g}, {seconds:.1f} s (CPU time {processor:.1f} s), peak {memory / 1e9:.2f} GB\n"
+    )
+    if arguments.kind == "demo":
+        print_demo_error(mesh, scene)
+        print_depth_error(source, [view.camera for view in scene.test])
+    else:
+        print_point_error(source, mesh, scene)
+
+
+def write_maps(source: Source, path: Path) -> None:
+    """Write depth, weight, colours, intrinsics and poses of the maps that a mesh is fused from."""
+    maps = list(render_depth_maps(source.model, evenly_spaced(source.fit_cameras, MAX_MAPS), "as-photographed"))
+    np.savez_compressed(
+        path,
+        depth=np.stack([np.where(m.weight > 0, m.depth, 0) for m in maps]),
+        colors=np.stack([m.colors for m in maps]),
+        intrinsics=np.array([m.camera.intrinsics for m in maps]),
+        poses=np.stack([m.camera.camera_from_world for m in maps]),
+    )
+
+
+def nearest_surface(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the distance (N,) of points (N, 3) to the demo scene's nearest surface, and its normals (N, 3) there."""
+    best, normals = np.abs(points[:, 2]), np.tile((0.0, 0.0, 1.0), (len(points), 1))
+    for solid in SOLIDS:
+        local = (points - solid.center) @ solid.object_from_world.T.astype(np.float64)
+        half = np.array(solid.half)
+        if solid.box:
+            beyond = np.abs(local) - half
+            outside = np.maximum(beyond, 0)
+            distance = np.where(beyond.max(axis=1) > 0, np.linalg.norm(outside, axis=1), -beyond.max(axis=1))
+            axis = beyond.argmax(axis=1)
+            normal = np.zeros_like(local)
+            normal[np.arange(len(local)), axis] = np.sign(local[np.arange(len(local)), axis])
+        else:
+            radius = np.linalg.norm(local, axis=1)
+            distance, normal = np.abs(radius - half[0]), local / np.maximum(radius, 1e-12)[:, None]
+        closer = distance < best
+        best[closer], normals[closer] = distance[closer], (normal @ solid.object_from_world)[closer]
+    return best, normals
+
+
+def demo_depth(camera: Camera) -> np.ndarray:
+    """Return the depth (H, W) of the demo scene along the view axis; infinite in the sky."""
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5 - camera.cx, np.arange(camera.height) + 0.5 - camera.cy)
+    rays = np.stack((x / camera.fx, y / camera.fy, np.ones(x.shape)), axis=-1).reshape(-1, 3) @ camera.rotation
+    lengths = np.linalg.norm(rays, axis=1)
+    directions = np.ascontiguousarray((rays / lengths[:, None]).T, np.float32)
+    origins = np.ascontiguousarray(np.broadcast_to(camera.position[:, None], directions.shape), np.float32)
+    distance, _ = find_nearest_hit(origins, directions)
+    depth = np.where(distance < NO_HIT_DISTANCE, distance / lengths, np.inf)
+    return depth.reshape(camera.height, camera.width)
+
+
+def print_demo_error(mesh: Mesh, scene: Scene) -> None:
+    """Print accuracy, completeness and normal error of a mesh of the demo scene."""
+    shape = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    samples, faces = trimesh.sample.sample_surface(shape, MESH_SAMPLES, seed=0)
+    accuracy, normals = nearest_surface(samples)
+    angles = np.degrees(np.arccos(np.clip((shape.face_normals[faces] * normals).sum(axis=1), -1, 1)))
+    seen = np.concatenate([seen_points(view.camera) for view in scene.train])
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    seen = seen[((seen >= low) & (seen <= high)).all(axis=1)]
+    completeness, _ = cKDTree(samples).query(seen)
+    precision, recall = (accuracy < HIT_LIMIT).mean(), (completeness < HIT_LIMIT).mean()
+    rows = [
+        ["accuracy", *statistics(accuracy)],
+        ["completeness", *statistics(completeness)],
+        ["normal error (degrees)", *statistics(angles)],
+    ]
+    print(markdown_table(["", "mean", "median", "95 %"], rows))
+    print(
+        f"\nchamfer distance {(accuracy.mean() + completeness.mean()) / 2:.5f}; within {HIT_LIMIT}: precision "
+        f"{precision:.3f}, recall {recall:.3f}\n"
+    )
+
+
+def seen_points(camera: Camera) -> np.ndarray:
+    """Return points (n, 3) of the demo scene's surfaces that a camera sees, evenly over its picture."""
+    depth = demo_depth(camera)
+    stride = max(1, round((depth.size / SURFACE_RAYS_PER_CAMERA) ** 0.5))
+    rows, columns = np.nonzero(np.isfinite(depth[::stride, ::stride]))
+    rows, columns = stride * rows, stride * columns
+    z = depth[rows, columns]
+    x, y = (columns + 0.5 - camera.cx) / camera.fx * z, (rows + 0.5 - camera.cy) / camera.fy * z
+    return (np.stack((x, y, z), axis=1) - camera.camera_from_world[:3, 3]) @ camera.rotation
+
+
+def render_depths(source: Source, camera: Camera) -> dict[str, np.ndarray]:
+    """Render the depths (H, W) of a view: expected, median of centres, and median of planes."""
+    model = source.model
+    with torch.no_grad():
+        decoded = model.decode()
+        seen = render_view(model, camera, decoded=decoded, depth=True)
+        index = seen.indices[seen.visible]
+        planes = render_median_depth(model, camera, decoded, index, RenderSettings())
+        viewport = model.config.frame.local_viewport(camera)
+        gaussians = decoded.geometry[index].at(model.gaussians.positions[index])
+        settings = RasterSettings(antialiased=model.config.antialiased)
+        flat = torch.zeros_like(gaussians.means)
+        centers = cpu.median_depth(gaussians, flat, MAX_PLANE_DEPTH_RATIO, viewport, settings)
+    assert seen.depth is not None
+    scale = model.config.frame.scale
+    return {
+        "expected": seen.depth.numpy(),
+        "median, centres": scale * centers.numpy(),
+        "median, planes": planes.numpy(),
+    }
+
+
+def print_depth_error(source: Source, cameras: Sequence[Camera]) -> None:
+    """Print the error of rendered depths of the demo scene, relative to the depth, at pixels within 6 units."""
+    errors: dict[str, list[np.ndarray]] = {}
+    for camera in cameras:
+        exact = demo_depth(camera)
+        near = exact < 6
+        for name, depth in render_depths(source, camera).items():
+            errors.setdefault(name, []).append(np.abs(depth[near] - exact[near]) / exact[near])
+    rows = [[name, *statistics(np.concatenate(parts))] for name, parts in errors.items()]
+    print(markdown_table(["relative error of depth, held-out views", "mean", "median", "95 %"], rows))
+
+
+def print_point_error(source: Source, mesh: Mesh, scene: Scene) -> None:
+    """Print the errors of depths at the points that were found in held-out views, relative to the depth."""
+    errors: dict[str, list[np.ndarray]] = {}
+    shares: dict[str, list[np.ndarray]] = {}
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    for view in scene.test:
+        points = scene.points[scene.tracks[view.name]]
+        u, v, z = view.camera.project(points)
+        inside = (z > 0) & (u >= 0) & (v >= 0) & (u < view.camera.width) & (v < view.camera.height)
+        inside &= ((points >= low) & (points <= high)).all(axis=1)
+        rows, columns, z = v[inside].astype(int), u[inside].astype(int), z[inside]
+        depths = {"mesh": draw_depth(mesh, view.camera), **render_depths(source, view.camera)}
+        for name, depth in depths.items():
+            found = depth[rows, columns]
+            known = np.isfinite(found) & (found > 0)
+            errors.setdefault(name, []).append(np.abs(found[known] - z[known]) / z[known])
+            shares.setdefault(name, []).append(known)
+    rows_out = []
+    for name, parts in errors.items():
+        all_errors, known = np.concatenate(parts), np.concatenate(shares[name])
+        rows_out.append([name, f"{known.mean():.3f}", *statistics(all_errors), f"{(all_errors < 0.02).mean():.3f}"])
+    total = sum(len(part) for part in shares["mesh"])
+    columns = [f"depth at {total:,} points", "with depth", "mean", "median", "95 %", "within 2 %"]
+    print(markdown_table(columns, rows_out) + "\n")
+
+
+def draw_depth(mesh: Mesh, camera: Camera) -> np.ndarray:
+    """Draw the depth (H, W) of a mesh; infinite where there is none."""
+    x, y, z = (mesh.vertices @ camera.rotation.T + camera.camera_from_world[:3, 3]).T
+    safe = np.where(z > 1e-6, z, np.nan)
+    corners = np.stack((camera.fx * x / safe + camera.cx, camera.fy * y / safe + camera.cy, z), axis=1)
+    depth = np.full((camera.height, camera.width), np.inf)
+    _draw_triangles(corners, mesh.faces, depth)
+    return depth
+
+
+@numba.njit
+def _draw_triangles(corners, faces, depth):
+    height, width = depth.shape
+    for face in range(len(faces)):
+        a, b, c = corners[faces[face, 0]], corners[faces[face, 1]], corners[faces[face, 2]]
+        area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+        if not abs(area) > 0:  # also for corners behind the camera
+            continue
+        left, right = max(0, int(min(a[0], b[0], c[0]))), min(width - 1, int(max(a[0], b[0], c[0])))
+        top, bottom = max(0, int(min(a[1], b[1], c[1]))), min(height - 1, int(max(a[1], b[1], c[1])))
+        for row in range(top, bottom + 1):
+            for column in range(left, right + 1):
+                x, y = column + 0.5, row + 0.5
+                u = ((b[0] - x) * (c[1] - y) - (b[1] - y) * (c[0] - x)) / area
+                v = ((c[0] - x) * (a[1] - y) - (c[1] - y) * (a[0] - x)) / area
+                w = 1 - u - v
+                if u >= 0 and v >= 0 and w >= 0:
+                    depth[row, column] = min(depth[row, column], 1 / (u / a[2] + v / b[2] + w / c[2]))
+
+
+def statistics(values: np.ndarray) -> list[str]:
+    """Return mean, median and 95th percentile as cells of a table."""
+    return [format_cell(float(number)) for number in (values.mean(), np.median(values), np.quantile(values, 0.95))]
+
+
+if __name__ == "__main__":
+    main()
