@@ -76,8 +76,9 @@ def main() -> None:
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     print(
         f"{arguments.model}: {len(source.model):,} Gaussians, {mesh.maps} maps, {len(mesh.faces):,} triangles, voxel "
-        f"{mesh.voxel:.4g}, truncation {mesh.truncation:.4g}, {seconds:.1f} s (CPU time {processor:.1f} s), peak {memory / 1e9:.2f} GB\n"
+        f"{mesh.voxel:.4g}, truncation {mesh.truncation:.4g}"
     )
+    print(f"{seconds:.1f} s (CPU time {processor:.1f} s), peak {memory / 1e9:.2f} GB\n")
     if arguments.kind == "demo":
         print_demo_error(mesh, scene)
         print_depth_error(source, [view.camera for view in scene.test])
