@@ -85,7 +85,7 @@ def _(action: RemoveFloaters, state: EditState) -> np.ndarray:
     if not state.photos:
         raise HyrfError(
             "floaters are found by comparing the model with its photos, and there are none",
-            fix="name the folder of the photos and poses with --data (in Python: data=hyrfpack.load_scene(...))",
+            fix="name the photos with `data`",
         )
     return ~find_floaters(state.model, state.photos, action.min_opacity_share, state.progress)
 

@@ -62,7 +62,8 @@ def test_render_writes_views_as_photographed_or_at_one_exposure(run, model_with_
         out = tmp_path / exposure
         succeeded("render", model_with_map, "-o", out, "--data", data, "--exposure", exposure)
         expected = [np.asarray(to_image(render_view(model, view.camera).rgb)) for view in views]
-        np.testing.assert_array_equal(read_pictures(out), expected)
+        # The command decodes the model once for all views, so bytes may be rounded otherwise.
+        np.testing.assert_allclose(np.array(read_pictures(out), int), np.array(expected, int), rtol=0, atol=1)
     succeeded("render", model_with_map, "-o", tmp_path / "default", "--data", data)
     np.testing.assert_array_equal(read_pictures(tmp_path / "default"), read_pictures(tmp_path / "as-photographed"))
     assert not np.array_equal(read_pictures(tmp_path / "default"), read_pictures(tmp_path / "consistent"))

@@ -313,7 +313,7 @@ def child_process_ids(process: int) -> list[int]:
     return [int(word) for word in Path(f"/proc/{process}/task/{process}/children").read_text().split()]
 
 
-def wait_until(happened: Callable[[], bool], seconds: float = 60) -> bool:
+def wait_until(happened: Callable[[], bool], seconds: float = 240) -> bool:
     end = time.monotonic() + seconds
     while not happened() and time.monotonic() < end:
         time.sleep(0.05)
