@@ -141,6 +141,7 @@ def _fill_page(
     values: dict[str, str],
     *,
     readers: bool = True,
+    credit: str = "",
 ) -> bytes:
     """Return the player's page from values of its template; other arguments as for `assemble_player_page`."""
     values = values | {
@@ -148,6 +149,7 @@ def _fill_page(
         "title": html.escape(title),
         "meta": meta_tags(title, description, image),
         "accept": ",".join([MODEL_SUFFIX, *SPLATS_SUFFIXES] if readers else [MODEL_SUFFIX]),
+        "credit": html.escape(credit),
         "back": "" if gallery is None else BACK_LINK.format(html.escape(gallery)),
     }
     return fill_template(read_web_file("viewer/page.html"), values).encode()

@@ -247,6 +247,7 @@ def wide_browser(browser: Browser):
 def test_key_and_button_switch_the_exposure_and_announce_it(wide_browser: Browser, tmp_path: Path):
     open_complete_page(wide_browser, tmp_path, make_model_page(random_model_with_map(100)))
     assert wide_browser.evaluate(CONTROLS_SHOWN_JS) and wide_browser.evaluate(BUTTON_PRESSED_JS) == "true"
+    wide_browser.evaluate("document.getElementById('menu').click()")
     button = "document.getElementById('exposure')"
     assert wide_browser.evaluate(f"{button}.checkVisibility() && {button}.textContent") == "Exposure as photographed"
     heard = "document.getElementById('status').textContent"
@@ -272,7 +273,7 @@ def test_key_and_button_switch_the_exposure_and_announce_it(wide_browser: Browse
 def test_a_finger_switches_the_exposure(wide_browser: Browser, tmp_path: Path):
     wide_browser.resize(390, 844, phone=True)
     open_complete_page(wide_browser, tmp_path, make_model_page(random_model_with_map(100)))
-    wide_browser.evaluate("document.getElementById('toggle').click()")
+    wide_browser.evaluate("document.getElementById('menu').click()")
     box = wide_browser.evaluate(
         "(({ left, right, top, bottom }) => [left, right, top, bottom])"
         "(document.getElementById('exposure').getBoundingClientRect())"

@@ -115,7 +115,7 @@ def check_way_back(browser: Browser, host: Site) -> None:
         browser.evaluate("hyrfpack.ready")
         wait_until(browser, "document.body.classList.contains('there')")
         boxes = browser.evaluate(
-            "['back', 'toggle', 'panel'].map((name) => document.getElementById(name))"
+            "['back', 'title', 'toolbar', 'strip'].map((name) => document.getElementById(name))"
             ".map((part) => (part.hidden = false, part.getBoundingClientRect()))"
             ".map(({ left, top, right, bottom }) => [left, top, right, bottom])"
         )

@@ -1,4 +1,4 @@
-"""The interface of the page: panel, messages, help, links and saved pictures, also with the keyboard alone."""
+"""The interface of the page: toolbar, cameras, settings, messages, help, links and pictures, also by keyboard alone."""
 
 from __future__ import annotations
 
@@ -32,6 +32,7 @@ from web.pages import (
 )  # fmt: skip
 from web.scripts import run_script
 
+from hyrfpack.cameras.view_sampling import shrink_camera
 from hyrfpack.web.html import decode_splats_page
 from hyrfpack.web.serve import serve_in_thread
 
@@ -47,6 +48,17 @@ def reset_window(browser: Browser) -> Iterator[None]:
     browser.prefer()
 
 
+CURRENT_CAMERA_JS = (
+    "[...document.getElementById('strip').children].findIndex((it) => it.getAttribute('aria-pressed') === 'true')"
+)
+
+
+def find_box(browser: Browser, name: str) -> list[float]:
+    """Return left, top, right and bottom of an element in CSS pixels."""
+    sides = "({ left, top, right, bottom }) => [left, top, right, bottom]"
+    return browser.evaluate(f"({sides})(document.getElementById('{name}').getBoundingClientRect())")
+
+
 def is_hidden(browser: Browser, name: str) -> bool:
     return browser.evaluate(f"!document.getElementById('{name}').checkVisibility()")
 
@@ -54,20 +66,117 @@ def is_hidden(browser: Browser, name: str) -> bool:
 # ---- layout
 
 
-@pytest.mark.parametrize("size", [(390, 844), (844, 390), (600, 400), (1280, 800)], ids=str)
-def test_the_panel_is_open_only_in_large_windows(browser: Browser, tmp_path: Path, size: tuple[int, int]):
-    browser.resize(*size)
+@pytest.mark.parametrize("size", [(390, 844), (844, 390), (300, 200), (1280, 800)], ids=str)
+def test_the_toolbar_is_a_thin_strip_with_large_buttons(browser: Browser, tmp_path: Path, size: tuple[int, int]):
+    browser.resize(*size, phone=size[0] < 1280)
     open_page(browser, tmp_path, make_splats_page(random_splats(50)))
-    assert is_hidden(browser, "panel") == (size != (1280, 800))
-    assert not is_hidden(browser, "toggle")
-    browser.evaluate("document.getElementById('toggle').click()")
-    expanded = browser.evaluate("document.getElementById('toggle').getAttribute('aria-expanded')")
-    assert expanded == str(not is_hidden(browser, "panel")).lower() == str(size != (1280, 800)).lower()
+    assert is_hidden(browser, "strip") == (size != (1280, 800))  # only a large window has room for it
+    left, top, right, bottom = find_box(browser, "toolbar")
+    assert left >= 0 and right <= size[0] and bottom <= size[1] and bottom - top <= 48
+    widths = browser.evaluate(
+        "[...document.querySelectorAll('#toolbar button')].filter((button) => button.checkVisibility())"
+        ".map((button) => button.getBoundingClientRect()).map(({ width, height }) => [width, height])"
+    )
+    assert len(widths) >= 4 and np.min(widths) >= 44
+    hidden = "button => !button.checkVisibility() && button.id !== 'fullscreen'"
+    missing = f"[...document.querySelectorAll('#toolbar button')].filter({hidden}).map((it) => it.dataset.key)"
+    browser.evaluate("document.getElementById('menu').click()")
+    in_sheet = "[...document.querySelectorAll('#settings button')].filter((it) => it.checkVisibility())"
+    assert set(browser.evaluate(missing)) <= set(browser.evaluate(f"{in_sheet}.map((it) => it.dataset.key ?? '')"))
+    left, top, right, bottom = find_box(browser, "settings")
+    assert left >= 0 and top >= 0 and right <= size[0] and bottom <= size[1]
+
+
+@pytest.mark.parametrize(("name", "button"), [("strip", "views"), ("settings", "menu")])
+def test_buttons_open_and_close_the_cameras_and_the_settings(browser: Browser, tmp_path: Path, name: str, button: str):
+    open_page(browser, tmp_path, make_splats_page(random_splats(50)))
+    for is_open in (True, False):
+        browser.evaluate(f"document.getElementById('{button}').click()")
+        assert is_hidden(browser, name) != is_open
+        expanded = browser.evaluate(f"document.getElementById('{button}').getAttribute('aria-expanded')")
+        assert expanded == str(is_open).lower()
+
+
+def test_the_settings_close_by_escape_and_by_a_press_on_the_scene(browser: Browser, tmp_path: Path):
+    browser.resize(1280, 800)
+    open_page(browser, tmp_path, make_splats_page(random_splats(50)))
+    for close in (lambda: browser.press("Escape"), lambda: browser.click(300, 300)):
+        browser.press("m")
+        assert not is_hidden(browser, "settings")
+        close()
+        assert is_hidden(browser, "settings")
+
+
+def test_the_toolbar_of_a_small_frame_disappears_until_the_next_input(browser: Browser, tmp_path: Path):
+    opacity = "Number(getComputedStyle(document.getElementById('toolbar')).opacity)"
+    for size, is_small in {(300, 200): True, (800, 600): False}.items():
+        browser.resize(*size)
+        open_page(browser, tmp_path, make_splats_page(random_splats(50)))
+        browser.move(100, 100)
+        assert browser.evaluate(opacity) == 1
+        wait_until(browser, "document.body.classList.contains('idle')")
+        wait_until(browser, f"{opacity} === {0 if is_small else 1}")
+        browser.move(120, 110)
+        wait_until(browser, f"{opacity} === 1")
+    assert browser.evaluate("document.body.classList.contains('idle')") is False
+
+
+def test_a_focused_button_shows_its_name_and_key(browser: Browser, tmp_path: Path):
+    browser.resize(1280, 800)
+    open_page(browser, tmp_path, make_splats_page(random_splats(50)))
+    tip = "getComputedStyle(document.getElementById('turn'), '::after').visibility"
+    assert browser.evaluate(tip) == "hidden"
+    browser.press("Tab")
+    browser.evaluate("document.getElementById('turn').focus()")
+    assert browser.evaluate(tip) == "visible"
+
+
+# ---- the strip of cameras
+
+
+def find_current_camera(browser: Browser) -> int:
+    """Return the index of the camera that the strip marks."""
+    return browser.evaluate(CURRENT_CAMERA_JS)
+
+
+def test_the_strip_shows_what_each_camera_sees_and_moves_there(browser: Browser, tmp_path: Path):
+    browser.resize(1280, 800)
+    page = make_splats_page(random_splats())
+    open_page(browser, tmp_path, page)
+    wait_until(browser, "document.querySelectorAll('#strip canvas').length === 3")
+    splats = decode_splats_page(page, "page")[0]
+    for number, distance in enumerate((2.5, 1.5, 4.0)):
+        data = browser.evaluate(
+            f"document.querySelectorAll('#strip canvas')[{number}].toDataURL('image/png').split(',')[1]"
+        )
+        with Image.open(io.BytesIO(base64.b64decode(data))) as picture:
+            seen = np.asarray(picture.convert("RGB"), np.float64)
+        assert psnr(seen, rasterize_reference(splats, shrink_camera(make_camera(distance), 96))) > 30
+    home = window_camera(browser)
+    np.testing.assert_allclose(home.camera_from_world, make_camera().camera_from_world, atol=1e-9)
+    wait_until_still(browser)
+    assert psnr(render_in_page(browser, home), rasterize_reference(splats, home)) > 40, "the order is of another view"
+    browser.evaluate("document.querySelectorAll('#strip button')[1].click()")
+    np.testing.assert_allclose(window_camera(browser).camera_from_world, make_camera(1.5).camera_from_world, atol=1e-9)
+    assert find_current_camera(browser) == 1
+    assert browser.list_errors() == []
+
+
+def test_a_scene_with_one_camera_has_no_strip(browser: Browser, tmp_path: Path):
+    browser.resize(1280, 800)
+    open_page(browser, tmp_path, make_splats_page(random_splats(50), cameras=[make_camera()]))
+    browser.press("v")
+    assert is_hidden(browser, "strip") and is_hidden(browser, "views")
+
+
+# ---- layout of all parts
 
 
 @pytest.mark.parametrize("size", [(800, 600), (390, 844), (844, 390), (320, 480)], ids=str)
 def test_no_element_overlaps_another_or_leaves_the_window(browser: Browser, tmp_path: Path, size: tuple[int, int]):
     browser.resize(*size)
+    has_strip = size[1] > 500
+    names = ["heading", "toolbar", "loading", "hint", "remark", "message", *(["strip"] if has_strip else [])]
     open_page(
         browser,
         tmp_path,
@@ -77,13 +186,14 @@ def test_no_element_overlaps_another_or_leaves_the_window(browser: Browser, tmp_
         "document.getElementById('hint').hidden = false,"
         "document.getElementById('exposure').hidden = false,"
         "document.getElementById('remark').textContent = 'Drawn with harmonics: this device is too weak.',"
-        "document.getElementById('remark').hidden = document.getElementById('panel').hidden = false"
+        "document.getElementById('remark').hidden = false,"
+        f"document.getElementById('strip').hidden = {json.dumps(not has_strip)}"
     )
     browser.evaluate("location.hash = 'camera=no'")
     assert "camera" in wait_for_message(browser)
     browser.evaluate("document.getElementById('loading').hidden = false")
     boxes = browser.evaluate(
-        "['panel', 'toggle', 'loading', 'hint', 'remark', 'message'].map((name) => {"
+        f"{names}.map((name) => {{"
         "  const box = document.getElementById(name).getBoundingClientRect();"
         "  return [name, box.left, box.top, box.right, box.bottom];"
         "})"
@@ -91,12 +201,10 @@ def test_no_element_overlaps_another_or_leaves_the_window(browser: Browser, tmp_
     for name, left, top, right, bottom in boxes:
         assert left >= 0 and top >= 0 and right <= size[0] and bottom <= size[1] and right - left > 20, name
     for (one, *a), (other, *b) in itertools.combinations(boxes, 2):
-        if {one, other} & {"panel"} and size[1] < 500:
-            continue  # on a small phone the opened panel covers other elements
         assert a[2] <= b[0] or b[2] <= a[0] or a[3] <= b[1] or b[3] <= a[1], f"{one} overlaps {other}"
 
 
-def test_the_panel_shows_title_count_and_speed(browser: Browser, tmp_path: Path):
+def test_the_page_shows_title_count_and_speed(browser: Browser, tmp_path: Path):
     browser.resize(1280, 800)
     open_page(browser, tmp_path, make_splats_page(random_splats(1500), title="<b>& co"))
     text = "document.getElementById('{}').textContent"
@@ -104,7 +212,7 @@ def test_the_panel_shows_title_count_and_speed(browser: Browser, tmp_path: Path)
     assert browser.evaluate(text.format("count")) == "1,500 splats"
     ends = time.monotonic() + 20
     while not re.fullmatch(r"\d+ fps", browser.evaluate(text.format("speed"))):
-        assert time.monotonic() < ends, "the panel shows no speed"
+        assert time.monotonic() < ends, "the settings show no speed"
         browser.press("w", seconds=0.5)  # a frame may take longer than half a second
 
 
@@ -127,7 +235,8 @@ def test_text_has_enough_contrast_in_light_and_dark(browser: Browser, tmp_path: 
             [read(["--ink"]), read([scene, "--glass"])], [read(["--dim"]), read([scene, "--glass"])],
             [read(["--ink"]), read([scene, "--glass", "--button"])],
             [read(["--accent"]), read([scene, "--glass", "--button"])],
-            [read(["--dim"]), read(["--solid"])], [read(["--ink"]), read(["--page"])],
+            [read(["--dim"]), read(["--solid"])], [read(["--light"]), read([scene, "--pill"])],
+            [read(["--ink"]), read(["--page"])],
         ]);
     })()"""
     for ink, paper in browser.evaluate(script):
@@ -147,7 +256,7 @@ def relative_luminance(color: list[int]) -> float:
 def test_noui_hides_everything_but_the_canvas_and_messages(browser: Browser, tmp_path: Path):
     browser.resize(1280, 800)
     open_page(browser, tmp_path, make_splats_page(random_splats(50)), "?noui#camera=77")
-    assert all(is_hidden(browser, name) for name in ("panel", "toggle", "hint", "invitation", "loading"))
+    assert all(is_hidden(browser, name) for name in ("heading", "toolbar", "strip", "hint", "invitation", "loading"))
     assert "no camera 77, only 3" in wait_for_message(browser) and not is_hidden(browser, "message")
 
 
@@ -281,7 +390,7 @@ def test_a_copied_link_equals_the_address(browser: Browser, served_page: str):
 def test_the_address_can_select_a_camera_by_number(browser: Browser, tmp_path: Path, where: str):
     open_page(browser, tmp_path, make_splats_page(random_splats(50)), where)
     np.testing.assert_allclose(window_camera(browser).camera_from_world, make_camera(1.5).camera_from_world, atol=1e-9)
-    assert browser.evaluate("document.getElementById('cameras').selectedIndex") == 1
+    assert find_current_camera(browser) == 1
 
 
 def test_the_address_can_set_the_title(browser: Browser, tmp_path: Path):
@@ -337,7 +446,7 @@ def test_without_webgl_the_poster_and_a_message_are_shown_and_no_buttons(browser
         browser.open((tmp_path / "page.html").as_uri())
         assert "needs WebGL 2" in wait_for_message(browser)
     assert not is_hidden(browser, "poster")
-    assert all(is_hidden(browser, name) for name in ("panel", "toggle", "loading"))
+    assert all(is_hidden(browser, name) for name in ("heading", "toolbar", "loading"))
     assert browser.evaluate("document.getElementById('message').getBoundingClientRect().top") > 600
 
 
@@ -392,13 +501,13 @@ def test_a_page_works_without_local_storage(browser: Browser, tmp_path: Path):
 def test_the_tab_key_visibly_focuses_every_control_and_leaves_the_page(browser: Browser, tmp_path: Path):
     browser.resize(1280, 800)
     open_page(browser, tmp_path, make_splats_page(random_splats(50)))
-    browser.evaluate("(localStorage.setItem('hyrfpack.hinted', '1'), document.querySelector('details').open = true)")
+    browser.evaluate("(localStorage.setItem('hyrfpack.hinted', '1'), document.getElementById('menu').click())")
     controls = browser.evaluate(
-        "[...document.querySelectorAll('canvas, button, select, summary, input')].filter((part) =>"
+        "[...document.querySelectorAll('#view, button, input')].filter((part) =>"
         " part.checkVisibility() && !part.disabled)"
         ".map((part) => (part.dataset.number = Math.random(), part.dataset.number))"
     )
-    assert len(controls) == 15
+    assert len(controls) == 15  # canvas, 3 settings, 3 cameras and 8 buttons of the toolbar
     focused = []
     for _ in range(len(controls)):
         browser.press("Tab")
@@ -418,12 +527,14 @@ def test_every_button_has_a_working_key(browser: Browser, tmp_path: Path):
     browser.resize(1280, 800)
     open_page(browser, tmp_path, make_splats_page(random_splats(50)))
     keys = browser.evaluate("[...document.querySelectorAll('[data-key]')].map((button) => button.dataset.key)")
-    assert sorted(keys) == sorted("PNRTLC?FHX")
+    assert set(keys) == set("VRTCLM?FX")
     for key, effect in {
         "t": "document.getElementById('turn').getAttribute('aria-pressed') === 'true'",
-        "3": "document.getElementById('cameras').selectedIndex === 2",
-        "9": "document.getElementById('cameras').selectedIndex === 2",
-        "h": "document.getElementById('panel').hidden",
+        "3": f"{CURRENT_CAMERA_JS} === 2",
+        "9": f"{CURRENT_CAMERA_JS} === 2",
+        "v": "document.getElementById('strip').hidden",
+        "m": "!document.getElementById('settings').hidden",
+        "h": "!document.getElementById('toolbar').checkVisibility()",
         "l": "!document.getElementById('toast').hidden",
         "?": "document.getElementById('help').open",
     }.items():
@@ -451,7 +562,7 @@ def test_screen_readers_get_labels_and_status_messages(browser: Browser, tmp_pat
     wait_until_at_rest(browser)
     assert browser.evaluate("heard.at(-1)") == "Camera 2 of 3"
     nameless = browser.evaluate(
-        "[...document.querySelectorAll('button, select, input:not([hidden]), canvas, progress')].filter((it) =>"
+        "[...document.querySelectorAll('button, input:not([hidden]), #view, progress')].filter((it) =>"
         " !(it.getAttribute('aria-label') || it.textContent.trim() || it.labels?.length)).map((it) => it.outerHTML)"
     )
     assert nameless == []

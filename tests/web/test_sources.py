@@ -122,7 +122,7 @@ def test_an_empty_player_asks_for_a_file_and_opens_dropped_files(browser: Browse
     wait_until(browser, LOADED_COUNT_JS + " === 300")
     assert not browser.evaluate(invitation)
     assert browser.evaluate("document.title") == "my cloud"
-    wait_until(browser, "document.getElementById('panel').checkVisibility()")
+    wait_until(browser, "document.getElementById('toolbar').checkVisibility()")
     drop_file(browser, GOLDEN_FILE_DATA, "model.hyrf")
     wait_until(browser, "hyrfpack.player.scene.kind === 'hyrf'")
     wait_until(browser, "document.getElementById('count').textContent.startsWith('hybrid field, ')")

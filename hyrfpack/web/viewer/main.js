@@ -142,8 +142,13 @@ function start() {
     L: ifLoaded(share),
     C: ifLoaded(async () => savePicture(await player.capture(), opener.shown.title)),
     H: () => panel.toggle(),
+    M: () => panel.toggleSettings(),
+    V: () => player.cameras.length > 1 && panel.strip.toggle(),
     "?": () => help.show(),
-    Escape: dismiss,
+    Escape: () => {
+      dismiss();
+      panel.toggleSettings(false);
+    },
   });
   const opener = new Opener(player, panel, embedded ? (parameters.title ?? embedded.title) : document.title);
   if (parameters.exposure) player.exposure = parameters.exposure;
@@ -162,7 +167,7 @@ function start() {
     panel.describe(detail, opener.shown.title);
     if (opener.shown.isOwn) followNamedCamera();
   });
-  player.addEventListener("count", ({ detail }) => panel.describe(detail, opener.shown.title));
+  player.addEventListener("count", ({ detail }) => panel.setTitle(detail, opener.shown.title));
   player.addEventListener("loaded", () => {
     document.body.classList.remove("empty"); // the page's own scene may be loaded after a file failed
     revealCanvas(player, poster);

@@ -1,19 +1,20 @@
-// Shows the panel with the scene's name, its cameras and the settings.
+// Shows the scene's title, the toolbar, the settings and the strip of cameras.
 
 import { AS_PHOTOGRAPHED } from "./exposure.js";
 import { element } from "./dom.js";
+import { Strip } from "./strip.js";
 
-const SMALL_SCREEN_QUERY = "(max-width: 640px), (max-height: 480px)"; // the open panel would cover the scene
+const LARGE_WINDOW_QUERY = "(min-width: 900px) and (min-height: 600px)"; // the strip of cameras covers little of it
+const IDLE_MS = 4000; // after the last input, the toolbar of a small frame disappears
 const COUNT_TEXTS = { hyrf: (count) => `hybrid field, ${count} Gaussians`, splats: (count) => `${count} splats` };
 
 export class Panel {
   // `actions` has a function for each key that does not move the eye. Buttons call the same functions.
   constructor(player, actions) {
     Object.assign(this, { player, actions });
+    this.strip = new Strip(player, actions.choose);
     for (const button of document.querySelectorAll("[data-key]")) button.onclick = () => this.press(button.dataset.key);
-    element("cameras").onchange = ({ target }) => actions.choose(target.selectedIndex);
     element("fullscreen").hidden = !document.fullscreenEnabled;
-    if (matchMedia(SMALL_SCREEN_QUERY).matches) this.toggle();
     element("automatic").onchange = ({ target }) => {
       player.automatic = target.checked;
       player.redraw();
@@ -23,11 +24,13 @@ export class Panel {
       player.resolution = target.value / 100;
       player.redraw();
     };
+    element("view").addEventListener("pointerdown", () => this.toggleSettings(false));
+    for (const name of ["pointermove", "pointerdown", "keydown"]) addEventListener(name, () => this.wake(), true);
     player.addEventListener("frame", ({ detail }) => {
       element("speed").textContent = `${Math.round(1000 / detail)} fps`;
     });
     player.addEventListener("exposure", () => this.showExposure());
-    player.addEventListener("camera", ({ detail }) => (element("cameras").selectedIndex = detail));
+    this.wake();
   }
 
   // Shows the scene's name and its number of Gaussians.
@@ -40,9 +43,8 @@ export class Panel {
   // Shows the scene's name, its number of Gaussians and its cameras.
   describe({ kind, count, cameras }, title) {
     this.setTitle({ kind, count }, title);
-    const options = cameras.map((_, number) => new Option(`Camera ${number + 1} of ${cameras.length}`));
-    element("cameras").replaceChildren(...options);
-    for (const name of ["previous", "next", "cameras"]) element(name).disabled = cameras.length < 2;
+    this.strip.describe(cameras.length);
+    this.strip.toggle(cameras.length > 1 && matchMedia(LARGE_WINDOW_QUERY).matches);
   }
 
   // Shows the exposure's button and its state if the scene has an exposure map.
@@ -58,9 +60,21 @@ export class Panel {
     else this.actions[key]?.();
   }
 
+  // Shows or hides the title, the toolbar and what belongs to it.
   toggle() {
-    const panel = element("panel");
-    panel.hidden = !panel.hidden;
-    element("toggle").setAttribute("aria-expanded", String(!panel.hidden));
+    document.body.classList.toggle("plain");
+  }
+
+  toggleSettings(isOpen = element("settings").hidden) {
+    element("settings").hidden = !isOpen;
+    element("menu").setAttribute("aria-expanded", String(isOpen));
+    this.wake();
+  }
+
+  // Shows the toolbar of a small frame until no input has come for IDLE_MS and the settings are closed.
+  wake() {
+    document.body.classList.remove("idle");
+    clearTimeout(this.timer);
+    this.timer = setTimeout(() => document.body.classList.toggle("idle", element("settings").hidden), IDLE_MS);
   }
 }

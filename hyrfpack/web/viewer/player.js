@@ -525,6 +525,24 @@ export class Player extends EventTarget {
     return new Promise((resolve) => this.canvas.toBlob(resolve, type, quality));
   }
 
+  // Draws small pictures of views while the window's picture is complete. Gaussians keep the colours of the window's
+  // view, because new ones would take long. Returns the RGB bytes of each picture, top row first, or null if another
+  // picture is wanted meanwhile.
+  async preview(views) {
+    const { moves } = this, { content } = this.renderer, pictures = [];
+    const isWanted = () => this.idle && this.loaded && this.moves === moves && content === this.renderer.content;
+    const draw = async (view) => {
+      const sorted = isWanted() ? await this.loader.sort(view, this.scene) : null;
+      if (!sorted || !isWanted()) return;
+      this.unsorted = true;
+      this.setOrder(sorted);
+      pictures.push(this.renderer.read(view, this.gains(view)));
+    };
+    for (const view of views) await this.enqueue(() => draw(view));
+    this.sort(); // for the window's view
+    return pictures.length === views.length ? pictures : null;
+  }
+
   // Moves the eye to a camera in world units and draws its picture. Returns its RGB bytes, top row first. If that is
   // impossible, throws an Error with a message for the user, and the eye does not move.
   async show(camera) {
