@@ -1,5 +1,5 @@
 // The colour of each Gaussian as seen from a point.
-uniform usampler2DArray u_cached; // from first.frag
+uniform usampler2DArray u_features; // from features.frag
 uniform usampler2D u_places;
 uniform sampler2D u_logits; // colour logits; scale logit
 uniform vec3 u_eye;
@@ -8,9 +8,11 @@ out uvec2 o_color; // halves: red, green; blue
 
 void main() {
     ivec2 place = ivec2(gl_FragCoord.xy);
-EACH uvec4 cell$ = texelFetch(u_cached, ivec3(place, $), 0);
-EACH a$ = vec4(unpackHalf2x16(cell$.x), unpackHalf2x16(cell$.y));
-EACH b$ = vec4(unpackHalf2x16(cell$.z), unpackHalf2x16(cell$.w));
+    begin(BIAS_1);
+    for (int first = 0; first < LEVELS; first += 4) {
+        uvec4 packed = texelFetch(u_features, ivec3(place, first >> 2), 0);
+        for (int k = 0; k < 4 && first + k < LEVELS; ++k) add_level(unpackHalf2x16(packed[k]), first + k);
+    }
     vec3 ray = uintBitsToFloat(texelFetch(u_places, place, 0).xyz) - u_eye;
     add_direction(ray / max(length(ray), 1e-12));
     rectify();

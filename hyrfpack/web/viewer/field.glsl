@@ -28,6 +28,13 @@ void add(float value, int at) {
 EACH a$ += value * WEIGHT(at + 2 * $); b$ += value * WEIGHT(at + 2 * $ + 1);
 }
 
+// Add what the two features of a level say.
+void add_level(vec2 values, int level) {
+    int at = INPUTS + 4 * CELLS * level;
+    add(values.x, at);
+    add(values.y, at + 2 * CELLS);
+}
+
 void rectify() {
 EACH a$ = max(a$, 0.0); b$ = max(b$, 0.0);
 }
@@ -65,16 +72,17 @@ vec2 features(uvec4 level, vec3 c) {
     return mix(mix(sides[0], sides[1], w.y), mix(sides[2], sides[3], w.y), w.z);
 }
 
-// Add what the hash features of a local position say. `at`: weights of the first feature; `next`: of the one after it.
-void add_place(vec3 p, int at, int next) {
+// A local position in the unit cube.
+vec3 contract(vec3 p) {
     vec3 u = p / u_half_extent;
     float r = max(norm(u), 1.0);
-    vec3 c = 0.25 * (2.0 - 1.0 / r) * u / r + 0.5;
-    for (int level = 0; level < LEVELS; ++level) {
-        vec2 f = features(u_levels[level], c);
-        add(f.x, at + 2 * level * next);
-        add(f.y, at + (2 * level + 1) * next);
-    }
+    return 0.25 * (2.0 - 1.0 / r) * u / r + 0.5;
+}
+
+// Add what the hash features of a local position say.
+void add_place(vec3 p) {
+    vec3 c = contract(p);
+    for (int level = 0; level < LEVELS; ++level) add_level(features(u_levels[level], c), level);
 }
 #endif
 
@@ -132,7 +140,7 @@ const float RADIUS = 100.0; // of the background's sphere, in local units
 // The background at a place on its sphere, seen along a unit vector.
 vec3 background(vec3 place, vec3 d) {
     begin(BIAS_1);
-    add_place(place, INPUTS, 2 * CELLS);
+    add_place(place);
     add_direction(d);
     rectify();
     vec4 sum = WEIGHT(BIAS_3);

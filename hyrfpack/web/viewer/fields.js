@@ -8,6 +8,7 @@ import { Sky } from "./sky.js";
 import { readText } from "./texts.js";
 import { RowStates } from "../hyrf/row_states.js";
 
+const LEVELS_PER_LAYER = 4; // of features, two halves a level
 const MAX_CELLS = 32; // a cell is 8 hidden units; the shaders hold all cells in variables
 const WEIGHTS_TEXTURE_WIDTH = 1024; // of the texture for a decoder's numbers if no uniform block is used
 const WEIGHTS_TEXTURE_UNIT = 6;
@@ -45,7 +46,8 @@ export class Fields {
     this.places = words();
     this.shapes = words();
     this.colors = graphics.texture(gl.TEXTURE_2D, gl.RG32UI, ...size);
-    this.cached = graphics.texture(gl.TEXTURE_2D_ARRAY, gl.RGBA32UI, ...size, this.cells);
+    this.layers = Math.ceil(model.radiance.levels.length / LEVELS_PER_LAYER);
+    this.features = graphics.texture(gl.TEXTURE_2D_ARRAY, gl.RGBA32UI, ...size, this.layers);
     const floats = [gl.RGBA32F, gl.RGBA, gl.FLOAT, 4];
     await graphics.whenDone();
     const shaders = this.shaders(), programs = {}, vertexText = readText("whole.vert");
@@ -66,7 +68,7 @@ export class Fields {
     geometry.free();
     graphics.free(programs.geometry.program);
     await this.cache(radiance, (part) => report(0.5 + 0.5 * part));
-    graphics.free(programs.first.program);
+    graphics.free(programs.features.program);
     this.target = graphics.framebuffer(this.colors);
     this.radiance = radiance;
     if (model.background) {
@@ -114,12 +116,12 @@ export class Fields {
 
   // Builds the fragment shaders of all passes.
   shaders() {
-    const { gl, cells, model: { geometry, radiance, sh, background } } = this;
+    const { gl, cells, layers, model: { geometry, radiance, sh, background } } = this;
     // Some devices cannot draw to as many targets as they report, because they limit the bytes per pixel.
-    this.targets = Math.min(cells, gl.getParameter(gl.MAX_DRAW_BUFFERS), gl.getParameter(gl.MAX_COLOR_ATTACHMENTS));
+    this.targets = Math.min(layers, gl.getParameter(gl.MAX_DRAW_BUFFERS), gl.getParameter(gl.MAX_COLOR_ATTACHMENTS));
     while (this.targets > 1 && !this.supports(this.targets)) this.targets >>= 1;
-    const common = ({ decoder: { numbers, places } }) => ({
-      CELLS: cells,
+    const common = ({ levels, decoder: { numbers, places } }) => ({
+      CELLS: cells, LEVELS: levels.length,
       BIAS_1: places.BIAS_1, INPUTS: places.INPUTS, WEIGHTS: places.WEIGHTS,
       ...(this.fitsBlock(numbers) ? { IN_BLOCK: 1 } : {}),
     });
@@ -127,17 +129,16 @@ export class Fields {
       const { BIAS_2, MATRIX_2, BIAS_3, MATRIX_3 } = field.decoder.places;
       return { ...common(field), BIAS_2, MATRIX_2, BIAS_3, MATRIX_3 };
     };
-    const placed = ({ levels }) => ({ PLACES: 1, LEVELS: levels.length });
+    const placed = { PLACES: 1 };
     const directions = radiance.decoder.places.INPUTS + 4 * cells * radiance.levels.length;
     const turned = { DIRECTIONS: directions, ...(sh ? { HARMONICS: 1 } : {}) };
-    const parted = { CELLS: this.targets, ALL_CELLS: cells };
     const shaders = {
-      geometry: buildFieldShader("geometry.frag", { ...deep(geometry), ...placed(geometry) }),
-      first: buildFieldShader("first.frag", { ...common(radiance), ...placed(radiance), ...parted }),
+      geometry: buildFieldShader("geometry.frag", { ...deep(geometry), ...placed }),
+      features: buildFieldShader("features.frag", { ...common(radiance), ...placed, CELLS: this.targets }),
       colors: buildFieldShader("colors.frag", { ...deep(radiance), ...turned }),
     };
     if (!background) return shaders;
-    const constants = { ...deep(radiance), ...placed(radiance), ...turned, BACKGROUND: 1 };
+    const constants = { ...deep(radiance), ...placed, ...turned, BACKGROUND: 1 };
     for (const name of ["panorama", "sky"]) shaders[name] = buildFieldShader(`${name}.frag`, constants);
     return shaders;
   }
@@ -145,7 +146,7 @@ export class Fields {
   // Returns whether the device can draw to `count` layers in one pass.
   supports(count) {
     const { gl, graphics } = this;
-    const framebuffer = graphics.framebuffer(...Array.from({ length: count }, (_, k) => [this.cached, k]));
+    const framebuffer = graphics.framebuffer(...Array.from({ length: count }, (_, k) => [this.features, k]));
     const whole = gl.checkFramebufferStatus(gl.FRAMEBUFFER) === gl.FRAMEBUFFER_COMPLETE;
     graphics.free(framebuffer);
     return whole;
@@ -195,14 +196,14 @@ export class Fields {
     graphics.free(target);
   }
 
-  // Evaluates the view-independent part of the colour decoder's first layer for all Gaussians.
+  // Evaluates the hash features of all Gaussians, from which colours are computed.
   async cache(field, report) {
-    const { gl, graphics, cells, targets } = this, pace = new WorkPacer(), passes = Math.ceil(cells / targets);
+    const { gl, graphics, layers, targets } = this, pace = new WorkPacer(), passes = Math.ceil(layers / targets);
     for (let number = 0; number < passes; number++) {
-      const start = number * targets, layers = Math.min(targets, cells - start);
-      const target = graphics.framebuffer(...Array.from({ length: layers }, (_, k) => [this.cached, start + k]));
+      const start = number * targets, count = Math.min(targets, layers - start);
+      const target = graphics.framebuffer(...Array.from({ length: count }, (_, k) => [this.features, start + k]));
       await pace.run(graphics, this.count ? this.height : 0, (first, last) => {
-        const p = this.use("first", field);
+        const p = this.use("features", field);
         graphics.bind(p, { u_places: this.places }, gl.TEXTURE_2D, 1);
         gl.uniform1i(p.u_first, start);
         this.pass(target, first, last);
@@ -233,7 +234,7 @@ export class Fields {
   color(rows, eye) {
     const { gl, graphics } = this, p = this.use("colors", this.radiance);
     graphics.bind(p, { u_places: this.places, u_logits: this.logits });
-    graphics.bind(p, { u_cached: this.cached }, gl.TEXTURE_2D_ARRAY, 2);
+    graphics.bind(p, { u_features: this.features }, gl.TEXTURE_2D_ARRAY, 2);
     gl.uniform3fv(p.u_eye, eye);
     const sorted = [...rows].sort((a, b) => a - b);
     for (let k = 0, start = 0; k < sorted.length; k++) {

@@ -16,7 +16,7 @@ void main() {
     vec4 own = texelFetch(u_explicit, place, 0);
     float logit = texelFetch(u_logits, place, 0).w;
     begin(BIAS_1);
-    add_place(own.xyz, INPUTS, 2 * CELLS);
+    add_place(own.xyz);
     rectify();
     vec4 first = WEIGHT(BIAS_3), last = WEIGHT(BIAS_3 + 1);
     for (int group = 0; group < 2 * CELLS; ++group) {
