@@ -4,8 +4,9 @@
     python -m tools.studies.viewer_comparison MODEL.hyrf --viewers viewers --repeats 3
 
 The player gets the `.hyrf` file and each other viewer the format that suits it, all written by `hyrfpack export` from
-the same model: Spark .spz, SuperSplat .sog and GaussianSplats3D .ply. All start at the same camera, in the same window,
-in a new Chromium each time, and take turns. A row has:
+the same model: Spark .spz, SuperSplat .sog and GaussianSplats3D .ply. The file is also drawn inside three.js by
+`examples/three`. All start at the same camera, in the same window, in a new Chromium each time, and take turns. A row
+has:
 
 - script: bytes of scripts, styles and pages that the viewer fetches, each compressed by gzip
 - scene: bytes of the file of the scene
@@ -38,6 +39,7 @@ from dataclasses import dataclass, fields
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
@@ -61,7 +63,9 @@ EXACT_SETTINGS = hyrfpack.RenderSettings(background_threshold=0, background_stri
 STILL_SECONDS = 8.0  # a page whose screen has not changed for this long is complete
 PAGE_TIMEOUT_SECONDS = 300.0
 ORBIT_SECONDS = 6.0
-ESBUILD = Path(__file__).parents[2] / "tests" / "node" / "node_modules" / ".bin" / "esbuild"  # after `make player`
+REPOSITORY_ROOT = Path(__file__).parents[2]
+DECODER_FOLDER = REPOSITORY_ROOT / "hyrfpack" / "web" / "hyrf"
+ESBUILD = REPOSITORY_ROOT / "tests" / "node" / "node_modules" / ".bin" / "esbuild"  # after `make player`
 SCRIPT_SUFFIXES = (".js", ".mjs", ".css", ".html", ".wasm")
 
 # Counts frames in which a WebGL draw call was made, and records tasks of the main thread above 50 ms.
@@ -86,12 +90,11 @@ OBSERVER_SCRIPT = """
 BUNDLED_PAGE = """<!DOCTYPE html><meta charset="utf-8">
 <style>html, body { margin: 0; height: 100%%; overflow: hidden; background: black; }</style>
 <body><script type="module" src="%s.js"></script>"""
-# Both scripts get the position, the target and the field of view of the camera. Three's world has y up: the first
-# script gets a file with y up, the second one turns the camera's up direction.
-SPARK_SCRIPT = """
+# All scripts get the position, the target and the field of view of the camera. Three's world has y up: the first two
+# scripts turn the camera about x, and the object or the file likewise; the last one turns the camera's up direction.
+THREE_SCRIPT = """
 import * as THREE from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
-import { SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
 const camera = new THREE.PerspectiveCamera(%(fov)s, innerWidth / innerHeight, 0.01, 1e5);
 camera.position.set(%(x)s, -(%(y)s), -(%(z)s));
 const renderer = new THREE.WebGLRenderer({ antialias: false });
@@ -99,10 +102,25 @@ renderer.setSize(innerWidth, innerHeight);
 document.body.append(renderer.domElement);
 const scene = new THREE.Scene(), controls = new OrbitControls(camera, renderer.domElement);
 controls.target.set(%(tx)s, -(%(ty)s), -(%(tz)s));
-const splats = new SplatMesh({ url: "scene.spz" });
-scene.add(new SparkRenderer({ renderer }), splats);
 renderer.setAnimationLoop(() => { controls.update(); renderer.render(scene, camera); });
 """
+OBJECT_SCRIPT = (
+    'import { HyrfObject } from "%(examples)s/three/hyrf-object.js";'
+    + THREE_SCRIPT
+    + """
+const createWorker = () => new Worker("remote_worker.js", { type: "module" });
+const object = await HyrfObject.load("player/scene.hyrf", { createWorker });
+object.quaternion.set(1, 0, 0, 0);
+scene.add(object);
+"""
+)
+SPARK_SCRIPT = (
+    'import { SparkRenderer, SplatMesh } from "@sparkjsdev/spark";'
+    + THREE_SCRIPT
+    + """
+scene.add(new SparkRenderer({ renderer }), new SplatMesh({ url: "scene.spz" }));
+"""
+)
 SPLATS3D_SCRIPT = """
 import * as GaussianSplats3D from "@mkkellogg/gaussian-splats-3d";
 const viewer = new GaussianSplats3D.Viewer({
@@ -157,12 +175,14 @@ class Viewer:
         name: its name in the table.
         address: path and query of its page on the server, with the camera.
         scene_file: name of the file of the scene that the page fetches.
+        settled: JavaScript that is true when the picture is final; the screen has to be still, too.
         prepare: JavaScript that runs in the complete page before frames are counted.
     """
 
     name: str
     address: str
     scene_file: str
+    settled: str = "true"
     prepare: str = "0"
 
 
@@ -205,8 +225,9 @@ def write_site(folder: Path, model: Path, viewers: Path, pose: Pose) -> list[Vie
     Image.new("RGB", (1, 1)).save(folder / "player" / "poster.jpg")  # the picture has to come from the scene
     for name, spz_version in (("scene.spz", 3), ("scene.ply", 4), ("scene.sog", 4)):
         hyrfpack.export_model(model, folder / name, hyrfpack.ExportConfig(spz_version=spz_version))
-    values = pose.to_page_values()
-    for name, script in (("spark", SPARK_SCRIPT), ("splats3d", SPLATS3D_SCRIPT)):
+    values: dict[str, Any] = {**pose.to_page_values(), "examples": REPOSITORY_ROOT / "examples"}
+    bundle_script(f'import "{DECODER_FOLDER / "remote_worker.js"}";', folder / "remote_worker.js", viewers)
+    for name, script in (("three", OBJECT_SCRIPT), ("spark", SPARK_SCRIPT), ("splats3d", SPLATS3D_SCRIPT)):
         bundle_script(script % values, folder / f"{name}.js", viewers)
         (folder / f"{name}.html").write_text(BUNDLED_PAGE % name)
     (folder / "favicon.ico").touch()
@@ -219,13 +240,21 @@ def write_site(folder: Path, model: Path, viewers: Path, pose: Pose) -> list[Vie
     own_camera = quote(json.dumps(camera_to_json(pose.to_camera(*WINDOW_SIZE))))
     supersplat = "viewers/@playcanvas/supersplat-viewer/public/index.html"
     return [
-        Viewer("hyrfpack", f"player/index.html?noui#camera={own_camera}", "player/scene.hyrf", FULL_RESOLUTION_SCRIPT),
+        Viewer(
+            "hyrfpack",
+            f"player/index.html?noui#camera={own_camera}",
+            "player/scene.hyrf",
+            SETTLED_SCRIPT,
+            FULL_RESOLUTION_SCRIPT,
+        ),
+        Viewer("hyrfpack in three.js", "three.html", "player/scene.hyrf"),
         Viewer("Spark", "spark.html", "scene.spz"),
         Viewer("GaussianSplats3D", "splats3d.html", "scene.ply"),
         Viewer("SuperSplat", f"{supersplat}?content=/scene.sog&settings=/settings.json&noui&webgl&noanim", "scene.sog"),
     ]
 
 
+SETTLED_SCRIPT = "hyrfpack.player.idle"
 FULL_RESOLUTION_SCRIPT = "hyrfpack.player.automatic = false"
 SUPERSPLAT_SETTINGS = {
     "version": 2,
@@ -250,6 +279,7 @@ def bundle_script(script: str, path: Path, viewers: Path) -> None:
     entry = path.with_suffix(".entry.js")
     entry.write_text(script)
     command = [ESBUILD, entry, "--bundle", "--minify", "--format=esm", f"--outfile={path}"]
+    command.append(f"--alias:hyrf.js={DECODER_FOLDER}")
     subprocess.run(
         [str(word) for word in [*command, "--log-level=error"]],
         env={**os.environ, "NODE_PATH": str((viewers / "node_modules").resolve())},
@@ -291,10 +321,14 @@ def visit(site: Site, folder: Path, viewer: Viewer, reference: np.ndarray) -> tu
         with browser.record_screen() as frames:
             opened = time.time()
             browser.open(f"{site.address}/{viewer.address}")
-            while not frames or time.time() - max(opened, frames[-1][0]) < STILL_SECONDS:
+            while (
+                not frames
+                or time.time() - max(opened, frames[-1][0]) < STILL_SECONDS
+                or not browser.evaluate(viewer.settled)
+            ):
                 if time.time() - opened > PAGE_TIMEOUT_SECONDS:
                     raise SystemExit(f"{viewer.name}: the picture was not complete after {PAGE_TIMEOUT_SECONDS:.0f} s")
-                time.sleep(0.1)
+                time.sleep(0.2)
             first, complete = find_times(list(frames), opened)
         if errors := browser.list_errors():
             raise SystemExit(f"{viewer.name}: {errors}")
