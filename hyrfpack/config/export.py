@@ -52,6 +52,8 @@ class ExportConfig(ConvertConfig):
         exposure: exposure of baked splats: each as bright as in the photos that see it (local), or one exposure for all
             (consistent). A model without an exposure map gives the same splats with both.
         colmap: write a folder with a COLMAP model: cameras, and centres as points.
+        title: title of a page, a player or a gallery. Default: the name of its file or folder.
+        credit: text below the title of a page or a player, such as the author and the licence.
         voxel: side of the voxels in which a mesh is fused, in world units. Default: 1.5 times the size of a photo's
             pixel on the surface, and at least 1/512 of the mesh.
         faces: reduce a mesh to at most this number of triangles. Default: all.
@@ -61,5 +63,7 @@ class ExportConfig(ConvertConfig):
     baked: bool = False
     exposure: Annotated[str, OneOf(SPLAT_EXPOSURES)] = LOCAL_EXPOSURE
     colmap: bool = False
+    title: str | None = None
+    credit: str = ""
     voxel: Annotated[float | None, Range(MIN_VOXEL, unit="length")] = None
     faces: Annotated[int | None, Range(4)] = None

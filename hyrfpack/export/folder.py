@@ -60,6 +60,8 @@ def export_player(
     *,
     data: Scene | None = None,
     overwrite: bool = True,
+    title: str | None = None,
+    credit: str = "",
 ) -> ExportReport:
     """Write a folder of static files that plays a scene on any web server: a page, the file itself and a poster.
 
@@ -73,6 +75,8 @@ def export_player(
         data: photos of the scene; the poster is rendered from the first camera. Without them it is rendered from a
             camera that the file keeps or suggests.
         overwrite: replace existing files; if False, an existing file is an error.
+        title: title of the page. Default: the name of the source, or of the folder.
+        credit: text below the title, such as the author and the licence.
 
     Raises:
         HyrfError: the file cannot be read, a file cannot be written, or another call is writing into the folder.
@@ -90,17 +94,19 @@ def export_player(
     check_folder(folder, sources, [data], overwrite=True, is_gallery=False)
     with exclusive_folder(folder):
         check_folder(folder, sources, [data], overwrite=overwrite, is_gallery=False)
-        return _write_player(source, _OutputFolder(Path(folder), overwrite), data)
+        return _write_player(source, _OutputFolder(Path(folder), overwrite), data, title, credit)
 
 
-def _write_player(source: StrPath | None, output: _OutputFolder, data: Scene | None) -> ExportReport:
+def _write_player(
+    source: StrPath | None, output: _OutputFolder, data: Scene | None, title: str | None, credit: str
+) -> ExportReport:
     """Write the files of `export_player` into a folder that the caller has locked."""
-    title = _folder_title(output.path)
+    if title is None:
+        title = _folder_title(output.path) if source is None else Path(source).stem
     content = poster = None
     stages = {}
     description, count = "A player of 3D scenes", 0
     if source is not None:
-        title = Path(source).stem
         source = find_playable_file(source)
         scene = _PlayableContent.read(source, data, with_quality=False)
         count = scene.count
@@ -116,7 +122,15 @@ def _write_player(source: StrPath | None, output: _OutputFolder, data: Scene | N
     output.write(README_NAME, encode_readme(title, INDEX_NAME, INDEX_NAME, element=content or "URL"))
     for name, encoded in encode_player_files().items():
         output.write(name, encoded)
-    page = encode_player(title, content=content, poster=poster, description=description, stages=stages, in_folder=True)
+    page = encode_player(
+        title,
+        content=content,
+        poster=poster,
+        description=description,
+        stages=stages,
+        in_folder=True,
+        credit=credit,
+    )
     output.write(INDEX_NAME, page)
     return ExportReport(str(output.path), output.bytes, count, native=source is not None)
 
@@ -127,6 +141,8 @@ def export_gallery(
     *,
     data: Sequence[Scene | None] = (),
     overwrite: bool = True,
+    title: str | None = None,
+    credit: str = "",
 ) -> ExportReport:
     """Write a folder of static files that shows several scenes: a page that lists them, a player, and the files.
 
@@ -136,6 +152,8 @@ def export_gallery(
         data: photos of each scene, or None. Held-out photos score a model, and the list shows the score. Without them
             the list shows how well the model fits its training photos, if the file states it.
         overwrite: replace existing files; if False, an existing file is an error.
+        title: title of the list. Default: the name of the folder.
+        credit: text below the title of each scene.
 
     Raises:
         HyrfError: a file cannot be read or written, or another call is writing into the folder.
@@ -156,10 +174,16 @@ def export_gallery(
     check_folder(folder, sources, scenes, overwrite=True, is_gallery=True)
     with exclusive_folder(folder):
         check_folder(folder, sources, scenes, overwrite=overwrite, is_gallery=True)
-        return _write_gallery(sources, _OutputFolder(Path(folder), overwrite), scenes)
+        return _write_gallery(sources, _OutputFolder(Path(folder), overwrite), scenes, title, credit)
 
 
-def _write_gallery(sources: Sequence[StrPath], output: _OutputFolder, scenes: Sequence[Scene | None]) -> ExportReport:
+def _write_gallery(
+    sources: Sequence[StrPath],
+    output: _OutputFolder,
+    scenes: Sequence[Scene | None],
+    title: str | None,
+    credit: str,
+) -> ExportReport:
     """Write the files of `export_gallery` into a folder that the caller has locked."""
     contents = []
     for source, scene in zip(sources, scenes, strict=True):  # all are read before anything is written
@@ -174,12 +198,13 @@ def _write_gallery(sources: Sequence[StrPath], output: _OutputFolder, scenes: Se
             output.write(poster, encode_poster(shown.poster, "JPEG", MAX_POSTER_BYTES))
         picture = None if shown.poster is None else poster
         cards.append(Card(Path(source).stem, content, picture, shown.count, shown.length, shown.quality))
-    title = _folder_title(output.path)
+    title = _folder_title(output.path) if title is None else title
     pairs = zip(cards, contents, strict=True)
     stages = {card.content: shown.stage for card, shown in pairs if shown.stage}
     for name, encoded in encode_player_files().items():
         output.write(name, encoded)
-    output.write(GALLERY_PLAYER_NAME, encode_player(title, stages=stages, gallery=INDEX_NAME, in_folder=True))
+    page = encode_player(title, stages=stages, gallery=INDEX_NAME, in_folder=True, credit=credit)
+    output.write(GALLERY_PLAYER_NAME, page)
     output.write(GALLERY_STYLE_NAME, encode_gallery_style())
     output.write(README_NAME, encode_readme(title, GALLERY_PLAYER_NAME, INDEX_NAME))
     output.write(INDEX_NAME, encode_gallery(title, cards, GALLERY_PLAYER_NAME))

@@ -97,6 +97,13 @@ def check_request(kind: FileKind, target: str | os.PathLike[str], config: Export
             f"{target}: the folder of a player holds the model file itself and no baked splats",
             fix="with `baked=True`, use a path that ends in .html",
         )
+    texts = {"`title`": config.title, "`credit`": config.credit}
+    given = " and ".join(name for name, text in texts.items() if text)
+    if given and kind not in (HTML_PAGE, PLAYER_FOLDER):
+        raise HyrfError(
+            f"{target}: only pages show a title and a credit",
+            fix=f"leave out {given}, or write a page (.html) or a player's folder",
+        )
     asked = {
         "`degree`": config.degree is not None,
         "`crop`": config.crop is not None,

@@ -72,7 +72,9 @@ def measure_detail(model: HybridModel, cameras: Sequence[Camera]) -> list[float]
     return details
 
 
-def encode_baked_page(loaded: Source, splats: Splats, picture: np.ndarray | None, title: str) -> bytes:
+def encode_baked_page(
+    loaded: Source, splats: Splats, picture: np.ndarray | None, title: str, credit: str = ""
+) -> bytes:
     """Encode a page that shows splats baked from a model.
 
     Args:
@@ -80,23 +82,25 @@ def encode_baked_page(loaded: Source, splats: Splats, picture: np.ndarray | None
         splats: the baked splats.
         picture: (H, 2H, 3) background of the model, see `background_picture`; None for its solid colour.
         title: title of the page.
+        credit: text below the title.
     """
     frame = loaded.model.config.frame
     near, sphere = RenderSettings().near * frame.scale, (frame.center, BACKGROUND_RADIUS * frame.scale)
-    return encode_splats_page(splats, background=picture, near=near, sphere=sphere, **_page_settings(loaded, title))
+    settings = _page_settings(loaded, title, credit)
+    return encode_splats_page(splats, background=picture, near=near, sphere=sphere, **settings)
 
 
-def encode_native_page(loaded: Source, data: bytes, title: str) -> bytes:
+def encode_native_page(loaded: Source, data: bytes, title: str, credit: str = "") -> bytes:
     """Encode a page that contains a model file.
 
     Args:
         loaded: the model with its cameras.
         data: bytes of the `.hyrf` file.
         title: title of the page.
+        credit: text below the title.
     """
-    return encode_model_page(
-        data, count=len(loaded.model), frame=loaded.model.config.frame, **_page_settings(loaded, title)
-    )
+    settings = _page_settings(loaded, title, credit)
+    return encode_model_page(data, count=len(loaded.model), frame=loaded.model.config.frame, **settings)
 
 
 def write_native_page(
@@ -104,15 +108,20 @@ def write_native_page(
     source: str | os.PathLike[str],
     target: str | os.PathLike[str],
     overwrite: bool = True,
+    *,
+    title: str | None = None,
+    credit: str = "",
 ) -> ExportReport:
     """Write a page that contains a model file; `overwrite` is that of `hyrfpack.atomic.pending_file`.
+
+    The title is the name of the file if `title` is None; `credit` is the text below it.
 
     Raises:
         HyrfError: the page cannot be written.
     """
     data = Path(source).read_bytes()
     suggest_compression(source, len(data))
-    page = encode_native_page(loaded, data, Path(target).stem)
+    page = encode_native_page(loaded, data, Path(target).stem if title is None else title, credit)
     written = write_atomic(target, page, overwrite=overwrite)
     return ExportReport(str(written), len(page), len(loaded.model), native=True)
 
@@ -123,11 +132,12 @@ def suggest_compression(source: str | os.PathLike[str], length: int) -> None:
         _LOG.info(f"{source} is copied unchanged, {length:,} bytes; 'hyrfpack compress' makes it smaller")
 
 
-def _page_settings(loaded: Source, title: str) -> dict[str, Any]:
-    """Collect the arguments that both kinds of page share: title, cameras, axes, background colour and poster."""
+def _page_settings(loaded: Source, title: str, credit: str) -> dict[str, Any]:
+    """Collect the arguments that both kinds of page share: texts, cameras, axes, background colour and poster."""
     cameras = page_cameras(loaded)
     return {
         "title": title,
+        "credit": credit,
         "cameras": cameras,
         "up": loaded.up,
         "center": loaded.center,

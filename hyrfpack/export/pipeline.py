@@ -99,14 +99,14 @@ def export_model(
     check_request(kind, target, config)
     source = find_model(source)
     if kind is PLAYER_FOLDER:
-        return export_player(source, target, data=data, overwrite=overwrite)
+        return export_player(source, target, data=data, overwrite=overwrite, title=config.title, credit=config.credit)
     if kind is COLMAP_FOLDER:
         check_place(target, Outputs(source, scene=data, overwrite=True), config.colmap)
     with exclusive_folder(target) if kind is COLMAP_FOLDER else nullcontext():
         check_place(target, Outputs(source, scene=data, overwrite=overwrite), config.colmap)
         loaded = Source.read(source, data)
         if kind is HTML_PAGE and not config.baked:
-            return write_native_page(loaded, source, target, overwrite)
+            return write_native_page(loaded, source, target, overwrite, title=config.title, credit=config.credit)
         if kind in (TRANSFORMS_JSON, COLMAP_FOLDER):
             _check_cameras(loaded, source)
         if kind is TRANSFORMS_JSON:
@@ -177,7 +177,8 @@ def _write_splats(
         data = kind.encode(baked.splats, Hints(loaded.up, camera, config.spz_version))
         shown = kind.decode(data, str(target)), None
     else:
-        data = encode_baked_page(loaded, baked.splats, baked.picture, target.stem)
+        title = target.stem if config.title is None else config.title
+        data = encode_baked_page(loaded, baked.splats, baked.picture, title, config.credit)
         shown = decode_splats_page(data, str(target))
     written = write_atomic(target, data, overwrite=overwrite)
     result = ExportReport(

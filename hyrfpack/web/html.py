@@ -43,6 +43,7 @@ def encode_model_page(
     center: np.ndarray,
     solid: tuple[float, float, float],
     poster: bytes | None = None,
+    credit: str = "",
 ) -> bytes:
     """Return an HTML file that holds a `.hyrf` file and decodes and draws it in a browser with WebGL 2.
 
@@ -59,6 +60,7 @@ def encode_model_page(
         center: (3,) centre of orbits, world units.
         solid: RGB in [0, 1] of the background where the model has no background sphere.
         poster: a WebP picture that is shown while the scene is unpacked; None for none.
+        credit: text below the title, such as the author and the licence.
 
     Returns:
         The file, UTF-8. The same arguments give the same bytes.
@@ -68,9 +70,8 @@ def encode_model_page(
     """
     facts = {"count": count, "center": list(frame.center), "unit": frame.scale, "near": RenderSettings().near}
     scene = _scene_element("hyrf", title, facts, cameras, up, center, solid)
-    return assemble_player_page(
-        title, [scene, *_poster_elements(poster)], _page_description(count, len(data)), payload=data, readers=False
-    )
+    texts, description = [scene, *_poster_elements(poster)], _page_description(count, len(data))
+    return assemble_player_page(title, texts, description, payload=data, readers=False, credit=credit)
 
 
 def encode_splats_page(
@@ -85,6 +86,7 @@ def encode_splats_page(
     near: float,
     sphere: tuple[Sequence[float], float] | None = None,
     poster: bytes | None = None,
+    credit: str = "",
 ) -> bytes:
     """Return an HTML file that shows splats in a browser with WebGL 2; it needs no network and no other file.
 
@@ -100,7 +102,7 @@ def encode_splats_page(
         near: near plane in world units; splats in front of it are not drawn.
         sphere: centre (3,) and radius of the sphere that the background lies on, world units. Directions are relative
             to the centre. None for a background that is infinitely far away.
-        title, cameras, up, center, solid, poster: as for `encode_model_page`.
+        title, cameras, up, center, solid, poster, credit: as for `encode_model_page`.
 
     Returns:
         The file, UTF-8. The same arguments give the same bytes.
@@ -118,7 +120,8 @@ def encode_splats_page(
     if background is not None:
         texts.append(f'<img id="background" alt="" hidden src="{_data_url(_encode_webp(background), "image/webp")}">')
     packed = spz.encode(local, Hints(spz_version=SPZ_VERSION))
-    return assemble_player_page(title, texts, _page_description(len(splats), len(packed)), payload=packed)
+    description = _page_description(len(splats), len(packed))
+    return assemble_player_page(title, texts, description, payload=packed, credit=credit)
 
 
 def extract_payload(page: bytes, name: str) -> tuple[dict, bytes]:

@@ -39,6 +39,7 @@ def encode_player(
     updates: str | None = None,
     gallery: str | None = None,
     in_folder: bool = False,
+    credit: str = "",
 ) -> bytes:
     """Return a page that plays a hosted file, a file that its address names (`?content=URL`), or a dropped file.
 
@@ -56,6 +57,7 @@ def encode_player(
         gallery: address, relative to the page, of the list of scenes that a button leads back to; None for no button.
         in_folder: use the scripts and the style of `encode_player_files`, which must be beside the page, so that the
             page runs on servers whose content security policy is `default-src 'self'`.
+        credit: text below the title, such as the author and the licence.
 
     Returns:
         The file, UTF-8. The same arguments give the same bytes.
@@ -67,7 +69,7 @@ def encode_player(
     if poster is not None:
         texts.append(f'<img id="poster" alt="" src="{html.escape(poster)}">')
     assemble = _assemble_page_in_folder if in_folder else assemble_player_page
-    return assemble(title, texts, description, image=poster, fetches=fetches, gallery=gallery)
+    return assemble(title, texts, description, image=poster, fetches=fetches, gallery=gallery, credit=credit)
 
 
 def encode_player_files() -> dict[str, bytes]:
@@ -89,6 +91,7 @@ def assemble_player_page(
     fetches: str = "",
     readers: bool = True,
     gallery: str | None = None,
+    credit: str = "",
 ) -> bytes:
     """Return the player's page around the elements of a scene, as UTF-8.
 
@@ -101,6 +104,7 @@ def assemble_player_page(
         fetches: sources that the page may fetch from, in the syntax of a content security policy.
         readers: include the readers of splats, which make the page a third larger.
         gallery: address of the list of scenes that a button leads back to; None for no button.
+        credit: text below the title.
     """
     style, script = read_style(), read_script("boot.js")
     main, packed = _pack_scripts("worker.js" if readers else "worker_model.js")
@@ -116,11 +120,18 @@ def assemble_player_page(
         "script": f"<script>{script}</script>",
         "payload": "\n".join(f'<script type="text/plain" class="payload">{block}</script>' for block in blocks),
     }
-    return _fill_page(title, description, image, gallery, values, readers=readers)
+    return _fill_page(title, description, image, gallery, credit, values, readers=readers)
 
 
 def _assemble_page_in_folder(
-    title: str, texts: list[str], description: str, *, image: str | None, fetches: str, gallery: str | None
+    title: str,
+    texts: list[str],
+    description: str,
+    *,
+    image: str | None,
+    fetches: str,
+    gallery: str | None,
+    credit: str,
 ) -> bytes:
     """Return the player's page around the files of `encode_player_files`; arguments as for `assemble_player_page`."""
     values = {
@@ -130,7 +141,7 @@ def _assemble_page_in_folder(
         "script": f'<script src="{SCRIPT_FILE_NAME}"></script>',
         "payload": "",
     }
-    return _fill_page(title, description, image, gallery, values)
+    return _fill_page(title, description, image, gallery, credit, values)
 
 
 def _fill_page(
@@ -138,10 +149,10 @@ def _fill_page(
     description: str,
     image: str | None,
     gallery: str | None,
+    credit: str,
     values: dict[str, str],
     *,
     readers: bool = True,
-    credit: str = "",
 ) -> bytes:
     """Return the player's page from values of its template; other arguments as for `assemble_player_page`."""
     values = values | {

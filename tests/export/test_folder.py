@@ -93,6 +93,16 @@ def test_a_player_without_a_scene_has_no_content(tmp_path):
     assert 'id="content"' not in (tmp_path / "p" / "index.html").read_text()
 
 
+def test_title_and_credit_are_shown_by_players_and_galleries(model_file, splats_file, tmp_path):
+    texts = {"title": "The room", "credit": "Photos: A. & B."}
+    export_model(model_file, tmp_path / "p", ExportConfig(**texts))
+    export_gallery([model_file, splats_file], tmp_path / "g", **texts)
+    for page in ("p/index.html", "g/player.html"):
+        text = (tmp_path / page).read_text()
+        assert "<title>The room</title>" in text and '<p id="credit">Photos: A. &amp; B.</p>' in text
+    assert "<h1>The room</h1>" in (tmp_path / "g" / "index.html").read_text()
+
+
 def test_other_files_in_the_folder_are_kept(model_file, tmp_path):
     (tmp_path / "mine.txt").write_text("mine")
     for _ in range(2):

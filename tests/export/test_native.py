@@ -135,3 +135,11 @@ def test_invalid_files_are_refused_and_nothing_is_written(target, compact_file, 
         with pytest.raises(HyrfFormatError, match=r"^[^\n]*bad\.hyrf: [^\n]*$"):
             export_model(tmp_path / "bad.hyrf", tmp_path / target)
         assert [path.name for path in tmp_path.iterdir()] == ["bad.hyrf"]
+
+
+def test_title_and_credit_are_only_for_pages(model_file, tmp_path):
+    export_model(model_file, tmp_path / "a.html", ExportConfig(title="<Room>", credit="A. B."))
+    page = (tmp_path / "a.html").read_text()
+    assert "<title>&lt;Room&gt;</title>" in page and '<p id="credit">A. B.</p>' in page
+    with pytest.raises(HyrfError, match=r"a\.ply: only pages show a title and a credit; leave out `credit`"):
+        export_model(model_file, tmp_path / "a.ply", ExportConfig(credit="A. B."))

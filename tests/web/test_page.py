@@ -147,6 +147,12 @@ def test_a_player_page_refers_to_its_content_and_poster():
     assert 'id="content"' not in empty and 'id="poster"' not in empty and 'id="scene"' not in empty
 
 
+def test_the_credit_is_shown_below_the_title_and_escaped():
+    for page in (encode_native_page(credit="A <b> & C"), encode_baked_page(credit="A <b> & C")):
+        assert '<p id="credit">A &lt;b&gt; &amp; C</p>' in page.decode()
+    assert '<p id="credit"></p>' in encode_native_page().decode()
+
+
 def test_comments_and_indentation_are_removed_from_shaders():
     text = "// first\nvoid main() { // second\n  x = a / b; // third\n\n}\n"
     assert strip_shader_comments(text) == "void main() {\nx = a / b;\n}"

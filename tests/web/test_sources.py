@@ -44,6 +44,19 @@ def test_a_file_beside_the_player_is_the_default(browser: Browser, host: Site):
     assert browser.evaluate(LOADED_COUNT_JS) == 300
 
 
+def test_the_credit_is_shown_only_with_the_files_of_the_page(browser: Browser, host: Site):
+    host.files["/index.html"] = encode_player("a title", content="some scene.hyrf", credit="Photos: A. B.")
+    visible = "document.getElementById('credit').checkVisibility()"
+    browser.open(f"{host.address}/index.html")
+    browser.evaluate("hyrfpack.ready")
+    assert browser.evaluate(visible)
+    drop_file(browser, host.files["/cloud.spz"], "cloud.spz")
+    wait_until(browser, f"!{visible}")
+    browser.open(f"{host.address}/index.html?content=cloud.spz")
+    browser.evaluate("hyrfpack.ready")
+    assert not browser.evaluate(visible)
+
+
 @pytest.mark.acceptance
 @pytest.mark.smoke
 def test_a_failed_fetch_is_reported_in_one_sentence(browser: Browser, host: Site):

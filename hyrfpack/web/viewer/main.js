@@ -165,6 +165,7 @@ function start() {
     navigation.stop();
     opener.shown = opener.loading;
     panel.describe(detail, opener.shown.title);
+    element("credit").hidden = !(opener.shown.isOwn && isCredited);
     if (opener.shown.isOwn) followNamedCamera();
   });
   player.addEventListener("count", ({ detail }) => panel.setTitle(detail, opener.shown.title));
@@ -207,6 +208,8 @@ function start() {
     panel.describe(embedded, opener.shown.title);
     followNamedCamera();
   }
+  const { isOwn, stage } = findFirstFile(served, parameters), isCredited = Boolean(isOwn || stage);
+  element("credit").hidden = !embedded && !isCredited;
   const ready = opener.openFirst(Boolean(embedded), served, parameters);
   ready.catch((error) => {
     fail(error);
