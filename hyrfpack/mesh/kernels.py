@@ -102,9 +102,7 @@ def fuse_block(low, voxel, truncation, views, poses, lenses, sizes, depth, weigh
                             surface, w = _look_up(depth, weight, width, height, start, u, v, truncation)
                             away = surface - z
                             if w > 0 and away >= -truncation:
-                                # The weight is about the cosine between the axis and the surface's normal, which turns
-                                # the distance along the axis into the distance to the surface's plane.
-                                distance[i, j, k] += np.float32(w * w / 255.0 * min(away / truncation, 1.0))
+                                distance[i, j, k] += np.float32(w * min(away / truncation, 1.0))
                                 total[i, j, k] += np.float32(w)
                     x, y, z = x + step_x, y + step_y, z + step_z
     for i in range(count):
