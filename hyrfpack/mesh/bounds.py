@@ -18,7 +18,7 @@ DEFAULT_VOXEL_PIXELS = 1.5
 MAX_VOXELS_PER_DEFAULT_SIDE = 512
 # Positions along an axis must fit into the keys by which vertices are welded.
 MAX_VOXELS_PER_SIDE = 8000
-PEAK_BYTES_PER_SURFACE_VOXEL = 400  # measured: triangles, and their clean-up
+PEAK_BYTES_PER_SURFACE_VOXEL = 800  # measured 614: triangles, and their clean-up
 
 
 @dataclass(frozen=True)
