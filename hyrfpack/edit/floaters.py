@@ -93,8 +93,14 @@ def _adjusted_opacities(
 
 
 def _squared_error(rgb: Tensor, photo: Tensor, mask: Tensor | None) -> Tensor:
-    errors = (rgb - photo).square()
-    return errors.mean() if mask is None else (errors * mask[..., None]).mean()
+    """Return the mean squared error of a render (H, W, 3), after its channels are scaled to the exposure of the photo.
+
+    Without this, opacities would change to make pictures brighter or darker.
+    """
+    weight = rgb.new_ones(()) if mask is None else mask[..., None].to(rgb)
+    with torch.no_grad():
+        gains = (weight * rgb * photo).sum((0, 1)) / (weight * rgb * rgb).sum((0, 1)).clamp_min(1e-9)
+    return (weight * (gains * rgb - photo).square()).mean()
 
 
 def _share_in_front(
