@@ -12,6 +12,7 @@ const LEVELS_PER_LAYER = 4; // of features, two halves a level
 const MAX_CELLS = 32; // a cell is 8 hidden units; the shaders hold all cells in variables
 const WEIGHTS_TEXTURE_WIDTH = 1024; // of the texture for a decoder's numbers if no uniform block is used
 const WEIGHTS_TEXTURE_UNIT = 6;
+const FIRST_REFRESH_MS = 1000; // after this time a view at rest is drawn again while rows are coloured, then less often
 const MAX_FRESH_TURN_RADIANS = 2e-3; // a larger turn of its viewing direction makes a row's colours stale
 const MOVING_ROWS_DIVISOR = 8; // while moving, a frame colours at most this part of the visible rows
 
@@ -37,9 +38,8 @@ export class Fields {
     this.pace = new WorkPacer();
   }
 
-  // Evaluates everything that does not depend on the view. `eye` is where the first view's is. `report` is called with
-  // the fraction done; it may throw an error to stop the work.
-  async prepare(eye, report) {
+  // Uploads the model, and draws a coarse background for an eye.
+  async prepare(eye) {
     const { gl, graphics, model, height } = this, size = [TEXTURE_WIDTH, height];
     Fields.check(gl, model);
     const words = (...more) => graphics.texture(gl.TEXTURE_2D, gl.RGBA32UI, ...size, ...more);
@@ -55,28 +55,21 @@ export class Fields {
     for (const name of ["enlarge", "needed"]) programs[name] = graphics.program("whole.vert", `${name}.frag`);
     this.programs = programs;
 
-    const explicit = await graphics.table(floats, TEXTURE_WIDTH, model.explicit);
+    this.explicit = await graphics.table(floats, TEXTURE_WIDTH, model.explicit);
     this.logits = await graphics.table(floats, TEXTURE_WIDTH, model.logits);
     model.explicit = model.logits = null; // frees memory; the worker can decode them again
-    const geometry = await this.field(model.geometry), radiance = await this.field(model.radiance);
+    this.geometry = await this.field(model.geometry);
+    this.radiance = await this.field(model.radiance);
     await graphics.whenDone();
     this.checkMemory();
     await graphics.compiled(programs);
 
-    await this.shape(geometry, explicit, (part) => report(0.5 * part));
-    graphics.free(explicit);
-    geometry.free();
-    graphics.free(programs.geometry.program);
-    await this.cache(radiance, (part) => report(0.5 + 0.5 * part));
-    graphics.free(programs.features.program);
-    this.target = graphics.framebuffer(this.colors);
-    this.radiance = radiance;
+    this.createTargets();
+    this.pending = new Set(Array.from({ length: this.count ? height : 0 }, (_, row) => row)); // not evaluated yet
     if (model.background) {
       this.panorama = new Panorama(graphics, model, (...area) => this.drawPanorama(...area));
       await this.panorama.begin(eye, programs.enlarge);
       this.sky = new Sky(graphics, programs.needed, (...area) => this.drawSky(...area));
-    } else {
-      radiance.freeTable();
     }
   }
 
@@ -166,10 +159,14 @@ export class Fields {
     return p;
   }
 
-  // Draws a pass to rows of its target.
-  pass(target, first, last) {
-    const wide = this.height === 1 ? this.count : TEXTURE_WIDTH;
-    this.area(target, [TEXTURE_WIDTH, this.height], [0, first, wide, last - first]);
+  // Draws a pass to rows of its target. Adjacent rows are drawn together.
+  passes(target, rows) {
+    const wide = this.height === 1 ? this.count : TEXTURE_WIDTH, sorted = [...rows].sort((a, b) => a - b);
+    for (let k = 0, start = 0; k < sorted.length; k++) {
+      if (sorted[k + 1] === sorted[k] + 1) continue;
+      this.area(target, [TEXTURE_WIDTH, this.height], [0, sorted[start], wide, k + 1 - start]);
+      start = k + 1;
+    }
   }
 
   // Draws a pass to a part (x, y, width, height in pixels) of its target.
@@ -183,33 +180,44 @@ export class Fields {
     gl.disable(gl.SCISSOR_TEST);
   }
 
-  // Evaluates the positions, opacities, scales and rotations of all Gaussians.
-  async shape(field, explicit, report) {
-    const { gl, graphics, model } = this, target = graphics.framebuffer(this.places, this.shapes);
-    await new WorkPacer().run(graphics, this.count ? this.height : 0, (first, last) => {
-      const p = this.use("geometry", field);
-      graphics.bind(p, { u_explicit: explicit, u_logits: this.logits }, gl.TEXTURE_2D, 1);
-      gl.uniform1i(p.u_product, model.product);
-      gl.uniform1i(p.u_grows, model.grows);
-      this.pass(target, first, last);
-    }, { report });
-    graphics.free(target);
+  // Evaluates what no view changes: positions, opacities, scales, rotations and hash features of the Gaussians of rows.
+  // Until then they are transparent.
+  evaluate(rows) {
+    const { gl, graphics, model, geometry, targets } = this;
+    const fresh = rows.filter((row) => this.pending.delete(row));
+    if (!fresh.length) return;
+    const p = this.use("geometry", geometry);
+    graphics.bind(p, { u_explicit: this.explicit, u_logits: this.logits }, gl.TEXTURE_2D, 1);
+    gl.uniform1i(p.u_product, model.product);
+    gl.uniform1i(p.u_grows, model.grows);
+    this.passes(this.geometryTarget, fresh);
+    const q = this.use("features", this.radiance);
+    graphics.bind(q, { u_places: this.places }, gl.TEXTURE_2D, 1);
+    this.featureTargets.forEach((target, number) => {
+      gl.uniform1i(q.u_first, number * targets);
+      this.passes(target, fresh);
+    });
+    if (!this.pending.size) this.freeInputs();
   }
 
-  // Evaluates the hash features of all Gaussians, from which colours are computed.
-  async cache(field, report) {
-    const { gl, graphics, layers, targets } = this, pace = new WorkPacer(), passes = Math.ceil(layers / targets);
-    for (let number = 0; number < passes; number++) {
+  // Creates the targets of `evaluate`.
+  createTargets() {
+    const { graphics, layers, targets } = this;
+    this.target = graphics.framebuffer(this.colors);
+    this.geometryTarget = graphics.framebuffer(this.places, this.shapes);
+    this.featureTargets = Array.from({ length: Math.ceil(layers / targets) }, (_, number) => {
       const start = number * targets, count = Math.min(targets, layers - start);
-      const target = graphics.framebuffer(...Array.from({ length: count }, (_, k) => [this.features, start + k]));
-      await pace.run(graphics, this.count ? this.height : 0, (first, last) => {
-        const p = this.use("features", field);
-        graphics.bind(p, { u_places: this.places }, gl.TEXTURE_2D, 1);
-        gl.uniform1i(p.u_first, start);
-        this.pass(target, first, last);
-      }, { report: (part) => report((number + part) / passes) });
-      graphics.free(target);
-    }
+      return graphics.framebuffer(...Array.from({ length: count }, (_, k) => [this.features, start + k]));
+    });
+  }
+
+  // Frees the objects that only `evaluate` needs.
+  freeInputs() {
+    const { graphics, programs, geometry, radiance } = this;
+    geometry.free();
+    if (!this.panorama) radiance.freeTable();
+    const objects = [this.explicit, this.geometryTarget, ...this.featureTargets];
+    for (const object of [...objects, programs.geometry.program, programs.features.program]) graphics.free(object);
   }
 
   // Draws a part (x, y, width, height in pixels) of a panorama.
@@ -230,57 +238,60 @@ export class Fields {
     this.area(target, [view.width, view.height], part);
   }
 
-  // Evaluates the colours of rows. Adjacent rows are drawn together.
+  // Evaluates the colours of rows, and what else is missing of them.
   color(rows, eye) {
+    this.evaluate(rows);
     const { gl, graphics } = this, p = this.use("colors", this.radiance);
     graphics.bind(p, { u_places: this.places, u_logits: this.logits });
     graphics.bind(p, { u_features: this.features }, gl.TEXTURE_2D_ARRAY, 2);
     gl.uniform3fv(p.u_eye, eye);
-    const sorted = [...rows].sort((a, b) => a - b);
-    for (let k = 0, start = 0; k < sorted.length; k++) {
-      this.rows.colored(sorted[k], eye);
-      if (sorted[k + 1] === sorted[k] + 1) continue;
-      this.pass(this.target, sorted[start], sorted[k] + 1);
-      start = k + 1;
-    }
+    for (const row of rows) this.rows.colored(row, eye);
+    this.passes(this.target, rows);
   }
 
-  // Colours, while the view moves, all rows without colours and then the stalest rows, for about `ms`; then draws the
+  // Colours, while the view moves, rows without colours and then the stalest rows, for about `ms`; then draws the
   // background for about `ms`.
   recolor(view, margin, ms) {
-    const { visible, rows, fresh } = this.rows.stale(frustumPlanes(view, margin), view.eye, MAX_FRESH_TURN_RADIANS);
-    const most = Math.max(fresh, Math.min(this.pace.within(ms), Math.ceil(visible / MOVING_ROWS_DIVISOR)));
+    const { visible, rows } = this.rows.stale(frustumPlanes(view, margin), view.eye, MAX_FRESH_TURN_RADIANS);
+    const most = Math.min(this.pace.within(ms), Math.ceil(visible / MOVING_ROWS_DIVISOR));
     if (rows.length) this.color(rows.slice(0, most), view.eye);
     this.panorama?.advance(view, ms);
   }
 
   // Colours all stale rows in view while `goOn()` is true. If `exact`, any turn of the viewing direction makes colours
-  // stale. Returns {rows: their number, done: whether all were coloured}.
-  async coloured(view, margin, { goOn, exact = false }) {
+  // stale. `report` is called with the fraction done. Returns {rows: their number, done: whether all were coloured}.
+  async coloured(view, margin, { goOn, report, exact = false }) {
     const { rows } = this.rows.stale(frustumPlanes(view, margin), view.eye, exact ? 0 : MAX_FRESH_TURN_RADIANS);
-    return { rows: rows.length, done: await this.coloring(rows, view.eye, goOn) };
+    return { rows: rows.length, done: await this.coloring(rows, view.eye, { goOn, report }) };
   }
 
   // Colours rows in slices while `goOn()` is true. Returns whether all were coloured.
-  coloring(rows, eye, goOn) {
+  coloring(rows, eye, { goOn, report }) {
     const work = (first, last) => this.color(rows.slice(first, last), eye);
-    return this.pace.run(this.graphics, rows.length, work, { goOn });
+    return this.pace.run(this.graphics, rows.length, work, { goOn, report });
   }
 
   // Completes the picture of a still view while `goOn()` is true: colours all rows in view, and evaluates the
-  // background. `blended` has the splats of this view, {texture, used: its size in use}. `changed` is called when the
-  // picture has improved. Returns whether it is complete.
-  async complete(view, margin, { blended, goOn = () => true, changed = () => {}, exact = false }) {
-    this.sky?.begin(view, blended);
-    const { rows, done } = await this.coloured(view, margin, { goOn, exact });
+  // background. `blend(view)` blends the splats of a view and returns {texture, used: its size in use}. `changed` is
+  // called when the picture has improved. Returns whether it is complete.
+  async complete(view, margin, { blend, goOn = () => true, changed = () => {}, exact = false }) {
+    let shownAt = performance.now(), pause = FIRST_REFRESH_MS;
+    const report = () => {
+      if (performance.now() < shownAt + pause) return;
+      changed();
+      [shownAt, pause] = [performance.now(), 2 * pause];
+    };
+    const { rows, done } = await this.coloured(view, margin, { goOn, report, exact });
     if (rows) changed();
-    return done && (!this.sky || this.sky.complete({ goOn, changed }));
+    if (!done || !this.sky) return done;
+    this.sky.begin(view, blend);
+    return this.sky.complete({ goOn, changed });
   }
 
   // Evaluates, while `goOn()` is true, what other views will need: the panorama, and colours of rows out of view.
   async lookAhead(view, goOn) {
     await this.panorama?.complete(view, goOn);
-    await this.coloring(this.rows.fresh(), view.eye, goOn);
+    await this.coloring(this.rows.fresh(), view.eye, { goOn });
   }
 
   dispose() {

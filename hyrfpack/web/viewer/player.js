@@ -22,6 +22,7 @@ import { Splats } from "./splats.js";
 
 const SETTLE_MS = 200; // the wait after a movement before the picture is drawn at full resolution
 const TARGET_FRAME_MS = 33; // slower frames lower the resolution while moving
+const FIRST_PICTURE_MS = 2000; // after this time Gaussians that are ready are shown
 const QUICK_FRAME_MS = 20; // frames that take less are shown at once
 const MIN_SCALE = 0.2;
 const MAX_PIXEL_RATIO = 2; // device pixels per CSS pixel
@@ -187,11 +188,13 @@ export class Player extends EventTarget {
       if (model) {
         content = new Fields(gl, model);
         const view = this.view(loader.update && sameAxes(this.scene, scene) ? this.eye : initial?.eye);
-        await content.prepare(view.eye, (part) => {
-          if (!this.wanted(loader)) throw new SupersededError();
-          this.progress(loader, "preparing", part);
+        await content.prepare(view.eye);
+        // The first picture is shown before it is complete, but a picture is replaced by complete ones only.
+        const end = this.loaded ? Infinity : performance.now() + FIRST_PICTURE_MS;
+        await content.coloured(view, scene.tolerance, {
+          goOn: () => this.wanted(loader) && performance.now() < end,
+          report: (part) => this.progress(loader, "preparing", part),
         });
-        await content.coloured(view, scene.tolerance, { goOn: () => this.wanted(loader) });
       } else {
         content = new Splats(gl, splats);
         await content.prepare();
@@ -437,7 +440,7 @@ export class Player extends EventTarget {
     this.finishing = true;
     const { moves } = this, { content } = this.renderer;
     const goOn = () => this.loaded && !this.paused && this.moves === moves && this.renderer.content === content;
-    const options = { goOn, changed: () => this.redraw(), blended: this.renderer.blended };
+    const options = { goOn, changed: () => this.redraw(), blend: (view) => this.renderer.blended(view) };
     const work = () => content.complete(this.view(), this.scene.tolerance, options);
     const whole = await this.enqueue(work).catch((error) => {
       this.emit("failed", error);
@@ -558,8 +561,7 @@ export class Player extends EventTarget {
         this.setOrder(sorted);
       };
       await sort();
-      this.renderer.splats(view);
-      await content.complete(view, this.scene.tolerance, { exact: true, blended: this.renderer.blended });
+      await content.complete(view, this.scene.tolerance, { exact: true, blend: (seen) => this.renderer.blended(seen) });
       await sort(); // meanwhile frames of the window may have got another order
       return this.renderer.read(view, this.gains(view));
     });

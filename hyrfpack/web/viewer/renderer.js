@@ -179,7 +179,6 @@ export class Renderer {
     const { gl, graphics, blend } = this, { width, height } = view;
     this.projections(view, pick);
     this.reserve(width, height);
-    this.used = [width, height];
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.layers);
     gl.viewport(0, 0, width, height);
     gl.enable(gl.SCISSOR_TEST);
@@ -201,9 +200,10 @@ export class Renderer {
     gl.disable(gl.SCISSOR_TEST);
   }
 
-  // Returns the picture of the splats that was blended last, and its size in use.
-  get blended() {
-    return { texture: this.layered, used: this.used };
+  // Blends the splats of a view. Returns their picture, and its size in use.
+  blended(view) {
+    this.splats(view);
+    return { texture: this.layered, used: [view.width, view.height] };
   }
 
   // Projects all splats of a view.

@@ -22,10 +22,10 @@ export class Sky {
     return this.key === describeView(view) ? this.texture : null;
   }
 
-  // Starts a view. For `blended` see Fields.complete.
-  begin(view, blended) {
+  // Starts a view. For `blend` see Fields.complete.
+  begin(view, blend) {
     if (this.of(view)) return;
-    const { gl } = this.graphics, { width, height } = view;
+    const { gl } = this.graphics, { width, height } = view, blended = blend(view);
     this.reserve(width, height);
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.target);
     gl.clearColor(0, 0, 0, 0);
