@@ -23,6 +23,7 @@ import { Splats } from "./splats.js";
 const SETTLE_MS = 200; // the wait after a movement before the picture is drawn at full resolution
 const TARGET_FRAME_MS = 33; // slower frames lower the resolution while moving
 const FIRST_PICTURE_MS = 2000; // after this time Gaussians that are ready are shown
+const FIRST_PICTURE_REST_MS = 250; // the device does nothing else while the browser shows the first picture
 const QUICK_FRAME_MS = 20; // frames that take less are shown at once
 const MIN_SCALE = 0.2;
 const MAX_PIXEL_RATIO = 2; // device pixels per CSS pixel
@@ -415,7 +416,9 @@ export class Player extends EventTarget {
       if (this.drawnMoves !== this.moves) this.emit("moved");
       this.drawnMoves = this.moves;
     }
-    if (moving || this.began !== null) return this.schedule();
+    // Without an order, the background would be evaluated where splats will hide it.
+    const isNew = performance.now() - this.times.first < FIRST_PICTURE_REST_MS; // false while `first` is null
+    if (moving || this.began !== null || this.loader.busy || isNew) return this.schedule();
     this.took = null;
     this.finish();
   }
