@@ -13,12 +13,14 @@ from hyrfpack.config.train import FIELD_WARMUP_STEPS
 from hyrfpack.errors import HyrfTrainingError
 from hyrfpack.format import decode_model, encode_model
 from hyrfpack.ops.adam import adam_step
-from hyrfpack.render import render_view
+from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.scene import Picture, Scene
 from hyrfpack.train import DensityConfig, LearningRates, TrainConfig, Trainer
+from hyrfpack.train.resolution import MIN_BACKGROUND_STRIDE
 
 # Density control acts after steps 2, 7, 12, 17, 22 and 27, with resets after 12 and 22, all within a short run.
 EARLY_DENSITY_CONFIG = DensityConfig(start=0.05, stop=0.68, peak=0.68, excess=1.0, rounds=5, gradient=1e-5, resets=2)
+TRAINING_SETTINGS = RenderSettings(background_stride=MIN_BACKGROUND_STRIDE)  # on small photos
 SHORT_CONFIG = TrainConfig(steps=40, seed=3, max_gaussians=160, density=EARLY_DENSITY_CONFIG)
 
 
@@ -45,7 +47,7 @@ def mean_training_psnr(trainer: Trainer) -> float:
     values = []
     for view in trainer.scene.train:
         with torch.no_grad():
-            rgb = render_view(trainer.model, view.camera).rgb.double().numpy()
+            rgb = render_view(trainer.model, view.camera, TRAINING_SETTINGS).rgb.double().numpy()
         values.append(-10 * np.log10(np.mean((rgb - view.load().composite()) ** 2)))
     return float(np.mean(values))
 
@@ -256,7 +258,7 @@ def test_reported_errors_are_those_outside_the_mask():
     masked = view_of(view.name, view.camera, Picture(view.load().rgb, None, mask))
     trainer = Trainer(dataclasses.replace(scene, train=[masked]), TrainConfig(steps=1, max_gaussians=80))
     with torch.no_grad():
-        rgb = render_view(trainer.model, view.camera).rgb.double().numpy()
+        rgb = render_view(trainer.model, view.camera, TRAINING_SETTINGS).rgb.double().numpy()
     seen = []
     trainer.run(progress=lambda event: seen.append(event.mse))
     errors = (rgb - view.load().rgb / 255) ** 2
