@@ -293,7 +293,7 @@ def test_opening_many_files_leaks_no_webgl_objects(browser: Browser, tmp_path: P
     open_once = "hyrfpack.player.open({name: 'x.hyrf', stream: (async function* () { yield file.slice(); })()})"
     counts = []
     for _ in range(5):
-        browser.evaluate(f"{open_once}.then(() => true)")
+        browser.evaluate(f"{open_once}.then(() => hyrfpack.player.settled).then(() => true)")
         counts.append(browser.evaluate("window.count"))
     assert len(set(counts[1:])) == 1
     assert browser.evaluate("hyrfpack.player.scene.count") == 200
