@@ -153,7 +153,7 @@ def _radiance(
     color = np.empty_like(directions)
     sky = hit < 0
     color[:, sky] = _sky_color(directions[:, sky], noise)
-    for index in range(len(SOLIDS) + 1):
+    for index in range(len(SOLID_SHAPES) + 1):
         rays = np.flatnonzero(hit == index)
         if rays.size:
             points = origins[:, rays] + directions[:, rays] * distance[rays]
@@ -171,11 +171,11 @@ def _shade(
     bounces: int,
 ) -> np.ndarray:
     """Return the linear light (3, N) from points of one surface, whose index is that of `find_nearest_hit`."""
-    if index == len(SOLIDS):
+    if index == len(SOLID_SHAPES):
         normals = np.broadcast_to(np.array([[0], [0], [1]], np.float32), points.shape)
         albedo, reflectance, metal = _ground_albedo(points, distance, noise), 0.0, False
     else:
-        solid = SOLIDS[index]
+        solid = SOLID_SHAPES[index]
         normals, coordinates = _normals_and_coordinates(solid, points)
         albedo, reflectance, metal = solid.texture(coordinates, noise), solid.reflectance, solid.metal
     lifted = points + normals * np.float32(2e-3)
@@ -219,8 +219,8 @@ def find_nearest_hit(origins: np.ndarray, directions: np.ndarray) -> tuple[np.nd
     """
     down = directions[2] < -1e-6
     distance = np.where(down, -origins[2] / np.where(down, directions[2], -1), NO_HIT_DISTANCE)
-    hit = np.where(down, len(SOLIDS), -1)
-    for index, solid in enumerate(SOLIDS):
+    hit = np.where(down, len(SOLID_SHAPES), -1)
+    for index, solid in enumerate(SOLID_SHAPES):
         near = _intersect(solid, origins, directions)
         closer = near < distance
         distance[closer], hit[closer] = near[closer], index
@@ -230,7 +230,7 @@ def find_nearest_hit(origins: np.ndarray, directions: np.ndarray) -> tuple[np.nd
 def _is_blocked(origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Return whether a solid lies on each ray."""
     blocked = np.zeros(origins.shape[1], bool)
-    for solid in SOLIDS:
+    for solid in SOLID_SHAPES:
         blocked |= _intersect(solid, origins, directions) < NO_HIT_DISTANCE
     return blocked
 
@@ -278,7 +278,7 @@ def _normals_and_coordinates(solid: Solid, points: np.ndarray) -> tuple[np.ndarr
 def _open_sky_share(points: np.ndarray, normals: np.ndarray, index: int) -> np.ndarray:
     """Return the share (N,) of the sky that the other solids leave open, each approximated by a sphere."""
     free = np.ones(points.shape[1], np.float32)
-    for other, solid in enumerate(SOLIDS):
+    for other, solid in enumerate(SOLID_SHAPES):
         if other != index:
             toward = np.array(solid.center, np.float32)[:, None] - points
             squared = np.maximum(_dot(toward, toward), 1e-4)
@@ -364,7 +364,7 @@ def _stripes(coordinates: np.ndarray, noise: np.ndarray) -> np.ndarray:
     )
 
 
-SOLIDS = (
+SOLID_SHAPES = (
     Solid((-0.72, -0.28, 0.5), (0.5, 0.5, 0.5), _uniform_color((0.50, 0.015, 0.02)), reflectance=0.07),
     Solid((0.42, -0.78, 0.36), (0.36, 0.36, 0.36), _uniform_color((0.95, 0.60, 0.18)), metal=True),
     Solid((0.48, 0.48, 0.45), (0.27, 0.27, 0.45), _wood, box=True, yaw=0.5),

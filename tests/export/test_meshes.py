@@ -20,7 +20,7 @@ from hyrfpack.mesh.files import MESH_EXTENSIONS, encode_mesh
 from tools.safety.train_golden import DEMO_MODEL_FILE
 
 # A tetrahedron; the scene's up is -y, as in most reconstructions.
-TETRAHEDRON = Mesh(
+TETRAHEDRON_MESH = Mesh(
     np.array([[0, 0, 0], [1, 0, 0], [0, -2, 0], [0, 0, 3.0]]),
     np.array([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]]),
     np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [188, 188, 188]], np.uint8),
@@ -37,15 +37,15 @@ def read_mesh(data: bytes, extension: str) -> trimesh.Trimesh:
 
 @pytest.mark.parametrize("extension", MESH_EXTENSIONS)
 def test_trimesh_reads_positions_in_world_units(extension):
-    read = read_mesh(encode_mesh(TETRAHEDRON, extension, UP), extension)
+    read = read_mesh(encode_mesh(TETRAHEDRON_MESH, extension, UP), extension)
     corners = np.asarray(read.vertices)[np.asarray(read.faces)]
-    expected = TETRAHEDRON.vertices[TETRAHEDRON.faces] * ((1, -1, -1) if extension == "glb" else (1, 1, 1))
+    expected = TETRAHEDRON_MESH.vertices[TETRAHEDRON_MESH.faces] * ((1, -1, -1) if extension == "glb" else (1, 1, 1))
     np.testing.assert_allclose(corners, expected, atol=1e-6)
     assert read.volume == pytest.approx(1)
 
 
 def test_a_glb_is_upright_with_linear_colours_and_no_light():
-    data = encode_mesh(TETRAHEDRON, "glb", UP)
+    data = encode_mesh(TETRAHEDRON_MESH, "glb", UP)
     read = read_mesh(data, "glb")
     assert read.vertices[:, 1].max() == pytest.approx(2)  # the corner at y = -2, which is up
     (stored,) = trimesh.load_scene(io.BytesIO(data), file_type="glb", process=False).geometry.values()
@@ -56,14 +56,14 @@ def test_a_glb_is_upright_with_linear_colours_and_no_light():
 
 @pytest.mark.parametrize("extension", ["ply", "obj"])
 def test_ply_and_obj_have_srgb_colours(extension):
-    read = read_mesh(encode_mesh(TETRAHEDRON, extension, UP), extension)
-    np.testing.assert_array_equal(read.visual.vertex_colors[:, :3], TETRAHEDRON.colors)
+    read = read_mesh(encode_mesh(TETRAHEDRON_MESH, extension, UP), extension)
+    np.testing.assert_array_equal(read.visual.vertex_colors[:, :3], TETRAHEDRON_MESH.colors)
 
 
 @pytest.mark.parametrize("extension", ["glb", "ply", "obj"])
 def test_a_mesh_far_from_the_origin_keeps_its_shape(extension):
     shift = np.array([4e6, -3e6, 50.0])
-    far = Mesh(TETRAHEDRON.vertices + shift, *list(vars(TETRAHEDRON).values())[1:])
+    far = Mesh(TETRAHEDRON_MESH.vertices + shift, *list(vars(TETRAHEDRON_MESH).values())[1:])
     read = read_mesh(encode_mesh(far, extension, UP), extension)
     edges = np.linalg.norm(read.vertices - read.vertices[0], axis=1)
     np.testing.assert_allclose(edges, [0, 1, 2, 3], atol=0.02 if extension == "obj" else 1e-4)

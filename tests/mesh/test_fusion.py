@@ -17,7 +17,7 @@ from hyrfpack.mesh.fusion import choose_truncation, extract_surface, find_blocks
 from hyrfpack.mesh.kernels import MapArrays
 from hyrfpack.scene import Camera
 
-VOXEL = 0.05
+VOXEL_SIDE = 0.05
 
 
 def camera_at(position: tuple[float, float, float]) -> Camera:
@@ -49,11 +49,11 @@ def plane_map(position: tuple[float, float, float]) -> DepthMap:
     return make_depth_map(camera, depth, np.ones_like(depth, np.float32), np.zeros((*depth.shape, 3), np.uint8))
 
 
-AROUND = [(4, 0, 0), (-4, 0, 0.1), (0, 4, 0), (0.1, -4, 0), (0, 0.1, 4), (0.1, 0, -4)]
-CORNERS = [tuple(2.3 * (2 * bit - 1) for bit in bits) for bits in np.ndindex(2, 2, 2)]
+CAMERA_POSITIONS_ON_AXES = [(4, 0, 0), (-4, 0, 0.1), (0, 4, 0), (0.1, -4, 0), (0, 0.1, 4), (0.1, 0, -4)]
+CAMERA_POSITIONS_AT_CORNERS = [tuple(2.3 * (2 * bit - 1) for bit in bits) for bits in np.ndindex(2, 2, 2)]
 
 
-def fuse(maps: list[DepthMap], grid: Grid, truncation: float = 4 * VOXEL) -> tuple[np.ndarray, np.ndarray]:
+def fuse(maps: list[DepthMap], grid: Grid, truncation: float = 4 * VOXEL_SIDE) -> tuple[np.ndarray, np.ndarray]:
     return extract_surface(MapArrays.pack(maps), grid, find_blocks(maps, grid), truncation, min_weight=100)
 
 
@@ -63,10 +63,10 @@ def normals_of(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def test_a_sphere_is_closed_and_lies_within_a_fifth_of_a_voxel():
-    maps = [sphere_map(position) for position in (*AROUND, *CORNERS)]
-    vertices, faces = fuse(maps, Grid(np.full(3, -1.33), VOXEL, (54, 54, 54)))
+    maps = [sphere_map(position) for position in (*CAMERA_POSITIONS_ON_AXES, *CAMERA_POSITIONS_AT_CORNERS)]
+    vertices, faces = fuse(maps, Grid(np.full(3, -1.33), VOXEL_SIDE, (54, 54, 54)))
     away = np.abs(np.linalg.norm(vertices, axis=1) - 1)
-    assert away.mean() < 0.05 * VOXEL and away.max() < 0.2 * VOXEL
+    assert away.mean() < 0.05 * VOXEL_SIDE and away.max() < 0.2 * VOXEL_SIDE
     assert (normals_of(vertices, faces) * vertices[faces].mean(axis=1)).sum(axis=1).min() > -1e-6
     edges = np.sort(np.concatenate((faces[:, :2], faces[:, 1:], faces[:, [2, 0]])), axis=1)
     _, counts = np.unique(edges, axis=0, return_counts=True)
@@ -75,30 +75,30 @@ def test_a_sphere_is_closed_and_lies_within_a_fifth_of_a_voxel():
 
 def test_a_plane_seen_at_a_slant_lies_within_a_twentieth_of_a_voxel():
     maps = [plane_map(position) for position in ((2, 0, 3), (-2, 1, 3), (0, -3, 2))]
-    vertices, faces = fuse(maps, Grid(np.array([-0.7, -0.7, -0.41]), VOXEL, (28, 28, 16)))
+    vertices, faces = fuse(maps, Grid(np.array([-0.7, -0.7, -0.41]), VOXEL_SIDE, (28, 28, 16)))
     assert len(faces) > 1000
-    assert np.abs(vertices[:, 2]).max() < 0.05 * VOXEL
+    assert np.abs(vertices[:, 2]).max() < 0.05 * VOXEL_SIDE
     assert normals_of(vertices, faces)[:, 2].min() > 0
 
 
 def test_noise_of_depth_is_estimated_and_averaged_out():
-    maps = [sphere_map(position, noise=0.03) for position in (*AROUND, *CORNERS)]
-    grid = Grid(np.full(3, -1.33), VOXEL, (54, 54, 54))
+    maps = [sphere_map(position, noise=0.03) for position in (*CAMERA_POSITIONS_ON_AXES, *CAMERA_POSITIONS_AT_CORNERS)]
+    grid = Grid(np.full(3, -1.33), VOXEL_SIDE, (54, 54, 54))
     # The noise lies along the view axes, which are oblique to the surface.
-    assert 0.5 * 0.03 < fusion.estimate_depth_noise(maps, grid, 8 * VOXEL) < 0.03
+    assert 0.5 * 0.03 < fusion.estimate_depth_noise(maps, grid, 8 * VOXEL_SIDE) < 0.03
     truncation = choose_truncation(maps, grid)
-    assert 3 * VOXEL <= truncation <= 8 * VOXEL
+    assert 3 * VOXEL_SIDE <= truncation <= 8 * VOXEL_SIDE
     vertices, faces = remove_small_components(*fuse(maps, grid, truncation))
     assert np.abs(np.linalg.norm(vertices, axis=1) - 1).mean() < 0.03 / 2
 
 
 def test_space_that_a_camera_sees_to_be_empty_is_carved():
-    clean = [sphere_map(position) for position in (*AROUND, *CORNERS)]
+    clean = [sphere_map(position) for position in (*CAMERA_POSITIONS_ON_AXES, *CAMERA_POSITIONS_AT_CORNERS)]
     floating = sphere_map((4, 0, 0))
     floating.depth[:20, :20], floating.weight[:20, :20] = 2.5, 255  # one camera sees something in front of itself
-    grid = Grid(np.array([-1.33, -1.33, -1.33]), VOXEL, (80, 80, 80))
+    grid = Grid(np.array([-1.33, -1.33, -1.33]), VOXEL_SIDE, (80, 80, 80))
     vertices, _ = fuse([*clean, floating], grid)
-    assert np.abs(np.linalg.norm(vertices, axis=1) - 1).max() < 0.5 * VOXEL
+    assert np.abs(np.linalg.norm(vertices, axis=1) - 1).max() < 0.5 * VOXEL_SIDE
 
 
 def test_jumps_of_single_pixels_are_filtered_out():
@@ -120,7 +120,7 @@ def test_pixels_at_depth_edges_and_grazing_pixels_have_no_weight():
 
 
 def test_voxels_that_are_too_small_are_refused_with_the_memory_that_they_would_need(monkeypatch):
-    maps = [sphere_map(position) for position in AROUND]
+    maps = [sphere_map(position) for position in CAMERA_POSITIONS_ON_AXES]
     monkeypatch.setattr(fusion, "memory_bytes", lambda: 10_000_000)
     with pytest.raises(HyrfError, match=r"would take more than 0\.\d GB, and this machine has 0\.0 GB"):
         find_blocks(maps, Grid(np.full(3, -1.33), 0.01, (266, 266, 266)))
@@ -129,7 +129,12 @@ def test_voxels_that_are_too_small_are_refused_with_the_memory_that_they_would_n
 
 
 def test_the_default_box_holds_what_cameras_see_near_the_centre():
-    grid = choose_grid([sphere_map(position) for position in (*AROUND, *CORNERS)], np.zeros(3), None, None)
+    grid = choose_grid(
+        [sphere_map(position) for position in (*CAMERA_POSITIONS_ON_AXES, *CAMERA_POSITIONS_AT_CORNERS)],
+        np.zeros(3),
+        None,
+        None,
+    )
     high = grid.low + grid.voxel * np.array(grid.shape)
     assert np.abs(grid.low + 1).max() < 0.1 and np.abs(high - 1).max() < 0.1
     assert grid.voxel == pytest.approx(1.5 * 3.2 / 150, rel=0.1)  # 1.5 pixels on the sphere, seen from 4 units
@@ -141,12 +146,12 @@ def test_a_box_without_a_surface_is_refused():
 
 
 def test_small_components_are_removed_and_reduction_keeps_the_shape():
-    maps = [sphere_map(position) for position in (*AROUND, *CORNERS)]
-    vertices, faces = fuse(maps, Grid(np.full(3, -1.33), VOXEL, (54, 54, 54)))
+    maps = [sphere_map(position) for position in (*CAMERA_POSITIONS_ON_AXES, *CAMERA_POSITIONS_AT_CORNERS)]
+    vertices, faces = fuse(maps, Grid(np.full(3, -1.33), VOXEL_SIDE, (54, 54, 54)))
     speck = np.array([[3, 3, 3], [3.01, 3, 3], [3, 3.01, 3]])
     joined = np.concatenate((vertices, speck)), np.concatenate((faces, [[len(vertices) + i for i in range(3)]]))
     kept = remove_small_components(*joined)
     assert len(kept[0]) == len(vertices) and len(kept[1]) == len(faces)
     reduced_vertices, reduced_faces = reduce_faces(vertices, faces, 1000)
     assert 900 <= len(reduced_faces) <= 1000
-    assert np.abs(np.linalg.norm(reduced_vertices, axis=1) - 1).max() < VOXEL
+    assert np.abs(np.linalg.norm(reduced_vertices, axis=1) - 1).max() < VOXEL_SIDE

@@ -9,7 +9,7 @@ from ops.test_blend_weights import SCENE_KINDS, VIEWPORT, make_scene
 from hyrfpack.ops.rasterize import Gaussians3D, RasterSettings, rasterize
 from hyrfpack.ops.rasterize.median_depth import median_depth
 
-IMPLEMENTATIONS = ["reference", "cpu"]
+IMPLEMENTATION_NAMES = ["reference", "cpu"]
 
 
 def in_float64(gaussians: Gaussians3D) -> Gaussians3D:
@@ -28,7 +28,7 @@ def test_the_kernel_agrees_with_the_float64_reference(kind: str, antialiased: bo
     assert agrees.float().mean() > 0.998
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", IMPLEMENTATION_NAMES)
 def test_a_tilted_disc_has_the_depth_of_its_plane(implementation: str) -> None:
     half_turn = torch.tensor(0.5)  # tilt of 1 radian about x
     disc = Gaussians3D(
@@ -54,7 +54,7 @@ def test_a_tilted_disc_has_the_depth_of_its_plane(implementation: str) -> None:
     assert (depth - exact)[near].abs().max() < 0.03  # the centre's own depth would be wrong by up to 0.25
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", IMPLEMENTATION_NAMES)
 def test_a_faint_layer_in_front_does_not_move_the_depth(implementation: str) -> None:
     wide = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).expand(2, 4), torch.full((2, 3), 1.0) * torch.tensor([1.0, 1.0, 1e-3])
     layers = Gaussians3D(torch.tensor([[0.0, 0.0, 2.0], [0.0, 0.0, 5.0]]), wide[0], wide[1], torch.tensor([0.3, 0.99]))
@@ -64,7 +64,7 @@ def test_a_faint_layer_in_front_does_not_move_the_depth(implementation: str) -> 
     assert expected_depth is not None and expected_depth[20, 24] < 4.2
 
 
-@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("implementation", IMPLEMENTATION_NAMES)
 def test_pixels_that_pass_more_than_half_of_the_light_have_no_depth(implementation: str) -> None:
     gaussians = make_scene("a cloud")
     faint = gaussians._replace(opacities=gaussians.opacities * 1e-3)

@@ -8,15 +8,17 @@ from scenes import camera_at, small_model
 from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.render.background_stride import MIN_PREDICTED_PSNR, choose_background_stride
 
-WIDTH, HEIGHT = 128, 96
+WIDTH_PIXELS, HEIGHT_PIXELS = 128, 96
 
 
 def chosen_stride(fields: float, transmittance: float = 1.0) -> int:
     """Return the stride that is chosen for an empty model, whose fields have weights of this size."""
     model = small_model(np.zeros((0, 3)), fields=fields, background=True)
-    camera = camera_at((0, -3.0, 0), (0, -6.0, 0), width=WIDTH, height=HEIGHT, focal=80.0)
+    camera = camera_at((0, -3.0, 0), (0, -6.0, 0), width=WIDTH_PIXELS, height=HEIGHT_PIXELS, focal=80.0)
     viewport = model.config.frame.local_viewport(camera, torch.float32)
-    return choose_background_stride(model, torch.full((HEIGHT, WIDTH), transmittance), viewport, threshold=1 / 512)
+    return choose_background_stride(
+        model, torch.full((HEIGHT_PIXELS, WIDTH_PIXELS), transmittance), viewport, threshold=1 / 512
+    )
 
 
 def test_a_uniform_background_gets_the_largest_stride():
@@ -34,7 +36,7 @@ def test_a_nearly_hidden_background_is_interpolated():
 @pytest.mark.parametrize("fields", [0.05, 0.1, 0.2, 0.4, 0.8, 1.6])
 def test_the_default_is_as_accurate_as_predicted(fields: float):
     model = small_model(np.zeros((0, 3)), fields=fields, background=True)
-    camera = camera_at((0, -3.0, 0), (0, -6.0, 0), width=WIDTH, height=HEIGHT, focal=80.0)
+    camera = camera_at((0, -3.0, 0), (0, -6.0, 0), width=WIDTH_PIXELS, height=HEIGHT_PIXELS, focal=80.0)
     with torch.no_grad():
         found, exact = (
             render_view(model, camera, settings).rgb

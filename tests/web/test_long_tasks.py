@@ -16,7 +16,7 @@ import hyrfpack
 from tools.browser.browser import Browser
 
 GOLDEN_MODEL = Path(__file__).parents[1] / "golden" / "trained" / "demo_compact.hyrf"
-VISITS = 3
+VISIT_COUNT = 3
 WINDOW_SIZE = (640, 400)
 MAX_BLOCKING_MS = 1000  # the sum over all long tasks of their time above 50 ms; many times that if frames are awaited
 OBSERVER_JS = """
@@ -38,7 +38,7 @@ def test_no_long_task_waits_for_the_device_while_loading_and_orbiting(one_browse
     hyrfpack.export_model(GOLDEN_MODEL, page)
     one_browser.resize(*WINDOW_SIZE)
     loading, orbiting, frames = [], [], []
-    for _ in range(VISITS):
+    for _ in range(VISIT_COUNT):
         with one_browser.before_every_page(OBSERVER_JS):
             one_browser.open(page.as_uri())
         one_browser.evaluate("hyrfpack.player.settled.then(() => true)")

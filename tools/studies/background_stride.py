@@ -23,8 +23,8 @@ from hyrfpack.scene import Camera
 from tools.studies.web_player import psnr, stored_cameras
 from tools.tables import markdown_table
 
-STRIDES = (1, 2, 3, 4, None)
-REPEATS = 3
+COMPARED_STRIDES = (1, 2, 3, 4, None)
+REPEAT_COUNT = 3
 
 
 def count_strides(model: hyrfpack.HybridModel, cameras: list[Camera]) -> str:
@@ -48,9 +48,9 @@ def measure(path: Path, cameras: list[Camera]) -> list[list[str]]:
         return lambda: [hyrfpack.render_view(model, camera, settings, decoded=decoded).rgb for camera in cameras]
 
     task(1)()  # compiles kernels
-    times, pictures = time_alternately({str(stride): task(stride) for stride in STRIDES}, REPEATS)
+    times, pictures = time_alternately({str(stride): task(stride) for stride in COMPARED_STRIDES}, REPEAT_COUNT)
     rows = []
-    for stride in STRIDES:
+    for stride in COMPARED_STRIDES:
         scores = [
             psnr(found.numpy(), exact.numpy())
             for found, exact in zip(pictures[str(stride)], pictures["1"], strict=True)

@@ -29,7 +29,7 @@ import trimesh
 from scipy.spatial import cKDTree
 
 import hyrfpack
-from hyrfpack.demo.scene import NO_HIT_DISTANCE, SOLIDS, find_nearest_hit
+from hyrfpack.demo.scene import NO_HIT_DISTANCE, SOLID_SHAPES, find_nearest_hit
 from hyrfpack.export.source import Source
 from hyrfpack.mesh import Mesh, extract_mesh
 from hyrfpack.mesh.depth_maps import render_depth_maps
@@ -101,7 +101,7 @@ def write_maps(source: Source, path: Path) -> None:
 def nearest_surface(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the distance (N,) of points (N, 3) to the demo scene's nearest surface, and its normals (N, 3) there."""
     best, normals = np.abs(points[:, 2]), np.tile((0.0, 0.0, 1.0), (len(points), 1))
-    for solid in SOLIDS:
+    for solid in SOLID_SHAPES:
         local = (points - solid.center) @ solid.object_from_world.T.astype(np.float64)
         half = np.array(solid.half)
         if solid.box:

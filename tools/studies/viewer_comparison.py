@@ -15,7 +15,7 @@ has:
 - frame: CPU milliseconds of all processes of the browser for each drawn frame, while a mouse orbits at full resolution
 - long tasks: number of tasks of the page's main thread above 50 ms until the picture is complete, and the longest, ms
 - heap: megabytes of JavaScript objects and buffers in the page, after a garbage collection; workers are not included
-- likeness: PSNR in dB of the screen's picture against `render_view` without approximations, at the same camera
+- psnr: PSNR in dB of the screen's picture against `render_view` without approximations, at the same camera
 
 Values are medians over the repeats. Times need an otherwise idle machine. Without a GPU the browser draws in software.
 """
@@ -65,7 +65,7 @@ PAGE_TIMEOUT_SECONDS = 300.0
 ORBIT_SECONDS = 6.0
 REPOSITORY_ROOT = Path(__file__).parents[2]
 DECODER_FOLDER = REPOSITORY_ROOT / "hyrfpack" / "web" / "hyrf"
-ESBUILD = REPOSITORY_ROOT / "tests" / "node" / "node_modules" / ".bin" / "esbuild"  # after `make player`
+ESBUILD_PROGRAM = REPOSITORY_ROOT / "tests" / "node" / "node_modules" / ".bin" / "esbuild"  # after `make player`
 SCRIPT_SUFFIXES = (".js", ".mjs", ".css", ".html", ".wasm")
 
 # Counts frames in which a WebGL draw call was made, and records tasks of the main thread above 50 ms.
@@ -164,7 +164,7 @@ class Measurement:
     long_tasks: float
     longest_task_ms: float
     heap_mb: float
-    likeness_db: float
+    psnr_db: float
 
 
 @dataclass(frozen=True)
@@ -175,14 +175,14 @@ class Viewer:
         name: its name in the table.
         address: path and query of its page on the server, with the camera.
         scene_file: name of the file of the scene that the page fetches.
-        settled: JavaScript that is true when the picture is final; the screen has to be still, too.
+        is_final: JavaScript that is true when the picture is final; the screen has to be still, too.
         prepare: JavaScript that runs in the complete page before frames are counted.
     """
 
     name: str
     address: str
     scene_file: str
-    settled: str = "true"
+    is_final: str = "true"
     prepare: str = "0"
 
 
@@ -244,7 +244,7 @@ def write_site(folder: Path, model: Path, viewers: Path, pose: Pose) -> list[Vie
             "hyrfpack",
             f"player/index.html?noui#camera={own_camera}",
             "player/scene.hyrf",
-            SETTLED_SCRIPT,
+            FINAL_PICTURE_SCRIPT,
             FULL_RESOLUTION_SCRIPT,
         ),
         Viewer("hyrfpack in three.js", "three.html", "player/scene.hyrf"),
@@ -254,7 +254,7 @@ def write_site(folder: Path, model: Path, viewers: Path, pose: Pose) -> list[Vie
     ]
 
 
-SETTLED_SCRIPT = "hyrfpack.player.idle"
+FINAL_PICTURE_SCRIPT = "hyrfpack.player.idle"
 FULL_RESOLUTION_SCRIPT = "hyrfpack.player.automatic = false"
 SUPERSPLAT_SETTINGS = {
     "version": 2,
@@ -278,7 +278,7 @@ def bundle_script(script: str, path: Path, viewers: Path) -> None:
     """Write a script with all that it imports, minified."""
     entry = path.with_suffix(".entry.js")
     entry.write_text(script)
-    command = [ESBUILD, entry, "--bundle", "--minify", "--format=esm", f"--outfile={path}"]
+    command = [ESBUILD_PROGRAM, entry, "--bundle", "--minify", "--format=esm", f"--outfile={path}"]
     command.append(f"--alias:hyrf.js={DECODER_FOLDER}")
     subprocess.run(
         [str(word) for word in [*command, "--log-level=error"]],
@@ -324,7 +324,7 @@ def visit(site: Site, folder: Path, viewer: Viewer, reference: np.ndarray) -> tu
             while (
                 not frames
                 or time.time() - max(opened, frames[-1][0]) < STILL_SECONDS
-                or not browser.evaluate(viewer.settled)
+                or not browser.evaluate(viewer.is_final)
             ):
                 if time.time() - opened > PAGE_TIMEOUT_SECONDS:
                     raise SystemExit(f"{viewer.name}: the picture was not complete after {PAGE_TIMEOUT_SECONDS:.0f} s")
@@ -347,7 +347,7 @@ def visit(site: Site, folder: Path, viewer: Viewer, reference: np.ndarray) -> tu
         long_tasks=len(tasks),
         longest_task_ms=max(tasks, default=0.0),
         heap_mb=heap / 1e6,
-        likeness_db=psnr(decode_png(picture), reference),
+        psnr_db=psnr(decode_png(picture), reference),
     ), picture
 
 

@@ -25,7 +25,7 @@ from tools.browser.chromium import Chromium, find
 GOLDEN_FILE = Path(__file__).parents[2] / "golden" / "trained" / "demo_compact.hyrf"
 EXACT = RenderSettings(background_stride=1, background_threshold=0, transmittance_min=0, exposure="consistent")
 SIZE_PIXELS = 240
-MIN_LIKENESS_DB = 50
+MIN_PSNR_DB = 50
 __all__ = ["app_folder"]
 
 
@@ -93,7 +93,7 @@ def test_pictures_of_a_golden_model_are_those_of_the_exact_render(page: Chromium
     ]
     for number, camera in enumerate(cameras):
         picture, reference = draw(page, camera), render(GOLDEN_FILE, camera)
-        assert psnr(picture, reference) > MIN_LIKENESS_DB, number
+        assert psnr(picture, reference) > MIN_PSNR_DB, number
         assert psnr(reference.mean((0, 1)), reference) < 25, "the picture is nearly uniform"
 
 
@@ -115,7 +115,7 @@ def test_tone_mapping_and_render_targets_change_no_color(page: Chromium, app_fol
     camera, reference = first_camera(page), None
     reference = render(app_folder / "balls.hyrf", camera)
     page.evaluate("page.renderer.toneMapping = page.THREE.ACESFilmicToneMapping")
-    assert psnr(draw(page, camera), reference) > MIN_LIKENESS_DB
+    assert psnr(draw(page, camera), reference) > MIN_PSNR_DB
     floats = page.evaluate("page.readLinear()")
     linear = np.reshape(floats, (SIZE_PIXELS, SIZE_PIXELS, 4))[::-1, :, :3]
     encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0) ** (1 / 2.4) - 0.055)

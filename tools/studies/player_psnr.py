@@ -1,6 +1,6 @@
 """Measure how closely the web player's pictures match exact renders, at rest and while the view moves.
 
-    python -m tools.studies.player_likeness runs/street/compact.hyrf runs/bonsai/compact.hyrf --views 8
+    python -m tools.studies.player_psnr runs/street/compact.hyrf runs/bonsai/compact.hyrf --views 8
 
 For cameras that each model stores, the table has the mean and the worst PSNR in dB of the page of `hyrfpack export`
 against `render_view` without any approximation: at rest, and as frames are drawn at a part of the resolution while the
