@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from web.pages import Browser, wait_for_message, wait_until
+from web.pages import Browser, wait_for_message, wait_for_path, wait_until
 from web.site import GOLDEN_FILE_DATA, Site
 
 import hyrfpack
@@ -40,7 +40,8 @@ def test_an_exported_gallery_and_its_player_run_under_a_policy_of_self(browser: 
     browser.open(f"{host.address}/index.html")
     assert browser.evaluate("getComputedStyle(document.querySelector('ul')).display") == "grid", "no style"
     browser.evaluate("document.querySelector('h2 a').click()")
-    wait_until(browser, "location.pathname === '/player.html' && Boolean(window.hyrfpack)")
+    wait_for_path(browser, "/player.html")
+    wait_until(browser, "Boolean(window.hyrfpack)")
     browser.evaluate("hyrfpack.ready")
     assert browser.evaluate("hyrfpack.player.scene.kind") == "hyrf"
 
