@@ -10,7 +10,7 @@ from typing import Annotated
 from hyrfpack.choices import DEFAULT_SPZ_VERSION, LOCAL_EXPOSURE, SPLAT_EXPOSURES, SPZ_VERSIONS
 from hyrfpack.config.settings import OneOf, Range, check_settings
 
-MIN_VOXEL = 1e-12  # world units; smaller ones are not told from zero
+MIN_VOXEL = 1e-12  # world units; smaller ones count as zero
 
 
 @dataclass(frozen=True)
