@@ -11,6 +11,7 @@ import numpy as np
 
 from hyrfpack.cameras.files import camera_from_numbers, camera_to_numbers
 from hyrfpack.cameras.paths import Viewpoint, orbit
+from hyrfpack.cameras.sampling import select_representative_cameras
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Camera, Scene, evenly_spaced
 
@@ -50,22 +51,26 @@ def scene_provenance(scene: Scene) -> dict:
     return kept
 
 
-def quantized_provenance(provenance: dict, scale: float) -> dict:
+def quantized_provenance(provenance: dict, scale: float, points: np.ndarray | None = None) -> dict:
     """Shorten a provenance for small files: round its numbers and replace "cameras" by fewer "coarse_cameras".
 
-    Up to MAX_COARSE_CAMERAS evenly spaced cameras are kept. Their positions are rounded to about
-    scale / COARSE_POSE_STEPS_PER_SCENE_SCALE, which is precise enough to render from there, but not to train. Entries
-    that cannot be read are left out.
+    Up to MAX_COARSE_CAMERAS cameras are kept, which together show the scene about as finely as all of them. Their
+    positions are rounded to about scale / COARSE_POSE_STEPS_PER_SCENE_SCALE, which is precise enough to render from
+    there, but not to train. Entries that cannot be read are left out.
 
     Args:
         provenance: the provenance of a trained model.
         scale: longest half-axis of the scene's frame, in world units.
+        points: (N, 3) the Gaussians' centres in world units; without them, the cameras are evenly spaced.
     """
     kept = {name: value for name, value in provenance.items() if name != "cameras"}
     with suppress(TypeError, ValueError, ArithmeticError, KeyError):
         kept["viewpoint"] = Viewpoint.from_json(provenance["viewpoint"]).to_json(rounded=True)
     with suppress(TypeError, ValueError, ArithmeticError, KeyError):
-        cameras = evenly_spaced([camera_from_numbers(numbers) for numbers in provenance["cameras"]], MAX_COARSE_CAMERAS)
+        cameras = [camera_from_numbers(numbers) for numbers in provenance["cameras"]]
+        cameras = select_representative_cameras(
+            cameras, np.zeros((0, 3)) if points is None else points, scale, MAX_COARSE_CAMERAS
+        )
         farthest = max((float(np.linalg.norm(camera.position)) for camera in cameras), default=0.0)
         # Rounding a rotation moves the camera in proportion to its distance from the origin.
         decimals = (

@@ -6,7 +6,7 @@ import logging
 from pathlib import Path
 from typing import cast
 
-from hyrfpack.cameras.capture import Capture, quantized_provenance
+from hyrfpack.cameras.capture import Capture
 from hyrfpack.checks import check_type
 from hyrfpack.compress.calibrate import measure_calibrated_sensitivity
 from hyrfpack.compress.distortion import DEFAULT_PSNR_DROP_DB, default_distortion
@@ -17,7 +17,7 @@ from hyrfpack.config.compress import CompressConfig
 from hyrfpack.context import RunContext
 from hyrfpack.data import PictureCache
 from hyrfpack.errors import HyrfError
-from hyrfpack.format.codec import load_with_provenance, repack, write_model
+from hyrfpack.format.codec import load_with_provenance, packed_provenance, repack, write_model
 from hyrfpack.format.info import FileReport, describe_file
 from hyrfpack.format.min_file_size import check_target_bytes
 from hyrfpack.format.run_folder import find_model
@@ -103,7 +103,7 @@ def _encode_compact(
     """Encode a file with profile "compact"; return it, the outcome of a search as a sentence, and the sensitivities."""
     ranks = context.ranks or SINGLE_PROCESS
     model, provenance = load_with_provenance(source)
-    kept = quantized_provenance(provenance, model.config.frame.scale)
+    kept = packed_provenance(provenance, model)
     if config.target_bytes is not None:
         check_target_bytes(config.target_bytes, kept, model.exposure)
     model = model.to(context.choose_device())

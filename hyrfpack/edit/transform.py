@@ -85,5 +85,5 @@ def replace_config(model: HybridModel, **changes: Any) -> HybridModel:
     """Return a model with changed fields of its configuration; it shares all parameters with `model`."""
     changed = HybridModel(replace(model.config, **changes), model.gaussians)
     changed.geometry, changed.radiance = model.geometry, model.radiance
-    changed.precision, changed.exposure = model.precision, model.exposure
+    changed.copy_settings(model)
     return changed

@@ -187,8 +187,14 @@ def repack(
     source = find_model(source)
     Outputs(source, overwrite=overwrite).file(target)
     model, provenance = load_with_provenance(source, fraction)
-    stored_provenance = provenance if profile == "raw" else quantized_provenance(provenance, model.config.frame.scale)
+    stored_provenance = provenance if profile == "raw" else packed_provenance(provenance, model)
     return save_model(model, target, profile, stored_provenance, overwrite=overwrite, **settings)
+
+
+def packed_provenance(provenance: dict, model: HybridModel) -> dict:
+    """Shorten the provenance of a model for a compressed file, see `quantized_provenance`."""
+    frame = model.config.frame
+    return quantized_provenance(provenance, frame.scale, frame.to_world(model.gaussians.positions.numpy(force=True)))
 
 
 def load_with_provenance(path: str | os.PathLike[str], fraction: float | None = None) -> tuple[HybridModel, dict]:

@@ -7,7 +7,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
+from hyrfpack.cameras.sampling import PhotoCameras
 from hyrfpack.errors import HyrfFormatError
 from hyrfpack.format import compact, paper, raw
 from hyrfpack.format.arrays import check_rules, group_shapes, parse_config, to_model
@@ -69,7 +71,16 @@ def decode_container(container: Container) -> HybridModel:
         section = container[EXPOSURE]
         with _add_error_context(container.name, EXPOSURE):
             model.exposure = decode_exposure(section.codec, memoryview(section.data), section.raw_length)
+    _add_photo_sampling(model, read_metadata(container).provenance)
     return model
+
+
+def _add_photo_sampling(model: HybridModel, provenance: dict) -> None:
+    """Store with the model how finely the photos sampled it, if the provenance has their cameras."""
+    photos, frame = PhotoCameras.from_provenance(provenance), model.config.frame
+    model.background_spacing = photos.background_spacing
+    sizes = photos.pixel_sizes(model.gaussians.positions.numpy(), frame.center, frame.scale)
+    model.gaussians.pixel_sizes = None if sizes is None else torch.from_numpy(sizes)
 
 
 def read_layout(container: Container) -> ModelLayout:

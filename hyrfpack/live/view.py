@@ -8,10 +8,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from time import monotonic
 
-from hyrfpack.cameras.capture import scene_provenance
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import encode_model
 from hyrfpack.train import Trainer
+from hyrfpack.train.provenance import training_provenance
 from hyrfpack.web.player import encode_player
 from hyrfpack.web.serve import MemoryFile, serve_in_thread
 
@@ -64,7 +64,7 @@ class LiveView:
         if self._count and started < self._next and trainer.step < trainer.steps:
             return
         if self._capture is None:
-            self._capture = scene_provenance(trainer.scene)
+            self._capture = training_provenance(trainer.scene)
         try:
             data = encode_model(trainer.model, "raw", {"steps": trainer.step, **self._capture})
         except HyrfError:

@@ -7,13 +7,13 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
-from hyrfpack.cameras.capture import scene_provenance
 from hyrfpack.compress import compress_model
 from hyrfpack.context import RunContext
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import save_model
 from hyrfpack.make.stage_cache import StageCache
 from hyrfpack.train import Trainer
+from hyrfpack.train.provenance import training_provenance
 
 _LOG = logging.getLogger(__name__)
 
@@ -37,7 +37,7 @@ def write_preview(stage_cache: StageCache, trainer: Trainer, context: RunContext
     """
     target, trained = stage_cache.folder / PREVIEW_FILE, stage_cache.folder / _TRAINED_FILE
     _LOG.info("stopping: compressing the scene as it is now; a second interruption skips this")
-    provenance = {"steps": trainer.step, "choices": trainer.choices, **scene_provenance(trainer.scene)}
+    provenance = {"steps": trainer.step, "choices": trainer.choices, **training_provenance(trainer.scene)}
     try:
         trainer.fit_exposure_map()
         save_model(trainer.model, trained, profile="raw", provenance=provenance)

@@ -26,6 +26,9 @@ class Gaussians(nn.Module):
         color_logits: (N, 3) explicit RGB logits.
         scale_logits: (N, 1) explicit logit of the scale.
         opacity_logits: (N, 1) explicit logit of the opacity.
+        pixel_sizes: (N,) the size of a photo's pixel at each Gaussian, in local units, of the photo that shows it at
+            the highest rate. None if the photos' cameras are not known, as in training. It is not trained, and files
+            do not store it. `hyrfpack.render_view` samples the Gaussians no more finely.
     """
 
     PARAMETER_NAMES = ("positions", "color_logits", "scale_logits", "opacity_logits")
@@ -34,6 +37,7 @@ class Gaussians(nn.Module):
     color_logits: Tensor
     scale_logits: Tensor
     opacity_logits: Tensor
+    pixel_sizes: Tensor | None
 
     def __init__(self, positions: Tensor, color_logits: Tensor, scale_logits: Tensor, opacity_logits: Tensor) -> None:
         super().__init__()
@@ -46,6 +50,13 @@ class Gaussians(nn.Module):
             if values.shape != (len(positions), width):
                 raise ValueError(f"{name} has shape {tuple(values.shape)}; ({len(positions)}, {width}) is needed")
             setattr(self, name, nn.Parameter(values.float().contiguous()))
+        self.register_buffer("pixel_sizes", None, persistent=False)
+
+    def subset(self, index: Tensor) -> Gaussians:
+        """Return copies of the Gaussians at `index` (n,) int64."""
+        subset = Gaussians(*(getattr(self, name).detach()[index] for name in self.PARAMETER_NAMES))
+        subset.pixel_sizes = None if self.pixel_sizes is None else self.pixel_sizes[index]
+        return subset
 
     def __len__(self) -> int:
         return len(self.positions)

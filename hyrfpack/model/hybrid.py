@@ -84,6 +84,8 @@ class HybridModel(nn.Module):
             bfloat16 and adds up in float32, "float32" rounds nothing. The CPU always computes in float32.
         exposure: the exposure map; None for a model of one exposure. `hyrfpack.render_view` and
             `hyrfpack.export_model` apply it.
+        background_spacing: the spacing of nodes at which training evaluated the background: the tangent of their angle
+            at the picture's centre. 0 if it is not known.
     """
 
     def __init__(self, config: ModelConfig, gaussians: Gaussians, generator: torch.Generator | None = None) -> None:
@@ -91,6 +93,7 @@ class HybridModel(nn.Module):
         self.config = config
         self.precision = "mixed"
         self.exposure: ExposureMap | None = None
+        self.background_spacing = 0.0
         self.gaussians = gaussians
         self.geometry = Field(config.geometry, outputs=8, hidden=config.hidden, generator=generator)
         self.radiance = Field(
@@ -103,11 +106,15 @@ class HybridModel(nn.Module):
 
     def subset(self, index: Tensor) -> HybridModel:
         """Return a model with copies of the Gaussians at `index` (n,) int64; it shares the fields with this model."""
-        explicit = (getattr(self.gaussians, name).detach()[index] for name in Gaussians.PARAMETER_NAMES)
-        subset = HybridModel(self.config, Gaussians(*explicit))
+        subset = HybridModel(self.config, self.gaussians.subset(index))
         subset.geometry, subset.radiance = self.geometry, self.radiance
-        subset.precision, subset.exposure = self.precision, self.exposure
+        subset.copy_settings(self)
         return subset
+
+    def copy_settings(self, other: HybridModel) -> None:
+        """Take over precision, exposure map and background spacing of another model."""
+        self.precision, self.exposure = other.precision, other.exposure
+        self.background_spacing = other.background_spacing
 
     def cube_coords(self, positions: Tensor) -> Tensor:
         """Convert local positions (N, 3) to coordinates (N, 3) in the hash grids' unit cube."""

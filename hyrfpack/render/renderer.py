@@ -26,7 +26,7 @@ from hyrfpack.ops.rasterize.inputs import LOW_PASS_VARIANCE, TRANSMITTANCE_MIN
 from hyrfpack.ops.shade import Shading
 from hyrfpack.ops.transfer import tensor_like
 from hyrfpack.parallel.pool import torch_on_one_thread
-from hyrfpack.render.background_stride import choose_background_stride
+from hyrfpack.render.sampling import background_stride, widen_to_photos
 from hyrfpack.scene import Camera
 
 MIN_LOW_PASS_VARIANCE = 1e-3  # Narrower filters let Gaussians fall between pixel centres.
@@ -42,7 +42,7 @@ class RenderSettings:
             keeps every Gaussian in front of the camera.
         background_threshold: pixels with at most this transmittance get no background (tau in the paper).
         background_stride: the background is evaluated at every background_stride-th pixel of each axis and
-            interpolated between them; 1 is exact. None chooses 1, 2 or 4 for each view, by the predicted error.
+            interpolated between them; 1 evaluates every pixel. None has the spacing of training, at any size of view.
         transmittance_min: blending of a pixel stops when its transmittance is at most this; 0 blends every Gaussian.
         exposure: "as-photographed" applies the model's exposure map, so that a view looks like the photos taken near
             it; "consistent" renders all views at the model's own exposure. Without a map, both are the same.
@@ -149,6 +149,8 @@ def render_view(
     _check_finite(pose=viewport.pose)
     try:
         index, gaussians, colors = _select_gaussians(model, viewport, settings, decoded, seconds)
+        if (sizes := model.gaussians.pixel_sizes) is not None:
+            gaussians = widen_to_photos(gaussians, sizes[index], viewport, antialiased=model.config.antialiased)
         gradients = positions.new_zeros(len(index), 2) if absgrad else None
         raster_settings = settings.raster_settings(model.config.antialiased, depth)
         raster = rasterize(gaussians, colors, viewport, raster_settings, absgrad=gradients)
@@ -160,7 +162,7 @@ def render_view(
     with _record_seconds(seconds, "background"):
         if model.config.background and background:
             light, threshold = raster.transmittance, settings.background_threshold
-            stride = settings.background_stride or choose_background_stride(model, light, viewport, threshold=threshold)
+            stride = settings.background_stride or background_stride(model.background_spacing, viewport)
             behind = model.background_grid(light, viewport, threshold=threshold, stride=stride)
             rgb = composite(raster.rgb, light, behind, stride)
         else:

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from hyrfpack.atomic import write_atomic
-from hyrfpack.cameras.capture import Capture, quantized_provenance
+from hyrfpack.cameras.capture import Capture
 from hyrfpack.compress import CompressionReport
 from hyrfpack.compress.calibrate import measure_calibrated_sensitivity
 from hyrfpack.compress.distortion import DISTORTION_RANGE, default_distortion
@@ -28,6 +28,7 @@ from hyrfpack.format.codec import (
     decode_model,
     encode_model,
     load_with_provenance,
+    packed_provenance,
 )
 from hyrfpack.format.info import describe_file
 from hyrfpack.lock import exclusive_folder
@@ -191,7 +192,7 @@ def _distortion_of_file(facts: dict, model: HybridModel, provenance: dict) -> fl
 def _encode_other_profiles(model: HybridModel, provenance: dict, written_profile: str) -> dict[str, bytes]:
     """Encode the model in the profiles that have no settings, except the profile that was written already."""
     files = {}
-    for profile, kept in (("raw", provenance), ("paper", quantized_provenance(provenance, model.config.frame.scale))):
+    for profile, kept in (("raw", provenance), ("paper", packed_provenance(provenance, model))):
         with suppress(HyrfError):  # half precision cannot represent every model
             if profile != written_profile:
                 files[profile] = encode_model(model, profile, kept)
@@ -214,9 +215,7 @@ def _encode_curve(
         share = f"{Fraction(factor)} of the distortion" if factor < 1 else f"{factor} times the distortion"
         quantized = decide(model, sensitivity, float(np.clip(factor * distortion, *DISTORTION_RANGE)))
         name = SAME_DISTORTION_NAME if factor == 1 else f"compact, {share}"
-        files[name] = encode_model(
-            model, "compact", quantized_provenance(provenance, model.config.frame.scale), quantized=quantized
-        )
+        files[name] = encode_model(model, "compact", packed_provenance(provenance, model), quantized=quantized)
     return files
 
 

@@ -20,7 +20,6 @@ import torch
 
 from hyrfpack import format as hyrf_format
 from hyrfpack.atomic import write_atomic
-from hyrfpack.cameras.capture import scene_provenance
 from hyrfpack.config.train import TrainConfig
 from hyrfpack.device import describe_device
 from hyrfpack.errors import HyrfError, HyrfTrainingError
@@ -34,6 +33,7 @@ from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.scene import Scene, evenly_spaced
 from hyrfpack.train.checkpoint import names_and_sizes
 from hyrfpack.train.decisions import chosen_steps, is_budget_open
+from hyrfpack.train.provenance import training_provenance
 from hyrfpack.train.trainer import Trainer
 
 CURVE_FILE, VIEWS_FOLDER, RECORD_FILE = "curve.png", "views", "training.json"
@@ -138,7 +138,7 @@ def save_model(trainer: Trainer, out: Path, progress: Progress, *, overwrite: bo
         "steps": config.steps,
         "seed": config.seed,
         "choices": trainer.choices,
-        **scene_provenance(scene),
+        **training_provenance(scene),
         "psnr": statistics.median(record["psnr"] for record in trainer.records[-len(trainer.records) // 10 :]),
     }
     data = hyrf_format.encode_model(model, "raw", provenance)

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from hyrfpack.cameras.capture import quantized_provenance, scene_provenance
+from hyrfpack.cameras.capture import quantized_provenance
 from hyrfpack.config.train import FULL_STEPS, TrainConfig
 from hyrfpack.data.preset import detect_preset
 from hyrfpack.errors import HyrfTrainingError
@@ -21,6 +21,7 @@ from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians, logit
 from hyrfpack.model.hybrid import scale_bounds
 from hyrfpack.scene import Scene
+from hyrfpack.train.provenance import training_provenance
 from hyrfpack.train.silhouette import inside_silhouettes
 
 SYNTHETIC_HALF_BOX = 1.3  # NeRF-synthetic objects lie in [-1.3, 1.3]^3.
@@ -122,8 +123,10 @@ def check_target(scene: Scene, config: TrainConfig) -> None:
     if config.target_bytes is None or not scene.train:
         return
     preset = config.preset if config.preset != "auto" else detect_preset(scene)[0]
-    provenance = {"steps": config.steps, "seed": config.seed, **scene_provenance(scene)}
-    check_target_bytes(config.target_bytes, quantized_provenance(provenance, scene_frame(scene, preset).scale))
+    provenance = {"steps": config.steps, "seed": config.seed, **training_provenance(scene)}
+    check_target_bytes(
+        config.target_bytes, quantized_provenance(provenance, scene_frame(scene, preset).scale, scene.points)
+    )
 
 
 def table_size_for(budget: int, config: TrainConfig) -> tuple[int, str]:

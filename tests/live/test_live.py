@@ -110,7 +110,7 @@ def test_snapshots_take_less_than_3_percent_of_the_time_however_large_the_model_
         return b"snapshot"
 
     monkeypatch.setattr("hyrfpack.live.view.encode_model", encode)
-    monkeypatch.setattr("hyrfpack.live.view.scene_provenance", lambda *_, **__: {})
+    monkeypatch.setattr("hyrfpack.live.view.training_provenance", lambda *_, **__: {})
     view, began = LiveView(clock), clock.now
     for step in range(1, 10_000):
         clock.now += 0.5
@@ -121,7 +121,7 @@ def test_snapshots_take_less_than_3_percent_of_the_time_however_large_the_model_
 
 def test_the_first_step_and_the_last_one_are_always_shown(monkeypatch):
     monkeypatch.setattr("hyrfpack.live.view.encode_model", lambda *_: b"snapshot")
-    monkeypatch.setattr("hyrfpack.live.view.scene_provenance", lambda *_, **__: {})
+    monkeypatch.setattr("hyrfpack.live.view.training_provenance", lambda *_, **__: {})
     view, shown = LiveView(Clock()), []
     for step in range(1, 6):
         view.observe(fake_trainer(step, steps=5))

@@ -21,6 +21,7 @@ from hyrfpack import evaluate_model, load_model, load_scene, save_model
 from hyrfpack.config.make import MakeConfig
 from hyrfpack.context import RunContext
 from hyrfpack.format import describe_file
+from hyrfpack.format.codec import load_with_provenance
 from hyrfpack.make import make_scene, stages
 from hyrfpack.make.progress import Reporter
 from hyrfpack.progress import StageEvent, ignore_progress
@@ -94,9 +95,9 @@ def test_the_score_is_that_of_the_packed_model_on_held_out_photos(finished_work,
 
 
 def test_a_model_with_an_exposure_map_is_scored_as_render_shows_it_and_at_one_exposure(finished_work, posed, tmp_path):
-    model = load_model(finished_work / "model.hyrf")
+    model, provenance = load_with_provenance(finished_work / "model.hyrf")
     model.exposure = random_map(3, centers=6)
-    save_model(model, tmp_path / "model.hyrf")
+    save_model(model, tmp_path / "model.hyrf", provenance=provenance)
     state = SimpleNamespace(inputs=lambda stage: {"photos and poses": ""})
     reporter = Reporter(["scoring"], ignore_progress)
     stage = lambda name, inputs, act: act(False)[0]  # noqa: E731

@@ -19,7 +19,6 @@ import time
 from pathlib import Path
 
 import hyrfpack
-from hyrfpack.cameras.capture import quantized_provenance
 from hyrfpack.compress.calibrate import calibrate
 from hyrfpack.compress.distortion import default_distortion
 from hyrfpack.compress.packer import EncodedCandidate, Packer
@@ -27,7 +26,7 @@ from hyrfpack.compress.reference_renders import ReferenceRenders
 from hyrfpack.compress.search import find_coarsest
 from hyrfpack.compress.sensitivity import measure_sensitivity
 from hyrfpack.format import decode_model, encode_model
-from hyrfpack.format.codec import load_with_provenance
+from hyrfpack.format.codec import load_with_provenance, packed_provenance
 from hyrfpack.model import HybridModel
 from hyrfpack.scene import evenly_spaced
 from tools.studies.train_sets import DATA_FOLDER
@@ -68,7 +67,7 @@ class TrainedSet:
         self.name = folder.name
         self.scene = hyrfpack.load_scene(data)
         self.model, provenance = load_with_provenance(folder / "model.hyrf")
-        self.provenance = quantized_provenance(provenance, self.model.config.frame.scale)
+        self.provenance = packed_provenance(provenance, self.model)
         self.raw_scores = self.evaluate(self.model)
         self.held_out_renders = ReferenceRenders.from_views(
             [view.camera for view in evenly_spaced(self.scene.test, MAX_HELD_OUT_CAMERAS)], self.model

@@ -26,7 +26,7 @@ from tools.browser.chromium import Chromium
 from tools.studies.web_player import PAGE_TIMEOUT_SECONDS, draw_in_page, open_page, psnr, stored_cameras
 from tools.tables import markdown_table
 
-EXACT_SETTINGS = hyrfpack.RenderSettings(background_threshold=0, background_stride=1, transmittance_min=0)
+EXACT_SETTINGS = hyrfpack.RenderSettings(background_threshold=0, transmittance_min=0)
 # From here on, pictures are drawn as a frame at a part of the resolution is, without what is added at rest. The
 # panorama of the background has its final tiles in view, as after a rest at a view near this one.
 MOVING_SCRIPT = """(() => {

@@ -59,7 +59,7 @@ FILE_UP = np.array([0.0, -1.0, 0.0])  # the up direction that viewers expect in 
 FIRST_PICTURE_DETAIL = 0.5  # share of the standard deviation of the final picture's pixels
 SAME_PICTURE_DB = 40.0  # of two frames of the screen recording, whose pictures are scaled down
 # Settings without any approximation.
-EXACT_SETTINGS = hyrfpack.RenderSettings(background_threshold=0, background_stride=1, transmittance_min=0)
+EXACT_SETTINGS = hyrfpack.RenderSettings(background_threshold=0, transmittance_min=0)
 STILL_SECONDS = 8.0  # a page whose screen has not changed for this long is complete
 PAGE_TIMEOUT_SECONDS = 300.0
 ORBIT_SECONDS = 6.0

@@ -59,7 +59,7 @@ class Plan:
     def apply(self, model: HybridModel) -> HybridModel:
         """Return a model of the stored Gaussians, in file order, at their positions on the lattice.
 
-        It is on the device of `model` and has the same exposure map.
+        It is on the device of `model` and has its exposure map and its photos' sampling.
         """
         arrays = to_arrays(model)
         for group in LOGIT_SECTIONS:
@@ -67,7 +67,9 @@ class Plan:
         places = [lattice_to_local(layer.points, model.config.frame) for layer in self.layers]
         arrays[POSITIONS] = np.concatenate(places)
         stored = to_model(model.config, arrays).to(model.gaussians.positions.device)
-        stored.precision, stored.exposure = model.precision, model.exposure
+        sizes = model.gaussians.pixel_sizes
+        stored.gaussians.pixel_sizes = None if sizes is None else sizes[torch.from_numpy(self.kept).to(sizes.device)]
+        stored.copy_settings(model)
         return stored
 
 

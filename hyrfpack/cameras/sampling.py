@@ -1,0 +1,147 @@
+"""How finely photos sampled a scene: the size of their pixels at a point, and cameras that represent it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+
+from hyrfpack.cameras.files import camera_from_numbers
+from hyrfpack.scene import Camera, evenly_spaced
+
+# A camera sees points within its picture, enlarged by this share of its size on each side.
+PICTURE_MARGIN_RATIO = 0.15
+# A few coarse cameras underestimate the sampling rate of all photos by up to a fifth at most points.
+COARSE_RATE_RATIO = 1.1
+DEFAULT_BACKGROUND_STRIDE = 2
+MAX_BACKGROUND_STRIDE = 64
+BACKGROUND_STRIDE_KEY = "background_stride"
+MAX_SELECTION_POINTS = 2000
+_MIN_DEPTH = 1e-2  # in local units: the renderer's near plane
+_MIN_RATE_RATIO = 1e-3  # An unseen point counts as sampled at this share of its rate in all photos.
+_POINTS_PER_BLOCK = 1 << 13
+
+
+@dataclass(frozen=True)
+class PhotoCameras:
+    """The cameras of the photos that a file keeps, and the spacing at which training evaluated the background.
+
+    Attributes:
+        cameras: in world units.
+        is_coarse: whether they are only some of the cameras, with rounded poses.
+        background_stride: pixels between neighbouring nodes of the background in the last training steps.
+    """
+
+    cameras: Sequence[Camera]
+    is_coarse: bool
+    background_stride: int
+
+    @classmethod
+    def from_provenance(cls, provenance: dict) -> PhotoCameras:
+        """Read an untrusted provenance. A list of cameras with one that is not valid counts as missing."""
+        stored = provenance.get(BACKGROUND_STRIDE_KEY)
+        is_valid = isinstance(stored, int) and not isinstance(stored, bool) and 1 <= stored <= MAX_BACKGROUND_STRIDE
+        stride = cast(int, stored) if is_valid else DEFAULT_BACKGROUND_STRIDE
+        for key in ("cameras", "coarse_cameras"):
+            with suppress(TypeError, ValueError, ArithmeticError):
+                if cameras := [camera_from_numbers(numbers) for numbers in provenance.get(key) or ()]:
+                    return cls(cameras, key == "coarse_cameras", stride)
+        return cls((), False, stride)
+
+    @property
+    def background_spacing(self) -> float:
+        """The spacing of the background's nodes in training: the tangent of their angle at the picture's centre.
+
+        0 without cameras.
+        """
+        return self.background_stride / max(map(focal_length, self.cameras)) if self.cameras else 0.0
+
+    def pixel_sizes(self, points: np.ndarray, center: Sequence[float], scale: float) -> np.ndarray | None:
+        """Compute the size of a photo's pixel at each point, of the photo that shows the point at the highest rate.
+
+            q = 1 / max over the photos that see the point of f / z
+
+        with the focal length f and the depth z. If no photo sees the point, f / distance is the rate of all of them.
+
+        Args:
+            points: (N, 3) float32 in local units: local = (world - center) / scale.
+            center: centre of the scene's frame in world units.
+            scale: world units of a local unit.
+
+        Returns:
+            (N,) float32, in local units; None without cameras.
+        """
+        if not self.cameras:
+            return None
+        origin = np.array(center)
+        sizes = np.empty(len(points), np.float32)
+        for start in range(0, len(points), _POINTS_PER_BLOCK):
+            block = np.ascontiguousarray(points[start : start + _POINTS_PER_BLOCK].T)
+            best = np.zeros(block.shape[1], np.float32)
+            for camera in self.cameras:
+                np.maximum(best, _sampling_rates(camera, block, origin, scale), out=best)
+            unseen = np.flatnonzero(best == 0)
+            if len(unseen):
+                distant = [_rates_by_distance(camera, block[:, unseen], origin, scale) for camera in self.cameras]
+                best[unseen] = np.max(distant, axis=0)
+            sizes[start : start + len(best)] = 1 / best
+        return sizes / np.float32(COARSE_RATE_RATIO) if self.is_coarse else sizes
+
+
+def select_representative_cameras(
+    cameras: Sequence[Camera], points: np.ndarray, scale: float, count: int
+) -> list[Camera]:
+    """Select cameras whose sampling rates come near to those of all cameras, in the given order.
+
+    The first camera is always selected, then, one after the other, the one that raises the mean log rate most.
+
+    Args:
+        cameras: all cameras.
+        points: (N, 3) in world units; MAX_SELECTION_POINTS of them are used. Without points, cameras are evenly spaced.
+        scale: world units of a local unit.
+        count: number of cameras to select.
+    """
+    if len(cameras) <= count or not len(points):
+        return evenly_spaced(cameras, count)
+    points = points[:: -(-len(points) // MAX_SELECTION_POINTS)]
+    center = points.mean(axis=0)
+    local = ((points - center) / scale).astype(np.float32).T
+    rates = np.stack([_sampling_rates(camera, local, center, scale) for camera in cameras])
+    floor = np.maximum(_MIN_RATE_RATIO * rates.max(axis=0), np.finfo(np.float32).tiny)
+    logs = np.log(np.maximum(rates, floor))
+    selected, best = [0], logs[0]
+    while len(selected) < count:
+        gains = np.maximum(logs, best).sum(axis=1)
+        gains[selected] = -np.inf
+        selected.append(int(gains.argmax()))
+        best = np.maximum(best, logs[selected[-1]])
+    return [cameras[index] for index in sorted(selected)]
+
+
+def focal_length(camera: Camera) -> float:
+    """Return the larger one of a camera's two focal lengths, in pixels."""
+    return max(camera.fx, camera.fy)
+
+
+def _sampling_rates(camera: Camera, points: np.ndarray, center: np.ndarray, scale: float) -> np.ndarray:
+    """Return f / z (N,) in px per local unit at local points (3, N), 0 where the camera does not see them."""
+    width, height, (fx, fy, cx, cy) = camera.width, camera.height, camera.intrinsics
+    rotation = camera.rotation
+    lens = np.array([[fx], [fy], [1.0]])
+    offset = lens[:, 0] * ((rotation @ center + camera.camera_from_world[:3, 3]) / scale)
+    x, y, z = (lens * rotation).astype(np.float32) @ points + offset.astype(np.float32)[:, None]
+    right, down = PICTURE_MARGIN_RATIO * width, PICTURE_MARGIN_RATIO * height
+    is_seen = z > _MIN_DEPTH
+    is_seen &= (x >= np.float32(-right - cx) * z) & (x <= np.float32(width + right - cx) * z)
+    is_seen &= (y >= np.float32(-down - cy) * z) & (y <= np.float32(height + down - cy) * z)
+    return np.divide(np.float32(focal_length(camera)), z, out=np.zeros_like(z), where=is_seen)
+
+
+def _rates_by_distance(camera: Camera, points: np.ndarray, center: np.ndarray, scale: float) -> np.ndarray:
+    """Return f / distance (N,) in px per local unit at local points (3, N)."""
+    position = ((camera.position - center) / scale).astype(np.float32)[:, None]
+    distances = np.linalg.norm(points - position, axis=0)
+    return np.float32(focal_length(camera)) / np.maximum(distances, np.float32(_MIN_DEPTH))

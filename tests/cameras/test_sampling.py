@@ -1,0 +1,121 @@
+"""The sampling rate of photos at points, and cameras that represent it."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import camera_at, ring
+
+from hyrfpack.cameras.capture import provenance_cameras, quantized_provenance
+from hyrfpack.cameras.sampling import (
+    COARSE_RATE_RATIO,
+    DEFAULT_BACKGROUND_STRIDE,
+    MAX_BACKGROUND_STRIDE,
+    PhotoCameras,
+    select_representative_cameras,
+)
+from hyrfpack.scene import Camera
+
+CENTER, SCALE = (10.0, -20.0, 5.0), 4.0
+
+
+def along_z(z: float, focal: float = 50.0) -> Camera:
+    """Return a camera of 100 x 80 pixels that looks along +z from (0, 0, z), in local units."""
+    pose = np.eye(4)
+    pose[:3, 3] = -(np.array(CENTER) + SCALE * np.array([0, 0, z]))
+    return Camera(100, 80, focal, 0.8 * focal, 50.0, 40.0, pose)
+
+
+def pixel_sizes(cameras: list[Camera], points: list[list[float]], is_coarse: bool = False) -> list[float]:
+    sizes = PhotoCameras(cameras, is_coarse, 2).pixel_sizes(np.array(points, np.float32), CENTER, SCALE)
+    assert sizes is not None and sizes.dtype == np.float32
+    return sizes.tolist()
+
+
+def test_the_photo_with_the_highest_rate_counts():
+    cameras = [along_z(-2.0), along_z(-1.0), along_z(-4.0, focal=300.0)]
+    assert pixel_sizes(cameras, [[0, 0, 0], [0, 0, 8.0]]) == pytest.approx([1 / 75, 12 / 300], rel=1e-6)
+
+
+def test_a_photo_sees_points_up_to_15_percent_outside_its_picture():
+    near, far = along_z(-1.0), along_z(-3.0)
+    edge = 1.3  # the half-width of the picture at depth 1, enlarged by 30 %, in local units
+    found = pixel_sizes([near, far], [[0.999 * edge, 0, 0], [1.001 * edge, 0, 0]])
+    assert found == pytest.approx([1 / 50, 3 / 50], rel=1e-6)
+
+
+def test_a_point_that_no_photo_sees_takes_the_highest_rate_by_distance():
+    cameras = [along_z(1.0), along_z(4.0, focal=100.0)]
+    assert pixel_sizes(cameras, [[0, 3.0, -3.0]]) == pytest.approx([min(5 / 50, math.hypot(3, 7) / 100)], rel=1e-6)
+
+
+def test_coarse_cameras_are_taken_to_underestimate_the_rate():
+    exact, coarse = (pixel_sizes([along_z(-2.0)], [[0, 0, 0]], is_coarse) for is_coarse in (False, True))
+    assert coarse == pytest.approx([exact[0] / COARSE_RATE_RATIO], rel=1e-6)
+
+
+def test_many_points_have_the_sizes_that_single_ones_have():
+    points = np.random.default_rng(0).normal(size=(20_000, 3))
+    found = pixel_sizes([along_z(-2.0), along_z(-1.0)], points.tolist())
+    few = [0, 8191, 8192, 19_999]
+    assert [found[k] for k in few] == pixel_sizes([along_z(-2.0), along_z(-1.0)], points[few].tolist())
+
+
+def test_without_cameras_nothing_is_known():
+    photos = PhotoCameras.from_provenance({})
+    assert photos.pixel_sizes(np.zeros((3, 3), np.float32), CENTER, SCALE) is None
+    assert photos.background_spacing == 0
+
+
+def test_a_provenance_is_read_back():
+    stored = json.loads(json.dumps({"cameras": provenance_cameras([along_z(-2.0), along_z(1.0, 90.0)])}))
+    photos = PhotoCameras.from_provenance(stored)
+    assert provenance_cameras(photos.cameras) == stored["cameras"] and not photos.is_coarse
+    assert photos.background_spacing == pytest.approx(DEFAULT_BACKGROUND_STRIDE / 90)
+    assert PhotoCameras.from_provenance({**stored, "background_stride": 7}).background_spacing == pytest.approx(7 / 90)
+
+
+@pytest.mark.parametrize("cameras", [7, [[1, 2, 3]], [[32, 32, 0, 1, 1, 1, *range(12)]], {"a": 1}, None, "none"])
+def test_invalid_cameras_count_as_missing(cameras):
+    coarse = provenance_cameras([along_z(-2.0)])
+    assert PhotoCameras.from_provenance({"cameras": cameras}).cameras == ()
+    assert PhotoCameras.from_provenance({"cameras": cameras, "coarse_cameras": coarse}).is_coarse
+
+
+@pytest.mark.parametrize("stride", [0, -1, 2.0, True, "3", None, MAX_BACKGROUND_STRIDE + 1, 10**30])
+def test_an_invalid_stride_counts_as_missing(stride):
+    assert PhotoCameras.from_provenance({"background_stride": stride}).background_stride == DEFAULT_BACKGROUND_STRIDE
+
+
+def test_representative_cameras_include_the_only_close_up():
+    around = ring(30, radius=6.0)
+    close_up = camera_at((0.5, 0, 0), (0, 0, 0))
+    cameras = [*around[:17], close_up, *around[17:]]
+    points = np.random.default_rng(1).normal(scale=0.1, size=(500, 3))
+    chosen = select_representative_cameras(cameras, points, 1.0, 4)
+    assert len(chosen) == 4 and chosen[0] is cameras[0] and any(camera is close_up for camera in chosen)
+    assert [cameras.index(camera) for camera in chosen] == sorted(cameras.index(camera) for camera in chosen)
+
+
+def test_cameras_beside_each_other_do_not_represent_a_scene():
+    """Two groups of cameras look away from each other; two cameras must show both groups' points."""
+    back = np.diag([-1.0, 1.0, -1.0, 1.0])
+    forward = [camera_at((0.1 * k, 0, 0), (5, 0, 0)) for k in range(9)]
+    backward = [replace(camera, camera_from_world=back @ camera.camera_from_world) for camera in forward[:2]]
+    points = np.concatenate([np.array([[3.0, 0, 0]] * 50), np.array([[-3.0, 0, 0]] * 50)])
+    chosen = select_representative_cameras([*forward, *backward], points, 1.0, 2)
+    sizes = PhotoCameras(chosen, False, 2).pixel_sizes(points.astype(np.float32), (0, 0, 0), 1.0)
+    assert sizes is not None
+    focal = max(forward[0].fx, forward[0].fy)
+    assert sizes[0] == pytest.approx(3 / focal, rel=1e-5) and sizes[-1] == pytest.approx(3 / focal, rel=1e-5)
+
+
+def test_packed_files_keep_representative_cameras():
+    cameras = [*ring(30, radius=6.0), camera_at((0.5, 0, 0), (0, 0, 0))]
+    points = np.random.default_rng(1).normal(scale=0.1, size=(500, 3))
+    kept = quantized_provenance({"cameras": provenance_cameras(cameras)}, 1.0, points)
+    every = PhotoCameras(cameras, False, 2).pixel_sizes(points.astype(np.float32), (0, 0, 0), 1.0)
+    found = PhotoCameras.from_provenance(kept).pixel_sizes(points.astype(np.float32), (0, 0, 0), 1.0)
+    np.testing.assert_allclose(found * COARSE_RATE_RATIO, every, rtol=0.02)
