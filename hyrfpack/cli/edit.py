@@ -25,8 +25,10 @@ from hyrfpack.config.edit import (
     Action,
     Background,
     Center,
+    Crop,
     CropBox,
     CropCameras,
+    CropMasks,
     CropSphere,
     KeepGaussians,
     MaxScale,
@@ -47,6 +49,7 @@ _ACTION_BY_OPTION: dict[str, Callable[[Any], Action]] = {
     "crop_box": lambda box: CropBox(tuple(box[:3]), tuple(box[3:])),
     "crop_sphere": lambda numbers: CropSphere(tuple(numbers[:3]), numbers[3]),
     "crop_cameras": CropCameras,
+    "crop_masks": lambda folder: CropMasks(str(folder)),
     "min_opacity": MinOpacity,
     "max_scale": MaxScale,
     "remove_floaters": RemoveFloaters,
@@ -85,6 +88,14 @@ class _OrderedCommand(click.Command):
     help="Keep the Gaussians that the cameras surround, seen from above. The margin enlarges this area by a fraction "
     "of its size; 0 for none.",
 )
+@click.option(
+    "--crop-masks",
+    type=PATH,
+    multiple=True,
+    metavar="DIR",
+    help="Keep the Gaussians that the masks in DIR show; black is outside. Masks have the names of their photos; needs "
+    "--data.",
+)
 @click.option("--invert", count=True, help="After a crop: remove the Gaussians that it would keep.")
 @click.option("--min-opacity", type=float, multiple=True, metavar="OPACITY", help="Remove lower opacities, 0 to 1.")
 @click.option(
@@ -121,7 +132,8 @@ class _OrderedCommand(click.Command):
 @click.option(
     "--data",
     type=PATH,
-    help="Photos and poses of MODEL, for --remove-floaters, and for scores on held-out photos before and after.",
+    help="Photos and poses of MODEL, for --remove-floaters and --crop-masks, and for scores on held-out photos before "
+    "and after.",
 )
 @overwrite_option
 @scene_options
@@ -151,6 +163,7 @@ def edit(
       hyrfpack edit bonsai.hyrf -o table.hyrf --center --crop-sphere 0,0,0,1.5 --background-color 1,1,1
       hyrfpack edit garden.hyrf -o clean.hyrf --min-opacity 0.02 --crop-cameras 0.5
       hyrfpack edit runs/garden -o clean.hyrf --remove-floaters 0.35 --data photos/garden
+      hyrfpack edit runs/desk -o lamp.hyrf --crop-masks lamp_masks --data photos/desk --background-color 1,1,1
       hyrfpack edit room.hyrf -o hole.hyrf --crop-box=-1,-1,-1,1,1,1 --invert
       hyrfpack edit survey.hyrf -o meters.hyrf --scale 2.54
     """
@@ -184,8 +197,8 @@ def _read_actions(order: Sequence[str], values: dict[str, Any]) -> list[Action]:
     actions: list[Action] = []
     for name in order:
         if name == "invert":
-            if not actions or not isinstance(actions[-1], CropBox | CropSphere | CropCameras):
-                raise click.UsageError("--invert must follow --crop-box, --crop-sphere or --crop-cameras")
+            if not actions or not isinstance(actions[-1], Crop):
+                raise click.UsageError("--invert must follow an option that crops, such as --crop-box")
             actions[-1] = Remove(actions[-1])
         elif name in _ACTION_BY_OPTION:
             try:

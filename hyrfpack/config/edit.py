@@ -13,6 +13,7 @@ from hyrfpack.checks import check_float, check_int
 
 Vector = tuple[float, float, float]
 DEFAULT_MIN_OPACITY_SHARE = 0.35
+DEFAULT_MIN_LIGHT_SHARE = 0.5
 MIN_MARGIN = -0.99  # a hull of no size would keep nothing
 
 
@@ -83,7 +84,28 @@ class CropCameras:
         return f"crop to what the cameras surround, with a margin of {self.margin:g}"
 
 
-Crop = CropBox | CropSphere | CropCameras
+@dataclass(frozen=True)
+class CropMasks:
+    """Keep the Gaussians that masks of the photos show, such as those of one object. This needs photos.
+
+    Attributes:
+        folder: the folder of masks: pictures with the names of their photos. Black pixels are outside the object.
+            Photos without a mask are not used.
+        min_light_share: a Gaussian is kept if at least this share of its light in these photos falls into their masks,
+            in [0, 1].
+    """
+
+    folder: str
+    min_light_share: float = DEFAULT_MIN_LIGHT_SHARE
+
+    def __post_init__(self) -> None:
+        check_float("min_light_share", self.min_light_share, 0, 1)
+
+    def __str__(self) -> str:
+        return f"crop to what the masks in {self.folder} show"
+
+
+Crop = CropBox | CropSphere | CropCameras | CropMasks
 
 
 @dataclass(frozen=True)

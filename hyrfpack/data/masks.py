@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from hyrfpack.data.equirectangular import FaceFile
 from hyrfpack.data.names import PictureIndex
-from hyrfpack.data.pictures import has_same_aspect, is_picture_name, read_header
+from hyrfpack.data.pictures import PhotoFile, has_same_aspect, is_picture_name, read_header
+from hyrfpack.errors import HyrfDataError
+from hyrfpack.scene import View
 
 
 @dataclass(frozen=True)
@@ -67,6 +70,44 @@ def find_masks(folder: Path, photos: Sequence[tuple[str, tuple[int, int]]], used
     if not folder.is_dir() and (folder.parent / "mask").is_dir():
         return MaskMatches({}, [f"the folder mask is not read; rename it to {folder.name}"])
     return MaskMatches({}, _unmatched_mask_notes(folder, unmatched, len(index.files), names))
+
+
+def assign_masks(views: Sequence[View], folder: Path) -> list[View]:
+    """Return the views for whose photos a folder has masks, with these masks instead of any others.
+
+    Args:
+        views: views of photos on disk.
+        folder: the folder of masks, which are found by name as by `find_masks`.
+
+    Raises:
+        HyrfDataError: the folder has no mask of these photos, or a mask has another aspect ratio than its photo.
+    """
+    loaders = {view.name: view.load for view in views if isinstance(view.load, PhotoFile | FaceFile)}
+    sizes = [(name, load.stored) for name, load in loaders.items()]
+    found = find_masks(folder, sizes, set()) if folder.is_dir() else MaskMatches()
+    if not found.by_photo:
+        example = f", such as {Path(views[0].name).stem}.png" if views else ""
+        raise HyrfDataError(
+            f"{folder}: {'no mask has the name of a photo' if folder.is_dir() else 'there is no such folder'}",
+            fix=f"name a folder with masks that have their photos' names{example}",
+        )
+    masked = []
+    for view in views:
+        if (mask := found.by_photo.get(view.name)) is not None:
+            load = loaders[view.name]
+            _check_mask_shape(mask, load)
+            masked.append(replace(view, load=replace(load, mask=mask)))
+    return masked
+
+
+def _check_mask_shape(mask: Path, photo: PhotoFile | FaceFile) -> None:
+    """Raise HyrfDataError if a mask has another aspect ratio than its photo, turned or not."""
+    size = read_header(mask).size
+    if not (has_same_aspect(*size, *photo.stored) or has_same_aspect(*size[::-1], *photo.stored)):
+        raise HyrfDataError(
+            f"{mask}: the mask is {size[0]} x {size[1]} but its photo {photo.stored[0]} x {photo.stored[1]}",
+            fix="make it the size of its photo",
+        )
 
 
 def _unmatched_mask_notes(folder: Path, unmatched: list[Path], count: int, names: list[str]) -> list[str]:

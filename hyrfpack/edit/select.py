@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import singledispatch
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
@@ -11,6 +12,7 @@ from hyrfpack.compress.sensitivity import measure_sensitivity
 from hyrfpack.config.edit import (
     CropBox,
     CropCameras,
+    CropMasks,
     CropSphere,
     KeepGaussians,
     MaxScale,
@@ -18,7 +20,9 @@ from hyrfpack.config.edit import (
     Remove,
     RemoveFloaters,
 )
+from hyrfpack.data.masks import assign_masks
 from hyrfpack.edit.floaters import find_floaters
+from hyrfpack.edit.masks import share_of_light_in_masks
 from hyrfpack.edit.state import EditState
 from hyrfpack.errors import HyrfError
 
@@ -28,7 +32,8 @@ def keep_mask(action: object, state: EditState) -> np.ndarray:
     """Return a mask (N,) of the Gaussians that an action of selection keeps.
 
     Raises:
-        HyrfError: the cameras of the scene do not surround anything, or there are no photos to find floaters by.
+        HyrfError: the cameras of the scene do not surround anything, or there are no photos or masks that the action
+            needs.
     """
     raise TypeError(f"{action!r} selects no Gaussians")
 
@@ -62,6 +67,14 @@ def _(action: CropCameras, state: EditState) -> np.ndarray:
     points = (state.world_positions() @ plan - center) / (1 + action.margin) + center
     normals, offsets = hull.equations[:, :2], hull.equations[:, 2]
     return (points @ normals.T + offsets <= 0).all(axis=1)
+
+
+@keep_mask.register
+def _(action: CropMasks, state: EditState) -> np.ndarray:
+    if not state.photos:
+        raise HyrfError("masks belong to photos, and there are none", fix="name the photos with `data`")
+    views = assign_masks(state.photos, Path(action.folder))
+    return share_of_light_in_masks(state.model, views, state.progress) >= action.min_light_share
 
 
 @keep_mask.register
