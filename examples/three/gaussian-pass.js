@@ -21,12 +21,15 @@ export class GaussianPass {
     const rows = Math.max(1, Math.ceil(count / GAUSSIANS_PER_ROW));
     this.shapes = dataTexture(Float32Array, TEXELS_PER_SHAPE * rows, RGBAFormat, FloatType);
     this.colors = dataTexture(Float32Array, rows, RGBAFormat, FloatType);
+    // Four Gaussians a texel, because three.js updates parts of textures of four components only.
+    this.pixelSizes = dataTexture(Float32Array, rows, RGBAFormat, FloatType, GAUSSIANS_PER_ROW / FLOATS_PER_TEXEL);
     this.order = dataTexture(Uint32Array, rows, RedIntegerFormat, UnsignedIntType);
     this.uniforms = {
       ...viewUniforms,
       u_order: { value: this.order },
       u_shapes: { value: this.shapes },
       u_colors: { value: this.colors },
+      u_pixel_sizes: { value: this.pixelSizes },
       u_drawn: { value: 0 },
       u_quads: { value: QUADS_PER_INSTANCE },
     };
@@ -58,9 +61,10 @@ export class GaussianPass {
     return earlier;
   }
 
-  /** Takes the shapes and colours of a row of Gaussians. */
-  setRow({ row, shapes, colors }) {
+  /** Takes the shapes, pixel sizes and colours of a row of Gaussians. */
+  setRow({ row, shapes, pixelSizes, colors }) {
     if (shapes) writeRows(this.shapes, TEXELS_PER_SHAPE * row, shapes);
+    if (pixelSizes) writeRows(this.pixelSizes, row, pixelSizes);
     writeRows(this.colors, row, colors);
   }
 
@@ -85,22 +89,21 @@ export class GaussianPass {
   }
 
   dispose() {
-    for (const part of [this.shapes, this.colors, this.order, this.target, this.mesh.geometry, this.mesh.material]) {
-      part?.dispose();
-    }
+    const { shapes, colors, pixelSizes, order, target, mesh: { geometry, material } } = this;
+    for (const part of [shapes, colors, pixelSizes, order, target, geometry, material]) part?.dispose();
   }
 }
 
-function dataTexture(Numbers, rows, format, type) {
-  const numbers = new Numbers((format === RGBAFormat ? FLOATS_PER_TEXEL : 1) * GAUSSIANS_PER_ROW * rows);
-  const texture = new DataTexture(numbers, GAUSSIANS_PER_ROW, rows, format, type);
+function dataTexture(Numbers, rows, format, type, width = GAUSSIANS_PER_ROW) {
+  const numbers = new Numbers((format === RGBAFormat ? FLOATS_PER_TEXEL : 1) * width * rows);
+  const texture = new DataTexture(numbers, width, rows, format, type);
   texture.needsUpdate = true;
   return texture;
 }
 
 // Overwrites rows of a texture of floats from the start of the row `first` on. Only these are uploaded.
 function writeRows(texture, first, numbers) {
-  const length = FLOATS_PER_TEXEL * GAUSSIANS_PER_ROW, start = first * length;
+  const length = FLOATS_PER_TEXEL * texture.image.width, start = first * length;
   texture.image.data.set(numbers, start);
   for (let at = 0; at < numbers.length; at += length) {
     texture.addUpdateRange(start + at, Math.min(length, numbers.length - at));

@@ -18,6 +18,7 @@ ${VIEW}
 uniform highp usampler2D u_order; // indices of Gaussians, farthest first
 uniform sampler2D u_shapes; // three texels a Gaussian: position, three axes
 uniform sampler2D u_colors; // red, green, blue, opacity
+uniform sampler2D u_pixel_sizes; // of the photos, of four Gaussians a texel
 uniform int u_drawn; // the number of valid indices
 uniform int u_quads; // of an instance
 uniform bool u_antialiased;
@@ -31,6 +32,7 @@ flat varying vec4 v_color;
 
 const int WIDTH = ${GAUSSIANS_PER_ROW};
 const float LOW_PASS = 0.3; // px^2
+const float SAMPLING_VARIANCE = 0.4; // px^2 of the photos
 const float COMPENSATION_MIN = 2.5e-5;
 const float SLACK = 0.1; // px, because quads are snapped to a fraction of a pixel
 
@@ -57,9 +59,20 @@ void main() {
         && all(lessThan(focal * p.xy, (u_size + margin - principal) * p.z));
     if (!isInside) return;
 
+    mat3 axes = mat3(one.w, two.xyz, two.w, three.x, three.yzw);
+    float size = texelFetch(u_pixel_sizes, ivec2(splat % WIDTH / 4, splat / WIDTH), 0)[splat % 4];
+    float own = p.z / max(focal.x, focal.y), added = SAMPLING_VARIANCE * (size * size - own * own);
+    if (added > 0.0) { // no detail is finer than the photos' pixels
+        vec3 squares = max(vec3(dot(axes[0], axes[0]), dot(axes[1], axes[1]), dot(axes[2], axes[2])), 1e-30);
+        vec3 kept = squares / (squares + added), factors = inversesqrt(kept);
+        // Of the two longest axes.
+        if (u_antialiased) color.a *= sqrt(max(kept.x * kept.y, max(kept.y * kept.z, kept.z * kept.x)));
+        for (int axis = 0; axis < 3; ++axis) axes[axis] *= factors[axis];
+    }
+
     vec2 slope = p.xy / p.z, slack = 0.15 * u_size / focal;
     vec2 clamped = clamp(slope, -principal / focal - slack, (u_size - principal) / focal + slack);
-    mat3 rows = transpose(u_rotation * mat3(one.w, two.xyz, two.w, three.x, three.yzw));
+    mat3 rows = transpose(u_rotation * axes);
     vec3 first = focal.x / p.z * (rows[0] - clamped.x * rows[2]);
     vec3 second = focal.y / p.z * (rows[1] - clamped.y * rows[2]);
     float xx = dot(first, first), xy = dot(first, second), yy = dot(second, second);

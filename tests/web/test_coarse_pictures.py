@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from web.pages import Browser, make_splats_page, open_page, psnr, random_splats
-from web.test_native import make_model_page, random_model
+from web.test_native import encode_with_photos, make_model_page, random_model
 
 pytestmark = pytest.mark.in_turn
 
@@ -27,10 +27,18 @@ def make_page_of_small_gaussians(**config: object) -> bytes:
     return make_model_page(model)
 
 
+def make_page_of_small_photos() -> bytes:
+    """Return a page whose window is larger than the photos of its model."""
+    model = random_model(6000, antialiased=True)
+    model.gaussians.scale_logits.data -= 3
+    return make_model_page(model, encode_with_photos(model, background_stride=1))
+
+
 PAGE_ENCODERS = {
     "splats": make_page_of_small_splats,
     "model": make_page_of_small_gaussians,
     "antialiased model": lambda: make_page_of_small_gaussians(antialiased=True),
+    "model of small photos": make_page_of_small_photos,
 }
 # With 0.3 px^2 at every resolution, the first two pages have 25 and 31 dB at 0.5, and 16 and 24 dB at 0.2.
 MIN_PSNR_BY_SCALE = {0.5: 45.0, 0.2: 38.0}

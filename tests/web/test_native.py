@@ -13,8 +13,10 @@ import torch
 from scenes import camera_at, shift_cameras
 from web.pages import Browser, camera_json, psnr, render_in_page, wait_until
 
+from hyrfpack.cameras.capture import provenance_cameras
 from hyrfpack.cameras.files import camera_from_json
-from hyrfpack.format.codec import encode_model
+from hyrfpack.cameras.view_sampling import shrink_camera
+from hyrfpack.format.codec import decode_model, encode_model
 from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.render import RenderSettings, render_view
@@ -84,10 +86,10 @@ def make_model_page(model: HybridModel, data: bytes | None = None) -> bytes:
     )
 
 
-def render_reference(model: HybridModel, camera: Camera) -> np.ndarray:
+def render_reference(model: HybridModel, camera: Camera, settings: RenderSettings = EXACT_SETTINGS) -> np.ndarray:
     """Return the picture of `hyrfpack.render_view`, (H, W, 3) in 0 to 255."""
     with torch.no_grad():
-        return render_view(model, camera, EXACT_SETTINGS).rgb.clamp(0, 1).numpy() * 255
+        return render_view(model, camera, settings).rgb.clamp(0, 1).numpy() * 255
 
 
 def load_page(browser: Browser, tmp_path: Path, page: bytes, complete: bool = True) -> Browser:
@@ -192,6 +194,42 @@ def test_the_window_at_rest_has_the_exact_background(browser: Browser, tmp_path:
     shown = read_typed_array(browser, window, np.uint8)
     camera = camera_from_json(browser.evaluate("hyrfpack.camera()"))
     assert psnr(shown.reshape(camera.height, camera.width, 3), render_reference(model, camera)) > 50
+
+
+def encode_with_photos(model: HybridModel, width: int = 40, **more: object) -> bytes:
+    """Encode a model with cameras of smaller photos, from the same places as `make_cameras`."""
+    cameras = [shrink_camera(camera, width) for camera in make_cameras()]
+    return encode_model(model, provenance={"cameras": provenance_cameras(cameras), **more})
+
+
+@pytest.mark.parametrize("is_antialiased", [False, True])
+def test_pictures_larger_than_the_photos_show_no_finer_detail(browser: Browser, tmp_path: Path, is_antialiased: bool):
+    model = random_model(4000, antialiased=is_antialiased)
+    model.gaussians.scale_logits.data -= 2
+    data = encode_with_photos(model, background_stride=1)
+    load_page(browser, tmp_path, make_model_page(model, data), complete=False)
+    settings, filtered = RenderSettings(background_threshold=0.0), decode_model(data)
+    for camera in make_cameras()[:2]:
+        shown = render_in_page(browser, camera)
+        assert psnr(shown, render_reference(filtered, camera, settings)) > 55
+        assert psnr(shown, render_reference(model, camera)) < 40
+    sizes = np.ascontiguousarray(read_texture(browser, "shapes", 2048, 4)[: len(model), 3]).view(np.float32)
+    assert filtered.gaussians.pixel_sizes is not None
+    np.testing.assert_allclose(sizes, filtered.gaussians.pixel_sizes.numpy(), rtol=1e-5)
+
+
+@pytest.mark.in_turn
+@pytest.mark.parametrize("stride", [1, 3, 40])
+def test_the_background_is_interpolated_between_nodes_as_far_apart_as_in_training(
+    browser: Browser, tmp_path: Path, stride: int
+):
+    model = random_model(30)
+    data = encode_with_photos(model, background_stride=stride)
+    load_page(browser, tmp_path, make_model_page(model, data))
+    for camera in make_cameras():
+        expected = render_reference(decode_model(data), camera, RenderSettings(background_threshold=0.0))
+        assert psnr(render_in_page(browser, camera), expected) > 55
+    assert browser.evaluate("hyrfpack.player.renderer.content.sky.stride") == min(64, 3 * stride)
 
 
 @pytest.mark.in_turn

@@ -1,10 +1,11 @@
 """Measure how closely the web player's pictures match exact renders, at rest and while the view moves.
 
-    python -m tools.studies.player_psnr runs/street/compact.hyrf runs/bonsai/compact.hyrf --views 8
+    python -m tools.studies.player_psnr runs/street/compact.hyrf runs/bonsai/compact.hyrf --views 8 --enlarge 1 3
 
-For cameras that each model stores, the table has the mean and the worst PSNR in dB of the page of `hyrfpack export`
-against `render_view` without any approximation: at rest, and as frames are drawn at a part of the resolution while the
-view moves, against the mean over blocks of the exact render. The browser is headless Chromium.
+For cameras that each model stores, in pictures as large as the photos or --enlarge times as large, the table has the
+mean and the worst PSNR in dB of the page of `hyrfpack export` against `render_view` without any approximation: at rest,
+and as frames are drawn at a part of the resolution while the view moves, against the mean over blocks of the exact
+render. The browser is headless Chromium.
 """
 
 from __future__ import annotations
@@ -43,6 +44,12 @@ MOVING_SCRIPT = """(() => {
 })()"""
 
 
+def enlarge_camera(camera: Camera, enlarge: int) -> Camera:
+    """Return the camera with a picture that is `enlarge` times as large."""
+    fx, fy, cx, cy = (enlarge * value for value in camera.intrinsics)
+    return Camera(enlarge * camera.width, enlarge * camera.height, fx, fy, cx, cy, camera.camera_from_world)
+
+
 def cut_camera(camera: Camera, factor: int) -> Camera:
     """Return the camera with its picture cut to a multiple of `factor` pixels."""
     return replace(camera, width=camera.width // factor * factor, height=camera.height // factor * factor)
@@ -60,9 +67,9 @@ def render_exact(model: hyrfpack.HybridModel, cameras: Sequence[Camera]) -> list
     return [hyrfpack.render_view(model, camera, EXACT_SETTINGS).rgb.clamp(0, 1).numpy() for camera in cameras]
 
 
-def measure_page(browser: Browser, model: Path, views: int, factor: int) -> list[str]:
+def measure_page(browser: Browser, model: Path, views: int, factor: int, enlarge: int) -> list[str]:
     """Return the row of a model whose page is open."""
-    cameras = [cut_camera(camera, factor) for camera in stored_cameras(model, views)]
+    cameras = [cut_camera(enlarge_camera(camera, enlarge), factor) for camera in stored_cameras(model, views)]
     field = hyrfpack.load_model(model)
     exact = render_exact(field, cameras)
     still = [psnr(draw_in_page(browser, camera), picture) for camera, picture in zip(cameras, exact, strict=True)]
@@ -72,7 +79,7 @@ def measure_page(browser: Browser, model: Path, views: int, factor: int) -> list
         drawn = draw_in_page(browser, camera, reduction=factor)
         moving.append(psnr(drawn, reduce_picture(picture, factor)))
     cells = [f"{statistic(scores):.1f}" for scores in (still, moving) for statistic in (statistics.mean, min)]
-    return [f"{model.parent.name}/{model.name}", f"{len(field):,}", *cells]
+    return [f"{model.parent.name}/{model.name}", f"{len(field):,}", str(enlarge), *cells]
 
 
 def main() -> None:
@@ -80,6 +87,7 @@ def main() -> None:
     parser.add_argument("models", type=Path, nargs="+")
     parser.add_argument("--views", type=int, default=8, help="number of views of each model (8)")
     parser.add_argument("--factor", type=int, default=2, help="moving frames have 1/N of the resolution (2)")
+    parser.add_argument("--enlarge", type=int, nargs="+", default=[1], help="sizes of pictures in sizes of photos (1)")
     arguments = parser.parse_args()
     rows = []
     with tempfile.TemporaryDirectory() as folder, Chromium(timeout_seconds=PAGE_TIMEOUT_SECONDS) as browser:
@@ -87,9 +95,10 @@ def main() -> None:
         for model in arguments.models:
             page = Path(folder) / "page.html"
             hyrfpack.export_model(model, page, overwrite=True)
-            open_page(browser, page)
-            rows.append(measure_page(browser, model, arguments.views, arguments.factor))
-    print(markdown_table(["model", "Gaussians", "still dB", "worst", "moving dB", "worst"], rows))
+            for enlarge in arguments.enlarge:
+                open_page(browser, page)
+                rows.append(measure_page(browser, model, arguments.views, arguments.factor, enlarge))
+    print(markdown_table(["model", "Gaussians", "size", "still dB", "worst", "moving dB", "worst"], rows))
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@
 import { SH_BAND_0, evaluateBasis } from "./basis.js";
 import { HyrfFormatError } from "./errors.js";
 import { colorsAlong, colorsOfRows, decodeGeometry, firstLayers } from "./fields.js";
-import { cameraPosition } from "./viewpoint.js";
+import { toLocalView } from "./viewpoint.js";
 
 /** The number of harmonics of degree 1 and higher, by the largest degree. */
 export const HIGHER_HARMONICS_BY_DEGREE = [0, 3, 8, 15];
@@ -145,19 +145,14 @@ function requireFinite(what, ...arrays) {
 /**
  * Converts a camera to the model's local units.
  * @param {import("./viewpoint.js").Camera} camera
- * @param {{center: number[], scale: number}} frame
+ * @param {import("./metadata.js").Frame} frame
  * @returns {LocalCamera}
  */
-function toLocalCamera(camera, { center, scale }) {
-  const { fx, fy, cx, cy, width, height, camera_from_world: pose } = camera;
-  const translation = [0, 1, 2].map((r) => {
-    const [a, b, c, d] = pose[r];
-    return (a * center[0] + b * center[1] + c * center[2] + d) / scale;
-  });
-  const place = cameraPosition(camera).map((value, k) => (value - center[k]) / scale);
+function toLocalCamera(camera, frame) {
+  const { fx, fy, cx, cy, width, height, rows, translation, eye } = toLocalView(camera, frame);
   const wide = (PICTURE_MARGIN_RATIO * width) / 2, high = (PICTURE_MARGIN_RATIO * height) / 2;
   const bounds = [(-wide - cx) / fx, (width + wide - cx) / fx, (-high - cy) / fy, (height + high - cy) / fy];
-  return { place, rows: pose.slice(0, 3), translation, bounds, focal: fx * fy, area: width * height };
+  return { place: eye, rows, translation, bounds, focal: fx * fy, area: width * height };
 }
 
 /**

@@ -10,8 +10,8 @@ import { HyrfError, HyrfFormatError } from "./errors.js";
  * @typedef {import("./view_evaluator.js").SkyTile} SkyTile
  *
  * What the worker delivers. All arrays belong to the receiver. `onOrder`: the indices of the Gaussians of a view,
- * farthest first, of which the first `drawn` are valid. `onRow`: shapes and colours of a row of Gaussians. `onTile`: a
- * part of the background. `onError`: the worker has failed; it delivers nothing more.
+ * farthest first, of which the first `drawn` are valid. `onRow`: shapes, pixel sizes and colours of a row of Gaussians.
+ * `onTile`: a part of the background. `onError`: the worker has failed; it delivers nothing more.
  * @typedef {{
  *   onOrder: (order: Uint32Array, drawn: number) => void,
  *   onRow: (row: EvaluatedRow) => void,

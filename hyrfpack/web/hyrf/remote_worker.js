@@ -118,8 +118,8 @@ async function run() {
     spare = null;
     post({ order: { order, drawn } }, [order]);
     for (const part of evaluator.evaluate(view, () => post({ complete: ticket }))) {
-      if ("row" in part) post({ row: part }, part.shapes ? [part.shapes, part.colors] : [part.colors]);
-      else post({ tile: part }, [part.pixels]);
+      const arrays = "row" in part ? [part.shapes, part.pixelSizes, part.colors] : [part.pixels];
+      post("row" in part ? { row: part } : { tile: part }, arrays.filter((array) => array !== null));
       await handleMessages();
       if (latest) break;
     }

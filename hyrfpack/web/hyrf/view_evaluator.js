@@ -4,6 +4,7 @@ import { BACKGROUND_RADIUS, backgroundColors, colorsAlong, decodeGeometry, first
 import { CULL_MARGIN_RATIO, NEAR_PLANE_LOCAL, frustumPlanes } from "./frustum.js";
 import { rowsOf } from "./rotation.js";
 import { RowStates, rowBalls } from "./row_states.js";
+import { backgroundSpacing, pixelSizes } from "./sampling.js";
 import { DepthSort } from "./sort.js";
 
 /** The number of Gaussians of a row, which are evaluated together. */
@@ -24,8 +25,10 @@ const TILE_WIDTH_PIXELS = 64, TILE_HEIGHT_PIXELS = 32;
  *
  * A row of Gaussians, of which the first has the index GAUSSIANS_PER_ROW times `row`. `shapes` has FLOATS_PER_SHAPE
  * numbers for each: its position, and its three axes, each with the length of the standard deviation, in local units.
- * It is null if it was delivered before. `colors` has red, green, blue and opacity of each, in [0, 1].
- * @typedef {{row: number, shapes: Float32Array | null, colors: Float32Array}} EvaluatedRow
+ * `pixelSizes` has the pixel size of the photos at each, in local units, or 0 (see sampling.js). Both are null if they
+ * were delivered before. `colors` has red, green, blue and opacity of each, in [0, 1].
+ * @typedef {{row: number, shapes: Float32Array | null, pixelSizes: Float32Array | null, colors: Float32Array}}
+ *   EvaluatedRow
  *
  * A part of the equirectangular picture of the background: its place and its RGBA bytes. Column c of a picture with
  * height h is at the longitude (c + 0.5) pi / h - pi, row r at the latitude pi / 2 - (r + 0.5) pi / h. Longitudes run
@@ -38,12 +41,14 @@ const TILE_WIDTH_PIXELS = 64, TILE_HEIGHT_PIXELS = 32;
 
 /**
  * Returns the size of the background's picture, or null if the model has no background.
- * @param {import("./metadata.js").Config} config
+ * @param {import("./metadata.js").Metadata} metadata
  * @returns {SkySize | null}
  */
-export function skySize({ background, radiance }) {
+export function skySize(metadata) {
+  const { background, radiance } = metadata.config;
   if (!background) return null;
-  const fine = Math.ceil(Math.PI * radiance.finest); // two pixels per cell of the grid along an arc
+  // Along an arc, two pixels per cell of the grid are enough, and pixels need not be finer than nodes in training.
+  const fine = Math.ceil(Math.PI * Math.min(radiance.finest, 1 / backgroundSpacing(metadata)));
   const height = Math.min(MAX_SKY_HEIGHT_PIXELS, Math.max(MIN_SKY_HEIGHT_PIXELS, fine));
   const coarseHeight = COARSE_SKY_HEIGHT_PIXELS;
   return { width: 2 * height, height, coarseWidth: 2 * coarseHeight, coarseHeight };
@@ -55,10 +60,11 @@ export class ViewEvaluator {
     this.model = model;
     this.sorter = new DepthSort(model.positions, GAUSSIANS_PER_ROW);
     this.rows = new RowStates(model.count ? rowBalls(model.positions, GAUSSIANS_PER_ROW) : new Float32Array(0));
+    this.pixelSizes = pixelSizes(model.positions, model.metadata);
     this.opacities = new Float32Array(model.count);
     /** @type {(Float32Array | null)[]} */
     this.firstLayers = Array.from({ length: this.rows.count }, () => null); // by row, once they are needed
-    this.sky = skySize(model.config);
+    this.sky = skySize(model.metadata);
     this.tiles = this.sky ? cutTiles(this.sky.width, this.sky.height, false) : [];
     this.tileStates = new RowStates(Float32Array.from(this.tiles.flatMap(({ ball }) => ball)));
     this.hasCoarseSky = !this.sky;
@@ -112,11 +118,12 @@ export class ViewEvaluator {
   row(row, eye) {
     const { model, opacities } = this, { positions } = model;
     const start = row * GAUSSIANS_PER_ROW, stop = Math.min(model.count, start + GAUSSIANS_PER_ROW);
-    let layers = this.firstLayers[row], shapes = null;
+    let layers = this.firstLayers[row], shapes = null, sizes = null;
     if (!layers) {
       const geometry = decodeGeometry(model, start, stop);
       opacities.set(geometry.opacities, start);
       shapes = packShapes(positions.subarray(3 * start, 3 * stop), geometry);
+      sizes = this.pixelSizes.slice(start, stop);
       layers = this.firstLayers[row] = firstLayers(model, start, stop);
     }
     const directions = unitDirections(positions.subarray(3 * start, 3 * stop), eye);
@@ -129,7 +136,7 @@ export class ViewEvaluator {
       colors[to++] = opacities[start + i];
     }
     this.rows.colored(row, eye);
-    return { row, shapes, colors };
+    return { row, shapes, pixelSizes: sizes, colors };
   }
 
   /**

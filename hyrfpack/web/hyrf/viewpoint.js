@@ -39,15 +39,14 @@ export function viewpointOf(metadata) {
   const viewpoint = parseStoredViewpoint(provenance.viewpoint) ?? validateViewpoint(defaultViewpoint(center, scale)) ??
     defaultViewpoint([0, 0, 0], 1);
   const up = unit(viewpoint.up), { target } = viewpoint;
-  const [exact, coarse] = [provenance.cameras, provenance.coarse_cameras].map(parseStoredCameras);
-  const kept = exact.length ? exact : coarse;
+  const { cameras: kept, isCoarse } = storedCameras(metadata);
   if (!kept.length) {
     const others = orbitCameras(viewpoint, ORBIT_CAMERA_COUNT).filter((_, number) => number % 2 === 1);
     const cameras = evenlySpaced(others, MAX_SHOWN_CAMERAS);
     return { cameras, fitted: ringCameras(viewpoint, up), up, target, madeUp: true };
   }
   // Few coarse cameras are stored, too few for fitting colours, so rings of cameras about the scene are added.
-  const fitted = [...evenlySpaced(kept, MAX_FITTED_CAMERAS), ...(exact.length ? [] : ringCameras(viewpoint, up))];
+  const fitted = [...evenlySpaced(kept, MAX_FITTED_CAMERAS), ...(isCoarse ? ringCameras(viewpoint, up) : [])];
   return { cameras: evenlySpaced(kept, MAX_SHOWN_CAMERAS), fitted, up: estimateUp(kept, up), target, madeUp: false };
 }
 
@@ -79,7 +78,30 @@ export function cameraPosition({ camera_from_world: pose }) {
   return [0, 1, 2].map((k) => -(pose[0][k] * pose[0][3] + pose[1][k] * pose[1][3] + pose[2][k] * pose[2][3]));
 }
 
+/**
+ * Converts a camera to a view in a model's local units, with the position of its eye.
+ * @param {Camera} camera
+ * @param {import("./metadata.js").Frame} frame
+ * @returns {import("./frustum.js").View & {eye: number[]}}
+ */
+export function toLocalView(camera, { center, scale }) {
+  const { camera_from_world: pose, ...lens } = camera, rows = pose.slice(0, 3);
+  const translation = rows.map((row) => (dot(row, center) + row[3]) / scale);
+  const eye = cameraPosition(camera).map((value, axis) => (value - center[axis]) / scale);
+  return { ...lens, rows, translation, eye };
+}
+
 // --- cameras of the file ---------------------------------------------------------------------------------------------
+
+/**
+ * Returns the cameras that a file keeps: the training cameras or, if these are absent or invalid, the few coarse ones.
+ * @param {import("./metadata.js").Metadata} metadata the checked metadata of the model
+ * @returns {{cameras: Camera[], isCoarse: boolean}} `cameras` is empty if the file keeps none that are valid
+ */
+export function storedCameras({ provenance }) {
+  const [exact, coarse] = [provenance?.cameras, provenance?.coarse_cameras].map(parseStoredCameras);
+  return exact.length ? { cameras: exact, isCoarse: false } : { cameras: coarse, isCoarse: true };
+}
 
 /**
  * Parses the cameras of a provenance. Returns an empty list if one of them is invalid.

@@ -57,7 +57,8 @@ export class Fields {
 
     this.explicit = await graphics.table(floats, TEXTURE_WIDTH, model.explicit);
     this.logits = await graphics.table(floats, TEXTURE_WIDTH, model.logits);
-    model.explicit = model.logits = null; // frees memory; the worker can decode them again
+    this.pixelSizes = await graphics.table([gl.R32F, gl.RED, gl.FLOAT, 1], TEXTURE_WIDTH, model.pixelSizes);
+    model.explicit = model.logits = model.pixelSizes = null; // frees memory; the worker can decode them again
     this.geometry = await this.field(model.geometry);
     this.radiance = await this.field(model.radiance);
     await graphics.whenDone();
@@ -69,7 +70,7 @@ export class Fields {
     if (model.background) {
       this.panorama = new Panorama(graphics, model, (...area) => this.drawPanorama(...area));
       await this.panorama.begin(eye, programs.enlarge);
-      this.sky = new Sky(graphics, programs.needed, (...area) => this.drawSky(...area));
+      this.sky = new Sky(graphics, programs.needed, model.backgroundSpacing, (...area) => this.drawSky(...area));
     }
   }
 
@@ -187,7 +188,8 @@ export class Fields {
     const fresh = rows.filter((row) => this.pending.delete(row));
     if (!fresh.length) return;
     const p = this.use("geometry", geometry);
-    graphics.bind(p, { u_explicit: this.explicit, u_logits: this.logits }, gl.TEXTURE_2D, 1);
+    const { explicit, logits, pixelSizes } = this;
+    graphics.bind(p, { u_explicit: explicit, u_logits: logits, u_pixel_sizes: pixelSizes }, gl.TEXTURE_2D, 1);
     gl.uniform1i(p.u_product, model.product);
     gl.uniform1i(p.u_grows, model.grows);
     this.passes(this.geometryTarget, fresh);
@@ -216,7 +218,7 @@ export class Fields {
     const { graphics, programs, geometry, radiance } = this;
     geometry.free();
     if (!this.panorama) radiance.freeTable();
-    const objects = [this.explicit, this.geometryTarget, ...this.featureTargets];
+    const objects = [this.explicit, this.pixelSizes, this.geometryTarget, ...this.featureTargets];
     for (const object of [...objects, programs.geometry.program, programs.features.program]) graphics.free(object);
   }
 
@@ -228,14 +230,16 @@ export class Fields {
     this.area(target, size, part);
   }
 
-  // Draws a part of the background of a view, where `needed` is 1.
-  drawSky(target, part, view, needed) {
+  // Draws a part of a grid of `size` nodes of the background of a view, where `needed` is 1. They are `stride` pixels
+  // apart.
+  drawSky(target, size, part, view, needed, stride) {
     const { gl, graphics } = this, p = this.use("sky", this.radiance);
     graphics.bind(p, { u_needed: needed }, gl.TEXTURE_2D, 1);
+    gl.uniform1f(p.u_stride, stride);
     gl.uniform3fv(p.u_eye, view.eye);
     gl.uniformMatrix3fv(p.u_world, false, view.rows.flat()); // rows read as columns: transposed
     gl.uniform4f(p.u_intrinsics, view.fx, view.fy, view.cx, view.cy);
-    this.area(target, [view.width, view.height], part);
+    this.area(target, size, part);
   }
 
   // Evaluates the colours of rows, and what else is missing of them.
@@ -272,8 +276,8 @@ export class Fields {
   }
 
   // Completes the picture of a still view while `goOn()` is true: colours all rows in view, and evaluates the
-  // background. `blend(view)` blends the splats of a view and returns {texture, used: its size in use}. `changed` is
-  // called when the picture has improved. Returns whether it is complete.
+  // background. `blend(view)` blends the splats of a view and returns their picture. `changed` is called when the
+  // picture has improved. Returns whether it is complete.
   async complete(view, margin, { blend, goOn = () => true, changed = () => {}, exact = false }) {
     let shownAt = performance.now(), pause = FIRST_REFRESH_MS;
     const report = () => {

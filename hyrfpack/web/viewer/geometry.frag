@@ -1,6 +1,7 @@
 // Opacity, scales and rotation of each Gaussian, which no view changes.
 uniform sampler2D u_explicit; // x, y, z; opacity logit
 uniform sampler2D u_logits; // colour logits; scale logit
+uniform sampler2D u_pixel_sizes; // of the photos, from hyrf/sampling.js
 uniform bool u_product; // the scale rule, else the sum
 uniform bool u_grows; // the largest scale, outwards
 
@@ -32,4 +33,5 @@ void main() {
     float opacity = 1.0 / (1.0 + exp(-first.x - own.w));
     o_place = uvec4(floatBitsToUint(own.xyz), packUnorm2x16(vec2(opacity, scales.z)));
     o_shape = uvec4(packSnorm2x16(quat.xy), packSnorm2x16(quat.zw), packUnorm2x16(scales.xy), 0u);
+    o_shape.w = floatBitsToUint(texelFetch(u_pixel_sizes, place, 0).x);
 }

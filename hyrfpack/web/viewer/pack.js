@@ -2,6 +2,7 @@
 
 import { decoderLayout, gridLevels } from "../hyrf/grids.js";
 import { rowBalls } from "../hyrf/row_states.js";
+import { backgroundSpacing, pixelSizes } from "../hyrf/sampling.js";
 import { TEXTURE_WIDTH } from "./constants.js";
 
 const UNITS_PER_CELL = 8; // hidden units that the shaders process together
@@ -42,7 +43,8 @@ export function packSplats(splats) {
 }
 
 // Packs a model that hyrf/index.js has read for fields.js.
-export function packModel({ config, count, positions, colorLogits, scaleLogits, opacityLogits, geometry, radiance }) {
+export function packModel(model) {
+  const { metadata, config, count, positions, colorLogits, scaleLogits, opacityLogits, geometry, radiance } = model;
   const height = countRows(count);
   const explicit = new Float32Array(4 * TEXTURE_WIDTH * height), logits = new Float32Array(4 * TEXTURE_WIDTH * height);
   for (let i = 0, p = 0, q = 0; i < count; i++, p += 3, q += 4) {
@@ -62,6 +64,8 @@ export function packModel({ config, count, positions, colorLogits, scaleLogits, 
   });
   return {
     count, height, explicit, logits,
+    pixelSizes: pixelSizes(positions, metadata),
+    backgroundSpacing: backgroundSpacing(metadata),
     balls: rowBalls(positions, TEXTURE_WIDTH),
     geometry: field("geometry", geometry),
     radiance: field("radiance", radiance),

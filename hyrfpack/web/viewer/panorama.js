@@ -18,11 +18,12 @@ const MAX_FRESH_TURN_RADIANS = 1e-2; // a larger turn of the rays to a tile make
 export class Panorama {
   // `paint(framebuffer, size, part, eye)` draws a part (x, y, width, height) of a picture. `finest` is the finest
   // resolution of the hash grid, and `halfExtent` the half-axes of its frame. An arc from pole to pole crosses about
-  // pi / 2 times as many cells, more where a half-axis is short, and two texels per cell are enough.
-  constructor(graphics, { finest, halfExtent }, paint) {
+  // pi / 2 times as many cells, more where a half-axis is short, and two texels per cell are enough. Texels need not be
+  // finer than `backgroundSpacing`, the spacing in training.
+  constructor(graphics, { finest, halfExtent, backgroundSpacing }, paint) {
     Object.assign(this, { graphics, paint });
     this.pace = new WorkPacer();
-    const enough = Math.ceil((Math.PI * finest) / Math.min(...halfExtent));
+    const enough = Math.ceil(Math.PI * Math.min(finest / Math.min(...halfExtent), 1 / backgroundSpacing));
     this.height = Math.min(MAX_HEIGHT_TEXELS, Math.max(MIN_HEIGHT_TEXELS, enough));
   }
 

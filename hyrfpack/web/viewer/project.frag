@@ -7,12 +7,15 @@ precision highp usampler2D;
 precision highp usampler2DArray;
 
 uniform usampler2D u_places; // x, y, z as float32; opacity and log scale z
-uniform usampler2D u_shapes; // quaternion w, x; y, z; log scales x, y; red, green, blue in 11, 11 and 10 bits
+// Quaternion w, x; y, z; log scales x, y. Then splats have red, green, blue in 11, 11 and 10 bits, and Gaussians of a
+// model the pixel size q of its photos as float32.
+uniform usampler2D u_shapes;
 uniform usampler2DArray u_harmonics; // bytes, 16 a layer: coefficient after coefficient, red, green, blue of each
 uniform int u_degree;
 uniform float u_range; // of coefficients
 uniform usampler2D u_colors; // instead: halves red, green; blue, from colors.frag
-uniform bool u_colored; // take these
+uniform bool u_colored; // take these: the Gaussians are those of a model
+uniform float u_focal; // max(fx, fy) of the picture at full resolution
 uniform int u_count;
 uniform bool u_antialiased;
 uniform vec2 u_low_pass; // variances in px^2: of the picture at full resolution, and with the mean over its blocks
@@ -29,6 +32,7 @@ layout(location = 0) out uvec4 o_shape; // centre x, y in pixels; covariance xx,
 layout(location = 1) out uvec4 o_look; // covariance yy; its determinant; halves red, green; halves blue, opacity
 
 const float COMPENSATION_MIN = 2.5e-5;
+const float SAMPLING_VARIANCE = 0.4; // px^2 of the photos
 
 float byte_of(uint word, int place) {
     return float((word >> (8 * place)) & 255u);
@@ -99,6 +103,17 @@ void main() {
     vec3 scales = exp(vec3(unpackUnorm2x16(shape.z), last.y) * 44.0 - 22.0);
     vec4 quat = vec4(unpackSnorm2x16(shape.x), unpackSnorm2x16(shape.y));
     quat /= max(length(quat), 1e-12);
+
+    if (u_colored) { // no detail is finer than the photos' pixels
+        float size = uintBitsToFloat(shape.w), own = p.z / u_focal;
+        float added = SAMPLING_VARIANCE * (size * size - own * own);
+        if (added > 0.0) {
+            vec3 squares = scales * scales, kept = squares / (squares + added);
+            // Of the two longest axes.
+            if (u_antialiased) opacity *= sqrt(max(kept.x * kept.y, max(kept.y * kept.z, kept.z * kept.x)));
+            scales = sqrt(squares + added);
+        }
+    }
 
     vec2 slope = p.xy / p.z;
     vec2 slack = 0.15 * u_size / focal;

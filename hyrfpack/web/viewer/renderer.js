@@ -200,10 +200,10 @@ export class Renderer {
     gl.disable(gl.SCISSOR_TEST);
   }
 
-  // Blends the splats of a view. Returns their picture, and its size in use.
+  // Blends the splats of a view. Returns their picture, whose first rows and columns are in use.
   blended(view) {
     this.splats(view);
-    return { texture: this.layered, used: [view.width, view.height] };
+    return this.layered;
   }
 
   // Projects all splats of a view.
@@ -221,6 +221,7 @@ export class Renderer {
     gl.uniform1i(p.u_count, content.count);
     gl.uniform1i(p.u_antialiased, content.antialiased);
     gl.uniform2fv(p.u_low_pass, lowPassVariances(view.scale ?? 1));
+    gl.uniform1f(p.u_focal, Math.max(view.fx, view.fy) / (view.scale ?? 1));
     gl.uniformMatrix3fv(p.u_rotation, true, view.rows.flat());
     gl.uniform3fv(p.u_translation, view.translation);
     gl.uniform3fv(p.u_eye, view.eye);
@@ -240,10 +241,11 @@ export class Renderer {
     gl.bindFramebuffer(gl.FRAMEBUFFER, target);
     gl.viewport(0, 0, view.width, view.height);
     gl.useProgram(r.program);
-    graphics.bind(r, { u_splats: this.layered, u_background: picture ?? this.plain, u_sky: sky ?? this.plain });
+    const behind = { u_background: picture ?? this.plain, u_sky: sky?.texture ?? this.plain };
+    graphics.bind(r, { u_splats: this.layered, ...behind });
     gl.uniform2f(r.u_used, ...used);
     gl.uniform1i(r.u_pictured, picture ? 1 : 0);
-    gl.uniform1i(r.u_exact, sky ? 1 : 0);
+    gl.uniform1f(r.u_stride, sky?.stride ?? 0);
     gl.uniform3fv(r.u_from, view.eye.map((value, axis) => (value - center[axis]) / radius));
     gl.uniform3fv(r.u_solid, scene.solid);
     gl.uniform3fv(r.u_gains, gains);

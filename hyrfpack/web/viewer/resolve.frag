@@ -7,8 +7,8 @@ uniform sampler2D u_splats; // premultiplied, row 0 on top; a part of it is in u
 uniform vec2 u_used; // its size in texels
 uniform bool u_pictured; // the background is a picture, else a colour
 uniform sampler2D u_background; // equirectangular, on a sphere
-uniform sampler2D u_sky; // instead, at pixels of the target where its alpha is 1, row 0 on top
-uniform bool u_exact; // use it
+uniform sampler2D u_sky; // instead, between nodes whose alpha is 1, row 0 on top
+uniform float u_stride; // pixels of the target between its nodes; 0: do not use it
 uniform vec3 u_from; // the eye in units of the sphere's radius, from its centre
 uniform vec3 u_solid;
 uniform vec3 u_gains; // of the exposure; 1 changes nothing
@@ -33,8 +33,9 @@ void main() {
     vec2 texel = clamp(pixel / u_size * u_used, vec2(0.5), u_used - 0.5);
     vec4 splats = texture(u_splats, texel / vec2(textureSize(u_splats, 0)));
     vec3 behind = u_solid;
-    vec4 sky = u_exact ? texelFetch(u_sky, ivec2(pixel), 0) : vec4(0.0);
-    if (sky.a > 0.5) behind = sky.rgb;
+    vec4 sky = vec4(0.0);
+    if (u_stride > 0.0) sky = texture(u_sky, (floor(pixel) / u_stride + 0.5) / vec2(textureSize(u_sky, 0)));
+    if (sky.a > 0.99) behind = sky.rgb;
     else if (u_pictured) behind = background(normalize(u_world * vec3((pixel - u_intrinsics.zw) / u_intrinsics.xy, 1.0)));
     vec3 color = clamp(splats.rgb + (1.0 - splats.a) * behind, 0.0, 1.0);
     o_color = vec4(u_gains * color / (1.0 + (u_gains - 1.0) * color), 1.0);

@@ -29,6 +29,7 @@ PUBLIC_MODULES = (
     "remote",
     "remote_worker",
     "row_states",
+    "sampling",
     "sort",
     "viewpoint",
 )

@@ -29,7 +29,9 @@ window.open_ = async (source, options) => {
   const got = (window.got = { orders: [], rows: [], tiles: [] });
   window.model = await openRemoteModel(source, {
     onOrder: (order, drawn) => got.orders.push(Array.from(order.subarray(0, drawn))),
-    onRow: ({ shapes, colors }) => got.rows.push([Array.from(shapes), Array.from(colors)]),
+    onRow: ({ shapes, pixelSizes, colors }) => {
+      got.rows.push([shapes, pixelSizes, colors].map((numbers) => Array.from(numbers)));
+    },
     onTile: ({ isCoarse, x, y, width, height, pixels }) => {
       got.tiles.push([isCoarse, x, y, width, height, pixels.length]);
     },
@@ -63,7 +65,7 @@ def test_a_view_gets_its_order_its_shapes_and_its_colors(page: Browser):
     assert open_model(page) == len(reference)
 
     assert page.evaluate(f"model.look({json.dumps(VIEW)})") is True
-    order, shapes, colors = page.evaluate("[got.orders[0], ...got.rows[0]]")
+    order, shapes, sizes, colors = page.evaluate("[got.orders[0], ...got.rows[0]]")
 
     geometry = reference.decode_geometry()
     means = reference.gaussians.positions.detach().numpy().astype(np.float64)
@@ -73,6 +75,7 @@ def test_a_view_gets_its_order_its_shapes_and_its_colors(page: Browser):
     shapes = np.reshape(shapes, (-1, 4, 3))
     np.testing.assert_allclose(shapes[:, 0], means, atol=1e-6)
     quats = torch.nn.functional.normalize(geometry.quats).detach().numpy()[:, [1, 2, 3, 0]]
+    np.testing.assert_allclose(sizes, reference.gaussians.pixel_sizes, rtol=1e-5)
     axes = Rotation.from_quat(quats).as_matrix() * geometry.scales.detach().numpy()[:, None, :]
     np.testing.assert_allclose(shapes[:, 1:], axes.transpose(0, 2, 1), atol=1e-5)
     rgb = reference.decode_colors(torch.tensor(EYE, dtype=torch.float32))

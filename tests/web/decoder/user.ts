@@ -11,6 +11,7 @@ import { fitHarmonics } from "hyrf.js/harmonics.js";
 import { openRemoteModel } from "hyrf.js/remote.js";
 import type { EvaluatedRow, RemoteModel } from "hyrf.js/remote.js";
 import { RowStates, rowBalls } from "hyrf.js/row_states.js";
+import { backgroundSpacing, backgroundStride, pixelSizes } from "hyrf.js/sampling.js";
 import { DepthSort } from "hyrf.js/sort.js";
 import { viewpointOf } from "hyrf.js/viewpoint.js";
 
@@ -32,6 +33,10 @@ export function sort(model: Model, view: View): Uint32Array {
   const { rows } = new RowStates(rowBalls(model.positions, 256)).stale(planes, [0, 0, 0], 0);
   console.log(rows.length);
   return new DepthSort(model.positions, 256).sort(row, planes, 0.01).order;
+}
+
+export function limitDetail(model: Model, view: View): [Float32Array, number] {
+  return [pixelSizes(model.positions, model.metadata), backgroundStride(backgroundSpacing(model.metadata), view)];
 }
 
 export async function open(view: View, receive: (row: EvaluatedRow) => void): Promise<RemoteModel | null> {

@@ -10,6 +10,7 @@ export type View = import("./frustum.js").View;
 export type EvaluatedRow = {
     row: number;
     shapes: Float32Array | null;
+    pixelSizes: Float32Array | null;
     colors: Float32Array;
 };
 export type SkyTile = {
@@ -32,8 +33,10 @@ export type SkySize = {
  *
  * A row of Gaussians, of which the first has the index GAUSSIANS_PER_ROW times `row`. `shapes` has FLOATS_PER_SHAPE
  * numbers for each: its position, and its three axes, each with the length of the standard deviation, in local units.
- * It is null if it was delivered before. `colors` has red, green, blue and opacity of each, in [0, 1].
- * @typedef {{row: number, shapes: Float32Array | null, colors: Float32Array}} EvaluatedRow
+ * `pixelSizes` has the pixel size of the photos at each, in local units, or 0 (see sampling.js). Both are null if they
+ * were delivered before. `colors` has red, green, blue and opacity of each, in [0, 1].
+ * @typedef {{row: number, shapes: Float32Array | null, pixelSizes: Float32Array | null, colors: Float32Array}}
+ *   EvaluatedRow
  *
  * A part of the equirectangular picture of the background: its place and its RGBA bytes. Column c of a picture with
  * height h is at the longitude (c + 0.5) pi / h - pi, row r at the latitude pi / 2 - (r + 0.5) pi / h. Longitudes run
@@ -45,14 +48,15 @@ export type SkySize = {
  */
 /**
  * Returns the size of the background's picture, or null if the model has no background.
- * @param {import("./metadata.js").Config} config
+ * @param {import("./metadata.js").Metadata} metadata
  * @returns {SkySize | null}
  */
-export declare function skySize({ background, radiance }: import("./metadata.js").Config): SkySize | null;
+export declare function skySize(metadata: import("./metadata.js").Metadata): SkySize | null;
 export declare class ViewEvaluator {
     model: import("./index.js").Model;
     sorter: DepthSort;
     rows: RowStates;
+    pixelSizes: Float32Array<ArrayBufferLike>;
     opacities: Float32Array<ArrayBuffer>;
     /** @type {(Float32Array | null)[]} */
     firstLayers: (Float32Array | null)[];

@@ -51,3 +51,21 @@ export declare function evenlySpaced<Item>(items: Item[], count: number): Item[]
  * @returns {number[]}
  */
 export declare function cameraPosition({ camera_from_world: pose }: Camera): number[];
+/**
+ * Converts a camera to a view in a model's local units, with the position of its eye.
+ * @param {Camera} camera
+ * @param {import("./metadata.js").Frame} frame
+ * @returns {import("./frustum.js").View & {eye: number[]}}
+ */
+export declare function toLocalView(camera: Camera, { center, scale }: import("./metadata.js").Frame): import("./frustum.js").View & {
+    eye: number[];
+};
+/**
+ * Returns the cameras that a file keeps: the training cameras or, if these are absent or invalid, the few coarse ones.
+ * @param {import("./metadata.js").Metadata} metadata the checked metadata of the model
+ * @returns {{cameras: Camera[], isCoarse: boolean}} `cameras` is empty if the file keeps none that are valid
+ */
+export declare function storedCameras({ provenance }: import("./metadata.js").Metadata): {
+    cameras: Camera[];
+    isCoarse: boolean;
+};
