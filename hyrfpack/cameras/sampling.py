@@ -20,6 +20,8 @@ DEFAULT_BACKGROUND_STRIDE = 2
 MAX_BACKGROUND_STRIDE = 64
 BACKGROUND_STRIDE_KEY = "background_stride"
 MAX_SELECTION_POINTS = 2000
+MAX_SAMPLING_CAMERAS = 128  # It bounds the time that a forged file can take.
+MAX_PIXEL_SIZE = 1e6  # Local units; larger ones come from broken cameras, and their squares would overflow.
 _MIN_DEPTH = 1e-2  # in local units: the renderer's near plane
 _MIN_RATE_RATIO = 1e-3  # An unseen point counts as sampled at this share of its rate in all photos.
 _POINTS_PER_BLOCK = 1 << 13
@@ -30,7 +32,7 @@ class PhotoCameras:
     """The cameras of the photos that a file keeps, and the spacing at which training evaluated the background.
 
     Attributes:
-        cameras: in world units.
+        cameras: in world units, at most MAX_SAMPLING_CAMERAS.
         is_coarse: whether they are only some of the cameras, with rounded poses.
         background_stride: pixels between neighbouring nodes of the background in the last training steps.
     """
@@ -41,13 +43,17 @@ class PhotoCameras:
 
     @classmethod
     def from_provenance(cls, provenance: dict) -> PhotoCameras:
-        """Read an untrusted provenance. A list of cameras with one that is not valid counts as missing."""
+        """Read an untrusted provenance. A list of cameras with one that is not valid counts as missing.
+
+        Of a list with more than MAX_SAMPLING_CAMERAS, the first ones count.
+        """
         stored = provenance.get(BACKGROUND_STRIDE_KEY)
         is_valid = isinstance(stored, int) and not isinstance(stored, bool) and 1 <= stored <= MAX_BACKGROUND_STRIDE
         stride = cast(int, stored) if is_valid else DEFAULT_BACKGROUND_STRIDE
         for key in ("cameras", "coarse_cameras"):
             with suppress(TypeError, ValueError, ArithmeticError):
-                if cameras := [camera_from_numbers(numbers) for numbers in provenance.get(key) or ()]:
+                kept = list(provenance.get(key) or ())[:MAX_SAMPLING_CAMERAS]
+                if cameras := [camera_from_numbers(numbers) for numbers in kept]:
                     return cls(cameras, key == "coarse_cameras", stride)
         return cls((), False, stride)
 
@@ -72,12 +78,21 @@ class PhotoCameras:
             scale: world units of a local unit.
 
         Returns:
-            (N,) float32, in local units; None without cameras.
+            (N,) float32, in local units, at most MAX_PIXEL_SIZE; None without cameras. 0 where cameras beyond float32
+            give no size, which limits nothing.
         """
         if not self.cameras:
             return None
-        origin = np.array(center)
         sizes = np.empty(len(points), np.float32)
+        with np.errstate(all="ignore"):
+            self._fill_pixel_sizes(sizes, points, np.array(center), scale)
+        if self.is_coarse:
+            sizes /= np.float32(COARSE_RATE_RATIO)
+        sizes[~(sizes <= MAX_PIXEL_SIZE)] = 0  # also where NaN
+        return sizes
+
+    def _fill_pixel_sizes(self, sizes: np.ndarray, points: np.ndarray, origin: np.ndarray, scale: float) -> None:
+        """Write the inverse of the highest rates (N,) at points (N, 3) to `sizes`."""
         for start in range(0, len(points), _POINTS_PER_BLOCK):
             block = np.ascontiguousarray(points[start : start + _POINTS_PER_BLOCK].T)
             best = np.zeros(block.shape[1], np.float32)
@@ -88,7 +103,6 @@ class PhotoCameras:
                 distant = [_rates_by_distance(camera, block[:, unseen], origin, scale) for camera in self.cameras]
                 best[unseen] = np.max(distant, axis=0)
             sizes[start : start + len(best)] = 1 / best
-        return sizes / np.float32(COARSE_RATE_RATIO) if self.is_coarse else sizes
 
 
 def select_representative_cameras(
@@ -109,7 +123,9 @@ def select_representative_cameras(
     points = points[:: -(-len(points) // MAX_SELECTION_POINTS)]
     center = points.mean(axis=0)
     local = ((points - center) / scale).astype(np.float32).T
-    rates = np.stack([_sampling_rates(camera, local, center, scale) for camera in cameras])
+    with np.errstate(all="ignore"):
+        rates = np.stack([_sampling_rates(camera, local, center, scale) for camera in cameras])
+        rates = np.nan_to_num(rates, posinf=0)
     floor = np.maximum(_MIN_RATE_RATIO * rates.max(axis=0), np.finfo(np.float32).tiny)
     logs = np.log(np.maximum(rates, floor))
     selected, best = [0], logs[0]

@@ -2,10 +2,13 @@
 
 import json
 import math
+import warnings
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scenes import camera_at, ring
 
 from hyrfpack.cameras.capture import provenance_cameras, quantized_provenance
@@ -13,6 +16,8 @@ from hyrfpack.cameras.sampling import (
     COARSE_RATE_RATIO,
     DEFAULT_BACKGROUND_STRIDE,
     MAX_BACKGROUND_STRIDE,
+    MAX_PIXEL_SIZE,
+    MAX_SAMPLING_CAMERAS,
     PhotoCameras,
     select_representative_cameras,
 )
@@ -87,6 +92,30 @@ def test_invalid_cameras_count_as_missing(cameras):
 @pytest.mark.parametrize("stride", [0, -1, 2.0, True, "3", None, MAX_BACKGROUND_STRIDE + 1, 10**30])
 def test_an_invalid_stride_counts_as_missing(stride):
     assert PhotoCameras.from_provenance({"background_stride": stride}).background_stride == DEFAULT_BACKGROUND_STRIDE
+
+
+def test_of_a_long_list_only_the_first_cameras_count():
+    stored = provenance_cameras([along_z(-2.0), along_z(1.0, 90.0)])
+    photos = PhotoCameras.from_provenance({"cameras": [stored[0]] * MAX_SAMPLING_CAMERAS + [stored[1]] * 10_000})
+    assert len(photos.cameras) == MAX_SAMPLING_CAMERAS and photos.background_spacing == pytest.approx(2 / 50)
+
+
+@given(
+    st.floats(1e-30, 1e30),
+    st.floats(1e-30, 1e30),
+    st.lists(st.floats(-1e30, 1e30), min_size=3, max_size=3),
+    st.floats(1e-6, 1e6),
+)
+def test_forged_cameras_give_finite_sizes_and_no_warning(fx, fy, translation, scale):
+    pose = np.concatenate([np.eye(3), np.array(translation)[:, None]], axis=1)
+    camera = [32, 32, fx, fy, 16, 16, *pose.ravel().tolist()]
+    photos = PhotoCameras.from_provenance({"cameras": [camera] * 20})
+    points = np.random.default_rng(0).normal(size=(50, 3))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        sizes = photos.pixel_sizes(points.astype(np.float32), (0, 0, 0), scale)
+        chosen = select_representative_cameras(photos.cameras, points, scale, 14)
+    assert sizes is not None and ((sizes >= 0) & (sizes <= MAX_PIXEL_SIZE)).all() and len(chosen) == 14
 
 
 def test_representative_cameras_include_the_only_close_up():
