@@ -6,7 +6,8 @@ import { storedCameras, toLocalView } from "./viewpoint.js";
 const PICTURE_MARGIN_RATIO = 0.15; // positions in this margin count as visible; in sizes of the picture
 const MIN_DEPTH_LOCAL = 0.01;
 const COARSE_RATE_RATIO = 1.1; // the few coarse cameras underestimate the rate of all photos
-const MAX_SIZE_LOCAL = 1e18; // the square is finite in float32
+const MAX_CAMERAS = 128; // bounds the time that a forged file can take
+const MAX_SIZE_LOCAL = 1e6; // larger ones come from broken cameras
 const DEFAULT_BACKGROUND_STRIDE = 2;
 const MAX_BACKGROUND_STRIDE = 64;
 const STRIDE_TOLERANCE = 0.01; // files round focal lengths
@@ -17,14 +18,16 @@ const NUMBERS_PER_VIEW = 20; // see `packViews`
 /**
  * Computes the pixel size of the photos at positions: q = min over the cameras of the file that see the position of
  * z / f, with f = max(fx, fy) and the depth z in local units. Where no camera sees it, q is the minimum over all
- * cameras of distance / f. If the file keeps only coarse cameras, q is divided by COARSE_RATE_RATIO.
+ * cameras of distance / f. If the file keeps only coarse cameras, q is divided by COARSE_RATE_RATIO. Of a long list of
+ * cameras the first MAX_CAMERAS count.
  *
  * @param {Float32Array} positions 3 n, in local units
  * @param {Metadata} metadata the checked metadata of the model
- * @returns {Float32Array} n sizes of a pixel in local units; 0 if the file has no valid cameras
+ * @returns {Float32Array} n sizes of a pixel in local units; 0 if the file has no valid cameras,
+ *   or if these give no sensible size
  */
 export function pixelSizes(positions, metadata) {
-  const sizes = new Float32Array(positions.length / 3), { cameras, isCoarse } = storedCameras(metadata);
+  const sizes = new Float32Array(positions.length / 3), { cameras, isCoarse } = samplingCameras(metadata);
   const views = packViews(cameras, metadata.config.frame), ratio = isCoarse ? 1 / COARSE_RATE_RATIO : 1;
   for (let i = 0, p = 0; i < sizes.length; i++, p += 3) {
     const x = positions[p], y = positions[p + 1], z = positions[p + 2];
@@ -38,9 +41,19 @@ export function pixelSizes(positions, metadata) {
       if (down >= views[k + 15] * depth && down <= views[k + 16] * depth) smallest = size;
     }
     if (smallest === Infinity) smallest = smallestByDistance(views, x, y, z);
-    sizes[i] = smallest < MAX_SIZE_LOCAL ? ratio * smallest : 0;
+    const size = ratio * smallest;
+    sizes[i] = size <= MAX_SIZE_LOCAL ? size : 0;
   }
   return sizes;
+}
+
+/**
+ * Returns the cameras of a file that count, at most MAX_CAMERAS.
+ * @param {Metadata} metadata
+ */
+function samplingCameras(metadata) {
+  const { cameras, isCoarse } = storedCameras(metadata);
+  return { cameras: cameras.slice(0, MAX_CAMERAS), isCoarse };
 }
 
 /**
@@ -87,7 +100,7 @@ function packViews(cameras, frame) {
  * @returns {number} the tangent of an angle; 0 if the file has no valid cameras
  */
 export function backgroundSpacing(metadata) {
-  const focals = storedCameras(metadata).cameras.map(({ fx, fy }) => Math.max(fx, fy));
+  const focals = samplingCameras(metadata).cameras.map(({ fx, fy }) => Math.max(fx, fy));
   const stride = metadata.provenance?.background_stride;
   const isValid = Number.isInteger(stride) && stride >= 1 && stride <= MAX_BACKGROUND_STRIDE;
   return focals.length ? (isValid ? stride : DEFAULT_BACKGROUND_STRIDE) / Math.max(...focals) : 0;

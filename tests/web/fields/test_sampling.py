@@ -89,6 +89,15 @@ def test_coarse_cameras_count_only_without_exact_ones_and_for_a_tenth_more(tmp_p
     np.testing.assert_allclose(sizes, [8 / FOCAL / 1.1, 4 / FOCAL, 8 / FOCAL / 1.1], rtol=FLOAT32_ROUNDING)
 
 
+def test_forged_cameras_limit_nothing_and_take_no_long_time(tmp_path: Path) -> None:
+    far, near = (camera_to_numbers(axis_camera(distance)) for distance in (4.0, 2.0))
+    blurred = [*far[:2], 1e-9, 1e-9, *far[4:]]
+
+    sizes = [sample_in_node(tmp_path, {"cameras": cameras})["sizes"] for cameras in ([far] * 128 + [near], [blurred])]
+
+    np.testing.assert_allclose(sizes, [[4 / FOCAL], [0]], rtol=FLOAT32_ROUNDING)
+
+
 @pytest.mark.parametrize("provenance", [None, {}, {"cameras": 3}, {"cameras": []}, {"coarse_cameras": [[1]]}])
 def test_without_cameras_nothing_is_filtered_and_each_pixel_has_its_background(tmp_path: Path, provenance: Any) -> None:
     found = sample_in_node(tmp_path, provenance, focals=(1.0, 1e4))

@@ -3,11 +3,13 @@ export type Metadata = import("./metadata.js").Metadata;
 /**
  * Computes the pixel size of the photos at positions: q = min over the cameras of the file that see the position of
  * z / f, with f = max(fx, fy) and the depth z in local units. Where no camera sees it, q is the minimum over all
- * cameras of distance / f. If the file keeps only coarse cameras, q is divided by COARSE_RATE_RATIO.
+ * cameras of distance / f. If the file keeps only coarse cameras, q is divided by COARSE_RATE_RATIO. Of a long list of
+ * cameras the first MAX_CAMERAS count.
  *
  * @param {Float32Array} positions 3 n, in local units
  * @param {Metadata} metadata the checked metadata of the model
- * @returns {Float32Array} n sizes of a pixel in local units; 0 if the file has no valid cameras
+ * @returns {Float32Array} n sizes of a pixel in local units; 0 if the file has no valid cameras,
+ *   or if these give no sensible size
  */
 export declare function pixelSizes(positions: Float32Array, metadata: Metadata): Float32Array;
 /**
