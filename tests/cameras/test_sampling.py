@@ -23,18 +23,18 @@ from hyrfpack.cameras.sampling import (
 )
 from hyrfpack.scene import Camera
 
-CENTER, SCALE = (10.0, -20.0, 5.0), 4.0
+FRAME_CENTER, FRAME_SCALE = (10.0, -20.0, 5.0), 4.0
 
 
 def along_z(z: float, focal: float = 50.0) -> Camera:
     """Return a camera of 100 x 80 pixels that looks along +z from (0, 0, z), in local units."""
     pose = np.eye(4)
-    pose[:3, 3] = -(np.array(CENTER) + SCALE * np.array([0, 0, z]))
+    pose[:3, 3] = -(np.array(FRAME_CENTER) + FRAME_SCALE * np.array([0, 0, z]))
     return Camera(100, 80, focal, 0.8 * focal, 50.0, 40.0, pose)
 
 
 def pixel_sizes(cameras: list[Camera], points: list[list[float]], is_coarse: bool = False) -> list[float]:
-    sizes = PhotoCameras(cameras, is_coarse, 2).pixel_sizes(np.array(points, np.float32), CENTER, SCALE)
+    sizes = PhotoCameras(cameras, is_coarse, 2).pixel_sizes(np.array(points, np.float32), FRAME_CENTER, FRAME_SCALE)
     assert sizes is not None and sizes.dtype == np.float32
     return sizes.tolist()
 
@@ -70,7 +70,7 @@ def test_many_points_have_the_sizes_that_single_ones_have():
 
 def test_without_cameras_nothing_is_known():
     photos = PhotoCameras.from_provenance({})
-    assert photos.pixel_sizes(np.zeros((3, 3), np.float32), CENTER, SCALE) is None
+    assert photos.pixel_sizes(np.zeros((3, 3), np.float32), FRAME_CENTER, FRAME_SCALE) is None
     assert photos.background_spacing == 0
 
 

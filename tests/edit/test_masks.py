@@ -22,7 +22,7 @@ from hyrfpack.render import RenderSettings
 from hyrfpack.scene import Picture, Scene, View
 from tools.safety.train_golden import DEMO_MODEL_FILE, write_demo_photos
 
-CENTER, RADIUS = (0.0, 0.0, 0.0), 1.0
+OBJECT_CENTER, OBJECT_RADIUS = (0.0, 0.0, 0.0), 1.0
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def scene(photos) -> Scene:
 def is_object() -> np.ndarray:
     model = load_model(DEMO_MODEL_FILE)
     positions = model.config.frame.to_world(model.gaussians.positions.numpy())
-    return np.linalg.norm(positions - CENTER, axis=1) <= RADIUS
+    return np.linalg.norm(positions - OBJECT_CENTER, axis=1) <= OBJECT_RADIUS
 
 
 @pytest.fixture(scope="module")
@@ -145,7 +145,7 @@ def test_black_masks_are_refused_because_nothing_is_left(scene, masks, tmp_path)
 
 def test_a_crop_keeps_at_least_a_sphere_inside_the_object(scene, masks):
     """Crops can follow each other: of the masks' object, the sphere that made it keeps nearly all."""
-    actions = [CropMasks(str(masks)), CropSphere(CENTER, 1.3 * RADIUS)]
+    actions = [CropMasks(str(masks)), CropSphere(OBJECT_CENTER, 1.3 * OBJECT_RADIUS)]
     report = plan_edit(DEMO_MODEL_FILE, actions, data=scene, context=QUIET_CONTEXT)
     first, second = (action.gaussians_after for action in report.actions)
     assert second > 0.8 * first

@@ -18,7 +18,7 @@ from tools.studies.compare_versions import DEFAULT_SETS
 from tools.studies.train_sets import make_study_parser
 from tools.tables import markdown_table
 
-REDUCTION = 2
+PHOTO_REDUCTION = 2
 
 
 def without_photo_sampling(model: hyrfpack.HybridModel) -> hyrfpack.HybridModel:
@@ -32,7 +32,7 @@ def measure(data: Path, steps: int, seed: int, out: Path) -> list[tuple[float, f
     """Train, compress and score one set; return PSNR and SSIM of the four columns of the table."""
     photos = hyrfpack.load_scene(data)
     longest = max(max(view.camera.width, view.camera.height) for view in photos.views)
-    reduced = hyrfpack.load_scene(data, max_size=longest // REDUCTION)
+    reduced = hyrfpack.load_scene(data, max_size=longest // PHOTO_REDUCTION)
     packed = out / "compact.hyrf"
     if not packed.exists():
         hyrfpack.train_model(reduced, out, hyrfpack.TrainConfig(steps=steps, seed=seed), overwrite=True)

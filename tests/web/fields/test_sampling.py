@@ -17,16 +17,16 @@ from hyrfpack.cameras.sampling import PhotoCameras
 from hyrfpack.scene import Camera
 
 SAMPLING_SCRIPT = Path(__file__).parent / "sampling.mjs"
-FOCAL, WIDTH, HEIGHT = 100.0, 80, 60
+FOCAL_PIXELS, WIDTH_PIXELS, HEIGHT_PIXELS = 100.0, 80, 60
 FLOAT32_ROUNDING = 3e-7
 
 
-def axis_camera(distance: float = 4.0, focal: float = FOCAL) -> Camera:
+def axis_camera(distance: float = 4.0, focal: float = FOCAL_PIXELS) -> Camera:
     """Return a camera that looks along +z of the world at the frame's centre, `distance` local units away from it."""
     pose = np.eye(4)
     pose[:3, 3] = -np.array(MODEL_FRAME.center)
     pose[2, 3] += distance * MODEL_FRAME.scale
-    return Camera(WIDTH, HEIGHT, focal, focal, WIDTH / 2, HEIGHT / 2, pose)
+    return Camera(WIDTH_PIXELS, HEIGHT_PIXELS, focal, focal, WIDTH_PIXELS / 2, HEIGHT_PIXELS / 2, pose)
 
 
 def provenance_of(cameras: list[Camera], key: str = "cameras", **more: Any) -> dict:
@@ -48,7 +48,7 @@ def test_the_pixel_size_is_the_depth_by_the_focal_length(tmp_path: Path) -> None
 
     found = sample_in_node(tmp_path, provenance_of([axis_camera()]), positions)
 
-    np.testing.assert_allclose(found["sizes"], depths / FOCAL, rtol=1e-5)
+    np.testing.assert_allclose(found["sizes"], depths / FOCAL_PIXELS, rtol=1e-5)
 
 
 def test_the_finest_camera_that_sees_a_position_decides(tmp_path: Path) -> None:
@@ -64,19 +64,21 @@ def test_the_finest_camera_that_sees_a_position_decides(tmp_path: Path) -> None:
 def test_cameras_see_15_percent_beyond_each_edge_and_otherwise_the_distance_counts(
     tmp_path: Path, axis: int, side: int
 ) -> None:
-    reach = (0.5 + 0.15) * (WIDTH, HEIGHT)[axis] / FOCAL  # the tangent at which the camera ceases to see
+    reach = (
+        (0.5 + 0.15) * (WIDTH_PIXELS, HEIGHT_PIXELS)[axis] / FOCAL_PIXELS
+    )  # the tangent at which the camera ceases to see
     positions = np.zeros((2, 3))
     positions[:, axis] = [side * 4 * (reach - 1e-4), side * 4 * (reach + 1e-4)]
 
     found = sample_in_node(tmp_path, provenance_of([axis_camera()]), positions)
 
-    np.testing.assert_allclose(found["sizes"], np.array([4, 4 * np.hypot(1, reach + 1e-4)]) / FOCAL, rtol=1e-6)
+    np.testing.assert_allclose(found["sizes"], np.array([4, 4 * np.hypot(1, reach + 1e-4)]) / FOCAL_PIXELS, rtol=1e-6)
 
 
 def test_a_position_behind_all_cameras_has_a_size_by_its_distance(tmp_path: Path) -> None:
     found = sample_in_node(tmp_path, provenance_of([axis_camera()]), [(0, 0, -5), (0, 3, -8), (0, 0, -4)])
 
-    np.testing.assert_allclose(found["sizes"], np.array([1, 5, 0.01]) / FOCAL, rtol=1e-5)
+    np.testing.assert_allclose(found["sizes"], np.array([1, 5, 0.01]) / FOCAL_PIXELS, rtol=1e-5)
 
 
 def test_coarse_cameras_count_only_without_exact_ones_and_for_a_tenth_more(tmp_path: Path) -> None:
@@ -86,7 +88,9 @@ def test_coarse_cameras_count_only_without_exact_ones_and_for_a_tenth_more(tmp_p
 
     sizes = [sample_in_node(tmp_path, provenance)["sizes"][0] for provenance in (coarse, both, broken)]
 
-    np.testing.assert_allclose(sizes, [8 / FOCAL / 1.1, 4 / FOCAL, 8 / FOCAL / 1.1], rtol=FLOAT32_ROUNDING)
+    np.testing.assert_allclose(
+        sizes, [8 / FOCAL_PIXELS / 1.1, 4 / FOCAL_PIXELS, 8 / FOCAL_PIXELS / 1.1], rtol=FLOAT32_ROUNDING
+    )
 
 
 def test_forged_cameras_limit_nothing_and_take_no_long_time(tmp_path: Path) -> None:
@@ -95,7 +99,7 @@ def test_forged_cameras_limit_nothing_and_take_no_long_time(tmp_path: Path) -> N
 
     sizes = [sample_in_node(tmp_path, {"cameras": cameras})["sizes"] for cameras in ([far] * 128 + [near], [blurred])]
 
-    np.testing.assert_allclose(sizes, [[4 / FOCAL], [0]], rtol=FLOAT32_ROUNDING)
+    np.testing.assert_allclose(sizes, [[4 / FOCAL_PIXELS], [0]], rtol=FLOAT32_ROUNDING)
 
 
 @pytest.mark.parametrize("provenance", [None, {}, {"cameras": 3}, {"cameras": []}, {"coarse_cameras": [[1]]}])
@@ -116,7 +120,7 @@ def test_without_cameras_nothing_is_filtered_and_each_pixel_has_its_background(t
     ],
 )
 def test_strides_keep_the_spacing_of_training(tmp_path: Path, stored: dict, strides: list[int]) -> None:
-    cameras = [axis_camera(), axis_camera(focal=FOCAL / 2)]  # the longer focal length counts
+    cameras = [axis_camera(), axis_camera(focal=FOCAL_PIXELS / 2)]  # the longer focal length counts
     focals = (25.0, 50.0, 99.6, 100.0, 150.0, 300.0, 1e5)
 
     found = sample_in_node(tmp_path, provenance_of(cameras, **stored), focals=focals)
