@@ -12,7 +12,7 @@ import numpy as np
 
 from hyrfpack.data.equirectangular import CUBE_FACES, Face, FaceFile, face_lens, face_size
 from hyrfpack.data.folder import is_raw_name, list_pictures
-from hyrfpack.data.masks import find_masks
+from hyrfpack.data.masks import check_mask_shape, find_masks
 from hyrfpack.data.names import find_similar_file
 from hyrfpack.data.pictures import (
     PhotoFile,
@@ -303,13 +303,7 @@ def _make_view(photo: Photo, max_size: int) -> View:
         lens = lens.scaled(*size)
     whole = header.size if photo.face is None else read_header(photo.path).size
     if photo.mask is not None:
-        mask = read_header(photo.mask)
-        sizes = {mask.size, mask.turned(photo.orientation).size}
-        if not any(has_same_aspect(*shape, *whole) for shape in sizes):
-            raise HyrfDataError(
-                f"{photo.mask}: the mask is {mask.width} x {mask.height} but its photo {whole[0]} x {whole[1]}",
-                fix="make it the photo's size",
-            )
+        check_mask_shape(photo.mask, whole, photo.orientation)
     pose = _orthonormal_pose(photo.camera_from_world, photo.path)
     camera = Camera(*size, lens.fx, lens.fy, lens.cx, lens.cy, pose)
     if photo.face is not None:

@@ -95,18 +95,25 @@ def assign_masks(views: Sequence[View], folder: Path) -> list[View]:
     for view in views:
         if (mask := found.by_photo.get(view.name)) is not None:
             load = loaders[view.name]
-            _check_mask_shape(mask, load)
+            check_mask_shape(mask, load.stored, load.orientation if isinstance(load, PhotoFile) else 1)
             masked.append(replace(view, load=replace(load, mask=mask)))
     return masked
 
 
-def _check_mask_shape(mask: Path, photo: PhotoFile | FaceFile) -> None:
-    """Raise HyrfDataError if a mask has another aspect ratio than its photo, turned or not."""
-    size = read_header(mask).size
-    if not (has_same_aspect(*size, *photo.stored) or has_same_aspect(*size[::-1], *photo.stored)):
+def check_mask_shape(path: Path, photo_size: tuple[int, int], orientation: int = 1) -> None:
+    """Raise HyrfDataError if a mask has another aspect ratio than its photo, also when it is turned like the photo.
+
+    Args:
+        path: the mask.
+        photo_size: (width, height) of the upright photo.
+        orientation: EXIF orientation of the photo.
+    """
+    mask = read_header(path)
+    sizes = {mask.size, mask.turned(orientation).size}
+    if not any(has_same_aspect(*size, *photo_size) for size in sizes):
         raise HyrfDataError(
-            f"{mask}: the mask is {size[0]} x {size[1]} but its photo {photo.stored[0]} x {photo.stored[1]}",
-            fix="make it the size of its photo",
+            f"{path}: the mask is {mask.width} x {mask.height} but its photo {photo_size[0]} x {photo_size[1]}",
+            fix="make it the photo's size",
         )
 
 

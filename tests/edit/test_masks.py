@@ -92,7 +92,7 @@ def test_masks_of_an_object_select_its_gaussians(scene, masks, is_object):
 
     found = share_of_light_in_masks(model, assign_masks(scene.train, masks)) >= 0.5
     assert found.sum() == kept
-    assert found[is_object & opaque].mean() > 0.75
+    assert found[is_object & opaque].mean() > 0.85
     assert (~found)[~is_object & opaque].mean() > 0.85
 
 

@@ -23,7 +23,7 @@ from hyrfpack.scene import Camera
 from tools.browser.chromium import Chromium, find
 
 GOLDEN_FILE = Path(__file__).parents[2] / "golden" / "trained" / "demo_compact.hyrf"
-EXACT = RenderSettings(background_threshold=0, transmittance_min=0, exposure="consistent")
+EXACT_SETTINGS = RenderSettings(background_threshold=0, transmittance_min=0, exposure="consistent")
 SIZE_PIXELS = 240
 MIN_PSNR_DB = 50
 MIN_BACKGROUND_PSNR_DB = 45  # the background is a picture of its sphere, not interpolated between pixels of the view
@@ -78,7 +78,7 @@ def draw(page: Chromium, camera: Camera) -> np.ndarray:
 
 
 def render(file: Path, camera: Camera) -> np.ndarray:
-    rgb = render_view(hyrfpack.load_model(file), camera, EXACT).rgb
+    rgb = render_view(hyrfpack.load_model(file), camera, EXACT_SETTINGS).rgb
     return 255 * rgb.clamp(0, 1).detach().numpy().astype(np.float64)
 
 
