@@ -44,11 +44,20 @@ if TYPE_CHECKING:
     from hyrfpack.edit import EditReport
 
 _ORDER_KEY = "hyrfpack.cli.edit.order"
+
+
+def _read_polygon(path: Path) -> Action:
+    from hyrfpack.edit.polygon import read_polygon
+
+    return read_polygon(path)
+
+
 # How the value of each option becomes an action.
 _ACTION_BY_OPTION: dict[str, Callable[[Any], Action]] = {
     "crop_box": lambda box: CropBox(tuple(box[:3]), tuple(box[3:])),
     "crop_sphere": lambda numbers: CropSphere(tuple(numbers[:3]), numbers[3]),
     "crop_cameras": CropCameras,
+    "crop_polygon": _read_polygon,
     "crop_masks": lambda folder: CropMasks(str(folder)),
     "min_opacity": MinOpacity,
     "max_scale": MaxScale,
@@ -87,6 +96,14 @@ class _OrderedCommand(click.Command):
     metavar="MARGIN",
     help="Keep the Gaussians that the cameras surround, seen from above. The margin enlarges this area by a fraction "
     "of its size; 0 for none.",
+)
+@click.option(
+    "--crop-polygon",
+    type=PATH,
+    multiple=True,
+    metavar="JSON",
+    help="Keep the Gaussians above and below a polygon on the ground, which the file states as [[x, y, z], ...], or as "
+    'an object with "points", "min_height" and "max_height".',
 )
 @click.option(
     "--crop-masks",
@@ -164,6 +181,7 @@ def edit(
       hyrfpack edit garden.hyrf -o clean.hyrf --min-opacity 0.02 --crop-cameras 0.5
       hyrfpack edit runs/garden -o clean.hyrf --remove-floaters 0.35 --data photos/garden
       hyrfpack edit runs/desk -o lamp.hyrf --crop-masks lamp_masks --data photos/desk --background-color 1,1,1
+      hyrfpack edit survey.hyrf -o plot.hyrf --crop-polygon plot.json
       hyrfpack edit room.hyrf -o hole.hyrf --crop-box=-1,-1,-1,1,1,1 --invert
       hyrfpack edit survey.hyrf -o meters.hyrf --scale 2.54
     """

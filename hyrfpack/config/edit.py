@@ -14,6 +14,7 @@ from hyrfpack.checks import check_float, check_int
 Vector = tuple[float, float, float]
 DEFAULT_MIN_OPACITY_SHARE = 0.35
 DEFAULT_MIN_LIGHT_SHARE = 0.5
+MIN_POLYGON_POINTS, MAX_POLYGON_POINTS = 3, 10_000
 MIN_MARGIN = -0.99  # a hull of no size would keep nothing
 
 
@@ -105,7 +106,44 @@ class CropMasks:
         return f"crop to what the masks in {self.folder} show"
 
 
-Crop = CropBox | CropSphere | CropCameras | CropMasks
+@dataclass(frozen=True)
+class CropPolygon:
+    """Keep the Gaussians whose centres lie above or below a polygon on the ground.
+
+    The polygon is seen from above, along the scene's up direction. It may be concave, but its sides may not cross.
+
+    Attributes:
+        points: the corners in order, at least three.
+        min_height, max_height: heights along the up direction, relative to the mean height of the corners. Infinite
+            numbers leave a side open.
+    """
+
+    points: tuple[Vector, ...]
+    min_height: float = -math.inf
+    max_height: float = math.inf
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "points", tuple(tuple(point) for point in self.points))
+        for point in self.points:
+            _check_vector("a point of the polygon", point)
+        if len(set(self.points)) < MIN_POLYGON_POINTS:
+            raise ValueError(f"the polygon has {len(set(self.points))} different points; it needs at least three")
+        if len(self.points) > MAX_POLYGON_POINTS:
+            raise ValueError(
+                f"the polygon has {len(self.points):,} points; at most {MAX_POLYGON_POINTS:,} are possible"
+            )
+        if not self.min_height < self.max_height:
+            raise ValueError(
+                f"min_height is {self.min_height:g} and max_height {self.max_height:g}; the first must be lower"
+            )
+
+    def __str__(self) -> str:
+        bounds = {"above": self.min_height, "below": self.max_height}
+        heights = " and ".join(f"{side} {bound:g}" for side, bound in bounds.items() if math.isfinite(bound))
+        return f"crop to the polygon of {len(self.points)} points" + (f", heights {heights}" if heights else "")
+
+
+Crop = CropBox | CropSphere | CropCameras | CropPolygon | CropMasks
 
 
 @dataclass(frozen=True)

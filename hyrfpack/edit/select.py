@@ -13,6 +13,7 @@ from hyrfpack.config.edit import (
     CropBox,
     CropCameras,
     CropMasks,
+    CropPolygon,
     CropSphere,
     KeepGaussians,
     MaxScale,
@@ -23,6 +24,7 @@ from hyrfpack.config.edit import (
 from hyrfpack.data.masks import assign_masks
 from hyrfpack.edit.floaters import find_floaters
 from hyrfpack.edit.masks import share_of_light_in_masks
+from hyrfpack.edit.polygon import clean_corners, find_inside
 from hyrfpack.edit.state import EditState
 from hyrfpack.errors import HyrfError
 
@@ -32,8 +34,8 @@ def keep_mask(action: object, state: EditState) -> np.ndarray:
     """Return a mask (N,) of the Gaussians that an action of selection keeps.
 
     Raises:
-        HyrfError: the cameras of the scene do not surround anything, or there are no photos or masks that the action
-            needs.
+        HyrfError: the cameras of the scene do not surround anything, the sides of a polygon meet, or there are no
+            photos or masks that the action needs.
     """
     raise TypeError(f"{action!r} selects no Gaussians")
 
@@ -67,6 +69,16 @@ def _(action: CropCameras, state: EditState) -> np.ndarray:
     points = (state.world_positions() @ plan - center) / (1 + action.margin) + center
     normals, offsets = hull.equations[:, :2], hull.equations[:, 2]
     return (points @ normals.T + offsets <= 0).all(axis=1)
+
+
+@keep_mask.register
+def _(action: CropPolygon, state: EditState) -> np.ndarray:
+    plan, up = np.stack(_horizontal_axes(state.up), axis=1), state.up / np.linalg.norm(state.up)
+    corners, positions = np.array(action.points, np.float64), state.world_positions()
+    middle = corners.mean(axis=0)  # far from the origin, coordinates about it are more precise
+    heights = (positions - middle) @ up
+    inside = find_inside((positions - middle) @ plan, clean_corners((corners - middle) @ plan))
+    return inside & (heights >= action.min_height) & (heights <= action.max_height)
 
 
 @keep_mask.register
