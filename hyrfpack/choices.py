@@ -11,6 +11,9 @@ RENDER_EXPOSURES = (AS_PHOTOGRAPHED, CONSISTENT_EXPOSURE)
 # How the splats that a model is baked to are exposed: each like the photos that see it, or all alike.
 LOCAL_EXPOSURE = "local"
 SPLAT_EXPOSURES = (LOCAL_EXPOSURE, CONSISTENT_EXPOSURE)
+# Files of depth and of normals that are written beside renders.
+DEPTH_FORMATS = ("tiff", "png", "exr")
+NORMAL_FORMATS = ("png", "exr")
 # Versions of SPZ files that can be written: 4 (May 2026) is smaller and faster to read, 3 is for programs without it.
 SPZ_VERSIONS = (3, 4)
 DEFAULT_SPZ_VERSION = 4

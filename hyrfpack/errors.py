@@ -23,6 +23,7 @@ _PACKAGE_BY_MODULE = {
 }
 # The extra of pyproject.toml that stands for the use of a package, if that is its only use.
 _EXTRA_BY_PACKAGE = {
+    "OpenEXR": "exr",
     "av": "video",
     "fast-simplification": "mesh",
     "pillow-heif": "heic",

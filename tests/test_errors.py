@@ -96,6 +96,7 @@ def hide_package(monkeypatch):
         ("nowhere.at.all", "flying needs nowhere; run 'pip install nowhere'"),
         ("PIL", "flying needs pillow; run 'pip install pillow'"),
         ("av", "flying needs av; run 'pip install \"hyrfpack[video]\"'"),
+        ("OpenEXR", "flying needs OpenEXR; run 'pip install \"hyrfpack[exr]\"'"),
         ("pillow_heif", "flying needs pillow-heif; run 'pip install \"hyrfpack[heic]\"'"),
         ("pxr", "flying needs usd-core; run 'pip install \"hyrfpack[usd]\"'"),
         ("pycolmap", "flying needs pycolmap; run 'pip install \"hyrfpack[poses]\"'"),

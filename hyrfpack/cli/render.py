@@ -8,20 +8,24 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from hyrfpack.choices import DEPTH_FORMATS, NORMAL_FORMATS
 from hyrfpack.cli.common import note, note_rename, print_json, read_scene, scene_options
 from hyrfpack.cli.drawing import drawing_options, largest_picture_size, select_views, split_option
 from hyrfpack.cli.progress import show_item_progress
+from hyrfpack.cli.settings import settings_options
 from hyrfpack.cli.types import OUTPUT, PATH
+from hyrfpack.config.render import GeometryConfig
 from hyrfpack.outputs import Outputs
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from hyrfpack.cli.drawing import Drawing
-    from hyrfpack.render.files import ColorAndDepth
+    from hyrfpack.render import RenderedPicture
     from hyrfpack.scene import Camera
 
 DEFAULT_ORBIT_FRAMES = 60
+CAMERAS_NAME = "cameras.json"
 
 
 @click.command(short_help="Render views to picture files.")
@@ -34,7 +38,23 @@ DEFAULT_ORBIT_FRAMES = 60
 @click.option(
     "--orbit", type=click.IntRange(1, 100_000), metavar="N", help="Render an orbit of N frames around the scene."
 )
-@click.option("--depth", is_flag=True, help="Also write depth in world units (float32 TIFF).")
+@click.option(
+    "--depth",
+    type=click.Choice(DEPTH_FORMATS),
+    is_flag=False,
+    flag_value=DEPTH_FORMATS[0],
+    help="Also write the depth along the view axis in world units: as float32 (tiff, which --depth alone writes, or "
+    "exr) or as 16-bit steps of --depth-unit (png). 0 is no surface.",
+)
+@settings_options(GeometryConfig, "depth_unit")
+@click.option(
+    "--normals",
+    type=click.Choice(NORMAL_FORMATS),
+    is_flag=False,
+    flag_value=NORMAL_FORMATS[0],
+    help="Also write the normals of surfaces in world axes: as 8 bits, 0.5 n + 0.5 (png, which --normals alone "
+    "writes), or as float32 (exr).",
+)
 @click.option("--video", is_flag=True, help="Also write the frames as OUT/video.mp4 (needs ffmpeg).")
 @drawing_options
 def render(
@@ -45,7 +65,9 @@ def render(
     reader_options: dict[str, Any],
     cameras: Path | None,
     orbit: int | None,
-    depth: bool,
+    depth: str | None,
+    depth_unit: float,
+    normals: str | None,
     video: bool,
     drawing: Drawing,
     overwrite: bool,
@@ -62,19 +84,24 @@ def render(
     Examples:
       hyrfpack render bonsai.hyrf -o orbit --video
       hyrfpack render bonsai.hyrf -o out --data photos/bonsai --split test
-      hyrfpack render bonsai.hyrf -o path --cameras path.json --depth
+      hyrfpack render bonsai.hyrf -o path --cameras path.json --depth exr --normals exr
+      hyrfpack render bonsai.hyrf -o rgbd --data photos/bonsai --split all --depth png --depth-unit 0.001
       hyrfpack render other.ply -o orbit --orbit 90
     """
     if sum(source is not None for source in (data, cameras, orbit)) > 1:
         raise click.UsageError("--data, --cameras and --orbit each say what to render; give one of them")
-    from hyrfpack.cameras.files import cameras_from_json
+    from hyrfpack.atomic import write_atomic
+    from hyrfpack.cameras.files import cameras_from_json, cameras_to_json
     from hyrfpack.cameras.paths import orbit as orbit_around
     from hyrfpack.lock import exclusive_folder
-    from hyrfpack.render.files import make_renderer, render_file_names, write_pictures
+    from hyrfpack.render.files import make_renderer, render_file_names, unique_stems, write_pictures
+    from hyrfpack.render.geometry_files import GeometryWriter
     from hyrfpack.render.video import has_ffmpeg, write_video
-    from hyrfpack.splats.draw import Drawable, draw
+    from hyrfpack.splats.draw import Drawable, draw_picture
 
     ranks, settings = drawing.ranks, drawing.settings
+    geometry = GeometryConfig(depth, normals, depth_unit)
+    writer = GeometryWriter(geometry) if geometry.is_wanted else None
     source, scene = drawing.open(model), None
     if data is not None:
         scene = ranks.run_on_all(lambda: read_scene(data, reader_options, source.facts))
@@ -86,22 +113,26 @@ def render(
         cameras_around = orbit_around(source.viewpoint, orbit or DEFAULT_ORBIT_FRAMES)
         named = [(f"{number:04d}", camera) for number, camera in enumerate(cameras_around)]
     video_path = output / "video.mp4" if video and has_ffmpeg() else None
-    names = render_file_names([name for name, _ in named], depth)
+    names = render_file_names([name for name, _ in named], geometry)
     names += [video_path.name] if video_path else []
+    names += [CAMERAS_NAME] if writer else []
 
     def check(replace: bool) -> None:
         if ranks.is_main:
             outputs = Outputs(source.path, cameras, folder=source.folder, scene=scene, overwrite=replace)
             outputs.folder(output, names)
 
-    def write() -> list[Path]:
+    def write() -> tuple[list[Path], float]:
         shown = source.load()
         if isinstance(shown, Drawable):
-            picture_of: Callable[[Camera], ColorAndDepth] = partial(draw, shown, settings=settings, depth=depth)
+            picture_of: Callable[[Camera], RenderedPicture] = partial(
+                draw_picture, shown, settings=settings, geometry=geometry
+            )
         else:
-            picture_of = make_renderer(shown, depth=depth, settings=settings)
-        pictures = write_pictures(picture_of, named, output, overwrite=overwrite, ranks=ranks)
-        return list(show_item_progress(pictures, len(ranks.share(named)), "render", "picture"))
+            picture_of = make_renderer(shown, geometry=geometry, settings=settings)
+        pictures = write_pictures(picture_of, named, output, geometry=writer, overwrite=overwrite, ranks=ranks)
+        written = list(show_item_progress(pictures, len(ranks.share(named)), "render", "picture"))
+        return written, writer.max_depth if writer else 0.0
 
     # This first check ignores existing files. It prevents the creation of a folder where nothing may be written.
     ranks.run_on_all(lambda: check(replace=True))
@@ -112,7 +143,13 @@ def render(
         parts = ranks.all_gather(ranks.run_on_all(write))
         if not ranks.is_main:
             return
-        written = [parts[index % ranks.size][index // ranks.size] for index in range(len(named))]
+        written = [parts[index % ranks.size][0][index // ranks.size] for index in range(len(named))]
+        if writer:
+            text = cameras_to_json(
+                list(zip(unique_stems([name for name, _ in named]), [camera for _, camera in named], strict=True))
+            )
+            write_atomic(output / CAMERAS_NAME, text.encode(), overwrite=overwrite, rename=False)
+            writer.warn_of_losses(max(max_depth for _, max_depth in parts))
         if video_path:
             video_path = note_rename(video_path, write_video(written, video_path, overwrite=overwrite))
     for name, path in zip(render_file_names([name for name, _ in named]), written, strict=True):

@@ -12,7 +12,7 @@ from scipy.ndimage import median_filter, minimum_filter
 from hyrfpack.cameras.view_sampling import shrink_camera
 from hyrfpack.model import HybridModel
 from hyrfpack.render import RenderSettings, render_view
-from hyrfpack.render.median_depth import render_median_depth
+from hyrfpack.render.surface import render_median_depth
 from hyrfpack.scene import Camera
 
 MAX_MAP_SIDE_PIXELS = 800  # bounds memory: a map takes 8 bytes a pixel

@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import io
 import os
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
 from pathlib import Path, PurePosixPath
-from typing import Protocol
 
 import torch
 from PIL import Image
 from torch import Tensor
 
 from hyrfpack.atomic import write_atomic
+from hyrfpack.config.render import GeometryConfig
+from hyrfpack.errors import HyrfError
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.model import HybridModel
 from hyrfpack.outputs import PICTURE_SUFFIXES
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
-from hyrfpack.render.renderer import RenderSettings, render_view
+from hyrfpack.render.geometry_files import GeometryWriter
+from hyrfpack.render.renderer import RenderedPicture, RenderSettings, render_view
+from hyrfpack.render.surface import render_surface, widened_gaussians
 from hyrfpack.scene import Camera
 
 
@@ -27,7 +30,7 @@ def render_files(
     cameras: Sequence[tuple[str, Camera]],
     folder: str | os.PathLike[str],
     *,
-    depth: bool = False,
+    geometry: GeometryConfig = GeometryConfig(),  # noqa: B008 - frozen
     settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
     overwrite: bool = True,
     ranks: Ranks = SINGLE_PROCESS,
@@ -40,68 +43,86 @@ def render_files(
         model: the model to render.
         cameras: pairs of a name (of a photo, or any other) and a camera.
         folder: output folder; it is created if missing.
-        depth: whether to write also `<name>.depth.tiff`: one float32 channel, depth along the view axis in world units,
-            0 where no Gaussian is hit.
+        geometry: which files of depth and of normals to write beside the images: `<name>.depth.<extension>` and
+            `<name>.normals.<extension>`, see `hyrfpack.render.geometry_files`.
         settings: render settings.
         overwrite: replace existing files. Without it, an image whose file exists is written under a free file name in
-            the same folder, and an existing depth file is an error.
+            the same folder, and an existing file of geometry is an error.
         ranks: processes that share the cameras; each yields the paths that it has written.
 
     Raises:
-        HyrfError: an image cannot be written, or another call is writing into the folder.
+        HyrfError: a file cannot be written, two of them would have the same name, a package is missing, or another call
+            is writing into the folder.
     """
+    render_file_names([name for name, _ in cameras], geometry)
+    writer = GeometryWriter(geometry) if geometry.is_wanted else None
     with exclusive_folder(folder, ranks=ranks):
-        draw = make_renderer(model, depth=depth, settings=settings)
-        yield from write_pictures(draw, cameras, folder, overwrite=overwrite, ranks=ranks)
-
-
-class ColorAndDepth(Protocol):
-    """A rendered image of colours (H, W, 3) and, if requested, of depth (H, W) in world units."""
-
-    @property
-    def rgb(self) -> Tensor: ...
-
-    @property
-    def depth(self) -> Tensor | None: ...
+        draw = make_renderer(model, geometry=geometry, settings=settings)
+        yield from write_pictures(draw, cameras, folder, geometry=writer, overwrite=overwrite, ranks=ranks)
+    if writer is not None:
+        writer.warn_of_losses()
 
 
 def make_renderer(
     model: HybridModel,
     *,
-    depth: bool = False,
+    geometry: GeometryConfig = GeometryConfig(),  # noqa: B008 - frozen
     settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
-) -> Callable[[Camera], ColorAndDepth]:
-    """Decode a model once, and return a function that renders it. The arguments are those of `render_files`."""
+) -> Callable[[Camera], RenderedPicture]:
+    """Decode a model once, and return a function that renders it with the geometry that is wanted."""
     with torch.no_grad():
         decoded = model.decode()
-    return partial(render_view, model, settings=settings, decoded=decoded, depth=depth)
+    frame, antialiased = model.config.frame, model.config.antialiased
+
+    def draw(camera: Camera) -> RenderedPicture:
+        rendering = render_view(model, camera, settings, decoded=decoded)
+        if not geometry.is_wanted:
+            return RenderedPicture(rendering.rgb)
+        gaussians = widened_gaussians(model, camera, decoded, rendering.indices[rendering.visible])
+        surface = render_surface(gaussians, frame, camera, settings, antialiased, normals=geometry.normals is not None)
+        return RenderedPicture(rendering.rgb, *surface)
+
+    return draw
 
 
 def write_pictures(
-    draw: Callable[[Camera], ColorAndDepth],
+    draw: Callable[[Camera], RenderedPicture],
     cameras: Sequence[tuple[str, Camera]],
     folder: str | os.PathLike[str],
     *,
+    geometry: GeometryWriter | None = None,
     overwrite: bool = True,
     ranks: Ranks = SINGLE_PROCESS,
 ) -> Iterator[Path]:
-    """Write the renders of named cameras by `draw` into a folder that the caller has locked; see `render_files`."""
+    """Write the renders of named cameras by `draw` into a folder that the caller has locked; see `render_files`.
+
+    `draw` has to return the geometry that the writer of geometry writes.
+    """
     named = list(zip(unique_stems([name for name, _ in cameras]), cameras, strict=True))
     for name, (_, camera) in ranks.share(named):
         with torch.no_grad():
             rendering = draw(camera)
         path = Path(folder) / f"{name}.png"
         written = save_picture(path, to_image(rendering.rgb), overwrite=overwrite)
-        if rendering.depth is not None:
-            depths = Image.fromarray(rendering.depth.float().cpu().numpy())
-            save_picture(path.with_suffix(".depth.tiff"), depths, overwrite=overwrite, rename=False)
+        if geometry is not None:
+            geometry.write(path, rendering, overwrite=overwrite)
         yield written
 
 
-def render_file_names(names: Sequence[str], depth: bool = False) -> list[str]:
-    """Return the names of the files that `render_files` writes for cameras of these names, relative to its folder."""
-    kinds = (".png", ".depth.tiff") if depth else (".png",)
-    return [f"{name}{kind}" for name in unique_stems(names) for kind in kinds]
+def render_file_names(
+    names: Sequence[str],
+    geometry: GeometryConfig = GeometryConfig(),  # noqa: B008 - frozen
+) -> list[str]:
+    """Return the names of the files that `render_files` writes for cameras of these names, relative to its folder.
+
+    Raises:
+        HyrfError: two files would have the same name, as the depth of "a" and the picture of "a.depth".
+    """
+    files = [f"{name}{ending}" for name in unique_stems(names) for ending in (".png", *geometry.endings)]
+    name, count = Counter(files).most_common(1)[0] if files else ("", 0)
+    if count > 1:
+        raise HyrfError(f"{name}: two of the files to be written would have this name", fix="rename a camera")
+    return files
 
 
 def to_image(rgb: Tensor) -> Image.Image:

@@ -103,6 +103,22 @@ class Rendering:
     seconds: dict[str, float] = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class RenderedPicture:
+    """A render of a view.
+
+    Attributes:
+        rgb: (H, W, 3) colours.
+        depth: (H, W) median depth along the view axis in world units, 0 where there is no surface; None unless
+            requested.
+        normals: (H, W, 3) unit normals in world axes, (0, 0, 0) where there is no surface; None unless requested.
+    """
+
+    rgb: Tensor
+    depth: Tensor | None = None
+    normals: Tensor | None = None
+
+
 @torch_on_one_thread()
 def render_view(
     model: HybridModel,

@@ -8,12 +8,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hyrfpack.config.render import GeometryConfig
 from hyrfpack.model import Frame
 from hyrfpack.ops.poses import camera_center
 from hyrfpack.ops.rasterize import Gaussians3D, Rasterization, rasterize
 from hyrfpack.ops.rasterize.cull import frustum_cull
 from hyrfpack.parallel.pool import torch_on_one_thread
-from hyrfpack.render import RenderSettings
+from hyrfpack.render import RenderedPicture, RenderSettings
+from hyrfpack.render.surface import render_surface
 from hyrfpack.scene import Camera
 from hyrfpack.splats.harmonics import harmonics_basis
 from hyrfpack.splats.splats import Splats
@@ -85,7 +87,6 @@ def draw(
     settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
     *,
     black: bool = False,
-    depth: bool = False,
 ) -> Rasterization:
     """Render splats from a camera over a black background.
 
@@ -96,7 +97,6 @@ def draw(
         camera: a camera in world units.
         settings: near plane (local units), culling and transmittance, as in `hyrfpack.render_view`.
         black: draw all splats black, which is faster where only the transmittance is needed.
-        depth: also return the depth, (H, W) in world units.
     """
     viewport = drawable.frame.local_viewport(camera)
     index = frustum_cull(drawable.positions, viewport, settings.near, settings.cull_tolerance)
@@ -104,5 +104,21 @@ def draw(
     means = gaussians.means
     viewpoint = camera_center(viewport.pose).to(means.device, non_blocking=means.is_cuda)
     colors = torch.zeros_like(means) if black else drawable.evaluate_colors(viewpoint, index).clamp_min(0)
-    drawn = rasterize(gaussians, colors, viewport, settings.raster_settings(drawable.antialiased, depth))
-    return drawn if drawn.depth is None else replace(drawn, depth=drawn.depth * drawable.frame.scale)
+    return rasterize(gaussians, colors, viewport, settings.raster_settings(drawable.antialiased))
+
+
+def draw_picture(
+    drawable: Drawable,
+    camera: Camera,
+    settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
+    *,
+    geometry: GeometryConfig = GeometryConfig(),  # noqa: B008 - frozen
+) -> RenderedPicture:
+    """Render splats as a picture over black, with the geometry that is wanted."""
+    rgb = draw(drawable, camera, settings).rgb
+    if not geometry.is_wanted:
+        return RenderedPicture(rgb)
+    frame, antialiased = drawable.frame, drawable.antialiased
+    index = frustum_cull(drawable.positions, frame.local_viewport(camera), settings.near, settings.cull_tolerance)
+    seen, has_normals = drawable.gaussians.select(index), geometry.normals is not None
+    return RenderedPicture(rgb, *render_surface(seen, frame, camera, settings, antialiased, normals=has_normals))

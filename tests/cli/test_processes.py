@@ -163,11 +163,11 @@ def test_scores_equal_those_of_one_process(size, data, model, logs, tmp_path):
 
 @needs_ranks
 def test_pictures_equal_those_of_one_process(model, logs, tmp_path):
-    words = ("render", model, "--orbit", 5, "--depth", "--json", "-o")
+    words = ("render", model, "--orbit", 5, "--depth", "png", "--normals", "--json", "-o")
     said = json.loads(check_rank_0_speaks(run_command_on_ranks(*words, tmp_path / "two", folder=logs)).output)
     expected = json.loads(succeeded(*words, tmp_path / "one").stdout)
     assert [Path(path).name for path in said["pictures"]] == [Path(path).name for path in expected["pictures"]]
-    assert files_in(tmp_path / "two") == files_in(tmp_path / "one") and len(files_in(tmp_path / "one")) == 10
+    assert files_in(tmp_path / "two") == files_in(tmp_path / "one") and len(files_in(tmp_path / "one")) == 16
 
 
 @needs_ranks

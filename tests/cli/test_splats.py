@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -86,12 +87,18 @@ def test_an_orbit_of_splats_is_centred_on_them(files, tmp_path):
         assert picture[300, 400] and not picture[0, 0] and picture.mean() > 0.05
 
 
-def test_depth_of_splats_is_in_world_units(files, tmp_path):
+def test_depth_and_normals_of_splats_are_in_world_units_and_axes(tmp_path):
+    opaque = replace(BALL_SPLATS, opacities=np.full(60, 0.99, np.float32), scales=np.full((60, 3), 0.3, np.float32))
+    (tmp_path / "ball.ply").write_bytes(FORMATS[".ply"].encode(opaque, NO_HINTS))
     (camera,) = ring(1, radius=5.0, elevation=0.0, width=33, height=33)
     (tmp_path / "path.json").write_text(cameras_to_json([("c", camera)]))
-    succeeded("render", files[".ply"], "-o", tmp_path / "out", "--cameras", tmp_path / "path.json", "--depth")
+    words = ("render", tmp_path / "ball.ply", "-o", tmp_path / "out", "--cameras", tmp_path / "path.json")
+    succeeded(*words, "--depth", "--normals")
     depth = np.asarray(Image.open(tmp_path / "out" / "c.depth.tiff"))
-    assert 3.5 < depth[16, 16] < 6.5 and depth[0, 0] == 0  # a ball of radius 1 seen from a distance of 5
+    assert 3 < depth[16, 16] < 5 and depth[0, 0] == 0  # a ball of radius 1 seen from a distance of 5
+    toward_camera = -camera.forward
+    normal = np.asarray(Image.open(tmp_path / "out" / "c.normals.png"))[16, 16] / 127.5 - 1
+    assert normal @ toward_camera > 0.8
 
 
 def test_an_exported_file_has_the_score_that_the_export_printed(data, tmp_path):

@@ -6,7 +6,7 @@
 `demo` takes a model of the built-in scene, whose photos `hyrfpack.demo.scene.write_demo_scene` writes, and compares its
 mesh with the spheres, boxes and the ground that were photographed. Accuracy is the distance from the mesh to the
 nearest surface, completeness the distance from what the cameras see to the mesh, both in world units, and the normal
-error is the angle between a triangle and the nearest surface. A second table has the error of rendered depths.
+error is the angle between a triangle and the nearest surface. `tools.studies.depth_error` measures rendered depths.
 
 `points` compares depths in held-out views with the points of the reconstruction that were found there: of the mesh, and
 of the model's own expected and median depth. Points are trained on as initial Gaussians, so they are not independent.
@@ -19,7 +19,6 @@ from __future__ import annotations
 import argparse
 import resource
 import time
-from collections.abc import Sequence
 from pathlib import Path
 
 import numba
@@ -37,8 +36,8 @@ from hyrfpack.mesh.extract import MAX_MAPS
 from hyrfpack.ops.rasterize import RasterSettings, cpu
 from hyrfpack.ops.rasterize.median_depth import MAX_PLANE_DEPTH_RATIO
 from hyrfpack.render import render_view
-from hyrfpack.render.median_depth import render_median_depth
 from hyrfpack.render.renderer import RenderSettings
+from hyrfpack.render.surface import render_median_depth
 from hyrfpack.scene import Camera, Scene, evenly_spaced
 from tools.tables import format_cell, markdown_table
 
@@ -81,7 +80,6 @@ def main() -> None:
     print(f"{seconds:.1f} s (CPU time {processor:.1f} s), peak {memory / 1e9:.2f} GB\n")
     if arguments.kind == "demo":
         print_demo_error(mesh, scene)
-        print_depth_error(source, [view.camera for view in scene.test])
     else:
         print_point_error(source, mesh, scene)
 
@@ -185,18 +183,6 @@ def render_depths(source: Source, camera: Camera) -> dict[str, np.ndarray]:
         "median, centres": scale * centers.numpy(),
         "median, planes": planes.numpy(),
     }
-
-
-def print_depth_error(source: Source, cameras: Sequence[Camera]) -> None:
-    """Print the error of rendered depths of the demo scene, relative to the depth, at pixels within 6 units."""
-    errors: dict[str, list[np.ndarray]] = {}
-    for camera in cameras:
-        exact = demo_depth(camera)
-        near = exact < 6
-        for name, depth in render_depths(source, camera).items():
-            errors.setdefault(name, []).append(np.abs(depth[near] - exact[near]) / exact[near])
-    rows = [[name, *statistics(np.concatenate(parts))] for name, parts in errors.items()]
-    print(markdown_table(["relative error of depth, held-out views", "mean", "median", "95 %"], rows))
 
 
 def print_point_error(source: Source, mesh: Mesh, scene: Scene) -> None:

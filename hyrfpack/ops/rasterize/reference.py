@@ -80,7 +80,7 @@ def project(gaussians: Gaussians3D, viewport: Viewport, settings: RasterSettings
     index = torch.nonzero(seen[:, 2] > settings.near)[:, 0]
     x, y, z = seen[index].to(means.dtype).unbind(-1)
     x_z, y_z = x / z, y / z
-    axes = camera[:3, :3].to(means.dtype) @ _rotations(quats[index]) * scales[index, None, :]
+    axes = camera[:3, :3].to(means.dtype) @ quats_to_rotations(quats[index]) * scales[index, None, :]
     half = _projection_jacobian(x_z, y_z, z, viewport) @ axes
 
     xx, xy, yy = (half[:, 0] ** 2).sum(-1), (half[:, 0] * half[:, 1]).sum(-1), (half[:, 1] ** 2).sum(-1)
@@ -110,7 +110,7 @@ def depth_slopes(gaussians: Gaussians3D, viewport: Viewport, projected: Projecte
     """
     index = projected.index
     rotation = viewport.pose[:3, :3].to(gaussians.means)
-    axes = rotation @ _rotations(gaussians.quats[index]) * gaussians.scales[index, None, :]
+    axes = rotation @ quats_to_rotations(gaussians.quats[index]) * gaussians.scales[index, None, :]
     fx, fy, cx, cy = viewport.intrinsics
     x_z, y_z = (projected.means2d[:, 0] - cx) / fx, (projected.means2d[:, 1] - cy) / fy
     half = _projection_jacobian(x_z, y_z, projected.depths, viewport) @ axes
@@ -270,7 +270,7 @@ def _blend_tile(
     return torch.cat(parts).view(len(rows), len(columns), -1), touched
 
 
-def _rotations(quats: Tensor) -> Tensor:
+def quats_to_rotations(quats: Tensor) -> Tensor:
     """Return rotation matrices (M, 3, 3) of quaternions (M, 4) wxyz of any length; the identity for length zero."""
     w, x, y, z = torch.nn.functional.normalize(quats, dim=-1, eps=QUAT_NORM_MIN).unbind(-1)
     rows = [

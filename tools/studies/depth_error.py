@@ -1,0 +1,116 @@
+"""Measure the error of rendered depths and normals on scenes of known geometry, in held-out views.
+
+    python -m tools.studies.depth_error demo runs/demo/model.hyrf --photos runs/demo_photos
+    python -m tools.studies.depth_error room runs/room/model.hyrf --photos sets/room
+
+`demo` is the built-in scene, whose photos `hyrfpack.demo.scene.write_demo_scene` writes, up to a depth of 6 units; the
+others are sets that `tools.scenes.write_set` writes with the seed 0. Depths are compared at pixels that have a median
+depth, relative to the true depth. Normals are those of `render --normals`, and of its two parts alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+
+import hyrfpack
+from hyrfpack.model import HybridModel
+from hyrfpack.render import RenderSettings, render_view, surface
+from hyrfpack.scene import Camera, Scene
+from tools.scenes.catalog import LAYOUTS, make_scene
+from tools.scenes.render import cast_pixels
+from tools.studies.mesh_error import demo_depth, nearest_surface, statistics
+from tools.tables import markdown_table
+
+MAX_DEMO_DEPTH = 6
+SMALL_ANGLE_DEGREES = 11.25
+# Weights of the normals from depth, beside the axes of Gaussians.
+DEPTH_NORMAL_WEIGHTS = {
+    "axes of Gaussians alone": 0.0,
+    "from depth alone": 1e9,
+    "`render --normals`": surface.DEPTH_NORMAL_WEIGHT,
+}
+
+# Returns the depth (H, W) of a view, infinite where it is not compared, and the normals (H, W, 3) in world axes.
+Geometry = Callable[[Camera], tuple[np.ndarray, np.ndarray]]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("kind", choices=("demo", *LAYOUTS))
+    parser.add_argument("model", type=Path, help="a .hyrf file")
+    parser.add_argument("--photos", type=Path, required=True, help="folder of the model's photos")
+    arguments = parser.parse_args()
+
+    scene = hyrfpack.load_scene(arguments.photos)
+    geometry = demo_geometry if arguments.kind == "demo" else set_geometry(arguments.kind, scene)
+    print_errors(hyrfpack.load_model(arguments.model), [view.camera for view in scene.test], geometry)
+
+
+def demo_geometry(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Return depth and normals of the built-in scene."""
+    depth = demo_depth(camera)
+    depth[depth >= MAX_DEMO_DEPTH] = np.inf
+    points = rays_of(camera) * np.where(np.isfinite(depth), depth, 1)[..., None] - camera.camera_from_world[:3, 3]
+    _, normals = nearest_surface((points @ camera.rotation).reshape(-1, 3))
+    return depth, normals.reshape(*depth.shape, 3)
+
+
+def set_geometry(name: str, scene: Scene) -> Geometry:
+    """Return the function that casts the rays of a view of a generated set."""
+    camera = scene.views[0].camera
+    arrays = make_scene(name, len(scene.views), camera.width, camera.height, 0).arrays
+
+    def cast(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+        x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+        depth, _, normals = cast_pixels(arrays, camera, np.stack((x.ravel(), y.ravel()), axis=1))
+        return depth.reshape(x.shape), normals.reshape(*x.shape, 3)
+
+    return cast
+
+
+@torch.no_grad()
+def print_errors(model: HybridModel, cameras: list[Camera], geometry: Geometry) -> None:
+    """Print tables of the errors of depths and of normals."""
+    depth_errors: dict[str, list[np.ndarray]] = {"expected": [], "median": []}
+    angles: dict[str, list[np.ndarray]] = {name: [] for name in DEPTH_NORMAL_WEIGHTS}
+    decoded, frame, antialiased = model.decode(), model.config.frame, model.config.antialiased
+    for camera in cameras:
+        exact, exact_normals = geometry(camera)
+        seen = render_view(model, camera, decoded=decoded, depth=True)
+        assert seen.depth is not None
+        gaussians = surface.widened_gaussians(model, camera, decoded, seen.indices[seen.visible])
+        depth, _ = surface.render_surface(gaussians, frame, camera, RenderSettings(), antialiased, normals=False)
+        known = np.isfinite(exact) & (depth.numpy() > 0)
+        for name, found in (("expected", seen.depth), ("median", depth)):
+            depth_errors[name].append(np.abs(found.numpy() - exact)[known] / exact[known])
+        rays = rays_of(camera) @ camera.rotation
+        faces_away = (exact_normals * rays).sum(axis=-1, keepdims=True) > 0
+        exact_normals = np.where(faces_away, -exact_normals, exact_normals)
+        for name, weight in DEPTH_NORMAL_WEIGHTS.items():
+            normals = surface.render_normals(
+                gaussians, depth, frame, camera, RenderSettings(), antialiased, depth_weight=weight
+            )
+            cosines = (normals.numpy() * exact_normals).sum(axis=-1)[known]
+            angles[name].append(np.degrees(np.arccos(cosines.clip(-1, 1))))
+    rows = [[name, *statistics(np.concatenate(parts))] for name, parts in depth_errors.items()]
+    print(markdown_table(["depth, relative error", "mean", "median", "95 %"], rows) + "\n")
+    rows = []
+    for name, parts in angles.items():
+        joined = np.concatenate(parts)
+        rows.append([name, *statistics(joined), f"{(joined < SMALL_ANGLE_DEGREES).mean():.3f}"])
+    print(markdown_table(["normals, degrees", "mean", "median", "95 %", f"within {SMALL_ANGLE_DEGREES}"], rows))
+
+
+def rays_of(camera: Camera) -> np.ndarray:
+    """Return rays (H, W, 3), camera axes, whose length along the view axis is 1."""
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5 - camera.cx, np.arange(camera.height) + 0.5 - camera.cy)
+    return np.stack((x / camera.fx, y / camera.fy, np.ones(x.shape)), axis=-1)
+
+
+if __name__ == "__main__":
+    main()
