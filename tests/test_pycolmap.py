@@ -18,7 +18,7 @@ from scenes import BALL_CENTERS, ball_scene, small_model
 
 from hyrfpack.cameras.capture import provenance_cameras
 from hyrfpack.format import save_model
-from hyrfpack.splats.splats import quaternion_from_matrix
+from hyrfpack.rotations import quaternion_from_matrix
 
 CHECK_IMPORT_ORDER_CODE = """
 import sys

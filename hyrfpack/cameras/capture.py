@@ -13,6 +13,7 @@ from hyrfpack.cameras.files import camera_from_numbers, camera_to_numbers
 from hyrfpack.cameras.paths import Viewpoint, orbit
 from hyrfpack.cameras.sampling import select_representative_cameras
 from hyrfpack.errors import HyrfDataError
+from hyrfpack.rotations import IDENTITY
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Camera, Scene, evenly_spaced
 
 MAX_STORED_CAMERAS = 128
@@ -145,7 +146,7 @@ class Capture:
         stored, frame = self.facts["provenance"].get("viewpoint"), self.facts["config"]["frame"]
         try:
             if stored is None:
-                return Viewpoint.from_frame(frame["center"], frame["scale"])
+                return Viewpoint.from_frame(frame["center"], frame["scale"], frame.get("rotation", IDENTITY))
             return Viewpoint.from_json(stored)
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise HyrfDataError(

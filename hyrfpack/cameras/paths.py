@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from hyrfpack.cameras.files import INTRINSICS_KEYS, camera_from_json, round_number
+from hyrfpack.rotations import IDENTITY, rotation_matrix
 from hyrfpack.scene import Camera
 
 # Cameras that cover at least this much azimuth are treated as a full circle.
@@ -87,14 +88,22 @@ class Viewpoint:
         return cls(center, up, cameras[typical], arc)
 
     @classmethod
-    def from_frame(cls, center: Sequence[float], scale: float) -> Viewpoint:
+    def from_frame(cls, center: Sequence[float], scale: float, rotation: Sequence[float] = IDENTITY) -> Viewpoint:
         """Derive a viewpoint from a model's frame, for a model whose file does not store one.
 
         The camera looks slightly down at the frame's centre, from a distance of 2.5 times its longest half-axis. Its
-        picture is 800 x 600 with a horizontal field of view of 50 degrees. Up is -y, as in most reconstructions.
+        picture is 800 x 600 with a horizontal field of view of 50 degrees. Up is the frame's -y axis, as in most
+        reconstructions.
+
+        Args:
+            center, scale, rotation: of the frame; the rotation is a quaternion wxyz.
+
+        Raises:
+            ValueError: a number is not finite, or the quaternion has no unit length.
         """
-        middle, up = np.asarray(center, np.float64), np.array([0.0, -1.0, 0.0])
-        position = middle + 2.5 * scale * np.array([0.0, -math.sin(math.radians(20)), -math.cos(math.radians(20))])
+        axes, middle = rotation_matrix(rotation), np.asarray(center, np.float64)
+        up = axes @ (0.0, -1.0, 0.0)
+        position = middle + 2.5 * scale * axes @ (0.0, -math.sin(math.radians(20)), -math.cos(math.radians(20)))
         focal = 400 / math.tan(math.radians(25))
         camera = Camera(800, 600, focal, focal, 400.0, 300.0, look_at(position, middle, up))
         return cls(middle, up, camera, (0.0, 360.0)).validated()

@@ -19,6 +19,7 @@ COARSE_RATE_RATIO = 1.1
 DEFAULT_BACKGROUND_STRIDE = 2
 MAX_BACKGROUND_STRIDE = 64
 BACKGROUND_STRIDE_KEY = "background_stride"
+WORLD_AXES = np.eye(3)
 MAX_SELECTION_POINTS = 2000
 MAX_SAMPLING_CAMERAS = 128  # It bounds the time that a forged file can take.
 MAX_PIXEL_SIZE = 1e6  # Local units; larger ones come from broken cameras, and their squares would overflow.
@@ -65,7 +66,9 @@ class PhotoCameras:
         """
         return self.background_stride / max(map(focal_length, self.cameras)) if self.cameras else 0.0
 
-    def pixel_sizes(self, points: np.ndarray, center: Sequence[float], scale: float) -> np.ndarray | None:
+    def pixel_sizes(
+        self, points: np.ndarray, center: Sequence[float], scale: float, axes: np.ndarray = WORLD_AXES
+    ) -> np.ndarray | None:
         """Compute the size of a photo's pixel at each point, of the photo that shows the point at the highest rate.
 
             q = 1 / max over the photos that see the point of f / z
@@ -73,9 +76,10 @@ class PhotoCameras:
         with the focal length f and the depth z. If no photo sees the point, f / distance is the rate of all of them.
 
         Args:
-            points: (N, 3) float32 in local units: local = (world - center) / scale.
+            points: (N, 3) float32 in local units: local = axes^T (world - center) / scale.
             center: centre of the scene's frame in world units.
             scale: world units of a local unit.
+            axes: (3, 3) rotation whose columns are the frame's axes in the world.
 
         Returns:
             (N,) float32, in local units, at most MAX_PIXEL_SIZE; None without cameras. 0 where cameras beyond float32
@@ -85,22 +89,24 @@ class PhotoCameras:
             return None
         sizes = np.empty(len(points), np.float32)
         with np.errstate(all="ignore"):
-            self._fill_pixel_sizes(sizes, points, np.array(center), scale)
+            self._fill_pixel_sizes(sizes, points, np.array(center), scale, axes)
         if self.is_coarse:
             sizes /= np.float32(COARSE_RATE_RATIO)
         sizes[~(sizes <= MAX_PIXEL_SIZE)] = 0  # also where NaN
         return sizes
 
-    def _fill_pixel_sizes(self, sizes: np.ndarray, points: np.ndarray, origin: np.ndarray, scale: float) -> None:
+    def _fill_pixel_sizes(
+        self, sizes: np.ndarray, points: np.ndarray, origin: np.ndarray, scale: float, axes: np.ndarray
+    ) -> None:
         """Write the inverse of the highest rates (N,) at points (N, 3) to `sizes`."""
         for start in range(0, len(points), _POINTS_PER_BLOCK):
             block = np.ascontiguousarray(points[start : start + _POINTS_PER_BLOCK].T)
             best = np.zeros(block.shape[1], np.float32)
             for camera in self.cameras:
-                np.maximum(best, _sampling_rates(camera, block, origin, scale), out=best)
+                np.maximum(best, _sampling_rates(camera, block, origin, scale, axes), out=best)
             unseen = np.flatnonzero(best == 0)
             if len(unseen):
-                distant = [_rates_by_distance(camera, block[:, unseen], origin, scale) for camera in self.cameras]
+                distant = [_rates_by_distance(camera, block[:, unseen], origin, scale, axes) for camera in self.cameras]
                 best[unseen] = np.max(distant, axis=0)
             sizes[start : start + len(best)] = 1 / best
 
@@ -124,7 +130,7 @@ def select_representative_cameras(
     center = points.mean(axis=0)
     local = ((points - center) / scale).astype(np.float32).T
     with np.errstate(all="ignore"):
-        rates = np.stack([_sampling_rates(camera, local, center, scale) for camera in cameras])
+        rates = np.stack([_sampling_rates(camera, local, center, scale, WORLD_AXES) for camera in cameras])
         rates = np.nan_to_num(rates, posinf=0)
     floor = np.maximum(_MIN_RATE_RATIO * rates.max(axis=0), np.finfo(np.float32).tiny)
     logs = np.log(np.maximum(rates, floor))
@@ -142,13 +148,15 @@ def focal_length(camera: Camera) -> float:
     return max(camera.fx, camera.fy)
 
 
-def _sampling_rates(camera: Camera, points: np.ndarray, center: np.ndarray, scale: float) -> np.ndarray:
+def _sampling_rates(
+    camera: Camera, points: np.ndarray, center: np.ndarray, scale: float, axes: np.ndarray
+) -> np.ndarray:
     """Return f / z (N,) in px per local unit at local points (3, N), 0 where the camera does not see them."""
     width, height, (fx, fy, cx, cy) = camera.width, camera.height, camera.intrinsics
     rotation = camera.rotation
     lens = np.array([[fx], [fy], [1.0]])
     offset = lens[:, 0] * ((rotation @ center + camera.camera_from_world[:3, 3]) / scale)
-    x, y, z = (lens * rotation).astype(np.float32) @ points + offset.astype(np.float32)[:, None]
+    x, y, z = (lens * (rotation @ axes)).astype(np.float32) @ points + offset.astype(np.float32)[:, None]
     right, down = PICTURE_MARGIN_RATIO * width, PICTURE_MARGIN_RATIO * height
     is_seen = z > _MIN_DEPTH
     is_seen &= (x >= np.float32(-right - cx) * z) & (x <= np.float32(width + right - cx) * z)
@@ -156,8 +164,10 @@ def _sampling_rates(camera: Camera, points: np.ndarray, center: np.ndarray, scal
     return np.divide(np.float32(focal_length(camera)), z, out=np.zeros_like(z), where=is_seen)
 
 
-def _rates_by_distance(camera: Camera, points: np.ndarray, center: np.ndarray, scale: float) -> np.ndarray:
+def _rates_by_distance(
+    camera: Camera, points: np.ndarray, center: np.ndarray, scale: float, axes: np.ndarray
+) -> np.ndarray:
     """Return f / distance (N,) in px per local unit at local points (3, N)."""
-    position = ((camera.position - center) / scale).astype(np.float32)[:, None]
+    position = ((camera.position - center) / scale @ axes).astype(np.float32)[:, None]
     distances = np.linalg.norm(points - position, axis=0)
     return np.float32(focal_length(camera)) / np.maximum(distances, np.float32(_MIN_DEPTH))

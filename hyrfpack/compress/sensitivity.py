@@ -230,7 +230,7 @@ def _expected_sensitivity(
     frame = model.config.frame
     positions = model.gaussians.positions.double()
     for camera in cameras:
-        place = torch.as_tensor((camera.position - np.array(frame.center)) / frame.scale).to(positions)
+        place = torch.as_tensor(frame.to_local(camera.position)).to(positions)
         distance = torch.linalg.vector_norm(positions - place, dim=1).clamp_min(MIN_CAMERA_DISTANCE_LOCAL)
         total += (area * (camera.fx * camera.fy / (camera.width * camera.height)) / distance**2).clamp_max(1)
     seen = total * opacities**2

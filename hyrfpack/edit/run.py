@@ -221,7 +221,7 @@ def _apply(path: Path, actions: Sequence[Action], data: Scene | None, progress: 
     capture = Capture(facts)
     viewpoint = capture.viewpoint
     photos = [] if data is None else list(data.train)
-    before = EditState(model, capture.cameras, viewpoint.center, viewpoint.up, photos, Placement.identity(), progress)
+    before = EditState(model, capture.cameras, viewpoint.center, viewpoint.up, photos, Placement(), progress)
     after, reports = before, []
     for action in actions:
         count = len(after.model)
@@ -229,7 +229,7 @@ def _apply(path: Path, actions: Sequence[Action], data: Scene | None, progress: 
         reports.append(ActionReport(str(action), count, len(after.model)))
     if not after.placement.is_identity:
         provenance = after.placement.move_provenance(provenance)
-    if after.up is not before.up:
+    if any(isinstance(action, Up) for action in actions):
         camera = after.placement.move_camera(viewpoint.camera)
         turned = replace(viewpoint, center=after.center, up=after.up, camera=camera)
         provenance = {**provenance, "viewpoint": turned.to_json()}
@@ -240,11 +240,11 @@ def _apply_action(action: Action, state: EditState) -> EditState:
     if isinstance(action, Background):
         return replace(state, model=replace_config(state.model, background=False, solid=action.color))
     if isinstance(action, Translate):
-        return state.move(1.0, action.offset)
+        return state.move(Placement.translation(action.offset))
     if isinstance(action, Scale):
-        return state.move(action.factor, (0.0, 0.0, 0.0))
+        return state.move(Placement(action.factor))
     if isinstance(action, Center):
-        return state.move(1.0, -state.center)
+        return state.move(Placement.translation(-state.center))
     if isinstance(action, Up):
         return replace(state, up=np.array(action.direction) / np.linalg.norm(action.direction))
     keep = keep_mask(action, state)

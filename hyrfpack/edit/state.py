@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -35,16 +34,16 @@ class EditState:
     placement: Placement
     progress: Progress = ignore_progress
 
-    def move(self, factor: float, offset: Sequence[float] | np.ndarray) -> EditState:
-        """Return the scene with positions p' = factor p + offset."""
-        step = Placement.identity().then(factor, offset)
+    def move(self, step: Placement) -> EditState:
+        """Return the scene in new world coordinates."""
         return replace(
             self,
             model=step.move_model(self.model),
             cameras=[step.move_camera(camera) for camera in self.cameras],
             center=step.move_point(self.center),
+            up=step.move_direction(self.up),
             photos=[step.move_view(view) for view in self.photos],
-            placement=self.placement.then(factor, offset),
+            placement=self.placement.then(step),
         )
 
     def world_positions(self) -> np.ndarray:

@@ -1,10 +1,11 @@
-"""A scene in new world coordinates: p' = factor p + offset. Only the frame and the stored cameras change."""
+"""A scene in new world coordinates: p' = factor R p + offset. Only the frame and the stored cameras change."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -13,42 +14,59 @@ from hyrfpack.cameras.files import camera_from_numbers, camera_to_numbers
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.model import HybridModel
 from hyrfpack.model.frame import Frame
+from hyrfpack.rotations import IDENTITY, quaternion_from_matrix, rotation_matrix
 from hyrfpack.scene import Camera, View
 
 CAMERA_KEYS = ("cameras", "coarse_cameras")
+# A scene whose frame is turned by less has been turned back, and gets the file of one that was never turned.
+MIN_TURN_RADIANS = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """A map of world positions, p' = factor p + offset.
+    """A similarity of world positions, p' = factor R p + offset.
 
     Attributes:
         factor: scale factor, above 0.
+        rotation: (3, 3) float64 proper rotation R.
         offset: (3,) float64.
     """
 
-    factor: float
-    offset: np.ndarray
+    factor: float = 1.0
+    rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
+    offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
     @classmethod
-    def identity(cls) -> Placement:
-        return cls(1.0, np.zeros(3))
+    def translation(cls, offset: Sequence[float] | np.ndarray) -> Placement:
+        """Return the map p' = p + offset."""
+        return cls(offset=np.asarray(offset, np.float64))
 
-    def then(self, factor: float, offset: Sequence[float] | np.ndarray) -> Placement:
-        """Return the map of this one followed by p' = factor p + offset."""
-        return Placement(factor * self.factor, factor * self.offset + np.asarray(offset, np.float64))
+    @classmethod
+    def rotation_about_axis(cls, axis: Sequence[float] | np.ndarray, degrees: float) -> Placement:
+        """Return the right-handed rotation about an axis (3,) of any length above 0 through the origin."""
+        x, y, z = np.sin(np.radians(degrees) / 2) * np.asarray(axis, np.float64) / np.linalg.norm(axis)
+        return cls(rotation=rotation_matrix((math.cos(math.radians(degrees) / 2), x, y, z)))
+
+    def then(self, step: Placement) -> Placement:
+        """Return the map of this one followed by `step`."""
+        return Placement(self.factor * step.factor, step.rotation @ self.rotation, step.move_point(self.offset))
 
     @property
     def is_identity(self) -> bool:
-        return self.factor == 1 and not self.offset.any()
+        return self.factor == 1 and np.array_equal(self.rotation, np.eye(3)) and not self.offset.any()
 
     def move_point(self, point: Sequence[float] | np.ndarray) -> np.ndarray:
         """Return the new position (3,) of a point (3,)."""
-        return self.factor * np.asarray(point, np.float64) + self.offset
+        return self.factor * self.move_direction(point) + self.offset
+
+    def move_direction(self, direction: Sequence[float] | np.ndarray) -> np.ndarray:
+        """Return the new direction (3,) of a direction (3,), of the same length."""
+        return self.rotation @ np.asarray(direction, np.float64)
 
     def move_camera(self, camera: Camera) -> Camera:
         """Return the camera that sees the moved scene as `camera` sees the scene."""
         pose = camera.camera_from_world.copy()
+        pose[:3, :3] = pose[:3, :3] @ self.rotation.T
         pose[:3, 3] = self.factor * pose[:3, 3] - pose[:3, :3] @ self.offset
         return replace(camera, camera_from_world=pose)
 
@@ -60,7 +78,9 @@ class Placement:
         """Return the moved model, which shares all parameters with `model`: only its frame differs."""
         frame = model.config.frame
         x, y, z = self.move_point(frame.center).tolist()
-        return replace_config(model, frame=Frame((x, y, z), self.factor * frame.scale, frame.half_extent))
+        w, i, j, k = (quaternion_from_matrix(self.rotation @ frame.axes) + 0.0).tolist()  # + 0.0 turns -0.0 into 0.0
+        rotation = IDENTITY if 2 * math.hypot(i, j, k) < MIN_TURN_RADIANS else (w, i, j, k)
+        return replace_config(model, frame=Frame((x, y, z), self.factor * frame.scale, frame.half_extent, rotation))
 
     def move_provenance(self, provenance: dict) -> dict:
         """Return a provenance with moved cameras and viewpoint. Entries that cannot be read are left out."""
@@ -77,7 +97,10 @@ class Placement:
             return [camera_to_numbers(self.move_camera(camera_from_numbers(numbers))) for numbers in entry]
         viewpoint = Viewpoint.from_json(entry)
         return replace(
-            viewpoint, center=self.move_point(viewpoint.center), camera=self.move_camera(viewpoint.camera)
+            viewpoint,
+            center=self.move_point(viewpoint.center),
+            up=self.move_direction(viewpoint.up),
+            camera=self.move_camera(viewpoint.camera),
         ).to_json()
 
 

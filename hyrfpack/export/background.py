@@ -162,7 +162,7 @@ def background_picture(
     latitudes, longitudes = torch.meshgrid(latitudes, longitudes, indexing="ij")
     level = latitudes.cos()
     directions = torch.stack((level * longitudes.sin(), -latitudes.sin(), level * longitudes.cos()), -1)
-    flat_directions = directions.reshape(-1, 3).float()
+    flat_directions = (directions.reshape(-1, 3) @ torch.from_numpy(model.config.frame.axes)).float()  # local axes
     colors = _sphere_colors(model, flat_directions)
     gains = BackgroundGains.predict(model, cameras, visibility)
     if gains is not None:
@@ -186,7 +186,7 @@ class BackgroundGains:
     s = GAIN_SMOOTHING_RADIANS. Directions that no camera sees thus get the gains of the nearest cells, without a step.
 
     Attributes:
-        directions: (n, 3) float32 unit vectors to the centres of the cells that cameras see.
+        directions: (n, 3) float32 unit vectors to the centres of the cells that cameras see, in local axes.
         log_light: (n,) float32 logarithm of the light that cameras see of each cell.
         log_gains: (n, 3) float32 mean log gains of the cells.
     """
@@ -225,14 +225,14 @@ class BackgroundGains:
         return cls(*(torch.from_numpy(array).float() for array in (centers, np.log(light), means)))
 
     def evaluate(self, directions: Tensor) -> Tensor:
-        """Evaluate the gains (N, 3) along unit vectors (N, 3) from the sphere's centre."""
+        """Evaluate the gains (N, 3) along unit vectors (N, 3) from the sphere's centre, in local axes."""
         cosines = directions @ self.directions.T  # |d - c|^2 = 2 - 2 cos
         weights = (cosines / GAIN_SMOOTHING_RADIANS**2 + self.log_light).softmax(1)
         return (weights @ self.log_gains).exp()
 
 
 def _sphere_colors(model: HybridModel, directions: Tensor) -> Tensor:
-    """Evaluate the colours (N, 3) of the sphere along unit vectors (N, 3) from its centre."""
+    """Evaluate the colours (N, 3) of the sphere along unit vectors (N, 3) from its centre, in local axes."""
     encoding = model.config.direction_encoding
     colors = torch.cat(
         [

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -98,8 +99,9 @@ def bake(
     opacities = geometry.opacities * (1 - share.float().square())
     keep = ((share == 0) | (opacities >= ALPHA_MIN)).numpy()
 
+    frame = model.config.frame
     shared = (
-        model.config.frame.to_world(positions.numpy()),
+        positions.double().numpy() * frame.scale,
         scales.numpy(),
         normalized_quats(geometry.quats.numpy()),
         opacities.numpy(),
@@ -110,6 +112,9 @@ def bake(
         harmonics = fitted.pop(degree)
         check_finite("colors", harmonics)
         splats = Splats(*shared, harmonics.numpy(), model.config.antialiased)
+        if frame.is_rotated:  # so far, all axes are local
+            splats = splats.rotated(frame.axes)
+        splats = replace(splats, positions=splats.positions + np.array(frame.center))
         baked[degree] = splats if keep.all() else splats[keep]
     return baked
 

@@ -22,6 +22,7 @@ from hyrfpack.format.info import FileReport, section_sizes
 from hyrfpack.format.metadata import Metadata, read_metadata
 from hyrfpack.format.run_folder import find_model
 from hyrfpack.format.sections import NON_PARAMETER_SECTIONS, POSITIONS, SECTION_CONTENTS, group_and_layer
+from hyrfpack.format.versions import lowest_minor_version
 from hyrfpack.model.hybrid import HybridModel
 from hyrfpack.outputs import Outputs
 
@@ -55,11 +56,9 @@ def encode_model(model: HybridModel, profile: str = "raw", provenance: dict | No
     metadata = Metadata(
         profile, sum(counts), model.config.to_dict(), MODEL_RULES, used, provenance or {}, layers=layers
     )
-    is_compact = profile == "compact"
-    minor = int(is_compact)  # readers of version 1.0 can read every profile but this one
     if model.exposure is not None:
-        sections, minor = [encode_exposure(model.exposure), *sections], 2
-    sections = [metadata.to_section(deflate=is_compact), *sections]
+        sections = [encode_exposure(model.exposure), *sections]
+    sections = [metadata.to_section(deflate=profile == "compact"), *sections]
     stored, raw_length = (sum(sizes) for sizes in zip(*((len(s.data), s.raw_length) for s in sections), strict=True))
     if raw_length > raw_bytes_limit(stored) or sum(counts) > gaussian_limit(stored):
         raise HyrfError(
@@ -67,7 +66,7 @@ def encode_model(model: HybridModel, profile: str = "raw", provenance: dict | No
             "refuse",
             fix="use profile 'raw' for this model",
         )
-    return write_container(sections, minor=minor)
+    return write_container(sections, minor=lowest_minor_version(sections, metadata.config))
 
 
 def decode_model(

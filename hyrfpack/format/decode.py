@@ -79,7 +79,7 @@ def _add_photo_sampling(model: HybridModel, provenance: dict) -> None:
     """Store with the model how finely the photos sampled it, if the provenance has their cameras."""
     photos, frame = PhotoCameras.from_provenance(provenance), model.config.frame
     model.background_spacing = photos.background_spacing
-    sizes = photos.pixel_sizes(model.gaussians.positions.numpy(), frame.center, frame.scale)
+    sizes = photos.pixel_sizes(model.gaussians.positions.numpy(), frame.center, frame.scale, frame.axes)
     model.gaussians.pixel_sizes = None if sizes is None else torch.from_numpy(sizes)
 
 

@@ -148,6 +148,8 @@ def read_metadata(container: Container) -> Metadata:
         for key, kind in (("gaussians", int), ("rules", dict), ("settings", dict), ("provenance", dict)):
             _check_type(values[key], kind, key)
         _check_type(values["config"], _CONFIG_TYPES, "config")
+        if "rotation" in values["config"]["frame"]:
+            _check_type(values["config"]["frame"]["rotation"], (float,) * 4, "config.frame.rotation")
         _check_type([values["profile"], values["writer"]], (str, str), "profile or writer")
         if not 0 <= values["gaussians"] < 1 << 40:
             raise ValueError(f"there cannot be {values['gaussians']} Gaussians")

@@ -10,6 +10,7 @@ from hyrfpack.format.container import Container, write_container
 from hyrfpack.format.info import FileReport
 from hyrfpack.format.metadata import CODEC_DEFLATED, read_metadata, writer_name
 from hyrfpack.format.sections import METADATA
+from hyrfpack.format.versions import lowest_minor_version
 from hyrfpack.model.config import ModelConfig
 
 
@@ -44,5 +45,5 @@ def rewrite_metadata(
             else container[entry.type]
             for entry in container.entries.values()
         ]
-        data = write_container(sections, minor=container.version[1])
+        data = write_container(sections, minor=lowest_minor_version(sections, metadata.config))
     return write_model(data, target, overwrite=overwrite)

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass
 
 from hyrfpack.model.frame import Frame
 from hyrfpack.model.hash_grid import HashGridConfig
+from hyrfpack.rotations import Quaternion
 
 
 @dataclass(frozen=True)
@@ -38,8 +39,14 @@ class ModelConfig:
     antialiased: bool = False
 
     def to_dict(self) -> dict:
-        """Return the configuration as plain numbers, strings, lists and dictionaries, ready for JSON."""
-        return asdict(self)
+        """Return the configuration as plain numbers, strings, lists and dictionaries, ready for JSON.
+
+        The frame has a rotation only if it is not the identity.
+        """
+        values = asdict(self)
+        if not self.frame.is_rotated:
+            del values["frame"]["rotation"]
+        return values
 
     @classmethod
     def from_dict(cls, values: dict) -> ModelConfig:
@@ -52,6 +59,8 @@ class ModelConfig:
         frame = dict(parts["frame"])
         for name, convert in (("center", _to_triple), ("scale", float), ("half_extent", _to_triple)):
             frame[name] = convert(frame[name])
+        if "rotation" in frame:
+            frame["rotation"] = _to_quaternion(frame["rotation"])
         parts["frame"] = Frame(**frame)
         for name in ("geometry", "radiance"):
             parts[name] = HashGridConfig(**parts[name])
@@ -67,6 +76,12 @@ class ModelConfig:
             raise ValueError(f"hidden is {self.hidden}; it must lie in [1, 1024]")
         if not (self.frame.scale > 0 and all(h > 0 for h in self.frame.half_extent)):
             raise ValueError("the frame's scale and half extents must be positive")
+
+
+def _to_quaternion(values: list[float]) -> Quaternion:
+    """Convert a list of four numbers to a tuple of floats."""
+    w, x, y, z = map(float, values)
+    return w, x, y, z
 
 
 def _to_triple(values: list[float]) -> tuple[float, float, float]:

@@ -3,9 +3,9 @@
 Points are mapped through three coordinate systems:
 
 - **world**: the input's own axes, origin and unit (float64);
-- **local**: `local = (world - center) / scale`, with the same axes; the scene's box lies within [-1, 1]^3. All learnt
-  positions and sizes are local, so that nothing depends on the unit or the origin of a reconstruction, and float32 is
-  precise enough;
+- **local**: `local = R^T (world - center) / scale`; the scene's box lies within [-1, 1]^3. All learnt positions and
+  sizes are local, so that nothing depends on the unit, the origin or the axes of the world, and float32 is precise
+  enough. Training leaves R at the identity; an edit that turns a scene changes R alone;
 - **cube**: `contract(local / half_extent)` in (0, 1)^3, the domain of the hash grids.
 """
 
@@ -20,6 +20,7 @@ from torch import Tensor
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.ops.transfer import tensor_like
 from hyrfpack.ops.viewport import Viewport
+from hyrfpack.rotations import IDENTITY, Quaternion, check_rotation, rotation_matrix
 from hyrfpack.scene import Camera
 
 # Flat boxes are widened to this fraction of the longest half-axis, because even a row of cameras sees a volume.
@@ -34,11 +35,29 @@ class Frame:
         center: centre (x, y, z) of the box in world units.
         scale: world units per local unit, which is the longest half-axis of the box; positive.
         half_extent: half-axes of the box in local units, each in [MIN_HALF_EXTENT, 1].
+        rotation: rotation R from local to world axes, a quaternion wxyz of unit length.
+
+    Raises:
+        ValueError: the quaternion has no unit length.
     """
 
     center: tuple[float, float, float]
     scale: float
     half_extent: tuple[float, float, float]
+    rotation: Quaternion = IDENTITY
+
+    def __post_init__(self) -> None:
+        check_rotation(self.rotation)
+
+    @property
+    def axes(self) -> np.ndarray:
+        """Return R (3, 3) float64, whose columns are the local axes in the world."""
+        return rotation_matrix(self.rotation)
+
+    @property
+    def is_rotated(self) -> bool:
+        """Return whether the local axes differ from those of the world."""
+        return self.rotation != IDENTITY
 
     @classmethod
     def from_box(cls, low: np.ndarray, high: np.ndarray) -> Frame:
@@ -63,11 +82,11 @@ class Frame:
 
     def to_local(self, points: np.ndarray) -> np.ndarray:
         """Convert world positions (N, 3) to local positions, float64."""
-        return (np.asarray(points, np.float64) - np.array(self.center)) / self.scale
+        return (np.asarray(points, np.float64) - np.array(self.center)) / self.scale @ self.axes
 
     def to_world(self, points: np.ndarray) -> np.ndarray:
         """Convert local positions (N, 3) to world positions, float64."""
-        return np.asarray(points, np.float64) * self.scale + np.array(self.center)
+        return np.asarray(points, np.float64) * self.scale @ self.axes.T + np.array(self.center)
 
     def local_pose(self, camera: Camera) -> np.ndarray:
         """Return the camera's pose camera_from_local (4, 4) float64, with depths in local units.
@@ -76,6 +95,7 @@ class Frame:
         """
         pose = camera.camera_from_world.copy()
         pose[:3, 3] = (pose[:3, :3] @ np.array(self.center) + pose[:3, 3]) / self.scale
+        pose[:3, :3] = pose[:3, :3] @ self.axes
         return pose
 
     def local_viewport(self, camera: Camera, dtype: torch.dtype = torch.float32) -> Viewport:

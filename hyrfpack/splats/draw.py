@@ -16,6 +16,7 @@ from hyrfpack.ops.rasterize.cull import frustum_cull
 from hyrfpack.parallel.pool import torch_on_one_thread
 from hyrfpack.render import RenderedPicture, RenderSettings
 from hyrfpack.render.surface import render_surface
+from hyrfpack.rotations import IDENTITY
 from hyrfpack.scene import Camera
 from hyrfpack.splats.harmonics import harmonics_basis
 from hyrfpack.splats.splats import Splats
@@ -26,7 +27,7 @@ class Drawable:
     """Splats as float32 tensors in the local units of a frame, ready to be drawn many times.
 
     Attributes:
-        frame: the frame that defines the local units; near planes are in these units, too.
+        frame: the frame that defines the local units, without a rotation; near planes are in these units, too.
         positions (N, 3), scales (N, 3), quats (N, 4) wxyz, opacities (N,), harmonics (N, K, 3): as in Splats.
         antialiased: as in Splats.
     """
@@ -46,7 +47,11 @@ class Drawable:
         frame: Frame,
         device: torch.device = torch.device("cpu"),  # noqa: B008 - a constant
     ) -> Drawable:
-        """Convert splats to the local units of a frame and copy them to a device."""
+        """Convert splats to the local units of a frame and copy them to a device.
+
+        The frame's rotation is ignored: the axes remain those of the world, as the splats' harmonics need them.
+        """
+        frame = replace(frame, rotation=IDENTITY)
         positions = frame.to_local(splats.positions).astype(np.float32)
         scales = splats.scales / np.float32(frame.scale)
         arrays = positions, scales, splats.quats, splats.opacities, splats.harmonics

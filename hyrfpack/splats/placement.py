@@ -113,17 +113,6 @@ def decompose_similarity(matrix: np.ndarray, name: str) -> tuple[float, np.ndarr
     )
 
 
-def rotation_matrices(quats: np.ndarray) -> np.ndarray:
-    """Convert unit quaternions (N, 4) wxyz to rotation matrices (N, 3, 3) of the same dtype."""
-    w, x, y, z = quats.T
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return np.stack([np.stack(row, axis=1) for row in rows], axis=1)
-
-
 def _shortest_rotation(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Return the shortest rotation between unit vectors that are not opposite, by Rodrigues' formula."""
     x, y, z = np.cross(start, end)

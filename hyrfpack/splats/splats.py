@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hyrfpack.rotations import multiply_quats, quaternion_from_matrix
 from hyrfpack.splats.harmonics import MAX_DEGREE, SH_C0, harmonics_rotation, num_sh_bases
 
 
@@ -89,7 +90,7 @@ class Splats:
             rotation: (3, 3) proper rotation R, which moves a point x to R x.
         """
         turn = quaternion_from_matrix(rotation)
-        quats = _multiply_quats(turn, self.quats.astype(np.float64))
+        quats = normalized_quats(multiply_quats(turn, self.quats.astype(np.float64)))
         harmonics = np.einsum("jk,nkc->njc", harmonics_rotation(rotation, self.degree), self.harmonics)
         return replace(self, positions=self.positions @ np.asarray(rotation).T, quats=quats, harmonics=harmonics)
 
@@ -114,31 +115,3 @@ def normalized_quats(quats: np.ndarray) -> np.ndarray:
     lengths = np.linalg.norm(quats, axis=1, keepdims=True)
     quats = np.where(lengths > 0, quats / np.where(lengths > 0, lengths, 1), [1.0, 0.0, 0.0, 0.0])
     return np.where(quats[:, :1] < 0, -quats, quats).astype(np.float32)
-
-
-def quaternion_from_matrix(rotation: np.ndarray) -> np.ndarray:
-    """Convert a proper rotation (3, 3) to a unit quaternion (4,) float64 wxyz with w >= 0."""
-    r = np.asarray(rotation, np.float64)
-    # This is the outer product of the quaternion with itself. Its column with the largest diagonal entry is computed
-    # without cancellation.
-    outer = np.empty((4, 4))
-    outer[0, 0] = 1 + r[0, 0] + r[1, 1] + r[2, 2]
-    outer[1, 1] = 1 + r[0, 0] - r[1, 1] - r[2, 2]
-    outer[2, 2] = 1 - r[0, 0] + r[1, 1] - r[2, 2]
-    outer[3, 3] = 1 - r[0, 0] - r[1, 1] + r[2, 2]
-    outer[0, 1] = outer[1, 0] = r[2, 1] - r[1, 2]
-    outer[0, 2] = outer[2, 0] = r[0, 2] - r[2, 0]
-    outer[0, 3] = outer[3, 0] = r[1, 0] - r[0, 1]
-    outer[1, 2] = outer[2, 1] = r[0, 1] + r[1, 0]
-    outer[1, 3] = outer[3, 1] = r[0, 2] + r[2, 0]
-    outer[2, 3] = outer[3, 2] = r[1, 2] + r[2, 1]
-    quat = outer[np.argmax(np.diagonal(outer))]
-    quat = quat / np.linalg.norm(quat)
-    return -quat if quat[0] < 0 else quat
-
-
-def _multiply_quats(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the Hamilton products (N, 4) of a quaternion (4,) with quaternions (N, 4), all wxyz."""
-    w, v = first[0], first[1:]
-    s, u = second[:, :1], second[:, 1:]
-    return np.concatenate((w * s - u @ v[:, None], w * u + s * v + np.cross(v, u)), axis=1)

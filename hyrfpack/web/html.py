@@ -54,7 +54,7 @@ def encode_model_page(
         data: the `.hyrf` file.
         title: title of the page.
         count: number of Gaussians in the file.
-        frame: frame of the model; its centre and its longest half-axis are the page's origin and unit.
+        frame: frame of the model; the page has its origin, its axes, and its longest half-axis as the unit.
         cameras: at least one camera. The page starts at the first one and steps through the others.
         up: (3,) upward direction in the world, unit length.
         center: (3,) centre of orbits, world units.
@@ -69,6 +69,8 @@ def encode_model_page(
         ValueError: there is no camera.
     """
     facts = {"count": count, "center": list(frame.center), "unit": frame.scale, "near": RenderSettings().near}
+    if frame.is_rotated:
+        facts["rotation"] = list(frame.rotation)
     scene = _scene_element("hyrf", title, facts, cameras, up, center, solid)
     texts, description = [scene, *_poster_elements(poster)], _page_description(count, len(data))
     return assemble_player_page(title, texts, description, payload=data, readers=False, credit=credit)

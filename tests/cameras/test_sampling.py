@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scenes import camera_at, ring
+from scipy.spatial.transform import Rotation
 
 from hyrfpack.cameras.capture import provenance_cameras, quantized_provenance
 from hyrfpack.cameras.sampling import (
@@ -54,6 +55,20 @@ def test_a_photo_sees_points_up_to_15_percent_outside_its_picture():
 def test_a_point_that_no_photo_sees_takes_the_highest_rate_by_distance():
     cameras = [along_z(1.0), along_z(4.0, focal=100.0)]
     assert pixel_sizes(cameras, [[0, 3.0, -3.0]]) == pytest.approx([min(5 / 50, math.hypot(3, 7) / 100)], rel=1e-6)
+
+
+def test_points_in_a_rotated_frame_have_the_sizes_of_the_same_points_in_the_world():
+    axes = Rotation.from_rotvec([0.4, -1.1, 2.0]).as_matrix()
+    points = np.random.default_rng(1).normal(size=(500, 3))
+    photos = PhotoCameras([along_z(-2.0), along_z(-1.0, focal=100.0)], False, 2)
+
+    straight, rotated = (
+        photos.pixel_sizes(local.astype(np.float32), FRAME_CENTER, FRAME_SCALE, turn)
+        for local, turn in ((points, np.eye(3)), (points @ axes, axes))
+    )
+
+    assert len(set(np.sign(points[:, 2] + 2))) == 2  # some are behind the cameras
+    np.testing.assert_allclose(rotated, straight, rtol=1e-5)
 
 
 def test_coarse_cameras_are_taken_to_underestimate_the_rate():

@@ -11,8 +11,8 @@ from PIL import Image
 from scenes import ball_points, photograph, ring
 
 from hyrfpack.data import load_scene
+from hyrfpack.rotations import quaternion_from_matrix
 from hyrfpack.scene import Camera, Scene
-from hyrfpack.splats.splats import quaternion_from_matrix
 from tools.safety.variants.catalog import ALL_VARIANTS
 from tools.safety.variants.check import check_variant
 from tools.safety.variants.working_set import WorkingSet

@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scenes import QUIET_CONTEXT, ring
+from scipy.spatial.transform import Rotation
 
 from hyrfpack.cameras.capture import Capture, provenance_cameras
 from hyrfpack.config.edit import (
@@ -64,7 +65,7 @@ def test_a_moved_scene_renders_as_before_from_moved_cameras(file, tmp_path):
         assert_allclose(
             moved_camera.position, 2.5 * camera.position + (300, -20, 7), atol=0.03
         )  # rotations are rounded
-        exact = Placement(2.5, np.array([300.0, -20.0, 7.0])).move_camera(camera)
+        exact = Placement(2.5, offset=np.array([300.0, -20.0, 7.0])).move_camera(camera)
         pictures = [render_view(model, view).rgb.numpy() for model, view in ((before, camera), (after, exact))]
         assert_allclose(pictures[1], pictures[0], atol=1e-4)
 
@@ -83,14 +84,42 @@ def test_center_moves_the_point_of_interest_to_the_origin(tmp_path):
 
 
 offsets = st.tuples(*[st.floats(-100, 100)] * 3)
+turns = st.tuples(*[st.floats(-3, 3)] * 3)
 
 
-@given(st.lists(st.tuples(st.floats(0.1, 10), offsets), max_size=5))
+@given(st.lists(st.tuples(st.floats(0.1, 10), turns, offsets), max_size=5))
 def test_placements_compose_as_the_moves_in_turn(moves):
-    placement, point = Placement.identity(), np.array([3.0, -2.0, 0.5])
-    for factor, offset in moves:
-        placement, point = placement.then(factor, offset), factor * point + np.array(offset)
+    placement, point = Placement(), np.array([3.0, -2.0, 0.5])
+    for factor, turn, offset in moves:
+        rotation = Rotation.from_rotvec(turn)
+        placement = placement.then(Placement(factor, rotation.as_matrix(), np.array(offset)))
+        point = factor * rotation.apply(point) + np.array(offset)
     assert_allclose(placement.move_point((3.0, -2.0, 0.5)), point, rtol=1e-9, atol=1e-6)
+
+
+@given(turns.filter(lambda axis: np.linalg.norm(axis) > 1e-100), st.floats(-720, 720))
+def test_a_rotation_about_an_axis_is_right_handed(axis, degrees):
+    expected = Rotation.from_rotvec(np.radians(degrees) * np.array(axis) / np.linalg.norm(axis)).as_matrix()
+    assert_allclose(Placement.rotation_about_axis(axis, degrees).rotation, expected, atol=1e-12)
+
+
+def test_two_turns_of_a_model_are_one_turn_by_their_product():
+    first, second = (Rotation.from_rotvec(turn) for turn in ([0.3, 1.1, -0.7], [-1.9, 0.2, 0.4]))
+    model = load_model(COMPACT_FILE)
+    in_turn = Placement(rotation=second.as_matrix()).move_model(Placement(rotation=first.as_matrix()).move_model(model))
+    w, *vector = in_turn.config.frame.rotation
+    assert_allclose(Rotation.from_quat([*vector, w]).as_matrix(), (second * first).as_matrix(), atol=1e-13)
+    assert_allclose(in_turn.config.frame.center, (second * first).apply(model.config.frame.center), atol=1e-12)
+
+
+@pytest.mark.parametrize("steps", [2, 3, 7, 90])
+def test_a_full_turn_in_steps_gives_the_start_back(steps):
+    start = load_model(COMPACT_FILE)
+    model, step = start, Placement.rotation_about_axis((0.3, -1.2, 0.5), 360 / steps)
+    for _ in range(steps):
+        model = step.move_model(model)
+    assert not model.config.frame.is_rotated  # and so the file has no rotation
+    assert_allclose(model.config.frame.center, start.config.frame.center, atol=1e-12)
 
 
 @pytest.mark.parametrize("file", [COMPACT_FILE, RAW_FILE], ids=["compact", "raw"])

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -25,6 +26,13 @@ def test_config_survives_json():
     assert ModelConfig.from_dict(json.loads(json.dumps(MODEL_CONFIG.to_dict()))) == MODEL_CONFIG
 
 
+def test_a_configuration_has_a_rotation_only_if_its_frame_is_rotated():
+    rotated = replace(MODEL_CONFIG, frame=replace(MODEL_CONFIG.frame, rotation=(0.8, 0.0, -0.6, 0.0)))
+
+    assert "rotation" not in MODEL_CONFIG.to_dict()["frame"]
+    assert ModelConfig.from_dict(json.loads(json.dumps(rotated.to_dict()))) == rotated != MODEL_CONFIG
+
+
 def test_by_default_grids_rise_from_8_to_512_vertices_and_directions_have_24_inputs():
     grid = HashGridConfig(10)
     ratios = np.divide(grid.resolutions[1:], grid.resolutions[:-1])
@@ -47,6 +55,8 @@ def test_by_default_grids_rise_from_8_to_512_vertices_and_directions_have_24_inp
         ("frame", {"center": [0, 0, 0], "scale": 0.0, "half_extent": [1, 1, 1]}),
         ("frame", {"center": [0, 0, 0], "scale": 1.0, "half_extent": [1, -1, 1]}),
         ("frame", {"center": [0, 0, 0], "scale": float("nan"), "half_extent": [1, 1, 1]}),
+        ("frame", {"center": [0, 0, 0], "scale": 1.0, "half_extent": [1, 1, 1], "rotation": [1, 0, 0]}),
+        ("frame", {"center": [0, 0, 0], "scale": 1.0, "half_extent": [1, 1, 1], "rotation": [1, 0, 0, 0.1]}),
         ("geometry", {"log2_table_size": 9, "depth": 3}),
         ("surprise", 1),
     ],

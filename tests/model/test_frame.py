@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -22,11 +25,12 @@ def project(points: np.ndarray, pose: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 @pytest.mark.parametrize("offset", [0.0, 1e6])
-def test_local_pose_sees_the_same_pixels_with_depth_in_local_units(offset):
+@pytest.mark.parametrize("rotation", [(1.0, 0.0, 0.0, 0.0), (0.5, -0.1, 0.7, 0.5)], ids=["straight", "rotated"])
+def test_local_pose_sees_the_same_pixels_with_depth_in_local_units(offset, rotation):
     shift = np.array([offset, -offset, offset / 2])
     points = np.random.default_rng(4).uniform(-1, 1, (100, 3)) + shift
     camera = make_camera(shift + (3.0, -2.0, 1.0), shift + (0.1, 0.2, 0.3))
-    frame = Frame.from_box(shift - (2, 3, 1), shift + (2.5, 3, 0.5))
+    frame = replace(Frame.from_box(shift - (2, 3, 1), shift + (2.5, 3, 0.5)), rotation=rotation)
 
     local = project(frame.to_local(points), frame.local_pose(camera), camera)
 
@@ -46,6 +50,24 @@ def test_local_pose_keeps_a_close_scene_exact_a_million_units_away():
     seen = project(local, frame.local_pose(far).astype(np.float32), far)
 
     np.testing.assert_allclose(seen[:, :2], project(points, near.camera_from_world, near)[:, :2], rtol=0, atol=1e-3)
+
+
+def test_a_rotated_frame_maps_its_own_axes_to_the_coordinate_axes():
+    """A right-handed turn by 90 degrees about z maps x to y, y to -x, and z to itself."""
+    half = math.sqrt(0.5)
+    frame = Frame((10.0, 20.0, 30.0), 2.0, (1.0, 1.0, 1.0), (half, 0.0, 0.0, half))
+    world = np.array([[10.0, 22.0, 30.0], [8.0, 20.0, 30.0], [10.0, 20.0, 32.0]])  # the centre + 2 times each axis
+
+    np.testing.assert_allclose(frame.to_local(world), np.eye(3), rtol=0, atol=1e-15)
+    np.testing.assert_allclose(frame.to_world(np.eye(3)), world, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    "rotation", [(0.0, 0.0, 0.0, 0.0), (1.0, 1.0, 0.0, 0.0), (1 + 2e-6, 0.0, 0.0, 0.0), (float("nan"), 0, 0, 1)]
+)
+def test_a_frame_refuses_a_rotation_that_is_no_unit_quaternion(rotation):
+    with pytest.raises(ValueError, match="unit length"):
+        Frame((0.0, 0.0, 0.0), 1.0, (1.0, 1.0, 1.0), rotation)
 
 
 def test_local_pose_does_not_change_the_camera():

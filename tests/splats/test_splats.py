@@ -6,9 +6,10 @@ from scenes import camera_at
 from scipy.spatial.transform import Rotation
 
 from hyrfpack.model import Frame
+from hyrfpack.rotations import quaternion_from_matrix
 from hyrfpack.scene import Camera
 from hyrfpack.splats.draw import Drawable, draw
-from hyrfpack.splats.splats import Splats, concatenate, normalized_quats, quaternion_from_matrix
+from hyrfpack.splats.splats import Splats, concatenate, normalized_quats
 
 UNIT_FRAME = Frame((0.0, 0.0, 0.0), 1.0, (1.0, 1.0, 1.0))
 

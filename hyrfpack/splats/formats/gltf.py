@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 
 from hyrfpack.errors import HyrfDataError
+from hyrfpack.rotations import quaternion_from_matrix, rotation_matrices
 from hyrfpack.splats.formats.hints import NO_HINTS, Hints
 from hyrfpack.splats.formats.validation import build_valid_splats
 from hyrfpack.splats.harmonics import MAX_DEGREE, num_sh_bases
@@ -34,10 +35,9 @@ from hyrfpack.splats.placement import (
     decompose_similarity,
     local_origin,
     local_positions,
-    rotation_matrices,
     upright_rotation,
 )
-from hyrfpack.splats.splats import Splats, concatenate, quaternion_from_matrix
+from hyrfpack.splats.splats import Splats, concatenate
 
 SPLATTING_EXTENSION = "KHR_gaussian_splatting"
 GLTF_UP = (0.0, 1.0, 0.0)

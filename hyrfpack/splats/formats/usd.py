@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import numpy as np
 
 from hyrfpack.errors import HyrfDataError, needs_package
+from hyrfpack.rotations import rotation_matrices
 from hyrfpack.scene import Camera
 from hyrfpack.splats.formats.hints import NO_HINTS, Hints
 from hyrfpack.splats.formats.validation import build_valid_splats
@@ -29,7 +30,6 @@ from hyrfpack.splats.placement import (
     decompose_similarity,
     local_origin,
     local_positions,
-    rotation_matrices,
     upright_rotation,
 )
 from hyrfpack.splats.splats import Splats

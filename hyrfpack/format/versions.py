@@ -1,0 +1,20 @@
+"""The minor version of a file: the lowest one of the format that has all that the file uses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from hyrfpack.format.container import Section
+from hyrfpack.format.sections import EXPOSURE, group_and_layer
+
+_COMPACT_CODECS = range(5, 9)
+
+
+def lowest_minor_version(sections: Iterable[Section], config: dict) -> int:
+    """Return the lowest minor version that has the sections, their codecs, and the keys of a configuration."""
+    sections = list(sections)
+    if "rotation" in config["frame"]:
+        return 3
+    if any(section.type == EXPOSURE for section in sections):
+        return 2
+    return int(any(section.codec in _COMPACT_CODECS or group_and_layer(section.type)[1] for section in sections))
