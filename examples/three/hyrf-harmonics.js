@@ -12,6 +12,7 @@ import {
 import { read } from "hyrf.js";
 import { BACKGROUND_RADIUS, backgroundColors } from "hyrf.js/fields.js";
 import { fitHarmonics } from "hyrf.js/harmonics.js";
+import { IDENTITY_QUAT } from "hyrf.js/rotation.js";
 import { viewpointOf } from "hyrf.js/viewpoint.js";
 
 // Lengths are in the model's units.
@@ -37,12 +38,14 @@ const WORK_SLICE_MS = 12; // then the page can react and render a frame
  */
 export async function loadHyrf(source, { degree = 2, onCoarse = () => {}, onProgress = () => {} } = {}) {
   const model = await read(source instanceof Uint8Array ? source : await fetchBytes(source));
-  const { config, metadata } = model, { center, scale } = config.frame;
+  const { config, metadata } = model, { center, scale, rotation = IDENTITY_QUAT } = config.frame;
   const { cameras, fitted, up, target } = viewpointOf(metadata);
   const object = new Group(), frame = new Group();
   object.name = "hyrf";
   object.quaternion.copy(new Quaternion().setFromUnitVectors(new Vector3(...up), new Vector3(0, 1, 0)));
+  const [w, ...vector] = rotation;
   frame.position.set(...center);
+  frame.quaternion.set(...vector, w).normalize();
   frame.scale.setScalar(scale);
   object.add(frame);
   const near = NEAR_PLANE * scale, far = 2.5 * BACKGROUND_RADIUS * scale;

@@ -8,6 +8,7 @@ import {
 import { BACKGROUND_RADIUS } from "hyrf.js/fields.js";
 import { CULL_MARGIN_RATIO, NEAR_PLANE_LOCAL } from "hyrf.js/frustum.js";
 import { openRemoteModel } from "hyrf.js/remote.js";
+import { IDENTITY_QUAT } from "hyrf.js/rotation.js";
 import { viewpointOf } from "hyrf.js/viewpoint.js";
 
 import { GaussianPass } from "./gaussian-pass.js";
@@ -55,7 +56,7 @@ export class HyrfObject extends Object3D {
     this.model = model;
     /** Whether everything that the camera of the last frame sees is evaluated. */
     this.isComplete = false;
-    const { metadata, config, count, exposure } = model, { center, scale } = config.frame;
+    const { metadata, config, count, exposure } = model, { center, scale, rotation = IDENTITY_QUAT } = config.frame;
     const { cameras, up, target } = viewpointOf(metadata);
     const near = NEAR_PLANE_LOCAL * scale, far = 2.5 * BACKGROUND_RADIUS * scale;
     const solid = config.background ? null : config.solid;
@@ -69,8 +70,10 @@ export class HyrfObject extends Object3D {
       u_near: { value: NEAR_PLANE_LOCAL }, u_margin: { value: CULL_MARGIN_RATIO },
       u_antialiased: { value: config.antialiased },
     };
-    this.frame = new Group(); // has the model's local units
+    const [w, ...vector] = rotation;
+    this.frame = new Group(); // has the model's local units and axes
     this.frame.position.set(...center);
+    this.frame.quaternion.set(...vector, w).normalize();
     this.frame.scale.setScalar(scale);
     this.add(this.frame);
     this.gaussians = new GaussianPass(count, this.view);

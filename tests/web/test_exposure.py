@@ -25,6 +25,7 @@ from web.pages import (
 )
 from web.test_native import (
     EXACT_SETTINGS,
+    MODEL_FRAME,
     load_page,
     lose_and_restore_device,
     make_cameras,
@@ -95,7 +96,12 @@ def open_complete_page(browser: Browser, tmp_path: Path, page: bytes, address: s
 # ---- pictures
 
 
-@pytest.mark.parametrize("config", [{}, {"background": False}], ids=["background", "solid"])
+ROTATED_FRAME = dataclasses.replace(MODEL_FRAME, rotation=(0.5, -0.1, 0.7, 0.5))
+
+
+@pytest.mark.parametrize(
+    "config", [{}, {"background": False}, {"frame": ROTATED_FRAME}], ids=["background", "solid", "rotated"]
+)
 def test_both_exposures_look_as_in_hyrfpack_render(browser: Browser, tmp_path: Path, config: dict):
     model = random_model_with_map(**config)
     load_page(browser, tmp_path, make_model_page(model))
@@ -186,7 +192,7 @@ def test_saved_pictures_and_the_window_have_the_chosen_exposure(browser: Browser
 
 @pytest.mark.in_turn
 def test_fitted_harmonics_of_weak_devices_use_the_exposure_map(browser: Browser, tmp_path: Path):
-    model = random_model_with_map(400)
+    model = random_model_with_map(400, frame=ROTATED_FRAME)
     with torch.no_grad():  # degree 3 can represent such colours
         model.radiance.weights[0][:, model.radiance.grid.feature_count :] *= 0.1
     load_page(browser, tmp_path, make_model_page(model).replace(b'{"kind": "hyrf"', b'{"plain": true, "kind": "hyrf"'))

@@ -33,6 +33,7 @@ from web.pages import (
 from web.scripts import run_script
 
 from hyrfpack.cameras.view_sampling import shrink_camera
+from hyrfpack.rotations import IDENTITY, rotation_matrix
 from hyrfpack.web.html import decode_splats_page
 from hyrfpack.web.serve import serve_in_thread
 
@@ -342,13 +343,19 @@ def test_links_are_exact_for_any_unit_and_rotation(tmp_path: Path):
             "eye": (rng.normal(size=3) * 3).tolist(),
             "fy": float(rng.uniform(100, 3000)),
         }
-        cases.append({**case, "unit": unit, "center": (rng.normal(size=3) * unit * 10).tolist()})
+        quat = rng.normal(size=4)
+        turned = {"rotation": (quat / np.linalg.norm(quat)).tolist()} if len(cases) % 2 else {}
+        cases.append({**case, "unit": unit, "center": (rng.normal(size=3) * unit * 10).tolist(), **turned})
     (tmp_path / "cases.json").write_text(json.dumps(cases))
     answers = run_script(Path(__file__).with_name("links.mjs"), tmp_path / "cases.json")
     for case, answer in zip(cases, answers, strict=True):
         expected = answer["expected"]
         assert np.abs(np.array(answer["rows"]) - case["rows"]).max() < 1e-5, answer
         assert np.abs(np.array(answer["eye"]) - case["eye"]).max() < 1e-5 * expected["pace"], answer
+        axes = rotation_matrix(case.get("rotation", IDENTITY))
+        place = np.array(case["center"]) + case["unit"] * axes @ case["eye"]  # links are in world units
+        written = np.array(answer["text"].split(",")[:3], float)
+        assert np.abs(written - place).max() < 1e-4 * expected["pace"] * case["unit"], answer
         assert answer["focal"] == pytest.approx(expected["focal"], rel=1e-5)
         assert answer["depth"] == pytest.approx(expected["depth"], rel=1e-4) and len(answer["text"]) < 140, answer
 

@@ -55,7 +55,7 @@ def random_model(count: int = 2600, seed: int = 0, **config: object) -> HybridMo
 
     positions = normal(count, 3) * 0.4 * torch.exp(normal(count, 1) * 0.5)
     gaussians = Gaussians(positions, normal(count, 3), normal(count, 1) * 0.5 - 3, normal(count, 1) + 1)
-    model = HybridModel(ModelConfig(frame=MODEL_FRAME, **shape), gaussians, generator)
+    model = HybridModel(ModelConfig(**{"frame": MODEL_FRAME, **shape}), gaussians, generator)
     with torch.no_grad():
         for field in (model.geometry, model.radiance):
             field.grid.table.copy_(normal(*field.grid.table.shape))
@@ -144,6 +144,28 @@ def test_pictures_geometry_and_colors_equal_those_of_the_model(browser: Browser,
     check_geometry_and_colors(browser, model, camera)
     scores = [psnr(render_in_page(browser, camera), render_reference(model, camera)) for camera in make_cameras()]
     assert min(scores) > 45 and browser.list_errors() == [], scores
+
+
+def test_a_page_of_a_rotated_model_shows_it_from_cameras_in_world_axes(browser: Browser, tmp_path: Path):
+    """The pixel sizes, the background, links, picked points and the window's camera all depend on the rotation."""
+    model = random_model(frame=replace(MODEL_FRAME, rotation=(0.5, -0.1, 0.7, 0.5)))
+    cameras = make_cameras()
+    data = encode_model(model, provenance={"cameras": provenance_cameras(cameras)})
+    model = decode_model(data)  # it has pixel sizes
+    load_page(browser, tmp_path, make_model_page(model, data))
+    near = replace(cameras[2], fx=150.0, fy=150.0)
+
+    scores = [psnr(render_in_page(browser, camera), render_reference(model, camera)) for camera in (*cameras, near)]
+
+    assert min(scores) > 45, scores
+    render_in_page(browser, cameras[0])
+    shown = camera_from_json(browser.evaluate("hyrfpack.camera()"))
+    np.testing.assert_allclose(shown.camera_from_world, cameras[0].camera_from_world, rtol=0, atol=1e-5)
+    up = browser.evaluate("hyrfpack.player.eye.up")
+    np.testing.assert_allclose(model.config.frame.axes @ up, UP_DIRECTION, rtol=0, atol=1e-12)
+    target = browser.evaluate("hyrfpack.player.eye.center")
+    np.testing.assert_allclose(model.config.frame.to_world(np.array(target)), SCENE_CENTER, rtol=0, atol=1e-9)
+    assert browser.list_errors() == []
 
 
 def check_geometry_and_colors(browser: Browser, model: HybridModel, camera: Camera) -> None:

@@ -20,14 +20,16 @@ const CLIPPED_RATIO = 1e-4; // clipping a few harmonics gives all others finer s
 const COARSE_TIME_RATIO = 0.1; // the measured share of the time until the coarse result
 
 /**
- * Explicit splats. The world position of a point p is `center` + `unit` p; the axes are the world's. The colour along
- * the unit vector d is max(0, `colors` + sum over k > 0 of Y_k(d) harmonic_k).
+ * Explicit splats in local axes. The world position of a point p is `center` + `unit` R p, with the rotation R of the
+ * quaternion `rotation` (wxyz; absent: the axes are the world's). The colour along the unit vector d is max(0, `colors`
+ * + sum over k > 0 of Y_k(d) harmonic_k).
  * @typedef {{
  *   count: number,
  *   degree: number,
  *   antialiased: boolean,
  *   center: number[],
  *   unit: number,
+ *   rotation?: number[],
  *   positions: Float32Array,
  *   scales: Float32Array,
  *   quats: Float32Array,
@@ -66,13 +68,15 @@ const COARSE_TIME_RATIO = 0.1; // the measured share of the time until the coars
  * @throws {HyrfFormatError} a resulting number is NaN or infinite
  */
 export async function fitHarmonics(model, viewpoints, degree, report = () => {}) {
-  const { count, config } = model, { center, scale } = config.frame, higher = HIGHER_HARMONICS_BY_DEGREE[degree];
+  const { count, config } = model, { center, scale, rotation } = config.frame;
+  const higher = HIGHER_HARMONICS_BY_DEGREE[degree];
   /** @type {Splats} */
   const splats = {
     count, degree,
     antialiased: config.antialiased,
     center: [...center],
     unit: scale,
+    ...(rotation && { rotation: [...rotation] }),
     positions: model.positions.slice(0, 3 * count),
     scales: new Float32Array(3 * count),
     quats: new Float32Array(4 * count),

@@ -1,4 +1,4 @@
-// Reads models from the bytes of `.hyrf` files, versions 1.0 to 1.2 (docs/reference/format.md).
+// Reads models from the bytes of `.hyrf` files, versions 1.0 to 1.3 (docs/reference/format.md).
 
 import { decodeChannels } from "./channels.js";
 import { Container, EXPOSURE_TYPE, FIELD_TYPES, LAYERED_TYPES, layerType, rejectIncomplete } from "./container.js";

@@ -12,7 +12,9 @@ import { JsonNumber, parseJson } from "./json.js";
  * @typedef {import("./json.js").JsonObject} JsonObject
  * @typedef {import("./grids.js").Grid} Grid
  *
- * @typedef {{center: number[], scale: number, half_extent: number[]}} Frame
+ * The frame of a model. `rotation`, a quaternion wxyz, is absent if its axes are those of the world; `frameAxes` of
+ * rotation.js reads it.
+ * @typedef {{center: number[], scale: number, half_extent: number[], rotation?: number[]}} Frame
  *
  * The configuration of a model.
  * @typedef {{
@@ -32,6 +34,7 @@ const CODEC_JSON = 0;
 const CODEC_DEFLATED = 5;
 const MAX_METADATA_BYTES = 2 ** 20;
 const MAX_GAUSSIANS = 2 ** 40 - 1;
+const MAX_QUAT_LENGTH_ERROR = 1e-6;
 
 /** @type {Record<string, string | number>} */
 const KNOWN_RULES = {
@@ -124,11 +127,16 @@ const checkConfig = (node) => {
   for (const key of booleans) {
     assertValid(typeof config.get(key) === "boolean", `'config.${key}' must be true or false`);
   }
-  const frame = requireExactObject(config.get("frame"), "config.frame", ["center", "scale", "half_extent"]);
+  const frameKeys = ["center", "scale", "half_extent"];
+  const frame = requireExactObject(config.get("frame"), "config.frame", frameKeys, ["rotation"]);
   requireTriple(frame.get("center"), "config.frame.center");
   const sizes = [requireFiniteNumber(frame.get("scale"), "config.frame.scale")];
   sizes.push(...requireTriple(frame.get("half_extent"), "config.frame.half_extent"));
   assertValid(sizes.every((size) => size > 0), "the frame's scale and half extents must be positive");
+  if (frame.has("rotation")) {
+    const length = Math.hypot(...requireNumbers(frame.get("rotation"), "config.frame.rotation", 4));
+    assertValid(Math.abs(length - 1) <= MAX_QUAT_LENGTH_ERROR, "'config.frame.rotation' must have unit length");
+  }
   for (const field of ["geometry", "radiance"]) {
     const keys = ["log2_table_size", "levels", "base", "finest"];
     const grid = requireExactObject(config.get(field), `config.${field}`, keys);
@@ -160,11 +168,13 @@ const requireObject = (node, path) => {
  * @param {JsonNode | undefined} node
  * @param {string} path
  * @param {string[]} keys
+ * @param {string[]} [optional] keys that may be absent
  */
-const requireExactObject = (node, path, keys) => {
+const requireExactObject = (node, path, keys, optional = []) => {
   const object = requireObject(node, path);
   for (const key of keys) assertValid(object.has(key), `'${path}.${key}' is missing`);
-  assertValid(object.size === keys.length, `'${path}' has keys that are unknown`);
+  const known = [...keys, ...optional];
+  assertValid([...object.keys()].every((key) => known.includes(key)), `'${path}' has keys that are unknown`);
   return object;
 };
 
@@ -204,15 +214,23 @@ const requireFiniteNumber = (node, path) => {
 };
 
 /**
+ * Returns the values of a node that must be a list of `count` finite numbers.
+ * @param {JsonNode | undefined} node
+ * @param {string} path
+ * @param {number} count
+ */
+const requireNumbers = (node, path, count) => {
+  const list = requireList(node, path);
+  assertValid(list.length === count, `'${path}' must be a list of ${count}`);
+  return list.map((item) => requireFiniteNumber(item, path));
+};
+
+/**
  * Returns the values of a node that must be a list of three finite numbers.
  * @param {JsonNode | undefined} node
  * @param {string} path
  */
-const requireTriple = (node, path) => {
-  const list = requireList(node, path);
-  assertValid(list.length === 3, `'${path}' must be a list of 3`);
-  return list.map((item) => requireFiniteNumber(item, path));
-};
+const requireTriple = (node, path) => requireNumbers(node, path, 3);
 
 /**
  * Checks that a node is one of several strings.

@@ -1,4 +1,29 @@
-// Rotations as unit quaternions (w, x, y, z), for interpolation and for short addresses.
+// Rotations as unit quaternions (w, x, y, z): of frames, for interpolation and for short addresses.
+
+import { dot } from "./vectors.js";
+
+export const IDENTITY_QUAT = [1, 0, 0, 0];
+
+/**
+ * Returns the rows of the rotation from a frame's local axes to the axes of the world.
+ * @param {{rotation?: number[]}} frame a frame, or anything else with its rotation; absent, the axes are the same
+ */
+export const frameAxes = ({ rotation = IDENTITY_QUAT }) => rowsOf(normalizedQuat(rotation));
+
+/**
+ * Rotates a vector by a matrix, given by its rows.
+ * @param {number[][]} rows
+ * @param {number[]} vector
+ */
+export const rotateBy = (rows, vector) => rows.map((row) => dot(row, vector));
+
+/**
+ * Rotates a vector by the inverse of a rotation matrix, given by its rows.
+ * @param {number[][]} rows
+ * @param {number[]} vector
+ */
+export const rotateBack = ([a, b, c], vector) =>
+  [0, 1, 2].map((k) => a[k] * vector[0] + b[k] * vector[1] + c[k] * vector[2]);
 
 /**
  * Returns the quaternion of a rotation matrix, given by its rows.

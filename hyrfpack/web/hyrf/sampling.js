@@ -82,7 +82,7 @@ function smallestByDistance(views, x, y, z) {
 function packViews(cameras, frame) {
   const numbers = cameras.flatMap((camera) => {
     const { rows, translation, eye, fx, fy, cx, cy, width, height } = toLocalView(camera, frame);
-    const [across, down, depth] = rows.map((row, k) => [...row.slice(0, 3), translation[k]]);
+    const [across, down, depth] = rows.map((row, k) => [...row, translation[k]]);
     /** @type {(size: number, center: number, focal: number) => number[]} */
     const bounds = (size, center, focal) => {
       return [-PICTURE_MARGIN_RATIO, 1 + PICTURE_MARGIN_RATIO].map((end) => (end * size - center) / focal);

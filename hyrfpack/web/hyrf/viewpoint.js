@@ -1,6 +1,7 @@
 // Chooses the cameras from which a model is shown, from the provenance of its file. The provenance is not trusted:
 // invalid entries are ignored.
 
+import { frameAxes, rotateBack, rotateBy } from "./rotation.js";
 import { add, cross, dot, mul, rotate, sub, unit } from "./vectors.js";
 
 const MAX_SHOWN_CAMERAS = 12;
@@ -35,9 +36,9 @@ const MAX_MEAN_DOWN_LENGTH = 0.5;
  *   file has no usable cameras
  */
 export function viewpointOf(metadata) {
-  const provenance = metadata.provenance ?? {}, { center, scale } = metadata.config.frame;
-  const viewpoint = parseStoredViewpoint(provenance.viewpoint) ?? validateViewpoint(defaultViewpoint(center, scale)) ??
-    defaultViewpoint([0, 0, 0], 1);
+  const provenance = metadata.provenance ?? {}, { frame } = metadata.config;
+  const viewpoint = parseStoredViewpoint(provenance.viewpoint) ?? validateViewpoint(defaultViewpoint(frame)) ??
+    defaultViewpoint({ center: [0, 0, 0], scale: 1 });
   const up = unit(viewpoint.up), { target } = viewpoint;
   const { cameras: kept, isCoarse } = storedCameras(metadata);
   if (!kept.length) {
@@ -84,11 +85,12 @@ export function cameraPosition({ camera_from_world: pose }) {
  * @param {import("./metadata.js").Frame} frame
  * @returns {import("./frustum.js").View & {eye: number[]}}
  */
-export function toLocalView(camera, { center, scale }) {
-  const { camera_from_world: pose, ...lens } = camera, rows = pose.slice(0, 3);
-  const translation = rows.map((row) => (dot(row, center) + row[3]) / scale);
-  const eye = cameraPosition(camera).map((value, axis) => (value - center[axis]) / scale);
-  return { ...lens, rows, translation, eye };
+export function toLocalView(camera, frame) {
+  const { center, scale } = frame, axes = frameAxes(frame);
+  const { camera_from_world: pose, ...lens } = camera, worldRows = pose.slice(0, 3);
+  const translation = worldRows.map((row) => (dot(row, center) + row[3]) / scale);
+  const eye = rotateBack(axes, cameraPosition(camera).map((value, axis) => (value - center[axis]) / scale));
+  return { ...lens, rows: worldRows.map((row) => rotateBack(axes, row)), translation, eye };
 }
 
 // --- cameras of the file ---------------------------------------------------------------------------------------------
@@ -187,14 +189,14 @@ const isNumberList = (values, count) =>
 
 /**
  * Returns the viewpoint of a model whose file has none. It looks slightly down from 2.5 times the frame's longest
- * half-axis away.
- * @param {number[]} center
- * @param {number} scale
+ * half-axis away; up is the frame's -y axis.
+ * @param {{center: number[], scale: number, rotation?: number[]}} frame
  * @returns {Viewpoint}
  */
-function defaultViewpoint(center, scale) {
-  const slope = (20 * Math.PI) / 180, up = [0, -1, 0], focal = 400 / Math.tan((25 * Math.PI) / 180);
-  const place = add(center, mul([0, -Math.sin(slope), -Math.cos(slope)], 2.5 * scale));
+function defaultViewpoint({ center, scale, rotation }) {
+  const slope = (20 * Math.PI) / 180, focal = 400 / Math.tan((25 * Math.PI) / 180), axes = frameAxes({ rotation });
+  const up = rotateBy(axes, [0, -1, 0]);
+  const place = add(center, mul(rotateBy(axes, [0, -Math.sin(slope), -Math.cos(slope)]), 2.5 * scale));
   const pose = lookAtPose(place, center, up);
   const camera = { width: 800, height: 600, fx: focal, fy: focal, cx: 400, cy: 300, camera_from_world: pose };
   return { target: [...center], up, camera, arc: [0, 360] };

@@ -1,7 +1,7 @@
 // Parses the parameters of the page's address, ?content=URL&camera=...&poster=URL&title=...&exposure=consistent&noui
 // &autorotate and #camera=..., and formats cameras for links.
 
-import { cameraOf, viewOf } from "./camera.js";
+import { cameraOf, toWorld, viewOf } from "./camera.js";
 import { EXPOSURES } from "./exposure.js";
 import { normalizedQuat, quatOf, rowsOf } from "../hyrf/rotation.js";
 
@@ -90,7 +90,7 @@ export function parseCamera(text, scene) {
 // to 1e-4 of the viewing distance or finer.
 export function formatCamera(eye, scene) {
   const { fy, camera_from_world: pose } = cameraOf(eye.view(LINK_SIDE_PIXELS, LINK_SIDE_PIXELS), scene);
-  const position = eye.position.map((value, axis) => scene.center[axis] + scene.unit * value);
+  const position = toWorld(eye.position, scene);
   const digits = Math.min(15, Math.max(0, 5 - Math.floor(Math.log10(scene.unit * Math.max(eye.pace, 1e-9)))));
   const lengths = [...position, scene.unit * eye.depth].map((value) => Number(value.toFixed(digits)));
   const quat = quatOf(pose.slice(0, 3).map((row) => row.slice(0, 3))).map((value) => Number(value.toFixed(6)));

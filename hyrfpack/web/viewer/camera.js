@@ -1,7 +1,8 @@
-// Defines cameras. The page uses the world's axes, with the origin `scene.center` and the unit `scene.unit` (both in
-// world units). A view is a pinhole camera in these coordinates: rows (right, down, forward), translation, eye, and fx,
-// fy, cx, cy in pixels.
+// Defines cameras. The page has the origin `scene.center`, the unit `scene.unit` (both in world units) and the world's
+// axes, rotated by the quaternion `scene.rotation` if there is one. A view is a pinhole camera in these coordinates:
+// rows (right, down, forward), translation, eye, and fx, fy, cx, cy in pixels.
 
+import { frameAxes, rotateBack, rotateBy } from "../hyrf/rotation.js";
 import { add, cross, dot, mul, rotate, sub, unit } from "../hyrf/vectors.js";
 
 const POSE_TOLERANCE = 1e-3; // the maximum error of the dot products of a pose's rows
@@ -16,6 +17,12 @@ function isRigid(rows) {
   return right && dot(cross(rows[0], rows[1]), rows[2]) > 0;
 }
 
+// Converts a point in world units to the page's coordinates.
+const toPage = (point, scene) => mul(rotateBack(frameAxes(scene), sub(point, scene.center)), 1 / scene.unit);
+
+// Converts a point in the page's coordinates to world units.
+export const toWorld = (point, scene) => add(scene.center, mul(rotateBy(frameAxes(scene), point), scene.unit));
+
 // Converts a camera in world units, {width, height, fx, fy, cx, cy, camera_from_world: 4 x 4 rows}, to a view. The last
 // row may be absent. Throws an Error that says what is wrong with an invalid camera.
 export function viewOf({ width, height, fx, fy, cx, cy, camera_from_world: pose }, scene) {
@@ -27,25 +34,27 @@ export function viewOf({ width, height, fx, fy, cx, cy, camera_from_world: pose 
     throw new Error("width and height must be whole numbers above 0");
   }
   if (!(fx > 0 && fy > 0)) throw new Error("fx and fy must be above 0");
-  const rows = pose.slice(0, 3).map((row) => row.slice(0, 3));
-  if (!isRigid(rows)) throw new Error("the first three columns of camera_from_world must be a rotation");
+  const worldRows = pose.slice(0, 3).map((row) => row.slice(0, 3)), axes = frameAxes(scene);
+  if (!isRigid(worldRows)) throw new Error("the first three columns of camera_from_world must be a rotation");
   const translation = pose.slice(0, 3).map((row) => (dot(row, scene.center) + row[3]) / scene.unit);
+  const rows = worldRows.map((row) => rotateBack(axes, row));
   const eye = [0, 1, 2].map((k) => -rows.reduce((sum, row, r) => sum + row[k] * translation[r], 0));
   return { rows, translation, eye, width, height, fx, fy, cx, cy };
 }
 
 // Converts a view to a camera in world units: the inverse of `viewOf`.
 export function cameraOf({ rows, translation, width, height, fx, fy, cx, cy }, scene) {
-  const world = rows.map((row, r) => [...row, translation[r] * scene.unit - dot(row, scene.center)]);
-  return { width, height, fx, fy, cx, cy, camera_from_world: [...world, [0, 0, 0, 1]] };
+  const worldRows = rows.map((row) => rotateBy(frameAxes(scene), row));
+  const pose = worldRows.map((row, r) => [...row, translation[r] * scene.unit - dot(row, scene.center)]);
+  return { width, height, fx, fy, cx, cy, camera_from_world: [...pose, [0, 0, 0, 1]] };
 }
 
 // The movable camera from which the window's picture is drawn.
 export class Eye {
   // The size of the scene is the median distance of `views` from its target.
   constructor(scene, views) {
-    this.up = scene.up;
-    this.center = mul(sub(scene.target, scene.center), 1 / scene.unit);
+    this.up = rotateBack(frameAxes(scene), scene.up);
+    this.center = toPage(scene.target, scene);
     const distances = views.map((view) => Math.hypot(...sub(view.eye, this.center))).sort((a, b) => a - b);
     this.size = distances[distances.length >> 1];
   }

@@ -19,6 +19,7 @@ import { ContextLostError, countContextChange } from "./graphics.js";
 import { Loader, StartError, SupersededError } from "./loader.js";
 import { Renderer } from "./renderer.js";
 import { Splats } from "./splats.js";
+import { IDENTITY_QUAT } from "../hyrf/rotation.js";
 
 const SETTLE_MS = 200; // the wait after a movement before the picture is drawn at full resolution
 const TARGET_FRAME_MS = 33; // slower frames lower the resolution while moving
@@ -575,9 +576,10 @@ export class Player extends EventTarget {
   }
 }
 
-// Returns whether two scenes have the same origin and unit, so that an eye of one is valid in the other.
+// Returns whether two scenes have the same origin, unit and axes, so that an eye of one is valid in the other.
 function sameAxes(before, after) {
-  return before?.unit === after.unit && before.center.every((value, axis) => value === after.center[axis]);
+  const numbersOf = ({ center, unit, rotation = IDENTITY_QUAT }) => [...center, unit, ...rotation];
+  return Boolean(before) && numbersOf(before).every((value, k) => value === numbersOf(after)[k]);
 }
 
 // Returns the views and the first eye of a scene. Throws an Error if a camera is invalid.

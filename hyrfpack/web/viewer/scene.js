@@ -10,10 +10,10 @@ const BACKGROUND_HEIGHT_PIXELS = 128;
 
 // Returns the scene of a model.
 export function modelScene({ metadata, config, count }, name) {
-  const { cameras, up, target } = viewpointOf(metadata), { center, scale } = config.frame;
+  const { cameras, up, target } = viewpointOf(metadata), { center, scale, rotation } = config.frame;
   return {
-    kind: "hyrf", title: name, count, center, unit: scale, near: NEAR_PLANE_LOCAL, tolerance: CULL_MARGIN_RATIO,
-    up, target, solid: config.solid, cameras,
+    kind: "hyrf", title: name, count, center, unit: scale, rotation, near: NEAR_PLANE_LOCAL,
+    tolerance: CULL_MARGIN_RATIO, up, target, solid: config.solid, cameras,
   };
 }
 

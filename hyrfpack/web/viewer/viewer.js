@@ -1,7 +1,7 @@
 // Shows scenes in an element of any page: the interface of the package hyrf-viewer, see npm/hyrf-viewer/index.d.ts.
 
 import { formatCamera, parseCamera } from "./address.js";
-import { cameraOf, viewOf } from "./camera.js";
+import { cameraOf, toWorld, viewOf } from "./camera.js";
 import { AS_PHOTOGRAPHED, EXPOSURES } from "./exposure.js";
 import { SupersededError } from "./loader.js";
 import { Navigation } from "./navigation.js";
@@ -193,7 +193,7 @@ class Viewer {
 
   pick(x, y) {
     const { scene } = this.player, point = this.player.findPoint(x, y);
-    return point && point.map((value, axis) => scene.center[axis] + scene.unit * value);
+    return point && toWorld(point, scene);
   }
 
   async screenshot({ type = "image/png", quality } = {}) {

@@ -28,6 +28,7 @@ PUBLIC_MODULES = (
     "harmonics",
     "remote",
     "remote_worker",
+    "rotation",
     "row_states",
     "sampling",
     "sort",

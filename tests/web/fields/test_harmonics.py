@@ -17,9 +17,10 @@ import hyrfpack
 from hyrfpack.cameras.files import camera_to_json
 from hyrfpack.cameras.paths import Viewpoint, orbit
 from hyrfpack.cameras.view_sampling import shrink_camera
+from hyrfpack.edit.transform import Placement
 from hyrfpack.export.bake import RIDGE_WEIGHT, SPHERE_DIRECTIONS, SPHERE_WEIGHT, bake
 from hyrfpack.export.measure import measure_psnr
-from hyrfpack.model import HybridModel
+from hyrfpack.model import Frame, HybridModel
 from hyrfpack.ops.rasterize.cull import frustum_cull
 from hyrfpack.ops.shade import encode_directions
 from hyrfpack.render import RenderSettings
@@ -108,6 +109,22 @@ def test_harmonics_solve_the_least_squares_over_views_and_sphere(degree: int, tm
     np.testing.assert_allclose(splats.harmonics[:, 1:], inside, atol=most / 255)
     assert (np.abs(expected[:, 1:]) > most).sum() <= 2e-3 * expected[:, 1:].size
     assert splats.antialiased and facts["degree"] == degree
+
+
+def test_splats_of_a_rotated_model_are_those_of_the_straight_one_in_its_axes(tmp_path: Path) -> None:
+    model, cameras = random_model(300), ring(9, radius=6.0, target=(0, 0, 0), width=50, height=40)
+    step = Placement.rotation_about_axis((0.3, -1.0, 0.4), 130)
+
+    before, _ = fit_in_node(model, cameras, 2, tmp_path)
+    after, facts = fit_in_node(step.move_model(model), [step.move_camera(camera) for camera in cameras], 2, tmp_path)
+
+    np.testing.assert_allclose(Frame((0, 0, 0), 1.0, (1, 1, 1), tuple(facts["rotation"])).axes, step.rotation)
+    np.testing.assert_allclose(facts["center"], step.move_point(model.config.frame.center), rtol=1e-9)
+    np.testing.assert_array_equal(after.quats, before.quats)
+    np.testing.assert_allclose(
+        after.positions - facts["center"], before.positions - model.config.frame.center, rtol=0, atol=1e-13
+    )
+    np.testing.assert_allclose(after.harmonics, before.harmonics, atol=facts["range"] / 100)
 
 
 def move_pose(camera: Camera, offset: np.ndarray) -> np.ndarray:

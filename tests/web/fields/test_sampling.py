@@ -14,6 +14,7 @@ from web.scripts import run_script
 
 from hyrfpack.cameras.files import camera_to_numbers
 from hyrfpack.cameras.sampling import PhotoCameras
+from hyrfpack.rotations import Quaternion, rotation_matrix
 from hyrfpack.scene import Camera
 
 SAMPLING_SCRIPT = Path(__file__).parent / "sampling.mjs"
@@ -34,11 +35,16 @@ def provenance_of(cameras: list[Camera], key: str = "cameras", **more: Any) -> d
 
 
 def sample_in_node(
-    tmp_path: Path, provenance: Any, positions: Any = ((0.0, 0.0, 0.0),), focals: tuple[float, ...] = ()
+    tmp_path: Path,
+    provenance: Any,
+    positions: Any = ((0.0, 0.0, 0.0),),
+    focals: tuple[float, ...] = (),
+    **frame: Any,
 ) -> dict:
     file = tmp_path / "cases.json"
     points = np.asarray(positions, np.float32).tolist()
-    file.write_text(json.dumps([{"metadata": make_metadata(provenance), "positions": points, "focals": focals}]))
+    metadata = make_metadata(provenance, **frame)
+    file.write_text(json.dumps([{"metadata": metadata, "positions": points, "focals": focals}]))
     return run_script(SAMPLING_SCRIPT, file)[0]
 
 
@@ -128,15 +134,16 @@ def test_strides_keep_the_spacing_of_training(tmp_path: Path, stored: dict, stri
     assert found["strides"] == strides
 
 
+@pytest.mark.parametrize("rotation", [(1.0, 0.0, 0.0, 0.0), (0.5, -0.1, 0.7, 0.5)], ids=["straight", "rotated"])
 @pytest.mark.parametrize("key", ["cameras", "coarse_cameras"])
-def test_sizes_equal_those_of_python(tmp_path: Path, key: str) -> None:
-    center, scale = MODEL_FRAME.center, MODEL_FRAME.scale
+def test_sizes_equal_those_of_python(tmp_path: Path, key: str, rotation: Quaternion) -> None:
+    center, scale, axes = MODEL_FRAME.center, MODEL_FRAME.scale, rotation_matrix(rotation)
     cameras = shift_cameras(ring(9, radius=6.0, target=(0, 0, 0), width=50, height=40), np.array(center))
     provenance = provenance_of(cameras, key, background_stride=3)
     positions = (np.random.default_rng(0).normal(size=(3000, 3)) * np.logspace(-1, 2, 3000)[:, None]).astype(np.float32)
 
-    found = sample_in_node(tmp_path, provenance, positions, focals=(40.0, 170.0))
+    found = sample_in_node(tmp_path, provenance, positions, focals=(40.0, 170.0), rotation=rotation)
 
     photos = PhotoCameras.from_provenance(json.loads(json.dumps(provenance)))
-    np.testing.assert_allclose(found["sizes"], photos.pixel_sizes(positions, center, scale), rtol=1e-5)
+    np.testing.assert_allclose(found["sizes"], photos.pixel_sizes(positions, center, scale, axes), rtol=1e-5)
     assert found["spacing"] == pytest.approx(photos.background_spacing, rel=1e-12)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from hyrfpack.cameras.files import camera_from_json, camera_to_json
 from hyrfpack.export.pages import MAX_PAGE_CAMERAS
 from hyrfpack.export.source import Source
 from hyrfpack.model import Frame
+from hyrfpack.rotations import Quaternion
 from hyrfpack.scene import Camera, Scene, evenly_spaced
 
 VIEWPOINTS_SCRIPT = Path(__file__).parent / "viewpoints.mjs"
@@ -77,14 +79,17 @@ def camera_json_array(cameras: list[dict]) -> np.ndarray:
     return np.array([[*(item[key] for key in order), *np.ravel(item["camera_from_world"])] for item in cameras])
 
 
+@pytest.mark.parametrize("rotation", [None, (0.5, -0.1, 0.7, 0.5)], ids=["straight", "rotated"])
 @pytest.mark.parametrize("name", VALID_PROVENANCES)
-def test_the_page_has_the_same_viewpoint_as_python(name: str, tmp_path: Path) -> None:
+def test_the_page_has_the_same_viewpoint_as_python(name: str, rotation: Quaternion | None, tmp_path: Path) -> None:
     file = tmp_path / "model.hyrf"
-    hyrfpack.save_model(small_model([[0, 0, 0]], frame=MODEL_FRAME), file, provenance=VALID_PROVENANCES[name])
+    frame = MODEL_FRAME if rotation is None else replace(MODEL_FRAME, rotation=rotation)
+    hyrfpack.save_model(small_model([[0, 0, 0]], frame=frame), file, provenance=VALID_PROVENANCES[name])
     read = Source.read(file)
     cameras = [camera for _, camera in read.cameras] or [camera for camera, _ in read.measured_views]
 
-    (found,) = viewpoints_in_node(tmp_path, [make_metadata(VALID_PROVENANCES[name])])
+    numbers = {} if rotation is None else {"rotation": list(rotation)}
+    (found,) = viewpoints_in_node(tmp_path, [make_metadata(VALID_PROVENANCES[name], **numbers)])
 
     close = {"rtol": 1e-9, "atol": 1e-9}
     np.testing.assert_allclose(

@@ -18,6 +18,8 @@ from web.served import serve_project
 from web.three.test_three import app_folder, cameras_around_model, make_model, save_model
 
 import hyrfpack
+from hyrfpack.edit.transform import Placement
+from hyrfpack.format.codec import load_with_provenance
 from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.scene import Camera
 from tools.browser.chromium import Chromium, find
@@ -44,6 +46,9 @@ def address(app_folder: Path) -> Iterator[str]:
         shutil.copy(Path(__file__).with_name(name), app_folder)
     shutil.copy(GOLDEN_FILE, app_folder / "golden.hyrf")
     save_model(make_model(), app_folder / "balls.hyrf")
+    model, provenance = load_with_provenance(GOLDEN_FILE)
+    step = Placement.rotation_about_axis((0.4, 1.0, -0.3), 77)
+    hyrfpack.save_model(step.move_model(model), app_folder / "rotated.hyrf", "raw", step.move_provenance(provenance))
     with serve_project(app_folder) as address:
         yield f"{address}/own"
 
@@ -95,6 +100,15 @@ def test_pictures_of_a_golden_model_are_those_of_the_exact_render(page: Chromium
     for number, camera in enumerate(cameras):
         picture, reference = draw(page, camera), render(GOLDEN_FILE, camera)
         assert psnr(picture, reference) > MIN_BACKGROUND_PSNR_DB, number
+        assert psnr(reference.mean((0, 1)), reference) < 25, "the picture is nearly uniform"
+
+
+@pytest.mark.acceptance
+def test_pictures_of_a_rotated_model_are_those_of_the_exact_render(page: Chromium, app_folder: Path):
+    page.evaluate("page.load('rotated.hyrf')")
+    for camera in (first_camera(page), first_camera(page, 3)):
+        picture, reference = draw(page, camera), render(app_folder / "rotated.hyrf", camera)
+        assert psnr(picture, reference) > MIN_BACKGROUND_PSNR_DB
         assert psnr(reference.mean((0, 1)), reference) < 25, "the picture is nearly uniform"
 
 

@@ -6,6 +6,7 @@ export type Splats = {
     antialiased: boolean;
     center: number[];
     unit: number;
+    rotation?: number[];
     positions: Float32Array;
     scales: Float32Array;
     quats: Float32Array;
@@ -24,14 +25,16 @@ export type LocalCamera = {
 };
 export type Model = import("./index.js").Model;
 /**
- * Explicit splats. The world position of a point p is `center` + `unit` p; the axes are the world's. The colour along
- * the unit vector d is max(0, `colors` + sum over k > 0 of Y_k(d) harmonic_k).
+ * Explicit splats in local axes. The world position of a point p is `center` + `unit` R p, with the rotation R of the
+ * quaternion `rotation` (wxyz; absent: the axes are the world's). The colour along the unit vector d is max(0, `colors`
+ * + sum over k > 0 of Y_k(d) harmonic_k).
  * @typedef {{
  *   count: number,
  *   degree: number,
  *   antialiased: boolean,
  *   center: number[],
  *   unit: number,
+ *   rotation?: number[],
  *   positions: Float32Array,
  *   scales: Float32Array,
  *   quats: Float32Array,

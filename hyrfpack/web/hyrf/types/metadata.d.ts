@@ -7,6 +7,7 @@ export type Frame = {
     center: number[];
     scale: number;
     half_extent: number[];
+    rotation?: number[];
 };
 export type Config = {
     frame: Frame;

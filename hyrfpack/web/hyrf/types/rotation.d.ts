@@ -1,3 +1,23 @@
+export declare const IDENTITY_QUAT: number[];
+/**
+ * Returns the rows of the rotation from a frame's local axes to the axes of the world.
+ * @param {{rotation?: number[]}} frame a frame, or anything else with its rotation; absent, the axes are the same
+ */
+export declare const frameAxes: ({ rotation }: {
+    rotation?: number[];
+}) => number[][];
+/**
+ * Rotates a vector by a matrix, given by its rows.
+ * @param {number[][]} rows
+ * @param {number[]} vector
+ */
+export declare const rotateBy: (rows: number[][], vector: number[]) => number[];
+/**
+ * Rotates a vector by the inverse of a rotation matrix, given by its rows.
+ * @param {number[][]} rows
+ * @param {number[]} vector
+ */
+export declare const rotateBack: ([a, b, c]: number[][], vector: number[]) => number[];
 /**
  * Returns the quaternion of a rotation matrix, given by its rows.
  * @param {number[][]} rows

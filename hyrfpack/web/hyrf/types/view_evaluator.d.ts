@@ -40,7 +40,7 @@ export type SkySize = {
  *
  * A part of the equirectangular picture of the background: its place and its RGBA bytes. Column c of a picture with
  * height h is at the longitude (c + 0.5) pi / h - pi, row r at the latitude pi / 2 - (r + 0.5) pi / h. Longitudes run
- * from +z to +x, latitudes to -y. `isCoarse` is true for the small picture, which comes first.
+ * from +z to +x, latitudes to -y, in local axes. `isCoarse` is true for the small picture, which comes first.
  * @typedef {{isCoarse: boolean, x: number, y: number, width: number, height: number, pixels: Uint8Array}} SkyTile
  *
  * The size of the background's picture and of its coarse version.

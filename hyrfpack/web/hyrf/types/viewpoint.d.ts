@@ -57,7 +57,7 @@ export declare function cameraPosition({ camera_from_world: pose }: Camera): num
  * @param {import("./metadata.js").Frame} frame
  * @returns {import("./frustum.js").View & {eye: number[]}}
  */
-export declare function toLocalView(camera: Camera, { center, scale }: import("./metadata.js").Frame): import("./frustum.js").View & {
+export declare function toLocalView(camera: Camera, frame: import("./metadata.js").Frame): import("./frustum.js").View & {
     eye: number[];
 };
 /**
