@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from hyrfpack.choices import CONSISTENT_EXPOSURE
+from hyrfpack.edit.transform import replace_config
 from hyrfpack.format import describe_file, load_model, metadata
 from hyrfpack.model import Frame, HashGridConfig, ModelConfig
 from hyrfpack.render import RenderSettings, render_view
@@ -39,7 +41,12 @@ def test_golden_file_has_the_recorded_configuration(file):
     config = load_model(file).config
 
     assert config == ModelConfig(
-        frame=Frame(center=(1e6, -0.1, 3.0), scale=12.5, half_extent=(1.0, 0.75, 0.25)),
+        frame=Frame(
+            center=(1e6, -0.1, 3.0),
+            scale=12.5,
+            half_extent=(1.0, 0.75, 0.25),
+            rotation=(0.5, -0.1, 0.7, 0.5) if file.stem == "v1.3_compact_rotated" else (1.0, 0.0, 0.0, 0.0),
+        ),
         geometry=HashGridConfig(log2_table_size=4, levels=2, base=2, finest=5),
         radiance=HashGridConfig(log2_table_size=5, levels=2, base=3, finest=7),
         hidden=3,
@@ -53,11 +60,11 @@ def test_golden_file_has_the_recorded_configuration(file):
     )
 
 
-NAMES_WITH_EXPOSURE_MAP = sorted(name for name, (_, _, exposure) in GOLDEN_FILES.items() if exposure is not None)
+NAMES_WITH_EXPOSURE_MAP = sorted(name for name, golden in GOLDEN_FILES.items() if golden.exposure is not None)
 
 
 def test_golden_files_have_an_exposure_map_from_version_1_2_on():
-    assert NAMES_WITH_EXPOSURE_MAP == ["v1.2_compact_exposure"]
+    assert NAMES_WITH_EXPOSURE_MAP == ["v1.2_compact_exposure", "v1.3_compact_rotated"]
     for file in GOLDEN_PATHS:
         assert (load_model(file).exposure is not None) == (file.stem in NAMES_WITH_EXPOSURE_MAP)
 
@@ -78,7 +85,8 @@ def test_golden_exposure_map_gives_the_recorded_log_gains(name):
 @pytest.mark.parametrize("name", NAMES_WITH_EXPOSURE_MAP)
 def test_golden_file_with_an_exposure_map_renders_the_recorded_picture(name):
     recorded = np.load(GOLDEN_FOLDER / f"{name}.npz")["exposure.picture"]
-    model, camera = load_model(GOLDEN_FOLDER / f"{name}.hyrf"), make_golden_camera()
+    model = load_model(GOLDEN_FOLDER / f"{name}.hyrf")
+    camera = make_golden_camera(GOLDEN_FILES[name].rotation)
 
     picture = render_view(model, camera).rgb.numpy()
 
@@ -89,15 +97,26 @@ def test_golden_file_with_an_exposure_map_renders_the_recorded_picture(name):
     )
 
 
+def test_the_rotated_golden_file_renders_the_picture_of_the_straight_one_from_the_rotated_camera():
+    straight = render_view(load_model(GOLDEN_FOLDER / "v1.2_compact_exposure.hyrf"), make_golden_camera()).rgb.numpy()
+    model = load_model(GOLDEN_FOLDER / "v1.3_compact_rotated.hyrf")
+
+    picture = render_view(model, make_golden_camera(model.config.frame.rotation)).rgb.numpy()
+
+    np.testing.assert_allclose(picture, straight, rtol=0, atol=1e-5)
+    assert np.abs(render_view(model, make_golden_camera()).rgb.numpy() - straight).max() > 0.1
+
+
 @pytest.mark.parametrize("name", GOLDEN_FILES)
 def test_golden_model_encodes_to_the_same_bytes(name, monkeypatch):
     golden = (GOLDEN_FOLDER / f"{name}.hyrf").read_bytes()
-    info, (profile, settings, exposure) = describe_file(GOLDEN_FOLDER / f"{name}.hyrf"), GOLDEN_FILES[name]
+    info, expected = describe_file(GOLDEN_FOLDER / f"{name}.hyrf"), GOLDEN_FILES[name]
     monkeypatch.setattr(metadata, "writer_name", lambda: info["writer"])
     model = load_model(GOLDEN_FOLDER / "v1.0_raw.hyrf")
-    model.exposure = exposure
+    model = replace_config(model, frame=replace(model.config.frame, rotation=expected.rotation))
+    model.exposure = expected.exposure
 
-    data = encode(model, profile, info["provenance"], **settings)
+    data = encode(model, expected.profile, info["provenance"], **expected.settings)
 
     assert data == golden
-    assert (info["version"], info["profile"]) == (name[1:4], profile)
+    assert (info["version"], info["profile"]) == (name[1:4], expected.profile)

@@ -13,7 +13,7 @@ import pytest
 from exposures import random_map
 from hypothesis import given
 from hypothesis import strategies as st
-from scenes import small_model
+from scenes import camera_at, small_model
 
 from hyrfpack.compress import plan
 from hyrfpack.errors import HyrfFormatError
@@ -21,7 +21,7 @@ from hyrfpack.format import decode_model
 from hyrfpack.format.arrays import to_arrays
 from hyrfpack.format.container import MINOR_VERSION, read_container, write_container
 from hyrfpack.format.exposure import decode_exposure, encode_exposure
-from hyrfpack.model import ExposureMap
+from hyrfpack.model import ExposureMap, Frame
 from hyrfpack.quant.integers import encode_integers
 from tools.safety import minimal_reader
 from tools.safety.synthetic_encoding import encode
@@ -83,6 +83,17 @@ def test_minimal_reader_imports_nothing_of_hyrfpack():
 @pytest.mark.parametrize("file", GOLDEN_PATHS, ids=lambda file: file.stem)
 def test_golden_files_decode_to_the_same_bits(file):
     assert_same_bits(file.read_bytes())
+
+
+@pytest.mark.parametrize("rotation", [(1.0, 0.0, 0.0, 0.0), (0.5, -0.1, 0.7, 0.5), (0.0, 0.6 * (1 + 5e-7), 0.0, -0.8)])
+def test_local_units_are_those_of_the_page(rotation):
+    frame = Frame((10.0, -20.0, 30.0), 2.5, (1.0, 1.0, 0.5), rotation)
+    camera = camera_at((12.0, -23.0, 31.0), (10.0, -20.0, 30.0))
+    config = random_model(1, frame=frame).config.to_dict()
+
+    pose = minimal_reader.local_pose(config["frame"], camera.camera_from_world)
+
+    np.testing.assert_allclose(frame.local_pose(camera), pose, rtol=0, atol=1e-13)
 
 
 @pytest.mark.parametrize("profile", ALL_PROFILES)

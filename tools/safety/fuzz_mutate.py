@@ -7,8 +7,10 @@ that the forged values reach their decoder.
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import json
+import math
 import struct
 import zlib
 from collections.abc import Callable
@@ -28,6 +30,7 @@ from hyrfpack.format.exposure import encode_exposure
 from hyrfpack.model import ExposureMap, Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.quant import HuffmanCode, MinMaxQuantizer, ResidualVectorQuantizer, huffman_encode
+from hyrfpack.rotations import IDENTITY, Quaternion
 from tools.safety.synthetic_encoding import encode
 
 GOLDEN_FOLDER = Path(__file__).parents[2] / "tests" / "golden"
@@ -67,6 +70,7 @@ class RawSection:
 def assemble(parts: list[RawSection]) -> bytes:
     """Return a file of these sections with correct offsets, lengths and checksums, for any content of the sections."""
     minor = 2 if any(part.codec == 9 for part in parts) else int(any(5 <= part.codec <= 8 for part in parts))
+    minor = 3 if any(_has_rotation(part) for part in parts if part.tag == b"META") else minor
     offset = 48 + 40 * len(parts)
     toc, payloads = [], []
     for part in parts:
@@ -80,6 +84,15 @@ def assemble(parts: list[RawSection]) -> bytes:
         "<8sHHIQQIII", b"\x89HYRF\r\n\n", 1, minor, 0, offset, 48, len(table), len(parts), zlib.crc32(table)
     )
     return b"".join((header, struct.pack("<I", zlib.crc32(header)), table, *payloads))
+
+
+def _has_rotation(part: RawSection) -> bool:
+    """Return whether metadata has the key `rotation` of the frame; the one of the rules has no list."""
+    text = part.data
+    if part.codec == 5:
+        with contextlib.suppress(zlib.error):
+            text = zlib.decompressobj().decompress(text, 1 << 20)
+    return b'"rotation":[' in text
 
 
 def disassemble(data: bytes) -> list[RawSection]:
@@ -102,10 +115,12 @@ def repair_checksums(data: bytearray) -> bytes:
 # --- Valid files as seeds ---
 
 
-def _make_model(count: int, hidden: int = 3, background: bool = True, **config: object) -> HybridModel:
+def _make_model(
+    count: int, hidden: int = 3, background: bool = True, rotation: Quaternion = IDENTITY, **config: object
+) -> HybridModel:
     rng = np.random.default_rng(count)
     shape = ModelConfig(
-        frame=Frame(center=(1.5, -0.1, 3.0), scale=12.5, half_extent=(1.0, 0.75, 0.25)),
+        frame=Frame(center=(1.5, -0.1, 3.0), scale=12.5, half_extent=(1.0, 0.75, 0.25), rotation=rotation),
         geometry=HashGridConfig(log2_table_size=4, levels=2, base=2, finest=5),
         radiance=HashGridConfig(log2_table_size=5, levels=2, base=3, finest=7),
         hidden=hidden,
@@ -145,8 +160,8 @@ def load_seed_files() -> tuple[tuple[bytes, ...], tuple[float, ...]]:
     """Return valid files and their weights; small files, which decode faster, have larger weights.
 
     The files are: each profile with 0, 1, 20 and 200 Gaussians, with and without background; the golden files;
-    Gaussians in layers; groups in codecs that no profile uses for them; and exposure maps of up to 64 centers in each
-    profile.
+    Gaussians in layers; groups in codecs that no profile uses for them; and rotated models with exposure maps of up to
+    64 centers in each profile.
     """
     rng = Random(0)
     models = [
@@ -174,7 +189,7 @@ def load_seed_files() -> tuple[tuple[bytes, ...], tuple[float, ...]]:
                     part.data = _encode_in_codec(arrays[part.tag.decode()], part.codec, rng)
             files.append((assemble(parts), weight))
     for profile, centers in zip(PROFILES, (0, 3, 64), strict=True):
-        exposed = _make_model(20, background=False)
+        exposed = _make_model(20, background=False, rotation=(0.8, 0.0, -0.6, 0.0))
         exposed.exposure = _make_exposure_map(centers)
         files.append((encode(exposed, profile), 10))
     return tuple(zip(*files, strict=True))
@@ -330,7 +345,7 @@ def _forge_metadata(rng: Random) -> bytes:
     parts = [replace(part) for part in _choose_sections(rng)]
     values = json.loads(zlib.decompress(parts[0].data) if parts[0].codec == 5 else parts[0].data)
     for _ in range(rng.choice((1, 1, 2))):
-        kind = rng.randrange(8)
+        kind = rng.randrange(9)
         all_values = list_json_values(values)
         sizes = [(node, key) for node, key in all_values if key in CONFIG_RANGES]
         if kind < 3 and sizes:
@@ -341,6 +356,10 @@ def _forge_metadata(rng: Random) -> bytes:
             if rng.random() < 0.3:
                 first = rng.randint(0, min(values["gaussians"], 50))
                 values["layers"] = rng.choice(([first, values["gaussians"] - first], [values["gaussians"]], [0] * 9))
+        elif kind == 8 and isinstance(values.get("config"), dict) and isinstance(values["config"].get("frame"), dict):
+            quat = [rng.gauss(0, 1) for _ in range(4)]
+            length = math.hypot(*quat) * (1 + rng.choice((0, 0, 9e-7, 1.1e-6, -1.1e-6, 1)))
+            values["config"]["frame"]["rotation"] = [number / length for number in quat]
         else:
             node, key = rng.choice(all_values)
             if kind == 4 and isinstance(node, dict):

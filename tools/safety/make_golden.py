@@ -8,11 +8,13 @@ replace one before the release, delete it by hand first.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 from hyrfpack.choices import CONSISTENT_EXPOSURE
 from hyrfpack.format import decode_model
@@ -20,6 +22,7 @@ from hyrfpack.format.arrays import to_arrays
 from hyrfpack.model import ExposureMap, Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.render import RenderSettings, render_view
+from hyrfpack.rotations import IDENTITY, Quaternion
 from hyrfpack.scene import Camera
 from tools.safety import minimal_reader
 from tools.safety.synthetic_encoding import encode
@@ -42,21 +45,34 @@ GOLDEN_EXPOSURE_MAP = ExposureMap(
     directions=np.array([[0, 0, 127], [-128, 0, 0], [90, -90, 5], [-60, 1, 111]], np.int8),
     weights=np.array([[32767, -20000, 1], [-32768, 9000, 250], [15000, 30000, -12000], [0, -1, 22222]], np.int16),
 )
-# Profile, settings and exposure map of each file.
-GOLDEN_FILES: dict[str, tuple[str, dict[str, Any], ExposureMap | None]] = {
-    "v1.0_raw": ("raw", {}, None),
-    "v1.0_paper": ("paper", {"color": (3, 8), "scale": (2, 4), "opacity": (1, 16)}, None),
-    "v1.1_compact": ("compact", {"distortion": 5e-4}, None),
-    "v1.1_compact_layers": ("compact", {"distortion": 1e-5, "layered": True}, None),
-    "v1.2_compact_exposure": ("compact", {"distortion": 5e-4}, GOLDEN_EXPOSURE_MAP),
+GOLDEN_ROTATION = (0.5, -0.1, 0.7, 0.5)
+
+
+@dataclass(frozen=True)
+class GoldenFile:
+    """How a golden file is encoded: profile, settings of the profile, exposure map, and rotation of the frame."""
+
+    profile: str
+    settings: dict[str, Any]
+    exposure: ExposureMap | None = None
+    rotation: Quaternion = IDENTITY
+
+
+GOLDEN_FILES = {
+    "v1.0_raw": GoldenFile("raw", {}),
+    "v1.0_paper": GoldenFile("paper", {"color": (3, 8), "scale": (2, 4), "opacity": (1, 16)}),
+    "v1.1_compact": GoldenFile("compact", {"distortion": 5e-4}),
+    "v1.1_compact_layers": GoldenFile("compact", {"distortion": 1e-5, "layered": True}),
+    "v1.2_compact_exposure": GoldenFile("compact", {"distortion": 5e-4}, GOLDEN_EXPOSURE_MAP),
+    "v1.3_compact_rotated": GoldenFile("compact", {"distortion": 5e-4}, GOLDEN_EXPOSURE_MAP, GOLDEN_ROTATION),
 }
 
 
-def make_golden_model() -> HybridModel:
+def make_golden_model(rotation: Quaternion = IDENTITY) -> HybridModel:
     """Return a model of 20 Gaussians with one dense and one hashed level in each grid, and no two equal sizes."""
     rng = np.random.default_rng(20)
     config = ModelConfig(
-        frame=Frame(center=(1e6, -0.1, 3.0), scale=12.5, half_extent=(1.0, 0.75, 0.25)),
+        frame=Frame(center=(1e6, -0.1, 3.0), scale=12.5, half_extent=(1.0, 0.75, 0.25), rotation=rotation),
         geometry=HashGridConfig(log2_table_size=4, levels=2, base=2, finest=5),
         radiance=HashGridConfig(log2_table_size=5, levels=2, base=3, finest=7),
         hidden=3,
@@ -108,11 +124,16 @@ def expect_values(model: HybridModel, profile: str, data: bytes) -> dict[str, np
     return values | gains
 
 
-def make_golden_camera() -> Camera:
-    """Return a camera that sees the golden model from inside the box of the exposure map."""
-    config = make_golden_model().config
+def make_golden_camera(rotation: Quaternion = IDENTITY) -> Camera:
+    """Return a camera that sees the golden model from inside the box of the exposure map.
+
+    In local units, the camera is the same for all rotations of the frame.
+    """
+    frame = make_golden_model(rotation).config.frame
+    w, x, y, z = rotation
     pose = np.eye(4)
-    pose[:3, 3] = config.frame.scale * np.array([0.1, 0.2, 1.0]) - np.array(config.frame.center)
+    pose[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix().T
+    pose[:3, 3] = frame.scale * np.array([0.1, 0.2, 1.0]) - pose[:3, :3] @ frame.center
     return Camera(16, 12, 20.0, 20.0, 8.0, 6.0, pose)
 
 
@@ -127,7 +148,11 @@ def expect_exposure(exposure: minimal_reader.Exposure, model: HybridModel) -> di
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     logs = np.array([minimal_reader.log_gains(exposure, *view) for view in zip(positions, directions, strict=True)])
     consistent = (
-        render_view(model, make_golden_camera(), RenderSettings(exposure=CONSISTENT_EXPOSURE)).rgb.double().numpy()
+        render_view(
+            model, make_golden_camera(model.config.frame.rotation), RenderSettings(exposure=CONSISTENT_EXPOSURE)
+        )
+        .rgb.double()
+        .numpy()
     )
     return {
         "exposure.positions": positions,
@@ -138,15 +163,15 @@ def expect_exposure(exposure: minimal_reader.Exposure, model: HybridModel) -> di
 
 
 def main() -> None:
-    model = make_golden_model()
-    for name, (profile, settings, exposure) in GOLDEN_FILES.items():
+    for name, golden in GOLDEN_FILES.items():
         target = GOLDEN_FOLDER / f"{name}.hyrf"
         if target.exists():
             print(f"{target} exists and is kept")
             continue
-        model.exposure = exposure
-        data = encode(model, profile, GOLDEN_PROVENANCE, **settings)
-        values = expect_values(model, profile, data)
+        model = make_golden_model(golden.rotation)
+        model.exposure = golden.exposure
+        data = encode(model, golden.profile, GOLDEN_PROVENANCE, **golden.settings)
+        values = expect_values(model, golden.profile, data)
         GOLDEN_FOLDER.mkdir(exist_ok=True)
         target.write_bytes(data)
         np.savez_compressed(target.with_suffix(".npz"), **values)

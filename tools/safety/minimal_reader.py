@@ -1,10 +1,11 @@
-"""Read `.hyrf` files of versions 1.0 to 1.2, by code written only from docs/reference/format.md, with numpy alone.
+"""Read `.hyrf` files of versions 1.0 to 1.3, by code written only from docs/reference/format.md, with numpy alone.
 
 This reader shares no code with hyrfpack. So it tests whether the page is complete and whether hyrfpack conforms to it.
 It is simple, not fast: a file of 30,000 Gaussians takes some seconds. Section numbers are those of the page.
 
     metadata, groups, exposure = read(Path("scene.hyrf").read_bytes())
     groups["POSI"]      # float32 (N, 3), the Gaussians of all layers
+    local_pose(metadata["config"]["frame"], camera_from_world)
     if exposure:        # the file has an exposure map
         log_gains(exposure, position, direction)
 """
@@ -244,8 +245,10 @@ def read_metadata(section: Section) -> dict[str, Any]:
     require(METADATA_KEYS <= metadata.keys(), "META: a key is missing")
     require(metadata["rules"] == REQUIRED_RULES, "META: other rules")
     config = metadata["config"]
+    frame = config["frame"]
     require(
-        set(config) == CONFIG_KEYS and set(config["frame"]) == FRAME_KEYS, "META: unknown or missing keys in config"
+        set(config) == CONFIG_KEYS and set(frame) - {"rotation"} == FRAME_KEYS,
+        "META: unknown or missing keys in config",
     )
     check_integer(metadata["gaussians"], 0, 2**40 - 1)
     layers = metadata.get("layers", [])
@@ -262,7 +265,12 @@ def read_metadata(section: Section) -> dict[str, Any]:
         check_integer(grid["finest"], check_integer(grid["base"], 2, 65536), 65536)
     require(config["direction_encoding"] in ("sh", "frequency"), "META: direction_encoding")
     require(config["scale_rule"] in ("sum", "product"), "META: scale_rule")
-    require(config["frame"]["scale"] > 0 and min(config["frame"]["half_extent"]) > 0, "META: frame")
+    require(frame["scale"] > 0 and min(frame["half_extent"]) > 0, "META: frame")
+    if "rotation" in frame:
+        quaternion = frame["rotation"]
+        require(isinstance(quaternion, list) and len(quaternion) == 4, "META: rotation")
+        require(all(type(number) in (int, float) for number in quaternion), "META: rotation")
+        require(abs(math.hypot(*quaternion) - 1) <= 1e-6, "META: the rotation has no unit length")
     return metadata
 
 
@@ -565,6 +573,26 @@ def table_groups(grid: dict[str, int], m: np.ndarray) -> np.ndarray:
             use += np.bincount(row, minlength=rows)
         groups += [16 * level + (count.bit_length() + 1) // 2 for count in use.tolist()]
     return np.array(groups)
+
+
+# 2.7 Local units
+
+
+def local_pose(frame: dict[str, Any], camera_from_world: np.ndarray) -> np.ndarray:
+    """Return the pose (4, 4) of a camera from local units, given that from the world."""
+    quaternion = np.array(frame.get("rotation", (1, 0, 0, 0)), np.float64)
+    w, x, y, z = quaternion / math.hypot(*quaternion)
+    rotation = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    pose = np.eye(4)
+    pose[:3, :3] = camera_from_world[:3, :3] @ rotation
+    pose[:3, 3] = (camera_from_world[:3, :3] @ frame["center"] + camera_from_world[:3, 3]) / frame["scale"]
+    return pose
 
 
 # 2.9 Exposure map
