@@ -90,6 +90,7 @@ def export(
       .ply .splat .spz .sog .glb .usda .usdc .usdz    3D Gaussians with spherical harmonics
       .points.ply .points.glb                         centres as points, cameras as frusta
       .mesh.glb .mesh.ply .obj .stl                   the surface as triangles with vertex colours
+      .collision.glb .collision.obj .collision.stl    a closed mesh of few triangles for physics engines
       .json, or a folder with --colmap                cameras: transforms.json, or a COLMAP model
 
     Several models exported to a folder make a gallery. Without a model, the folder gets a player that opens the files
@@ -105,6 +106,7 @@ def export(
       hyrfpack export bonsai.hyrf -o bonsai.ply --data photos/bonsai --min-opacity 0.02
       hyrfpack export bonsai.hyrf -o table.glb --crop -1,-1,-1,1,1,1
       hyrfpack export bonsai.hyrf -o bonsai.mesh.glb --faces 200000
+      hyrfpack export bonsai.hyrf -o bonsai.collision.glb
     """
     from hyrfpack.export import export_model as write
     from hyrfpack.export.folder import check_folder, export_gallery, export_player
@@ -201,6 +203,11 @@ def _print_report(report: ExportReport) -> None:
     mesh = f", {report.vertices:,} vertices, {report.faces:,} triangles" if report.faces else ""
     voxels = f", voxels of {report.voxel:.4g} units" if report.voxel else ""
     click.echo(f"{report.file}: {report.bytes:,} bytes{holds}{cameras}{mesh}{voxels}")
+    if report.surface_to_mesh and report.mesh_to_surface and report.wall:
+        ways = {"surface to mesh": report.surface_to_mesh, "mesh to surface": report.mesh_to_surface}
+        rows = [[way, *(f"{distance:.4g}" for distance in distances)] for way, distances in ways.items()]
+        click.echo(format_table(["distance, units", "mean", "95 %"], rows))
+        click.echo(f"the mesh is closed; behind the surface it has walls of {report.wall:.4g} units")
     if report.photos_model is not None:
         click.echo(
             f"PSNR against held-out photos: model {report.photos_model:.3f} dB, file {report.photos_file:.3f} dB"

@@ -10,6 +10,7 @@ from typing import Annotated
 from hyrfpack.choices import DEFAULT_SPZ_VERSION, LOCAL_EXPOSURE, SPLAT_EXPOSURES, SPZ_VERSIONS
 from hyrfpack.config.settings import OneOf, Range, check_settings
 
+DEFAULT_COLLISION_FACES = 4000
 MIN_VOXEL = 1e-12  # world units; smaller ones count as zero
 
 
@@ -56,7 +57,7 @@ class ExportConfig(ConvertConfig):
         credit: text below the title of a page or a player, such as the author and the licence.
         voxel: side of the voxels in which a mesh is fused, in world units. Default: 1.5 times the size of a photo's
             pixel on the surface, and at least 1/512 of the mesh.
-        faces: reduce a mesh to at most this number of triangles. Default: all.
+        faces: reduce a mesh to at most this number of triangles. Default: all, but 4000 for a .collision file.
     """
 
     background: bool = True

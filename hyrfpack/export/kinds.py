@@ -30,10 +30,13 @@ POINT_FILES = (
 MESH_FILES = tuple(
     FileKind(ending=ending, max_degree=0, module="skimage") for ending in (".mesh.glb", ".mesh.ply", ".obj", ".stl")
 )
+COLLISION_FILES = tuple(
+    FileKind(ending=f".collision.{extension}", max_degree=0, module="skimage") for extension in ("glb", "obj", "stl")
+)
 COLMAP_FOLDER = FileKind(ending="", max_degree=0, module="pycolmap")
 POSITION_KINDS = (COLMAP_FOLDER, *POINT_FILES)  # these hold the centres of Gaussians, and cameras
 PLAYER_FOLDER = FileKind(ending="")
-_FILE_KINDS = (*POINT_FILES, *MESH_FILES, *FORMATS.values(), HTML_PAGE, TRANSFORMS_JSON)
+_FILE_KINDS = (*POINT_FILES, *COLLISION_FILES, *MESH_FILES, *FORMATS.values(), HTML_PAGE, TRANSFORMS_JSON)
 _KINDS_BY_ENDING = {kind.ending: kind for kind in _FILE_KINDS}
 EXPORT_ENDINGS = tuple(_KINDS_BY_ENDING)
 
@@ -86,11 +89,12 @@ def check_request(kind: FileKind, target: str | os.PathLike[str], config: Export
             f"{target}: this file holds only cameras, so that Gaussians cannot be selected",
             fix="leave out `crop` and `min_opacity`",
         )
-    if kind not in MESH_FILES and (config.voxel is not None or config.faces is not None):
+    is_mesh = kind in (*MESH_FILES, *COLLISION_FILES)
+    if not is_mesh and (config.voxel is not None or config.faces is not None):
         names = " and ".join(f"`{name}`" for name in ("voxel", "faces") if getattr(config, name) is not None)
         raise HyrfError(
             f"{target}: this is not a mesh, which has voxels and triangles",
-            fix=f"leave out {names}, or use one of {', '.join(kind.ending for kind in MESH_FILES)}",
+            fix=f"leave out {names}, or use one of {', '.join(row.ending for row in (*MESH_FILES, *COLLISION_FILES))}",
         )
     if config.baked and kind is PLAYER_FOLDER:
         raise HyrfError(
@@ -118,7 +122,7 @@ def check_request(kind: FileKind, target: str | os.PathLike[str], config: Export
             fix=f"leave out {names}, or write baked splats into a page with `baked=True`",
         )
     check_package(kind, target)
-    if config.faces is not None:
+    if config.faces is not None or kind in COLLISION_FILES:
         with needs_package(f"{target}: reducing the triangles of a mesh"):
             import_module("fast_simplification")
 

@@ -1,20 +1,23 @@
-"""Export of the surface of a model as a triangle mesh."""
+"""Export of the surface of a model as a triangle mesh, with colours or as a closed shape for physics engines."""
 
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 
+import numpy as np
 import torch
 
 from hyrfpack.atomic import write_atomic
 from hyrfpack.choices import AS_PHOTOGRAPHED, CONSISTENT_EXPOSURE
-from hyrfpack.config.export import ExportConfig
+from hyrfpack.config.export import DEFAULT_COLLISION_FACES, ExportConfig
 from hyrfpack.export.kinds import selection_mask
 from hyrfpack.export.report import ExportReport
 from hyrfpack.export.source import Source
-from hyrfpack.mesh import extract_mesh
+from hyrfpack.mesh import Mesh, extract_mesh
 from hyrfpack.mesh.files import encode_mesh
-from hyrfpack.progress import Progress
+from hyrfpack.mesh.solid import make_proxy
+from hyrfpack.progress import Progress, TaskEvent, part_of_progress
 from hyrfpack.splats.table import FileKind
 
 
@@ -39,6 +42,49 @@ def write_mesh(
     Raises:
         HyrfError: no surface is in view, the voxels are too small, a package is missing, or the file cannot be written.
     """
+    mesh = _extract(loaded, config, config.faces, colored=True, progress=progress)
+    data = encode_mesh(mesh, kind.ending.rpartition(".")[2], loaded.up)
+    written = write_atomic(target, data, overwrite=overwrite)
+    return ExportReport(str(written), len(data), vertices=len(mesh.vertices), faces=len(mesh.faces), voxel=mesh.voxel)
+
+
+def write_collision_mesh(
+    loaded: Source,
+    target: str | os.PathLike[str],
+    kind: FileKind,
+    config: ExportConfig,
+    overwrite: bool,
+    progress: Progress,
+) -> ExportReport:
+    """Extract the surface of a model and write a closed mesh of few triangles, for physics engines.
+
+    Arguments and errors are those of `write_mesh`; `kind` is one of `kinds.COLLISION_FILES`.
+    """
+    mesh = _extract(loaded, config, None, colored=False, progress=part_of_progress(progress, 0, 0.8))
+    progress(TaskEvent("closing the surface", 0.8))
+    count = DEFAULT_COLLISION_FACES if config.faces is None else config.faces
+    proxy = make_proxy(mesh.vertices, mesh.faces, mesh.voxel, count)
+    closed = replace(mesh, vertices=proxy.vertices, faces=proxy.faces)
+    data = encode_mesh(closed, kind.ending.rpartition(".")[2], loaded.up)
+    written = write_atomic(target, data, overwrite=overwrite)
+    return ExportReport(
+        str(written),
+        len(data),
+        vertices=len(proxy.vertices),
+        faces=len(proxy.faces),
+        voxel=mesh.voxel,
+        wall=proxy.wall,
+        surface_to_mesh=_mean_and_95(proxy.surface_distances),
+        mesh_to_surface=_mean_and_95(proxy.proxy_distances),
+    )
+
+
+def _mean_and_95(distances: np.ndarray) -> tuple[float, float]:
+    return float(distances.mean()), float(np.quantile(distances, 0.95))
+
+
+def _extract(loaded: Source, config: ExportConfig, faces: int | None, colored: bool, progress: Progress) -> Mesh:
+    """Extract the surface of the Gaussians that are opaque enough."""
     model = loaded.model
     if config.min_opacity > 0:
         with torch.no_grad():
@@ -46,16 +92,14 @@ def write_mesh(
         positions = model.config.frame.to_world(model.gaussians.positions.detach().numpy())
         keep = selection_mask(positions, opacities, None, config.min_opacity)
         model = model.subset(torch.from_numpy(keep).nonzero()[:, 0])
-    mesh = extract_mesh(
+    return extract_mesh(
         model,
         loaded.fit_cameras,
         loaded.center,
         crop=config.crop,
         voxel=config.voxel,
-        faces=config.faces,
+        faces=faces,
         exposure=CONSISTENT_EXPOSURE if config.exposure == CONSISTENT_EXPOSURE else AS_PHOTOGRAPHED,
+        colored=colored,
         progress=progress,
     )
-    data = encode_mesh(mesh, kind.ending.rpartition(".")[2], loaded.up)
-    written = write_atomic(target, data, overwrite=overwrite)
-    return ExportReport(str(written), len(data), vertices=len(mesh.vertices), faces=len(mesh.faces), voxel=mesh.voxel)

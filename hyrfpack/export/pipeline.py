@@ -16,6 +16,7 @@ from hyrfpack.export.baked_scene import BakedScene, ShownSplats, bake_scene
 from hyrfpack.export.cameras import encode_transforms, write_colmap
 from hyrfpack.export.folder import export_player
 from hyrfpack.export.kinds import (
+    COLLISION_FILES,
     COLMAP_FOLDER,
     HTML_PAGE,
     MESH_FILES,
@@ -27,7 +28,7 @@ from hyrfpack.export.kinds import (
     check_request,
     find_file_kind,
 )
-from hyrfpack.export.meshes import write_mesh
+from hyrfpack.export.meshes import write_collision_mesh, write_mesh
 from hyrfpack.export.pages import encode_baked_page, write_native_page
 from hyrfpack.export.points import encode_points
 from hyrfpack.export.report import ExportReport
@@ -63,6 +64,8 @@ def export_model(
     - no ending: a folder with a player and the file, for a web server (see `hyrfpack.export_player`);
     - .points.ply, .points.glb: the Gaussians' centres as coloured points, and the cameras as frusta;
     - .mesh.glb, .mesh.ply, .obj, .stl: the surface as a triangle mesh with vertex colours (needs scikit-image);
+    - .collision.glb, .collision.obj, .collision.stl: a closed mesh of few triangles, without colours, for physics
+      engines (needs scikit-image and fast-simplification);
     - .json: the cameras as a transforms.json.
 
     The loss is not measured for a cropped scene, nor for an output of only points, only cameras, a mesh or the model
@@ -114,6 +117,8 @@ def export_model(
         with context.open_progress("export") as progress:
             if kind in MESH_FILES:
                 return write_mesh(loaded, target, kind, config, overwrite, progress)
+            if kind in COLLISION_FILES:
+                return write_collision_mesh(loaded, target, kind, config, overwrite, progress)
             return _export_gaussians(loaded, Path(target), kind, config, overwrite, progress)
 
 

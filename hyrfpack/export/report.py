@@ -31,6 +31,9 @@ class ExportReport:
         cameras: number of cameras in a file of points or of cameras.
         vertices, faces: number of vertices and of triangles of a mesh.
         voxel: side of the voxels in which a mesh was fused, world units; None for other files.
+        wall: thickness of the walls of a closed mesh for physics engines, world units; None for other files.
+        surface_to_mesh, mesh_to_surface: distances from the surface of the model to such a mesh, and from the mesh to
+            the surface: mean and 95th percentile, world units. Half of the mesh is the back of walls.
     """
 
     file: str
@@ -52,3 +55,6 @@ class ExportReport:
     vertices: int = 0
     faces: int = 0
     voxel: float | None = None
+    wall: float | None = None
+    surface_to_mesh: tuple[float, float] | None = None
+    mesh_to_surface: tuple[float, float] | None = None

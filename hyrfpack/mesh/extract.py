@@ -37,7 +37,7 @@ class Mesh:
     Attributes:
         vertices: (V, 3) float64 positions, world units.
         faces: (F, 3) int64 vertices of each triangle, counter-clockwise seen from outside.
-        colors: (V, 3) uint8 sRGB.
+        colors: (V, 3) uint8 sRGB; None for the shape alone.
         voxel: side of the voxels of the fusion, world units.
         truncation: truncation of the signed distance, world units.
         maps: number of depth maps that were fused.
@@ -45,7 +45,7 @@ class Mesh:
 
     vertices: np.ndarray
     faces: np.ndarray
-    colors: np.ndarray
+    colors: np.ndarray | None
     voxel: float
     truncation: float
     maps: int
@@ -60,6 +60,7 @@ def extract_mesh(
     voxel: float | None = None,
     faces: int | None = None,
     exposure: str = AS_PHOTOGRAPHED,
+    colored: bool = True,
     progress: Progress = ignore_progress,
 ) -> Mesh:
     """Extract the surface of a model by truncated signed distance fusion of rendered median depths.
@@ -74,6 +75,7 @@ def extract_mesh(
         voxel: side of a voxel in world units; None for the default of `choose_grid`.
         faces: largest number of triangles; None for all.
         exposure: exposure of the colours, as in `RenderSettings`.
+        colored: whether vertices get colours.
         progress: called with `TaskEvent`s.
 
     Raises:
@@ -112,8 +114,10 @@ def extract_mesh(
     if faces is not None:
         progress(TaskEvent("reducing triangles", 0.9))
         vertices, triangles = reduce_faces(vertices, triangles, faces)
-    progress(TaskEvent("colouring the surface", 0.95))
-    colors = _color_vertices(arrays, vertices, COLOR_TOLERANCE_TRUNCATIONS * truncation)
+    colors = None
+    if colored:
+        progress(TaskEvent("colouring the surface", 0.95))
+        colors = _color_vertices(arrays, vertices, COLOR_TOLERANCE_TRUNCATIONS * truncation)
     return Mesh(vertices, triangles, colors, grid.voxel, truncation, len(chosen))
 
 

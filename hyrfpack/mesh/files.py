@@ -17,9 +17,9 @@ def encode_mesh(mesh: Mesh, extension: str, up: np.ndarray) -> bytes:
     """Encode a mesh in the input's axes and units. The same mesh gives the same bytes.
 
     - A .glb has linear vertex colours, normals, and a material without light. Its node turns the mesh upright, and
-      translates it if it lies far from the origin compared to its size.
+      translates it if it lies far from the origin compared to its size. Without colours, it has positions alone.
     - A .ply has sRGB vertex colours, and float64 positions where float32 would be too coarse.
-    - A .obj has sRGB vertex colours after the positions, which most programs read.
+    - A .obj has sRGB vertex colours, if there are any, after the positions, which most programs read.
     - A .stl has no colours, and float32 positions.
 
     Args:
@@ -50,9 +50,13 @@ def _encode_glb(mesh: Mesh, local: np.ndarray, origin: np.ndarray, up: np.ndarra
     place = np.eye(4)
     place[:3, :3] = upright_rotation(up, np.array(GLTF_UP))
     place[:3, 3] = place[:3, :3] @ origin
+    scene = trimesh.Scene()
+    if mesh.colors is None:
+        shape = trimesh.Trimesh(local, mesh.faces, process=False)
+        scene.add_geometry(shape, node_name="mesh", geom_name="mesh", transform=place)
+        return scene.export(file_type="glb", include_normals=False)
     colors = np.round(255 * linear_from_srgb(mesh.colors / 255)).astype(np.uint8)
     shape = trimesh.Trimesh(local, mesh.faces, vertex_colors=colors, process=False)
-    scene = trimesh.Scene()
     scene.add_geometry(shape, node_name="mesh", geom_name="mesh", transform=place)
 
     def make_unlit(tree: dict) -> None:
@@ -65,6 +69,7 @@ def _encode_glb(mesh: Mesh, local: np.ndarray, origin: np.ndarray, up: np.ndarra
 
 
 def _encode_ply(mesh: Mesh, positions: np.ndarray) -> bytes:
+    assert mesh.colors is not None
     number = "float" if positions.dtype == np.float32 else "double"
     vertices = np.empty(len(positions), [("position", positions.dtype.newbyteorder("<"), 3), ("color", "u1", 3)])
     vertices["position"], vertices["color"] = positions, mesh.colors
@@ -78,10 +83,10 @@ def _encode_ply(mesh: Mesh, positions: np.ndarray) -> bytes:
 
 
 def _encode_obj(mesh: Mesh) -> bytes:
-    lines = [
-        f"v {x:.9g} {y:.9g} {z:.9g} {red:.4f} {green:.4f} {blue:.4f}"
-        for (x, y, z), (red, green, blue) in zip(mesh.vertices.tolist(), (mesh.colors / 255).tolist(), strict=True)
-    ]
+    lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in mesh.vertices.tolist()]
+    if mesh.colors is not None:
+        colors = (f" {red:.4f} {green:.4f} {blue:.4f}" for red, green, blue in (mesh.colors / 255).tolist())
+        lines = [line + color for line, color in zip(lines, colors, strict=True)]
     lines += [f"f {a} {b} {c}" for a, b, c in (mesh.faces + 1).tolist()]
     return ("\n".join(lines) + "\n").encode()
 

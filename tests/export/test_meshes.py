@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import io
+import json
 import sys
 
 import numpy as np
 import pytest
 import trimesh
+from commands import succeeded
 from scenes import ring, small_model
 
 import hyrfpack
@@ -123,3 +125,34 @@ def test_a_missing_package_is_named_with_its_extra(module, faces, tmp_path, monk
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(HyrfError, match=r'pip install "hyrfpack\[mesh\]"'):
         hyrfpack.export_model(DEMO_MODEL_FILE, tmp_path / "demo.stl", hyrfpack.ExportConfig(faces=faces))
+
+
+# -- closed meshes for physics engines --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("extension", ["glb", "obj", "stl"])
+def test_a_collision_file_is_closed_upright_and_small(extension, tmp_path):
+    path = tmp_path / f"demo.collision.{extension}"
+    report = hyrfpack.export_model(DEMO_MODEL_FILE, path, hyrfpack.ExportConfig(faces=600))
+    mesh = trimesh.load(path, force="mesh")  # merges vertices at one place, as engines do
+    assert mesh.is_watertight and mesh.is_volume and len(mesh.faces) == report.faces <= 650
+    assert "color" not in str(mesh.visual.kind) and b"COLOR_0" not in path.read_bytes()
+    lowest = mesh.vertices[:, 1 if extension == "glb" else 2].min()
+    assert report.wall is not None and -0.6 - report.wall < lowest < 0.2  # the ground of the scene is at 0
+    assert report.surface_to_mesh is not None and report.surface_to_mesh[0] < report.wall
+    assert report.mesh_to_surface is not None and report.mesh_to_surface[0] < report.wall
+
+
+def test_the_command_prints_the_distances_of_a_collision_file(tmp_path):
+    printed = succeeded("export", DEMO_MODEL_FILE, "-o", tmp_path / "demo.collision.obj").stdout
+    assert "surface to mesh" in printed and "mesh to surface" in printed and "the mesh is closed" in printed
+    report = json.loads(
+        succeeded("export", DEMO_MODEL_FILE, "-o", tmp_path / "b.collision.obj", "--faces", 300, "--json").stdout
+    )
+    assert 0 < report["faces"] <= 330 and len(report["surface_to_mesh"]) == 2
+
+
+def test_a_collision_file_needs_the_package_that_reduces_triangles(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "fast_simplification", None)
+    with pytest.raises(HyrfError, match=r"needs fast-simplification; run 'pip install \"hyrfpack\[mesh\]\"'"):
+        hyrfpack.export_model(DEMO_MODEL_FILE, tmp_path / "demo.collision.glb")
