@@ -76,6 +76,7 @@ def boundary_of_cells(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return corners.astype(float), np.concatenate((np.c_[a, b, c], np.c_[a, c, d]))
 
 
+@settings(deadline=None)
 @given(st.lists(st.booleans(), min_size=27, max_size=27).filter(any))
 def test_cells_that_touch_along_edges_and_corners_are_cut_apart(cells):
     vertices, faces = boundary_of_cells(np.array(cells).reshape(3, 3, 3))
@@ -99,7 +100,7 @@ def test_a_mesh_that_is_manifold_stays_as_it_is():
     assert mesh_of(vertices, faces).volume == pytest.approx(sphere.volume)
 
 
-@settings(max_examples=25)
+@settings(max_examples=25, deadline=None)
 @given(st.integers(0, 1000), st.integers(20, 400))
 def test_thin_solids_stay_closed_after_any_reduction(seed, count):
     generator = np.random.default_rng(seed)

@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import camera_at
+from scipy.spatial.transform import Rotation
 
 from hyrfpack.cameras.capture import Capture
 from hyrfpack.config.render import GeometryConfig
@@ -46,6 +47,7 @@ def angles(normals: np.ndarray, exact: np.ndarray) -> np.ndarray:
 # -- normals from depth -----------------------------------------------------------------------------------------------
 
 
+@settings(deadline=None)
 @given(st.floats(-0.7, 0.7), st.floats(-0.7, 0.7), st.floats(1e-3, 1e6))
 def test_the_normals_of_a_plane_are_exact_up_to_the_border(tilt_x, tilt_y, distance):
     normal = np.array([tilt_x, tilt_y, 1.0]) / np.linalg.norm([tilt_x, tilt_y, 1.0])
@@ -109,12 +111,17 @@ def sheet(normal: np.ndarray, count: int = 4000, half: float = 2.0) -> Gaussians
     )
 
 
-def test_a_sheet_of_discs_has_its_depth_and_normal_in_world_units_and_axes():
-    normal = np.array([0.36, -0.48, 0.8])
-    frame = Frame((10.0, -20.0, 30.0), 7.0, (1.0, 1.0, 1.0))
+@pytest.mark.parametrize(
+    "rotation", [(1.0, 0.0, 0.0, 0.0), (0.8, 0.0, 0.36, 0.48)], ids=["world axes", "rotated frame"]
+)
+def test_a_sheet_of_discs_has_its_depth_and_normal_in_world_units_and_axes(rotation):
+    local_normal = np.array([0.36, -0.48, 0.8])
+    frame = Frame((10.0, -20.0, 30.0), 7.0, (1.0, 1.0, 1.0), rotation)
+    to_world = Rotation.from_quat(rotation, scalar_first=True)
+    normal = to_world.apply(local_normal)
     center = np.array(frame.center)
-    camera = camera_at(center + (4, 3, 14), center, width=48, height=48, focal=90.0)
-    depth, normals = render_surface(sheet(normal, half=1.5), frame, camera, RenderSettings(), True, normals=True)
+    camera = camera_at(center + to_world.apply((4, 3, 14)), center, width=48, height=48, focal=90.0)
+    depth, normals = render_surface(sheet(local_normal, half=1.5), frame, camera, RenderSettings(), True, normals=True)
     in_camera = camera.rotation @ normal
     exact = plane_depth(camera, in_camera, float(in_camera @ (camera.rotation @ (center - camera.position))))
     assert normals is not None and bool((depth > 0).all())
@@ -126,8 +133,8 @@ def test_a_sheet_of_discs_has_its_depth_and_normal_in_world_units_and_axes():
 def test_where_gaussians_are_too_faint_there_is_neither_depth_nor_normal():
     gaussians = sheet(np.array([0.0, 0.0, 1.0]), count=40, half=0.2)
     camera = camera_at((0, 0, 3), up=(0, 1, 0), width=48, height=48, focal=30.0)
-    settings, frame = RenderSettings(), Frame((0.0, 0.0, 0.0), 1.0, (1.0, 1.0, 1.0))
-    depth, normals = render_surface(gaussians, frame, camera, settings, False, normals=True)
+    frame = Frame((0.0, 0.0, 0.0), 1.0, (1.0, 1.0, 1.0))
+    depth, normals = render_surface(gaussians, frame, camera, RenderSettings(), False, normals=True)
     assert normals is not None and 0 < (depth > 0).sum() < depth.numel()
     assert bool((normals[depth == 0] == 0).all()) and bool((normals[depth > 0].norm(dim=-1) > 0.99).all())
 
@@ -136,8 +143,8 @@ def test_round_gaussians_take_their_normals_from_depth():
     gaussians = sheet(np.array([0.0, 0.0, 1.0]))
     gaussians = gaussians._replace(scales=torch.full((len(gaussians.means), 3), 0.1))
     camera = camera_at((1, 0.5, 4), up=(0, 1, 0), width=48, height=48, focal=80.0)
-    settings, frame = RenderSettings(), Frame((0.0, 0.0, 0.0), 1.0, (1.0, 1.0, 1.0))
-    _, normals = render_surface(gaussians, frame, camera, settings, False, normals=True)
+    frame = Frame((0.0, 0.0, 0.0), 1.0, (1.0, 1.0, 1.0))
+    _, normals = render_surface(gaussians, frame, camera, RenderSettings(), False, normals=True)
     assert normals is not None
     assert np.median(angles(normals.numpy(), np.array([0.0, 0.0, 1.0]))) < 10
 
