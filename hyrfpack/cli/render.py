@@ -14,7 +14,7 @@ from hyrfpack.cli.drawing import drawing_options, largest_picture_size, select_v
 from hyrfpack.cli.progress import show_item_progress
 from hyrfpack.cli.settings import settings_options
 from hyrfpack.cli.types import OUTPUT, PATH
-from hyrfpack.config.render import GeometryConfig
+from hyrfpack.config.render import DEFAULT_DEPTH_UNIT, GeometryConfig
 from hyrfpack.outputs import Outputs
 
 if TYPE_CHECKING:
@@ -90,6 +90,8 @@ def render(
     """
     if sum(source is not None for source in (data, cameras, orbit)) > 1:
         raise click.UsageError("--data, --cameras and --orbit each say what to render; give one of them")
+    if depth_unit != DEFAULT_DEPTH_UNIT and depth != "png":
+        raise click.UsageError("--depth-unit is the step of a 16-bit PNG; give it with --depth png")
     from hyrfpack.atomic import write_atomic
     from hyrfpack.cameras.files import cameras_from_json, cameras_to_json
     from hyrfpack.cameras.paths import orbit as orbit_around
@@ -160,4 +162,5 @@ def render(
         print_json({"pictures": [str(path) for path in written], "video": str(video_path) if video_path else None})
     else:
         film = f" and {video_path.name}" if video_path else ""
-        click.echo(f"{output}: {len(written)} pictures{film}, {width} x {height} pixels")
+        kinds = " and ".join(kind for kind, extension in (("depth", depth), ("normals", normals)) if extension)
+        click.echo(f"{output}: {len(written)} pictures{film}, {width} x {height} pixels{kinds and f', with {kinds}'}")

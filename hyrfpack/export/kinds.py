@@ -52,7 +52,7 @@ def find_file_kind(
         other_endings: further endings that the caller accepts, to be named in the error message.
 
     Raises:
-        HyrfError: the ending is none of EXPORT_ENDINGS, or contradicts `colmap`.
+        HyrfError: the ending is none of EXPORT_ENDINGS, contradicts `colmap`, or is ".collision" and another format.
     """
     name = Path(target).name.lower()
     if colmap:
@@ -69,6 +69,11 @@ def find_file_kind(
         )
     for ending, kind in _KINDS_BY_ENDING.items():
         if name.endswith(ending):
+            if Path(name).stem.endswith(".collision") and kind not in COLLISION_FILES:
+                raise HyrfError(
+                    f"{target}: a collision mesh is not written in this format",
+                    fix=f"use {', '.join(row.ending for row in COLLISION_FILES)}",
+                )
             return kind
     if os.path.isdir(target) or not Path(name).suffix:
         return PLAYER_FOLDER

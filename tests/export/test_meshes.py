@@ -152,6 +152,11 @@ def test_the_command_prints_the_distances_of_a_collision_file(tmp_path):
     assert 0 < report["faces"] <= 330 and len(report["surface_to_mesh"]) == 2
 
 
+def test_a_collision_file_of_another_format_is_refused(tmp_path):
+    with pytest.raises(HyrfError, match=r"use \.collision\.glb, \.collision\.obj, \.collision\.stl"):
+        hyrfpack.export_model(DEMO_MODEL_FILE, tmp_path / "demo.collision.ply")
+
+
 def test_a_collision_file_needs_the_package_that_reduces_triangles(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "fast_simplification", None)
     with pytest.raises(HyrfError, match=r"needs fast-simplification; run 'pip install \"hyrfpack\[mesh\]\"'"):

@@ -171,6 +171,16 @@ def test_the_command_writes_geometry_with_the_cameras_that_saw_it(tmp_path):
     assert "of the files to be written are there" in refused(*words)
 
 
-def test_a_word_that_is_no_format_is_refused(tmp_path):
-    result = hyrfpack("render", MODEL_FILE, "-o", tmp_path / "out", "--depth", "jpg")
-    assert result.exit_code == 2 and "'jpg' is not one of 'tiff', 'png', 'exr'" in result.stderr
+@pytest.mark.parametrize(
+    ("options", "problem"),
+    [
+        (("--depth", "jpg"), "'jpg' is not one of 'tiff', 'png', 'exr'"),
+        (("--normals", "tiff"), "'tiff' is not one of 'png', 'exr'"),
+        (("--depth-unit", "0.01"), "give it with --depth png"),
+        (("--depth", "exr", "--depth-unit", "0.01"), "give it with --depth png"),
+        (("--depth", "png", "--depth-unit", "0"), "--depth-unit"),
+    ],
+)
+def test_options_that_make_no_sense_are_refused(options, problem, tmp_path):
+    result = hyrfpack("render", MODEL_FILE, "-o", tmp_path / "out", *options)
+    assert result.exit_code == 2 and problem in result.stderr and not (tmp_path / "out").exists()
