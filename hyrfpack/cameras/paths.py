@@ -23,6 +23,12 @@ MIN_HEADING_MEAN_SQUARE = 0.02
 MIN_ARC_DEGREES = 20.0
 # Cameras have a common direction if the mean of their unit viewing directions is at least this long.
 MIN_COMMON_DIRECTION_LENGTH = 0.9
+# Of cameras that look down, pictures are rotated against each other: the mean of their down axes is at most this long.
+MAX_ROTATED_DOWN_LENGTH = 0.5
+# Cameras lie in a plane if they spread across it by at most this share of their smaller spread along it.
+MAX_PLANE_THICKNESS_RATIO = 0.25
+MIN_PLANE_CAMERAS = 6
+MIN_PLANE_AGREEMENT = math.cos(math.radians(20))  # with the direction opposite to the views
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,6 +152,41 @@ def common_direction(cameras: Sequence[Camera]) -> np.ndarray | None:
     return mean / length if length >= MIN_COMMON_DIRECTION_LENGTH else None
 
 
+def downward_direction(cameras: Sequence[Camera]) -> np.ndarray | None:
+    """Return the (3,) unit direction that cameras of a flight look in, straight down, or None for other cameras.
+
+    They share a viewing direction while their pictures are rotated against each other.
+    """
+    mean_down = np.mean([camera.rotation[1] for camera in cameras], axis=0)
+    return None if np.linalg.norm(mean_down) >= MAX_ROTATED_DOWN_LENGTH else common_direction(cameras)
+
+
+def estimate_up(cameras: Sequence[Camera]) -> tuple[np.ndarray, str]:
+    """Estimate the (3,) unit up direction from at least one camera, and say from what.
+
+    - People hold cameras level, so up is perpendicular to the cameras' right axes, if these determine it.
+    - Cameras that look straight down say where up is only roughly, because their mounts are tilted. If they fly at one
+      height, up is perpendicular to the plane of their positions, otherwise opposite to their views.
+    - Of other cameras, up is the mean of their up axes. A tilt that they all have remains in it.
+    """
+    if (down := downward_direction(cameras)) is not None:
+        normal = _plane_normal(np.array([camera.position for camera in cameras]))
+        if normal is not None and abs(normal @ down) >= MIN_PLANE_AGREEMENT:
+            return -np.sign(normal @ down) * normal, "the plane in which the cameras fly"
+        return -down, "the direction opposite to the cameras' views"
+    rotations = np.array([camera.rotation for camera in cameras])
+    level = _level_axis(rotations)
+    return (_mean_up(rotations), "the mean of the cameras' up axes") if level is None else (level, "the level cameras")
+
+
+def _plane_normal(points: np.ndarray) -> np.ndarray | None:
+    """Return the (3,) unit normal of the plane in which points (N, 3) lie, None if they lie in none."""
+    if len(points) < MIN_PLANE_CAMERAS:
+        return None
+    values, vectors = np.linalg.eigh(np.cov(points.T))
+    return vectors[:, 0] if values[0] <= MAX_PLANE_THICKNESS_RATIO**2 * values[1] else None
+
+
 def orbit(viewpoint: Viewpoint, frames: int) -> list[Camera]:
     """Generate cameras on a circle around a scene, all looking at its centre.
 
@@ -186,14 +227,24 @@ def look_at(position: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndar
 
 def _up_axis(rotations: np.ndarray) -> np.ndarray:
     """Estimate the (3,) unit up direction from (N, 3, 3) camera rotations."""
-    rights, downs, forwards = rotations[:, 0], rotations[:, 1], rotations[:, 2]
-    mean_up = _unit(-downs.sum(axis=0), np.array([0.0, -1.0, 0.0]))
+    level = _level_axis(rotations)
+    return _mean_up(rotations) if level is None else level
+
+
+def _mean_up(rotations: np.ndarray) -> np.ndarray:
+    """Return the (3,) unit mean of the up axes of (N, 3, 3) camera rotations."""
+    return _unit(-rotations[:, 1].sum(axis=0), np.array([0.0, -1.0, 0.0]))
+
+
+def _level_axis(rotations: np.ndarray) -> np.ndarray | None:
+    """Return the (3,) unit up direction of level cameras, None if (N, 3, 3) rotations do not determine it."""
+    rights, forwards = rotations[:, 0], rotations[:, 2]
     # People hold cameras level, so the cameras' right axes lie in a plane, and up is perpendicular to it.
     values, vectors = np.linalg.eigh(rights.T @ rights / len(rights))
     if values[0] > MAX_LEVEL_ROLL_MEAN_SQUARE or values[1] < max(MIN_HEADING_MEAN_SQUARE, 4 * values[0]):
-        return mean_up
+        return None
     level = vectors[:, 0]
-    along = level @ mean_up
+    along = level @ _mean_up(rotations)
     if abs(along) < 0.2:  # the cameras look straight down, so up points from the scene to them
         along = -level @ forwards.mean(axis=0)
     return level if along > 0 else -level

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hyrfpack.cameras.capture import Capture
-from hyrfpack.cameras.paths import Viewpoint, common_direction, look_at, orbit
+from hyrfpack.cameras.paths import Viewpoint, downward_direction, look_at, orbit
 from hyrfpack.cameras.view_sampling import interpolate_views
 from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.evaluate.metrics import provenance_mse
@@ -24,8 +24,8 @@ MIN_CAMERAS_TO_HOLD_OUT = 16
 VIEWS_BETWEEN_PER_CAMERA = 4
 RING_CAMERAS = 24
 RING_HEIGHTS_PER_DISTANCE = (-0.2, 0.0, 0.2)
-# If pictures are rotated against each other, their downward axes cancel, so that the mean axis is shorter than this.
-MIN_MEAN_DOWN_LENGTH = 0.5
+# A stored up direction within 45 degrees of that of cameras that look down was stated, and is kept.
+MIN_STATED_UP_AGREEMENT = math.cos(math.radians(45))
 
 
 @dataclass(frozen=True)
@@ -108,11 +108,11 @@ class Source:
 def _choose_up(cameras: list[Camera], up: np.ndarray) -> np.ndarray:
     """Return the unit vector that points up, also for cameras that look straight down, as those of drones do.
 
-    Such cameras share a forward direction while their pictures are rotated against each other; up is opposite to it.
+    Training stores the up direction of a picture of theirs. A stored direction that is nearly opposite to their views
+    was stated by an edit, and is kept.
     """
-    forward = common_direction(cameras)
-    downward = np.mean([camera.rotation[1] for camera in cameras], axis=0)
-    return up if forward is None or np.linalg.norm(downward) >= MIN_MEAN_DOWN_LENGTH else -forward
+    down = downward_direction(cameras)
+    return up if down is None or -up @ down >= MIN_STATED_UP_AGREEMENT else -down
 
 
 def _make_ring_cameras(viewpoint: Viewpoint, center: np.ndarray, up: np.ndarray) -> list[Camera]:

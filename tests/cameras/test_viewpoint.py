@@ -2,15 +2,18 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from made_up_cameras import cameras
 from scenes import camera_at, ring, shift_cameras
+from scipy.spatial.transform import Rotation
 
 from hyrfpack.cameras.capture import Capture
-from hyrfpack.cameras.paths import Viewpoint, common_direction, orbit
+from hyrfpack.cameras.paths import Viewpoint, common_direction, estimate_up, orbit
+from hyrfpack.scene import Camera
 
 
 @pytest.mark.parametrize("offset", [(0, 0, 0), (1e6, -2e6, 3e5)])
@@ -27,6 +30,60 @@ def test_up_is_the_axis_about_which_cameras_are_level():
     np.testing.assert_allclose(Viewpoint.from_cameras(on_a_part).up, (0, 0, 1), atol=1e-9)
     almost_above = [camera_at((1.7 * math.cos(a), 1.7 * math.sin(a), 9)) for a in np.linspace(0, 2.5, 9)]
     np.testing.assert_allclose(Viewpoint.from_cameras(almost_above).up, (0, 0, 1), atol=1e-9)
+
+
+def turned(cameras: list[Camera], rotation: np.ndarray) -> list[Camera]:
+    """Return cameras of a scene that is rotated about the origin."""
+    poses = [np.block([[c.rotation @ rotation.T, c.camera_from_world[:3, 3:]], [np.eye(4)[3:]]]) for c in cameras]
+    return [replace(camera, camera_from_world=pose) for camera, pose in zip(cameras, poses, strict=True)]
+
+
+def flight(mount_degrees: float, climb: float = 0.0, rows: int = 4) -> list[Camera]:
+    """Return cameras that fly to and fro over z = 0 and look down, with a mount that is tilted along their right axes.
+
+    Their tilts to both sides cancel only partly, because the first rows look along x and the last one along -x.
+    """
+    tilt = Rotation.from_euler("y", mount_degrees, degrees=True).as_matrix()
+    cameras = []
+    for row in range(rows):
+        for place in range(5):
+            up = (1, 0, 0) if row % 2 == 0 else (-1, 0, 0)
+            camera = camera_at((place, row, 9 + climb * (place + row)), (place, row, 0), up)
+            pose = camera.camera_from_world.copy()
+            pose[:3] = tilt @ pose[:3]
+            cameras.append(replace(camera, camera_from_world=pose))
+    return cameras
+
+
+ANY_TURN = Rotation.from_rotvec([0.5, -1.2, 2.0]).as_matrix()
+
+
+@pytest.mark.parametrize("turn", [np.eye(3), ANY_TURN], ids=["straight", "turned"])
+def test_up_of_level_cameras_is_perpendicular_to_their_right_axes(turn):
+    up, basis = estimate_up(turned(ring(9, elevation=2.0), turn))
+    np.testing.assert_allclose(up, turn @ (0, 0, 1), atol=1e-9)
+    assert "level" in basis
+
+
+@pytest.mark.parametrize("turn", [np.eye(3), ANY_TURN], ids=["straight", "turned"])
+def test_up_of_a_flight_is_perpendicular_to_it_whatever_its_mount(turn):
+    up, basis = estimate_up(turned(flight(5, rows=3), turn))
+    np.testing.assert_allclose(up, turn @ (0, 0, 1), atol=1e-9)
+    assert "plane" in basis
+
+
+def test_up_of_a_flight_along_a_line_is_opposite_to_its_views():
+    cameras = [camera_at((k, 0, 9), (k, 0, 0), (-1) ** k * np.array([1.0, 0, 0])) for k in range(8)]
+    up, basis = estimate_up(cameras)
+    np.testing.assert_allclose(up, (0, 0, 1), atol=1e-9)
+    assert "views" in basis
+
+
+def test_up_of_cameras_on_a_drive_is_the_mean_of_their_up_axes():
+    cameras = [camera_at((0, k, 0), (0, k + 1, 0.1 if k % 2 else -0.1)) for k in range(10)]  # pitch up and down
+    up, basis = estimate_up(cameras)
+    np.testing.assert_allclose(up, (0, 0, 1), atol=1e-9)
+    assert "mean" in basis
 
 
 def test_the_viewpoint_converts_to_json():

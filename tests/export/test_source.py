@@ -145,6 +145,11 @@ def test_up_is_opposite_to_the_view_of_cameras_that_look_down_and_turn(write_mod
     cameras = [Camera(32, 32, 30.0, 30.0, 16.0, 16.0, pose) for pose in poses]
     ring_provenance = {"cameras": provenance_cameras(cameras), "viewpoint": Viewpoint.from_cameras(cameras).to_json()}
     assert np.allclose(Source.read(write_model(ring_provenance)).up, (0, 0, 1))
+    # A direction that an edit has stated is kept, unless it contradicts the cameras.
+    for stated, expected in (((0.0, 0.1, 1.0), (0, 0.1, 1.0)), ((0.0, 1.0, 0.0), (0, 0, 1)), ((0, 0, -1), (0, 0, 1))):
+        ring_provenance["viewpoint"]["up"] = stated
+        assert np.allclose(Source.read(write_model(ring_provenance)).up, np.array(expected) / np.linalg.norm(expected))
+    ring_provenance["viewpoint"] = Viewpoint.from_cameras(cameras).to_json()
     # With equal orientation the plane may as well be a wall.
     ring_provenance["cameras"] = provenance_cameras(cameras[::2])
     assert np.allclose(abs(Source.read(write_model(ring_provenance)).up), (0, 1, 0))

@@ -16,6 +16,7 @@ const RIGID_TOLERANCE = 1e-3;
 // Their pictures are rotated against each other if the mean of their down axes is shorter than MAX_MEAN_DOWN_LENGTH.
 const MIN_MEAN_FORWARD_LENGTH = 0.9;
 const MAX_MEAN_DOWN_LENGTH = 0.5;
+const MIN_STATED_UP_AGREEMENT = Math.cos(Math.PI / 4); // a stored direction that agrees so far with theirs is kept
 
 /**
  * A pinhole camera as files store it: OpenCV axes, pixels, world units.
@@ -243,7 +244,7 @@ function ringCameras(viewpoint, up) {
 
 /**
  * Estimates the up direction. If cameras have similar viewing directions but rotated pictures, as those of drones that
- * look down, up is opposite to their viewing direction.
+ * look down, up is opposite to their viewing direction, unless an edit has stated nearly that direction.
  * @param {Camera[]} cameras
  * @param {number[]} up the direction for all other cameras
  * @returns {number[]} a unit vector
@@ -254,8 +255,9 @@ function estimateUp(cameras, up) {
     return mul(sum, 1 / cameras.length);
   };
   const forward = mean(2), agreement = Math.hypot(...forward);
-  const keepsUp = agreement < MIN_MEAN_FORWARD_LENGTH || Math.hypot(...mean(1)) >= MAX_MEAN_DOWN_LENGTH;
-  return keepsUp ? up : mul(forward, -1 / agreement);
+  if (agreement < MIN_MEAN_FORWARD_LENGTH || Math.hypot(...mean(1)) >= MAX_MEAN_DOWN_LENGTH) return up;
+  const above = mul(forward, -1 / agreement);
+  return dot(up, above) >= MIN_STATED_UP_AGREEMENT ? up : above;
 }
 
 /**

@@ -62,6 +62,10 @@ VALID_PROVENANCES = {
     "few": provenance_of_cameras(ring(3)),
     "one": provenance_of_cameras([camera_at((0, -3, 1))]),
     "drone": provenance_of_cameras(drone_cameras(14)),
+    "drone with a stated direction": {
+        **provenance_of_cameras(drone_cameras(14)),
+        "viewpoint": {**provenance_of_cameras(drone_cameras(14))["viewpoint"], "up": [0.1, 0.0, 2.0]},
+    },
     "cameras alone": {"cameras": provenance_of_cameras(ring(30))["cameras"]},
     "viewpoint alone": {"viewpoint": provenance_of_cameras(ring(30))["viewpoint"]},
     "viewpoint of an arc": {
