@@ -18,10 +18,11 @@ from hyrfpack.cli.common import (
     resolve_model_file,
     scene_options,
 )
-from hyrfpack.cli.types import BOX, OUTPUT, PATH, Numbers
+from hyrfpack.cli.types import BOX, OUTPUT, PATH, Numbers, NumbersOrWord
 from hyrfpack.config.compress import PROFILES
 from hyrfpack.config.edit import (
     DEFAULT_MIN_OPACITY_SHARE,
+    UPRIGHT_AXES,
     Action,
     Background,
     Center,
@@ -30,19 +31,23 @@ from hyrfpack.config.edit import (
     CropCameras,
     CropMasks,
     CropSphere,
+    EstimateUp,
     KeepGaussians,
     MaxScale,
     MinOpacity,
     Remove,
     RemoveFloaters,
+    Rotate,
     Scale,
     Translate,
     Up,
+    Upright,
 )
 
 if TYPE_CHECKING:
     from hyrfpack.edit import EditReport
 
+AUTO = "auto"
 _ORDER_KEY = "hyrfpack.cli.edit.order"
 
 
@@ -66,7 +71,9 @@ _ACTION_BY_OPTION: dict[str, Callable[[Any], Action]] = {
     "background_color": Background,
     "translate": Translate,
     "scale": Scale,
-    "up": Up,
+    "rotate": lambda numbers: Rotate(tuple(numbers[:3]), numbers[3]),
+    "up": lambda direction: EstimateUp() if direction == AUTO else Up(direction),
+    "upright": Upright,
     "center": lambda _: Center(),
 }
 
@@ -141,9 +148,25 @@ class _OrderedCommand(click.Command):
 )
 @click.option("--translate", type=Numbers(3, "X,Y,Z"), multiple=True, help="Move the scene.")
 @click.option("--scale", type=float, multiple=True, metavar="FACTOR", help="Scale the scene about the origin.")
+@click.option(
+    "--rotate",
+    type=Numbers(4, "X,Y,Z,DEGREES"),
+    multiple=True,
+    help="Rotate the scene about the axis X,Y,Z through the origin, by the right-hand rule.",
+)
 @click.option("--center", count=True, help="Move the point that the cameras look at to the origin.")
 @click.option(
-    "--up", type=Numbers(3, "X,Y,Z"), multiple=True, help="State which direction is up, for viewers and exports."
+    "--up",
+    type=NumbersOrWord(3, "X,Y,Z", AUTO),
+    multiple=True,
+    help="State which direction is up, for viewers, exports and --upright; auto estimates it from the cameras.",
+)
+@click.option(
+    "--upright",
+    type=click.Choice(UPRIGHT_AXES),
+    multiple=True,
+    help="Rotate the scene about the origin so that its up direction becomes +y, as in three.js, Unity and glTF, or "
+    "+z, as in Blender, Unreal and CAD.",
 )
 @click.option("--profile", type=click.Choice(PROFILES), help="Profile of the file to write.  [default: that of MODEL]")
 @click.option(
@@ -184,6 +207,7 @@ def edit(
       hyrfpack edit survey.hyrf -o plot.hyrf --crop-polygon plot.json
       hyrfpack edit room.hyrf -o hole.hyrf --crop-box=-1,-1,-1,1,1,1 --invert
       hyrfpack edit survey.hyrf -o meters.hyrf --scale 2.54
+      hyrfpack edit bonsai.hyrf -o upright.hyrf --up auto --upright z --center
     """
     actions = _read_actions(ctx.meta[_ORDER_KEY], values)
     if plan == (output is not None):

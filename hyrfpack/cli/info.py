@@ -134,6 +134,8 @@ def _print_model_facts(file: Path, facts: dict) -> None:
     center = ", ".join(f"{value:.4g}" for value in frame["center"])
     half = " x ".join(f"{2.0 * value * frame['scale']:.4g}" for value in frame["half_extent"])
     print_line(f"  {'box':<18}  {half} around ({center}), world units")
+    if rotation := frame.get("rotation"):
+        print_line(f"  {'rotation':<18}  {', '.join(f'{value:.6g}' for value in rotation)} (wxyz)")
     for name in ("geometry", "radiance"):
         print_line(f"  {name + ' grid':<18}  {_format_settings(config[name])}")
     if (exposure := facts["exposure"]) is not None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -81,6 +82,17 @@ class Numbers(click.ParamType):
         if len(numbers) != self._count or not all(map(math.isfinite, numbers)):
             self.fail(f"'{value}' is not {self._count} numbers; write it as {self._form}", param, ctx)
         return numbers
+
+
+class NumbersOrWord(Numbers):
+    """Numbers as in `Numbers`, or one word, which is returned as it is."""
+
+    def __init__(self, count: int, form: str, word: str) -> None:
+        super().__init__(count, f"{form}|{word}")
+        self._word = word
+
+    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        return value if value == self._word else super().convert(value, param, ctx)
 
 
 class _HarmonicsDegree(click.ParamType):

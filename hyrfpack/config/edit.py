@@ -15,7 +15,14 @@ Vector = tuple[float, float, float]
 DEFAULT_MIN_OPACITY_SHARE = 0.35
 DEFAULT_MIN_LIGHT_SHARE = 0.5
 MIN_POLYGON_POINTS, MAX_POLYGON_POINTS = 3, 10_000
+UPRIGHT_AXES = ("y", "z")
 MIN_MARGIN = -0.99  # a hull of no size would keep nothing
+
+
+def _check_direction(name: str, values: Sequence[float]) -> None:
+    _check_vector(name, values)
+    if not any(values):
+        raise ValueError(f"{name} is (0, 0, 0); it must have a length")
 
 
 def _check_vector(name: str, values: Sequence[float], *, may_be_infinite: bool = False) -> None:
@@ -287,6 +294,44 @@ class Scale:
 
 
 @dataclass(frozen=True)
+class Rotate:
+    """Rotate the scene about an axis through the origin, by the right-hand rule.
+
+    Attributes:
+        axis: direction of the axis, of any length above 0.
+        degrees: the angle.
+    """
+
+    axis: Vector
+    degrees: float
+
+    def __post_init__(self) -> None:
+        _check_direction("axis", self.axis)
+        check_float("degrees", abs(self.degrees))
+
+    def __str__(self) -> str:
+        return f"rotate by {self.degrees:g} degrees about {_format(self.axis)}"
+
+
+@dataclass(frozen=True)
+class Upright:
+    """Rotate the scene about the origin so that its up direction becomes a coordinate axis.
+
+    Attributes:
+        axis: "y" or "z", the axis that points up afterwards.
+    """
+
+    axis: str
+
+    def __post_init__(self) -> None:
+        if self.axis not in UPRIGHT_AXES:
+            raise ValueError(f"axis is {self.axis!r}; it must be {' or '.join(map(repr, UPRIGHT_AXES))}")
+
+    def __str__(self) -> str:
+        return f"turn upright, with +{self.axis} up"
+
+
+@dataclass(frozen=True)
 class Center:
     """Move the scene so that the point that its cameras look at becomes the origin."""
 
@@ -305,12 +350,18 @@ class Up:
     direction: Vector
 
     def __post_init__(self) -> None:
-        _check_vector("direction", self.direction)
-        if not any(self.direction):
-            raise ValueError("direction is (0, 0, 0); it must have a length")
+        _check_direction("direction", self.direction)
 
     def __str__(self) -> str:
         return f"take {_format(self.direction)} as up"
+
+
+@dataclass(frozen=True)
+class EstimateUp:
+    """State which direction is up, as `Up`, by an estimate from the cameras."""
+
+    def __str__(self) -> str:
+        return "estimate up from the cameras"
 
 
 Action = (
@@ -323,8 +374,11 @@ Action = (
     | Background
     | Translate
     | Scale
+    | Rotate
+    | Upright
     | Center
     | Up
+    | EstimateUp
 )
 
 

@@ -13,14 +13,15 @@ import torch
 from torch import Tensor
 
 from hyrfpack.cameras.capture import Capture
+from hyrfpack.cameras.paths import estimate_up
 from hyrfpack.checks import check_type
 from hyrfpack.compress import compress_model
 from hyrfpack.config.compress import CompressConfig
-from hyrfpack.config.edit import Action, Background, Center, Scale, Translate, Up
+from hyrfpack.config.edit import Action, Background, Center, EstimateUp, Rotate, Scale, Translate, Up, Upright
 from hyrfpack.context import RunContext
 from hyrfpack.edit.select import keep_mask
 from hyrfpack.edit.state import EditState
-from hyrfpack.edit.transform import Placement, replace_config
+from hyrfpack.edit.transform import Placement, replace_config, unit_vector
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import evaluate_model
 from hyrfpack.evaluate.figures import draw_comparison
@@ -34,6 +35,7 @@ from hyrfpack.progress import Progress, TaskEvent, part_of_progress
 from hyrfpack.render import render_view
 from hyrfpack.render.files import save_picture
 from hyrfpack.scene import Camera, Scene, evenly_spaced
+from hyrfpack.splats.placement import upright_rotation
 
 MAX_COMPARED_VIEWS = 8
 PICTURE_ENDINGS = (".png", ".jpg")
@@ -219,34 +221,39 @@ def _apply(path: Path, actions: Sequence[Action], data: Scene | None, progress: 
     if not len(model):
         raise HyrfError(f"{path}: there is no Gaussian in it, so there is nothing to edit", fix="train it again")
     capture = Capture(facts)
+    if capture.is_synthetic and not data and any(isinstance(action, EstimateUp) for action in actions):
+        raise HyrfError(
+            f"{path}: it keeps no cameras, from which up could be estimated", fix="state the direction, or name `data`"
+        )
     viewpoint = capture.viewpoint
     photos = [] if data is None else list(data.train)
     before = EditState(model, capture.cameras, viewpoint.center, viewpoint.up, photos, Placement(), progress)
     after, reports = before, []
     for action in actions:
         count = len(after.model)
-        after = _apply_action(action, after)
-        reports.append(ActionReport(str(action), count, len(after.model)))
+        after, description = _apply_action(action, after)
+        reports.append(ActionReport(description, count, len(after.model)))
     if not after.placement.is_identity:
         provenance = after.placement.move_provenance(provenance)
-    if any(isinstance(action, Up) for action in actions):
+    if any(isinstance(action, Up | EstimateUp) for action in actions):
         camera = after.placement.move_camera(viewpoint.camera)
         turned = replace(viewpoint, center=after.center, up=after.up, camera=camera)
         provenance = {**provenance, "viewpoint": turned.to_json()}
     return _Edit(path, facts["profile"], before, after, reports, provenance)
 
 
-def _apply_action(action: Action, state: EditState) -> EditState:
-    if isinstance(action, Background):
-        return replace(state, model=replace_config(state.model, background=False, solid=action.color))
-    if isinstance(action, Translate):
-        return state.move(Placement.translation(action.offset))
-    if isinstance(action, Scale):
-        return state.move(Placement(action.factor))
-    if isinstance(action, Center):
-        return state.move(Placement.translation(-state.center))
+def _apply_action(action: Action, state: EditState) -> tuple[EditState, str]:
+    """Apply one action; return the scene after it, and what was done in words."""
+    if isinstance(action, EstimateUp):
+        up, basis = estimate_up([view.camera for view in state.photos] or state.cameras)
+        x, y, z = (up.round(4) + 0.0).tolist()  # adding 0.0 turns -0.0 into 0.0
+        return replace(state, up=up), f"{Up((x, y, z))}, estimated from {basis}"
     if isinstance(action, Up):
-        return replace(state, up=np.array(action.direction) / np.linalg.norm(action.direction))
+        return replace(state, up=unit_vector(action.direction)), str(action)
+    if isinstance(action, Background):
+        return replace(state, model=replace_config(state.model, background=False, solid=action.color)), str(action)
+    if (step := _find_move(action, state)) is not None:
+        return state.move(step), str(action)
     keep = keep_mask(action, state)
     if not keep.any():
         positions = state.world_positions()
@@ -256,7 +263,22 @@ def _apply_action(action: Action, state: EditState) -> EditState:
             fix="change its numbers",
         )
     kept = state.model.subset(torch.from_numpy(np.flatnonzero(keep)))
-    return replace(state, model=kept.requires_grad_(False))
+    return replace(state, model=kept.requires_grad_(False)), str(action)
+
+
+def _find_move(action: Action, state: EditState) -> Placement | None:
+    """Return the map of world positions that an action applies, None if it moves nothing."""
+    if isinstance(action, Translate):
+        return Placement.translation(action.offset)
+    if isinstance(action, Scale):
+        return Placement(action.factor)
+    if isinstance(action, Rotate):
+        return Placement.rotation_about_axis(action.axis, action.degrees)
+    if isinstance(action, Upright):
+        return Placement(rotation=upright_rotation(unit_vector(state.up), np.eye(3)["xyz".index(action.axis)]))
+    if isinstance(action, Center):
+        return Placement.translation(-state.center)
+    return None
 
 
 def _write(

@@ -44,7 +44,7 @@ class Placement:
     @classmethod
     def rotation_about_axis(cls, axis: Sequence[float] | np.ndarray, degrees: float) -> Placement:
         """Return the right-handed rotation about an axis (3,) of any length above 0 through the origin."""
-        x, y, z = np.sin(np.radians(degrees) / 2) * np.asarray(axis, np.float64) / np.linalg.norm(axis)
+        x, y, z = math.sin(math.radians(degrees) / 2) * unit_vector(axis)
         return cls(rotation=rotation_matrix((math.cos(math.radians(degrees) / 2), x, y, z)))
 
     def then(self, step: Placement) -> Placement:
@@ -102,6 +102,12 @@ class Placement:
             up=self.move_direction(viewpoint.up),
             camera=self.move_camera(viewpoint.camera),
         ).to_json()
+
+
+def unit_vector(vector: Sequence[float] | np.ndarray) -> np.ndarray:
+    """Scale a vector (3,) of any length above 0 to unit length."""
+    scaled = np.asarray(vector, np.float64) / np.abs(vector).max()  # so that no square overflows or becomes 0
+    return scaled / np.linalg.norm(scaled)
 
 
 def replace_config(model: HybridModel, **changes: Any) -> HybridModel:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,17 +22,22 @@ from hyrfpack.config.edit import (
     CropBox,
     CropCameras,
     CropSphere,
+    EstimateUp,
     KeepGaussians,
     MaxScale,
     MinOpacity,
     Remove,
+    Rotate,
     Scale,
     Translate,
     Up,
+    Upright,
 )
+from hyrfpack.config.export import ExportConfig
 from hyrfpack.edit import edit_model, plan_edit
 from hyrfpack.edit.transform import Placement
 from hyrfpack.evaluate.metrics import IDENTICAL_PSNR
+from hyrfpack.export import export_model
 from hyrfpack.format import describe_file, load_model, save_model
 from hyrfpack.format.codec import load_with_provenance
 from hyrfpack.format.container import Container
@@ -58,14 +64,18 @@ def rows(positions: np.ndarray) -> set[tuple[float, ...]]:
 
 @pytest.mark.parametrize("file", [COMPACT_FILE, RAW_FILE, MAP_FILE], ids=lambda path: path.stem)
 def test_a_moved_scene_renders_as_before_from_moved_cameras(file, tmp_path):
-    moved = edited(file, tmp_path, Scale(2.5), Translate((300.0, -20.0, 7.0)))
+    turn = Rotation.from_rotvec(np.radians(77) * np.array([2.0, -1.0, 2.0]) / 3).as_matrix()
+    moved = edited(file, tmp_path, Rotate((2.0, -1.0, 2.0), 77), Scale(2.5), Translate((300.0, -20.0, 7.0)))
     before, after = load_model(file), load_model(moved)
     cameras = zip(Capture(describe_file(file)).cameras[:3], Capture(describe_file(moved)).cameras[:3], strict=True)
     for camera, moved_camera in cameras:
         assert_allclose(
-            moved_camera.position, 2.5 * camera.position + (300, -20, 7), atol=0.03
+            moved_camera.position, 2.5 * turn @ camera.position + (300, -20, 7), atol=0.03
         )  # rotations are rounded
-        exact = Placement(2.5, offset=np.array([300.0, -20.0, 7.0])).move_camera(camera)
+        pose = camera.camera_from_world.copy()  # x = R p + t with p = turn^T (p' - offset) / 2.5, and x' = 2.5 x
+        pose[:3, :3] = pose[:3, :3] @ turn.T
+        pose[:3, 3] = 2.5 * pose[:3, 3] - pose[:3, :3] @ (300.0, -20.0, 7.0)
+        exact = replace(camera, camera_from_world=pose)
         pictures = [render_view(model, view).rgb.numpy() for model, view in ((before, camera), (after, exact))]
         assert_allclose(pictures[1], pictures[0], atol=1e-4)
 
@@ -233,6 +243,79 @@ def test_the_up_direction_is_stored_for_viewers_and_exports(tmp_path):
         assert all(bytes(old[name].data) == bytes(new[name].data) for name in old.entries if name != "META")
 
 
+def test_a_rotation_moves_the_viewpoint_and_copies_all_other_sections(tmp_path):
+    turned = edited(COMPACT_FILE, tmp_path, Rotate((0.0, 0.0, 5.0), 90))  # x becomes y, y becomes -x
+    before, after = (Capture(describe_file(path)).viewpoint for path in (COMPACT_FILE, turned))
+    for old, new in ((before.up, after.up), (before.center, after.center)):
+        assert_allclose(new, (-old[1], old[0], old[2]), atol=1e-9)
+    x, y, z = world_positions(COMPACT_FILE).T
+    frame, positions = load_model(turned).config.frame, load_model(turned).gaussians.positions.numpy()
+    assert_allclose(frame.to_world(positions), np.stack((-y, x, z), axis=1), atol=1e-9)
+    with Container.open(COMPACT_FILE) as old, Container.open(turned) as new:
+        assert new.version == (1, 3)
+        assert all(bytes(old[name].data) == bytes(new[name].data) for name in old.entries if name != "META")
+
+
+def test_a_box_after_a_rotation_has_the_new_axes(tmp_path):
+    positions = world_positions(RAW_FILE) @ Rotation.from_euler("x", 30, degrees=True).as_matrix().T
+    low, high = np.quantile(positions, (0.2, 0.8), axis=0)
+    inside = ((positions >= low) & (positions <= high)).all(axis=1).sum()
+    report = plan_edit(RAW_FILE, [Rotate((1.0, 0.0, 0.0), 30), CropBox(tuple(low), tuple(high))], context=QUIET_CONTEXT)
+    assert 0 < inside < len(positions)
+    assert report.actions[1].gaussians_after == pytest.approx(inside, abs=1)
+
+
+def test_turning_back_gives_a_file_of_the_old_version_and_the_same_box(tmp_path):
+    there = edited(COMPACT_FILE, tmp_path, Rotate((1.0, 2.0, 3.0), 40))
+    edit_model(there, tmp_path / "back.hyrf", [Rotate((1.0, 2.0, 3.0), -40)], context=QUIET_CONTEXT)
+    start, back = (describe_file(path) for path in (COMPACT_FILE, tmp_path / "back.hyrf"))
+    assert back["version"] == start["version"] != describe_file(there)["version"]
+    assert back["config"]["frame"].keys() == start["config"]["frame"].keys()
+    assert_allclose(back["config"]["frame"]["center"], start["config"]["frame"]["center"], atol=1e-12)
+
+
+@pytest.mark.parametrize(("axis", "expected"), [("y", (0, 1, 0)), ("z", (0, 0, 1))])
+def test_upright_turns_the_stated_direction_to_an_axis(axis, expected, tmp_path):
+    turned = edited(COMPACT_FILE, tmp_path, Up((0.3, -0.8, 0.1)), Upright(axis))
+    assert_allclose(Capture(describe_file(turned)).viewpoint.up, expected, atol=1e-12)
+    # The Gaussian highest along the stated direction is the highest one along the axis.
+    heights = world_positions(COMPACT_FILE) @ (0.3, -0.8, 0.1)
+    model = load_model(turned)
+    turned_positions = model.config.frame.to_world(model.gaussians.positions.numpy())
+    assert_allclose(turned_positions @ expected, heights / np.linalg.norm((0.3, -0.8, 0.1)), atol=1e-6)
+
+
+@pytest.mark.parametrize(("axis", "upright_by_itself"), [("y", True), ("z", False)])
+def test_a_gltf_of_an_upright_scene_is_not_turned_again(axis, upright_by_itself, tmp_path):
+    turned = edited(COMPACT_FILE, tmp_path, Upright(axis))
+    export_model(turned, tmp_path / "scene.glb", ExportConfig(degree=0, background=False))
+    data = (tmp_path / "scene.glb").read_bytes()
+    content = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+    quat = next(node["rotation"] for node in content["nodes"] if "rotation" in node)  # xyzw
+    assert_allclose(np.abs(quat), (0, 0, 0, 1) if upright_by_itself else (0.5**0.5, 0, 0, 0.5**0.5), atol=1e-6)
+
+
+def test_up_is_estimated_in_the_axes_of_the_rotated_scene(tmp_path):
+    """The demo scene was rendered by level cameras with z up."""
+    turned = edited(RAW_FILE, tmp_path, Rotate((1.0, 0.0, 0.0), 90), EstimateUp())
+    assert_allclose(Capture(describe_file(turned)).viewpoint.up, (0, -1, 0), atol=1e-6)
+
+
+def test_up_cannot_be_estimated_without_cameras(tmp_path):
+    save_model(load_model(RAW_FILE), tmp_path / "bare.hyrf")
+    sentence = refused("edit", tmp_path / "bare.hyrf", "--plan", "--up", "auto")
+    assert "it keeps no cameras, from which up could be estimated" in sentence
+
+
+def test_the_command_turns_a_scene_upright_and_says_how(tmp_path):
+    result = succeeded("edit", RAW_FILE, "-o", tmp_path / "out.hyrf", "--up", "auto", "--upright", "y", "--up", "0,1,0")
+    assert "1) as up, estimated from the level cameras" in result.stdout and "turn upright, with +y up" in result.stdout
+    report = succeeded("edit", RAW_FILE, "--plan", "--rotate", "0,0,1,-90", "--json")
+    assert json.loads(report.stdout)["actions"][0]["action"] == "rotate by -90 degrees about (0, 0, 1)"
+    facts = succeeded("info", tmp_path / "out.hyrf").stdout
+    assert "format 1.3" in facts and "rotation" in facts and "(wxyz)" in facts
+
+
 def test_an_edit_that_leaves_nothing_is_refused_and_writes_nothing(tmp_path):
     sentence = refused("edit", COMPACT_FILE, "-o", tmp_path / "out.hyrf", "--crop-box", "90,90,90,91,91,91")
     assert "would leave no Gaussian; their centres lie between" in sentence
@@ -248,6 +331,10 @@ def test_an_edit_that_leaves_nothing_is_refused_and_writes_nothing(tmp_path):
         (["--plan", "--min-opacity", "2"], "--min-opacity: opacity is 2.0"),
         (["--plan", "--scale", "0"], "--scale: factor is 0"),
         (["--plan", "--up", "0,0,0"], "--up: direction is (0, 0, 0)"),
+        (["--plan", "--up", "down"], "is not 3 numbers; write it as X,Y,Z|auto"),
+        (["--plan", "--rotate", "0,0,0,90"], "--rotate: axis is (0, 0, 0); it must have a length"),
+        (["--plan", "--rotate", "0,0,1"], "is not 4 numbers"),
+        (["--plan", "--upright", "x"], "'x' is not one of 'y', 'z'"),
         (["--plan", "--crop-sphere", "0,0,0"], "is not 4 numbers"),
         (["--plan", "--translate", "nan,0,0"], "is not 3 numbers"),
         (["--plan", "--crop-cameras", "-1"], "--crop-cameras: margin is -1.0"),
