@@ -16,6 +16,7 @@ from scenes import QUIET_CONTEXT, ring
 from scipy.spatial.transform import Rotation
 
 from hyrfpack.cameras.capture import Capture, provenance_cameras
+from hyrfpack.compress import compress_model
 from hyrfpack.config.edit import (
     Background,
     Center,
@@ -272,6 +273,15 @@ def test_turning_back_gives_a_file_of_the_old_version_and_the_same_box(tmp_path)
     assert back["version"] == start["version"] != describe_file(there)["version"]
     assert back["config"]["frame"].keys() == start["config"]["frame"].keys()
     assert_allclose(back["config"]["frame"]["center"], start["config"]["frame"]["center"], atol=1e-12)
+
+
+def test_compression_of_a_rotated_model_stores_the_same_numbers(tmp_path):
+    turned = edited(RAW_FILE, tmp_path, Rotate((1.0, -2.0, 0.5), 100), Scale(1.7), Translate((3.0, -2.0, 40.0)))
+    for source, name in ((RAW_FILE, "before"), (turned, "after")):
+        compress_model(source, tmp_path / f"{name}.hyrf", context=QUIET_CONTEXT)
+    with Container.open(tmp_path / "before.hyrf") as before, Container.open(tmp_path / "after.hyrf") as after:
+        assert list(before.entries) == list(after.entries)
+        assert all(bytes(before[name].data) == bytes(after[name].data) for name in before.entries if name != "META")
 
 
 @pytest.mark.parametrize(("axis", "expected"), [("y", (0, 1, 0)), ("z", (0, 0, 1))])

@@ -6,6 +6,7 @@ import io
 import json
 import shutil
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import pytest
 import torch
 from PIL import Image
 from scenes import ball_points, ring, small_model
+from scipy.spatial.transform import Rotation
 from web.fields.test_harmonics import fit_in_node
 from web.scripts import run_script
 from web.served import serve_project
@@ -21,6 +23,7 @@ from web.served import serve_project
 import hyrfpack
 from hyrfpack.cameras.capture import provenance_cameras
 from hyrfpack.cameras.paths import Viewpoint
+from hyrfpack.edit.transform import replace_config
 from hyrfpack.evaluate.metrics import psnr
 from hyrfpack.model import Frame, HybridModel
 from hyrfpack.render import render_view
@@ -110,6 +113,17 @@ def test_a_loaded_file_has_the_fitted_splats(app_folder: Path, tmp_path: Path, d
         read = (packed.reshape(len(splats), -1)[:, : wanted.shape[1]] - 128) / 128
         np.testing.assert_allclose(read, np.clip(wanted, -1, 1), atol=1 / 127)
     assert facts["count"] == 1200
+
+
+def test_splats_and_camera_of_a_rotated_model_are_in_the_axes_of_the_world(app_folder: Path, tmp_path: Path) -> None:
+    model, quat = make_model(40), (0.5, -0.1, 0.7, 0.5)
+    rotated = replace_config(model, frame=replace(model.config.frame, rotation=quat))
+    found = describe_in_node(app_folder, save_model(rotated, tmp_path / "scene.hyrf"), 0)
+
+    turn = Rotation.from_quat([*quat[1:], quat[0]]).as_matrix()
+    local = model.gaussians.positions.detach().double().numpy()
+    np.testing.assert_allclose(found["places"], MODEL_CENTER + MODEL_SCALE * local @ turn.T, atol=1e-4)
+    np.testing.assert_allclose(found["eye"], cameras_around_model(10)[0].position, rtol=1e-5)
 
 
 def test_the_camera_of_three_is_the_first_camera_of_the_file(app_folder: Path, tmp_path: Path) -> None:
