@@ -23,6 +23,7 @@ from hyrfpack.evaluate.lpips import LPIPS
 from hyrfpack.evaluate.metrics import psnr, ssim, to_8bit
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.model import HybridModel
+from hyrfpack.model.merged import MergedModel
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.progress import Progress, TaskEvent, ignore_progress
 from hyrfpack.render import RenderSettings, apply_exposure_map, render_view
@@ -89,7 +90,7 @@ class Evaluation:
 
 @torch.no_grad()
 def evaluate_model(
-    model: HybridModel | Drawable,
+    model: HybridModel | MergedModel | Drawable,
     views: Sequence[View],
     *,
     lpips_weights: str | os.PathLike[str] | None = None,
@@ -108,7 +109,7 @@ def evaluate_model(
     pixels are ignored.
 
     Args:
-        model: the model to score, or splats prepared for rendering (`hyrfpack.splats.draw.Drawable`).
+        model: the model or merged model to score, or splats prepared for rendering (`hyrfpack.splats.draw.Drawable`).
         views: photos to compare with, which were not used in training.
         lpips_weights: path of the LPIPS weights, see `hyrfpack.evaluate.lpips`; without it lpips is None.
         settings: render settings, including the exposure.
@@ -132,7 +133,7 @@ def evaluate_model(
         >>> len(scores.views), scores.psnr > 10, scores.lpips is None
         (2, True, True)
     """
-    if not isinstance(model, Drawable):
+    if not isinstance(model, (Drawable, MergedModel)):
         check_type("model", model, HybridModel)
     check_type("settings", settings, RenderSettings)
     for view in views if isinstance(views, Sequence) else [views]:
@@ -143,8 +144,8 @@ def evaluate_model(
     if isinstance(model, Drawable):
         solid, device, count = np.zeros(3, np.float32), model.device, len(model.positions)
     else:
-        solid, device = np.array(model.config.solid, dtype=np.float32), model.gaussians.positions.device
-        count = len(model)
+        scene, count = model.scene if isinstance(model, MergedModel) else model, len(model)
+        solid, device = np.array(scene.config.solid, dtype=np.float32), scene.gaussians.positions.device
     pictures_to_write = picture_names(views, picture_count)
 
     def score_own_views() -> list[tuple[int, ViewScore | None, float]]:
@@ -209,15 +210,18 @@ def evaluate_model(
 
 
 def _color_renderer(
-    model: HybridModel | Drawable, settings: RenderSettings
+    model: HybridModel | MergedModel | Drawable, settings: RenderSettings
 ) -> Callable[[Camera], tuple[torch.Tensor, torch.Tensor | None]]:
     """Return a function that renders a camera: (H, W, 3) as `settings` ask, and (H, W, 3) at the consistent exposure.
 
-    The second is None for splats and for models without an exposure map. Everything that does not depend on the view
-    is decoded once.
+    The second is None for splats, merged models and models without an exposure map. Everything that does not depend on
+    the view is decoded once.
     """
     if isinstance(model, Drawable):
         return lambda camera: (draw(model, camera, settings).rgb, None)
+    if isinstance(model, MergedModel):
+        parts = model.decode()
+        return lambda camera: (render_view(model, camera, settings, decoded=parts).rgb, None)
     decoded, at_one_exposure = model.decode(), replace(settings, exposure=CONSISTENT_EXPOSURE)
 
     def draw_colors(camera: Camera) -> tuple[torch.Tensor, torch.Tensor | None]:

@@ -30,7 +30,7 @@ def apply_exposure_gains(image: Tensor, gains: Tensor) -> Tensor:
 
     Args:
         image: (..., 3) in [0, 1].
-        gains: (3,) positive.
+        gains: (3,) or (..., 3), positive.
 
     Returns:
         (..., 3) in [0, 1]. Differentiable in both.

@@ -17,16 +17,18 @@ from hyrfpack.config.render import GeometryConfig
 from hyrfpack.errors import HyrfError
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.model import HybridModel
+from hyrfpack.model.merged import MergedModel
 from hyrfpack.outputs import PICTURE_SUFFIXES
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.render.geometry_files import GeometryWriter
+from hyrfpack.render.parts import camera_frame, gather_parts
 from hyrfpack.render.renderer import RenderedPicture, RenderSettings, render_view
 from hyrfpack.render.surface import render_surface, widened_gaussians
 from hyrfpack.scene import Camera
 
 
 def render_files(
-    model: HybridModel,
+    model: HybridModel | MergedModel,
     cameras: Sequence[tuple[str, Camera]],
     folder: str | os.PathLike[str],
     *,
@@ -64,7 +66,7 @@ def render_files(
 
 
 def make_renderer(
-    model: HybridModel,
+    model: HybridModel | MergedModel,
     *,
     geometry: GeometryConfig = GeometryConfig(),  # noqa: B008 - frozen
     settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
@@ -72,13 +74,18 @@ def make_renderer(
     """Decode a model once, and return a function that renders it with the geometry that is wanted."""
     with torch.no_grad():
         decoded = model.decode()
-    frame, antialiased = model.config.frame, model.config.antialiased
+    antialiased = (model.scene if isinstance(model, MergedModel) else model).config.antialiased
 
     def draw(camera: Camera) -> RenderedPicture:
         rendering = render_view(model, camera, settings, decoded=decoded)
         if not geometry.is_wanted:
             return RenderedPicture(rendering.rgb)
-        gaussians = widened_gaussians(model, camera, decoded, rendering.indices[rendering.visible])
+        if isinstance(model, MergedModel):
+            frame = camera_frame(model, camera)
+            _, gaussians, _ = gather_parts(model, camera, settings.near, settings.cull_tolerance, decoded)
+        else:
+            frame = model.config.frame
+            gaussians = widened_gaussians(model, camera, decoded, rendering.indices[rendering.visible])
         surface = render_surface(gaussians, frame, camera, settings, antialiased, normals=geometry.normals is not None)
         return RenderedPicture(rendering.rgb, *surface)
 

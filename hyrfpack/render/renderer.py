@@ -15,8 +15,8 @@ from hyrfpack.checks import check_choice, check_float, check_int, check_type
 from hyrfpack.choices import AS_PHOTOGRAPHED, RENDER_EXPOSURES
 from hyrfpack.errors import HyrfError
 from hyrfpack.model import Decoded, HybridModel
-from hyrfpack.model.exposure import apply_exposure_gains
 from hyrfpack.model.gaussians import take_rows
+from hyrfpack.model.merged import MergedModel
 from hyrfpack.ops.composite import composite
 from hyrfpack.ops.finite import all_finite
 from hyrfpack.ops.poses import camera_center
@@ -26,6 +26,8 @@ from hyrfpack.ops.rasterize.inputs import LOW_PASS_VARIANCE, TRANSMITTANCE_MIN
 from hyrfpack.ops.shade import Shading
 from hyrfpack.ops.transfer import tensor_like
 from hyrfpack.parallel.pool import torch_on_one_thread
+from hyrfpack.render.exposure import apply_exposure_map
+from hyrfpack.render.parts import camera_frame, expose_parts, gather_parts
 from hyrfpack.render.sampling import background_stride, widen_to_photos
 from hyrfpack.scene import Camera
 
@@ -121,7 +123,7 @@ class RenderedPicture:
 
 @torch_on_one_thread()
 def render_view(
-    model: HybridModel,
+    model: HybridModel | MergedModel,
     camera: Camera,
     settings: RenderSettings = RenderSettings(),
     *,
@@ -134,7 +136,7 @@ def render_view(
     """Render one view; differentiable in the model's parameters.
 
     Args:
-        model: the model to render.
+        model: the model to render. Each part of a merged model has its own exposure.
         camera: the camera, in world units.
         settings: render settings.
         decoded: result of `model.decode()`. It does not depend on the view, so callers who render many views of an
@@ -156,33 +158,41 @@ def render_view(
         >>> hyrfpack.render_view(model, camera).rgb.shape
         torch.Size([48, 48, 3])
     """
-    check_type("model", model, HybridModel)
+    if not isinstance(model, MergedModel):
+        check_type("model", model, HybridModel)
     check_type("camera", camera, Camera)
     check_type("settings", settings, RenderSettings)
     seconds: dict[str, float] = {}
-    positions = model.gaussians.positions
-    viewport = model.config.frame.local_viewport(camera, positions.dtype)
+    scene = model.scene if isinstance(model, MergedModel) else model
+    positions = scene.gaussians.positions
+    viewport = scene.config.frame.local_viewport(camera, positions.dtype)
     _check_finite(pose=viewport.pose)
+    colors: Tensor | Shading
     try:
-        index, gaussians, colors = _select_gaussians(model, viewport, settings, decoded, seconds)
-        if (sizes := model.gaussians.pixel_sizes) is not None:
-            gaussians = widen_to_photos(gaussians, sizes[index], viewport, antialiased=model.config.antialiased)
+        if isinstance(model, MergedModel):
+            raster_viewport = camera_frame(model, camera).local_viewport(camera, positions.dtype)
+            index, gaussians, colors = gather_parts(model, camera, settings.near, settings.cull_tolerance, decoded)
+        else:
+            raster_viewport = viewport
+            index, gaussians, colors = _select_gaussians(model, viewport, settings, decoded, seconds)
+            if (sizes := model.gaussians.pixel_sizes) is not None:
+                gaussians = widen_to_photos(gaussians, sizes[index], viewport, antialiased=model.config.antialiased)
         gradients = positions.new_zeros(len(index), 2) if absgrad else None
-        raster_settings = settings.raster_settings(model.config.antialiased, depth)
-        raster = rasterize(gaussians, colors, viewport, raster_settings, absgrad=gradients)
+        raster_settings = settings.raster_settings(scene.config.antialiased, depth)
+        raster = rasterize(gaussians, colors, raster_viewport, raster_settings, absgrad=gradients)
     except FloatingPointError:
         raise _nonfinite_error("positions") from None
     if raster.nonfinite:
         raise _nonfinite_error(raster.nonfinite[0])
     seconds.update(raster.seconds)
     with _record_seconds(seconds, "background"):
-        if model.config.background and background:
+        if scene.config.background and background:
             light, threshold = raster.transmittance, settings.background_threshold
-            stride = settings.background_stride or background_stride(model.background_spacing, viewport)
-            behind = model.background_grid(light, viewport, threshold=threshold, stride=stride)
+            stride = settings.background_stride or background_stride(scene.background_spacing, viewport)
+            behind = scene.background_grid(light, viewport, threshold=threshold, stride=stride)
             rgb = composite(raster.rgb, light, behind, stride)
         else:
-            behind = tensor_like(model.config.solid, positions) if solid is None else solid
+            behind = tensor_like(scene.config.solid, positions) if solid is None else solid
             rgb = raster.rgb + raster.transmittance[..., None] * behind
         # Each check on a GPU waits for the device. So only the image is checked there, and not even the image in
         # training, where the caller checks the loss.
@@ -190,11 +200,14 @@ def render_view(
         if on_cpu or not rgb.requires_grad:
             _check_finite(background=behind if on_cpu else rgb)
     if settings.exposure == AS_PHOTOGRAPHED:
-        rgb = apply_exposure_map(model, camera, rgb)
+        if isinstance(model, MergedModel):
+            rgb = expose_parts(model, camera, rgb, index, gaussians, raster_viewport, raster_settings)
+        else:
+            rgb = apply_exposure_map(model, camera, rgb)
     return Rendering(
         rgb=rgb,
         alpha=1 - raster.transmittance,
-        depth=None if raster.depth is None else raster.depth * model.config.frame.scale,
+        depth=None if raster.depth is None else raster.depth * scene.config.frame.scale,
         indices=index,
         visible=raster.visible,
         absgrad=gradients,
@@ -222,23 +235,6 @@ def _select_gaussians(
         geometry = model.decode_geometry(index) if decoded is None else decoded.geometry[index]
         viewpoint = camera_center(viewport.pose).to(positions.device, non_blocking=positions.is_cuda)
         return index, geometry.at(take_rows(positions, index)), model.decode_colors(viewpoint, index)
-
-
-def apply_exposure_map(model: HybridModel, camera: Camera, rgb: Tensor) -> Tensor:
-    """Apply the exposure map to a render of the consistent exposure, as `render_view` does for "as-photographed".
-
-    Args:
-        model: the model that was rendered.
-        camera: the camera that it was rendered from, in world units.
-        rgb: (H, W, 3) in [0, 1], rendered with `RenderSettings(exposure="consistent")`.
-
-    Returns:
-        (H, W, 3) in [0, 1]; `rgb` itself if the model has no exposure map. Differentiable in `rgb`.
-    """
-    if model.exposure is None:
-        return rgb
-    gains = model.exposure.predict_gains(model.config.frame.local_pose(camera))
-    return apply_exposure_gains(rgb, tensor_like(gains.tolist(), rgb))
 
 
 def _check_finite(**values: Tensor) -> None:

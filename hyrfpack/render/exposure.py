@@ -1,0 +1,27 @@
+"""Brings renders to the exposure of the photos taken near a camera."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from hyrfpack.model import HybridModel
+from hyrfpack.model.exposure import apply_exposure_gains
+from hyrfpack.ops.transfer import tensor_like
+from hyrfpack.scene import Camera
+
+
+def apply_exposure_map(model: HybridModel, camera: Camera, rgb: Tensor) -> Tensor:
+    """Apply the exposure map to a render of the consistent exposure, as `render_view` does for "as-photographed".
+
+    Args:
+        model: the model that was rendered.
+        camera: the camera that it was rendered from, in world units.
+        rgb: (..., 3) in [0, 1], rendered with `RenderSettings(exposure="consistent")`.
+
+    Returns:
+        (..., 3) in [0, 1]; `rgb` itself if the model has no exposure map. Differentiable in `rgb`.
+    """
+    if model.exposure is None:
+        return rgb
+    gains = model.exposure.predict_gains(model.config.frame.local_pose(camera))
+    return apply_exposure_gains(rgb, tensor_like(gains.tolist(), rgb))

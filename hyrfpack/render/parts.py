@@ -1,0 +1,120 @@
+"""Brings the Gaussians of several models that a camera sees into the axes of that camera."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hyrfpack.model import Decoded, Frame, HybridModel
+from hyrfpack.model.exposure import apply_exposure_gains
+from hyrfpack.model.gaussians import take_rows
+from hyrfpack.model.merged import MergedModel
+from hyrfpack.ops.poses import camera_center
+from hyrfpack.ops.rasterize import Gaussians3D, RasterSettings, rasterize
+from hyrfpack.ops.rasterize.cull import frustum_cull
+from hyrfpack.ops.transfer import tensor_like
+from hyrfpack.ops.viewport import Viewport
+from hyrfpack.render.sampling import widen_to_photos
+from hyrfpack.rotations import multiply_quats, quaternion_from_matrix
+from hyrfpack.scene import Camera
+
+
+def gather_parts(
+    model: MergedModel,
+    camera: Camera,
+    near: float,
+    cull_tolerance: float,
+    decoded: Decoded | None = None,
+) -> tuple[Tensor, Gaussians3D, Tensor]:
+    """Return the Gaussians of all parts in view of a camera, in the local units of `camera_frame`.
+
+    Args:
+        model: the merged model.
+        camera: the camera, in world units.
+        near, cull_tolerance: as in `RenderSettings`; `near` is in local units of each part.
+        decoded: result of `model.decode()`, or None.
+
+    Returns:
+        Indices (n,) int64 of the Gaussians, counted over all parts in their order; the Gaussians; colours (n, 3).
+
+    Raises:
+        FloatingPointError: a position is NaN or infinite.
+    """
+    unit, first = model.scene.config.frame.scale, 0
+    indices, gaussians, colors = [], [], []
+    for part in model.parts:
+        viewport = part.config.frame.local_viewport(camera, part.gaussians.positions.dtype)
+        index = frustum_cull(part.gaussians.positions, viewport, near, cull_tolerance)
+        geometry = part.decode_geometry(index) if decoded is None else decoded.geometry[index + first]
+        local = geometry.at(take_rows(part.gaussians.positions, index))
+        if (sizes := part.gaussians.pixel_sizes) is not None:
+            local = widen_to_photos(local, sizes[index], viewport, antialiased=part.config.antialiased)
+        indices.append(index + first)
+        gaussians.append(_to_camera_axes(local, viewport, part.config.frame.scale / unit))
+        colors.append(part.decode_colors(camera_center(viewport.pose).to(local.means), index))
+        first += len(part)
+    joined = Gaussians3D(*(torch.cat(values) for values in zip(*gaussians, strict=True)))
+    return torch.cat(indices), joined, torch.cat(colors)
+
+
+def expose_parts(
+    model: MergedModel,
+    camera: Camera,
+    rgb: Tensor,
+    index: Tensor,
+    gaussians: Gaussians3D,
+    viewport: Viewport,
+    settings: RasterSettings,
+) -> Tensor:
+    """Bring a render of a merged model to the exposures that the maps of its parts predict for a camera.
+
+    Log gains are blended as colours are: the log gain of a pixel is the mean over the Gaussians that it shows, weighted
+    by their light. So a pixel that shows one part has the exposure of that part.
+
+    Args:
+        model: the merged model.
+        camera: the camera, in world units.
+        rgb: (H, W, 3) in [0, 1], at the consistent exposure of each part.
+        index, gaussians: results of `gather_parts`.
+        viewport: the camera, in the local units of `camera_frame`.
+        settings: settings that `rgb` was rasterised with.
+
+    Returns:
+        (H, W, 3) in [0, 1].
+    """
+    if all(part.exposure is None for part in model.parts):
+        return rgb
+    log_gains = torch.stack([tensor_like(_predict_log_gains(part, camera), rgb) for part in model.parts])
+    ends = torch.tensor([len(part) for part in model.parts], device=index.device).cumsum(0)
+    blended = rasterize(gaussians, log_gains[torch.bucketize(index, ends, right=True)], viewport, settings)
+    behind = blended.transmittance[..., None] * log_gains[0]
+    return apply_exposure_gains(rgb, (blended.rgb + behind).exp())
+
+
+def _predict_log_gains(model: HybridModel, camera: Camera) -> list[float]:
+    """Return the log gains (3,) that a model's exposure map predicts for a camera; zeros without a map."""
+    if model.exposure is None:
+        return [0.0, 0.0, 0.0]
+    return np.log(model.exposure.predict_gains(model.config.frame.local_pose(camera))).tolist()
+
+
+def camera_frame(model: MergedModel, camera: Camera) -> Frame:
+    """Return the frame of `gather_parts`: the axes and the position of a camera, and the unit of the first part."""
+    x, y, z = camera.position.tolist()
+    w, i, j, k = quaternion_from_matrix(camera.rotation.T).tolist()
+    return Frame((x, y, z), model.scene.config.frame.scale, (1.0, 1.0, 1.0), (w, i, j, k))
+
+
+def _to_camera_axes(gaussians: Gaussians3D, viewport: Viewport, factor: float) -> Gaussians3D:
+    """Return Gaussians in the axes of a camera, scaled by `factor`."""
+    pose = viewport.pose.double().numpy()
+    rotation = tensor_like(pose[:3, :3].tolist(), gaussians.means)
+    offset = tensor_like(pose[:3, 3].tolist(), gaussians.means)
+    turned_basis = multiply_quats(quaternion_from_matrix(pose[:3, :3]), np.eye(4))
+    return Gaussians3D(
+        factor * (gaussians.means @ rotation.T + offset),
+        gaussians.quats @ tensor_like(turned_basis.tolist(), gaussians.quats),
+        factor * gaussians.scales,
+        gaussians.opacities,
+    )
