@@ -55,7 +55,9 @@ if TYPE_CHECKING:
     from hyrfpack.distill import DistillReport as DistillReport
     from hyrfpack.distill import import_splats as import_splats
     from hyrfpack.edit import EditReport as EditReport
+    from hyrfpack.edit import MergeReport as MergeReport
     from hyrfpack.edit import edit_model as edit_model
+    from hyrfpack.edit import merge_models as merge_models
     from hyrfpack.edit import plan_edit as plan_edit
     from hyrfpack.errors import HyrfDataError as HyrfDataError
     from hyrfpack.errors import HyrfError as HyrfError
@@ -74,10 +76,12 @@ if TYPE_CHECKING:
     from hyrfpack.format import describe_file as describe_file
     from hyrfpack.format.codec import load_model as load_model
     from hyrfpack.format.codec import save_model as save_model
+    from hyrfpack.format.parts import load_merged_model as load_merged_model
     from hyrfpack.make import MakeResult as MakeResult
     from hyrfpack.make import make_scene as make_scene
     from hyrfpack.model import HybridModel as HybridModel
     from hyrfpack.model import ModelConfig as ModelConfig
+    from hyrfpack.model.merged import MergedModel as MergedModel
     from hyrfpack.poses import PosesReport as PosesReport
     from hyrfpack.poses import estimate_poses as estimate_poses
     from hyrfpack.render import Rendering as Rendering
@@ -111,7 +115,9 @@ _MODULES_BY_PUBLIC_NAME = {
     "DistillReport": "hyrfpack.distill",
     "import_splats": "hyrfpack.distill",
     "EditReport": "hyrfpack.edit",
+    "MergeReport": "hyrfpack.edit",
     "edit_model": "hyrfpack.edit",
+    "merge_models": "hyrfpack.edit",
     "plan_edit": "hyrfpack.edit",
     "HyrfDataError": "hyrfpack.errors",
     "HyrfError": "hyrfpack.errors",
@@ -130,12 +136,14 @@ _MODULES_BY_PUBLIC_NAME = {
     "export_player": "hyrfpack.export",
     "describe_file": "hyrfpack.format",
     "FileReport": "hyrfpack.format",
+    "load_merged_model": "hyrfpack.format",
     "load_model": "hyrfpack.format",
     "save_model": "hyrfpack.format",
     "MakeConfig": "hyrfpack.config.make",
     "MakeResult": "hyrfpack.make",
     "make_scene": "hyrfpack.make",
     "HybridModel": "hyrfpack.model",
+    "MergedModel": "hyrfpack.model.merged",
     "ModelConfig": "hyrfpack.model",
     "PosesConfig": "hyrfpack.config.poses",
     "PosesReport": "hyrfpack.poses",

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from hyrfpack.cli.drawing import Drawing
     from hyrfpack.evaluate import Evaluation, ViewScore
     from hyrfpack.model import HybridModel
+    from hyrfpack.model.merged import MergedModel
     from hyrfpack.scene import Scene, View
     from hyrfpack.splats.draw import Drawable
 
@@ -64,7 +65,7 @@ def evaluate(
 
     ranks, source = drawing.ranks, drawing.open(model)
 
-    def read() -> tuple[HybridModel | Drawable, Scene, list[View]]:
+    def read() -> tuple[HybridModel | MergedModel | Drawable, Scene, list[View]]:
         shown = source.load()
         scene = read_scene(data, reader_options, source.facts)
         views = select_views(scene, split)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from hyrfpack.cli.common import format_consistent_psnr, json_option, print_json
+from hyrfpack.cli.common import format_consistent_psnr, format_table, json_option, print_json
 from hyrfpack.cli.console import print_line
 from hyrfpack.cli.section_table import format_section_table
 from hyrfpack.cli.types import PATH
@@ -126,6 +126,13 @@ def _print_model_facts(file: Path, facts: dict) -> None:
     config, provenance = facts["config"], facts["provenance"]
     click.echo(f"{file}: {facts['bytes']:,} bytes, {facts['gaussians']:,} Gaussians")
     print_line(f"written by {facts['writer']}, format {facts['version']}, profile {facts['profile']}")
+    if "parts" in facts:
+        rows = [
+            [part["name"], f"{part['gaussians']:,}", f"{part['bytes']:,}", part["profile"]] for part in facts["parts"]
+        ]
+        click.echo("\n" + format_table(["part", "Gaussians", "bytes", "profile"], rows))
+        click.echo(f"\nThe rest describes the scene, its first part '{facts['parts'][0]['name']}'.")
+        facts = facts["parts"][0]
     names = ("type", "holds", "before", "after")
     sections = [SectionSize(*(part[name] for name in names)) for part in facts["sections"]]
     click.echo("\n" + format_section_table(sections, facts["bytes"], facts["gaussians"]))

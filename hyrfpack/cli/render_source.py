@@ -13,8 +13,9 @@ import torch
 from hyrfpack.cameras.capture import Capture
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.errors import HyrfError
-from hyrfpack.format import describe_file, find_model, load_model
+from hyrfpack.format import describe_file, find_model, load_merged_model, load_model
 from hyrfpack.model import HybridModel
+from hyrfpack.model.merged import MergedModel
 from hyrfpack.splats.draw import Drawable
 from hyrfpack.splats.files import read_splats
 from hyrfpack.splats.names import bytes_on_disk, is_splats, sog_folder
@@ -56,10 +57,15 @@ class RenderSource:
         model, fraction = find_model(path), 1.0 if allow_partial else None
         return cls(model, device, precision, fraction, facts=describe_file(model, fraction))
 
-    def load(self) -> HybridModel | Drawable:
+    def load(self) -> HybridModel | MergedModel | Drawable:
         """Return the model or the splats on the device."""
         if self.splats is not None:
             return self.splats
+        if self.facts is not None and "parts" in self.facts:
+            merged = load_merged_model(self.path, self.device)
+            for part in merged.parts:
+                part.precision = self.precision
+            return merged
         model = load_model(self.path, self.device, self.fraction)
         model.precision = self.precision
         return model

@@ -13,6 +13,7 @@ from hyrfpack.format.run_folder import RunStatus, find_model, read_run_status
 
 if TYPE_CHECKING:
     from hyrfpack.format.codec import decode_model, encode_model, load_model, repack, save_model
+    from hyrfpack.format.parts import load_merged_model
 
 __all__ = [
     "FileReport",
@@ -22,6 +23,7 @@ __all__ = [
     "describe_file",
     "encode_model",
     "find_model",
+    "load_merged_model",
     "load_model",
     "read_run_status",
     "repack",
@@ -32,4 +34,5 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
-    return getattr(import_module("hyrfpack.format.codec"), name)
+    module = "parts" if name == "load_merged_model" else "codec"
+    return getattr(import_module(f"hyrfpack.format.{module}"), name)

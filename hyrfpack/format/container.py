@@ -24,7 +24,7 @@ from hyrfpack.format.run_folder import find_model
 
 MAGIC = b"\x89HYRF\r\n\n"
 MAJOR_VERSION = 1
-MINOR_VERSION = 3
+MINOR_VERSION = 4
 
 # A file beyond one of these limits is rejected before anything is read or allocated for it.
 MAX_SECTIONS = 1024
@@ -202,6 +202,17 @@ class Container:
         if any(stored[entry.length :]):
             raise self._damaged_error(f"the padding after section '{tag}' is not zero")
         return Section(tag, entry.codec, data, entry.raw_length, entry.required)
+
+    def read_bytes(self) -> bytes:
+        """Return all bytes of the file, after a check of every section of a known type.
+
+        Raises:
+            HyrfFormatError: a section is damaged.
+        """
+        for tag in self.entries:
+            if tag in self:
+                self[tag]
+        return bytes(self._read_at(0, self.length))
 
     def _is_available(self, entry: Entry) -> bool:
         return entry.end <= self.available

@@ -16,7 +16,14 @@ from hyrfpack.format.arrays import check_rules, group_shapes, parse_config, to_m
 from hyrfpack.format.container import Container
 from hyrfpack.format.exposure import decode_exposure
 from hyrfpack.format.metadata import read_metadata
-from hyrfpack.format.sections import EXPOSURE, LAYERED_SECTIONS, POSITIONS, group_and_layer, layer_section
+from hyrfpack.format.sections import (
+    EXPOSURE,
+    LAYERED_SECTIONS,
+    PART_NAMES,
+    POSITIONS,
+    group_and_layer,
+    layer_section,
+)
 from hyrfpack.model.config import ModelConfig
 from hyrfpack.model.hybrid import HybridModel
 from hyrfpack.parallel.pool import run_tasks
@@ -53,8 +60,13 @@ def decode_container(container: Container) -> HybridModel:
     """Decode the model of an open file; it is safe on untrusted input.
 
     Raises:
-        HyrfFormatError: the file is damaged, inconsistent, or incomplete.
+        HyrfFormatError: the file is damaged, inconsistent, or incomplete, or it holds several models.
     """
+    if PART_NAMES in container.entries:
+        raise HyrfFormatError(
+            f"{container.name}: this file holds merged models, and one model is needed",
+            fix="take one out with 'hyrfpack edit FILE -o OUTPUT --part NAME'",
+        )
     layout = read_layout(container)
     arrays = _decode_sections(container, layout)
     for tag, values in arrays.items():

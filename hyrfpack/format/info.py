@@ -10,7 +10,8 @@ from hyrfpack.errors import HyrfFormatError
 from hyrfpack.format.container import Container
 from hyrfpack.format.exposure_header import read_exposure_header
 from hyrfpack.format.metadata import read_metadata
-from hyrfpack.format.sections import EXPOSURE, NON_PARAMETER_SECTIONS, SECTION_CONTENTS, group_and_layer
+from hyrfpack.format.part_names import open_parts
+from hyrfpack.format.sections import EXPOSURE, NON_PARAMETER_SECTIONS, PART_NAMES, SECTION_CONTENTS, group_and_layer
 
 
 @dataclass(frozen=True)
@@ -91,7 +92,9 @@ def describe_file(path: str | os.PathLike[str], fraction: float | None = None) -
         `exposure` of a file with an exposure map: its number of `centers`, and in `stops` the lowest and the highest
         exposure of renders, as means of the three channels (null without a map, or if its bytes are missing);
         `bits_per_gaussian` of the whole file (null without Gaussians); and `sections`, each with `type`, `holds`,
-        `before` (bytes as float32), `after` (stored bytes) and `bits_per_gaussian`.
+        `before` (bytes as float32), `after` (stored bytes) and `bits_per_gaussian`. A merged file has the description
+        of its first part, the scene, with the `bytes`, `version`, `gaussians`, `bits_per_gaussian` and `sections` of
+        the whole file; and `parts`, each with its `name` and its own description.
 
     Raises:
         HyrfFormatError: the file does not exist, or its header, table of contents, metadata or exposure map is damaged.
@@ -103,22 +106,29 @@ def describe_file(path: str | os.PathLike[str], fraction: float | None = None) -
         ('compact', '1.1', 'META')
     """
     with Container.open(path, SECTION_CONTENTS, fraction) as container:
-        metadata = read_metadata(container)
-        sizes = section_sizes(container)
-        exposure = _describe_exposure(container)
-        length, version = container.length, ".".join(map(str, container.version))
-    count = metadata.gaussians
+        if PART_NAMES not in container.entries:
+            return _describe_model(container)
+        parts = [{"name": name, **_describe_model(part)} for name, part in open_parts(container)]
+        count = sum(part["gaussians"] for part in parts)
+        scene = {key: value for key, value in parts[0].items() if key != "name"}
+        return {**scene, **_describe_sizes(container, count), "gaussians": count, "parts": parts}
 
+
+def _describe_model(container: Container) -> dict:
+    metadata = read_metadata(container)
+    exposure = _describe_exposure(container)
+    return {**asdict(metadata), "exposure": exposure, **_describe_sizes(container, metadata.gaussians)}
+
+
+def _describe_sizes(container: Container, gaussians: int) -> dict:
     def bits(length: int) -> float | None:
-        return 8 * length / count if count else None
+        return 8 * length / gaussians if gaussians else None
 
     return {
-        "bytes": length,
-        "version": version,
-        **asdict(metadata),
-        "exposure": exposure,
-        "bits_per_gaussian": bits(length),
-        "sections": [{**asdict(size), "bits_per_gaussian": bits(size.after)} for size in sizes],
+        "bytes": container.length,
+        "version": ".".join(map(str, container.version)),
+        "bits_per_gaussian": bits(container.length),
+        "sections": [{**asdict(size), "bits_per_gaussian": bits(size.after)} for size in section_sizes(container)],
     }
 
 

@@ -36,14 +36,15 @@ def rewrite_metadata(
         HyrfError: the file cannot be written.
     """
     with Container.open(source) as container:
-        metadata = replace(
-            read_metadata(container), config=config.to_dict(), provenance=provenance, writer=writer_name()
-        )
-        sections = [
-            metadata.to_section(deflate=entry.codec == CODEC_DEFLATED)
-            if entry.type == METADATA
-            else container[entry.type]
-            for entry in container.entries.values()
-        ]
-        data = write_container(sections, minor=lowest_minor_version(sections, metadata.config))
+        data = with_metadata(container, config, provenance)
     return write_model(data, target, overwrite=overwrite)
+
+
+def with_metadata(container: Container, config: ModelConfig, provenance: dict) -> bytes:
+    """Return the bytes of a file of one model with another configuration and provenance; see `rewrite_metadata`."""
+    metadata = replace(read_metadata(container), config=config.to_dict(), provenance=provenance, writer=writer_name())
+    sections = [
+        metadata.to_section(deflate=entry.codec == CODEC_DEFLATED) if entry.type == METADATA else container[entry.type]
+        for entry in container.entries.values()
+    ]
+    return write_container(sections, minor=lowest_minor_version(sections, metadata.config))

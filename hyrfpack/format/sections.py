@@ -15,6 +15,9 @@ GEOMETRY_TABLE = "GTAB"
 GEOMETRY_DECODER = "GMLP"
 RADIANCE_TABLE = "RTAB"
 RADIANCE_DECODER = "RMLP"
+# A merged file has these instead: the names of its parts, and the part files (`part_section`).
+PART_NAMES = "PRTS"
+MAX_PARTS = 64
 
 LOGIT_SECTIONS = (COLORS, SCALES, OPACITIES)
 TABLE_SECTIONS = (GEOMETRY_TABLE, RADIANCE_TABLE)
@@ -22,9 +25,16 @@ DECODER_SECTIONS = (GEOMETRY_DECODER, RADIANCE_DECODER)
 # Gaussians may be stored in layers, the most important first. These are the section types of the first layer.
 LAYERED_SECTIONS = (POSITIONS, *LOGIT_SECTIONS)
 MAX_LAYERS = 8
+
+
+def part_section(number: int) -> str:
+    """Return the section type of a part of a merged file, from 0: "PT00", "PT01", ..."""
+    return f"PT{number:02d}"
+
+
 NON_PARAMETER_SECTIONS = (METADATA, EXPOSURE)
 
-# Content of each section type. Every section except EXPOSURE is required.
+# Content of each section type. In a file of one model, every section of a model except EXPOSURE is required.
 SECTION_CONTENTS = {
     METADATA: "metadata",
     EXPOSURE: "exposure map",
@@ -50,6 +60,9 @@ _GROUP_AND_LAYER_BY_TAG = {
 SECTION_CONTENTS |= {
     tag: f"{SECTION_CONTENTS[group]}, layer {layer}" for tag, (group, layer) in _GROUP_AND_LAYER_BY_TAG.items() if layer
 }
+
+SECTION_CONTENTS |= {PART_NAMES: "names of the parts"}
+SECTION_CONTENTS |= {part_section(number): f"part {number + 1}" for number in range(MAX_PARTS)}
 
 
 def group_and_layer(tag: str) -> tuple[str, int]:

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from hyrfpack.format.container import Section
 from hyrfpack.format.sections import EXPOSURE, group_and_layer
 
+MERGED_MINOR_VERSION = 4  # of a file of several models
 _COMPACT_CODECS = range(5, 9)
 
 

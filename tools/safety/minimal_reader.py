@@ -1,4 +1,4 @@
-"""Read `.hyrf` files of versions 1.0 to 1.3, by code written only from docs/reference/format.md, with numpy alone.
+"""Read `.hyrf` files of versions 1.0 to 1.4, by code written only from docs/reference/format.md, with numpy alone.
 
 This reader shares no code with hyrfpack. So it tests whether the page is complete and whether hyrfpack conforms to it.
 It is simple, not fast: a file of 30,000 Gaussians takes some seconds. Section numbers are those of the page.
@@ -118,6 +118,42 @@ def read(data: bytes, part: bool = False) -> tuple[dict[str, Any], dict[str, np.
     return metadata, {group: np.concatenate(parts) for group, parts in matrices.items()}, exposure
 
 
+def read_parts(data: bytes) -> list[tuple[str, Any]]:
+    """Read a merged file (2.11): the name of each part, and what `read` returns for it.
+
+    The arguments and the errors are those of `read`.
+    """
+    sections = read_container(data)
+    names = sections["PRTS"]
+    require(names.codec == 0 and names.raw_length == names.stored_length <= 2**16, "PRTS: unknown codec or size")
+    content = json.loads(names.read().decode("utf-8"))
+    require(isinstance(content, dict) and "names" in content, "PRTS: no object with names")
+    listed = content["names"]
+    require(isinstance(listed, list) and 1 <= len(listed) <= 64, "PRTS: not 1 to 64 names")
+    require(all(isinstance(name, str) and 1 <= len(name) <= 64 for name in listed), "PRTS: a name")
+    require(
+        not any(is_control(ord(letter)) for name in listed for letter in name) and len(set(listed)) == len(listed),
+        "PRTS: a name",
+    )
+    files, raw_total = [], 0
+    for number in range(len(listed)):
+        require(f"PT{number:02d}" in sections, f"part {number} is missing")
+        section = sections[f"PT{number:02d}"]
+        require(section.codec == 10 and section.raw_length == section.stored_length, "a part is not stored as a file")
+        files.append(section.read())
+        inner = read_container(files[-1])
+        require("PRTS" not in inner, "a part is a merged file")
+        raw_total += sum(part.raw_length for part in inner.values())
+    require(raw_total <= min(1024 * len(data) + 3 * 2**24, 2**34), "the parts are too large")
+    parts = [read(file) for file in files]
+    require(sum(part[0]["gaussians"] for part in parts) <= 32 * len(data) + 2**18, "too many Gaussians")
+    return list(zip(listed, parts, strict=True))
+
+
+def is_control(code: int) -> bool:
+    return code < 0x20 or 0x7F <= code < 0xA0 or code in (0x2028, 0x2029) or 0xD800 <= code < 0xE000
+
+
 # Bytes
 
 
@@ -193,6 +229,8 @@ def section_type(group: str, layer: int) -> str:
 KNOWN_SECTION_TYPES = {
     "META",
     "EXPO",
+    "PRTS",
+    *(f"PT{number:02d}" for number in range(64)),
     *FIELD_GROUPS,
     *(section_type(group, layer) for group in LAYERED_GROUPS for layer in range(8)),
 }

@@ -1,0 +1,99 @@
+"""The names of a merged file's parts, and its part files. It imports neither torch nor numpy."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+
+from hyrfpack.errors import HyrfFormatError
+from hyrfpack.format.container import Container, Section, raw_bytes_limit, read_container
+from hyrfpack.format.sections import MAX_PARTS, PART_NAMES, SECTION_CONTENTS, part_section
+
+CODEC_NAMES = 0
+CODEC_FILE = 10
+MAX_NAME_LENGTH = 64
+MAX_NAMES_BYTES = 1 << 16
+_CONTROL_CHARACTERS = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
+
+
+def check_part_names(names: Sequence[object]) -> None:
+    """Raise ValueError unless the names of the parts are as a merged file needs them.
+
+    They must be 1 to MAX_PARTS different texts of 1 to MAX_NAME_LENGTH characters without control characters.
+    """
+    if not 1 <= len(names) <= MAX_PARTS:
+        raise ValueError(f"there are {len(names)} parts; a file holds 1 to {MAX_PARTS}")
+    for name in names:
+        if not isinstance(name, str) or not 1 <= len(name) <= MAX_NAME_LENGTH or _CONTROL_CHARACTERS.search(name):
+            raise ValueError(
+                f"{name!r:.80} is no name of a part, which has 1 to {MAX_NAME_LENGTH} characters, none "
+                "of them a control character"
+            )
+    if len(set(names)) != len(names):
+        raise ValueError("two parts have the same name")
+
+
+def write_part_names(names: Sequence[str]) -> Section:
+    """Return the section with the names of the parts."""
+    check_part_names(names)
+    data = json.dumps({"names": list(names)}, separators=(",", ":")).encode("ascii")
+    return Section(PART_NAMES, CODEC_NAMES, data, len(data))
+
+
+def read_part_names(container: Container) -> list[str]:
+    """Read the names of a merged file's parts.
+
+    Raises:
+        HyrfFormatError: the names are damaged, or a part is missing.
+    """
+    name, entry = container.name, container.entries[PART_NAMES]
+    if entry.codec != CODEC_NAMES or entry.raw_length != entry.length or entry.length > MAX_NAMES_BYTES:
+        raise HyrfFormatError(f"{name}: the names of its parts cannot be read", fix="update hyrfpack")
+    try:
+        text = bytes(container[PART_NAMES].data).decode("utf-8")
+        names = json.loads(text, parse_constant=_reject_constant)["names"]
+        if not isinstance(names, list):
+            raise ValueError("the names are no list")
+        check_part_names(names)
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
+        raise HyrfFormatError(
+            f"{name}: the names of its parts are not valid ({error!s:.160})", fix="write the file again"
+        ) from error
+    return names
+
+
+def printable_name(name: str) -> str:
+    """Return a text without control characters, cut to fit into a name of a part with a number after it."""
+    return _CONTROL_CHARACTERS.sub("", name)[: MAX_NAME_LENGTH - 3] or "part"
+
+
+def _reject_constant(name: str) -> None:
+    raise ValueError(f"the number {name} is not finite")
+
+
+def open_parts(container: Container) -> list[tuple[str, Container]]:
+    """Return name and container of each part of a merged file, after a check of all sizes that they declare.
+
+    Raises:
+        HyrfFormatError: a part is missing or damaged, is itself a merged file, or the parts declare too many bytes.
+    """
+    parts = []
+    for number, part_name in enumerate(read_part_names(container)):
+        section = container[part_section(number)]
+        if section.codec != CODEC_FILE or section.raw_length != len(section.data):
+            raise HyrfFormatError(
+                f"{container.name}: section '{section.type}' has the unknown codec {section.codec}, or a wrong size",
+                fix="update hyrfpack",
+            )
+        part = read_container(section.data, SECTION_CONTENTS, f"{container.name}: part '{part_name}'")
+        if PART_NAMES in part.entries:
+            raise HyrfFormatError(f"{part.name}: a part must be one model", fix="write the file again")
+        parts.append((part_name, part))
+    declared = sum(entry.raw_length for _, part in parts for entry in part.entries.values())
+    if declared > (limit := raw_bytes_limit(container.length)):
+        raise HyrfFormatError(
+            f"{container.name}: the parts say they decode to {declared:,} bytes, more than {limit:,}",
+            fix="the file is damaged, copy or write it again",
+        )
+    return parts

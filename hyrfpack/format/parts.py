@@ -1,0 +1,79 @@
+"""Merged files: several complete `.hyrf` files as sections of one, and a section with their names."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+
+import torch
+
+from hyrfpack.atomic import write_atomic
+from hyrfpack.device import choose_device
+from hyrfpack.errors import HyrfError, HyrfFormatError
+from hyrfpack.format.container import Container, Section, read_container, write_container
+from hyrfpack.format.decode import decode_container, gaussian_limit
+from hyrfpack.format.metadata import read_metadata
+from hyrfpack.format.part_names import CODEC_FILE, open_parts, write_part_names
+from hyrfpack.format.sections import PART_NAMES, SECTION_CONTENTS, part_section
+from hyrfpack.format.versions import MERGED_MINOR_VERSION
+from hyrfpack.model.merged import MergedModel
+
+
+def encode_parts(parts: Sequence[tuple[str, bytes]]) -> bytes:
+    """Encode a merged file of named parts, each the bytes of a `.hyrf` file of one model. The first is the scene.
+
+    Raises:
+        HyrfError: the parts together exceed the limits of a file.
+        ValueError: a name is not valid, or two are equal.
+    """
+    sections = [write_part_names([name for name, _ in parts])]
+    for number, (_, data) in enumerate(parts):
+        sections.append(Section(part_section(number), CODEC_FILE, data, len(data)))
+    data = write_container(sections, minor=MERGED_MINOR_VERSION)
+    try:
+        _check_gaussians(open_parts(read_container(data, SECTION_CONTENTS)), len(data))
+    except HyrfFormatError as error:
+        raise HyrfError(error.problem, fix="merge fewer models") from error
+    return data
+
+
+def write_parts(parts: Sequence[tuple[str, bytes]], path: str | os.PathLike[str], *, overwrite: bool = True) -> str:
+    """Write a merged file, completely or not at all, and return its path. Arguments and errors: `encode_parts`."""
+    return str(write_atomic(path, encode_parts(parts), overwrite=overwrite))
+
+
+def load_merged_model(path: str | os.PathLike[str], device: str | torch.device = "cpu") -> MergedModel:
+    """Read the models of a merged file, or the one model of any other `.hyrf` file as its only part.
+
+    Args:
+        path: a `.hyrf` file, or the folder of a training run.
+        device: device of the parameters, see `hyrfpack.device.choose_device`.
+
+    Raises:
+        HyrfFormatError: the file is damaged, incomplete, or of a newer format version.
+        HyrfError: the device is not available.
+
+    Example:
+        >>> import hyrfpack
+        >>> model = hyrfpack.load_merged_model("bonsai.hyrf")
+        >>> len(model.parts), len(model) == len(hyrfpack.load_model("bonsai.hyrf"))
+        (1, True)
+    """
+    device = choose_device(device)
+    with Container.open(path, SECTION_CONTENTS) as container:
+        if PART_NAMES not in container.entries:
+            return MergedModel(("scene",), (decode_container(container).to(device),))
+        parts = open_parts(container)
+        _check_gaussians(parts, container.length)
+        names, models = zip(*((name, decode_container(part).to(device)) for name, part in parts), strict=True)
+        return MergedModel(names, models)
+
+
+def _check_gaussians(parts: Sequence[tuple[str, Container]], length: int) -> None:
+    """Raise HyrfFormatError if the parts claim more Gaussians than a file of `length` bytes may have."""
+    count, limit = sum(read_metadata(part).gaussians for _, part in parts), gaussian_limit(length)
+    if count > limit:
+        raise HyrfFormatError(
+            f"the parts claim {count:,} Gaussians, but the size of the file allows at most {limit:,}",
+            fix="the file is damaged, copy or write it again",
+        )

@@ -1,0 +1,215 @@
+"""Merged files hold several models, and damaged or forged ones are refused."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from scenes import small_model
+
+from hyrfpack.errors import HyrfFormatError
+from hyrfpack.format import describe_file, encode_model, load_merged_model, load_model, repack
+from hyrfpack.format.arrays import to_arrays
+from hyrfpack.format.container import MINOR_VERSION, Section, read_container, write_container
+from hyrfpack.format.part_names import write_part_names
+from hyrfpack.format.parts import encode_parts, write_parts
+from tools.safety import minimal_reader
+
+GOLDEN_FOLDER = Path(__file__).parents[1] / "golden"
+PAPER, COMPACT = ((GOLDEN_FOLDER / name).read_bytes() for name in ("v1.0_paper.hyrf", "v1.2_compact_exposure.hyrf"))
+NAMES = ["room", "a chair, caf\u00e9"]
+MERGED = encode_parts(list(zip(NAMES, (PAPER, COMPACT), strict=True)))
+
+
+def write_file(folder: Path, data: bytes) -> Path:
+    path = folder / "merged.hyrf"
+    path.write_bytes(data)
+    return path
+
+
+def names_section(value: object) -> Section:
+    data = json.dumps(value).encode()
+    return Section("PRTS", 0, data, len(data))
+
+
+def with_sections(*changed: Section, without: str = "") -> bytes:
+    """Return MERGED with changed or further sections."""
+    sections = {section.type: section for section in read_container(MERGED).sections if section.type != without}
+    return write_container(list((sections | {section.type: section for section in changed}).values()), MINOR_VERSION)
+
+
+def part(data: bytes, number: int = 1, **changes) -> Section:
+    return replace(Section(f"PT{number:02d}", 10, data, len(data)), **changes)
+
+
+def test_a_merged_file_holds_the_models_and_their_names(tmp_path):
+    merged = load_merged_model(write_file(tmp_path, MERGED))
+
+    assert list(merged.names) == NAMES
+    for model, file in zip(merged.parts, ("v1.0_paper", "v1.2_compact_exposure"), strict=True):
+        expected = load_model(GOLDEN_FOLDER / f"{file}.hyrf")
+        assert model.config == expected.config
+        for name, values in expected.state_dict().items():
+            assert torch.equal(model.state_dict()[name], values), name
+    assert [model.exposure is None for model in merged.parts] == [True, False]
+
+
+def test_part_files_are_stored_unchanged():
+    sections = {section.type: bytes(section.data) for section in read_container(MERGED).sections}
+
+    assert (sections["PT00"], sections["PT01"]) == (PAPER, COMPACT)
+
+
+def test_a_reader_written_from_the_specification_reads_the_same_bits(tmp_path):
+    merged = load_merged_model(write_file(tmp_path, MERGED))
+
+    read = minimal_reader.read_parts(MERGED)
+
+    assert [name for name, _ in read] == NAMES
+    for (_, (metadata, groups, _)), model in zip(read, merged.parts, strict=True):
+        assert metadata["gaussians"] == len(model)
+        for tag, values in to_arrays(model).items():
+            assert np.array_equal(values.view(np.uint32), groups[tag].view(np.uint32)), tag
+
+
+def test_a_file_of_one_model_is_read_as_its_only_part():
+    merged = load_merged_model(GOLDEN_FOLDER / "v1.0_raw.hyrf")
+
+    assert len(merged.parts) == 1
+    assert len(merged) == len(load_model(GOLDEN_FOLDER / "v1.0_raw.hyrf"))
+
+
+def test_the_description_is_that_of_the_scene_with_sizes_of_the_whole(tmp_path):
+    facts = describe_file(write_file(tmp_path, MERGED))
+
+    assert facts["bytes"] == len(MERGED)
+    assert facts["version"] == "1.4"
+    assert facts["gaussians"] == sum(part["gaussians"] for part in facts["parts"])
+    assert facts["config"] == describe_file(GOLDEN_FOLDER / "v1.0_paper.hyrf")["config"]
+    assert [(part["name"], part["bytes"]) for part in facts["parts"]] == list(
+        zip(NAMES, (len(PAPER), len(COMPACT)), strict=True)
+    )
+    assert [section["type"] for section in facts["sections"]] == ["PRTS", "PT00", "PT01"]
+
+
+def test_a_file_of_one_model_has_no_parts_in_its_description():
+    assert "parts" not in describe_file(GOLDEN_FOLDER / "v1.0_paper.hyrf")
+
+
+@pytest.mark.parametrize("read", [load_model, lambda path: repack(path, path.with_name("out.hyrf"))])
+def test_what_needs_one_model_says_how_to_get_it(tmp_path, read):
+    with pytest.raises(HyrfFormatError, match=r"merged models.*--part"):
+        read(write_file(tmp_path, MERGED))
+
+    assert not (tmp_path / "out.hyrf").exists()
+
+
+def test_earlier_readers_refuse_merged_files():
+    """They know the section types of version 1.2, and must refuse a required section of another type."""
+    entries = read_container(MERGED).entries
+
+    assert all(entry.required for entry in entries.values())
+    assert not {"META", "POSI"} & entries.keys()
+
+
+BAD_NAMES = [
+    [],
+    ["room"],
+    ["room", "room"],
+    ["room", ""],
+    ["room", "two\nlines"],
+    ["room", "x" * 65],
+    ["room", 7],
+    ["room", None],
+    "room",
+    None,
+    [f"part {number}" for number in range(65)],
+]
+
+
+@pytest.mark.parametrize("names", BAD_NAMES[:1] + BAD_NAMES[2:], ids=repr)
+def test_names_that_are_not_valid_are_refused(tmp_path, names):
+    data = with_sections(names_section({"names": names}))
+
+    with pytest.raises(HyrfFormatError, match="names of its parts"):
+        load_merged_model(write_file(tmp_path, data))
+    with pytest.raises(ValueError):
+        minimal_reader.read_parts(data)
+
+
+@pytest.mark.parametrize("names", [[], ["a", "a"], [""], ["x" * 65], ["tab\t"], [str(n) for n in range(65)]], ids=repr)
+def test_names_that_are_not_valid_are_not_written(names):
+    with pytest.raises(ValueError):
+        write_part_names(names)
+
+
+FORGED_FILES = {
+    "a part is missing": with_sections(without="PT01"),
+    "a part is a merged file": with_sections(part(MERGED)),
+    "a part is no file": with_sections(part(b"nothing")),
+    "a part is cut": with_sections(part(COMPACT[:-8])),
+    "a part has another codec": with_sections(part(COMPACT, codec=5)),
+    "a part has another raw length": with_sections(part(COMPACT, raw_length=len(COMPACT) + 1)),
+    "names are no object": with_sections(names_section(NAMES)),
+    "names are not JSON": with_sections(Section("PRTS", 0, b"{", 1)),
+    "names have another codec": with_sections(replace(write_part_names(NAMES), codec=5)),
+    "names are too long": with_sections(names_section({"names": NAMES, "note": "x" * (1 << 16)})),
+    "names are nested deeply": with_sections(Section("PRTS", 0, b"[" * 60_000, 60_000)),
+}
+
+
+@pytest.mark.parametrize("case", FORGED_FILES)
+def test_forged_merged_files_are_refused(tmp_path, case):
+    path = write_file(tmp_path, FORGED_FILES[case])
+
+    for read in (load_merged_model, describe_file):
+        with pytest.raises(HyrfFormatError):
+            read(path)
+    with pytest.raises((ValueError, RecursionError)):
+        minimal_reader.read_parts(path.read_bytes())
+
+
+def test_parts_together_may_not_claim_more_than_the_limits_of_one_file(tmp_path):
+    """Each of these parts is within the limits of its own size; 64 of them are not within those of their file."""
+    small = read_container(encode_model(small_model(np.zeros((0, 3))))).sections
+    large = write_container([*small, Section("NOTE", 5, b"x", 3 << 24, required=False)], MINOR_VERSION)
+    read_container(large)
+
+    sections = [write_part_names([str(number) for number in range(64)]), *(part(large, n) for n in range(64))]
+    path = write_file(tmp_path, write_container(sections, MINOR_VERSION))
+
+    with pytest.raises(HyrfFormatError, match="more than"):
+        load_merged_model(path)
+    with pytest.raises(ValueError):
+        minimal_reader.read_parts(path.read_bytes())
+
+
+@given(st.data())
+def test_damaged_bytes_of_a_merged_file_raise_only_format_errors(tmp_path_factory, data):
+    place = data.draw(st.integers(0, len(MERGED) - 1))
+    damaged = bytearray(MERGED)
+    damaged[place] ^= data.draw(st.integers(1, 255))
+    path = write_file(tmp_path_factory.mktemp("damaged"), bytes(damaged))
+
+    with pytest.raises(HyrfFormatError):
+        load_merged_model(path)
+
+
+@given(st.integers(0, len(MERGED) - 1))
+def test_a_truncated_merged_file_is_refused(tmp_path_factory, length):
+    path = write_file(tmp_path_factory.mktemp("cut"), MERGED[:length])
+
+    with pytest.raises(HyrfFormatError):
+        load_merged_model(path)
+
+
+def test_the_same_parts_give_the_same_bytes(tmp_path):
+    written = write_parts(list(zip(NAMES, (PAPER, COMPACT), strict=True)), tmp_path / "again.hyrf")
+
+    assert Path(written).read_bytes() == MERGED
