@@ -30,6 +30,7 @@ from hyrfpack.export.source import Source
 from hyrfpack.format import describe_file
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.model import HybridModel
+from hyrfpack.model.merged import MergedModel
 from hyrfpack.outputs import Outputs
 from hyrfpack.scene import Scene
 from hyrfpack.splats.files import READABLE_ENDINGS, read_splats
@@ -273,18 +274,20 @@ class _PlayableContent:
             return cls(len(splats), length, poster, stage=stage)
         loaded = Source.read(path, data)
         suggest_compression(path, length)
-        quality = _describe_quality(path, loaded.model, data) if with_quality else ""
+        quality = _describe_quality(path, loaded.drawn, data) if with_quality else ""
         cameras = page_cameras(loaded)
-        poster = render_model_poster(loaded.model, cameras[0], POSTER_LONGEST_SIDE_PIXELS)
-        return cls(len(loaded.model), length, poster, quality, encode_stage(cameras, loaded.up, loaded.center))
+        poster = render_model_poster(loaded.drawn, cameras[0], POSTER_LONGEST_SIDE_PIXELS)
+        return cls(len(loaded.drawn), length, poster, quality, encode_stage(cameras, loaded.up, loaded.center))
 
 
-def _describe_quality(path: StrPath, model: HybridModel, data: Scene | None) -> str:
+def _describe_quality(path: StrPath, model: HybridModel | MergedModel, data: Scene | None) -> str:
     """Describe the quality of a model in words, on held-out photos if there are any, else as stated in its file."""
     if data is not None and data.test:
         _LOG.info(f"scoring on {_format_photo_count(len(data.test))}")
         scores = evaluate_model(model, data.test)
         return f"{scores.psnr:.2f} dB on {_format_photo_count(len(scores.views))}"
+    if isinstance(model, MergedModel):
+        return ""
     provenance = describe_file(path)["provenance"]
     stated, choices = provenance.get("psnr"), provenance.get("choices")
     if not isinstance(stated, float) or not 0 < stated < IDENTICAL_PSNR:

@@ -19,6 +19,7 @@ from hyrfpack.export.report import ExportReport
 from hyrfpack.export.source import Source
 from hyrfpack.format import describe_file
 from hyrfpack.model import BACKGROUND_RADIUS, HybridModel
+from hyrfpack.model.merged import MergedModel
 from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.scene import Camera, evenly_spaced
 from hyrfpack.splats.splats import Splats
@@ -43,7 +44,7 @@ def page_cameras(loaded: Source) -> list[Camera]:
     """
     known = [camera for _, camera in loaded.cameras] or [camera for camera, _ in loaded.measured_views]
     cameras = evenly_spaced(known, MAX_PAGE_CAMERAS)
-    start = choose_start(measure_detail(loaded.model, cameras))
+    start = choose_start(measure_detail(loaded.drawn, cameras))
     return cameras[start:] + cameras[:start]
 
 
@@ -61,7 +62,7 @@ def choose_start(details: Sequence[float]) -> int:
 
 
 @torch.no_grad()
-def measure_detail(model: HybridModel, cameras: Sequence[Camera]) -> list[float]:
+def measure_detail(model: HybridModel | MergedModel, cameras: Sequence[Camera]) -> list[float]:
     """Return the mean difference between neighbouring pixels of a small picture of the model from each camera."""
     decoded = model.decode()
     details = []
@@ -100,7 +101,7 @@ def encode_native_page(loaded: Source, data: bytes, title: str, credit: str = ""
         credit: text below the title.
     """
     settings = _page_settings(loaded, title, credit)
-    return encode_model_page(data, count=len(loaded.model), frame=loaded.model.config.frame, **settings)
+    return encode_model_page(data, count=len(loaded.drawn), frame=loaded.model.config.frame, **settings)
 
 
 def write_native_page(
@@ -123,7 +124,7 @@ def write_native_page(
     suggest_compression(source, len(data))
     page = encode_native_page(loaded, data, Path(target).stem if title is None else title, credit)
     written = write_atomic(target, page, overwrite=overwrite)
-    return ExportReport(str(written), len(page), len(loaded.model), native=True)
+    return ExportReport(str(written), len(page), len(loaded.drawn), native=True)
 
 
 def suggest_compression(source: str | os.PathLike[str], length: int) -> None:
@@ -143,6 +144,6 @@ def _page_settings(loaded: Source, title: str, credit: str) -> dict[str, Any]:
         "center": loaded.center,
         "solid": loaded.model.config.solid,
         "poster": encode_poster(
-            render_model_poster(loaded.model, cameras[0], POSTER_LONGEST_SIDE_PIXELS), "WEBP", MAX_POSTER_BYTES
+            render_model_poster(loaded.drawn, cameras[0], POSTER_LONGEST_SIDE_PIXELS), "WEBP", MAX_POSTER_BYTES
         ),
     }

@@ -36,6 +36,7 @@ from hyrfpack.export.scores import measure_export
 from hyrfpack.export.source import Source
 from hyrfpack.format import find_model
 from hyrfpack.lock import exclusive_folder
+from hyrfpack.model.merged import MergedModel
 from hyrfpack.outputs import Outputs
 from hyrfpack.progress import Progress, TaskEvent, part_of_progress
 from hyrfpack.scene import Scene
@@ -110,6 +111,11 @@ def export_model(
         loaded = Source.read(source, data)
         if kind is HTML_PAGE and not config.baked:
             return write_native_page(loaded, source, target, overwrite, title=config.title, credit=config.credit)
+        if isinstance(loaded.drawn, MergedModel):
+            raise HyrfError(
+                f"{source}: only pages and players' folders hold merged models",
+                fix="take a part out with 'hyrfpack edit FILE -o OUTPUT --part NAME', and export that",
+            )
         if kind in (TRANSFORMS_JSON, COLMAP_FOLDER):
             _check_cameras(loaded, source)
         if kind is TRANSFORMS_JSON:

@@ -9,6 +9,7 @@ from PIL import Image
 
 from hyrfpack.cameras.view_sampling import shrink_camera
 from hyrfpack.model import Frame, HybridModel
+from hyrfpack.model.merged import MergedModel
 from hyrfpack.render import render_view
 from hyrfpack.render.files import to_image
 from hyrfpack.scene import Camera
@@ -19,7 +20,7 @@ ENCODER_QUALITIES = (80, 65, 50, 35, 20, 10)
 REACH_PERCENTILE = 90
 
 
-def render_model_poster(model: HybridModel, camera: Camera, longest_side: int) -> Image.Image:
+def render_model_poster(model: HybridModel | MergedModel, camera: Camera, longest_side: int) -> Image.Image:
     """Render a model from a camera, in a picture of at most `longest_side` pixels a side."""
     return to_image(render_view(model, shrink_camera(camera, longest_side)).rgb)
 

@@ -13,8 +13,9 @@ from hyrfpack.cameras.paths import Viewpoint, downward_direction, look_at, orbit
 from hyrfpack.cameras.view_sampling import interpolate_views
 from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.evaluate.metrics import provenance_mse
-from hyrfpack.format import describe_file, load_model
+from hyrfpack.format import describe_file, load_merged_model
 from hyrfpack.model import HybridModel
+from hyrfpack.model.merged import MergedModel
 from hyrfpack.scene import Camera, Scene, View, evenly_spaced
 
 MAX_FIT_CAMERAS = 256  # because each camera takes memory and time
@@ -33,7 +34,8 @@ class Source:
     """A model with the cameras from which it was photographed.
 
     Attributes:
-        model: the model.
+        model: the model; the scene of a merged file, its first part.
+        drawn: what pages draw: `model`, or all parts of a merged file.
         cameras: names and cameras of the training photos; empty if the file keeps none and no photos are given.
         fit_cameras: cameras at which colours are fitted; made-up ones around the scene if none are known.
         measured_views: cameras at which the loss is measured, with their photos or None. They are not fitted, unless
@@ -45,6 +47,7 @@ class Source:
     """
 
     model: HybridModel
+    drawn: HybridModel | MergedModel
     cameras: list[tuple[str, Camera]]
     fit_cameras: list[Camera]
     measured_views: list[tuple[Camera, View | None]]
@@ -60,8 +63,10 @@ class Source:
         Raises:
             HyrfError: the file cannot be read or holds no Gaussian.
         """
-        facts, model = describe_file(path), load_model(path)
-        if not len(model):
+        facts, merged = describe_file(path), load_merged_model(path)
+        model = merged.scene
+        drawn = merged if "parts" in facts else model
+        if not len(merged):
             raise HyrfError(f"{path}: there is no Gaussian in it, so there is nothing to export", fix="train it again")
         capture = Capture(facts, data)
         try:
@@ -80,12 +85,12 @@ class Source:
             named = [(view.name, view.camera) for view in data.train]
             measured_views = [(view.camera, view) for view in evenly_spaced(data.test, MAX_MEASURED_VIEWS)]
             fit_cameras = evenly_spaced(cameras, MAX_FIT_CAMERAS)
-            return cls(model, named, fit_cameras, measured_views, _choose_up(cameras, up), center, stated)
+            return cls(model, drawn, named, fit_cameras, measured_views, _choose_up(cameras, up), center, stated)
         if capture.is_synthetic:
             # The orbit has twice as many cameras as RING_CAMERAS; every other one lies between the fitted ones.
             between = evenly_spaced(cameras[1::2], MAX_MEASURED_VIEWS)
             measured_views = [(camera, None) for camera in between]
-            return cls(model, [], _make_ring_cameras(viewpoint, center, up), measured_views, up, center, stated)
+            return cls(model, drawn, [], _make_ring_cameras(viewpoint, center, up), measured_views, up, center, stated)
         named = [(f"{number:04d}.png", camera) for number, camera in enumerate(cameras)]
         spare = cameras[::HELD_OUT_INTERVAL] if len(cameras) >= MIN_CAMERAS_TO_HOLD_OUT else cameras
         fit_cameras = (
@@ -101,7 +106,7 @@ class Source:
             ]
             fit_cameras = [*cameras, *between, *_make_ring_cameras(viewpoint, center, up)]
         return cls(
-            model, named, fit_cameras, measured_views, _choose_up(cameras, up), center, stated, capture.is_coarse
+            model, drawn, named, fit_cameras, measured_views, _choose_up(cameras, up), center, stated, capture.is_coarse
         )
 
 

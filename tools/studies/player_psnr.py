@@ -62,7 +62,7 @@ def reduce_picture(picture: np.ndarray, factor: int) -> np.ndarray:
 
 
 @torch.no_grad()
-def render_exact(model: hyrfpack.HybridModel, cameras: Sequence[Camera]) -> list[np.ndarray]:
+def render_exact(model: hyrfpack.MergedModel, cameras: Sequence[Camera]) -> list[np.ndarray]:
     """Return exact renders (H, W, 3) in [0, 1]."""
     return [hyrfpack.render_view(model, camera, EXACT_SETTINGS).rgb.clamp(0, 1).numpy() for camera in cameras]
 
@@ -70,7 +70,7 @@ def render_exact(model: hyrfpack.HybridModel, cameras: Sequence[Camera]) -> list
 def measure_page(browser: Browser, model: Path, views: int, factor: int, enlarge: int) -> list[str]:
     """Return the row of a model whose page is open."""
     cameras = [cut_camera(enlarge_camera(camera, enlarge), factor) for camera in stored_cameras(model, views)]
-    field = hyrfpack.load_model(model)
+    field = hyrfpack.load_merged_model(model)
     exact = render_exact(field, cameras)
     still = [psnr(draw_in_page(browser, camera), picture) for camera, picture in zip(cameras, exact, strict=True)]
     browser.evaluate(MOVING_SCRIPT % factor)

@@ -22,6 +22,12 @@ const MAX_FILE_BYTES = 2 ** 34; // limits a file and its decoded bytes
 const MAX_RAW_BYTES_PER_BYTE = 1024;
 const BASE_RAW_BYTES = 3 * 2 ** 24;
 
+/**
+ * Returns the largest number of bytes that all sections of a file of `length` bytes may decode to.
+ * @param {number} length
+ */
+export const rawBytesLimit = (length) => Math.min(MAX_RAW_BYTES_PER_BYTE * length + BASE_RAW_BYTES, MAX_FILE_BYTES);
+
 /** The maximum number of layers of Gaussians in a file. */
 export const MAX_LAYERS = 8;
 export const LAYERED_TYPES = ["POSI", "COLO", "SCAL", "OPAC"];
@@ -36,7 +42,19 @@ export const EXPOSURE_TYPE = "EXPO";
  */
 export const layerType = (type, layer) => (layer ? type.slice(0, 3) + layer : type);
 
-const KNOWN_TYPES = new Set(["META", EXPOSURE_TYPE, ...FIELD_TYPES]);
+/** The maximum number of parts of a merged file. */
+export const MAX_PARTS = 64;
+/** The type of the names of the parts, which only merged files have. */
+export const PART_NAMES_TYPE = "PRTS";
+
+/**
+ * Returns the type of the section that holds a part of a merged file.
+ * @param {number} number counted from 0
+ */
+export const partType = (number) => `PT${String(number).padStart(2, "0")}`;
+
+const KNOWN_TYPES = new Set(["META", EXPOSURE_TYPE, ...FIELD_TYPES, PART_NAMES_TYPE]);
+for (let part = 0; part < MAX_PARTS; part++) KNOWN_TYPES.add(partType(part));
 for (let layer = 0; layer < MAX_LAYERS; layer++) {
   for (const type of LAYERED_TYPES) KNOWN_TYPES.add(layerType(type, layer));
 }
@@ -157,8 +175,7 @@ export class Container {
       if (end <= this.bytes.length) promised += raw;
     }
     if (end !== this.length) rejectDamaged("its sections end elsewhere than the file");
-    const limit = Math.min(MAX_RAW_BYTES_PER_BYTE * this.bytes.length + BASE_RAW_BYTES, MAX_FILE_BYTES);
-    if (promised > limit) rejectDamaged(`its sections say they decode to ${groupedDigits(promised)} bytes, too many`);
+    if (promised > rawBytesLimit(this.bytes.length)) rejectDamaged(`its sections say they decode to ${groupedDigits(promised)} bytes, too many`);
   }
 }
 

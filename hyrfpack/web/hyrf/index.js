@@ -1,13 +1,16 @@
-// Reads models from the bytes of `.hyrf` files, versions 1.0 to 1.3 (docs/reference/format.md).
+// Reads models from the bytes of `.hyrf` files, versions 1.0 to 1.4 (docs/reference/format.md).
 
 import { decodeChannels } from "./channels.js";
-import { Container, EXPOSURE_TYPE, FIELD_TYPES, LAYERED_TYPES, layerType, rejectIncomplete } from "./container.js";
+import {
+  Container, EXPOSURE_TYPE, FIELD_TYPES, LAYERED_TYPES, PART_NAMES_TYPE, layerType, rejectIncomplete,
+} from "./container.js";
 import { DamagedData, HyrfError, HyrfFormatError, rejectDamaged, rejectNewer } from "./errors.js";
 import { decodeExposure } from "./exposure.js";
 import { FEATURES_PER_ROW, decoderSize, tableRows } from "./grids.js";
 import { decodeGroups, decoderGroups, tableGroups } from "./groups.js";
 import { decodeLattice, latticePositions } from "./lattice.js";
 import { readMetadata } from "./metadata.js";
+import { openParts, readPartNames } from "./parts.js";
 import { decodeFloat16, decodeFloat32, decodeMinMax, decodeVectors } from "./plain.js";
 
 export { HyrfError, HyrfFormatError };
@@ -65,13 +68,15 @@ const LAYERED_COLUMNS = [3, 3, 1, 1];
 /**
  * Describes a file by its header and its table of contents.
  * @param {Uint8Array} bytes the start of a file, or all of it
- * @returns {Description} all lengths in bytes; a model of the first layer needs the first `firstLayer` bytes
+ * @returns {Description} all lengths in bytes; a model of the first layer needs the first `firstLayer` bytes. A merged
+ *   file is needed whole
  * @throws {HyrfFormatError} the header or the table of contents is invalid
  */
 export const describe = (bytes) => {
   const container = new Container(bytes, true);
-  let firstLayer = 0;
-  for (const type of ["META", ...LAYERED_TYPES, ...FIELD_TYPES]) {
+  const isMerged = container.entries.has(PART_NAMES_TYPE);
+  let firstLayer = isMerged ? container.length : 0;
+  for (const type of isMerged ? [] : ["META", ...LAYERED_TYPES, ...FIELD_TYPES]) {
     firstLayer = Math.max(firstLayer, requireEntry(container, type).end);
   }
   const sections = [...container.entries.values()].map(({ type, codec, offset, stored, raw }) => {
@@ -81,18 +86,60 @@ export const describe = (bytes) => {
 };
 
 /**
- * Decodes a file.
+ * Decodes a file of one model.
  * @param {Uint8Array} bytes the file, or its start if `partial` is true
  * @param {{partial?: boolean}} [options] `partial`: accept the start of a file, and read the layers that are complete
  * @returns {Promise<Model>}
- * @throws {HyrfFormatError} the file is damaged, truncated or too new; or `bytes` has no complete layer
+ * @throws {HyrfFormatError} the file is damaged, truncated or too new; `bytes` has no complete layer; or the file is a
+ *   merged one
  */
-export const read = async (bytes, { partial = false } = {}) => {
+export const read = async (bytes, { partial = false } = {}) =>
+  explainMemory(() => {
+    const container = new Container(bytes, partial);
+    if (!container.entries.has(PART_NAMES_TYPE)) return readModel(container);
+    throw new HyrfFormatError(`The file holds ${readPartNames(container).length} merged models; use readParts.`);
+  });
+
+/**
+ * Decodes all parts of a merged file, or the one model of any other file. The first part is the scene, whose background
+ * and cameras are those of the file.
+ * @param {Uint8Array} bytes the whole file
+ * @returns {Promise<{name: string, model: Model}[]>}
+ * @throws {HyrfFormatError} the file is damaged, truncated or too new
+ */
+export const readParts = async (bytes) =>
+  explainMemory(() => {
+    const container = new Container(bytes, false);
+    if (!container.entries.has(PART_NAMES_TYPE)) return [{ name: "scene", model: readModel(container) }];
+    const parts = openParts(container);
+    const metadatas = parts.map((part) => readMetadata(part.container));
+    checkGaussians(metadatas.reduce((sum, { gaussians }) => sum + gaussians, 0), bytes.length);
+    return parts.map((part) => ({ name: part.name, model: readModel(part.container) }));
+  });
+
+/**
+ * Returns the result of `decode`. An array that is too long for the memory becomes an error with a clear message.
+ * @template Decoded
+ * @param {() => Decoded} decode
+ * @returns {Decoded}
+ */
+const explainMemory = (decode) => {
   try {
-    return readModel(new Container(bytes, partial));
+    return decode();
   } catch (error) {
     if (!(error instanceof RangeError)) throw error;
     throw new HyrfFormatError("The model takes more memory than there is; open a smaller one.");
+  }
+};
+
+/**
+ * Throws an error if a file of `length` bytes may not have `count` Gaussians.
+ * @param {number} count
+ * @param {number} length
+ */
+const checkGaussians = (count, length) => {
+  if (count > MAX_GAUSSIANS_PER_BYTE * length + BASE_GAUSSIANS) {
+    rejectDamaged(`it says ${count} Gaussians, too many for its bytes`);
   }
 };
 
@@ -117,9 +164,7 @@ const readModel = (container) => {
   }
 
   const layers = counts.slice(0, layerCount), count = layers.reduce((sum, each) => sum + each, 0);
-  if (count > MAX_GAUSSIANS_PER_BYTE * container.bytes.length + BASE_GAUSSIANS) {
-    rejectDamaged(`it says ${count} Gaussians, too many for its bytes`);
-  }
+  checkGaussians(count, container.bytes.length);
 
   /** @type {Map<string, Float32Array>} */
   const arrays = new Map();

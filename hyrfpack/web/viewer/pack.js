@@ -80,6 +80,19 @@ export function packModel(model) {
   };
 }
 
+// Returns the positions of several parts (3 N each) as one array, in which each part begins a row of the textures.
+// Numbers that belong to no Gaussian are NaN.
+export function joinPositions(parts) {
+  const heights = parts.map((positions) => countRows(positions.length / 3));
+  const joined = new Float32Array(3 * TEXTURE_WIDTH * heights.reduce((sum, height) => sum + height, 0)).fill(NaN);
+  let row = 0;
+  for (const [number, positions] of parts.entries()) {
+    joined.set(positions, 3 * TEXTURE_WIDTH * row);
+    row += heights[number];
+  }
+  return joined;
+}
+
 // Packs a decoder's numbers in groups of four; hidden units are padded to whole cells. The order is: bias 1, the
 // weights of each input, bias 2, matrix 2 (for each four outputs, the weights of each input), bias 3, matrix 3 like
 // matrix 2. Returns {numbers, places: the offset of each part, in groups of four}.

@@ -13,9 +13,10 @@
 //     "failed"     detail: an Error
 
 import { Eye, cameraOf, viewOf } from "./camera.js";
-import { AS_PHOTOGRAPHED, EXPOSURES, viewGains } from "./exposure.js";
+import { AS_PHOTOGRAPHED, EXPOSURES, hasExposureMap, viewExposure } from "./exposure.js";
 import { Fields, MEMORY_REASON, UnsupportedDeviceError } from "./fields.js";
 import { ContextLostError, countContextChange } from "./graphics.js";
+import { MergedFields } from "./merged_fields.js";
 import { Loader, StartError, SupersededError } from "./loader.js";
 import { Renderer } from "./renderer.js";
 import { Splats } from "./splats.js";
@@ -179,7 +180,7 @@ export class Player extends EventTarget {
   }
 
   // Uploads a content that the worker has read, and then shows it instead of the old one. Returns whether it is shown.
-  async install(loader, { number, whole, scene, model, splats, picture }) {
+  async install(loader, { number, whole, scene, models, splats, picture }) {
     const { gl } = this.renderer, initial = loader.scene ? null : initialView(scene);
     let content = null, staged = null;
     try {
@@ -187,8 +188,8 @@ export class Player extends EventTarget {
       await this.renderer.prepare();
       await loader.picture?.decode();
       gl.getError(); // clears earlier errors
-      if (model) {
-        content = new Fields(gl, model);
+      if (models) {
+        content = models.length > 1 ? new MergedFields(gl, models) : new Fields(gl, models[0]);
         const view = this.view(loader.update && sameAxes(this.scene, scene) ? this.eye : initial?.eye);
         await content.prepare(view.eye);
         // The first picture is shown before it is complete, but a picture is replaced by complete ones only.
@@ -206,13 +207,13 @@ export class Player extends EventTarget {
       await this.waitFor(loader);
       const error = gl.getError();
       if (content.graphics.lost) throw new ContextLostError();
-      if (error !== gl.NO_ERROR && model) throw new UnsupportedDeviceError(MEMORY_REASON);
+      if (error !== gl.NO_ERROR && models) throw new UnsupportedDeviceError(MEMORY_REASON);
       if (error !== gl.NO_ERROR) throw new Error("It does not fit into the memory of the graphics device.");
     } catch (error) {
       content?.dispose();
       // After a lost context, `onRestored` decodes the file again.
       if (error instanceof ContextLostError || error instanceof SupersededError) return false;
-      if (!model) throw error;
+      if (!models || models.length > 1) throw error; // merged models have no harmonics
       const isUnsupported = error instanceof UnsupportedDeviceError;
       const reason = isUnsupported ? error.message : "this device's driver refuses the fields.";
       loader.remark = `Drawn with harmonics: ${reason}`;
@@ -296,12 +297,12 @@ export class Player extends EventTarget {
 
   // Returns whether the scene has an exposure map. Without one, both exposures are the same.
   get hasExposureMap() {
-    return Boolean(this.scene?.exposure);
+    return this.scene !== null && hasExposureMap(this.scene);
   }
 
-  // Returns the gains of red, green and blue for a view.
-  gains(view) {
-    return viewGains(this.scene, view, this.exposure);
+  // Returns the exposure of a view, as Renderer.draw takes it.
+  exposureOf(view) {
+    return viewExposure(this.scene, view, this.exposure);
   }
 
   // Returns the factor of the resolution of the next frame, in (0, 1].
@@ -408,7 +409,7 @@ export class Player extends EventTarget {
       const view = this.view(), { content } = this.renderer;
       const frameMs = Math.max(TARGET_FRAME_MS, this.took ?? 0);
       if (moving) content.recolor(view, this.scene.tolerance, COLORING_RATIO * frameMs);
-      this.renderer.draw(view, scale, this.gains(view));
+      this.renderer.draw(view, scale, this.exposureOf(view));
       if (this.quick || (this.blank && this.times.first !== null)) this.present();
       this.frames++;
       this.began = now;
@@ -527,7 +528,7 @@ export class Player extends EventTarget {
   // Returns a promise of a picture file (Blob) of the canvas at full size. `type` and `quality` are those of toBlob.
   capture(type = "image/png", quality = undefined) {
     const view = this.view();
-    this.renderer.draw(view, this.resolution, this.gains(view));
+    this.renderer.draw(view, this.resolution, this.exposureOf(view));
     this.present();
     return new Promise((resolve) => this.canvas.toBlob(resolve, type, quality));
   }
@@ -543,7 +544,7 @@ export class Player extends EventTarget {
       if (!sorted || !isWanted()) return;
       this.unsorted = true;
       this.setOrder(sorted);
-      pictures.push(this.renderer.read(view, this.gains(view)));
+      pictures.push(this.renderer.read(view, this.exposureOf(view)));
     };
     for (const view of views) await this.enqueue(() => draw(view));
     this.sort(); // for the window's view
@@ -567,7 +568,7 @@ export class Player extends EventTarget {
       await sort();
       await content.complete(view, this.scene.tolerance, { exact: true, blend: (seen) => this.renderer.blended(seen) });
       await sort(); // meanwhile frames of the window may have got another order
-      return this.renderer.read(view, this.gains(view));
+      return this.renderer.read(view, this.exposureOf(view));
     });
     this.unsorted = true;
     this.redraw();

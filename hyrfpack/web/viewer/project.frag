@@ -27,6 +27,8 @@ uniform vec2 u_size;
 uniform float u_near;
 uniform float u_tolerance; // band around the picture in which centres may lie, as a fraction of half its size
 uniform float u_pick; // > 0: instead of a colour, z / (z + u_pick)
+uniform vec4 u_flat; // instead, this colour for all splats, if alpha is 1
+uniform int u_first_row; // of the target
 
 layout(location = 0) out uvec4 o_shape; // centre x, y in pixels; covariance xx, xy
 layout(location = 1) out uvec4 o_look; // covariance yy; its determinant; halves red, green; halves blue, opacity
@@ -84,7 +86,7 @@ vec3 harmonics(ivec2 place, vec3 d) {
 void main() {
     o_shape = uvec4(0u);
     o_look = uvec4(0u); // opacity 0: not drawn
-    ivec2 place = ivec2(gl_FragCoord.xy);
+    ivec2 place = ivec2(gl_FragCoord.xy) - ivec2(0, u_first_row);
     if (place.y * textureSize(u_places, 0).x + place.x >= u_count) return;
 
     uvec4 packed = texelFetch(u_places, place, 0);
@@ -139,6 +141,7 @@ void main() {
         color = vec3(levels) * 3.0 / vec3(2047.0, 2047.0, 1023.0) - 1.0;
         if (u_degree > 0) color += harmonics(place, normalize(mean - u_eye));
     }
+    if (u_flat.a > 0.0) color = u_flat.rgb;
     color = u_pick > 0.0 ? vec3(p.z / (p.z + u_pick)) : clamp(color, 0.0, 100.0); // far below what halves hold
 
     o_shape = uvec4(floatBitsToUint(focal * slope + principal), floatBitsToUint(vec2(xx + u_low_pass.y, xy)));

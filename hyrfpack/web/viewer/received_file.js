@@ -1,6 +1,6 @@
 // Collects the bytes of a file while they arrive, and identifies its format from the first of them.
 
-import { ENTRY_BYTES, HEADER_BYTES, MAGIC_BYTES, MAX_SECTIONS } from "../hyrf/container.js";
+import { ENTRY_BYTES, HEADER_BYTES, MAGIC_BYTES, MAX_SECTIONS, PART_NAMES_TYPE } from "../hyrf/container.js";
 import { describe } from "../hyrf/index.js";
 
 const MAX_FIRST_LAYER_RATIO = 0.8; // a first layer that is a larger part of its file is not decoded alone
@@ -19,6 +19,7 @@ export class ReceivedFile {
     this.firstLayerLength = Infinity; // finite once a model is known to have a first layer that may be decoded alone
     this.firstBytes = new Uint8Array(HEADER_BYTES + ENTRY_BYTES * MAX_SECTIONS); // null once the format is known
     this.isOtherFormat = false;
+    this.isMerged = false; // whether it is a file of several models
   }
 
   // Whether the bytes so far are of a model, as far as they show.
@@ -69,6 +70,7 @@ export class ReceivedFile {
     if (sections <= MAX_SECTIONS && length < HEADER_BYTES + ENTRY_BYTES * sections) return;
     const description = describe(available);
     this.maxLength = description.length;
+    this.isMerged = description.sections.some(({ type }) => type === PART_NAMES_TYPE);
     if (this.layered && description.firstLayer < MAX_FIRST_LAYER_RATIO * description.length) {
       this.firstLayerLength = description.firstLayer;
     }

@@ -3,9 +3,11 @@
 
 import { Graphics } from "./graphics.js";
 import { BACKGROUND_RADIUS, TEXTURE_WIDTH } from "./constants.js";
+import { viewFromPlace } from "./places.js";
 
 const MAX_READ_SIDE_PIXELS = 8192; // the limit of pictures that are read back
 const QUADS_PER_INSTANCE = 1024; // drivers are slow with many small instances
+const MAX_ABS_LOG_GAIN = 8; // in files
 const LOW_PASS_VARIANCE = 0.3; // px^2, as in hyrfpack render
 
 export class Renderer {
@@ -25,6 +27,7 @@ export class Renderer {
     this.blend = this.graphics.program("blend.vert", "blend.frag");
     this.resolve = this.graphics.program("whole.vert", "resolve.frag");
     this.ready = null; // a promise that resolves when the programs are compiled
+    this.surfaces = { colors: null, logs: null }; // of blended splats, {texture, target, size}
     this.frame = null; // the picture of the last frame, {texture, target, size}
     this.finished = false; // whether `frame` must be copied to the canvas
 
@@ -92,12 +95,12 @@ export class Renderer {
     this.drawn = drawn;
   }
 
-  // Draws a frame of a view, with splats at `scale` times its resolution. `gains` are those of exposure.js. `present`
+  // Draws a frame of a view, with splats at `scale` times its resolution. `exposure` is from exposure.js. `present`
   // shows it, once `busy` is false: the browser waits for the device to show a canvas, and would keep the page waiting.
-  draw(view, scale, gains) {
+  draw(view, scale, exposure) {
     const { gl } = this, size = [view.width, view.height].map((side) => Math.max(1, Math.round(side * scale)));
-    this.splats({ ...resizeView(view, ...size), scale });
-    this.over(view, size, this.frameTarget(view.width, view.height), gains);
+    this.blendAll({ ...resizeView(view, ...size), scale }, exposure);
+    this.over(view, size, this.frameTarget(view.width, view.height), exposure);
     gl.deleteSync(this.fence);
     this.fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
     gl.flush();
@@ -126,14 +129,14 @@ export class Renderer {
   }
 
   // Draws a view and returns its RGB bytes, top row first. Throws an Error with a message for the user on failure.
-  read(view, gains) {
+  read(view, exposure) {
     const { gl, graphics } = this, { width, height } = view;
     this.check(view);
     gl.getError(); // clears earlier errors
     const texture = graphics.texture(gl.TEXTURE_2D, gl.RGBA8, width, height);
     const target = graphics.framebuffer(texture);
-    this.splats(view);
-    this.over(view, [width, height], target, gains);
+    this.blendAll(view, exposure);
+    this.over(view, [width, height], target, exposure);
     const rgba = new Uint8Array(4 * width * height);
     gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, rgba);
     const refused = gl.getError() !== gl.NO_ERROR && !gl.isContextLost();
@@ -155,7 +158,7 @@ export class Renderer {
   pick(view, x, y, scale) {
     const { gl } = this;
     const place = [Math.floor(x), Math.floor(y), 1, 1];
-    this.splats(view, scale, place);
+    this.splats(view, { pick: scale }, place);
     const found = this.fine ? new Float32Array(4) : new Uint8Array(4);
     gl.readPixels(...place, gl.RGBA, this.fine ? gl.FLOAT : gl.UNSIGNED_BYTE, found);
     const [value, , , alpha] = found;
@@ -173,13 +176,18 @@ export class Renderer {
     return false;
   }
 
-  // Blends the splats of a view at the pixels of `part` (x, y, width, height). If `pick` is not 0, it is the `scale` of
-  // the method `pick`, and depths are blended instead of colours.
-  splats(view, pick = 0, part = [0, 0, view.width, view.height]) {
+  // Blends the splats of a view and, if its parts have exposures of their own, their log gains.
+  blendAll(view, { partLogs }) {
+    if (partLogs) this.splats(view, { partLogs });
+    this.splats(view);
+  }
+
+  // Blends the splats of a view at the pixels of `part` (x, y, width, height). With `pick`, the `scale` of the method
+  // `pick`, depths are blended instead of colours; with `partLogs`, log gains of each part of the scene.
+  splats(view, paint = {}, part = [0, 0, view.width, view.height]) {
     const { gl, graphics, blend } = this, { width, height } = view;
-    this.projections(view, pick);
-    this.reserve(width, height);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.layers);
+    this.projections(view, paint);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.reserve(paint.partLogs ? "logs" : "colors", width, height).target);
     gl.viewport(0, 0, width, height);
     gl.enable(gl.SCISSOR_TEST);
     gl.scissor(...part);
@@ -203,15 +211,30 @@ export class Renderer {
   // Blends the splats of a view. Returns their picture, whose first rows and columns are in use.
   blended(view) {
     this.splats(view);
-    return this.layered;
+    return this.surfaces.colors.texture;
   }
 
-  // Projects all splats of a view.
-  projections(view, pick) {
-    const { gl, graphics, project: p, content, scene } = this, { colors, harmonics } = content;
+  // Projects all splats of a view. For `paint` see `splats`.
+  projections(view, paint) {
+    const { content } = this;
+    if (!content.parts) {
+      this.projectPart(content, view, 0, { pick: paint.pick ?? 0 });
+      return;
+    }
+    for (const [number, { fields, place, firstRow }] of content.parts.entries()) {
+      const flat = paint.partLogs?.[number].map(encodeLog) ?? null, pick = (paint.pick ?? 0) / place.scale;
+      this.projectPart(fields, viewFromPlace(view, place), firstRow, { pick, flat });
+    }
+  }
+
+  // Projects the splats of a content to the rows from `firstRow` on. `flat` is a colour for all of them, or null.
+  projectPart(content, view, firstRow, { pick, flat = null }) {
+    const { gl, graphics, project: p, scene } = this, { colors, harmonics } = content;
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.projection);
-    gl.viewport(0, 0, ...this.tableSize);
+    gl.viewport(0, firstRow, TEXTURE_WIDTH, content.height);
     gl.useProgram(p.program);
+    gl.uniform1i(p.u_first_row, firstRow);
+    gl.uniform4f(p.u_flat, ...(flat ?? [0, 0, 0]), flat ? 1 : 0);
     const colored = colors ? { u_colors: colors } : this.unused;
     graphics.bind(p, { u_places: content.places, u_shapes: content.shapes, ...colored });
     graphics.bind(p, harmonics ? { u_harmonics: harmonics } : this.noLayers, gl.TEXTURE_2D_ARRAY, 3);
@@ -234,7 +257,7 @@ export class Renderer {
   }
 
   // Composites the blended splats, which fill the size `used`, over the background, to a target.
-  over(view, used, target, gains) {
+  over(view, used, target, { gains = [1, 1, 1], partLogs }) {
     const { gl, graphics, resolve: r, scene, content } = this, picture = content.panorama?.texture ?? this.picture;
     const sky = content.sky?.of(view);
     const { center, radius } = backgroundSphere(scene);
@@ -242,7 +265,9 @@ export class Renderer {
     gl.viewport(0, 0, view.width, view.height);
     gl.useProgram(r.program);
     const behind = { u_background: picture ?? this.plain, u_sky: sky?.texture ?? this.plain };
-    graphics.bind(r, { u_splats: this.layered, ...behind });
+    const { colors, logs } = this.surfaces;
+    graphics.bind(r, { u_splats: colors.texture, ...behind, u_logs: partLogs ? logs.texture : this.plain });
+    gl.uniform4f(r.u_log_behind, ...(partLogs?.[0].map(encodeLog) ?? [0, 0, 0]), partLogs ? 1 : 0);
     gl.uniform2f(r.u_used, ...used);
     gl.uniform1i(r.u_pictured, picture ? 1 : 0);
     gl.uniform1f(r.u_stride, sky?.stride ?? 0);
@@ -255,21 +280,25 @@ export class Renderer {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  // Provides a target for the splats of at least this size.
-  reserve(width, height) {
-    const { gl, graphics } = this, [w, h] = this.reserved ?? [0, 0];
-    if (width <= w && height <= h) return;
-    this.release();
-    this.reserved = [Math.max(w, width), Math.max(h, height)];
-    this.layered = graphics.texture(gl.TEXTURE_2D, this.fine ? gl.RGBA16F : gl.RGBA8, ...this.reserved);
+  // Returns a target, {texture, target}, of at least this size for blended "colors" or "logs".
+  reserve(name, width, height) {
+    const { gl, graphics } = this, surface = this.surfaces[name], [w, h] = surface?.size ?? [0, 0];
+    if (width <= w && height <= h) return surface;
+    this.free(name);
+    const size = [Math.max(w, width), Math.max(h, height)];
+    const texture = graphics.texture(gl.TEXTURE_2D, this.fine ? gl.RGBA16F : gl.RGBA8, ...size);
     graphics.setLinear();
-    this.layers = graphics.framebuffer(this.layered);
+    return (this.surfaces[name] = { texture, target: graphics.framebuffer(texture), size });
   }
 
-  // Frees the target of `reserve`.
+  // Frees the targets of `reserve`.
   release() {
-    for (const object of [this.layered, this.layers]) this.graphics.free(object);
-    this.layered = this.layers = this.reserved = null;
+    for (const name of Object.keys(this.surfaces)) this.free(name);
+  }
+
+  free(name) {
+    for (const object of [this.surfaces[name]?.texture, this.surfaces[name]?.target]) this.graphics.free(object);
+    this.surfaces[name] = null;
   }
 
   dispose() {
@@ -286,6 +315,9 @@ function backgroundSphere({ kind, sphere, center, unit }) {
   if (!sphere) return { center: [0, 0, 0], radius: Infinity };
   return { center: sphere.center.map((value, axis) => (value - center[axis]) / unit), radius: sphere.radius / unit };
 }
+
+// Returns a log gain as a colour in [0, 1], which targets of 8 bits can hold, too. resolve.frag decodes it.
+const encodeLog = (log) => (log + MAX_ABS_LOG_GAIN) / (2 * MAX_ABS_LOG_GAIN);
 
 // Returns the variances of the low-pass filter at `scale` times the full resolution, in pixels of that resolution: that
 // of the full resolution, and the sum of that and the variance of the mean over 1 / scale pixels, which makes a picture

@@ -12,6 +12,8 @@ uniform float u_stride; // pixels of the target between its nodes; 0: do not use
 uniform vec3 u_from; // the eye in units of the sphere's radius, from its centre
 uniform vec3 u_solid;
 uniform vec3 u_gains; // of the exposure; 1 changes nothing
+uniform sampler2D u_logs; // instead, blended log gains from -8 to 8 as 0 to 1, like u_splats
+uniform vec4 u_log_behind; // that of the background; take these if alpha is 1
 uniform mat3 u_world; // world from camera
 uniform vec4 u_intrinsics; // fx, fy, cx, cy in pixels of the target
 uniform vec2 u_size; // of the target
@@ -38,5 +40,10 @@ void main() {
     if (sky.a > 0.99) behind = sky.rgb;
     else if (u_pictured) behind = background(normalize(u_world * vec3((pixel - u_intrinsics.zw) / u_intrinsics.xy, 1.0)));
     vec3 color = clamp(splats.rgb + (1.0 - splats.a) * behind, 0.0, 1.0);
-    o_color = vec4(u_gains * color / (1.0 + (u_gains - 1.0) * color), 1.0);
+    vec3 gains = u_gains;
+    if (u_log_behind.a > 0.0) {
+        vec4 logs = texture(u_logs, texel / vec2(textureSize(u_logs, 0)));
+        gains = exp(16.0 * (logs.rgb + (1.0 - logs.a) * u_log_behind.rgb) - 8.0);
+    }
+    o_color = vec4(gains * color / (1.0 + (gains - 1.0) * color), 1.0);
 }

@@ -13,16 +13,17 @@
 //     {close}                                the reader is no longer needed
 // Messages from the worker:
 //     {progress: {what, part}}
-//     {content: {number, whole, scene, model | splats, picture}}   see pack.js
+//     {content: {number, whole, scene, models | splats, picture}}   see pack.js
 //     {order: {ticket, number, order, drawn}}
 //     {error}                                the reason, as soon as it is certain that the file cannot be read
 
 import { fitHarmonics } from "../hyrf/harmonics.js";
-import { read } from "../hyrf/index.js";
+import { read, readParts } from "../hyrf/index.js";
 import { viewpointOf } from "../hyrf/viewpoint.js";
 import { TEXTURE_WIDTH } from "./constants.js";
 import { rejectOtherFiles } from "./other_files.js";
-import { packModel, packSplats } from "./pack.js";
+import { joinPositions, packModel, packSplats } from "./pack.js";
+import { movePositions, placeOf } from "./places.js";
 import { ReceivedFile } from "./received_file.js";
 import { backgroundPicture, modelScene, splatsScene } from "./scene.js";
 import { DepthSort } from "../hyrf/sort.js";
@@ -136,7 +137,9 @@ class SceneReader {
     const content = { number: ++this.contents, whole: !partial };
     this.reportProgress("unpacking", 0);
     let positions;
-    if (file.isModel) {
+    if (file.isMerged) {
+      positions = this.decodeMerged(await readParts(bytes), content);
+    } else if (file.isModel) {
       const model = await read(bytes, { partial });
       content.scene = { ...(scene ?? { ...modelScene(model, name), ...stage }), exposure: model.exposure };
       positions = model.positions;
@@ -147,7 +150,7 @@ class SceneReader {
         content.splats = packSplats(await fitHarmonics(model, fitted, HARMONICS_DEGREE, report));
         content.picture = backgroundPicture(model);
       } else {
-        content.model = packModel(model);
+        content.models = [packModel(model)];
       }
     } else {
       rejectOtherFiles(bytes);
@@ -162,11 +165,27 @@ class SceneReader {
     this.reportProgress("unpacking", 1);
     this.post({ content }, listBuffers(content));
   }
+
+  // Packs the parts of a merged file for a content. Returns the positions of all their Gaussians.
+  decodeMerged(parts, content) {
+    const { name, scene, stage, plain } = this.request, frame = parts[0].model.config.frame;
+    if (plain) throw new Error("It holds merged models, which this device cannot draw.");
+    const placed = parts.map(({ model }) => ({ model, place: placeOf(model.config.frame, frame) }));
+    const count = parts.reduce((sum, { model }) => sum + model.count, 0);
+    const own = scene ?? { ...modelScene(parts[0].model, name), ...stage };
+    const described = placed.map(({ model: { exposure }, place }) => ({ exposure, place }));
+    content.scene = { ...own, count, exposure: null, parts: described };
+    content.models = placed.map(({ model, place }, number) => {
+      const packed = packModel(model);
+      return { ...packed, place, background: number === 0 && packed.background };
+    });
+    return joinPositions(placed.map(({ model, place }) => movePositions(model.positions, place)));
+  }
 }
 
 // Returns the buffers of all arrays of a content, which are transferred with its message.
-function listBuffers({ splats, model, picture }) {
-  const parts = [splats, model, model?.geometry, model?.radiance, picture];
+function listBuffers({ splats, models = [], picture }) {
+  const parts = [splats, ...models.flatMap((model) => [model, model.geometry, model.radiance]), picture];
   const values = parts.flatMap((part) => Object.values(part ?? {}));
   return [...new Set(values.filter(ArrayBuffer.isView).map(({ buffer }) => buffer))];
 }

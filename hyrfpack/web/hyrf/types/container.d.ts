@@ -18,6 +18,11 @@ export declare const MAGIC_BYTES: number[];
 export declare const HEADER_BYTES = 48;
 export declare const ENTRY_BYTES = 40;
 export declare const MAX_SECTIONS = 1024;
+/**
+ * Returns the largest number of bytes that all sections of a file of `length` bytes may decode to.
+ * @param {number} length
+ */
+export declare const rawBytesLimit: (length: number) => number;
 /** The maximum number of layers of Gaussians in a file. */
 export declare const MAX_LAYERS = 8;
 export declare const LAYERED_TYPES: string[];
@@ -30,6 +35,15 @@ export declare const EXPOSURE_TYPE = "EXPO";
  * @param {number} layer counted from 0
  */
 export declare const layerType: (type: string, layer: number) => string;
+/** The maximum number of parts of a merged file. */
+export declare const MAX_PARTS = 64;
+/** The type of the names of the parts, which only merged files have. */
+export declare const PART_NAMES_TYPE = "PRTS";
+/**
+ * Returns the type of the section that holds a part of a merged file.
+ * @param {number} number counted from 0
+ */
+export declare const partType: (number: number) => string;
 /** The sections of a file whose header and table of contents have been checked. */
 export declare class Container {
     bytes: Uint8Array<ArrayBufferLike>;

@@ -46,17 +46,30 @@ export type ExpectedSection = {
 /**
  * Describes a file by its header and its table of contents.
  * @param {Uint8Array} bytes the start of a file, or all of it
- * @returns {Description} all lengths in bytes; a model of the first layer needs the first `firstLayer` bytes
+ * @returns {Description} all lengths in bytes; a model of the first layer needs the first `firstLayer` bytes. A merged
+ *   file is needed whole
  * @throws {HyrfFormatError} the header or the table of contents is invalid
  */
 export declare const describe: (bytes: Uint8Array) => Description;
 /**
- * Decodes a file.
+ * Decodes a file of one model.
  * @param {Uint8Array} bytes the file, or its start if `partial` is true
  * @param {{partial?: boolean}} [options] `partial`: accept the start of a file, and read the layers that are complete
  * @returns {Promise<Model>}
- * @throws {HyrfFormatError} the file is damaged, truncated or too new; or `bytes` has no complete layer
+ * @throws {HyrfFormatError} the file is damaged, truncated or too new; `bytes` has no complete layer; or the file is a
+ *   merged one
  */
 export declare const read: (bytes: Uint8Array, { partial }?: {
     partial?: boolean;
 }) => Promise<Model>;
+/**
+ * Decodes all parts of a merged file, or the one model of any other file. The first part is the scene, whose background
+ * and cameras are those of the file.
+ * @param {Uint8Array} bytes the whole file
+ * @returns {Promise<{name: string, model: Model}[]>}
+ * @throws {HyrfFormatError} the file is damaged, truncated or too new
+ */
+export declare const readParts: (bytes: Uint8Array) => Promise<{
+    name: string;
+    model: Model;
+}[]>;
