@@ -34,9 +34,11 @@ REJECTED_ARGUMENTS = {
     "import_splats": ("missing.ply", "out.hyrf"),
     "estimate_poses": ("missing", "out"),
     "export_model": ("missing.hyrf", "out.spz"),
+    "load_merged_model": ("missing.hyrf",),
     "load_model": ("missing.hyrf",),
     "load_scene": ("missing",),
     "make_scene": ("missing", "out.html"),
+    "merge_models": (["missing.hyrf"], "out.hyrf"),
     "plan_edit": ("missing.hyrf", [Center()]),
 }
 

@@ -37,6 +37,7 @@ from hyrfpack.cli.export import export
 from hyrfpack.cli.imports import import_
 from hyrfpack.cli.info import info
 from hyrfpack.cli.make import make
+from hyrfpack.cli.merge import merge
 from hyrfpack.cli.poses import poses
 from hyrfpack.cli.render import render
 from hyrfpack.cli.train import train
@@ -150,6 +151,7 @@ for _command in (
     import_,
     convert,
     edit,
+    merge,
     bench,
     info,
     demo,

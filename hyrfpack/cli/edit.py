@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +18,7 @@ from hyrfpack.cli.common import (
     resolve_model_file,
     scene_options,
 )
+from hyrfpack.cli.ordered import OrderedCommand, options_in_order
 from hyrfpack.cli.types import BOX, OUTPUT, PATH, Numbers, NumbersOrWord
 from hyrfpack.config.compress import PROFILES
 from hyrfpack.config.edit import (
@@ -48,7 +49,6 @@ if TYPE_CHECKING:
     from hyrfpack.edit import EditReport
 
 AUTO = "auto"
-_ORDER_KEY = "hyrfpack.cli.edit.order"
 
 
 def _read_polygon(path: Path) -> Action:
@@ -78,16 +78,7 @@ _ACTION_BY_OPTION: dict[str, Callable[[Any], Action]] = {
 }
 
 
-class _OrderedCommand(click.Command):
-    """A command that keeps the order in which its options were given."""
-
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        _, _, given = self.make_parser(ctx).parse_args(args=list(args))
-        ctx.meta[_ORDER_KEY] = [str(parameter.name) for parameter in given]
-        return super().parse_args(ctx, args)
-
-
-@click.command(short_help="Crop, clean, reduce and move a model.", cls=_OrderedCommand)
+@click.command(short_help="Crop, clean, reduce and move a model.", cls=OrderedCommand)
 @click.argument("model", type=PATH)
 @click.option("-o", "--output", type=OUTPUT, metavar="FILE", help="The .hyrf file to write.")
 @click.option("--plan", is_flag=True, help="Print what the actions would do, and write no model.")
@@ -168,6 +159,7 @@ class _OrderedCommand(click.Command):
     help="Rotate the scene about the origin so that its up direction becomes +y, as in three.js, Unity and glTF, or "
     "+z, as in Blender, Unreal and CAD.",
 )
+@click.option("--part", metavar="NAME", help="The part of a merged file that is taken out and edited.")
 @click.option("--profile", type=click.Choice(PROFILES), help="Profile of the file to write.  [default: that of MODEL]")
 @click.option(
     "--data",
@@ -185,6 +177,7 @@ def edit(
     output: Path | None,
     plan: bool,
     picture: Path | None,
+    part: str | None,
     profile: str | None,
     data: Path | None,
     overwrite: bool,
@@ -208,8 +201,11 @@ def edit(
       hyrfpack edit room.hyrf -o hole.hyrf --crop-box=-1,-1,-1,1,1,1 --invert
       hyrfpack edit survey.hyrf -o meters.hyrf --scale 2.54
       hyrfpack edit bonsai.hyrf -o upright.hyrf --up auto --upright z --center
+      hyrfpack edit furnished.hyrf -o chair.hyrf --part chair
     """
-    actions = _read_actions(ctx.meta[_ORDER_KEY], values)
+    actions = _read_actions(options_in_order(ctx, values))
+    if not actions and part is None:
+        raise click.UsageError("there is nothing to do; give at least one action, such as --crop-sphere 0,0,0,1")
     if plan == (output is not None):
         raise click.UsageError("give either -o FILE to write the edited model, or --plan to see what would change")
     from hyrfpack.edit import edit_model, plan_edit
@@ -218,10 +214,19 @@ def edit(
     model = resolve_model_file(model)
     scene = None if data is None else read_scene(data, reader_options, describe_file(model))
     if plan:
-        report = plan_edit(model, actions, data=scene, picture=picture, overwrite=overwrite)
+        report = plan_edit(model, actions, part=part, data=scene, picture=picture, overwrite=overwrite)
     else:
         assert output is not None
-        report = edit_model(model, output, actions, profile=profile, data=scene, picture=picture, overwrite=overwrite)
+        report = edit_model(
+            model,
+            output,
+            actions,
+            part=part,
+            profile=profile,
+            data=scene,
+            picture=picture,
+            overwrite=overwrite,
+        )
         note_rename(output, report.file)
     if as_json:
         print_json(report.to_dict())
@@ -229,26 +234,23 @@ def edit(
         _print_report(report)
 
 
-def _read_actions(order: Sequence[str], values: dict[str, Any]) -> list[Action]:
-    """Return the actions that the options name, in the order in which these were given.
+def _read_actions(options: Iterable[tuple[str, Any]]) -> list[Action]:
+    """Return the actions that options name by their names and values, in this order.
 
     Raises:
-        UsageError: there is no action, a number is out of its range, or --invert does not follow a crop.
+        UsageError: a number is out of its range, or --invert does not follow a crop.
     """
-    left = {name: list(given) if isinstance(given, tuple) else [None] * given for name, given in values.items()}
     actions: list[Action] = []
-    for name in order:
+    for name, value in options:
         if name == "invert":
             if not actions or not isinstance(actions[-1], Crop):
                 raise click.UsageError("--invert must follow an option that crops, such as --crop-box")
             actions[-1] = Remove(actions[-1])
-        elif name in _ACTION_BY_OPTION:
+        else:
             try:
-                actions.append(_ACTION_BY_OPTION[name](left[name].pop(0)))
+                actions.append(_ACTION_BY_OPTION[name](value))
             except ValueError as error:
                 raise click.UsageError(f"--{name.replace('_', '-')}: {error}") from error
-    if not actions:
-        raise click.UsageError("there is nothing to do; give at least one action, such as --crop-sphere 0,0,0,1")
     return actions
 
 

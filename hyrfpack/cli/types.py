@@ -95,6 +95,23 @@ class NumbersOrWord(Numbers):
         return value if value == self._word else super().convert(value, param, ctx)
 
 
+class NamedNumbers(Numbers):
+    """A name and a fixed number of finite numbers: NAME=0,1.5,2."""
+
+    name = "named numbers"
+
+    def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
+        return f"NAME={self._form}"
+
+    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        if isinstance(value, tuple):  # click converts again what it has converted
+            return value
+        name, _, numbers = str(value).rpartition("=")
+        if not name:
+            self.fail(f"'{value}' names no model; write it as NAME={self._form}", param, ctx)
+        return name, super().convert(numbers, param, ctx)
+
+
 class _HarmonicsDegree(click.ParamType):
     """A degree of spherical harmonics, or "auto", which becomes None."""
 

@@ -364,6 +364,7 @@ class EstimateUp:
         return "estimate up from the cameras"
 
 
+Move = Translate | Rotate | Scale
 Action = (
     Crop
     | Remove
@@ -372,9 +373,7 @@ Action = (
     | RemoveFloaters
     | KeepGaussians
     | Background
-    | Translate
-    | Scale
-    | Rotate
+    | Move
     | Upright
     | Center
     | Up

@@ -17,8 +17,9 @@ from hyrfpack.cameras.paths import estimate_up
 from hyrfpack.checks import check_type
 from hyrfpack.compress import compress_model
 from hyrfpack.config.compress import CompressConfig
-from hyrfpack.config.edit import Action, Background, Center, EstimateUp, Rotate, Scale, Translate, Up, Upright
+from hyrfpack.config.edit import Action, Background, Center, EstimateUp, Move, Up, Upright
 from hyrfpack.context import RunContext
+from hyrfpack.edit.merge import take_part
 from hyrfpack.edit.select import keep_mask
 from hyrfpack.edit.state import EditState
 from hyrfpack.edit.transform import Placement, replace_config, unit_vector
@@ -93,6 +94,7 @@ def edit_model(
     target: StrPath,
     actions: Sequence[Action],
     *,
+    part: str | None = None,
     profile: str | None = None,
     data: Scene | None = None,
     picture: StrPath | None = None,
@@ -107,8 +109,9 @@ def edit_model(
     Args:
         source: a file of any profile, or the folder of a run.
         target: the file to write. It may not be `source`.
-        actions: at least one of the actions of `hyrfpack.config.edit`, in order. Each sees the result of the one before
-            it, so positions after a move are new ones.
+        actions: actions of `hyrfpack.config.edit`, in order, at least one unless `part` is given. Each sees the result
+            of the one before it, so positions after a move are new ones.
+        part: the part of a merged file that is taken out and edited.
         profile: profile of the file to write; None keeps that of `source`.
         data: photos of the scene. Held-out ones are scored before and after, others decide what a floater is.
         picture: a .png or .jpg file to write: the scene before and after, side by side.
@@ -116,7 +119,8 @@ def edit_model(
         context: progress. Edits run on the CPU.
 
     Raises:
-        HyrfError: a file cannot be read or written, or no Gaussian would be left.
+        HyrfError: a file cannot be read or written, no Gaussian would be left, or `part` is missing for a merged file
+            or names none of its parts.
         TypeError: `actions` has something else than actions.
         ValueError: there are no actions.
 
@@ -127,13 +131,14 @@ def edit_model(
         >>> len(report.actions), report.profile
         (2, 'compact')
     """
-    path = _check_request(source, actions, data)
+    path = _check_request(source, actions, data, part)
     outputs = Outputs(path, scene=data, overwrite=overwrite)
     outputs.file(target, ".hyrf")
     if picture is not None:
         outputs.file(picture, *PICTURE_ENDINGS)
-    compression = CompressConfig(profile=profile or describe_file(path)["profile"])
-    with context.open_progress("edit") as progress:
+    with tempfile.TemporaryDirectory() as folder, context.open_progress("edit") as progress:
+        path = take_part(path, part, folder)
+        compression = CompressConfig(profile=profile or describe_file(path)["profile"])
         edit = _apply(path, actions, data, part_of_progress(progress, 0, 0.3))
         written = _write(
             edit,
@@ -153,6 +158,7 @@ def plan_edit(
     source: StrPath,
     actions: Sequence[Action],
     *,
+    part: str | None = None,
     data: Scene | None = None,
     picture: StrPath | None = None,
     overwrite: bool = True,
@@ -165,6 +171,7 @@ def plan_edit(
     Args:
         source: a file of any profile, or the folder of a run.
         actions: as for `edit_model`.
+        part: as for `edit_model`.
         data: photos of the scene. Held-out ones are scored before and after.
         picture: as for `edit_model`.
         overwrite: replace an existing picture. If False, it is an error.
@@ -182,10 +189,11 @@ def plan_edit(
         >>> report.actions[0].gaussians_after <= report.actions[0].gaussians_before
         True
     """
-    path = _check_request(source, actions, data)
+    path = _check_request(source, actions, data, part)
     if picture is not None:
         Outputs(path, scene=data, overwrite=overwrite).file(picture, *PICTURE_ENDINGS)
-    with context.open_progress("edit") as progress:
+    with tempfile.TemporaryDirectory() as folder, context.open_progress("edit") as progress:
+        path = take_part(path, part, folder)
         edit = _apply(path, actions, data, part_of_progress(progress, 0, 0.5))
         report = _measure(edit, data, part_of_progress(progress, 0.5, 1))
         if picture is not None:
@@ -193,14 +201,14 @@ def plan_edit(
     return report
 
 
-def _check_request(source: StrPath, actions: Sequence[Action], data: Scene | None) -> Path:
+def _check_request(source: StrPath, actions: Sequence[Action], data: Scene | None, part: str | None) -> Path:
     """Return the path of the file to edit, after a check of the arguments.
 
     Raises:
         HyrfError: there is no file.
         TypeError, ValueError: the arguments are not valid.
     """
-    if not actions:
+    if not actions and part is None:
         raise ValueError("there are no actions; give at least one")
     for action in actions:
         if not isinstance(action, Action):
@@ -268,12 +276,8 @@ def _apply_action(action: Action, state: EditState) -> tuple[EditState, str]:
 
 def _find_move(action: Action, state: EditState) -> Placement | None:
     """Return the map of world positions that an action applies, None if it moves nothing."""
-    if isinstance(action, Translate):
-        return Placement.translation(action.offset)
-    if isinstance(action, Scale):
-        return Placement(action.factor)
-    if isinstance(action, Rotate):
-        return Placement.rotation_about_axis(action.axis, action.degrees)
+    if isinstance(action, Move):
+        return Placement.of(action)
     if isinstance(action, Upright):
         return Placement(rotation=upright_rotation(unit_vector(state.up), np.eye(3)["xyz".index(action.axis)]))
     if isinstance(action, Center):

@@ -12,6 +12,7 @@ import numpy as np
 
 from hyrfpack.cameras.files import camera_from_numbers, camera_to_numbers
 from hyrfpack.cameras.paths import Viewpoint
+from hyrfpack.config.edit import Move, Rotate, Scale, Translate
 from hyrfpack.model import HybridModel
 from hyrfpack.model.frame import Frame
 from hyrfpack.rotations import IDENTITY, quaternion_from_matrix, rotation_matrix
@@ -47,6 +48,21 @@ class Placement:
         x, y, z = math.sin(math.radians(degrees) / 2) * unit_vector(axis)
         return cls(rotation=rotation_matrix((math.cos(math.radians(degrees) / 2), x, y, z)))
 
+    @classmethod
+    def of(cls, move: Move) -> Placement:
+        """Return the map of a move.
+
+        Raises:
+            TypeError: it is no move.
+        """
+        if isinstance(move, Translate):
+            return cls.translation(move.offset)
+        if isinstance(move, Rotate):
+            return cls.rotation_about_axis(move.axis, move.degrees)
+        if isinstance(move, Scale):
+            return cls(move.factor)
+        raise TypeError(f"{move!r} is no move; use Translate, Rotate or Scale of hyrfpack.config.edit")
+
     def then(self, step: Placement) -> Placement:
         """Return the map of this one followed by `step`."""
         return Placement(self.factor * step.factor, step.rotation @ self.rotation, step.move_point(self.offset))
@@ -74,13 +90,16 @@ class Placement:
         """Return the view of the moved scene that shows the same photo."""
         return replace(view, camera=self.move_camera(view.camera))
 
-    def move_model(self, model: HybridModel) -> HybridModel:
-        """Return the moved model, which shares all parameters with `model`: only its frame differs."""
-        frame = model.config.frame
+    def move_frame(self, frame: Frame) -> Frame:
+        """Return the frame of a moved model."""
         x, y, z = self.move_point(frame.center).tolist()
         w, i, j, k = (quaternion_from_matrix(self.rotation @ frame.axes) + 0.0).tolist()  # + 0.0 turns -0.0 into 0.0
         rotation = IDENTITY if 2 * math.hypot(i, j, k) < MIN_TURN_RADIANS else (w, i, j, k)
-        return replace_config(model, frame=Frame((x, y, z), self.factor * frame.scale, frame.half_extent, rotation))
+        return Frame((x, y, z), self.factor * frame.scale, frame.half_extent, rotation)
+
+    def move_model(self, model: HybridModel) -> HybridModel:
+        """Return the moved model, which shares all parameters with `model`: only its frame differs."""
+        return replace_config(model, frame=self.move_frame(model.config.frame))
 
     def move_provenance(self, provenance: dict) -> dict:
         """Return a provenance with moved cameras and viewpoint. Entries that cannot be read are left out."""

@@ -1,0 +1,169 @@
+"""Merge models into one file, and take parts out again."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+from hyrfpack.config.edit import Move
+from hyrfpack.edit.transform import Placement
+from hyrfpack.errors import HyrfError
+from hyrfpack.format.arrays import parse_config
+from hyrfpack.format.container import Container
+from hyrfpack.format.metadata import read_metadata
+from hyrfpack.format.part_names import open_parts, printable_name
+from hyrfpack.format.parts import write_parts
+from hyrfpack.format.rewrite import with_metadata
+from hyrfpack.format.run_folder import find_model
+from hyrfpack.format.sections import MAX_PARTS, PART_NAMES, SECTION_CONTENTS
+from hyrfpack.outputs import Outputs, StrPath
+
+
+@dataclass(frozen=True)
+class MergedPart:
+    """One part of a merged file.
+
+    Attributes:
+        name: its name in the file.
+        source: path of the file that it comes from.
+        gaussians, bytes: its size.
+    """
+
+    name: str
+    source: str
+    gaussians: int
+    bytes: int
+
+
+@dataclass(frozen=True)
+class MergeReport:
+    """What `merge_models` has written.
+
+    Attributes:
+        file: path of the file.
+        bytes: its size.
+        parts: its parts, the scene first.
+    """
+
+    file: str
+    bytes: int
+    parts: list[MergedPart]
+
+    def to_dict(self) -> dict:
+        """Return the report as numbers, strings, lists and dictionaries for JSON."""
+        return asdict(self)
+
+
+def merge_models(
+    sources: Sequence[StrPath],
+    target: StrPath,
+    moves: Mapping[str, Sequence[Move]] | None = None,
+    *,
+    overwrite: bool = True,
+) -> MergeReport:
+    """Write several models into one file, in which they are drawn together in one order of depth.
+
+    The bytes of each model are copied. The first source is the scene: its background, viewpoint and cameras are those
+    of the result. The parts of a source that is a merged file itself become parts of the result.
+
+    Args:
+        sources: `.hyrf` files or folders of runs, in one world.
+        target: the file to write.
+        moves: moves of sources, by the name of their file without its ending or of their folder; in order.
+        overwrite: replace an existing file. If False, an existing file is an error.
+
+    Raises:
+        HyrfError: a file cannot be read or written, `moves` names no source or two, there are too many parts, or some
+            models are antialiased and others not.
+        TypeError: an action of `moves` is no move.
+        ValueError: there is no source.
+
+    Example:
+        >>> import hyrfpack
+        >>> from hyrfpack.config.edit import Translate
+        >>> report = hyrfpack.merge_models(["bonsai.hyrf", "bonsai.hyrf"], "two.hyrf")
+        >>> len(report.parts), report.parts[1].name
+        (2, 'bonsai 2')
+    """
+    if not sources:
+        raise ValueError("there are no models; give at least one")
+    paths = [find_model(source) for source in sources]
+    stems = [Path(source).stem for source in sources]
+    placements = _check_moves(stems, moves or {})
+    Outputs(*paths, overwrite=overwrite).file(target, ".hyrf")
+    parts: list[tuple[MergedPart, bytes]] = []
+    antialiased: dict[bool, str] = {}
+    with ExitStack() as stack:
+        for path, stem in zip(paths, stems, strict=True):
+            container = stack.enter_context(Container.open(path, SECTION_CONTENTS))
+            is_merged = PART_NAMES in container.entries
+            for name, part in open_parts(container) if is_merged else [(stem, container)]:
+                metadata = read_metadata(part)
+                antialiased[parse_config(metadata.config).antialiased] = str(path)
+                data = _moved_bytes(part, placements[stem]) if stem in placements else part.read_bytes()
+                taken = {other.name for other, _ in parts}
+                merged = MergedPart(_free_name(name, taken), str(path), metadata.gaussians, len(data))
+                parts.append((merged, data))
+    if len(antialiased) > 1:
+        raise HyrfError(
+            f"{antialiased[True]} is antialiased and {antialiased[False]} is not, so one picture cannot show both",
+            fix="train both with the same `antialiased`",
+        )
+    if len(parts) > MAX_PARTS:
+        raise HyrfError(f"there are {len(parts)} parts, and a file holds {MAX_PARTS}", fix="merge fewer models")
+    written = write_parts([(part.name, data) for part, data in parts], target, overwrite=overwrite)
+    return MergeReport(written, Path(written).stat().st_size, [part for part, _ in parts])
+
+
+def take_part(path: Path, part: str | None, folder: StrPath) -> Path:
+    """Return the path of a file of one model: `path` itself, or a copy in `folder` of a part of a merged file.
+
+    Raises:
+        HyrfError: the file is damaged, `part` is None for a merged file, or there is no such part.
+    """
+    with Container.open(path, SECTION_CONTENTS) as container:
+        parts = dict(open_parts(container)) if PART_NAMES in container.entries else {}
+        if not parts and part is None:
+            return path
+        if not parts:
+            raise HyrfError(f"{path}: it holds one model and no parts", fix="leave out `part`")
+        if part not in parts:
+            names = ", ".join(f"'{name}'" for name in parts)
+            raise HyrfError(f"{path}: it holds the parts {names}", fix="name one of them with `part`")
+        copy = Path(folder, "part.hyrf")
+        copy.write_bytes(parts[part].read_bytes())
+        return copy
+
+
+def _check_moves(stems: Sequence[str], moves: Mapping[str, Sequence[Move]]) -> dict[str, Placement]:
+    """Return the placement of each source that is moved, by its name."""
+    placements = {}
+    for name, actions in moves.items():
+        if stems.count(name) != 1:
+            found = "none" if name not in stems else "several"
+            raise HyrfError(
+                f"a move names the model '{name}', and {found} of the models {', '.join(stems)} has this name",
+                fix="name a file without its folder and ending; rename a file if two have the same name",
+            )
+        placement = Placement()
+        for action in actions:
+            placement = placement.then(Placement.of(action))
+        placements[name] = placement
+    return placements
+
+
+def _moved_bytes(part: Container, placement: Placement) -> bytes:
+    """Return the bytes of a model that is placed elsewhere; only its metadata differ."""
+    metadata = read_metadata(part)
+    config = parse_config(metadata.config)
+    moved = replace(config, frame=placement.move_frame(config.frame))
+    return with_metadata(part, moved, placement.move_provenance(metadata.provenance))
+
+
+def _free_name(name: str, taken: set[str]) -> str:
+    """Return a name that is not taken: "chair", "chair 2", ..."""
+    base = printable_name(name)
+    names = [base, *(f"{base} {number}" for number in range(2, MAX_PARTS + 2))]
+    return next(free for free in names if free not in taken)
