@@ -20,6 +20,7 @@ from hyrfpack.format.container import MINOR_VERSION, Section, read_container, wr
 from hyrfpack.format.part_names import write_part_names
 from hyrfpack.format.parts import encode_parts, write_parts
 from tools.safety import minimal_reader
+from tools.safety.make_golden import GOLDEN_MERGED_FILE, GOLDEN_PARTS, encode_golden_parts
 
 GOLDEN_FOLDER = Path(__file__).parents[1] / "golden"
 PAPER, COMPACT = ((GOLDEN_FOLDER / name).read_bytes() for name in ("v1.0_paper.hyrf", "v1.2_compact_exposure.hyrf"))
@@ -209,6 +210,16 @@ def test_a_truncated_merged_file_is_refused(tmp_path_factory, length):
 
     with pytest.raises(HyrfFormatError):
         load_merged_model(path)
+
+
+def test_the_golden_merged_file_is_read_and_written_as_before():
+    merged = load_merged_model(GOLDEN_MERGED_FILE)
+
+    assert list(merged.names) == list(GOLDEN_PARTS)
+    for model, file in zip(merged.parts, GOLDEN_PARTS.values(), strict=True):
+        for name, values in load_model(GOLDEN_FOLDER / f"{file}.hyrf").state_dict().items():
+            assert torch.equal(model.state_dict()[name], values), name
+    assert encode_golden_parts() == GOLDEN_MERGED_FILE.read_bytes()
 
 
 def test_the_same_parts_give_the_same_bytes(tmp_path):

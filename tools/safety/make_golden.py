@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from hyrfpack.choices import CONSISTENT_EXPOSURE
 from hyrfpack.format import decode_model
 from hyrfpack.format.arrays import to_arrays
+from hyrfpack.format.parts import encode_parts
 from hyrfpack.model import ExposureMap, Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.render import RenderSettings, render_view
@@ -66,6 +67,11 @@ GOLDEN_FILES = {
     "v1.2_compact_exposure": GoldenFile("compact", {"distortion": 5e-4}, GOLDEN_EXPOSURE_MAP),
     "v1.3_compact_rotated": GoldenFile("compact", {"distortion": 5e-4}, GOLDEN_EXPOSURE_MAP, GOLDEN_ROTATION),
 }
+
+
+# Name and file of each part of the merged file. It lies in a folder of its own, because it is read in another way.
+GOLDEN_PARTS = {"scene": "v1.2_compact_exposure", "turned": "v1.3_compact_rotated", "on paper": "v1.0_paper"}
+GOLDEN_MERGED_FILE = GOLDEN_FOLDER / "merged" / "v1.4_merged.hyrf"
 
 
 def make_golden_model(rotation: Quaternion = IDENTITY) -> HybridModel:
@@ -162,6 +168,11 @@ def expect_exposure(exposure: minimal_reader.Exposure, model: HybridModel) -> di
     }
 
 
+def encode_golden_parts() -> bytes:
+    """Return the bytes of the merged file."""
+    return encode_parts([(name, (GOLDEN_FOLDER / f"{file}.hyrf").read_bytes()) for name, file in GOLDEN_PARTS.items()])
+
+
 def main() -> None:
     for name, golden in GOLDEN_FILES.items():
         target = GOLDEN_FOLDER / f"{name}.hyrf"
@@ -176,6 +187,10 @@ def main() -> None:
         target.write_bytes(data)
         np.savez_compressed(target.with_suffix(".npz"), **values)
         print(f"{target}: {len(data)} bytes")
+    if not GOLDEN_MERGED_FILE.exists():
+        GOLDEN_MERGED_FILE.parent.mkdir(exist_ok=True)
+        GOLDEN_MERGED_FILE.write_bytes(encode_golden_parts())
+        print(f"{GOLDEN_MERGED_FILE}: {GOLDEN_MERGED_FILE.stat().st_size} bytes")
 
 
 if __name__ == "__main__":
