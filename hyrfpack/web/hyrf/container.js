@@ -175,7 +175,8 @@ export class Container {
       if (end <= this.bytes.length) promised += raw;
     }
     if (end !== this.length) rejectDamaged("its sections end elsewhere than the file");
-    if (promised > rawBytesLimit(this.bytes.length)) rejectDamaged(`its sections say they decode to ${groupedDigits(promised)} bytes, too many`);
+    const limit = rawBytesLimit(this.bytes.length);
+    if (promised > limit) rejectDamaged(`its sections say they decode to ${groupedDigits(promised)} bytes, too many`);
   }
 }
 

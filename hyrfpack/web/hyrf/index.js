@@ -1,9 +1,8 @@
 // Reads models from the bytes of `.hyrf` files, versions 1.0 to 1.4 (docs/reference/format.md).
 
 import { decodeChannels } from "./channels.js";
-import {
-  Container, EXPOSURE_TYPE, FIELD_TYPES, LAYERED_TYPES, PART_NAMES_TYPE, layerType, rejectIncomplete,
-} from "./container.js";
+import { Container, EXPOSURE_TYPE, FIELD_TYPES, LAYERED_TYPES } from "./container.js";
+import { PART_NAMES_TYPE, layerType, rejectIncomplete } from "./container.js";
 import { DamagedData, HyrfError, HyrfFormatError, rejectDamaged, rejectNewer } from "./errors.js";
 import { decodeExposure } from "./exposure.js";
 import { FEATURES_PER_ROW, decoderSize, tableRows } from "./grids.js";

@@ -23,7 +23,8 @@ export const readPartNames = (container) => {
   /** @type {any} */
   let content = null;
   try {
-    content = JSON.parse(new TextDecoder("utf-8", { fatal: true, ignoreBOM: true }).decode(container.stored(PART_NAMES_TYPE)));
+    const decoder = new TextDecoder("utf-8", { fatal: true, ignoreBOM: true });
+    content = JSON.parse(decoder.decode(container.stored(PART_NAMES_TYPE)));
   } catch (error) {
     if (error instanceof HyrfFormatError) throw error;
     rejectDamaged("the names of its parts are not JSON");
