@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from web.native_models import encode_with_photos, make_model_page, random_model
 from web.pages import Browser, make_splats_page, open_page, psnr, random_splats
-from web.test_native import encode_with_photos, make_model_page, random_model
 
 pytestmark = pytest.mark.in_turn
 

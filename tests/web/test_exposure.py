@@ -12,18 +12,7 @@ import pytest
 import torch
 from exposures import random_map
 from PIL import Image
-from web.pages import (
-    Browser,
-    make_splats_page,
-    open_page,
-    psnr,
-    random_splats,
-    render_in_page,
-    wait_for_message,
-    wait_until,
-    window_camera,
-)
-from web.test_native import (
+from web.native_models import (
     EXACT_SETTINGS,
     MODEL_FRAME,
     load_page,
@@ -35,6 +24,17 @@ from web.test_native import (
     store_file_in_page,
     wait_until_complete,
 )  # fmt: skip
+from web.pages import (
+    Browser,
+    make_splats_page,
+    open_page,
+    psnr,
+    random_splats,
+    render_in_page,
+    wait_for_message,
+    wait_until,
+    window_camera,
+)
 from web.test_sources import Site, serve_site
 
 from hyrfpack.cameras.capture import provenance_cameras
