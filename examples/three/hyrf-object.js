@@ -5,6 +5,7 @@ import {
   BufferAttribute, BufferGeometry, DataTexture, Group, LinearFilter, Matrix3, Matrix4, Mesh, Object3D, Quaternion,
   RepeatWrapping, ShaderMaterial, Vector2, Vector3, Vector4,
 } from "three";
+import { logGains } from "hyrf.js/exposure.js";
 import { BACKGROUND_RADIUS } from "hyrf.js/fields.js";
 import { CULL_MARGIN_RATIO, NEAR_PLANE_LOCAL } from "hyrf.js/frustum.js";
 import { openRemoteModel } from "hyrf.js/remote.js";
@@ -16,6 +17,7 @@ import { compositeFragment, skyFragment, wholeVertex } from "./shaders.js";
 
 const RGBA_BYTES = 4;
 const FIRST_IN_SCENE = -1e9; // `renderOrder` of the background
+const AS_PHOTOGRAPHED = "as-photographed", CONSISTENT = "consistent"; // the names in hyrfpack.RenderSettings
 
 /**
  * A model in the file's world units, rotated so that up is +y. It may be moved, turned and scaled uniformly.
@@ -56,6 +58,7 @@ export class HyrfObject extends Object3D {
     this.model = model;
     /** Whether everything that the camera of the last frame sees is evaluated. */
     this.isComplete = false;
+    this.exposureMode = AS_PHOTOGRAPHED;
     const { metadata, config, count, exposure } = model, { center, scale, rotation = IDENTITY_QUAT } = config.frame;
     const { cameras, up, target } = viewpointOf(metadata);
     const near = NEAR_PLANE_LOCAL * scale, far = 2.5 * BACKGROUND_RADIUS * scale;
@@ -68,8 +71,10 @@ export class HyrfObject extends Object3D {
       u_intrinsics: { value: new Vector4() }, u_size: { value: new Vector2() }, u_corner: { value: new Vector2() },
       u_depth: { value: new Vector3() },
       u_near: { value: NEAR_PLANE_LOCAL }, u_margin: { value: CULL_MARGIN_RATIO },
-      u_antialiased: { value: config.antialiased },
+      u_antialiased: { value: config.antialiased }, u_gains: { value: new Vector3(1, 1, 1) },
     };
+    const [fine, coarse] = model.sky ? skyTextures(model.sky) : [null, null];
+    const skyUniforms = { ...this.view, u_fine_sky: { value: fine }, u_coarse_sky: { value: coarse } };
     const [w, ...vector] = rotation;
     this.frame = new Group(); // has the model's local units and axes
     this.frame.position.set(...center);
@@ -77,18 +82,40 @@ export class HyrfObject extends Object3D {
     this.frame.scale.setScalar(scale);
     this.add(this.frame);
     this.gaussians = new GaussianPass(count, this.view);
-    this.composite = wholeMesh(compositeFragment, { ...this.view, u_blended: { value: null } }, true);
+    const compositeUniforms = { ...skyUniforms, u_blended: { value: null }, u_has_sky: { value: Boolean(model.sky) } };
+    this.composite = wholeMesh(compositeFragment, compositeUniforms, true);
     this.composite.onBeforeRender = (...drawn) => this.drawGaussians(...drawn);
     this.frame.add(this.gaussians.mesh, this.composite);
     if (model.sky) {
-      const { width, height, coarseWidth, coarseHeight } = model.sky;
-      this.skies = [skyTexture(width, height), skyTexture(coarseWidth, coarseHeight)];
-      const [u_fine_sky, u_coarse_sky] = this.skies.map((value) => ({ value }));
-      this.sky = wholeMesh(skyFragment, { ...this.view, u_fine_sky, u_coarse_sky }, false);
+      this.skies = [fine, coarse];
+      this.sky = wholeMesh(skyFragment, skyUniforms, false);
       this.sky.renderOrder = FIRST_IN_SCENE;
       this.sky.onBeforeRender = (...drawn) => this.setView(...drawn);
       this.frame.add(this.sky);
     }
+  }
+
+  /**
+   * The exposure of files with an exposure map: "as-photographed", that of the photos taken near the camera, or
+   * "consistent", that of the model.
+   */
+  get exposure() {
+    return this.exposureMode;
+  }
+
+  set exposure(exposure) {
+    if (![AS_PHOTOGRAPHED, CONSISTENT].includes(exposure)) {
+      throw new Error(`exposure must be ${AS_PHOTOGRAPHED} or ${CONSISTENT}, not ${String(exposure)}.`);
+    }
+    this.exposureMode = exposure;
+    this.dispatchEvent({ type: "change" });
+  }
+
+  // Returns the gains of red, green and blue at a place, looking along a direction, both in local units.
+  gains(eye, direction) {
+    const { exposure } = this.model;
+    if (!exposure || this.exposure === CONSISTENT) return [1, 1, 1];
+    return logGains(exposure, eye, direction).map(Math.exp);
   }
 
   receiveOrder(order, drawn) {
@@ -136,6 +163,7 @@ export class HyrfObject extends Object3D {
     u_eye.value.set(...eye).divideScalar(BACKGROUND_RADIUS);
     u_intrinsics.value.set(view.fx, view.fy, view.cx, view.cy);
     u_size.value.set(width, height);
+    this.view.u_gains.value.set(...this.gains(eye, rows[2]));
     u_corner.value.set(x, y);
     u_depth.value.set(p[10], p[14], unit);
     this.look(view);
@@ -186,6 +214,10 @@ function wholeMesh(fragmentShader, uniforms, transparent) {
   mesh.raycast = () => {};
   return mesh;
 }
+
+// Returns the textures of the fine and of the coarse picture of the background.
+const skyTextures = ({ width, height, coarseWidth, coarseHeight }) =>
+  [skyTexture(width, height), skyTexture(coarseWidth, coarseHeight)];
 
 function skyTexture(width, height) {
   const texture = new DataTexture(new Uint8Array(RGBA_BYTES * width * height), width, height);

@@ -120,6 +120,31 @@ void main() {
 }
 `;
 
+// Applies the gains of the exposure to a displayed colour. Gains of 1 change nothing.
+const EXPOSURE = `
+uniform vec3 u_gains;
+
+vec3 expose(vec3 color) {
+    return u_gains * color / (1.0 + (u_gains - 1.0) * color);
+}
+`;
+
+// Looks the background up by the point of its sphere that a pixel sees.
+const SKY = `
+uniform sampler2D u_coarse_sky, u_fine_sky; // equirectangular; the fine one has alpha 0 where it is not evaluated yet
+uniform vec3 u_eye; // in units of the sphere's radius
+
+vec3 sky(vec2 pixel) {
+    vec2 slope = (vec2(pixel.x, u_size.y - pixel.y) - u_intrinsics.zw) / u_intrinsics.xy;
+    vec3 ray = normalize(vec3(slope, 1.0) * u_rotation);
+    float along = dot(u_eye, ray);
+    vec3 d = normalize(u_eye + (sqrt(max(along * along - dot(u_eye, u_eye) + 1.0, 0.0)) - along) * ray);
+    vec2 place = vec2(0.5 + atan(d.x, d.z) / 6.283185307179586, 0.5 + asin(clamp(d.y, -1.0, 1.0)) / 3.141592653589793);
+    vec4 fine = texture2D(u_fine_sky, place);
+    return fine.rgb + (1.0 - fine.a) * texture2D(u_coarse_sky, place).rgb;
+}
+`;
+
 // A triangle that covers the picture.
 export const wholeVertex = `
 void main() {
@@ -134,34 +159,39 @@ const OUTPUT = `
     #include <premultiplied_alpha_fragment>
 `;
 
+// Gains apply to the sum of Gaussians and background. So with gains, the colour is what the background, which has its
+// gains already, lacks of that sum. It is exact where no mesh is behind the Gaussians.
 export const compositeFragment = `
+${VIEW}
+${EXPOSURE}
+${SKY}
 uniform sampler2D u_blended; // premultiplied
 uniform vec2 u_corner; // the lower left corner of the viewport in pixels
+uniform bool u_has_sky;
 
 void main() {
-    vec4 blended = texelFetch(u_blended, ivec2(gl_FragCoord.xy - u_corner), 0);
+    vec2 pixel = gl_FragCoord.xy - u_corner;
+    vec4 blended = texelFetch(u_blended, ivec2(pixel), 0);
     if (blended.a <= 0.0) discard;
-    gl_FragColor = vec4(clamp(blended.rgb / blended.a, 0.0, 1.0), blended.a);
+    vec3 color = blended.rgb / blended.a;
+    if (u_gains != vec3(1.0)) {
+        vec3 behind = u_has_sky ? sky(pixel) : color;
+        float passed = 1.0 - blended.a;
+        color = (expose(clamp(blended.rgb + passed * behind, 0.0, 1.0)) - passed * expose(behind)) / blended.a;
+    }
+    gl_FragColor = vec4(clamp(color, 0.0, 1.0), blended.a);
     ${OUTPUT}
 }
 `;
 
-// Looks the background up by the point of its sphere that a pixel sees.
 export const skyFragment = `
 ${VIEW}
-uniform sampler2D u_coarse_sky, u_fine_sky; // equirectangular; the fine one has alpha 0 where it is not evaluated yet
-uniform vec3 u_eye; // in units of the sphere's radius
+${EXPOSURE}
+${SKY}
 uniform vec2 u_corner;
 
 void main() {
-    vec2 pixel = gl_FragCoord.xy - u_corner;
-    vec2 slope = (vec2(pixel.x, u_size.y - pixel.y) - u_intrinsics.zw) / u_intrinsics.xy;
-    vec3 ray = normalize(vec3(slope, 1.0) * u_rotation);
-    float along = dot(u_eye, ray);
-    vec3 d = normalize(u_eye + (sqrt(max(along * along - dot(u_eye, u_eye) + 1.0, 0.0)) - along) * ray);
-    vec2 place = vec2(0.5 + atan(d.x, d.z) / 6.283185307179586, 0.5 + asin(clamp(d.y, -1.0, 1.0)) / 3.141592653589793);
-    vec4 fine = texture2D(u_fine_sky, place);
-    gl_FragColor = vec4(fine.rgb + (1.0 - fine.a) * texture2D(u_coarse_sky, place).rgb, 1.0);
+    gl_FragColor = vec4(expose(sky(gl_FragCoord.xy - u_corner)), 1.0);
     ${OUTPUT}
 }
 `;
