@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 import torch
 from exposures import map_with_gains
-from web.pages import Browser, camera_json, psnr, render_in_page
-from web.test_native import (
+from web.native_models import (
     MODEL_FRAME,
     SCENE_CENTER,
     UP_DIRECTION,
@@ -20,6 +19,7 @@ from web.test_native import (
     random_model,
     render_reference,
 )
+from web.pages import Browser, camera_json, psnr, render_in_page
 
 from hyrfpack.format import encode_model
 from hyrfpack.format.parts import encode_parts

@@ -108,9 +108,10 @@ def test_the_pages_own_scene_is_shown_when_another_file_fails_to_open(one_browse
     file = tmp_path / "page.html"
     file.write_bytes(make_model_page(random_model(3000)))
     script = (
-        "addEventListener('DOMContentLoaded', () => setTimeout(() => { window.bad = hyrfpack.player.open("
+        "const open = () => { if (!globalThis.hyrfpack?.player) return setTimeout(open, 1);"
+        "window.bad = hyrfpack.player.open("
         "{ name: 'bad.hyrf', stream: (async function* () { yield new Uint8Array(100); })() })"
-        ".then(() => '', (error) => error.message); }, 50))"
+        ".then(() => '', (error) => error.message); }; open();"
     )
     with one_browser.before_every_page(script):
         one_browser.open(file.as_uri())
@@ -126,8 +127,9 @@ def test_a_file_opened_before_the_pages_own_scene_is_loaded_replaces_it(one_brow
     other = base64.b64encode(encode_model(random_model(70))).decode()
     script = (
         f"const other = Uint8Array.from(atob('{other}'), (c) => c.charCodeAt(0));"
-        "addEventListener('DOMContentLoaded', () => setTimeout(() => { window.good = hyrfpack.player.open("
-        "{ name: 'good.hyrf', stream: (async function* () { yield other; })() }).then(() => true); }, 50))"
+        "const open = () => { if (!globalThis.hyrfpack?.player) return setTimeout(open, 1);"
+        "window.good = hyrfpack.player.open("
+        "{ name: 'good.hyrf', stream: (async function* () { yield other; })() }).then(() => true); }; open();"
     )
     with one_browser.before_every_page(script):
         one_browser.open(file.as_uri())

@@ -85,7 +85,7 @@ def test_a_moving_view_has_its_own_background_where_that_is_quick(browser: Brows
                  "player.eye.orbit(0.4, 0.1); window.view = player.view();"
     )  # fmt: skip
     for unit_ms, follows in (("null", False), ("1e4", False), ("1e-4", True)):
-        run_statements(browser, f"content.panorama.pace.unit = {unit_ms}; content.recolor(view, 0.3, 8);")
+        run_statements(browser, f"content.panorama.pace.unit = {unit_ms}; content.recolor(view, 0.3, 8, true);")
         assert browser.evaluate("content.sky.of(view) !== null") == follows
     camera = camera_from_json(browser.evaluate("hyrfpack.camera()"))
     assert psnr(draw_moving_frame(browser, 1).astype(float), render_reference(model, camera)) > 45

@@ -5,7 +5,8 @@
 For cameras that each model stores, in pictures as large as the photos or --enlarge times as large, the table has the
 mean and the worst PSNR in dB of the page of `hyrfpack export` against `render_view` without any approximation: at rest,
 and as frames are drawn at a part of the resolution while the view moves, against the mean over blocks of the exact
-render. The browser is headless Chromium.
+render. Moving frames have the panorama behind them, or the background of the view, which devices that evaluate it
+quickly enough take. The browser is headless Chromium.
 """
 
 from __future__ import annotations
@@ -24,22 +25,27 @@ import hyrfpack
 from hyrfpack.scene import Camera
 from tools.browser.browser import Browser
 from tools.browser.chromium import Chromium
-from tools.studies.web_player import PAGE_TIMEOUT_SECONDS, draw_in_page, open_page, psnr, stored_cameras
+from tools.studies.web_player import PAGE_TIMEOUT_SECONDS, draw_in_page, open_page, psnr, read_from_page, stored_cameras
 from tools.tables import markdown_table
 
 EXACT_SETTINGS = hyrfpack.RenderSettings(background_threshold=0, transmittance_min=0)
-# From here on, pictures are drawn as a frame at a part of the resolution is, without what is added at rest. The
-# panorama of the background has its final tiles in view, as after a rest at a view near this one.
+# From here on, pictures are those of frames at a part of the resolution, before they are enlarged, without what is
+# added at rest. The panorama has its final tiles in view, as after a rest at a view near this one. With
+# `hyrfpack.follows`, the background is evaluated for the view instead, as where the device is quick enough.
 MOVING_SCRIPT = """(() => {
-  const { renderer } = hyrfpack.player, { content, read } = renderer, { complete } = content, scale = 1 / %d;
+  const { renderer } = hyrfpack.player, { content, gl } = renderer, { complete } = content;
   content.complete = async function (view, ...rest) {
     await this.panorama?.complete(view, () => true);
-    return complete.call(this, view, ...rest);
+    await complete.call(this, view, ...rest);
+    if (this.sky) this.sky.key = null;
+    if (hyrfpack.follows) this.sky?.follow(view, 0, 0);
   };
-  renderer.read = function ({ width, height, fx, fy, cx, cy, ...pose }, gains) {
-    const [w, h, ...rest] = [width, height, fx, fy, cx, cy].map((value) => value * scale);
-    return read.call(this, { ...pose, width: w, height: h, fx: rest[0], fy: rest[1], cx: rest[2], cy: rest[3], scale },
-      gains);
+  renderer.read = function (view, gains) {
+    this.draw(view, 1 / %d, gains);
+    const { target, size: [width, height] } = this.frame, rgba = new Uint8Array(4 * width * height);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, target);
+    gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, rgba);
+    return rgba.filter((_, place) => (place & 3) !== 3);
   };
 })()"""
 
@@ -67,6 +73,15 @@ def render_exact(model: hyrfpack.MergedModel, cameras: Sequence[Camera]) -> list
     return [hyrfpack.render_view(model, camera, EXACT_SETTINGS).rgb.clamp(0, 1).numpy() for camera in cameras]
 
 
+def draw_moving(browser: Browser, camera: Camera, factor: int) -> np.ndarray:
+    """Return the picture of a moving frame at 1 / factor of the resolution, (H / factor, W / factor, 3) in [0, 1].
+
+    The page draws more rows than that. The result has means of them.
+    """
+    width, height = camera.width // factor, camera.height // factor
+    return read_from_page(browser, camera).reshape(height, -1, width, 3).mean(1)
+
+
 def measure_page(browser: Browser, model: Path, views: int, factor: int, enlarge: int) -> list[str]:
     """Return the row of a model whose page is open."""
     cameras = [cut_camera(enlarge_camera(camera, enlarge), factor) for camera in stored_cameras(model, views)]
@@ -74,11 +89,12 @@ def measure_page(browser: Browser, model: Path, views: int, factor: int, enlarge
     exact = render_exact(field, cameras)
     still = [psnr(draw_in_page(browser, camera), picture) for camera, picture in zip(cameras, exact, strict=True)]
     browser.evaluate(MOVING_SCRIPT % factor)
-    moving = []
-    for camera, picture in zip(cameras, exact, strict=True):
-        drawn = draw_in_page(browser, camera, reduction=factor)
-        moving.append(psnr(drawn, reduce_picture(picture, factor)))
-    cells = [f"{statistic(scores):.1f}" for scores in (still, moving) for statistic in (statistics.mean, min)]
+    table = [still]
+    for follows in ("false", "true"):
+        browser.evaluate(f"hyrfpack.follows = {follows}")
+        pictures = [draw_moving(browser, camera, factor) for camera in cameras]
+        table.append([psnr(*pair) for pair in zip(pictures, (reduce_picture(p, factor) for p in exact), strict=True)])
+    cells = [f"{statistic(scores):.1f}" for scores in table for statistic in (statistics.mean, min)]
     return [f"{model.parent.name}/{model.name}", f"{len(field):,}", str(enlarge), *cells]
 
 
@@ -98,7 +114,9 @@ def main() -> None:
             for enlarge in arguments.enlarge:
                 open_page(browser, page)
                 rows.append(measure_page(browser, model, arguments.views, arguments.factor, enlarge))
-    print(markdown_table(["model", "Gaussians", "size", "still dB", "worst", "moving dB", "worst"], rows))
+    kinds = ("still", "moving", "moving, view's background")
+    columns = [f"{kind}, {statistic} dB" for kind in kinds for statistic in ("mean", "worst")]
+    print(markdown_table(["model", "Gaussians", "size", *columns], rows))
 
 
 if __name__ == "__main__":

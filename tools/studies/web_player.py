@@ -47,11 +47,15 @@ def stored_cameras(model: Path, count: int) -> list[Camera]:
     return evenly_spaced(Capture(hyrfpack.describe_file(model)).cameras, count)
 
 
-def draw_in_page(browser: Browser, camera: Camera, reduction: int = 1) -> np.ndarray:
-    """Draw the view of a camera in the page; return (H, W, 3) in [0, 1], of a picture that is reduced by a factor."""
+def read_from_page(browser: Browser, camera: Camera) -> np.ndarray:
+    """Draw the view of a camera in the page; return the values in [0, 1] of its picture, row by row."""
     browser.evaluate(f"hyrfpack.show({json.dumps(camera_to_json(camera))})")
-    data = base64.b64decode(browser.evaluate(READ_PIXELS_SCRIPT))
-    return np.frombuffer(data, np.uint8).reshape(camera.height // reduction, camera.width // reduction, 3) / 255
+    return np.frombuffer(base64.b64decode(browser.evaluate(READ_PIXELS_SCRIPT)), np.uint8) / 255
+
+
+def draw_in_page(browser: Browser, camera: Camera) -> np.ndarray:
+    """Draw the view of a camera in the page; return (H, W, 3) in [0, 1]."""
+    return read_from_page(browser, camera).reshape(camera.height, camera.width, 3)
 
 
 def write_pages(model: Path, folder: Path, data: Scene | None = None) -> dict[str, Path]:

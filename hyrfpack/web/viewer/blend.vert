@@ -1,5 +1,6 @@
 #version 300 es
-// A splat's quad: as far as its alpha is at least 1/255, along the axes of its ellipse. Row 0 of the target is on top.
+// A splat's quad: as far as its alpha is at least u_alpha_min, along the axes of its ellipse. Row 0 of the target is on
+// top.
 precision highp float;
 precision highp int;
 precision highp usampler2D;
@@ -10,6 +11,7 @@ uniform int u_quads; // an instance
 uniform usampler2D u_shapes; // from project.frag
 uniform usampler2D u_projected; // likewise
 uniform vec2 u_size;
+uniform float u_alpha_min;
 
 flat out vec2 v_mean;
 flat out vec3 v_conic;
@@ -29,7 +31,7 @@ void main() {
     ivec2 place = ivec2(splat % width, splat / width);
     uvec4 look = texelFetch(u_projected, place, 0);
     v_color = vec4(unpackHalf2x16(look.z), unpackHalf2x16(look.w));
-    if (v_color.a * 255.0 < 1.0) return;
+    if (v_color.a < u_alpha_min) return;
 
     vec4 shape = uintBitsToFloat(texelFetch(u_shapes, place, 0));
     float xx = shape.z, xy = shape.w, yy = uintBitsToFloat(look.x), determinant = uintBitsToFloat(look.y);
@@ -39,7 +41,7 @@ void main() {
     float larger = 0.5 * (xx + yy) + length(vec2(0.5 * (xx - yy), xy));
     vec2 axis = xx > yy ? vec2(larger - yy, xy) : vec2(xy, larger - xx);
     axis = dot(axis, axis) > 0.0 ? normalize(axis) : vec2(1.0, 0.0);
-    float reach = 2.0 * log(255.0 * v_color.a);
+    float reach = 2.0 * log(v_color.a / u_alpha_min);
     vec2 extent = sqrt(reach * vec2(larger, determinant / larger)) + SLACK;
     extent = min(extent, 1.5 * (u_size.x + u_size.y)); // centres are near the picture: this covers it
     vec2 corner = vec2(gl_VertexID & 1, (gl_VertexID >> 1) & 1) * 2.0 - 1.0;

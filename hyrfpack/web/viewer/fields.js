@@ -14,6 +14,7 @@ const WEIGHTS_TEXTURE_WIDTH = 1024; // of the texture for a decoder's numbers if
 const WEIGHTS_TEXTURE_UNIT = 6;
 const FIRST_REFRESH_MS = 1000; // after this time a view at rest is drawn again while rows are coloured, then less often
 const MAX_FRESH_TURN_RADIANS = 2e-3; // a larger turn of its viewing direction makes a row's colours stale
+const MOVING_SKY_RATIO = 0.4; // while moving, the share of the time for colours in which a background is quick
 const MOVING_ROWS_DIVISOR = 8; // while moving, a frame colours at most this part of the visible rows
 
 // The device cannot evaluate fields, but it can draw splats. The message gives the reason, as the end of a sentence.
@@ -50,10 +51,10 @@ export class Fields {
     this.features = graphics.texture(gl.TEXTURE_2D_ARRAY, gl.RGBA32UI, ...size, this.layers);
     const floats = [gl.RGBA32F, gl.RGBA, gl.FLOAT, 4];
     await graphics.whenDone();
-    const shaders = this.shaders(), programs = {}, vertexText = readText("whole.vert");
+    const { sky, ...shaders } = this.shaders(), programs = {}, vertexText = readText("whole.vert");
     for (const name of Object.keys(shaders)) programs[name] = graphics.compile(vertexText, shaders[name]);
-    for (const name of ["enlarge", "needed"]) programs[name] = graphics.program("whole.vert", `${name}.frag`);
-    this.programs = programs;
+    programs.enlarge = graphics.program("whole.vert", "enlarge.frag");
+    Object.assign(this, { programs, skyShader: sky });
 
     this.explicit = await graphics.table(floats, TEXTURE_WIDTH, model.explicit);
     this.logits = await graphics.table(floats, TEXTURE_WIDTH, model.logits);
@@ -70,8 +71,17 @@ export class Fields {
     if (model.background) {
       this.panorama = new Panorama(graphics, model, (...area) => this.drawPanorama(...area));
       await this.panorama.begin(eye, programs.enlarge);
-      this.sky = new Sky(graphics, programs.needed, model.backgroundSpacing, (...area) => this.drawSky(...area));
     }
+  }
+
+  // Prepares the background of views at rest, which the first picture does without.
+  async prepareSky() {
+    const { graphics, programs, model: { backgroundSpacing } } = this;
+    const sky = graphics.compile(readText("whole.vert"), this.skyShader);
+    const needed = graphics.program("whole.vert", "needed.frag");
+    await graphics.compiled({ sky, needed });
+    Object.assign(programs, { sky, needed });
+    this.sky = new Sky(graphics, needed, backgroundSpacing, (...area) => this.drawSky(...area));
   }
 
   // Throws an error if the device's memory was too small for the objects so far.
@@ -253,13 +263,15 @@ export class Fields {
     this.passes(this.target, rows);
   }
 
-  // Colours, while the view moves, rows without colours and then the stalest rows, for about `ms`; then draws the
-  // background for about `ms`.
-  recolor(view, margin, ms) {
+  // Colours, while the view moves, rows without colours and then the stalest rows, for about `ms`. Then evaluates the
+  // background as at rest if that is quick and `follows`, or else draws the panorama for about `ms`.
+  recolor(view, margin, ms, follows) {
     const { visible, rows } = this.rows.stale(frustumPlanes(view, margin), view.eye, MAX_FRESH_TURN_RADIANS);
     const most = Math.min(this.pace.within(ms), Math.ceil(visible / MOVING_ROWS_DIVISOR));
     if (rows.length) this.color(rows.slice(0, most), view.eye);
-    this.panorama?.advance(view, ms);
+    const { panorama, sky } = this;
+    if (follows && sky?.follow(view, panorama.texelMs, MOVING_SKY_RATIO * ms)) return;
+    panorama?.advance(view, ms);
   }
 
   // Colours all stale rows in view while `goOn()` is true. If `exact`, any turn of the viewing direction makes colours
@@ -287,7 +299,8 @@ export class Fields {
     };
     const { rows, done } = await this.coloured(view, margin, { goOn, report, exact });
     if (rows) changed();
-    if (!done || !this.sky) return done;
+    if (!done || !this.panorama) return done;
+    if (!this.sky) await this.prepareSky();
     this.sky.begin(view, blend);
     return this.sky.complete({ goOn, changed });
   }

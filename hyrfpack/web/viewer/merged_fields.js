@@ -30,9 +30,9 @@ export class MergedFields {
 
   // For these methods see Fields.
 
-  recolor(view, margin, ms) {
+  recolor(view, margin, ms, follows) {
     for (const { fields, place } of this.parts) {
-      fields.recolor(viewFromPlace(view, place), margin, ms / this.parts.length);
+      fields.recolor(viewFromPlace(view, place), margin, ms / this.parts.length, follows);
     }
   }
 

@@ -27,6 +27,11 @@ export class Panorama {
     this.height = Math.min(MAX_HEIGHT_TEXELS, Math.max(MIN_HEIGHT_TEXELS, enough));
   }
 
+  // Returns the time in ms that a texel takes, or NaN if it is not known yet.
+  get texelMs() {
+    return (this.pace.unit ?? NaN) / (TILE_SIZE_TEXELS[0] * TILE_SIZE_TEXELS[1]);
+  }
+
   get size() {
     return [2 * this.height, this.height];
   }

@@ -24,7 +24,7 @@ import { IDENTITY_QUAT } from "../hyrf/rotation.js";
 
 const SETTLE_MS = 200; // the wait after a movement before the picture is drawn at full resolution
 const TARGET_FRAME_MS = 33; // slower frames lower the resolution while moving
-const FIRST_PICTURE_MS = 2000; // after this time Gaussians that are ready are shown
+const FIRST_PICTURE_MS = 700; // after this time Gaussians that are ready are shown
 const FIRST_PICTURE_REST_MS = 250; // the device does nothing else while the browser shows the first picture
 const QUICK_FRAME_MS = 20; // frames that take less are shown at once
 const MIN_SCALE = 0.2;
@@ -76,6 +76,7 @@ export class Player extends EventTarget {
     this.idle = false; // whether the picture is complete
     this.onIdle = []; // functions that resolve the promises of `settled`
     this.queue = Promise.resolve(); // resolves when all queued work has ended
+    this.showing = false; // whether `show` completes a picture, whose background frames must not replace
     if (scene) this.setScene(initialView(scene));
 
     this.aborter = new AbortController();
@@ -408,7 +409,7 @@ export class Player extends EventTarget {
     if (this.stale || this.shown !== scale) {
       const view = this.view(), { content } = this.renderer;
       const frameMs = Math.max(TARGET_FRAME_MS, this.took ?? 0);
-      if (moving) content.recolor(view, this.scene.tolerance, COLORING_RATIO * frameMs);
+      if (moving) content.recolor(view, this.scene.tolerance, COLORING_RATIO * frameMs, !this.showing);
       this.renderer.draw(view, scale, this.exposureOf(view));
       if (this.quick || (this.blank && this.times.first !== null)) this.present();
       this.frames++;
@@ -559,7 +560,7 @@ export class Player extends EventTarget {
     this.renderer.check(view);
     this.eye.setView(view);
     this.changed();
-    const picture = await this.enqueue(async () => {
+    const draw = async () => {
       const sort = async () => {
         const sorted = await this.loader.sort(view, this.scene);
         if (!sorted || !this.loaded || content !== this.renderer.content) throw new ContextLostError();
@@ -569,6 +570,10 @@ export class Player extends EventTarget {
       await content.complete(view, this.scene.tolerance, { exact: true, blend: (seen) => this.renderer.blended(seen) });
       await sort(); // meanwhile frames of the window may have got another order
       return this.renderer.read(view, this.exposureOf(view));
+    };
+    const picture = await this.enqueue(() => {
+      this.showing = true;
+      return draw().finally(() => (this.showing = false));
     });
     this.unsorted = true;
     this.redraw();

@@ -18,7 +18,8 @@ uniform bool u_colored; // take these: the Gaussians are those of a model
 uniform float u_focal; // max(fx, fy) of the picture at full resolution
 uniform int u_count;
 uniform bool u_antialiased;
-uniform vec2 u_low_pass; // variances in px^2: of the picture at full resolution, and with the mean over its blocks
+// Variances in px^2 along x and y: of the picture at full resolution, and with the mean over its blocks.
+uniform vec4 u_low_pass;
 uniform mat3 u_rotation; // camera from page
 uniform vec3 u_translation;
 uniform vec3 u_eye;
@@ -128,7 +129,7 @@ void main() {
     float xx = dot(first, first), xy = dot(first, second), yy = dot(second, second);
     vec3 normal = cross(first, second); // free of the cancellation in xx yy - xy^2
     float determinant = dot(normal, normal);
-    vec2 filtered = determinant + u_low_pass * (xx + yy + u_low_pass);
+    vec2 filtered = determinant + u_low_pass.xz * yy + u_low_pass.yw * xx + u_low_pass.xz * u_low_pass.yw;
     opacity *= sqrt(filtered.x / filtered.y); // 1 at full resolution
     if (u_antialiased) opacity *= sqrt(max(determinant / filtered.x, COMPENSATION_MIN));
 
@@ -144,8 +145,8 @@ void main() {
     if (u_flat.a > 0.0) color = u_flat.rgb;
     color = u_pick > 0.0 ? vec3(p.z / (p.z + u_pick)) : clamp(color, 0.0, 100.0); // far below what halves hold
 
-    o_shape = uvec4(floatBitsToUint(focal * slope + principal), floatBitsToUint(vec2(xx + u_low_pass.y, xy)));
+    o_shape = uvec4(floatBitsToUint(focal * slope + principal), floatBitsToUint(vec2(xx + u_low_pass.z, xy)));
     o_look = uvec4(
-        floatBitsToUint(vec2(yy + u_low_pass.y, filtered.y)), packHalf2x16(color.rg), packHalf2x16(vec2(color.b, opacity))
+        floatBitsToUint(vec2(yy + u_low_pass.w, filtered.y)), packHalf2x16(color.rg), packHalf2x16(vec2(color.b, opacity))
     );
 }

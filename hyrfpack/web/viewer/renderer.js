@@ -9,6 +9,9 @@ const MAX_READ_SIDE_PIXELS = 8192; // the limit of pictures that are read back
 const QUADS_PER_INSTANCE = 1024; // drivers are slow with many small instances
 const MAX_ABS_LOG_GAIN = 8; // in files
 const LOW_PASS_VARIANCE = 0.3; // px^2, as in hyrfpack render
+const ALPHA_MIN = 1 / 255; // splats are not drawn where their alpha is less, as in hyrfpack render
+const REDUCED_ALPHA_MIN = 1 / 72; // of a picture at a part of the resolution
+const ROWS_PER_COLUMN = 2; // a picture at a part of the resolution keeps this many times as many rows as columns
 
 export class Renderer {
   // Throws an Error with a message for the user if the browser has no WebGL 2.
@@ -95,12 +98,14 @@ export class Renderer {
     this.drawn = drawn;
   }
 
-  // Draws a frame of a view, with splats at `scale` times its resolution. `exposure` is from exposure.js. `present`
-  // shows it, once `busy` is false: the browser waits for the device to show a canvas, and would keep the page waiting.
+  // Draws a frame of a view at `scale` times its resolution. `exposure` is from exposure.js. `present` shows it, once
+  // `busy` is false: the browser waits for the device to show a canvas, and would keep the page waiting. With twice as
+  // many rows, the picture is much nearer to the reduced picture at full resolution, because a pixel where several
+  // small splats meet is not what their mean opacities make of it.
   draw(view, scale, exposure) {
-    const { gl } = this, size = [view.width, view.height].map((side) => Math.max(1, Math.round(side * scale)));
-    this.blendAll({ ...resizeView(view, ...size), scale }, exposure);
-    this.over(view, size, this.frameTarget(view.width, view.height), exposure);
+    const { gl } = this, reduced = resizeView(view, scale, Math.min(1, ROWS_PER_COLUMN * scale));
+    this.blendAll(reduced, exposure);
+    this.over(reduced, this.frameTarget(reduced.width, reduced.height), exposure, view);
     gl.deleteSync(this.fence);
     this.fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
     gl.flush();
@@ -111,10 +116,12 @@ export class Renderer {
   present() {
     if (!this.finished) return false;
     const { gl, frame: { target, size: [width, height] } } = this;
+    const { drawingBufferWidth: w, drawingBufferHeight: h } = gl;
+    const filter = width === w && height === h ? gl.NEAREST : gl.LINEAR;
     this.finished = false;
     gl.bindFramebuffer(gl.READ_FRAMEBUFFER, target);
     gl.bindFramebuffer(gl.DRAW_FRAMEBUFFER, null);
-    gl.blitFramebuffer(0, 0, width, height, 0, height, width, 0, gl.COLOR_BUFFER_BIT, gl.NEAREST); // row 0 is on top
+    gl.blitFramebuffer(0, 0, width, height, 0, h, w, 0, gl.COLOR_BUFFER_BIT, filter); // row 0 is on top
     return true;
   }
 
@@ -136,7 +143,7 @@ export class Renderer {
     const texture = graphics.texture(gl.TEXTURE_2D, gl.RGBA8, width, height);
     const target = graphics.framebuffer(texture);
     this.blendAll(view, exposure);
-    this.over(view, [width, height], target, exposure);
+    this.over(view, target, exposure);
     const rgba = new Uint8Array(4 * width * height);
     gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, rgba);
     const refused = gl.getError() !== gl.NO_ERROR && !gl.isContextLost();
@@ -196,6 +203,7 @@ export class Renderer {
     gl.useProgram(blend.program);
     graphics.bind(blend, { u_order: this.order, u_shapes: this.shapes, u_projected: this.appearances });
     gl.uniform2f(blend.u_size, width, height);
+    gl.uniform1f(blend.u_alpha_min, isReduced(view) ? REDUCED_ALPHA_MIN : ALPHA_MIN);
     gl.uniform1i(blend.u_drawn, this.drawn);
     gl.uniform1i(blend.u_quads, QUADS_PER_INSTANCE);
     gl.enable(gl.BLEND);
@@ -230,6 +238,7 @@ export class Renderer {
   // Projects the splats of a content to the rows from `firstRow` on. `flat` is a colour for all of them, or null.
   projectPart(content, view, firstRow, { pick, flat = null }) {
     const { gl, graphics, project: p, scene } = this, { colors, harmonics } = content;
+    const [across, down] = view.scales ?? [1, 1];
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.projection);
     gl.viewport(0, firstRow, TEXTURE_WIDTH, content.height);
     gl.useProgram(p.program);
@@ -243,8 +252,8 @@ export class Renderer {
     gl.uniform1f(p.u_range, content.range ?? 1);
     gl.uniform1i(p.u_count, content.count);
     gl.uniform1i(p.u_antialiased, content.antialiased);
-    gl.uniform2fv(p.u_low_pass, lowPassVariances(view.scale ?? 1));
-    gl.uniform1f(p.u_focal, Math.max(view.fx, view.fy) / (view.scale ?? 1));
+    gl.uniform4fv(p.u_low_pass, lowPassVariances([across, down]));
+    gl.uniform1f(p.u_focal, Math.max(view.fx / across, view.fy / down));
     gl.uniformMatrix3fv(p.u_rotation, true, view.rows.flat());
     gl.uniform3fv(p.u_translation, view.translation);
     gl.uniform3fv(p.u_eye, view.eye);
@@ -256,10 +265,11 @@ export class Renderer {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  // Composites the blended splats, which fill the size `used`, over the background, to a target.
-  over(view, used, target, { gains = [1, 1, 1], partLogs }) {
+  // Composites the blended splats over the background, to a target of the view's size. `whole` is the view at its full
+  // resolution.
+  over(view, target, { gains = [1, 1, 1], partLogs }, whole = view) {
     const { gl, graphics, resolve: r, scene, content } = this, picture = content.panorama?.texture ?? this.picture;
-    const sky = content.sky?.of(view);
+    const sky = content.sky?.of(whole), stride = sky?.stride ?? 0;
     const { center, radius } = backgroundSphere(scene);
     gl.bindFramebuffer(gl.FRAMEBUFFER, target);
     gl.viewport(0, 0, view.width, view.height);
@@ -268,15 +278,14 @@ export class Renderer {
     const { colors, logs } = this.surfaces;
     graphics.bind(r, { u_splats: colors.texture, ...behind, u_logs: partLogs ? logs.texture : this.plain });
     gl.uniform4f(r.u_log_behind, ...(partLogs?.[0].map(encodeLog) ?? [0, 0, 0]), partLogs ? 1 : 0);
-    gl.uniform2f(r.u_used, ...used);
     gl.uniform1i(r.u_pictured, picture ? 1 : 0);
-    gl.uniform1f(r.u_stride, sky?.stride ?? 0);
+    gl.uniform2f(r.u_stride, (stride * view.width) / whole.width, (stride * view.height) / whole.height);
+    gl.uniform1f(r.u_origin, 0.5 - 0.5 / Math.max(1, stride));
     gl.uniform3fv(r.u_from, view.eye.map((value, axis) => (value - center[axis]) / radius));
     gl.uniform3fv(r.u_solid, scene.solid);
     gl.uniform3fv(r.u_gains, gains);
     gl.uniformMatrix3fv(r.u_world, false, view.rows.flat()); // rows read as columns: transposed
     gl.uniform4f(r.u_intrinsics, view.fx, view.fy, view.cx, view.cy);
-    gl.uniform2f(r.u_size, view.width, view.height);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
@@ -319,17 +328,19 @@ function backgroundSphere({ kind, sphere, center, unit }) {
 // Returns a log gain as a colour in [0, 1], which targets of 8 bits can hold, too. resolve.frag decodes it.
 const encodeLog = (log) => (log + MAX_ABS_LOG_GAIN) / (2 * MAX_ABS_LOG_GAIN);
 
-// Returns the variances of the low-pass filter at `scale` times the full resolution, in pixels of that resolution: that
-// of the full resolution, and the sum of that and the variance of the mean over 1 / scale pixels, which makes a picture
-// at this resolution nearly equal to the reduced picture at full resolution.
-function lowPassVariances(scale) {
-  const full = LOW_PASS_VARIANCE * scale ** 2;
-  return [full, full + (1 - scale ** 2) / 12];
+// Returns the variances of the low-pass filter at `scales` times the full resolution along x and y, in pixels of that
+// resolution: those of the full resolution, and the sums of these and the variances of the mean over 1 / scale pixels,
+// which make a picture at this resolution nearly equal to the reduced picture at full resolution.
+function lowPassVariances(scales) {
+  const full = scales.map((scale) => LOW_PASS_VARIANCE * scale ** 2);
+  return [...full, ...full.map((variance, axis) => variance + (1 - scales[axis] ** 2) / 12)];
 }
 
-// Returns a view at another resolution.
-function resizeView(view, width, height) {
-  const x = width / view.width, y = height / view.height;
-  if (x === 1 && y === 1) return view;
-  return { ...view, width, height, fx: view.fx * x, fy: view.fy * y, cx: view.cx * x, cy: view.cy * y };
+const isReduced = ({ scales }) => scales !== undefined && Math.min(...scales) < 1;
+
+// Returns a view at about `across` and `down` times its resolution along x and y.
+function resizeView(view, across, down) {
+  const width = Math.max(1, Math.round(view.width * across)), height = Math.max(1, Math.round(view.height * down));
+  const [x, y] = [width / view.width, height / view.height];
+  return { ...view, width, height, fx: view.fx * x, fy: view.fy * y, cx: view.cx * x, cy: view.cy * y, scales: [x, y] };
 }

@@ -31,9 +31,9 @@ export class Sky {
   // Starts a view. For `blend` see Fields.complete.
   begin(view, blend) {
     if (this.of(view)) return;
-    const { gl } = this.graphics, { width, height } = view, blended = blend(view);
-    this.stride = backgroundStride(this.spacing, view);
-    this.reserve(...[width, height].map((side) => Math.ceil((side - 1) / this.stride) + 1));
+    const { gl } = this.graphics, blended = blend(view), [stride, ...size] = this.grid(view);
+    this.stride = stride;
+    this.reserve(...size);
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.target);
     gl.clearColor(0, 0, 0, 0);
     gl.clear(gl.COLOR_BUFFER_BIT);
@@ -41,6 +41,28 @@ export class Sky {
     this.view = view;
     this.key = describeView(view);
     this.tiles = cutTiles(...this.size);
+  }
+
+  // Returns the stride, the width and the height of the grid of a view.
+  grid(view) {
+    const stride = backgroundStride(this.spacing, view);
+    return [stride, ...[view.width, view.height].map((side) => Math.ceil((side - 1) / stride) + 1)];
+  }
+
+  // Evaluates all nodes of a moving view, at once, if that takes at most `ms` at `nodeMs` a node. Returns whether it
+  // did.
+  follow(view, nodeMs, ms) {
+    const { gl } = this.graphics, [stride, ...size] = this.grid(view);
+    if (!(size[0] * size[1] * nodeMs <= ms)) return false;
+    this.stride = stride;
+    this.reserve(...size);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.marked);
+    gl.clearColor(1, 1, 1, 1);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+    this.paint(this.target, size, [0, 0, ...size], view, this.needed, stride);
+    this.key = describeView(view);
+    this.tiles = [];
+    return true;
   }
 
   // Provides textures of this number of nodes.
