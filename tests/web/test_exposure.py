@@ -138,7 +138,7 @@ def test_gains_follow_the_viewpoint_of_the_window(browser: Browser, tmp_path: Pa
     for end in [(121, 90), (200, 110), (40, 160)]:
         browser.drag((120, 90), end)
         pose = model.config.frame.local_pose(window_camera(browser))
-        gains = browser.evaluate("hyrfpack.player.gains(hyrfpack.player.view())")
+        gains = browser.evaluate("hyrfpack.player.exposureOf(hyrfpack.player.view()).gains")
         np.testing.assert_allclose(gains, model.exposure.predict_gains(pose), rtol=1e-9)
         seen.append(gains)
     assert np.ptp(seen, axis=0).max() > 0.05
@@ -226,7 +226,8 @@ def test_the_first_layer_of_a_file_is_shown_with_its_map(browser: Browser, tmp_p
     run_statements(
         browser,
         "window.contents = []; const { player } = hyrfpack; player.addEventListener('loaded', () => {"
-        "  contents.push([player.renderer.content.count, player.gains(player.view())]); window.sendRest?.(); });",
+        "  contents.push([player.renderer.content.count, player.exposureOf(player.view()).gains]);"
+        "  window.sendRest?.(); });",
     )
     browser.evaluate(
         "hyrfpack.player.open({ name: 'x.hyrf', stream: (async function* () {"

@@ -49,7 +49,7 @@ def draw_moving_frame(browser: Browser, scale: float) -> np.ndarray:
     """Draw a frame of the page's view at `scale` times its resolution; return the rows of its picture (H, W, 3)."""
     script = f"""(() => {{
         const {{ player }} = hyrfpack, {{ renderer }} = player, {{ gl }} = renderer;
-        renderer.draw(player.view(), {scale}, [1, 1, 1]);
+        renderer.draw(player.view(), {scale}, {{}});
         const {{ target, size: [width, height] }} = renderer.frame, rgba = new Uint8Array(4 * width * height);
         gl.bindFramebuffer(gl.FRAMEBUFFER, target);
         gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, rgba);

@@ -118,7 +118,7 @@ def test_a_snapshot_with_an_exposure_map_shows_its_control(browser: Browser):
         wait_until(browser, f"{LOADED_COUNT_JS} === 30")
         camera = window_camera(wait_until_still(browser))
         assert browser.evaluate(control)
-        gains = browser.evaluate("hyrfpack.player.gains(hyrfpack.player.view())")
+        gains = browser.evaluate("hyrfpack.player.exposureOf(hyrfpack.player.view()).gains")
         np.testing.assert_allclose(
             gains, np.exp(exposure.predict_log_gains(camera.position, camera.forward)), rtol=1e-9
         )
