@@ -41,7 +41,7 @@ def gather_parts(
     Raises:
         FloatingPointError: a position is NaN or infinite.
     """
-    unit, first = model.scene.config.frame.scale, 0
+    frame, first = camera_frame(model, camera), 0
     indices, gaussians, colors = [], [], []
     for part in model.parts:
         viewport = part.config.frame.local_viewport(camera, part.gaussians.positions.dtype)
@@ -51,7 +51,7 @@ def gather_parts(
         if (sizes := part.gaussians.pixel_sizes) is not None:
             local = widen_to_photos(local, sizes[index], viewport, antialiased=part.config.antialiased)
         indices.append(index + first)
-        gaussians.append(_to_camera_axes(local, viewport, part.config.frame.scale / unit))
+        gaussians.append(_to_frame(local, part.config.frame, frame))
         colors.append(part.decode_colors(camera_center(viewport.pose).to(local.means), index))
         first += len(part)
     joined = Gaussians3D(*(torch.cat(values) for values in zip(*gaussians, strict=True)))
@@ -106,14 +106,14 @@ def camera_frame(model: MergedModel, camera: Camera) -> Frame:
     return Frame((x, y, z), model.scene.config.frame.scale, (1.0, 1.0, 1.0), (w, i, j, k))
 
 
-def _to_camera_axes(gaussians: Gaussians3D, viewport: Viewport, factor: float) -> Gaussians3D:
-    """Return Gaussians in the axes of a camera, scaled by `factor`."""
-    pose = viewport.pose.double().numpy()
-    rotation = tensor_like(pose[:3, :3].tolist(), gaussians.means)
-    offset = tensor_like(pose[:3, 3].tolist(), gaussians.means)
-    turned_basis = multiply_quats(quaternion_from_matrix(pose[:3, :3]), np.eye(4))
+def _to_frame(gaussians: Gaussians3D, own: Frame, frame: Frame) -> Gaussians3D:
+    """Return Gaussians in the local units of another frame than their own."""
+    turn = frame.axes.T @ own.axes
+    factor, offset = own.scale / frame.scale, frame.to_local(np.array([own.center]))[0]
+    rotation = tensor_like((factor * turn).tolist(), gaussians.means)
+    turned_basis = multiply_quats(quaternion_from_matrix(turn), np.eye(4))
     return Gaussians3D(
-        factor * (gaussians.means @ rotation.T + offset),
+        gaussians.means @ rotation.T + tensor_like(offset.tolist(), gaussians.means),
         gaussians.quats @ tensor_like(turned_basis.tolist(), gaussians.quats),
         factor * gaussians.scales,
         gaussians.opacities,

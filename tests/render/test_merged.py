@@ -66,6 +66,18 @@ def test_a_scene_in_two_interpenetrating_parts_is_drawn_like_the_whole(number, a
     assert len(merged.indices) == len(whole.indices)
 
 
+def test_rounded_poses_of_small_files_are_drawn_alike():
+    """Compressed files round the rotations of their cameras, which are then no exact rotations."""
+    model = ball_model()
+    pose = CAMERAS[1].camera_from_world.copy()
+    pose[:3, :3] = pose[:3, :3].round(3)
+    camera = replace(CAMERAS[1], camera_from_world=pose)
+
+    whole, merged = (render(scene, camera) for scene in (model, split_model(model)))
+
+    torch.testing.assert_close(merged.rgb, whole.rgb, atol=RATIO_TOLERANCE, rtol=0)
+
+
 def test_precomputed_geometry_changes_nothing():
     merged = split_model(ball_model())
 
