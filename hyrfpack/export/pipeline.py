@@ -114,7 +114,7 @@ def export_model(
         if isinstance(loaded.drawn, MergedModel):
             raise HyrfError(
                 f"{source}: only pages and players' folders hold merged models",
-                fix="take a part out with 'hyrfpack edit FILE -o OUTPUT --part NAME', and export that",
+                fix="take a part out with 'hyrfpack edit' and its `part`, and export that",
             )
         if kind in (TRANSFORMS_JSON, COLMAP_FOLDER):
             _check_cameras(loaded, source)

@@ -65,7 +65,7 @@ def decode_container(container: Container) -> HybridModel:
     if PART_NAMES in container.entries:
         raise HyrfFormatError(
             f"{container.name}: this file holds merged models, and one model is needed",
-            fix="take one out with 'hyrfpack edit FILE -o OUTPUT --part NAME'",
+            fix="take one out with 'hyrfpack edit' and its `part`",
         )
     layout = read_layout(container)
     arrays = _decode_sections(container, layout)

@@ -105,7 +105,7 @@ def test_a_file_of_one_model_has_no_parts_in_its_description():
 
 @pytest.mark.parametrize("read", [load_model, lambda path: repack(path, path.with_name("out.hyrf"))])
 def test_what_needs_one_model_says_how_to_get_it(tmp_path, read):
-    with pytest.raises(HyrfFormatError, match=r"merged models.*--part"):
+    with pytest.raises(HyrfFormatError, match=r"merged models.*`part`"):
         read(write_file(tmp_path, MERGED))
 
     assert not (tmp_path / "out.hyrf").exists()
