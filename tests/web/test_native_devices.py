@@ -226,4 +226,4 @@ def test_a_large_picture_releases_its_memory(one_browser: Browser, tmp_path: Pat
     camera = replace(make_cameras()[0], width=1200, height=900)
     one_browser.evaluate(f"hyrfpack.show({camera_json(camera)}).then(() => true)")
     wait_until_complete(one_browser)
-    assert max(one_browser.evaluate("hyrfpack.player.renderer.reserved")) < 900
+    assert max(one_browser.evaluate("hyrfpack.player.renderer.surfaces.colors.size")) < 900
