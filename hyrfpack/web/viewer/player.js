@@ -24,7 +24,7 @@ import { IDENTITY_QUAT } from "../hyrf/rotation.js";
 
 const SETTLE_MS = 200; // the wait after a movement before the picture is drawn at full resolution
 const TARGET_FRAME_MS = 33; // slower frames lower the resolution while moving
-const FIRST_PICTURE_MS = 700; // after this time Gaussians that are ready are shown
+const FIRST_PICTURE_MS = 2000; // after this time Gaussians that are ready are shown
 const FIRST_PICTURE_REST_MS = 250; // the device does nothing else while the browser shows the first picture
 const QUICK_FRAME_MS = 20; // frames that take less are shown at once
 const MIN_SCALE = 0.2;
