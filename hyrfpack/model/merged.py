@@ -40,14 +40,6 @@ class MergedModel:
         """The first part."""
         return self.parts[0]
 
-    @property
-    def device(self) -> torch.device:
-        return self.scene.gaussians.positions.device
-
-    def to(self, device: torch.device) -> MergedModel:
-        """Return the model with all parts moved to `device`."""
-        return MergedModel(self.names, tuple(part.to(device) for part in self.parts))
-
     @torch.no_grad()
     def decode(self) -> Decoded:
         """Evaluate geometry that no view changes, of all Gaussians in the order of the parts, in units of each part."""
