@@ -48,7 +48,7 @@ from hyrfpack.config.edit import (
 if TYPE_CHECKING:
     from hyrfpack.edit import EditReport
 
-AUTO = "auto"
+ESTIMATED_UP_WORD = "auto"
 
 
 def _read_polygon(path: Path) -> Action:
@@ -72,7 +72,7 @@ _ACTION_BY_OPTION: dict[str, Callable[[Any], Action]] = {
     "translate": Translate,
     "scale": Scale,
     "rotate": lambda numbers: Rotate(tuple(numbers[:3]), numbers[3]),
-    "up": lambda direction: EstimateUp() if direction == AUTO else Up(direction),
+    "up": lambda direction: EstimateUp() if direction == ESTIMATED_UP_WORD else Up(direction),
     "upright": Upright,
     "center": lambda _: Center(),
 }
@@ -148,7 +148,7 @@ _ACTION_BY_OPTION: dict[str, Callable[[Any], Action]] = {
 @click.option("--center", count=True, help="Move the point that the cameras look at to the origin.")
 @click.option(
     "--up",
-    type=NumbersOrWord(3, "X,Y,Z", AUTO),
+    type=NumbersOrWord(3, "X,Y,Z", ESTIMATED_UP_WORD),
     multiple=True,
     help="State which direction is up, for viewers, exports and --upright; auto estimates it from the cameras.",
 )

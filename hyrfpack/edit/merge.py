@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -95,11 +94,15 @@ def merge_models(
     Outputs(*paths, overwrite=overwrite).file(target, ".hyrf")
     parts: list[tuple[MergedPart, bytes]] = []
     antialiased: dict[bool, str] = {}
-    with ExitStack() as stack:
-        for path, stem in zip(paths, stems, strict=True):
-            container = stack.enter_context(Container.open(path, SECTION_CONTENTS))
+    for path, stem in zip(paths, stems, strict=True):
+        with Container.open(path, SECTION_CONTENTS) as container:
             is_merged = PART_NAMES in container.entries
             for name, part in open_parts(container) if is_merged else [(stem, container)]:
+                if len(parts) == MAX_PARTS:
+                    raise HyrfError(
+                        f"{path}: with it there are more than {MAX_PARTS} parts, which a file cannot hold",
+                        fix="merge fewer models",
+                    )
                 metadata = read_metadata(part)
                 antialiased[parse_config(metadata.config).antialiased] = str(path)
                 data = _moved_bytes(part, placements[stem]) if stem in placements else part.read_bytes()
@@ -111,8 +114,6 @@ def merge_models(
             f"{antialiased[True]} is antialiased and {antialiased[False]} is not, so one picture cannot show both",
             fix="train both with the same `antialiased`",
         )
-    if len(parts) > MAX_PARTS:
-        raise HyrfError(f"there are {len(parts)} parts, and a file holds {MAX_PARTS}", fix="merge fewer models")
     written = write_parts([(part.name, data) for part, data in parts], target, overwrite=overwrite)
     return MergeReport(written, Path(written).stat().st_size, [part for part, _ in parts])
 
@@ -165,5 +166,5 @@ def _moved_bytes(part: Container, placement: Placement) -> bytes:
 def _free_name(name: str, taken: set[str]) -> str:
     """Return a name that is not taken: "chair", "chair 2", ..."""
     base = printable_name(name)
-    names = [base, *(f"{base} {number}" for number in range(2, MAX_PARTS + 2))]
+    names = [base, *(f"{base} {number}" for number in range(2, MAX_PARTS + 1))]
     return next(free for free in names if free not in taken)

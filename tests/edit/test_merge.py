@@ -131,8 +131,14 @@ def test_models_that_one_picture_cannot_show_are_refused(tmp_path: Path, files: 
 
 
 def test_more_parts_than_a_file_holds_are_refused(tmp_path: Path, files: tuple[Path, Path]):
-    with pytest.raises(HyrfError, match="65 parts"):
-        merge_models([files[0]] * 65, tmp_path / "many.hyrf")
+    assert len(merge_models([files[0]] * 64, tmp_path / "most.hyrf").parts) == 64
+
+    for count in (65, 200):
+        with pytest.raises(HyrfError, match="more than 64 parts"):
+            merge_models([files[0]] * count, tmp_path / "many.hyrf")
+    with pytest.raises(HyrfError, match="more than 64 parts"):
+        merge_models([tmp_path / "most.hyrf", files[1]], tmp_path / "many.hyrf")
+    assert not (tmp_path / "many.hyrf").exists()
 
 
 def test_an_action_that_is_no_move_is_a_type_error(tmp_path: Path, files: tuple[Path, Path]):
