@@ -61,6 +61,7 @@ crop_option = click.option(
 @settings_options(ExportConfig, "min_opacity", "background", "exposure")
 @click.option("--title", metavar="TEXT", help="Title of a page, a player or a gallery.  [default: its name]")
 @click.option("--credit", default="", metavar="TEXT", help="Text below the title, such as the author and the licence.")
+@settings_options(ExportConfig, "editable")
 @click.option(
     "--data",
     type=PATH,
@@ -138,10 +139,18 @@ def export(
         check_place(output, Outputs(*files, scene=scenes[0] if scenes else None, overwrite=overwrite), config.colmap)
     if len(models) > 1:
         report = export_gallery(
-            models, output, data=scenes, overwrite=overwrite, title=config.title, credit=config.credit
+            models,
+            output,
+            data=scenes,
+            overwrite=overwrite,
+            title=config.title,
+            credit=config.credit,
+            editable=config.editable,
         )
     elif not models:
-        report = export_player(None, output, overwrite=overwrite, title=config.title, credit=config.credit)
+        report = export_player(
+            None, output, overwrite=overwrite, title=config.title, credit=config.credit, editable=config.editable
+        )
     else:
         report = write(models[0], output, config, data=scenes[0] if scenes else None, overwrite=overwrite)
     note_rename(output, report.file)

@@ -55,6 +55,7 @@ class ExportConfig(ConvertConfig):
         colmap: write a folder with a COLMAP model: cameras, and centres as points.
         title: title of a page, a player or a gallery. Default: the name of its file or folder.
         credit: text below the title of a page or a player, such as the author and the licence.
+        editable: include a panel in a page or a player that crops, cleans, turns and measures the scene.
         voxel: side of the voxels in which a mesh is fused, in world units. Default: 1.5 times the size of a photo's
             pixel on the surface, and at least 1/512 of the mesh.
         faces: reduce a mesh to at most this number of triangles. Default: all, but 4000 for a .collision file.
@@ -66,5 +67,6 @@ class ExportConfig(ConvertConfig):
     colmap: bool = False
     title: str | None = None
     credit: str = ""
+    editable: bool = False
     voxel: Annotated[float | None, Range(MIN_VOXEL, unit="length")] = None
     faces: Annotated[int | None, Range(4)] = None

@@ -63,6 +63,7 @@ def export_player(
     overwrite: bool = True,
     title: str | None = None,
     credit: str = "",
+    editable: bool = False,
 ) -> ExportReport:
     """Write a folder of static files that plays a scene on any web server: a page, the file itself and a poster.
 
@@ -78,6 +79,7 @@ def export_player(
         overwrite: replace existing files; if False, an existing file is an error.
         title: title of the page. Default: the name of the source, or of the folder.
         credit: text below the title, such as the author and the licence.
+        editable: include a panel that crops, cleans, turns and measures the scene.
 
     Raises:
         HyrfError: the file cannot be read, a file cannot be written, or another call is writing into the folder.
@@ -95,11 +97,16 @@ def export_player(
     check_folder(folder, sources, [data], overwrite=True, is_gallery=False)
     with exclusive_folder(folder):
         check_folder(folder, sources, [data], overwrite=overwrite, is_gallery=False)
-        return _write_player(source, _OutputFolder(Path(folder), overwrite), data, title, credit)
+        return _write_player(source, _OutputFolder(Path(folder), overwrite), data, title, credit, editable)
 
 
 def _write_player(
-    source: StrPath | None, output: _OutputFolder, data: Scene | None, title: str | None, credit: str
+    source: StrPath | None,
+    output: _OutputFolder,
+    data: Scene | None,
+    title: str | None,
+    credit: str,
+    editable: bool,
 ) -> ExportReport:
     """Write the files of `export_player` into a folder that the caller has locked."""
     if title is None:
@@ -121,7 +128,7 @@ def _write_player(
         description = f"{count:,} Gaussians, {scene.length:,} bytes"
     output.write(ELEMENT_SCRIPT_NAME, encode_element_script())
     output.write(README_NAME, encode_readme(title, INDEX_NAME, INDEX_NAME, element=content or "URL"))
-    for name, encoded in encode_player_files().items():
+    for name, encoded in encode_player_files(editable).items():
         output.write(name, encoded)
     page = encode_player(
         title,
@@ -131,6 +138,8 @@ def _write_player(
         stages=stages,
         in_folder=True,
         credit=credit,
+        editable=editable,
+        file=Path(source).name if editable and source is not None else None,
     )
     output.write(INDEX_NAME, page)
     return ExportReport(str(output.path), output.bytes, count, native=source is not None)
@@ -144,6 +153,7 @@ def export_gallery(
     overwrite: bool = True,
     title: str | None = None,
     credit: str = "",
+    editable: bool = False,
 ) -> ExportReport:
     """Write a folder of static files that shows several scenes: a page that lists them, a player, and the files.
 
@@ -155,6 +165,7 @@ def export_gallery(
         overwrite: replace existing files; if False, an existing file is an error.
         title: title of the list. Default: the name of the folder.
         credit: text below the title of each scene.
+        editable: include a panel that crops, cleans, turns and measures a scene.
 
     Raises:
         HyrfError: a file cannot be read or written, or another call is writing into the folder.
@@ -175,7 +186,7 @@ def export_gallery(
     check_folder(folder, sources, scenes, overwrite=True, is_gallery=True)
     with exclusive_folder(folder):
         check_folder(folder, sources, scenes, overwrite=overwrite, is_gallery=True)
-        return _write_gallery(sources, _OutputFolder(Path(folder), overwrite), scenes, title, credit)
+        return _write_gallery(sources, _OutputFolder(Path(folder), overwrite), scenes, title, credit, editable)
 
 
 def _write_gallery(
@@ -184,6 +195,7 @@ def _write_gallery(
     scenes: Sequence[Scene | None],
     title: str | None,
     credit: str,
+    editable: bool,
 ) -> ExportReport:
     """Write the files of `export_gallery` into a folder that the caller has locked."""
     contents = []
@@ -202,9 +214,9 @@ def _write_gallery(
     title = _folder_title(output.path) if title is None else title
     pairs = zip(cards, contents, strict=True)
     stages = {card.content: shown.stage for card, shown in pairs if shown.stage}
-    for name, encoded in encode_player_files().items():
+    for name, encoded in encode_player_files(editable).items():
         output.write(name, encoded)
-    page = encode_player(title, stages=stages, gallery=INDEX_NAME, in_folder=True, credit=credit)
+    page = encode_player(title, stages=stages, gallery=INDEX_NAME, in_folder=True, credit=credit, editable=editable)
     output.write(GALLERY_PLAYER_NAME, page)
     output.write(GALLERY_STYLE_NAME, encode_gallery_style())
     output.write(README_NAME, encode_readme(title, GALLERY_PLAYER_NAME, INDEX_NAME))

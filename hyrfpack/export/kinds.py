@@ -113,6 +113,11 @@ def check_request(kind: FileKind, target: str | os.PathLike[str], config: Export
             f"{target}: only pages show a title and a credit",
             fix=f"leave out {given}, or write a page (.html) or a player's folder",
         )
+    if config.editable and (kind not in (HTML_PAGE, PLAYER_FOLDER) or config.baked):
+        raise HyrfError(
+            f"{target}: only pages of the model itself can edit it",
+            fix="leave out `editable`, or write a page (.html) without `baked`, or a player's folder",
+        )
     asked = {
         "`degree`": config.degree is not None,
         "`crop`": config.crop is not None,

@@ -14,6 +14,7 @@ import torch
 
 from hyrfpack.atomic import write_atomic
 from hyrfpack.cameras.view_sampling import shrink_camera
+from hyrfpack.config.export import ExportConfig
 from hyrfpack.export.poster import encode_poster, render_model_poster
 from hyrfpack.export.report import ExportReport
 from hyrfpack.export.source import Source
@@ -91,7 +92,9 @@ def encode_baked_page(
     return encode_splats_page(splats, background=picture, near=near, sphere=sphere, **settings)
 
 
-def encode_native_page(loaded: Source, data: bytes, title: str, credit: str = "") -> bytes:
+def encode_native_page(
+    loaded: Source, data: bytes, title: str, credit: str = "", editable_file: str | None = None
+) -> bytes:
     """Encode a page that contains a model file.
 
     Args:
@@ -99,30 +102,29 @@ def encode_native_page(loaded: Source, data: bytes, title: str, credit: str = ""
         data: bytes of the `.hyrf` file.
         title: title of the page.
         credit: text below the title.
+        editable_file: as for `encode_model_page`.
     """
     settings = _page_settings(loaded, title, credit)
-    return encode_model_page(data, count=len(loaded.drawn), frame=loaded.model.config.frame, **settings)
+    frame, count = loaded.model.config.frame, len(loaded.drawn)
+    return encode_model_page(data, count=count, frame=frame, editable_file=editable_file, **settings)
 
 
 def write_native_page(
     loaded: Source,
     source: str | os.PathLike[str],
     target: str | os.PathLike[str],
+    config: ExportConfig,
     overwrite: bool = True,
-    *,
-    title: str | None = None,
-    credit: str = "",
 ) -> ExportReport:
     """Write a page that contains a model file; `overwrite` is that of `hyrfpack.atomic.pending_file`.
-
-    The title is the name of the file if `title` is None; `credit` is the text below it.
 
     Raises:
         HyrfError: the page cannot be written.
     """
     data = Path(source).read_bytes()
     suggest_compression(source, len(data))
-    page = encode_native_page(loaded, data, Path(target).stem if title is None else title, credit)
+    title = Path(target).stem if config.title is None else config.title
+    page = encode_native_page(loaded, data, title, config.credit, Path(source).name if config.editable else None)
     written = write_atomic(target, page, overwrite=overwrite)
     return ExportReport(str(written), len(page), len(loaded.drawn), native=True)
 

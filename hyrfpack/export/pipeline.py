@@ -103,14 +103,22 @@ def export_model(
     check_request(kind, target, config)
     source = find_model(source)
     if kind is PLAYER_FOLDER:
-        return export_player(source, target, data=data, overwrite=overwrite, title=config.title, credit=config.credit)
+        return export_player(
+            source,
+            target,
+            data=data,
+            overwrite=overwrite,
+            title=config.title,
+            credit=config.credit,
+            editable=config.editable,
+        )
     if kind is COLMAP_FOLDER:
         check_place(target, Outputs(source, scene=data, overwrite=True), config.colmap)
     with exclusive_folder(target) if kind is COLMAP_FOLDER else nullcontext():
         check_place(target, Outputs(source, scene=data, overwrite=overwrite), config.colmap)
         loaded = Source.read(source, data)
         if kind is HTML_PAGE and not config.baked:
-            return write_native_page(loaded, source, target, overwrite, title=config.title, credit=config.credit)
+            return write_native_page(loaded, source, target, config, overwrite)
         if isinstance(loaded.drawn, MergedModel):
             raise HyrfError(
                 f"{source}: only pages and players' folders hold merged models",

@@ -44,6 +44,7 @@ def encode_model_page(
     solid: tuple[float, float, float],
     poster: bytes | None = None,
     credit: str = "",
+    editable_file: str | None = None,
 ) -> bytes:
     """Return an HTML file that holds a `.hyrf` file and decodes and draws it in a browser with WebGL 2.
 
@@ -61,6 +62,7 @@ def encode_model_page(
         solid: RGB in [0, 1] of the background where the model has no background sphere.
         poster: a WebP picture that is shown while the scene is unpacked; None for none.
         credit: text below the title, such as the author and the licence.
+        editable_file: name of the file in the commands of the panel that edits it; None for a page without this panel.
 
     Returns:
         The file, UTF-8. The same arguments give the same bytes.
@@ -68,12 +70,17 @@ def encode_model_page(
     Raises:
         ValueError: there is no camera.
     """
-    facts = {"count": count, "center": list(frame.center), "unit": frame.scale, "near": RenderSettings().near}
+    facts: dict = {"count": count, "center": list(frame.center), "unit": frame.scale, "near": RenderSettings().near}
     if frame.is_rotated:
         facts["rotation"] = list(frame.rotation)
+    editable = editable_file is not None
+    if editable:
+        facts["file"] = editable_file
     scene = _scene_element("hyrf", title, facts, cameras, up, center, solid)
     texts, description = [scene, *_poster_elements(poster)], _page_description(count, len(data))
-    return assemble_player_page(title, texts, description, payload=data, readers=False, credit=credit)
+    return assemble_player_page(
+        title, texts, description, payload=data, readers=False, credit=credit, editable=editable
+    )
 
 
 def encode_splats_page(

@@ -18,6 +18,7 @@ from hyrfpack.web.scripts import read_script, read_style
 
 MODEL_SUFFIX = ".hyrf"
 BACK_LINK = '<a id="back" href="{}" aria-label="All scenes" title="All scenes">&#8249;</a>\n'
+EDITING_ELEMENTS = ("overlay", "panel", "button")  # files in viewer/edit, which an editable page includes
 SHADER_SUFFIXES = (".vert", ".frag", ".glsl")
 _SHADER_COMMENT = re.compile(r"\s*//.*")
 # The browser decodes one base64 block while it loads the next one. A multiple of 3 needs no padding.
@@ -40,6 +41,8 @@ def encode_player(
     gallery: str | None = None,
     in_folder: bool = False,
     credit: str = "",
+    editable: bool = False,
+    file: str | None = None,
 ) -> bytes:
     """Return a page that plays a hosted file, a file that its address names (`?content=URL`), or a dropped file.
 
@@ -58,25 +61,38 @@ def encode_player(
         in_folder: use the scripts and the style of `encode_player_files`, which must be beside the page, so that the
             page runs on servers whose content security policy is `default-src 'self'`.
         credit: text below the title, such as the author and the licence.
+        editable: include the panel that edits a scene; with `in_folder`, use `encode_player_files(editable=True)`.
+        file: name or path of the file in the commands of that panel; None for the title.
 
     Returns:
         The file, UTF-8. The same arguments give the same bytes.
     """
     settings: dict = {"content": content, "title": title, "stages": stages or {}}
+    if file is not None:
+        settings["file"] = file
     if updates is not None:
         settings["updates"] = updates
     texts = [json_element("content", settings)] if content is not None or stages else []
     if poster is not None:
         texts.append(f'<img id="poster" alt="" src="{html.escape(poster)}">')
     assemble = _assemble_page_in_folder if in_folder else assemble_player_page
-    return assemble(title, texts, description, image=poster, fetches=fetches, gallery=gallery, credit=credit)
+    return assemble(
+        title,
+        texts,
+        description,
+        image=poster,
+        fetches=fetches,
+        gallery=gallery,
+        credit=credit,
+        editable=editable,
+    )
 
 
-def encode_player_files() -> dict[str, bytes]:
-    """Return, by name, the files beside a page of `encode_player` with `in_folder`."""
+def encode_player_files(editable: bool = False) -> dict[str, bytes]:
+    """Return, by name, the files beside a page of `encode_player` with `in_folder` and the same `editable`."""
     return {
-        STYLE_FILE_NAME: read_style().encode(),
-        SCRIPT_FILE_NAME: _script_with_texts("main.js", embedded_texts()),
+        STYLE_FILE_NAME: read_style(editable).encode(),
+        SCRIPT_FILE_NAME: _script_with_texts(_main_script(editable), embedded_texts()),
         WORKER_FILE_NAME: read_script("worker.js").encode(),
     }
 
@@ -92,6 +108,7 @@ def assemble_player_page(
     readers: bool = True,
     gallery: str | None = None,
     credit: str = "",
+    editable: bool = False,
 ) -> bytes:
     """Return the player's page around the elements of a scene, as UTF-8.
 
@@ -105,9 +122,10 @@ def assemble_player_page(
         readers: include the readers of splats, which make the page a third larger.
         gallery: address of the list of scenes that a button leads back to; None for no button.
         credit: text below the title.
+        editable: include the panel that edits a scene.
     """
-    style, script = read_style(), read_script("boot.js")
-    main, packed = _pack_scripts("worker.js" if readers else "worker_model.js")
+    style, script = read_style(editable), read_script("boot.js")
+    main, packed = _pack_scripts(_main_script(editable), "worker.js" if readers else "worker_model.js")
     view = memoryview(payload)
     blocks = (
         base64.b64encode(view[at : at + PAYLOAD_BLOCK_BYTES]).decode()
@@ -120,7 +138,7 @@ def assemble_player_page(
         "script": f"<script>{script}</script>",
         "payload": "\n".join(f'<script type="text/plain" class="payload">{block}</script>' for block in blocks),
     }
-    return _fill_page(title, description, image, gallery, credit, values, readers=readers)
+    return _fill_page(title, description, image, gallery, credit, values, readers=readers, editable=editable)
 
 
 def _assemble_page_in_folder(
@@ -132,6 +150,7 @@ def _assemble_page_in_folder(
     fetches: str,
     gallery: str | None,
     credit: str,
+    editable: bool,
 ) -> bytes:
     """Return the player's page around the files of `encode_player_files`; arguments as for `assemble_player_page`."""
     values = {
@@ -141,7 +160,7 @@ def _assemble_page_in_folder(
         "script": f'<script src="{SCRIPT_FILE_NAME}"></script>',
         "payload": "",
     }
-    return _fill_page(title, description, image, gallery, credit, values)
+    return _fill_page(title, description, image, gallery, credit, values, editable=editable)
 
 
 def _fill_page(
@@ -153,16 +172,21 @@ def _fill_page(
     values: dict[str, str],
     *,
     readers: bool = True,
+    editable: bool,
 ) -> bytes:
     """Return the player's page from values of its template; other arguments as for `assemble_player_page`."""
-    values = values | {
-        "version": __version__,
-        "title": html.escape(title),
-        "meta": meta_tags(title, description, image),
-        "accept": ",".join([MODEL_SUFFIX, *SPLATS_SUFFIXES] if readers else [MODEL_SUFFIX]),
-        "credit": html.escape(credit),
-        "back": "" if gallery is None else BACK_LINK.format(html.escape(gallery)),
-    }
+    values = (
+        values
+        | {
+            "version": __version__,
+            "title": html.escape(title),
+            "meta": meta_tags(title, description, image),
+            "accept": ",".join([MODEL_SUFFIX, *SPLATS_SUFFIXES] if readers else [MODEL_SUFFIX]),
+            "credit": html.escape(credit),
+            "back": "" if gallery is None else BACK_LINK.format(html.escape(gallery)),
+        }
+        | {f"edit_{name}": read_web_file(f"viewer/edit/{name}.html") if editable else "" for name in EDITING_ELEMENTS}
+    )
     return fill_template(read_web_file("viewer/page.html"), values).encode()
 
 
@@ -227,16 +251,22 @@ def fill_template(template: str, values: dict[str, str]) -> str:
     return re.sub(r"\{\{(\w+)\}\}", lambda match: values[match[1]], template)
 
 
+def _main_script(editable: bool) -> str:
+    """Return the name of the page's main script."""
+    return "main_editable.js" if editable else "main.js"
+
+
 @cache
-def _pack_scripts(worker: str) -> tuple[str, str]:
+def _pack_scripts(main: str, worker: str) -> tuple[str, str]:
     """Return the player's script, and all scripts and shaders in the form that `boot.js` unpacks.
 
     That form is base64 of gzipped JSON.
 
     Args:
+        main: name of the player's script.
         worker: name of the script of the worker.
     """
-    texts = embedded_texts(worker) | {"main.js": read_script("main.js")}
+    texts = embedded_texts(worker) | {"main.js": read_script(main)}
     packer = zlib.compressobj(9, zlib.DEFLATED, GZIP_WINDOW_BITS, 9)
     packed = packer.compress(json.dumps(texts).encode()) + packer.flush()
     return texts["main.js"], base64.b64encode(packed).decode()

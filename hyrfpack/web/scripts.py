@@ -12,8 +12,8 @@ from hyrfpack.web.modules import link_modules
 
 _LOG = logging.getLogger(__name__)
 
-SCRIPT_NAMES = ("boot.js", "element_script.js", "main.js", "worker.js", "worker_model.js")
-STYLE_NAME = "style.css"
+SCRIPT_NAMES = ("boot.js", "element_script.js", "main.js", "main_editable.js", "worker.js", "worker_model.js")
+STYLE_NAME, EDITING_STYLE_NAME = "style.css", "edit.css"
 MINIFIED_FOLDER = "minified"
 DIGEST_NAME = "sources.sha256"
 SOURCE_FOLDERS = ("hyrf", "viewer")
@@ -34,9 +34,10 @@ def read_script(name: str) -> str:
 
 
 @cache
-def read_style() -> str:
-    """Return the style sheet of the player's page."""
-    return read_web_file(f"{MINIFIED_FOLDER if is_minified_current() else 'viewer'}/{STYLE_NAME}")
+def read_style(editable: bool = False) -> str:
+    """Return the style sheet of the player's page, with that of its editing panel if it is `editable`."""
+    folder = MINIFIED_FOLDER if is_minified_current() else "viewer"
+    return "".join(read_web_file(f"{folder}/{name}") for name in (STYLE_NAME, EDITING_STYLE_NAME)[: 1 + editable])
 
 
 @cache

@@ -39,7 +39,7 @@ def view(
         suffix = MODEL_SUFFIX
         describe_file(path)
     name = f"scene{suffix}"
-    page = encode_player(title, content=name, fetches="'self'")
+    page = encode_player(title, content=name, fetches="'self'", editable=True, file=str(path))
     serve(page, {name: path}, host=host, port=port, open_browser=open_browser, on_ready=on_ready)
 
 

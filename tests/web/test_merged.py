@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -55,11 +56,11 @@ def make_parts(*, exposures: bool = False) -> MergedModel:
     return MergedModel(("scene", "beside", "inside"), (scene, beside, inside))
 
 
-def make_page(model: MergedModel, cameras: list[Camera]) -> bytes:
+def make_page(model: MergedModel, cameras: list[Camera], **more: Any) -> bytes:
     data = encode_parts(list(zip(model.names, map(encode_model, model.parts), strict=True)))
     config = model.scene.config
     facts = {"count": len(model), "frame": config.frame, "solid": config.solid, "title": "parts"}
-    return encode_model_page(data, cameras=cameras, up=UP_DIRECTION, center=SCENE_CENTER, **facts)
+    return encode_model_page(data, cameras=cameras, up=UP_DIRECTION, center=SCENE_CENTER, **facts, **more)
 
 
 @pytest.mark.parametrize("exposures", [False, True])

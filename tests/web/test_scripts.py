@@ -62,7 +62,10 @@ def test_the_minified_player_was_made_from_the_current_sources():
 def test_make_player_gives_the_same_bytes_again():
     if not (PROGRAMS_FOLDER / "esbuild").exists():
         pytest.skip("esbuild is not here; run `npm ci` in tests/node")
-    files = {name: read_web_file(f"minified/{name}").encode() for name in (*SCRIPT_NAMES, "style.css", DIGEST_NAME)}
+    files = {
+        name: read_web_file(f"minified/{name}").encode()
+        for name in (*SCRIPT_NAMES, "style.css", "edit.css", DIGEST_NAME)
+    }
     assert build_player() == files
 
 

@@ -13,7 +13,14 @@ import subprocess
 from pathlib import Path
 
 from hyrfpack.atomic import write_atomic
-from hyrfpack.web.scripts import DIGEST_NAME, MINIFIED_FOLDER, SCRIPT_NAMES, STYLE_NAME, source_digest
+from hyrfpack.web.scripts import (
+    DIGEST_NAME,
+    EDITING_STYLE_NAME,
+    MINIFIED_FOLDER,
+    SCRIPT_NAMES,
+    STYLE_NAME,
+    source_digest,
+)
 
 REPOSITORY_ROOT = Path(__file__).parents[2]
 WEB_FOLDER = REPOSITORY_ROOT / "hyrfpack" / "web"
@@ -33,7 +40,8 @@ def build_player() -> dict[str, bytes]:
         subprocess.CalledProcessError: one of them refuses a source; it has printed the reason.
     """
     scripts = {name: _run("terser", *TERSER_OPTIONS, stdin=_bundle(name, STRICT_MODE)) for name in SCRIPT_NAMES}
-    return scripts | {STYLE_NAME: _bundle(STYLE_NAME), DIGEST_NAME: f"{source_digest()}\n".encode()}
+    styles = {name: _bundle(name) for name in (STYLE_NAME, EDITING_STYLE_NAME)}
+    return scripts | styles | {DIGEST_NAME: f"{source_digest()}\n".encode()}
 
 
 def _bundle(name: str, *options: str) -> bytes:

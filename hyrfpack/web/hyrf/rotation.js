@@ -26,6 +26,12 @@ export const rotateBack = ([a, b, c], vector) =>
   [0, 1, 2].map((k) => a[k] * vector[0] + b[k] * vector[1] + c[k] * vector[2]);
 
 /**
+ * Returns the columns of a matrix, given by its rows.
+ * @param {number[][]} rows
+ */
+export const transpose = (rows) => [0, 1, 2].map((k) => rows.map((row) => row[k]));
+
+/**
  * Returns the quaternion of a rotation matrix, given by its rows.
  * @param {number[][]} rows
  */

@@ -25,9 +25,10 @@ export class DepthSort {
    * @param {number[]} sides from `frustumPlanes`
    * @param {number} near the depth of the near plane
    * @param {Uint32Array | null} [order] an array to reuse, if its length fits
+   * @param {Uint8Array | null} [kept] 0 for each splat to omit
    * @returns {{order: Uint32Array, drawn: number}} indices of splats, of which the first `drawn` are valid
    */
-  sort(row, sides, near, order) {
+  sort(row, sides, near, order, kept) {
     const { positions, depths, bits, indices, others, counts } = this;
     const [a, b, c, d] = row;
     let drawn = 0;
@@ -35,7 +36,7 @@ export class DepthSort {
     for (let i = this.count - 1; i >= 0; i--) {
       const x = positions[3 * i], y = positions[3 * i + 1], z = positions[3 * i + 2];
       const depth = a * x + b * y + c * z + d;
-      if (!(depth > near)) continue;
+      if (!(depth > near) || kept?.[i] === 0) continue;
       let inside = true;
       for (let s = 0; s < 16 && inside; s += 4) {
         inside = sides[s] * x + sides[s + 1] * y + sides[s + 2] * z + sides[s + 3] > 0;

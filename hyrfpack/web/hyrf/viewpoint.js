@@ -194,7 +194,7 @@ const isNumberList = (values, count) =>
  * @param {{center: number[], scale: number, rotation?: number[]}} frame
  * @returns {Viewpoint}
  */
-function defaultViewpoint({ center, scale, rotation }) {
+export function defaultViewpoint({ center, scale, rotation }) {
   const slope = (20 * Math.PI) / 180, focal = 400 / Math.tan((25 * Math.PI) / 180), axes = frameAxes({ rotation });
   const up = rotateBy(axes, [0, -1, 0]);
   const place = add(center, mul(rotateBy(axes, [0, -Math.sin(slope), -Math.cos(slope)]), 2.5 * scale));

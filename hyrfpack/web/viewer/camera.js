@@ -18,7 +18,7 @@ function isRigid(rows) {
 }
 
 // Converts a point in world units to the page's coordinates.
-const toPage = (point, scene) => mul(rotateBack(frameAxes(scene), sub(point, scene.center)), 1 / scene.unit);
+export const toPage = (point, scene) => mul(rotateBack(frameAxes(scene), sub(point, scene.center)), 1 / scene.unit);
 
 // Converts a point in the page's coordinates to world units.
 export const toWorld = (point, scene) => add(scene.center, mul(rotateBy(frameAxes(scene), point), scene.unit));

@@ -27,6 +27,7 @@ export class Controls {
     this.pointers = new Map();
     this.held = new Map(); // code of each pressed key -> its name
     this.tapped = null;
+    this.pick = null; // if set, it is called with the place of each tap, and a double tap does not approach
     this.engage(!isEmbedded);
     this.aborter = new AbortController();
     const { signal } = this.aborter;
@@ -138,14 +139,17 @@ export class Controls {
   lift(event) {
     this.pointers.delete(event.pointerId);
     const [x, y] = this.placeOf(event), { timeStamp: time } = event;
-    const near = (to, pixels) => to && Math.hypot(x - to.x, y - to.y) < pixels && time - to.time < MAX_TAP_MS;
-    const tap = event.type === "pointerup" && near(this.start, MAX_TAP_MOVE_PIXELS);
+    const near = (to, pixels, ms) => to && Math.hypot(x - to.x, y - to.y) < pixels && time - to.time < ms;
+    const maxTapMs = this.pick ? Infinity : MAX_TAP_MS; // a pick may take time to aim
+    const tap = event.type === "pointerup" && near(this.start, MAX_TAP_MOVE_PIXELS, maxTapMs);
     this.start = null;
     this.acted();
     if (!tap) {
       this.tapped = null;
       if (!this.engaged) this.ignored("finger");
-    } else if (near(this.tapped, MAX_DOUBLE_TAP_DISTANCE_PIXELS)) {
+    } else if (this.pick) {
+      this.pick(x, y);
+    } else if (near(this.tapped, MAX_DOUBLE_TAP_DISTANCE_PIXELS, MAX_TAP_MS)) {
       this.tapped = null;
       this.approach(x, y);
     } else {

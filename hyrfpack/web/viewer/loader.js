@@ -24,6 +24,7 @@ export class Loader {
     Object.assign(this, { content, progress });
     this.ticket = 0;
     this.waiting = new Map(); // ticket -> the function that resolves the promise of its order
+    this.asked = new Map(); // ticket -> {resolve, reject} of the promise of its answer
     this.spare = null; // the array of an old order, for reuse
     const refusal = workerAddress
       ? `The player's worker ${workerAddress} cannot be started; it must be a script on the same site as the page.`
@@ -32,6 +33,7 @@ export class Loader {
       if (message.progress) this.progress(message.progress);
       if (message.content) this.deliver(message.content);
       if (message.order) this.sorted(message.order);
+      if (message.answer) this.answered(message.answer);
       if (message.error) this.fail(new Error(message.error));
     };
     // An error without a message means that the worker's script was not allowed to run.
@@ -123,6 +125,20 @@ export class Loader {
     this.waiting.delete(answer.ticket);
   }
 
+  // Asks the worker a question (see worker_tasks.js). Returns a promise of the answer.
+  ask(question) {
+    const ticket = ++this.ticket;
+    this.connection.post({ ask: { ticket, ...question } });
+    return new Promise((resolve, reject) => this.asked.set(ticket, { resolve, reject }));
+  }
+
+  answered({ ticket, value, error }) {
+    const { resolve, reject } = this.asked.get(ticket);
+    this.asked.delete(ticket);
+    if (error) reject(new Error(error));
+    else resolve(value);
+  }
+
   // Keeps the array of an order for the next call of `sort`.
   reuse(order) {
     this.spare = order;
@@ -133,5 +149,7 @@ export class Loader {
     this.fail(new SupersededError("another file was opened instead"));
     for (const answer of this.waiting.values()) answer(null);
     this.waiting.clear();
+    for (const { reject } of this.asked.values()) reject(new SupersededError());
+    this.asked.clear();
   }
 }

@@ -60,11 +60,11 @@ export class Damper {
   }
 }
 
-// Moves the eye smoothly from one pose to another.
+// Moves the eye smoothly from one pose to another, or along a path.
 export class Glide {
   constructor(player) {
     this.player = player;
-    this.stop();
+    this.path = null;
   }
 
   get active() {
@@ -72,7 +72,9 @@ export class Glide {
   }
 
   stop() {
+    const ended = this.path?.ended;
     this.path = null;
+    ended?.();
   }
 
   // Glides to the pose that `move` sets, in `seconds`.
@@ -81,30 +83,37 @@ export class Glide {
     move();
     this.stop();
     if (prefersReducedMotion() || !(seconds > 0)) return;
-    const to = eye.pose;
+    const to = eye.pose, ends = [from, to].map(blendablePose);
     Object.assign(eye, from);
-    this.path = { from: blendablePose(from), to: blendablePose(to), end: to, seconds, time: 0 };
+    this.follow((part) => (part < 1 ? blendPoses(...ends, part * part * (3 - 2 * part)) : to), seconds);
+  }
+
+  // Takes the poses of `poseAt(part)`, for parts from 0 to 1, in `seconds`. `ended()` is called at the end, also if
+  // another movement replaces this one.
+  follow(poseAt, seconds, ended) {
+    this.stop();
+    this.path = { poseAt, seconds, ended, time: 0 };
     this.player.changed();
   }
 
   advance(seconds) {
-    if (!this.path) return false;
-    const { from, to, end, seconds: duration } = this.path, { eye } = this.player;
-    const time = (this.path.time += seconds) / duration;
-    if (time >= 1) {
-      Object.assign(eye, end);
-      this.stop();
-      return true;
-    }
-    const part = time * time * (3 - 2 * time), lerp = (a, b) => a + part * (b - a);
-    const lerpVector = (a, b) => a.map((value, k) => lerp(value, b[k]));
-    const rows = rowsOf(slerp(from.quat, to.quat, part));
-    const away = mul(lerpVector(from.away, to.away), Math.exp(lerp(Math.log(from.distance), Math.log(to.distance))));
-    const target = lerpVector(from.target, to.target);
-    const position = [0, 1, 2].reduce((sum, row) => sub(sum, mul(rows[row], away[row])), target);
-    Object.assign(eye, { rows, target, position, focal: lerp(from.focal, to.focal), pace: lerp(from.pace, to.pace) });
+    const { path } = this;
+    if (!path) return false;
+    path.time += seconds;
+    Object.assign(this.player.eye, path.poseAt(Math.min(1, path.time / path.seconds)));
+    if (path.time >= path.seconds) this.stop();
     return true;
   }
+}
+
+// Returns the pose at a part of the way between two blendable poses.
+function blendPoses(from, to, part) {
+  const lerp = (a, b) => a + part * (b - a), lerpVector = (a, b) => a.map((value, k) => lerp(value, b[k]));
+  const rows = rowsOf(slerp(from.quat, to.quat, part));
+  const away = mul(lerpVector(from.away, to.away), Math.exp(lerp(Math.log(from.distance), Math.log(to.distance))));
+  const target = lerpVector(from.target, to.target);
+  const position = [0, 1, 2].reduce((sum, row) => sub(sum, mul(rows[row], away[row])), target);
+  return { rows, target, position, focal: lerp(from.focal, to.focal), pace: lerp(from.pace, to.pace) };
 }
 
 // Returns a pose in terms that can be interpolated, such as its target, and the distance and direction (in the eye's

@@ -497,6 +497,15 @@ export class Player extends EventTarget {
     this.loader.reuse(order);
   }
 
+  // Draws only the Gaussians that selections keep (see selection.js). Returns a promise of the numbers that are left
+  // after each.
+  async select(selections) {
+    const { loader, renderer: { content } } = this, counts = await loader.ask({ select: selections });
+    if (content.sky) content.sky.key = null; // another part of the background may be visible
+    this.changed();
+    return counts;
+  }
+
   // ---- cameras
 
   // Moves the eye to one of the scene's cameras.

@@ -37,13 +37,18 @@ export async function shareView(camera, exposure, includesScene) {
   }
 }
 
-// Downloads a picture (Blob), with the title in its file name.
-export function savePicture(blob, title) {
+// Downloads a Blob as a file whose name is made of a title and an ending. Returns the name.
+export function saveBlob(blob, title, ending) {
   const link = document.createElement("a"), address = URL.createObjectURL(blob);
-  Object.assign(link, { href: address, download: `${fileName(title)}.png` });
+  Object.assign(link, { href: address, download: `${fileName(title)}${ending}` });
   link.click();
   setTimeout(() => URL.revokeObjectURL(address), 10_000);
-  toast(`Saved as ${link.download}.`);
+  return link.download;
+}
+
+// Downloads a picture (Blob), with the title in its file name.
+export function savePicture(blob, title) {
+  toast(`Saved as ${saveBlob(blob, title, ".png")}.`);
 }
 
 const fileName = (title) =>

@@ -10,11 +10,14 @@
 //     {again: {plain}}                       decode the same bytes again
 //     {use: number}                          select the content to sort
 //     {sort: {ticket, row, sides, near, order}}
+//     {ask: {ticket, select}}                draw only the Gaussians that these selections keep, see selection.js
+//     {ask: {ticket}}                        return the file's bytes
 //     {close}                                the reader is no longer needed
 // Messages from the worker:
 //     {progress: {what, part}}
 //     {content: {number, whole, scene, models | splats, picture}}   see pack.js
 //     {order: {ticket, number, order, drawn}}
+//     {answer: {ticket, value | error}}      to `ask`: the numbers that are left after each selection, or the bytes
 //     {error}                                the reason, as soon as it is certain that the file cannot be read
 
 import { fitHarmonics } from "../hyrf/harmonics.js";
@@ -26,6 +29,7 @@ import { joinPositions, packModel, packSplats } from "./pack.js";
 import { movePositions, placeOf } from "./places.js";
 import { ReceivedFile } from "./received_file.js";
 import { backgroundPicture, modelScene, splatsScene } from "./scene.js";
+import { measureGaussians, selectGaussians } from "./selection.js";
 import { DepthSort } from "../hyrf/sort.js";
 
 const FIRST_LAYER_DELAY_MS = 150; // if the rest of the file arrives in this time, the first layer is not shown alone
@@ -64,7 +68,26 @@ class Service {
     if (message.again) this.reader.decodeAgain(message.again.plain);
     if (message.use !== undefined) this.sorter.use(message.use);
     if (message.sort) this.sorter.sort(message.sort);
+    if (message.ask) this.answer(message.ask);
     if (message.close) this.isClosed = true;
+  }
+
+  async answer({ ticket, select }) {
+    try {
+      const value = select ? await this.select(select) : this.reader.file.gather();
+      this.post({ answer: { ticket, value } });
+    } catch (error) {
+      this.post({ answer: { ticket, error: describeError(error) } });
+    }
+  }
+
+  // Hides the Gaussians that selections remove. Returns the numbers that are left after each.
+  async select(selections) {
+    const { reader, sorter } = this, needsMeasures = selections.some(({ rows }) => !rows);
+    if (needsMeasures) reader.measures ??= await measureGaussians(reader.file.gather());
+    const { kept, counts } = selectGaussians(selections, sorter.positions, reader.measures);
+    sorter.kept = kept;
+    return counts;
   }
 }
 
@@ -206,6 +229,12 @@ class ContentSorter {
     this.post = post;
     this.sorters = new Map(); // number of a content -> its DepthSort
     this.selected = null;
+    this.kept = null; // a byte for each Gaussian of the whole file, 0 if it is hidden; null to show all
+  }
+
+  // Returns the positions of the Gaussians of the selected content.
+  get positions() {
+    return this.sorters.get(this.selected).positions;
   }
 
   // Adds a content by its number and the positions of its splats (3 N).
@@ -221,7 +250,8 @@ class ContentSorter {
 
   // Posts the order of the splats for a request.
   sort({ ticket, row, sides, near, order: spare }) {
-    const { order, drawn } = this.sorters.get(this.selected).sort(row, sides, near, spare);
+    const sorter = this.sorters.get(this.selected), kept = this.kept?.length === sorter.count ? this.kept : null;
+    const { order, drawn } = sorter.sort(row, sides, near, spare, kept);
     this.post({ order: { ticket, number: this.selected, order, drawn } }, [order.buffer]);
   }
 }

@@ -19,6 +19,11 @@ export declare const rotateBy: (rows: number[][], vector: number[]) => number[];
  */
 export declare const rotateBack: ([a, b, c]: number[][], vector: number[]) => number[];
 /**
+ * Returns the columns of a matrix, given by its rows.
+ * @param {number[][]} rows
+ */
+export declare const transpose: (rows: number[][]) => number[][];
+/**
  * Returns the quaternion of a rotation matrix, given by its rows.
  * @param {number[][]} rows
  */

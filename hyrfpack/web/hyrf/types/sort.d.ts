@@ -19,9 +19,10 @@ export declare class DepthSort {
      * @param {number[]} sides from `frustumPlanes`
      * @param {number} near the depth of the near plane
      * @param {Uint32Array | null} [order] an array to reuse, if its length fits
+     * @param {Uint8Array | null} [kept] 0 for each splat to omit
      * @returns {{order: Uint32Array, drawn: number}} indices of splats, of which the first `drawn` are valid
      */
-    sort(row: number[], sides: number[], near: number, order?: Uint32Array | null): {
+    sort(row: number[], sides: number[], near: number, order?: Uint32Array | null, kept?: Uint8Array | null): {
         order: Uint32Array;
         drawn: number;
     };

@@ -69,3 +69,14 @@ export declare function storedCameras({ provenance }: import("./metadata.js").Me
     cameras: Camera[];
     isCoarse: boolean;
 };
+/**
+ * Returns the viewpoint of a model whose file has none. It looks slightly down from 2.5 times the frame's longest
+ * half-axis away; up is the frame's -y axis.
+ * @param {{center: number[], scale: number, rotation?: number[]}} frame
+ * @returns {Viewpoint}
+ */
+export declare function defaultViewpoint({ center, scale, rotation }: {
+    center: number[];
+    scale: number;
+    rotation?: number[];
+}): Viewpoint;

@@ -1,0 +1,102 @@
+// The actions of an edit, in the vocabulary of `hyrfpack edit`. An action is {option, value} with the name of the
+// option, without dashes, and its value: a number, a word, or several numbers. A crop box also has `isInverted`.
+
+import { frameAxes, rotateBy, transpose } from "../../hyrf/rotation.js";
+import { cross, dot, mul, unit } from "../../hyrf/vectors.js";
+
+const DIGITS_BELOW_UNIT = 4; // of positions, in a scene of one unit
+const AXES = { x: [1, 0, 0], y: [0, 1, 0], z: [0, 0, 1] };
+// An action takes the place of an earlier one of the same option, unless one of these lies between.
+const SEPARATORS = { "crop-box": ["scale", "upright"], "max-scale": ["scale"], "min-opacity": [], up: ["upright"] };
+
+// Returns the index of the action that another one of the option would replace, or -1.
+export function findActive(actions, option) {
+  const separators = SEPARATORS[option] ?? actions.map((action) => action.option);
+  const last = actions.findLastIndex((action) => separators.includes(action.option));
+  const found = actions.findLastIndex((action) => action.option === option);
+  return found > last ? found : -1;
+}
+
+// Returns the actions with another one, which replaces the active one of its option.
+export function putAction(actions, action) {
+  const active = findActive(actions, action.option);
+  return active < 0 ? [...actions, action] : actions.with(active, action);
+}
+
+// Returns the actions without the active one of an option.
+export function dropAction(actions, option) {
+  const active = findActive(actions, option);
+  return actions.filter((_, index) => index !== active);
+}
+
+// Returns where actions move a scene, p' = factor rows p in world units, and the up direction after them.
+export function placementAfter(actions, scene) {
+  let factor = 1, rows = [AXES.x, AXES.y, AXES.z], up = unit(scene.up);
+  for (const { option, value } of actions) {
+    if (option === "scale") factor *= value;
+    if (option === "up") up = unit(value);
+    if (option === "upright") {
+      const turn = uprightRows(up, AXES[value]), columns = transpose(rows).map((column) => rotateBy(turn, column));
+      rows = transpose(columns);
+      up = rotateBy(turn, up);
+    }
+  }
+  return { factor, rows, up };
+}
+
+// Returns the rows of the rotation that maps `up` to `target`, as upright_rotation in hyrfpack/splats/placement.py: if
+// they point in opposite directions, half a turn about x comes first.
+function uprightRows(up, target) {
+  if (dot(up, target) >= 0) return shortestRows(up, target);
+  const [a, b, c] = transpose(shortestRows([up[0], -up[1], -up[2]], target));
+  return transpose([a, mul(b, -1), mul(c, -1)]);
+}
+
+// Returns the rows of the shortest rotation between unit vectors whose dot product is not negative.
+function shortestRows(from, to) {
+  const [x, y, z] = cross(from, to), cosine = dot(from, to), k = 1 / (1 + cosine);
+  return [
+    [cosine + k * x * x, k * x * y - z, k * x * z + y],
+    [k * x * y + z, cosine + k * y * y, k * y * z - x],
+    [k * x * z - y, k * y * z + x, cosine + k * z * z],
+  ];
+}
+
+// Returns 3 x 4 numbers that map positions in the page's coordinates to world units after a placement.
+export function worldFromPage({ factor, rows }, scene) {
+  const columns = transpose(frameAxes(scene)).map((axis) => mul(rotateBy(rows, axis), factor * scene.unit));
+  const shift = mul(rotateBy(rows, scene.center), factor);
+  return transpose(columns).map((row, axis) => [...row, shift[axis]]);
+}
+
+// Returns what selection.js shall keep after actions.
+export function selectionsOf(actions, scene) {
+  return actions.flatMap(({ option, value, isInverted = false }, index) => {
+    const placement = placementAfter(actions.slice(0, index), scene);
+    if (option === "min-opacity") return [{ minOpacity: value }];
+    if (option === "max-scale") return [{ maxLength: value / (placement.factor * scene.unit) }];
+    if (option !== "crop-box") return [];
+    return [{ rows: worldFromPage(placement, scene), low: value.slice(0, 3), high: value.slice(3), isInverted }];
+  });
+}
+
+// Rounds a position or a length to a step that is invisible in a scene of a size, both in world units.
+export function roundLength(value, size) {
+  const digits = Math.min(20, Math.max(0, DIGITS_BELOW_UNIT - Math.floor(Math.log10(size))));
+  return Number(value.toFixed(digits)) + 0; // turns -0 into 0
+}
+
+// Returns the command that applies actions to a file, for POSIX shells and PowerShell.
+export function commandText(actions, file) {
+  const stem = file.split(/[\\/]/).pop().replace(/\.hyrf$/i, "") || "scene";
+  const options = actions.map(({ option, value, isInverted }) => {
+    return `--${option}=${[value].flat().join()}${isInverted ? " --invert" : ""}`;
+  });
+  return ["hyrfpack edit", shellWord(file), "-o", shellWord(`${stem}-edited.hyrf`), ...options].join(" ");
+}
+
+// Returns a path as one word of a shell.
+function shellWord(path) {
+  const word = path.startsWith("-") ? `./${path}` : path;
+  return /^[\p{L}\p{N}_.\/:+-]+$/u.test(word) ? word : `'${word.replaceAll("'", "'\\''")}'`;
+}

@@ -1,0 +1,159 @@
+// Edits the scene of a page: the panel with its tools, undo, and the command that does the same.
+
+import { element } from "../dom.js";
+import { announce, fail } from "../notifications.js";
+import { frameAxes, rotateBack } from "../../hyrf/rotation.js";
+import { placementAfter, selectionsOf } from "./actions.js";
+import { CleanTool } from "./clean_tool.js";
+import { CropTool } from "./crop_tool.js";
+import { History } from "./history.js";
+import { MeasureTool } from "./measure_tool.js";
+import { Overlay } from "./overlay.js";
+import { SaveTool } from "./save_tool.js";
+import { UpTool } from "./up_tool.js";
+import { ViewsTool } from "./views_tool.js";
+
+const MERGED_TEXT = "This file holds several models. Take one out with 'hyrfpack edit' and --part, and edit that one.";
+const TOOLS_FOR_ANY_FILE = ["measure", "views"]; // these change nothing
+
+export class Editor {
+  // The arguments are those of startPage.
+  constructor({ player, navigation, panel, opener, file }) {
+    Object.assign(this, { player, navigation, panel, opener, ownFile: file });
+    this.reset();
+    this.overlay = new Overlay(player, () => this.drawn, (projection) => this.tool?.placed?.(projection));
+    this.tools = {
+      crop: new CropTool(this), clean: new CleanTool(this), up: new UpTool(this),
+      measure: new MeasureTool(this), views: new ViewsTool(this), save: new SaveTool(this),
+    };
+    for (const button of document.querySelectorAll("[data-tool]")) {
+      button.onclick = () => this.choose(button.dataset.tool);
+    }
+    const { actions } = panel, closeOthers = actions.Escape;
+    actions.I = () => this.toggle();
+    actions.Escape = () => (element("edit").hidden ? closeOthers() : this.toggle(false));
+    element("edit-undo").onclick = () => this.go(-1);
+    element("edit-redo").onclick = () => this.go(1);
+    addEventListener("keydown", (event) => this.key(event));
+    player.addEventListener("opened", () => this.reset());
+    player.addEventListener("loaded", () => this.offer());
+    this.choose("crop");
+  }
+
+  // Forgets the edit of another scene.
+  reset() {
+    this.history = new History([]);
+    this.actions = []; // those that are shown: the last state of the history, or one that is being changed
+    this.count = null; // of the Gaussians that are left, null until it is known
+    this.applied = "[]"; // the selections that the player shows, as JSON
+    for (const tool of Object.values(this.tools ?? {})) tool.reset?.();
+    if (this.tools) this.toggle(false);
+  }
+
+  // Offers to edit a scene that is loaded.
+  offer() {
+    element("edit-button").hidden = !this.player.whole || this.player.scene.kind !== "hyrf";
+  }
+
+  // The name of the scene's file, or its path if the page knows it.
+  get file() {
+    const { isOwn, title } = this.opener.shown;
+    return (isOwn && this.ownFile) || `${title}.hyrf`;
+  }
+
+  get placement() {
+    return placementAfter(this.actions, this.player.scene);
+  }
+
+  // The size of the scene in world units.
+  get size() {
+    return this.placement.factor * this.player.scene.unit;
+  }
+
+  // What the overlay draws.
+  get drawn() {
+    return (!element("edit").hidden && this.tool?.drawn) || {};
+  }
+
+  toggle(isOpen = element("edit").hidden) {
+    if (isOpen && element("edit-button").hidden) return;
+    element("edit").hidden = !isOpen;
+    document.body.classList.toggle("editing", isOpen);
+    element("edit-button").setAttribute("aria-expanded", String(isOpen));
+    if (isOpen) this.panel.toggleSettings(false);
+    this.choose(this.toolName);
+  }
+
+  choose(name) {
+    this.tool?.leave?.();
+    this.toolName = name;
+    this.tool = this.tools[name];
+    const isOpen = !element("edit").hidden, isMerged = Boolean(this.player.scene?.parts);
+    const isRefused = isMerged && !TOOLS_FOR_ANY_FILE.includes(name);
+    for (const button of document.querySelectorAll("[data-tool]")) {
+      button.setAttribute("aria-pressed", String(button.dataset.tool === name));
+    }
+    for (const pane of document.querySelectorAll("[data-pane]")) pane.hidden = pane.dataset.pane !== name || isRefused;
+    element("edit-refusal").hidden = !isRefused;
+    element("edit-refusal").textContent = MERGED_TEXT;
+    element("edit-foot").hidden = isMerged;
+    this.navigation.controls.pick = isOpen && this.tool.pick ? (x, y) => this.tool.pick(x, y) : null;
+    document.body.classList.toggle("picking", this.navigation.controls.pick !== null);
+    if (isOpen && !isRefused) this.tool.enter?.();
+    this.refresh();
+  }
+
+  // Shows actions; if `isFinal`, they become a step that can be undone.
+  set(actions, isFinal = true) {
+    this.actions = actions;
+    if (isFinal) this.history.add(actions);
+    this.refresh();
+    this.apply().catch(fail);
+  }
+
+  go(step) {
+    this.history.go(step);
+    this.set(this.history.state, false);
+    announce(step < 0 ? "Undone" : "Redone");
+  }
+
+  key(event) {
+    const key = event.key.toUpperCase(), isRedo = key === "Y" || event.shiftKey;
+    if (element("edit").hidden || !(event.ctrlKey || event.metaKey) || !["Z", "Y"].includes(key)) return;
+    if (event.target.closest?.("input:not([type='range'], [type='checkbox'])")) return; // it has its own undo
+    event.preventDefault();
+    this.go(isRedo ? 1 : -1);
+  }
+
+  // Shows the state in the panel and over the scene.
+  refresh() {
+    const { scene } = this.player, { canUndo, canRedo } = this.history;
+    element("edit-undo").disabled = !canUndo;
+    element("edit-redo").disabled = !canRedo;
+    if (!scene || element("edit").hidden) return this.player.loaded && this.overlay.draw();
+    const all = scene.count.toLocaleString("en"), left = (this.count ?? scene.count).toLocaleString("en");
+    element("edit-count").textContent = this.count === 0
+      ? "No Gaussian is left." : `${left === all ? all : `${left} of ${all}`} Gaussians`;
+    this.tool.refresh?.();
+    this.overlay.draw();
+  }
+
+  // Applies the actions to the picture, the newest ones only if they change quickly.
+  async apply() {
+    const { player } = this, { scene, up } = { ...this.placement, scene: player.scene };
+    player.eye.up = rotateBack(frameAxes(scene), rotateBack(this.placement.rows, up));
+    if (this.isApplying) return;
+    this.isApplying = true;
+    try {
+      for (;;) {
+        const selections = selectionsOf(this.actions, player.scene), wanted = JSON.stringify(selections);
+        if (wanted === this.applied) break;
+        this.applied = wanted;
+        this.count = (await player.select(selections)).at(-1) ?? null;
+        this.refresh();
+      }
+    } finally {
+      this.isApplying = false;
+    }
+  }
+}

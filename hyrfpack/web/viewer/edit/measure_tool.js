@@ -1,0 +1,61 @@
+// Measures the distance of two points, and scales the scene by a known one.
+
+import { element } from "../dom.js";
+import { add, mul, sub } from "../../hyrf/vectors.js";
+import { PointPicker } from "./point_picker.js";
+
+const DIGITS = 4; // of distances
+const FACTOR_DIGITS = 6;
+
+export class MeasureTool {
+  constructor(editor) {
+    this.editor = editor;
+    this.picker = new PointPicker(editor, "measure", (points) => this.take(points));
+    element("edit-clear").onclick = () => {
+      this.picker.clear();
+      editor.refresh();
+    };
+    element("edit-rescale").onclick = () => this.rescale(element("edit-length").valueAsNumber);
+  }
+
+  // The distance in world units after the actions, or null without two points.
+  get distance() {
+    const { points: [from, to] } = this.picker;
+    return to ? this.editor.size * Math.hypot(...sub(to, from)) : null;
+  }
+
+  get text() {
+    return this.distance === null ? "" : `${Number(this.distance.toPrecision(DIGITS))} units`;
+  }
+
+  get drawn() {
+    const { points } = this.picker, [from, to] = points;
+    if (!to) return { points };
+    return { points, segments: [points], labels: [{ at: mul(add(from, to), 0.5), text: this.text }] };
+  }
+
+  pick(x, y) {
+    this.picker.pick(x, y);
+  }
+
+  reset() {
+    this.picker.clear();
+  }
+
+  // A third point begins another measurement.
+  take(points) {
+    if (points.length > 2) this.picker.points = points.slice(2);
+    this.editor.refresh();
+  }
+
+  // Scales the scene so that the two points have a distance.
+  rescale(length) {
+    const { editor, distance } = this, value = Number((length / distance).toPrecision(FACTOR_DIGITS));
+    if (distance && value > 0 && Number.isFinite(value)) editor.set([...editor.actions, { option: "scale", value }]);
+  }
+
+  refresh() {
+    element("edit-distance").textContent = this.text;
+    element("edit-rescale").disabled = this.distance === null;
+  }
+}

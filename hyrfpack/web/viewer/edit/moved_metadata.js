@@ -1,0 +1,53 @@
+// Moves the metadata of a file: its frame, its cameras and its viewpoint, as hyrfpack/edit/transform.py.
+
+import { frameAxes, quatOf, rotateBy, transpose } from "../../hyrf/rotation.js";
+import { dot, mul } from "../../hyrf/vectors.js";
+import { defaultViewpoint } from "../../hyrf/viewpoint.js";
+
+const MIN_TURN_RADIANS = 1e-12; // a frame that is turned by less is not turned
+const CAMERA_KEYS = ["cameras", "coarse_cameras"];
+const INTRINSICS = 6; // numbers of a stored camera before its pose
+
+// Returns metadata after a placement, p' = factor rows p. `statesUp` is whether the placement's up replaces that of the
+// file.
+export function moveMetadata(metadata, placement, statesUp) {
+  const { config, provenance } = metadata, moved = { ...provenance };
+  for (const key of CAMERA_KEYS) {
+    if (moved[key]) moved[key] = moved[key].map((numbers) => moveCamera(numbers, placement).map(roundNumber));
+  }
+  if (statesUp) moved.viewpoint ??= storedForm(defaultViewpoint(config.frame));
+  if (moved.viewpoint) moved.viewpoint = moveViewpoint(moved.viewpoint, placement, statesUp);
+  return { ...metadata, config: { ...config, frame: moveFrame(config.frame, placement) }, provenance: moved };
+}
+
+function moveFrame(frame, { factor, rows }) {
+  const { rotation, ...rest } = frame, axes = transpose(frameAxes({ rotation })).map((axis) => rotateBy(rows, axis));
+  const quat = quatOf(transpose(axes));
+  const isTurned = 2 * Math.hypot(...quat.slice(1)) >= MIN_TURN_RADIANS;
+  const moved = { ...rest, center: mul(rotateBy(rows, frame.center), factor), scale: factor * frame.scale };
+  return isTurned ? { ...moved, rotation: quat } : moved;
+}
+
+// Moves 18 numbers: those of the lens, and the rows of the pose.
+function moveCamera(numbers, placement) {
+  const pose = [0, 1, 2].map((r) => numbers.slice(INTRINSICS + 4 * r, INTRINSICS + 4 * r + 4));
+  return [...numbers.slice(0, INTRINSICS), ...pose.flatMap((row) => moveRow(row, placement))];
+}
+
+const moveRow = (row, { factor, rows }) => [...rows.map((axis) => dot(axis, row)), factor * row[3]];
+
+// Returns a viewpoint in the form that files store.
+const storedForm = ({ target, up, arc, camera: { fx, fy, cx, cy, ...camera } }) =>
+  ({ ...camera, center: target, up, arc, intrinsics: [fx, fy, cx, cy] });
+
+function moveViewpoint(viewpoint, placement, statesUp) {
+  const { factor, rows, up } = placement, [a, b, c] = viewpoint.camera_from_world;
+  return {
+    ...viewpoint, center: mul(rotateBy(rows, viewpoint.center), factor),
+    up: statesUp ? up : rotateBy(rows, viewpoint.up),
+    camera_from_world: [...[a, b, c].map((row) => moveRow(row, placement)), [0, 0, 0, 1]],
+  };
+}
+
+// Rounds as round_number in hyrfpack/cameras/files.py.
+const roundNumber = (value) => Number(Math.abs(value) < 1000 ? value.toPrecision(9) : value.toFixed(6)) + 0;

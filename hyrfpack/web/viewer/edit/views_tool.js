@@ -1,0 +1,137 @@
+// Keeps named views, plays a path through them, and saves both as cameras for `hyrfpack render --cameras`.
+
+import { cameraOf } from "../camera.js";
+import { element } from "../dom.js";
+import { saveBlob } from "../share.js";
+import { toast } from "../notifications.js";
+import { dot } from "../../hyrf/vectors.js";
+import { poseOnPath } from "./camera_path.js";
+
+const FRAMES_PER_SECOND = 30; // of a saved path
+const MAX_SIDE_PIXELS = 1920; // of saved cameras
+
+export class ViewsTool {
+  constructor(editor) {
+    Object.assign(this, { editor, views: [] }); // {name, pose: that of the eye}
+    element("edit-new-view").onsubmit = (event) => {
+      event.preventDefault();
+      this.add(element("edit-view-name").value.trim() || this.nextName);
+    };
+    element("edit-seconds").oninput = () => this.refresh();
+    element("edit-play").onclick = () => this.play();
+    element("edit-save-views").onclick = () => this.saveViews();
+    element("edit-save-path").onclick = () => this.savePath();
+  }
+
+  get nextName() {
+    return `view ${this.views.length + 1}`;
+  }
+
+  get seconds() {
+    return Number(element("edit-seconds").value) * (this.views.length - 1);
+  }
+
+  get poses() {
+    return this.views.map(({ pose }) => pose);
+  }
+
+  enter() {
+    element("edit-view-name").value = this.nextName;
+    this.list();
+  }
+
+  leave() {
+    if (this.isPlaying) this.editor.navigation.glide.stop();
+  }
+
+  reset() {
+    this.views = [];
+  }
+
+  add(name) {
+    this.views.push({ name, pose: this.editor.player.eye.pose });
+    element("edit-view-name").value = this.nextName;
+    this.list();
+  }
+
+  // Lists the views, each with its name, a button that goes there, and one that removes it.
+  list() {
+    element("edit-views").replaceChildren(...this.views.map((view) => {
+      const item = document.createElement("li"), name = document.createElement("input");
+      const rename = () => (view.name = name.value);
+      Object.assign(name, { value: view.name, maxLength: 60, ariaLabel: "Name", onchange: rename });
+      item.append(name, createButton("Go", `Go to ${view.name}`, () => this.go(view)));
+      item.append(createButton("✕", `Remove ${view.name}`, () => this.remove(view)));
+      return item;
+    }));
+    this.refresh();
+  }
+
+  go({ pose }) {
+    const { navigation, player } = this.editor;
+    navigation.stop();
+    navigation.glide.to(() => Object.assign(player.eye, pose));
+    player.changed();
+  }
+
+  remove(view) {
+    this.views = this.views.filter((other) => other !== view);
+    this.list();
+  }
+
+  play() {
+    const { navigation: { glide } } = this.editor;
+    if (this.isPlaying) return glide.stop();
+    const { poses } = this;
+    this.isPlaying = true;
+    glide.follow((part) => poseOnPath(poses, part), this.seconds, () => {
+      this.isPlaying = false;
+      this.refresh();
+    });
+    this.refresh();
+  }
+
+  // Returns a camera of a pose for the scene after the actions of the edit.
+  cameraOf(pose) {
+    const { player, placement: { factor, rows } } = this.editor, { width, height } = player.canvas;
+    const scale = Math.min(1, MAX_SIDE_PIXELS / Math.max(width, height));
+    const sides = [width, height].map((side) => 2 * Math.max(1, Math.round((side * scale) / 2))); // even, for videos
+    const eye = Object.assign(Object.create(player.eye), pose), camera = cameraOf(eye.view(...sides), player.scene);
+    const moved = camera.camera_from_world.slice(0, 3).map((row) => {
+      return [...rows.map((axis) => dot(axis, row)), factor * row[3]];
+    });
+    return { ...camera, camera_from_world: [...moved, [0, 0, 0, 1]] };
+  }
+
+  saveViews() {
+    this.save(this.views.map(({ name, pose }) => ({ name, ...this.cameraOf(pose) })), "views");
+  }
+
+  savePath() {
+    const frames = Math.round(this.seconds * FRAMES_PER_SECOND) + 1, { poses } = this;
+    const digits = String(frames).length;
+    this.save(Array.from({ length: frames }, (_, k) => {
+      return { name: String(k).padStart(digits, "0"), ...this.cameraOf(poseOnPath(poses, k / (frames - 1))) };
+    }), "path");
+  }
+
+  save(cameras, kind) {
+    const text = JSON.stringify(cameras, null, 1), { title } = this.editor.opener.shown;
+    const name = saveBlob(new Blob([text]), title, `-${kind}.json`);
+    toast(`Saved as ${name}; 'hyrfpack render' reads it by --cameras.`);
+  }
+
+  refresh() {
+    const { length } = this.views;
+    element("edit-seconds").nextElementSibling.textContent = `${Number(element("edit-seconds").value)} s`;
+    element("edit-play").textContent = this.isPlaying ? "Stop" : "Play";
+    element("edit-save-views").disabled = length < 1;
+    element("edit-play").disabled = element("edit-save-path").disabled = length < 2;
+  }
+}
+
+function createButton(text, name, onclick) {
+  const button = Object.assign(document.createElement("button"), { textContent: text, title: name, onclick });
+  button.setAttribute("aria-label", name);
+  return button;
+}

@@ -1,0 +1,89 @@
+"""A file that the player saves after an edit of its metadata equals the one that `hyrfpack edit` writes."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from pathlib import Path
+from typing import Any
+
+import pytest
+from web.scripts import run_script
+
+from hyrfpack.cli.edit import edit
+from hyrfpack.format.container import Container
+from hyrfpack.format.metadata import read_metadata, writer_name
+from hyrfpack.format.sections import METADATA
+
+GOLDEN_FOLDER = Path(__file__).parents[1] / "golden"
+FILES = [
+    "trained/demo.hyrf",
+    "trained/demo_compact.hyrf",
+    "trained/exposed_balls.hyrf",
+    "v1.0_paper.hyrf",
+    "v1.1_compact_layers.hyrf",
+    "v1.3_compact_rotated.hyrf",
+]
+UP = {"option": "up", "value": [0.3, -0.8, 0.52]}
+EDITS = {
+    "up": [UP],
+    "upright": [UP, {"option": "upright", "value": "z"}],
+    "half a turn": [{"option": "up", "value": [0.1, -0.9, -0.2]}, {"option": "upright", "value": "y"}],
+    "scaled": [{"option": "scale", "value": 0.254}],
+    "all": [
+        {"option": "scale", "value": 3},
+        UP,
+        {"option": "upright", "value": "y"},
+        {"option": "up", "value": [0, 0.6, 0.8]},
+        {"option": "upright", "value": "z"},
+        {"option": "scale", "value": 0.5},
+    ],
+}
+
+
+def assert_equal_numbers(first: Any, second: Any, path: str = "") -> None:
+    """Assert that two JSON values are equal, numbers to nine digits."""
+    if isinstance(first, dict):
+        assert isinstance(second, dict) and sorted(first) == sorted(second), path
+        for key in first:
+            assert_equal_numbers(first[key], second[key], f"{path}.{key}")
+    elif isinstance(first, list):
+        assert isinstance(second, list) and len(first) == len(second), path
+        for number, (one, other) in enumerate(zip(first, second, strict=True)):
+            assert_equal_numbers(one, other, f"{path}[{number}]")
+    elif isinstance(first, (int, float)) and not isinstance(first, bool):
+        assert first == pytest.approx(second, rel=2e-9, abs=2e-9), path
+    else:
+        assert first == second, path
+
+
+@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("actions", EDITS.values(), ids=EDITS)
+def test_a_saved_file_equals_that_of_the_command(name: str, actions: list[dict], tmp_path: Path, monkeypatch):
+    path, target = tmp_path / "scene.hyrf", tmp_path / "saved.hyrf"
+    path.write_bytes((GOLDEN_FOLDER / name).read_bytes())
+    (tmp_path / "actions.json").write_text(json.dumps(actions))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("hyrfpack.edit.run.MAX_COMPARED_VIEWS", 1)
+
+    script = Path(__file__).with_name("rewrite.mjs")
+    answer = run_script(script, path, tmp_path / "actions.json", writer_name(), target)
+    edit.main(shlex.split(answer["command"])[2:], standalone_mode=False)
+
+    assert answer["isOffered"]
+    with Container.open(target) as saved, Container.open(tmp_path / "scene-edited.hyrf") as written:
+        assert list(saved.entries) == list(written.entries)
+        for section in written.entries:
+            if section != METADATA:
+                assert bytes(saved[section].data) == bytes(written[section].data)
+            assert saved.entries[section].codec == written.entries[section].codec
+        assert_equal_numbers(vars(read_metadata(saved)), vars(read_metadata(written)))
+    assert target.read_bytes()[:16] == (tmp_path / "scene-edited.hyrf").read_bytes()[:16]  # with the format version
+
+
+def test_edits_that_remove_gaussians_are_left_to_the_command(tmp_path: Path):
+    path = GOLDEN_FOLDER / "trained" / "demo_compact.hyrf"
+    (tmp_path / "actions.json").write_text(json.dumps([UP, {"option": "min-opacity", "value": 0.1}]))
+    script = Path(__file__).with_name("rewrite.mjs")
+    answer = run_script(script, path, tmp_path / "actions.json", writer_name(), tmp_path / "saved.hyrf")
+    assert not answer["isOffered"] and not (tmp_path / "saved.hyrf").exists()
