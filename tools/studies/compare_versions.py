@@ -8,8 +8,13 @@ version scores the decoded files on held-out photos by PSNR and SSIM. For each d
 bytes at equal PSNR in percent (BD-rate over the common range of PSNR, by monotone cubics). It also has the change of
 PSNR in dB and of SSIM at the largest common number of bytes, and the ratio of training times. The share `measured` is
 the budget that a version chooses itself. With that share alone, the table has PSNR, SSIM and bytes of both versions and
-their differences instead. Runs are kept in --out and are not repeated; a run with scores.json is not scored again. The
-other version runs with the packages of this environment, and with --against-options for `train`.
+their differences instead. With --sizes, each model is also compressed to shares of its default file, so one budget is
+enough for the change of bytes at equal PSNR:
+
+    python -m tools.studies.compare_versions --against ../before --shares measured --sizes 1 0.7 0.5 0.35
+
+Runs are kept in --out and are not repeated; a file with scores is not scored again. The other version runs with the
+packages of this environment, and with --against-options for `train`.
 """
 
 from __future__ import annotations
@@ -20,6 +25,7 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -59,21 +65,25 @@ def train_and_score(
     seed: int,
     out: Path,
     options: Sequence[str] = (),
+    size: float = 1,
 ) -> dict[str, float]:
     """Train and compress with one version, score with this one, and return bytes, scores, seconds and Gaussians.
 
-    With `gaussians` None, the version chooses its budget. `options` are further options of its command `train`.
+    With `gaussians` None, the version chooses its budget. `options` are further options of its command `train`. `size`
+    is the share of the bytes of the version's default file that the scored file may have; 1 for that file itself.
     """
-    scores_file = out / "scores.json"
+    suffix = "" if size == 1 else f"-{size:g}"
+    scores_file = out / f"scores{suffix}.json"
     if scores_file.exists():
         return json.loads(scores_file.read_text())
     if not (out / "metrics.json").exists():
         settings = ["--steps", str(steps), "--seed", str(seed), "--overwrite", *options]
         budget = [] if gaussians is None else ["--max-gaussians", str(gaussians)]
         _run_command(version, "train", str(scene.path), "-o", str(out), *settings, *budget)
-    packed = out / "compact.hyrf"
+    default_file, packed = out / "compact.hyrf", out / f"compact{suffix}.hyrf"
     packed.unlink(missing_ok=True)
-    _run_command(version, "compress", str(out / "model.hyrf"), "-o", str(packed))
+    limit = [] if size == 1 else ["--target-size", str(round(size * default_file.stat().st_size))]
+    _run_command(version, "compress", str(out / "model.hyrf"), "-o", str(packed), *limit)
     scores = hyrfpack.evaluate_model(hyrfpack.load_model(packed), scene.test)
     trained = json.loads((out / "metrics.json").read_text())
     result = {
@@ -178,9 +188,12 @@ def main() -> None:
     parser.add_argument(
         "--shares", nargs="+", default=["0.25", "0.5", "1", "2"], help="shares of the budget, or 'measured'"
     )
+    parser.add_argument(
+        "--sizes", type=float, nargs="+", default=[1.0], help="bytes of the files, as shares of the default file's (1)"
+    )
     parser.add_argument("--against-options", nargs="*", default=[], help="options of `train` for the other version")
     args = parser.parse_args()
-    shows_scores = args.shares == [ESTIMATED_BUDGET_SHARE]
+    shows_scores = args.shares == [ESTIMATED_BUDGET_SHARE] and args.sizes == [1.0]
     header = _SCORES_HEADER if shows_scores else _TABLE_HEADER
     versions = {"now": REPOSITORY_ROOT, "before": args.against.resolve()}
     warnings.simplefilter("ignore")
@@ -189,7 +202,7 @@ def main() -> None:
         scene = hyrfpack.load_scene((args.data / name).resolve())
         budget, _ = budget_for(scene, TrainConfig(steps=args.steps))
         points: dict[str, list[dict[str, float]]] = {version: [] for version in versions}
-        for share in args.shares:
+        for share, size in product(args.shares, sorted(args.sizes, reverse=True)):
             for version, folder in versions.items():
                 seeds = []
                 for seed in range(args.seeds):
@@ -197,7 +210,7 @@ def main() -> None:
                     out.mkdir(parents=True, exist_ok=True)
                     gaussians = None if share == ESTIMATED_BUDGET_SHARE else round(float(share) * budget)
                     options = args.against_options if version == "before" else []
-                    seeds.append(train_and_score(folder, scene, args.steps, gaussians, seed, out, options))
+                    seeds.append(train_and_score(folder, scene, args.steps, gaussians, seed, out, options, size))
                 points[version].append(mean_over_seeds(seeds))
         now, before = points["now"], points["before"]
         rows.append(format_scores_row(name, now[0], before[0]) if shows_scores else format_row(name, now, before))
