@@ -1,9 +1,11 @@
 """Floaters: Gaussians that hang in front of the surfaces, and whose light the photos contradict.
 
-A model alone does not say whether something in the air was there. So all opacities are first adjusted to the photos,
-and nothing else. This is a small problem with a clear answer, because a pixel's colour is linear in each opacity: what
-the photos contradict fades. Of the Gaussians that fade, those are floaters that lie in front of the depth that the
-others show. The rest are needless parts of surfaces, which an edit should not touch.
+A model alone does not say whether something in the air was there. So all opacities are first reduced where the photos
+ask for it, and nothing else changes. This is a small problem with a clear answer, because a pixel's colour is linear in
+each opacity: what the photos contradict fades. Opacities may not rise, or surfaces would replace each other. A Gaussian
+whose colour is like that of what lies behind it stays, because fading must pay for its light. Of the Gaussians that
+fade, those are floaters that lie in front of the depth that the others show. The rest are needless parts of surfaces,
+which an edit should not touch.
 """
 
 from __future__ import annotations
@@ -19,7 +21,9 @@ from torch import Tensor
 
 from hyrfpack.data.reduced import reduce_view
 from hyrfpack.device import upload
+from hyrfpack.edit.light import measure_light
 from hyrfpack.model import HybridModel
+from hyrfpack.model.gaussians import logit
 from hyrfpack.progress import Progress, TaskEvent, ignore_progress
 from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.scene import Camera, View, evenly_spaced
@@ -27,12 +31,17 @@ from hyrfpack.train.resolution import reduced_low_pass_variance
 
 MAX_PHOTOS = 128
 MAX_SIDE_PIXELS = 640  # of the reduced photos
-MIN_PASSES, MIN_STEPS = 8, 300  # passes over the photos; steps of one photo each
-LEARNING_RATE = 0.1  # of the opacity logits
+MIN_PASSES, MIN_STEPS = 16, 600  # passes over the photos; steps of one photo each
+LEARNING_RATE = 0.05  # of the shares of opacity
 ADAM_BETAS = (0.9, 0.99)
+# Fading must lower the squared error, the mean of three channels, by this much for each pixel of light that is lost.
+MIN_ERROR_PER_LIGHT = (4.5 / 255) ** 2
 # A floater is nearer than the surface behind it by this fraction of the surface's depth, in this share of its views.
 MIN_GAP = 0.12
-MIN_VIEW_SHARE_IN_FRONT = 0.3
+MIN_VIEW_SHARE_IN_FRONT = 0.15
+# Many faded Gaussians, each with a share of 0.01, are a haze that others then make up for.
+MIN_SHARE = 0.002
+MIN_OPACITY, MAX_OPACITY = 1e-4, 1 - 1e-4  # limits for finite logits
 MIN_SURFACE_ALPHA = 0.5  # pixels with less coverage show no surface: what is there lies in front of it
 _ADJUSTING_SHARE = 0.9  # of the time
 
@@ -56,9 +65,7 @@ def find_floaters(
     factor = math.ceil(longest / MAX_SIDE_PIXELS)
     settings = RenderSettings(low_pass_variance=reduced_low_pass_variance(factor))
     reduced = [reduce_view(view, factor) for view in evenly_spaced(views, MAX_PHOTOS)]
-    before = model.decode_geometry().opacities.detach().numpy()
-    after = _adjusted_opacities(model, reduced, settings, progress)
-    faded = after < min_opacity_share * before
+    faded = _supported_shares(model, reduced, settings, progress) < min_opacity_share
     if not faded.any():
         return faded
     progress(TaskEvent("comparing depths", _ADJUSTING_SHARE))
@@ -69,27 +76,49 @@ def find_floaters(
     return faded
 
 
-def _adjusted_opacities(
+def _supported_shares(
     model: HybridModel, views: Sequence[View], settings: RenderSettings, progress: Progress
 ) -> np.ndarray:
-    """Return opacities (N,) that minimise the squared error of the photos, with all else as it is."""
-    adjusted = copy.deepcopy(model).requires_grad_(False)
-    logits = adjusted.gaussians.opacity_logits.requires_grad_(True)
-    optimizer = torch.optim.Adam([logits], lr=LEARNING_RATE, betas=ADAM_BETAS)
+    """Return the share (N,) of its opacity that the photos leave to each Gaussian, `MIN_SHARE` to 1.
+
+    The shares s minimise the squared error of the photos plus the cost of lost light: `MIN_ERROR_PER_LIGHT` (1 - s) L
+    for a Gaussian with the light L, in pixels of a mean view. A logit instead of a share would leave opaque Gaussians
+    almost no gradient.
+    """
+    reduced = copy.deepcopy(model).requires_grad_(False)
+    before = model.decode_geometry().opacities.detach()[:, None].clamp(MIN_OPACITY, MAX_OPACITY)
+    fields = logit(before) - reduced.gaussians.opacity_logits
+    del reduced.gaussians.opacity_logits  # from a parameter to a function of the shares
+    light = _mean_light(model, views, settings)
+    shares = torch.ones_like(before).requires_grad_(True)
+    optimizer = torch.optim.Adam([shares], lr=LEARNING_RATE, betas=ADAM_BETAS)
     solid = np.array(model.config.solid, np.float32)
     order = np.random.default_rng(0)
     passes = max(MIN_PASSES, math.ceil(MIN_STEPS / len(views)))
     steps = passes * len(views)
     for step, view in enumerate(views[i] for _ in range(passes) for i in order.permutation(len(views))):
         progress(TaskEvent("comparing with photos", _ADJUSTING_SHARE * step / steps))
-        photo, mask = upload(view.load(), solid, logits.device)
-        rgb = render_view(adjusted, view.camera, settings).rgb
+        photo, mask = upload(view.load(), solid, shares.device)
+        reduced.gaussians.opacity_logits = logit(shares * before) - fields
+        rgb = render_view(reduced, view.camera, settings).rgb
         if not rgb.requires_grad:  # no Gaussian is in view
             continue
+        kept_light = (light * shares).sum() / photo[..., 0].numel()
         optimizer.zero_grad()
-        _squared_error(rgb, photo, mask).backward()
+        (_squared_error(rgb, photo, mask) - MIN_ERROR_PER_LIGHT * kept_light).backward()
         optimizer.step()
-    return adjusted.requires_grad_(False).decode_geometry().opacities.numpy()
+        with torch.no_grad():
+            shares.clamp_(MIN_SHARE, 1)
+    return shares.detach()[:, 0].numpy()
+
+
+def _mean_light(model: HybridModel, views: Sequence[View], settings: RenderSettings) -> Tensor:
+    """Return the light (N, 1) of the Gaussians in pixels, the mean of all views."""
+    light = torch.zeros((1, len(model)))
+    for view in views:
+        everywhere = torch.ones((1, view.camera.height, view.camera.width))
+        light += measure_light(model, view.camera, everywhere, settings) / len(views)
+    return light.T
 
 
 def _squared_error(rgb: Tensor, photo: Tensor, mask: Tensor | None) -> Tensor:
