@@ -19,10 +19,12 @@ from hyrfpack.cli.common import (
     scene_options,
 )
 from hyrfpack.cli.ordered import OrderedCommand, options_in_order
+from hyrfpack.cli.settings import settings_options
 from hyrfpack.cli.types import BOX, OUTPUT, PATH, Numbers, NumbersOrWord
 from hyrfpack.config.compress import PROFILES
 from hyrfpack.config.edit import (
     DEFAULT_MIN_OPACITY_SHARE,
+    DEFAULT_REFIT_STEPS,
     UPRIGHT_AXES,
     Action,
     Background,
@@ -32,10 +34,12 @@ from hyrfpack.config.edit import (
     CropCameras,
     CropMasks,
     CropSphere,
+    EditLimits,
     EstimateUp,
     KeepGaussians,
     MaxScale,
     MinOpacity,
+    Refit,
     Remove,
     RemoveFloaters,
     Rotate,
@@ -78,7 +82,7 @@ _ACTION_BY_OPTION: dict[str, Callable[[Any], Action]] = {
 }
 
 
-@click.command(short_help="Crop, clean, reduce and move a model.", cls=OrderedCommand)
+@click.command(short_help="Crop, clean, repair, reduce and move a model.", cls=OrderedCommand)
 @click.argument("model", type=PATH)
 @click.option("-o", "--output", type=OUTPUT, metavar="FILE", help="The .hyrf file to write.")
 @click.option("--plan", is_flag=True, help="Print what the actions would do, and write no model.")
@@ -112,6 +116,14 @@ _ACTION_BY_OPTION: dict[str, Callable[[Any], Action]] = {
     "--data.",
 )
 @click.option("--invert", count=True, help="After a crop: remove the Gaussians that it would keep.")
+@click.option(
+    "--refit",
+    type=int,
+    multiple=True,
+    metavar="STEPS",
+    help="After a crop: remove nothing, and train the Gaussians that it would keep on the photos, while all others "
+    f"stay as they are; needs --data. Begin with {DEFAULT_REFIT_STEPS} steps.",
+)
 @click.option("--min-opacity", type=float, multiple=True, metavar="OPACITY", help="Remove lower opacities, 0 to 1.")
 @click.option(
     "--max-scale", type=float, multiple=True, metavar="LENGTH", help="Remove Gaussians with a longer axis (std. dev.)."
@@ -160,12 +172,17 @@ _ACTION_BY_OPTION: dict[str, Callable[[Any], Action]] = {
     "+z, as in Blender, Unreal and CAD.",
 )
 @click.option("--part", metavar="NAME", help="The part of a merged file that is taken out and edited.")
-@click.option("--profile", type=click.Choice(PROFILES), help="Profile of the file to write.  [default: that of MODEL]")
+@click.option(
+    "--profile",
+    type=click.Choice(PROFILES),
+    help="Profile of the file to write.  [default: that of MODEL; compact with --target-size or --max-psnr-drop]",
+)
+@settings_options(EditLimits, "target_bytes", "max_psnr_drop")
 @click.option(
     "--data",
     type=PATH,
-    help="Photos and poses of MODEL, for --remove-floaters and --crop-masks, and for scores on held-out photos before "
-    "and after.",
+    help="Photos and poses of MODEL, for --remove-floaters, --crop-masks, --refit and --max-psnr-drop, and for scores "
+    "on held-out photos before and after.",
 )
 @overwrite_option
 @scene_options
@@ -179,6 +196,8 @@ def edit(
     picture: Path | None,
     part: str | None,
     profile: str | None,
+    target_bytes: int | None,
+    max_psnr_drop: float | None,
     data: Path | None,
     overwrite: bool,
     reader_options: dict[str, Any],
@@ -197,6 +216,8 @@ def edit(
       hyrfpack edit garden.hyrf -o clean.hyrf --min-opacity 0.02 --crop-cameras 0.5
       hyrfpack edit runs/garden -o clean.hyrf --remove-floaters 0.35 --data photos/garden
       hyrfpack edit runs/desk -o lamp.hyrf --crop-masks lamp_masks --data photos/desk --background-color 1,1,1
+      hyrfpack edit runs/desk -o desk.hyrf --crop-sphere 0,0,0,0.4 --refit 500 --data photos/desk
+      hyrfpack edit runs/garden -o small.hyrf --crop-cameras 0.5 --target-size 150kB
       hyrfpack edit survey.hyrf -o plot.hyrf --crop-polygon plot.json
       hyrfpack edit room.hyrf -o hole.hyrf --crop-box=-1,-1,-1,1,1,1 --invert
       hyrfpack edit survey.hyrf -o meters.hyrf --scale 2.54
@@ -204,10 +225,13 @@ def edit(
       hyrfpack edit furnished.hyrf -o chair.hyrf --part chair
     """
     actions = _read_actions(options_in_order(ctx, values))
-    if not actions and part is None:
+    limits = EditLimits(target_bytes, max_psnr_drop)
+    if not actions and part is None and limits == EditLimits():
         raise click.UsageError("there is nothing to do; give at least one action, such as --crop-sphere 0,0,0,1")
     if plan == (output is not None):
         raise click.UsageError("give either -o FILE to write the edited model, or --plan to see what would change")
+    if plan and limits != EditLimits():
+        raise click.UsageError("--plan writes no file, whose size or loss could be limited; leave out the limit")
     from hyrfpack.edit import edit_model, plan_edit
     from hyrfpack.format import describe_file
 
@@ -223,6 +247,7 @@ def edit(
             actions,
             part=part,
             profile=profile,
+            limits=limits,
             data=scene,
             picture=picture,
             overwrite=overwrite,
@@ -238,19 +263,23 @@ def _read_actions(options: Iterable[tuple[str, Any]]) -> list[Action]:
     """Return the actions that options name by their names and values, in this order.
 
     Raises:
-        UsageError: a number is out of its range, or --invert does not follow a crop.
+        UsageError: a number is out of its range, or --invert or --refit does not follow a crop.
     """
     actions: list[Action] = []
     for name, value in options:
-        if name == "invert":
-            if not actions or not isinstance(actions[-1], Crop):
-                raise click.UsageError("--invert must follow an option that crops, such as --crop-box")
-            actions[-1] = Remove(actions[-1])
-        else:
-            try:
+        try:
+            if name == "invert":
+                if not actions or not isinstance(actions[-1], Crop):
+                    raise click.UsageError("--invert must follow an option that crops, such as --crop-box")
+                actions[-1] = Remove(actions[-1])
+            elif name == "refit":
+                if not actions or not isinstance(actions[-1], Crop | Remove):
+                    raise click.UsageError("--refit must follow an option that crops, such as --crop-box")
+                actions[-1] = Refit(actions[-1], value)
+            else:
                 actions.append(_ACTION_BY_OPTION[name](value))
-            except ValueError as error:
-                raise click.UsageError(f"--{name.replace('_', '-')}: {error}") from error
+        except ValueError as error:
+            raise click.UsageError(f"--{name.replace('_', '-')}: {error}") from error
     return actions
 
 
@@ -260,6 +289,12 @@ def _print_report(report: EditReport) -> None:
         for step in report.actions
     ]
     click.echo(format_table(["action", "Gaussians", "change"], rows))
+    for step in report.actions:
+        if step.region_psnr_before is not None:
+            click.echo(
+                f"{step.action}: {step.gaussians_trained:,} Gaussians, PSNR there on held-out photos "
+                f"{step.region_psnr_before:.2f} to {step.region_psnr_after:.2f} dB"
+            )
     click.echo(
         f"renders before and after, {report.views} views: PSNR mean {report.psnr_change:.2f} dB, lowest "
         f"{report.psnr_change_worst:.2f} dB"
@@ -269,5 +304,7 @@ def _print_report(report: EditReport) -> None:
             f"held-out photos: PSNR {report.psnr_before:.3f} to {report.psnr_after:.3f} dB, SSIM "
             f"{report.ssim_before:.4f} to {report.ssim_after:.4f}"
         )
+    if report.found:
+        click.echo(report.found)
     if report.file:
         click.echo(f"{report.file}: {report.bytes_after:,} bytes, {report.bytes_before:,} before")

@@ -74,7 +74,7 @@ def compress_model(
     # Only the main process checks the target, while the others wait. They must not mistake its output for an old file.
     outputs = Outputs(source, scene=data, overwrite=overwrite)
     ranks.run_on_all(lambda: outputs.file(target) if ranks.is_main else None)
-    _check_request(config, data)
+    check_request(config, data)
     if config.profile != "compact":
         settings = config.encoder_settings()
         repacked = ranks.run_on_all(
@@ -135,8 +135,8 @@ def _encode_compact(
     return packer.encode_to_distortion(start, references, target_drop), "", sensitivity
 
 
-def _check_request(config: CompressConfig, data: Scene | None) -> None:
-    """Raise an error if settings exclude each other, or photos are missing or cannot be used."""
+def check_request(config: CompressConfig, data: Scene | None) -> None:
+    """Raise HyrfError if settings exclude each other, or photos are missing or cannot be used."""
     limits = (config.target_bytes, config.max_psnr_drop, config.distortion)
     limit_count = sum(limit is not None for limit in limits)
     if config.profile != "compact" and (data is not None or config.finetune_steps or limit_count):

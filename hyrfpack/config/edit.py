@@ -8,14 +8,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 from hyrfpack.checks import check_float, check_int
+from hyrfpack.config.settings import Range, check_settings
 
 Vector = tuple[float, float, float]
 DEFAULT_MIN_OPACITY_SHARE = 0.35
 DEFAULT_MIN_LIGHT_SHARE = 0.5
 MIN_POLYGON_POINTS, MAX_POLYGON_POINTS = 3, 10_000
 UPRIGHT_AXES = ("y", "z")
+DEFAULT_REFIT_STEPS = 500
 MIN_MARGIN = -0.99  # a hull of no size would keep nothing
 
 
@@ -222,6 +225,28 @@ class RemoveFloaters:
 
 
 @dataclass(frozen=True)
+class Refit:
+    """Train the Gaussians of a region again, on the photos, while all others stay as they are. This needs photos.
+
+    Positions, colours, scales and opacities are trained. Hash grids and decoders belong to all Gaussians and stay.
+
+    Attributes:
+        region: a crop; the Gaussians that it would keep are trained. With `Remove`, those that it would remove.
+        steps: training steps, each on one photo.
+    """
+
+    region: Crop | Remove
+    steps: int = DEFAULT_REFIT_STEPS
+
+    def __post_init__(self) -> None:
+        check_int("steps", self.steps, 1)
+
+    def __str__(self) -> str:
+        where = str(self.region).replace("crop to ", "").replace("remove", "all but", 1)
+        return f"refit {where} for {self.steps:,} steps"
+
+
+@dataclass(frozen=True)
 class KeepGaussians:
     """Keep a number of Gaussians: those whose removal would change renders at the training cameras most.
 
@@ -371,6 +396,7 @@ Action = (
     | MinOpacity
     | MaxScale
     | RemoveFloaters
+    | Refit
     | KeepGaussians
     | Background
     | Move
@@ -379,6 +405,23 @@ Action = (
     | Up
     | EstimateUp
 )
+
+
+@dataclass(frozen=True)
+class EditLimits:
+    """Limits of the file that an edit writes, of which it takes one. They need profile "compact".
+
+    Attributes:
+        target_bytes: best quality within this file size, such as 2MB.
+        max_psnr_drop: smallest file that loses at most this PSNR, in dB, on the held-out photos of `data`, compared
+            with the edited model. Where the edit changed a picture, its pixels do not count.
+    """
+
+    target_bytes: Annotated[int | None, Range(1, unit="bytes")] = None
+    max_psnr_drop: Annotated[float | None, Range(0, unit="dB")] = None
+
+    def __post_init__(self) -> None:
+        check_settings(self)
 
 
 def _format(values: Sequence[float]) -> str:

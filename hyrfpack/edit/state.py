@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,6 +25,8 @@ class EditState:
         photos: the training photos, likewise; empty if they are not given.
         placement: the map from the world coordinates of the file that is edited.
         progress: called with `TaskEvent`s.
+        held_out: the held-out photos, likewise.
+        has_gains: whether the model was trained with per-image gains, so that photos differ from it in exposure.
     """
 
     model: HybridModel
@@ -33,6 +36,8 @@ class EditState:
     photos: list[View]
     placement: Placement
     progress: Progress = ignore_progress
+    held_out: Sequence[View] = ()
+    has_gains: bool = False
 
     def move(self, step: Placement) -> EditState:
         """Return the scene in new world coordinates."""
@@ -43,6 +48,7 @@ class EditState:
             center=step.move_point(self.center),
             up=step.move_direction(self.up),
             photos=[step.move_view(view) for view in self.photos],
+            held_out=[step.move_view(view) for view in self.held_out],
             placement=self.placement.then(step),
         )
 

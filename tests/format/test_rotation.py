@@ -13,7 +13,7 @@ from hyrfpack.errors import HyrfFormatError
 from hyrfpack.format import decode_model, describe_file, load_model, save_model
 from hyrfpack.format.codec import load_with_provenance
 from hyrfpack.format.container import Container
-from hyrfpack.format.rewrite import rewrite_metadata
+from hyrfpack.format.rewrite import with_metadata
 
 GOLDEN_FOLDER = Path(__file__).parents[1] / "golden"
 ROTATION = (0.5, -0.5, 0.5, 0.5)
@@ -36,8 +36,9 @@ def test_a_rotated_file_has_version_1_3_and_turned_back_that_of_its_sections(nam
     source, there, back = GOLDEN_FOLDER / f"{name}.hyrf", tmp_path / "there.hyrf", tmp_path / "back.hyrf"
     model, provenance = load_with_provenance(source)
 
-    rewrite_metadata(source, there, rotate_frame(model).config, provenance)
-    rewrite_metadata(there, back, model.config, provenance)
+    for old, new, config in ((source, there, rotate_frame(model).config), (there, back, model.config)):
+        with Container.open(old) as container:
+            new.write_bytes(with_metadata(container, config, provenance))
 
     assert describe_file(there)["version"] == "1.3"
     assert load_model(there).config == rotate_frame(model).config
