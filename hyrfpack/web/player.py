@@ -18,7 +18,7 @@ from hyrfpack.web.scripts import read_script, read_style
 
 MODEL_SUFFIX = ".hyrf"
 BACK_LINK = '<a id="back" href="{}" aria-label="All scenes" title="All scenes">&#8249;</a>\n'
-EDITING_ELEMENTS = ("overlay", "panel", "button")  # files in viewer/edit, which an editable page includes
+EDITING_ELEMENTS = ("overlay", "panel", "button", "help")  # files in viewer/edit, which an editable page includes
 SHADER_SUFFIXES = (".vert", ".frag", ".glsl")
 _SHADER_COMMENT = re.compile(r"\s*//.*")
 # The browser decodes one base64 block while it loads the next one. A multiple of 3 needs no padding.

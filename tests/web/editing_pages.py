@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 from collections.abc import Sequence
 from dataclasses import replace
@@ -118,6 +119,11 @@ def catch_downloads(browser: Browser) -> None:
         "void (URL.createObjectURL = (blob) => { window.saved = blob; return 'data:,'; },"
         "HTMLAnchorElement.prototype.click = () => {})"
     )
+
+
+def read_saved_bytes(browser: Browser) -> bytes:
+    text = "String.fromCharCode(...new Uint8Array(buffer))"
+    return base64.b64decode(browser.evaluate(f"saved.arrayBuffer().then((buffer) => btoa({text}))"))
 
 
 def read_saved_text(browser: Browser) -> str:

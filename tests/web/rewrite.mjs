@@ -1,11 +1,17 @@
-// Rewrites a file as the player does: `node rewrite.mjs MODEL.hyrf ACTIONS.json WRITER TARGET.hyrf`. Prints whether the
-// player offers it, and the command that does the same, as JSON.
+// Writes an edited file as the player does: `node rewrite.mjs MODEL.hyrf ACTIONS.json WRITER TARGET.hyrf`. Prints whether
+// all Gaussians are kept, and the command that does the same, as JSON.
 
 import { readFileSync, writeFileSync } from "node:fs";
-import { commandText } from "../../hyrfpack/web/viewer/edit/actions.js";
-import { canRewrite, rewriteFile } from "../../hyrfpack/web/viewer/edit/rewrite.js";
+import { read } from "../../hyrfpack/web/hyrf/index.js";
+import { commandText, selectionsOf } from "../../hyrfpack/web/viewer/edit/actions.js";
+import { keepsGaussians, rewriteFile, writeKept } from "../../hyrfpack/web/viewer/edit/rewrite.js";
+import { modelScene } from "../../hyrfpack/web/viewer/scene.js";
+import { measureGaussians, selectGaussians } from "../../hyrfpack/web/viewer/selection.js";
 
 const [path, actionsPath, writer, target] = process.argv.slice(2), bytes = new Uint8Array(readFileSync(path));
-const actions = JSON.parse(readFileSync(actionsPath, "utf8")), isOffered = canRewrite(actions);
-if (isOffered) writeFileSync(target, await rewriteFile(bytes, actions, writer));
-console.log(JSON.stringify({ isOffered, command: commandText(actions, path) }));
+const actions = JSON.parse(readFileSync(actionsPath, "utf8")), model = await read(bytes), keeps = keepsGaussians(actions);
+const selections = selectionsOf(actions, modelScene(model, "a scene"));
+const { kept } = selectGaussians(selections, model.positions, await measureGaussians(bytes));
+const rewritten = keeps ? rewriteFile(bytes, actions, writer) : writeKept(bytes, { model, kept }, actions, writer);
+writeFileSync(target, await rewritten);
+console.log(JSON.stringify({ keeps, command: commandText(actions, path) }));

@@ -22,6 +22,7 @@ from web.editing_pages import (
     middle_of,
     place_on_axis,
     project,
+    read_saved_bytes,
     read_saved_text,
     read_text,
     wait_until_applied,
@@ -34,6 +35,7 @@ from web.pages import (
     psnr,
     random_splats,
     render_in_page,
+    wait_until,
     wait_until_at_rest,
     window_camera,
 )
@@ -41,6 +43,7 @@ from web.test_merged import make_page as make_merged_page
 from web.test_merged import make_parts
 
 from hyrfpack.cameras.files import cameras_from_json
+from hyrfpack.format import load_model
 from hyrfpack.web.player import encode_player
 
 pytestmark = pytest.mark.in_turn
@@ -190,6 +193,26 @@ def test_the_edit_survives_a_lost_graphics_device(browser: Browser, tmp_path: Pa
     lose_and_restore_device(browser)
     assert wait_until_applied(browser) == count and 0 < count < len(model)
     assert browser.evaluate("hyrfpack.player.renderer.drawn") <= count
+
+
+def test_a_saved_file_holds_the_gaussians_that_the_picture_shows(browser: Browser, tmp_path: Path):
+    model = make_model()
+    load_editable_page(browser, tmp_path, make_editable_page(model))
+    catch_downloads(browser)
+    click(browser, "#edit-add-box")
+    count = wait_until_applied(browser)
+    (action,) = list_actions(browser)
+    click(browser, "[data-tool=save]")
+    click(browser, "#edit-download")
+    wait_until(browser, "Boolean(window.saved)")
+
+    (tmp_path / "saved.hyrf").write_bytes(read_saved_bytes(browser))
+    saved = load_model(tmp_path / "saved.hyrf")
+    positions = FRAME.to_world(model.gaussians.positions.detach().numpy())
+    inside = ((positions >= action["value"][:3]) & (positions <= action["value"][3:])).all(1)
+    assert len(saved) == count == inside.sum() and 0 < count < len(model)
+    np.testing.assert_array_equal(saved.gaussians.positions, model.gaussians.positions.detach()[inside])
+    assert browser.list_errors() == []
 
 
 # ---- picked points

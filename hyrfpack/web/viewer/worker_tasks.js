@@ -11,13 +11,13 @@
 //     {use: number}                          select the content to sort
 //     {sort: {ticket, row, sides, near, order}}
 //     {ask: {ticket, select}}                draw only the Gaussians that these selections keep, see selection.js
-//     {ask: {ticket}}                        return the file's bytes
+//     {ask: {ticket, decode}}                return the file: its bytes or, if `decode`, {model, kept}
 //     {close}                                the reader is no longer needed
 // Messages from the worker:
 //     {progress: {what, part}}
 //     {content: {number, whole, scene, models | splats, picture}}   see pack.js
 //     {order: {ticket, number, order, drawn}}
-//     {answer: {ticket, value | error}}      to `ask`: the numbers that are left after each selection, or the bytes
+//     {answer: {ticket, value | error}}      to `ask`: the numbers that are left after each selection, or the file
 //     {error}                                the reason, as soon as it is certain that the file cannot be read
 
 import { fitHarmonics } from "../hyrf/harmonics.js";
@@ -72,9 +72,10 @@ class Service {
     if (message.close) this.isClosed = true;
   }
 
-  async answer({ ticket, select }) {
+  async answer({ ticket, select, decode }) {
+    const bytes = this.reader.file.gather(), { kept } = this.sorter;
     try {
-      const value = select ? await this.select(select) : this.reader.file.gather();
+      const value = select ? await this.select(select) : decode ? { model: await read(bytes), kept } : bytes;
       this.post({ answer: { ticket, value } });
     } catch (error) {
       this.post({ answer: { ticket, error: describeError(error) } });

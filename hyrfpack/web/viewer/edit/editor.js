@@ -154,6 +154,7 @@ export class Editor {
       }
     } finally {
       this.isApplying = false;
+      this.refresh();
     }
   }
 }

@@ -1,40 +1,71 @@
-// Rewrites a file in the browser: edits that change only its metadata. All other sections keep their bytes.
+// Writes the edited file in the browser. An edit of the metadata alone keeps the bytes of all other sections. If
+// Gaussians are removed, the numbers of the others are stored as they are, as float32 (profile "raw").
 
 import { Container, ENTRY_BYTES, EXPOSURE_TYPE, HEADER_BYTES } from "../../hyrf/container.js";
-import { crc32 } from "../../hyrf/crc.js";
 import { readMetadata } from "../../hyrf/metadata.js";
 import { placementAfter } from "./actions.js";
+import { writeContainer } from "./container_writer.js";
 import { moveMetadata } from "./moved_metadata.js";
 
 const METADATA_OPTIONS = ["up", "upright", "scale"];
-const CODEC_DEFLATED = 5;
+const CODEC_JSON = 0, CODEC_FLOAT32 = 1, CODEC_DEFLATED = 5;
 const COMPACT_CODECS = [5, 6, 7, 8];
-const ALIGNMENT = 8; // of sections, in bytes
+const REQUIRED_FLAG = 1;
 
-// Returns whether `rewriteFile` can apply actions.
-export const canRewrite = (actions) => actions.every(({ option }) => METADATA_OPTIONS.includes(option));
+// Returns whether actions remove no Gaussians.
+export const keepsGaussians = (actions) => actions.every(({ option }) => METADATA_OPTIONS.includes(option));
 
-// Returns the bytes of a file after actions. `writer` is the name of this program, as files state it.
+// Returns the bytes of a file after actions that remove no Gaussians. `writer` is the name of this program, as files
+// state it.
 export async function rewriteFile(bytes, actions, writer) {
-  const container = new Container(bytes, false), metadata = readMetadata(container);
-  const stated = metadata.provenance.viewpoint?.up ?? [0, -1, 0]; // `upright` follows an `up`, which replaces it
-  const placement = placementAfter(actions, { up: stated }), statesUp = actions.some(({ option }) => option === "up");
-  const edited = { ...moveMetadata(metadata, placement, statesUp), writer };
-  const text = new TextEncoder().encode(asciiJson(edited));
-  const entries = [...container.entries.values()], { codec } = container.entries.get("META");
-  const data = codec === CODEC_DEFLATED ? await deflate(text) : text;
-  const sections = entries.map((entry) => {
-    if (entry.type === "META") return { ...entry, data, raw: text.length };
-    return { ...entry, data: container.stored(entry.type) };
+  const container = new Container(bytes, false), view = new DataView(bytes.buffer, bytes.byteOffset);
+  const metadata = { ...editMetadata(readMetadata(container), actions), writer };
+  const sections = [...container.entries.values()].map((entry, number) => {
+    const flags = view.getUint16(HEADER_BYTES + ENTRY_BYTES * number + 6, true);
+    return { ...entry, flags, data: container.stored(entry.type) };
   });
-  return writeContainer(bytes, sections, lowestMinorVersion(entries, edited.config));
+  const own = sections.find(({ type }) => type === "META"), text = encodeJson(metadata);
+  Object.assign(own, { raw: text.length, data: own.codec === CODEC_DEFLATED ? await deflate(text) : text });
+  return writeContainer(sections, lowestMinorVersion(sections, metadata.config));
 }
 
-// Returns JSON of ASCII letters only.
-const asciiJson = (value) =>
-  JSON.stringify(value).replace(/[\u0080-\uffff]/g, (letter) => {
-    return `\\u${letter.charCodeAt(0).toString(16).padStart(4, "0")}`;
-  });
+// Returns the bytes of a file of profile "raw" after actions that remove Gaussians. `bytes` are those of the file
+// before, and `model` is what they decode to. `kept` has a byte for each Gaussian, 0 if it is removed.
+export function writeKept(bytes, { model, kept }, actions, writer) {
+  const { config, rules, provenance } = editMetadata(model.metadata, actions);
+  const take = (numbers) => {
+    const columns = numbers.length / kept.length;
+    return numbers.filter((_, at) => kept[Math.floor(at / columns)]);
+  };
+  const count = kept.reduce((sum, byte) => sum + byte, 0), { geometry, radiance } = model;
+  const metadata = { profile: "raw", gaussians: count, config, rules, settings: {}, provenance, writer };
+  const text = encodeJson(metadata), container = new Container(bytes, false);
+  const arrays = {
+    POSI: take(model.positions), COLO: take(model.colorLogits), SCAL: take(model.scaleLogits),
+    OPAC: take(model.opacityLogits), GTAB: geometry.table, GMLP: geometry.decoder, RTAB: radiance.table,
+    RMLP: radiance.decoder,
+  };
+  const sections = [{ type: "META", codec: CODEC_JSON, flags: REQUIRED_FLAG, raw: text.length, data: text }];
+  const exposure = container.entries.get(EXPOSURE_TYPE);
+  if (exposure) sections.push({ ...exposure, flags: 0, data: container.stored(EXPOSURE_TYPE) });
+  for (const [type, { buffer, byteOffset, byteLength }] of Object.entries(arrays)) {
+    const data = new Uint8Array(buffer, byteOffset, byteLength); // all devices of today are little-endian
+    sections.push({ type, codec: CODEC_FLOAT32, flags: REQUIRED_FLAG, raw: byteLength, data });
+  }
+  return writeContainer(sections, lowestMinorVersion(sections, config));
+}
+
+function editMetadata(metadata, actions) {
+  const stated = metadata.provenance.viewpoint?.up ?? [0, -1, 0]; // `upright` follows an `up`, which replaces it
+  const placement = placementAfter(actions, { up: stated });
+  return moveMetadata(metadata, placement, actions.some(({ option }) => option === "up"));
+}
+
+// Returns JSON of ASCII letters only, as bytes.
+function encodeJson(value) {
+  const escape = (letter) => `\\u${letter.charCodeAt(0).toString(16).padStart(4, "0")}`;
+  return new TextEncoder().encode(JSON.stringify(value).replace(/[\u0080-\uffff]/g, escape));
+}
 
 async function deflate(bytes) {
   const stream = new Blob([bytes]).stream().pipeThrough(new CompressionStream("deflate"));
@@ -47,29 +78,4 @@ function lowestMinorVersion(entries, { frame }) {
   if (entries.some(({ type }) => type === EXPOSURE_TYPE)) return 2;
   const isLater = (type) => /^(POS|COL|SCA|OPA)\d$/.test(type);
   return Number(entries.some(({ type, codec }) => COMPACT_CODECS.includes(codec) || isLater(type)));
-}
-
-// Returns a file with the header and the flags of another one, and new sections in the same order.
-function writeContainer(bytes, sections, minor) {
-  const start = HEADER_BYTES + ENTRY_BYTES * sections.length;
-  const padded = (length) => ALIGNMENT * Math.ceil(length / ALIGNMENT);
-  const length = sections.reduce((end, { data }) => end + padded(data.length), start), file = new Uint8Array(length);
-  file.set(bytes.subarray(0, start));
-  const view = new DataView(file.buffer);
-  const setLength = (at, value) => view.setBigUint64(at, BigInt(value), true);
-  let offset = start;
-  sections.forEach(({ data, raw }, number) => {
-    const entry = HEADER_BYTES + ENTRY_BYTES * number;
-    setLength(entry + 8, offset);
-    setLength(entry + 16, data.length);
-    setLength(entry + 24, raw);
-    view.setUint32(entry + 32, crc32(data), true);
-    file.set(data, offset);
-    offset += padded(data.length);
-  });
-  view.setUint16(10, minor, true);
-  setLength(16, length);
-  view.setUint32(40, crc32(file.subarray(HEADER_BYTES, start)), true);
-  view.setUint32(44, crc32(file.subarray(0, 44)), true);
-  return file;
 }

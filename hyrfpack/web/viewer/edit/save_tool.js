@@ -1,13 +1,13 @@
-// Shows the command that does what the edit does, and saves the edited file if only its metadata change.
+// Shows the command that does what the edit does, and saves the edited file.
 
 import { element } from "../dom.js";
 import { fail, toast } from "../notifications.js";
 import { saveBlob } from "../share.js";
 import { commandText } from "./actions.js";
-import { canRewrite, rewriteFile } from "./rewrite.js";
+import { keepsGaussians, rewriteFile, writeKept } from "./rewrite.js";
 
 const NOTHING_TEXT = "Nothing is edited yet.";
-const COMMAND_TEXT = "Where Gaussians are removed, the command compresses the rest again, which takes it some minutes.";
+const UNCOMPRESSED_TEXT = "Save .hyrf stores what is left uncompressed, as the command does with --profile raw.";
 
 export class SaveTool {
   constructor(editor) {
@@ -29,16 +29,19 @@ export class SaveTool {
 
   // Saves the edited file.
   async download() {
-    const { player, actions, opener } = this.editor, writer = document.querySelector("[name=generator]").content;
-    const file = await rewriteFile(await player.loader.ask({}), actions, writer);
-    toast(`Saved as ${saveBlob(new Blob([file]), opener.shown.title, "-edited.hyrf")}.`);
+    const { player: { loader }, actions, opener } = this.editor, bytes = await loader.ask({});
+    const writer = document.querySelector("[name=generator]").content;
+    const write = async () => writeKept(bytes, await loader.ask({ decode: true }), actions, writer);
+    const file = await (keepsGaussians(actions) ? rewriteFile(bytes, actions, writer) : write());
+    const name = saveBlob(new Blob([file]), opener.shown.title, "-edited.hyrf");
+    toast(`Saved as ${name}, ${(file.length / 1e6).toFixed(1)} MB.`);
   }
 
   refresh() {
-    const { actions, file } = this.editor, isWhole = canRewrite(actions);
+    const { actions, file } = this.editor, { count, isApplying } = this.editor;
     element("edit-command").value = actions.length ? commandText(actions, file) : NOTHING_TEXT;
     element("edit-copy").disabled = !actions.length;
-    element("edit-download").disabled = !actions.length || !isWhole;
-    element("edit-advice").textContent = isWhole ? "" : COMMAND_TEXT;
+    element("edit-download").disabled = !actions.length || count === 0 || isApplying;
+    element("edit-advice").textContent = keepsGaussians(actions) ? "" : UNCOMPRESSED_TEXT;
   }
 }
