@@ -58,6 +58,26 @@ def test_the_page_contains_the_file_and_its_metadata(model_file, tmp_path):
     assert (report.views, report.psnr, report.psnr_baked, report.chosen_by) == (0, None, None, {})
 
 
+def test_pages_and_players_have_the_editing_panel_on_request_only(model_file, tmp_path):
+    export_model(model_file, tmp_path / "plain.html")
+    export_model(model_file, tmp_path / "room.html", ExportConfig(editable=True, title="A room"))
+    export_model(model_file, tmp_path / "player", ExportConfig(editable=True))
+    plain, page = ((tmp_path / name).read_bytes() for name in ("plain.html", "room.html"))
+    index = (tmp_path / "player" / "index.html").read_text()
+    script, style = ((tmp_path / "player" / name).read_text() for name in ("player.js", "player.css"))
+
+    assert b'id="edit"' not in plain and "file" not in extract_payload(plain, "page")[0]
+    assert b'id="edit"' in page and extract_payload(page, "page")[0]["file"] == "model.hyrf"
+    assert 'id="edit"' in index and '"file": "model.hyrf"' in index
+    assert "hyrfpack edit" in script and "#edit-handles" in style
+
+
+@pytest.mark.parametrize(("name", "more"), [("a.ply", {}), ("a.html", {"baked": True})])
+def test_outputs_without_the_model_have_no_editing_panel(model_file, tmp_path, name, more):
+    with pytest.raises(HyrfError, match="only pages of the model itself can edit it"):
+        export_model(model_file, tmp_path / name, ExportConfig(editable=True, **more))
+
+
 def test_pages_are_deterministic(model_file, tmp_path):
     (tmp_path / "again").mkdir()
     for path in (tmp_path / "a.html", tmp_path / "again" / "a.html"):
