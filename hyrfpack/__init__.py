@@ -54,6 +54,8 @@ if TYPE_CHECKING:
     from hyrfpack.distill import DistillConfig as DistillConfig
     from hyrfpack.distill import DistillReport as DistillReport
     from hyrfpack.distill import import_splats as import_splats
+    from hyrfpack.doctor import MachineReport as MachineReport
+    from hyrfpack.doctor import diagnose_machine as diagnose_machine
     from hyrfpack.edit import EditReport as EditReport
     from hyrfpack.edit import MergeReport as MergeReport
     from hyrfpack.edit import edit_model as edit_model
@@ -114,6 +116,8 @@ _MODULES_BY_PUBLIC_NAME = {
     "DistillConfig": "hyrfpack.distill",
     "DistillReport": "hyrfpack.distill",
     "import_splats": "hyrfpack.distill",
+    "MachineReport": "hyrfpack.doctor",
+    "diagnose_machine": "hyrfpack.doctor",
     "EditReport": "hyrfpack.edit",
     "MergeReport": "hyrfpack.edit",
     "edit_model": "hyrfpack.edit",

@@ -21,7 +21,8 @@ class RunContext:
     """Settings of how a long call runs, which do not change its result. Each long call takes one as `context`.
 
     Attributes:
-        device: where to compute, see `hyrfpack.device.choose_device`. A call that needs no device ignores it.
+        device: where to compute, see `hyrfpack.device.choose_device`. A call that needs no device ignores it. The
+            result of `choose_device("cuda", self_test=False)` is a GPU without the self-test of its kernels.
         ranks: processes that work together, from `hyrfpack.parallel.ranks.join_processes`; None for this process alone.
             All of them make the same call, and only rank 0 writes, prints and logs.
         progress: "auto" shows a bar and curves in Jupyter, a line that is redrawn on a terminal, and plain lines on

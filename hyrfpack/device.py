@@ -5,15 +5,18 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Hashable
+from functools import cache
+from itertools import chain
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from hyrfpack.errors import HyrfError
-from hyrfpack.ops.dispatch import has_triton
+from hyrfpack.ops.dispatch import GPU_OPERATIONS, has_triton, set_replaced_operations
 from hyrfpack.parallel.ranks import Ranks
 from hyrfpack.scene import Picture
+from hyrfpack.self_test import SelfTest, load_or_run_self_test
 
 _LOG = logging.getLogger(__name__)
 
@@ -30,15 +33,17 @@ NO_METAL_NOTE = (
 )
 
 
-def choose_device(name: str | torch.device = "auto") -> torch.device:
+def choose_device(name: str | torch.device = "auto", *, self_test: bool = True) -> torch.device:
     """Return the torch device of a name, after checking that it can be used.
 
-    A warning is logged if the named device has no kernels or runs them slowly. A torch.device was chosen before, and
-    is only checked.
+    A warning is logged if the named device has no kernels or runs them slowly. On first use of a GPU a self-test of the
+    kernels runs there; its result is stored. Operations whose kernels failed it run as plain torch on that GPU, and a
+    warning names them. A torch.device was chosen before, and is only checked.
 
     Args:
         name: "auto", "cpu", "cuda" (torch's current CUDA or ROCm device), "cuda:N" or "mps"; or a torch.device. "auto"
             means a CUDA or ROCm device if one is usable and Triton is installed, otherwise the CPU.
+        self_test: False uses all kernels untested, or as the process has set them before.
 
     Returns:
         The device. "cuda:N" also becomes torch's current device, on which kernels are launched.
@@ -74,6 +79,8 @@ def choose_device(name: str | torch.device = "auto") -> torch.device:
             _LOG.warning(NO_TRITON_NOTE)
         elif is_named and not torch.version.hip and torch.cuda.get_device_capability(name) < (8, 0):
             _LOG.warning(OLD_GPU_NOTE)
+        if is_named and self_test and has_triton():
+            set_replaced_operations(_find_failed_operations(_with_index(torch.device(name))))
         make_current(torch.device(name))
     if kind == "mps":
         if not torch.backends.mps.is_available():
@@ -83,17 +90,18 @@ def choose_device(name: str | torch.device = "auto") -> torch.device:
     return torch.device(name)
 
 
-def choose_own_device(name: str | torch.device, ranks: Ranks) -> torch.device:
+def choose_own_device(name: str | torch.device, ranks: Ranks, *, self_test: bool = True) -> torch.device:
     """Choose the device of one of several processes: "auto" and "cuda" give each process on a machine its own GPU.
 
     Args:
         name: as for `choose_device`.
         ranks: the processes, all of which call this.
+        self_test: as for `choose_device`. An operation that failed on one process's GPU runs as plain torch on all.
 
     Raises:
         HyrfError: `choose_device` fails on one process, or two would share a GPU; it is raised on all processes.
     """
-    device = ranks.run_on_all(lambda: choose_device(name))
+    device = ranks.run_on_all(lambda: choose_device(name, self_test=self_test and ranks.is_single))
     if device.type == "cuda" and not ranks.is_single:
         if device.index is None:
             device = choose_device(torch.device("cuda", ranks.local_rank % torch.cuda.device_count()))
@@ -103,7 +111,50 @@ def choose_own_device(name: str | torch.device, ranks: Ranks) -> torch.device:
                 f"{ranks.size} processes have {len(set(gpus))} GPUs between them, and each needs its own",
                 fix="start one process for each GPU with `device='cuda'`, or use `device='cpu'`",
             )
+        if isinstance(name, str) and self_test and has_triton():
+            _agree_on_failed_operations(device, ranks)
     return device
+
+
+def _agree_on_failed_operations(device: torch.device, ranks: Ranks) -> None:
+    """Test the kernels on the GPUs of all processes; operations that failed on any of them are replaced on all."""
+    failed: frozenset[str] = frozenset()
+    for is_first in (True, False):  # The first process of a machine stores the result that the others then read.
+        if (ranks.local_rank == 0) == is_first:
+            failed = ranks.run_on_all(lambda: _find_failed_operations(device))
+        else:
+            ranks.run_on_all(lambda: None)
+    set_replaced_operations(chain(*ranks.all_gather(failed)))
+
+
+@cache
+def _find_failed_operations(device: torch.device) -> frozenset[str]:
+    """Return the operations whose kernels do not work on a GPU. A warning names them, once in this process."""
+    test = load_or_run_self_test(device)
+    if test.problem is not None:
+        _LOG.warning(f"the kernels could not be tested on {describe_device(device)} ({test.problem}); they are used")
+    elif test.failed_operations:
+        _LOG.warning(describe_failed_operations(test, describe_device(device)))
+    return frozenset(test.failed_operations)
+
+
+def describe_failed_operations(test: SelfTest, where: str) -> str:
+    """Return a sentence on the operations that failed a self-test, how much slower they are, and what to do."""
+    reasons = []
+    for operation, row in test.failed_operations.items():
+        slowdown = f"{row['slowdown']} times as slow" if "slowdown" in row else "of unknown speed"
+        reasons.append(f"{operation} ({row['note']}; plain torch is {slowdown} on a small input)")
+    faster = "; `device='cpu'` may be faster" if "rasterize" in test.failed_operations else ""
+    return (
+        f"the kernels of {len(reasons)} of {len(GPU_OPERATIONS)} operations do not work on {where}, which computes "
+        f"them in plain torch instead: {', '.join(reasons)}{faster}; please report this, with the output of "
+        "'hyrfpack doctor'"
+    )
+
+
+def _with_index(device: torch.device) -> torch.device:
+    """Return a GPU with its number; that of the current one if the device has none."""
+    return torch.device("cuda", torch.cuda.current_device()) if device.index is None else device
 
 
 def make_current(device: torch.device) -> None:
@@ -119,8 +170,7 @@ def describe_device(device: torch.device) -> str:
     """Return the name of a device for users, such as "cpu" or "cuda:0 (NVIDIA H200)"."""
     if device.type != "cuda":
         return device.type
-    number = torch.cuda.current_device() if device.index is None else device.index
-    return f"cuda:{number} ({torch.cuda.get_device_properties(device).name})"
+    return f"{_with_index(device)} ({torch.cuda.get_device_properties(device).name})"
 
 
 def upload_array(array: np.ndarray, device: torch.device) -> Tensor:

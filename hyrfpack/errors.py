@@ -130,6 +130,10 @@ def needs_package(task: str) -> Iterator[None]:
         package = missing_package(error)
         if package is None:
             raise
-        extra = _EXTRA_BY_PACKAGE.get(package)
-        command = f'pip install "hyrfpack[{extra}]"' if extra else f"pip install {package}"
-        raise HyrfError(f"{task} needs {package}", fix=f"run '{command}'") from error
+        raise HyrfError(f"{task} needs {package}", fix=f"run '{install_command(package)}'") from error
+
+
+def install_command(package: str) -> str:
+    """Return the command that installs a package, through the extra of hyrfpack if it has one."""
+    extra = _EXTRA_BY_PACKAGE.get(package)
+    return f'pip install "hyrfpack[{extra}]"' if extra else f"pip install {package}"

@@ -16,6 +16,9 @@ import pytest
 import torch
 from torch.utils._pytree import tree_leaves, tree_map
 
+from hyrfpack import device as devices
+from hyrfpack.self_test import SelfTest
+
 aten = torch.ops.aten
 CUDA_DEVICE = torch.device("cuda", 0)
 
@@ -220,7 +223,10 @@ class _ToCpu(torch.autograd.Function):
 
 @contextmanager
 def use_fake_gpu() -> Iterator[torch.device]:
-    """Make torch see one CUDA device inside this context, and yield that device."""
+    """Make torch see one CUDA device inside this context, and yield that device.
+
+    The kernels count as tested, because a child process has no such device.
+    """
     interpreter = pytest.importorskip("triton.runtime.interpreter", reason="Triton is not installed")
     launch = interpreter.GridExecutor.__call__
 
@@ -241,6 +247,7 @@ def use_fake_gpu() -> Iterator[torch.device]:
         mock.patch.object(torch.cuda, "get_device_capability", lambda *_: (9, 0)),
         mock.patch.object(torch.cuda, "is_bf16_supported", lambda *_: True),
         mock.patch.object(interpreter.GridExecutor, "__call__", on_the_cpu),
+        mock.patch.object(devices, "load_or_run_self_test", lambda device: SelfTest("gpu", str(device), ())),
         mock.patch.object(torch.Tensor, "to", _move),
         mock.patch.object(torch.Tensor, "cpu", lambda tensor: _move(tensor, "cpu")),
         mock.patch.multiple(torch, **{name: _wrap_factory(getattr(torch, name)) for name in TENSOR_FACTORIES}),

@@ -23,6 +23,7 @@ from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.distill import DistillConfig, distill_splats
 from hyrfpack.distill.pack import pack
 from hyrfpack.model import HashGridConfig
+from hyrfpack.ops.dispatch import GPU_OPERATIONS
 from hyrfpack.render import render_view
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer
 
@@ -74,6 +75,31 @@ def test_training_agrees_with_the_cpu(gpu):
     for (name, value), expected in zip(parameter_values(there).items(), parameter_values(here).values(), strict=True):
         # Adam's first steps are as long for a rounded gradient as for a large one.
         assert (value - expected).abs().median() < 1e-4, name
+
+
+def test_training_with_replaced_kernels_agrees_with_the_cpu(gpu, monkeypatch):
+    # The gradient of torch's cumprod, in the rasteriser, allocates memory that is not on the fake GPU.
+    replaced = frozenset(GPU_OPERATIONS) - {"rasterize"}
+    monkeypatch.setattr("hyrfpack.ops.dispatch._replaced_operations", replaced)
+    config = dataclasses.replace(TRAIN_CONFIG, steps=2)
+    here, there = Trainer(make_scene(), config), Trainer(make_scene(), config, device=gpu)
+    torch.testing.assert_close(record_curve(there), record_curve(here), rtol=1e-4, atol=1e-6)
+    assert all(p.device == gpu for p in there.model.parameters())
+
+
+@pytest.mark.parametrize("kept", [False, True])
+def test_renders_with_all_kernels_replaced_launch_none_and_agree_with_the_cpu(gpu, kept, monkeypatch):
+    monkeypatch.setattr("hyrfpack.ops.dispatch._replaced_operations", frozenset(GPU_OPERATIONS))
+    camera = camera_at((0.3, -2.2, 0.6), (0.2, 0, 0), width=30, height=20)
+    model = make_model(background=True)
+    model.precision = "float32"
+    with torch.no_grad():
+        expected = render_view(model, camera)
+        monkeypatch.setattr("triton.runtime.jit.KernelInterface.__getitem__", lambda *_: pytest.fail("a launch"))
+        model = model.to(gpu)
+        found = render_view(model, camera, decoded=model.decode() if kept else None)
+    assert found.rgb.device == gpu
+    torch.testing.assert_close(found.rgb.cpu(), expected.rgb, rtol=0, atol=1e-4)
 
 
 def test_mixed_precision_starts_near_the_loss_of_float32(gpu):

@@ -29,6 +29,7 @@ REJECTED_ARGUMENTS = {
     "compress_model": ("missing.hyrf", "out.hyrf"),
     "convert_splats": ("missing.ply", "out.spz"),
     "describe_file": ("missing.hyrf",),
+    "diagnose_machine": ("missing",),
     "describe_photos": ("missing",),
     "edit_model": ("missing.hyrf", "out.hyrf", [Center()]),
     "import_splats": ("missing.ply", "out.hyrf"),

@@ -31,6 +31,7 @@ from hyrfpack.cli.console import (
 )
 from hyrfpack.cli.convert import convert
 from hyrfpack.cli.demo import demo
+from hyrfpack.cli.doctor import doctor
 from hyrfpack.cli.edit import edit
 from hyrfpack.cli.evaluate import evaluate
 from hyrfpack.cli.export import export
@@ -154,6 +155,7 @@ for _command in (
     merge,
     bench,
     info,
+    doctor,
     demo,
 ):
     main.add_command(_command)

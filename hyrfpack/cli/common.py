@@ -82,14 +82,36 @@ def scene_options(command: Command) -> Command:
     return with_options
 
 
-device_option = click.option(
-    "--device",
-    metavar="NAME",
-    default="auto",
-    show_default=True,
-    help="Device: cpu, cuda (NVIDIA and AMD GPUs), cuda:N or mps (Apple GPUs). auto uses cuda if there is a GPU and "
-    "Triton is installed, otherwise cpu.",
-)
+_SELF_TEST_KEY = "hyrfpack.self_test"  # key of --self-test in click's context
+
+
+def _store_self_test(ctx: click.Context, option: click.Parameter, value: bool) -> None:
+    ctx.meta[_SELF_TEST_KEY] = value
+
+
+def device_option(command: Command) -> Command:
+    """Add the options --device and --no-self-test, whose values `choose_command_device` takes."""
+    with_options = click.option(
+        "--self-test/--no-self-test",
+        default=True,
+        expose_value=False,
+        callback=_store_self_test,
+        help="Test the GPU's kernels on its first use, and replace those that do not work by plain torch.  "
+        "[default: self-test]",
+    )(command)
+    return click.option(
+        "--device",
+        metavar="NAME",
+        default="auto",
+        show_default=True,
+        help="Device: cpu, cuda (NVIDIA and AMD GPUs), cuda:N or mps (Apple GPUs). auto uses cuda if there is a GPU "
+        "and Triton is installed, otherwise cpu.",
+    )(with_options)
+
+
+def is_self_test_wanted() -> bool:
+    """Return the value of --self-test, of a command with `device_option`."""
+    return click.get_current_context().meta[_SELF_TEST_KEY]
 
 
 def device_options(command: Command) -> Command:
@@ -98,7 +120,7 @@ def device_options(command: Command) -> Command:
 
 
 def choose_command_device(name: str, ranks: Ranks | None = None) -> torch.device:
-    """Choose the device that --device names.
+    """Choose the device that --device names, with the self-test of its kernels unless --no-self-test is given.
 
     Args:
         name: value of the option.
@@ -110,7 +132,7 @@ def choose_command_device(name: str, ranks: Ranks | None = None) -> torch.device
     from hyrfpack.device import choose_own_device, describe_device
     from hyrfpack.parallel.ranks import SINGLE_PROCESS
 
-    device = choose_own_device(name, ranks or SINGLE_PROCESS)
+    device = choose_own_device(name, ranks or SINGLE_PROCESS, self_test=is_self_test_wanted())
     note_if_verbose(f"device: {describe_device(device)}")
     return device
 

@@ -9,6 +9,7 @@ import click
 
 from hyrfpack.cli.common import (
     choose_command_device,
+    device_option,
     format_consistent_psnr,
     json_option,
     note,
@@ -37,7 +38,7 @@ MAX_LISTED_PHOTOS = 5
 @click.option(
     "--work", type=OUTPUT, metavar="DIR", help="Folder of intermediate results.  [default: the name of FILE with .work]"
 )
-@click.option("--device", metavar="NAME", default="auto", show_default=True, help="Device: cpu, cuda, cuda:N.")
+@device_option
 @settings_options(MakeConfig, "seed")
 @view_options
 @overwrite_option

@@ -9,7 +9,6 @@ import hashlib
 import os
 import shutil
 import stat
-import sys
 import tempfile
 import time
 import zipfile
@@ -17,6 +16,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from hyrfpack.cache_folder import open_cache_folder
 from hyrfpack.errors import HyrfDataError, HyrfError, short_reason
 from hyrfpack.outputs import ARCHIVE_SUFFIXES
 
@@ -53,7 +53,7 @@ def unpack(archive: Path) -> Path:
     try:
         with zipfile.ZipFile(archive) as content:
             entries = _checked_entries(archive, content)
-            folder = _cache_folder() / f"{archive.stem[:60]}-{_archive_digest(archive)}"
+            folder = open_cache_folder("archives") / f"{archive.stem[:60]}-{_archive_digest(archive)}"
             if not _is_complete(folder, entries):
                 _write_entries(archive, content, entries, folder)
             _archive_by_folder[folder] = archive
@@ -205,24 +205,3 @@ def _archive_digest(archive: Path) -> str:
     stat_result = os.stat(archive)
     text = f"{os.path.realpath(archive)}\0{stat_result.st_size}\0{stat_result.st_mtime_ns}"
     return hashlib.sha256(os.fsencode(text)).hexdigest()[:12]
-
-
-def _cache_folder() -> Path:
-    """Create and return the cache folder for archives, below the temporary folder if the home is not writable."""
-    home = os.path.expanduser("~")
-    default_caches = {"darwin": f"{home}/Library/Caches", "win32": os.environ.get("LOCALAPPDATA", home)}
-    caches = os.environ.get("XDG_CACHE_HOME") or default_caches.get(sys.platform, f"{home}/.cache")
-    user = os.getuid() if hasattr(os, "getuid") else "user"
-    for folder in (Path(caches, "hyrfpack", "archives"), Path(tempfile.gettempdir(), f"hyrfpack-{user}")):
-        try:
-            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            # In the shared temporary folder, another user may have created it.
-            is_own = not hasattr(os, "getuid") or folder.stat().st_uid == os.getuid()
-            if is_own and os.access(folder, os.W_OK | os.X_OK):
-                return folder
-        except OSError:
-            continue
-    raise HyrfDataError(
-        f"{caches}: no file can be made in this folder",
-        fix="set XDG_CACHE_HOME to a folder that is writable",
-    )

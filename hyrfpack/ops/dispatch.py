@@ -3,12 +3,51 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from functools import cache
 
 import torch
 from torch import Tensor
 
 from hyrfpack.parallel import has_numba
+
+# Every operation that has Triton kernels.
+GPU_OPERATIONS = (
+    "activate_geometry",
+    "adam_step",
+    "background_grid",
+    "composite",
+    "contract",
+    "encode_views",
+    "frustum_cull",
+    "hash_encode",
+    "mlp",
+    "photometric_loss",
+    "rasterize",
+    "rasterize_shaded",
+    "shade",
+)
+_replaced_operations: frozenset[str] = frozenset()
+
+
+def replaced_operations() -> frozenset[str]:
+    """Return the operations that run as plain torch on a GPU in this process, because their kernels are unusable."""
+    return _replaced_operations
+
+
+def set_replaced_operations(operations: Iterable[str]) -> None:
+    """Replace the kernels of these operations, and of no others, by plain torch wherever "auto" would choose "gpu".
+
+    The choice of a device calls this with the operations that failed the self-test there, see `hyrfpack.self_test`.
+
+    Raises:
+        ValueError: a name is not in GPU_OPERATIONS.
+    """
+    global _replaced_operations
+    names = frozenset(operations)
+    if unknown := sorted(names.difference(GPU_OPERATIONS)):
+        raise ValueError(f"no GPU operation '{unknown[0]}'; there are {', '.join(GPU_OPERATIONS)}")
+    _replaced_operations = names
 
 
 @cache
@@ -29,18 +68,19 @@ def is_interpreting() -> bool:
     return os.environ.get("TRITON_INTERPRET", "0") == "1"
 
 
-def choose_implementation(implementation: str, available: tuple[str, ...], *tensors: Tensor) -> str:
+def choose_implementation(operation: str, implementation: str, available: tuple[str, ...], *tensors: Tensor) -> str:
     """Choose the implementation of an operation that runs on the given tensors.
 
     Args:
+        operation: the operation's name; one of GPU_OPERATIONS if "gpu" is available.
         implementation: "auto", or a name from `available` to force that implementation.
         available: names of the operation's implementations; "reference" is always one of them.
         tensors: the operation's inputs; all must have the same device and dtype.
 
     Returns:
         A name from `available`. For float32 tensors, "auto" selects "gpu" on a CUDA or ROCm device if Triton is
-        installed, and "cpu" on the CPU if Numba is installed. Otherwise it selects "reference" (plain torch, any
-        device, any dtype).
+        installed and the operation is not one of `replaced_operations`, and "cpu" on the CPU if Numba is installed.
+        Otherwise it selects "reference" (plain torch, any device, any dtype).
 
     Raises:
         ValueError: the name is not available, the implementation does not support these tensors, or the tensors
@@ -67,7 +107,8 @@ def choose_implementation(implementation: str, available: tuple[str, ...], *tens
         if implementation == "gpu" and device_type == "cuda":
             _check_current(first.device)
         return implementation
-    if "gpu" in available and is_supported["gpu"] and device_type == "cuda" and has_triton():
+    is_gpu_usable = device_type == "cuda" and has_triton() and operation not in _replaced_operations
+    if "gpu" in available and is_supported["gpu"] and is_gpu_usable:
         _check_current(first.device)
         return "gpu"
     if "cpu" in available and is_supported["cpu"] and has_numba():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -14,6 +13,7 @@ from threading import Thread
 from typing import Any
 
 from hyrfpack.errors import HyrfDataError, HyrfError
+from hyrfpack.parallel.child_items import child_environment
 from hyrfpack.progress import Progress, TaskEvent
 
 MAX_SILENCE_SECONDS = 2.0  # the last message is reported again after this time, so that a display keeps counting
@@ -26,7 +26,6 @@ _STAGE_DESCRIPTIONS = {
     "repeat": "repeating the mapping",
 }
 _FINISH_DESCRIPTION = "finishing the poses"
-_IMPORT_ROOT = str(Path(__file__).parents[2])  # the folder from which hyrfpack was imported
 
 
 class StageCrashedError(HyrfError):
@@ -53,13 +52,11 @@ def run_stage(job: Path, stage: str, report_progress: Progress, *arguments: str)
         StageCrashedError: the process ended without an answer: the library crashed or ran out of memory or disk space.
     """
     command = [sys.executable, "-m", "hyrfpack.poses.worker", str(job), stage, *arguments]
-    path = os.pathsep.join(filter(None, (_IMPORT_ROOT, os.environ.get("PYTHONPATH"))))
-    environment = {**os.environ, "PYTHONPATH": path}
     log = job.parent / f"{stage}.log"
     with log.open("wb") as errors:
         process = subprocess.Popen(
             command,
-            env=environment,
+            env=child_environment(),
             stdin=subprocess.PIPE,  # never written to; it is closed when this process ends, which ends the other one
             stdout=subprocess.PIPE,
             stderr=errors,

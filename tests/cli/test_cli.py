@@ -33,6 +33,7 @@ COMMAND_NAMES = (
     "evaluate",
     "info",
     "bench",
+    "doctor",
     "demo",
     "export",
     "view",

@@ -18,6 +18,7 @@ from hyrfpack.errors import HyrfError, needs_package
 from hyrfpack.ops.dispatch import has_triton
 from hyrfpack.ops.rasterize import RasterSettings, rasterize
 from hyrfpack.ops.rasterize.reference import project
+from hyrfpack.parallel.child_items import run_in_children
 from tools.gpu import check as gpu_check
 from tools.gpu import frames as gpu_frames
 from tools.gpu import kernels as gpu_kernels
@@ -31,7 +32,7 @@ from tools.gpu.compare import check_call
 from tools.gpu.rows import goal_row
 from tools.gpu.scene import TIDY_LOOK, TRAINED_LOOK, Look, decode_splats, make_cameras, make_model
 from tools.gpu.setup import Setup, find_dataset
-from tools.gpu.worker import failure_row, find_missing_package, run_in_children
+from tools.gpu.worker import failure_row, find_missing_package
 
 HAS_CUDA = torch.cuda.is_available()
 KERNEL_IMPLEMENTATION = "gpu" if has_triton() else "cpu"

@@ -327,7 +327,7 @@ def _patches_for(name: str) -> Iterator[object]:
     """Yield the patches that make operations on CPU tensors launch the same kernels as on a target."""
     from hyrfpack.ops import dispatch
 
-    def choose(implementation: str, available: tuple[str, ...], *tensors: Tensor) -> str:
+    def choose(operation: str, implementation: str, available: tuple[str, ...], *tensors: Tensor) -> str:
         return "gpu" if "gpu" in available else "reference"
 
     target = GPU_TARGETS[name]

@@ -33,10 +33,11 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 import torch
 
 from hyrfpack.measure.machine import format_machine
+from hyrfpack.parallel.child_items import run_in_children
 from tools.gpu.report import describe_gpu_machine, write_report
 from tools.gpu.rows import Row
 from tools.gpu.setup import Setup, find_dataset
-from tools.gpu.worker import failure_row, run_child, run_in_children
+from tools.gpu.worker import failure_row, run_child
 
 REPOSITORY_ROOT = Path(__file__).parents[2]
 # Each part has a module with `items(setup)` and `run(item, setup)`, and a time limit in seconds for all its items. The

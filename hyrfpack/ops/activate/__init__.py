@@ -57,8 +57,9 @@ def activate_geometry(
     needs_position_grad = torch.is_grad_enabled() and positions.requires_grad
     available = ("reference",) if needs_position_grad else ("reference", "gpu")
     run: Callable[..., tuple[Tensor, Tensor, Tensor]] = reference.activate_geometry
-    if choose_implementation(implementation, available, raw, positions, scale_logits, opacity_logits) == "gpu":
+    tensors = raw, positions, scale_logits, opacity_logits
+    if choose_implementation("activate_geometry", implementation, available, *tensors) == "gpu":
         from hyrfpack.ops.activate import gpu
 
         run = gpu.activate_geometry
-    return run(raw, positions, scale_logits, opacity_logits, half_extent, rule)
+    return run(*tensors, half_extent, rule)

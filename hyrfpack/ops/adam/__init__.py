@@ -72,7 +72,7 @@ def adam_step(
     if not len(steps) == len(rates) == len(tensors):
         raise ValueError(f"{len(tensors)} tensors, {len(steps)} steps and {len(rates)} rates")
     chosen = choose_implementation(
-        implementation, ("reference", "cpu", "gpu"), *(tensor for group in tensors for tensor in group)
+        "adam_step", implementation, ("reference", "cpu", "gpu"), *(tensor for group in tensors for tensor in group)
     )
     run: Callable[..., Tensor] = reference.adam_step
     if chosen == "gpu":

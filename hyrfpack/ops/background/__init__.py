@@ -86,7 +86,7 @@ def background_grid(
     needs_grad = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in parameters)
     available = ("reference", "cpu", "gpu") if is_gpu_supported else ("reference", "cpu")
     run: Callable[..., Tensor] = reference.background_grid
-    chosen = choose_implementation(implementation, available, transmittance, *parameters)
+    chosen = choose_implementation("background_grid", implementation, available, transmittance, *parameters)
     if chosen == "gpu":
         from hyrfpack.ops.background import gpu
 

@@ -46,7 +46,7 @@ def composite(rgb: Tensor, transmittance: Tensor, grid: Tensor, stride: int, *, 
             f"{stride}-th pixel do not fit together"
         )
     run: Callable[..., Tensor] = reference.composite
-    chosen = choose_implementation(implementation, ("reference", "cpu", "gpu"), rgb, transmittance, grid)
+    chosen = choose_implementation("composite", implementation, ("reference", "cpu", "gpu"), rgb, transmittance, grid)
     if chosen == "gpu":
         from hyrfpack.ops.composite import gpu
 

@@ -45,7 +45,8 @@ def contract(
     if not points.ndim or points.shape[-1] != 3:
         raise ValueError(f"points {tuple(points.shape)} do not end in 3 coordinates")
     needs_grad = torch.is_grad_enabled() and points.requires_grad
-    if choose_implementation(implementation, ("reference",) if needs_grad else ("reference", "gpu"), points) == "gpu":
+    available = ("reference",) if needs_grad else ("reference", "gpu")
+    if choose_implementation("contract", implementation, available, points) == "gpu":
         from hyrfpack.ops.contraction import gpu
 
         return gpu.contract(points, half_extent)

@@ -55,7 +55,7 @@ def hash_encode(
     if table.shape[0] != rows:
         raise ValueError(f"table has {table.shape[0]} rows; these levels need {rows}")
     available = ("reference", "cpu", "gpu") if table.shape[1] == 2 else ("reference",)
-    chosen = choose_implementation(implementation, available, coords, table)
+    chosen = choose_implementation("hash_encode", implementation, available, coords, table)
     if chosen == "reference":
         return reference.hash_encode(coords, table, resolutions, log2_table_size)
     return _HashEncode.apply(coords, table, tuple(resolutions), log2_table_size, _kernels(chosen))

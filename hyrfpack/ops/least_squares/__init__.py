@@ -49,7 +49,7 @@ def least_squares(
         [3.0, 2.0]
     """
     rows = basis, values, weights
-    if choose_implementation(implementation, ("reference", "cpu"), *rows) == "cpu":
+    if choose_implementation("least_squares", implementation, ("reference", "cpu"), *rows) == "cpu":
         from hyrfpack.ops.least_squares import cpu
 
         return torch.from_numpy(cpu.least_squares(*(part.contiguous().numpy() for part in (index, *rows, gram, right))))

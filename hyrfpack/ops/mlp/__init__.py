@@ -61,7 +61,7 @@ def mlp(
     ):
         shapes = [tuple(tensor.shape) for tensor in (x, *weights, *biases)]
         raise ValueError(f"x, weights and biases do not form layers: {shapes}")
-    chosen = choose_implementation(implementation, ("reference", "cpu", "gpu"), x, *weights, *biases)
+    chosen = choose_implementation("mlp", implementation, ("reference", "cpu", "gpu"), x, *weights, *biases)
     if chosen == "cpu":
         return _CpuMlp.apply(x, *weights, *biases)
     if chosen == "gpu" and len(weights) == 3 and max(widths[:3]) <= MAX_GPU_LAYER_WIDTH and widths[3] <= 16:

@@ -101,7 +101,7 @@ def rasterize(
     if absgrad is not None and (absgrad.shape != (count, 2) or absgrad.dtype != dtype):
         raise ValueError(f"absgrad is {absgrad.dtype} {tuple(absgrad.shape)}, expected {dtype} {(count, 2)}")
 
-    chosen = choose_implementation(implementation, ("reference", "cpu", "gpu"), *gaussians, colors)
+    chosen = choose_implementation("rasterize", implementation, ("reference", "cpu", "gpu"), *gaussians, colors)
     run: Callable[..., tuple] = reference.rasterize
     if chosen == "gpu":
         from hyrfpack.ops.rasterize import gpu

@@ -36,7 +36,7 @@ def sum_blend_weights(
         (True, torch.Size([32, 32]))
     """
     check_shapes(gaussians)
-    if choose_implementation(implementation, ("reference", "cpu"), *gaussians) == "cpu":
+    if choose_implementation("sum_blend_weights", implementation, ("reference", "cpu"), *gaussians) == "cpu":
         from hyrfpack.ops.rasterize import cpu
 
         return cpu.sum_blend_weights(gaussians, viewport, settings)

@@ -29,7 +29,7 @@ def frustum_cull(
         FloatingPointError: a position is NaN or infinite; comparisons alone would drop it silently.
         ValueError: the implementation does not support these positions.
     """
-    if choose_implementation(implementation, ("reference", "gpu"), positions) == "gpu":
+    if choose_implementation("frustum_cull", implementation, ("reference", "gpu"), positions) == "gpu":
         from hyrfpack.ops.rasterize import gpu_cull
 
         return gpu_cull.frustum_cull(positions, viewport, near, tolerance)

@@ -48,7 +48,7 @@ def median_depth(
         (2.0, 0.0)
     """
     check_shapes(gaussians)
-    if choose_implementation(implementation, ("reference", "cpu"), *gaussians) == "cpu":
+    if choose_implementation("median_depth", implementation, ("reference", "cpu"), *gaussians) == "cpu":
         from hyrfpack.ops.rasterize import cpu
 
         # Slopes of needles cancel in float32.

@@ -27,7 +27,7 @@ def rasterize_shaded(
     check_shapes(gaussians)
     means = gaussians.means
     check_shading(shading, len(means))
-    if choose_shading_implementation(shading, implementation, *gaussians) == "gpu":
+    if choose_shading_implementation("rasterize_shaded", shading, implementation, *gaussians) == "gpu":
         from hyrfpack.ops.rasterize import gpu_shaded
 
         return gpu_shaded.rasterize_shaded(gaussians, shading, viewport, settings)

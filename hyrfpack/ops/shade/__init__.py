@@ -88,7 +88,11 @@ def check_shading(shading: Shading, count: int) -> None:
 
 
 def choose_shading_implementation(
-    shading: Shading, implementation: str, *tensors: Tensor, available: tuple[str, ...] = ("reference", "gpu")
+    operation: str,
+    shading: Shading,
+    implementation: str,
+    *tensors: Tensor,
+    available: tuple[str, ...] = ("reference", "gpu"),
 ) -> str:
     """Choose the implementation that runs on these tensors and a shading, see `dispatch.choose_implementation`."""
     parameters = (shading.direction_weight, *shading.weights, *shading.biases, shading.color_logits)
@@ -96,7 +100,7 @@ def choose_shading_implementation(
         available = tuple(name for name in available if name != "gpu")
     if shading.mixed:
         available = tuple(name for name in available if name != "cpu")
-    return choose_implementation(implementation, available, *tensors, *parameters)
+    return choose_implementation(operation, implementation, available, *tensors, *parameters)
 
 
 @torch.no_grad()
@@ -131,7 +135,7 @@ def shade(
     if positions.shape != (len(positions), 3) or viewpoint.shape != (3,):
         raise ValueError(f"{tuple(positions.shape)} positions and viewpoint {tuple(viewpoint.shape)}, not (N, 3), (3,)")
     available = ("reference", "cpu", "gpu")
-    chosen = choose_shading_implementation(shading, implementation, positions, viewpoint, available=available)
+    chosen = choose_shading_implementation("shade", shading, implementation, positions, viewpoint, available=available)
     if chosen == "cpu":
         from hyrfpack.ops.shade import cpu
 

@@ -86,7 +86,7 @@ def encode_views(points: Tensor, viewpoint: Tensor, encoding: str, *, implementa
         raise ValueError(f"points {tuple(points.shape)} from {tuple(viewpoint.shape)}, encoding '{encoding}'")
     needs_grad = torch.is_grad_enabled() and (points.requires_grad or viewpoint.requires_grad)
     available = ("reference", "gpu") if is_single_viewpoint and not needs_grad else ("reference",)
-    if choose_implementation(implementation, available, points, viewpoint) == "gpu":
+    if choose_implementation("encode_views", implementation, available, points, viewpoint) == "gpu":
         from hyrfpack.ops.shade import gpu_directions
 
         return gpu_directions.encode_views(points, viewpoint, encoding, DIRECTION_FEATURES[encoding])

@@ -38,7 +38,7 @@ def ssim(image: Tensor, reference: Tensor, *, implementation: str = "auto") -> T
         1.0
     """
     _check(image, reference, None)
-    chosen = choose_implementation(implementation, _IMPLEMENTATIONS, image, reference)
+    chosen = choose_implementation("photometric_loss", implementation, _IMPLEMENTATIONS, image, reference)
     if chosen == "reference":
         return _reference.ssim(image, reference.detach())
     loss = _GpuLoss if chosen == "gpu" else _CpuLoss
@@ -78,7 +78,7 @@ def photometric_loss(
         0.5
     """
     _check(image, target, mask)
-    chosen = choose_implementation(implementation, _IMPLEMENTATIONS, image, target)
+    chosen = choose_implementation("photometric_loss", implementation, _IMPLEMENTATIONS, image, target)
     if chosen == "reference":
         return _reference.photometric_loss(image, target.detach(), mask, ssim_weight)
     loss = _GpuLoss if chosen == "gpu" else _CpuLoss

@@ -1,0 +1,299 @@
+"""The cases of the self-test: each GPU operation on a small random input, larger than one block of its kernels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cache
+
+import torch
+from torch import Tensor
+
+from hyrfpack.ops.activate import activate_geometry
+from hyrfpack.ops.adam import adam_step
+from hyrfpack.ops.background import BackgroundField, background_grid, grid_size
+from hyrfpack.ops.composite import composite
+from hyrfpack.ops.contraction import contract
+from hyrfpack.ops.hash_encode import hash_encode, level_offsets, level_resolutions
+from hyrfpack.ops.mlp import mlp
+from hyrfpack.ops.rasterize import Gaussians3D, RasterSettings, rasterize
+from hyrfpack.ops.rasterize.cull import frustum_cull
+from hyrfpack.ops.shade import DIRECTION_FEATURES, Shading, encode_views, shade
+from hyrfpack.ops.ssim import photometric_loss
+from hyrfpack.ops.viewport import Viewport
+
+Inputs = Mapping[str, Tensor]
+# Widths of a decoder's hidden layers, and the levels of a hash grid; those of a trained model are as wide.
+HIDDEN_WIDTH = 64
+LOG2_TABLE_SIZE = 9
+RESOLUTIONS = level_resolutions(4, 4, 40)
+WIDTH, HEIGHT = 37, 33  # pixels: 3 x 3 tiles, with parts of a tile at the edges
+STRIDE = 2
+
+
+@dataclass(frozen=True)
+class SelfTestCase:
+    """An operation with inputs, and the errors that its kernels may have.
+
+    Attributes:
+        operation: the operation's name, one of `hyrfpack.ops.dispatch.GPU_OPERATIONS`.
+        inputs: float32 CPU tensors by name; tensors of other types stay as they are in every precision.
+        run: function of an implementation's name and the inputs; returns the results by name.
+        gradient_inputs: names of the inputs whose gradients are tested.
+        has_cpu_kernels: whether there is an implementation "cpu".
+        bounds: largest allowed rms errors of a result and of a gradient against the float64 reference, as fractions of
+            the reference's rms.
+    """
+
+    operation: str
+    inputs: Inputs
+    run: Callable[[str, Inputs], dict[str, Tensor]]
+    gradient_inputs: tuple[str, ...] = ()
+    has_cpu_kernels: bool = False
+    bounds: tuple[float, float] = (1e-4, 1e-3)
+
+
+# In a few pixels, rounding moves alpha or transmittance across a threshold. These bounds allow for that.
+_RASTER_BOUNDS = (1e-3, 1e-2)
+# Implementations may round a value halfway between two bfloat16 numbers in different directions.
+_MIXED_BOUNDS = (5e-3, 2e-2)
+
+
+@cache
+def self_test_cases() -> dict[str, SelfTestCase]:
+    """Return all cases by name. The kernels that others depend on come first."""
+    return {
+        "hash_encode": _hash_encode(),
+        "mlp": _mlp(mixed=False),
+        "mlp, mixed precision": _mlp(mixed=True),
+        "contract": _contract(),
+        "encode_views, frequency": _encode_views("frequency"),
+        "encode_views, sh": _encode_views("sh"),
+        "activate_geometry, sum": _activate("sum"),
+        "activate_geometry, product": _activate("product"),
+        "frustum_cull": _frustum_cull(),
+        "rasterize": _rasterize(RasterSettings(depth=True)),
+        "rasterize, antialiased": _rasterize(RasterSettings(antialiased=True)),
+        "shade": _shade(mixed=False),
+        "shade, mixed precision": _shade(mixed=True),
+        "rasterize_shaded": _rasterize_shaded(mixed=False),
+        "rasterize_shaded, mixed precision": _rasterize_shaded(mixed=True),
+        "background_grid": _background(needs_grad=False),
+        "background_grid, gradients": _background(needs_grad=True),
+        "composite": _composite(),
+        "photometric_loss": _loss(masked=False),
+        "photometric_loss, masked": _loss(masked=True),
+        "adam_step": _adam(),
+    }
+
+
+def _normal(seed: int, *shape: int) -> Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def _uniform(seed: int, *shape: int) -> Tensor:
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def _viewport() -> Viewport:
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, 3] = torch.tensor([0.1, -0.05, 4.0])
+    return Viewport(pose, (30.0, 32.0, 0.45 * WIDTH, 0.55 * HEIGHT), WIDTH, HEIGHT)
+
+
+def _layers(widths: tuple[int, ...], seed: int) -> dict[str, Tensor]:
+    """Return weights "w0", "w1", ... and biases "b0", "b1", ... of an MLP."""
+    layers: dict[str, Tensor] = {}
+    for layer, (inputs, outputs) in enumerate(zip(widths, widths[1:], strict=False)):
+        layers[f"w{layer}"] = _normal(seed + layer, outputs, inputs) / inputs**0.5
+        layers[f"b{layer}"] = 0.1 * _normal(seed + 10 + layer, outputs)
+    return layers
+
+
+def _split_layers(inputs: Inputs) -> tuple[list[Tensor], list[Tensor]]:
+    """Return the weights and the biases of `_layers`."""
+    return [inputs[f"w{layer}"] for layer in range(3)], [inputs[f"b{layer}"] for layer in range(3)]
+
+
+def _hash_encode() -> SelfTestCase:
+    # Coordinates have 16 bits, so that a point has the same cell and offset in every precision.
+    coords = torch.randint(0, 1 << 16, (700, 3), generator=torch.Generator().manual_seed(0)) / (1 << 16)
+    table = _normal(1, level_offsets(RESOLUTIONS, LOG2_TABLE_SIZE)[-1], 2)
+
+    def run(implementation: str, x: Inputs) -> dict[str, Tensor]:
+        encoded = hash_encode(x["coords"], x["table"], RESOLUTIONS, LOG2_TABLE_SIZE, implementation=implementation)
+        return {"features": encoded}
+
+    return SelfTestCase("hash_encode", {"coords": coords, "table": table}, run, ("coords", "table"), True)
+
+
+def _mlp(mixed: bool) -> SelfTestCase:
+    layers = _layers((32, HIDDEN_WIDTH, HIDDEN_WIDTH, 8), 1)
+
+    def run(implementation: str, x: Inputs) -> dict[str, Tensor]:
+        return {"outputs": mlp(x["rows"], *_split_layers(x), mixed=mixed, implementation=implementation)}
+
+    bounds = _MIXED_BOUNDS if mixed else (1e-4, 1e-3)
+    return SelfTestCase("mlp", {"rows": _normal(0, 300, 32)} | layers, run, ("rows", *layers), not mixed, bounds)
+
+
+def _contract() -> SelfTestCase:
+    points = _normal(0, 1500, 3) * torch.logspace(-1, 2, 1500)[:, None]
+
+    def run(implementation: str, x: Inputs) -> dict[str, Tensor]:
+        return {"coords": contract(x["points"], (1.0, 0.5, 0.25), implementation=implementation)}
+
+    return SelfTestCase("contract", {"points": points}, run)
+
+
+def _encode_views(encoding: str) -> SelfTestCase:
+    def run(implementation: str, x: Inputs) -> dict[str, Tensor]:
+        return {"features": encode_views(x["points"], x["viewpoint"], encoding, implementation=implementation)}
+
+    return SelfTestCase("encode_views", {"points": _normal(0, 700, 3), "viewpoint": _normal(1, 3)}, run)
+
+
+def _activate(rule: str) -> SelfTestCase:
+    inputs = {"raw": _normal(0, 700, 8), "positions": 2 * _normal(1, 700, 3)}
+    inputs |= {"scale_logits": _normal(2, 700, 1), "opacity_logits": _normal(3, 700, 1)}
+
+    def run(implementation: str, x: Inputs) -> dict[str, Tensor]:
+        activated = activate_geometry(
+            *x.values(), half_extent=(1.0, 0.5, 0.25), rule=rule, implementation=implementation
+        )
+        return dict(zip(("scales", "quats", "opacities"), activated, strict=True))
+
+    return SelfTestCase("activate_geometry", inputs, run, ("raw", "scale_logits", "opacity_logits"))
+
+
+def _frustum_cull() -> SelfTestCase:
+    def run(implementation: str, x: Inputs) -> dict[str, Tensor]:
+        return {"index": frustum_cull(x["positions"], _viewport(), 0.01, 0.1, implementation=implementation)}
+
+    return SelfTestCase("frustum_cull", {"positions": 3 * _normal(0, 3000, 3)}, run)
+
+
+def _splats(count: int) -> dict[str, Tensor]:
+    return {
+        "means": _normal(0, count, 3),
+        "quats": _normal(1, count, 4),
+        "scales": 0.1 * torch.exp(0.5 * _normal(2, count, 3)),
+        "opacities": torch.sigmoid(1.5 * _normal(3, count)),
+    }
+
+
+def _rasterize(settings: RasterSettings) -> SelfTestCase:
+    inputs = _splats(300) | {"colors": _uniform(4, 300, 3)}
+
+    def run(implementation: str, x: Inputs) -> dict[str, Tensor]:
+        *gaussians, colors = x.values()
+        image = rasterize(Gaussians3D(*gaussians), colors, _viewport(), settings, implementation=implementation)
+        depth = {"depth": image.depth} if image.depth is not None else {}
+        return {"rgb": image.rgb, "transmittance": image.transmittance} | depth
+
+    return SelfTestCase("rasterize", inputs, run, tuple(inputs), True, _RASTER_BOUNDS)
+
+
+def _shading_inputs(count: int, mixed: bool) -> dict[str, Tensor]:
+    layers = _layers((HIDDEN_WIDTH, HIDDEN_WIDTH, 3), 20)
+    first = _normal(10, count, HIDDEN_WIDTH)
+    return {
+        "first_layer": first.to(torch.bfloat16) if mixed else first,
+        "direction_weight": _normal(11, HIDDEN_WIDTH, DIRECTION_FEATURES["frequency"]) / 5,
+        "color_logits": _normal(12, count, 3),
+    } | layers
+
+
+def _make_shading(x: Inputs, mixed: bool) -> Shading:
+    weights, biases = (x["w0"], x["w1"]), (x["b0"], x["b1"])
+    return Shading(x["first_layer"], x["direction_weight"], weights, biases, x["color_logits"], "frequency", mixed)
+
+
+def _shade(mixed: bool) -> SelfTestCase:
+    inputs = {"positions": _normal(0, 300, 3), "viewpoint": 3 * _normal(1, 3)} | _shading_inputs(300, mixed)
+
+    def run(implementation: str, x: Inputs) -> dict[str, Tensor]:
+        shading = _make_shading(x, mixed)
+        return {"colors": shade(x["positions"], x["viewpoint"], shading, implementation=implementation)}
+
+    return SelfTestCase("shade", inputs, run, (), not mixed, _MIXED_BOUNDS if mixed else (1e-4, 1e-3))
+
+
+def _rasterize_shaded(mixed: bool) -> SelfTestCase:
+    splats = _splats(300)
+
+    def run(implementation: str, x: Inputs) -> dict[str, Tensor]:
+        gaussians = Gaussians3D(*(x[name] for name in splats))
+        settings = RasterSettings(depth=True)
+        image = rasterize(gaussians, _make_shading(x, mixed), _viewport(), settings, implementation=implementation)
+        assert image.depth is not None
+        return {"rgb": image.rgb, "transmittance": image.transmittance, "depth": image.depth}
+
+    bounds = _MIXED_BOUNDS if mixed else _RASTER_BOUNDS
+    return SelfTestCase("rasterize_shaded", splats | _shading_inputs(300, mixed), run, (), False, bounds)
+
+
+def _background(needs_grad: bool) -> SelfTestCase:
+    features = 2 * len(RESOLUTIONS) + DIRECTION_FEATURES["frequency"]
+    table = _normal(30, level_offsets(RESOLUTIONS, LOG2_TABLE_SIZE)[-1], 2)
+    # Light passes in stripes, at a distance from the threshold.
+    light = torch.where(torch.arange(HEIGHT * WIDTH).view(HEIGHT, WIDTH) // 100 % 2 == 0, 0.9, 0.1)
+    parameters = {"table": table} | _layers((features, HIDDEN_WIDTH, HIDDEN_WIDTH, 3), 31)
+
+    def run(implementation: str, x: Inputs) -> dict[str, Tensor]:
+        field = BackgroundField(
+            (1.0, 1.0, 1.0), x["table"], RESOLUTIONS, LOG2_TABLE_SIZE, *_split_layers(x), "frequency", False
+        )
+        grid = background_grid(
+            x["transmittance"], _viewport(), field, threshold=0.5, stride=STRIDE, implementation=implementation
+        )
+        return {"grid": grid}
+
+    gradients = tuple(parameters) if needs_grad else ()
+    # A direction's error is multiplied by the highest octave and by the finest level.
+    return SelfTestCase("background_grid", {"transmittance": light} | parameters, run, gradients, True, (1e-3, 1e-2))
+
+
+def _composite() -> SelfTestCase:
+    inputs = {"rgb": _uniform(0, HEIGHT, WIDTH, 3), "transmittance": _uniform(1, HEIGHT, WIDTH)}
+    inputs["grid"] = _uniform(2, *grid_size(HEIGHT, WIDTH, STRIDE), 3)
+
+    def run(implementation: str, x: Inputs) -> dict[str, Tensor]:
+        return {"image": composite(x["rgb"], x["transmittance"], x["grid"], STRIDE, implementation=implementation)}
+
+    return SelfTestCase("composite", inputs, run, tuple(inputs), True)
+
+
+def _loss(masked: bool) -> SelfTestCase:
+    target = _uniform(0, HEIGHT, WIDTH, 3)
+    inputs = {"image": (target + 0.1 * _normal(1, HEIGHT, WIDTH, 3)).clamp(0, 1), "target": target}
+    if masked:
+        inputs["mask"] = _uniform(2, HEIGHT, WIDTH) < 0.7
+
+    def run(implementation: str, x: Inputs) -> dict[str, Tensor]:
+        return {"loss": photometric_loss(x["image"], x["target"], x.get("mask"), implementation=implementation)}
+
+    return SelfTestCase("photometric_loss", inputs, run, ("image",), True)
+
+
+def _adam() -> SelfTestCase:
+    # Tensors of odd sizes end within a block. One gradient is not finite, and its element must not change.
+    shapes = {"a": (1500, 3), "b": (701,)}
+    inputs: dict[str, Tensor] = {}
+    for seed, (name, shape) in enumerate(shapes.items()):
+        inputs[f"value {name}"], inputs[f"gradient {name}"] = _normal(seed, *shape), _normal(seed + 2, *shape)
+        inputs[f"exp_avg {name}"] = 0.1 * _normal(seed + 4, *shape)
+        inputs[f"exp_avg_sq {name}"] = _uniform(seed + 6, *shape)
+    inputs["gradient b"][3] = torch.inf
+
+    def run(implementation: str, x: Inputs) -> dict[str, Tensor]:
+        copies = {name: tensor.clone() for name, tensor in x.items()}
+        lists = [
+            [copies[f"{kind} {name}"] for name in shapes] for kind in ("value", "gradient", "exp_avg", "exp_avg_sq")
+        ]
+        values, gradients, exp_avg, exp_avg_sq = lists
+        skipped = adam_step(values, gradients, exp_avg, exp_avg_sq, step=3, rate=0.1, implementation=implementation)
+        changed = {name: tensor for name, tensor in copies.items() if not name.startswith("gradient")}
+        return changed | {"skipped": skipped}
+
+    return SelfTestCase("adam_step", inputs, run, (), True)

@@ -1,0 +1,90 @@
+"""Run the self-test in child processes, because a broken kernel may end its process or hang."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+
+from hyrfpack.parallel.child_items import Row, run_in_children
+from hyrfpack.self_test.cases import self_test_cases
+
+# A case compiles up to ten kernels. Compilation of one takes seconds on a slow CPU, and a kernel that hangs never ends.
+MAX_CASE_SECONDS = 120.0
+MAX_SECONDS = 900.0
+# The first item only uses the device. If it fails, the device is unusable or in use by others, whatever the kernels do.
+DEVICE_ITEM = "device"
+
+
+@dataclass(frozen=True)
+class SelfTest:
+    """The result of a self-test.
+
+    Attributes:
+        implementation: the implementation that was tested, "gpu" or "cpu".
+        device: the tested device, as torch names it.
+        rows: for each case its name ("item") and operation, its errors and the seconds that it took with compilation.
+            A failed one has "status" "failed", the reason as "note", and if its kernels ran, as "slowdown" how many
+            times as long plain torch took.
+        problem: why no case could run; None if they ran.
+    """
+
+    implementation: str
+    device: str
+    rows: tuple[Row, ...]
+    problem: str | None = None
+
+    @property
+    def failed_rows(self) -> list[Row]:
+        """The rows of the cases that failed."""
+        return [row for row in self.rows if row.get("status") == "failed"]
+
+    @property
+    def failed_operations(self) -> dict[str, Row]:
+        """The first failed row of each operation that failed in some case."""
+        failed: dict[str, Row] = {}
+        for row in self.failed_rows:
+            failed.setdefault(str(row["operation"]), row)
+        return failed
+
+
+def run_self_test(
+    implementation: str,
+    device: torch.device,
+    command: Callable[[str, str, Sequence[str]], list[str]] | None = None,
+    *,
+    max_case_seconds: float = MAX_CASE_SECONDS,
+    max_seconds: float = MAX_SECONDS,
+) -> SelfTest:
+    """Test the kernels of an implementation on a device against the float64 reference, values and gradients.
+
+    Args:
+        implementation: "gpu" or "cpu".
+        device: the device, which this process need not have used yet.
+        command: returns the command that runs the cases of some names, from the implementation and the device's name;
+            None for `hyrfpack.self_test.worker`.
+        max_case_seconds: time limit for each case with its compilation; a case that exceeds it has failed.
+        max_seconds: time limit for all cases together.
+    """
+    cases = self_test_cases()
+    names = [name for name, case in cases.items() if implementation == "gpu" or case.has_cpu_kernels]
+    make_command = command or _worker_command
+    found: dict[str, Row] = {}
+    for row in run_in_children(
+        lambda left: make_command(implementation, str(device), left),
+        [DEVICE_ITEM, *names],
+        max_seconds,
+        max_case_seconds,
+    ):
+        name = str(row["item"])
+        if name != DEVICE_ITEM:
+            found[name] = {"operation": cases[name].operation, **row}
+        elif "status" in row:
+            return SelfTest(implementation, str(device), (), str(row["note"]))
+    return SelfTest(implementation, str(device), tuple(found[name] for name in names))
+
+
+def _worker_command(implementation: str, device: str, names: Sequence[str]) -> list[str]:
+    return [sys.executable, "-m", "hyrfpack.self_test.worker", implementation, device, *names]
