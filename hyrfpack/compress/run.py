@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
@@ -10,6 +11,7 @@ from hyrfpack.cameras.capture import Capture
 from hyrfpack.checks import check_type
 from hyrfpack.compress.calibrate import measure_calibrated_sensitivity
 from hyrfpack.compress.distortion import DEFAULT_PSNR_DROP_DB, default_distortion
+from hyrfpack.compress.merged import compress_parts, is_merged
 from hyrfpack.compress.packer import EncodedCandidate, Packer
 from hyrfpack.compress.report import CompressionReport
 from hyrfpack.compress.sensitivity import Sensitivity
@@ -45,7 +47,8 @@ def compress_model(
     """Compress a `.hyrf` file into a smaller one.
 
     Profile "compact" measures at the cameras of `data`, or at those stored in the file. On the CPU the same input gives
-    the same bytes. On a GPU sums of gradients vary in their last bits, and so may the bytes.
+    the same bytes. On a GPU sums of gradients vary in their last bits, and so may the bytes. The parts of a merged file
+    are compressed each by itself.
 
     Args:
         source: a file of any profile, best "raw", or the folder of a run.
@@ -75,6 +78,8 @@ def compress_model(
     outputs = Outputs(source, scene=data, overwrite=overwrite)
     ranks.run_on_all(lambda: outputs.file(target) if ranks.is_main else None)
     check_request(config, data)
+    if is_merged(source):
+        return _compress_merged(source, target, config, data, overwrite, context)
     if config.profile != "compact":
         settings = config.encoder_settings()
         repacked = ranks.run_on_all(
@@ -95,6 +100,25 @@ def compress_model(
         finetuned=config.finetune_steps is not None,
         sensitivity=sensitivity,
     )
+
+
+def _compress_merged(
+    source: Path, target: StrPath, config: CompressConfig, data: Scene | None, overwrite: bool, context: RunContext
+) -> CompressionReport:
+    """Compress each part of a merged file by itself, and write a merged file of the results."""
+    one_model = (data, config.target_bytes, config.finetune_steps)  # A limit on the loss of PSNR needs data.
+    if any(setting is not None for setting in one_model) or not (context.ranks or SINGLE_PROCESS).is_single:
+        raise HyrfError(
+            f"{source}: it holds merged models, and photos, a target size and several processes are for one model",
+            fix="leave them out, or compress the models before they are merged",
+        )
+
+    def compress_part(loose: Path, packed: Path, progress: Progress) -> FileReport:
+        return compress_model(loose, packed, config, context=replace(context, progress=progress))
+
+    with context.open_progress("compress") as progress:
+        written = compress_parts(source, target, compress_part, progress, overwrite=overwrite)
+    return CompressionReport(**vars(written))
 
 
 def _encode_compact(

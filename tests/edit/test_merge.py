@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import refused, succeeded
-from scenes import small_model
+from scenes import QUIET_CONTEXT, small_model
 
 from hyrfpack.cameras.capture import Capture
+from hyrfpack.compress import compress_model
 from hyrfpack.config.edit import Center, Scale, Translate
 from hyrfpack.edit import edit_model, merge_models
 from hyrfpack.errors import HyrfError
@@ -188,7 +189,7 @@ def test_the_commands_read_what_merge_writes(tmp_path: Path, files: tuple[Path, 
         ("edit both.hyrf -o out.hyrf --center", "holds the parts 'room', 'balls'; name one of them with --part"),
         ("edit both.hyrf -o out.hyrf --part lamp", "holds the parts 'room', 'balls'"),
         ("edit room.hyrf -o out.hyrf --part lamp", "one model and no parts"),
-        ("compress both.hyrf -o out.hyrf", "merged models"),
+        ("compress both.hyrf -o out.hyrf --target-size 100kB", "compress the models before they are merged"),
         ("decompress both.hyrf -o out.hyrf", "merged models"),
         ("export both.hyrf -o out.spz", "only pages"),
     ],
@@ -198,6 +199,23 @@ def test_what_needs_one_model_says_so(tmp_path: Path, files: tuple[Path, Path], 
 
     assert message in refused(*arguments.split())
     assert not list(tmp_path.glob("out.*"))
+
+
+def test_each_part_of_a_merged_file_is_compressed_by_itself(tmp_path: Path, files: tuple[Path, Path]):
+    merge_models(files, tmp_path / "both.hyrf", {"balls": [Translate((1.0, 0.0, 0.0))]})
+    report = compress_model(tmp_path / "both.hyrf", tmp_path / "small.hyrf", context=QUIET_CONTEXT)
+    assert report.bytes_after == (tmp_path / "small.hyrf").stat().st_size < (tmp_path / "both.hyrf").stat().st_size
+
+    for name in ("room", "balls"):
+        edit_model(tmp_path / "both.hyrf", tmp_path / "part.hyrf", [], part=name, context=QUIET_CONTEXT)
+        compress_model(tmp_path / "part.hyrf", tmp_path / "alone.hyrf", context=QUIET_CONTEXT)
+        edit_model(tmp_path / "small.hyrf", tmp_path / "taken.hyrf", [], part=name, context=QUIET_CONTEXT)
+        alone, taken = load_model(tmp_path / "alone.hyrf"), load_model(tmp_path / "taken.hyrf")
+        assert taken.config == alone.config and describe_file(tmp_path / "taken.hyrf")["profile"] == "compact"
+        assert all((a == b).all() for a, b in zip(alone.parameters(), taken.parameters(), strict=True))
+
+    succeeded("compress", "both.hyrf", "-o", "paper.hyrf", "--profile", "paper")
+    assert len(load_merged_model(tmp_path / "paper.hyrf")) == len(load_merged_model(tmp_path / "both.hyrf"))
 
 
 def test_a_merged_model_of_one_part_is_that_model(files: tuple[Path, Path]):
