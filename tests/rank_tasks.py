@@ -241,9 +241,18 @@ def collect_errors(ranks: Ranks) -> dict[str, str | None]:
     version, trainers.__version__ = trainers.__version__, "0.0" if mine else trainers.__version__
     said["version"] = error_message(lambda: record_training(ranks, six_photo_scene(), short))
     trainers.__version__ = version
+    drawing = trainers.render_view
+    if mine:
+        trainers.render_view = _run_out_of_memory
+    said["memory"] = error_message(lambda: record_training(ranks, six_photo_scene(), short))
+    trainers.render_view = drawing
     said["checkpoint"] = error_message(lambda: Trainer(six_photo_scene(), short, ranks=ranks).load(Path("nowhere.pt")))
     said["none"] = error_message(lambda: record_training(ranks, six_photo_scene(), short))
     return said
+
+
+def _run_out_of_memory(*arguments: object, **options: object) -> NoReturn:
+    raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
 
 
 def collect_setup_errors(ranks: Ranks, out: Path) -> dict[str, str | None]:

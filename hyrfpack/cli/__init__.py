@@ -45,6 +45,7 @@ from hyrfpack.cli.train import train
 from hyrfpack.cli.view import view
 from hyrfpack.cli.wording import use_option_names
 from hyrfpack.errors import HyrfError, needs_package, printable
+from hyrfpack.out_of_memory import describe_out_of_memory
 from hyrfpack.version import __version__
 
 
@@ -82,6 +83,13 @@ class _CommandGroup(click.Group):
             if error.errno not in (errno.ENOSPC, errno.EDQUOT):
                 raise
             raise _UserError(f"the output cannot be printed ({error.strerror}); send it elsewhere") from error
+        except (MemoryError, RuntimeError) as error:
+            problem = describe_out_of_memory(error)
+            if problem is None:
+                raise
+            if is_verbose():
+                traceback.print_exc()
+            raise _UserError(f"{problem}; use smaller photos, pictures or models, or --device cpu") from error
         _note_uncached_kernels()
         return result
 

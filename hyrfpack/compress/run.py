@@ -23,6 +23,7 @@ from hyrfpack.format.codec import load_with_provenance, packed_provenance, repac
 from hyrfpack.format.info import FileReport, describe_file
 from hyrfpack.format.min_file_size import check_target_bytes
 from hyrfpack.format.run_folder import find_model
+from hyrfpack.out_of_memory import explain_out_of_memory
 from hyrfpack.outputs import Outputs, StrPath
 from hyrfpack.parallel.ranks import SINGLE_PROCESS
 from hyrfpack.progress import Progress, part_of_progress
@@ -35,6 +36,7 @@ ENCODING_START_SHARE = 0.7
 SEARCH_ENCODING_START_SHARE = 0.3
 
 
+@explain_out_of_memory("reduce `max_size` of the photos, or use `device='cpu'`")
 def compress_model(
     source: StrPath,
     target: StrPath,

@@ -19,6 +19,7 @@ from hyrfpack.config.distill import DistillConfig
 from hyrfpack.context import RunContext
 from hyrfpack.distill.distillation import distill_model
 from hyrfpack.distill.pack import pack
+from hyrfpack.out_of_memory import explain_out_of_memory
 from hyrfpack.outputs import Outputs
 from hyrfpack.progress import TaskEvent, part_of_progress
 from hyrfpack.scene import Camera
@@ -68,6 +69,7 @@ class DistillReport:
         return asdict(self)
 
 
+@explain_out_of_memory("reduce `size`, or use `device='cpu'`")
 def import_splats(
     source: str | os.PathLike[str],
     target: str | os.PathLike[str],

@@ -24,6 +24,7 @@ from hyrfpack.evaluate.metrics import psnr, ssim, to_8bit
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.model import HybridModel
 from hyrfpack.model.merged import MergedModel
+from hyrfpack.out_of_memory import explain_out_of_memory
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.progress import Progress, TaskEvent, ignore_progress
 from hyrfpack.render import RenderSettings, apply_exposure_map, render_view
@@ -88,6 +89,7 @@ class Evaluation:
         return asdict(self)
 
 
+@explain_out_of_memory("reduce `max_size`, or use `device='cpu'`")
 @torch.no_grad()
 def evaluate_model(
     model: HybridModel | MergedModel | Drawable,

@@ -25,6 +25,7 @@ from hyrfpack.ops.rasterize.cull import frustum_cull
 from hyrfpack.ops.rasterize.inputs import LOW_PASS_VARIANCE, TRANSMITTANCE_MIN
 from hyrfpack.ops.shade import Shading
 from hyrfpack.ops.transfer import tensor_like
+from hyrfpack.out_of_memory import explain_out_of_memory
 from hyrfpack.parallel.pool import torch_on_one_thread
 from hyrfpack.render.exposure import apply_exposure_map
 from hyrfpack.render.parts import camera_frame, expose_parts, gather_parts
@@ -121,6 +122,7 @@ class RenderedPicture:
     normals: Tensor | None = None
 
 
+@explain_out_of_memory("render a smaller picture or a model of fewer Gaussians, or use `device='cpu'`")
 @torch_on_one_thread()
 def render_view(
     model: HybridModel | MergedModel,

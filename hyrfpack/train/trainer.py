@@ -23,6 +23,7 @@ from hyrfpack.measure.psnr import psnr_from_mse
 from hyrfpack.model import HybridModel
 from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.ops.ssim import photometric_loss
+from hyrfpack.out_of_memory import explain_out_of_memory
 from hyrfpack.parallel.pool import keep_freed_memory, torch_on_one_thread
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.progress import StepEvent, ignore_progress
@@ -203,13 +204,14 @@ class Trainer:
         """
         problem: HyrfError | None = None
         try:
-            with self._timed("data"):
-                view, picture = next(views)
-            loss, error = self._gradients(view, picture)
+            with explain_out_of_memory("reduce `max_gaussians` or `max_size`, or use `device='cpu'`"):
+                with self._timed("data"):
+                    view, picture = next(views)
+                loss, error = self._gradients(view, picture)
         except HyrfError as refusal:
             if self.ranks.is_single:
                 raise
-            problem = refusal
+            problem = refusal.with_text()  # This copy has no traceback, which would keep the step's memory.
             loss = error = torch.zeros((), device=self.device)
         packed = torch.stack((loss, error))
         if not self.ranks.is_single:

@@ -317,6 +317,7 @@ def errors_by_rank() -> list[dict]:
         ("seed", ["process 1 of 2", "other settings", "(seed)", "versions"]),
         ("photos", ["process 1 of 2", "views)"]),
         ("version", ["process 1 of 2", "(versions)"]),
+        ("memory", ["process 1 of 2: the GPU's memory ran out", "reduce `max_gaussians`"]),
         ("checkpoint", ["no checkpoint to resume"]),
     ],
 )

@@ -1,0 +1,41 @@
+"""Turn running out of memory, of a GPU or of this machine, into an error that says what to reduce."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from hyrfpack.errors import HyrfError, short_reason
+
+MAX_REASON_LENGTH = 160
+
+
+@contextmanager
+def explain_out_of_memory(fix: str) -> Iterator[None]:
+    """Raise a HyrfError with this fix if memory runs out in the block. It also serves as a decorator.
+
+    Raises:
+        HyrfError: memory ran out.
+    """
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        problem = describe_out_of_memory(error)
+        if problem is None:
+            raise
+        raise HyrfError(problem, fix=fix) from error
+
+
+def describe_out_of_memory(error: BaseException) -> str | None:
+    """Return what to tell the user if an error says that memory ran out; None for any other error.
+
+    The types of torch's errors are compared by name, so that this does not import torch.
+    """
+    if type(error).__name__ == "OutOfMemoryError":
+        return f"the GPU's memory ran out ({short_reason(error, MAX_REASON_LENGTH)})"  # type: ignore[arg-type]
+    if isinstance(error, MemoryError):
+        return f"memory ran out ({short_reason(error, MAX_REASON_LENGTH)})"
+    if isinstance(error, RuntimeError) and "DefaultCPUAllocator" in str(error):
+        allocator_message = str(error).partition("DefaultCPUAllocator: ")[2].splitlines()[0]
+        return f"memory ran out ({allocator_message[:MAX_REASON_LENGTH]})"
+    return None

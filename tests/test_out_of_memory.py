@@ -1,0 +1,55 @@
+"""Running out of memory is one sentence with what to reduce, and on one of several processes it ends all of them."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from commands import refused
+from scenes import ball_scene, camera_at, small_model
+
+import hyrfpack
+from hyrfpack.errors import HyrfError
+from hyrfpack.out_of_memory import explain_out_of_memory
+from hyrfpack.train import TrainConfig, Trainer
+
+GPU_ERROR = torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.\nSee the documentation")
+
+
+def fail(*arguments, **options):
+    raise GPU_ERROR
+
+
+def test_a_gpu_without_memory_is_one_sentence():
+    with pytest.raises(HyrfError) as caught, explain_out_of_memory("reduce it"):
+        fail()
+    expected = "the GPU's memory ran out (CUDA out of memory. Tried to allocate 2.00 GiB.); reduce it"
+    assert str(caught.value) == expected
+
+
+@pytest.mark.parametrize("allocate", [lambda: torch.empty(1 << 55), lambda: bytearray(1 << 55)])
+def test_a_machine_without_memory_is_one_sentence(allocate):
+    with pytest.raises(HyrfError, match=r"memory ran out \(.*\); reduce it"), explain_out_of_memory("reduce it"):
+        allocate()
+
+
+def test_any_other_error_passes():
+    with pytest.raises(RuntimeError, match="shapes differ"), explain_out_of_memory("reduce it"):
+        raise RuntimeError("shapes differ")
+
+
+def test_a_training_step_names_the_settings_of_training(monkeypatch):
+    trainer = Trainer(ball_scene(views=3, points=20, side=8), TrainConfig(steps=2, max_gaussians=20, log2_table_size=5))
+    monkeypatch.setattr(trainer, "_gradients", fail)
+    with pytest.raises(HyrfError, match="GPU's memory ran out.*reduce `max_gaussians` or `max_size`"):
+        trainer.run()
+
+
+def test_a_render_names_the_size_of_the_picture(monkeypatch):
+    monkeypatch.setattr("hyrfpack.render.renderer._select_gaussians", fail)
+    with pytest.raises(HyrfError, match="GPU's memory ran out.*render a smaller picture"):
+        hyrfpack.render_view(small_model([(0, 0, 0)]), camera_at((0.0, -2.0, 0.5), width=8, height=8))
+
+
+def test_a_command_ends_with_the_sentence(monkeypatch):
+    monkeypatch.setattr("hyrfpack.doctor.diagnose_machine", fail)
+    assert "the GPU's memory ran out" in refused("doctor") and "--device cpu" in refused("doctor")
