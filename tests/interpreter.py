@@ -8,8 +8,11 @@ from functools import cache
 from typing import Any
 
 import triton.language as tl
+from triton.backends.compiler import BaseBackend
 from triton.language.semantic import TritonSemantic
-from triton.runtime import interpreter
+from triton.runtime import interpreter, jit
+
+native_specialize_impl = getattr(jit, "native_specialize_impl", None)
 
 
 def speed_up_interpreter() -> None:
@@ -37,6 +40,7 @@ def speed_up_interpreter() -> None:
     def launch_once(self: Any, *args: Any, **kwargs: Any) -> Any:
         nonlocal done
         done = set()
+        _specialize_arguments(self, args, kwargs)
         try:
             return launch(self, *args, **kwargs)
         finally:
@@ -44,6 +48,16 @@ def speed_up_interpreter() -> None:
 
     interpreter._patch_lang, interpreter.GridExecutor.__call__ = patch_new, launch_once
     _cache_types()
+
+
+def _specialize_arguments(executor: Any, args: tuple, kwargs: dict[str, Any]) -> None:
+    """Raise TypeError for arguments that a real launch refuses and the interpreter takes, such as numpy's numbers."""
+    if native_specialize_impl is None:  # Other versions of Triton have another function.
+        return
+    given = dict(zip(executor.arg_names, args, strict=False)) | kwargs
+    for name in executor.arg_names:
+        if name in given and name not in executor.constexprs:
+            native_specialize_impl(BaseBackend, given[name], False, True, True)
 
 
 def _cache_types() -> None:
