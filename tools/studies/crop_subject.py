@@ -1,0 +1,113 @@
+"""Crop trained models to their subject, and measure bytes and the quality of the subject before and after.
+
+    python -m tools.studies.crop_subject --runs runs/quality/2000 --crops mipnerf360_bonsai=0.35 ngp_fox=0.3
+
+--runs has a folder for each data set, and below it runs with a `model.hyrf`. The subject is what lies in a sphere about
+the point that the cameras look at; its radius is given as a share of the median distance from the cameras to that
+point. The model and the cropped model are both compressed. PSNR in dB and SSIM are those of the files on held-out
+photos, over the pixels whose surface lies in the sphere; the model before the crop decides which pixels these are.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+import hyrfpack
+from hyrfpack.cameras.paths import Viewpoint
+from hyrfpack.config.edit import CropSphere
+from hyrfpack.edit.masked_views import mask_view
+from hyrfpack.evaluate import Evaluation
+from hyrfpack.format.run_folder import MODEL_FILE
+from hyrfpack.model import HybridModel
+from hyrfpack.render import RenderSettings, render_view
+from hyrfpack.render.surface import render_median_depth
+from hyrfpack.scene import Camera, View
+from tools.studies.train_sets import DATA_FOLDER
+from tools.tables import markdown_table
+
+MIN_PIXELS = 200  # Views that show less of the subject are left out.
+HEADER = ("set", "radius", "Gaussians", "bytes", "PSNR, SSIM", "Gaussians after", "bytes after", "PSNR, SSIM after")
+QUIET = hyrfpack.RunContext(progress=None)
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """A sphere in world units."""
+
+    center: np.ndarray
+    radius: float
+
+    def mask(self, model: HybridModel, camera: Camera) -> np.ndarray:
+        """Return the pixels (H, W) bool whose surface, at the median depth, lies in the sphere."""
+        depth = _median_depth(model, camera)
+        x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+        local = np.stack(((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)), -1)
+        world = (local * depth[..., None] - camera.camera_from_world[:3, 3]) @ camera.rotation
+        return (depth > 0) & (np.linalg.norm(world - self.center, axis=-1) <= self.radius)
+
+
+def _median_depth(model: HybridModel, camera: Camera) -> np.ndarray:
+    seen = render_view(model, camera)
+    index = seen.indices[seen.visible]
+    return render_median_depth(model, camera, model.decode(), index, RenderSettings()).numpy()
+
+
+def subject(cameras: list[Camera], share: float) -> Sphere:
+    """Return the sphere about the point that the cameras look at."""
+    center = np.array(Viewpoint.from_cameras(cameras).center)
+    distances = np.linalg.norm(np.array([camera.position for camera in cameras]) - center, axis=1)
+    return Sphere(center, share * float(np.median(distances)))
+
+
+def masked_views(views: list[View], masks: list[np.ndarray]) -> list[View]:
+    """Return the views that show enough of the subject, with its pixels as their mask."""
+    pairs = [pair for pair in zip(views, masks, strict=True) if np.count_nonzero(pair[1]) >= MIN_PIXELS]
+    return [mask_view(*pair) for pair in pairs]
+
+
+def measure(model_file: Path, name: str, share: float, data: Path) -> list[str]:
+    """Return the row of one set."""
+    scene = hyrfpack.load_scene(data / name)
+    sphere = subject([view.camera for view in scene.train], share)
+    with tempfile.TemporaryDirectory() as folder:
+        cropped, before, after = (Path(folder) / f"{each}.hyrf" for each in ("cropped", "before", "after"))
+        action = CropSphere(tuple(sphere.center.tolist()), sphere.radius)
+        hyrfpack.edit_model(model_file, cropped, [action], context=QUIET)
+        hyrfpack.compress_model(model_file, before, context=QUIET)
+        hyrfpack.compress_model(cropped, after, context=QUIET)
+        model = hyrfpack.load_model(before).requires_grad_(False)
+        views = masked_views(scene.test, [sphere.mask(model, view.camera) for view in scene.test])
+        cells = [name, f"{share:g}"]
+        for path in (before, after):
+            model = hyrfpack.load_model(path)
+            scores = hyrfpack.evaluate_model(model, views)
+            cells += [f"{len(model):,}", f"{path.stat().st_size:,}", _format_scores(scores)]
+    return cells
+
+
+def _format_scores(scores: Evaluation) -> str:
+    return f"{scores.psnr:.2f}, {scores.ssim:.3f}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--runs", type=Path, required=True, help="folder of the sets' runs")
+    parser.add_argument("--data", type=Path, default=DATA_FOLDER, help="folder of the data sets")
+    parser.add_argument("--crops", nargs="+", required=True, metavar="SET=RADIUS")
+    arguments = parser.parse_args()
+    rows = []
+    for crop in arguments.crops:
+        name, share = crop.split("=")
+        model_file = next(iter(sorted((arguments.runs / name).glob(f"**/{MODEL_FILE}"))))
+        rows.append(measure(model_file, name, float(share), arguments.data))
+        print(rows[-1], flush=True)
+    print(markdown_table(HEADER, rows))
+
+
+if __name__ == "__main__":
+    main()
