@@ -32,7 +32,7 @@ from hyrfpack.train.resolution import reduced_low_pass_variance
 MAX_PHOTOS = 128
 MAX_SIDE_PIXELS = 640  # of the reduced photos
 MIN_PASSES, MIN_STEPS = 16, 600  # passes over the photos; steps of one photo each
-LEARNING_RATE = 0.05  # of the shares of opacity
+LEARNING_RATES = (0.1, 0.005)  # of the shares of opacity, at the first and after the last step
 ADAM_BETAS = (0.9, 0.99)
 # Fading must lower the squared error, the mean of three channels, by this much for each pixel of light that is lost.
 MIN_ERROR_PER_LIGHT = (4.5 / 255) ** 2
@@ -91,7 +91,7 @@ def _supported_shares(
     del reduced.gaussians.opacity_logits  # from a parameter to a function of the shares
     light = _mean_light(model, views, settings)
     shares = torch.ones_like(before).requires_grad_(True)
-    optimizer = torch.optim.Adam([shares], lr=LEARNING_RATE, betas=ADAM_BETAS)
+    optimizer = torch.optim.Adam([shares], betas=ADAM_BETAS)
     solid = np.array(model.config.solid, np.float32)
     order = np.random.default_rng(0)
     passes = max(MIN_PASSES, math.ceil(MIN_STEPS / len(views)))
@@ -106,6 +106,7 @@ def _supported_shares(
         kept_light = (light * shares).sum() / photo[..., 0].numel()
         optimizer.zero_grad()
         (_squared_error(rgb, photo, mask) - MIN_ERROR_PER_LIGHT * kept_light).backward()
+        optimizer.param_groups[0]["lr"] = np.interp(step, (0, steps), LEARNING_RATES)
         optimizer.step()
         with torch.no_grad():
             shares.clamp_(MIN_SHARE, 1)

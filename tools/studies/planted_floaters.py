@@ -101,7 +101,7 @@ def _opacities_and_scales(model: HybridModel) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _with_gaussians(model: HybridModel, parameters: list[torch.Tensor]) -> HybridModel:
-    """Return a model with other Gaussians and the same fields."""
+    """Return a model with other Gaussians and the same fields, without the sampling of its photos."""
     changed = replace_config(model)
     changed.gaussians = Gaussians(*parameters)
     changed.precision = None
@@ -123,7 +123,7 @@ def main() -> None:
         model = hyrfpack.load_model(run).requires_grad_(False)
         scene = hyrfpack.load_scene(arguments.data / name)
         cameras = [view.camera for view in scene.train]
-        psnr = hyrfpack.evaluate_model(model, scene.test).psnr
+        psnr = hyrfpack.evaluate_model(_with_gaussians(model, _parameters(model)), scene.test).psnr
         for share in arguments.shares:
             planted, is_planted = plant_floaters(model, cameras, share, arguments.seed)
             removed = find_floaters(planted, scene.train, arguments.min_opacity_share)
