@@ -384,7 +384,7 @@ def test_tests_marked_gpu_are_run_and_a_failure_is_reported_with_its_reason(tmp_
     ("content", "words"),
     [
         ("def test_cpu(): pass", "no test is marked 'gpu'"),
-        ("import no_such_module", "exit code 2.*test_some.py"),
+        ("import no_such_module", "exit code 1.*test_some.py"),
         ("import os, pytest\n@pytest.mark.gpu\ndef test_dies(): os._exit(7)", "exit code 7.*test_dies"),
     ],
 )
@@ -392,6 +392,14 @@ def test_pytest_without_a_result_is_a_failure(content: str, words: str, tmp_path
     (tmp_path / "test_some.py").write_text(content)
     (row,) = gpu_suite.run_suite([str(tmp_path)])
     assert row["status"] == "failed" and re.search(words, row["note"]), row
+
+
+def test_a_file_that_cannot_be_imported_does_not_stop_the_others(tmp_path: Path) -> None:
+    (tmp_path / "test_a.py").write_text("import no_such_module")
+    (tmp_path / "test_b.py").write_text("import pytest\n@pytest.mark.gpu\ndef test_good(): pass")
+    good, missing = gpu_suite.run_suite([str(tmp_path)])
+    assert Path(good["case"]).name == "test_b.py" and good["result"] == "1 passed" and "status" not in good
+    assert missing["status"] == "failed" and "test_a.py" in missing["note"]
 
 
 def test_gpu_tests_are_omitted_without_pytest(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,8 +15,11 @@ from tools.gpu.rows import Row
 REPOSITORY_ROOT = Path(__file__).parents[2]
 TEST_PATHS = ("tests/ops", "tests/test_gpu_path.py")  # the kernels alone, and the pipeline from photos to pictures
 GPU_MARKER = "gpu"  # the marker that pyproject.toml declares
-# pyproject.toml asks for strict settings; these are not strict, because a GPU machine may lack pytest's plugins.
-PYTEST_OVERRIDES = ("-o", "addopts=--import-mode=importlib", "-p", "no:cacheprovider")
+# pyproject.toml asks for strict settings; these are not strict, because a GPU machine may lack pytest's plugins. It may
+# also lack other packages, so files that cannot be imported do not stop the others.
+PYTEST_OVERRIDES = (
+    "-o", "addopts=--import-mode=importlib", "-p", "no:cacheprovider", "--continue-on-collection-errors",
+)  # fmt: skip
 _TEST_LINE = re.compile(r"(\S+\.py)::.* (PASSED|FAILED|ERROR|SKIPPED|XFAIL|XPASS)(?: \(.*\))?\s+\[ *\d+%\]\s*")
 _OUTCOME_LABELS = {"PASSED": "passed", "FAILED": "failed", "ERROR": "errors", "SKIPPED": "skipped", "XFAIL": "xfailed"}
 _FAILED_OUTCOMES = ("FAILED", "ERROR")

@@ -28,10 +28,9 @@ import struct
 import zlib
 
 import numpy as np
-import zstandard
 
 from hyrfpack.choices import SPZ_VERSIONS
-from hyrfpack.errors import HyrfDataError
+from hyrfpack.errors import HyrfDataError, needs_package
 from hyrfpack.parallel.pool import run_tasks
 from hyrfpack.splats.formats.hints import NO_HINTS, Hints
 from hyrfpack.splats.formats.smallest_three import drop_largest, restore_largest
@@ -113,6 +112,9 @@ def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
     if version == 3:
         header = _HEADER_STRUCT.pack(_MAGIC, version, len(splats), splats.degree, bits, flags, 0)
         return _compress_gzip([header, *contents])
+    with needs_package(f"writing .spz files of version {version}"):
+        import zstandard
+
     contents = [content for content in contents if content]
     header = _HEADER_STRUCT.pack(_MAGIC, version, len(splats), splats.degree, bits, flags, len(contents))
     streams = [zstandard.ZstdCompressor(level=9).compress(content) for content in contents]
@@ -311,6 +313,9 @@ def _decompress_zstd(stream: bytes, length: int, name: str) -> bytes:
     """Decompress a zstd stream of exactly `length` bytes, without unpacking more than one byte beyond these."""
     if not length:
         return b""
+    with needs_package(f"{name}: reading .spz files of version 4"):
+        import zstandard
+
     try:
         with zstandard.ZstdDecompressor(max_window_size=1 << 27).stream_reader(stream) as reader:
             content = reader.read(length + 1)

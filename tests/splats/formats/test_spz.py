@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import struct
+import sys
 import tracemalloc
 import zlib
 
@@ -13,7 +14,7 @@ import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hyrfpack.errors import HyrfDataError
+from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.splats.formats import compressed_ply, spz
 from hyrfpack.splats.formats.hints import Hints
 from hyrfpack.splats.splats import Splats, normalized_quats
@@ -159,6 +160,17 @@ def test_encoding_is_deterministic_and_stores_no_time():
     assert data[:10] == b"\x1f\x8b\x08\0\0\0\0\0\0\xff"
     assert data == spz.encode(make_splats(50), older)
     assert spz.encode(make_splats(50)) == spz.encode(make_splats(50))
+
+
+def test_only_version_4_needs_zstandard(monkeypatch):
+    splats = make_splats(3)
+    version_3, version_4 = (spz.encode(splats, Hints(spz_version=version)) for version in (3, 4))
+    monkeypatch.setitem(sys.modules, "zstandard", None)
+    assert spz.encode(splats, Hints(spz_version=3)) == version_3
+    assert len(spz.decode(version_3, "a.spz")) == 3
+    for call in (lambda: spz.encode(splats, Hints(spz_version=4)), lambda: spz.decode(version_4, "a.spz")):
+        with pytest.raises(HyrfError, match="pip install zstandard"):
+            call()
 
 
 def test_version_4_is_the_default():
