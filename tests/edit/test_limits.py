@@ -12,28 +12,16 @@ from commands import hyrfpack, refused, succeeded
 from scenes import QUIET_CONTEXT
 
 from hyrfpack.config.edit import Background, CropSphere, EditLimits, MinOpacity, Scale, Translate
-from hyrfpack.data import load_scene
 from hyrfpack.edit import edit_model, plan_edit
 from hyrfpack.edit.masked_views import mask_view
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import evaluate_model
 from hyrfpack.format import describe_file, load_model
 from hyrfpack.render import render_view
-from hyrfpack.scene import Scene
-from tools.safety.train_golden import DEMO_MODEL_FILE, write_demo_photos
+from tools.safety.train_golden import DEMO_MODEL_FILE
 
 COMPACT_FILE = DEMO_MODEL_FILE.with_name("demo_compact.hyrf")
 BALL = CropSphere((0.0, 0.0, 0.0), 1.0)
-
-
-@pytest.fixture(scope="module")
-def photos(tmp_path_factory) -> Path:
-    return write_demo_photos(tmp_path_factory.mktemp("demo"))
-
-
-@pytest.fixture(scope="module")
-def scene(photos) -> Scene:
-    return load_scene(photos)
 
 
 def test_an_edited_model_fills_a_target_size(tmp_path):

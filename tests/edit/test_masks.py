@@ -12,27 +12,16 @@ from PIL import Image
 from scenes import QUIET_CONTEXT, ring, small_model
 
 from hyrfpack.config.edit import CropMasks, CropSphere, Remove, Scale, Translate
-from hyrfpack.data import load_scene
 from hyrfpack.edit import plan_edit
 from hyrfpack.edit.masks import share_of_light_in_masks
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import load_model
 from hyrfpack.ops.rasterize import rasterize
 from hyrfpack.render import RenderSettings
-from hyrfpack.scene import Picture, Scene, View
-from tools.safety.train_golden import DEMO_MODEL_FILE, write_demo_photos
+from hyrfpack.scene import Picture, View
+from tools.safety.train_golden import DEMO_MODEL_FILE
 
 OBJECT_CENTER, OBJECT_RADIUS = (0.0, 0.0, 0.0), 1.0
-
-
-@pytest.fixture(scope="module")
-def photos(tmp_path_factory) -> Path:
-    return write_demo_photos(tmp_path_factory.mktemp("demo"))
-
-
-@pytest.fixture(scope="module")
-def scene(photos) -> Scene:
-    return load_scene(photos)
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,6 @@ from commands import hyrfpack, refused, succeeded
 from scenes import QUIET_CONTEXT
 
 from hyrfpack.config.edit import CropBox, CropSphere, Refit, Remove, Scale, Translate
-from hyrfpack.data import load_scene
 from hyrfpack.edit import edit_model, merge_models, plan_edit
 from hyrfpack.edit.refit import refit, score_region
 from hyrfpack.errors import HyrfError
@@ -22,21 +21,11 @@ from hyrfpack.format import load_model, save_model
 from hyrfpack.format.codec import load_with_provenance
 from hyrfpack.model import HybridModel
 from hyrfpack.model.exposure import apply_exposure_gains
-from hyrfpack.scene import Scene, View
-from tools.safety.train_golden import DEMO_MODEL_FILE, write_demo_photos
+from hyrfpack.scene import View
+from tools.safety.train_golden import DEMO_MODEL_FILE
 
 BALL = CropSphere((0.0, 0.0, 0.0), 1.0)
 STEPS, REPAIR_STEPS = 60, 150
-
-
-@pytest.fixture(scope="module")
-def photos(tmp_path_factory) -> Path:
-    return write_demo_photos(tmp_path_factory.mktemp("demo"))
-
-
-@pytest.fixture(scope="module")
-def scene(photos) -> Scene:
-    return load_scene(photos)
 
 
 @pytest.fixture(scope="module")
