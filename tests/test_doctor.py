@@ -17,12 +17,14 @@ from hyrfpack.doctor import COMPUTING_PACKAGES, diagnose_machine
 from hyrfpack.self_test import SelfTest, run_self_test
 from hyrfpack.version import __version__
 
-BROKEN = SelfTest("cpu", "cpu", ({"item": "mlp", "operation": "mlp", "status": "failed", "note": "outputs is NaN"},))
+BROKEN_MLP_TEST = SelfTest(
+    "cpu", "cpu", ({"item": "mlp", "operation": "mlp", "status": "failed", "note": "outputs is NaN"},)
+)
 
 
 @pytest.fixture
 def broken_kernels(monkeypatch):
-    monkeypatch.setattr("hyrfpack.self_test.run_self_test", lambda implementation, device: BROKEN)
+    monkeypatch.setattr("hyrfpack.self_test.run_self_test", lambda implementation, device: BROKEN_MLP_TEST)
 
 
 def test_the_report_has_the_versions_that_are_installed():
@@ -35,7 +37,7 @@ def test_the_report_has_the_versions_that_are_installed():
 
 def test_json_is_the_whole_report(broken_kernels):
     found = json.loads(succeeded("doctor", "--json", "--device", "cpu").stdout)
-    assert found["self_test"]["rows"] == list(BROKEN.rows)
+    assert found["self_test"]["rows"] == list(BROKEN_MLP_TEST.rows)
     assert "kernels of mlp: outputs is NaN" in found["problems"]
 
 
@@ -89,7 +91,7 @@ def test_a_text_that_names_no_device_is_refused():
 
 def test_a_gpu_is_described_and_its_result_stored(monkeypatch, tmp_path):
     stored = []
-    monkeypatch.setattr("hyrfpack.self_test.run_self_test", lambda *_: replace(BROKEN, implementation="gpu"))
+    monkeypatch.setattr("hyrfpack.self_test.run_self_test", lambda *_: replace(BROKEN_MLP_TEST, implementation="gpu"))
     monkeypatch.setattr("hyrfpack.self_test.store_self_test", lambda test, device: stored.append(test.implementation))
     with use_fake_gpu():
         output = succeeded("doctor", "--device", "cuda").stdout

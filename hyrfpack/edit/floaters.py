@@ -113,12 +113,16 @@ def _supported_shares(
     return shares.detach()[:, 0].numpy()
 
 
+@torch.no_grad()
 def _mean_light(model: HybridModel, views: Sequence[View], settings: RenderSettings) -> Tensor:
     """Return the light (N, 1) of the Gaussians in pixels, the mean of all views."""
-    light = torch.zeros((1, len(model)))
+    gaussians = model.decode_geometry().at(model.gaussians.positions)
+    raster_settings = settings.raster_settings(model.config.antialiased)
+    light = gaussians.means.new_zeros((1, len(model)))
     for view in views:
-        everywhere = torch.ones((1, view.camera.height, view.camera.width))
-        light += measure_light(model, view.camera, everywhere, settings) / len(views)
+        viewport = model.config.frame.local_viewport(view.camera, gaussians.means.dtype)
+        everywhere = light.new_ones((1, view.camera.height, view.camera.width))
+        light += measure_light(gaussians, viewport, everywhere, raster_settings) / len(views)
     return light.T
 
 

@@ -32,13 +32,15 @@ def share_of_light_in_masks(
     Returns:
         (N,) float64 in [0, 1]; 0 for a Gaussian that no photo shows.
     """
-    settings = RenderSettings()
-    light = torch.zeros((2, len(model)), dtype=torch.float64, device=model.gaussians.positions.device)
+    gaussians = model.decode_geometry().at(model.gaussians.positions.detach())
+    settings = RenderSettings().raster_settings(model.config.antialiased)
+    light = gaussians.means.new_zeros((2, len(model)), dtype=torch.float64)
     for number, view in enumerate(views):
         progress(TaskEvent("comparing the model with masks", done=number, total=len(views)))
         mask = view.load().mask
         everywhere = light.new_ones((view.camera.height, view.camera.width), dtype=torch.float32)
         inside = torch.zeros_like(everywhere) if mask is None else torch.from_numpy(mask).to(everywhere)
-        light += measure_light(model, view.camera, torch.stack((inside, everywhere)), settings)
+        viewport = model.config.frame.local_viewport(view.camera, gaussians.means.dtype)
+        light += measure_light(gaussians, viewport, torch.stack((inside, everywhere)), settings)
     shown = light[1] >= MIN_LIGHT_PIXELS
     return torch.where(shown, light[0] / light[1].clamp_min(MIN_LIGHT_PIXELS), 0).clamp(0, 1).numpy(force=True)

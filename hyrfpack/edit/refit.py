@@ -23,7 +23,7 @@ from hyrfpack.data import PictureCache
 from hyrfpack.device import upload
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate.metrics import psnr, to_8bit
-from hyrfpack.model import HybridModel
+from hyrfpack.model import Geometry, HybridModel
 from hyrfpack.model.exposure import apply_exposure_gains
 from hyrfpack.ops.rasterize import rasterize
 from hyrfpack.ops.ssim import photometric_loss
@@ -68,7 +68,9 @@ def refit(
         HyrfError: no photo shows the selected Gaussians, a photo cannot be read, or the loss is not finite.
     """
     progress(TaskEvent("finding photos of the region", 0.0))
-    light = parallel_map(lambda view: float(region_share(model, is_selected, view.camera).sum()), views)
+    with torch.no_grad():
+        geometry = model.decode_geometry()
+    light = parallel_map(lambda view: float(region_share(model, geometry, is_selected, view.camera).sum()), views)
     shown = [view for view, pixels in zip(views, light, strict=True) if pixels >= MIN_REGION_PIXELS]
     if not shown:
         raise HyrfError(
@@ -111,15 +113,16 @@ def refit(
 
 
 @torch.no_grad()
-def region_share(model: HybridModel, is_selected: np.ndarray, camera: Camera) -> Tensor:
+def region_share(model: HybridModel, geometry: Geometry, is_selected: np.ndarray, camera: Camera) -> Tensor:
     """Return the share (H, W), in [0, 1], of each pixel's light that comes from selected Gaussians.
 
     Args:
         model: the model.
+        geometry: result of `model.decode_geometry()`.
         is_selected: (N,) bool, the Gaussians.
         camera: the camera, in world units.
     """
-    gaussians = model.decode_geometry().at(model.gaussians.positions)
+    gaussians = geometry.at(model.gaussians.positions)
     colors = torch.from_numpy(is_selected).to(gaussians.means)[:, None].expand(-1, 3).contiguous()
     viewport = model.config.frame.local_viewport(camera, gaussians.means.dtype)
     settings = RenderSettings().raster_settings(model.config.antialiased)
@@ -140,18 +143,18 @@ def score_region(models: Sequence[HybridModel], is_selected: np.ndarray, views: 
     Returns:
         PSNR of each model; None if no photo shows the region.
     """
-    decoded = [model.decode() for model in models]
+    pairs = [(model, model.decode()) for model in models]
     solid = np.array(models[0].config.solid, np.float32)
     scores = []
     for view in views:
-        shares = torch.stack([region_share(model, is_selected, view.camera) for model in models])
+        shares = torch.stack(
+            [region_share(model, decoded.geometry, is_selected, view.camera) for model, decoded in pairs]
+        )
         photo, mask = upload(view.load(), solid, shares.device)
         counted = shares.amax(0) > MIN_REGION_SHARE
         if mask is not None:
             counted &= mask
         if counted.any():
-            renders = [
-                render_view(model, view.camera, decoded=each).rgb for model, each in zip(models, decoded, strict=True)
-            ]
+            renders = [render_view(model, view.camera, decoded=decoded).rgb for model, decoded in pairs]
             scores.append([psnr(to_8bit(rgb), photo, counted) for rgb in renders])
     return [statistics.fmean(each) for each in zip(*scores, strict=True)] if scores else None

@@ -26,9 +26,9 @@ Inputs = Mapping[str, Tensor]
 # Widths of a decoder's hidden layers, and the levels of a hash grid; those of a trained model are as wide.
 HIDDEN_WIDTH = 64
 LOG2_TABLE_SIZE = 9
-RESOLUTIONS = level_resolutions(4, 4, 40)
-WIDTH, HEIGHT = 37, 33  # pixels: 3 x 3 tiles, with parts of a tile at the edges
-STRIDE = 2
+GRID_RESOLUTIONS = level_resolutions(4, 4, 40)
+IMAGE_WIDTH, IMAGE_HEIGHT = 37, 33  # pixels: 3 x 3 tiles, with parts of a tile at the edges
+BACKGROUND_STRIDE = 2
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ def _uniform(seed: int, *shape: int) -> Tensor:
 def _viewport() -> Viewport:
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, 3] = torch.tensor([0.1, -0.05, 4.0])
-    return Viewport(pose, (30.0, 32.0, 0.45 * WIDTH, 0.55 * HEIGHT), WIDTH, HEIGHT)
+    return Viewport(pose, (30.0, 32.0, 0.45 * IMAGE_WIDTH, 0.55 * IMAGE_HEIGHT), IMAGE_WIDTH, IMAGE_HEIGHT)
 
 
 def _layers(widths: tuple[int, ...], seed: int) -> dict[str, Tensor]:
@@ -118,10 +118,10 @@ def _split_layers(inputs: Inputs) -> tuple[list[Tensor], list[Tensor]]:
 def _hash_encode() -> SelfTestCase:
     # Coordinates have 16 bits, so that a point has the same cell and offset in every precision.
     coords = torch.randint(0, 1 << 16, (700, 3), generator=torch.Generator().manual_seed(0)) / (1 << 16)
-    table = _normal(1, level_offsets(RESOLUTIONS, LOG2_TABLE_SIZE)[-1], 2)
+    table = _normal(1, level_offsets(GRID_RESOLUTIONS, LOG2_TABLE_SIZE)[-1], 2)
 
     def run(implementation: str, x: Inputs) -> dict[str, Tensor]:
-        encoded = hash_encode(x["coords"], x["table"], RESOLUTIONS, LOG2_TABLE_SIZE, implementation=implementation)
+        encoded = hash_encode(x["coords"], x["table"], GRID_RESOLUTIONS, LOG2_TABLE_SIZE, implementation=implementation)
         return {"features": encoded}
 
     return SelfTestCase("hash_encode", {"coords": coords, "table": table}, run, ("coords", "table"), True)
@@ -234,18 +234,25 @@ def _rasterize_shaded(mixed: bool) -> SelfTestCase:
 
 
 def _background(needs_grad: bool) -> SelfTestCase:
-    features = 2 * len(RESOLUTIONS) + DIRECTION_FEATURES["frequency"]
-    table = _normal(30, level_offsets(RESOLUTIONS, LOG2_TABLE_SIZE)[-1], 2)
+    features = 2 * len(GRID_RESOLUTIONS) + DIRECTION_FEATURES["frequency"]
+    table = _normal(30, level_offsets(GRID_RESOLUTIONS, LOG2_TABLE_SIZE)[-1], 2)
     # Light passes in stripes, at a distance from the threshold.
-    light = torch.where(torch.arange(HEIGHT * WIDTH).view(HEIGHT, WIDTH) // 100 % 2 == 0, 0.9, 0.1)
+    light = torch.where(
+        torch.arange(IMAGE_HEIGHT * IMAGE_WIDTH).view(IMAGE_HEIGHT, IMAGE_WIDTH) // 100 % 2 == 0, 0.9, 0.1
+    )
     parameters = {"table": table} | _layers((features, HIDDEN_WIDTH, HIDDEN_WIDTH, 3), 31)
 
     def run(implementation: str, x: Inputs) -> dict[str, Tensor]:
         field = BackgroundField(
-            (1.0, 1.0, 1.0), x["table"], RESOLUTIONS, LOG2_TABLE_SIZE, *_split_layers(x), "frequency", False
+            (1.0, 1.0, 1.0), x["table"], GRID_RESOLUTIONS, LOG2_TABLE_SIZE, *_split_layers(x), "frequency", False
         )
         grid = background_grid(
-            x["transmittance"], _viewport(), field, threshold=0.5, stride=STRIDE, implementation=implementation
+            x["transmittance"],
+            _viewport(),
+            field,
+            threshold=0.5,
+            stride=BACKGROUND_STRIDE,
+            implementation=implementation,
         )
         return {"grid": grid}
 
@@ -255,20 +262,24 @@ def _background(needs_grad: bool) -> SelfTestCase:
 
 
 def _composite() -> SelfTestCase:
-    inputs = {"rgb": _uniform(0, HEIGHT, WIDTH, 3), "transmittance": _uniform(1, HEIGHT, WIDTH)}
-    inputs["grid"] = _uniform(2, *grid_size(HEIGHT, WIDTH, STRIDE), 3)
+    inputs = {"rgb": _uniform(0, IMAGE_HEIGHT, IMAGE_WIDTH, 3), "transmittance": _uniform(1, IMAGE_HEIGHT, IMAGE_WIDTH)}
+    inputs["grid"] = _uniform(2, *grid_size(IMAGE_HEIGHT, IMAGE_WIDTH, BACKGROUND_STRIDE), 3)
 
     def run(implementation: str, x: Inputs) -> dict[str, Tensor]:
-        return {"image": composite(x["rgb"], x["transmittance"], x["grid"], STRIDE, implementation=implementation)}
+        return {
+            "image": composite(
+                x["rgb"], x["transmittance"], x["grid"], BACKGROUND_STRIDE, implementation=implementation
+            )
+        }
 
     return SelfTestCase("composite", inputs, run, tuple(inputs), True)
 
 
 def _loss(masked: bool) -> SelfTestCase:
-    target = _uniform(0, HEIGHT, WIDTH, 3)
-    inputs = {"image": (target + 0.1 * _normal(1, HEIGHT, WIDTH, 3)).clamp(0, 1), "target": target}
+    target = _uniform(0, IMAGE_HEIGHT, IMAGE_WIDTH, 3)
+    inputs = {"image": (target + 0.1 * _normal(1, IMAGE_HEIGHT, IMAGE_WIDTH, 3)).clamp(0, 1), "target": target}
     if masked:
-        inputs["mask"] = _uniform(2, HEIGHT, WIDTH) < 0.7
+        inputs["mask"] = _uniform(2, IMAGE_HEIGHT, IMAGE_WIDTH) < 0.7
 
     def run(implementation: str, x: Inputs) -> dict[str, Tensor]:
         return {"loss": photometric_loss(x["image"], x["target"], x.get("mask"), implementation=implementation)}

@@ -21,13 +21,13 @@ from hyrfpack.render import render_view
 from tools.safety.train_golden import DEMO_MODEL_FILE
 
 COMPACT_FILE = DEMO_MODEL_FILE.with_name("demo_compact.hyrf")
-BALL = CropSphere((0.0, 0.0, 0.0), 1.0)
+CENTER_BALL = CropSphere((0.0, 0.0, 0.0), 1.0)
 
 
 def test_an_edited_model_fills_a_target_size(tmp_path):
-    free = edit_model(DEMO_MODEL_FILE, tmp_path / "free.hyrf", [BALL], profile="compact", context=QUIET_CONTEXT)
+    free = edit_model(DEMO_MODEL_FILE, tmp_path / "free.hyrf", [CENTER_BALL], profile="compact", context=QUIET_CONTEXT)
     limits = EditLimits(target_bytes=free.bytes_after * 2 // 3)
-    report = edit_model(DEMO_MODEL_FILE, tmp_path / "small.hyrf", [BALL], limits=limits, context=QUIET_CONTEXT)
+    report = edit_model(DEMO_MODEL_FILE, tmp_path / "small.hyrf", [CENTER_BALL], limits=limits, context=QUIET_CONTEXT)
     assert report.profile == "compact" and str(limits.target_bytes) in report.found.replace(",", "")
     assert 0.9 * limits.target_bytes < report.bytes_after <= limits.target_bytes
     assert Path(report.file).stat().st_size == report.bytes_after
@@ -46,7 +46,7 @@ def test_a_file_that_fits_already_is_copied(tmp_path):
 @pytest.mark.parametrize("moves", [[], [Scale(2.0), Translate((1.0, 2.0, 3.0))]], ids=["in place", "moved"])
 def test_the_loss_is_that_of_the_pixels_that_the_edit_left(scene, tmp_path, moves):
     """The limit holds for the photos' pixels that the crop does not change."""
-    crop, drop = BALL, 0.3
+    crop, drop = CENTER_BALL, 0.3
     edit_model(DEMO_MODEL_FILE, tmp_path / "raw.hyrf", [crop], context=QUIET_CONTEXT)
     limits = EditLimits(max_psnr_drop=drop)
     report = edit_model(

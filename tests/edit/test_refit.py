@@ -24,7 +24,7 @@ from hyrfpack.model.exposure import apply_exposure_gains
 from hyrfpack.scene import View
 from tools.safety.train_golden import DEMO_MODEL_FILE
 
-BALL = CropSphere((0.0, 0.0, 0.0), 1.0)
+CENTER_BALL = CropSphere((0.0, 0.0, 0.0), 1.0)
 STEPS, REPAIR_STEPS = 60, 150
 
 
@@ -36,7 +36,7 @@ def model() -> HybridModel:
 @pytest.fixture(scope="module")
 def is_inside(model) -> np.ndarray:
     positions = model.config.frame.to_world(model.gaussians.positions.numpy())
-    return np.linalg.norm(positions - BALL.center, axis=1) <= BALL.radius
+    return np.linalg.norm(positions - CENTER_BALL.center, axis=1) <= CENTER_BALL.radius
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +58,7 @@ def damaged_file(damaged, tmp_path_factory) -> Path:
 def test_planted_damage_is_repaired_and_all_else_stays_bit_for_bit(scene, model, is_inside, damaged_file, tmp_path):
     assert 50 < is_inside.sum() < 0.7 * len(is_inside)
     report = edit_model(
-        damaged_file, tmp_path / "out.hyrf", [Refit(BALL, REPAIR_STEPS)], data=scene, context=QUIET_CONTEXT
+        damaged_file, tmp_path / "out.hyrf", [Refit(CENTER_BALL, REPAIR_STEPS)], data=scene, context=QUIET_CONTEXT
     )
     before, after = load_model(damaged_file), load_model(report.file)
     (step,) = report.actions
@@ -78,7 +78,7 @@ def test_planted_damage_is_repaired_and_all_else_stays_bit_for_bit(scene, model,
 def test_a_region_of_a_moved_scene_is_trained_on_the_moved_photos(scene, damaged_file):
     moves = [Scale(2.0), Translate((1.0, 2.0, 3.0))]
     region = Refit(CropSphere((1.0, 2.0, 3.0), 2.0), STEPS)
-    here = plan_edit(damaged_file, [Refit(BALL, STEPS)], data=scene, context=QUIET_CONTEXT).actions[-1]
+    here = plan_edit(damaged_file, [Refit(CENTER_BALL, STEPS)], data=scene, context=QUIET_CONTEXT).actions[-1]
     there = plan_edit(damaged_file, [*moves, region], data=scene, context=QUIET_CONTEXT).actions[-1]
     assert there.gaussians_trained == here.gaussians_trained
     assert there.region_psnr_after == pytest.approx(here.region_psnr_after, abs=0.3)
@@ -106,7 +106,7 @@ def test_photos_of_other_exposure_do_not_change_the_colours(scene, model, is_ins
 
 
 def test_the_outside_of_a_region_can_be_trained(scene, is_inside, damaged_file):
-    report = plan_edit(damaged_file, [Refit(Remove(BALL), 1)], data=scene, context=QUIET_CONTEXT)
+    report = plan_edit(damaged_file, [Refit(Remove(CENTER_BALL), 1)], data=scene, context=QUIET_CONTEXT)
     assert report.actions[0].gaussians_trained == (~is_inside).sum()
     assert report.actions[0].action.startswith("refit all but the sphere")
 
@@ -116,7 +116,7 @@ def test_a_region_without_gaussians_or_photos_is_refused(scene, model, damaged_f
     with pytest.raises(HyrfError, match="no Gaussian lies there"):
         plan_edit(damaged_file, [nowhere], data=scene, context=QUIET_CONTEXT)
     with pytest.raises(HyrfError, match="trained on photos, and there are none"):
-        plan_edit(damaged_file, [Refit(BALL)], context=QUIET_CONTEXT)
+        plan_edit(damaged_file, [Refit(CENTER_BALL)], context=QUIET_CONTEXT)
     hidden = copy.deepcopy(model)
     hidden.gaussians.positions[0] = torch.tensor([0.0, 0.0, 60.0])
     is_selected = np.arange(len(model)) == 0

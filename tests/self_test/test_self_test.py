@@ -19,8 +19,8 @@ from hyrfpack.self_test import run as self_test_run
 from hyrfpack.self_test.cases import self_test_cases
 from hyrfpack.self_test.check import check_case
 
-WORKER = Path(__file__).with_name("broken_worker.py")
-CPU = torch.device("cpu")
+BROKEN_WORKER_FILE = Path(__file__).with_name("broken_worker.py")
+CPU_DEVICE = torch.device("cpu")
 # Cases that the interpreter runs within a second.
 QUICK_CASES = ("contract", "encode_views, sh", "activate_geometry, sum", "shade", "composite", "adam_step")
 
@@ -33,10 +33,10 @@ def run_broken(broken: dict[str, str], cases: Sequence[str] = QUICK_CASES, **lim
     """Run some cases of the self-test in the interpreter, with some kernels broken."""
 
     def command(implementation: str, device: str, names: Sequence[str]) -> list[str]:
-        return [sys.executable, str(WORKER), json.dumps(broken), implementation, device, *names]
+        return [sys.executable, str(BROKEN_WORKER_FILE), json.dumps(broken), implementation, device, *names]
 
     with mock.patch.object(self_test_run, "self_test_cases", lambda: {name: ALL_CASES[name] for name in cases}):
-        return run_self_test("gpu", CPU, command, **limits)
+        return run_self_test("gpu", CPU_DEVICE, command, **limits)
 
 
 def test_every_gpu_operation_has_a_case() -> None:
@@ -48,7 +48,7 @@ def test_every_gpu_operation_has_a_case() -> None:
 @pytest.mark.parametrize("name", QUICK_CASES)
 def test_kernels_pass_with_errors_far_below_their_bounds(name: str) -> None:
     case = ALL_CASES[name]
-    row = check_case(case, "gpu", CPU)
+    row = check_case(case, "gpu", CPU_DEVICE)
     assert "status" not in row and row["value error"] < case.bounds[0] / 10
     assert ("gradient error" in row) == bool(case.gradient_inputs)
 
@@ -57,7 +57,7 @@ def test_kernels_pass_with_errors_far_below_their_bounds(name: str) -> None:
 @needs_interpreter
 @pytest.mark.acceptance
 def test_all_kernels_pass_in_a_child_process() -> None:
-    test = run_self_test("gpu", CPU)
+    test = run_self_test("gpu", CPU_DEVICE)
     assert test.problem is None and not test.failed_rows
     assert [row["item"] for row in test.rows] == list(ALL_CASES)
 
@@ -65,7 +65,7 @@ def test_all_kernels_pass_in_a_child_process() -> None:
 @pytest.mark.skipif(not has_numba(), reason="no numba")
 @pytest.mark.acceptance
 def test_all_cpu_kernels_pass_in_a_child_process() -> None:
-    test = run_self_test("cpu", CPU)
+    test = run_self_test("cpu", CPU_DEVICE)
     assert not test.failed_rows and len(test.rows) == sum(case.has_cpu_kernels for case in ALL_CASES.values())
 
 

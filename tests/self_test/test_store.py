@@ -20,7 +20,7 @@ from hyrfpack.self_test import SelfTest, load_or_run_self_test, store
 from hyrfpack.self_test.store import load_self_test, store_self_test
 
 pytestmark = needs_triton
-FAILED = SelfTest(
+FAILED_TEST = SelfTest(
     "gpu",
     "cuda:0",
     (
@@ -50,7 +50,7 @@ def runs(monkeypatch: pytest.MonkeyPatch) -> list[torch.device]:
 
     def run(implementation: str, device: torch.device) -> SelfTest:
         tested.append(device)
-        return FAILED
+        return FAILED_TEST
 
     monkeypatch.setattr(store, "run_self_test", run)
     return tested
@@ -116,9 +116,9 @@ def test_a_test_that_could_not_run_is_not_stored_and_replaces_nothing(gpu, monke
 
 @pytest.mark.parametrize("content", ["", "[]", '{"result": {}}', '{"result": {"rows": 3}}', "\xff"])
 def test_a_damaged_result_is_tested_again(gpu, runs, content):
-    store_self_test(FAILED, gpu)
+    store_self_test(FAILED_TEST, gpu)
     store._path(gpu).write_text(content, encoding="latin-1")
-    assert load_or_run_self_test(gpu) == FAILED and runs == [gpu]
+    assert load_or_run_self_test(gpu) == FAILED_TEST and runs == [gpu]
     assert json.loads(store._path(gpu).read_text())["key"]["device"] == "a GPU that is not there"
 
 

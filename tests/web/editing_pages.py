@@ -19,19 +19,19 @@ from hyrfpack.model import HybridModel
 from hyrfpack.scene import Camera
 from hyrfpack.web.html import encode_model_page
 
-TURN = (0.5, -0.5, 0.1, 0.7)  # a rotation of the frame, as an edit stores one
-FRAME = replace(MODEL_FRAME, rotation=tuple(np.array(TURN) / np.linalg.norm(TURN)))
+FRAME_ROTATION = (0.5, -0.5, 0.1, 0.7)  # a rotation of the frame, as an edit stores one
+TURNED_FRAME = replace(MODEL_FRAME, rotation=tuple(np.array(FRAME_ROTATION) / np.linalg.norm(FRAME_ROTATION)))
 
 
 def make_model(count: int = 600) -> HybridModel:
-    return random_model(count, frame=FRAME, background=False)
+    return random_model(count, frame=TURNED_FRAME, background=False)
 
 
 def make_ball_model(places: Sequence[Sequence[float]]) -> HybridModel:
     """Return a model of small opaque balls at places in world units."""
-    model = random_model(len(places), frame=FRAME, background=False)
+    model = random_model(len(places), frame=TURNED_FRAME, background=False)
     with torch.no_grad():
-        model.gaussians.positions.copy_(torch.from_numpy(FRAME.to_local(np.array(places))))
+        model.gaussians.positions.copy_(torch.from_numpy(TURNED_FRAME.to_local(np.array(places))))
         model.gaussians.opacity_logits.fill_(20)
         model.gaussians.scale_logits.fill_(-5)
     return model

@@ -18,16 +18,16 @@ from hyrfpack.model import Frame
 
 ROTATED_FRAME = replace(MODEL_FRAME, rotation=(0.5, -0.5, 0.1, 0.7))
 FAR_FRAME = Frame((512_000.0, 5_403_000.0, 310.0), 40.0, (1.0, 1.0, 0.4))
-BOX = {"option": "crop-box", "value": [7.1, -22.5, 2.0, 12.25, -18.0, 6.5]}
+CROP_BOX_ACTION = {"option": "crop-box", "value": [7.1, -22.5, 2.0, 12.25, -18.0, 6.5]}
 OTHER_BOX = {"option": "crop-box", "value": [9.0, -21.0, 4.0, 30.0, 30.0, 30.0], "isInverted": True}
 TURNED_BOX = {"option": "crop-box", "value": [-30.0, -6.0, -40.0, 40.0, 20.0, 40.0]}
 FAR_BOX = {"option": "crop-box", "value": [511_990.0, 5_402_980.5, 300.0, 512_031.0, 5_403_010.0, 330.0]}
 UP = {"option": "up", "value": [0.3, -0.8, 0.52]}
 CASES: dict[str, tuple[Frame, list[dict]]] = {
-    "a box": (MODEL_FRAME, [BOX]),
-    "a box in a rotated frame": (ROTATED_FRAME, [BOX]),
+    "a box": (MODEL_FRAME, [CROP_BOX_ACTION]),
+    "a box in a rotated frame": (ROTATED_FRAME, [CROP_BOX_ACTION]),
     "a box far from the origin": (FAR_FRAME, [FAR_BOX]),
-    "two boxes, one inverted": (MODEL_FRAME, [BOX, OTHER_BOX]),
+    "two boxes, one inverted": (MODEL_FRAME, [CROP_BOX_ACTION, OTHER_BOX]),
     "faint and large Gaussians": (
         MODEL_FRAME,
         [{"option": "min-opacity", "value": 0.6}, {"option": "max-scale", "value": 0.35}],

@@ -10,7 +10,6 @@ photos, over the pixels whose surface lies in the sphere; the model before the c
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,12 +21,11 @@ from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.config.edit import CropSphere
 from hyrfpack.edit.masked_views import mask_view
 from hyrfpack.evaluate import Evaluation
-from hyrfpack.format.run_folder import MODEL_FILE
 from hyrfpack.model import HybridModel
 from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.render.surface import render_median_depth
-from hyrfpack.scene import Camera, View
-from tools.studies.train_sets import DATA_FOLDER
+from hyrfpack.scene import Camera, Scene, View
+from tools.studies.trained_runs import load_runs, make_runs_parser
 from tools.tables import markdown_table
 
 MIN_PIXELS = 200  # Views that show less of the subject are left out.
@@ -70,9 +68,8 @@ def masked_views(views: list[View], masks: list[np.ndarray]) -> list[View]:
     return [mask_view(*pair) for pair in pairs]
 
 
-def measure(model_file: Path, name: str, share: float, data: Path) -> list[str]:
-    """Return the row of one set."""
-    scene = hyrfpack.load_scene(data / name)
+def measure(model_file: Path, scene: Scene, share: float) -> list[str]:
+    """Return the cells of one set, without its name and radius."""
     sphere = subject([view.camera for view in scene.train], share)
     with tempfile.TemporaryDirectory() as folder:
         cropped, before, after = (Path(folder) / f"{each}.hyrf" for each in ("cropped", "before", "after"))
@@ -82,7 +79,7 @@ def measure(model_file: Path, name: str, share: float, data: Path) -> list[str]:
         hyrfpack.compress_model(cropped, after, context=QUIET)
         model = hyrfpack.load_model(before).requires_grad_(False)
         views = masked_views(scene.test, [sphere.mask(model, view.camera) for view in scene.test])
-        cells = [name, f"{share:g}"]
+        cells: list[str] = []
         for path in (before, after):
             model = hyrfpack.load_model(path)
             scores = hyrfpack.evaluate_model(model, views)
@@ -95,16 +92,13 @@ def _format_scores(scores: Evaluation) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--runs", type=Path, required=True, help="folder of the sets' runs")
-    parser.add_argument("--data", type=Path, default=DATA_FOLDER, help="folder of the data sets")
+    parser = make_runs_parser(__doc__ or "")
     parser.add_argument("--crops", nargs="+", required=True, metavar="SET=RADIUS")
     arguments = parser.parse_args()
+    shares = {name: float(share) for name, share in (crop.split("=") for crop in arguments.crops)}
     rows = []
-    for crop in arguments.crops:
-        name, share = crop.split("=")
-        model_file = next(iter(sorted((arguments.runs / name).glob(f"**/{MODEL_FILE}"))))
-        rows.append(measure(model_file, name, float(share), arguments.data))
+    for name, model_file, scene in load_runs(arguments.runs, arguments.data, list(shares)):
+        rows.append([name, f"{shares[name]:g}", *measure(model_file, scene, shares[name])])
         print(rows[-1], flush=True)
     print(markdown_table(HEADER, rows))
 

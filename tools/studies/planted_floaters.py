@@ -14,9 +14,6 @@ removed. A trained model has floaters of its own, which lower the precision. Row
 
 from __future__ import annotations
 
-import argparse
-from pathlib import Path
-
 import numpy as np
 import torch
 
@@ -24,10 +21,10 @@ import hyrfpack
 from hyrfpack.config.edit import DEFAULT_MIN_OPACITY_SHARE
 from hyrfpack.edit.floaters import find_floaters
 from hyrfpack.edit.transform import replace_config
-from hyrfpack.format.run_folder import MODEL_FILE
 from hyrfpack.model import HybridModel
 from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.scene import Camera, evenly_spaced
+from tools.studies.trained_runs import load_runs, make_runs_parser
 from tools.tables import markdown_table
 
 PLANTING_VIEWS = 24
@@ -109,19 +106,15 @@ def _with_gaussians(model: HybridModel, parameters: list[torch.Tensor]) -> Hybri
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--runs", type=Path, required=True, help="folder of the sets' runs")
-    parser.add_argument("--data", type=Path, default=Path("../shared/data"), help="folder of the data sets")
+    parser = make_runs_parser(__doc__ or "")
     parser.add_argument("--sets", nargs="*", help="data sets (all below --runs)")
     parser.add_argument("--shares", type=float, nargs="+", default=[0, 0.05, 0.15], help="shares of planted Gaussians")
     parser.add_argument("--min-opacity-share", type=float, default=DEFAULT_MIN_OPACITY_SHARE)
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     rows = []
-    for name in arguments.sets or sorted(path.name for path in arguments.runs.iterdir()):
-        run = next(iter(sorted((arguments.runs / name).glob(f"**/{MODEL_FILE}"))))
+    for name, run, scene in load_runs(arguments.runs, arguments.data, arguments.sets):
         model = hyrfpack.load_model(run).requires_grad_(False)
-        scene = hyrfpack.load_scene(arguments.data / name)
         cameras = [view.camera for view in scene.train]
         psnr = hyrfpack.evaluate_model(_with_gaussians(model, _parameters(model)), scene.test).psnr
         for share in arguments.shares:

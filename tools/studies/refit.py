@@ -15,11 +15,9 @@ learning rates.
 
 from __future__ import annotations
 
-import argparse
 import copy
 import time
 from dataclasses import fields
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -29,8 +27,8 @@ from hyrfpack.cameras.capture import Capture
 from hyrfpack.config.edit import DEFAULT_REFIT_STEPS
 from hyrfpack.config.train import LearningRates
 from hyrfpack.edit.refit import REFIT_RATES, refit, score_region
-from hyrfpack.format.run_folder import MODEL_FILE
 from hyrfpack.model import HybridModel
+from tools.studies.trained_runs import load_runs, make_runs_parser
 from tools.tables import markdown_table
 
 REGION_SHARE = 0.1
@@ -81,9 +79,7 @@ def scale_rates(rates: LearningRates, factor: float) -> LearningRates:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--runs", type=Path, required=True, help="folder of the sets' runs")
-    parser.add_argument("--data", type=Path, default=Path("../shared/data"), help="folder of the data sets")
+    parser = make_runs_parser(__doc__ or "")
     parser.add_argument("--sets", nargs="*", help="data sets (all below --runs)")
     parser.add_argument("--kinds", nargs="+", choices=SHUFFLED_NAMES, default=list(SHUFFLED_NAMES))
     parser.add_argument("--steps", type=int, nargs="+", default=[DEFAULT_REFIT_STEPS])
@@ -92,10 +88,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     rows = []
-    for name in arguments.sets or sorted(path.name for path in arguments.runs.iterdir()):
-        run = next(iter(sorted((arguments.runs / name).glob(f"**/{MODEL_FILE}"))))
+    for name, run, scene in load_runs(arguments.runs, arguments.data, arguments.sets):
         model = hyrfpack.load_model(run).requires_grad_(False)
-        scene = hyrfpack.load_scene(arguments.data / name)
         validation = scene.train[::VALIDATION_INTERVAL]
         scored = scene.test if arguments.held_out else validation
         trained = [view for view in scene.train if arguments.held_out or view not in validation]

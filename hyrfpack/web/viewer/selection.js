@@ -18,7 +18,7 @@ export async function measureGaussians(bytes) {
 export function selectGaussians(selections, positions, measures) {
   const count = positions.length / 3, kept = new Uint8Array(count).fill(1);
   const counts = selections.map((selection) => {
-    const keeps = keeperOf(selection, positions, measures);
+    const keeps = predicateOf(selection, positions, measures);
     let left = 0;
     for (let i = 0; i < count; i++) left += kept[i] &&= keeps(i) ? 1 : 0;
     return left;
@@ -26,8 +26,8 @@ export function selectGaussians(selections, positions, measures) {
   return { kept, counts };
 }
 
-// Returns a function that tells whether a selection keeps the Gaussian with an index.
-function keeperOf({ rows, low, high, isInverted, minOpacity, maxLength }, positions, measures) {
+// Returns the predicate of a selection: a function of a Gaussian's index, true if the selection keeps that Gaussian.
+function predicateOf({ rows, low, high, isInverted, minOpacity, maxLength }, positions, measures) {
   if (minOpacity !== undefined) return (i) => measures.opacities[i] >= minOpacity;
   if (maxLength !== undefined) return (i) => measures.lengths[i] <= maxLength;
   const isInside = (i) =>
