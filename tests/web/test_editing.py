@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from web.editing_pages import (
-    FRAME,
+    TURNED_FRAME,
     catch_downloads,
     click,
     fill,
@@ -123,7 +123,7 @@ def test_arrow_keys_move_the_face_whose_handle_has_the_focus(browser: Browser, t
     browser.press("ArrowLeft")
     browser.press("ArrowRight", shift=True)
     after = list_actions(browser)[0]["value"]
-    np.testing.assert_allclose(np.subtract(after, before), [0, 0.09 * FRAME.scale, 0, 0, 0, 0], atol=2e-4)
+    np.testing.assert_allclose(np.subtract(after, before), [0, 0.09 * TURNED_FRAME.scale, 0, 0, 0, 0], atol=2e-4)
     assert np.array_equal(window_camera(browser).camera_from_world, camera.camera_from_world)
 
 
@@ -160,11 +160,11 @@ def test_the_picture_equals_that_of_the_gaussians_that_are_left(browser: Browser
     count = wait_until_applied(browser)
 
     actions = {action["option"]: action["value"] for action in list_actions(browser)}
-    positions = FRAME.to_world(model.gaussians.positions.detach().numpy())
+    positions = TURNED_FRAME.to_world(model.gaussians.positions.detach().numpy())
     decoded = model.decode_geometry()
     kept = (positions >= (5, -24, 1)).all(1) & (positions <= (12, -17, 9)).all(1)
     kept &= decoded.opacities.detach().numpy() >= actions["min-opacity"]
-    kept &= decoded.scales.detach().numpy().max(1) * FRAME.scale <= actions["max-scale"]
+    kept &= decoded.scales.detach().numpy().max(1) * TURNED_FRAME.scale <= actions["max-scale"]
     assert count == kept.sum() and 100 < count < 2000
     assert read_text(browser, "edit-count") == f"{count:,} of 2,600 Gaussians"
     rest = model.subset(torch.from_numpy(np.flatnonzero(kept)))
@@ -208,7 +208,7 @@ def test_a_saved_file_holds_the_gaussians_that_the_picture_shows(browser: Browse
 
     (tmp_path / "saved.hyrf").write_bytes(read_saved_bytes(browser))
     saved = load_model(tmp_path / "saved.hyrf")
-    positions = FRAME.to_world(model.gaussians.positions.detach().numpy())
+    positions = TURNED_FRAME.to_world(model.gaussians.positions.detach().numpy())
     inside = ((positions >= action["value"][:3]) & (positions <= action["value"][3:])).all(1)
     assert len(saved) == count == inside.sum() and 0 < count < len(model)
     np.testing.assert_array_equal(saved.gaussians.positions, model.gaussians.positions.detach()[inside])
@@ -273,7 +273,9 @@ def test_keys_alone_pick_the_centre_of_the_picture(browser: Browser, tmp_path: P
     browser.evaluate("document.querySelector('[data-pane=measure] .edit-pick').focus()")
     browser.press("Enter")
     (point,) = browser.evaluate("hyrfpack.editor.tool.picker.points")
-    np.testing.assert_allclose(FRAME.to_world(np.array([point]))[0], SCENE_CENTER, atol=0.05 * FRAME.scale)
+    np.testing.assert_allclose(
+        TURNED_FRAME.to_world(np.array([point]))[0], SCENE_CENTER, atol=0.05 * TURNED_FRAME.scale
+    )
 
 
 # ---- views
