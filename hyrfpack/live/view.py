@@ -10,6 +10,7 @@ from time import monotonic
 
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import encode_model
+from hyrfpack.scene import Scene
 from hyrfpack.train import Trainer
 from hyrfpack.train.provenance import training_provenance
 from hyrfpack.web.player import encode_player
@@ -27,15 +28,17 @@ MIN_INTERVAL_RATIO = 40.0
 
 
 class LiveView:
-    """Observer of `hyrfpack.train_model` that takes snapshots of the model in training.
+    """Observer of `hyrfpack.train_model` that takes snapshots of the model in training, and of models of pilot runs.
 
     A snapshot is a `.hyrf` file in memory with profile "raw", which is the fastest to write. Snapshots are taken after
-    the first and the last step, and in between at intervals of at least MIN_INTERVAL_SECONDS and MIN_INTERVAL_RATIO.
+    the very first step and the last step of the training, and in between at intervals of at least MIN_INTERVAL_SECONDS
+    and MIN_INTERVAL_RATIO.
     The model is only read, so training with a live view gives the same model, bit by bit, as training without.
 
     Attributes:
         scene: the newest snapshot.
-        updates: JSON with the number of the newest snapshot (0 if there is none), its step, and the number of steps.
+        updates: JSON with the number of the newest snapshot (0 if there is none), its step, the number of steps, and
+            whether it is of a pilot run.
 
     Example:
         >>> view = LiveView()
@@ -49,11 +52,12 @@ class LiveView:
             clock: returns the current time in seconds.
         """
         self.scene = MemoryFile(b"")
-        self.updates = MemoryFile(_encode_progress(0, 0, 0))
+        self.updates = MemoryFile(_encode_progress(0, 0, 0, False))
         self._clock = clock
         self._count = 0
         self._next = 0.0  # earliest time of the next snapshot, in seconds of the clock
-        self._capture: dict | None = None
+        self._scene: Scene | None = None  # the scene of `_capture`; pilot runs have fewer photos than the main run
+        self._capture: dict = {}
 
     def observe(self, trainer: Trainer) -> None:
         """Take a snapshot if one is due; called after each step.
@@ -61,17 +65,18 @@ class LiveView:
         A model that cannot be written, such as one with non-finite numbers, is skipped: the trainer reports it.
         """
         started = self._clock()
-        if self._count and started < self._next and trainer.step < trainer.steps:
+        is_last = trainer.step == trainer.steps and not trainer.is_pilot
+        if self._count and started < self._next and not is_last:
             return
-        if self._capture is None:
-            self._capture = training_provenance(trainer.scene)
+        if trainer.scene is not self._scene:
+            self._scene, self._capture = trainer.scene, training_provenance(trainer.scene)
         try:
             data = encode_model(trainer.model, "raw", {"steps": trainer.step, **self._capture})
         except HyrfError:
             return
         self._count += 1
         self.scene.replace(data)
-        self.updates.replace(_encode_progress(self._count, trainer.step, trainer.steps))
+        self.updates.replace(_encode_progress(self._count, trainer.step, trainer.steps, trainer.is_pilot))
         now = self._clock()
         self._next = now + max(MIN_INTERVAL_SECONDS, MIN_INTERVAL_RATIO * (now - started))
 
@@ -98,5 +103,5 @@ def live_view(title: str, *, port: int = 0) -> Iterator[LiveView]:
         yield view
 
 
-def _encode_progress(snapshot: int, step: int, steps: int) -> bytes:
-    return json.dumps({"snapshot": snapshot, "step": step, "steps": steps}).encode()
+def _encode_progress(snapshot: int, step: int, steps: int, is_pilot: bool) -> bytes:
+    return json.dumps({"snapshot": snapshot, "step": step, "steps": steps, "pilot": is_pilot}).encode()

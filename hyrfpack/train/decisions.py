@@ -20,6 +20,7 @@ from hyrfpack.train.exposure_pilots import (
 )
 from hyrfpack.train.length_pilots import measure_length, pilot_lengths
 from hyrfpack.train.pilots import MIN_TRAINING_VIEWS, PilotScore, PilotsStopped, ScenePilots
+from hyrfpack.train.trainer import Trainer
 
 # Shorter runs have no pilots, which would take too large a part of their time.
 MIN_BUDGET_STEPS = 2_000
@@ -111,11 +112,12 @@ def decide(
     device: torch.device,
     progress: Progress = ignore_progress,
     stop: Callable[[], bool] = lambda: False,
+    observer: Callable[[Trainer], None] | None = None,
 ) -> Decisions | None:
     """Decide by pilot runs what the settings leave open: first exposure compensation, then the budget, then the length.
 
     Args:
-        scene, config, cache, device, progress, stop: see `ScenePilots`.
+        scene, config, cache, device, progress, stop, observer: see `ScenePilots`.
 
     Returns:
         The decisions; None if `stop` ended the pilots.
@@ -124,7 +126,7 @@ def decide(
         HyrfError: as `Trainer.run`; a photo cannot be read.
     """
     decided = without_pilots(config).config
-    pilots = ScenePilots(scene, decided, cache, device, progress, stop, max_pilot_steps(scene, config))
+    pilots = ScenePilots(scene, decided, cache, device, progress, stop, max_pilot_steps(scene, config), observer)
     reasons: dict[str, str] = {}
     try:
         if measures_exposure(scene, config):

@@ -84,6 +84,7 @@ class ScenePilots:
         progress: Progress = ignore_progress,
         stop: Callable[[], bool] = lambda: False,
         max_steps: int = 0,
+        observer: Callable[[Trainer], None] | None = None,
     ) -> None:
         """Start without any scores.
 
@@ -95,9 +96,11 @@ class ScenePilots:
             progress: called with `TaskEvent`s, which have the number of steps, photos or views done, and that of all.
             stop: called after each step; True ends the pilots.
             max_steps: most steps that all pilots take; if given, the events of steps have the share of them.
+            observer: called after each step with the trainer of the pilot.
         """
         self.scene, self.config, self.cache = scene, config, cache
         self._device, self._progress, self._stop, self._max_steps = device, progress, stop, max_steps
+        self._observer = observer
         self.scores: list[PilotScore] = []
         self.steps = 0
 
@@ -146,12 +149,15 @@ class ScenePilots:
         )
         self._progress(TaskEvent(f"{name}: reading photos"))
         trainer = Trainer(fold.scene, settings, self.cache, self._device)
+        trainer.is_pilot = True
         before = self.steps
 
         def report_step(event: StepEvent) -> None:
             self.steps = before + event.step
             share = min(1.0, self.steps / self._max_steps) if self._max_steps else None
             self._progress(TaskEvent(f"{name}: training", share, event.step, steps))
+            if self._observer is not None:
+                self._observer(trainer)
 
         trainer.run(progress=report_step, stop=self._stop)
         if self._stop():

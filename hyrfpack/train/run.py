@@ -86,8 +86,9 @@ def train_model(
             of an uninterrupted run.
         overwrite: replace an earlier run in the folder. Without it, nothing is replaced. If a file appears at a
             result's name during training, the result gets a free name beside it; `TrainResult.model` has the model's.
-        observer: called after each step with the trainer, whose model it may read and must not change. Of several
-            processes only rank 0 calls it. Its time does not count as training time.
+        observer: called after each step with the trainer, whose model it may read and must not change; after steps of
+            pilot runs, too, whose trainer has `is_pilot` set. Of several processes only rank 0 calls it. Its time does
+            not count as training time.
         log: a file that gets a line of JSON every few steps, and TensorBoard files beside it if that is installed; see
             `hyrfpack.train.log.TrainingLog`. A resumed run appends to it.
         context: device, processes, progress and stop. A run may be resumed on another device; on a GPU sums of
@@ -217,7 +218,8 @@ class _Run:
             _LOG.info(f"pilot runs, scored on validation photos, choose: {', '.join(labels)}")
         with catch_stop_signals(self.context.stop) as stop:
             # Every rank runs all pilots, so that no rank waits for another.
-            pilots = partial(decide, self.scene, self.config, self.cache, self.device, self.progress, stop)
+            observer = self.observer if self.ranks.is_main else None
+            pilots = partial(decide, self.scene, self.config, self.cache, self.device, self.progress, stop, observer)
             answers = self.ranks.all_gather(self.ranks.run_on_all(pilots))
         return None if None in answers else answers[0]
 

@@ -68,6 +68,7 @@ class Trainer:
 
     Attributes:
         steps: number of optimiser steps of the whole run.
+        is_pilot: whether this is a pilot run, see `hyrfpack.train.pilots`.
 
     Example:
         >>> trainer = Trainer(scene, TrainConfig(steps=2000))
@@ -114,6 +115,7 @@ class Trainer:
         )
         self.resolution = ResolutionSchedule(scene.train, self.steps, len(self.model), is_on=config.resolution_schedule)
         self.step = 0
+        self.is_pilot = False
         self.saved: int | None = None  # The step of the checkpoint on disk.
         self.records: list[dict] = []
         self.seconds: dict[str, float] = defaultdict(float)  # By stage, summed over all parts of a resumed run.

@@ -72,11 +72,29 @@ def test_training_with_a_live_view_gives_the_same_model_bit_by_bit(exposure, bac
     assert curves[0] == curves[1]
 
 
+def test_pilot_runs_are_shown_before_the_first_step_of_the_training(monkeypatch, tmp_path):
+    monkeypatch.setattr("hyrfpack.train.decisions.MIN_BUDGET_STEPS", 4)
+    monkeypatch.setattr("hyrfpack.train.budget_pilots.BUDGET_PILOT_STEPS", 1)
+    clock, shown = Clock(), []
+    view = LiveView(clock)
+
+    def observe(trainer: Trainer) -> None:
+        clock.now += 1e9  # makes a snapshot due after each step
+        view.observe(trainer)
+        shown.append(read_progress(view))
+
+    config = TrainConfig(steps=4, exposure=False)
+    scene = ball_scene(views=12, points=60, side=24)
+    train_model(scene, tmp_path / "run", config, context=QUIET_CONTEXT, observer=observe)
+    assert [progress["pilot"] for progress in shown] == [True] * (len(shown) - 4) + [False] * 4 and len(shown) > 4
+    assert [(progress["step"], progress["steps"]) for progress in shown[-4:]] == [(step, 4) for step in range(1, 5)]
+
+
 def test_a_snapshot_holds_the_model_of_its_step_and_the_cameras_of_the_photos():
     trainer, view = Trainer(make_scene(), TRAIN_CONFIG), LiveView(Clock())
     for wanted in (1, 40):
         trainer.run(progress=lambda _: view.observe(trainer), stop=lambda wanted=wanted: trainer.step == wanted)
-        assert read_progress(view) == {"snapshot": 1 if wanted == 1 else 2, "step": wanted, "steps": 40}
+        assert read_progress(view) == {"snapshot": 1 if wanted == 1 else 2, "step": wanted, "steps": 40, "pilot": False}
         shown = dict(decode_model(read_content(view.scene)).named_parameters())
         assert shown.keys() == dict(trainer.model.named_parameters()).keys()
         for name, parameter in trainer.model.named_parameters():
@@ -93,7 +111,7 @@ def test_a_snapshot_keeps_the_cameras_for_the_page_to_start_from(tmp_path):
 
 
 def fake_trainer(step: int, steps: int = 10_000) -> SimpleNamespace:
-    return SimpleNamespace(step=step, steps=steps, model=None, scene=None, exposures=None)
+    return SimpleNamespace(step=step, steps=steps, is_pilot=False, model=None, scene=None)
 
 
 @pytest.mark.parametrize(
@@ -149,10 +167,10 @@ def test_the_page_and_its_files_are_served_while_the_block_runs_and_not_after(ca
                 return answer.read()
 
         assert b"<title>a &lt;scene&gt;</title>" in fetched("")
-        assert json.loads(fetched("training.json")) == {"snapshot": 0, "step": 0, "steps": 0}
+        assert json.loads(fetched("training.json")) == {"snapshot": 0, "step": 0, "steps": 0, "pilot": False}
         trainer = Trainer(make_scene(), dataclasses.replace(TRAIN_CONFIG, steps=2))
         trainer.run(progress=lambda _: view.observe(trainer))
-        assert json.loads(fetched("training.json")) == {"snapshot": 2, "step": 2, "steps": 2}
+        assert json.loads(fetched("training.json")) == {"snapshot": 2, "step": 2, "steps": 2, "pilot": False}
         assert len(decode_model(fetched("scene.hyrf"))) == len(trainer.model)
     with pytest.raises(urllib.error.URLError):
         fetched("")
