@@ -23,7 +23,7 @@ from hyrfpack.evaluate.lpips import LPIPS
 from hyrfpack.evaluate.metrics import psnr, ssim, to_8bit
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.model import HybridModel
-from hyrfpack.model.merged import MergedModel
+from hyrfpack.model.merged import MergedModel, scene_of
 from hyrfpack.out_of_memory import explain_out_of_memory
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.progress import Progress, TaskEvent, ignore_progress
@@ -146,7 +146,7 @@ def evaluate_model(
     if isinstance(model, Drawable):
         solid, device, count = np.zeros(3, np.float32), model.device, len(model.positions)
     else:
-        scene, count = model.scene if isinstance(model, MergedModel) else model, len(model)
+        scene, count = scene_of(model), len(model)
         solid, device = np.array(scene.config.solid, dtype=np.float32), scene.gaussians.positions.device
     pictures_to_write = picture_names(views, picture_count)
 

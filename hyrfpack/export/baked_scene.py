@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import logging
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -12,10 +11,12 @@ import numpy as np
 from hyrfpack.choices import CONSISTENT_EXPOSURE, LOCAL_EXPOSURE, SPLAT_EXPOSURES
 from hyrfpack.config.export import ExportConfig
 from hyrfpack.export.background import background_picture, background_splats
-from hyrfpack.export.bake import CameraVisibility, bake, compute_visibility
+from hyrfpack.export.bake_parts import PartsVisibility, bake_parts, compute_parts_visibility
 from hyrfpack.export.degree import choose_degree
 from hyrfpack.export.kinds import HTML_PAGE, POSITION_KINDS, includes_background, select_splats
 from hyrfpack.export.source import Source
+from hyrfpack.model import HybridModel
+from hyrfpack.model.merged import MergedModel, parts_of
 from hyrfpack.progress import Progress, part_of_progress
 from hyrfpack.splats.splats import Splats, concatenate
 from hyrfpack.splats.table import FileKind
@@ -70,7 +71,7 @@ def bake_scene(source: Source, kind: FileKind, config: ExportConfig, progress: P
     degree, chosen_by, visibility = _decide_degree(loaded, kind, config, part_of_progress(progress, 0.0, 0.7))
     fit_progress = part_of_progress(progress, 0.7 if chosen_by else 0.5, 0.8)
     baked = _bake_at(loaded, kind, config, degree, visibility, fit_progress)
-    has_map = source.model.exposure is not None
+    has_map = any(part.exposure is not None for part in parts_of(source.drawn))
     baked = replace(baked, chosen_by=chosen_by, exposure=config.exposure if has_map else None)
     if not has_map or config.crop is not None or not source.measured_views or kind in POSITION_KINDS:
         return baked
@@ -83,7 +84,7 @@ def bake_scene(source: Source, kind: FileKind, config: ExportConfig, progress: P
 
 def _decide_degree(
     loaded: Source, kind: FileKind, config: ExportConfig, progress: Progress
-) -> tuple[int, dict[int, float], Sequence[CameraVisibility]]:
+) -> tuple[int, dict[int, float], PartsVisibility]:
     """Return the degree of the harmonics, the scores if it was chosen by these, and what the cameras see."""
     places = f"{len(loaded.fit_cameras)} " + (
         "cameras"
@@ -95,15 +96,15 @@ def _decide_degree(
     is_chosen = config.degree is None and highest > 0
     if is_chosen:
         _LOG.info(f"choosing the degree of the spherical harmonics at {places}")
-        visibility = compute_visibility(loaded.model, loaded.fit_cameras, part_of_progress(progress, 0.0, 0.43))
+        visibility = compute_parts_visibility(loaded.drawn, loaded.fit_cameras, part_of_progress(progress, 0.0, 0.43))
         degree, chosen_by = choose_degree(
-            loaded.model, loaded.fit_cameras, highest, visibility, part_of_progress(progress, 0.43, 1.0)
+            loaded.drawn, loaded.fit_cameras, highest, visibility, part_of_progress(progress, 0.43, 1.0)
         )
         scores = ", ".join(f"{score:.2f}" for score in chosen_by.values())
         _LOG.info(f"chosen degree {degree}: {scores} dB against the model for degrees 0 to {highest}")
     _LOG.info(f"fitting colours of degree {degree} at {places}")
     if not is_chosen:
-        visibility = compute_visibility(loaded.model, loaded.fit_cameras, part_of_progress(progress, 0.0, 0.71))
+        visibility = compute_parts_visibility(loaded.drawn, loaded.fit_cameras, part_of_progress(progress, 0.0, 0.71))
     return degree, chosen_by, visibility
 
 
@@ -112,23 +113,27 @@ def _bake_at(
     kind: FileKind,
     config: ExportConfig,
     degree: int,
-    visibility: Sequence[CameraVisibility],
+    visibility: PartsVisibility,
     progress: Progress,
 ) -> BakedScene:
     """Bake a model at a degree, select splats, and add the background."""
-    splats = bake(loaded.model, loaded.fit_cameras, (degree,), visibility, progress)[degree]
+    splats = bake_parts(loaded.drawn, loaded.fit_cameras, (degree,), visibility, progress)[degree]
     sphere = includes_background(loaded, kind, config)
     splats, picture, background_count = select_splats(splats, config.crop, config.min_opacity), None, 0
     if sphere and kind is HTML_PAGE:
-        picture = background_picture(loaded.model, cameras=loaded.fit_cameras, visibility=visibility)
+        picture = background_picture(loaded.model, cameras=loaded.fit_cameras, visibility=visibility[0])
     elif sphere:
-        distant = background_splats(loaded.model, loaded.fit_cameras, kind.max_scale, visibility)
+        distant = background_splats(loaded.model, loaded.fit_cameras, kind.max_scale, visibility[0])
         splats, background_count = concatenate((splats, distant)), len(distant)
     return BakedScene(loaded, splats, background_count, picture, sphere, degree)
 
 
 def _without_exposure_map(loaded: Source) -> Source:
     """Return a copy without the exposure map, for renders and bakes of consistent exposure; parameters are shared."""
-    model = copy.copy(loaded.model)
-    model.exposure = None
-    return replace(loaded, model=model)
+    parts = [copy.copy(part) for part in parts_of(loaded.drawn)]
+    for part in parts:
+        part.exposure = None
+    drawn: HybridModel | MergedModel = parts[0]
+    if isinstance(loaded.drawn, MergedModel):
+        drawn = replace(loaded.drawn, parts=tuple(parts))
+    return replace(loaded, model=parts[0], drawn=drawn)

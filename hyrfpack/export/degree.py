@@ -7,10 +7,11 @@ from collections.abc import Sequence
 import torch
 
 from hyrfpack.cameras.view_sampling import shrink_camera
-from hyrfpack.export.bake import CameraVisibility, bake
+from hyrfpack.export.bake_parts import PartsVisibility, bake_parts
 from hyrfpack.export.measure import measure_psnr
 from hyrfpack.export.source import MAX_MEASURED_VIEWS, MIN_CAMERAS_TO_HOLD_OUT
 from hyrfpack.model import HybridModel
+from hyrfpack.model.merged import MergedModel
 from hyrfpack.progress import Progress, ignore_progress, part_of_progress
 from hyrfpack.scene import Camera, evenly_spaced
 
@@ -23,10 +24,10 @@ SCORE_TOLERANCE_DB = 0.2
 
 
 def choose_degree(
-    model: HybridModel,
+    model: HybridModel | MergedModel,
     cameras: Sequence[Camera],
     highest: int,
-    visibility: Sequence[CameraVisibility] | None = None,
+    visibility: PartsVisibility | None = None,
     progress: Progress = ignore_progress,
 ) -> tuple[int, dict[int, float]]:
     """Choose the lowest degree of harmonics, 0 to `highest`, whose score is within SCORE_TOLERANCE_DB of the best.
@@ -40,7 +41,7 @@ def choose_degree(
         model: a model on the CPU.
         cameras: cameras at which colours may be fitted, world units, without those that will measure the result.
         highest: highest degree to consider, 0 to 3.
-        visibility: result of `compute_visibility` for the cameras, if it is known already.
+        visibility: result of `compute_parts_visibility` for the cameras, if it is known already.
         progress: called with `TaskEvent`s.
 
     Returns:
@@ -50,12 +51,13 @@ def choose_degree(
     stride = -(-len(model) // MAX_GAUSSIANS)
     if stride > 1:
         model, visibility = model.subset(torch.arange(0, len(model), stride)), None
-    fit_visibility = None if visibility is None else list(visibility)
+    fit_visibility = None if visibility is None else [list(views) for views in visibility]
     if len(cameras) >= MIN_CAMERAS_TO_HOLD_OUT:
         validation = fit_cameras[VALIDATION_CAMERAS]
-        for items in (fit_cameras, fit_visibility or []):
-            del items[VALIDATION_CAMERAS]
-    baked = bake(model, fit_cameras, range(highest + 1), fit_visibility, part_of_progress(progress, 0.0, 0.6))
+        del fit_cameras[VALIDATION_CAMERAS]
+        for views_of_part in fit_visibility or []:
+            del views_of_part[VALIDATION_CAMERAS]
+    baked = bake_parts(model, fit_cameras, range(highest + 1), fit_visibility, part_of_progress(progress, 0.0, 0.6))
     candidates = {str(degree): (splats, None) for degree, splats in baked.items()}
     views = [(shrink_camera(camera), None) for camera in evenly_spaced(validation, MAX_MEASURED_VIEWS)]
     measured = measure_psnr(model, candidates, views, sphere=False, progress=part_of_progress(progress, 0.6, 1.0))

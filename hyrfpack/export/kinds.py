@@ -16,6 +16,7 @@ from hyrfpack.errors import HyrfError, needs_package
 from hyrfpack.export.background import background_reach
 from hyrfpack.export.cameras import COLMAP_FILES
 from hyrfpack.export.source import Source
+from hyrfpack.model.merged import world_positions
 from hyrfpack.outputs import Outputs
 from hyrfpack.splats.splats import Splats
 from hyrfpack.splats.table import FORMATS, FileKind
@@ -164,8 +165,8 @@ def check_model(loaded: Source, kind: FileKind, config: ExportConfig) -> None:
     Raises:
         HyrfError: the settings leave no Gaussian, or the scene is too far from the origin.
     """
-    model, frame = loaded.model, loaded.model.config.frame
-    positions = frame.to_world(model.gaussians.positions.numpy())
+    model, frame = loaded.drawn, loaded.model.config.frame
+    positions = world_positions(model)
     crop, min_opacity = config.crop, config.min_opacity
     if crop is not None or min_opacity > 0:  # certain before the bake, because it raises no opacity
         positions = positions[selection_mask(positions, model.decode_geometry().opacities.numpy(), crop, min_opacity)]

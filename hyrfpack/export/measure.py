@@ -12,6 +12,7 @@ from torch import Tensor
 
 from hyrfpack.evaluate.metrics import psnr, to_8bit
 from hyrfpack.model import HybridModel
+from hyrfpack.model.merged import MergedModel, scene_of
 from hyrfpack.ops.background import pixel_directions
 from hyrfpack.ops.viewport import Viewport
 from hyrfpack.parallel.pool import parallel_map
@@ -39,7 +40,7 @@ class PsnrScores:
 
 @torch.no_grad()
 def measure_psnr(
-    model: HybridModel,
+    model: HybridModel | MergedModel,
     candidates: Mapping[str, tuple[Splats, np.ndarray | None]],
     views: Sequence[tuple[Camera, View | None]],
     *,
@@ -59,10 +60,10 @@ def measure_psnr(
     Returns:
         Scores by candidate, and those of the model as "model"; empty if the masks of the photos leave no pixel.
     """
-    decoded, frame = model.decode(), model.config.frame
-    solid = torch.tensor(model.config.solid)
+    decoded, config = model.decode(), scene_of(model).config
+    solid = torch.tensor(config.solid)
     drawables = {
-        name: (Drawable.from_splats(splats, frame), panorama) for name, (splats, panorama) in candidates.items()
+        name: (Drawable.from_splats(splats, config.frame), panorama) for name, (splats, panorama) in candidates.items()
     }
 
     @torch.no_grad()  # because torch keeps this setting per thread
@@ -74,7 +75,7 @@ def measure_psnr(
             raster = draw(drawable, camera)
             backdrop = solid if panorama is None else _equirect_colors(torch.from_numpy(panorama), camera)
             pictures[name] = to_8bit(raster.rgb + raster.transmittance[..., None] * backdrop)
-        photo, mask = (None, None) if view is None else _load_photo(view, model)
+        photo, mask = (None, None) if view is None else _load_photo(view, config.solid)
         if mask is not None and not mask.any():
             return {}
         return {
@@ -109,9 +110,9 @@ def _equirect_colors(picture: Tensor, camera: Camera) -> Tensor:
     return sampled[0, :, 0].T.reshape(camera.height, camera.width, 3)
 
 
-def _load_photo(view: View, model: HybridModel) -> tuple[Tensor, Tensor | None]:
+def _load_photo(view: View, solid: tuple[float, float, float]) -> tuple[Tensor, Tensor | None]:
     picture = view.load()
-    photo = torch.from_numpy(picture.composite(np.array(model.config.solid, np.float32)))
+    photo = torch.from_numpy(picture.composite(np.array(solid, np.float32)))
     return photo, None if picture.mask is None else torch.from_numpy(picture.mask)
 
 

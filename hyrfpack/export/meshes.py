@@ -17,6 +17,7 @@ from hyrfpack.export.source import Source
 from hyrfpack.mesh import Mesh, extract_mesh
 from hyrfpack.mesh.files import encode_mesh
 from hyrfpack.mesh.solid import make_proxy
+from hyrfpack.model.merged import world_positions
 from hyrfpack.progress import Progress, TaskEvent, part_of_progress
 from hyrfpack.splats.table import FileKind
 
@@ -85,12 +86,11 @@ def _mean_and_95(distances: np.ndarray) -> tuple[float, float]:
 
 def _extract(loaded: Source, config: ExportConfig, faces: int | None, colored: bool, progress: Progress) -> Mesh:
     """Extract the surface of the Gaussians that are opaque enough."""
-    model = loaded.model
+    model = loaded.drawn
     if config.min_opacity > 0:
         with torch.no_grad():
             opacities = model.decode_geometry().opacities.numpy()
-        positions = model.config.frame.to_world(model.gaussians.positions.detach().numpy())
-        keep = selection_mask(positions, opacities, None, config.min_opacity)
+        keep = selection_mask(world_positions(model), opacities, None, config.min_opacity)
         model = model.subset(torch.from_numpy(keep).nonzero()[:, 0])
     return extract_mesh(
         model,

@@ -36,7 +36,6 @@ from hyrfpack.export.scores import measure_export
 from hyrfpack.export.source import Source
 from hyrfpack.format import find_model
 from hyrfpack.lock import exclusive_folder
-from hyrfpack.model.merged import MergedModel
 from hyrfpack.outputs import Outputs
 from hyrfpack.progress import Progress, TaskEvent, part_of_progress
 from hyrfpack.scene import Scene
@@ -119,11 +118,6 @@ def export_model(
         loaded = Source.read(source, data)
         if kind is HTML_PAGE and not config.baked:
             return write_native_page(loaded, source, target, config, overwrite)
-        if isinstance(loaded.drawn, MergedModel):
-            raise HyrfError(
-                f"{source}: only pages and players' folders hold merged models",
-                fix="take a part out with 'hyrfpack edit' and its `part`, and export that",
-            )
         if kind in (TRANSFORMS_JSON, COLMAP_FOLDER):
             _check_cameras(loaded, source)
         if kind is TRANSFORMS_JSON:

@@ -48,7 +48,7 @@ def _add_file_scores(
 ) -> ExportReport:
     """Add the scores of the baked splats and of the file, and log a warning if the format costs much."""
     loaded, shown = baked.source, {"baked": (baked.splats, baked.picture), "file": written}
-    scores = measure_psnr(loaded.model, shown, loaded.measured_views, sphere=baked.sphere, progress=progress)
+    scores = measure_psnr(loaded.drawn, shown, loaded.measured_views, sphere=baked.sphere, progress=progress)
     if not scores:
         _LOG.warning("quality is not measured, because the masks leave no pixel of the held-out photos")
         return result
@@ -85,7 +85,7 @@ def _warn_of_cost(cost: float, loaded: Source, kind: FileKind) -> None:
 def _add_exposure_scores(result: ExportReport, loaded: Source, baked: BakedScene, progress: Progress) -> ExportReport:
     """Add the scores of splats of both exposures, against the model as photographed and against photos."""
     scores = measure_psnr(
-        loaded.model, baked.by_exposure, loaded.measured_views, sphere=baked.sphere, progress=progress
+        loaded.drawn, baked.by_exposure, loaded.measured_views, sphere=baked.sphere, progress=progress
     )
     by_exposure = {name: scores[name] for name in SPLAT_EXPOSURES if name in scores}
     return replace(

@@ -35,7 +35,7 @@ class Source:
 
     Attributes:
         model: the model; the scene of a merged file, its first part.
-        drawn: what pages draw: `model`, or all parts of a merged file.
+        drawn: what is shown and exported: `model`, or all parts of a merged file.
         cameras: names and cameras of the training photos; empty if the file keeps none and no photos are given.
         fit_cameras: cameras at which colours are fitted; made-up ones around the scene if none are known.
         measured_views: cameras at which the loss is measured, with their photos or None. They are not fitted, unless

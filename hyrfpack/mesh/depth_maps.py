@@ -11,6 +11,7 @@ from scipy.ndimage import median_filter, minimum_filter
 
 from hyrfpack.cameras.view_sampling import shrink_camera
 from hyrfpack.model import HybridModel
+from hyrfpack.model.merged import MergedModel
 from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.render.surface import render_median_depth
 from hyrfpack.scene import Camera
@@ -57,7 +58,7 @@ class DepthMap:
 
 @torch.no_grad()
 def render_depth_maps(
-    model: HybridModel,
+    model: HybridModel | MergedModel,
     cameras: Sequence[Camera],
     exposure: str,
     on_map: Callable[[], None] = lambda: None,

@@ -18,6 +18,7 @@ from hyrfpack.mesh.depth_maps import render_depth_maps
 from hyrfpack.mesh.fusion import MIN_TOTAL_WEIGHT, choose_truncation, extract_surface, find_blocks
 from hyrfpack.mesh.kernels import MapArrays, color_points
 from hyrfpack.model import HybridModel
+from hyrfpack.model.merged import MergedModel
 from hyrfpack.parallel.pool import run_ranges
 from hyrfpack.progress import Progress, TaskEvent, ignore_progress
 from hyrfpack.scene import Camera, evenly_spaced
@@ -52,7 +53,7 @@ class Mesh:
 
 
 def extract_mesh(
-    model: HybridModel,
+    model: HybridModel | MergedModel,
     cameras: Sequence[Camera],
     center: np.ndarray,
     *,

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from torch import Tensor
 
 from hyrfpack.errors import HyrfError
 from hyrfpack.model.hybrid import Decoded, Geometry, HybridModel
@@ -43,9 +45,42 @@ class MergedModel:
     @torch.no_grad()
     def decode(self) -> Decoded:
         """Evaluate geometry that no view changes, of all Gaussians in the order of the parts, in units of each part."""
+        return Decoded(self.decode_geometry(), None)
+
+    def decode_geometry(self) -> Geometry:
+        """Evaluate the geometry of all Gaussians in the order of the parts, in units of each part."""
         parts = [part.decode_geometry() for part in self.parts]
         values = zip(*((part.scales, part.quats, part.opacities) for part in parts), strict=True)
-        return Decoded(Geometry(*(torch.cat(value) for value in values)), None)
+        return Geometry(*(torch.cat(value) for value in values))
+
+    def subset(self, index: Tensor) -> MergedModel:
+        """Return a model with copies of the Gaussians at ascending `index` (n,) int64, counted over all parts.
+
+        Parts may be left with no Gaussian. Each shares its fields with the part that it is taken from.
+        """
+        ends = np.cumsum([len(part) for part in self.parts])
+        bounds = torch.searchsorted(index, torch.from_numpy(ends)).tolist()
+        starts, firsts = [0, *bounds[:-1]], [0, *ends[:-1].tolist()]
+        chosen = [index[start:end] - first for start, end, first in zip(starts, bounds, firsts, strict=True)]
+        subsets = (part.subset(some) for part, some in zip(self.parts, chosen, strict=True))
+        return MergedModel(self.names, tuple(subsets))
 
     def __len__(self) -> int:
         return sum(len(part) for part in self.parts)
+
+
+def parts_of(model: HybridModel | MergedModel) -> tuple[HybridModel, ...]:
+    """Return the parts of a merged model, or a single model as its only part."""
+    return model.parts if isinstance(model, MergedModel) else (model,)
+
+
+def scene_of(model: HybridModel | MergedModel) -> HybridModel:
+    """Return the model whose background, viewpoint and cameras are shown: the first part of a merged model."""
+    return parts_of(model)[0]
+
+
+def world_positions(model: HybridModel | MergedModel) -> np.ndarray:
+    """Return the centres (N, 3) of the Gaussians of all parts in world units, float64."""
+    return np.concatenate(
+        [part.config.frame.to_world(part.gaussians.positions.detach().numpy()) for part in parts_of(model)]
+    )

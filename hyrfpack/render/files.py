@@ -17,13 +17,12 @@ from hyrfpack.config.render import GeometryConfig
 from hyrfpack.errors import HyrfError
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.model import HybridModel
-from hyrfpack.model.merged import MergedModel
+from hyrfpack.model.merged import MergedModel, scene_of
 from hyrfpack.outputs import PICTURE_SUFFIXES
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.render.geometry_files import GeometryWriter
-from hyrfpack.render.parts import camera_frame, gather_parts
 from hyrfpack.render.renderer import RenderedPicture, RenderSettings, render_view
-from hyrfpack.render.surface import render_surface, widened_gaussians
+from hyrfpack.render.surface import drawn_gaussians, render_surface
 from hyrfpack.scene import Camera
 
 
@@ -74,18 +73,13 @@ def make_renderer(
     """Decode a model once, and return a function that renders it with the geometry that is wanted."""
     with torch.no_grad():
         decoded = model.decode()
-    antialiased = (model.scene if isinstance(model, MergedModel) else model).config.antialiased
+    antialiased = scene_of(model).config.antialiased
 
     def draw(camera: Camera) -> RenderedPicture:
         rendering = render_view(model, camera, settings, decoded=decoded)
         if not geometry.is_wanted:
             return RenderedPicture(rendering.rgb)
-        if isinstance(model, MergedModel):
-            frame = camera_frame(model, camera)
-            _, gaussians, _ = gather_parts(model, camera, settings.near, settings.cull_tolerance, decoded)
-        else:
-            frame = model.config.frame
-            gaussians = widened_gaussians(model, camera, decoded, rendering.indices[rendering.visible])
+        gaussians, frame = drawn_gaussians(model, camera, decoded, rendering.indices[rendering.visible])
         surface = render_surface(gaussians, frame, camera, settings, antialiased, normals=geometry.normals is not None)
         return RenderedPicture(rendering.rgb, *surface)
 

@@ -41,21 +41,37 @@ def gather_parts(
     Raises:
         FloatingPointError: a position is NaN or infinite.
     """
-    frame, first = camera_frame(model, camera), 0
-    indices, gaussians, colors = [], [], []
+    indices, colors, first = [], [], 0
     for part in model.parts:
         viewport = part.config.frame.local_viewport(camera, part.gaussians.positions.dtype)
         index = frustum_cull(part.gaussians.positions, viewport, near, cull_tolerance)
-        geometry = part.decode_geometry(index) if decoded is None else decoded.geometry[index + first]
-        local = geometry.at(take_rows(part.gaussians.positions, index))
-        if (sizes := part.gaussians.pixel_sizes) is not None:
-            local = widen_to_photos(local, sizes[index], viewport, antialiased=part.config.antialiased)
         indices.append(index + first)
-        gaussians.append(_to_frame(local, part.config.frame, frame))
-        colors.append(part.decode_colors(camera_center(viewport.pose).to(local.means), index))
+        colors.append(part.decode_colors(camera_center(viewport.pose).to(part.gaussians.positions), index))
         first += len(part)
-    joined = Gaussians3D(*(torch.cat(values) for values in zip(*gaussians, strict=True)))
-    return torch.cat(indices), joined, torch.cat(colors)
+    drawn = torch.cat(indices)
+    return drawn, gather_geometry(model, camera, drawn, decoded), torch.cat(colors)
+
+
+def gather_geometry(model: MergedModel, camera: Camera, index: Tensor, decoded: Decoded | None = None) -> Gaussians3D:
+    """Return Gaussians of all parts as a camera draws them, in the local units of `camera_frame`.
+
+    Args:
+        model: the merged model.
+        camera: the camera, in world units.
+        index: (n,) int64 ascending, the Gaussians, counted over all parts in their order.
+        decoded: result of `model.decode()`, or None.
+    """
+    frame, first, gaussians = camera_frame(model, camera), 0, []
+    for part in model.parts:
+        some = index[(index >= first) & (index < first + len(part))]
+        geometry = part.decode_geometry(some - first) if decoded is None else decoded.geometry[some]
+        local = geometry.at(take_rows(part.gaussians.positions, some - first))
+        if (sizes := part.gaussians.pixel_sizes) is not None:
+            viewport = part.config.frame.local_viewport(camera, part.gaussians.positions.dtype)
+            local = widen_to_photos(local, sizes[some - first], viewport, antialiased=part.config.antialiased)
+        gaussians.append(_to_frame(local, part.config.frame, frame))
+        first += len(part)
+    return Gaussians3D(*(torch.cat(values) for values in zip(*gaussians, strict=True)))
 
 
 def expose_parts(

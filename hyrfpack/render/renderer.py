@@ -16,7 +16,7 @@ from hyrfpack.choices import AS_PHOTOGRAPHED, RENDER_EXPOSURES
 from hyrfpack.errors import HyrfError
 from hyrfpack.model import Decoded, HybridModel
 from hyrfpack.model.gaussians import take_rows
-from hyrfpack.model.merged import MergedModel
+from hyrfpack.model.merged import MergedModel, scene_of
 from hyrfpack.ops.composite import composite
 from hyrfpack.ops.finite import all_finite
 from hyrfpack.ops.poses import camera_center
@@ -165,7 +165,7 @@ def render_view(
     check_type("camera", camera, Camera)
     check_type("settings", settings, RenderSettings)
     seconds: dict[str, float] = {}
-    scene = model.scene if isinstance(model, MergedModel) else model
+    scene = scene_of(model)
     positions = scene.gaussians.positions
     viewport = scene.config.frame.local_viewport(camera, positions.dtype)
     _check_finite(pose=viewport.pose)

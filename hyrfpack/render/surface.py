@@ -6,11 +6,13 @@ import torch
 from torch import Tensor
 
 from hyrfpack.model import Decoded, Frame, HybridModel
+from hyrfpack.model.merged import MergedModel, scene_of
 from hyrfpack.ops.rasterize import Gaussians3D, rasterize
 from hyrfpack.ops.rasterize.median_depth import median_depth
 from hyrfpack.ops.rasterize.reference import quats_to_rotations
 from hyrfpack.parallel.pool import torch_on_one_thread
 from hyrfpack.render.depth_normals import normals_from_depth, unit_rays
+from hyrfpack.render.parts import camera_frame, gather_geometry
 from hyrfpack.render.renderer import RenderSettings
 from hyrfpack.render.sampling import widen_to_photos
 from hyrfpack.scene import Camera
@@ -23,7 +25,7 @@ DEPTH_NORMAL_WEIGHT = 0.5
 @torch_on_one_thread()
 @torch.no_grad()
 def render_median_depth(
-    model: HybridModel, camera: Camera, decoded: Decoded, index: Tensor, settings: RenderSettings
+    model: HybridModel | MergedModel, camera: Camera, decoded: Decoded, index: Tensor, settings: RenderSettings
 ) -> Tensor:
     """Render the depth along the view axis at which half of the light is lost, (H, W) in world units on the CPU.
 
@@ -36,17 +38,21 @@ def render_median_depth(
         index: (n,) int64, the Gaussians to draw, such as those that `render_view` found to be visible.
         settings: render settings.
     """
-    gaussians = widened_gaussians(model, camera, decoded, index)
-    return _median_depth_in_frame(gaussians, model.config.frame, camera, settings, model.config.antialiased)
+    gaussians, frame = drawn_gaussians(model, camera, decoded, index)
+    return _median_depth_in_frame(gaussians, frame, camera, settings, scene_of(model).config.antialiased)
 
 
-def widened_gaussians(model: HybridModel, camera: Camera, decoded: Decoded, index: Tensor) -> Gaussians3D:
-    """Return Gaussians of a model as `render_view` draws them: sampled no more finely than the photos did."""
-    gaussians = decoded.geometry[index].at(model.gaussians.positions[index])
+def drawn_gaussians(
+    model: HybridModel | MergedModel, camera: Camera, decoded: Decoded, index: Tensor
+) -> tuple[Gaussians3D, Frame]:
+    """Return Gaussians as `render_view` draws them, sampled no more finely than the photos did, and their frame."""
+    if isinstance(model, MergedModel):
+        return gather_geometry(model, camera, index, decoded), camera_frame(model, camera)
+    gaussians, frame = decoded.geometry[index].at(model.gaussians.positions[index]), model.config.frame
     if (sizes := model.gaussians.pixel_sizes) is None:
-        return gaussians
-    viewport = model.config.frame.local_viewport(camera, gaussians.means.dtype)
-    return widen_to_photos(gaussians, sizes[index], viewport, antialiased=model.config.antialiased)
+        return gaussians, frame
+    viewport = frame.local_viewport(camera, gaussians.means.dtype)
+    return widen_to_photos(gaussians, sizes[index], viewport, antialiased=model.config.antialiased), frame
 
 
 @torch_on_one_thread()

@@ -80,8 +80,8 @@ def test_the_degree_is_chosen_by_held_out_cameras_other_than_the_measured_ones(c
         judged.extend(camera.position.tobytes() for camera, _ in views)
         return measure_psnr(model, contenders, views, **options)
 
-    bake, measure_psnr = degrees.bake, degrees.measure_psnr
-    monkeypatch.setattr(degrees, "bake", recording_bake)
+    bake, measure_psnr = degrees.bake_parts, degrees.measure_psnr
+    monkeypatch.setattr(degrees, "bake_parts", recording_bake)
     monkeypatch.setattr(degrees, "measure_psnr", recording_measure_psnr)
     source = Source.read(write_model(tmp_path / "m.hyrf", 1.0, ring(count)))
     choose_degree(source.model, source.fit_cameras, 3)
@@ -101,13 +101,13 @@ def test_the_degree_of_many_gaussians_is_chosen_by_a_sample(monkeypatch):
         counts.append(len(model))
         return bake(model, *others)
 
-    bake = degrees.bake
-    monkeypatch.setattr(degrees, "bake", recording_bake)
+    bake = degrees.bake_parts
+    monkeypatch.setattr(degrees, "bake_parts", recording_bake)
     positions = np.random.default_rng(0).uniform(-0.6, 0.6, (200, 3))
     model, cameras = small_model(positions, fields=4.0, direction_encoding="sh"), ring(40)
     whole = choose_degree(model, cameras, 3)
     monkeypatch.setattr(degrees, "MAX_GAUSSIANS", 60)
-    some = choose_degree(model, cameras, 3, compute_visibility(model, cameras))
+    some = choose_degree(model, cameras, 3, [compute_visibility(model, cameras)])
     assert counts == [200, 50] and some[0] == whole[0] and some[1] != whole[1]
 
 

@@ -72,7 +72,7 @@ def sphere_file(tmp_path_factory):
 @pytest.fixture
 def fail_if_baked(monkeypatch):
     """Fail the test if baking starts."""
-    for name in ("bake", "compute_visibility"):
+    for name in ("bake_parts", "compute_parts_visibility"):
         monkeypatch.setattr(baked_scene, name, lambda *arguments: pytest.fail("the bake began"))
 
 
@@ -311,7 +311,9 @@ def test_held_out_photos_are_scored_but_not_fitted(plain_file, tmp_path, monkeyp
     scene = replace(ball_scene(8), train=photos[1::2], test=photos[::2])
     fitted = []
     monkeypatch.setattr(
-        baked_scene, "bake", lambda model, cameras, degrees, *others: fitted.extend(cameras) or bake(model, [], degrees)
+        baked_scene,
+        "bake_parts",
+        lambda model, cameras, degrees, *_: fitted.extend(cameras) or bake(model, [], degrees),
     )
     report = export(plain_file, tmp_path / "a.ply", data=scene)
     assert fitted == [view.camera for view in scene.train] and report.views == 4

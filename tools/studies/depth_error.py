@@ -83,7 +83,7 @@ def print_errors(model: HybridModel, cameras: list[Camera], geometry: Geometry) 
         exact, exact_normals = geometry(camera)
         seen = render_view(model, camera, decoded=decoded, depth=True)
         assert seen.depth is not None
-        gaussians = surface.widened_gaussians(model, camera, decoded, seen.indices[seen.visible])
+        gaussians, _ = surface.drawn_gaussians(model, camera, decoded, seen.indices[seen.visible])
         depth, _ = surface.render_surface(gaussians, frame, camera, RenderSettings(), antialiased, normals=False)
         known = np.isfinite(exact) & (depth.numpy() > 0)
         for name, found in (("expected", seen.depth), ("median", depth)):
