@@ -207,13 +207,12 @@ def _make_plan(
     shape = (context_count * selector.classes, alphabet)
     first = lanes_log2 | len(thresholds) << 4
 
-    segments, cost, counts = [], 0, np.zeros(shape, np.int64)
-    for start, stop in iter_update_ranges(lanes.steps):
-        frequencies = adaptive_frequencies(counts)
-        new = backend.count_tokens(tokens, selector, lanes, start, stop, shape)
-        cost += int((new * COST_BY_FREQUENCY[frequencies]).sum())
-        segments.append((start, stop, frequencies))
-        counts += new
+    ranges = list(iter_update_ranges(lanes.steps))
+    new = np.stack([backend.count_tokens(tokens, selector, lanes, start, stop, shape) for start, stop in ranges])
+    counts = new.sum(axis=0)
+    frequencies = adaptive_frequencies(np.cumsum(new, axis=0) - new)  # from the counts before each range
+    cost = int((new * COST_BY_FREQUENCY[frequencies]).sum())
+    segments = [(*steps, rows) for steps, rows in zip(ranges, frequencies, strict=True)]
     adaptive = _CodingPlan(cost, bytes((first, alphabet, *thresholds)), selector, lanes, segments)
     if not static:
         return adaptive

@@ -1,7 +1,8 @@
 """Frequencies for the rANS coder: the probability of each token, in 4096ths.
 
 A *model* is one row of frequencies; a stream has one model per context. Every function takes and returns the rows of
-all models. The decoder's symbols depend on these numbers, so they are computed in integers only.
+all models. Further axes in front are moments in a stream, between which adaptive models change. The decoder's symbols
+depend on these numbers, so they are computed in integers only.
 """
 
 from __future__ import annotations
@@ -42,15 +43,16 @@ def normalise(weights: np.ndarray) -> np.ndarray:
     The largest frequency is at least floor((4096 - b) / (A - b)), and (4096 - b) >= b (A - b) for every b if A <= 127.
 
     Args:
-        weights: (K, A) int64, 0 to 2^50, A at most `MAX_ALPHABET_SIZE`; no row is all zero.
+        weights: (..., K, A) int64, 0 to 2^50, A at most `MAX_ALPHABET_SIZE`; no row is all zero.
 
     Returns:
-        (K, A) int64 frequencies; each row adds up to 4096.
+        (..., K, A) int64 frequencies; each row adds up to 4096.
     """
-    frequencies = np.maximum((weights << SCALE_BITS) // weights.sum(axis=1, keepdims=True), weights > 0)
-    largest = weights.argmax(axis=1)
-    frequencies[np.arange(len(weights)), largest] += FREQUENCY_TOTAL - frequencies.sum(axis=1)
-    return frequencies
+    rows = weights.reshape(-1, weights.shape[-1])
+    frequencies = np.maximum((rows << SCALE_BITS) // rows.sum(axis=1, keepdims=True), rows > 0)
+    largest = rows.argmax(axis=1)
+    frequencies[np.arange(len(rows)), largest] += FREQUENCY_TOTAL - frequencies.sum(axis=1)
+    return frequencies.reshape(weights.shape)
 
 
 def adaptive_frequencies(counts: np.ndarray) -> np.ndarray:
@@ -63,13 +65,13 @@ def adaptive_frequencies(counts: np.ndarray) -> np.ndarray:
     that is, the counts in the context plus the distribution over all contexts with the weight of 16 symbols.
 
     Args:
-        counts: (K, A) int64; their sum is below 2^34.
+        counts: (..., K, A) int64; their sum is below 2^34.
 
     Returns:
-        (K, A) int64 frequencies as from `normalise`; none is 0.
+        (..., K, A) int64 frequencies as from `normalise`; none is 0.
     """
-    pooled = 2 * counts.sum(axis=0) + 1
-    prior = (pooled * (_PRIOR_SYMBOLS << _WEIGHT_FRACTION_BITS)) // pooled.sum() + 1
+    pooled = 2 * counts.sum(axis=-2, keepdims=True) + 1
+    prior = (pooled * (_PRIOR_SYMBOLS << _WEIGHT_FRACTION_BITS)) // pooled.sum(axis=-1, keepdims=True) + 1
     return normalise((counts << _WEIGHT_FRACTION_BITS) + prior)
 
 
