@@ -6,7 +6,8 @@ SHELL := bash
 .DEFAULT_GOAL := help
 
 BIN := .venv/bin
-PYTEST := $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal
+# Bytecode is kept, because tests start many processes that would compile the same modules again.
+PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal
 # Each stamp file is newer than the files from which its environment was made.
 VENV_STAMP := .venv/.ready
 NODE_STAMP := tests/node/node_modules/.ready

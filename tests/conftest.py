@@ -73,6 +73,14 @@ def skip_timing_warm_up() -> None:
     timing.WARM_UP_SECONDS = 0
 
 
+@pytest.fixture(scope="session", autouse=True)
+def skip_waiting_for_the_disk() -> Iterator[None]:
+    """Skip fsync, because no test cuts the power. Tests of its place in the order of writes replace it themselves."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda descriptor: None)
+        yield
+
+
 @pytest.fixture
 def signals() -> Iterator[None]:
     """Set the default signal handlers of a terminal, in this process and in programs started from it.
