@@ -18,6 +18,7 @@ import hyrfpack
 from hyrfpack import quant
 from hyrfpack.train import load_training_scene
 
+pytestmark = pytest.mark.usefixtures("quick_calibration")
 DOCUMENTED_OPERATIONS = (
     "activate", "adam", "background", "composite", "contraction", "hash_encode", "mlp", "rasterize", "shade", "ssim",
 )  # fmt: skip

@@ -31,6 +31,7 @@ from hyrfpack.data import PictureCache
 from hyrfpack.errors import HyrfError
 from hyrfpack.train import TrainConfig, Trainer, train_model
 
+pytestmark = pytest.mark.usefixtures("quick_calibration")
 resource = pytest.importorskip("resource", reason="limits and mounts are of Unix")
 SHORT_TRAINING_OPTIONS = ("--steps", 20, "--max-gaussians", 500)
 PICTURE_NAME_PATTERN = re.compile(r"\.(png|tiff)$")

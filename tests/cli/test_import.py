@@ -16,7 +16,7 @@ from hyrfpack.splats.formats import ply
 from hyrfpack.splats.viewpoints import WeightedSplats, sample_viewpoints
 
 QUICK_OPTIONS = ("--steps", 2, "--size", 24)
-pytestmark = pytest.mark.usefixtures("quick_distillation")
+pytestmark = pytest.mark.usefixtures("quick_calibration", "quick_distillation")
 
 
 @pytest.fixture

@@ -18,6 +18,8 @@ from hyrfpack.scene import Camera
 from hyrfpack.splats.draw import Drawable, draw
 from hyrfpack.splats.viewpoints import WeightedSplats, sample_viewpoints
 
+pytestmark = pytest.mark.usefixtures("quick_calibration", "quick_distillation")
+
 
 def test_the_report_describes_the_file(tmp_path: Path) -> None:
     splats, target = ball_splats(200), tmp_path / "ball.hyrf"

@@ -44,6 +44,7 @@ from hyrfpack.format.codec import load_with_provenance
 from hyrfpack.format.container import Container
 from hyrfpack.render import render_view
 
+pytestmark = pytest.mark.usefixtures("quick_calibration")
 GOLDEN_FOLDER = Path(__file__).parents[1] / "golden"
 COMPACT_FILE = GOLDEN_FOLDER / "trained" / "demo_compact.hyrf"
 RAW_FILE = GOLDEN_FOLDER / "trained" / "demo.hyrf"

@@ -62,6 +62,12 @@ def plant(model: HybridModel, cameras: list[Camera]) -> tuple[HybridModel, np.nd
     return model.requires_grad_(False), np.arange(len(model)) >= len(old)
 
 
+@pytest.fixture(autouse=True)
+def quick_comparison(monkeypatch):
+    """Compare the model with its few small photos in a quarter of the steps, which are enough for them."""
+    monkeypatch.setattr("hyrfpack.edit.floaters.MIN_STEPS", 150)
+
+
 @pytest.fixture(scope="module")
 def cameras() -> list[Camera]:
     return Capture(describe_file(RAW_FILE)).cameras

@@ -20,6 +20,7 @@ from hyrfpack.format import describe_file, load_model
 from hyrfpack.render import render_view
 from tools.safety.train_golden import DEMO_MODEL_FILE
 
+pytestmark = pytest.mark.usefixtures("quick_calibration")
 COMPACT_FILE = DEMO_MODEL_FILE.with_name("demo_compact.hyrf")
 CENTER_BALL = CropSphere((0.0, 0.0, 0.0), 1.0)
 

@@ -23,6 +23,7 @@ from hyrfpack.model.merged import MergedModel
 from hyrfpack.render import render_view
 from hyrfpack.scene import Camera
 
+pytestmark = pytest.mark.usefixtures("quick_calibration")
 GOLDEN_FOLDER = Path(__file__).parents[1] / "golden" / "trained"
 COMPACT_FILE = GOLDEN_FOLDER / "demo_compact.hyrf"
 MAP_FILE = GOLDEN_FOLDER / "exposed_balls.hyrf"

@@ -98,7 +98,7 @@ def test_a_forged_file_is_refused_with_the_message_in_its_name(name):
 @pytest.mark.filterwarnings("error")
 def test_mutants_are_decoded_or_refused_in_one_line():
     outcomes = Counter()
-    for number in range(2000):
+    for number in range(1000):
         kind, data = make_hostile_file(number)
         outcome = decode(data)
         outcomes[kind, isinstance(outcome, str)] += 1
@@ -108,7 +108,7 @@ def test_mutants_are_decoded_or_refused_in_one_line():
     assert {kind for kind, _ in outcomes} == set(INPUT_KINDS)
     # Forged content has valid checksums, so that some of it is decoded; damaged content has not.
     for kind in INPUT_KINDS:
-        assert (outcomes[kind, False] > 10) == kind.startswith("forged"), kind
+        assert (outcomes[kind, False] > 4) == kind.startswith("forged"), kind
 
 
 def test_mutants_depend_only_on_their_number_and_seed():
@@ -244,7 +244,7 @@ def test_a_group_may_have_16_stages_but_not_17():
 def test_forged_exposure_maps_trigger_every_check_of_the_reader():
     """The forged maps produce each error message of codec 9, and some are decoded."""
     outcomes = Counter()
-    for number in range(250):
+    for number in range(120):
         outcome = decode(INPUT_KINDS["forged exposure map"][1](Random(number)))
         if isinstance(outcome, str):
             assert "section 'EXPO'" in outcome or "decode to" in outcome, outcome

@@ -124,7 +124,7 @@ def read_mutant(layout_folders: Path, layout: str, seed: int) -> str:
 
 @pytest.mark.parametrize("layout", WRITERS_BY_LAYOUT)
 def test_mutated_tables_are_read_or_refused_in_one_line(layout_folders, layout):
-    @settings(max_examples=80, deadline=None)
+    @settings(max_examples=40, deadline=None)
     @given(st.integers(0, 2**32 - 1))
     def search(seed):
         read_mutant(layout_folders, layout, seed)

@@ -38,7 +38,7 @@ from tools.safety.fuzz_mutate import EXTREME_INTEGERS, HOSTILE_JSON, edit_bytes,
 
 # Hypothesis draws only a seed, because mutants are cheap and need no shrinking.
 seeded_rng = st.integers(0, 2**32 - 1).map(Random)
-with_150_examples = settings(max_examples=150, deadline=None)
+with_70_examples = settings(max_examples=70, deadline=None)
 
 HOSTILE_VALUES = (*HOSTILE_JSON, math.nan, math.inf, "x" * 5000, "a\0b", [[1.0] * 4] * 4, [[1e200] * 4] * 4, [[]] * 4)
 IDENTITY_POSE = np.eye(4).tolist()
@@ -151,7 +151,7 @@ HOSTILE_WORDS = (
 )
 
 
-@with_150_examples
+@with_70_examples
 @given(rng=seeded_rng)
 def test_forged_colmap_text_tables_are_read_or_refused(colmap, rng):
     root, model, tables, _ = colmap
@@ -170,7 +170,7 @@ def test_forged_colmap_text_tables_are_read_or_refused(colmap, rng):
     check_read_or_refused(lambda: load_pictures(root))
 
 
-@with_150_examples
+@with_70_examples
 @given(rng=seeded_rng)
 def test_forged_colmap_binary_tables_with_rigs_are_read_or_refused(colmap, rng):
     root, model, _, tables = colmap
@@ -192,7 +192,7 @@ def test_forged_colmap_binary_tables_with_rigs_are_read_or_refused(colmap, rng):
 BLENDER_TRANSFORMS = {"camera_angle_x": 0.9, "frames": frame_entries([f"images/{index}" for index in range(3)])}
 
 
-@with_150_examples
+@with_70_examples
 @given(rng=seeded_rng)
 def test_forged_blender_sets_are_read_or_refused(root, rng):
     (root / "transforms_train.json").write_bytes(forge_json(BLENDER_TRANSFORMS, rng))
@@ -237,7 +237,7 @@ ANGLE_CAMERAS = {
 }
 
 
-@settings(max_examples=600, deadline=None)
+@settings(max_examples=200, deadline=None)
 @given(rng=seeded_rng)
 def test_forged_camera_files_are_read_or_refused(root, rng):
     path = root / "cameras.json"
@@ -279,7 +279,7 @@ def test_an_error_quotes_only_the_start_of_a_long_value(tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore:overflow")
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(rng=seeded_rng)
 def test_a_forged_viewpoint_is_used_or_refused(rng):
     viewpoint = json.loads(json.dumps(Viewpoint.from_frame((0, 0, 0), 1.0).to_json()))
@@ -326,7 +326,7 @@ PLY_FORGERIES = [
 ]
 
 
-@with_150_examples
+@with_70_examples
 @given(rng=seeded_rng)
 def test_forged_points_are_read_or_refused(root, rng):
     (root / "transforms.json").write_text(json.dumps(TRANSFORMS_WITH_POINTS))
@@ -391,7 +391,7 @@ def repair_png_checksums(data: bytes) -> bytes:
 
 
 @pytest.mark.filterwarnings("ignore")  # Pillow warns about damaged files
-@with_150_examples
+@with_70_examples
 @given(rng=seeded_rng)
 def test_forged_picture_headers_are_read_or_refused(tmp_path_factory, rng):
     suffix, data = rng.choice(PICTURE_FILES)
@@ -445,7 +445,7 @@ def test_a_small_picture_that_declares_a_huge_one_is_refused(tmp_path):
 # --- checkpoints ---
 
 
-@with_150_examples
+@with_70_examples
 @given(rng=seeded_rng)
 def test_a_forged_checkpoint_with_its_digest_right_is_read_or_refused(tmp_path_factory, rng):
     path = tmp_path_factory.getbasetemp() / "checkpoint.pt"

@@ -15,6 +15,7 @@ from hyrfpack.format.container import read_container
 from hyrfpack.model import HybridModel
 from tools.safety.synthetic_encoding import quantize_uniformly, quantize_with_drawn_sensitivity
 
+pytestmark = pytest.mark.usefixtures("quick_calibration")
 PLANNED_STEP = 2.0**-10
 # An even plan of this step may choose steps up to this size.
 MAX_STEP = PLANNED_STEP * 16 / 15

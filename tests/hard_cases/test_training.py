@@ -28,6 +28,7 @@ from hyrfpack.scene import Camera, Picture, Scene, View
 from hyrfpack.train import Trainer
 from hyrfpack.train.setup import MAX_INITIAL_COORDINATE, initial_points
 
+pytestmark = pytest.mark.usefixtures("quick_calibration")
 # In dB: the root mean square error is half a step of 8 bits.
 HALF_STEP_PSNR_DB = 20 * np.log10(2 * 255)
 
@@ -329,6 +330,7 @@ def rescale_scene(scene: Scene, unit: float) -> Scene:
     return dataclasses.replace(scene, points=scene.points * unit, **views)
 
 
+@pytest.mark.acceptance
 def test_real_photos_in_millimetres_and_kilometres_give_the_same_quality(shared_data):
     scene = load_scene(shared_data / "drone_caliterra", max_size=100)
     scores = []

@@ -171,7 +171,7 @@ def test_correlated_tokens_are_coded_with_classes_of_the_previous_token() -> Non
 
 
 @given(st.data())
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 def test_normalised_frequencies_add_up_and_keep_every_nonzero_weight(data: st.DataObject) -> None:
     size = data.draw(st.integers(1, 127))
     weight = st.one_of(st.just(0), st.integers(1, 50), st.integers(0, 2**50))

@@ -150,8 +150,9 @@ def test_training_reduces_photos_and_renders_at_their_size() -> None:
 
 
 def test_a_resumed_run_takes_the_same_steps_when_the_resolution_changes(tmp_path, monkeypatch) -> None:
+    side = 64
+    monkeypatch.setattr(resolution, "MIN_REDUCED_SIDE_PIXELS", side // 2)
     # The first rounds add Gaussians beyond the limit for reduced photos.
-    side = 2 * resolution.MIN_REDUCED_SIDE_PIXELS
     monkeypatch.setattr(resolution, "MIN_PIXELS_PER_GAUSSIAN", side**2 / 4 / 65)
     whole, first, second = (Trainer(make_large_scene(), SHORT_RUN) for _ in range(3))
     whole.run()

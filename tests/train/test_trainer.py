@@ -503,7 +503,12 @@ def opaque_object_on_a_plain_wall() -> Scene:
             6,
             marks=pytest.mark.acceptance,
         ),
-        (opaque_object_on_a_plain_wall, TrainConfig(steps=400, max_gaussians=500), 12),
+        pytest.param(
+            opaque_object_on_a_plain_wall,
+            TrainConfig(steps=400, max_gaussians=500),
+            12,
+            marks=pytest.mark.acceptance,
+        ),
     ],
     ids=["sphere", "no room", "no sphere", "object"],
 )

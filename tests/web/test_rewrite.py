@@ -59,26 +59,41 @@ def assert_equal_numbers(first: Any, second: Any, path: str = "") -> None:
         assert first == second, path
 
 
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], dict[str, Any]]:
+    """Save every file after every edit as the player does; return the source, the target and the answers of each."""
+    folder = tmp_path_factory.mktemp("saved")
+    cases = {}
+    for name in FILES:
+        for edits, actions in EDITS.items():
+            place = folder / str(len(cases))
+            place.mkdir()
+            (place / "scene.hyrf").write_bytes((GOLDEN_FOLDER / name).read_bytes())
+            paths = {"source": str(place / "scene.hyrf"), "target": str(place / "saved.hyrf")}
+            cases[name, edits] = {**paths, "actions": actions}
+    (folder / "cases.json").write_text(json.dumps(list(cases.values())))
+    answers = run_script(Path(__file__).with_name("rewrite.mjs"), folder / "cases.json", writer_name())
+    return {key: {**case, **answer} for (key, case), answer in zip(cases.items(), answers, strict=True)}
+
+
 @pytest.mark.parametrize("name", FILES)
-@pytest.mark.parametrize("actions", EDITS.values(), ids=EDITS)
-def test_a_saved_file_equals_that_of_the_command(name: str, actions: list[dict], tmp_path: Path, monkeypatch):
-    path, target = tmp_path / "scene.hyrf", tmp_path / "saved.hyrf"
-    path.write_bytes((GOLDEN_FOLDER / name).read_bytes())
-    (tmp_path / "actions.json").write_text(json.dumps(actions))
-    monkeypatch.chdir(tmp_path)
+@pytest.mark.parametrize("edits", EDITS)
+def test_a_saved_file_equals_that_of_the_command(name: str, edits: str, saved, monkeypatch):
+    case = saved[name, edits]
+    source, target = Path(case["source"]), Path(case["target"])
+    monkeypatch.chdir(source.parent)
     monkeypatch.setattr("hyrfpack.edit.run.MAX_COMPARED_VIEWS", 1)
 
-    script = Path(__file__).with_name("rewrite.mjs")
-    answer = run_script(script, path, tmp_path / "actions.json", writer_name(), target)
-    profile = [] if answer["keeps"] else ["--profile", "raw"]  # because pages cannot compress
-    edit.main([*shlex.split(answer["command"])[2:], *profile], standalone_mode=False)
+    profile = [] if case["keeps"] else ["--profile", "raw"]  # because pages cannot compress
+    edit.main([*shlex.split(case["command"])[2:], *profile], standalone_mode=False)
 
-    assert answer["keeps"] == ("min-opacity" not in str(actions))
-    with Container.open(target) as saved, Container.open(tmp_path / "scene-edited.hyrf") as written:
-        assert list(saved.entries) == list(written.entries)
+    written_file = source.with_name("scene-edited.hyrf")
+    assert case["keeps"] == ("min-opacity" not in str(case["actions"]))
+    with Container.open(target) as saved_file, Container.open(written_file) as written:
+        assert list(saved_file.entries) == list(written.entries)
         for section in written.entries:
             if section != METADATA:
-                assert bytes(saved[section].data) == bytes(written[section].data)
-            assert saved.entries[section].codec == written.entries[section].codec
-        assert_equal_numbers(vars(read_metadata(saved)), vars(read_metadata(written)))
-    assert target.read_bytes()[:16] == (tmp_path / "scene-edited.hyrf").read_bytes()[:16]  # with the format version
+                assert bytes(saved_file[section].data) == bytes(written[section].data)
+            assert saved_file.entries[section].codec == written.entries[section].codec
+        assert_equal_numbers(vars(read_metadata(saved_file)), vars(read_metadata(written)))
+    assert target.read_bytes()[:16] == written_file.read_bytes()[:16]  # with the format version

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -18,21 +19,64 @@ STRICT_FLAGS = (
 ).split()
 
 
-@pytest.fixture
-def project(tmp_path: Path) -> Path:
-    """Return a folder in which a copy of hyrf.js is installed, without the sources of its modules."""
-    installed = tmp_path / "node_modules" / "hyrf.js"
+MISTAKES = [
+    "void read('scene.hyrf');",
+    "void openRemoteModel(5);",
+    "void openRemoteModel('a', { onOrder: (order: string) => order });",
+    "export const levels: string = gridLevels({});",
+]
+MODULES = [name for name in list_public_modules() if name != "remote_worker.js"]
+
+
+def exported_names() -> dict[str, list[str]]:
+    """Return the names that each module exports, by module."""
+    code = f"""
+        const names = {{}};
+        for (const module of {json.dumps(MODULES)}) names[module] = Object.keys(await import(`./${{module}}`));
+        console.log(JSON.stringify(names));"""
+    command = ["node", "--input-type=module", "-e", code]
+    done = subprocess.run(command, cwd=HYRF_FOLDER, capture_output=True, text=True, check=True)
+    return json.loads(done.stdout)
+
+
+def declare_names(module: str, names: list[str]) -> str:
+    """Return a program that compiles only if a module declares these names and no others."""
+    address = "hyrf.js" if module == "index.js" else f"hyrf.js/{module}"
+    listed = ", ".join(f"{name}: true" for name in names)
+    declared = "{ [Name in keyof typeof all]: true }"
+    return f'import * as all from "{address}";\nexport const names: {declared} = {{ {listed} }};\n'
+
+
+@pytest.fixture(scope="module")
+def error_lines(compiler: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[int]]:
+    """Return the lines with type errors in each program, by the program's name.
+
+    The compiler checks all programs at once, because its start takes most of the time. They are in a folder in which a
+    copy of hyrf.js is installed, without the sources of its modules.
+    """
+    folder = tmp_path_factory.mktemp("programs")
+    installed = folder / "node_modules" / "hyrf.js"
     installed.mkdir(parents=True)
     shutil.copy(HYRF_FOLDER / "package.json", installed)
     shutil.copytree(TYPES_FOLDER, installed / "types")
-    (tmp_path / "package.json").write_text('{"type": "module"}')
-    return tmp_path
+    (folder / "package.json").write_text('{"type": "module"}')
 
+    programs = {"user.ts": USER_FILE.read_text()}
+    for number, mistake in enumerate(MISTAKES):
+        programs[f"mistake{number}.ts"] = f"{USER_FILE.read_text()}\n{mistake}\n"
+    for module, names in exported_names().items():
+        assert names, module
+        programs[f"{module}.all.ts"] = declare_names(module, names)
+        programs[f"{module}.fewer.ts"] = declare_names(module, names[1:])
+    for name, text in programs.items():
+        (folder / name).write_text(text)
 
-def compile_file(compiler: Path, project: Path, text: str) -> subprocess.CompletedProcess:
-    (project / "user.ts").write_text(text)
-    command = ["node", str(compiler), *STRICT_FLAGS, "--types", "", "user.ts"]
-    return subprocess.run(command, cwd=project, capture_output=True, text=True, timeout=120)
+    command = ["node", str(compiler), *STRICT_FLAGS, "--types", "", *programs]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120)
+    lines: dict[str, list[int]] = {name: [] for name in programs}
+    for name, line in re.findall(r"^(\S.*?)\((\d+),\d+\): error ", done.stdout, re.MULTILINE):
+        lines[name].append(int(line))
+    return lines
 
 
 def test_the_declarations_were_made_from_the_current_modules(compiler):
@@ -40,42 +84,17 @@ def test_the_declarations_were_made_from_the_current_modules(compiler):
     assert stored == build_types(), "a module has changed: run 'make player'"
 
 
-def test_strict_typescript_compiles_a_program_of_a_user(compiler, project):
-    done = compile_file(compiler, project, USER_FILE.read_text())
-    assert done.returncode == 0, done.stdout
+def test_strict_typescript_compiles_a_program_of_a_user(error_lines):
+    assert error_lines["user.ts"] == []
 
 
-@pytest.mark.parametrize(
-    "mistake",
-    [
-        "void read('scene.hyrf');",
-        "void openRemoteModel(5);",
-        "void openRemoteModel('a', { onOrder: (order: string) => order });",
-        "export const levels: string = gridLevels({});",
-    ],
-)
-def test_mistakes_are_type_errors(compiler, project, mistake):
-    done = compile_file(compiler, project, f"{USER_FILE.read_text()}\n{mistake}\n")
-    assert done.returncode != 0
+@pytest.mark.parametrize("number", range(len(MISTAKES)), ids=MISTAKES)
+def test_mistakes_are_type_errors(error_lines, number):
     last = len(USER_FILE.read_text().splitlines()) + 2
-    assert done.stdout.startswith(f"user.ts({last},"), done.stdout
+    assert error_lines[f"mistake{number}.ts"][0] == last
 
 
-@pytest.mark.parametrize("module", [name for name in list_public_modules() if name != "remote_worker.js"])
-def test_every_exported_name_is_declared_and_no_other(compiler, project, module):
-    code = f"console.log(JSON.stringify(Object.keys(await import('./{module}'))))"
-    done = subprocess.run(
-        ["node", "--input-type=module", "-e", code], cwd=HYRF_FOLDER, capture_output=True, text=True, check=True
-    )
-    names = json.loads(done.stdout)
-    assert names
-    address = "hyrf.js" if module == "index.js" else f"hyrf.js/{module}"
-    listed = ", ".join(f"{name}: true" for name in names)
-    declared = "{ [Name in keyof typeof all]: true }"
-    text = f'import * as all from "{address}";\nexport const names: {declared} = {{ {listed} }};'
-
-    done = compile_file(compiler, project, text)
-
-    assert done.returncode == 0, done.stdout
-    fewer = text.replace(f"{names[0]}: true", "")
-    assert compile_file(compiler, project, fewer).returncode != 0, "the check does not see a missing name"
+@pytest.mark.parametrize("module", MODULES)
+def test_every_exported_name_is_declared_and_no_other(error_lines, module):
+    assert error_lines[f"{module}.all.ts"] == []
+    assert error_lines[f"{module}.fewer.ts"], "the check does not see a missing name"
