@@ -204,11 +204,11 @@ def _score_both_files(before: Path, after: Path, scene: Scene | None, progress: 
     if scene is None or not scene.test:
         return {}
     from hyrfpack.evaluate import evaluate_model
-    from hyrfpack.format import load_model
+    from hyrfpack.format.parts import load_model_or_parts
     from hyrfpack.progress import part_of_progress
 
-    old = evaluate_model(load_model(before), scene.test, progress=part_of_progress(progress, 0.0, 0.5))
-    new = evaluate_model(load_model(after), scene.test, progress=part_of_progress(progress, 0.5, 1.0))
+    old = evaluate_model(load_model_or_parts(before), scene.test, progress=part_of_progress(progress, 0.0, 0.5))
+    new = evaluate_model(load_model_or_parts(after), scene.test, progress=part_of_progress(progress, 0.5, 1.0))
     return {"psnr_before": old.psnr, "psnr": new.psnr, "ssim_before": old.ssim, "ssim": new.ssim}
 
 

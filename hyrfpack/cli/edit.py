@@ -171,7 +171,11 @@ _ACTION_BY_OPTION: dict[str, Callable[[Any], Action]] = {
     help="Rotate the scene about the origin so that its up direction becomes +y, as in three.js, Unity and glTF, or "
     "+z, as in Blender, Unreal and CAD.",
 )
-@click.option("--part", metavar="NAME", help="The part of a merged file that is taken out and edited.")
+@click.option(
+    "--part",
+    metavar="NAME",
+    help="The part of a merged file that is taken out and edited.  [default: all parts together]",
+)
 @click.option(
     "--profile",
     type=click.Choice(PROFILES),
@@ -222,6 +226,7 @@ def edit(
       hyrfpack edit room.hyrf -o hole.hyrf --crop-box=-1,-1,-1,1,1,1 --invert
       hyrfpack edit survey.hyrf -o meters.hyrf --scale 2.54
       hyrfpack edit bonsai.hyrf -o upright.hyrf --up auto --upright z --center
+      hyrfpack edit furnished.hyrf -o corner.hyrf --crop-box=-1,-1,-1,1,1,1
       hyrfpack edit furnished.hyrf -o chair.hyrf --part chair
     """
     actions = _read_actions(options_in_order(ctx, values))

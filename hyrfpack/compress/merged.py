@@ -1,24 +1,46 @@
-"""Compression of merged files: each part by itself."""
+"""Compression of merged files: each part by itself, or all to one distortion, within limits on the whole file."""
 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from hyrfpack.format.container import Container
-from hyrfpack.format.info import FileReport, describe_file, section_sizes
+from hyrfpack.compress.limits import EncodedCandidate
+from hyrfpack.compress.packer import Packer
+from hyrfpack.data.masked_views import mask_view
+from hyrfpack.errors import HyrfError
+from hyrfpack.format.container import Container, read_container
+from hyrfpack.format.info import FileReport
 from hyrfpack.format.part_names import open_parts
-from hyrfpack.format.parts import write_parts
+from hyrfpack.format.parts import decode_parts, encode_parts, write_parts
 from hyrfpack.format.sections import PART_NAMES, SECTION_CONTENTS
+from hyrfpack.model import HybridModel
+from hyrfpack.model.merged import MergedModel
 from hyrfpack.outputs import StrPath
 from hyrfpack.progress import Progress, part_of_progress
+from hyrfpack.render import render_view
+from hyrfpack.scene import View
+
+# A pixel shows the scene if the other parts change none of its channels by more.
+MAX_SCENE_DIFFERENCE = 8 / 255
 
 
 def is_merged(path: Path) -> bool:
     """Return whether a file holds several models."""
     with Container.open(path, SECTION_CONTENTS) as container:
         return PART_NAMES in container.entries
+
+
+def iterate_parts(source: Path, progress: Progress) -> Iterator[tuple[str, Path, Progress]]:
+    """Yield name, file and progress of each part of a merged file. A file lasts until the next one is asked for."""
+    with Container.open(source, SECTION_CONTENTS) as container, tempfile.TemporaryDirectory() as folder:
+        models = open_parts(container)
+        for number, (name, part) in enumerate(models):
+            loose = Path(folder, "part.hyrf")
+            loose.write_bytes(part.read_bytes())
+            yield name, loose, part_of_progress(progress, number / len(models), (number + 1) / len(models))
 
 
 def compress_parts(
@@ -38,17 +60,71 @@ def compress_parts(
         progress: called with `TaskEvent`s.
         overwrite: replace a file at `target`.
     """
-    parts, bytes_before = [], 0
-    with Container.open(source, SECTION_CONTENTS) as container, tempfile.TemporaryDirectory() as folder:
-        models = open_parts(container)
-        for number, (name, part) in enumerate(models):
-            loose, packed = Path(folder, "part.hyrf"), Path(folder, "packed.hyrf")
-            loose.write_bytes(part.read_bytes())
-            share = part_of_progress(progress, number / len(models), (number + 1) / len(models))
-            bytes_before += compress_part(loose, packed, share).bytes_before
-            parts.append((name, packed.read_bytes()))
-    written = write_parts(parts, target, overwrite=overwrite)
-    facts = describe_file(written)
-    with Container.open(written, SECTION_CONTENTS) as container:
-        sizes = section_sizes(container)
-    return FileReport(written, facts["profile"], facts["gaussians"], bytes_before, facts["bytes"], sizes)
+    parts = []
+    for name, loose, share in iterate_parts(source, progress):
+        packed = loose.with_name("packed.hyrf")
+        compress_part(loose, packed, share)
+        parts.append((name, packed.read_bytes()))
+    return write_parts(parts, target, overwrite=overwrite)
+
+
+@dataclass(frozen=True)
+class MergedPacker:
+    """Encodes all parts of a merged file at one distortion.
+
+    Attributes:
+        names: names of the parts.
+        packers: the packer of each part.
+    """
+
+    names: Sequence[str]
+    packers: Sequence[Packer]
+
+    @property
+    def model(self) -> MergedModel:
+        """The models that are encoded."""
+        return MergedModel(tuple(self.names), tuple(packer.model for packer in self.packers))
+
+    def encode(self, distortion: float, progress: Progress) -> EncodedCandidate:
+        """Encode a file of which each part adds an estimated `distortion` to the mean squared error of its pictures."""
+        parts, errors, count = [], [], len(self.packers)
+        for number, (name, packer) in enumerate(zip(self.names, self.packers, strict=True)):
+            share = part_of_progress(progress, number / count, (number + 1) / count)
+            candidate = packer.encode(distortion, share)
+            parts.append((name, candidate.data))
+            errors.append(candidate.predicted_errors)
+        sums = {key: sum(error.get(key, 0.0) for error in errors) / count for error in errors for key in error}
+        return EncodedCandidate(encode_parts(parts), sums)
+
+    def decode(self, candidate: EncodedCandidate) -> HybridModel | MergedModel:
+        """Decode a file."""
+        model = decode_parts(read_container(candidate.data, SECTION_CONTENTS))
+        device = self.packers[0].model.gaussians.positions.device
+        assert isinstance(model, MergedModel)
+        return replace(model, parts=tuple(part.to(device) for part in model.parts))
+
+
+def mask_scene_views(model: MergedModel, views: Sequence[View]) -> list[View]:
+    """Return photos of the scene, of which only the pixels count in which no other part is seen.
+
+    Photos do not show the other parts, and that error would hide the error that compression adds.
+
+    Raises:
+        HyrfError: the other parts cover all photos.
+    """
+    decoded, alone = model.decode(), model.scene.decode()
+    masked = []
+    for view in views:
+        pictures = (
+            render_view(model, view.camera, decoded=decoded).rgb,
+            render_view(model.scene, view.camera, decoded=alone).rgb,
+        )
+        shows_scene = (pictures[0] - pictures[1]).abs().amax(-1) <= MAX_SCENE_DIFFERENCE
+        if shows_scene.any():
+            masked.append(mask_view(view, shows_scene.numpy(force=True)))
+    if not masked:
+        raise HyrfError(
+            "other parts cover every pixel of the photos, so no loss of PSNR can be measured there",
+            fix="use `target_bytes` instead of `max_psnr_drop`",
+        )
+    return masked

@@ -6,21 +6,25 @@ import dataclasses
 import logging
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import count
 
 import torch
 
 from hyrfpack.cameras.capture import has_mean_exposure
-from hyrfpack.compress.distortion import DISTORTION_RANGE
 from hyrfpack.compress.finetune import finetune, fit_residual_gains
+from hyrfpack.compress.limits import (
+    FINETUNED_SEARCH_TRIALS,
+    SEARCH_TRIALS,
+    EncodedCandidate,
+    encode_within_bytes,
+    encode_within_psnr_drop,
+)
 from hyrfpack.compress.part_errors import predict_errors
 from hyrfpack.compress.plan import make_plan
 from hyrfpack.compress.quantize import quantize
 from hyrfpack.compress.reference_renders import ReferenceRenders
-from hyrfpack.compress.search import find_coarsest, find_fullest
 from hyrfpack.compress.sensitivity import Sensitivity
 from hyrfpack.data import PictureCache
-from hyrfpack.errors import HyrfError, HyrfSizeError
+from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import evaluate_model
 from hyrfpack.format.codec import decode_model, encode_model
 from hyrfpack.model import HybridModel
@@ -40,26 +44,6 @@ MAX_CORRECTIONS = 3
 # The distortion changes at most by these ratios from one file to the next.
 MAX_COARSENING_RATIO = 2.0
 MAX_REFINING_RATIO = 16.0
-# Fine-tuning takes long, so a search over fine-tuned files makes fewer trials.
-SEARCH_TRIALS = 9
-FINETUNED_SEARCH_TRIALS = 4
-
-
-@dataclass(frozen=True)
-class EncodedCandidate:
-    """An encoded file of the model, and the errors of its pictures.
-
-    Attributes:
-        data: the bytes of the file.
-        predicted_errors: predicted mean squared error that compression adds to pictures, by section and for PRUNED_KEY.
-        measured_error: mean squared error measured on renders; 0 if it was not measured.
-        psnr_drop: measured loss of PSNR in dB; 0 if it was not measured.
-    """
-
-    data: bytes
-    predicted_errors: dict[str, float]
-    measured_error: float = 0.0
-    psnr_drop: float = 0.0
 
 
 @dataclass
@@ -190,71 +174,18 @@ class Packer:
         return candidate, distortion
 
     def encode_within_bytes(self, limit: int, start: float) -> tuple[EncodedCandidate, str]:
-        """Search for the best file of at most `limit` bytes, from distortion `start`; return it and a description.
-
-        Raises:
-            HyrfSizeError: even the largest distortion gives a larger file.
-        """
-        rounds = count()
-
-        def encode_candidate(distortion: float) -> EncodedCandidate:
-            candidate = self.encode(distortion, round_of_progress(self.progress, next(rounds)))
-            _LOG.info(f"distortion {distortion:.2g}: {len(candidate.data):,} bytes")
-            return candidate
-
-        answer = find_fullest(
-            encode_candidate, lambda candidate: len(candidate.data), limit, start, self._max_trials(), DISTORTION_RANGE
-        )
-        if answer is None:
-            smallest = len(self.encode(DISTORTION_RANGE[1]).data)
-            raise HyrfSizeError(
-                f"the model does not fit into {limit:,} bytes, and the smallest possible size is about {smallest:,} "
-                "bytes",
-                fix="use a larger target size, or train with fewer Gaussians (`max_gaussians`)",
-                min_bytes=smallest,
-            )
-        distortion, candidate = answer
-        return candidate, f"distortion {distortion:.2g} gives {len(candidate.data):,} of {limit:,} bytes"
+        """Search for the best file of at most `limit` bytes; see `limits.encode_within_bytes`."""
+        return encode_within_bytes(self.encode, limit, start, self.progress, self._max_trials())
 
     def encode_within_psnr_drop(self, limit: float, start: float) -> tuple[EncodedCandidate, str]:
-        """Search for the smallest file that loses at most `limit` dB of PSNR; return it and a description.
+        """Search for the smallest file that loses at most `limit` dB of PSNR; see `limits.encode_within_psnr_drop`.
 
         The loss is measured on the held-out photos, or on the training photos if none are held out.
-
-        Raises:
-            HyrfError: even the smallest distortion loses more.
         """
         assert self.scene is not None
         views = self.scene.test or self.scene.train
-        self.progress(TaskEvent("scoring the model", 0.0))
-        before = evaluate_model(self.model, views).psnr
-        rounds = count()
-
-        def encode_candidate(distortion: float) -> EncodedCandidate:
-            progress = round_of_progress(self.progress, next(rounds))
-            candidate = self.encode(distortion, part_of_progress(progress, 0.0, 0.7))
-            progress(TaskEvent("scoring the file", 0.7))
-            psnr_drop = before - evaluate_model(self.decode(candidate), views).psnr
-            candidate = dataclasses.replace(candidate, psnr_drop=psnr_drop)
-            _LOG.info(f"distortion {distortion:.2g}: {len(candidate.data):,} bytes, {psnr_drop:+.3f} dB lost")
-            return candidate
-
-        answer = find_coarsest(
-            encode_candidate,
-            lambda candidate: candidate.psnr_drop <= limit,
-            start,
-            self._max_trials(),
-            DISTORTION_RANGE,
-        )
-        if answer is None:
-            raise HyrfError(
-                f"even the finest file loses more than {limit:g} dB of PSNR",
-                fix="use a larger `max_psnr_drop`, or profile 'raw'",
-            )
-        distortion, candidate = answer
-        return (
-            candidate,
-            f"distortion {distortion:.2g} loses {candidate.psnr_drop:+.3f} of {limit:g} dB on {len(views)} photos",
+        return encode_within_psnr_drop(
+            self.encode, self.decode, self.model, views, limit, start, self.progress, self._max_trials()
         )
 
     @cached_property

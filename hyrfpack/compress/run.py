@@ -11,8 +11,10 @@ from hyrfpack.cameras.capture import Capture
 from hyrfpack.checks import check_type
 from hyrfpack.compress.calibrate import measure_calibrated_sensitivity
 from hyrfpack.compress.distortion import DEFAULT_PSNR_DROP_DB, default_distortion
-from hyrfpack.compress.merged import compress_parts, is_merged
-from hyrfpack.compress.packer import EncodedCandidate, Packer
+from hyrfpack.compress.limits import EncodedCandidate, encode_within_bytes, encode_within_psnr_drop
+from hyrfpack.compress.merged import MergedPacker, compress_parts, is_merged, iterate_parts, mask_scene_views
+from hyrfpack.compress.packer import Packer
+from hyrfpack.compress.reference_renders import ReferenceRenders
 from hyrfpack.compress.report import CompressionReport
 from hyrfpack.compress.sensitivity import Sensitivity
 from hyrfpack.config.compress import CompressConfig
@@ -22,6 +24,7 @@ from hyrfpack.errors import HyrfError
 from hyrfpack.format.codec import load_with_provenance, packed_provenance, repack, write_model
 from hyrfpack.format.info import FileReport, describe_file
 from hyrfpack.format.min_file_size import check_target_bytes
+from hyrfpack.format.parts import write_merged
 from hyrfpack.format.run_folder import find_model
 from hyrfpack.out_of_memory import explain_out_of_memory
 from hyrfpack.outputs import Outputs, StrPath
@@ -50,13 +53,14 @@ def compress_model(
 
     Profile "compact" measures at the cameras of `data`, or at those stored in the file. On the CPU the same input gives
     the same bytes. On a GPU sums of gradients vary in their last bits, and so may the bytes. The parts of a merged file
-    are compressed each by itself.
+    are compressed each by itself; within a limit, all to the same distortion.
 
     Args:
         source: a file of any profile, best "raw", or the folder of a run.
         target: the file to write.
         config: the settings.
-        data: photos of the scene, for profile "compact" only. Fine-tuning and limits on PSNR need them.
+        data: photos of the scene, for profile "compact" only. Fine-tuning and limits on PSNR need them. Those of a
+            merged file show its first part.
         overwrite: replace a file at `target`. If False, an existing file is an error. A file that appears in the
             meantime is kept, and the result is written beside it under a free name, which the report names.
         context: device, processes and progress. The processes share the photos of fine-tuning.
@@ -107,26 +111,86 @@ def compress_model(
 def _compress_merged(
     source: Path, target: StrPath, config: CompressConfig, data: Scene | None, overwrite: bool, context: RunContext
 ) -> CompressionReport:
-    """Compress each part of a merged file by itself, and write a merged file of the results."""
-    one_model = (data, config.target_bytes, config.finetune_steps)  # A limit on the loss of PSNR needs data.
-    if any(setting is not None for setting in one_model) or not (context.ranks or SINGLE_PROCESS).is_single:
+    """Compress the parts of a merged file: within a limit to one distortion, else each part by itself."""
+    if config.finetune_steps or not (context.ranks or SINGLE_PROCESS).is_single:
         raise HyrfError(
-            f"{source}: it holds merged models, and photos, a target size and several processes are for one model",
+            f"{source}: it holds merged models, and fine-tuning and several processes are for one model",
             fix="leave them out, or compress the models before they are merged",
         )
+    if config.target_bytes is not None or config.max_psnr_drop is not None:
+        with context.open_progress("compress") as progress:
+            candidate, found = _encode_merged(source, config, data, context, progress)
+        written = write_merged(candidate.data, target, overwrite=overwrite)
+        total = sum(candidate.predicted_errors.values())
+        shares = {part: error / (total or 1.0) for part, error in candidate.predicted_errors.items()}
+        return CompressionReport(**vars(written), shares=shares, error=total, found=found)
+    photos = data  # which show the first part, the scene
 
     def compress_part(loose: Path, packed: Path, progress: Progress) -> FileReport:
-        return compress_model(loose, packed, config, context=replace(context, progress=progress))
+        nonlocal photos
+        own, photos = photos, None
+        return compress_model(loose, packed, config, data=own, context=replace(context, progress=progress))
 
     with context.open_progress("compress") as progress:
         written = compress_parts(source, target, compress_part, progress, overwrite=overwrite)
     return CompressionReport(**vars(written))
 
 
+def _encode_merged(
+    source: Path, config: CompressConfig, data: Scene | None, context: RunContext, progress: Progress
+) -> tuple[EncodedCandidate, str]:
+    """Encode all parts of a merged file within a limit; return the file, and the outcome of the search."""
+    names, packers, start = list[str](), list[Packer](), 0.0
+    for name, part, share in iterate_parts(source, part_of_progress(progress, 0.0, SEARCH_ENCODING_START_SHARE)):
+        photos = None if packers else data
+        packer, _, distortion = _prepare_packer(
+            part, replace(config, target_bytes=None), photos, context, share, progress
+        )
+        start = start or distortion  # that of the scene
+        names.append(name)
+        packers.append(packer)
+    merged = MergedPacker(names, packers)
+    searching = part_of_progress(progress, SEARCH_ENCODING_START_SHARE, 1.0)
+    if config.target_bytes is not None:
+        return encode_within_bytes(merged.encode, config.target_bytes, start, searching)
+    assert data is not None and config.max_psnr_drop is not None
+    views = mask_scene_views(merged.model, data.test or data.train)
+    return encode_within_psnr_drop(
+        merged.encode, merged.decode, merged.model, views, config.max_psnr_drop, start, searching
+    )
+
+
 def _encode_compact(
     source: Path, config: CompressConfig, data: Scene | None, context: RunContext, progress: Progress
 ) -> tuple[EncodedCandidate, str, Sensitivity]:
     """Encode a file with profile "compact"; return it, the outcome of a search as a sentence, and the sensitivities."""
+    searches = config.target_bytes is not None or config.max_psnr_drop is not None
+    encoding_start = SEARCH_ENCODING_START_SHARE if config.finetune_steps or searches else ENCODING_START_SHARE
+    measuring, encoding = (
+        part_of_progress(progress, 0.0, encoding_start),
+        part_of_progress(progress, encoding_start, 1.0),
+    )
+    packer, references, start = _prepare_packer(source, config, data, context, measuring, encoding)
+    sensitivity = packer.sensitivity
+    if config.target_bytes is not None:
+        return *packer.encode_within_bytes(config.target_bytes, start), sensitivity
+    if config.max_psnr_drop is not None:
+        return *packer.encode_within_psnr_drop(config.max_psnr_drop, start), sensitivity
+    if config.finetune_steps:
+        return packer.encode(start, encoding), "", sensitivity
+    target_drop = DEFAULT_PSNR_DROP_DB if config.distortion is None else None
+    return packer.encode_to_distortion(start, references, target_drop), "", sensitivity
+
+
+def _prepare_packer(
+    source: Path,
+    config: CompressConfig,
+    data: Scene | None,
+    context: RunContext,
+    measuring_progress: Progress,
+    encoding_progress: Progress,
+) -> tuple[Packer, ReferenceRenders, float]:
+    """Measure sensitivities of a model; return its packer, renders of it, and the distortion to start from."""
     ranks = context.ranks or SINGLE_PROCESS
     model, provenance = load_with_provenance(source)
     kept = packed_provenance(provenance, model)
@@ -143,22 +207,11 @@ def _encode_compact(
     _LOG.info(f"measuring how each stored number affects renders, at {len(cameras)} cameras and between them")
     steps = config.finetune_steps or 0
     start = config.distortion or default_distortion(provenance, steps)
-    searches = config.target_bytes is not None or config.max_psnr_drop is not None
-    encoding_start = SEARCH_ENCODING_START_SHARE if steps or searches else ENCODING_START_SHARE
-    measuring_progress = part_of_progress(progress, 0.0, encoding_start)
     sensitivity, references = measure_calibrated_sensitivity(model, cameras, start, config.prune, measuring_progress)
     sensitivity = ranks.broadcast(sensitivity)  # on GPUs the other ranks' values differ in their last bits
-    encoding_progress = part_of_progress(progress, encoding_start, 1.0)
     cache = context.cache or PictureCache()
     packer = Packer(model, kept, sensitivity, data, steps, config.prune, encoding_progress, cache, ranks)
-    if config.target_bytes is not None:
-        return *packer.encode_within_bytes(config.target_bytes, start), sensitivity
-    if config.max_psnr_drop is not None:
-        return *packer.encode_within_psnr_drop(config.max_psnr_drop, start), sensitivity
-    if steps:
-        return packer.encode(start, encoding_progress), "", sensitivity
-    target_drop = DEFAULT_PSNR_DROP_DB if config.distortion is None else None
-    return packer.encode_to_distortion(start, references, target_drop), "", sensitivity
+    return packer, references, start
 
 
 def check_request(config: CompressConfig, data: Scene | None) -> None:

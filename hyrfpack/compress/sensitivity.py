@@ -99,10 +99,7 @@ def measure_sensitivity(
     Raises:
         HyrfError: a number of the model is NaN or infinite.
     """
-    count = (
-        int(np.clip(TARGET_DRAWN_GAUSSIANS // max(len(model), 1), MIN_SENSITIVITY_VIEWS, MAX_SENSITIVITY_VIEWS)) // 2
-    )
-    at, between = sample_views(cameras, count, seed)
+    at, between = sample_views(cameras, choose_view_count(len(model)), seed)
     views = [view for pair in zip(at, between, strict=True) for view in pair]
     field_interval = max(1, round(1 / FIELD_VIEW_SHARE))
     generator = torch.Generator().manual_seed(seed)
@@ -136,6 +133,11 @@ def measure_sensitivity(
     return _combine(model, squares, pixels, field_pixels, at, jacobian)
 
 
+def choose_view_count(gaussians: int) -> int:
+    """Return the number of views at cameras, and between them, in which a model of so many Gaussians is measured."""
+    return int(np.clip(TARGET_DRAWN_GAUSSIANS // max(gaussians, 1), MIN_SENSITIVITY_VIEWS, MAX_SENSITIVITY_VIEWS)) // 2
+
+
 @torch.no_grad()
 def _combine(
     model: HybridModel,
@@ -152,14 +154,7 @@ def _combine(
     explicit = []
     for name, guess in expected.items():
         measured = squares[f"gaussians.{name}"].double().mean(dim=1).cpu().numpy() / pixels
-        # Few views give a noisy measurement, and a Gaussian that none of them shows may be visible in others.
-        explicit.append(
-            np.maximum(
-                (views * measured + PRIOR_WEIGHT_VIEWS * _fit_prior(model, measured, guess))
-                / (views + PRIOR_WEIGHT_VIEWS),
-                1e-30,
-            )
-        )
+        explicit.append(combine_with_prior(model, measured, guess, views))
     fields = {
         group: np.concatenate([squares[name].double().cpu().numpy().ravel() for name in SECTION_PARAMETERS[group]])
         / field_pixels
@@ -177,6 +172,15 @@ def _combine(
     positions, colors, scales, opacities = explicit
     removals = removal_error(geometry.opacities.double().cpu().numpy(), opacities)
     return Sensitivity(positions, colors, scales, opacities, removals, fields)
+
+
+def combine_with_prior(model: HybridModel, measured: np.ndarray, guess: np.ndarray, views: int) -> np.ndarray:
+    """Average sensitivities (N,) measured in a number of views with estimates, which are known up to a factor.
+
+    Few views give a noisy measurement, and a Gaussian that none of them shows may be visible in others.
+    """
+    prior = _fit_prior(model, measured, guess)
+    return np.maximum((views * measured + PRIOR_WEIGHT_VIEWS * prior) / (views + PRIOR_WEIGHT_VIEWS), 1e-30)
 
 
 def removal_error(opacities: np.ndarray, logit_sensitivity: np.ndarray) -> np.ndarray:
@@ -224,6 +228,28 @@ def _expected_sensitivity(
     The derivative of such a pixel is at most o with respect to the Gaussian's colour. With respect to its opacity logit
     it is at most o (1 - o), and with respect to its position o / (a b)^(1/2).
     """
+    seen, area = _expected_light(model, geometry, cameras)
+    stretched = jacobian.double().square().sum(dim=(1, 2))
+    guesses = {
+        "positions": seen * stretched / area.clamp_min(1e-12),
+        "color_logits": seen,
+        "scale_logits": seen,
+    }
+    numbers = {name: values.cpu().numpy() for name, values in guesses.items()}
+    return {**numbers, "opacity_logits": expected_opacity_sensitivity(model, geometry, cameras)}
+
+
+@torch.no_grad()
+def expected_opacity_sensitivity(model: HybridModel, geometry: Geometry, cameras: Sequence[Camera]) -> np.ndarray:
+    """Estimate the sensitivity (N,) of the opacity logits of unoccluded Gaussians, up to a factor."""
+    seen, _ = _expected_light(model, geometry, cameras)
+    return (seen * (1 - geometry.opacities.double()).clamp_min(1e-3) ** 2).cpu().numpy()
+
+
+def _expected_light(
+    model: HybridModel, geometry: Geometry, cameras: Sequence[Camera]
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the sum over cameras of the share of the picture times opacity squared (N,), and the area (N,)."""
     sides = geometry.scales.double().sort(dim=1).values
     area, opacities = sides[:, 1] * sides[:, 2], geometry.opacities.double()
     total = torch.zeros_like(area)
@@ -233,12 +259,4 @@ def _expected_sensitivity(
         place = torch.as_tensor(frame.to_local(camera.position)).to(positions)
         distance = torch.linalg.vector_norm(positions - place, dim=1).clamp_min(MIN_CAMERA_DISTANCE_LOCAL)
         total += (area * (camera.fx * camera.fy / (camera.width * camera.height)) / distance**2).clamp_max(1)
-    seen = total * opacities**2
-    stretched = jacobian.double().square().sum(dim=(1, 2))
-    guesses = {
-        "positions": seen * stretched / area.clamp_min(1e-12),
-        "color_logits": seen,
-        "scale_logits": seen,
-        "opacity_logits": seen * (1 - opacities).clamp_min(1e-3) ** 2,
-    }
-    return {name: values.cpu().numpy() for name, values in guesses.items()}
+    return total * opacities**2, area

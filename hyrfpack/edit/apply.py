@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,12 +21,44 @@ from hyrfpack.edit.select import keep_mask
 from hyrfpack.edit.state import EditState
 from hyrfpack.edit.transform import Placement, replace_config, unit_vector
 from hyrfpack.errors import HyrfError
-from hyrfpack.format.codec import load_with_provenance
+from hyrfpack.format.container import Container
 from hyrfpack.format.info import describe_file
+from hyrfpack.format.metadata import read_metadata
+from hyrfpack.format.part_names import open_parts
+from hyrfpack.format.parts import decode_parts
+from hyrfpack.format.sections import PART_NAMES, SECTION_CONTENTS
+from hyrfpack.model import HybridModel
+from hyrfpack.model.merged import MergedModel, map_parts, parts_of
 from hyrfpack.progress import Progress
 from hyrfpack.render import render_view
 from hyrfpack.scene import Camera, Scene
 from hyrfpack.splats.placement import upright_rotation
+
+_LOG = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class EditedPart:
+    """One model of the edited file: a part of a merged file, or the only model.
+
+    Attributes:
+        name: name of the part; "" for the only model of a file.
+        profile: profile of its file before the edit.
+        provenance: the provenance of the edited file.
+        before, after: the model before the first action and after the last one.
+    """
+
+    name: str
+    profile: str
+    provenance: dict
+    before: HybridModel
+    after: HybridModel
+
+    @property
+    def keeps_gaussians(self) -> bool:
+        """Return whether all numbers of the Gaussians are as before."""
+        before, after = (model.gaussians.parameters() for model in (self.before, self.after))
+        return all(torch.equal(old, new) for old, new in zip(before, after, strict=True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,26 +67,23 @@ class Edit:
 
     Attributes:
         path: the file that is edited.
-        profile: its profile.
         capture: the cameras and the viewpoint that the file keeps.
         before, after: the scene before the first action and after the last one.
         reports: what each action has done.
-        provenance: the provenance of the edited file.
+        parts: the models of the file that have Gaussians after the last action, in order.
     """
 
     path: Path
-    profile: str
     capture: Capture
     before: EditState
     after: EditState
     reports: list[ActionReport]
-    provenance: dict
+    parts: list[EditedPart]
 
     @property
-    def keeps_gaussians(self) -> bool:
-        """Return whether all numbers of the Gaussians are as before."""
-        before, after = (state.model.gaussians.parameters() for state in (self.before, self.after))
-        return all(torch.equal(old, new) for old, new in zip(before, after, strict=True))
+    def profile(self) -> str:
+        """Return the profile of the first model."""
+        return self.parts[0].profile
 
     def render(self, camera: Camera) -> tuple[Tensor, Tensor]:
         """Return renders (H, W, 3) of both scenes in [0, 1] from one camera, given in coordinates before the edit."""
@@ -65,18 +96,23 @@ def open_scene(path: Path, data: Scene | None, progress: Progress) -> Edit:
     """Read the scene of a file, to which no action has been applied.
 
     Args:
-        path: a file of one model.
+        path: a file of one model, or a merged file.
         data: photos of the scene, or None.
         progress: called with `TaskEvent`s by the actions.
 
     Raises:
         HyrfError: the file cannot be read, or holds no Gaussian.
     """
-    model, provenance = load_with_provenance(path)
-    facts = describe_file(path)
+    with Container.open(path, SECTION_CONTENTS) as container:
+        files = open_parts(container) if PART_NAMES in container.entries else [("", container)]
+        model, metadata = decode_parts(container), [read_metadata(part) for _, part in files]
     if not len(model):
         raise HyrfError(f"{path}: there is no Gaussian in it, so there is nothing to edit", fix="train it again")
-    capture = Capture(facts)
+    parts = [
+        EditedPart(name, facts.profile, facts.provenance, part, part)
+        for (name, _), facts, part in zip(files, metadata, parts_of(model), strict=True)
+    ]
+    capture, scene = Capture(describe_file(path)), parts[0]
     state = EditState(
         model,
         capture.cameras,
@@ -86,9 +122,9 @@ def open_scene(path: Path, data: Scene | None, progress: Progress) -> Edit:
         Placement(),
         progress,
         held_out=[] if data is None else list(data.test),
-        has_gains=model.exposure is not None or has_mean_exposure(provenance),
+        has_gains=scene.before.exposure is not None or has_mean_exposure(scene.provenance),
     )
-    return Edit(path, facts["profile"], capture, state, state, [], provenance)
+    return Edit(path, capture, state, state, [], parts)
 
 
 def apply_actions(edit: Edit, actions: Sequence[Action]) -> Edit:
@@ -106,13 +142,19 @@ def apply_actions(edit: Edit, actions: Sequence[Action]) -> Edit:
     for action in actions:
         state, report = _apply_action(action, state)
         reports.append(report)
-    provenance = edit.provenance if state.placement.is_identity else state.placement.move_provenance(edit.provenance)
+    names = state.model.names if isinstance(state.model, MergedModel) else ("",)
+    sources = {part.name: part for part in edit.parts}
+    parts = []
+    for name, after in zip(names, parts_of(state.model), strict=True):
+        part, placement = sources[name], state.placement
+        provenance = part.provenance if placement.is_identity else placement.move_provenance(part.provenance)
+        parts.append(replace(part, after=after, provenance=provenance))
     if any(isinstance(action, Up | EstimateUp) for action in actions):
         viewpoint = edit.capture.viewpoint
         camera = state.placement.move_camera(viewpoint.camera)
         turned = replace(viewpoint, center=state.center, up=state.up, camera=camera)
-        provenance = {**provenance, "viewpoint": turned.to_json()}
-    return replace(edit, after=state, reports=reports, provenance=provenance)
+        parts[0] = replace(parts[0], provenance={**parts[0].provenance, "viewpoint": turned.to_json()})
+    return replace(edit, after=state, reports=reports, parts=parts)
 
 
 def _apply_action(action: Action, state: EditState) -> tuple[EditState, ActionReport]:
@@ -126,7 +168,8 @@ def _apply_action(action: Action, state: EditState) -> tuple[EditState, ActionRe
     if isinstance(action, Up):
         return replace(state, up=unit_vector(action.direction)), report
     if isinstance(action, Background):
-        return replace(state, model=replace_config(state.model, background=False, solid=action.color)), report
+        changed = partial(replace_config, background=False, solid=action.color)
+        return replace(state, model=map_parts(changed, state.model)), report
     if isinstance(action, Refit):
         return _refit(action, state, report)
     if (step := _find_move(action, state)) is not None:
@@ -139,13 +182,34 @@ def _apply_action(action: Action, state: EditState) -> tuple[EditState, ActionRe
             f"'{action}' would leave no Gaussian; their centres lie between {low} and {high}",
             fix="change its numbers",
         )
-    kept = state.model.subset(torch.from_numpy(np.flatnonzero(keep)))
-    after = replace(state, model=kept.requires_grad_(False))
+    after = _keep(keep, state)
     return after, replace(report, gaussians_after=len(after.model))
+
+
+def _keep(keep: np.ndarray, state: EditState) -> EditState:
+    """Return the scene of the Gaussians in a mask (N,). Parts of a merged file that are left with none are left out."""
+    kept = map_parts(
+        lambda part: part.requires_grad_(False), state.model.subset(torch.from_numpy(np.flatnonzero(keep)))
+    )
+    if not isinstance(kept, MergedModel):
+        return replace(state, model=kept)
+    whole = kept.without_empty_parts()
+    for name in kept.names:
+        if name not in whole.names:
+            _LOG.info(f"part '{name}' has no Gaussian left, and is left out")
+    is_changed = whole.names[0] != kept.names[0]
+    if is_changed:
+        _LOG.info(f"the background, the viewpoint and the cameras of the file are those of part '{whole.names[0]}' now")
+    return replace(state, model=whole, has_scene=state.has_scene and not is_changed)
 
 
 def _refit(action: Refit, state: EditState, report: ActionReport) -> tuple[EditState, ActionReport]:
     """Train the Gaussians of a region; return the scene after it, and the scores of the region on held-out photos."""
+    if isinstance(state.model, MergedModel):
+        raise HyrfError(
+            "photos show one model, and this file holds several, so it cannot be trained on them",
+            fix="take the part out with `part`, train its region, and merge again",
+        )
     if not state.photos:
         raise HyrfError("a region is trained on photos, and there are none", fix="name the photos with `data`")
     is_selected = keep_mask(action.region, state)

@@ -115,19 +115,19 @@ def merge_models(
             fix="train both with the same `antialiased`",
         )
     written = write_parts([(part.name, data) for part, data in parts], target, overwrite=overwrite)
-    return MergeReport(written, Path(written).stat().st_size, [part for part, _ in parts])
+    return MergeReport(written.file, written.bytes_after, [part for part, _ in parts])
 
 
 def take_part(path: Path, part: str | None, folder: StrPath) -> Path:
-    """Return the path of a file of one model: `path` itself, or a copy in `folder` of a part of a merged file.
+    """Return `path` itself if `part` is None, or the path of a copy in `folder` of a part of a merged file.
 
     Raises:
-        HyrfError: the file is damaged, `part` is None for a merged file, or there is no such part.
+        HyrfError: the file is damaged, or there is no such part.
     """
+    if part is None:
+        return path
     with Container.open(path, SECTION_CONTENTS) as container:
         parts = dict(open_parts(container)) if PART_NAMES in container.entries else {}
-        if not parts and part is None:
-            return path
         if not parts:
             raise HyrfError(f"{path}: it holds one model and no parts", fix="leave out `part`")
         if part not in parts:

@@ -15,11 +15,11 @@ from hyrfpack.context import RunContext
 from hyrfpack.edit.apply import Edit, apply_actions, open_scene
 from hyrfpack.edit.merge import take_part
 from hyrfpack.edit.report import EditReport
-from hyrfpack.edit.write import choose_compression, write_edit
+from hyrfpack.edit.write import check_limits, write_edit
 from hyrfpack.evaluate import evaluate_model
 from hyrfpack.evaluate.figures import draw_comparison
 from hyrfpack.evaluate.metrics import psnr
-from hyrfpack.format.codec import load_model
+from hyrfpack.format.parts import load_model_or_parts
 from hyrfpack.format.run_folder import find_model
 from hyrfpack.outputs import Outputs, StrPath
 from hyrfpack.progress import Progress, TaskEvent, part_of_progress
@@ -46,14 +46,15 @@ def edit_model(
     """Apply actions to a `.hyrf` file in turn, and write the result to another file.
 
     Moves and backgrounds are exact: they change the file's metadata alone. Where Gaussians are removed, a file of
-    profile "compact" or "paper" is quantised again, as by `compress_model`.
+    profile "compact" or "paper" is quantised again, as by `compress_model`. All parts of a merged file are edited in
+    the world that they share, and parts that are left with no Gaussian are left out.
 
     Args:
         source: a file of any profile, or the folder of a run.
         target: the file to write. It may not be `source`.
         actions: actions of `hyrfpack.config.edit`, in order, at least one unless `part` or a limit is given. Each sees
             the result of the one before it, so positions after a move are new ones.
-        part: the part of a merged file that is taken out and edited.
+        part: the part of a merged file that is taken out and edited; None edits all parts together.
         profile: profile of the file to write; None keeps that of `source`, or takes "compact" for a limit.
         limits: largest size or largest loss of the file.
         data: photos of the scene. Held-out ones are scored before and after, others decide what a floater is, and are
@@ -63,8 +64,8 @@ def edit_model(
         context: progress. Edits run on the CPU.
 
     Raises:
-        HyrfError: a file cannot be read or written, no Gaussian would be left, `part` is missing for a merged file
-            or names none of its parts, or no file meets a limit.
+        HyrfError: a file cannot be read or written, no Gaussian would be left, `part` names none of its parts, an
+            action cannot be applied to a merged file, or no file meets a limit.
         TypeError: `actions` has something else than actions.
         ValueError: there is nothing to do.
 
@@ -82,11 +83,11 @@ def edit_model(
         outputs.file(picture, *PICTURE_ENDINGS)
     with tempfile.TemporaryDirectory() as folder, context.open_progress("edit") as progress:
         opened = open_scene(take_part(path, part, folder), data, part_of_progress(progress, 0, 0.3))
-        compression = choose_compression(opened, profile, limits, data)
+        check_limits(opened, profile, limits, data)
         edit = apply_actions(opened, actions)
         writing = replace(context, device="cpu", progress=part_of_progress(progress, 0.3, 0.8))
-        written = write_edit(edit, target, compression, data, overwrite, writing)
-        edit = replace(edit, after=replace(edit.after, model=load_model(written.file)))
+        written = write_edit(edit, target, profile, limits, data, overwrite, writing)
+        edit = replace(edit, after=replace(edit.after, model=load_model_or_parts(written.file)))
         report = _measure(edit, data, part_of_progress(progress, 0.8, 1))
         if picture is not None:
             _save_comparison(picture, edit, overwrite)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from hyrfpack.compress.sensitivity import measure_sensitivity
+from hyrfpack.compress.removals import measure_removals
 from hyrfpack.config.edit import (
     CropBox,
     CropCameras,
@@ -27,6 +27,7 @@ from hyrfpack.edit.masks import share_of_light_in_masks
 from hyrfpack.edit.polygon import clean_corners, find_inside
 from hyrfpack.edit.state import EditState
 from hyrfpack.errors import HyrfError
+from hyrfpack.model.merged import MergedModel, parts_of, scene_of
 
 
 @singledispatch
@@ -85,6 +86,11 @@ def _(action: CropPolygon, state: EditState) -> np.ndarray:
 def _(action: CropMasks, state: EditState) -> np.ndarray:
     if not state.photos:
         raise HyrfError("masks belong to photos, and there are none", fix="name the photos with `data`")
+    if isinstance(state.model, MergedModel):
+        raise HyrfError(
+            "masks of photos select Gaussians of one model, and this file holds several",
+            fix="take a part out with `part`, crop it, and merge again",
+        )
     views = assign_masks(state.photos, Path(action.folder))
     return share_of_light_in_masks(state.model, views, state.progress) >= action.min_light_share
 
@@ -101,8 +107,10 @@ def _(action: MinOpacity, state: EditState) -> np.ndarray:
 
 @keep_mask.register
 def _(action: MaxScale, state: EditState) -> np.ndarray:
-    longest = state.model.decode_geometry().scales.amax(dim=1).numpy()
-    return longest * state.model.config.frame.scale <= action.scale
+    longest = [
+        part.decode_geometry().scales.amax(dim=1).numpy() * part.config.frame.scale for part in parts_of(state.model)
+    ]
+    return np.concatenate(longest) <= action.scale
 
 
 @keep_mask.register
@@ -112,14 +120,18 @@ def _(action: RemoveFloaters, state: EditState) -> np.ndarray:
             "floaters are found by comparing the model with its photos, and there are none",
             fix="name the photos with `data`",
         )
-    return ~find_floaters(state.model, state.photos, action.min_opacity_share, state.progress)
+    keep = np.ones(len(state.model), bool)
+    if state.has_scene:
+        scene = scene_of(state.model)
+        keep[: len(scene)] = ~find_floaters(scene, state.photos, action.min_opacity_share, state.progress)
+    return keep
 
 
 @keep_mask.register
 def _(action: KeepGaussians, state: EditState) -> np.ndarray:
     keep = np.ones(len(state.model), bool)
     if action.count < len(keep):
-        removals = measure_sensitivity(state.model, state.cameras, progress=state.progress).removals
+        removals = measure_removals(state.model, state.cameras, progress=state.progress)
         keep[np.argsort(-removals, kind="stable")[action.count :]] = False
     return keep
 

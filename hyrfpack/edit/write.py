@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,15 +14,19 @@ from hyrfpack.compress.run import check_request
 from hyrfpack.config.compress import CompressConfig
 from hyrfpack.config.edit import EditLimits
 from hyrfpack.context import RunContext
-from hyrfpack.edit.apply import Edit
-from hyrfpack.edit.masked_views import mask_view
+from hyrfpack.data.masked_views import mask_view
+from hyrfpack.edit.apply import Edit, EditedPart
 from hyrfpack.errors import HyrfError, HyrfSizeError
-from hyrfpack.format.codec import packed_provenance, save_model, write_model
-from hyrfpack.format.container import Container
+from hyrfpack.format.codec import encode_model, packed_provenance, save_model, write_model
+from hyrfpack.format.container import Container, read_container
 from hyrfpack.format.info import FileReport
 from hyrfpack.format.min_file_size import check_target_bytes
+from hyrfpack.format.part_names import open_parts
+from hyrfpack.format.parts import encode_parts, write_merged
 from hyrfpack.format.rewrite import with_metadata
+from hyrfpack.format.sections import PART_NAMES, SECTION_CONTENTS
 from hyrfpack.outputs import StrPath
+from hyrfpack.progress import part_of_progress
 from hyrfpack.scene import Scene, View
 
 # A pixel counts as unchanged by an edit if no channel differs by more. Gaussians that are hardly seen change pixels by
@@ -29,8 +34,8 @@ from hyrfpack.scene import Scene, View
 MAX_UNCHANGED_DIFFERENCE = 8 / 255
 
 
-def choose_compression(edit: Edit, profile: str | None, limits: EditLimits, data: Scene | None) -> CompressConfig:
-    """Return the settings of the file to write, after a check that they suit the scene before its actions.
+def check_limits(edit: Edit, profile: str | None, limits: EditLimits, data: Scene | None) -> None:
+    """Check that the profile and the limits of the file to write suit the scene before its actions.
 
     Args:
         edit: the opened scene.
@@ -41,45 +46,95 @@ def choose_compression(edit: Edit, profile: str | None, limits: EditLimits, data
     Raises:
         HyrfError: the limits exclude each other or the profile, need photos, or no file can be that small.
     """
-    is_limited = limits != EditLimits()
-    config = CompressConfig(
-        profile=profile or ("compact" if is_limited else edit.profile),
-        target_bytes=limits.target_bytes,
-        max_psnr_drop=limits.max_psnr_drop,
-    )
-    check_request(config, data if is_limited else None)
+    for part in edit.parts:
+        check_request(_choose_settings(part, profile, limits), None if limits == EditLimits() else data)
     if limits.target_bytes is not None:
-        model = edit.before.model
-        check_target_bytes(limits.target_bytes, packed_provenance(edit.provenance, model), model.exposure)
-    return config
+        for part in edit.parts:
+            check_target_bytes(
+                limits.target_bytes, packed_provenance(part.provenance, part.before), part.before.exposure
+            )
 
 
 def write_edit(
-    edit: Edit, target: StrPath, config: CompressConfig, data: Scene | None, overwrite: bool, context: RunContext
+    edit: Edit,
+    target: StrPath,
+    profile: str | None,
+    limits: EditLimits,
+    data: Scene | None,
+    overwrite: bool,
+    context: RunContext,
 ) -> FileReport:
-    """Write an edited scene. If only its metadata differ from those of the source, all numbers are copied.
+    """Write an edited scene. Models of which only metadata differ from those of the source keep all their numbers.
+
+    A merged file of which one part is left becomes a file of one model. The arguments `profile` and `limits` are those
+    of `check_limits`.
 
     Raises:
         HyrfError: the file cannot be written, or none is within the limits.
     """
-    model = edit.after.model
-    if edit.keeps_gaussians and config.profile == edit.profile and config.max_psnr_drop is None:
-        with Container.open(edit.path) as container:
-            copy = with_metadata(container, model.config, edit.provenance)
-        if config.target_bytes is None or len(copy) <= config.target_bytes:
-            return write_model(copy, target, overwrite=overwrite)
-    photos = None if data is None or config.max_psnr_drop is None else _unchanged_photos(edit, data)
+    settings = [_choose_settings(part, profile, limits) for part in edit.parts]
+    copies = [_copy_numbers(edit, *pair) for pair in zip(edit.parts, settings, strict=True)]
+    if limits.max_psnr_drop is None and all(copy is not None for copy in copies):
+        copy = _join(edit, [copy for copy in copies if copy is not None])
+        if limits.target_bytes is None or len(copy) <= limits.target_bytes:
+            return _write(copy, target, overwrite)
+    if limits == EditLimits() and len(copies) > 1:
+        encoded = []
+        with context.open_progress() as progress:
+            for number, (part, config, done) in enumerate(zip(edit.parts, settings, copies, strict=True)):
+                share = part_of_progress(progress, number / len(copies), (number + 1) / len(copies))
+                encoded.append(done or _encode_part(part, config, replace(context, progress=share)))
+        return _write(_join(edit, encoded), target, overwrite)
+    photos = None if data is None or limits.max_psnr_drop is None else _unchanged_photos(edit, data)
     with tempfile.TemporaryDirectory() as folder:
         edited = Path(folder, "edited.hyrf")
-        save_model(model, edited, "raw", edit.provenance)
+        edited.write_bytes(_join(edit, [encode_model(part.after, "raw", part.provenance) for part in edit.parts]))
         try:
-            return compress_model(edited, target, config, data=photos, overwrite=overwrite, context=context)
+            return compress_model(edited, target, settings[0], data=photos, overwrite=overwrite, context=context)
         except HyrfSizeError as error:
             raise HyrfSizeError(
                 f"{edit.path}: after the edit {error.problem}",
                 fix="use a larger `target_bytes`, or keep fewer `gaussians`",
                 min_bytes=error.min_bytes,
             ) from error
+
+
+def _choose_settings(part: EditedPart, profile: str | None, limits: EditLimits) -> CompressConfig:
+    """Return the settings of compression of one model."""
+    return CompressConfig(
+        profile=profile or (part.profile if limits == EditLimits() else "compact"),
+        target_bytes=limits.target_bytes,
+        max_psnr_drop=limits.max_psnr_drop,
+    )
+
+
+def _copy_numbers(edit: Edit, part: EditedPart, config: CompressConfig) -> bytes | None:
+    """Return the bytes of a model that keeps all its numbers, with its new metadata; None if numbers change."""
+    if config.profile != part.profile or not part.keeps_gaussians:
+        return None
+    with Container.open(edit.path, SECTION_CONTENTS) as container:
+        source = dict(open_parts(container))[part.name] if part.name else container
+        return with_metadata(source, part.after.config, part.provenance)
+
+
+def _encode_part(part: EditedPart, config: CompressConfig, context: RunContext) -> bytes:
+    """Encode one part of a merged file by itself."""
+    with tempfile.TemporaryDirectory() as folder:
+        edited, packed = Path(folder, "edited.hyrf"), Path(folder, "packed.hyrf")
+        save_model(part.after, edited, "raw", part.provenance)
+        compress_model(edited, packed, config, context=context)
+        return packed.read_bytes()
+
+
+def _join(edit: Edit, models: Sequence[bytes]) -> bytes:
+    """Return the bytes of a file of one model, or of a merged file of all models."""
+    return models[0] if len(models) == 1 else encode_parts([*zip((p.name for p in edit.parts), models, strict=True)])
+
+
+def _write(data: bytes, target: StrPath, overwrite: bool) -> FileReport:
+    """Write the bytes of a file of one model or of several."""
+    write = write_merged if PART_NAMES in read_container(data, SECTION_CONTENTS).entries else write_model
+    return write(data, target, overwrite=overwrite)
 
 
 def _unchanged_photos(edit: Edit, data: Scene) -> Scene:

@@ -16,7 +16,7 @@ from hyrfpack.export.degree import choose_degree
 from hyrfpack.export.kinds import HTML_PAGE, POSITION_KINDS, includes_background, select_splats
 from hyrfpack.export.source import Source
 from hyrfpack.model import HybridModel
-from hyrfpack.model.merged import MergedModel, parts_of
+from hyrfpack.model.merged import map_parts, parts_of, scene_of
 from hyrfpack.progress import Progress, part_of_progress
 from hyrfpack.splats.splats import Splats, concatenate
 from hyrfpack.splats.table import FileKind
@@ -130,10 +130,11 @@ def _bake_at(
 
 def _without_exposure_map(loaded: Source) -> Source:
     """Return a copy without the exposure map, for renders and bakes of consistent exposure; parameters are shared."""
-    parts = [copy.copy(part) for part in parts_of(loaded.drawn)]
-    for part in parts:
-        part.exposure = None
-    drawn: HybridModel | MergedModel = parts[0]
-    if isinstance(loaded.drawn, MergedModel):
-        drawn = replace(loaded.drawn, parts=tuple(parts))
-    return replace(loaded, model=parts[0], drawn=drawn)
+
+    def without_map(part: HybridModel) -> HybridModel:
+        changed = copy.copy(part)
+        changed.exposure = None
+        return changed
+
+    drawn = map_parts(without_map, loaded.drawn)
+    return replace(loaded, model=scene_of(drawn), drawn=drawn)

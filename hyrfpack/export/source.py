@@ -13,9 +13,10 @@ from hyrfpack.cameras.paths import Viewpoint, downward_direction, look_at, orbit
 from hyrfpack.cameras.view_sampling import interpolate_views
 from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.evaluate.metrics import provenance_mse
-from hyrfpack.format import describe_file, load_merged_model
+from hyrfpack.format import describe_file
+from hyrfpack.format.parts import load_model_or_parts
 from hyrfpack.model import HybridModel
-from hyrfpack.model.merged import MergedModel
+from hyrfpack.model.merged import MergedModel, scene_of
 from hyrfpack.scene import Camera, Scene, View, evenly_spaced
 
 MAX_FIT_CAMERAS = 256  # because each camera takes memory and time
@@ -63,10 +64,9 @@ class Source:
         Raises:
             HyrfError: the file cannot be read or holds no Gaussian.
         """
-        facts, merged = describe_file(path), load_merged_model(path)
-        model = merged.scene
-        drawn = merged if "parts" in facts else model
-        if not len(merged):
+        facts, drawn = describe_file(path), load_model_or_parts(path)
+        model = scene_of(drawn)
+        if not len(drawn):
             raise HyrfError(f"{path}: there is no Gaussian in it, so there is nothing to export", fix="train it again")
         capture = Capture(facts, data)
         try:

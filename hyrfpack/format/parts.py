@@ -12,10 +12,12 @@ from hyrfpack.device import choose_device
 from hyrfpack.errors import HyrfError, HyrfFormatError
 from hyrfpack.format.container import Container, Section, read_container, write_container
 from hyrfpack.format.decode import decode_container, gaussian_limit
+from hyrfpack.format.info import FileReport, section_sizes
 from hyrfpack.format.metadata import read_metadata
 from hyrfpack.format.part_names import CODEC_FILE, open_parts, write_part_names
-from hyrfpack.format.sections import PART_NAMES, SECTION_CONTENTS, part_section
+from hyrfpack.format.sections import NON_PARAMETER_SECTIONS, PART_NAMES, SECTION_CONTENTS, part_section
 from hyrfpack.format.versions import MERGED_MINOR_VERSION
+from hyrfpack.model import HybridModel
 from hyrfpack.model.merged import MergedModel
 
 
@@ -37,9 +39,27 @@ def encode_parts(parts: Sequence[tuple[str, bytes]]) -> bytes:
     return data
 
 
-def write_parts(parts: Sequence[tuple[str, bytes]], path: str | os.PathLike[str], *, overwrite: bool = True) -> str:
-    """Write a merged file, completely or not at all, and return its path. Arguments and errors: `encode_parts`."""
-    return str(write_atomic(path, encode_parts(parts), overwrite=overwrite))
+def write_parts(
+    parts: Sequence[tuple[str, bytes]], path: str | os.PathLike[str], *, overwrite: bool = True
+) -> FileReport:
+    """Write a merged file, completely or not at all. Arguments and errors: `encode_parts`.
+
+    The report has the profile of the first part, and the bytes of all parts.
+    """
+    return write_merged(encode_parts(parts), path, overwrite=overwrite)
+
+
+def write_merged(data: bytes, path: str | os.PathLike[str], *, overwrite: bool = True) -> FileReport:
+    """Write the bytes of a merged file, completely or not at all; see `write_parts`."""
+    written = write_atomic(path, data, overwrite=overwrite)
+    container = read_container(data, SECTION_CONTENTS)
+    parts = [part for _, part in open_parts(container)]
+    metadata = [read_metadata(part) for part in parts]
+    before = sum(
+        size.before for part in parts for size in section_sizes(part) if size.type not in NON_PARAMETER_SECTIONS
+    )
+    count = sum(facts.gaussians for facts in metadata)
+    return FileReport(str(written), metadata[0].profile, count, before, len(data), section_sizes(container))
 
 
 def load_merged_model(path: str | os.PathLike[str], device: str | torch.device = "cpu") -> MergedModel:
@@ -60,13 +80,35 @@ def load_merged_model(path: str | os.PathLike[str], device: str | torch.device =
         (1, True)
     """
     device = choose_device(device)
+    model = load_model_or_parts(path)
+    merged = model if isinstance(model, MergedModel) else MergedModel(("scene",), (model,))
+    for part in merged.parts:
+        part.to(device)
+    return merged
+
+
+def load_model_or_parts(path: str | os.PathLike[str]) -> HybridModel | MergedModel:
+    """Read the models of a merged file, or the one model of another file or run folder, on the CPU.
+
+    Raises:
+        HyrfFormatError: the file is damaged, incomplete, or of a newer format version.
+    """
     with Container.open(path, SECTION_CONTENTS) as container:
-        if PART_NAMES not in container.entries:
-            return MergedModel(("scene",), (decode_container(container).to(device),))
-        parts = open_parts(container)
-        _check_gaussians(parts, container.length)
-        names, models = zip(*((name, decode_container(part).to(device)) for name, part in parts), strict=True)
-        return MergedModel(names, models)
+        return decode_parts(container)
+
+
+def decode_parts(container: Container) -> HybridModel | MergedModel:
+    """Decode the models of a merged file, or the one model of another file, on the CPU.
+
+    Raises:
+        HyrfFormatError: the file is damaged, inconsistent, or incomplete.
+    """
+    if PART_NAMES not in container.entries:
+        return decode_container(container)
+    parts = open_parts(container)
+    _check_gaussians(parts, container.length)
+    names, models = zip(*((name, decode_container(part)) for name, part in parts), strict=True)
+    return MergedModel(names, models)
 
 
 def _check_gaussians(parts: Sequence[tuple[str, Container]], length: int) -> None:

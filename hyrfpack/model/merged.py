@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -65,6 +66,12 @@ class MergedModel:
         subsets = (part.subset(some) for part, some in zip(self.parts, chosen, strict=True))
         return MergedModel(self.names, tuple(subsets))
 
+    def without_empty_parts(self) -> MergedModel:
+        """Return the model of the parts that have Gaussians, at least one."""
+        kept = [(name, part) for name, part in zip(self.names, self.parts, strict=True) if len(part)]
+        names, parts = zip(*kept, strict=True)
+        return MergedModel(names, parts)
+
     def __len__(self) -> int:
         return sum(len(part) for part in self.parts)
 
@@ -77,6 +84,15 @@ def parts_of(model: HybridModel | MergedModel) -> tuple[HybridModel, ...]:
 def scene_of(model: HybridModel | MergedModel) -> HybridModel:
     """Return the model whose background, viewpoint and cameras are shown: the first part of a merged model."""
     return parts_of(model)[0]
+
+
+def map_parts(
+    change: Callable[[HybridModel], HybridModel], model: HybridModel | MergedModel
+) -> HybridModel | MergedModel:
+    """Apply a function to a model, or to each part of a merged model."""
+    if isinstance(model, MergedModel):
+        return replace(model, parts=tuple(map(change, model.parts)))
+    return change(model)
 
 
 def world_positions(model: HybridModel | MergedModel) -> np.ndarray:

@@ -14,7 +14,7 @@ from scenes import ball_points, ball_scene, small_model
 
 import hyrfpack
 from hyrfpack.cameras.capture import MAX_COARSE_CAMERAS, provenance_cameras, quantized_provenance
-from hyrfpack.compress import compress_model, run
+from hyrfpack.compress import compress_model, limits, run
 from hyrfpack.compress import packer as running
 from hyrfpack.compress.calibrate import measure_calibrated_sensitivity
 from hyrfpack.compress.distortion import default_distortion
@@ -384,14 +384,14 @@ def test_progress_grows_and_the_work_ends_when_it_is_stopped(ball_file, tmp_path
 
 
 def test_an_unreachable_max_psnr_drop_is_refused(ball_file, tmp_path, monkeypatch):
-    scored = running.evaluate_model
+    scored = limits.evaluate_model
 
     def worse_each_time(model, views, **options):
         worse_each_time.calls += 1
         return dataclasses.replace(scored(model, views, **options), psnr=30.0 - worse_each_time.calls)
 
     worse_each_time.calls = 0
-    monkeypatch.setattr(running, "evaluate_model", worse_each_time)
+    monkeypatch.setattr(limits, "evaluate_model", worse_each_time)
 
     with pytest.raises(HyrfError, match="even the finest file loses more than 0.5 dB of PSNR"):
         compress_model(ball_file, tmp_path / "small.hyrf", CompressConfig(max_psnr_drop=0.5), data=ball_scene())

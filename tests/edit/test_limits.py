@@ -12,8 +12,8 @@ from commands import hyrfpack, refused, succeeded
 from scenes import QUIET_CONTEXT
 
 from hyrfpack.config.edit import Background, CropSphere, EditLimits, MinOpacity, Scale, Translate
+from hyrfpack.data.masked_views import mask_view
 from hyrfpack.edit import edit_model, plan_edit
-from hyrfpack.edit.masked_views import mask_view
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import evaluate_model
 from hyrfpack.format import describe_file, load_model

@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import refused, succeeded
-from scenes import QUIET_CONTEXT, small_model
+from scenes import QUIET_CONTEXT, ball_scene, small_model
 
 from hyrfpack.cameras.capture import Capture
 from hyrfpack.compress import compress_model
+from hyrfpack.config.compress import CompressConfig
 from hyrfpack.config.edit import Center, Scale, Translate
 from hyrfpack.edit import edit_model, merge_models
 from hyrfpack.errors import HyrfError
@@ -187,12 +188,9 @@ def test_the_commands_read_what_merge_writes(tmp_path: Path, files: tuple[Path, 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("edit both.hyrf -o out.hyrf --center", "holds the parts 'room', 'balls'; name one of them with --part"),
         ("edit both.hyrf -o out.hyrf --part lamp", "holds the parts 'room', 'balls'"),
         ("edit room.hyrf -o out.hyrf --part lamp", "one model and no parts"),
-        ("compress both.hyrf -o out.hyrf --target-size 100kB", "compress the models before they are merged"),
         ("decompress both.hyrf -o out.hyrf", "merged models"),
-        ("export both.hyrf -o out.spz", "only pages"),
     ],
 )
 def test_what_needs_one_model_says_so(tmp_path: Path, files: tuple[Path, Path], arguments: str, message: str):
@@ -200,6 +198,13 @@ def test_what_needs_one_model_says_so(tmp_path: Path, files: tuple[Path, Path], 
 
     assert message in refused(*arguments.split())
     assert not list(tmp_path.glob("out.*"))
+
+
+def test_fine_tuning_needs_one_model(tmp_path: Path, files: tuple[Path, Path]):
+    merge_models(files, tmp_path / "both.hyrf")
+
+    with pytest.raises(HyrfError, match="compress the models before they are merged"):
+        compress_model("both.hyrf", "out.hyrf", CompressConfig(finetune_steps=5), data=ball_scene(4))
 
 
 def test_each_part_of_a_merged_file_is_compressed_by_itself(tmp_path: Path, files: tuple[Path, Path]):

@@ -223,6 +223,6 @@ def test_the_golden_merged_file_is_read_and_written_as_before():
 
 
 def test_the_same_parts_give_the_same_bytes(tmp_path):
-    written = write_parts(list(zip(NAMES, (PAPER, COMPACT), strict=True)), tmp_path / "again.hyrf")
+    written = write_parts(list(zip(NAMES, (PAPER, COMPACT), strict=True)), tmp_path / "again.hyrf").file
 
     assert Path(written).read_bytes() == MERGED

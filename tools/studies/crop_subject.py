@@ -19,7 +19,7 @@ import numpy as np
 import hyrfpack
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.config.edit import CropSphere
-from hyrfpack.edit.masked_views import mask_view
+from hyrfpack.data.masked_views import mask_view
 from hyrfpack.evaluate import Evaluation
 from hyrfpack.model import HybridModel
 from hyrfpack.render import RenderSettings, render_view

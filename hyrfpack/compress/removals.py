@@ -1,0 +1,64 @@
+"""The error that leaving out each Gaussian adds to pictures, of a single model or of all parts of a merged one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from hyrfpack.cameras.view_sampling import sample_views
+from hyrfpack.compress.sensitivity import (
+    choose_view_count,
+    combine_with_prior,
+    expected_opacity_sensitivity,
+    measure_sensitivity,
+    removal_error,
+)
+from hyrfpack.model import HybridModel
+from hyrfpack.model.merged import MergedModel
+from hyrfpack.progress import Progress, TaskEvent, ignore_progress
+from hyrfpack.render import render_view
+from hyrfpack.scene import Camera
+
+
+def measure_removals(
+    model: HybridModel | MergedModel, cameras: Sequence[Camera], seed: int = 0, progress: Progress = ignore_progress
+) -> np.ndarray:
+    """Estimate the mean squared error (N,) that leaving out each Gaussian adds to pictures; see `removal_error`.
+
+    In a merged model the parts hide each other, so their Gaussians are measured in the same pictures. Arguments and
+    errors are those of `measure_sensitivity`.
+    """
+    if not isinstance(model, MergedModel):
+        return measure_sensitivity(model, cameras, seed, progress).removals
+    at, between = sample_views(cameras, choose_view_count(len(model)), seed)
+    logits = [part.gaussians.opacity_logits for part in model.parts]
+    required = [values.requires_grad for values in logits]
+    squares = [torch.zeros_like(values) for values in logits]
+    generator, pixels = torch.Generator().manual_seed(seed), 0
+    views = [*at, *between]
+    try:
+        for values in logits:
+            values.requires_grad_(True)
+        for number, camera in enumerate(views):
+            progress(TaskEvent(f"measuring sensitivities, view {number + 1}/{len(views)}", number / len(views)))
+            rgb = render_view(model, camera).rgb
+            signs = torch.randint(0, 2, rgb.shape, generator=generator).to(rgb) * 2 - 1
+            pixels += rgb.numel()
+            if rgb.requires_grad:
+                gradients = torch.autograd.grad((rgb * signs).sum(), logits, allow_unused=True)
+                for square, gradient in zip(squares, gradients, strict=True):
+                    if gradient is not None:
+                        square += gradient.square()
+    finally:
+        for values, needed in zip(logits, required, strict=True):
+            values.requires_grad_(needed)
+    removals = []
+    for part, square in zip(model.parts, squares, strict=True):
+        measured = square[:, 0].double().numpy() / pixels
+        geometry = part.decode_geometry()
+        guess = expected_opacity_sensitivity(part, geometry, at)
+        sensitivity = combine_with_prior(part, measured, guess, len(views))
+        removals.append(removal_error(geometry.opacities.detach().double().numpy(), sensitivity))
+    return np.concatenate(removals)
