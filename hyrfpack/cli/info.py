@@ -12,6 +12,7 @@ from hyrfpack.cli.console import print_line
 from hyrfpack.cli.section_table import format_section_table
 from hyrfpack.cli.types import PATH
 from hyrfpack.cli.wording import use_option_names
+from hyrfpack.errors import printable
 from hyrfpack.format.info import SectionSize
 from hyrfpack.outputs import ARCHIVE_SUFFIXES, PICTURE_SUFFIXES, VIDEO_SUFFIXES
 
@@ -128,10 +129,12 @@ def _print_model_facts(file: Path, facts: dict) -> None:
     print_line(f"written by {facts['writer']}, format {facts['version']}, profile {facts['profile']}")
     if "parts" in facts:
         rows = [
-            [part["name"], f"{part['gaussians']:,}", f"{part['bytes']:,}", part["profile"]] for part in facts["parts"]
+            [printable(part["name"]), f"{part['gaussians']:,}", f"{part['bytes']:,}", part["profile"]]
+            for part in facts["parts"]
         ]
         click.echo("\n" + format_table(["part", "Gaussians", "bytes", "profile"], rows))
-        click.echo(f"\nThe rest describes the scene, its first part '{facts['parts'][0]['name']}'.")
+        click.echo()
+        print_line(f"The rest describes the scene, its first part '{facts['parts'][0]['name']}'.")
         facts = facts["parts"][0]
     names = ("type", "holds", "before", "after")
     sections = [SectionSize(*(part[name] for name in names)) for part in facts["sections"]]

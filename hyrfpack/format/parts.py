@@ -10,6 +10,7 @@ import torch
 from hyrfpack.atomic import write_atomic
 from hyrfpack.device import choose_device
 from hyrfpack.errors import HyrfError, HyrfFormatError
+from hyrfpack.format.arrays import parse_config
 from hyrfpack.format.container import Container, Section, read_container, write_container
 from hyrfpack.format.decode import decode_container, gaussian_limit
 from hyrfpack.format.info import FileReport, section_sizes
@@ -107,6 +108,10 @@ def decode_parts(container: Container) -> HybridModel | MergedModel:
         return decode_container(container)
     parts = open_parts(container)
     _check_gaussians(parts, container.length)
+    if len({parse_config(read_metadata(part).config).antialiased for _, part in parts}) > 1:
+        raise HyrfFormatError(
+            f"{container.name}: some of its parts are antialiased and others are not", fix="write the file again"
+        )
     names, models = zip(*((name, decode_container(part)) for name, part in parts), strict=True)
     return MergedModel(names, models)
 

@@ -226,3 +226,11 @@ def test_the_same_parts_give_the_same_bytes(tmp_path):
     written = write_parts(list(zip(NAMES, (PAPER, COMPACT), strict=True)), tmp_path / "again.hyrf").file
 
     assert Path(written).read_bytes() == MERGED
+
+
+def test_parts_with_and_without_antialiasing_are_refused_in_one_line(tmp_path):
+    files = [encode_model(small_model(np.zeros((3, 3)), antialiased=antialiased)) for antialiased in (False, True)]
+    (tmp_path / "mixed.hyrf").write_bytes(encode_parts([("a", files[0]), ("b", files[1])]))
+
+    with pytest.raises(HyrfFormatError, match="some of its parts are antialiased and others are not"):
+        load_merged_model(tmp_path / "mixed.hyrf")

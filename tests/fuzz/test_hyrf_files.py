@@ -31,6 +31,8 @@ from tools.safety.fuzz_mutate import (
     SECTION_GROUPS,
     assemble,
     disassemble,
+    join_parts,
+    load_merged_seed_files,
     load_seed_files,
     make_hostile_file,
 )
@@ -119,8 +121,23 @@ def test_mutants_depend_only_on_their_number_and_seed():
 
 
 def test_assemble_inverts_disassemble():
-    for data in load_seed_files()[0]:
+    for data in (*load_seed_files()[0], *load_merged_seed_files()):
         assert assemble(disassemble(data)) == data
+
+
+def test_valid_merged_files_are_decoded(tmp_path):
+    for data in load_merged_seed_files():
+        outcome = decode(data)
+        check_model(outcome)
+        check_file(data, outcome, tmp_path)
+
+
+@pytest.mark.parametrize("name", ["\u202e", "\u200b", "\u00ad", "'", "; rm"])
+def test_names_of_parts_are_printed_as_characters_that_any_terminal_can_show(name, tmp_path):
+    whole, damaged = load_seed_files()[0][1], load_seed_files()[0][1][:-1] + b"x"
+    for second in (whole, damaged):
+        data = assemble(join_parts(["scene", name], [whole, second]))
+        check_file(data, decode(data), tmp_path)
 
 
 def test_too_many_gaussians_for_the_length_of_the_file_are_refused_before_any_allocation():

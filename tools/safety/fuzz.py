@@ -48,13 +48,16 @@ from hyrfpack.cameras.paths import orbit
 from hyrfpack.cameras.view_sampling import shrink_camera
 from hyrfpack.cli.info import info
 from hyrfpack.errors import HyrfError, HyrfFormatError
-from hyrfpack.format import decode_model, describe_file, encode_model, load_model
-from hyrfpack.format.container import raw_bytes_limit
+from hyrfpack.format import decode_model, describe_file, encode_model
+from hyrfpack.format.container import raw_bytes_limit, read_container
 from hyrfpack.format.exposure import encode_exposure
+from hyrfpack.format.parts import decode_parts, load_model_or_parts
+from hyrfpack.format.sections import SECTION_CONTENTS
 from hyrfpack.model import HybridModel
 from hyrfpack.model.exposure import MAX_LOG_GAIN
+from hyrfpack.model.merged import MergedModel, parts_of, scene_of
 from hyrfpack.render.renderer import render_view
-from tools.safety.fuzz_mutate import load_seed_files, make_hostile_file
+from tools.safety.fuzz_mutate import load_merged_seed_files, load_seed_files, make_hostile_file
 
 MAX_CPU_SECONDS = 2.0
 MAX_EXTRA_ADDRESS_SPACE_BYTES = 1 << 30
@@ -119,19 +122,21 @@ def allowed_bytes(data: bytes) -> int:
     declared = 0
     if len(data) >= 48:
         (count,) = struct.unpack_from("<I", data, 36)
-        entries = range(72, min(48 + 40 * count, len(data) - 8), 40)
-        declared = sum(struct.unpack_from("<Q", data, at)[0] for at in entries)
+        entries = range(48, min(48 + 40 * count, len(data) - 40), 40)
+        declared = sum(struct.unpack_from("<Q", data, at + 24)[0] for at in entries)
+        if any(data[at : at + 4] == b"PRTS" for at in entries):
+            declared = raw_bytes_limit(len(data))  # of which the sections of all parts may take any share
     return 10 * (min(declared, raw_bytes_limit(len(data))) + len(data)) + ALLOWED_BASE_BYTES
 
 
-def decode(data: bytes) -> HybridModel | str:
-    """Return the decoded model, or the message of its refusal.
+def decode(data: bytes) -> HybridModel | MergedModel | str:
+    """Return the decoded model or models, or the message of their refusal.
 
     Raises:
         Failure: the message is not one printable line of reasonable length.
     """
     try:
-        return decode_model(data)
+        return decode_parts(read_container(data, SECTION_CONTENTS, "the data"))
     except HyrfFormatError as error:
         message = str(error)
         if not message.isprintable() or not 10 < len(message) < MAX_MESSAGE_CHARACTERS:
@@ -139,8 +144,13 @@ def decode(data: bytes) -> HybridModel | str:
         return message
 
 
-def check_model(model: HybridModel) -> None:
-    """Raise Failure unless every number is finite, the model survives profile raw, and log gains are within bounds."""
+def check_model(model: HybridModel | MergedModel) -> None:
+    """Raise Failure unless every number is finite, all models survive profile raw, and log gains are within bounds."""
+    for part in parts_of(model):
+        _check_part(part)
+
+
+def _check_part(model: HybridModel) -> None:
     state = model.state_dict()
     again = decode_model(encode_model(model, "raw"))
     again_values = again.state_dict()
@@ -167,20 +177,20 @@ def check_memory(data: bytes) -> tuple[int, float]:
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
-    if isinstance(outcome, HybridModel):  # tracemalloc does not see torch's memory
-        peak += sum(4 * values.numel() for values in outcome.state_dict().values())
+    if not isinstance(outcome, str):  # tracemalloc does not see torch's memory
+        peak += sum(4 * values.numel() for part in parts_of(outcome) for values in part.state_dict().values())
     allowed = allowed_bytes(data)
     if peak > allowed:
         raise Failure(f"{peak:,} bytes were allocated at once, and {allowed:,} are allowed")
     return peak, peak / allowed
 
 
-def check_file(data: bytes, outcome: HybridModel | str, folder: Path) -> None:
+def check_file(data: bytes, outcome: HybridModel | MergedModel | str, folder: Path) -> None:
     """Raise Failure unless a file with these bytes gives the same outcome, and is described and printed by `info`."""
     path = folder / "model.hyrf"
     path.write_bytes(data)
     try:
-        load_model(path)
+        load_model_or_parts(path)
         refused = None
     except HyrfFormatError as error:
         refused = str(error).replace(str(path), "the data")
@@ -200,10 +210,10 @@ def check_file(data: bytes, outcome: HybridModel | str, folder: Path) -> None:
         raise Failure("`hyrfpack info` prints unprintable characters")
 
 
-def check_rendering(model: HybridModel) -> None:
+def check_rendering(model: HybridModel | MergedModel) -> None:
     """Render a small picture; a HyrfError is allowed, because a hostile frame may fit no camera."""
     with contextlib.suppress(HyrfError), torch.no_grad():
-        facts = {"provenance": {}, "config": {"frame": vars(model.config.frame)}}
+        facts = {"provenance": {}, "config": {"frame": vars(scene_of(model).config.frame)}}
         (camera,) = orbit(Capture(facts).viewpoint, 1)
         render_view(model, shrink_camera(camera, 16))
 
@@ -269,7 +279,10 @@ def run_worker(pipe: Connection, current: multiprocessing.Value, seed: int) -> N
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     warnings.simplefilter("error")
     with tempfile.TemporaryDirectory() as folder:
-        for data in load_seed_files()[0]:  # load and compile everything before the memory limit is set
+        for data in (
+            *load_seed_files()[0],
+            *load_merged_seed_files(),
+        ):  # load and compile everything before the memory limit is set
             model = decode(data)
             check_file(data, model, Path(folder))
             check_rendering(model)

@@ -33,6 +33,11 @@ import torch
 from hyrfpack.errors import HyrfFormatError
 from hyrfpack.format import decode_model
 from hyrfpack.format.arrays import to_arrays
+from hyrfpack.format.container import read_container
+from hyrfpack.format.parts import decode_parts
+from hyrfpack.format.sections import SECTION_CONTENTS
+from hyrfpack.model import HybridModel
+from hyrfpack.model.merged import parts_of
 from tools.safety.fuzz import MAX_MESSAGE_CHARACTERS, message_pattern
 from tools.safety.fuzz_mutate import make_hostile_file
 
@@ -48,7 +53,8 @@ class Verdict:
     """Result of reading one file.
 
     Attributes:
-        groups: SHA-256 of each group's numbers as float32, by section; empty if the file is refused.
+        groups: SHA-256 of each group's numbers as float32, by section, and by number after the first part of a merged
+            file; empty if the file is refused.
         refused: the message of the refusal, else empty.
         failed: an unexpected error, else empty.
         seconds: CPU time.
@@ -70,7 +76,15 @@ def read_in_python(data: bytes, is_start: bool = False) -> Verdict:
     """Read a file with hyrfpack, or, with `is_start`, the start of a file."""
     start = time.process_time()
     try:
-        groups = to_arrays(decode_model(data, fraction=1 if is_start else None))
+        if is_start:
+            models: Sequence[HybridModel] = [decode_model(data, fraction=1)]
+        else:
+            models = parts_of(decode_parts(read_container(data, SECTION_CONTENTS)))
+        groups = {
+            f"{group} {number}" if number else group: values
+            for number, model in enumerate(models)
+            for group, values in to_arrays(model).items()
+        }
     except HyrfFormatError as error:
         return Verdict(refused=str(error), seconds=time.process_time() - start)
     hashes = {group: hashlib.sha256(values.tobytes()).hexdigest() for group, values in groups.items()}

@@ -13,7 +13,7 @@ import json
 import math
 import struct
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -34,6 +34,8 @@ from hyrfpack.rotations import IDENTITY, Quaternion
 from tools.safety.synthetic_encoding import encode
 
 GOLDEN_FOLDER = Path(__file__).parents[2] / "tests" / "golden"
+MERGED_FILE = GOLDEN_FOLDER / "merged" / "v1.4_merged.hyrf"
+MERGED_SHARE = 0.1  # of the files that are damaged
 SECTION_GROUPS = ("POSI", "COLO", "SCAL", "OPAC", "GTAB", "GMLP", "RTAB", "RMLP")
 EXTREME_INTEGERS = (0, 1, 2, 3, 7, 8, 16, 57, 58, 127, 128, 255, 256, 257, 1023, 1024, 1025, 65535, 65536, 65537)
 EXTREME_INTEGERS += tuple(2**power + step for power in (20, 28, 31, 32, 34, 40, 48, 60, 63, 64) for step in (-1, 0, 1))
@@ -71,6 +73,7 @@ def assemble(parts: list[RawSection]) -> bytes:
     """Return a file of these sections with correct offsets, lengths and checksums, for any content of the sections."""
     minor = 2 if any(part.codec == 9 for part in parts) else int(any(5 <= part.codec <= 8 for part in parts))
     minor = 3 if any(_has_rotation(part) for part in parts if part.tag == b"META") else minor
+    minor = 4 if any(part.tag == b"PRTS" for part in parts) else minor
     offset = 48 + 40 * len(parts)
     toc, payloads = [], []
     for part in parts:
@@ -217,8 +220,29 @@ def _make_equal_gaussians(model: HybridModel) -> HybridModel:
     return model
 
 
+@lru_cache
+def load_merged_seed_files() -> tuple[bytes, ...]:
+    """Return valid merged files: the golden one, one of a single part, and one of equal parts without Gaussians."""
+    files, _ = load_seed_files()
+    single = assemble(join_parts(["only"], [files[1]]))
+    return (MERGED_FILE.read_bytes(), single, assemble(join_parts([f"part {k}" for k in range(9)], [files[0]] * 9)))
+
+
+def join_parts(names: Sequence[object], files: Sequence[bytes]) -> list[RawSection]:
+    """Return the sections of a merged file of these files and names, valid or not."""
+    text = json.dumps({"names": list(names)}).encode()
+    parts = [RawSection(b"PT%02d" % number, 10, 1, data, len(data)) for number, data in enumerate(files)]
+    return [RawSection(b"PRTS", 0, 1, text, len(text)), *parts]
+
+
 def _choose_seed_file(rng: Random) -> bytes:
+    """Choose a file of one model."""
     return rng.choices(*load_seed_files())[0]
+
+
+def _choose_any_file(rng: Random) -> bytes:
+    """Choose a file of one model or a merged file."""
+    return rng.choice(load_merged_seed_files()) if rng.random() < MERGED_SHARE else _choose_seed_file(rng)
 
 
 @lru_cache
@@ -255,27 +279,27 @@ def edit_bytes(data: bytes, rng: Random, max_edits: int = 4) -> bytes:
 
 
 def _flip_bits(rng: Random) -> bytes:
-    data = bytearray(_choose_seed_file(rng))
+    data = bytearray(_choose_any_file(rng))
     for _ in range(rng.choice((1, 1, 2, 8))):
         data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
     return bytes(data)
 
 
 def _damage_bytes(rng: Random) -> bytes:
-    return edit_bytes(_choose_seed_file(rng), rng)
+    return edit_bytes(_choose_any_file(rng), rng)
 
 
 def _truncate(rng: Random) -> bytes:
-    data = _choose_seed_file(rng)
+    data = _choose_any_file(rng)
     return data[: rng.choice((rng.randrange(len(data)), rng.randrange(500), len(data) - rng.randint(1, 9)))]
 
 
 def _extend(rng: Random) -> bytes:
-    return _choose_seed_file(rng) + rng.choice((bytes, rng.randbytes))(rng.randint(1, 100))
+    return _choose_any_file(rng) + rng.choice((bytes, rng.randbytes))(rng.randint(1, 100))
 
 
 def _splice(rng: Random) -> bytes:
-    first, second = _choose_seed_file(rng), _choose_seed_file(rng)
+    first, second = _choose_any_file(rng), _choose_any_file(rng)
     return first[: rng.randrange(len(first))] + second[rng.randrange(len(second)) :]
 
 
@@ -284,7 +308,7 @@ def _splice(rng: Random) -> bytes:
 
 def _forge_header(rng: Random) -> bytes:
     """Set numbers of the header and of the table of contents to extreme values."""
-    data = bytearray(_choose_seed_file(rng))
+    data = bytearray(_choose_any_file(rng))
     (count,) = struct.unpack_from("<I", data, 36)
     for _ in range(rng.randint(1, 2)):
         entry = 48 + 40 * rng.randrange(count)
@@ -567,9 +591,37 @@ def _repair_lengths(fields: dict) -> None:
             fields[name] = (total % 256 ** value[1], value[1])
 
 
+def _forge_parts(rng: Random) -> bytes:
+    """Forge a merged file: names, order, number or codecs of its parts, or a part that is forged itself."""
+    files = [_choose_any_file(rng) if rng.random() < 0.05 else _choose_seed_file(rng) for _ in range(rng.randint(1, 4))]
+    names: list[object] = [f"part {number}" for number in range(len(files))]
+    kind = rng.randrange(6)
+    if kind == 0:
+        files[rng.randrange(len(files))] = rng.choice(PART_FORGERS)(rng)
+    elif kind == 1:
+        names[rng.randrange(len(names))] = rng.choice((*HOSTILE_JSON, "x" * 64, "x" * 65, "part 0"))
+    elif kind == 2:
+        names = rng.choice((names[1:], [*names, "more"], names * 30))
+    sections = join_parts(names, files)
+    one = rng.randrange(len(sections))
+    if kind == 3:
+        sections[0].data = edit_bytes(sections[0].data, rng)
+        sections[0].raw_length = len(sections[0].data)
+    elif kind == 4:
+        sections[one].codec = rng.choice((*range(12), 65535))
+        sections[one].raw_length = rng.choice((*EXTREME_INTEGERS, len(sections[one].data)))
+    elif kind == 5:
+        rng.shuffle(sections)
+        sections[one].tag = rng.choice((b"PRTS", b"PT00", b"PT63", b"PT64", b"META", b"POSI", sections[one].tag))
+    return assemble(sections)
+
+
 def _choose_sections(rng: Random) -> tuple[RawSection, ...]:
     return _disassemble_cached(_choose_seed_file(rng))
 
+
+# Each forges a file of one model.
+PART_FORGERS = (_forge_header, _forge_sections, _forge_payload, _forge_metadata, _forge_fields, _forge_exposure)
 
 # Each kind of input has a weight and a function that makes such an input.
 INPUT_KINDS: dict[str, tuple[int, Callable[[Random], bytes]]] = {
@@ -584,6 +636,7 @@ INPUT_KINDS: dict[str, tuple[int, Callable[[Random], bytes]]] = {
     "forged metadata": (15, _forge_metadata),
     "forged codec field": (15, _forge_fields),
     "forged exposure map": (8, _forge_exposure),
+    "forged parts": (10, _forge_parts),
 }
 
 

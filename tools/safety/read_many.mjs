@@ -1,4 +1,4 @@
-// Reads many files with the decoder in JavaScript, for tools/safety/fuzz_browser.py and the tests.
+// Reads many files, merged ones too, with the decoder in JavaScript, for tools/safety/fuzz_browser.py and the tests.
 //
 //   node read_many.mjs FILES
 //
@@ -9,7 +9,7 @@
 import { createHash } from "node:crypto";
 import { readFileSync } from "node:fs";
 
-import { HyrfFormatError, read } from "../../hyrfpack/web/hyrf/index.js";
+import { HyrfFormatError, read, readParts } from "../../hyrfpack/web/hyrf/index.js";
 
 const hashOf = (numbers) => {
   if (!(numbers instanceof Float32Array)) throw new Error("no Float32Array");
@@ -33,14 +33,15 @@ const readVerdict = async (bytes, partial) => {
     return (user + system) / 1000;
   };
   try {
-    const { layers, whole, positions, colorLogits, scaleLogits, opacityLogits, geometry, radiance } = await read(
-      bytes, { partial },
-    );
-    const ms = elapsedCpuMs();
-    const numbers = { POSI: positions, COLO: colorLogits, SCAL: scaleLogits, OPAC: opacityLogits };
-    Object.assign(numbers, { GTAB: geometry.table, GMLP: geometry.decoder });
-    Object.assign(numbers, { RTAB: radiance.table, RMLP: radiance.decoder });
-    const groups = Object.fromEntries(Object.entries(numbers).map(([group, array]) => [group, hashOf(array)]));
+    const parts = partial ? [{ model: await read(bytes, { partial }) }] : await readParts(bytes);
+    const ms = elapsedCpuMs(), { layers, whole } = parts[0].model, groups = {};
+    for (const [number, { model }] of parts.entries()) {
+      const { positions, colorLogits, scaleLogits, opacityLogits, geometry, radiance } = model;
+      const numbers = { POSI: positions, COLO: colorLogits, SCAL: scaleLogits, OPAC: opacityLogits };
+      Object.assign(numbers, { GTAB: geometry.table, GMLP: geometry.decoder });
+      Object.assign(numbers, { RTAB: radiance.table, RMLP: radiance.decoder });
+      for (const [group, array] of Object.entries(numbers)) groups[number ? `${group} ${number}` : group] = hashOf(array);
+    }
     return { ms, layers, whole, groups, peak: peakBytes() };
   } catch (error) {
     const ms = elapsedCpuMs();

@@ -113,6 +113,9 @@ export const readParts = async (bytes) =>
     const parts = openParts(container);
     const metadatas = parts.map((part) => readMetadata(part.container));
     checkGaussians(metadatas.reduce((sum, { gaussians }) => sum + gaussians, 0), bytes.length);
+    if (metadatas.some(({ config }) => config.antialiased !== metadatas[0].config.antialiased)) {
+      rejectDamaged("some of its parts are antialiased and others are not");
+    }
     return parts.map((part) => ({ name: part.name, model: readModel(part.container) }));
   });
 
