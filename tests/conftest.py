@@ -11,13 +11,15 @@ import os
 import shutil
 import signal
 import subprocess
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import nullcontext
 from importlib.util import find_spec
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import pytest
+from PIL import Image
 
 # OpenMP's threads spin while they wait and take the cores from the kernels' own threads: tiny pictures train 3 times
 # slower on a quiet machine and 20 times slower on a busy one. OpenMP reads this once, when torch is loaded.
@@ -40,6 +42,8 @@ if os.environ["TRITON_INTERPRET"] == "1" and find_spec("triton"):
 
 from layers import forbid_training_and_processes, layer_of
 from ops.device import needs_triton  # this import asks for Triton, which reads the environment set above
+
+from hyrfpack.atomic import write_atomic
 
 
 def pytest_itemcollected(item: pytest.Item) -> None:
@@ -78,6 +82,20 @@ def skip_waiting_for_the_disk() -> Iterator[None]:
     """Skip fsync, because no test cuts the power. Tests of its place in the order of writes replace it themselves."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", lambda descriptor: None)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def skip_drawing_curves() -> Iterator[None]:
+    """Write a white pixel as the curve of a training run, because drawing it takes as long as the run of a test."""
+
+    def write_pixel(records: Sequence[dict], path: Path, *, overwrite: bool = True) -> Path:
+        pixel = BytesIO()
+        Image.new("RGB", (1, 1), "white").save(pixel, "png")
+        return write_atomic(path, pixel.getvalue(), overwrite=overwrite)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("hyrfpack.train.results.draw_training_curve", write_pixel)
         yield
 
 

@@ -55,11 +55,12 @@ def mean_squared_derivative(
     return float(np.mean(((sides[0] - sides[1]) / (2 * step)) ** 2))
 
 
-# Sensitivities are estimated with random signs; with 96 views their means are off by about 5 to 15 %.
+# Sensitivities are estimated with random signs; with 96 views their means are off by about 5 to 15 %. The mean over
+# every third of these views, which finite differences take, is close to that over all views.
 
 
 def test_sensitivities_of_attributes_equal_finite_differences(measured):
-    model, views = ball_model(), add_interpolated_views(RING_CAMERAS)
+    model, views = ball_model(), add_interpolated_views(RING_CAMERAS)[::3]
     gaussians = model.gaussians
 
     for name, values, columns, step in (
@@ -82,7 +83,7 @@ def test_sensitivities_of_attributes_equal_finite_differences(measured):
 
 
 def test_sensitivities_of_positions_are_per_unit_of_the_contracted_cube(measured):
-    model, views = ball_model(), add_interpolated_views(RING_CAMERAS)
+    model, views = ball_model(), add_interpolated_views(RING_CAMERAS)[::3]
     with torch.no_grad():
         # One Gaussian lies outside the frame, where a unit of the cube is long.
         model.gaussians.positions[3] = torch.tensor([0.9, 0.9, 0.6])
@@ -104,7 +105,7 @@ def test_sensitivities_of_positions_are_per_unit_of_the_contracted_cube(measured
 
 def test_sensitivities_of_fields_equal_finite_differences(measured):
     model = ball_model()
-    every = add_interpolated_views(RING_CAMERAS)
+    every = add_interpolated_views(RING_CAMERAS)[::3]
 
     outputs = {"GMLP": model.geometry.biases[-1], "RMLP": model.radiance.biases[-1]}
     for group, biases in outputs.items():

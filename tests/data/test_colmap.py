@@ -270,7 +270,7 @@ def mutable_root(tmp_path_factory) -> Path:
     return tmp_path_factory.mktemp("mutable")
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_mutated_tables_raise_only_data_errors(mutable_root, colmap_folder, data):
     exists = (mutable_root / "images").is_dir()

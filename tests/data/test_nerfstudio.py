@@ -233,7 +233,7 @@ _TOP_KEYS = ["frames", "fl_x", "fl_y", "cx", "w", "h", "k1", "k4", "camera_model
 _FRAME_KEYS = ["file_path", "transform_matrix", "mask_path", "fl_x", "w", "k2", "camera_model"]
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     top=st.dictionaries(st.sampled_from([*_TOP_KEYS, "train_filenames", "test_filenames"]), _JSON_VALUES, max_size=2),
     frame=st.dictionaries(st.sampled_from(_FRAME_KEYS), _JSON_VALUES, max_size=2),

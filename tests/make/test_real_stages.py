@@ -28,6 +28,7 @@ from hyrfpack.progress import StageEvent, ignore_progress
 from hyrfpack.progress.lines import LineDisplay
 from hyrfpack.splats.formats import ply
 
+pytestmark = pytest.mark.usefixtures("quick_calibration")
 PRODUCT_PATHS = ("model.hyrf", "run/model.hyrf", "export/scene.html")
 
 

@@ -113,7 +113,7 @@ def test_any_number_of_lanes_decodes(lanes_log2: int, implementation: str, monke
 
 @pytest.mark.parametrize("implementation", CODER_IMPLEMENTATIONS)
 @given(data=st.data())
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=70, deadline=None)
 def test_any_tokens_round_trip(implementation: str, data: st.DataObject) -> None:
     top, contexts_below = data.draw(st.sampled_from([0, 1, 3, 20, 125])), data.draw(st.integers(1, 256))
     pairs = data.draw(st.lists(st.tuples(st.integers(0, top), st.integers(0, contexts_below - 1)), max_size=400))
@@ -171,7 +171,7 @@ def test_correlated_tokens_are_coded_with_classes_of_the_previous_token() -> Non
 
 
 @given(st.data())
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=50, deadline=None)
 def test_normalised_frequencies_add_up_and_keep_every_nonzero_weight(data: st.DataObject) -> None:
     size = data.draw(st.integers(1, 127))
     weight = st.one_of(st.just(0), st.integers(1, 50), st.integers(0, 2**50))
@@ -213,7 +213,7 @@ def test_truncation_is_refused(name: str, implementation: str) -> None:
     tokens, contexts = HARD_CASES[name]
     data = encode_tokens(tokens, contexts)
 
-    for length in np.unique(np.append(np.arange(min(len(data), 100)), np.linspace(0, len(data) - 1, 20).astype(int))):
+    for length in np.unique(np.append(np.arange(min(len(data), 50)), np.linspace(0, len(data) - 1, 12).astype(int))):
         with pytest.raises(DamagedDataError):
             decode_tokens(data[:length], len(tokens), contexts, implementation)
 
@@ -223,7 +223,7 @@ def test_truncation_is_refused(name: str, implementation: str) -> None:
     "name", ["contexts", "classes", "many contexts, few tokens", "many tokens, static", "constant"]
 )
 @given(data=st.data())
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=8, deadline=None)
 def test_damaged_stream_is_refused_or_decodes_to_the_requested_count(
     name: str, implementation: str, data: st.DataObject
 ) -> None:

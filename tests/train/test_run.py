@@ -15,11 +15,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from scenes import QUIET_CONTEXT, ball_scene
 
 from hyrfpack import format as hyrf_format
 from hyrfpack.context import RunContext
 from hyrfpack.errors import HyrfError
+from hyrfpack.evaluate.figures import draw_training_curve
 from hyrfpack.progress import StepEvent
 from hyrfpack.render import render_view
 from hyrfpack.scene import Scene
@@ -90,7 +92,9 @@ def uninterrupted_trainer() -> Trainer:
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     out = tmp_path_factory.mktemp("runs") / "deep" / "balls"
-    return out, train_model(split_scene(), out, RUN_CONFIG, context=QUIET_CONTEXT)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("hyrfpack.train.results.draw_training_curve", draw_training_curve)  # in place of a pixel
+        return out, train_model(split_scene(), out, RUN_CONFIG, context=QUIET_CONTEXT)
 
 
 def test_a_run_leaves_model_metrics_curve_and_views(finished):
@@ -98,6 +102,8 @@ def test_a_run_leaves_model_metrics_curve_and_views(finished):
     assert result.complete and result.step == 60 and result.model == out / "model.hyrf"
     assert {"model.hyrf", "metrics.json", "curve.png", "views"} == {entry.name for entry in out.iterdir()}
     assert list((out / "views").rglob("*.png"))
+    with Image.open(out / "curve.png") as curve:
+        assert min(curve.size) > 100 and len(curve.convert("RGB").getcolors(1 << 20)) > 10
 
 
 def test_the_saved_model_is_the_trained_one(finished):

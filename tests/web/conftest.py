@@ -6,6 +6,7 @@ import os
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from pathlib import Path
 
 import pytest
 from web.site import Site, serve_player
@@ -14,11 +15,16 @@ from tools.browser import chromium, firefox
 from tools.browser.browser import Browser
 
 WINDOW_SIZE = (240, 180)
+WEB_FOLDER = Path(__file__).parent
 BROWSER_NAMES = ["chromium", "firefox"]
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Run each test marked `in_turn` in one browser only, unless HYRFPACK_BROWSERS=all."""
+    """Run each test marked `in_turn` in one browser only, unless HYRFPACK_BROWSERS=all, and tests of the player first.
+
+    The first of several parallel processes then runs all of these, and only it has to start browsers.
+    """
+    items.sort(key=lambda item: not item.path.is_relative_to(WEB_FOLDER))
     if os.environ.get("HYRFPACK_BROWSERS") == "all" or None in (chromium.find(), firefox.find()):
         return
     left = {item for item in items if _is_turn_of_another_browser(item)}
