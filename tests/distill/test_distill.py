@@ -173,6 +173,7 @@ def test_a_short_import_uses_fewer_viewpoints_and_regression_steps(
 ) -> None:
     looked = record_calls(monkeypatch, distillation, "sample_viewpoints")
     started = record_calls(monkeypatch, distillation, "initial_model")
+    monkeypatch.setattr("hyrfpack.splats.viewpoints.coverage", lambda *args: 1.0)
     monkeypatch.setattr(distillation, "_fit_to_pictures", lambda *args: None)
     monkeypatch.setattr(fit, "pack", _interrupt)
     for steps in (1, DistillConfig.steps):
