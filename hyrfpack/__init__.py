@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     from hyrfpack.config.export import ExportConfig as ExportConfig
     from hyrfpack.config.make import MakeConfig as MakeConfig
     from hyrfpack.config.poses import PosesConfig as PosesConfig
+    from hyrfpack.config.split import SplitConfig as SplitConfig
     from hyrfpack.context import RunContext as RunContext
     from hyrfpack.data import load_scene as load_scene
     from hyrfpack.distill import DistillConfig as DistillConfig
@@ -79,6 +80,11 @@ if TYPE_CHECKING:
     from hyrfpack.format.codec import load_model as load_model
     from hyrfpack.format.codec import save_model as save_model
     from hyrfpack.format.parts import load_merged_model as load_merged_model
+    from hyrfpack.format.scene_folder import SceneFolder as SceneFolder
+    from hyrfpack.lod import LevelSelection as LevelSelection
+    from hyrfpack.lod import SplitReport as SplitReport
+    from hyrfpack.lod import select_levels as select_levels
+    from hyrfpack.lod import split_model as split_model
     from hyrfpack.make import MakeResult as MakeResult
     from hyrfpack.make import make_scene as make_scene
     from hyrfpack.model import HybridModel as HybridModel
@@ -111,6 +117,12 @@ _MODULES_BY_PUBLIC_NAME = {
     "compress_model": "hyrfpack.compress",
     "CompressConfig": "hyrfpack.config.compress",
     "PaperSettings": "hyrfpack.config.compress",
+    "SceneFolder": "hyrfpack.format.scene_folder",
+    "SplitConfig": "hyrfpack.config.split",
+    "LevelSelection": "hyrfpack.lod",
+    "SplitReport": "hyrfpack.lod",
+    "select_levels": "hyrfpack.lod",
+    "split_model": "hyrfpack.lod",
     "RunContext": "hyrfpack.context",
     "load_scene": "hyrfpack.data",
     "DistillConfig": "hyrfpack.distill",

@@ -40,6 +40,7 @@ REJECTED_ARGUMENTS = {
     "load_scene": ("missing",),
     "make_scene": ("missing", "out.html"),
     "merge_models": (["missing.hyrf"], "out.hyrf"),
+    "split_model": ("missing.hyrf", "out"),
     "plan_edit": ("missing.hyrf", [Center()]),
 }
 
@@ -56,6 +57,7 @@ def test_every_public_function_is_covered_here():
         "export_player",
         "render_view",
         "save_model",
+        "select_levels",
         "train_model",
     }
 

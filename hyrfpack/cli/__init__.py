@@ -41,6 +41,7 @@ from hyrfpack.cli.make import make
 from hyrfpack.cli.merge import merge
 from hyrfpack.cli.poses import poses
 from hyrfpack.cli.render import render
+from hyrfpack.cli.split import split
 from hyrfpack.cli.train import train
 from hyrfpack.cli.view import view
 from hyrfpack.cli.wording import use_option_names
@@ -161,6 +162,7 @@ for _command in (
     convert,
     edit,
     merge,
+    split,
     bench,
     info,
     doctor,

@@ -27,6 +27,8 @@ def info(path: Path, as_json: bool) -> None:
 
     For the folder of a training run: its model, steps and scores, or the progress of an unfinished run.
 
+    For a scene folder of 'hyrfpack split': its chunks, their levels of detail and errors.
+
     For splats (.ply .splat .spz .sog): format, number of Gaussians, degree of harmonics, bounds.
 
     For a folder of photos, with or without poses, its .zip, or a video: number of photos, poses, cameras, sharpness,
@@ -37,14 +39,18 @@ def info(path: Path, as_json: bool) -> None:
       hyrfpack info bonsai.hyrf
       hyrfpack info bonsai.hyrf --json
       hyrfpack info runs/bonsai
+      hyrfpack info city-scene
       hyrfpack info other.ply
       hyrfpack info photos/bonsai
       hyrfpack info clip.mp4
     """
     from hyrfpack.format.run_folder import is_run_folder
+    from hyrfpack.format.scene_folder import is_scene
     from hyrfpack.splats.names import is_splats
 
-    if is_run_folder(path):
+    if is_scene(path):
+        _print_scene(path, as_json)
+    elif is_run_folder(path):
         _print_run(path, as_json)
     elif is_splats(path):
         _print_splats(path, as_json)
@@ -90,6 +96,32 @@ def _print_run(folder: Path, as_json: bool) -> None:
     if facts:
         click.echo()
         _print_model_facts(folder / MODEL_FILE, facts)
+
+
+def _print_scene(path: Path, as_json: bool) -> None:
+    from hyrfpack.format import describe_file
+
+    facts = describe_file(path)
+    if as_json:
+        print_json(facts)
+        return
+    scene, name = facts["scene"], path.parent if path.name == "scene.json" else path
+    click.echo(f"{name}: {facts['bytes']:,} bytes, {facts['gaussians']:,} Gaussians in {len(scene['chunks'])} chunks")
+    print_line(f"written by {facts['writer']}, chunks of format {facts['version']}")
+    for key in ("title", "licence"):
+        if scene[key]:
+            print_line(f"  {key:<9}  {scene[key]}")
+    depth = max((len(chunk["levels"]) for chunk in scene["chunks"]), default=0)
+    rows = [["shared", "-", f"{scene['shared']['bytes']:,}", *("-" for _ in scene["error_radii"])]]
+    for level in range(depth):
+        items = [chunk["levels"][level] for chunk in scene["chunks"] if level < len(chunk["levels"])]
+        sums = [sum(item[key] for item in items) for key in ("gaussians", "bytes")]
+        means = [
+            sum(item["errors"][place] for item in items) / len(items) for place in range(len(scene["error_radii"]))
+        ]
+        rows.append([f"level {level}", *(f"{value:,}" for value in sums), *(f"{mean:.1e}" for mean in means)])
+    head = ["files", "Gaussians", "bytes", *(f"MSE at {radius:g} px" for radius in scene["error_radii"])]
+    click.echo("\n" + format_table(head, rows))
 
 
 def _print_splats(path: Path, as_json: bool) -> None:

@@ -13,7 +13,7 @@ from hyrfpack.cli.common import note, note_rename, print_json, read_scene, scene
 from hyrfpack.cli.drawing import drawing_options, largest_picture_size, select_views, split_option
 from hyrfpack.cli.progress import show_item_progress
 from hyrfpack.cli.settings import settings_options
-from hyrfpack.cli.types import OUTPUT, PATH
+from hyrfpack.cli.types import OUTPUT, PATH, SIZE
 from hyrfpack.config.render import DEFAULT_DEPTH_UNIT, GeometryConfig
 from hyrfpack.outputs import Outputs
 
@@ -55,6 +55,19 @@ CAMERAS_NAME = "cameras.json"
     help="Also write the normals of surfaces in world axes: as 8 bits, 0.5 n + 0.5 (png, which --normals alone "
     "writes), or as float32 (exr).",
 )
+@click.option(
+    "--gaussians",
+    type=click.IntRange(1),
+    metavar="N",
+    help="Of a scene folder, draw at most N Gaussians in each view, at the levels of detail with the least error.",
+)
+@click.option(
+    "--bytes",
+    "level_bytes",
+    type=SIZE,
+    metavar="SIZE",
+    help="Of a scene folder, draw files of at most SIZE in each view: 200kB, 2MB, or bytes.",
+)
 @click.option("--video", is_flag=True, help="Also write the frames as OUT/video.mp4 (needs ffmpeg).")
 @drawing_options
 def render(
@@ -68,6 +81,8 @@ def render(
     depth: str | None,
     depth_unit: float,
     normals: str | None,
+    gaussians: int | None,
+    level_bytes: int | None,
     video: bool,
     drawing: Drawing,
     overwrite: bool,
@@ -75,7 +90,8 @@ def render(
 ) -> None:
     """Render MODEL to PNG pictures: the views of photos, the cameras of a file, or by default an orbit of 60 frames.
 
-    MODEL is a .hyrf file, the folder of a run, or splats (.ply .splat .spz .sog), which are drawn over black.
+    MODEL is a .hyrf file, the folder of a run, a scene folder of 'hyrfpack split', or splats (.ply .splat .spz .sog),
+    which are drawn over black.
 
     The file of --cameras is a list of {"name", "width", "height", "fx", "fy", "cx", "cy", "camera_from_world": 4 x 4}
     with OpenCV axes, or a transforms.json in the format of nerfstudio.
@@ -87,11 +103,14 @@ def render(
       hyrfpack render bonsai.hyrf -o path --cameras path.json --depth exr --normals exr
       hyrfpack render bonsai.hyrf -o rgbd --data photos/bonsai --split all --depth png --depth-unit 0.001
       hyrfpack render other.ply -o orbit --orbit 90
+      hyrfpack render city-scene -o walk --cameras walk.json --gaussians 500000
     """
     if sum(source is not None for source in (data, cameras, orbit)) > 1:
         raise click.UsageError("--data, --cameras and --orbit each say what to render; give one of them")
     if depth_unit != DEFAULT_DEPTH_UNIT and depth != "png":
         raise click.UsageError("--depth-unit is the step of a 16-bit PNG; give it with --depth png")
+    if gaussians is not None and level_bytes is not None:
+        raise click.UsageError("--gaussians and --bytes each limit what a view draws; give one of them")
     from hyrfpack.atomic import write_atomic
     from hyrfpack.cameras.files import cameras_from_json, cameras_to_json
     from hyrfpack.cameras.paths import orbit as orbit_around
@@ -105,6 +124,8 @@ def render(
     geometry = GeometryConfig(depth, normals, depth_unit)
     writer = GeometryWriter(geometry) if geometry.is_wanted else None
     source, scene = drawing.open(model), None
+    has_budget = gaussians is not None or level_bytes is not None
+    levels = source.load_levels(gaussians, level_bytes) if has_budget else None
     if data is not None:
         scene = ranks.run_on_all(lambda: read_scene(data, reader_options, source.facts))
         views = select_views(scene, split)
@@ -125,11 +146,11 @@ def render(
             outputs.folder(output, names)
 
     def write() -> tuple[list[Path], float]:
-        shown = source.load()
-        if isinstance(shown, Drawable):
-            picture_of: Callable[[Camera], RenderedPicture] = partial(
-                draw_picture, shown, settings=settings, geometry=geometry
-            )
+        picture_of: Callable[[Camera], RenderedPicture]
+        if levels is not None:
+            picture_of = partial(levels.draw, settings=settings, geometry=geometry)
+        elif isinstance(shown := source.load(), Drawable):
+            picture_of = partial(draw_picture, shown, settings=settings, geometry=geometry)
         else:
             picture_of = make_renderer(shown, geometry=geometry, settings=settings)
         pictures = write_pictures(picture_of, named, output, geometry=writer, overwrite=overwrite, ranks=ranks)

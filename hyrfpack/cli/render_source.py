@@ -14,6 +14,8 @@ from hyrfpack.cameras.capture import Capture
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import describe_file, find_model, load_merged_model, load_model
+from hyrfpack.format.scene_folder import SceneFolder, is_scene
+from hyrfpack.lod import LevelRenderer
 from hyrfpack.model import HybridModel
 from hyrfpack.model.merged import MergedModel
 from hyrfpack.splats.draw import Drawable
@@ -32,6 +34,7 @@ class RenderSource:
         fraction: share of the file that must exist, see `hyrfpack.load_model`.
         facts: description of a model, see `hyrfpack.describe_file`; None for splats.
         splats: the splats, ready to be drawn; None for a model, which `load` reads.
+        scene: the scene folder that `path` names, if it is one.
     """
 
     path: Path
@@ -40,6 +43,7 @@ class RenderSource:
     fraction: float | None
     facts: dict | None = None
     splats: Drawable | None = None
+    scene: SceneFolder | None = None
 
     @classmethod
     def open(cls, path: Path, device: torch.device, precision: str, allow_partial: bool) -> RenderSource:
@@ -54,6 +58,10 @@ class RenderSource:
             splats = read_splats(path)
             drawable = Drawable.from_splats(splats, WeightedSplats.from_splats(splats, str(path)).frame, device)
             return cls(path, device, precision, None, splats=drawable)
+        if is_scene(path):
+            if allow_partial:
+                raise HyrfError(f"{path}: a scene of several files is read whole", fix="leave out --allow-partial")
+            return cls(find_model(path), device, precision, None, facts=describe_file(path), scene=SceneFolder(path))
         model, fraction = find_model(path), 1.0 if allow_partial else None
         return cls(model, device, precision, fraction, facts=describe_file(model, fraction))
 
@@ -70,6 +78,18 @@ class RenderSource:
         model.precision = self.precision
         return model
 
+    def load_levels(self, gaussians: int | None, bytes: int | None) -> LevelRenderer:
+        """Return a renderer that chooses levels of detail for each view, within a number of Gaussians or bytes.
+
+        Raises:
+            HyrfError: the source is no scene folder.
+        """
+        if self.scene is None:
+            raise HyrfError(
+                f"{self.path}: it has no levels of detail to choose from", fix="make them with 'hyrfpack split'"
+            )
+        return LevelRenderer(self.scene, gaussians=gaussians, bytes=bytes, device=self.device, precision=self.precision)
+
     @property
     def viewpoint(self) -> Viewpoint:
         """The viewpoint to orbit around: that of the photos, or the middle of the splats."""
@@ -81,9 +101,13 @@ class RenderSource:
     @property
     def folder(self) -> Path | None:
         """The folder whose files are all read; None if a single file is read."""
+        if self.scene is not None and self.scene.path.is_dir():
+            return self.scene.path
         return sog_folder(self.path) if self.splats is not None else None
 
     @property
     def bytes(self) -> int:
         """Size on disk in bytes."""
+        if self.scene is not None:
+            return self.scene.manifest.total_bytes
         return bytes_on_disk(self.path)

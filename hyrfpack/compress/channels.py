@@ -89,6 +89,27 @@ def quantize_channel(
     return Channel(mean, weight, codes, residuals, decoded / FIXED_POINT_ONE + float(mean))
 
 
+def requantize_channel(
+    values: np.ndarray, classes: np.ndarray, codes: np.ndarray, mean: np.float32, weight: int | None = None
+) -> Channel:
+    """Quantise a channel with given steps: each number takes the nearest symbol.
+
+    Args:
+        values: (N,) float64, clamped to +-MAX_ABS_CHANNEL_VALUE.
+        classes: (N,) uint8 class of each number.
+        codes: (K,) uint8 step code of each class, at least MIN_STEP_CODE.
+        mean: number that is added to all.
+        weight: weight of the prediction in sixteenths; None for the best of PREDICTION_WEIGHTS_SIXTEENTHS. With weight
+            0, numbers of the form mean + n step are kept exactly.
+    """
+    steps = decode_step(codes)[classes]
+    values = np.clip(values, -MAX_ABS_CHANNEL_VALUE, MAX_ABS_CHANNEL_VALUE)
+    target = np.rint((values - float(mean)) * FIXED_POINT_ONE).astype(np.int64)
+    weight = _choose_weight(target, steps) if weight is None else weight
+    residuals, decoded = lift(len(target), weight, steps, _nearest_chooser(target, steps))
+    return Channel(mean, weight, codes, residuals, decoded / FIXED_POINT_ONE + float(mean))
+
+
 def _choose_weight(target: np.ndarray, steps: np.ndarray) -> int:
     """Choose the weight with the lowest estimated rate on a contiguous run of the numbers."""
     start = max(len(target) - _WEIGHT_SAMPLE_SIZE, 0) // 2

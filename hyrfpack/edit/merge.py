@@ -17,6 +17,7 @@ from hyrfpack.format.parts import write_parts
 from hyrfpack.format.rewrite import with_metadata
 from hyrfpack.format.run_folder import find_model
 from hyrfpack.format.sections import MAX_PARTS, PART_NAMES, SECTION_CONTENTS
+from hyrfpack.format.shared import read_provenance, self_contained_bytes
 from hyrfpack.outputs import Outputs, StrPath
 
 
@@ -105,7 +106,7 @@ def merge_models(
                     )
                 metadata = read_metadata(part)
                 antialiased[parse_config(metadata.config).antialiased] = str(path)
-                data = _moved_bytes(part, placements[stem]) if stem in placements else part.read_bytes()
+                data = _moved_bytes(part, placements[stem]) if stem in placements else self_contained_bytes(part)
                 taken = {other.name for other, _ in parts}
                 merged = MergedPart(_free_name(name, taken), str(path), metadata.gaussians, len(data))
                 parts.append((merged, data))
@@ -160,7 +161,7 @@ def _moved_bytes(part: Container, placement: Placement) -> bytes:
     metadata = read_metadata(part)
     config = parse_config(metadata.config)
     moved = replace(config, frame=placement.move_frame(config.frame))
-    return with_metadata(part, moved, placement.move_provenance(metadata.provenance))
+    return with_metadata(part, moved, placement.move_provenance(read_provenance(part)))
 
 
 def _free_name(name: str, taken: set[str]) -> str:

@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 from collections.abc import Sequence
+from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
 from itertools import count as count_up
 from pathlib import Path
@@ -28,6 +29,7 @@ from hyrfpack.export.poster import (
 from hyrfpack.export.report import ExportReport
 from hyrfpack.export.source import Source
 from hyrfpack.format import describe_file
+from hyrfpack.format.scene_folder import single_file
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.model import HybridModel
 from hyrfpack.model.merged import MergedModel
@@ -97,7 +99,8 @@ def export_player(
     check_folder(folder, sources, [data], overwrite=True, is_gallery=False)
     with exclusive_folder(folder):
         check_folder(folder, sources, [data], overwrite=overwrite, is_gallery=False)
-        return _write_player(source, _OutputFolder(Path(folder), overwrite), data, title, credit, editable)
+        with nullcontext(None) if source is None else single_file(source) as file:
+            return _write_player(file, _OutputFolder(Path(folder), overwrite), data, title, credit, editable)
 
 
 def _write_player(
@@ -186,7 +189,9 @@ def export_gallery(
     check_folder(folder, sources, scenes, overwrite=True, is_gallery=True)
     with exclusive_folder(folder):
         check_folder(folder, sources, scenes, overwrite=overwrite, is_gallery=True)
-        return _write_gallery(sources, _OutputFolder(Path(folder), overwrite), scenes, title, credit, editable)
+        with ExitStack() as joined:
+            files = [joined.enter_context(single_file(source)) for source in sources]
+            return _write_gallery(files, _OutputFolder(Path(folder), overwrite), scenes, title, credit, editable)
 
 
 def _write_gallery(

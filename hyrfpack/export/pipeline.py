@@ -35,6 +35,7 @@ from hyrfpack.export.report import ExportReport
 from hyrfpack.export.scores import measure_export
 from hyrfpack.export.source import Source
 from hyrfpack.format import find_model
+from hyrfpack.format.scene_folder import single_file
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.outputs import Outputs
 from hyrfpack.progress import Progress, TaskEvent, part_of_progress
@@ -72,7 +73,7 @@ def export_model(
     itself.
 
     Args:
-        source: the model, a `.hyrf` file or the folder of a run.
+        source: the model: a `.hyrf` file, the folder of a run, or a scene folder, whose finest level is exported.
         target: the file or the folder to write.
         config: what to export, and how; None for the defaults.
         data: photos of the scene. Colours are fitted at the training cameras, and the held-out photos score the result.
@@ -100,7 +101,20 @@ def export_model(
         check_type("data", data, Scene)
     kind = find_file_kind(target, config.colmap)
     check_request(kind, target, config)
-    source = find_model(source)
+    with single_file(find_model(source)) as file:
+        return _export_file(file, target, kind, config, data, overwrite, context)
+
+
+def _export_file(
+    source: Path,
+    target: str | os.PathLike[str],
+    kind: FileKind,
+    config: ExportConfig,
+    data: Scene | None,
+    overwrite: bool,
+    context: RunContext,
+) -> ExportReport:
+    """Export a `.hyrf` file. The arguments are those of `export_model`."""
     if kind is PLAYER_FOLDER:
         return export_player(
             source,

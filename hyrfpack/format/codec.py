@@ -21,7 +21,9 @@ from hyrfpack.format.exposure import encode_exposure
 from hyrfpack.format.info import FileReport, section_sizes
 from hyrfpack.format.metadata import Metadata, read_metadata
 from hyrfpack.format.run_folder import find_model
+from hyrfpack.format.scene_folder import SceneFolder, is_scene
 from hyrfpack.format.sections import NON_PARAMETER_SECTIONS, POSITIONS, SECTION_CONTENTS, group_and_layer
+from hyrfpack.format.shared import read_provenance
 from hyrfpack.format.versions import lowest_minor_version
 from hyrfpack.model.hybrid import HybridModel
 from hyrfpack.outputs import Outputs
@@ -144,12 +146,13 @@ def write_model(data: bytes, path: str | os.PathLike[str], *, overwrite: bool = 
 def load_model(
     path: str | os.PathLike[str], device: str | torch.device = "cpu", fraction: float | None = None
 ) -> HybridModel:
-    """Read a model from a `.hyrf` file, or from the folder of a training run.
+    """Read a model from a `.hyrf` file, from the folder of a training run, or from a scene folder.
 
-    The other arguments and the errors are those of `decode_model`.
+    Of a scene folder (`hyrfpack.split_model`), all chunks are read at the finest level, and `fraction` is ignored. The
+    other arguments and the errors are those of `decode_model`.
 
     Args:
-        path: a `.hyrf` file, or the folder of a training run.
+        path: a `.hyrf` file, the folder of a training run, or a scene folder.
 
     Raises:
         HyrfFormatError: there is no readable file at `path`, or an error of `decode_model`.
@@ -161,8 +164,7 @@ def load_model(
         (3, False)
     """
     device = choose_device(device)
-    with Container.open(path, SECTION_CONTENTS, fraction) as container:
-        return decode_container(container).to(device)
+    return load_with_provenance(path, fraction)[0].to(device)
 
 
 def repack(
@@ -198,5 +200,9 @@ def packed_provenance(provenance: dict, model: HybridModel) -> dict:
 
 def load_with_provenance(path: str | os.PathLike[str], fraction: float | None = None) -> tuple[HybridModel, dict]:
     """Read a model and its provenance. The arguments and the errors are those of `load_model`."""
+    if is_scene(path):
+        scene = SceneFolder(path)
+        with scene.open_file(scene.manifest.shared) as shared:
+            return scene.load(), read_metadata(shared).provenance
     with Container.open(path, SECTION_CONTENTS, fraction) as container:
-        return decode_container(container), read_metadata(container).provenance
+        return decode_container(container), read_provenance(container)

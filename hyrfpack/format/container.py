@@ -20,11 +20,11 @@ from functools import partial
 from typing import BinaryIO
 
 from hyrfpack.errors import HyrfFormatError
-from hyrfpack.format.run_folder import find_model
+from hyrfpack.format.run_folder import SCENE_MANIFEST_FILE, find_model
 
 MAGIC = b"\x89HYRF\r\n\n"
 MAJOR_VERSION = 1
-MINOR_VERSION = 4
+MINOR_VERSION = 5
 
 # A file beyond one of these limits is rejected before anything is read or allocated for it.
 MAX_SECTIONS = 1024
@@ -97,7 +97,10 @@ class Container:
         available: bytes from the start of the file that exist and may be used.
         version: (major, minor) version of the format.
         entries: the whole table of contents by type, in file order, unknown optional sections included.
+        open_file: opens another file of the same folder by its name; None if there is no folder.
     """
+
+    open_file: Callable[[str], Container] | None = None
 
     def __init__(
         self,
@@ -129,6 +132,7 @@ class Container:
         self._fraction = fraction
         self._known = known
         self._close: Callable[[], None] = lambda: None
+        self._siblings: dict[str, Container] = {}
         self.version, toc, count = self._read_header()
         self.entries = self._check_toc(toc, count)
 
@@ -148,6 +152,11 @@ class Container:
         """
         path = find_model(path)
         name = os.fspath(path)
+        if path.name == SCENE_MANIFEST_FILE:
+            raise HyrfFormatError(
+                f"{name}: this is a scene of several files, and one file is needed",
+                fix="join it with 'hyrfpack decompress' first",
+            )
         try:
             # The mode is checked before opening, because opening a named pipe would wait for a writer.
             mode = os.stat(path).st_mode
@@ -166,6 +175,7 @@ class Container:
             file.close()
             raise
         container._close = file.close
+        container.open_file = lambda other: cls.open(path.with_name(other), known)
         return container
 
     @property
@@ -217,8 +227,25 @@ class Container:
     def _is_available(self, entry: Entry) -> bool:
         return entry.end <= self.available
 
+    def open_sibling(self, name: str) -> Container:
+        """Open another file of the same folder once; closing this file closes it, too.
+
+        Raises:
+            HyrfFormatError: there is no such file, or an error of the constructor.
+        """
+        if self.open_file is None:
+            raise HyrfFormatError(
+                f"{self.name}: it needs the file {name} of its folder, and only the bytes of one file are given",
+                fix="open it by its path, with the whole folder of its scene",
+            )
+        if name not in self._siblings:
+            self._siblings[name] = self.open_file(name)
+        return self._siblings[name]
+
     def close(self) -> None:
         """Close the file. Sections that were read before stay valid."""
+        for sibling in self._siblings.values():
+            sibling.close()
         self._close()
 
     def __enter__(self) -> Container:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -24,7 +24,9 @@ from hyrfpack.format.sections import (
     group_and_layer,
     layer_section,
 )
+from hyrfpack.format.shared import CODEC_SHARED, open_shared, read_provenance, read_section
 from hyrfpack.model.config import ModelConfig
+from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.model.hybrid import HybridModel
 from hyrfpack.parallel.pool import run_tasks
 from hyrfpack.quant import DamagedDataError
@@ -56,8 +58,12 @@ def gaussian_limit(file_length: int) -> int:
     return MAX_GAUSSIANS_PER_FILE_BYTE * file_length + EXTRA_GAUSSIANS_PER_FILE
 
 
-def decode_container(container: Container) -> HybridModel:
+def decode_container(container: Container, fields: HybridModel | None = None) -> HybridModel:
     """Decode the model of an open file; it is safe on untrusted input.
+
+    Args:
+        container: the file.
+        fields: a model whose fields and exposure map the model gets, because it shares them; None decodes them.
 
     Raises:
         HyrfFormatError: the file is damaged, inconsistent, or incomplete, or it holds several models.
@@ -68,6 +74,14 @@ def decode_container(container: Container) -> HybridModel:
             fix="take one out with 'hyrfpack edit' and its `part`",
         )
     layout = read_layout(container)
+    if fields is not None:
+        if layout.config != fields.config:
+            raise HyrfFormatError(
+                f"{container.name}: its configuration is not that of the file with its fields",
+                fix="copy the whole folder again",
+            )
+        shapes = {tag: shape for tag, shape in layout.shapes.items() if group_and_layer(tag)[0] in LAYERED_SECTIONS}
+        layout = replace(layout, shapes=shapes)
     arrays = _decode_sections(container, layout)
     for tag, values in arrays.items():
         if not np.isfinite(values).all():
@@ -78,12 +92,16 @@ def decode_container(container: Container) -> HybridModel:
     if (layer_count := len(layout.layers)) > 1:
         for group in LAYERED_SECTIONS:
             arrays[group] = np.concatenate([arrays.pop(layer_section(group, layer)) for layer in range(layer_count)])
+    if fields is not None:
+        model = fields.with_gaussians(Gaussians(*(torch.from_numpy(arrays[group]) for group in LAYERED_SECTIONS)))
+        _add_photo_sampling(model.requires_grad_(False), read_provenance(container))
+        return model
     model = to_model(layout.config, arrays).requires_grad_(False)
     if EXPOSURE in container:
-        section = container[EXPOSURE]
+        section = read_section(container, EXPOSURE)
         with _add_error_context(container.name, EXPOSURE):
             model.exposure = decode_exposure(section.codec, memoryview(section.data), section.raw_length)
-    _add_photo_sampling(model, read_metadata(container).provenance)
+    _add_photo_sampling(model, read_provenance(container))
     return model
 
 
@@ -142,9 +160,11 @@ def read_layout(container: Container) -> ModelLayout:
 
 def _check_sections(container: Container, shapes: dict[str, tuple[int, int]]) -> None:
     """Check the codec and the decoded size of each section that the metadata asks for."""
-    name = container.name
     for tag, (rows, columns) in shapes.items():
-        entry = container.entries.get(tag)
+        entry, name = container.entries.get(tag), container.name
+        if entry is not None and entry.codec == CODEC_SHARED:
+            shared = open_shared(container)
+            entry, name = shared.entries[tag], shared.name
         if entry is None:
             raise HyrfFormatError(f"{name}: there is no section '{tag}'", fix="the file is incomplete, write it again")
         if entry.codec not in DECODER_BY_CODEC and entry.codec not in compact.SECTIONS_BY_CODEC:
@@ -160,7 +180,7 @@ def _check_sections(container: Container, shapes: dict[str, tuple[int, int]]) ->
 def _decode_sections(container: Container, layout: ModelLayout) -> dict[str, np.ndarray]:
     """Decode the sections of a layout in parallel; return their numbers by the type of the section."""
     config, shapes, name = layout.config, layout.shapes, container.name
-    sections = {tag: container[tag] for tag in shapes}
+    sections = {tag: read_section(container, tag) for tag in shapes}
     arrays: dict[str, np.ndarray] = {}
     points = {}  # lattice points by layer, if positions are on a lattice; other sections need them for decoding
 

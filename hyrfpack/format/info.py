@@ -11,7 +11,9 @@ from hyrfpack.format.container import Container
 from hyrfpack.format.exposure_header import read_exposure_header
 from hyrfpack.format.metadata import read_metadata
 from hyrfpack.format.part_names import open_parts
+from hyrfpack.format.scene_folder import SceneFolder, is_scene
 from hyrfpack.format.sections import EXPOSURE, NON_PARAMETER_SECTIONS, PART_NAMES, SECTION_CONTENTS, group_and_layer
+from hyrfpack.format.shared import read_provenance, read_section
 
 
 @dataclass(frozen=True)
@@ -94,7 +96,8 @@ def describe_file(path: str | os.PathLike[str], fraction: float | None = None) -
         `bits_per_gaussian` of the whole file (null without Gaussians); and `sections`, each with `type`, `holds`,
         `before` (bytes as float32), `after` (stored bytes) and `bits_per_gaussian`. A merged file has the description
         of its first part, the scene, with the `bytes`, `version`, `gaussians`, `bits_per_gaussian` and `sections` of
-        the whole file; and `parts`, each with its `name` and its own description.
+        the whole file; and `parts`, each with its `name` and its own description. A scene folder has the description of
+        its shared file, with the `bytes` and `gaussians` of the whole folder, and its chunks in `scene`.
 
     Raises:
         HyrfFormatError: the file does not exist, or its header, table of contents, metadata or exposure map is damaged.
@@ -105,6 +108,8 @@ def describe_file(path: str | os.PathLike[str], fraction: float | None = None) -
         >>> facts["profile"], facts["version"], next(section["type"] for section in facts["sections"])
         ('compact', '1.1', 'META')
     """
+    if is_scene(path):
+        return describe_scene(path)
     with Container.open(path, SECTION_CONTENTS, fraction) as container:
         if PART_NAMES not in container.entries:
             return _describe_model(container)
@@ -114,8 +119,25 @@ def describe_file(path: str | os.PathLike[str], fraction: float | None = None) -
         return {**scene, **_describe_sizes(container, count), "gaussians": count, "parts": parts}
 
 
+def describe_scene(path: str | os.PathLike[str]) -> dict:
+    """Describe a scene folder: its shared file, with the `bytes` and `gaussians` of all, and its manifest as `scene`.
+
+    Raises:
+        HyrfFormatError: the manifest is damaged, or a file is missing or has another size.
+    """
+    scene = SceneFolder(path)
+    scene.check_files()
+    manifest = scene.manifest
+    with scene.open_file(manifest.shared) as shared:
+        facts = _describe_model(shared)
+    size, count = manifest.total_bytes, manifest.gaussians
+    parts = {key: asdict(manifest)[key] for key in ("title", "licence", "error_radii", "shared", "chunks")}
+    totals = {"bytes": size, "gaussians": count, "bits_per_gaussian": 8 * size / count if count else None}
+    return {**facts, **totals, "scene": parts}
+
+
 def _describe_model(container: Container) -> dict:
-    metadata = read_metadata(container)
+    metadata = replace(read_metadata(container), provenance=read_provenance(container))
     exposure = _describe_exposure(container)
     return {**asdict(metadata), "exposure": exposure, **_describe_sizes(container, metadata.gaussians)}
 
@@ -135,7 +157,7 @@ def _describe_sizes(container: Container, gaussians: int) -> dict:
 def _describe_exposure(container: Container) -> dict | None:
     if EXPOSURE not in container:
         return None
-    section = container[EXPOSURE]
+    section = read_section(container, EXPOSURE)
     try:
         head, _ = read_exposure_header(section.codec, section.data, section.raw_length)
     except HyrfFormatError as error:

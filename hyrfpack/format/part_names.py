@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from hyrfpack.errors import HyrfFormatError
 from hyrfpack.format.container import Container, Section, raw_bytes_limit, read_container
 from hyrfpack.format.sections import MAX_PARTS, PART_NAMES, SECTION_CONTENTS, part_section
+from hyrfpack.format.shared import has_shared_sections
 
 CODEC_NAMES = 0
 CODEC_FILE = 10
@@ -89,6 +90,8 @@ def open_parts(container: Container) -> list[tuple[str, Container]]:
         part = read_container(section.data, SECTION_CONTENTS, f"{container.name}: part '{part_name}'")
         if PART_NAMES in part.entries:
             raise HyrfFormatError(f"{part.name}: a part must be one model", fix="write the file again")
+        if has_shared_sections(part):
+            raise HyrfFormatError(f"{part.name}: a part cannot refer to another file", fix="write the file again")
         parts.append((part_name, part))
     declared = sum(entry.raw_length for _, part in parts for entry in part.entries.values())
     if declared > (limit := raw_bytes_limit(container.length)):

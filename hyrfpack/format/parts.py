@@ -16,6 +16,7 @@ from hyrfpack.format.decode import decode_container, gaussian_limit
 from hyrfpack.format.info import FileReport, section_sizes
 from hyrfpack.format.metadata import read_metadata
 from hyrfpack.format.part_names import CODEC_FILE, open_parts, write_part_names
+from hyrfpack.format.scene_folder import SceneFolder, is_scene
 from hyrfpack.format.sections import NON_PARAMETER_SECTIONS, PART_NAMES, SECTION_CONTENTS, part_section
 from hyrfpack.format.versions import MERGED_MINOR_VERSION
 from hyrfpack.model import HybridModel
@@ -89,11 +90,13 @@ def load_merged_model(path: str | os.PathLike[str], device: str | torch.device =
 
 
 def load_model_or_parts(path: str | os.PathLike[str]) -> HybridModel | MergedModel:
-    """Read the models of a merged file, or the one model of another file or run folder, on the CPU.
+    """Read the models of a merged file, or the one model of another file, run folder or scene folder, on the CPU.
 
     Raises:
         HyrfFormatError: the file is damaged, incomplete, or of a newer format version.
     """
+    if is_scene(path):
+        return SceneFolder(path).load()
     with Container.open(path, SECTION_CONTENTS) as container:
         return decode_parts(container)
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from hyrfpack.format.container import Container, write_container
+from hyrfpack.format.container import Container, read_container, write_container
 from hyrfpack.format.metadata import CODEC_DEFLATED, read_metadata, writer_name
-from hyrfpack.format.sections import METADATA
+from hyrfpack.format.sections import METADATA, SECTION_CONTENTS
+from hyrfpack.format.shared import self_contained_bytes
 from hyrfpack.format.versions import lowest_minor_version
 from hyrfpack.model.config import ModelConfig
 
@@ -22,6 +23,7 @@ def with_metadata(container: Container, config: ModelConfig, provenance: dict) -
     Raises:
         HyrfFormatError: the file is damaged.
     """
+    container = read_container(self_contained_bytes(container), SECTION_CONTENTS, container.name)
     metadata = replace(read_metadata(container), config=config.to_dict(), provenance=provenance, writer=writer_name())
     sections = [
         metadata.to_section(deflate=entry.codec == CODEC_DEFLATED) if entry.type == METADATA else container[entry.type]

@@ -13,6 +13,7 @@ from hyrfpack.errors import HyrfFormatError
 MODEL_FILE = "model.hyrf"
 CHECKPOINT_FILE = "checkpoint.pt"
 METRICS_FILE = "metrics.json"
+SCENE_MANIFEST_FILE = "scene.json"  # of a scene folder, see `hyrfpack.format.scene_folder`
 FINISH_RUN_ADVICE = "finish it by running its 'hyrfpack train' command again with `resume=True`"
 
 
@@ -54,6 +55,8 @@ def is_run_folder(path: str | os.PathLike[str]) -> bool:
 def find_model(path: str | os.PathLike[str]) -> Path:
     """Return the path of a `.hyrf` file: `path` itself, or the model if `path` is the folder of a training run.
 
+    Of a scene folder, it is the path of the manifest.
+
     Raises:
         HyrfFormatError: `path` is a folder without a model, or the folder of a run that has not finished.
 
@@ -67,6 +70,8 @@ def find_model(path: str | os.PathLike[str]) -> Path:
         return path
     if (path / MODEL_FILE).is_file():
         return path / MODEL_FILE
+    if (path / SCENE_MANIFEST_FILE).is_file():
+        return path / SCENE_MANIFEST_FILE
     if (path / CHECKPOINT_FILE).is_file():
         raise HyrfFormatError(f"{path}: {describe_unfinished_run(read_run_status(path))}", fix=FINISH_RUN_ADVICE)
     raise HyrfFormatError(

@@ -106,10 +106,15 @@ class HybridModel(nn.Module):
 
     def subset(self, index: Tensor) -> HybridModel:
         """Return a model with copies of the Gaussians at `index` (n,) int64; it shares the fields with this model."""
-        subset = HybridModel(self.config, self.gaussians.subset(index))
-        subset.geometry, subset.radiance = self.geometry, self.radiance
-        subset.copy_settings(self)
-        return subset
+        return self.with_gaussians(self.gaussians.subset(index))
+
+    def with_gaussians(self, gaussians: Gaussians) -> HybridModel:
+        """Return a model of other Gaussians; it shares the fields with this model."""
+        with torch.device("meta"):  # has no storage, so that no random initial values are computed
+            model = HybridModel(self.config, gaussians)
+        model.geometry, model.radiance = self.geometry, self.radiance
+        model.copy_settings(self)
+        return model
 
     def copy_settings(self, other: HybridModel) -> None:
         """Take over precision, exposure map and background spacing of another model."""

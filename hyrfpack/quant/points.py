@@ -45,18 +45,24 @@ class LatticePoints:
         return (2 * self.cells + 1) << (MAX_BITS_PER_AXIS - self.bits)[self.classes][:, None]
 
 
-def encode_points(points: LatticePoints) -> tuple[bytes, np.ndarray, LatticePoints]:
+def encode_points(points: LatticePoints, *, keep_bits: bool = False) -> tuple[bytes, np.ndarray, LatticePoints]:
     """Sort and encode points.
+
+    Args:
+        points: the points.
+        keep_bits: keep each point in its cell, even if finer cells would take fewer bytes.
 
     Returns:
         The bytes; (N,) int64 index of the point at each place of the new order; and the points in the new order, as
-        the decoder will return them. Classes with fewer bits than the base get as many bits as the base.
+        the decoder will return them. Classes with fewer bits than the base get as many bits as the base; with
+        `keep_bits`, only classes without points.
     """
     cells, classes, bits = points.cells, points.classes, points.bits
     finest = int(bits.max(initial=1))
     codes = morton_codes(cells << (finest - bits[classes])[:, None])
     order = np.argsort(codes, kind="stable")
-    base = _choose_base_bits(codes[order], classes[order], bits, finest)
+    largest = int(bits[classes].min(initial=finest)) if keep_bits else finest
+    base = _choose_base_bits(codes[order], classes[order], bits, finest, largest)
     order = order[np.lexsort((classes[order], codes[order] >> 3 * (finest - base)))]
     refined = np.maximum(bits, base)
     classes = classes[order]
@@ -106,8 +112,8 @@ def decode_points(data: bytes | memoryview, count: int) -> LatticePoints:
     return LatticePoints(morton_cells(heads), classes, bits)
 
 
-def _choose_base_bits(codes: np.ndarray, classes: np.ndarray, bits: np.ndarray, finest: int) -> int:
-    """Choose the number of bits per axis to sort by and to code as gaps, by an estimate of the encoded size.
+def _choose_base_bits(codes: np.ndarray, classes: np.ndarray, bits: np.ndarray, finest: int, largest: int) -> int:
+    """Choose the number of bits per axis, up to `largest`, to sort by and to code as gaps, by an estimate of the size.
 
     Each further bit costs about 3 bits per point, as when it is stored raw, but less in dense places. But classes with
     a coarser lattice then get bits that they do not need. And fewer points share a cell, in which their order takes no
@@ -117,7 +123,7 @@ def _choose_base_bits(codes: np.ndarray, classes: np.ndarray, bits: np.ndarray, 
         return 1
     population = np.bincount(classes, minlength=len(bits))
     best, least = 1, np.inf
-    for base in range(max(1, min(int(np.log2(len(codes)) / 3) - 1, finest)), finest + 1):
+    for base in range(max(1, min(int(np.log2(len(codes)) / 3) - 1, largest)), largest + 1):
         lengths = np.frexp(np.diff(codes >> 3 * (finest - base), prepend=0).astype(np.float64))[1]
         histogram = np.bincount(lengths)
         share = histogram[histogram > 0] / len(codes)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.format import describe_file, find_model
+from hyrfpack.format.scene_folder import single_file
 from hyrfpack.splats.names import SPLATS_SUFFIXES, is_splats, sog_folder
 from hyrfpack.web.player import MODEL_SUFFIX, encode_player
 from hyrfpack.web.serve import LOCAL_HOST, serve
@@ -24,14 +25,22 @@ def view(
     """Serve a scene's file and a player for it until interrupted; the page decodes the file.
 
     Args:
-        path: a `.hyrf` file, the folder of a run, or a file of splats with one of the suffixes
+        path: a `.hyrf` file, the folder of a run, a scene folder, or a file of splats with one of the suffixes
             `hyrfpack.splats.names.SPLATS_SUFFIXES`.
         host, port, open_browser, on_ready: as for `hyrfpack.web.serve.serve`.
 
     Raises:
         HyrfError: there is no such file, its first kilobytes are damaged, or the server cannot listen at the address.
     """
-    title, path = Path(path).stem, find_playable_file(path)
+    with single_file(path) as file:
+        _serve_file(file, str(find_playable_file(path)), host, port, open_browser, on_ready)
+
+
+def _serve_file(
+    path: Path, shown_path: str, host: str, port: int, open_browser: bool, on_ready: Callable[[str], None]
+) -> None:
+    """Serve a file; commands that the page shows name `shown_path`."""
+    title, path = path.stem, find_playable_file(path)
     suffix = path.suffix.lower()
     if suffix in SPLATS_SUFFIXES:
         _check_readable(path)
@@ -39,7 +48,7 @@ def view(
         suffix = MODEL_SUFFIX
         describe_file(path)
     name = f"scene{suffix}"
-    page = encode_player(title, content=name, fetches="'self'", editable=True, file=str(path))
+    page = encode_player(title, content=name, fetches="'self'", editable=True, file=shown_path)
     serve(page, {name: path}, host=host, port=port, open_browser=open_browser, on_ready=on_ready)
 
 

@@ -75,6 +75,7 @@ ALL_CASES = [
     Case("edit soft.hyrf --center -o {}", "hard.hyrf"),
     Case("edit model.hyrf --data blender --center -o new.hyrf --picture {}", "blender/train/r_0.png"),
     Case("merge first soft.hyrf -o {}", "first/model.hyrf"),
+    Case("split first -o {} --levels 1", "first/model.hyrf"),
     Case("render model.hyrf --data blender -o {}", "blender/train"),
     Case("render model.hyrf --cameras nerfstudio/transforms.json -o {}", "nerfstudio/transforms.json"),
     Case("evaluate model.hyrf --data blender --lpips-weights lpips.pth --pictures {}", "lpips.pth"),
@@ -97,6 +98,7 @@ ALL_CASES = [
     Case("edit packed.hyrf --center -o {}", "old/a.hyrf", OUTCOME_REFUSED, OUTCOME_REPLACED),
     Case("edit packed.hyrf --center --plan --picture {}", "old/a.png", OUTCOME_REFUSED, OUTCOME_REPLACED),
     Case("merge packed.hyrf soft.hyrf -o {}", "old/a.hyrf", OUTCOME_REFUSED, OUTCOME_REPLACED),
+    Case("split packed.hyrf -o {} --levels 1", "old/scene", OUTCOME_REFUSED, OUTCOME_REPLACED),
     Case("render model.hyrf --orbit 1 -o {}", "hall/images", OUTCOME_REFUSED, OUTCOME_REPLACED),
     Case("evaluate model.hyrf --data hall --pictures {}", "old/pictures", OUTCOME_REFUSED, OUTCOME_REPLACED),
     Case("export model.hyrf --sh-degree 0 -o {}", "old/a.ply", OUTCOME_REFUSED, OUTCOME_REPLACED),
@@ -157,7 +159,7 @@ def _make_foreign(folder: Path, photo: str) -> None:
     scored = f"{Path(photo).stem}.png"
     names = [f"a{ending}" for ending in (".hyrf", ".png", ".json", ".md", *OUTPUT_ENDINGS)]
     names += ["colmap/sparse/0/cameras.bin", "player/index.html", "gallery/index.html"]
-    names += ["pictures/0000.png", f"pictures/{scored}", f"report/{REPORT_FILES[0]}"]
+    names += ["pictures/0000.png", f"pictures/{scored}", f"report/{REPORT_FILES[0]}", "scene/shared.hyrf"]
     for path in (*(f"old/{name}" for name in names), f"old/demo/{DEMO[0]}", "run/metrics.json"):
         (folder / path).parent.mkdir(parents=True, exist_ok=True)
         (folder / path).write_bytes(b"of another program")

@@ -75,7 +75,7 @@ def test_minimal_reader_imports_nothing_of_hyrfpack():
     imported |= {node.module for node in nodes if isinstance(node, ast.ImportFrom)}
 
     assert imported == {
-        *("__future__", "bisect", "collections.abc", "dataclasses", "json", "math", "struct", "typing", "zlib"),
+        *("__future__", "bisect", "collections.abc", "dataclasses", "json", "math", "re", "struct", "typing", "zlib"),
         "numpy",
     }
 

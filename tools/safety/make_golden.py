@@ -17,9 +17,11 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from hyrfpack.choices import CONSISTENT_EXPOSURE
+from hyrfpack.config.split import SplitConfig
 from hyrfpack.format import decode_model
 from hyrfpack.format.arrays import to_arrays
 from hyrfpack.format.parts import encode_parts
+from hyrfpack.lod import split_model
 from hyrfpack.model import ExposureMap, Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.render import RenderSettings, render_view
@@ -72,6 +74,8 @@ GOLDEN_FILES = {
 # Name and file of each part of the merged file. It lies in a folder of its own, because it is read in another way.
 GOLDEN_PARTS = {"scene": "v1.2_compact_exposure", "turned": "v1.3_compact_rotated", "on paper": "v1.0_paper"}
 GOLDEN_MERGED_FILE = GOLDEN_FOLDER / "merged" / "v1.4_merged.hyrf"
+# A scene folder of one chunk, made of a golden file.
+GOLDEN_SCENE_SOURCE, GOLDEN_SCENE_FOLDER = "v1.2_compact_exposure", GOLDEN_FOLDER / "scene"
 
 
 def make_golden_model(rotation: Quaternion = IDENTITY) -> HybridModel:
@@ -191,6 +195,9 @@ def main() -> None:
         GOLDEN_MERGED_FILE.parent.mkdir(exist_ok=True)
         GOLDEN_MERGED_FILE.write_bytes(encode_golden_parts())
         print(f"{GOLDEN_MERGED_FILE}: {GOLDEN_MERGED_FILE.stat().st_size} bytes")
+    if not GOLDEN_SCENE_FOLDER.exists():
+        report = split_model(GOLDEN_FOLDER / f"{GOLDEN_SCENE_SOURCE}.hyrf", GOLDEN_SCENE_FOLDER, SplitConfig(levels=1))
+        print(f"{GOLDEN_SCENE_FOLDER}: {report.bytes} bytes")
 
 
 if __name__ == "__main__":

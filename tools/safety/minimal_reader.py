@@ -1,4 +1,4 @@
-"""Read `.hyrf` files of versions 1.0 to 1.4, by code written only from docs/reference/format.md, with numpy alone.
+"""Read `.hyrf` files of versions 1.0 to 1.5, by code written only from docs/reference/format.md, with numpy alone.
 
 This reader shares no code with hyrfpack. So it tests whether the page is complete and whether hyrfpack conforms to it.
 It is simple, not fast: a file of 30,000 Gaussians takes some seconds. Section numbers are those of the page.
@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import struct
 import zlib
 from bisect import bisect_right
@@ -28,8 +29,8 @@ MATRIX_CODECS = {
     "COLO": {1, 2, 3, 4, 7},
     "SCAL": {1, 2, 3, 4, 7},
     "OPAC": {1, 2, 3, 4, 7},
-    "GTAB": {1, 2, 3, 4, 8},
-    "RTAB": {1, 2, 3, 4, 8},
+    "GTAB": {1, 2, 3, 4, 8, 11},
+    "RTAB": {1, 2, 3, 4, 8, 11},
     "GMLP": {1, 2, 3, 4, 8},
     "RMLP": {1, 2, 3, 4, 8},
 }
@@ -52,11 +53,14 @@ FRAME_KEYS = {"center", "scale", "half_extent"}
 GRID_KEYS = {"log2_table_size", "levels", "base", "finest"}
 
 
-def read(data: bytes, part: bool = False) -> tuple[dict[str, Any], dict[str, np.ndarray], Exposure | None]:
+def read(
+    data: bytes, part: bool = False, folder: dict[str, bytes] | None = None
+) -> tuple[dict[str, Any], dict[str, np.ndarray], Exposure | None]:
     """Read a file.
 
     Args:
         data: the bytes of a file.
+        folder: the bytes of other files of its folder by name, which its sections may refer to (2.12).
         part: whether `data` may be the start of a file; incomplete layers, and all layers after them, are left out.
 
     Returns:
@@ -70,6 +74,8 @@ def read(data: bytes, part: bool = False) -> tuple[dict[str, Any], dict[str, np.
     sections = read_container(data, part)
     require("META" in sections, "a section is missing")
     metadata = read_metadata(sections["META"])
+    if shared := follow_references(sections, folder or {}):
+        metadata["provenance"] = read_metadata(shared["META"])["provenance"] | metadata["provenance"]
     config, layers = metadata["config"], metadata.get("layers") or [metadata["gaussians"]]
     shapes = matrix_shapes(config, layers)
     for (group, layer), (rows, columns) in shapes.items():
@@ -104,6 +110,8 @@ def read(data: bytes, part: bool = False) -> tuple[dict[str, Any], dict[str, np.
         elif codec == 7:
             require(layer in points, f"{group}: codec 7 without lattice points in layer {layer}")
             numbers = read_channels(source, columns, points[layer].classes)
+        elif codec == 11:
+            numbers = read_numbers(source, stated_groups(source, config["geometry" if group == "GTAB" else "radiance"]))
         elif group in ("GMLP", "RMLP"):
             numbers = read_numbers(source, decoder_groups(decoder_layers(config, group)))
         else:
@@ -264,6 +272,31 @@ def read_container(data: bytes, part: bool = False) -> dict[str, Section]:
     require(expected == length, "bytes after the last section")
     require(raw_total <= min(1024 * len(data) + 3 * 2**24, 2**34), "sections too large")
     return sections
+
+
+# 2.12 Sections of other files
+
+
+def follow_references(sections: dict[str, Section], folder: dict[str, bytes]) -> dict[str, Section]:
+    """Replace sections of codec 12 by those that they refer to; return the sections of the other file, if any."""
+    references = {name: section for name, section in sections.items() if section.codec == 12 and section.whole}
+    names = set()
+    for section in references.values():
+        require(section.name in {"EXPO", *FIELD_GROUPS}, f"{section.name}: codec 12 not allowed here")
+        require(section.raw_length == section.stored_length > 4, f"{section.name}: wrong raw length")
+        names.add(section.read()[4:])
+    require(len(names) < 2, "references to several files")
+    if not names:
+        return {}
+    name = names.pop()
+    require(re.fullmatch(rb"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}", name) is not None, "bad name of a file")
+    require(name.endswith(b".hyrf") and len(name) <= 64 and name.decode() in folder, "a file is missing")
+    shared = read_container(folder[name.decode()])
+    for own in references.values():
+        require(own.name in shared and shared[own.name].codec != 12, f"{own.name}: not in the other file")
+        require(shared[own.name].crc == struct.unpack("<I", own.read()[:4])[0], f"{own.name}: another section")
+        sections[own.name] = shared[own.name]
+    return shared
 
 
 # 2.1 Metadata and the shapes that follow from it
@@ -595,6 +628,15 @@ def read_numbers(source: Cursor, groups: tuple[np.ndarray, int]) -> np.ndarray:
 def decoder_groups(layers: list[tuple[int, int]]) -> tuple[np.ndarray, int]:
     sizes = [size for inputs, outputs in layers for size in [inputs] * outputs + [outputs]]
     return np.repeat(np.arange(len(sizes)), sizes), len(sizes)
+
+
+def stated_groups(source: Cursor, grid: dict[str, int]) -> tuple[np.ndarray, int]:
+    """Read the groups of a table's numbers (3.6)."""
+    rows = [rows for _, rows in grid_levels(grid)]
+    levels = np.repeat(np.arange(len(rows)), rows)
+    uses = read_integers(source.take(source.unpack("I")[0]), levels)
+    require(bool((uses < 16).all()), "codec 11: use class out of range")
+    return np.repeat(16 * levels + uses, 2), 16 * len(rows)
 
 
 def table_groups(grid: dict[str, int], m: np.ndarray) -> np.ndarray:

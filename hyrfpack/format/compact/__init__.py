@@ -2,7 +2,7 @@
 
 positions                          lattice of the contracted cube, Morton order, gaps       section codec 6
 colour, scale, opacity logits      a step for each class of Gaussians, prediction, rANS     section codec 7
-hash tables                        a step for each usage class of rows, rANS                section codec 8
+hash tables                        a step for each usage class of rows, rANS                section codec 8, shared 11
 decoders (MLPs)                    a step for each output, rANS                             section codec 8
 
 `hyrfpack.compress_model` chooses what is stored and the quantisation steps; this package only encodes and decodes.
@@ -13,9 +13,17 @@ from __future__ import annotations
 import numpy as np
 
 from hyrfpack.errors import HyrfFormatError
-from hyrfpack.format.compact.groups import decode_groups
-from hyrfpack.format.compact.plan import build_step_groups, lattice_to_local
-from hyrfpack.format.compact.quantized import CODEC_CHANNELS, CODEC_GROUPS, CODEC_POINTS, decode_channels, encode
+from hyrfpack.format.arrays import grid_configs
+from hyrfpack.format.compact.groups import decode_groups, decode_use_classes
+from hyrfpack.format.compact.plan import USAGE_CLASS_COUNT, build_step_groups, lattice_to_local
+from hyrfpack.format.compact.quantized import (
+    CODEC_CHANNELS,
+    CODEC_GROUPS,
+    CODEC_POINTS,
+    CODEC_STATED_GROUPS,
+    decode_channels,
+    encode,
+)
 from hyrfpack.format.sections import DECODER_SECTIONS, LOGIT_SECTIONS, POSITIONS, TABLE_SECTIONS
 from hyrfpack.model.config import ModelConfig
 from hyrfpack.quant.points import LatticePoints, decode_points
@@ -27,6 +35,7 @@ SECTIONS_BY_CODEC = {
     CODEC_POINTS: (POSITIONS,),
     CODEC_CHANNELS: LOGIT_SECTIONS,
     CODEC_GROUPS: (*TABLE_SECTIONS, *DECODER_SECTIONS),
+    CODEC_STATED_GROUPS: TABLE_SECTIONS,
 }
 
 
@@ -51,7 +60,7 @@ def decode_positions(data: memoryview, count: int, config: ModelConfig) -> tuple
 def decode_section(
     group: str, codec: int, data: memoryview, shape: tuple[int, int], config: ModelConfig, points: LatticePoints | None
 ) -> np.ndarray:
-    """Decode a section of codec 7 or 8.
+    """Decode a section of codec 7, 8 or 11.
 
     Args:
         group: section type in the first layer.
@@ -72,6 +81,9 @@ def decode_section(
         raise HyrfFormatError(f"it cannot have codec {codec}", fix="the file is damaged, write it again")
     if group in DECODER_SECTIONS:
         return decode_groups(data, build_step_groups(group, config)).reshape(shape)
+    if codec == CODEC_STATED_GROUPS:
+        groups, rest = decode_use_classes(data, grid_configs(config)[group].offsets, USAGE_CLASS_COUNT)
+        return decode_groups(rest, groups).reshape(shape)
     if points is None:
         raise HyrfFormatError(f"codec {codec} needs positions of codec {CODEC_POINTS}", fix="write the file again")
     if codec == CODEC_CHANNELS:

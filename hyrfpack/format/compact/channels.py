@@ -47,6 +47,13 @@ def encode_channel(channel: Channel, classes: np.ndarray) -> bytes:
     return header + channel.codes.tobytes() + stream
 
 
+def read_channel_header(data: memoryview) -> tuple[np.float32, int, np.ndarray]:
+    """Return mean, weight and step codes from the start of a channel's bytes, which `decode_channel` has checked."""
+    mean, weight, _, kinds = _HEADER_STRUCT.unpack_from(data)
+    codes = np.frombuffer(data[_HEADER_STRUCT.size : _HEADER_STRUCT.size + kinds], np.uint8)
+    return np.float32(mean), weight, codes
+
+
 def decode_channel(data: memoryview, classes: np.ndarray) -> tuple[np.ndarray, memoryview]:
     """Decode a channel from the start of `data`.
 

@@ -3,12 +3,15 @@
 The symbols of a group are coded with one of a few entropy models, chosen by their spread; a group of zeros takes no
 symbols. The bytes are: u32 length of the stream of step codes, u32 length of the stream of models, these two streams,
 and the stream of the symbols.
+
+Groups of a table that other files share are stated (section codec 11), because its readers do not have the positions
+from which they were found: u32 length of the stream of use classes, this stream, and the bytes above.
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +24,7 @@ ENTROPY_MODEL_COUNT = 8
 MAX_ABS_SYMBOL = 1 << 24
 _NUMBERS_PER_BLOCK = 1 << 15  # small enough that temporary arrays stay in the caches
 _HEADER_STRUCT = struct.Struct("<II")
+_LENGTH_STRUCT = struct.Struct("<I")
 
 
 def iter_blocks(count: int) -> Iterator[slice]:
@@ -113,3 +117,35 @@ def decode_groups(data: memoryview, groups: StepGroups) -> np.ndarray:
         values[part][coded[part]] = symbols[place : place + len(index)] * steps[index]
         place += len(index)
     return values
+
+
+def encode_use_classes(groups: StepGroups, offsets: Sequence[int], classes_per_level: int) -> bytes:
+    """Encode the groups of a table's rows as bytes that go before those of `encode_groups`.
+
+    Args:
+        groups: groups of the table's numbers, two for each row.
+        offsets: first row of each level, and the number of rows.
+        classes_per_level: groups of a level.
+    """
+    levels = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
+    stream = encode_integers(groups.index[::2].astype(np.int64) - classes_per_level * levels, levels.astype(np.uint8))
+    return _LENGTH_STRUCT.pack(len(stream)) + stream
+
+
+def decode_use_classes(
+    data: memoryview, offsets: Sequence[int], classes_per_level: int
+) -> tuple[StepGroups, memoryview]:
+    """Decode the groups of a table's rows; return them and the bytes that follow.
+
+    Raises:
+        DamagedDataError: the bytes are truncated, damaged or inconsistent.
+    """
+    if len(data) < _LENGTH_STRUCT.size or _LENGTH_STRUCT.unpack_from(data)[0] > len(data) - _LENGTH_STRUCT.size:
+        raise DamagedDataError(f"its use classes do not fit its {len(data)} bytes; it is damaged")
+    end = _LENGTH_STRUCT.size + _LENGTH_STRUCT.unpack_from(data)[0]
+    levels = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
+    classes = decode_integers(data[_LENGTH_STRUCT.size : end], len(levels), levels.astype(np.uint8))
+    if classes.max(initial=0) >= classes_per_level:
+        raise DamagedDataError(f"the use class {classes.max()} of {classes_per_level}; it is damaged")
+    index = (classes_per_level * levels + classes).astype(np.uint16)
+    return StepGroups(np.repeat(index, 2), classes_per_level * (len(offsets) - 1)), data[end:]

@@ -29,6 +29,7 @@ from hyrfpack.quant.points import LatticePoints
 CODEC_POINTS = 6
 CODEC_CHANNELS = 7
 CODEC_GROUPS = 8
+CODEC_STATED_GROUPS = 11
 LOGIT_COLUMNS = dict(zip(LOGIT_SECTIONS, (3, 1, 1), strict=True))
 _GAUSSIANS_PER_BLOCK = 1 << 15  # small enough that temporary arrays stay in the caches
 

@@ -1,0 +1,221 @@
+"""Reading of scene folders: a manifest, `scene.json`, with chunk files beside it, or a .zip of them."""
+
+from __future__ import annotations
+
+import logging
+import os
+import tempfile
+import zipfile
+import zlib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hyrfpack.errors import HyrfFormatError
+from hyrfpack.format.container import Container, read_container
+from hyrfpack.format.scene_manifest import MANIFEST_NAME, MAX_MANIFEST_BYTES, Manifest, SceneFile, parse_manifest
+from hyrfpack.format.sections import SECTION_CONTENTS
+
+if TYPE_CHECKING:
+    import torch
+
+    from hyrfpack.model.hybrid import HybridModel
+
+_LOG = logging.getLogger(__name__)
+
+StrPath = str | os.PathLike[str]
+
+COPY_AGAIN = "copy the whole folder again, or split the model again"
+
+
+def is_scene(path: StrPath) -> bool:
+    """Return whether a path names a scene folder, its manifest or a .zip of it."""
+    path = Path(path)
+    if path.is_dir():
+        return (path / MANIFEST_NAME).is_file()
+    return path.is_file() and (path.name == MANIFEST_NAME or (_is_zip(path) and _zip_prefix(path) is not None))
+
+
+class SceneFolder:
+    """A scene folder whose manifest has been checked. Files are checked when they are read.
+
+    Attributes:
+        path: the folder, or the .zip file.
+        manifest: its manifest.
+
+    Example:
+        >>> import hyrfpack
+        >>> report = hyrfpack.split_model("bonsai.hyrf", "bonsai-scene", hyrfpack.SplitConfig(levels=1))
+        >>> scene = hyrfpack.SceneFolder("bonsai-scene")
+        >>> len(scene.load()) == scene.manifest.gaussians == report.gaussians
+        True
+    """
+
+    def __init__(self, path: StrPath) -> None:
+        """Open a scene folder, its manifest, or a .zip of the folder.
+
+        Raises:
+            HyrfFormatError: there is no manifest, or it is damaged or of another version.
+        """
+        path = Path(path)
+        self.path = path.parent if path.name == MANIFEST_NAME and not path.is_dir() else path
+        self._prefix = _zip_prefix(self.path) if _is_zip(self.path) else None
+        data = self._read(MANIFEST_NAME, MAX_MANIFEST_BYTES)
+        self.manifest: Manifest = parse_manifest(data, str(self.path / MANIFEST_NAME))
+
+    def read_file(self, item: SceneFile) -> bytes:
+        """Return the bytes of a file, after a check of its size and its checksum.
+
+        Raises:
+            HyrfFormatError: the file is missing, damaged, or another one than the manifest says.
+        """
+        name, data = self.path / item.file, self._read(item.file, item.bytes)
+        if len(data) != item.bytes:
+            raise HyrfFormatError(
+                f"{name}: the manifest says {item.bytes:,} bytes and there are {len(data):,}", fix=COPY_AGAIN
+            )
+        if f"{zlib.crc32(data):08x}" != item.crc32:
+            raise HyrfFormatError(f"{name}: its bytes are not those that the manifest lists", fix=COPY_AGAIN)
+        return data
+
+    def open_file(self, item: SceneFile) -> Container:
+        """Open a file of the folder, after a check of its size and its checksum."""
+        container = read_container(self.read_file(item), SECTION_CONTENTS, str(self.path / item.file))
+        container.open_file = self._open_sibling
+        return container
+
+    def check_files(self) -> None:
+        """Check that all files are there, with the sizes that the manifest lists; none is read.
+
+        A file that looks like a chunk and is not in the manifest is ignored, with a warning.
+
+        Raises:
+            HyrfFormatError: a file is missing or has another size.
+        """
+        for item in self.manifest.files:
+            if (size := self._size(item.file)) != item.bytes:
+                raise HyrfFormatError(
+                    f"{self.path / item.file}: the manifest says {item.bytes:,} bytes and there are {size:,}",
+                    fix=COPY_AGAIN,
+                )
+        listed = {item.file for item in self.manifest.files}
+        extra = sorted({path.name for path in self.path.glob("*.hyrf")} - listed) if self._prefix is None else []
+        if extra:
+            more = f" and {len(extra) - 1} more" if len(extra) > 1 else ""
+            _LOG.warning(f"{self.path / extra[0]}{more}: not in the manifest and ignored")
+
+    def load(self, levels: Sequence[int] | None = None, device: str | torch.device = "cpu") -> HybridModel:
+        """Return a model of all chunks.
+
+        Args:
+            levels: level of each chunk, 0 for the finest; None for the finest of all.
+            device: device of the parameters, see `hyrfpack.device.choose_device`.
+
+        Raises:
+            HyrfFormatError: a file is missing or damaged.
+        """
+        from hyrfpack.device import choose_device
+        from hyrfpack.format.scene_model import join_chunks
+
+        chosen = [0] * len(self.manifest.chunks) if levels is None else levels
+        chunks = [self.load_chunk(number, level) for number, level in enumerate(chosen)]
+        return join_chunks(self.fields, chunks).to(choose_device(device))
+
+    @cached_property
+    def fields(self) -> HybridModel:
+        """A model without Gaussians, of the fields and the exposure map that all chunks share."""
+        from hyrfpack.format.decode import decode_container
+
+        with self.open_file(self.manifest.shared) as container:
+            return decode_container(container)
+
+    def load_chunk(self, number: int, level: int = 0) -> HybridModel:
+        """Return the model of one chunk at a level of detail, whose fields are those of the scene.
+
+        Raises:
+            HyrfFormatError: a file is missing or damaged, or holds another number of Gaussians than the manifest says.
+        """
+        from hyrfpack.format.decode import decode_container
+
+        item = self.manifest.chunks[number].levels[level]
+        with self.open_file(item) as container:
+            model = decode_container(container, self.fields)
+        if len(model) != item.gaussians:
+            raise HyrfFormatError(
+                f"{self.path / item.file}: the manifest says {item.gaussians:,} Gaussians and there are {len(model):,}",
+                fix=COPY_AGAIN,
+            )
+        return model
+
+    def _open_sibling(self, name: str) -> Container:
+        """Open the shared file for a chunk that refers to it."""
+        shared = self.manifest.shared
+        if name != shared.file:
+            raise HyrfFormatError(
+                f"{self.path / name}: a chunk refers to this file, and the manifest lists {shared.file}", fix=COPY_AGAIN
+            )
+        return self.open_file(shared)
+
+    def _read(self, name: str, limit: int) -> bytes:
+        """Return the bytes of a file, at most `limit` and one more."""
+        try:
+            if self._prefix is None:
+                with open(self.path / name, "rb") as file:
+                    return file.read(limit + 1)
+            with zipfile.ZipFile(self.path) as archive, archive.open(self._prefix + name) as member:
+                return member.read(limit + 1)
+        except (OSError, KeyError, zipfile.BadZipFile, zlib.error, RuntimeError, NotImplementedError) as error:
+            raise self._unreadable_error(name, error) from error
+
+    def _size(self, name: str) -> int:
+        try:
+            if self._prefix is None:
+                return os.stat(self.path / name).st_size
+            with zipfile.ZipFile(self.path) as archive:
+                return archive.getinfo(self._prefix + name).file_size
+        except (OSError, KeyError, zipfile.BadZipFile) as error:
+            raise self._unreadable_error(name, error) from error
+
+    def _unreadable_error(self, name: str, error: Exception) -> HyrfFormatError:
+        if isinstance(error, (FileNotFoundError, KeyError, NotADirectoryError)):
+            return HyrfFormatError(f"{self.path / name}: this file of the scene is missing", fix=COPY_AGAIN)
+        reason = getattr(error, "strerror", None) or error
+        return HyrfFormatError(f"{self.path / name}: the file cannot be read ({reason})", fix=COPY_AGAIN)
+
+
+@contextmanager
+def single_file(path: StrPath) -> Iterator[Path]:
+    """Yield the path of a model's file: `path` itself, or a temporary file of all chunks of a scene, uncompressed.
+
+    The temporary file has the name of the scene, profile "raw" and the scene's finest levels.
+
+    Raises:
+        HyrfFormatError: a file of the scene is missing or damaged.
+    """
+    if not is_scene(path):
+        yield Path(path)
+        return
+    from hyrfpack.format.codec import load_with_provenance, save_model
+
+    with tempfile.TemporaryDirectory() as folder:
+        model, provenance = load_with_provenance(path)
+        joined = Path(folder, f"{SceneFolder(path).path.stem or 'scene'}.hyrf")
+        save_model(model, joined, "raw", provenance)
+        yield joined
+
+
+def _is_zip(path: Path) -> bool:
+    return path.suffix.lower() == ".zip" and path.is_file()
+
+
+def _zip_prefix(path: Path) -> str | None:
+    """Return the folder in a .zip that holds the manifest, "" or "name/"; None if there is none."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = [name for name in archive.namelist() if name.rpartition("/")[2] == MANIFEST_NAME]
+    except (OSError, zipfile.BadZipFile):
+        return None
+    prefixes = sorted(name.removesuffix(MANIFEST_NAME) for name in names if name.count("/") <= 1)
+    return prefixes[0] if prefixes else None

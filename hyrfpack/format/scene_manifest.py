@@ -1,0 +1,274 @@
+"""The manifest of a scene folder, `scene.json`: chunks of a model, each at several levels of detail.
+
+`docs/reference/scene-folder.md` specifies it, `scene.schema.json` beside this module describes it for other programs.
+This module imports neither torch nor numpy.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from hyrfpack.errors import HyrfFormatError
+from hyrfpack.format.metadata import writer_name
+from hyrfpack.format.run_folder import SCENE_MANIFEST_FILE as MANIFEST_NAME
+from hyrfpack.format.shared import is_file_name
+
+FORMAT_NAME = "hyrf-scene"
+MAJOR_VERSION, MINOR_VERSION = 1, 0
+MAX_MANIFEST_BYTES = 1 << 24
+MAX_CHUNKS = 1 << 16
+MAX_LEVELS = 8
+MAX_ERROR_RADII = 16
+MAX_TEXT_LENGTH = 1000
+_INTEGER_LIMIT = 1 << 40
+_CHECKSUM_PATTERN = re.compile(r"[0-9a-f]{8}")
+_VERSION_PATTERN = re.compile(r"(\d{1,4})\.(\d{1,4})")
+
+
+@dataclass(frozen=True)
+class SceneFile:
+    """A file of a scene folder.
+
+    Attributes:
+        file: its name in the folder.
+        bytes: its size.
+        crc32: CRC-32 of its bytes, as 8 hexadecimal digits.
+    """
+
+    file: str
+    bytes: int
+    crc32: str
+
+
+@dataclass(frozen=True)
+class ChunkLevel(SceneFile):
+    """A chunk at one level of detail.
+
+    Attributes:
+        gaussians: number of its Gaussians.
+        errors: mean squared error of a pixel that shows the chunk, if this level takes the place of the finest one, at
+            each of the manifest's `error_radii`; 0 for the finest level.
+    """
+
+    gaussians: int
+    errors: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Gaussians of one region.
+
+    Attributes:
+        low, high: corners of the box that holds them, three standard deviations included, world units.
+        levels: from the finest to the coarsest.
+    """
+
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+    levels: tuple[ChunkLevel, ...]
+
+    @property
+    def center(self) -> tuple[float, float, float]:
+        """The centre of the box."""
+        x, y, z = ((a + b) / 2 for a, b in zip(self.low, self.high, strict=True))
+        return x, y, z
+
+    @property
+    def radius(self) -> float:
+        """Half the diagonal of the box, world units."""
+        return math.dist(self.low, self.high) / 2
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """The manifest of a scene folder.
+
+    Attributes:
+        gaussians: number of Gaussians of all chunks at the finest level.
+        shared: the file with the fields, the exposure map and the provenance, which all chunks refer to.
+        chunks: the chunks.
+        error_radii: radii of a chunk's projection in pixels, rising, for which its levels have errors. The radius of a
+            chunk in a view is its `radius` times the focal length, divided by its distance.
+        frame: frame of the model, as in the `config` of its files.
+        background: whether a background sphere lies behind the Gaussians.
+        solid: colour behind everything without one.
+        viewpoint: the viewpoint to orbit around, as in `provenance`; empty if the model has none.
+        cameras: cameras of the capture as lists of numbers, as in `provenance`.
+        title, licence: texts for people; empty if unknown.
+        writer: program that wrote the folder.
+    """
+
+    gaussians: int
+    shared: SceneFile
+    chunks: tuple[Chunk, ...]
+    error_radii: tuple[float, ...]
+    frame: dict[str, Any]
+    background: bool
+    solid: tuple[float, float, float]
+    viewpoint: dict[str, Any] = field(default_factory=dict)
+    cameras: tuple[tuple[float, ...], ...] = ()
+    title: str = ""
+    licence: str = ""
+    writer: str = field(default_factory=writer_name)
+
+    @property
+    def files(self) -> list[SceneFile]:
+        """All files of the folder but the manifest."""
+        return [self.shared, *(level for chunk in self.chunks for level in chunk.levels)]
+
+    @property
+    def total_bytes(self) -> int:
+        """Bytes of all files but the manifest."""
+        return sum(item.bytes for item in self.files)
+
+    def to_json(self) -> bytes:
+        """Return the text of the manifest. Equal manifests give equal bytes."""
+        values = {"format": FORMAT_NAME, "version": f"{MAJOR_VERSION}.{MINOR_VERSION}", **asdict(self)}
+        return (json.dumps(values, indent=1, sort_keys=True, allow_nan=False) + "\n").encode("ascii")
+
+
+def parse_manifest(data: bytes, name: str = MANIFEST_NAME) -> Manifest:
+    """Parse the text of a manifest; it is safe on untrusted input.
+
+    Args:
+        data: the bytes of the file.
+        name: name of the file in error messages.
+
+    Raises:
+        HyrfFormatError: the text is no manifest, is damaged, or has another major version.
+    """
+    try:
+        if len(data) > MAX_MANIFEST_BYTES:
+            raise ValueError(f"it has {len(data):,} bytes and may have {MAX_MANIFEST_BYTES:,}")
+        values = json.loads(data.decode("utf-8"), parse_constant=_reject_constant)
+        if not isinstance(values, dict) or values.get("format") != FORMAT_NAME:
+            raise HyrfFormatError(f"{name}: this is not the manifest of a scene folder", fix="check the path")
+        _check_version(values.get("version"), name)
+        return _parse_values(values)
+    # Deep nesting overflows the parser's stack, and Python converts no integer of 5,000 digits (ValueError).
+    except (ValueError, RecursionError) as error:
+        raise HyrfFormatError(
+            f"{name}: the manifest is damaged ({error!s:.200})", fix="copy the whole folder again, or split it again"
+        ) from error
+
+
+def _check_version(version: object, name: str) -> None:
+    match = _VERSION_PATTERN.fullmatch(version) if isinstance(version, str) else None
+    if match is None:
+        raise ValueError("it has no version")
+    if int(match[1]) != MAJOR_VERSION:
+        raise HyrfFormatError(
+            f"{name}: the scene has version {version} and this hyrfpack reads version {MAJOR_VERSION}",
+            fix="update hyrfpack",
+        )
+
+
+def _parse_values(values: Mapping[str, Any]) -> Manifest:
+    """Build a manifest of checked values; unknown keys are ignored, as later minor versions may add some."""
+    radii = _numbers(values, "error_radii", range(1, MAX_ERROR_RADII + 1), minimum=0)
+    if any(a >= b for a, b in zip((0.0, *radii), radii, strict=False)):
+        raise ValueError("'error_radii' do not rise")
+    chunks = tuple(_parse_chunk(item, len(radii)) for item in _list(values, "chunks", range(MAX_CHUNKS + 1)))
+    manifest = Manifest(
+        gaussians=_integer(values, "gaussians"),
+        shared=SceneFile(**_file_values(_object(values, "shared"))),
+        chunks=chunks,
+        error_radii=radii,
+        frame=dict(_object(values, "frame")),
+        background=_typed(values, "background", bool),
+        solid=_triple(values, "solid"),
+        viewpoint=dict(_object(values, "viewpoint")),
+        cameras=tuple(
+            _numbers({"cameras": camera}, "cameras", range(1, 33)) for camera in _list(values, "cameras", range(1025))
+        ),
+        **{key: _text(values, key) for key in ("title", "licence", "writer")},
+    )
+    if sum(chunk.levels[0].gaussians for chunk in chunks) != manifest.gaussians:
+        raise ValueError(f"the chunks do not add up to {manifest.gaussians:,} Gaussians")
+    names = [item.file.lower() for item in manifest.files]  # Some file systems ignore case.
+    if len(set(names)) != len(names):
+        raise ValueError(f"two files are named '{next(name for name in names if names.count(name) > 1)}'")
+    return manifest
+
+
+def _parse_chunk(item: object, radii: int) -> Chunk:
+    if not isinstance(item, dict):
+        raise ValueError("a chunk is no object")
+    low, high = _triple(item, "low"), _triple(item, "high")
+    if any(a > b for a, b in zip(low, high, strict=True)):
+        raise ValueError("the box of a chunk is not in order")
+    levels = []
+    for level in _list(item, "levels", range(1, MAX_LEVELS + 1)):
+        if not isinstance(level, dict):
+            raise ValueError("a level is no object")
+        errors = _numbers(level, "errors", range(radii, radii + 1), minimum=0)
+        levels.append(ChunkLevel(**_file_values(level), gaussians=_integer(level, "gaussians"), errors=errors))
+    return Chunk(low, high, tuple(levels))
+
+
+def _file_values(values: Mapping[str, Any]) -> dict[str, Any]:
+    name, checksum = values.get("file"), values.get("crc32")
+    if not is_file_name(name):
+        raise ValueError(f"{name!r:.80} is not the name of a .hyrf file in the folder")
+    if not isinstance(checksum, str) or not _CHECKSUM_PATTERN.fullmatch(checksum):
+        raise ValueError(f"the checksum of {name} is not 8 hexadecimal digits")
+    return {"file": name, "bytes": _integer(values, "bytes"), "crc32": checksum}
+
+
+def _typed(values: Mapping[str, Any], key: str, kind: type) -> Any:
+    value = values.get(key)
+    if type(value) is not kind:
+        raise ValueError(f"'{key}' must be of type {kind.__name__}")
+    return value
+
+
+def _object(values: Mapping[str, Any], key: str) -> dict[str, Any]:
+    return _typed(values, key, dict)
+
+
+def _list(values: Mapping[str, Any], key: str, lengths: range) -> list[Any]:
+    items = _typed(values, key, list)
+    if len(items) not in lengths:
+        raise ValueError(f"'{key}' has {len(items):,} entries, not {lengths.start} to {lengths.stop - 1:,}")
+    return items
+
+
+def _text(values: Mapping[str, Any], key: str) -> str:
+    text = _typed(values, key, str)
+    if len(text) > MAX_TEXT_LENGTH or not text.isprintable():
+        raise ValueError(f"'{key}' is longer than {MAX_TEXT_LENGTH} characters or holds a control character")
+    return text
+
+
+def _integer(values: Mapping[str, Any], key: str) -> int:
+    value = _typed(values, key, int)
+    if not 0 <= value < _INTEGER_LIMIT:
+        raise ValueError(f"'{key}' is out of range")
+    return value
+
+
+def _triple(values: Mapping[str, Any], key: str) -> tuple[float, float, float]:
+    x, y, z = _numbers(values, key, range(3, 4))
+    return x, y, z
+
+
+def _numbers(values: Mapping[str, Any], key: str, lengths: range, minimum: float = -math.inf) -> tuple[float, ...]:
+    numbers = _list(values, key, lengths)
+    if not all(type(number) in (int, float) for number in numbers):
+        raise ValueError(f"'{key}' holds something else than numbers")
+    try:
+        floats = tuple(map(float, numbers))
+    except OverflowError:
+        raise ValueError(f"'{key}' holds a number out of range") from None
+    if not all(math.isfinite(number) and number >= minimum for number in floats):
+        raise ValueError(f"'{key}' holds a number out of range")
+    return floats
+
+
+def _reject_constant(name: str) -> None:
+    raise ValueError(f"the number {name} is not finite")

@@ -1,0 +1,72 @@
+"""Draws a scene folder at the levels of detail that suit each view."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+
+import torch
+
+from hyrfpack.config.render import GeometryConfig
+from hyrfpack.format.scene_folder import SceneFolder
+from hyrfpack.format.scene_model import join_chunks
+from hyrfpack.lod.select import LevelSelection, select_levels
+from hyrfpack.model import HybridModel
+from hyrfpack.render import RenderedPicture, RenderSettings
+from hyrfpack.render.files import make_renderer
+from hyrfpack.scene import Camera
+
+# At most this many Gaussians of chunks are kept for later views.
+MAX_CACHED_GAUSSIANS = 8_000_000
+
+
+class LevelRenderer:
+    """Chooses levels of detail for each view of a scene folder, and loads them.
+
+    Attributes:
+        scene: the scene folder.
+        gaussians, bytes: limits of each view, see `select_levels`.
+    """
+
+    def __init__(
+        self,
+        scene: SceneFolder,
+        *,
+        gaussians: int | None = None,
+        bytes: int | None = None,
+        device: str | torch.device = "cpu",
+        precision: str = "mixed",
+    ) -> None:
+        self.scene, self.gaussians, self.bytes = scene, gaussians, bytes
+        self._device, self._precision = device, precision
+        self._chunks: OrderedDict[tuple[int, int], HybridModel] = OrderedDict()
+
+    def load(self, camera: Camera) -> tuple[HybridModel, LevelSelection]:
+        """Return a model of the levels that are chosen for a view, and the choice.
+
+        Raises:
+            HyrfFormatError: a file is missing or damaged.
+        """
+        choice = select_levels(self.scene.manifest, camera, gaussians=self.gaussians, bytes=self.bytes)
+        model = join_chunks(self.scene.fields, [self._chunk(*key) for key in enumerate(choice.levels)])
+        model = model.to(self._device)
+        model.precision = self._precision
+        return model, choice
+
+    def draw(
+        self,
+        camera: Camera,
+        *,
+        geometry: GeometryConfig = GeometryConfig(),  # noqa: B008 - frozen
+        settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
+    ) -> RenderedPicture:
+        """Render a view at the levels that are chosen for it. The arguments are those of `make_renderer`."""
+        return make_renderer(self.load(camera)[0], geometry=geometry, settings=settings)(camera)
+
+    def _chunk(self, number: int, level: int) -> HybridModel:
+        key = (number, level)
+        if key not in self._chunks:
+            self._chunks[key] = self.scene.load_chunk(number, level)
+        self._chunks.move_to_end(key)
+        while len(self._chunks) > 1 and sum(map(len, self._chunks.values())) > MAX_CACHED_GAUSSIANS:
+            self._chunks.popitem(last=False)
+        return self._chunks[key]

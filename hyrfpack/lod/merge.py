@@ -1,0 +1,128 @@
+"""Merges clusters of Gaussians: the merged ones keep mean, covariance, colour and covered area."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hyrfpack.lod.partition import cluster
+from hyrfpack.model import Geometry, HybridModel
+from hyrfpack.model.gaussians import LOGIT_LIMIT, Gaussians, logit
+from hyrfpack.rotations import rotation_matrices
+
+MAX_OPACITY = 0.99
+_BISECTIONS = 40
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Gaussians by their moments.
+
+    Attributes:
+        means: (N, 3) float64.
+        covariances: (N, 3, 3) float64.
+        opacities: (N,) float64.
+        colors: (N, C) float64, any numbers that are averaged by light.
+    """
+
+    means: np.ndarray
+    covariances: np.ndarray
+    opacities: np.ndarray
+    colors: np.ndarray
+
+    @property
+    def areas(self) -> np.ndarray:
+        """Geometric means of the projected areas along the axes, up to a constant: det(covariance)^(1/3)."""
+        return np.cbrt(np.maximum(np.linalg.det(self.covariances), 1e-60))
+
+
+def merge_moments(gaussians: Moments, labels: np.ndarray, count: int) -> Moments:
+    """Merge the Gaussians of each cluster into one.
+
+    With the weights m_i = opacity_i area_i, the merged Gaussian has the mean and the covariance of the mixture,
+
+        mean = sum m_i p_i / sum m_i      covariance = sum m_i (C_i + (p_i - mean) (p_i - mean)^T) / sum m_i,
+
+    the mean colour, and the opacity sum m_i / area, at most MAX_OPACITY, so that it covers as much as they did.
+
+    Args:
+        gaussians: N Gaussians.
+        labels: (N,) cluster of each, 0 to count - 1; no cluster is empty.
+        count: number of clusters.
+    """
+    light = gaussians.opacities * gaussians.areas
+    total = np.bincount(labels, light, count)
+
+    def average(values: np.ndarray) -> np.ndarray:
+        flat = (light[:, None] * values.reshape(len(values), -1)).T
+        sums = np.stack([np.bincount(labels, column, count) for column in flat], axis=1)
+        return (sums / total[:, None]).reshape(count, *values.shape[1:])
+
+    means = average(gaussians.means)
+    offsets = gaussians.means - means[labels]
+    covariances = average(gaussians.covariances + offsets[:, :, None] * offsets[:, None, :])
+    merged = Moments(means, covariances, np.ones(count), average(gaussians.colors))
+    return Moments(means, covariances, np.minimum(total / merged.areas, MAX_OPACITY), merged.colors)
+
+
+@torch.no_grad()
+def merge_gaussians(model: HybridModel, geometry: Geometry, viewpoints: Sequence[Tensor], count: int) -> Gaussians:
+    """Merge the Gaussians of a model into `count` ones, which the fields of the model complete.
+
+    The fields give the shape and the rotation of a Gaussian at its place. So a merged Gaussian has the volume of the
+    covariance of its cluster, but the fields' shape.
+
+    Args:
+        model: the model, on the CPU.
+        geometry: result of `model.decode_geometry()`.
+        viewpoints: points (3,) in local units from which colours are matched.
+        count: number of merged Gaussians, at most that of the model.
+    """
+    colors = torch.cat([model.decode_colors(viewpoint) for viewpoint in viewpoints], dim=1).double().numpy()
+    positions = model.gaussians.positions
+    cube = model.cube_coords(positions).double().numpy()
+    labels = cluster(cube, count)
+    turns = rotation_matrices(torch.nn.functional.normalize(geometry.quats).double().numpy())
+    axes = turns * geometry.scales.double().numpy()[:, None, :]
+    covariances = axes @ axes.transpose(0, 2, 1)
+    opacities = geometry.opacities.double().numpy()
+    merged = merge_moments(Moments(positions.double().numpy(), covariances, opacities, colors), labels, count)
+    return fit_logits(model, merged, viewpoints)
+
+
+@torch.no_grad()
+def fit_logits(model: HybridModel, merged: Moments, viewpoints: Sequence[Tensor]) -> Gaussians:
+    """Return Gaussians that have, with the fields of a model, the volumes and the colours of `merged`.
+
+    Args:
+        model: the model, on the CPU.
+        merged: M Gaussians in local units; `colors` (M, 3 V) from each of V viewpoints.
+        viewpoints: V points (3,) in local units.
+    """
+    count = len(merged.means)
+    zeros = torch.zeros(count, 1)
+    means = torch.from_numpy(merged.means).float()
+    plain = model.with_gaussians(Gaussians(means, zeros.expand(-1, 3), zeros, zeros))
+    raw = plain.geometry(plain.cube_coords(means))
+    target = torch.from_numpy(np.linalg.slogdet(merged.covariances)[1] / 2)
+    low, high = torch.full((count, 1), -LOGIT_LIMIT), torch.full((count, 1), LOGIT_LIMIT)
+    for _ in range(_BISECTIONS):
+        middle = (low + high) / 2
+        scales = plain.activate(raw, means, middle, zeros).scales
+        is_small = (scales.double().log().sum(dim=1) < target)[:, None]
+        low, high = torch.where(is_small, middle, low), torch.where(is_small, high, middle)
+    scales = plain.activate(raw, means, high, zeros).scales.double()
+    # Where the volume cannot be reached, the opacity makes up for the area.
+    light = torch.from_numpy(merged.opacities * merged.areas)
+    opacities = (light / scales.prod(dim=1) ** (2 / 3)).clamp(max=MAX_OPACITY)
+    neural = logit(plain.activate(raw, means, high, zeros).opacities)
+    opacity_logits = (logit(opacities) - neural)[:, None]
+    seen = torch.from_numpy(merged.colors).reshape(count, -1, 3)
+    offsets = [
+        logit(seen[:, number]) - logit(plain.decode_colors(viewpoint)) for number, viewpoint in enumerate(viewpoints)
+    ]
+    return Gaussians(means, torch.stack(offsets).mean(dim=0), high, opacity_logits)

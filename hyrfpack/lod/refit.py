@@ -1,0 +1,61 @@
+"""Fits the Gaussians of a coarse level to renders of the finest level, at the resolution that it is seen at."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+
+from hyrfpack.model import HybridModel
+from hyrfpack.ops.adam import adam_step
+from hyrfpack.progress import Progress, TaskEvent, ignore_progress
+from hyrfpack.render import render_view
+from hyrfpack.scene import Camera
+
+# Learning rates at the start; they fall to zero along a cosine.
+LEARNING_RATES = {"color_logits": 0.1, "opacity_logits": 0.1, "scale_logits": 0.04}
+# The learning rate of positions, in mean distances between N Gaussians in the unit of the frame, N^(-1/3).
+POSITION_RATE = 0.04
+
+
+def refit_level(
+    level: HybridModel,
+    finest: HybridModel,
+    cameras: Sequence[Camera],
+    steps: int,
+    seed: int = 0,
+    progress: Progress = ignore_progress,
+) -> None:
+    """Fit the Gaussians of a level to renders of the finest level, in place; fields stay as they are.
+
+    Args:
+        level: the model of the level, which shares its fields with `finest`.
+        finest: the finest level.
+        cameras: views at the resolution at which the level is seen, world units.
+        steps: optimiser steps, each on one view.
+        seed: random seed of the order of the views.
+        progress: called with `TaskEvent`s.
+    """
+    if not steps or not cameras:
+        return
+    with torch.no_grad():
+        decoded = finest.decode()
+        targets = [render_view(finest, camera, decoded=decoded).rgb for camera in cameras]
+    rates = {**LEARNING_RATES, "positions": POSITION_RATE * len(level) ** (-1 / 3)}
+    values = [getattr(level.gaussians, name).requires_grad_() for name in rates]
+    moments = [[torch.zeros_like(value) for value in values] for _ in range(2)]
+    generator = torch.Generator().manual_seed(seed)
+    order: list[int] = []
+    for step in range(steps):
+        progress(TaskEvent(f"fitting a level, step {step + 1}/{steps}", step / steps))
+        order = order or torch.randperm(len(cameras), generator=generator).tolist()
+        number = order.pop()
+        loss = (render_view(level, cameras[number]).rgb - targets[number]).square().mean()
+        if not loss.requires_grad:  # no Gaussian is in view
+            continue
+        gradients = torch.autograd.grad(loss, values)
+        decay = (1 + math.cos(math.pi * step / steps)) / 2
+        adam_step(values, gradients, *moments, step=step + 1, rate=[decay * rate for rate in rates.values()])
+    for value in values:
+        value.requires_grad_(False)

@@ -1,0 +1,165 @@
+"""Chooses the levels of detail of a scene's chunks for a view and a budget."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hyrfpack.format.scene_manifest import Manifest
+from hyrfpack.scene import Camera
+
+
+@dataclass(frozen=True)
+class LevelSelection:
+    """Levels of detail chosen for a view.
+
+    Attributes:
+        levels: level of each chunk, 0 for the finest.
+        gaussians: number of Gaussians of these levels.
+        bytes: size of their files and of the shared file.
+        predicted_mse: predicted mean squared error of the view against the finest levels.
+        max_gap: bound on how much lower the error of the best choice within the budget can be; 0 if all upgrades fit.
+    """
+
+    levels: list[int]
+    gaussians: int
+    bytes: int
+    predicted_mse: float
+    max_gap: float
+
+
+def select_levels(
+    manifest: Manifest, camera: Camera, *, gaussians: int | None = None, bytes: int | None = None
+) -> LevelSelection:
+    """Choose a level for each chunk, with the least predicted error of a view within a budget.
+
+    Every chunk starts at its cheapest level. Then the upgrades along the lower convex hull of each chunk's costs and
+    errors are taken by falling gain of error for their cost, as long as they fit (a greedy knapsack). The error exceeds
+    that of the best choice by less than the gain of the first upgrade that does not fit, `max_gap`: with a fraction of
+    this upgrade, the choice before it would be the optimum of the linear relaxation, which bounds all choices.
+
+    Args:
+        manifest: the manifest of a scene folder.
+        camera: the view, in world units.
+        gaussians: the most Gaussians; None for no limit.
+        bytes: the most bytes of files; None for no limit. Only one of both limits may be given. If not even the
+            cheapest levels fit, these are chosen.
+
+    Raises:
+        ValueError: both limits are given.
+
+    Example:
+        >>> import hyrfpack
+        >>> report = hyrfpack.split_model("bonsai.hyrf", "scene", hyrfpack.SplitConfig(levels=2, refit_steps=1))
+        >>> camera = hyrfpack.load_scene("photos/bonsai").test[0].camera
+        >>> choice = hyrfpack.select_levels(hyrfpack.SceneFolder("scene").manifest, camera)
+        >>> choice.gaussians == report.gaussians, choice.predicted_mse
+        (True, 0.0)
+    """
+    if gaussians is not None and bytes is not None:
+        raise ValueError("both a number of Gaussians and a size limit the view; give one of them")
+    count_bytes = bytes is not None
+    given = gaussians if bytes is None else bytes
+    limit = math.inf if given is None else given
+    base = manifest.shared.bytes if count_bytes else 0
+    costs = [[x.bytes if count_bytes else x.gaussians for x in chunk.levels] for chunk in manifest.chunks]
+    errors = predict_errors(manifest, camera)
+    levels, max_gap = choose_levels(costs, errors, limit - base)
+    chosen = [chunk.levels[level] for chunk, level in zip(manifest.chunks, levels, strict=True)]
+    return LevelSelection(
+        levels,
+        sum(item.gaussians for item in chosen),
+        manifest.shared.bytes + sum(item.bytes for item in chosen),
+        sum(each[level] for each, level in zip(errors, levels, strict=True)),
+        max_gap,
+    )
+
+
+def choose_levels(
+    costs: Sequence[Sequence[float]], errors: Sequence[Sequence[float]], limit: float
+) -> tuple[list[int], float]:
+    """Choose one level of each item with a low total error and a total cost of at most `limit`, see `select_levels`.
+
+    Returns:
+        The level of each item, and a bound on how much lower the total error of the best choice can be. If not even the
+        cheapest levels fit, these are returned, with the bound 0.
+    """
+    hulls = [_lower_hull(*item) for item in zip(costs, errors, strict=True)]
+    chosen = [hull[0] for hull in hulls]
+    spent = sum(each[level] for each, level in zip(costs, chosen, strict=True))
+    if spent > limit:
+        return chosen, 0.0
+    upgrades = []
+    for item, hull in enumerate(hulls):
+        for place, (worse, better) in enumerate(zip(hull, hull[1:], strict=False)):
+            gain = errors[item][worse] - errors[item][better]
+            upgrades.append((-gain / (costs[item][better] - costs[item][worse]), item, place, worse, better))
+    max_gap, is_full = 0.0, set()
+    for _, item, _, worse, better in sorted(upgrades):
+        cost = costs[item][better] - costs[item][worse]
+        if item not in is_full and spent + cost <= limit:
+            chosen[item], spent = better, spent + cost
+        else:
+            max_gap = max_gap or errors[item][worse] - errors[item][better]
+            is_full.add(item)
+    return chosen, max_gap
+
+
+def _lower_hull(costs: Sequence[float], errors: Sequence[float]) -> list[int]:
+    """Return the levels on the lower convex hull of (cost, error), from the cheapest, as far as the error falls."""
+    hull: list[int] = []
+    for level in sorted(range(len(costs)), key=lambda level: (costs[level], errors[level])):
+        if hull and errors[level] >= errors[hull[-1]]:
+            continue
+        if hull and costs[level] == costs[hull[-1]]:
+            hull.pop()
+        while len(hull) > 1:
+            a, b = hull[-2:]
+            rises = (errors[b] - errors[a]) * (costs[level] - costs[a])
+            if rises < (errors[level] - errors[a]) * (costs[b] - costs[a]):
+                break
+            hull.pop()
+        hull.append(level)
+    return hull
+
+
+def predict_errors(manifest: Manifest, camera: Camera) -> list[list[float]]:
+    """Predict the mean squared error that each level of each chunk adds to a view."""
+    pixels = camera.width * camera.height
+    result = []
+    for chunk in manifest.chunks:
+        radius, area = project_sphere(chunk.center, chunk.radius, camera)
+        result.append(
+            [area / pixels * _interpolate(manifest.error_radii, level.errors, radius) for level in chunk.levels]
+        )
+    return result
+
+
+def project_sphere(center: Sequence[float], radius: float, camera: Camera) -> tuple[float, float]:
+    """Return the radius in pixels of a sphere's projection, and its area within the picture in square pixels.
+
+    The radius is f r / max(distance, r) with the focal length f. The area is that of the disc, times the share of its
+    bounding square that lies in the picture. A camera inside the sphere sees it everywhere; behind the camera it is 0.
+    """
+    x, y, z = (camera.rotation @ (np.asarray(center) - camera.position)).tolist()
+    distance, focal = math.hypot(x, y, z), math.sqrt(camera.fx * camera.fy)
+    pixels = float(camera.width * camera.height)
+    projected = focal * radius / max(distance, radius, 1e-30)
+    if distance <= radius:
+        return projected, pixels
+    if z <= 0 and -z >= radius:
+        return projected, 0.0
+    depth = max(z, 1e-3 * distance)
+    u, v = camera.cx + camera.fx * x / depth, camera.cy + camera.fy * y / depth
+    half = focal * radius / depth
+    width = min(u + half, camera.width) - max(u - half, 0)
+    height = min(v + half, camera.height) - max(v - half, 0)
+    return projected, min(math.pi / 4 * max(width, 0.0) * max(height, 0.0), pixels)
+
+
+def _interpolate(radii: Sequence[float], errors: Sequence[float], radius: float) -> float:
+    """Interpolate errors linearly in the logarithm of the radius; beyond the first and the last they are constant."""
+    return float(np.interp(math.log(max(radius, 1e-30)), np.log(radii), errors))

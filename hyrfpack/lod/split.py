@@ -1,0 +1,300 @@
+"""Splits a model into a scene folder: chunks at several levels of detail, and a manifest with their errors."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import zlib
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from hyrfpack.atomic import write_atomic
+from hyrfpack.cameras.capture import Capture
+from hyrfpack.cameras.files import camera_to_numbers
+from hyrfpack.cameras.view_sampling import sample_views
+from hyrfpack.checks import check_type
+from hyrfpack.config.split import SplitConfig
+from hyrfpack.context import RunContext
+from hyrfpack.errors import HyrfError, HyrfFormatError
+from hyrfpack.format.container import Container, read_container
+from hyrfpack.format.decode import decode_container
+from hyrfpack.format.info import describe_file
+from hyrfpack.format.run_folder import find_model
+from hyrfpack.format.scene_folder import SceneFolder, is_scene
+from hyrfpack.format.scene_manifest import MANIFEST_NAME, Chunk, ChunkLevel, Manifest, SceneFile
+from hyrfpack.format.scene_model import join_chunks
+from hyrfpack.format.sections import SECTION_CONTENTS
+from hyrfpack.lock import exclusive_folder
+from hyrfpack.lod.encode import ChunkEncoder
+from hyrfpack.lod.errors import ERROR_RADII, measure_level_errors, resize_camera
+from hyrfpack.lod.merge import merge_gaussians
+from hyrfpack.lod.partition import partition
+from hyrfpack.lod.refit import refit_level
+from hyrfpack.model import Geometry, HybridModel
+from hyrfpack.ops.transfer import tensor_like
+from hyrfpack.outputs import Outputs, StrPath
+from hyrfpack.progress import Progress, TaskEvent, part_of_progress
+from hyrfpack.scene import Camera
+
+_LOG = logging.getLogger(__name__)
+
+SHARED_NAME = "shared.hyrf"
+LEVEL_RATIO = 4  # A level has as many times the Gaussians of the next coarser one, as pictures of half the size.
+MERGE_VIEWPOINTS = 8
+REFIT_VIEWS = 24
+MEASURED_VIEWS = 8
+_SIGMAS = 3.0
+_REFIT_SHARE, _MEASURE_SHARE = 0.6, 0.3  # of the progress
+
+
+@dataclass(frozen=True)
+class SplitReport:
+    """What `split_model` has written.
+
+    Attributes:
+        folder: path of the folder.
+        gaussians: Gaussians of the model, and so of the finest levels.
+        chunks: number of chunks.
+        bytes: bytes of all files but the manifest.
+        bytes_source: bytes of the file that was split.
+        bytes_finest: bytes of the shared file and the finest levels.
+        level_gaussians, level_bytes: Gaussians and bytes of all chunks at each level, the finest first.
+    """
+
+    folder: str
+    gaussians: int
+    chunks: int
+    bytes: int
+    bytes_source: int
+    bytes_finest: int
+    level_gaussians: list[int]
+    level_bytes: list[int]
+
+    def to_dict(self) -> dict:
+        """Return the report as numbers, strings and lists for JSON."""
+        return asdict(self)
+
+
+def split_model(
+    source: StrPath,
+    target: StrPath,
+    config: SplitConfig | None = None,
+    *,
+    overwrite: bool = True,
+    context: RunContext = RunContext(),  # noqa: B008 - frozen
+) -> SplitReport:
+    """Split a model into a scene folder: chunks of nearby Gaussians, each at several levels of detail.
+
+    The finest level of all chunks is the model: positions and fields are kept exactly, logits exactly or with steps
+    finer than those of the file. Coarser levels are merged, fitted to renders of the model, and their errors in
+    pictures are measured at the cameras that the file keeps.
+
+    Args:
+        source: a `.hyrf` file of one model, or the folder of a run.
+        target: folder to write; created if it is missing.
+        config: the settings; None for the defaults.
+        overwrite: replace a scene in the folder. If False, existing files are an error.
+        context: how progress is shown.
+
+    Raises:
+        HyrfError: the file cannot be read or holds merged models or no Gaussian, or the folder cannot be written.
+        TypeError: `config` is not a SplitConfig.
+
+    Example:
+        >>> import hyrfpack
+        >>> config = hyrfpack.SplitConfig(chunk_gaussians=64, levels=2, refit_steps=2)
+        >>> report = hyrfpack.split_model("bonsai.hyrf", "bonsai-scene", config)
+        >>> len(hyrfpack.load_model("bonsai-scene")) == report.gaussians, len(report.level_bytes)
+        (True, 2)
+    """
+    config = SplitConfig() if config is None else config
+    check_type("config", config, SplitConfig)
+    if is_scene(source):
+        raise HyrfError(f"{source}: this is a scene of several files already", fix="split the model that it came from")
+    path, target = find_model(source), Path(target)
+    Outputs(path, overwrite=True).folder(target, [MANIFEST_NAME, SHARED_NAME])
+    with exclusive_folder(target), context.open_progress("split") as progress:
+        Outputs(path, overwrite=overwrite).folder(target, [MANIFEST_NAME, SHARED_NAME])
+        files, manifest = _split(path, Path(source).stem, config, progress)
+        Outputs(path, overwrite=overwrite).folder(target, files)
+        _write_folder(target, files, manifest, overwrite)
+    levels = list(zip(*(chunk.levels for chunk in manifest.chunks), strict=True))
+    level_bytes = [sum(item.bytes for item in level) for level in levels]
+    return SplitReport(
+        str(target),
+        manifest.gaussians,
+        len(manifest.chunks),
+        manifest.total_bytes,
+        path.stat().st_size,
+        manifest.shared.bytes + level_bytes[0],
+        [sum(item.gaussians for item in level) for level in levels],
+        level_bytes,
+    )
+
+
+def _split(path: Path, name: str, config: SplitConfig, progress: Progress) -> tuple[dict[str, bytes], Manifest]:
+    """Return the files of the folder by name, without the manifest, and the manifest."""
+    progress(TaskEvent("reading the model", 0.0))
+    capture = Capture(describe_file(path))
+    with Container.open(path, SECTION_CONTENTS) as container:
+        model = decode_container(container)
+        if not len(model):
+            raise HyrfError(f"{path}: there is no Gaussian in it, so there is nothing to split", fix="train it again")
+        encoder = ChunkEncoder(container, model, SHARED_NAME)
+    files = {SHARED_NAME: encoder.shared_bytes}
+    cube = model.cube_coords(model.gaussians.positions.detach().double()).numpy()
+    groups = partition(cube, config.chunk_gaussians)
+    finest = [encoder.encode_subset(group) for group in groups]
+    groups = [order for _, order in finest]
+    encoded = [[data] for data, _ in finest]
+    counts = [[len(group)] for group in groups]
+    order = np.concatenate(groups)
+    chunk_of = np.repeat(np.arange(len(groups)), list(map(len, groups)))
+    boxes = _measure_boxes(model, groups)
+    models = [model.subset(torch.from_numpy(order))]
+    cameras = capture.cameras
+    geometry = model.decode_geometry()
+    for level in range(1, config.levels):
+        share = (level - 1) / max(config.levels - 1, 1)
+        part = part_of_progress(progress, _REFIT_SHARE * share, _REFIT_SHARE * (share + 1 / (config.levels - 1)))
+        parts = _make_level(model, geometry, groups, cameras, level, config, part)
+        decoded = []
+        for number, coarse in enumerate(parts):
+            data = encoder.encode_gaussians(coarse)
+            encoded[number].append(data)
+            counts[number].append(len(coarse))
+            decoded.append(_decode(data, encoder, model))
+        models.append(join_chunks(model, decoded))
+    spheres = [(chunk.center, chunk.radius) for chunk in (Chunk(low, high, ()) for low, high in boxes)]
+    part = part_of_progress(progress, _REFIT_SHARE, _REFIT_SHARE + _MEASURE_SHARE)
+    views = _views(cameras, MEASURED_VIEWS, config.seed + 1) if config.levels > 1 else []
+    errors = measure_level_errors(models, chunk_of, spheres, views, part)
+    chunks = []
+    for number, (low, high) in enumerate(boxes):
+        levels = []
+        for level, data in enumerate(encoded[number]):
+            file = f"chunk-{number:04d}-{level}.hyrf"
+            files[file] = data
+            stated = tuple(float(f"{error:.4g}") for error in errors[level, number])
+            levels.append(ChunkLevel(file, len(data), _checksum(data), counts[number][level], stated))
+        chunks.append(Chunk(low, high, tuple(levels)))
+    return files, _make_manifest(encoder, chunks, capture, name, config)
+
+
+def _make_level(
+    model: HybridModel,
+    geometry: Geometry,
+    groups: Sequence[np.ndarray],
+    cameras: Sequence[Camera],
+    level: int,
+    config: SplitConfig,
+    progress: Progress,
+) -> list[HybridModel]:
+    """Return the model of each chunk at a coarse level."""
+    frame = model.config.frame
+    places = [camera.position for camera in sample_views(cameras, MERGE_VIEWPOINTS, config.seed)[0]]
+    viewpoints = [tensor_like(frame.to_local(place).tolist(), model.gaussians.positions) for place in places]
+    merged = []
+    for group in groups:
+        index = torch.from_numpy(group)
+        count = max(1, len(group) // LEVEL_RATIO**level)
+        merged.append(model.with_gaussians(merge_gaussians(model.subset(index), geometry[index], viewpoints, count)))
+    joined = join_chunks(model, merged)
+    share = LEVEL_RATIO ** (-level / 2)
+    views = [resize_camera(camera, share) for camera in _views(cameras, REFIT_VIEWS, config.seed)]
+    refit_level(joined, model, views, config.refit_steps, config.seed, progress)
+    ends = np.cumsum([len(each) for each in merged])
+    return [joined.subset(torch.arange(end - len(each), end)) for each, end in zip(merged, ends.tolist(), strict=True)]
+
+
+def _views(cameras: Sequence[Camera], count: int, seed: int) -> list[Camera]:
+    """Return views, half of them at cameras and half between them."""
+    at, between = sample_views(cameras, count // 2, seed)
+    return [*at, *between]
+
+
+def _decode(data: bytes, encoder: ChunkEncoder, model: HybridModel) -> HybridModel:
+    """Return the model of a chunk as readers will decode it."""
+    container = read_container(data, SECTION_CONTENTS)
+    container.open_file = lambda name: read_container(encoder.shared_bytes, SECTION_CONTENTS, name)
+    return decode_container(container, model)
+
+
+def _measure_boxes(
+    model: HybridModel, groups: Sequence[np.ndarray]
+) -> list[tuple[tuple[float, float, float], tuple[float, float, float]]]:
+    """Return the corners of the box of each group of Gaussians in world units, three standard deviations included."""
+    frame = model.config.frame
+    means = frame.to_world(model.gaussians.positions.numpy())
+    reach = _SIGMAS * frame.scale * model.decode_geometry().scales.amax(dim=1).double().numpy()
+    boxes = []
+    for group in groups:
+        low = (means[group] - reach[group, None]).min(axis=0)
+        high = (means[group] + reach[group, None]).max(axis=0)
+        boxes.append((_rounded(low), _rounded(high)))
+    return boxes
+
+
+def _rounded(values: np.ndarray) -> tuple[float, float, float]:
+    x, y, z = (float(f"{value:.7g}") for value in values)
+    return x, y, z
+
+
+def _checksum(data: bytes) -> str:
+    return f"{zlib.crc32(data):08x}"
+
+
+def _make_manifest(
+    encoder: ChunkEncoder, chunks: list[Chunk], capture: Capture, name: str, config: SplitConfig
+) -> Manifest:
+    model, shared = encoder.model, encoder.shared_bytes
+    values = model.config.to_dict()
+    known = not capture.is_synthetic
+    return Manifest(
+        gaussians=len(model),
+        shared=SceneFile(SHARED_NAME, len(shared), _checksum(shared)),
+        chunks=tuple(chunks),
+        error_radii=ERROR_RADII,
+        frame=values["frame"],
+        background=values["background"],
+        solid=tuple(values["solid"]),
+        viewpoint=capture.viewpoint.to_json(rounded=True),
+        cameras=tuple(tuple(camera_to_numbers(camera)) for camera in capture.cameras[:14]) if known else (),
+        title=name if config.title is None else config.title,
+        licence=config.licence,
+    )
+
+
+def _write_folder(folder: Path, files: dict[str, bytes], manifest: Manifest, overwrite: bool) -> None:
+    """Write all files and then the manifest; if anything fails, the folder holds no manifest and no new file."""
+    old = []
+    if overwrite:  # Without the old manifest, no mixture of old and new files can be taken for a scene.
+        old = _list_old_files(folder)
+        (folder / MANIFEST_NAME).unlink(missing_ok=True)
+    written = []
+    try:
+        for name, data in files.items():
+            is_new = not (folder / name).exists()
+            write_atomic(folder / name, data, overwrite=overwrite, rename=False)
+            written += [folder / name] * is_new
+        write_atomic(folder / MANIFEST_NAME, manifest.to_json(), overwrite=overwrite, rename=False)
+    except BaseException:
+        for path in written:
+            with contextlib.suppress(OSError):
+                path.unlink()
+        raise
+    for name in set(old) - set(files):
+        with contextlib.suppress(OSError):
+            (folder / name).unlink()
+
+
+def _list_old_files(folder: Path) -> list[str]:
+    """Return the names of the files of the scene that a folder holds; none if it holds no valid one."""
+    try:
+        return [item.file for item in SceneFolder(folder).manifest.files]
+    except HyrfFormatError:
+        return []

@@ -1,0 +1,333 @@
+"""A model that is split into a scene folder stays the model, and damaged or forged folders are refused."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import zipfile
+import zlib
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from commands import hyrfpack, refused, succeeded
+from json_schema import matches
+
+from hyrfpack.cameras.capture import Capture
+from hyrfpack.config.split import SplitConfig
+from hyrfpack.context import RunContext
+from hyrfpack.errors import HyrfError, HyrfFormatError
+from hyrfpack.format import describe_file, load_merged_model, load_model, scene_manifest
+from hyrfpack.format.arrays import to_arrays
+from hyrfpack.format.container import MINOR_VERSION, Container, Section, read_container, write_container
+from hyrfpack.format.parts import encode_parts
+from hyrfpack.format.scene_folder import SceneFolder, is_scene, single_file
+from hyrfpack.format.sections import SECTION_CONTENTS
+from hyrfpack.format.shared import CODEC_SHARED
+from hyrfpack.lod import LevelRenderer, split, split_model
+from hyrfpack.render import render_view
+from tools.safety import minimal_reader
+from tools.safety.make_golden import GOLDEN_FOLDER, GOLDEN_SCENE_FOLDER, GOLDEN_SCENE_SOURCE
+
+COMPACT, RAW = (GOLDEN_FOLDER / "trained" / name for name in ("demo_compact.hyrf", "demo.hyrf"))
+QUIET = RunContext(progress=None)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """Return a scene folder of four chunks at two levels."""
+    path = tmp_path_factory.mktemp("split") / "demo-scene"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(split, "REFIT_VIEWS", 2)
+        patch.setattr(split, "MEASURED_VIEWS", 2)
+        split_model(COMPACT, path, SplitConfig(chunk_gaussians=400, levels=2, refit_steps=3), context=QUIET)
+    return path
+
+
+@pytest.fixture
+def copy(folder, tmp_path) -> Path:
+    return Path(shutil.copytree(folder, tmp_path / "copy"))
+
+
+@pytest.fixture(scope="module")
+def cameras():
+    return Capture(describe_file(COMPACT)).cameras[:3]
+
+
+def read_with_minimal_reader(path: Path):
+    others = {file.name: file.read_bytes() for file in path.parent.glob("*.hyrf")}
+    return minimal_reader.read(path.read_bytes(), folder=others)
+
+
+def psnr_between(first, second, camera) -> float:
+    with torch.no_grad():
+        error = (render_view(first, camera).rgb - render_view(second, camera).rgb).square().mean()
+    return -10 * math.log10(float(error) + 1e-12)
+
+
+def edit_manifest(path: Path, change) -> None:
+    values = json.loads((path / "scene.json").read_text())
+    change(values)
+    (path / "scene.json").write_text(json.dumps(values))
+
+
+def test_the_manifest_lists_every_file_as_it_is(folder):
+    values = json.loads((folder / "scene.json").read_text())
+    listed = [values["shared"], *(level for chunk in values["chunks"] for level in chunk["levels"])]
+
+    assert {item["file"] for item in listed} == {path.name for path in folder.glob("*.hyrf")}
+    for item in listed:
+        data = (folder / item["file"]).read_bytes()
+        assert (item["bytes"], item["crc32"]) == (len(data), f"{zlib.crc32(data):08x}")
+        metadata = minimal_reader.read_metadata(minimal_reader.read_container(data)["META"])
+        assert item.get("gaussians", 0) == metadata["gaussians"]
+    assert matches(values, json.loads(Path(scene_manifest.__file__).with_name("scene.schema.json").read_text()))
+
+
+def test_the_finest_levels_are_the_model(folder, cameras):
+    model, scene = load_model(COMPACT), load_model(folder)
+
+    def sort(positions):
+        return positions[np.lexsort(positions.T)]
+
+    np.testing.assert_array_equal(*(sort(each.gaussians.positions.numpy()) for each in (model, scene)))
+    for name, values in model.state_dict().items():
+        if not name.startswith("gaussians"):
+            assert torch.equal(scene.state_dict()[name], values), name
+    assert min(psnr_between(model, scene, camera) for camera in cameras) > 45
+
+
+def test_the_finest_levels_of_a_raw_file_have_its_very_numbers(tmp_path):
+    split_model(RAW, tmp_path / "scene", SplitConfig(chunk_gaussians=500, levels=1), context=QUIET)
+
+    rows = [
+        np.concatenate(list(to_arrays(load_model(path)).values())[:4], axis=1) for path in (RAW, tmp_path / "scene")
+    ]
+    assert Counter(row.tobytes() for row in rows[0]) == Counter(row.tobytes() for row in rows[1])
+
+
+def test_a_chunk_opens_by_itself_as_the_format_page_says(folder):
+    path = folder / "chunk-0001-0.hyrf"
+    metadata, groups, _ = read_with_minimal_reader(path)
+
+    facts = describe_file(path)
+
+    for group, values in to_arrays(load_model(path)).items():
+        np.testing.assert_array_equal(values, groups[group], err_msg=group)
+    assert facts["version"] == "1.5"
+    assert facts["provenance"] == metadata["provenance"] == describe_file(COMPACT)["provenance"]
+
+
+def test_chunks_do_not_repeat_the_fields(folder):
+    with Container.open(folder / "chunk-0000-0.hyrf", SECTION_CONTENTS) as chunk:
+        shared = [entry for entry in chunk.entries.values() if entry.codec == CODEC_SHARED]
+
+    assert {entry.type for entry in shared} >= {"GTAB", "RTAB", "GMLP", "RMLP"}
+    assert sum(entry.length for entry in shared) < 100
+
+
+def test_the_box_of_a_chunk_holds_its_gaussians(folder):
+    scene = SceneFolder(folder)
+    for number, chunk in enumerate(scene.manifest.chunks):
+        model = scene.load_chunk(number)
+        means = model.config.frame.to_world(model.gaussians.positions.numpy())
+        assert (means >= np.array(chunk.low)).all() and (means <= np.array(chunk.high)).all()
+
+
+def test_a_coarse_level_has_a_quarter_of_the_gaussians_and_a_measured_error(folder):
+    for chunk in SceneFolder(folder).manifest.chunks:
+        fine, coarse = chunk.levels
+        assert coarse.gaussians == fine.gaussians // 4
+        assert coarse.bytes < fine.bytes
+        assert set(fine.errors) == {0.0} and 0 < max(coarse.errors) < 1
+
+
+def test_a_view_with_a_budget_draws_no_more_gaussians(folder, cameras):
+    renderer = LevelRenderer(SceneFolder(folder), gaussians=800)
+
+    model, choice = renderer.load(cameras[0])
+
+    assert len(model) == choice.gaussians <= 800
+    assert set(choice.levels) == {0, 1}
+
+
+def test_a_zip_of_the_folder_is_read_like_the_folder(folder, tmp_path):
+    archive = shutil.make_archive(str(tmp_path / "scene"), "zip", folder.parent, folder.name)
+
+    assert is_scene(archive) and describe_file(archive) == describe_file(folder)
+    assert all(torch.equal(a, b) for a, b in zip(*(load_model(p).parameters() for p in (archive, folder)), strict=True))
+
+
+def test_a_zip_that_declares_another_size_is_refused(folder, tmp_path):
+    with zipfile.ZipFile(tmp_path / "scene.zip", "w", zipfile.ZIP_DEFLATED) as archive:
+        for path in folder.iterdir():
+            archive.writestr(path.name, path.read_bytes() if path.name != "shared.hyrf" else bytes(10**6))
+
+    with pytest.raises(HyrfFormatError, match=r"shared.hyrf: the manifest says [\d,]+ bytes and there are"):
+        load_model(tmp_path / "scene.zip")
+
+
+@pytest.mark.parametrize(
+    ("name", "damage", "problem"),
+    [
+        ("chunk-0002-0.hyrf", None, "this file of the scene is missing"),
+        ("shared.hyrf", None, "this file of the scene is missing"),
+        ("chunk-0002-0.hyrf", lambda data: data[:-8], "the manifest says"),
+        ("chunk-0002-0.hyrf", lambda data: data + bytes(8), "the manifest says"),
+        (
+            "chunk-0002-0.hyrf",
+            lambda data: data[:-9] + bytes([data[-9] ^ 1]) + data[-8:],
+            "its bytes are not those that the manifest",
+        ),
+    ],
+)
+def test_a_missing_or_damaged_file_is_one_clear_sentence(copy, name, damage, problem):
+    path = copy / name
+    if damage is None:
+        path.unlink()
+    else:
+        path.write_bytes(damage(path.read_bytes()))
+
+    with pytest.raises(HyrfFormatError, match=f"{name}: {problem}"):
+        load_model(copy)
+
+
+def test_a_manifest_that_lies_about_gaussians_is_refused(copy):
+    def lie(values):
+        values["gaussians"] += 1
+        values["chunks"][0]["levels"][0]["gaussians"] += 1
+
+    edit_manifest(copy, lie)
+
+    with pytest.raises(HyrfFormatError, match=r"says [\d,]+ Gaussians and there are"):
+        load_model(copy)
+
+
+def test_a_chunk_of_another_scene_is_refused(copy, tmp_path):
+    split_model(RAW, tmp_path / "other", SplitConfig(chunk_gaussians=400, levels=1), context=QUIET)
+    data = (tmp_path / "other" / "shared.hyrf").read_bytes()
+    (copy / "shared.hyrf").write_bytes(data)
+    edit_manifest(
+        copy, lambda v: v.update(shared={"file": "shared.hyrf", "bytes": len(data), "crc32": f"{zlib.crc32(data):08x}"})
+    )
+
+    with pytest.raises(HyrfFormatError, match="configuration is not that|is not the one that .* refers to"):
+        load_model(copy)
+    with pytest.raises(HyrfFormatError, match="is not the one that .*chunk-0000-0.hyrf refers to"):
+        load_model(copy / "chunk-0000-0.hyrf")
+
+
+@pytest.mark.parametrize("name", [b"../shared.hyrf", b"", b".hyrf", b"a\0.hyrf", b"shared.txt", b"x" * 70 + b".hyrf"])
+def test_a_reference_out_of_the_folder_is_refused(copy, name):
+    path = copy / "chunk-0000-0.hyrf"
+    sections = {section.type: section for section in read_container(path.read_bytes()).sections}
+    data = bytes(sections["GTAB"].data[:4]) + name
+    sections["GTAB"] = Section("GTAB", CODEC_SHARED, data, len(data))
+    path.write_bytes(write_container(list(sections.values()), MINOR_VERSION))
+
+    with pytest.raises(HyrfFormatError, match="section 'GTAB' refers to no file of its folder|refer to several files"):
+        load_model(path)
+    with pytest.raises(ValueError, match=r"bad name|several files|wrong raw length"):
+        read_with_minimal_reader(path)
+
+
+def test_the_bytes_of_a_chunk_alone_are_refused(folder):
+    data = (folder / "chunk-0000-0.hyrf").read_bytes()
+
+    with pytest.raises(HyrfFormatError, match=r"needs the file shared.hyrf of its folder"):
+        from hyrfpack.format import decode_model
+
+        decode_model(data)
+    with pytest.raises(HyrfError, match="a part cannot refer to another file"):
+        encode_parts([("chunk", data)])
+
+
+def test_a_file_that_the_manifest_does_not_list_is_ignored_with_a_note(copy):
+    shutil.copy(copy / "shared.hyrf", copy / "stray.hyrf")
+
+    result = hyrfpack("info", copy)
+
+    assert result.exit_code == 0
+    assert "stray.hyrf: not in the manifest and ignored" in result.stderr
+
+
+def test_an_existing_scene_is_replaced_only_with_permission_and_completely(copy):
+    before = {path.name: path.read_bytes() for path in copy.iterdir()}
+    fewer = SplitConfig(chunk_gaussians=800, levels=1)
+    with pytest.raises(HyrfError, match="overwrite"):
+        split_model(COMPACT, copy, fewer, overwrite=False, context=QUIET)
+    assert {path.name: path.read_bytes() for path in copy.iterdir()} == before
+
+    split_model(COMPACT, copy, fewer, context=QUIET)
+
+    assert sorted(path.name for path in copy.iterdir()) == [
+        "chunk-0000-0.hyrf",
+        "chunk-0001-0.hyrf",
+        "scene.json",
+        "shared.hyrf",
+    ]
+
+
+def test_a_failure_leaves_no_half_written_folder(tmp_path, monkeypatch):
+    written, real = [], split.write_atomic
+
+    def fail_third(path, *args, **options):
+        written.append(path)
+        if len(written) == 3:
+            raise HyrfError(f"{path}: the disk is full", fix="free space")
+        return real(path, *args, **options)
+
+    monkeypatch.setattr(split, "write_atomic", fail_third)
+    with pytest.raises(HyrfError, match="disk is full"):
+        split_model(COMPACT, tmp_path / "scene", SplitConfig(chunk_gaussians=400, levels=1), context=QUIET)
+
+    assert len(written) == 3 and not (tmp_path / "scene").exists()
+
+
+def test_merged_files_and_scenes_are_refused_as_sources(folder, tmp_path):
+    merged = tmp_path / "two.hyrf"
+    merged.write_bytes(encode_parts([("a", COMPACT.read_bytes()), ("b", COMPACT.read_bytes())]))
+
+    assert "holds merged models" in refused("split", merged, "-o", tmp_path / "scene")
+    assert "a scene of several files already" in refused("split", folder, "-o", tmp_path / "scene")
+    assert not (tmp_path / "scene").exists()
+
+
+def test_commands_read_a_scene_like_a_file(folder, tmp_path):
+    info = json.loads(succeeded("info", folder, "--json").stdout)
+    text = succeeded("info", folder / "scene.json").stdout
+    succeeded("render", folder, "-o", tmp_path / "views", "--orbit", 1, "--gaussians", 700)
+    succeeded("decompress", folder, "-o", tmp_path / "joined.hyrf")
+    succeeded("export", folder, "-o", tmp_path / "player")
+
+    assert info["gaussians"] == 1500 and len(info["scene"]["chunks"]) == 4
+    assert "1,500 Gaussians in 4 chunks" in text and "level 1" in text
+    assert [path.name for path in (tmp_path / "views").iterdir()] == ["0000.png"]
+    for joined in (tmp_path / "joined.hyrf", tmp_path / "player" / "scene.hyrf"):
+        for first, second in zip(load_model(joined).parameters(), load_model(folder).parameters(), strict=True):
+            assert torch.equal(first, second)
+    assert len(load_merged_model(folder)) == 1500
+    with single_file(folder) as file:
+        assert file.name == "demo-scene.hyrf"
+
+
+def test_budgets_are_for_scenes_and_exclude_each_other(folder, tmp_path):
+    assert "no levels of detail" in refused("render", COMPACT, "-o", tmp_path / "a", "--bytes", "1MB")
+    assert "give one of them" in refused("render", folder, "-o", tmp_path / "a", "--bytes", "1MB", "--gaussians", 5)
+    assert not (tmp_path / "a").exists()
+
+
+def test_the_golden_scene_is_read_as_the_file_that_it_was_made_of():
+    model, scene = load_model(GOLDEN_FOLDER / f"{GOLDEN_SCENE_SOURCE}.hyrf"), load_model(GOLDEN_SCENE_FOLDER)
+
+    for name, values in model.state_dict().items():
+        if not name.startswith("gaussians"):
+            assert torch.equal(scene.state_dict()[name], values), name
+    assert len(scene) == len(model) and scene.exposure is not None
+    _, groups, exposure = read_with_minimal_reader(GOLDEN_SCENE_FOLDER / "chunk-0000-0.hyrf")
+    for group, values in to_arrays(scene).items():
+        np.testing.assert_array_equal(values, groups[group], err_msg=group)
+    assert exposure is not None

@@ -1,0 +1,131 @@
+"""Split trained models into chunks with levels of detail, and compare predicted with measured errors of views.
+
+    python -m tools.studies.levels --runs runs/quality/2000 --sets mipnerf360_bonsai kitti_street indoor_room
+
+--runs has a folder for each data set, and below it runs with a `model.hyrf` and, beside it, its `compact.hyrf`, which
+is split. The first table compares the finest level with the file: bytes, PSNR in dB of its renders against those of the
+file, and PSNR of both on held-out photos. The second one draws views between the cameras, which levels were neither
+fitted nor measured at, within budgets: the share of all Gaussians, the size of the pictures, the mean Gaussians in a
+view, predicted and measured PSNR against the finest level, the largest difference of both in one view, and the PSNR of
+the level of about as many Gaussians everywhere.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+import hyrfpack
+from hyrfpack.cameras.view_sampling import interpolate_views
+from hyrfpack.config.split import SplitConfig
+from hyrfpack.lod import LevelRenderer
+from hyrfpack.lod.errors import resize_camera
+from hyrfpack.measure.psnr import psnr_from_mse
+from hyrfpack.model import HybridModel
+from hyrfpack.scene import Camera, Scene, evenly_spaced
+from tools.studies.trained_runs import load_runs, make_runs_parser
+from tools.tables import markdown_table
+
+COMPACT_FILE = "compact.hyrf"
+BUDGETS = (0.1, 0.25, 0.5)
+RESOLUTIONS = (1.0, 1 / 4)
+PATH_VIEWS = 12
+PATH_SEED = 1000  # unlike the seeds of the views that `split_model` fits and measures at
+FINEST_HEADER = (
+    *("set", "Gaussians", "chunks", "bytes of the file", "bytes of the finest level", "bytes of all levels"),
+    *("PSNR to the file", "photos, file", "photos, finest level"),
+)
+VIEWS_HEADER = ("set", "budget", "pictures", "Gaussians", "predicted", "measured", "largest difference", "one level")
+QUIET = hyrfpack.RunContext(progress=None)
+
+
+@torch.no_grad()
+def render_all(model: HybridModel, cameras: Sequence[Camera]) -> list[torch.Tensor]:
+    return [hyrfpack.render_view(model, camera).rgb for camera in cameras]
+
+
+def compare(pictures: Sequence[torch.Tensor], others: Sequence[torch.Tensor]) -> list[float]:
+    """Return the mean squared error of each picture."""
+    return [float((a - b).square().mean()) for a, b in zip(pictures, others, strict=True)]
+
+
+def mean_psnr(errors: Sequence[float]) -> float:
+    return float(np.mean([psnr_from_mse(error) for error in errors]))
+
+
+def measure_finest(name: str, file: Path, folder: Path, scene: Scene, report: hyrfpack.SplitReport) -> list[str]:
+    """Return the cells of a row of the first table."""
+    model, finest = hyrfpack.load_model(file), hyrfpack.load_model(folder)
+    cameras = [view.camera for view in evenly_spaced(scene.test, PATH_VIEWS)]
+    same = mean_psnr(compare(render_all(model, cameras), render_all(finest, cameras)))
+    photos = [hyrfpack.evaluate_model(each, scene.test).psnr for each in (model, finest)]
+    sizes = (report.bytes_source, report.bytes_finest, report.bytes)
+    cells = [f"{size:,}" for size in sizes] + [f"{same:.1f}", *(f"{psnr:.3f}" for psnr in photos)]
+    return [name, f"{report.gaussians:,}", str(report.chunks), *cells]
+
+
+def measure_views(name: str, folder: Path, scene: Scene) -> list[list[str]]:
+    """Return the rows of the second table."""
+    levels, rows = hyrfpack.SceneFolder(folder), []
+    cameras = evenly_spaced(interpolate_views([view.camera for view in scene.train], PATH_SEED), PATH_VIEWS)
+    finest, chunks = levels.load(), levels.manifest.chunks
+    uniform = [levels.load([level] * len(chunks)) for level in range(len(chunks[0].levels))]
+    for share in RESOLUTIONS:
+        views = [resize_camera(camera, share) for camera in cameras]
+        targets = render_all(finest, views)
+        by_level = [mean_psnr(compare(targets, render_all(model, views))) for model in uniform[1:]]
+        for budget in BUDGETS:
+            renderer = LevelRenderer(levels, gaussians=round(budget * len(finest)))
+            drawn = [renderer.load(view) for view in views]
+            measured = compare(
+                targets, [render_all(model, [view])[0] for (model, _), view in zip(drawn, views, strict=True)]
+            )
+            pairs = [
+                (psnr_from_mse(choice.predicted_mse), psnr_from_mse(error))
+                for (_, choice), error in zip(drawn, measured, strict=True)
+            ]
+            count = np.mean([choice.gaussians for _, choice in drawn])
+            nearest = max(level for level, model in enumerate(uniform) if len(model) >= 0.99 * budget * len(finest))
+            alone = f"{by_level[nearest - 1]:.1f}" if nearest and budget == BUDGETS[1] else ""
+            predicted, actual = np.mean(pairs, axis=0)
+            worst = max((a - b for a, b in pairs), key=abs)
+            rows.append(
+                [
+                    name,
+                    f"{budget:.0%}",
+                    f"{share:g}",
+                    f"{count:,.0f}",
+                    f"{predicted:.1f}",
+                    f"{actual:.1f}",
+                    f"{worst:+.1f}",
+                    alone,
+                ]
+            )
+            print(rows[-1], flush=True)
+    return rows
+
+
+def main() -> None:
+    parser = make_runs_parser(__doc__ or "")
+    parser.add_argument("--sets", nargs="+", help="data sets; default: all below --runs")
+    parser.add_argument("--chunk-gaussians", type=int, default=2048)
+    arguments = parser.parse_args()
+    finest_rows, view_rows = [], []
+    for name, model_file, scene in load_runs(arguments.runs, arguments.data, arguments.sets):
+        file = model_file.with_name(COMPACT_FILE)
+        with tempfile.TemporaryDirectory() as temporary:
+            folder = Path(temporary, name)
+            report = hyrfpack.split_model(file, folder, SplitConfig(arguments.chunk_gaussians), context=QUIET)
+            finest_rows.append(measure_finest(name, file, folder, scene, report))
+            print(finest_rows[-1], report.level_bytes, flush=True)
+            view_rows += measure_views(name, folder, scene)
+    print(markdown_table(FINEST_HEADER, finest_rows))
+    print(markdown_table(VIEWS_HEADER, view_rows))
+
+
+if __name__ == "__main__":
+    main()
