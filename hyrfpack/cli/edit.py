@@ -20,7 +20,7 @@ from hyrfpack.cli.common import (
 )
 from hyrfpack.cli.ordered import OrderedCommand, options_in_order
 from hyrfpack.cli.settings import settings_options
-from hyrfpack.cli.types import BOX, OUTPUT, PATH, Numbers, NumbersOrWord
+from hyrfpack.cli.types import OUTPUT, PATH, TURNED_BOX, Numbers, NumbersOrWord
 from hyrfpack.config.compress import PROFILES
 from hyrfpack.config.edit import (
     DEFAULT_MIN_OPACITY_SHARE,
@@ -63,7 +63,7 @@ def _read_polygon(path: Path) -> Action:
 
 # How the value of each option becomes an action.
 _ACTION_BY_OPTION: dict[str, Callable[[Any], Action]] = {
-    "crop_box": lambda box: CropBox(tuple(box[:3]), tuple(box[3:])),
+    "crop_box": lambda box: CropBox(tuple(box[:3]), tuple(box[3:6]), *box[6:]),
     "crop_sphere": lambda numbers: CropSphere(tuple(numbers[:3]), numbers[3]),
     "crop_cameras": CropCameras,
     "crop_polygon": _read_polygon,
@@ -87,7 +87,13 @@ _ACTION_BY_OPTION: dict[str, Callable[[Any], Action]] = {
 @click.option("-o", "--output", type=OUTPUT, metavar="FILE", help="The .hyrf file to write.")
 @click.option("--plan", is_flag=True, help="Print what the actions would do, and write no model.")
 @click.option("--picture", type=OUTPUT, metavar="FILE", help="Write a .png or .jpg of the scene before and after.")
-@click.option("--crop-box", type=BOX, multiple=True, help="Keep the Gaussians inside MINX,MINY,MINZ,MAXX,MAXY,MAXZ.")
+@click.option(
+    "--crop-box",
+    type=TURNED_BOX,
+    multiple=True,
+    help="Keep the Gaussians inside MINX,MINY,MINZ,MAXX,MAXY,MAXZ[,DEGREES]. The degrees turn the box about its centre "
+    "and the up direction, by the right-hand rule.",
+)
 @click.option(
     "--crop-sphere", type=Numbers(4, "X,Y,Z,RADIUS"), multiple=True, help="Keep the Gaussians inside a sphere."
 )

@@ -47,18 +47,22 @@ SIZE = _Size()
 
 
 class _Box(click.ParamType):
-    """An axis-aligned box as six numbers with commas between: minimum x, y, z, then maximum x, y, z."""
+    """A box as numbers with commas between: minimum x, y, z, maximum x, y, z; with `may_turn`, degrees may follow."""
 
     name = "box"
+
+    def __init__(self, *, may_turn: bool = False) -> None:
+        self._form = "MINX,MINY,MINZ,MAXX,MAXY,MAXZ" + ("[,DEGREES]" if may_turn else "")
+        self._counts = (6, 7) if may_turn else (6,)
 
     def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, ...]:
         try:
             numbers = tuple(float(part) for part in str(value).split(","))
         except ValueError:
             numbers = ()
-        if len(numbers) != 6 or any(map(math.isnan, numbers)):
-            self.fail(f"'{value}' is not a box; write it as MINX,MINY,MINZ,MAXX,MAXY,MAXZ in world units", param, ctx)
-        if any(low > high for low, high in zip(numbers[:3], numbers[3:], strict=True)):
+        if len(numbers) not in self._counts or any(map(math.isnan, numbers)):
+            self.fail(f"'{value}' is not a box; write it as {self._form} in world units", param, ctx)
+        if any(low > high for low, high in zip(numbers[:3], numbers[3:6], strict=True)):
             self.fail(f"'{value}' has a minimum above its maximum; give the minimum x, y and z first", param, ctx)
         return numbers
 
@@ -125,7 +129,7 @@ class _HarmonicsDegree(click.ParamType):
         return int(str(value))
 
 
-BOX = _Box()
+BOX, TURNED_BOX = _Box(), _Box(may_turn=True)
 HARMONICS_DEGREE = _HarmonicsDegree()
 
 

@@ -39,19 +39,25 @@ class CropBox:
 
     Attributes:
         low, high: minimum and maximum corner. Infinite numbers leave a side open.
+        degrees: turns the box about its centre and the scene's up direction, by the right-hand rule.
     """
 
     low: Vector
     high: Vector
+    degrees: float = 0.0
 
     def __post_init__(self) -> None:
+        check_float("degrees", abs(self.degrees))
+        if self.degrees and not all(map(math.isfinite, (*self.low, *self.high))):
+            raise ValueError(f"the box from {self.low} to {self.high} has no centre, about which it could be turned")
         for name in ("low", "high"):
             _check_vector(name, getattr(self, name), may_be_infinite=True)
         if any(low > high for low, high in zip(self.low, self.high, strict=True)):
             raise ValueError(f"the box from {self.low} to {self.high} has a minimum above its maximum")
 
     def __str__(self) -> str:
-        return f"crop to the box from {_format(self.low)} to {_format(self.high)}"
+        turn = f", turned by {self.degrees:g} degrees" if self.degrees else ""
+        return f"crop to the box from {_format(self.low)} to {_format(self.high)}{turn}"
 
 
 @dataclass(frozen=True)

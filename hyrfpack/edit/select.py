@@ -26,6 +26,7 @@ from hyrfpack.edit.floaters import find_floaters
 from hyrfpack.edit.masks import share_of_light_in_masks
 from hyrfpack.edit.polygon import clean_corners, find_inside
 from hyrfpack.edit.state import EditState
+from hyrfpack.edit.transform import Placement
 from hyrfpack.errors import HyrfError
 from hyrfpack.model.merged import MergedModel, parts_of, scene_of
 
@@ -44,6 +45,10 @@ def keep_mask(action: object, state: EditState) -> np.ndarray:
 @keep_mask.register
 def _(action: CropBox, state: EditState) -> np.ndarray:
     positions = state.world_positions()
+    if action.degrees:
+        center = (np.array(action.low) + action.high) / 2
+        turn = Placement.rotation_about_axis(state.up, action.degrees).rotation
+        positions = (positions - center) @ turn + center  # turned back, to the axes of the box
     return np.asarray(((positions >= action.low) & (positions <= action.high)).all(axis=1))
 
 

@@ -267,6 +267,28 @@ def test_a_box_after_a_rotation_has_the_new_axes(tmp_path):
     assert report.actions[1].gaussians_after == pytest.approx(inside, abs=1)
 
 
+@pytest.mark.parametrize("degrees", [30.0, -115.0])
+def test_a_turned_box_keeps_what_lies_in_it_after_a_turn_about_its_centre_and_up(degrees):
+    positions = world_positions(RAW_FILE)
+    low, high = np.quantile(positions, [0.15, 0.8], axis=0)
+    axis = np.array([0.2, 0.9, -0.3]) / np.linalg.norm([0.2, 0.9, -0.3])
+    actions = [Up((0.2, 0.9, -0.3)), CropBox(tuple(low), tuple(high), degrees)]
+
+    report = plan_edit(RAW_FILE, actions, context=QUIET_CONTEXT)
+
+    middle = (low + high) / 2
+    turned_back = Rotation.from_rotvec(-np.radians(degrees) * axis).apply(positions - middle)
+    expected = (np.abs(turned_back) <= (high - low) / 2).all(axis=1).sum()
+    assert report.actions[1].gaussians_after == expected
+    assert expected != ((positions >= low) & (positions <= high)).all(axis=1).sum()
+
+
+def test_a_box_with_an_open_side_cannot_be_turned():
+    assert "no centre" in refused("edit", RAW_FILE, "--plan", "--crop-box=-1,-1,-1,1,1,inf,30")
+    with pytest.raises(ValueError, match="no centre"):
+        CropBox((0, 0, 0), (1, 1, np.inf), 5)
+
+
 def test_turning_back_gives_a_file_of_the_old_version_and_the_same_box(tmp_path):
     there = edited(COMPACT_FILE, tmp_path, Rotate((1.0, 2.0, 3.0), 40))
     edit_model(there, tmp_path / "back.hyrf", [Rotate((1.0, 2.0, 3.0), -40)], context=QUIET_CONTEXT)

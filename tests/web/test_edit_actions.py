@@ -32,6 +32,16 @@ CASES: dict[str, tuple[Frame, list[dict]]] = {
         MODEL_FRAME,
         [{"option": "min-opacity", "value": 0.6}, {"option": "max-scale", "value": 0.35}],
     ),
+    "a box turned about up": (ROTATED_FRAME, [UP, {**CROP_BOX_ACTION, "value": [*CROP_BOX_ACTION["value"], 37.5]}]),
+    "a turned box after a turn to +z, inverted": (
+        MODEL_FRAME,
+        [
+            UP,
+            {"option": "upright", "value": "z"},
+            {"option": "scale", "value": 2.0},
+            {**OTHER_BOX, "value": [-60.0, -30.0, -80.0, 40.0, 10.0, 60.0, -120.5]},
+        ],
+    ),
     "a box after a turn to +y": (MODEL_FRAME, [UP, {"option": "upright", "value": "y"}, TURNED_BOX]),
     "a box after a turn to +z": (ROTATED_FRAME, [UP, {"option": "upright", "value": "z"}, TURNED_BOX]),
     "a box and a length between two scales": (

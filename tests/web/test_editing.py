@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 from web.editing_pages import (
     TURNED_FRAME,
     catch_downloads,
@@ -27,7 +28,7 @@ from web.editing_pages import (
     read_text,
     wait_until_applied,
 )
-from web.native_models import SCENE_CENTER, make_cameras, render_reference
+from web.native_models import SCENE_CENTER, UP_DIRECTION, make_cameras, render_reference
 from web.pages import (
     Browser,
     make_splats_page,
@@ -125,6 +126,100 @@ def test_arrow_keys_move_the_face_whose_handle_has_the_focus(browser: Browser, t
     after = list_actions(browser)[0]["value"]
     np.testing.assert_allclose(np.subtract(after, before), [0, 0.09 * TURNED_FRAME.scale, 0, 0, 0, 0], atol=2e-4)
     assert np.array_equal(window_camera(browser).camera_from_world, camera.camera_from_world)
+
+
+MOVE_HANDLE, TURN_HANDLE = 6, 7
+
+
+def middle_and_sides(value: list[float]) -> tuple[np.ndarray, np.ndarray]:
+    return (np.array(value[:3]) + value[3:6]) / 2, np.subtract(value[3:6], value[:3])
+
+
+def drag_handle(browser: Browser, number: int, by: tuple[float, float], device: str) -> np.ndarray:
+    """Drag a handle of the box; return its places before and after, in CSS pixels."""
+    start = middle_of(browser, "#edit-handles button", number)
+    end = (start[0] + by[0], start[1] + by[1])
+    if device == "mouse":
+        browser.drag(start, end)
+    else:
+        browser.touch("touchStart", start)
+        for share in (0.5, 1.0):
+            browser.touch("touchMove", tuple(a + share * (b - a) for a, b in zip(start, end, strict=True)))
+        browser.touch("touchEnd")
+    return np.array([start, end])
+
+
+@pytest.mark.parametrize("device", ["mouse", "finger"])
+def test_handles_move_the_whole_box_and_turn_it_about_up(browser: Browser, tmp_path: Path, device: str):
+    browser.resize(1000, 700, phone=device == "finger")
+    model = make_model(2600)
+    load_editable_page(browser, tmp_path, make_editable_page(model))
+    click(browser, "#edit-add-box")
+    camera, before = window_camera(browser), list_actions(browser)[0]["value"]
+
+    start, end = drag_handle(browser, MOVE_HANDLE, (50, -30), device)
+
+    moved = list_actions(browser)[0]["value"]
+    (middle, sides), (old, old_sides) = middle_and_sides(moved), middle_and_sides(before)
+    np.testing.assert_allclose(project(browser, camera, middle), end, atol=1.5)
+    np.testing.assert_allclose(sides, old_sides, atol=2e-3)
+    assert abs((camera.rotation @ (middle - old))[2]) < 2e-3, "the box has moved to the front or to the back"
+
+    start, end = drag_handle(browser, TURN_HANDLE, (-35, 25), device)
+
+    up_action, action = list_actions(browser)
+    assert up_action["option"] == "up" and action["value"][:6] == moved
+    up = np.array(up_action["value"]) / np.linalg.norm(up_action["value"])
+    np.testing.assert_allclose(up, UP_DIRECTION / np.linalg.norm(UP_DIRECTION), atol=1e-5)
+    arms = []
+    for place in np.array((start, end)) * camera.width / 1000:
+        x, y = (place - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+        ray = camera.rotation.T @ (x, y, 1)
+        arms.append(camera.position + ray * ((middle - camera.position) @ up) / (ray @ up) - middle)
+    degrees = np.degrees(np.arctan2(up @ np.cross(*arms), np.dot(*arms)))
+    assert abs(degrees) > 3 and action["value"][6] == pytest.approx(degrees, abs=0.5)
+
+    count = wait_until_applied(browser)
+    positions = TURNED_FRAME.to_world(model.gaussians.positions.detach().numpy())
+    turned_back = Rotation.from_rotvec(-np.radians(action["value"][6]) * up).apply(positions - middle)
+    assert count == (np.abs(turned_back) <= sides / 2).all(1).sum() and 50 < count < 2500
+    click(browser, "[data-tool=save]")
+    command = browser.evaluate("document.getElementById('edit-command').value")
+    assert [word.split("=")[0] for word in shlex.split(command)[5:]] == ["--up", "--crop-box"]
+    assert np.allclose(window_camera(browser).camera_from_world, camera.camera_from_world), "the eye has moved, too"
+    assert browser.list_errors() == []
+
+
+def test_keys_move_and_turn_the_box(browser: Browser, tmp_path: Path):
+    load_editable_page(browser, tmp_path, make_editable_page(make_model()))
+    click(browser, "#edit-add-box")
+    camera, before = window_camera(browser), list_actions(browser)[0]["value"]
+    browser.evaluate(f"document.querySelectorAll('#edit-handles button')[{MOVE_HANDLE}].focus()")
+    for key, shift in (("ArrowRight", True), ("ArrowUp", False), ("PageUp", False)):
+        browser.press(key, shift=shift)
+    (middle, sides), (old, old_sides) = (middle_and_sides(v) for v in (list_actions(browser)[0]["value"], before))
+    step = 0.01 * TURNED_FRAME.scale
+    np.testing.assert_allclose(camera.rotation @ (middle - old), [10 * step, -step, step], atol=2e-3)
+    np.testing.assert_allclose(sides, old_sides, atol=2e-3)
+
+    browser.evaluate(f"document.querySelectorAll('#edit-handles button')[{TURN_HANDLE}].focus()")
+    browser.press("ArrowLeft", shift=True)
+    browser.press("ArrowRight")
+    action = list_actions(browser)[-1]
+    assert action["value"][6] == -9
+    handle = f"document.querySelectorAll('#edit-handles button')[{TURN_HANDLE}]"
+    assert browser.evaluate(f"{handle}.getAttribute('aria-valuenow')") == "-9"
+
+    # A face of a turned box moves alone: the middle of the opposite one stays.
+    browser.evaluate("document.querySelectorAll('#edit-handles button')[1].focus()")  # maximum x
+    browser.press("ArrowRight", shift=True)
+    wider = list_actions(browser)[-1]["value"]
+    axis = Rotation.from_rotvec(np.radians(-9) * UP_DIRECTION / np.linalg.norm(UP_DIRECTION)).apply([1, 0, 0])
+    ends = [center - side[0] / 2 * axis for center, side in map(middle_and_sides, (action["value"], wider))]
+    np.testing.assert_allclose(ends[1], ends[0], atol=3e-3)
+    assert middle_and_sides(wider)[1][0] - sides[0] == pytest.approx(10 * step, abs=2e-3)
+    fill(browser, "#edit-turn", 0)
+    assert len(list_actions(browser)[-1]["value"]) == 6
 
 
 def test_undo_and_redo_step_through_the_actions(browser: Browser, tmp_path: Path):

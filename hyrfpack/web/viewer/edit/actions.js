@@ -1,10 +1,12 @@
 // The actions of an edit, in the vocabulary of `hyrfpack edit`. An action is {option, value} with the name of the
-// option, without dashes, and its value: a number, a word, or several numbers. A crop box also has `isInverted`.
+// option, without dashes, and its value: a number, a word, or several numbers. A crop box also has `isInverted`; a
+// seventh number turns it, in degrees, about its centre and the up direction.
 
-import { frameAxes, rotateBy, transpose } from "../../hyrf/rotation.js";
-import { cross, dot, mul, unit } from "../../hyrf/vectors.js";
+import { frameAxes, rotateBack, rotateBy, rowsOf, transpose } from "../../hyrf/rotation.js";
+import { add, cross, dot, mul, sub, unit } from "../../hyrf/vectors.js";
 
 const DIGITS_BELOW_UNIT = 4; // of positions, in a scene of one unit
+const DIRECTION_DIGITS = 6;
 const AXES = { x: [1, 0, 0], y: [0, 1, 0], z: [0, 0, 1] };
 // An action takes the place of an earlier one of the same option, unless one of these lies between.
 const SEPARATORS = { "crop-box": ["scale", "upright"], "max-scale": ["scale"], "min-opacity": [], up: ["upright"] };
@@ -76,8 +78,26 @@ export function selectionsOf(actions, scene) {
     if (option === "min-opacity") return [{ minOpacity: value }];
     if (option === "max-scale") return [{ maxLength: value / (placement.factor * scene.unit) }];
     if (option !== "crop-box") return [];
-    return [{ rows: worldFromPage(placement, scene), low: value.slice(0, 3), high: value.slice(3), isInverted }];
+    const low = value.slice(0, 3), high = value.slice(3, 6), rows = worldFromPage(placement, scene);
+    const turned = value[6] ? turnedBack(rows, boxTurn(value, placement.up), middleOf(low, high)) : rows;
+    return [{ rows: turned, low, high, isInverted }];
   });
+}
+
+// Returns the rows of the rotation that turns a crop box, of `value`, about its centre.
+export function boxTurn([, , , , , , degrees = 0], up) {
+  const half = (degrees * Math.PI) / 360;
+  return rowsOf([Math.cos(half), ...mul(up, Math.sin(half))]);
+}
+
+export const middleOf = (low, high) => mul(add(low, high), 0.5);
+
+// Returns 3 x 4 numbers that map positions as `rows` do, and then turn them back about a point.
+function turnedBack(rows, turn, middle) {
+  const columns = [0, 1, 2, 3].map((k) => rows.map((row) => row[k]));
+  const [a, b, c] = columns.slice(0, 3).map((column) => rotateBack(turn, column));
+  const shift = add(rotateBack(turn, sub(columns[3], middle)), middle);
+  return [0, 1, 2].map((k) => [a[k], b[k], c[k], shift[k]]);
 }
 
 // Rounds a position or a length to a step that is invisible in a scene of a size, both in world units.
@@ -85,6 +105,9 @@ export function roundLength(value, size) {
   const digits = Math.min(20, Math.max(0, DIGITS_BELOW_UNIT - Math.floor(Math.log10(size))));
   return Number(value.toFixed(digits)) + 0; // turns -0 into 0
 }
+
+// Rounds the parts of a unit vector.
+export const roundDirection = (vector) => vector.map((part) => Number(part.toFixed(DIRECTION_DIGITS)) + 0);
 
 // Returns the command that applies actions to a file, for POSIX shells and PowerShell.
 export function commandText(actions, file) {

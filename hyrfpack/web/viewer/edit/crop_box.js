@@ -1,47 +1,79 @@
-// The crop box: its edges, and a handle on each face, which pointers, fingers and arrow keys move.
+// The crop box: its edges, and handles that pointers, fingers and keys move: one on each face, one that moves the whole
+// box, and one that turns it about the up direction.
 
 import { element } from "../dom.js";
-import { add, mul, sub } from "../../hyrf/vectors.js";
+import { add, cross, dot, mul, sub } from "../../hyrf/vectors.js";
 
 const STEP_RATIO = 0.01; // of the scene's size, for an arrow key; ten times as much with Shift
+const STEP_DEGREES = 1;
+const MARGIN = 24; // of a handle to the window's edge, in CSS pixels
+const TURN_HANDLE_RATIO = 0.3; // its distance from an edge, of that of the edge from the box's centre
 const FACES = [0, 1, 2].flatMap((axis) => [{ axis, side: 0 }, { axis, side: 1 }]);
 const KEY_SIGNS = { ArrowRight: 1, ArrowUp: 1, ArrowLeft: -1, ArrowDown: -1 };
+// The axis of the picture along which a key moves the box, and its sign.
+const KEY_MOVES = {
+  ArrowRight: [0, 1], ArrowLeft: [0, -1], ArrowDown: [1, 1], ArrowUp: [1, -1], PageUp: [2, 1], PageDown: [2, -1],
+};
 
 export class CropBox {
-  // `getBox()` returns the box, {corner: a function of three numbers 0 or 1, value: its six numbers, axes: unit vectors
-  // along its sides, unit: the length of a world unit, size: that of the scene in world units}, or null.
-  // `change(value, isFinal)` is called with new numbers.
+  // `getBox()` returns the box or null, see CropTool.describe. `change(value, isFinal)` is called with new numbers.
   constructor(player, getBox, change) {
     Object.assign(this, { player, getBox, change });
-    this.handles = FACES.map((face) => this.createHandle(face));
-    element("edit-handles").replaceChildren(...this.handles);
+    this.arm = 3; // of those that turnArms returns
+    this.handles = FACES.map((face) => this.createFaceHandle(face));
+    this.mover = this.createHandle("move", "Move the box", "drag it, or use arrow keys, Page Up and Page Down", {
+      grab: (event) => this.grabMiddle(event),
+      step: (event) => this.stepMove(event),
+    });
+    this.turner = this.createHandle("turn", "Turn of the box in degrees", "drag it, or use arrow keys", {
+      grab: (event) => this.grabTurn(event),
+      step: (event) => this.stepTurn(event),
+    });
+    this.turner.setAttribute("role", "slider");
+    this.turner.setAttribute("aria-valuemin", -180);
+    this.turner.setAttribute("aria-valuemax", 180);
+    element("edit-handles").replaceChildren(...this.handles, this.mover, this.turner);
   }
 
-  createHandle(face) {
-    const handle = document.createElement("button"), letter = "xyz"[face.axis], end = face.side ? "maximum" : "minimum";
-    handle.className = letter;
+  createFaceHandle(face) {
+    const letter = "xyz"[face.axis], end = face.side ? "maximum" : "minimum";
+    const handle = this.createHandle(letter, `${end} ${letter} of the box`, "drag it, or use arrow keys", {
+      grab: (event) => this.grabFace(event, face),
+      step: (event) => this.stepFace(event, face),
+    });
     handle.setAttribute("role", "slider");
-    handle.setAttribute("aria-label", `${end} ${letter} of the box`);
-    handle.title = `${end} ${letter}: drag it, or use arrow keys`;
-    handle.onpointerdown = (event) => this.press(event, handle, face);
-    handle.onkeydown = (event) => this.key(event, face);
+    return handle;
+  }
+
+  // Makes a handle. `grab(event)` returns a function of later events that returns the numbers of the box, or null; so
+  // does `step(event)` for a key, which it does not know if it returns null.
+  createHandle(name, label, use, { grab, step }) {
+    const handle = document.createElement("button");
+    handle.className = name;
+    handle.setAttribute("aria-label", label);
+    handle.title = `${label}: ${use}`;
+    handle.onpointerdown = (event) => this.press(event, handle, grab);
+    handle.onkeydown = (event) => {
+      const value = step(event);
+      if (!value) return;
+      event.preventDefault();
+      event.stopPropagation(); // arrow keys also turn the eye
+      this.change(value, false);
+    };
     handle.onkeyup = () => this.drawn && this.change(this.getBox().value, true);
     return handle;
   }
 
-  // Drags a face along its axis until the pointer is released.
-  press(event, handle, { axis, side }) {
+  // Drags a handle until the pointer is released.
+  press(event, handle, grab) {
     if (event.button) return;
     event.preventDefault();
     handle.focus();
     handle.setPointerCapture(event.pointerId);
-    const box = this.getBox(), middle = faceMiddle(box, axis, side);
-    const along = ({ clientX, clientY }) => this.projection.along(middle, box.axes[axis], [clientX, clientY]);
-    const start = along(event);
+    const follow = grab(event);
     handle.onpointermove = (moved) => {
-      const now = along(moved);
-      if (start === null || now === null) return;
-      this.change(withSide(box.value, axis, side, box.value[axis + 3 * side] + (now - start) / box.unit), false);
+      const value = follow(moved);
+      if (value) this.change(value, false);
     };
     handle.onpointerup = handle.onpointercancel = handle.onlostpointercapture = () => {
       handle.onpointermove = handle.onpointerup = handle.onpointercancel = handle.onlostpointercapture = null;
@@ -49,47 +81,144 @@ export class CropBox {
     };
   }
 
-  key(event, { axis, side }) {
-    const sign = KEY_SIGNS[event.key];
-    if (!sign) return;
-    event.preventDefault();
-    event.stopPropagation(); // arrow keys also turn the eye
-    const { value, size } = this.getBox(), step = sign * STEP_RATIO * size * (event.shiftKey ? 10 : 1);
-    this.change(withSide(value, axis, side, value[axis + 3 * side] + step), false);
+  // ---- a face, along its axis
+
+  grabFace(event, { axis, side }) {
+    const box = this.getBox(), middle = faceMiddle(box, axis, side);
+    const along = (pointer) => this.projection.along(middle, box.axes[axis], placeOf(pointer));
+    const start = along(event);
+    return (moved) => {
+      const now = along(moved);
+      if (start === null || now === null) return null;
+      return withSide(box, axis, side, box.value[axis + 3 * side] + (now - start) / box.unit);
+    };
   }
 
-  // Returns the twelve edges.
+  stepFace(event, { axis, side }) {
+    const sign = KEY_SIGNS[event.key], box = this.getBox();
+    return sign ? withSide(box, axis, side, box.value[axis + 3 * side] + sign * stepLength(event, box)) : null;
+  }
+
+  // ---- the whole box, in the plane of the picture
+
+  grabMiddle(event) {
+    const box = this.getBox(), normal = this.projection.view.rows[2];
+    const onPlane = (pointer) => this.projection.onPlane(box.middle, normal, placeOf(pointer));
+    const start = onPlane(event);
+    return (moved) => {
+      const now = onPlane(moved);
+      return start && now && withMove(box.value, box.toWorld(sub(now, start)));
+    };
+  }
+
+  stepMove(event) {
+    const [axis, sign] = KEY_MOVES[event.key] ?? [], box = this.getBox();
+    if (!sign) return null;
+    const along = mul(this.projection.view.rows[axis], sign * box.unit * stepLength(event, box));
+    return withMove(box.value, box.toWorld(along));
+  }
+
+  // ---- its turn about the up direction
+
+  grabTurn(event) {
+    const box = this.getBox(), { middle, up } = box;
+    const arm = (pointer) => {
+      const point = this.projection.onPlane(middle, up, placeOf(pointer));
+      return point && sub(point, middle);
+    };
+    const start = arm(event);
+    return (moved) => {
+      const now = arm(moved);
+      if (!start || !now) return null;
+      return withTurn(box.value, (180 / Math.PI) * Math.atan2(dot(up, cross(start, now)), dot(start, now)));
+    };
+  }
+
+  stepTurn(event) {
+    const sign = KEY_SIGNS[event.key];
+    return sign ? withTurn(this.getBox().value, sign * STEP_DEGREES * (event.shiftKey ? 10 : 1)) : null;
+  }
+
+  // Chooses an arm whose handle can be reached. It stays the same as long as it can.
+  chooseArm(box) {
+    const isReachable = ([, end]) => isFree(this.projection.place(end)), arms = turnArms(box);
+    if (!isReachable(arms[this.arm])) this.arm = Math.max(0, arms.findIndex(isReachable));
+  }
+
+  // Returns the twelve edges, and the arm of the handle that turns the box.
   get segments() {
     const box = this.getBox();
     if (!box) return [];
-    return [0, 1, 2].flatMap((axis) => [[0, 0], [0, 1], [1, 0], [1, 1]].map((others) => {
+    if (this.projection) this.chooseArm(box);
+    const edges = [0, 1, 2].flatMap((axis) => [[0, 0], [0, 1], [1, 0], [1, 1]].map((others) => {
       const ends = [0, 1].map((end) => others.toSpliced(axis, 0, end));
       return ends.map((end) => box.corner(...end));
     }));
+    return [...edges, turnArms(box)[this.arm]];
   }
 
-  // Puts the handles on the faces.
+  // Puts the handles where they belong.
   place(projection) {
     const box = this.getBox();
     this.projection = projection;
     this.drawn = box !== null;
-    for (const [number, { axis, side }] of FACES.entries()) {
-      const handle = this.handles[number], place = box && projection.place(faceMiddle(box, axis, side));
+    if (box) this.chooseArm(box);
+    const show = (handle, point) => {
+      const place = point && projection.place(point);
       handle.hidden = !place;
-      if (!place) continue;
-      Object.assign(handle.style, { left: `${place[0]}px`, top: `${place[1]}px` });
-      handle.setAttribute("aria-valuenow", box.value[axis + 3 * side]);
+      if (place) Object.assign(handle.style, { left: `${place[0]}px`, top: `${place[1]}px` });
+    };
+    for (const [number, { axis, side }] of FACES.entries()) {
+      show(this.handles[number], box && faceMiddle(box, axis, side));
+      if (box) this.handles[number].setAttribute("aria-valuenow", box.value[axis + 3 * side]);
     }
+    show(this.mover, box && box.middle);
+    show(this.turner, box && turnArms(box)[this.arm][1]);
+    if (box) this.turner.setAttribute("aria-valuenow", box.value[6] ?? 0);
   }
 }
+
+const placeOf = ({ clientX, clientY }) => [clientX, clientY];
+
+const stepLength = ({ shiftKey }, { size }) => STEP_RATIO * size * (shiftKey ? 10 : 1);
 
 const faceMiddle = ({ corner }, axis, side) => {
   const first = corner(...[0, 0, 0].with(axis, side)), last = corner(...[1, 1, 1].with(axis, side));
   return add(first, mul(sub(last, first), 0.5));
 };
 
-// Returns the six numbers of a box with one of its sides moved, but not beyond the opposite one.
-function withSide(value, axis, side, position) {
-  const other = value[axis + 3 * (1 - side)];
-  return value.with(axis + 3 * side, side ? Math.max(position, other) : Math.min(position, other));
+// Returns the four places of the arm of the handle that turns a box, each by its two ends: the middle of an edge that
+// stands upright, far from the handles of the faces, and a point outside of it.
+function turnArms(box) {
+  const slopes = box.axes.map((axis) => Math.abs(dot(axis, box.up))), upright = slopes.indexOf(Math.max(...slopes));
+  return [[0, 0], [0, 1], [1, 0], [1, 1]].map((others) => {
+    const edge = mul(add(...[0, 1].map((end) => box.corner(...others.toSpliced(upright, 0, end)))), 0.5);
+    return [edge, add(edge, mul(sub(edge, box.middle), TURN_HANDLE_RATIO))];
+  });
+}
+
+// Returns whether a handle at a place can be reached: in the window, and not under the panel.
+function isFree(place) {
+  if (!place) return false;
+  const [x, y] = place, { left, right, top, bottom } = element("edit").getBoundingClientRect();
+  const isUnderPanel = x > left - MARGIN && x < right + MARGIN && y > top - MARGIN && y < bottom + MARGIN;
+  return x > MARGIN && y > MARGIN && x < innerWidth - MARGIN && y < innerHeight - MARGIN && !isUnderPanel;
+}
+
+// Returns the numbers of a box with one of its sides moved, but not beyond the opposite one, which stays where it is.
+function withSide({ value, turn }, axis, side, position) {
+  const other = value[axis + 3 * (1 - side)], place = side ? Math.max(position, other) : Math.min(position, other);
+  // The box turns about its centre, which moves by half of the way: along the turned axis, and not along that of the
+  // numbers.
+  const half = (place - value[axis + 3 * side]) / 2;
+  const shift = turn.map((row, k) => half * (row[axis] - (k === axis ? 1 : 0)));
+  return withMove(value.with(axis + 3 * side, place), shift);
+}
+
+const withMove = (value, shift) => value.map((place, k) => (k < 6 ? place + shift[k % 3] : place));
+
+// Returns the numbers of a box that is turned further, to between -180 and 180 degrees.
+function withTurn(value, degrees) {
+  const turned = (value[6] ?? 0) + degrees;
+  return [...value.slice(0, 6), turned - 360 * Math.round(turned / 360)];
 }

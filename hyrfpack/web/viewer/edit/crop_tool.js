@@ -1,19 +1,21 @@
 // Crops to boxes, by handles over the scene and by numbers.
 
 import { element } from "../dom.js";
-import { frameAxes, rotateBack, rotateBy } from "../../hyrf/rotation.js";
-import { mul, sub } from "../../hyrf/vectors.js";
-import { dropAction, findActive, putAction, roundLength } from "./actions.js";
+import { frameAxes, rotateBack, rotateBy, transpose } from "../../hyrf/rotation.js";
+import { add, mul, sub } from "../../hyrf/vectors.js";
+import { boxTurn, dropAction, findActive, middleOf, putAction, roundDirection, roundLength } from "./actions.js";
 import { CropBox } from "./crop_box.js";
 
 const OPTION = "crop-box";
+const DEGREE_DIGITS = 1;
 const FIRST_SIDE_RATIO = 0.3; // half the sides of a new box, of the cameras' distance from the scene's target
 
 export class CropTool {
   constructor(editor) {
     this.editor = editor;
     this.box = new CropBox(editor.player, () => this.describe(), (value, isFinal) => this.put({ value }, isFinal));
-    this.inputs = [...document.querySelectorAll("#edit-box [type=number]")];
+    const sides = document.querySelectorAll("#edit-box [type=number]:not(#edit-turn)");
+    this.inputs = [...sides, element("edit-turn")]; // in the order of the numbers of a box
     for (const input of this.inputs) {
       input.oninput = () => this.read(false);
       input.onchange = () => this.read(true);
@@ -52,11 +54,19 @@ export class CropTool {
     editor.set([...editor.actions, { option: OPTION, value }]);
   }
 
-  // Changes the box with handles.
+  // Changes the box with handles. The command states up before a box that is turned about it, so that it does not
+  // depend on what the page knows of the file.
   put({ value = this.active.value, isInverted = this.active.isInverted }, isFinal = true) {
-    const { editor } = this, rounded = value.map((place) => roundLength(place, editor.size));
+    const { editor } = this, rounded = value.slice(0, 6).map((place) => roundLength(place, editor.size));
+    const degrees = Number((value[6] ?? 0).toFixed(DEGREE_DIGITS));
+    if (degrees) rounded.push(degrees);
     const action = { option: OPTION, value: rounded, ...(isInverted ? { isInverted } : {}) };
-    editor.set(putAction(editor.actions, action), isFinal);
+    let { actions } = editor;
+    if (degrees && !actions.some(({ option }) => option === "up")) {
+      const up = { option: "up", value: roundDirection(editor.placement.up) };
+      actions = actions.toSpliced(findActive(actions, OPTION), 0, up);
+    }
+    editor.set(putAction(actions, action), isFinal);
   }
 
   // Takes the numbers of the panel if they make a box.
@@ -72,21 +82,29 @@ export class CropTool {
     element("edit-add-box").textContent = active ? "Another box" : "Add a box";
     if (!active) return;
     this.inputs.forEach((input, k) => {
-      if (input !== document.activeElement || input.valueAsNumber !== active.value[k]) input.value = active.value[k];
+      const number = active.value[k] ?? 0;
+      if (input !== document.activeElement || input.valueAsNumber !== number) input.value = number;
     });
     element("edit-inside").checked = Boolean(active.isInverted);
   }
 
-  // Describes the box for CropBox.
+  // Describes the box for CropBox: {value: its numbers, turn: the rows of its rotation in the world, corner: a function
+  // of three numbers 0 or 1, middle, axes: unit vectors along its sides, up, unit: the length of a world unit, size:
+  // that of the scene in world units, toWorld: a function of vectors}. Points and vectors are those of the page.
   describe() {
     const { active, editor } = this;
     if (!active) return null;
-    const { player: { scene }, placement: { factor, rows }, size } = editor, { value } = active;
+    const { player: { scene }, placement: { factor, rows, up }, size } = editor, { value } = active;
+    const turn = boxTurn(value, up), center = middleOf(value.slice(0, 3), value.slice(3, 6));
     const turnBack = (vector) => rotateBack(frameAxes(scene), rotateBack(rows, vector));
     const origin = mul(rotateBack(frameAxes(scene), scene.center), 1 / scene.unit);
-    const corner = (...ends) =>
-      sub(mul(turnBack(ends.map((end, axis) => value[axis + 3 * end])), 1 / (factor * scene.unit)), origin);
-    const axes = [[1, 0, 0], [0, 1, 0], [0, 0, 1]].map(turnBack);
-    return { value, corner, axes, unit: 1 / (factor * scene.unit), size };
+    const unit = 1 / (factor * scene.unit), toPage = (place) => sub(mul(turnBack(place), unit), origin);
+    const corner = (...ends) => {
+      const place = ends.map((end, axis) => value[axis + 3 * end]);
+      return toPage(add(rotateBy(turn, sub(place, center)), center));
+    };
+    const axes = transpose(turn).map(turnBack);
+    const toWorld = (vector) => mul(rotateBy(rows, rotateBy(frameAxes(scene), vector)), 1 / unit);
+    return { value, turn, corner, middle: toPage(center), axes, up: turnBack(up), unit, size, toWorld };
   }
 }

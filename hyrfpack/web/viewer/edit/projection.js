@@ -39,6 +39,14 @@ export class Projection {
     return unit(add(add(mul(rows[0], right), mul(rows[1], down)), rows[2]));
   }
 
+  // Returns where the ray through a place meets a plane through a point with a normal (a unit vector), or null if it
+  // does not meet it in front of the eye, or at a small angle.
+  onPlane(point, normal, place) {
+    const ray = this.ray(place), cosine = dot(ray, normal);
+    const distance = dot(sub(point, this.view.eye), normal) / cosine;
+    return Math.abs(cosine) < MIN_AXIS_SINE || !(distance > 0) ? null : add(this.view.eye, mul(ray, distance));
+  }
+
   // Returns how far along an axis (a unit vector) through a point the ray through a place passes nearest to it, or null
   // if the axis points along the ray.
   along(point, axis, place) {

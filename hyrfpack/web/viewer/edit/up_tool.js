@@ -4,12 +4,11 @@ import { frameAxes, rotateBy } from "../../hyrf/rotation.js";
 import { cross, dot, sub, unit } from "../../hyrf/vectors.js";
 import { toPage } from "../camera.js";
 import { toast } from "../notifications.js";
-import { findActive, putAction } from "./actions.js";
+import { findActive, putAction, roundDirection } from "./actions.js";
 import { PointPicker } from "./point_picker.js";
 
 const POINTS = 3;
 const MIN_SINE = 0.05; // of the angle at the first point; at smaller ones the points are in a row
-const DIGITS = 6;
 
 export class UpTool {
   constructor(editor) {
@@ -50,8 +49,8 @@ export class UpTool {
 
   // Adds the action that states a direction.
   state(direction) {
-    const { editor } = this, value = direction.map((part) => Number(part.toFixed(DIGITS)) + 0);
-    editor.set(putAction(editor.actions, { option: "up", value }));
+    const { editor } = this;
+    editor.set(putAction(editor.actions, { option: "up", value: roundDirection(direction) }));
     toast("Up is perpendicular to the ground now. Orbits turn about it.");
   }
 
@@ -59,8 +58,7 @@ export class UpTool {
   turn(axis) {
     const { editor } = this;
     if (findActive(editor.actions, "up") < 0) {
-      const value = editor.placement.up.map((part) => Number(part.toFixed(DIGITS)) + 0);
-      editor.actions = [...editor.actions, { option: "up", value }];
+      editor.actions = [...editor.actions, { option: "up", value: roundDirection(editor.placement.up) }];
     }
     editor.set([...editor.actions, { option: "upright", value: axis }]);
     toast(`The saved scene will have +${axis} up. New boxes lie along its axes.`);
