@@ -9,13 +9,21 @@ import zipfile
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hyrfpack.errors import HyrfFormatError
 from hyrfpack.format.container import Container, read_container
-from hyrfpack.format.scene_manifest import MANIFEST_NAME, MAX_MANIFEST_BYTES, Manifest, SceneFile, parse_manifest
+from hyrfpack.format.scene_manifest import (
+    FORMAT_NAME,
+    MANIFEST_NAME,
+    MAX_MANIFEST_BYTES,
+    Manifest,
+    SceneFile,
+    parse_manifest,
+)
 from hyrfpack.format.sections import SECTION_CONTENTS
 
 if TYPE_CHECKING:
@@ -33,9 +41,59 @@ COPY_AGAIN = "copy the whole folder again, or split the model again"
 def is_scene(path: StrPath) -> bool:
     """Return whether a path names a scene folder, its manifest or a .zip of it."""
     path = Path(path)
-    if path.is_dir():
-        return (path / MANIFEST_NAME).is_file()
-    return path.is_file() and (path.name == MANIFEST_NAME or (_is_zip(path) and _zip_prefix(path) is not None))
+    if not (path.is_dir() or path.name == MANIFEST_NAME or _is_zip(path)):
+        return False
+    try:  # Other programs write files of this name, too.
+        return FORMAT_NAME.encode() in _SceneFiles.of(path).read(MANIFEST_NAME, MAX_MANIFEST_BYTES)
+    except HyrfFormatError:
+        return False
+
+
+@dataclass(frozen=True)
+class _SceneFiles:
+    """The files of a scene, in a folder or in a .zip.
+
+    Attributes:
+        path: the folder or the .zip.
+        prefix: the folder within the .zip, "" or "name/"; None for a folder.
+    """
+
+    path: Path
+    prefix: str | None
+
+    @classmethod
+    def of(cls, path: Path) -> _SceneFiles:
+        """Return the files of a scene folder, of the folder of a manifest, or of a .zip."""
+        if _is_zip(path):
+            return cls(path, _find_prefix(path))
+        return cls(path.parent if path.name == MANIFEST_NAME and not path.is_dir() else path, None)
+
+    def read(self, name: str, limit: int) -> bytes:
+        """Return the bytes of a file, at most `limit` and one more."""
+        try:
+            if self.prefix is None:
+                with open(self.path / name, "rb") as file:
+                    return file.read(limit + 1)
+            with zipfile.ZipFile(self.path) as archive, archive.open(self.prefix + name) as member:
+                return member.read(limit + 1)
+        except (OSError, KeyError, zipfile.BadZipFile, zlib.error, RuntimeError, NotImplementedError) as error:
+            raise self._unreadable_error(name, error) from error
+
+    def size(self, name: str) -> int:
+        """Return the size of a file."""
+        try:
+            if self.prefix is None:
+                return os.stat(self.path / name).st_size
+            with zipfile.ZipFile(self.path) as archive:
+                return archive.getinfo(self.prefix + name).file_size
+        except (OSError, KeyError, zipfile.BadZipFile) as error:
+            raise self._unreadable_error(name, error) from error
+
+    def _unreadable_error(self, name: str, error: Exception) -> HyrfFormatError:
+        if isinstance(error, (FileNotFoundError, KeyError, NotADirectoryError)):
+            return HyrfFormatError(f"{self.path / name}: this file of the scene is missing", fix=COPY_AGAIN)
+        reason = getattr(error, "strerror", None) or error
+        return HyrfFormatError(f"{self.path / name}: the file cannot be read ({reason})", fix=COPY_AGAIN)
 
 
 class SceneFolder:
@@ -59,10 +117,9 @@ class SceneFolder:
         Raises:
             HyrfFormatError: there is no manifest, or it is damaged or of another version.
         """
-        path = Path(path)
-        self.path = path.parent if path.name == MANIFEST_NAME and not path.is_dir() else path
-        self._prefix = _zip_prefix(self.path) if _is_zip(self.path) else None
-        data = self._read(MANIFEST_NAME, MAX_MANIFEST_BYTES)
+        self._files = _SceneFiles.of(Path(path))
+        self.path = self._files.path
+        data = self._files.read(MANIFEST_NAME, MAX_MANIFEST_BYTES)
         self.manifest: Manifest = parse_manifest(data, str(self.path / MANIFEST_NAME))
 
     def read_file(self, item: SceneFile) -> bytes:
@@ -71,7 +128,7 @@ class SceneFolder:
         Raises:
             HyrfFormatError: the file is missing, damaged, or another one than the manifest says.
         """
-        name, data = self.path / item.file, self._read(item.file, item.bytes)
+        name, data = self.path / item.file, self._files.read(item.file, item.bytes)
         if len(data) != item.bytes:
             raise HyrfFormatError(
                 f"{name}: the manifest says {item.bytes:,} bytes and there are {len(data):,}", fix=COPY_AGAIN
@@ -95,13 +152,13 @@ class SceneFolder:
             HyrfFormatError: a file is missing or has another size.
         """
         for item in self.manifest.files:
-            if (size := self._size(item.file)) != item.bytes:
+            if (size := self._files.size(item.file)) != item.bytes:
                 raise HyrfFormatError(
                     f"{self.path / item.file}: the manifest says {item.bytes:,} bytes and there are {size:,}",
                     fix=COPY_AGAIN,
                 )
         listed = {item.file for item in self.manifest.files}
-        extra = sorted({path.name for path in self.path.glob("*.hyrf")} - listed) if self._prefix is None else []
+        extra = sorted({path.name for path in self.path.glob("*.hyrf")} - listed) if self._files.prefix is None else []
         if extra:
             more = f" and {len(extra) - 1} more" if len(extra) > 1 else ""
             _LOG.warning(f"{self.path / extra[0]}{more}: not in the manifest and ignored")
@@ -158,32 +215,6 @@ class SceneFolder:
             )
         return self.open_file(shared)
 
-    def _read(self, name: str, limit: int) -> bytes:
-        """Return the bytes of a file, at most `limit` and one more."""
-        try:
-            if self._prefix is None:
-                with open(self.path / name, "rb") as file:
-                    return file.read(limit + 1)
-            with zipfile.ZipFile(self.path) as archive, archive.open(self._prefix + name) as member:
-                return member.read(limit + 1)
-        except (OSError, KeyError, zipfile.BadZipFile, zlib.error, RuntimeError, NotImplementedError) as error:
-            raise self._unreadable_error(name, error) from error
-
-    def _size(self, name: str) -> int:
-        try:
-            if self._prefix is None:
-                return os.stat(self.path / name).st_size
-            with zipfile.ZipFile(self.path) as archive:
-                return archive.getinfo(self._prefix + name).file_size
-        except (OSError, KeyError, zipfile.BadZipFile) as error:
-            raise self._unreadable_error(name, error) from error
-
-    def _unreadable_error(self, name: str, error: Exception) -> HyrfFormatError:
-        if isinstance(error, (FileNotFoundError, KeyError, NotADirectoryError)):
-            return HyrfFormatError(f"{self.path / name}: this file of the scene is missing", fix=COPY_AGAIN)
-        reason = getattr(error, "strerror", None) or error
-        return HyrfFormatError(f"{self.path / name}: the file cannot be read ({reason})", fix=COPY_AGAIN)
-
 
 @contextmanager
 def single_file(path: StrPath) -> Iterator[Path]:
@@ -210,12 +241,11 @@ def _is_zip(path: Path) -> bool:
     return path.suffix.lower() == ".zip" and path.is_file()
 
 
-def _zip_prefix(path: Path) -> str | None:
-    """Return the folder in a .zip that holds the manifest, "" or "name/"; None if there is none."""
+def _find_prefix(path: Path) -> str:
+    """Return the folder in a .zip that holds the manifest, "" or "name/"; "" if there is none."""
     try:
         with zipfile.ZipFile(path) as archive:
             names = [name for name in archive.namelist() if name.rpartition("/")[2] == MANIFEST_NAME]
     except (OSError, zipfile.BadZipFile):
-        return None
-    prefixes = sorted(name.removesuffix(MANIFEST_NAME) for name in names if name.count("/") <= 1)
-    return prefixes[0] if prefixes else None
+        return ""
+    return min((name.removesuffix(MANIFEST_NAME) for name in names if name.count("/") <= 1), default="")

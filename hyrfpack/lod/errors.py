@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from hyrfpack.format.scene_model import join_chunks
 from hyrfpack.lod.select import project_sphere
 from hyrfpack.model import Decoded, HybridModel
 from hyrfpack.ops.rasterize import rasterize
@@ -18,56 +20,103 @@ from hyrfpack.scene import Camera
 ERROR_RADII = (16.0, 32.0, 64.0, 128.0, 256.0, 512.0, 1024.0)
 # Views are measured at these shares of the photos' resolution. A coarser picture is the view from farther away.
 RESOLUTION_SHARES = (1.0, 1 / 2, 1 / 4, 1 / 8)
+# A pixel of which a half of the chunks has a smaller share counts less, because its error comes from elsewhere.
+MIN_SHARE = 1e-3
 _COLUMNS = 3  # shares of chunks that are drawn at once, as the three channels of a picture
 
 
 @torch.no_grad()
 def measure_level_errors(
-    models: Sequence[HybridModel],
-    chunk_of: np.ndarray,
+    levels: Sequence[Sequence[HybridModel]],
     spheres: Sequence[tuple[tuple[float, float, float], float]],
     cameras: Sequence[Camera],
+    seed: int = 0,
     progress: Progress = ignore_progress,
 ) -> np.ndarray:
     """Measure the error of each level and chunk, in pixels that show the chunk.
 
-    A level is drawn for all chunks at once. The squared error of a pixel is divided among the chunks by their light in
-    the render of the finest level. So the errors of all chunks add up to that of the picture.
+    In each view a random half of the chunks is drawn at a level, and the other half at the finest one; then the halves
+    change places. So chunks are measured among neighbours of other levels, as views with a budget mix them. The squared
+    error of a pixel is divided among the chunks of the half by their light in the render of the finest levels.
 
     Args:
-        models: the model at each level, the finest first.
-        chunk_of: (N,) chunk of each Gaussian of the finest level.
+        levels: models of all chunks at each level, the finest first. They share their fields.
         spheres: centre and radius of each chunk, world units.
         cameras: views to measure at, world units.
+        seed: random seed of the halves.
         progress: called with `TaskEvent`s.
 
     Returns:
         (levels, chunks, len(ERROR_RADII)) float64: mean squared errors, relative to the area that `project_sphere`
         gives; 0 for the finest level.
     """
-    shape = (len(models), len(spheres), len(ERROR_RADII))
+    pool = _Pool.of(levels)
+    shape, rng = (len(levels), len(spheres), len(ERROR_RADII)), np.random.default_rng(seed)
     sums, areas = np.zeros(shape), np.zeros(shape[1:])
-    decoded = [model.decode() for model in models]
     views = [resize_camera(camera, share) for camera in cameras for share in RESOLUTION_SHARES]
     for number, camera in enumerate(views):
         progress(TaskEvent(f"measuring levels, view {number + 1}/{len(views)}", number / len(views)))
-        finest = render_view(models[0], camera, decoded=decoded[0]).rgb
-        differences = [
-            (render_view(model, camera, decoded=each).rgb - finest).square().mean(dim=-1)
-            for model, each in zip(models[1:], decoded[1:], strict=True)
-        ]
+        in_half = rng.permutation(len(spheres)) % 2 == 0
+        finest = pool.draw(np.zeros(len(spheres), np.int64), camera)
+        errors = []  # of each half at each level, divided by the share of the half
+        for half in (in_half, ~in_half):
+            light = pool.draw_shares([half], camera)[..., 0] + MIN_SHARE
+            renders = [pool.draw(half * level, camera) for level in range(1, len(levels))]
+            errors.append([(rgb - finest).square().mean(dim=-1) / light for rgb in renders])
         projections = [project_sphere(center, radius, camera) for center, radius in spheres]
         shown = [chunk for chunk, (_, area) in enumerate(projections) if area > 0]
         for first in range(0, len(shown), _COLUMNS):
             some = shown[first : first + _COLUMNS]
-            shares = _draw_shares(models[0], decoded[0], chunk_of, some, camera)
+            shares = pool.draw_shares([np.arange(len(spheres)) == chunk for chunk in some], camera)
             for column, chunk in enumerate(some):
                 radius, area = projections[chunk]
                 weights = _node_weights(radius)
                 areas[chunk] += weights * area
-                for level, difference in enumerate(differences, 1):
-                    sums[level, chunk] += weights * float((difference * shares[..., column]).sum())
+                for level, error in enumerate(errors[0 if in_half[chunk] else 1], 1):
+                    sums[level, chunk] += weights * float((error * shares[..., column]).sum())
     return _fill_gaps(sums, areas)
+
+
+@dataclass(frozen=True)
+class _Pool:
+    """The Gaussians of all chunks at all levels.
+
+    Attributes:
+        model: the model of them all.
+        decoded: its view-independent part.
+        chunk_of, level_of: (N,) chunk and level of each.
+    """
+
+    model: HybridModel
+    decoded: Decoded
+    chunk_of: np.ndarray
+    level_of: np.ndarray
+
+    @classmethod
+    def of(cls, levels: Sequence[Sequence[HybridModel]]) -> _Pool:
+        """Pool the models of all chunks at each level."""
+        models = [model for level in levels for model in level]
+        counts = list(map(len, models))
+        model = join_chunks(models[0], models)
+        chunk_of = np.repeat([chunk for level in levels for chunk in range(len(level))], counts)
+        level_of = np.repeat([number for number, level in enumerate(levels) for _ in level], counts)
+        return cls(model, model.decode(), chunk_of, level_of)
+
+    def draw(self, levels: np.ndarray, camera: Camera) -> Tensor:
+        """Render a view with a level (chunks,) of each chunk."""
+        index = torch.from_numpy(np.flatnonzero(self.level_of == levels[self.chunk_of]))
+        return render_view(self.model.subset(index), camera, decoded=self.decoded[index]).rgb
+
+    def draw_shares(self, sets: Sequence[np.ndarray], camera: Camera) -> Tensor:
+        """Return the share (H, W, 3) of each pixel's light of up to three sets (chunks,) bool, at the finest levels."""
+        index = np.flatnonzero(self.level_of == 0)
+        gaussians = self.decoded[torch.from_numpy(index)].geometry.at(self.model.gaussians.positions[index])
+        none = np.zeros(len(sets[0]), bool)
+        members = np.stack([each[self.chunk_of[index]] for each in (*sets, none, none)[:_COLUMNS]], axis=1)
+        config = self.model.config
+        viewport = config.frame.local_viewport(camera, gaussians.means.dtype)
+        settings = RenderSettings().raster_settings(config.antialiased)
+        return rasterize(gaussians, torch.from_numpy(members).to(gaussians.means), viewport, settings).rgb
 
 
 def resize_camera(camera: Camera, share: float) -> Camera:
@@ -75,17 +124,6 @@ def resize_camera(camera: Camera, share: float) -> Camera:
     width, height = (max(1, round(share * side)) for side in (camera.width, camera.height))
     x, y = width / camera.width, height / camera.height
     return Camera(width, height, x * camera.fx, y * camera.fy, x * camera.cx, y * camera.cy, camera.camera_from_world)
-
-
-def _draw_shares(
-    model: HybridModel, decoded: Decoded, chunk_of: np.ndarray, chunks: Sequence[int], camera: Camera
-) -> Tensor:
-    """Return the share (H, W, 3) of each pixel's light that comes from each of up to three chunks."""
-    gaussians = decoded.geometry.at(model.gaussians.positions)
-    members = np.stack([chunk_of == chunk for chunk in (*chunks, -1, -1)[:_COLUMNS]], axis=1)
-    colors = torch.from_numpy(members).to(gaussians.means)
-    viewport = model.config.frame.local_viewport(camera, gaussians.means.dtype)
-    return rasterize(gaussians, colors, viewport, RenderSettings().raster_settings(model.config.antialiased)).rgb
 
 
 def _node_weights(radius: float) -> np.ndarray:

@@ -45,8 +45,9 @@ _LOG = logging.getLogger(__name__)
 SHARED_NAME = "shared.hyrf"
 LEVEL_RATIO = 4  # A level has as many times the Gaussians of the next coarser one, as pictures of half the size.
 MERGE_VIEWPOINTS = 8
-REFIT_VIEWS = 24
+REFIT_CAMERAS, REFIT_BETWEEN = 12, 3  # views at cameras, and views between cameras for each of them
 MEASURED_VIEWS = 8
+_SEED_STEP = 1000  # keeps the views that levels are fitted at from those that they are measured at
 _SIGMAS = 3.0
 _REFIT_SHARE, _MEASURE_SHARE = 0.6, 0.3  # of the progress
 
@@ -152,27 +153,24 @@ def _split(path: Path, name: str, config: SplitConfig, progress: Progress) -> tu
     groups = [order for _, order in finest]
     encoded = [[data] for data, _ in finest]
     counts = [[len(group)] for group in groups]
-    order = np.concatenate(groups)
-    chunk_of = np.repeat(np.arange(len(groups)), list(map(len, groups)))
     boxes = _measure_boxes(model, groups)
-    models = [model.subset(torch.from_numpy(order))]
+    models = [[model.subset(torch.from_numpy(group)) for group in groups]]
     cameras = capture.cameras
     geometry = model.decode_geometry()
     for level in range(1, config.levels):
         share = (level - 1) / max(config.levels - 1, 1)
         part = part_of_progress(progress, _REFIT_SHARE * share, _REFIT_SHARE * (share + 1 / (config.levels - 1)))
         parts = _make_level(model, geometry, groups, cameras, level, config, part)
-        decoded = []
+        models.append([])
         for number, coarse in enumerate(parts):
             data = encoder.encode_gaussians(coarse)
             encoded[number].append(data)
             counts[number].append(len(coarse))
-            decoded.append(_decode(data, encoder, model))
-        models.append(join_chunks(model, decoded))
+            models[-1].append(_decode(data, encoder, model))
     spheres = [(chunk.center, chunk.radius) for chunk in (Chunk(low, high, ()) for low, high in boxes)]
     part = part_of_progress(progress, _REFIT_SHARE, _REFIT_SHARE + _MEASURE_SHARE)
-    views = _views(cameras, MEASURED_VIEWS, config.seed + 1) if config.levels > 1 else []
-    errors = measure_level_errors(models, chunk_of, spheres, views, part)
+    views = sample_views(cameras, MEASURED_VIEWS, config.seed + 1)[1] if config.levels > 1 else []
+    errors = measure_level_errors(models, spheres, views, config.seed, part)
     chunks = []
     for number, (low, high) in enumerate(boxes):
         levels = []
@@ -205,16 +203,17 @@ def _make_level(
         merged.append(model.with_gaussians(merge_gaussians(model.subset(index), geometry[index], viewpoints, count)))
     joined = join_chunks(model, merged)
     share = LEVEL_RATIO ** (-level / 2)
-    views = [resize_camera(camera, share) for camera in _views(cameras, REFIT_VIEWS, config.seed)]
+    views = [resize_camera(camera, share) for camera in _refit_views(cameras, config.seed)]
     refit_level(joined, model, views, config.refit_steps, config.seed, progress)
     ends = np.cumsum([len(each) for each in merged])
     return [joined.subset(torch.arange(end - len(each), end)) for each, end in zip(merged, ends.tolist(), strict=True)]
 
 
-def _views(cameras: Sequence[Camera], count: int, seed: int) -> list[Camera]:
-    """Return views, half of them at cameras and half between them."""
-    at, between = sample_views(cameras, count // 2, seed)
-    return [*at, *between]
+def _refit_views(cameras: Sequence[Camera], seed: int) -> list[Camera]:
+    """Return views at cameras, and for each of them several between it and its neighbours."""
+    at, between = sample_views(cameras, REFIT_CAMERAS, seed)
+    more = [sample_views(cameras, REFIT_CAMERAS, seed + _SEED_STEP * number)[1] for number in range(1, REFIT_BETWEEN)]
+    return [*at, *between, *(view for views in more for view in views)]
 
 
 def _decode(data: bytes, encoder: ChunkEncoder, model: HybridModel) -> HybridModel:

@@ -41,7 +41,7 @@ def folder(tmp_path_factory) -> Path:
     """Return a scene folder of four chunks at two levels."""
     path = tmp_path_factory.mktemp("split") / "demo-scene"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(split, "REFIT_VIEWS", 2)
+        patch.setattr(split, "REFIT_CAMERAS", 1)
         patch.setattr(split, "MEASURED_VIEWS", 2)
         split_model(COMPACT, path, SplitConfig(chunk_gaussians=400, levels=2, refit_steps=3), context=QUIET)
     return path
@@ -285,6 +285,15 @@ def test_a_failure_leaves_no_half_written_folder(tmp_path, monkeypatch):
         split_model(COMPACT, tmp_path / "scene", SplitConfig(chunk_gaussians=400, levels=1), context=QUIET)
 
     assert len(written) == 3 and not (tmp_path / "scene").exists()
+
+
+def test_a_scene_json_of_another_program_makes_no_scene(tmp_path):
+    (tmp_path / "scene.json").write_text('{"scale": 1.0, "center": [0, 0, 0]}')
+    archive = shutil.make_archive(str(tmp_path.parent / "other"), "zip", tmp_path)
+
+    assert not is_scene(tmp_path) and not is_scene(tmp_path / "scene.json") and not is_scene(archive)
+    with pytest.raises(HyrfFormatError, match="not the manifest of a scene folder"):
+        SceneFolder(tmp_path)
 
 
 def test_merged_files_and_scenes_are_refused_as_sources(folder, tmp_path):
