@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from hyrfpack.ops.shade.directions import encode_views
+from hyrfpack.ops.shade.cpu_directions import encode_views
 from hyrfpack.parallel.pool import run_tasks, torch_on_one_thread
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ def shade(positions: Tensor, viewpoint: Tensor, shading: Shading, index: Tensor 
             return values[chunk_slice] if index is None else values.index_select(0, index[chunk_slice])
 
         with torch.no_grad():
-            encoded = encode_views(take(positions), viewpoint, shading.encoding, implementation="reference")
+            encoded = encode_views(take(positions), viewpoint, shading.encoding, threaded=False)
             hidden = torch.addmm(take(shading.first_layer), encoded, shading.direction_weight.T).relu_()
             hidden = torch.addmm(b2, hidden, w2.T).relu_()
             logits = torch.addmm(b3, hidden, w3.T).add_(take(shading.color_logits))

@@ -64,8 +64,8 @@ def encode_views(points: Tensor, viewpoint: Tensor, encoding: str, *, implementa
         points: (N, 3) p.
         viewpoint: (3,) o, in the same units, or (N, 3), one for each point.
         encoding: "sh" or "frequency", see `encode_directions`.
-        implementation: "auto", "reference" or "gpu" (float32, one viewpoint). "gpu" has no backward pass and is
-            available only if no gradient is needed.
+        implementation: "auto", "reference", "cpu" or "gpu" (both float32, one viewpoint). "cpu" and "gpu" have no
+            backward pass and are available only if no gradient is needed.
 
     Returns:
         (N, E), see `DIRECTION_FEATURES`. For a point at the viewpoint itself, d = (0, 0, 0).
@@ -85,8 +85,13 @@ def encode_views(points: Tensor, viewpoint: Tensor, encoding: str, *, implementa
     ):
         raise ValueError(f"points {tuple(points.shape)} from {tuple(viewpoint.shape)}, encoding '{encoding}'")
     needs_grad = torch.is_grad_enabled() and (points.requires_grad or viewpoint.requires_grad)
-    available = ("reference", "gpu") if is_single_viewpoint and not needs_grad else ("reference",)
-    if choose_implementation("encode_views", implementation, available, points, viewpoint) == "gpu":
+    available = ("reference", "cpu", "gpu") if is_single_viewpoint and not needs_grad else ("reference",)
+    chosen = choose_implementation("encode_views", implementation, available, points, viewpoint)
+    if chosen == "cpu":
+        from hyrfpack.ops.shade import cpu_directions
+
+        return cpu_directions.encode_views(points, viewpoint, encoding)
+    if chosen == "gpu":
         from hyrfpack.ops.shade import gpu_directions
 
         return gpu_directions.encode_views(points, viewpoint, encoding, DIRECTION_FEATURES[encoding])
