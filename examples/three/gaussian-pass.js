@@ -14,11 +14,13 @@ const TEXELS_PER_SHAPE = 3;
 
 export class GaussianPass {
   /**
-   * @param {number} count the number of Gaussians
+   * @param {number} rowCount the number of rows of Gaussians
    * @param {Record<string, {value: unknown}>} viewUniforms the uniforms of the view, which the caller sets
    */
-  constructor(count, viewUniforms) {
-    const rows = Math.max(1, Math.ceil(count / GAUSSIANS_PER_ROW));
+  constructor(rowCount, viewUniforms) {
+    const rows = Math.max(1, rowCount);
+    this.gains = new DataTexture(new Float32Array(FLOATS_PER_TEXEL * rows).fill(1), 1, rows, RGBAFormat, FloatType);
+    this.gains.needsUpdate = true;
     this.shapes = dataTexture(Float32Array, TEXELS_PER_SHAPE * rows, RGBAFormat, FloatType);
     this.colors = dataTexture(Float32Array, rows, RGBAFormat, FloatType);
     // Four Gaussians a texel, because three.js updates parts of textures of four components only.
@@ -30,6 +32,7 @@ export class GaussianPass {
       u_shapes: { value: this.shapes },
       u_colors: { value: this.colors },
       u_pixel_sizes: { value: this.pixelSizes },
+      u_row_gains: { value: this.gains },
       u_drawn: { value: 0 },
       u_quads: { value: QUADS_PER_INSTANCE },
     };
@@ -68,6 +71,13 @@ export class GaussianPass {
     writeRows(this.colors, row, colors);
   }
 
+  /** Sets the gains of red, green and blue of rows of Gaussians. */
+  setGains(firstRow, rowCount, gains) {
+    const { data } = this.gains.image;
+    for (let row = firstRow; row < firstRow + rowCount; row++) data.set(gains, FLOATS_PER_TEXEL * row);
+    this.gains.needsUpdate = true;
+  }
+
   /**
    * Draws the Gaussians into `target.texture`, premultiplied. Must be called while the renderer draws `scene`.
    * @param {import("three").WebGLRenderer} renderer
@@ -89,8 +99,8 @@ export class GaussianPass {
   }
 
   dispose() {
-    const { shapes, colors, pixelSizes, order, target, mesh: { geometry, material } } = this;
-    for (const part of [shapes, colors, pixelSizes, order, target, geometry, material]) part?.dispose();
+    const { shapes, colors, pixelSizes, gains, order, target, mesh: { geometry, material } } = this;
+    for (const part of [shapes, colors, pixelSizes, gains, order, target, geometry, material]) part?.dispose();
   }
 }
 

@@ -8,6 +8,7 @@ import {
 import { logGains } from "hyrf.js/exposure.js";
 import { BACKGROUND_RADIUS } from "hyrf.js/fields.js";
 import { CULL_MARGIN_RATIO, NEAR_PLANE_LOCAL } from "hyrf.js/frustum.js";
+import { viewFromPlace } from "hyrf.js/places.js";
 import { openRemoteModel } from "hyrf.js/remote.js";
 import { IDENTITY_QUAT } from "hyrf.js/rotation.js";
 import { viewpointOf } from "hyrf.js/viewpoint.js";
@@ -20,7 +21,7 @@ const FIRST_IN_SCENE = -1e9; // `renderOrder` of the background
 const AS_PHOTOGRAPHED = "as-photographed", CONSISTENT = "consistent"; // the names in hyrfpack.RenderSettings
 
 /**
- * A model in the file's world units, rotated so that up is +y. It may be moved, turned and scaled uniformly.
+ * The model of a file, or all models of a merged file, in the file's world units, rotated so that up is +y. It may be moved, turned and scaled uniformly.
  *
  * Events: "change" when a new frame would look different, "complete" when everything that the camera sees is evaluated,
  * "error" with `error` if the worker fails.
@@ -81,8 +82,10 @@ export class HyrfObject extends Object3D {
     this.frame.quaternion.set(...vector, w).normalize();
     this.frame.scale.setScalar(scale);
     this.add(this.frame);
-    this.gaussians = new GaussianPass(count, this.view);
+    this.gaussians = new GaussianPass(model.rowCount, this.view);
     const compositeUniforms = { ...skyUniforms, u_blended: { value: null }, u_has_sky: { value: Boolean(model.sky) } };
+    // Gaussians of a merged file are exposed one by one, because each part has its own exposure.
+    if (model.parts.length > 1) compositeUniforms.u_gains = { value: new Vector3(1, 1, 1) };
     this.composite = wholeMesh(compositeFragment, compositeUniforms, true);
     this.composite.onBeforeRender = (...drawn) => this.drawGaussians(...drawn);
     this.frame.add(this.gaussians.mesh, this.composite);
@@ -111,9 +114,8 @@ export class HyrfObject extends Object3D {
     this.dispatchEvent({ type: "change" });
   }
 
-  // Returns the gains of red, green and blue at a place, looking along a direction, both in local units.
-  gains(eye, direction) {
-    const { exposure } = this.model;
+  // Returns the gains of red, green and blue at a place, looking along a direction, both in the local units of a part.
+  gains({ exposure }, eye, direction) {
     if (!exposure || this.exposure === CONSISTENT) return [1, 1, 1];
     return logGains(exposure, eye, direction).map(Math.exp);
   }
@@ -163,11 +165,20 @@ export class HyrfObject extends Object3D {
     u_eye.value.set(...eye).divideScalar(BACKGROUND_RADIUS);
     u_intrinsics.value.set(view.fx, view.fy, view.cx, view.cy);
     u_size.value.set(width, height);
-    this.view.u_gains.value.set(...this.gains(eye, rows[2]));
+    this.view.u_gains.value.set(...this.gains(this.model, eye, rows[2]));
+    if (this.model.parts.length > 1) this.exposeParts({ ...view, eye });
     u_corner.value.set(x, y);
     u_depth.value.set(p[10], p[14], unit);
     this.look(view);
     return true;
+  }
+
+  // Sets the exposures of the parts of a merged file for a view.
+  exposeParts(view) {
+    for (const part of this.model.parts) {
+      const { eye, rows } = viewFromPlace(view, part.place);
+      this.gaussians.setGains(part.firstRow, part.rowCount, this.gains(part, eye, rows[2]));
+    }
   }
 
   // Has the worker evaluate a view, unless it is the latest one.

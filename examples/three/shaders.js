@@ -10,15 +10,24 @@ uniform vec4 u_intrinsics; // fx, fy, cx, cy in pixels
 uniform vec2 u_size; // of the picture in pixels
 `;
 
+// Applies the gains of an exposure to a displayed colour. Gains of 1 change nothing.
+const EXPOSE = `
+vec3 expose(vec3 color, vec3 gains) {
+    return gains * color / (1.0 + (gains - 1.0) * color);
+}
+`;
+
 // Projects a Gaussian as hyrfpack/ops/rasterize/reference.py does, and spans a quad where its alpha is at least 1/255.
 export const gaussianVertex = `
 #include <common>
 #include <logdepthbuf_pars_vertex>
 ${VIEW}
+${EXPOSE}
 uniform highp usampler2D u_order; // indices of Gaussians, farthest first
 uniform sampler2D u_shapes; // three texels a Gaussian: position, three axes
 uniform sampler2D u_colors; // red, green, blue, opacity
 uniform sampler2D u_pixel_sizes; // of the photos, of four Gaussians a texel
+uniform sampler2D u_row_gains; // of the exposure of each row of Gaussians
 uniform int u_drawn; // the number of valid indices
 uniform int u_quads; // of an instance
 uniform bool u_antialiased;
@@ -86,7 +95,7 @@ void main() {
 
     v_mean = focal * slope + principal;
     v_conic = vec3(yy, -xy, xx) / filtered;
-    v_color = color;
+    v_color = vec4(expose(color.rgb, texelFetch(u_row_gains, ivec2(0, splat / WIDTH), 0).rgb), color.a);
     float larger = 0.5 * (xx + yy) + length(vec2(0.5 * (xx - yy), xy));
     vec2 axis = xx > yy ? vec2(larger - yy, xy) : vec2(xy, larger - xx);
     axis = dot(axis, axis) > 0.0 ? normalize(axis) : vec2(1.0, 0.0);
@@ -120,13 +129,9 @@ void main() {
 }
 `;
 
-// Applies the gains of the exposure to a displayed colour. Gains of 1 change nothing.
 const EXPOSURE = `
 uniform vec3 u_gains;
-
-vec3 expose(vec3 color) {
-    return u_gains * color / (1.0 + (u_gains - 1.0) * color);
-}
+${EXPOSE}
 `;
 
 // Looks the background up by the point of its sphere that a pixel sees.
@@ -177,7 +182,7 @@ void main() {
     if (u_gains != vec3(1.0)) {
         vec3 behind = u_has_sky ? sky(pixel) : color;
         float passed = 1.0 - blended.a;
-        color = (expose(clamp(blended.rgb + passed * behind, 0.0, 1.0)) - passed * expose(behind)) / blended.a;
+        color = (expose(clamp(blended.rgb + passed * behind, 0.0, 1.0), u_gains) - passed * expose(behind, u_gains)) / blended.a;
     }
     gl_FragColor = vec4(clamp(color, 0.0, 1.0), blended.a);
     ${OUTPUT}
@@ -191,7 +196,7 @@ ${SKY}
 uniform vec2 u_corner;
 
 void main() {
-    gl_FragColor = vec4(expose(sky(gl_FragCoord.xy - u_corner)), 1.0);
+    gl_FragColor = vec4(expose(sky(gl_FragCoord.xy - u_corner), u_gains), 1.0);
     ${OUTPUT}
 }
 `;

@@ -19,6 +19,14 @@ import { HyrfError, HyrfFormatError } from "./errors.js";
  *   onError: (error: HyrfError) => void,
  * }} Receiver
  *
+ * A model of a file, see `RemoteModel.parts`.
+ * @typedef {{
+ *   place: import("./places.js").Place,
+ *   firstRow: number,
+ *   rowCount: number,
+ *   exposure: import("./exposure.js").ExposureMap | null,
+ * }} RemotePart
+ *
  * What can be opened: an address (relative to the page), or the content of a file.
  * @typedef {string | URL | Blob | ArrayBuffer | Uint8Array} Source
  *
@@ -47,7 +55,7 @@ export const openRemoteModel = (source, options = {}) => RemoteModel.open(source
 
 /** A model in a worker. `openRemoteModel` makes one. */
 export class RemoteModel {
-  /** The metadata of the file. @type {import("./metadata.js").Metadata} */
+  /** The metadata of the file, of the first part of a merged file. @type {import("./metadata.js").Metadata} */
   metadata = /** @type {any} */ (null);
   /** `metadata.config`. @type {import("./metadata.js").Config} */
   config = /** @type {any} */ (null);
@@ -55,6 +63,14 @@ export class RemoteModel {
   count = 0;
   /** The exposure map, for `logGains`, or null. @type {import("./exposure.js").ExposureMap | null} */
   exposure = null;
+  /** The number of rows of Gaussians; each part of a merged file begins a row. */
+  rowCount = 0;
+  /**
+   * The models of a merged file, or the only model: their places in the units of the first, their rows and their
+   * exposure maps.
+   * @type {RemotePart[]}
+   */
+  parts = [];
   /** The size of the background's picture, or null if there is none. @type {SkySize | null} */
   sky = null;
   /** Whether the worker was ended. */

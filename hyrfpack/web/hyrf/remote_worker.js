@@ -13,14 +13,14 @@
 //     {error: {message, isFormat}}      a sentence for the user
 
 import { HyrfError, HyrfFormatError } from "./errors.js";
-import { read } from "./index.js";
-import { ViewEvaluator } from "./view_evaluator.js";
+import { readParts } from "./index.js";
+import { MergedEvaluator } from "./merged_evaluator.js";
 
 const PROGRESS_INTERVAL_MS = 50;
 
 /** @typedef {import("./frustum.js").View} View */
 
-/** @type {ViewEvaluator | null} */
+/** @type {MergedEvaluator | null} */
 let evaluator = null;
 /** @type {{ticket: number, view: View} | null} */
 let latest = null; // the view that was not begun yet
@@ -69,10 +69,13 @@ function report(work) {
 async function open({ address, bytes = new Uint8Array(0) }) {
   const data = address === undefined ? bytes : await fetchBytes(address);
   post({ progress: { step: "decoding", part: 0 } });
-  const model = await read(data);
-  evaluator = new ViewEvaluator(model);
-  const { metadata, config, count, exposure } = model;
-  post({ opened: { metadata, config, count, exposure, sky: evaluator.sky } });
+  const models = (await readParts(data)).map(({ model }) => model);
+  evaluator = new MergedEvaluator(models);
+  const { metadata, config, exposure } = models[0], count = models.reduce((sum, model) => sum + model.count, 0);
+  const parts = evaluator.parts.map(({ place, firstRow, rowCount }, number) => {
+    return { place, firstRow, rowCount, exposure: models[number].exposure };
+  });
+  post({ opened: { metadata, config, count, exposure, parts, rowCount: evaluator.rowCount, sky: evaluator.sky } });
 }
 
 /**

@@ -55,8 +55,11 @@ export function skySize(metadata) {
 }
 
 export class ViewEvaluator {
-  /** @param {Model} model */
-  constructor(model) {
+  /**
+   * @param {Model} model
+   * @param {boolean} [withSky] whether its background is evaluated, if it has one
+   */
+  constructor(model, withSky = true) {
     this.model = model;
     this.sorter = new DepthSort(model.positions, GAUSSIANS_PER_ROW);
     this.rows = new RowStates(model.count ? rowBalls(model.positions, GAUSSIANS_PER_ROW) : new Float32Array(0));
@@ -64,7 +67,7 @@ export class ViewEvaluator {
     this.opacities = new Float32Array(model.count);
     /** @type {(Float32Array | null)[]} */
     this.firstLayers = Array.from({ length: this.rows.count }, () => null); // by row, once they are needed
-    this.sky = skySize(model.metadata);
+    this.sky = withSky ? skySize(model.metadata) : null;
     this.tiles = this.sky ? cutTiles(this.sky.width, this.sky.height, false) : [];
     this.tileStates = new RowStates(Float32Array.from(this.tiles.flatMap(({ ball }) => ball)));
     this.hasCoarseSky = !this.sky;

@@ -1,7 +1,7 @@
 // Applies the exposure of the photos taken near the viewpoint, or a consistent one.
 
 import { logGains } from "../hyrf/exposure.js";
-import { viewFromPlace } from "./places.js";
+import { viewFromPlace } from "../hyrf/places.js";
 
 export const AS_PHOTOGRAPHED = "as-photographed", CONSISTENT = "consistent"; // the names in hyrfpack.RenderSettings
 export const EXPOSURES = [AS_PHOTOGRAPHED, CONSISTENT];

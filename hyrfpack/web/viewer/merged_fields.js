@@ -2,7 +2,7 @@
 
 import { Fields } from "./fields.js";
 import { Graphics } from "./graphics.js";
-import { viewFromPlace } from "./places.js";
+import { viewFromPlace } from "../hyrf/places.js";
 
 export class MergedFields {
   // `models` are packed by pack.js; the first is the scene, which alone has a background. Each has its `place`.

@@ -3,7 +3,7 @@
 
 import { Graphics } from "./graphics.js";
 import { BACKGROUND_RADIUS, TEXTURE_WIDTH } from "./constants.js";
-import { viewFromPlace } from "./places.js";
+import { viewFromPlace } from "../hyrf/places.js";
 
 const MAX_READ_SIDE_PIXELS = 8192; // the limit of pictures that are read back
 const QUADS_PER_INSTANCE = 1024; // drivers are slow with many small instances

@@ -26,7 +26,7 @@ import { viewpointOf } from "../hyrf/viewpoint.js";
 import { TEXTURE_WIDTH } from "./constants.js";
 import { rejectOtherFiles } from "./other_files.js";
 import { joinPositions, packModel, packSplats } from "./pack.js";
-import { movePositions, placeOf } from "./places.js";
+import { movePositions, placeOf } from "../hyrf/places.js";
 import { ReceivedFile } from "./received_file.js";
 import { backgroundPicture, modelScene, splatsScene } from "./scene.js";
 import { measureGaussians, selectGaussians } from "./selection.js";

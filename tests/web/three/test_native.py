@@ -22,6 +22,8 @@ from web.test_exposure import visible_map
 from web.three.test_three import app_folder, cameras_around_model, make_model, save_model
 
 import hyrfpack
+from hyrfpack.config.edit import Rotate, Scale, Translate
+from hyrfpack.edit import merge_models
 from hyrfpack.edit.transform import Placement
 from hyrfpack.format.codec import load_with_provenance
 from hyrfpack.model import HybridModel
@@ -196,6 +198,33 @@ def test_the_exposure_map_applies_to_gaussians_and_background(page: Chromium, ap
         "(() => { try { page.object.exposure = 'no'; } catch (error) { return error.message; } })()"
     )
     assert message == "exposure must be as-photographed or consistent, not no."
+
+
+@pytest.mark.acceptance
+@pytest.mark.parametrize(("exposed", "least_psnr"), [(False, 44), (True, 38)])
+def test_pictures_of_a_merged_file_are_those_of_all_its_parts(exposed, least_psnr, page: Chromium, app_folder: Path):
+    """A Gaussian at a time is exposed, where the render exposes the blended picture."""
+    toy, provenance = load_with_provenance(GOLDEN_FILE)
+    toy.exposure = visible_map() if exposed else None
+    hyrfpack.save_model(toy, app_folder / "toy.hyrf", provenance=provenance)
+    settings = replace(EXACT_SETTINGS, exposure="as-photographed")
+    moves = {"toy": [Rotate((1.0, 2.0, 0.5), 40), Scale(0.4), Translate((0.3, -0.2, 1.2))]}
+    merge_models([app_folder / "golden.hyrf", app_folder / "toy.hyrf"], app_folder / "both.hyrf", moves)
+    merged = hyrfpack.load_merged_model(app_folder / "both.hyrf")
+    page.evaluate("page.load('both.hyrf')")
+    assert page.evaluate("page.object.userData.hyrf.count") == len(merged)
+    for number in (0, 3):
+        camera = first_camera(page, number)
+        picture = draw(page, camera)
+        front = render_view(merged, camera, settings, background=False, solid=torch.zeros(3))
+        height = page.evaluate("page.object.model.sky.height")
+        frame = merged.scene.config.frame
+        viewport = frame.local_viewport(camera, torch.float32)
+        behind = sample_sphere(sphere_picture(merged.scene, camera_center(viewport.pose), height), viewport)
+        reference = 255 * (front.rgb + (1 - front.alpha[..., None]) * behind).clamp(0, 1).numpy().astype(np.float64)
+        assert psnr(picture, reference) > least_psnr
+        alone = render_with_sphere(merged.scene, camera, height)
+        assert psnr(alone, reference) < 35, "the other part is not in view"
 
 
 @pytest.mark.acceptance

@@ -9,6 +9,12 @@ export type Receiver = {
     onTile: (tile: SkyTile) => void;
     onError: (error: HyrfError) => void;
 };
+export type RemotePart = {
+    place: import("./places.js").Place;
+    firstRow: number;
+    rowCount: number;
+    exposure: import("./exposure.js").ExposureMap | null;
+};
 export type Source = string | URL | Blob | ArrayBuffer | Uint8Array;
 export type OpenOptions = {
     name?: string;
@@ -30,7 +36,7 @@ export declare const openRemoteModel: (source: Source, options?: Partial<Receive
 /** A model in a worker. `openRemoteModel` makes one. */
 export declare class RemoteModel {
     #private;
-    /** The metadata of the file. @type {import("./metadata.js").Metadata} */
+    /** The metadata of the file, of the first part of a merged file. @type {import("./metadata.js").Metadata} */
     metadata: import("./metadata.js").Metadata;
     /** `metadata.config`. @type {import("./metadata.js").Config} */
     config: import("./metadata.js").Config;
@@ -38,6 +44,14 @@ export declare class RemoteModel {
     count: number;
     /** The exposure map, for `logGains`, or null. @type {import("./exposure.js").ExposureMap | null} */
     exposure: import("./exposure.js").ExposureMap | null;
+    /** The number of rows of Gaussians; each part of a merged file begins a row. */
+    rowCount: number;
+    /**
+     * The models of a merged file, or the only model: their places in the units of the first, their rows and their
+     * exposure maps.
+     * @type {RemotePart[]}
+     */
+    parts: RemotePart[];
     /** The size of the background's picture, or null if there is none. @type {SkySize | null} */
     sky: SkySize | null;
     /** Whether the worker was ended. */

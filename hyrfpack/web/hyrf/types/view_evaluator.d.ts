@@ -64,8 +64,11 @@ export declare class ViewEvaluator {
     tiles: Tile[];
     tileStates: RowStates;
     hasCoarseSky: boolean;
-    /** @param {Model} model */
-    constructor(model: Model);
+    /**
+     * @param {Model} model
+     * @param {boolean} [withSky] whether its background is evaluated, if it has one
+     */
+    constructor(model: Model, withSky?: boolean);
     /**
      * Sorts the Gaussians by their depth in a view.
      * @param {View} view in local units

@@ -1,0 +1,93 @@
+// Evaluates the models of a merged file for one viewpoint after the other, as one set of Gaussians in the local units
+// of the scene, the first model. Each model begins a row.
+
+import { CULL_MARGIN_RATIO, NEAR_PLANE_LOCAL, frustumPlanes } from "./frustum.js";
+import { IDENTITY_PLACE, movePositions, placeOf, viewFromPlace } from "./places.js";
+import { rotateBy } from "./rotation.js";
+import { DepthSort } from "./sort.js";
+import { add, mul } from "./vectors.js";
+import { FLOATS_PER_SHAPE, GAUSSIANS_PER_ROW, ViewEvaluator } from "./view_evaluator.js";
+
+/**
+ * @typedef {import("./frustum.js").View} View
+ * @typedef {import("./places.js").Place} Place
+ * @typedef {import("./view_evaluator.js").EvaluatedRow} EvaluatedRow
+ * @typedef {import("./view_evaluator.js").SkyTile} SkyTile
+ *
+ * A model of a merged file: its place in the scene, its first row and its number of rows.
+ * @typedef {{evaluator: ViewEvaluator, place: Place, firstRow: number, rowCount: number}} Part
+ */
+
+export class MergedEvaluator {
+  /** @param {import("./index.js").Model[]} models */
+  constructor(models) {
+    /** The number of rows. */
+    this.rowCount = 0;
+    /** @type {Part[]} */
+    this.parts = models.map((model, number) => {
+      const evaluator = new ViewEvaluator(model, number === 0), firstRow = this.rowCount;
+      const rowCount = Math.ceil(model.count / GAUSSIANS_PER_ROW);
+      this.rowCount += rowCount;
+      return { evaluator, place: placeOf(model.config.frame, models[0].config.frame), firstRow, rowCount };
+    });
+    const joined = new Float32Array(3 * GAUSSIANS_PER_ROW * this.rowCount).fill(NaN); // which is not drawn
+    for (const { evaluator: { model }, place, firstRow } of this.parts) {
+      joined.set(movePositions(model.positions, place), 3 * GAUSSIANS_PER_ROW * firstRow);
+    }
+    this.sorter = new DepthSort(joined, GAUSSIANS_PER_ROW);
+    this.sky = this.parts[0].evaluator.sky;
+  }
+
+  /**
+   * See ViewEvaluator.
+   * @param {View} view
+   * @param {Uint32Array | null} spare
+   */
+  sort(view, spare) {
+    const sides = frustumPlanes(view, 1 + CULL_MARGIN_RATIO);
+    return this.sorter.sort([...view.rows[2], view.translation[2]], sides, NEAR_PLANE_LOCAL, spare);
+  }
+
+  /**
+   * See ViewEvaluator. What is in view of all models comes first.
+   * @param {View} view
+   * @param {() => void} onComplete
+   * @returns {Generator<EvaluatedRow | SkyTile, void>}
+   */
+  *evaluate(view, onComplete) {
+    const rest = [];
+    for (const part of this.parts) {
+      let isComplete = false;
+      const steps = part.evaluator.evaluate(viewFromPlace(view, part.place), () => (isComplete = true));
+      while (!isComplete) {
+        const { value, done } = steps.next();
+        if (done || !value) break;
+        yield moved(value, part);
+      }
+      rest.push({ part, steps });
+    }
+    onComplete();
+    for (const { part, steps } of rest) {
+      for (const value of steps) yield moved(value, part);
+    }
+  }
+}
+
+/**
+ * Returns what a part evaluates in the units and rows of the scene.
+ * @param {EvaluatedRow | SkyTile} value
+ * @param {Part} part
+ * @returns {EvaluatedRow | SkyTile}
+ */
+function moved(value, { place, firstRow }) {
+  if (!("row" in value) || place === IDENTITY_PLACE) return value;
+  const { shapes, pixelSizes } = value;
+  for (let at = 0; shapes && at < shapes.length; at += FLOATS_PER_SHAPE) {
+    for (let k = 0; k < FLOATS_PER_SHAPE; k += 3) {
+      const vector = mul(rotateBy(place.rows, [shapes[at + k], shapes[at + k + 1], shapes[at + k + 2]]), place.scale);
+      shapes.set(k ? vector : add(vector, place.shift), at + k); // the position comes before the axes
+    }
+  }
+  for (let k = 0; pixelSizes && k < pixelSizes.length; k++) pixelSizes[k] *= place.scale;
+  return { ...value, row: value.row + firstRow };
+}
