@@ -14,7 +14,7 @@ from torch import Tensor
 
 from hyrfpack.errors import HyrfError
 from hyrfpack.ops.dispatch import GPU_OPERATIONS, has_triton, set_replaced_operations
-from hyrfpack.parallel.ranks import Ranks
+from hyrfpack.parallel.ranks import Ranks, uses_gloo_on_gpus
 from hyrfpack.scene import Picture
 from hyrfpack.self_test import SelfTest, load_or_run_self_test
 
@@ -106,7 +106,7 @@ def choose_own_device(name: str | torch.device, ranks: Ranks, *, self_test: bool
         if device.index is None:
             device = choose_device(torch.device("cuda", ranks.local_rank % torch.cuda.device_count()))
         gpus = ranks.all_gather(str(torch.cuda.get_device_properties(device).uuid))
-        if len(set(gpus)) < len(gpus):
+        if len(set(gpus)) < len(gpus) and not uses_gloo_on_gpus():
             raise HyrfError(
                 f"{ranks.size} processes have {len(set(gpus))} GPUs between them, and each needs its own",
                 fix="start one process for each GPU with `device='cuda'`, or use `device='cpu'`",

@@ -6,6 +6,7 @@ import dataclasses
 import logging
 import os
 import signal
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import NoReturn
@@ -95,6 +96,37 @@ def exit_one_rank(ranks: Ranks, leaver: int) -> None:
     if ranks.rank == leaver:
         os._exit(0)
     ranks.all_reduce(torch.ones(3))
+
+
+def exit_one_rank_while_others_wait(ranks: Ranks, leaver: int, how: str) -> float:
+    """End one process, while the others wait for something that is not a collective operation, as for a GPU.
+
+    Returns:
+        The seconds after which this process has noticed, or -1 if it has not noticed within a minute.
+    """
+    ranks.all_gather("here")
+    if ranks.rank == leaver:
+        if how == "error":
+            raise HyrfDataError("photo 3 is bad")
+        if how == "kill":
+            os.kill(os.getpid(), signal.SIGKILL)
+        return 0.0
+    start = time.monotonic()
+    while time.monotonic() < start + (60 if how != "leave" else 1):
+        if error_message(ranks.raise_if_lost) is not None:
+            return time.monotonic() - start
+        time.sleep(0.01)
+    return -1.0
+
+
+def collect_after_a_loss(ranks: Ranks) -> str | None:
+    """Let process 1 be killed; return the error of process 0's next collective operation."""
+    ranks.all_gather("here")
+    if ranks.rank == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+    while error_message(ranks.raise_if_lost) is None:
+        time.sleep(0.01)
+    return error_message(lambda: ranks.all_reduce(torch.ones(3)))
 
 
 # -- training --------------------------------------------------------------------------------------------------------

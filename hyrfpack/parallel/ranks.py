@@ -2,6 +2,8 @@
 
 torchrun or SLURM starts the processes, usually one for each GPU, and gives each its rank in the environment. They
 communicate through torch.distributed, with gloo for the CPU and NCCL for CUDA. A single process needs no network.
+With HYRFPACK_COLLECTIVES=gloo, CUDA tensors are sent by gloo, too, and processes may share a GPU; this is slow, and
+tests two processes on a machine with one GPU.
 """
 
 from __future__ import annotations
@@ -11,7 +13,7 @@ import re
 import signal
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import timedelta
 from threading import Thread
@@ -22,13 +24,17 @@ import torch.distributed as dist
 from torch import Tensor
 
 from hyrfpack.errors import HyrfError, short_reason
+from hyrfpack.parallel.peer_watch import PeerWatch, connect_to_peers
 from hyrfpack.parallel.pool import available_cores
 
 Item = TypeVar("Item")
 
 # A process that sends nothing for this long counts as ended. The time is long because shares of work may be uneven.
-# If a process really ends, the others notice immediately.
+# If a process really ends, the others notice immediately, see `hyrfpack.parallel.peer_watch`.
 COLLECTIVE_TIMEOUT = timedelta(minutes=30)
+COLLECTIVES_VARIABLE = "HYRFPACK_COLLECTIVES"
+# The watch over the other processes of the group that this process has joined.
+_watch: PeerWatch | None = None
 # Each SLURM job uses one of these ports for its rendezvous, unless MASTER_PORT is set. The job number selects the port,
 # so that two jobs on one machine do not collide.
 SLURM_PORTS = range(20_000, 40_000)
@@ -150,19 +156,35 @@ class Ranks:
             rank, what, fix = failed[0]
             raise HyrfError(f"process {rank} of {self.size}: {what}", fix=fix) from problem
 
+    def raise_if_lost(self) -> None:
+        """Raise an error if another process has ended. This is not collective.
+
+        Call it after a wait for the GPU: a collective operation there is aborted if a process ends, and gives no usable
+        result.
+
+        Raises:
+            HyrfError: another process has ended.
+        """
+        if _watch is not None and _watch.lost is not None:
+            raise self._lost_process_error(f"process {_watch.lost}")
+
     @contextmanager
     def _communication_errors(self) -> Iterator[None]:
-        """Turn an error of torch.distributed in the block into a HyrfError."""
+        """Turn an error of torch.distributed in the block into a HyrfError, and a lost process before it, too."""
+        self.raise_if_lost()
         try:
             yield
         except RuntimeError as error:  # All errors of torch.distributed have this type.
             if isinstance(error, (torch.OutOfMemoryError, NotImplementedError)):
                 raise
             reason = re.sub(r"\[\S*/\S*:\d+\] ", "", short_reason(error, 300))  # without the location in gloo's source
-            raise HyrfError(
-                f"one of the {self.size} processes has ended or does not respond ({reason})",
-                fix="read the messages of that process, and check whether memory ran out",
-            ) from error
+            raise self._lost_process_error(reason) from error
+
+    def _lost_process_error(self, reason: str) -> HyrfError:
+        return HyrfError(
+            f"one of the {self.size} processes has ended or does not respond ({reason})",
+            fix="read the messages of that process, and check whether memory ran out",
+        )
 
 
 SINGLE_PROCESS = Ranks()
@@ -199,7 +221,8 @@ def join_processes(environment: Mapping[str, str] | None = None) -> Iterator[Ran
         _stop_when_launcher_ends()
     os.environ.setdefault("HYRFPACK_THREADS", str(max(1, available_cores() // ranks.local_size)))
     address, port = rendezvous_address(environment)
-    devices = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() and dist.is_nccl_available() else "gloo"
+    has_nccl = torch.cuda.is_available() and dist.is_nccl_available() and not uses_gloo_on_gpus(environment)
+    devices = "cpu:gloo,cuda:nccl" if has_nccl else "gloo"
     try:
         if "TORCHELASTIC_RUN_ID" in environment:
             # This store belongs to torchrun, and after a restart it still holds the keys of the old processes. So the
@@ -220,10 +243,39 @@ def join_processes(environment: Mapping[str, str] | None = None) -> Iterator[Ran
             f"process {ranks.rank} of {ranks.size} did not find the others at {address}:{port} ({short_reason(error)})",
             fix=hint,
         ) from error
+    global _watch
+    _watch = connect_to_peers(ranks.rank, ranks.size, address, ranks.broadcast, _abort_gpu_communication)
     try:
         yield ranks
+    except BaseException:
+        _watch.close(failed=True)
+        _abort_gpu_communication()  # Otherwise NCCL waits for operations that the other processes never join.
+        raise
+    else:
+        _watch.close()
     finally:
+        _watch = None
         dist.destroy_process_group()
+
+
+def uses_gloo_on_gpus(environment: Mapping[str, str] | None = None) -> bool:
+    """Return whether the environment asks for gloo in place of NCCL, so that processes may share a GPU.
+
+    Raises:
+        HyrfError: the variable has an unknown value.
+    """
+    name = (os.environ if environment is None else environment).get(COLLECTIVES_VARIABLE, "")
+    if name not in ("", "gloo", "nccl"):
+        raise HyrfError(f"the environment variable {COLLECTIVES_VARIABLE} is {name!r}", fix="set it to gloo or nccl")
+    return name == "gloo"
+
+
+def _abort_gpu_communication() -> None:
+    """Abort the collective operations that are queued on this process's GPU, so that a wait for them ends."""
+    with suppress(RuntimeError):  # There is no backend for CUDA, or it has ended already.
+        group = dist.group.WORLD if dist.is_initialized() else None
+        if group is not None and (backend := group._get_backend(torch.device("cuda"))).name() == "nccl":
+            backend.abort()
 
 
 def _stop_when_launcher_ends() -> None:

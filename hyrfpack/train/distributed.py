@@ -13,6 +13,9 @@ from torch import Tensor, nn
 from hyrfpack.errors import HyrfTrainingError
 from hyrfpack.parallel.ranks import Ranks
 
+# Each gradient begins at a multiple of so many numbers in the message: the Adam kernel reads 16 bytes at a time.
+GRADIENT_ALIGNMENT = 4
+
 
 @dataclass(frozen=True)
 class StepStats:
@@ -72,10 +75,16 @@ def average_gradients(ranks: Ranks, parameters: Sequence[nn.Parameter], numbers:
         >>> average_gradients(Ranks(), [weight], torch.tensor([3.0])), weight.grad
         (tensor([3.]), tensor([1., 1.]))
     """
-    gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
-    flat = ranks.all_reduce(torch.cat([*(gradient.reshape(-1) for gradient in gradients), numbers]))
-    *means, sums = flat.split([*(parameter.numel() for parameter in parameters), len(numbers)])
-    for parameter, mean in zip(parameters, means, strict=True):
+    padding = numbers.new_zeros(GRADIENT_ALIGNMENT - 1)
+    pieces, sizes = [], []
+    for parameter in parameters:
+        gradient = torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
+        missing = -gradient.numel() % GRADIENT_ALIGNMENT
+        pieces += [gradient.reshape(-1), padding[:missing]]
+        sizes += [gradient.numel(), missing]
+    flat = ranks.all_reduce(torch.cat([*pieces, numbers]))
+    *parts, sums = flat.split([*sizes, len(numbers)])
+    for parameter, mean in zip(parameters, parts[::2], strict=True):
         parameter.grad = mean.div_(ranks.size).view_as(parameter)
     return sums
 

@@ -230,6 +230,7 @@ class Trainer:
         with self._timed("loss"):
             # This is the only place in a step where the host waits for the device.
             numbers = torch.cat((packed, broken)).tolist()
+        self.ranks.raise_if_lost()
         sums, flags = numbers[: len(packed)], numbers[len(packed) :]
         stats = StepStats(*sums) if self.ranks.is_single else StepStats.from_sums(sums, self.ranks.size)
         if stats.problem:

@@ -19,6 +19,7 @@ from rank_processes import free_port, needs_ranks, run_on_ranks, torchrun_enviro
 from hyrfpack import device as devices
 from hyrfpack.device import choose_own_device
 from hyrfpack.errors import HyrfError
+from hyrfpack.parallel import ranks as ranks_module
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks, join_processes, ranks_from_environment, rendezvous_address
 
 SRUN_ENVIRONMENT = {
@@ -279,6 +280,39 @@ def test_a_process_that_ends_silently_is_noticed_at_once(leaver):
     assert all("\n" not in said and ".cc:" not in said for said in refusals)
 
 
+@needs_ranks
+@pytest.mark.parametrize(("leaver", "how"), [(0, "kill"), (1, "kill"), (2, "error")])
+def test_a_process_that_ends_is_noticed_within_seconds_by_those_that_wait_for_a_gpu(leaver, how):
+    ends = run_on_ranks(tasks.exit_one_rank_while_others_wait, leaver, how, size=3, timeout_seconds=100)
+    assert all(0 <= end.result < 10 for rank, end in enumerate(ends) if rank != leaver)
+
+
+@needs_ranks
+def test_a_process_that_leaves_without_an_error_is_not_lost():
+    ends = run_on_ranks(tasks.exit_one_rank_while_others_wait, 1, "leave", size=2, timeout_seconds=60)
+    assert [end.result for end in ends] == [-1.0, 0.0]
+
+
+@needs_ranks
+def test_the_next_collective_operation_after_a_loss_names_the_process():
+    first, _ = run_on_ranks(tasks.collect_after_a_loss, size=2, timeout_seconds=60)
+    assert (
+        first.result is not None and "one of the 2 processes has ended or does not respond (process 1)" in first.result
+    )
+    assert "\n" not in first.result
+
+
+def test_the_operations_queued_on_a_gpu_are_aborted_by_nccl_alone(monkeypatch):
+    aborted = []
+    for name in ("nccl", "gloo"):
+        backend = SimpleNamespace(name=lambda name=name: name, abort=lambda name=name: aborted.append(name))
+        world = SimpleNamespace(_get_backend=lambda device, backend=backend: backend)
+        monkeypatch.setattr(ranks_module.dist, "is_initialized", lambda: True)
+        monkeypatch.setattr(ranks_module.dist, "group", SimpleNamespace(WORLD=world))
+        ranks_module._abort_gpu_communication()
+    assert aborted == ["nccl"]
+
+
 # -- sharing ---------------------------------------------------------------------------------------------------------
 
 
@@ -331,6 +365,19 @@ def test_each_process_has_its_own_gpu(name):
 def test_two_processes_on_one_gpu_are_rejected(name, rank, other):
     with pytest.raises(HyrfError, match=r"3 processes have 1 GPUs.*each needs its own.*`device='cpu'`"):
         choose_own_device(name, FakeRank(rank, 3, rank, 3, others=(other, other)))
+
+
+@pytest.mark.usefixtures("two_gpus")
+def test_two_processes_share_a_gpu_where_gloo_sends_its_tensors(monkeypatch):
+    monkeypatch.setenv("HYRFPACK_COLLECTIVES", "gloo")
+    rank = FakeRank(2, 3, 2, 3, others=("uuid of 0",) * 2)
+    assert choose_own_device("cuda", rank, self_test=False) == torch.device("cuda:0")
+
+
+def test_unknown_collectives_are_a_clear_error(monkeypatch):
+    monkeypatch.setenv("HYRFPACK_COLLECTIVES", "mpi")
+    with pytest.raises(HyrfError, match="HYRFPACK_COLLECTIVES is 'mpi'; set it to gloo or nccl"):
+        ranks_module.uses_gloo_on_gpus()
 
 
 def test_processes_share_the_cpu():

@@ -19,7 +19,7 @@ from rank_processes import ProcessOutcome, needs_ranks, run_on_ranks
 from hyrfpack.config.train import FIELD_WARMUP_STEPS
 from hyrfpack.errors import HyrfError
 from hyrfpack.ops.ssim import photometric_loss
-from hyrfpack.parallel.ranks import SINGLE_PROCESS
+from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.render import render_view
 from hyrfpack.scene import Scene
 from hyrfpack.train import TrainConfig, Trainer
@@ -115,6 +115,17 @@ def test_one_process_keeps_its_gradients_and_its_settings():
     assert average_gradients(SINGLE_PROCESS, [weight], torch.tensor([2.0, 5.0])).tolist() == [2.0, 5.0]
     assert torch.equal(weight.grad, expected)
     check_settings(SINGLE_PROCESS, {"seed": 1})
+
+
+def test_averaged_gradients_lie_at_multiples_of_16_bytes():
+    """The Adam kernel then reads 16 bytes at a time."""
+    parameters = [torch.nn.Parameter(torch.zeros(size)) for size in (3, 5, 8, 1)]
+    for number, parameter in enumerate(parameters, 1):
+        parameter.grad = torch.full_like(parameter, number)
+    sums = average_gradients(Ranks(), parameters, torch.tensor([7.0]))
+    start = parameters[0].grad.data_ptr()
+    assert all((parameter.grad.data_ptr() - start) % 16 == 0 for parameter in parameters)
+    assert all(bool((p.grad == number).all()) for number, p in enumerate(parameters, 1)) and sums.tolist() == [7.0]
 
 
 def test_a_digest_depends_on_every_bit():
