@@ -74,6 +74,7 @@ def self_test_cases() -> dict[str, SelfTestCase]:
         "frustum_cull": _frustum_cull(),
         "rasterize": _rasterize(RasterSettings(depth=True)),
         "rasterize, antialiased": _rasterize(RasterSettings(antialiased=True)),
+        "rasterize, replay": _replay(),
         "shade": _shade(mixed=False),
         "shade, mixed precision": _shade(mixed=True),
         "rasterize_shaded": _rasterize_shaded(mixed=False),
@@ -192,6 +193,22 @@ def _rasterize(settings: RasterSettings) -> SelfTestCase:
         return {"rgb": image.rgb, "transmittance": image.transmittance} | depth
 
     return SelfTestCase("rasterize", inputs, run, tuple(inputs), True, _RASTER_BOUNDS)
+
+
+def _replay() -> SelfTestCase:
+    """The backward pass replays the transmittance of the forward pass; all bits have to agree."""
+    inputs = _splats(300) | {"colors": _uniform(4, 300, 3)}
+
+    def run(implementation: str, x: Inputs) -> dict[str, Tensor]:
+        if implementation != "gpu":
+            return {"equal pixels": torch.ones(IMAGE_HEIGHT, IMAGE_WIDTH)}
+        from hyrfpack.ops.rasterize.gpu import replay_transmittance
+
+        *gaussians, colors = x.values()
+        stored, replayed = replay_transmittance(Gaussians3D(*gaussians), colors, _viewport(), RasterSettings())
+        return {"equal pixels": (stored == replayed).float()}
+
+    return SelfTestCase("rasterize", inputs, run, bounds=(1e-6, 1e-6))
 
 
 def _shading_inputs(count: int, mixed: bool) -> dict[str, Tensor]:

@@ -610,3 +610,17 @@ def test_blending_loops_are_vectorised() -> None:
         fresh.compile(kernel.signatures[0])
         (assembly,) = fresh.inspect_asm().values()
         assert re.search(rf"v?{packed}\s+.*%[xyz]mm", assembly)
+
+
+@needs_triton
+@pytest.mark.parametrize("transmittance_min", [0.0, 1e-4, 0.3])
+def test_the_backward_pass_replays_the_bits_of_the_transmittance(transmittance_min: float) -> None:
+    from hyrfpack.ops.rasterize.gpu import replay_transmittance
+
+    case = _reduce_for_interpreter(Case(_gaussians(3000, size=0.2), 40, 20, (50.0, 50.0, 20.0, 10.0)), "gpu")
+    (*gaussians, colors), _ = _inputs(case, "gpu", torch.float32)
+    viewport = Viewport(case.camera, case.intrinsics, case.width, case.height)
+    settings = RasterSettings(transmittance_min=transmittance_min)
+    stored, replayed = replay_transmittance(Gaussians3D(*gaussians), colors, viewport, settings)
+    assert torch.equal(stored, replayed)
+    assert stored.min() < 0.5  # Otherwise no pixel is near a threshold.

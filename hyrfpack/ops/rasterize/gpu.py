@@ -128,15 +128,12 @@ class _Rasterize(torch.autograd.Function):
         grads = tuple(torch.empty_like(tensor) for tensor in (*inputs, inputs[0]))
         if not total:
             return *grads, None, None
-        rows = torch.empty(count, gpu_project.GRADIENT_ROW_FLOATS.value // 2, dtype=torch.int64, device=rgb.device)
+        rows = _empty_rows(count, rgb.device)
         sums = rows.view(torch.float32)
         if count:
-            gpu_blend.blend_backward[(len(ctx.blended),)](
-                pairs.tile_starts, pairs.owners, pairs.slots, ctx.blended, projection.records,
-                int(view.viewport.width), int(view.viewport.height), float(view.settings.transmittance_min),
-                rgb, transmittance, grad_rgb.contiguous(), grad_transmittance.contiguous(), rows,
-                ABSGRAD=with_absgrad, num_warps=gpu_blend.WARPS_PER_TILE, enable_fp_fusion=True,
-            )  # fmt: skip
+            image = BlendedImage(rgb, transmittance, None, pairs, ctx.blended)
+            grads_of_image = grad_rgb.contiguous(), grad_transmittance.contiguous()
+            _blend_backward(projection, image, view.viewport, view.settings, *grads_of_image, rows, with_absgrad)
             gpu_blend.sum_rows[(triton.cdiv(total, _SUM_GAUSSIANS_PER_PROGRAM),)](
                 sums, pairs.slot_starts, projection.counts, total,
                 ABSGRAD=with_absgrad, BLOCK=_SUM_GAUSSIANS_PER_PROGRAM, SLOTS=_SUM_ROWS_PER_LOAD,
@@ -150,3 +147,50 @@ class _Rasterize(torch.autograd.Function):
             BLOCK=gpu_project.GAUSSIANS_PER_PROGRAM, num_warps=gpu_project.WARPS_PER_PROGRAM, enable_fp_fusion=True,
         )  # fmt: skip
         return *grads, None, None
+
+
+def _empty_rows(count: int, device: torch.device) -> Tensor:
+    """Return memory for the gradient rows of all pairs."""
+    return torch.empty(count, gpu_project.GRADIENT_ROW_FLOATS.value // 2, dtype=torch.int64, device=device)
+
+
+def _blend_backward(
+    projection: Projection,
+    image: BlendedImage,
+    viewport: Viewport,
+    settings: RasterSettings,
+    grad_rgb: Tensor,
+    grad_transmittance: Tensor,
+    rows: Tensor,
+    with_absgrad: bool,
+    replayed: Tensor | None = None,
+) -> None:
+    """Write the gradient row of each pair, and if asked for, the transmittance that this pass has replayed."""
+    pairs = image.pairs
+    gpu_blend.blend_backward[(len(image.blended),)](
+        pairs.tile_starts, pairs.owners, pairs.slots, image.blended, projection.records,
+        int(viewport.width), int(viewport.height), float(settings.transmittance_min),
+        image.rgb, image.transmittance, grad_rgb, grad_transmittance, rows, replayed,
+        ABSGRAD=with_absgrad, REPLAYED=replayed is not None,
+        num_warps=gpu_blend.WARPS_PER_TILE, enable_fp_fusion=True,
+    )  # fmt: skip
+
+
+@torch.no_grad()
+def replay_transmittance(
+    gaussians: Gaussians3D, colors: Tensor, viewport: Viewport, settings: RasterSettings
+) -> tuple[Tensor, Tensor]:
+    """Return the transmittance (H, W) of the forward pass, and that which the backward pass replays; for tests.
+
+    All bits have to agree. Otherwise a pair near a threshold could count in one pass and not in the other.
+    """
+    camera = gpu_project.pack_camera(
+        viewport, settings.near, colors.device, low_pass_variance=settings.low_pass_variance
+    )
+    projection = _project(gaussians, colors, _View(camera, viewport, settings, None))
+    image = bin_and_blend(projection, viewport, settings)
+    replayed = torch.full_like(image.transmittance, torch.nan)
+    rows = _empty_rows(len(image.pairs.owners), colors.device)
+    gradients = torch.ones_like(image.rgb), torch.ones_like(image.transmittance)
+    _blend_backward(projection, image, viewport, settings, *gradients, rows, False, replayed)
+    return image.transmittance, replayed

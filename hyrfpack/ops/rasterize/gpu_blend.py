@@ -101,21 +101,34 @@ def _load_record(records, owner, live):
 
 
 @triton.jit
-def _log2_alpha(record, x, y, row):
-    """Return u (ROWS, LANES), v (LANES,) and log2 of the unclamped alpha (ROWS, LANES)."""
+def _attenuate(record, x, y, row, transmittance_min, remaining):
+    """Compute how one pair attenuates the light, for both passes.
+
+    Both kernels round alike here, however the compiler fuses operations in each of them: a product that is added to
+    something is an explicit fma, or a select stands in between. So the backward pass replays exactly the transmittance
+    of the forward pass, and the same pixels are above the thresholds of alpha and transmittance.
+
+    Returns:
+        u: (ROWS, LANES); v: (LANES,); log2 of the unclamped alpha: (ROWS, LANES).
+        is_blended: (ROWS, LANES), whether the pixel is above both thresholds.
+        alpha: (ROWS, LANES), clamped.
+        weight: (ROWS, LANES), the light that the pair takes; the rest, `remaining - weight`, lies behind it.
+    """
     ref_x, ref_y, u_0, v_0, u_x, u_y, v_x, log_opacity, _, _, _, _ = record
     dx = x - ref_x
-    v = v_x * dx + v_0
-    u = (u_y * (y - ref_y) + (u_x * dx + u_0))[None, :] + u_y * row
-    return u, v, (log_opacity - v * v)[None, :] - u * u
+    v = tl.fma(v_x, dx, v_0)
+    u_first = tl.fma(u_y, y - ref_y, tl.fma(u_x, dx, u_0))
+    u = tl.fma(u_y, row, u_first[None, :])
+    log2_alpha = tl.fma(-u, u, tl.fma(-v, v, log_opacity)[None, :])
+    is_blended = (log2_alpha >= LOG2_ALPHA_MIN) & (remaining > transmittance_min)
+    alpha = tl.minimum(tl.exp2(log2_alpha), _ALPHA_MAX)
+    return u, v, log2_alpha, is_blended, alpha, tl.where(is_blended, alpha * remaining, 0.0)
 
 
 @triton.jit
 def _blend_pair(record, x, y, row, transmittance_min, remaining, red, green, blue, depth, DEPTH: tl.constexpr):
     """Blend one pair; returns the remaining transmittance and the accumulated values."""
-    _, _, log2_alpha = _log2_alpha(record, x, y, row)
-    alpha = tl.minimum(tl.exp2(log2_alpha), _ALPHA_MAX)
-    weight = tl.where((log2_alpha >= LOG2_ALPHA_MIN) & (remaining > transmittance_min), alpha * remaining, 0.0)
+    _, _, _, _, _, weight = _attenuate(record, x, y, row, transmittance_min, remaining)
     red += weight * record[8]
     green += weight * record[9]
     blue += weight * record[10]
@@ -189,10 +202,8 @@ def _backpropagate_pair(
 
     R is the contribution to g . rgb of everything behind the pair: dL/d(alpha) = T (color . g) - R / (1 - alpha).
     """
-    u, v, log2_alpha = _log2_alpha(record, x, y, row)
-    alpha = tl.minimum(tl.exp2(log2_alpha), _ALPHA_MAX)
-    alpha = tl.where((log2_alpha >= LOG2_ALPHA_MIN) & (remaining > transmittance_min), alpha, 0.0)
-    weight = alpha * remaining
+    u, v, log2_alpha, is_blended, alpha, weight = _attenuate(record, x, y, row, transmittance_min, remaining)
+    alpha = tl.where(is_blended, alpha, 0.0)
     contribution = weight * (record[8] * g_red + record[9] * g_green + record[10] * g_blue)
     rest -= contribution
     p = contribution - rest * (alpha / (1 - alpha))
@@ -223,12 +234,13 @@ def _backpropagate_pair(
 @triton.jit(do_not_specialize=["width", "height"])
 def blend_backward(
     starts, owners, slots, blended, records, width, height, transmittance_min,
-    rgb, transmittance, grad_rgb, grad_transmittance, gradient_rows, ABSGRAD: tl.constexpr,
+    rgb, transmittance, grad_rgb, grad_transmittance, gradient_rows, replayed,
+    ABSGRAD: tl.constexpr, REPLAYED: tl.constexpr,
 ):  # fmt: skip
     """Write the gradient row of each pair of one tile to its slot in gradient_rows (P, 6) int64.
 
     Pairs behind the one that finished the tile get zeros. Blending is replayed front to back, so that forward stores
-    only the image.
+    only the image. If REPLAYED, the replayed transmittance is written to `replayed` (H, W), to be compared.
     """
     tile = tl.program_id(0)
     x, y, row, place, inside = _tile_pixels(tile, width, height)
@@ -262,6 +274,8 @@ def blend_backward(
         remaining, rest = _backpropagate_pair(
             record_1, x, y, row, transmittance_min, remaining, rest, g_red, g_green, g_blue, to_1, more, ABSGRAD
         )
+    if REPLAYED:
+        _store_pixels(replayed + place, remaining, inside)
 
     word = tl.arange(0, 8)[None, :]
     pair = finish + tl.arange(0, _ROWS_CLEARED_PER_STORE)
