@@ -78,7 +78,7 @@ golden: $(VENV_STAMP) ## train the golden models of the tests again, after a cha
 bench: $(VENV_STAMP) ## time each hot operation at several sizes against its references
 	$(BIN)/python -m tools.bench
 
-gpu: $(VENV_STAMP) ## check and measure the GPU kernels on this machine's GPU; results in docs/gpu/ (at most 13 minutes)
+gpu: $(VENV_STAMP) ## check and measure the GPU kernels on this machine's GPU; results in docs/gpu/ (at most 9 minutes)
 	$(BIN)/python -m tools.gpu.check
 
 speed: $(VENV_STAMP) ## measure time and error of every setting on a small model; plot in runs/speed.png (2 to 4 minutes)

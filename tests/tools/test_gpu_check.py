@@ -22,9 +22,12 @@ from hyrfpack.parallel.child_items import run_in_children
 from tools.gpu import check as gpu_check
 from tools.gpu import frames as gpu_frames
 from tools.gpu import kernels as gpu_kernels
+from tools.gpu import prepare as gpu_prepare
 from tools.gpu import quality as gpu_quality
+from tools.gpu import repeat as gpu_repeat
 from tools.gpu import report as gpu_report
 from tools.gpu import roofline as gpu_roofline
+from tools.gpu import sanitizer as gpu_sanitizer
 from tools.gpu import suite as gpu_suite
 from tools.gpu import tests as gpu_tests
 from tools.gpu import timing as gpu_timing
@@ -339,6 +342,79 @@ def test_it_starts_from_the_repository_root_without_an_installed_hyrfpack() -> N
     assert done.returncode == 0 and "--parts" in done.stdout, done.stderr
 
 
+def test_the_default_parts_end_within_nine_minutes_and_leave_out_long_training() -> None:
+    assert sum(gpu_check.CHECK_PARTS[part][1] for part in gpu_check.DEFAULT_PARTS) <= 540
+    assert set(gpu_check.CHECK_PARTS) - set(gpu_check.DEFAULT_PARTS) == {"quality"}
+
+
+def test_rooms_of_the_goals_size_come_first_as_trained_before_tidy() -> None:
+    assert gpu_frames.items(Setup())[:2] == ["1,000,000, as trained", "1,000,000"]
+    assert sorted(gpu_frames.items(Setup())[2:]) == ["100,000", "3,000,000"]
+
+
+def test_the_report_is_written_after_every_row(monkeypatch: pytest.MonkeyPatch) -> None:
+    lengths = []
+    monkeypatch.setattr(gpu_check, "run_part", lambda part, setup, seconds: iter([{"item": part}, {"item": part}]))
+    gpu_check.check(["tests", "kernels"], TINY_SETUP, report=lambda rows: lengths.append(len(rows)))
+    assert lengths == [1, 2, 3, 4, 5, 6]  # two rows of each part, and the time that it took
+
+
+@pytest.mark.parametrize("item", gpu_repeat.items(TINY_SETUP))
+def test_a_repeated_frame_and_step_have_the_same_bits(item: str) -> None:
+    rows = list(gpu_repeat.run(item, TINY_SETUP))
+    assert rows and {row["same bits"] for row in rows} == {"yes"}
+
+
+def test_different_bits_fail_a_row_unless_a_hash_table_was_added_to_in_any_order() -> None:
+    one, other = torch.tensor([1.0, 2.0]), torch.tensor([1.0, 2.5])
+    assert gpu_repeat.compare("gaussians.positions", one, other)["status"] == "failed"
+    table = gpu_repeat.compare("radiance.grid.table", one, other)
+    assert "status" not in table and table["same bits"] == "no" and table["largest difference"] == 0.5
+
+
+SANITIZER_OUTPUT = """========= COMPUTE-SANITIZER
+@begun mlp
+{lines}========= {summary}
+"""
+
+
+@pytest.mark.parametrize(
+    ("lines", "summary", "found", "note"),
+    [
+        ("", "ERROR SUMMARY: 0 errors", "0 errors", None),
+        ("", "RACECHECK SUMMARY: 0 hazards displayed (0 errors, 0 warnings)", "0 hazards displayed", None),
+        (
+            "========= Invalid __global__ read of size 4 bytes\n",
+            "ERROR SUMMARY: 3 errors",
+            "3 errors",
+            "Invalid __global",
+        ),
+        ("", "Target application terminated", None, "no summary"),
+    ],
+)
+def test_errors_that_the_sanitizer_counts_fail_its_row(
+    lines: str, summary: str, found: str | None, note: str | None
+) -> None:
+    row = gpu_sanitizer.describe_output(SANITIZER_OUTPUT.format(lines=lines, summary=summary), 1)
+    assert found is None or str(row["found"]).startswith(found)
+    assert ("status" in row) == (note is not None) and (note is None or note in str(row["note"]))
+
+
+def test_the_sanitizer_is_left_out_where_it_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gpu_sanitizer.shutil, "which", lambda name: None)
+    monkeypatch.setattr(gpu_sanitizer, "DEFAULT_PROGRAM", Path("/nowhere"))
+    rows = [row for item in gpu_sanitizer.items(TINY_SETUP) for row in gpu_sanitizer.run(item, TINY_SETUP)]
+    assert [row["status"] for row in rows] == ["left out", "left out"]
+
+
+def test_prepared_commands_install_the_wheels_without_a_network_and_run_both_checks() -> None:
+    first, second = gpu_prepare.check_commands(Path("build/gpu"), "abc123", "$OUT")
+    for command in (first, second):
+        assert "--no-index" in command and "build/gpu/wheels/*.whl" in command
+        assert "PYTHONPATH=/tmp/gpu-packages" in command and "--commit abc123 --out $OUT" in command
+    assert "--parts quality --data build/gpu/data" in second and "--parts" not in first
+
+
 def test_the_command_writes_its_page_and_fails_where_a_check_does(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
@@ -346,10 +422,11 @@ def test_the_command_writes_its_page_and_fails_where_a_check_does(
     monkeypatch.setattr(
         gpu_check, "Setup", lambda data: replace(TINY_SETUP, device="cpu", data=str(tmp_path / "no set"))
     )
-    assert gpu_check.main(["--parts", "quality", "--out", str(tmp_path)]) == 1
+    assert gpu_check.main(["--parts", "quality", "--out", str(tmp_path), "--commit", "abc123"]) == 1
     (page,) = tmp_path.glob("*.md")
     assert all(f"| {run} | " in page.read_text() for run in ("CPU", "GPU, float32", "GPU, mixed"))
     assert "| quality: " + str(tmp_path / "no set") in page.read_text()
+    assert "commit abc123" in page.read_text()
     assert capsys.readouterr().out.endswith("1 failed\n")
 
 
@@ -364,7 +441,8 @@ def test_matrix_case_runs_through() -> None:
     assert "status" not in row, row
 
 
-def test_tests_marked_gpu_are_run_and_a_failure_is_reported_with_its_reason(tmp_path: Path) -> None:
+@pytest.mark.parametrize("workers", [0, 2])
+def test_tests_marked_gpu_are_run_and_a_failure_is_reported_with_its_reason(workers: int, tmp_path: Path) -> None:
     (tmp_path / "test_a.py").write_text("import pytest\npytestmark = pytest.mark.gpu\ndef test_good(): pass\n")
     (tmp_path / "test_b.py").write_text(
         "import pytest\n@pytest.mark.gpu\ndef test_good(): pass\n@pytest.mark.gpu\ndef test_bad(): assert 1 == 2\n"
@@ -373,7 +451,8 @@ def test_tests_marked_gpu_are_run_and_a_failure_is_reported_with_its_reason(tmp_
     (tmp_path / "test_c.py").write_text(
         "import pytest\n@pytest.mark.gpu\n@pytest.mark.parametrize('x', ['a b - FAILED'])\ndef test_good(x): pass\n"
     )
-    good, bad, last = gpu_suite.run_suite([str(tmp_path)])
+    rows = gpu_suite.run_suite([str(tmp_path)], workers=workers)
+    good, bad, last = sorted(rows, key=lambda row: str(row["case"]))
     assert [Path(row["case"]).name for row in (good, bad, last)] == ["test_a.py", "test_b.py", "test_c.py"]
     assert good["result"] == last["result"] == "1 passed" and "status" not in good | last
     assert bad["result"] == "1 passed, 2 failed" and bad["status"] == "failed"
@@ -390,14 +469,39 @@ def test_tests_marked_gpu_are_run_and_a_failure_is_reported_with_its_reason(tmp_
 )
 def test_pytest_without_a_result_is_a_failure(content: str, words: str, tmp_path: Path) -> None:
     (tmp_path / "test_some.py").write_text(content)
-    (row,) = gpu_suite.run_suite([str(tmp_path)])
+    (row,) = gpu_suite.run_suite([str(tmp_path)], workers=0)
     assert row["status"] == "failed" and re.search(words, row["note"]), row
+
+
+def test_a_worker_whose_gpu_is_broken_is_replaced_and_the_rest_of_its_file_still_runs(tmp_path: Path) -> None:
+    (tmp_path / "test_some.py").write_text(
+        "import os, sys, types, pytest\npytestmark = pytest.mark.gpu\n"
+        "def test_first(): pass\n"
+        "def test_breaks(monkeypatch):\n"
+        "    from tools.gpu import replace_worker\n"
+        "    replace_worker.is_gpu_broken = lambda: True\n"
+        "    raise RuntimeError('an illegal memory access')\n"
+        "def test_last(): pass\n"
+    )
+    (row,) = gpu_suite.run_suite([str(tmp_path)], workers=1)
+    assert sorted(str(row["result"]).split(", ")) == ["1 failed", "1 skipped", "2 passed"]
+    assert "crashed while running" in row["note"] and "test_breaks" in row["note"]
+
+
+def test_a_suite_that_takes_too_long_keeps_the_outcomes_of_the_tests_that_ended(tmp_path: Path) -> None:
+    (tmp_path / "test_some.py").write_text(
+        "import time, pytest\npytestmark = pytest.mark.gpu\n"
+        "def test_quick(): pass\ndef test_bad(): assert 1 == 2\ndef test_slow(): time.sleep(60)\n"
+    )
+    row, late = gpu_suite.run_suite([str(tmp_path)], seconds=8.0, workers=0)
+    assert row["result"] == "1 passed, 1 failed" and "1 == 2" in row["note"]
+    assert late["status"] == "failed" and late["note"] == "not done within 8 s; 2 tests were run"
 
 
 def test_a_file_that_cannot_be_imported_does_not_stop_the_others(tmp_path: Path) -> None:
     (tmp_path / "test_a.py").write_text("import no_such_module")
     (tmp_path / "test_b.py").write_text("import pytest\n@pytest.mark.gpu\ndef test_good(): pass")
-    good, missing = gpu_suite.run_suite([str(tmp_path)])
+    good, missing = gpu_suite.run_suite([str(tmp_path)], workers=0)
     assert Path(good["case"]).name == "test_b.py" and good["result"] == "1 passed" and "status" not in good
     assert missing["status"] == "failed" and "test_a.py" in missing["note"]
 
@@ -421,7 +525,7 @@ def test_every_kernel_test_and_end_to_end_test_is_selected() -> None:
         gpu_suite.GPU_MARKER,
     ]
     done = subprocess.run(
-        [*command, *gpu_suite.TEST_PATHS], cwd=gpu_check.REPOSITORY_ROOT, capture_output=True, text=True
+        [*command, *Setup().test_paths], cwd=gpu_check.REPOSITORY_ROOT, capture_output=True, text=True
     )
     chosen = {line.partition("[")[0] for line in done.stdout.splitlines() if "::" in line}
     for file in ("tests/ops/test_shaded.py", "tests/test_gpu_path.py"):

@@ -1,17 +1,20 @@
-"""Check and measure hyrfpack's GPU kernels on this machine, and write a report; this takes at most 13 minutes.
+"""Check and measure hyrfpack's GPU kernels on this machine, and write a report; this takes at most 9 minutes.
 
-    python -m tools.gpu.check                          all parts; writes docs/gpu/<machine>.json and .md
+    python -m tools.gpu.check                          the default parts; writes docs/gpu/<machine>.json and .md
     python -m tools.gpu.check --parts tests kernels    only these parts
-    python -m tools.gpu.check --out runs/gpu --data ../shared/data/mipnerf360_bonsai
+    python -m tools.gpu.check --parts quality --data ../shared/data/mipnerf360_bonsai
 
-It prints one line for each row of the report. It needs a GPU, torch with Triton, and numpy; hyrfpack need not be
-installed. The part `tests` also needs pytest. Training, in the last two parts, also needs pillow, rich and scipy, and
-on the CPU Numba. Items that lack a package are left out, and the report gives the reason. The parts:
+It prints one line for each row of the report, and writes the report again after each row. It needs a GPU, torch with
+Triton, and numpy; hyrfpack need not be installed. The part `tests` also needs pytest. Training needs pillow, rich and
+scipy, and on the CPU Numba. Items that lack a package are left out, and the report gives the reason. The parts, in the
+order in which they run:
 
-    tests     random cases against the float64 reference, and the tests marked "gpu"
-    kernels   each operation alone: time in ms, roofline, error
-    frames    whole frames, training steps and gsplat, with 100,000 to 3 million Gaussians
-    quality   the same training run on the CPU and on the GPU: PSNR on held-out photos in dB
+    tests      random cases against the float64 reference, and the tests marked "gpu"
+    kernels    each operation alone: time in ms, roofline, error
+    frames     whole frames, training steps and gsplat, with 100,000 to 3 million Gaussians
+    sanitizer  NVIDIA's compute-sanitizer on the cases of the self-test, where it is installed
+    repeat     the same frame and the same training step twice: whether all bits agree
+    quality    the same training run on the CPU and on the GPU: PSNR on held-out photos in dB; not run by default
 
 Exit code: 0 if every check passed, 1 if one failed, 2 if there is no GPU. A missed goal does not fail the check.
 """
@@ -23,7 +26,7 @@ import importlib
 import os
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -43,21 +46,32 @@ REPOSITORY_ROOT = Path(__file__).parents[2]
 # Each part has a module with `items(setup)` and `run(item, setup)`, and a time limit in seconds for all its items. The
 # limit of the tests includes the first build of 140 kernels, which takes up to a second each.
 CHECK_PARTS = {
-    "tests": ("tools.gpu.tests", 300.0),
+    "tests": ("tools.gpu.tests", 180.0),
     "kernels": ("tools.gpu.kernels", 90.0),
     "frames": ("tools.gpu.frames", 200.0),
+    "sanitizer": ("tools.gpu.sanitizer", 45.0),
+    "repeat": ("tools.gpu.repeat", 25.0),
     "quality": ("tools.gpu.quality", 170.0),
 }
+DEFAULT_PARTS = ("tests", "kernels", "frames", "sanitizer", "repeat")
+# The default parts end within this time, because some machines kill a command after 10 minutes.
+MAX_DEFAULT_SECONDS = 540.0
 NO_GPU = "torch finds no GPU on this machine, so nothing was checked; run this on a machine with a CUDA or ROCm GPU"
 
 
-def check(parts: Sequence[str], setup: Setup, scale: float = 1.0) -> list[Row]:
+def check(
+    parts: Sequence[str],
+    setup: Setup,
+    scale: float = 1.0,
+    report: Callable[[Sequence[Row]], object] = lambda rows: None,
+) -> list[Row]:
     """Run the parts, each in its own child processes; print each row as one line and return all rows.
 
     Args:
         parts: keys of CHECK_PARTS.
         setup: the sizes and the device.
         scale: factor of the parts' time limits.
+        report: called with all rows so far after each row, so that an interrupted check loses nothing.
     """
     rows: list[Row] = []
     for part in parts:
@@ -65,8 +79,10 @@ def check(parts: Sequence[str], setup: Setup, scale: float = 1.0) -> list[Row]:
         for row in run_part(part, setup, scale * CHECK_PARTS[part][1]):
             rows.append({"part": part, **row})
             print(_format_row(rows[-1]), flush=True)
+            report(rows)
         seconds = time.monotonic() - start
         rows.append({"table": "Time taken", "part": part, "item": "", "what": part, "seconds": round(seconds, 1)})
+        report(rows)
     return rows
 
 
@@ -96,12 +112,17 @@ def main(arguments: list[str] | None = None) -> int:
         return run_child_items(arguments[1], Setup.from_json(arguments[2]), arguments[3:])
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
-        "--parts", nargs="+", choices=list(CHECK_PARTS), default=list(CHECK_PARTS), help="parts to run (all)"
+        "--parts",
+        nargs="+",
+        choices=list(CHECK_PARTS),
+        default=list(DEFAULT_PARTS),
+        help="parts to run (all but quality)",
     )
     parser.add_argument(
         "--out", type=Path, default=REPOSITORY_ROOT / "docs" / "gpu", help="folder for results (docs/gpu)"
     )
     parser.add_argument("--data", type=Path, help="a real data set to train on, or a folder of data sets")
+    parser.add_argument("--commit", help="the commit that is checked, for a copy of the repository without .git")
     parser.add_argument("--long", action="store_true", help="triple the time limits of timing and training")
     args = parser.parse_args(arguments)
     if not torch.cuda.is_available():
@@ -111,10 +132,15 @@ def main(arguments: list[str] | None = None) -> int:
     setup = Setup(data=None if data is None else str(data))
     if args.long:
         setup = replace(setup, step_seconds=3 * setup.step_seconds, quality_seconds=3 * setup.quality_seconds)
-    facts = describe_gpu_machine(setup.torch_device)
+    facts = describe_gpu_machine(setup.torch_device, args.commit)
     print(format_machine(facts), flush=True)
-    rows = check(args.parts, setup, 3.0 if args.long else 1.0)
-    page = write_report(args.out, facts, asdict(setup), rows)
+
+    def report(rows: Sequence[Row]) -> Path:
+        return write_report(args.out, facts, asdict(setup), rows)
+
+    report([])  # the machine's description remains even if the first part takes all the time
+    rows = check(args.parts, setup, 3.0 if args.long else 1.0, report)
+    page = report(rows)
     failed = [row for row in rows if row.get("status") == "failed"]
     print(f"{page}: {len(rows)} rows, {len(failed)} failed")
     return 1 if failed else 0

@@ -37,10 +37,10 @@ GSPLAT_TRANSMITTANCE_MIN = 1e-4
 
 
 def items(setup: Setup) -> list[str]:
-    """Return one item for each number of Gaussians, and one for each room whose Gaussians look as if trained."""
-    return [f"{count:,}" for count in setup.frame_gaussians] + [
-        f"{count:,}{AS_TRAINED_SUFFIX}" for count in setup.trained_gaussians
-    ]
+    """Return one item for each room, the most useful first: those of the goals' size, as trained before tidy."""
+    rooms = [f"{count:,}{AS_TRAINED_SUFFIX}" for count in setup.trained_gaussians]
+    rooms += [f"{count:,}" for count in setup.frame_gaussians]
+    return sorted(rooms, key=lambda room: room.removesuffix(AS_TRAINED_SUFFIX) != GOAL_ROOM_NAME)
 
 
 def run(item: str, setup: Setup) -> Iterator[Row]:

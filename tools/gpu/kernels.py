@@ -377,17 +377,19 @@ def _sample(rows: Tensor, setup: Setup) -> Tensor:
     return rows[:: max(1, len(rows) // setup.error_rows)]
 
 
+# The kernels that are expected to take most of a step come first: the backward passes of hash encoding, of decoders and
+# of the rasteriser with its `sum_rows`.
 ITEM_ROW_GENERATORS: dict[str, Callable[[Setup], Iterator[Row]]] = {
     "rates": rates_rows,
-    "rasterize": partial(rasterize_rows, "rasterize", TIDY_LOOK),
-    "rasterize, as trained": partial(rasterize_rows, "rasterize, as trained", TRAINED_LOOK),
     "hash encode": hash_encode_rows,
     "mlp mixed": lambda setup: mlp_rows(True, setup),
-    "mlp float32": lambda setup: mlp_rows(False, setup),
-    "decode": decode_rows,
-    "shade": shade_rows,
+    "rasterize, as trained": partial(rasterize_rows, "rasterize, as trained", TRAINED_LOOK),
+    "rasterize": partial(rasterize_rows, "rasterize", TIDY_LOOK),
     "rasterize shaded": rasterize_shaded_rows,
+    "shade": shade_rows,
     "background": background_rows,
     "loss": ssim_rows,
     "adam": adam_rows,
+    "decode": decode_rows,
+    "mlp float32": lambda setup: mlp_rows(False, setup),
 }

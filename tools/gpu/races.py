@@ -1,6 +1,6 @@
 """Find races between the programs of a launch, and accesses out of bounds, in Triton's interpreter.
 
-    TRITON_INTERPRET=1 python -m pytest -p tools.gpu.races tests/ops      all launches of these tests; no GPU is needed
+    python -m pytest -p tools.gpu.races -m gpu tests/ops      all launches of these tests; no GPU is needed
 
 The interpreter runs the programs of a launch one after the other, so it hides what a GPU may do at the same time. This
 module runs them in random order and records the address of every load, store and atomic operation. After each launch
@@ -17,6 +17,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 from unittest import mock
+
+os.environ.setdefault("TRITON_INTERPRET", "1")  # Triton reads it once
 
 import numpy as np
 import pytest

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import torch
 
-from hyrfpack.measure.machine import format_machine, package_versions
+from hyrfpack.measure.machine import driver_version, format_machine, package_versions
 from tools.gpu.rows import Row
 from tools.tables import format_cell, markdown_table
 
@@ -22,22 +22,43 @@ LEADING_TABLES = ("Goals", "Failed and left out")
 FAILURE_LABEL_CELLS = 2  # the first two text cells are enough to identify a failed row
 
 
-def describe_gpu_machine(device: torch.device) -> dict[str, object]:
-    """Return the facts that the numbers depend on: GPU, driver, package versions, commit and date."""
+def describe_gpu_machine(device: torch.device, commit: str | None = None) -> dict[str, object]:
+    """Return the facts that the numbers depend on: GPU, driver, package versions, commit and date.
+
+    Args:
+        device: the device that is measured.
+        commit: the commit of this copy of the repository; None asks git.
+    """
     facts: dict[str, object] = {"device": device_name(device)}
     if device.type == "cuda":
         properties = torch.cuda.get_device_properties(device)
         facts["memory GB"] = round(properties.total_memory / 1e9, 1)
         facts["multiprocessors"] = properties.multi_processor_count
-        facts["driver"] = _first_output_line("nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader")
+        facts["driver"] = driver_version()
+        facts |= _query_nvidia_smi()
         facts["cuda or rocm"] = torch.version.cuda or torch.version.hip
     facts |= {"python": platform.python_version(), "torch": torch.__version__}
     facts |= package_versions("triton", "numpy", "numba", "gsplat")
-    facts["commit"] = _first_output_line(
+    facts["commit"] = commit or _first_output_line(
         "git", "-C", str(REPOSITORY_ROOT), "describe", "--always", "--dirty", "--abbrev=12"
     )
     facts["date"] = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
     return facts
+
+
+def _query_nvidia_smi() -> dict[str, object]:
+    """Return what nvidia-smi says of power, clocks and load of the GPU; nothing where it is missing."""
+    names = (
+        "power.limit",
+        "clocks.max.sm",
+        "clocks.max.memory",
+        "temperature.gpu",
+        "utilization.gpu",
+        "mig.mode.current",
+    )
+    line = _first_output_line("nvidia-smi", f"--query-gpu={','.join(names)}", "--format=csv,noheader")
+    values = [value.strip() for value in line.split(",")] if line else []
+    return dict(zip(names, values, strict=True)) if len(values) == len(names) else {}
 
 
 def device_name(device: torch.device) -> str:
@@ -55,9 +76,16 @@ def write_report(folder: Path, facts: dict[str, object], settings: dict[str, obj
     folder.mkdir(parents=True, exist_ok=True)
     page = folder / f"{file_name(str(facts['device']))}.md"
     content = {"machine": facts, "settings": settings, "rows": list(rows)}
-    page.with_suffix(".json").write_text(json.dumps(content, indent=1) + "\n")
-    page.write_text(format_page(facts, rows))
+    _replace_text(page.with_suffix(".json"), json.dumps(content, indent=1) + "\n")
+    _replace_text(page, format_page(facts, rows))
     return page
+
+
+def _replace_text(path: Path, text: str) -> None:
+    """Write a file in one piece, so that a kill during the write leaves the previous one."""
+    part = path.with_name(path.name + ".part")
+    part.write_text(text)
+    part.replace(path)
 
 
 def format_page(facts: dict[str, object], rows: Sequence[Row]) -> str:

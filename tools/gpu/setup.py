@@ -32,6 +32,7 @@ class Setup:
         demo_views, demo_size: number of photos of the built-in scene, and their side in pixels.
         quality_steps: largest number of steps of each training run of the quality comparison.
         quality_seconds: time limit in seconds for the CPU's training run; the number of steps is reduced to keep it.
+        test_paths: files and folders of the tests that pytest runs, relative to the repository's root.
         data: folder of a real data set, or None.
     """
 
@@ -53,6 +54,7 @@ class Setup:
     demo_size: int = 200
     quality_steps: int = 1000
     quality_seconds: float = 40.0
+    test_paths: tuple[str, ...] = ("tests/ops", "tests/test_gpu_path.py")
     data: str | None = None
 
     @property

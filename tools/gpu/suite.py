@@ -1,45 +1,69 @@
-"""Run the repository's tests marked `gpu` with pytest, all in one process, and make one row for each file."""
+"""Run the repository's tests marked `gpu` with pytest, in several processes, and make one row for each file."""
 
 from __future__ import annotations
 
 import os
 import re
+import signal
 import subprocess
 import sys
+import tempfile
+import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from importlib.util import find_spec
 from pathlib import Path
+from threading import Timer
 
 from tools.gpu.rows import Row
 
 REPOSITORY_ROOT = Path(__file__).parents[2]
-TEST_PATHS = ("tests/ops", "tests/test_gpu_path.py")  # the kernels alone, and the pipeline from photos to pictures
+MAX_SECONDS = 140.0  # together with the random cases, this fits into the part's time limit
+SECONDS_TO_SUMMARISE = 8.0
+# The environment variable that names the file in which workers note the tests that broke the GPU.
+BROKEN_TESTS_VARIABLE = "HYRFPACK_BROKEN_GPU_TESTS"
 GPU_MARKER = "gpu"  # the marker that pyproject.toml declares
 # pyproject.toml asks for strict settings; these are not strict, because a GPU machine may lack pytest's plugins. It may
 # also lack other packages, so files that cannot be imported do not stop the others.
 PYTEST_OVERRIDES = (
     "-o", "addopts=--import-mode=importlib", "-p", "no:cacheprovider", "--continue-on-collection-errors",
 )  # fmt: skip
-_TEST_LINE = re.compile(r"(\S+\.py)::.* (PASSED|FAILED|ERROR|SKIPPED|XFAIL|XPASS)(?: \(.*\))?\s+\[ *\d+%\]\s*")
+# Building kernels takes a CPU core each. All tests of a file run in one process, which loads their kernels once.
+WORKERS = 6
+PARALLEL_OPTIONS = ("--dist", "loadfile", "-p", "tools.gpu.replace_worker")
+_OUTCOME = "(?P<outcome>PASSED|FAILED|ERROR|SKIPPED|XFAIL|XPASS)"
+# "tests/test_a.py::test_b PASSED [ 50%]", or from xdist "[gw1] [ 50%] PASSED tests/test_a.py::test_b".
+_TEST_LINES = (
+    re.compile(rf"(?P<file>\S+\.py)::.* {_OUTCOME}(?: \(.*\))?\s+\[ *\d+%\]\s*"),
+    re.compile(rf"\[gw\d+\] \[ *\d+%\] {_OUTCOME} (?P<file>\S+\.py)::.*\s*"),
+)
 _OUTCOME_LABELS = {"PASSED": "passed", "FAILED": "failed", "ERROR": "errors", "SKIPPED": "skipped", "XFAIL": "xfailed"}
 _FAILED_OUTCOMES = ("FAILED", "ERROR")
 
 
-def run_suite(paths: Sequence[str] = TEST_PATHS) -> Iterator[Row]:
+def run_suite(paths: Sequence[str], seconds: float = MAX_SECONDS, workers: int = WORKERS) -> Iterator[Row]:
     """Run the tests marked `gpu`; yield one row for each file, and one more if pytest failed outside of a test.
 
-    The row of a file without failures is yielded when the next file begins. That of a file with failures is yielded at
-    the end, with the first reason. Each test's line is printed when the test ends, so the last line precedes a test
-    that hangs.
+    Rows are yielded at the end, or when `seconds` are over, with the first reason of each file's failures. Each test's
+    line is printed when the test ends, so the last line precedes a test that hangs.
+
+    Args:
+        paths: files and folders of tests.
+        seconds: time limit, after which pytest is interrupted.
+        workers: number of xdist's processes; 0, or a missing xdist, runs all tests in one process.
 
     Raises:
         ModuleNotFoundError: pytest is not installed.
     """
     import pytest
 
-    command = [sys.executable, "-m", "pytest", "-v", "--no-header", *PYTEST_OVERRIDES, "-m", GPU_MARKER, *paths]
+    parallel = ("-n", str(workers), *PARALLEL_OPTIONS) if workers and find_spec("xdist") else ()
+    command = [sys.executable, "-m", "pytest", "-v", "--no-header", *PYTEST_OVERRIDES, *parallel]
+    command += ["-m", GPU_MARKER, *paths]
     # The lines must be wide enough for the message of a failed test.
+    folder = tempfile.TemporaryDirectory(prefix="hyrfpack-gpu-")
     environment = {**os.environ, "COLUMNS": "400", "PYTHONUNBUFFERED": "1"}
+    environment[BROKEN_TESTS_VARIABLE] = str(Path(folder.name) / "broken_tests")
     child = subprocess.Popen(
         command,
         cwd=REPOSITORY_ROOT,
@@ -49,28 +73,37 @@ def run_suite(paths: Sequence[str] = TEST_PATHS) -> Iterator[Row]:
         errors="replace",
         env=environment,
     )
+    # An interrupted pytest still prints the reasons of failed tests.
+    timers = [
+        Timer(seconds, child.send_signal, (signal.SIGINT,)),
+        Timer(seconds + SECONDS_TO_SUMMARISE, child.kill),
+    ]
+    end = time.monotonic() + seconds
+    for timer in timers:
+        timer.start()
     counts: dict[str, Counter[str]] = {}
     last_line, reasons = "", dict[str, str]()
-    reported = set[str]()
     assert child.stdout is not None
     for line in child.stdout:
         last_line = " ".join(line.split()) or last_line
-        if test := _TEST_LINE.fullmatch(line):
+        if test := next(filter(None, (pattern.fullmatch(line) for pattern in _TEST_LINES)), None):
             print(last_line, flush=True)
-            file, outcome = test.groups()
-            for other in [name for name in counts if name not in {file, *reported} and not _has_failed(counts[name])]:
-                reported.add(other)
-                yield _row(other, counts[other])
-            counts.setdefault(file, Counter())[outcome] += 1
+            counts.setdefault(test["file"], Counter())[test["outcome"]] += 1
         elif line.startswith(_FAILED_OUTCOMES):  # a line of pytest's summary
             reasons.setdefault(line.partition(" ")[2].partition("::")[0], last_line)
     code = child.wait()
-    for file in [name for name in counts if name not in reported]:
-        row = _row(file, counts[file])
-        if _has_failed(counts[file]):
+    for timer in timers:
+        timer.cancel()
+    folder.cleanup()
+    for file, outcomes in counts.items():
+        row = _row(file, outcomes)
+        if _has_failed(outcomes):
             row |= {"status": "failed", "note": reasons.get(file, last_line)}
         yield row
-    if not counts and code == pytest.ExitCode.NO_TESTS_COLLECTED:
+    if code and time.monotonic() >= end:
+        tests = sum(outcomes.total() for outcomes in counts.values())
+        yield {"case": "pytest", "status": "failed", "note": f"not done within {seconds:.0f} s; {tests} tests were run"}
+    elif not counts and code == pytest.ExitCode.NO_TESTS_COLLECTED:
         yield {"case": "pytest", "status": "failed", "note": f"no test is marked '{GPU_MARKER}' in {' '.join(paths)}"}
     elif code and not any(map(_has_failed, counts.values())):
         note = next(iter(reasons.values()), last_line)

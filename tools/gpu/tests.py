@@ -28,7 +28,7 @@ def items(setup: Setup) -> list[str]:
 def run(item: str, setup: Setup) -> Iterator[Row]:
     """Yield the row of one random call, or for pytest one row for each test file."""
     if item == PYTEST_ITEM:
-        yield from ({"table": TABLE_NAME, **row} for row in run_suite())
+        yield from ({"table": TABLE_NAME, **row} for row in run_suite(setup.test_paths))
     else:
         yield {
             "table": TABLE_NAME,

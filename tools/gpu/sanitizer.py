@@ -1,0 +1,69 @@
+"""Run NVIDIA's compute-sanitizer on the cases of the self-test: accesses out of bounds, and races in shared memory."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+from hyrfpack.parallel.child_items import child_environment
+from hyrfpack.self_test.cases import self_test_cases
+from tools.gpu.rows import Row
+from tools.gpu.setup import Setup
+
+TABLE_NAME = "compute-sanitizer"
+# The usual place of the tool, for machines whose PATH lacks it.
+DEFAULT_PROGRAM = Path("/usr/local/cuda/bin/compute-sanitizer")
+# Only these kernels use shared memory explicitly or through matrix products.
+RACE_CHECK_OPERATIONS = ("mlp", "shade")
+_SUMMARY = re.compile(r"(?:ERROR|RACECHECK) SUMMARY: (\d+) (.*)")
+
+
+def items(setup: Setup) -> list[str]:
+    """Return the names of the sanitizer's tools."""
+    return ["memcheck", "racecheck"]
+
+
+def run(item: str, setup: Setup) -> Iterator[Row]:
+    """Yield the row of one tool, with the number of errors that it found."""
+    program = shutil.which("compute-sanitizer") or (str(DEFAULT_PROGRAM) if DEFAULT_PROGRAM.exists() else None)
+    if program is None:
+        yield {
+            "table": TABLE_NAME,
+            "tool": item,
+            "status": "left out",
+            "note": "compute-sanitizer is not installed here",
+        }
+        return
+    cases = self_test_cases()
+    names = [name for name, case in cases.items() if item == "memcheck" or case.operation in RACE_CHECK_OPERATIONS]
+    worker = [sys.executable, "-m", "hyrfpack.self_test.worker", setup.implementation, f"{setup.device}:0", *names]
+    # torch's cache of memory would hide accesses between two tensors.
+    environment = {**child_environment(), "PYTORCH_NO_CUDA_MEMORY_CACHING": "1"}
+    done = subprocess.run(
+        [program, "--tool", item, *worker],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        errors="replace",
+        env=environment,
+    )
+    yield {"table": TABLE_NAME, "tool": item, "cases": len(names), **describe_output(done.stdout, done.returncode)}
+
+
+def describe_output(output: str, exit_code: int) -> Row:
+    """Return the number of errors in a tool's output; the row has failed if there are any, or no summary."""
+    summary = _SUMMARY.search(output)
+    if summary is None:
+        last_line = (output.strip().splitlines() or ["no output"])[-1]
+        return {"status": "failed", "note": f"it ended with exit code {exit_code} and no summary: {last_line[:200]}"}
+    row: Row = {"found": f"{summary[1]} {summary[2].strip()}"}
+    if int(summary[1]):
+        reports = [
+            line.strip("= ") for line in output.splitlines() if line.startswith("=========") and line.strip("= ")
+        ]
+        return row | {"status": "failed", "note": "; ".join(reports[:4])[:300]}
+    return row
