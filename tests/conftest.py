@@ -36,9 +36,10 @@ import torch
 # Without a GPU the kernels run in Triton's interpreter. Triton reads this once, when the kernels are defined.
 os.environ.setdefault("TRITON_INTERPRET", "0" if torch.cuda.is_available() else "1")
 if os.environ["TRITON_INTERPRET"] == "1" and find_spec("triton"):
-    from interpreter import speed_up_interpreter
+    from interpreter import fill_new_memory_with_nan, speed_up_interpreter
 
     speed_up_interpreter()
+    fill_new_memory_with_nan()
 
 from layers import forbid_training_and_processes, layer_of
 from ops.device import needs_triton  # this import asks for Triton, which reads the environment set above

@@ -21,3 +21,11 @@ def test_numbers_of_numpy_are_refused_as_arguments_of_a_launch(number):
 
 def test_numbers_of_python_are_taken():
     assert gpu.contract(torch.zeros(2, 3), (2.0, 1.0, 1.0)).eq(0.5).all()
+
+
+def test_new_memory_of_a_gpu_operation_is_nan_and_that_of_others_is_not_touched():
+    from hyrfpack.ops.rasterize import gpu
+
+    rows = gpu._empty_rows(3, torch.device("cpu"))
+    assert rows.view(torch.float32).isnan().all()
+    assert torch.empty(0).dtype == torch.float32 and torch.empty(2, 3).shape == (2, 3)
