@@ -69,16 +69,10 @@ def find_blocks(maps: Sequence[DepthMap], grid: Grid) -> np.ndarray:
         HyrfError: the mesh would not fit into memory.
     """
     shape = -(-np.array(grid.shape, np.int64) // BLOCK_VOXELS)
-    offsets = BLOCK_MARGIN_VOXELS / BLOCK_VOXELS * np.stack(np.meshgrid(*[(-1, 1)] * 3), -1).reshape(-1, 3)
     known = np.zeros(0, np.int64)
     for depth_map in maps:
-        places = (depth_map.surface_points() - grid.low) / (grid.voxel * BLOCK_VOXELS)
-        keys = [known]
-        for offset in offsets:
-            blocks = np.floor(places + offset).astype(np.int64)
-            blocks = blocks[((blocks >= 0) & (blocks < shape)).all(axis=1)]
-            keys.append(np.unique(np.ravel_multi_index(tuple(blocks.T), shape)))
-        known = np.unique(np.concatenate(keys))
+        blocks = find_blocks_near((depth_map.surface_points() - grid.low) / (grid.voxel * BLOCK_VOXELS), shape)
+        known = np.union1d(known, np.ravel_multi_index(tuple(blocks.T), shape))
         needed, there = len(known) * BLOCK_VOXELS**2 * PEAK_BYTES_PER_SURFACE_VOXEL, memory_bytes()
         if needed > MAX_MEMORY_SHARE * there:
             raise HyrfError(
@@ -87,6 +81,26 @@ def find_blocks(maps: Sequence[DepthMap], grid: Grid) -> np.ndarray:
                 fix="use a larger `voxel` or a smaller `crop`",
             )
     return np.stack(np.unravel_index(known, shape), axis=1)
+
+
+def find_blocks_near(places: np.ndarray, shape: np.ndarray) -> np.ndarray:
+    """Return the blocks (B, 3) int64 that lie within BLOCK_MARGIN_VOXELS of points, those inside the grid.
+
+    Args:
+        places: (N, 3) points in units of a block, from the corner of the grid.
+        shape: (3,) number of blocks along each axis.
+    """
+    margin = BLOCK_MARGIN_VOXELS / BLOCK_VOXELS
+    first, last = (np.floor(places + sign * margin).astype(np.int64) for sign in (-1, 1))
+    is_near = ((last >= 0) & (first < shape)).all(axis=1)
+    # Many points lie in few blocks, so points are reduced to their first block and the axes along which they touch two.
+    widest = shape + 1
+    rows = np.ravel_multi_index(tuple(first[is_near].T + 1), widest) * 8 + (last - first)[is_near] @ (1, 2, 4)
+    rows = np.unique(rows)
+    corners = np.stack(np.unravel_index(rows // 8, widest), axis=1) - 1
+    found = [corners[rows & axes == axes] + (axes & 1, axes >> 1 & 1, axes >> 2) for axes in range(8)]
+    blocks = np.unique(np.concatenate(found), axis=0)
+    return blocks[((blocks >= 0) & (blocks < shape)).all(axis=1)]
 
 
 def extract_surface(

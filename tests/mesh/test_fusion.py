@@ -155,3 +155,22 @@ def test_small_components_are_removed_and_reduction_keeps_the_shape():
     reduced_vertices, reduced_faces = reduce_faces(vertices, faces, 1000)
     assert 900 <= len(reduced_faces) <= 1000
     assert np.abs(np.linalg.norm(reduced_vertices, axis=1) - 1).max() < VOXEL_SIDE
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_blocks_are_those_within_the_margin_of_a_point(seed):
+    generator = np.random.default_rng(seed)
+    shape = np.array([4, 3, 5])
+    # Also points on the borders of blocks and of margins, outside of the grid, and far away.
+    places = np.concatenate((generator.uniform(-1.2, 6, (300, 3)), generator.integers(-1, 6, (60, 3)), [[1e9] * 3]))
+    places[:40] += fusion.BLOCK_MARGIN_VOXELS / fusion.BLOCK_VOXELS - places[:40] % 1
+
+    found = fusion.find_blocks_near(places, shape)
+
+    margin = fusion.BLOCK_MARGIN_VOXELS / fusion.BLOCK_VOXELS
+    expected = set()
+    for signs in np.ndindex(2, 2, 2):
+        for block in np.floor(places + margin * (2 * np.array(signs) - 1)).astype(int).tolist():
+            if all(0 <= number < most for number, most in zip(block, shape, strict=True)):
+                expected.add(tuple(block))
+    assert sorted(map(tuple, found.tolist())) == sorted(expected) and len(expected) > 20
