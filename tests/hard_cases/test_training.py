@@ -23,9 +23,10 @@ from hyrfpack.format import decode_model, save_model
 from hyrfpack.format.codec import PROFILES
 from hyrfpack.format.container import read_container
 from hyrfpack.model import Frame, HybridModel
-from hyrfpack.render import render_view
+from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.scene import Camera, Picture, Scene, View
 from hyrfpack.train import Trainer
+from hyrfpack.train.resolution import MIN_BACKGROUND_STRIDE
 from hyrfpack.train.setup import MAX_INITIAL_COORDINATE, initial_points
 
 pytestmark = pytest.mark.usefixtures("quick_calibration")
@@ -113,12 +114,15 @@ def one_pixel_scene(**options) -> Scene:
 
 
 def mean_psnr(model: HybridModel, views: Iterable[View]) -> float:
-    """Return the PSNR of the mean squared error over all unmasked pixels, without rounding to 8 bits."""
-    squares = []
+    """Return the PSNR of the mean squared error over all unmasked pixels, without rounding to 8 bits.
+
+    The background is evaluated as in training, whose files record this spacing of nodes.
+    """
+    squares, settings = [], RenderSettings(background_stride=MIN_BACKGROUND_STRIDE)
     for view in views:
         photo = view.load()
         with torch.no_grad():
-            error = render_view(model, view.camera).rgb.double().numpy() - photo.composite()
+            error = render_view(model, view.camera, settings).rgb.double().numpy() - photo.composite()
         squares.append(error[... if photo.mask is None else photo.mask].ravel() ** 2)
     mean = np.concatenate(squares).mean()
     return float(-10 * np.log10(mean)) if mean > 0 else np.inf
