@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
+from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -115,6 +116,7 @@ def render(
     from hyrfpack.cameras.files import cameras_from_json, cameras_to_json
     from hyrfpack.cameras.paths import orbit as orbit_around
     from hyrfpack.lock import exclusive_folder
+    from hyrfpack.measure.psnr import psnr_from_mse
     from hyrfpack.render.files import make_renderer, render_file_names, unique_stems, write_pictures
     from hyrfpack.render.geometry_files import GeometryWriter
     from hyrfpack.render.video import has_ffmpeg, write_video
@@ -175,6 +177,12 @@ def render(
             writer.warn_of_losses(max(max_depth for _, max_depth in parts))
         if video_path:
             video_path = note_rename(video_path, write_video(written, video_path, overwrite=overwrite))
+    if levels is not None and levels.choices:
+        counts = [choice.gaussians for choice in levels.choices]
+        predicted = fmean(psnr_from_mse(choice.predicted_mse) for choice in levels.choices)
+        note(
+            f"views have {min(counts):,} to {max(counts):,} Gaussians; predicted PSNR to the finest {predicted:.1f} dB"
+        )
     for name, path in zip(render_file_names([name for name, _ in named]), written, strict=True):
         note_rename(output / name, path)
     if video and not video_path:

@@ -25,6 +25,7 @@ class LevelRenderer:
     Attributes:
         scene: the scene folder.
         gaussians, bytes: limits of each view, see `select_levels`.
+        choices: the choice for each view that was loaded, in order.
     """
 
     def __init__(
@@ -37,6 +38,7 @@ class LevelRenderer:
         precision: str = "mixed",
     ) -> None:
         self.scene, self.gaussians, self.bytes = scene, gaussians, bytes
+        self.choices: list[LevelSelection] = []
         self._device, self._precision = device, precision
         self._chunks: OrderedDict[tuple[int, int], HybridModel] = OrderedDict()
 
@@ -47,6 +49,7 @@ class LevelRenderer:
             HyrfFormatError: a file is missing or damaged.
         """
         choice = select_levels(self.scene.manifest, camera, gaussians=self.gaussians, bytes=self.bytes)
+        self.choices.append(choice)
         model = join_chunks(self.scene.fields, [self._chunk(*key) for key in enumerate(choice.levels)])
         model = model.to(self._device)
         model.precision = self._precision

@@ -308,12 +308,13 @@ def test_merged_files_and_scenes_are_refused_as_sources(folder, tmp_path):
 def test_commands_read_a_scene_like_a_file(folder, tmp_path):
     info = json.loads(succeeded("info", folder, "--json").stdout)
     text = succeeded("info", folder / "scene.json").stdout
-    succeeded("render", folder, "-o", tmp_path / "views", "--orbit", 1, "--gaussians", 700)
+    drawn = succeeded("render", folder, "-o", tmp_path / "views", "--orbit", 1, "--gaussians", 700)
     succeeded("decompress", folder, "-o", tmp_path / "joined.hyrf")
     succeeded("export", folder, "-o", tmp_path / "player")
 
     assert info["gaussians"] == 1500 and len(info["scene"]["chunks"]) == 4
     assert "1,500 Gaussians in 4 chunks" in text and "level 1" in text
+    assert "Gaussians; predicted PSNR to the finest" in drawn.stderr
     assert [path.name for path in (tmp_path / "views").iterdir()] == ["0000.png"]
     for joined in (tmp_path / "joined.hyrf", tmp_path / "player" / "scene.hyrf"):
         for first, second in zip(load_model(joined).parameters(), load_model(folder).parameters(), strict=True):
