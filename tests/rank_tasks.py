@@ -107,7 +107,7 @@ def exit_one_rank_while_others_wait(ranks: Ranks, leaver: int, how: str) -> floa
     ranks.all_gather("here")
     if ranks.rank == leaver:
         if how == "error":
-            raise HyrfDataError("photo 3 is bad")
+            raise HyrfDataError("photo 3 is bad", fix="replace it")
         if how == "kill":
             os.kill(os.getpid(), signal.SIGKILL)
         return 0.0

@@ -56,7 +56,8 @@ def train_on_one_process(scene: Scene, config: TrainConfig) -> tuple[list[StepRe
         learnt = [*model.parameters(), *([exposures.values] if exposures else [])]
         sums = [torch.zeros_like(parameter) for parameter in learnt]
         for view in own:
-            drawn = render_view(model, view.camera, absgrad=density.watching(step))
+            settings = trainer.resolution.render_settings(view.camera, step)
+            drawn = render_view(model, view.camera, settings, absgrad=density.watching(step))
             image = exposures.exposed(drawn.rgb, view) if exposures else drawn.rgb
             photo = torch.from_numpy(view.load().composite())
             loss = photometric_loss(image, photo, None, ssim_weight=config.ssim_weight)
