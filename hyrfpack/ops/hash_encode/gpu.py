@@ -141,9 +141,11 @@ def sum_copies_kernel(levels, copies, out, BLOCK: tl.constexpr):
     to = out + tl.load(levels + level * 5 + 4) * 2 + lane
     total = tl.load(to, mask=mine, other=0.0)
     other = out + tl.load(copies + level * 3 + 2) * 2 + lane
-    for _ in range(1, count):
+    copy = 1
+    while copy < count:  # Triton 3.6's interpreter takes no tensor as the end of a range.
         total += tl.load(other, mask=mine, other=0.0)
         other += rows * 2
+        copy += 1
     tl.store(to, total, mask=mine)
 
 
