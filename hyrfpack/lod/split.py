@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from hyrfpack.atomic import write_atomic
-from hyrfpack.cameras.capture import Capture
+from hyrfpack.cameras.capture import MAX_COARSE_CAMERAS, Capture
 from hyrfpack.cameras.files import camera_to_numbers
 from hyrfpack.cameras.view_sampling import sample_views
 from hyrfpack.checks import check_type
@@ -38,7 +38,7 @@ from hyrfpack.model import Geometry, HybridModel
 from hyrfpack.ops.transfer import tensor_like
 from hyrfpack.outputs import Outputs, StrPath
 from hyrfpack.progress import Progress, TaskEvent, part_of_progress
-from hyrfpack.scene import Camera
+from hyrfpack.scene import Camera, evenly_spaced
 
 _LOG = logging.getLogger(__name__)
 
@@ -252,7 +252,7 @@ def _make_manifest(
 ) -> Manifest:
     model, shared = encoder.model, encoder.shared_bytes
     values = model.config.to_dict()
-    known = not capture.is_synthetic
+    cameras = [] if capture.is_synthetic else evenly_spaced(capture.cameras, MAX_COARSE_CAMERAS)
     return Manifest(
         gaussians=len(model),
         shared=SceneFile(SHARED_NAME, len(shared), _checksum(shared)),
@@ -262,7 +262,7 @@ def _make_manifest(
         background=values["background"],
         solid=tuple(values["solid"]),
         viewpoint=capture.viewpoint.to_json(rounded=True),
-        cameras=tuple(tuple(camera_to_numbers(camera)) for camera in capture.cameras[:14]) if known else (),
+        cameras=tuple(tuple(camera_to_numbers(camera)) for camera in cameras),
         title=name if config.title is None else config.title,
         licence=config.licence,
     )
