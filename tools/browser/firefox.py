@@ -47,7 +47,8 @@ DEFAULT_PREFERENCES = {
 MOUSE_BUTTONS = {"left": 0, "right": 2}
 WEBDRIVER_KEYS = {
     "Shift": "\ue008", "Enter": "\ue007", "Escape": "\ue00c", "Tab": "\ue004", "ArrowLeft": "\ue012",
-    "ArrowUp": "\ue013", "ArrowRight": "\ue014", "ArrowDown": "\ue015", "Space": " ",
+    "ArrowUp": "\ue013", "ArrowRight": "\ue014", "ArrowDown": "\ue015", "PageUp": "\ue00e",
+    "PageDown": "\ue00f", "Space": " ",
 }  # fmt: skip
 
 
