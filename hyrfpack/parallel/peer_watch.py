@@ -2,7 +2,7 @@
 
 Gloo notices by itself that a peer has ended. NCCL does not: a collective operation is only queued on the GPU, and waits
 there for the peer forever. So each process keeps a TCP connection to process 0, which the system closes when its
-process ends, however it ends. Process 0 tells the others which process it lost.
+process ends, also by a crash. Process 0 tells the others which process has ended.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ CONNECT_SECONDS = 60.0
 # and after 6 of them without an answer, 10 s apart, the connection counts as closed.
 KEEPALIVE_OPTIONS = {"TCP_KEEPIDLE": 30, "TCP_KEEPINTVL": 10, "TCP_KEEPCNT": 6}
 # Lines that processes send: "bye" before a process leaves as planned, "lost N" from process 0.
-BYE, LOST = "bye", "lost"
+LEAVING_WORD, LOST_WORD = "bye", "lost"
 
 
 class PeerWatch:
@@ -55,7 +55,7 @@ class PeerWatch:
         for connection in self._connections.values():
             with suppress(OSError):
                 if not failed:
-                    connection.sendall(f"{BYE}\n".encode())
+                    connection.sendall(f"{LEAVING_WORD}\n".encode())
                 connection.shutdown(socket.SHUT_RDWR)
             connection.close()
 
@@ -63,7 +63,7 @@ class PeerWatch:
         with suppress(OSError, ValueError), connection.makefile() as lines:
             for line in lines:
                 word, _, rank = line.strip().partition(" ")
-                if word == LOST:
+                if word == LOST_WORD:
                     self._lose(int(rank))
                 return
         self._lose(peer)
@@ -76,7 +76,7 @@ class PeerWatch:
         for peer, connection in self._connections.items():
             if peer != rank:
                 with suppress(OSError):
-                    connection.sendall(f"{LOST} {rank}\n".encode())
+                    connection.sendall(f"{LOST_WORD} {rank}\n".encode())
         self._on_loss()
 
 

@@ -45,9 +45,9 @@ from hyrfpack.render import render_view
 
 pytestmark = pytest.mark.usefixtures("quick_calibration")
 CAMERAS = ring(8)
-OFFSET = np.array([1.2, 0.3, -0.1])
-MOVES = [Rotate((0, 0, 1), 90), Scale(0.5), Translate(tuple(OFFSET))]
-TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+PART_OFFSET = np.array([1.2, 0.3, -0.1])
+PART_MOVES = [Rotate((0, 0, 1), 90), Scale(0.5), Translate(tuple(PART_OFFSET))]
+QUARTER_TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
 def write_model(path: Path, seed: int, **settings) -> Path:
@@ -66,7 +66,7 @@ def merged(tmp_path_factory) -> Path:
     """Return a file of a room with a background, and of a toy that is turned, scaled and moved."""
     folder = tmp_path_factory.mktemp("models")
     sources = write_model(folder / "room.hyrf", 1, background=True), write_model(folder / "toy.hyrf", 2)
-    merge_models(sources, folder / "both.hyrf", {"toy": MOVES})
+    merge_models(sources, folder / "both.hyrf", {"toy": PART_MOVES})
     return folder / "both.hyrf"
 
 
@@ -76,7 +76,7 @@ class World:
     def __init__(self, path: Path) -> None:
         room, toy = (load_model(path.with_name(f"{name}.hyrf")) for name in ("room", "toy"))
         first, second = (part.gaussians.positions.detach().double().numpy() for part in (room, toy))
-        self.positions = np.concatenate((first, 0.5 * second @ TURN.T + OFFSET))
+        self.positions = np.concatenate((first, 0.5 * second @ QUARTER_TURN.T + PART_OFFSET))
         shapes = [part.decode_geometry() for part in (room, toy)]
         longest = [shape.scales.detach().double().amax(1).numpy() for shape in shapes]
         self.longest = np.concatenate((longest[0], 0.5 * longest[1]))
@@ -88,17 +88,24 @@ def is_in_plan_hull(points: np.ndarray, *corners: tuple[float, float]) -> np.nda
     return Delaunay(corners).find_simplex(points[:, :2]) >= 0
 
 
-BOX, SPHERE, INFINITY = (np.array((-0.3, -1, -1)), np.array((1.3, 1, 1))), CropSphere((0.8, 0.2, 0.0), 0.7), np.inf
-CONCAVE = CropPolygon(((-1, -1, 0), (1.2, -1, 0), (1.2, 2, 0), (0, 0.2, 0)), max_height=0.2)
-WIDER = CropBox((-INFINITY,) * 3, (3.4, INFINITY, INFINITY))
-SELECTIONS = {
-    "box": ([CropBox(*map(tuple, BOX))], lambda w: ((w.positions >= BOX[0]) & (w.positions <= BOX[1])).all(1)),
+BOX_CORNERS, SPHERE, INFINITY = (
+    (np.array((-0.3, -1, -1)), np.array((1.3, 1, 1))),
+    CropSphere((0.8, 0.2, 0.0), 0.7),
+    np.inf,
+)
+CONCAVE_POLYGON = CropPolygon(((-1, -1, 0), (1.2, -1, 0), (1.2, 2, 0), (0, 0.2, 0)), max_height=0.2)
+WIDER_BOX = CropBox((-INFINITY,) * 3, (3.4, INFINITY, INFINITY))
+SELECTION_CASES = {
+    "box": (
+        [CropBox(*map(tuple, BOX_CORNERS))],
+        lambda w: ((w.positions >= BOX_CORNERS[0]) & (w.positions <= BOX_CORNERS[1])).all(1),
+    ),
     "sphere": ([SPHERE], lambda w: np.linalg.norm(w.positions - SPHERE.center, axis=1) <= 0.7),
     "invert": ([Remove(SPHERE)], lambda w: np.linalg.norm(w.positions - SPHERE.center, axis=1) > 0.7),
     "opacity": ([MinOpacity(0.6)], lambda w: w.opacities >= 0.6),
     "scale": ([MaxScale(0.07)], lambda w: w.longest <= 0.07),
     "polygon": (
-        [CONCAVE],
+        [CONCAVE_POLYGON],
         lambda w: (
             (
                 is_in_plan_hull(w.positions, (-1, -1), (1.2, -1), (0, 0.2))
@@ -112,15 +119,15 @@ SELECTIONS = {
         lambda w: is_in_plan_hull(w.positions, *(0.4 * camera.position[:2] for camera in CAMERAS)),
     ),
     "after moves": (
-        [Scale(2.0), Translate((1.0, 0.0, 0.0)), WIDER, MaxScale(0.16)],
+        [Scale(2.0), Translate((1.0, 0.0, 0.0)), WIDER_BOX, MaxScale(0.16)],
         lambda w: (2 * w.positions[:, 0] + 1 <= 3.4) & (2 * w.longest <= 0.16),
     ),
 }
 
 
-@pytest.mark.parametrize("name", SELECTIONS)
+@pytest.mark.parametrize("name", SELECTION_CASES)
 def test_a_selection_keeps_the_gaussians_of_the_float64_union(name, merged, tmp_path):
-    actions, keep = SELECTIONS[name]
+    actions, keep = SELECTION_CASES[name]
     world = World(merged)
 
     report = edit_model(merged, tmp_path / "out.hyrf", actions, context=QUIET_CONTEXT)
@@ -265,6 +272,6 @@ def test_the_command_edits_all_parts(merged, tmp_path):
     options = ("--crop-box=-0.3,-1,-1,1.3,1,1", "--json")
     report = json.loads(succeeded("edit", merged, "-o", tmp_path / "out.hyrf", *options).stdout)
 
-    assert report["actions"][0]["gaussians_after"] == SELECTIONS["box"][1](World(merged)).sum()
+    assert report["actions"][0]["gaussians_after"] == SELECTION_CASES["box"][1](World(merged)).sum()
     error = refused("edit", merged, "-o", tmp_path / "no.hyrf", "--crop-sphere", "50,0,0,1")
     assert "would leave no Gaussian" in error and not (tmp_path / "no.hyrf").exists()

@@ -33,9 +33,9 @@ from hyrfpack.web.html import decode_splats_page
 
 CAMERAS = ring(8)
 # How the second model is placed: turned about two axes, scaled and moved.
-FACTOR, OFFSET = 0.6, np.array([0.9, -0.4, 0.2])
-TURN = Rotation.from_rotvec([0, 0, np.radians(70)]) * Rotation.from_rotvec([np.radians(-35), 0, 0])
-MOVES = [Rotate((1, 0, 0), -35), Rotate((0, 0, 1), 70), Scale(FACTOR), Translate(tuple(OFFSET))]
+PART_SCALE, PART_OFFSET = 0.6, np.array([0.9, -0.4, 0.2])
+PART_ROTATION = Rotation.from_rotvec([0, 0, np.radians(70)]) * Rotation.from_rotvec([np.radians(-35), 0, 0])
+PART_MOVES = [Rotate((1, 0, 0), -35), Rotate((0, 0, 1), 70), Scale(PART_SCALE), Translate(tuple(PART_OFFSET))]
 POSITION_TOLERANCES = {".spz": 1e-3, ".sog": 1e-3}
 SHAPE_TOLERANCES = {".spz": 0.07}  # logarithms of scales are rounded to 1/16
 COLOR_TOLERANCES = {".ply": 2e-5, ".usda": 1e-3, ".usdc": 1e-3, ".usdz": 1e-3, ".glb": 2e-5, ".spz": 0.1, ".sog": 0.1}
@@ -56,15 +56,15 @@ def files(tmp_path_factory) -> tuple[Path, Path, Path]:
     """Return a scene with a background, an object, and both in one file with the object moved."""
     folder = tmp_path_factory.mktemp("models")
     sources = write_model(folder / "room.hyrf", 1, background=True), write_model(folder / "toy.hyrf", 2)
-    merge_models(sources, folder / "both.hyrf", {"toy": MOVES})
+    merge_models(sources, folder / "both.hyrf", {"toy": PART_MOVES})
     return (*sources, folder / "both.hyrf")
 
 
 def camera_before_the_move(camera: Camera) -> Camera:
     """Return the camera that sees the second model as `camera` sees it after its moves."""
     pose = camera.camera_from_world.copy()
-    pose[:3, 3] = (pose[:3, 3] + pose[:3, :3] @ OFFSET) / FACTOR
-    pose[:3, :3] = pose[:3, :3] @ TURN.as_matrix()
+    pose[:3, 3] = (pose[:3, 3] + pose[:3, :3] @ PART_OFFSET) / PART_SCALE
+    pose[:3, :3] = pose[:3, :3] @ PART_ROTATION.as_matrix()
     return replace(camera, camera_from_world=pose)
 
 
@@ -98,9 +98,9 @@ def test_exported_splats_are_the_union_of_both_models_placed_in_float64(ending, 
         bake(room, CAMERAS, (degree,))[degree],
         bake(toy, [*map(camera_before_the_move, CAMERAS)], (degree,))[degree],
     )
-    turn = TURN.as_matrix()
-    positions = np.concatenate((first.positions, FACTOR * second.positions @ turn.T + OFFSET))
-    shapes = np.concatenate((covariances(first), FACTOR**2 * turn @ covariances(second) @ turn.T))
+    turn = PART_ROTATION.as_matrix()
+    positions = np.concatenate((first.positions, PART_SCALE * second.positions @ turn.T + PART_OFFSET))
+    shapes = np.concatenate((covariances(first), PART_SCALE**2 * turn @ covariances(second) @ turn.T))
     colors = np.concatenate((colors_along(first, directions), colors_along(second, directions @ turn)))
     distances, index = cKDTree(read.positions).query(positions)
     assert len(read) == report.gaussians == len(positions) == len(set(index))
@@ -136,7 +136,7 @@ def test_a_baked_page_of_a_merged_file_holds_the_splats_of_all_parts(files, tmp_
 
 def test_the_exposures_of_all_parts_are_baked(files, tmp_path):
     toy = write_model(tmp_path / "toy.hyrf", 2, exposure=random_map(3, centers=4))
-    merge_models([files[0], toy], tmp_path / "both.hyrf", {"toy": MOVES})
+    merge_models([files[0], toy], tmp_path / "both.hyrf", {"toy": PART_MOVES})
 
     config = hyrfpack.ExportConfig(degree=1, background=False)
     report = hyrfpack.export_model(tmp_path / "both.hyrf", tmp_path / "both.ply", config)
@@ -150,7 +150,7 @@ def test_points_are_the_centres_of_all_parts_with_the_cameras_of_the_scene(files
 
     vertices = trimesh.load(tmp_path / "both.points.ply", process=False).vertices
     room, toy = (np.asarray(load_model(path).gaussians.positions.detach(), np.float64) for path in files[:2])
-    expected = np.concatenate((room, FACTOR * TURN.apply(toy) + OFFSET))
+    expected = np.concatenate((room, PART_SCALE * PART_ROTATION.apply(toy) + PART_OFFSET))
     assert cKDTree(vertices[: report.gaussians]).query(expected)[0].max() < 1e-6
     assert report.gaussians == len(expected) and report.cameras == len(CAMERAS)
 

@@ -17,8 +17,8 @@ from hyrfpack.format import scene_manifest
 from hyrfpack.format.scene_manifest import Chunk, ChunkLevel, Manifest, SceneFile, parse_manifest
 from hyrfpack.format.shared import is_file_name
 
-SCHEMA = json.loads(Path(scene_manifest.__file__).with_name("scene.schema.json").read_text())
-MANIFEST = Manifest(
+MANIFEST_SCHEMA = json.loads(Path(scene_manifest.__file__).with_name("scene.schema.json").read_text())
+VALID_MANIFEST = Manifest(
     gaussians=7,
     shared=SceneFile("shared.hyrf", 1000, "0123abcd"),
     chunks=(
@@ -44,8 +44,8 @@ MANIFEST = Manifest(
 
 
 def with_value(path: list[Any], value: Any) -> bytes:
-    """Return the text of MANIFEST with another value at a path of keys and places."""
-    values = json.loads(MANIFEST.to_json())
+    """Return the text of VALID_MANIFEST with another value at a path of keys and places."""
+    values = json.loads(VALID_MANIFEST.to_json())
     inner = values
     for key in path[:-1]:
         inner = inner[key]
@@ -54,17 +54,17 @@ def with_value(path: list[Any], value: Any) -> bytes:
 
 
 def test_a_manifest_is_read_as_it_was_written():
-    assert parse_manifest(MANIFEST.to_json()) == MANIFEST
+    assert parse_manifest(VALID_MANIFEST.to_json()) == VALID_MANIFEST
 
 
 def test_a_written_manifest_matches_the_schema():
-    assert matches(json.loads(MANIFEST.to_json()), SCHEMA)
+    assert matches(json.loads(VALID_MANIFEST.to_json()), MANIFEST_SCHEMA)
 
 
 def test_unknown_keys_and_a_later_minor_version_are_accepted():
-    values = json.loads(MANIFEST.to_json()) | {"version": "1.7", "sky": "blue"}
+    values = json.loads(VALID_MANIFEST.to_json()) | {"version": "1.7", "sky": "blue"}
 
-    assert parse_manifest(json.dumps(values).encode()) == MANIFEST
+    assert parse_manifest(json.dumps(values).encode()) == VALID_MANIFEST
 
 
 @pytest.mark.parametrize(
@@ -117,7 +117,7 @@ def test_a_manifest_with_an_impossible_value_is_refused(path, value, problem):
 
 
 @pytest.mark.parametrize(
-    "data", [b"", b"[]", b"{}", b"[" * 5000, b'{"format": NaN}', b"\xff\xfe", MANIFEST.to_json()[:-20]]
+    "data", [b"", b"[]", b"{}", b"[" * 5000, b'{"format": NaN}', b"\xff\xfe", VALID_MANIFEST.to_json()[:-20]]
 )
 def test_a_text_that_is_no_manifest_is_refused(data):
     with pytest.raises(HyrfFormatError):
@@ -137,11 +137,11 @@ def list_paths(value: Any, path: tuple = ()) -> list[tuple]:
 
 
 @settings(deadline=None)
-@given(st.sampled_from(list_paths(json.loads(MANIFEST.to_json()))), JSON_VALUES)
+@given(st.sampled_from(list_paths(json.loads(VALID_MANIFEST.to_json()))), JSON_VALUES)
 def test_any_change_of_a_value_gives_a_valid_manifest_or_a_format_error(path, value):
     data = with_value(list(path), deepcopy(value))
     try:
         parsed = parse_manifest(data)
     except HyrfFormatError:
         return
-    assert matches(json.loads(parsed.to_json()), SCHEMA) and matches(json.loads(data), SCHEMA)
+    assert matches(json.loads(parsed.to_json()), MANIFEST_SCHEMA) and matches(json.loads(data), MANIFEST_SCHEMA)

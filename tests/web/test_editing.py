@@ -94,16 +94,8 @@ def test_a_face_of_the_box_follows_the_pointer_along_its_axis(browser: Browser, 
     load_editable_page(browser, tmp_path, make_editable_page(make_model()))
     click(browser, "#edit-add-box")
     before = list_actions(browser)[0]["value"]
-    camera, start = window_camera(browser), middle_of(browser, "#edit-handles button", 1)  # maximum x
-    end = (start[0] + 40, start[1] - 15)
-
-    if device == "mouse":
-        browser.drag(start, end)
-    else:
-        browser.touch("touchStart", start)
-        for share in (0.5, 1.0):
-            browser.touch("touchMove", tuple(a + share * (b - a) for a, b in zip(start, end, strict=True)))
-        browser.touch("touchEnd")
+    camera = window_camera(browser)
+    start, end = drag_handle(browser, 1, (40, -15), device)  # maximum x
 
     after = list_actions(browser)[0]["value"]
     middle = np.array([before[3], (before[1] + before[4]) / 2, (before[2] + before[5]) / 2])
