@@ -77,6 +77,10 @@ export class Container {
     this.length = 0;
     /** @type {Map<string, Entry>} */
     this.entries = new Map();
+    /** The file that holds the sections of codec 12, once it is known. @type {Container | null} */
+    this.shared = null;
+    /** Results of decoding that files which refer to this one need, too. @type {Map<string, any>} */
+    this.decoded = new Map();
     this.checkEntries(this.checkHeader(partial));
   }
 

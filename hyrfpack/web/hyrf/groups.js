@@ -1,5 +1,5 @@
-// Decodes numbers in groups that share a quantisation step (codec 8, docs/reference/format.md 3.5). The groups are not
-// stored, because they follow from the configuration and the positions.
+// Decodes numbers in groups that share a quantisation step (codecs 8 and 11, docs/reference/format.md 3.5 and 3.6). The
+// groups of codec 8 are not stored, because they follow from the configuration and the positions.
 
 import { assertValid } from "./errors.js";
 import { FEATURES_PER_ROW, HASH_FACTOR_Y, HASH_FACTOR_Z, decoderLayout, gridLevels, tableRows } from "./grids.js";
@@ -84,6 +84,26 @@ const countUses = ({ resolution, rows, dense }, { centers, count }, uses) => {
       uses[dense ? a + b + c : (a ^ b ^ c) & (rows - 1)]++;
     }
   }
+};
+
+/**
+ * Reads the groups of a table's rows, which codec 11 states before the numbers.
+ * @param {Uint8Array} data
+ * @param {Grid} grid
+ * @returns {{groups: NumberGroups, rest: Uint8Array}} `rest` is for `decodeGroups`
+ * @throws {DamagedData} a length or a group is invalid
+ */
+export const readTableGroups = (data, grid) => {
+  assertValid(data.length >= 4, "it ends within its header");
+  const end = 4 + new DataView(data.buffer, data.byteOffset, 4).getUint32(0, true);
+  assertValid(end <= data.length, "its use classes do not fit its bytes");
+  const rowLevels = new Uint8Array(tableRows(grid)), levels = gridLevels(grid);
+  levels.forEach(({ first, rows }, level) => rowLevels.fill(level, first, first + rows));
+  const classes = decodeIntegers(data.subarray(4, end), rowLevels.length, rowLevels, false);
+  assertValid(classes.every((use) => use < USE_CLASSES_PER_LEVEL), "a use class is out of range");
+  const index = Uint16Array.from(classes, (use, row) => USE_CLASSES_PER_LEVEL * rowLevels[row] + use);
+  const groups = { index, count: USE_CLASSES_PER_LEVEL * levels.length, width: FEATURES_PER_ROW };
+  return { groups, rest: data.subarray(end) };
 };
 
 /**

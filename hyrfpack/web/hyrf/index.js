@@ -1,4 +1,4 @@
-// Reads models from the bytes of `.hyrf` files, versions 1.0 to 1.4 (docs/reference/format.md).
+// Reads models from the bytes of `.hyrf` files, versions 1.0 to 1.5 (docs/reference/format.md).
 
 import { decodeChannels } from "./channels.js";
 import { Container, EXPOSURE_TYPE, FIELD_TYPES, LAYERED_TYPES } from "./container.js";
@@ -6,11 +6,12 @@ import { PART_NAMES_TYPE, layerType, rejectIncomplete } from "./container.js";
 import { DamagedData, HyrfError, HyrfFormatError, rejectDamaged, rejectNewer } from "./errors.js";
 import { decodeExposure } from "./exposure.js";
 import { FEATURES_PER_ROW, decoderSize, tableRows } from "./grids.js";
-import { decodeGroups, decoderGroups, tableGroups } from "./groups.js";
+import { decodeGroups, decoderGroups, readTableGroups, tableGroups } from "./groups.js";
 import { decodeLattice, latticePositions } from "./lattice.js";
 import { readMetadata } from "./metadata.js";
 import { openParts, readPartNames } from "./parts.js";
 import { decodeFloat16, decodeFloat32, decodeMinMax, decodeVectors } from "./plain.js";
+import { CODEC_SHARED, attachShared, sharedFileName } from "./shared.js";
 
 export { HyrfError, HyrfFormatError };
 
@@ -54,14 +55,18 @@ const BASE_GAUSSIANS = 2 ** 18;
  *   firstLayer: number,
  * }} Description
  *
+ * Returns the bytes of another file in the folder of a file. Where it returns the same array for several files, what
+ * they share is decoded once.
+ * @typedef {(name: string) => Uint8Array | Promise<Uint8Array>} OpenFile
+ *
  * A section that the metadata requires: `group` is its type in the first layer, `rows` x `columns` its shape.
  * @typedef {{type: string, group: string, layer: number, rows: number, columns: number}} ExpectedSection
  */
 
 const CODEC_FLOAT32 = 1, CODEC_FLOAT16 = 2, CODEC_VECTORS = 3, CODEC_MIN_MAX = 4;
-const CODEC_LATTICE = 6, CODEC_CHANNELS = 7, CODEC_GROUPS = 8, CODEC_EXPOSURE = 9;
+const CODEC_LATTICE = 6, CODEC_CHANNELS = 7, CODEC_GROUPS = 8, CODEC_EXPOSURE = 9, CODEC_STATED_GROUPS = 11;
 const PARAMETER_CODECS = [CODEC_FLOAT32, CODEC_FLOAT16, CODEC_VECTORS, CODEC_MIN_MAX];
-PARAMETER_CODECS.push(CODEC_LATTICE, CODEC_CHANNELS, CODEC_GROUPS);
+PARAMETER_CODECS.push(CODEC_LATTICE, CODEC_CHANNELS, CODEC_GROUPS, CODEC_STATED_GROUPS);
 const LAYERED_COLUMNS = [3, 3, 1, 1];
 
 /**
@@ -87,17 +92,20 @@ export const describe = (bytes) => {
 /**
  * Decodes a file of one model.
  * @param {Uint8Array} bytes the file, or its start if `partial` is true
- * @param {{partial?: boolean}} [options] `partial`: accept the start of a file, and read the layers that are complete
- * @returns {Promise<Model>}
- * @throws {HyrfFormatError} the file is damaged, truncated or too new; `bytes` has no complete layer; or the file is a
- *   merged one
+ * @param {{partial?: boolean, openFile?: OpenFile}} [options] `partial`: accept the start of a file, and read the
+ *   layers that are complete; `openFile`: called for the file that a chunk of a scene folder refers to
+ * @returns {Promise<Model>} the fields and the exposure map of a chunk are those of the other file
+ * @throws {HyrfFormatError} the file is damaged, truncated or too new; `bytes` has no complete layer; the file is a
+ *   merged one; or it refers to a file that is damaged or another one, or that cannot be opened
  */
-export const read = async (bytes, { partial = false } = {}) =>
-  explainMemory(() => {
-    const container = new Container(bytes, partial);
+export const read = async (bytes, { partial = false, openFile } = {}) => {
+  const container = new Container(bytes, partial), name = sharedFileName(container);
+  if (name !== null && openFile) attachShared(container, name, await openFile(name));
+  return explainMemory(() => {
     if (!container.entries.has(PART_NAMES_TYPE)) return readModel(container);
     throw new HyrfFormatError(`The file holds ${readPartNames(container).length} merged models; use readParts.`);
   });
+};
 
 /**
  * Decodes all parts of a merged file, or the one model of any other file. The first part is the scene, whose background
@@ -152,7 +160,11 @@ const checkGaussians = (count, length) => {
  */
 const readModel = (container) => {
   const metadata = readMetadata(container);
-  const { config } = metadata;
+  const { config } = metadata, { shared } = container;
+  if (shared) {
+    const { provenance } = decodeOnce(shared, "META", () => readMetadata(shared));
+    metadata.provenance = { ...provenance, ...metadata.provenance };
+  }
   const counts = metadata.layers?.length ? metadata.layers : [metadata.gaussians];
   const sections = expectedSections(config, counts);
   sections.forEach((section) => checkSection(container, section)); // all are checked before the first one is decoded
@@ -200,9 +212,37 @@ const readModel = (container) => {
  */
 const readExposure = (container) => {
   if (!container.has(EXPOSURE_TYPE)) return null;
-  const { codec, raw } = requireEntry(container, EXPOSURE_TYPE);
+  const source = sourceOf(container, EXPOSURE_TYPE), { codec, raw } = requireEntry(source, EXPOSURE_TYPE);
   if (codec !== CODEC_EXPOSURE) rejectNewer(`section '${EXPOSURE_TYPE}' has the codec ${codec}, which is unknown`);
-  return nameDamagedSection(EXPOSURE_TYPE, () => decodeExposure(container.stored(EXPOSURE_TYPE), raw));
+  return nameDamagedSection(EXPOSURE_TYPE, () => decodeExposure(source.stored(EXPOSURE_TYPE), raw));
+};
+
+/**
+ * Returns the container that holds a section: that of the file, or of the file that it refers to.
+ * @param {Container} container
+ * @param {string} type
+ * @returns {Container}
+ * @throws {HyrfFormatError} the other file is not known
+ */
+const sourceOf = (container, type) => {
+  if (container.entries.get(type)?.codec !== CODEC_SHARED) return container;
+  if (!container.has(type)) rejectIncomplete(container, requireEntry(container, type).end);
+  if (container.shared) return container.shared;
+  const name = sharedFileName(container);
+  throw new HyrfFormatError(`The file needs the file ${name} of its folder; open the scene.json of that folder.`);
+};
+
+/**
+ * Returns the result of `decode` for a part of a file, which is called once for all files that refer to it.
+ * @template Decoded
+ * @param {Container} container
+ * @param {string} key
+ * @param {() => Decoded} decode
+ * @returns {Decoded}
+ */
+const decodeOnce = ({ decoded }, key, decode) => {
+  if (!decoded.has(key)) decoded.set(key, decode());
+  return decoded.get(key);
 };
 
 /**
@@ -248,7 +288,7 @@ const requireEntry = (container, type) =>
  * @param {ExpectedSection} section
  */
 const checkSection = (container, { type, rows, columns }) => {
-  const { codec, raw } = requireEntry(container, type);
+  const { codec, raw } = requireEntry(sourceOf(container, type), type);
   if (!PARAMETER_CODECS.includes(codec)) rejectNewer(`section '${type}' has the codec ${codec}, which is unknown`);
   if (raw !== 4 * rows * columns) rejectDamaged(`section '${type}' says another size than the metadata`);
 };
@@ -262,15 +302,21 @@ const checkSection = (container, { type, rows, columns }) => {
  * @returns {Float32Array} (rows x columns), finite
  */
 const decodeSection = (container, section, config, points) => {
-  const { type } = section, { codec } = requireEntry(container, type);
-  const data = container.stored(type);
-  return nameDamagedSection(type, () => {
-    const numbers = decodeNumbers(section, codec, data, config, points);
-    for (let i = 0; i < numbers.length; i++) {
-      if (numbers[i] - numbers[i] !== 0) throw new DamagedData("it holds numbers that are not finite");
-    }
-    return numbers;
-  });
+  const { type } = section, source = sourceOf(container, type), { codec } = requireEntry(source, type);
+  const decode = () => {
+    const data = source.stored(type);
+    return nameDamagedSection(type, () => {
+      const numbers = decodeNumbers(section, codec, data, config, points);
+      for (let i = 0; i < numbers.length; i++) {
+        if (numbers[i] - numbers[i] !== 0) throw new DamagedData("it holds numbers that are not finite");
+      }
+      return numbers;
+    });
+  };
+  // Where groups follow from positions, they are those of this file.
+  if (source === container || (codec === CODEC_GROUPS && section.columns > 1)) return decode();
+  const { geometry, radiance, hidden, direction_encoding } = config; // they determine the section's shape
+  return decodeOnce(source, JSON.stringify([type, geometry, radiance, hidden, direction_encoding]), decode);
 };
 
 /**
@@ -309,6 +355,10 @@ const decodeNumbers = ({ group, layer, rows, columns }, codec, data, config, poi
   }
   const isField = FIELD_TYPES.includes(group), isDecoder = isField && columns === 1;
   if (codec === CODEC_GROUPS && isDecoder) return decodeGroups(data, decoderGroups(config, fieldOf(group)));
+  if (codec === CODEC_STATED_GROUPS && isField && !isDecoder) {
+    const { groups, rest } = readTableGroups(data, config[fieldOf(group)]);
+    return decodeGroups(rest, groups);
+  }
   if (group === "POSI" || codec !== (isField ? CODEC_GROUPS : CODEC_CHANNELS)) {
     throw new DamagedData(`it cannot have codec ${codec}`);
   }

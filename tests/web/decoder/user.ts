@@ -15,6 +15,10 @@ import { backgroundSpacing, backgroundStride, pixelSizes } from "hyrf.js/samplin
 import { DepthSort } from "hyrf.js/sort.js";
 import { viewpointOf } from "hyrf.js/viewpoint.js";
 
+export async function readChunk(bytes: Uint8Array, shared: Uint8Array): Promise<Model> {
+  return read(bytes, { openFile: async (name: string) => (name === "shared.hyrf" ? shared : new Uint8Array(0)) });
+}
+
 export async function evaluate(bytes: Uint8Array): Promise<Float32Array> {
   const { firstLayer, sections } = describe(bytes);
   const model: Model = await read(bytes.subarray(0, firstLayer), { partial: true });

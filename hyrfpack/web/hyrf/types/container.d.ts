@@ -53,6 +53,10 @@ export declare class Container {
     length: number;
     /** @type {Map<string, Entry>} */
     entries: Map<string, Entry>;
+    /** The file that holds the sections of codec 12, once it is known. @type {Container | null} */
+    shared: Container | null;
+    /** Results of decoding that files which refer to this one need, too. @type {Map<string, any>} */
+    decoded: Map<string, any>;
     /**
      * @param {Uint8Array} bytes the whole file, or its start
      * @param {boolean} partial whether the start of a file is accepted

@@ -24,6 +24,17 @@ export declare const decoderGroups: (config: DecoderConfig, which: FieldName) =>
  */
 export declare const tableGroups: (grid: Grid, points: LatticePoints) => NumberGroups;
 /**
+ * Reads the groups of a table's rows, which codec 11 states before the numbers.
+ * @param {Uint8Array} data
+ * @param {Grid} grid
+ * @returns {{groups: NumberGroups, rest: Uint8Array}} `rest` is for `decodeGroups`
+ * @throws {DamagedData} a length or a group is invalid
+ */
+export declare const readTableGroups: (data: Uint8Array, grid: Grid) => {
+    groups: NumberGroups;
+    rest: Uint8Array;
+};
+/**
  * Decodes numbers in groups.
  * @param {Uint8Array} data
  * @param {NumberGroups} groups

@@ -36,6 +36,7 @@ export type Description = {
     }[];
     firstLayer: number;
 };
+export type OpenFile = (name: string) => Uint8Array | Promise<Uint8Array>;
 export type ExpectedSection = {
     type: string;
     group: string;
@@ -54,13 +55,15 @@ export declare const describe: (bytes: Uint8Array) => Description;
 /**
  * Decodes a file of one model.
  * @param {Uint8Array} bytes the file, or its start if `partial` is true
- * @param {{partial?: boolean}} [options] `partial`: accept the start of a file, and read the layers that are complete
- * @returns {Promise<Model>}
- * @throws {HyrfFormatError} the file is damaged, truncated or too new; `bytes` has no complete layer; or the file is a
- *   merged one
+ * @param {{partial?: boolean, openFile?: OpenFile}} [options] `partial`: accept the start of a file, and read the
+ *   layers that are complete; `openFile`: called for the file that a chunk of a scene folder refers to
+ * @returns {Promise<Model>} the fields and the exposure map of a chunk are those of the other file
+ * @throws {HyrfFormatError} the file is damaged, truncated or too new; `bytes` has no complete layer; the file is a
+ *   merged one; or it refers to a file that is damaged or another one, or that cannot be opened
  */
-export declare const read: (bytes: Uint8Array, { partial }?: {
+export declare const read: (bytes: Uint8Array, { partial, openFile }?: {
     partial?: boolean;
+    openFile?: OpenFile;
 }) => Promise<Model>;
 /**
  * Decodes all parts of a merged file, or the one model of any other file. The first part is the scene, whose background

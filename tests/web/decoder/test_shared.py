@@ -1,0 +1,119 @@
+"""hyrf.js reads chunks of scene folders bit by bit, and refuses references that hyrfpack refuses."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from web.scripts import run_script
+
+from hyrfpack.errors import HyrfFormatError
+from hyrfpack.format import describe_file, load_model
+from hyrfpack.format.arrays import to_arrays
+from hyrfpack.format.container import MINOR_VERSION, Section, read_container, write_container
+from hyrfpack.format.shared import CODEC_SHARED
+from tools.safety.fuzz_browser import read_in_javascript
+from tools.safety.make_golden import GOLDEN_SCENE_FOLDER
+
+READ_CHUNKS_SCRIPT = Path(__file__).with_name("read_chunks.mjs")
+CHUNK, SHARED = "chunk-0000-0.hyrf", "shared.hyrf"
+SECTIONS = ("POSI", "COLO", "SCAL", "OPAC", "GTAB", "GMLP", "RTAB", "RMLP")
+BAD_NAMES = [b"../shared.hyrf", b"", b".hyrf", b"a\0.hyrf", b"shared.txt", b"x" * 70 + b".hyrf", b"shared.hyrf\n"]
+
+
+def with_section(data: bytes, tag: str, change: Callable[[Section], Section | None]) -> bytes:
+    """Return a file with one section changed, or without it."""
+    sections = {section.type: section for section in read_container(data).sections}
+    changed = change(sections.pop(tag))
+    return write_container([*sections.values(), *([changed] if changed else [])], MINOR_VERSION)
+
+
+def rename(name: bytes) -> Callable[[Section], Section]:
+    """Return a change of the name that a reference has."""
+
+    def change(section: Section) -> Section:
+        data = bytes(section.data[:4]) + name
+        return Section(section.type, CODEC_SHARED, data, len(data), section.required)
+
+    return change
+
+
+def damage(section: Section) -> Section:
+    """Return the section with a bit of its first stream flipped, under a right checksum."""
+    data = bytearray(section.data)
+    data[6] ^= 64
+    return Section(section.type, section.codec, bytes(data), section.raw_length, section.required)
+
+
+def make_folders(folder: Path, chunks: list[bytes], shared: list[bytes]) -> list[Path]:
+    """Write a folder for each chunk and its shared file; return the paths of the chunks."""
+    paths = []
+    for number, (chunk, other) in enumerate(zip(chunks, shared, strict=True)):
+        (folder / str(number)).mkdir()
+        (folder / str(number) / SHARED).write_bytes(other)
+        paths.append(folder / str(number) / CHUNK)
+        paths[-1].write_bytes(chunk)
+    return paths
+
+
+def test_a_chunk_has_the_bits_and_the_provenance_that_python_reads(tmp_path: Path):
+    for copy in ("first", "second"):
+        shutil.copytree(GOLDEN_SCENE_FOLDER, tmp_path / copy)
+    path = tmp_path / "first" / CHUNK
+
+    answers = run_script(READ_CHUNKS_SCRIPT, path, path, tmp_path / "second" / CHUNK)
+
+    arrays, model = to_arrays(load_model(path)), load_model(path)
+    for answer in answers:
+        assert answer["count"] == len(model) and answer["opened"] == [SHARED]
+        assert answer["hashes"] == [hashlib.sha256(arrays[tag].tobytes()).hexdigest() for tag in SECTIONS]
+        assert answer["hasMap"] and answer["provenance"] == describe_file(path)["provenance"]
+
+
+def test_references_that_python_refuses_are_refused(tmp_path: Path):
+    chunk, shared = ((GOLDEN_SCENE_FOLDER / name).read_bytes() for name in (CHUNK, SHARED))
+    cases = {
+        **{f"name {name!r}": (with_section(chunk, "GTAB", rename(name)), shared) for name in BAD_NAMES},
+        "two names": (with_section(chunk, "GTAB", rename(b"other.hyrf")), shared),
+        "positions elsewhere": (with_section(chunk, "POSI", rename(b"shared.hyrf")), shared),
+        "not there": (chunk, with_section(shared, "RMLP", lambda section: None)),
+        "another section": (chunk, with_section(shared, "RTAB", damage)),
+        "a reference to a reference": (chunk, with_section(shared, "RTAB", rename(b"shared.hyrf"))),
+        "another file": (chunk, chunk),
+        "no file": (chunk, b"no file"),
+        "cut": (chunk, shared[:-8]),
+        "damaged": (chunk, shared[:-20] + bytes([shared[-20] ^ 1]) + shared[-19:]),
+    }
+    paths = make_folders(tmp_path, *map(list, zip(*cases.values(), strict=True)))
+
+    answers = run_script(READ_CHUNKS_SCRIPT, *paths)
+
+    for name, path, answer in zip(cases, paths, answers, strict=True):
+        assert "refused" in answer and "\n" not in answer["refused"], name
+        with pytest.raises(HyrfFormatError):
+            load_model(path)
+
+
+def test_damaged_groups_of_a_table_are_refused(tmp_path: Path):
+    """The reference has the checksum of the damaged section, so that only the decoder can find the damage."""
+    shared = (GOLDEN_SCENE_FOLDER / SHARED).read_bytes()
+    table = read_container(shared)["RTAB"]
+    cases = []
+    for data in (b"", b"\xff" * 4 + bytes(table.data[4:]), bytes(table.data[:4]), bytes(table.data[:-1])):
+        section = Section("RTAB", table.codec, data, table.raw_length, table.required)
+        cases.append(with_section(shared, "RTAB", lambda _, section=section: section))
+
+    refusals = [verdict.refused for verdict in read_in_javascript([(data, False) for data in cases])]
+
+    assert all(refusal.startswith("Section 'RTAB' is damaged") for refusal in refusals), refusals
+
+
+def test_the_bytes_of_a_chunk_alone_are_refused_with_the_way_to_open_it():
+    chunk = (GOLDEN_SCENE_FOLDER / CHUNK).read_bytes()
+
+    (verdict,) = read_in_javascript([(chunk, False)])
+
+    assert "needs the file shared.hyrf of its folder; open the scene.json" in verdict.refused
