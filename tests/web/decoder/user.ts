@@ -8,15 +8,23 @@ import { frustumPlanes } from "hyrf.js/frustum.js";
 import type { View } from "hyrf.js/frustum.js";
 import { gridLevels } from "hyrf.js/grids.js";
 import { fitHarmonics } from "hyrf.js/harmonics.js";
+import { selectLevels } from "hyrf.js/levels.js";
+import { parseManifest } from "hyrf.js/manifest.js";
 import { openRemoteModel } from "hyrf.js/remote.js";
 import type { EvaluatedRow, RemoteModel } from "hyrf.js/remote.js";
 import { RowStates, rowBalls } from "hyrf.js/row_states.js";
 import { backgroundSpacing, backgroundStride, pixelSizes } from "hyrf.js/sampling.js";
 import { DepthSort } from "hyrf.js/sort.js";
+import type { Camera } from "hyrf.js/viewpoint.js";
 import { viewpointOf } from "hyrf.js/viewpoint.js";
 
 export async function readChunk(bytes: Uint8Array, shared: Uint8Array): Promise<Model> {
   return read(bytes, { openFile: async (name: string) => (name === "shared.hyrf" ? shared : new Uint8Array(0)) });
+}
+
+export function chooseFiles(bytes: Uint8Array, camera: Camera): (string | undefined)[] {
+  const manifest = parseManifest(bytes), { levels } = selectLevels(manifest, camera, { gaussians: 1000 });
+  return levels.map((level, number) => manifest.chunks[number]?.levels[level]?.file);
 }
 
 export async function evaluate(bytes: Uint8Array): Promise<Float32Array> {

@@ -1,0 +1,175 @@
+// The manifest of a scene folder, `scene.json` (docs/reference/scene-folder.md). It is not trusted: all that is used of
+// it is checked.
+
+import { DamagedData, HyrfFormatError, assertValid, groupedDigits, quotedText } from "./errors.js";
+import { isFileName } from "./shared.js";
+
+/**
+ * A file of the folder: its name, its size, and the CRC-32 of its bytes as 8 hexadecimal digits.
+ * @typedef {{file: string, bytes: number, crc32: string}} SceneFile
+ *
+ * A chunk at one level of detail. `errors` are mean squared errors, one for each of the manifest's `error_radii`.
+ * @typedef {SceneFile & {gaussians: number, errors: number[]}} ChunkLevel
+ *
+ * Gaussians of one region: corners of the box that holds them, in world units, and levels from the finest.
+ * @typedef {{low: number[], high: number[], levels: ChunkLevel[]}} Chunk
+ *
+ * The stored object. It keeps keys that this reader does not know.
+ * @typedef {{
+ *   gaussians: number, shared: SceneFile, chunks: Chunk[], error_radii: number[], frame: Record<string, any>,
+ *   background: boolean, solid: number[], viewpoint: Record<string, any>, cameras: number[][],
+ *   title: string, licence: string, writer: string,
+ * }} Manifest
+ */
+
+const FORMAT_NAME = "hyrf-scene";
+const MAJOR_VERSION = 1;
+export const MAX_MANIFEST_BYTES = 2 ** 24;
+const MAX_CHUNKS = 2 ** 16;
+const MAX_LEVELS = 8;
+const MAX_ERROR_RADII = 16;
+const MAX_CAMERAS = 1024, MAX_CAMERA_NUMBERS = 32;
+const MAX_TEXT_LENGTH = 1000;
+const INTEGER_LIMIT = 2 ** 40;
+// Control characters and separators, which Python does not print.
+const UNPRINTABLE = /(?! )[\p{C}\p{Z}]/u;
+
+/**
+ * Parses a manifest.
+ * @param {Uint8Array} bytes
+ * @returns {Manifest}
+ * @throws {HyrfFormatError} it is no manifest, is damaged, or has another major version
+ */
+export const parseManifest = (bytes) => {
+  try {
+    assertValid(bytes.length <= MAX_MANIFEST_BYTES, `it has ${groupedDigits(bytes.length)} bytes`);
+    const values = parseText(bytes);
+    if (values?.format !== FORMAT_NAME) {
+      throw new HyrfFormatError("This is not the manifest of a scene folder; check the address.");
+    }
+    checkVersion(values.version);
+    checkManifest(values);
+    return values;
+  } catch (error) {
+    if (!(error instanceof DamagedData)) throw error;
+    throw new HyrfFormatError(`The manifest is damaged: ${error.message}; copy the whole folder again.`);
+  }
+};
+
+/**
+ * @param {Uint8Array} bytes
+ * @returns {any}
+ */
+const parseText = (bytes) => {
+  try {
+    return JSON.parse(new TextDecoder("utf-8", { fatal: true, ignoreBOM: true }).decode(bytes));
+  } catch {
+    throw new DamagedData("it is not JSON");
+  }
+};
+
+/** @param {any} version */
+const checkVersion = (version) => {
+  const match = typeof version === "string" ? /^(\d{1,4})\.\d{1,4}$/.exec(version) : null;
+  if (!match) throw new DamagedData("it has no version");
+  if (Number(match[1]) === MAJOR_VERSION) return;
+  throw new HyrfFormatError(`The scene has version ${version}, newer than this reader; update the reader.`);
+};
+
+/** @param {Record<string, any>} values */
+const checkManifest = (values) => {
+  const { chunks, error_radii: radii } = values;
+  checkNumbers(radii, "error_radii", 1, MAX_ERROR_RADII, 0);
+  const rises = radii.every((/** @type {number} */ radius, /** @type {number} */ k) => radius > (k ? radii[k - 1] : 0));
+  assertValid(rises, "'error_radii' do not rise");
+  checkFile(values.shared, "shared");
+  checkList(chunks, "chunks", 0, MAX_CHUNKS);
+  for (const chunk of chunks) checkChunk(chunk, radii.length);
+  for (const key of ["frame", "viewpoint"]) assertValid(isObject(values[key]), `'${key}' must be an object`);
+  assertValid(typeof values.background === "boolean", "'background' must be true or false");
+  checkNumbers(values.solid, "solid", 3, 3);
+  checkList(values.cameras, "cameras", 0, MAX_CAMERAS);
+  for (const camera of values.cameras) checkNumbers(camera, "cameras", 1, MAX_CAMERA_NUMBERS);
+  for (const key of ["title", "licence", "writer"]) {
+    const text = values[key];
+    const isText = typeof text === "string" && [...text].length <= MAX_TEXT_LENGTH && !UNPRINTABLE.test(text);
+    assertValid(isText, `'${key}' must be a text of at most ${MAX_TEXT_LENGTH} characters`);
+  }
+  checkInteger(values.gaussians, "gaussians");
+  let sum = 0;
+  for (const { levels } of chunks) sum += levels[0].gaussians;
+  assertValid(sum === values.gaussians, `the chunks do not add up to ${values.gaussians} Gaussians`);
+  // Some file systems ignore case.
+  const names = listFiles(/** @type {Manifest} */ (values)).map(({ file }) => file.toLowerCase());
+  assertValid(new Set(names).size === names.length, "two files have the same name");
+};
+
+/**
+ * Returns all files of the folder but the manifest.
+ * @param {Manifest} manifest
+ * @returns {SceneFile[]}
+ */
+export const listFiles = ({ shared, chunks }) => [shared, ...chunks.flatMap(({ levels }) => levels)];
+
+/**
+ * @param {any} chunk
+ * @param {number} radii the number of errors of a level
+ */
+const checkChunk = (chunk, radii) => {
+  assertValid(isObject(chunk), "a chunk is no object");
+  for (const key of ["low", "high"]) checkNumbers(chunk[key], key, 3, 3);
+  const inOrder = chunk.low.every((/** @type {number} */ low, /** @type {number} */ axis) => low <= chunk.high[axis]);
+  assertValid(inOrder, "the box of a chunk is not in order");
+  checkList(chunk.levels, "levels", 1, MAX_LEVELS);
+  for (const level of chunk.levels) {
+    checkFile(level, "levels");
+    checkInteger(level.gaussians, "gaussians");
+    checkNumbers(level.errors, "errors", radii, radii, 0);
+  }
+};
+
+/**
+ * @param {any} file
+ * @param {string} key
+ */
+const checkFile = (file, key) => {
+  assertValid(isObject(file), `'${key}' must be an object`);
+  assertValid(isFileName(file.file), `${quotedText(String(file.file))} is not the name of a .hyrf file in the folder`);
+  checkInteger(file.bytes, "bytes");
+  const isChecksum = typeof file.crc32 === "string" && /^[0-9a-f]{8}$/.test(file.crc32);
+  assertValid(isChecksum, `the checksum of ${file.file} is not 8 hexadecimal digits`);
+};
+
+/** @param {any} value */
+const isObject = (value) => typeof value === "object" && value !== null && !Array.isArray(value);
+
+/**
+ * @param {any} value
+ * @param {string} key
+ */
+const checkInteger = (value, key) =>
+  assertValid(Number.isInteger(value) && value >= 0 && value < INTEGER_LIMIT, `'${key}' is out of range`);
+
+/**
+ * @param {any} list
+ * @param {string} key
+ * @param {number} least
+ * @param {number} most
+ */
+const checkList = (list, key, least, most) => {
+  const isList = Array.isArray(list) && list.length >= least && list.length <= most;
+  assertValid(isList, `'${key}' must be a list of ${least} to ${groupedDigits(most)} entries`);
+};
+
+/**
+ * @param {any} numbers
+ * @param {string} key
+ * @param {number} least the smallest length of the list
+ * @param {number} most its largest length
+ * @param {number} [minimum] of the numbers
+ */
+const checkNumbers = (numbers, key, least, most, minimum = -Infinity) => {
+  checkList(numbers, key, least, most);
+  const areFinite = numbers.every((/** @type {any} */ value) => Number.isFinite(value) && value >= minimum);
+  assertValid(areFinite, `'${key}' holds something else than numbers in range`);
+};

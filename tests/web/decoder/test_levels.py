@@ -1,0 +1,171 @@
+"""hyrf.js reads the manifest of a scene folder and chooses levels of detail as hyrfpack does."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from format.test_scene_manifest import VALID_MANIFEST, with_value
+from scenes import camera_at
+from web.scripts import run_script
+
+from hyrfpack.cameras.files import camera_to_json
+from hyrfpack.format.scene_manifest import Chunk, ChunkLevel, Manifest, SceneFile, parse_manifest
+from hyrfpack.lod.select import predict_errors, select_levels
+from tools.safety.make_golden import GOLDEN_SCENE_FOLDER
+
+SELECT_SCRIPT = Path(__file__).with_name("select_levels.mjs")
+LATER_VERSION = json.dumps({**json.loads(VALID_MANIFEST.to_json()), "version": "1.7", "sky": "blue"}).encode()
+BAD_MANIFESTS = [
+    b"",
+    b"[]",
+    b"{}",
+    b'{"format": NaN}',
+    b"\xff\xfe",
+    VALID_MANIFEST.to_json()[:-20],
+    *(
+        with_value(path, value)
+        for path, value in [
+            (["version"], "2.0"),
+            (["version"], None),
+            (["format"], "other"),
+            (["gaussians"], 8),
+            (["gaussians"], True),
+            (["shared"], None),
+            (["shared", "bytes"], -1),
+            (["shared", "bytes"], 2**40),
+            (["shared", "crc32"], "XYZ"),
+            (["shared", "file"], "../shared.hyrf"),
+            (["chunks", 0, "levels", 0, "file"], "a/b.hyrf"),
+            (["chunks", 1, "levels", 0, "file"], "Shared.hyrf"),
+            (["chunks", 0, "levels"], []),
+            (["chunks", 0], 5),
+            (["chunks", 0, "levels", 1, "errors"], [0.1]),
+            (["chunks", 0, "levels", 1, "errors"], [0.1, -0.1]),
+            (["chunks", 0, "low"], [5, 5, 5]),
+            (["chunks", 0, "high"], [5, 5]),
+            (["error_radii"], [64, 16]),
+            (["error_radii"], []),
+            (["solid"], None),
+            (["background"], 1),
+            (["frame"], []),
+            (["cameras"], [[]]),
+            (["title"], "two\nlines"),
+            (["licence"], "x" * 1001),
+        ]
+    ),
+]
+
+
+def run(tmp_path: Path, cases: list[dict[str, Any]]) -> list[dict]:
+    """Return what the script answers for cases whose manifests are bytes."""
+    texts = [{**case, "manifest": base64.b64encode(case["manifest"]).decode()} for case in cases]
+    (tmp_path / "cases.json").write_text(json.dumps(texts))
+    return run_script(SELECT_SCRIPT, tmp_path / "cases.json")
+
+
+def random_manifest(rng: np.random.Generator) -> Manifest:
+    """Return a manifest of chunks of all sizes, some with levels that are no better than cheaper ones."""
+    chunks = []
+    radii = tuple(np.cumsum(rng.uniform(1, 200, rng.integers(1, 9))).tolist())
+    for number in range(rng.integers(1, 30)):
+        low, levels = rng.normal(size=3) * 20, []
+        gaussians = int(rng.integers(1, 3000))
+        for level in range(rng.integers(1, 9)):
+            errors = tuple((rng.uniform(0, 0.02) * level * np.sort(rng.uniform(size=len(radii)))).tolist())
+            name, size = f"chunk-{number}-{level}.hyrf", int(rng.integers(1, 40_000))
+            levels.append(ChunkLevel(name, size, "0123abcd", max(1, gaussians >> (2 * level)), errors))
+        chunks.append(Chunk(tuple(low), tuple(low + rng.uniform(0, 10, 3)), tuple(levels)))
+    count = sum(chunk.levels[0].gaussians for chunk in chunks)
+    return Manifest(count, SceneFile("shared.hyrf", 500, "0123abcd"), tuple(chunks), radii, {}, False, (0.0, 0.0, 0.0))
+
+
+def test_the_selection_is_that_of_python(tmp_path: Path):
+    rng = np.random.default_rng(0)
+    cases, expected = [], []
+    for _ in range(60):
+        manifest = random_manifest(rng)
+        camera = camera_at(tuple(rng.normal(size=3) * 15), width=200, height=150, focal=float(rng.uniform(50, 900)))
+        for options in (
+            {},
+            {"gaussians": int(rng.integers(0, manifest.gaussians + 1))},
+            {"bytes": int(rng.integers(0, manifest.total_bytes))},
+        ):
+            cases.append({"manifest": manifest.to_json(), "camera": camera_to_json(camera), "options": options})
+            expected.append(select_levels(manifest, camera, **options))
+    golden = (GOLDEN_SCENE_FOLDER / "scene.json").read_bytes()
+    camera = camera_at((1e6, 3, -20), width=80, height=60, focal=70)
+    cases.append({"manifest": golden, "camera": camera_to_json(camera)})
+    expected.append(select_levels(parse_manifest(golden), camera))
+
+    answers = run(tmp_path, cases)
+
+    for answer, choice in zip(answers, expected, strict=True):
+        assert (answer["levels"], answer["gaussians"], answer["bytes"]) == (
+            choice.levels,
+            choice.gaussians,
+            choice.bytes,
+        )
+        assert answer["predictedMse"] == pytest.approx(choice.predicted_mse, rel=1e-9, abs=1e-15)
+        assert answer["maxGap"] == pytest.approx(choice.max_gap, rel=1e-9, abs=1e-15)
+
+
+def test_levels_that_are_not_available_are_left_out(tmp_path: Path):
+    """The best choice among the rest, by trying all, is at most the stated gap better."""
+    rng = np.random.default_rng(1)
+    camera = camera_at((0, -30, 0), width=200, height=150, focal=300)
+    files = SceneFile("shared.hyrf", 500, "0123abcd")
+    chunks = tuple(chunk for _ in range(4) for chunk in random_manifest(rng).chunks[:1])
+    names = [f"{number}.hyrf" for number in range(sum(len(chunk.levels) for chunk in chunks))]
+    chunks = tuple(
+        Chunk(
+            chunk.low,
+            chunk.high,
+            tuple(ChunkLevel(names.pop(), x.bytes, x.crc32, x.gaussians, x.errors[:1]) for x in chunk.levels[:4]),
+        )
+        for chunk in chunks
+    )
+    count = sum(chunk.levels[0].gaussians for chunk in chunks)
+    manifest = Manifest(count, files, chunks, (50.0,), {}, False, (0.0, 0.0, 0.0))
+    missing = [[0, 0], *([1, level] for level in range(len(chunks[1].levels)))]
+    limit = count // 3
+
+    (answer,) = run(
+        tmp_path,
+        [
+            {
+                "manifest": manifest.to_json(),
+                "camera": camera_to_json(camera),
+                "options": {"gaussians": limit},
+                "missing": missing,
+            }
+        ],
+    )
+
+    assert answer["levels"][1] == -1 and all(
+        [chunk, level] not in missing for chunk, level in enumerate(answer["levels"])
+    )
+    errors, best = predict_errors(manifest, camera), math.inf
+    for levels in product(*(range(len(chunk.levels)) for number, chunk in enumerate(chunks) if number != 1)):
+        picked = dict(zip((0, 2, 3), levels, strict=True))
+        if picked[0] and sum(chunks[chunk].levels[level].gaussians for chunk, level in picked.items()) <= limit:
+            best = min(best, sum(errors[chunk][level] for chunk, level in picked.items()))
+    assert answer["gaussians"] <= limit and best < math.inf
+    assert answer["predictedMse"] - best <= answer["maxGap"] + 1e-12
+
+
+def test_manifests_are_accepted_and_refused_as_in_python(tmp_path: Path):
+    good = [VALID_MANIFEST.to_json(), LATER_VERSION, (GOLDEN_SCENE_FOLDER / "scene.json").read_bytes()]
+
+    answers = run(tmp_path, [{"manifest": data} for data in good + BAD_MANIFESTS])
+
+    assert answers[0] == json.loads(VALID_MANIFEST.to_json())
+    assert all("refused" not in answer for answer in answers[: len(good)])
+    for data, answer in zip(BAD_MANIFESTS, answers[len(good) :], strict=True):
+        assert answer.get("refused", "").count("\n") == 0 and "refused" in answer, data
