@@ -147,6 +147,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/long"))
     parser.add_argument("--table", action="store_true", help="only print the table")
     args = parser.parse_args()
+    if args.table:
+        print(format_table(list(read_finished_rows(args.out))))
+        return
     names = args.sets or sorted(
         folder.name for folder in args.data.iterdir() if (folder / "images").exists() or (folder / "train").exists()
     )
@@ -156,7 +159,7 @@ def main() -> None:
         for seed in range(args.seeds)
         for name in names
     ]
-    for run in [] if args.table else queue:
+    for run in queue:
         folder = run.folder(args.out)
         lock = folder.with_name(f"{folder.name}.queue")  # training locks the folder itself
         try:
