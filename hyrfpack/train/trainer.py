@@ -124,6 +124,7 @@ class Trainer:
     def _take(self, model: HybridModel) -> None:
         """Replace the trained model and start a new optimiser for it."""
         model.precision = self.config.precision
+        model.gaussians.pixel_sizes = None  # They belong to the Gaussians of a file, which training moves and replaces.
         if not any(parameter.requires_grad for parameter in model.parameters()):  # A loaded model records none.
             model.requires_grad_(True)
         self.model = model.to(self.device)

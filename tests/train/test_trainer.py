@@ -570,6 +570,17 @@ def test_a_loaded_model_can_be_trained_further():
     assert not torch.equal(trainer.model.gaussians.color_logits, before)
 
 
+def test_pixel_sizes_of_a_loaded_model_do_not_affect_its_training():
+    parameters = []
+    for size in (None, 1.0):  # of a photo's pixel at each Gaussian, in local units
+        model = decode_model(encode_model(Trainer(make_scene(), SHORT_CONFIG).model))
+        model.gaussians.pixel_sizes = None if size is None else torch.full((len(model),), size)
+        trainer = Trainer(make_scene(), dataclasses.replace(SHORT_CONFIG, steps=20), model=model)
+        trainer.run()
+        parameters.append(parameter_bytes(trainer))
+    assert parameters[0] == parameters[1]
+
+
 def test_frozen_parameters_stay_frozen():
     model = Trainer(make_scene(), SHORT_CONFIG).model
     model.geometry.requires_grad_(False)
