@@ -13,7 +13,7 @@ from hyrfpack.config.settings import OneOf, Seed, check_settings
 class PosesConfig:
     """Settings that, with the photos and their masks, determine the poses.
 
-    With `matching` "sequential", loops are matched, too. "auto" means exhaustive for up to 200 photos, sequential for
+    With `matching` "sequential", loops are matched, too. "auto" means exhaustive for up to 60 photos, sequential for
     videos and larger numbered bursts, and retrieval for other large sets.
 
     Attributes:

@@ -6,12 +6,14 @@ import numpy as np
 
 from hyrfpack.progress import Progress, TaskEvent, ignore_progress
 
-MAX_EXHAUSTIVE_PHOTOS = 200  # in larger unordered sets, only similar photos are matched
+MAX_EXHAUSTIVE_PHOTOS = 60  # in larger unordered sets, only similar photos are matched
 _VOCABULARY_WORDS = 64
 _VOCABULARY_SAMPLE_DESCRIPTORS = 50_000
 _KMEANS_ITERATIONS = 12
-# Partners of a photo in an unordered set: similar photos, and neighbours by name on each side.
-_RETRIEVAL_SIMILAR_PHOTOS = 40
+# Partners of a photo in an unordered set: similar photos, more of them in larger sets, and neighbours by name on each
+# side.
+_RETRIEVAL_SIMILAR_RATIO = 0.2
+_MIN_RETRIEVAL_SIMILAR_PHOTOS, _MAX_RETRIEVAL_SIMILAR_PHOTOS = 20, 40
 _RETRIEVAL_NEIGHBOURS = 5
 # Partners of a photo in a sequence: the next photos, and similar ones farther away, which close loops.
 _SEQUENTIAL_NEIGHBOURS = 10
@@ -46,11 +48,13 @@ def sequential_pairs(count: int, similarity: np.ndarray) -> Pairs:
 
 
 def retrieval_pairs(count: int, similarity: np.ndarray) -> Pairs:
-    """Pair each photo of an unordered set with the most similar ones and with its neighbours by name."""
+    """Pair each photo of an unordered set with the most similar fifth, 20 to 40, and with its neighbours by name."""
+    similar = round(_RETRIEVAL_SIMILAR_RATIO * count)
+    similar = min(max(similar, _MIN_RETRIEVAL_SIMILAR_PHOTOS), _MAX_RETRIEVAL_SIMILAR_PHOTOS)
     neighbours = {
         (first, first + step) for step in range(1, _RETRIEVAL_NEIGHBOURS + 1) for first in range(count - step)
     }
-    return sorted(neighbours | _most_similar_pairs(similarity, _RETRIEVAL_SIMILAR_PHOTOS))
+    return sorted(neighbours | _most_similar_pairs(similarity, similar))
 
 
 def _most_similar_pairs(similarity: np.ndarray, most: int) -> set[tuple[int, int]]:
