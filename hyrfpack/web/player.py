@@ -92,7 +92,7 @@ def encode_player_files(editable: bool = False) -> dict[str, bytes]:
     """Return, by name, the files beside a page of `encode_player` with `in_folder` and the same `editable`."""
     return {
         STYLE_FILE_NAME: read_style(editable).encode(),
-        SCRIPT_FILE_NAME: _script_with_texts(_main_script(editable), embedded_texts()),
+        SCRIPT_FILE_NAME: _script_with_texts(_main_script(editable, is_hosted=True), embedded_texts()),
         WORKER_FILE_NAME: read_script("worker.js").encode(),
     }
 
@@ -119,13 +119,15 @@ def assemble_player_page(
         payload: a file that the page holds, empty for none.
         image: address of a picture for those who share the page; None for none.
         fetches: sources that the page may fetch from, in the syntax of a content security policy.
-        readers: include the readers of splats, which make the page a third larger.
+        readers: include the readers of splats, which make the page a third larger; pages with `fetches` need them.
         gallery: address of the list of scenes that a button leads back to; None for no button.
         credit: text below the title.
         editable: include the panel that edits a scene.
     """
     style, script = read_style(editable), read_script("boot.js")
-    main, packed = _pack_scripts(_main_script(editable), "worker.js" if readers else "worker_model.js")
+    is_hosted = bool(fetches)
+    worker = "worker.js" if is_hosted else "worker_splats.js" if readers else "worker_model.js"
+    main, packed = _pack_scripts(_main_script(editable, is_hosted), worker)
     view = memoryview(payload)
     blocks = (
         base64.b64encode(view[at : at + PAYLOAD_BLOCK_BYTES]).decode()
@@ -251,9 +253,9 @@ def fill_template(template: str, values: dict[str, str]) -> str:
     return re.sub(r"\{\{(\w+)\}\}", lambda match: values[match[1]], template)
 
 
-def _main_script(editable: bool) -> str:
-    """Return the name of the page's main script."""
-    return "main_editable.js" if editable else "main.js"
+def _main_script(editable: bool, is_hosted: bool) -> str:
+    """Return the name of the page's main script. Those of pages that fetch files also play scene folders."""
+    return "main_editable.js" if editable else "main_hosted.js" if is_hosted else "main.js"
 
 
 @cache

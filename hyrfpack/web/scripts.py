@@ -12,7 +12,16 @@ from hyrfpack.web.modules import link_modules
 
 _LOG = logging.getLogger(__name__)
 
-SCRIPT_NAMES = ("boot.js", "element_script.js", "main.js", "main_editable.js", "worker.js", "worker_model.js")
+SCRIPT_NAMES = (
+    "boot.js",
+    "element_script.js",
+    "main.js",
+    "main_editable.js",
+    "main_hosted.js",
+    "worker.js",
+    "worker_model.js",
+    "worker_splats.js",
+)
 STYLE_NAME, EDITING_STYLE_NAME = "style.css", "edit.css"
 MINIFIED_FOLDER = "minified"
 DIGEST_NAME = "sources.sha256"

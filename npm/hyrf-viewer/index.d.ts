@@ -52,6 +52,8 @@ export interface ViewerOptions {
    * forbids `worker-src blob:`.
    */
   workerUrl?: string | URL | null;
+  /** The most Gaussians of a scene folder at a time. Default: 2 million, 500,000 on phones. */
+  maxGaussians?: number | null;
 }
 
 export interface SceneInfo {

@@ -40,6 +40,16 @@ export class RowStates {
     return { visible, fresh, rows: stale };
   }
 
+  /**
+   * Replaces the Gaussians of a row. They have no colours yet.
+   * @param {number} row
+   * @param {Float32Array} ball around them, from `rowBalls`
+   */
+  replace(row, ball) {
+    this.balls.set(ball, 4 * row);
+    this.eyes.fill(NaN, 3 * row, 3 * row + 3);
+  }
+
   /** Returns the rows that have no colours yet. */
   fresh() {
     return Array.from({ length: this.count }, (_, row) => row).filter((row) => Number.isNaN(this.eyes[3 * row]));

@@ -29,9 +29,9 @@ export function resolveAddress(text, what) {
 // Shortens a text from the address for a message.
 const shortenForMessage = (text) => (text.length > 60 ? `${text.slice(0, 60)}…` : text || "an empty one");
 
-// Parses what follows "?". Returns {content, poster, title, camera, exposure, noui, autorotate, wrong}: the flags noui
-// and autorotate are boolean, and other absent parameters are null. `wrong` has a sentence for each invalid parameter;
-// invalid addresses become "", an invalid exposure null.
+// Parses what follows "?". Returns {content, poster, title, camera, exposure, gaussians, noui, autorotate, wrong}: the
+// flags noui and autorotate are boolean, and other absent parameters are null. `wrong` has a sentence for each invalid
+// parameter; invalid addresses become "", an invalid exposure or number null.
 export function parseSearch(search) {
   const parameters = new URLSearchParams(search), wrong = [];
   const readAddress = (name, what) => {
@@ -47,6 +47,10 @@ export function parseSearch(search) {
   if (exposure !== null && !EXPOSURES.includes(exposure)) {
     wrong.push(`The exposure in the address must be ${EXPOSURES.join(" or ")}, not ${shortenForMessage(exposure)}.`);
   }
+  const gaussians = parameters.get("gaussians"), isCount = /^[1-9]\d{0,8}$/.test(gaussians ?? "1");
+  if (!isCount) {
+    wrong.push(`The number of Gaussians in the address must be a whole number, not ${shortenForMessage(gaussians)}.`);
+  }
   const readFlag = (name) => {
     return parameters.has(name) && !["0", "false", "no", "off"].includes(parameters.get(name).toLowerCase());
   };
@@ -56,6 +60,7 @@ export function parseSearch(search) {
     title: parameters.get("title")?.trim().slice(0, MAX_TITLE_LETTERS) || null,
     camera: parameters.get("camera"),
     exposure: EXPOSURES.includes(exposure) ? exposure : null,
+    gaussians: gaussians !== null && isCount ? Number(gaussians) : null,
     noui: readFlag("noui"),
     autorotate: readFlag("autorotate"),
     wrong,

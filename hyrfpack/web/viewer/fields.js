@@ -31,17 +31,17 @@ export class Fields {
   }
 
   constructor(gl, model) {
-    const { count, height, antialiased, cells, balls } = model;
+    const { count, width = TEXTURE_WIDTH, height, antialiased, cells } = model;
     this.gl = gl;
     this.graphics = new Graphics(gl);
-    Object.assign(this, { model, count, height, antialiased, cells });
-    this.rows = new RowStates(balls);
+    Object.assign(this, { model, count, width, height, antialiased, cells });
+    this.rows = new RowStates(model.balls);
     this.pace = new WorkPacer();
   }
 
   // Uploads the model, and draws a coarse background for an eye.
   async prepare(eye) {
-    const { gl, graphics, model, height } = this, size = [TEXTURE_WIDTH, height];
+    const { gl, graphics, model, height } = this, size = [this.width, height];
     Fields.check(gl, model);
     const words = (...more) => graphics.texture(gl.TEXTURE_2D, gl.RGBA32UI, ...size, ...more);
     this.places = words();
@@ -49,17 +49,13 @@ export class Fields {
     this.colors = graphics.texture(gl.TEXTURE_2D, gl.RG32UI, ...size);
     this.layers = Math.ceil(model.radiance.levels.length / LEVELS_PER_LAYER);
     this.features = graphics.texture(gl.TEXTURE_2D_ARRAY, gl.RGBA32UI, ...size, this.layers);
-    const floats = [gl.RGBA32F, gl.RGBA, gl.FLOAT, 4];
     await graphics.whenDone();
     const { sky, ...shaders } = this.shaders(), programs = {}, vertexText = readText("whole.vert");
     for (const name of Object.keys(shaders)) programs[name] = graphics.compile(vertexText, shaders[name]);
     programs.enlarge = graphics.program("whole.vert", "enlarge.frag");
     Object.assign(this, { programs, skyShader: sky });
 
-    this.explicit = await graphics.table(floats, TEXTURE_WIDTH, model.explicit);
-    this.logits = await graphics.table(floats, TEXTURE_WIDTH, model.logits);
-    this.pixelSizes = await graphics.table([gl.R32F, gl.RED, gl.FLOAT, 1], TEXTURE_WIDTH, model.pixelSizes);
-    model.explicit = model.logits = model.pixelSizes = null; // frees memory; the worker can decode them again
+    await this.uploadGaussians();
     this.geometry = await this.field(model.geometry);
     this.radiance = await this.field(model.radiance);
     await graphics.whenDone();
@@ -72,6 +68,15 @@ export class Fields {
       this.panorama = new Panorama(graphics, model, (...area) => this.drawPanorama(...area));
       await this.panorama.begin(eye, programs.enlarge);
     }
+  }
+
+  // Uploads the numbers of the Gaussians that `evaluate` reads.
+  async uploadGaussians() {
+    const { gl, graphics, model } = this, floats = [gl.RGBA32F, gl.RGBA, gl.FLOAT, 4];
+    this.explicit = await graphics.table(floats, TEXTURE_WIDTH, model.explicit);
+    this.logits = await graphics.table(floats, TEXTURE_WIDTH, model.logits);
+    this.pixelSizes = await graphics.table([gl.R32F, gl.RED, gl.FLOAT, 1], TEXTURE_WIDTH, model.pixelSizes);
+    model.explicit = model.logits = model.pixelSizes = null; // frees memory; the worker can decode them again
   }
 
   // Prepares the background of views at rest, which the first picture does without.
@@ -172,10 +177,10 @@ export class Fields {
 
   // Draws a pass to rows of its target. Adjacent rows are drawn together.
   passes(target, rows) {
-    const wide = this.height === 1 ? this.count : TEXTURE_WIDTH, sorted = [...rows].sort((a, b) => a - b);
+    const wide = this.height === 1 ? this.count : this.width, sorted = [...rows].sort((a, b) => a - b);
     for (let k = 0, start = 0; k < sorted.length; k++) {
       if (sorted[k + 1] === sorted[k] + 1) continue;
-      this.area(target, [TEXTURE_WIDTH, this.height], [0, sorted[start], wide, k + 1 - start]);
+      this.area(target, [this.width, this.height], [0, sorted[start], wide, k + 1 - start]);
       start = k + 1;
     }
   }

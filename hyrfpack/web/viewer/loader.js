@@ -29,13 +29,7 @@ export class Loader {
     const refusal = workerAddress
       ? `The player's worker ${workerAddress} cannot be started; it must be a script on the same site as the page.`
       : NO_EMBEDDED_WORKER_TEXT;
-    const receive = (message) => {
-      if (message.progress) this.progress(message.progress);
-      if (message.content) this.deliver(message.content);
-      if (message.order) this.sorted(message.order);
-      if (message.answer) this.answered(message.answer);
-      if (message.error) this.fail(new Error(message.error));
-    };
+    const receive = (message) => this.receive(message);
     // An error without a message means that the worker's script was not allowed to run.
     const fail = (message) => this.fail(message ? new Error(message) : new StartError(refusal));
     try {
@@ -46,6 +40,20 @@ export class Loader {
     this.delivered = Promise.resolve();
     this.broken = false; // true if no more of the file will arrive; the part that was shown can be decoded again
     this.pending = []; // {resolve, reject} of the promises of `expect`
+  }
+
+  // Handles a message of the worker.
+  receive(message) {
+    if (message.progress) this.progress(message.progress);
+    if (message.content) this.deliver(message.content);
+    if (message.order) this.sorted(message.order);
+    if (message.answer) this.answered(message.answer);
+    if (message.error) this.fail(new Error(message.error));
+  }
+
+  // Returns an object that evaluates and draws the models of a content, or null for the player's own.
+  makeContent() {
+    return null;
   }
 
   // Calls `content` after the call for the previous content has ended.

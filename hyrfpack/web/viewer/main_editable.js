@@ -2,5 +2,6 @@
 
 import { Editor } from "./edit/editor.js";
 import { startPage } from "./page.js";
+import { STREAMING } from "./stream/stream_loader.js";
 
-startPage((parts) => new Editor(parts));
+startPage({ startEditing: (parts) => new Editor(parts), streaming: STREAMING });

@@ -80,7 +80,7 @@ export class Opener {
       progress(0);
       const file = await fetchFile();
       if (thisOpen !== this.openCount) return;
-      this.loading = { title: name ?? file.name.replace(/\.\w+$/, ""), isOwn };
+      this.loading = { title: name ?? file.name.replace(/\.\w+$/, ""), isNamed: name !== null, isOwn };
       await this.player.open(file);
       postToParent("load");
     } catch (error) {

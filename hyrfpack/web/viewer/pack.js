@@ -44,29 +44,16 @@ export function packSplats(splats) {
 
 // Packs a model that hyrf/index.js has read for fields.js.
 export function packModel(model) {
-  const { metadata, config, count, positions, colorLogits, scaleLogits, opacityLogits, geometry, radiance } = model;
-  const height = countRows(count);
-  const explicit = new Float32Array(4 * TEXTURE_WIDTH * height), logits = new Float32Array(4 * TEXTURE_WIDTH * height);
-  for (let i = 0, p = 0, q = 0; i < count; i++, p += 3, q += 4) {
-    explicit[q] = positions[p];
-    explicit[q + 1] = positions[p + 1];
-    explicit[q + 2] = positions[p + 2];
-    explicit[q + 3] = opacityLogits[i];
-    logits[q] = colorLogits[p];
-    logits[q + 1] = colorLogits[p + 1];
-    logits[q + 2] = colorLogits[p + 2];
-    logits[q + 3] = scaleLogits[i];
-  }
+  const { metadata, config, count, geometry, radiance } = model;
   const field = (which, { table, decoder }) => ({
     table,
     levels: gridLevels(config[which]).map((level) => [level.resolution, level.first, level.rows, Number(level.dense)]),
     decoder: packDecoder(decoder, decoderLayout(config, which)),
   });
   return {
-    count, height, explicit, logits,
-    pixelSizes: pixelSizes(positions, metadata),
+    count, height: countRows(count),
+    ...packGaussians(model, TEXTURE_WIDTH),
     backgroundSpacing: backgroundSpacing(metadata),
-    balls: rowBalls(positions, TEXTURE_WIDTH),
     geometry: field("geometry", geometry),
     radiance: field("radiance", radiance),
     cells: Math.ceil(config.hidden / UNITS_PER_CELL),
@@ -78,6 +65,25 @@ export function packModel(model) {
     background: config.background,
     finest: config.radiance.finest,
   };
+}
+
+// Packs the Gaussians of a model for textures that are `width` wide.
+export function packGaussians({ metadata, count, positions, colorLogits, scaleLogits, opacityLogits }, width) {
+  const texels = width * Math.max(1, Math.ceil(count / width));
+  const explicit = new Float32Array(4 * texels), logits = new Float32Array(4 * texels);
+  const sizes = new Float32Array(texels);
+  sizes.set(pixelSizes(positions, metadata));
+  for (let i = 0, p = 0, q = 0; i < count; i++, p += 3, q += 4) {
+    explicit[q] = positions[p];
+    explicit[q + 1] = positions[p + 1];
+    explicit[q + 2] = positions[p + 2];
+    explicit[q + 3] = opacityLogits[i];
+    logits[q] = colorLogits[p];
+    logits[q + 1] = colorLogits[p + 1];
+    logits[q + 2] = colorLogits[p + 2];
+    logits[q + 3] = scaleLogits[i];
+  }
+  return { explicit, logits, pixelSizes: sizes, balls: rowBalls(positions, width) };
 }
 
 // Returns the positions of several parts (3 N each) as one array, in which each part begins a row of the textures.

@@ -71,7 +71,7 @@ function showPage() {
   postToParent("start");
 }
 
-function start(startEditing) {
+function start({ startEditing = () => {}, streaming = null }) {
   showPage();
   // In a folder, hyrfpack.web.player writes the constant EMBEDDED_TEXTS in front of this script.
   const isInFolder = typeof EMBEDDED_TEXTS !== "undefined";
@@ -83,7 +83,9 @@ function start(startEditing) {
   const served = element("content") ? JSON.parse(elementText("content")) : null;
 
   const poster = showPoster(parameters, embedded, served);
-  const player = new Player(element("view"), { scene: embedded, workerAddress }), help = new Help();
+  const maxGaussians = parameters.gaussians;
+  const player = new Player(element("view"), { scene: embedded, workerAddress, streaming, maxGaussians });
+  const help = new Help();
   const navigation = new Navigation(player, {
     keyTarget: window,
     isEmbedded: window.parent !== window,
@@ -165,6 +167,7 @@ function start(startEditing) {
   player.addEventListener("opened", ({ detail }) => {
     navigation.stop();
     opener.shown = opener.loading;
+    if (detail.isStreamed && !opener.shown.isNamed) opener.shown.title = detail.title; // the manifest has it
     panel.describe(detail, opener.shown.title);
     element("credit").hidden = !(opener.shown.isOwn && isCredited);
     if (opener.shown.isOwn) followNamedCamera();
@@ -236,10 +239,10 @@ function start(startEditing) {
 }
 
 // Starts the page. `startEditing(parts)` is called with its player, navigation, panel, opener, and the name of its file
-// if the page states it, and returns the editor.
-export function startPage(startEditing = () => {}) {
+// if the page states it, and returns the editor. `streaming` is for Player.
+export function startPage(options = {}) {
   try {
-    start(startEditing);
+    start(options);
   } catch (error) {
     document.body.classList.add("bare"); // hides the controls, which would have no effect
     fail(error);

@@ -38,9 +38,12 @@ const DEVICE_LOST_TEXT = "Meanwhile the graphics device was lost, or another sce
 
 export class Player extends EventTarget {
   // A player without a scene gets one from `open`. `workerAddress` is that of the worker's script, or null for the
-  // embedded one. Throws an Error with a message for the user if the browser cannot draw.
-  constructor(canvas, { scene = null, workerAddress = null } = {}) {
+  // embedded one. `streaming` is the module stream/stream_loader.js of players that open scene folders, else null, and
+  // `maxGaussians` their budget, null for the default one. Throws an Error with a message for the user if the browser
+  // cannot draw.
+  constructor(canvas, { scene = null, workerAddress = null, streaming = null, maxGaussians = null } = {}) {
     super();
+    Object.assign(this, { streaming, maxGaussians });
     this.canvas = canvas;
     this.workerAddress = workerAddress;
     this.renderer = new Renderer(canvas);
@@ -118,11 +121,12 @@ export class Player extends EventTarget {
     }
   }
 
-  // Opens a file, {name, stream}. `stage` has its {cameras, up, target} if they are known. `update` is true for a newer
-  // version of the scene that is shown: then the eye stays, and only errors are reported.
-  async open({ name, stream, stage = null, update = false }) {
+  // Opens a file, {name, stream, address}; `address` is needed for manifests of scene folders. `stage` has its
+  // {cameras, up, target} if they are known. `update` is true for a newer version of the scene that is shown: then the
+  // eye stays, and only errors are reported.
+  async open({ name, stream, address = null, stage = null, update = false }) {
     try {
-      await this.receive({ name, stream, stage, picture: null, update });
+      await this.receive({ name, stream, address, stage, picture: null, update });
     } catch (error) {
       const isForUser = error instanceof StartError || error instanceof SupersededError;
       throw isForUser ? error : new Error(`${name} cannot be opened: ${error.message}`);
@@ -130,19 +134,21 @@ export class Player extends EventTarget {
   }
 
   // Loads a file and shows it.
-  async receive({ name = "", scene = null, stage = null, stream, picture, update = false }) {
+  async receive({ name = "", scene = null, stage = null, stream, address = null, picture, update = false }) {
     // The page's own file is kept, and shown if this one fails.
     if (this.loader || this.previous) this.next?.dispose();
     else this.previous = this.next;
-    const loader = new Loader({
+    const isStreamed = address !== null && this.streaming?.isManifest(address);
+    const loader = new (isStreamed ? this.streaming.StreamLoader : Loader)({
       content: (content) => this.install(loader, content),
       progress: ({ what, part }) => this.progress(loader, what, part),
       workerAddress: this.workerAddress,
+      player: this,
     });
     Object.assign(loader, { picture, part: 0, scene, remark: "", update });
     this.next = loader;
     try {
-      await loader.read({ name, scene, stage, plain: scene?.plain ?? false, stream });
+      await loader.read({ name, scene, stage, plain: scene?.plain ?? false, stream, address });
     } catch (error) {
       if (this.loader === loader) {
         this.whole = true; // no more of the file will arrive
@@ -181,7 +187,7 @@ export class Player extends EventTarget {
   }
 
   // Uploads a content that the worker has read, and then shows it instead of the old one. Returns whether it is shown.
-  async install(loader, { number, whole, scene, models, splats, picture }) {
+  async install(loader, { number, whole, scene, models, splats, picture, chunks }) {
     const { gl } = this.renderer, initial = loader.scene ? null : initialView(scene);
     let content = null, staged = null;
     try {
@@ -190,7 +196,8 @@ export class Player extends EventTarget {
       await loader.picture?.decode();
       gl.getError(); // clears earlier errors
       if (models) {
-        content = models.length > 1 ? new MergedFields(gl, models) : new Fields(gl, models[0]);
+        content = loader.makeContent(gl, models, chunks) ??
+          (models.length > 1 ? new MergedFields(gl, models) : new Fields(gl, models[0]));
         const view = this.view(loader.update && sameAxes(this.scene, scene) ? this.eye : initial?.eye);
         await content.prepare(view.eye);
         // The first picture is shown before it is complete, but a picture is replaced by complete ones only.
@@ -405,6 +412,7 @@ export class Player extends EventTarget {
     if (this.movers.map((mover) => mover.advance(seconds)).some(Boolean)) this.changed();
     this.before = this.driven ? now : null;
     this.sort();
+    if (this.renderer.content.fade?.()) this.stale = true;
     const moving = this.moving, scale = this.scale;
     if (this.stale || this.shown !== scale) {
       const view = this.view(), { content } = this.renderer;

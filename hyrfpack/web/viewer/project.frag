@@ -30,6 +30,8 @@ uniform float u_tolerance; // band around the picture in which centres may lie, 
 uniform float u_pick; // > 0: instead of a colour, z / (z + u_pick)
 uniform vec4 u_flat; // instead, this colour for all splats, if alpha is 1
 uniform int u_first_row; // of the target
+uniform highp sampler2D u_weights; // of each row of splats, in [0, 1], while levels of detail fade
+uniform bool u_weighted; // take these
 
 layout(location = 0) out uvec4 o_shape; // centre x, y in pixels; covariance xx, xy
 layout(location = 1) out uvec4 o_look; // covariance yy; its determinant; halves red, green; halves blue, opacity
@@ -103,6 +105,10 @@ void main() {
     uvec4 shape = texelFetch(u_shapes, place, 0);
     vec2 last = unpackUnorm2x16(packed.w);
     float opacity = last.x;
+    float weight = u_weighted ? texelFetch(u_weights, ivec2(0, place.y), 0).x : 1.0;
+    if (weight <= 0.0) return;
+    // Equal opacities whose weights add up to 1 let as much light through as one of them.
+    if (weight < 1.0) opacity = 1.0 - pow(max(1.0 - opacity, 1e-6), weight);
     vec3 scales = exp(vec3(unpackUnorm2x16(shape.z), last.y) * 44.0 - 22.0);
     vec4 quat = vec4(unpackSnorm2x16(shape.x), unpackSnorm2x16(shape.y));
     quat /= max(length(quat), 1e-12);

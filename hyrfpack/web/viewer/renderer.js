@@ -60,7 +60,7 @@ export class Renderer {
   // Creates all objects for drawing a content (`Splats` or `Fields`), which `show` uses. They are freed with the
   // content. `picture` is the background's picture (see `background`), or null.
   stage(content, scene, picture) {
-    const { gl } = this, { graphics } = content, size = [TEXTURE_WIDTH, content.height];
+    const { gl } = this, { graphics, width = TEXTURE_WIDTH, height } = content, size = [width, height];
     const order = graphics.texture(gl.TEXTURE_2D, gl.R32UI, ...size);
     const shapes = graphics.texture(gl.TEXTURE_2D, gl.RGBA32UI, ...size);
     const appearances = graphics.texture(gl.TEXTURE_2D, gl.RGBA32UI, ...size);
@@ -92,9 +92,9 @@ export class Renderer {
   // Uploads an order: indices of splats, farthest first, of which the first `drawn` are drawn. It fills whole rows of
   // the texture.
   sorted(order, drawn) {
-    const { gl } = this, rows = Math.ceil(drawn / TEXTURE_WIDTH);
+    const { gl, tableSize: [width] } = this, rows = Math.ceil(drawn / width);
     gl.bindTexture(gl.TEXTURE_2D, this.order);
-    if (rows) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, TEXTURE_WIDTH, rows, gl.RED_INTEGER, gl.UNSIGNED_INT, order);
+    if (rows) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, width, rows, gl.RED_INTEGER, gl.UNSIGNED_INT, order);
     this.drawn = drawn;
   }
 
@@ -240,13 +240,15 @@ export class Renderer {
     const { gl, graphics, project: p, scene } = this, { colors, harmonics } = content;
     const [across, down] = view.scales ?? [1, 1];
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.projection);
-    gl.viewport(0, firstRow, TEXTURE_WIDTH, content.height);
+    gl.viewport(0, firstRow, this.tableSize[0], content.usedHeight ?? content.height);
     gl.useProgram(p.program);
     gl.uniform1i(p.u_first_row, firstRow);
     gl.uniform4f(p.u_flat, ...(flat ?? [0, 0, 0]), flat ? 1 : 0);
     const colored = colors ? { u_colors: colors } : this.unused;
     graphics.bind(p, { u_places: content.places, u_shapes: content.shapes, ...colored });
     graphics.bind(p, harmonics ? { u_harmonics: harmonics } : this.noLayers, gl.TEXTURE_2D_ARRAY, 3);
+    graphics.bind(p, { u_weights: content.weights ?? this.plain }, gl.TEXTURE_2D, 4);
+    gl.uniform1i(p.u_weighted, content.weights ? 1 : 0);
     gl.uniform1i(p.u_colored, colors ? 1 : 0);
     gl.uniform1i(p.u_degree, content.degree ?? 0);
     gl.uniform1f(p.u_range, content.range ?? 1);

@@ -1,5 +1,5 @@
-// Reads a scene's bytes from an address, a file or memory, as {name, stream}; the stream is an async iterable of
-// Uint8Array, whose `length` is the number of bytes, or 0 if that is unknown.
+// Reads a scene's bytes from an address, a file or memory, as {name, stream, address}; the stream is an async iterable
+// of Uint8Array, whose `length` is the number of bytes, or 0 if that is unknown. Only fetched files have an address.
 
 const FROM_DISK_TEXT = "a page opened from the disk may not read files; drop the file on the page, or serve both";
 // A sandbox without allow-same-origin makes every server, even the page's own, another site.
@@ -44,7 +44,8 @@ export async function fetchedFile(address) {
   }
   // For a compressed transfer, Content-Length is not the length of the file.
   const length = answer.headers.get("Content-Encoding") ? 0 : Number(answer.headers.get("Content-Length")) || 0;
-  return { name, stream: Object.assign(downloaded(address, name, answer, length), { length }) };
+  const stream = Object.assign(downloaded(address, name, answer, length), { length });
+  return { name, stream, address: answer.url || address };
 }
 
 // Returns a file that the user chose.

@@ -7,6 +7,7 @@ import { SupersededError } from "./loader.js";
 import { Navigation } from "./navigation.js";
 import { Player } from "./player.js";
 import { openSource } from "./source.js";
+import { STREAMING } from "./stream/stream_loader.js";
 
 const EVENTS = ["ready", "progress", "error", "camera", "ignored"];
 const INTERACTIONS = ["after-click", "always", "none"];
@@ -21,7 +22,7 @@ export const createViewer = (options) => new Viewer(options);
 class Viewer {
   constructor({
     container, src = null, name, camera = null, exposure = AS_PHOTOGRAPHED, autorotate = false,
-    interaction = "after-click", loading = "eager", title = "3D scene", workerUrl = null,
+    interaction = "after-click", loading = "eager", title = "3D scene", workerUrl = null, maxGaussians = null,
   }) {
     this.container = typeof container === "string" ? document.querySelector(container) : container;
     if (!(this.container instanceof Element)) throw new Error("createViewer needs a container: element or selector.");
@@ -34,7 +35,7 @@ class Viewer {
     this.canvas.setAttribute("role", interaction === "none" ? "img" : "application");
     this.canvas.setAttribute("aria-label", title);
     const workerAddress = workerUrl && new URL(workerUrl, document.baseURI).href;
-    this.player = new Player(this.canvas, { workerAddress });
+    this.player = new Player(this.canvas, { workerAddress, streaming: STREAMING, maxGaussians });
     this.player.exposure = exposure;
     this.navigation = new Navigation(this.player, {
       keyTarget: interaction === "none" ? null : this.canvas,

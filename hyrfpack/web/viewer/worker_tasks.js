@@ -13,6 +13,7 @@
 //     {ask: {ticket, select}}                draw only the Gaussians that these selections keep, see selection.js
 //     {ask: {ticket, decode}}                return the file: its bytes or, if `decode`, {model, kept}
 //     {close}                                the reader is no longer needed
+// and those of stream/scene_stream.js.
 // Messages from the worker:
 //     {progress: {what, part}}
 //     {content: {number, whole, scene, models | splats, picture}}   see pack.js
@@ -36,11 +37,13 @@ const FIRST_LAYER_DELAY_MS = 150; // if the rest of the file arrives in this tim
 const HARMONICS_DEGREE = 3;
 
 // Starts to handle messages. `readSplats(name, bytes)` decodes files of splats, like decodeSplats in formats/index.js.
-export function startWorker(readSplats) {
+// `Stream` reads scene folders, like SceneStream in stream/scene_stream.js; null where no page asks for one.
+export function startWorker(readSplats, Stream = null) {
   const services = new Map(); // number of a reader -> its Service
   onmessage = ({ data: { reader, ...message } }) => {
     if (!services.has(reader)) {
-      services.set(reader, new Service(readSplats, (answer, buffers) => postMessage({ reader, ...answer }, buffers)));
+      const post = (answer, buffers) => postMessage({ reader, ...answer }, buffers);
+      services.set(reader, new Service(readSplats, Stream, post));
     }
     const service = services.get(reader);
     if (message.close) services.delete(reader);
@@ -50,14 +53,15 @@ export function startWorker(readSplats) {
 
 // Reads files and sorts their splats for one player. `post(message, buffers)` sends a message to it.
 class Service {
-  constructor(readSplats, post) {
-    this.readSplats = readSplats;
+  constructor(readSplats, Stream, post) {
+    Object.assign(this, { readSplats, Stream });
     this.isClosed = false;
     this.post = (message, buffers) => {
       if (!this.isClosed) post(message, buffers);
     };
     this.sorter = new ContentSorter(this.post);
     this.reader = null;
+    this.stream = null;
   }
 
   handle(message) {
@@ -65,10 +69,12 @@ class Service {
     if (message.bytes) this.reader.receive(message.bytes);
     if (message.end) this.reader.end();
     if (message.broken) this.reader.interrupt();
-    if (message.again) this.reader.decodeAgain(message.again.plain);
+    if (message.again) this.reader?.decodeAgain(message.again.plain);
     if (message.use !== undefined) this.sorter.use(message.use);
     if (message.sort) this.sorter.sort(message.sort);
     if (message.ask) this.answer(message.ask);
+    if (message.stream) this.stream = new this.Stream(message.stream, this.sorter, this.post);
+    else this.stream?.handle(message);
     if (message.close) this.isClosed = true;
   }
 
@@ -238,9 +244,9 @@ class ContentSorter {
     return this.sorters.get(this.selected).positions;
   }
 
-  // Adds a content by its number and the positions of its splats (3 N).
-  add(number, positions) {
-    this.sorters.set(number, new DepthSort(positions, TEXTURE_WIDTH));
+  // Adds a content by its number, the positions of its splats (3 N) and the width of its textures.
+  add(number, positions, width = TEXTURE_WIDTH) {
+    this.sorters.set(number, new DepthSort(positions, width));
   }
 
   // Selects the content to sort, and drops older ones.

@@ -18,6 +18,12 @@ export declare class RowStates {
         fresh: number;
         rows: number[];
     };
+    /**
+     * Replaces the Gaussians of a row. They have no colours yet.
+     * @param {number} row
+     * @param {Float32Array} ball around them, from `rowBalls`
+     */
+    replace(row: number, ball: Float32Array): void;
     /** Returns the rows that have no colours yet. */
     fresh(): number[];
     /**

@@ -1,0 +1,392 @@
+// Reads a scene folder as views need it, in the worker: fetches the coarsest level of all chunks first and then, by
+// priority, the levels that suit the view within a budget of Gaussians; decodes them, and drops what is not needed when
+// memory is short.
+//
+// Messages to the worker, beside those in worker_tasks.js; `number` is that of the content:
+//     {stream: {manifest, address, name, stage, gaussians, maxRows}}   open the scene with the text `manifest` from
+//                                            `address`, with at most `gaussians` in a view, in textures of at most
+//                                            `maxRows` rows
+//     {look: {ticket, view}}                 choose levels for a view
+//     {gaussians}                            another budget
+//     {uploaded: {number, chunk, level}}     a level can be drawn
+//     {faded: {number, chunk}}               of a `swap`, only the last level is still drawn
+//     {again}                                send the content again, because the graphics device was lost
+// Messages from the worker:
+//     {content: {..., chunks}}               the content, and the levels that are drawn at once
+//     {chunk: {number, chunk, level, rows, explicit, logits, pixelSizes, balls}}   a level to upload to these rows
+//     {swap: {number, chunk, from, to}}      fade from the rows of one level to those of another one
+//     {state: {ticket, isComplete, gaussians, bytes, problem}}   of the view with this ticket; `problem` is a sentence
+
+import { HyrfFormatError } from "../../hyrf/errors.js";
+import { read } from "../../hyrf/index.js";
+import { chooseLevels, predictErrors } from "../../hyrf/levels.js";
+import { parseManifest } from "../../hyrf/manifest.js";
+import { viewpointOf } from "../../hyrf/viewpoint.js";
+import { cameraOf } from "../camera.js";
+import { packGaussians, packModel } from "../pack.js";
+import { modelScene } from "../scene.js";
+import { ABSENT, ChunkLevels, READY, UNUSABLE, UPLOADING } from "./chunk_levels.js";
+import { FileQueue } from "./file_queue.js";
+import { RowPool } from "./row_pool.js";
+
+const ROW_WIDTH = 256; // of the textures: each level begins a row, and the coarsest ones are small
+const FIRST_PICTURE_BYTES = 200_000; // that are fetched before the first picture is drawn, if they have a chunk
+const MEMORY_RATIO = 1.25; // memory for Gaussians in budgets, because levels that fade are there twice
+const EXTRA_ROWS_PER_CHUNK = 2; // for the coarsest level, and for rows that are not full
+const MAX_FIRST_LOSSES = 3; // of the connection before the first picture; then what is there is drawn
+const MIN_UPDATE_MS = 20; // between two updates, so that many events cause only one
+
+const countRows = (gaussians) => Math.max(1, Math.ceil(gaussians / ROW_WIDTH));
+
+export class SceneStream {
+  // `sorter` sorts the Gaussians (see worker_tasks.js), and `post` sends messages.
+  constructor(request, sorter, post) {
+    Object.assign(this, { request, sorter, post });
+    this.number = 0; // of the content
+    this.gaussians = request.gaussians;
+    this.problems = new Map(); // name of an unusable file -> the reason
+    this.isOpening = false; // whether the content is being prepared
+    this.isShown = false; // whether it was sent
+    this.shared = null; // the bytes of the shared file
+    this.early = []; // [file, bytes] that came before the shared file
+    this.isOutdated = true; // whether levels must be chosen again
+    this.isShort = false; // whether a wanted level does not fit into memory
+    this.decoding = 0; // the number of files that are being decoded
+    this.timer = null; // of the next update
+    this.updateMs = 0; // the time that the last update took
+    this.resume = () => this.queue.resume();
+    try {
+      this.open();
+    } catch (error) {
+      post({ error: error.message });
+    }
+  }
+
+  // Reads the manifest and starts to fetch files.
+  open() {
+    const { manifest: text, address, maxRows } = this.request, manifest = parseManifest(text), { chunks } = manifest;
+    const extra = EXTRA_ROWS_PER_CHUNK * chunks.length;
+    this.manifest = manifest;
+    this.chunks = chunks.map((chunk, number) => new ChunkLevels(number, chunk, countRows));
+    this.costs = chunks.map(({ levels }) => levels.map(({ gaussians }) => gaussians));
+    this.places = new Map(); // name of a file -> [number of the chunk, level]
+    chunks.forEach(({ levels }, number) => levels.forEach(({ file }, level) => this.places.set(file, [number, level])));
+    const all = this.chunks.reduce((sum, { levels }) => levels.reduce((rows, { rowCount }) => rows + rowCount, sum), 0);
+    this.rowCount = Math.max(1, Math.min(all, maxRows, countRows(MEMORY_RATIO * this.gaussians) + extra));
+    // A device with small textures has a smaller budget.
+    this.maxGaussians = all <= this.rowCount ? Infinity : ((this.rowCount - extra) * ROW_WIDTH) / MEMORY_RATIO;
+    this.view = { ticket: 0, camera: firstCamera(manifest) };
+    this.queue = new FileQueue(new URL(".", address).href, {
+      received: (file, bytes) => this.receive(file, bytes),
+      failed: (file, reason) => this.reject(file, reason),
+      changed: () => this.schedule(),
+    });
+    self.addEventListener("online", this.resume);
+    this.clear();
+    this.update();
+  }
+
+  // Empties the memory for Gaussians.
+  clear() {
+    this.number++;
+    this.isShown = false;
+    this.pool = new RowPool(this.rowCount);
+    this.positions = new Float32Array(3 * ROW_WIDTH * this.rowCount).fill(NaN); // which are not drawn
+    this.sorter.add(this.number, this.positions, ROW_WIDTH);
+    for (const chunk of this.chunks) chunk.clear();
+  }
+
+  handle({ look, gaussians, uploaded, faded, again, close }) {
+    if (close) return this.close();
+    if (look) this.view = { ticket: look.ticket, camera: cameraOf(look.view, this.scene) };
+    if (gaussians) this.gaussians = gaussians;
+    if (look || gaussians) this.isOutdated = true;
+    if (uploaded?.number === this.number) this.chunks[uploaded.chunk].get(uploaded.level).state = READY;
+    if (faded?.number === this.number) this.endFade(this.chunks[faded.chunk]);
+    if (again && this.scene) this.clear();
+    if (look || gaussians || uploaded || faded || again) this.schedule();
+  }
+
+  close() {
+    this.queue?.close();
+    clearTimeout(this.timer);
+    self.removeEventListener("online", this.resume);
+  }
+
+  // Updates soon. Choosing levels of many chunks takes long, so it leaves time for sorting.
+  schedule() {
+    this.timer ??= setTimeout(() => this.update(), Math.max(MIN_UPDATE_MS, 2 * this.updateMs));
+  }
+
+  // Chooses levels, and does what is to be done next.
+  update() {
+    this.timer = null;
+    const began = performance.now();
+    if (this.isOutdated) this.chooseLevels();
+    if (this.isShown) {
+      for (const chunk of this.chunks) this.swap(chunk, chunk.next(this.isShort));
+      this.fetchWanted();
+      this.postState();
+    } else if (!this.isOpening) {
+      this.fetchFirst();
+    }
+    this.updateMs = performance.now() - began;
+  }
+
+  // Chooses the level of each chunk that suits the view.
+  chooseLevels() {
+    const { manifest, chunks, view: { camera } } = this, now = performance.now();
+    const isUsable = (number, level) => chunks[number].get(level).state !== UNUSABLE;
+    this.errors = predictErrors(manifest, camera);
+    const limit = Math.min(this.gaussians, this.maxGaussians);
+    chooseLevels(this.costs, this.errors, limit, isUsable).levels.forEach((level, number) => {
+      chunks[number].target = level;
+      if (level >= 0) chunks[number].get(level).usedAt = now;
+    });
+    this.isOutdated = false;
+    this.chosenTicket = this.view.ticket;
+  }
+
+  // Fades a chunk to a level.
+  swap(chunk, level) {
+    if (chunk.fading || level === chunk.shown) return;
+    const from = chunk.shown, { rows: to } = chunk.get(level);
+    chunk.fading = { from, to: level };
+    this.show(chunk, level);
+    this.post({ swap: { number: this.number, chunk: chunk.number, from: chunk.get(from)?.rows ?? [], to } });
+  }
+
+  endFade(chunk) {
+    const { from } = chunk.fading ?? { from: -1 };
+    if (from >= 0) this.setPositions(chunk.get(from), null);
+    chunk.fading = null;
+  }
+
+  // Adds a level to what is sorted.
+  show(chunk, level) {
+    chunk.shown = level;
+    this.setPositions(chunk.get(level), chunk.get(level).positions);
+  }
+
+  // Sets the positions (3 N) of a level's Gaussians, or hides them if `positions` is null.
+  setPositions({ rows }, positions) {
+    rows.forEach((row, k) => {
+      const first = 3 * ROW_WIDTH * row;
+      this.positions.fill(NaN, first, first + 3 * ROW_WIDTH);
+      if (positions) this.positions.set(positions.subarray(3 * ROW_WIDTH * k, 3 * ROW_WIDTH * (k + 1)), first);
+    });
+  }
+
+  // ---- files
+
+  // Fetches what the first picture needs, and sends it once it is there.
+  fetchFirst() {
+    const { shared } = this.manifest, coarsest = this.chunks.map((chunk) => coarsestUsable(chunk)).filter(Boolean);
+    const rank = ({ chunk, level }) => this.errors[chunk.number][level.level];
+    coarsest.sort((a, b) => rank(b) - rank(a));
+    let bytes = this.request.manifest.length + shared.bytes;
+    const first = coarsest.filter(({ level }, place) => {
+      bytes += level.file.bytes;
+      return !place || bytes <= FIRST_PICTURE_BYTES;
+    });
+    const missing = first.filter(({ level }) => level.state === ABSENT).map(({ level }) => level.file);
+    this.queue.want(this.shared ? missing : [shared, ...missing]);
+    const read = first.length - missing.length;
+    this.post({ progress: { what: "loading", part: read / Math.max(1, first.length) } });
+    const hasLost = this.queue.losses > MAX_FIRST_LOSSES;
+    if (this.shared && (!missing.length || (hasLost && read))) this.postContent();
+    else if (hasLost) this.fail(`${new URL(this.queue.folder).host} does not answer; reload the page to try again`);
+  }
+
+  // Gives up, with a sentence for the user.
+  fail(sentence) {
+    this.close();
+    this.post({ error: sentence });
+  }
+
+  // Sends the content, with the levels that were read.
+  async postContent() {
+    this.isOpening = true;
+    const { number, manifest, request: { name, stage } } = this, model = await read(this.shared);
+    this.isOpening = false;
+    this.isShown = true;
+    const described = modelScene({ ...model, count: manifest.gaussians }, manifest.title || name);
+    this.scene = { ...described, ...stage, exposure: model.exposure, isStreamed: true };
+    const packed = { ...packModel(model), explicit: null, logits: null, pixelSizes: null, balls: null };
+    const layout = { width: ROW_WIDTH, height: this.rowCount, count: ROW_WIDTH * this.rowCount };
+    const chunks = [];
+    for (const chunk of this.chunks) {
+      for (const level of chunk.levels.filter(({ packed }) => packed)) {
+        chunks.push({ number, chunk: chunk.number, level: level.level, rows: level.rows, ...level.packed });
+        level.packed = null;
+      }
+      if (chunk.next(false) >= 0) this.show(chunk, chunk.next(false));
+    }
+    const content = { number, whole: true, scene: this.scene, models: [{ ...packed, ...layout }], chunks };
+    const { geometry, radiance } = packed;
+    this.post({ content }, [geometry.table.buffer, radiance.table.buffer, ...chunks.flatMap(listBuffers)]);
+    this.schedule();
+  }
+
+  // Fetches the coarsest levels, and those that suit the view, as far as they fit into memory.
+  fetchWanted() {
+    const wanted = [];
+    for (const chunk of this.chunks) {
+      const { number, target, shown, coarsest } = chunk, errors = this.errors[number];
+      const isWanted = (level) => chunk.get(level)?.state === ABSENT;
+      if (isWanted(coarsest)) wanted.push({ level: chunk.get(coarsest), isFirst: true, rate: errors[coarsest] });
+      if (target === coarsest || !isWanted(target)) continue;
+      const gain = errors[shown < 0 ? coarsest : shown] - errors[target], level = chunk.get(target);
+      wanted.push({ level, isFirst: false, rate: gain / level.file.bytes });
+    }
+    wanted.sort((a, b) => b.isFirst - a.isFirst || b.rate - a.rate);
+    let room = this.spareLevels().reduce((rows, { rowCount }) => rows + rowCount, this.pool.free);
+    const fitting = wanted.findIndex(({ level: { rowCount } }) => (room -= rowCount) < 0);
+    this.queue.want((fitting < 0 ? wanted : wanted.slice(0, fitting)).map(({ level }) => level.file));
+    if (this.isShort !== fitting >= 0) this.schedule();
+    this.isShort = fitting >= 0;
+  }
+
+  // Takes a file.
+  async receive(file, bytes) {
+    this.decoding++;
+    try {
+      if (file === this.manifest.shared) await this.receiveShared(bytes);
+      else await this.receiveChunk(file, bytes);
+    } catch (error) {
+      const isMemory = error instanceof RangeError; // thrown for arrays that are too long
+      this.reject(file, isMemory ? "there is not enough memory for it" : reasonOf(error));
+    }
+    this.decoding--;
+    this.schedule();
+  }
+
+  async receiveShared(bytes) {
+    const model = await read(bytes);
+    if (model.count) throw new HyrfFormatError("it holds Gaussians, and should hold only what chunks share");
+    this.config = canonicalText(model.config);
+    this.shared = bytes;
+    for (const [file, data] of this.early.splice(0)) this.receive(file, data);
+  }
+
+  async receiveChunk(file, bytes) {
+    if (!this.shared) {
+      this.early.push([file, bytes]);
+      return;
+    }
+    const [number, levelNumber] = this.places.get(file.file), level = this.chunks[number].get(levelNumber);
+    const content = this.number, model = await read(bytes, { openFile: (name) => this.openFile(name) });
+    if (model.count !== file.gaussians) {
+      throw new HyrfFormatError(`it has ${model.count} Gaussians, and the manifest says ${file.gaussians}`);
+    }
+    if (canonicalText(model.config) !== this.config) {
+      throw new HyrfFormatError(`its configuration is not that of ${this.manifest.shared.file}`);
+    }
+    if (content !== this.number || level.state !== ABSENT) return; // meanwhile the device was lost
+    const rows = this.takeRows(level.rowCount);
+    if (!rows) return; // meanwhile memory has become short; it is fetched again if it still suits the view
+    const packed = packGaussians(model, ROW_WIDTH);
+    Object.assign(level, { rows, positions: model.positions, state: this.isShown ? UPLOADING : READY });
+    if (this.isShown) {
+      const chunk = { number: content, chunk: number, level: levelNumber, rows, ...packed };
+      this.post({ chunk }, listBuffers(chunk));
+    } else {
+      level.packed = packed;
+    }
+  }
+
+  // Returns the bytes of the file that chunks refer to.
+  openFile(name) {
+    const { shared } = this.manifest;
+    if (name === shared.file) return this.shared;
+    throw new HyrfFormatError(`it refers to ${name}, and the manifest lists ${shared.file}`);
+  }
+
+  // Records that a file cannot be used.
+  reject({ file }, reason) {
+    if (file === this.manifest.shared.file) return this.fail(`${file}: ${reason}`);
+    this.problems.set(file, reason);
+    const [number, level] = this.places.get(file);
+    this.chunks[number].get(level).state = UNUSABLE;
+    this.isOutdated = true;
+    this.schedule();
+  }
+
+  // ---- memory
+
+  // Returns the levels that may be dropped, those first that no view has needed for the longest time.
+  spareLevels() {
+    const spare = this.chunks.flatMap((chunk) => chunk.levels.filter((level) => chunk.isSpare(level)));
+    return spare.sort((a, b) => a.usedAt - b.usedAt);
+  }
+
+  // Returns free rows for a level, or null if there are too few.
+  takeRows(count) {
+    for (const level of this.pool.free < count ? this.spareLevels() : []) {
+      this.drop(level);
+      if (this.pool.free >= count) break;
+    }
+    return this.pool.take(count);
+  }
+
+  // Frees the memory of a level that is not drawn.
+  drop(level) {
+    this.pool.give(level.rows);
+    level.clear();
+  }
+
+  // ---- state
+
+  // Sends what is loaded, if that has changed.
+  postState() {
+    const { queue, chunks } = this;
+    const isWorking = chunks.some(({ fading, levels }) => fading || levels.some(({ state }) => state === UPLOADING));
+    const isWaiting = this.isOutdated || this.decoding > 0 || (queue.wanted.length > 0 && !queue.isLost);
+    const isSettled = chunks.every((chunk) => chunk.next(this.isShort) === chunk.shown);
+    const state = {
+      ticket: this.chosenTicket,
+      isComplete: !isWorking && !isWaiting && isSettled && this.timer === null,
+      gaussians: chunks.reduce((sum, chunk) => sum + (chunk.get(chunk.shown)?.file.gaussians ?? 0), 0),
+      bytes: queue.bytes + this.request.manifest.length,
+      problem: this.describeProblems(),
+    };
+    const text = JSON.stringify(state);
+    if (text !== this.postedState) this.post({ state });
+    this.postedState = text;
+  }
+
+  // Returns a sentence for the user, "" if all is well.
+  describeProblems() {
+    const { queue: { isLost, folder }, problems: { size } } = this;
+    if (isLost) return `The connection to ${new URL(folder).host} is lost; loading goes on when it is back.`;
+    if (!size) return "";
+    const [[file, reason]] = this.problems;
+    const more = size > 1 ? `, nor can ${size - 1} other file${size > 2 ? "s" : ""} of the scene` : "";
+    return `${file} cannot be shown: ${reason}${more}; the rest of the scene is shown.`;
+  }
+}
+
+// Returns the first camera of a scene, in world units, as far as its manifest says.
+function firstCamera({ viewpoint, cameras, frame }) {
+  const { center, scale } = frame ?? {}, isFrame = Array.isArray(center) && center.every(Number.isFinite) && scale > 0;
+  const usedFrame = isFrame ? frame : { center: [0, 0, 0], scale: 1 };
+  return viewpointOf({ provenance: { viewpoint, cameras }, config: { frame: usedFrame } }).cameras[0];
+}
+
+// Returns the coarsest level of a chunk whose file is usable, or null.
+function coarsestUsable(chunk) {
+  const level = chunk.levels.findLast(({ state }) => state !== UNUSABLE);
+  return level ? { chunk, level } : null;
+}
+
+// Returns the message of an error as the end of a sentence.
+const reasonOf = ({ message }) => message[0].toLowerCase() + message.slice(1).replace(/\.$/, "");
+
+// Returns a text that is the same for the same JSON value.
+const canonicalText = (value) =>
+  JSON.stringify(value, (_, inner) => {
+    const isObject = typeof inner === "object" && inner !== null && !Array.isArray(inner);
+    return isObject ? Object.fromEntries(Object.entries(inner).sort()) : inner;
+  });
+
+const listBuffers = (chunk) => Object.values(chunk).filter(ArrayBuffer.isView).map(({ buffer }) => buffer);

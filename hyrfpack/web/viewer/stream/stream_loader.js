@@ -1,0 +1,155 @@
+// Connects the player with the worker's SceneStream, which reads a scene folder as views need it.
+//
+// Events of the player, beside its own:
+//     "streamed"   detail: {isComplete, gaussians, bytes, problem} of the view: whether all levels that suit it are
+//                  drawn, the number of Gaussians drawn, the bytes received, and a sentence, "" for none
+
+import { Loader } from "../loader.js";
+import { StreamedFields } from "./streamed_fields.js";
+
+export const DEFAULT_GAUSSIANS = 2_000_000;
+export const DEFAULT_PHONE_GAUSSIANS = 500_000;
+const MIN_GAUSSIANS = 100_000; // that slow frames leave
+const PHONE_QUERY = "(pointer: coarse) and (max-width: 600px), (pointer: coarse) and (max-height: 600px)";
+const MANIFEST_NAME = "scene.json";
+const MAX_MANIFEST_BYTES = 2 ** 24;
+const MOVING_LOOK_MS = 150; // between two choices of levels while the view moves
+const ADAPTATION_MS = 1000; // between two changes of the budget
+// The budget falls where frames are slow at this part of the resolution, and rises where they are quick at full one.
+const LOW_RESOLUTION_RATIO = 0.5, SLOW_FRAME_MS = 43, QUICK_FRAME_MS = 20;
+const FEWER_RATIO = 0.8, MORE_RATIO = 1.25;
+
+// Returns whether an address is that of a scene's manifest.
+const isManifest = (address) => new URL(address).pathname.endsWith(".json");
+
+class StreamLoader extends Loader {
+  // `player` shows the scene.
+  constructor({ player, ...options }) {
+    super(options);
+    this.player = player;
+    this.fields = null; // the StreamedFields that are drawn
+    this.state = null; // from the worker
+    this.lastLook = { key: "", ticket: 0, at: 0 };
+    this.most = player.maxGaussians ?? (matchMedia(PHONE_QUERY).matches ? DEFAULT_PHONE_GAUSSIANS : DEFAULT_GAUSSIANS);
+    this.gaussians = this.most; // the present budget
+    this.adaptedAt = 0;
+    this.onFrame = ({ detail }) => this.adapt(detail);
+    player.addEventListener("frame", this.onFrame);
+  }
+
+  // Opens the scene whose manifest `stream` yields.
+  async read({ name, address, stage, stream }) {
+    const manifest = await gather(stream), { gaussians } = this, maxRows = this.player.renderer.largest[1];
+    const shown = this.expect(), [folder] = decodeURI(new URL(address).pathname).split("/").slice(-2);
+    const ownName = name === MANIFEST_NAME && folder ? folder : name;
+    this.post({ stream: { manifest, address, name: ownName, stage, gaussians, maxRows } });
+    return shown;
+  }
+
+  post(message) {
+    this.connection.post(message);
+  }
+
+  receive(message) {
+    super.receive(message);
+    const { chunk, swap, state } = message;
+    // A content is installed before its levels are handled.
+    if (chunk || swap) this.delivered.then(() => this.updateLevels(chunk, swap));
+    if (state) this.setState(state);
+  }
+
+  // Handles a level that has arrived, or one that is to be drawn instead of another one.
+  updateLevels(chunk, swap) {
+    if ((chunk ?? swap).number !== this.current) return; // of a content that was lost with the device
+    if (chunk) this.fields.arrive(chunk).catch(() => {}); // the device was lost
+    if (!swap) return;
+    this.fields.swap(swap);
+    this.redraw();
+  }
+
+  setState(state) {
+    const before = this.state;
+    this.state = state;
+    if (state.problem !== (before?.problem ?? "")) {
+      this.remark = state.problem;
+      this.player.emit("remark", state.problem);
+    }
+    this.player.emit("streamed", state);
+  }
+
+  makeContent(gl, [model], chunks) {
+    this.fields = new StreamedFields(gl, model, chunks, this);
+    return this.fields;
+  }
+
+  sorted(answer) {
+    super.sorted(answer);
+    if (answer.number === this.current) this.fields.receiveOrder();
+  }
+
+  // Sends the content again. Harmonics cannot be fitted to a scene that is loaded in parts.
+  again(plain) {
+    if (plain) this.fail(new Error(`${this.remark.split(": ")[1]} Open the scene as one file`));
+    else this.post({ again: true });
+  }
+
+  ask() {
+    const text = "A scene folder cannot be edited here; edit the file that hyrfpack decompress joins.";
+    return Promise.reject(new Error(text));
+  }
+
+  // ---- for StreamedFields
+
+  // Chooses levels for a view. Returns the number of the choice.
+  look(view, isMoving) {
+    const { lastLook } = this, { rows, eye, width, height, fx, fy, cx, cy } = view, now = performance.now();
+    const key = [rows, eye, width, height, fx, fy, cx, cy].join();
+    if (key === lastLook.key || (isMoving && now < lastLook.at + MOVING_LOOK_MS)) return lastLook.ticket;
+    this.lastLook = { key, ticket: lastLook.ticket + 1, at: now };
+    this.post({ look: { ticket: this.lastLook.ticket, view } });
+    return this.lastLook.ticket;
+  }
+
+  // Returns whether the worker has sent all that suits the last view, if `ticket` is that of it.
+  isComplete(ticket) {
+    return Boolean(this.state?.isComplete) && this.state.ticket === ticket;
+  }
+
+  // Draws another order of Gaussians.
+  redraw() {
+    this.player.unsorted = true;
+    this.player.redraw();
+  }
+
+  // Adapts the budget to the ms that a frame of a moving view takes.
+  adapt(ms) {
+    const { player: { automatic, coarse, scene }, most } = this, now = performance.now();
+    if (!automatic || !this.fields || now < this.adaptedAt + ADAPTATION_MS) return;
+    const isSlow = coarse <= LOW_RESOLUTION_RATIO && ms > SLOW_FRAME_MS, isQuick = coarse === 1 && ms < QUICK_FRAME_MS;
+    const ratio = isSlow ? FEWER_RATIO : isQuick ? MORE_RATIO : 1, present = Math.min(this.gaussians, scene.count);
+    const gaussians = Math.min(most, Math.max(Math.min(MIN_GAUSSIANS, most), Math.round(ratio * present)));
+    if (ratio === 1 || gaussians === this.gaussians) return;
+    Object.assign(this, { gaussians, adaptedAt: now });
+    this.post({ gaussians });
+  }
+
+  dispose() {
+    this.player.removeEventListener("frame", this.onFrame);
+    super.dispose();
+  }
+}
+
+// What the player needs to open scene folders.
+export const STREAMING = { StreamLoader, isManifest };
+
+// Returns all bytes of a stream, of which a manifest may have few.
+async function gather(stream) {
+  const parts = [];
+  let length = 0;
+  for await (const bytes of stream) {
+    length += bytes.length;
+    if (length > MAX_MANIFEST_BYTES) throw new Error("The manifest is too long");
+    parts.push(bytes);
+  }
+  return new Uint8Array(await new Blob(parts).arrayBuffer());
+}

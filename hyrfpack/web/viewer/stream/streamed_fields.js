@@ -1,0 +1,170 @@
+// Evaluates and draws the chunks of a scene folder. They lie in the rows of one set of textures, so that all of them
+// are sorted and blended together. One level of a chunk fades into another over several frames.
+
+import { Fields } from "../fields.js";
+import { eachRun } from "./row_pool.js";
+
+const FADE_MS = 400;
+const MAX_FADE_STEP = 1 / 3; // of a frame, so that slow devices show a fade, too
+const MAX_FRAME_WAIT_MS = 1000; // where no frames are drawn for this time, as in a hidden page, fades end at once
+const POLL_MS = 30;
+
+export class StreamedFields extends Fields {
+  // `model` has the fields and the size of the textures. `chunks` are the levels that are drawn at once. `events` is a
+  // StreamLoader.
+  constructor(gl, model, chunks, events) {
+    super(gl, { ...model, balls: new Float32Array(4 * model.height).fill(NaN) });
+    Object.assign(this, { chunks, events });
+    this.rowWeights = new Float32Array(this.height);
+    this.usedHeight = 1; // rows from here on were never used
+    this.fades = new Map(); // number of a chunk -> the last `swap` of it, its `part`, and whether it `isSorted`
+    this.fadedAt = 0; // when the fades last went on
+    this.arrivals = []; // levels that are to be uploaded
+    this.isUploading = false;
+    this.isDisposed = false;
+  }
+
+  // Creates the textures of the Gaussians, and uploads those of the first levels.
+  async uploadGaussians() {
+    const { gl, graphics, width, height } = this;
+    const create = (format) => graphics.texture(gl.TEXTURE_2D, format, width, height);
+    [this.explicit, this.logits, this.pixelSizes] = [gl.RGBA32F, gl.RGBA32F, gl.R32F].map(create);
+    this.weights = graphics.texture(gl.TEXTURE_2D, gl.R32F, 1, height);
+    for (const chunk of this.chunks) {
+      this.upload(chunk);
+      this.setWeights(chunk.rows, 1);
+      await graphics.whenDone();
+    }
+    this.uploadWeights();
+  }
+
+  async prepare(eye) {
+    await super.prepare(eye);
+    this.pending = new Set(this.chunks.flatMap(({ rows }) => rows));
+    this.chunks = null; // frees memory
+    this.eye = eye;
+  }
+
+  // Uploads the Gaussians of a level to its rows.
+  upload({ rows, explicit, logits, pixelSizes, balls }) {
+    const { gl, width } = this, floats = [[this.explicit, gl.RGBA, 4, explicit], [this.logits, gl.RGBA, 4, logits]];
+    for (const [texture, format, size, numbers] of [...floats, [this.pixelSizes, gl.RED, 1, pixelSizes]]) {
+      gl.bindTexture(gl.TEXTURE_2D, texture);
+      eachRun(rows, (first, count, place) => {
+        const part = numbers.subarray(place * width * size, (place + count) * width * size);
+        gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, first, width, count, format, gl.FLOAT, part);
+      });
+    }
+    rows.forEach((row, place) => this.rows.replace(row, balls.subarray(4 * place, 4 * place + 4)));
+    this.usedHeight = Math.max(this.usedHeight, ...rows.map((row) => row + 1));
+  }
+
+  // Uploads a level that has arrived, and evaluates it, after those before it.
+  async arrive(chunk) {
+    this.arrivals.push(chunk);
+    if (this.isUploading) return;
+    this.isUploading = true;
+    const goOn = () => !this.isDisposed && !this.graphics.lost;
+    while (this.arrivals.length && goOn()) {
+      const next = this.arrivals.shift(), { rows, number, chunk: place, level } = next;
+      this.upload(next);
+      for (const row of rows) this.pending.add(row);
+      const isColoured = await this.coloring(rows, this.eye, { goOn });
+      if (isColoured) this.events.post({ uploaded: { number, chunk: place, level } });
+    }
+    this.isUploading = false;
+  }
+
+  // Starts to fade from one level to another one.
+  swap(swap) {
+    this.fades.set(swap.chunk, { ...swap, part: 0, isSorted: false });
+    this.fadedAt = performance.now();
+  }
+
+  // Lets the fades begin whose new levels are in the order that has arrived.
+  receiveOrder() {
+    for (const fade of this.fades.values()) fade.isSorted = true;
+  }
+
+  // Continues the fades by a frame. Returns whether the picture has changed.
+  fade(largestStep = MAX_FADE_STEP) {
+    const fades = [...this.fades.values()].filter(({ isSorted }) => isSorted), now = performance.now();
+    if (!fades.length) return false;
+    const step = Math.min(largestStep, Math.max(now - this.fadedAt, 1) / FADE_MS);
+    this.fadedAt = now;
+    for (const fade of fades) {
+      fade.part = Math.min(1, fade.part + step);
+      this.setWeights(fade.from, 1 - fade.part);
+      this.setWeights(fade.to, fade.part);
+      if (fade.part === 1) this.endFade(fade);
+    }
+    this.uploadWeights();
+    if (this.sky) this.sky.key = null; // another part of the background may be visible
+    return true;
+  }
+
+  endFade({ number, chunk }) {
+    this.fades.delete(chunk);
+    this.events.post({ faded: { number, chunk } });
+  }
+
+  setWeights(rows, weight) {
+    for (const row of rows) this.rowWeights[row] = weight;
+  }
+
+  uploadWeights() {
+    const { gl, rowWeights, usedHeight } = this;
+    gl.bindTexture(gl.TEXTURE_2D, this.weights);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, 1, usedHeight, gl.RED, gl.FLOAT, rowWeights.subarray(0, usedHeight));
+  }
+
+  // For these methods see Fields.
+
+  recolor(view, margin, ms, follows) {
+    this.look(view, true);
+    super.recolor(view, margin, ms, follows);
+  }
+
+  // Waits until the levels that suit the view are drawn.
+  async complete(view, margin, options) {
+    const { goOn = () => true, changed = () => {}, exact = false } = options, ticket = this.look(view);
+    const isUploaded = () => !this.arrivals.length && !this.isUploading;
+    const isDone = () => this.events.isComplete(ticket) && isUploaded() && !this.fades.size;
+    while (!isDone()) {
+      const { rows } = await this.coloured(view, margin, { goOn, report: () => {}, exact });
+      if (rows) changed();
+      if (!goOn() || this.isDisposed) return false;
+      await new Promise((resolve) => setTimeout(resolve, POLL_MS));
+      if (!goOn() || this.isDisposed) return false;
+      if (this.fades.size && performance.now() > this.fadedAt + MAX_FRAME_WAIT_MS) this.endFades();
+    }
+    return super.complete(view, margin, options);
+  }
+
+  // Ends all fades at once.
+  endFades() {
+    this.receiveOrder();
+    this.fadedAt = 0;
+    this.fade(1);
+    this.events.redraw();
+  }
+
+  // Chooses levels for a view, at most a few times a second if it `isMoving`. Returns the number of the choice.
+  look(view, isMoving = false) {
+    this.eye = view.eye;
+    return this.events.look(view, isMoving);
+  }
+
+  // Rows out of view were coloured when they arrived.
+  async lookAhead(view, goOn) {
+    await this.panorama?.complete(view, goOn);
+  }
+
+  // Does nothing: more levels may arrive.
+  freeInputs() {}
+
+  dispose() {
+    this.isDisposed = true;
+    super.dispose();
+  }
+}

@@ -1,0 +1,143 @@
+"""The player shows scene folders as their chunks arrive, and says in one sentence which files it cannot show."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from web.pages import Browser, psnr, render_in_page, wait_for_message, wait_until, window_camera
+from web.site import Site
+from web.test_element import ELEMENT_JS, LOADED_JS, open_element
+
+import hyrfpack
+from hyrfpack.config.split import SplitConfig
+from hyrfpack.context import RunContext
+from hyrfpack.lod import split, split_model
+from hyrfpack.scene import Camera
+
+pytestmark = [pytest.mark.in_turn, pytest.mark.usefixtures("reset_window")]
+SCENE_FOLDER = Path(__file__).parents[1] / "golden" / "scene"
+TRAINED_FILE = SCENE_FOLDER.parent / "trained" / "demo_compact.hyrf"
+SHARED_PATH, MANIFEST_PATH = "/scene/shared.hyrf", "/scene/scene.json"
+MIN_PSNR_DB = 45  # WebGL evaluates the fields with smaller numbers
+
+
+@pytest.fixture
+def scene_host(host: Site) -> Site:
+    host.files |= {f"/scene/{file.name}": file.read_bytes() for file in SCENE_FOLDER.iterdir()}
+    return host
+
+
+def open_scene(browser: Browser, host: Site) -> None:
+    browser.open(f"{host.address}/index.html?content=scene/scene.json")
+
+
+def test_a_scene_folder_is_drawn_as_python_renders_it(browser: Browser, scene_host: Site):
+    scene = hyrfpack.SceneFolder(SCENE_FOLDER)
+    viewpoint = scene.manifest.viewpoint
+    camera = Camera(120, 90, 129.0, 129.0, 60.0, 45.0, np.array(viewpoint["camera_from_world"]))
+    open_scene(browser, scene_host)
+    browser.evaluate("hyrfpack.ready")
+    picture = render_in_page(browser, camera)
+    reference = np.clip(np.asarray(hyrfpack.render_view(scene.load(), camera).rgb) * 255, 0, 255)
+    assert psnr(picture.astype(float), reference) > MIN_PSNR_DB
+    assert browser.evaluate("document.title").startswith(scene.manifest.title)
+
+
+def test_a_missing_shared_file_is_named(browser: Browser, scene_host: Site):
+    del scene_host.files[SHARED_PATH]
+    open_scene(browser, scene_host)
+    assert wait_for_message(browser) == "scene.json cannot be opened: shared.hyrf: it is missing"
+
+
+def test_a_file_with_another_size_than_the_manifest_says_is_named(browser: Browser, scene_host: Site):
+    manifest = json.loads(scene_host.files[MANIFEST_PATH])
+    manifest["chunks"][0]["levels"][0]["bytes"] -= 8
+    scene_host.files[MANIFEST_PATH] = json.dumps(manifest).encode()
+    open_scene(browser, scene_host)
+    wait_until(browser, "document.getElementById('remark').textContent.includes('it is longer than the 1,208 bytes')")
+    assert browser.evaluate("document.getElementById('message').hidden")
+
+
+@pytest.fixture(scope="module")
+def levels_folder(tmp_path_factory) -> hyrfpack.SceneFolder:
+    """Return a scene folder of four chunks at two levels."""
+    path = tmp_path_factory.mktemp("stream") / "demo-scene"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(split, "REFIT_CAMERAS", 1)
+        patch.setattr(split, "MEASURED_VIEWS", 2)
+        config = SplitConfig(chunk_gaussians=400, levels=2, refit_steps=3)
+        split_model(TRAINED_FILE, path, config, context=RunContext(progress=None))
+    return hyrfpack.SceneFolder(path)
+
+
+def serve_levels(host: Site, folder: hyrfpack.SceneFolder) -> None:
+    host.files |= {f"/levels/{file.name}": file.read_bytes() for file in folder.path.iterdir()}
+
+
+def open_levels(browser: Browser, host: Site, budget: int) -> None:
+    """Open the served scene folder with a budget of Gaussians, and wait for the first picture."""
+    browser.open(f"{host.address}/index.html?content=levels/scene.json&gaussians={budget}")
+    browser.evaluate("hyrfpack.ready")
+
+
+def wait_until_complete(browser: Browser) -> dict:
+    wait_until(browser, "Boolean(hyrfpack.player.loader.state?.isComplete)", 60)
+    return browser.evaluate("hyrfpack.player.loader.state")
+
+
+def count_gaussians(folder: hyrfpack.SceneFolder, level: int) -> int:
+    return sum(chunk.levels[level].gaussians for chunk in folder.manifest.chunks)
+
+
+@pytest.mark.acceptance
+def test_the_budget_decides_which_levels_are_drawn(browser: Browser, host: Site, levels_folder):
+    coarsest, finest = (count_gaussians(levels_folder, level) for level in (-1, 0))
+    budget = (coarsest + finest) // 2
+    serve_levels(host, levels_folder)
+    open_levels(browser, host, budget)
+    state = wait_until_complete(browser)
+    chosen = hyrfpack.select_levels(levels_folder.manifest, window_camera(browser), gaussians=budget)
+    assert coarsest < state["gaussians"] == chosen.gaussians <= budget
+    assert not state["problem"]
+
+
+class DyingServer(dict):
+    """Files of a server whose connections break from the first request of a finest level on."""
+
+    def __init__(self, host: Site) -> None:
+        super().__init__(host.files)
+        self.host = host
+
+    def get(self, path: str, default: bytes | None = None) -> bytes | None:
+        if path.endswith("-0.hyrf"):
+            self.host.breaks, self.host.always = 0, True
+        return super().get(path, default)
+
+
+@pytest.mark.acceptance
+def test_a_connection_that_is_lost_after_the_first_picture_is_named_and_found_again(
+    browser: Browser, host: Site, levels_folder
+):
+    finest = count_gaussians(levels_folder, 0)
+    serve_levels(host, levels_folder)
+    host.files = DyingServer(host)
+    open_levels(browser, host, finest)
+    wait_until(browser, "document.getElementById('remark').textContent.includes('loading goes on when it is back')")
+    assert browser.evaluate("hyrfpack.player.loader.state.gaussians") == count_gaussians(levels_folder, -1)
+    host.files, host.breaks, host.always = dict(host.files), None, False
+    wait_until(browser, f"hyrfpack.player.loader.state.gaussians === {finest}", 60)
+    assert not wait_until_complete(browser)["problem"]
+
+
+@pytest.mark.acceptance
+def test_the_element_streams_a_scene_folder(browser: Browser, host: Site, levels_folder):
+    serve_levels(host, levels_folder)
+    open_element(browser, host, 'src="levels/scene.json"')
+    wait_until(browser, LOADED_JS, 30)
+    wait_until(browser, f"{ELEMENT_JS}.viewer.player.loader.state?.isComplete === true", 60)
+    state = browser.evaluate(f"{ELEMENT_JS}.viewer.player.loader.state")
+    assert state["gaussians"] == browser.evaluate(f"{ELEMENT_JS}.viewer.scene.count")
+    assert browser.list_errors() == []
