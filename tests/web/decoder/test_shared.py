@@ -19,8 +19,8 @@ from tools.safety.fuzz_browser import read_in_javascript
 from tools.safety.make_golden import GOLDEN_SCENE_FOLDER
 
 READ_CHUNKS_SCRIPT = Path(__file__).with_name("read_chunks.mjs")
-CHUNK, SHARED = "chunk-0000-0.hyrf", "shared.hyrf"
-SECTIONS = ("POSI", "COLO", "SCAL", "OPAC", "GTAB", "GMLP", "RTAB", "RMLP")
+CHUNK_FILE_NAME, SHARED_FILE_NAME = "chunk-0000-0.hyrf", "shared.hyrf"
+SECTION_TAGS = ("POSI", "COLO", "SCAL", "OPAC", "GTAB", "GMLP", "RTAB", "RMLP")
 BAD_NAMES = [b"../shared.hyrf", b"", b".hyrf", b"a\0.hyrf", b"shared.txt", b"x" * 70 + b".hyrf", b"shared.hyrf\n"]
 
 
@@ -53,8 +53,8 @@ def make_folders(folder: Path, chunks: list[bytes], shared: list[bytes]) -> list
     paths = []
     for number, (chunk, other) in enumerate(zip(chunks, shared, strict=True)):
         (folder / str(number)).mkdir()
-        (folder / str(number) / SHARED).write_bytes(other)
-        paths.append(folder / str(number) / CHUNK)
+        (folder / str(number) / SHARED_FILE_NAME).write_bytes(other)
+        paths.append(folder / str(number) / CHUNK_FILE_NAME)
         paths[-1].write_bytes(chunk)
     return paths
 
@@ -62,19 +62,19 @@ def make_folders(folder: Path, chunks: list[bytes], shared: list[bytes]) -> list
 def test_a_chunk_has_the_bits_and_the_provenance_that_python_reads(tmp_path: Path):
     for copy in ("first", "second"):
         shutil.copytree(GOLDEN_SCENE_FOLDER, tmp_path / copy)
-    path = tmp_path / "first" / CHUNK
+    path = tmp_path / "first" / CHUNK_FILE_NAME
 
-    answers = run_script(READ_CHUNKS_SCRIPT, path, path, tmp_path / "second" / CHUNK)
+    answers = run_script(READ_CHUNKS_SCRIPT, path, path, tmp_path / "second" / CHUNK_FILE_NAME)
 
     arrays, model = to_arrays(load_model(path)), load_model(path)
     for answer in answers:
-        assert answer["count"] == len(model) and answer["opened"] == [SHARED]
-        assert answer["hashes"] == [hashlib.sha256(arrays[tag].tobytes()).hexdigest() for tag in SECTIONS]
+        assert answer["count"] == len(model) and answer["opened"] == [SHARED_FILE_NAME]
+        assert answer["hashes"] == [hashlib.sha256(arrays[tag].tobytes()).hexdigest() for tag in SECTION_TAGS]
         assert answer["hasMap"] and answer["provenance"] == describe_file(path)["provenance"]
 
 
 def test_references_that_python_refuses_are_refused(tmp_path: Path):
-    chunk, shared = ((GOLDEN_SCENE_FOLDER / name).read_bytes() for name in (CHUNK, SHARED))
+    chunk, shared = ((GOLDEN_SCENE_FOLDER / name).read_bytes() for name in (CHUNK_FILE_NAME, SHARED_FILE_NAME))
     cases = {
         **{f"name {name!r}": (with_section(chunk, "GTAB", rename(name)), shared) for name in BAD_NAMES},
         "two names": (with_section(chunk, "GTAB", rename(b"other.hyrf")), shared),
@@ -99,7 +99,7 @@ def test_references_that_python_refuses_are_refused(tmp_path: Path):
 
 def test_damaged_groups_of_a_table_are_refused(tmp_path: Path):
     """The reference has the checksum of the damaged section, so that only the decoder can find the damage."""
-    shared = (GOLDEN_SCENE_FOLDER / SHARED).read_bytes()
+    shared = (GOLDEN_SCENE_FOLDER / SHARED_FILE_NAME).read_bytes()
     table = read_container(shared)["RTAB"]
     cases = []
     for data in (b"", b"\xff" * 4 + bytes(table.data[4:]), bytes(table.data[:4]), bytes(table.data[:-1])):
@@ -112,7 +112,7 @@ def test_damaged_groups_of_a_table_are_refused(tmp_path: Path):
 
 
 def test_the_bytes_of_a_chunk_alone_are_refused_with_the_way_to_open_it():
-    chunk = (GOLDEN_SCENE_FOLDER / CHUNK).read_bytes()
+    chunk = (GOLDEN_SCENE_FOLDER / CHUNK_FILE_NAME).read_bytes()
 
     (verdict,) = read_in_javascript([(chunk, False)])
 
