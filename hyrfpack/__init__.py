@@ -41,6 +41,7 @@ if _TOO_LATE:
 if TYPE_CHECKING:
     from hyrfpack.bench.suite import BenchReport as BenchReport
     from hyrfpack.bench.suite import benchmark_model as benchmark_model
+    from hyrfpack.blocks import train_blocks as train_blocks
     from hyrfpack.compress import CompressionReport as CompressionReport
     from hyrfpack.compress import compress_model as compress_model
     from hyrfpack.config.compress import CompressConfig as CompressConfig
@@ -111,6 +112,7 @@ if TYPE_CHECKING:
 _MODULES_BY_PUBLIC_NAME = {
     "BenchReport": "hyrfpack.bench.suite",
     "benchmark_model": "hyrfpack.bench.suite",
+    "train_blocks": "hyrfpack.blocks",
     "ComparisonReport": "hyrfpack.report",
     "compare_runs": "hyrfpack.report",
     "CompressionReport": "hyrfpack.compress",

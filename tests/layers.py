@@ -26,6 +26,8 @@ BROWSER_FIXTURES = {"browser", "one_browser", "start_browser"}
 TESTS_FOLDER = Path(__file__).parent
 LAYER_BY_PATH = {
     "": "integration",
+    "blocks/test_merge.py": "unit",
+    "blocks/test_plan.py": "unit",
     "cameras": "unit",
     "cli/test_processes.py": "acceptance",
     "compress/test_determinism.py": "acceptance",

@@ -58,6 +58,7 @@ def test_every_public_function_is_covered_here():
         "render_view",
         "save_model",
         "select_levels",
+        "train_blocks",
         "train_model",
     }
 
@@ -135,6 +136,7 @@ def test_a_former_function_name_raises_an_error_with_the_present_name():
 MISTAKEN_CALLS = [
     (lambda model, scene: hyrfpack.train_model("photos", "run"), "scene must be a Scene, not a str; .*load_scene"),
     (lambda model, scene: hyrfpack.train_model(scene, "run", {"steps": 3}), "config must be a TrainConfig, not a dict"),
+    (lambda model, scene: hyrfpack.train_blocks("photos", "run"), "scene must be a Scene, not a str; .*load_scene"),
     (
         lambda model, scene: hyrfpack.compress_model("m.hyrf", "a.hyrf", data="photos"),
         "data must be a Scene.*load_scene",

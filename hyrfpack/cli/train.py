@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -39,6 +40,12 @@ if TYPE_CHECKING:
 @scene_options
 @settings_options(TrainConfig, "background", "background_color", "exposure", "antialiased", "log2_table_size")
 @click.option(
+    "--blocks",
+    metavar="auto|NxM",
+    help="Train in blocks: divide the ground into N x M cells, and train them one after the other. auto takes as many "
+    "as memory asks for.",
+)
+@click.option(
     "--cache-mb",
     type=click.IntRange(min=1),
     metavar="MB",
@@ -61,6 +68,7 @@ def train(
     data: Path,
     out: Path,
     reader_options: dict[str, Any],
+    blocks: str | None,
     cache_mb: int | None,
     log: Path | None,
     view: bool,
@@ -83,6 +91,9 @@ def train(
     With --processes, torchrun or srun, several processes train together. In each step, each process renders a different
     photo, on its own GPU if there are GPUs. --steps counts photos, and --cache-mb is the total of a machine.
 
+    With --blocks, scenes larger than the memory are trained in parts and written as one file. --steps are those of each
+    block, and --max-gaussians is the total.
+
     RUN gets model.hyrf, metrics.json, the training curve and renders of held-out views. Ctrl-C saves a checkpoint and
     exits with code 1; so do SIGTERM and closing the terminal. --resume then gives the same model as an uninterrupted
     run.
@@ -96,6 +107,7 @@ def train(
       hyrfpack train photos/garden -o runs/garden --images images_4 --steps 30000 --resume
       hyrfpack train photos/desk -o runs/desk --poses
       hyrfpack train photos/garden -o runs/garden --processes 4
+      hyrfpack train photos/city -o runs/city --blocks 2x2
     """
     if resume and overwrite:
         raise click.UsageError("--resume continues a run and --overwrite replaces it; give one of them")
@@ -104,11 +116,15 @@ def train(
         raise click.UsageError(
             "--poses runs in one process only; run 'hyrfpack poses' first, then train from its folder"
         )
+    if blocks is not None and not ranks.is_single:
+        raise click.UsageError("--blocks trains in one process only; leave out --processes")
+    from hyrfpack.blocks.journal import is_begun as is_block_run_begun
+    from hyrfpack.blocks.run import train_blocks
     from hyrfpack.context import RunContext
     from hyrfpack.data import PictureCache
     from hyrfpack.device import describe_device
     from hyrfpack.format.run_folder import MODEL_FILE
-    from hyrfpack.train import train_model as run
+    from hyrfpack.train import train_model
     from hyrfpack.train.run import is_begun, resuming
 
     torch_device = choose_command_device(device, ranks)
@@ -126,11 +142,12 @@ def train(
     config, context = TrainConfig(**settings), RunContext(device=torch_device, ranks=ranks, cache=cache)
     with serve_training_view(out.name, view and ranks.is_main, view_port) as observer:
         try:
+            run = train_model if blocks is None else partial(train_blocks, blocks=blocks)
             result = run(
                 scene, out, config, resume=resume, overwrite=overwrite, observer=observer, log=log, context=context
             )
         except KeyboardInterrupt:
-            if not is_begun(out):
+            if not (is_begun(out) if blocks is None else is_block_run_begun(out)):
                 raise
             note(f"stopped; {resuming(overwrite)} continues")
             click.get_current_context().exit(1)

@@ -180,6 +180,11 @@ class Exposures:
         poses = [frame.local_pose(view.camera) for view in views]
         return fit_exposure_map(poses, self.values.detach().cpu().numpy())
 
+    def to_dict(self) -> dict[str, list[float]]:
+        """Return the three log gains of each photo, by its name."""
+        values = self.values.detach().cpu().tolist()
+        return {name: values[row] for name, row in self._row.items()}
+
     @torch.no_grad()
     def step(self, rate: float, views: Iterable[View]) -> Tensor:
         """Take one Adam step for the photos of these views, clear the gradients, and subtract the mean of all gains.

@@ -146,14 +146,7 @@ def save_model(trainer: Trainer, out: Path, progress: Progress, *, overwrite: bo
         "settings": config.to_dict(),
         "device": describe_device(trainer.device),
         "processes": trainer.ranks.size,
-        "scene": {
-            "path": scene.path,
-            "layout": scene.layout,
-            "train": len(scene.train),
-            "test": len(scene.test),
-            "max_size": scene.max_size,
-            "reading": dict(scene.reading),
-        },
+        "scene": scene_facts(scene),
         "choices": trainer.choices,
         "pilots": trainer.pilots,
         "notes": scene.notes,
@@ -163,6 +156,7 @@ def save_model(trainer: Trainer, out: Path, progress: Progress, *, overwrite: bo
         "steps_per_second": trainer.steps / max(trainer.elapsed, 1e-9),
         "stage_seconds": {name: round(value, 3) for name, value in sorted(trainer.seconds.items())},
         "curve": trainer.records,
+        "log_gains": {} if trainer.exposures is None else trainer.exposures.to_dict(),
     }
     digest = hashlib.sha256(data).hexdigest()
     record = TrainingRecord(MODEL_FILE, digest, trainer.step, _settings_of(scene, config), metrics)
@@ -252,6 +246,18 @@ def write_results(
     if not missing:
         _remove(out / RECORD_FILE)
     return Results(metrics, tuple(missing), tuple(reasons))
+
+
+def scene_facts(scene: Scene) -> dict[str, Any]:
+    """Return what `metrics.json` states about the photos of a run."""
+    return {
+        "path": scene.path,
+        "layout": scene.layout,
+        "train": len(scene.train),
+        "test": len(scene.test),
+        "max_size": scene.max_size,
+        "reading": dict(scene.reading),
+    }
 
 
 def _settings_of(scene: Scene, config: TrainConfig) -> dict[str, Any]:

@@ -66,6 +66,7 @@ ALL_CASES = [
     Case("poses hall -o {}", "hall/images"),
     Case("poses blender -o {}", "blender"),
     Case("train link-to-set -o {} --steps 2", "hall/images"),
+    Case("train hall -o {} --steps 2 --blocks 1x1", "hall/images"),
     Case("compress soft.hyrf -o {}", "hard.hyrf"),
     Case("compress first --profile paper -o {}", "first/model.hyrf"),
     Case("compress model.hyrf --data nerfstudio -o {}", "nerfstudio/images/new.hyrf"),

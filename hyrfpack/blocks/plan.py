@@ -1,0 +1,176 @@
+"""Assign the photos and points of a scene to blocks."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hyrfpack.blocks.cells import Cells, divide_ground
+from hyrfpack.errors import HyrfError
+from hyrfpack.format.sections import MAX_PARTS
+from hyrfpack.scene import Scene, View
+
+# A photo belongs to every block that holds at least this share of the points that it shows.
+MIN_PHOTO_SHARE = 0.1
+MIN_BLOCK_PHOTOS = 4  # A block with fewer is merged into the nearest one.
+_GRID_PATTERN = re.compile(r"([1-9]\d{0,3})x([1-9]\d{0,3})")
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """A part of the ground with the photos that train it.
+
+    Attributes:
+        name: name of its first cell.
+        cells: its cells, ascending; more than one if others were merged into it.
+        scene: the photos that show it, none of them held out, and the points that these photos show.
+    """
+
+    name: str
+    cells: tuple[int, ...]
+    scene: Scene
+
+
+@dataclass(frozen=True, eq=False)
+class BlockPlan:
+    """The division of a scene into blocks.
+
+    Attributes:
+        cells: the cells of all blocks.
+        blocks: the blocks, those with the most photos first.
+    """
+
+    cells: Cells
+    blocks: list[Block]
+
+    def core_mask(self, block: Block, positions: np.ndarray) -> np.ndarray:
+        """Return which positions (N, 3) lie in the cells of a block, (N,) bool."""
+        return np.isin(self.cells.find(positions), block.cells)
+
+
+def parse_grid(blocks: str) -> tuple[int, int]:
+    """Return the numbers of columns and rows that a text such as "2x3" states.
+
+    Raises:
+        HyrfError: the text is no grid, or has more cells than a file has parts.
+    """
+    match = _GRID_PATTERN.fullmatch(blocks)
+    if match is None:
+        raise HyrfError(
+            f"'{blocks}' is no grid of blocks", fix="use `blocks=auto`, or columns and rows as in `blocks=2x2`"
+        )
+    columns, rows = int(match[1]), int(match[2])
+    if columns * rows > MAX_PARTS:
+        raise HyrfError(
+            f"{blocks} are {columns * rows:,} blocks, and a file holds at most {MAX_PARTS} parts",
+            fix="use a smaller grid as `blocks`",
+        )
+    return columns, rows
+
+
+def plan_blocks(scene: Scene, columns: int, rows: int) -> BlockPlan:
+    """Divide a scene into at most columns x rows blocks.
+
+    A photo belongs to every block whose extended cell holds at least MIN_PHOTO_SHARE of the points that it shows, and
+    to the one whose cell holds most of them. A photo that shows no point belongs to the block that its camera stands
+    in. Blocks with fewer than MIN_BLOCK_PHOTOS photos are merged into the nearest one. The points of a block are those
+    in its cells, and all others that its photos show.
+
+    Raises:
+        HyrfError: the scene has no points, or too few photos for so many blocks.
+    """
+    photos = scene.train
+    if not len(scene.points):
+        raise HyrfError(
+            f"{scene.path}: there are no points, which say what each photo shows",
+            fix="train without `blocks`, or repeat the reconstruction",
+        )
+    if columns * rows > max(1, len(photos) // MIN_BLOCK_PHOTOS):
+        raise HyrfError(
+            f"{scene.path}: {len(photos)} training photos are too few for {columns}x{rows} blocks",
+            fix=f"use at most {max(1, len(photos) // MIN_BLOCK_PHOTOS)} blocks; each needs {MIN_BLOCK_PHOTOS} photos",
+        )
+    cells = divide_ground(scene, columns, rows)
+    core, seen = cells.find(scene.points), [visible_rows(scene, view) for view in photos]
+    member = _assign_photos(cells, scene.points, core, photos, seen)
+    blocks = []
+    for group in _merge_small_groups(cells, scene.points, core, member):
+        chosen = np.flatnonzero(member[:, group].any(axis=1))
+        used = np.isin(core, group)
+        for photo in chosen:
+            used[seen[photo]] = True
+        blocks.append(Block(cells.name(group[0]), tuple(group), _subset(scene, [photos[n] for n in chosen], used)))
+    return BlockPlan(cells, sorted(blocks, key=lambda block: (-len(block.scene.train), block.cells)))
+
+
+def visible_rows(scene: Scene, view: View) -> np.ndarray:
+    """Return the rows (M,) of the points that a photo shows: those of its tracks, or all in its picture without any."""
+    if scene.tracks:
+        return scene.tracks.get(view.name, np.zeros(0, np.int64))
+    camera = view.camera
+    x, y, z = camera.project(scene.points)
+    return np.flatnonzero((z > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height))
+
+
+def _assign_photos(
+    cells: Cells, points: np.ndarray, core: np.ndarray, photos: Sequence[View], seen: Sequence[np.ndarray]
+) -> np.ndarray:
+    """Return which photos belong to which cells, (photos, cells) bool."""
+    extended = cells.find_extended(points)
+    member = np.zeros((len(photos), cells.count), bool)
+    stands_in = cells.find(np.array([view.camera.position for view in photos]))
+    for photo, rows in enumerate(seen):
+        if not len(rows):
+            member[photo, stands_in[photo]] = True
+            continue
+        member[photo] = extended[rows].mean(axis=0) >= MIN_PHOTO_SHARE
+        member[photo, np.bincount(core[rows], minlength=cells.count).argmax()] = True
+    return member
+
+
+def _merge_small_groups(cells: Cells, points: np.ndarray, core: np.ndarray, member: np.ndarray) -> list[list[int]]:
+    """Return groups of cells that have enough photos; the smallest is merged into the nearest one until all have."""
+    groups = [[cell] for cell in range(cells.count)]
+    ground = points @ cells.axes.T
+    while len(groups) > 1:
+        counts = [int(member[:, group].any(axis=1).sum()) for group in groups]
+        if min(counts) >= MIN_BLOCK_PHOTOS:
+            break
+        small = groups.pop(counts.index(min(counts)))
+        here = _center(cells, ground, core, small)
+        distances = [float(np.linalg.norm(_center(cells, ground, core, group) - here)) for group in groups]
+        nearest = groups[distances.index(min(distances))]
+        nearest[:] = sorted(nearest + small)
+    return groups
+
+
+def _center(cells: Cells, ground: np.ndarray, core: np.ndarray, group: Sequence[int]) -> np.ndarray:
+    """Return the centre (2,) of a group of cells on the ground: the mean of its points, or of its inner borders."""
+    inside = np.isin(core, group)
+    if inside.any():
+        return ground[inside].mean(axis=0)
+    column, row = divmod(group[0], cells.row_borders.shape[1] - 1)
+    borders = cells.column_borders[column : column + 2], cells.row_borders[column, row : row + 2]
+    return np.array([inner[np.isfinite(inner)].mean() if np.isfinite(inner).any() else 0.0 for inner in borders])
+
+
+def _subset(scene: Scene, photos: list[View], used: np.ndarray) -> Scene:
+    """Return a scene of some photos, none of them held out, and the points where `used` (P,) is True."""
+    new_row = np.cumsum(used) - 1
+    tracks = {}
+    for view in photos:
+        rows = scene.tracks.get(view.name)
+        if rows is not None:
+            tracks[view.name] = new_row[rows[used[rows]]]
+    return replace(
+        scene,
+        train=photos,
+        test=[],
+        points=scene.points[used],
+        point_colors=scene.point_colors[used],
+        tracks=tracks,
+        reading={},
+    )

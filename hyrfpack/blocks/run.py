@@ -1,0 +1,289 @@
+"""Do a complete training run in blocks: divide the scene, train each block, and merge the results."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import logging
+import math
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from hyrfpack.atomic import write_atomic
+from hyrfpack.blocks.cells import ground_axes, ground_extent
+from hyrfpack.blocks.journal import BLOCKS_FOLDER, Journal, open_journal
+from hyrfpack.blocks.merge import merge_blocks
+from hyrfpack.blocks.plan import MIN_BLOCK_PHOTOS, Block, BlockPlan, parse_grid, plan_blocks
+from hyrfpack.checks import check_type
+from hyrfpack.config.train import TrainConfig
+from hyrfpack.context import RunContext
+from hyrfpack.data import PictureCache
+from hyrfpack.data.cache import memory_bytes
+from hyrfpack.data.preset import detect_preset
+from hyrfpack.device import describe_device
+from hyrfpack.errors import HyrfError
+from hyrfpack.evaluate import evaluate_model
+from hyrfpack.format.parts import load_model_or_parts
+from hyrfpack.format.run_folder import METRICS_FILE, MODEL_FILE
+from hyrfpack.format.sections import MAX_PARTS
+from hyrfpack.lock import exclusive_folder
+from hyrfpack.model.merged import parts_of
+from hyrfpack.progress import Progress, TaskEvent, items_of_progress
+from hyrfpack.scene import Scene
+from hyrfpack.train.checks import check_outputs, check_photos
+from hyrfpack.train.finish import TrainResult
+from hyrfpack.train.results import VIEWS_FOLDER, scene_facts
+from hyrfpack.train.run import Observer, resuming, train_model
+from hyrfpack.train.run import is_begun as is_run_begun
+from hyrfpack.train.setup import budget_for
+
+_LOG = logging.getLogger(__name__)
+
+# `auto` gives each block at most so many photos and bytes.
+MAX_BLOCK_PHOTOS = 500
+BYTES_PER_GAUSSIAN = 1_500  # Peak memory of training for each Gaussian of the budget.
+MAX_MEMORY_SHARE = 0.5  # of the device; photos and one view's pixels take the rest
+
+
+def train_blocks(
+    scene: Scene,
+    out: Path | str,
+    config: TrainConfig | None = None,
+    blocks: str = "auto",
+    *,
+    resume: bool = False,
+    overwrite: bool = False,
+    observer: Observer | None = None,
+    log: Path | str | None = None,
+    context: RunContext = RunContext(),  # noqa: B008 - frozen
+) -> TrainResult:
+    """Train a large scene in blocks, one after the other, and write them as one merged file.
+
+    The ground is divided into cells. Each block trains on all photos that show its cell, as a run of its own in
+    `blocks/`, and keeps the Gaussians in its cell. The folder gets `model.hyrf` (a merged file of profile raw, a part
+    for each block), `metrics.json` and `views/`, as by `train_model`. Memory is bounded by the largest block.
+
+    Args:
+        scene: the scene, from `hyrfpack.load_scene`.
+        out: the run's folder, created if missing.
+        config: settings of the run; None for the defaults. `steps` are those of each block. `max_gaussians` and
+            `target_bytes` are those of all blocks together. The pilot runs of the block with the most photos decide
+            `exposure` and `budget_factor` for all.
+        blocks: columns x rows of the grid, such as "2x2"; columns follow each other along the longer side of the
+            scene. "auto" takes as many as memory and photos ask for.
+        resume: resume an interrupted run; blocks that are finished are kept.
+        overwrite: replace an earlier run in the folder.
+        observer, log: see `hyrfpack.train_model`. The log of a block has its name in the name of the file.
+        context: device, progress and stop, see `hyrfpack.train_model`. Several processes are not supported.
+
+    Raises:
+        HyrfError: the grid does not suit the scene, or an error of `train_model`, which names the block.
+        TypeError: `scene` is no Scene or `config` no TrainConfig.
+
+    Example:
+        >>> import hyrfpack
+        >>> scene = hyrfpack.load_scene("photos/bonsai")
+        >>> quiet = hyrfpack.RunContext(progress=None)
+        >>> result = hyrfpack.train_blocks(scene, "runs/blocks", hyrfpack.TrainConfig(steps=5), "2x1", context=quiet)
+        >>> result.complete, result.step, [block["name"] for block in result.metrics["blocks"]]
+        (True, 10, ['1-1', '2-1'])
+    """
+    check_type("scene", scene, Scene)
+    out = Path(out)
+    config = TrainConfig() if config is None else config
+    check_type("config", config, TrainConfig)
+    device = context.choose_device()
+    if config.preset == "auto":
+        config = dataclasses.replace(config, preset=detect_preset(scene)[0])
+    columns, rows = _choose_grid(scene, config, device) if blocks == "auto" else parse_grid(blocks)
+    plan = plan_blocks(scene, columns, rows)
+    check_outputs(out, scene, overwrite=True)  # It runs before a folder is created.
+    with exclusive_folder(out):
+        journal = open_journal(out, f"{columns}x{rows}", plan, config, resume=resume, overwrite=overwrite)
+        check_outputs(out, scene, overwrite=resume or overwrite)
+        cache = context.cache or PictureCache()
+        with context.open_progress("blocks") as progress:
+            check_photos(scene, cache, progress)
+        return _BlockRun(
+            scene=scene,
+            out=out,
+            config=config,
+            plan=plan,
+            journal=journal,
+            resume=resume,
+            overwrite=overwrite,
+            observer=observer,
+            log=None if log is None else Path(log),
+            context=dataclasses.replace(context, device=device, cache=cache),
+            device=device,
+        ).execute()
+
+
+def _choose_grid(scene: Scene, config: TrainConfig, device: torch.device) -> tuple[int, int]:
+    """Return columns and rows of about square cells, as many as memory and photos ask for."""
+    memory = torch.cuda.get_device_properties(device).total_memory if device.type == "cuda" else memory_bytes()
+    budget, _ = budget_for(scene, config)
+    needed = max(budget * BYTES_PER_GAUSSIAN / (MAX_MEMORY_SHARE * memory), len(scene.train) / MAX_BLOCK_PHOTOS)
+    count = max(1, min(math.ceil(needed), MAX_PARTS, len(scene.train) // MIN_BLOCK_PHOTOS))
+    along, across = ground_extent(scene, ground_axes(scene)).tolist()
+    rows = min(count, max(1, round(math.sqrt(count * across / along)))) if along > 0 else 1
+    return max(1, count // rows), rows
+
+
+@dataclasses.dataclass(frozen=True)
+class _BlockRun:
+    """One call of `train_blocks`, in a folder that it has locked."""
+
+    scene: Scene
+    out: Path
+    config: TrainConfig
+    plan: BlockPlan
+    journal: Journal
+    resume: bool
+    overwrite: bool
+    observer: Observer | None
+    log: Path | None
+    context: RunContext
+    device: torch.device
+
+    def execute(self) -> TrainResult:
+        """Train the blocks that are not finished, and merge all."""
+        metrics: list[dict] = []
+        for number, block in enumerate(self.plan.blocks, 1):
+            label = f"block {block.name} ({number} of {len(self.plan.blocks)})"
+            if block.name not in self.journal.finished:
+                photos, points = len(block.scene.train), len(block.scene.points)
+                _LOG.info(f"{label}: {photos} photos, {points:,} points")
+                try:
+                    result = self._train_block(block, metrics[0] if metrics else None)
+                except HyrfError as error:
+                    kept = f"finished blocks are kept, {resuming(self.overwrite)} continues"
+                    raise error.with_text(f"{label}: {error.problem}", f"{error.fix}; {kept}") from error
+                if not result.complete:
+                    done = sum(each["curve"][-1]["step"] for each in metrics)
+                    return TrainResult(False, done + result.step, None, {})
+                self.journal.finish(block.name)
+            metrics.append(self._read_metrics(block))
+        with self.context.open_progress("blocks") as progress:
+            return self._merge(metrics, progress, overwrite=self.resume or self.overwrite)
+
+    def _train_block(self, block: Block, first: dict | None) -> TrainResult:
+        """Train a block, or resume it if its training has begun.
+
+        Args:
+            block: the block.
+            first: metrics of the first block, whose pilot runs decide for all; None for that block itself.
+        """
+        folder = self.journal.folder(block.name)
+        begun = block.name in self.journal.begun
+        if not begun:
+            self.journal.begin(block.name)
+        resumes = begun and is_run_begun(folder)
+        result = train_model(
+            block.scene,
+            folder,
+            self._block_config(block, first),
+            resume=resumes,
+            overwrite=not resumes,
+            observer=self.observer,
+            log=None if self.log is None else self.log.with_stem(f"{self.log.stem}-{block.name}"),
+            context=self.context,
+        )
+        if result.missing:
+            raise HyrfError(result.missing, fix="free space on the disk")
+        return result
+
+    def _block_config(self, block: Block, first: dict | None) -> TrainConfig:
+        """Return the settings of a block. A total budget is shared out by the points that photos of blocks show."""
+        config = self.config
+        if config.max_gaussians is not None or config.target_bytes is not None:
+            total, _ = budget_for(self.scene, config)
+            budget = max(1, round(total * len(block.scene.points) / len(self.scene.points)))
+            config = dataclasses.replace(config, max_gaussians=budget, target_bytes=None)
+        if first is not None:
+            config = dataclasses.replace(config, exposure=first["settings"]["exposure"])
+            if config.max_gaussians is None:
+                config = dataclasses.replace(config, budget_factor=first["settings"]["budget_factor"])
+        return config
+
+    def _read_metrics(self, block: Block) -> dict:
+        """Read the metrics of a finished block."""
+        path = self.journal.folder(block.name) / METRICS_FILE
+        try:
+            metrics = json.loads(path.read_bytes())
+            if not {"settings", "curve", "seconds", "gaussians", "log_gains"} <= metrics.keys():
+                raise ValueError
+        except (OSError, ValueError, AttributeError) as error:
+            raise HyrfError(
+                f"{path}: the results of a finished block are missing or damaged",
+                fix="train anew with `overwrite=True`",
+            ) from error
+        return metrics
+
+    def _merge(self, metrics: list[dict], progress: Progress, *, overwrite: bool) -> TrainResult:
+        """Merge the models of all blocks, score the result on the held-out photos, and write `metrics.json`."""
+        progress(TaskEvent("merging blocks"))
+        models = [self.journal.folder(block.name) / MODEL_FILE for block in self.plan.blocks]
+        gains = [{name: np.array(gain) for name, gain in each["log_gains"].items()} for each in metrics]
+        target = self.out / MODEL_FILE
+        merged = merge_blocks(self.scene, self.plan, models, gains, target, overwrite=overwrite)
+        content = self._describe(metrics, merged.kept, merged.file.bytes_after)
+        if self.scene.test:
+            model = load_model_or_parts(merged.file.file)
+            for part in parts_of(model):
+                part.to(self.device)
+                part.precision = self.config.precision
+            scores = evaluate_model(
+                model,
+                self.scene.test,
+                pictures=self.out / VIEWS_FOLDER,
+                overwrite=overwrite,
+                progress=items_of_progress(progress, "scoring held-out photos", len(self.scene.test)),
+            )
+            content["evaluation"] = scores.to_dict()
+        write_atomic(self.out / METRICS_FILE, json.dumps(content, indent=1).encode(), overwrite=overwrite)
+        return TrainResult(True, content["curve"][-1]["step"], Path(merged.file.file), content)
+
+    def _describe(self, metrics: list[dict], kept: list[int], size: int) -> dict[str, Any]:
+        """Return the content of the run's `metrics.json` without scores: sums over the blocks."""
+        seconds = sum(each["seconds"] for each in metrics)
+        stages: Counter[str] = Counter()
+        curve: list[dict] = []
+        for each in metrics:
+            stages.update(each["stage_seconds"])
+            before = curve[-1] if curve else {"step": 0, "seconds": 0.0}
+            curve += [
+                {**record, "step": before["step"] + record["step"], "seconds": before["seconds"] + record["seconds"]}
+                for record in each["curve"]
+            ]
+        grid = self.journal.settings["blocks"]
+        return {
+            "settings": self.config.to_dict(),
+            "device": describe_device(self.device),
+            "processes": 1,
+            "scene": scene_facts(self.scene),
+            "choices": {"blocks": f"{grid}: {len(self.plan.blocks)} blocks"},
+            "notes": self.scene.notes,
+            "gaussians": sum(kept),
+            "bytes": size,
+            "seconds": seconds,
+            "steps_per_second": curve[-1]["step"] / max(seconds, 1e-9),
+            "stage_seconds": dict(sorted(stages.items())),
+            "curve": curve,
+            "blocks": [
+                {
+                    "name": block.name,
+                    "folder": f"{BLOCKS_FOLDER}/{block.name}",
+                    "photos": len(block.scene.train),
+                    "points": len(block.scene.points),
+                    "gaussians": each["gaussians"],
+                    "kept": count,
+                    "seconds": each["seconds"],
+                }
+                for block, each, count in zip(self.plan.blocks, metrics, kept, strict=True)
+            ],
+        }

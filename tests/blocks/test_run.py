@@ -1,0 +1,157 @@
+"""Runs in blocks: their files, how they resume, and their errors."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import torch
+from commands import refused, succeeded
+from scenes import QUIET_CONTEXT, ball_scene, visible_points_by_photo
+
+from hyrfpack.blocks import train_blocks
+from hyrfpack.blocks.plan import plan_blocks
+from hyrfpack.context import RunContext
+from hyrfpack.errors import HyrfError
+from hyrfpack.format import load_merged_model, load_model
+from hyrfpack.model.merged import world_positions
+from hyrfpack.progress import StepEvent
+from hyrfpack.render import render_view
+from hyrfpack.scene import Scene
+from hyrfpack.train import DensityConfig, TrainConfig, load_training_scene
+
+CONFIG = TrainConfig(
+    steps=12, seed=1, max_gaussians=150, exposure=True, preset="standard", checkpoint_every=1,
+    density=DensityConfig(start=0.1, rounds=3, gradient=1e-5),
+)  # fmt: skip
+
+
+def make_scene() -> Scene:
+    """Return a scene of ten training photos and two held-out photos, with tracks."""
+    scene = ball_scene(views=12, points=80, side=16)
+    tracks = visible_points_by_photo(scene, facing=0.2)
+    return dataclasses.replace(scene, train=scene.train[2:], test=scene.train[:2], tracks=tracks)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    out = tmp_path_factory.mktemp("blocks") / "run"
+    return out, train_blocks(make_scene(), out, CONFIG, "2x1", context=QUIET_CONTEXT)
+
+
+def test_a_run_in_blocks_leaves_one_model_with_a_part_for_each_block(finished):
+    out, result = finished
+    assert {path.name for path in out.iterdir()} == {"model.hyrf", "metrics.json", "views", "blocks"}
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics == json.loads(json.dumps(result.metrics))
+    assert result.complete and result.step == 24 == metrics["curve"][-1]["step"]
+    model = load_merged_model(result.model)
+    assert len(model) == metrics["gaussians"] and result.model.stat().st_size == metrics["bytes"]
+    assert {name.removeprefix("block ") for name in model.names} == {block["name"] for block in metrics["blocks"]}
+    for part in model.parts:
+        assert part.exposure is not None
+
+
+def test_a_part_is_what_its_block_has_learnt_in_its_cells(finished):
+    out, result = finished
+    plan = plan_blocks(make_scene(), 2, 1)
+    model = load_merged_model(result.model)
+    parts = dict(zip(model.names, model.parts, strict=True))
+    for block, facts in zip(plan.blocks, result.metrics["blocks"], strict=True):
+        trained = load_model(out / facts["folder"])
+        keep = plan.core_mask(block, world_positions(trained))
+        part = parts[f"block {block.name}"]
+        assert 0 < len(part) == keep.sum() == facts["kept"] < len(trained) == facts["gaussians"]
+        assert torch.equal(part.gaussians.positions, trained.gaussians.positions[torch.from_numpy(keep)])
+
+
+def test_scores_are_those_of_the_merged_file(finished):
+    _, result = finished
+    model = load_merged_model(result.model)
+    expected = {}
+    for view in make_scene().test:
+        with torch.no_grad():
+            rgb = render_view(model, view.camera).rgb.double().numpy().clip(0, 1)
+        expected[view.name] = -10 * np.log10(np.mean((rgb - view.load().composite()) ** 2))
+    found = {view["name"]: view["psnr"] for view in result.metrics["evaluation"]["views"]}
+    assert found == pytest.approx(expected, abs=0.1)  # renders are rounded to 8 bits
+
+
+def test_a_total_budget_is_shared_out_by_the_points_of_blocks(finished):
+    out, result = finished
+    for facts in result.metrics["blocks"]:
+        settings = json.loads((out / facts["folder"] / "metrics.json").read_text())["settings"]
+        assert settings["max_gaussians"] == round(150 * facts["points"] / 80)
+        assert facts["gaussians"] <= settings["max_gaussians"]
+
+
+@pytest.mark.parametrize("stop_at", [5, 17])
+def test_an_interrupted_run_resumes_to_the_same_bytes_and_keeps_finished_blocks(finished, tmp_path, stop_at):
+    steps: list[StepEvent] = []
+
+    def count(event: object) -> None:
+        if isinstance(event, StepEvent):
+            steps.append(event)
+
+    interrupted = RunContext(progress=count, stop=lambda: len(steps) >= stop_at)
+    first = train_blocks(make_scene(), tmp_path / "run", CONFIG, "2x1", context=interrupted)
+    assert not first.complete and first.step == stop_at and first.model is None
+    steps.clear()
+    resumed = RunContext(progress=count)
+    second = train_blocks(make_scene(), tmp_path / "run", CONFIG, "2x1", resume=True, context=resumed)
+    assert len(steps) == 24 - stop_at
+    assert second.model.read_bytes() == finished[1].model.read_bytes()
+
+
+def test_a_finished_run_is_neither_replaced_nor_resumed_with_other_settings(finished):
+    out, result = finished
+    before = result.model.read_bytes()
+    with pytest.raises(HyrfError, match="holds an earlier run; `resume=True` continues it"):
+        train_blocks(make_scene(), out, CONFIG, "2x1", context=QUIET_CONTEXT)
+    other = dataclasses.replace(CONFIG, steps=13)
+    for config, blocks, named in ((other, "2x1", "steps"), (CONFIG, "1x1", "blocks")):
+        with pytest.raises(HyrfError, match=rf"started with other settings \({named}\)"):
+            train_blocks(make_scene(), out, config, blocks, resume=True, context=QUIET_CONTEXT)
+    fewer = dataclasses.replace(make_scene(), train=make_scene().train[1:])
+    with pytest.raises(HyrfError, match="started with other photos"):
+        train_blocks(fewer, out, CONFIG, "2x1", resume=True, context=QUIET_CONTEXT)
+    assert result.model.read_bytes() == before
+
+
+def test_there_is_no_run_to_resume_in_an_empty_folder(tmp_path):
+    with pytest.raises(HyrfError, match="no run in blocks to resume"):
+        train_blocks(make_scene(), tmp_path / "run", CONFIG, "2x1", resume=True, context=QUIET_CONTEXT)
+
+
+def test_an_error_names_the_block_and_says_how_to_continue(tmp_path):
+    """Exposure compensation refuses transparent photos when the first block begins."""
+    scene = dataclasses.replace(make_scene(), has_alpha=True)
+    with pytest.raises(HyrfError, match=r"^block \d-1 \(1 of 2\): .*transparent.*kept.*`resume=True` continues"):
+        train_blocks(scene, tmp_path / "run", CONFIG, "2x1", context=QUIET_CONTEXT)
+
+
+def test_the_photos_of_a_block_are_not_taken_for_those_of_the_whole_set(finished):
+    out, result = finished
+    assert load_training_scene(out / result.metrics["blocks"][0]["folder"]) is None
+
+
+@pytest.mark.parametrize(
+    ("grid", "problem"),
+    [
+        ("2x", "Error: '2x' is no grid of blocks; use --blocks auto, or columns and rows as in --blocks 2x2"),
+        ("99x99", "99x99 are 9,801 blocks, and a file holds at most 64 parts; use a smaller grid as --blocks"),
+        ("3x1", "8 training photos are too few for 3x1 blocks; use at most 2 blocks; each needs 4 photos"),
+    ],
+)
+def test_the_command_refuses_a_grid_that_does_not_suit_the_photos(data, tmp_path, grid, problem):
+    assert problem in refused("train", data, "-o", tmp_path / "run", "--blocks", grid)
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_command_trains_blocks(data, tmp_path):
+    run = succeeded("train", data, "-o", tmp_path / "run", "--blocks", "2x1", "--steps", 2, "--max-gaussians", 60)
+    assert "block 1-1" in run.stderr and "held-out views" in run.stdout
+    assert "part" in succeeded("info", tmp_path / "run").stdout
+    assert "holds an earlier run" in refused("train", data, "-o", tmp_path / "run", "--blocks", "2x1")
