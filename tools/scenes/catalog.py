@@ -9,12 +9,17 @@ from types import ModuleType
 import numpy as np
 
 from hyrfpack.scene import Camera
-from tools.scenes import layout_object, layout_room, layout_street
+from tools.scenes import layout_city, layout_object, layout_room, layout_street
 from tools.scenes.build import SceneBuilder, assemble
 from tools.scenes.geometry import SceneArrays
 from tools.scenes.lighting import add_indirect_light
 
-LAYOUTS: dict[str, ModuleType] = {"object": layout_object, "room": layout_room, "street": layout_street}
+LAYOUTS: dict[str, ModuleType] = {
+    "object": layout_object,
+    "room": layout_room,
+    "street": layout_street,
+    "city": layout_city,
+}
 _FIELD_OF_VIEW_DEGREES = 65.0  # horizontal, as of the main camera of a phone
 _AMBIENT_START = 0.12  # stands for the bounces that are not computed
 _GATHER_RAYS = 64

@@ -1,6 +1,6 @@
 """Writes synthetic photo sets of the size that users have, as folders with a COLMAP model.
 
-    python -m tools.scenes.write_set --out DIR                         writes DIR/object, DIR/room and DIR/street
+    python -m tools.scenes.write_set --out DIR                         writes DIR/object, room, street and city
     python -m tools.scenes.write_set --out DIR --scenes room --photos 30 --width 800
 
 Each set has photos in images/ and poses and points in sparse/0/. The same options write the same bytes. Depth maps of
