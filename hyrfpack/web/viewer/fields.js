@@ -1,4 +1,5 @@
-// Evaluates a model on the graphics device: view-independent numbers once, and colours again when the view moves.
+// Evaluates a model on the graphics device: view-independent numbers once, and colours again when the view moves. Until
+// then it draws the worker's estimate (see estimate.js).
 
 import { frustumPlanes } from "../hyrf/frustum.js";
 import { ContextLostError, Graphics, WorkPacer } from "./graphics.js";
@@ -37,19 +38,39 @@ export class Fields {
     Object.assign(this, { model, count, width, height, antialiased, cells });
     this.rows = new RowStates(model.balls);
     this.pace = new WorkPacer();
+    this.hasEstimate = Boolean(model.estimate);
+    this.isReady = false; // whether rows can be evaluated
   }
 
-  // Uploads the model, and draws a coarse background for an eye.
-  async prepare(eye) {
-    const { gl, graphics, model, height } = this, size = [this.width, height];
+  // Uploads what is drawn before any row is evaluated: an estimate of the Gaussians, and a coarse background.
+  async prepare() {
+    const { gl, graphics, model, model: { coarseBackground } } = this;
     Fields.check(gl, model);
-    const words = (...more) => graphics.texture(gl.TEXTURE_2D, gl.RGBA32UI, ...size, ...more);
-    this.places = words();
-    this.shapes = words();
-    this.colors = graphics.texture(gl.TEXTURE_2D, gl.RG32UI, ...size);
-    this.layers = Math.ceil(model.radiance.levels.length / LEVELS_PER_LAYER);
-    this.features = graphics.texture(gl.TEXTURE_2D_ARRAY, gl.RGBA32UI, ...size, this.layers);
+    await this.uploadEstimate();
+    if (!model.background) return;
+    const bytes = [gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, 4];
+    const coarse = await graphics.table(bytes, coarseBackground.width, coarseBackground.rgba);
+    this.panorama = new Panorama(graphics, model, coarse, (...area) => this.drawPanorama(...area));
+    model.coarseBackground = null;
+  }
+
+  async uploadEstimate() {
+    const { gl, graphics, model, model: { estimate } } = this;
+    const words = [gl.RGBA32UI, gl.RGBA_INTEGER, gl.UNSIGNED_INT, 4];
+    const pairs = [gl.RG32UI, gl.RG_INTEGER, gl.UNSIGNED_INT, 2];
+    this.places = await graphics.table(words, TEXTURE_WIDTH, estimate.places);
+    this.shapes = await graphics.table(words, TEXTURE_WIDTH, estimate.shapes);
+    this.colors = await graphics.table(pairs, TEXTURE_WIDTH, estimate.colors);
+    model.estimate = null; // frees memory; the worker can estimate them again
+  }
+
+  // Uploads the model and compiles programs, so that rows can be evaluated.
+  async prepareFields() {
+    const { gl, graphics, model, width, height } = this;
     await graphics.whenDone();
+    gl.getError(); // clears earlier errors
+    this.layers = Math.ceil(model.radiance.levels.length / LEVELS_PER_LAYER);
+    this.features = graphics.texture(gl.TEXTURE_2D_ARRAY, gl.RGBA32UI, width, height, this.layers);
     const { sky, ...shaders } = this.shaders(), programs = {}, vertexText = readText("whole.vert");
     for (const name of Object.keys(shaders)) programs[name] = graphics.compile(vertexText, shaders[name]);
     programs.enlarge = graphics.program("whole.vert", "enlarge.frag");
@@ -58,16 +79,14 @@ export class Fields {
     await this.uploadGaussians();
     this.geometry = await this.field(model.geometry);
     this.radiance = await this.field(model.radiance);
-    await graphics.whenDone();
-    this.checkMemory();
     await graphics.compiled(programs);
 
     this.createTargets();
     this.pending = new Set(Array.from({ length: this.count ? height : 0 }, (_, row) => row)); // not evaluated yet
-    if (model.background) {
-      this.panorama = new Panorama(graphics, model, (...area) => this.drawPanorama(...area));
-      await this.panorama.begin(eye, programs.enlarge);
-    }
+    this.panorama?.begin(programs.enlarge);
+    await graphics.whenDone();
+    this.checkMemory();
+    this.isReady = true;
   }
 
   // Uploads the numbers of the Gaussians that `evaluate` reads.
@@ -197,7 +216,6 @@ export class Fields {
   }
 
   // Evaluates what no view changes: positions, opacities, scales, rotations and hash features of the Gaussians of rows.
-  // Until then they are transparent.
   evaluate(rows) {
     const { gl, graphics, model, geometry, targets } = this;
     const fresh = rows.filter((row) => this.pending.delete(row));
@@ -271,6 +289,7 @@ export class Fields {
   // Colours, while the view moves, rows without colours and then the stalest rows, for about `ms`. Then evaluates the
   // background as at rest if that is quick and `follows`, or else draws the panorama for about `ms`.
   recolor(view, margin, ms, follows) {
+    if (!this.isReady) return;
     const { visible, rows } = this.rows.stale(frustumPlanes(view, margin), view.eye, MAX_FRESH_TURN_RADIANS);
     const most = Math.min(this.pace.within(ms), Math.ceil(visible / MOVING_ROWS_DIVISOR));
     if (rows.length) this.color(rows.slice(0, most), view.eye);
@@ -296,6 +315,7 @@ export class Fields {
   // background. `blend(view)` blends the splats of a view and returns their picture. `changed` is called when the
   // picture has improved. Returns whether it is complete.
   async complete(view, margin, { blend, goOn = () => true, changed = () => {}, exact = false }) {
+    if (!this.isReady) return false;
     let shownAt = performance.now(), pause = FIRST_REFRESH_MS;
     const report = () => {
       if (performance.now() < shownAt + pause) return;

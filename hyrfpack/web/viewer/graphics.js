@@ -63,6 +63,14 @@ export class Graphics {
     for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, name, gl.LINEAR);
   }
 
+  // Sets the filters of the texture of an equirectangular picture.
+  setPanoramic(texture) {
+    const { gl } = this;
+    gl.bindTexture(gl.TEXTURE_2D, texture);
+    this.setLinear();
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_S, gl.REPEAT);
+  }
+
   // Creates a texture from an array of numbers, row by row; the last row may be short. The first argument has the
   // internal format, the format, the type, and the number of components per texel. Large arrays are uploaded in pieces.
   async table([internal, format, type, size], width, numbers) {

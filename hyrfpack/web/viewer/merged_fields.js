@@ -16,6 +16,10 @@ export class MergedFields {
     });
   }
 
+  get hasEstimate() {
+    return true;
+  }
+
   get panorama() {
     return this.parts[0].fields.panorama;
   }
@@ -24,11 +28,15 @@ export class MergedFields {
     return this.parts[0].fields.sky;
   }
 
-  async prepare(eye) {
-    for (const { fields } of this.parts) await fields.prepare(eye);
+  // For these methods see Fields.
+
+  async prepare() {
+    for (const { fields } of this.parts) await fields.prepare();
   }
 
-  // For these methods see Fields.
+  async prepareFields() {
+    for (const { fields } of this.parts) await fields.prepareFields();
+  }
 
   recolor(view, margin, ms, follows) {
     for (const { fields, place } of this.parts) {

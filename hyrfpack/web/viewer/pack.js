@@ -1,11 +1,17 @@
 // Packs splats and models into the textures that the shaders read. Textures are TEXTURE_WIDTH wide.
 
+import { estimateGaussians } from "./estimate.js";
 import { decoderLayout, gridLevels } from "../hyrf/grids.js";
 import { rowBalls } from "../hyrf/row_states.js";
 import { backgroundSpacing, pixelSizes } from "../hyrf/sampling.js";
 import { TEXTURE_WIDTH } from "./constants.js";
+import { backgroundPicture } from "./scene.js";
 
+const COARSE_BACKGROUND_HEIGHT_PIXELS = 32;
 const UNITS_PER_CELL = 8; // hidden units that the shaders process together
+// Bits of float32 numbers.
+const MIN_NORMAL_HALF_BITS = 0x38800000; // 2^-14
+const HALF_EXPONENT_OFFSET = 0x38000000, HALF_ROUNDING = 0x1000;
 
 const countRows = (count) => Math.max(1, Math.ceil(count / TEXTURE_WIDTH));
 
@@ -15,11 +21,19 @@ const pair16 = (low, high) => (low | (high << 16)) >>> 0;
 const quantizeScale = (scale) => unorm16((Math.log(scale) + 22) / 44);
 const quantizeColor = (color, levels) => Math.round((levels * (Math.min(2, Math.max(-1, color)) + 1)) / 3);
 
-// Packs splats (see viewer/formats): positions and shapes take 4 words per splat, harmonics 4 words per splat and
-// layer.
-export function packSplats(splats) {
-  const { count, degree, antialiased, positions, scales, quats, opacities, colors, harmonics, range } = splats;
-  const height = countRows(count), capacity = TEXTURE_WIDTH * height;
+const float = new Float32Array(1), floatBits = new Uint32Array(float.buffer);
+
+// Returns the bits of a number in [0, 1] as a half. Numbers below the smallest normal one become 0.
+function encodeHalf(number) {
+  float[0] = number;
+  const bits = floatBits[0];
+  return bits < MIN_NORMAL_HALF_BITS ? 0 : (bits - HALF_EXPONENT_OFFSET + HALF_ROUNDING) >>> 13;
+}
+
+// Packs positions, opacities, scales and rotations in 4 words each of `places` and `shapes` per splat. The last word of
+// `shapes` is left 0.
+function packShapes({ count, positions, scales, quats, opacities }) {
+  const capacity = TEXTURE_WIDTH * countRows(count);
   const floats = new Uint32Array(positions.buffer, positions.byteOffset, 3 * count);
   const places = new Uint32Array(4 * capacity), shapes = new Uint32Array(4 * capacity);
   for (let i = 0, p = 0, q = 0; i < count; i++, p += 3, q += 4) {
@@ -30,6 +44,16 @@ export function packSplats(splats) {
     shapes[q] = pair16(snorm16(quats[q]), snorm16(quats[q + 1]));
     shapes[q + 1] = pair16(snorm16(quats[q + 2]), snorm16(quats[q + 3]));
     shapes[q + 2] = pair16(quantizeScale(scales[p]), quantizeScale(scales[p + 1]));
+  }
+  return { places, shapes };
+}
+
+// Packs splats (see viewer/formats): positions and shapes take 4 words per splat, harmonics 4 words per splat and
+// layer.
+export function packSplats(splats) {
+  const { count, degree, antialiased, colors, harmonics, range } = splats, { places, shapes } = packShapes(splats);
+  const height = countRows(count), capacity = TEXTURE_WIDTH * height;
+  for (let i = 0, p = 0, q = 0; i < count; i++, p += 3, q += 4) {
     const red = quantizeColor(colors[p], 2047), green = quantizeColor(colors[p + 1], 2047);
     const blue = quantizeColor(colors[p + 2], 1023);
     shapes[q + 3] = red | (green << 11) | (blue << 22);
@@ -42,17 +66,36 @@ export function packSplats(splats) {
   return { count, height, degree, range, antialiased, places, shapes, harmonics: new Uint32Array(layered.buffer) };
 }
 
-// Packs a model that hyrf/index.js has read for fields.js.
-export function packModel(model) {
-  const { metadata, config, count, geometry, radiance } = model;
+// Packs an estimate of a model's Gaussians (see estimate.js) as geometry.frag and colors.frag pack the exact ones.
+function packEstimate(model, eye, pixelSizes) {
+  const { count, positions } = model, { colors, ...shapesOf } = estimateGaussians(model, eye);
+  const { places, shapes } = packShapes({ count, positions, ...shapesOf }), packed = new Uint32Array(places.length / 2);
+  const sizes = new Float32Array(shapes.buffer);
+  for (let i = 0, p = 0; i < count; i++, p += 3) {
+    packed[2 * i] = pair16(encodeHalf(colors[p]), encodeHalf(colors[p + 1]));
+    packed[2 * i + 1] = encodeHalf(colors[p + 2]);
+    sizes[4 * i + 3] = pixelSizes[i];
+  }
+  return { places, shapes, colors: packed };
+}
+
+// Packs a model that hyrf/index.js has read for fields.js. `eye` is the first viewpoint in local units.
+export function packModel(model, eye) {
+  const { count } = model, gaussians = packGaussians(model, TEXTURE_WIDTH);
+  const estimate = packEstimate(model, eye, gaussians.pixelSizes);
+  return { count, height: countRows(count), ...packFields(model), ...gaussians, estimate };
+}
+
+// Packs what the Gaussians of a model share.
+export function packFields(model) {
+  const { metadata, config, geometry, radiance } = model;
   const field = (which, { table, decoder }) => ({
     table,
     levels: gridLevels(config[which]).map((level) => [level.resolution, level.first, level.rows, Number(level.dense)]),
     decoder: packDecoder(decoder, decoderLayout(config, which)),
   });
   return {
-    count, height: countRows(count),
-    ...packGaussians(model, TEXTURE_WIDTH),
+    coarseBackground: backgroundPicture(model, COARSE_BACKGROUND_HEIGHT_PIXELS),
     backgroundSpacing: backgroundSpacing(metadata),
     geometry: field("geometry", geometry),
     radiance: field("radiance", radiance),

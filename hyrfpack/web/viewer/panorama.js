@@ -1,6 +1,6 @@
-// Draws the background as an equirectangular picture, which is shown while the view moves: first a coarse one, then
-// finer tiles, those in view first. A tile has the colours that an eye sees from one place. It is drawn again when the
-// eye has moved far enough.
+// Draws the background as an equirectangular picture, which is shown while the view moves: first the worker's coarse
+// one, then finer tiles, those in view first. A tile has the colours that an eye sees from one place. It is drawn again
+// when the eye has moved far enough.
 
 import { dot, sub } from "../hyrf/vectors.js";
 import { frustumPlanes, intersectsFrustum } from "../hyrf/frustum.js";
@@ -8,7 +8,6 @@ import { WorkPacer } from "./graphics.js";
 import { BACKGROUND_RADIUS } from "./constants.js";
 
 // Pictures are twice as wide as high. The encoding of directions needs MIN_HEIGHT_TEXELS even with a coarse hash grid.
-const COARSE_HEIGHT_TEXELS = 64;
 const MIN_HEIGHT_TEXELS = 256;
 const MAX_HEIGHT_TEXELS = 1024;
 const TILE_SIZE_TEXELS = [32, 32];
@@ -16,12 +15,13 @@ const MAX_EAGER_TILE_MS = 2.5; // devices that draw a tile in this time draw til
 const MAX_FRESH_TURN_RADIANS = 1e-2; // a larger turn of the rays to a tile makes its colours stale
 
 export class Panorama {
-  // `paint(framebuffer, size, part, eye)` draws a part (x, y, width, height) of a picture. `finest` is the finest
-  // resolution of the hash grid, and `halfExtent` the half-axes of its frame. An arc from pole to pole crosses about
-  // pi / 2 times as many cells, more where a half-axis is short, and two texels per cell are enough. Texels need not be
-  // finer than `backgroundSpacing`, the spacing in training.
-  constructor(graphics, { finest, halfExtent, backgroundSpacing }, paint) {
-    Object.assign(this, { graphics, paint });
+  // `coarse` is the texture of a coarse picture. `paint(framebuffer, size, part, eye)` draws a part (x, y, width,
+  // height) of a picture. `finest` is the finest resolution of the hash grid, and `halfExtent` the half-axes of its
+  // frame. An arc from pole to pole crosses about pi / 2 times as many cells, more where a half-axis is short, and two
+  // texels per cell are enough. Texels need not be finer than `backgroundSpacing`, the spacing in training.
+  constructor(graphics, { finest, halfExtent, backgroundSpacing }, coarse, paint) {
+    Object.assign(this, { graphics, paint, texture: coarse });
+    graphics.setPanoramic(coarse);
     this.pace = new WorkPacer();
     const enough = Math.ceil(Math.PI * Math.min(finest / Math.min(...halfExtent), 1 / backgroundSpacing));
     this.height = Math.min(MAX_HEIGHT_TEXELS, Math.max(MIN_HEIGHT_TEXELS, enough));
@@ -36,29 +36,18 @@ export class Panorama {
     return [2 * this.height, this.height];
   }
 
-  // Creates the texture of a picture.
-  picture(height) {
-    const { graphics } = this, { gl } = graphics;
-    const texture = graphics.texture(gl.TEXTURE_2D, gl.RGB10_A2, 2 * height, height);
-    graphics.setLinear();
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_S, gl.REPEAT);
-    return texture;
-  }
-
-  // Draws the coarse picture, as an eye sees it, and enlarges it by a program.
-  async begin(eye, enlarge) {
-    const { graphics, height } = this, { gl } = graphics, size = [2 * COARSE_HEIGHT_TEXELS, COARSE_HEIGHT_TEXELS];
-    const small = this.picture(COARSE_HEIGHT_TEXELS), coarse = graphics.framebuffer(small);
-    const work = (first, last) => this.paint(coarse, size, [0, first, size[0], last - first], eye);
-    await new WorkPacer().run(graphics, COARSE_HEIGHT_TEXELS, work);
-    this.texture = this.picture(height);
+  // Creates the texture of the whole picture, and fills it with the coarse one by the program `enlarge`.
+  begin(enlarge) {
+    const { graphics, texture: coarse } = this, { gl } = graphics;
+    this.texture = graphics.texture(gl.TEXTURE_2D, gl.RGB10_A2, ...this.size);
+    graphics.setPanoramic(this.texture);
     this.target = graphics.framebuffer(this.texture);
     gl.viewport(0, 0, ...this.size);
     gl.useProgram(enlarge.program);
-    graphics.bind(enlarge, { u_picture: small });
+    graphics.bind(enlarge, { u_picture: coarse });
     gl.uniform2f(enlarge.u_size, ...this.size);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
-    for (const object of [coarse, small]) graphics.free(object);
+    graphics.free(coarse);
     this.tiles = this.cut();
   }
 

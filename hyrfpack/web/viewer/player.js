@@ -24,8 +24,10 @@ import { IDENTITY_QUAT } from "../hyrf/rotation.js";
 
 const SETTLE_MS = 200; // the wait after a movement before the picture is drawn at full resolution
 const TARGET_FRAME_MS = 33; // slower frames lower the resolution while moving
-const FIRST_PICTURE_MS = 2000; // after this time Gaussians that are ready are shown
-const FIRST_PICTURE_REST_MS = 250; // the device does nothing else while the browser shows the first picture
+const FIRST_PICTURE_MS = 2000; // after this time Gaussians that are ready are shown if there is no estimate
+const FIRST_PICTURE_SCALE = 0.35; // of the resolution: slow devices draw it in a quarter of the time
+const FIRST_PICTURE_REST_MS = 250; // a slow device does nothing else while the browser shows the first picture
+const MAX_FIRST_PICTURE_WAIT_MS = 2000; // other work on a model waits for its first picture, but not in hidden pages
 const QUICK_FRAME_MS = 20; // frames that take less are shown at once
 const MIN_SCALE = 0.2;
 const MAX_PIXEL_RATIO = 2; // device pixels per CSS pixel
@@ -79,6 +81,7 @@ export class Player extends EventTarget {
     this.idle = false; // whether the picture is complete
     this.onIdle = []; // functions that resolve the promises of `settled`
     this.queue = Promise.resolve(); // resolves when all queued work has ended
+    this.onFirstPicture = () => {}; // is called when the canvas shows a frame
     this.showing = false; // whether `show` completes a picture, whose background frames must not replace
     if (scene) this.setScene(initialView(scene));
 
@@ -186,52 +189,91 @@ export class Player extends EventTarget {
     if (!this.wanted(loader)) throw new SupersededError();
   }
 
-  // Uploads a content that the worker has read, and then shows it instead of the old one. Returns whether it is shown.
-  async install(loader, { number, whole, scene, models, splats, picture, chunks }) {
-    const { gl } = this.renderer, initial = loader.scene ? null : initialView(scene);
-    let content = null, staged = null;
+  // Shows a content that the worker has read instead of the old one. The first picture of a model is an estimate, or
+  // what can be evaluated soon, but a picture is replaced by complete ones only. Returns whether the content is shown.
+  async install(loader, message) {
+    const { scene, models, picture } = message, initial = loader.scene ? null : initialView(scene);
+    let content = null, staged = null, isEstimate = false;
     try {
       await this.waitFor(loader);
       await this.renderer.prepare();
       await loader.picture?.decode();
-      gl.getError(); // clears earlier errors
-      if (models) {
-        content = loader.makeContent(gl, models, chunks) ??
-          (models.length > 1 ? new MergedFields(gl, models) : new Fields(gl, models[0]));
-        const view = this.view(loader.update && sameAxes(this.scene, scene) ? this.eye : initial?.eye);
-        await content.prepare(view.eye);
-        // The first picture is shown before it is complete, but a picture is replaced by complete ones only.
+      this.renderer.gl.getError(); // clears earlier errors
+      content = this.makeContent(loader, message);
+      const view = this.view(loader.update && sameAxes(this.scene, scene) ? this.eye : initial?.eye);
+      await content.prepare(view.eye);
+      isEstimate = Boolean(models && content.hasEstimate && !this.loaded);
+      if (models && !isEstimate) {
+        await content.prepareFields();
         const end = this.loaded ? Infinity : performance.now() + FIRST_PICTURE_MS;
         await content.coloured(view, scene.tolerance, {
           goOn: () => this.wanted(loader) && performance.now() < end,
           report: (part) => this.progress(loader, "preparing", part),
         });
-      } else {
-        content = new Splats(gl, splats);
-        await content.prepare();
       }
       staged = this.renderer.stage(content, scene, picture ?? loader.picture);
-      await content.graphics.whenDone(); // otherwise asking for errors would block the page
-      await this.waitFor(loader);
-      const error = gl.getError();
-      if (content.graphics.lost) throw new ContextLostError();
-      if (error !== gl.NO_ERROR && models) throw new UnsupportedDeviceError(MEMORY_REASON);
-      if (error !== gl.NO_ERROR) throw new Error("It does not fit into the memory of the graphics device.");
+      await this.check(loader, content, models);
+      this.showContent(loader, message, staged, initial);
+      return !isEstimate || Boolean(await this.enqueue(() => this.prepareFields(loader, content)));
     } catch (error) {
-      content?.dispose();
-      // After a lost context, `onRestored` decodes the file again.
-      if (error instanceof ContextLostError || error instanceof SupersededError) return false;
-      if (!models || models.length > 1) throw error; // merged models have no harmonics
-      const isUnsupported = error instanceof UnsupportedDeviceError;
-      const reason = isUnsupported ? error.message : "this device's driver refuses the fields.";
-      loader.remark = `Drawn with harmonics: ${reason}`;
-      loader.again(true);
+      this.refuse(loader, content, models, error);
       return false;
     }
+  }
+
+  // Returns an object that draws a content.
+  makeContent(loader, { models, splats, chunks }) {
+    const { gl } = this.renderer;
+    if (!models) return new Splats(gl, splats);
+    const streamed = loader.makeContent(gl, models, chunks);
+    return streamed ?? (models.length > 1 ? new MergedFields(gl, models) : new Fields(gl, models[0]));
+  }
+
+  // Prepares the fields of a model whose estimate is shown. Returns true.
+  async prepareFields(loader, content) {
+    await new Promise((resolve) => {
+      this.onFirstPicture = resolve;
+      setTimeout(resolve, MAX_FIRST_PICTURE_WAIT_MS);
+    });
+    await this.waitFor(loader);
+    await content.prepareFields();
+    await this.waitFor(loader);
+    return true;
+  }
+
+  // Throws an Error if the graphics device does not hold a content, or if the player no longer uses it.
+  async check(loader, { graphics }, models) {
+    await graphics.whenDone(); // otherwise asking for errors would block the page
+    await this.waitFor(loader);
+    const error = graphics.gl.getError();
+    if (graphics.lost) throw new ContextLostError();
+    if (error !== graphics.gl.NO_ERROR && models) throw new UnsupportedDeviceError(MEMORY_REASON);
+    if (error !== graphics.gl.NO_ERROR) throw new Error("It does not fit into the memory of the graphics device.");
+  }
+
+  // Asks for harmonics instead of a model that the device cannot draw. Throws the error if there is nothing else.
+  refuse(loader, content, models, error) {
+    const isShown = content === this.renderer.content;
+    if (!isShown) content?.dispose();
+    // After a lost context, `onRestored` decodes the file again.
+    if (error instanceof ContextLostError || error instanceof SupersededError) return;
+    if (!models || models.length > 1) { // merged models have no harmonics
+      if (isShown) this.loaded = false; // what the canvas shows stays there
+      throw error;
+    }
+    const isUnsupported = error instanceof UnsupportedDeviceError;
+    const reason = isUnsupported ? error.message : "this device's driver refuses the fields.";
+    loader.remark = `Drawn with harmonics: ${reason}`;
+    loader.again(true);
+  }
+
+  // Shows a staged content instead of the old one.
+  showContent(loader, { number, whole, scene }, staged, initial) {
     const keepsEye = loader.update && sameAxes(this.scene, scene);
     if (keepsEye) Object.assign(this, { scene, cameras: initial?.cameras ?? this.cameras });
     else if (initial) this.setScene(initial);
-    this.renderer.show(staged);
+    const before = this.renderer.show(staged);
+    if (before) this.enqueue(() => before.dispose()); // after all work on it
     loader.use(number);
     if (loader === this.next) {
       for (const other of [this.loader, this.previous]) other?.dispose();
@@ -253,7 +295,6 @@ export class Player extends EventTarget {
     if (!keepsEye) this.emit("loaded");
     this.resize();
     this.sort();
-    return true;
   }
 
   // Replaces the scene and moves the eye to its first camera.
@@ -315,7 +356,14 @@ export class Player extends EventTarget {
 
   // Returns the factor of the resolution of the next frame, in (0, 1].
   get scale() {
+    if (this.isNew) return FIRST_PICTURE_SCALE * this.resolution;
     return this.moving && this.automatic ? Math.max(MIN_SCALE, this.resolution * this.coarse) : this.resolution;
+  }
+
+  // Returns whether there is no picture yet or, on slow devices, only since a moment.
+  get isNew() {
+    const { first } = this.times;
+    return first === null || (!this.quick && performance.now() < first + FIRST_PICTURE_REST_MS);
   }
 
   // Returns whether a mover moves the eye.
@@ -397,7 +445,8 @@ export class Player extends EventTarget {
   present() {
     if (!this.loaded || !this.renderer.present()) return false;
     this.blank = false;
-    if (this.renderer.drawn) this.times.first ??= performance.now();
+    this.times.first ??= performance.now();
+    this.onFirstPicture();
     return true;
   }
 
@@ -414,7 +463,7 @@ export class Player extends EventTarget {
     this.sort();
     if (this.renderer.content.fade?.()) this.stale = true;
     const moving = this.moving, scale = this.scale;
-    if (this.stale || this.shown !== scale) {
+    if (this.renderer.isSorted && (this.stale || this.shown !== scale)) {
       const view = this.view(), { content } = this.renderer;
       const frameMs = Math.max(TARGET_FRAME_MS, this.took ?? 0);
       if (moving) content.recolor(view, this.scene.tolerance, COLORING_RATIO * frameMs, !this.showing);
@@ -428,8 +477,7 @@ export class Player extends EventTarget {
       this.drawnMoves = this.moves;
     }
     // Without an order, the background would be evaluated where splats will hide it.
-    const isNew = performance.now() - this.times.first < FIRST_PICTURE_REST_MS; // false while `first` is null
-    if (moving || this.began !== null || this.loader.busy || isNew) return this.schedule();
+    if (moving || this.began !== null || this.loader.busy || this.isNew) return this.schedule();
     this.took = null;
     this.finish();
   }

@@ -48,6 +48,7 @@ export class Renderer {
     this.plain = this.graphics.texture(gl.TEXTURE_2D, gl.RGBA8, 1, 1);
     this.content = null;
     this.fence = null; // is signalled when the last frame is drawn
+    this.isSorted = false; // whether the content has got an order
     this.drawn = 0;
   }
 
@@ -69,11 +70,11 @@ export class Renderer {
     return { content, scene, order, shapes, appearances, projection, tableSize: size, picture: background };
   }
 
-  // Selects a staged content for drawing, and frees the previous one.
+  // Selects a staged content for drawing, once it has got an order. Returns the previous one, or null.
   show(staged) {
-    this.content?.dispose();
-    Object.assign(this, staged);
-    this.drawn = 0;
+    const { content } = this;
+    Object.assign(this, staged, { isSorted: false, drawn: 0 });
+    return content;
   }
 
   // Creates the texture of an equirectangular picture: an image, or {width, height, rgba}.
@@ -84,8 +85,7 @@ export class Renderer {
     gl.pixelStorei(gl.UNPACK_COLORSPACE_CONVERSION_WEBGL, gl.NONE);
     if (picture.rgba) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ...size, gl.RGBA, gl.UNSIGNED_BYTE, picture.rgba);
     else gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, gl.RGBA, gl.UNSIGNED_BYTE, picture);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_S, gl.REPEAT);
-    graphics.setLinear();
+    graphics.setPanoramic(texture);
     return texture;
   }
 
@@ -95,6 +95,7 @@ export class Renderer {
     const { gl, tableSize: [width] } = this, rows = Math.ceil(drawn / width);
     gl.bindTexture(gl.TEXTURE_2D, this.order);
     if (rows) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, width, rows, gl.RED_INTEGER, gl.UNSIGNED_INT, order);
+    this.isSorted = true;
     this.drawn = drawn;
   }
 

@@ -6,7 +6,7 @@ import { viewpointOf } from "../hyrf/viewpoint.js";
 import { BACKGROUND_RADIUS } from "./constants.js";
 
 const MIN_SAMPLED_SPLATS = 10000;
-const BACKGROUND_HEIGHT_PIXELS = 128;
+export const BACKGROUND_HEIGHT_PIXELS = 128;
 
 // Returns the scene of a model.
 export function modelScene({ metadata, config, count }, name) {
@@ -36,10 +36,10 @@ export function splatsScene({ count, center, unit, positions }, name) {
 const percentile = (values, part) => Float32Array.from(values).sort()[Math.floor(part * (values.length - 1))] ?? 0;
 
 // Returns the background of a model, seen from its centre, as an equirectangular picture {width, height, rgba}, or null
-// if there is none. The picture is for devices that cannot evaluate the background.
-export function backgroundPicture(model) {
+// if there is none. The picture is for the first frame, and for devices that cannot evaluate the background.
+export function backgroundPicture(model, height) {
   if (!model.config.background) return null;
-  const height = BACKGROUND_HEIGHT_PIXELS, width = 2 * height, directions = new Float32Array(3 * width * height);
+  const width = 2 * height, directions = new Float32Array(3 * width * height);
   for (let v = 0, at = 0; v < height; v++) {
     const latitude = Math.PI * (0.5 - (v + 0.5) / height);
     for (let u = 0; u < width; u++) {

@@ -23,13 +23,13 @@
 
 import { fitHarmonics } from "../hyrf/harmonics.js";
 import { read, readParts } from "../hyrf/index.js";
-import { viewpointOf } from "../hyrf/viewpoint.js";
+import { toLocalView, viewpointOf } from "../hyrf/viewpoint.js";
 import { TEXTURE_WIDTH } from "./constants.js";
 import { rejectOtherFiles } from "./other_files.js";
 import { joinPositions, packModel, packSplats } from "./pack.js";
 import { movePositions, placeOf } from "../hyrf/places.js";
 import { ReceivedFile } from "./received_file.js";
-import { backgroundPicture, modelScene, splatsScene } from "./scene.js";
+import { BACKGROUND_HEIGHT_PIXELS, backgroundPicture, modelScene, splatsScene } from "./scene.js";
 import { measureGaussians, selectGaussians } from "./selection.js";
 import { DepthSort } from "../hyrf/sort.js";
 
@@ -178,9 +178,9 @@ class SceneReader {
         const report = ({ done }) => this.reportProgress("preparing", done);
         const { fitted } = viewpointOf(model.metadata);
         content.splats = packSplats(await fitHarmonics(model, fitted, HARMONICS_DEGREE, report));
-        content.picture = backgroundPicture(model);
+        content.picture = backgroundPicture(model, BACKGROUND_HEIGHT_PIXELS);
       } else {
-        content.models = [packModel(model)];
+        content.models = [packModel(model, firstEye(content.scene, model))];
       }
     } else {
       rejectOtherFiles(bytes);
@@ -206,16 +206,20 @@ class SceneReader {
     const described = placed.map(({ model: { exposure }, place }) => ({ exposure, place }));
     content.scene = { ...own, count, exposure: null, parts: described };
     content.models = placed.map(({ model, place }, number) => {
-      const packed = packModel(model);
+      const packed = packModel(model, firstEye(content.scene, model));
       return { ...packed, place, background: number === 0 && packed.background };
     });
     return joinPositions(placed.map(({ model, place }) => movePositions(model.positions, place)));
   }
 }
 
+// Returns the eye of a scene's first camera in the local units of a model.
+const firstEye = ({ cameras }, { config }) => toLocalView(cameras[0], config.frame).eye;
+
 // Returns the buffers of all arrays of a content, which are transferred with its message.
 function listBuffers({ splats, models = [], picture }) {
-  const parts = [splats, ...models.flatMap((model) => [model, model.geometry, model.radiance]), picture];
+  const partsOf = (model) => [model, model.geometry, model.radiance, model.estimate, model.coarseBackground];
+  const parts = [splats, ...models.flatMap(partsOf), picture];
   const values = parts.flatMap((part) => Object.values(part ?? {}));
   return [...new Set(values.filter(ArrayBuffer.isView).map(({ buffer }) => buffer))];
 }

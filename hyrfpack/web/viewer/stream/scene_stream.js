@@ -23,7 +23,7 @@ import { chooseLevels, predictErrors } from "../../hyrf/levels.js";
 import { parseManifest } from "../../hyrf/manifest.js";
 import { viewpointOf } from "../../hyrf/viewpoint.js";
 import { cameraOf } from "../camera.js";
-import { packGaussians, packModel } from "../pack.js";
+import { packFields, packGaussians } from "../pack.js";
 import { modelScene } from "../scene.js";
 import { ABSENT, ChunkLevels, READY, UNUSABLE, UPLOADING } from "./chunk_levels.js";
 import { FileQueue } from "./file_queue.js";
@@ -212,7 +212,7 @@ export class SceneStream {
     this.isShown = true;
     const described = modelScene({ ...model, count: manifest.gaussians }, manifest.title || name);
     this.scene = { ...described, ...stage, exposure: model.exposure, isStreamed: true };
-    const packed = { ...packModel(model), explicit: null, logits: null, pixelSizes: null, balls: null };
+    const packed = packFields(model);
     const layout = { width: ROW_WIDTH, height: this.rowCount, count: ROW_WIDTH * this.rowCount };
     const chunks = [];
     for (const chunk of this.chunks) {

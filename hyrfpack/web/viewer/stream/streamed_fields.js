@@ -38,11 +38,22 @@ export class StreamedFields extends Fields {
     this.uploadWeights();
   }
 
+  // Creates textures without an estimate: Gaussians that are not evaluated are transparent.
+  async uploadEstimate() {
+    const { gl, graphics, width, height } = this;
+    const create = (format) => graphics.texture(gl.TEXTURE_2D, format, width, height);
+    [this.places, this.shapes, this.colors] = [gl.RGBA32UI, gl.RGBA32UI, gl.RG32UI].map(create);
+  }
+
   async prepare(eye) {
-    await super.prepare(eye);
+    this.eye = eye;
+    await super.prepare();
+  }
+
+  async prepareFields() {
+    await super.prepareFields();
     this.pending = new Set(this.chunks.flatMap(({ rows }) => rows));
     this.chunks = null; // frees memory
-    this.eye = eye;
   }
 
   // Uploads the Gaussians of a level to its rows.
