@@ -19,7 +19,7 @@ from hyrfpack.compress.sensitivity import measure_sensitivity
 from hyrfpack.config.compress import CompressConfig
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import decode_model, encode_model
-from hyrfpack.format.arrays import to_arrays
+from hyrfpack.format.arrays import layered_groups, to_arrays
 from hyrfpack.format.codec import PROFILES
 from hyrfpack.format.container import read_container
 from hyrfpack.format.metadata import read_metadata
@@ -112,7 +112,7 @@ def parameter_errors(before: HybridModel, after: HybridModel) -> dict[str, Error
     old, new = to_arrays(before), to_arrays(after)
     if len(before) == len(after):
         order = _match_gaussians(old, new)
-        new |= {group: new[group][order] for group in LAYERED_SECTIONS}
+        new |= {group: new[group][order] for group in layered_groups(before.config)}
     return {
         SECTION_CONTENTS[group]: measure_error(
             torch.from_numpy(new[group]), torch.from_numpy(values), SECTION_CONTENTS[group]

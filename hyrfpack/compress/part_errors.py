@@ -4,28 +4,33 @@ from __future__ import annotations
 
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Protocol
+from typing import Protocol
 
 import numpy as np
 import torch
 
+from hyrfpack.compress.field_codes import FieldCodes
 from hyrfpack.compress.plan import distortion_per_number, indices_to_keep, make_plan
 from hyrfpack.compress.quantize import opacity_error_model, quantize
 from hyrfpack.compress.reference_renders import ReferenceRenders
+from hyrfpack.compress.residuals import residual_sensitivity
 from hyrfpack.compress.sensitivity import PRUNED_KEY, Sensitivity
-from hyrfpack.format.arrays import iter_parameters, to_arrays
+from hyrfpack.format.arrays import group_shapes, iter_parameters, residual_widths, to_arrays
 from hyrfpack.format.compact.plan import Plan
 from hyrfpack.format.compact.quantized import QuantizedModel
 from hyrfpack.format.sections import (
     COLORS,
     DECODER_SECTIONS,
     GEOMETRY_TABLE,
+    HARMONICS,
     LOGIT_SECTIONS,
     OPACITIES,
     POSITIONS,
     RADIANCE_TABLE,
+    RESIDUAL_SECTIONS,
     SCALES,
     SECTION_CONTENTS,
+    SHAPES,
     TABLE_SECTIONS,
 )
 from hyrfpack.model import Decoded, HybridModel
@@ -38,6 +43,8 @@ QUANTIZED_PARTS: tuple[Part, ...] = (
     (POSITIONS,),
     (COLORS,),
     (SCALES, OPACITIES),
+    (SHAPES,),
+    (HARMONICS,),
     *zip(TABLE_SECTIONS, DECODER_SECTIONS, strict=True),
 )
 
@@ -51,13 +58,11 @@ class ErrorMeasurement:
 
 
 class PartErrors(Protocol):
-    """Predicts and measures the errors of some parts of a model.
+    """Predicts and measures the errors of some parts of a model."""
 
-    Attributes:
-        parts: the parts, in the order of measurement.
-    """
-
-    parts: ClassVar[tuple[Part, ...]]
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """The parts, in the order of measurement."""
 
     def measure(self, sensitivity: Sensitivity, parts: list[Part], progress: Progress) -> dict[Part, ErrorMeasurement]:
         """Compress each of `parts` alone, as `sensitivity` asks for, and return its errors.
@@ -81,11 +86,11 @@ class PruningErrors:
         distortion: as in `make_plan`.
     """
 
-    parts: ClassVar[tuple[Part, ...]] = ((PRUNED_KEY,),)
     model: HybridModel
     decoded: Decoded
     references: ReferenceRenders
     distortion: float
+    parts: tuple[Part, ...] = ((PRUNED_KEY,),)
 
     def measure(self, sensitivity: Sensitivity, parts: list[Part], progress: Progress) -> dict[Part, ErrorMeasurement]:
         """Measure the error of pruning, see `PartErrors.measure`."""
@@ -101,27 +106,37 @@ class QuantizationErrors:
     """Errors of quantising the Gaussians and fields that are left after pruning.
 
     Attributes:
+        parts: the parts that the model has.
         model: the model to compress, before pruning.
         pruned: the model after pruning.
         decoded: the result of `pruned.decode()`.
         references: renders of the pruned model.
         distortion, prune: as in `make_plan`.
+        field_codes: as in `quantize`; the fields then add no error.
     """
 
-    parts: ClassVar[tuple[Part, ...]] = QUANTIZED_PARTS
     model: HybridModel
     pruned: HybridModel
     decoded: Decoded
     references: ReferenceRenders
     distortion: float
     prune: bool
+    field_codes: FieldCodes | None = None
     # The sensitivities of positions that the last plan was made for, the plan, and the planned model.
     _last_plan: tuple[np.ndarray, Plan, HybridModel] | None = field(default=None, init=False)
+    parts: tuple[Part, ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        groups = set(group_shapes(self.model.config, 0))
+        if self.field_codes is not None:
+            groups -= {*TABLE_SECTIONS, *DECODER_SECTIONS}
+        self.parts = tuple(part for part in QUANTIZED_PARTS if groups.issuperset(part))
 
     def measure(self, sensitivity: Sensitivity, parts: list[Part], progress: Progress) -> dict[Part, ErrorMeasurement]:
         """Quantise all of `parts` and measure the error of each one alone, see `PartErrors.measure`."""
         plan, planned = self._plan(sensitivity)
-        quantized = quantize(planned, plan, sensitivity, sections=[name for part in parts for name in part])
+        names = [name for part in parts for name in part]
+        quantized = quantize(planned, plan, sensitivity, sections=names, field_codes=self.field_codes)
         predicted = _predict_quantization_errors(planned, quantized, sensitivity)
         arrays = _undo_plan_order(quantized)
         errors = {}
@@ -168,6 +183,8 @@ def _predict_quantization_errors(
     plan = quantized.plan
     wanted, stored, s = to_arrays(planned), quantized.arrays(), sensitivity.subset(plan.kept)
     weights = {COLORS: np.repeat(s.colors, 3), SCALES: s.scales, **s.fields}
+    for group, columns in residual_widths(planned.config).items():
+        weights[group] = residual_sensitivity(s, group, columns).ravel()
     # Positions are uniform within their lattice cell: variance 1/12 of the squared step for each of the three axes.
     bits = np.concatenate([layer.points.bits[layer.points.classes] for layer in plan.layers])
     errors = {POSITIONS: float((s.positions * 3 / 12 * 4.0**-bits).sum())}
@@ -188,7 +205,10 @@ def _undo_plan_order(quantized: QuantizedModel) -> dict[str, np.ndarray]:
     """
     order = np.argsort(quantized.plan.kept)
     arrays = quantized.arrays()
-    return {name: values[order] if name in LOGIT_SECTIONS else values for name, values in arrays.items()}
+    return {
+        name: values[order] if name in (*LOGIT_SECTIONS, *RESIDUAL_SECTIONS) else values
+        for name, values in arrays.items()
+    }
 
 
 def _replace_arrays(model: HybridModel, arrays: dict[str, np.ndarray]) -> HybridModel:
@@ -200,7 +220,9 @@ def _replace_arrays(model: HybridModel, arrays: dict[str, np.ndarray]) -> Hybrid
 
 def update_decoded(model: HybridModel, before: Decoded, part: Part) -> Decoded:
     """Decode a model again after one part changed, reusing the results `before` that do not depend on this part."""
-    if GEOMETRY_TABLE in part or OPACITIES in part:
+    if HARMONICS in part:  # are evaluated for each view
+        return before
+    if GEOMETRY_TABLE in part or OPACITIES in part or SHAPES in part:
         return replace(before, geometry=model.decode_geometry())
     if before.shading is None:
         return before

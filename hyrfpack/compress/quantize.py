@@ -11,14 +11,25 @@ import torch
 from scipy.special import expit
 
 from hyrfpack.compress.channels import ErrorModel, quantize_channel
-from hyrfpack.compress.groups import quantize_groups
+from hyrfpack.compress.field_codes import FieldCodes
+from hyrfpack.compress.groups import quantize_groups, requantize_groups
 from hyrfpack.compress.plan import make_plan
+from hyrfpack.compress.residuals import quantize_residuals, residual_sensitivity, split_colors
 from hyrfpack.compress.sensitivity import Sensitivity
-from hyrfpack.format.arrays import to_arrays
+from hyrfpack.format.arrays import residual_widths, to_arrays
 from hyrfpack.format.compact.channels import MAX_ABS_CHANNEL_VALUE
 from hyrfpack.format.compact.plan import Plan
 from hyrfpack.format.compact.quantized import LOGIT_COLUMNS, QuantizedModel
-from hyrfpack.format.sections import COLORS, DECODER_SECTIONS, LOGIT_SECTIONS, OPACITIES, SCALES, TABLE_SECTIONS
+from hyrfpack.format.sections import (
+    COLORS,
+    DECODER_SECTIONS,
+    HARMONICS,
+    LOGIT_SECTIONS,
+    OPACITIES,
+    RESIDUAL_SECTIONS,
+    SCALES,
+    TABLE_SECTIONS,
+)
 from hyrfpack.model import HybridModel
 from hyrfpack.parallel.pool import run_jobs
 
@@ -41,7 +52,8 @@ def quantize(
     *,
     reach: int = 1,
     previous: QuantizedModel | None = None,
-    sections: Collection[str] = (*LOGIT_SECTIONS, *TABLE_SECTIONS, *DECODER_SECTIONS),
+    sections: Collection[str] = (*LOGIT_SECTIONS, *RESIDUAL_SECTIONS, *TABLE_SECTIONS, *DECODER_SECTIONS),
+    field_codes: FieldCodes | None = None,
 ) -> QuantizedModel:
     """Quantise a planned model (`plan.apply`) by rate and distortion.
 
@@ -52,6 +64,7 @@ def quantize(
         reach: distance in steps of the furthest candidate from the nearest symbol; 0 takes the nearest.
         previous: an earlier result for the same plan, whose prediction weights are reused.
         sections: the sections to quantise; a file needs all of them.
+        field_codes: step codes of fields whose numbers are quantised already; None chooses steps.
 
     Raises:
         HyrfError: a parameter is NaN or infinite.
@@ -60,9 +73,14 @@ def quantize(
     sensitivity, d = sensitivity.subset(plan.kept), plan.distortion_per_number
     jobs: dict[str, Callable[[], Any]] = {
         group: partial(quantize_groups, arrays[group].ravel(), groups, sensitivity.fields[group], d, reach)
+        if field_codes is None
+        else partial(requantize_groups, arrays[group].ravel(), groups, field_codes.of_groups(group, groups))
         for group, groups in plan.groups.items()
         if group in sections
     }
+    residuals = [group for group in residual_widths(model.config) if group in sections]
+    if HARMONICS in residuals:
+        arrays[HARMONICS] = split_colors(arrays[HARMONICS], plan.basis)
     logits = [group for group in LOGIT_SECTIONS if group in sections]
     weights = {COLORS: sensitivity.colors, SCALES: sensitivity.scales, OPACITIES: sensitivity.opacities}
     error: ErrorModel | None = None
@@ -85,12 +103,25 @@ def quantize(
                 jobs[f"{group} {layer} {column}"] = partial(
                     quantize_channel, values, classes, weights[group][members], d, cost, own_reach, weight
                 )
+        for group in residuals:
+            jobs[f"{group} {layer}"] = partial(
+                quantize_residuals,
+                group,
+                arrays[group][members],
+                classes,
+                residual_sensitivity(sensitivity.subset(members), group, arrays[group].shape[1]),
+                d,
+                reach,
+            )
     done = run_jobs(jobs)
     channels = [
         {group: [done[f"{group} {layer} {column}"] for column in range(LOGIT_COLUMNS[group])] for group in logits}
         for layer in range(len(plan.layers))
     ]
-    return QuantizedModel(plan, channels, {group: done[group] for group in plan.groups if group in sections})
+    layers = range(len(plan.layers)) if residuals else ()
+    quantized_residuals = [{group: done[f"{group} {layer}"] for group in residuals} for layer in layers]
+    groups = {group: done[group] for group in plan.groups if group in sections}
+    return QuantizedModel(plan, channels, groups, quantized_residuals)
 
 
 def _offset_error(error: ErrorModel, start: int, places: Any, candidates: np.ndarray) -> np.ndarray:

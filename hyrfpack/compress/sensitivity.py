@@ -10,8 +10,18 @@ import torch
 
 from hyrfpack.cameras.view_sampling import sample_views
 from hyrfpack.format.arrays import SECTION_PARAMETERS
-from hyrfpack.format.sections import COLORS, DECODER_SECTIONS, OPACITIES, POSITIONS, SCALES, TABLE_SECTIONS
+from hyrfpack.format.sections import (
+    COLORS,
+    DECODER_SECTIONS,
+    HARMONICS,
+    OPACITIES,
+    POSITIONS,
+    SCALES,
+    SHAPES,
+    TABLE_SECTIONS,
+)
 from hyrfpack.model import Geometry, HybridModel, expand
+from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.progress import Progress, TaskEvent, ignore_progress
 from hyrfpack.render import render_view
 from hyrfpack.scene import Camera
@@ -31,6 +41,8 @@ MIN_CAMERA_DISTANCE_LOCAL = 0.05
 MIN_RELATIVE_DECODER_SENSITIVITY = 1e-2
 # Setting a whole decoder to zero is assumed to add at least this error, because gradients vanish under saturation.
 MIN_ZEROED_DECODER_ERROR = 1e-6
+# Bound of the factor by which the sensitivity of a thin Gaussian's rotation exceeds that of its scales.
+MAX_SHAPE_ANISOTROPY = 1e4
 # Key of the Gaussians that are left out, beside the names of the sections.
 PRUNED_KEY = "pruned"
 
@@ -48,6 +60,8 @@ class Sensitivity:
         scales, opacities: (N,) sensitivities of the explicit logits.
         removals: (N,) mean squared error that leaving out a Gaussian adds, see `removal_error`.
         fields: sensitivities of each hash table and decoder by section, in the order of the file.
+        shapes, harmonics: (N, 5) sensitivities of the shape residuals, and (N,) of a coefficient of the colour
+            residuals, the mean of all; None for a model without residuals.
     """
 
     positions: np.ndarray
@@ -56,11 +70,15 @@ class Sensitivity:
     opacities: np.ndarray
     removals: np.ndarray
     fields: dict[str, np.ndarray]
+    shapes: np.ndarray | None = None
+    harmonics: np.ndarray | None = None
 
     def subset(self, index: np.ndarray | slice) -> Sensitivity:
         """Return the sensitivities of the Gaussians at `index` (n,) int64, and of all fields."""
+        shapes, harmonics = (None if values is None else values[index] for values in (self.shapes, self.harmonics))
         positions, colors, scales = self.positions[index], self.colors[index], self.scales[index]
-        return Sensitivity(positions, colors, scales, self.opacities[index], self.removals[index], self.fields)
+        opacities, removals = self.opacities[index], self.removals[index]
+        return Sensitivity(positions, colors, scales, opacities, removals, self.fields, shapes, harmonics)
 
     def scaled_by(self, factors: dict[str, float]) -> Sensitivity:
         """Multiply each section, and the removals (PRUNED_KEY), by its factor, which is 1 if it is not given."""
@@ -75,7 +93,11 @@ class Sensitivity:
             )
         )
         fields = {group: values * factors.get(group, 1.0) for group, values in self.fields.items()}
-        return Sensitivity(positions, colors, scales, opacities, removals, fields)
+        shapes, harmonics = (
+            None if values is None else values * factors.get(group, 1.0)
+            for group, values in ((SHAPES, self.shapes), (HARMONICS, self.harmonics))
+        )
+        return Sensitivity(positions, colors, scales, opacities, removals, fields, shapes, harmonics)
 
 
 def measure_sensitivity(
@@ -105,6 +127,8 @@ def measure_sensitivity(
     generator = torch.Generator().manual_seed(seed)
     squares = {name: torch.zeros_like(parameter) for name, parameter in model.named_parameters()}
     jacobian = _cube_jacobian(model)
+    residuals = {name: values for name, values in model.gaussians.named_buffers() if name in Gaussians.RESIDUAL_NAMES}
+    squares |= {name: torch.zeros_like(values) for name, values in residuals.items()}
     required = {name: parameter.requires_grad for name, parameter in model.named_parameters()}
     pixels, field_pixels = 0, 0
     for number, camera in enumerate(views):
@@ -114,6 +138,8 @@ def measure_sensitivity(
         for name, parameter in model.named_parameters():
             parameter.requires_grad_(with_fields or name.startswith("gaussians"))
             parameter.grad = None
+        for values in residuals.values():
+            values.requires_grad_(True)
         rgb = render_view(model, camera).rgb
         signs = torch.randint(0, 2, rgb.shape, generator=generator).to(rgb) * 2 - 1
         if rgb.requires_grad:
@@ -128,6 +154,11 @@ def measure_sensitivity(
                 gradient = (jacobian * gradient[:, :, None]).sum(1)
             squares[name] += gradient.square()
             parameter.grad = None
+        for name, values in residuals.items():
+            if values.grad is not None:
+                squares[name] += values.grad.square()
+            values.requires_grad_(False)
+            values.grad = None
     for name, parameter in model.named_parameters():
         parameter.requires_grad_(required[name])
     return _combine(model, squares, pixels, field_pixels, at, jacobian)
@@ -171,7 +202,26 @@ def _combine(
         )
     positions, colors, scales, opacities = explicit
     removals = removal_error(geometry.opacities.double().cpu().numpy(), opacities)
-    return Sensitivity(positions, colors, scales, opacities, removals, fields)
+    if model.gaussians.shape_residuals is None:
+        return Sensitivity(positions, colors, scales, opacities, removals, fields)
+    measured = squares["shape_residuals"].double().cpu().numpy() / pixels
+    guesses = _expected_shape_sensitivity(geometry, expected["scale_logits"])
+    pairs = zip(measured.T, guesses.T, strict=True)
+    shapes = np.stack([combine_with_prior(model, values, guess, views) for values, guess in pairs], axis=1)
+    measured = squares["color_residuals"].mean(dim=1).double().cpu().numpy() / pixels
+    harmonics = combine_with_prior(model, measured, expected["color_logits"], views)
+    return Sensitivity(positions, colors, scales, opacities, removals, fields, shapes, harmonics)
+
+
+def _expected_shape_sensitivity(geometry: Geometry, scale_sensitivity: np.ndarray) -> np.ndarray:
+    """Estimate the sensitivities (N, 5) of shape residuals, up to a factor for each column.
+
+    Turning a Gaussian about an axis changes its covariance in proportion to the difference of the other two variances.
+    """
+    scales = geometry.scales.double().cpu().numpy()
+    ratios = np.roll(scales, -1, axis=1) / np.maximum(np.roll(scales, -2, axis=1), 1e-12)
+    turns = np.minimum((ratios - 1 / np.maximum(ratios, 1e-12)) ** 2, MAX_SHAPE_ANISOTROPY)
+    return scale_sensitivity[:, None] * np.concatenate((np.ones((len(scales), 2)), turns), axis=1)
 
 
 def combine_with_prior(model: HybridModel, measured: np.ndarray, guess: np.ndarray, views: int) -> np.ndarray:

@@ -15,6 +15,7 @@ from hyrfpack.errors import HyrfError
 from hyrfpack.export.exposure import BakeGains
 from hyrfpack.model import Geometry, HybridModel
 from hyrfpack.model.exposure import apply_exposure_gains
+from hyrfpack.model.residuals import add_color_residuals
 from hyrfpack.ops.least_squares import least_squares
 from hyrfpack.ops.mlp import mlp
 from hyrfpack.ops.poses import camera_center
@@ -203,6 +204,7 @@ def _fit_harmonics(
 ) -> dict[int, Tensor]:
     """Fit the harmonics (N, K, 3) of all Gaussians for each degree."""
     shading, positions = model.shading(), model.gaussians.positions.detach()
+    residuals = model.gaussians.color_residuals
     fitted = {degree: positions.new_empty(len(model), num_sh_bases(degree), 3) for degree in degrees}
     highest = max(fitted)
     sphere = fibonacci_sphere(SPHERE_DIRECTIONS).float()
@@ -222,7 +224,7 @@ def _fit_harmonics(
         block_slice = slice(start, stop)
         mean_gains = None if gains is None else gains.gaussians[block_slice]
         sphere_colors = torch.stack(
-            [_centered_colors(direction[None], shading, block_slice, mean_gains) for direction in sphere]
+            [_centered_colors(direction[None], shading, residuals, block_slice, mean_gains) for direction in sphere]
         ).flatten(1)
         right_sides = (weighted_sphere_basis @ sphere_colors).reshape(terms, stop - start, 3).transpose(0, 1)
         rows = [
@@ -238,7 +240,7 @@ def _fit_harmonics(
             index = view.index[view_slice].long()
             directions = torch.nn.functional.normalize(positions[index] - view.viewpoint, dim=-1, eps=1e-12)
             camera_gains = None if gains is None else gains.cameras[number]
-            colors = _centered_colors(directions, shading, index, camera_gains)
+            colors = _centered_colors(directions, shading, residuals, index, camera_gains)
             weights = (view.light[view_slice] / light[index]).float()
             rows.append((index - start, harmonics_basis(directions, highest), colors, weights))
         owners, basis, colors, weights = map(torch.cat, zip(*rows, strict=True))
@@ -258,11 +260,14 @@ def _fit_harmonics(
     return fitted
 
 
-def _centered_colors(directions: Tensor, shading: Shading, index: Tensor | slice, gains: Tensor | None) -> Tensor:
+def _centered_colors(
+    directions: Tensor, shading: Shading, residuals: Tensor | None, index: Tensor | slice, gains: Tensor | None
+) -> Tensor:
     """Evaluate colours minus 0.5 (n, 3) of Gaussians along directions, exposed by `gains` (3,) or (n, 3) if given.
 
     Args:
         directions: (n, 3), one for each Gaussian at `index`; or (1, 3) if `index` is a slice.
+        residuals: (N, 3 K) colour residuals of all Gaussians, if the model has any.
     """
     encoded = encode_directions(directions, shading.encoding)
     if isinstance(index, slice):
@@ -271,6 +276,8 @@ def _centered_colors(directions: Tensor, shading: Shading, index: Tensor | slice
         hidden = shading.first_layer[index].addmm_(encoded, shading.direction_weight.T)
     logits = mlp(hidden.relu_(), shading.weights, shading.biases)
     colors = logits.add_(shading.color_logits[index]).sigmoid_()
+    if residuals is not None:
+        colors = add_color_residuals(colors, residuals[index], directions)
     return (colors if gains is None else apply_exposure_gains(colors, gains)).sub_(0.5)
 
 

@@ -15,6 +15,7 @@ from hyrfpack.model.config import ModelConfig
 from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.model.hash_grid import FEATURES_PER_LEVEL, HashGridConfig
 from hyrfpack.model.hybrid import HybridModel
+from hyrfpack.model.residuals import SHAPE_RESIDUALS, count_color_residuals
 
 # Equations of every model of this version, which no setting changes; `docs/reference/format.md` defines the names.
 MODEL_RULES = {
@@ -38,6 +39,8 @@ SECTION_PARAMETERS = {
     sections.COLORS: ("gaussians.color_logits",),
     sections.SCALES: ("gaussians.scale_logits",),
     sections.OPACITIES: ("gaussians.opacity_logits",),
+    sections.SHAPES: ("gaussians.shape_residuals",),
+    sections.HARMONICS: ("gaussians.color_residuals",),
     sections.GEOMETRY_TABLE: ("geometry.grid.table",),
     sections.GEOMETRY_DECODER: _decoder_parameters("geometry"),
     sections.RADIANCE_TABLE: ("radiance.grid.table",),
@@ -56,6 +59,8 @@ def to_arrays(model: HybridModel) -> dict[str, np.ndarray]:
     state = model.state_dict()
     matrices = {}
     for group, names in SECTION_PARAMETERS.items():
+        if names[0] not in state:  # a model without residuals
+            continue
         parts = [state[name].cpu().numpy().astype(np.float32) for name in names]
         values = parts[0] if len(parts) == 1 else np.concatenate([part.ravel() for part in parts])[:, None]
         if wrong := int(np.count_nonzero(~np.isfinite(values))):
@@ -77,10 +82,25 @@ def group_shapes(config: ModelConfig, gaussians: int) -> dict[str, tuple[int, in
         group: (gaussians, width)
         for group, width in zip(sections.LAYERED_SECTIONS, Gaussians.PARAMETER_WIDTHS, strict=True)
     }
+    for group, width in residual_widths(config).items():
+        shapes[group] = gaussians, width
     shapes |= {group: (grid.rows, FEATURES_PER_LEVEL) for group, grid in grid_configs(config).items()}
     for group, widths in decoder_widths(config).items():
         shapes[group] = (sum((fan_in + 1) * fan_out for fan_in, fan_out in pairwise(widths)), 1)
-    return {group: shapes[group] for group in SECTION_PARAMETERS}
+    return {group: shapes[group] for group in SECTION_PARAMETERS if group in shapes}
+
+
+def residual_widths(config: ModelConfig) -> dict[str, int]:
+    """Return the columns of the residuals that a model has, by section."""
+    degree = config.residual_degree
+    if degree is None:
+        return {}
+    return {sections.SHAPES: SHAPE_RESIDUALS, sections.HARMONICS: count_color_residuals(degree)}
+
+
+def layered_groups(config: ModelConfig) -> tuple[str, ...]:
+    """Return the sections of a model that each layer has."""
+    return (*sections.LAYERED_SECTIONS, *residual_widths(config))
 
 
 def grid_configs(config: ModelConfig) -> dict[str, HashGridConfig]:
@@ -99,11 +119,18 @@ def decoder_widths(config: ModelConfig) -> dict[str, tuple[int, int, int, int]]:
 
 def to_model(config: ModelConfig, arrays: dict[str, np.ndarray]) -> HybridModel:
     """Build a model from matrices: the inverse of `to_arrays`. Shapes must be those of `group_shapes`."""
-    gaussians = Gaussians(*(torch.from_numpy(arrays[group]) for group in sections.LAYERED_SECTIONS))
+    gaussians = to_gaussians(arrays)
     with torch.device("meta"):  # has shapes but no storage, so that no random initial values are computed
         model = HybridModel(config, gaussians)
     model.load_state_dict({name: value.clone() for name, value in iter_parameters(arrays, model)}, assign=True)
     return model
+
+
+def to_gaussians(arrays: dict[str, np.ndarray]) -> Gaussians:
+    """Build Gaussians from the matrices of the layered sections."""
+    groups = (*sections.LAYERED_SECTIONS, *(group for group in sections.RESIDUAL_SECTIONS if group in arrays))
+    names = (SECTION_PARAMETERS[group][0].removeprefix("gaussians.") for group in groups)
+    return Gaussians(**{name: torch.from_numpy(arrays[group]) for name, group in zip(names, groups, strict=True)})
 
 
 def iter_parameters(arrays: dict[str, np.ndarray], model: HybridModel) -> Iterator[tuple[str, torch.Tensor]]:

@@ -24,7 +24,7 @@ from hyrfpack.format.run_folder import SCENE_MANIFEST_FILE, find_model
 
 MAGIC = b"\x89HYRF\r\n\n"
 MAJOR_VERSION = 1
-MINOR_VERSION = 5
+MINOR_VERSION = 6
 
 # A file beyond one of these limits is rejected before anything is read or allocated for it.
 MAX_SECTIONS = 1024

@@ -12,13 +12,12 @@ import torch
 from hyrfpack.cameras.sampling import PhotoCameras
 from hyrfpack.errors import HyrfFormatError
 from hyrfpack.format import compact, paper, raw
-from hyrfpack.format.arrays import check_rules, group_shapes, parse_config, to_model
+from hyrfpack.format.arrays import check_rules, group_shapes, layered_groups, parse_config, to_gaussians, to_model
 from hyrfpack.format.container import Container
 from hyrfpack.format.exposure import decode_exposure
 from hyrfpack.format.metadata import read_metadata
 from hyrfpack.format.sections import (
     EXPOSURE,
-    LAYERED_SECTIONS,
     PART_NAMES,
     POSITIONS,
     group_and_layer,
@@ -26,7 +25,6 @@ from hyrfpack.format.sections import (
 )
 from hyrfpack.format.shared import CODEC_SHARED, open_shared, read_provenance, read_section
 from hyrfpack.model.config import ModelConfig
-from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.model.hybrid import HybridModel
 from hyrfpack.parallel.pool import run_tasks
 from hyrfpack.quant import DamagedDataError
@@ -80,7 +78,8 @@ def decode_container(container: Container, fields: HybridModel | None = None) ->
                 f"{container.name}: its configuration is not that of the file with its fields",
                 fix="copy the whole folder again",
             )
-        shapes = {tag: shape for tag, shape in layout.shapes.items() if group_and_layer(tag)[0] in LAYERED_SECTIONS}
+        groups = layered_groups(layout.config)
+        shapes = {tag: shape for tag, shape in layout.shapes.items() if group_and_layer(tag)[0] in groups}
         layout = replace(layout, shapes=shapes)
     arrays = _decode_sections(container, layout)
     for tag, values in arrays.items():
@@ -90,10 +89,10 @@ def decode_container(container: Container, fields: HybridModel | None = None) ->
                 fix="write the file again",
             )
     if (layer_count := len(layout.layers)) > 1:
-        for group in LAYERED_SECTIONS:
+        for group in layered_groups(layout.config):
             arrays[group] = np.concatenate([arrays.pop(layer_section(group, layer)) for layer in range(layer_count)])
     if fields is not None:
-        model = fields.with_gaussians(Gaussians(*(torch.from_numpy(arrays[group]) for group in LAYERED_SECTIONS)))
+        model = fields.with_gaussians(to_gaussians(arrays))
         _add_photo_sampling(model.requires_grad_(False), read_provenance(container))
         return model
     model = to_model(layout.config, arrays).requires_grad_(False)
@@ -130,16 +129,14 @@ def read_layout(container: Container) -> ModelLayout:
     except HyrfFormatError as error:
         raise error.with_text(f"{name}: {error.problem}") from error
     layers = metadata.layers or [metadata.gaussians]
-    shapes = {}
+    shapes, groups = {}, layered_groups(config)
     for layer, count in enumerate(layers):
         for group, shape in group_shapes(config, count).items():
-            if layer == 0 or group in LAYERED_SECTIONS:
+            if layer == 0 or group in groups:
                 shapes[layer_section(group, layer)] = shape
     _check_sections(container, shapes)
     layer_count = 1
-    while layer_count < len(layers) and all(
-        layer_section(group, layer_count) in container for group in LAYERED_SECTIONS
-    ):
+    while layer_count < len(layers) and all(layer_section(group, layer_count) in container for group in groups):
         layer_count += 1
     layers = layers[:layer_count]
     shapes = {tag: shape for tag, shape in shapes.items() if group_and_layer(tag)[1] < layer_count}

@@ -150,6 +150,8 @@ def read_metadata(container: Container) -> Metadata:
         _check_type(values["config"], _CONFIG_TYPES, "config")
         if "rotation" in values["config"]["frame"]:
             _check_type(values["config"]["frame"]["rotation"], (float,) * 4, "config.frame.rotation")
+        if "residual_degree" in values["config"]:
+            _check_type(values["config"]["residual_degree"], int, "config.residual_degree")
         _check_type([values["profile"], values["writer"]], (str, str), "profile or writer")
         if not 0 <= values["gaussians"] < 1 << 40:
             raise ValueError(f"there cannot be {values['gaussians']} Gaussians")

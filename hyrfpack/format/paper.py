@@ -60,7 +60,9 @@ def encode(model: HybridModel, **settings: Any) -> tuple[list[Section], dict]:
     # Halves are encoded first. They reject values that would overflow the geometry field, whose outputs are needed to
     # clip the opacity logits below.
     halves = {
-        group: _encode_float16(group, arrays[group]) for group in (sections.POSITIONS, *sections.DECODER_SECTIONS)
+        group: _encode_float16(group, arrays[group])
+        for group in (sections.POSITIONS, *sections.DECODER_SECTIONS, *sections.RESIDUAL_SECTIONS)
+        if group in arrays
     }
     arrays[sections.OPACITIES] = _clip_opacity_logits(model, arrays[sections.OPACITIES])
     return [
@@ -72,6 +74,7 @@ def encode(model: HybridModel, **settings: Any) -> tuple[list[Section], dict]:
         halves[sections.GEOMETRY_DECODER],
         _encode_min_max(sections.RADIANCE_TABLE, arrays[sections.RADIANCE_TABLE]),
         halves[sections.RADIANCE_DECODER],
+        *(halves[group] for group in sections.RESIDUAL_SECTIONS if group in halves),
     ], asdict(chosen)
 
 

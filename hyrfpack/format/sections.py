@@ -15,6 +15,8 @@ GEOMETRY_TABLE = "GTAB"
 GEOMETRY_DECODER = "GMLP"
 RADIANCE_TABLE = "RTAB"
 RADIANCE_DECODER = "RMLP"
+SHAPES = "SHAP"
+HARMONICS = "HARM"
 # A merged file has these instead: the names of its parts, and the part files (`part_section`).
 PART_NAMES = "PRTS"
 MAX_PARTS = 64
@@ -24,6 +26,8 @@ TABLE_SECTIONS = (GEOMETRY_TABLE, RADIANCE_TABLE)
 DECODER_SECTIONS = (GEOMETRY_DECODER, RADIANCE_DECODER)
 # Gaussians may be stored in layers, the most important first. These are the section types of the first layer.
 LAYERED_SECTIONS = (POSITIONS, *LOGIT_SECTIONS)
+# A model with residuals has these, too, in the same layers.
+RESIDUAL_SECTIONS = (SHAPES, HARMONICS)
 MAX_LAYERS = 8
 
 
@@ -34,7 +38,8 @@ def part_section(number: int) -> str:
 
 NON_PARAMETER_SECTIONS = (METADATA, EXPOSURE)
 
-# Content of each section type. In a file of one model, every section of a model except EXPOSURE is required.
+# Content of each section type. In a file of one model, every section of a model except EXPOSURE is required, and the
+# residuals are if the configuration says so.
 SECTION_CONTENTS = {
     METADATA: "metadata",
     EXPOSURE: "exposure map",
@@ -42,6 +47,8 @@ SECTION_CONTENTS = {
     COLORS: "colour logits",
     SCALES: "scale logits",
     OPACITIES: "opacity logits",
+    SHAPES: "residuals of shapes",
+    HARMONICS: "residuals of colours",
     GEOMETRY_TABLE: "geometry hash table",
     GEOMETRY_DECODER: "geometry decoder",
     RADIANCE_TABLE: "radiance hash table",
@@ -55,7 +62,9 @@ def layer_section(group: str, layer: int) -> str:
 
 
 _GROUP_AND_LAYER_BY_TAG = {
-    layer_section(group, layer): (group, layer) for layer in range(MAX_LAYERS) for group in LAYERED_SECTIONS
+    layer_section(group, layer): (group, layer)
+    for layer in range(MAX_LAYERS)
+    for group in (*LAYERED_SECTIONS, *RESIDUAL_SECTIONS)
 }
 SECTION_CONTENTS |= {
     tag: f"{SECTION_CONTENTS[group]}, layer {layer}" for tag, (group, layer) in _GROUP_AND_LAYER_BY_TAG.items() if layer

@@ -11,11 +11,14 @@ MERGED_MINOR_VERSION = 4  # of a file of several models
 _COMPACT_CODECS = range(5, 9)
 _SHARED_MINOR_VERSION = 5
 _SHARED_CODECS = (11, 12)  # tables with stated groups, and sections of another file
+_RESIDUAL_MINOR_VERSION = 6
 
 
 def lowest_minor_version(sections: Iterable[Section], config: dict) -> int:
     """Return the lowest minor version that has the sections, their codecs, and the keys of a configuration."""
     sections = list(sections)
+    if "residual_degree" in config:
+        return _RESIDUAL_MINOR_VERSION
     if any(section.codec in _SHARED_CODECS for section in sections):
         return _SHARED_MINOR_VERSION
     if "rotation" in config["frame"]:

@@ -145,6 +145,11 @@ def _split(path: Path, name: str, config: SplitConfig, progress: Progress) -> tu
         model = decode_container(container)
         if not len(model):
             raise HyrfError(f"{path}: there is no Gaussian in it, so there is nothing to split", fix="train it again")
+        if model.config.residual_degree is not None:
+            raise HyrfError(
+                f"{path}: a model with residuals cannot be split into levels of detail",
+                fix="import the splats again with a `psnr` below 38 dB",
+            )
         encoder = ChunkEncoder(container, model, SHARED_NAME)
     files = {SHARED_NAME: encoder.shared_bytes}
     cube = model.cube_coords(model.gaussians.positions.detach().double()).numpy()

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass
 
 from hyrfpack.model.frame import Frame
 from hyrfpack.model.hash_grid import HashGridConfig
+from hyrfpack.ops.harmonics import MAX_DEGREE
 from hyrfpack.rotations import Quaternion
 
 
@@ -24,6 +25,8 @@ class ModelConfig:
         direction_encoding: "frequency" (NeRF, 4 octaves) or "sh" (real spherical harmonics, bands 0 to 2).
         position_gradients: whether gradients flow from the fields to the Gaussians' positions (training only).
         antialiased: whether opacity is compensated for the rasteriser's low-pass filter.
+        residual_degree: degree of the harmonics of colour residuals; None without residuals
+            (`hyrfpack.model.residuals`).
     """
 
     frame: Frame
@@ -37,15 +40,18 @@ class ModelConfig:
     direction_encoding: str = "frequency"
     position_gradients: bool = False
     antialiased: bool = False
+    residual_degree: int | None = None
 
     def to_dict(self) -> dict:
         """Return the configuration as plain numbers, strings, lists and dictionaries, ready for JSON.
 
-        The frame has a rotation only if it is not the identity.
+        The frame has a rotation only if it is not the identity, and `residual_degree` is left out if it is None.
         """
         values = asdict(self)
         if not self.frame.is_rotated:
             del values["frame"]["rotation"]
+        if self.residual_degree is None:
+            del values["residual_degree"]
         return values
 
     @classmethod
@@ -72,6 +78,8 @@ class ModelConfig:
             raise ValueError(f"scale_rule is '{self.scale_rule}'; it must be 'sum' or 'product'")
         if self.direction_encoding not in ("sh", "frequency"):
             raise ValueError(f"direction_encoding is '{self.direction_encoding}'; it must be 'sh' or 'frequency'")
+        if self.residual_degree not in (None, *range(MAX_DEGREE + 1)):
+            raise ValueError(f"residual_degree is {self.residual_degree}; it must lie in [0, {MAX_DEGREE}]")
         if not 1 <= self.hidden <= 1024:
             raise ValueError(f"hidden is {self.hidden}; it must lie in [1, 1024]")
         if not (self.frame.scale > 0 and all(h > 0 for h in self.frame.half_extent)):

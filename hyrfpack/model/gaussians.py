@@ -26,6 +26,8 @@ class Gaussians(nn.Module):
         color_logits: (N, 3) explicit RGB logits.
         scale_logits: (N, 1) explicit logit of the scale.
         opacity_logits: (N, 1) explicit logit of the opacity.
+        shape_residuals, color_residuals: (N, 5) and (N, 3 K) corrections of what the fields predict, see
+            `hyrfpack.model.residuals`; None in a model without them. Training keeps them as they are.
         pixel_sizes: (N,) the size of a photo's pixel at each Gaussian, in local units, of the photo that shows it at
             the highest rate. None if the photos' cameras are not known, as in training. It is not trained, and files
             do not store it. `hyrfpack.render_view` samples the Gaussians no more finely.
@@ -33,13 +35,24 @@ class Gaussians(nn.Module):
 
     PARAMETER_NAMES = ("positions", "color_logits", "scale_logits", "opacity_logits")
     PARAMETER_WIDTHS = (3, 3, 1, 1)
+    RESIDUAL_NAMES = ("shape_residuals", "color_residuals")
     positions: Tensor
     color_logits: Tensor
     scale_logits: Tensor
     opacity_logits: Tensor
+    shape_residuals: Tensor | None
+    color_residuals: Tensor | None
     pixel_sizes: Tensor | None
 
-    def __init__(self, positions: Tensor, color_logits: Tensor, scale_logits: Tensor, opacity_logits: Tensor) -> None:
+    def __init__(
+        self,
+        positions: Tensor,
+        color_logits: Tensor,
+        scale_logits: Tensor,
+        opacity_logits: Tensor,
+        shape_residuals: Tensor | None = None,
+        color_residuals: Tensor | None = None,
+    ) -> None:
         super().__init__()
         for name, width, values in zip(
             self.PARAMETER_NAMES,
@@ -50,11 +63,18 @@ class Gaussians(nn.Module):
             if values.shape != (len(positions), width):
                 raise ValueError(f"{name} has shape {tuple(values.shape)}; ({len(positions)}, {width}) is needed")
             setattr(self, name, nn.Parameter(values.float().contiguous()))
+        for name, residuals in zip(self.RESIDUAL_NAMES, (shape_residuals, color_residuals), strict=True):
+            self.register_buffer(name, None if residuals is None else residuals.detach().float().contiguous())
         self.register_buffer("pixel_sizes", None, persistent=False)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of all values that these Gaussians have: the parameters, and the residuals if there are any."""
+        return (*self.PARAMETER_NAMES, *(name for name in self.RESIDUAL_NAMES if getattr(self, name) is not None))
 
     def subset(self, index: Tensor) -> Gaussians:
         """Return copies of the Gaussians at `index` (n,) int64."""
-        subset = Gaussians(*(getattr(self, name).detach()[index] for name in self.PARAMETER_NAMES))
+        subset = Gaussians(**{name: getattr(self, name).detach()[index] for name in self.names})
         subset.pixel_sizes = None if self.pixel_sizes is None else self.pixel_sizes[index]
         return subset
 

@@ -11,12 +11,13 @@ from hyrfpack.model.config import ModelConfig
 from hyrfpack.model.exposure import ExposureMap
 from hyrfpack.model.field import Field
 from hyrfpack.model.gaussians import Gaussians, take_rows
+from hyrfpack.model.residuals import add_color_residuals, add_shape_residuals
 from hyrfpack.ops import activate
 from hyrfpack.ops.background import BackgroundField, background_colors, background_grid
 from hyrfpack.ops.contraction import contract
 from hyrfpack.ops.mlp import mlp
 from hyrfpack.ops.rasterize import Gaussians3D
-from hyrfpack.ops.shade import DIRECTION_FEATURES, Shading, encode_views
+from hyrfpack.ops.shade import DIRECTION_FEATURES, Shading, encode_views, shade
 from hyrfpack.ops.viewport import Viewport
 
 GAUSSIANS_PER_SHADING_BLOCK = 1 << 20  # This bounds the memory of hash features in `HybridModel.shading`.
@@ -77,7 +78,8 @@ class HybridModel(nn.Module):
         opacity = sigmoid(a_n + a_e)      colour = sigmoid(c_n(direction) + c_e)
         scale = S(p) sigmoid(s_n + s_e)   rotation = normalize(r_n + (1, 0, 0, 0))
 
-    with S(p) = max(1, |u|) local units. All positions are local to `config.frame`.
+    with S(p) = max(1, |u|) local units. All positions are local to `config.frame`. Residuals correct shapes and colours
+    of single Gaussians, see `hyrfpack.model.residuals`.
 
     Attributes:
         precision: precision of the decoders' products in GPU kernels, not stored in files: "mixed" rounds factors to
@@ -108,10 +110,15 @@ class HybridModel(nn.Module):
         """Return a model with copies of the Gaussians at `index` (n,) int64; it shares the fields with this model."""
         return self.with_gaussians(self.gaussians.subset(index))
 
-    def with_gaussians(self, gaussians: Gaussians) -> HybridModel:
-        """Return a model of other Gaussians; it shares the fields with this model."""
+    def with_gaussians(self, gaussians: Gaussians, config: ModelConfig | None = None) -> HybridModel:
+        """Return a model of other Gaussians; it shares the fields with this model.
+
+        Args:
+            gaussians: the Gaussians, with the residuals that the configuration asks for.
+            config: the configuration, which differs at most in `residual_degree` from that of this model.
+        """
         with torch.device("meta"):  # has no storage, so that no random initial values are computed
-            model = HybridModel(self.config, gaussians)
+            model = HybridModel(config or self.config, gaussians)
         model.geometry, model.radiance = self.geometry, self.radiance
         model.copy_settings(self)
         return model
@@ -172,6 +179,8 @@ class HybridModel(nn.Module):
         pick = (lambda values: values) if index is None else (lambda values: take_rows(values, index))
         positions = self._field_positions(pick(explicit.positions))
         raw = self.geometry(self.cube_coords(positions), mixed=self._mixed)
+        if explicit.shape_residuals is not None:
+            raw = add_shape_residuals(raw, pick(explicit.shape_residuals))
         return self.activate(raw, positions, pick(explicit.scale_logits), pick(explicit.opacity_logits))
 
     def activate(self, raw: Tensor, positions: Tensor, scale_logits: Tensor, opacity_logits: Tensor) -> Geometry:
@@ -183,16 +192,27 @@ class HybridModel(nn.Module):
         )
         return Geometry(*parts)
 
-    def decode_colors(self, viewpoint: Tensor, index: Tensor | None = None) -> Tensor:
-        """Return colours (n, 3) in (0, 1) of the Gaussians at `index`, seen from `viewpoint` (3,) in local units."""
+    def decode_colors(self, viewpoint: Tensor, index: Tensor | None = None, shading: Shading | None = None) -> Tensor:
+        """Return colours (n, 3), 0 or more, of the Gaussians at `index` (n,), seen from `viewpoint` (3,), local units.
+
+        Without colour residuals they lie in (0, 1). `shading` is the result of `shading()`, if it is known; then the
+        colours are not differentiable in the fields.
+        """
         explicit = self.gaussians
-        positions, logits = explicit.positions, explicit.color_logits
+        positions, logits, residuals = explicit.positions, explicit.color_logits, explicit.color_residuals
+        if shading is not None:
+            colors = shade(positions, viewpoint, shading, index)
         if index is not None:
             positions, logits = take_rows(positions, index), take_rows(logits, index)
-        if self.radiance.is_constant_zero:
-            return torch.sigmoid(logits)
         positions = self._field_positions(positions)
-        return torch.sigmoid(self._radiance(positions, viewpoint) + logits)
+        if shading is None and self.radiance.is_constant_zero:
+            colors = torch.sigmoid(logits)
+        elif shading is None:
+            colors = torch.sigmoid(self._radiance(positions, viewpoint) + logits)
+        if residuals is None:
+            return colors
+        directions = torch.nn.functional.normalize(positions - viewpoint, dim=-1, eps=1e-12)
+        return add_color_residuals(colors, residuals if index is None else residuals[index], directions)
 
     def decode_background(self, points: Tensor, viewport: Viewport) -> Tensor:
         """Return background colours (n, 3) in (0, 1) at points (n, 2) of the image, in pixels.

@@ -223,20 +223,22 @@ def _select_gaussians(
 ) -> tuple[Tensor, Gaussians3D, Tensor | Shading]:
     """Return indices (n,) of the Gaussians to rasterise, these Gaussians, and their colours as `rasterize` takes them.
 
-    Without precomputed shading only Gaussians in view are decoded. With it `rasterize` gets all and culls them itself.
+    With precomputed shading and without colour residuals, `rasterize` gets all Gaussians and culls them itself.
+    Otherwise only those in view are shaded.
 
     Raises:
         FloatingPointError: a position is NaN or infinite.
     """
     positions = model.gaussians.positions
-    if decoded is not None and decoded.shading is not None:
-        return torch.arange(len(model), device=positions.device), decoded.geometry.at(positions), decoded.shading
+    shading = None if decoded is None else decoded.shading
+    if decoded is not None and shading is not None and model.gaussians.color_residuals is None:
+        return torch.arange(len(model), device=positions.device), decoded.geometry.at(positions), shading
     with _record_seconds(seconds, "cull"), torch.no_grad():
         index = frustum_cull(positions, viewport, settings.near, settings.cull_tolerance)
     with _record_seconds(seconds, "decode"):
         geometry = model.decode_geometry(index) if decoded is None else decoded.geometry[index]
         viewpoint = camera_center(viewport.pose).to(positions.device, non_blocking=positions.is_cuda)
-        return index, geometry.at(take_rows(positions, index)), model.decode_colors(viewpoint, index)
+        return index, geometry.at(take_rows(positions, index)), model.decode_colors(viewpoint, index, shading)
 
 
 def _check_finite(**values: Tensor) -> None:

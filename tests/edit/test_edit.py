@@ -12,7 +12,7 @@ from commands import hyrfpack, refused, succeeded
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
-from scenes import QUIET_CONTEXT, ring
+from scenes import QUIET_CONTEXT, ring, shift_cameras
 from scipy.spatial.transform import Rotation
 
 from hyrfpack.cameras.capture import Capture, provenance_cameras
@@ -49,6 +49,7 @@ GOLDEN_FOLDER = Path(__file__).parents[1] / "golden"
 COMPACT_FILE = GOLDEN_FOLDER / "trained" / "demo_compact.hyrf"
 RAW_FILE = GOLDEN_FOLDER / "trained" / "demo.hyrf"
 MAP_FILE = GOLDEN_FOLDER / "trained" / "exposed_balls.hyrf"
+RESIDUAL_FILE = GOLDEN_FOLDER / "v1.6_compact_residuals.hyrf"
 
 
 def world_positions(path: Path) -> np.ndarray:
@@ -80,6 +81,31 @@ def test_a_moved_scene_renders_as_before_from_moved_cameras(file, tmp_path):
         exact = replace(camera, camera_from_world=pose)
         pictures = [render_view(model, view).rgb.numpy() for model, view in ((before, camera), (after, exact))]
         assert_allclose(pictures[1], pictures[0], atol=1e-4)
+
+
+def test_residuals_turn_with_a_scene(tmp_path):
+    turn = Rotation.from_rotvec(np.radians(77) * np.array([2.0, -1.0, 2.0]) / 3).as_matrix()
+    before = load_model(RESIDUAL_FILE)
+    after = load_model(edited(RESIDUAL_FILE, tmp_path, Rotate((2.0, -1.0, 2.0), 77)))
+    frame = before.config.frame
+    for camera in shift_cameras(ring(3, radius=3 * frame.scale, elevation=frame.scale), frame.center):
+        pose = camera.camera_from_world.copy()
+        pose[:3, :3] = pose[:3, :3] @ turn.T
+        pictures = [
+            render_view(model, view).rgb.numpy()
+            for model, view in ((before, camera), (after, replace(camera, camera_from_world=pose)))
+        ]
+        assert pictures[0].std() > 0.01
+        assert_allclose(pictures[1], pictures[0], atol=1e-4)
+
+
+def test_a_crop_keeps_the_residuals_of_what_is_left(tmp_path):
+    before = load_model(RESIDUAL_FILE)
+    kept = before.decode_geometry().opacities >= 0.5
+    after = load_model(edited(RESIDUAL_FILE, tmp_path, MinOpacity(0.5), profile="raw"))
+    assert 0 < len(after) < len(before)
+    for name in before.gaussians.RESIDUAL_NAMES:
+        assert_allclose(getattr(after.gaussians, name), getattr(before.gaussians, name)[kept])
 
 
 def test_a_move_copies_all_other_sections_byte_for_byte(tmp_path):

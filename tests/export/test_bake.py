@@ -13,6 +13,7 @@ from hyrfpack.model import Frame
 from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.splats.draw import Drawable, draw
 from hyrfpack.splats.harmonics import SH_C0, harmonics_basis
+from tools.safety.make_golden import add_golden_residuals
 
 GAUSSIAN_POSITIONS = np.random.default_rng(0).uniform(-0.6, 0.6, (60, 3))
 NO_CULLING = RenderSettings(cull_tolerance=1e9)
@@ -58,6 +59,20 @@ def test_baked_geometry_equals_the_model_in_world_units():
     agreement = (splats.quats * (geometry.quats / lengths).numpy()).sum(1)
     assert np.allclose(np.abs(agreement), 1, atol=1e-6) and (splats.quats[:, 0] >= 0).all()
     assert splats.antialiased
+
+
+def test_residuals_are_baked():
+    """A harmonic of degree 2 is baked as it is where the colour stays above 0."""
+    model = add_golden_residuals(small_model(GAUSSIAN_POSITIONS, color_logits=2.0), 2)
+    model.gaussians.color_residuals.mul_(0.2)
+    splats = bake(model, ring(4), (2,))[2]
+    with torch.no_grad():
+        geometry = model.decode_geometry()
+    assert np.allclose(splats.scales, geometry.scales, rtol=1e-6)
+    expected = model.gaussians.color_residuals.reshape(-1, 9, 3).numpy().copy()
+    expected[:, 0] += (1 / (1 + np.exp(-2.0)) - 0.5) / SH_C0
+    assert np.allclose(splats.harmonics, expected, atol=2e-2)
+    assert rms_difference(model, splats, ring(4)) < 1e-3
 
 
 def test_higher_degrees_have_lower_errors():

@@ -13,7 +13,7 @@ from hyrfpack.edit.transform import replace_config
 from hyrfpack.format import describe_file, load_model, metadata
 from hyrfpack.model import Frame, HashGridConfig, ModelConfig
 from hyrfpack.render import RenderSettings, render_view
-from tools.safety.make_golden import GOLDEN_FILES, make_golden_camera
+from tools.safety.make_golden import GOLDEN_FILES, add_golden_residuals, make_golden_camera
 from tools.safety.synthetic_encoding import encode
 
 GOLDEN_FOLDER = Path(__file__).parents[1] / "golden"
@@ -57,6 +57,7 @@ def test_golden_file_has_the_recorded_configuration(file):
         direction_encoding="sh",
         position_gradients=False,
         antialiased=True,
+        residual_degree=GOLDEN_FILES[file.stem].residual_degree,
     )
 
 
@@ -115,6 +116,8 @@ def test_golden_model_encodes_to_the_same_bytes(name, monkeypatch):
     model = load_model(GOLDEN_FOLDER / "v1.0_raw.hyrf")
     model = replace_config(model, frame=replace(model.config.frame, rotation=expected.rotation))
     model.exposure = expected.exposure
+    if expected.residual_degree is not None:
+        model = add_golden_residuals(model, expected.residual_degree)
 
     data = encode(model, expected.profile, info["provenance"], **expected.settings)
 

@@ -110,7 +110,7 @@ def test_mutants_are_decoded_or_refused_in_one_line():
     assert {kind for kind, _ in outcomes} == set(INPUT_KINDS)
     # Forged content has valid checksums, so that some of it is decoded; damaged content has not.
     for kind in INPUT_KINDS:
-        assert (outcomes[kind, False] > 4) == kind.startswith("forged"), kind
+        assert (outcomes[kind, False] > 2) == kind.startswith("forged"), kind
 
 
 def test_mutants_depend_only_on_their_number_and_seed():
@@ -233,9 +233,9 @@ def test_metadata_nested_too_deep_to_be_read_is_not_written():
 def test_seed_files_cover_every_group_and_codec():
     met = {(part.tag.decode(), part.codec) for data in load_seed_files()[0] for part in disassemble(data)[1:]}
 
-    groups = {group for group, _ in met}
-    assert groups >= {*SECTION_GROUPS, "POS1", "COL1", "SCA1", "OPA2", "EXPO"} and groups < set(SECTION_CONTENTS)
-    assert {codec for _, codec in met} == {1, 2, 3, 4, 6, 7, 8, 9}
+    groups, layered = {group for group, _ in met}, {"POS1", "COL1", "SCA1", "OPA2", "SHA1", "HAR1"}
+    assert groups >= {*SECTION_GROUPS, *layered, "EXPO"} and groups < set(SECTION_CONTENTS)
+    assert {codec for _, codec in met} == {1, 2, 3, 4, 6, 7, 8, 9, 13}
     assert {disassemble(data)[0].codec for data in load_seed_files()[0]} == {0, 5}
     assert all(not isinstance(decode(data), str) for data in load_seed_files()[0])
 
@@ -261,7 +261,7 @@ def test_a_group_may_have_16_stages_but_not_17():
 def test_forged_exposure_maps_trigger_every_check_of_the_reader():
     """The forged maps produce each error message of codec 9, and some are decoded."""
     outcomes = Counter()
-    for number in range(120):
+    for number in range(200):
         outcome = decode(INPUT_KINDS["forged exposure map"][1](Random(number)))
         if isinstance(outcome, str):
             assert "section 'EXPO'" in outcome or "decode to" in outcome, outcome

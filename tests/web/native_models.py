@@ -19,6 +19,7 @@ from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.scene import Camera
 from hyrfpack.web.html import encode_model_page
+from tools.safety.make_golden import add_golden_residuals
 
 MODEL_FRAME = Frame((10.0, -20.0, 5.0), 7.0, (1.0, 0.5, 0.8))
 
@@ -41,7 +42,7 @@ SIXTEEN_LEVEL_GRID = HashGridConfig(log2_table_size=11, levels=16, base=4, fines
 ONE_LEVEL_GRID = HashGridConfig(log2_table_size=12, levels=1, base=12, finest=12)
 
 
-def random_model(count: int = 2600, seed: int = 0, **config: object) -> HybridModel:
+def random_model(count: int = 2600, seed: int = 0, residual_degree: int | None = None, **config: object) -> HybridModel:
     """Return a model with large random fields and Gaussians of all shapes and colours, inside and outside the frame."""
     shape = {"geometry": SMALL_GRID, "radiance": SMALL_GRID, "hidden": 16, "solid": (0.2, 0.3, 0.1), **config}
     generator = torch.Generator().manual_seed(seed)
@@ -59,7 +60,7 @@ def random_model(count: int = 2600, seed: int = 0, **config: object) -> HybridMo
                 bias.copy_(normal(*bias.shape) * 0.3)
         # The background is evaluated along directions from the centre; trained models hardly depend on these.
         model.radiance.weights[0][:, model.radiance.grid.feature_count :] *= 0.5
-    return model
+    return model if residual_degree is None else add_golden_residuals(model, residual_degree)
 
 
 def make_cameras(width: int = 120, height: int = 90) -> list[Camera]:

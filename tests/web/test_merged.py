@@ -48,7 +48,8 @@ def make_parts(*, exposures: bool = False) -> MergedModel:
     # More than a row of the textures, and another shape of the fields.
     beside = random_model(2100, seed=1, hidden=8, direction_encoding="sh", background=False)
     beside = with_frame(beside, OTHER_FRAME)
-    inside = with_frame(random_model(50, seed=2), Frame(MODEL_FRAME.center, 3.0, (1.0, 1.0, 1.0)))
+    inside = random_model(50, seed=2, residual_degree=1)
+    inside = with_frame(inside, Frame(MODEL_FRAME.center, 3.0, (1.0, 1.0, 1.0)))
     if exposures:
         for model, gain in ((scene, 0.8), (beside, 1.7)):
             gains = np.linspace(gain, gain + 0.4, len(make_cameras()))[:, None]

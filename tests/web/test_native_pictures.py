@@ -43,6 +43,8 @@ MODEL_SETTINGS = {
     },
     "one level, 3 hidden": {"geometry": ONE_LEVEL_GRID, "radiance": ONE_LEVEL_GRID, "hidden": 3},
     "100 hidden, even scales": {"hidden": 100, "scale_grows": False, "direction_encoding": "sh"},
+    "residuals": {"residual_degree": 3},
+    "residuals of one harmonic, antialiased": {"residual_degree": 0, "antialiased": True},
 }
 
 

@@ -23,6 +23,7 @@ FILES = [
     "v1.0_paper.hyrf",
     "v1.1_compact_layers.hyrf",
     "v1.3_compact_rotated.hyrf",
+    "v1.6_compact_residuals.hyrf",
 ]
 UP = {"option": "up", "value": [0.3, -0.8, 0.52]}
 EDITS = {

@@ -31,12 +31,13 @@ from hyrfpack.model import ExposureMap, Frame, HashGridConfig, HybridModel, Mode
 from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.quant import HuffmanCode, MinMaxQuantizer, ResidualVectorQuantizer, huffman_encode
 from hyrfpack.rotations import IDENTITY, Quaternion
+from tools.safety.make_golden import add_golden_residuals
 from tools.safety.synthetic_encoding import encode
 
 GOLDEN_FOLDER = Path(__file__).parents[2] / "tests" / "golden"
 MERGED_FILE = GOLDEN_FOLDER / "merged" / "v1.4_merged.hyrf"
 MERGED_SHARE = 0.1  # of the files that are damaged
-SECTION_GROUPS = ("POSI", "COLO", "SCAL", "OPAC", "GTAB", "GMLP", "RTAB", "RMLP")
+SECTION_GROUPS = ("POSI", "COLO", "SCAL", "OPAC", "GTAB", "GMLP", "RTAB", "RMLP", "SHAP", "HARM")
 EXTREME_INTEGERS = (0, 1, 2, 3, 7, 8, 16, 57, 58, 127, 128, 255, 256, 257, 1023, 1024, 1025, 65535, 65536, 65537)
 EXTREME_INTEGERS += tuple(2**power + step for power in (20, 28, 31, 32, 34, 40, 48, 60, 63, 64) for step in (-1, 0, 1))
 HOSTILE_TEXT = ("", "\n", "\x1b[2J", "\ud800", "\0", "a" * 3000, "__class__", "../../x", "\u202e", "NaN", "sum", "sh")
@@ -47,6 +48,7 @@ HOSTILE_JSON += (*HOSTILE_TEXT, [0, 0, 0], [1e308] * 3, [[[]]], {"a": 1})
 HOSTILE_FLOAT_BITS = (0, 1 << 31, 1, 0x007FFFFF, 0x40FFFFFF, 0x41000000, 0x41000001, 0xC1000000, 0xC1000001)
 HOSTILE_FLOAT_BITS += (0x3F800000, 0x7F7FFFFF, 0xFF7FFFFF, 0x7F800000, 0xFF800000, 0x7FC00000, 0x7F800001)
 CONFIG_RANGES = {"log2_table_size": (3, 25), "levels": (0, 33), "base": (1, 70), "finest": (1, 70), "hidden": (0, 70)}
+CONFIG_RANGES |= {"residual_degree": (-1, 4)}
 
 
 @dataclass
@@ -74,6 +76,7 @@ def assemble(parts: list[RawSection]) -> bytes:
     minor = 2 if any(part.codec == 9 for part in parts) else int(any(5 <= part.codec <= 8 for part in parts))
     minor = 3 if any(_has_rotation(part) for part in parts if part.tag == b"META") else minor
     minor = 4 if any(part.tag == b"PRTS" for part in parts) else minor
+    minor = 6 if any(part.tag == b"SHAP" for part in parts) else minor
     offset = 48 + 40 * len(parts)
     toc, payloads = [], []
     for part in parts:
@@ -119,7 +122,12 @@ def repair_checksums(data: bytearray) -> bytes:
 
 
 def _make_model(
-    count: int, hidden: int = 3, background: bool = True, rotation: Quaternion = IDENTITY, **config: object
+    count: int,
+    hidden: int = 3,
+    background: bool = True,
+    rotation: Quaternion = IDENTITY,
+    residual_degree: int | None = None,
+    **config: object,
 ) -> HybridModel:
     rng = np.random.default_rng(count)
     shape = ModelConfig(
@@ -135,7 +143,7 @@ def _make_model(
     with torch.no_grad():
         for parameter in (*model.geometry.parameters(), *model.radiance.parameters()):
             parameter.copy_(torch.from_numpy(rng.laplace(scale=0.1, size=parameter.shape)))
-    return model
+    return model if residual_degree is None else add_golden_residuals(model, residual_degree)
 
 
 def _encode_in_codec(values: np.ndarray, codec: int, rng: Random) -> bytes:
@@ -163,8 +171,8 @@ def load_seed_files() -> tuple[tuple[bytes, ...], tuple[float, ...]]:
     """Return valid files and their weights; small files, which decode faster, have larger weights.
 
     The files are: each profile with 0, 1, 20 and 200 Gaussians, with and without background; the golden files;
-    Gaussians in layers; groups in codecs that no profile uses for them; and rotated models with exposure maps of up to
-    64 centers in each profile.
+    Gaussians in layers; groups in codecs that no profile uses for them; rotated models with exposure maps of up to
+    64 centers in each profile; and models with residuals.
     """
     rng = Random(0)
     models = [
@@ -179,7 +187,9 @@ def load_seed_files() -> tuple[tuple[bytes, ...], tuple[float, ...]]:
     files.append((encode(models[3], "compact", distortion=1e-9, prune=False), 2))
     files.append((encode(_make_equal_gaussians(models[3]), "compact", prune=False), 10))
     files += [(encode(model, "compact", prune=False, layered=True), 10) for model in (models[2], _make_model(40))]
-    mixed = [models[1], _make_model(5), _make_model(6), models[2], models[3], _make_model(2500)]
+    with_residuals = [_make_model(30 + degree, residual_degree=degree) for degree in range(4)]
+    files += [(encode(model, "compact", prune=False, layered=True), 3) for model in with_residuals]
+    mixed = [models[1], _make_model(5), _make_model(6), models[2], models[3], _make_model(2500), with_residuals[1]]
     for model in mixed:
         weight = {200: 0.5, 2500: 0.1}.get(len(model), 10)
         for profile, exchanged in (("raw", 1.0), ("compact", 0.4)):
@@ -342,14 +352,14 @@ def _forge_sections(rng: Random) -> bytes:
             borrowed = rng.choice(_choose_sections(rng))
             parts[one].data, parts[one].codec = borrowed.data, borrowed.codec
         elif kind == 5:
-            parts[one].codec = rng.choice((*range(11), 65535))
+            parts[one].codec = rng.choice((*range(14), 65535))
         elif kind == 6:
             parts[one].raw_length = rng.choice((*EXTREME_INTEGERS, parts[one].raw_length + 4))
         elif kind == 7:
             parts[one].flags = rng.choice((0, 1, 2, 65535))
         else:
             parts[one].tag = rng.choice(
-                (b"NEW_", b"posi", b"\0\0\0\0", b"\xff\n\x1b ", b"META", b"POSI", b"POS1", b"COL3", b"EXPO")
+                (b"NEW_", b"posi", b"\0\0\0\0", b"\xff\n\x1b ", b"META", b"POSI", b"POS1", b"COL3", b"EXPO", b"HAR1")
             )
     return assemble(parts)
 
@@ -443,7 +453,7 @@ def list_json_values(node: dict | list) -> list[tuple[dict | list, str | int]]:
 def _forge_fields(rng: Random) -> bytes:
     """Forge one or two fields of a section's codec, mostly with repaired lengths around them."""
     parts = [replace(part) for part in _choose_sections(rng)]
-    coded = [part for part in parts[1:] if part.codec in (3, 4, 6, 7, 8)] or parts[1:]
+    coded = [part for part in parts[1:] if part.codec in (3, 4, 6, 7, 8, 13)] or parts[1:]
     part = rng.choice(coded)
     fields = _split_fields(part)
     for _ in range(rng.choice((1, 1, 2))):
@@ -505,6 +515,8 @@ def _split_fields(part: RawSection) -> dict[str, bytes | tuple[int, int]]:
         return _split_channels_fields(part.data, 3 if part.tag[:3] == b"COL" else 1)
     if part.codec == 8:
         return _split_groups_fields(part.data)
+    if part.codec == 13:
+        return _split_residuals_fields(part.data, is_color=part.tag[:3] == b"HAR")
     if part.codec == 4:
         names = {"minimum": part.data[:4], "maximum": part.data[4:8], "bits": (part.data[8], 1)}
         return names | _split_stream_fields(part.data[9:], "")
@@ -552,6 +564,25 @@ def _split_groups_fields(data: bytes) -> dict[str, bytes | tuple[int, int]]:
     fields |= _split_integers_fields(data[8 : 8 + first], "steps")
     fields |= _split_integers_fields(data[8 + first : 8 + first + second], "models")
     return fields | _split_integers_fields(data[8 + first + second :], "symbols")
+
+
+def _split_residuals_fields(data: bytes, is_color: bool) -> dict[str, bytes | tuple[int, int]]:
+    class_count, size = struct.unpack_from("<BI", data)
+    fields = {"class count": (class_count, 1), "size of flags": (size, 4)}
+    fields |= _split_integers_fields(data[5 : 5 + size], "flags")
+    start = 5 + size
+    if is_color:
+        fields["basis"] = data[start : start + 36]
+        start += 36
+    band = 0
+    while start < len(data):
+        fields[f"steps {band}"] = data[start : start + class_count]
+        start += class_count
+        (size,) = struct.unpack_from("<I", data, start)
+        fields[f"size of band {band}"] = (size, 4)
+        fields |= _split_integers_fields(data[start + 4 : start + 4 + size], f"band {band}")
+        start, band = start + 4 + size, band + 1
+    return fields
 
 
 def _split_integers_fields(data: bytes, name: str) -> dict[str, bytes | tuple[int, int]]:
@@ -608,7 +639,7 @@ def _forge_parts(rng: Random) -> bytes:
         sections[0].data = edit_bytes(sections[0].data, rng)
         sections[0].raw_length = len(sections[0].data)
     elif kind == 4:
-        sections[one].codec = rng.choice((*range(12), 65535))
+        sections[one].codec = rng.choice((*range(14), 65535))
         sections[one].raw_length = rng.choice((*EXTREME_INTEGERS, len(sections[one].data)))
     elif kind == 5:
         rng.shuffle(sections)

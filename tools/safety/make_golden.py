@@ -8,7 +8,7 @@ replace one before the release, delete it by hand first.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from hyrfpack.format.parts import encode_parts
 from hyrfpack.lod import split_model
 from hyrfpack.model import ExposureMap, Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians
+from hyrfpack.model.residuals import SHAPE_RESIDUALS, count_color_residuals
 from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.rotations import IDENTITY, Quaternion
 from hyrfpack.scene import Camera
@@ -53,12 +54,13 @@ GOLDEN_ROTATION = (0.5, -0.1, 0.7, 0.5)
 
 @dataclass(frozen=True)
 class GoldenFile:
-    """How a golden file is encoded: profile, settings of the profile, exposure map, and rotation of the frame."""
+    """How a golden file is encoded: profile, settings of the profile, exposure map, rotation, and residuals."""
 
     profile: str
     settings: dict[str, Any]
     exposure: ExposureMap | None = None
     rotation: Quaternion = IDENTITY
+    residual_degree: int | None = None
 
 
 GOLDEN_FILES = {
@@ -68,6 +70,7 @@ GOLDEN_FILES = {
     "v1.1_compact_layers": GoldenFile("compact", {"distortion": 1e-5, "layered": True}),
     "v1.2_compact_exposure": GoldenFile("compact", {"distortion": 5e-4}, GOLDEN_EXPOSURE_MAP),
     "v1.3_compact_rotated": GoldenFile("compact", {"distortion": 5e-4}, GOLDEN_EXPOSURE_MAP, GOLDEN_ROTATION),
+    "v1.6_compact_residuals": GoldenFile("compact", {"distortion": 1e-5, "layered": True}, residual_degree=2),
 }
 
 
@@ -101,6 +104,19 @@ def make_golden_model(rotation: Quaternion = IDENTITY) -> HybridModel:
         for parameter in (*model.geometry.parameters(), *model.radiance.parameters()):
             parameter.copy_(torch.from_numpy(rng.laplace(scale=0.1, size=parameter.shape)))
     return model
+
+
+def add_golden_residuals(model: HybridModel, degree: int) -> HybridModel:
+    """Return the golden model with residuals of two thirds of its Gaussians."""
+    rng = np.random.default_rng(7)
+    explicit = {name: getattr(model.gaussians, name).detach() for name in Gaussians.PARAMETER_NAMES}
+    shapes, colors = (
+        torch.from_numpy((0.3 * rng.normal(size=(len(model), width))).astype(np.float32))
+        for width in (SHAPE_RESIDUALS, count_color_residuals(degree))
+    )
+    shapes[::3], colors[1::3] = 0, 0
+    gaussians = Gaussians(**explicit, shape_residuals=shapes, color_residuals=colors)
+    return model.with_gaussians(gaussians, replace(model.config, residual_degree=degree))
 
 
 def expect_parameter(model: HybridModel, name: str) -> np.ndarray:
@@ -185,6 +201,8 @@ def main() -> None:
             continue
         model = make_golden_model(golden.rotation)
         model.exposure = golden.exposure
+        if golden.residual_degree is not None:
+            model = add_golden_residuals(model, golden.residual_degree)
         data = encode(model, golden.profile, GOLDEN_PROVENANCE, **golden.settings)
         values = expect_values(model, golden.profile, data)
         GOLDEN_FOLDER.mkdir(exist_ok=True)

@@ -1,4 +1,4 @@
-"""Read `.hyrf` files of versions 1.0 to 1.5, by code written only from docs/reference/format.md, with numpy alone.
+"""Read `.hyrf` files of versions 1.0 to 1.6, by code written only from docs/reference/format.md, with numpy alone.
 
 This reader shares no code with hyrfpack. So it tests whether the page is complete and whether hyrfpack conforms to it.
 It is simple, not fast: a file of 30,000 Gaussians takes some seconds. Section numbers are those of the page.
@@ -33,8 +33,11 @@ MATRIX_CODECS = {
     "RTAB": {1, 2, 3, 4, 8, 11},
     "GMLP": {1, 2, 3, 4, 8},
     "RMLP": {1, 2, 3, 4, 8},
+    "SHAP": {1, 2, 3, 4, 13},
+    "HARM": {1, 2, 3, 4, 13},
 }
 LAYERED_GROUPS = ("POSI", "COLO", "SCAL", "OPAC")
+RESIDUAL_GROUPS = ("SHAP", "HARM")
 FIELD_GROUPS = ("GTAB", "RTAB", "GMLP", "RMLP")
 REQUIRED_RULES = {
     "activations": "sigmoid",
@@ -64,8 +67,8 @@ def read(
         part: whether `data` may be the start of a file; incomplete layers, and all layers after them, are left out.
 
     Returns:
-        The metadata; the eight groups of section 2, by the type of their first layer, as float32 matrices (rows,
-        columns); and the exposure map, None without one.
+        The metadata; the eight groups of section 2 and the residuals, if there are any, by the type of their first
+        layer, as float32 matrices (rows, columns); and the exposure map, None without one.
 
     Raises:
         ValueError: the specification requires readers to reject the file.
@@ -85,12 +88,12 @@ def read(
         require(sections[name].codec in MATRIX_CODECS[group], f"{name}: codec not allowed here")
     used_layers = 1
     while used_layers < len(layers) and all(
-        sections[section_type(group, used_layers)].whole for group in LAYERED_GROUPS
+        sections[section_type(group, used_layers)].whole for group, layer in shapes if layer == used_layers
     ):
         used_layers += 1
     require(sum(layers[:used_layers]) <= 32 * len(data) + 2**18, "META: too many Gaussians for so few bytes")
 
-    matrices: dict[str, list[np.ndarray]] = {group: [] for group in MATRIX_CODECS}
+    matrices: dict[str, list[np.ndarray]] = {group: [] for group, layer in shapes if layer == 0}
     points: dict[int, Points] = {}
     # POSI comes first in a layer, because other sections depend on it.
     for (group, layer), (rows, columns) in shapes.items():
@@ -110,6 +113,9 @@ def read(
         elif codec == 7:
             require(layer in points, f"{group}: codec 7 without lattice points in layer {layer}")
             numbers = read_channels(source, columns, points[layer].classes)
+        elif codec == 13:
+            require(layer in points, f"{group}: codec 13 without lattice points in layer {layer}")
+            numbers = read_residuals(source, columns, points[layer].classes, group == "HARM")
         elif codec == 11:
             numbers = read_numbers(source, stated_groups(source, config["geometry" if group == "GTAB" else "radiance"]))
         elif group in ("GMLP", "RMLP"):
@@ -240,7 +246,7 @@ KNOWN_SECTION_TYPES = {
     "PRTS",
     *(f"PT{number:02d}" for number in range(64)),
     *FIELD_GROUPS,
-    *(section_type(group, layer) for group in LAYERED_GROUPS for layer in range(8)),
+    *(section_type(group, layer) for group in LAYERED_GROUPS + RESIDUAL_GROUPS for layer in range(8)),
 }
 
 
@@ -318,7 +324,7 @@ def read_metadata(section: Section) -> dict[str, Any]:
     config = metadata["config"]
     frame = config["frame"]
     require(
-        set(config) == CONFIG_KEYS and set(frame) - {"rotation"} == FRAME_KEYS,
+        set(config) - {"residual_degree"} == CONFIG_KEYS and set(frame) - {"rotation"} == FRAME_KEYS,
         "META: unknown or missing keys in config",
     )
     check_integer(metadata["gaussians"], 0, 2**40 - 1)
@@ -329,6 +335,8 @@ def read_metadata(section: Section) -> dict[str, Any]:
         "META: layers do not add up",
     )
     check_integer(config["hidden"], 1, 1024)
+    if "residual_degree" in config:
+        check_integer(config["residual_degree"], 0, 3)
     for grid in (config["geometry"], config["radiance"]):
         require(set(grid) == GRID_KEYS, "META: unknown or missing keys in a grid")
         check_integer(grid["log2_table_size"], 4, 24)
@@ -363,8 +371,11 @@ def check_integer(value: Any, low: int, high: int) -> int:
 def matrix_shapes(config: dict[str, Any], layers: list[int]) -> dict[tuple[str, int], tuple[int, int]]:
     """Return the rows and columns of each (group, layer); field groups have layer 0 only (2)."""
     shapes = {}
+    columns_by_group = dict(zip(LAYERED_GROUPS, (3, 3, 1, 1), strict=True))
+    if "residual_degree" in config:
+        columns_by_group |= {"SHAP": 5, "HARM": 3 * (config["residual_degree"] + 1) ** 2}
     for layer, n in enumerate(layers):
-        shapes |= {(group, layer): (n, columns) for group, columns in zip(LAYERED_GROUPS, (3, 3, 1, 1), strict=True)}
+        shapes |= {(group, layer): (n, columns) for group, columns in columns_by_group.items()}
     for name, grid in (("GTAB", config["geometry"]), ("RTAB", config["radiance"])):
         shapes[name, 0] = (sum(rows for _, rows in grid_levels(grid)), 2)
     for name in ("GMLP", "RMLP"):
@@ -653,6 +664,69 @@ def table_groups(grid: dict[str, int], m: np.ndarray) -> np.ndarray:
             use += np.bincount(row, minlength=rows)
         groups += [16 * level + (count.bit_length() + 1) // 2 for count in use.tolist()]
     return np.array(groups)
+
+
+# 3.7 Codec 13
+
+
+def read_residuals(source: Cursor, columns: int, classes: np.ndarray, is_color: bool) -> np.ndarray:
+    class_count, flag_bytes = source.unpack("BI")
+    require(classes.max(initial=0) < class_count <= 16, "codec 13: classes without a step size")
+    flags = read_integers(source.take(flag_bytes), classes)
+    require(bool((flags <= 1).all()), "codec 13: flag out of range")
+    basis = np.array(source.unpack("9f")).reshape(3, 3) if is_color else np.eye(3)
+    require(bool((np.abs(basis) <= 1 + 2**-10).all()), "codec 13: basis out of range")
+    rows, bands = np.flatnonzero(flags), []
+    for width in range(3, columns + 1, 6) if is_color else (2, 3):
+        if sum(band.shape[1] for band in bands) == columns:
+            break
+        d = decode_step_sizes(source.take(class_count))[classes[rows]]
+        components = np.arange(width) % (3 if is_color else width)
+        contexts = (classes[rows][:, None] + class_count * components).ravel()
+        s = read_integers(source.take(source.unpack("I")[0]), contexts, signed=True)
+        require(bool((np.abs(s) <= 2**24).all()), "codec 13: symbol out of range")
+        bands.append(s.reshape(len(rows), width) * d[:, None] / 2**24)
+    n = np.concatenate(bands, axis=1)
+    if is_color:
+        n = n.reshape(len(rows), columns // 3, 3)
+        n = np.stack([(n[..., 0] * row[0] + n[..., 1] * row[1]) + n[..., 2] * row[2] for row in basis], axis=2)
+    numbers = np.zeros((len(classes), columns))
+    numbers[rows] = n.reshape(len(rows), columns)
+    return numbers
+
+
+# 2.13 Residuals
+
+
+def correct_shape(outputs: Sequence[float], residuals: Sequence[float]) -> list[float]:
+    """Return the corrected outputs of the geometry field: opacity, scales, and the rotation without its offset of 1."""
+    a, b, x, y, z = residuals
+    opacity, s0, s1, s2, w, i, j, k = outputs
+    w += 1
+    turned = (
+        w - i * x - j * y - k * z,
+        w * x + i + j * z - k * y,
+        w * y + j + k * x - i * z,
+        w * z + k + i * y - j * x,
+    )
+    return [opacity, s0 + a, s1 + b, s2 - a - b, turned[0] - 1, *turned[1:]]
+
+
+def correct_color(color: Sequence[float], residuals: np.ndarray, direction: Sequence[float]) -> list[float]:
+    """Return a colour with its residuals (3 K) along a unit direction."""
+    x, y, z = direction
+    harmonics = [
+        0.28209479177387814,
+        *(-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x),
+        *(1.0925484305920792 * x * y, -1.0925484305920792 * y * z, 0.31539156525252005 * (3 * z * z - 1)),
+        *(-1.0925484305920792 * x * z, 0.5462742152960396 * (x * x - y * y)),
+        *(-0.5900435899266435 * y * (3 * x * x - y * y), 2.890611442640554 * x * y * z),
+        *(-0.4570457994644658 * y * (5 * z * z - 1), 0.3731763325901154 * z * (5 * z * z - 3)),
+        *(-0.4570457994644658 * x * (5 * z * z - 1), 1.445305721320277 * z * (x * x - y * y)),
+        -0.5900435899266435 * x * (x * x - 3 * y * y),
+    ]
+    h = np.reshape(residuals, (-1, 3))
+    return [max(0.0, value + float(np.dot(harmonics[: len(h)], h[:, c]))) for c, value in enumerate(color)]
 
 
 # 2.7 Local units

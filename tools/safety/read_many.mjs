@@ -38,6 +38,7 @@ const readVerdict = async (bytes, partial) => {
     for (const [number, { model }] of parts.entries()) {
       const { positions, colorLogits, scaleLogits, opacityLogits, geometry, radiance } = model;
       const numbers = { POSI: positions, COLO: colorLogits, SCAL: scaleLogits, OPAC: opacityLogits };
+      if (model.shapeResiduals) Object.assign(numbers, { SHAP: model.shapeResiduals, HARM: model.colorResiduals });
       Object.assign(numbers, { GTAB: geometry.table, GMLP: geometry.decoder });
       Object.assign(numbers, { RTAB: radiance.table, RMLP: radiance.decoder });
       for (const [group, array] of Object.entries(numbers)) groups[number ? `${group} ${number}` : group] = hashOf(array);

@@ -18,6 +18,7 @@ from hyrfpack.format import encode_model
 from hyrfpack.format.arrays import decoder_widths, grid_configs, to_arrays
 from hyrfpack.format.compact.quantized import QuantizedModel
 from hyrfpack.model import HybridModel
+from hyrfpack.model.residuals import SHAPE_RESIDUALS
 from hyrfpack.quant.morton import MAX_BITS_PER_AXIS
 
 DEFAULT_DISTORTION = 1e-5
@@ -49,7 +50,9 @@ def draw_sensitivity(model: HybridModel) -> Sensitivity:
     removals = removal_error(
         model.decode_geometry().opacities.detach().double().numpy(), TOTAL_LOGIT_SENSITIVITY * shares
     )
-    return Sensitivity(TOTAL_POSITION_SENSITIVITY * shares, *[TOTAL_LOGIT_SENSITIVITY * shares] * 3, removals, fields)
+    explicit = TOTAL_LOGIT_SENSITIVITY * shares
+    residuals = () if model.config.residual_degree is None else (explicit[:, None].repeat(SHAPE_RESIDUALS, 1), explicit)
+    return Sensitivity(TOTAL_POSITION_SENSITIVITY * shares, *[explicit] * 3, removals, fields, *residuals)
 
 
 def quantize_with_drawn_sensitivity(

@@ -4,6 +4,7 @@ positions                          lattice of the contracted cube, Morton order,
 colour, scale, opacity logits      a step for each class of Gaussians, prediction, rANS     section codec 7
 hash tables                        a step for each usage class of rows, rANS                section codec 8, shared 11
 decoders (MLPs)                    a step for each output, rANS                             section codec 8
+residuals                          a flag for each Gaussian, a step for each class, rANS    section codec 13
 
 `hyrfpack.compress_model` chooses what is stored and the quantisation steps; this package only encodes and decodes.
 """
@@ -20,11 +21,13 @@ from hyrfpack.format.compact.quantized import (
     CODEC_CHANNELS,
     CODEC_GROUPS,
     CODEC_POINTS,
+    CODEC_RESIDUALS,
     CODEC_STATED_GROUPS,
     decode_channels,
     encode,
 )
-from hyrfpack.format.sections import DECODER_SECTIONS, LOGIT_SECTIONS, POSITIONS, TABLE_SECTIONS
+from hyrfpack.format.compact.residuals import decode_residuals
+from hyrfpack.format.sections import DECODER_SECTIONS, LOGIT_SECTIONS, POSITIONS, RESIDUAL_SECTIONS, TABLE_SECTIONS
 from hyrfpack.model.config import ModelConfig
 from hyrfpack.quant.points import LatticePoints, decode_points
 
@@ -36,6 +39,7 @@ SECTIONS_BY_CODEC = {
     CODEC_CHANNELS: LOGIT_SECTIONS,
     CODEC_GROUPS: (*TABLE_SECTIONS, *DECODER_SECTIONS),
     CODEC_STATED_GROUPS: TABLE_SECTIONS,
+    CODEC_RESIDUALS: RESIDUAL_SECTIONS,
 }
 
 
@@ -60,7 +64,7 @@ def decode_positions(data: memoryview, count: int, config: ModelConfig) -> tuple
 def decode_section(
     group: str, codec: int, data: memoryview, shape: tuple[int, int], config: ModelConfig, points: LatticePoints | None
 ) -> np.ndarray:
-    """Decode a section of codec 7, 8 or 11.
+    """Decode a section of codec 7, 8, 11 or 13.
 
     Args:
         group: section type in the first layer.
@@ -86,6 +90,8 @@ def decode_section(
         return decode_groups(rest, groups).reshape(shape)
     if points is None:
         raise HyrfFormatError(f"codec {codec} needs positions of codec {CODEC_POINTS}", fix="write the file again")
+    if codec == CODEC_RESIDUALS:
+        return decode_residuals(group, data, points.classes, shape[1])
     if codec == CODEC_CHANNELS:
         return decode_channels(data, points, shape[1])
     return decode_groups(data, build_step_groups(group, config, points)).reshape(shape)

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import torch
 
-from hyrfpack.format.arrays import decoder_widths, grid_configs, to_arrays, to_model
+from hyrfpack.format.arrays import decoder_widths, grid_configs, residual_widths, to_arrays, to_model
 from hyrfpack.format.compact.groups import StepGroups
 from hyrfpack.format.sections import DECODER_SECTIONS, LOGIT_SECTIONS, POSITIONS
 from hyrfpack.model import expand
@@ -62,7 +62,7 @@ class Plan:
         It is on the device of `model` and has its exposure map and its photos' sampling.
         """
         arrays = to_arrays(model)
-        for group in LOGIT_SECTIONS:
+        for group in (*LOGIT_SECTIONS, *residual_widths(model.config)):
             arrays[group] = arrays[group][self.kept]
         places = [lattice_to_local(layer.points, model.config.frame) for layer in self.layers]
         arrays[POSITIONS] = np.concatenate(places)

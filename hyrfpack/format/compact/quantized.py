@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
 
+from hyrfpack.format.arrays import residual_widths
 from hyrfpack.format.compact.channels import Channel, decode_channel, encode_channel
 from hyrfpack.format.compact.groups import GroupSymbols, encode_groups
 from hyrfpack.format.compact.plan import Plan
+from hyrfpack.format.compact.residuals import ResidualSymbols, encode_residuals
 from hyrfpack.format.container import Section
 from hyrfpack.format.sections import (
     COLORS,
     DECODER_SECTIONS,
+    HARMONICS,
     LAYERED_SECTIONS,
     LOGIT_SECTIONS,
     POSITIONS,
@@ -30,6 +33,7 @@ CODEC_POINTS = 6
 CODEC_CHANNELS = 7
 CODEC_GROUPS = 8
 CODEC_STATED_GROUPS = 11
+CODEC_RESIDUALS = 13
 LOGIT_COLUMNS = dict(zip(LOGIT_SECTIONS, (3, 1, 1), strict=True))
 _GAUSSIANS_PER_BLOCK = 1 << 15  # small enough that temporary arrays stay in the caches
 
@@ -43,11 +47,13 @@ class QuantizedModel:
         channels: for each layer, the channels of colour (3, in the plan's basis), scale (1) and opacity logits (1), by
             section.
         groups: symbols of the hash tables and decoders, by section.
+        residuals: for each layer, the residuals by section; empty for a model without them.
     """
 
     plan: Plan
     channels: list[dict[str, list[Channel]]]
     groups: dict[str, GroupSymbols]
+    residuals: list[dict[str, ResidualSymbols]] = field(default_factory=list)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return float32 numbers as they will be decoded, by section: flat tables and decoders, logits (M, columns)."""
@@ -55,6 +61,10 @@ class QuantizedModel:
         for group in self.channels[0]:
             layers = [[channel.values for channel in layer[group]] for layer in self.channels]
             arrays[group] = np.concatenate([_join_channels(values, self.plan.basis) for values in layers])
+        for group in self.residuals[0] if self.residuals else ():
+            basis = self.plan.basis if group == HARMONICS else None
+            pairs = zip(self.residuals, self.plan.layers, strict=True)
+            arrays[group] = np.concatenate([each[group].values(layer.points.classes, basis) for each, layer in pairs])
         return arrays
 
 
@@ -79,16 +89,24 @@ def encode(model: HybridModel, quantized: QuantizedModel) -> tuple[list[Section]
         data = encode_groups(quantized.groups[group], plan.groups[group])
         return Section(group, CODEC_GROUPS, data, 4 * len(plan.groups[group].index))
 
+    def encode_layer_residuals(layer: int, group: str) -> Section:
+        classes, symbols = plan.layers[layer].points.classes, quantized.residuals[layer][group]
+        data = encode_residuals(group, symbols, classes, plan.basis if group == HARMONICS else None)
+        return Section(layer_section(group, layer), CODEC_RESIDUALS, data, 4 * widths[group] * len(classes))
+
+    widths = residual_widths(model.config)
+    groups = (*LAYERED_SECTIONS, *widths)
     jobs: dict[str, Callable[[], Section]] = {group: partial(encode_numbers, group) for group in plan.groups}
     for layer in range(len(plan.layers)):
         jobs |= {layer_section(group, layer): partial(encode_channels, layer, group) for group in LOGIT_COLUMNS}
+        jobs |= {layer_section(group, layer): partial(encode_layer_residuals, layer, group) for group in widths}
     done = run_jobs(jobs)
     for layer, part in enumerate(plan.layers):
         tag = layer_section(POSITIONS, layer)
         done[tag] = Section(tag, CODEC_POINTS, part.positions, 12 * len(part.points.classes))
-    further = [layer_section(group, layer) for layer in range(1, len(plan.layers)) for group in LAYERED_SECTIONS]
+    further = [layer_section(group, layer) for layer in range(1, len(plan.layers)) for group in groups]
     settings = {"distortion": plan.distortion_per_number, "gaussians_before": len(model)}
-    return [done[tag] for tag in (*DECODER_SECTIONS, *LAYERED_SECTIONS, *TABLE_SECTIONS, *further)], settings
+    return [done[tag] for tag in (*DECODER_SECTIONS, *groups, *TABLE_SECTIONS, *further)], settings
 
 
 def decode_channels(data: memoryview, points: LatticePoints, columns: int) -> np.ndarray:

@@ -32,6 +32,8 @@ export const rawBytesLimit = (length) => Math.min(MAX_RAW_BYTES_PER_BYTE * lengt
 export const MAX_LAYERS = 8;
 export const LAYERED_TYPES = ["POSI", "COLO", "SCAL", "OPAC"];
 export const FIELD_TYPES = ["GTAB", "GMLP", "RTAB", "RMLP"];
+/** The types of residuals, which a model of residuals has in each layer. */
+export const RESIDUAL_TYPES = ["SHAP", "HARM"];
 /** The type of the exposure map, which is optional. */
 export const EXPOSURE_TYPE = "EXPO";
 
@@ -56,7 +58,7 @@ export const partType = (number) => `PT${String(number).padStart(2, "0")}`;
 const KNOWN_TYPES = new Set(["META", EXPOSURE_TYPE, ...FIELD_TYPES, PART_NAMES_TYPE]);
 for (let part = 0; part < MAX_PARTS; part++) KNOWN_TYPES.add(partType(part));
 for (let layer = 0; layer < MAX_LAYERS; layer++) {
-  for (const type of LAYERED_TYPES) KNOWN_TYPES.add(layerType(type, layer));
+  for (const type of [...LAYERED_TYPES, ...RESIDUAL_TYPES]) KNOWN_TYPES.add(layerType(type, layer));
 }
 
 /** @param {number} length */

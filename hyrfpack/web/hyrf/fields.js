@@ -3,6 +3,7 @@
 
 import { evaluateBasis } from "./basis.js";
 import { HASH_FACTOR_Y, HASH_FACTOR_Z, decoderLayout, gridLevels } from "./grids.js";
+import { ColorResiduals, SHAPE_RESIDUALS, addShapeResiduals } from "./residuals.js";
 
 export const BACKGROUND_RADIUS = 100; // of the background sphere, in local units (docs/reference/format.md 2.7)
 
@@ -46,7 +47,7 @@ const preparedFields = new WeakMap();
  */
 export function decodeGeometry(model, start, stop) {
   const { geometry } = getPreparedFields(model), { scale_rule: rule, scale_grows: grows } = model.config;
-  const { opacityLogits, scaleLogits } = model, { places, radii, outputs } = geometry;
+  const { opacityLogits, scaleLogits, shapeResiduals } = model, { places, radii, outputs } = geometry;
   const opacities = new Float32Array(stop - start);
   const scales = new Float32Array(3 * (stop - start)), quats = new Float32Array(4 * (stop - start));
   for (let first = start; first < stop; first += ROWS_PER_BATCH) {
@@ -57,6 +58,7 @@ export function decodeGeometry(model, start, stop) {
     runLaterLayers(geometry, rows, outputs);
     for (let row = 0; row < rows; row++) {
       const i = first + row, at = i - start, raw = row * geometry.last.stride, largest = grows ? radii[row] : 1;
+      if (shapeResiduals) addShapeResiduals(outputs, raw, shapeResiduals, SHAPE_RESIDUALS * i);
       opacities[at] = sigmoid(outputs[raw] + opacityLogits[i]);
       for (let axis = 0; axis < 3; axis++) {
         const neural = outputs[raw + 1 + axis], own = scaleLogits[i];
@@ -104,7 +106,7 @@ export function firstLayers(model, start, stop) {
  * @param {number} start the index of the first Gaussian
  * @param {number} stop the index after the last Gaussian
  * @param {Float32Array} directions 3 n: unit vectors from the viewpoint to each Gaussian
- * @returns {Float32Array} 3 n in [0, 1]
+ * @returns {Float32Array} 3 n, 0 or more, and at most 1 without residuals
  */
 export function colorsAlong(model, layers, start, stop, directions) {
   const rows = Int32Array.from({ length: stop - start }, (_, row) => row);
@@ -112,7 +114,7 @@ export function colorsAlong(model, layers, start, stop, directions) {
 }
 
 /**
- * Evaluates colours in [0, 1] of selected Gaussians along given directions. A Gaussian may be selected repeatedly.
+ * Evaluates colours of selected Gaussians along given directions. A Gaussian may be selected repeatedly.
  * @param {Model} model
  * @param {Float32Array} layers from `firstLayers`
  * @param {number} start the first Gaussian of `layers`
@@ -122,7 +124,8 @@ export function colorsAlong(model, layers, start, stop, directions) {
  * @returns {Float32Array} `colors`
  */
 export function colorsOfRows(model, layers, start, rows, directions, colors) {
-  const { radiance } = getPreparedFields(model), { colorLogits } = model;
+  const { radiance } = getPreparedFields(model), { colorLogits, colorResiduals, config } = model;
+  const residuals = colorResiduals && new ColorResiduals(colorResiduals, config.residual_degree ?? 0);
   const { hidden, outputs, last, first: { width, stride } } = radiance;
   for (let first = 0; first < rows.length; first += ROWS_PER_BATCH) {
     const count = Math.min(ROWS_PER_BATCH, rows.length - first);
@@ -133,8 +136,12 @@ export function colorsOfRows(model, layers, start, rows, directions, colors) {
     }
     runLaterLayers(radiance, count, outputs);
     for (let row = 0, at = 3 * first; row < count; row++) {
-      const own = 3 * (start + rows[first + row]);
-      for (let c = 0; c < 3; c++) colors[at++] = sigmoid(outputs[row * last.stride + c] + colorLogits[own + c]);
+      const gaussian = start + rows[first + row];
+      residuals?.turn(directions, at);
+      for (let c = 0; c < 3; c++) {
+        const color = sigmoid(outputs[row * last.stride + c] + colorLogits[3 * gaussian + c]);
+        colors[at++] = residuals ? residuals.corrected(color, gaussian, c) : color;
+      }
     }
   }
   return colors;

@@ -1,8 +1,8 @@
-// Reads models from the bytes of `.hyrf` files, versions 1.0 to 1.5 (docs/reference/format.md).
+// Reads models from the bytes of `.hyrf` files, versions 1.0 to 1.6 (docs/reference/format.md).
 
 import { decodeChannels } from "./channels.js";
 import { Container, EXPOSURE_TYPE, FIELD_TYPES, LAYERED_TYPES } from "./container.js";
-import { PART_NAMES_TYPE, layerType, rejectIncomplete } from "./container.js";
+import { PART_NAMES_TYPE, RESIDUAL_TYPES, layerType, rejectIncomplete } from "./container.js";
 import { DamagedData, HyrfError, HyrfFormatError, rejectDamaged, rejectNewer } from "./errors.js";
 import { decodeExposure } from "./exposure.js";
 import { FEATURES_PER_ROW, decoderSize, tableRows } from "./grids.js";
@@ -11,6 +11,7 @@ import { decodeLattice, latticePositions } from "./lattice.js";
 import { readMetadata } from "./metadata.js";
 import { openParts, readPartNames } from "./parts.js";
 import { decodeFloat16, decodeFloat32, decodeMinMax, decodeVectors } from "./plain.js";
+import { decodeResiduals, residualColumns } from "./residuals.js";
 import { CODEC_SHARED, attachShared, sharedFileName } from "./shared.js";
 
 export { HyrfError, HyrfFormatError };
@@ -41,12 +42,15 @@ const BASE_GAUSSIANS = 2 ** 18;
  *   colorLogits: Float32Array,
  *   scaleLogits: Float32Array,
  *   opacityLogits: Float32Array,
+ *   shapeResiduals: Float32Array | null,
+ *   colorResiduals: Float32Array | null,
  *   geometry: Field,
  *   radiance: Field,
  *   exposure: ExposureMap | null,
  * }} Model `layers` has the number of Gaussians of each layer that was read, and `count` is their sum; `whole` is true
- *   if these are all layers of the file. `positions` (3 numbers per Gaussian) are in local units. `exposure` is the
- *   exposure map, for `logGains`, or null if the file has none.
+ *   if these are all layers of the file. `positions` (3 numbers per Gaussian) are in local units. The residuals, which
+ *   correct what the fields predict, are null in a model without them. `exposure` is the exposure map, for `logGains`,
+ *   or null if the file has none.
  *
  * @typedef {{
  *   version: [number, number],
@@ -65,8 +69,9 @@ const BASE_GAUSSIANS = 2 ** 18;
 
 const CODEC_FLOAT32 = 1, CODEC_FLOAT16 = 2, CODEC_VECTORS = 3, CODEC_MIN_MAX = 4;
 const CODEC_LATTICE = 6, CODEC_CHANNELS = 7, CODEC_GROUPS = 8, CODEC_EXPOSURE = 9, CODEC_STATED_GROUPS = 11;
+const CODEC_RESIDUALS = 13;
 const PARAMETER_CODECS = [CODEC_FLOAT32, CODEC_FLOAT16, CODEC_VECTORS, CODEC_MIN_MAX];
-PARAMETER_CODECS.push(CODEC_LATTICE, CODEC_CHANNELS, CODEC_GROUPS, CODEC_STATED_GROUPS);
+PARAMETER_CODECS.push(CODEC_LATTICE, CODEC_CHANNELS, CODEC_GROUPS, CODEC_STATED_GROUPS, CODEC_RESIDUALS);
 const LAYERED_COLUMNS = [3, 3, 1, 1];
 
 /**
@@ -80,7 +85,8 @@ export const describe = (bytes) => {
   const container = new Container(bytes, true);
   const isMerged = container.entries.has(PART_NAMES_TYPE);
   let firstLayer = isMerged ? container.length : 0;
-  for (const type of isMerged ? [] : ["META", ...LAYERED_TYPES, ...FIELD_TYPES]) {
+  const residuals = RESIDUAL_TYPES.filter((type) => container.entries.has(type));
+  for (const type of isMerged ? [] : ["META", ...LAYERED_TYPES, ...residuals, ...FIELD_TYPES]) {
     firstLayer = Math.max(firstLayer, requireEntry(container, type).end);
   }
   const sections = [...container.entries.values()].map(({ type, codec, offset, stored, raw }) => {
@@ -170,7 +176,7 @@ const readModel = (container) => {
   sections.forEach((section) => checkSection(container, section)); // all are checked before the first one is decoded
   let layerCount = 1;
   /** @param {number} layer */
-  const hasLayer = (layer) => LAYERED_TYPES.every((type) => container.has(layerType(type, layer)));
+  const hasLayer = (layer) => layeredTypes(config).every((type) => container.has(layerType(type, layer)));
   while (layerCount < counts.length && hasLayer(layerCount)) layerCount++;
   const required = sections.filter(({ layer }) => layer < layerCount);
   if (!required.every(({ type }) => container.has(type))) {
@@ -189,6 +195,8 @@ const readModel = (container) => {
   /** @param {string} type */
   const joined = (type) => concatenateArrays(layers.map((_, layer) => getArray(arrays, layerType(type, layer))));
   const [positions, colorLogits, scaleLogits, opacityLogits] = LAYERED_TYPES.map(joined);
+  const hasResiduals = config.residual_degree !== undefined;
+  const [shapeResiduals, colorResiduals] = hasResiduals ? RESIDUAL_TYPES.map(joined) : [null, null];
   return {
     metadata,
     config,
@@ -199,6 +207,8 @@ const readModel = (container) => {
     colorLogits,
     scaleLogits,
     opacityLogits,
+    shapeResiduals,
+    colorResiduals,
     geometry: { table: getArray(arrays, "GTAB"), decoder: getArray(arrays, "GMLP") },
     radiance: { table: getArray(arrays, "RTAB"), decoder: getArray(arrays, "RMLP") },
     exposure: readExposure(container),
@@ -246,15 +256,23 @@ const decodeOnce = ({ decoded }, key, decode) => {
 };
 
 /**
+ * Returns the types of the sections that each layer has, as in the first layer.
+ * @param {Config} config
+ */
+const layeredTypes = ({ residual_degree: degree }) =>
+  degree === undefined ? LAYERED_TYPES : [...LAYERED_TYPES, ...RESIDUAL_TYPES];
+
+/**
  * Lists the sections that a model must have, except the metadata. Positions come first, because others depend on them.
  * @param {Config} config
  * @param {number[]} counts the number of Gaussians of each layer
  * @returns {ExpectedSection[]}
  */
 const expectedSections = (config, counts) => {
+  const columns = [...LAYERED_COLUMNS, ...residualColumns(config.residual_degree ?? 0)];
   const sections = counts.flatMap((rows, layer) =>
-    LAYERED_TYPES.map((group, i) => {
-      return { type: layerType(group, layer), group, layer, rows, columns: LAYERED_COLUMNS[i] };
+    layeredTypes(config).map((group, i) => {
+      return { type: layerType(group, layer), group, layer, rows, columns: columns[i] };
     }),
   );
   for (const group of FIELD_TYPES) {
@@ -359,10 +377,12 @@ const decodeNumbers = ({ group, layer, rows, columns }, codec, data, config, poi
     const { groups, rest } = readTableGroups(data, config[fieldOf(group)]);
     return decodeGroups(rest, groups);
   }
-  if (group === "POSI" || codec !== (isField ? CODEC_GROUPS : CODEC_CHANNELS)) {
+  const isResidual = RESIDUAL_TYPES.includes(group);
+  if (group === "POSI" || codec !== (isField ? CODEC_GROUPS : isResidual ? CODEC_RESIDUALS : CODEC_CHANNELS)) {
     throw new DamagedData(`it cannot have codec ${codec}`);
   }
   if (!points[layer]) throw new DamagedData(`codec ${codec} needs positions of codec ${CODEC_LATTICE}`);
+  if (codec === CODEC_RESIDUALS) return decodeResiduals(data, points[layer], columns, group === "HARM");
   if (codec === CODEC_CHANNELS) return decodeChannels(data, points[layer], columns);
   return decodeGroups(data, tableGroups(config[fieldOf(group)], points[0]));
 };

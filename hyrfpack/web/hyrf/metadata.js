@@ -20,7 +20,7 @@ import { JsonNumber, parseJson } from "./json.js";
  * @typedef {{
  *   frame: Frame, geometry: Grid, radiance: Grid, hidden: number, background: boolean, solid: number[],
  *   scale_rule: "sum" | "product", scale_grows: boolean, direction_encoding: "sh" | "frequency",
- *   antialiased: boolean, position_gradients: boolean,
+ *   antialiased: boolean, position_gradients: boolean, residual_degree?: number,
  * }} Config
  *
  * The stored object. At its top level it keeps keys that this reader does not know.
@@ -123,7 +123,7 @@ const checkRules = (rules) => {
 const checkConfig = (node) => {
   const booleans = ["background", "scale_grows", "position_gradients", "antialiased"];
   const others = ["frame", "geometry", "radiance", "hidden", "solid", "scale_rule", "direction_encoding"];
-  const config = requireExactObject(node, "config", [...booleans, ...others]);
+  const config = requireExactObject(node, "config", [...booleans, ...others], ["residual_degree"]);
   for (const key of booleans) {
     assertValid(typeof config.get(key) === "boolean", `'config.${key}' must be true or false`);
   }
@@ -146,6 +146,7 @@ const checkConfig = (node) => {
     requireInteger(grid.get("finest"), `config.${field}.finest`, base, 65536);
   }
   requireInteger(config.get("hidden"), "config.hidden", 1, 1024);
+  if (config.has("residual_degree")) requireInteger(config.get("residual_degree"), "config.residual_degree", 0, 3);
   requireTriple(config.get("solid"), "config.solid");
   requireChoice(config.get("scale_rule"), "config.scale_rule", ["sum", "product"]);
   requireChoice(config.get("direction_encoding"), "config.direction_encoding", ["sh", "frequency"]);

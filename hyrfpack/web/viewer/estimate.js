@@ -1,6 +1,6 @@
 // Estimates the shapes and colours of a model's Gaussians for a first picture, from few evaluations of its fields.
 // Fields vary little between neighbours, so Gaussians take the neural values of the nearest of a few thousand anchors.
-// They add their own logits, which are not approximate.
+// They add their own logits, which are not approximate. Residuals are left out.
 
 import { colorsAlong, decodeGeometry, firstLayers } from "../hyrf/fields.js";
 
@@ -55,7 +55,8 @@ function evaluateAnchors(model, sources, eye) {
     for (let axis = 0; axis < 3; axis++) directions[p + axis] = ray[axis] / length;
   }
   const logits = new Float32Array(3 * count);
-  const bare = { ...model, count, positions, opacityLogits: logits, scaleLogits: logits, colorLogits: logits };
+  const explicit = { opacityLogits: logits, scaleLogits: logits, colorLogits: logits };
+  const bare = { ...model, count, positions, ...explicit, shapeResiduals: null, colorResiduals: null };
   const { opacities, scales, quats } = decodeGeometry(bare, 0, count);
   const colors = colorsAlong(bare, firstLayers(bare, 0, count), 0, count, directions);
   const ownFactor = model.config.scale_rule === "product" ? 0.5 : 1; // sigmoid(0)

@@ -24,9 +24,11 @@ export const MEMORY_REASON = "this device's memory does not hold the fields.";
 
 export class Fields {
   // Throws UnsupportedDeviceError if the device cannot hold a model that pack.js has packed.
-  static check(gl, { cells, height, geometry, radiance }) {
+  static check(gl, { cells, height, geometry, radiance, residualDegree }) {
     const side = gl.getParameter(gl.MAX_TEXTURE_SIZE);
-    const rows = Math.max(height, ...[geometry, radiance].map(({ table }) => table.length / 2 / TEXTURE_WIDTH));
+    const texels = residualDegree === undefined ? 1 : Math.max(2, (residualDegree + 1) ** 2);
+    const tableRows = [geometry, radiance].map(({ table }) => table.length / 2 / TEXTURE_WIDTH);
+    const rows = Math.max(height * texels, ...tableRows);
     if (cells > MAX_CELLS) throw new UnsupportedDeviceError("the decoders are too wide for this device.");
     if (rows > side) throw new UnsupportedDeviceError("the model is larger than this device's textures.");
   }
@@ -95,6 +97,12 @@ export class Fields {
     this.explicit = await graphics.table(floats, TEXTURE_WIDTH, model.explicit);
     this.logits = await graphics.table(floats, TEXTURE_WIDTH, model.logits);
     this.pixelSizes = await graphics.table([gl.R32F, gl.RED, gl.FLOAT, 1], TEXTURE_WIDTH, model.pixelSizes);
+    if (model.shapeResiduals) {
+      const halves = [gl.RGBA16F, gl.RGBA, gl.FLOAT, 4];
+      this.shapeResiduals = await graphics.table(floats, TEXTURE_WIDTH, model.shapeResiduals);
+      this.colorResiduals = await graphics.table(halves, TEXTURE_WIDTH, model.colorResiduals);
+      model.shapeResiduals = model.colorResiduals = null;
+    }
     model.explicit = model.logits = model.pixelSizes = null; // frees memory; the worker can decode them again
   }
 
@@ -144,7 +152,7 @@ export class Fields {
 
   // Builds the fragment shaders of all passes.
   shaders() {
-    const { gl, cells, layers, model: { geometry, radiance, sh, background } } = this;
+    const { gl, cells, layers, model: { geometry, radiance, sh, background, residualDegree } } = this;
     // Some devices cannot draw to as many targets as they report, because they limit the bytes per pixel.
     this.targets = Math.min(layers, gl.getParameter(gl.MAX_DRAW_BUFFERS), gl.getParameter(gl.MAX_COLOR_ATTACHMENTS));
     while (this.targets > 1 && !this.supports(this.targets)) this.targets >>= 1;
@@ -160,10 +168,11 @@ export class Fields {
     const placed = { PLACES: 1 };
     const directions = radiance.decoder.places.INPUTS + 4 * cells * radiance.levels.length;
     const turned = { DIRECTIONS: directions, ...(sh ? { HARMONICS: 1 } : {}) };
+    const residuals = residualDegree === undefined ? {} : { RESIDUAL_TERMS: (residualDegree + 1) ** 2 };
     const shaders = {
-      geometry: buildFieldShader("geometry.frag", { ...deep(geometry), ...placed }),
+      geometry: buildFieldShader("geometry.frag", { ...deep(geometry), ...placed, ...residuals }),
       features: buildFieldShader("features.frag", { ...common(radiance), ...placed, CELLS: this.targets }),
-      colors: buildFieldShader("colors.frag", { ...deep(radiance), ...turned }),
+      colors: buildFieldShader("colors.frag", { ...deep(radiance), ...turned, ...residuals }),
     };
     if (!background) return shaders;
     const constants = { ...deep(radiance), ...placed, ...turned, BACKGROUND: 1 };
@@ -223,6 +232,7 @@ export class Fields {
     const p = this.use("geometry", geometry);
     const { explicit, logits, pixelSizes } = this;
     graphics.bind(p, { u_explicit: explicit, u_logits: logits, u_pixel_sizes: pixelSizes }, gl.TEXTURE_2D, 1);
+    if (this.shapeResiduals) graphics.bind(p, { u_residuals: this.shapeResiduals }, gl.TEXTURE_2D, 4);
     gl.uniform1i(p.u_product, model.product);
     gl.uniform1i(p.u_grows, model.grows);
     this.passes(this.geometryTarget, fresh);
@@ -252,6 +262,7 @@ export class Fields {
     geometry.free();
     if (!this.panorama) radiance.freeTable();
     const objects = [this.explicit, this.pixelSizes, this.geometryTarget, ...this.featureTargets];
+    if (this.shapeResiduals) objects.push(this.shapeResiduals);
     for (const object of [...objects, programs.geometry.program, programs.features.program]) graphics.free(object);
   }
 
@@ -281,6 +292,7 @@ export class Fields {
     const { gl, graphics } = this, p = this.use("colors", this.radiance);
     graphics.bind(p, { u_places: this.places, u_logits: this.logits });
     graphics.bind(p, { u_features: this.features }, gl.TEXTURE_2D_ARRAY, 2);
+    if (this.colorResiduals) graphics.bind(p, { u_residuals: this.colorResiduals }, gl.TEXTURE_2D, 3);
     gl.uniform3fv(p.u_eye, eye);
     for (const row of rows) this.rows.colored(row, eye);
     this.passes(this.target, rows);

@@ -2,6 +2,9 @@
 uniform sampler2D u_explicit; // x, y, z; opacity logit
 uniform sampler2D u_logits; // colour logits; scale logit
 uniform sampler2D u_pixel_sizes; // of the photos, from hyrf/sampling.js
+#ifdef RESIDUAL_TERMS
+uniform sampler2D u_residuals; // two texels for each Gaussian, in two rows: a, b, x; y, z
+#endif
 uniform bool u_product; // the scale rule, else the sum
 uniform bool u_grows; // the largest scale, outwards
 
@@ -25,6 +28,14 @@ void main() {
         first += MATRIX(MATRIX_3 + 4 * group) * units;
         last += MATRIX(MATRIX_3 + 8 * CELLS + 4 * group) * units;
     }
+#ifdef RESIDUAL_TERMS
+    ivec2 at = ivec2(place.x, 2 * place.y);
+    vec3 one = texelFetch(u_residuals, at, 0).xyz, two = texelFetch(u_residuals, at + ivec2(0, 1), 0).xyz;
+    vec3 axis = vec3(one.z, two.xy);
+    float w = last.x + 1.0;
+    first.yzw += vec3(one.xy, -one.x - one.y);
+    last += vec4(-dot(last.yzw, axis), w * axis + cross(last.yzw, axis));
+#endif
     vec3 scales = u_product ? log_sigmoid(first.yzw) + log_sigmoid(vec3(logit)) : log_sigmoid(first.yzw + logit);
     if (u_grows) scales += log(max(1.0, norm(own.xyz / u_half_extent)));
     scales = (scales + 22.0) / 44.0;

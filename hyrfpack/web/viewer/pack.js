@@ -3,6 +3,7 @@
 import { estimateGaussians } from "./estimate.js";
 import { decoderLayout, gridLevels } from "../hyrf/grids.js";
 import { rowBalls } from "../hyrf/row_states.js";
+import { SHAPE_RESIDUALS } from "../hyrf/residuals.js";
 import { backgroundSpacing, pixelSizes } from "../hyrf/sampling.js";
 import { TEXTURE_WIDTH } from "./constants.js";
 import { backgroundPicture } from "./scene.js";
@@ -83,7 +84,16 @@ function packEstimate(model, eye, pixelSizes) {
 export function packModel(model, eye) {
   const { count } = model, gaussians = packGaussians(model, TEXTURE_WIDTH);
   const estimate = packEstimate(model, eye, gaussians.pixelSizes);
-  return { count, height: countRows(count), ...packFields(model), ...gaussians, estimate };
+  return { count, height: countRows(count), ...packFields(model), ...gaussians, ...packResiduals(model), estimate };
+}
+
+// Packs the residuals of a model, if it has any.
+function packResiduals({ count, shapeResiduals, colorResiduals }) {
+  if (!shapeResiduals) return {};
+  return {
+    shapeResiduals: stackRows(shapeResiduals, count, SHAPE_RESIDUALS),
+    colorResiduals: stackRows(colorResiduals, count, colorResiduals.length / Math.max(1, count)),
+  };
 }
 
 // Packs what the Gaussians of a model share.
@@ -107,6 +117,7 @@ export function packFields(model) {
     antialiased: config.antialiased,
     background: config.background,
     finest: config.radiance.finest,
+    residualDegree: config.residual_degree,
   };
 }
 
@@ -127,6 +138,19 @@ export function packGaussians({ metadata, count, positions, colorLogits, scaleLo
     logits[q + 3] = scaleLogits[i];
   }
   return { explicit, logits, pixelSizes: sizes, balls: rowBalls(positions, width) };
+}
+
+// Arranges numbers, `columns` for each Gaussian, for a texture of three numbers a texel: a row of Gaussians becomes
+// ceil(columns / 3) rows of texels.
+function stackRows(numbers, count, columns) {
+  const texels = Math.ceil(columns / 3), stacked = new Float32Array(4 * TEXTURE_WIDTH * countRows(count) * texels);
+  for (let i = 0, at = 0; i < count; i++) {
+    const row = Math.floor(i / TEXTURE_WIDTH) * texels, x = i % TEXTURE_WIDTH;
+    for (let k = 0; k < columns; k++) {
+      stacked[4 * (TEXTURE_WIDTH * (row + Math.floor(k / 3)) + x) + (k % 3)] = numbers[at++];
+    }
+  }
+  return stacked;
 }
 
 // Returns the positions of several parts (3 N each) as one array, in which each part begins a row of the textures.

@@ -12,10 +12,12 @@ from web.scripts import run_script
 import hyrfpack
 from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians
+from hyrfpack.model.residuals import add_color_residuals
 from hyrfpack.ops.background.reference import BACKGROUND_RADIUS
 from hyrfpack.ops.contraction import contract
 from hyrfpack.ops.shade import encode_directions
 from hyrfpack.splats.splats import normalized_quats
+from tools.safety.make_golden import add_golden_residuals
 
 EVALUATE_SCRIPT = Path(__file__).parent / "evaluate.mjs"
 SMALL_GRID = HashGridConfig(log2_table_size=6, levels=3, base=3, finest=12)
@@ -25,7 +27,7 @@ ONE_LEVEL_GRID = HashGridConfig(log2_table_size=4, levels=1, base=2, finest=2)
 FLOAT32_ROUNDING = {"rtol": 2e-7, "atol": 1e-7}
 
 
-def random_model(count: int, seed: int = 3, **settings: object) -> HybridModel:
+def random_model(count: int, seed: int = 3, residual_degree: int | None = None, **settings: object) -> HybridModel:
     """Return a model with large random fields and Gaussians inside the frame, far outside and at its centre."""
     generator = torch.Generator().manual_seed(seed)
     frame = Frame((10.0, -3.0, 0.5), 2.5, (1.0, 0.5, 0.25))
@@ -40,7 +42,7 @@ def random_model(count: int, seed: int = 3, **settings: object) -> HybridModel:
     with torch.no_grad():
         for parameter in (*model.geometry.parameters(), *model.radiance.parameters()):
             parameter.copy_(torch.randn(parameter.shape, generator=generator) * 0.4)
-    return model
+    return model if residual_degree is None else add_golden_residuals(model, residual_degree)
 
 
 def random_directions(count: int, seed: int) -> np.ndarray:
@@ -60,6 +62,8 @@ def evaluate_in_float64(
     with torch.no_grad():
         geometry, coords = model.decode_geometry(), model.cube_coords(model.gaussians.positions)
         colors = torch.sigmoid(model.radiance(coords, encode_directions(along, coding)) + model.gaussians.color_logits)
+        if model.gaussians.color_residuals is not None:
+            colors = add_color_residuals(colors, model.gaussians.color_residuals, along)
         sphere = contract(model.config.frame.normalize(places))
         background = torch.sigmoid(model.radiance(sphere, encode_directions(behind, coding)))
     quats = geometry.quats / geometry.quats.norm(dim=1, keepdim=True)
@@ -84,8 +88,10 @@ def evaluate_in_node(model: HybridModel, tmp_path: Path, *inputs: np.ndarray) ->
         {"direction_encoding": "sh", "scale_rule": "product"},
         {"geometry": LARGE_GRID, "radiance": SMALL_GRID, "hidden": 64, "scale_grows": False},
         {"geometry": ONE_LEVEL_GRID, "radiance": ONE_LEVEL_GRID, "hidden": 1},
+        {"residual_degree": 0},
+        {"residual_degree": 3},
     ],
-    ids=["frequency", "sh", "wide", "smallest"],
+    ids=["frequency", "sh", "wide", "smallest", "residuals", "residuals of degree 3"],
 )
 def test_fields_equal_those_of_the_model_in_float64(settings: dict, tmp_path: Path) -> None:
     model = random_model(700, **settings)

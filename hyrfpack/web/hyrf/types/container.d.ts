@@ -27,6 +27,8 @@ export declare const rawBytesLimit: (length: number) => number;
 export declare const MAX_LAYERS = 8;
 export declare const LAYERED_TYPES: string[];
 export declare const FIELD_TYPES: string[];
+/** The types of residuals, which a model of residuals has in each layer. */
+export declare const RESIDUAL_TYPES: string[];
 /** The type of the exposure map, which is optional. */
 export declare const EXPOSURE_TYPE = "EXPO";
 /**

@@ -54,11 +54,11 @@ export declare function firstLayers(model: Model, start: number, stop: number): 
  * @param {number} start the index of the first Gaussian
  * @param {number} stop the index after the last Gaussian
  * @param {Float32Array} directions 3 n: unit vectors from the viewpoint to each Gaussian
- * @returns {Float32Array} 3 n in [0, 1]
+ * @returns {Float32Array} 3 n, 0 or more, and at most 1 without residuals
  */
 export declare function colorsAlong(model: Model, layers: Float32Array, start: number, stop: number, directions: Float32Array): Float32Array;
 /**
- * Evaluates colours in [0, 1] of selected Gaussians along given directions. A Gaussian may be selected repeatedly.
+ * Evaluates colours of selected Gaussians along given directions. A Gaussian may be selected repeatedly.
  * @param {Model} model
  * @param {Float32Array} layers from `firstLayers`
  * @param {number} start the first Gaussian of `layers`

@@ -20,6 +20,8 @@ export type Model = {
     colorLogits: Float32Array;
     scaleLogits: Float32Array;
     opacityLogits: Float32Array;
+    shapeResiduals: Float32Array | null;
+    colorResiduals: Float32Array | null;
     geometry: Field;
     radiance: Field;
     exposure: ExposureMap | null;

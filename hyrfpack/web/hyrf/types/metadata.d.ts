@@ -21,6 +21,7 @@ export type Config = {
     direction_encoding: "sh" | "frequency";
     antialiased: boolean;
     position_gradients: boolean;
+    residual_degree?: number;
 };
 export type Metadata = {
     gaussians: number;

@@ -42,8 +42,9 @@ export function writeKept(bytes, { model, kept }, actions, writer) {
   const text = encodeJson(metadata), container = new Container(bytes, false);
   const arrays = {
     POSI: take(model.positions), COLO: take(model.colorLogits), SCAL: take(model.scaleLogits),
-    OPAC: take(model.opacityLogits), GTAB: geometry.table, GMLP: geometry.decoder, RTAB: radiance.table,
-    RMLP: radiance.decoder,
+    OPAC: take(model.opacityLogits),
+    ...(model.shapeResiduals ? { SHAP: take(model.shapeResiduals), HARM: take(model.colorResiduals) } : {}),
+    GTAB: geometry.table, GMLP: geometry.decoder, RTAB: radiance.table, RMLP: radiance.decoder,
   };
   const sections = [{ type: "META", codec: CODEC_JSON, flags: REQUIRED_FLAG, raw: text.length, data: text }];
   const exposure = container.entries.get(EXPOSURE_TYPE);
@@ -73,7 +74,8 @@ async function deflate(bytes) {
 }
 
 // As in hyrfpack/format/versions.py.
-function lowestMinorVersion(entries, { frame }) {
+function lowestMinorVersion(entries, { frame, residual_degree: degree }) {
+  if (degree !== undefined) return 6;
   if (frame.rotation) return 3;
   if (entries.some(({ type }) => type === EXPOSURE_TYPE)) return 2;
   const isLater = (type) => /^(POS|COL|SCA|OPA)\d$/.test(type);

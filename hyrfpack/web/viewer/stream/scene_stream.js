@@ -264,6 +264,7 @@ export class SceneStream {
   async receiveShared(bytes) {
     const model = await read(bytes);
     if (model.count) throw new HyrfFormatError("it holds Gaussians, and should hold only what chunks share");
+    if (model.shapeResiduals) throw new HyrfFormatError("chunks with residuals cannot be shown");
     this.config = canonicalText(model.config);
     this.shared = bytes;
     for (const [file, data] of this.early.splice(0)) this.receive(file, data);
