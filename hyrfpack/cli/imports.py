@@ -60,7 +60,7 @@ def import_(
     \b
     Examples:
       hyrfpack import scene.ply -o scene.hyrf
-      hyrfpack import scene.spz -o scene.hyrf --steps 1500 --psnr 40
+      hyrfpack import scene.spz -o scene.hyrf --psnr 45
       hyrfpack import room.ply -o room.hyrf --cameras photos/room --size 800
     """
     folder = source.parent if source.name == "meta.json" else source  # a SOG may be a folder that holds meta.json

@@ -7,16 +7,20 @@ from typing import Annotated
 
 from hyrfpack.config.settings import Range, Seed, check_settings
 
+# From this PSNR in dB on, a file with residuals is smaller than one without, if that reaches the PSNR at all.
+RESIDUALS_MIN_PSNR = 38.0
+
 
 @dataclass(frozen=True)
 class DistillConfig:
     """Settings that, with the splats, determine the result of a distillation.
 
     The model is fitted to reference renders of the splats, one a step. The renders, at most `train_views`, are taken
-    from sampled viewpoints; `test_views` others score the file.
+    from sampled viewpoints; `test_views` others score the file. If `psnr` is RESIDUALS_MIN_PSNR or more, the file has
+    residuals, which correct the shapes and colours of single Gaussians and take the place of training.
 
     Attributes:
-        steps: training steps.
+        steps: training steps, for a PSNR below 38 dB.
         psnr: PSNR of renders of FILE against renders of SOURCE; more dB take more bytes.
         size: longer side of the reference renders.
         train_views, test_views: number of sampled viewpoints to train at and to score at.
@@ -32,3 +36,8 @@ class DistillConfig:
 
     def __post_init__(self) -> None:
         check_settings(self)
+
+    @property
+    def has_residuals(self) -> bool:
+        """Whether the file gets residuals."""
+        return self.psnr >= RESIDUALS_MIN_PSNR

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -16,6 +16,7 @@ from hyrfpack.config.train import DensityConfig, LearningRates, TrainConfig
 from hyrfpack.data import PictureCache
 from hyrfpack.distill.initialize import initial_model
 from hyrfpack.distill.reference import ReferenceViews, mean_sent_light, reference_scene
+from hyrfpack.distill.residuals import exact_model
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.model import HybridModel
 from hyrfpack.progress import Progress, StepEvent, TaskEvent, ignore_progress, part_of_progress
@@ -34,6 +35,7 @@ TEST_EVERY = 8
 LIGHT_MEASUREMENT_VIEWS = 64
 # The faintest Gaussians that together send less than this share of all light are left out.
 FAINT_LIGHT_SHARE = 0.01
+FAINT_LIGHT_SHARE_WITH_RESIDUALS = 1e-4  # Compression prunes the others as the target PSNR allows.
 # The regression has its full length from this many training steps on, and is proportionally shorter below.
 FULL_REGRESSION_STEPS = 250
 MIN_REGRESSION_SHARE = 0.2
@@ -56,12 +58,14 @@ class DistilledModel:
         train: cameras of the training views.
         validation: reference renders on which the compression is decided.
         test: held-out reference renders, for scores.
+        exact: the splats of the model, if its residuals make it equal to them; None without residuals.
     """
 
     model: HybridModel
     train: list[Camera]
     validation: ReferenceViews
     test: ReferenceViews
+    exact: Drawable | None = None
 
 
 def distill_model(
@@ -91,20 +95,26 @@ def distill_model(
     )
     progress(TaskEvent("measuring which Gaussians are visible", 0.05))
     light = mean_sent_light(original, evenly_spaced(train, LIGHT_MEASUREMENT_VIEWS))
-    kept = torch.from_numpy(_indices_without_faint(light.cpu().numpy())).to(device)
+    faint_share = FAINT_LIGHT_SHARE_WITH_RESIDUALS if config.has_residuals else FAINT_LIGHT_SHARE
+    kept = torch.from_numpy(_indices_without_faint(light.cpu().numpy(), faint_share)).to(device)
     if not len(kept):
         raise HyrfDataError(f"{name}: no view shows anything of the Gaussians", fix="give others with `cameras`")
     _LOG.info(
         f"{len(splats) - len(kept):,} Gaussians are hardly visible and are left out; fitting the fields to the others"
     )
     share = min(1.0, max(MIN_REGRESSION_SHARE, config.steps / FULL_REGRESSION_STEPS))
-    model = initial_model(original[kept], light[kept], train, config.seed, share, part_of_progress(progress, 0.1, 0.4))
-    scene, cache = reference_scene(name, original, train, test), PictureCache()
-    _fit_to_pictures(model, scene, config, cache, part_of_progress(progress, 0.4, 0.98))
+    exact = original[kept] if config.has_residuals else None
+    # Residuals hold all colours that depend on the view, so there is no radiance field beside them.
+    fitted = original[kept] if exact is None else replace(exact, harmonics=exact.harmonics[:, :1])
+    model = initial_model(fitted, light[kept], train, config.seed, share, part_of_progress(progress, 0.1, 0.4))
+    if exact is None:
+        scene, cache = reference_scene(name, original, train, test), PictureCache()
+        _fit_to_pictures(model, scene, config, cache, part_of_progress(progress, 0.4, 0.98))
+    else:
+        model = exact_model(model, exact)
     progress(TaskEvent("rendering held-out views", 0.98))
-    return DistilledModel(
-        model, train, *(ReferenceViews.from_splats(original, cameras) for cameras in (validation, test))
-    )
+    validation_views, test_views = (ReferenceViews.from_splats(original, views) for views in (validation, test))
+    return DistilledModel(model, train, validation_views, test_views, exact)
 
 
 def _choose_cameras(
@@ -133,14 +143,14 @@ def _choose_cameras(
     return train, sample_views(train, config.test_views, config.seed)[1], test
 
 
-def _indices_without_faint(light: np.ndarray) -> np.ndarray:
+def _indices_without_faint(light: np.ndarray, share: float = FAINT_LIGHT_SHARE) -> np.ndarray:
     """Return ascending indices (n,) of all Gaussians but the faintest, given the light (N,) that each sends.
 
-    The faintest are those that together send FAINT_LIGHT_SHARE of all light, or none.
+    The faintest are those that together send `share` of all light, or none.
     """
     order = np.argsort(light, kind="stable")
     sums = np.cumsum(light[order].astype(np.float64))
-    return np.sort(order[(sums > FAINT_LIGHT_SHARE * sums[-1]) & (light[order] > 0)]) if len(order) else order
+    return np.sort(order[(sums > share * sums[-1]) & (light[order] > 0)]) if len(order) else order
 
 
 def _fit_to_pictures(

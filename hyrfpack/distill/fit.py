@@ -15,7 +15,7 @@ import numpy as np
 from hyrfpack import format as hyrf_format
 from hyrfpack.atomic import write_atomic
 from hyrfpack.checks import check_type
-from hyrfpack.config.distill import DistillConfig
+from hyrfpack.config.distill import RESIDUALS_MIN_PSNR, DistillConfig
 from hyrfpack.context import RunContext
 from hyrfpack.distill.distillation import distill_model
 from hyrfpack.distill.pack import pack
@@ -197,4 +197,11 @@ def _shortfall(
     if not _falls_short(unpacked_psnr, config.psnr):
         return f"{outcome}; set a higher target with `psnr`"
     where = ", or give the viewpoints that matter with `cameras`" if viewpoints_are_sampled else ""
-    return f"{outcome}; train longer, for example with `steps={max(DistillConfig.steps, 2 * config.steps)}`{where}"
+    if config.has_residuals:
+        return (
+            f"{outcome}; the model has the largest opacities and smallest scales of all models, so set a lower `psnr`"
+        )
+    return (
+        f"{outcome}; train longer, for example with `steps={max(DistillConfig.steps, 2 * config.steps)}`, or store "
+        f"corrections of single Gaussians, which take the place of training, with `psnr={RESIDUALS_MIN_PSNR:g}`{where}"
+    )

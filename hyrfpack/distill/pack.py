@@ -9,9 +9,13 @@ import numpy as np
 from scipy.optimize import brentq
 
 from hyrfpack.cameras.paths import Viewpoint
-from hyrfpack.compress.calibrate import measure_calibrated_sensitivity
+from hyrfpack.compress.calibrate import calibrate, measure_calibrated_sensitivity
+from hyrfpack.compress.field_codes import quantize_fields
 from hyrfpack.compress.packer import Packer
+from hyrfpack.compress.reference_renders import ReferenceRenders
+from hyrfpack.compress.sensitivity import measure_sensitivity
 from hyrfpack.distill.distillation import DistilledModel
+from hyrfpack.distill.residuals import exact_model
 from hyrfpack.progress import (
     Progress,
     TaskEvent,
@@ -29,6 +33,8 @@ PLANNED_ERROR_SHARE = 0.8
 FALLBACK_MODEL_ERROR_SHARE = 0.25
 FALLBACK_ALLOWED_ERROR_SHARE = 0.5
 MAX_TRIALS = 5
+# With residuals, fields are quantised as if they alone might add this error, in dB; residuals correct it.
+FIELD_PSNR = 28.0
 
 
 def pack(
@@ -63,11 +69,19 @@ def pack(
     allowance = max(allowed - error, min(FALLBACK_MODEL_ERROR_SHARE * error, FALLBACK_ALLOWED_ERROR_SHARE * allowed))
     _LOG.info(f"measuring how each stored number affects renders, at {len(distilled.train)} cameras and between them")
     distortion = PLANNED_ERROR_SHARE * solve_added_error(_mse(psnrs), error + allowance)
-    sensitivity, references = measure_calibrated_sensitivity(
-        model, distilled.train, distortion, progress=part_of_progress(progress, 0.0, 0.7)
-    )
+    measuring, field_codes = part_of_progress(progress, 0.0, 0.7), None
+    if distilled.exact is None:
+        sensitivity, references = measure_calibrated_sensitivity(model, distilled.train, distortion, progress=measuring)
+    else:
+        sensitivity = measure_sensitivity(model, distilled.train, progress=part_of_progress(measuring, 0.0, 0.5))
+        model, field_codes = quantize_fields(model, sensitivity, _mse(FIELD_PSNR))
+        model = exact_model(model, distilled.exact)
+        references = ReferenceRenders.from_model(model, distilled.train)
+        rest = part_of_progress(measuring, 0.55, 1.0)
+        sensitivity = calibrate(model, sensitivity, references, distortion, progress=rest, field_codes=field_codes)
     provenance = {**provenance, "viewpoint": Viewpoint.from_cameras(distilled.train).to_json()}
-    packer = Packer(model, provenance, sensitivity, progress=part_of_progress(progress, 0.7, 0.85))
+    encoding = part_of_progress(progress, 0.7, 0.85)
+    packer = Packer(model, provenance, sensitivity, progress=encoding, field_codes=field_codes)
     candidate = packer.encode_to_distortion(distortion, references)
     for number in range(MAX_TRIALS):
         trial_progress = round_of_progress(part_of_progress(progress, 0.85, 1.0), number)

@@ -97,11 +97,11 @@ def test_invalid_inputs_of_import_are_a_clear_error(source: Path, tmp_path: Path
 
 
 def test_import_reports_a_missed_target(source: Path, tmp_path: Path) -> None:
-    result = succeeded("import", source, "-o", tmp_path / "x.hyrf", *QUICK_OPTIONS, "--psnr", 60, "--json")
+    result = succeeded("import", source, "-o", tmp_path / "x.hyrf", *QUICK_OPTIONS, "--psnr", 37.9, "--json")
     numbers = json.loads(result.stdout)
-    assert numbers["psnr_asked"] == 60
+    assert numbers["psnr_asked"] == 37.9
     assert (
-        f"the target PSNR is 60 dB, but the file reaches {numbers['psnr']:.1f} dB at held-out viewpoints"
+        f"the target PSNR is 37.9 dB, but the file reaches {numbers['psnr']:.1f} dB at held-out viewpoints"
         in result.stderr
     )
-    assert f"--steps {DistillConfig.steps}" in result.stderr
+    assert f"--steps {DistillConfig.steps}" in result.stderr and "--psnr 38" in result.stderr

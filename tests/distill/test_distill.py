@@ -191,13 +191,13 @@ def _interrupt(*args):
 
 @pytest.mark.acceptance
 def test_a_psnr_below_the_target_is_reported(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    report = distill_splats(ball_splats(60), tmp_path / "x.hyrf", replace(TINY_DISTILL_CONFIG, psnr=60))
-    assert report.psnr_asked == 60
+    report = distill_splats(ball_splats(60), tmp_path / "x.hyrf", replace(TINY_DISTILL_CONFIG, psnr=37.9))
+    assert report.psnr_asked == 37.9
     last = caplog.messages[-1]
     assert last.startswith(
-        f"the target PSNR is 60 dB, but the file reaches {report.psnr:.1f} dB at held-out viewpoints"
+        f"the target PSNR is 37.9 dB, but the file reaches {report.psnr:.1f} dB at held-out viewpoints"
     )
-    assert f"`steps={DistillConfig.steps}`" in last and "`cameras`" in last
+    assert all(words in last for words in (f"`steps={DistillConfig.steps}`", "`psnr=38`", "`cameras`"))
 
     caplog.clear()
     distill_splats(ball_splats(60), tmp_path / "x.hyrf", replace(TINY_DISTILL_CONFIG, psnr=10))
@@ -208,6 +208,8 @@ def test_a_target_missed_only_by_packing_advises_psnr_and_not_steps() -> None:
     messages = fit._shortfall(36.5, 38.6, DistillConfig(psnr=37), viewpoints_are_sampled=True)
     assert "reaches 36.5" in messages and messages.endswith("with `psnr`") and "steps" not in messages
     assert "cameras" not in fit._shortfall(36.5, 36.6, DistillConfig(psnr=37), viewpoints_are_sampled=False)
+    exact = DistillConfig(psnr=60)
+    assert "set a lower `psnr`" in fit._shortfall(55, 56, exact, viewpoints_are_sampled=True)
     assert not fit._falls_short(36.96, 37) and fit._falls_short(36.94, 37)
 
 

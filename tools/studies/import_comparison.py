@@ -5,10 +5,10 @@
 
 PlayCanvas' splat-transform (`npm ci --prefix tests/node`) writes SOG and SPZ, and gsply writes SPZ. Neither has a
 quality setting, so they encode the whole file, and also versions with fewer harmonics and without faint Gaussians.
-hyrfpack distils one model and compresses it for each --psnr. All files are decoded, drawn by hyrfpack's rasteriser at
-the viewpoints that import holds out, and compared with the original's pictures. The table has bytes, mean and worst
-PSNR in dB, and seconds of compression. The viewpoints are few and far apart, so differences of some tenths of a dB are
-not significant.
+hyrfpack distils one model without residuals and one with them, and compresses one of them for each --psnr. All files
+are decoded, drawn by hyrfpack's rasteriser at the viewpoints that import holds out, and compared with the original's
+pictures. The table has bytes, mean and worst PSNR in dB, and seconds of compression. The viewpoints are few and far
+apart, so differences of some tenths of a dB are not significant.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from hyrfpack.splats.splats import Splats
 from tools.tables import markdown_table
 
 NODE_FOLDER = Path(__file__).parents[2] / "tests" / "node"
-DEFAULT_PSNR_TARGETS_DB = (30, 32, 34, 36, 38, 40, 42)
+DEFAULT_PSNR_TARGETS_DB = (30, 32, 34, 36, 38, 40, 42, 45, 50)
 MIN_OPACITIES = (0.0, 0.05, 0.1)
 
 
@@ -67,10 +67,10 @@ class MeasuredFile:
         return [self.encoder, self.setting, *sizes]
 
 
-def measure_own_files(distilled: DistilledModel, psnr_targets: list[float]) -> Iterator[MeasuredFile]:
-    """Compress the distilled model for each PSNR target and yield the files."""
+def measure_own_files(models: dict[bool, DistilledModel], psnr_targets: list[float]) -> Iterator[MeasuredFile]:
+    """Compress the distilled models, by whether they have residuals, for each PSNR target and yield the files."""
     for psnr_target in psnr_targets:
-        started = time.perf_counter()
+        started, distilled = time.perf_counter(), models[DistillConfig(psnr=psnr_target).has_residuals]
         data = pack(distilled, psnr_target, {})
         seconds = time.perf_counter() - started
         scores = distilled.test.psnr_per_view(decode_model(data))
@@ -162,12 +162,13 @@ def main() -> None:
     for file in args.files:
         splats = read_splats(file)
         started = time.perf_counter()
-        distilled = distill_model(
-            splats, DistillConfig(steps=args.steps, size=args.size, seed=args.seed), name=str(file)
-        )
+        settings = [DistillConfig(args.steps, psnr, args.size, seed=args.seed) for psnr in sorted(args.psnr)]
+        config_by_kind = {config.has_residuals: config for config in settings}
+        models = {kind: distill_model(splats, config, name=str(file)) for kind, config in config_by_kind.items()}
+        distilled = next(iter(models.values()))
         print(f"\n{file.name}: {len(splats):,} Gaussians of degree {splats.degree}; "
               f"distilled in {time.perf_counter() - started:.0f} s\n")  # fmt: skip
-        own_files = list(measure_own_files(distilled, args.psnr))
+        own_files = list(measure_own_files(models, args.psnr))
         with tempfile.TemporaryDirectory() as folder:
             other_files = list(measure_other_files(splats, distilled, Path(folder)))
         columns = ["encoder", "setting", "bytes", "dB, mean", "worst", "s"]

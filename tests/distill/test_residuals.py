@@ -1,0 +1,81 @@
+"""With residuals, a model equals the splats, and files keep what the target PSNR needs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from explicit_balls import TINY_DISTILL_CONFIG, ball_splats
+from scenes import ring, small_model
+from scipy.spatial.transform import Rotation
+
+from hyrfpack.distill import distill_splats
+from hyrfpack.distill.residuals import exact_model, shape_residuals
+from hyrfpack.errors import HyrfError
+from hyrfpack.format import describe_file, load_model
+from hyrfpack.lod import split_model
+from hyrfpack.model.residuals import add_shape_residuals
+from hyrfpack.render import render_view
+from hyrfpack.splats.draw import Drawable, draw
+from tools.safety.make_golden import GOLDEN_FOLDER
+
+pytestmark = pytest.mark.usefixtures("quick_calibration")
+
+
+def covariances(scales: np.ndarray, quats: np.ndarray) -> np.ndarray:
+    axes = Rotation.from_quat(np.roll(quats, -1, axis=1)).as_matrix() * scales[:, None]  # scipy puts w last
+    return axes @ axes.transpose(0, 2, 1)
+
+
+def test_shape_residuals_give_any_gaussian_its_covariance_whatever_the_field_predicts() -> None:
+    rng = np.random.default_rng(0)
+    scales, quats = np.exp(rng.uniform(-7, -0.2, (500, 3))), rng.normal(size=(500, 4))
+    quats[:3] = [(1, 0, 0, 0), (0, 1, 0, 0), (0.5, 0.5, 0.5, 0.5)]
+    raw = torch.from_numpy(rng.normal(size=(500, 8)))
+    sizes = torch.from_numpy(np.log(scales / (1 - scales)))  # scale_bounds are 1
+
+    residuals, explicit = shape_residuals(raw, sizes, torch.from_numpy(quats))
+
+    outputs = add_shape_residuals(raw, residuals).numpy()
+    found_scales = 1 / (1 + np.exp(-(outputs[:, 1:4] + explicit.numpy())))
+    found = covariances(found_scales, outputs[:, 4:] + (1, 0, 0, 0))
+    expected = covariances(scales, quats)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+    # The nearest of the 24 equivalent rotations is at most 62.8 degrees away, so |(x, y, z)| <= tan(31.4 degrees).
+    assert np.linalg.norm(residuals.numpy()[:, 2:], axis=1).max() <= np.tan(np.radians(31.4))
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_an_exact_model_renders_the_splats(degree: int) -> None:
+    splats = ball_splats(150, degree=degree)
+    fields = small_model(splats.positions, fields=0.5, scale_rule="sum")
+    with torch.no_grad():
+        for values in (fields.radiance.weights[-1], fields.radiance.biases[-1]):
+            values.zero_()
+    drawable = Drawable.from_splats(splats, fields.config.frame)
+    model = exact_model(fields, drawable)
+    with torch.no_grad():
+        for camera in ring(3):
+            difference = render_view(model, camera).rgb.clamp(0, 1) - draw(drawable, camera).rgb.clamp(0, 1)
+            assert -10 * difference.square().mean().log10() > 60
+
+
+def test_an_import_with_residuals_stores_what_the_target_needs(tmp_path: Path) -> None:
+    splats, sizes = ball_splats(200), []
+    for psnr in (38, 50):
+        report = distill_splats(splats, tmp_path / "x.hyrf", replace(TINY_DISTILL_CONFIG, psnr=psnr))
+        assert report.psnr_unpacked > 55 and report.psnr > psnr - 1
+        sizes.append(report.bytes_after)
+    assert sizes[1] > 1.3 * sizes[0]
+    model, description = load_model(tmp_path / "x.hyrf"), describe_file(tmp_path / "x.hyrf")
+    assert model.config.residual_degree == splats.degree and description["version"] == "1.6"
+    for residuals in (model.gaussians.shape_residuals, model.gaussians.color_residuals):
+        assert residuals is not None and residuals.any()
+
+
+def test_a_model_with_residuals_is_not_split(tmp_path: Path) -> None:
+    with pytest.raises(HyrfError, match="a model with residuals cannot be split into levels of detail"):
+        split_model(GOLDEN_FOLDER / "v1.6_compact_residuals.hyrf", tmp_path / "scene")
