@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hyrfpack.atomic import make_folder
-from hyrfpack.errors import HyrfError
+from hyrfpack.errors import HyrfBusyError
 
 if TYPE_CHECKING:
     from hyrfpack.parallel.ranks import Ranks
@@ -40,7 +40,8 @@ def exclusive_folder(
             get the lock, all of them raise the error.
 
     Raises:
-        HyrfError: another call is working in the folder, or the folder cannot be created.
+        HyrfBusyError: another call is working in the folder.
+        HyrfError: the folder cannot be created.
     """
     folder = Path(folder)
     if ranks is not None and not ranks.is_main:
@@ -78,7 +79,7 @@ def _lock(folder: Path, remedy: str) -> int | None:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             os.close(handle)
-            raise HyrfError(
+            raise HyrfBusyError(
                 f"{folder}: another hyrfpack command is at work in this folder",
                 fix=f"wait until it has ended, or name {remedy}",
             ) from None

@@ -28,6 +28,7 @@ LAYER_BY_PATH = {
     "": "integration",
     "blocks/test_merge.py": "unit",
     "blocks/test_plan.py": "unit",
+    "blocks/test_processes.py": "acceptance",
     "cameras": "unit",
     "cli/test_processes.py": "acceptance",
     "compress/test_determinism.py": "acceptance",

@@ -14,8 +14,9 @@ from typing import NoReturn
 import numpy as np
 import torch
 import torch.distributed as dist
-from scenes import alternating_gains, ball_scene, exposed_scene
+from scenes import alternating_gains, ball_scene, exposed_scene, visible_points_by_photo
 
+from hyrfpack.blocks import train_blocks
 from hyrfpack.context import RunContext
 from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.parallel.ranks import Ranks, join_processes
@@ -31,6 +32,10 @@ SIX_PHOTO_CONFIG = TrainConfig(steps=400, seed=3, max_gaussians=80, density=DENS
 # Three photos for two processes, so that in some steps both render the same photo.
 EXPOSURE_CONFIG = dataclasses.replace(SIX_PHOTO_CONFIG, steps=59, exposure=True)
 RUN_CONFIG = dataclasses.replace(SIX_PHOTO_CONFIG, steps=60, checkpoint_every=5)
+BLOCK_CONFIG = TrainConfig(
+    steps=12, seed=1, max_gaussians=150, exposure=True, preset="standard", checkpoint_every=1,
+    density=DensityConfig(start=0.1, rounds=3, gradient=1e-5),
+)  # fmt: skip
 
 
 def six_photo_scene() -> Scene:
@@ -44,6 +49,13 @@ def three_photo_scene() -> Scene:
 def held_out_scene() -> Scene:
     scene = ball_scene(views=7, points=60, side=24)
     return dataclasses.replace(scene, train=scene.train[2:], test=scene.train[:2])
+
+
+def block_scene() -> Scene:
+    """Return a scene of ten training photos and two held-out photos, with tracks."""
+    scene = ball_scene(views=12, points=80, side=16)
+    tracks = visible_points_by_photo(scene, facing=0.2)
+    return dataclasses.replace(scene, train=scene.train[2:], test=scene.train[:2], tracks=tracks)
 
 
 def error_message(work: Callable[[], object]) -> str | None:
@@ -308,3 +320,24 @@ def collect_setup_errors(ranks: Ranks, out: Path) -> dict[str, str | None]:
 
 def _unreadable() -> NoReturn:
     raise HyrfDataError("held.png: cannot be read", fix="replace it")
+
+
+# -- training in blocks ----------------------------------------------------------------------------------------------
+
+
+def train_two_blocks(ranks: Ranks, out: Path, lost_at_step: int | None) -> tuple[bool, int]:
+    """Train two blocks, and return whether all is complete and the number of steps of this rank.
+
+    Args:
+        lost_at_step: the step after which rank 1 is killed; None for no step.
+    """
+    steps = 0
+
+    def count(event: Event) -> None:
+        nonlocal steps
+        steps += isinstance(event, StepEvent)
+        if steps == lost_at_step and ranks.rank == 1:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    context = RunContext(progress=count, ranks=ranks)
+    return train_blocks(block_scene(), out, BLOCK_CONFIG, "2x1", context=context).complete, steps

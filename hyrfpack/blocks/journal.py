@@ -1,9 +1,13 @@
-"""The journal of a run in blocks: its settings and its progress, from which an interrupted run resumes."""
+"""The journal of a run in blocks: what it trains, and how far each block is.
+
+The journal itself does not change during a run. The files of a block say whether its training has begun and finished,
+so that several processes need no other record.
+"""
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,15 +15,16 @@ from hyrfpack.atomic import write_atomic
 from hyrfpack.blocks.plan import BlockPlan
 from hyrfpack.config.train import TrainConfig
 from hyrfpack.errors import HyrfError, HyrfTrainingError
-from hyrfpack.format.run_folder import CHECKPOINT_FILE, MODEL_FILE
+from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
 from hyrfpack.train.checkpoint import names_and_sizes
 from hyrfpack.train.results import RECORD_FILE
+from hyrfpack.train.run import is_begun as is_run_begun
 
 BLOCKS_FOLDER, JOURNAL_FILE = "blocks", "blocks.json"
 JOURNAL_VERSION = 1
 
 
-@dataclass
+@dataclass(frozen=True)
 class Journal:
     """The journal of a run in blocks.
 
@@ -27,40 +32,38 @@ class Journal:
         path: its file, `blocks/blocks.json` in the folder of the run.
         settings: settings of the run by name. They and `photos` must be the same in a resumed run.
         photos: name, width and height of each photo of each block.
-        begun, finished: names of the blocks whose training has begun, and of those that are trained.
     """
 
     path: Path
     settings: dict[str, Any]
     photos: dict[str, list]
-    begun: list[str] = field(default_factory=list)
-    finished: list[str] = field(default_factory=list)
 
     def folder(self, block: str) -> Path:
         """Return the folder of the run of a block."""
         return self.path.parent / block
 
-    def begin(self, block: str) -> None:
-        """Record that the training of a block begins, which must not resume from a checkpoint of an earlier run."""
-        for name in (CHECKPOINT_FILE, RECORD_FILE):
-            (self.folder(block) / name).unlink(missing_ok=True)
-        self.begun.append(block)
-        self._write()
+    def is_begun(self, block: str) -> bool:
+        """Return whether the training of a block can be resumed."""
+        return is_run_begun(self.folder(block))
 
-    def finish(self, block: str) -> None:
-        """Record that a block is trained."""
-        self.finished.append(block)
-        self._write()
+    def is_finished(self, block: str) -> bool:
+        """Return whether a block is trained and all its results are written."""
+        files = (self.folder(block) / name for name in (MODEL_FILE, METRICS_FILE))
+        return all(file.is_file() for file in files) and not self.is_begun(block)
 
-    def _write(self) -> None:
-        content = {"version": JOURNAL_VERSION, **{name: value for name, value in vars(self).items() if name != "path"}}
+    def start(self) -> None:
+        """Write the journal of a new run, and remove what would be taken for results of its blocks."""
+        for block in self.photos:
+            for name in (CHECKPOINT_FILE, RECORD_FILE, METRICS_FILE, MODEL_FILE):
+                (self.folder(block) / name).unlink(missing_ok=True)
+        content = {"version": JOURNAL_VERSION, "settings": self.settings, "photos": self.photos}
         write_atomic(self.path, json.dumps(content, indent=1).encode())
 
 
 def open_journal(
     out: Path, blocks: str, plan: BlockPlan, config: TrainConfig, *, resume: bool, overwrite: bool
 ) -> Journal:
-    """Return the journal of the run that is resumed, or that of a new one, which is written when a block begins.
+    """Return the journal of a run, which is new unless it is resumed.
 
     Raises:
         HyrfError: there is no run to resume, it had other settings or photos, or a new run would replace an earlier
@@ -78,8 +81,7 @@ def open_journal(
                 f"{out}: the run was started with other {other}",
                 fix="resume with the same ones or train anew with `overwrite=True`",
             )
-        return found
-    if not overwrite and (is_begun(out) or (out / MODEL_FILE).exists()):
+    elif not overwrite and (is_begun(out) or (out / MODEL_FILE).exists()):
         hint = "`resume=True` continues it, " if is_begun(out) else ""
         raise HyrfError(f"{out}: the folder holds an earlier run", fix=f"{hint}`overwrite=True` replaces it")
     return new
@@ -102,11 +104,8 @@ def _read_journal(path: Path) -> Journal:
         )
     try:
         content = json.loads(path.read_bytes())
-        if content.pop("version") != JOURNAL_VERSION:
-            raise ValueError("another version")
-        journal = Journal(path, **content)
-        if not all(isinstance(names, list) for names in (journal.begun, journal.finished)):
-            raise TypeError("no list")
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        if content["version"] != JOURNAL_VERSION or not isinstance(content["settings"], dict):
+            raise ValueError("it is of another version")
+        return Journal(path, content["settings"], content["photos"])
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise HyrfTrainingError(f"{path}: the journal is damaged", fix="train anew with `overwrite=True`") from error
-    return journal

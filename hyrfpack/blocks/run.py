@@ -6,7 +6,10 @@ import dataclasses
 import json
 import logging
 import math
+import time
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +18,7 @@ import torch
 
 from hyrfpack.atomic import write_atomic
 from hyrfpack.blocks.cells import ground_axes, ground_extent
-from hyrfpack.blocks.journal import BLOCKS_FOLDER, Journal, open_journal
+from hyrfpack.blocks.journal import BLOCKS_FOLDER, Journal, is_begun, open_journal
 from hyrfpack.blocks.merge import merge_blocks
 from hyrfpack.blocks.plan import MIN_BLOCK_PHOTOS, Block, BlockPlan, parse_grid, plan_blocks
 from hyrfpack.checks import check_type
@@ -25,27 +28,32 @@ from hyrfpack.data import PictureCache
 from hyrfpack.data.cache import memory_bytes
 from hyrfpack.data.preset import detect_preset
 from hyrfpack.device import describe_device
-from hyrfpack.errors import HyrfError
+from hyrfpack.errors import HyrfBusyError, HyrfError
 from hyrfpack.evaluate import evaluate_model
 from hyrfpack.format.parts import load_model_or_parts
-from hyrfpack.format.run_folder import METRICS_FILE, MODEL_FILE
+from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
 from hyrfpack.format.sections import MAX_PARTS
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.model.merged import parts_of
+from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.progress import Progress, TaskEvent, items_of_progress
 from hyrfpack.scene import Scene
+from hyrfpack.train.checkpoint import saved_decisions
 from hyrfpack.train.checks import check_outputs, check_photos
+from hyrfpack.train.decisions import measures_budget, measures_exposure
 from hyrfpack.train.finish import TrainResult
 from hyrfpack.train.results import VIEWS_FOLDER, scene_facts
 from hyrfpack.train.run import Observer, resuming, train_model
-from hyrfpack.train.run import is_begun as is_run_begun
 from hyrfpack.train.setup import budget_for
 
 _LOG = logging.getLogger(__name__)
 
 # `auto` gives each block at most so many photos and bytes.
 MAX_BLOCK_PHOTOS = 500
-BYTES_PER_GAUSSIAN = 1_500  # Peak memory of training for each Gaussian of the budget.
+BYTES_PER_GAUSSIAN = (
+    2_500  # of the budget, at the peak of training: 1,260 for each, of which there are up to twice as many
+)
+POLL_SECONDS = 1.0  # A process without a block looks for one this often.
 MAX_MEMORY_SHARE = 0.5  # of the device; photos and one view's pixels take the rest
 
 
@@ -61,11 +69,12 @@ def train_blocks(
     log: Path | str | None = None,
     context: RunContext = RunContext(),  # noqa: B008 - frozen
 ) -> TrainResult:
-    """Train a large scene in blocks, one after the other, and write them as one merged file.
+    """Train a large scene in blocks and write them as one merged file.
 
     The ground is divided into cells. Each block trains on all photos that show its cell, as a run of its own in
-    `blocks/`, and keeps the Gaussians in its cell. The folder gets `model.hyrf` (a merged file of profile raw, a part
-    for each block), `metrics.json` and `views/`, as by `train_model`. Memory is bounded by the largest block.
+    `blocks/`, and keeps the Gaussians in its cell. Blocks train one after the other, or side by side in several
+    processes. The folder gets `model.hyrf` (a merged file of profile raw, a part for each block), `metrics.json` and
+    `views/`, as by `train_model`. The memory of a process is bounded by the largest block.
 
     Args:
         scene: the scene, from `hyrfpack.load_scene`.
@@ -78,7 +87,9 @@ def train_blocks(
         resume: resume an interrupted run; blocks that are finished are kept.
         overwrite: replace an earlier run in the folder.
         observer, log: see `hyrfpack.train_model`. The log of a block has its name in the name of the file.
-        context: device, progress and stop, see `hyrfpack.train_model`. Several processes are not supported.
+        context: device, processes, progress and stop, see `hyrfpack.train_model`. Several processes train one block
+            each at a time, and need a common file system. Only rank 0 merges and returns metrics. If the launcher
+            restarts the processes, they resume.
 
     Raises:
         HyrfError: the grid does not suit the scene, or an error of `train_model`, which names the block.
@@ -101,13 +112,23 @@ def train_blocks(
         config = dataclasses.replace(config, preset=detect_preset(scene)[0])
     columns, rows = _choose_grid(scene, config, device) if blocks == "auto" else parse_grid(blocks)
     plan = plan_blocks(scene, columns, rows)
-    check_outputs(out, scene, overwrite=True)  # It runs before a folder is created.
-    with exclusive_folder(out):
-        journal = open_journal(out, f"{columns}x{rows}", plan, config, resume=resume, overwrite=overwrite)
-        check_outputs(out, scene, overwrite=resume or overwrite)
-        cache = context.cache or PictureCache()
-        with context.open_progress("blocks") as progress:
-            check_photos(scene, cache, progress)
+    ranks = context.ranks or SINGLE_PROCESS
+    # This check ignores existing results. It runs first, so that no folder is created where nothing may be written.
+    ranks.run_on_all(lambda: check_outputs(out, scene, overwrite=True) if ranks.is_main else None)
+    with exclusive_folder(out, ranks=ranks):
+        resume = ranks.broadcast(resume or (ranks.restarts > 0 and is_begun(out)))
+        cache = context.cache or PictureCache(memory_bytes() // 4 // ranks.local_size)
+
+        def begin() -> Journal:
+            journal = open_journal(out, f"{columns}x{rows}", plan, config, resume=resume, overwrite=overwrite)
+            if ranks.is_main:
+                check_outputs(out, scene, overwrite=resume or overwrite)
+                with context.open_progress("blocks") as progress:
+                    check_photos(scene, cache, progress)
+            return journal
+
+        journal = ranks.run_on_all(begin)
+        ranks.run_on_all(lambda: journal.start() if ranks.is_main and not resume else None)
         return _BlockRun(
             scene=scene,
             out=out,
@@ -120,6 +141,7 @@ def train_blocks(
             log=None if log is None else Path(log),
             context=dataclasses.replace(context, device=device, cache=cache),
             device=device,
+            ranks=ranks,
         ).execute()
 
 
@@ -149,66 +171,97 @@ class _BlockRun:
     log: Path | None
     context: RunContext
     device: torch.device
+    ranks: Ranks
 
     def execute(self) -> TrainResult:
-        """Train the blocks that are not finished, and merge all."""
-        metrics: list[dict] = []
-        for number, block in enumerate(self.plan.blocks, 1):
-            label = f"block {block.name} ({number} of {len(self.plan.blocks)})"
-            if block.name not in self.journal.finished:
-                photos, points = len(block.scene.train), len(block.scene.points)
-                _LOG.info(f"{label}: {photos} photos, {points:,} points")
-                try:
-                    result = self._train_block(block, metrics[0] if metrics else None)
-                except HyrfError as error:
-                    kept = f"finished blocks are kept, {resuming(self.overwrite)} continues"
-                    raise error.with_text(f"{label}: {error.problem}", f"{error.fix}; {kept}") from error
+        """Train blocks until all are finished, and merge them in the main process."""
+        steps = 0
+        while waiting := [block for block in self.plan.blocks if not self.journal.is_finished(block.name)]:
+            trained = False
+            for block in waiting:
+                with self._claim(block) as is_mine:
+                    config = self._block_config(block) if is_mine else None
+                    if config is None or self.journal.is_finished(block.name):
+                        continue
+                    result = self._train_block(block, config)
+                steps, trained = steps + result.step, True
                 if not result.complete:
-                    done = sum(each["curve"][-1]["step"] for each in metrics)
-                    return TrainResult(False, done + result.step, None, {})
-                self.journal.finish(block.name)
-            metrics.append(self._read_metrics(block))
+                    return TrainResult(False, steps, None, {})
+            # Other processes are training what is left, or deciding its settings. If one of them ends, its claim ends.
+            if not trained:
+                if self.context.stop is not None and self.context.stop():
+                    return TrainResult(False, steps, None, {})
+                time.sleep(POLL_SECONDS)
+        if not self.ranks.is_main:
+            return TrainResult(True, steps, self.out / MODEL_FILE, {})
         with self.context.open_progress("blocks") as progress:
-            return self._merge(metrics, progress, overwrite=self.resume or self.overwrite)
+            return self._merge(progress, overwrite=self.resume or self.overwrite)
 
-    def _train_block(self, block: Block, first: dict | None) -> TrainResult:
-        """Train a block, or resume it if its training has begun.
-
-        Args:
-            block: the block.
-            first: metrics of the first block, whose pilot runs decide for all; None for that block itself.
-        """
+    @contextmanager
+    def _claim(self, block: Block) -> Iterator[bool]:
+        """Keep other processes from training a block while the `with` block runs; yield False if one is at it."""
+        if self.ranks.is_single:
+            yield True
+            return
         folder = self.journal.folder(block.name)
-        begun = block.name in self.journal.begun
-        if not begun:
-            self.journal.begin(block.name)
-        resumes = begun and is_run_begun(folder)
-        result = train_model(
-            block.scene,
-            folder,
-            self._block_config(block, first),
-            resume=resumes,
-            overwrite=not resumes,
-            observer=self.observer,
-            log=None if self.log is None else self.log.with_stem(f"{self.log.stem}-{block.name}"),
-            context=self.context,
-        )
-        if result.missing:
-            raise HyrfError(result.missing, fix="free space on the disk")
+        with ExitStack() as stack:
+            try:
+                stack.enter_context(exclusive_folder(folder.with_name(f"{folder.name}.lock")))
+            except HyrfBusyError:
+                yield False
+                return
+            yield True
+
+    def _train_block(self, block: Block, config: TrainConfig) -> TrainResult:
+        """Train a block, or resume it if its training has begun."""
+        number, photos, points = self.plan.blocks.index(block) + 1, len(block.scene.train), len(block.scene.points)
+        label = f"block {block.name} ({number} of {len(self.plan.blocks)})"
+        _LOG.info(f"{label}: {photos} photos, {points:,} points")
+        resumes = self.journal.is_begun(block.name)
+        is_silent = self.context.progress == "auto" and not self.context.is_shown
+        try:
+            result = train_model(
+                block.scene,
+                self.journal.folder(block.name),
+                config,
+                resume=resumes,
+                overwrite=not resumes,
+                observer=self.observer if self.ranks.is_main else None,
+                log=None if self.log is None else self.log.with_stem(f"{self.log.stem}-{block.name}"),
+                context=dataclasses.replace(
+                    self.context, ranks=None, progress=None if is_silent else self.context.progress
+                ),
+            )
+            if result.missing:
+                raise HyrfError(result.missing, fix="free space on the disk")
+        except HyrfError as error:
+            kept = f"finished blocks are kept, {resuming(self.overwrite)} continues"
+            raise error.with_text(f"{label}: {error.problem}", f"{error.fix}; {kept}") from error
         return result
 
-    def _block_config(self, block: Block, first: dict | None) -> TrainConfig:
-        """Return the settings of a block. A total budget is shared out by the points that photos of blocks show."""
-        config = self.config
+    def _block_config(self, block: Block) -> TrainConfig | None:
+        """Return the settings of a block; None if they are not decided yet.
+
+        A total budget is shared out by the points that photos of blocks show. The pilot runs of the first block decide
+        for all blocks.
+        """
+        config, first = self.config, self.plan.blocks[0]
         if config.max_gaussians is not None or config.target_bytes is not None:
             total, _ = budget_for(self.scene, config)
             budget = max(1, round(total * len(block.scene.points) / len(self.scene.points)))
             config = dataclasses.replace(config, max_gaussians=budget, target_bytes=None)
-        if first is not None:
-            config = dataclasses.replace(config, exposure=first["settings"]["exposure"])
-            if config.max_gaussians is None:
-                config = dataclasses.replace(config, budget_factor=first["settings"]["budget_factor"])
-        return config
+        if block is first or not (measures_exposure(first.scene, config) or measures_budget(first.scene, config)):
+            return config
+        if self.journal.is_finished(first.name):
+            settings = self._read_metrics(first)["settings"]
+            exposure, factor = settings["exposure"], settings["budget_factor"]
+        elif (checkpoint := self.journal.folder(first.name) / CHECKPOINT_FILE).is_file():
+            saved = saved_decisions(checkpoint)
+            exposure, factor = saved.exposure, saved.budget_factor
+        else:
+            return None
+        config = dataclasses.replace(config, exposure=exposure)
+        return config if config.max_gaussians is not None else dataclasses.replace(config, budget_factor=factor)
 
     def _read_metrics(self, block: Block) -> dict:
         """Read the metrics of a finished block."""
@@ -224,9 +277,10 @@ class _BlockRun:
             ) from error
         return metrics
 
-    def _merge(self, metrics: list[dict], progress: Progress, *, overwrite: bool) -> TrainResult:
+    def _merge(self, progress: Progress, *, overwrite: bool) -> TrainResult:
         """Merge the models of all blocks, score the result on the held-out photos, and write `metrics.json`."""
         progress(TaskEvent("merging blocks"))
+        metrics = [self._read_metrics(block) for block in self.plan.blocks]
         models = [self.journal.folder(block.name) / MODEL_FILE for block in self.plan.blocks]
         gains = [{name: np.array(gain) for name, gain in each["log_gains"].items()} for each in metrics]
         target = self.out / MODEL_FILE
@@ -264,7 +318,7 @@ class _BlockRun:
         return {
             "settings": self.config.to_dict(),
             "device": describe_device(self.device),
-            "processes": 1,
+            "processes": self.ranks.size,
             "scene": scene_facts(self.scene),
             "choices": {"blocks": f"{grid}: {len(self.plan.blocks)} blocks"},
             "notes": self.scene.notes,

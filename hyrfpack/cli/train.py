@@ -92,7 +92,7 @@ def train(
     photo, on its own GPU if there are GPUs. --steps counts photos, and --cache-mb is the total of a machine.
 
     With --blocks, scenes larger than the memory are trained in parts and written as one file. --steps are those of each
-    block, and --max-gaussians is the total.
+    block, and --max-gaussians is the total. Several processes then train one block each at a time.
 
     RUN gets model.hyrf, metrics.json, the training curve and renders of held-out views. Ctrl-C saves a checkpoint and
     exits with code 1; so do SIGTERM and closing the terminal. --resume then gives the same model as an uninterrupted
@@ -116,8 +116,6 @@ def train(
         raise click.UsageError(
             "--poses runs in one process only; run 'hyrfpack poses' first, then train from its folder"
         )
-    if blocks is not None and not ranks.is_single:
-        raise click.UsageError("--blocks trains in one process only; leave out --processes")
     from hyrfpack.blocks.journal import is_begun as is_block_run_begun
     from hyrfpack.blocks.run import train_blocks
     from hyrfpack.context import RunContext

@@ -165,7 +165,7 @@ class Ranks:
         Raises:
             HyrfError: another process has ended.
         """
-        if _watch is not None and _watch.lost is not None:
+        if not self.is_single and _watch is not None and _watch.lost is not None:
             raise self._lost_process_error(f"process {_watch.lost}")
 
     @contextmanager

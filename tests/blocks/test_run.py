@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import torch
 from commands import refused, succeeded
-from scenes import QUIET_CONTEXT, ball_scene, visible_points_by_photo
+from rank_tasks import BLOCK_CONFIG, block_scene
+from scenes import QUIET_CONTEXT
 
 from hyrfpack.blocks import train_blocks
 from hyrfpack.blocks.plan import plan_blocks
@@ -19,26 +20,13 @@ from hyrfpack.format import load_merged_model, load_model
 from hyrfpack.model.merged import world_positions
 from hyrfpack.progress import StepEvent
 from hyrfpack.render import render_view
-from hyrfpack.scene import Scene
-from hyrfpack.train import DensityConfig, TrainConfig, load_training_scene
-
-CONFIG = TrainConfig(
-    steps=12, seed=1, max_gaussians=150, exposure=True, preset="standard", checkpoint_every=1,
-    density=DensityConfig(start=0.1, rounds=3, gradient=1e-5),
-)  # fmt: skip
-
-
-def make_scene() -> Scene:
-    """Return a scene of ten training photos and two held-out photos, with tracks."""
-    scene = ball_scene(views=12, points=80, side=16)
-    tracks = visible_points_by_photo(scene, facing=0.2)
-    return dataclasses.replace(scene, train=scene.train[2:], test=scene.train[:2], tracks=tracks)
+from hyrfpack.train import load_training_scene
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     out = tmp_path_factory.mktemp("blocks") / "run"
-    return out, train_blocks(make_scene(), out, CONFIG, "2x1", context=QUIET_CONTEXT)
+    return out, train_blocks(block_scene(), out, BLOCK_CONFIG, "2x1", context=QUIET_CONTEXT)
 
 
 def test_a_run_in_blocks_leaves_one_model_with_a_part_for_each_block(finished):
@@ -56,7 +44,7 @@ def test_a_run_in_blocks_leaves_one_model_with_a_part_for_each_block(finished):
 
 def test_a_part_is_what_its_block_has_learnt_in_its_cells(finished):
     out, result = finished
-    plan = plan_blocks(make_scene(), 2, 1)
+    plan = plan_blocks(block_scene(), 2, 1)
     model = load_merged_model(result.model)
     parts = dict(zip(model.names, model.parts, strict=True))
     for block, facts in zip(plan.blocks, result.metrics["blocks"], strict=True):
@@ -71,7 +59,7 @@ def test_scores_are_those_of_the_merged_file(finished):
     _, result = finished
     model = load_merged_model(result.model)
     expected = {}
-    for view in make_scene().test:
+    for view in block_scene().test:
         with torch.no_grad():
             rgb = render_view(model, view.camera).rgb.double().numpy().clip(0, 1)
         expected[view.name] = -10 * np.log10(np.mean((rgb - view.load().composite()) ** 2))
@@ -96,11 +84,11 @@ def test_an_interrupted_run_resumes_to_the_same_bytes_and_keeps_finished_blocks(
             steps.append(event)
 
     interrupted = RunContext(progress=count, stop=lambda: len(steps) >= stop_at)
-    first = train_blocks(make_scene(), tmp_path / "run", CONFIG, "2x1", context=interrupted)
+    first = train_blocks(block_scene(), tmp_path / "run", BLOCK_CONFIG, "2x1", context=interrupted)
     assert not first.complete and first.step == stop_at and first.model is None
     steps.clear()
     resumed = RunContext(progress=count)
-    second = train_blocks(make_scene(), tmp_path / "run", CONFIG, "2x1", resume=True, context=resumed)
+    second = train_blocks(block_scene(), tmp_path / "run", BLOCK_CONFIG, "2x1", resume=True, context=resumed)
     assert len(steps) == 24 - stop_at
     assert second.model.read_bytes() == finished[1].model.read_bytes()
 
@@ -109,27 +97,27 @@ def test_a_finished_run_is_neither_replaced_nor_resumed_with_other_settings(fini
     out, result = finished
     before = result.model.read_bytes()
     with pytest.raises(HyrfError, match="holds an earlier run; `resume=True` continues it"):
-        train_blocks(make_scene(), out, CONFIG, "2x1", context=QUIET_CONTEXT)
-    other = dataclasses.replace(CONFIG, steps=13)
-    for config, blocks, named in ((other, "2x1", "steps"), (CONFIG, "1x1", "blocks")):
+        train_blocks(block_scene(), out, BLOCK_CONFIG, "2x1", context=QUIET_CONTEXT)
+    other = dataclasses.replace(BLOCK_CONFIG, steps=13)
+    for config, blocks, named in ((other, "2x1", "steps"), (BLOCK_CONFIG, "1x1", "blocks")):
         with pytest.raises(HyrfError, match=rf"started with other settings \({named}\)"):
-            train_blocks(make_scene(), out, config, blocks, resume=True, context=QUIET_CONTEXT)
-    fewer = dataclasses.replace(make_scene(), train=make_scene().train[1:])
+            train_blocks(block_scene(), out, config, blocks, resume=True, context=QUIET_CONTEXT)
+    fewer = dataclasses.replace(block_scene(), train=block_scene().train[1:])
     with pytest.raises(HyrfError, match="started with other photos"):
-        train_blocks(fewer, out, CONFIG, "2x1", resume=True, context=QUIET_CONTEXT)
+        train_blocks(fewer, out, BLOCK_CONFIG, "2x1", resume=True, context=QUIET_CONTEXT)
     assert result.model.read_bytes() == before
 
 
 def test_there_is_no_run_to_resume_in_an_empty_folder(tmp_path):
     with pytest.raises(HyrfError, match="no run in blocks to resume"):
-        train_blocks(make_scene(), tmp_path / "run", CONFIG, "2x1", resume=True, context=QUIET_CONTEXT)
+        train_blocks(block_scene(), tmp_path / "run", BLOCK_CONFIG, "2x1", resume=True, context=QUIET_CONTEXT)
 
 
 def test_an_error_names_the_block_and_says_how_to_continue(tmp_path):
     """Exposure compensation refuses transparent photos when the first block begins."""
-    scene = dataclasses.replace(make_scene(), has_alpha=True)
+    scene = dataclasses.replace(block_scene(), has_alpha=True)
     with pytest.raises(HyrfError, match=r"^block \d-1 \(1 of 2\): .*transparent.*kept.*`resume=True` continues"):
-        train_blocks(scene, tmp_path / "run", CONFIG, "2x1", context=QUIET_CONTEXT)
+        train_blocks(scene, tmp_path / "run", BLOCK_CONFIG, "2x1", context=QUIET_CONTEXT)
 
 
 def test_the_photos_of_a_block_are_not_taken_for_those_of_the_whole_set(finished):
