@@ -49,6 +49,7 @@ export class Player extends EventTarget {
     this.canvas = canvas;
     this.workerAddress = workerAddress;
     this.renderer = new Renderer(canvas);
+    this.renderer.prepare().catch(() => {}); // while the file loads; `install` reports errors
     this.loader = null; // the loader of the file that is drawn
     this.next = null; // the loader of the file that is being loaded
     this.previous = null; // the loader of the file before, in case the next one cannot be shown

@@ -12,6 +12,10 @@ const LOW_PASS_VARIANCE = 0.3; // px^2, as in hyrfpack render
 const ALPHA_MIN = 1 / 255; // splats are not drawn where their alpha is less, as in hyrfpack render
 const REDUCED_ALPHA_MIN = 1 / 72; // of a picture at a part of the resolution
 const ROWS_PER_COLUMN = 2; // a picture at a part of the resolution keeps this many times as many rows as columns
+const WARM_UP_VIEW = {
+  width: 1, height: 1, fx: 1, fy: 1, cx: 0.5, cy: 0.5,
+  rows: [[1, 0, 0], [0, 1, 0], [0, 0, 1]], eye: [0, 0, 0], translation: [0, 0, 0],
+};
 
 export class Renderer {
   // Throws an Error with a message for the user if the browser has no WebGL 2.
@@ -55,7 +59,21 @@ export class Renderer {
   // Finishes the programs. Throws an Error if the driver refuses them.
   prepare() {
     const { project, blend, resolve } = this;
-    return (this.ready ??= this.graphics.compiled({ project, blend, resolve }));
+    return (this.ready ??= this.graphics.compiled({ project, blend, resolve }).then(() => this.warmUp()));
+  }
+
+  // Draws a picture of one splat, because drivers finish programs only when they first draw.
+  warmUp() {
+    const { gl } = this, graphics = new Graphics(gl);
+    const [places, shapes, colors] = [gl.RGBA32UI, gl.RGBA32UI, gl.RG32UI].map((format) =>
+      graphics.texture(gl.TEXTURE_2D, format, 1, 1));
+    const content = { graphics, width: 1, height: 1, count: 1, antialiased: false, places, shapes, colors };
+    const picture = { width: 1, height: 1, rgba: new Uint8Array(4) };
+    this.show(this.stage(content, { kind: "hyrf", near: 0, tolerance: 0, solid: [0, 0, 0] }, picture));
+    this.sorted(new Uint32Array(1), 1);
+    this.draw(WARM_UP_VIEW, 1, {});
+    graphics.dispose();
+    Object.assign(this, { content: null, finished: false });
   }
 
   // Creates all objects for drawing a content (`Splats` or `Fields`), which `show` uses. They are freed with the
