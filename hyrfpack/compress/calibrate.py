@@ -25,7 +25,7 @@ from hyrfpack.model import HybridModel
 from hyrfpack.progress import Progress, TaskEvent, ignore_progress, part_of_progress, round_of_progress
 from hyrfpack.scene import Camera
 
-MAX_CORRECTION_ROUNDS = 5
+MAX_CORRECTION_ROUNDS = 3
 # Parts whose error is a smaller share of the distortion are not corrected.
 MIN_CORRECTED_ERROR_RATIO = 0.03
 
