@@ -70,7 +70,7 @@ def open_journal(
             one without `overwrite`.
     """
     path = out / BLOCKS_FOLDER / JOURNAL_FILE
-    photos = {block.name: names_and_sizes(block.scene.train) for block in plan.blocks}
+    photos = {block.name: names_and_sizes(block.photos) for block in plan.blocks}
     new = Journal(path, json.loads(json.dumps({"blocks": blocks, **config.to_dict()})), photos)
     if resume:
         found = _read_journal(path)

@@ -26,12 +26,33 @@ class Block:
     Attributes:
         name: name of its first cell.
         cells: its cells, ascending; more than one if others were merged into it.
-        scene: the photos that show it, none of them held out, and the points that these photos show.
+        photos: the photos that show it.
+        used: (P,) bool, which points of the whole scene it starts from.
     """
 
     name: str
     cells: tuple[int, ...]
-    scene: Scene
+    photos: list[View]
+    used: np.ndarray
+
+    @property
+    def point_count(self) -> int:
+        """Return the number of points that it starts from."""
+        return int(self.used.sum())
+
+    def cut(self, scene: Scene) -> Scene:
+        """Return the photos of the block, none of them held out, and its points, of the whole scene."""
+        new_row = np.cumsum(self.used) - 1
+        rows_by_name = {view.name: scene.tracks[view.name] for view in self.photos if view.name in scene.tracks}
+        return replace(
+            scene,
+            train=self.photos,
+            test=[],
+            points=scene.points[self.used],
+            point_colors=scene.point_colors[self.used],
+            tracks={name: new_row[rows[self.used[rows]]] for name, rows in rows_by_name.items()},
+            reading={},
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,8 +123,8 @@ def plan_blocks(scene: Scene, columns: int, rows: int) -> BlockPlan:
         used = np.isin(core, group)
         for photo in chosen:
             used[seen[photo]] = True
-        blocks.append(Block(cells.name(group[0]), tuple(group), _subset(scene, [photos[n] for n in chosen], used)))
-    return BlockPlan(cells, sorted(blocks, key=lambda block: (-len(block.scene.train), block.cells)))
+        blocks.append(Block(cells.name(group[0]), tuple(group), [photos[n] for n in chosen], used))
+    return BlockPlan(cells, sorted(blocks, key=lambda block: (-len(block.photos), block.cells)))
 
 
 def visible_rows(scene: Scene, view: View) -> np.ndarray:
@@ -155,22 +176,3 @@ def _center(cells: Cells, ground: np.ndarray, core: np.ndarray, group: Sequence[
     column, row = divmod(group[0], cells.row_borders.shape[1] - 1)
     borders = cells.column_borders[column : column + 2], cells.row_borders[column, row : row + 2]
     return np.array([inner[np.isfinite(inner)].mean() if np.isfinite(inner).any() else 0.0 for inner in borders])
-
-
-def _subset(scene: Scene, photos: list[View], used: np.ndarray) -> Scene:
-    """Return a scene of some photos, none of them held out, and the points where `used` (P,) is True."""
-    new_row = np.cumsum(used) - 1
-    tracks = {}
-    for view in photos:
-        rows = scene.tracks.get(view.name)
-        if rows is not None:
-            tracks[view.name] = new_row[rows[used[rows]]]
-    return replace(
-        scene,
-        train=photos,
-        test=[],
-        points=scene.points[used],
-        point_colors=scene.point_colors[used],
-        tracks=tracks,
-        reading={},
-    )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import gc
 import json
 import logging
 import math
@@ -214,14 +215,13 @@ class _BlockRun:
 
     def _train_block(self, block: Block, config: TrainConfig) -> TrainResult:
         """Train a block, or resume it if its training has begun."""
-        number, photos, points = self.plan.blocks.index(block) + 1, len(block.scene.train), len(block.scene.points)
-        label = f"block {block.name} ({number} of {len(self.plan.blocks)})"
-        _LOG.info(f"{label}: {photos} photos, {points:,} points")
+        label = f"block {block.name} ({self.plan.blocks.index(block) + 1} of {len(self.plan.blocks)})"
+        _LOG.info(f"{label}: {len(block.photos)} photos, {block.point_count:,} points")
         resumes = self.journal.is_begun(block.name)
         is_silent = self.context.progress == "auto" and not self.context.is_shown
         try:
             result = train_model(
-                block.scene,
+                block.cut(self.scene),
                 self.journal.folder(block.name),
                 config,
                 resume=resumes,
@@ -237,6 +237,7 @@ class _BlockRun:
         except HyrfError as error:
             kept = f"finished blocks are kept, {resuming(self.overwrite)} continues"
             raise error.with_text(f"{label}: {error.problem}", f"{error.fix}; {kept}") from error
+        gc.collect()  # Reference cycles would keep the trainer and its model while the next block is trained.
         return result
 
     def _block_config(self, block: Block) -> TrainConfig | None:
@@ -248,9 +249,10 @@ class _BlockRun:
         config, first = self.config, self.plan.blocks[0]
         if config.max_gaussians is not None or config.target_bytes is not None:
             total, _ = budget_for(self.scene, config)
-            budget = max(1, round(total * len(block.scene.points) / len(self.scene.points)))
+            budget = max(1, round(total * block.point_count / len(self.scene.points)))
             config = dataclasses.replace(config, max_gaussians=budget, target_bytes=None)
-        if block is first or not (measures_exposure(first.scene, config) or measures_budget(first.scene, config)):
+        scene = first.cut(self.scene)
+        if block is first or not (measures_exposure(scene, config) or measures_budget(scene, config)):
             return config
         if self.journal.is_finished(first.name):
             settings = self._read_metrics(first)["settings"]
@@ -332,8 +334,8 @@ class _BlockRun:
                 {
                     "name": block.name,
                     "folder": f"{BLOCKS_FOLDER}/{block.name}",
-                    "photos": len(block.scene.train),
-                    "points": len(block.scene.points),
+                    "photos": len(block.photos),
+                    "points": block.point_count,
                     "gaussians": each["gaussians"],
                     "kept": count,
                     "seconds": each["seconds"],

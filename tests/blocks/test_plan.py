@@ -62,13 +62,14 @@ def test_cores_tile_space_and_every_photo_and_point_is_in_a_block(scene, grid, s
     anywhere = np.random.default_rng(seed).normal(size=(50, 3)) * 10.0 ** np.arange(-1, 4).repeat(10)[:, None]
     for places in (anywhere, scene.points):
         assert (sum(plan.core_mask(block, places).astype(int) for block in plan.blocks) == 1).all()
-    assert {view.name for block in plan.blocks for view in block.scene.train} == {view.name for view in scene.train}
+    assert {view.name for block in plan.blocks for view in block.photos} == {view.name for view in scene.train}
     for block in plan.blocks:
-        held = {tuple(point) for point in block.scene.points.tolist()}
+        cut = block.cut(scene)
+        held = {tuple(point) for point in cut.points.tolist()}
         assert {tuple(point) for point in scene.points[plan.core_mask(block, scene.points)].tolist()} <= held
-        assert len(block.scene.train) >= MIN_BLOCK_PHOTOS and not block.scene.test
-        for view in block.scene.train:
-            seen, kept = scene.points[visible_rows(scene, view)], block.scene.points[visible_rows(block.scene, view)]
+        assert len(cut.train) >= MIN_BLOCK_PHOTOS and not cut.test
+        for view in cut.train:
+            seen, kept = scene.points[visible_rows(scene, view)], cut.points[visible_rows(cut, view)]
             assert np.array_equal(seen, kept)
     assert sorted(cell for block in plan.blocks for cell in block.cells) == list(range(plan.cells.count))
 
@@ -78,11 +79,10 @@ def test_cores_tile_space_and_every_photo_and_point_is_in_a_block(scene, grid, s
 def test_a_plan_is_deterministic_and_puts_the_largest_block_first(scene, grid):
     plans = [plan_blocks(scene, *grid) for _ in range(2)]
     first, second = (
-        [(block.name, block.cells, block.scene.train, block.scene.points.tolist()) for block in plan.blocks]
-        for plan in plans
+        [(block.name, block.cells, block.photos, block.used.tolist()) for block in plan.blocks] for plan in plans
     )
     assert first == second
-    sizes = [len(block.scene.train) for block in plans[0].blocks]
+    sizes = [len(block.photos) for block in plans[0].blocks]
     assert sizes == sorted(sizes, reverse=True)
 
 
@@ -105,7 +105,7 @@ def test_a_photo_belongs_to_each_block_that_holds_a_tenth_of_what_it_shows():
     for view in scene.train:
         seen = scene.points[scene.tracks[view.name]]
         for block in plan.blocks:
-            is_member = view in block.scene.train
+            is_member = view in block.photos
             assert is_member or plan.core_mask(block, seen).mean() < MIN_PHOTO_SHARE
             missed += not is_member
     assert missed > 30  # of 160 pairs, so that the claim is not true of all
