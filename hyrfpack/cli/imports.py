@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 @click.command("import", short_help="Distil splats of another program to a small model.")
 @click.argument("source", type=PATH)
 @click.option("-o", "--output", type=OUTPUT, required=True, metavar="FILE", help="The .hyrf file to write.")
-@settings_options(DistillConfig, "steps", "psnr", "size")
+@settings_options(DistillConfig, "steps", "psnr", "worst", "target_bytes", "size")
 @click.option(
     "--cameras",
     type=PATH,
@@ -61,6 +61,7 @@ def import_(
     Examples:
       hyrfpack import scene.ply -o scene.hyrf
       hyrfpack import scene.spz -o scene.hyrf --psnr 45
+      hyrfpack import scene.spz -o scene.hyrf --target-size 2MB
       hyrfpack import room.ply -o room.hyrf --cameras photos/room --size 800
     """
     folder = source.parent if source.name == "meta.json" else source  # a SOG may be a folder that holds meta.json

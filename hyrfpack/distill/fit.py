@@ -41,7 +41,7 @@ class DistillReport:
         psnr: mean PSNR over these views of the decoded file's renders against the original's, over black; dB.
         psnr_worst: PSNR of the worst view; dB.
         psnr_unpacked: mean PSNR of the model before compression; dB.
-        psnr_asked: the target PSNR of `DistillConfig`.
+        psnr_asked: the target PSNR of `DistillConfig`; None with a target size.
         bytes_source: size of the original file; None if the splats did not come from a file.
         bytes_ply: size of the original as PLY in INRIA's layout, without the header: 4 (17 + 3 (K - 1)) bytes for each
             Gaussian with K harmonics.
@@ -57,7 +57,7 @@ class DistillReport:
     psnr: float
     psnr_worst: float
     psnr_unpacked: float
-    psnr_asked: float
+    psnr_asked: float | None
     bytes_source: int | None
     bytes_ply: int
     bytes_after: int
@@ -85,6 +85,7 @@ def import_splats(
 
     Raises:
         HyrfDataError: the source cannot be read, or no view shows any of its Gaussians.
+        HyrfSizeError: no file is as small as `config.target_bytes`.
         HyrfError: the target cannot be written.
         TypeError: the settings or a camera have the wrong type.
 
@@ -135,6 +136,7 @@ def distill_splats(
 
     Raises:
         HyrfDataError: no view shows any of the splats.
+        HyrfSizeError: no file is as small as `config.target_bytes`.
         HyrfError: the file cannot be written, or the device does not exist.
     """
     started = time.perf_counter()
@@ -154,7 +156,8 @@ def distill_splats(
         imported = f"{len(splats):,} Gaussians of degree {splats.degree} from {Path(name).name}, without photos"
         choices = {"imported": imported}
         provenance = {"steps": config.steps, "seed": config.seed, "psnr": unpacked_psnr, "choices": choices}
-        data = pack(distilled, config.psnr, provenance, part_of_progress(progress, 0.7, 0.97))
+        packing = part_of_progress(progress, 0.7, 0.97)
+        data = pack(distilled, config.psnr, provenance, packing, worst=config.worst, target_bytes=config.target_bytes)
         progress(TaskEvent("scoring the file", 0.97))
         # The file is written after all else that an interrupt may end, so that an earlier file is kept.
         written = write_atomic(target, data, overwrite=overwrite)
@@ -162,8 +165,13 @@ def distill_splats(
         decoded.precision = distilled.model.precision
         scores = distilled.test.psnr_per_view(decoded)
     reached_psnr = float(np.mean(scores))
-    if _falls_short(reached_psnr, config.psnr):
+    if config.target_bytes is None and _falls_short(reached_psnr, config.psnr):
         _LOG.warning(_shortfall(reached_psnr, unpacked_psnr, config, viewpoints_are_sampled=cameras is None))
+    if config.worst is not None and _falls_short(min(scores), config.worst):
+        _LOG.warning(
+            f"the worst view is to have {config.worst:g} dB, but the worst of the held-out ones has {min(scores):.1f} "
+            "dB; set a higher `worst`"
+        )
     return DistillReport(
         gaussians_before=len(splats),
         gaussians_after=len(decoded),
@@ -172,7 +180,7 @@ def distill_splats(
         psnr=reached_psnr,
         psnr_worst=min(scores),
         psnr_unpacked=unpacked_psnr,
-        psnr_asked=config.psnr,
+        psnr_asked=config.psnr if config.target_bytes is None else None,
         bytes_source=None,
         bytes_ply=4 * len(splats) * (17 + 3 * (splats.harmonics.shape[1] - 1)),
         bytes_after=len(data),
@@ -198,9 +206,7 @@ def _shortfall(
         return f"{outcome}; set a higher target with `psnr`"
     where = ", or give the viewpoints that matter with `cameras`" if viewpoints_are_sampled else ""
     if config.has_residuals:
-        return (
-            f"{outcome}; the model has the largest opacities and smallest scales of all models, so set a lower `psnr`"
-        )
+        return f"{outcome}; models have a largest opacity and a smallest scale, so set a lower `psnr`"
     return (
         f"{outcome}; train longer, for example with `steps={max(DistillConfig.steps, 2 * config.steps)}`, or store "
         f"corrections of single Gaussians, which take the place of training, with `psnr={RESIDUALS_MIN_PSNR:g}`{where}"

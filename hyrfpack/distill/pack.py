@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -11,18 +12,14 @@ from scipy.optimize import brentq
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.compress.calibrate import calibrate, measure_calibrated_sensitivity
 from hyrfpack.compress.field_codes import quantize_fields
+from hyrfpack.compress.limits import EncodedCandidate
 from hyrfpack.compress.packer import Packer
 from hyrfpack.compress.reference_renders import ReferenceRenders
 from hyrfpack.compress.sensitivity import measure_sensitivity
 from hyrfpack.distill.distillation import DistilledModel
 from hyrfpack.distill.residuals import exact_model
-from hyrfpack.progress import (
-    Progress,
-    TaskEvent,
-    ignore_progress,
-    part_of_progress,
-    round_of_progress,
-)
+from hyrfpack.errors import HyrfSizeError
+from hyrfpack.progress import Progress, TaskEvent, ignore_progress, part_of_progress, round_of_progress
 
 _LOG = logging.getLogger(__name__)
 
@@ -32,7 +29,14 @@ PLANNED_ERROR_SHARE = 0.8
 # this share of the model's error, and this share of the allowed error.
 FALLBACK_MODEL_ERROR_SHARE = 0.25
 FALLBACK_ALLOWED_ERROR_SHARE = 0.5
-MAX_TRIALS = 5
+# The search ends with a file whose error is at least this share of the allowed one, and aims at the second share.
+ACCEPTED_ERROR_RATIO = 0.85
+AIMED_ERROR_RATIO = 0.93
+MIN_ERROR_RATIO = 1e-3  # Smaller ratios, also negative ones, are noise.
+# Of log error ratio / log distortion. It is below 1 if few views have most of the error.
+MIN_LOG_SLOPE = 0.4
+MAX_LOG_STEP = np.log(16)
+MAX_TRIALS = 6
 # With residuals, fields are quantised as if they alone might add this error, in dB; residuals correct it.
 FIELD_PSNR = 28.0
 
@@ -42,17 +46,25 @@ def pack(
     psnr: float,
     provenance: dict,
     progress: Progress = ignore_progress,
+    *,
+    worst: float | None = None,
+    target_bytes: int | None = None,
 ) -> bytes:
-    """Encode the smallest file that reaches a target PSNR on the validation views.
+    """Encode the smallest file that reaches target PSNRs on the validation views, or the best one within a size.
 
     Args:
         distilled: the model, and reference renders of the original.
-        psnr: target PSNR in dB against the reference renders.
+        psnr: target PSNR in dB against the reference renders, mean over views.
         provenance: provenance to store in the file; the viewpoint is added to it.
         progress: called with `TaskEvent`s.
+        worst: target PSNR in dB of the worst view, if any.
+        target_bytes: size to fill in place of reaching a PSNR.
 
     Returns:
         The bytes of the file.
+
+    Raises:
+        HyrfSizeError: no file is as small as `target_bytes`.
 
     Example:
         >>> from hyrfpack.distill import DistillConfig
@@ -69,33 +81,83 @@ def pack(
     allowance = max(allowed - error, min(FALLBACK_MODEL_ERROR_SHARE * error, FALLBACK_ALLOWED_ERROR_SHARE * allowed))
     _LOG.info(f"measuring how each stored number affects renders, at {len(distilled.train)} cameras and between them")
     distortion = PLANNED_ERROR_SHARE * solve_added_error(_mse(psnrs), error + allowance)
-    measuring, field_codes = part_of_progress(progress, 0.0, 0.7), None
+    packer = _make_packer(distilled, distortion, provenance, part_of_progress(progress, 0.0, 0.7))
+    if target_bytes is not None:
+        packer.progress = part_of_progress(progress, 0.7, 1.0)
+        try:
+            return packer.encode_within_bytes(target_bytes, distortion)[0].data
+        except HyrfSizeError as error:
+            raise HyrfSizeError(error.problem, "use a larger target size", error.min_bytes) from error
+
+    def error_ratio(candidate: EncodedCandidate) -> float:
+        """Return the larger ratio of an error to its limit: that of the mean, or that of the worst view."""
+        scores = distilled.validation.psnr_per_view(packer.decode(candidate))
+        ratio = (_mse(np.mean(scores)) - error) / allowance
+        return ratio if worst is None else max(ratio, _mse(min(scores)) / _mse(worst))
+
+    return _search(packer, distortion, error_ratio, part_of_progress(progress, 0.7, 1.0)).data
+
+
+def _make_packer(distilled: DistilledModel, distortion: float, provenance: dict, progress: Progress) -> Packer:
+    """Measure the sensitivities of a model, and quantise the fields of one that has residuals.
+
+    Args:
+        distilled: the model.
+        distortion: mean squared error for which sensitivities are calibrated.
+        provenance: as in `pack`.
+        progress: called with `TaskEvent`s.
+    """
+    model, train = distilled.model, distilled.train
+    provenance = {**provenance, "viewpoint": Viewpoint.from_cameras(train).to_json()}
     if distilled.exact is None:
-        sensitivity, references = measure_calibrated_sensitivity(model, distilled.train, distortion, progress=measuring)
-    else:
-        sensitivity = measure_sensitivity(model, distilled.train, progress=part_of_progress(measuring, 0.0, 0.5))
-        model, field_codes = quantize_fields(model, sensitivity, _mse(FIELD_PSNR))
-        model = exact_model(model, distilled.exact)
-        references = ReferenceRenders.from_model(model, distilled.train)
-        rest = part_of_progress(measuring, 0.55, 1.0)
-        sensitivity = calibrate(model, sensitivity, references, distortion, progress=rest, field_codes=field_codes)
-    provenance = {**provenance, "viewpoint": Viewpoint.from_cameras(distilled.train).to_json()}
-    encoding = part_of_progress(progress, 0.7, 0.85)
-    packer = Packer(model, provenance, sensitivity, progress=encoding, field_codes=field_codes)
-    candidate = packer.encode_to_distortion(distortion, references)
+        sensitivity, _ = measure_calibrated_sensitivity(model, train, distortion, progress=progress)
+        return Packer(model, provenance, sensitivity)
+    sensitivity = measure_sensitivity(model, train, progress=part_of_progress(progress, 0.0, 0.5))
+    model, codes = quantize_fields(model, sensitivity, _mse(FIELD_PSNR))
+    model = exact_model(model, distilled.exact)
+    references, rest = ReferenceRenders.from_model(model, train), part_of_progress(progress, 0.55, 1.0)
+    sensitivity = calibrate(model, sensitivity, references, distortion, progress=rest, field_codes=codes)
+    return Packer(model, provenance, sensitivity, field_codes=codes)
+
+
+def _search(
+    packer: Packer, distortion: float, error_ratio: Callable[[EncodedCandidate], float], progress: Progress
+) -> EncodedCandidate:
+    """Search for the smallest file whose error ratio is at most 1; without one, return that of the smallest error.
+
+    The next distortion is found by interpolation of the logarithms of the last two error ratios.
+
+    Args:
+        packer: encodes the files.
+        distortion: of the first file.
+        error_ratio: measures a file.
+        progress: called with `TaskEvent`s.
+    """
+    trials: list[tuple[float, float, EncodedCandidate]] = []
     for number in range(MAX_TRIALS):
-        trial_progress = round_of_progress(part_of_progress(progress, 0.85, 1.0), number)
-        trial_progress(TaskEvent("comparing renders of the file with those of the original", 0.0))
-        added_error = _mse(np.mean(distilled.validation.psnr_per_view(packer.decode(candidate)))) - error
-        if added_error <= allowance:
+        trial_progress = round_of_progress(progress, number)
+        candidate = packer.encode(distortion, part_of_progress(trial_progress, 0.0, 0.5))
+        trial_progress(TaskEvent("comparing renders of the file with those of the original", 0.5))
+        ratio = error_ratio(candidate)
+        _LOG.info(f"distortion {distortion:.2g}: {len(candidate.data):,} bytes, {ratio:.2f} of the allowed error")
+        trials.append((distortion, max(ratio, MIN_ERROR_RATIO), candidate))
+        if ACCEPTED_ERROR_RATIO <= ratio <= 1:
             break
-        distortion *= max(PLANNED_ERROR_SHARE * allowance / added_error, 1 / 16)
-        _LOG.info(
-            f"packing adds a mean squared error of {added_error:.2g}, limit {allowance:.2g}; encoding again at "
-            f"distortion {distortion:.2g}"
-        )
-        candidate = packer.encode(distortion, part_of_progress(trial_progress, 0.5, 1.0))
-    return candidate.data
+        distortion = _next_distortion([(d, r) for d, r, _ in trials[-2:]])
+    fitting = [candidate for _, ratio, candidate in trials if ratio <= 1]
+    return min(fitting, key=lambda one: len(one.data)) if fitting else min(trials, key=lambda trial: trial[1])[2]
+
+
+def _next_distortion(measured: list[tuple[float, float]]) -> float:
+    """Return the distortion at which the error ratio is expected to be AIMED_ERROR_RATIO.
+
+    Args:
+        measured: one or two pairs of a distortion and its error ratio, the last one last.
+    """
+    (first, first_ratio), (last, last_ratio) = (np.log(pair) for pair in (measured[0], measured[-1]))
+    slope = (last_ratio - first_ratio) / (last - first) if last != first else 1.0
+    step = (np.log(AIMED_ERROR_RATIO) - last_ratio) / min(max(slope, MIN_LOG_SLOPE), 1 / MIN_LOG_SLOPE)
+    return float(np.exp(last + np.clip(step, -MAX_LOG_STEP, MAX_LOG_STEP)))
 
 
 def solve_added_error(errors: np.ndarray, mean: float) -> float:

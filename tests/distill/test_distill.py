@@ -163,7 +163,7 @@ def test_repeated_packing_attempts_measure_and_draw_only_once(tmp_path: Path, mo
 
     distill_splats(ball_splats(60), tmp_path / "x.hyrf", replace(TINY_DISTILL_CONFIG, steps=12))
 
-    assert len(tried) > 2 and len(measured) == 1
+    assert len(tried) > 1 and len(measured) == 1
     assert len({noise for _, noise, *_ in tried}) == len(tried)
     assert len(drawn) == TINY_DISTILL_CONFIG.train_views
 
@@ -185,7 +185,7 @@ def test_a_short_import_uses_fewer_viewpoints_and_regression_steps(
     assert less < whole == 1
 
 
-def _interrupt(*args):
+def _interrupt(*args, **settings):
     raise KeyboardInterrupt
 
 
@@ -216,7 +216,15 @@ def test_a_target_missed_only_by_packing_advises_psnr_and_not_steps() -> None:
 def test_settings_out_of_range_are_rejected() -> None:
     for wrong in (
         *({"steps": 0}, {"steps": 2.5}, {"size": 0}, {"train_views": True}, {"test_views": "3"}),
-        *({"psnr": float("nan")}, {"psnr": 61}, {"psnr": "high"}, {"seed": -1}, {"seed": 2**64}),
+        *(
+            {"psnr": float("nan")},
+            {"psnr": 61},
+            {"worst": 61},
+            {"target_bytes": 0},
+            {"psnr": "high"},
+            {"seed": -1},
+            {"seed": 2**64},
+        ),
     ):
         with pytest.raises(ValueError, match=next(iter(wrong))):
             DistillConfig(**wrong)
