@@ -334,12 +334,14 @@ export class Fields {
       changed();
       [shownAt, pause] = [performance.now(), 2 * pause];
     };
-    const { rows, done } = await this.coloured(view, margin, { goOn, report, exact });
+    let { rows, done } = await this.coloured(view, margin, { goOn, report, exact });
+    if (done && this.panorama) { // a frame is drawn only afterwards, because showing it would wait for this work
+      if (!this.sky) await this.prepareSky();
+      this.sky.begin(view, blend);
+      done = await this.sky.complete({ goOn, changed });
+    }
     if (rows) changed();
-    if (!done || !this.panorama) return done;
-    if (!this.sky) await this.prepareSky();
-    this.sky.begin(view, blend);
-    return this.sky.complete({ goOn, changed });
+    return done;
   }
 
   // Evaluates, while `goOn()` is true, what other views will need: the panorama, and colours of rows out of view.

@@ -361,10 +361,12 @@ export class Player extends EventTarget {
     return this.moving && this.automatic ? Math.max(MIN_SCALE, this.resolution * this.coarse) : this.resolution;
   }
 
-  // Returns whether there is no picture yet or, on slow devices, only since a moment.
+  // Returns whether there is no picture yet or, on slow devices, only since a moment, or one whose fields are being
+  // prepared: that asks the device many questions, which would block the page while a large frame is drawn.
   get isNew() {
-    const { first } = this.times;
-    return first === null || (!this.quick && performance.now() < first + FIRST_PICTURE_REST_MS);
+    const { times: { first }, renderer: { content } } = this;
+    if (first === null) return true;
+    return !this.quick && (performance.now() < first + FIRST_PICTURE_REST_MS || content.isReady === false);
   }
 
   // Returns whether a mover moves the eye.
