@@ -75,7 +75,7 @@ def train_blocks(
     The ground is divided into cells. Each block trains on all photos that show its cell, as a run of its own in
     `blocks/`, and keeps the Gaussians in its cell. Blocks train one after the other, or side by side in several
     processes. The folder gets `model.hyrf` (a merged file of profile raw, a part for each block), `metrics.json` and
-    `views/`, as by `train_model`. The memory of a process is bounded by the largest block.
+    `views/`, as by `train_model`. A process trains one block at a time.
 
     Args:
         scene: the scene, from `hyrfpack.load_scene`.

@@ -91,7 +91,7 @@ def train(
     With --processes, torchrun or srun, several processes train together. In each step, each process renders a different
     photo, on its own GPU if there are GPUs. --steps counts photos, and --cache-mb is the total of a machine.
 
-    With --blocks, scenes larger than the memory are trained in parts and written as one file. --steps are those of each
+    With --blocks, large scenes are trained in parts and written as one file. --steps are those of each
     block, and --max-gaussians is the total. Several processes then train one block each at a time.
 
     RUN gets model.hyrf, metrics.json, the training curve and renders of held-out views. Ctrl-C saves a checkpoint and
