@@ -51,9 +51,8 @@ _LOG = logging.getLogger(__name__)
 
 # `auto` gives each block at most so many photos and bytes.
 MAX_BLOCK_PHOTOS = 500
-BYTES_PER_GAUSSIAN = (
-    2_500  # of the budget, at the peak of training: 1,260 for each, of which there are up to twice as many
-)
+# Of the budget, at the peak of training: 1,260 for each Gaussian, of which there are up to twice as many.
+BYTES_PER_GAUSSIAN = 2_500
 POLL_SECONDS = 1.0  # A process without a block looks for one this often.
 MAX_MEMORY_SHARE = 0.5  # of the device; photos and one view's pixels take the rest
 
@@ -111,9 +110,11 @@ def train_blocks(
     device = context.choose_device()
     if config.preset == "auto":
         config = dataclasses.replace(config, preset=detect_preset(scene)[0])
-    columns, rows = _choose_grid(scene, config, device) if blocks == "auto" else parse_grid(blocks)
-    plan = plan_blocks(scene, columns, rows)
     ranks = context.ranks or SINGLE_PROCESS
+    # Machines may differ in their memory, but all processes need the same grid.
+    is_auto = blocks == "auto"
+    columns, rows = ranks.broadcast(choose_grid(scene, config, device, ranks)) if is_auto else parse_grid(blocks)
+    plan = plan_blocks(scene, columns, rows)
     # This check ignores existing results. It runs first, so that no folder is created where nothing may be written.
     ranks.run_on_all(lambda: check_outputs(out, scene, overwrite=True) if ranks.is_main else None)
     with exclusive_folder(out, ranks=ranks):
@@ -124,7 +125,7 @@ def train_blocks(
             journal = open_journal(out, f"{columns}x{rows}", plan, config, resume=resume, overwrite=overwrite)
             if ranks.is_main:
                 check_outputs(out, scene, overwrite=resume or overwrite)
-                with context.open_progress("blocks") as progress:
+                with context.open_progress("blocks", interruptible=False) as progress:
                     check_photos(scene, cache, progress)
             return journal
 
@@ -146,15 +147,24 @@ def train_blocks(
         ).execute()
 
 
-def _choose_grid(scene: Scene, config: TrainConfig, device: torch.device) -> tuple[int, int]:
-    """Return columns and rows of about square cells, as many as memory and photos ask for."""
-    memory = torch.cuda.get_device_properties(device).total_memory if device.type == "cuda" else memory_bytes()
+def choose_grid(scene: Scene, config: TrainConfig, device: torch.device, ranks: Ranks) -> tuple[int, int]:
+    """Return columns and rows of about square cells, at least as many as memory and photos ask for.
+
+    A cell has at least MIN_BLOCK_PHOTOS photos in the mean, and there are at most MAX_PARTS.
+    """
+    if device.type == "cuda":
+        memory = torch.cuda.get_device_properties(device).total_memory
+    else:
+        memory = memory_bytes() // ranks.local_size
     budget, _ = budget_for(scene, config)
     needed = max(budget * BYTES_PER_GAUSSIAN / (MAX_MEMORY_SHARE * memory), len(scene.train) / MAX_BLOCK_PHOTOS)
-    count = max(1, min(math.ceil(needed), MAX_PARTS, len(scene.train) // MIN_BLOCK_PHOTOS))
+    most = max(1, min(MAX_PARTS, len(scene.train) // MIN_BLOCK_PHOTOS))
+    count = max(1, min(math.ceil(needed), most))
     along, across = ground_extent(scene, ground_axes(scene)).tolist()
     rows = min(count, max(1, round(math.sqrt(count * across / along)))) if along > 0 else 1
-    return max(1, count // rows), rows
+    while rows * math.ceil(count / rows) > most:
+        rows -= 1
+    return math.ceil(count / rows), rows
 
 
 @dataclasses.dataclass(frozen=True)
@@ -195,7 +205,7 @@ class _BlockRun:
                 time.sleep(POLL_SECONDS)
         if not self.ranks.is_main:
             return TrainResult(True, steps, self.out / MODEL_FILE, {})
-        with self.context.open_progress("blocks") as progress:
+        with self.context.open_progress("blocks", interruptible=False) as progress:
             return self._merge(progress, overwrite=self.resume or self.overwrite)
 
     @contextmanager
@@ -251,8 +261,10 @@ class _BlockRun:
             total, _ = budget_for(self.scene, config)
             budget = max(1, round(total * block.point_count / len(self.scene.points)))
             config = dataclasses.replace(config, max_gaussians=budget, target_bytes=None)
+        if block is first:
+            return config
         scene = first.cut(self.scene)
-        if block is first or not (measures_exposure(scene, config) or measures_budget(scene, config)):
+        if not (measures_exposure(scene, config) or measures_budget(scene, config)):
             return config
         if self.journal.is_finished(first.name):
             settings = self._read_metrics(first)["settings"]
@@ -270,7 +282,7 @@ class _BlockRun:
         path = self.journal.folder(block.name) / METRICS_FILE
         try:
             metrics = json.loads(path.read_bytes())
-            if not {"settings", "curve", "seconds", "gaussians", "log_gains"} <= metrics.keys():
+            if not {"settings", "curve", "seconds", "stage_seconds", "gaussians", "log_gains"} <= metrics.keys():
                 raise ValueError
         except (OSError, ValueError, AttributeError) as error:
             raise HyrfError(

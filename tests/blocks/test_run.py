@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -13,11 +14,15 @@ from rank_tasks import BLOCK_CONFIG, block_scene
 from scenes import QUIET_CONTEXT
 
 from hyrfpack.blocks import train_blocks
-from hyrfpack.blocks.plan import plan_blocks
+from hyrfpack.blocks.journal import is_begun
+from hyrfpack.blocks.plan import MIN_BLOCK_PHOTOS, plan_blocks
+from hyrfpack.blocks.run import BYTES_PER_GAUSSIAN, choose_grid
 from hyrfpack.context import RunContext
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import load_merged_model, load_model
+from hyrfpack.format.sections import MAX_PARTS
 from hyrfpack.model.merged import world_positions
+from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.progress import StepEvent
 from hyrfpack.render import render_view
 from hyrfpack.train import load_training_scene
@@ -120,9 +125,50 @@ def test_an_error_names_the_block_and_says_how_to_continue(tmp_path):
         train_blocks(scene, tmp_path / "run", BLOCK_CONFIG, "2x1", context=QUIET_CONTEXT)
 
 
+def test_a_stop_before_the_first_step_can_be_resumed(finished, tmp_path):
+    stopped = RunContext(progress=None, stop=lambda: True)
+    first = train_blocks(block_scene(), tmp_path / "run", BLOCK_CONFIG, "2x1", context=stopped)
+    assert not first.complete and is_begun(tmp_path / "run")
+    second = train_blocks(block_scene(), tmp_path / "run", BLOCK_CONFIG, "2x1", resume=True, context=QUIET_CONTEXT)
+    assert second.model.read_bytes() == finished[1].model.read_bytes()
+
+
+@pytest.mark.parametrize("content", ["{", "[]", "{}"])
+@pytest.mark.parametrize("file", ["blocks.json", "1-1/metrics.json"])
+def test_a_damaged_journal_or_result_of_a_block_is_one_clear_error(finished, tmp_path, file, content):
+    run = tmp_path / "run"
+    shutil.copytree(finished[0], run)
+    (run / "blocks" / file).write_text(content)
+    with pytest.raises(HyrfError, match=r"damaged; train anew with `overwrite=True`"):
+        train_blocks(block_scene(), run, BLOCK_CONFIG, "2x1", resume=True, context=QUIET_CONTEXT)
+
+
 def test_the_photos_of_a_block_are_not_taken_for_those_of_the_whole_set(finished):
     out, result = finished
     assert load_training_scene(out / result.metrics["blocks"][0]["folder"]) is None
+
+
+@pytest.mark.parametrize(("gibibytes", "processes", "blocks"), [(1000, 1, 1), (4, 1, 2), (8, 2, 2), (2, 1, 3)])
+def test_auto_takes_as_many_blocks_as_the_memory_of_each_process_asks_for(monkeypatch, gibibytes, processes, blocks):
+    """A budget of 1.3 million Gaussians needs 3.03 GiB, in half of the memory."""
+    monkeypatch.setattr("hyrfpack.blocks.run.memory_bytes", lambda: gibibytes * 2**30)
+    config = dataclasses.replace(BLOCK_CONFIG, max_gaussians=1_300_000)
+    photos = (2 * block_scene().train)[:14]  # for at most three blocks
+    scene, ranks = dataclasses.replace(block_scene(), train=photos), Ranks(size=processes, local_size=processes)
+    columns, rows = choose_grid(scene, config, torch.device("cpu"), ranks)
+    assert columns * rows == blocks
+
+
+@pytest.mark.parametrize("photos", [4, 11, 12, 20, 400])
+@pytest.mark.parametrize("needed", [1, 2, 3, 5, 7, 64])
+def test_auto_has_neither_too_few_blocks_nor_blocks_with_too_few_photos(monkeypatch, photos, needed):
+    monkeypatch.setattr("hyrfpack.blocks.run.memory_bytes", lambda: 2**30)
+    budget = int(needed * 2**29 / BYTES_PER_GAUSSIAN)
+    scene = dataclasses.replace(block_scene(), train=(40 * block_scene().train)[:photos])
+    config = dataclasses.replace(BLOCK_CONFIG, max_gaussians=budget)
+    columns, rows = choose_grid(scene, config, torch.device("cpu"), SINGLE_PROCESS)
+    most = min(photos // MIN_BLOCK_PHOTOS, MAX_PARTS)
+    assert min(needed, most) <= columns * rows <= most
 
 
 @pytest.mark.parametrize(
