@@ -117,6 +117,7 @@ def train(
             "--poses runs in one process only; run 'hyrfpack poses' first, then train from its folder"
         )
     from hyrfpack.blocks.journal import is_begun as is_block_run_begun
+    from hyrfpack.blocks.plan import parse_grid
     from hyrfpack.blocks.run import train_blocks
     from hyrfpack.context import RunContext
     from hyrfpack.data import PictureCache
@@ -125,6 +126,9 @@ def train(
     from hyrfpack.train import train_model
     from hyrfpack.train.run import is_begun, resuming
 
+    if blocks not in (None, "auto"):
+        parse_grid(blocks)  # before photos are read, which takes minutes for large scenes
+    is_resumable = is_begun if blocks is None else is_block_run_begun
     torch_device = choose_command_device(device, ranks)
     try:
         scene = ranks.run_on_all(lambda: read_scene(data, reader_options))
@@ -145,14 +149,14 @@ def train(
                 scene, out, config, resume=resume, overwrite=overwrite, observer=observer, log=log, context=context
             )
         except KeyboardInterrupt:
-            if not (is_begun(out) if blocks is None else is_block_run_begun(out)):
+            if not is_resumable(out):
                 raise
             note(f"stopped; {resuming(overwrite)} continues")
             click.get_current_context().exit(1)
     note_if_verbose(
         "seconds: " + ", ".join(f"{part} {t:.1f}" for part, t in result.metrics.get("stage_seconds", {}).items())
     )
-    if not result.complete and result.step == 0:
+    if not result.complete and not is_resumable(out):
         note("stopped before the first step; run the same command to start again")
     elif not result.complete:
         note(f"stopped after step {result.step:,}; {resuming(overwrite)} continues from there")
