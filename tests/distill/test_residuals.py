@@ -72,6 +72,8 @@ def test_an_import_with_residuals_stores_what_the_target_needs(tmp_path: Path, m
 
     small, large = (distil(psnr=psnr) for psnr in (38, 50))
     assert small.psnr_unpacked > 55 and small.psnr > 36 and large.psnr > 47  # of 2 views
+    # `compress` takes its default error from this number, which is not that of the model before compression.
+    assert describe_file(tmp_path / "x.hyrf")["provenance"]["psnr"] == 50
     assert large.bytes_after > 1.2 * small.bytes_after  # fields and metadata take half of these
     limit = (small.bytes_after + large.bytes_after) // 2
     filled = distil(target_bytes=limit)
