@@ -32,7 +32,8 @@ def view(model: Path, port: int, host: str, no_browser: bool, as_json: bool) -> 
     """Show MODEL in a browser until Ctrl-C: a .hyrf file, the folder of a run, or splats (.ply .spz .splat .sog).
 
     The file is served unchanged, with the same player that 'hyrfpack export' writes to a folder. Of a large file, the
-    first layer appears while the others load.
+    first layer appears while the others load. A scene folder of 'hyrfpack split', or a .zip of it, is streamed: coarse
+    levels first, then what the view needs.
 
     \b
     Examples:

@@ -129,7 +129,8 @@ class Manifest:
     def to_json(self) -> bytes:
         """Return the text of the manifest. Equal manifests give equal bytes."""
         values = {"format": FORMAT_NAME, "version": f"{MAJOR_VERSION}.{MINOR_VERSION}", **asdict(self)}
-        return (json.dumps(values, indent=1, sort_keys=True, allow_nan=False) + "\n").encode("ascii")
+        text = json.dumps(values, separators=(",", ":"), sort_keys=True, allow_nan=False)
+        return (text + "\n").encode("ascii")
 
 
 def parse_manifest(data: bytes, name: str = MANIFEST_NAME) -> Manifest:

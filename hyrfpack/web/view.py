@@ -1,4 +1,4 @@
-"""Viewing of a scene's file in a browser of this machine."""
+"""Viewing of a scene in a browser of this machine."""
 
 from __future__ import annotations
 
@@ -8,10 +8,13 @@ from pathlib import Path
 
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.format import describe_file, find_model
-from hyrfpack.format.scene_folder import single_file
+from hyrfpack.format.scene_folder import SceneFolder, is_scene
+from hyrfpack.format.scene_manifest import MANIFEST_NAME
 from hyrfpack.splats.names import SPLATS_SUFFIXES, is_splats, sog_folder
 from hyrfpack.web.player import MODEL_SUFFIX, encode_player
-from hyrfpack.web.serve import LOCAL_HOST, serve
+from hyrfpack.web.serve import LOCAL_HOST, MemoryFile, ServedFiles, serve
+
+FOLDER_ADDRESS = "scene/"  # of the files of a scene folder
 
 
 def view(
@@ -22,34 +25,44 @@ def view(
     open_browser: bool,
     on_ready: Callable[[str], None],
 ) -> None:
-    """Serve a scene's file and a player for it until interrupted; the page decodes the file.
+    """Serve a scene and a player for it until interrupted; the page decodes a file, or streams a scene folder.
 
     Args:
-        path: a `.hyrf` file, the folder of a run, a scene folder, or a file of splats with one of the suffixes
-            `hyrfpack.splats.names.SPLATS_SUFFIXES`.
+        path: a `.hyrf` file, the folder of a run, a scene folder, its manifest or a .zip of it, or a file of splats
+            with one of the suffixes `hyrfpack.splats.names.SPLATS_SUFFIXES`.
         host, port, open_browser, on_ready: as for `hyrfpack.web.serve.serve`.
 
     Raises:
         HyrfError: there is no such file, its first kilobytes are damaged, or the server cannot listen at the address.
     """
-    with single_file(path) as file:
-        _serve_file(file, str(find_playable_file(path)), host, port, open_browser, on_ready)
+    page, files = _scene_page(path) if is_scene(path) else _file_page(path)
+    serve(page, files, host=host, port=port, open_browser=open_browser, on_ready=on_ready)
 
 
-def _serve_file(
-    path: Path, shown_path: str, host: str, port: int, open_browser: bool, on_ready: Callable[[str], None]
-) -> None:
-    """Serve a file; commands that the page shows name `shown_path`."""
-    title, path = path.stem, find_playable_file(path)
-    suffix = path.suffix.lower()
+def _scene_page(path: str | os.PathLike[str]) -> tuple[bytes, ServedFiles]:
+    """Return a page that streams a scene folder, and the files of that folder."""
+    scene = SceneFolder(path)
+    scene.check_files()
+    files: dict[str, Path | MemoryFile] = {FOLDER_ADDRESS + MANIFEST_NAME: MemoryFile(scene.manifest.to_json())}
+    for item in scene.manifest.files:
+        in_folder = scene.path.is_dir()
+        files[FOLDER_ADDRESS + item.file] = scene.path / item.file if in_folder else MemoryFile(scene.read_file(item))
+    title = scene.manifest.title or scene.path.stem or "scene"
+    return encode_player(title, content=FOLDER_ADDRESS + MANIFEST_NAME, fetches="'self'"), files
+
+
+def _file_page(path: str | os.PathLike[str]) -> tuple[bytes, ServedFiles]:
+    """Return a page that plays a file, and that file. Commands that the page shows name its path."""
+    file = find_playable_file(path)
+    suffix = file.suffix.lower()
     if suffix in SPLATS_SUFFIXES:
-        _check_readable(path)
+        _check_readable(file)
     else:
         suffix = MODEL_SUFFIX
-        describe_file(path)
+        describe_file(file)
     name = f"scene{suffix}"
-    page = encode_player(title, content=name, fetches="'self'", editable=True, file=shown_path)
-    serve(page, {name: path}, host=host, port=port, open_browser=open_browser, on_ready=on_ready)
+    title = Path(path).stem
+    return encode_player(title, content=name, fetches="'self'", editable=True, file=str(file)), {name: file}
 
 
 def find_playable_file(path: str | os.PathLike[str]) -> Path:

@@ -6,11 +6,13 @@ import base64
 import json
 import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
 import sys
 import urllib.request
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,7 +26,10 @@ from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.cli import main
 from hyrfpack.format import save_model
 from hyrfpack.splats.files import read_splats
+from hyrfpack.web import view as web_view
+from hyrfpack.web.serve import MemoryFile
 
+GOLDEN_SCENE_FOLDER = Path(__file__).parents[1] / "golden" / "scene"
 GAUSSIAN_POSITIONS = np.random.default_rng(0).uniform(-0.6, 0.6, (40, 3))
 
 
@@ -244,6 +249,31 @@ def test_view_decodes_nothing_and_loads_no_torch(model):
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60)
     assert done.stdout.endswith("['scene.hyrf']\nFalse\n")
+
+
+@pytest.mark.parametrize("ending", ["", "/scene.json", ".zip"])
+def test_view_serves_the_files_of_a_scene_folder_as_they_are(ending, tmp_path, monkeypatch):
+    folder = tmp_path / "city"
+    shutil.copytree(GOLDEN_SCENE_FOLDER, folder)
+    shutil.make_archive(str(folder), "zip", folder)
+    served = {}
+    monkeypatch.setattr(web_view, "serve", lambda page, files, **more: served.update(page=page, files=files))
+
+    web_view.view(f"{folder}{ending}", open_browser=False, on_ready=print)
+
+    for name in (file.name for file in folder.iterdir()):
+        found = served["files"].pop(f"scene/{name}")
+        data = found.open()[0].read() if isinstance(found, MemoryFile) else found.read_bytes()
+        expected = (folder / name).read_bytes()
+        assert json.loads(data) == json.loads(expected) if name == "scene.json" else data == expected
+    assert not served["files"] and b"scene/scene.json" in served["page"]
+
+
+def test_view_names_a_missing_file_of_a_scene_folder(tmp_path):
+    folder = tmp_path / "city"
+    shutil.copytree(GOLDEN_SCENE_FOLDER, folder)
+    (folder / "shared.hyrf").unlink()
+    assert "shared.hyrf: this file of the scene is missing" in refused("view", folder, "--no-browser")
 
 
 def test_view_rejects_a_port_in_use_and_no_port(model):

@@ -16,6 +16,8 @@ from hyrfpack.config.split import SplitConfig
 from hyrfpack.context import RunContext
 from hyrfpack.lod import split, split_model
 from hyrfpack.scene import Camera
+from hyrfpack.web import view as view_module
+from hyrfpack.web.serve import serve_in_thread
 
 pytestmark = [pytest.mark.in_turn, pytest.mark.usefixtures("reset_window")]
 SCENE_FOLDER = Path(__file__).parents[1] / "golden" / "scene"
@@ -44,6 +46,17 @@ def test_a_scene_folder_is_drawn_as_python_renders_it(browser: Browser, scene_ho
     reference = np.clip(np.asarray(hyrfpack.render_view(scene.load(), camera).rgb) * 255, 0, 255)
     assert psnr(picture.astype(float), reference) > MIN_PSNR_DB
     assert browser.evaluate("document.title").startswith(scene.manifest.title)
+
+
+def test_view_streams_a_scene_folder(browser: Browser, monkeypatch: pytest.MonkeyPatch):
+    served: dict = {}
+    monkeypatch.setattr(view_module, "serve", lambda page, files, **_: served.update(page=page, files=files))
+    view_module.view(SCENE_FOLDER, open_browser=False, on_ready=print)
+    with serve_in_thread(**served) as address:
+        browser.open(address)
+        browser.evaluate("hyrfpack.ready")
+        gaussians = browser.evaluate("hyrfpack.player.loader.state.gaussians")
+    assert gaussians == hyrfpack.SceneFolder(SCENE_FOLDER).manifest.gaussians
 
 
 def test_a_missing_shared_file_is_named(browser: Browser, scene_host: Site):
