@@ -8,6 +8,7 @@ const FADE_MS = 400;
 const MAX_FADE_STEP = 1 / 3; // of a frame, so that slow devices show a fade, too
 const MAX_FRAME_WAIT_MS = 1000; // where no frames are drawn for this time, as in a hidden page, fades end at once
 const POLL_MS = 30;
+const MAX_BATCH_ROWS = 256; // of levels that are evaluated together: the first of them waits for the last
 
 export class StreamedFields extends Fields {
   // `model` has the fields and the size of the textures. `chunks` are the levels that are drawn at once. `events` is a
@@ -70,20 +71,28 @@ export class StreamedFields extends Fields {
     this.usedHeight = Math.max(this.usedHeight, ...rows.map((row) => row + 1));
   }
 
-  // Uploads a level that has arrived, and evaluates it, after those before it.
-  async arrive(chunk) {
-    this.arrivals.push(chunk);
+  // Uploads a level that has arrived, and evaluates it, after those before it. Levels that arrive in the meantime are
+  // evaluated together, because on slow devices each wait for the device is also a wait for frames.
+  async arrive(arrival) {
+    this.arrivals.push(arrival);
     if (this.isUploading) return;
     this.isUploading = true;
     const goOn = () => !this.isDisposed && !this.graphics.lost;
     while (this.arrivals.length && goOn()) {
-      const next = this.arrivals.shift(), { rows, number, chunk: place, level } = next;
-      this.upload(next);
+      const batch = this.takeArrivals(), rows = batch.flatMap((level) => level.rows);
+      for (const level of batch) this.upload(level);
       for (const row of rows) this.pending.add(row);
-      const isColoured = await this.coloring(rows, this.eye, { goOn });
-      if (isColoured) this.events.post({ uploaded: { number, chunk: place, level } });
+      if (!(await this.coloring(rows, this.eye, { goOn }))) continue;
+      for (const { number, chunk, level } of batch) this.events.post({ uploaded: { number, chunk, level } });
     }
     this.isUploading = false;
+  }
+
+  // Returns the first levels that have arrived: one, or several of at most MAX_BATCH_ROWS rows.
+  takeArrivals() {
+    let rows = 0;
+    const end = this.arrivals.findIndex((level) => (rows += level.rows.length) > MAX_BATCH_ROWS);
+    return this.arrivals.splice(0, end < 0 ? this.arrivals.length : Math.max(1, end));
   }
 
   // Starts to fade from one level to another one.
