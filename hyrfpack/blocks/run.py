@@ -86,7 +86,8 @@ def train_blocks(
             scene. "auto" takes as many as memory and photos ask for.
         resume: resume an interrupted run; blocks that are finished are kept.
         overwrite: replace an earlier run in the folder.
-        observer, log: see `hyrfpack.train_model`. The log of a block has its name in the name of the file.
+        observer: see `hyrfpack.train_model`.
+        log: see `hyrfpack.train_model`. The log of a block has its name in the name of the file.
         context: device, processes, progress and stop, see `hyrfpack.train_model`. Several processes train one block
             each at a time, and need a common file system. Only rank 0 merges and returns metrics. If the launcher
             restarts the processes, they resume.
