@@ -69,10 +69,6 @@ class HyrfError(Exception):
         return error
 
 
-class HyrfBusyError(HyrfError):
-    """Another call is writing into the same folder."""
-
-
 class HyrfDataError(HyrfError):
     """Photos, poses or points on disk cannot be used."""
 

@@ -1,4 +1,4 @@
-"""Lock folders, so that only one call at a time writes into a folder."""
+"""Lock folders, so that only one call at a time writes into a folder, and files, which stand for pieces of work."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hyrfpack.atomic import make_folder
-from hyrfpack.errors import HyrfBusyError
+from hyrfpack.errors import HyrfError
 
 if TYPE_CHECKING:
     from hyrfpack.parallel.ranks import Ranks
@@ -40,8 +40,7 @@ def exclusive_folder(
             get the lock, all of them raise the error.
 
     Raises:
-        HyrfBusyError: another call is working in the folder.
-        HyrfError: the folder cannot be created.
+        HyrfError: another call is working in the folder, or the folder cannot be created.
     """
     folder = Path(folder)
     if ranks is not None and not ranks.is_main:
@@ -63,6 +62,47 @@ def exclusive_folder(
             os.close(handle)
 
 
+@contextmanager
+def try_lock(file: Path) -> Iterator[bool]:
+    """Lock a file while the `with` block runs, and yield True; yield False if another process holds the lock.
+
+    The file is created if it is missing, and stays. The kernel releases the lock when the process ends. On NFS, the
+    lock of a file that is open for writing also excludes processes of other machines; that of a folder does not.
+
+    Raises:
+        HyrfError: the file cannot be created, or the system does not support such locks.
+    """
+    make_folder(file.parent)
+    try:
+        handle = os.open(file, os.O_RDWR | os.O_CREAT, 0o666)
+    except OSError as error:
+        raise HyrfError(
+            f"{file}: the file cannot be opened ({error.strerror or error})", fix="choose another place"
+        ) from error
+    try:
+        yield _try_to_lock_file(file, handle)
+    finally:
+        with suppress(OSError, AttributeError):  # This system may have no locks.
+            fcntl.flock(handle, fcntl.LOCK_UN)  # for the reason in `exclusive_folder`
+        os.close(handle)
+
+
+def _try_to_lock_file(file: Path, handle: int) -> bool:
+    """Lock an open file; return False if another process holds the lock."""
+    try:
+        if fcntl is None:
+            raise OSError("Windows has none")
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError as error:
+        raise HyrfError(
+            f"{file}: this file system does not support locks ({error.strerror or error})",
+            fix="choose another place, or use one process",
+        ) from error
+    return True
+
+
 def _lock(folder: Path, remedy: str) -> int | None:
     """Create a folder, lock it and return the descriptor that holds the lock; None if it cannot be locked."""
     while True:
@@ -79,7 +119,7 @@ def _lock(folder: Path, remedy: str) -> int | None:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             os.close(handle)
-            raise HyrfBusyError(
+            raise HyrfError(
                 f"{folder}: another hyrfpack command is at work in this folder",
                 fix=f"wait until it has ended, or name {remedy}",
             ) from None

@@ -15,7 +15,7 @@ import pytest
 
 from hyrfpack import lock
 from hyrfpack.errors import HyrfError
-from hyrfpack.lock import exclusive_folder
+from hyrfpack.lock import exclusive_folder, try_lock
 
 pytest.importorskip("fcntl", reason="locks are of Unix")
 RACE_ROUNDS = 50
@@ -164,3 +164,45 @@ def test_folder_that_cannot_be_opened_for_reading_is_not_locked(tmp_path, monkey
     monkeypatch.setattr(lock.os, "open", forbidden)
     with exclusive_folder(tmp_path):
         pass
+
+
+def test_a_file_is_locked_once_at_a_time_and_stays(tmp_path):
+    file = tmp_path / "blocks" / "1-1.lock"
+    with try_lock(file) as is_first, try_lock(file) as is_second, try_lock(file.with_name("2-1.lock")) as is_other:
+        assert (is_first, is_second, is_other) == (True, False, True)
+    with try_lock(file) as is_free:
+        assert is_free and file.is_file()
+
+
+def test_a_file_lock_ends_when_its_process_is_killed(tmp_path):
+    file = tmp_path / "1-1.lock"
+    script = (
+        "import sys, time, pathlib; from hyrfpack.lock import try_lock\n"
+        "with try_lock(pathlib.Path(sys.argv[1])) as is_mine: print(is_mine, flush=True); time.sleep(60)"
+    )
+    with subprocess.Popen([sys.executable, "-c", script, file], stdout=subprocess.PIPE, text=True) as holder:
+        assert holder.stdout is not None and holder.stdout.readline() == "True\n"
+        with try_lock(file) as is_mine:
+            assert not is_mine
+        holder.kill()
+    with try_lock(file) as is_mine:
+        assert is_mine
+
+
+@pytest.mark.parametrize("system", ["Windows", "without locks"])
+def test_a_file_lock_is_refused_where_it_would_not_exclude_anyone(tmp_path, monkeypatch, system):
+    def refuse(handle: int, kind: int) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    if system == "Windows":
+        monkeypatch.setattr(lock, "fcntl", None)
+    else:
+        monkeypatch.setattr("fcntl.flock", refuse)
+    with pytest.raises(HyrfError, match="does not support locks.*or use one process"), try_lock(tmp_path / "x.lock"):
+        raise AssertionError("it was let in")
+
+
+def test_a_lock_file_that_cannot_be_made_is_one_clear_error(tmp_path):
+    (tmp_path / "x.lock").mkdir()
+    with pytest.raises(HyrfError, match="x.lock: the file cannot be opened"), try_lock(tmp_path / "x.lock"):
+        raise AssertionError("it was let in")

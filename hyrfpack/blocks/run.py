@@ -9,8 +9,7 @@ import logging
 import math
 import time
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -29,12 +28,12 @@ from hyrfpack.data import PictureCache
 from hyrfpack.data.cache import memory_bytes
 from hyrfpack.data.preset import detect_preset
 from hyrfpack.device import describe_device
-from hyrfpack.errors import HyrfBusyError, HyrfError
+from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import evaluate_model
 from hyrfpack.format.parts import load_model_or_parts
 from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
 from hyrfpack.format.sections import MAX_PARTS
-from hyrfpack.lock import exclusive_folder
+from hyrfpack.lock import exclusive_folder, try_lock
 from hyrfpack.model.merged import parts_of
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.progress import Progress, TaskEvent, items_of_progress
@@ -209,20 +208,11 @@ class _BlockRun:
         with self.context.open_progress("blocks", interruptible=False) as progress:
             return self._merge(progress, overwrite=self.resume or self.overwrite)
 
-    @contextmanager
-    def _claim(self, block: Block) -> Iterator[bool]:
-        """Keep other processes from training a block while the `with` block runs; yield False if one is at it."""
+    def _claim(self, block: Block) -> AbstractContextManager[bool]:
+        """Keep other processes from training a block in a `with` block, whose value is False if one is at it."""
         if self.ranks.is_single:
-            yield True
-            return
-        folder = self.journal.folder(block.name)
-        with ExitStack() as stack:
-            try:
-                stack.enter_context(exclusive_folder(folder.with_name(f"{folder.name}.lock")))
-            except HyrfBusyError:
-                yield False
-                return
-            yield True
+            return nullcontext(True)
+        return try_lock(self.journal.path.parent / f"{block.name}.lock")
 
     def _train_block(self, block: Block, config: TrainConfig) -> TrainResult:
         """Train a block, or resume it if its training has begun."""
