@@ -20,6 +20,10 @@ export class MergedFields {
     return true;
   }
 
+  get isReady() {
+    return this.parts.every(({ fields }) => fields.isReady);
+  }
+
   get panorama() {
     return this.parts[0].fields.panorama;
   }
