@@ -12,6 +12,7 @@ import torch
 from hyrfpack.blocks.exposure import align_log_gains
 from hyrfpack.blocks.plan import BlockPlan
 from hyrfpack.cameras.capture import scene_provenance
+from hyrfpack.errors import HyrfTrainingError
 from hyrfpack.format.codec import encode_model, load_with_provenance
 from hyrfpack.format.info import FileReport
 from hyrfpack.format.parts import write_parts
@@ -55,6 +56,10 @@ def merge_blocks(
         log_gains: the log gains (3,) of each block's photos, by name; empty if it has learnt none.
         target: the file to write.
         overwrite: replace a file at `target`. Without it, a free name beside it is used.
+
+    Raises:
+        HyrfTrainingError: no block has a Gaussian in its own cells.
+        HyrfError: a model cannot be read, or the file cannot be written.
     """
     offsets, photo_gains = align_log_gains(log_gains)
     viewpoint = scene_provenance(scene)["viewpoint"]
@@ -70,6 +75,10 @@ def merge_blocks(
         _set_exposure(part, offset, scene, photo_gains)
         data = encode_model(part, "raw", {**provenance, "viewpoint": viewpoint})
         parts.append((model.config.background, f"block {block.name}", data))
+    if not parts:
+        raise HyrfTrainingError(
+            f"{target}: no block has a Gaussian in its own cells", fix="train with a larger budget, or without `blocks`"
+        )
     parts.sort(key=lambda part: not part[0])  # The first part is the one whose background is drawn.
     return MergedBlocks(write_parts([part[1:] for part in parts], target, overwrite=overwrite), kept)
 

@@ -14,7 +14,8 @@ from scenes import ball_scene, small_model, visible_points_by_photo
 from hyrfpack.blocks.exposure import align_log_gains
 from hyrfpack.blocks.merge import merge_blocks
 from hyrfpack.blocks.plan import plan_blocks
-from hyrfpack.format import describe_file, load_merged_model, save_model
+from hyrfpack.errors import HyrfTrainingError
+from hyrfpack.format import describe_file, load_merged_model, load_model, save_model
 from hyrfpack.model.merged import world_positions
 
 
@@ -83,6 +84,17 @@ def test_each_part_has_the_gaussians_in_the_cells_of_its_block(blocks, tmp_path)
     for block, part, kept in zip(plan.blocks, reversed(model.parts), merged.kept, strict=True):
         assert plan.core_mask(block, world_positions(part)).all() and len(part) == kept
         assert part.exposure is None
+
+
+def test_blocks_without_a_gaussian_in_their_cells_are_one_clear_error(blocks, tmp_path):
+    scene, plan, paths = blocks
+    for block, path in zip(plan.blocks, paths, strict=True):
+        model = load_model(path)
+        outside = ~plan.core_mask(block, world_positions(model))
+        save_model(model.subset(torch.from_numpy(np.flatnonzero(outside))), path)
+    with pytest.raises(HyrfTrainingError, match="no block has a Gaussian in its own cells; train with a larger budget"):
+        merge_blocks(scene, plan, paths, [{}, {}], tmp_path / "all.hyrf", overwrite=False)
+    assert not (tmp_path / "all.hyrf").exists()
 
 
 def test_the_first_part_has_a_background_and_the_viewpoint_of_all_photos(blocks, tmp_path):
