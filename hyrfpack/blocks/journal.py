@@ -52,7 +52,9 @@ class Journal:
         return all(file.is_file() for file in files) and not self.is_begun(block)
 
     def start(self) -> None:
-        """Write the journal of a new run, and remove what would be taken for results of its blocks."""
+        """Write the journal of a new run, and remove what would be taken for results of its blocks, or resumed."""
+        for name in (CHECKPOINT_FILE, RECORD_FILE):  # of a run without blocks, which this one replaces
+            (self.path.parent.parent / name).unlink(missing_ok=True)
         for block in self.photos:
             for name in (CHECKPOINT_FILE, RECORD_FILE, METRICS_FILE, MODEL_FILE):
                 (self.folder(block) / name).unlink(missing_ok=True)

@@ -82,7 +82,7 @@ def train_blocks(
             `target_bytes` are those of all blocks together. The pilot runs of the block with the most photos decide
             `exposure` and `budget_factor` for all.
         blocks: columns x rows of the grid, such as "2x2"; columns follow each other along the longer side of the
-            scene. "auto" takes as many as memory and photos ask for.
+            scene. "auto" takes as many as memory and photos ask for. A single block is a run of `train_model`.
         resume: resume an interrupted run; blocks that are finished are kept.
         overwrite: replace an earlier run in the folder.
         observer: see `hyrfpack.train_model`.
@@ -114,6 +114,10 @@ def train_blocks(
     # Machines may differ in their memory, but all processes need the same grid.
     is_auto = blocks == "auto"
     columns, rows = ranks.broadcast(choose_grid(scene, config, device, ranks)) if is_auto else parse_grid(blocks)
+    if columns * rows == 1:
+        return train_model(
+            scene, out, config, resume=resume, overwrite=overwrite, observer=observer, log=log, context=context
+        )
     plan = plan_blocks(scene, columns, rows)
     # This check ignores existing results. It runs first, so that no folder is created where nothing may be written.
     ranks.run_on_all(lambda: check_outputs(out, scene, overwrite=True) if ranks.is_main else None)

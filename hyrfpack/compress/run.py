@@ -97,9 +97,15 @@ def compress_model(
     written = ranks.run_on_all(
         lambda: write_model(candidate.data, target, overwrite=overwrite) if ranks.is_main else None
     )
+    report = cast(FileReport, ranks.broadcast(written))
+    if report.bytes_after > (before := source.stat().st_size):
+        _LOG.warning(
+            f"{report.file}: {report.bytes_after:,} bytes, more than the {before:,} of {source}, which was compressed "
+            "already; keep that file, or set a larger `distortion`"
+        )
     total = sum(candidate.predicted_errors.values())
     return CompressionReport(
-        **vars(cast(FileReport, ranks.broadcast(written))),
+        **vars(report),
         shares={part: error / (total or 1.0) for part, error in candidate.predicted_errors.items()},
         error=candidate.measured_error or total,
         found=search_result,

@@ -208,7 +208,7 @@ def _shortfall(
         return f"{outcome}; set a higher target with `psnr`"
     where = ", or give the viewpoints that matter with `cameras`" if viewpoints_are_sampled else ""
     if config.has_residuals:
-        return f"{outcome}; models have a largest opacity and a smallest scale, so set a lower `psnr`"
+        return f"{outcome}; opacities and scales are limited in a model, so set a lower `psnr`"
     return (
         f"{outcome}; train longer, for example with `steps={max(DistillConfig.steps, 2 * config.steps)}`, or store "
         f"corrections of single Gaussians, which take the place of training, with `psnr={RESIDUALS_MIN_PSNR:g}`{where}"

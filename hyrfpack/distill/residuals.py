@@ -60,7 +60,8 @@ def shape_residuals(raw: Tensor, scale_logits: Tensor, quats: Tensor) -> tuple[T
     # The w of the product of two quaternions is the dot product with the conjugate.
     chosen = (difference @ _conjugate(turns).T).abs().argmax(dim=1)
     turned = _multiply(difference, turns[chosen])
-    rotation = turned[:, 1:] / turned[:, :1]
+    cosine = turned[:, :1]
+    rotation = turned[:, 1:] / torch.where(cosine == 0, 1, cosine)  # it is 0 only if the field predicts no rotation
     order = _axis_orders(turns)[chosen]
     logits = scale_logits.gather(1, order) - raw[:, 1:4]
     mean = logits.mean(dim=1, keepdim=True)

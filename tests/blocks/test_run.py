@@ -14,18 +14,20 @@ from rank_tasks import BLOCK_CONFIG, block_scene
 from scenes import QUIET_CONTEXT
 
 from hyrfpack.blocks import train_blocks
-from hyrfpack.blocks.journal import is_begun
+from hyrfpack.blocks.journal import Journal, is_begun
 from hyrfpack.blocks.plan import MIN_BLOCK_PHOTOS, plan_blocks
 from hyrfpack.blocks.run import BYTES_PER_GAUSSIAN, choose_grid
 from hyrfpack.context import RunContext
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import load_merged_model, load_model
+from hyrfpack.format.run_folder import CHECKPOINT_FILE
 from hyrfpack.format.sections import MAX_PARTS
 from hyrfpack.model.merged import world_positions
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.progress import StepEvent
 from hyrfpack.render import render_view
 from hyrfpack.train import load_training_scene
+from hyrfpack.train.results import RECORD_FILE
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +47,20 @@ def test_a_run_in_blocks_leaves_one_model_with_a_part_for_each_block(finished):
     assert {name.removeprefix("block ") for name in model.names} == {block["name"] for block in metrics["blocks"]}
     for part in model.parts:
         assert part.exposure is not None
+
+
+def test_a_single_block_is_a_run_without_blocks(tmp_path):
+    config = dataclasses.replace(BLOCK_CONFIG, steps=2)
+    result = train_blocks(block_scene(), tmp_path / "run", config, "1x1", context=QUIET_CONTEXT)
+    assert result.complete and len(load_model(result.model)) == result.metrics["gaussians"]
+    assert not is_begun(tmp_path / "run")
+
+
+def test_a_new_run_in_blocks_removes_the_checkpoint_of_a_run_without_blocks(tmp_path):
+    for name in (CHECKPOINT_FILE, RECORD_FILE):
+        (tmp_path / name).write_bytes(b"of an earlier run")
+    Journal(tmp_path / "blocks" / "blocks.json", {}, {}).start()
+    assert is_begun(tmp_path) and [path.name for path in tmp_path.iterdir()] == ["blocks"]
 
 
 def test_a_part_is_what_its_block_has_learnt_in_its_cells(finished):
@@ -104,7 +120,7 @@ def test_a_finished_run_is_neither_replaced_nor_resumed_with_other_settings(fini
     with pytest.raises(HyrfError, match="holds an earlier run; `resume=True` continues it"):
         train_blocks(block_scene(), out, BLOCK_CONFIG, "2x1", context=QUIET_CONTEXT)
     other = dataclasses.replace(BLOCK_CONFIG, steps=13)
-    for config, blocks, named in ((other, "2x1", "steps"), (BLOCK_CONFIG, "1x1", "blocks")):
+    for config, blocks, named in ((other, "2x1", "steps"), (BLOCK_CONFIG, "1x2", "blocks")):
         with pytest.raises(HyrfError, match=rf"started with other settings \({named}\)"):
             train_blocks(block_scene(), out, config, blocks, resume=True, context=QUIET_CONTEXT)
     fewer = dataclasses.replace(block_scene(), train=block_scene().train[1:])

@@ -274,6 +274,16 @@ def test_the_distortion_is_lowered_until_the_drop_on_training_photos_is_met(
     assert trial.data == trial.measured_error == pytest.approx(expected, rel=1e-3)
 
 
+def test_a_file_that_grows_is_reported(ball_file, tmp_path, caplog):
+    coarse, fine = tmp_path / "coarse.hyrf", tmp_path / "fine.hyrf"
+    compress_model(ball_file, coarse, CompressConfig(distortion=1e-2))
+    assert not any("more than" in message for message in caplog.messages)
+    compress_model(coarse, fine, CompressConfig(distortion=1e-9))
+    assert fine.stat().st_size > coarse.stat().st_size
+    warning = f"more than the {coarse.stat().st_size:,} of {coarse}"
+    assert any(warning in message for message in caplog.messages)
+
+
 def test_unreadable_photos_do_not_stop_packing(monkeypatch, caplog):
     packer = running.Packer(None, {}, None, SimpleNamespace(train=["a photo"]))
     monkeypatch.setattr(packer, "encode", lambda distortion, *_: running.EncodedCandidate(distortion, {}))
