@@ -101,7 +101,7 @@ def compress_model(
     if report.bytes_after > (before := source.stat().st_size):
         _LOG.warning(
             f"{report.file}: {report.bytes_after:,} bytes, more than the {before:,} of {source}, which was compressed "
-            "already; keep that file, or set a larger `distortion`"
+            "already; keep that file, or set a limit with `target_bytes`"
         )
     total = sum(candidate.predicted_errors.values())
     return CompressionReport(

@@ -86,8 +86,8 @@ def pack(
         packer.progress = part_of_progress(progress, 0.7, 1.0)
         try:
             return packer.encode_within_bytes(target_bytes, distortion)[0].data
-        except HyrfSizeError as error:
-            raise HyrfSizeError(error.problem, "use a larger target size", error.min_bytes) from error
+        except HyrfSizeError as cause:
+            raise HyrfSizeError(cause.problem, fix="use a larger target size", min_bytes=cause.min_bytes) from cause
 
     def error_ratio(candidate: EncodedCandidate) -> float:
         """Return the larger ratio of an error to its limit: that of the mean, or that of the worst view."""
