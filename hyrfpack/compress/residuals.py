@@ -19,7 +19,7 @@ from hyrfpack.format.sections import HARMONICS
 from hyrfpack.quant.steps import FIXED_POINT_ONE, decode_step
 
 # Statistics of the symbols depend on which Gaussians have residuals, and the other way round.
-ROUNDS = 3
+SELECTION_ROUNDS = 3
 
 
 def quantize_residuals(
@@ -52,7 +52,7 @@ def quantize_residuals(
         bands.append((band, weights, values[:, columns], codes, steps, nearest))
     flags = zero_error > price * values.shape[1]
     chosen = [nearest for *_, nearest in bands]
-    for _ in range(ROUNDS):
+    for _ in range(SELECTION_ROUNDS):
         error, rate, chosen = np.zeros(len(values)), np.zeros(len(values)), []
         for band, weights, wanted, _, steps, nearest in bands:
             contexts, count = band.contexts(classes, class_count), class_count * band.components

@@ -23,7 +23,8 @@ MIN_SCALE_LOCAL = 1e-4
 def exact_model(model: HybridModel, drawable: Drawable) -> HybridModel:
     """Return a model of splats with the fields of `model`, whose residuals make its Gaussians equal the splats.
 
-    Shapes and colours are exact. Scales below MIN_SCALE_LOCAL and opacities above MAX_OPACITY are clamped.
+    Shapes and colours are exact. Scales below MIN_SCALE_LOCAL or above what the model can store, and opacities above
+    MAX_OPACITY, are clamped.
 
     Args:
         model: a model in the frame of `drawable`, whose radiance field is constant zero.

@@ -44,8 +44,8 @@ def random_residuals(
     return residuals, rng.integers(0, class_count, count).astype(np.uint8), basis
 
 
-SAMPLE = random_residuals(HARMONICS, COLUMNS_OF_DEGREE_2, 16, 3, 0.5)
-SAMPLE_DATA = encode_residuals(HARMONICS, SAMPLE[0], SAMPLE[1], SAMPLE[2])
+SAMPLE_RESIDUALS = random_residuals(HARMONICS, COLUMNS_OF_DEGREE_2, 16, 3, 0.5)
+SAMPLE_DATA = encode_residuals(HARMONICS, SAMPLE_RESIDUALS[0], SAMPLE_RESIDUALS[1], SAMPLE_RESIDUALS[2])
 
 
 @given(
@@ -78,7 +78,7 @@ def test_a_round_trip_keeps_flags_steps_and_symbols_in_both_readers(section, cou
 def test_truncation_at_every_byte_and_trailing_bytes_are_refused() -> None:
     for data in (*(SAMPLE_DATA[:length] for length in range(len(SAMPLE_DATA))), SAMPLE_DATA + b"\0"):
         with pytest.raises(DamagedDataError):
-            decode_residuals(HARMONICS, memoryview(data), SAMPLE[1], COLUMNS_OF_DEGREE_2)
+            decode_residuals(HARMONICS, memoryview(data), SAMPLE_RESIDUALS[1], COLUMNS_OF_DEGREE_2)
 
 
 @given(st.data())
@@ -88,7 +88,7 @@ def test_damaged_data_is_refused_or_decodes_to_finite_numbers(data: st.DataObjec
     for _ in range(data.draw(st.integers(1, 4))):
         damaged[data.draw(st.integers(0, len(damaged) - 1))] ^= data.draw(st.integers(1, 255))
     try:
-        numbers = decode_residuals(HARMONICS, memoryview(bytes(damaged)), SAMPLE[1], COLUMNS_OF_DEGREE_2)
+        numbers = decode_residuals(HARMONICS, memoryview(bytes(damaged)), SAMPLE_RESIDUALS[1], COLUMNS_OF_DEGREE_2)
     except DamagedDataError:
         return
     assert np.isfinite(numbers).all()
@@ -122,7 +122,7 @@ def test_a_basis_with_an_entry_beyond_1_is_refused(entry: float) -> None:
     basis = struct.pack("<9f", *[entry] * 9)
     data = SAMPLE_DATA[: 5 + size] + basis + SAMPLE_DATA[5 + size + BASIS_BYTES :]
     with pytest.raises(DamagedDataError, match="basis"):
-        decode_residuals(HARMONICS, memoryview(data), SAMPLE[1], COLUMNS_OF_DEGREE_2)
+        decode_residuals(HARMONICS, memoryview(data), SAMPLE_RESIDUALS[1], COLUMNS_OF_DEGREE_2)
 
 
 def test_a_symbol_beyond_the_limit_is_refused() -> None:

@@ -100,7 +100,7 @@ def test_a_forged_file_is_refused_with_the_message_in_its_name(name):
 @pytest.mark.filterwarnings("error")
 def test_mutants_are_decoded_or_refused_in_one_line():
     outcomes = Counter()
-    for number in range(1000):
+    for number in range(1600):
         kind, data = make_hostile_file(number)
         outcome = decode(data)
         outcomes[kind, isinstance(outcome, str)] += 1
@@ -110,7 +110,7 @@ def test_mutants_are_decoded_or_refused_in_one_line():
     assert {kind for kind, _ in outcomes} == set(INPUT_KINDS)
     # Forged content has valid checksums, so that some of it is decoded; damaged content has not.
     for kind in INPUT_KINDS:
-        assert (outcomes[kind, False] > 2) == kind.startswith("forged"), kind
+        assert (outcomes[kind, False] > 4) == kind.startswith("forged"), kind
 
 
 def test_mutants_depend_only_on_their_number_and_seed():

@@ -17,9 +17,9 @@ from hyrfpack.ops.shade import encode_directions
 
 ESTIMATE_SCRIPT = Path(__file__).parent / "estimate.mjs"
 MAX_ANCHORS = 4096
-EYE = np.array([0.3, -2.0, 0.5])
+EYE_LOCAL = np.array([0.3, -2.0, 0.5])
 # Anchors' values are float32 numbers in (0, 1), and logits are added to these.
-ROUNDING = {"rtol": 1e-4, "atol": 1e-6}
+ROUNDING_TOLERANCES = {"rtol": 1e-4, "atol": 1e-6}
 
 
 def make_model(count: int, **settings: object) -> HybridModel:
@@ -33,7 +33,7 @@ def make_model(count: int, **settings: object) -> HybridModel:
 def estimate_in_node(model: HybridModel, tmp_path: Path) -> list[np.ndarray]:
     """Return opacities, scales, quats and colours of all Gaussians."""
     hyrfpack.save_model(model, tmp_path / "model.hyrf", profile="raw")
-    lengths = run_script(ESTIMATE_SCRIPT, tmp_path / "model.hyrf", json.dumps(EYE.tolist()), tmp_path / "outputs")
+    lengths = run_script(ESTIMATE_SCRIPT, tmp_path / "model.hyrf", json.dumps(EYE_LOCAL.tolist()), tmp_path / "outputs")
     parts = np.split(np.fromfile(tmp_path / "outputs", "<f4"), np.cumsum(lengths)[:-1])
     return [part.reshape(len(model), -1) for part in parts]
 
@@ -42,7 +42,7 @@ def evaluate_in_float64(model: HybridModel) -> list[np.ndarray]:
     """Return the exact values of what `estimate_in_node` returns."""
     model = model.double()
     positions = model.gaussians.positions
-    rays = positions - torch.from_numpy(EYE)
+    rays = positions - torch.from_numpy(EYE_LOCAL)
     directions = encode_directions(rays / rays.norm(dim=1, keepdim=True), model.config.direction_encoding)
     with torch.no_grad():
         geometry = model.decode_geometry()
@@ -58,13 +58,13 @@ def evaluate_in_float64(model: HybridModel) -> list[np.ndarray]:
 def test_all_values_of_a_model_with_few_gaussians_are_exact(tmp_path: Path, settings: dict[str, object]):
     model = make_model(700, **settings)
     for estimate, exact in zip(estimate_in_node(model, tmp_path), evaluate_in_float64(model), strict=True):
-        np.testing.assert_allclose(estimate, exact, **ROUNDING)
+        np.testing.assert_allclose(estimate, exact, **ROUNDING_TOLERANCES)
 
 
 def test_anchors_have_exact_values_and_others_the_neural_values_of_a_near_anchor(tmp_path: Path):
     model = make_model(MAX_ANCHORS + 900)
     estimate, exact = estimate_in_node(model, tmp_path), evaluate_in_float64(model)
-    is_exact = np.isclose(estimate[0], exact[0], **ROUNDING).ravel()
+    is_exact = np.isclose(estimate[0], exact[0], **ROUNDING_TOLERANCES).ravel()
     assert is_exact.sum() >= MAX_ANCHORS
     positions = model.gaussians.positions.detach().numpy()
     anchors, others = np.flatnonzero(is_exact), np.flatnonzero(~is_exact)
