@@ -15,6 +15,7 @@ def matches(value: Any, schema: dict[str, Any], root: dict[str, Any] | None = No
     known = {
         "$ref": lambda to: matches(value, whole["$defs"][to.removeprefix("#/$defs/")], whole),
         "allOf": lambda parts: all(matches(value, part, whole) for part in parts),
+        "oneOf": lambda parts: sum(matches(value, part, whole) for part in parts) == 1,
         "const": lambda other: value == other,
         "type": lambda name: {
             "object": isinstance(value, dict),
@@ -31,8 +32,10 @@ def matches(value: Any, schema: dict[str, Any], root: dict[str, Any] | None = No
         "items": lambda part: all(matches(item, part, whole) for item in value),
         "minItems": lambda least: len(value) >= least,
         "maxItems": lambda most: len(value) <= most,
+        "minLength": lambda least: len(value) >= least,
         "maxLength": lambda most: len(value) <= most,
         "minimum": lambda least: value >= least,
+        "maximum": lambda most: value <= most,
         "exclusiveMinimum": lambda bound: value > bound,
         "pattern": lambda pattern: re.search(pattern, value) is not None,
     }

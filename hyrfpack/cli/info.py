@@ -112,7 +112,11 @@ def _print_scene(path: Path, as_json: bool) -> None:
         if scene[key]:
             print_line(f"  {key:<9}  {scene[key]}")
     depth = max((len(chunk["levels"]) for chunk in scene["chunks"]), default=0)
-    rows = [["shared", "-", f"{scene['shared']['bytes']:,}", *("-" for _ in scene["error_radii"])]]
+    if "parts" in facts:
+        rows = [[printable(part["name"]), f"{part['gaussians']:,}", f"{part['bytes']:,}"] for part in facts["parts"]]
+        click.echo("\n" + format_table(["part", "Gaussians", "bytes"], rows))
+    shared = sum(part["bytes"] for part in scene.get("parts") or [scene["shared"]])
+    rows = [["shared", "-", f"{shared:,}", *("-" for _ in scene["error_radii"])]]
     for level in range(depth):
         items = [chunk["levels"][level] for chunk in scene["chunks"] if level < len(chunk["levels"])]
         sums = [sum(item[key] for item in items) for key in ("gaussians", "bytes")]

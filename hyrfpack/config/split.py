@@ -19,7 +19,8 @@ class SplitConfig:
         chunk_gaussians: the most Gaussians of a chunk.
         levels: levels of detail of each chunk. Each has a quarter of the Gaussians of the next finer one; the finest is
             the model itself.
-        refit_steps: steps in which each level's Gaussians are fitted to renders of the model.
+        refit_steps: steps in which each level's Gaussians are fitted to renders of the model; for each part of a merged
+            file.
         title: title of the scene, for people. Default: the name of the source.
         licence: licence of the scene, for people.
         seed: random seed.

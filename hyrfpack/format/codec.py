@@ -12,7 +12,7 @@ from hyrfpack.atomic import write_atomic
 from hyrfpack.cameras.capture import quantized_provenance
 from hyrfpack.checks import check_type
 from hyrfpack.device import choose_device
-from hyrfpack.errors import HyrfError
+from hyrfpack.errors import HyrfError, HyrfFormatError
 from hyrfpack.format import compact, paper, raw
 from hyrfpack.format.arrays import MODEL_RULES
 from hyrfpack.format.container import Container, Section, raw_bytes_limit, read_container, write_container
@@ -20,12 +20,15 @@ from hyrfpack.format.decode import decode_container, gaussian_limit
 from hyrfpack.format.exposure import encode_exposure
 from hyrfpack.format.info import FileReport, section_sizes
 from hyrfpack.format.metadata import Metadata, read_metadata
+from hyrfpack.format.part_names import list_parts
+from hyrfpack.format.parts import write_parts
 from hyrfpack.format.run_folder import find_model
 from hyrfpack.format.scene_folder import SceneFolder, is_scene
 from hyrfpack.format.sections import NON_PARAMETER_SECTIONS, POSITIONS, SECTION_CONTENTS, group_and_layer
 from hyrfpack.format.shared import read_provenance
 from hyrfpack.format.versions import lowest_minor_version
 from hyrfpack.model.hybrid import HybridModel
+from hyrfpack.model.merged import parts_of
 from hyrfpack.outputs import Outputs
 
 PROFILES: dict[str, Callable[..., tuple[list[Section], dict]]] = {
@@ -146,7 +149,7 @@ def write_model(data: bytes, path: str | os.PathLike[str], *, overwrite: bool = 
 def load_model(
     path: str | os.PathLike[str], device: str | torch.device = "cpu", fraction: float | None = None
 ) -> HybridModel:
-    """Read a model from a `.hyrf` file, from the folder of a training run, or from a scene folder.
+    """Read a model from a `.hyrf` file, from the folder of a training run, or from a scene folder of one model.
 
     Of a scene folder (`hyrfpack.split_model`), all chunks are read at the finest level, and `fraction` is ignored. The
     other arguments and the errors are those of `decode_model`.
@@ -176,7 +179,7 @@ def repack(
     overwrite: bool = True,
     **settings: Any,
 ) -> FileReport:
-    """Rewrite a `.hyrf` file with profile "raw" or "paper", and copy its provenance.
+    """Rewrite a `.hyrf` file, a merged one or a scene folder with profile "raw" or "paper", and copy its provenance.
 
     Except for profile "raw", the cameras in the provenance are rounded, see `quantized_provenance`. The other
     arguments and the errors are those of `encode_model`, `load_model` and `save_model`.
@@ -187,9 +190,13 @@ def repack(
     """
     source = find_model(source)
     Outputs(source, overwrite=overwrite).file(target)
-    model, provenance = load_with_provenance(source, fraction)
-    stored_provenance = provenance if profile == "raw" else packed_provenance(provenance, model)
-    return save_model(model, target, profile, stored_provenance, overwrite=overwrite, **settings)
+    parts = []
+    for name, model, provenance in load_parts(source, fraction):
+        stored_provenance = provenance if profile == "raw" else packed_provenance(provenance, model)
+        parts.append((name, encode_model(model, profile, stored_provenance, **settings)))
+    if len(parts) > 1:
+        return write_parts(parts, target, overwrite=overwrite)
+    return write_model(parts[0][1], target, overwrite=overwrite)
 
 
 def packed_provenance(provenance: dict, model: HybridModel) -> dict:
@@ -201,8 +208,25 @@ def packed_provenance(provenance: dict, model: HybridModel) -> dict:
 def load_with_provenance(path: str | os.PathLike[str], fraction: float | None = None) -> tuple[HybridModel, dict]:
     """Read a model and its provenance. The arguments and the errors are those of `load_model`."""
     if is_scene(path):
-        scene = SceneFolder(path)
-        with scene.open_file(scene.manifest.shared) as shared:
-            return scene.load(), read_metadata(shared).provenance
+        if len(parts := load_parts(path)) > 1:
+            raise HyrfFormatError(
+                f"{path}: this scene holds {len(parts)} merged models, and one model is needed",
+                fix="join its chunks with 'hyrfpack decompress', and take one out with 'hyrfpack edit' and its `part`",
+            )
+        return parts[0][1:]
     with Container.open(path, SECTION_CONTENTS, fraction) as container:
         return decode_container(container), read_provenance(container)
+
+
+def load_parts(path: str | os.PathLike[str], fraction: float | None = None) -> list[tuple[str, HybridModel, dict]]:
+    """Read name, model and provenance of each part of a merged file or a scene folder, or of the one model of a file.
+
+    The arguments and the errors are those of `load_model`.
+    """
+    if is_scene(path):
+        scene = SceneFolder(path)
+        models, names = parts_of(scene.load()), [part.name for part in scene.manifest.parts]
+        return list(zip(names, models, scene.read_provenances(), strict=True))
+    with Container.open(path, SECTION_CONTENTS, fraction) as container:
+        parts = list_parts(container)
+        return [(name, decode_container(part), read_provenance(part)) for name, part in parts]

@@ -97,7 +97,9 @@ def describe_file(path: str | os.PathLike[str], fraction: float | None = None) -
         `before` (bytes as float32), `after` (stored bytes) and `bits_per_gaussian`. A merged file has the description
         of its first part, the scene, with the `bytes`, `version`, `gaussians`, `bits_per_gaussian` and `sections` of
         the whole file; and `parts`, each with its `name` and its own description. A scene folder has the description of
-        its shared file, with the `bytes` and `gaussians` of the whole folder, and its chunks in `scene`.
+        its shared file, with the `bytes` and `gaussians` of the whole folder, and its chunks in `scene`; if it has
+        several parts, it has `parts`, too, whose `bytes` and `gaussians` are those of their chunks at all levels and at
+        the finest.
 
     Raises:
         HyrfFormatError: the file does not exist, or its header, table of contents, metadata or exposure map is damaged.
@@ -122,18 +124,32 @@ def describe_file(path: str | os.PathLike[str], fraction: float | None = None) -
 def describe_scene(path: str | os.PathLike[str]) -> dict:
     """Describe a scene folder: its shared file, with the `bytes` and `gaussians` of all, and its manifest as `scene`.
 
+    A folder of several parts has the description of the first one, and `parts` as a merged file has.
+
     Raises:
         HyrfFormatError: the manifest is damaged, or a file is missing or has another size.
     """
     scene = SceneFolder(path)
     scene.check_files()
     manifest = scene.manifest
-    with scene.open_file(manifest.shared) as shared:
-        facts = _describe_model(shared)
-    size, count = manifest.total_bytes, manifest.gaussians
-    parts = {key: asdict(manifest)[key] for key in ("title", "licence", "error_radii", "shared", "chunks")}
-    totals = {"bytes": size, "gaussians": count, "bits_per_gaussian": 8 * size / count if count else None}
-    return {**facts, **totals, "scene": parts}
+    parts = []
+    for number, part in enumerate(manifest.parts):
+        chunks = [chunk for chunk in manifest.chunks if chunk.part == number]
+        size = part.bytes + sum(level.bytes for chunk in chunks for level in chunk.levels)
+        count = sum(chunk.levels[0].gaussians for chunk in chunks)
+        with scene.open_file(part) as shared:
+            parts.append({**_describe_model(shared), **_describe_totals(size, count)})
+    keys = ("title", "licence", "error_radii", "shared", "parts", "chunks")
+    listed = {key: value for key, value in manifest.to_dict().items() if key in keys}
+    facts = {**parts[0], **_describe_totals(manifest.total_bytes, manifest.gaussians), "scene": listed}
+    if len(parts) > 1:
+        facts["parts"] = [{"name": part.name, **own} for part, own in zip(manifest.parts, parts, strict=True)]
+    return facts
+
+
+def _describe_totals(size: int, gaussians: int) -> dict:
+    """Return the totals of several files."""
+    return {"bytes": size, "gaussians": gaussians, "bits_per_gaussian": 8 * size / gaussians if gaussians else None}
 
 
 def _describe_model(container: Container) -> dict:

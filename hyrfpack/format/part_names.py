@@ -11,6 +11,7 @@ from hyrfpack.format.container import Container, Section, raw_bytes_limit, read_
 from hyrfpack.format.sections import MAX_PARTS, PART_NAMES, SECTION_CONTENTS, part_section
 from hyrfpack.format.shared import has_shared_sections
 
+ONE_PART_NAME = "scene"  # of a file that is not merged
 CODEC_NAMES = 0
 CODEC_FILE = 10
 MAX_NAME_LENGTH = 64
@@ -100,3 +101,8 @@ def open_parts(container: Container) -> list[tuple[str, Container]]:
             fix="the file is damaged, copy or write it again",
         )
     return parts
+
+
+def list_parts(container: Container) -> list[tuple[str, Container]]:
+    """Return name and container of each part of a merged file (see `open_parts`), or of the one model of a file."""
+    return open_parts(container) if PART_NAMES in container.entries else [(ONE_PART_NAME, container)]

@@ -15,7 +15,7 @@ from hyrfpack.format.container import Container, Section, read_container, write_
 from hyrfpack.format.decode import decode_container, gaussian_limit
 from hyrfpack.format.info import FileReport, section_sizes
 from hyrfpack.format.metadata import read_metadata
-from hyrfpack.format.part_names import CODEC_FILE, open_parts, write_part_names
+from hyrfpack.format.part_names import CODEC_FILE, ONE_PART_NAME, open_parts, write_part_names
 from hyrfpack.format.scene_folder import SceneFolder, is_scene
 from hyrfpack.format.sections import NON_PARAMETER_SECTIONS, PART_NAMES, SECTION_CONTENTS, part_section
 from hyrfpack.format.versions import MERGED_MINOR_VERSION
@@ -65,10 +65,10 @@ def write_merged(data: bytes, path: str | os.PathLike[str], *, overwrite: bool =
 
 
 def load_merged_model(path: str | os.PathLike[str], device: str | torch.device = "cpu") -> MergedModel:
-    """Read the models of a merged file, or the one model of any other `.hyrf` file as its only part.
+    """Read the models of a merged file or a scene folder, or the one model of any other file as its only part.
 
     Args:
-        path: a `.hyrf` file, or the folder of a training run.
+        path: a `.hyrf` file, the folder of a training run, or a scene folder (all chunks, at the finest level).
         device: device of the parameters, see `hyrfpack.device.choose_device`.
 
     Raises:
@@ -83,7 +83,7 @@ def load_merged_model(path: str | os.PathLike[str], device: str | torch.device =
     """
     device = choose_device(device)
     model = load_model_or_parts(path)
-    merged = model if isinstance(model, MergedModel) else MergedModel(("scene",), (model,))
+    merged = model if isinstance(model, MergedModel) else MergedModel((ONE_PART_NAME,), (model,))
     for part in merged.parts:
         part.to(device)
     return merged

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 from hyrfpack.errors import HyrfFormatError
 from hyrfpack.format.container import Container, read_container
+from hyrfpack.format.metadata import read_metadata
 from hyrfpack.format.scene_manifest import (
     FORMAT_NAME,
     MANIFEST_NAME,
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     import torch
 
     from hyrfpack.model.hybrid import HybridModel
+    from hyrfpack.model.merged import MergedModel
 
 _LOG = logging.getLogger(__name__)
 
@@ -139,9 +141,7 @@ class SceneFolder:
 
     def open_file(self, item: SceneFile) -> Container:
         """Open a file of the folder, after a check of its size and its checksum."""
-        container = read_container(self.read_file(item), SECTION_CONTENTS, str(self.path / item.file))
-        container.open_file = self._open_sibling
-        return container
+        return read_container(self.read_file(item), SECTION_CONTENTS, str(self.path / item.file))
 
     def check_files(self) -> None:
         """Check that all files are there, with the sizes that the manifest lists; none is read.
@@ -163,8 +163,10 @@ class SceneFolder:
             more = f" and {len(extra) - 1} more" if len(extra) > 1 else ""
             _LOG.warning(f"{self.path / extra[0]}{more}: not in the manifest and ignored")
 
-    def load(self, levels: Sequence[int] | None = None, device: str | torch.device = "cpu") -> HybridModel:
-        """Return a model of all chunks.
+    def load(
+        self, levels: Sequence[int] | None = None, device: str | torch.device = "cpu"
+    ) -> HybridModel | MergedModel:
+        """Return a model of all chunks; a merged model if the scene has several parts.
 
         Args:
             levels: level of each chunk, 0 for the finest; None for the finest of all.
@@ -174,31 +176,67 @@ class SceneFolder:
             HyrfFormatError: a file is missing or damaged.
         """
         from hyrfpack.device import choose_device
-        from hyrfpack.format.scene_model import join_chunks
+        from hyrfpack.model.merged import parts_of
 
         chosen = [0] * len(self.manifest.chunks) if levels is None else levels
-        chunks = [self.load_chunk(number, level) for number, level in enumerate(chosen)]
-        return join_chunks(self.fields, chunks).to(choose_device(device))
+        model = self.join([self.load_chunk(number, level) for number, level in enumerate(chosen)])
+        device = choose_device(device)
+        for part in parts_of(model):
+            part.to(device)
+        return model
+
+    def join(self, chunks: Sequence[HybridModel]) -> HybridModel | MergedModel:
+        """Return a model of all chunks, given the model of each at any level; a merged model of several parts."""
+        from hyrfpack.format.scene_model import join_parts
+
+        names = [part.name for part in self.manifest.parts]
+        return join_parts(names, self.fields, chunks, [chunk.part for chunk in self.manifest.chunks])
 
     @cached_property
-    def fields(self) -> HybridModel:
-        """A model without Gaussians, of the fields and the exposure map that all chunks share."""
+    def fields(self) -> list[HybridModel]:
+        """For each part, a model without Gaussians, of the fields and the exposure map that its chunks share."""
         from hyrfpack.format.decode import decode_container
 
-        with self.open_file(self.manifest.shared) as container:
-            return decode_container(container)
+        models = []
+        for part in self.manifest.parts:
+            with self.open_file(part) as container:
+                models.append(decode_container(container))
+            if len(models[-1]):
+                raise HyrfFormatError(
+                    f"{self.path / part.file}: it holds Gaussians, and should hold only what chunks share",
+                    fix=COPY_AGAIN,
+                )
+        return models
+
+    def read_provenances(self) -> list[dict]:
+        """Return the provenance of each part."""
+        provenances = []
+        for part in self.manifest.parts:
+            with self.open_file(part) as container:
+                provenances.append(read_metadata(container).provenance)
+        return provenances
 
     def load_chunk(self, number: int, level: int = 0) -> HybridModel:
-        """Return the model of one chunk at a level of detail, whose fields are those of the scene.
+        """Return the model of one chunk at a level of detail, whose fields are those of its part.
 
         Raises:
             HyrfFormatError: a file is missing or damaged, or holds another number of Gaussians than the manifest says.
         """
         from hyrfpack.format.decode import decode_container
 
-        item = self.manifest.chunks[number].levels[level]
+        chunk = self.manifest.chunks[number]
+        item, part = chunk.levels[level], self.manifest.parts[chunk.part]
+
+        def open_shared(name: str) -> Container:
+            if name == part.file:
+                return self.open_file(part)
+            raise HyrfFormatError(
+                f"{self.path / item.file}: it refers to {name}, and the manifest says {part.file}", fix=COPY_AGAIN
+            )
+
         with self.open_file(item) as container:
-            model = decode_container(container, self.fields)
+            container.open_file = open_shared
+            model = decode_container(container, self.fields[chunk.part])
         if len(model) != item.gaussians:
             raise HyrfFormatError(
                 f"{self.path / item.file}: the manifest says {item.gaussians:,} Gaussians and there are {len(model):,}",
@@ -206,21 +244,13 @@ class SceneFolder:
             )
         return model
 
-    def _open_sibling(self, name: str) -> Container:
-        """Open the shared file for a chunk that refers to it."""
-        shared = self.manifest.shared
-        if name != shared.file:
-            raise HyrfFormatError(
-                f"{self.path / name}: a chunk refers to this file, and the manifest lists {shared.file}", fix=COPY_AGAIN
-            )
-        return self.open_file(shared)
-
 
 @contextmanager
 def single_file(path: StrPath) -> Iterator[Path]:
     """Yield the path of a model's file: `path` itself, or a temporary file of all chunks of a scene, uncompressed.
 
-    The temporary file has the name of the scene, profile "raw" and the scene's finest levels.
+    The temporary file has the name of the scene, profile "raw" and the scene's finest levels. It is a merged file if
+    the scene has several parts.
 
     Raises:
         HyrfFormatError: a file of the scene is missing or damaged.
@@ -228,12 +258,11 @@ def single_file(path: StrPath) -> Iterator[Path]:
     if not is_scene(path):
         yield Path(path)
         return
-    from hyrfpack.format.codec import load_with_provenance, save_model
+    from hyrfpack.format.codec import repack
 
     with tempfile.TemporaryDirectory() as folder:
-        model, provenance = load_with_provenance(path)
         joined = Path(folder, f"{SceneFolder(path).path.stem or 'scene'}.hyrf")
-        save_model(model, joined, "raw", provenance)
+        repack(path, joined)
         yield joined
 
 

@@ -15,11 +15,14 @@ from typing import Any
 
 from hyrfpack.errors import HyrfFormatError
 from hyrfpack.format.metadata import writer_name
+from hyrfpack.format.part_names import ONE_PART_NAME, check_part_names
 from hyrfpack.format.run_folder import SCENE_MANIFEST_FILE as MANIFEST_NAME
+from hyrfpack.format.sections import MAX_PARTS
 from hyrfpack.format.shared import is_file_name
 
 FORMAT_NAME = "hyrf-scene"
-MAJOR_VERSION, MINOR_VERSION = 1, 0
+# A reader of one major version refuses the other one, and would else draw all chunks with the fields of one part.
+ONE_PART_VERSION, PARTS_VERSION = (1, 0), (2, 0)
 MAX_MANIFEST_BYTES = 1 << 24
 MAX_CHUNKS = 1 << 16
 MAX_LEVELS = 8
@@ -46,6 +49,17 @@ class SceneFile:
 
 
 @dataclass(frozen=True)
+class ScenePart(SceneFile):
+    """A part of the scene, by its shared file: the fields, the exposure map and the provenance of its model.
+
+    Attributes:
+        name: name of the part; no two are equal.
+    """
+
+    name: str = ONE_PART_NAME
+
+
+@dataclass(frozen=True)
 class ChunkLevel(SceneFile):
     """A chunk at one level of detail.
 
@@ -66,11 +80,13 @@ class Chunk:
     Attributes:
         low, high: corners of the box that holds them, three standard deviations included, world units.
         levels: from the finest to the coarsest.
+        part: number of the part that its Gaussians belong to.
     """
 
     low: tuple[float, float, float]
     high: tuple[float, float, float]
     levels: tuple[ChunkLevel, ...]
+    part: int = 0
 
     @property
     def center(self) -> tuple[float, float, float]:
@@ -90,11 +106,12 @@ class Manifest:
 
     Attributes:
         gaussians: number of Gaussians of all chunks at the finest level.
-        shared: the file with the fields, the exposure map and the provenance, which all chunks refer to.
+        parts: the parts, one for each model that was split. The first is the scene, whose frame, background, viewpoint
+            and cameras are those of the manifest.
         chunks: the chunks.
         error_radii: radii of a chunk's projection in pixels, rising, for which its levels have errors. The radius of a
             chunk in a view is its `radius` times the focal length, divided by its distance.
-        frame: frame of the model, as in the `config` of its files.
+        frame: frame of the scene, as in the `config` of its files.
         background: whether a background sphere lies behind the Gaussians.
         solid: colour behind everything without one.
         viewpoint: the viewpoint to orbit around, as in `provenance`; empty if the model has none.
@@ -104,7 +121,7 @@ class Manifest:
     """
 
     gaussians: int
-    shared: SceneFile
+    parts: tuple[ScenePart, ...]
     chunks: tuple[Chunk, ...]
     error_radii: tuple[float, ...]
     frame: dict[str, Any]
@@ -119,17 +136,31 @@ class Manifest:
     @property
     def files(self) -> list[SceneFile]:
         """All files of the folder but the manifest."""
-        return [self.shared, *(level for chunk in self.chunks for level in chunk.levels)]
+        return [*self.parts, *(level for chunk in self.chunks for level in chunk.levels)]
+
+    @property
+    def shared_bytes(self) -> int:
+        """Bytes of the shared files of all parts."""
+        return sum(part.bytes for part in self.parts)
 
     @property
     def total_bytes(self) -> int:
         """Bytes of all files but the manifest."""
         return sum(item.bytes for item in self.files)
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return the manifest as values for JSON. One of several parts has version 2.0, another one has no `parts`."""
+        values = asdict(self)
+        version = PARTS_VERSION if len(self.parts) > 1 else ONE_PART_VERSION
+        if version == ONE_PART_VERSION:
+            (part,) = values.pop("parts")
+            values["shared"] = {key: value for key, value in part.items() if key != "name"}
+            values["chunks"] = [{key: chunk[key] for key in ("low", "high", "levels")} for chunk in values["chunks"]]
+        return {"format": FORMAT_NAME, "version": "{}.{}".format(*version), **values}
+
     def to_json(self) -> bytes:
         """Return the text of the manifest. Equal manifests give equal bytes."""
-        values = {"format": FORMAT_NAME, "version": f"{MAJOR_VERSION}.{MINOR_VERSION}", **asdict(self)}
-        text = json.dumps(values, separators=(",", ":"), sort_keys=True, allow_nan=False)
+        text = json.dumps(self.to_dict(), separators=(",", ":"), sort_keys=True, allow_nan=False)
         return (text + "\n").encode("ascii")
 
 
@@ -149,8 +180,7 @@ def parse_manifest(data: bytes, name: str = MANIFEST_NAME) -> Manifest:
         values = json.loads(data.decode("utf-8"), parse_constant=_reject_constant)
         if not isinstance(values, dict) or values.get("format") != FORMAT_NAME:
             raise HyrfFormatError(f"{name}: this is not the manifest of a scene folder", fix="check the path")
-        _check_version(values.get("version"), name)
-        return _parse_values(values)
+        return _parse_values(values, _read_major_version(values.get("version"), name))
     # Deep nesting overflows the parser's stack, and Python converts no integer of 5,000 digits (ValueError).
     except (ValueError, RecursionError) as error:
         raise HyrfFormatError(
@@ -158,26 +188,30 @@ def parse_manifest(data: bytes, name: str = MANIFEST_NAME) -> Manifest:
         ) from error
 
 
-def _check_version(version: object, name: str) -> None:
+def _read_major_version(version: object, name: str) -> int:
     match = _VERSION_PATTERN.fullmatch(version) if isinstance(version, str) else None
     if match is None:
         raise ValueError("it has no version")
-    if int(match[1]) != MAJOR_VERSION:
+    if (major := int(match[1])) not in (known := (ONE_PART_VERSION[0], PARTS_VERSION[0])):
         raise HyrfFormatError(
-            f"{name}: the scene has version {version} and this hyrfpack reads version {MAJOR_VERSION}",
+            f"{name}: the scene has version {version} and this hyrfpack reads versions {known[0]} and {known[1]}",
             fix="update hyrfpack",
         )
+    return major
 
 
-def _parse_values(values: Mapping[str, Any]) -> Manifest:
+def _parse_values(values: Mapping[str, Any], major: int) -> Manifest:
     """Build a manifest of checked values; unknown keys are ignored, as later minor versions may add some."""
     radii = _numbers(values, "error_radii", range(1, MAX_ERROR_RADII + 1), minimum=0)
     if any(a >= b for a, b in zip((0.0, *radii), radii, strict=False)):
         raise ValueError("'error_radii' do not rise")
-    chunks = tuple(_parse_chunk(item, len(radii)) for item in _list(values, "chunks", range(MAX_CHUNKS + 1)))
+    parts = _parse_parts(values, major)
+    chunks = tuple(
+        _parse_chunk(item, len(radii), len(parts)) for item in _list(values, "chunks", range(MAX_CHUNKS + 1))
+    )
     manifest = Manifest(
         gaussians=_integer(values, "gaussians"),
-        shared=SceneFile(**_file_values(_object(values, "shared"))),
+        parts=parts,
         chunks=chunks,
         error_radii=radii,
         frame=dict(_object(values, "frame")),
@@ -197,7 +231,17 @@ def _parse_values(values: Mapping[str, Any]) -> Manifest:
     return manifest
 
 
-def _parse_chunk(item: object, radii: int) -> Chunk:
+def _parse_parts(values: Mapping[str, Any], major: int) -> tuple[ScenePart, ...]:
+    if major == ONE_PART_VERSION[0]:
+        return (ScenePart(**_file_values(_object(values, "shared"))),)
+    items = _list(values, "parts", range(2, MAX_PARTS + 1))
+    if not all(isinstance(item, dict) for item in items):
+        raise ValueError("a part is no object")
+    check_part_names([item.get("name") for item in items])
+    return tuple(ScenePart(**_file_values(item), name=item["name"]) for item in items)
+
+
+def _parse_chunk(item: object, radii: int, parts: int) -> Chunk:
     if not isinstance(item, dict):
         raise ValueError("a chunk is no object")
     low, high = _triple(item, "low"), _triple(item, "high")
@@ -209,7 +253,10 @@ def _parse_chunk(item: object, radii: int) -> Chunk:
             raise ValueError("a level is no object")
         errors = _numbers(level, "errors", range(radii, radii + 1), minimum=0)
         levels.append(ChunkLevel(**_file_values(level), gaussians=_integer(level, "gaussians"), errors=errors))
-    return Chunk(low, high, tuple(levels))
+    part = _integer(item, "part") if parts > 1 else 0
+    if part >= parts:
+        raise ValueError(f"a chunk belongs to part {part}, and there are {parts} parts")
+    return Chunk(low, high, tuple(levels), part)
 
 
 def _file_values(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -8,9 +8,9 @@ import torch
 
 from hyrfpack.config.render import GeometryConfig
 from hyrfpack.format.scene_folder import SceneFolder
-from hyrfpack.format.scene_model import join_chunks
 from hyrfpack.lod.select import LevelSelection, select_levels
 from hyrfpack.model import HybridModel
+from hyrfpack.model.merged import MergedModel, parts_of
 from hyrfpack.render import RenderedPicture, RenderSettings
 from hyrfpack.render.files import make_renderer
 from hyrfpack.scene import Camera
@@ -42,7 +42,7 @@ class LevelRenderer:
         self._device, self._precision = device, precision
         self._chunks: OrderedDict[tuple[int, int], HybridModel] = OrderedDict()
 
-    def load(self, camera: Camera) -> tuple[HybridModel, LevelSelection]:
+    def load(self, camera: Camera) -> tuple[HybridModel | MergedModel, LevelSelection]:
         """Return a model of the levels that are chosen for a view, and the choice.
 
         Raises:
@@ -50,9 +50,10 @@ class LevelRenderer:
         """
         choice = select_levels(self.scene.manifest, camera, gaussians=self.gaussians, bytes=self.bytes)
         self.choices.append(choice)
-        model = join_chunks(self.scene.fields, [self._chunk(*key) for key in enumerate(choice.levels)])
-        model = model.to(self._device)
-        model.precision = self._precision
+        model = self.scene.join([self._chunk(*key) for key in enumerate(choice.levels)])
+        for part in parts_of(model):
+            part.to(self._device)
+            part.precision = self._precision
         return model, choice
 
     def draw(

@@ -9,12 +9,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hyrfpack.format.scene_model import join_chunks
+from hyrfpack.format.scene_model import join_parts
 from hyrfpack.lod.select import project_sphere
 from hyrfpack.model import Decoded, HybridModel
+from hyrfpack.model.merged import MergedModel, scene_of
 from hyrfpack.ops.rasterize import rasterize
 from hyrfpack.progress import Progress, TaskEvent, ignore_progress
 from hyrfpack.render import RenderSettings, render_view
+from hyrfpack.render.parts import camera_frame, gather_geometry
 from hyrfpack.scene import Camera
 
 ERROR_RADII = (16.0, 32.0, 64.0, 128.0, 256.0, 512.0, 1024.0)
@@ -30,6 +32,8 @@ def measure_level_errors(
     levels: Sequence[Sequence[HybridModel]],
     spheres: Sequence[tuple[tuple[float, float, float], float]],
     cameras: Sequence[Camera],
+    fields: Sequence[HybridModel] | None = None,
+    parts: Sequence[int] | None = None,
     seed: int = 0,
     progress: Progress = ignore_progress,
 ) -> np.ndarray:
@@ -40,9 +44,12 @@ def measure_level_errors(
     error of a pixel is divided among the chunks of the half by their light in the render of the finest levels.
 
     Args:
-        levels: models of all chunks at each level, the finest first. They share their fields.
+        levels: models of all chunks at each level, the finest first. Those of a part share their fields.
         spheres: centre and radius of each chunk, world units.
         cameras: views to measure at, world units.
+        fields: for each part of the scene, a model with its fields; None for those of the first chunk. All parts are
+            drawn together.
+        parts: number of the part of each chunk; None if there is one part.
         seed: random seed of the halves.
         progress: called with `TaskEvent`s.
 
@@ -50,7 +57,7 @@ def measure_level_errors(
         (levels, chunks, len(ERROR_RADII)) float64: mean squared errors, relative to the area that `project_sphere`
         gives; 0 for the finest level.
     """
-    pool = _Pool.of(levels)
+    pool = _Pool.of(levels, fields or levels[0][:1], parts or [0] * len(spheres))
     shape, rng = (len(levels), len(spheres), len(ERROR_RADII)), np.random.default_rng(seed)
     sums, areas = np.zeros(shape), np.zeros(shape[1:])
     views = [resize_camera(camera, share) for camera in cameras for share in RESOLUTION_SHARES]
@@ -87,19 +94,20 @@ class _Pool:
         chunk_of, level_of: (N,) chunk and level of each.
     """
 
-    model: HybridModel
+    model: HybridModel | MergedModel
     decoded: Decoded
     chunk_of: np.ndarray
     level_of: np.ndarray
 
     @classmethod
-    def of(cls, levels: Sequence[Sequence[HybridModel]]) -> _Pool:
-        """Pool the models of all chunks at each level."""
-        models = [model for level in levels for model in level]
-        counts = list(map(len, models))
-        model = join_chunks(models[0], models)
-        chunk_of = np.repeat([chunk for level in levels for chunk in range(len(level))], counts)
-        level_of = np.repeat([number for number, level in enumerate(levels) for _ in level], counts)
+    def of(cls, levels: Sequence[Sequence[HybridModel]], fields: Sequence[HybridModel], parts: Sequence[int]) -> _Pool:
+        """Pool the models of all chunks at each level, part by part."""
+        keys = [(level, chunk) for level in range(len(levels)) for chunk in range(len(parts))]
+        keys.sort(key=lambda key: parts[key[1]])  # The sort is stable.
+        models = [levels[level][chunk] for level, chunk in keys]
+        names = [str(number) for number in range(len(fields))]
+        model = join_parts(names, fields, models, [parts[chunk] for _, chunk in keys])
+        level_of, chunk_of = np.repeat(np.array(keys).T, list(map(len, models)), axis=1)
         return cls(model, model.decode(), chunk_of, level_of)
 
     def draw(self, levels: np.ndarray, camera: Camera) -> Tensor:
@@ -109,12 +117,15 @@ class _Pool:
 
     def draw_shares(self, sets: Sequence[np.ndarray], camera: Camera) -> Tensor:
         """Return the share (H, W, 3) of each pixel's light of up to three sets (chunks,) bool, at the finest levels."""
-        index = np.flatnonzero(self.level_of == 0)
-        gaussians = self.decoded[torch.from_numpy(index)].geometry.at(self.model.gaussians.positions[index])
+        index = torch.from_numpy(np.flatnonzero(self.level_of == 0))
         none = np.zeros(len(sets[0]), bool)
         members = np.stack([each[self.chunk_of[index]] for each in (*sets, none, none)[:_COLUMNS]], axis=1)
-        config = self.model.config
-        viewport = config.frame.local_viewport(camera, gaussians.means.dtype)
+        model, config = self.model, scene_of(self.model).config
+        if isinstance(model, MergedModel):
+            gaussians, frame = gather_geometry(model, camera, index, self.decoded), camera_frame(model, camera)
+        else:
+            gaussians, frame = self.decoded[index].geometry.at(model.gaussians.positions[index]), config.frame
+        viewport = frame.local_viewport(camera, gaussians.means.dtype)
         settings = RenderSettings().raster_settings(config.antialiased)
         return rasterize(gaussians, torch.from_numpy(members).to(gaussians.means), viewport, settings).rgb
 

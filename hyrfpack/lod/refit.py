@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import torch
 
 from hyrfpack.model import HybridModel
+from hyrfpack.model.merged import MergedModel, parts_of
 from hyrfpack.ops.adam import adam_step
 from hyrfpack.progress import Progress, TaskEvent, ignore_progress
 from hyrfpack.render import render_view
@@ -20,14 +21,16 @@ POSITION_RATE = 0.04
 
 
 def refit_level(
-    level: HybridModel,
-    finest: HybridModel,
+    level: HybridModel | MergedModel,
+    finest: HybridModel | MergedModel,
     cameras: Sequence[Camera],
     steps: int,
     seed: int = 0,
     progress: Progress = ignore_progress,
 ) -> None:
     """Fit the Gaussians of a level to renders of the finest level, in place; fields stay as they are.
+
+    All parts of a merged model are fitted together.
 
     Args:
         level: the model of the level, which shares its fields with `finest`.
@@ -42,8 +45,11 @@ def refit_level(
     with torch.no_grad():
         decoded = finest.decode()
         targets = [render_view(finest, camera, decoded=decoded).rgb for camera in cameras]
-    rates = {**LEARNING_RATES, "positions": POSITION_RATE * len(level) ** (-1 / 3)}
-    values = [getattr(level.gaussians, name).requires_grad_() for name in rates]
+    values, rates = [], []
+    for part in filter(len, parts_of(level)):
+        for name, rate in {**LEARNING_RATES, "positions": POSITION_RATE * len(part) ** (-1 / 3)}.items():
+            values.append(getattr(part.gaussians, name).requires_grad_())
+            rates.append(rate)
     moments = [[torch.zeros_like(value) for value in values] for _ in range(2)]
     generator = torch.Generator().manual_seed(seed)
     order: list[int] = []
@@ -54,8 +60,8 @@ def refit_level(
         loss = (render_view(level, cameras[number]).rgb - targets[number]).square().mean()
         if not loss.requires_grad:  # no Gaussian is in view
             continue
-        gradients = torch.autograd.grad(loss, values)
+        gradients = torch.autograd.grad(loss, values, materialize_grads=True)  # A part may be out of view.
         decay = (1 + math.cos(math.pi * step / steps)) / 2
-        adam_step(values, gradients, *moments, step=step + 1, rate=[decay * rate for rate in rates.values()])
+        adam_step(values, gradients, *moments, step=step + 1, rate=[decay * rate for rate in rates])
     for value in values:
         value.requires_grad_(False)

@@ -19,7 +19,7 @@ class LevelSelection:
     Attributes:
         levels: level of each chunk, 0 for the finest.
         gaussians: number of Gaussians of these levels.
-        bytes: size of their files and of the shared file.
+        bytes: size of their files and of the shared files.
         predicted_mse: predicted mean squared error of the view against the finest levels.
         max_gap: bound on how much lower the error of the best choice within the budget can be; 0 if all upgrades fit.
     """
@@ -64,7 +64,7 @@ def select_levels(
     count_bytes = bytes is not None
     given = gaussians if bytes is None else bytes
     limit = math.inf if given is None else given
-    base = manifest.shared.bytes if count_bytes else 0
+    base = manifest.shared_bytes if count_bytes else 0
     costs = [[x.bytes if count_bytes else x.gaussians for x in chunk.levels] for chunk in manifest.chunks]
     errors = predict_errors(manifest, camera)
     levels, max_gap = choose_levels(costs, errors, limit - base)
@@ -72,7 +72,7 @@ def select_levels(
     return LevelSelection(
         levels,
         sum(item.gaussians for item in chosen),
-        manifest.shared.bytes + sum(item.bytes for item in chosen),
+        manifest.shared_bytes + sum(item.bytes for item in chosen),
         sum(each[level] for each, level in zip(errors, levels, strict=True)),
         max_gap,
     )

@@ -23,10 +23,12 @@ from hyrfpack.errors import HyrfError, HyrfFormatError
 from hyrfpack.format.container import Container, read_container
 from hyrfpack.format.decode import decode_container
 from hyrfpack.format.info import describe_file
+from hyrfpack.format.part_names import ONE_PART_NAME, list_parts
+from hyrfpack.format.parts import decode_parts
 from hyrfpack.format.run_folder import find_model
 from hyrfpack.format.scene_folder import SceneFolder, is_scene
-from hyrfpack.format.scene_manifest import MANIFEST_NAME, Chunk, ChunkLevel, Manifest, SceneFile
-from hyrfpack.format.scene_model import join_chunks
+from hyrfpack.format.scene_manifest import MANIFEST_NAME, Chunk, ChunkLevel, Manifest, ScenePart
+from hyrfpack.format.scene_model import join_parts
 from hyrfpack.format.sections import SECTION_CONTENTS
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.lod.encode import ChunkEncoder
@@ -35,6 +37,7 @@ from hyrfpack.lod.merge import merge_gaussians
 from hyrfpack.lod.partition import partition
 from hyrfpack.lod.refit import refit_level
 from hyrfpack.model import Geometry, HybridModel
+from hyrfpack.model.merged import MergedModel, parts_of
 from hyrfpack.ops.transfer import tensor_like
 from hyrfpack.outputs import Outputs, StrPath
 from hyrfpack.progress import Progress, TaskEvent, part_of_progress
@@ -45,8 +48,10 @@ _LOG = logging.getLogger(__name__)
 SHARED_NAME = "shared.hyrf"
 LEVEL_RATIO = 4  # A level has as many times the Gaussians of the next coarser one, as pictures of half the size.
 MERGE_VIEWPOINTS = 8
-REFIT_CAMERAS, REFIT_BETWEEN = 12, 3  # views at cameras, and views between cameras for each of them
-MEASURED_VIEWS = 8
+REFIT_BETWEEN = 3  # views between cameras, for each view at a camera
+# Of each part; views of all parts together are limited, because they take memory and time.
+REFIT_CAMERAS, MAX_REFIT_CAMERAS = 12, 48
+MEASURED_VIEWS, MAX_MEASURED_VIEWS = 8, 32
 _SEED_STEP = 1000  # keeps the views that levels are fitted at from those that they are measured at
 _SIGMAS = 3.0
 _REFIT_SHARE, _MEASURE_SHARE = 0.6, 0.3  # of the progress
@@ -62,7 +67,7 @@ class SplitReport:
         chunks: number of chunks.
         bytes: bytes of all files but the manifest.
         bytes_source: bytes of the file that was split.
-        bytes_finest: bytes of the shared file and the finest levels.
+        bytes_finest: bytes of the shared files and the finest levels.
         level_gaussians, level_bytes: Gaussians and bytes of all chunks at each level, the finest first.
     """
 
@@ -92,17 +97,18 @@ def split_model(
 
     The finest level of all chunks is the model: positions and fields are kept exactly, logits exactly or with steps
     finer than those of the file. Coarser levels are merged, fitted to renders of the model, and their errors in
-    pictures are measured at the cameras that the file keeps.
+    pictures are measured at the cameras that the file keeps. Each part of a merged file has chunks of its own, but
+    pictures show all parts.
 
     Args:
-        source: a `.hyrf` file of one model, or the folder of a run.
+        source: a `.hyrf` file or the folder of a run.
         target: folder to write; created if it is missing.
         config: the settings; None for the defaults.
         overwrite: replace a scene in the folder. If False, existing files are an error.
         context: how progress is shown.
 
     Raises:
-        HyrfError: the file cannot be read or holds merged models or no Gaussian, or the folder cannot be written.
+        HyrfError: the file cannot be read or holds no Gaussian, or the folder cannot be written.
         TypeError: `config` is not a SplitConfig.
 
     Example:
@@ -117,10 +123,11 @@ def split_model(
     if is_scene(source):
         raise HyrfError(f"{source}: this is a scene of several files already", fix="split the model that it came from")
     path, target = find_model(source), Path(target)
-    Outputs(path, overwrite=True).folder(target, [MANIFEST_NAME, SHARED_NAME])
+    shared_names = _name_shared_files(path)
+    Outputs(path, overwrite=True).folder(target, [MANIFEST_NAME, *shared_names])
     with exclusive_folder(target), context.open_progress("split") as progress:
-        Outputs(path, overwrite=overwrite).folder(target, [MANIFEST_NAME, SHARED_NAME])
-        files, manifest = _split(path, Path(source).stem, config, progress)
+        Outputs(path, overwrite=overwrite).folder(target, [MANIFEST_NAME, *shared_names])
+        files, manifest = _split(path, shared_names, Path(source).stem, config, progress)
         Outputs(path, overwrite=overwrite).folder(target, files)
         _write_folder(target, files, manifest, overwrite)
     levels = list(zip(*(chunk.levels for chunk in manifest.chunks), strict=True))
@@ -131,51 +138,79 @@ def split_model(
         len(manifest.chunks),
         manifest.total_bytes,
         path.stat().st_size,
-        manifest.shared.bytes + level_bytes[0],
+        manifest.shared_bytes + level_bytes[0],
         [sum(item.gaussians for item in level) for level in levels],
         level_bytes,
     )
 
 
-def _split(path: Path, name: str, config: SplitConfig, progress: Progress) -> tuple[dict[str, bytes], Manifest]:
+@dataclass(frozen=True)
+class _Part:
+    """A part of the scene that is split.
+
+    Attributes:
+        name: its name.
+        encoder: the encoder of its chunks.
+        geometry: geometry of its Gaussians.
+        groups: the Gaussians of each of its chunks, in the order of the chunk's file.
+        finest: the bytes of each of its chunks at the finest level.
+    """
+
+    name: str
+    encoder: ChunkEncoder
+    geometry: Geometry
+    groups: list[np.ndarray]
+    finest: list[bytes]
+
+    @classmethod
+    def of(cls, name: str, encoder: ChunkEncoder, chunk_gaussians: int) -> _Part:
+        """Divide a part into chunks."""
+        model = encoder.model
+        cube = model.cube_coords(model.gaussians.positions.detach().double()).numpy()
+        encoded = [encoder.encode_subset(group) for group in partition(cube, chunk_gaussians) if len(group)]
+        groups = [order for _, order in encoded]
+        return cls(name, encoder, model.decode_geometry(), groups, [data for data, _ in encoded])
+
+    @property
+    def model(self) -> HybridModel:
+        """The model of all its Gaussians."""
+        return self.encoder.model
+
+
+def _name_shared_files(path: Path) -> list[str]:
+    """Return the name of the shared file of each part of a file."""
+    with Container.open(path, SECTION_CONTENTS) as container:
+        count = len(list_parts(container))
+    return [SHARED_NAME] if count == 1 else [f"shared-{number:02d}.hyrf" for number in range(count)]
+
+
+def _split(
+    path: Path, shared_names: Sequence[str], name: str, config: SplitConfig, progress: Progress
+) -> tuple[dict[str, bytes], Manifest]:
     """Return the files of the folder by name, without the manifest, and the manifest."""
     progress(TaskEvent("reading the model", 0.0))
-    capture = Capture(describe_file(path))
-    with Container.open(path, SECTION_CONTENTS) as container:
-        model = decode_container(container)
-        if not len(model):
-            raise HyrfError(f"{path}: there is no Gaussian in it, so there is nothing to split", fix="train it again")
-        if model.config.residual_degree is not None:
-            raise HyrfError(
-                f"{path}: a model with residuals cannot be split into levels of detail",
-                fix="import the splats again with a `psnr` below 38 dB",
-            )
-        encoder = ChunkEncoder(container, model, SHARED_NAME)
-    files = {SHARED_NAME: encoder.shared_bytes}
-    cube = model.cube_coords(model.gaussians.positions.detach().double()).numpy()
-    groups = partition(cube, config.chunk_gaussians)
-    finest = [encoder.encode_subset(group) for group in groups]
-    groups = [order for _, order in finest]
-    encoded = [[data] for data, _ in finest]
-    counts = [[len(group)] for group in groups]
-    boxes = _measure_boxes(model, groups)
-    models = [[model.subset(torch.from_numpy(group)) for group in groups]]
-    cameras = capture.cameras
-    geometry = model.decode_geometry()
+    facts = describe_file(path)
+    whole, parts = _read_parts(path, shared_names, config.chunk_gaussians)
+    cameras = _list_cameras(facts)
+    owners = [number for number, part in enumerate(parts) for _ in part.groups]
+    encoded = [[data] for part in parts for data in part.finest]
+    models = [[part.model.subset(torch.from_numpy(group)) for part in parts for group in part.groups]]
+    boxes = [box for part in parts for box in _measure_boxes(part)]
     for level in range(1, config.levels):
         share = (level - 1) / max(config.levels - 1, 1)
-        part = part_of_progress(progress, _REFIT_SHARE * share, _REFIT_SHARE * (share + 1 / (config.levels - 1)))
-        parts = _make_level(model, geometry, groups, cameras, level, config, part)
+        stage = part_of_progress(progress, _REFIT_SHARE * share, _REFIT_SHARE * (share + 1 / (config.levels - 1)))
         models.append([])
-        for number, coarse in enumerate(parts):
+        for number, coarse in enumerate(_make_level(parts, owners, whole, cameras, level, config, stage)):
+            encoder = parts[owners[number]].encoder
             data = encoder.encode_gaussians(coarse)
             encoded[number].append(data)
-            counts[number].append(len(coarse))
-            models[-1].append(_decode(data, encoder, model))
+            models[-1].append(_decode(data, encoder))
     spheres = [(chunk.center, chunk.radius) for chunk in (Chunk(low, high, ()) for low, high in boxes)]
-    part = part_of_progress(progress, _REFIT_SHARE, _REFIT_SHARE + _MEASURE_SHARE)
-    views = sample_views(cameras, MEASURED_VIEWS, config.seed + 1)[1] if config.levels > 1 else []
-    errors = measure_level_errors(models, spheres, views, config.seed, part)
+    stage = part_of_progress(progress, _REFIT_SHARE, _REFIT_SHARE + _MEASURE_SHARE)
+    count = min(MEASURED_VIEWS * len(parts), MAX_MEASURED_VIEWS)
+    views = sample_views(cameras, count, config.seed + 1)[1] if config.levels > 1 else []
+    errors = measure_level_errors(models, spheres, views, [part.model for part in parts], owners, config.seed, stage)
+    files = {part.encoder.shared_name: part.encoder.shared_bytes for part in parts}
     chunks = []
     for number, (low, high) in enumerate(boxes):
         levels = []
@@ -183,60 +218,98 @@ def _split(path: Path, name: str, config: SplitConfig, progress: Progress) -> tu
             file = f"chunk-{number:04d}-{level}.hyrf"
             files[file] = data
             stated = tuple(float(f"{error:.4g}") for error in errors[level, number])
-            levels.append(ChunkLevel(file, len(data), _checksum(data), counts[number][level], stated))
-        chunks.append(Chunk(low, high, tuple(levels)))
-    return files, _make_manifest(encoder, chunks, capture, name, config)
+            levels.append(ChunkLevel(file, len(data), _checksum(data), len(models[level][number]), stated))
+        chunks.append(Chunk(low, high, tuple(levels), owners[number]))
+    return files, _make_manifest(parts, chunks, Capture(facts), name, config)
+
+
+def _read_parts(
+    path: Path, shared_names: Sequence[str], chunk_gaussians: int
+) -> tuple[HybridModel | MergedModel, list[_Part]]:
+    """Read a file; return its model and its parts, each divided into chunks. A single model is the only part.
+
+    Raises:
+        HyrfError: the file cannot be read, holds no Gaussian or a model with residuals, or mixes models that are
+            antialiased and others.
+    """
+    with Container.open(path, SECTION_CONTENTS) as container:
+        decoded = decode_parts(container)
+        if not len(decoded):
+            raise HyrfError(f"{path}: there is no Gaussian in it, so there is nothing to split", fix="train it again")
+        models, parts = parts_of(decoded), []
+        for number, (name, part) in enumerate(list_parts(container)):
+            if models[number].config.residual_degree is not None:
+                raise HyrfError(
+                    f"{part.name}: a model with residuals cannot be split into levels of detail",
+                    fix="import the splats again with a `psnr` below 38 dB",
+                )
+            encoder = ChunkEncoder(part, models[number], shared_names[number])
+            parts.append(_Part.of(name, encoder, chunk_gaussians))
+    return decoded, parts
+
+
+def _list_cameras(facts: dict) -> list[Camera]:
+    """Return the cameras of all parts of a file, without repetitions; an orbit around the scene if none are known."""
+    captures = [capture for capture in map(Capture, facts.get("parts", [facts])) if not capture.is_synthetic]
+    if not captures:
+        return Capture(facts).cameras
+    cameras = [camera for capture in captures for camera in capture.cameras]
+    return list({tuple(camera_to_numbers(camera)): camera for camera in cameras}.values())
 
 
 def _make_level(
-    model: HybridModel,
-    geometry: Geometry,
-    groups: Sequence[np.ndarray],
+    parts: Sequence[_Part],
+    owners: Sequence[int],
+    whole: HybridModel | MergedModel,
     cameras: Sequence[Camera],
     level: int,
     config: SplitConfig,
     progress: Progress,
 ) -> list[HybridModel]:
     """Return the model of each chunk at a coarse level."""
-    frame = model.config.frame
     places = [camera.position for camera in sample_views(cameras, MERGE_VIEWPOINTS, config.seed)[0]]
-    viewpoints = [tensor_like(frame.to_local(place).tolist(), model.gaussians.positions) for place in places]
     merged = []
-    for group in groups:
-        index = torch.from_numpy(group)
-        count = max(1, len(group) // LEVEL_RATIO**level)
-        merged.append(model.with_gaussians(merge_gaussians(model.subset(index), geometry[index], viewpoints, count)))
-    joined = join_chunks(model, merged)
+    for part in parts:
+        model, frame = part.model, part.model.config.frame
+        viewpoints = [tensor_like(frame.to_local(place).tolist(), model.gaussians.positions) for place in places]
+        for group in part.groups:
+            index = torch.from_numpy(group)
+            count = max(1, len(group) // LEVEL_RATIO**level)
+            gaussians = merge_gaussians(model.subset(index), part.geometry[index], viewpoints, count)
+            merged.append(model.with_gaussians(gaussians))
+    joined = join_parts([part.name for part in parts], [part.model for part in parts], merged, owners)
     share = LEVEL_RATIO ** (-level / 2)
-    views = [resize_camera(camera, share) for camera in _refit_views(cameras, config.seed)]
-    refit_level(joined, model, views, config.refit_steps, config.seed, progress)
-    ends = np.cumsum([len(each) for each in merged])
-    return [joined.subset(torch.arange(end - len(each), end)) for each, end in zip(merged, ends.tolist(), strict=True)]
+    count = min(REFIT_CAMERAS * len(parts), MAX_REFIT_CAMERAS)
+    views = [resize_camera(camera, share) for camera in _refit_views(cameras, count, config.seed)]
+    refit_level(joined, whole, views, config.refit_steps * len(parts), config.seed, progress)
+    fitted = []
+    for number, model in enumerate(parts_of(joined)):
+        counts = [len(chunk) for chunk, owner in zip(merged, owners, strict=True) if owner == number]
+        fitted += [model.subset(index) for index in torch.arange(len(model)).split(counts)]
+    return fitted
 
 
-def _refit_views(cameras: Sequence[Camera], seed: int) -> list[Camera]:
-    """Return views at cameras, and for each of them several between it and its neighbours."""
-    at, between = sample_views(cameras, REFIT_CAMERAS, seed)
-    more = [sample_views(cameras, REFIT_CAMERAS, seed + _SEED_STEP * number)[1] for number in range(1, REFIT_BETWEEN)]
+def _refit_views(cameras: Sequence[Camera], count: int, seed: int) -> list[Camera]:
+    """Return views at `count` cameras, and for each of them several between it and its neighbours."""
+    at, between = sample_views(cameras, count, seed)
+    more = [sample_views(cameras, count, seed + _SEED_STEP * number)[1] for number in range(1, REFIT_BETWEEN)]
     return [*at, *between, *(view for views in more for view in views)]
 
 
-def _decode(data: bytes, encoder: ChunkEncoder, model: HybridModel) -> HybridModel:
+def _decode(data: bytes, encoder: ChunkEncoder) -> HybridModel:
     """Return the model of a chunk as readers will decode it."""
     container = read_container(data, SECTION_CONTENTS)
     container.open_file = lambda name: read_container(encoder.shared_bytes, SECTION_CONTENTS, name)
-    return decode_container(container, model)
+    return decode_container(container, encoder.model)
 
 
-def _measure_boxes(
-    model: HybridModel, groups: Sequence[np.ndarray]
-) -> list[tuple[tuple[float, float, float], tuple[float, float, float]]]:
-    """Return the corners of the box of each group of Gaussians in world units, three standard deviations included."""
-    frame = model.config.frame
-    means = frame.to_world(model.gaussians.positions.numpy())
-    reach = _SIGMAS * frame.scale * model.decode_geometry().scales.amax(dim=1).double().numpy()
+def _measure_boxes(part: _Part) -> list[tuple[tuple[float, float, float], tuple[float, float, float]]]:
+    """Return the corners of the box of each chunk of a part in world units, three standard deviations included."""
+    frame = part.model.config.frame
+    means = frame.to_world(part.model.gaussians.positions.numpy())
+    reach = _SIGMAS * frame.scale * part.geometry.scales.amax(dim=1).double().numpy()
     boxes = []
-    for group in groups:
+    for group in part.groups:
         low = (means[group] - reach[group, None]).min(axis=0)
         high = (means[group] + reach[group, None]).max(axis=0)
         boxes.append((_rounded(low), _rounded(high)))
@@ -253,14 +326,16 @@ def _checksum(data: bytes) -> str:
 
 
 def _make_manifest(
-    encoder: ChunkEncoder, chunks: list[Chunk], capture: Capture, name: str, config: SplitConfig
+    parts: Sequence[_Part], chunks: list[Chunk], capture: Capture, name: str, config: SplitConfig
 ) -> Manifest:
-    model, shared = encoder.model, encoder.shared_bytes
-    values = model.config.to_dict()
+    values = parts[0].model.config.to_dict()
+    encoders = [part.encoder for part in parts]
+    shared = [(encoder.shared_name, len(encoder.shared_bytes), _checksum(encoder.shared_bytes)) for encoder in encoders]
+    names = [part.name for part in parts] if len(parts) > 1 else [ONE_PART_NAME]
     cameras = [] if capture.is_synthetic else evenly_spaced(capture.cameras, MAX_COARSE_CAMERAS)
     return Manifest(
-        gaussians=len(model),
-        shared=SceneFile(SHARED_NAME, len(shared), _checksum(shared)),
+        gaussians=sum(len(part.model) for part in parts),
+        parts=tuple(ScenePart(*file, name) for file, name in zip(shared, names, strict=True)),
         chunks=tuple(chunks),
         error_radii=ERROR_RADII,
         frame=values["frame"],

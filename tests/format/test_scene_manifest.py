@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from copy import deepcopy
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +15,13 @@ from json_schema import matches
 
 from hyrfpack.errors import HyrfFormatError
 from hyrfpack.format import scene_manifest
-from hyrfpack.format.scene_manifest import Chunk, ChunkLevel, Manifest, SceneFile, parse_manifest
+from hyrfpack.format.scene_manifest import Chunk, ChunkLevel, Manifest, ScenePart, parse_manifest
 from hyrfpack.format.shared import is_file_name
 
 MANIFEST_SCHEMA = json.loads(Path(scene_manifest.__file__).with_name("scene.schema.json").read_text())
 VALID_MANIFEST = Manifest(
     gaussians=7,
-    shared=SceneFile("shared.hyrf", 1000, "0123abcd"),
+    parts=(ScenePart("shared.hyrf", 1000, "0123abcd"),),
     chunks=(
         Chunk(
             (-1.0, 0.0, 2.5),
@@ -42,10 +43,16 @@ VALID_MANIFEST = Manifest(
     writer="hyrfpack",
 )
 
+PARTS_MANIFEST = replace(
+    VALID_MANIFEST,
+    parts=(ScenePart("a.hyrf", 1000, "0123abcd", "house"), ScenePart("c.hyrf", 900, "00112233", "gard\u00e9n")),
+    chunks=tuple(replace(chunk, part=number) for number, chunk in enumerate(VALID_MANIFEST.chunks)),
+)
 
-def with_value(path: list[Any], value: Any) -> bytes:
-    """Return the text of VALID_MANIFEST with another value at a path of keys and places."""
-    values = json.loads(VALID_MANIFEST.to_json())
+
+def with_value(path: list[Any], value: Any, manifest: Manifest = VALID_MANIFEST) -> bytes:
+    """Return the text of a manifest with another value at a path of keys and places."""
+    values = json.loads(manifest.to_json())
     inner = values
     for key in path[:-1]:
         inner = inner[key]
@@ -53,18 +60,26 @@ def with_value(path: list[Any], value: Any) -> bytes:
     return json.dumps(values).encode()
 
 
-def test_a_manifest_is_read_as_it_was_written():
-    assert parse_manifest(VALID_MANIFEST.to_json()) == VALID_MANIFEST
+@pytest.mark.parametrize(("manifest", "version"), [(VALID_MANIFEST, "1.0"), (PARTS_MANIFEST, "2.0")])
+def test_a_manifest_is_read_as_it_was_written_and_matches_the_schema(manifest, version):
+    values = json.loads(manifest.to_json())
+
+    assert parse_manifest(manifest.to_json()) == manifest
+    assert values["version"] == version and matches(values, MANIFEST_SCHEMA)
 
 
-def test_a_written_manifest_matches_the_schema():
-    assert matches(json.loads(VALID_MANIFEST.to_json()), MANIFEST_SCHEMA)
+def test_a_manifest_of_one_part_has_the_keys_of_version_1_alone():
+    values = json.loads(VALID_MANIFEST.to_json())
+
+    assert set(values["shared"]) == {"file", "bytes", "crc32"} and "parts" not in values
+    assert all(set(chunk) == {"low", "high", "levels"} for chunk in values["chunks"])
 
 
-def test_unknown_keys_and_a_later_minor_version_are_accepted():
-    values = json.loads(VALID_MANIFEST.to_json()) | {"version": "1.7", "sky": "blue"}
+@pytest.mark.parametrize(("manifest", "version"), [(VALID_MANIFEST, "1.7"), (PARTS_MANIFEST, "2.7")])
+def test_unknown_keys_and_a_later_minor_version_are_accepted(manifest, version):
+    values = json.loads(manifest.to_json()) | {"version": version, "sky": "blue"}
 
-    assert parse_manifest(json.dumps(values).encode()) == VALID_MANIFEST
+    assert parse_manifest(json.dumps(values).encode()) == manifest
 
 
 @pytest.mark.parametrize(
@@ -94,7 +109,8 @@ def test_a_name_that_leads_out_of_the_folder_is_refused(name):
 @pytest.mark.parametrize(
     ("path", "value", "problem"),
     [
-        (["version"], "2.0", "version 2.0 and this hyrfpack reads version 1"),
+        (["version"], "3.0", "version 3.0 and this hyrfpack reads versions 1 and 2"),
+        (["version"], "2.0", "'parts' must be of type list"),
         (["version"], None, "no version"),
         (["format"], "other", "not the manifest of a scene folder"),
         (["gaussians"], 8, "do not add up to 8"),
@@ -117,6 +133,27 @@ def test_a_manifest_with_an_impossible_value_is_refused(path, value, problem):
 
 
 @pytest.mark.parametrize(
+    ("path", "value", "problem"),
+    [
+        (["version"], "1.0", "'shared' must be of type dict"),
+        (["parts"], [], "'parts' has 0 entries"),
+        (["parts"], [json.loads(PARTS_MANIFEST.to_json())["parts"][0]], "'parts' has 1 entries"),
+        (["parts", 1], "c.hyrf", "a part is no object"),
+        (["parts", 1, "name"], "house", "two parts have the same name"),
+        (["parts", 1, "name"], "", "is no name of a part"),
+        (["parts", 1, "file"], "../c.hyrf", "is not the name of a .hyrf file in the folder"),
+        (["parts", 1, "file"], "B.hyrf", "two files are named 'b.hyrf'"),
+        (["chunks", 0, "part"], 2, "a chunk belongs to part 2, and there are 2 parts"),
+        (["chunks", 0, "part"], -1, "'part' is out of range"),
+        (["chunks", 0, "part"], None, "'part' must be of type int"),
+    ],
+)
+def test_a_manifest_with_an_impossible_part_is_refused(path, value, problem):
+    with pytest.raises(HyrfFormatError, match=problem):
+        parse_manifest(with_value(path, value, PARTS_MANIFEST))
+
+
+@pytest.mark.parametrize(
     "data", [b"", b"[]", b"{}", b"[" * 5000, b'{"format": NaN}', b"\xff\xfe", VALID_MANIFEST.to_json()[:-20]]
 )
 def test_a_text_that_is_no_manifest_is_refused(data):
@@ -136,10 +173,18 @@ def list_paths(value: Any, path: tuple = ()) -> list[tuple]:
     return [path] * bool(path) + [found for key, item in inner for found in list_paths(item, (*path, key))]
 
 
+CHANGES = [
+    (manifest, path)
+    for manifest in (VALID_MANIFEST, PARTS_MANIFEST)
+    for path in list_paths(json.loads(manifest.to_json()))
+]
+
+
 @settings(deadline=None)
-@given(st.sampled_from(list_paths(json.loads(VALID_MANIFEST.to_json()))), JSON_VALUES)
-def test_any_change_of_a_value_gives_a_valid_manifest_or_a_format_error(path, value):
-    data = with_value(list(path), deepcopy(value))
+@given(st.sampled_from(CHANGES), JSON_VALUES)
+def test_any_change_of_a_value_gives_a_valid_manifest_or_a_format_error(change, value):
+    manifest, path = change
+    data = with_value(list(path), deepcopy(value), manifest)
     try:
         parsed = parse_manifest(data)
     except HyrfFormatError:

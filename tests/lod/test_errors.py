@@ -7,7 +7,7 @@ import pytest
 import torch
 from scenes import ball_points, camera_at, ring, small_model
 
-from hyrfpack.format.scene_manifest import Chunk, ChunkLevel, Manifest, SceneFile
+from hyrfpack.format.scene_manifest import Chunk, ChunkLevel, Manifest, ScenePart
 from hyrfpack.format.scene_model import join_chunks
 from hyrfpack.lod import errors
 from hyrfpack.lod.errors import ERROR_RADII, measure_level_errors, resize_camera
@@ -33,7 +33,7 @@ def manifest_of(measured: np.ndarray) -> Manifest:
         return ChunkLevel(f"{chunk}-{number}.hyrf", 1, "0" * 8, 1, tuple(measured[number, chunk]))
 
     chunks = tuple(Chunk(LOW, HIGH, (level(0, chunk), level(1, chunk))) for chunk in range(2))
-    return Manifest(2, SceneFile("s.hyrf", 1, "0" * 8), chunks, ERROR_RADII, {}, False, (0.0, 0.0, 0.0))
+    return Manifest(2, (ScenePart("s.hyrf", 1, "0" * 8),), chunks, ERROR_RADII, {}, False, (0.0, 0.0, 0.0))
 
 
 def test_predictions_add_up_to_the_error_of_the_measured_views(monkeypatch):
@@ -48,6 +48,18 @@ def test_predictions_add_up_to_the_error_of_the_measured_views(monkeypatch):
     predicted = [sum(chunk[1] for chunk in predict_errors(manifest_of(measured), camera)) for camera in cameras]
     assert (measured[0] == 0).all() and (measured[1] > 0).all()
     assert np.mean(predicted) == pytest.approx(np.mean(actual), rel=0.25)
+
+
+def test_chunks_of_two_parts_have_the_errors_of_chunks_of_one(monkeypatch):
+    """So each part is seen among the Gaussians of the other one."""
+    monkeypatch.setattr(errors, "RESOLUTION_SHARES", (1.0,))
+    levels, cameras = make_levels(), ring(2, radius=4.0, width=48, height=48)
+    spheres = [(Chunk(LOW, HIGH, ()).center, Chunk(LOW, HIGH, ()).radius)] * 2
+
+    together = measure_level_errors(levels, spheres, cameras)
+    parts = measure_level_errors(levels, spheres, cameras, fields=[levels[0][0]] * 2, parts=[0, 1])
+
+    np.testing.assert_allclose(parts, together, rtol=1e-3)
 
 
 def test_a_resized_camera_sees_the_same_view():

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import camera_at
 
-from hyrfpack.format.scene_manifest import Chunk, ChunkLevel, Manifest, SceneFile
+from hyrfpack.format.scene_manifest import Chunk, ChunkLevel, Manifest, ScenePart
 from hyrfpack.lod.select import choose_levels, predict_errors, project_sphere, select_levels
 
 pytestmark = pytest.mark.unit
@@ -50,8 +50,8 @@ def make_manifest(*centers) -> Manifest:
         ChunkLevel("{}-1.hyrf", 300, "0" * 8, 25, (0.001, 0.009)),
     )
     chunks = tuple(Chunk(tuple(np.add(c, -0.5)), tuple(np.add(c, 0.5)), levels) for c in centers)
-    shared = SceneFile("shared.hyrf", 50, "0" * 8)
-    return Manifest(100 * len(chunks), shared, chunks, (10.0, 1000.0), {}, False, (0.0, 0.0, 0.0))
+    shared = ScenePart("shared.hyrf", 50, "0" * 8)
+    return Manifest(100 * len(chunks), (shared,), chunks, (10.0, 1000.0), {}, False, (0.0, 0.0, 0.0))
 
 
 def test_a_nearer_chunk_is_refined_first_and_one_behind_the_camera_never():

@@ -296,11 +296,7 @@ def test_a_scene_json_of_another_program_makes_no_scene(tmp_path):
         SceneFolder(tmp_path)
 
 
-def test_merged_files_and_scenes_are_refused_as_sources(folder, tmp_path):
-    merged = tmp_path / "two.hyrf"
-    merged.write_bytes(encode_parts([("a", COMPACT.read_bytes()), ("b", COMPACT.read_bytes())]))
-
-    assert "holds merged models" in refused("split", merged, "-o", tmp_path / "scene")
+def test_a_scene_is_refused_as_a_source(folder, tmp_path):
     assert "a scene of several files already" in refused("split", folder, "-o", tmp_path / "scene")
     assert not (tmp_path / "scene").exists()
 

@@ -79,6 +79,8 @@ GOLDEN_PARTS = {"scene": "v1.2_compact_exposure", "turned": "v1.3_compact_rotate
 GOLDEN_MERGED_FILE = GOLDEN_FOLDER / "merged" / "v1.4_merged.hyrf"
 # A scene folder of one chunk, made of a golden file.
 GOLDEN_SCENE_SOURCE, GOLDEN_SCENE_FOLDER = "v1.2_compact_exposure", GOLDEN_FOLDER / "scene"
+# A scene folder of several parts, each with one chunk, made of the merged golden file.
+GOLDEN_PARTS_SCENE_FOLDER = GOLDEN_FOLDER / "parts_scene"
 
 
 def make_golden_model(rotation: Quaternion = IDENTITY) -> HybridModel:
@@ -213,9 +215,14 @@ def main() -> None:
         GOLDEN_MERGED_FILE.parent.mkdir(exist_ok=True)
         GOLDEN_MERGED_FILE.write_bytes(encode_golden_parts())
         print(f"{GOLDEN_MERGED_FILE}: {GOLDEN_MERGED_FILE.stat().st_size} bytes")
-    if not GOLDEN_SCENE_FOLDER.exists():
-        report = split_model(GOLDEN_FOLDER / f"{GOLDEN_SCENE_SOURCE}.hyrf", GOLDEN_SCENE_FOLDER, SplitConfig(levels=1))
-        print(f"{GOLDEN_SCENE_FOLDER}: {report.bytes} bytes")
+    scenes = {
+        GOLDEN_SCENE_FOLDER: GOLDEN_FOLDER / f"{GOLDEN_SCENE_SOURCE}.hyrf",
+        GOLDEN_PARTS_SCENE_FOLDER: GOLDEN_MERGED_FILE,
+    }
+    for folder, source in scenes.items():
+        if not folder.exists():
+            report = split_model(source, folder, SplitConfig(levels=1))
+            print(f"{folder}: {report.bytes} bytes")
 
 
 if __name__ == "__main__":

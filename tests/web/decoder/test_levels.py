@@ -16,7 +16,7 @@ from scenes import camera_at
 from web.scripts import run_script
 
 from hyrfpack.cameras.files import camera_to_json
-from hyrfpack.format.scene_manifest import Chunk, ChunkLevel, Manifest, SceneFile, parse_manifest
+from hyrfpack.format.scene_manifest import Chunk, ChunkLevel, Manifest, ScenePart, parse_manifest
 from hyrfpack.lod.select import predict_errors, select_levels
 from tools.safety.make_golden import GOLDEN_SCENE_FOLDER
 
@@ -83,7 +83,9 @@ def random_manifest(rng: np.random.Generator) -> Manifest:
             levels.append(ChunkLevel(name, size, "0123abcd", max(1, gaussians >> (2 * level)), errors))
         chunks.append(Chunk(tuple(low), tuple(low + rng.uniform(0, 10, 3)), tuple(levels)))
     count = sum(chunk.levels[0].gaussians for chunk in chunks)
-    return Manifest(count, SceneFile("shared.hyrf", 500, "0123abcd"), tuple(chunks), radii, {}, False, (0.0, 0.0, 0.0))
+    return Manifest(
+        count, (ScenePart("shared.hyrf", 500, "0123abcd"),), tuple(chunks), radii, {}, False, (0.0, 0.0, 0.0)
+    )
 
 
 def test_the_selection_is_that_of_python(tmp_path: Path):
@@ -120,7 +122,7 @@ def test_levels_that_are_not_available_are_left_out(tmp_path: Path):
     """The best choice among the rest, by trying all, is at most the stated gap better."""
     rng = np.random.default_rng(1)
     camera = camera_at((0, -30, 0), width=200, height=150, focal=300)
-    files = SceneFile("shared.hyrf", 500, "0123abcd")
+    files = (ScenePart("shared.hyrf", 500, "0123abcd"),)
     chunks = tuple(chunk for _ in range(4) for chunk in random_manifest(rng).chunks[:1])
     names = [f"{number}.hyrf" for number in range(sum(len(chunk.levels) for chunk in chunks))]
     chunks = tuple(
