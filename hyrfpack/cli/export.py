@@ -46,7 +46,7 @@ crop_option = click.option(
     metavar="FILE",
     help="File or folder to write. Its extension names the format.",
 )
-@settings_options(ExportConfig, "baked", "colmap")
+@settings_options(ExportConfig, "baked", "colmap", "streamed_sog")
 @click.option(
     "--sh-degree",
     "degree",
@@ -93,10 +93,11 @@ def export(
       .mesh.glb .mesh.ply .obj .stl                   the surface as triangles with vertex colours
       .collision.glb .collision.obj .collision.stl    a closed mesh of few triangles for physics engines
       .json, or a folder with --colmap                cameras: transforms.json, or a COLMAP model
+      a folder with --streamed-sog                    levels of detail that PlayCanvas streams
 
     Several models exported to a folder make a gallery. Without a model, the folder gets a player that opens the files
-    that are dropped on it. Splats (.ply .spz .splat .sog) can be exported to a player folder, too. Axes and units are
-    those of the photos' poses.
+    that are dropped on it. Splats (.ply .spz .splat .sog) can be exported to a player folder, too. Levels of detail
+    come from a scene folder ('hyrfpack split'). Axes and units are those of the photos' poses.
 
     \b
     Examples:
@@ -108,6 +109,7 @@ def export(
       hyrfpack export bonsai.hyrf -o table.glb --crop -1,-1,-1,1,1,1
       hyrfpack export bonsai.hyrf -o bonsai.mesh.glb --faces 200000
       hyrfpack export bonsai.hyrf -o bonsai.collision.glb
+      hyrfpack export bonsai-scene -o streamed/ --streamed-sog
     """
     from hyrfpack.export import export_model as write
     from hyrfpack.export.folder import check_folder, export_gallery, export_player
@@ -116,7 +118,7 @@ def export(
     from hyrfpack.splats.names import is_splats
 
     config = ExportConfig(**settings)
-    kind = find_file_kind(output, config.colmap)
+    kind = find_file_kind(output, config)
     if len(models) != 1 and kind is not PLAYER_FOLDER:
         what = "there is no MODEL to write" if not models else "several models make a gallery, which is a folder"
         raise HyrfError(f"{output}: {what}", fix="name one MODEL")
@@ -136,7 +138,7 @@ def export(
     if kind is PLAYER_FOLDER:
         check_folder(output, models, scenes, overwrite=overwrite, is_gallery=len(models) > 1)
     else:
-        check_place(output, Outputs(*files, scene=scenes[0] if scenes else None, overwrite=overwrite), config.colmap)
+        check_place(output, Outputs(*files, scene=scenes[0] if scenes else None, overwrite=overwrite), config)
     if len(models) > 1:
         report = export_gallery(
             models,
@@ -194,14 +196,15 @@ def _print_report(report: ExportReport) -> None:
         )
         return
     ending = Path(report.file).suffix
+    written, rounding = ("folder, finest level", "the format") if report.chunks else (f"{ending} file", ending)
     if report.views:
         rows = [
             [f"baked to harmonics of degree {report.degree}, before writing", f"{report.psnr_baked:.2f}"],
-            [f"read back from the {ending} file", f"{report.psnr:.2f}"],
+            [f"read back from the {written}", f"{report.psnr:.2f}"],
         ]
         click.echo(format_table([f"against renders of the model, {report.views} views", "PSNR (dB)"], rows))
         click.echo(
-            f"the first row shows the loss by baking, the second the loss by baking and by the rounding of {ending} "
+            f"the first row shows the loss by baking, the second the loss by baking and by the rounding of {rounding} "
             "together; neither compares with photos"
         )
     if report.psnr_by_exposure:
@@ -212,6 +215,9 @@ def _print_report(report: ExportReport) -> None:
     mesh = f", {report.vertices:,} vertices, {report.faces:,} triangles" if report.faces else ""
     voxels = f", voxels of {report.voxel:.4g} units" if report.voxel else ""
     click.echo(f"{report.file}: {report.bytes:,} bytes{holds}{cameras}{mesh}{voxels}")
+    if report.chunks:
+        levels = ", ".join(f"{count:,}" for count in report.level_gaussians)
+        click.echo(f"{report.chunks:,} chunks; Gaussians at each level, without the background: {levels}")
     if report.surface_to_mesh and report.mesh_to_surface and report.wall:
         ways = {"surface to mesh": report.surface_to_mesh, "mesh to surface": report.mesh_to_surface}
         rows = [[way, *(f"{distance:.4g}" for distance in distances)] for way, distances in ways.items()]

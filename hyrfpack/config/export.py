@@ -53,6 +53,7 @@ class ExportConfig(ConvertConfig):
         exposure: exposure of baked splats: each as bright as in the photos that see it (local), or one exposure for all
             (consistent). A model without an exposure map gives the same splats with both.
         colmap: write a folder with a COLMAP model: cameras, and centres as points.
+        streamed_sog: write a folder with the levels of detail of a scene folder as PlayCanvas' Streamed SOG.
         title: title of a page, a player or a gallery. Default: the name of its file or folder.
         credit: text below the title of a page or a player, such as the author and the licence.
         editable: include a panel in a page or a player that crops, cleans, turns and measures the scene.
@@ -65,6 +66,7 @@ class ExportConfig(ConvertConfig):
     baked: bool = False
     exposure: Annotated[str, OneOf(SPLAT_EXPOSURES)] = LOCAL_EXPOSURE
     colmap: bool = False
+    streamed_sog: bool = False
     title: str | None = None
     credit: str = ""
     editable: bool = False

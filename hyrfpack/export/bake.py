@@ -92,13 +92,8 @@ def bake(
     for name, values in {**vars(geometry), "positions": positions, "scales": scales}.items():
         check_finite(name, values)
     visibility = compute_visibility(model, cameras) if visibility is None else visibility
-    light, culled_light = torch.zeros(2, len(model), dtype=torch.float64)
-    for view in visibility:
-        light[view.index] += view.light
-        culled_light[view.culled_index] += view.culled_light
-    share = culled_light / (light + culled_light).clamp_min(torch.finfo().tiny)
-    opacities = geometry.opacities * (1 - share.float().square())
-    keep = ((share == 0) | (opacities >= ALPHA_MIN)).numpy()
+    light, culled_light = _sum_light(len(model), visibility)
+    opacities, keep = _correct_opacities(geometry.opacities, light, culled_light)
 
     frame = model.config.frame
     shared = (
@@ -118,6 +113,28 @@ def bake(
         splats = replace(splats, positions=splats.positions + np.array(frame.center))
         baked[degree] = splats if keep.all() else splats[keep]
     return baked
+
+
+@torch.no_grad()
+def kept_mask(model: HybridModel, visibility: Sequence[CameraVisibility]) -> np.ndarray:
+    """Return a mask (N,) of the Gaussians that `bake` keeps, given the result of `compute_visibility`."""
+    return _correct_opacities(model.decode_geometry().opacities, *_sum_light(len(model), visibility))[1]
+
+
+def _sum_light(count: int, visibility: Sequence[CameraVisibility]) -> tuple[Tensor, Tensor]:
+    """Return the light (N,) that each Gaussian sends to all cameras, and that of cameras that cull it."""
+    light, culled_light = torch.zeros(2, count, dtype=torch.float64)
+    for view in visibility:
+        light[view.index] += view.light
+        culled_light[view.culled_index] += view.culled_light
+    return light, culled_light
+
+
+def _correct_opacities(opacities: Tensor, light: Tensor, culled_light: Tensor) -> tuple[Tensor, np.ndarray]:
+    """Return the opacities (N,) corrected for culling, see `bake`, and a mask of the Gaussians that stay visible."""
+    share = culled_light / (light + culled_light).clamp_min(torch.finfo().tiny)
+    corrected = opacities * (1 - share.float().square())
+    return corrected, ((share == 0) | (corrected >= ALPHA_MIN)).numpy()
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,10 @@ import numpy as np
 from hyrfpack.choices import CONSISTENT_EXPOSURE, LOCAL_EXPOSURE, SPLAT_EXPOSURES
 from hyrfpack.config.export import ExportConfig
 from hyrfpack.export.background import background_picture, background_splats
+from hyrfpack.export.bake import kept_mask
 from hyrfpack.export.bake_parts import PartsVisibility, bake_parts, compute_parts_visibility
 from hyrfpack.export.degree import choose_degree
-from hyrfpack.export.kinds import HTML_PAGE, POSITION_KINDS, includes_background, select_splats
+from hyrfpack.export.kinds import HTML_PAGE, POSITION_KINDS, includes_background, selection_mask
 from hyrfpack.export.source import Source
 from hyrfpack.model import HybridModel
 from hyrfpack.model.merged import map_parts, parts_of, scene_of
@@ -34,6 +35,7 @@ class BakedScene:
     Attributes:
         source: the model with the exposure of the splats, and its cameras.
         splats: the splats, those of the background last.
+        index: (n,) indices of the model's Gaussians that all splats but those of the background stand for.
         background_count: number of splats that represent the background.
         picture: (H, 2H, 3) picture of the background, for kinds of files that hold one, else None.
         sphere: whether the background is included.
@@ -45,6 +47,7 @@ class BakedScene:
 
     source: Source
     splats: Splats
+    index: np.ndarray
     background_count: int
     picture: np.ndarray | None
     sphere: bool
@@ -119,13 +122,16 @@ def _bake_at(
     """Bake a model at a degree, select splats, and add the background."""
     splats = bake_parts(loaded.drawn, loaded.fit_cameras, (degree,), visibility, progress)[degree]
     sphere = includes_background(loaded, kind, config)
-    splats, picture, background_count = select_splats(splats, config.crop, config.min_opacity), None, 0
+    kept = [kept_mask(part, views) for part, views in zip(parts_of(loaded.drawn), visibility, strict=True)]
+    selected = selection_mask(splats.positions, splats.opacities, config.crop, config.min_opacity)
+    index = np.flatnonzero(np.concatenate(kept))[selected]
+    splats, picture, background_count = splats if selected.all() else splats[selected], None, 0
     if sphere and kind is HTML_PAGE:
         picture = background_picture(loaded.model, cameras=loaded.fit_cameras, visibility=visibility[0])
     elif sphere:
         distant = background_splats(loaded.model, loaded.fit_cameras, kind.max_scale, visibility[0])
         splats, background_count = concatenate((splats, distant)), len(distant)
-    return BakedScene(loaded, splats, background_count, picture, sphere, degree)
+    return BakedScene(loaded, splats, index, background_count, picture, sphere, degree)
 
 
 def _without_exposure_map(loaded: Source) -> Source:

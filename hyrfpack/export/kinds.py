@@ -37,32 +37,46 @@ COLLISION_FILES = tuple(
 COLMAP_FOLDER = FileKind(ending="", max_degree=0, module="pycolmap")
 POSITION_KINDS = (COLMAP_FOLDER, *POINT_FILES)  # these hold the centres of Gaussians, and cameras
 PLAYER_FOLDER = FileKind(ending="")
+STREAMED_SOG_FOLDER = FileKind(ending="lod-meta.json", stores_antialiased=True)  # the folder's index
+LEVEL_FOLDERS = (STREAMED_SOG_FOLDER,)  # levels of detail, of a scene folder
 _FILE_KINDS = (*POINT_FILES, *COLLISION_FILES, *MESH_FILES, *FORMATS.values(), HTML_PAGE, TRANSFORMS_JSON)
 _KINDS_BY_ENDING = {kind.ending: kind for kind in _FILE_KINDS}
 EXPORT_ENDINGS = tuple(_KINDS_BY_ENDING)
+# Kinds of folders by the settings of `ExportConfig` that name them.
+_FOLDERS_BY_SETTING = {"colmap": COLMAP_FOLDER, "streamed_sog": STREAMED_SOG_FOLDER}
 
 
 def find_file_kind(
-    target: str | os.PathLike[str], colmap: bool = False, *, other_endings: tuple[str, ...] = ()
+    target: str | os.PathLike[str],
+    config: ExportConfig = ExportConfig(),  # noqa: B008 - frozen
+    *,
+    other_endings: tuple[str, ...] = (),
 ) -> FileKind:
     """Find the kind of file that the ending of `target` names; a folder or a name without ending means a player.
 
     Args:
         target: path of the output.
-        colmap: the output is a folder with a COLMAP model.
+        config: settings of the export, which can name a kind of folder.
         other_endings: further endings that the caller accepts, to be named in the error message.
 
     Raises:
-        HyrfError: the ending is none of EXPORT_ENDINGS, contradicts `colmap`, or is ".collision" and another format.
+        HyrfError: the ending is none of EXPORT_ENDINGS, contradicts the kind of folder that `config` names, or is
+            ".collision" and another format; or `config` names two kinds of folders.
     """
     name = Path(target).name.lower()
-    if colmap:
+    asked = [(setting, kind) for setting, kind in _FOLDERS_BY_SETTING.items() if getattr(config, setting)]
+    if len(asked) > 1:
+        raise HyrfError(
+            f"{target}: one export writes one kind of folder",
+            fix="give only one of " + " and ".join(f"`{setting}=True`" for setting, _ in asked),
+        )
+    for setting, kind in asked:
         if name.endswith(EXPORT_ENDINGS) and not os.path.isdir(target):
             raise HyrfError(
-                f"{target}: a COLMAP model is a folder of tables, not a file",
-                fix="use a path without a file extension with `colmap=True`",
+                f"{target}: this format is a folder of files, not one file",
+                fix=f"use a path without a file extension with `{setting}=True`",
             )
-        return COLMAP_FOLDER
+        return kind
     if name.endswith(".compressed.ply"):
         raise HyrfError(
             f"{target}: compressed PLY is read, not written",
@@ -94,6 +108,11 @@ def check_request(kind: FileKind, target: str | os.PathLike[str], config: Export
         raise HyrfError(
             f"{target}: this file holds only cameras, so that Gaussians cannot be selected",
             fix="leave out `crop` and `min_opacity`",
+        )
+    if kind in LEVEL_FOLDERS and (config.crop is not None or config.min_opacity > 0):
+        raise HyrfError(
+            f"{target}: levels of detail stand for all Gaussians, so that none can be left out",
+            fix="leave out `crop` and `min_opacity`; select Gaussians with 'hyrfpack edit' and split its result",
         )
     is_mesh = kind in (*MESH_FILES, *COLLISION_FILES)
     if not is_mesh and (config.voxel is not None or config.faces is not None):
@@ -145,10 +164,17 @@ def check_package(kind: FileKind, target: str | os.PathLike[str]) -> None:
             import_module(kind.module)
 
 
-def check_place(target: str | os.PathLike[str], outputs: Outputs, colmap: bool = False) -> None:
+def check_place(
+    target: str | os.PathLike[str],
+    outputs: Outputs,
+    config: ExportConfig = ExportConfig(),  # noqa: B008 - frozen
+) -> None:
     """Check that a target other than a player's folder may be written. Raises HyrfError otherwise."""
-    if find_file_kind(target, colmap) is COLMAP_FOLDER:
+    kind = find_file_kind(target, config)
+    if kind is COLMAP_FOLDER:
         outputs.folder(target, COLMAP_FILES)
+    elif kind in LEVEL_FOLDERS:
+        outputs.folder(target, [kind.ending])  # names of further files follow from the bake
     else:
         outputs.file(target)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 
 from hyrfpack.atomic import write_atomic
@@ -19,6 +20,7 @@ from hyrfpack.export.kinds import (
     COLLISION_FILES,
     COLMAP_FOLDER,
     HTML_PAGE,
+    LEVEL_FOLDERS,
     MESH_FILES,
     PLAYER_FOLDER,
     POSITION_KINDS,
@@ -28,14 +30,16 @@ from hyrfpack.export.kinds import (
     check_request,
     find_file_kind,
 )
+from hyrfpack.export.levels import bake_levels, open_levels
 from hyrfpack.export.meshes import write_collision_mesh, write_mesh
 from hyrfpack.export.pages import encode_baked_page, write_native_page
 from hyrfpack.export.points import encode_points
 from hyrfpack.export.report import ExportReport
 from hyrfpack.export.scores import measure_export
 from hyrfpack.export.source import Source
+from hyrfpack.export.streamed_sog import write_streamed_sog
 from hyrfpack.format import find_model
-from hyrfpack.format.scene_folder import single_file
+from hyrfpack.format.scene_folder import SceneFolder, single_file
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.outputs import Outputs
 from hyrfpack.progress import Progress, TaskEvent, part_of_progress
@@ -69,6 +73,8 @@ def export_model(
       engines (needs scikit-image and fast-simplification);
     - .json: the cameras as a transforms.json.
 
+    With `streamed_sog` in `config`, the levels of detail of a scene folder become a folder of PlayCanvas' Streamed SOG.
+
     The loss is not measured for a cropped scene, nor for an output of only points, only cameras, a mesh or the model
     itself.
 
@@ -99,14 +105,16 @@ def export_model(
     check_type("config", config, ExportConfig)
     if data is not None:
         check_type("data", data, Scene)
-    kind = find_file_kind(target, config.colmap)
+    kind = find_file_kind(target, config)
     check_request(kind, target, config)
+    scene = open_levels(source) if kind in LEVEL_FOLDERS else None
     with single_file(find_model(source)) as file:
-        return _export_file(file, target, kind, config, data, overwrite, context)
+        return _export_file(file, scene, target, kind, config, data, overwrite, context)
 
 
 def _export_file(
     source: Path,
+    scene: SceneFolder | None,
     target: str | os.PathLike[str],
     kind: FileKind,
     config: ExportConfig,
@@ -114,7 +122,7 @@ def _export_file(
     overwrite: bool,
     context: RunContext,
 ) -> ExportReport:
-    """Export a `.hyrf` file. The arguments are those of `export_model`."""
+    """Export a `.hyrf` file, or the levels of `scene`, if it is given. Other arguments are those of `export_model`."""
     if kind is PLAYER_FOLDER:
         return export_player(
             source,
@@ -125,10 +133,11 @@ def _export_file(
             credit=config.credit,
             editable=config.editable,
         )
-    if kind is COLMAP_FOLDER:
-        check_place(target, Outputs(source, scene=data, overwrite=True), config.colmap)
-    with exclusive_folder(target) if kind is COLMAP_FOLDER else nullcontext():
-        check_place(target, Outputs(source, scene=data, overwrite=overwrite), config.colmap)
+    is_folder = kind is COLMAP_FOLDER or kind in LEVEL_FOLDERS
+    if is_folder:
+        check_place(target, Outputs(source, scene=data, overwrite=True), config)
+    with exclusive_folder(target) if is_folder else nullcontext():
+        check_place(target, Outputs(source, scene=data, overwrite=overwrite), config)
         loaded = Source.read(source, data)
         if kind is HTML_PAGE and not config.baked:
             return write_native_page(loaded, source, target, config, overwrite)
@@ -141,6 +150,8 @@ def _export_file(
                 return write_mesh(loaded, target, kind, config, overwrite, progress)
             if kind in COLLISION_FILES:
                 return write_collision_mesh(loaded, target, kind, config, overwrite, progress)
+            if scene is not None:
+                return _export_levels(loaded, scene, Path(target), kind, config, overwrite, progress)
             return _export_gaussians(loaded, Path(target), kind, config, overwrite, progress)
 
 
@@ -160,6 +171,26 @@ def _export_gaussians(
         _LOG.info("quality is not measured, because a part of the scene was cropped")
         return result
     return measure_export(result, loaded, baked, written, kind, part_of_progress(progress, 0.65, 1.0))
+
+
+def _export_levels(
+    loaded: Source,
+    scene: SceneFolder,
+    target: Path,
+    kind: FileKind,
+    config: ExportConfig,
+    overwrite: bool,
+    progress: Progress,
+) -> ExportReport:
+    """Export all levels of a scene folder, and measure the finest one."""
+    check_model(loaded, kind, config)
+    baked = bake_levels(loaded, scene, kind, config, part_of_progress(progress, 0.0, 0.6))
+    _LOG.info(f"writing {len(baked.chunks)} chunks")
+    size, written = write_streamed_sog(baked, target, overwrite, part_of_progress(progress, 0.6, 0.8))
+    report = replace(
+        _describe_splats(baked.finest, target, size), chunks=len(baked.chunks), level_gaussians=baked.level_gaussians
+    )
+    return measure_export(report, loaded, baked.finest, written, kind, part_of_progress(progress, 0.8, 1.0))
 
 
 def _check_cameras(loaded: Source, source: str | os.PathLike[str]) -> None:
@@ -208,13 +239,17 @@ def _write_splats(
         data = encode_baked_page(loaded, baked.splats, baked.picture, title, config.credit)
         shown = decode_splats_page(data, str(target))
     written = write_atomic(target, data, overwrite=overwrite)
-    result = ExportReport(
+    return _describe_splats(baked, written, len(data)), shown
+
+
+def _describe_splats(baked: BakedScene, written: Path, size: int) -> ExportReport:
+    """Return the report on a file or folder of splats without scores."""
+    return ExportReport(
         str(written),
-        len(data),
+        size,
         len(baked.splats),
         background=baked.background_count,
         degree=baked.degree,
         chosen_by=baked.chosen_by,
         exposure=baked.exposure,
     )
-    return result, shown

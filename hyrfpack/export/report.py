@@ -12,7 +12,8 @@ class ExportReport:
     Attributes:
         file: path of the written file or folder.
         bytes: size on disk; of a folder, the total size of the written files.
-        gaussians: number of Gaussians in the file, including the background's; 0 for a file of cameras.
+        gaussians: number of Gaussians in the file, or at the finest level, including the background's; 0 for a file of
+            cameras.
         native: whether the file holds the model itself, so that nothing was lost and nothing is measured.
         background: number of Gaussians that represent the background.
         degree: degree of the spherical harmonics in the file.
@@ -28,6 +29,8 @@ class ExportReport:
         psnr_by_exposure: PSNR of baked splats with local and with consistent exposure, before rounding, against the
             model's pictures as photographed. Empty without an exposure map, or if it was not measured.
         photos_by_exposure: PSNR of the same splats against held-out photos, if given.
+        chunks: number of chunks in a folder with levels of detail.
+        level_gaussians: their Gaussians at each level, the finest first, without the background's.
         cameras: number of cameras in a file of points or of cameras.
         vertices, faces: number of vertices and of triangles of a mesh.
         voxel: side of the voxels in which a mesh was fused, world units; None for other files.
@@ -51,6 +54,8 @@ class ExportReport:
     exposure: str | None = None
     psnr_by_exposure: dict[str, float] = field(default_factory=dict)
     photos_by_exposure: dict[str, float] = field(default_factory=dict)
+    chunks: int = 0
+    level_gaussians: list[int] = field(default_factory=list)
     cameras: int = 0
     vertices: int = 0
     faces: int = 0

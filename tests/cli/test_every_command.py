@@ -104,6 +104,7 @@ ALL_CASES = [
     Case("evaluate model.hyrf --data hall --pictures {}", "old/pictures", OUTCOME_REFUSED, OUTCOME_REPLACED),
     Case("export model.hyrf --sh-degree 0 -o {}", "old/a.ply", OUTCOME_REFUSED, OUTCOME_REPLACED),
     Case("export model.hyrf --colmap -o {}", "old/colmap", OUTCOME_REFUSED, OUTCOME_REPLACED),
+    Case("export scene --streamed-sog -o {}", "old/streamed", OUTCOME_REFUSED, OUTCOME_REPLACED),
     Case("export model.hyrf named.json -o {}", "old/gallery", OUTCOME_REFUSED, OUTCOME_REPLACED),
     Case("import ball.ply --steps 1 --size 16 -o {}", "old/a.hyrf", OUTCOME_REFUSED, OUTCOME_REPLACED),
     Case("convert ball.ply {}", "old/a.ply", OUTCOME_REFUSED, OUTCOME_REPLACED),
@@ -133,6 +134,7 @@ def make_input_folder(folder: Path) -> Path:
     (folder / "trained").rename(folder / "first")
     shutil.copytree(folder / "first", folder / "second")
     _run_checked("compress", folder / "model.hyrf", "-o", folder / "packed.hyrf", "--profile", "paper")
+    _run_checked("split", folder / "packed.hyrf", "-o", folder / "scene", "--levels", 1)
     shutil.copy(folder / "model.hyrf", folder / "named.json")
     (folder / "cameras.json").write_text(cameras_to_json(named))
     shutil.copy(folder / "cameras.json", folder / "poses.hyrf")
@@ -160,6 +162,7 @@ def _make_foreign(folder: Path, photo: str) -> None:
     scored = f"{Path(photo).stem}.png"
     names = [f"a{ending}" for ending in (".hyrf", ".png", ".json", ".md", *OUTPUT_ENDINGS)]
     names += ["colmap/sparse/0/cameras.bin", "player/index.html", "gallery/index.html"]
+    names += ["streamed/lod-meta.json"]
     names += ["pictures/0000.png", f"pictures/{scored}", f"report/{REPORT_FILES[0]}", "scene/shared.hyrf"]
     for path in (*(f"old/{name}" for name in names), f"old/demo/{DEMO[0]}", "run/metrics.json"):
         (folder / path).parent.mkdir(parents=True, exist_ok=True)

@@ -169,7 +169,10 @@ WRONG_REQUESTS = {
     "exposure": (("-o", "a.ply", "--exposure", "even"), "'--exposure'"),
     "exposure of a model": (("-o", "a.html", "--exposure", "consistent"), "leave out --exposure consistent, or"),
     "baked player": (("-o", "player", "--baked"), "--baked"),
-    "COLMAP file": (("-o", "a.ply", "--colmap"), "a COLMAP model is a folder"),
+    "COLMAP file": (("-o", "a.ply", "--colmap"), "this format is a folder of files"),
+    "levels of a file": (("-o", "out", "--streamed-sog"), "split it first with 'hyrfpack split"),
+    "two folders": (("-o", "out", "--colmap", "--streamed-sog"), "give only one of --colmap and --streamed-sog"),
+    "crop of levels": (("-o", "out", "--streamed-sog", "--min-opacity", "0.1"), "leave out --crop and --min-opacity"),
     "two models": (("second.hyrf", "-o", "a.ply"), "several models make a gallery"),
     "photos of two": (("-o", "player", "--data", "a", "--data", "b"), "given 2 times for 1 models"),
 }

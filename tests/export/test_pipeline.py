@@ -372,7 +372,10 @@ def test_a_file_without_cameras_is_baked_and_measured_on_an_orbit(plain_file, tm
 
 def test_the_suffix_selects_the_format():
     assert [find_file_kind(f"a/b{ending}").ending for ending in EXPORT_ENDINGS] == list(EXPORT_ENDINGS)
-    assert find_file_kind("a/b") is PLAYER_FOLDER and find_file_kind("a/b", colmap=True) is COLMAP_FOLDER
+    assert (
+        find_file_kind("a/b") is PLAYER_FOLDER
+        and find_file_kind("a/b", hyrfpack.ExportConfig(colmap=True)) is COLMAP_FOLDER
+    )
     for name, ending in {"A/B.PLY": ".ply", "a.b/c": "", "my.scene.spz": ".spz"}.items():
         assert find_file_kind(name).ending == ending
     for name in ("a.xyz", "model.hyrf", "a.ply.txt"):
@@ -382,8 +385,8 @@ def test_the_suffix_selects_the_format():
             find_file_kind(name)
     with pytest.raises(HyrfError, match="compressed PLY is read, not written"):
         find_file_kind("a.compressed.ply")
-    with pytest.raises(HyrfError, match=r"^a\.ply: a COLMAP model is a folder"):
-        find_file_kind("a.ply", colmap=True)
+    with pytest.raises(HyrfError, match=r"^a\.ply: this format is a folder of files"):
+        find_file_kind("a.ply", hyrfpack.ExportConfig(colmap=True))
 
 
 INVALID_OPTIONS = [

@@ -21,7 +21,7 @@ import json
 import math
 import warnings
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -84,8 +84,14 @@ def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
     return bundle.getvalue()
 
 
-def encode_files(splats: Splats) -> dict[str, bytes]:
-    """Encode splats as the files of an unbundled SOG, by name; programs open such a folder through its meta.json."""
+def encode_files(splats: Splats, runs: Sequence[int] = ()) -> dict[str, bytes]:
+    """Encode splats as the files of an unbundled SOG, by name; programs open such a folder through its meta.json.
+
+    Args:
+        splats: the splats.
+        runs: numbers of consecutive splats that stay together, in this order: the Morton curve orders each run by
+            itself. Without any, all splats are one run.
+    """
     count = len(splats)
     if count > _MAX_GAUSSIANS:
         raise HyrfDataError(
@@ -95,7 +101,8 @@ def encode_files(splats: Splats) -> dict[str, bytes]:
     log_positions = np.sign(splats.positions) * np.log1p(np.abs(splats.positions))
     mins, maxs = (log_positions.min(0), log_positions.max(0)) if count else (np.zeros(3), np.zeros(3))
     steps = np.rint((log_positions - mins) / np.where(maxs > mins, maxs - mins, 1) * 65535).astype(np.uint16)
-    order = np.argsort(morton_codes(steps), kind="stable")
+    run_numbers = np.repeat(np.arange(len(runs)), runs) if runs else np.zeros(count, np.int64)
+    order = np.lexsort((morton_codes(steps), run_numbers))  # stable
     splats, steps = splats[order], steps[order]
 
     scale_book, scales = _quantize_to_codebook(np.log(np.maximum(splats.scales, _MIN_SCALE)))

@@ -1,0 +1,158 @@
+"""Export of a scene folder as PlayCanvas' Streamed SOG: lod-meta.json and unbundled SOGs of several chunks each.
+
+Source: the PlayCanvas user manual, "The Streamed SOG Format", version 1 (developer.playcanvas.com).
+
+    lod-meta.json       a binary tree of boxes. A leaf names the file, the first Gaussian and the number of Gaussians
+                        of each of its levels, and the error of each level
+    0_0/meta.json ...   a SOG: the chunks of level 0 one after the other, each in the order of a Morton curve
+    env/meta.json ...   the background, which is always drawn
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import accumulate
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hyrfpack.export.baked_scene import ShownSplats
+from hyrfpack.export.boxes import Box, BoxTree
+from hyrfpack.export.indexed_folder import IndexedFolder, writing_indexed_folder
+from hyrfpack.export.kinds import STREAMED_SOG_FOLDER
+from hyrfpack.export.levels import BakedLevels
+from hyrfpack.format.metadata import writer_name
+from hyrfpack.format.scene_manifest import Chunk
+from hyrfpack.progress import Progress, TaskEvent
+from hyrfpack.splats.formats import sog
+from hyrfpack.splats.splats import Splats, concatenate
+
+INDEX_NAME = STREAMED_SOG_FOLDER.ending
+ENVIRONMENT_NAME = "env"
+FORMAT_VERSION = 1
+# A file is the unit that a program loads. A SOG has at most 16,384 rows of harmonics, one for 4 Gaussians up to here.
+MAX_FILE_GAUSSIANS = 65_536
+
+
+@dataclass
+class _Leaf:
+    """What the index says about a chunk.
+
+    Attributes:
+        runs: by level, the number of the file, the first Gaussian in it and the number of Gaussians.
+        boxes: boxes of the Gaussians of each level, as read back from its file.
+    """
+
+    runs: dict[int, tuple[int, int, int]] = field(default_factory=dict)
+    boxes: list[Box] = field(default_factory=list)
+
+
+def write_streamed_sog(
+    baked: BakedLevels, target: Path, overwrite: bool, progress: Progress
+) -> tuple[int, ShownSplats]:
+    """Write the levels of a scene as Streamed SOG.
+
+    Args:
+        baked: the baked levels.
+        target: the folder.
+        overwrite: replace existing files; those with other names stay.
+        progress: called with `TaskEvent`s.
+
+    Returns:
+        The bytes of all files, and the finest level with the background, as read back.
+
+    Raises:
+        HyrfError: a file cannot be written, or it exists and may not be replaced.
+    """
+    order = list(BoxTree.build([Box.of_splats(chunk.levels[0]) for chunk in baked.chunks]).leaves())
+    level_count = max(len(chunk.levels) for chunk in baked.chunks)
+    files = [(level, group) for level in range(level_count) for group in _group_chunks(baked, order, level)]
+    leaves = [_Leaf() for _ in baked.chunks]
+    names, shown, counts = [], [], [0] * level_count
+    with writing_indexed_folder(target, INDEX_NAME, overwrite) as folder:
+        for number, (level, group) in enumerate(files):
+            progress(TaskEvent(f"writing file {number + 1}/{len(files)}", number / len(files)))
+            name = f"{level}_{sum(1 for other, _ in files[:number] if other == level)}"
+            runs = [len(baked.chunks[chunk].levels[level]) for chunk in group]
+            splats = _write_sog(folder, name, concatenate([baked.chunks[chunk].levels[level] for chunk in group]), runs)
+            names.append(f"{name}/{sog.META_NAME}")
+            counts[level] += len(splats)
+            shown += [splats] if level == 0 else []
+            for chunk, start, count in zip(group, accumulate(runs, initial=0), runs, strict=False):
+                leaves[chunk].runs[level] = (number, start, count)
+                leaves[chunk].boxes.append(Box.of_splats(splats[start : start + count]))
+        if baked.background is not None:
+            shown.append(_write_sog(folder, ENVIRONMENT_NAME, baked.background, ()))
+        index = {
+            "version": FORMAT_VERSION,
+            "asset": {"generator": writer_name()},
+            "count": sum(counts),
+            "counts": counts,
+            "lodLevels": level_count,
+            "lodErrors": True,
+            **({"environment": f"{ENVIRONMENT_NAME}/{sog.META_NAME}"} if baked.background is not None else {}),
+            "filenames": names,
+            "tree": _make_tree(baked, leaves, level_count),
+        }
+        folder.write(INDEX_NAME, json.dumps(index, separators=(",", ":"), allow_nan=False).encode("ascii"))
+    return folder.bytes, (concatenate(shown), None)
+
+
+def level_errors(chunk: Chunk, level_count: int) -> list[float]:
+    """Return an error for each level: the mean of the chunk's `errors` over all radii, raised so that none falls.
+
+    These are mean squared errors of a pixel that shows the chunk. A program that spends its budget by the error that a
+    finer level saves, times the pixels that the chunk covers, therefore reduces the squared error of the picture.
+    """
+    means = [float(np.mean(level.errors)) for level in chunk.levels]
+    raised = list(accumulate(means, max))
+    return raised + raised[-1:] * (level_count - len(raised))
+
+
+def _group_chunks(baked: BakedLevels, order: Sequence[int], level: int) -> Iterator[list[int]]:
+    """Yield groups of neighbouring chunks that share a file at a level, of at most MAX_FILE_GAUSSIANS if they can."""
+    group: list[int] = []
+    size = 0
+    for number in order:
+        levels = baked.chunks[number].levels
+        count = len(levels[level]) if level < len(levels) else 0
+        if not count:
+            continue
+        if group and size + count > MAX_FILE_GAUSSIANS:
+            yield group
+            group, size = [], 0
+        group, size = [*group, number], size + count
+    if group:
+        yield group
+
+
+def _write_sog(folder: IndexedFolder, name: str, splats: Splats, runs: Sequence[int]) -> Splats:
+    """Write an unbundled SOG, its meta.json last, and return its splats as read back."""
+    files = sog.encode_files(splats, runs)
+    for file in (*(file for file in files if file != sog.META_NAME), sog.META_NAME):
+        folder.write(f"{name}/{file}", files[file])
+    return sog.decode_files(files, str(folder.path / name))
+
+
+def _make_tree(baked: BakedLevels, leaves: Sequence[_Leaf], level_count: int) -> dict[str, Any]:
+    """Return the tree of the index."""
+    chunks = baked.scene.manifest.chunks
+
+    def describe(node: BoxTree) -> dict[str, Any]:
+        bound = {"min": _rounded(node.box.low), "max": _rounded(node.box.high)}
+        if node.leaf is None:
+            return {"bound": bound, "children": [describe(child) for child in node.children]}
+        runs = sorted(leaves[node.leaf].runs.items())
+        lods = {str(level): {"file": file, "offset": start, "count": count} for level, (file, start, count) in runs}
+        errors = level_errors(chunks[baked.chunks[node.leaf].number], level_count)
+        return {"bound": bound, "lods": lods, "errors": _rounded(errors)}
+
+    return describe(BoxTree.build([Box.around(leaf.boxes) for leaf in leaves]))
+
+
+def _rounded(values: Sequence[float] | np.ndarray) -> list[float]:
+    """Round to the 7 digits that the format asks for."""
+    return [float(f"{value:.7g}") for value in values]
