@@ -11,7 +11,7 @@ import torch
 
 from hyrfpack.compress.channels import MIN_STEP_CODE, requantize_channel
 from hyrfpack.compress.plan import snap_to_lattice
-from hyrfpack.format.arrays import grid_configs, to_arrays
+from hyrfpack.format.arrays import grid_configs, layered_groups, residual_widths, to_arrays
 from hyrfpack.format.compact.channels import Channel, decode_channel, encode_channel, read_channel_header
 from hyrfpack.format.compact.groups import encode_use_classes
 from hyrfpack.format.compact.plan import USAGE_CLASS_COUNT, build_step_groups
@@ -19,6 +19,7 @@ from hyrfpack.format.compact.quantized import (
     CODEC_CHANNELS,
     CODEC_GROUPS,
     CODEC_POINTS,
+    CODEC_RESIDUALS,
     CODEC_STATED_GROUPS,
     LOGIT_COLUMNS,
 )
@@ -27,7 +28,6 @@ from hyrfpack.format.metadata import Metadata, read_metadata, writer_name
 from hyrfpack.format.raw import CODEC_FLOAT32
 from hyrfpack.format.sections import (
     COLORS,
-    LAYERED_SECTIONS,
     LOGIT_SECTIONS,
     POSITIONS,
     SECTION_CONTENTS,
@@ -36,6 +36,7 @@ from hyrfpack.format.sections import (
 )
 from hyrfpack.format.shared import SHARED_SECTIONS, refer_to_section, self_contained_bytes
 from hyrfpack.format.versions import lowest_minor_version
+from hyrfpack.lod.residuals import LayerResiduals
 from hyrfpack.model import HybridModel
 from hyrfpack.quant.points import LatticePoints, decode_points, encode_points
 
@@ -53,11 +54,13 @@ class LayerNumbers:
         points: lattice points of its Gaussians, with their classes.
         values: five channels (N,) float64: three of colour in the file's basis, then scale and opacity logit.
         headers: mean, weight of the prediction, and step codes of each channel.
+        residuals: the residuals of each section; empty without any.
     """
 
     points: LatticePoints
     values: list[np.ndarray]
     headers: list[tuple[np.float32, int, np.ndarray]]
+    residuals: list[LayerResiduals]
 
 
 class ChunkEncoder:
@@ -106,6 +109,9 @@ class ChunkEncoder:
                     for values, header in zip(layer.values, layer.headers, strict=True)
                 ]
                 sections += self._sections(len(counts), points, data, channels)
+                for residuals in layer.residuals:
+                    stored = residuals.encode_subset(members, points.classes)
+                    sections.append(self._residual_section(residuals.group, len(counts), stored, len(members)))
                 counts.append(len(members))
                 order.append(members + start)
             start += count
@@ -127,7 +133,11 @@ class ChunkEncoder:
             requantize_channel(values, classes, codes, np.float32(values.mean() if len(values) else 0))
             for values, (_, _, codes) in zip(numbers.T, layer.headers, strict=True)
         ]
-        return self._write(self._sections(0, points, data, channels), [len(model)])
+        sections = self._sections(0, points, data, channels)
+        for residuals in layer.residuals:
+            stored = residuals.encode_values(arrays[residuals.group][order], points.classes)
+            sections.append(self._residual_section(residuals.group, 0, stored, len(model)))
+        return self._write(sections, [len(model)])
 
     @cached_property
     def _basis(self) -> np.ndarray:
@@ -146,13 +156,23 @@ class ChunkEncoder:
                     headers.append(read_channel_header(data))
                     numbers, data = decode_channel(data, points.classes)
                     values.append(numbers)
-            layers.append(LayerNumbers(points, values, headers))
+            residuals = [
+                LayerResiduals.from_section(
+                    group, memoryview(self._file[layer_section(group, number)].data), points.classes, columns
+                )
+                for group, columns in self._residual_widths.items()
+            ]
+            layers.append(LayerNumbers(points, values, headers, residuals))
         return layers
+
+    @cached_property
+    def _residual_widths(self) -> dict[str, int]:
+        return residual_widths(self.model.config)
 
     def _encode_shared(self) -> bytes:
         """Return the bytes of the shared file: a model without Gaussians."""
         config = self.model.config
-        empty = [Section(group, CODEC_FLOAT32, b"", 0) for group in LAYERED_SECTIONS]
+        empty = [Section(group, CODEC_FLOAT32, b"", 0) for group in layered_groups(config)]
         sections = [self._file[tag] for tag in SHARED_SECTIONS if tag in self._file]
         for place, section in enumerate(sections):
             if section.type in TABLE_SECTIONS and section.codec == CODEC_GROUPS:
@@ -173,11 +193,14 @@ class ChunkEncoder:
             rest = rest[columns:]
         return sections
 
+    def _residual_section(self, group: str, layer: int, stored: bytes, count: int) -> Section:
+        return Section(layer_section(group, layer), CODEC_RESIDUALS, stored, 4 * self._residual_widths[group] * count)
+
     def _write_raw(self, model: HybridModel) -> bytes:
         arrays = to_arrays(model)
         sections = [
             Section(group, CODEC_FLOAT32, arrays[group].astype("<f4").tobytes(), 4 * arrays[group].size)
-            for group in LAYERED_SECTIONS
+            for group in layered_groups(model.config)
         ]
         return self._write(sections, [len(model)])
 

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from hyrfpack.lod.partition import cluster
 from hyrfpack.model import Geometry, HybridModel
 from hyrfpack.model.gaussians import LOGIT_LIMIT, Gaussians, logit
+from hyrfpack.model.residuals import add_shape_residuals, color_differences
+from hyrfpack.model.shape_residuals import shape_residuals
 from hyrfpack.rotations import rotation_matrices
 
 MAX_OPACITY = 0.99
@@ -74,7 +77,8 @@ def merge_gaussians(model: HybridModel, geometry: Geometry, viewpoints: Sequence
     """Merge the Gaussians of a model into `count` ones, which the fields of the model complete.
 
     The fields give the shape and the rotation of a Gaussian at its place. So a merged Gaussian has the volume of the
-    covariance of its cluster, but the fields' shape.
+    covariance of its cluster, but the fields' shape. In a model with residuals it has the whole covariance, and the
+    mean colour residuals of its cluster.
 
     Args:
         model: the model, on the CPU.
@@ -83,7 +87,9 @@ def merge_gaussians(model: HybridModel, geometry: Geometry, viewpoints: Sequence
         count: number of merged Gaussians, at most that of the model.
     """
     colors = torch.cat([model.decode_colors(viewpoint) for viewpoint in viewpoints], dim=1).double().numpy()
-    positions = model.gaussians.positions
+    positions, residuals = model.gaussians.positions, model.gaussians.color_residuals
+    if residuals is not None:
+        colors = np.concatenate((colors, residuals.double().numpy()), axis=1)
     cube = model.cube_coords(positions).double().numpy()
     labels = cluster(cube, count)
     turns = rotation_matrices(torch.nn.functional.normalize(geometry.quats).double().numpy())
@@ -100,29 +106,62 @@ def fit_logits(model: HybridModel, merged: Moments, viewpoints: Sequence[Tensor]
 
     Args:
         model: the model, on the CPU.
-        merged: M Gaussians in local units; `colors` (M, 3 V) from each of V viewpoints.
+        merged: M Gaussians in local units; `colors` (M, 3 V) from each of V viewpoints, followed by the colour
+            residuals (M, 3 K) of a model that has them.
         viewpoints: V points (3,) in local units.
     """
     count = len(merged.means)
     zeros = torch.zeros(count, 1)
     means = torch.from_numpy(merged.means).float()
-    plain = model.with_gaussians(Gaussians(means, zeros.expand(-1, 3), zeros, zeros))
+    plain = model.with_gaussians(
+        Gaussians(means, zeros.expand(-1, 3), zeros, zeros), replace(model.config, residual_degree=None)
+    )
     raw = plain.geometry(plain.cube_coords(means))
+    shapes = None
+    if model.config.residual_degree is None:
+        scale_logits = _match_volumes(plain, raw, merged)
+    else:
+        shapes, scale_logits = _match_shapes(plain, raw, merged)
+        raw = add_shape_residuals(raw, shapes)
+    scales = plain.activate(raw, means, scale_logits, zeros).scales.double()
+    # Where the volume cannot be reached, the opacity makes up for the area.
+    light = torch.from_numpy(merged.opacities * merged.areas)
+    opacities = (light / scales.prod(dim=1) ** (2 / 3)).clamp(max=MAX_OPACITY)
+    neural = logit(plain.activate(raw, means, scale_logits, zeros).opacities)
+    opacity_logits = (logit(opacities) - neural)[:, None]
+    seen, residuals = torch.from_numpy(merged.colors).tensor_split([3 * len(viewpoints)], dim=1)
+    offsets = []
+    for viewpoint, colors in zip(viewpoints, seen.split(3, dim=1), strict=True):
+        if shapes is not None:
+            colors = colors - color_differences(residuals, torch.nn.functional.normalize(means - viewpoint))
+        offsets.append(logit(colors) - logit(plain.decode_colors(viewpoint)))
+    return Gaussians(
+        means,
+        torch.stack(offsets).mean(dim=0),
+        scale_logits,
+        opacity_logits,
+        shapes,
+        None if shapes is None else residuals,
+    )
+
+
+def _match_volumes(plain: HybridModel, raw: Tensor, merged: Moments) -> Tensor:
+    """Return the scale logits (M, 1) with which Gaussians of the fields' shapes have the volumes of `merged`."""
+    means, zeros = plain.gaussians.positions, plain.gaussians.scale_logits
     target = torch.from_numpy(np.linalg.slogdet(merged.covariances)[1] / 2)
-    low, high = torch.full((count, 1), -LOGIT_LIMIT), torch.full((count, 1), LOGIT_LIMIT)
+    low, high = torch.full_like(zeros, -LOGIT_LIMIT), torch.full_like(zeros, LOGIT_LIMIT)
     for _ in range(_BISECTIONS):
         middle = (low + high) / 2
         scales = plain.activate(raw, means, middle, zeros).scales
         is_small = (scales.double().log().sum(dim=1) < target)[:, None]
         low, high = torch.where(is_small, middle, low), torch.where(is_small, high, middle)
-    scales = plain.activate(raw, means, high, zeros).scales.double()
-    # Where the volume cannot be reached, the opacity makes up for the area.
-    light = torch.from_numpy(merged.opacities * merged.areas)
-    opacities = (light / scales.prod(dim=1) ** (2 / 3)).clamp(max=MAX_OPACITY)
-    neural = logit(plain.activate(raw, means, high, zeros).opacities)
-    opacity_logits = (logit(opacities) - neural)[:, None]
-    seen = torch.from_numpy(merged.colors).reshape(count, -1, 3)
-    offsets = [
-        logit(seen[:, number]) - logit(plain.decode_colors(viewpoint)) for number, viewpoint in enumerate(viewpoints)
-    ]
-    return Gaussians(means, torch.stack(offsets).mean(dim=0), high, opacity_logits)
+    return high
+
+
+def _match_shapes(plain: HybridModel, raw: Tensor, merged: Moments) -> tuple[Tensor, Tensor]:
+    """Return the shape residuals (M, 5) and scale logits (M, 1) that give the covariances of `merged`."""
+    variances, axes = np.linalg.eigh(merged.covariances)
+    axes *= np.sign(np.linalg.det(axes))[:, None, None]
+    quats = Rotation.from_matrix(axes).as_quat(scalar_first=True)
+    sizes = torch.from_numpy(np.sqrt(np.maximum(variances, 0))) / plain.scale_bounds(plain.gaussians.positions)
+    return shape_residuals(raw, logit(sizes), torch.from_numpy(quats).float())

@@ -229,8 +229,7 @@ def _read_parts(
     """Read a file; return its model and its parts, each divided into chunks. A single model is the only part.
 
     Raises:
-        HyrfError: the file cannot be read, holds no Gaussian or a model with residuals, or mixes models that are
-            antialiased and others.
+        HyrfError: the file cannot be read or holds no Gaussian, or mixes models that are antialiased and others.
     """
     with Container.open(path, SECTION_CONTENTS) as container:
         decoded = decode_parts(container)
@@ -238,11 +237,6 @@ def _read_parts(
             raise HyrfError(f"{path}: there is no Gaussian in it, so there is nothing to split", fix="train it again")
         models, parts = parts_of(decoded), []
         for number, (name, part) in enumerate(list_parts(container)):
-            if models[number].config.residual_degree is not None:
-                raise HyrfError(
-                    f"{part.name}: a model with residuals cannot be split into levels of detail",
-                    fix="import the splats again with a `psnr` below 38 dB",
-                )
             encoder = ChunkEncoder(part, models[number], shared_names[number])
             parts.append(_Part.of(name, encoder, chunk_gaussians))
     return decoded, parts

@@ -53,13 +53,22 @@ def add_color_residuals(colors: Tensor, residuals: Tensor, directions: Tensor) -
 
     Args:
         colors: (N, 3) colours of the model without residuals.
-        residuals: (N, 3 K) coefficients of K harmonics Y_k, see `harmonics_basis`; red, green and blue of the first
-            harmonic first.
-        directions: (N, 3), or (1, 3) for all, unit vectors from the viewpoint to the Gaussians.
+        residuals, directions: as in `color_differences`.
 
     Returns:
         (N, 3), 0 or more.
     """
+    return (colors + color_differences(residuals, directions)).clamp_min(0)
+
+
+def color_differences(residuals: Tensor, directions: Tensor) -> Tensor:
+    """Return what colour residuals add to the colours (N, 3) of Gaussians along directions.
+
+    Args:
+        residuals: (N, 3 K) coefficients of K harmonics Y_k, see `harmonics_basis`; red, green and blue of the first
+            harmonic first.
+        directions: (N, 3), or (1, 3) for all, unit vectors from the viewpoint to the Gaussians.
+    """
     parts = residuals.view(len(residuals), residuals.shape[1] // 3, 3)
     basis = harmonics_basis(directions, round(parts.shape[1] ** 0.5) - 1)
-    return (colors + (basis[:, :, None] * parts).sum(1)).clamp_min(0)
+    return (basis[:, :, None] * parts).sum(1)

@@ -13,14 +13,13 @@ from scenes import ring, small_model
 from scipy.spatial.transform import Rotation
 
 from hyrfpack.distill import DistillReport, distill_splats, pack
-from hyrfpack.distill.residuals import exact_model, shape_residuals
-from hyrfpack.errors import HyrfError, HyrfSizeError
+from hyrfpack.distill.residuals import exact_model
+from hyrfpack.errors import HyrfSizeError
 from hyrfpack.format import describe_file, load_model
-from hyrfpack.lod import split_model
 from hyrfpack.model.residuals import add_shape_residuals
+from hyrfpack.model.shape_residuals import shape_residuals
 from hyrfpack.render import render_view
 from hyrfpack.splats.draw import Drawable, draw
-from tools.safety.make_golden import GOLDEN_FOLDER
 
 pytestmark = pytest.mark.usefixtures("quick_calibration")
 
@@ -86,8 +85,3 @@ def test_an_import_with_residuals_stores_what_the_target_needs(tmp_path: Path, m
     assert model.config.residual_degree == splats.degree and description["version"] == "1.6"
     for residuals in (model.gaussians.shape_residuals, model.gaussians.color_residuals):
         assert residuals is not None and residuals.any()
-
-
-def test_a_model_with_residuals_is_not_split(tmp_path: Path) -> None:
-    with pytest.raises(HyrfError, match="a model with residuals cannot be split into levels of detail"):
-        split_model(GOLDEN_FOLDER / "v1.6_compact_residuals.hyrf", tmp_path / "scene")

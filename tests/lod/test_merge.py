@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 import torch
 from scenes import small_model
+from scipy.spatial.transform import Rotation
 
 from hyrfpack.lod.merge import Moments, fit_logits, merge_gaussians, merge_moments
 from hyrfpack.lod.partition import cluster, partition
+from tools.safety.make_golden import add_golden_residuals
 
 pytestmark = pytest.mark.unit
 
@@ -75,6 +77,26 @@ def test_fitted_logits_give_the_volume_the_opacity_and_the_colour_of_a_view():
     np.testing.assert_allclose(volumes, np.sqrt(np.linalg.det(covariances)), rtol=1e-3)
     np.testing.assert_allclose(decoded.opacities.detach().numpy(), 0.4, rtol=1e-3)
     np.testing.assert_allclose(fitted.decode_colors(viewpoint).detach().numpy(), colors, atol=1e-4)
+
+
+def test_residuals_give_merged_gaussians_the_whole_covariance_and_the_colour_of_a_view():
+    model = add_golden_residuals(small_model(POSITIONS, fields=0.5), 1).requires_grad_(False)
+    rng, viewpoint = np.random.default_rng(0), torch.tensor([0.3, -2.0, 0.4])
+    # Standard deviations up to 0.2 lie below the largest that a model can have.
+    axes = Rotation.random(50, rng).as_matrix() * rng.uniform(0.01, 0.2, (50, 1, 3))
+    covariances = axes @ axes.transpose(0, 2, 1)
+    seen, residuals = rng.uniform(0.4, 0.6, (50, 3)), rng.uniform(-0.1, 0.1, (50, 12))
+    target = Moments(POSITIONS, covariances, np.full(50, 0.4), np.concatenate((seen, residuals), axis=1))
+
+    fitted = model.with_gaussians(fit_logits(model, target, [viewpoint])).requires_grad_(False)
+
+    decoded = fitted.decode_geometry()
+    turns = Rotation.from_quat(decoded.quats.double().numpy(), scalar_first=True).as_matrix()
+    found = turns * decoded.scales.double().numpy()[:, None, :]
+    np.testing.assert_allclose(found @ found.transpose(0, 2, 1), covariances, atol=1e-6)
+    np.testing.assert_allclose(decoded.opacities.numpy(), 0.4, rtol=1e-3)
+    np.testing.assert_allclose(fitted.decode_colors(viewpoint).numpy(), seen, atol=1e-4)
+    np.testing.assert_array_equal(fitted.gaussians.color_residuals.numpy(), residuals.astype(np.float32))
 
 
 def test_merging_gives_the_asked_number_within_the_box_of_the_model():

@@ -20,7 +20,7 @@ from hyrfpack.cameras.capture import Capture
 from hyrfpack.config.split import SplitConfig
 from hyrfpack.context import RunContext
 from hyrfpack.errors import HyrfError, HyrfFormatError
-from hyrfpack.format import describe_file, load_merged_model, load_model, scene_manifest
+from hyrfpack.format import describe_file, load_merged_model, load_model, save_model, scene_manifest
 from hyrfpack.format.arrays import to_arrays
 from hyrfpack.format.container import MINOR_VERSION, Container, Section, read_container, write_container
 from hyrfpack.format.parts import encode_parts
@@ -107,6 +107,25 @@ def test_the_finest_levels_of_a_raw_file_have_its_very_numbers(tmp_path):
         np.concatenate(list(to_arrays(load_model(path)).values())[:4], axis=1) for path in (RAW, tmp_path / "scene")
     ]
     assert Counter(row.tobytes() for row in rows[0]) == Counter(row.tobytes() for row in rows[1])
+
+
+@pytest.mark.parametrize("profile", ["compact", "raw"])
+def test_chunks_keep_residuals_exactly_and_merged_gaussians_have_their_own(tmp_path, monkeypatch, profile):
+    source = GOLDEN_FOLDER / "v1.6_compact_residuals.hyrf"
+    if profile == "raw":
+        source = tmp_path / "raw.hyrf"
+        save_model(load_model(GOLDEN_FOLDER / "v1.6_compact_residuals.hyrf"), source)
+    monkeypatch.setattr(split, "MEASURED_VIEWS", 1)
+    split_model(source, tmp_path / "scene", SplitConfig(levels=2, refit_steps=0), context=QUIET)
+
+    exact = ("positions", "shape_residuals", "color_residuals")
+    rows = [
+        np.concatenate([getattr(load_model(path).gaussians, name).numpy() for name in exact], axis=1)
+        for path in (source, tmp_path / "scene")
+    ]
+    assert Counter(row.tobytes() for row in rows[0]) == Counter(row.tobytes() for row in rows[1])
+    _, merged, _ = read_with_minimal_reader(tmp_path / "scene" / "chunk-0000-1.hyrf")
+    assert merged["SHAP"].any() and merged["HARM"].any()
 
 
 def test_a_chunk_opens_by_itself_as_the_format_page_says(folder):
