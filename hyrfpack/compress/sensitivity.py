@@ -101,7 +101,11 @@ class Sensitivity:
 
 
 def measure_sensitivity(
-    model: HybridModel, cameras: Sequence[Camera], seed: int = 0, progress: Progress = ignore_progress
+    model: HybridModel,
+    cameras: Sequence[Camera],
+    seed: int = 0,
+    progress: Progress = ignore_progress,
+    drawn: int = TARGET_DRAWN_GAUSSIANS,
 ) -> Sensitivity:
     """Estimate the mean squared derivatives of pictures with respect to every number of a model.
 
@@ -117,11 +121,12 @@ def measure_sensitivity(
         cameras: viewpoints typical of how the model will be viewed; world units.
         seed: random seed of the signs and of the views between cameras.
         progress: called with `TaskEvent`s.
+        drawn: about how many Gaussians are drawn in all views together; more make the measurement less noisy.
 
     Raises:
         HyrfError: a number of the model is NaN or infinite.
     """
-    at, between = sample_views(cameras, choose_view_count(len(model)), seed)
+    at, between = sample_views(cameras, choose_view_count(len(model), drawn), seed)
     views = [view for pair in zip(at, between, strict=True) for view in pair]
     field_interval = max(1, round(1 / FIELD_VIEW_SHARE))
     generator = torch.Generator().manual_seed(seed)
@@ -164,9 +169,9 @@ def measure_sensitivity(
     return _combine(model, squares, pixels, field_pixels, at, jacobian)
 
 
-def choose_view_count(gaussians: int) -> int:
+def choose_view_count(gaussians: int, drawn: int = TARGET_DRAWN_GAUSSIANS) -> int:
     """Return the number of views at cameras, and between them, in which a model of so many Gaussians is measured."""
-    return int(np.clip(TARGET_DRAWN_GAUSSIANS // max(gaussians, 1), MIN_SENSITIVITY_VIEWS, MAX_SENSITIVITY_VIEWS)) // 2
+    return int(np.clip(drawn // max(gaussians, 1), MIN_SENSITIVITY_VIEWS, MAX_SENSITIVITY_VIEWS)) // 2
 
 
 @torch.no_grad()

@@ -37,6 +37,8 @@ MIN_ERROR_RATIO = 1e-3  # Smaller ratios, also negative ones, are noise.
 MIN_LOG_SLOPE = 0.4
 MAX_LOG_STEP = np.log(16)
 MAX_TRIALS = 6
+# Views around splats differ in distance by a factor of four, so more of them are measured than of a capture.
+DRAWN_GAUSSIANS = 15_000_000
 # With residuals, fields are quantised as if they alone might add this error, in dB; residuals correct it.
 FIELD_PSNR = 28.0
 
@@ -112,7 +114,8 @@ def _make_packer(distilled: DistilledModel, distortion: float, provenance: dict,
     if distilled.exact is None:
         sensitivity, _ = measure_calibrated_sensitivity(model, train, distortion, progress=progress)
         return Packer(model, provenance, sensitivity)
-    sensitivity = measure_sensitivity(model, train, progress=part_of_progress(progress, 0.0, 0.5))
+    measuring = part_of_progress(progress, 0.0, 0.5)
+    sensitivity = measure_sensitivity(model, train, progress=measuring, drawn=DRAWN_GAUSSIANS)
     model, codes = quantize_fields(model, sensitivity, _mse(FIELD_PSNR))
     model = exact_model(model, distilled.exact)
     references, rest = ReferenceRenders.from_model(model, train), part_of_progress(progress, 0.55, 1.0)
