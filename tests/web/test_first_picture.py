@@ -21,7 +21,7 @@ from web.native_models import (
     store_file_in_page,
     wait_until_complete,
 )
-from web.pages import Browser, psnr, render_in_page, wait_for_message
+from web.pages import Browser, camera_json, psnr, render_in_page, wait_for_message
 
 from hyrfpack.format.codec import encode_model
 from hyrfpack.format.parts import encode_parts
@@ -63,9 +63,30 @@ def test_the_first_picture_is_an_estimate_near_the_exact_one(browser: Browser, t
     with browser.before_every_page(RECORD_JS):
         load_page(browser, tmp_path, make_model_page(model))
     assert not browser.evaluate("firstPicture.isReady") and browser.evaluate("hyrfpack.player.renderer.content.isReady")
-    final = browser.evaluate("(hyrfpack.player.capture(), hyrfpack.player.canvas.toDataURL())")
+    final = browser.evaluate(
+        "hyrfpack.player.capture().then((blob) => new Promise((resolve) => {"
+        "  const reader = new FileReader(); reader.onload = () => resolve(reader.result); reader.readAsDataURL(blob); }))"
+    )
     assert psnr(read_canvas(browser.evaluate("firstPicture.address")), read_canvas(final)) > 20
     assert psnr(render_in_page(browser, camera), render_reference(model, camera)) > 45
+
+
+def test_a_picture_of_the_estimate_is_not_returned_as_an_exact_one(browser: Browser, tmp_path: Path):
+    camera = make_cameras()[0]
+    show_early = f"""
+      let page;
+      const show = () => page.player.show({camera_json(camera)}).then(() => "a picture", (error) => error.message);
+      Object.defineProperty(window, "hyrfpack", {{
+        get: () => page,
+        set: (value) => {{
+          page = value;
+          page.player.addEventListener("loaded", () => (window.early ??= show()));
+        }},
+      }});
+    """
+    with browser.before_every_page(show_early):
+        load_page(browser, tmp_path, make_model_page(make_smooth_model()))
+    assert "not ready for exact pictures" in browser.evaluate("early")
 
 
 def test_a_merged_file_that_the_driver_refuses_is_reported_and_another_opens(browser: Browser, tmp_path: Path):
@@ -78,6 +99,7 @@ def test_a_merged_file_that_the_driver_refuses_is_reported_and_another_opens(bro
         assert "refuses" in wait_for_message(browser)
         assert not browser.evaluate("firstPicture.isReady")  # the estimate was shown
         assert browser.evaluate("hyrfpack.ready.then(() => '', () => 'rejected')") == "rejected"
+        assert "refuses" in browser.evaluate("hyrfpack.player.settled.then(() => '', ({ message }) => message)")
         run_statements(browser, "window.refuses = false;")
         store_file_in_page(browser, encode_model(model))
         assert open_file_error(browser, "yield file;") == ""

@@ -434,6 +434,23 @@ def test_a_saved_picture_equals_the_window(browser: Browser, tmp_path: Path):
 ONE_PIXEL_POSTER = base64.b64decode(b"UklGRh4AAABXRUJQVlA4TBEAAAAvAAAAAAdQ//73v/+BiOh/AAA=")  # one pixel
 
 
+def test_a_picture_saved_while_others_are_drawn_has_the_order_of_its_own_view(browser: Browser, tmp_path: Path):
+    open_page(browser, tmp_path, make_splats_page(random_splats()))
+    home = wait_until_still(browser).evaluate("hyrfpack.player.capture().then((blob) => blob.text())")
+    statements = (
+        "const { player } = hyrfpack, { cameras: [view], renderer } = player, { rows, translation } = view;"
+        "const turn = ([x, y, z]) => [-x, y, -z];"
+        "const behind = { ...view, rows: [turn(rows[0]), rows[1], turn(rows[2])] };"
+        "const { read } = renderer;"
+        "renderer.read = (...values) => {"  # the renderer has the order of the other view now
+        "  const picture = read.apply(renderer, values);"
+        "  window.saved ??= player.capture().then((blob) => blob.text());"
+        "  return picture; };"
+        "return player.settled.then(() => player.preview([behind])).then(() => saved);"
+    )
+    assert browser.evaluate(f"(() => {{ {statements} }})()") == home
+
+
 def test_the_poster_is_shown_until_the_first_picture(browser: Browser, tmp_path: Path):
     (tmp_path / "page.html").write_bytes(make_splats_page(random_splats(), poster=ONE_PIXEL_POSTER))
     watch = (

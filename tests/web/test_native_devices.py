@@ -158,18 +158,30 @@ def test_a_weak_device_draws_fitted_harmonics(browser: Browser, tmp_path: Path, 
     assert min(scores) > 28 and browser.list_errors() == [], scores
 
 
-def test_a_device_lost_while_a_file_is_loading_is_restored(browser: Browser, tmp_path: Path):
+LOSSES_JS = {
+    "after 300 ms": "addEventListener('DOMContentLoaded', () => setTimeout(lose, 300, canvas().getContext('webgl2')));",
+    "when it is asked for its limits": (
+        "const { prototype } = WebGL2RenderingContext, { getParameter } = prototype; let count = 0;"
+        "prototype.getParameter = function (name) {"
+        "  if (name === this.MAX_TEXTURE_SIZE && ++count === 2) lose(this);"  # the renderer has asked before
+        "  return getParameter.call(this, name); };"
+    ),
+}
+
+
+@pytest.mark.parametrize("moment", LOSSES_JS)
+def test_a_device_lost_while_a_file_is_loading_is_restored(browser: Browser, tmp_path: Path, moment: str):
     model = random_model(3000)
     file = tmp_path / "page.html"
     file.write_bytes(make_model_page(model))
     script = (
-        "addEventListener('DOMContentLoaded', () => { const canvas = document.getElementById('view'), "
-        "device = canvas.getContext('webgl2').getExtension('WEBGL_lose_context'); "
-        "canvas.addEventListener('webglcontextlost', () => setTimeout(() => device.restoreContext(), 50)); "
-        "canvas.addEventListener('webglcontextrestored', () => { window.restored = true; }); "
-        "setTimeout(() => device.loseContext(), 300); })"
+        "const canvas = () => document.getElementById('view');"
+        "const lose = (gl) => { const device = gl.getExtension('WEBGL_lose_context');"
+        "  canvas().addEventListener('webglcontextlost', () => setTimeout(() => device.restoreContext(), 50));"
+        "  canvas().addEventListener('webglcontextrestored', () => { window.restored = true; });"
+        "  device.loseContext(); };"
     )
-    with browser.before_every_page(script):
+    with browser.before_every_page(script + LOSSES_JS[moment]):
         browser.open(file.as_uri())
         browser.evaluate("hyrfpack.ready")
         wait_until(browser, "window.restored === true")  # because a small file may be loaded before the loss

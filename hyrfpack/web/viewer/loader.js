@@ -40,6 +40,7 @@ export class Loader {
     this.delivered = Promise.resolve();
     this.broken = false; // true if no more of the file will arrive; the part that was shown can be decoded again
     this.pending = []; // {resolve, reject} of the promises of `expect`
+    this.repeats = 0; // of `again`
   }
 
   // Handles a message of the worker.
@@ -104,7 +105,13 @@ export class Loader {
 
   // Decodes the same bytes again, as splats if `plain`.
   again(plain) {
+    this.repeats++;
     this.connection.post({ again: { plain } });
+  }
+
+  // Returns whether no other content will replace this one because of `again`.
+  isLatest({ repeats = 0 }) {
+    return repeats === this.repeats;
   }
 
   // Selects the content that later calls of `sort` sort.

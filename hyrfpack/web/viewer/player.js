@@ -37,6 +37,8 @@ const COLORING_RATIO = 0.25; // the share of a frame that is used for colours wh
 const PROGRESS_RANGES = { loading: [0, 0.3], unpacking: [0.3, 0.6], preparing: [0.6, 1] };
 
 const DEVICE_LOST_TEXT = "Meanwhile the graphics device was lost, or another scene opened; try again.";
+const NOT_READY_TEXT = "The scene is not ready for exact pictures yet; wait until it is loaded.";
+const DISPOSED_TEXT = "The player was disposed of.";
 
 export class Player extends EventTarget {
   // A player without a scene gets one from `open`. `workerAddress` is that of the worker's script, or null for the
@@ -80,7 +82,8 @@ export class Player extends EventTarget {
     this.quick = false; // whether the last frame took the device hardly any time
     this.unsorted = true; // whether the splats must be sorted for the view
     this.idle = false; // whether the picture is complete
-    this.onIdle = []; // functions that resolve the promises of `settled`
+    this.onIdle = []; // {resolve, reject} of the promises of `settled`
+    this.failure = null; // the error for which there is no picture and none will come
     this.queue = Promise.resolve(); // resolves when all queued work has ended
     this.onFirstPicture = () => {}; // is called when the canvas shows a frame
     this.showing = false; // whether `show` completes a picture, whose background frames must not replace
@@ -106,6 +109,8 @@ export class Player extends EventTarget {
     this.observer.disconnect();
     this.loaded = false;
     for (const loader of [this.loader, this.next, this.previous]) loader?.dispose();
+    this.next = null;
+    this.giveUp(new Error(DISPOSED_TEXT));
     this.renderer.dispose();
     this.renderer.gl.getExtension("WEBGL_lose_context")?.loseContext();
   }
@@ -151,6 +156,7 @@ export class Player extends EventTarget {
     });
     Object.assign(loader, { picture, part: 0, scene, remark: "", update });
     this.next = loader;
+    this.failure = null;
     try {
       await loader.read({ name, scene, stage, plain: scene?.plain ?? false, stream, address });
     } catch (error) {
@@ -160,8 +166,16 @@ export class Player extends EventTarget {
       } else {
         this.discard(loader);
       }
+      if (!this.loader) this.giveUp(error);
       throw error;
     }
+  }
+
+  // Rejects the promises of `settled` if there is no picture and none will come.
+  giveUp(error) {
+    if (this.loaded || this.next) return;
+    this.failure = error;
+    for (const { reject } of this.onIdle.splice(0)) reject(error);
   }
 
   // Discards a loader whose file cannot be shown.
@@ -214,6 +228,7 @@ export class Player extends EventTarget {
       }
       staged = this.renderer.stage(content, scene, picture ?? loader.picture);
       await this.check(loader, content, models);
+      if (!loader.isLatest(message)) throw new SupersededError();
       this.showContent(loader, message, staged, initial);
       return !isEstimate || Boolean(await this.enqueue(() => this.prepareFields(loader, content)));
     } catch (error) {
@@ -256,10 +271,10 @@ export class Player extends EventTarget {
   refuse(loader, content, models, error) {
     const isShown = content === this.renderer.content;
     if (!isShown) content?.dispose();
-    // After a lost context, `onRestored` decodes the file again.
-    if (error instanceof ContextLostError || error instanceof SupersededError) return;
+    // After a lost context, `onRestored` decodes the file again. A lost device answers any question about it by null.
+    if (content?.graphics.lost || error instanceof ContextLostError || error instanceof SupersededError) return;
     if (!models || models.length > 1) { // merged models have no harmonics
-      if (isShown) this.loaded = false; // what the canvas shows stays there
+      if (isShown) [this.loaded, this.loader] = [false, null]; // what the canvas shows stays there
       throw error;
     }
     const isUnsupported = error instanceof UnsupportedDeviceError;
@@ -325,7 +340,9 @@ export class Player extends EventTarget {
       if (this.loader) await this.loader.expect(); // showing the content also updates the remark
       else this.emit("remark", "");
     } catch (error) {
-      if (!(error instanceof SupersededError)) this.emit("failed", error);
+      if (error instanceof SupersededError) return;
+      this.giveUp(error);
+      this.emit("failed", error);
     }
   }
 
@@ -380,9 +397,11 @@ export class Player extends EventTarget {
   }
 
   // Returns a promise that resolves when the picture is complete: at full resolution, with the order and colours of
-  // this view, and with the background.
+  // this view, and with the background. It is rejected if the scene cannot be shown, and there is no other.
   get settled() {
-    return this.idle && !this.lost ? Promise.resolve() : new Promise((resolve) => this.onIdle.push(resolve));
+    if (this.failure) return Promise.reject(this.failure);
+    if (this.idle && !this.lost) return Promise.resolve();
+    return new Promise((resolve, reject) => this.onIdle.push({ resolve, reject }));
   }
 
   // Returns whether the graphics context is lost, which the browser reports only later by an event.
@@ -516,7 +535,7 @@ export class Player extends EventTarget {
     if (!this.whole) return;
     this.idle = true;
     this.times.complete ??= performance.now();
-    for (const resolve of this.onIdle.splice(0)) resolve();
+    for (const { resolve } of this.onIdle.splice(0)) resolve();
     this.enqueue(() => content.lookAhead(this.view(), goOn)).catch((error) => this.emit("failed", error));
   }
 
@@ -542,7 +561,7 @@ export class Player extends EventTarget {
 
   // Sorts the splats for the current view.
   async sort() {
-    if (!this.unsorted || this.loader.busy) return;
+    if (!this.unsorted || !this.loaded || this.loader.busy) return;
     this.unsorted = false;
     const { content } = this.renderer, sorted = await this.loader.sort(this.view(), this.scene);
     if (sorted && content === this.renderer.content) this.setOrder(sorted);
@@ -595,11 +614,19 @@ export class Player extends EventTarget {
   }
 
   // Returns a promise of a picture file (Blob) of the canvas at full size. `type` and `quality` are those of toBlob.
-  capture(type = "image/png", quality = undefined) {
+  async capture(type = "image/png", quality = undefined) {
     const view = this.view();
+    await this.sortFor(view); // the last order may be that of a picture of `preview` or `show`
     this.renderer.draw(view, this.resolution, this.exposureOf(view));
     this.present();
     return new Promise((resolve) => this.canvas.toBlob(resolve, type, quality));
+  }
+
+  // Sorts a content for a view, for a picture that is drawn at once. Throws ContextLostError if that is impossible.
+  async sortFor(view, content = this.renderer.content) {
+    const sorted = this.loaded ? await this.loader.sort(view, this.scene) : null;
+    if (!sorted || !this.loaded || content !== this.renderer.content) throw new ContextLostError(DEVICE_LOST_TEXT);
+    this.setOrder(sorted);
   }
 
   // Draws small pictures of views while the window's picture is complete. Gaussians keep the colours of the window's
@@ -629,22 +656,21 @@ export class Player extends EventTarget {
     this.eye.setView(view);
     this.changed();
     const draw = async () => {
-      const sort = async () => {
-        const sorted = await this.loader.sort(view, this.scene);
-        if (!sorted || !this.loaded || content !== this.renderer.content) throw new ContextLostError();
-        this.setOrder(sorted);
-      };
-      await sort();
-      await content.complete(view, this.scene.tolerance, { exact: true, blend: (seen) => this.renderer.blended(seen) });
-      await sort(); // meanwhile frames of the window may have got another order
+      await this.sortFor(view, content);
+      const options = { exact: true, blend: (seen) => this.renderer.blended(seen) };
+      const isExact = await content.complete(view, this.scene.tolerance, options);
+      if (!isExact) throw new Error(NOT_READY_TEXT); // the content is an estimate
+      await this.sortFor(view, content); // meanwhile frames of the window may have got another order
       return this.renderer.read(view, this.exposureOf(view));
     };
     const picture = await this.enqueue(() => {
       this.showing = true;
-      return draw().finally(() => (this.showing = false));
+      return draw().finally(() => {
+        this.showing = false;
+        this.unsorted = true;
+        this.redraw();
+      });
     });
-    this.unsorted = true;
-    this.redraw();
     if (!picture) throw new Error(DEVICE_LOST_TEXT);
     return picture;
   }

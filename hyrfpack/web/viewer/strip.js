@@ -47,7 +47,7 @@ export class Strip {
     const { player, strip } = this, { cameras } = player;
     const isWanted = () => !strip.hidden && this.drawn !== cameras && player.cameras === cameras;
     while (isWanted()) {
-      await player.settled;
+      if (!(await player.settled.then(() => true, () => false))) return; // the scene cannot be shown
       const pictures = isWanted() && (await player.preview(cameras.map(coveringView)));
       if (!pictures || !isWanted()) continue;
       this.drawn = cameras;

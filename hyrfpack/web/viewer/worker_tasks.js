@@ -16,7 +16,8 @@
 // and those of stream/scene_stream.js.
 // Messages from the worker:
 //     {progress: {what, part}}
-//     {content: {number, whole, scene, models | splats, picture}}   see pack.js
+//     {content: {number, repeats, whole, scene, models | splats, picture}}   see pack.js; `repeats` is the number of
+//                                            messages `again` before it
 //     {order: {ticket, number, order, drawn}}
 //     {answer: {ticket, value | error}}      to `ask`: the numbers that are left after each selection, or the file
 //     {error}                                the reason, as soon as it is certain that the file cannot be read
@@ -114,6 +115,7 @@ class SceneReader {
     this.isRejected = false; // whether the whole file is useless
     this.decodedLength = 0; // the number of bytes in the last decoding
     this.contents = 0; // the number of the last content
+    this.repeats = 0; // of `decodeAgain`
     this.queue = Promise.resolve();
   }
 
@@ -145,6 +147,7 @@ class SceneReader {
 
   // Decodes the same bytes again, as splats if `plain`. A file that is still arriving is decoded at its end.
   decodeAgain(plain) {
+    this.repeats++;
     this.request.plain ||= plain;
     if (this.ended) this.queueDecoding(this.broken);
   }
@@ -164,7 +167,7 @@ class SceneReader {
   async decode(partial) {
     const { file, request: { name, scene, stage, plain } } = this, all = file.gather();
     const bytes = partial && this.broken ? all.subarray(0, this.decodedLength || file.length) : all;
-    const content = { number: ++this.contents, whole: !partial };
+    const content = { number: ++this.contents, repeats: this.repeats, whole: !partial };
     this.reportProgress("unpacking", 0);
     let positions;
     if (file.isMerged) {
