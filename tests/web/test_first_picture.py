@@ -65,7 +65,8 @@ def test_the_first_picture_is_an_estimate_near_the_exact_one(browser: Browser, t
     assert not browser.evaluate("firstPicture.isReady") and browser.evaluate("hyrfpack.player.renderer.content.isReady")
     final = browser.evaluate(
         "hyrfpack.player.capture().then((blob) => new Promise((resolve) => {"
-        "  const reader = new FileReader(); reader.onload = () => resolve(reader.result); reader.readAsDataURL(blob); }))"
+        "  const reader = new FileReader(); reader.onload = () => resolve(reader.result);"
+        "  reader.readAsDataURL(blob); }))"
     )
     assert psnr(read_canvas(browser.evaluate("firstPicture.address")), read_canvas(final)) > 20
     assert psnr(render_in_page(browser, camera), render_reference(model, camera)) > 45
