@@ -14,6 +14,8 @@ from hyrfpack.errors import HyrfError
 from hyrfpack.export.baked_scene import BakedScene, bake_scene
 from hyrfpack.export.source import Source
 from hyrfpack.format.scene_folder import SceneFolder, is_scene
+from hyrfpack.format.scene_manifest import Chunk
+from hyrfpack.model.merged import scene_of
 from hyrfpack.progress import Progress, TaskEvent, part_of_progress
 from hyrfpack.splats.splats import Splats
 from hyrfpack.splats.table import FileKind
@@ -100,7 +102,7 @@ def bake_levels(
     chunks = scene.manifest.chunks
     finest = bake_scene(loaded, kind, config, part_of_progress(progress, 0.0, _FINEST_SHARE))
     count = len(finest.splats) - finest.background_count
-    levels = [_divide(finest.splats[:count], finest.index, [chunk.levels[0].gaussians for chunk in chunks])]
+    levels = [_divide(finest.splats[:count], finest.index, chunks, [0] * len(chunks))]
     level_count = max(len(chunk.levels) for chunk in chunks)
     settings = replace(config, degree=finest.degree, background=False)
     for level in range(1, level_count):
@@ -111,13 +113,12 @@ def bake_levels(
         model = scene.load(chosen)
         # Without views to measure at, splats of another exposure are not baked for comparison.
         coarse = bake_scene(
-            replace(loaded, model=model, drawn=model, measured_views=[]),
+            replace(loaded, model=scene_of(model), drawn=model, measured_views=[]),
             kind,
             settings,
             part_of_progress(progress, start, end),
         )
-        sizes = [chunk.levels[number].gaussians for chunk, number in zip(chunks, chosen, strict=True)]
-        levels.append(_divide(coarse.splats, coarse.index, sizes))
+        levels.append(_divide(coarse.splats, coarse.index, chunks, chosen))
     baked = [
         BakedChunk(number, tuple(level[number] for level in levels[: len(chunk.levels)]))
         for number, chunk in enumerate(chunks)
@@ -126,7 +127,18 @@ def bake_levels(
     return BakedLevels(scene, finest, baked)
 
 
-def _divide(splats: Splats, index: np.ndarray, sizes: Sequence[int]) -> list[Splats]:
-    """Divide splats among chunks, by the indices of their Gaussians in a model of all chunks of these sizes."""
+def _divide(splats: Splats, index: np.ndarray, chunks: Sequence[Chunk], levels: Sequence[int]) -> list[Splats]:
+    """Divide splats among chunks.
+
+    Args:
+        splats: the splats.
+        index: for each of them, the index of its Gaussian in a model of all chunks, which holds one part of the scene
+            after the other.
+        chunks: the chunks.
+        levels: level of each chunk in the model.
+    """
+    order = sorted(range(len(chunks)), key=lambda number: chunks[number].part)
+    sizes = [chunks[number].levels[levels[number]].gaussians for number in order]
     edges = np.searchsorted(index, np.concatenate(([0], np.cumsum(sizes)))).tolist()
-    return [splats[start:end] for start, end in zip(edges, edges[1:], strict=False)]
+    runs = dict(zip(order, zip(edges, edges[1:], strict=False), strict=True))
+    return [splats[slice(*runs[number])] for number in range(len(chunks))]
