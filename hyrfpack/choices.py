@@ -17,6 +17,9 @@ NORMAL_FORMATS = ("png", "exr")
 # Versions of SPZ files that can be written: 4 (May 2026) is smaller and faster to read, 3 is for programs without it.
 SPZ_VERSIONS = (3, 4)
 DEFAULT_SPZ_VERSION = 4
+# Contents of 3D Tiles: SPZ in glTF, or plain glTF.
+SPZ_TILE_CONTENT = "spz"
+TILE_CONTENTS = (SPZ_TILE_CONTENT, "gltf")
 # Layouts of photos and poses. They are the keys of `hyrfpack.data.LAYOUTS`.
 LAYOUTS = (
     "colmap",

@@ -46,7 +46,7 @@ crop_option = click.option(
     metavar="FILE",
     help="File or folder to write. Its extension names the format.",
 )
-@settings_options(ExportConfig, "baked", "colmap", "streamed_sog")
+@settings_options(ExportConfig, "baked", "colmap", "streamed_sog", "tiles_3d", "tile_content")
 @click.option(
     "--sh-degree",
     "degree",
@@ -93,7 +93,7 @@ def export(
       .mesh.glb .mesh.ply .obj .stl                   the surface as triangles with vertex colours
       .collision.glb .collision.obj .collision.stl    a closed mesh of few triangles for physics engines
       .json, or a folder with --colmap                cameras: transforms.json, or a COLMAP model
-      a folder with --streamed-sog                    levels of detail that PlayCanvas streams
+      a folder with --streamed-sog or --3d-tiles      levels of detail that other programs stream
 
     Several models exported to a folder make a gallery. Without a model, the folder gets a player that opens the files
     that are dropped on it. Splats (.ply .spz .splat .sog) can be exported to a player folder, too. Levels of detail
@@ -110,6 +110,7 @@ def export(
       hyrfpack export bonsai.hyrf -o bonsai.mesh.glb --faces 200000
       hyrfpack export bonsai.hyrf -o bonsai.collision.glb
       hyrfpack export bonsai-scene -o streamed/ --streamed-sog
+      hyrfpack export bonsai-scene -o tiles/ --3d-tiles
     """
     from hyrfpack.export import export_model as write
     from hyrfpack.export.folder import check_folder, export_gallery, export_player

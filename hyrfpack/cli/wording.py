@@ -8,7 +8,12 @@ import re
 _ARGUMENT_PATTERN = re.compile(r"`([a-z_0-9]+)(?:=([^`]+))?`")
 _WORD_QUOTE = "'"  # Python writes it around a value that is a word
 # Arguments whose option is not the argument's name with dashes.
-_OPTION_OF_ARGUMENT = {"degree": "--sh-degree", "finetune_steps": "--finetune", "target_bytes": "--target-size"}
+_OPTION_OF_ARGUMENT = {
+    "degree": "--sh-degree",
+    "finetune_steps": "--finetune",
+    "target_bytes": "--target-size",
+    "tiles_3d": "--3d-tiles",
+}
 
 
 def use_option_names(message: str) -> str:

@@ -7,7 +7,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
-from hyrfpack.choices import DEFAULT_SPZ_VERSION, LOCAL_EXPOSURE, SPLAT_EXPOSURES, SPZ_VERSIONS
+from hyrfpack.choices import (
+    DEFAULT_SPZ_VERSION,
+    LOCAL_EXPOSURE,
+    SPLAT_EXPOSURES,
+    SPZ_TILE_CONTENT,
+    SPZ_VERSIONS,
+    TILE_CONTENTS,
+)
 from hyrfpack.config.settings import OneOf, Range, check_settings
 
 DEFAULT_COLLISION_FACES = 4000
@@ -54,6 +61,9 @@ class ExportConfig(ConvertConfig):
             (consistent). A model without an exposure map gives the same splats with both.
         colmap: write a folder with a COLMAP model: cameras, and centres as points.
         streamed_sog: write a folder with the levels of detail of a scene folder as PlayCanvas' Streamed SOG.
+        tiles_3d: write a folder with the levels of detail of a scene folder as 3D Tiles.
+        tile_content: content of 3D Tiles: SPZ in glTF by a draft extension, which CesiumJS draws (spz), or plain glTF,
+            which is larger and exact (gltf).
         title: title of a page, a player or a gallery. Default: the name of its file or folder.
         credit: text below the title of a page or a player, such as the author and the licence.
         editable: include a panel in a page or a player that crops, cleans, turns and measures the scene.
@@ -67,6 +77,8 @@ class ExportConfig(ConvertConfig):
     exposure: Annotated[str, OneOf(SPLAT_EXPOSURES)] = LOCAL_EXPOSURE
     colmap: bool = False
     streamed_sog: bool = False
+    tiles_3d: bool = False
+    tile_content: Annotated[str, OneOf(TILE_CONTENTS)] = SPZ_TILE_CONTENT
     title: str | None = None
     credit: str = ""
     editable: bool = False

@@ -11,6 +11,7 @@ from hyrfpack.rotations import rotation_matrices
 from hyrfpack.splats.splats import Splats
 
 BOX_SIGMAS = 3.0
+_NO_TURN = np.eye(3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,21 +27,31 @@ class Box:
         return cls(np.min([box.low for box in boxes], axis=0), np.max([box.high for box in boxes], axis=0))
 
     @classmethod
-    def of_splats(cls, splats: Splats) -> Box:
+    def of_splats(cls, splats: Splats, turn: np.ndarray = _NO_TURN) -> Box:
         """Return the smallest box that holds the ellipsoids of splats, at least one, at BOX_SIGMAS deviations.
 
         The half side along axis i of the box of an ellipsoid with the rotation R and the scales s is
 
             BOX_SIGMAS sqrt(sum_j (R_ij s_j)^2)
+
+        Args:
+            splats: the splats.
+            turn: (3, 3) rotation that maps the splats to the axes of the box.
         """
-        axes = rotation_matrices(splats.quats.astype(np.float64)) * splats.scales[:, None]
+        axes = turn @ rotation_matrices(splats.quats.astype(np.float64)) * splats.scales[:, None]
         reach = BOX_SIGMAS * np.linalg.norm(axes, axis=2)
-        return cls((splats.positions - reach).min(axis=0), (splats.positions + reach).max(axis=0))
+        centers = splats.positions @ turn.T
+        return cls((centers - reach).min(axis=0), (centers + reach).max(axis=0))
 
     @property
     def center(self) -> np.ndarray:
         """The centre (3,)."""
         return (self.low + self.high) / 2
+
+    @property
+    def half_sides(self) -> np.ndarray:
+        """Half of the length of each side (3,)."""
+        return (self.high - self.low) / 2
 
     @property
     def diagonal(self) -> float:

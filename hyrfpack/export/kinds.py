@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from hyrfpack.choices import LOCAL_EXPOSURE
+from hyrfpack.choices import LOCAL_EXPOSURE, SPZ_TILE_CONTENT
 from hyrfpack.config.export import ExportConfig
 from hyrfpack.errors import HyrfError, needs_package
 from hyrfpack.export.background import background_reach
@@ -18,6 +19,7 @@ from hyrfpack.export.cameras import COLMAP_FILES
 from hyrfpack.export.source import Source
 from hyrfpack.model.merged import world_positions
 from hyrfpack.outputs import Outputs
+from hyrfpack.splats.formats.spz import MAX_COORDINATE, MAX_SCALE
 from hyrfpack.splats.splats import Splats
 from hyrfpack.splats.table import FORMATS, FileKind
 
@@ -38,12 +40,14 @@ COLMAP_FOLDER = FileKind(ending="", max_degree=0, module="pycolmap")
 POSITION_KINDS = (COLMAP_FOLDER, *POINT_FILES)  # these hold the centres of Gaussians, and cameras
 PLAYER_FOLDER = FileKind(ending="")
 STREAMED_SOG_FOLDER = FileKind(ending="lod-meta.json", stores_antialiased=True)  # the folder's index
-LEVEL_FOLDERS = (STREAMED_SOG_FOLDER,)  # levels of detail, of a scene folder
+TILES_FOLDER = FileKind(ending="tileset.json")  # the folder's index
+SPZ_TILES_FOLDER = replace(TILES_FOLDER, max_coordinate=MAX_COORDINATE, max_scale=MAX_SCALE)
+LEVEL_FOLDERS = (STREAMED_SOG_FOLDER, TILES_FOLDER, SPZ_TILES_FOLDER)  # levels of detail, of a scene folder
 _FILE_KINDS = (*POINT_FILES, *COLLISION_FILES, *MESH_FILES, *FORMATS.values(), HTML_PAGE, TRANSFORMS_JSON)
 _KINDS_BY_ENDING = {kind.ending: kind for kind in _FILE_KINDS}
 EXPORT_ENDINGS = tuple(_KINDS_BY_ENDING)
 # Kinds of folders by the settings of `ExportConfig` that name them.
-_FOLDERS_BY_SETTING = {"colmap": COLMAP_FOLDER, "streamed_sog": STREAMED_SOG_FOLDER}
+_FOLDERS_BY_SETTING = {"colmap": COLMAP_FOLDER, "streamed_sog": STREAMED_SOG_FOLDER, "tiles_3d": TILES_FOLDER}
 
 
 def find_file_kind(
@@ -76,7 +80,8 @@ def find_file_kind(
                 f"{target}: this format is a folder of files, not one file",
                 fix=f"use a path without a file extension with `{setting}=True`",
             )
-        return kind
+        is_spz = kind is TILES_FOLDER and config.tile_content == SPZ_TILE_CONTENT
+        return SPZ_TILES_FOLDER if is_spz else kind
     if name.endswith(".compressed.ply"):
         raise HyrfError(
             f"{target}: compressed PLY is read, not written",

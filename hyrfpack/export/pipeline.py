@@ -6,6 +6,7 @@ import logging
 import os
 from contextlib import nullcontext
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from hyrfpack.atomic import write_atomic
@@ -24,6 +25,7 @@ from hyrfpack.export.kinds import (
     MESH_FILES,
     PLAYER_FOLDER,
     POSITION_KINDS,
+    STREAMED_SOG_FOLDER,
     TRANSFORMS_JSON,
     check_model,
     check_place,
@@ -38,6 +40,7 @@ from hyrfpack.export.report import ExportReport
 from hyrfpack.export.scores import measure_export
 from hyrfpack.export.source import Source
 from hyrfpack.export.streamed_sog import write_streamed_sog
+from hyrfpack.export.tiles import write_tiles
 from hyrfpack.format import find_model
 from hyrfpack.format.scene_folder import SceneFolder, single_file
 from hyrfpack.lock import exclusive_folder
@@ -73,7 +76,8 @@ def export_model(
       engines (needs scikit-image and fast-simplification);
     - .json: the cameras as a transforms.json.
 
-    With `streamed_sog` in `config`, the levels of detail of a scene folder become a folder of PlayCanvas' Streamed SOG.
+    With `streamed_sog` in `config`, the levels of detail of a scene folder become a folder of PlayCanvas' Streamed SOG,
+    and with `tiles_3d` one of 3D Tiles.
 
     The loss is not measured for a cropped scene, nor for an output of only points, only cameras, a mesh or the model
     itself.
@@ -186,7 +190,8 @@ def _export_levels(
     check_model(loaded, kind, config)
     baked = bake_levels(loaded, scene, kind, config, part_of_progress(progress, 0.0, 0.6))
     _LOG.info(f"writing {len(baked.chunks)} chunks")
-    size, written = write_streamed_sog(baked, target, overwrite, part_of_progress(progress, 0.6, 0.8))
+    write = write_streamed_sog if kind is STREAMED_SOG_FOLDER else partial(write_tiles, kind)
+    size, written = write(baked, target, overwrite, part_of_progress(progress, 0.6, 0.8))
     report = replace(
         _describe_splats(baked.finest, target, size), chunks=len(baked.chunks), level_gaussians=baked.level_gaussians
     )

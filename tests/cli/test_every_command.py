@@ -105,6 +105,7 @@ ALL_CASES = [
     Case("export model.hyrf --sh-degree 0 -o {}", "old/a.ply", OUTCOME_REFUSED, OUTCOME_REPLACED),
     Case("export model.hyrf --colmap -o {}", "old/colmap", OUTCOME_REFUSED, OUTCOME_REPLACED),
     Case("export scene --streamed-sog -o {}", "old/streamed", OUTCOME_REFUSED, OUTCOME_REPLACED),
+    Case("export scene --3d-tiles -o {}", "old/tiles", OUTCOME_REFUSED, OUTCOME_REPLACED),
     Case("export model.hyrf named.json -o {}", "old/gallery", OUTCOME_REFUSED, OUTCOME_REPLACED),
     Case("import ball.ply --steps 1 --size 16 -o {}", "old/a.hyrf", OUTCOME_REFUSED, OUTCOME_REPLACED),
     Case("convert ball.ply {}", "old/a.ply", OUTCOME_REFUSED, OUTCOME_REPLACED),
@@ -162,7 +163,7 @@ def _make_foreign(folder: Path, photo: str) -> None:
     scored = f"{Path(photo).stem}.png"
     names = [f"a{ending}" for ending in (".hyrf", ".png", ".json", ".md", *OUTPUT_ENDINGS)]
     names += ["colmap/sparse/0/cameras.bin", "player/index.html", "gallery/index.html"]
-    names += ["streamed/lod-meta.json"]
+    names += ["streamed/lod-meta.json", "tiles/tileset.json"]
     names += ["pictures/0000.png", f"pictures/{scored}", f"report/{REPORT_FILES[0]}", "scene/shared.hyrf"]
     for path in (*(f"old/{name}" for name in names), f"old/demo/{DEMO[0]}", "run/metrics.json"):
         (folder / path).parent.mkdir(parents=True, exist_ok=True)

@@ -6,6 +6,8 @@ import pytest
 from independent.clouds import sample_splats
 from independent.formats import SPLAT_FORMATS
 
+from hyrfpack.splats.formats import gltf
+
 # The validator does not know KHR_gaussian_splatting and reports these (code, pointer) for it.
 EXPECTED_ISSUES = {
     ("UNSUPPORTED_EXTENSION", "/extensionsUsed/0"),
@@ -25,6 +27,8 @@ def validator_reports(node, tmp_path_factory: pytest.TempPathFactory) -> list[di
     files = [folder / f"{degree}.glb" for degree in range(4)]
     for degree, file in enumerate(files):
         file.write_bytes(SPLAT_FORMATS["glb"].encode(sample_splats(degree)))
+    files.append(folder / "compressed.glb")
+    files[-1].write_bytes(gltf.encode_compressed(sample_splats(3))[0])
     return node("gltf_validator.mjs", *files)
 
 
@@ -39,3 +43,12 @@ def test_the_validator_reports_only_the_unsupported_extension(degree, validator_
         ["KHR_gaussian_splatting"],
         300,
     )
+
+
+def test_the_validator_reports_only_what_cesiumjs_needs_of_compressed_splats(validator_reports):
+    issues = {(issue["code"], issue["pointer"]) for issue in validator_reports[-1]["issues"]["messages"]}
+    assert issues - EXPECTED_ISSUES == {
+        ("UNSUPPORTED_EXTENSION", "/extensionsUsed/1"),
+        ("UNUSED_OBJECT", "/bufferViews/0"),  # which the unknown extension uses
+        ("NODE_MATRIX_DEFAULT", "/nodes/0/matrix"),
+    }

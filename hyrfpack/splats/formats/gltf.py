@@ -27,6 +27,7 @@ import numpy as np
 
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.rotations import quaternion_from_matrix, rotation_matrices
+from hyrfpack.splats.formats import spz
 from hyrfpack.splats.formats.hints import NO_HINTS, Hints
 from hyrfpack.splats.formats.validation import build_valid_splats
 from hyrfpack.splats.harmonics import MAX_DEGREE, num_sh_bases
@@ -40,12 +41,14 @@ from hyrfpack.splats.placement import (
 from hyrfpack.splats.splats import Splats, concatenate
 
 SPLATTING_EXTENSION = "KHR_gaussian_splatting"
+SPZ_EXTENSION = "KHR_gaussian_splatting_compression_spz_2"
 GLTF_UP = (0.0, 1.0, 0.0)
 _HEADER_STRUCT = struct.Struct("<4sII")
 _CHUNK_HEADER_STRUCT = struct.Struct("<II")
 _JSON_CHUNK_TYPE = 0x4E4F534A
 _BINARY_CHUNK_TYPE = 0x004E4942
 _POINTS_MODE = 0
+_FLOAT_TYPE, _BYTE_TYPE = 5126, 5121
 _ARRAY_BUFFER_TARGET = 34962
 _DTYPE_BY_COMPONENT_TYPE = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5126: np.float32}
 _WIDTH_BY_ACCESSOR_TYPE = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
@@ -69,9 +72,16 @@ def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
     Raises:
         HyrfDataError: there are no splats, or they do not fit into float32 or into 4 GiB.
     """
-    if not len(splats):
-        raise HyrfDataError("there are no Gaussians, and glTF cannot represent an empty set", fix="export at least one")
-    origin, turn = local_origin(splats.positions), upright_rotation(hints.up, np.array(GLTF_UP))
+    return encode_at(splats, local_origin(splats.positions), upright_rotation(hints.up, np.array(GLTF_UP)))
+
+
+def encode_at(splats: Splats, origin: np.ndarray, turn: np.ndarray) -> bytes:
+    """Encode splats relative to `origin` (3,), with a node that moves them back and has the rotation `turn` (3, 3).
+
+    Raises:
+        HyrfDataError: there are no splats, or they do not fit into float32 or into 4 GiB.
+    """
+    _check_not_empty(splats)
     attributes = {"POSITION": local_positions(splats, origin)}
     attributes["COLOR_0"] = linear_colors(splats)
     attributes[f"{SPLATTING_EXTENSION}:ROTATION"] = splats.quats[:, [1, 2, 3, 0]]
@@ -81,29 +91,92 @@ def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
         attributes[semantic] = splats.harmonics[:, term]
 
     accessors, views, parts = _pack_attributes(list(attributes.values()))
-    binary = sum(map(len, parts))
     positions = attributes["POSITION"]
     accessors[0].update(min=positions.min(axis=0).tolist(), max=positions.max(axis=0).tolist())
-
     w, x, y, z = quaternion_from_matrix(turn).tolist()
     node = {"name": "Gaussians", "mesh": 0, "rotation": [x, y, z, w]}
     if origin.any():
         node["translation"] = (turn @ origin).tolist()
-    primitive = {
-        "attributes": {semantic: number for number, semantic in enumerate(attributes)},
-        "mode": _POINTS_MODE,
-        "extensions": {
-            SPLATTING_EXTENSION: {
-                "kernel": "ellipse",
-                "colorSpace": "srgb_rec709_display",
-                "projection": "perspective",
-                "sortingMethod": "cameraDistance",
-            }
-        },
+    return _assemble(list(attributes), node, accessors, views, parts)
+
+
+def encode_compressed(splats: Splats) -> tuple[bytes, Splats]:
+    """Encode splats as a .glb file whose numbers are an SPZ file of version 2, for CesiumJS.
+
+    The extension SPZ_EXTENSION is a draft, and programs that do not know it cannot read the file. Its axes are those of
+    SPZ: the splats turned by 180 degrees about x. The node has no transform, and positions are rounded relative to the
+    origin.
+
+    Returns:
+        The bytes, and the splats as read back, in their own axes.
+
+    Raises:
+        HyrfDataError: there are no splats, or they are too far from the origin.
+    """
+    _check_not_empty(splats)
+    positions = (splats.positions * (1, -1, -1)).astype(np.float32)
+    corners = {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}
+    vector, count = {"componentType": _FLOAT_TYPE, "type": "VEC3"}, {"count": len(splats)}
+    accessors: dict[str, dict[str, Any]] = {
+        "POSITION": {**vector, **count, **corners},
+        "COLOR_0": {"componentType": _BYTE_TYPE, "normalized": True, "type": "VEC4", **count},
+        f"{SPLATTING_EXTENSION}:ROTATION": {"componentType": _FLOAT_TYPE, "type": "VEC4", **count},
+        f"{SPLATTING_EXTENSION}:SCALE": {**vector, **count},
     }
+    for semantic in _harmonics_semantics(splats.degree)[1:]:
+        accessors[semantic] = {**vector, **count}
+    data = spz.encode(splats, Hints(spz_version=spz.VERSION_IN_GLTF))
+    views = [{"buffer": 0, "byteLength": len(data)}]
+    # CesiumJS needs a matrix, even if it is the identity.
+    node = {"name": "Gaussians", "mesh": 0, "matrix": np.eye(4).ravel().tolist()}
+    padded = data + bytes(-len(data) % 4)
+    compression = {SPZ_EXTENSION: {"bufferView": 0}}
+    file = _assemble(list(accessors), node, list(accessors.values()), views, [padded], compression)
+    return file, spz.decode(data, "SPZ in glTF")
+
+
+def _check_not_empty(splats: Splats) -> None:
+    if not len(splats):
+        raise HyrfDataError("there are no Gaussians, and glTF cannot represent an empty set", fix="export at least one")
+
+
+def _assemble(
+    semantics: list[str],
+    node: dict[str, Any],
+    accessors: list[dict[str, Any]],
+    views: list[dict[str, Any]],
+    parts: list[bytes],
+    compression: dict[str, Any] | None = None,
+) -> bytes:
+    """Assemble a .glb file of one primitive.
+
+    Args:
+        semantics: the names of its attributes, in the order of `accessors`.
+        node: the node of its mesh, number 0.
+        accessors, views: accessors and buffer views.
+        parts: pieces of the binary chunk.
+        compression: an extension of the extension for splats.
+    """
+    splatting: dict[str, Any] = {
+        "kernel": "ellipse",
+        "colorSpace": "srgb_rec709_display",
+        "projection": "perspective",
+        "sortingMethod": "cameraDistance",
+    }
+    required = {}
+    if compression is not None:
+        splatting["extensions"] = compression
+        required = {"extensionsRequired": [SPLATTING_EXTENSION, *compression]}
+    primitive = {
+        "attributes": {semantic: number for number, semantic in enumerate(semantics)},
+        "mode": _POINTS_MODE,
+        "extensions": {SPLATTING_EXTENSION: splatting},
+    }
+    binary, count = sum(map(len, parts)), accessors[0]["count"]
     content = {
         "asset": {"version": "2.0", "generator": "hyrfpack"},
-        "extensionsUsed": [SPLATTING_EXTENSION],
+        "extensionsUsed": [SPLATTING_EXTENSION, *(compression or ())],
+        **required,
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [node],
@@ -117,8 +190,7 @@ def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
     length = _HEADER_STRUCT.size + 2 * _CHUNK_HEADER_STRUCT.size + len(text) + binary
     if length > _MAX_FILE_BYTES:
         raise HyrfDataError(
-            f"{len(splats):,} Gaussians of degree {splats.degree} come to {length:,} bytes and a .glb file holds "
-            f"{_MAX_FILE_BYTES:,}",
+            f"{count:,} Gaussians come to {length:,} bytes and a .glb file holds {_MAX_FILE_BYTES:,}",
             fix="lower `degree`",
         )
     head = _HEADER_STRUCT.pack(b"glTF", 2, length) + _CHUNK_HEADER_STRUCT.pack(len(text), _JSON_CHUNK_TYPE) + text

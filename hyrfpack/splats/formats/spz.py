@@ -38,6 +38,7 @@ from hyrfpack.splats.formats.validation import build_valid_splats
 from hyrfpack.splats.harmonics import MAX_DEGREE, harmonics_rotation, num_sh_bases
 from hyrfpack.splats.splats import Splats
 
+VERSION_IN_GLTF = 2  # of the draft extension KHR_gaussian_splatting_compression_spz_2
 _MAGIC = b"NGSP"
 _GZIP_MAGIC = b"\x1f\x8b"
 _HEADER_STRUCT = struct.Struct("<4sIIBBBB")
@@ -83,19 +84,19 @@ def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
     - positions to multiples of 2^-b, with b the largest number of fractional bits, at most 23, that the farthest
       coordinate allows: to 1/4,194,304 of that coordinate or finer, or else to 2^-23;
     - scales to steps of 6 %, clamped to 4.5e-5 to 379 units;
-    - opacities to 1/255 and quaternions to 1/723;
+    - opacities to 1/255 and quaternions to 1/723 (1/128 in version 2);
     - harmonics of degree 0 to 1/38, clamped to -3.3 to 3.3, and higher ones to 1/32, clamped to -1 to 1.
 
     Args:
         splats: the splats.
-        hints: `spz_version`, one of SPZ_VERSIONS, is used.
+        hints: `spz_version`, one of SPZ_VERSIONS or VERSION_IN_GLTF, is used.
 
     Raises:
         ValueError: the version is not one of SPZ_VERSIONS.
         HyrfDataError: a position is too far from the origin (more than 4,194,303 units).
     """
     version = hints.spz_version
-    if version not in SPZ_VERSIONS:
+    if version not in (VERSION_IN_GLTF, *SPZ_VERSIONS):
         raise ValueError(f"SPZ version {version} cannot be written; choose one of {SPZ_VERSIONS}")
     bits = _choose_fractional_bits(splats.positions)
     signs = _harmonics_signs(splats.degree).astype(np.float32)
@@ -104,12 +105,12 @@ def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
         _round_to_bytes(splats.opacities * 255),
         _round_to_bytes(splats.harmonics[:, 0] * (0.15 * 255) + 127.5),
         _round_to_bytes((np.log(np.maximum(splats.scales, np.float32(1e-30))) + 10) * 16),
-        _pack_quats(splats.quats),
+        _pack_quats(splats.quats) if version >= 3 else _pack_quats_coarsely(splats.quats),
         _pack_harmonics(splats.harmonics[:, 1:] * signs[1:, None]),
     )
     contents = [section.tobytes() for section in sections]
     flags = _ANTIALIASED_FLAG if splats.antialiased else 0
-    if version == 3:
+    if version <= 3:
         header = _HEADER_STRUCT.pack(_MAGIC, version, len(splats), splats.degree, bits, flags, 0)
         return _compress_gzip([header, *contents])
     with needs_package(f"writing .spz files of version {version}"):
@@ -372,6 +373,12 @@ def _pack_quats(quats: np.ndarray) -> np.ndarray:
     sizes = np.minimum(np.rint(np.abs(others) * (511 * _SQRT_2)), 511).astype(np.uint32)
     codes = sizes | (others < 0).astype(np.uint32) << 9
     return (largest.astype(np.uint32) << 30 | codes[:, 0] << 20 | codes[:, 1] << 10 | codes[:, 2]).astype("<u4")
+
+
+def _pack_quats_coarsely(quats: np.ndarray) -> np.ndarray:
+    """Pack quaternions (N, 4) wxyz, w >= 0, into x, y and z (N, 3) uint8, as versions 1 and 2 do."""
+    upper = np.where(quats[:, :1] < 0, -quats, quats)
+    return _round_to_bytes((upper[:, 1:] * np.array([1, -1, -1], np.float32) + 1) * 127.5)
 
 
 def _unpack_quats(packed: np.ndarray, version: int) -> np.ndarray:

@@ -90,6 +90,15 @@ def test_splats_round_trip_within_the_documented_error_bounds(version, degree):
     assert decoded.degree == degree and decoded.antialiased == splats.antialiased
 
 
+def test_version_2_rounds_rotations_to_bytes_and_all_else_as_version_3():
+    splats = make_splats(500, 1)
+    older, newer = (spz.decode(spz.encode(splats, Hints(spz_version=version)), "a.spz") for version in (2, 3))
+    for name in ("positions", "scales", "opacities", "harmonics"):
+        np.testing.assert_array_equal(getattr(older, name), getattr(newer, name), name)
+    upper = np.where(splats.quats[:, :1] < 0, -splats.quats, splats.quats)
+    assert np.abs(older.quats - upper)[:, 1:].max() <= 0.5 / 127.5 + 1e-6
+
+
 @pytest.mark.parametrize("version", [3, 4])
 def test_encoding_decoded_splats_again_changes_nothing(version):
     once = spz.encode(make_splats(500), Hints(spz_version=version))
@@ -231,8 +240,8 @@ def test_invalid_files_are_refused_with_the_reason(data, words):
 
 
 def test_unsupported_versions_raise_value_error():
-    with pytest.raises(ValueError, match="version 2"):
-        spz.encode(make_splats(1), Hints(spz_version=2))
+    with pytest.raises(ValueError, match="version 1"):
+        spz.encode(make_splats(1), Hints(spz_version=1))
 
 
 @pytest.mark.parametrize("version", [3, 4])
