@@ -12,15 +12,18 @@ from web.site import Site
 from web.test_element import ELEMENT_JS, LOADED_JS, open_element
 
 import hyrfpack
+from hyrfpack.config.edit import Rotate, Scale, Translate
 from hyrfpack.config.split import SplitConfig
 from hyrfpack.context import RunContext
 from hyrfpack.lod import split, split_model
+from hyrfpack.model.merged import MergedModel
 from hyrfpack.scene import Camera
 from hyrfpack.web import view as view_module
 from hyrfpack.web.serve import serve_in_thread
 
 pytestmark = [pytest.mark.in_turn, pytest.mark.usefixtures("reset_window")]
 SCENE_FOLDER = Path(__file__).parents[1] / "golden" / "scene"
+PARTS_FOLDER = SCENE_FOLDER.with_name("parts_scene")
 TRAINED_FILE = SCENE_FOLDER.parent / "trained" / "demo_compact.hyrf"
 SHARED_PATH, MANIFEST_PATH = "/scene/shared.hyrf", "/scene/scene.json"
 MIN_PSNR_DB = 45  # WebGL evaluates the fields with smaller numbers
@@ -29,6 +32,13 @@ MIN_PSNR_DB = 45  # WebGL evaluates the fields with smaller numbers
 @pytest.fixture
 def scene_host(host: Site) -> Site:
     host.files |= {f"/scene/{file.name}": file.read_bytes() for file in SCENE_FOLDER.iterdir()}
+    return host
+
+
+@pytest.fixture
+def parts_host(host: Site) -> Site:
+    """Serve a scene of three parts."""
+    host.files |= {f"/scene/{file.name}": file.read_bytes() for file in PARTS_FOLDER.iterdir()}
     return host
 
 
@@ -46,6 +56,38 @@ def test_a_scene_folder_is_drawn_as_python_renders_it(browser: Browser, scene_ho
     reference = np.clip(np.asarray(hyrfpack.render_view(scene.load(), camera).rgb) * 255, 0, 255)
     assert psnr(picture.astype(float), reference) > MIN_PSNR_DB
     assert browser.evaluate("document.title").startswith(scene.manifest.title)
+
+
+def reference_picture(model, camera: Camera) -> np.ndarray:
+    return np.clip(np.asarray(hyrfpack.render_view(model, camera).rgb) * 255, 0, 255)
+
+
+def scene_camera(folder: Path) -> Camera:
+    pose = hyrfpack.SceneFolder(folder).manifest.viewpoint["camera_from_world"]
+    return Camera(120, 90, 129.0, 129.0, 60.0, 45.0, np.array(pose))
+
+
+def test_a_scene_of_several_parts_is_drawn_as_python_renders_it(browser: Browser, parts_host: Site):
+    camera = scene_camera(PARTS_FOLDER)
+    open_scene(browser, parts_host)
+    browser.evaluate("hyrfpack.ready")
+    wait_until_complete(browser)
+    picture = render_in_page(browser, camera)
+    assert (
+        psnr(picture.astype(float), reference_picture(hyrfpack.load_merged_model(PARTS_FOLDER), camera)) > MIN_PSNR_DB
+    )
+    assert browser.list_errors() == []
+
+
+def test_without_the_shared_file_of_a_part_the_other_parts_are_shown(browser: Browser, parts_host: Site):
+    camera, merged = scene_camera(PARTS_FOLDER), hyrfpack.load_merged_model(PARTS_FOLDER)
+    rest = MergedModel(merged.names[::2], merged.parts[::2])
+    del parts_host.files["/scene/shared-01.hyrf"]
+    open_scene(browser, parts_host)
+    message = "shared-01.hyrf cannot be shown: it is missing; the rest of the scene is shown."
+    wait_until(browser, f"document.getElementById('remark').textContent.includes('{message}')")
+    assert psnr(render_in_page(browser, camera).astype(float), reference_picture(rest, camera)) > MIN_PSNR_DB
+    assert browser.evaluate("document.getElementById('message').hidden")
 
 
 def test_view_streams_a_scene_folder(browser: Browser, monkeypatch: pytest.MonkeyPatch):
@@ -86,6 +128,21 @@ def levels_folder(tmp_path_factory) -> hyrfpack.SceneFolder:
     return hyrfpack.SceneFolder(path)
 
 
+@pytest.fixture(scope="module")
+def parts_folder(tmp_path_factory) -> hyrfpack.SceneFolder:
+    """Return a scene folder of two parts, each of two chunks at two levels; the second part is turned and larger."""
+    path = tmp_path_factory.mktemp("stream-parts")
+    moves = {"other": [Rotate((0.0, 0.0, 1.0), 40.0), Scale(1.5), Translate((0.3, 0.1, 0.0))]}
+    (path / "other.hyrf").write_bytes(TRAINED_FILE.read_bytes())
+    hyrfpack.merge_models([TRAINED_FILE, path / "other.hyrf"], path / "both.hyrf", moves)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(split, "REFIT_CAMERAS", 1)
+        patch.setattr(split, "MEASURED_VIEWS", 1)
+        config = SplitConfig(chunk_gaussians=800, levels=2, refit_steps=3)
+        split_model(path / "both.hyrf", path / "scene", config, context=RunContext(progress=None))
+    return hyrfpack.SceneFolder(path / "scene")
+
+
 def serve_levels(host: Site, folder: hyrfpack.SceneFolder) -> None:
     host.files |= {f"/levels/{file.name}": file.read_bytes() for file in folder.path.iterdir()}
 
@@ -115,6 +172,22 @@ def test_the_budget_decides_which_levels_are_drawn(browser: Browser, host: Site,
     chosen = hyrfpack.select_levels(levels_folder.manifest, window_camera(browser), gaussians=budget)
     assert coarsest < state["gaussians"] == chosen.gaussians <= budget
     assert not state["problem"]
+
+
+@pytest.mark.acceptance
+@pytest.mark.parametrize("padding", [0, 200_000])
+def test_levels_of_all_parts_are_drawn_as_python_renders_them(browser: Browser, host: Site, parts_folder, padding: int):
+    """After a long manifest, the first picture waits for one chunk alone, and a part arrives after it."""
+    finest = count_gaussians(parts_folder, 0)
+    serve_levels(host, parts_folder)
+    host.files["/levels/scene.json"] += b" " * padding
+    open_levels(browser, host, finest)
+    state = wait_until_complete(browser)
+    camera = Camera(120, 90, 129.0, 129.0, 60.0, 45.0, window_camera(browser).camera_from_world)
+    picture = render_in_page(browser, camera).astype(float)
+    assert state["gaussians"] == finest and not state["problem"]
+    assert psnr(picture, reference_picture(parts_folder.load(), camera)) > MIN_PSNR_DB
+    assert browser.list_errors() == []
 
 
 class DyingServer(dict):

@@ -1,6 +1,7 @@
 // Chooses the levels of detail of a scene's chunks for a view and a budget, like `hyrfpack.select_levels`
 // (docs/reference/scene-folder.md).
 
+import { sharedBytes } from "./manifest.js";
 import { dot, sub } from "./vectors.js";
 
 /**
@@ -8,7 +9,7 @@ import { dot, sub } from "./vectors.js";
  * @typedef {import("./viewpoint.js").Camera} Camera
  *
  * Levels for a view: `levels` has the level of each chunk, 0 for the finest, or -1 for a chunk without a level;
- * `gaussians` is their number of Gaussians, `bytes` the size of their files and of the shared file. `predictedMse` is
+ * `gaussians` is their number of Gaussians, `bytes` the size of their files and of the shared files. `predictedMse` is
  * the predicted mean squared error of the view against the finest levels. `maxGap` bounds how much lower the error of
  * the best choice can be.
  * @typedef {{levels: number[], gaussians: number, bytes: number, predictedMse: number, maxGap: number}} LevelSelection
@@ -30,12 +31,12 @@ const MIN_DEPTH_RATIO = 1e-3; // of the distance; nearer centres would project b
  * @returns {LevelSelection}
  */
 export const selectLevels = (manifest, camera, { gaussians, bytes, isAvailable = () => true } = {}) => {
-  const { chunks, shared } = manifest, errors = predictErrors(manifest, camera);
+  const { chunks } = manifest, shared = sharedBytes(manifest), errors = predictErrors(manifest, camera);
   const cost = bytes === undefined ? "gaussians" : "bytes";
   const costs = chunks.map((chunk) => chunk.levels.map((level) => level[cost]));
-  const limit = bytes === undefined ? (gaussians ?? Infinity) : bytes - shared.bytes;
+  const limit = bytes === undefined ? (gaussians ?? Infinity) : bytes - shared;
   const { levels, maxGap } = chooseLevels(costs, errors, limit, isAvailable);
-  const selection = { levels, gaussians: 0, bytes: shared.bytes, predictedMse: 0, maxGap };
+  const selection = { levels, gaussians: 0, bytes: shared, predictedMse: 0, maxGap };
   levels.forEach((level, chunk) => {
     if (level < 0) return;
     selection.gaussians += chunks[chunk].levels[level].gaussians;

@@ -1,7 +1,9 @@
 // The manifest of a scene folder, `scene.json` (docs/reference/scene-folder.md). It is not trusted: all that is used of
 // it is checked.
 
+import { MAX_PARTS } from "./container.js";
 import { DamagedData, HyrfFormatError, assertValid, groupedDigits, quotedText } from "./errors.js";
+import { arePartNames } from "./parts.js";
 import { isFileName } from "./shared.js";
 
 /**
@@ -11,19 +13,24 @@ import { isFileName } from "./shared.js";
  * A chunk at one level of detail. `errors` are mean squared errors, one for each of the manifest's `error_radii`.
  * @typedef {SceneFile & {gaussians: number, errors: number[]}} ChunkLevel
  *
- * Gaussians of one region: corners of the box that holds them, in world units, and levels from the finest.
- * @typedef {{low: number[], high: number[], levels: ChunkLevel[]}} Chunk
+ * A part of the scene, by its shared file: a model with fields of its own.
+ * @typedef {SceneFile & {name: string}} ScenePart
  *
- * The stored object. It keeps keys that this reader does not know.
+ * Gaussians of one region of a part: corners of the box that holds them, in world units, levels from the finest, and
+ * the number of the part.
+ * @typedef {{low: number[], high: number[], levels: ChunkLevel[], part: number}} Chunk
+ *
+ * The stored object, in which a scene of version 1 has one part. It keeps keys that this reader does not know.
  * @typedef {{
- *   gaussians: number, shared: SceneFile, chunks: Chunk[], error_radii: number[], frame: Record<string, any>,
+ *   gaussians: number, parts: ScenePart[], chunks: Chunk[], error_radii: number[], frame: Record<string, any>,
  *   background: boolean, solid: number[], viewpoint: Record<string, any>, cameras: number[][],
  *   title: string, licence: string, writer: string,
  * }} Manifest
  */
 
 const FORMAT_NAME = "hyrf-scene";
-const MAJOR_VERSION = 1;
+const PARTS_VERSION = 2; // the major version of a scene of several parts; that of another scene is 1
+const ONE_PART_NAME = "scene";
 export const MAX_MANIFEST_BYTES = 2 ** 24;
 const MAX_CHUNKS = 2 ** 16;
 const MAX_LEVELS = 8;
@@ -47,9 +54,10 @@ export const parseManifest = (bytes) => {
     if (values?.format !== FORMAT_NAME) {
       throw new HyrfFormatError("This is not the manifest of a scene folder; check the address.");
     }
-    checkVersion(values.version);
-    checkManifest(values);
-    return values;
+    const isOne = readMajorVersion(values.version) < PARTS_VERSION;
+    const manifest = isOne ? { ...values, ...onePart(values) } : values;
+    checkManifest(manifest, isOne ? 1 : 2);
+    return manifest;
   } catch (error) {
     if (!(error instanceof DamagedData)) throw error;
     throw new HyrfFormatError(`The manifest is damaged: ${error.message}; copy the whole folder again.`);
@@ -69,22 +77,39 @@ const parseText = (bytes) => {
 };
 
 /** @param {any} version */
-const checkVersion = (version) => {
+const readMajorVersion = (version) => {
   const match = typeof version === "string" ? /^(\d{1,4})\.\d{1,4}$/.exec(version) : null;
   if (!match) throw new DamagedData("it has no version");
-  if (Number(match[1]) === MAJOR_VERSION) return;
+  const major = Number(match[1]);
+  if (major >= 1 && major <= PARTS_VERSION) return major;
   throw new HyrfFormatError(`The scene has version ${version}, newer than this reader; update the reader.`);
 };
 
-/** @param {Record<string, any>} values */
-const checkManifest = (values) => {
-  const { chunks, error_radii: radii } = values;
+/**
+ * Returns the parts and the chunks of a scene of version 1.
+ * @param {Record<string, any>} values
+ */
+const onePart = ({ shared, chunks }) => {
+  checkFile(shared, "shared");
+  checkList(chunks, "chunks", 0, MAX_CHUNKS);
+  const owned = chunks.map((/** @type {any} */ chunk) => (isObject(chunk) ? { ...chunk, part: 0 } : chunk));
+  return { parts: [{ ...shared, name: ONE_PART_NAME }], chunks: owned };
+};
+
+/**
+ * @param {Record<string, any>} values
+ * @param {number} leastParts
+ */
+const checkManifest = (values, leastParts) => {
+  const { chunks, parts, error_radii: radii } = values;
   checkNumbers(radii, "error_radii", 1, MAX_ERROR_RADII, 0);
   const rises = radii.every((/** @type {number} */ radius, /** @type {number} */ k) => radius > (k ? radii[k - 1] : 0));
   assertValid(rises, "'error_radii' do not rise");
-  checkFile(values.shared, "shared");
+  checkList(parts, "parts", leastParts, MAX_PARTS);
+  for (const part of parts) checkFile(part, "parts");
+  assertValid(arePartNames(parts.map((/** @type {any} */ { name }) => name)), "the names of its parts are not valid");
   checkList(chunks, "chunks", 0, MAX_CHUNKS);
-  for (const chunk of chunks) checkChunk(chunk, radii.length);
+  for (const chunk of chunks) checkChunk(chunk, radii.length, parts.length);
   for (const key of ["frame", "viewpoint"]) assertValid(isObject(values[key]), `'${key}' must be an object`);
   assertValid(typeof values.background === "boolean", "'background' must be true or false");
   checkNumbers(values.solid, "solid", 3, 3);
@@ -109,17 +134,26 @@ const checkManifest = (values) => {
  * @param {Manifest} manifest
  * @returns {SceneFile[]}
  */
-export const listFiles = ({ shared, chunks }) => [shared, ...chunks.flatMap(({ levels }) => levels)];
+export const listFiles = ({ parts, chunks }) => [...parts, ...chunks.flatMap(({ levels }) => levels)];
+
+/**
+ * Returns the bytes of the shared files of all parts.
+ * @param {Manifest} manifest
+ */
+export const sharedBytes = ({ parts }) => parts.reduce((sum, { bytes }) => sum + bytes, 0);
 
 /**
  * @param {any} chunk
  * @param {number} radii the number of errors of a level
+ * @param {number} parts their number
  */
-const checkChunk = (chunk, radii) => {
+const checkChunk = (chunk, radii, parts) => {
   assertValid(isObject(chunk), "a chunk is no object");
   for (const key of ["low", "high"]) checkNumbers(chunk[key], key, 3, 3);
   const inOrder = chunk.low.every((/** @type {number} */ low, /** @type {number} */ axis) => low <= chunk.high[axis]);
   assertValid(inOrder, "the box of a chunk is not in order");
+  checkInteger(chunk.part, "part");
+  assertValid(chunk.part < parts, `a chunk belongs to part ${chunk.part}, and there are ${parts} parts`);
   checkList(chunk.levels, "levels", 1, MAX_LEVELS);
   for (const level of chunk.levels) {
     checkFile(level, "levels");

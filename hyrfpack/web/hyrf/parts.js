@@ -30,10 +30,17 @@ export const readPartNames = (container) => {
     rejectDamaged("the names of its parts are not JSON");
   }
   const names = content?.names;
-  const isValid = Array.isArray(names) && names.length >= 1 && names.length <= MAX_PARTS && names.every(isName);
-  if (!isValid || new Set(names).size !== names.length) rejectDamaged("the names of its parts are not valid");
+  if (!arePartNames(names)) rejectDamaged("the names of its parts are not valid");
   return names;
 };
+
+/**
+ * Returns whether a value is a list of names of parts.
+ * @param {any} names
+ */
+export const arePartNames = (names) =>
+  Array.isArray(names) && names.length >= 1 && names.length <= MAX_PARTS && names.every(isName) &&
+  new Set(names).size === names.length;
 
 /** @param {any} name */
 const isName = (name) =>

@@ -3,6 +3,9 @@ uniform usampler2DArray u_features; // from features.frag
 uniform usampler2D u_places;
 uniform sampler2D u_logits; // colour logits; scale logit
 uniform vec3 u_eye;
+#ifdef MOVED
+uniform mat3 u_place_inverse; // from the axes of the scene to those of the part
+#endif
 #ifdef RESIDUAL_TERMS
 uniform sampler2D u_residuals; // RESIDUAL_TERMS texels for each Gaussian, each in a row of its own
 
@@ -45,6 +48,9 @@ void main() {
     }
     vec3 ray = uintBitsToFloat(texelFetch(u_places, place, 0).xyz) - u_eye;
     vec3 direction = ray / max(length(ray), 1e-12);
+#ifdef MOVED
+    direction = u_place_inverse * direction;
+#endif
     add_direction(direction);
     rectify();
     vec4 sum = WEIGHT(BIAS_3);

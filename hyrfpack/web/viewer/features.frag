@@ -1,5 +1,11 @@
 // The hash features of each Gaussian as halves, 8 a layer. As many layers as there are targets.
+#ifdef MOVED // places are those in the scene
+uniform sampler2D u_explicit; // x, y, z; opacity logit
+#define POSITION(place) texelFetch(u_explicit, place, 0).xyz
+#else
 uniform usampler2D u_places;
+#define POSITION(place) uintBitsToFloat(texelFetch(u_places, place, 0).xyz)
+#endif
 uniform int u_first; // layer
 
 EACH layout(location = $) out uvec4 o_layer$;
@@ -14,6 +20,6 @@ uvec4 four_levels(vec3 c, int first) {
 }
 
 void main() {
-    vec3 c = contract(uintBitsToFloat(texelFetch(u_places, ivec2(gl_FragCoord.xy), 0).xyz));
+    vec3 c = contract(POSITION(ivec2(gl_FragCoord.xy)));
 EACH o_layer$ = four_levels(c, 4 * (u_first + $));
 }

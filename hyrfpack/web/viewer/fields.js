@@ -68,11 +68,10 @@ export class Fields {
 
   // Uploads the model and compiles programs, so that rows can be evaluated.
   async prepareFields() {
-    const { gl, graphics, model, width, height } = this;
+    const { gl, graphics, model, height } = this;
     await graphics.whenDone();
     gl.getError(); // clears earlier errors
-    this.layers = Math.ceil(model.radiance.levels.length / LEVELS_PER_LAYER);
-    this.features = graphics.texture(gl.TEXTURE_2D_ARRAY, gl.RGBA32UI, width, height, this.layers);
+    this.createFeatures();
     const { sky, ...shaders } = this.shaders(), programs = {}, vertexText = readText("whole.vert");
     for (const name of Object.keys(shaders)) programs[name] = graphics.compile(vertexText, shaders[name]);
     programs.enlarge = graphics.program("whole.vert", "enlarge.frag");
@@ -89,6 +88,13 @@ export class Fields {
     await graphics.whenDone();
     this.checkMemory();
     this.isReady = true;
+  }
+
+  // Creates the textures of hash features.
+  createFeatures() {
+    const { gl, graphics, model, width, height } = this;
+    this.layers = Math.ceil(model.radiance.levels.length / LEVELS_PER_LAYER);
+    this.features = graphics.texture(gl.TEXTURE_2D_ARRAY, gl.RGBA32UI, width, height, this.layers);
   }
 
   // Uploads the numbers of the Gaussians that `evaluate` reads.
@@ -150,8 +156,8 @@ export class Fields {
     return byteLength <= gl.getParameter(gl.MAX_UNIFORM_BLOCK_SIZE) && !/swiftshader|llvmpipe|software/i.test(name);
   }
 
-  // Builds the fragment shaders of all passes.
-  shaders() {
+  // Builds the fragment shaders of all passes. `constants` are for those that evaluate Gaussians.
+  shaders(constants = {}) {
     const { gl, cells, layers, model: { geometry, radiance, sh, background, residualDegree } } = this;
     // Some devices cannot draw to as many targets as they report, because they limit the bytes per pixel.
     this.targets = Math.min(layers, gl.getParameter(gl.MAX_DRAW_BUFFERS), gl.getParameter(gl.MAX_COLOR_ATTACHMENTS));
@@ -165,9 +171,9 @@ export class Fields {
       const { BIAS_2, MATRIX_2, BIAS_3, MATRIX_3 } = field.decoder.places;
       return { ...common(field), BIAS_2, MATRIX_2, BIAS_3, MATRIX_3 };
     };
-    const placed = { PLACES: 1 };
+    const placed = { PLACES: 1, ...constants };
     const directions = radiance.decoder.places.INPUTS + 4 * cells * radiance.levels.length;
-    const turned = { DIRECTIONS: directions, ...(sh ? { HARMONICS: 1 } : {}) };
+    const turned = { DIRECTIONS: directions, ...(sh ? { HARMONICS: 1 } : {}), ...constants };
     const residuals = residualDegree === undefined ? {} : { RESIDUAL_TERMS: (residualDegree + 1) ** 2 };
     const shaders = {
       geometry: buildFieldShader("geometry.frag", { ...deep(geometry), ...placed, ...residuals }),
@@ -175,8 +181,8 @@ export class Fields {
       colors: buildFieldShader("colors.frag", { ...deep(radiance), ...turned, ...residuals }),
     };
     if (!background) return shaders;
-    const constants = { ...deep(radiance), ...placed, ...turned, BACKGROUND: 1 };
-    for (const name of ["panorama", "sky"]) shaders[name] = buildFieldShader(`${name}.frag`, constants);
+    const behind = { ...deep(radiance), ...placed, ...turned, BACKGROUND: 1 };
+    for (const name of ["panorama", "sky"]) shaders[name] = buildFieldShader(`${name}.frag`, behind);
     return shaders;
   }
 

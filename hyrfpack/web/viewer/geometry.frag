@@ -5,6 +5,12 @@ uniform sampler2D u_pixel_sizes; // of the photos, from hyrf/sampling.js
 #ifdef RESIDUAL_TERMS
 uniform sampler2D u_residuals; // two texels for each Gaussian, in two rows: a, b, x; y, z
 #endif
+#ifdef MOVED // the part's place in the scene, see hyrf/places.js
+uniform mat3 u_place_rows;
+uniform vec4 u_place_quat;
+uniform vec3 u_place_shift;
+uniform float u_place_scale;
+#endif
 uniform bool u_product; // the scale rule, else the sum
 uniform bool u_grows; // the largest scale, outwards
 
@@ -38,11 +44,21 @@ void main() {
 #endif
     vec3 scales = u_product ? log_sigmoid(first.yzw) + log_sigmoid(vec3(logit)) : log_sigmoid(first.yzw + logit);
     if (u_grows) scales += log(max(1.0, norm(own.xyz / u_half_extent)));
-    scales = (scales + 22.0) / 44.0;
     vec4 quat = last + vec4(1.0, 0.0, 0.0, 0.0);
     quat /= max(length(quat), 1e-12);
-    float opacity = 1.0 / (1.0 + exp(-first.x - own.w));
-    o_place = uvec4(floatBitsToUint(own.xyz), packUnorm2x16(vec2(opacity, scales.z)));
+    float opacity = 1.0 / (1.0 + exp(-first.x - own.w)), size = texelFetch(u_pixel_sizes, place, 0).x;
+    vec3 mean = own.xyz;
+#ifdef MOVED
+    vec4 turn = u_place_quat, q = quat;
+    mean = u_place_scale * (u_place_rows * mean) + u_place_shift;
+    scales += log(u_place_scale);
+    size *= u_place_scale;
+    quat = vec4(
+        turn.x * q.x - dot(turn.yzw, q.yzw), turn.x * q.yzw + q.x * turn.yzw + cross(turn.yzw, q.yzw)
+    );
+#endif
+    scales = (scales + 22.0) / 44.0;
+    o_place = uvec4(floatBitsToUint(mean), packUnorm2x16(vec2(opacity, scales.z)));
     o_shape = uvec4(packSnorm2x16(quat.xy), packSnorm2x16(quat.zw), packUnorm2x16(scales.xy), 0u);
-    o_shape.w = floatBitsToUint(texelFetch(u_pixel_sizes, place, 0).x);
+    o_shape.w = floatBitsToUint(size);
 }

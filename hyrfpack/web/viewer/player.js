@@ -238,10 +238,10 @@ export class Player extends EventTarget {
   }
 
   // Returns an object that draws a content.
-  makeContent(loader, { models, splats, chunks }) {
-    const { gl } = this.renderer;
+  makeContent(loader, message) {
+    const { renderer: { gl } } = this, { models, splats } = message;
     if (!models) return new Splats(gl, splats);
-    const streamed = loader.makeContent(gl, models, chunks);
+    const streamed = loader.makeContent(gl, message);
     return streamed ?? (models.length > 1 ? new MergedFields(gl, models) : new Fields(gl, models[0]));
   }
 

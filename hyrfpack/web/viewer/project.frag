@@ -28,9 +28,11 @@ uniform vec2 u_size;
 uniform float u_near;
 uniform float u_tolerance; // band around the picture in which centres may lie, as a fraction of half its size
 uniform float u_pick; // > 0: instead of a colour, z / (z + u_pick)
-uniform vec4 u_flat; // instead, this colour for all splats, if alpha is 1
+uniform bool u_flat; // instead, the colour of each part
+uniform vec3 u_flats[64];
 uniform int u_first_row; // of the target
-uniform highp sampler2D u_weights; // of each row of splats, in [0, 1], while levels of detail fade
+// Of each row of splats: its weight in [0, 1], while levels of detail fade; the number of its part.
+uniform highp sampler2D u_weights;
 uniform bool u_weighted; // take these
 
 layout(location = 0) out uvec4 o_shape; // centre x, y in pixels; covariance xx, xy
@@ -105,7 +107,8 @@ void main() {
     uvec4 shape = texelFetch(u_shapes, place, 0);
     vec2 last = unpackUnorm2x16(packed.w);
     float opacity = last.x;
-    float weight = u_weighted ? texelFetch(u_weights, ivec2(0, place.y), 0).x : 1.0;
+    vec2 row = u_weighted ? texelFetch(u_weights, ivec2(0, place.y), 0).xy : vec2(1.0, 0.0);
+    float weight = row.x;
     if (weight <= 0.0) return;
     // Equal opacities whose weights add up to 1 let as much light through as one of them.
     if (weight < 1.0) opacity = 1.0 - pow(max(1.0 - opacity, 1e-6), weight);
@@ -148,7 +151,7 @@ void main() {
         color = vec3(levels) * 3.0 / vec3(2047.0, 2047.0, 1023.0) - 1.0;
         if (u_degree > 0) color += harmonics(place, normalize(mean - u_eye));
     }
-    if (u_flat.a > 0.0) color = u_flat.rgb;
+    if (u_flat) color = u_flats[int(row.y)];
     color = u_pick > 0.0 ? vec3(p.z / (p.z + u_pick)) : clamp(color, 0.0, 100.0); // far below what halves hold
 
     o_shape = uvec4(floatBitsToUint(focal * slope + principal), floatBitsToUint(vec2(xx + u_low_pass.z, xy)));

@@ -244,25 +244,28 @@ export class Renderer {
   // Projects all splats of a view. For `paint` see `splats`.
   projections(view, paint) {
     const { content } = this;
+    const flats = paint.partLogs?.map((logs) => logs.map(encodeLog)) ?? [];
     if (!content.parts) {
-      this.projectPart(content, view, 0, { pick: paint.pick ?? 0 });
+      this.projectPart(content, view, 0, { pick: paint.pick ?? 0, flats });
       return;
     }
     for (const [number, { fields, place, firstRow }] of content.parts.entries()) {
-      const flat = paint.partLogs?.[number].map(encodeLog) ?? null, pick = (paint.pick ?? 0) / place.scale;
-      this.projectPart(fields, viewFromPlace(view, place), firstRow, { pick, flat });
+      const pick = (paint.pick ?? 0) / place.scale;
+      this.projectPart(fields, viewFromPlace(view, place), firstRow, { pick, flats: flats.slice(number, number + 1) });
     }
   }
 
-  // Projects the splats of a content to the rows from `firstRow` on. `flat` is a colour for all of them, or null.
-  projectPart(content, view, firstRow, { pick, flat = null }) {
+  // Projects the splats of a content to the rows from `firstRow` on. `flats` has the colour of each of its parts
+  // instead of their own, if it has any.
+  projectPart(content, view, firstRow, { pick, flats }) {
     const { gl, graphics, project: p, scene } = this, { colors, harmonics } = content;
     const [across, down] = view.scales ?? [1, 1];
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.projection);
     gl.viewport(0, firstRow, this.tableSize[0], content.usedHeight ?? content.height);
     gl.useProgram(p.program);
     gl.uniform1i(p.u_first_row, firstRow);
-    gl.uniform4f(p.u_flat, ...(flat ?? [0, 0, 0]), flat ? 1 : 0);
+    gl.uniform1i(p.u_flat, flats.length);
+    if (flats.length) gl.uniform3fv(p.u_flats, flats.flat());
     const colored = colors ? { u_colors: colors } : this.unused;
     graphics.bind(p, { u_places: content.places, u_shapes: content.shapes, ...colored });
     graphics.bind(p, harmonics ? { u_harmonics: harmonics } : this.noLayers, gl.TEXTURE_2D_ARRAY, 3);

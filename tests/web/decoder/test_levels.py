@@ -5,20 +5,21 @@ from __future__ import annotations
 import base64
 import json
 import math
+from dataclasses import asdict
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from format.test_scene_manifest import VALID_MANIFEST, with_value
+from format.test_scene_manifest import PARTS_MANIFEST, VALID_MANIFEST, with_value
 from scenes import camera_at
 from web.scripts import run_script
 
 from hyrfpack.cameras.files import camera_to_json
 from hyrfpack.format.scene_manifest import Chunk, ChunkLevel, Manifest, ScenePart, parse_manifest
 from hyrfpack.lod.select import predict_errors, select_levels
-from tools.safety.make_golden import GOLDEN_SCENE_FOLDER
+from tools.safety.make_golden import GOLDEN_PARTS_SCENE_FOLDER, GOLDEN_SCENE_FOLDER
 
 SELECT_SCRIPT = Path(__file__).with_name("select_levels.mjs")
 LATER_VERSION = json.dumps({**json.loads(VALID_MANIFEST.to_json()), "version": "1.7", "sky": "blue"}).encode()
@@ -33,6 +34,8 @@ BAD_MANIFESTS = [
         with_value(path, value)
         for path, value in [
             (["version"], "2.0"),
+            (["version"], "3.0"),
+            (["version"], "0.9"),
             (["version"], None),
             (["format"], "other"),
             (["gaussians"], 8),
@@ -58,6 +61,26 @@ BAD_MANIFESTS = [
             (["cameras"], [[]]),
             (["title"], "two\nlines"),
             (["licence"], "x" * 1001),
+        ]
+    ),
+    *(
+        with_value(path, value, PARTS_MANIFEST)
+        for path, value in [
+            (["version"], "1.0"),
+            (["parts"], []),
+            (["parts"], [json.loads(PARTS_MANIFEST.to_json())["parts"][0]]),
+            (["parts"], {"0": 1}),
+            (["parts", 1], "c.hyrf"),
+            (["parts", 1, "name"], "house"),
+            (["parts", 1, "name"], ""),
+            (["parts", 1, "name"], "a\nb"),
+            (["parts", 1, "file"], "../c.hyrf"),
+            (["parts", 1, "file"], "B.hyrf"),
+            (["parts", 1, "crc32"], "XYZ"),
+            (["chunks", 0, "part"], 2),
+            (["chunks", 0, "part"], -1),
+            (["chunks", 0, "part"], 0.5),
+            (["chunks", 0, "part"], None),
         ]
     ),
 ]
@@ -101,10 +124,11 @@ def test_the_selection_is_that_of_python(tmp_path: Path):
         ):
             cases.append({"manifest": manifest.to_json(), "camera": camera_to_json(camera), "options": options})
             expected.append(select_levels(manifest, camera, **options))
-    golden = (GOLDEN_SCENE_FOLDER / "scene.json").read_bytes()
-    camera = camera_at((1e6, 3, -20), width=80, height=60, focal=70)
-    cases.append({"manifest": golden, "camera": camera_to_json(camera)})
-    expected.append(select_levels(parse_manifest(golden), camera))
+    for folder in (GOLDEN_SCENE_FOLDER, GOLDEN_PARTS_SCENE_FOLDER):
+        golden = (folder / "scene.json").read_bytes()
+        camera = camera_at((1e6, 3, -20), width=80, height=60, focal=70)
+        cases.append({"manifest": golden, "camera": camera_to_json(camera)})
+        expected.append(select_levels(parse_manifest(golden), camera))
 
     answers = run(tmp_path, cases)
 
@@ -163,11 +187,15 @@ def test_levels_that_are_not_available_are_left_out(tmp_path: Path):
 
 
 def test_manifests_are_accepted_and_refused_as_in_python(tmp_path: Path):
-    good = [VALID_MANIFEST.to_json(), LATER_VERSION, (GOLDEN_SCENE_FOLDER / "scene.json").read_bytes()]
+    folders = (GOLDEN_SCENE_FOLDER, GOLDEN_PARTS_SCENE_FOLDER)
+    golden = [(folder / "scene.json").read_bytes() for folder in folders]
+    good = [VALID_MANIFEST.to_json(), PARTS_MANIFEST.to_json(), LATER_VERSION, *golden]
 
     answers = run(tmp_path, [{"manifest": data} for data in good + BAD_MANIFESTS])
 
-    assert answers[0] == json.loads(VALID_MANIFEST.to_json())
+    for answer, manifest in zip(answers, (VALID_MANIFEST, PARTS_MANIFEST), strict=False):
+        expected = json.loads(json.dumps(asdict(manifest)))
+        assert {key: answer[key] for key in expected} == expected
     assert all("refused" not in answer for answer in answers[: len(good)])
     for data, answer in zip(BAD_MANIFESTS, answers[len(good) :], strict=True):
         assert answer.get("refused", "").count("\n") == 0 and "refused" in answer, data

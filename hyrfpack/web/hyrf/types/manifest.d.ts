@@ -7,14 +7,18 @@ export type ChunkLevel = SceneFile & {
     gaussians: number;
     errors: number[];
 };
+export type ScenePart = SceneFile & {
+    name: string;
+};
 export type Chunk = {
     low: number[];
     high: number[];
     levels: ChunkLevel[];
+    part: number;
 };
 export type Manifest = {
     gaussians: number;
-    shared: SceneFile;
+    parts: ScenePart[];
     chunks: Chunk[];
     error_radii: number[];
     frame: Record<string, any>;
@@ -39,4 +43,9 @@ export declare const parseManifest: (bytes: Uint8Array) => Manifest;
  * @param {Manifest} manifest
  * @returns {SceneFile[]}
  */
-export declare const listFiles: ({ shared, chunks }: Manifest) => SceneFile[];
+export declare const listFiles: ({ parts, chunks }: Manifest) => SceneFile[];
+/**
+ * Returns the bytes of the shared files of all parts.
+ * @param {Manifest} manifest
+ */
+export declare const sharedBytes: ({ parts }: Manifest) => number;

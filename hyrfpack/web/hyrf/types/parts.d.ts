@@ -7,6 +7,11 @@ import { Container } from "./container.js";
  */
 export declare const readPartNames: (container: Container) => string[];
 /**
+ * Returns whether a value is a list of names of parts.
+ * @param {any} names
+ */
+export declare const arePartNames: (names: any) => boolean;
+/**
  * Returns name and container of each part, after a check of all sizes that they declare.
  * @param {Container} container of a merged file that is complete
  * @returns {{name: string, container: Container}[]}

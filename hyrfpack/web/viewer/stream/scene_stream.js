@@ -10,24 +10,28 @@
 //     {gaussians}                            another budget
 //     {uploaded: {number, chunk, level}}     a level can be drawn
 //     {faded: {number, chunk}}               of a `swap`, only the last level is still drawn
+//     {unusable: {part, reason}}             the device cannot draw a part
 //     {again}                                send the content again, because the graphics device was lost
 // Messages from the worker:
-//     {content: {..., chunks}}               the content, and the levels that are drawn at once
-//     {chunk: {number, chunk, level, rows, explicit, logits, pixelSizes, balls}}   a level to upload to these rows
+//     {content: {..., parts, chunks}}        the content, with the first part of the scene as its model; the further
+//                                            parts that were read, and the levels that are drawn at once
+//     {part: {number, part, model, place, exposure}}   a further part of the scene
+//     {chunk: {number, chunk, level, part, rows, explicit, logits, pixelSizes, balls}}   a level to upload to `rows`
 //     {swap: {number, chunk, from, to}}      fade from the rows of one level to those of another one
 //     {state: {ticket, isComplete, gaussians, bytes, problem}}   of the view with this ticket; `problem` is a sentence
 
-import { HyrfFormatError } from "../../hyrf/errors.js";
-import { read } from "../../hyrf/index.js";
 import { chooseLevels, predictErrors } from "../../hyrf/levels.js";
 import { parseManifest } from "../../hyrf/manifest.js";
+import { movePositions } from "../../hyrf/places.js";
+import { rowBalls } from "../../hyrf/row_states.js";
 import { viewpointOf } from "../../hyrf/viewpoint.js";
 import { cameraOf } from "../camera.js";
-import { packFields, packGaussians } from "../pack.js";
+import { packGaussians } from "../pack.js";
 import { modelScene } from "../scene.js";
 import { ABSENT, ChunkLevels, READY, UNUSABLE, UPLOADING } from "./chunk_levels.js";
 import { FileQueue } from "./file_queue.js";
 import { RowPool } from "./row_pool.js";
+import { ScenePart } from "./scene_part.js";
 
 const ROW_WIDTH = 256; // of the textures: each level begins a row, and the coarsest ones are small
 const FIRST_PICTURE_BYTES = 200_000; // that are fetched before the first picture is drawn, if they have a chunk
@@ -47,8 +51,7 @@ export class SceneStream {
     this.problems = new Map(); // name of an unusable file -> the reason
     this.isOpening = false; // whether the content is being prepared
     this.isShown = false; // whether it was sent
-    this.shared = null; // the bytes of the shared file
-    this.early = []; // [file, bytes] that came before the shared file
+    this.early = new Map(); // name of a file that came before the shared file of its part -> [file, bytes]
     this.isOutdated = true; // whether levels must be chosen again
     this.isShort = false; // whether a wanted level does not fit into memory
     this.decoding = 0; // the number of files that are being decoded
@@ -67,6 +70,7 @@ export class SceneStream {
     const { manifest: text, address, maxRows } = this.request, manifest = parseManifest(text), { chunks } = manifest;
     const extra = EXTRA_ROWS_PER_CHUNK * chunks.length;
     this.manifest = manifest;
+    this.parts = manifest.parts.map((file, number) => new ScenePart(number, file));
     this.chunks = chunks.map((chunk, number) => new ChunkLevels(number, chunk, countRows));
     this.costs = chunks.map(({ levels }) => levels.map(({ gaussians }) => gaussians));
     this.places = new Map(); // name of a file -> [number of the chunk, level]
@@ -94,15 +98,17 @@ export class SceneStream {
     this.positions = new Float32Array(3 * ROW_WIDTH * this.rowCount).fill(NaN); // which are not drawn
     this.sorter.add(this.number, this.positions, ROW_WIDTH);
     for (const chunk of this.chunks) chunk.clear();
+    for (const part of this.parts) part.sent = null;
   }
 
-  handle({ look, gaussians, uploaded, faded, again, close }) {
+  handle({ look, gaussians, uploaded, faded, unusable, again, close }) {
     if (close) return this.close();
     if (look) this.view = { ticket: look.ticket, camera: cameraOf(look.view, this.scene) };
     if (gaussians) this.gaussians = gaussians;
     if (look || gaussians) this.isOutdated = true;
     if (uploaded?.number === this.number) this.chunks[uploaded.chunk].get(uploaded.level).state = READY;
     if (faded?.number === this.number) this.endFade(this.chunks[faded.chunk]);
+    if (unusable) this.reject(this.parts[unusable.part].file, unusable.reason);
     if (again && this.scene) this.clear();
     if (look || gaussians || uploaded || faded || again) this.schedule();
   }
@@ -181,21 +187,44 @@ export class SceneStream {
 
   // Fetches what the first picture needs, and sends it once it is there.
   fetchFirst() {
-    const { shared } = this.manifest, coarsest = this.chunks.map((chunk) => coarsestUsable(chunk)).filter(Boolean);
+    const [scene] = this.parts, coarsest = this.chunks.map((chunk) => coarsestUsable(chunk)).filter(Boolean);
     const rank = ({ chunk, level }) => this.errors[chunk.number][level.level];
     coarsest.sort((a, b) => rank(b) - rank(a));
-    let bytes = this.request.manifest.length + shared.bytes;
-    const first = coarsest.filter(({ level }, place) => {
-      bytes += level.file.bytes;
+    const counted = new Set([scene]);
+    let bytes = this.request.manifest.length + scene.file.bytes;
+    const first = coarsest.filter(({ chunk, level }, place) => {
+      const part = this.partOf(chunk);
+      bytes += level.file.bytes + (counted.has(part) ? 0 : part.file.bytes);
+      counted.add(part);
       return !place || bytes <= FIRST_PICTURE_BYTES;
     });
-    const missing = first.filter(({ level }) => level.state === ABSENT).map(({ level }) => level.file);
-    this.queue.want(this.shared ? missing : [shared, ...missing]);
+    const missing = first.filter(({ level }) => level.state === ABSENT);
+    this.want(missing);
     const read = first.length - missing.length;
     this.post({ progress: { what: "loading", part: read / Math.max(1, first.length) } });
     const hasLost = this.queue.losses > MAX_FIRST_LOSSES;
-    if (this.shared && (!missing.length || (hasLost && read))) this.postContent();
+    if (scene.isRead && (!missing.length || (hasLost && read))) this.postContent();
     else if (hasLost) this.fail(`${new URL(this.queue.folder).host} does not answer; reload the page to try again`);
+  }
+
+  // Returns the part that a chunk belongs to.
+  partOf({ number }) {
+    return this.parts[this.manifest.chunks[number].part];
+  }
+
+  // Fetches the files of levels {chunk, level}, those needed most first. Before the first level of a part, it fetches
+  // the shared file of this part. That of the first part comes first of all, because the scene is placed by it.
+  want(levels) {
+    const files = new Set();
+    const add = (part) => {
+      if (!part.isRead) files.add(part.file);
+    };
+    add(this.parts[0]);
+    for (const { chunk, level } of levels) {
+      add(this.partOf(chunk));
+      files.add(level.file);
+    }
+    this.queue.want([...files].filter(({ file }) => !this.early.has(file)));
   }
 
   // Gives up, with a sentence for the user.
@@ -207,25 +236,46 @@ export class SceneStream {
   // Sends the content, with the levels that were read.
   async postContent() {
     this.isOpening = true;
-    const { number, manifest, request: { name, stage } } = this, model = await read(this.shared);
+    const { number, manifest, request: { name, stage } } = this, [scene, ...rest] = this.parts;
+    const sent = Promise.resolve(), parts = [];
+    scene.sent = sent;
+    const { source, packed: { model, exposure, place } } = await scene.pack();
+    for (let part; (part = rest.find(({ isRead, sent }) => isRead && !sent));) { // more may be read meanwhile
+      part.sent = sent;
+      parts.push((await part.pack()).packed);
+    }
     this.isOpening = false;
     this.isShown = true;
-    const described = modelScene({ ...model, count: manifest.gaussians }, manifest.title || name);
-    this.scene = { ...described, ...stage, exposure: model.exposure, isStreamed: true };
-    const packed = packFields(model);
+    const described = modelScene({ ...source, count: manifest.gaussians }, manifest.title || name);
+    this.scene = { ...described, ...stage, exposure, isStreamed: true };
+    if (rest.length) {
+      const others = rest.map(({ number: part }) => parts.find((other) => other.part === part));
+      const maps = others.map((part) => ({ exposure: part?.exposure ?? null, place: part?.place ?? place }));
+      Object.assign(this.scene, { exposure: null, parts: [{ exposure, place }, ...maps] });
+    }
     const layout = { width: ROW_WIDTH, height: this.rowCount, count: ROW_WIDTH * this.rowCount };
     const chunks = [];
     for (const chunk of this.chunks) {
       for (const level of chunk.levels.filter(({ packed }) => packed)) {
-        chunks.push({ number, chunk: chunk.number, level: level.level, rows: level.rows, ...level.packed });
+        const { number: part } = this.partOf(chunk);
+        chunks.push({ number, chunk: chunk.number, level: level.level, part, rows: level.rows, ...level.packed });
         level.packed = null;
       }
       if (chunk.next(false) >= 0) this.show(chunk, chunk.next(false));
     }
-    const content = { number, whole: true, scene: this.scene, models: [{ ...packed, ...layout }], chunks };
-    const { geometry, radiance } = packed;
-    this.post({ content }, [geometry.table.buffer, radiance.table.buffer, ...chunks.flatMap(listBuffers)]);
+    const content = { number, whole: true, scene: this.scene, models: [{ ...model, ...layout }], parts, chunks };
+    const tables = [model, ...parts.map((part) => part.model)].flatMap(listTables);
+    this.post({ content }, [...tables, ...chunks.flatMap(listBuffers)]);
     this.schedule();
+  }
+
+  // Sends a part to the page, once. Returns a promise that it is sent.
+  sendPart(part) {
+    const send = async () => {
+      const { number } = this, { packed } = await part.pack();
+      this.post({ part: { number, ...packed } }, listTables(packed.model));
+    };
+    return (part.sent ??= send());
   }
 
   // Fetches the coarsest levels, and those that suit the view, as far as they fit into memory.
@@ -234,15 +284,15 @@ export class SceneStream {
     for (const chunk of this.chunks) {
       const { number, target, shown, coarsest } = chunk, errors = this.errors[number];
       const isWanted = (level) => chunk.get(level)?.state === ABSENT;
-      if (isWanted(coarsest)) wanted.push({ level: chunk.get(coarsest), isFirst: true, rate: errors[coarsest] });
+      if (isWanted(coarsest)) wanted.push({ chunk, level: chunk.get(coarsest), isFirst: true, rate: errors[coarsest] });
       if (target === coarsest || !isWanted(target)) continue;
       const gain = errors[shown < 0 ? coarsest : shown] - errors[target], level = chunk.get(target);
-      wanted.push({ level, isFirst: false, rate: gain / level.file.bytes });
+      wanted.push({ chunk, level, isFirst: false, rate: gain / level.file.bytes });
     }
     wanted.sort((a, b) => b.isFirst - a.isFirst || b.rate - a.rate);
     let room = this.spareLevels().reduce((rows, { rowCount }) => rows + rowCount, this.pool.free);
     const fitting = wanted.findIndex(({ level: { rowCount } }) => (room -= rowCount) < 0);
-    this.queue.want((fitting < 0 ? wanted : wanted.slice(0, fitting)).map(({ level }) => level.file));
+    this.want(fitting < 0 ? wanted : wanted.slice(0, fitting));
     if (this.isShort !== fitting >= 0) this.schedule();
     this.isShort = fitting >= 0;
   }
@@ -251,7 +301,8 @@ export class SceneStream {
   async receive(file, bytes) {
     this.decoding++;
     try {
-      if (file === this.manifest.shared) await this.receiveShared(bytes);
+      const part = this.parts.find((each) => each.file === file);
+      if (part) await this.receivePart(part, bytes);
       else await this.receiveChunk(file, bytes);
     } catch (error) {
       const isMemory = error instanceof RangeError; // thrown for arrays that are too long
@@ -261,54 +312,58 @@ export class SceneStream {
     this.schedule();
   }
 
-  async receiveShared(bytes) {
-    const model = await read(bytes);
-    if (model.count) throw new HyrfFormatError("it holds Gaussians, and should hold only what chunks share");
-    if (model.shapeResiduals) throw new HyrfFormatError("chunks with residuals cannot be shown");
-    this.config = canonicalText(model.config);
-    this.shared = bytes;
-    for (const [file, data] of this.early.splice(0)) this.receive(file, data);
+  // Takes the shared file of a part, and the files that came before it.
+  async receivePart(part, bytes) {
+    const [scene] = this.parts;
+    if (part !== scene && !scene.isRead) {
+      this.early.set(part.file.file, [part.file, bytes]);
+      return;
+    }
+    await part.receive(bytes, scene);
+    const early = [...this.early.values()];
+    this.early.clear();
+    for (const [file, data] of early) this.receive(file, data);
   }
 
   async receiveChunk(file, bytes) {
-    if (!this.shared) {
-      this.early.push([file, bytes]);
+    const [number, levelNumber] = this.places.get(file.file), chunk = this.chunks[number], part = this.partOf(chunk);
+    if (!part.isRead) {
+      if (!part.isUnusable) this.early.set(file.file, [file, bytes]);
       return;
     }
-    const [number, levelNumber] = this.places.get(file.file), level = this.chunks[number].get(levelNumber);
-    const content = this.number, model = await read(bytes, { openFile: (name) => this.openFile(name) });
-    if (model.count !== file.gaussians) {
-      throw new HyrfFormatError(`it has ${model.count} Gaussians, and the manifest says ${file.gaussians}`);
-    }
-    if (canonicalText(model.config) !== this.config) {
-      throw new HyrfFormatError(`its configuration is not that of ${this.manifest.shared.file}`);
-    }
+    const content = this.number, level = chunk.get(levelNumber), model = await part.readChunk(file, bytes);
+    if (this.isShown) await this.sendPart(part);
     if (content !== this.number || level.state !== ABSENT) return; // meanwhile the device was lost
     const rows = this.takeRows(level.rowCount);
     if (!rows) return; // meanwhile memory has become short; it is fetched again if it still suits the view
     const packed = packGaussians(model, ROW_WIDTH);
-    Object.assign(level, { rows, positions: model.positions, state: this.isShown ? UPLOADING : READY });
+    let { positions } = model;
+    if (part.number) {
+      positions = movePositions(positions, part.place);
+      packed.balls = rowBalls(positions, ROW_WIDTH);
+    }
+    Object.assign(level, { rows, positions, state: this.isShown ? UPLOADING : READY });
     if (this.isShown) {
-      const chunk = { number: content, chunk: number, level: levelNumber, rows, ...packed };
-      this.post({ chunk }, listBuffers(chunk));
+      const sent = { number: content, chunk: number, level: levelNumber, part: part.number, rows, ...packed };
+      this.post({ chunk: sent }, listBuffers(sent));
     } else {
       level.packed = packed;
     }
   }
 
-  // Returns the bytes of the file that chunks refer to.
-  openFile(name) {
-    const { shared } = this.manifest;
-    if (name === shared.file) return this.shared;
-    throw new HyrfFormatError(`it refers to ${name}, and the manifest lists ${shared.file}`);
-  }
-
   // Records that a file cannot be used.
   reject({ file }, reason) {
-    if (file === this.manifest.shared.file) return this.fail(`${file}: ${reason}`);
+    const part = this.parts.find((each) => each.file.file === file);
+    if (part?.number === 0) return this.fail(`${file}: ${reason}`);
     this.problems.set(file, reason);
-    const [number, level] = this.places.get(file);
-    this.chunks[number].get(level).state = UNUSABLE;
+    if (part) {
+      part.isUnusable = true;
+      const lost = this.chunks.filter((chunk) => this.partOf(chunk) === part).flatMap(({ levels }) => levels);
+      for (const level of lost) level.state = UNUSABLE;
+    } else {
+      const [number, level] = this.places.get(file);
+      this.chunks[number].get(level).state = UNUSABLE;
+    }
     this.isOutdated = true;
     this.schedule();
   }
@@ -383,11 +438,6 @@ function coarsestUsable(chunk) {
 // Returns the message of an error as the end of a sentence.
 const reasonOf = ({ message }) => message[0].toLowerCase() + message.slice(1).replace(/\.$/, "");
 
-// Returns a text that is the same for the same JSON value.
-const canonicalText = (value) =>
-  JSON.stringify(value, (_, inner) => {
-    const isObject = typeof inner === "object" && inner !== null && !Array.isArray(inner);
-    return isObject ? Object.fromEntries(Object.entries(inner).sort()) : inner;
-  });
-
 const listBuffers = (chunk) => Object.values(chunk).filter(ArrayBuffer.isView).map(({ buffer }) => buffer);
+
+const listTables = ({ geometry, radiance }) => [geometry.table.buffer, radiance.table.buffer];

@@ -52,10 +52,19 @@ class StreamLoader extends Loader {
 
   receive(message) {
     super.receive(message);
-    const { chunk, swap, state } = message;
-    // A content is installed before its levels are handled.
+    const { part, chunk, swap, state } = message;
+    // A content is installed before its parts and levels are handled.
+    if (part) this.delivered.then(() => this.addPart(part));
     if (chunk || swap) this.delivered.then(() => this.updateLevels(chunk, swap));
     if (state) this.setState(state);
+  }
+
+  // Handles a part whose fields have arrived.
+  addPart(part) {
+    if (part.number !== this.current) return; // of a content that was lost with the device
+    const { exposure, place } = part;
+    this.player.scene.parts[part.part] = { exposure, place };
+    this.fields.addPart(part);
   }
 
   // Handles a level that has arrived, or one that is to be drawn instead of another one.
@@ -77,8 +86,8 @@ class StreamLoader extends Loader {
     this.player.emit("streamed", state);
   }
 
-  makeContent(gl, [model], chunks) {
-    this.fields = new StreamedFields(gl, model, chunks, this);
+  makeContent(gl, { models: [model], parts, chunks }) {
+    this.fields = new StreamedFields(gl, model, parts, chunks, this);
     return this.fields;
   }
 

@@ -1,7 +1,10 @@
 // Evaluates and draws the chunks of a scene folder. They lie in the rows of one set of textures, so that all of them
-// are sorted and blended together. One level of a chunk fades into another over several frames.
+// are sorted and blended together. One level of a chunk fades into another over several frames. Each part of the scene
+// has fields of its own; those of the first part are this object.
 
 import { Fields } from "../fields.js";
+import { readText } from "../texts.js";
+import { PartFields } from "./part_fields.js";
 import { eachRun } from "./row_pool.js";
 
 const FADE_MS = 400;
@@ -11,12 +14,16 @@ const POLL_MS = 30;
 const MAX_BATCH_ROWS = 256; // of levels that are evaluated together: the first of them waits for the last
 
 export class StreamedFields extends Fields {
-  // `model` has the fields and the size of the textures. `chunks` are the levels that are drawn at once. `events` is a
-  // StreamLoader.
-  constructor(gl, model, chunks, events) {
+  // `model` has the fields of the first part and the size of the textures. `parts` are further parts, {part: number,
+  // model, place}. `chunks` are the levels that are drawn at once. `events` is a StreamLoader.
+  constructor(gl, model, parts, chunks, events) {
     super(gl, { ...model, balls: new Float32Array(4 * model.height).fill(NaN) });
-    Object.assign(this, { chunks, events });
-    this.rowWeights = new Float32Array(this.height);
+    Object.assign(this, { firstParts: parts, chunks, events });
+    this.further = new Map(); // number of a further part -> its PartFields
+    this.ready = new Map(); // number of a further part -> the promise that it is ready, of whether it can be drawn
+    this.compiled = new Map(); // text of shaders -> the promise of their programs, which equal parts share
+    this.rowParts = new Uint8Array(this.height); // number of the part of each row
+    this.rowWeights = new Float32Array(2 * this.height); // and the number of its part
     this.usedHeight = 1; // rows from here on were never used
     this.fades = new Map(); // number of a chunk -> the last `swap` of it, its `part`, and whether it `isSorted`
     this.fadedAt = 0; // when the fades last went on
@@ -30,7 +37,7 @@ export class StreamedFields extends Fields {
     const { gl, graphics, width, height } = this;
     const create = (format) => graphics.texture(gl.TEXTURE_2D, format, width, height);
     [this.explicit, this.logits, this.pixelSizes] = [gl.RGBA32F, gl.RGBA32F, gl.R32F].map(create);
-    this.weights = graphics.texture(gl.TEXTURE_2D, gl.R32F, 1, height);
+    this.weights = graphics.texture(gl.TEXTURE_2D, gl.RG32F, 1, height);
     for (const chunk of this.chunks) {
       this.upload(chunk);
       this.setWeights(chunk.rows, 1);
@@ -53,12 +60,56 @@ export class StreamedFields extends Fields {
 
   async prepareFields() {
     await super.prepareFields();
+    this.isReady = false;
     this.pending = new Set(this.chunks.flatMap(({ rows }) => rows));
     this.chunks = null; // frees memory
+    for (const part of this.firstParts) this.addPart(part);
+    await Promise.all(this.ready.values());
+    this.isReady = true;
+  }
+
+  // Prepares the fields of a further part. Its levels are drawn once it is ready.
+  addPart({ part, model, place }) {
+    const fields = new PartFields(this.gl, model, place, this);
+    this.further.set(part, fields);
+    this.ready.set(part, this.preparePart(part, fields));
+  }
+
+  // Returns whether a part can be drawn.
+  async preparePart(part, fields) {
+    try {
+      await fields.prepareFields();
+      return true;
+    } catch (error) {
+      if (!this.graphics.lost) this.events.post({ unusable: { part, reason: error.message } });
+      return false;
+    }
+  }
+
+  // Returns the programs of shaders, which are compiled once.
+  compileOnce(shaders) {
+    const { graphics, compiled } = this, key = Object.values(shaders).join();
+    if (!compiled.has(key)) {
+      const programs = {}, vertexText = readText("whole.vert");
+      for (const name of Object.keys(shaders)) programs[name] = graphics.compile(vertexText, shaders[name]);
+      compiled.set(key, graphics.compiled(programs).then(() => programs));
+    }
+    return compiled.get(key);
+  }
+
+  // Evaluates the colours of rows by the fields of their parts.
+  color(rows, eye) {
+    const { rowParts, further } = this;
+    for (const part of new Set(rows.map((row) => rowParts[row]))) {
+      const own = rows.filter((row) => rowParts[row] === part);
+      if (!part) super.color(own, eye);
+      else if (further.get(part).isReady) further.get(part).color(own, eye);
+      else for (const row of own) this.rows.colored(row, eye); // it cannot be drawn
+    }
   }
 
   // Uploads the Gaussians of a level to its rows.
-  upload({ rows, explicit, logits, pixelSizes, balls }) {
+  upload({ part, rows, explicit, logits, pixelSizes, balls }) {
     const { gl, width } = this, floats = [[this.explicit, gl.RGBA, 4, explicit], [this.logits, gl.RGBA, 4, logits]];
     for (const [texture, format, size, numbers] of [...floats, [this.pixelSizes, gl.RED, 1, pixelSizes]]) {
       gl.bindTexture(gl.TEXTURE_2D, texture);
@@ -68,6 +119,7 @@ export class StreamedFields extends Fields {
       });
     }
     rows.forEach((row, place) => this.rows.replace(row, balls.subarray(4 * place, 4 * place + 4)));
+    for (const row of rows) this.rowParts[row] = this.rowWeights[2 * row + 1] = part;
     this.usedHeight = Math.max(this.usedHeight, ...rows.map((row) => row + 1));
   }
 
@@ -79,13 +131,19 @@ export class StreamedFields extends Fields {
     this.isUploading = true;
     const goOn = () => !this.isDisposed && !this.graphics.lost;
     while (this.arrivals.length && goOn()) {
-      const batch = this.takeArrivals(), rows = batch.flatMap((level) => level.rows);
+      const batch = await this.whenReady(this.takeArrivals()), rows = batch.flatMap((level) => level.rows);
       for (const level of batch) this.upload(level);
       for (const row of rows) this.pending.add(row);
       if (!(await this.coloring(rows, this.eye, { goOn }))) continue;
       for (const { number, chunk, level } of batch) this.events.post({ uploaded: { number, chunk, level } });
     }
     this.isUploading = false;
+  }
+
+  // Waits for the parts that levels belong to. Returns the levels whose part can be drawn.
+  async whenReady(levels) {
+    const areReady = await Promise.all(levels.map(({ part }) => this.ready.get(part) ?? true));
+    return levels.filter((_, place) => areReady[place]);
   }
 
   // Returns the first levels that have arrived: one, or several of at most MAX_BATCH_ROWS rows.
@@ -129,13 +187,13 @@ export class StreamedFields extends Fields {
   }
 
   setWeights(rows, weight) {
-    for (const row of rows) this.rowWeights[row] = weight;
+    for (const row of rows) this.rowWeights[2 * row] = weight;
   }
 
   uploadWeights() {
     const { gl, rowWeights, usedHeight } = this;
     gl.bindTexture(gl.TEXTURE_2D, this.weights);
-    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, 1, usedHeight, gl.RED, gl.FLOAT, rowWeights.subarray(0, usedHeight));
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, 1, usedHeight, gl.RG, gl.FLOAT, rowWeights.subarray(0, 2 * usedHeight));
   }
 
   // For these methods see Fields.
@@ -185,6 +243,7 @@ export class StreamedFields extends Fields {
 
   dispose() {
     this.isDisposed = true;
+    for (const fields of this.further.values()) fields.dispose();
     super.dispose();
   }
 }

@@ -1,0 +1,68 @@
+// One part of a streamed scene, in the worker: its shared file, and where it lies in the scene.
+
+import { HyrfFormatError } from "../../hyrf/errors.js";
+import { read } from "../../hyrf/index.js";
+import { IDENTITY_PLACE, placeOf } from "../../hyrf/places.js";
+import { packFields } from "../pack.js";
+
+export class ScenePart {
+  // `file` is the entry of its shared file in the manifest.
+  constructor(number, file) {
+    Object.assign(this, { number, file });
+    this.bytes = null; // of the shared file
+    this.config = null; // of the model
+    this.place = IDENTITY_PLACE; // from its units to those of the first part
+    this.isUnusable = false;
+    this.sent = null; // the promise that it is sent to the page
+  }
+
+  get isRead() {
+    return this.bytes !== null;
+  }
+
+  // Takes the bytes of its shared file. `scene` is the first part.
+  async receive(bytes, scene) {
+    const model = await read(bytes);
+    if (model.count) throw new HyrfFormatError("it holds Gaussians, and should hold only what chunks share");
+    if (model.shapeResiduals) throw new HyrfFormatError("chunks with residuals cannot be shown");
+    if (this !== scene) {
+      if (model.config.antialiased !== scene.config.antialiased) {
+        throw new HyrfFormatError(`${scene.file.file} is antialiased and this file is not, or the other way round`);
+      }
+      this.place = placeOf(model.config.frame, scene.config.frame);
+    }
+    this.config = model.config;
+    this.bytes = bytes;
+  }
+
+  // Reads a chunk of the part. `file` is its entry in the manifest.
+  async readChunk(file, bytes) {
+    const model = await read(bytes, { openFile: (name) => this.openFile(name) });
+    if (model.count !== file.gaussians) {
+      throw new HyrfFormatError(`it has ${model.count} Gaussians, and the manifest says ${file.gaussians}`);
+    }
+    if (canonicalText(model.config) !== canonicalText(this.config)) {
+      throw new HyrfFormatError(`its configuration is not that of ${this.file.file}`);
+    }
+    return model;
+  }
+
+  // Returns the bytes of the file that a chunk refers to.
+  openFile(name) {
+    if (name === this.file.file) return this.bytes;
+    throw new HyrfFormatError(`it refers to ${name}, and the manifest says ${this.file.file}`);
+  }
+
+  // Returns what the page needs of the part, and its `source`, which is not sent.
+  async pack() {
+    const { number, place } = this, source = await read(this.bytes), model = packFields(source);
+    return { source, packed: { part: number, model, place, exposure: source.exposure } };
+  }
+}
+
+// Returns a text that is the same for the same JSON value.
+const canonicalText = (value) =>
+  JSON.stringify(value, (_, inner) => {
+    const isObject = typeof inner === "object" && inner !== null && !Array.isArray(inner);
+    return isObject ? Object.fromEntries(Object.entries(inner).sort()) : inner;
+  });
