@@ -116,9 +116,9 @@ def wait_until_complete(browser: Browser) -> None:
 
 
 def read_typed_array(browser: Browser, expression: str, kind: type) -> np.ndarray:
-    """Return the value of a JavaScript expression, a typed array whose element type is `kind`."""
-    text = f"((a) => btoa(Array.from(new Uint8Array(a.buffer), (b) => String.fromCharCode(b)).join('')))({expression})"
-    return np.frombuffer(base64.b64decode(browser.evaluate(text)), kind)
+    """Return the value of a JavaScript expression, a typed array of `kind` or a promise of one."""
+    text = "(a) => btoa(Array.from(new Uint8Array(a.buffer), (b) => String.fromCharCode(b)).join(''))"
+    return np.frombuffer(base64.b64decode(browser.evaluate(f"Promise.resolve({expression}).then({text})")), kind)
 
 
 def read_texture(browser: Browser, name: str, width: int, words: int) -> np.ndarray:

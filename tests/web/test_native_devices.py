@@ -159,7 +159,10 @@ def test_a_weak_device_draws_fitted_harmonics(browser: Browser, tmp_path: Path, 
 
 
 LOSSES_JS = {
-    "after 300 ms": "addEventListener('DOMContentLoaded', () => setTimeout(lose, 300, canvas().getContext('webgl2')));",
+    "after 300 ms": (
+        "addEventListener('DOMContentLoaded', () =>"
+        " setTimeout(lose, 300, canvas().getContext('webgl2', { antialias: false })));"  # as the player does
+    ),
     "when it is asked for its limits": (
         "const { prototype } = WebGL2RenderingContext, { getParameter } = prototype; let count = 0;"
         "prototype.getParameter = function (name) {"

@@ -73,7 +73,10 @@ export class Fields {
     gl.getError(); // clears earlier errors
     this.createFeatures();
     const { sky, ...shaders } = this.shaders(), programs = {}, vertexText = readText("whole.vert");
-    for (const name of Object.keys(shaders)) programs[name] = graphics.compile(vertexText, shaders[name]);
+    for (const name of Object.keys(shaders)) {
+      programs[name] = graphics.compile(vertexText, shaders[name]);
+      await graphics.whenDone(); // the device takes in texts slowly
+    }
     programs.enlarge = graphics.program("whole.vert", "enlarge.frag");
     Object.assign(this, { programs, skyShader: sky });
 
@@ -149,11 +152,8 @@ export class Fields {
   // Returns whether shaders read a decoder's numbers from a uniform block. Graphics devices read a uniform block far
   // faster than a texture; software renderers read a texture faster.
   fitsBlock({ byteLength }) {
-    const { gl } = this, rendererName = gl.getParameter(gl.RENDERER);
-    // WebKit hides the device's name.
-    const debugInfo = rendererName === "WebKit WebGL" ? gl.getExtension("WEBGL_debug_renderer_info") : null;
-    const name = debugInfo ? gl.getParameter(debugInfo.UNMASKED_RENDERER_WEBGL) : rendererName;
-    return byteLength <= gl.getParameter(gl.MAX_UNIFORM_BLOCK_SIZE) && !/swiftshader|llvmpipe|software/i.test(name);
+    const { gl, graphics } = this;
+    return byteLength <= gl.getParameter(gl.MAX_UNIFORM_BLOCK_SIZE) && !graphics.isSoftware;
   }
 
   // Builds the fragment shaders of all passes. `constants` are for those that evaluate Gaussians.
@@ -331,13 +331,13 @@ export class Fields {
 
   // Completes the picture of a still view while `goOn()` is true: colours all rows in view, and evaluates the
   // background. `blend(view)` blends the splats of a view and returns their picture. `changed` is called when the
-  // picture has improved. Returns whether it is complete.
+  // picture has improved, and returns a promise that resolves when it is shown. Returns whether it is complete.
   async complete(view, margin, { blend, goOn = () => true, changed = () => {}, exact = false }) {
     if (!this.isReady) return false;
     let shownAt = performance.now(), pause = FIRST_REFRESH_MS;
-    const report = () => {
+    const report = async () => {
       if (performance.now() < shownAt + pause) return;
-      changed();
+      await changed(); // a browser that shows a canvas waits for all work on it
       [shownAt, pause] = [performance.now(), 2 * pause];
     };
     let { rows, done } = await this.coloured(view, margin, { goOn, report, exact });

@@ -16,9 +16,13 @@ export function countContextChange(gl) {
   contextChanges.set(gl, contextChangesOf(gl) + 1);
 }
 
+const softwareContexts = new WeakMap(); // context -> whether it draws in software
+
 export class Graphics {
   constructor(gl) {
     this.gl = gl;
+    // The first object of a context asks for the name of its device, which would later block the page.
+    if (!softwareContexts.has(gl)) softwareContexts.set(gl, /swiftshader|llvmpipe|software/i.test(deviceName(gl)));
     this.made = new Map(); // object -> its kind, which ends the name of the function that deletes it
     this.losses = contextChangesOf(gl);
   }
@@ -26,6 +30,11 @@ export class Graphics {
   // Returns whether the context was lost after this object was created, even if it was restored since.
   get lost() {
     return this.gl.isContextLost() || this.losses !== contextChangesOf(this.gl);
+  }
+
+  // Returns whether the device draws in software.
+  get isSoftware() {
+    return softwareContexts.get(this.gl);
   }
 
   // Registers an object, so that `dispose` deletes it.
@@ -155,8 +164,10 @@ export class Graphics {
       const pending = () => parallel && !gl.getProgramParameter(found.program, parallel.COMPLETION_STATUS_KHR);
       while (!this.lost && pending()) await waitForPoll();
     }
-    await this.whenDone(); // later calls ask the device, which would block the page while it works
-    for (const [name, found] of Object.entries(programs)) this.link(found, name);
+    for (const [name, found] of Object.entries(programs)) {
+      await this.whenDone(); // `link` asks the device, which would block the page while it works
+      this.link(found, name);
+    }
   }
 
   // Waits until the device has finished all work so far.
@@ -171,6 +182,14 @@ export class Graphics {
     }
     gl.deleteSync(fence);
   }
+}
+
+// Returns the name of a context's device.
+function deviceName(gl) {
+  const name = gl.getParameter(gl.RENDERER);
+  // WebKit hides the device's name.
+  const debugInfo = name === "WebKit WebGL" ? gl.getExtension("WEBGL_debug_renderer_info") : null;
+  return debugInfo ? gl.getParameter(debugInfo.UNMASKED_RENDERER_WEBGL) : name;
 }
 
 const waitForPoll = () => new Promise((resolve) => setTimeout(resolve, POLL_INTERVAL_MS));
@@ -190,7 +209,7 @@ export class WorkPacer {
   }
 
   // Calls `work(first, last)` for consecutive ranges of 0 to `count` while `goOn()` is true, and waits for the device
-  // after each. `report` is called with the fraction done. Returns whether the work is complete.
+  // after each. `report` is called with the fraction done, and awaited. Returns whether the work is complete.
   async run(graphics, count, work, { goOn = () => true, report = () => {} } = {}) {
     for (let first = 0; first < count;) {
       if (!goOn()) return false;
@@ -200,7 +219,7 @@ export class WorkPacer {
       const unit = (performance.now() - began) / (last - first);
       this.unit = this.unit === null ? unit : Math.max(unit, this.unit / 4); // slices grow at most fourfold
       first = last;
-      report(first / count);
+      await report(first / count);
     }
     return true;
   }

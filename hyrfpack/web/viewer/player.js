@@ -27,7 +27,7 @@ const TARGET_FRAME_MS = 33; // slower frames lower the resolution while moving
 const FIRST_PICTURE_MS = 2000; // after this time Gaussians that are ready are shown if there is no estimate
 const FIRST_PICTURE_SCALE = 0.35; // of the resolution: slow devices draw it in a quarter of the time
 const FIRST_PICTURE_REST_MS = 250; // a slow device does nothing else while the browser shows the first picture
-const MAX_FIRST_PICTURE_WAIT_MS = 2000; // other work on a model waits for its first picture, but not in hidden pages
+const MAX_FRAME_WAIT_MS = 2000; // other work on a model waits for a frame to be shown, but not in hidden pages
 const QUICK_FRAME_MS = 20; // frames that take less are shown at once
 const MIN_SCALE = 0.2;
 const MAX_PIXEL_RATIO = 2; // device pixels per CSS pixel
@@ -85,7 +85,7 @@ export class Player extends EventTarget {
     this.onIdle = []; // {resolve, reject} of the promises of `settled`
     this.failure = null; // the error for which there is no picture and none will come
     this.queue = Promise.resolve(); // resolves when all queued work has ended
-    this.onFirstPicture = () => {}; // is called when the canvas shows a frame
+    this.onShown = []; // functions that resolve the promises of `whenShown`
     this.showing = false; // whether `show` completes a picture, whose background frames must not replace
     if (scene) this.setScene(initialView(scene));
 
@@ -247,10 +247,7 @@ export class Player extends EventTarget {
 
   // Prepares the fields of a model whose estimate is shown. Returns true.
   async prepareFields(loader, content) {
-    await new Promise((resolve) => {
-      this.onFirstPicture = resolve;
-      setTimeout(resolve, MAX_FIRST_PICTURE_WAIT_MS);
-    });
+    await this.whenShown();
     await this.waitFor(loader);
     await content.prepareFields();
     await this.waitFor(loader);
@@ -468,8 +465,16 @@ export class Player extends EventTarget {
     if (!this.loaded || !this.renderer.present()) return false;
     this.blank = false;
     this.times.first ??= performance.now();
-    this.onFirstPicture();
+    for (const resolve of this.onShown.splice(0)) setTimeout(resolve); // once the browser has copied the canvas
     return true;
+  }
+
+  // Waits until the canvas shows another frame.
+  whenShown() {
+    return new Promise((resolve) => {
+      this.onShown.push(resolve);
+      setTimeout(resolve, MAX_FRAME_WAIT_MS);
+    });
   }
 
   // Moves the eye, and draws a frame if the picture has changed.
@@ -524,7 +529,11 @@ export class Player extends EventTarget {
     this.finishing = true;
     const { moves } = this, { content } = this.renderer;
     const goOn = () => this.loaded && !this.paused && this.moves === moves && this.renderer.content === content;
-    const options = { goOn, changed: () => this.redraw(), blend: (view) => this.renderer.blended(view) };
+    const changed = () => {
+      this.redraw();
+      return this.whenShown();
+    };
+    const options = { goOn, changed, blend: (view) => this.renderer.blended(view) };
     const work = () => content.complete(this.view(), this.scene.tolerance, options);
     const whole = await this.enqueue(work).catch((error) => {
       this.emit("failed", error);
@@ -635,12 +644,13 @@ export class Player extends EventTarget {
   async preview(views) {
     const { moves } = this, { content } = this.renderer, pictures = [];
     const isWanted = () => this.idle && this.loaded && this.moves === moves && content === this.renderer.content;
+    await this.enqueue(() => this.renderer.graphics.whenDone()); // for `read`
     const draw = async (view) => {
       const sorted = isWanted() ? await this.loader.sort(view, this.scene) : null;
       if (!sorted || !isWanted()) return;
       this.unsorted = true;
       this.setOrder(sorted);
-      pictures.push(this.renderer.read(view, this.exposureOf(view)));
+      pictures.push(await this.renderer.read(view, this.exposureOf(view)));
     };
     for (const view of views) await this.enqueue(() => draw(view));
     this.sort(); // for the window's view
@@ -660,6 +670,7 @@ export class Player extends EventTarget {
       const options = { exact: true, blend: (seen) => this.renderer.blended(seen) };
       const isExact = await content.complete(view, this.scene.tolerance, options);
       if (!isExact) throw new Error(NOT_READY_TEXT); // the content is an estimate
+      await this.renderer.graphics.whenDone(); // for `read`
       await this.sortFor(view, content); // meanwhile frames of the window may have got another order
       return this.renderer.read(view, this.exposureOf(view));
     };

@@ -154,8 +154,9 @@ export class Renderer {
     return this.frame.target;
   }
 
-  // Draws a view and returns its RGB bytes, top row first. Throws an Error with a message for the user on failure.
-  read(view, exposure) {
+  // Draws a view at once. Returns a promise of its RGB bytes, top row first. Throws an Error with a message for the
+  // user on failure. Before, the device should have nothing to do, because the page waits for it here.
+  async read(view, exposure) {
     const { gl, graphics } = this, { width, height } = view;
     this.check(view);
     gl.getError(); // clears earlier errors
@@ -163,10 +164,17 @@ export class Renderer {
     const target = graphics.framebuffer(texture);
     this.blendAll(view, exposure);
     this.over(view, target, exposure);
-    const rgba = new Uint8Array(4 * width * height);
-    gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, rgba);
+    const rgba = new Uint8Array(4 * width * height), buffer = graphics.track(gl.createBuffer(), "Buffer");
+    gl.bindBuffer(gl.PIXEL_PACK_BUFFER, buffer);
+    gl.bufferData(gl.PIXEL_PACK_BUFFER, rgba.length, gl.STREAM_READ);
+    gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, 0);
+    gl.bindBuffer(gl.PIXEL_PACK_BUFFER, null);
+    await graphics.whenDone();
+    gl.bindBuffer(gl.PIXEL_PACK_BUFFER, buffer);
+    gl.getBufferSubData(gl.PIXEL_PACK_BUFFER, 0, rgba);
+    gl.bindBuffer(gl.PIXEL_PACK_BUFFER, null);
     const refused = gl.getError() !== gl.NO_ERROR && !gl.isContextLost();
-    for (const object of [target, texture]) graphics.free(object);
+    for (const object of [target, texture, buffer]) graphics.free(object);
     if (width > gl.drawingBufferWidth || height > gl.drawingBufferHeight) this.release();
     if (refused) throw new Error(`The device cannot draw a picture of ${width} x ${height}; ask for a smaller one.`);
     return rgba.filter((_, place) => (place & 3) !== 3);
