@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
 from json_schema import matches
-from level_scenes import write_level_scene
 
 import hyrfpack
 from hyrfpack.context import RunContext
@@ -69,11 +67,6 @@ SCHEMA = {
 def export(scene, target, **options):
     config = hyrfpack.ExportConfig(streamed_sog=True, **{"degree": 1, **options})
     return hyrfpack.export_model(scene, target, config, context=QUIET)
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory) -> Path:
-    return write_level_scene(tmp_path_factory.mktemp("scene"))
 
 
 @pytest.fixture(scope="module")

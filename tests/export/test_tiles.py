@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from json_schema import matches
-from level_scenes import write_level_scene
 from scenes import camera_at
 
 import hyrfpack
@@ -69,11 +68,6 @@ SCHEMA = {
         }
     },
 }
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory) -> Path:
-    return write_level_scene(tmp_path_factory.mktemp("scene"))
 
 
 @pytest.fixture(scope="module")
