@@ -19,7 +19,7 @@ from hyrfpack.export.cameras import COLMAP_FILES
 from hyrfpack.export.source import Source
 from hyrfpack.model.merged import world_positions
 from hyrfpack.outputs import Outputs
-from hyrfpack.splats.formats.spz import MAX_COORDINATE, MAX_SCALE
+from hyrfpack.splats.formats.spz import MAX_SCALE
 from hyrfpack.splats.splats import Splats
 from hyrfpack.splats.table import FORMATS, FileKind
 
@@ -41,7 +41,7 @@ POSITION_KINDS = (COLMAP_FOLDER, *POINT_FILES)  # these hold the centres of Gaus
 PLAYER_FOLDER = FileKind(ending="")
 STREAMED_SOG_FOLDER = FileKind(ending="lod-meta.json", stores_antialiased=True)  # the folder's index
 TILES_FOLDER = FileKind(ending="tileset.json")  # the folder's index
-SPZ_TILES_FOLDER = replace(TILES_FOLDER, max_coordinate=MAX_COORDINATE, max_scale=MAX_SCALE)
+SPZ_TILES_FOLDER = replace(TILES_FOLDER, max_scale=MAX_SCALE)  # positions are relative to an origin in the scene
 LEVEL_FOLDERS = (STREAMED_SOG_FOLDER, TILES_FOLDER, SPZ_TILES_FOLDER)  # levels of detail, of a scene folder
 _FILE_KINDS = (*POINT_FILES, *COLLISION_FILES, *MESH_FILES, *FORMATS.values(), HTML_PAGE, TRANSFORMS_JSON)
 _KINDS_BY_ENDING = {kind.ending: kind for kind in _FILE_KINDS}

@@ -24,6 +24,7 @@ from hyrfpack.lod.select import predict_errors
 from hyrfpack.rotations import rotation_matrices
 from hyrfpack.splats.formats import gltf
 from hyrfpack.splats.splats import Splats
+from tools.safety.make_golden import GOLDEN_PARTS_SCENE_FOLDER
 
 QUIET = RunContext(progress=None)
 CONTENTS = ("gltf", "spz")
@@ -215,6 +216,17 @@ def test_contents_stand_upright_at_their_place(content, exported, scene):
 def test_the_report_measures_the_finest_level_as_written(content, exported):
     report = exported[content][1]
     assert report.views > 0 and abs(report.psnr - report.psnr_baked) < {"gltf": 0.01, "spz": 1}[content]
+
+
+def test_a_scene_of_parts_far_from_the_origin_keeps_its_precision(tmp_path):
+    config = hyrfpack.ExportConfig(tiles_3d=True, tile_content="gltf", degree=0, background=False)
+    report = hyrfpack.export_model(GOLDEN_PARTS_SCENE_FOLDER, tmp_path / "out", config, context=QUIET)
+    assert report.chunks == 3 and report.psnr == pytest.approx(report.psnr_baked, abs=0.01)
+    root = json.loads((tmp_path / "out" / "tileset.json").read_text())["root"]
+    assert (
+        np.linalg.norm(root["transform"][12:15]) > 1e5
+    )  # the transform holds the distance, and float32 numbers do not
+    assert "content" not in root
 
 
 def make_chunk(*errors: tuple[float, ...]) -> Chunk:
