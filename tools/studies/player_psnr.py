@@ -36,9 +36,10 @@ MOVING_SCRIPT = """(() => {
   const { renderer } = hyrfpack.player, { content, gl } = renderer, { complete } = content;
   content.complete = async function (view, ...rest) {
     await this.panorama?.complete(view, () => true);
-    await complete.call(this, view, ...rest);
+    const isComplete = await complete.call(this, view, ...rest);
     if (this.sky) this.sky.key = null;
     if (hyrfpack.follows) this.sky?.follow(view, 0, 0);
+    return isComplete;
   };
   renderer.read = function (view, gains) {
     this.draw(view, 1 / %d, gains);
