@@ -138,7 +138,7 @@ class Chromium(Browser):
             self._wait(added.close())
 
     def screenshot(self) -> bytes:
-        return self._wait(self._page.screenshot())
+        return self._wait(self._page.screenshot(timeout=1000 * self._timeout_seconds))
 
     @contextlib.contextmanager
     def record_screen(self) -> Iterator[list[tuple[float, bytes]]]:
