@@ -24,15 +24,14 @@ def main() -> None:
     parser.add_argument("splats", help="a file of 3D Gaussians")
     parser.add_argument("model", help="the .hyrf file to write")
     parser.add_argument("picture", help="the picture to write: Gaussians on the left, model on the right")
-    parser.add_argument("--steps", type=int, default=hyrfpack.DistillConfig.steps, help="training steps")
     parser.add_argument(
-        "--size", type=int, default=hyrfpack.DistillConfig.size, help="size of the reference renders in pixels"
+        "--size", type=int, default=hyrfpack.ImportConfig.size, help="size of the reference renders in pixels"
     )
-    parser.add_argument("--psnr", type=float, default=hyrfpack.DistillConfig.psnr, help="target PSNR in dB")
+    parser.add_argument("--psnr", type=float, default=hyrfpack.ImportConfig.psnr, help="target PSNR in dB")
     args = parser.parse_args()
 
     logging.basicConfig(level=logging.INFO, format="%(message)s")  # shows what the import does
-    config = hyrfpack.DistillConfig(steps=args.steps, psnr=args.psnr, size=args.size)
+    config = hyrfpack.ImportConfig(psnr=args.psnr, size=args.size)
     report = hyrfpack.import_splats(args.splats, args.model, config)
     print(f"{report.bytes_source:,} -> {report.bytes_after:,} bytes, {report.psnr:.1f} dB against the Gaussians")
 

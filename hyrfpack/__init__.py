@@ -53,9 +53,6 @@ if TYPE_CHECKING:
     from hyrfpack.config.split import SplitConfig as SplitConfig
     from hyrfpack.context import RunContext as RunContext
     from hyrfpack.data import load_scene as load_scene
-    from hyrfpack.distill import DistillConfig as DistillConfig
-    from hyrfpack.distill import DistillReport as DistillReport
-    from hyrfpack.distill import import_splats as import_splats
     from hyrfpack.doctor import MachineReport as MachineReport
     from hyrfpack.doctor import diagnose_machine as diagnose_machine
     from hyrfpack.edit import EditReport as EditReport
@@ -82,6 +79,9 @@ if TYPE_CHECKING:
     from hyrfpack.format.codec import save_model as save_model
     from hyrfpack.format.parts import load_merged_model as load_merged_model
     from hyrfpack.format.scene_folder import SceneFolder as SceneFolder
+    from hyrfpack.imports import ImportConfig as ImportConfig
+    from hyrfpack.imports import ImportReport as ImportReport
+    from hyrfpack.imports import import_splats as import_splats
     from hyrfpack.lod import LevelSelection as LevelSelection
     from hyrfpack.lod import SplitReport as SplitReport
     from hyrfpack.lod import select_levels as select_levels
@@ -127,9 +127,9 @@ _MODULES_BY_PUBLIC_NAME = {
     "split_model": "hyrfpack.lod",
     "RunContext": "hyrfpack.context",
     "load_scene": "hyrfpack.data",
-    "DistillConfig": "hyrfpack.distill",
-    "DistillReport": "hyrfpack.distill",
-    "import_splats": "hyrfpack.distill",
+    "ImportConfig": "hyrfpack.imports",
+    "ImportReport": "hyrfpack.imports",
+    "import_splats": "hyrfpack.imports",
     "MachineReport": "hyrfpack.doctor",
     "diagnose_machine": "hyrfpack.doctor",
     "EditReport": "hyrfpack.edit",
@@ -187,6 +187,8 @@ _NEW_NAMES_BY_OLD_NAME = {
     "convert": "convert_splats",
     "describe": "describe_file",
     "distill": "import_splats",
+    "DistillConfig": "ImportConfig",
+    "DistillReport": "ImportReport",
     "evaluate": "evaluate_model",
     "export": "export_model",
     "load": "load_model",

@@ -116,14 +116,13 @@ def signals() -> Iterator[None]:
 
 
 @pytest.fixture
-def quick_distillation(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Reduce the optimisation of an import of splats and its viewpoints to the least that still makes a model."""
-    from hyrfpack.distill import distillation, initialize, pack
+def quick_import(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reduce the viewpoints and files of an import of splats to the least that still makes a model."""
+    from hyrfpack.imports import pack, prepare
 
-    monkeypatch.setattr(initialize, "MIN_STEPS", 100)
     monkeypatch.setattr(pack, "MAX_TRIALS", 2)
-    monkeypatch.setattr(distillation, "LIGHT_MEASUREMENT_VIEWS", 8)
-    monkeypatch.setattr(distillation, "VALIDATION_VIEWS_PER_TEST_VIEW", 1)
+    monkeypatch.setattr(prepare, "LIGHT_MEASUREMENT_VIEWS", 8)
+    monkeypatch.setattr(prepare, "VALIDATION_VIEWS_PER_TEST_VIEW", 1)
 
 
 @pytest.fixture(scope="module")

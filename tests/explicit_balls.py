@@ -1,13 +1,13 @@
-"""Synthetic explicit Gaussians for tests of distillation."""
+"""Synthetic explicit Gaussians for tests of imports."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from hyrfpack.distill import DistillConfig
+from hyrfpack.imports import ImportConfig
 from hyrfpack.splats.splats import Splats, normalized_quats
 
-TINY_DISTILL_CONFIG = DistillConfig(steps=6, size=24, train_views=6, test_views=2)
+TINY_IMPORT_CONFIG = ImportConfig(size=24, views=6, test_views=2)
 
 
 def ball_splats(count: int, degree: int = 1, seed: int = 0) -> Splats:

@@ -20,8 +20,8 @@ from scenes import ball_points, ball_scene, camera_at, small_model
 import hyrfpack
 from hyrfpack.context import RunContext
 from hyrfpack.demo.scene import write_demo_scene
-from hyrfpack.distill import DistillConfig, distill_splats
-from hyrfpack.distill.pack import pack
+from hyrfpack.imports import ImportConfig, import_loaded_splats
+from hyrfpack.imports.pack import pack
 from hyrfpack.model import HashGridConfig
 from hyrfpack.ops.dispatch import GPU_OPERATIONS
 from hyrfpack.render import render_view
@@ -202,22 +202,16 @@ def test_a_model_is_measured_packed_and_fine_tuned_on_a_gpu(gpu, few_pictures, t
 
 
 @pytest.mark.acceptance
-def test_splats_of_other_programs_are_distilled_on_a_gpu(gpu, few_pictures, tmp_path, monkeypatch):
-    monkeypatch.setattr("hyrfpack.distill.initialize.MIN_STEPS", 3)
-    monkeypatch.setattr(
-        "hyrfpack.distill.initialize.HashGridConfig", lambda log2, finest: HashGridConfig(log2, levels=2)
-    )
-    # One thread, because the interpreter runs one kernel at a time.
-    monkeypatch.setattr(
-        "hyrfpack.data.PictureCache.stream", lambda cache, views: ((view, cache.get(view)) for view in views)
-    )
-    monkeypatch.setattr("hyrfpack.distill.pack.MAX_TRIALS", 1)
+def test_splats_of_other_programs_are_imported_on_a_gpu(gpu, few_pictures, tmp_path, monkeypatch):
+    monkeypatch.setattr("hyrfpack.imports.pack.MAX_TRIALS", 1)
     packed = []
-    monkeypatch.setattr("hyrfpack.distill.fit.pack", lambda learnt, *rest: packed.append(learnt) or pack(learnt, *rest))
+    monkeypatch.setattr(
+        "hyrfpack.imports.run.pack", lambda prepared, *rest: packed.append(prepared) or pack(prepared, *rest)
+    )
     cameras = [camera_at(place, width=12, height=12) for place in ((0.0, -3, 0.5), (0.0, 3, 0.5), (3.0, 0, -0.5))]
-    quick = DistillConfig(steps=1, test_views=2, psnr=12)
+    quick = ImportConfig(test_views=2, psnr=12)
     reports = [
-        distill_splats(
+        import_loaded_splats(
             ball_splats(12), tmp_path / f"{device}.hyrf", quick, cameras=cameras, context=RunContext(device=device)
         )
         for device in ("cpu", "cuda")

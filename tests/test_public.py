@@ -155,7 +155,7 @@ MISTAKEN_CALLS = [
     (lambda model, scene: hyrfpack.render_view("m.hyrf", scene.train[0].camera), "model must be a HybridModel"),
     (lambda model, scene: hyrfpack.render_view(model, scene.train[0].camera, 0.1), "settings must be a RenderSettings"),
     (lambda model, scene: hyrfpack.save_model("m.hyrf", "a.hyrf"), "model must be a HybridModel"),
-    (lambda model, scene: hyrfpack.import_splats("a.ply", "a.hyrf", 500), "config must be a DistillConfig"),
+    (lambda model, scene: hyrfpack.import_splats("a.ply", "a.hyrf", 500), "config must be a ImportConfig"),
     (lambda model, scene: hyrfpack.import_splats("a.ply", "a.hyrf", cameras=scene.train), "cameras must be a Camera"),
 ]
 

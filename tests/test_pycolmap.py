@@ -47,8 +47,8 @@ CODE_BY_CALL = {
     "hyrfpack.export_model('model.hyrf', 'colmap', hyrfpack.ExportConfig(colmap=True), data=scene)",
     "bench": "from hyrfpack.measure import timing\ntiming.WARM_UP_SECONDS = 0\n"
     "hyrfpack.benchmark_model('model.hyrf', scene, repeats=1, only=['codec'])",
-    "distill": "hyrfpack.export_model('model.hyrf', 'a.ply', hyrfpack.ExportConfig(background=False), data=scene)\n"
-    "hyrfpack.import_splats('a.ply', 'a.hyrf', hyrfpack.DistillConfig(1, 10, 16, 4, 2))",
+    "imports": "hyrfpack.export_model('model.hyrf', 'a.ply', hyrfpack.ExportConfig(background=False), data=scene)\n"
+    "hyrfpack.import_splats('a.ply', 'a.hyrf', hyrfpack.ImportConfig(10, size=16, views=4, test_views=2))",
 }
 
 

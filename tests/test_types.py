@@ -23,7 +23,7 @@ model: hyrfpack.HybridModel = hyrfpack.load_model("small.hyrf")
 rgb = hyrfpack.render_view(model, scene.test[0].camera).rgb.numpy()
 mean: float = hyrfpack.evaluate_model(model, scene.test).psnr
 written = hyrfpack.export_model("small.hyrf", "small.spz", hyrfpack.ExportConfig(degree=2)).bytes
-imported: float = hyrfpack.import_splats("a.ply", "a.hyrf", hyrfpack.DistillConfig(steps=5)).psnr
+imported: float = hyrfpack.import_splats("a.ply", "a.hyrf", hyrfpack.ImportConfig(psnr=30)).psnr
 rows = hyrfpack.benchmark_model("small.hyrf").rows
 camera = hyrfpack.Camera(640, 480, 500.0, 500.0, 320.0, 240.0, np.eye(4))
 facts = hyrfpack.describe_file("small.hyrf")["profile"]

@@ -19,25 +19,25 @@ from hyrfpack.cli.common import (
 )
 from hyrfpack.cli.settings import settings_options
 from hyrfpack.cli.types import OUTPUT, PATH
-from hyrfpack.config.distill import DistillConfig
+from hyrfpack.config.imports import ImportConfig
 from hyrfpack.outputs import Outputs
 
 if TYPE_CHECKING:
-    from hyrfpack.distill import DistillReport
+    from hyrfpack.imports import ImportReport
     from hyrfpack.scene import Camera
 
 
-@click.command("import", short_help="Distil splats of another program to a small model.")
+@click.command("import", short_help="Compress splats of another program to a small model.")
 @click.argument("source", type=PATH)
 @click.option("-o", "--output", type=OUTPUT, required=True, metavar="FILE", help="The .hyrf file to write.")
-@settings_options(DistillConfig, "steps", "psnr", "worst", "target_bytes", "size")
+@settings_options(ImportConfig, "psnr", "worst", "target_bytes", "size")
 @click.option(
     "--cameras",
     type=PATH,
     metavar="PATH",
-    help="Cameras to learn from: a JSON file (also of nerfstudio or 3DGS), or a folder of photos and poses.",
+    help="Cameras to measure at: a JSON file (also of nerfstudio or 3DGS), or a folder of photos and poses.",
 )
-@settings_options(DistillConfig, "seed")
+@settings_options(ImportConfig, "seed")
 @device_option
 @overwrite_option
 @json_option
@@ -50,12 +50,12 @@ def import_(
     as_json: bool,
     **settings: Any,
 ) -> None:
-    """Distil SOURCE, 3D Gaussians as .ply (plain or compressed), .splat, .spz or .sog, to a small .hyrf file.
+    """Compress SOURCE, 3D Gaussians as .ply (plain or compressed), .splat, .spz or .sog, to a small .hyrf file.
 
-    No photos are needed: the model is trained on renders of SOURCE, from all around an object or from inside a room.
-    --cameras names the viewpoints to render instead; it reads the files of 'hyrfpack render --cameras' and the folders
-    of --data. A cameras.json that 3DGS training has left with SOURCE is used automatically. Scores are measured at
-    held-out viewpoints.
+    No photos are needed: what each number is worth is measured on renders of SOURCE, from all around an object or from
+    inside a room. --cameras names the viewpoints to render instead; it reads the files of 'hyrfpack render --cameras'
+    and the folders of --data. A cameras.json that 3DGS training has left with SOURCE is used automatically. Scores are
+    measured at held-out viewpoints.
 
     \b
     Examples:
@@ -67,12 +67,12 @@ def import_(
     folder = source.parent if source.name == "meta.json" else source  # a SOG may be a folder that holds meta.json
     Outputs(source, cameras, folder=folder, overwrite=overwrite).file(output, ".hyrf")
     from hyrfpack.context import RunContext
-    from hyrfpack.distill import import_splats
+    from hyrfpack.imports import import_splats
 
     cameras = cameras or _find_training_cameras(source)
     given = None if cameras is None else _read_cameras(cameras)
     torch_device = choose_command_device(device)
-    config = DistillConfig(**settings)
+    config = ImportConfig(**settings)
     context = RunContext(device=torch_device)
     report = import_splats(source, output, config, cameras=given, overwrite=overwrite, context=context)
     written = note_rename(output, report.file)
@@ -119,6 +119,6 @@ def _read_cameras(path: Path) -> list[Camera]:
     return [camera for _, camera in cameras_from_json(path)]
 
 
-def _format_ratio(report: DistillReport, size: int | None) -> str:
+def _format_ratio(report: ImportReport, size: int | None) -> str:
     """Return as text how many times larger a size is than the written file; "" if the size is None."""
     return "" if size is None else f"{size / report.bytes_after:.1f}x"

@@ -16,11 +16,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from hyrfpack.compress.correction import SensitivityCorrection
-from hyrfpack.compress.field_codes import FieldCodes
 from hyrfpack.compress.part_errors import PartErrors, PruningErrors, QuantizationErrors, subset_decoded
 from hyrfpack.compress.plan import distortion_per_number, indices_to_keep
 from hyrfpack.compress.reference_renders import ReferenceRenders
-from hyrfpack.compress.sensitivity import Sensitivity, measure_sensitivity
+from hyrfpack.compress.sensitivity import TARGET_DRAWN_GAUSSIANS, Sensitivity, measure_sensitivity
 from hyrfpack.model import HybridModel
 from hyrfpack.progress import Progress, TaskEvent, ignore_progress, part_of_progress, round_of_progress
 from hyrfpack.scene import Camera
@@ -36,7 +35,7 @@ def measure_calibrated_sensitivity(
     distortion: float,
     prune: bool = True,
     progress: Progress = ignore_progress,
-    field_codes: FieldCodes | None = None,
+    drawn: int = TARGET_DRAWN_GAUSSIANS,
 ) -> tuple[Sensitivity, ReferenceRenders]:
     """Measure a model's sensitivities, calibrate them for a distortion, and return them with the reference renders.
 
@@ -44,16 +43,16 @@ def measure_calibrated_sensitivity(
         cameras: viewpoints typical of how the model will be viewed; world units.
         distortion, prune: as `make_plan` takes them.
         progress: called with `TaskEvent`s.
-        field_codes: as in `quantize`.
+        drawn: as `measure_sensitivity` takes it.
 
     Raises:
         HyrfError: a number of the model is NaN or infinite.
     """
-    sensitivity = measure_sensitivity(model, cameras, progress=part_of_progress(progress, 0.0, 0.5))
+    sensitivity = measure_sensitivity(model, cameras, progress=part_of_progress(progress, 0.0, 0.5), drawn=drawn)
     progress(TaskEvent("rendering reference views", 0.5))
     references = ReferenceRenders.from_model(model, cameras)
     rest = part_of_progress(progress, 0.55, 1.0)
-    return calibrate(model, sensitivity, references, distortion, prune, rest, field_codes), references
+    return calibrate(model, sensitivity, references, distortion, prune, rest), references
 
 
 def calibrate(
@@ -63,7 +62,6 @@ def calibrate(
     distortion: float,
     prune: bool = True,
     progress: Progress = ignore_progress,
-    field_codes: FieldCodes | None = None,
 ) -> Sensitivity:
     """Scale sensitivities so that they predict the error measured on renders, for plans of about this distortion.
 
@@ -72,7 +70,6 @@ def calibrate(
         references: renders of the model.
         distortion, prune: as `make_plan` takes them.
         progress: called with `TaskEvent`s.
-        field_codes: as in `quantize`.
 
     Raises:
         HyrfError: a parameter is NaN or infinite.
@@ -85,7 +82,7 @@ def calibrate(
     kept = indices_to_keep(sensitivity, distortion_per_number(model, distortion), prune)
     pruned, decoded = subset_decoded(model, decoded, kept)
     references = ReferenceRenders.from_views(references.views, pruned, decoded)
-    quantization = QuantizationErrors(model, pruned, decoded, references, distortion, prune, field_codes)
+    quantization = QuantizationErrors(model, pruned, decoded, references, distortion, prune)
     return _match_measurements(sensitivity, quantization, distortion, part_of_progress(progress, 0.2, 1.0))
 
 

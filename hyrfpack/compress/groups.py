@@ -53,16 +53,6 @@ def quantize_groups(
     return GroupSymbols(codes, models, symbols, (symbols * groups.gather(steps)).astype(np.float32))
 
 
-def requantize_groups(values: np.ndarray, groups: StepGroups, codes: np.ndarray) -> GroupSymbols:
-    """Quantise numbers with given step codes (count,): each takes the nearest symbol, so multiples are kept exactly."""
-    steps = groups.gather(decode_step(codes) / FIXED_POINT_ONE)
-    symbols = np.rint(values / steps).astype(np.int64)
-    members = np.maximum(np.bincount(groups.index, minlength=groups.count), 1)
-    magnitude = np.bincount(groups.index, np.abs(symbols), groups.count)
-    used = np.where(magnitude > 0, codes, ALL_ZERO_CODE).astype(np.uint8)
-    return GroupSymbols(used, _model_indices(magnitude / members), symbols, (symbols * steps).astype(np.float32))
-
-
 def _model_indices(magnitude: np.ndarray) -> np.ndarray:
     """Return the entropy coding model (count,) uint8 of each group, by the mean magnitude of its symbols.
 

@@ -10,7 +10,6 @@ from functools import cached_property
 import torch
 
 from hyrfpack.cameras.capture import has_mean_exposure
-from hyrfpack.compress.field_codes import FieldCodes
 from hyrfpack.compress.finetune import finetune, fit_residual_gains
 from hyrfpack.compress.limits import (
     FINETUNED_SEARCH_TRIALS,
@@ -61,7 +60,6 @@ class Packer:
         progress: called with `TaskEvent`s.
         cache: cache of decoded photos.
         ranks: processes that fine-tune together.
-        field_codes: as in `quantize`.
     """
 
     model: HybridModel
@@ -73,7 +71,6 @@ class Packer:
     progress: Progress = ignore_progress
     cache: PictureCache = field(default_factory=PictureCache)
     ranks: Ranks = SINGLE_PROCESS
-    field_codes: FieldCodes | None = None
 
     def encode(self, distortion: float, progress: Progress = ignore_progress) -> EncodedCandidate:
         """Encode a file that adds an estimated `distortion` to the mean squared error of pictures."""
@@ -98,7 +95,7 @@ class Packer:
             planned = plan.apply(model)
         progress(TaskEvent("quantising", 0.9 if steps else 0.1))
         reach = 0 if steps else 1
-        quantized = quantize(planned, plan, self.sensitivity, reach=reach, field_codes=self.field_codes)
+        quantized = quantize(planned, plan, self.sensitivity, reach=reach)
         progress(TaskEvent("entropy coding", 0.95 if steps else 0.6))
         data = encode_model(planned, "compact", self.provenance, quantized=quantized)
         return EncodedCandidate(data, predict_errors(self.model, planned, quantized, self.sensitivity))

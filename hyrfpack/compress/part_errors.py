@@ -9,7 +9,6 @@ from typing import Protocol
 import numpy as np
 import torch
 
-from hyrfpack.compress.field_codes import FieldCodes
 from hyrfpack.compress.plan import distortion_per_number, indices_to_keep, make_plan
 from hyrfpack.compress.quantize import opacity_error_model, quantize
 from hyrfpack.compress.reference_renders import ReferenceRenders
@@ -112,7 +111,6 @@ class QuantizationErrors:
         decoded: the result of `pruned.decode()`.
         references: renders of the pruned model.
         distortion, prune: as in `make_plan`.
-        field_codes: as in `quantize`; the fields then add no error.
     """
 
     model: HybridModel
@@ -121,22 +119,19 @@ class QuantizationErrors:
     references: ReferenceRenders
     distortion: float
     prune: bool
-    field_codes: FieldCodes | None = None
     # The sensitivities of positions that the last plan was made for, the plan, and the planned model.
     _last_plan: tuple[np.ndarray, Plan, HybridModel] | None = field(default=None, init=False)
     parts: tuple[Part, ...] = field(init=False)
 
     def __post_init__(self) -> None:
         groups = set(group_shapes(self.model.config, 0))
-        if self.field_codes is not None:
-            groups -= {*TABLE_SECTIONS, *DECODER_SECTIONS}
         self.parts = tuple(part for part in QUANTIZED_PARTS if groups.issuperset(part))
 
     def measure(self, sensitivity: Sensitivity, parts: list[Part], progress: Progress) -> dict[Part, ErrorMeasurement]:
         """Quantise all of `parts` and measure the error of each one alone, see `PartErrors.measure`."""
         plan, planned = self._plan(sensitivity)
         names = [name for part in parts for name in part]
-        quantized = quantize(planned, plan, sensitivity, sections=names, field_codes=self.field_codes)
+        quantized = quantize(planned, plan, sensitivity, sections=names)
         predicted = _predict_quantization_errors(planned, quantized, sensitivity)
         arrays = _undo_plan_order(quantized)
         errors = {}

@@ -11,8 +11,7 @@ import torch
 from scipy.special import expit
 
 from hyrfpack.compress.channels import ErrorModel, quantize_channel
-from hyrfpack.compress.field_codes import FieldCodes
-from hyrfpack.compress.groups import quantize_groups, requantize_groups
+from hyrfpack.compress.groups import quantize_groups
 from hyrfpack.compress.plan import make_plan
 from hyrfpack.compress.residuals import quantize_residuals, residual_sensitivity, split_colors
 from hyrfpack.compress.sensitivity import Sensitivity
@@ -53,7 +52,6 @@ def quantize(
     reach: int = 1,
     previous: QuantizedModel | None = None,
     sections: Collection[str] = (*LOGIT_SECTIONS, *RESIDUAL_SECTIONS, *TABLE_SECTIONS, *DECODER_SECTIONS),
-    field_codes: FieldCodes | None = None,
 ) -> QuantizedModel:
     """Quantise a planned model (`plan.apply`) by rate and distortion.
 
@@ -64,7 +62,6 @@ def quantize(
         reach: distance in steps of the furthest candidate from the nearest symbol; 0 takes the nearest.
         previous: an earlier result for the same plan, whose prediction weights are reused.
         sections: the sections to quantise; a file needs all of them.
-        field_codes: step codes of fields whose numbers are quantised already; None chooses steps.
 
     Raises:
         HyrfError: a parameter is NaN or infinite.
@@ -73,8 +70,6 @@ def quantize(
     sensitivity, d = sensitivity.subset(plan.kept), plan.distortion_per_number
     jobs: dict[str, Callable[[], Any]] = {
         group: partial(quantize_groups, arrays[group].ravel(), groups, sensitivity.fields[group], d, reach)
-        if field_codes is None
-        else partial(requantize_groups, arrays[group].ravel(), groups, field_codes.of_groups(group, groups))
         for group, groups in plan.groups.items()
         if group in sections
     }

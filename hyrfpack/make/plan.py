@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from hyrfpack.compress.sensitivity import MAX_SENSITIVITY_VIEWS, MIN_SENSITIVITY_VIEWS, TARGET_DRAWN_GAUSSIANS
+from hyrfpack.config.imports import ImportConfig
 from hyrfpack.config.make import MakeConfig
 from hyrfpack.config.train import FULL_STEPS, DensityConfig, TrainConfig
 from hyrfpack.data.pictures import fit_size
@@ -52,7 +53,7 @@ class Quality:
         gpu_steps: training steps on a GPU.
         max_size: longer side in pixels to which larger photos are shrunk.
         finetune_steps: fine-tuning steps during packing.
-        import_steps: distillation steps for splats of other programs.
+        import_psnr: PSNR in dB that imported splats of other programs reach.
     """
 
     steps: int
@@ -60,7 +61,7 @@ class Quality:
     gpu_steps: int
     max_size: int
     finetune_steps: int
-    import_steps: int
+    import_psnr: float
 
     def training_steps(self, pixels: float, device: torch.device) -> int:
         """Return the training steps on photos of `pixels` pixels; between the two sizes they follow a power law."""
@@ -72,7 +73,7 @@ class Quality:
 
 QUALITIES = {
     "draft": Quality(
-        steps=600, large_photo_steps=600, gpu_steps=1_000, max_size=640, finetune_steps=0, import_steps=150
+        steps=600, large_photo_steps=600, gpu_steps=1_000, max_size=640, finetune_steps=0, import_psnr=34.0
     ),
     "normal": Quality(
         steps=TrainConfig.steps,
@@ -80,7 +81,7 @@ QUALITIES = {
         gpu_steps=TrainConfig.steps,
         max_size=DEFAULT_MAX_SIZE,
         finetune_steps=0,
-        import_steps=500,
+        import_psnr=ImportConfig.psnr,
     ),
     "best": Quality(
         steps=10_000,
@@ -88,7 +89,7 @@ QUALITIES = {
         gpu_steps=FULL_STEPS,
         max_size=DEFAULT_MAX_SIZE,
         finetune_steps=500,
-        import_steps=1_500,
+        import_psnr=42.0,
     ),
 }
 

@@ -197,8 +197,8 @@ class _Pipeline:
             return self._finish(self.source.path, scene=None)
         if kind == "splats":
             config = self.request.config
-            steps = find_quality(config).import_steps
-            facts = stages.run_import_stage(self.stage_cache, self.source.path, steps, config.seed, self.context)
+            target = find_quality(config).import_psnr
+            facts = stages.run_import_stage(self.stage_cache, self.source.path, target, config.seed, self.context)
             return self._finish(self.stage_cache.folder / stages.PACKED_MODEL, scene=None, imported=facts)
         return self._make_from_photos()
 

@@ -20,12 +20,12 @@ from hyrfpack.config.poses import PosesConfig
 from hyrfpack.context import RunContext
 from hyrfpack.copying import copy_file
 from hyrfpack.device import describe_device
-from hyrfpack.distill import DistillConfig, import_splats
 from hyrfpack.errors import HyrfError, HyrfSizeError
 from hyrfpack.evaluate import evaluate_model
 from hyrfpack.export import export_model
 from hyrfpack.format import describe_file, load_model
 from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
+from hyrfpack.imports import ImportConfig, import_splats
 from hyrfpack.make.plan import Plan
 from hyrfpack.make.preview import write_preview
 from hyrfpack.make.progress import Reporter
@@ -219,13 +219,13 @@ def run_compression_stage(stage_cache: StageCache, scene: Scene, plan: Plan, con
 
 
 def run_import_stage(
-    stage_cache: StageCache, source: Path, steps: int, seed: int, context: RunContext
+    stage_cache: StageCache, source: Path, psnr: float, seed: int, context: RunContext
 ) -> dict[str, Any]:
-    """Distil splats of another program into `model.hyrf`; return the report of `hyrfpack.import_splats`."""
+    """Import splats of another program as `model.hyrf`; return the report of `hyrfpack.import_splats`."""
     files = sorted(p for p in source.parent.iterdir() if p.is_file()) if source.name == "meta.json" else [source]
     if source.is_dir():
         files = sorted(p for p in source.iterdir() if p.is_file())
-    config = DistillConfig(steps=steps, seed=seed)
+    config = ImportConfig(psnr=psnr, seed=seed)
 
     def execute(resuming: bool) -> tuple[dict, list[str]]:
         report = import_splats(

@@ -132,7 +132,7 @@ FOLDER_COMMANDS_WITH_FREE_NAMES = [
 ]
 
 
-@pytest.mark.usefixtures("quick_distillation")
+@pytest.mark.usefixtures("quick_import")
 @pytest.mark.parametrize(("command", "asked", "beside"), [*SINGLE_FILE_COMMANDS, *FOLDER_COMMANDS_WITH_FREE_NAMES])
 def test_a_file_that_appears_meanwhile_is_kept_and_the_result_gets_another_name(
     command, asked, beside, working_folder, monkeypatch
@@ -151,7 +151,7 @@ def test_a_file_that_appears_meanwhile_is_kept_and_the_result_gets_another_name(
         assert beside in result.stdout and asked not in result.stdout
 
 
-@pytest.mark.usefixtures("quick_distillation")
+@pytest.mark.usefixtures("quick_import")
 @pytest.mark.parametrize(("command", "asked", "beside"), SINGLE_FILE_COMMANDS)
 def test_json_names_the_file_that_was_actually_written(command, asked, beside, working_folder, monkeypatch):
     create_foreign_file(asked, monkeypatch)
@@ -162,7 +162,7 @@ def test_json_names_the_file_that_was_actually_written(command, asked, beside, w
         assert facts["export"]["file"] == beside
 
 
-@pytest.mark.usefixtures("quick_distillation")
+@pytest.mark.usefixtures("quick_import")
 @pytest.mark.parametrize(("command", "asked", "beside"), [*SINGLE_FILE_COMMANDS, *FOLDER_COMMANDS_WITH_FREE_NAMES])
 def test_with_overwrite_the_last_writer_wins(command, asked, beside, working_folder, monkeypatch):
     create_foreign_file(asked, monkeypatch)
@@ -258,15 +258,13 @@ CALLS_THAT_WRITE_A_FILE = {
     "save": lambda out: hyrfpack.save_model(load_model("model.hyrf"), out, overwrite=False),
     "repack": lambda out: repack("packed.hyrf", out, overwrite=False),
     "compress": lambda out: hyrfpack.compress_model("model.hyrf", out, PAPER_PROFILE, overwrite=False),
-    "distill": lambda out: hyrfpack.import_splats(
-        "ball.ply", out, hyrfpack.DistillConfig(steps=1, size=16), overwrite=False
-    ),
+    "import": lambda out: hyrfpack.import_splats("ball.ply", out, hyrfpack.ImportConfig(size=16), overwrite=False),
     "export": lambda out: hyrfpack.export_model("model.hyrf", out, hyrfpack.ExportConfig(degree=0), overwrite=False),
     "compare": lambda out: hyrfpack.compare_runs(["first", "second"], out),
 }
 
 
-@pytest.mark.usefixtures("quick_distillation")
+@pytest.mark.usefixtures("quick_import")
 @pytest.mark.parametrize("name", CALLS_THAT_WRITE_A_FILE)
 def test_a_library_call_without_overwrite_keeps_a_new_file_and_reports_its_own_path(name, working_folder, monkeypatch):
     ending = {"export": "ply", "compare": "html"}.get(name, "hyrf")

@@ -286,7 +286,7 @@ def copy_with_hard_links(template: Path, folder: Path) -> Path:
     return folder
 
 
-@pytest.mark.usefixtures("quick_distillation")
+@pytest.mark.usefixtures("quick_import")
 @pytest.mark.parametrize("overwrite", [False, True], ids=["plain", "overwrite"])
 @pytest.mark.parametrize("case", ALL_CASES, ids=str)
 def test_no_command_loses_a_users_files(case, overwrite, folder_copies, monkeypatch):
@@ -308,14 +308,14 @@ def test_the_cases_cover_every_command_that_writes():
     assert {case.command.split()[0] for case in ALL_CASES} == writes
 
 
-@pytest.mark.usefixtures("quick_distillation")
+@pytest.mark.usefixtures("quick_import")
 def test_commands_accept_the_inputs_of_the_cases(folder_copies, monkeypatch):
     """Otherwise commands would fail for another reason."""
     monkeypatch.chdir(folder_copies.new())
     for name in READ_PATHS_BY_SET:
         _run_checked("evaluate", "model.hyrf", "--data", name, "--pictures", f"pictures-{name}")
     for source in ("ball.ply", "loose"):
-        _run_checked("import", source, "-o", f"{source}-new.hyrf", "--steps", 1, "--size", 16)
+        _run_checked("import", source, "-o", f"{source}-new.hyrf", "--size", 16)
     _run_checked("render", "model.hyrf", "--cameras", "cameras.json", "-o", "renders")
 
 

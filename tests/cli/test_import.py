@@ -10,13 +10,13 @@ from explicit_balls import ball_splats
 
 from hyrfpack.cameras.files import cameras_to_json
 from hyrfpack.demo.scene import write_demo_scene
-from hyrfpack.distill import DistillConfig
+from hyrfpack.imports import pack
 from hyrfpack.splats.draw import Drawable
 from hyrfpack.splats.formats import ply
 from hyrfpack.splats.viewpoints import WeightedSplats, sample_viewpoints
 
-QUICK_OPTIONS = ("--steps", 2, "--size", 24)
-pytestmark = pytest.mark.usefixtures("quick_calibration", "quick_distillation")
+QUICK_OPTIONS = ("--size", 24)
+pytestmark = pytest.mark.usefixtures("quick_calibration", "quick_import")
 
 
 @pytest.fixture
@@ -96,12 +96,14 @@ def test_invalid_inputs_of_import_are_a_clear_error(source: Path, tmp_path: Path
     assert not target.exists()
 
 
-def test_import_reports_a_missed_target(source: Path, tmp_path: Path) -> None:
-    result = succeeded("import", source, "-o", tmp_path / "x.hyrf", *QUICK_OPTIONS, "--psnr", 37.9, "--json")
+def test_import_reports_a_missed_target(source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pack, "MAX_TRIALS", 1)
+    monkeypatch.setattr(pack, "PLANNED_ERROR_SHARE", 16.0)  # makes the only file miss the target
+    result = succeeded("import", source, "-o", tmp_path / "x.hyrf", *QUICK_OPTIONS, "--psnr", 40, "--json")
     numbers = json.loads(result.stdout)
-    assert numbers["psnr_asked"] == 37.9
+    assert numbers["psnr_asked"] == 40
     assert (
-        f"the target PSNR is 37.9 dB, but the file reaches {numbers['psnr']:.1f} dB at held-out viewpoints"
+        f"the target PSNR is 40 dB, but the file reaches {numbers['psnr']:.1f} dB at held-out viewpoints"
         in result.stderr
     )
-    assert f"--steps {DistillConfig.steps}" in result.stderr and "--psnr 38" in result.stderr
+    assert "set a higher target with --psnr" in result.stderr

@@ -13,7 +13,7 @@ from hyrfpack.cli import main
 from hyrfpack.cli.settings import settings_options
 from hyrfpack.cli.wording import option_of_argument
 from hyrfpack.config.compress import CompressConfig
-from hyrfpack.config.distill import DistillConfig
+from hyrfpack.config.imports import ImportConfig
 from hyrfpack.config.settings import list_settings
 from hyrfpack.config.train import TrainConfig
 
@@ -39,7 +39,7 @@ def run(config_class: type, name: str, *arguments: str) -> click.testing.Result:
         (TrainConfig, "antialiased", ("--antialiased",), "True"),
         (TrainConfig, "preset", ("--preset", "street"), "'street'"),
         (TrainConfig, "ssim_weight", ("--ssim-weight", "0.5"), "0.5"),
-        (DistillConfig, "psnr", ("--psnr", "40"), "40.0"),
+        (ImportConfig, "psnr", ("--psnr", "40"), "40.0"),
         (CompressConfig, "profile", (), "'compact'"),
         (CompressConfig, "finetune_steps", ("--finetune", "500"), "500"),
         (CompressConfig, "prune", ("--no-prune",), "False"),
@@ -59,11 +59,11 @@ def test_an_option_gives_the_value_of_its_setting(config_class, name, arguments,
         (TrainConfig, "target_bytes", ("--target-size", "0")),
         (TrainConfig, "preset", ("--preset", "indoor")),
         (TrainConfig, "antialiased", ("--no-antialiased",)),
-        (DistillConfig, "psnr", ("--psnr", "nan")),
+        (ImportConfig, "psnr", ("--psnr", "nan")),
         (CompressConfig, "finetune_steps", ("--finetune", "0")),
         (CompressConfig, "max_psnr_drop", ("--max-psnr-drop", "nan")),
         (CompressConfig, "profile", ("--profile", "zip")),
-        (DistillConfig, "psnr", ("--psnr", "61")),
+        (ImportConfig, "psnr", ("--psnr", "61")),
     ],
 )
 def test_a_value_outside_the_limits_of_a_setting_is_a_usage_error(config_class, name, arguments):

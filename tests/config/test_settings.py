@@ -9,8 +9,8 @@ from typing import Annotated
 import pytest
 
 from hyrfpack.config.compress import CompressConfig
-from hyrfpack.config.distill import DistillConfig
 from hyrfpack.config.export import ConvertConfig, ExportConfig
+from hyrfpack.config.imports import ImportConfig
 from hyrfpack.config.make import MakeConfig
 from hyrfpack.config.poses import PosesConfig
 from hyrfpack.config.settings import OneOf, Range, check_settings, list_settings
@@ -20,7 +20,7 @@ CONFIG_CLASSES = (
     CompressConfig,
     ConvertConfig,
     DensityConfig,
-    DistillConfig,
+    ImportConfig,
     ExportConfig,
     MakeConfig,
     PosesConfig,

@@ -17,10 +17,10 @@ from hyrfpack.cameras.capture import scene_provenance
 from hyrfpack.compress import CompressionReport, sensitivity
 from hyrfpack.data import load_scene
 from hyrfpack.demo.scene import write_demo_scene
-from hyrfpack.distill import DistillConfig
 from hyrfpack.errors import HyrfError
 from hyrfpack.export.cameras import write_colmap
 from hyrfpack.format.codec import encode_model
+from hyrfpack.imports import ImportConfig
 from hyrfpack.make import make_scene, minutes, stages
 from hyrfpack.make.minutes import SceneCost
 from hyrfpack.make.plan import QUALITIES, Quality
@@ -30,9 +30,9 @@ from hyrfpack.train import TrainResult
 from hyrfpack.train.results import RECORD_FILE, TrainingRecord, read_record
 
 QUICK_QUALITIES = {
-    "draft": Quality(steps=6, large_photo_steps=6, gpu_steps=6, max_size=40, finetune_steps=0, import_steps=2),
-    "normal": Quality(steps=9, large_photo_steps=9, gpu_steps=9, max_size=1600, finetune_steps=0, import_steps=3),
-    "best": Quality(steps=9, large_photo_steps=9, gpu_steps=9, max_size=1600, finetune_steps=3, import_steps=4),
+    "draft": Quality(steps=6, large_photo_steps=6, gpu_steps=6, max_size=40, finetune_steps=0, import_psnr=20.0),
+    "normal": Quality(steps=9, large_photo_steps=9, gpu_steps=9, max_size=1600, finetune_steps=0, import_psnr=20.0),
+    "best": Quality(steps=9, large_photo_steps=9, gpu_steps=9, max_size=1600, finetune_steps=3, import_psnr=20.0),
 }
 
 
@@ -42,7 +42,7 @@ def quick_settings():
     with pytest.MonkeyPatch.context() as patch:
         for name, quality in QUICK_QUALITIES.items():
             patch.setitem(QUALITIES, name, quality)
-        patch.setattr(stages, "DistillConfig", partial(DistillConfig, size=24, train_views=6, test_views=2))
+        patch.setattr(stages, "ImportConfig", partial(ImportConfig, size=24, views=6, test_views=2))
         patch.setattr(sensitivity, "MAX_SENSITIVITY_VIEWS", 12)
         yield
 

@@ -130,7 +130,7 @@ def test_an_unreachable_target_size_names_a_reachable_one_which_is_met(finished_
     assert (tmp_path / "scene.hyrf").stat().st_size <= smallest < (finished_work / "model.hyrf").stat().st_size
 
 
-@pytest.mark.usefixtures("quick_distillation")
+@pytest.mark.usefixtures("quick_import")
 def test_splats_of_other_programs_are_imported(tmp_path):
     (tmp_path / "ball.ply").write_bytes(ply.encode(ball_splats(40)))
     result = make_scene(tmp_path / "ball.ply", tmp_path / "scene.html", MakeConfig(quality="draft"))

@@ -34,18 +34,13 @@ PYTHON_BLOCK_PATTERN = re.compile(
 )
 FEWER_STEPS_SCRIPT = """
 import runpy, sys
-from hyrfpack.distill import DistillConfig, initialize
 from hyrfpack.measure import timing
 from hyrfpack.train import TrainConfig
-def cut(settings):
-    whole = settings.__post_init__
-    def fewer(config):
-        object.__setattr__(config, "steps", min(config.steps, {steps}))
-        whole(config)
-    settings.__post_init__ = fewer
-cut(TrainConfig)
-cut(DistillConfig)
-initialize.MIN_STEPS = initialize.MAX_STEPS = {steps}
+whole = TrainConfig.__post_init__
+def fewer(config):
+    object.__setattr__(config, "steps", min(config.steps, {steps}))
+    whole(config)
+TrainConfig.__post_init__ = fewer
 timing.WARM_UP_SECONDS = 0
 runpy.run_path(sys.argv[1], run_name="__main__")
 """

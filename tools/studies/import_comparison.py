@@ -5,10 +5,10 @@
 
 PlayCanvas' splat-transform (`npm ci --prefix tests/node`) writes SOG and SPZ, and gsply writes SPZ. Neither has a
 quality setting, so they encode the whole file, and also versions with fewer harmonics and without faint Gaussians.
-hyrfpack distils one model without residuals and one with them, and compresses one of them for each --psnr. All files
-are decoded, drawn by hyrfpack's rasteriser at the viewpoints that import holds out, and compared with the original's
-pictures. The table has bytes, mean and worst PSNR in dB, and seconds of compression. The viewpoints are few and far
-apart, so differences of some tenths of a dB are not significant.
+hyrfpack makes one model and compresses it for each --psnr. All files are decoded, drawn by hyrfpack's rasteriser at the
+viewpoints that import holds out, and compared with the original's pictures. The table has bytes, mean and worst PSNR in
+dB, and seconds of compression. The viewpoints are few and far apart, so differences of some tenths of a dB are not
+significant.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from pathlib import Path
 import gsply
 import numpy as np
 
-from hyrfpack.distill import DistillConfig
-from hyrfpack.distill.distillation import DistilledModel, distill_model
-from hyrfpack.distill.pack import pack
 from hyrfpack.evaluate.metrics import psnr
 from hyrfpack.format.codec import decode_model
+from hyrfpack.imports import ImportConfig
+from hyrfpack.imports.pack import pack
+from hyrfpack.imports.prepare import PreparedModel, prepare_model
 from hyrfpack.splats.draw import Drawable, draw
 from hyrfpack.splats.files import read_splats
 from hyrfpack.splats.formats import ply
@@ -67,19 +67,19 @@ class MeasuredFile:
         return [self.encoder, self.setting, *sizes]
 
 
-def measure_own_files(models: dict[bool, DistilledModel], psnr_targets: list[float]) -> Iterator[MeasuredFile]:
-    """Compress the distilled models, by whether they have residuals, for each PSNR target and yield the files."""
+def measure_own_files(prepared: PreparedModel, psnr_targets: list[float]) -> Iterator[MeasuredFile]:
+    """Compress the model for each PSNR target and yield the files."""
     for psnr_target in psnr_targets:
-        started, distilled = time.perf_counter(), models[DistillConfig(psnr=psnr_target).has_residuals]
-        data = pack(distilled, psnr_target, {})
+        started = time.perf_counter()
+        data = pack(prepared, psnr_target, {})
         seconds = time.perf_counter() - started
-        scores = distilled.test.psnr_per_view(decode_model(data))
+        scores = prepared.test.psnr_per_view(decode_model(data))
         yield MeasuredFile(
             "hyrfpack", f"--psnr {psnr_target:g}", len(data), float(np.mean(scores)), min(scores), seconds
         )
 
 
-def measure_other_files(splats: Splats, distilled: DistilledModel, folder: Path) -> Iterator[MeasuredFile]:
+def measure_other_files(splats: Splats, prepared: PreparedModel, folder: Path) -> Iterator[MeasuredFile]:
     """Encode the splats, and reduced versions of them, with other programs and yield the files."""
     for degree in range(splats.degree, -1, -1):
         for min_opacity in MIN_OPACITIES:
@@ -89,14 +89,14 @@ def measure_other_files(splats: Splats, distilled: DistilledModel, folder: Path)
             for encoder, target in (("SOG, splat-transform", "a.sog"), ("SPZ, splat-transform", "a.spz")):
                 started = time.perf_counter()
                 convert_with_splat_transform(source, folder / target)
-                yield measure_splat_file(encoder, setting, folder / target, distilled, time.perf_counter() - started)
+                yield measure_splat_file(encoder, setting, folder / target, prepared, time.perf_counter() - started)
             started = time.perf_counter()
             gsply.write_spz(folder / "b.spz", gsply.plyread(source), version=4)
             seconds = time.perf_counter() - started
             gsply.plywrite(
                 folder / "b.ply", gsply.read_spz(folder / "b.spz")
             )  # gsply stores other axes than the SPZ format
-            file = measure_splat_file("SPZ 4, gsply", setting, folder / "b.ply", distilled, seconds)
+            file = measure_splat_file("SPZ 4, gsply", setting, folder / "b.ply", prepared, seconds)
             yield dataclasses.replace(file, bytes=(folder / "b.spz").stat().st_size)
 
 
@@ -114,12 +114,10 @@ def convert_with_splat_transform(source: Path, target: Path) -> None:
         raise SystemExit(f"splat-transform: {error_text}")
 
 
-def measure_splat_file(
-    encoder: str, setting: str, file: Path, distilled: DistilledModel, seconds: float
-) -> MeasuredFile:
+def measure_splat_file(encoder: str, setting: str, file: Path, prepared: PreparedModel, seconds: float) -> MeasuredFile:
     """Draw a file of splats and score it against the original's pictures."""
-    drawable = Drawable.from_splats(read_splats(file), distilled.model.config.frame)
-    pairs = zip(distilled.test.cameras, distilled.test.pictures, strict=True)
+    drawable = Drawable.from_splats(read_splats(file), prepared.model.config.frame)
+    pairs = zip(prepared.test.cameras, prepared.test.pictures, strict=True)
     scores = [psnr(draw(drawable, camera).rgb.clamp(0, 1), picture) for camera, picture in pairs]
     return MeasuredFile(encoder, setting, file.stat().st_size, float(np.mean(scores)), min(scores), seconds)
 
@@ -155,22 +153,18 @@ def main() -> None:
         metavar="DB",
         help="PSNR targets of hyrfpack's files",
     )
-    parser.add_argument("--steps", type=int, default=DistillConfig.steps)
-    parser.add_argument("--size", type=int, default=DistillConfig.size)
+    parser.add_argument("--size", type=int, default=ImportConfig.size)
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     for file in args.files:
         splats = read_splats(file)
         started = time.perf_counter()
-        settings = [DistillConfig(args.steps, psnr, args.size, seed=args.seed) for psnr in sorted(args.psnr)]
-        config_by_kind = {config.has_residuals: config for config in settings}
-        models = {kind: distill_model(splats, config, name=str(file)) for kind, config in config_by_kind.items()}
-        distilled = next(iter(models.values()))
+        prepared = prepare_model(splats, ImportConfig(size=args.size, seed=args.seed), name=str(file))
         print(f"\n{file.name}: {len(splats):,} Gaussians of degree {splats.degree}; "
-              f"distilled in {time.perf_counter() - started:.0f} s\n")  # fmt: skip
-        own_files = list(measure_own_files(models, args.psnr))
+              f"prepared in {time.perf_counter() - started:.0f} s\n")  # fmt: skip
+        own_files = list(measure_own_files(prepared, args.psnr))
         with tempfile.TemporaryDirectory() as folder:
-            other_files = list(measure_other_files(splats, distilled, Path(folder)))
+            other_files = list(measure_other_files(splats, prepared, Path(folder)))
         columns = ["encoder", "setting", "bytes", "dB, mean", "worst", "s"]
         print(markdown_table(columns, [file.row() for file in (*own_files, *other_files)]), flush=True)
         print("\nAt equal PSNR:\n", *compare_at_equal_psnr(own_files, other_files), sep="\n", flush=True)

@@ -1,4 +1,4 @@
-"""Distil a file of 3D Gaussians, or splats in memory, into a `.hyrf` file."""
+"""Make a `.hyrf` file from a file of 3D Gaussians, or from splats in memory."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ import numpy as np
 from hyrfpack import format as hyrf_format
 from hyrfpack.atomic import write_atomic
 from hyrfpack.checks import check_type
-from hyrfpack.config.distill import RESIDUALS_MIN_PSNR, DistillConfig
+from hyrfpack.config.imports import ImportConfig
 from hyrfpack.context import RunContext
-from hyrfpack.distill.distillation import distill_model
-from hyrfpack.distill.pack import pack
+from hyrfpack.imports.pack import pack
+from hyrfpack.imports.prepare import prepare_model
 from hyrfpack.out_of_memory import explain_out_of_memory
 from hyrfpack.outputs import Outputs
 from hyrfpack.progress import TaskEvent, part_of_progress
@@ -31,8 +31,8 @@ _LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class DistillReport:
-    """The result of a distillation.
+class ImportReport:
+    """The result of an import.
 
     Attributes:
         gaussians_before, gaussians_after: number of Gaussians of the original and of the file.
@@ -41,12 +41,12 @@ class DistillReport:
         psnr: mean PSNR over these views of the decoded file's renders against the original's, over black; dB.
         psnr_worst: PSNR of the worst view; dB.
         psnr_unpacked: mean PSNR of the model before compression; dB.
-        psnr_asked: the target PSNR of `DistillConfig`; None with a target size.
+        psnr_asked: the target PSNR of `ImportConfig`; None with a target size.
         bytes_source: size of the original file; None if the splats did not come from a file.
         bytes_ply: size of the original as PLY in INRIA's layout, without the header: 4 (17 + 3 (K - 1)) bytes for each
             Gaussian with K harmonics.
         bytes_after: size of the `.hyrf` file.
-        seconds: duration of the distillation.
+        seconds: duration of the import.
         file: the path that was written.
     """
 
@@ -73,15 +73,15 @@ class DistillReport:
 def import_splats(
     source: str | os.PathLike[str],
     target: str | os.PathLike[str],
-    config: DistillConfig = DistillConfig(),  # noqa: B008 - frozen
+    config: ImportConfig = ImportConfig(),  # noqa: B008 - frozen
     *,
     cameras: Sequence[Camera] | None = None,
     overwrite: bool = True,
     context: RunContext = RunContext(),  # noqa: B008 - frozen
-) -> DistillReport:
+) -> ImportReport:
     """Make a `.hyrf` file from a file of 3D Gaussians.
 
-    The arguments are those of `distill_splats`; `read_splats` describes which files can be read.
+    The arguments are those of `import_loaded_splats`; `read_splats` describes which files can be read.
 
     Raises:
         HyrfDataError: the source cannot be read, or no view shows any of its Gaussians.
@@ -91,38 +91,38 @@ def import_splats(
 
     Example:
         >>> import hyrfpack
-        >>> quick = hyrfpack.DistillConfig(steps=4, psnr=15, size=32, train_views=6, test_views=2)
+        >>> quick = hyrfpack.ImportConfig(psnr=15, size=32, views=6, test_views=2)
         >>> report = hyrfpack.import_splats("bonsai.ply", "again.hyrf", quick)
         >>> report.bytes_after < report.bytes_source
         True
     """
-    check_type("config", config, DistillConfig)
+    check_type("config", config, ImportConfig)
     for camera in cameras or ():
         check_type("each of the cameras", camera, Camera)
     Outputs(source, overwrite=overwrite).file(target)
     splats = read_splats(source)
-    result = distill_splats(
+    result = import_loaded_splats(
         splats, target, config, name=str(source), cameras=cameras, overwrite=overwrite, context=context
     )
     return dataclasses.replace(result, bytes_source=bytes_on_disk(source))
 
 
-def distill_splats(
+def import_loaded_splats(
     splats: Splats,
     target: str | os.PathLike[str],
-    config: DistillConfig = DistillConfig(),  # noqa: B008 - frozen
+    config: ImportConfig = ImportConfig(),  # noqa: B008 - frozen
     *,
     name: str = "the splats",
     cameras: Sequence[Camera] | None = None,
     overwrite: bool = True,
     context: RunContext = RunContext(),  # noqa: B008 - frozen
-) -> DistillReport:
-    """Distil splats into a hybrid model of the same appearance, and compress it with profile "compact".
+) -> ImportReport:
+    """Make a model that equals splats, and compress it with profile "compact".
 
     Without cameras, viewpoints are sampled (`sample_viewpoints`). The Gaussians that contribute least to the renders
-    from there are left out. The fields are initialised by regression on the shapes and colours of the others
-    (`initial_model`). Then the whole model is fitted to renders of the original. On the CPU the same splats and
-    settings give the same bytes; on a GPU sums of gradients vary in their last bits.
+    from there are left out. The fields are zero, and residuals hold the shapes and colours of the others
+    (`exact_model`). On the CPU the same splats and settings give the same bytes; on a GPU sums of gradients vary in
+    their last bits.
 
     Args:
         splats: the splats, in any units and at any place.
@@ -132,7 +132,7 @@ def distill_splats(
             TEST_EVERY is held out.
         overwrite: replace a file at `target`. If False, an existing file is an error. A file that appears in the
             meantime is kept, and the result is written beside it under a free name, which the report names.
-        context: device for rendering and training, progress and stop.
+        context: device for rendering, progress and stop.
 
     Raises:
         HyrfDataError: no view shows any of the splats.
@@ -143,7 +143,7 @@ def distill_splats(
     Outputs(overwrite=overwrite).file(target)
     device = context.choose_device()
     with context.open_progress("import") as progress:
-        distilled = distill_model(
+        prepared = prepare_model(
             splats,
             config,
             name=name,
@@ -151,30 +151,30 @@ def distill_splats(
             device=device,
             progress=part_of_progress(progress, 0.0, 0.7),
         )
-        unpacked_psnr = float(np.mean(distilled.test.psnr_per_view(distilled.model)))
+        unpacked_psnr = float(np.mean(prepared.test.psnr_per_view(prepared.model)))
         _LOG.info(f"PSNR before compression: {unpacked_psnr:.2f} dB")
         imported = f"{len(splats):,} Gaussians of degree {splats.degree} from {Path(name).name}, without photos"
         choices = {"imported": imported}
-        # By default, `compress` adds a share of this error. That of a model with residuals would be next to none.
+        # By default, `compress` adds a share of this error. That of the model itself would be next to none.
         psnr = min(unpacked_psnr, config.psnr)
-        provenance = {"steps": config.steps, "seed": config.seed, "psnr": psnr, "choices": choices}
+        provenance = {"steps": 0, "seed": config.seed, "psnr": psnr, "choices": choices}
         packing = part_of_progress(progress, 0.7, 0.97)
-        data = pack(distilled, config.psnr, provenance, packing, worst=config.worst, target_bytes=config.target_bytes)
+        data = pack(prepared, config.psnr, provenance, packing, worst=config.worst, target_bytes=config.target_bytes)
         progress(TaskEvent("scoring the file", 0.97))
         # The file is written after all else that an interrupt may end, so that an earlier file is kept.
         written = write_atomic(target, data, overwrite=overwrite)
         decoded = hyrf_format.load_model(written).to(device)
-        decoded.precision = distilled.model.precision
-        scores = distilled.test.psnr_per_view(decoded)
+        decoded.precision = prepared.model.precision
+        scores = prepared.test.psnr_per_view(decoded)
     reached_psnr = float(np.mean(scores))
     if config.target_bytes is None and _falls_short(reached_psnr, config.psnr):
-        _LOG.warning(_shortfall(reached_psnr, unpacked_psnr, config, viewpoints_are_sampled=cameras is None))
+        _LOG.warning(_shortfall(reached_psnr, unpacked_psnr, config))
     if config.worst is not None and _falls_short(min(scores), config.worst):
         _LOG.warning(
             f"the worst view is to have {config.worst:g} dB, but the worst of the held-out ones has {min(scores):.1f} "
             "dB; set a higher `worst`"
         )
-    return DistillReport(
+    return ImportReport(
         gaussians_before=len(splats),
         gaussians_after=len(decoded),
         degree=splats.degree,
@@ -196,9 +196,7 @@ def _falls_short(reached_psnr: float, asked: float) -> bool:
     return round(reached_psnr, 1) < asked
 
 
-def _shortfall(
-    reached_psnr: float, unpacked_psnr: float, config: DistillConfig, *, viewpoints_are_sampled: bool
-) -> str:
+def _shortfall(reached_psnr: float, unpacked_psnr: float, config: ImportConfig) -> str:
     """Describe how far the file falls short of the target PSNR, and what the user can do about it."""
     outcome = (
         f"the target PSNR is {config.psnr:g} dB, but the file reaches {reached_psnr:.1f} dB at held-out viewpoints "
@@ -206,10 +204,4 @@ def _shortfall(
     )
     if not _falls_short(unpacked_psnr, config.psnr):
         return f"{outcome}; set a higher target with `psnr`"
-    where = ", or give the viewpoints that matter with `cameras`" if viewpoints_are_sampled else ""
-    if config.has_residuals:
-        return f"{outcome}; opacities and scales are limited in a model, so set a lower `psnr`"
-    return (
-        f"{outcome}; train longer, for example with `steps={max(DistillConfig.steps, 2 * config.steps)}`, or store "
-        f"corrections of single Gaussians, which take the place of training, with `psnr={RESIDUALS_MIN_PSNR:g}`{where}"
-    )
+    return f"{outcome}; opacities and scales are limited in a model, so set a lower `psnr`"

@@ -4,5 +4,5 @@ import pytest
 
 
 @pytest.fixture(autouse=True)
-def use_quick_distillation(quick_distillation: None) -> None:
+def use_quick_import(quick_import: None) -> None:
     pass

@@ -5,29 +5,30 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from explicit_balls import TINY_DISTILL_CONFIG, ball_splats
+import torch
+from explicit_balls import TINY_IMPORT_CONFIG, ball_splats
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import hyrfpack
 from hyrfpack.compress import calibrate
-from hyrfpack.distill import DistillConfig, distill_splats, distillation, fit, pack, reference
-from hyrfpack.distill.reference import ReferenceViews, reference_scene
 from hyrfpack.errors import HyrfDataError, HyrfError
+from hyrfpack.imports import ImportConfig, import_loaded_splats, pack, prepare, run
+from hyrfpack.imports.reference import ReferenceViews
 from hyrfpack.scene import Camera
 from hyrfpack.splats.draw import Drawable, draw
 from hyrfpack.splats.viewpoints import WeightedSplats, sample_viewpoints
 
-pytestmark = pytest.mark.usefixtures("quick_calibration", "quick_distillation")
+pytestmark = pytest.mark.usefixtures("quick_calibration", "quick_import")
 
 
 def test_the_report_describes_the_file(tmp_path: Path) -> None:
     splats, target = ball_splats(200), tmp_path / "ball.hyrf"
-    report = distill_splats(splats, target, TINY_DISTILL_CONFIG)
+    report = import_loaded_splats(splats, target, TINY_IMPORT_CONFIG)
     model = hyrfpack.load_model(target)
     weighted = WeightedSplats.from_splats(splats, "ball")
     original = Drawable.from_splats(splats, weighted.frame)
-    held_out = sample_viewpoints(weighted, original, TINY_DISTILL_CONFIG.test_views, TINY_DISTILL_CONFIG.size, 1)
+    held_out = sample_viewpoints(weighted, original, TINY_IMPORT_CONFIG.test_views, TINY_IMPORT_CONFIG.size, 1)
     scores = ReferenceViews.from_splats(original, held_out).psnr_per_view(model)
     assert (report.psnr, report.psnr_worst) == (np.mean(scores), min(scores))
     assert (report.gaussians_before, report.gaussians_after) == (200, len(model))
@@ -36,24 +37,14 @@ def test_the_report_describes_the_file(tmp_path: Path) -> None:
     assert hyrfpack.describe_file(target)["profile"] == "compact"
 
 
-@pytest.mark.acceptance
-def test_more_steps_raise_the_psnr(tmp_path: Path) -> None:
-    splats = ball_splats(200)
-    few, many = (
-        distill_splats(splats, tmp_path / "ball.hyrf", replace(TINY_DISTILL_CONFIG, steps=steps)).psnr_unpacked
-        for steps in (1, 40)
-    )
-    assert many > few + 0.2
-
-
 def test_same_splats_and_seed_give_the_same_bytes(tmp_path: Path) -> None:
     for name in "ab":
-        distill_splats(ball_splats(60), tmp_path / name, TINY_DISTILL_CONFIG)
+        import_loaded_splats(ball_splats(60), tmp_path / name, TINY_IMPORT_CONFIG)
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
 def test_the_largest_seed_is_accepted(tmp_path: Path) -> None:
-    report = distill_splats(ball_splats(40), tmp_path / "x.hyrf", replace(TINY_DISTILL_CONFIG, seed=2**64 - 1, steps=2))
+    report = import_loaded_splats(ball_splats(40), tmp_path / "x.hyrf", replace(TINY_IMPORT_CONFIG, seed=2**64 - 1))
     assert hyrfpack.describe_file(tmp_path / "x.hyrf")["provenance"]["seed"] == 2**64 - 1 and report.psnr > 10
 
 
@@ -62,7 +53,7 @@ def test_the_largest_seed_is_accepted(tmp_path: Path) -> None:
 def test_the_result_does_not_depend_on_origin_and_unit(tmp_path: Path, unit: float, offset: float) -> None:
     splats = ball_splats(100)
     moved = replace(splats, positions=splats.positions * unit + offset, scales=splats.scales * np.float32(unit))
-    here, there = (distill_splats(some, tmp_path / "x.hyrf", TINY_DISTILL_CONFIG) for some in (splats, moved))
+    here, there = (import_loaded_splats(some, tmp_path / "x.hyrf", TINY_IMPORT_CONFIG) for some in (splats, moved))
     assert abs(here.psnr_unpacked - there.psnr_unpacked) < 0.05
     frame = hyrfpack.load_model(tmp_path / "x.hyrf").config.frame
     np.testing.assert_allclose(
@@ -73,7 +64,7 @@ def test_the_result_does_not_depend_on_origin_and_unit(tmp_path: Path, unit: flo
 
 
 def test_a_model_of_degree_0_splats_has_colours_without_direction(tmp_path: Path) -> None:
-    distill_splats(ball_splats(100, degree=0), tmp_path / "x.hyrf", TINY_DISTILL_CONFIG)
+    import_loaded_splats(ball_splats(100, degree=0), tmp_path / "x.hyrf", TINY_IMPORT_CONFIG)
     assert {s["type"]: s["after"] for s in hyrfpack.describe_file(tmp_path / "x.hyrf")["sections"]}["RTAB"] < 32
 
 
@@ -91,8 +82,8 @@ def test_a_model_of_degree_0_splats_has_colours_without_direction(tmp_path: Path
     ],
     ids=["one", "two", "coincident", "flat", "opaque", "clear", "outlier", "antialiased"],
 )
-def test_unusual_splats_can_be_distilled(tmp_path: Path, change) -> None:
-    report = distill_splats(change(ball_splats(30)), tmp_path / "x.hyrf", TINY_DISTILL_CONFIG)
+def test_unusual_splats_can_be_imported(tmp_path: Path, change) -> None:
+    report = import_loaded_splats(change(ball_splats(30)), tmp_path / "x.hyrf", TINY_IMPORT_CONFIG)
     assert report.gaussians_after >= 1
     assert report.psnr > 15
 
@@ -104,15 +95,15 @@ def test_unusual_splats_can_be_distilled(tmp_path: Path, change) -> None:
 )
 def test_splats_that_cannot_be_seen_are_a_clear_error(tmp_path: Path, change) -> None:
     with pytest.raises(HyrfDataError, match="^ball.ply: no Gaussian is visible"):
-        distill_splats(change(ball_splats(20)), tmp_path / "x.hyrf", TINY_DISTILL_CONFIG, name="ball.ply")
+        import_loaded_splats(change(ball_splats(20)), tmp_path / "x.hyrf", TINY_IMPORT_CONFIG, name="ball.ply")
 
 
 def test_cameras_that_see_no_splats_are_a_clear_error(tmp_path: Path) -> None:
     pose = np.eye(4)
     pose[2, 3] = -100  # moves all splats behind the camera
     with pytest.raises(HyrfDataError, match="no view shows anything"):
-        distill_splats(
-            ball_splats(20), tmp_path / "x.hyrf", TINY_DISTILL_CONFIG, cameras=[Camera(32, 32, 32, 32, 16, 16, pose)]
+        import_loaded_splats(
+            ball_splats(20), tmp_path / "x.hyrf", TINY_IMPORT_CONFIG, cameras=[Camera(32, 32, 32, 32, 16, 16, pose)]
         )
 
 
@@ -120,9 +111,9 @@ def test_folder_that_cannot_be_made_is_reported_before_the_work(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "file").write_bytes(b"")
-    monkeypatch.setattr(distillation, "_choose_cameras", lambda *arguments: pytest.fail("the work began"))
+    monkeypatch.setattr(prepare, "_choose_cameras", lambda *arguments: pytest.fail("the work began"))
     with pytest.raises(HyrfError, match="file is a file, not a folder"):
-        distill_splats(ball_splats(20), tmp_path / "file" / "x.hyrf", TINY_DISTILL_CONFIG)
+        import_loaded_splats(ball_splats(20), tmp_path / "file" / "x.hyrf", TINY_IMPORT_CONFIG)
 
 
 def test_an_interrupt_while_packing_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -131,7 +122,7 @@ def test_an_interrupt_while_packing_keeps_the_old_file(tmp_path: Path, monkeypat
     monkeypatch.setattr(pack, "PLANNED_ERROR_SHARE", 100.0)  # makes the first attempt miss the target
     monkeypatch.setattr(pack.Packer, "encode", _interrupt_second_call(pack.Packer.encode))
     with pytest.raises(KeyboardInterrupt):
-        distill_splats(ball_splats(20), target, TINY_DISTILL_CONFIG)
+        import_loaded_splats(ball_splats(20), target, TINY_IMPORT_CONFIG)
     assert [path.name for path in tmp_path.iterdir()] == ["x.hyrf"]
     assert target.read_bytes() == b"before"
 
@@ -159,63 +150,41 @@ def test_repeated_packing_attempts_measure_and_draw_only_once(tmp_path: Path, mo
     monkeypatch.setattr(pack, "_mse", lambda psnr: 2.0**-psnr)  # makes packing seem to add a large error
     measured = record_calls(monkeypatch, calibrate, "measure_sensitivity")
     tried = record_calls(monkeypatch, pack.Packer, "encode")
-    drawn = record_calls(monkeypatch, reference, "render_reference")
 
-    distill_splats(ball_splats(60), tmp_path / "x.hyrf", replace(TINY_DISTILL_CONFIG, steps=12))
+    import_loaded_splats(ball_splats(60), tmp_path / "x.hyrf", TINY_IMPORT_CONFIG)
 
     assert len(tried) > 1 and len(measured) == 1
     assert len({noise for _, noise, *_ in tried}) == len(tried)
-    assert len(drawn) == TINY_DISTILL_CONFIG.train_views
 
 
-def test_a_short_import_uses_fewer_viewpoints_and_regression_steps(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_psnr_below_the_target_is_reported(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    looked = record_calls(monkeypatch, distillation, "sample_viewpoints")
-    started = record_calls(monkeypatch, distillation, "initial_model")
-    monkeypatch.setattr("hyrfpack.splats.viewpoints.coverage", lambda *args: 1.0)
-    monkeypatch.setattr(distillation, "_fit_to_pictures", lambda *args: None)
-    monkeypatch.setattr(fit, "pack", _interrupt)
-    for steps in (1, DistillConfig.steps):
-        with pytest.raises(KeyboardInterrupt):
-            distill_splats(ball_splats(20), tmp_path / "x.hyrf", DistillConfig(steps=steps, size=16))
-    (_, _, few, *_), _, _, (_, _, many, *_), _, _ = looked  # the other calls decide something, or are held out
-    (*_, less, _), (*_, whole, _) = started
-    assert few <= 64 < many == DistillConfig.train_views
-    assert less < whole == 1
-
-
-def _interrupt(*args, **settings):
-    raise KeyboardInterrupt
-
-
-@pytest.mark.acceptance
-def test_a_psnr_below_the_target_is_reported(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    report = distill_splats(ball_splats(60), tmp_path / "x.hyrf", replace(TINY_DISTILL_CONFIG, psnr=37.9))
+    monkeypatch.setattr(pack, "MAX_TRIALS", 1)
+    monkeypatch.setattr(pack, "PLANNED_ERROR_SHARE", 4.0)  # makes the only file miss the target
+    caplog.set_level("INFO")
+    report = import_loaded_splats(ball_splats(60), tmp_path / "x.hyrf", replace(TINY_IMPORT_CONFIG, psnr=37.9))
     assert report.psnr_asked == 37.9
-    last = caplog.messages[-1]
-    assert last.startswith(
+    assert caplog.messages[-1].startswith(
         f"the target PSNR is 37.9 dB, but the file reaches {report.psnr:.1f} dB at held-out viewpoints"
     )
-    assert all(words in last for words in (f"`steps={DistillConfig.steps}`", "`psnr=38`", "`cameras`"))
+    assert caplog.messages[-1].endswith("set a higher target with `psnr`")
 
     caplog.clear()
-    distill_splats(ball_splats(60), tmp_path / "x.hyrf", replace(TINY_DISTILL_CONFIG, psnr=10))
+    import_loaded_splats(ball_splats(60), tmp_path / "x.hyrf", replace(TINY_IMPORT_CONFIG, psnr=10))
     assert not any("target PSNR" in sentence for sentence in caplog.messages)
 
 
-def test_a_target_missed_only_by_packing_advises_psnr_and_not_steps() -> None:
-    messages = fit._shortfall(36.5, 38.6, DistillConfig(psnr=37), viewpoints_are_sampled=True)
-    assert "reaches 36.5" in messages and messages.endswith("with `psnr`") and "steps" not in messages
-    assert "cameras" not in fit._shortfall(36.5, 36.6, DistillConfig(psnr=37), viewpoints_are_sampled=False)
-    exact = DistillConfig(psnr=60)
-    assert "set a lower `psnr`" in fit._shortfall(55, 56, exact, viewpoints_are_sampled=True)
-    assert not fit._falls_short(36.96, 37) and fit._falls_short(36.94, 37)
+def test_a_missed_target_advises_another_psnr() -> None:
+    messages = run._shortfall(36.5, 38.6, ImportConfig(psnr=37))
+    assert "reaches 36.5" in messages and messages.endswith("set a higher target with `psnr`")
+    assert "set a lower `psnr`" in run._shortfall(55, 56, ImportConfig(psnr=60))
+    assert not run._falls_short(36.96, 37) and run._falls_short(36.94, 37)
 
 
 def test_settings_out_of_range_are_rejected() -> None:
     for wrong in (
-        *({"steps": 0}, {"steps": 2.5}, {"size": 0}, {"train_views": True}, {"test_views": "3"}),
+        *({"size": 0}, {"views": True}, {"test_views": "3"}),
         *(
             {"psnr": float("nan")},
             {"psnr": 61},
@@ -227,7 +196,7 @@ def test_settings_out_of_range_are_rejected() -> None:
         ),
     ):
         with pytest.raises(ValueError, match=next(iter(wrong))):
-            DistillConfig(**wrong)
+            ImportConfig(**wrong)
 
 
 def test_reference_views_hold_the_drawn_pictures() -> None:
@@ -235,11 +204,10 @@ def test_reference_views_hold_the_drawn_pictures() -> None:
     weighted = WeightedSplats.from_splats(splats, "ball")
     original = Drawable.from_splats(splats, weighted.frame)
     (camera,) = sample_viewpoints(weighted, original, 1, 32, 0)
-    scene = reference_scene("ball", original, [camera], [])
-    picture = scene.train[0].load()
-    drawn = draw(original, camera)
-    np.testing.assert_allclose(picture.alpha / 255, 1 - drawn.transmittance, atol=0.5 / 255 + 1e-6)
-    np.testing.assert_allclose(picture.composite(), drawn.rgb.clamp(0, 1), atol=1.5 / 255)
+
+    (picture,) = ReferenceViews.from_splats(original, [camera]).pictures
+
+    assert torch.equal(picture, draw(original, camera).rgb.clamp(0, 1))
 
 
 @given(st.lists(st.floats(1e-8, 1e-2), min_size=1, max_size=48), st.floats(1.001, 50.0))

@@ -1,4 +1,4 @@
-"""Compress a distilled model to the smallest file that reaches a target PSNR."""
+"""Compress a model of splats to the smallest file that reaches a target PSNR."""
 
 from __future__ import annotations
 
@@ -10,15 +10,11 @@ import numpy as np
 from scipy.optimize import brentq
 
 from hyrfpack.cameras.paths import Viewpoint
-from hyrfpack.compress.calibrate import calibrate, measure_calibrated_sensitivity
-from hyrfpack.compress.field_codes import quantize_fields
+from hyrfpack.compress.calibrate import measure_calibrated_sensitivity
 from hyrfpack.compress.limits import EncodedCandidate
 from hyrfpack.compress.packer import Packer
-from hyrfpack.compress.reference_renders import ReferenceRenders
-from hyrfpack.compress.sensitivity import measure_sensitivity
-from hyrfpack.distill.distillation import DistilledModel
-from hyrfpack.distill.residuals import exact_model
 from hyrfpack.errors import HyrfSizeError
+from hyrfpack.imports.prepare import PreparedModel
 from hyrfpack.progress import Progress, TaskEvent, ignore_progress, part_of_progress, round_of_progress
 
 _LOG = logging.getLogger(__name__)
@@ -39,12 +35,10 @@ MAX_LOG_STEP = np.log(16)
 MAX_TRIALS = 6
 # Views around splats differ in distance by a factor of four, so more of them are measured than of a capture.
 DRAWN_GAUSSIANS = 15_000_000
-# With residuals, fields are quantised as if they alone might add this error, in dB; residuals correct it.
-FIELD_PSNR = 28.0
 
 
 def pack(
-    distilled: DistilledModel,
+    prepared: PreparedModel,
     psnr: float,
     provenance: dict,
     progress: Progress = ignore_progress,
@@ -55,7 +49,7 @@ def pack(
     """Encode the smallest file that reaches target PSNRs on the validation views, or the best one within a size.
 
     Args:
-        distilled: the model, and reference renders of the original.
+        prepared: the model, and reference renders of the original.
         psnr: target PSNR in dB against the reference renders, mean over views.
         provenance: provenance to store in the file; the viewpoint is added to it.
         progress: called with `TaskEvent`s.
@@ -69,21 +63,26 @@ def pack(
         HyrfSizeError: no file is as small as `target_bytes`.
 
     Example:
-        >>> from hyrfpack.distill import DistillConfig
-        >>> from hyrfpack.distill.distillation import distill_model
+        >>> from hyrfpack.imports import ImportConfig
+        >>> from hyrfpack.imports.prepare import prepare_model
         >>> from hyrfpack.splats.files import read_splats
-        >>> quick = DistillConfig(steps=1, size=16, train_views=2, test_views=2)
-        >>> distilled = distill_model(read_splats("bonsai.ply"), quick)
-        >>> pack(distilled, psnr=15, provenance={})[:4]
+        >>> quick = ImportConfig(size=16, views=2, test_views=2)
+        >>> prepared = prepare_model(read_splats("bonsai.ply"), quick)
+        >>> pack(prepared, psnr=15, provenance={})[:4]
         b'HYRF'
     """
-    model = distilled.model
-    psnrs = np.array(distilled.validation.psnr_per_view(model))
+    model = prepared.model
+    psnrs = np.array(prepared.validation.psnr_per_view(model))
     allowed, error = _mse(psnr), _mse(psnrs.mean())
     allowance = max(allowed - error, min(FALLBACK_MODEL_ERROR_SHARE * error, FALLBACK_ALLOWED_ERROR_SHARE * allowed))
-    _LOG.info(f"measuring how each stored number affects renders, at {len(distilled.train)} cameras and between them")
+    _LOG.info(f"measuring how each stored number affects renders, at {len(prepared.cameras)} cameras and between them")
     distortion = PLANNED_ERROR_SHARE * solve_added_error(_mse(psnrs), error + allowance)
-    packer = _make_packer(distilled, distortion, provenance, part_of_progress(progress, 0.0, 0.7))
+    measuring = part_of_progress(progress, 0.0, 0.7)
+    sensitivity, _ = measure_calibrated_sensitivity(
+        model, prepared.cameras, distortion, progress=measuring, drawn=DRAWN_GAUSSIANS
+    )
+    provenance = {**provenance, "viewpoint": Viewpoint.from_cameras(prepared.cameras).to_json()}
+    packer = Packer(model, provenance, sensitivity)
     if target_bytes is not None:
         packer.progress = part_of_progress(progress, 0.7, 1.0)
         try:
@@ -93,34 +92,11 @@ def pack(
 
     def error_ratio(candidate: EncodedCandidate) -> float:
         """Return the larger ratio of an error to its limit: that of the mean, or that of the worst view."""
-        scores = distilled.validation.psnr_per_view(packer.decode(candidate))
+        scores = prepared.validation.psnr_per_view(packer.decode(candidate))
         ratio = (_mse(np.mean(scores)) - error) / allowance
         return ratio if worst is None else max(ratio, _mse(min(scores)) / _mse(worst))
 
     return _search(packer, distortion, error_ratio, part_of_progress(progress, 0.7, 1.0)).data
-
-
-def _make_packer(distilled: DistilledModel, distortion: float, provenance: dict, progress: Progress) -> Packer:
-    """Measure the sensitivities of a model, and quantise the fields of one that has residuals.
-
-    Args:
-        distilled: the model.
-        distortion: mean squared error for which sensitivities are calibrated.
-        provenance: as in `pack`.
-        progress: called with `TaskEvent`s.
-    """
-    model, train = distilled.model, distilled.train
-    provenance = {**provenance, "viewpoint": Viewpoint.from_cameras(train).to_json()}
-    if distilled.exact is None:
-        sensitivity, _ = measure_calibrated_sensitivity(model, train, distortion, progress=progress)
-        return Packer(model, provenance, sensitivity)
-    measuring = part_of_progress(progress, 0.0, 0.5)
-    sensitivity = measure_sensitivity(model, train, progress=measuring, drawn=DRAWN_GAUSSIANS)
-    model, codes = quantize_fields(model, sensitivity, _mse(FIELD_PSNR))
-    model = exact_model(model, distilled.exact)
-    references, rest = ReferenceRenders.from_model(model, train), part_of_progress(progress, 0.55, 1.0)
-    sensitivity = calibrate(model, sensitivity, references, distortion, progress=rest, field_codes=codes)
-    return Packer(model, provenance, sensitivity, field_codes=codes)
 
 
 def _search(

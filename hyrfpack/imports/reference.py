@@ -1,52 +1,25 @@
-"""Render the original splats, as photos to train on and as references, and measure the light that they send."""
+"""Render the original splats as references, and measure the light that they send."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from hyrfpack.device import make_current
 from hyrfpack.evaluate.metrics import psnr
 from hyrfpack.model import HybridModel
 from hyrfpack.ops.rasterize.blend_weights import sum_blend_weights
 from hyrfpack.ops.rasterize.cull import frustum_cull
 from hyrfpack.parallel.pool import parallel_map, torch_on_one_thread
 from hyrfpack.render import RenderSettings, render_view
-from hyrfpack.scene import Camera, Picture, Scene, View
+from hyrfpack.scene import Camera
 from hyrfpack.splats.draw import Drawable, draw
 
 LIGHT_VIEWS_IN_MEMORY = 8
 # Division by a smaller alpha would amplify noise in the colours of nearly transparent pixels.
 MIN_ALPHA = 1e-6
-
-
-def reference_scene(name: str, drawable: Drawable, train: Sequence[Camera], test: Sequence[Camera]) -> Scene:
-    """Return a scene whose photos are renders of the splats with alpha; each is rendered when it is loaded."""
-    count = len(str(len(train) + len(test)))
-    train_views, test_views = (
-        [
-            View(f"{kind}/{number:0{count}d}", camera, partial(render_reference, drawable, camera))
-            for number, camera in enumerate(cameras)
-        ]
-        for kind, cameras in (("train", train), ("test", test))
-    )
-    return Scene(
-        name, "splats", train_views, test_views, np.zeros((0, 3)), np.zeros((0, 3), np.float32), has_alpha=True
-    )
-
-
-def render_reference(drawable: Drawable, camera: Camera) -> Picture:
-    """Render the splats from a camera as a picture of 8 bits per channel with straight alpha."""
-    make_current(drawable.device)  # the current device is kept per thread, and this may be a prefetching thread
-    rendered = draw(drawable, camera)
-    alpha = 1 - rendered.transmittance
-    rgb = rendered.rgb / alpha.clamp_min(MIN_ALPHA)[..., None]
-    return Picture(*((values.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy() for values in (rgb, alpha)))
 
 
 @torch_on_one_thread()
