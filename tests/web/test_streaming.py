@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from web.native_models import random_model
 from web.pages import Browser, psnr, render_in_page, wait_for_message, wait_until, window_camera
 from web.site import Site
 from web.test_element import ELEMENT_JS, LOADED_JS, open_element
@@ -187,6 +188,26 @@ def test_levels_of_all_parts_are_drawn_as_python_renders_them(browser: Browser, 
     picture = render_in_page(browser, camera).astype(float)
     assert state["gaussians"] == finest and not state["problem"]
     assert psnr(picture, reference_picture(parts_folder.load(), camera)) > MIN_PSNR_DB
+    assert browser.list_errors() == []
+
+
+def test_residuals_of_chunks_are_drawn_as_python_renders_them(browser: Browser, host: Site, tmp_path: Path):
+    """Parts have residuals of different degrees, or none, and chunks of several levels arrive before and after them."""
+    files = [tmp_path / f"{name}.hyrf" for name in ("degree-2", "none", "degree-0")]
+    for seed, (path, degree) in enumerate(zip(files, (2, None, 0), strict=True)):
+        hyrfpack.save_model(random_model(300, seed, residual_degree=degree), path)
+    moves = {"none": [Translate((0.3, 0.0, 0.0))], "degree-0": [Rotate((0.0, 0.0, 1.0), 40.0), Scale(1.2)]}
+    hyrfpack.merge_models(files, tmp_path / "all.hyrf", moves)
+    config = SplitConfig(chunk_gaussians=160, levels=2, refit_steps=0)
+    split_model(tmp_path / "all.hyrf", tmp_path / "scene", config, context=RunContext(progress=None))
+    folder = hyrfpack.SceneFolder(tmp_path / "scene")
+    serve_levels(host, folder)
+    open_levels(browser, host, count_gaussians(folder, 0))
+    state = wait_until_complete(browser)
+    camera = Camera(120, 90, 129.0, 129.0, 60.0, 45.0, window_camera(browser).camera_from_world)
+    picture = render_in_page(browser, camera).astype(float)
+    assert state["gaussians"] == 900 and not state["problem"]
+    assert psnr(picture, reference_picture(folder.load(), camera)) > MIN_PSNR_DB
     assert browser.list_errors() == []
 
 

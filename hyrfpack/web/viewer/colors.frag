@@ -7,7 +7,7 @@ uniform vec3 u_eye;
 uniform mat3 u_place_inverse; // from the axes of the scene to those of the part
 #endif
 #ifdef RESIDUAL_TERMS
-uniform sampler2D u_residuals; // RESIDUAL_TERMS texels for each Gaussian, each in a row of its own
+uniform highp sampler2DArray u_residuals; // a layer for each of RESIDUAL_TERMS harmonics
 
 // What the residuals of a Gaussian add to its colour along a direction, see hyrf/basis.js.
 vec3 residual(ivec2 place, vec3 d) {
@@ -30,9 +30,7 @@ vec3 residual(ivec2 place, vec3 d) {
     basis[14] = 1.445305721320277 * d.z * (s.x - s.y);
     basis[15] = -0.5900435899266435 * d.x * (s.x - 3.0 * s.y);
     vec3 sum = vec3(0.0);
-    for (int k = 0; k < RESIDUAL_TERMS; ++k) {
-        sum += basis[k] * texelFetch(u_residuals, ivec2(place.x, RESIDUAL_TERMS * place.y + k), 0).xyz;
-    }
+    for (int k = 0; k < RESIDUAL_TERMS; ++k) sum += basis[k] * texelFetch(u_residuals, ivec3(place, k), 0).xyz;
     return sum;
 }
 #endif

@@ -24,11 +24,10 @@ export const MEMORY_REASON = "this device's memory does not hold the fields.";
 
 export class Fields {
   // Throws UnsupportedDeviceError if the device cannot hold a model that pack.js has packed.
-  static check(gl, { cells, height, geometry, radiance, residualDegree }) {
+  static check(gl, { cells, height, geometry, radiance }) {
     const side = gl.getParameter(gl.MAX_TEXTURE_SIZE);
-    const texels = residualDegree === undefined ? 1 : Math.max(2, (residualDegree + 1) ** 2);
     const tableRows = [geometry, radiance].map(({ table }) => table.length / 2 / TEXTURE_WIDTH);
-    const rows = Math.max(height * texels, ...tableRows);
+    const rows = Math.max(height, ...tableRows);
     if (cells > MAX_CELLS) throw new UnsupportedDeviceError("the decoders are too wide for this device.");
     if (rows > side) throw new UnsupportedDeviceError("the model is larger than this device's textures.");
   }
@@ -102,14 +101,14 @@ export class Fields {
 
   // Uploads the numbers of the Gaussians that `evaluate` reads.
   async uploadGaussians() {
-    const { gl, graphics, model } = this, floats = [gl.RGBA32F, gl.RGBA, gl.FLOAT, 4];
+    const { gl, graphics, model, width, height } = this, floats = [gl.RGBA32F, gl.RGBA, gl.FLOAT, 4];
     this.explicit = await graphics.table(floats, TEXTURE_WIDTH, model.explicit);
     this.logits = await graphics.table(floats, TEXTURE_WIDTH, model.logits);
     this.pixelSizes = await graphics.table([gl.R32F, gl.RED, gl.FLOAT, 1], TEXTURE_WIDTH, model.pixelSizes);
     if (model.shapeResiduals) {
       const halves = [gl.RGBA16F, gl.RGBA, gl.FLOAT, 4];
-      this.shapeResiduals = await graphics.table(floats, TEXTURE_WIDTH, model.shapeResiduals);
-      this.colorResiduals = await graphics.table(halves, TEXTURE_WIDTH, model.colorResiduals);
+      this.shapeResiduals = await graphics.layers(floats, width, height, model.shapeResiduals);
+      this.colorResiduals = await graphics.layers(halves, width, height, model.colorResiduals);
       model.shapeResiduals = model.colorResiduals = null;
     }
     model.explicit = model.logits = model.pixelSizes = null; // frees memory; the worker can decode them again
@@ -238,7 +237,7 @@ export class Fields {
     const p = this.use("geometry", geometry);
     const { explicit, logits, pixelSizes } = this;
     graphics.bind(p, { u_explicit: explicit, u_logits: logits, u_pixel_sizes: pixelSizes }, gl.TEXTURE_2D, 1);
-    if (this.shapeResiduals) graphics.bind(p, { u_residuals: this.shapeResiduals }, gl.TEXTURE_2D, 4);
+    if (this.shapeResiduals) graphics.bind(p, { u_residuals: this.shapeResiduals }, gl.TEXTURE_2D_ARRAY, 4);
     gl.uniform1i(p.u_product, model.product);
     gl.uniform1i(p.u_grows, model.grows);
     this.passes(this.geometryTarget, fresh);
@@ -298,7 +297,7 @@ export class Fields {
     const { gl, graphics } = this, p = this.use("colors", this.radiance);
     graphics.bind(p, { u_places: this.places, u_logits: this.logits });
     graphics.bind(p, { u_features: this.features }, gl.TEXTURE_2D_ARRAY, 2);
-    if (this.colorResiduals) graphics.bind(p, { u_residuals: this.colorResiduals }, gl.TEXTURE_2D, 3);
+    if (this.colorResiduals) graphics.bind(p, { u_residuals: this.colorResiduals }, gl.TEXTURE_2D_ARRAY, 3);
     gl.uniform3fv(p.u_eye, eye);
     for (const row of rows) this.rows.colored(row, eye);
     this.passes(this.target, rows);

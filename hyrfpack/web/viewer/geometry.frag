@@ -3,7 +3,7 @@ uniform sampler2D u_explicit; // x, y, z; opacity logit
 uniform sampler2D u_logits; // colour logits; scale logit
 uniform sampler2D u_pixel_sizes; // of the photos, from hyrf/sampling.js
 #ifdef RESIDUAL_TERMS
-uniform sampler2D u_residuals; // two texels for each Gaussian, in two rows: a, b, x; y, z
+uniform highp sampler2DArray u_residuals; // two layers: a, b, x; y, z
 #endif
 #ifdef MOVED // the part's place in the scene, see hyrf/places.js
 uniform mat3 u_place_rows;
@@ -35,8 +35,7 @@ void main() {
         last += MATRIX(MATRIX_3 + 8 * CELLS + 4 * group) * units;
     }
 #ifdef RESIDUAL_TERMS
-    ivec2 at = ivec2(place.x, 2 * place.y);
-    vec3 one = texelFetch(u_residuals, at, 0).xyz, two = texelFetch(u_residuals, at + ivec2(0, 1), 0).xyz;
+    vec3 one = texelFetch(u_residuals, ivec3(place, 0), 0).xyz, two = texelFetch(u_residuals, ivec3(place, 1), 0).xyz;
     vec3 axis = vec3(one.z, two.xy);
     float w = last.x + 1.0;
     first.yzw += vec3(one.xy, -one.x - one.y);

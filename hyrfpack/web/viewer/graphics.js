@@ -99,6 +99,19 @@ export class Graphics {
     return texture;
   }
 
+  // Creates a texture array and uploads its layers, one after the other.
+  async layers([internal, format, type, size], width, height, numbers) {
+    const { gl } = this, step = width * height * size, depth = numbers.length / step;
+    const texture = this.texture(gl.TEXTURE_2D_ARRAY, internal, width, height, depth);
+    for (let layer = 0; layer < depth; layer++) {
+      if (layer) await this.whenDone();
+      gl.bindTexture(gl.TEXTURE_2D_ARRAY, texture);
+      const part = numbers.subarray(layer * step, (layer + 1) * step);
+      gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, layer, width, height, 1, format, type, part);
+    }
+    return texture;
+  }
+
   // Creates a framebuffer. Targets are textures, or [texture array, layer].
   framebuffer(...targets) {
     const { gl } = this, framebuffer = this.track(gl.createFramebuffer(), "Framebuffer");

@@ -84,15 +84,15 @@ function packEstimate(model, eye, pixelSizes) {
 export function packModel(model, eye) {
   const { count } = model, gaussians = packGaussians(model, TEXTURE_WIDTH);
   const estimate = packEstimate(model, eye, gaussians.pixelSizes);
-  return { count, height: countRows(count), ...packFields(model), ...gaussians, ...packResiduals(model), estimate };
+  return { count, height: countRows(count), ...packFields(model), ...gaussians, estimate };
 }
 
 // Packs the residuals of a model, if it has any.
-function packResiduals({ count, shapeResiduals, colorResiduals }) {
+function packResiduals({ count, shapeResiduals, colorResiduals }, width) {
   if (!shapeResiduals) return {};
   return {
-    shapeResiduals: stackRows(shapeResiduals, count, SHAPE_RESIDUALS),
-    colorResiduals: stackRows(colorResiduals, count, colorResiduals.length / Math.max(1, count)),
+    shapeResiduals: layerNumbers(shapeResiduals, count, SHAPE_RESIDUALS, width),
+    colorResiduals: layerNumbers(colorResiduals, count, colorResiduals.length / Math.max(1, count), width),
   };
 }
 
@@ -122,7 +122,8 @@ export function packFields(model) {
 }
 
 // Packs the Gaussians of a model for textures that are `width` wide.
-export function packGaussians({ metadata, count, positions, colorLogits, scaleLogits, opacityLogits }, width) {
+export function packGaussians(model, width) {
+  const { metadata, count, positions, colorLogits, scaleLogits, opacityLogits } = model;
   const texels = width * Math.max(1, Math.ceil(count / width));
   const explicit = new Float32Array(4 * texels), logits = new Float32Array(4 * texels);
   const sizes = new Float32Array(texels);
@@ -137,20 +138,19 @@ export function packGaussians({ metadata, count, positions, colorLogits, scaleLo
     logits[q + 2] = colorLogits[p + 2];
     logits[q + 3] = scaleLogits[i];
   }
-  return { explicit, logits, pixelSizes: sizes, balls: rowBalls(positions, width) };
+  const balls = rowBalls(positions, width);
+  return { explicit, logits, pixelSizes: sizes, balls, ...packResiduals(model, width) };
 }
 
-// Arranges numbers, `columns` for each Gaussian, for a texture of three numbers a texel: a row of Gaussians becomes
-// ceil(columns / 3) rows of texels.
-function stackRows(numbers, count, columns) {
-  const texels = Math.ceil(columns / 3), stacked = new Float32Array(4 * TEXTURE_WIDTH * countRows(count) * texels);
+// Arranges numbers, `columns` for each Gaussian, for a texture array that is `width` wide and has three of them in each
+// layer.
+function layerNumbers(numbers, count, columns, width) {
+  const texels = width * Math.max(1, Math.ceil(count / width));
+  const layered = new Float32Array(4 * texels * Math.ceil(columns / 3));
   for (let i = 0, at = 0; i < count; i++) {
-    const row = Math.floor(i / TEXTURE_WIDTH) * texels, x = i % TEXTURE_WIDTH;
-    for (let k = 0; k < columns; k++) {
-      stacked[4 * (TEXTURE_WIDTH * (row + Math.floor(k / 3)) + x) + (k % 3)] = numbers[at++];
-    }
+    for (let k = 0; k < columns; k++) layered[4 * (texels * Math.floor(k / 3) + i) + (k % 3)] = numbers[at++];
   }
-  return stacked;
+  return layered;
 }
 
 // Returns the positions of several parts (3 N each) as one array, in which each part begins a row of the textures.

@@ -21,6 +21,7 @@ export class PartFields extends Fields {
     for (const name of ["rows", "pending", "explicit", "logits", "pixelSizes", "places", "shapes", "colors"]) {
       this[name] = whole[name];
     }
+    Object.assign(this, whole.createResiduals(model.residualDegree));
     this.createFeatures();
     this.programs = await whole.compileOnce(this.shaders({ MOVED: 1 }));
     this.geometry = await this.field(model.geometry);

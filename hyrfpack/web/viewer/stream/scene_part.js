@@ -24,7 +24,6 @@ export class ScenePart {
   async receive(bytes, scene) {
     const model = await read(bytes);
     if (model.count) throw new HyrfFormatError("it holds Gaussians, and should hold only what chunks share");
-    if (model.shapeResiduals) throw new HyrfFormatError("chunks with residuals cannot be shown");
     if (this !== scene) {
       if (model.config.antialiased !== scene.config.antialiased) {
         throw new HyrfFormatError(`${scene.file.file} is antialiased and this file is not, or the other way round`);

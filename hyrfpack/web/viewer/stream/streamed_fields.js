@@ -2,6 +2,7 @@
 // are sorted and blended together. One level of a chunk fades into another over several frames. Each part of the scene
 // has fields of its own; those of the first part are this object.
 
+import { SHAPE_RESIDUALS } from "../../hyrf/residuals.js";
 import { Fields } from "../fields.js";
 import { readText } from "../texts.js";
 import { PartFields } from "./part_fields.js";
@@ -21,6 +22,9 @@ export class StreamedFields extends Fields {
     Object.assign(this, { firstParts: parts, chunks, events });
     this.further = new Map(); // number of a further part -> its PartFields
     this.ready = new Map(); // number of a further part -> the promise that it is ready, of whether it can be drawn
+    this.degrees = new Map([[0, model.residualDegree]]); // number of a part -> degree of its residuals, or undefined
+    for (const { part, model: { residualDegree } } of parts) this.degrees.set(part, residualDegree);
+    this.residuals = new Map(); // degree -> the textures of the residuals of all parts of this degree
     this.compiled = new Map(); // text of shaders -> the promise of their programs, which equal parts share
     this.rowParts = new Uint8Array(this.height); // number of the part of each row
     this.rowWeights = new Float32Array(2 * this.height); // and the number of its part
@@ -37,6 +41,7 @@ export class StreamedFields extends Fields {
     const { gl, graphics, width, height } = this;
     const create = (format) => graphics.texture(gl.TEXTURE_2D, format, width, height);
     [this.explicit, this.logits, this.pixelSizes] = [gl.RGBA32F, gl.RGBA32F, gl.R32F].map(create);
+    Object.assign(this, this.createResiduals(this.model.residualDegree));
     this.weights = graphics.texture(gl.TEXTURE_2D, gl.RG32F, 1, height);
     for (const chunk of this.chunks) {
       this.upload(chunk);
@@ -44,6 +49,18 @@ export class StreamedFields extends Fields {
       await graphics.whenDone();
     }
     this.uploadWeights();
+  }
+
+  // Returns the textures of the residuals of a degree, which are created once; none if it is undefined.
+  createResiduals(degree) {
+    const { gl, graphics, width, height, residuals } = this;
+    if (degree === undefined) return {};
+    if (!residuals.has(degree)) {
+      const create = (format, depth) => graphics.texture(gl.TEXTURE_2D_ARRAY, format, width, height, depth);
+      const shapeResiduals = create(gl.RGBA32F, Math.ceil(SHAPE_RESIDUALS / 3));
+      residuals.set(degree, { shapeResiduals, colorResiduals: create(gl.RGBA16F, (degree + 1) ** 2) });
+    }
+    return residuals.get(degree);
   }
 
   // Creates textures without an estimate: Gaussians that are not evaluated are transparent.
@@ -71,6 +88,7 @@ export class StreamedFields extends Fields {
   // Prepares the fields of a further part. Its levels are drawn once it is ready.
   addPart({ part, model, place }) {
     const fields = new PartFields(this.gl, model, place, this);
+    this.degrees.set(part, model.residualDegree);
     this.further.set(part, fields);
     this.ready.set(part, this.preparePart(part, fields));
   }
@@ -109,7 +127,8 @@ export class StreamedFields extends Fields {
   }
 
   // Uploads the Gaussians of a level to its rows.
-  upload({ part, rows, explicit, logits, pixelSizes, balls }) {
+  upload(level) {
+    const { part, rows, explicit, logits, pixelSizes, balls } = level;
     const { gl, width } = this, floats = [[this.explicit, gl.RGBA, 4, explicit], [this.logits, gl.RGBA, 4, logits]];
     for (const [texture, format, size, numbers] of [...floats, [this.pixelSizes, gl.RED, 1, pixelSizes]]) {
       gl.bindTexture(gl.TEXTURE_2D, texture);
@@ -118,9 +137,27 @@ export class StreamedFields extends Fields {
         gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, first, width, count, format, gl.FLOAT, part);
       });
     }
+    this.uploadResiduals(level);
     rows.forEach((row, place) => this.rows.replace(row, balls.subarray(4 * place, 4 * place + 4)));
     for (const row of rows) this.rowParts[row] = this.rowWeights[2 * row + 1] = part;
     this.usedHeight = Math.max(this.usedHeight, ...rows.map((row) => row + 1));
+  }
+
+  // Uploads the residuals of a level, if it has any.
+  uploadResiduals({ part, rows, shapeResiduals, colorResiduals }) {
+    if (!shapeResiduals) return;
+    const { gl, width } = this, layer = 4 * width * rows.length;
+    const textures = this.createResiduals(this.degrees.get(part));
+    const pairs = [[textures.shapeResiduals, shapeResiduals], [textures.colorResiduals, colorResiduals]];
+    for (const [texture, numbers] of pairs) {
+      gl.bindTexture(gl.TEXTURE_2D_ARRAY, texture);
+      for (let start = 0, k = 0; start < numbers.length; start += layer, k++) {
+        eachRun(rows, (first, count, place) => {
+          const some = numbers.subarray(start + 4 * width * place, start + 4 * width * (place + count));
+          gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, first, k, width, count, 1, gl.RGBA, gl.FLOAT, some);
+        });
+      }
+    }
   }
 
   // Uploads a level that has arrived, and evaluates it, after those before it. Levels that arrive in the meantime are
