@@ -37,6 +37,7 @@ PRIOR_WEIGHT_VIEWS = 8.0
 # The estimate is scaled to the measurement in each cell of a grid over the contracted cube.
 PRIOR_CELLS_PER_AXIS = 32
 MIN_CAMERA_DISTANCE_LOCAL = 0.05
+MIN_PRIOR_SUM = 1e-300
 # Lower bound of the sensitivity of a decoder's number, as a share of the mean of its decoder.
 MIN_RELATIVE_DECODER_SENSITIVITY = 1e-2
 # Setting a whole decoder to zero is assumed to add at least this error, because gradients vanish under saturation.
@@ -252,7 +253,13 @@ def removal_error(opacities: np.ndarray, logit_sensitivity: np.ndarray) -> np.nd
 
 
 def _fit_prior(model: HybridModel, measured: np.ndarray, guess: np.ndarray) -> np.ndarray:
-    """Scale the estimate (N,) so that it matches the measurements (N,) in each cell of the cube and overall."""
+    """Scale the estimate (N,) so that it matches the measurements (N,) in each cell of the cube and overall.
+
+    If the estimate is almost zero everywhere, as for Gaussians that are far too small to be seen, the mean of the measurements
+    takes its place.
+    """
+    if not guess.sum() > MIN_PRIOR_SUM:
+        guess = np.ones_like(guess)
     cube = model.cube_coords(model.gaussians.positions.detach()).cpu().numpy()
     cells = np.minimum((cube * PRIOR_CELLS_PER_AXIS).astype(np.int64), PRIOR_CELLS_PER_AXIS - 1) @ np.array(
         (1, PRIOR_CELLS_PER_AXIS, PRIOR_CELLS_PER_AXIS**2)

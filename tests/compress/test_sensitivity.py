@@ -8,7 +8,7 @@ import torch
 from scenes import ball_points, ring, small_model
 
 from hyrfpack.cameras.view_sampling import interpolate_views
-from hyrfpack.compress.sensitivity import Sensitivity, measure_sensitivity
+from hyrfpack.compress.sensitivity import Sensitivity, combine_with_prior, measure_sensitivity
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import decode_model, encode_model
 from hyrfpack.format.arrays import SECTION_PARAMETERS
@@ -227,3 +227,15 @@ def test_requires_grad_is_unchanged(wanted):
     sensitivity = measure_sensitivity(model, RING_CAMERAS[:2])
     assert sensitivity.colors.max() > 1e-12
     assert all(parameter.requires_grad == wanted for parameter in model.parameters())
+
+
+@pytest.mark.parametrize("guess", [0.0, 1e-320])
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_an_estimate_of_zero_gives_the_mean_of_the_measurements(guess):
+    model = small_model(np.random.default_rng(0).uniform(-0.8, 0.8, (20, 3)))
+    measured = np.arange(20.0)
+
+    combined = combine_with_prior(model, measured, np.full(20, guess), views=8)
+
+    assert (combined >= measured / 2).all() and (combined <= 19).all()
+    assert combined.mean() == pytest.approx(measured.mean(), rel=0.1)
