@@ -255,8 +255,8 @@ def removal_error(opacities: np.ndarray, logit_sensitivity: np.ndarray) -> np.nd
 def _fit_prior(model: HybridModel, measured: np.ndarray, guess: np.ndarray) -> np.ndarray:
     """Scale the estimate (N,) so that it matches the measurements (N,) in each cell of the cube and overall.
 
-    If the estimate is almost zero everywhere, as for Gaussians that are far too small to be seen, the mean of the measurements
-    takes its place.
+    If the estimate is almost zero everywhere, as for Gaussians that are far too small to be seen, the mean of the
+    measurements takes its place.
     """
     if not guess.sum() > MIN_PRIOR_SUM:
         guess = np.ones_like(guess)

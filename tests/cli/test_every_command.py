@@ -239,7 +239,7 @@ def _replace_work(patch: pytest.MonkeyPatch) -> None:
 
 def _forbid_work(patch: pytest.MonkeyPatch) -> None:
     """Make drawing an error, because outputs must be rejected before anything is learned, measured, baked or scored."""
-    for name in ("bench", "compress", "demo", "distill", "evaluate", "export", "render", "report", "train"):
+    for name in ("bench", "compress", "demo", "evaluate", "export", "imports", "render", "report", "train"):
         import_module(f"hyrfpack.{name}")
     rasterize = import_module("hyrfpack.ops.rasterize").rasterize
 
