@@ -120,7 +120,7 @@ SINGLE_FILE_COMMANDS = [
     ("export model.hyrf --sh-degree 0 -o {}", "out.ply", "out-2.ply"),
     ("export model.hyrf -o {}", "out.points.ply", "out-2.points.ply"),
     ("export model.hyrf -o {}", "out.json", "out-2.json"),
-    ("import ball.ply --steps 1 --size 16 -o {}", "out.hyrf", "out-2.hyrf"),
+    ("import ball.ply --size 16 -o {}", "out.hyrf", "out-2.hyrf"),
     ("compare first second -o {}", "out.html", "out-2.html"),
     ("make packed.hyrf --work made -o {}", "out.html", "out-2.html"),
     ("make packed.hyrf --work made -o {}", "out.points.ply", "out-2.points.ply"),

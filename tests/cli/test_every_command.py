@@ -107,7 +107,7 @@ ALL_CASES = [
     Case("export scene --streamed-sog -o {}", "old/streamed", OUTCOME_REFUSED, OUTCOME_REPLACED),
     Case("export scene --3d-tiles -o {}", "old/tiles", OUTCOME_REFUSED, OUTCOME_REPLACED),
     Case("export model.hyrf named.json -o {}", "old/gallery", OUTCOME_REFUSED, OUTCOME_REPLACED),
-    Case("import ball.ply --steps 1 --size 16 -o {}", "old/a.hyrf", OUTCOME_REFUSED, OUTCOME_REPLACED),
+    Case("import ball.ply --size 16 -o {}", "old/a.hyrf", OUTCOME_REFUSED, OUTCOME_REPLACED),
     Case("convert ball.ply {}", "old/a.ply", OUTCOME_REFUSED, OUTCOME_REPLACED),
     Case("compare first second -o {}", "old/a.html", OUTCOME_REFUSED, OUTCOME_REPLACED),
     Case("bench model.hyrf -o {}", "old/a.png", OUTCOME_REFUSED, OUTCOME_WRITTEN),
