@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from web.native_models import random_model
+from web.native_models import lose_and_restore_device, random_model
 from web.pages import Browser, psnr, render_in_page, wait_for_message, wait_until, window_camera
 from web.site import Site
 from web.test_element import ELEMENT_JS, LOADED_JS, open_element
@@ -16,6 +16,8 @@ import hyrfpack
 from hyrfpack.config.edit import Rotate, Scale, Translate
 from hyrfpack.config.split import SplitConfig
 from hyrfpack.context import RunContext
+from hyrfpack.format import encode_model
+from hyrfpack.format.parts import encode_parts
 from hyrfpack.lod import split, split_model
 from hyrfpack.model.merged import MergedModel
 from hyrfpack.scene import Camera
@@ -209,6 +211,35 @@ def test_residuals_of_chunks_are_drawn_as_python_renders_them(browser: Browser, 
     assert state["gaussians"] == 900 and not state["problem"]
     assert psnr(picture, reference_picture(folder.load(), camera)) > MIN_PSNR_DB
     assert browser.list_errors() == []
+
+
+@pytest.mark.acceptance
+def test_a_restored_device_draws_all_parts_again(browser: Browser, host: Site, parts_folder):
+    finest = count_gaussians(parts_folder, 0)
+    serve_levels(host, parts_folder)
+    open_levels(browser, host, finest)
+    wait_until_complete(browser)
+    camera = Camera(120, 90, 129.0, 129.0, 60.0, 45.0, window_camera(browser).camera_from_world)
+    lose_and_restore_device(browser)
+    browser.evaluate("hyrfpack.ready")
+    wait_until(browser, f"hyrfpack.player.loader.state.gaussians === {finest}", 60)
+    wait_until_complete(browser)
+    picture = render_in_page(browser, camera).astype(float)
+    assert psnr(picture, reference_picture(parts_folder.load(), camera)) > MIN_PSNR_DB
+
+
+@pytest.mark.acceptance
+def test_a_part_that_the_device_cannot_draw_is_named_and_left_out(browser: Browser, host: Site, tmp_path: Path):
+    scene, wide = hyrfpack.load_model(TRAINED_FILE), random_model(50, hidden=272, background=False)
+    parts = [("scene", TRAINED_FILE.read_bytes()), ("wide", encode_model(wide))]
+    (tmp_path / "both.hyrf").write_bytes(encode_parts(parts))
+    split_model(tmp_path / "both.hyrf", tmp_path / "scene", SplitConfig(levels=1), context=RunContext(progress=None))
+    serve_levels(host, hyrfpack.SceneFolder(tmp_path / "scene"))
+    open_levels(browser, host, 2000)
+    message = "shared-01.hyrf cannot be shown: the decoders are too wide for this device; the rest of the scene"
+    wait_until(browser, f"document.getElementById('remark').textContent.includes('{message}')", 60)
+    camera = Camera(120, 90, 129.0, 129.0, 60.0, 45.0, window_camera(browser).camera_from_world)
+    assert psnr(render_in_page(browser, camera).astype(float), reference_picture(scene, camera)) > MIN_PSNR_DB
 
 
 class DyingServer(dict):

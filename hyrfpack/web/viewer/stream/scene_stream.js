@@ -108,7 +108,7 @@ export class SceneStream {
     if (look || gaussians) this.isOutdated = true;
     if (uploaded?.number === this.number) this.chunks[uploaded.chunk].get(uploaded.level).state = READY;
     if (faded?.number === this.number) this.endFade(this.chunks[faded.chunk]);
-    if (unusable) this.reject(this.parts[unusable.part].file, unusable.reason);
+    if (unusable) this.reject(this.parts[unusable.part].file, reasonOf({ message: unusable.reason }));
     if (again && this.scene) this.clear();
     if (look || gaussians || uploaded || faded || again) this.schedule();
   }
