@@ -27,7 +27,7 @@ from hyrfpack.splats.files import read_splats
 from hyrfpack.splats.splats import concatenate
 from tools.browser.chromium import Chromium, find
 
-NODE_MODULES = Path(__file__).parents[2] / "node" / "node_modules"
+NODE_MODULES = Path(__file__).parents[2] / "bundlers" / "node_modules"
 SIZE_PIXELS = 200
 MIN_PSNR_DB = 30  # PlayCanvas rounds colours of its work buffer, and blends in another order where depths are close
 AMPLE_BUDGET = 1_000_000
@@ -38,7 +38,7 @@ SETTLING_FRAMES = 30
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with the page, the engine and an export of three levels: 256, 64 and 16 Gaussians."""
     if not (NODE_MODULES / "playcanvas").is_dir():
-        pytest.skip("playcanvas is not installed (npm ci --prefix tests/node)")
+        pytest.skip("playcanvas is not installed (npm ci --prefix tests/bundlers)")
     folder = tmp_path_factory.mktemp("playcanvas")
     for name in ("streamed.html", "streamed.js"):
         shutil.copy(Path(__file__).with_name(name), folder)
