@@ -206,7 +206,7 @@ def test_splats_of_other_programs_are_imported_on_a_gpu(gpu, few_pictures, tmp_p
     monkeypatch.setattr("hyrfpack.imports.pack.MAX_TRIALS", 1)
     packed = []
     monkeypatch.setattr(
-        "hyrfpack.imports.run.pack", lambda prepared, *rest: packed.append(prepared) or pack(prepared, *rest)
+        "hyrfpack.imports.run.pack", lambda made, *rest, **limits: packed.append(made) or pack(made, *rest, **limits)
     )
     cameras = [camera_at(place, width=12, height=12) for place in ((0.0, -3, 0.5), (0.0, 3, 0.5), (3.0, 0, -0.5))]
     quick = ImportConfig(test_views=2, psnr=12)
