@@ -25,19 +25,19 @@ from tools.safety.make_golden import GOLDEN_PARTS_SCENE_FOLDER
 QUIET = RunContext(progress=None)
 FILE_GAUSSIANS = 140  # two of the four chunks at the finest level, so that levels have several files
 # Written from the specification, developer.playcanvas.com/user-manual/gaussian-splatting/formats/streamed-sog.
-COUNT = {"type": "integer", "minimum": 0}
-CORNER = {"type": "array", "items": {"type": "number"}, "minItems": 3, "maxItems": 3}
-RUN = {
+COUNT_SCHEMA = {"type": "integer", "minimum": 0}
+CORNER_SCHEMA = {"type": "array", "items": {"type": "number"}, "minItems": 3, "maxItems": 3}
+LEVEL_SCHEMA = {
     "type": "object",
-    "properties": {"file": COUNT, "offset": COUNT, "count": COUNT},
+    "properties": {"file": COUNT_SCHEMA, "offset": COUNT_SCHEMA, "count": COUNT_SCHEMA},
     "required": ["file", "offset", "count"],
 }
-SCHEMA = {
+INDEX_SCHEMA = {
     "type": "object",
     "properties": {
         "version": {"const": 1},
-        "count": COUNT,
-        "counts": {"type": "array", "items": COUNT},
+        "count": COUNT_SCHEMA,
+        "counts": {"type": "array", "items": COUNT_SCHEMA},
         "lodLevels": {"type": "integer", "minimum": 1},
         "lodErrors": {"const": True},
         "environment": {"type": "string"},
@@ -51,11 +51,11 @@ SCHEMA = {
             "properties": {
                 "bound": {
                     "type": "object",
-                    "properties": {"min": CORNER, "max": CORNER},
+                    "properties": {"min": CORNER_SCHEMA, "max": CORNER_SCHEMA},
                     "required": ["min", "max"],
                 },
                 "children": {"type": "array", "items": {"$ref": "#/$defs/node"}, "minItems": 2, "maxItems": 2},
-                "lods": {"type": "object", "properties": {str(level): RUN for level in range(8)}},
+                "lods": {"type": "object", "properties": {str(level): LEVEL_SCHEMA for level in range(8)}},
                 "errors": {"type": "array", "items": {"type": "number", "minimum": 0}},
             },
             "required": ["bound"],
@@ -107,7 +107,7 @@ def ellipsoid_points(splats: Splats) -> np.ndarray:
 
 def test_the_index_follows_the_specification(exported):
     _, _, index, _ = exported
-    assert matches(index, SCHEMA)
+    assert matches(index, INDEX_SCHEMA)
     assert all(("children" in node) != ("lods" in node) for node in nodes(index["tree"]))
     assert len(index["counts"]) == index["lodLevels"] == 3 and index["count"] == sum(index["counts"])
 

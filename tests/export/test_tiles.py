@@ -27,24 +27,24 @@ from hyrfpack.splats.splats import Splats
 from tools.safety.make_golden import GOLDEN_PARTS_SCENE_FOLDER
 
 QUIET = RunContext(progress=None)
-CONTENTS = ("gltf", "spz")
+CONTENT_KINDS = ("gltf", "spz")
 Y_TO_Z_UP = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # 3D Tiles 1.1, section 6.7.1.6.2
 # The parts of the JSON schema of 3D Tiles 1.1 that concern our tilesets.
-NUMBER = {"type": "number"}
-TEXTS = {"type": "array", "items": {"type": "string"}, "minItems": 1}
-SCHEMA = {
+NUMBER_SCHEMA = {"type": "number"}
+TEXTS_SCHEMA = {"type": "array", "items": {"type": "string"}, "minItems": 1}
+TILESET_SCHEMA = {
     "type": "object",
     "properties": {
         "asset": {"type": "object", "properties": {"version": {"const": "1.1"}}, "required": ["version"]},
         "geometricError": {"type": "number", "minimum": 0},
         "root": {"$ref": "#/$defs/tile"},
-        "extensionsUsed": TEXTS,
+        "extensionsUsed": TEXTS_SCHEMA,
         "extensions": {
             "type": "object",
             "properties": {
                 "3DTILES_content_gltf": {
                     "type": "object",
-                    "properties": {"extensionsUsed": TEXTS, "extensionsRequired": TEXTS},
+                    "properties": {"extensionsUsed": TEXTS_SCHEMA, "extensionsRequired": TEXTS_SCHEMA},
                 }
             },
         },
@@ -56,12 +56,12 @@ SCHEMA = {
             "properties": {
                 "boundingVolume": {
                     "type": "object",
-                    "properties": {"box": {"type": "array", "items": NUMBER, "minItems": 12, "maxItems": 12}},
+                    "properties": {"box": {"type": "array", "items": NUMBER_SCHEMA, "minItems": 12, "maxItems": 12}},
                     "required": ["box"],
                 },
                 "geometricError": {"type": "number", "minimum": 0},
                 "refine": {"type": "string", "pattern": "^(ADD|REPLACE)$"},
-                "transform": {"type": "array", "items": NUMBER, "minItems": 16, "maxItems": 16},
+                "transform": {"type": "array", "items": NUMBER_SCHEMA, "minItems": 16, "maxItems": 16},
                 "content": {"type": "object", "properties": {"uri": {"type": "string"}}, "required": ["uri"]},
                 "children": {"type": "array", "items": {"$ref": "#/$defs/tile"}, "minItems": 1},
             },
@@ -75,7 +75,7 @@ SCHEMA = {
 def exported(scene, tmp_path_factory) -> dict:
     """Return by kind of content the folder, the report and the tileset."""
     found = {}
-    for content in CONTENTS:
+    for content in CONTENT_KINDS:
         folder = tmp_path_factory.mktemp("tiles") / content
         config = hyrfpack.ExportConfig(tiles_3d=True, tile_content=content, degree=1)
         report = hyrfpack.export_model(scene, folder, config, context=QUIET)
@@ -116,10 +116,10 @@ def splats_in_tile(folder: Path, tile: dict) -> Splats:
     return gltf.decode(data, "content", upright=True).rotated(Y_TO_Z_UP)
 
 
-@pytest.mark.parametrize("content", CONTENTS)
+@pytest.mark.parametrize("content", CONTENT_KINDS)
 def test_the_tileset_follows_the_specification(content, exported):
     folder, report, tileset = exported[content]
-    assert matches(tileset, SCHEMA)
+    assert matches(tileset, TILESET_SCHEMA)
     named = {"tileset.json", *(tile["content"]["uri"] for tile in tiles(tileset["root"]) if "content" in tile)}
     found = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
     assert found == named and len(named) == 1 + 4 * 3 + 1
@@ -127,7 +127,7 @@ def test_the_tileset_follows_the_specification(content, exported):
     assert "refine" in tileset["root"] and tileset["geometricError"] >= tileset["root"]["geometricError"]
 
 
-@pytest.mark.parametrize("content", CONTENTS)
+@pytest.mark.parametrize("content", CONTENT_KINDS)
 def test_the_tileset_names_the_extensions_of_its_contents(content, exported):
     folder, _, tileset = exported[content]
     stated = tileset["extensions"]["3DTILES_content_gltf"]
@@ -185,7 +185,7 @@ def test_the_root_adds_its_children_to_the_background(exported):
     assert all("content" in tile or tile["refine"] == "ADD" for tile in tiles(root))
 
 
-@pytest.mark.parametrize("content", CONTENTS)
+@pytest.mark.parametrize("content", CONTENT_KINDS)
 def test_contents_stand_upright_at_their_place(content, exported, scene):
     folder, _, tileset = exported[content]
     opened = hyrfpack.SceneFolder(scene)
@@ -212,7 +212,7 @@ def test_contents_stand_upright_at_their_place(content, exported, scene):
     np.testing.assert_allclose(np.linalg.det(matrix), 1)
 
 
-@pytest.mark.parametrize("content", CONTENTS)
+@pytest.mark.parametrize("content", CONTENT_KINDS)
 def test_the_report_measures_the_finest_level_as_written(content, exported):
     report = exported[content][1]
     assert report.views > 0 and abs(report.psnr - report.psnr_baked) < {"gltf": 0.01, "spz": 1}[content]
@@ -233,20 +233,20 @@ def make_chunk(*errors: tuple[float, ...]) -> Chunk:
     return Chunk((0, 0, 0), (2, 4, 4), tuple(ChunkLevel("a.hyrf", 1, "00000000", 1, each) for each in errors))
 
 
-RADII = (16.0, 64.0, 256.0)
+RADII_PIXELS = (16.0, 64.0, 256.0)
 
 
 def test_the_geometric_error_of_a_constant_error_is_proportional_to_its_root():
-    errors = geometric_errors(make_chunk((0, 0, 0), (0.01,) * 3, (0.04,) * 3), RADII)
+    errors = geometric_errors(make_chunk((0, 0, 0), (0.01,) * 3, (0.04,) * 3), RADII_PIXELS)
     np.testing.assert_allclose(errors, [0, 4 * 3 * 0.1, 4 * 3 * 0.2])  # the radius is 3
 
 
 @pytest.mark.parametrize("errors", [(0.09, 0.1, 0.2), (0.0, 0.004, 0.001), (0.0002, 0.0001, 0.0001), (0.0, 0.0, 0.001)])
 def test_a_client_switches_where_the_predicted_error_is_that_of_the_wrong_disc(errors):
     chunk = make_chunk((0, 0, 0), errors)
-    error = geometric_errors(chunk, RADII)[1]
+    error = geometric_errors(chunk, RADII_PIXELS)[1]
     frame = {"center": [0, 0, 0], "scale": 1, "half_sides": [1, 1, 1]}
-    manifest = Manifest(1, (ScenePart("a.hyrf", 1, "00000000"),), (chunk,), RADII, frame, False, (0, 0, 0))
+    manifest = Manifest(1, (ScenePart("a.hyrf", 1, "00000000"),), (chunk,), RADII_PIXELS, frame, False, (0, 0, 0))
     focal = 40_000.0  # so long that the chunk is small in the picture even where it is close
     distance = error * focal / 16  # a screen-space error of 16 pixels
     center = np.array(chunk.center)
@@ -256,7 +256,7 @@ def test_a_client_switches_where_the_predicted_error_is_that_of_the_wrong_disc(e
 
 
 def test_a_level_without_measured_error_replaces_the_finest_one_at_any_distance():
-    assert geometric_errors(make_chunk((0, 0, 0), (0, 0, 0)), RADII) == [0, 0]
+    assert geometric_errors(make_chunk((0, 0, 0), (0, 0, 0)), RADII_PIXELS) == [0, 0]
 
 
 def test_one_export_writes_one_kind_of_folder(scene, tmp_path):

@@ -32,7 +32,7 @@ from tools.safety.make_golden import GOLDEN_FOLDER, GOLDEN_MERGED_FILE, GOLDEN_P
 
 COMPACT, RAW = (GOLDEN_FOLDER / "trained" / name for name in ("demo_compact.hyrf", "demo.hyrf"))
 QUIET = RunContext(progress=None)
-SCHEMA = json.loads(Path(scene_manifest.__file__).with_name("scene.schema.json").read_text())
+MANIFEST_SCHEMA = json.loads(Path(scene_manifest.__file__).with_name("scene.schema.json").read_text())
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +95,7 @@ def test_the_manifest_has_a_shared_file_for_each_part_and_matches_the_schema(fol
     assert [chunk["part"] for chunk in values["chunks"]] == [0, 0, 1, 1]
     listed = [*values["parts"], *(level for chunk in values["chunks"] for level in chunk["levels"])]
     assert {item["file"] for item in listed} == {path.name for path in folder.glob("*.hyrf")}
-    assert matches(values, SCHEMA)
+    assert matches(values, MANIFEST_SCHEMA)
 
 
 def test_the_finest_levels_are_drawn_as_the_merged_file(folder, merged_file, cameras):
