@@ -27,6 +27,7 @@ from hyrfpack.splats.files import read_splats
 from hyrfpack.splats.splats import concatenate
 from tools.browser.chromium import Chromium, find
 
+pytestmark = pytest.mark.acceptance
 NODE_MODULES = Path(__file__).parents[2] / "bundlers" / "node_modules"
 SIZE_PIXELS = 200
 MIN_PSNR_DB = 30  # PlayCanvas rounds colours of its work buffer, and blends in another order where depths are close
