@@ -167,7 +167,7 @@ def find_target_format(source: str | os.PathLike[str], target: str | os.PathLike
     name = Path(target).name.lower()
     if name.endswith(".hyrf"):
         raise HyrfError(
-            f"{target}: splats cannot be converted to a model, which has to learn from them",
+            f"{target}: splats are imported as a model, not converted",
             fix=f"run 'hyrfpack import {source} -o {target}'",
         )
     if name.endswith(".compressed.ply"):

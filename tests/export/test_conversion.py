@@ -111,7 +111,7 @@ def test_progress_is_reported_in_order(tmp_path):
     [
         ("model.hyrf", "a.ply", "this is a model, not splats; write it with 'hyrfpack export model.hyrf -o a.ply'"),
         ("photo.png", "a.ply", "this is not a file of splats"),
-        ("a.ply", "b.hyrf", "to a model, which has to learn from them; run 'hyrfpack import a.ply -o b.hyrf'"),
+        ("a.ply", "b.hyrf", "are imported as a model, not converted; run 'hyrfpack import a.ply -o b.hyrf'"),
         ("a.ply", "b.compressed.ply", "compressed PLY is read, not written"),
         ("a.ply", "b.txt", "the file extension does not name a known format"),
         ("missing.ply", "b.spz", "cannot be read"),
