@@ -17,8 +17,8 @@ from hyrfpack.lod import split, split_model
 from hyrfpack.model import Frame
 from hyrfpack.rotations import quaternion_from_matrix
 
-CENTER = (5.0, -2.0, 1.0)
-SCALE = 2.0
+SCENE_CENTER = (5.0, -2.0, 1.0)
+SCENE_SCALE = 2.0
 
 
 def write_level_scene(folder: Path) -> Path:
@@ -27,10 +27,10 @@ def write_level_scene(folder: Path) -> Path:
     The model, model.hyrf, has 256 Gaussians. The scene has four chunks of three levels.
     """
     turn = quaternion_from_matrix(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]))
-    frame = Frame(CENTER, SCALE, (1.0, 1.0, 1.0), tuple(turn.tolist()))
+    frame = Frame(SCENE_CENTER, SCENE_SCALE, (1.0, 1.0, 1.0), tuple(turn.tolist()))
     positions = np.random.default_rng(0).uniform(-0.6, 0.6, (256, 3))
     model = small_model(positions, frame=frame, fields=2.0, background=True)
-    cameras = shift_cameras(ring(4, radius=3 * SCALE, elevation=SCALE), CENTER)
+    cameras = shift_cameras(ring(4, radius=3 * SCENE_SCALE, elevation=SCENE_SCALE), SCENE_CENTER)
     kept = {"cameras": provenance_cameras(cameras), "viewpoint": Viewpoint.from_cameras(cameras).to_json()}
     save_model(model, folder / "model.hyrf", provenance=kept)
     with pytest.MonkeyPatch.context() as patch:

@@ -113,11 +113,11 @@ def _choose_cameras(
     return measured, sample_views(measured, config.test_views, config.seed)[1], test
 
 
-def _indices_without_faint(light: np.ndarray, share: float = FAINT_LIGHT_SHARE) -> np.ndarray:
+def _indices_without_faint(light: np.ndarray) -> np.ndarray:
     """Return ascending indices (n,) of all Gaussians but the faintest, given the light (N,) that each sends.
 
-    The faintest are those that together send `share` of all light, or none.
+    The faintest are those that together send FAINT_LIGHT_SHARE of all light, or none.
     """
     order = np.argsort(light, kind="stable")
     sums = np.cumsum(light[order].astype(np.float64))
-    return np.sort(order[(sums > share * sums[-1]) & (light[order] > 0)]) if len(order) else order
+    return np.sort(order[(sums > FAINT_LIGHT_SHARE * sums[-1]) & (light[order] > 0)]) if len(order) else order

@@ -22,7 +22,7 @@ from hyrfpack.splats.formats import sog
 from hyrfpack.splats.splats import Splats
 from tools.safety.make_golden import GOLDEN_PARTS_SCENE_FOLDER
 
-QUIET = RunContext(progress=None)
+QUIET_CONTEXT = RunContext(progress=None)
 FILE_GAUSSIANS = 140  # two of the four chunks at the finest level, so that levels have several files
 # Written from the specification, developer.playcanvas.com/user-manual/gaussian-splatting/formats/streamed-sog.
 COUNT_SCHEMA = {"type": "integer", "minimum": 0}
@@ -66,7 +66,7 @@ INDEX_SCHEMA = {
 
 def export(scene, target, **options):
     config = hyrfpack.ExportConfig(streamed_sog=True, **{"degree": 1, **options})
-    return hyrfpack.export_model(scene, target, config, context=QUIET)
+    return hyrfpack.export_model(scene, target, config, context=QUIET_CONTEXT)
 
 
 @pytest.fixture(scope="module")
@@ -251,7 +251,7 @@ def test_without_overwrite_an_existing_export_stays(scene, tmp_path, monkeypatch
     monkeypatch.setattr(hyrfpack.export.pipeline, "bake_levels", None)  # refused before any work
     config = hyrfpack.ExportConfig(streamed_sog=True)
     with pytest.raises(HyrfError, match="lod-meta.json of the files to be written is there"):
-        hyrfpack.export_model(scene, tmp_path / "out", config, overwrite=False, context=QUIET)
+        hyrfpack.export_model(scene, tmp_path / "out", config, overwrite=False, context=QUIET_CONTEXT)
     assert (tmp_path / "out" / "lod-meta.json").read_text() == "mine"
 
 

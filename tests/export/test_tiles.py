@@ -26,7 +26,7 @@ from hyrfpack.splats.formats import gltf
 from hyrfpack.splats.splats import Splats
 from tools.safety.make_golden import GOLDEN_PARTS_SCENE_FOLDER
 
-QUIET = RunContext(progress=None)
+QUIET_CONTEXT = RunContext(progress=None)
 CONTENT_KINDS = ("gltf", "spz")
 Y_TO_Z_UP = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # 3D Tiles 1.1, section 6.7.1.6.2
 # The parts of the JSON schema of 3D Tiles 1.1 that concern our tilesets.
@@ -78,7 +78,7 @@ def exported(scene, tmp_path_factory) -> dict:
     for content in CONTENT_KINDS:
         folder = tmp_path_factory.mktemp("tiles") / content
         config = hyrfpack.ExportConfig(tiles_3d=True, tile_content=content, degree=1)
-        report = hyrfpack.export_model(scene, folder, config, context=QUIET)
+        report = hyrfpack.export_model(scene, folder, config, context=QUIET_CONTEXT)
         found[content] = folder, report, json.loads((folder / "tileset.json").read_text())
     return found
 
@@ -220,7 +220,7 @@ def test_the_report_measures_the_finest_level_as_written(content, exported):
 
 def test_a_scene_of_parts_far_from_the_origin_keeps_its_precision(tmp_path):
     config = hyrfpack.ExportConfig(tiles_3d=True, tile_content="gltf", degree=0, background=False)
-    report = hyrfpack.export_model(GOLDEN_PARTS_SCENE_FOLDER, tmp_path / "out", config, context=QUIET)
+    report = hyrfpack.export_model(GOLDEN_PARTS_SCENE_FOLDER, tmp_path / "out", config, context=QUIET_CONTEXT)
     assert report.chunks == 3 and report.psnr == pytest.approx(report.psnr_baked, abs=0.01)
     root = json.loads((tmp_path / "out" / "tileset.json").read_text())["root"]
     assert (

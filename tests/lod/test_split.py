@@ -32,8 +32,8 @@ from hyrfpack.render import render_view
 from tools.safety import minimal_reader
 from tools.safety.make_golden import GOLDEN_FOLDER, GOLDEN_SCENE_FOLDER, GOLDEN_SCENE_SOURCE
 
-COMPACT, RAW = (GOLDEN_FOLDER / "trained" / name for name in ("demo_compact.hyrf", "demo.hyrf"))
-QUIET = RunContext(progress=None)
+COMPACT_FILE, RAW_FILE = (GOLDEN_FOLDER / "trained" / name for name in ("demo_compact.hyrf", "demo.hyrf"))
+QUIET_CONTEXT = RunContext(progress=None)
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +43,9 @@ def folder(tmp_path_factory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(split, "REFIT_CAMERAS", 1)
         patch.setattr(split, "MEASURED_VIEWS", 2)
-        split_model(COMPACT, path, SplitConfig(chunk_gaussians=400, levels=2, refit_steps=3), context=QUIET)
+        split_model(
+            COMPACT_FILE, path, SplitConfig(chunk_gaussians=400, levels=2, refit_steps=3), context=QUIET_CONTEXT
+        )
     return path
 
 
@@ -54,7 +56,7 @@ def copy(folder, tmp_path) -> Path:
 
 @pytest.fixture(scope="module")
 def cameras():
-    return Capture(describe_file(COMPACT)).cameras[:3]
+    return Capture(describe_file(COMPACT_FILE)).cameras[:3]
 
 
 def read_with_minimal_reader(path: Path):
@@ -88,7 +90,7 @@ def test_the_manifest_lists_every_file_as_it_is(folder):
 
 
 def test_the_finest_levels_are_the_model(folder, cameras):
-    model, scene = load_model(COMPACT), load_model(folder)
+    model, scene = load_model(COMPACT_FILE), load_model(folder)
 
     def sort(positions):
         return positions[np.lexsort(positions.T)]
@@ -101,10 +103,11 @@ def test_the_finest_levels_are_the_model(folder, cameras):
 
 
 def test_the_finest_levels_of_a_raw_file_have_its_very_numbers(tmp_path):
-    split_model(RAW, tmp_path / "scene", SplitConfig(chunk_gaussians=500, levels=1), context=QUIET)
+    split_model(RAW_FILE, tmp_path / "scene", SplitConfig(chunk_gaussians=500, levels=1), context=QUIET_CONTEXT)
 
     rows = [
-        np.concatenate(list(to_arrays(load_model(path)).values())[:4], axis=1) for path in (RAW, tmp_path / "scene")
+        np.concatenate(list(to_arrays(load_model(path)).values())[:4], axis=1)
+        for path in (RAW_FILE, tmp_path / "scene")
     ]
     assert Counter(row.tobytes() for row in rows[0]) == Counter(row.tobytes() for row in rows[1])
 
@@ -116,7 +119,7 @@ def test_chunks_keep_residuals_exactly_and_merged_gaussians_have_their_own(tmp_p
         source = tmp_path / "raw.hyrf"
         save_model(load_model(GOLDEN_FOLDER / "v1.6_compact_residuals.hyrf"), source)
     monkeypatch.setattr(split, "MEASURED_VIEWS", 1)
-    split_model(source, tmp_path / "scene", SplitConfig(levels=2, refit_steps=0), context=QUIET)
+    split_model(source, tmp_path / "scene", SplitConfig(levels=2, refit_steps=0), context=QUIET_CONTEXT)
 
     exact = ("positions", "shape_residuals", "color_residuals")
     rows = [
@@ -137,7 +140,7 @@ def test_a_chunk_opens_by_itself_as_the_format_page_says(folder):
     for group, values in to_arrays(load_model(path)).items():
         np.testing.assert_array_equal(values, groups[group], err_msg=group)
     assert facts["version"] == "1.5"
-    assert facts["provenance"] == metadata["provenance"] == describe_file(COMPACT)["provenance"]
+    assert facts["provenance"] == metadata["provenance"] == describe_file(COMPACT_FILE)["provenance"]
 
 
 def test_chunks_do_not_repeat_the_fields(folder):
@@ -226,7 +229,7 @@ def test_a_manifest_that_lies_about_gaussians_is_refused(copy):
 
 
 def test_a_chunk_of_another_scene_is_refused(copy, tmp_path):
-    split_model(RAW, tmp_path / "other", SplitConfig(chunk_gaussians=400, levels=1), context=QUIET)
+    split_model(RAW_FILE, tmp_path / "other", SplitConfig(chunk_gaussians=400, levels=1), context=QUIET_CONTEXT)
     data = (tmp_path / "other" / "shared.hyrf").read_bytes()
     (copy / "shared.hyrf").write_bytes(data)
     edit_manifest(
@@ -277,10 +280,10 @@ def test_an_existing_scene_is_replaced_only_with_permission_and_completely(copy)
     before = {path.name: path.read_bytes() for path in copy.iterdir()}
     fewer = SplitConfig(chunk_gaussians=800, levels=1)
     with pytest.raises(HyrfError, match="overwrite"):
-        split_model(COMPACT, copy, fewer, overwrite=False, context=QUIET)
+        split_model(COMPACT_FILE, copy, fewer, overwrite=False, context=QUIET_CONTEXT)
     assert {path.name: path.read_bytes() for path in copy.iterdir()} == before
 
-    split_model(COMPACT, copy, fewer, context=QUIET)
+    split_model(COMPACT_FILE, copy, fewer, context=QUIET_CONTEXT)
 
     assert sorted(path.name for path in copy.iterdir()) == [
         "chunk-0000-0.hyrf",
@@ -301,7 +304,7 @@ def test_a_failure_leaves_no_half_written_folder(tmp_path, monkeypatch):
 
     monkeypatch.setattr(split, "write_atomic", fail_third)
     with pytest.raises(HyrfError, match="disk is full"):
-        split_model(COMPACT, tmp_path / "scene", SplitConfig(chunk_gaussians=400, levels=1), context=QUIET)
+        split_model(COMPACT_FILE, tmp_path / "scene", SplitConfig(chunk_gaussians=400, levels=1), context=QUIET_CONTEXT)
 
     assert len(written) == 3 and not (tmp_path / "scene").exists()
 
@@ -340,7 +343,7 @@ def test_commands_read_a_scene_like_a_file(folder, tmp_path):
 
 
 def test_budgets_are_for_scenes_and_exclude_each_other(folder, tmp_path):
-    assert "no levels of detail" in refused("render", COMPACT, "-o", tmp_path / "a", "--bytes", "1MB")
+    assert "no levels of detail" in refused("render", COMPACT_FILE, "-o", tmp_path / "a", "--bytes", "1MB")
     assert "give one of them" in refused("render", folder, "-o", tmp_path / "a", "--bytes", "1MB", "--gaussians", 5)
     assert not (tmp_path / "a").exists()
 

@@ -30,14 +30,14 @@ from hyrfpack.render import render_view
 from tools.safety import minimal_reader
 from tools.safety.make_golden import GOLDEN_FOLDER, GOLDEN_MERGED_FILE, GOLDEN_PARTS_SCENE_FOLDER
 
-COMPACT, RAW = (GOLDEN_FOLDER / "trained" / name for name in ("demo_compact.hyrf", "demo.hyrf"))
-QUIET = RunContext(progress=None)
+COMPACT_FILE, RAW_FILE = (GOLDEN_FOLDER / "trained" / name for name in ("demo_compact.hyrf", "demo.hyrf"))
+QUIET_CONTEXT = RunContext(progress=None)
 MANIFEST_SCHEMA = json.loads(Path(scene_manifest.__file__).with_name("scene.schema.json").read_text())
 
 
 @pytest.fixture(scope="module")
 def cameras():
-    return Capture(describe_file(RAW)).cameras[:3]
+    return Capture(describe_file(RAW_FILE)).cameras[:3]
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,7 @@ def merged_file(tmp_path_factory, cameras) -> Path:
     """Return a merged file of two raw parts, which overlap, have frames of their own and different exposures."""
     folder = tmp_path_factory.mktemp("merged")
     for name, gain in (("first", 0.8), ("second", 1.6)):
-        model, provenance = load_with_provenance(RAW)
+        model, provenance = load_with_provenance(RAW_FILE)
         model.exposure = map_with_gains(cameras, model.config.frame, np.linspace(gain, gain + 0.3, 3)[:, None])
         save_model(model, folder / f"{name}.hyrf", provenance=provenance)
     moves = {"second": [Translate((0.3, 0.1, 0.0)), Rotate((0.0, 0.0, 1.0), 40.0)]}
@@ -60,7 +60,7 @@ def folder(merged_file, tmp_path_factory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(split, "REFIT_CAMERAS", 1)
         patch.setattr(split, "MEASURED_VIEWS", 1)
-        split_model(merged_file, path, SplitConfig(chunk_gaussians=800, levels=2, refit_steps=1), context=QUIET)
+        split_model(merged_file, path, SplitConfig(chunk_gaussians=800, levels=2, refit_steps=1), context=QUIET_CONTEXT)
     return path
 
 
@@ -204,7 +204,7 @@ def test_a_chunk_that_refers_to_the_shared_file_of_another_part_is_refused(copy)
 
 
 def test_a_shared_file_with_gaussians_is_refused(copy):
-    values, data = read_manifest(copy), RAW.read_bytes()
+    values, data = read_manifest(copy), RAW_FILE.read_bytes()
     values["parts"][1] |= {"bytes": len(data), "crc32": f"{zlib.crc32(data):08x}"}
     (copy / "shared-01.hyrf").write_bytes(data)
     write_manifest(copy, values)
@@ -214,13 +214,13 @@ def test_a_shared_file_with_gaussians_is_refused(copy):
 
 
 def test_a_merged_file_of_one_part_makes_a_folder_of_one_model(tmp_path):
-    merge_models([COMPACT], tmp_path / "one.hyrf")
+    merge_models([COMPACT_FILE], tmp_path / "one.hyrf")
 
-    split_model(tmp_path / "one.hyrf", tmp_path / "scene", SplitConfig(levels=1), context=QUIET)
+    split_model(tmp_path / "one.hyrf", tmp_path / "scene", SplitConfig(levels=1), context=QUIET_CONTEXT)
 
     values = read_manifest(tmp_path / "scene")
     assert values["version"] == "1.0" and values["shared"]["file"] == "shared.hyrf"
-    assert len(load_model(tmp_path / "scene")) == len(load_model(COMPACT))
+    assert len(load_model(tmp_path / "scene")) == len(load_model(COMPACT_FILE))
 
 
 def test_the_golden_scene_of_several_parts_is_read_as_the_file_that_it_was_made_of():

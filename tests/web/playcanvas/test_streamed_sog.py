@@ -12,7 +12,7 @@ from urllib.parse import quote
 
 import numpy as np
 import pytest
-from level_scenes import CENTER, SCALE, write_level_scene
+from level_scenes import SCENE_CENTER, SCENE_SCALE, write_level_scene
 from PIL import Image
 from scenes import camera_at
 from web.pages import camera_json, psnr, wait_until
@@ -61,8 +61,8 @@ def engine() -> Iterator[Chromium]:
 
 
 def make_camera() -> Camera:
-    position = np.array(CENTER) + SCALE * np.array((1.5, 1.2, 0.9))
-    return camera_at(position, target=CENTER, width=SIZE_PIXELS, height=SIZE_PIXELS)
+    position = np.array(SCENE_CENTER) + SCENE_SCALE * np.array((1.5, 1.2, 0.9))
+    return camera_at(position, target=SCENE_CENTER, width=SIZE_PIXELS, height=SIZE_PIXELS)
 
 
 def stream(engine: Chromium, folder: Path, budget: int, expected_count: int) -> np.ndarray:
@@ -87,7 +87,7 @@ def draw_levels(folder: Path, level: int) -> np.ndarray:
     index = json.loads((folder / "streamed" / "lod-meta.json").read_text())
     names = [name for name in index["filenames"] if name.startswith(f"{level}_")]
     parts = [read_splats((folder / "streamed" / name).parent) for name in (*names, index["environment"])]
-    drawable = Drawable.from_splats(concatenate(parts), Frame(CENTER, SCALE, (1.0, 1.0, 1.0)))
+    drawable = Drawable.from_splats(concatenate(parts), Frame(SCENE_CENTER, SCENE_SCALE, (1.0, 1.0, 1.0)))
     return 255 * draw(drawable, make_camera()).rgb.clamp(0, 1).numpy()
 
 
