@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import base64
+import itertools
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +33,21 @@ PARTS_FOLDER = SCENE_FOLDER.with_name("parts_scene")
 TRAINED_FILE = SCENE_FOLDER.parent / "trained" / "demo_compact.hyrf"
 SHARED_PATH, MANIFEST_PATH = "/scene/shared.hyrf", "/scene/scene.json"
 MIN_PSNR_DB = 45  # WebGL evaluates the fields with smaller numbers
+MIN_NEIGHBOUR_PSNR_DB = 30  # between two frames of a fade
+# Keeps each frame that is drawn. So long ago was the frame before that each step of a fade is the largest one.
+KEEP_FRAMES_JS = """(() => {
+  const { renderer } = hyrfpack.player, draw = renderer.draw.bind(renderer);
+  window.keptFrames = [];
+  renderer.draw = (...values) => {
+    draw(...values);
+    const { gl, content, frame: { target, size: [width, height] } } = renderer;
+    const rgba = new Uint8Array(4 * width * height);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, target);
+    gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, rgba);
+    keptFrames.push(btoa(Array.from(rgba, (byte) => String.fromCharCode(byte)).join("")));
+    content.fadedAt = performance.now() - 1000;
+  };
+})()"""
 
 
 @pytest.fixture
@@ -175,6 +193,31 @@ def test_the_budget_decides_which_levels_are_drawn(browser: Browser, host: Site,
     chosen = hyrfpack.select_levels(levels_folder.manifest, window_camera(browser), gaussians=budget)
     assert coarsest < state["gaussians"] == chosen.gaussians <= budget
     assert not state["problem"]
+    sizes = {f"/levels/{file.name}": file.stat().st_size for file in levels_folder.path.iterdir()}
+    requested = {path for path, _ in host.requests}
+    read, total = sum(size for path, size in sizes.items() if path in requested), sum(sizes.values())
+    drawn, loaded = (browser.evaluate(f"document.getElementById('{name}').textContent") for name in ("count", "loaded"))
+    assert drawn == f"{chosen.gaussians:,} of {finest:,} Gaussians"
+    assert re.fullmatch(rf"{read / 1e6:.1f} of {total / 1e6:.1f} MB loaded, (low|medium|high) detail here", loaded)
+
+
+@pytest.mark.acceptance
+def test_neighbouring_frames_of_a_switch_of_levels_are_alike(browser: Browser, host: Site, levels_folder):
+    coarsest, finest = (count_gaussians(levels_folder, level) for level in (-1, 0))
+    serve_levels(host, levels_folder)
+    open_levels(browser, host, finest)
+    wait_until_complete(browser)
+    browser.evaluate("hyrfpack.player.settled.then(() => true)")
+    browser.evaluate(KEEP_FRAMES_JS)
+    browser.evaluate("hyrfpack.player.redraw()")
+    wait_until(browser, "keptFrames.length > 0")
+    browser.evaluate(f"hyrfpack.player.loader.post({{ gaussians: {coarsest} }})")
+    wait_until(browser, f"hyrfpack.player.loader.state.gaussians === {coarsest}")
+    wait_until_complete(browser)
+    kept = [np.frombuffer(base64.b64decode(frame), np.uint8) for frame in browser.evaluate("keptFrames")]
+    frames = [frame.reshape(-1, 4)[:, :3].astype(float) for frame in kept]
+    assert psnr(frames[0], frames[-1]) < MIN_NEIGHBOUR_PSNR_DB - 3
+    assert min(psnr(first, second) for first, second in itertools.pairwise(frames)) > MIN_NEIGHBOUR_PSNR_DB
 
 
 @pytest.mark.acceptance

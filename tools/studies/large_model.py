@@ -24,7 +24,7 @@ WINDOW_SIZE = (390, 844)
 COUNT_TEXTURES_SCRIPT = """
   const proto = WebGL2RenderingContext.prototype, sizes = new Map(), bound = new Map();
   const formats = { RGBA32UI: 16, RGBA32F: 16, RG32UI: 8, RG32F: 8, RGBA16F: 8, R32UI: 4, RGBA8: 4, RGB10_A2: 4 };
-  const bytes = new Map(Object.entries({ ...formats, R8: 1 }).map(([name, size]) => [proto[name], size]));
+  const bytes = new Map(Object.entries({ ...formats, R32F: 4, R8: 1 }).map(([name, size]) => [proto[name], size]));
   const wrap = (name, before) => {
     const call = proto[name];
     proto[name] = function (...values) { before(...values); return call.apply(this, values); };

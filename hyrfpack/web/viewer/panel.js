@@ -30,6 +30,7 @@ export class Panel {
       element("speed").textContent = `${Math.round(1000 / detail)} fps`;
     });
     player.addEventListener("exposure", () => this.showExposure());
+    player.addEventListener("streamed", () => this.showLoaded());
     this.wake();
   }
 
@@ -38,6 +39,15 @@ export class Panel {
     element("title").textContent = element("title").title = document.title = title;
     element("count").textContent = COUNT_TEXTS[kind](count.toLocaleString("en"));
     element("view").setAttribute("aria-label", `${title}, a 3D scene`);
+    this.showLoaded();
+  }
+
+  // Shows what is loaded of a scene folder.
+  showLoaded() {
+    const { streaming, loader, scene } = this.player, state = loader?.state;
+    element("loaded").hidden = !state;
+    if (!state) return;
+    [element("count").textContent, element("loaded").textContent] = streaming.describeLoaded(state, scene.count);
   }
 
   // Shows the scene's name, its number of Gaussians and its cameras.

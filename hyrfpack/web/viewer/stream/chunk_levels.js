@@ -43,6 +43,11 @@ export class ChunkLevels {
     return this.levels[level];
   }
 
+  // The number of Gaussians in memory.
+  get resident() {
+    return this.levels.reduce((sum, { rows, file }) => sum + (rows.length ? file.gaussians : 0), 0);
+  }
+
   isReady(level) {
     return this.get(level)?.state === READY;
   }

@@ -17,8 +17,11 @@
 //                                            parts that were read, and the levels that are drawn at once
 //     {part: {number, part, model, place, exposure}}   a further part of the scene
 //     {chunk: {number, chunk, level, part, rows, explicit, logits, pixelSizes, balls}}   a level to upload to `rows`
-//     {swap: {number, chunk, from, to}}      fade from the rows of one level to those of another one
-//     {state: {ticket, isComplete, gaussians, bytes, problem}}   of the view with this ticket; `problem` is a sentence
+//     {swap: {number, chunk, from, to, mse}}   fade from the rows of one level to those of another one, which changes
+//                                            the picture by about `mse`
+//     {state: {ticket, isComplete, gaussians, resident, bytes, totalBytes, psnr, problem}}   of the view with this
+//                                            ticket: the Gaussians drawn and in memory, the bytes received and of the
+//                                            scene, the predicted PSNR in dB; `problem` is a sentence
 
 import { chooseLevels, predictErrors } from "../../hyrf/levels.js";
 import { parseManifest } from "../../hyrf/manifest.js";
@@ -38,6 +41,7 @@ const FIRST_PICTURE_BYTES = 200_000; // that are fetched before the first pictur
 const MEMORY_RATIO = 1.25; // memory for Gaussians in budgets, because levels that fade are there twice
 const EXTRA_ROWS_PER_CHUNK = 2; // for the coarsest level, and for rows that are not full
 const MAX_FIRST_LOSSES = 3; // of the connection before the first picture; then what is there is drawn
+const MAX_PSNR_DB = 99;
 const MIN_UPDATE_MS = 20; // between two updates, so that many events cause only one
 
 const countRows = (gaussians) => Math.max(1, Math.ceil(gaussians / ROW_WIDTH));
@@ -72,6 +76,8 @@ export class SceneStream {
     this.manifest = manifest;
     this.parts = manifest.parts.map((file, number) => new ScenePart(number, file));
     this.chunks = chunks.map((chunk, number) => new ChunkLevels(number, chunk, countRows));
+    const files = [...manifest.parts, ...chunks.flatMap(({ levels }) => levels)];
+    this.fileBytes = files.reduce((sum, file) => sum + file.bytes, 0);
     this.costs = chunks.map(({ levels }) => levels.map(({ gaussians }) => gaussians));
     this.places = new Map(); // name of a file -> [number of the chunk, level]
     chunks.forEach(({ levels }, number) => levels.forEach(({ file }, level) => this.places.set(file, [number, level])));
@@ -156,10 +162,11 @@ export class SceneStream {
   // Fades a chunk to a level.
   swap(chunk, level) {
     if (chunk.fading || level === chunk.shown) return;
-    const from = chunk.shown, { rows: to } = chunk.get(level);
+    const from = chunk.shown, { rows: to } = chunk.get(level), errors = this.errors[chunk.number];
     chunk.fading = { from, to: level };
     this.show(chunk, level);
-    this.post({ swap: { number: this.number, chunk: chunk.number, from: chunk.get(from)?.rows ?? [], to } });
+    const mse = (errors[from] ?? 0) + errors[level];
+    this.post({ swap: { number: this.number, chunk: chunk.number, from: chunk.get(from)?.rows ?? [], to, mse } });
   }
 
   endFade(chunk) {
@@ -395,7 +402,7 @@ export class SceneStream {
 
   // Sends what is loaded, if that has changed.
   postState() {
-    const { queue, chunks } = this;
+    const { queue, chunks, request: { manifest } } = this;
     const isWorking = chunks.some(({ fading, levels }) => fading || levels.some(({ state }) => state === UPLOADING));
     const isWaiting = this.isOutdated || this.decoding > 0 || (queue.wanted.length > 0 && !queue.isLost);
     const isSettled = chunks.every((chunk) => chunk.next(this.isShort) === chunk.shown);
@@ -403,12 +410,23 @@ export class SceneStream {
       ticket: this.chosenTicket,
       isComplete: !isWorking && !isWaiting && isSettled && this.timer === null,
       gaussians: chunks.reduce((sum, chunk) => sum + (chunk.get(chunk.shown)?.file.gaussians ?? 0), 0),
-      bytes: queue.bytes + this.request.manifest.length,
+      resident: chunks.reduce((sum, chunk) => sum + chunk.resident, 0),
+      bytes: queue.bytes + manifest.length,
+      totalBytes: manifest.length + this.fileBytes,
+      psnr: this.predictPsnr(),
       problem: this.describeProblems(),
     };
     const text = JSON.stringify(state);
     if (text !== this.postedState) this.post({ state });
     this.postedState = text;
+  }
+
+  // Returns the predicted PSNR (dB) of the view against the finest levels, MAX_PSNR_DB for these; 0 while a chunk has
+  // no level yet.
+  predictPsnr() {
+    const errors = this.chunks.map(({ number, shown }) => this.errors[number][shown] ?? Infinity);
+    const mse = errors.reduce((sum, error) => sum + error, 0);
+    return Math.round(Math.min(MAX_PSNR_DB, Math.max(0, -10 * Math.log10(mse))));
   }
 
   // Returns a sentence for the user, "" if all is well.

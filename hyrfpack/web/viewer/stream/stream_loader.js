@@ -1,8 +1,9 @@
 // Connects the player with the worker's SceneStream, which reads a scene folder as views need it.
 //
 // Events of the player, beside its own:
-//     "streamed"   detail: {isComplete, gaussians, bytes, problem} of the view: whether all levels that suit it are
-//                  drawn, the number of Gaussians drawn, the bytes received, and a sentence, "" for none
+//     "streamed"   detail: {isComplete, gaussians, resident, bytes, totalBytes, psnr, problem} of the view: whether all
+//                  levels that suit it are drawn, the numbers of Gaussians drawn and in memory, the bytes received and
+//                  those of the scene, the predicted PSNR in dB, and a sentence, "" for none
 
 import { Loader } from "../loader.js";
 import { StreamedFields } from "./streamed_fields.js";
@@ -14,6 +15,7 @@ const PHONE_QUERY = "(pointer: coarse) and (max-width: 600px), (pointer: coarse)
 const MANIFEST_NAME = "scene.json";
 const MAX_MANIFEST_BYTES = 2 ** 24;
 const MOVING_LOOK_MS = 150; // between two choices of levels while the view moves
+const DETAILS = [[40, "full"], [34, "high"], [28, "medium"], [0, "low"]]; // predicted PSNR in dB, and a word for it
 const ADAPTATION_MS = 1000; // between two changes of the budget
 // The budget falls where frames are slow at this part of the resolution, and rises where they are quick at full one.
 const LOW_RESOLUTION_RATIO = 0.5, SLOW_FRAME_MS = 43, QUICK_FRAME_MS = 20;
@@ -149,7 +151,16 @@ class StreamLoader extends Loader {
 }
 
 // What the player needs to open scene folders.
-export const STREAMING = { StreamLoader, isManifest };
+export const STREAMING = { StreamLoader, isManifest, describeLoaded };
+
+// Returns two texts for people on a scene of `count` Gaussians: how many are drawn, and what is loaded of its bytes and
+// its detail.
+function describeLoaded({ gaussians, bytes, totalBytes, psnr }, count) {
+  const megabytes = [bytes, totalBytes].map((size) => (size / 1e6).toFixed(1));
+  const [, detail] = DETAILS.find(([least]) => psnr >= least);
+  const drawn = `${gaussians.toLocaleString("en")} of ${count.toLocaleString("en")} Gaussians`;
+  return [drawn, `${megabytes.join(" of ")} MB loaded, ${detail} detail here`];
+}
 
 // Returns all bytes of a stream, of which a manifest may have few.
 async function gather(stream) {
