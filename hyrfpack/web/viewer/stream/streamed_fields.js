@@ -241,15 +241,15 @@ export class StreamedFields extends Fields {
   // For these methods see Fields.
 
   recolor(view, margin, ms, follows) {
-    this.look(view, true);
+    if (follows) this.look(view, true);
     super.recolor(view, margin, ms, follows);
   }
 
-  // Waits until the levels that suit the view are drawn.
+  // Waits until the levels that suit the view are drawn. Meanwhile frames may have looked at another view.
   async complete(view, margin, options) {
-    const { goOn = () => true, changed = () => {}, exact = false } = options, ticket = this.look(view);
+    const { goOn = () => true, changed = () => {}, exact = false } = options;
     const isUploaded = () => !this.arrivals.length && !this.isUploading;
-    const isDone = () => this.events.isComplete(ticket) && isUploaded() && !this.fades.size;
+    const isDone = () => this.events.isComplete(this.look(view)) && isUploaded() && !this.fades.size;
     while (!isDone()) {
       const { rows } = await this.coloured(view, margin, { goOn, report: () => {}, exact });
       if (rows) changed();
