@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, ClassVar
 from unittest import mock
 
 import pytest
@@ -97,13 +97,31 @@ class FakeGpuTensor(torch.Tensor):
         if _listeners:
             _report_work(func.overloadpacket.__name__, *_work_kinds(func, args, kwargs))
         if func is aten.copy_.default and not isinstance(args[0], FakeGpuTensor):
-            args[0].copy_(args[1].cpu_tensor)
+            if len(args) > 2 and args[2]:
+                FakeEvent.copies.append((args[0], args[1].cpu_tensor.clone()))
+            else:
+                args[0].copy_(args[1].cpu_tensor)
             return args[0]
         result = func(*tree_map(_unwrap, args), **{**tree_map(_unwrap, kwargs)})
         for name, value in zip(func._schema.arguments, args, strict=False):
             if name.alias_info is not None and name.alias_info.is_write:
                 return value if isinstance(result, torch.Tensor) else tree_map(_wrap, result)
         return tree_map(_wrap, result)
+
+
+class FakeEvent:
+    """A CUDA event. Non-blocking copies to the host arrive when the host waits for the next one."""
+
+    copies: ClassVar[list[tuple[torch.Tensor, torch.Tensor]]] = []
+
+    def record(self) -> None:
+        self.copies_before = list(FakeEvent.copies)
+        FakeEvent.copies.clear()
+
+    def synchronize(self) -> None:
+        _report_work("synchronize", "wait")
+        for target, source in self.copies_before:
+            target.copy_(source)
 
 
 # These operations only allocate memory, or answer without looking at the values.
@@ -120,10 +138,13 @@ OPERATIONS_WITHOUT_LAUNCH = (
 def _work_kinds(func: Any, args: tuple, kwargs: dict) -> Iterator[str]:
     """Yield what kinds of work one of torch's operations gives a GPU."""
     name, second = func.overloadpacket.__name__, args[1] if len(args) > 1 else None
-    if name == "_local_scalar_dense" or (name == "copy_" and not isinstance(args[0], FakeGpuTensor)):
+    if name == "_local_scalar_dense":
         yield "wait"
         return
-    if name == "copy_" and not isinstance(second, FakeGpuTensor):
+    if name == "copy_" and not isinstance(args[0], FakeGpuTensor) and not (len(args) > 2 and args[2]):
+        yield "wait"
+        return
+    if name == "copy_" and not (isinstance(args[0], FakeGpuTensor) and isinstance(second, FakeGpuTensor)):
         yield from ("copy",) if len(args) > 2 and args[2] else ("copy", "wait")
         return
     leaves = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, torch.Tensor) and leaf.ndim]
@@ -242,6 +263,7 @@ def use_fake_gpu() -> Iterator[torch.device]:
         mock.patch.object(torch.cuda, "device_count", lambda: 1),
         mock.patch.object(torch.cuda, "current_device", lambda: 0),
         mock.patch.object(torch.cuda, "set_device", lambda _: None),
+        mock.patch.object(torch.cuda, "Event", FakeEvent),
         mock.patch.object(torch.cuda, "synchronize", lambda *_: None),
         mock.patch.object(torch.cuda, "get_device_properties", lambda *_: properties),
         mock.patch.object(torch.cuda, "get_device_capability", lambda *_: (9, 0)),

@@ -43,19 +43,23 @@ class Field(nn.Module):
             return False
         return not any(bool(values.any()) for values in last)
 
-    def forward(self, coords: Tensor, extra: Tensor | None = None, *, mixed: bool = False) -> Tensor:
+    def forward(
+        self, coords: Tensor, extra: Tensor | None = None, *, mixed: bool = False, used: Tensor | None = None
+    ) -> Tensor:
         """Compute raw outputs (N, outputs) at coords (N, 3) in the unit cube.
 
         Args:
             coords: (N, 3) points in the unit cube.
             extra: (N, E) extra inputs of the decoder.
             mixed: whether to multiply in mixed precision, see `mlp`.
+            used: the number of points in use, see `hyrfpack.ops.rows`; None if all are.
         """
-        return mlp(self.features(coords, extra), list(self.weights), list(self.biases), mixed=mixed)
+        features = self.features(coords, extra, used)
+        return mlp(features, list(self.weights), list(self.biases), mixed=mixed, used=used)
 
-    def features(self, coords: Tensor, extra: Tensor | None = None) -> Tensor:
+    def features(self, coords: Tensor, extra: Tensor | None = None, used: Tensor | None = None) -> Tensor:
         """Return the inputs (N, 2 levels + E) of the decoder: hash features, then the extra inputs."""
-        features = self.grid(coords)
+        features = self.grid(coords, used)
         if extra is None:
             return features
         # Hash features are stored column by column; joining them in this layout saves a transposed copy in backward.

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 
-import torch
 from torch import Tensor, nn
-from torch.autograd.function import once_differentiable
 
 LOGIT_LIMIT = 12.0  # There the sigmoid is within 7e-6 of 0 or 1; beyond, its gradient vanishes.
 
@@ -80,26 +78,3 @@ class Gaussians(nn.Module):
 
     def __len__(self) -> int:
         return len(self.positions)
-
-
-def take_rows(values: Tensor, index: Tensor) -> Tensor:
-    """Return the rows values[index] (n, C), for index (n,) int64 without repeated rows; differentiable.
-
-    As no row is taken twice, the backward pass copies gradients instead of summing them, for which torch would sort the
-    indices.
-    """
-    return _TakeRows.apply(values, index)
-
-
-class _TakeRows(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, values: Tensor, index: Tensor) -> Tensor:
-        ctx.save_for_backward(index)
-        ctx.shape = values.shape
-        return values.index_select(0, index)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, grad: Tensor) -> tuple[Tensor, None]:
-        (index,) = ctx.saved_tensors
-        return grad.new_zeros(ctx.shape).index_copy_(0, index, grad), None

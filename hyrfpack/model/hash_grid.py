@@ -106,6 +106,9 @@ class HashGrid(nn.Module):
         """Return the number of features per point."""
         return self.config.levels * FEATURES_PER_LEVEL
 
-    def forward(self, coords: Tensor) -> Tensor:
-        """Return the features (N, levels * 2) of points (N, 3) in the unit cube."""
-        return hash_encode(coords, self.table, self.config.resolutions, self.config.log2_table_size)
+    def forward(self, coords: Tensor, used: Tensor | None = None) -> Tensor:
+        """Return the features (N, levels * 2) of points (N, 3) in the unit cube.
+
+        `used` is the number of points in use, see `hyrfpack.ops.rows`; None if all are.
+        """
+        return hash_encode(coords, self.table, self.config.resolutions, self.config.log2_table_size, used=used)

@@ -10,13 +10,14 @@ from torch import Tensor, nn
 from hyrfpack.model.config import ModelConfig
 from hyrfpack.model.exposure import ExposureMap
 from hyrfpack.model.field import Field
-from hyrfpack.model.gaussians import Gaussians, take_rows
+from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.model.residuals import add_color_residuals, add_shape_residuals
 from hyrfpack.ops import activate
 from hyrfpack.ops.background import BackgroundField, background_colors, background_grid
 from hyrfpack.ops.contraction import contract
 from hyrfpack.ops.mlp import mlp
 from hyrfpack.ops.rasterize import Gaussians3D
+from hyrfpack.ops.rows import take_rows
 from hyrfpack.ops.shade import DIRECTION_FEATURES, Shading, encode_views, shade
 from hyrfpack.ops.viewport import Viewport
 
@@ -128,9 +129,12 @@ class HybridModel(nn.Module):
         self.precision, self.exposure = other.precision, other.exposure
         self.background_spacing = other.background_spacing
 
-    def cube_coords(self, positions: Tensor) -> Tensor:
-        """Convert local positions (N, 3) to coordinates (N, 3) in the hash grids' unit cube."""
-        return contract(positions, self.config.frame.half_extent)
+    def cube_coords(self, positions: Tensor, used: Tensor | None = None) -> Tensor:
+        """Convert local positions (N, 3) to coordinates (N, 3) in the hash grids' unit cube.
+
+        `used` is the number of rows in use, see `hyrfpack.ops.rows`; None if all are.
+        """
+        return contract(positions, self.config.frame.half_extent, used=used)
 
     def scale_bounds(self, positions: Tensor) -> Tensor:
         """Return the largest scales S(p), (N, 1), at local positions (N, 3); see `scale_bounds`."""
@@ -173,42 +177,58 @@ class HybridModel(nn.Module):
             self._mixed,
         )
 
-    def decode_geometry(self, index: Tensor | None = None) -> Geometry:
-        """Return scales, rotations and opacities of the Gaussians at `index` (n,) int64, or of all."""
+    def decode_geometry(self, index: Tensor | None = None, used: Tensor | None = None) -> Geometry:
+        """Return scales, rotations and opacities of the Gaussians at `index` (n,) int64, or of all.
+
+        `used` is the number of indices in use, see `hyrfpack.ops.rows`; None if all are.
+        """
         explicit = self.gaussians
-        pick = (lambda values: values) if index is None else (lambda values: take_rows(values, index))
+        pick = (lambda values: values) if index is None else (lambda values: take_rows(values, index, used))
         positions = self._field_positions(pick(explicit.positions))
-        raw = self.geometry(self.cube_coords(positions), mixed=self._mixed)
+        raw = self.geometry(self.cube_coords(positions, used), mixed=self._mixed, used=used)
         if explicit.shape_residuals is not None:
             raw = add_shape_residuals(raw, pick(explicit.shape_residuals))
-        return self.activate(raw, positions, pick(explicit.scale_logits), pick(explicit.opacity_logits))
+        return self.activate(raw, positions, pick(explicit.scale_logits), pick(explicit.opacity_logits), used)
 
-    def activate(self, raw: Tensor, positions: Tensor, scale_logits: Tensor, opacity_logits: Tensor) -> Geometry:
+    def activate(
+        self,
+        raw: Tensor,
+        positions: Tensor,
+        scale_logits: Tensor,
+        opacity_logits: Tensor,
+        used: Tensor | None = None,
+    ) -> Geometry:
         """Combine raw outputs (n, 8) of the geometry field with the explicit logits; see `activate_geometry`."""
         half_extent = self.config.frame.half_extent if self.config.scale_grows else None
         rule = self.config.scale_rule
         parts = activate.activate_geometry(
-            raw, positions, scale_logits, opacity_logits, half_extent=half_extent, rule=rule
+            raw, positions, scale_logits, opacity_logits, half_extent=half_extent, rule=rule, used=used
         )
         return Geometry(*parts)
 
-    def decode_colors(self, viewpoint: Tensor, index: Tensor | None = None, shading: Shading | None = None) -> Tensor:
+    def decode_colors(
+        self,
+        viewpoint: Tensor,
+        index: Tensor | None = None,
+        shading: Shading | None = None,
+        used: Tensor | None = None,
+    ) -> Tensor:
         """Return colours (n, 3), 0 or more, of the Gaussians at `index` (n,), seen from `viewpoint` (3,), local units.
 
         Without colour residuals they lie in (0, 1). `shading` is the result of `shading()`, if it is known; then the
-        colours are not differentiable in the fields.
+        colours are not differentiable in the fields. `used` is the number of indices in use, see `hyrfpack.ops.rows`.
         """
         explicit = self.gaussians
         positions, logits, residuals = explicit.positions, explicit.color_logits, explicit.color_residuals
         if shading is not None:
             colors = shade(positions, viewpoint, shading, index)
         if index is not None:
-            positions, logits = take_rows(positions, index), take_rows(logits, index)
+            positions, logits = take_rows(positions, index, used), take_rows(logits, index, used)
         positions = self._field_positions(positions)
         if shading is None and self.radiance.is_constant_zero:
             colors = torch.sigmoid(logits)
         elif shading is None:
-            colors = torch.sigmoid(self._radiance(positions, viewpoint) + logits)
+            colors = torch.sigmoid(self._radiance(positions, viewpoint, used) + logits)
         if residuals is None:
             return colors
         directions = torch.nn.functional.normalize(positions - viewpoint, dim=-1, eps=1e-12)
@@ -245,9 +265,9 @@ class HybridModel(nn.Module):
         """Return weights and biases of the colour decoder."""
         return list(self.radiance.weights), list(self.radiance.biases)
 
-    def _radiance(self, positions: Tensor, viewpoint: Tensor) -> Tensor:
-        seen = encode_views(positions, viewpoint, self.config.direction_encoding)
-        return self.radiance(self.cube_coords(positions), seen, mixed=self._mixed)
+    def _radiance(self, positions: Tensor, viewpoint: Tensor, used: Tensor | None) -> Tensor:
+        seen = encode_views(positions, viewpoint, self.config.direction_encoding, used=used)
+        return self.radiance(self.cube_coords(positions, used), seen, mixed=self._mixed, used=used)
 
     def __len__(self) -> int:
         return len(self.gaussians)

@@ -8,11 +8,11 @@ from torch import Tensor
 
 from hyrfpack.model import Decoded, Frame, HybridModel
 from hyrfpack.model.exposure import apply_exposure_gains
-from hyrfpack.model.gaussians import take_rows
 from hyrfpack.model.merged import MergedModel
 from hyrfpack.ops.poses import camera_center
 from hyrfpack.ops.rasterize import Gaussians3D, RasterSettings, rasterize
 from hyrfpack.ops.rasterize.cull import frustum_cull
+from hyrfpack.ops.rows import take_rows
 from hyrfpack.ops.transfer import tensor_like
 from hyrfpack.ops.viewport import Viewport
 from hyrfpack.render.sampling import widen_to_photos

@@ -15,20 +15,21 @@ from hyrfpack.checks import check_choice, check_float, check_int, check_type
 from hyrfpack.choices import AS_PHOTOGRAPHED, RENDER_EXPOSURES
 from hyrfpack.errors import HyrfError
 from hyrfpack.model import Decoded, HybridModel
-from hyrfpack.model.gaussians import take_rows
 from hyrfpack.model.merged import MergedModel, scene_of
 from hyrfpack.ops.composite import composite
 from hyrfpack.ops.finite import all_finite
 from hyrfpack.ops.poses import camera_center
 from hyrfpack.ops.rasterize import Gaussians3D, RasterSettings, Viewport, rasterize
-from hyrfpack.ops.rasterize.cull import frustum_cull
+from hyrfpack.ops.rasterize.cull import frustum_cull, frustum_cull_into
 from hyrfpack.ops.rasterize.inputs import LOW_PASS_VARIANCE, TRANSMITTANCE_MIN
+from hyrfpack.ops.rows import take_rows
 from hyrfpack.ops.shade import Shading
 from hyrfpack.ops.transfer import tensor_like
 from hyrfpack.out_of_memory import explain_out_of_memory
 from hyrfpack.parallel.pool import torch_on_one_thread
 from hyrfpack.render.exposure import apply_exposure_map
 from hyrfpack.render.parts import camera_frame, expose_parts, gather_parts
+from hyrfpack.render.reserve import Reserve
 from hyrfpack.render.sampling import background_stride, widen_to_photos
 from hyrfpack.scene import Camera
 
@@ -92,7 +93,13 @@ class Rendering:
         indices: (n,) indices of the Gaussians that were decoded: those in view, or all if `decoded` had their colours.
         visible: (n,) bool, whether each of these touches the image.
         absgrad: (n, 2) sums over pixels of |dL/d mean2d| in 1/px; zero until backward has run; None unless requested.
-        pairs: number of blended tile-Gaussian pairs.
+        pairs: number of blended tile-Gaussian pairs, or of those reserved.
+        demand: None, or with a `Reserve`, (4,) int64 on the device: not 0 if a position is NaN or infinite; number of
+            Gaussians in view; not 0 if another number is NaN or infinite; number of tile-Gaussian pairs. Values above
+            `Reserve.limits` mean that the rendering is invalid. Only the first indices, as many as there are Gaussians
+            in view, then count; the others belong to Gaussians that are not visible.
+        valid: bool scalar on the device, False if the rendering is incomplete and what is learnt from it must be
+            dropped, see `demand`; None if it is known to be complete.
         seconds: wall time of each stage in seconds.
     """
 
@@ -104,6 +111,8 @@ class Rendering:
     absgrad: Tensor | None
     pairs: int
     seconds: dict[str, float] = field(default_factory=dict)
+    demand: Tensor | None = None
+    valid: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -134,6 +143,7 @@ def render_view(
     absgrad: bool = False,
     solid: Tensor | None = None,
     background: bool = True,
+    reserve: Reserve | None = None,
 ) -> Rendering:
     """Render one view; differentiable in the model's parameters.
 
@@ -147,6 +157,8 @@ def render_view(
         absgrad: whether to collect absolute gradients of the projected centres during backward.
         solid: (3,) colour behind everything instead of the model's own; for models without a background sphere.
         background: whether to render the background sphere.
+        reserve: memory for which a HybridModel is rendered without waiting for the GPU, if `can_reserve` and without
+            `decoded`; then check `Rendering.demand`.
 
     Raises:
         HyrfError: a number that the view needs is NaN or infinite. On a GPU, while gradients are recorded, the
@@ -170,18 +182,25 @@ def render_view(
     viewport = scene.config.frame.local_viewport(camera, positions.dtype)
     _check_finite(pose=viewport.pose)
     colors: Tensor | Shading
+    used, cull_demand = None, None
     try:
         if isinstance(model, MergedModel):
+            reserve = None
             raster_viewport = camera_frame(model, camera).local_viewport(camera, positions.dtype)
             index, gaussians, colors = gather_parts(model, camera, settings.near, settings.cull_tolerance, decoded)
         else:
             raster_viewport = viewport
-            index, gaussians, colors = _select_gaussians(model, viewport, settings, decoded, seconds)
+            index, gaussians, colors, used, cull_demand = _select_gaussians(
+                model, viewport, settings, decoded, reserve, seconds
+            )
             if (sizes := model.gaussians.pixel_sizes) is not None:
                 gaussians = widen_to_photos(gaussians, sizes[index], viewport, antialiased=model.config.antialiased)
         gradients = positions.new_zeros(len(index), 2) if absgrad else None
         raster_settings = settings.raster_settings(scene.config.antialiased, depth)
-        raster = rasterize(gaussians, colors, raster_viewport, raster_settings, absgrad=gradients)
+        raster = rasterize(
+            gaussians, colors, raster_viewport, raster_settings,
+            absgrad=gradients, used=used, reserve=reserve.pairs if reserve else None,
+        )  # fmt: skip
     except FloatingPointError:
         raise _nonfinite_error("positions") from None
     if raster.nonfinite:
@@ -215,13 +234,22 @@ def render_view(
         absgrad=gradients,
         pairs=raster.pairs,
         seconds=seconds,
+        demand=None if cull_demand is None or raster.demand is None else torch.cat((cull_demand, raster.demand)),
     )
 
 
 def _select_gaussians(
-    model: HybridModel, viewport: Viewport, settings: RenderSettings, decoded: Decoded | None, seconds: dict[str, float]
-) -> tuple[Tensor, Gaussians3D, Tensor | Shading]:
+    model: HybridModel,
+    viewport: Viewport,
+    settings: RenderSettings,
+    decoded: Decoded | None,
+    reserve: Reserve | None,
+    seconds: dict[str, float],
+) -> tuple[Tensor, Gaussians3D, Tensor | Shading, Tensor | None, Tensor | None]:
     """Return indices (n,) of the Gaussians to rasterise, these Gaussians, and their colours as `rasterize` takes them.
+
+    With a reserve, also the number of indices in use and what the reserve must have, as `frustum_cull_into` returns
+    them; otherwise None, None.
 
     With precomputed shading and without colour residuals, `rasterize` gets all Gaussians and culls them itself.
     Otherwise only those in view are shaded.
@@ -232,13 +260,19 @@ def _select_gaussians(
     positions = model.gaussians.positions
     shading = None if decoded is None else decoded.shading
     if decoded is not None and shading is not None and model.gaussians.color_residuals is None:
-        return torch.arange(len(model), device=positions.device), decoded.geometry.at(positions), shading
+        return torch.arange(len(model), device=positions.device), decoded.geometry.at(positions), shading, None, None
+    used, demand = None, None
     with _record_seconds(seconds, "cull"), torch.no_grad():
-        index = frustum_cull(positions, viewport, settings.near, settings.cull_tolerance)
+        frustum = positions, viewport, settings.near, settings.cull_tolerance
+        if reserve is None:
+            index = frustum_cull(*frustum)
+        else:
+            index, used, demand = frustum_cull_into(*frustum, reserve.gaussians)
     with _record_seconds(seconds, "decode"):
-        geometry = model.decode_geometry(index) if decoded is None else decoded.geometry[index]
+        geometry = model.decode_geometry(index, used) if decoded is None else decoded.geometry[index]
         viewpoint = camera_center(viewport.pose).to(positions.device, non_blocking=positions.is_cuda)
-        return index, geometry.at(take_rows(positions, index)), model.decode_colors(viewpoint, index, shading)
+        colors = model.decode_colors(viewpoint, index, shading, used)
+        return index, geometry.at(take_rows(positions, index, used)), colors, used, demand
 
 
 def _check_finite(**values: Tensor) -> None:

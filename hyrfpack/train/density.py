@@ -92,23 +92,36 @@ class DensityControl:
         if rendering.absgrad is None:
             return
         # Selecting the visible Gaussians would make the host wait for the device. Instead, zeros are added for the
-        # invisible ones.
+        # invisible ones, and for all if the rendering is not valid.
+        visible, valid = rendering.visible, rendering.valid
+        if valid is not None:
+            visible = visible & valid
         ndc = rendering.absgrad * tensor_like((camera.width / 2, camera.height / 2), rendering.absgrad)
-        lengths = torch.where(rendering.visible, torch.linalg.vector_norm(ndc, dim=-1), 0)
+        lengths = torch.where(visible, torch.linalg.vector_norm(ndc, dim=-1), 0)
         self.gradients.index_add_(0, rendering.indices, lengths.to(self.gradients.dtype))
-        self.views.index_add_(0, rendering.indices, rendering.visible.to(self.views.dtype))
+        self.views.index_add_(0, rendering.indices, visible.to(self.views.dtype))
         if (gradient := model.gaussians.opacity_logits.grad) is not None:
-            self.squares += gradient[:, 0].square()
+            squares = gradient[:, 0].square()
+            self.squares += squares if valid is None else torch.where(valid, squares, 0)
+
+    def acting(self, step: int) -> bool:
+        """Return whether a round or a reset is due after this step (counted from 1)."""
+        return self._has_round(step) or self._has_reset(step)
 
     def act(self, step: int, model: HybridModel, optimizer: Optimizer) -> None:
-        """Run a round or a reset if one is due after this step (counted from 1)."""
-        if not self.first <= step <= self.last:
-            return
-        since = step - self.first
-        if since % self.interval == 0:
+        """Run the round and the reset that are due after this step (counted from 1)."""
+        if self._has_round(step):
             self._round(step, model, optimizer)
-        if self.reset_interval and since and since % self.reset_interval == 0 and step + self.interval < self.peak:
+        if self._has_reset(step):
             self._reset(model, optimizer)
+
+    def _has_round(self, step: int) -> bool:
+        return self.first <= step <= self.last and (step - self.first) % self.interval == 0
+
+    def _has_reset(self, step: int) -> bool:
+        if not self.reset_interval or not self.first < step <= self.last:
+            return False
+        return (step - self.first) % self.reset_interval == 0 and step + self.interval < self.peak
 
     def target(self, step: int) -> int:
         """Return the largest number of Gaussians after a round at this step.

@@ -170,6 +170,7 @@ class Exposures:
         self.values = nn.Parameter(torch.from_numpy(gains - gains.mean(0)).float().to(device))
         self._exp_avg, self._exp_avg_sq = torch.zeros_like(self.values), torch.zeros_like(self.values)
         self._steps = [0] * len(views)
+        self._stepped: list[int] = []  # The rows of the last step.
 
     def exposed(self, rgb: Tensor, view: View) -> Tensor:
         """Apply the gains of a view's photo to its render (H, W, 3); differentiable."""
@@ -186,23 +187,33 @@ class Exposures:
         return {name: values[row] for name, row in self._row.items()}
 
     @torch.no_grad()
-    def step(self, rate: float, views: Iterable[View]) -> Tensor:
+    def step(self, rate: float, views: Iterable[View], enabled: Tensor | None = None) -> Tensor:
         """Take one Adam step for the photos of these views, clear the gradients, and subtract the mean of all gains.
+
+        Args:
+            enabled: bool scalar on the device; if it is False, no gain changes. Then call `retract_step`.
 
         Returns:
             Bool scalar on the device: whether a gradient was not finite. Such a gain stays as it is. The host does not
             wait for the device.
         """
         assert self.values.grad is not None
-        rows = sorted({self._row[view.name] for view in views})
+        rows = self._stepped = sorted({self._row[view.name] for view in views})
         for row in rows:
             self._steps[row] += 1
         gradients = [self.values.grad[row] + GAIN_DECAY * self.values[row] for row in rows]
         values, *moments = ([tensor[row] for row in rows] for tensor in (self.values, self._exp_avg, self._exp_avg_sq))
-        broken = adam_step(values, gradients, *moments, step=[self._steps[row] for row in rows], rate=rate).any()
+        steps = [self._steps[row] for row in rows]
+        broken = adam_step(values, gradients, *moments, step=steps, rate=rate, enabled=enabled).any()
         self.values.grad = None
-        self.values.sub_(self.values.mean(0))
+        mean = self.values.mean(0)
+        self.values.sub_(mean if enabled is None else torch.where(enabled, mean, 0))
         return broken
+
+    def retract_step(self) -> None:
+        """Discount the last step, which was not enabled and is to be taken again."""
+        for row in self._stepped:
+            self._steps[row] -= 1
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return gains, Adam moments and step counts."""

@@ -55,10 +55,13 @@ class Optimizer:
         }
         self.groups["fields"] = [*model.geometry.parameters(), *model.radiance.parameters()]
         self._states: dict[nn.Parameter, _State] = {}
-        self._stepped: list[str] = []  # The group of each parameter that the last step updated.
+        self._stepped: dict[nn.Parameter, str] = {}  # The group of each parameter that the last step updated.
 
-    def step(self, step: int, steps: int) -> Tensor:
+    def step(self, step: int, steps: int, enabled: Tensor | None = None) -> Tensor:
         """Take one step with the learning rates of `step` (from 0) of `steps`, and clear the gradients.
+
+        Args:
+            enabled: bool scalar on the model's device; if it is False, no parameter changes. Then call `retract_step`.
 
         Returns:
             (tensors,) float32 flags on the model's device, to be passed to `names`: not 0 for each parameter that has
@@ -66,7 +69,7 @@ class Optimizer:
             the device.
         """
         stepped = [(name, p) for name, group in self.groups.items() for p in group if p.grad is not None]
-        self._stepped = [name for name, _ in stepped]
+        self._stepped = {parameter: name for name, parameter in stepped}
         if not stepped:
             return self.model.gaussians.positions.new_zeros(0)
         for _, parameter in stepped:
@@ -83,10 +86,16 @@ class Optimizer:
             step=[state.step for state in states],
             rate=[self._rate(name, step, steps) for name, _ in stepped],
             betas=self.betas,
+            enabled=enabled,
         )
         for _, parameter in stepped:
             parameter.grad = None
         return broken.float()
+
+    def retract_step(self) -> None:
+        """Discount the last step, which was not enabled and is to be taken again."""
+        for parameter in self._stepped:
+            self._states[parameter].step -= 1
 
     def _rate(self, name: str, step: int, steps: int) -> float:
         """Return the learning rate of the group `name` at `step` (from 0) of `steps`."""
@@ -97,7 +106,7 @@ class Optimizer:
 
     def names(self, broken: Sequence[float]) -> list[str]:
         """Return the names of the groups that the last `step` flagged as broken."""
-        return list(dict.fromkeys(name for name, flag in zip(self._stepped, broken, strict=True) if flag))
+        return list(dict.fromkeys(name for name, flag in zip(self._stepped.values(), broken, strict=True) if flag))
 
     def replace_gaussians(self, keep: Tensor, new: dict[str, Tensor]) -> None:
         """Keep the rows at `keep` (int64), with their moments, and append new rows with moments of zero."""
@@ -119,6 +128,7 @@ class Optimizer:
     def _edit(self, name: str, values: Callable[[Tensor], Tensor], moments: Callable[[Tensor], Tensor]) -> None:
         (old,) = self.groups[name]
         new = nn.Parameter(values(old.detach()).contiguous())
+        self._stepped.pop(old, None)  # Otherwise its memory would be kept until the next step.
         state = self._states.pop(old, None)
         if state is not None:
             exp_avg, exp_avg_sq = (moments(getattr(state, moment)).contiguous() for moment in MOMENT_NAMES)

@@ -15,11 +15,11 @@ from hyrfpack.train.optimizer import Optimizer
 class Strategy(Protocol):
     """Interface of a density control strategy, for `Trainer(scene, config, strategy=...)`.
 
-    In every step the trainer calls `watching` before it renders the view, `observe` after the backward pass, and `act`
-    after the optimiser's step. A resumed run must give the same result as an uninterrupted one. So a strategy seeds
-    random numbers by the run's seed and the step, and its state contains all its observations. On several processes
-    each strategy observes its own views. It must sum its observations over the ranks (`Ranks.all_reduce`) before it
-    decides, so that all take the same decisions.
+    In every step the trainer calls `watching` before it renders the view and `observe` after the backward pass. After
+    the optimiser's step it calls `act` if `acting` returned True. A resumed run must give the same result as an
+    uninterrupted one. So a strategy seeds random numbers by the run's seed and the step, and its state contains all its
+    observations. On several processes each strategy observes its own views. It must sum its observations over the ranks
+    (`Ranks.all_reduce`) before it decides, so that all take the same decisions.
 
     The default strategy is `hyrfpack.train.DensityControl`.
 
@@ -29,11 +29,12 @@ class Strategy(Protocol):
         ...         return False
         ...     def observe(self, rendering, camera, model):
         ...         pass
+        ...     def acting(self, step):
+        ...         return step % 100 == 0
         ...     def act(self, step, model, optimizer):
-        ...         if step % 100 == 0:
-        ...             keep = (model.decode_geometry().opacities >= 0.01).nonzero().squeeze(1)
-        ...             nothing = {name: getattr(model.gaussians, name)[:0] for name in model.gaussians.PARAMETER_NAMES}
-        ...             optimizer.replace_gaussians(keep, nothing)
+        ...         keep = (model.decode_geometry().opacities >= 0.01).nonzero().squeeze(1)
+        ...         nothing = {name: getattr(model.gaussians, name)[:0] for name in model.gaussians.PARAMETER_NAMES}
+        ...         optimizer.replace_gaussians(keep, nothing)
         ...     def state_dict(self):
         ...         return {}
         ...     def load_state_dict(self, state):
@@ -45,7 +46,14 @@ class Strategy(Protocol):
         """Return whether this step, counted from 1, needs absolute gradients of the projected centres."""
 
     def observe(self, rendering: Rendering, camera: Camera, model: HybridModel) -> None:
-        """Observe the rendering of one view and the gradients of the model's parameters, after the backward pass."""
+        """Observe the rendering of one view and the gradients of the model's parameters, after the backward pass.
+
+        On a GPU the rendering may have `valid`, a flag on the device. If it is False, the step is taken again, so that
+        what is observed now must be dropped, without reading the flag.
+        """
+
+    def acting(self, step: int) -> bool:
+        """Return whether `act` is due after this step, counted from 1. On a GPU the host then waits for the step."""
 
     def act(self, step: int, model: HybridModel, optimizer: Optimizer) -> None:
         """Add and remove Gaussians after this step, counted from 1, by methods of the optimiser.

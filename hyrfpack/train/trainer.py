@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import time
 from collections import defaultdict
@@ -23,17 +24,21 @@ from hyrfpack.measure.psnr import psnr_from_mse
 from hyrfpack.model import HybridModel
 from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.ops.ssim import photometric_loss
+from hyrfpack.ops.transfer import HostCopy, tensor_like
 from hyrfpack.out_of_memory import explain_out_of_memory
 from hyrfpack.parallel.pool import keep_freed_memory, torch_on_one_thread
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.progress import StepEvent, ignore_progress
 from hyrfpack.render import render_view
+from hyrfpack.render.reserve import can_reserve
 from hyrfpack.scene import Picture, Scene, View
 from hyrfpack.train.checkpoint import load_checkpoint, names_and_sizes, save_checkpoint
 from hyrfpack.train.density import DensityControl
 from hyrfpack.train.distributed import StepStats, average_gradients, check_settings, digest, pack_step_stats
 from hyrfpack.train.exposure import initialize_exposures
+from hyrfpack.train.launched import LaunchedStep, RenderedView, SettledStep
 from hyrfpack.train.optimizer import Optimizer
+from hyrfpack.train.reserves import ReserveEstimator
 from hyrfpack.train.resolution import ResolutionSchedule
 from hyrfpack.train.setup import build_model
 from hyrfpack.train.strategy import Strategy
@@ -41,6 +46,8 @@ from hyrfpack.version import __version__
 
 _LOG = logging.getLogger(__name__)
 
+OUT_OF_MEMORY_FIX = "reduce `max_gaussians` or `max_size`, or use `device='cpu'`"
+MAX_LOSS = float(np.finfo(np.float32).max)
 MIN_CURVE_RECORDS = 200  # A run of more steps has up to twice as many records.
 
 
@@ -115,6 +122,8 @@ class Trainer:
         )
         self.resolution = ResolutionSchedule(scene.train, self.steps, len(self.model), is_on=config.resolution_schedule)
         self.step = 0
+        self._reserves, self._reserves_memory = ReserveEstimator(), can_reserve(device) and ranks.is_single
+        self._launched: LaunchedStep | None = None  # The step whose numbers were not read yet.
         self.is_pilot = False
         self.saved: int | None = None  # The step of the checkpoint on disk.
         self.records: list[dict] = []
@@ -167,18 +176,14 @@ class Trainer:
             while self.step < self.steps:
                 start = time.perf_counter()
                 self.step += 1
-                loss, mse, stopped = self._train_step(views, stop)
+                complete, is_due = self.step == self.steps, self.step % every == 0
+                settled = self._train_step(views, stop, settle=complete or (checkpoint is not None and is_due))
                 self.elapsed += time.perf_counter() - start
-                self._record(loss, mse)
-                complete = self.step == self.steps
-                if complete:
-                    self.fit_exposure_map()
-                    if reduced := self.resolution.describe():
-                        self.choices["resolution"] = reduced
-                share = self.resolution.share_done(self.step)
-                progress(StepEvent(self.step, self.steps, loss, mse, len(self.model), share))
-                stopped = (stop() if self.ranks.is_single else stopped) and not complete
-                if checkpoint and (stopped or (self.step % every == 0 and not complete)):
+                self._report(settled, progress)
+                stopped = (stop() if self.ranks.is_single else settled[-1].stop) and not complete
+                if stopped:
+                    self._report(self._settle_launched(), progress)
+                if checkpoint and (stopped or (is_due and not complete)):
                     try:
                         self.save(checkpoint, overwrite=overwrite or self.saved is not None)
                     except HyrfError as error:
@@ -199,74 +204,77 @@ class Trainer:
         views = shuffled(self.scene.train, self.config.seed, places)
         return map(self.resolution.reduce_view, views, range(self.step + 1, self.steps + 1))
 
-    def _train_step(self, views: Iterator[tuple[View, Picture]], stop: Callable[[], bool]) -> tuple[float, float, bool]:
+    def _report(self, settled: Sequence[SettledStep], progress: Callable[[StepEvent], None]) -> None:
+        """Add settled steps to the training curve and report them; the last one of the run fits the exposure map."""
+        for stats in settled:
+            self._record(stats)
+            if stats.step == self.steps:
+                self.fit_exposure_map()
+                if reduced := self.resolution.describe():
+                    self.choices["resolution"] = reduced
+            share = self.resolution.share_done(stats.step)
+            progress(StepEvent(stats.step, self.steps, stats.loss, stats.error, len(self.model), share))
+
+    def _train_step(
+        self, views: Iterator[tuple[View, Picture]], stop: Callable[[], bool], *, settle: bool
+    ) -> list[SettledStep]:
         """Take one optimiser step, and add and prune Gaussians if a round is due.
 
+        A step is settled when its numbers are read and found valid. If views are rendered into reserves, the host gives
+        the GPU the next view's gradients before it reads the numbers of a step, so that the GPU never runs idle.
+
+        Args:
+            settle: settle this step, too, before returning.
+
         Returns:
-            Mean loss and mean squared error over all ranks' views, and whether any rank was asked to stop.
+            The steps that were settled.
         """
         problem: HyrfError | None = None
+        settled: list[SettledStep] = []
+        rendered: RenderedView | None = None
         try:
-            with explain_out_of_memory("reduce `max_gaussians` or `max_size`, or use `device='cpu'`"):
-                with self._timed("data"):
-                    view, picture = next(views)
-                loss, error = self._gradients(view, picture)
+            with explain_out_of_memory(OUT_OF_MEMORY_FIX), self._timed("data"):
+                view, picture = next(views)
+            rendered = self._gradients(self.step, view, picture)
         except HyrfError as refusal:
             if self.ranks.is_single:
                 raise
             problem = refusal.with_text()  # This copy has no traceback, which would keep the step's memory.
-            loss = error = torch.zeros((), device=self.device)
-        packed = torch.stack((loss, error))
-        if not self.ranks.is_single:
-            with self._timed("exchange"):
-                own_stats = pack_step_stats(loss, error, stop=stop(), problem=problem is not None)
-                packed = average_gradients(self.ranks, self._learnt_parameters(), own_stats)
-        with self._timed("optimizer"):
-            broken = self.optimizer.step(self.step - 1, self.steps)
-            if self.exposures is not None:
-                # A photo's gains take as many steps as with a single process, so their rate is that of such a run.
-                seen, all_seen = (self.ranks.size * steps for steps in (self.step - 1, self.steps))
-                rate = self.config.learning_rates.at("exposure", seen, all_seen)
-                broken = torch.cat((broken, self.exposures.step(rate, self._views_of_step())[None]))
-        with self._timed("loss"):
-            # This is the only place in a step where the host waits for the device.
-            numbers = torch.cat((packed, broken)).tolist()
-        self.ranks.raise_if_lost()
-        sums, flags = numbers[: len(packed)], numbers[len(packed) :]
-        stats = StepStats(*sums) if self.ranks.is_single else StepStats.from_sums(sums, self.ranks.size)
-        if stats.problem:
-            self.ranks.raise_if_any(problem)
-        if not np.isfinite(stats.loss):
-            self._refuse("the loss is not finite", self._nonfinite_parameters())
-        if any(flags):
-            self._refuse("a gradient is not finite", self._groups(flags))
-        with self._timed("density"):
-            before = self.model.gaussians.positions
-            self.strategy.act(self.step, self.model, self.optimizer)
-            self.resolution.update(self.step, len(self.model))
-            if not self.ranks.is_single and self.model.gaussians.positions is not before:
-                self._synchronize()
-        return stats.loss, stats.error, stats.stop
+        settled += self._settle_launched()
+        if any(stats.was_retaken for stats in settled):  # These gradients are those of an older model.
+            self._discard_gradients()
+            rendered = self._gradients(self.step, view, picture)
+        self._update(self.step, rendered, stop, problem)
+        is_acting = self.strategy.acting(self.step)
+        if settle or is_acting or not self._reserves_memory:
+            settled += self._settle_launched(problem)
+        if is_acting:
+            with self._timed("density"):
+                before = self.model.gaussians.positions
+                self.strategy.act(self.step, self.model, self.optimizer)
+                self.resolution.update(self.step, len(self.model))
+                if not self.ranks.is_single and self.model.gaussians.positions is not before:
+                    self._synchronize()
+        return settled
 
-    def _gradients(self, view: View, picture: Picture) -> tuple[Tensor, Tensor]:
-        """Accumulate the gradients of one view.
-
-        Returns:
-            The view's loss, and its mean squared error, NaN if all of the photo is masked; both scalars.
-        """
+    @explain_out_of_memory(OUT_OF_MEMORY_FIX)
+    def _gradients(self, step: int, view: View, picture: Picture) -> RenderedView:
+        """Render a view for a step, and accumulate its gradients."""
         with self._timed("data"):
-            solid = self._solid()
+            solid = self._solid(step)
             target, mask = self.photos.get(view.load, picture, solid)
+        reserve = self._reserves.estimate(view, len(self.model)) if self._reserves_memory else None
         try:
             rendering = render_view(
                 self.model,
                 view.camera,
-                self.resolution.render_settings(view.camera, self.step),
-                absgrad=self.strategy.watching(self.step),
+                self.resolution.render_settings(view.camera, step),
+                absgrad=self.strategy.watching(step),
                 solid=None if solid is None else upload_array(solid, self.device),
+                reserve=reserve,
             )
         except HyrfError:
-            self._refuse("a number to be rendered is not finite", self._nonfinite_parameters())
+            self._refuse(step, "a number to be rendered is not finite", self._nonfinite_parameters())
         for stage, seconds in rendering.seconds.items():
             self.seconds[stage] += seconds
         with self._timed("loss"):
@@ -274,10 +282,94 @@ class Trainer:
             loss = photometric_loss(image, target, mask, ssim_weight=self.config.ssim_weight)
         with self._timed("backward"):
             loss.backward()
-        with self._timed("density"):
-            self.strategy.observe(rendering, view.camera, self.model)
         with self._timed("loss"):
-            return loss.detach(), _mean_square(image.detach() - target, mask)
+            error = _mean_square(image.detach() - target, mask)
+        # What the graph of the rendering holds on to is as large as all that the view needed.
+        rendering = dataclasses.replace(rendering, rgb=rendering.rgb.detach(), alpha=rendering.alpha.detach())
+        return RenderedView(view, picture, loss.detach(), error, rendering, reserve)
+
+    def _update(
+        self, step: int, rendered: RenderedView | None, stop: Callable[[], bool], problem: HyrfError | None
+    ) -> None:
+        """Launch the rest of a step: observe its gradients, exchange them, update the parameters, copy the numbers.
+
+        Nothing changes if the rendering turns out to be invalid. On one of several processes, None stands for a view
+        that has a problem.
+        """
+        view = picture = valid = None
+        checks: list[Tensor] = []
+        if rendered is None:
+            loss = error = torch.zeros((), device=self.device)
+        else:
+            view, picture, loss, error, rendering = (
+                rendered.view, rendered.picture, rendered.loss, rendered.error, rendered.rendering
+            )  # fmt: skip
+            if rendered.reserve is not None and (demand := rendering.demand) is not None:
+                numbers = torch.cat((loss.double()[None], demand))
+                valid = (numbers <= tensor_like((MAX_LOSS, *rendered.reserve.limits), numbers)).all()
+                rendering = dataclasses.replace(rendering, valid=valid)
+                checks = [valid[None], demand]
+            with self._timed("density"):
+                self.strategy.observe(rendering, view.camera, self.model)
+        packed = torch.stack((loss, error))
+        if not self.ranks.is_single:
+            with self._timed("exchange"):
+                own_stats = pack_step_stats(loss, error, stop=stop(), problem=problem is not None)
+                packed = average_gradients(self.ranks, self._learnt_parameters(), own_stats)
+        with self._timed("optimizer"):
+            broken = self.optimizer.step(step - 1, self.steps, valid)
+            if self.exposures is not None:
+                # A photo's gains take as many steps as with a single process, so their rate is that of such a run.
+                seen, all_seen = (self.ranks.size * steps for steps in (step - 1, self.steps))
+                rate = self.config.learning_rates.at("exposure", seen, all_seen)
+                broken = torch.cat((broken, self.exposures.step(rate, self._views_of_step(step), valid)[None]))
+        lengths = len(packed), sum(map(len, checks)), len(broken)
+        self._launched = LaunchedStep(step, view, picture, HostCopy(torch.cat((packed, *checks, broken))), lengths)
+
+    def _settle_launched(self, problem: HyrfError | None = None, *, was_retaken: bool = False) -> list[SettledStep]:
+        """Settle the launched step, if any: wait for its numbers and check them.
+
+        If its reserve was too small, nothing was changed, and the step is taken again with a larger one.
+
+        Args:
+            problem: the problem of this process's view.
+            was_retaken: whether the step was taken before.
+        """
+        if self._launched is None:
+            return []
+        launched, self._launched = self._launched, None
+        step, view, picture = launched.step, launched.view, launched.picture
+        with self._timed("loss"):
+            sums, checks, flags = launched.read_numbers()
+        self.ranks.raise_if_lost()
+        stats = StepStats(sums[0], sums[1]) if self.ranks.is_single else StepStats.from_sums(sums, self.ranks.size)
+        if stats.problem:
+            self.ranks.raise_if_any(problem)
+        if checks and view is not None and picture is not None:
+            valid, nonfinite_positions, in_view, nonfinite_inputs, pairs = checks
+            if nonfinite_positions or nonfinite_inputs:
+                self._refuse(step, "a number to be rendered is not finite", self._nonfinite_parameters())
+            self._reserves.record(view, len(self.model), int(in_view), int(pairs))
+            if not valid and np.isfinite(stats.loss):
+                self._retake(step, view, picture)
+                return self._settle_launched(was_retaken=True)
+        if not np.isfinite(stats.loss):
+            self._refuse(step, "the loss is not finite", self._nonfinite_parameters())
+        if any(flags):
+            self._refuse(step, "a gradient is not finite", self._groups(flags))
+        return [SettledStep(step, stats.loss, stats.error, stats.stop, was_retaken)]
+
+    def _retake(self, step: int, view: View, picture: Picture) -> None:
+        """Launch a step again that changed nothing, because its reserve was too small."""
+        self.optimizer.retract_step()
+        if self.exposures is not None:
+            self.exposures.retract_step()
+        self._discard_gradients()
+        self._update(step, self._gradients(step, view, picture), lambda: False, None)
+
+    def _discard_gradients(self) -> None:
+        for parameter in self._learnt_parameters():
+            parameter.grad = None
 
     def fit_exposure_map(self) -> None:
         """Fit the exposure map to the learnt per-image gains, if any, and store it in the model."""
@@ -292,9 +384,9 @@ class Trainer:
         """Return the parameters whose gradients are averaged over the ranks."""
         return [*self.model.parameters(), *([] if self.exposures is None else [self.exposures.values])]
 
-    def _views_of_step(self) -> list[View]:
-        """Return the views that all ranks render in this step."""
-        places = range((self.step - 1) * self.ranks.size, self.step * self.ranks.size)
+    def _views_of_step(self, step: int) -> list[View]:
+        """Return the views that all ranks render in a step."""
+        places = range((step - 1) * self.ranks.size, step * self.ranks.size)
         return list(shuffled(self.scene.train, self.config.seed, places))
 
     def _synchronize(self) -> None:
@@ -302,18 +394,19 @@ class Trainer:
         if len(set(self.ranks.all_gather(digest(self.model.parameters())))) > 1:
             self._restore(self.ranks.broadcast(self._tensors()))
 
-    def _record(self, loss: float, mse: float) -> None:
-        """Add a record of the step to the training curve if `is_recorded`, unless all of its photo is masked."""
-        if not np.isnan(mse) and is_recorded(self.step, self.steps):
-            record = {"step": self.step, "loss": loss, "psnr": psnr_from_mse(mse), "gaussians": len(self.model)}
+    def _record(self, stats: SettledStep) -> None:
+        """Add a record of a step to the training curve if `is_recorded`, unless all of its photo is masked."""
+        if not np.isnan(stats.error) and is_recorded(stats.step, self.steps):
+            psnr = psnr_from_mse(stats.error)
+            record = {"step": stats.step, "loss": stats.loss, "psnr": psnr, "gaussians": len(self.model)}
             self.records.append({**record, "seconds": round(self.elapsed, 3)})
 
-    def _solid(self) -> np.ndarray | None:
-        """Return the background colour (3,) of this step's view; None if the model has a background sphere."""
+    def _solid(self, step: int) -> np.ndarray | None:
+        """Return the background colour (3,) of a step's view; None if the model has a background sphere."""
         if self.model.config.background:
             return None
         if self.config.background_color == "random":
-            number = (self.step - 1) * self.ranks.size + self.ranks.rank + 1  # The number of the view, from 1.
+            number = (step - 1) * self.ranks.size + self.ranks.rank + 1  # The number of the view, from 1.
             return np.random.default_rng((self.config.seed, 1, number)).random(3, dtype=np.float32)
         return np.array(self.model.config.solid, np.float32)
 
@@ -325,11 +418,11 @@ class Trainer:
     def _nonfinite_parameters(self) -> list[str]:
         return [name for name, p in self.model.named_parameters() if not torch.isfinite(p).all()]
 
-    def _refuse(self, what: str, groups: list[str]) -> NoReturn:
+    def _refuse(self, step: int, what: str, groups: list[str]) -> NoReturn:
         where = ", ".join(groups) if groups else "none; look at the photo itself"
-        views = " or ".join(f"'{view.name}'" for view in self._views_of_step())
+        views = " or ".join(f"'{view.name}'" for view in self._views_of_step(step))
         raise HyrfTrainingError(
-            f"training stopped at step {self.step} on view {views}: {what} (parameter groups: {where})",
+            f"training stopped at step {step} on view {views}: {what} (parameter groups: {where})",
             fix="lower the learning rates or remove the view",
         )
 
@@ -405,6 +498,7 @@ class Trainer:
         )
         tensors, progress = self.ranks.broadcast(saved)
         self._restore(tensors)
+        self._launched = None
         self.strategy.load_state_dict(_under(_strategy_prefix(self.ranks.rank), tensors))
         self.step, self.records = progress["step"], progress["records"]
         self.saved = self.step

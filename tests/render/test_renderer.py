@@ -244,7 +244,9 @@ def test_a_stride_of_two_evaluates_every_second_pixel_of_the_background(monkeypa
     model, camera = small_model(np.zeros((0, 3)), background=True), camera_at((0, -3.0, 0), width=31, height=18)
     asked = []
     encode = reference.hash_encode
-    monkeypatch.setattr(reference, "hash_encode", lambda coords, *grid: asked.append(coords) or encode(coords, *grid))
+    monkeypatch.setattr(
+        reference, "hash_encode", lambda coords, *grid, **_: asked.append(coords) or encode(coords, *grid)
+    )
     render_rgb(model, camera, settings=RenderSettings(background_stride=2))
     points = torch.tensor([(x + 0.5, y + 0.5) for y in range(0, 20, 2) for x in range(0, 32, 2)])
     model.decode_background(points, model.config.frame.local_viewport(camera, torch.float32))
@@ -357,11 +359,11 @@ def test_torch_computes_on_one_thread_while_rendering_and_on_as_many_as_before_a
     model, seen = ball_model(), []
     decode = model.decode_geometry
 
-    def spy(index):
+    def spy(*index):
         seen.append(torch.get_num_threads())
         if fails:
             raise RuntimeError("no")
-        return decode(index)
+        return decode(*index)
 
     monkeypatch.setattr(model, "decode_geometry", spy)
     before = torch.get_num_threads()

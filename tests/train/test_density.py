@@ -415,8 +415,9 @@ def test_short_runs_have_a_density_schedule(steps):
     assert 1 <= len(model) <= 30
 
 
-def make_rendering(indices, visible, absgrad) -> SimpleNamespace:
-    return SimpleNamespace(indices=torch.tensor(indices), visible=torch.tensor(visible), absgrad=torch.tensor(absgrad))
+def make_rendering(indices, visible, absgrad, valid: torch.Tensor | None = None) -> SimpleNamespace:
+    lists = {"indices": indices, "visible": visible, "absgrad": absgrad}
+    return SimpleNamespace(valid=valid, **{name: torch.tensor(values) for name, values in lists.items()})
 
 
 def test_views_add_ndc_gradients_of_visible_gaussians():
@@ -438,6 +439,17 @@ def test_views_without_gradients_change_nothing():
     nothing = SimpleNamespace(indices=torch.tensor([3]), visible=torch.tensor([True]), absgrad=None)
     density.observe(nothing, SimpleNamespace(width=10, height=10), model)
     assert (density.gradients == 0.25).all() and (density.views == 1).all()
+
+
+@pytest.mark.parametrize("valid", [True, False])
+def test_nothing_is_collected_from_a_rendering_that_is_not_valid(valid):
+    model, _, density = set_up()
+    density.clear(20)
+    model.gaussians.opacity_logits.grad = torch.full((20, 1), torch.nan if not valid else 2.0)
+    rendering = make_rendering([3], [True], [[0.5, torch.nan if not valid else 0.5]], torch.tensor(valid))
+    density.observe(rendering, SimpleNamespace(width=10, height=10), model)
+    assert density.views.sum() == density.gradients.count_nonzero() == valid
+    assert density.squares.tolist() == [4.0 * valid] * 20
 
 
 def test_gradients_are_collected_until_the_last_round():

@@ -110,7 +110,7 @@ def _interrupt() -> None:
 
 
 def test_a_failed_run_logs_the_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*_: object) -> None:
+    def fail(*_: object, **__: object) -> None:
         raise HyrfError("it is broken", fix="repair it")
 
     monkeypatch.setattr("hyrfpack.train.trainer.Trainer._train_step", fail)

@@ -25,7 +25,7 @@ TINY_TRAIN_CONFIG = TrainConfig(steps=2, max_gaussians=60)
 def fail_at_first_step(monkeypatch):
     """Training fails at its first step, so that an error has to come before it."""
 
-    def step(self, view, picture):
+    def step(*_, **__):
         raise AssertionError("a step was taken")
 
     monkeypatch.setattr(Trainer, "_train_step", step)

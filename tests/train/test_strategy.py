@@ -39,14 +39,16 @@ class PruneLeastSeen:
             self.sums = torch.zeros(len(model))
         self.sums += gradient[:, 0].square()
 
+    def acting(self, step: int) -> bool:
+        return step % 4 == 0
+
     def act(self, step: int, model: HybridModel, optimizer: Optimizer) -> None:
-        if step % 4 == 0:
-            keep = torch.arange(len(model)) != self.sums.argmin()
-            optimizer.replace_gaussians(
-                keep.nonzero().squeeze(1),
-                {name: getattr(model.gaussians, name)[:0] for name in Gaussians.PARAMETER_NAMES},
-            )
-            self.sums = self.sums[keep]
+        keep = torch.arange(len(model)) != self.sums.argmin()
+        optimizer.replace_gaussians(
+            keep.nonzero().squeeze(1),
+            {name: getattr(model.gaussians, name)[:0] for name in Gaussians.PARAMETER_NAMES},
+        )
+        self.sums = self.sums[keep]
 
     def state_dict(self) -> dict[str, Tensor]:
         return {"sums": self.sums}

@@ -102,9 +102,7 @@ def train_row(scene: Scene, config: TrainConfig, row: str) -> tuple[HybridModel,
         dtype = torch.float32 if row == "adam" else torch.float64
         patches = {lookup: run_in_dtype(dtype, operation) for lookup, operation in OPERATION_BY_LOOKUP.items()}
     elif row == "mixed":
-        patches = dict.fromkeys(
-            MLP_LOOKUPS, lambda *layers, mixed: mlp(*layers, mixed=True, implementation="reference")
-        )
+        patches = dict.fromkeys(MLP_LOOKUPS, lambda *layers, **_: mlp(*layers, mixed=True, implementation="reference"))
     elif row == "rasterizer":
         patches = {RASTERIZE_LOOKUP: run_in_dtype(torch.float64, rasterize)}
     started = time.perf_counter()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor
 
@@ -22,6 +20,7 @@ def activate_geometry(
     *,
     half_extent: tuple[float, float, float] | None = None,
     rule: str = "sum",
+    used: Tensor | None = None,
     implementation: str = "auto",
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Compute scales, rotations and opacities of Gaussians (HyRF eq. 6, 7) from neural (n) and explicit (e) logits.
@@ -35,6 +34,7 @@ def activate_geometry(
         scale_logits, opacity_logits: (N, 1) s_e and a_e.
         half_extent: half-axes of the box in the definition of S(p), see `scale_bounds`; None for S(p) = 1.
         rule: "sum" or "product".
+        used: the number of Gaussians in use, see `hyrfpack.ops.rows`; None if all are.
         implementation: "auto", "reference" or "gpu" (float32). "gpu" computes no gradient of positions and is
             available only if none is needed.
 
@@ -56,10 +56,9 @@ def activate_geometry(
         raise ValueError(f"raw, positions, scale and opacity logits are {shapes}, the rule '{rule}'")
     needs_position_grad = torch.is_grad_enabled() and positions.requires_grad
     available = ("reference",) if needs_position_grad else ("reference", "gpu")
-    run: Callable[..., tuple[Tensor, Tensor, Tensor]] = reference.activate_geometry
     tensors = raw, positions, scale_logits, opacity_logits
     if choose_implementation("activate_geometry", implementation, available, *tensors) == "gpu":
         from hyrfpack.ops.activate import gpu
 
-        run = gpu.activate_geometry
-    return run(*tensors, half_extent, rule)
+        return gpu.activate_geometry(*tensors, half_extent, rule, used)
+    return reference.activate_geometry(*tensors, half_extent, rule)

@@ -8,6 +8,8 @@ import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from hyrfpack.ops.gpu_rows import count_used_rows
+
 _GAUSSIANS_PER_PROGRAM = 128
 
 
@@ -27,12 +29,16 @@ def _scale_bounds(positions, index, live, half_extent, HAS_HALF_EXTENT: tl.const
 
 @triton.jit(do_not_specialize=["total", "raw_row", "raw_column"])
 def activate(
-    raw, raw_row, raw_column, positions, scale_logits, opacity_logits, half_extent, total, scales, quats, opacities,
+    raw, raw_row, raw_column, positions, scale_logits, opacity_logits, half_extent, total, used,
+    scales, quats, opacities,
     HAS_HALF_EXTENT: tl.constexpr, RULE_IS_SUM: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Write scales (N, 3), quats (N, 4) and opacities (N,)."""
     index = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    live = index < total
+    count = count_used_rows(used, total)
+    if tl.program_id(0) * BLOCK >= count:
+        return
+    live = index < count
     first = raw + index * raw_row
     opacity = tl.load(first, mask=live, other=0.0) + tl.load(opacity_logits + index, mask=live, other=0.0)
     tl.store(opacities + index, tl.sigmoid(opacity), mask=live)
@@ -50,12 +56,15 @@ def activate(
 @triton.jit(do_not_specialize=["total", "raw_row", "raw_column", "grad_row", "grad_column"])
 def activate_backward(
     raw, raw_row, raw_column, positions, scale_logits, half_extent, opacities, grad_scales, grad_quats, grad_opacities,
-    total, grad_raw, grad_row, grad_column, grad_scale_logits, grad_opacity_logits,
+    total, used, grad_raw, grad_row, grad_column, grad_scale_logits, grad_opacity_logits,
     HAS_HALF_EXTENT: tl.constexpr, RULE_IS_SUM: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Write the gradients of raw (N, 8) and of both logits (N, 1)."""
     index = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    live = index < total
+    count = count_used_rows(used, total)
+    if tl.program_id(0) * BLOCK >= count:
+        return
+    live = index < count
     first, grad_first = raw + index * raw_row, grad_raw + index * grad_row
     opacity = tl.load(opacities + index, mask=live, other=0.0)
     grad = tl.load(grad_opacities + index, mask=live, other=0.0) * opacity * (1 - opacity)
@@ -95,6 +104,7 @@ class _Activate(torch.autograd.Function):
         opacity_logits: Tensor,
         half_extent: tuple[float, float, float] | None,
         rule: str,
+        used: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
         raw, total = raw.detach(), len(raw)
         positions, scale_logits, opacity_logits = (
@@ -110,27 +120,27 @@ class _Activate(torch.autograd.Function):
         }
         if total:
             activate[(triton.cdiv(total, _GAUSSIANS_PER_PROGRAM),)](
-                raw, *raw.stride(), positions, scale_logits, opacity_logits, ctx.half_extent, total,
+                raw, *raw.stride(), positions, scale_logits, opacity_logits, ctx.half_extent, total, used,
                 scales, quats, opacities, **ctx.constants, enable_fp_fusion=True,
             )  # fmt: skip
-        ctx.save_for_backward(raw, positions, scale_logits, opacities)
+        ctx.save_for_backward(raw, positions, scale_logits, opacities, used)
         return scales, quats, opacities
 
     @staticmethod
     @once_differentiable
     def backward(ctx, grad_scales: Tensor, grad_quats: Tensor, grad_opacities: Tensor) -> tuple[Tensor | None, ...]:
-        raw, positions, scale_logits, opacities = ctx.saved_tensors
+        raw, positions, scale_logits, opacities, used = ctx.saved_tensors
         total = len(raw)
         grad_raw = torch.empty_like(raw)  # This has the strides of `raw`, unless elements of `raw` share memory.
         grad_scale_logits, grad_opacity_logits = raw.new_empty(total, 1), raw.new_empty(total, 1)
         if total:
             activate_backward[(triton.cdiv(total, _GAUSSIANS_PER_PROGRAM),)](
                 raw, *raw.stride(), positions, scale_logits, ctx.half_extent, opacities,
-                grad_scales.contiguous(), grad_quats.contiguous(), grad_opacities.contiguous(), total,
+                grad_scales.contiguous(), grad_quats.contiguous(), grad_opacities.contiguous(), total, used,
                 grad_raw, *grad_raw.stride(), grad_scale_logits, grad_opacity_logits,
                 **ctx.constants, enable_fp_fusion=True,
             )  # fmt: skip
-        return grad_raw, None, grad_scale_logits, grad_opacity_logits, None, None
+        return grad_raw, None, grad_scale_logits, grad_opacity_logits, None, None, None
 
 
 def activate_geometry(
@@ -140,6 +150,7 @@ def activate_geometry(
     opacity_logits: Tensor,
     half_extent: tuple[float, float, float] | None,
     rule: str,
+    used: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Compute `hyrfpack.ops.activate.activate_geometry` without a gradient of positions."""
-    return _Activate.apply(raw, positions, scale_logits, opacity_logits, half_extent, rule)
+    return _Activate.apply(raw, positions, scale_logits, opacity_logits, half_extent, rule, used)

@@ -24,6 +24,7 @@ def adam_step(
     rate: float | Sequence[float],
     betas: tuple[float, float] = (0.9, 0.999),
     eps: float = 1e-15,
+    enabled: Tensor | None = None,
     implementation: str = "auto",
 ) -> Tensor:
     """Take one Adam step without weight decay on every tensor.
@@ -43,6 +44,8 @@ def adam_step(
         rate: learning rate: one for all tensors, or one per tensor.
         betas: b1 and b2, in [0, 1).
         eps: positive.
+        enabled: bool scalar on the device of the tensors; if it is False, nothing changes and nothing counts as
+            skipped. None is True.
         implementation: "auto", "reference", "cpu" (float32; torch's fused kernel, bit-identical to
             torch.optim.Adam(fused=True)) or "gpu" (float32; one launch for all tensors).
 
@@ -83,4 +86,4 @@ def adam_step(
         from hyrfpack.ops.adam import cpu
 
         run = cpu.adam_step
-    return run(*map(list, zip(*tensors, strict=True)), steps, rates, betas, eps)
+    return run(*map(list, zip(*tensors, strict=True)), steps, rates, betas, eps, enabled)

@@ -20,8 +20,11 @@ def adam_step(
     rates: list[float],
     betas: tuple[float, float],
     eps: float,
+    enabled: Tensor | None = None,
 ) -> Tensor:
     """Take the step of `hyrfpack.ops.adam.adam_step`."""
+    if enabled is not None and not enabled:
+        return torch.zeros(len(values), dtype=torch.bool)
     # The fused kernel indexes all four tensors alike, so the gradients must be contiguous, too.
     gradients = [gradient.contiguous() for gradient in gradients]
     skipped = [not _squares_are_finite(gradient) for gradient in gradients]

@@ -52,6 +52,7 @@ def _update_elements(
 def adam_step_kernel(
     table,
     step_scales,
+    enabled,
     skipped,
     weight1,
     weight2,
@@ -66,10 +67,14 @@ def adam_step_kernel(
         table: (6, SLOTS) int64: first program, number of elements, addresses of values, gradients, exp_avg and
             exp_avg_sq of each tensor; in unused slots the first program is beyond the last one.
         step_scales: (2, SLOTS): learning rate / (1 - b1^step) and 1 / sqrt(1 - b2^step) of each tensor.
+        enabled: uint8 scalar, 0 if nothing may change; or None.
         skipped: (tensors,) uint8, set to 1 for a tensor with a non-finite squared gradient.
         weight1, weight2: 1 - b1 and 1 - b2.
         ALIGNED: whether all addresses are multiples of 16.
     """
+    if enabled is not None:
+        if tl.load(enabled) == 0:
+            return
     program = tl.program_id(0)
     firsts = tl.load(table + tl.arange(0, SLOTS))
     slot = tl.sum((firsts <= program).to(tl.int32)) - 1
@@ -138,6 +143,7 @@ def adam_step(
     rates: list[float],
     betas: tuple[float, float],
     eps: float,
+    enabled: Tensor | None = None,
 ) -> Tensor:
     """Take the step of `hyrfpack.ops.adam.adam_step`."""
     device = values[0].device
@@ -157,6 +163,7 @@ def adam_step(
         adam_step_kernel[(programs,)](
             table,
             step_scales,
+            None if enabled is None else enabled.view(torch.uint8),
             skipped.view(torch.uint8),
             1.0 - betas[0],
             1.0 - betas[1],

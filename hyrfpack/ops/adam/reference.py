@@ -17,6 +17,7 @@ def adam_step(
     rates: list[float],
     betas: tuple[float, float],
     eps: float,
+    enabled: Tensor | None = None,
 ) -> Tensor:
     """Take the step of `hyrfpack.ops.adam.adam_step`."""
     beta1, beta2 = betas
@@ -24,7 +25,10 @@ def adam_step(
     for x, g, m, v, step, rate in zip(values, gradients, exp_avg, exp_avg_sq, steps, rates, strict=True):
         correction1, correction2 = 1 - beta1**step, 1 - beta2**step
         finite = (g * g).isfinite()
-        skipped.append(~finite.all())
+        is_skipped = ~finite.all()
+        if enabled is not None:
+            finite, is_skipped = finite & enabled, is_skipped & enabled
+        skipped.append(is_skipped)
         new_m = beta1 * m + (1 - beta1) * g
         new_v = beta2 * v + (1 - beta2) * (g * g)
         new_x = x - rate / correction1 * new_m / (new_v.sqrt() / math.sqrt(correction2) + eps)

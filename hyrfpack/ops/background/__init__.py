@@ -58,8 +58,7 @@ def background_grid(
         threshold: the transmittance above which a pixel needs the background, 0 or more.
         stride: pixels between neighbouring nodes, at least 1.
         implementation: "auto", "reference", "cpu" (float32) or "gpu" (float32, two features per level, at most 16
-            levels, two hidden layers of width 128 or less). Without gradients "gpu" is one launch; with gradients it
-            synchronises with the device once.
+            levels, two hidden layers of width 128 or less). Without gradients "gpu" is one launch.
 
     Returns:
         (rows, columns, 3) in (0, 1), see `grid_size`; 0 at nodes that are not needed, NaN where the field is NaN.

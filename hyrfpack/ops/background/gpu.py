@@ -28,8 +28,10 @@ from hyrfpack.ops.background.reference import (
 )
 from hyrfpack.ops.contraction.gpu import contract_block
 from hyrfpack.ops.gpu_pairs import unpack_pair
+from hyrfpack.ops.gpu_rows import count_used_rows, partition_rows
 from hyrfpack.ops.hash_encode.gpu import axis_vertices, level_parameters, rows_as_words, vertex_row
 from hyrfpack.ops.mlp.tiles import multiply_add, pad_width, product_precision, round_factor, round_relu
+from hyrfpack.ops.rows import place_rows
 from hyrfpack.ops.shade.directions import DIRECTION_FEATURES
 from hyrfpack.ops.shade.gpu_directions import encode_block
 from hyrfpack.ops.viewport import Viewport
@@ -278,15 +280,15 @@ def find_nodes_kernel(
 
 @triton.jit(do_not_specialize=["columns", "total"])
 def encode_nodes_kernel(
-    nodes, columns, total, rays, half_extent, coords, encoded,
+    nodes, columns, total, used, rays, half_extent, coords, encoded,
     ENCODING_WIDTH: tl.constexpr, FREQUENCY: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Write the field's inputs at `nodes` (total,) int64.
+    """Write the field's inputs at `nodes` (total,) int64, of which `used` are in use.
 
     They are planar coords (3, total) and encoded directions (ENCODING_WIDTH, total).
     """
     index = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    live = index < total
+    live = index < count_used_rows(used, total)
     node = tl.load(nodes + index, mask=live, other=0).to(tl.int32)
     u, v, w, x, y, z = _cast_rays(node // columns, node % columns, rays, half_extent)
     tl.store(coords + index, u, mask=live)
@@ -303,23 +305,23 @@ def differentiable_grid(
 ) -> Tensor:
     """Compute `hyrfpack.ops.background.background_grid`, differentiable in the field's parameters.
 
-    Synchronises with the device once, to read the number of needed nodes.
+    All nodes get memory, so that the host need not wait for the number of needed ones.
     """
     height, width = transmittance.shape
     rows, columns = grid_size(height, width, stride)
-    needed = torch.empty(rows * columns, dtype=torch.uint8, device=transmittance.device)
-    find_nodes_kernel[(triton.cdiv(rows * columns, _NODES_PER_PROGRAM),)](
-        transmittance.detach().contiguous(), height, width, threshold, stride, columns, rows * columns, needed,
+    total = rows * columns
+    needed = torch.empty(total, dtype=torch.uint8, device=transmittance.device)
+    find_nodes_kernel[(triton.cdiv(total, _NODES_PER_PROGRAM),)](
+        transmittance.detach().contiguous(), height, width, threshold, stride, columns, total, needed,
         STRIDE=stride, BLOCK=_NODES_PER_PROGRAM, num_warps=4, enable_fp_fusion=True,
     )  # fmt: skip
-    nodes = torch.nonzero(needed).squeeze(-1)
-    colors = transmittance.new_zeros(3, rows * columns)
-    if total := len(nodes):
-        coords, encoded = colors.new_empty(3, total), colors.new_empty(DIRECTION_FEATURES[field.encoding], total)
-        encode_nodes_kernel[(triton.cdiv(total, _NODES_PER_PROGRAM),)](
-            nodes, columns, total, camera_rays(viewport, stride), tuple(field.half_extent), coords, encoded,
-            ENCODING_WIDTH=len(encoded), FREQUENCY=field.encoding == "frequency", BLOCK=_NODES_PER_PROGRAM,
-            num_warps=4, enable_fp_fusion=True,
-        )  # fmt: skip
-        colors.index_copy_(1, nodes, field_colors(coords.T, encoded.T, field).T)
-    return colors.view(3, rows, columns).permute(1, 2, 0)
+    nodes, used = partition_rows(needed, torch.cumsum(needed, 0, dtype=torch.int64), total)
+    coords = transmittance.new_empty(3, total)
+    encoded = transmittance.new_empty(DIRECTION_FEATURES[field.encoding], total)
+    encode_nodes_kernel[(triton.cdiv(total, _NODES_PER_PROGRAM),)](
+        nodes, columns, total, used, camera_rays(viewport, stride), tuple(field.half_extent), coords, encoded,
+        ENCODING_WIDTH=len(encoded), FREQUENCY=field.encoding == "frequency", BLOCK=_NODES_PER_PROGRAM,
+        num_warps=4, enable_fp_fusion=True,
+    )  # fmt: skip
+    colors = field_colors(coords.T, encoded.T, field, used)
+    return place_rows(colors, nodes, used, total).view(rows, columns, 3)

@@ -103,12 +103,15 @@ def background_colors(points: Tensor, viewport: Viewport, field: BackgroundField
     return field_colors(coords, encode_directions(directions, field.encoding), field)
 
 
-def field_colors(coords: Tensor, encoded: Tensor, field: BackgroundField) -> Tensor:
-    """Compute the field's colours (N, 3) at coords (N, 3) of the cube for encoded directions (N, E)."""
-    features = hash_encode(coords, field.table, field.resolutions, field.log2_table_size)
+def field_colors(coords: Tensor, encoded: Tensor, field: BackgroundField, used: Tensor | None = None) -> Tensor:
+    """Compute the field's colours (N, 3) at coords (N, 3) of the cube for encoded directions (N, E).
+
+    `used` is the number of rows in use, see `hyrfpack.ops.rows`; None if all are.
+    """
+    features = hash_encode(coords, field.table, field.resolutions, field.log2_table_size, used=used)
     # Hash features are stored planar, so concatenating along the first axis is a plain copy.
     inputs = torch.cat((features.T, encoded.T)).T
-    return torch.sigmoid(mlp(inputs, field.weights, field.biases, mixed=field.mixed))
+    return torch.sigmoid(mlp(inputs, field.weights, field.biases, mixed=field.mixed, used=used))
 
 
 def grid_size(height: int, width: int, stride: int) -> tuple[int, int]:

@@ -16,7 +16,11 @@ UNIT_HALF_EXTENT = (1.0, 1.0, 1.0)
 
 
 def contract(
-    points: Tensor, half_extent: tuple[float, float, float] = UNIT_HALF_EXTENT, *, implementation: str = "auto"
+    points: Tensor,
+    half_extent: tuple[float, float, float] = UNIT_HALF_EXTENT,
+    *,
+    used: Tensor | None = None,
+    implementation: str = "auto",
 ) -> Tensor:
     """Map points into the open unit cube.
 
@@ -29,6 +33,7 @@ def contract(
     Args:
         points: (..., 3) p, any finite value.
         half_extent: half-axes of the box around the origin that is scaled to [-1, 1]^3, positive.
+        used: the number of points in use, see `hyrfpack.ops.rows`; None if all are.
         implementation: "auto", "reference" or "gpu" (float32). "gpu" has no backward pass and is available only if
             no gradient is needed.
 
@@ -49,5 +54,5 @@ def contract(
     if choose_implementation("contract", implementation, available, points) == "gpu":
         from hyrfpack.ops.contraction import gpu
 
-        return gpu.contract(points, half_extent)
+        return gpu.contract(points, half_extent, used)
     return reference.contract(points if half_extent == UNIT_HALF_EXTENT else points / tensor_like(half_extent, points))

@@ -11,12 +11,19 @@ from torch.autograd.function import once_differentiable
 from hyrfpack.ops.dispatch import choose_implementation
 from hyrfpack.ops.hash_encode import reference
 from hyrfpack.ops.hash_encode.reference import cells, corner_rows, level_offsets, level_resolutions
+from hyrfpack.ops.rows import clear_unused_rows
 
 __all__ = ["cells", "corner_rows", "hash_encode", "level_offsets", "level_resolutions"]
 
 
 def hash_encode(
-    coords: Tensor, table: Tensor, resolutions: tuple[int, ...], log2_table_size: int, *, implementation: str = "auto"
+    coords: Tensor,
+    table: Tensor,
+    resolutions: tuple[int, ...],
+    log2_table_size: int,
+    *,
+    used: Tensor | None = None,
+    implementation: str = "auto",
 ) -> Tensor:
     """Interpolate features trilinearly between the 8 vertices around each point, on every level.
 
@@ -29,6 +36,7 @@ def hash_encode(
         table: (rows, F) features of all levels, concatenated as `level_offsets` defines.
         resolutions: (L,) vertices per axis, each at least 2; see `level_resolutions`.
         log2_table_size: base-2 logarithm of the maximum number of rows per level; 1 to 28.
+        used: the number of points in use, see `hyrfpack.ops.rows`; None if all are.
         implementation: "auto", "reference", "cpu" or "gpu" (the last two take float32 and two features per level).
 
     Returns:
@@ -56,9 +64,15 @@ def hash_encode(
         raise ValueError(f"table has {table.shape[0]} rows; these levels need {rows}")
     available = ("reference", "cpu", "gpu") if table.shape[1] == 2 else ("reference",)
     chosen = choose_implementation("hash_encode", implementation, available, coords, table)
+    if chosen == "gpu":
+        return _HashEncode.apply(coords, table, tuple(resolutions), log2_table_size, _kernels(chosen), used)
+    if used is not None:
+        coords = clear_unused_rows(coords, used)
     if chosen == "reference":
-        return reference.hash_encode(coords, table, resolutions, log2_table_size)
-    return _HashEncode.apply(coords, table, tuple(resolutions), log2_table_size, _kernels(chosen))
+        features = reference.hash_encode(coords, table, resolutions, log2_table_size)
+    else:
+        features = _HashEncode.apply(coords, table, tuple(resolutions), log2_table_size, _kernels(chosen))
+    return features if used is None else clear_unused_rows(features, used)
 
 
 def _kernels(implementation: str) -> ModuleType:
@@ -77,22 +91,27 @@ class _HashEncode(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx, coords: Tensor, table: Tensor, resolutions: tuple[int, ...], log2_table_size: int, kernels: ModuleType
+        ctx,
+        coords: Tensor,
+        table: Tensor,
+        resolutions: tuple[int, ...],
+        log2_table_size: int,
+        kernels: ModuleType,
+        *used: Tensor | None,
     ) -> Tensor:
-        ctx.save_for_backward(coords, table)
+        ctx.save_for_backward(coords, table, *used)
         ctx.settings = resolutions, log2_table_size
         ctx.kernels = kernels
-        return kernels.encode(coords, table, resolutions, log2_table_size)
+        return kernels.encode(coords, table, resolutions, log2_table_size, *used)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, grad: Tensor) -> tuple[Tensor | None, ...]:
-        arguments = (*ctx.saved_tensors, *ctx.settings, grad)
+        coords, table, *used = ctx.saved_tensors
+        arguments = (coords, table, *ctx.settings, grad, *used)
         needs_coords, needs_table = ctx.needs_input_grad[:2]
         return (
             ctx.kernels.grad_coords(*arguments) if needs_coords else None,
             ctx.kernels.grad_table(*arguments) if needs_table else None,
-            None,
-            None,
-            None,
+            *[None] * (3 + len(used)),
         )

@@ -25,6 +25,7 @@ import triton.language as tl
 from torch import Tensor
 
 from hyrfpack.ops.gpu_pairs import unpack_pair
+from hyrfpack.ops.gpu_rows import count_used_rows
 from hyrfpack.ops.hash_encode.reference import PRIME_Y, PRIME_Z, level_offsets
 
 # Each thread handles one point, so that no value moves between threads on its way to a load or an atomic. With 32
@@ -76,11 +77,14 @@ def vertex_row(x, y, z, mask):
 
 
 @triton.jit(do_not_specialize=["points", "axis_stride"])
-def encode_kernel(coords, axis_stride, point_stride, table, levels, out, points, POINTS: tl.constexpr):
+def encode_kernel(coords, axis_stride, point_stride, table, levels, out, points, used, POINTS: tl.constexpr):
     """Write the features of a block of points (grid axis 0) on a level (grid axis 1) to planar `out` (2L, N)."""
     start, level = tl.program_id(0).to(tl.int64) * POINTS, tl.program_id(1)
+    count = count_used_rows(used, points)
+    if start >= count:
+        return
     lane = tl.arange(0, POINTS)
-    inside = lane < points - start
+    inside = lane < count - start
     x1, y1, z1, row_x0, row_x1, row_y0, row_y1, row_z0, row_z1, span, mask, offset = _locate_cell(
         coords, axis_stride, point_stride, levels, level, start, lane, inside
     )
@@ -102,12 +106,15 @@ def encode_kernel(coords, axis_stride, point_stride, table, levels, out, points,
 @triton.jit(do_not_specialize=["points", "axis_stride", "feature_stride"])
 def grad_table_kernel(
     coords, axis_stride, point_stride, levels, copies,
-    grad, feature_stride, grad_stride, out, points, POINTS: tl.constexpr,
+    grad, feature_stride, grad_stride, out, points, used, POINTS: tl.constexpr,
 ):  # fmt: skip
     """Add gradients of a block of points (grid axis 0) to a copy of a level (grid axis 1) in `out` (rows, 2)."""
     start, level = tl.program_id(0).to(tl.int64) * POINTS, tl.program_id(1)
+    count = count_used_rows(used, points)
+    if start >= count:
+        return
     lane = tl.arange(0, POINTS)
-    inside = lane < points - start
+    inside = lane < count - start
     grad += (2 * level).to(tl.int64) * feature_stride + start * grad_stride
     grad0 = tl.load(grad + lane * grad_stride, mask=inside, other=0.0)
     grad1 = tl.load(grad + feature_stride + lane * grad_stride, mask=inside, other=0.0)
@@ -163,13 +170,17 @@ def grad_coords_kernel(
     out_axis_stride,
     out_point_stride,
     points,
+    used,
     LEVELS: tl.constexpr,
     POINTS: tl.constexpr,
 ):
     """Write the gradient of the coordinates for a block of points (grid axis 0), summed over levels in order."""
     start = tl.program_id(0).to(tl.int64) * POINTS
+    count = count_used_rows(used, points)
+    if start >= count:
+        return
     lane = tl.arange(0, POINTS)
-    inside = lane < points - start
+    inside = lane < count - start
     grad += start * grad_stride
     total_x, total_y = tl.zeros([POINTS], tl.float32), tl.zeros([POINTS], tl.float32)
     total_z = tl.zeros([POINTS], tl.float32)
@@ -273,7 +284,9 @@ def rows_as_words(table: Tensor) -> Tensor:
     return table.view(torch.int64)
 
 
-def encode(coords: Tensor, table: Tensor, resolutions: tuple[int, ...], log2_table_size: int) -> Tensor:
+def encode(
+    coords: Tensor, table: Tensor, resolutions: tuple[int, ...], log2_table_size: int, used: Tensor | None = None
+) -> Tensor:
     """Compute the features (N, 2L), stored planar, of coords (N, 3), in any layout, from a table (rows, 2)."""
     points = coords.shape[0]
     features = coords.new_empty((2 * len(resolutions), points))
@@ -286,6 +299,7 @@ def encode(coords: Tensor, table: Tensor, resolutions: tuple[int, ...], log2_tab
             level_parameters(resolutions, log2_table_size, coords.device),
             features,
             points,
+            used,
             POINTS=_POINTS_PER_PROGRAM,
             num_warps=_WARPS_PER_PROGRAM,
             enable_fp_fusion=True,
@@ -294,7 +308,12 @@ def encode(coords: Tensor, table: Tensor, resolutions: tuple[int, ...], log2_tab
 
 
 def grad_table(
-    coords: Tensor, table: Tensor, resolutions: tuple[int, ...], log2_table_size: int, grad: Tensor
+    coords: Tensor,
+    table: Tensor,
+    resolutions: tuple[int, ...],
+    log2_table_size: int,
+    grad: Tensor,
+    used: Tensor | None = None,
 ) -> Tensor:
     """Compute the gradient of the table, in its shape, from the gradient (N, 2L) of the features, in any layout.
 
@@ -309,7 +328,7 @@ def grad_table(
     result = table.new_zeros(copies.total_rows, 2)
     grad_table_kernel[_program_count(points), len(resolutions)](
         coords.detach(), coords.stride(1), coords.stride(0), levels, copies.layout,
-        grad, grad.stride(1), grad.stride(0), result, points,
+        grad, grad.stride(1), grad.stride(0), result, points, used,
         POINTS=_POINTS_PER_PROGRAM, num_warps=_WARPS_PER_PROGRAM, enable_fp_fusion=True,
     )  # fmt: skip
     if copies.copied_levels:
@@ -320,7 +339,12 @@ def grad_table(
 
 
 def grad_coords(
-    coords: Tensor, table: Tensor, resolutions: tuple[int, ...], log2_table_size: int, grad: Tensor
+    coords: Tensor,
+    table: Tensor,
+    resolutions: tuple[int, ...],
+    log2_table_size: int,
+    grad: Tensor,
+    used: Tensor | None = None,
 ) -> Tensor:
     """Compute the gradient (N, 3) of the coordinates, in their layout, from the gradient (N, 2L) of the features."""
     points = coords.shape[0]
@@ -339,6 +363,7 @@ def grad_coords(
             result.stride(1),
             result.stride(0),
             points,
+            used,
             LEVELS=len(resolutions),
             POINTS=_POINTS_PER_PROGRAM,
             num_warps=_WARPS_PER_PROGRAM,

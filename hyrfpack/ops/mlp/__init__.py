@@ -10,6 +10,7 @@ from torch.autograd.function import once_differentiable
 
 from hyrfpack.ops.dispatch import choose_implementation
 from hyrfpack.ops.mlp import reference
+from hyrfpack.ops.rows import clear_unused_rows
 
 __all__ = ["MAX_GPU_LAYER_WIDTH", "mlp"]
 
@@ -23,6 +24,7 @@ def mlp(
     biases: Sequence[Tensor],
     *,
     mixed: bool = False,
+    used: Tensor | None = None,
     implementation: str = "auto",
 ) -> Tensor:
     """Apply linear layers with ReLU between them, and no activation after the last, to every row.
@@ -35,6 +37,7 @@ def mlp(
         biases: one (out,) vector for each layer.
         mixed: forward and backward round the factors of products to bfloat16 and sum in float32, which is fast on the
             matrix units of a GPU. "cpu" always multiplies in float32.
+        used: the number of rows in use, see `hyrfpack.ops.rows`; None if all are.
         implementation: "auto", "reference", "cpu" or "gpu" (the last two take float32 only). The GPU kernels support
             two hidden layers, inputs and hidden layers of width 128 or less, and at most 16 outputs; otherwise "gpu"
             falls back to "reference".
@@ -62,11 +65,15 @@ def mlp(
         shapes = [tuple(tensor.shape) for tensor in (x, *weights, *biases)]
         raise ValueError(f"x, weights and biases do not form layers: {shapes}")
     chosen = choose_implementation("mlp", implementation, ("reference", "cpu", "gpu"), x, *weights, *biases)
-    if chosen == "cpu":
-        return _CpuMlp.apply(x, *weights, *biases)
     if chosen == "gpu" and len(weights) == 3 and max(widths[:3]) <= MAX_GPU_LAYER_WIDTH and widths[3] <= 16:
-        return _GpuMlp.apply(x, mixed, *weights, *biases)
-    return reference.mlp(x, weights, biases, mixed)
+        return _GpuMlp.apply(x, mixed, used, *weights, *biases)
+    if used is not None:
+        x = clear_unused_rows(x, used)
+    if chosen == "cpu":
+        y = _CpuMlp.apply(x, *weights, *biases)
+    else:
+        y = reference.mlp(x, weights, biases, mixed)
+    return y if used is None else clear_unused_rows(y, used)
 
 
 def _halves(parameters: Sequence[Tensor]) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
@@ -103,12 +110,12 @@ class _GpuMlp(torch.autograd.Function):
     """Autograd function of `mlp` on a GPU."""
 
     @staticmethod
-    def forward(ctx, x: Tensor, mixed: bool, *parameters: Tensor) -> Tensor:
+    def forward(ctx, x: Tensor, mixed: bool, used: Tensor | None, *parameters: Tensor) -> Tensor:
         from hyrfpack.ops.mlp import gpu
 
         weights, biases = parameters[:3], parameters[3:]
-        result, packed = gpu.forward(x, weights, biases, mixed)
-        ctx.save_for_backward(x, packed, *biases)
+        result, packed = gpu.forward(x, weights, biases, mixed, used)
+        ctx.save_for_backward(x, used, packed, *biases)
         ctx.mixed = mixed
         ctx.widths = x.shape[1], *(weight.shape[0] for weight in weights)
         return result
@@ -118,7 +125,7 @@ class _GpuMlp(torch.autograd.Function):
     def backward(ctx, grad: Tensor) -> tuple[Tensor | None, ...]:
         from hyrfpack.ops.mlp import gpu
 
-        x, packed, *biases = ctx.saved_tensors
+        x, used, packed, *biases = ctx.saved_tensors
         needs_x = ctx.needs_input_grad[0]
-        grad_x, grad_weights, grad_biases = gpu.backward(x, packed, biases, ctx.widths, grad, needs_x, ctx.mixed)
-        return grad_x, None, *grad_weights, *grad_biases
+        grad_x, grad_weights, grad_biases = gpu.backward(x, packed, biases, ctx.widths, grad, needs_x, ctx.mixed, used)
+        return grad_x, None, None, *grad_weights, *grad_biases

@@ -18,6 +18,7 @@ import triton.language as tl
 from torch import Tensor
 
 from hyrfpack.ops.dispatch import is_interpreting
+from hyrfpack.ops.gpu_rows import count_used_rows
 from hyrfpack.ops.mlp.tiles import (
     kernel_widths,
     linear,
@@ -46,7 +47,9 @@ class Rows(NamedTuple):
     feature_stride: int
 
 
-def forward(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], mixed: bool) -> tuple[Tensor, Tensor]:
+def forward(
+    x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], mixed: bool, used: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     """Compute the outputs (N, O) of rows (N, I), and the packed weights for `backward`."""
     widths = [x.shape[1], *(weight.shape[0] for weight in weights)]
     multiplication = product_precision(mixed)
@@ -61,6 +64,7 @@ def forward(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], mixe
             tuple(bias.contiguous() for bias in biases),
             result,
             x.shape[0],
+            used,
             W=kernel_widths(widths),
             PLANAR=x.stride(0) == 1,
             NEEDS_INT64=_needs_int64_offsets(x),
@@ -80,6 +84,7 @@ def backward(
     grad: Tensor,
     needs_x: bool,
     mixed: bool,
+    used: Tensor | None = None,
 ) -> tuple[Tensor | None, list[Tensor], list[Tensor]]:
     """Compute the gradients of x, weights and biases from the gradient (N, O) of the outputs.
 
@@ -115,6 +120,7 @@ def backward(
             Rows(written, *written.stride()),
             partials,
             x.shape[0],
+            used,
             W=kernel_widths(widths),
             **launch,
             PLANAR=planar,
@@ -214,13 +220,14 @@ def _opaque_zero(start, count):
 
 @triton.jit(do_not_specialize=["count"])
 def forward_kernel(
-    x, packed, biases, y, count,
+    x, packed, biases, y, count, used,
     W: tl.constexpr, PLANAR: tl.constexpr, NEEDS_INT64: tl.constexpr, BLOCK: tl.constexpr, PRECISION: tl.constexpr,
 ):  # fmt: skip
-    """Compute y (count, OUT) from the `Rows` x (count, IN).
+    """Compute y (count, OUT) from the `Rows` x (count, IN), as far as they are in use.
 
     W: `KernelWidths`. PLANAR: whether the stride between points of x is 1.
     """
+    count = count_used_rows(used, count)
     b1, b2, b3 = biases
     w2 = packed + W.H1_P * W.IN_P
     w3 = w2 + W.H2_P * W.H1_P
@@ -241,7 +248,7 @@ def forward_kernel(
 
 @triton.jit(do_not_specialize=["count"])
 def backward_kernel(
-    x, packed, biases, grad, grad_x, partials, count,
+    x, packed, biases, grad, grad_x, partials, count, used,
     W: tl.constexpr, UPPER_LAYERS: tl.constexpr, FIRST_LAYER: tl.constexpr, NEEDS_X: tl.constexpr,
     PLANAR: tl.constexpr, NEEDS_INT64: tl.constexpr, BLOCK: tl.constexpr, PRECISION: tl.constexpr,
 ):  # fmt: skip
@@ -250,6 +257,7 @@ def backward_kernel(
     x, grad and grad_x are `Rows`. Each program writes its sums to its row of `partials` (programs, parameters): W1, W2,
     W3, b1, b2, b3, flattened.
     """
+    count = count_used_rows(used, count)
     b1, b2 = biases
     w2 = packed + W.H1_P * W.IN_P
     w3 = w2 + W.H2_P * W.H1_P

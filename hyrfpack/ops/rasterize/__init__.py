@@ -27,11 +27,13 @@ class Rasterization:
         depth: (H, W) mean camera z weighted by T alpha, in world units, 0 where nothing is hit; not differentiable.
             None unless requested.
         visible: (N,) bool, whether a Gaussian is in front of the near plane and reaches alpha >= 1/255 in some tile.
-        pairs: number of (Gaussian, tile) pairs blended.
+        pairs: number of (Gaussian, tile) pairs blended, or reserved.
         seconds: wall time of the stages project, sort, bin and blend, and of cull and decode if colours were decoded;
             empty on the GPU, where the stages run asynchronously.
         nonfinite: names of the inputs (means, quats, scales, opacities, colors) that contain NaN or infinity. Such
             Gaussians are skipped or corrupt the pixels they cover; callers must check this field.
+        demand: None, or if pairs are reserved, (2,) int64 on the device, which callers must check instead: not 0 if an
+            input contains NaN or infinity; and the number of pairs. If it exceeds the reserve, Gaussians are missing.
     """
 
     rgb: Tensor
@@ -41,6 +43,7 @@ class Rasterization:
     pairs: int
     seconds: dict[str, float]
     nonfinite: tuple[str, ...]
+    demand: Tensor | None = None
 
 
 def rasterize(
@@ -50,6 +53,8 @@ def rasterize(
     settings: RasterSettings = RasterSettings(),  # noqa: B008 - frozen
     *,
     absgrad: Tensor | None = None,
+    used: Tensor | None = None,
+    reserve: int | None = None,
     implementation: str = "auto",
 ) -> Rasterization:
     """Render 3D Gaussians from a camera (3D Gaussian Splatting, Kerbl et al. 2023).
@@ -76,13 +81,16 @@ def rasterize(
         settings: near plane, antialiasing, transmittance_min, depth, culling and low-pass filter.
         absgrad: (N, 2) buffer to which backward adds the sums over pixels of |dL/d mean2d| (x, y) in 1/px,
             the criterion of densification by absolute gradients.
+        used: the number of Gaussians in use, see `hyrfpack.ops.rows`, for "gpu"; None if all are.
+        reserve: number of (Gaussian, tile) pairs that "gpu" reserves memory for, without waiting for their number; see
+            `Rasterization.demand`. None waits, and reserves as many as there are.
         implementation: "auto", "reference", "cpu" or "gpu"; with a `Shading` "reference" runs each step in its fastest
             implementation, and there is no "cpu".
 
     Raises:
         FloatingPointError: with a `Shading`, a centre is NaN or infinite ("reference"; "gpu" reports it as
             `nonfinite`).
-        ValueError: shapes, dtypes or devices do not match.
+        ValueError: shapes, dtypes or devices do not match, or pairs are reserved for another implementation than "gpu".
         MemoryError: there are more (Gaussian, tile) pairs than "cpu" (2^28) or "gpu" (2^31) can index.
 
     Example:
@@ -102,17 +110,18 @@ def rasterize(
         raise ValueError(f"absgrad is {absgrad.dtype} {tuple(absgrad.shape)}, expected {dtype} {(count, 2)}")
 
     chosen = choose_implementation("rasterize", implementation, ("reference", "cpu", "gpu"), *gaussians, colors)
-    run: Callable[..., tuple] = reference.rasterize
     if chosen == "gpu":
         from hyrfpack.ops.rasterize import gpu
 
-        run = gpu.rasterize
-    elif chosen == "cpu":
+        return Rasterization(*gpu.rasterize(gaussians, colors, viewport, settings, absgrad, used, reserve))
+    if used is not None or reserve is not None:
+        raise ValueError(f"the {chosen} implementation reserves no pairs and takes all Gaussians")
+    run: Callable[..., tuple] = reference.rasterize
+    if chosen == "cpu":
         from hyrfpack.ops.rasterize import cpu
 
         run = cpu.rasterize
     results = run(gaussians, colors, viewport, settings, absgrad)
-    if chosen != "gpu":  # The GPU kernels check every number and have set this field already.
-        inputs = zip(INPUT_SHAPES, (*gaussians, colors), strict=True)
-        results += (tuple(name for name, tensor in inputs if not all_finite(tensor)),)
+    inputs = zip(INPUT_SHAPES, (*gaussians, colors), strict=True)
+    results += (tuple(name for name, tensor in inputs if not all_finite(tensor)),)
     return Rasterization(*results)

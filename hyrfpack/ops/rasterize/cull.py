@@ -48,3 +48,30 @@ def frustum_cull(
         & (v < (height + margin_y - cy) * z)
     )
     return torch.nonzero(inside).squeeze(-1)
+
+
+def frustum_cull_into(
+    positions: Tensor, viewport: Viewport, near: float, tolerance: float, reserve: int, *, implementation: str = "auto"
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return what `frustum_cull` does, without waiting for the GPU, in memory for a given number of indices.
+
+    Args:
+        positions: (N, 3) float32 world units, at least one.
+        viewport, near, tolerance: as in `frustum_cull`.
+        reserve: the largest number of indices returned; others are missing.
+        implementation: "auto" or "gpu".
+
+    Returns:
+        Distinct indices (min(reserve, N),) int64, of which those of points inside come first, ascending; (1,) int64,
+        how many these are; and (2,) int64, which callers must check: not 0 if a position is NaN or infinite, and the
+        number of all points inside, which may exceed the reserve. All on the device.
+
+    Raises:
+        ValueError: there is no kernel for these positions.
+    """
+    chosen = choose_implementation("frustum_cull", implementation, ("reference", "gpu"), positions)
+    if chosen != "gpu":
+        raise ValueError(f"the {chosen} implementation cannot cull into a reserve")
+    from hyrfpack.ops.rasterize import gpu_cull
+
+    return gpu_cull.frustum_cull_into(positions, viewport, near, tolerance, reserve)

@@ -43,14 +43,16 @@ class BlendedImage:
     blended: Tensor
 
 
-def bin_and_blend(projection: Projection, viewport: Viewport, settings: RasterSettings) -> BlendedImage:
-    """Bin and blend projected Gaussians. Synchronises with the device once.
+def bin_and_blend(
+    projection: Projection, viewport: Viewport, settings: RasterSettings, reserve: int | None = None
+) -> BlendedImage:
+    """Bin and blend projected Gaussians. Synchronises with the device once, unless pairs are reserved.
 
     Raises:
         MemoryError: there are more than 2^31 - 64 pairs.
     """
     width, height, depth = int(viewport.width), int(viewport.height), bool(settings.depth)
-    pairs = bin_pairs(projection, width, height)
+    pairs = bin_pairs(projection, width, height, reserve)
     device = projection.keys.device
     rgb = torch.empty(height, width, 3, device=device)
     transmittance = torch.empty(height, width, device=device)
@@ -71,20 +73,28 @@ class _View:
     camera: Tensor
     viewport: Viewport
     settings: RasterSettings
-    absgrad: Tensor | None
+    absgrad: Tensor | None = None
+    used: Tensor | None = None
+    reserve: int | None = None
 
 
 def rasterize(
-    gaussians: Gaussians3D, colors: Tensor, viewport: Viewport, settings: RasterSettings, absgrad: Tensor | None
-) -> tuple[Tensor, Tensor, Tensor | None, Tensor, int, dict[str, float], tuple[str, ...]]:
+    gaussians: Gaussians3D,
+    colors: Tensor,
+    viewport: Viewport,
+    settings: RasterSettings,
+    absgrad: Tensor | None,
+    used: Tensor | None = None,
+    reserve: int | None = None,
+) -> tuple[Tensor, Tensor, Tensor | None, Tensor, int, dict[str, float], tuple[str, ...], Tensor | None]:
     """Compute `hyrfpack.ops.rasterize.rasterize`; the result is a tuple of the fields of `Rasterization` in order."""
     camera = gpu_project.pack_camera(
         viewport, settings.near, colors.device, low_pass_variance=settings.low_pass_variance
     )
-    view = _View(camera, viewport, settings, None if absgrad is None else absgrad.detach())
+    view = _View(camera, viewport, settings, None if absgrad is None else absgrad.detach(), used, reserve)
     report: dict = {}
     rgb, transmittance, depths, visible = _Rasterize.apply(*gaussians, colors, view, report)
-    return rgb, transmittance, depths, visible, report["pairs"], {}, report["nonfinite"]
+    return rgb, transmittance, depths, visible, report["pairs"], {}, report["nonfinite"], report["demand"]
 
 
 def _project(gaussians: Gaussians3D, colors: Tensor, view: _View) -> Projection:
@@ -93,7 +103,8 @@ def _project(gaussians: Gaussians3D, colors: Tensor, view: _View) -> Projection:
     projection = Projection.empty(total, colors.device)
     if total:
         gpu_project.project[(triton.cdiv(total, gpu_project.GAUSSIANS_PER_PROGRAM),)](
-            gaussians, colors, view.camera, total, int(view.viewport.width), int(view.viewport.height), projection,
+            gaussians, colors, view.camera, total, view.used, int(view.viewport.width), int(view.viewport.height),
+            projection,
             ANTIALIASED=bool(view.settings.antialiased), BLOCK=gpu_project.GAUSSIANS_PER_PROGRAM,
             num_warps=gpu_project.WARPS_PER_PROGRAM, enable_fp_fusion=True,
         )  # fmt: skip
@@ -109,11 +120,12 @@ class _Rasterize(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor, Tensor | None, Tensor]:
         inputs = tuple(tensor.detach().contiguous() for tensor in (means, quats, scales, opacities, colors))
         projection = _project(Gaussians3D(*inputs[:4]), inputs[4], view)
-        image = bin_and_blend(projection, view.viewport, view.settings)
-        report["pairs"], report["nonfinite"] = len(image.pairs.owners), image.pairs.nonfinite
+        image = bin_and_blend(projection, view.viewport, view.settings, view.reserve)
+        pairs = image.pairs
+        report |= {"pairs": len(pairs.owners), "nonfinite": pairs.nonfinite, "demand": pairs.demand}
         visible = projection.visible.view(torch.bool)
         ctx.save_for_backward(*inputs[:4], image.rgb, image.transmittance)
-        ctx.projection, ctx.pairs, ctx.blended, ctx.view = projection, image.pairs, image.blended, view
+        ctx.projection, ctx.pairs, ctx.blended, ctx.view = projection, pairs, image.blended, view
         ctx.mark_non_differentiable(*([visible] if image.depth is None else [visible, image.depth]))
         return image.rgb, image.transmittance, image.depth, visible
 
@@ -140,7 +152,7 @@ class _Rasterize(torch.autograd.Function):
                 num_warps=_SUM_WARPS_PER_PROGRAM, enable_fp_fusion=True,
             )  # fmt: skip
         gpu_project.project_backward[(triton.cdiv(total, gpu_project.GAUSSIANS_PER_PROGRAM),)](
-            sums, pairs.slot_starts, projection.counts, Gaussians3D(*inputs), view.camera, total,
+            sums, pairs.slot_starts, projection.counts, Gaussians3D(*inputs), view.camera, total, view.used,
             Gaussians3D(*grads[:4]), grads[4],
             view.absgrad, *(view.absgrad.stride() if with_absgrad else (0, 0)),
             ANTIALIASED=bool(view.settings.antialiased), ABSGRAD=with_absgrad,
@@ -187,7 +199,7 @@ def replay_transmittance(
     camera = gpu_project.pack_camera(
         viewport, settings.near, colors.device, low_pass_variance=settings.low_pass_variance
     )
-    projection = _project(gaussians, colors, _View(camera, viewport, settings, None))
+    projection = _project(gaussians, colors, _View(camera, viewport, settings))
     image = bin_and_blend(projection, viewport, settings)
     replayed = torch.full_like(image.transmittance, torch.nan)
     rows = _empty_rows(len(image.pairs.owners), colors.device)

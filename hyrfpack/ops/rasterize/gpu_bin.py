@@ -44,7 +44,9 @@ class Pairs:
         owners: (P,) int32, the Gaussian of each pair.
         slots: (P,) int64, the slot of each pair.
         slot_starts: (N,) int32, the first slot of each Gaussian; undefined for Gaussians that are not drawn.
-        nonfinite: names of the inputs that contain NaN or infinity.
+        nonfinite: names of the inputs that contain NaN or infinity; empty if pairs are reserved.
+        demand: None, or if pairs are reserved, (2,) int64: the bits of inputs that contain NaN or infinity, in the
+            order of FLAGGED_INPUTS, and the number of pairs, which may exceed the reserve.
     """
 
     tile_starts: Tensor
@@ -52,16 +54,19 @@ class Pairs:
     slots: Tensor
     slot_starts: Tensor
     nonfinite: tuple[str, ...]
+    demand: Tensor | None
 
 
-@triton.jit(do_not_specialize=["total", "width", "height"])
+@triton.jit(do_not_specialize=["total", "width", "height", "capacity"])
 def _list_pairs_kernel(
     order,
     ends,
     records,
+    counts,
     total,
     width,
     height,
+    capacity,
     tiles,
     owners,
     slot_starts,
@@ -73,6 +78,8 @@ def _list_pairs_kernel(
     Args:
         order: (N,) int64, the Gaussian at each position of the depth order.
         ends: (N,) int64, the end of that Gaussian's slots.
+        counts: (N,) int32, the number of tiles of each Gaussian; set to 0 for one whose slots would exceed `capacity`.
+            It is not drawn.
         tiles, owners: (P,), written: the tile and the Gaussian of each slot.
         slot_starts: (N,), written: the first slot of each Gaussian.
     """
@@ -80,9 +87,12 @@ def _list_pairs_kernel(
     live = place < total
     end = tl.load(ends + place, mask=live, other=0)
     at = tl.load(ends + place - 1, mask=live & (place > 0), other=0)
-    at = tl.where(live, at, end)
-    drawn = at < end
+    drawn = live & (at < end)
     owner = tl.load(order + place, mask=drawn, other=0)
+    has_room = end <= capacity
+    tl.store(counts + owner, tl.zeros([BLOCK], tl.int32), mask=drawn & (has_room == 0))
+    drawn &= has_room
+    at = tl.where(drawn, at, end)
     tl.store(slot_starts + owner, at.to(tl.int32), mask=drawn)
     record = records + owner * RECORD_WORDS
     u_x, u_y = unpack_pair(tl.load(record + U_SLOPES, mask=drawn, other=0))
@@ -126,10 +136,12 @@ def _list_pairs_kernel(
         missing -= 1
 
 
-def bin_pairs(projection: Projection, width: int, height: int) -> Pairs:
+def bin_pairs(projection: Projection, width: int, height: int, reserve: int | None) -> Pairs:
     """Sort Gaussians by depth and list the pairs of each tile.
 
-    Synchronises with the device once, to read the number of pairs.
+    Args:
+        reserve: number of pairs that get memory; Gaussians without room in it are not drawn. None synchronises with
+            the device once, to read the number of pairs.
 
     Raises:
         MemoryError: there are more than MAX_PAIRS pairs.
@@ -139,7 +151,8 @@ def bin_pairs(projection: Projection, width: int, height: int) -> Pairs:
     order = torch.sort(projection.keys, stable=True)[1]
     ends = projection.flags_and_ends[1:]
     torch.cumsum(projection.counts[order], 0, dtype=torch.int64, out=ends)
-    bits, count = projection.flags_and_ends[::total].tolist() if total else (0, 0)
+    demand = projection.flags_and_ends[::total] if total else projection.flags_and_ends.new_zeros(2)
+    bits, count = demand.tolist() if reserve is None else (0, reserve)
     if count > MAX_PAIRS:
         raise MemoryError(f"{count} pairs of a Gaussian and a tile; at most {MAX_PAIRS} can be drawn")
 
@@ -148,9 +161,12 @@ def bin_pairs(projection: Projection, width: int, height: int) -> Pairs:
     # Tiles are int16 if that is enough, so that the radix sort needs half the passes.
     kind = torch.int16 if tile_total + 1 < 2**15 else torch.int32
     tiles = torch.empty(count, dtype=kind, device=device)
-    if count:
+    if reserve is not None:
+        tiles.fill_(tile_total + 1)  # Surplus slots lie behind those of all tiles.
+    if total:
         _list_pairs_kernel[(triton.cdiv(total, _GAUSSIANS_PER_PROGRAM),)](
-            order, ends, projection.records, total, width, height, tiles, owners, slot_starts,
+            order, ends, projection.records, projection.counts, total, width, height, count,
+            tiles, owners, slot_starts,
             BLOCK=_GAUSSIANS_PER_PROGRAM, TILES_PER_STORE=_TILES_PER_STORE,
             num_warps=_WARPS_PER_PROGRAM, enable_fp_fusion=True,
         )  # fmt: skip
@@ -158,4 +174,4 @@ def bin_pairs(projection: Projection, width: int, height: int) -> Pairs:
     edges = torch.arange(tile_total + 2, dtype=kind, device=device)
     tile_starts = torch.searchsorted(tiles, edges, out_int32=True)
     nonfinite = tuple(name for bit, name in enumerate(FLAGGED_INPUTS) if bits >> bit & 1)
-    return Pairs(tile_starts, owners[slots], slots, slot_starts, nonfinite)
+    return Pairs(tile_starts, owners[slots], slots, slot_starts, nonfinite, None if reserve is None else demand)

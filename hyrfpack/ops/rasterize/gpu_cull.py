@@ -1,6 +1,6 @@
 """Culls Gaussians in Triton: one launch tests all positions, another lists the result.
 
-The host synchronises with the device once, between the two launches.
+Between the two launches the host waits for the number of Gaussians in view, unless it reserves memory for the result.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from hyrfpack.ops.gpu_rows import partition_rows
 from hyrfpack.ops.rasterize.gpu_project import (
     GAUSSIANS_PER_PROGRAM,
     WARPS_PER_PROGRAM,
@@ -38,35 +39,41 @@ def frustum_kernel(positions, camera, total, inside, has_nonfinite, BLOCK: tl.co
     tl.store(has_nonfinite + tl.zeros_like(index), one, mask=live & (finite == 0))
 
 
-@triton.jit(do_not_specialize=["total"])
-def list_inside_kernel(inside, ends, total, indices, BLOCK: tl.constexpr):
-    """Write the indices of the positions inside, in order; ends: (N,) int64, the running count of those inside."""
-    index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    chosen = tl.load(inside + index, mask=index < total, other=0) != 0
-    tl.store(indices + tl.load(ends + index, mask=chosen, other=1) - 1, index.to(tl.int64), mask=chosen)
-
-
 def frustum_cull(positions: Tensor, viewport: Viewport, near: float, tolerance: float) -> Tensor:
     """Compute `hyrfpack.ops.rasterize.cull.frustum_cull`. Synchronises with the device once."""
+    if not len(positions):
+        return torch.empty(0, dtype=torch.int64, device=positions.device)
+    inside, flag_and_ends = _test_positions(positions, viewport, near, tolerance)
+    has_nonfinite, count = flag_and_ends[:: len(positions)].tolist()
+    if has_nonfinite:
+        raise FloatingPointError("positions hold NaN or infinity")
+    return partition_rows(inside, flag_and_ends[1:], count)[0]
+
+
+def frustum_cull_into(
+    positions: Tensor, viewport: Viewport, near: float, tolerance: float, reserve: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Compute `hyrfpack.ops.rasterize.cull.frustum_cull_into`."""
+    inside, flag_and_ends = _test_positions(positions, viewport, near, tolerance)
+    index, used = partition_rows(inside, flag_and_ends[1:], min(reserve, len(positions)))
+    return index, used, flag_and_ends[:: len(positions)]
+
+
+def _test_positions(positions: Tensor, viewport: Viewport, near: float, tolerance: float) -> tuple[Tensor, Tensor]:
+    """Test N positions, at least one, for lying in the frustum.
+
+    Returns:
+        (N,) uint8, whether each lies inside; and (1 + N,) int64, whether any of them is not finite, and the running
+        count of those inside.
+    """
     total, device = len(positions), positions.device
-    if not total:
-        return torch.empty(0, dtype=torch.int64, device=device)
     camera = pack_camera(viewport, near, device, tolerance)
     inside = torch.empty(total, dtype=torch.uint8, device=device)
     flag_and_ends = torch.empty(1 + total, dtype=torch.int64, device=device)
     flag_and_ends[:1].zero_()  # An assignment of 0 would copy it from the host and block.
-    programs = (triton.cdiv(total, GAUSSIANS_PER_PROGRAM),)
-    frustum_kernel[programs](
+    frustum_kernel[(triton.cdiv(total, GAUSSIANS_PER_PROGRAM),)](
         positions.detach().contiguous(), camera, total, inside, flag_and_ends, BLOCK=GAUSSIANS_PER_PROGRAM,
         num_warps=WARPS_PER_PROGRAM, enable_fp_fusion=True,
     )  # fmt: skip
     torch.cumsum(inside, 0, dtype=torch.int64, out=flag_and_ends[1:])
-    has_nonfinite, count = flag_and_ends[::total].tolist()
-    if has_nonfinite:
-        raise FloatingPointError("positions hold NaN or infinity")
-    indices = torch.empty(count, dtype=torch.int64, device=device)
-    if count:
-        list_inside_kernel[programs](
-            inside, flag_and_ends[1:], total, indices, BLOCK=GAUSSIANS_PER_PROGRAM, num_warps=WARPS_PER_PROGRAM
-        )
-    return indices
+    return inside, flag_and_ends

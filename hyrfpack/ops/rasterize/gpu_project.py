@@ -17,6 +17,7 @@ import triton.language as tl
 from torch import Tensor
 
 from hyrfpack.ops.gpu_pairs import pack_pair
+from hyrfpack.ops.gpu_rows import count_used_rows
 from hyrfpack.ops.poses import camera_center
 from hyrfpack.ops.rasterize import reference
 from hyrfpack.ops.rasterize.gpu_ellipse import (
@@ -418,19 +419,28 @@ def flag_colors(flags, color):
 
 @triton.jit(do_not_specialize=["total", "width", "height"])
 def project(
-    gaussians, colors, camera, total, width, height, projection, ANTIALIASED: tl.constexpr, BLOCK: tl.constexpr
+    gaussians, colors, camera, total, used, width, height, projection, ANTIALIASED: tl.constexpr, BLOCK: tl.constexpr
 ):
-    """Project a block of `Gaussians3D` to a `Projection`. A record is written only for a Gaussian that is drawn."""
+    """Project a block of `Gaussians3D` to a `Projection`. A record is written only for a Gaussian that is drawn.
+
+    Those that are not in use are not drawn.
+    """
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    live = index < total
+    used_count = count_used_rows(used, total)
+    if tl.program_id(0) * BLOCK >= used_count:
+        no_tiles = tl.zeros([BLOCK], tl.int32)
+        store_counts(projection, index, index < total, no_tiles + HIDDEN_KEY, no_tiles)
+        return
+    live = index < used_count
     mean, quat, scale, opacity = load_gaussians(gaussians, index, live)
     color = load_rows_3(colors, index, live)
     flag_geometry(projection.flags_and_ends, mean, quat, scale, opacity)
     flag_colors(projection.flags_and_ends, color)
     words, key, count = project_block(mean, quat, scale, opacity, load_camera(camera), width, height, ANTIALIASED)
+    key, count = tl.where(live, key, HIDDEN_KEY), tl.where(live, count, 0)
     store_records(projection.records, index, count > 0, words)
     store_colors(projection.records, index, count > 0, color, words[4])
-    store_counts(projection, index, live, key, count)
+    store_counts(projection, index, index < total, key, count)
 
 
 @triton.jit
@@ -444,7 +454,7 @@ def _store_rows_3(pointer, index, live, a):
 
 @triton.jit(do_not_specialize=["total", "absgrad_row", "absgrad_column"])
 def project_backward(
-    rows, slot_starts, counts, gaussians, camera, total, grads, grad_colors, absgrad, absgrad_row, absgrad_column,
+    rows, slot_starts, counts, gaussians, camera, total, used, grads, grad_colors, absgrad, absgrad_row, absgrad_column,
     ANTIALIASED: tl.constexpr, ABSGRAD: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Backpropagate the gradient row of each Gaussian, summed over tiles, through the projection.
@@ -456,7 +466,10 @@ def project_backward(
         absgrad: (N, 2) with the strides absgrad_row and absgrad_column, incremented.
     """
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    live = index < total
+    used_count = count_used_rows(used, total)
+    if tl.program_id(0) * BLOCK >= used_count:
+        return
+    live = index < used_count
     drawn = live & (tl.load(counts + index, mask=live, other=0) > 0)
     at = rows + tl.load(slot_starts + index, mask=drawn, other=0).to(tl.int64) * GRADIENT_ROW_FLOATS
     sum_u, sum_v = tl.load(at + SUM_U, mask=drawn, other=0.0), tl.load(at + SUM_V, mask=drawn, other=0.0)

@@ -57,13 +57,16 @@ def encode_directions(directions: Tensor, encoding: str) -> Tensor:
     return spherical_harmonics(directions) if encoding == "sh" else frequency_encoding(directions)
 
 
-def encode_views(points: Tensor, viewpoint: Tensor, encoding: str, *, implementation: str = "auto") -> Tensor:
+def encode_views(
+    points: Tensor, viewpoint: Tensor, encoding: str, *, used: Tensor | None = None, implementation: str = "auto"
+) -> Tensor:
     """Encode the viewing directions of points: e(d) with d = (p - o) / |p - o|.
 
     Args:
         points: (N, 3) p.
         viewpoint: (3,) o, in the same units, or (N, 3), one for each point.
         encoding: "sh" or "frequency", see `encode_directions`.
+        used: the number of points in use, see `hyrfpack.ops.rows`; None if all are.
         implementation: "auto", "reference", "cpu" or "gpu" (both float32, one viewpoint). "cpu" and "gpu" have no
             backward pass and are available only if no gradient is needed.
 
@@ -94,5 +97,5 @@ def encode_views(points: Tensor, viewpoint: Tensor, encoding: str, *, implementa
     if chosen == "gpu":
         from hyrfpack.ops.shade import gpu_directions
 
-        return gpu_directions.encode_views(points, viewpoint, encoding, DIRECTION_FEATURES[encoding])
+        return gpu_directions.encode_views(points, viewpoint, encoding, DIRECTION_FEATURES[encoding], used)
     return encode_directions(torch.nn.functional.normalize(points - viewpoint, dim=-1, eps=1e-12), encoding)

@@ -9,6 +9,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from hyrfpack.ops.gpu_rows import count_used_rows
+
 _POINTS_PER_PROGRAM = 128
 
 
@@ -59,11 +61,14 @@ def encode_block(x, y, z, FREQUENCY: tl.constexpr, FIRST: tl.constexpr, HEIGHT: 
 
 @triton.jit(do_not_specialize=["total"])
 def encode_views_kernel(
-    points, viewpoint, total, out, ROWS: tl.constexpr, FREQUENCY: tl.constexpr, BLOCK: tl.constexpr
+    points, viewpoint, total, used, out, ROWS: tl.constexpr, FREQUENCY: tl.constexpr, BLOCK: tl.constexpr
 ):
     """Write the encoded directions, planar (ROWS, N), from a viewpoint (3,) to points (N, 3)."""
     index = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    live, at = index < total, points + index * 3
+    count = count_used_rows(used, total)
+    if tl.program_id(0) * BLOCK >= count:
+        return
+    live, at = index < count, points + index * 3
     x = tl.load(at, mask=live, other=0.0) - tl.load(viewpoint)
     y = tl.load(at + 1, mask=live, other=0.0) - tl.load(viewpoint + 1)
     z = tl.load(at + 2, mask=live, other=0.0) - tl.load(viewpoint + 2)
@@ -74,13 +79,13 @@ def encode_views_kernel(
         tl.store(out + row.to(tl.int64) * total + index[None, :], encoded, mask=live[None, :] & (row < ROWS))
 
 
-def encode_views(points: Tensor, viewpoint: Tensor, encoding: str, features: int) -> Tensor:
+def encode_views(points: Tensor, viewpoint: Tensor, encoding: str, features: int, used: Tensor | None = None) -> Tensor:
     """Compute `directions.encode_views` without gradients; the result (N, features) is stored planar."""
     total = len(points)
     encoded = points.new_empty(features, total)
     if total:
         encode_views_kernel[(triton.cdiv(total, _POINTS_PER_PROGRAM),)](
-            points.detach().contiguous(), viewpoint.detach().contiguous(), total, encoded,
+            points.detach().contiguous(), viewpoint.detach().contiguous(), total, used, encoded,
             ROWS=features, FREQUENCY=encoding == "frequency", BLOCK=_POINTS_PER_PROGRAM, num_warps=4,
             enable_fp_fusion=True,
         )  # fmt: skip
