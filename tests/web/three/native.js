@@ -13,12 +13,13 @@ const longTasks = [];
 new PerformanceObserver((list) => longTasks.push(...list.getEntries().map(({ duration }) => duration)))
   .observe({ type: "longtask" });
 
-const page = {
+export const page = {
   THREE, renderer, scene, camera, longTasks,
+  Kind: HyrfObject,
   object: null,
 
   async load(file, options) {
-    const object = (page.object = await HyrfObject.load(file, options)), { solid } = object.userData.hyrf;
+    const object = (page.object = await page.Kind.load(file, options)), { solid } = object.userData.hyrf;
     scene.background = solid ? new THREE.Color().setRGB(...solid, THREE.SRGBColorSpace) : null;
     scene.add(object);
     object.updateMatrixWorld(true);
