@@ -1,0 +1,154 @@
+"""Train one data set with several numbers of Gaussians and photo sizes, and print what a file of each takes and scores.
+
+    python -m tools.studies.count_laws --set mipnerf360_bonsai --sizes 400 200 --counts 8000 16000 32000 64000
+    python -m tools.studies.count_laws --table --survey results          prints the table, and writes CSV files
+
+The first table has one row for each run: PSNR (dB) and SSIM of the compact file on held-out photos, its bytes, and its
+bits per Gaussian of positions, of the other properties, of the hash tables, and of decoders and metadata. The second
+has, for each photo size, the least-squares fit of PSNR = a + b log2(N), and of the bytes by N.
+
+--survey writes `FOLDER/SET/SIZE.csv` with the columns of the survey of compression methods "3DGS.zip" (Submethod, PSNR,
+SSIM, LPIPS, Size [Bytes], #Gaussians). LPIPS is empty without --lpips-weights.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+import hyrfpack
+from hyrfpack.format.info import sum_layers
+from hyrfpack.format.run_folder import METRICS_FILE, MODEL_FILE
+from hyrfpack.format.sections import LOGIT_SECTIONS, POSITIONS, TABLE_SECTIONS
+from hyrfpack.train import TrainConfig
+from tools.studies.train_sets import make_study_parser
+from tools.tables import markdown_table
+
+SURVEY_COLUMNS = ("Submethod", "PSNR", "SSIM", "LPIPS", "Size [Bytes]", "#Gaussians")
+ROW_FILE = "row.json"
+
+
+@dataclass(frozen=True)
+class CountRow:
+    """A compact file of one run.
+
+    Attributes:
+        size: longer side of the photos, pixels.
+        gaussians, bytes: of the file.
+        psnr, ssim, lpips: of its renders against the held-out photos; PSNR in dB, LPIPS None if not measured.
+        positions, properties, tables, rest: bytes of positions; of colours, scales and opacities; of hash tables; and
+            of decoders, metadata, header and padding.
+    """
+
+    size: int
+    gaussians: int
+    bytes: int
+    psnr: float
+    ssim: float
+    lpips: float | None
+    positions: int
+    properties: int
+    tables: int
+    rest: int
+
+
+def measure(data: Path, size: int, count: int, steps: int, folder: Path, lpips_weights: Path | None) -> CountRow:
+    """Train with `count` Gaussians on photos of at most `size` pixels, compress and score; return the row.
+
+    A run that `folder` has already is not repeated.
+    """
+    scene = hyrfpack.load_scene(data, max_size=size)
+    if not (folder / METRICS_FILE).exists():
+        config = TrainConfig(steps=steps, max_gaussians=count, exposure=False)
+        hyrfpack.train_model(scene, folder, config, overwrite=True, context=hyrfpack.RunContext(progress=None))
+    path = folder / "compact.hyrf"
+    quiet = hyrfpack.RunContext(progress=None)
+    report = hyrfpack.compress_model(folder / MODEL_FILE, path, context=quiet)
+    scores = hyrfpack.evaluate_model(hyrfpack.load_model(path), scene.test, lpips_weights=lpips_weights)
+    sections = {section.type: section.after for section in sum_layers(report.sections)}
+    parts = {
+        "positions": sections[POSITIONS],
+        "properties": sum(sections[name] for name in LOGIT_SECTIONS),
+        "tables": sum(sections[name] for name in TABLE_SECTIONS),
+    }
+    total = report.bytes_after
+    rest = total - sum(parts.values())
+    row = CountRow(size, report.gaussians, total, scores.psnr, scores.ssim, scores.lpips, **parts, rest=rest)
+    (folder / ROW_FILE).write_text(json.dumps(asdict(row)))
+    return row
+
+
+def read_rows(out: Path) -> list[CountRow]:
+    """Return the rows of all runs below `out`, by size, the largest first, and by number of Gaussians."""
+    rows = [CountRow(**json.loads(path.read_text())) for path in out.glob(f"*/*/{ROW_FILE}")]
+    return sorted(rows, key=lambda row: (-row.size, row.gaussians))
+
+
+def format_rows(rows: Sequence[CountRow]) -> str:
+    """Format the runs as a Markdown table."""
+    header = ("pixels", "Gaussians", "PSNR", "SSIM", "bytes", "bits a Gaussian")
+    parts = ("positions", "properties", "tables", "rest")
+    cells = [
+        [f"{row.size}", f"{row.gaussians:,}", f"{row.psnr:.2f}", f"{row.ssim:.3f}", f"{row.bytes:,}"]
+        + [f"{8 * value / row.gaussians:.1f}" for value in (row.bytes, *(getattr(row, part) for part in parts))]
+        for row in rows
+    ]
+    return markdown_table((*header, *parts), cells)
+
+
+def format_fits(rows: Sequence[CountRow]) -> str:
+    """Format the least-squares fits of PSNR and bytes against the number of Gaussians, for each photo size."""
+    cells = []
+    for size in dict.fromkeys(row.size for row in rows):
+        own = [row for row in rows if row.size == size]
+        if len(own) < 2:
+            continue
+        counts = np.array([row.gaussians for row in own], float)
+        slope, start = np.polyfit(np.log2(counts), [row.psnr for row in own], 1)
+        marginal, fixed = np.polyfit(counts, [row.bytes for row in own], 1)
+        bits = f"{8 * marginal:.1f} bits a Gaussian and {fixed:,.0f} bytes"
+        cells.append([f"{size}", f"{start:.2f} + {slope:.2f} log2(N) dB", bits])
+    return markdown_table(("pixels", "PSNR", "size of the file"), cells)
+
+
+def write_survey(rows: Sequence[CountRow], folder: Path) -> None:
+    """Write one CSV file for each photo size, with the survey's columns; rows without a name appear in its plots."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for size in dict.fromkeys(row.size for row in rows):
+        with (folder / f"{size}.csv").open("w", newline="") as file:
+            writer = csv.writer(file)
+            writer.writerow(SURVEY_COLUMNS)
+            for row in rows:
+                if row.size == size:
+                    lpips = "" if row.lpips is None else row.lpips
+                    writer.writerow(("", row.psnr, row.ssim, lpips, row.bytes, row.gaussians))
+
+
+def main() -> None:
+    parser = make_study_parser(__doc__, 3000, ["mipnerf360_bonsai"], Path("runs/count_laws"), seeds=False)
+    parser.add_argument("--sizes", type=int, nargs="+", default=[400, 200], help="longer sides of the photos, pixels")
+    parser.add_argument("--counts", type=int, nargs="+", default=[8000, 16000, 32000, 64000], help="Gaussians")
+    parser.add_argument("--lpips-weights", type=Path, help="weights of the lpips package")
+    parser.add_argument("--survey", type=Path, help="folder for CSV files")
+    parser.add_argument("--table", action="store_true", help="train nothing, and print what --out has")
+    args = parser.parse_args()
+    for name in args.sets:
+        out = args.out / name
+        for size in () if args.table else args.sizes:
+            for count in args.counts:
+                folder = out / str(size) / str(count)
+                if not (folder / ROW_FILE).exists():
+                    measure(args.data / name, size, count, args.steps, folder, args.lpips_weights)
+        rows = read_rows(out)
+        print(f"{name}\n\n{format_rows(rows)}\n\n{format_fits(rows)}\n")
+        if args.survey:
+            write_survey(rows, args.survey / name)
+
+
+if __name__ == "__main__":
+    main()
