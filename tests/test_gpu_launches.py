@@ -29,7 +29,7 @@ pytestmark = [
 ]
 
 PACKAGE_FOLDER = Path(hyrfpack.__file__).parent
-MAX_STEP_LAUNCHES = 118
+MAX_STEP_LAUNCHES = 119
 STEP_WAITS = 1
 # The second step is counted, because the first one also fills caches.
 COUNTED_STEP = 2
@@ -91,7 +91,7 @@ def asked() -> WorkCounts:
     return count_step_work(points=20, side=8)
 
 
-def test_a_step_has_at_most_118_launches(asked: WorkCounts) -> None:
+def test_a_step_has_at_most_119_launches(asked: WorkCounts) -> None:
     assert count_kind(asked, "launch") <= MAX_STEP_LAUNCHES, (
         f"{count_kind(asked, 'launch')} launches:\n{format_counts(asked)}"
     )
@@ -113,7 +113,7 @@ def test_all_parts_of_a_step_are_counted(asked: WorkCounts) -> None:
     }
     kernels |= {"composite_kernel", "grad_grid_kernel", "adam_step_kernel"}
     assert names >= kernels | {"index_add_", "searchsorted", "zeros", "arange"}
-    assert {(name, place) for kind, name, place in asked if kind == "wait"}
+    assert {name for kind, name, _ in asked if kind == "wait"} == {"synchronize"}
     assert count_kind(asked, "copy") > 0  # the photo, at least
 
 

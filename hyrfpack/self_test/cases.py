@@ -17,7 +17,8 @@ from hyrfpack.ops.contraction import contract
 from hyrfpack.ops.hash_encode import hash_encode, level_offsets, level_resolutions
 from hyrfpack.ops.mlp import mlp
 from hyrfpack.ops.rasterize import Gaussians3D, RasterSettings, rasterize
-from hyrfpack.ops.rasterize.cull import frustum_cull
+from hyrfpack.ops.rasterize.cull import frustum_cull, frustum_cull_into
+from hyrfpack.ops.rows import take_rows
 from hyrfpack.ops.shade import DIRECTION_FEATURES, Shading, encode_views, shade
 from hyrfpack.ops.ssim import photometric_loss
 from hyrfpack.ops.viewport import Viewport
@@ -73,7 +74,7 @@ def self_test_cases() -> dict[str, SelfTestCase]:
         "activate_geometry, product": _activate("product"),
         "frustum_cull": _frustum_cull(),
         "rasterize": _rasterize(RasterSettings(depth=True)),
-        "rasterize, antialiased": _rasterize(RasterSettings(antialiased=True)),
+        "rasterize, antialiased": _rasterize(RasterSettings(antialiased=True), reserve=8192),
         "rasterize, replay": _replay(),
         "shade": _shade(mixed=False),
         "shade, mixed precision": _shade(mixed=True),
@@ -169,7 +170,12 @@ def _activate(rule: str) -> SelfTestCase:
 
 def _frustum_cull() -> SelfTestCase:
     def run(implementation: str, x: Inputs) -> dict[str, Tensor]:
-        return {"index": frustum_cull(x["positions"], _viewport(), 0.01, 0.1, implementation=implementation)}
+        positions, frustum = x["positions"], (_viewport(), 0.01, 0.1)
+        index = frustum_cull(positions, *frustum, implementation=implementation)
+        if implementation != "gpu":
+            return {"index": index, "rows": positions[index]}
+        listed, used, _ = frustum_cull_into(positions, *frustum, len(positions), implementation="gpu")
+        return {"index": index, "rows": take_rows(positions, listed, used)[: len(index)]}
 
     return SelfTestCase("frustum_cull", {"positions": 3 * _normal(0, 3000, 3)}, run)
 
@@ -183,12 +189,16 @@ def _splats(count: int) -> dict[str, Tensor]:
     }
 
 
-def _rasterize(settings: RasterSettings) -> SelfTestCase:
+def _rasterize(settings: RasterSettings, reserve: int | None = None) -> SelfTestCase:
+    """Return the case of these settings; kernels render into the reserve, if any."""
     inputs = _splats(300) | {"colors": _uniform(4, 300, 3)}
 
     def run(implementation: str, x: Inputs) -> dict[str, Tensor]:
         *gaussians, colors = x.values()
-        image = rasterize(Gaussians3D(*gaussians), colors, _viewport(), settings, implementation=implementation)
+        image = rasterize(
+            Gaussians3D(*gaussians), colors, _viewport(), settings,
+            reserve=reserve if implementation == "gpu" else None, implementation=implementation,
+        )  # fmt: skip
         depth = {"depth": image.depth} if image.depth is not None else {}
         return {"rgb": image.rgb, "transmittance": image.transmittance} | depth
 

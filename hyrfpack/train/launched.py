@@ -38,8 +38,8 @@ class LaunchedStep:
     Attributes:
         step: number of the step, from 1.
         view, picture: the view and its photo; None on one of several processes whose view had a problem.
-        numbers: statistics of the step; if its rendering has them, `Rendering.valid` and `Rendering.demand`; and flags
-            of parameters with gradients that are not finite.
+        numbers: statistics of the step; `Rendering.valid` and `Rendering.demand`, if there is a demand; and for each
+            parameter with a gradient its largest absolute value or, without a demand, whether it is not finite.
         lengths: the length of each of these three.
     """
 
@@ -50,7 +50,7 @@ class LaunchedStep:
     lengths: tuple[int, int, int]
 
     def read_numbers(self) -> tuple[list[float], list[float], list[float]]:
-        """Wait for the numbers, and return statistics, checks and flags."""
+        """Wait for the numbers, and return the three kinds."""
         numbers = self.numbers.tolist()
         first, second, _ = self.lengths
         return numbers[:first], numbers[first : first + second], numbers[first + second :]

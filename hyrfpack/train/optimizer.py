@@ -92,6 +92,10 @@ class Optimizer:
             parameter.grad = None
         return broken.float()
 
+    def gradients(self) -> list[Tensor]:
+        """Return the gradients of the parameters that have one, in the order of the flags that `step` returns."""
+        return [p.grad for group in self.groups.values() for p in group if p.grad is not None]
+
     def retract_step(self) -> None:
         """Discount the last step, which was not enabled and is to be taken again."""
         for parameter in self._stepped:

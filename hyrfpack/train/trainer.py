@@ -48,6 +48,7 @@ _LOG = logging.getLogger(__name__)
 
 OUT_OF_MEMORY_FIX = "reduce `max_gaussians` or `max_size`, or use `device='cpu'`"
 MAX_LOSS = float(np.finfo(np.float32).max)
+MAX_GRADIENT = MAX_LOSS**0.5  # Adam squares gradients.
 MIN_CURVE_RECORDS = 200  # A run of more steps has up to twice as many records.
 
 
@@ -298,6 +299,7 @@ class Trainer:
         """
         view = picture = valid = None
         checks: list[Tensor] = []
+        norms: Tensor | None = None
         if rendered is None:
             loss = error = torch.zeros((), device=self.device)
         else:
@@ -305,8 +307,10 @@ class Trainer:
                 rendered.view, rendered.picture, rendered.loss, rendered.error, rendered.rendering
             )  # fmt: skip
             if rendered.reserve is not None and (demand := rendering.demand) is not None:
-                numbers = torch.cat((loss.double()[None], demand))
-                valid = (numbers <= tensor_like((MAX_LOSS, *rendered.reserve.limits), numbers)).all()
+                norms = self._gradient_norms()
+                numbers = torch.cat((loss.double()[None], norms, demand))
+                limits = MAX_LOSS, *[MAX_GRADIENT] * len(norms), *rendered.reserve.limits
+                valid = (numbers <= tensor_like(limits, numbers)).all()
                 rendering = dataclasses.replace(rendering, valid=valid)
                 checks = [valid[None], demand]
             with self._timed("density"):
@@ -323,8 +327,17 @@ class Trainer:
                 seen, all_seen = (self.ranks.size * steps for steps in (step - 1, self.steps))
                 rate = self.config.learning_rates.at("exposure", seen, all_seen)
                 broken = torch.cat((broken, self.exposures.step(rate, self._views_of_step(step), valid)[None]))
+        if norms is not None:
+            broken = norms  # Where it is not valid, the optimiser has set no flags.
         lengths = len(packed), sum(map(len, checks)), len(broken)
         self._launched = LaunchedStep(step, view, picture, HostCopy(torch.cat((packed, *checks, broken))), lengths)
+
+    def _gradient_norms(self) -> Tensor:
+        """Return the largest absolute value of each gradient, NaN if any is NaN, in the order of `_groups`."""
+        gradients = self.optimizer.gradients()
+        if self.exposures is not None and self.exposures.values.grad is not None:
+            gradients.append(self.exposures.values.grad)
+        return torch.stack(torch._foreach_norm(gradients, torch.inf))
 
     def _settle_launched(self, problem: HyrfError | None = None, *, was_retaken: bool = False) -> list[SettledStep]:
         """Settle the launched step, if any: wait for its numbers and check them.
@@ -347,10 +360,11 @@ class Trainer:
             self.ranks.raise_if_any(problem)
         if checks and view is not None and picture is not None:
             valid, nonfinite_positions, in_view, nonfinite_inputs, pairs = checks
+            flags = [float(not norm <= MAX_GRADIENT) for norm in flags]
             if nonfinite_positions or nonfinite_inputs:
                 self._refuse(step, "a number to be rendered is not finite", self._nonfinite_parameters())
             self._reserves.record(view, len(self.model), int(in_view), int(pairs))
-            if not valid and np.isfinite(stats.loss):
+            if not valid and np.isfinite(stats.loss) and not any(flags):
                 self._retake(step, view, picture)
                 return self._settle_launched(was_retaken=True)
         if not np.isfinite(stats.loss):

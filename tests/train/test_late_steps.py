@@ -7,14 +7,13 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterator
-from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from fake_gpu import use_fake_gpu
-from ops.device import needs_triton
+from ops.device import IS_INTERPRETED, needs_triton
 from scenes import ball_scene
 from torch import Tensor
 
@@ -27,7 +26,10 @@ from hyrfpack.scene import Camera, View
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer
 from hyrfpack.train.reserves import MIN_RESERVED_PAIRS, ReserveEstimator
 
-pytestmark = needs_triton
+pytestmark = [
+    needs_triton,
+    pytest.mark.skipif(not IS_INTERPRETED, reason="a GPU adds to hash tables in any order, so that bits differ"),
+]
 
 POINTS, SIDE_PIXELS = 20, 10
 LARGE_RESERVE = Reserve(1000, 5000)
@@ -62,7 +64,7 @@ def few_levels(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def gpu() -> Iterator[torch.device]:
-    with nullcontext(torch.device("cuda", 0)) if torch.cuda.is_available() else use_fake_gpu() as device:
+    with use_fake_gpu() as device:
         yield device
 
 
@@ -125,7 +127,7 @@ def expected() -> tuple[int, list[tuple], dict[str, Tensor]]:
     """A run whose reserves are always large enough."""
     with pytest.MonkeyPatch.context() as patch:
         reduce_levels(patch)
-        with nullcontext(torch.device("cuda", 0)) if torch.cuda.is_available() else use_fake_gpu() as device:
+        with use_fake_gpu() as device:
             return run_with_reserves(device, CONFIG, lambda number: LARGE_RESERVE)
 
 
@@ -163,17 +165,10 @@ def test_each_step_is_reported_once_and_a_step_later_unless_the_host_must_wait(g
     assert [now for _, now in reports] == [step if step in waits else step + 1 for step, _ in reports]
 
 
-POISONS = {
-    "a position": ("gaussians.positions", "a number to be rendered is not finite"),
-    "an opacity": ("gaussians.opacity_logits", "a number to be rendered is not finite"),
-    "a decoder": ("radiance.biases.2", "a number to be rendered is not finite"),
-}
-
-
 @pytest.mark.acceptance
-@pytest.mark.parametrize(("name", "message"), POISONS.values(), ids=POISONS)
-def test_a_number_that_is_not_finite_changes_nothing_and_is_reported_at_most_a_step_late(
-    name: str, message: str, gpu: torch.device
+@pytest.mark.parametrize("name", ["gaussians.positions", "gaussians.opacity_logits", "radiance.biases.2"])
+def test_a_parameter_that_is_not_finite_changes_nothing_and_is_reported_at_most_a_step_late(
+    name: str, gpu: torch.device
 ) -> None:
     trainer, poisoned = make_trainer(gpu), {}
 
@@ -182,30 +177,39 @@ def test_a_number_that_is_not_finite_changes_nothing_and_is_reported_at_most_a_s
             dict(trainer.model.named_parameters())[name].data.flatten()[0].fill_(torch.nan)
             poisoned.update(state_of(trainer))
 
-    with pytest.raises(HyrfTrainingError, match=rf"stopped at step 5 .*{message} .*groups: {name}\b"):
+    message = rf"stopped at step 5 .*a number to be rendered is not finite .*groups: {name}\b"
+    with pytest.raises(HyrfTrainingError, match=message):
         trainer.run(progress=poison)
 
     assert trainer.step == 6
     after = state_of(trainer)
-    moments = [
-        key for key in after if not key.endswith(".step") and key != "exposure.steps"
-    ]  # Counts end with the run.
-    assert all(torch.equal(after[key].nan_to_num(7.5), poisoned[key].nan_to_num(7.5)) for key in moments)
+    values = [key for key in after if not key.endswith((".step", ".steps"))]  # The last step is counted.
+    assert all(torch.equal(after[key].nan_to_num(7.5), poisoned[key].nan_to_num(7.5)) for key in values)
 
 
 @pytest.mark.acceptance
 def test_a_loss_that_is_not_finite_changes_nothing(gpu: torch.device, monkeypatch: pytest.MonkeyPatch) -> None:
     trainer = make_trainer(gpu)
     before = state_of(trainer)
-    original = torch.Tensor.backward
-    monkeypatch.setattr(
-        "hyrfpack.train.trainer.photometric_loss", lambda image, *_, **__: (image * torch.inf).square().mean()
-    )
-    monkeypatch.setattr(torch.Tensor, "backward", original)
+    monkeypatch.setattr("hyrfpack.train.trainer.photometric_loss", lambda image, *_, **__: image.mean() * torch.inf)
     with pytest.raises(HyrfTrainingError, match=r"stopped at step 1 .*the loss is not finite"):
         trainer.run()
     after = state_of(trainer)
     assert all(torch.equal(value, before[key]) for key, value in after.items() if key in before and "step" not in key)
+
+
+@pytest.mark.acceptance
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, 1e30])
+def test_a_gradient_that_is_not_finite_changes_nothing(gpu: torch.device, value: float) -> None:
+    """Adam squares gradients, so that 1e30 is as bad as infinity."""
+    trainer = make_trainer(gpu)
+    before = state_of(trainer)
+    trainer.model.gaussians.scale_logits.register_hook(lambda grad: grad + value * (grad == grad.max()))
+    with pytest.raises(HyrfTrainingError, match=r"step 1 .*a gradient is not finite .*groups: scale_logits\)"):
+        trainer.run()
+    assert trainer.step == 2
+    after = state_of(trainer)
+    assert all(torch.equal(after[key], old) for key, old in before.items() if key.startswith(("model", "density")))
 
 
 def test_a_copy_to_the_host_keeps_the_values_of_its_beginning(gpu: torch.device) -> None:

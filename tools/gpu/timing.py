@@ -16,9 +16,9 @@ from hyrfpack.measure.timing import Clock, time_alternately
 # cache, and writing it takes so long that the host has queued a short task before the task starts.
 FLUSH_BYTES = 1 << 30
 WARM_RUNS = 3
-# torch calls these functions to read a number from the device. The wait at the end of a profile is another call, which
-# is not counted.
-WAIT_CALL_NAMES = ("cudaStreamSynchronize", "hipStreamSynchronize")
+# torch calls the first to read a number from the device, and the trainer the second for the numbers of the step before.
+# The wait at the end of a profile is another call, which is not counted.
+WAIT_CALL_NAMES = ("cudaStreamSynchronize", "cudaEventSynchronize", "hipStreamSynchronize", "hipEventSynchronize")
 
 
 @dataclass(frozen=True)
