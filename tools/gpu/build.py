@@ -3,6 +3,7 @@
     python -m tools.gpu.build                  a table for each kernel and target: registers per thread, shared memory
                                                in bytes per program, spills in bytes (NVIDIA) or registers (AMD)
     python -m tools.gpu.build --json           the same as JSON; tests/tools/test_gpu_build.py reads it
+    python -m tools.gpu.build --compare DIR    registers and spills in a Markdown table, also those of the Triton in DIR
 
 The operations run as usual on small CPU tensors, but a launch only builds its kernel, for a driver that names the
 target. The build has the types, constants, alignment and options of the launch. So this file needs no list of kernels
@@ -30,7 +31,7 @@ from functools import partial
 from itertools import islice
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from unittest import mock
 
 os.environ.pop("TRITON_INTERPRET", None)  # Triton reads it when kernels are defined
@@ -42,6 +43,9 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from triton.backends.compiler import GPUTarget
 from triton.runtime.jit import JITFunction
+
+from tools.gpu import sass
+from tools.gpu.build_tables import format_comparison, format_table
 
 if TYPE_CHECKING:
     from hyrfpack.ops.viewport import Viewport
@@ -55,6 +59,9 @@ GPU_TARGETS = {
     "sm_100": GPUTarget("cuda", 100, 32),
     "gfx942": GPUTarget("hip", "gfx942", 64),
 }
+# The kernels whose machine code is read on some targets: those with the longest loops, and one that adds by atomics.
+SASS_KERNELS = ("rasterize.gpu_blend.blend", "rasterize.gpu_blend.blend_backward", "hash_encode.gpu.grad_table_kernel")
+SASS_TARGETS = ("sm_89", "sm_90")
 BUILD_PROCESSES = 2
 Run = Callable[[], object]
 
@@ -72,6 +79,7 @@ class Build:
         shared: shared memory of a program in bytes.
         spills: bytes of local memory per thread (NVIDIA), or spilled registers (AMD).
         error: why the build failed; empty if it succeeded.
+        sass: fields of `SassFacts` of SASS_KERNELS on SASS_TARGETS, if Triton has the disassembler.
     """
 
     kernel: str
@@ -82,10 +90,16 @@ class Build:
     shared: int = 0
     spills: int = 0
     error: str = ""
+    sass: dict[str, int] | None = None
 
 
 # The runs of each operation. Triton builds a kernel separately for sizes that are multiples of 16, for other sizes, and
-# for size 1.
+# for size 1; and for rows of which only the device knows how many are in use, as in training.
+
+
+def count_rows(rows: int) -> Tensor:
+    """Return a number of rows in use."""
+    return torch.tensor([rows])
 
 
 def make_viewport(width: int, height: int) -> Viewport:
@@ -110,9 +124,10 @@ def hash_encode_runs(count: int, width: int, height: int) -> Iterator[Run]:
     resolutions, size = HashGridConfig(log2_table_size=10, base=4).resolutions, 10
     table = torch.rand(level_offsets(resolutions, size)[-1], 2, requires_grad=True)
     coords = torch.rand(count, 3, requires_grad=True)
-    # The gradient is stored by columns, as `mlp` returns it, and by rows.
-    for grad in (torch.ones(2 * len(resolutions), count).T, torch.ones(count, 2 * len(resolutions))):
-        yield lambda grad=grad: hash_encode(coords, table, resolutions, size).backward(grad)
+    # The gradient is stored by columns, as `mlp` returns it in training, and by rows.
+    by_columns, by_rows = torch.ones(2 * len(resolutions), count).T, torch.ones(count, 2 * len(resolutions))
+    for grad, used in ((by_columns, count_rows(count)), (by_rows, None)):
+        yield lambda grad=grad, used=used: hash_encode(coords, table, resolutions, size, used=used).backward(grad)
 
 
 def mlp_runs(count: int, width: int, height: int) -> Iterator[Run]:
@@ -126,7 +141,8 @@ def mlp_runs(count: int, width: int, height: int) -> Iterator[Run]:
         biases = [torch.rand(shape[0], requires_grad=True) for shape in shapes]
         x = torch.rand(inputs, count).T.requires_grad_()
         for mixed in (False, True):
-            yield lambda x=x, w=weights, b=biases, mixed=mixed: mlp(x, w, b, mixed=mixed).sum().backward()
+            run = partial(mlp, x, weights, biases, mixed=mixed)
+            yield lambda run=run: (run(), run(used=count_rows(count)).sum().backward())
 
 
 def rasterize_runs(count: int, width: int, height: int) -> Iterator[Run]:
@@ -136,8 +152,9 @@ def rasterize_runs(count: int, width: int, height: int) -> Iterator[Run]:
         shapes = (count, 3), (count, 4), (count, 3), (count,), (count, 3)
         inputs = [torch.rand(shape, requires_grad=True) for shape in shapes]
         settings = RasterSettings(antialiased=antialiased, depth=depth)
-        buffer = torch.zeros(count, 2) if absgrad else None
-        drawn = rasterize(Gaussians3D(*inputs[:4]), inputs[4], make_viewport(width, height), settings, absgrad=buffer)
+        buffer = torch.zeros(count, 2)
+        options = {"absgrad": buffer, "used": count_rows(count), "reserve": 4096} if absgrad else {}
+        drawn = rasterize(Gaussians3D(*inputs[:4]), inputs[4], make_viewport(width, height), settings, **options)
         (drawn.rgb.sum() + drawn.transmittance.sum()).backward()
 
     for options in ((False, False, True), (False, True, False), (True, False, True), (True, True, False)):
@@ -147,12 +164,13 @@ def rasterize_runs(count: int, width: int, height: int) -> Iterator[Run]:
 def adam_runs(count: int, width: int, height: int) -> Iterator[Run]:
     from hyrfpack.ops.adam import adam_step
 
-    def run(start: int) -> None:
+    def run(start: int, *enabled: Tensor | None) -> None:
         lists = [[torch.rand(count + start)[start:]] for _ in range(4)]
-        adam_step(*lists, step=1, rate=0.1)
+        for flag in enabled:
+            adam_step(*lists, step=1, rate=0.1, enabled=flag)
 
-    yield partial(run, 0)
-    yield partial(run, 1)
+    yield partial(run, 0, torch.tensor(True), None)
+    yield partial(run, 1, None)
 
 
 def shade_runs(count: int, width: int, height: int) -> Iterator[Run]:
@@ -201,14 +219,16 @@ def background_runs(count: int, width: int, height: int) -> Iterator[Run]:
 def contraction_runs(count: int, width: int, height: int) -> Iterator[Run]:
     from hyrfpack.ops.contraction import contract
 
-    yield partial(contract, torch.rand(count, 3), (1.0, 0.5, 2.0))
+    for used in (None, count_rows(count)):
+        yield partial(contract, torch.rand(count, 3), (1.0, 0.5, 2.0), used=used)
 
 
 def directions_runs(count: int, width: int, height: int) -> Iterator[Run]:
     from hyrfpack.ops.shade import DIRECTION_FEATURES, encode_views
 
     for encoding in DIRECTION_FEATURES:
-        yield partial(encode_views, torch.rand(count, 3), torch.zeros(3), encoding)
+        used = count_rows(count) if encoding == "frequency" else None
+        yield partial(encode_views, torch.rand(count, 3), torch.zeros(3), encoding, used=used)
 
 
 def activate_runs(count: int, width: int, height: int) -> Iterator[Run]:
@@ -216,7 +236,10 @@ def activate_runs(count: int, width: int, height: int) -> Iterator[Run]:
 
     def run(rule: str, half_extent: tuple[float, float, float] | None) -> None:
         raw, logits = torch.rand(count, 8, requires_grad=True), torch.rand(count, 1)
-        parts = activate_geometry(raw, torch.rand(count, 3), logits, logits, half_extent=half_extent, rule=rule)
+        used = count_rows(count) if rule == "sum" else None
+        parts = activate_geometry(
+            raw, torch.rand(count, 3), logits, logits, half_extent=half_extent, rule=rule, used=used
+        )
         sum(part.sum() for part in parts).backward()
 
     for options in (("sum", (1.0, 0.5, 2.0)), ("product", (1.0, 0.5, 2.0)), ("sum", None)):
@@ -224,9 +247,19 @@ def activate_runs(count: int, width: int, height: int) -> Iterator[Run]:
 
 
 def cull_runs(count: int, width: int, height: int) -> Iterator[Run]:
-    from hyrfpack.ops.rasterize.cull import frustum_cull
+    from hyrfpack.ops.rasterize.cull import frustum_cull, frustum_cull_into
 
     yield partial(frustum_cull, torch.rand(count, 3), make_viewport(width, height), 0.01, 0.3)
+    yield partial(frustum_cull_into, torch.rand(count, 3), make_viewport(width, height), 0.01, 0.3, count)
+
+
+def rows_runs(count: int, width: int, height: int) -> Iterator[Run]:
+    from hyrfpack.ops.rows import place_rows, take_rows
+
+    for columns in (3, 1):
+        values, index = torch.rand(count, columns, requires_grad=True), torch.arange(count)
+        yield lambda v=values, i=index: take_rows(v, i, count_rows(count)).sum().backward()
+        yield lambda v=values, i=index: place_rows(v, i, count_rows(count), count).sum().backward()
 
 
 def composite_runs(count: int, width: int, height: int) -> Iterator[Run]:
@@ -256,6 +289,7 @@ OPERATION_RUNS = {
     "directions": directions_runs,
     "activate": activate_runs,
     "cull": cull_runs,
+    "rows": rows_runs,
     "composite": composite_runs,
 }
 # (points, width, height). The first target builds for all sizes and runs. The others build for the first size and the
@@ -354,7 +388,10 @@ def _describe_build(kernel: JITFunction, target: str, built: object) -> Build:
     registers, spills = _read_resources(built)
     metadata = built.metadata
     described = " ".join(constants) + " /16: " + " ".join(aligned)
-    return Build(_kernel_name(kernel), target, described, metadata.num_warps, registers, metadata.shared, spills)
+    name, facts = _kernel_name(kernel), None
+    if name in SASS_KERNELS and target in SASS_TARGETS and sass.has_disassembler():
+        facts = asdict(sass.read_facts(built.asm["cubin"]))
+    return Build(name, target, described, metadata.num_warps, registers, metadata.shared, spills, sass=facts)
 
 
 def _argument_name(kernel: JITFunction, path: tuple[int, ...]) -> str:
@@ -408,12 +445,12 @@ def _iterate_called_functions(function: JITFunction) -> Iterator[object]:
             yield value
 
 
-def build_all() -> dict[str, list]:
+def build_all() -> dict[str, Any]:
     """Build all kernels for all targets.
 
     Returns:
-        "builds": one row for each build. "probes": for each target, one row of a kernel that must spill. "left_out":
-        the kernels that no operation launched.
+        "triton": its version. "builds": one row for each build. "probes": for each target, one row of a kernel that
+        must spill. "left_out": the kernels that no operation launched.
     """
     # Each task runs in its own process, because operations make choices at import that depend on the target. Processes
     # inherit Triton's digest of its own sources, because computing it takes longer than most tasks.
@@ -427,35 +464,33 @@ def build_all() -> dict[str, list]:
         builds = sum(pool.map(build, tasks, chunksize=1), [])
         launched = {build.kernel for build in builds}
         left_out = [kernel for kernel in kernels.get() if kernel not in launched]
-    return {"builds": list(map(asdict, builds)), "probes": list(map(asdict, probes)), "left_out": left_out}
+    return {
+        "triton": triton.__version__,
+        "builds": list(map(asdict, builds)),
+        "probes": list(map(asdict, probes)),
+        "left_out": left_out,
+    }
 
 
-def format_table(report: dict[str, list]) -> Iterator[str]:
-    """Yield the lines of a table with the largest values over all builds of each kernel and target, and all errors."""
-    rows: dict[tuple[str, str, int], list[dict]] = {}
-    for row in report["builds"]:
-        if not row["error"]:
-            rows.setdefault((row["kernel"], row["target"], row["warps"]), []).append(row)
-    yield f"{'kernel':40} {'target':8} {'warps':>5} {'builds':>6} {'registers':>9} {'shared':>7} {'spills':>6}"
-    for (kernel, target, warps), builds in sorted(rows.items()):
-        registers, shared, spills = (max(row[key] for row in builds) for key in ("registers", "shared", "spills"))
-        yield f"{kernel:40} {target:8} {warps:5} {len(builds):6} {registers:9} {shared:7} {spills:6}"
-    for row in report["builds"]:
-        if row["spills"] or row["error"]:
-            yield f"{row['kernel']} on {row['target']}: {row['error'] or 'spills'} {row['constants']}"
-    for row in report["probes"]:
-        if row["error"]:
-            yield f"{row['target']}: Triton cannot build for this target: {row['error']}"
-    for kernel in report["left_out"]:
-        yield f"{kernel}: no operation launches it"
+def build_all_with(folder: str) -> dict[str, Any]:
+    """Return what `build_all` returns with the Triton that is installed in a folder."""
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join((folder, os.environ.get("PYTHONPATH", "")))}
+    command = [sys.executable, "-m", "tools.gpu.build", "--json"]
+    done = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True)
+    return json.loads(done.stdout.splitlines()[-1])
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--json", action="store_true", help="print JSON")
-    as_json = parser.parse_args().json
-    report = build_all()
-    print(json.dumps(report) if as_json else "\n".join(format_table(report)))
+    parser.add_argument("--compare", metavar="DIR", help="folder with another version of Triton")
+    arguments = parser.parse_args()
+    reports = [build_all()]
+    if arguments.compare:
+        reports.insert(0, build_all_with(arguments.compare))
+        print(f"Triton {' / '.join(report['triton'] for report in reports)}\n", *format_comparison(reports), sep="\n")
+    else:
+        print(json.dumps(reports[0]) if arguments.json else "\n".join(format_table(reports[0])))
 
 
 if __name__ == "__main__":
