@@ -18,6 +18,7 @@ from hyrfpack.ops.activate import activate_geometry
 from hyrfpack.ops.contraction import contract
 from hyrfpack.ops.hash_encode import hash_encode, level_offsets, level_resolutions
 from hyrfpack.ops.rasterize import Gaussians3D, RasterSettings
+from hyrfpack.ops.rows import place_rows, take_rows
 from hyrfpack.ops.shade import encode_views
 from hyrfpack.ops.viewport import Viewport
 
@@ -64,6 +65,8 @@ CASES: dict[str, tuple[Callable[..., Tensor | tuple[Tensor, ...]], tuple[int, ..
     "activate_geometry": (activate, (8, 3, 1, 1)),
     "hash_encode": (lambda x: hash_encode(x, TABLE, RESOLUTIONS, LOG2_TABLE_SIZE, implementation="gpu"), (3,)),
     "project": (project, (3, 4, 3, 1, 3)),
+    "take_rows": (lambda x: take_rows(x, torch.arange(len(x)), torch.tensor([len(x)])), (3,)),
+    "place_rows": (lambda x: place_rows(x, torch.arange(len(x)), torch.tensor([len(x)]), len(x)), (3,)),
 }
 
 
