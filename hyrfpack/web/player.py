@@ -285,8 +285,14 @@ def embedded_texts(worker: str | None = None) -> dict[str, str]:
     return shaders | ({} if worker is None else {"worker.js": read_script(worker)})
 
 
+def webgpu_texts() -> dict[str, str]:
+    """Return the shaders of the renderer for WebGPU by their names."""
+    paths = list_web_files("viewer/webgpu", ".wgsl")
+    return {path.rpartition("/")[2]: strip_shader_comments(read_web_file(path)) for path in paths}
+
+
 def strip_shader_comments(text: str) -> str:
-    """Return GLSL without indentation, empty lines and comments, all of which begin with "//"."""
+    """Return GLSL or WGSL without indentation, empty lines and comments, all of which begin with "//"."""
     lines = (_SHADER_COMMENT.sub("", line.strip()) for line in text.splitlines())
     return "\n".join(line for line in lines if line)
 

@@ -26,6 +26,9 @@ export type Exposure = "as-photographed" | "consistent";
 /** A `.hyrf`, `.ply`, `.spz`, `.splat` or `.sog` file: its address, or its content. */
 export type Source = string | URL | Blob | ArrayBuffer | ArrayBufferView | ReadableStream<Uint8Array>;
 
+/** What draws scenes: the value `webgpu` of "hyrf-viewer/webgpu". It has no use but the option `renderer`. */
+export type SceneRenderer = abstract new (...values: never[]) => object;
+
 export interface ViewerOptions {
   /** The element, or a selector of it, that the canvas fills. It needs a height. */
   container: Element | string;
@@ -54,6 +57,11 @@ export interface ViewerOptions {
   workerUrl?: string | URL | null;
   /** The most Gaussians of a scene folder at a time. Default: 2 million, 500,000 on phones. */
   maxGaussians?: number | null;
+  /**
+   * `webgpu` of "hyrf-viewer/webgpu": draw files of one model with WebGPU where the browser has it. Other scenes, and
+   * browsers without WebGPU, are drawn with WebGL 2, which is the default.
+   */
+  renderer?: SceneRenderer;
 }
 
 export interface SceneInfo {

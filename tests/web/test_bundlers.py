@@ -21,6 +21,13 @@ EXAMPLE_FOLDER = TESTS_FOLDER.parent / "examples" / "viewer"
 BUNDLERS_FOLDER = TESTS_FOLDER / "bundlers" / "node_modules"
 STATUS_JS = "document.getElementById('status')?.textContent.endsWith(' Gaussians')"
 ESBUILD_OPTIONS = ("--bundle", "--jsx=automatic", "--format=esm", "--outfile=dist/main.js")
+WEBGPU_PAGE = """<!DOCTYPE html><link rel="icon" href="data:,"><div id="scene" style="height: 90px"></div>
+<script type="module">
+import { createViewer } from "./hyrf-viewer/index.js";
+import { webgpu } from "./hyrf-viewer/webgpu.js";
+window.viewer = createViewer({ container: "#scene", src: "scene.hyrf", renderer: webgpu });
+</script>
+"""
 BUNDLE_COMMANDS = {
     "vite": [["vite", "build", "--logLevel", "error"]],
     "webpack": [["webpack", "--output-path", "dist"]],
@@ -91,6 +98,16 @@ def test_a_plain_page_shows_two_viewers(browser: Browser, host: Site, package: P
     assert browser.list_errors() == []
 
 
+def test_a_page_that_asks_for_webgpu_draws_where_there_is_none(one_browser: Browser, host: Site, package: Path):
+    host.files = {f"/hyrf-viewer/{path.name}": path.read_bytes() for path in package.iterdir()}
+    host.files["/page.html"] = WEBGPU_PAGE.encode()
+    host.files["/scene.hyrf"] = GOLDEN_FILE_DATA
+    one_browser.open(f"{host.address}/page.html")
+    wait_until(one_browser, "window.viewer?.isReady", 30)
+    assert one_browser.evaluate("viewer.player.renderer.isOnDevice") is False
+    assert one_browser.list_errors() == []
+
+
 def test_strict_typescript_compiles_against_the_types(project: Path):
     flags = "--noEmit --strict --exactOptionalPropertyTypes --noUncheckedIndexedAccess --module nodenext".split()
     run_program(project, "tsc", *flags, "--lib", "es2022,dom", "--types", "", "--ignoreConfig", "typed.ts")
@@ -106,7 +123,9 @@ def test_mistakes_are_type_errors(project: Path, mistake: str):
 
 
 def test_the_package_is_imported_by_a_server_without_a_browser(package: Path):
-    script = f"await import('{package}/index.js'); await import('{package}/element.js');"
+    script = (
+        f"await import('{package}/index.js'); await import('{package}/element.js'); await import('{package}/webgpu.js')"
+    )
     done = subprocess.run(["node", "--input-type=module", "-e", script], capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
 
@@ -116,7 +135,8 @@ def test_the_package_has_every_file_that_it_names(package: Path):
         ["npm", "pack", "--dry-run", "--json"], cwd=package, capture_output=True, text=True, timeout=60
     )
     assert packed.returncode == 0, packed.stderr
-    for name in ["index.js", "element.js", "worker.js", "index.d.ts", "element.d.ts", "LICENSE", "README.md"]:
+    modules = ["index.js", "element.js", "webgpu.js", "worker.js"]
+    for name in [*modules, "index.d.ts", "element.d.ts", "webgpu.d.ts", "LICENSE", "README.md"]:
         assert f'"{name}"' in packed.stdout
     assert (package / "worker.js").read_text() == read_web_file("minified/worker.js")
     assert "EMBEDDED_TEXTS=" not in (package / "index.js").read_text()

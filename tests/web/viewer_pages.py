@@ -7,7 +7,7 @@ import json
 from web.site import Site
 
 from hyrfpack.web.assets import list_web_files, read_web_file
-from hyrfpack.web.player import embedded_texts
+from hyrfpack.web.player import embedded_texts, webgpu_texts
 
 VIEWER_PAGE = """<!DOCTYPE html>
 <link rel="icon" href="data:,"><style>body {{ margin: 0; }} .box {{ width: 240px; height: 180px; }}</style>
@@ -29,7 +29,7 @@ def serve_modules(site: Site) -> None:
     """Add the viewer's modules and texts to a site."""
     for path in list_web_files("viewer", ".js") + list_web_files("hyrf", ".js"):
         site.files[f"/{path}"] = read_web_file(path).encode()
-    site.files["/texts.json"] = json.dumps(embedded_texts("worker.js")).encode()
+    site.files["/texts.json"] = json.dumps(embedded_texts("worker.js") | webgpu_texts()).encode()
 
 
 def viewer_page(script: str = "", body: str = '<div id="box" class="box"></div>') -> bytes:

@@ -14,14 +14,13 @@ import shutil
 import subprocess
 from pathlib import Path
 
-from hyrfpack.web.player import embedded_texts
+from hyrfpack.web.player import embedded_texts, webgpu_texts
 from hyrfpack.web.scripts import is_minified_current, read_script
 from tools.browser.build_player import PROGRAMS_FOLDER, REPOSITORY_ROOT
 
 PACKAGE_FOLDER = REPOSITORY_ROOT / "npm" / "hyrf-viewer"
-ENTRY_NAMES = ("index.js", "element.js")
-COPIED_NAMES = ("package.json", "README.md", "index.d.ts", "element.d.ts")
-TEXTS_NAME = "texts.js"
+ENTRY_NAMES = ("index.js", "element.js", "webgpu.js")
+COPIED_NAMES = ("package.json", "README.md", "index.d.ts", "element.d.ts", "webgpu.d.ts")
 ESBUILD_OPTIONS = (
     "--bundle --splitting --minify --sourcemap --format=esm --target=es2022 --charset=utf8 --legal-comments=none "
     "--chunk-names=[name]-[hash] --log-level=warning"
@@ -42,11 +41,15 @@ def build_package(folder: Path) -> None:
         raise SystemExit("the minified player was made from other sources: run 'make player'")
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    texts = folder / TEXTS_NAME  # esbuild replaces the constant of the modules by this one
-    texts.write_text(f"export const EMBEDDED_TEXTS = {json.dumps(embedded_texts('worker.js'))};\n", "utf-8")
+    constants = {"EMBEDDED_TEXTS": embedded_texts("worker.js"), "WEBGPU_TEXTS": webgpu_texts()}
+    files = [folder / f"{name.lower()}.js" for name in constants]  # two, so that each module gets only what it uses
+    for file, (name, texts) in zip(files, constants.items(), strict=True):
+        file.write_text(f"export const {name} = {json.dumps(texts)};\n", "utf-8")
     entries = [str(PACKAGE_FOLDER / name) for name in ENTRY_NAMES]
-    subprocess.run([program, *entries, *ESBUILD_OPTIONS, f"--inject:{texts}", f"--outdir={folder}"], check=True)
-    texts.unlink()
+    inject = [f"--inject:{file}" for file in files]  # esbuild replaces the constants of the modules by these
+    subprocess.run([program, *entries, *ESBUILD_OPTIONS, *inject, f"--outdir={folder}"], check=True)
+    for file in files:
+        file.unlink()
     (folder / "worker.js").write_text(read_script("worker.js"), "utf-8")
     for name in COPIED_NAMES:
         shutil.copy(PACKAGE_FOLDER / name, folder / name)

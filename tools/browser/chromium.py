@@ -18,6 +18,14 @@ if TYPE_CHECKING:
     from playwright.async_api import ConsoleMessage
 
 Result = TypeVar("Result")
+# WebGPU in software (SwiftShader). Without the last three, WebGL cannot read what WebGPU has drawn.
+WEBGPU_FLAGS = (
+    "--enable-unsafe-webgpu",
+    "--use-webgpu-adapter=swiftshader",
+    "--enable-features=Vulkan",
+    "--use-vulkan=swiftshader",
+    "--use-angle=swiftshader",
+)
 SCREENCAST_SIZE = {"maxWidth": 640, "maxHeight": 400}  # pixels
 PROGRAM_NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 

@@ -32,11 +32,11 @@ export class Fields {
     if (rows > side) throw new UnsupportedDeviceError("the model is larger than this device's textures.");
   }
 
-  constructor(gl, model) {
+  // `graphics` creates the objects of the device.
+  constructor(gl, model, graphics = new Graphics(gl)) {
     const { count, width = TEXTURE_WIDTH, height, antialiased, cells } = model;
     this.gl = gl;
-    this.graphics = new Graphics(gl);
-    Object.assign(this, { model, count, width, height, antialiased, cells });
+    Object.assign(this, { graphics, model, count, width, height, antialiased, cells });
     this.rows = new RowStates(model.balls);
     this.pace = new WorkPacer();
     this.hasEstimate = Boolean(model.estimate);
@@ -51,6 +51,7 @@ export class Fields {
     if (!model.background) return;
     const bytes = [gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, 4];
     const coarse = await graphics.table(bytes, coarseBackground.width, coarseBackground.rgba);
+    graphics.setPanoramic(coarse);
     this.panorama = new Panorama(graphics, model, coarse, (...area) => this.drawPanorama(...area));
     model.coarseBackground = null;
   }
@@ -67,9 +68,9 @@ export class Fields {
 
   // Uploads the model and compiles programs, so that rows can be evaluated.
   async prepareFields() {
-    const { gl, graphics, model, height } = this;
+    const { graphics, model, height } = this;
     await graphics.whenDone();
-    gl.getError(); // clears earlier errors
+    graphics.takeError(); // clears earlier errors
     this.createFeatures();
     const { sky, ...shaders } = this.shaders(), programs = {}, vertexText = readText("whole.vert");
     for (const name of Object.keys(shaders)) {
@@ -126,9 +127,9 @@ export class Fields {
 
   // Throws an error if the device's memory was too small for the objects so far.
   checkMemory() {
-    const { gl } = this, error = gl.getError();
+    const error = this.graphics.takeError();
     if (this.graphics.lost) throw new ContextLostError();
-    if (error !== gl.NO_ERROR) throw new UnsupportedDeviceError(MEMORY_REASON);
+    if (error) throw new UnsupportedDeviceError(MEMORY_REASON);
   }
 
   // Uploads a field's table and decoder.

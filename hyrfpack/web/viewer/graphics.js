@@ -37,6 +37,12 @@ export class Graphics {
     return softwareContexts.get(this.gl);
   }
 
+  // Returns the first error since the last call, or null.
+  takeError() {
+    const { gl } = this, error = gl.getError();
+    return error === gl.NO_ERROR ? null : error;
+  }
+
   // Registers an object, so that `dispose` deletes it.
   track(object, kind) {
     this.made.set(object, kind);

@@ -21,7 +21,6 @@ export class Panorama {
   // texels per cell are enough. Texels need not be finer than `backgroundSpacing`, the spacing in training.
   constructor(graphics, { finest, halfExtent, backgroundSpacing }, coarse, paint) {
     Object.assign(this, { graphics, paint, texture: coarse });
-    graphics.setPanoramic(coarse);
     this.pace = new WorkPacer();
     const enough = Math.ceil(Math.PI * Math.min(finest / Math.min(...halfExtent), 1 / backgroundSpacing));
     this.height = Math.min(MAX_HEIGHT_TEXELS, Math.max(MIN_HEIGHT_TEXELS, enough));

@@ -14,12 +14,10 @@
 
 import { Eye, cameraOf, viewOf } from "./camera.js";
 import { AS_PHOTOGRAPHED, EXPOSURES, hasExposureMap, viewExposure } from "./exposure.js";
-import { Fields, MEMORY_REASON, UnsupportedDeviceError } from "./fields.js";
+import { MEMORY_REASON, UnsupportedDeviceError } from "./fields.js";
 import { ContextLostError, countContextChange } from "./graphics.js";
-import { MergedFields } from "./merged_fields.js";
 import { Loader, StartError, SupersededError } from "./loader.js";
 import { Renderer } from "./renderer.js";
-import { Splats } from "./splats.js";
 import { IDENTITY_QUAT } from "../hyrf/rotation.js";
 
 const SETTLE_MS = 200; // the wait after a movement before the picture is drawn at full resolution
@@ -39,18 +37,21 @@ const PROGRESS_RANGES = { loading: [0, 0.3], unpacking: [0.3, 0.6], preparing: [
 const DEVICE_LOST_TEXT = "Meanwhile the graphics device was lost, or another scene opened; try again.";
 const NOT_READY_TEXT = "The scene is not ready for exact pictures yet; wait until it is loaded.";
 const DISPOSED_TEXT = "The player was disposed of.";
+const NO_ORDER = { order: null, drawn: 0 }; // of contents that sort themselves
 
 export class Player extends EventTarget {
   // A player without a scene gets one from `open`. `workerAddress` is that of the worker's script, or null for the
   // embedded one. `streaming` is the module stream/stream_loader.js of players that open scene folders, else null, and
-  // `maxGaussians` their budget, null for the default one. Throws an Error with a message for the user if the browser
-  // cannot draw.
-  constructor(canvas, { scene = null, workerAddress = null, streaming = null, maxGaussians = null } = {}) {
+  // `maxGaussians` their budget, null for the default one. `rendererClass` draws, Renderer or WebgpuRenderer. Throws an
+  // Error with a message for the user if the browser cannot draw.
+  constructor(canvas, {
+    scene = null, workerAddress = null, streaming = null, maxGaussians = null, rendererClass = Renderer,
+  } = {}) {
     super();
-    Object.assign(this, { streaming, maxGaussians });
+    Object.assign(this, { streaming, maxGaussians, rendererClass });
     this.canvas = canvas;
     this.workerAddress = workerAddress;
-    this.renderer = new Renderer(canvas);
+    this.renderer = this.createRenderer();
     this.renderer.prepare().catch(() => {}); // while the file loads; `install` reports errors
     this.loader = null; // the loader of the file that is drawn
     this.next = null; // the loader of the file that is being loaded
@@ -96,6 +97,10 @@ export class Player extends EventTarget {
     addEventListener("resize", () => this.schedule(), { signal }); // fired for a new pixel ratio, too
     this.observer = new ResizeObserver(() => this.schedule());
     this.observer.observe(canvas);
+  }
+
+  createRenderer() {
+    return new this.rendererClass(this.canvas, () => this.onDeviceLost());
   }
 
   // Dispatches an event.
@@ -213,7 +218,7 @@ export class Player extends EventTarget {
       await this.waitFor(loader);
       await this.renderer.prepare();
       await loader.picture?.decode();
-      this.renderer.gl.getError(); // clears earlier errors
+      this.renderer.graphics.takeError(); // clears earlier errors
       content = this.makeContent(loader, message);
       const view = this.view(loader.update && sameAxes(this.scene, scene) ? this.eye : initial?.eye);
       await content.prepare(view.eye);
@@ -239,10 +244,7 @@ export class Player extends EventTarget {
 
   // Returns an object that draws a content.
   makeContent(loader, message) {
-    const { renderer: { gl } } = this, { models, splats } = message;
-    if (!models) return new Splats(gl, splats);
-    const streamed = loader.makeContent(gl, message);
-    return streamed ?? (models.length > 1 ? new MergedFields(gl, models) : new Fields(gl, models[0]));
+    return loader.makeContent(this.renderer.gl, message) ?? this.renderer.makeContent(message);
   }
 
   // Prepares the fields of a model whose estimate is shown. Returns true.
@@ -258,10 +260,10 @@ export class Player extends EventTarget {
   async check(loader, { graphics }, models) {
     await graphics.whenDone(); // otherwise asking for errors would block the page
     await this.waitFor(loader);
-    const error = graphics.gl.getError();
+    const error = graphics.takeError();
     if (graphics.lost) throw new ContextLostError();
-    if (error !== graphics.gl.NO_ERROR && models) throw new UnsupportedDeviceError(MEMORY_REASON);
-    if (error !== graphics.gl.NO_ERROR) throw new Error("It does not fit into the memory of the graphics device.");
+    if (error && models) throw new UnsupportedDeviceError(MEMORY_REASON);
+    if (error) throw new Error("It does not fit into the memory of the graphics device.");
   }
 
   // Asks for harmonics instead of a model that the device cannot draw. Throws the error if there is nothing else.
@@ -270,6 +272,7 @@ export class Player extends EventTarget {
     if (!isShown) content?.dispose();
     // After a lost context, `onRestored` decodes the file again. A lost device answers any question about it by null.
     if (content?.graphics.lost || error instanceof ContextLostError || error instanceof SupersededError) return;
+    if (content?.sortsItself && this.renderer.fallBack()) return this.makeContentsAgain();
     if (!models || models.length > 1) { // merged models have no harmonics
       if (isShown) [this.loaded, this.loader] = [false, null]; // what the canvas shows stays there
       throw error;
@@ -322,16 +325,32 @@ export class Player extends EventTarget {
   onLost(event) {
     event.preventDefault(); // otherwise the browser never restores the context
     countContextChange(this.renderer.gl);
+    this.stopDrawing();
+  }
+
+  // Handles the restored context, whose objects are all lost.
+  onRestored() {
+    countContextChange(this.renderer.gl);
+    this.renderer.releaseDevice();
+    this.makeContentsAgain(() => (this.renderer = this.createRenderer()));
+  }
+
+  // Handles a lost WebGPU device. WebGL draws from now on.
+  onDeviceLost() {
+    this.stopDrawing();
+    if (!this.lost) this.makeContentsAgain();
+  }
+
+  stopDrawing() {
     this.loaded = false;
     this.idle = false; // the picture is incomplete until the device is restored
     this.emit("remark", "The graphics device was lost; drawing resumes when it is back.");
   }
 
-  // Handles the restored context, whose objects are all lost.
-  async onRestored() {
+  // Decodes the files again and draws them, after `prepare` if it succeeds.
+  async makeContentsAgain(prepare = () => {}) {
     try {
-      countContextChange(this.renderer.gl);
-      this.renderer = new Renderer(this.canvas);
+      prepare();
       this.coarse = 1;
       for (const loader of [this.loader, this.next, this.previous]) loader?.again(false);
       if (this.loader) await this.loader.expect(); // showing the content also updates the remark
@@ -572,10 +591,16 @@ export class Player extends EventTarget {
   async sort() {
     if (!this.unsorted || !this.loaded || this.loader.busy) return;
     this.unsorted = false;
-    const { content } = this.renderer, sorted = await this.loader.sort(this.view(), this.scene);
+    const { content } = this.renderer, order = this.findOrder(this.view());
+    const sorted = order === NO_ORDER ? order : await order; // frames need not wait for the device's own order
     if (sorted && content === this.renderer.content) this.setOrder(sorted);
     else this.unsorted = true;
     this.redraw();
+  }
+
+  // Returns the order of the splats for a view, or a promise of it, see Loader.sort.
+  findOrder(view) {
+    return this.renderer.content.sortsItself ? NO_ORDER : this.loader.sort(view, this.scene);
   }
 
   // Uploads an order.
@@ -633,7 +658,7 @@ export class Player extends EventTarget {
 
   // Sorts a content for a view, for a picture that is drawn at once. Throws ContextLostError if that is impossible.
   async sortFor(view, content = this.renderer.content) {
-    const sorted = this.loaded ? await this.loader.sort(view, this.scene) : null;
+    const sorted = this.loaded ? await this.findOrder(view) : null;
     if (!sorted || !this.loaded || content !== this.renderer.content) throw new ContextLostError(DEVICE_LOST_TEXT);
     this.setOrder(sorted);
   }
@@ -646,7 +671,7 @@ export class Player extends EventTarget {
     const isWanted = () => this.idle && this.loaded && this.moves === moves && content === this.renderer.content;
     await this.enqueue(() => this.renderer.graphics.whenDone()); // for `read`
     const draw = async (view) => {
-      const sorted = isWanted() ? await this.loader.sort(view, this.scene) : null;
+      const sorted = isWanted() ? await this.findOrder(view) : null;
       if (!sorted || !isWanted()) return;
       this.unsorted = true;
       this.setOrder(sorted);

@@ -3,14 +3,17 @@
 
 import { Graphics } from "./graphics.js";
 import { BACKGROUND_RADIUS, TEXTURE_WIDTH } from "./constants.js";
+import { Fields } from "./fields.js";
+import { MergedFields } from "./merged_fields.js";
+import { Splats } from "./splats.js";
 import { viewFromPlace } from "../hyrf/places.js";
 
 const MAX_READ_SIDE_PIXELS = 8192; // the limit of pictures that are read back
 const QUADS_PER_INSTANCE = 1024; // drivers are slow with many small instances
 const MAX_ABS_LOG_GAIN = 8; // in files
 const LOW_PASS_VARIANCE = 0.3; // px^2, as in hyrfpack render
-const ALPHA_MIN = 1 / 255; // splats are not drawn where their alpha is less, as in hyrfpack render
-const REDUCED_ALPHA_MIN = 1 / 72; // of a picture at a part of the resolution
+export const ALPHA_MIN = 1 / 255; // splats are not drawn where their alpha is less, as in hyrfpack render
+export const REDUCED_ALPHA_MIN = 1 / 72; // of a picture at a part of the resolution
 const ROWS_PER_COLUMN = 2; // a picture at a part of the resolution keeps this many times as many rows as columns
 const WARM_UP_VIEW = {
   width: 1, height: 1, fx: 1, fy: 1, cx: 0.5, cy: 0.5,
@@ -76,6 +79,18 @@ export class Renderer {
     Object.assign(this, { content: null, finished: false });
   }
 
+  // Returns an object that evaluates the models of a content, or holds its splats.
+  makeContent({ models, splats }) {
+    if (!models) return new Splats(this.gl, splats);
+    return models.length > 1 ? new MergedFields(this.gl, models) : new Fields(this.gl, models[0]);
+  }
+
+  // Draws with another interface of the device from now on, if there is one. Returns whether that is a change, after
+  // which contents must be made again.
+  fallBack() {
+    return false;
+  }
+
   // Creates all objects for drawing a content (`Splats` or `Fields`), which `show` uses. They are freed with the
   // content. `picture` is the background's picture (see `background`), or null.
   stage(content, scene, picture) {
@@ -122,7 +137,7 @@ export class Renderer {
   // many rows, the picture is much nearer to the reduced picture at full resolution, because a pixel where several
   // small splats meet is not what their mean opacities make of it.
   draw(view, scale, exposure) {
-    const { gl } = this, reduced = resizeView(view, scale, Math.min(1, ROWS_PER_COLUMN * scale));
+    const { gl } = this, reduced = reduceView(view, scale);
     this.blendAll(reduced, exposure);
     this.over(reduced, this.frameTarget(reduced.width, reduced.height), exposure, view);
     gl.deleteSync(this.fence);
@@ -162,8 +177,8 @@ export class Renderer {
     gl.getError(); // clears earlier errors
     const texture = graphics.texture(gl.TEXTURE_2D, gl.RGBA8, width, height);
     const target = graphics.framebuffer(texture);
-    this.blendAll(view, exposure);
-    this.over(view, target, exposure);
+    this.paint(view, { texture, target }, exposure);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, target);
     const rgba = new Uint8Array(4 * width * height), buffer = graphics.track(gl.createBuffer(), "Buffer");
     gl.bindBuffer(gl.PIXEL_PACK_BUFFER, buffer);
     gl.bufferData(gl.PIXEL_PACK_BUFFER, rgba.length, gl.STREAM_READ);
@@ -178,6 +193,12 @@ export class Renderer {
     if (width > gl.drawingBufferWidth || height > gl.drawingBufferHeight) this.release();
     if (refused) throw new Error(`The device cannot draw a picture of ${width} x ${height}; ask for a smaller one.`);
     return rgba.filter((_, place) => (place & 3) !== 3);
+  }
+
+  // Draws a view to a {texture, target} of its size.
+  paint(view, { target }, exposure) {
+    this.blendAll(view, exposure);
+    this.over(view, target, exposure);
   }
 
   // Throws an Error with a message for the user if a view's picture is too large.
@@ -342,6 +363,9 @@ export class Renderer {
     this.surfaces[name] = null;
   }
 
+  // Frees what outlives a lost WebGL context.
+  releaseDevice() {}
+
   dispose() {
     this.content?.dispose();
     this.graphics.dispose();
@@ -351,7 +375,7 @@ export class Renderer {
 }
 
 // Returns the background sphere in the page's units. The radius is Infinity if the scene has none.
-function backgroundSphere({ kind, sphere, center, unit }) {
+export function backgroundSphere({ kind, sphere, center, unit }) {
   if (kind === "hyrf") return { center: [0, 0, 0], radius: BACKGROUND_RADIUS };
   if (!sphere) return { center: [0, 0, 0], radius: Infinity };
   return { center: sphere.center.map((value, axis) => (value - center[axis]) / unit), radius: sphere.radius / unit };
@@ -363,15 +387,16 @@ const encodeLog = (log) => (log + MAX_ABS_LOG_GAIN) / (2 * MAX_ABS_LOG_GAIN);
 // Returns the variances of the low-pass filter at `scales` times the full resolution along x and y, in pixels of that
 // resolution: those of the full resolution, and the sums of these and the variances of the mean over 1 / scale pixels,
 // which make a picture at this resolution nearly equal to the reduced picture at full resolution.
-function lowPassVariances(scales) {
+export function lowPassVariances(scales) {
   const full = scales.map((scale) => LOW_PASS_VARIANCE * scale ** 2);
   return [...full, ...full.map((variance, axis) => variance + (1 - scales[axis] ** 2) / 12)];
 }
 
-const isReduced = ({ scales }) => scales !== undefined && Math.min(...scales) < 1;
+export const isReduced = ({ scales }) => scales !== undefined && Math.min(...scales) < 1;
 
-// Returns a view at about `across` and `down` times its resolution along x and y.
-function resizeView(view, across, down) {
+// Returns a view at about `scale` times its resolution, with more rows than columns.
+export function reduceView(view, scale) {
+  const [across, down] = [scale, Math.min(1, ROWS_PER_COLUMN * scale)];
   const width = Math.max(1, Math.round(view.width * across)), height = Math.max(1, Math.round(view.height * down));
   const [x, y] = [width / view.width, height / view.height];
   return { ...view, width, height, fx: view.fx * x, fy: view.fy * y, cx: view.cx * x, cy: view.cy * y, scales: [x, y] };

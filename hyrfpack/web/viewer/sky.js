@@ -31,12 +31,10 @@ export class Sky {
   // Starts a view. For `blend` see Fields.complete.
   begin(view, blend) {
     if (this.of(view)) return;
-    const { gl } = this.graphics, blended = blend(view), [stride, ...size] = this.grid(view);
+    const blended = blend(view), [stride, ...size] = this.grid(view);
     this.stride = stride;
     this.reserve(...size);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.target);
-    gl.clearColor(0, 0, 0, 0);
-    gl.clear(gl.COLOR_BUFFER_BIT);
+    this.clearNodes();
     this.markNeeded(view, blended);
     this.view = view;
     this.key = describeView(view);
@@ -52,13 +50,11 @@ export class Sky {
   // Evaluates all nodes of a moving view, at once, if that takes at most `ms` at `nodeMs` a node. Returns whether it
   // did.
   follow(view, nodeMs, ms) {
-    const { gl } = this.graphics, [stride, ...size] = this.grid(view);
+    const [stride, ...size] = this.grid(view);
     if (!(size[0] * size[1] * nodeMs <= ms)) return false;
     this.stride = stride;
     this.reserve(...size);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.marked);
-    gl.clearColor(1, 1, 1, 1);
-    gl.clear(gl.COLOR_BUFFER_BIT);
+    this.markAll();
     this.paint(this.target, size, [0, 0, ...size], view, this.needed, stride);
     this.key = describeView(view);
     this.tiles = [];
@@ -76,6 +72,22 @@ export class Sky {
     this.target = graphics.framebuffer(this.texture);
     this.needed = graphics.texture(gl.TEXTURE_2D, gl.R8, width, height);
     this.marked = graphics.framebuffer(this.needed);
+  }
+
+  clearNodes() {
+    this.clear(this.target, 0);
+  }
+
+  // Sets all components of a target to a value.
+  clear(target, value) {
+    const { gl } = this.graphics;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, target);
+    gl.clearColor(value, value, value, value);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+  }
+
+  markAll() {
+    this.clear(this.marked, 1);
   }
 
   // Marks the nodes from which a pixel that shows the background is interpolated. `splats` is the view's picture of

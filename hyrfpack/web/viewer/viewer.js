@@ -6,12 +6,14 @@ import { AS_PHOTOGRAPHED, EXPOSURES } from "./exposure.js";
 import { SupersededError } from "./loader.js";
 import { Navigation } from "./navigation.js";
 import { Player } from "./player.js";
+import { Renderer } from "./renderer.js";
 import { openSource } from "./source.js";
 import { STREAMING } from "./stream/stream_loader.js";
 
 const EVENTS = ["ready", "progress", "error", "camera", "ignored"];
 const INTERACTIONS = ["after-click", "always", "none"];
 const LOADINGS = ["eager", "lazy"];
+const RENDERER_TEXT = 'renderer must be the export `webgpu` of "hyrf-viewer/webgpu"; leave it out for WebGL 2.';
 const LAZY_MARGIN = "300px"; // a lazy scene is loaded when its container is this near to the window
 const CANVAS_STYLE = { display: "block", width: "100%", height: "100%" };
 
@@ -23,19 +25,22 @@ class Viewer {
   constructor({
     container, src = null, name, camera = null, exposure = AS_PHOTOGRAPHED, autorotate = false,
     interaction = "after-click", loading = "eager", title = "3D scene", workerUrl = null, maxGaussians = null,
+    renderer = Renderer,
   }) {
     this.container = typeof container === "string" ? document.querySelector(container) : container;
     if (!(this.container instanceof Element)) throw new Error("createViewer needs a container: element or selector.");
     checkChoice("exposure", exposure, EXPOSURES);
     checkChoice("interaction", interaction, INTERACTIONS);
     checkChoice("loading", loading, LOADINGS);
+    if (typeof renderer !== "function") throw new Error(RENDERER_TEXT);
     this.canvas = document.createElement("canvas");
     Object.assign(this.canvas.style, CANVAS_STYLE);
     this.canvas.tabIndex = interaction === "none" ? -1 : 0;
     this.canvas.setAttribute("role", interaction === "none" ? "img" : "application");
     this.canvas.setAttribute("aria-label", title);
     const workerAddress = workerUrl && new URL(workerUrl, document.baseURI).href;
-    this.player = new Player(this.canvas, { workerAddress, streaming: STREAMING, maxGaussians });
+    const playerOptions = { workerAddress, streaming: STREAMING, maxGaussians, rendererClass: renderer };
+    this.player = new Player(this.canvas, playerOptions);
     this.player.exposure = exposure;
     this.navigation = new Navigation(this.player, {
       keyTarget: interaction === "none" ? null : this.canvas,
