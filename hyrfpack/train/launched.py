@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from torch import Tensor
 
@@ -31,29 +32,41 @@ class RenderedView:
     reserve: Reserve | None
 
 
+class StepChecks(NamedTuple):
+    """What decides on the device whether a step is valid.
+
+    Attributes:
+        valid: bool scalar.
+        demand: (4,) int64, see `Rendering.demand`.
+        norms: (tensors,) the largest absolute value of each gradient; NaN if any is.
+    """
+
+    valid: Tensor
+    demand: Tensor
+    norms: Tensor
+
+
 @dataclass(frozen=True)
 class LaunchedStep:
     """A step that the device was given, and whose numbers are on their way to the host.
 
     Attributes:
         step: number of the step, from 1.
-        view, picture: the view and its photo; None on one of several processes whose view had a problem.
-        numbers: statistics of the step; `Rendering.valid` and `Rendering.demand`, if there is a demand; and for each
-            parameter with a gradient its largest absolute value or, without a demand, whether it is not finite.
-        lengths: the length of each of these three.
+        reserved: the view and its photo if it was rendered into a reserve, or None.
+        numbers: statistics of the step; then its `StepChecks` if it has a reserve, otherwise for each parameter with a
+            gradient whether that is not finite.
+        stats_length: how many of the numbers are statistics.
     """
 
     step: int
-    view: View | None
-    picture: Picture | None
+    reserved: tuple[View, Picture] | None
     numbers: HostCopy
-    lengths: tuple[int, int, int]
+    stats_length: int
 
-    def read_numbers(self) -> tuple[list[float], list[float], list[float]]:
-        """Wait for the numbers, and return the three kinds."""
+    def read_numbers(self) -> tuple[list[float], list[float]]:
+        """Wait for the numbers, and return the statistics and the others."""
         numbers = self.numbers.tolist()
-        first, second, _ = self.lengths
-        return numbers[:first], numbers[first : first + second], numbers[first + second :]
+        return numbers[: self.stats_length], numbers[self.stats_length :]
 
 
 @dataclass(frozen=True)

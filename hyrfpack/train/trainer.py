@@ -36,7 +36,7 @@ from hyrfpack.train.checkpoint import load_checkpoint, names_and_sizes, save_che
 from hyrfpack.train.density import DensityControl
 from hyrfpack.train.distributed import StepStats, average_gradients, check_settings, digest, pack_step_stats
 from hyrfpack.train.exposure import initialize_exposures
-from hyrfpack.train.launched import LaunchedStep, RenderedView, SettledStep
+from hyrfpack.train.launched import LaunchedStep, RenderedView, SettledStep, StepChecks
 from hyrfpack.train.optimizer import Optimizer
 from hyrfpack.train.reserves import ReserveEstimator
 from hyrfpack.train.resolution import ResolutionSchedule
@@ -297,24 +297,15 @@ class Trainer:
         Nothing changes if the rendering turns out to be invalid. On one of several processes, None stands for a view
         that has a problem.
         """
-        view = picture = valid = None
-        checks: list[Tensor] = []
-        norms: Tensor | None = None
+        checks = None if rendered is None else self._check_on_device(rendered)
+        valid = None if checks is None else checks.valid
         if rendered is None:
             loss = error = torch.zeros((), device=self.device)
         else:
-            view, picture, loss, error, rendering = (
-                rendered.view, rendered.picture, rendered.loss, rendered.error, rendered.rendering
-            )  # fmt: skip
-            if rendered.reserve is not None and (demand := rendering.demand) is not None:
-                norms = self._gradient_norms()
-                numbers = torch.cat((loss.double()[None], norms, demand))
-                limits = MAX_LOSS, *[MAX_GRADIENT] * len(norms), *rendered.reserve.limits
-                valid = (numbers <= tensor_like(limits, numbers)).all()
-                rendering = dataclasses.replace(rendering, valid=valid)
-                checks = [valid[None], demand]
+            loss, error = rendered.loss, rendered.error
             with self._timed("density"):
-                self.strategy.observe(rendering, view.camera, self.model)
+                rendering = dataclasses.replace(rendered.rendering, valid=valid)
+                self.strategy.observe(rendering, rendered.view.camera, self.model)
         packed = torch.stack((loss, error))
         if not self.ranks.is_single:
             with self._timed("exchange"):
@@ -327,17 +318,27 @@ class Trainer:
                 seen, all_seen = (self.ranks.size * steps for steps in (step - 1, self.steps))
                 rate = self.config.learning_rates.at("exposure", seen, all_seen)
                 broken = torch.cat((broken, self.exposures.step(rate, self._views_of_step(step), valid)[None]))
-        if norms is not None:
-            broken = norms  # Where it is not valid, the optimiser has set no flags.
-        lengths = len(packed), sum(map(len, checks)), len(broken)
-        self._launched = LaunchedStep(step, view, picture, HostCopy(torch.cat((packed, *checks, broken))), lengths)
+        reserved, numbers = None, [packed, broken]
+        if rendered is not None and checks is not None:  # Adam sets no flags where the step is not valid.
+            reserved = rendered.view, rendered.picture
+            numbers = [packed, checks.valid[None], checks.demand, checks.norms]
+        self._launched = LaunchedStep(step, reserved, HostCopy(torch.cat(numbers)), len(packed))
 
-    def _gradient_norms(self) -> Tensor:
-        """Return the largest absolute value of each gradient, NaN if any is NaN, in the order of `_groups`."""
+    def _check_on_device(self, rendered: RenderedView) -> StepChecks | None:
+        """Return whether a step is valid, without waiting; None if its rendering has no reserve that may be too small.
+
+        It is valid if the loss and all gradients are finite and the reserve was large enough.
+        """
+        demand = rendered.rendering.demand
+        if rendered.reserve is None or demand is None:
+            return None
         gradients = self.optimizer.gradients()
         if self.exposures is not None and self.exposures.values.grad is not None:
             gradients.append(self.exposures.values.grad)
-        return torch.stack(torch._foreach_norm(gradients, torch.inf))
+        norms = torch.stack(torch._foreach_norm(gradients, torch.inf))
+        numbers = torch.cat((rendered.loss.double()[None], norms, demand))
+        limits = MAX_LOSS, *[MAX_GRADIENT] * len(norms), *rendered.reserve.limits
+        return StepChecks((numbers <= tensor_like(limits, numbers)).all(), demand, norms)
 
     def _settle_launched(self, problem: HyrfError | None = None, *, was_retaken: bool = False) -> list[SettledStep]:
         """Settle the launched step, if any: wait for its numbers and check them.
@@ -351,21 +352,23 @@ class Trainer:
         if self._launched is None:
             return []
         launched, self._launched = self._launched, None
-        step, view, picture = launched.step, launched.view, launched.picture
+        step = launched.step
         with self._timed("loss"):
-            sums, checks, flags = launched.read_numbers()
+            sums, numbers = launched.read_numbers()
         self.ranks.raise_if_lost()
         stats = StepStats(sums[0], sums[1]) if self.ranks.is_single else StepStats.from_sums(sums, self.ranks.size)
         if stats.problem:
             self.ranks.raise_if_any(problem)
-        if checks and view is not None and picture is not None:
-            valid, nonfinite_positions, in_view, nonfinite_inputs, pairs = checks
-            flags = [float(not norm <= MAX_GRADIENT) for norm in flags]
+        if launched.reserved is None:
+            flags = numbers
+        else:
+            valid, nonfinite_positions, in_view, nonfinite_inputs, pairs, *norms = numbers
             if nonfinite_positions or nonfinite_inputs:
                 self._refuse(step, "a number to be rendered is not finite", self._nonfinite_parameters())
-            self._reserves.record(view, len(self.model), int(in_view), int(pairs))
+            self._reserves.record(launched.reserved[0], len(self.model), int(in_view), int(pairs))
+            flags = [float(not norm <= MAX_GRADIENT) for norm in norms]
             if not valid and np.isfinite(stats.loss) and not any(flags):
-                self._retake(step, view, picture)
+                self._retake(step, *launched.reserved)
                 return self._settle_launched(was_retaken=True)
         if not np.isfinite(stats.loss):
             self._refuse(step, "the loss is not finite", self._nonfinite_parameters())
