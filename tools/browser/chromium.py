@@ -10,6 +10,7 @@ import shutil
 import threading
 import time
 from collections.abc import Coroutine, Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from tools.browser.browser import TIMEOUT_SECONDS, Browser
@@ -168,16 +169,29 @@ class Chromium(Browser):
             self._wait(self._devtools.send("Page.stopScreencast"))
             self._devtools.remove_listener("Page.screencastFrame", receive)
 
-    def cpu_seconds(self) -> float:
-        """Return the CPU seconds of all processes of the browser since its start."""
+    def _list_processes(self) -> list[dict[str, Any]]:
+        """Return the id and the CPU seconds (cpuTime) of each process of the browser."""
 
-        async def measure() -> float:
+        async def ask() -> list[dict[str, Any]]:
             devtools = await self._browser.new_browser_cdp_session()
             processes = await devtools.send("SystemInfo.getProcessInfo")
             await devtools.detach()
-            return sum(process["cpuTime"] for process in processes["processInfo"])
+            return processes["processInfo"]
 
-        return self._wait(measure())
+        return self._wait(ask())
+
+    def cpu_seconds(self) -> float:
+        """Return the CPU seconds of all processes of the browser since its start."""
+        return sum(process["cpuTime"] for process in self._list_processes())
+
+    def measure_memory(self) -> int:
+        """Return the bytes of memory of all processes of the browser; memory that several share counts once (PSS)."""
+        total = 0
+        for process in self._list_processes():
+            with contextlib.suppress(OSError):  # it may have ended meanwhile
+                text = Path(f"/proc/{process['id']}/smaps_rollup").read_text()
+                total += sum(1024 * int(line.split()[1]) for line in text.splitlines() if line.startswith("Pss:"))
+        return total
 
     def collect_garbage(self) -> int:
         """Free unused memory of the page's scripts; return the bytes of objects and buffers that are left."""

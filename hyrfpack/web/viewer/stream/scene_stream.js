@@ -40,6 +40,8 @@ const ROW_WIDTH = 256; // of the textures: each level begins a row, and the coar
 const FIRST_PICTURE_BYTES = 200_000; // that are fetched before the first picture is drawn, if they have a chunk
 const MEMORY_RATIO = 1.25; // memory for Gaussians in budgets, because levels that fade are there twice
 const EXTRA_ROWS_PER_CHUNK = 2; // for the coarsest level, and for rows that are not full
+// That wait to be evaluated. A slow device then evaluates what the present view needs, not all that earlier ones did.
+const MAX_UPLOADING_ROWS = 512;
 const MAX_FIRST_LOSSES = 3; // of the connection before the first picture; then what is there is drawn
 const MAX_PSNR_DB = 99;
 const MIN_UPDATE_MS = 20; // between two updates, so that many events cause only one
@@ -58,7 +60,7 @@ export class SceneStream {
     this.early = new Map(); // name of a file that came before the shared file of its part -> [file, bytes]
     this.isOutdated = true; // whether levels must be chosen again
     this.isShort = false; // whether a wanted level does not fit into memory
-    this.decoding = 0; // the number of files that are being decoded
+    this.decoding = new Set(); // names of files that are being decoded
     this.timer = null; // of the next update
     this.updateMs = 0; // the time that the last update took
     this.resume = () => this.queue.resume();
@@ -231,7 +233,7 @@ export class SceneStream {
       add(this.partOf(chunk));
       files.add(level.file);
     }
-    this.queue.want([...files].filter(({ file }) => !this.early.has(file)));
+    this.queue.want([...files].filter(({ file }) => !this.early.has(file) && !this.decoding.has(file)));
   }
 
   // Gives up, with a sentence for the user.
@@ -299,14 +301,22 @@ export class SceneStream {
     wanted.sort((a, b) => b.isFirst - a.isFirst || b.rate - a.rate);
     let room = this.spareLevels().reduce((rows, { rowCount }) => rows + rowCount, this.pool.free);
     const fitting = wanted.findIndex(({ level: { rowCount } }) => (room -= rowCount) < 0);
-    this.want(fitting < 0 ? wanted : wanted.slice(0, fitting));
+    let queue = MAX_UPLOADING_ROWS - this.countUploadingRows();
+    const isNext = ({ level: { file, rowCount } }) => (queue -= rowCount) >= 0 || this.queue.requests.has(file.file);
+    this.want((fitting < 0 ? wanted : wanted.slice(0, fitting)).filter(isNext));
     if (this.isShort !== fitting >= 0) this.schedule();
     this.isShort = fitting >= 0;
   }
 
+  // Returns the number of rows that wait to be evaluated.
+  countUploadingRows() {
+    const waiting = this.chunks.flatMap(({ levels }) => levels.filter(({ state }) => state === UPLOADING));
+    return waiting.reduce((sum, { rowCount }) => sum + rowCount, 0);
+  }
+
   // Takes a file.
   async receive(file, bytes) {
-    this.decoding++;
+    this.decoding.add(file.file);
     try {
       const part = this.parts.find((each) => each.file === file);
       if (part) await this.receivePart(part, bytes);
@@ -315,7 +325,7 @@ export class SceneStream {
       const isMemory = error instanceof RangeError; // thrown for arrays that are too long
       this.reject(file, isMemory ? "there is not enough memory for it" : reasonOf(error));
     }
-    this.decoding--;
+    this.decoding.delete(file.file);
     this.schedule();
   }
 
@@ -404,7 +414,7 @@ export class SceneStream {
   postState() {
     const { queue, chunks, request: { manifest } } = this;
     const isWorking = chunks.some(({ fading, levels }) => fading || levels.some(({ state }) => state === UPLOADING));
-    const isWaiting = this.isOutdated || this.decoding > 0 || (queue.wanted.length > 0 && !queue.isLost);
+    const isWaiting = this.isOutdated || this.decoding.size > 0 || (queue.wanted.length > 0 && !queue.isLost);
     const isSettled = chunks.every((chunk) => chunk.next(this.isShort) === chunk.shown);
     const state = {
       ticket: this.chosenTicket,
