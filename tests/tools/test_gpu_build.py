@@ -17,9 +17,17 @@ from tools.gpu.build_tables import format_comparison
 from tools.gpu.sass import parse_listing
 
 REPOSITORY_ROOT = Path(__file__).parents[2]
-# Versions of Triton for which the kernels are arranged, and how many bytes a kernel may spill there: 3.6 keeps up to 4
-# addresses in memory. 3.9 spills 6 to 104 bytes in three builds (sm_80 and gfx942).
-MAX_SPILLS_BY_TRITON = {"3.6.": 32, "3.7.": 0}
+# Versions of Triton for which the kernels are arranged, and the bytes that a few kernels spill there. 3.9 spills 6 to
+# 104 bytes in three builds (sm_80 and gfx942).
+KNOWN_SPILLS = {
+    "3.6.": {
+        ("adam.gpu.adam_step_kernel", "sm_86"): 16,
+        ("adam.gpu.adam_step_kernel", "sm_89"): 16,
+        ("adam.gpu.adam_step_kernel", "sm_90"): 8,
+        ("mlp.gpu.backward_kernel", "sm_120"): 32,
+    },
+    "3.7.": {("mlp.gpu.backward_kernel", "sm_120"): 8},
+}
 GPU_TARGETS = ["sm_80", "sm_86", "sm_89", "sm_90", "sm_100", "sm_120", "gfx942"]
 
 pytestmark = needs_triton
@@ -60,11 +68,12 @@ def test_every_kernel_builds(report: dict[str, list], target: str) -> None:
 
 
 @pytest.mark.parametrize("target", GPU_TARGETS)
-def test_no_kernel_spills_registers(report: dict[str, list], target: str) -> None:
-    most = next((most for prefix, most in MAX_SPILLS_BY_TRITON.items() if report["triton"].startswith(prefix)), None)
-    spilling = [build for build in builds_for(report, target) if build["spills"] > (most or 0)]
+def test_no_kernel_spills_more_registers_than_known(report: dict, target: str) -> None:
+    known = next((spills for prefix, spills in KNOWN_SPILLS.items() if report["triton"].startswith(prefix)), None)
+    builds = builds_for(report, target)
+    spilling = [build for build in builds if build["spills"] > (known or {}).get((build["kernel"], target), 0)]
     messages = [f"{build['kernel']}: {build['spills']} ({build['constants']})" for build in spilling]
-    if messages and most is None:
+    if messages and known is None:
         pytest.xfail(
             f"Triton {report['triton']} takes more registers than those the kernels were laid out for: {messages}"
         )

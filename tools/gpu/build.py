@@ -142,7 +142,8 @@ def mlp_runs(count: int, width: int, height: int) -> Iterator[Run]:
         x = torch.rand(inputs, count).T.requires_grad_()
         for mixed in (False, True):
             run = partial(mlp, x, weights, biases, mixed=mixed)
-            yield lambda run=run: (run(), run(used=count_rows(count)).sum().backward())
+            # In training an activation follows, whose gradient is stored by rows.
+            yield lambda run=run: (run() + run(used=count_rows(count))).sigmoid().sum().backward()
 
 
 def rasterize_runs(count: int, width: int, height: int) -> Iterator[Run]:
