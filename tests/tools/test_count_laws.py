@@ -29,9 +29,14 @@ def test_bits_of_the_parts_add_up_to_those_of_the_file():
 
 
 def test_the_survey_gets_one_file_for_each_photo_size_with_its_columns(tmp_path):
-    write_survey([*ROWS, row(200, 1000, 21.5, 9000, 0.25)], tmp_path)
-    with (tmp_path / "400.csv").open(newline="") as file:
+    write_survey([*ROWS, row(200, 1000, 21.5, 9000, 0.25)], tmp_path, "bonsai")
+    with (tmp_path / "bonsai-400.csv").open(newline="") as file:
         large = list(csv.reader(file))
     assert tuple(large[0]) == SURVEY_COLUMNS and len(large) == 1 + len(ROWS)
     assert large[1] == ["", "20.0", "0.5", "", "10000", "1000"]
-    assert (tmp_path / "200.csv").read_text().splitlines()[1] == ",21.5,0.5,0.25,9000,1000"
+    assert (tmp_path / "bonsai-200.csv").read_text().splitlines()[1] == ",21.5,0.5,0.25,9000,1000"
+
+
+def test_the_survey_of_one_photo_size_has_the_name_of_the_set(tmp_path):
+    write_survey(ROWS, tmp_path, "bonsai")
+    assert [path.name for path in tmp_path.iterdir()] == ["bonsai.csv"]

@@ -7,8 +7,9 @@ The first table has one row for each run: PSNR (dB) and SSIM of the compact file
 bits per Gaussian of positions, of the other properties, of the hash tables, and of decoders and metadata. The second
 has, for each photo size, the least-squares fit of PSNR = a + b log2(N), and of the bytes by N.
 
---survey writes `FOLDER/SET/SIZE.csv` with the columns of the survey of compression methods "3DGS.zip" (Submethod, PSNR,
-SSIM, LPIPS, Size [Bytes], #Gaussians). LPIPS is empty without --lpips-weights.
+--survey writes `FOLDER/SET.csv`, or `FOLDER/SET-SIZE.csv` for several photo sizes, with the columns of the survey of
+compression methods "3DGS.zip" (Submethod, PSNR, SSIM, LPIPS, Size [Bytes], #Gaussians). LPIPS is empty without
+--lpips-weights.
 """
 
 from __future__ import annotations
@@ -116,11 +117,15 @@ def format_fits(rows: Sequence[CountRow]) -> str:
     return markdown_table(("pixels", "PSNR", "size of the file"), cells)
 
 
-def write_survey(rows: Sequence[CountRow], folder: Path) -> None:
-    """Write one CSV file for each photo size, with the survey's columns; rows without a name appear in its plots."""
+def write_survey(rows: Sequence[CountRow], folder: Path, name: str) -> None:
+    """Write one CSV file of the set `name` for each photo size, with the survey's columns.
+
+    Rows have no Submethod, so they appear in the survey's plots only.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    for size in dict.fromkeys(row.size for row in rows):
-        with (folder / f"{size}.csv").open("w", newline="") as file:
+    sizes = list(dict.fromkeys(row.size for row in rows))
+    for size in sizes:
+        with (folder / (f"{name}.csv" if len(sizes) == 1 else f"{name}-{size}.csv")).open("w", newline="") as file:
             writer = csv.writer(file)
             writer.writerow(SURVEY_COLUMNS)
             for row in rows:
@@ -147,7 +152,7 @@ def main() -> None:
         rows = read_rows(out)
         print(f"{name}\n\n{format_rows(rows)}\n\n{format_fits(rows)}\n")
         if args.survey:
-            write_survey(rows, args.survey / name)
+            write_survey(rows, args.survey, name)
 
 
 if __name__ == "__main__":
