@@ -70,7 +70,7 @@ class LaunchedStep:
 
 
 @dataclass(frozen=True)
-class SettledStep:
+class ConfirmedStep:
     """A step whose numbers were read and found valid.
 
     Attributes:

@@ -36,7 +36,7 @@ from hyrfpack.train.checkpoint import load_checkpoint, names_and_sizes, save_che
 from hyrfpack.train.density import DensityControl
 from hyrfpack.train.distributed import StepStats, average_gradients, check_settings, digest, pack_step_stats
 from hyrfpack.train.exposure import initialize_exposures
-from hyrfpack.train.launched import LaunchedStep, RenderedView, SettledStep, StepChecks
+from hyrfpack.train.launched import ConfirmedStep, LaunchedStep, RenderedView, StepChecks
 from hyrfpack.train.optimizer import Optimizer
 from hyrfpack.train.reserves import ReserveEstimator
 from hyrfpack.train.resolution import ResolutionSchedule
@@ -178,12 +178,12 @@ class Trainer:
                 start = time.perf_counter()
                 self.step += 1
                 complete, is_due = self.step == self.steps, self.step % every == 0
-                settled = self._train_step(views, stop, settle=complete or (checkpoint is not None and is_due))
+                confirmed = self._train_step(views, stop, confirm=complete or (checkpoint is not None and is_due))
                 self.elapsed += time.perf_counter() - start
-                self._report(settled, progress)
-                stopped = (stop() if self.ranks.is_single else settled[-1].stop) and not complete
+                self._report(confirmed, progress)
+                stopped = (stop() if self.ranks.is_single else confirmed[-1].stop) and not complete
                 if stopped:
-                    self._report(self._settle_launched(), progress)
+                    self._report(self._confirm_launched(), progress)
                 if checkpoint and (stopped or (is_due and not complete)):
                     try:
                         self.save(checkpoint, overwrite=overwrite or self.saved is not None)
@@ -205,9 +205,9 @@ class Trainer:
         views = shuffled(self.scene.train, self.config.seed, places)
         return map(self.resolution.reduce_view, views, range(self.step + 1, self.steps + 1))
 
-    def _report(self, settled: Sequence[SettledStep], progress: Callable[[StepEvent], None]) -> None:
-        """Add settled steps to the training curve and report them; the last one of the run fits the exposure map."""
-        for stats in settled:
+    def _report(self, confirmed: Sequence[ConfirmedStep], progress: Callable[[StepEvent], None]) -> None:
+        """Add confirmed steps to the training curve and report them; the last one of the run fits the exposure map."""
+        for stats in confirmed:
             self._record(stats)
             if stats.step == self.steps:
                 self.fit_exposure_map()
@@ -217,21 +217,21 @@ class Trainer:
             progress(StepEvent(stats.step, self.steps, stats.loss, stats.error, len(self.model), share))
 
     def _train_step(
-        self, views: Iterator[tuple[View, Picture]], stop: Callable[[], bool], *, settle: bool
-    ) -> list[SettledStep]:
+        self, views: Iterator[tuple[View, Picture]], stop: Callable[[], bool], *, confirm: bool
+    ) -> list[ConfirmedStep]:
         """Take one optimiser step, and add and prune Gaussians if a round is due.
 
-        A step is settled when its numbers are read and found valid. If views are rendered into reserves, the host gives
-        the GPU the next view's gradients before it reads the numbers of a step, so that the GPU never runs idle.
+        A step is confirmed when its numbers are read and found valid. If views are rendered into reserves, the host
+        gives the GPU the next view's gradients before it reads the numbers of a step, so that the GPU never runs idle.
 
         Args:
-            settle: settle this step, too, before returning.
+            confirm: confirm this step, too, before returning.
 
         Returns:
-            The steps that were settled.
+            The steps that were confirmed.
         """
         problem: HyrfError | None = None
-        settled: list[SettledStep] = []
+        confirmed: list[ConfirmedStep] = []
         rendered: RenderedView | None = None
         try:
             with explain_out_of_memory(OUT_OF_MEMORY_FIX), self._timed("data"):
@@ -241,14 +241,14 @@ class Trainer:
             if self.ranks.is_single:
                 raise
             problem = refusal.with_text()  # This copy has no traceback, which would keep the step's memory.
-        settled += self._settle_launched()
-        if any(stats.was_retaken for stats in settled):  # These gradients are those of an older model.
+        confirmed += self._confirm_launched()
+        if any(stats.was_retaken for stats in confirmed):  # These gradients are those of an older model.
             self._discard_gradients()
             rendered = self._gradients(self.step, view, picture)
         self._update(self.step, rendered, stop, problem)
         is_acting = self.strategy.acting(self.step)
-        if settle or is_acting or not self._reserves_memory:
-            settled += self._settle_launched(problem)
+        if confirm or is_acting or not self._reserves_memory:
+            confirmed += self._confirm_launched(problem)
         if is_acting:
             with self._timed("density"):
                 before = self.model.gaussians.positions
@@ -256,7 +256,7 @@ class Trainer:
                 self.resolution.update(self.step, len(self.model))
                 if not self.ranks.is_single and self.model.gaussians.positions is not before:
                     self._synchronize()
-        return settled
+        return confirmed
 
     @explain_out_of_memory(OUT_OF_MEMORY_FIX)
     def _gradients(self, step: int, view: View, picture: Picture) -> RenderedView:
@@ -340,8 +340,8 @@ class Trainer:
         limits = MAX_LOSS, *[MAX_GRADIENT] * len(norms), *rendered.reserve.limits
         return StepChecks((numbers <= tensor_like(limits, numbers)).all(), demand, norms)
 
-    def _settle_launched(self, problem: HyrfError | None = None, *, was_retaken: bool = False) -> list[SettledStep]:
-        """Settle the launched step, if any: wait for its numbers and check them.
+    def _confirm_launched(self, problem: HyrfError | None = None, *, was_retaken: bool = False) -> list[ConfirmedStep]:
+        """Confirm the launched step, if any: wait for its numbers and check them.
 
         If its reserve was too small, nothing was changed, and the step is taken again with a larger one.
 
@@ -369,12 +369,12 @@ class Trainer:
             flags = [float(not norm <= MAX_GRADIENT) for norm in norms]
             if not valid and np.isfinite(stats.loss) and not any(flags):
                 self._retake(step, *launched.reserved)
-                return self._settle_launched(was_retaken=True)
+                return self._confirm_launched(was_retaken=True)
         if not np.isfinite(stats.loss):
             self._refuse(step, "the loss is not finite", self._nonfinite_parameters())
         if any(flags):
             self._refuse(step, "a gradient is not finite", self._groups(flags))
-        return [SettledStep(step, stats.loss, stats.error, stats.stop, was_retaken)]
+        return [ConfirmedStep(step, stats.loss, stats.error, stats.stop, was_retaken)]
 
     def _retake(self, step: int, view: View, picture: Picture) -> None:
         """Launch a step again that changed nothing, because its reserve was too small."""
@@ -411,7 +411,7 @@ class Trainer:
         if len(set(self.ranks.all_gather(digest(self.model.parameters())))) > 1:
             self._restore(self.ranks.broadcast(self._tensors()))
 
-    def _record(self, stats: SettledStep) -> None:
+    def _record(self, stats: ConfirmedStep) -> None:
         """Add a record of a step to the training curve if `is_recorded`, unless all of its photo is masked."""
         if not np.isnan(stats.error) and is_recorded(stats.step, self.steps):
             psnr = psnr_from_mse(stats.error)

@@ -38,7 +38,7 @@ pytestmark = pytest.mark.acceptance
 def address(app_folder: Path) -> Iterator[str]:
     if not SPARK_FOLDER.is_dir():
         pytest.skip("Spark is not here; run `npm ci` in tests/bundlers")
-    for name in ("native.js", "spark.html", "spark.js"):
+    for name in ("native.html", "native.js", "spark.js"):
         shutil.copy(Path(__file__).with_name(name), app_folder)
     (app_folder / "node_modules" / "@sparkjsdev").mkdir()
     (app_folder / "node_modules" / "@sparkjsdev" / "spark").symlink_to(SPARK_FOLDER)
@@ -51,7 +51,7 @@ def address(app_folder: Path) -> Iterator[str]:
 @pytest.fixture
 def page(three_browser: Chromium, address: str) -> Iterator[Chromium]:
     three_browser.resize(2 * SIZE_PIXELS, 2 * SIZE_PIXELS)
-    three_browser.open(f"{address}/spark.html")
+    three_browser.open(f"{address}/native.html?spark")
     wait_until(three_browser, "Boolean(globalThis.page?.addSplat)", 60)
     yield three_browser
     errors = three_browser.list_errors()
