@@ -16,7 +16,8 @@ from hyrfpack.data import PictureCache
 from hyrfpack.model import Decoded, Geometry, HybridModel, ModelConfig
 from hyrfpack.model.field import Field
 from hyrfpack.model.gaussians import Gaussians
-from hyrfpack.ops.shade import DIRECTION_FEATURES, spherical_harmonics
+from hyrfpack.ops.rows import take_rows
+from hyrfpack.ops.shade import DIRECTION_FEATURES, Shading, spherical_harmonics
 from hyrfpack.scene import Scene
 from hyrfpack.train.optimizer import Optimizer
 from hyrfpack.train.trainer import Trainer
@@ -41,8 +42,8 @@ class SingleField(HybridModel):
         self.radiance = Field(grid, 3 + 8, config.hidden, extra_inputs=directions, generator=generator)
         self.geometry = _GeometryOutputs(self.radiance, directions)
 
-    def _radiance(self, positions: Tensor, viewpoint: Tensor) -> Tensor:
-        return super()._radiance(positions, viewpoint)[:, :3]
+    def _radiance(self, positions: Tensor, viewpoint: Tensor, used: Tensor | None) -> Tensor:
+        return super()._radiance(positions, viewpoint, used)[:, :3]
 
     def _color_layers(self) -> tuple[list[Tensor], list[Tensor]]:
         *weights, weight = self.radiance.weights
@@ -58,8 +59,8 @@ class _GeometryOutputs(nn.Module):
         self._field = (field,)  # the tuple keeps torch from registering the field as a submodule again
         self._directions = directions
 
-    def forward(self, coords: Tensor, *, mixed: bool = False) -> Tensor:
-        return self._field[0](coords, coords.new_zeros(len(coords), self._directions), mixed=mixed)[:, 3:]
+    def forward(self, coords: Tensor, *, mixed: bool = False, used: Tensor | None = None) -> Tensor:
+        return self._field[0](coords, coords.new_zeros(len(coords), self._directions), mixed=mixed, used=used)[:, 3:]
 
 
 class IsotropicDiffuse(HybridModel):
@@ -73,19 +74,25 @@ class IsotropicDiffuse(HybridModel):
         self.geometry.requires_grad_(False)
         self.radiance.requires_grad_(config.background)
 
-    def decode_geometry(self, index: Tensor | None = None) -> Geometry:
+    def decode_geometry(self, index: Tensor | None = None, used: Tensor | None = None) -> Geometry:
         explicit = self.gaussians
-        select = (lambda values: values) if index is None else (lambda values: values[index])
+        select = (lambda values: values) if index is None else (lambda values: take_rows(values, index, used))
         positions = self._field_positions(select(explicit.positions))
         nothing = positions.new_zeros(len(positions), 8)
-        return self.activate(nothing, positions, select(explicit.scale_logits), select(explicit.opacity_logits))
+        return self.activate(nothing, positions, select(explicit.scale_logits), select(explicit.opacity_logits), used)
 
     def decode(self) -> Decoded:
         return Decoded(self.decode_geometry(), None)  # no field predicts colours
 
-    def decode_colors(self, viewpoint: Tensor, index: Tensor | None = None) -> Tensor:
+    def decode_colors(
+        self,
+        viewpoint: Tensor,
+        index: Tensor | None = None,
+        shading: Shading | None = None,
+        used: Tensor | None = None,
+    ) -> Tensor:
         logits = self.gaussians.color_logits
-        return torch.sigmoid(logits if index is None else logits[index])
+        return torch.sigmoid(logits if index is None else take_rows(logits, index, used))
 
 
 class HarmonicColors(HybridModel):
@@ -106,10 +113,16 @@ class HarmonicColors(HybridModel):
     def decode(self) -> Decoded:
         return Decoded(self.decode_geometry(), None)  # no field predicts colours
 
-    def decode_colors(self, viewpoint: Tensor, index: Tensor | None = None) -> Tensor:
+    def decode_colors(
+        self,
+        viewpoint: Tensor,
+        index: Tensor | None = None,
+        shading: Shading | None = None,
+        used: Tensor | None = None,
+    ) -> Tensor:
         positions, stored = self.gaussians.positions, self.gaussians.color_logits
         if index is not None:
-            positions, stored = positions[index], stored[index]
+            positions, stored = take_rows(positions, index, used), take_rows(stored, index, used)
         offsets = self._field_positions(positions) - viewpoint
         basis = harmonics_to_degree_3(torch.nn.functional.normalize(offsets, dim=-1, eps=1e-12))
         rates = basis.new_full((SH_COEFFICIENTS,), SH_REST_RATE_RATIO)
