@@ -22,7 +22,7 @@ from hyrfpack.ops.viewport import Viewport
 
 pytestmark = needs_triton
 
-TOTAL, USED = 300, 100  # Kernels have blocks of at most 256 rows, so that one program has no row in use.
+TOTAL_ROWS, USED_ROWS = 300, 100  # Kernels have blocks of at most 256 rows, so that one program has no row in use.
 RESOLUTIONS, LOG2_TABLE_SIZE = (3, 9), 6
 
 
@@ -64,11 +64,15 @@ def run_activate(x: Mapping[str, Tensor], **options) -> Tensor:
 
 OPERATIONS = {
     "mlp": Operation(
-        {"x": normal(TOTAL, 9), **make_layers()}, ("x",), run_mlp, ("x", *make_layers()), ("reference", "cpu", "gpu")
+        {"x": normal(TOTAL_ROWS, 9), **make_layers()},
+        ("x",),
+        run_mlp,
+        ("x", *make_layers()),
+        ("reference", "cpu", "gpu"),
     ),
     "hash_encode": Operation(
         {
-            "coords": torch.rand(TOTAL, 3, generator=torch.Generator().manual_seed(1)),
+            "coords": torch.rand(TOTAL_ROWS, 3, generator=torch.Generator().manual_seed(1)),
             "table": normal(level_offsets(RESOLUTIONS, LOG2_TABLE_SIZE)[-1], 2),
         },
         ("coords",),
@@ -77,10 +81,14 @@ OPERATIONS = {
         ("reference", "cpu", "gpu"),
     ),
     "contract": Operation(
-        {"points": normal(TOTAL, 3)}, ("points",), lambda x, **options: contract(x["points"], **options), (), ("gpu",)
+        {"points": normal(TOTAL_ROWS, 3)},
+        ("points",),
+        lambda x, **options: contract(x["points"], **options),
+        (),
+        ("gpu",),
     ),
     "encode_views": Operation(
-        {"points": normal(TOTAL, 3), "viewpoint": torch.tensor([0.1, -3.0, 0.2])},
+        {"points": normal(TOTAL_ROWS, 3), "viewpoint": torch.tensor([0.1, -3.0, 0.2])},
         ("points",),
         lambda x, **options: encode_views(x["points"], x["viewpoint"], "frequency", **options),
         (),
@@ -88,10 +96,10 @@ OPERATIONS = {
     ),
     "activate_geometry": Operation(
         {
-            "raw": normal(TOTAL, 8),
-            "positions": normal(TOTAL, 3),
-            "scale": normal(TOTAL, 1),
-            "opacity": normal(TOTAL, 1),
+            "raw": normal(TOTAL_ROWS, 8),
+            "positions": normal(TOTAL_ROWS, 3),
+            "scale": normal(TOTAL_ROWS, 1),
+            "opacity": normal(TOTAL_ROWS, 1),
         },
         ("raw", "positions", "scale", "opacity"),
         run_activate,
@@ -99,7 +107,9 @@ OPERATIONS = {
         ("gpu",),
     ),
 }
-CASES = [(name, implementation) for name, case in OPERATIONS.items() for implementation in case.implementations]
+OPERATION_CASES = [
+    (name, implementation) for name, case in OPERATIONS.items() for implementation in case.implementations
+]
 
 
 def learn(case: Operation, inputs: Mapping[str, Tensor], upstream: Tensor, **options) -> tuple[Tensor, list[Tensor]]:
@@ -111,17 +121,19 @@ def learn(case: Operation, inputs: Mapping[str, Tensor], upstream: Tensor, **opt
     return result.detach(), [x[name].grad for name in case.learns]
 
 
-@pytest.mark.parametrize(("name", "implementation"), CASES)
+@pytest.mark.parametrize(("name", "implementation"), OPERATION_CASES)
 def test_results_and_gradients_are_those_of_the_rows_in_use(name: str, implementation: str) -> None:
     case = OPERATIONS[name]
-    first = {key: value[:USED].double() if key in case.rows else value.double() for key, value in case.inputs.items()}
+    first = {
+        key: value[:USED_ROWS].double() if key in case.rows else value.double() for key, value in case.inputs.items()
+    }
     width = case.run(first, implementation="reference").shape[1]
-    upstream = normal(TOTAL, width, seed=5)
-    expected, expected_gradients = learn(case, first, upstream[:USED].double(), implementation="reference")
+    upstream = normal(TOTAL_ROWS, width, seed=5)
+    expected, expected_gradients = learn(case, first, upstream[:USED_ROWS].double(), implementation="reference")
     inputs = {key: value.clone() for key, value in case.inputs.items()}
     for key in case.rows:
-        inputs[key][USED:] = torch.nan
-    upstream[USED:] = torch.nan
+        inputs[key][USED_ROWS:] = torch.nan
+    upstream[USED_ROWS:] = torch.nan
     move = gpu if implementation == "gpu" else torch.clone
 
     found, gradients = learn(
@@ -129,21 +141,21 @@ def test_results_and_gradients_are_those_of_the_rows_in_use(name: str, implement
         {key: move(value) for key, value in inputs.items()},
         move(upstream),
         implementation=implementation,
-        used=move(torch.tensor([USED])),
+        used=move(torch.tensor([USED_ROWS])),
     )
 
-    assert found.shape == (TOTAL, width)
-    torch.testing.assert_close(found[:USED].cpu().double(), expected, rtol=1e-4, atol=1e-5)
+    assert found.shape == (TOTAL_ROWS, width)
+    torch.testing.assert_close(found[:USED_ROWS].cpu().double(), expected, rtol=1e-4, atol=1e-5)
     for key, gradient, wanted in zip(case.learns, gradients, expected_gradients, strict=True):
-        mine = gradient[:USED] if key in case.rows else gradient
+        mine = gradient[:USED_ROWS] if key in case.rows else gradient
         torch.testing.assert_close(mine.cpu().double(), wanted, rtol=1e-3, atol=1e-4)
 
 
-@pytest.mark.parametrize("used", [0, 1, USED, TOTAL])
+@pytest.mark.parametrize("used", [0, 1, USED_ROWS, TOTAL_ROWS])
 @pytest.mark.parametrize("columns", [1, 3])
 def test_rows_are_taken_and_their_gradients_put_back(used: int, columns: int) -> None:
-    values, index = gpu(normal(1000, columns)).requires_grad_(), gpu(torch.randperm(1000)[:TOTAL])
-    upstream = gpu(normal(TOTAL, columns, seed=1))
+    values, index = gpu(normal(1000, columns)).requires_grad_(), gpu(torch.randperm(1000)[:TOTAL_ROWS])
+    upstream = gpu(normal(TOTAL_ROWS, columns, seed=1))
     upstream[used:] = torch.nan
 
     rows = take_rows(values, index, count_of(used))
@@ -154,9 +166,9 @@ def test_rows_are_taken_and_their_gradients_put_back(used: int, columns: int) ->
     assert torch.equal(values.grad, expected)
 
 
-@pytest.mark.parametrize("used", [0, 1, USED, TOTAL])
+@pytest.mark.parametrize("used", [0, 1, USED_ROWS, TOTAL_ROWS])
 def test_rows_are_placed_and_their_gradients_taken(used: int) -> None:
-    rows, index = gpu(normal(TOTAL, 3)), gpu(torch.randperm(1000)[:TOTAL])
+    rows, index = gpu(normal(TOTAL_ROWS, 3)), gpu(torch.randperm(1000)[:TOTAL_ROWS])
     rows[used:] = torch.nan
     rows.requires_grad_()
     upstream = gpu(normal(3, 1000, seed=1)).T
@@ -177,8 +189,8 @@ def test_unused_rows_are_cleared_in_values_and_gradients() -> None:
 
 # -- reserves --------------------------------------------------------------------------------------------------------
 
-VIEWPORT = Viewport(torch.eye(4, dtype=torch.float64), (20.0, 20.0, 10.0, 10.0), 20, 20)
-GAUSSIANS, PADDING = 30, 110  # together more than a block of every kernel
+SMALL_VIEWPORT = Viewport(torch.eye(4, dtype=torch.float64), (20.0, 20.0, 10.0, 10.0), 20, 20)
+GAUSSIAN_COUNT, PADDING_ROWS = 30, 110  # together more than a block of every kernel
 
 
 def make_gaussians(count: int) -> tuple[Gaussians3D, Tensor]:
@@ -190,10 +202,10 @@ def make_gaussians(count: int) -> tuple[Gaussians3D, Tensor]:
 @pytest.mark.parametrize("reserve", [1, 100, 5000])
 def test_culling_into_a_reserve_lists_what_culling_does(reserve: int) -> None:
     positions = gpu(normal(1000, 3))
-    inside = frustum_cull(positions, VIEWPORT, 0.01, 0.3, implementation="gpu").tolist()
+    inside = frustum_cull(positions, SMALL_VIEWPORT, 0.01, 0.3, implementation="gpu").tolist()
     assert 100 < len(inside) < 290
 
-    index, used, demand = frustum_cull_into(positions, VIEWPORT, 0.01, 0.3, reserve, implementation="gpu")
+    index, used, demand = frustum_cull_into(positions, SMALL_VIEWPORT, 0.01, 0.3, reserve, implementation="gpu")
 
     assert demand.tolist() == [0, len(inside)]
     assert len(index) == len(set(index.tolist())) == min(reserve, 1000)
@@ -205,13 +217,13 @@ def test_culling_into_a_reserve_lists_what_culling_does(reserve: int) -> None:
 def test_culling_into_a_reserve_flags_positions_that_are_not_finite() -> None:
     positions = gpu(normal(500, 3))
     positions[317, 1] = torch.inf
-    *_, demand = frustum_cull_into(positions, VIEWPORT, 0.01, 0.3, 500, implementation="gpu")
+    *_, demand = frustum_cull_into(positions, SMALL_VIEWPORT, 0.01, 0.3, 500, implementation="gpu")
     assert demand[0].item() != 0
 
 
 def test_the_reference_cannot_cull_into_a_reserve() -> None:
     with pytest.raises(ValueError, match="cannot cull into a reserve"):
-        frustum_cull_into(normal(5, 3).double(), VIEWPORT, 0.01, 0.3, 5)
+        frustum_cull_into(normal(5, 3).double(), SMALL_VIEWPORT, 0.01, 0.3, 5)
 
 
 def learn_rasterization(
@@ -221,7 +233,7 @@ def learn_rasterization(
     inputs = [value.clone().requires_grad_() for value in (*gaussians, colors)]
     absgrad = torch.zeros_like(inputs[0][:, :2])
     image = rasterize(
-        Gaussians3D(*inputs[:4]), inputs[4], VIEWPORT, RasterSettings(), absgrad=absgrad, implementation="gpu",
+        Gaussians3D(*inputs[:4]), inputs[4], SMALL_VIEWPORT, RasterSettings(), absgrad=absgrad, implementation="gpu",
         **options,
     )  # fmt: skip
     (image.rgb * torch.linspace(0, 1, image.rgb.numel(), device=image.rgb.device).view_as(image.rgb)).sum().backward()
@@ -230,29 +242,29 @@ def learn_rasterization(
 
 @pytest.mark.parametrize("surplus", [0, 700])
 def test_rasterising_into_a_reserve_gives_the_same_bits(surplus: int) -> None:
-    gaussians, colors = make_gaussians(GAUSSIANS)
+    gaussians, colors = make_gaussians(GAUSSIAN_COUNT)
     expected, expected_gradients, expected_absgrad = learn_rasterization(gaussians, colors)
     padded = [
-        torch.cat((value, torch.full_like(value[:1].expand(PADDING, *value.shape[1:]), torch.nan)))
+        torch.cat((value, torch.full_like(value[:1].expand(PADDING_ROWS, *value.shape[1:]), torch.nan)))
         for value in (*gaussians, colors)
     ]
 
     image, gradients, absgrad = learn_rasterization(
-        Gaussians3D(*padded[:4]), padded[4], used=count_of(GAUSSIANS), reserve=expected.pairs + surplus
+        Gaussians3D(*padded[:4]), padded[4], used=count_of(GAUSSIAN_COUNT), reserve=expected.pairs + surplus
     )
 
     assert image.demand.tolist() == [0, expected.pairs] and image.nonfinite == ()
     assert torch.equal(image.rgb, expected.rgb) and torch.equal(image.transmittance, expected.transmittance)
-    assert torch.equal(image.visible[:GAUSSIANS], expected.visible) and not image.visible[GAUSSIANS:].any()
+    assert torch.equal(image.visible[:GAUSSIAN_COUNT], expected.visible) and not image.visible[GAUSSIAN_COUNT:].any()
     for gradient, wanted in zip(gradients, expected_gradients, strict=True):
-        assert torch.equal(gradient[:GAUSSIANS], wanted)
-    assert torch.equal(absgrad[:GAUSSIANS], expected_absgrad) and not absgrad[GAUSSIANS:].any()
+        assert torch.equal(gradient[:GAUSSIAN_COUNT], wanted)
+    assert torch.equal(absgrad[:GAUSSIAN_COUNT], expected_absgrad) and not absgrad[GAUSSIAN_COUNT:].any()
 
 
 @pytest.mark.parametrize("room", [0, 20])
 def test_too_small_a_reserve_is_told_and_leaves_finite_numbers(room: int) -> None:
-    gaussians, colors = make_gaussians(GAUSSIANS)
-    expected = rasterize(gaussians, colors, VIEWPORT, implementation="gpu")
+    gaussians, colors = make_gaussians(GAUSSIAN_COUNT)
+    expected = rasterize(gaussians, colors, SMALL_VIEWPORT, implementation="gpu")
     assert expected.pairs > 20
 
     image, gradients, absgrad = learn_rasterization(gaussians, colors, reserve=room)
@@ -263,13 +275,13 @@ def test_too_small_a_reserve_is_told_and_leaves_finite_numbers(room: int) -> Non
 
 
 def test_a_reserve_flags_inputs_that_are_not_finite() -> None:
-    gaussians, colors = make_gaussians(GAUSSIANS)
+    gaussians, colors = make_gaussians(GAUSSIAN_COUNT)
     gaussians.opacities[20] = torch.nan
-    image = rasterize(gaussians, colors, VIEWPORT, reserve=5000, implementation="gpu")
+    image = rasterize(gaussians, colors, SMALL_VIEWPORT, reserve=5000, implementation="gpu")
     assert image.demand[0].item() != 0
 
 
 def test_the_reference_reserves_no_pairs() -> None:
     gaussians, colors = make_gaussians(5)
     with pytest.raises(ValueError, match="reserves no pairs"):
-        rasterize(gaussians, colors, VIEWPORT, reserve=5, implementation="reference")
+        rasterize(gaussians, colors, SMALL_VIEWPORT, reserve=5, implementation="reference")

@@ -11,32 +11,34 @@ def row(size: int, gaussians: int, psnr: float, total: int, lpips: float | None 
     )
 
 
-ROWS = [row(400, 1000 * 2**k, 20.0 + 1.5 * k, 6 * 1000 * 2**k + 4000) for k in range(4)]
+ROWS_ON_A_LAW = [row(400, 1000 * 2**k, 20.0 + 1.5 * k, 6 * 1000 * 2**k + 4000) for k in range(4)]
 
 
 def test_rows_that_follow_a_law_give_its_numbers():
     start = 20.0 - 1.5 * 9.965784284662087  # 1.5 dB a doubling, 20 dB at 1,000 = 2^9.9658
-    assert f"| 400 | {start:.2f} + 1.50 log2(N) dB | 48.0 bits a Gaussian and 4,000 bytes |" in format_fits(ROWS)
+    assert f"| 400 | {start:.2f} + 1.50 log2(N) dB | 48.0 bits a Gaussian and 4,000 bytes |" in format_fits(
+        ROWS_ON_A_LAW
+    )
 
 
 def test_a_single_run_of_a_size_has_no_fit():
-    assert "| 200 |" not in format_fits([*ROWS, row(200, 1000, 20.0, 10_000)])
+    assert "| 200 |" not in format_fits([*ROWS_ON_A_LAW, row(200, 1000, 20.0, 10_000)])
 
 
 def test_bits_of_the_parts_add_up_to_those_of_the_file():
-    cells = [cell.strip() for cell in format_rows(ROWS[:1]).splitlines()[-1].strip("|").split("|")]
+    cells = [cell.strip() for cell in format_rows(ROWS_ON_A_LAW[:1]).splitlines()[-1].strip("|").split("|")]
     assert sum(map(float, cells[6:])) == pytest.approx(float(cells[5])) == 80.0
 
 
 def test_the_survey_gets_one_file_for_each_photo_size_with_its_columns(tmp_path):
-    write_survey([*ROWS, row(200, 1000, 21.5, 9000, 0.25)], tmp_path, "bonsai")
+    write_survey([*ROWS_ON_A_LAW, row(200, 1000, 21.5, 9000, 0.25)], tmp_path, "bonsai")
     with (tmp_path / "bonsai-400.csv").open(newline="") as file:
         large = list(csv.reader(file))
-    assert tuple(large[0]) == SURVEY_COLUMNS and len(large) == 1 + len(ROWS)
+    assert tuple(large[0]) == SURVEY_COLUMNS and len(large) == 1 + len(ROWS_ON_A_LAW)
     assert large[1] == ["", "20.0", "0.5", "", "10000", "1000"]
     assert (tmp_path / "bonsai-200.csv").read_text().splitlines()[1] == ",21.5,0.5,0.25,9000,1000"
 
 
 def test_the_survey_of_one_photo_size_has_the_name_of_the_set(tmp_path):
-    write_survey(ROWS, tmp_path, "bonsai")
+    write_survey(ROWS_ON_A_LAW, tmp_path, "bonsai")
     assert [path.name for path in tmp_path.iterdir()] == ["bonsai.csv"]

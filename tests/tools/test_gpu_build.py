@@ -117,7 +117,7 @@ def test_both_features_of_a_vertex_are_added_at_once_where_the_gpu_can(
         assert (build["sass"]["scalar_adds"], build["sass"]["vector_adds"]) == (scalar, vector), build["constants"]
 
 
-LISTING = """
+DISASSEMBLY_LISTING = """
 first:
 .text.first:
         /*0000*/                   S2R R0, SR_CTAID.X ;
@@ -136,8 +136,8 @@ first:
 
 
 def test_loops_and_additions_are_read_from_a_listing() -> None:
-    assert asdict(parse_listing(LISTING)) == {"loop_instructions": 6, "scalar_adds": 2, "vector_adds": 1}
-    assert asdict(parse_listing(LISTING.replace("@P1 BRA `(.L_x_1)", "@P1 EXIT")))["loop_instructions"] == 0
+    assert asdict(parse_listing(DISASSEMBLY_LISTING)) == {"loop_instructions": 6, "scalar_adds": 2, "vector_adds": 1}
+    assert asdict(parse_listing(DISASSEMBLY_LISTING.replace("@P1 BRA `(.L_x_1)", "@P1 EXIT")))["loop_instructions"] == 0
 
 
 def test_versions_of_triton_are_compared_kernel_by_kernel() -> None:

@@ -31,7 +31,7 @@ pytestmark = [
     pytest.mark.skipif(not IS_INTERPRETED, reason="a GPU adds to hash tables in any order, so that bits differ"),
 ]
 
-POINTS, SIDE_PIXELS = 20, 10
+POINT_COUNT, SIDE_PIXELS = 20, 10
 LARGE_RESERVE = Reserve(1000, 5000)
 SMALL_RESERVES = {
     "Gaussians in view": Reserve(3, 5000),
@@ -39,7 +39,7 @@ SMALL_RESERVES = {
     "pairs of no Gaussian": Reserve(1000, 0),
 }
 # Density control acts after steps 2 and 7.
-CONFIG = TrainConfig(
+SHORT_RUN_CONFIG = TrainConfig(
     steps=7,
     max_gaussians=30,
     density=DensityConfig(start=0.3, stop=1.0, rounds=1, gradient=1e-6, resets=0),
@@ -68,8 +68,8 @@ def gpu() -> Iterator[torch.device]:
         yield device
 
 
-def make_trainer(device: torch.device, config: TrainConfig = CONFIG) -> Trainer:
-    scene = ball_scene(views=3, points=POINTS, side=SIDE_PIXELS)
+def make_trainer(device: torch.device, config: TrainConfig = SHORT_RUN_CONFIG) -> Trainer:
+    scene = ball_scene(views=3, points=POINT_COUNT, side=SIDE_PIXELS)
     return Trainer(dataclasses.replace(scene, test=scene.train[:1]), config, device=device)
 
 
@@ -114,8 +114,8 @@ def assert_same_run(found: tuple[int, list[tuple], dict[str, Tensor]], expected:
 
 
 def test_a_run_with_too_small_a_reserve_equals_one_with_a_large_reserve(gpu: torch.device) -> None:
-    density = dataclasses.replace(CONFIG.density, start=1.0)
-    config = dataclasses.replace(CONFIG, steps=2, density=density, background=False, exposure=False)
+    density = dataclasses.replace(SHORT_RUN_CONFIG.density, start=1.0)
+    config = dataclasses.replace(SHORT_RUN_CONFIG, steps=2, density=density, background=False, exposure=False)
     expected = run_with_reserves(gpu, config, lambda number: LARGE_RESERVE)
     found = run_with_reserves(gpu, config, lambda number: SMALL_RESERVES["pairs"] if number == 0 else LARGE_RESERVE)
     assert (expected[0], found[0]) == (2, 4)  # step 1, step 2, both again
@@ -128,7 +128,7 @@ def expected() -> tuple[int, list[tuple], dict[str, Tensor]]:
     with pytest.MonkeyPatch.context() as patch:
         reduce_levels(patch)
         with use_fake_gpu() as device:
-            return run_with_reserves(device, CONFIG, lambda number: LARGE_RESERVE)
+            return run_with_reserves(device, SHORT_RUN_CONFIG, lambda number: LARGE_RESERVE)
 
 
 @pytest.mark.acceptance
@@ -137,8 +137,8 @@ def expected() -> tuple[int, list[tuple], dict[str, Tensor]]:
 def test_density_control_and_gains_do_not_depend_on_reserves(
     small: Reserve, numbers: set[int], expected: tuple, gpu: torch.device
 ) -> None:
-    found = run_with_reserves(gpu, CONFIG, lambda number: small if number in numbers else LARGE_RESERVE)
-    assert found[0] > expected[0] == CONFIG.steps
+    found = run_with_reserves(gpu, SHORT_RUN_CONFIG, lambda number: small if number in numbers else LARGE_RESERVE)
+    assert found[0] > expected[0] == SHORT_RUN_CONFIG.steps
     assert_same_run(found, expected)
 
 
@@ -160,7 +160,7 @@ def test_a_resumed_run_gives_the_parameters_of_the_uninterrupted_one(
 def test_each_step_is_reported_once_and_a_step_later_unless_the_host_must_wait(gpu: torch.device) -> None:
     trainer, reports = make_trainer(gpu), []
     trainer.run(progress=lambda event: reports.append((event.step, trainer.step)))
-    assert [step for step, _ in reports] == list(range(1, CONFIG.steps + 1))
+    assert [step for step, _ in reports] == list(range(1, SHORT_RUN_CONFIG.steps + 1))
     waits = {2, 7}  # density control; the last one also ends the run
     assert [now for _, now in reports] == [step if step in waits else step + 1 for step, _ in reports]
 

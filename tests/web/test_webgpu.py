@@ -23,8 +23,8 @@ from hyrfpack.splats.formats.hints import Hints
 from tools.browser import chromium
 
 pytestmark = pytest.mark.acceptance
-MIN_LIKENESS_DB = 50  # of the pictures of WebGPU and WebGL 2
-BODY = '<div id="first" class="box"></div><div id="second" class="box"></div>'
+MIN_PSNR_DB = 50  # of the pictures of WebGPU and WebGL 2
+TWO_BOXES_HTML = '<div id="first" class="box"></div><div id="second" class="box"></div>'
 PAGE_JS = """
 const { WebgpuRenderer } = await import("/viewer/webgpu/renderer.js");
 const { setShaderSource } = await import("/viewer/webgpu/shaders.js");
@@ -128,7 +128,7 @@ def page(webgpu_browser: Browser, host: Site) -> Browser:
 
 
 def open_page(browser: Browser, host: Site) -> Browser:
-    host.files["/page.html"] = viewer_page(PAGE_JS, BODY)
+    host.files["/page.html"] = viewer_page(PAGE_JS, TWO_BOXES_HTML)
     browser.open(f"{host.address}/page.html")
     wait_until(browser, "window.isPageReady")
     return browser
@@ -153,7 +153,7 @@ def draw(page: Browser, kind: str, index: int = 0) -> np.ndarray:
     return pixels.reshape(camera.height, camera.width, 3)
 
 
-def likeness(page: Browser, index: int = 0) -> float:
+def psnr_between_renderers(page: Browser, index: int = 0) -> float:
     """Return the PSNR in dB of the pictures of both viewers for one of `make_cameras`."""
     return psnr(draw(page, "webgl", index).astype(float), draw(page, "webgpu", index).astype(float))
 
@@ -171,7 +171,7 @@ def test_pictures_equal_those_of_webgl_and_of_render(page: Browser, host: Site, 
     assert is_on_device(page)
     for index, camera in enumerate(make_cameras()):
         picture = draw(page, "webgpu", index)
-        assert psnr(picture, draw(page, "webgl", index).astype(float)) > MIN_LIKENESS_DB
+        assert psnr(picture, draw(page, "webgl", index).astype(float)) > MIN_PSNR_DB
         assert psnr(picture, render_reference(model, camera)) > 45
     assert page.list_errors() == []
 
@@ -182,8 +182,8 @@ def test_exposures_equal_those_of_webgl(page: Browser, host: Site, exposure: str
     model.exposure = visible_map()
     run_statements(page, f"for (const viewer of Object.values(viewers)) viewer.exposure = '{exposure}';")
     load(page, host, encode_model(model))
-    scores = [likeness(page, index) for index in range(len(make_cameras()))]
-    assert is_on_device(page) and min(scores) > MIN_LIKENESS_DB, scores
+    scores = [psnr_between_renderers(page, index) for index in range(len(make_cameras()))]
+    assert is_on_device(page) and min(scores) > MIN_PSNR_DB, scores
 
 
 FRAME_JS = """(async () => {
@@ -218,7 +218,7 @@ def test_frames_of_the_window_equal_those_of_webgl(page: Browser, host: Site, ca
     scale, move = FRAMES[case]
     script = FRAME_JS.replace("MOVE", move).replace("SCALE", scale)
     pictures = [read_typed_array(page, script.replace("KIND", kind), np.uint8) for kind in ("webgl", "webgpu")]
-    assert psnr(*(picture.astype(float) for picture in pictures)) > MIN_LIKENESS_DB and pictures[0].std() > 10
+    assert psnr(*(picture.astype(float) for picture in pictures)) > MIN_PSNR_DB and pictures[0].std() > 10
 
 
 def test_points_are_picked_as_with_webgl(page: Browser, host: Site):
@@ -231,25 +231,25 @@ def test_a_model_without_gaussians_shows_its_background_and_nothing_is_picked(pa
     model = random_model(0)
     load(page, host, encode_model(model))
     assert is_on_device(page) and page.evaluate("viewers.webgpu.pick(120, 90)") is None
-    assert psnr(draw(page, "webgpu"), render_reference(model, make_cameras()[0])) > MIN_LIKENESS_DB
+    assert psnr(draw(page, "webgpu"), render_reference(model, make_cameras()[0])) > MIN_PSNR_DB
 
 
 SKIPPED_KEY = 0xFFFFFFFF
-RNG = np.random.default_rng(5)
-KEYS = {
+KEY_RANDOM = np.random.default_rng(5)
+KEYS_TO_SORT = {
     "no keys": [],
     "one key": [7],
     "all are skipped": [SKIPPED_KEY] * 700,
     "equal keys of several blocks": [12] * 4500,
-    "a whole block": RNG.integers(0, 2**32 - 1, 2048).tolist(),
-    "one more than two blocks": RNG.integers(0, 2**32 - 1, 4097).tolist(),
-    "few values, some skipped": RNG.choice([0, 1, 255, 256, 2**31, SKIPPED_KEY - 1, SKIPPED_KEY], 5000).tolist(),
+    "a whole block": KEY_RANDOM.integers(0, 2**32 - 1, 2048).tolist(),
+    "one more than two blocks": KEY_RANDOM.integers(0, 2**32 - 1, 4097).tolist(),
+    "few values, some skipped": KEY_RANDOM.choice([0, 1, 255, 256, 2**31, SKIPPED_KEY - 1, SKIPPED_KEY], 5000).tolist(),
 }
 
 
 def test_the_order_is_that_of_a_stable_sort_with_larger_indices_first(page: Browser):
-    found = page.evaluate(f"({SORT_JS})({json.dumps(KEYS)})")
-    for case, values in KEYS.items():
+    found = page.evaluate(f"({SORT_JS})({json.dumps(KEYS_TO_SORT)})")
+    for case, values in KEYS_TO_SORT.items():
         keys = np.array(values, np.int64)
         indices = np.lexsort((-np.arange(len(keys)), keys))
         expected = indices[keys[indices] != SKIPPED_KEY].tolist()

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import triton
 
-DISASSEMBLER = Path(triton.__file__).parent / "backends" / "nvidia" / "bin" / "nvdisasm"
+NVDISASM_PATH = Path(triton.__file__).parent / "backends" / "nvidia" / "bin" / "nvdisasm"
 _INSTRUCTION = re.compile(r"^\s*/\*[0-9a-f]+\*/\s+(.*?)\s*;")
 _LABEL = re.compile(r"^(\.L\w+):")
 _BRANCH = re.compile(r"\bBRA\b.*`\((\.L\w+)\)")
@@ -35,7 +35,7 @@ class SassFacts:
 
 def has_disassembler() -> bool:
     """Return whether this Triton comes with the disassembler."""
-    return DISASSEMBLER.is_file()
+    return NVDISASM_PATH.is_file()
 
 
 def read_facts(cubin: bytes) -> SassFacts:
@@ -43,7 +43,7 @@ def read_facts(cubin: bytes) -> SassFacts:
     with tempfile.NamedTemporaryFile(suffix=".cubin") as file:
         file.write(cubin)
         file.flush()
-        command = [DISASSEMBLER, "--print-code", file.name]
+        command = [NVDISASM_PATH, "--print-code", file.name]
         return parse_listing(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
 
 

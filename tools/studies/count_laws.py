@@ -1,6 +1,6 @@
 """Train one data set with several numbers of Gaussians and photo sizes, and print what a file of each takes and scores.
 
-    python -m tools.studies.count_laws --set mipnerf360_bonsai --sizes 400 200 --counts 8000 16000 32000 64000
+    python -m tools.studies.count_laws --sets mipnerf360_bonsai --sizes 400 200 --counts 8000 16000 32000 64000
     python -m tools.studies.count_laws --table --survey results          prints the table, and writes CSV files
 
 The first table has one row for each run: PSNR (dB) and SSIM of the compact file on held-out photos, its bytes, and its
@@ -63,12 +63,11 @@ def measure(data: Path, size: int, count: int, steps: int, folder: Path, lpips_w
 
     A run that `folder` has already is not repeated.
     """
-    scene = hyrfpack.load_scene(data, max_size=size)
+    scene, quiet = hyrfpack.load_scene(data, max_size=size), hyrfpack.RunContext(progress=None)
     if not (folder / METRICS_FILE).exists():
         config = TrainConfig(steps=steps, max_gaussians=count, exposure=False)
-        hyrfpack.train_model(scene, folder, config, overwrite=True, context=hyrfpack.RunContext(progress=None))
+        hyrfpack.train_model(scene, folder, config, overwrite=True, context=quiet)
     path = folder / "compact.hyrf"
-    quiet = hyrfpack.RunContext(progress=None)
     report = hyrfpack.compress_model(folder / MODEL_FILE, path, context=quiet)
     scores = hyrfpack.evaluate_model(hyrfpack.load_model(path), scene.test, lpips_weights=lpips_weights)
     sections = {section.type: section.after for section in sum_layers(report.sections)}
