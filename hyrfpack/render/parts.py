@@ -52,6 +52,18 @@ def gather_parts(
     return drawn, gather_geometry(model, camera, drawn, decoded), torch.cat(colors)
 
 
+def nearest_plane(model: MergedModel, near: float) -> float:
+    """Return the near plane of the part with the smallest unit, in the local units of `camera_frame`.
+
+    `gather_parts` culls each part at its own near plane; of what it returns, nothing is nearer than this one.
+
+    Args:
+        model: the merged model.
+        near: the near plane in local units of each part.
+    """
+    return near * min(part.config.frame.scale for part in model.parts) / model.scene.config.frame.scale
+
+
 def gather_geometry(model: MergedModel, camera: Camera, index: Tensor, decoded: Decoded | None = None) -> Gaussians3D:
     """Return Gaussians of all parts as a camera draws them, in the local units of `camera_frame`.
 

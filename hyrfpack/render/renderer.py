@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import inf
 
 import torch
@@ -28,7 +28,7 @@ from hyrfpack.ops.transfer import tensor_like
 from hyrfpack.out_of_memory import explain_out_of_memory
 from hyrfpack.parallel.pool import torch_on_one_thread
 from hyrfpack.render.exposure import apply_exposure_map
-from hyrfpack.render.parts import camera_frame, expose_parts, gather_parts
+from hyrfpack.render.parts import camera_frame, expose_parts, gather_parts, nearest_plane
 from hyrfpack.render.reserve import Reserve
 from hyrfpack.render.sampling import background_stride, widen_to_photos
 from hyrfpack.scene import Camera
@@ -197,6 +197,8 @@ def render_view(
                 gaussians = widen_to_photos(gaussians, sizes[index], viewport, antialiased=model.config.antialiased)
         gradients = positions.new_zeros(len(index), 2) if absgrad else None
         raster_settings = settings.raster_settings(scene.config.antialiased, depth)
+        if isinstance(model, MergedModel):
+            raster_settings = replace(raster_settings, near=nearest_plane(model, settings.near))
         raster = rasterize(
             gaussians, colors, raster_viewport, raster_settings,
             absgrad=gradients, used=used, reserve=reserve.pairs if reserve else None,

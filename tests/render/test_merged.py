@@ -66,6 +66,19 @@ def test_a_scene_in_two_interpenetrating_parts_is_drawn_like_the_whole(number, a
     assert len(merged.indices) == len(whole.indices)
 
 
+@pytest.mark.parametrize("scale", [0.002, 1.0])
+def test_near_gaussians_of_a_small_part_are_drawn_as_in_the_part_alone(scale):
+    scene, camera = ball_model(1), CAMERAS[0]
+    scene = moved_model(scene.subset(torch.empty(0, dtype=torch.int64)), WORLD_FRAME)
+    part = moved_model(ball_model(), Frame(tuple(camera.position), scale, (1.0, 1.0, 1.0)))
+
+    merged = render(MergedModel(("scene", "part"), (scene, part)), camera)
+
+    alone = render(part, camera).alpha
+    assert alone.mean() > 0.1
+    torch.testing.assert_close(merged.alpha, alone, atol=RATIO_TOLERANCE, rtol=0)
+
+
 def test_rounded_poses_of_small_files_are_drawn_alike():
     """Compressed files round the rotations of their cameras, which are then no exact rotations."""
     model = ball_model()

@@ -16,6 +16,7 @@ from hyrfpack.cameras.view_sampling import shrink_camera
 from hyrfpack.format.codec import encode_model
 from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians
+from hyrfpack.model.merged import MergedModel
 from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.scene import Camera
 from hyrfpack.web.html import encode_model_page
@@ -87,6 +88,30 @@ def encode_with_photos(model: HybridModel, width: int = 40, **more: object) -> b
     """Encode a model with cameras of smaller photos, from the same places as `make_cameras`."""
     cameras = [shrink_camera(camera, width) for camera in make_cameras()]
     return encode_model(model, provenance={"cameras": provenance_cameras(cameras), **more})
+
+
+def make_near_parts(scale: float, depth: float) -> tuple[MergedModel, Camera]:
+    """Return a scene, and a part of one opaque Gaussian, which has another unit, before a camera.
+
+    Args:
+        scale: unit of the part, in units of the scene.
+        depth: depth of the Gaussian, in units of the scene.
+    """
+    scene, part, camera = random_model(300), random_model(1, seed=1, background=False), make_cameras()[0]
+    with torch.no_grad():
+        part.gaussians.positions.zero_()
+        part.gaussians.opacity_logits.fill_(20)
+        part.gaussians.scale_logits.fill_(-2)
+    center = camera.position + MODEL_FRAME.scale * depth * camera.rotation[2]
+    frame = Frame((center[0], center[1], center[2]), MODEL_FRAME.scale * scale, (1.0, 1.0, 1.0))
+    return MergedModel(("scene", "part"), (scene, with_frame(part, frame))), camera
+
+
+def with_frame(model: HybridModel, frame: Frame) -> HybridModel:
+    """Return a model of the same numbers in another frame."""
+    moved = HybridModel(replace(model.config, frame=frame), model.gaussians)
+    moved.geometry, moved.radiance = model.geometry, model.radiance
+    return moved
 
 
 def render_reference(model: HybridModel, camera: Camera, settings: RenderSettings = EXACT_SETTINGS) -> np.ndarray:

@@ -17,8 +17,10 @@ from web.native_models import (
     UP_DIRECTION,
     load_page,
     make_cameras,
+    make_near_parts,
     random_model,
     render_reference,
+    with_frame,
 )
 from web.pages import Browser, camera_json, psnr, render_in_page
 
@@ -33,13 +35,6 @@ from hyrfpack.web.html import encode_model_page
 EXACT = RenderSettings(background_threshold=0.0, background_stride=1, transmittance_min=0.0)
 # Beside the scene, larger, and turned by 120 degrees about the diagonal.
 OTHER_FRAME = Frame((16.0, -18.0, 6.0), 5.0, (1.0, 0.7, 1.0), (0.5, 0.5, 0.5, 0.5))
-
-
-def with_frame(model: HybridModel, frame: Frame) -> HybridModel:
-    """Return a model of the same numbers in another frame."""
-    moved = HybridModel(replace(model.config, frame=frame), model.gaussians)
-    moved.geometry, moved.radiance = model.geometry, model.radiance
-    return moved
 
 
 def make_parts(*, exposures: bool = False) -> MergedModel:
@@ -75,6 +70,14 @@ def test_pictures_equal_those_of_the_merged_model(browser: Browser, tmp_path: Pa
 
     assert min(scores) > 45 and browser.list_errors() == [], scores
     assert browser.evaluate("hyrfpack.player.hasExposureMap") is exposures
+
+
+def test_near_gaussians_are_culled_in_the_units_of_their_part(browser: Browser, tmp_path: Path):
+    model, camera = make_near_parts(scale=0.05, depth=0.004)
+    load_page(browser, tmp_path, make_page(model, [camera]))
+    reference = render_reference(model, camera, EXACT)
+    assert psnr(reference, render_reference(model.scene, camera, EXACT)) < 20  # The part is in the picture.
+    assert psnr(render_in_page(browser, camera), reference) > 45
 
 
 def test_the_consistent_exposure_ignores_the_maps_of_all_parts(browser: Browser, tmp_path: Path):

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from web.native_models import lose_and_restore_device, random_model
+from web.native_models import lose_and_restore_device, make_near_parts, random_model, render_reference
 from web.pages import Browser, psnr, render_in_page, wait_for_message, wait_until, window_camera
 from web.site import Site
 from web.test_element import ELEMENT_JS, LOADED_JS, open_element
@@ -254,6 +254,21 @@ def test_residuals_of_chunks_are_drawn_as_python_renders_them(browser: Browser, 
     assert state["gaussians"] == 900 and not state["problem"]
     assert psnr(picture, reference_picture(folder.load(), camera)) > MIN_PSNR_DB
     assert browser.list_errors() == []
+
+
+@pytest.mark.acceptance
+@pytest.mark.parametrize(("scale", "depth"), [(0.05, 0.004), (5.0, 0.03)])
+def test_near_gaussians_are_culled_in_the_units_of_their_part(
+    browser: Browser, host: Site, tmp_path: Path, scale: float, depth: float
+):
+    model, camera = make_near_parts(scale, depth)
+    parts = list(zip(model.names, map(encode_model, model.parts), strict=True))
+    (tmp_path / "both.hyrf").write_bytes(encode_parts(parts))
+    split_model(tmp_path / "both.hyrf", tmp_path / "scene", SplitConfig(levels=1), context=RunContext(progress=None))
+    serve_levels(host, hyrfpack.SceneFolder(tmp_path / "scene"))
+    open_levels(browser, host, 1000)
+    wait_until_complete(browser)
+    assert psnr(render_in_page(browser, camera).astype(float), render_reference(model, camera)) > MIN_PSNR_DB
 
 
 @pytest.mark.acceptance

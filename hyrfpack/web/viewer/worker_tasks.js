@@ -27,8 +27,8 @@ import { read, readParts } from "../hyrf/index.js";
 import { toLocalView, viewpointOf } from "../hyrf/viewpoint.js";
 import { TEXTURE_WIDTH } from "./constants.js";
 import { rejectOtherFiles } from "./other_files.js";
-import { joinPositions, packModel, packSplats } from "./pack.js";
-import { movePositions, placeOf } from "../hyrf/places.js";
+import { joinParts, packModel, packSplats } from "./pack.js";
+import { placeOf } from "../hyrf/places.js";
 import { ReceivedFile } from "./received_file.js";
 import { BACKGROUND_HEIGHT_PIXELS, backgroundPicture, modelScene, splatsScene } from "./scene.js";
 import { measureGaussians, selectGaussians } from "./selection.js";
@@ -169,13 +169,13 @@ class SceneReader {
     const bytes = partial && this.broken ? all.subarray(0, this.decodedLength || file.length) : all;
     const content = { number: ++this.contents, repeats: this.repeats, whole: !partial };
     this.reportProgress("unpacking", 0);
-    let positions;
+    let sorted;
     if (file.isMerged) {
-      positions = this.decodeMerged(await readParts(bytes), content);
+      sorted = this.decodeMerged(await readParts(bytes), content);
     } else if (file.isModel) {
       const model = await read(bytes, { partial });
       content.scene = { ...(scene ?? { ...modelScene(model, name), ...stage }), exposure: model.exposure };
-      positions = model.positions;
+      sorted = { positions: model.positions };
       if (plain) {
         this.reportProgress("unpacking", 1);
         const report = ({ done }) => this.reportProgress("preparing", done);
@@ -190,16 +190,16 @@ class SceneReader {
       const splats = await this.readSplats(name, bytes);
       if (scene) convertToScene(splats, scene);
       content.scene = scene ?? { ...splatsScene(splats, name), ...stage };
-      positions = splats.positions;
+      sorted = { positions: splats.positions };
       content.splats = packSplats(splats);
     }
-    this.sorter.add(content.number, positions);
+    this.sorter.add(content.number, sorted);
     this.decodedLength = bytes.length;
     this.reportProgress("unpacking", 1);
     this.post({ content }, listBuffers(content));
   }
 
-  // Packs the parts of a merged file for a content. Returns the positions of all their Gaussians.
+  // Packs the parts of a merged file for a content. Returns what is sorted, see joinParts.
   decodeMerged(parts, content) {
     const { name, scene, stage, plain } = this.request, frame = parts[0].model.config.frame;
     if (plain) throw new Error("It holds merged models, which this device cannot draw.");
@@ -212,7 +212,7 @@ class SceneReader {
       const packed = packModel(model, firstEye(content.scene, model));
       return { ...packed, place, background: number === 0 && packed.background };
     });
-    return joinPositions(placed.map(({ model, place }) => movePositions(model.positions, place)));
+    return joinParts(placed);
   }
 }
 
@@ -251,9 +251,10 @@ class ContentSorter {
     return this.sorters.get(this.selected).positions;
   }
 
-  // Adds a content by its number, the positions of its splats (3 N) and the width of its textures.
-  add(number, positions, width = TEXTURE_WIDTH) {
-    this.sorters.set(number, new DepthSort(positions, width));
+  // Adds a content by its number, the positions of its splats (3 N), the near planes of its rows (see DepthSort), and
+  // the width of its textures.
+  add(number, { positions, nearRatios = null, width = TEXTURE_WIDTH }) {
+    this.sorters.set(number, new DepthSort(positions, width, nearRatios));
   }
 
   // Selects the content to sort, and drops older ones.

@@ -104,7 +104,8 @@ export class SceneStream {
     this.isShown = false;
     this.pool = new RowPool(this.rowCount);
     this.positions = new Float32Array(3 * ROW_WIDTH * this.rowCount).fill(NaN); // which are not drawn
-    this.sorter.add(this.number, this.positions, ROW_WIDTH);
+    this.nearRatios = new Float32Array(this.rowCount).fill(1);
+    this.sorter.add(this.number, { positions: this.positions, nearRatios: this.nearRatios, width: ROW_WIDTH });
     for (const chunk of this.chunks) chunk.clear();
     for (const part of this.parts) part.sent = null;
   }
@@ -353,6 +354,7 @@ export class SceneStream {
     if (content !== this.number || level.state !== ABSENT) return; // meanwhile the device was lost
     const rows = this.takeRows(level.rowCount);
     if (!rows) return; // meanwhile memory has become short; it is fetched again if it still suits the view
+    for (const row of rows) this.nearRatios[row] = part.place.scale;
     const packed = packGaussians(model, ROW_WIDTH);
     let { positions } = model;
     if (part.number) {
