@@ -36,7 +36,7 @@ def measure(data: Path, name: str, out: Path, config: TrainConfig, reuse: bool) 
         hyrfpack.train_model(scene, out, config, overwrite=True)
     trained = json.loads((out / "metrics.json").read_text())
     model = out / "model.hyrf"
-    packed = {}
+    packed: dict[str, float] = {}
     for profile in COMPRESSED_PROFILES:
         path = out / f"{profile}.hyrf"
         started = time.perf_counter()
