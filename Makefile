@@ -13,7 +13,7 @@ VENV_STAMP := .venv/.ready
 NODE_STAMP := tests/node/node_modules/.ready
 BUNDLERS_STAMP := tests/bundlers/node_modules/.ready
 
-.PHONY: help demo test test-all test-browsers test-newest test-oldest docs player package golden bench gpu speed sets choices ablations precision kill races fuzz fuzz-browser lint format clean
+.PHONY: help demo test test-all test-browsers test-newest test-oldest docs player package golden bench gpu speed sets choices ablations precision kill races fuzz fuzz-browser lint style format clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z.-]+:.*## / { printf "  make %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -47,8 +47,12 @@ $(BUNDLERS_STAMP): tests/bundlers/package.json tests/bundlers/package-lock.json
 demo: $(VENV_STAMP) ## train, compress and render a small synthetic scene; results in demo/
 	$(BIN)/hyrfpack demo -o demo --overwrite
 
-test: lint $(NODE_STAMP) ## check style and types, then run the tests of every change (see tests/layers.py)
-	$(PYTEST) -m "not acceptance or smoke"
+# mypy uses one core and starts without a cache in CI, so it runs beside the tests; its report follows theirs.
+test: style $(NODE_STAMP) ## check style and types, and run the tests of every change (see tests/layers.py)
+	@report=$$(mktemp); $(BIN)/mypy >"$$report" 2>&1 & types=$$!; status=0; \
+	trap 'kill $$types 2>/dev/null || true; rm "$$report"' EXIT; \
+	$(PYTEST) -m "not acceptance or smoke" || status=$$?; \
+	wait $$types || status=$$?; echo "mypy:"; cat "$$report"; exit $$status
 
 test-all: lint $(NODE_STAMP) $(BUNDLERS_STAMP) ## check style and types, then run all tests
 	$(PYTEST)
@@ -108,10 +112,12 @@ fuzz: $(VENV_STAMP) ## feed the .hyrf reader a million hostile files (10 minutes
 fuzz-browser: $(VENV_STAMP) ## compare the readers in Python and in JavaScript on hostile files (a minute)
 	$(BIN)/python -m tools.safety.fuzz_browser
 
-lint: $(VENV_STAMP) ## check style and types only
+lint: style ## check style and types only
+	$(BIN)/mypy
+
+style: $(VENV_STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy
 
 format: $(VENV_STAMP) ## format the code and fix lint errors
 	$(BIN)/ruff check --fix .
