@@ -16,6 +16,7 @@ from hyrfpack.export.exposure import BakeGains
 from hyrfpack.model import Geometry, HybridModel
 from hyrfpack.model.exposure import apply_exposure_gains
 from hyrfpack.model.residuals import add_color_residuals
+from hyrfpack.ops.harmonics import harmonics_basis, num_sh_bases
 from hyrfpack.ops.least_squares import least_squares
 from hyrfpack.ops.mlp import mlp
 from hyrfpack.ops.poses import camera_center
@@ -27,7 +28,7 @@ from hyrfpack.parallel.pool import parallel_map, run_tasks, torch_on_one_thread
 from hyrfpack.progress import Progress, count_calls, ignore_progress
 from hyrfpack.render import RenderSettings
 from hyrfpack.scene import Camera
-from hyrfpack.splats.harmonics import fibonacci_sphere, harmonics_basis, num_sh_bases
+from hyrfpack.splats.harmonics import fibonacci_sphere
 from hyrfpack.splats.splats import Splats, normalized_quats
 
 SPHERE_DIRECTIONS = 32

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from hyrfpack.config.render import GeometryConfig
 from hyrfpack.model import Frame
+from hyrfpack.ops.harmonics import harmonics_basis
 from hyrfpack.ops.poses import camera_center
 from hyrfpack.ops.rasterize import Gaussians3D, Rasterization, rasterize
 from hyrfpack.ops.rasterize.cull import frustum_cull
@@ -18,7 +19,6 @@ from hyrfpack.render import RenderedPicture, RenderSettings
 from hyrfpack.render.surface import render_surface
 from hyrfpack.rotations import IDENTITY
 from hyrfpack.scene import Camera
-from hyrfpack.splats.harmonics import harmonics_basis
 from hyrfpack.splats.splats import Splats
 
 

@@ -6,16 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hyrfpack.ops.harmonics import MAX_DEGREE, harmonics_basis, num_sh_bases
-
-__all__ = [
-    "MAX_DEGREE",
-    "SH_C0",
-    "fibonacci_sphere",
-    "harmonics_basis",
-    "harmonics_rotation",
-    "num_sh_bases",
-]
+from hyrfpack.ops.harmonics import harmonics_basis, num_sh_bases
 
 SH_C0 = 0.28209479177387814  # Y00 = 1 / (2 sqrt(pi))
 

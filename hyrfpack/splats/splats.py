@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hyrfpack.ops.harmonics import MAX_DEGREE, num_sh_bases
 from hyrfpack.rotations import multiply_quats, quaternion_from_matrix
-from hyrfpack.splats.harmonics import MAX_DEGREE, SH_C0, harmonics_rotation, num_sh_bases
+from hyrfpack.splats.harmonics import SH_C0, harmonics_rotation
 
 
 @dataclass(frozen=True)
@@ -19,7 +20,7 @@ class Splats:
 
         max(0, 0.5 + sum_k harmonics_k Y_k(d))
 
-    with the basis Y of `hyrfpack.splats.harmonics`.
+    with the basis Y of `hyrfpack.ops.harmonics`.
 
     Attributes:
         positions: (N, 3) float64 centres, world units.

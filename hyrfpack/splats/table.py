@@ -7,9 +7,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
+from hyrfpack.ops.harmonics import MAX_DEGREE
 from hyrfpack.splats.formats import gltf, ply, sog, splat, spz, usd
 from hyrfpack.splats.formats.hints import Hints
-from hyrfpack.splats.harmonics import MAX_DEGREE
 from hyrfpack.splats.splats import Splats
 
 

@@ -10,9 +10,10 @@ from scenes import camera_at, ring, small_model
 from hyrfpack.errors import HyrfError
 from hyrfpack.export.bake import bake
 from hyrfpack.model import Frame
+from hyrfpack.ops.harmonics import harmonics_basis
 from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.splats.draw import Drawable, draw
-from hyrfpack.splats.harmonics import SH_C0, harmonics_basis
+from hyrfpack.splats.harmonics import SH_C0
 from tools.safety.make_golden import add_golden_residuals
 
 GAUSSIAN_POSITIONS = np.random.default_rng(0).uniform(-0.6, 0.6, (60, 3))

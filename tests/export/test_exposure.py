@@ -20,9 +20,10 @@ from hyrfpack.export.exposure import SMOOTHING_NEIGHBORS, smooth_log_gains
 from hyrfpack.export.poster import render_model_poster
 from hyrfpack.format import load_model, save_model
 from hyrfpack.model.exposure import ExposureMap
+from hyrfpack.ops.harmonics import harmonics_basis
 from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.splats.files import read_splats
-from hyrfpack.splats.harmonics import SH_C0, harmonics_basis
+from hyrfpack.splats.harmonics import SH_C0
 
 RANDOM_GENERATOR = np.random.default_rng(0)
 LEFT_POSITIONS, RIGHT_POSITIONS = (RANDOM_GENERATOR.uniform(-0.1, 0.1, (20, 3)) + (side, 0, 0) for side in (-0.6, 0.6))

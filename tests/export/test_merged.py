@@ -23,10 +23,10 @@ from hyrfpack.edit import merge_models
 from hyrfpack.evaluate.metrics import psnr
 from hyrfpack.export.bake import bake
 from hyrfpack.format import load_merged_model, load_model, save_model
+from hyrfpack.ops.harmonics import harmonics_basis
 from hyrfpack.render import render_view
 from hyrfpack.scene import Camera
 from hyrfpack.splats.draw import Drawable, draw
-from hyrfpack.splats.harmonics import harmonics_basis
 from hyrfpack.splats.splats import Splats
 from hyrfpack.splats.table import FORMATS
 from hyrfpack.web.html import decode_splats_page

@@ -23,8 +23,8 @@ from hyrfpack.edit.transform import Placement, replace_config
 from hyrfpack.export.background import background_picture, background_splats
 from hyrfpack.export.bake import bake
 from hyrfpack.format import save_model
+from hyrfpack.ops.harmonics import harmonics_basis
 from hyrfpack.rotations import IDENTITY
-from hyrfpack.splats.harmonics import harmonics_basis
 from hyrfpack.splats.splats import Splats
 from hyrfpack.splats.table import FORMATS
 

@@ -4,7 +4,8 @@ import torch
 from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y
 
-from hyrfpack.splats.harmonics import SH_C0, harmonics_basis, harmonics_rotation, num_sh_bases
+from hyrfpack.ops.harmonics import harmonics_basis, num_sh_bases
+from hyrfpack.splats.harmonics import SH_C0, harmonics_rotation
 
 RANDOM_GENERATOR = np.random.default_rng(0)
 

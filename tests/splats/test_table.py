@@ -13,8 +13,8 @@ import pytest
 from made_up_splats import random_splats
 
 from hyrfpack.errors import HyrfDataError
+from hyrfpack.ops.harmonics import MAX_DEGREE
 from hyrfpack.splats.formats.hints import NO_HINTS
-from hyrfpack.splats.harmonics import MAX_DEGREE
 from hyrfpack.splats.table import FORMATS, SplatFormat
 
 # By format: the largest errors of positions, logarithms of scales, quaternion components, opacities and harmonics.

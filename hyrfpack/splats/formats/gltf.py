@@ -26,11 +26,11 @@ from typing import Any
 import numpy as np
 
 from hyrfpack.errors import HyrfDataError
+from hyrfpack.ops.harmonics import MAX_DEGREE, num_sh_bases
 from hyrfpack.rotations import quaternion_from_matrix, rotation_matrices
 from hyrfpack.splats.formats import spz
 from hyrfpack.splats.formats.hints import NO_HINTS, Hints
 from hyrfpack.splats.formats.validation import build_valid_splats
-from hyrfpack.splats.harmonics import MAX_DEGREE, num_sh_bases
 from hyrfpack.splats.placement import (
     apply_transform,
     decompose_similarity,

@@ -19,11 +19,11 @@ import numpy as np
 from scipy.special import expit
 
 from hyrfpack.errors import HyrfDataError
+from hyrfpack.ops.harmonics import MAX_DEGREE, num_sh_bases
 from hyrfpack.ply import read_elements, read_header, stack_columns
 from hyrfpack.splats.formats import compressed_ply
 from hyrfpack.splats.formats.hints import NO_HINTS, Hints
 from hyrfpack.splats.formats.validation import build_valid_splats
-from hyrfpack.splats.harmonics import MAX_DEGREE, num_sh_bases
 from hyrfpack.splats.splats import Splats
 
 _POSITION_PROPERTIES = ("x", "y", "z")

@@ -31,11 +31,12 @@ import numpy as np
 
 from hyrfpack.choices import SPZ_VERSIONS
 from hyrfpack.errors import HyrfDataError, needs_package
+from hyrfpack.ops.harmonics import MAX_DEGREE, num_sh_bases
 from hyrfpack.parallel.pool import run_tasks
 from hyrfpack.splats.formats.hints import NO_HINTS, Hints
 from hyrfpack.splats.formats.smallest_three import drop_largest, restore_largest
 from hyrfpack.splats.formats.validation import build_valid_splats
-from hyrfpack.splats.harmonics import MAX_DEGREE, harmonics_rotation, num_sh_bases
+from hyrfpack.splats.harmonics import harmonics_rotation
 from hyrfpack.splats.splats import Splats
 
 VERSION_IN_GLTF = 2  # of the draft extension KHR_gaussian_splatting_compression_spz_2

@@ -20,11 +20,11 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import numpy as np
 
 from hyrfpack.errors import HyrfDataError, needs_package
+from hyrfpack.ops.harmonics import MAX_DEGREE, num_sh_bases
 from hyrfpack.rotations import rotation_matrices
 from hyrfpack.scene import Camera
 from hyrfpack.splats.formats.hints import NO_HINTS, Hints
 from hyrfpack.splats.formats.validation import build_valid_splats
-from hyrfpack.splats.harmonics import MAX_DEGREE, num_sh_bases
 from hyrfpack.splats.placement import (
     apply_transform,
     decompose_similarity,

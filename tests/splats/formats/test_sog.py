@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from hyrfpack.errors import HyrfDataError
+from hyrfpack.ops.harmonics import num_sh_bases
 from hyrfpack.splats.formats import sog
 from hyrfpack.splats.formats.palette import build_palette, find_nearest_entries
-from hyrfpack.splats.harmonics import num_sh_bases
 from hyrfpack.splats.splats import Splats, normalized_quats
 
 

@@ -21,11 +21,12 @@ from hyrfpack.edit.transform import Placement
 from hyrfpack.export.bake import RIDGE_WEIGHT, SPHERE_DIRECTIONS, SPHERE_WEIGHT, bake
 from hyrfpack.export.measure import measure_psnr
 from hyrfpack.model import Frame, HybridModel
+from hyrfpack.ops.harmonics import harmonics_basis, num_sh_bases
 from hyrfpack.ops.rasterize.cull import frustum_cull
 from hyrfpack.ops.shade import encode_directions
 from hyrfpack.render import RenderSettings
 from hyrfpack.scene import Camera
-from hyrfpack.splats.harmonics import SH_C0, fibonacci_sphere, harmonics_basis, num_sh_bases
+from hyrfpack.splats.harmonics import SH_C0, fibonacci_sphere
 from hyrfpack.splats.splats import Splats
 
 FIT_SCRIPT = Path(__file__).parent / "fit.mjs"

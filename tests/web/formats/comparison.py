@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 from web.scripts import run_script
 
-from hyrfpack.splats.harmonics import SH_C0, num_sh_bases
+from hyrfpack.ops.harmonics import num_sh_bases
+from hyrfpack.splats.harmonics import SH_C0
 from hyrfpack.splats.splats import Splats
 
 DECODE_SCRIPT = Path(__file__).parent / "decode.mjs"
