@@ -15,12 +15,11 @@ from hyrfpack.atomic import write_atomic
 from hyrfpack.blocks.plan import BlockPlan
 from hyrfpack.config.train import TrainConfig
 from hyrfpack.errors import HyrfError, HyrfTrainingError
-from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
+from hyrfpack.format.run_folder import BLOCKS_JOURNAL_FILE, CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
 from hyrfpack.train.checkpoint import names_and_sizes
 from hyrfpack.train.results import RECORD_FILE
 from hyrfpack.train.run import is_begun as is_run_begun
 
-BLOCKS_FOLDER, JOURNAL_FILE = "blocks", "blocks.json"
 JOURNAL_VERSION = 1
 
 
@@ -71,7 +70,7 @@ def open_journal(
         HyrfError: there is no run to resume, it had other settings or photos, or a new run would replace an earlier
             one without `overwrite`.
     """
-    path = out / BLOCKS_FOLDER / JOURNAL_FILE
+    path = out / BLOCKS_JOURNAL_FILE
     photos = {block.name: names_and_sizes(block.photos) for block in plan.blocks}
     new = Journal(path, json.loads(json.dumps({"blocks": blocks, **config.to_dict()})), photos)
     if resume:
@@ -91,7 +90,7 @@ def open_journal(
 
 def is_begun(out: Path) -> bool:
     """Return whether a folder holds a run in blocks that can be resumed."""
-    return (out / BLOCKS_FOLDER / JOURNAL_FILE).is_file()
+    return (out / BLOCKS_JOURNAL_FILE).is_file()
 
 
 def _read_journal(path: Path) -> Journal:

@@ -18,7 +18,7 @@ import torch
 
 from hyrfpack.atomic import write_atomic
 from hyrfpack.blocks.cells import ground_axes, ground_extent
-from hyrfpack.blocks.journal import BLOCKS_FOLDER, Journal, is_begun, open_journal
+from hyrfpack.blocks.journal import Journal, is_begun, open_journal
 from hyrfpack.blocks.merge import merge_blocks
 from hyrfpack.blocks.plan import MIN_BLOCK_PHOTOS, Block, BlockPlan, parse_grid, plan_blocks
 from hyrfpack.checks import check_type

@@ -13,6 +13,8 @@ from hyrfpack.errors import HyrfFormatError
 MODEL_FILE = "model.hyrf"
 CHECKPOINT_FILE = "checkpoint.pt"
 METRICS_FILE = "metrics.json"
+BLOCKS_FOLDER = "blocks"  # of a run in blocks, a folder for each block
+BLOCKS_JOURNAL_FILE = f"{BLOCKS_FOLDER}/blocks.json"  # see `hyrfpack.blocks.journal`
 SCENE_MANIFEST_FILE = "scene.json"  # of a scene folder, see `hyrfpack.format.scene_folder`
 FINISH_RUN_ADVICE = "finish it by running its 'hyrfpack train' command again with `resume=True`"
 

@@ -8,7 +8,7 @@ from hyrfpack.config.train import TrainConfig
 from hyrfpack.data import PictureCache
 from hyrfpack.errors import HyrfError, HyrfTrainingError
 from hyrfpack.evaluate import picture_names
-from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
+from hyrfpack.format.run_folder import BLOCKS_JOURNAL_FILE, CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
 from hyrfpack.outputs import Outputs
 from hyrfpack.progress import Progress, TaskEvent
 from hyrfpack.scene import Scene, View
@@ -27,8 +27,10 @@ def check_folder(
                 fix="use the same ones to complete its results, or replace it with `overwrite=True`",
             )
     elif resume and not (out / CHECKPOINT_FILE).is_file():
+        if (out / BLOCKS_JOURNAL_FILE).is_file():
+            raise HyrfError(f"{out}: the run in this folder is one in blocks", fix="resume it with the same `blocks`")
         raise HyrfError(f"{out}: there is no checkpoint to resume", fix="leave out `resume=True` to start a run")
-    left = [name for name in (MODEL_FILE, CHECKPOINT_FILE) if (out / name).exists()]
+    left = [name for name in (MODEL_FILE, CHECKPOINT_FILE, BLOCKS_JOURNAL_FILE) if (out / name).exists()]
     if left and not (resume or overwrite or record is not None):
         hint = "`resume=True` continues it, " if CHECKPOINT_FILE in left else ""
         raise HyrfError(

@@ -18,7 +18,7 @@ from hyrfpack.context import RunContext
 from hyrfpack.data import PictureCache
 from hyrfpack.data.cache import memory_bytes
 from hyrfpack.errors import HyrfError, HyrfTrainingError
-from hyrfpack.format.run_folder import CHECKPOINT_FILE, MODEL_FILE
+from hyrfpack.format.run_folder import BLOCKS_JOURNAL_FILE, CHECKPOINT_FILE, MODEL_FILE
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.outputs import Outputs
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
@@ -162,7 +162,8 @@ class _Run:
         if record is not None:
             return self._complete(record)
         if self.overwrite and not self.resume and self.ranks.is_main:
-            (self.out / RECORD_FILE).unlink(missing_ok=True)  # It belongs to the earlier run, which this one replaces.
+            for name in (RECORD_FILE, BLOCKS_JOURNAL_FILE):  # These belong to the earlier run, which this one replaces.
+                (self.out / name).unlink(missing_ok=True)
         decisions = self._decide()
         return TrainResult(False, 0, None, {}) if decisions is None else self._train(self._set_up(decisions), decisions)
 

@@ -20,13 +20,13 @@ from hyrfpack.blocks.run import BYTES_PER_GAUSSIAN, choose_grid
 from hyrfpack.context import RunContext
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import load_merged_model, load_model
-from hyrfpack.format.run_folder import CHECKPOINT_FILE
+from hyrfpack.format.run_folder import CHECKPOINT_FILE, MODEL_FILE
 from hyrfpack.format.sections import MAX_PARTS
 from hyrfpack.model.merged import world_positions
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.progress import StepEvent
 from hyrfpack.render import render_view
-from hyrfpack.train import load_training_scene
+from hyrfpack.train import load_training_scene, train_model
 from hyrfpack.train.results import RECORD_FILE
 
 
@@ -61,6 +61,23 @@ def test_a_new_run_in_blocks_removes_the_checkpoint_of_a_run_without_blocks(tmp_
         (tmp_path / name).write_bytes(b"of an earlier run")
     Journal(tmp_path / "blocks" / "blocks.json", {}, {}).start()
     assert is_begun(tmp_path) and [path.name for path in tmp_path.iterdir()] == ["blocks"]
+
+
+def test_a_run_without_blocks_replaces_one_in_blocks_only_if_asked_and_then_removes_its_journal(finished, tmp_path):
+    run, config = tmp_path / "run", dataclasses.replace(BLOCK_CONFIG, steps=2)
+    shutil.copytree(finished[0], run)
+    with pytest.raises(HyrfError, match="is one in blocks; resume it with the same `blocks`"):
+        train_model(block_scene(), run, config, resume=True, context=QUIET_CONTEXT)
+    (run / MODEL_FILE).unlink()  # as while the blocks are trained
+    with pytest.raises(HyrfError, match=r"holds an earlier run \(blocks/blocks.json\)"):
+        train_model(block_scene(), run, config, context=QUIET_CONTEXT)
+    assert is_begun(run)
+
+    train_model(block_scene(), run, config, overwrite=True, context=QUIET_CONTEXT)
+
+    assert not is_begun(run)
+    with pytest.raises(HyrfError, match="no run in blocks to resume"):
+        train_blocks(block_scene(), run, BLOCK_CONFIG, "2x1", resume=True, context=QUIET_CONTEXT)
 
 
 def test_a_part_is_what_its_block_has_learnt_in_its_cells(finished):
