@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import gc
 import json
 import logging
 import math
@@ -31,7 +30,7 @@ from hyrfpack.device import describe_device
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import evaluate_model
 from hyrfpack.format.parts import load_model_or_parts
-from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
+from hyrfpack.format.run_folder import BLOCKS_FOLDER, CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
 from hyrfpack.format.sections import MAX_PARTS
 from hyrfpack.lock import exclusive_folder, try_lock
 from hyrfpack.model.merged import parts_of
@@ -242,7 +241,6 @@ class _BlockRun:
         except HyrfError as error:
             kept = f"finished blocks are kept, {resuming(self.overwrite)} continues"
             raise error.with_text(f"{label}: {error.problem}", f"{error.fix}; {kept}") from error
-        gc.collect()  # Reference cycles would keep the trainer and its model while the next block is trained.
         return result
 
     def _block_config(self, block: Block) -> TrainConfig | None:

@@ -270,9 +270,11 @@ class _Run:
                         log.end(complete=complete, step=trainer.step)
                     return TrainResult(complete, trainer.step, self.out / MODEL_FILE if complete else None, {})
                 record = save_model(trainer, self.out, self.progress, overwrite=self._replaces)
+            config, owns_checkpoint = trainer.config, self._replaces or trainer.saved is not None
+            del trainer  # Its memory is free while results are written, and no frame that others keep holds it.
             return finish_run(
-                record, self.scene, self.out, trainer.config, self.device, self.progress, log,
-                overwrite=self._replaces, owns_checkpoint=self._replaces or trainer.saved is not None,
+                record, self.scene, self.out, config, self.device, self.progress, log,
+                overwrite=self._replaces, owns_checkpoint=owns_checkpoint,
             )  # fmt: skip
 
     def _take_steps(self, trainer: Trainer, log: TrainingLog | None) -> bool:

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+import weakref
 from pathlib import Path
 
 import numpy as np
@@ -163,6 +164,27 @@ def test_resuming_without_a_checkpoint_is_a_clear_error(tmp_path):
     with pytest.raises(HyrfError, match="no checkpoint to resume; leave out `resume=True`"):
         train_model(make_scene(), tmp_path / "run", RUN_CONFIG, resume=True, context=QUIET_CONTEXT)
     assert not (tmp_path / "run").exists()
+
+
+def test_the_trainer_is_freed_before_the_curve_is_drawn(tmp_path, monkeypatch):
+    """matplotlib keeps the frames of its callers in reference cycles, with all that they still hold."""
+    trainers: set[weakref.ref] = set()
+    freed: list[bool] = []
+
+    def draw(records, path: Path, *, overwrite: bool = True) -> Path:
+        freed.extend(trainer() is None for trainer in trainers)
+        return path
+
+    monkeypatch.setattr("hyrfpack.train.results.draw_training_curve", draw)
+    config = dataclasses.replace(RUN_CONFIG, steps=2)
+    train_model(
+        make_scene(),
+        tmp_path,
+        config,
+        context=QUIET_CONTEXT,
+        observer=lambda trainer: trainers.add(weakref.ref(trainer)),
+    )
+    assert freed == [True]
 
 
 @pytest.mark.parametrize("opacity", [0.9, 0.98, 0.9999])
