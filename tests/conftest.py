@@ -117,12 +117,25 @@ def signals() -> Iterator[None]:
 
 @pytest.fixture
 def quick_import(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Reduce the viewpoints and files of an import of splats to the least that still makes a model."""
-    from hyrfpack.imports import pack, prepare
+    """Reduce the viewpoints and files of an import of splats to the least that still makes a model.
 
+    Most small splats cover too little of every picture, so that an import would try all candidates.
+    """
+    from hyrfpack.imports import pack, prepare
+    from hyrfpack.splats import viewpoints
+
+    monkeypatch.setattr(viewpoints, "CANDIDATES_PER_CAMERA", 1)
     monkeypatch.setattr(pack, "MAX_TRIALS", 2)
     monkeypatch.setattr(prepare, "LIGHT_MEASUREMENT_VIEWS", 8)
     monkeypatch.setattr(prepare, "VALIDATION_VIEWS_PER_TEST_VIEW", 1)
+
+
+@pytest.fixture
+def quick_scores(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Score exports and conversions of splats in two small views."""
+    monkeypatch.setattr("hyrfpack.export.source.MAX_MEASURED_VIEWS", 2)
+    monkeypatch.setattr("hyrfpack.export.conversion.MEASURED_VIEWS", 2)
+    monkeypatch.setattr("hyrfpack.export.conversion.MEASURED_SIZE_PIXELS", 64)
 
 
 @pytest.fixture(scope="module")

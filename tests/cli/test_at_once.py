@@ -35,7 +35,7 @@ from hyrfpack.splats.formats import ply
 from hyrfpack.train import TrainConfig
 
 pytest.importorskip("fcntl", reason="locks are of Unix")
-pytestmark = pytest.mark.usefixtures("quick_calibration")
+pytestmark = pytest.mark.usefixtures("quick_calibration", "quick_scores")
 FOREIGN_BYTES = b"of another program"
 BUSY_FOLDER_ERROR = "another hyrfpack command is at work in this folder; wait until it has ended, or name another"
 PAPER_PROFILE = hyrfpack.CompressConfig(profile="paper")

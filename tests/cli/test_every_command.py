@@ -24,7 +24,7 @@ from click.testing import Result
 from commands import hyrfpack
 from photo_sets import READ_PATHS_BY_SET, write_photo_sets
 
-pytestmark = pytest.mark.usefixtures("quick_calibration")
+pytestmark = pytest.mark.usefixtures("quick_calibration", "quick_scores")
 OUTCOME_REFUSED = "refused"
 OUTCOME_REPLACED = "replaced"
 OUTCOME_WRITTEN = "written"

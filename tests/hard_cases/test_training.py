@@ -194,7 +194,9 @@ BAD_STARTS = {
 SLOW_STARTS = {  # the integration layer has a similar start for each of these
     "one view and no points",
     "one-pixel cut-outs and no points",
+    "one-pixel pictures and no points",
     "views from one place and no points",
+    "views from one place the same way",
     "views the same way and no points",
 }
 

@@ -21,7 +21,9 @@ from hyrfpack.imports.prepare import prepare_model
 from hyrfpack.model.residuals import add_shape_residuals
 from hyrfpack.model.shape_residuals import shape_residuals
 from hyrfpack.render import render_view
+from hyrfpack.splats import viewpoints
 from hyrfpack.splats.draw import Drawable, draw
+from hyrfpack.splats.viewpoints import CANDIDATES_PER_CAMERA
 
 pytestmark = pytest.mark.usefixtures("quick_calibration")
 
@@ -62,6 +64,7 @@ def test_an_exact_model_renders_the_splats(degree: int) -> None:
 
 def test_an_import_stores_what_the_target_needs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pack, "MAX_TRIALS", 6)
+    monkeypatch.setattr(viewpoints, "CANDIDATES_PER_CAMERA", CANDIDATES_PER_CAMERA)  # the worst views count here
     splats = ball_splats(200)
 
     def import_them(**settings: float) -> ImportReport:

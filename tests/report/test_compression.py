@@ -208,7 +208,8 @@ def test_parts_add_up_to_the_file_size_and_to_the_loss(report_with_photos):
 
 
 def test_layers_of_a_section_are_reported_as_one_part(model_file, tmp_path):
-    packed, report, _ = compress_and_report(model_file, tmp_path, "raw")
+    packed = tmp_path / "packed.hyrf"
+    report = compress_model(model_file, packed, CompressConfig(profile="raw"))
     positions = next(part for part in report.sections if part.type == "POSI")
     halves = [
         dataclasses.replace(positions, type=type, before=positions.before // 2, after=positions.after // 2)

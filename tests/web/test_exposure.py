@@ -118,7 +118,6 @@ def test_both_exposures_look_as_in_hyrfpack_render(browser: Browser, tmp_path: P
     assert browser.list_errors() == []
 
 
-@pytest.mark.smoke
 @pytest.mark.in_turn
 def test_a_consistent_picture_equals_that_of_the_model_without_its_map(browser: Browser, tmp_path: Path):
     model = random_model_with_map()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -77,8 +78,14 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], dic
     return {key: {**case, **answer} for (key, case), answer in zip(cases.items(), answers, strict=True)}
 
 
-@pytest.mark.parametrize("name", FILES)
-@pytest.mark.parametrize("edits", EDITS)
+@pytest.mark.parametrize(
+    ("name", "edits"),
+    [
+        # `make test` takes every file and every edit at least once, `make test-all` takes all pairs.
+        pytest.param(name, edits, marks=[] if edits == "all" or name == FILES[-1] else pytest.mark.acceptance)
+        for name, edits in product(FILES, EDITS)
+    ],
+)
 def test_a_saved_file_equals_that_of_the_command(name: str, edits: str, saved, monkeypatch):
     case = saved[name, edits]
     source, target = Path(case["source"]), Path(case["target"])
