@@ -7,6 +7,8 @@ import re
 import subprocess
 import sys
 import venv
+import zipfile
+from email import message_from_bytes
 from importlib import metadata
 from pathlib import Path, PurePosixPath
 from shutil import copyfile
@@ -42,11 +44,30 @@ def build_distribution(kind: str, source: Path, out: Path) -> Path:
     return out / done.stdout.splitlines()[-1]
 
 
+def distribution_name(requirement: str) -> str:
+    """Return the name of a distribution in a requirement such as "numpy>=1.26"."""
+    return re.match(r"[\w.-]+", requirement)[0].lower().replace("_", "-")
+
+
+def wheel_requirements(wheel: Path) -> list[str]:
+    """Return what a wheel requires without extras. Skips the test if this Python lacks any of it.
+
+    The requirements of an editable installation are those of the tree and the day that it was made from.
+    """
+    with zipfile.ZipFile(wheel) as archive:
+        (name,) = [name for name in archive.namelist() if name.endswith(".dist-info/METADATA")]
+        lines = message_from_bytes(archive.read(name)).get_all("Requires-Dist")
+    for line in lines:
+        if ";" not in line and not any(metadata.distributions(name=distribution_name(line))):
+            pytest.skip(f"the wheel requires {line}, which this Python lacks; refresh its environment: make .venv")
+    return [line for line in lines if "extra ==" not in line]
+
+
 def required_distributions(*roots: str) -> set[str]:
     """Return the names of distributions and of everything that they require."""
     found, waiting = set(), list(roots)
     while waiting:
-        name = re.match(r"[\w.-]+", waiting.pop())[0].lower().replace("_", "-")
+        name = distribution_name(waiting.pop())
         if name not in found:
             found.add(name)
             try:
@@ -68,7 +89,7 @@ def make_environment(folder: Path, wheel: Path, *packages: str) -> Path:
     pytest.importorskip("pip", reason="pip is not installed")
     venv.create(folder)
     (site_packages,) = folder.glob("lib/python*/site-packages")
-    for name in required_distributions(*packages) - {"hyrfpack"}:
+    for name in required_distributions(*packages):
         try:
             distribution = metadata.distribution(name)
         except metadata.PackageNotFoundError:

@@ -19,6 +19,7 @@ from distributions import (
     list_repository_files,
     make_environment,
     run_in_environment,
+    wheel_requirements,
 )
 
 import hyrfpack
@@ -100,7 +101,7 @@ def test_the_citation_has_the_version_of_the_package():
 
 @pytest.mark.skipif(sys.platform == "win32", reason="links to packages need administrator rights")
 def test_the_installed_wheel_passes_the_smoke_check(built, tmp_path):
-    python = make_environment(tmp_path / "environment", built["wheel"], "hyrfpack")
+    python = make_environment(tmp_path / "environment", built["wheel"], *wheel_requirements(built["wheel"]))
     done = run_in_environment(python, REPOSITORY_ROOT / "tools" / "safety" / "smoke.py")
     assert done.returncode == 0, done.stderr
     assert str(tmp_path) in done.stdout  # the installed package is checked, not this checkout
