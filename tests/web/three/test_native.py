@@ -9,6 +9,7 @@ import math
 import shutil
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -57,12 +58,29 @@ def three_browser() -> Iterator[Chromium]:
         yield browser
 
 
-@pytest.fixture(scope="module")
-def address(app_folder: Path) -> Iterator[str]:
-    for name in ("native.html", "native.js"):
+def write_page(app_folder: Path, *scripts: str) -> None:
+    """Write the page of these tests with scripts of this folder, and the files that it shows."""
+    for name in ("native.html", "native.js", *scripts):
         shutil.copy(Path(__file__).with_name(name), app_folder)
     shutil.copy(GOLDEN_FILE, app_folder / "golden.hyrf")
     save_model(make_model(), app_folder / "balls.hyrf")
+
+
+@contextmanager
+def opened_page(browser: Chromium, url: str, is_ready: str, seconds: float = 10.0) -> Iterator[Chromium]:
+    """Show the page in a small window in a `with` block, after which it must have no errors."""
+    browser.resize(2 * SIZE_PIXELS, 2 * SIZE_PIXELS)
+    browser.open(url)
+    wait_until(browser, is_ready, seconds)
+    yield browser
+    errors = browser.list_errors()
+    browser.open("about:blank")
+    assert errors == []
+
+
+@pytest.fixture(scope="module")
+def address(app_folder: Path) -> Iterator[str]:
+    write_page(app_folder)
     model, provenance = load_with_provenance(GOLDEN_FILE)
     step = Placement.rotation_about_axis((0.4, 1.0, -0.3), 77)
     hyrfpack.save_model(step.move_model(model), app_folder / "rotated.hyrf", "raw", step.move_provenance(provenance))
@@ -72,13 +90,8 @@ def address(app_folder: Path) -> Iterator[str]:
 
 @pytest.fixture
 def page(three_browser: Chromium, address: str) -> Iterator[Chromium]:
-    three_browser.resize(2 * SIZE_PIXELS, 2 * SIZE_PIXELS)
-    three_browser.open(f"{address}/native.html")
-    wait_until(three_browser, "Boolean(globalThis.page)")
-    yield three_browser
-    errors = three_browser.list_errors()
-    three_browser.open("about:blank")
-    assert errors == []
+    with opened_page(three_browser, f"{address}/native.html", "Boolean(globalThis.page)") as page:
+        yield page
 
 
 def first_camera(page: Chromium, number: int = 0) -> Camera:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -10,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from web.pages import psnr, wait_until
+from web.pages import psnr
 from web.served import serve_project
 from web.test_exposure import visible_map
 from web.three.test_native import (
@@ -19,11 +18,13 @@ from web.three.test_native import (
     SIZE_PIXELS,
     draw,
     first_camera,
+    opened_page,
     read,
     render,
     three_browser,
+    write_page,
 )
-from web.three.test_three import PROJECT_FOLDER, app_folder, make_model, save_model
+from web.three.test_three import PROJECT_FOLDER, app_folder
 
 import hyrfpack
 from hyrfpack.render import render_view
@@ -38,25 +39,17 @@ pytestmark = pytest.mark.acceptance
 def address(app_folder: Path) -> Iterator[str]:
     if not SPARK_FOLDER.is_dir():
         pytest.skip("Spark is not here; run `npm ci` in tests/bundlers")
-    for name in ("native.html", "native.js", "spark.js"):
-        shutil.copy(Path(__file__).with_name(name), app_folder)
+    write_page(app_folder, "spark.js")
     (app_folder / "node_modules" / "@sparkjsdev").mkdir()
     (app_folder / "node_modules" / "@sparkjsdev" / "spark").symlink_to(SPARK_FOLDER)
-    shutil.copy(GOLDEN_FILE, app_folder / "golden.hyrf")
-    save_model(make_model(), app_folder / "balls.hyrf")
     with serve_project(app_folder) as address:
         yield f"{address}/own"
 
 
 @pytest.fixture
 def page(three_browser: Chromium, address: str) -> Iterator[Chromium]:
-    three_browser.resize(2 * SIZE_PIXELS, 2 * SIZE_PIXELS)
-    three_browser.open(f"{address}/native.html?spark")
-    wait_until(three_browser, "Boolean(globalThis.page?.addSplat)", 60)
-    yield three_browser
-    errors = three_browser.list_errors()
-    three_browser.open("about:blank")
-    assert errors == []
+    with opened_page(three_browser, f"{address}/native.html?spark", "Boolean(globalThis.page?.addSplat)", 60) as page:
+        yield page
 
 
 @pytest.mark.parametrize(("file", "least_psnr"), [("golden.hyrf", 42), ("balls.hyrf", 52)])
