@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -20,8 +21,9 @@ from hyrfpack.render.parts import camera_frame, gather_geometry
 from hyrfpack.scene import Camera
 
 ERROR_RADII = (16.0, 32.0, 64.0, 128.0, 256.0, 512.0, 1024.0)
-# Views are measured at these shares of the photos' resolution. A coarser picture is the view from farther away.
-RESOLUTION_SHARES = (1.0, 1 / 2, 1 / 4, 1 / 8)
+# Views are measured at these shares of the photos' resolution, in turn. A coarser picture is a view from farther away.
+# Two resolutions of twice as many views predict other views better than four of each view.
+RESOLUTION_SHARES = ((1.0, 1 / 4), (1 / 2, 1 / 8))
 # A pixel of which a half of the chunks has a smaller share counts less, because its error comes from elsewhere.
 MIN_SHARE = 1e-3
 _COLUMNS = 3  # shares of chunks that are drawn at once, as the three channels of a picture
@@ -60,7 +62,8 @@ def measure_level_errors(
     pool = _Pool.of(levels, fields or levels[0][:1], parts or [0] * len(spheres))
     shape, rng = (len(levels), len(spheres), len(ERROR_RADII)), np.random.default_rng(seed)
     sums, areas = np.zeros(shape), np.zeros(shape[1:])
-    views = [resize_camera(camera, share) for camera in cameras for share in RESOLUTION_SHARES]
+    shares = itertools.cycle(RESOLUTION_SHARES)
+    views = [resize_camera(camera, share) for camera in cameras for share in next(shares)]
     for number, camera in enumerate(views):
         progress(TaskEvent(f"measuring levels, view {number + 1}/{len(views)}", number / len(views)))
         in_half = rng.permutation(len(spheres)) % 2 == 0

@@ -51,7 +51,7 @@ MERGE_VIEWPOINTS = 8
 REFIT_BETWEEN = 3  # views between cameras, for each view at a camera
 # Of each part; views of all parts together are limited, because they take memory and time.
 REFIT_CAMERAS, MAX_REFIT_CAMERAS = 12, 48
-MEASURED_VIEWS, MAX_MEASURED_VIEWS = 8, 32
+MEASURED_VIEWS, MAX_MEASURED_VIEWS = 24, 64
 _SEED_STEP = 1000  # keeps the views that levels are fitted at from those that they are measured at
 _SIGMAS = 3.0
 _REFIT_SHARE, _MEASURE_SHARE = 0.6, 0.3  # of the progress

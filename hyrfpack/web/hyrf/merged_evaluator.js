@@ -31,12 +31,11 @@ export class MergedEvaluator {
       return { evaluator, place: placeOf(model.config.frame, models[0].config.frame), firstRow, rowCount };
     });
     const joined = new Float32Array(3 * GAUSSIANS_PER_ROW * this.rowCount).fill(NaN); // which is not drawn
-    const nearRatios = new Float32Array(this.rowCount);
-    for (const { evaluator: { model }, place, firstRow, rowCount } of this.parts) {
+    for (const { evaluator: { model }, place, firstRow } of this.parts) {
       joined.set(movePositions(model.positions, place), 3 * GAUSSIANS_PER_ROW * firstRow);
-      nearRatios.fill(place.scale, firstRow, firstRow + rowCount);
     }
-    this.sorter = new DepthSort(joined, GAUSSIANS_PER_ROW, nearRatios);
+    const units = this.parts.flatMap(({ place, rowCount }) => Array(rowCount).fill(place.scale));
+    this.sorter = new DepthSort(joined, GAUSSIANS_PER_ROW, units);
     this.sky = this.parts[0].evaluator.sky;
   }
 

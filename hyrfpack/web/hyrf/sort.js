@@ -6,13 +6,12 @@ export class DepthSort {
   /**
    * @param {Float32Array} positions those of the splats (3 N)
    * @param {number} width orders fill whole rows of a texture that is `width` texels wide
-   * @param {Float32Array | null} [nearRatios] the depth of each row's near plane, relative to that of `sort`; null for 1.
-   *   In a scene of several parts, it is the unit of the row's part.
+   * @param {number[]} [units] of each row's near plane
    */
-  constructor(positions, width, nearRatios = null) {
+  constructor(positions, width, units) {
     this.positions = positions;
     this.width = width;
-    this.nearRatios = nearRatios;
+    this.units = units;
     this.count = positions.length / 3;
     this.capacity = width * Math.ceil(this.count / width);
     this.depths = new Float32Array(this.count);
@@ -33,14 +32,14 @@ export class DepthSort {
    * @returns {{order: Uint32Array, drawn: number}} indices of splats, of which the first `drawn` are valid
    */
   sort(row, sides, near, order, kept) {
-    const { positions, width, nearRatios, depths, bits, indices, others, counts } = this;
+    const { positions, width, units, depths, bits, indices, others, counts } = this;
     const [a, b, c, d] = row;
     let drawn = 0;
     counts.fill(0);
     for (let i = this.count - 1; i >= 0; i--) {
       const x = positions[3 * i], y = positions[3 * i + 1], z = positions[3 * i + 2];
       const depth = a * x + b * y + c * z + d;
-      if (!(depth > (nearRatios ? near * nearRatios[(i / width) | 0] : near)) || kept?.[i] === 0) continue;
+      if (!(depth > (units ? near * units[(i / width) | 0] : near)) || kept?.[i] === 0) continue;
       let inside = true;
       for (let s = 0; s < 16 && inside; s += 4) {
         inside = sides[s] * x + sides[s + 1] * y + sides[s + 2] * z + sides[s + 3] > 0;

@@ -126,12 +126,12 @@ export class Loader {
 
   // Sorts the splats for a view of a scene. Returns a promise of {order, drawn}, or of null if another content has been
   // selected meanwhile. The caller passes the order to `reuse` after copying it.
-  sort(view, { near, tolerance }) {
+  sort(view, { near, sortNear = near, tolerance }) {
     // The frustum is enlarged, so that no splats are missing at the edges until the next order arrives.
     const sides = frustumPlanes(view, 1 + tolerance), row = [...view.rows[2], view.translation[2]];
     const ticket = ++this.ticket, order = this.spare;
     this.spare = null;
-    this.connection.post({ sort: { ticket, row, sides, near, order } }, order ? [order.buffer] : []);
+    this.connection.post({ sort: { ticket, row, sides, near: sortNear, order } }, order ? [order.buffer] : []);
     return new Promise((resolve) => this.waiting.set(ticket, resolve));
   }
 

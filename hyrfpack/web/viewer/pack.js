@@ -2,7 +2,6 @@
 
 import { estimateGaussians } from "./estimate.js";
 import { decoderLayout, gridLevels } from "../hyrf/grids.js";
-import { movePositions } from "../hyrf/places.js";
 import { rowBalls } from "../hyrf/row_states.js";
 import { SHAPE_RESIDUALS } from "../hyrf/residuals.js";
 import { backgroundSpacing, pixelSizes } from "../hyrf/sampling.js";
@@ -154,19 +153,17 @@ function layerNumbers(numbers, count, columns, width) {
   return layered;
 }
 
-// Returns what DepthSort needs of several parts {model, place}: the positions of their Gaussians in the scene, and the
-// near plane of each row. Each part begins a row; numbers that belong to no Gaussian are NaN.
-export function joinParts(parts) {
-  const heights = parts.map(({ model }) => countRows(model.count));
-  const height = heights.reduce((sum, rows) => sum + rows, 0);
-  const positions = new Float32Array(3 * TEXTURE_WIDTH * height).fill(NaN), nearRatios = new Float32Array(height);
+// Returns the positions of several parts (3 N each) as one array, in which each part begins a row of the textures.
+// Numbers that belong to no Gaussian are NaN.
+export function joinPositions(parts) {
+  const heights = parts.map((positions) => countRows(positions.length / 3));
+  const joined = new Float32Array(3 * TEXTURE_WIDTH * heights.reduce((sum, height) => sum + height, 0)).fill(NaN);
   let row = 0;
-  for (const [number, { model, place }] of parts.entries()) {
-    positions.set(movePositions(model.positions, place), 3 * TEXTURE_WIDTH * row);
-    nearRatios.fill(place.scale, row, row + heights[number]);
+  for (const [number, positions] of parts.entries()) {
+    joined.set(positions, 3 * TEXTURE_WIDTH * row);
     row += heights[number];
   }
-  return { positions, nearRatios };
+  return joined;
 }
 
 // Packs a decoder's numbers in groups of four; hidden units are padded to whole cells. The order is: bias 1, the

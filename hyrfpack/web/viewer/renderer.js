@@ -312,7 +312,7 @@ export class Renderer {
     gl.uniform3fv(p.u_eye, view.eye);
     gl.uniform4f(p.u_intrinsics, view.fx, view.fy, view.cx, view.cy);
     gl.uniform2f(p.u_size, view.width, view.height);
-    gl.uniform1f(p.u_near, scene.near * (content.nearRatio ?? 1)); // the order omits what is too near in a larger part
+    gl.uniform1f(p.u_near, scene.near);
     gl.uniform1f(p.u_tolerance, scene.tolerance);
     gl.uniform1f(p.u_pick, pick);
     gl.drawArrays(gl.TRIANGLES, 0, 3);

@@ -27,8 +27,8 @@ import { read, readParts } from "../hyrf/index.js";
 import { toLocalView, viewpointOf } from "../hyrf/viewpoint.js";
 import { TEXTURE_WIDTH } from "./constants.js";
 import { rejectOtherFiles } from "./other_files.js";
-import { joinParts, packModel, packSplats } from "./pack.js";
-import { placeOf } from "../hyrf/places.js";
+import { joinPositions, packModel, packSplats } from "./pack.js";
+import { movePositions, placeOf } from "../hyrf/places.js";
 import { ReceivedFile } from "./received_file.js";
 import { BACKGROUND_HEIGHT_PIXELS, backgroundPicture, modelScene, splatsScene } from "./scene.js";
 import { measureGaussians, selectGaussians } from "./selection.js";
@@ -169,13 +169,13 @@ class SceneReader {
     const bytes = partial && this.broken ? all.subarray(0, this.decodedLength || file.length) : all;
     const content = { number: ++this.contents, repeats: this.repeats, whole: !partial };
     this.reportProgress("unpacking", 0);
-    let sorted;
+    let positions;
     if (file.isMerged) {
-      sorted = this.decodeMerged(await readParts(bytes), content);
+      positions = this.decodeMerged(await readParts(bytes), content);
     } else if (file.isModel) {
       const model = await read(bytes, { partial });
       content.scene = { ...(scene ?? { ...modelScene(model, name), ...stage }), exposure: model.exposure };
-      sorted = { positions: model.positions };
+      positions = model.positions;
       if (plain) {
         this.reportProgress("unpacking", 1);
         const report = ({ done }) => this.reportProgress("preparing", done);
@@ -190,29 +190,30 @@ class SceneReader {
       const splats = await this.readSplats(name, bytes);
       if (scene) convertToScene(splats, scene);
       content.scene = scene ?? { ...splatsScene(splats, name), ...stage };
-      sorted = { positions: splats.positions };
+      positions = splats.positions;
       content.splats = packSplats(splats);
     }
-    this.sorter.add(content.number, sorted);
+    this.sorter.add(content.number, new DepthSort(positions, TEXTURE_WIDTH));
     this.decodedLength = bytes.length;
     this.reportProgress("unpacking", 1);
     this.post({ content }, listBuffers(content));
   }
 
-  // Packs the parts of a merged file for a content. Returns what is sorted, see joinParts.
+  // Packs the parts of a merged file for a content. Returns the positions of all their Gaussians.
   decodeMerged(parts, content) {
     const { name, scene, stage, plain } = this.request, frame = parts[0].model.config.frame;
-    if (plain) throw new Error("It holds merged models, which this device cannot draw.");
+    if (plain) throw new Error("This device draws no merged models.");
     const placed = parts.map(({ model }) => ({ model, place: placeOf(model.config.frame, frame) }));
     const count = parts.reduce((sum, { model }) => sum + model.count, 0);
     const own = scene ?? { ...modelScene(parts[0].model, name), ...stage };
     const described = placed.map(({ model: { exposure }, place }) => ({ exposure, place }));
-    content.scene = { ...own, count, exposure: null, parts: described };
+    const sortNear = own.near * Math.min(...placed.map(({ place }) => place.scale)); // the nearest one of all parts
+    content.scene = { ...own, count, sortNear, exposure: null, parts: described };
     content.models = placed.map(({ model, place }, number) => {
       const packed = packModel(model, firstEye(content.scene, model));
       return { ...packed, place, background: number === 0 && packed.background };
     });
-    return joinParts(placed);
+    return joinPositions(placed.map(({ model, place }) => movePositions(model.positions, place)));
   }
 }
 
@@ -251,10 +252,9 @@ class ContentSorter {
     return this.sorters.get(this.selected).positions;
   }
 
-  // Adds a content by its number, the positions of its splats (3 N), the near planes of its rows (see DepthSort), and
-  // the width of its textures.
-  add(number, { positions, nearRatios = null, width = TEXTURE_WIDTH }) {
-    this.sorters.set(number, new DepthSort(positions, width, nearRatios));
+  // Adds the DepthSort of a content by its number.
+  add(number, sorter) {
+    this.sorters.set(number, sorter);
   }
 
   // Selects the content to sort, and drops older ones.

@@ -1,7 +1,7 @@
 export declare class DepthSort {
     positions: Float32Array<ArrayBufferLike>;
     width: number;
-    nearRatios: Float32Array<ArrayBufferLike> | null;
+    units: number[] | undefined;
     count: number;
     capacity: number;
     depths: Float32Array<ArrayBuffer>;
@@ -12,10 +12,9 @@ export declare class DepthSort {
     /**
      * @param {Float32Array} positions those of the splats (3 N)
      * @param {number} width orders fill whole rows of a texture that is `width` texels wide
-     * @param {Float32Array | null} [nearRatios] the depth of each row's near plane, relative to that of `sort`; null for 1.
-     *   In a scene of several parts, it is the unit of the row's part.
+     * @param {number[]} [units] of each row's near plane
      */
-    constructor(positions: Float32Array, width: number, nearRatios?: Float32Array | null);
+    constructor(positions: Float32Array, width: number, units?: number[]);
     /**
      * Sorts by a radix sort of the float32 depths in two passes of 16 bits. Splats nearer than the near plane or outside
      * the planes `sides` are omitted. At equal depth the splat with the larger index comes first, as in the rasteriser.

@@ -27,7 +27,8 @@ export class ChunkLevels {
     this.levels = levels.map((file, level) => new Level(level, file, countRows(file.gaussians)));
     this.coarsest = levels.length - 1;
     this.target = -1; // the level that suits the view, -1 for none
-    this.shown = -1; // the level that is drawn, or that is being faded in
+    this.isKept = true; // whether the coarsest level stays in memory whatever the view shows
+    this.shown = -1; // the level that is drawn, or that is being faded in; -1 for none
     this.fading = null; // {from, to} while one level fades into another; -1 for none
   }
 
@@ -52,19 +53,23 @@ export class ChunkLevels {
     return this.get(level)?.state === READY;
   }
 
-  // Returns the level that should be drawn: the target if it can be, else the present one, else any.
-  // With `isShort` of memory, a level finer than the target is given up for the coarsest one.
+  // Returns the level that should be drawn: the target if it can be, else the present one, else any; -1 for none.
+  // With `isShort` of memory, a level finer than the target is given up for the coarsest one, or for none.
   next(isShort) {
-    const { target, shown, coarsest } = this;
-    if (this.isReady(target)) return target;
-    if (shown >= 0 && isShort && shown < target && this.isReady(coarsest)) return coarsest;
+    const { target, shown, coarsest, isKept } = this;
+    if (target < 0 || this.isReady(target)) return target;
+    if (shown >= 0 && isShort && shown < target) {
+      if (this.isReady(coarsest)) return coarsest;
+      if (!isKept) return -1;
+    }
     if (shown >= 0) return shown;
     return this.levels.findLast(({ state }) => state === READY)?.level ?? -1;
   }
 
-  // Returns whether a level may be dropped: it is neither drawn nor wanted, nor the coarsest, which is always kept.
+  // Returns whether a level may be dropped: it is neither drawn nor wanted, nor the coarsest one if that is kept.
   isSpare({ level, state }) {
     const isFading = this.fading !== null && [this.fading.from, this.fading.to].includes(level);
-    return state === READY && !isFading && ![this.shown, this.target, this.coarsest].includes(level);
+    const isNeeded = [this.shown, this.target].includes(level) || (this.isKept && level === this.coarsest);
+    return state === READY && !isFading && !isNeeded;
   }
 }

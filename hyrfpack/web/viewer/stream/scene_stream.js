@@ -1,6 +1,6 @@
-// Reads a scene folder as views need it, in the worker: fetches the coarsest level of all chunks first and then, by
+// Reads a scene folder as views need it, in the worker: fetches the coarsest levels of chunks first and then, by
 // priority, the levels that suit the view within a budget of Gaussians; decodes them, and drops what is not needed when
-// memory is short.
+// memory is short. The memory does not grow with the scene (see level_choice.js).
 //
 // Messages to the worker, beside those in worker_tasks.js; `number` is that of the content:
 //     {stream: {manifest, address, name, stage, gaussians, maxRows}}   open the scene with the text `manifest` from
@@ -23,23 +23,25 @@
 //                                            ticket: the Gaussians drawn and in memory, the bytes received and of the
 //                                            scene, the predicted PSNR in dB; `problem` is a sentence
 
-import { chooseLevels, predictErrors } from "../../hyrf/levels.js";
 import { parseManifest } from "../../hyrf/manifest.js";
 import { movePositions } from "../../hyrf/places.js";
 import { rowBalls } from "../../hyrf/row_states.js";
+import { DepthSort } from "../../hyrf/sort.js";
 import { viewpointOf } from "../../hyrf/viewpoint.js";
 import { cameraOf } from "../camera.js";
 import { packGaussians } from "../pack.js";
 import { modelScene } from "../scene.js";
 import { ABSENT, ChunkLevels, READY, UNUSABLE, UPLOADING } from "./chunk_levels.js";
 import { FileQueue } from "./file_queue.js";
+import { addLeftOut, chooseTargets } from "./level_choice.js";
 import { RowPool } from "./row_pool.js";
 import { ScenePart } from "./scene_part.js";
 
 const ROW_WIDTH = 256; // of the textures: each level begins a row, and the coarsest ones are small
 const FIRST_PICTURE_BYTES = 200_000; // that are fetched before the first picture is drawn, if they have a chunk
 const MEMORY_RATIO = 1.25; // memory for Gaussians in budgets, because levels that fade are there twice
-const EXTRA_ROWS_PER_CHUNK = 2; // for the coarsest level, and for rows that are not full
+// Rows beyond that memory: for each of so many chunks, one for its coarsest level and one for rows that are not full.
+const EXTRA_ROWS_PER_CHUNK = 2, MAX_EXTRA_CHUNKS = 256;
 // That wait to be evaluated. A slow device then evaluates what the present view needs, not all that earlier ones did.
 const MAX_UPLOADING_ROWS = 512;
 const MAX_FIRST_LOSSES = 3; // of the connection before the first picture; then what is there is drawn
@@ -74,19 +76,14 @@ export class SceneStream {
   // Reads the manifest and starts to fetch files.
   open() {
     const { manifest: text, address, maxRows } = this.request, manifest = parseManifest(text), { chunks } = manifest;
-    const extra = EXTRA_ROWS_PER_CHUNK * chunks.length;
-    this.manifest = manifest;
+    Object.assign(this, { manifest, extended: addLeftOut(manifest) });
     this.parts = manifest.parts.map((file, number) => new ScenePart(number, file));
     this.chunks = chunks.map((chunk, number) => new ChunkLevels(number, chunk, countRows));
     const files = [...manifest.parts, ...chunks.flatMap(({ levels }) => levels)];
     this.fileBytes = files.reduce((sum, file) => sum + file.bytes, 0);
-    this.costs = chunks.map(({ levels }) => levels.map(({ gaussians }) => gaussians));
     this.places = new Map(); // name of a file -> [number of the chunk, level]
     chunks.forEach(({ levels }, number) => levels.forEach(({ file }, level) => this.places.set(file, [number, level])));
-    const all = this.chunks.reduce((sum, { levels }) => levels.reduce((rows, { rowCount }) => rows + rowCount, sum), 0);
-    this.rowCount = Math.max(1, Math.min(all, maxRows, countRows(MEMORY_RATIO * this.gaussians) + extra));
-    // A device with small textures has a smaller budget.
-    this.maxGaussians = all <= this.rowCount ? Infinity : ((this.rowCount - extra) * ROW_WIDTH) / MEMORY_RATIO;
+    this.reserveRows(maxRows);
     this.view = { ticket: 0, camera: firstCamera(manifest) };
     this.queue = new FileQueue(new URL(".", address).href, {
       received: (file, bytes) => this.receive(file, bytes),
@@ -98,14 +95,28 @@ export class SceneStream {
     this.update();
   }
 
+  // Sets the number of rows of the textures, and what a view may have of Gaussians and of rows.
+  reserveRows(maxRows) {
+    const { chunks, gaussians } = this, extraChunks = Math.min(chunks.length, MAX_EXTRA_CHUNKS);
+    const all = chunks.reduce((sum, { levels }) => levels.reduce((rows, { rowCount }) => rows + rowCount, sum), 0);
+    const extra = EXTRA_ROWS_PER_CHUNK * extraChunks;
+    this.rowCount = Math.max(1, Math.min(all, maxRows, countRows(MEMORY_RATIO * gaussians) + extra));
+    this.isWhole = all <= this.rowCount; // whether the whole scene has room
+    const budgetRows = (this.rowCount - extra) / MEMORY_RATIO;
+    // A device with small textures has a smaller budget.
+    this.maxGaussians = this.isWhole ? Infinity : budgetRows * ROW_WIDTH;
+    // Few chunks have no more rows than this.
+    this.maxViewRows = this.isWhole || chunks.length <= MAX_EXTRA_CHUNKS ? Infinity : budgetRows + extraChunks;
+  }
+
   // Empties the memory for Gaussians.
   clear() {
     this.number++;
     this.isShown = false;
     this.pool = new RowPool(this.rowCount);
     this.positions = new Float32Array(3 * ROW_WIDTH * this.rowCount).fill(NaN); // which are not drawn
-    this.nearRatios = new Float32Array(this.rowCount).fill(1);
-    this.sorter.add(this.number, { positions: this.positions, nearRatios: this.nearRatios, width: ROW_WIDTH });
+    this.units = Array(this.rowCount).fill(1);
+    this.sorter.add(this.number, new DepthSort(this.positions, ROW_WIDTH, this.units));
     for (const chunk of this.chunks) chunk.clear();
     for (const part of this.parts) part.sent = null;
   }
@@ -150,26 +161,23 @@ export class SceneStream {
 
   // Chooses the level of each chunk that suits the view.
   chooseLevels() {
-    const { manifest, chunks, view: { camera } } = this, now = performance.now();
-    const isUsable = (number, level) => chunks[number].get(level).state !== UNUSABLE;
-    this.errors = predictErrors(manifest, camera);
-    const limit = Math.min(this.gaussians, this.maxGaussians);
-    chooseLevels(this.costs, this.errors, limit, isUsable).levels.forEach((level, number) => {
-      chunks[number].target = level;
-      if (level >= 0) chunks[number].get(level).usedAt = now;
-    });
+    const { extended, chunks, isWhole, view: { camera } } = this, now = performance.now();
+    const gaussians = Math.min(this.gaussians, this.maxGaussians), rows = this.maxViewRows;
+    this.errors = chooseTargets(extended, chunks, camera, { gaussians, rows, isWhole }); // at -1: left out
+    for (const chunk of chunks) if (chunk.target >= 0) chunk.get(chunk.target).usedAt = now;
     this.isOutdated = false;
     this.chosenTicket = this.view.ticket;
   }
 
-  // Fades a chunk to a level.
+  // Fades a chunk to a level, or to none.
   swap(chunk, level) {
     if (chunk.fading || level === chunk.shown) return;
-    const from = chunk.shown, { rows: to } = chunk.get(level), errors = this.errors[chunk.number];
-    chunk.fading = { from, to: level };
+    const { number, shown } = chunk, errors = this.errors[number];
+    const [from, to] = [shown, level].map((each) => chunk.get(each)?.rows ?? []);
+    chunk.fading = { from: shown, to: level };
     this.show(chunk, level);
-    const mse = (errors[from] ?? 0) + errors[level];
-    this.post({ swap: { number: this.number, chunk: chunk.number, from: chunk.get(from)?.rows ?? [], to, mse } });
+    const mse = (errors[shown] ?? 0) + errors.at(level);
+    this.post({ swap: { number: this.number, chunk: number, from, to, mse } });
   }
 
   endFade(chunk) {
@@ -181,7 +189,7 @@ export class SceneStream {
   // Adds a level to what is sorted.
   show(chunk, level) {
     chunk.shown = level;
-    this.setPositions(chunk.get(level), chunk.get(level).positions);
+    if (level >= 0) this.setPositions(chunk.get(level), chunk.get(level).positions);
   }
 
   // Sets the positions (3 N) of a level's Gaussians, or hides them if `positions` is null.
@@ -197,7 +205,8 @@ export class SceneStream {
 
   // Fetches what the first picture needs, and sends it once it is there.
   fetchFirst() {
-    const [scene] = this.parts, coarsest = this.chunks.map((chunk) => coarsestUsable(chunk)).filter(Boolean);
+    const [scene] = this.parts, needed = this.chunks.filter(({ target, isKept }) => target >= 0 || isKept);
+    const coarsest = needed.map((chunk) => coarsestUsable(chunk)).filter(Boolean);
     const rank = ({ chunk, level }) => this.errors[chunk.number][level.level];
     coarsest.sort((a, b) => rank(b) - rank(a));
     const counted = new Set([scene]);
@@ -257,7 +266,9 @@ export class SceneStream {
     this.isOpening = false;
     this.isShown = true;
     const described = modelScene({ ...source, count: manifest.gaussians }, manifest.title || name);
-    this.scene = { ...described, ...stage, exposure, isStreamed: true };
+    // Gaussians are projected from the nearest near plane of all parts on; the order omits those before their own.
+    const near = described.near * Math.min(1, ...parts.map((part) => part.place.scale)), sortNear = described.near;
+    this.scene = { ...described, ...stage, exposure, near, sortNear, isStreamed: true };
     if (rest.length) {
       const others = rest.map(({ number: part }) => parts.find((other) => other.part === part));
       const maps = others.map((part) => ({ exposure: part?.exposure ?? null, place: part?.place ?? place }));
@@ -288,14 +299,16 @@ export class SceneStream {
     return (part.sent ??= send());
   }
 
-  // Fetches the coarsest levels, and those that suit the view, as far as they fit into memory.
+  // Fetches the coarsest levels that are kept or begin a chunk, and those that suit the view, as far as they fit into
+  // memory.
   fetchWanted() {
     const wanted = [];
     for (const chunk of this.chunks) {
-      const { number, target, shown, coarsest } = chunk, errors = this.errors[number];
+      const { number, target, shown, coarsest, isKept } = chunk, errors = this.errors[number];
       const isWanted = (level) => chunk.get(level)?.state === ABSENT;
-      if (isWanted(coarsest)) wanted.push({ chunk, level: chunk.get(coarsest), isFirst: true, rate: errors[coarsest] });
-      if (target === coarsest || !isWanted(target)) continue;
+      const isFirst = isWanted(coarsest) && (isKept || (target >= 0 && shown < 0));
+      if (isFirst) wanted.push({ chunk, level: chunk.get(coarsest), isFirst, rate: errors[coarsest] });
+      if ((isFirst && target === coarsest) || !isWanted(target)) continue;
       const gain = errors[shown < 0 ? coarsest : shown] - errors[target], level = chunk.get(target);
       wanted.push({ chunk, level, isFirst: false, rate: gain / level.file.bytes });
     }
@@ -354,7 +367,7 @@ export class SceneStream {
     if (content !== this.number || level.state !== ABSENT) return; // meanwhile the device was lost
     const rows = this.takeRows(level.rowCount);
     if (!rows) return; // meanwhile memory has become short; it is fetched again if it still suits the view
-    for (const row of rows) this.nearRatios[row] = part.place.scale;
+    for (const row of rows) this.units[row] = part.place.scale;
     const packed = packGaussians(model, ROW_WIDTH);
     let { positions } = model;
     if (part.number) {
@@ -433,10 +446,9 @@ export class SceneStream {
     this.postedState = text;
   }
 
-  // Returns the predicted PSNR (dB) of the view against the finest levels, MAX_PSNR_DB for these; 0 while a chunk has
-  // no level yet.
+  // Returns the predicted PSNR (dB) of the view against the finest levels, MAX_PSNR_DB for these.
   predictPsnr() {
-    const errors = this.chunks.map(({ number, shown }) => this.errors[number][shown] ?? Infinity);
+    const errors = this.chunks.map(({ number, shown }) => this.errors[number].at(shown));
     const mse = errors.reduce((sum, error) => sum + error, 0);
     return Math.round(Math.min(MAX_PSNR_DB, Math.max(0, -10 * Math.log10(mse))));
   }

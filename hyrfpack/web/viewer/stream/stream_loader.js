@@ -65,7 +65,9 @@ class StreamLoader extends Loader {
   addPart(part) {
     if (part.number !== this.current) return; // of a content that was lost with the device
     const { exposure, place } = part;
-    this.player.scene.parts[part.part] = { exposure, place };
+    const { scene } = this.player;
+    scene.parts[part.part] = { exposure, place };
+    scene.near = Math.min(scene.near, place.scale * scene.sortNear);
     this.fields.addPart(part);
   }
 

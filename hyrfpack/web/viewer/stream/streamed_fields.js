@@ -33,7 +33,6 @@ export class StreamedFields extends Fields {
     this.rowParts = new Uint8Array(this.height); // number of the part of each row
     this.rowWeights = new Float32Array(2 * this.height); // and the number of its part
     this.usedHeight = 1; // rows from here on were never used
-    this.nearRatio = 1; // the depth of the nearest near plane of the parts, relative to that of the scene
     this.fades = new Map(); // number of a chunk -> the last `swap` of it, its `part`, and whether it `isSorted`
     this.fadedAt = 0; // when the fades last went on
     this.arrivals = []; // levels that are to be uploaded
@@ -94,7 +93,6 @@ export class StreamedFields extends Fields {
   addPart({ part, model, place }) {
     const fields = new PartFields(this.gl, model, place, this);
     this.degrees.set(part, model.residualDegree);
-    this.nearRatio = Math.min(this.nearRatio, place.scale);
     this.further.set(part, fields);
     this.ready.set(part, this.preparePart(part, fields));
   }
