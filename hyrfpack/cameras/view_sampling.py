@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
@@ -30,6 +32,50 @@ def sample_views(cameras: Sequence[Camera], count: int, seed: int = 0) -> tuple[
     count = min(count, len(cameras))
     indices = [(2 * part + 1) * len(cameras) // (2 * count) for part in range(count)]
     return [cameras[index] for index in indices], interpolate_views(cameras, seed, indices)
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Windows of pictures: each view shows one cell of a grid into which a whole picture is divided.
+
+    Attributes:
+        views: the windows.
+        columns, rows: the grid; 1 and 1 for whole pictures.
+    """
+
+    views: list[Camera]
+    columns: int
+    rows: int
+
+    @property
+    def pictures(self) -> float:
+        """Return the number of whole pictures that have as many pixels as all windows together."""
+        return len(self.views) / (self.columns * self.rows)
+
+
+def sample_windows(cameras: Sequence[Camera], count: int, cells: int, seed: int = 0) -> Windows:
+    """Select about `count` views, in turn at cameras and between them, and one window of each.
+
+    Each picture is divided into about `cells` windows of equal size. Each view shows another one, in random order, so
+    that together the views show all parts of a picture equally often.
+
+    Args:
+        count: number of views; at most two for each camera.
+        cells: number of windows of a picture; 1 for whole pictures. At most as many as there are views.
+        seed: random seed of the views between cameras, and of the order of windows.
+    """
+    at, between = sample_views(cameras, count // 2, seed)
+    views = [view for pair in zip(at, between, strict=True) for view in pair]
+    cells = max(1, min(cells, len(views)))
+    columns = round(cells**0.5)
+    rows = cells // columns
+    order = np.random.default_rng(seed).permutation(columns * rows)
+    windows = []
+    for number, view in enumerate(views):
+        turn = number // 2 + (number % 2) * (len(order) // 2)  # Both kinds of views show all cells.
+        grid = divide_view(view, columns, rows)
+        windows.append(grid[order[turn % len(order)] % len(grid)])
+    return Windows(windows, columns, rows)
 
 
 def interpolate_views(cameras: Sequence[Camera], seed: int = 0, indices: Sequence[int] | None = None) -> list[Camera]:
@@ -77,6 +123,23 @@ def shrink_camera(camera: Camera, max_side: int = MAX_SMALL_VIEW_SIDE_PIXELS) ->
     return dataclasses.replace(
         camera, width=width, height=height, fx=camera.fx * x, fy=camera.fy * y, cx=camera.cx * x, cy=camera.cy * y
     )
+
+
+def divide_view(camera: Camera, columns: int, rows: int) -> list[Camera]:
+    """Divide a camera's picture into a grid of windows, and return a camera for each window, row by row.
+
+    The pixels of the windows are those of the picture. A picture of fewer pixels has fewer columns or rows.
+    """
+    columns, rows = min(columns, camera.width), min(rows, camera.height)
+    lefts, tops = (
+        [place * side // count for place in range(count + 1)]
+        for side, count in ((camera.width, columns), (camera.height, rows))
+    )
+    return [
+        dataclasses.replace(camera, width=right - left, height=bottom - top, cx=camera.cx - left, cy=camera.cy - top)
+        for top, bottom in pairwise(tops)
+        for left, right in pairwise(lefts)
+    ]
 
 
 def _widen(camera: Camera) -> Camera:

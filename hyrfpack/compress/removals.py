@@ -9,7 +9,7 @@ import torch
 
 from hyrfpack.cameras.view_sampling import sample_views
 from hyrfpack.compress.sensitivity import (
-    choose_view_count,
+    choose_windows,
     combine_with_prior,
     expected_opacity_sensitivity,
     measure_sensitivity,
@@ -32,12 +32,13 @@ def measure_removals(
     """
     if not isinstance(model, MergedModel):
         return measure_sensitivity(model, cameras, seed, progress).removals
-    at, between = sample_views(cameras, choose_view_count(len(model)), seed)
+    windows = choose_windows(cameras, len(model), seed=seed)
+    views = windows.views
+    at, _ = sample_views(cameras, len(views) // 2, seed)
     logits = [part.gaussians.opacity_logits for part in model.parts]
     required = [values.requires_grad for values in logits]
     squares = [torch.zeros_like(values) for values in logits]
     generator, pixels = torch.Generator().manual_seed(seed), 0
-    views = [*at, *between]
     try:
         for values in logits:
             values.requires_grad_(True)
@@ -59,6 +60,6 @@ def measure_removals(
         measured = square[:, 0].double().numpy() / pixels
         geometry = part.decode_geometry()
         guess = expected_opacity_sensitivity(part, geometry, at)
-        sensitivity = combine_with_prior(part, measured, guess, len(views))
+        sensitivity = combine_with_prior(part, measured, guess, windows.pictures)
         removals.append(removal_error(geometry.opacities.detach().double().numpy(), sensitivity))
     return np.concatenate(removals)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from hyrfpack.cameras.view_sampling import sample_views
+from hyrfpack.cameras.view_sampling import Windows, sample_views, sample_windows
 from hyrfpack.format.arrays import SECTION_PARAMETERS
 from hyrfpack.format.sections import (
     COLORS,
@@ -24,11 +24,13 @@ from hyrfpack.model import Geometry, HybridModel, expand
 from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.progress import Progress, TaskEvent, ignore_progress
 from hyrfpack.render import render_view
+from hyrfpack.render.in_view import gaussians_in_view
 from hyrfpack.scene import Camera
 
-# The number of views is chosen so that about this many Gaussians are drawn in all views together.
+# The number of views is chosen so that about this many Gaussians are drawn in all views together. Of large models,
+# MIN_SENSITIVITY_VIEWS views show a window each, because in a few whole pictures many Gaussians would not be visible.
 TARGET_DRAWN_GAUSSIANS = 3_000_000
-MIN_SENSITIVITY_VIEWS = 6
+MIN_SENSITIVITY_VIEWS = 48
 MAX_SENSITIVITY_VIEWS = 96
 # Fields need fewer views than Gaussians, because each of their numbers affects many Gaussians in a view.
 FIELD_VIEW_SHARE = 1 / 2
@@ -112,7 +114,8 @@ def measure_sensitivity(
 
     Let v be a picture of random signs. The derivative of (picture . v) with respect to a number x is the sum of the
     pixels' derivatives with random signs. The expectation of its square is the sum of their squares (Hutchinson 1990).
-    One v is drawn for each view. Half of the views are at cameras and half between them.
+    One v is drawn for each view. Half of the views are at cameras and half between them. Of a large model, each view is
+    a window of a picture.
 
     A Gaussian may be visible in few of the measured views, or in none, and still be visible in others. So measurements
     are averaged with an estimate from size, opacity and position, which is scaled to match the measurements nearby.
@@ -127,52 +130,75 @@ def measure_sensitivity(
     Raises:
         HyrfError: a number of the model is NaN or infinite.
     """
-    at, between = sample_views(cameras, choose_view_count(len(model), drawn), seed)
-    views = [view for pair in zip(at, between, strict=True) for view in pair]
+    windows = choose_windows(cameras, len(model), drawn, seed)
+    views = windows.views
     field_interval = max(1, round(1 / FIELD_VIEW_SHARE))
     generator = torch.Generator().manual_seed(seed)
     squares = {name: torch.zeros_like(parameter) for name, parameter in model.named_parameters()}
+    squares |= {f"gaussians.{name}": torch.zeros_like(values) for name, values in _residuals(model).items()}
     jacobian = _cube_jacobian(model)
-    residuals = {name: values for name, values in model.gaussians.named_buffers() if name in Gaussians.RESIDUAL_NAMES}
-    squares |= {name: torch.zeros_like(values) for name, values in residuals.items()}
-    required = {name: parameter.requires_grad for name, parameter in model.named_parameters()}
+    fields = [*model.geometry.parameters(), *model.radiance.parameters()]
+    required = [parameter.requires_grad for parameter in fields]
     pixels, field_pixels = 0, 0
     for number, camera in enumerate(views):
         progress(TaskEvent(f"measuring sensitivities, view {number + 1}/{len(views)}", number / len(views)))
         # Views at and between cameras alternate, so both kinds are among the views of the fields.
         with_fields = number % (2 * field_interval) < 2
-        for name, parameter in model.named_parameters():
-            parameter.requires_grad_(with_fields or name.startswith("gaussians"))
+        for parameter in fields:
+            parameter.requires_grad_(with_fields)
             parameter.grad = None
-        for values in residuals.values():
+        index = _indices_in_view(model, camera)
+        shown = model.subset(index)
+        for values in _residuals(shown).values():
             values.requires_grad_(True)
-        rgb = render_view(model, camera).rgb
+        rgb = render_view(shown, camera).rgb
         signs = torch.randint(0, 2, rgb.shape, generator=generator).to(rgb) * 2 - 1
         if rgb.requires_grad:
             (rgb * signs).sum().backward()
         pixels += rgb.numel()
         field_pixels += rgb.numel() * with_fields
-        for name, parameter in model.named_parameters():
-            gradient = parameter.grad
+        for name, values in (*shown.named_parameters(), *shown.named_buffers()):
+            gradient = values.grad
             if gradient is None:
                 continue
             if name == "gaussians.positions":
-                gradient = (jacobian * gradient[:, :, None]).sum(1)
-            squares[name] += gradient.square()
-            parameter.grad = None
-        for name, values in residuals.items():
-            if values.grad is not None:
-                squares[name] += values.grad.square()
-            values.requires_grad_(False)
-            values.grad = None
-    for name, parameter in model.named_parameters():
-        parameter.requires_grad_(required[name])
-    return _combine(model, squares, pixels, field_pixels, at, jacobian)
+                gradient = (jacobian[index] * gradient[:, :, None]).sum(1)
+            if name.startswith("gaussians."):
+                squares[name][index] += gradient.square()
+            else:
+                squares[name] += gradient.square()
+    for parameter, needed in zip(fields, required, strict=True):
+        parameter.requires_grad_(needed)
+        parameter.grad = None
+    at, _ = sample_views(cameras, len(views) // 2, seed)
+    return _combine(model, squares, pixels, field_pixels, at, windows.pictures, jacobian)
 
 
-def choose_view_count(gaussians: int, drawn: int = TARGET_DRAWN_GAUSSIANS) -> int:
-    """Return the number of views at cameras, and between them, in which a model of so many Gaussians is measured."""
-    return int(np.clip(drawn // max(gaussians, 1), MIN_SENSITIVITY_VIEWS, MAX_SENSITIVITY_VIEWS)) // 2
+def _residuals(model: HybridModel) -> dict[str, torch.Tensor]:
+    """Return the residuals of a model's Gaussians by name."""
+    return {name: values for name, values in model.gaussians.named_buffers() if name in Gaussians.RESIDUAL_NAMES}
+
+
+def _indices_in_view(model: HybridModel, camera: Camera) -> torch.Tensor:
+    """Return the Gaussians that a camera shows; all of them if a position is not finite, which rendering reports."""
+    try:
+        return gaussians_in_view(model, camera)
+    except FloatingPointError:
+        return torch.arange(len(model), device=model.gaussians.positions.device)
+
+
+def choose_windows(
+    cameras: Sequence[Camera], gaussians: int, drawn: int = TARGET_DRAWN_GAUSSIANS, seed: int = 0
+) -> Windows:
+    """Choose the views in which a model of so many Gaussians is measured.
+
+    Args:
+        cameras, seed: as `sample_windows` takes them.
+        gaussians: number of Gaussians of the model.
+        drawn: about how many Gaussians are drawn in all views together.
+    """
+    count = int(np.clip(drawn // max(gaussians, 1), MIN_SENSITIVITY_VIEWS, MAX_SENSITIVITY_VIEWS))
+    return sample_windows(cameras, count, round(count * gaussians / drawn), seed)
 
 
 @torch.no_grad()
@@ -182,12 +208,12 @@ def _combine(
     pixels: int,
     field_pixels: int,
     cameras: Sequence[Camera],
+    views: float,
     jacobian: torch.Tensor,
 ) -> Sensitivity:
     """Average the accumulated squared gradients, combine them with the prior estimate, and apply lower bounds."""
     geometry = model.decode_geometry()
     expected = _expected_sensitivity(model, geometry, cameras, jacobian)
-    views = len(cameras) * 2
     explicit = []
     for name, guess in expected.items():
         measured = squares[f"gaussians.{name}"].double().mean(dim=1).cpu().numpy() / pixels
@@ -210,11 +236,11 @@ def _combine(
     removals = removal_error(geometry.opacities.double().cpu().numpy(), opacities)
     if model.gaussians.shape_residuals is None:
         return Sensitivity(positions, colors, scales, opacities, removals, fields)
-    measured = squares["shape_residuals"].double().cpu().numpy() / pixels
+    measured = squares["gaussians.shape_residuals"].double().cpu().numpy() / pixels
     guesses = _expected_shape_sensitivity(geometry, expected["scale_logits"])
     pairs = zip(measured.T, guesses.T, strict=True)
     shapes = np.stack([combine_with_prior(model, values, guess, views) for values, guess in pairs], axis=1)
-    measured = squares["color_residuals"].mean(dim=1).double().cpu().numpy() / pixels
+    measured = squares["gaussians.color_residuals"].mean(dim=1).double().cpu().numpy() / pixels
     harmonics = combine_with_prior(model, measured, expected["color_logits"], views)
     return Sensitivity(positions, colors, scales, opacities, removals, fields, shapes, harmonics)
 
@@ -230,7 +256,7 @@ def _expected_shape_sensitivity(geometry: Geometry, scale_sensitivity: np.ndarra
     return scale_sensitivity[:, None] * np.concatenate((np.ones((len(scales), 2)), turns), axis=1)
 
 
-def combine_with_prior(model: HybridModel, measured: np.ndarray, guess: np.ndarray, views: int) -> np.ndarray:
+def combine_with_prior(model: HybridModel, measured: np.ndarray, guess: np.ndarray, views: float) -> np.ndarray:
     """Average sensitivities (N,) measured in a number of views with estimates, which are known up to a factor.
 
     Few views give a noisy measurement, and a Gaussian that none of them shows may be visible in others.

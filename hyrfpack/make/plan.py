@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from hyrfpack.compress.sensitivity import MAX_SENSITIVITY_VIEWS, MIN_SENSITIVITY_VIEWS, TARGET_DRAWN_GAUSSIANS
+from hyrfpack.compress.sensitivity import MAX_SENSITIVITY_VIEWS, TARGET_DRAWN_GAUSSIANS
 from hyrfpack.config.imports import ImportConfig
 from hyrfpack.config.make import MakeConfig
 from hyrfpack.config.train import FULL_STEPS, DensityConfig, TrainConfig
@@ -140,8 +140,8 @@ class Plan:
 
 
 def count_packing_passes(gaussians: int) -> int:
-    """Return the number of views that packing renders and back-propagates through."""
-    return int(np.clip(TARGET_DRAWN_GAUSSIANS // max(gaussians, 1), MIN_SENSITIVITY_VIEWS, MAX_SENSITIVITY_VIEWS))
+    """Return the number of whole views that packing renders and back-propagates through."""
+    return int(np.clip(TARGET_DRAWN_GAUSSIANS // max(gaussians, 1), 1, MAX_SENSITIVITY_VIEWS))
 
 
 def mean_megapixels(scene: Scene) -> float:

@@ -46,8 +46,8 @@ def widen_to_photos(
     depths = gaussians.means.detach() @ row[:3] + row[3]
     footprint = depths / max(viewport.intrinsics[:2])
     added = SAMPLING_VARIANCE * (pixel_sizes.square() - footprint.square()).clamp_min(0)[:, None]
-    smallest = torch.finfo(added.dtype).tiny  # The gradient of hypot is NaN where both arguments are zero.
-    scales = torch.hypot(gaussians.scales, added.sqrt().clamp_min(smallest))
+    smallest = torch.finfo(added.dtype).tiny  # The gradient of a square root is infinite at zero.
+    scales = (gaussians.scales.square() + added).clamp_min(smallest).sqrt()
     opacities = gaussians.opacities
     if antialiased:
         ratios = gaussians.scales / scales

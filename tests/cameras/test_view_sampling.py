@@ -2,15 +2,19 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scenes import ring
+import torch
+from scenes import ball_points, ring, small_model
 
 from hyrfpack.cameras.view_sampling import (
     INTERPOLATED_VIEW_SIZE_RATIO,
     MAX_SMALL_VIEW_SIDE_PIXELS,
+    divide_view,
     interpolate_views,
     sample_views,
+    sample_windows,
     shrink_camera,
 )
+from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.scene import Camera
 
 RING_CAMERAS = ring(48, elevation=1.2, width=16, height=16)
@@ -68,3 +72,46 @@ def test_large_cameras_are_reduced_with_the_same_field_of_view():
     assert (small.width, small.height) == (MAX_SMALL_VIEW_SIDE_PIXELS, MAX_SMALL_VIEW_SIDE_PIXELS * 3 // 4)
     assert np.allclose(np.array(small.intrinsics) * 4000 / MAX_SMALL_VIEW_SIDE_PIXELS, large.intrinsics)
     assert shrink_camera(small) == small
+
+
+@pytest.mark.parametrize(("columns", "rows"), [(3, 2), (1, 1), (1, 5)])
+def test_windows_of_a_view_show_its_picture(columns, rows):
+    camera = ring(8, width=41, height=30)[0]
+    model = small_model(ball_points(300)[0], fields=0.3, scale_logits=-5.0)
+    settings = RenderSettings(
+        cull_tolerance=float("inf"), background_stride=1, background_threshold=0, transmittance_min=0
+    )
+
+    windows = [render_view(model, window, settings).rgb for window in divide_view(camera, columns, rows)]
+
+    bands = [torch.cat(windows[row * columns : (row + 1) * columns], 1) for row in range(rows)]
+    torch.testing.assert_close(torch.cat(bands), render_view(model, camera, settings).rgb, rtol=0, atol=1e-5)
+
+
+def test_a_picture_of_few_pixels_has_no_empty_windows():
+    windows = divide_view(ring(8, width=2, height=1)[0], 3, 4)
+
+    assert [(window.width, window.height) for window in windows] == [(1, 1), (1, 1)]
+
+
+def test_sampled_windows_show_all_parts_of_a_picture_equally_often():
+    cameras = ring(24, width=60, height=40)
+
+    windows = sample_windows(cameras, 24, 6, seed=1)
+
+    assert (windows.columns, windows.rows, windows.pictures) == (2, 3, 4.0)
+    at, between = windows.views[::2], windows.views[1::2]
+    assert all(any(view.position == pytest.approx(camera.position) for camera in cameras) for view in at)
+    assert {(view.width, view.height) for view in at} == {(30, 13), (30, 14)}
+    assert {round(view.width / 1.4) for view in between} == {30}
+    for views in (at, between):
+        places = [(round(view.cx / view.width, 1), round(view.cy / view.height, 1)) for view in views]
+        assert sorted(places.count(place) for place in set(places)) == [2] * 6
+
+
+@pytest.mark.parametrize(("count", "cells"), [(6, 1), (2, 1), (6, 100)])
+def test_windows_are_whole_pictures_or_at_most_as_many_as_views(count, cells):
+    windows = sample_windows(RING_CAMERAS, count, cells)
+
+    assert len(windows.views) == count
+    assert windows.columns * windows.rows <= count

@@ -8,7 +8,7 @@ import torch
 from scenes import ball_points, ring, small_model
 
 from hyrfpack.cameras.view_sampling import interpolate_views
-from hyrfpack.compress.sensitivity import Sensitivity, combine_with_prior, measure_sensitivity
+from hyrfpack.compress.sensitivity import Sensitivity, choose_windows, combine_with_prior, measure_sensitivity
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import decode_model, encode_model
 from hyrfpack.format.arrays import SECTION_PARAMETERS
@@ -30,6 +30,26 @@ def ball_model() -> HybridModel:
 @pytest.fixture(scope="module")
 def measured() -> Sensitivity:
     return measure_sensitivity(ball_model(), RING_CAMERAS)
+
+
+def test_large_models_are_measured_in_windows_of_many_views():
+    cameras = ring(85, width=400, height=266)
+
+    small, large = choose_windows(cameras, 30_000), choose_windows(cameras, 1_000_000)
+
+    assert (len(small.views), small.pictures) == (96, 96)
+    assert (len(large.views), large.pictures) == (48, 3)
+    assert all(view.width <= 140 for view in large.views)
+
+
+def test_sensitivities_in_windows_agree_with_those_in_whole_pictures(measured):
+    model = ball_model()
+
+    windows = measure_sensitivity(model, RING_CAMERAS, drawn=8 * len(model))
+
+    for name in ("colors", "scales", "opacities"):
+        ratios = getattr(windows, name) / getattr(measured, name)
+        assert 1 / 2 < np.median(ratios) < 2 and (ratios > 1 / 8).all() and (ratios < 8).all()
 
 
 def add_interpolated_views(cameras: list[Camera]) -> list[Camera]:
