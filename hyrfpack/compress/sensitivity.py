@@ -131,25 +131,25 @@ def measure_sensitivity(
         HyrfError: a number of the model is NaN or infinite.
     """
     windows = choose_windows(cameras, len(model), drawn, seed)
-    views = windows.views
+    views, are_pictures = windows.views, windows.columns * windows.rows == 1
     field_interval = max(1, round(1 / FIELD_VIEW_SHARE))
     generator = torch.Generator().manual_seed(seed)
     squares = {name: torch.zeros_like(parameter) for name, parameter in model.named_parameters()}
     squares |= {f"gaussians.{name}": torch.zeros_like(values) for name, values in _residuals(model).items()}
     jacobian = _cube_jacobian(model)
-    fields = [*model.geometry.parameters(), *model.radiance.parameters()]
-    required = [parameter.requires_grad for parameter in fields]
+    required = {name: parameter.requires_grad for name, parameter in model.named_parameters()}
     pixels, field_pixels = 0, 0
     for number, camera in enumerate(views):
         progress(TaskEvent(f"measuring sensitivities, view {number + 1}/{len(views)}", number / len(views)))
         # Views at and between cameras alternate, so both kinds are among the views of the fields.
         with_fields = number % (2 * field_interval) < 2
-        for parameter in fields:
-            parameter.requires_grad_(with_fields)
-            parameter.grad = None
-        index = _indices_in_view(model, camera)
-        shown = model.subset(index)
-        for values in _residuals(shown).values():
+        for name, parameter in model.named_parameters():
+            parameter.requires_grad_(with_fields or name.startswith("gaussians."))
+        # A window renders only the Gaussians that it can show, so that gradients of the others take no memory.
+        index = slice(None) if are_pictures else _indices_in_view(model, camera)
+        shown = model if are_pictures else model.subset(index)
+        residuals = _residuals(shown)
+        for values in residuals.values():
             values.requires_grad_(True)
         rgb = render_view(shown, camera).rgb
         signs = torch.randint(0, 2, rgb.shape, generator=generator).to(rgb) * 2 - 1
@@ -159,6 +159,7 @@ def measure_sensitivity(
         field_pixels += rgb.numel() * with_fields
         for name, values in (*shown.named_parameters(), *shown.named_buffers()):
             gradient = values.grad
+            values.grad = None
             if gradient is None:
                 continue
             if name == "gaussians.positions":
@@ -167,9 +168,10 @@ def measure_sensitivity(
                 squares[name][index] += gradient.square()
             else:
                 squares[name] += gradient.square()
-    for parameter, needed in zip(fields, required, strict=True):
-        parameter.requires_grad_(needed)
-        parameter.grad = None
+        for values in residuals.values():
+            values.requires_grad_(False)
+    for name, parameter in model.named_parameters():
+        parameter.requires_grad_(required[name])
     at, _ = sample_views(cameras, len(views) // 2, seed)
     return _combine(model, squares, pixels, field_pixels, at, windows.pictures, jacobian)
 

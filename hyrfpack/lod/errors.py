@@ -62,8 +62,8 @@ def measure_level_errors(
     pool = _Pool.of(levels, fields or levels[0][:1], parts or [0] * len(spheres))
     shape, rng = (len(levels), len(spheres), len(ERROR_RADII)), np.random.default_rng(seed)
     sums, areas = np.zeros(shape), np.zeros(shape[1:])
-    shares = itertools.cycle(RESOLUTION_SHARES)
-    views = [resize_camera(camera, share) for camera in cameras for share in next(shares)]
+    turns = zip(cameras, itertools.cycle(RESOLUTION_SHARES))
+    views = [resize_camera(camera, share) for camera, shares in turns for share in shares]
     for number, camera in enumerate(views):
         progress(TaskEvent(f"measuring levels, view {number + 1}/{len(views)}", number / len(views)))
         in_half = rng.permutation(len(spheres)) % 2 == 0

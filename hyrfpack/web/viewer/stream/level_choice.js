@@ -18,9 +18,9 @@ export function addLeftOut(manifest) {
   return { ...manifest, chunks: manifest.chunks.map(add) };
 }
 
-// Sets the `target` of each of `chunks`, -1 for those that are left out, and whether its coarsest level `isKept`: of all
-// chunks if memory holds the whole scene (`isWhole`). `manifest` is from `addLeftOut`, and `rows` the most rows of the
-// chosen levels, or Infinity. Returns the predicted errors of the view by chunk and level.
+// Sets the `target` of each of `chunks`, -1 for those that are left out, and whether its coarsest level `isKept`: of
+// all chunks if memory holds the whole scene (`isWhole`). `manifest` is from `addLeftOut`, and `rows` the most rows of
+// the chosen levels, or Infinity. Returns the predicted errors of the view by chunk and level.
 export function chooseTargets(manifest, chunks, camera, { gaussians, rows, isWhole }) {
   const errors = predictErrors(manifest, camera);
   const costOf = ({ file, rowCount }) => Math.max(file.gaussians, (rowCount / rows) * gaussians);
