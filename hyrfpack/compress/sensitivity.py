@@ -146,8 +146,11 @@ def measure_sensitivity(
         for name, parameter in model.named_parameters():
             parameter.requires_grad_(with_fields or name.startswith("gaussians."))
         # A window renders only the Gaussians that it can show, so that gradients of the others take no memory.
-        index = slice(None) if are_pictures else _indices_in_view(model, camera)
-        shown = model if are_pictures else model.subset(index)
+        index: slice | torch.Tensor = slice(None)
+        shown = model
+        if not are_pictures:
+            index = _indices_in_view(model, camera)
+            shown = model.subset(index)
         residuals = _residuals(shown)
         for values in residuals.values():
             values.requires_grad_(True)
