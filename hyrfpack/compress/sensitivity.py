@@ -28,7 +28,7 @@ from hyrfpack.render.in_view import gaussians_in_view
 from hyrfpack.scene import Camera
 
 # The number of views is chosen so that about this many Gaussians are drawn in all views together. Of large models,
-# MIN_SENSITIVITY_VIEWS views show a window each, because in a few whole pictures many Gaussians would not be visible.
+# MIN_SENSITIVITY_VIEWS views show one window each, because few whole pictures would leave out many Gaussians.
 TARGET_DRAWN_GAUSSIANS = 3_000_000
 MIN_SENSITIVITY_VIEWS = 48
 MAX_SENSITIVITY_VIEWS = 96
@@ -145,6 +145,7 @@ def measure_sensitivity(
         with_fields = number % (2 * field_interval) < 2
         for name, parameter in model.named_parameters():
             parameter.requires_grad_(with_fields or name.startswith("gaussians."))
+            parameter.grad = None
         # A window renders only the Gaussians that it can show, so that gradients of the others take no memory.
         index: slice | torch.Tensor = slice(None)
         shown = model
@@ -161,8 +162,7 @@ def measure_sensitivity(
         pixels += rgb.numel()
         field_pixels += rgb.numel() * with_fields
         for name, values in (*shown.named_parameters(), *shown.named_buffers()):
-            gradient = values.grad
-            values.grad = None
+            gradient, values.grad = values.grad, None
             if gradient is None:
                 continue
             if name == "gaussians.positions":

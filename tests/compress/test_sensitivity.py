@@ -52,6 +52,20 @@ def test_sensitivities_in_windows_agree_with_those_in_whole_pictures(measured):
         assert 1 / 2 < np.median(ratios) < 2 and (ratios > 1 / 8).all() and (ratios < 8).all()
 
 
+@pytest.mark.parametrize("drawn", [None, 160])
+def test_gradients_from_before_are_not_measured(drawn):
+    model, settings = ball_model(), {} if drawn is None else {"drawn": drawn}
+    expected = measure_sensitivity(model, RING_CAMERAS[:8], **settings)
+    model.requires_grad_(True)
+    for parameter in model.parameters():
+        parameter.grad = torch.full_like(parameter, 1e3)
+
+    measured = measure_sensitivity(model, RING_CAMERAS[:8], **settings)
+
+    np.testing.assert_allclose(measured.colors, expected.colors, rtol=1e-3)
+    np.testing.assert_allclose(measured.fields["RTAB"], expected.fields["RTAB"], rtol=1e-3)
+
+
 def add_interpolated_views(cameras: list[Camera]) -> list[Camera]:
     return [*cameras, *interpolate_views(cameras)]
 
