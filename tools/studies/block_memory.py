@@ -30,12 +30,12 @@ from hyrfpack.scene import Scene, evenly_spaced
 from tools.scenes.layout_city import BLOCKS_PER_SIDE, PITCH_METRES
 from tools.tables import markdown_table
 
-STEPS = 2
+TRAINING_STEPS = 2
 MAX_SIDE_PIXELS = 160
 CACHE_BYTES = 32 << 20
 JITTER_METRES = 0.3
 TILE_METRES = 1.5 * BLOCKS_PER_SIDE * PITCH_METRES
-HEADER = ("tiles", "blocks", "Gaussians of the largest block", "scene loaded", "peak of training", "peak of all")
+TABLE_COLUMNS = ("tiles", "blocks", "Gaussians of the largest block", "scene loaded", "peak of training", "peak of all")
 
 
 def thin(scene: Scene, photos: int, points: int, rng: np.random.Generator) -> Scene:
@@ -85,7 +85,7 @@ def measure(folder: Path, tiles: int, blocks: int, photos: int, points: int) -> 
         return merge_blocks(*arguments, **more)
 
     blocks_run.merge_blocks = merge
-    config = hyrfpack.TrainConfig(steps=STEPS, max_gaussians=len(scene.points), exposure=False)
+    config = hyrfpack.TrainConfig(steps=TRAINING_STEPS, max_gaussians=len(scene.points), exposure=False)
     context = hyrfpack.RunContext(progress=None, cache=PictureCache(CACHE_BYTES))
     with tempfile.TemporaryDirectory() as out:
         hyrfpack.train_blocks(scene, out, config, f"{blocks}x1", context=context)
@@ -117,7 +117,7 @@ def main() -> None:
             memory = [f"{row[name]:,.0f}" for name in ("loaded", "trained", "peak")]
             rows.append([str(tiles), str(blocks), f"{row['largest']:,}", *memory])
             print(rows[-1], flush=True)
-    print(markdown_table(HEADER, rows))
+    print(markdown_table(TABLE_COLUMNS, rows))
 
 
 if __name__ == "__main__":

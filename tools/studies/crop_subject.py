@@ -29,7 +29,16 @@ from tools.studies.trained_runs import load_runs, make_runs_parser
 from tools.tables import markdown_table
 
 MIN_PIXELS = 200  # Views that show less of the subject are left out.
-HEADER = ("set", "radius", "Gaussians", "bytes", "PSNR, SSIM", "Gaussians after", "bytes after", "PSNR, SSIM after")
+TABLE_COLUMNS = (
+    "set",
+    "radius",
+    "Gaussians",
+    "bytes",
+    "PSNR, SSIM",
+    "Gaussians after",
+    "bytes after",
+    "PSNR, SSIM after",
+)
 QUIET = hyrfpack.RunContext(progress=None)
 
 
@@ -100,7 +109,7 @@ def main() -> None:
     for name, model_file, scene in load_runs(arguments.runs, arguments.data, list(shares)):
         rows.append([name, f"{shares[name]:g}", *measure(model_file, scene, shares[name])])
         print(rows[-1], flush=True)
-    print(markdown_table(HEADER, rows))
+    print(markdown_table(TABLE_COLUMNS, rows))
 
 
 if __name__ == "__main__":

@@ -55,7 +55,7 @@ RECORD_SCRIPT = """(() => {
   };
   look();
 })()"""
-HEADER = (
+TABLE_COLUMNS = (
     *("scene", "Gaussians", "first s", "first bytes", "bytes after the walk", "most drawn", "most in memory"),
     *("PSNR", "frame ms", "textures MB", "browser MB"),
 )
@@ -148,7 +148,7 @@ def main() -> None:
             found = walk(page.as_uri(), stored_cameras(file, arguments.stops), arguments.rest)
             rows.append(make_row(file.name, len(hyrfpack.load_merged_model(file)), page.stat().st_size, found))
         print(rows[-1], flush=True)
-    print(markdown_table(HEADER, rows))
+    print(markdown_table(TABLE_COLUMNS, rows))
 
 
 if __name__ == "__main__":
