@@ -164,12 +164,12 @@ class SceneFolder:
             _LOG.warning(f"{self.path / extra[0]}{more}: not in the manifest and ignored")
 
     def load(
-        self, levels: Sequence[int] | None = None, device: str | torch.device = "cpu"
+        self, levels: Sequence[int | None] | None = None, device: str | torch.device = "cpu"
     ) -> HybridModel | MergedModel:
         """Return a model of all chunks; a merged model if the scene has several parts.
 
         Args:
-            levels: level of each chunk, 0 for the finest; None for the finest of all.
+            levels: level of each chunk, 0 for the finest and None to leave it out; None for the finest of all.
             device: device of the parameters, see `hyrfpack.device.choose_device`.
 
         Raises:
@@ -179,18 +179,24 @@ class SceneFolder:
         from hyrfpack.model.merged import parts_of
 
         chosen = [0] * len(self.manifest.chunks) if levels is None else levels
-        model = self.join([self.load_chunk(number, level) for number, level in enumerate(chosen)])
+        chunks = [None if level is None else self.load_chunk(number, level) for number, level in enumerate(chosen)]
+        model = self.join(chunks)
         device = choose_device(device)
         for part in parts_of(model):
             part.to(device)
         return model
 
-    def join(self, chunks: Sequence[HybridModel]) -> HybridModel | MergedModel:
-        """Return a model of all chunks, given the model of each at any level; a merged model of several parts."""
+    def join(self, chunks: Sequence[HybridModel | None]) -> HybridModel | MergedModel:
+        """Return a model of all chunks, given the model of each at any level; a merged model of several parts.
+
+        A chunk without a model is left out.
+        """
         from hyrfpack.format.scene_model import join_parts
 
         names = [part.name for part in self.manifest.parts]
-        return join_parts(names, self.fields, chunks, [chunk.part for chunk in self.manifest.chunks])
+        numbers = [chunk.part for chunk in self.manifest.chunks]
+        given = [(chunk, part) for chunk, part in zip(chunks, numbers, strict=True) if chunk is not None]
+        return join_parts(names, self.fields, [chunk for chunk, _ in given], [part for _, part in given])
 
     @cached_property
     def fields(self) -> list[HybridModel]:

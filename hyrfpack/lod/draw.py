@@ -7,6 +7,7 @@ from collections import OrderedDict
 import torch
 
 from hyrfpack.config.render import GeometryConfig
+from hyrfpack.errors import HyrfError
 from hyrfpack.format.scene_folder import SceneFolder
 from hyrfpack.lod.select import LevelSelection, select_levels
 from hyrfpack.model import HybridModel
@@ -37,6 +38,22 @@ class LevelRenderer:
         device: str | torch.device = "cpu",
         precision: str = "mixed",
     ) -> None:
+        """Check the limits of each view, see `select_levels`.
+
+        Raises:
+            HyrfError: a view within the limit could have no Gaussian.
+        """
+        manifest = scene.manifest
+        smallest = [min(chunk.levels, key=lambda level: level.gaussians) for chunk in manifest.chunks]
+        if bytes is None:
+            unit, given, least = "Gaussians", gaussians, min((level.gaussians for level in smallest), default=0)
+        else:
+            unit, given = "bytes", bytes
+            least = manifest.shared_bytes + min((level.bytes for level in smallest), default=0)
+        if given is not None and given < least:
+            raise HyrfError(
+                f"{scene.path}: no chunk can be drawn within {given:,} {unit}", fix=f"allow at least {least:,} {unit}"
+            )
         self.scene, self.gaussians, self.bytes = scene, gaussians, bytes
         self.choices: list[LevelSelection] = []
         self._device, self._precision = device, precision
@@ -50,7 +67,8 @@ class LevelRenderer:
         """
         choice = select_levels(self.scene.manifest, camera, gaussians=self.gaussians, bytes=self.bytes)
         self.choices.append(choice)
-        model = self.scene.join([self._chunk(*key) for key in enumerate(choice.levels)])
+        chunks = [None if level is None else self._chunk(number, level) for number, level in enumerate(choice.levels)]
+        model = self.scene.join(chunks)
         for part in parts_of(model):
             part.to(self._device)
             part.precision = self._precision

@@ -11,20 +11,27 @@ import numpy as np
 from hyrfpack.format.scene_manifest import Manifest
 from hyrfpack.scene import Camera
 
+# The error of a view without a chunk, relative to that with its coarsest level, and the least error of the pixels that
+# the chunk covers (docs/research/levels.md).
+LEFT_OUT_RATIO = 3.0
+MIN_LEFT_OUT_MSE = 0.003
+# A chunk outside the picture has its coarsest level where the budget allows, because what it covers is an estimate.
+UNSEEN_MSE = 1e-12
+
 
 @dataclass(frozen=True)
 class LevelSelection:
     """Levels of detail chosen for a view.
 
     Attributes:
-        levels: level of each chunk, 0 for the finest.
+        levels: level of each chunk, 0 for the finest; None for a chunk that is left out.
         gaussians: number of Gaussians of these levels.
         bytes: size of their files and of the shared files.
         predicted_mse: predicted mean squared error of the view against the finest levels.
         max_gap: bound on how much lower the error of the best choice within the budget can be; 0 if all upgrades fit.
     """
 
-    levels: list[int]
+    levels: list[int | None]
     gaussians: int
     bytes: int
     predicted_mse: float
@@ -36,8 +43,8 @@ def select_levels(
 ) -> LevelSelection:
     """Choose a level for each chunk, with the least predicted error of a view within a budget.
 
-    Every chunk starts at its cheapest level. Then the upgrades along the lower convex hull of each chunk's costs and
-    errors are taken by falling gain of error for their cost, as long as they fit (a greedy knapsack). The error exceeds
+    Every chunk is left out at first. Then the upgrades along the lower convex hull of each chunk's costs and errors
+    are taken by falling gain of error for their cost, as long as they fit (a greedy knapsack). The error exceeds
     that of the best choice by less than the gain of the first upgrade that does not fit, `max_gap`: with a fraction of
     this upgrade, the choice before it would be the optimum of the linear relaxation, which bounds all choices.
 
@@ -45,8 +52,7 @@ def select_levels(
         manifest: the manifest of a scene folder.
         camera: the view, in world units.
         gaussians: the most Gaussians; None for no limit.
-        bytes: the most bytes of files; None for no limit. Only one of both limits may be given. If not even the
-            cheapest levels fit, these are chosen.
+        bytes: the most bytes of files, with the shared files; None for no limit. Only one of both limits may be given.
 
     Raises:
         ValueError: both limits are given.
@@ -65,15 +71,16 @@ def select_levels(
     given = gaussians if bytes is None else bytes
     limit = math.inf if given is None else given
     base = manifest.shared_bytes if count_bytes else 0
-    costs = [[x.bytes if count_bytes else x.gaussians for x in chunk.levels] for chunk in manifest.chunks]
-    errors = predict_errors(manifest, camera)
-    levels, max_gap = choose_levels(costs, errors, limit - base)
-    chosen = [chunk.levels[level] for chunk, level in zip(manifest.chunks, levels, strict=True)]
+    costs = [[*(x.bytes if count_bytes else x.gaussians for x in chunk.levels), 0] for chunk in manifest.chunks]
+    errors = [[*own, left_out + UNSEEN_MSE] for *own, left_out in predict_errors(manifest, camera)]
+    chosen, max_gap = choose_levels(costs, errors, limit - base)
+    levels = [level if level < len(x.levels) else None for x, level in zip(manifest.chunks, chosen, strict=True)]
+    files = [x.levels[level] for x, level in zip(manifest.chunks, levels, strict=True) if level is not None]
     return LevelSelection(
         levels,
-        sum(item.gaussians for item in chosen),
-        manifest.shared_bytes + sum(item.bytes for item in chosen),
-        sum(each[level] for each, level in zip(errors, levels, strict=True)),
+        sum(file.gaussians for file in files),
+        manifest.shared_bytes + sum(file.bytes for file in files),
+        sum(each[level] for each, level in zip(errors, chosen, strict=True)),
         max_gap,
     )
 
@@ -127,14 +134,14 @@ def _lower_hull(costs: Sequence[float], errors: Sequence[float]) -> list[int]:
 
 
 def predict_errors(manifest: Manifest, camera: Camera) -> list[list[float]]:
-    """Predict the mean squared error that each level of each chunk adds to a view."""
+    """Predict the mean squared error that each level of each chunk adds to a view, and last that of leaving it out."""
     pixels = camera.width * camera.height
     result = []
     for chunk in manifest.chunks:
         radius, area = project_sphere(chunk.center, chunk.radius, camera)
-        result.append(
-            [area / pixels * _interpolate(manifest.error_radii, level.errors, radius) for level in chunk.levels]
-        )
+        errors = [_interpolate(manifest.error_radii, level.errors, radius) for level in chunk.levels]
+        errors.append(max(LEFT_OUT_RATIO * errors[-1], MIN_LEFT_OUT_MSE))
+        result.append([area / pixels * error for error in errors])
     return result
 
 

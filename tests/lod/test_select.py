@@ -63,7 +63,19 @@ def test_a_nearer_chunk_is_refined_first_and_one_behind_the_camera_never():
     assert choice.levels == [1, 0, 1]
     assert (choice.gaussians, choice.bytes) == (150, 50 + 300 + 900 + 300)
     assert select_levels(manifest, camera).levels == [0, 0, 1]
-    assert select_levels(manifest, camera, bytes=50 + 3 * 300 + 599).levels == [1, 1, 1]
+    assert select_levels(manifest, camera, bytes=50 + 3 * 300 + 599).levels == [1, 0, None]
+
+
+def test_what_a_view_shows_least_is_left_out_where_not_even_coarsest_levels_fit():
+    camera = camera_at((0, -10, 0), width=100, height=100, focal=100)
+    manifest = make_manifest((0, 20, 0), (0, -4, 0), (0, -20, 0))
+
+    assert select_levels(manifest, camera, gaussians=50).levels == [1, 1, None]
+    assert select_levels(manifest, camera, gaussians=49).levels == [None, 1, None]
+    assert select_levels(manifest, camera, gaussians=75).levels == [1, 1, 1]
+    nothing = select_levels(manifest, camera, bytes=0)
+    assert (nothing.levels, nothing.gaussians, nothing.bytes) == ([None] * 3, 0, 50)
+    assert nothing.predicted_mse > select_levels(manifest, camera, gaussians=49).predicted_mse > 0
 
 
 def test_a_sphere_projects_as_seen_by_a_pinhole_camera():
@@ -81,10 +93,12 @@ def test_errors_are_interpolated_in_the_logarithm_of_the_radius():
     camera = camera_at((0, -math.sqrt(3) / 2, 0), width=200, height=200, focal=100)
     manifest = make_manifest((0, 0, 0))
 
-    ((finest, coarse),) = predict_errors(manifest, camera)  # radius 100 is half-way between 10 and 1000, all in view
+    # The radius 100 is half-way between 10 and 1000, and all is in view.
+    ((finest, coarse, left_out),) = predict_errors(manifest, camera)
 
     assert finest == 0
     assert coarse == pytest.approx(0.005)
+    assert left_out == pytest.approx(3 * coarse)
 
 
 def test_two_limits_exclude_each_other():

@@ -176,6 +176,30 @@ def test_a_view_with_a_budget_draws_no_more_gaussians(folder, cameras):
     assert set(choice.levels) == {0, 1}
 
 
+def test_a_budget_below_the_coarsest_levels_leaves_chunks_out(folder, cameras):
+    scene = SceneFolder(folder)
+    counts = [chunk.levels[-1].gaussians for chunk in scene.manifest.chunks]
+    renderer = LevelRenderer(scene, gaussians=sum(counts) // 2)
+
+    model, choice = renderer.load(cameras[0])
+
+    assert 0 < len(model) == choice.gaussians <= sum(counts) // 2
+    assert None in choice.levels
+    nothing = render_view(scene.load([None] * len(counts)), cameras[0])
+    assert np.isfinite(nothing.rgb.numpy()).all() and not nothing.alpha.any()
+
+
+@pytest.mark.parametrize("limit", ["gaussians", "bytes"])
+def test_a_budget_that_shows_nothing_is_refused(folder, limit):
+    scene = SceneFolder(folder)
+    least = min(getattr(chunk.levels[-1], limit) for chunk in scene.manifest.chunks)
+    least += scene.manifest.shared_bytes if limit == "bytes" else 0
+
+    LevelRenderer(scene, **{limit: least})
+    with pytest.raises(HyrfError, match=f"no chunk can be drawn within {least - 1:,} .*allow at least {least:,}"):
+        LevelRenderer(scene, **{limit: least - 1})
+
+
 def test_a_zip_of_the_folder_is_read_like_the_folder(folder, tmp_path):
     archive = shutil.make_archive(str(tmp_path / "scene"), "zip", folder.parent, folder.name)
 

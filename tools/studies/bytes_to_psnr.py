@@ -88,7 +88,7 @@ class FolderScene(Streamed):
         ]
 
     def predict(self, camera: Camera) -> list[list[float]]:
-        return predict_errors(self.manifest, camera)
+        return [errors[:-1] for errors in predict_errors(self.manifest, camera)]
 
     def render(self, levels: Sequence[int], camera: Camera) -> torch.Tensor:
         model = self.folder.join([chunk[level] for chunk, level in zip(self.chunks, levels, strict=True)])

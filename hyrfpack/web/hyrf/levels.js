@@ -3,21 +3,21 @@
 
 import { sharedBytes } from "./manifest.js";
 import { dot, sub } from "./vectors.js";
+import { cameraPosition } from "./viewpoint.js";
 
 /**
  * @typedef {import("./manifest.js").Manifest} Manifest
  * @typedef {import("./viewpoint.js").Camera} Camera
  *
- * Levels for a view: `levels` has the level of each chunk, 0 for the finest, or -1 for a chunk without a level;
- * `gaussians` is their number of Gaussians, `bytes` the size of their files and of the shared files. `predictedMse` is
- * the predicted mean squared error of the view against the finest levels. `maxGap` bounds how much lower the error of
- * the best choice can be.
+ * Levels for a view: `levels` has the level of each chunk, 0 for the finest, or -1 if it is left out. `bytes` are those
+ * of their files and of the shared files, `predictedMse` the mean squared error of the view against the finest levels.
+ * `maxGap` bounds how much lower the error of the best choice can be.
  * @typedef {{levels: number[], gaussians: number, bytes: number, predictedMse: number, maxGap: number}} LevelSelection
- *
- * A step from a level of an item to a better one on its hull; `rate` is the gain of error for its cost.
- * @typedef {{item: number, from: number, to: number, cost: number, gain: number, rate: number}} Upgrade
  */
 
+const LEFT_OUT_RATIO = 3; // of the errors of a view without a chunk and with its coarsest level
+const MIN_LEFT_OUT_MSE = 0.003; // of the pixels that a missing chunk covers
+const UNSEEN_MSE = 1e-12; // of missing chunks outside the picture, as what they cover is an estimate
 const MIN_RADIUS = 1e-30;
 const MIN_DEPTH_RATIO = 1e-3; // of the distance; nearer centres would project beyond all bounds
 
@@ -26,22 +26,26 @@ const MIN_DEPTH_RATIO = 1e-3; // of the distance; nearer centres would project b
  * @param {Manifest} manifest
  * @param {Camera} camera the view, in world units
  * @param {{gaussians?: number, bytes?: number, isAvailable?: (chunk: number, level: number) => boolean}} [options]
- *   `gaussians`: the most Gaussians, or `bytes`: the most bytes of files; if not even the cheapest levels fit, these
- *   are chosen. Levels that are not available are left out.
+ *   `gaussians`: the most Gaussians, or `bytes`: the most bytes of files, with the shared files. Levels that are not
+ *   available are not chosen.
  * @returns {LevelSelection}
  */
 export const selectLevels = (manifest, camera, { gaussians, bytes, isAvailable = () => true } = {}) => {
   const { chunks } = manifest, shared = sharedBytes(manifest), errors = predictErrors(manifest, camera);
   const cost = bytes === undefined ? "gaussians" : "bytes";
-  const costs = chunks.map((chunk) => chunk.levels.map((level) => level[cost]));
+  const costs = chunks.map(({ levels }) => [...levels.map((level) => level[cost]), 0]);
   const limit = bytes === undefined ? (gaussians ?? Infinity) : bytes - shared;
-  const { levels, maxGap } = chooseLevels(costs, errors, limit, isAvailable);
+  for (const own of errors) own[own.length - 1] += UNSEEN_MSE;
+  const { levels, maxGap } = chooseLevels(costs, errors, limit, (chunk, level) => {
+    return level === chunks[chunk].levels.length || isAvailable(chunk, level);
+  });
   const selection = { levels, gaussians: 0, bytes: shared, predictedMse: 0, maxGap };
   levels.forEach((level, chunk) => {
-    if (level < 0) return;
-    selection.gaussians += chunks[chunk].levels[level].gaussians;
-    selection.bytes += chunks[chunk].levels[level].bytes;
     selection.predictedMse += errors[chunk][level];
+    const file = chunks[chunk].levels[level];
+    if (!file) return void (levels[chunk] = -1);
+    selection.gaussians += file.gaussians;
+    selection.bytes += file.bytes;
   });
   return selection;
 };
@@ -59,16 +63,17 @@ export const chooseLevels = (costs, errors, limit, isAvailable) => {
   const levels = hulls.map(([first = -1]) => first);
   let spent = levels.reduce((sum, level, item) => sum + (level < 0 ? 0 : costs[item][level]), 0);
   if (spent > limit) return { levels, maxGap: 0 };
-  /** @type {Upgrade[]} */
+  /** @type {{item: number, to: number, cost: number, gain: number}[]} to a better level on the hull of an item */
   const upgrades = [];
   hulls.forEach((hull, item) => {
     for (let place = 1; place < hull.length; place++) {
       const [from, to] = [hull[place - 1], hull[place]];
       const gain = errors[item][from] - errors[item][to], cost = costs[item][to] - costs[item][from];
-      upgrades.push({ item, from, to, cost, gain, rate: gain / cost });
+      upgrades.push({ item, to, cost, gain });
     }
   });
-  upgrades.sort((a, b) => b.rate - a.rate || a.item - b.item); // the sort is stable, so places stay in order
+  // The sort is stable, so places stay in order.
+  upgrades.sort((a, b) => b.gain / b.cost - a.gain / a.cost || a.item - b.item);
   let maxGap = 0;
   const full = new Set();
   for (const { item, to, cost, gain } of upgrades) {
@@ -108,27 +113,22 @@ const lowerHull = (costs, errors, isAvailable) => {
 };
 
 /**
- * Predicts the mean squared error that each level of each chunk adds to a view.
+ * Predicts the mean squared error that each level of each chunk adds to a view, and last that of leaving it out.
  * @param {Manifest} manifest
  * @param {Camera} camera
- * @returns {number[][]} by chunk and level
+ * @returns {number[][]} by chunk and level, with one more than there are levels
  */
 export const predictErrors = ({ chunks, error_radii }, camera) => {
-  const pixels = camera.width * camera.height, position = eyeOf(camera), logRadii = error_radii.map(Math.log);
+  const pixels = camera.width * camera.height, position = cameraPosition(camera), logRadii = error_radii.map(Math.log);
   return chunks.map(({ low, high, levels }) => {
     const center = low.map((value, axis) => (value + high[axis]) / 2), radius = Math.hypot(...sub(high, low)) / 2;
     const projected = projectSphere(center, radius, camera, position);
     const logRadius = Math.log(Math.max(projected.radius, MIN_RADIUS)), share = projected.area / pixels;
-    return levels.map(({ errors }) => share * interpolate(logRadii, errors, logRadius));
+    const errors = levels.map((level) => interpolate(logRadii, level.errors, logRadius));
+    errors.push(Math.max(LEFT_OUT_RATIO * errors[errors.length - 1], MIN_LEFT_OUT_MSE));
+    return errors.map((error) => share * error);
   });
 };
-
-/**
- * Returns the position of a camera in world units.
- * @param {Camera} camera
- */
-const eyeOf = ({ camera_from_world: pose }) =>
-  [0, 1, 2].map((axis) => -(pose[0][axis] * pose[0][3] + pose[1][axis] * pose[1][3] + pose[2][axis] * pose[2][3]));
 
 /**
  * Returns the radius in pixels of a sphere's projection, and its area within the picture in square pixels.

@@ -7,21 +7,13 @@ export type LevelSelection = {
     predictedMse: number;
     maxGap: number;
 };
-export type Upgrade = {
-    item: number;
-    from: number;
-    to: number;
-    cost: number;
-    gain: number;
-    rate: number;
-};
 /**
  * Chooses a level for each chunk, with the least predicted error of a view within a budget: a greedy knapsack.
  * @param {Manifest} manifest
  * @param {Camera} camera the view, in world units
  * @param {{gaussians?: number, bytes?: number, isAvailable?: (chunk: number, level: number) => boolean}} [options]
- *   `gaussians`: the most Gaussians, or `bytes`: the most bytes of files; if not even the cheapest levels fit, these
- *   are chosen. Levels that are not available are left out.
+ *   `gaussians`: the most Gaussians, or `bytes`: the most bytes of files, with the shared files. Levels that are not
+ *   available are not chosen.
  * @returns {LevelSelection}
  */
 export declare const selectLevels: (manifest: Manifest, camera: Camera, { gaussians, bytes, isAvailable }?: {
@@ -42,9 +34,9 @@ export declare const chooseLevels: (costs: number[][], errors: number[][], limit
     maxGap: number;
 };
 /**
- * Predicts the mean squared error that each level of each chunk adds to a view.
+ * Predicts the mean squared error that each level of each chunk adds to a view, and last that of leaving it out.
  * @param {Manifest} manifest
  * @param {Camera} camera
- * @returns {number[][]} by chunk and level
+ * @returns {number[][]} by chunk and level, with one more than there are levels
  */
 export declare const predictErrors: ({ chunks, error_radii }: Manifest, camera: Camera) => number[][];

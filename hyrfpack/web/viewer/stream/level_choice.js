@@ -7,20 +7,10 @@ import { dot, sub } from "../../hyrf/vectors.js";
 import { UNUSABLE } from "./chunk_levels.js";
 
 const KEPT_RATIO = 1 / 4; // of the budget, for the coarsest levels of the nearest chunks
-// The error of a view without a chunk, relative to that with its coarsest level, and the least error of the pixels that
-// the chunk covers, for chunks of one level (docs/research/levels.md).
-const LEFT_OUT_RATIO = 3, MIN_LEFT_OUT_MSE = 0.003;
-
-// Returns a manifest in which each chunk has another level after the coarsest one: to be left out.
-export function addLeftOut(manifest) {
-  const leftOut = ({ errors }) => errors.map((error) => Math.max(LEFT_OUT_RATIO * error, MIN_LEFT_OUT_MSE));
-  const add = ({ levels, ...chunk }) => ({ ...chunk, levels: [...levels, { errors: leftOut(levels.at(-1)) }] });
-  return { ...manifest, chunks: manifest.chunks.map(add) };
-}
 
 // Sets the `target` of each of `chunks`, -1 for those that are left out, and whether its coarsest level `isKept`: of
-// all chunks if memory holds the whole scene (`isWhole`). `manifest` is from `addLeftOut`, and `rows` the most rows of
-// the chosen levels, or Infinity. Returns the predicted errors of the view by chunk and level.
+// all chunks if memory holds the whole scene (`isWhole`). `rows` is the most rows of the chosen levels, or Infinity.
+// Returns the predicted errors of the view by chunk and level, and last without the chunk.
 export function chooseTargets(manifest, chunks, camera, { gaussians, rows, isWhole }) {
   const errors = predictErrors(manifest, camera);
   const costOf = ({ file, rowCount }) => Math.max(file.gaussians, (rowCount / rows) * gaussians);

@@ -33,7 +33,7 @@ import { packGaussians } from "../pack.js";
 import { modelScene } from "../scene.js";
 import { ABSENT, ChunkLevels, READY, UNUSABLE, UPLOADING } from "./chunk_levels.js";
 import { FileQueue } from "./file_queue.js";
-import { addLeftOut, chooseTargets } from "./level_choice.js";
+import { chooseTargets } from "./level_choice.js";
 import { RowPool } from "./row_pool.js";
 import { ScenePart } from "./scene_part.js";
 
@@ -76,7 +76,7 @@ export class SceneStream {
   // Reads the manifest and starts to fetch files.
   open() {
     const { manifest: text, address, maxRows } = this.request, manifest = parseManifest(text), { chunks } = manifest;
-    Object.assign(this, { manifest, extended: addLeftOut(manifest) });
+    this.manifest = manifest;
     this.parts = manifest.parts.map((file, number) => new ScenePart(number, file));
     this.chunks = chunks.map((chunk, number) => new ChunkLevels(number, chunk, countRows));
     const files = [...manifest.parts, ...chunks.flatMap(({ levels }) => levels)];
@@ -161,9 +161,9 @@ export class SceneStream {
 
   // Chooses the level of each chunk that suits the view.
   chooseLevels() {
-    const { extended, chunks, isWhole, view: { camera } } = this, now = performance.now();
+    const { manifest, chunks, isWhole, view: { camera } } = this, now = performance.now();
     const gaussians = Math.min(this.gaussians, this.maxGaussians), rows = this.maxViewRows;
-    this.errors = chooseTargets(extended, chunks, camera, { gaussians, rows, isWhole }); // at -1: left out
+    this.errors = chooseTargets(manifest, chunks, camera, { gaussians, rows, isWhole }); // at -1: left out
     for (const chunk of chunks) if (chunk.target >= 0) chunk.get(chunk.target).usedAt = now;
     this.isOutdated = false;
     this.chosenTicket = this.view.ticket;
