@@ -1,4 +1,4 @@
-"""Speed-ups of Triton's interpreter, which takes three times as long without them, and new memory full of NaN."""
+"""Speed-ups of Triton's interpreter, which takes many times as long without them, and new memory full of NaN."""
 
 from __future__ import annotations
 
@@ -51,6 +51,8 @@ def speed_up_interpreter() -> None:
 
     interpreter._patch_lang, interpreter.GridExecutor.__call__ = patch_new, launch_once
     _cache_types()
+    _cache_operands()
+    _skip_unused_overflow_checks()
 
 
 def _specialize_arguments(executor: Any, args: tuple, kwargs: dict[str, Any]) -> None:
@@ -78,9 +80,9 @@ def _cache_types() -> None:
 
         interpreter._get_np_dtype = numpy_type
     if _has_parameters(tl.tensor.__init__, "self", "handle", "type"):
-        _cache_init(tl.tensor, lambda handle, type: type.name, "handle")
+        _cache_tensor_init()
     if _has_parameters(tl.block_type.__init__, "self", "element_ty", "shape"):
-        _cache_init(tl.block_type, _block_name)
+        _cache_block_type_init()
     if _has_parameters(TritonSemantic.broadcast_impl_value, "self", "lhs", "rhs"):
         broadcast = TritonSemantic.broadcast_impl_value
 
@@ -94,29 +96,91 @@ def _has_parameters(function: Callable, *names: str) -> bool:
     return list(inspect.signature(function).parameters) == list(names)
 
 
-def _block_name(element_ty: Any, shape: Any) -> tuple:
-    return element_ty.name, *[getattr(size, "value", size) for size in shape]
+def _cache_tensor_init() -> None:
+    """Cache the attributes that the constructor of tensors derives from the type. They are never modified."""
+    derive, found = tl.tensor.__init__, {}
 
-
-def _cache_init(kind: type, name: Callable[[Any, Any], Any], own: str | None = None) -> None:
-    """Cache the attributes that a class's constructor derives, by the name that `name` returns.
-
-    The cached attributes are never modified. `own` names the attribute that holds the first argument.
-    """
-    whole, made = kind.__init__, {}
-
-    def init(self: Any, first: Any, second: Any) -> None:
-        called = name(first, second)
-        known = made.get(called)
+    def init(self: Any, handle: Any, type: Any) -> None:
+        known = found.get(type.name)
         if known is None:
-            whole(self, first, second)
-            made[called] = {key: value for key, value in vars(self).items() if key != own}
-            return
-        vars(self).update(known)
-        if own is not None:
-            vars(self)[own] = first
+            derive(self, handle, type)
+            found[type.name] = {key: value for key, value in vars(self).items() if key != "handle"}
+        else:
+            self.__dict__.update(known)
+            self.handle = handle
 
-    kind.__init__ = init
+    tl.tensor.__init__ = init
+
+
+def _cache_block_type_init() -> None:
+    """Cache the attributes of block types. They are never modified."""
+    derive, found = tl.block_type.__init__, {}
+
+    def init(self: Any, element_ty: Any, shape: Any) -> None:
+        key = element_ty.name, *[getattr(size, "value", size) for size in shape]
+        known = found.get(key)
+        if known is None:
+            derive(self, element_ty, shape)
+            found[key] = dict(vars(self))
+        else:
+            self.__dict__.update(known)
+
+    tl.block_type.__init__ = init
+
+
+def _cache_operands() -> None:
+    """Cache how the types of two operands are made equal, which takes longer than the operation itself.
+
+    Two tensors of types that need no conversion are returned as they are. A number beside a tensor that is not
+    converted becomes the same constant each time; constants are never modified.
+    """
+    if not hasattr(TritonSemantic, "binary_op_type_checking_impl"):
+        return
+    convert, equal, constants = TritonSemantic.binary_op_type_checking_impl, set(), {}
+
+    def converted(self: Any, lhs: Any, rhs: Any, *rules: Any, **named_rules: Any) -> Any:
+        if named_rules:
+            return convert(self, lhs, rhs, *rules, **named_rules)
+        if type(lhs) is tl.tensor and type(rhs) is tl.tensor:
+            key = lhs.type.name, rhs.type.name, rules
+            if key in equal:
+                return lhs, rhs
+            left, right = convert(self, lhs, rhs, *rules)
+            if left is lhs and right is rhs:
+                equal.add(key)
+            return left, right
+        if type(lhs) is tl.tensor and type(rhs) in (int, float):
+            key = lhs.type.name, type(rhs), rhs, True, rules
+            if key in constants:
+                return lhs, constants[key]
+            left, right = convert(self, lhs, rhs, *rules)
+            if left is lhs:
+                constants[key] = right
+            return left, right
+        if type(lhs) in (int, float) and type(rhs) is tl.tensor:
+            key = rhs.type.name, type(lhs), lhs, False, rules
+            if key in constants:
+                return constants[key], rhs
+            left, right = convert(self, lhs, rhs, *rules)
+            if right is rhs:
+                constants[key] = left
+            return left, right
+        return convert(self, lhs, rhs, *rules)
+
+    TritonSemantic.binary_op_type_checking_impl = converted
+
+
+def _skip_unused_overflow_checks() -> None:
+    """Skip the repetition of each operation on integers in int64, the result of which only debug mode reads."""
+    check = getattr(TritonSemantic, "binary_op_sanitize_overflow_impl", None)
+    if check is None:
+        return
+
+    def check_in_debug_mode(self: Any, lhs: Any, rhs: Any, binary_op: Any) -> None:
+        if self.builder.options.debug:
+            check(self, lhs, rhs, binary_op)
+
+    TritonSemantic.binary_op_sanitize_overflow_impl = check_in_debug_mode
 
 
 # Modules that allocate memory for GPU kernels: those of the operations, and the fake GPU on their behalf.
