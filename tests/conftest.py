@@ -41,6 +41,11 @@ if os.environ["TRITON_INTERPRET"] == "1" and find_spec("triton"):
     speed_up_interpreter()
     fill_new_memory_with_nan()
 
+if "PYTEST_XDIST_WORKER" in os.environ:
+    from shared_kernels import compile_kernels_once
+
+    compile_kernels_once()
+
 from layers import forbid_training_and_processes, layer_of
 from ops.device import needs_triton  # this import asks for Triton, which reads the environment set above
 
