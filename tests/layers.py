@@ -16,13 +16,14 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from functools import cache
 from pathlib import Path
 from unittest.mock import patch
 
 import pytest
 
 LAYERS = ("unit", "integration", "acceptance")
-BROWSER_FIXTURES = {"browser", "one_browser", "start_browser"}
+BROWSER_FIXTURES = {"browser", "browser_reader", "one_browser", "start_browser"}
 TESTS_FOLDER = Path(__file__).parent
 LAYER_BY_PATH = {
     "": "integration",
@@ -73,8 +74,13 @@ def layer_of(item: pytest.Item) -> str:
             return mark.name
     if BROWSER_FIXTURES & set(getattr(item, "fixturenames", ())):
         return "acceptance"
-    path = item.path.relative_to(TESTS_FOLDER).as_posix()
-    return LAYER_BY_PATH[max((prefix for prefix in LAYER_BY_PATH if path.startswith(prefix)), key=len)]
+    return _layer_of_file(item.path)
+
+
+@cache
+def _layer_of_file(path: Path) -> str:
+    name = path.relative_to(TESTS_FOLDER).as_posix()
+    return LAYER_BY_PATH[max((prefix for prefix in LAYER_BY_PATH if name.startswith(prefix)), key=len)]
 
 
 @contextmanager

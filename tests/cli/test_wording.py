@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -21,13 +22,14 @@ LIBRARY_FOLDER = Path(PACKAGE_FILE).parent
 
 def message_strings(module: Path) -> Iterator[str]:
     """Yield the strings of a module that are not docstrings, and each constant part of f-strings."""
-    tree = ast.parse(module.read_text(encoding="utf-8"))
-    docstrings = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
-    for node in ast.walk(tree):
+    nodes = list(ast.walk(ast.parse(module.read_text(encoding="utf-8"))))
+    docstrings = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
+    for node in nodes:
         if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docstrings:
             yield node.value
 
 
+@cache
 def library_strings() -> list[tuple[str, str]]:
     modules = [(path.relative_to(LIBRARY_FOLDER).as_posix(), path) for path in sorted(LIBRARY_FOLDER.rglob("*.py"))]
     return [(name, text) for name, path in modules if not name.startswith("cli/") for text in message_strings(path)]

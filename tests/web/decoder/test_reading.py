@@ -109,7 +109,7 @@ def test_golden_files_decode_to_the_recorded_numbers(file):
 def test_random_configurations_decode_to_the_same_numbers():
     files = {}
     for seed in range(12):
-        model = random_model(seed, (0, 1, 2, 7, 300, 1500)[seed % 6])
+        model = random_model(seed, (0, 1, 2, 7, 150, 400)[seed % 6])
         for profile in ("raw", "paper", "compact"):
             files[f"{profile} {seed}"] = encode(model, profile)
         files[f"layers {seed}"] = encode(model, "compact", distortion=1e-6, prune=False, layered=True)
@@ -565,11 +565,12 @@ def test_missing_layers_of_a_truncated_file_may_declare_any_size():
     assert check_readers_agree({"whole": data}) == ([], ["whole"])
 
 
-def test_hostile_files_get_the_same_verdict():
-    tally = compare(range(100_000, 100_800), seed=3)
+@pytest.mark.parametrize("count", [200, pytest.param(800, marks=pytest.mark.acceptance)])
+def test_hostile_files_get_the_same_verdict(count):
+    tally = compare(range(100_000, 100_000 + count), seed=3)
 
     assert not tally.failures
-    assert set(tally.kinds) == set(INPUT_KINDS) and tally.accepted.total() > 20
+    assert set(tally.kinds) == set(INPUT_KINDS) and tally.accepted.total() > count / 40
 
 
 @pytest.mark.parametrize("name", SMALL_HOSTILE_FILES)

@@ -54,7 +54,7 @@ class BrowserReader:
 
 
 @pytest.fixture(scope="module")
-def reader(tmp_path_factory: pytest.TempPathFactory) -> Iterator[BrowserReader]:
+def browser_reader(tmp_path_factory: pytest.TempPathFactory) -> Iterator[BrowserReader]:
     if find() is None:
         pytest.skip("there is no Chromium on this machine")
     folder = tmp_path_factory.mktemp("files")
@@ -81,31 +81,31 @@ SPLATS_BY_CASE = {
 
 
 @pytest.mark.parametrize("name", SPLATS_BY_CASE)
-def test_sog_is_read_as_in_python(reader: BrowserReader, name: str) -> None:
+def test_sog_is_read_as_in_python(browser_reader: BrowserReader, name: str) -> None:
     data = sog.encode(SPLATS_BY_CASE[name])
-    answer = reader.read("a.sog", data)
+    answer = browser_reader.read("a.sog", data)
     assert isinstance(answer, PageSplats), answer
     answer.assert_equal(sog.decode(data, "a.sog"))
 
 
-def test_a_file_of_playcanvas_is_read_as_in_python(reader: BrowserReader, shared_data: Path) -> None:
+def test_a_file_of_playcanvas_is_read_as_in_python(browser_reader: BrowserReader, shared_data: Path) -> None:
     folder = shared_data / "trained_models" / "playbot_lod3_sog"
     if not folder.is_dir():
         pytest.skip(f"{folder} is not there")
     data = make_zip({file.name: file.read_bytes() for file in folder.iterdir()}, zipfile.ZIP_DEFLATED)
-    answer = reader.read("playbot.sog", data)
+    answer = browser_reader.read("playbot.sog", data)
     assert isinstance(answer, PageSplats), answer
     answer.assert_equal(sog.decode(data, "playbot.sog"))
 
 
-def test_colors_of_transparent_pixels_are_kept_in_webp_and_png(reader: BrowserReader) -> None:
+def test_colors_of_transparent_pixels_are_kept_in_webp_and_png(browser_reader: BrowserReader) -> None:
     files = hand_packed_bundle(antialias=True)
     pixel = Image.fromarray(np.array([[[1, 254, 3, 0]]], np.uint8))
     for kind, more in (("WEBP", {"lossless": True, "exact": True}), ("PNG", {})):
         file = io.BytesIO()
         pixel.save(file, kind, **more)
         data = make_zip({**files, "sh0.webp": file.getvalue()})
-        answer = reader.read("a.sog", data)
+        answer = browser_reader.read("a.sog", data)
         assert isinstance(answer, PageSplats), answer
         answer.assert_equal(sog.decode(data, "a.sog"))
 
@@ -155,13 +155,13 @@ INVALID_FILES = {
 
 
 @pytest.mark.parametrize("name", INVALID_FILES)
-def test_files_that_python_refuses_are_refused(reader: BrowserReader, name: str) -> None:
+def test_files_that_python_refuses_are_refused(browser_reader: BrowserReader, name: str) -> None:
     data = INVALID_FILES[name]
     try:
         expected: Splats | None = sog.decode(data, "a.sog")
     except HyrfDataError:
         expected = None
-    answer = reader.read("a.sog", data)
+    answer = browser_reader.read("a.sog", data)
     if expected is None:
         assert isinstance(answer, str)
     else:
@@ -169,12 +169,12 @@ def test_files_that_python_refuses_are_refused(reader: BrowserReader, name: str)
         answer.assert_equal(expected)
 
 
-def test_spz_4_is_read_where_the_browser_supports_zstd(reader: BrowserReader, shared_data: Path) -> None:
-    has_zstd = reader.browser.evaluate(
+def test_spz_4_is_read_where_the_browser_supports_zstd(browser_reader: BrowserReader, shared_data: Path) -> None:
+    has_zstd = browser_reader.browser.evaluate(
         "(() => { try { return !!new DecompressionStream('zstd'); } catch { return false; } })()"
     )
     data = FORMATS[".spz"].encode(random_splats(200, 3), Hints(spz_version=4))
-    answer = reader.read("a.spz", data)
+    answer = browser_reader.read("a.spz", data)
     if has_zstd:
         assert isinstance(answer, PageSplats), answer
         answer.assert_equal(FORMATS[".spz"].decode(data, "a.spz"))

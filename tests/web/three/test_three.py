@@ -160,6 +160,7 @@ def field_settings() -> dict[str, Any]:
     return {"frame": Frame(tuple(MODEL_CENTER), MODEL_SCALE, (1.0, 1.0, 1.0)), "fields": 0.5, "background": True}
 
 
+@pytest.mark.acceptance
 @pytest.mark.skipif(find() is None, reason="there is no Chromium on this machine")
 def test_the_example_page_shows_the_rendered_picture(app_folder: Path, tmp_path: Path) -> None:
     save_model(make_model(), app_folder / "scene.hyrf")
