@@ -40,6 +40,25 @@ def listen_to_gpu(listener: Listener) -> Iterator[None]:
         _listeners.remove(listener)
 
 
+TransferListener = Callable[[str, int], None]
+_transfer_listeners: list[TransferListener] = []
+
+
+@contextmanager
+def listen_to_transfers(listener: TransferListener) -> Iterator[None]:
+    """Call the listener with the direction, "to host" or "to device", and the number of elements of each transfer."""
+    _transfer_listeners.append(listener)
+    try:
+        yield
+    finally:
+        _transfer_listeners.remove(listener)
+
+
+def _report_transfer(direction: str, elements: int) -> None:
+    for listener in _transfer_listeners:
+        listener(direction, elements)
+
+
 def _report_work(name: str, *kinds: str) -> None:
     for listener in _listeners:
         for kind in kinds:
@@ -68,7 +87,9 @@ class FakeGpuTensor(torch.Tensor):
 
     def new_tensor(self, *args: Any, **kwargs: Any) -> FakeGpuTensor:
         _report_work("new_tensor", "copy", "wait")
-        return FakeGpuTensor(self.cpu_tensor.new_tensor(*args, **kwargs))
+        made = FakeGpuTensor(self.cpu_tensor.new_tensor(*args, **kwargs))
+        _report_transfer("to device", made.numel())
+        return made
 
     def numpy(self, *_: Any, **__: Any) -> None:
         raise TypeError("can't convert cuda:0 device type tensor to numpy")
@@ -84,6 +105,7 @@ class FakeGpuTensor(torch.Tensor):
 
     def tolist(self) -> Any:
         _report_work("tolist", "wait")
+        _report_transfer("to host", self.numel())
         return self.cpu_tensor.tolist()
 
     @classmethod
@@ -96,6 +118,10 @@ class FakeGpuTensor(torch.Tensor):
                 raise RuntimeError(f"{func}: expected all tensors to be on the same device, found cuda:0 and cpu")
         if _listeners:
             _report_work(func.overloadpacket.__name__, *_work_kinds(func, args, kwargs))
+        if func is aten._local_scalar_dense.default:
+            _report_transfer("to host", 1)
+        if func is aten.copy_.default and isinstance(args[0], FakeGpuTensor) != isinstance(args[1], FakeGpuTensor):
+            _report_transfer("to device" if isinstance(args[0], FakeGpuTensor) else "to host", args[1].numel())
         if func is aten.copy_.default and not isinstance(args[0], FakeGpuTensor):
             if len(args) > 2 and args[2]:
                 FakeEvent.copies.append((args[0], args[1].cpu_tensor.clone()))
@@ -199,6 +225,7 @@ def _wrap_factory(factory: Callable) -> Callable:
             return factory(*args, **kwargs)
         if factory.__name__ in ("as_tensor", "tensor"):
             _report_work(factory.__name__, "copy", "wait")
+            _report_transfer("to device", factory(*tree_map(_unwrap, args)).numel())
         elif not factory.__name__.startswith("empty"):
             _report_work(factory.__name__, "launch")
         return FakeGpuTensor(factory(*tree_map(_unwrap, args), **{**kwargs, "device": "cpu"}))
@@ -216,6 +243,7 @@ def _move(tensor: torch.Tensor, *args: Any, **kwargs: Any) -> torch.Tensor:
         blocks = isinstance(tensor, FakeGpuTensor) or not kwargs.get("non_blocking")
         kinds = [] if isinstance(tensor, FakeGpuTensor) else ["copy"]
         _report_work(f"to {place.type}", *kinds, *["wait"] * blocks)
+        _report_transfer("to host" if isinstance(tensor, FakeGpuTensor) else "to device", tensor.numel())
         tensor = (_ToCpu if isinstance(tensor, FakeGpuTensor) else _ToGpu).apply(tensor)
     return _original_to(tensor, dtypes[0]) if dtypes else tensor
 
@@ -228,6 +256,7 @@ class _ToGpu(torch.autograd.Function):
     @staticmethod
     def backward(ctx, grad):
         _report_work("to cpu", "wait")
+        _report_transfer("to host", grad.numel())
         return grad.cpu_tensor
 
 
@@ -239,6 +268,7 @@ class _ToCpu(torch.autograd.Function):
     @staticmethod
     def backward(ctx, grad):
         _report_work("to cuda", "copy", "wait")
+        _report_transfer("to device", grad.numel())
         return FakeGpuTensor(grad)
 
 

@@ -50,10 +50,7 @@ def quantize_channel(
             the rate.
         weight: weight of the prediction in sixteenths; None for the best of PREDICTION_WEIGHTS_SIXTEENTHS.
     """
-    kinds = int(classes.max(initial=0)) + 1
-    members = np.bincount(classes, minlength=kinds)
-    mean_sensitivity = np.bincount(classes, sensitivity, kinds) / np.maximum(members, 1)
-    codes = np.maximum(choose_step_codes(np.where(members > 0, mean_sensitivity, 1), distortion), MIN_STEP_CODE)
+    codes = choose_channel_codes(classes, sensitivity, distortion)
     steps = decode_step(codes)[classes]
     values = np.clip(values, -MAX_ABS_CHANNEL_VALUE, MAX_ABS_CHANNEL_VALUE)
     mean = np.float32(np.average(values, weights=1 / steps)) if len(values) else np.float32(0)
@@ -63,7 +60,7 @@ def quantize_channel(
     nearest = _nearest_chooser(target, steps)
     residuals, decoded = lift(len(target), weight, steps, nearest)
     if reach:
-        bits = estimate_code_bits(residuals, classes, kinds, reach)
+        bits = estimate_code_bits(residuals, classes, len(codes), reach)
 
         def added_error(places: np.ndarray, candidates: np.ndarray) -> np.ndarray:
             if error is not None:
@@ -87,6 +84,13 @@ def quantize_channel(
         if total(*chosen) < total(residuals, decoded):
             residuals, decoded = chosen
     return Channel(mean, weight, codes, residuals, decoded / FIXED_POINT_ONE + float(mean))
+
+
+def choose_channel_codes(classes: np.ndarray, sensitivity: np.ndarray, distortion: float) -> np.ndarray:
+    """Choose the step code (K,) uint8 of each class of a channel; arguments are those of `quantize_channel`."""
+    members = np.bincount(classes, minlength=int(classes.max(initial=0)) + 1)
+    mean = np.bincount(classes, sensitivity, len(members)) / np.maximum(members, 1)
+    return np.maximum(choose_step_codes(np.where(members > 0, mean, 1), distortion), MIN_STEP_CODE)
 
 
 def requantize_channel(

@@ -5,35 +5,36 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from contextlib import closing
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from hyrfpack.compress.plan import replan_moved, snap_to_lattice
-from hyrfpack.compress.quantize import quantize
+from hyrfpack.compress.plan import replan_moved
 from hyrfpack.compress.rate_distortion import LAMBDA_PER_DISTORTION
 from hyrfpack.compress.sensitivity import Sensitivity
+from hyrfpack.compress.training_quantizer import TrainingQuantizer, parameters_replaced
 from hyrfpack.config.train import LearningRates
 from hyrfpack.data import PictureCache
 from hyrfpack.device import Photos, upload
 from hyrfpack.errors import HyrfError, HyrfTrainingError
 from hyrfpack.evaluate.exposure import fit_gains
-from hyrfpack.format.arrays import iter_parameters
-from hyrfpack.format.compact.plan import Plan, lattice_to_local
-from hyrfpack.format.compact.quantized import QuantizedModel
-from hyrfpack.format.sections import COLORS, POSITIONS
+from hyrfpack.format.compact.plan import Plan
 from hyrfpack.model import HybridModel
 from hyrfpack.model.exposure import apply_exposure_gains
 from hyrfpack.ops.ssim import photometric_loss
+from hyrfpack.ops.transfer import HostCopy
 from hyrfpack.parallel.pool import keep_freed_memory, torch_on_one_thread
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.progress import Progress, TaskEvent, ignore_progress
-from hyrfpack.quant.steps import FIXED_POINT_ONE, decode_step
 from hyrfpack.render import render_view
+from hyrfpack.render.reserve import Reserve, can_reserve
 from hyrfpack.scene import Picture, View
 from hyrfpack.train.distributed import average_gradients
+from hyrfpack.train.launched import MAX_GRADIENT, LaunchedStep, check_step
 from hyrfpack.train.optimizer import Optimizer
+from hyrfpack.train.reserves import ReserveEstimator
 from hyrfpack.train.trainer import shuffled
 
 FINETUNING_RATES = LearningRates(
@@ -71,6 +72,7 @@ def finetune(
 
     to the photometric loss, with the same lambda as `quantize`. A number q steps from its prediction has the rate
     |q| / (b ln 2) bits, where b is the mean of |q| in its group. This is the ideal code of a Laplace distribution.
+    A step copies no parameters to the host, see `TrainingQuantizer`.
     Positions move on the lattice; classes and their steps stay fixed.
 
     Args:
@@ -100,57 +102,166 @@ def finetune(
     rates = {
         name: (share * first, share * last) for name, (first, last) in dataclasses.asdict(FINETUNING_RATES).items()
     }
+    price = LOSS_PER_MSE * LAMBDA_PER_DISTORTION * plan.distortion_per_number
+    quantizer = TrainingQuantizer(tuned, plan, sensitivity, price)
     optimizer = Optimizer(tuned, LearningRates(**rates), ranks.size)
-    steps = -(-steps // ranks.size)
-    quantized: QuantizedModel | None = None
-    keep_freed_memory()
-    photos = Photos(tuned.gaussians.positions.device)
-    order = shuffled(views, seed, range(ranks.rank, steps * ranks.size, ranks.size))
-    with closing((cache or PictureCache()).stream(order)) as pictures, torch_on_one_thread():
-        for step in range(steps):
-            quantized = quantize(tuned, plan, sensitivity, reach=0, previous=quantized)
-            exact = {name: value.clone() for name, value in tuned.state_dict().items()}
-            decoded = {**quantized.arrays(), POSITIONS: _lattice_positions(tuned, plan)}
-            tuned.load_state_dict(dict(iter_parameters(decoded, tuned)), strict=False)
-            problem: HyrfError | None = None
-            try:
-                loss = _backpropagate_view(tuned, photos, *next(pictures), gains)
-            except HyrfError as error:
-                if ranks.is_single:
-                    raise
-                problem, loss = error, tuned.gaussians.positions.new_zeros(())
-            if not ranks.is_single:
-                sums = average_gradients(ranks, list(tuned.parameters()), loss.new_tensor((loss, problem is not None)))
-                loss, problems = sums / ranks.size
-                if problems:
-                    ranks.raise_if_any(problem)
-            tuned.load_state_dict(exact)
-            _add_rate_gradients(tuned, quantized, LOSS_PER_MSE * LAMBDA_PER_DISTORTION * plan.distortion_per_number)
-            broken = optimizer.step(step, steps)
-            if not torch.isfinite(loss) or broken.any():
-                views_of_step = shuffled(views, seed, range(step * ranks.size, (step + 1) * ranks.size))
-                raise HyrfTrainingError(
-                    f"fine-tuning stopped at step {step + 1} on view "
-                    f"{' or '.join(repr(view.name) for view in views_of_step)}: the loss or a gradient is not finite",
-                    fix="compress without `finetune_steps`",
-                )
-            progress(TaskEvent(f"fine-tuning, step {step + 1}/{steps}", (step + 1) / steps))
+    finetuner = _Finetuner(tuned, quantizer, optimizer, views, -(-steps // ranks.size), seed, gains, ranks)
+    finetuner.run(cache or PictureCache(), progress)
     plan, placed = replan_moved(plan, tuned)
     return placed, plan
 
 
-def _backpropagate_view(
-    model: HybridModel, photos: Photos, view: View, picture: Picture, gains: Mapping[str, Tensor] | None
-) -> Tensor:
-    """Backpropagate the photometric loss of a view and return the loss, a detached scalar."""
-    solid = None if model.config.background else np.array(model.config.solid, np.float32)
-    target, mask = photos.get(view.load, picture, solid)
-    image = render_view(model, view.camera).rgb
-    if gains is not None:
-        image = apply_exposure_gains(image, gains[view.name])
-    loss = photometric_loss(image, target, mask)
-    loss.backward()
-    return loss.detach()
+@dataclass(frozen=True)
+class _BackpropagatedView:
+    """A view whose gradients, without those of the rate, are those of the parameters.
+
+    Attributes:
+        view, picture: the view and its photo.
+        loss: scalar on the device.
+        rate_gradients: see `QuantizedParameters`.
+        demand, reserve: what the rendering needed and had, see `Rendering.demand`; None if it reserved no memory.
+    """
+
+    view: View
+    picture: Picture
+    loss: Tensor
+    rate_gradients: dict[str, Tensor]
+    demand: Tensor | None
+    reserve: Reserve | None
+
+
+class _Finetuner:
+    """The steps of fine-tuning.
+
+    As in training (`Trainer`), a GPU renders views into reserved memory, and the host reads the numbers of a step after
+    it has launched the gradients of the next one. A step whose reserve was too small changes nothing and is retaken.
+    """
+
+    def __init__(
+        self,
+        model: HybridModel,
+        quantizer: TrainingQuantizer,
+        optimizer: Optimizer,
+        views: Sequence[View],
+        steps: int,
+        seed: int,
+        gains: Mapping[str, Tensor] | None,
+        ranks: Ranks,
+    ) -> None:
+        """Prepare to fine-tune a planned model in `steps` optimiser steps; the other arguments are `finetune`'s."""
+        self.model, self.quantizer, self.optimizer = model, quantizer, optimizer
+        self.views, self.steps, self.seed, self.gains, self.ranks = views, steps, seed, gains, ranks
+        device = model.gaussians.positions.device
+        self.photos = Photos(device)
+        self.reserves = ReserveEstimator() if can_reserve(device) and ranks.is_single else None
+        self._launched: LaunchedStep | None = None
+
+    def run(self, cache: PictureCache, progress: Progress) -> None:
+        """Take all steps.
+
+        Raises:
+            HyrfTrainingError: the loss or a gradient is not finite.
+        """
+        keep_freed_memory()
+        order = shuffled(self.views, self.seed, range(self.ranks.rank, self.steps * self.ranks.size, self.ranks.size))
+        with closing(cache.stream(order)) as pictures, torch_on_one_thread():
+            for step in range(1, self.steps + 1):
+                problem: HyrfError | None = None
+                rendered: _BackpropagatedView | None = None
+                try:
+                    view, picture = next(pictures)
+                    rendered = self._backpropagate(view, picture)
+                except HyrfError as error:
+                    if self.ranks.is_single:
+                        raise
+                    problem = error
+                if self._confirm_launched():  # These gradients are those of an older model.
+                    self._discard_gradients()
+                    rendered = self._backpropagate(view, picture)
+                self._update(step, rendered, problem)
+                if self.reserves is None or step == self.steps:
+                    self._confirm_launched(problem)
+                progress(TaskEvent(f"fine-tuning, step {step}/{self.steps}", step / self.steps))
+
+    def _backpropagate(self, view: View, picture: Picture) -> _BackpropagatedView:
+        """Backpropagate the photometric loss of a view of the quantised model."""
+        quantized = self.quantizer.quantize(self.model)
+        solid = None if self.model.config.background else np.array(self.model.config.solid, np.float32)
+        target, mask = self.photos.get(view.load, picture, solid)
+        reserve = None if self.reserves is None else self.reserves.estimate(view, len(self.model))
+        with parameters_replaced(self.model, quantized.values):
+            rendering = render_view(self.model, view.camera, reserve=reserve)
+            image = rendering.rgb
+            if self.gains is not None:
+                image = apply_exposure_gains(image, self.gains[view.name])
+            loss = photometric_loss(image, target, mask)
+            loss.backward()
+        return _BackpropagatedView(view, picture, loss.detach(), quantized.rate_gradients, rendering.demand, reserve)
+
+    def _update(self, step: int, rendered: _BackpropagatedView | None, problem: HyrfError | None) -> None:
+        """Launch the rest of a step: average and complete the gradients, update the parameters, copy the numbers.
+
+        On one of several processes, None stands for a view that has a problem.
+        """
+        loss = self.model.gaussians.positions.new_zeros(()) if rendered is None else rendered.loss
+        packed = torch.stack((loss,))
+        if not self.ranks.is_single:
+            own = loss.new_tensor((loss, problem is not None))
+            packed = average_gradients(self.ranks, list(self.model.parameters()), own) / self.ranks.size
+        if rendered is not None:
+            for name, parameter in self.model.named_parameters():
+                if parameter.grad is not None and name in rendered.rate_gradients:
+                    parameter.grad += rendered.rate_gradients[name]
+        checks, reserved = None, None
+        if rendered is not None and rendered.reserve is not None and rendered.demand is not None:
+            checks = check_step(rendered.loss, self.optimizer.gradients(), rendered.demand, rendered.reserve)
+            reserved = rendered.view, rendered.picture
+        broken = self.optimizer.step(step - 1, self.steps, None if checks is None else checks.valid)
+        # Adam sets no flags where the step is not valid.
+        numbers = [broken] if checks is None else [checks.valid[None], checks.demand, checks.norms]
+        self._launched = LaunchedStep(step, reserved, HostCopy(torch.cat([packed, *numbers])), len(packed))
+
+    def _confirm_launched(self, problem: HyrfError | None = None) -> bool:
+        """Wait for the numbers of the launched step, if any, and check them; return whether the step was retaken.
+
+        Args:
+            problem: the problem of this process's view.
+        """
+        if self._launched is None:
+            return False
+        launched, self._launched = self._launched, None
+        (loss, *problems), numbers = launched.read_numbers()
+        if any(problems):
+            self.ranks.raise_if_any(problem)
+        is_finite, is_complete = np.isfinite(loss), True
+        if launched.reserved is None:
+            is_finite = is_finite and not any(numbers)
+        else:
+            valid, nonfinite_positions, in_view, nonfinite_inputs, pairs, *norms = numbers
+            is_finite = is_finite and not nonfinite_positions and not nonfinite_inputs
+            is_finite = is_finite and all(norm <= MAX_GRADIENT for norm in norms)
+            is_complete = bool(valid)
+            assert self.reserves is not None
+            self.reserves.record(launched.reserved[0], len(self.model), int(in_view), int(pairs))
+        if not is_finite:
+            size = self.ranks.size
+            views = shuffled(self.views, self.seed, range((launched.step - 1) * size, launched.step * size))
+            raise HyrfTrainingError(
+                f"fine-tuning stopped at step {launched.step} on view {' or '.join(repr(v.name) for v in views)}: the "
+                "loss or a gradient is not finite",
+                fix="compress without `finetune_steps`",
+            )
+        if is_complete or launched.reserved is None:
+            return False
+        self.optimizer.retract_step()
+        self._discard_gradients()
+        self._update(launched.step, self._backpropagate(*launched.reserved), None)
+        self._confirm_launched()
+        return True
+
+    def _discard_gradients(self) -> None:
+        for parameter in self.model.parameters():
+            parameter.grad = None
 
 
 @torch.no_grad()
@@ -180,47 +291,3 @@ def fit_residual_gains(
             fitted = fit_gains(render_view(model, view.camera, decoded=decoded).rgb, photo, mask)
             gains[view.name] = torch.from_numpy(fitted).float().to(device)
     return gains
-
-
-@torch.no_grad()
-def _lattice_positions(model: HybridModel, plan: Plan) -> np.ndarray:
-    """Return the positions (M, 3) at which a planned model's Gaussians would be stored."""
-    cube = model.cube_coords(model.gaussians.positions.double()).cpu().numpy()
-    places, start = [], 0
-    for points in (layer.points for layer in plan.layers):
-        part = slice(start, start := start + len(points.classes))
-        places.append(lattice_to_local(snap_to_lattice(cube[part], points.classes, points.bits), model.config.frame))
-    return np.concatenate(places)
-
-
-@torch.no_grad()
-def _add_rate_gradients(model: HybridModel, quantized: QuantizedModel, price: float) -> None:
-    """Add the gradient of price * rate to the gradients of the parameters; `price` is the loss per bit."""
-    parameters, plan, slopes = dict(model.named_parameters()), quantized.plan, {}
-    for group in quantized.channels[0]:
-        values = np.concatenate(
-            [
-                np.stack(
-                    [_rate_gradient(c.residuals, layer.points.classes, len(c.codes), c.codes) for c in channels[group]],
-                    1,
-                )
-                for layer, channels in zip(plan.layers, quantized.channels, strict=True)
-            ]
-        )
-        slopes[group] = values @ plan.basis.T.astype(np.float64) if group == COLORS else values
-    for group, chosen in quantized.groups.items():
-        groups = plan.groups[group]
-        slopes[group] = _rate_gradient(chosen.symbols, groups.index, groups.count, chosen.codes)
-    slopes = {group: (price * values).astype(np.float32) for group, values in slopes.items()}
-    for name, slope in iter_parameters(slopes, model):
-        gradient = parameters[name].grad
-        if gradient is not None:
-            gradient += slope.to(gradient)
-
-
-def _rate_gradient(symbols: np.ndarray, index: np.ndarray, count: int, codes: np.ndarray) -> np.ndarray:
-    """Return d rate / d number = sign(q) / (b ln 2 step) in bits, (n,) float64."""
-    members = np.maximum(np.bincount(index, minlength=count), 1)
-    spread = np.bincount(index, np.abs(symbols), count) / members + 0.1
-    slope = 1 / (spread * np.log(2) * (decode_step(codes) / FIXED_POINT_ONE))
-    return np.sign(symbols) * slope[index]

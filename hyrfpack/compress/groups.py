@@ -27,10 +27,7 @@ def quantize_groups(
     """
     index, count = groups.index, groups.count
     members = np.maximum(np.bincount(index, minlength=count), 1)
-    mean = np.bincount(index, sensitivity, count) / members
-    codes = np.where(mean > 0, choose_step_codes(np.where(mean > 0, mean, 1), distortion), ALL_ZERO_CODE).astype(
-        np.uint8
-    )
+    codes, mean = choose_group_codes(groups, sensitivity, distortion)
     steps, unread = decode_step(codes) / FIXED_POINT_ONE, codes == ALL_ZERO_CODE
     symbols = np.empty(len(values), np.int64)
     for part in iter_blocks(len(values)):
@@ -51,6 +48,17 @@ def quantize_groups(
             symbols[part] = np.where(unread[index[part]], 0, np.clip(chosen, -MAX_ABS_SYMBOL, MAX_ABS_SYMBOL))
     codes[np.bincount(index, np.abs(symbols), count) == 0] = ALL_ZERO_CODE
     return GroupSymbols(codes, models, symbols, (symbols * groups.gather(steps)).astype(np.float32))
+
+
+def choose_group_codes(groups: StepGroups, sensitivity: np.ndarray, distortion: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the step code (count,) uint8 and the mean sensitivity (count,) of each group.
+
+    Groups whose sensitivity is 0 have ALL_ZERO_CODE. The arguments are those of `quantize_groups`.
+    """
+    members = np.maximum(np.bincount(groups.index, minlength=groups.count), 1)
+    mean = np.bincount(groups.index, sensitivity, groups.count) / members
+    codes = np.where(mean > 0, choose_step_codes(np.where(mean > 0, mean, 1), distortion), ALL_ZERO_CODE)
+    return codes.astype(np.uint8), mean
 
 
 def _model_indices(magnitude: np.ndarray) -> np.ndarray:

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
+import torch
 from torch import Tensor
 
-from hyrfpack.ops.transfer import HostCopy
+from hyrfpack.ops.transfer import HostCopy, tensor_like
 from hyrfpack.render import Rendering
 from hyrfpack.render.reserve import Reserve
 from hyrfpack.scene import Picture, View
+
+MAX_LOSS = float(np.finfo(np.float32).max)
+MAX_GRADIENT = MAX_LOSS**0.5  # Adam squares gradients.
 
 
 @dataclass(frozen=True)
@@ -44,6 +50,23 @@ class StepChecks(NamedTuple):
     valid: Tensor
     demand: Tensor
     norms: Tensor
+
+
+def check_step(loss: Tensor, gradients: Sequence[Tensor], demand: Tensor, reserve: Reserve) -> StepChecks:
+    """Return whether a step is valid, without waiting for the device.
+
+    It is valid if the loss and all gradients are finite and the reserve was large enough.
+
+    Args:
+        loss: scalar.
+        gradients: all gradients of the step, at least one.
+        demand: what the step's rendering needed, see `Rendering.demand`.
+        reserve: the memory that it was rendered into.
+    """
+    norms = torch.stack(torch._foreach_norm(list(gradients), torch.inf))
+    numbers = torch.cat((loss.double()[None], norms, demand))
+    limits = MAX_LOSS, *[MAX_GRADIENT] * len(norms), *reserve.limits
+    return StepChecks((numbers <= tensor_like(limits, numbers)).all(), demand, norms)
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from hyrfpack.measure.psnr import psnr_from_mse
 from hyrfpack.model import HybridModel
 from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.ops.ssim import photometric_loss
-from hyrfpack.ops.transfer import HostCopy, tensor_like
+from hyrfpack.ops.transfer import HostCopy
 from hyrfpack.out_of_memory import explain_out_of_memory
 from hyrfpack.parallel.pool import keep_freed_memory, torch_on_one_thread
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
@@ -36,7 +36,14 @@ from hyrfpack.train.checkpoint import load_checkpoint, names_and_sizes, save_che
 from hyrfpack.train.density import DensityControl
 from hyrfpack.train.distributed import StepStats, average_gradients, check_settings, digest, pack_step_stats
 from hyrfpack.train.exposure import initialize_exposures
-from hyrfpack.train.launched import ConfirmedStep, LaunchedStep, RenderedView, StepChecks
+from hyrfpack.train.launched import (
+    MAX_GRADIENT,
+    ConfirmedStep,
+    LaunchedStep,
+    RenderedView,
+    StepChecks,
+    check_step,
+)
 from hyrfpack.train.optimizer import Optimizer
 from hyrfpack.train.reserves import ReserveEstimator
 from hyrfpack.train.resolution import ResolutionSchedule
@@ -47,8 +54,6 @@ from hyrfpack.version import __version__
 _LOG = logging.getLogger(__name__)
 
 OUT_OF_MEMORY_FIX = "reduce `max_gaussians` or `max_size`, or use `device='cpu'`"
-MAX_LOSS = float(np.finfo(np.float32).max)
-MAX_GRADIENT = MAX_LOSS**0.5  # Adam squares gradients.
 MIN_CURVE_RECORDS = 200  # A run of more steps has up to twice as many records.
 
 
@@ -325,20 +330,14 @@ class Trainer:
         self._launched = LaunchedStep(step, reserved, HostCopy(torch.cat(numbers)), len(packed))
 
     def _check_on_device(self, rendered: RenderedView) -> StepChecks | None:
-        """Return whether a step is valid, without waiting; None if its rendering has no reserve that may be too small.
-
-        It is valid if the loss and all gradients are finite and the reserve was large enough.
-        """
+        """Return whether a step is valid, see `check_step`; None if its rendering has no reserve."""
         demand = rendered.rendering.demand
         if rendered.reserve is None or demand is None:
             return None
         gradients = self.optimizer.gradients()
         if self.exposures is not None and self.exposures.values.grad is not None:
             gradients.append(self.exposures.values.grad)
-        norms = torch.stack(torch._foreach_norm(gradients, torch.inf))
-        numbers = torch.cat((rendered.loss.double()[None], norms, demand))
-        limits = MAX_LOSS, *[MAX_GRADIENT] * len(norms), *rendered.reserve.limits
-        return StepChecks((numbers <= tensor_like(limits, numbers)).all(), demand, norms)
+        return check_step(rendered.loss, gradients, demand, rendered.reserve)
 
     def _confirm_launched(self, problem: HyrfError | None = None, *, was_retaken: bool = False) -> list[ConfirmedStep]:
         """Confirm the launched step, if any: wait for its numbers and check them.
