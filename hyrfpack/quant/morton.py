@@ -5,7 +5,10 @@ Points that are neighbours in the order of their codes are close in space.
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
+import torch
 
 MAX_BITS_PER_AXIS = 18  # A code then has 54 bits, so that the integer coder can code gaps between codes.
 
@@ -27,6 +30,21 @@ _GATHER_STEPS = (
 )
 _POINTS_PER_BLOCK = 1 << 14  # Temporary arrays of this size stay in the caches.
 
+Integers = TypeVar("Integers", np.ndarray, torch.Tensor)
+
+
+def spread_bits(numbers: Integers) -> Integers:
+    """Move bit i of int64 numbers from 0 to 2^21 - 1 to bit 3 i, in place, and return them.
+
+    Example:
+        >>> spread_bits(torch.tensor([3, 4])).tolist()
+        [9, 64]
+    """
+    for shift, mask in _SPREAD_STEPS:
+        numbers |= numbers << shift
+        numbers &= mask
+    return numbers
+
 
 def morton_codes(cells: np.ndarray) -> np.ndarray:
     """Return the codes (N,) int64 of cells (N, 3), each coordinate 0 to 2^21 - 1.
@@ -41,10 +59,7 @@ def morton_codes(cells: np.ndarray) -> np.ndarray:
     for first in range(0, len(cells), _POINTS_PER_BLOCK):
         part = slice(first, first + _POINTS_PER_BLOCK)
         for axis in range(3):
-            bits = cells[part, axis].astype(np.int64)
-            for shift, mask in _SPREAD_STEPS:
-                bits |= bits << shift
-                bits &= mask
+            bits = spread_bits(cells[part, axis].astype(np.int64))
             bits <<= axis
             codes[part] |= bits
     return codes

@@ -3,7 +3,7 @@
 Gaussians with the largest absolute gradients of their projected centres are cloned if they are small and split if they
 are large (3DGS; AbsGS), until their number exceeds the budget. Then each round prunes the Gaussians with the lowest
 importance scores, until their number equals the budget. So the budget is filled with the best candidates instead of the
-first ones.
+first ones. After each round the Gaussians are sorted by place.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from hyrfpack.model import Geometry, HybridModel
 from hyrfpack.model.gaussians import Gaussians, logit
 from hyrfpack.ops.transfer import tensor_like
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
+from hyrfpack.quant.morton import MAX_BITS_PER_AXIS, spread_bits
 from hyrfpack.render import Rendering
 from hyrfpack.scene import Camera
 from hyrfpack.train.optimizer import Optimizer
@@ -165,6 +166,9 @@ class DensityControl:
         self.squares = SQUARED_GRADIENT_DECAY * torch.cat(
             (self.squares[keep], self.squares[cloned], self.squares[split.repeat(2)] / 2)
         )
+        order = spatial_order(model)
+        optimizer.reorder_gaussians(order)
+        self.squares = self.squares[order]
         if not self.ranks.is_main:  # The sum over all ranks stays on rank 0, so that the next round counts it once.
             self.squares.zero_()
         self.clear(len(model))
@@ -221,6 +225,20 @@ class DensityControl:
         neural = model.geometry(model.cube_coords(explicit.positions))[:, :1]
         cap = logit(torch.tensor(self.config.reset_opacity))
         optimizer.reset("opacity_logits", torch.minimum(explicit.opacity_logits, cap - neural))
+
+
+def spatial_order(model: HybridModel) -> Tensor:
+    """Return the indices (N,) int64 of a model's Gaussians in Morton order in the contracted cube.
+
+    Neighbours in this order are close in space, so that they read and change the same rows of the hash tables.
+    Gaussians at the same place keep their order.
+    """
+    limit = 1 << MAX_BITS_PER_AXIS
+    cells = (model.cube_coords(model.gaussians.positions.detach()) * limit).long().clamp_(0, limit - 1)
+    codes = torch.zeros_like(cells[:, 0])
+    for axis, bits in enumerate(cells.unbind(1)):
+        codes |= spread_bits(bits.clone()) << axis
+    return torch.argsort(codes, stable=True)
 
 
 def _shrink(scale_logits: Tensor, fractions: Tensor) -> Tensor:

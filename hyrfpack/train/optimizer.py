@@ -125,6 +125,11 @@ class Optimizer:
         for name in Gaussians.PARAMETER_NAMES:
             edit(name, new[name])
 
+    def reorder_gaussians(self, order: Tensor) -> None:
+        """Move the Gaussian at order[i] (int64), with its moments, to place i, for all i."""
+        for name in Gaussians.PARAMETER_NAMES:
+            self._edit(name, lambda values: values[order], lambda moment: moment[order])
+
     def reset(self, name: str, values: Tensor) -> None:
         """Set the Gaussian property `name` to `values`, and reset its moments to zero."""
         self._edit(name, lambda _: values, torch.zeros_like)

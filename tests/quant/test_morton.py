@@ -2,10 +2,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hyrfpack.quant.morton import MAX_BITS_PER_AXIS, morton_cells, morton_codes
+from hyrfpack.quant.morton import MAX_BITS_PER_AXIS, morton_cells, morton_codes, spread_bits
 
 CELL_COORDINATE = st.one_of(st.integers(0, 3), st.integers(0, 2**21 - 1), st.integers(0, 20).map(lambda bit: 1 << bit))
 
@@ -25,6 +26,13 @@ def test_morton_codes_interleave_bits_and_morton_cells_inverts_them(cells: list[
     assert codes.dtype == np.int64
     assert codes.tolist() == [interleave_bits(cell) for cell in cells]
     np.testing.assert_array_equal(morton_cells(codes), array)
+
+
+@given(st.lists(CELL_COORDINATE, max_size=40))
+@settings(max_examples=50, deadline=None)
+def test_spreading_bits_of_tensors_moves_bit_i_to_bit_3_i(numbers: list[int]) -> None:
+    expected = [interleave_bits((number, 0, 0)) for number in numbers]
+    assert spread_bits(torch.tensor(numbers, dtype=torch.int64)).tolist() == expected
 
 
 def test_every_single_bit_round_trips() -> None:

@@ -10,7 +10,7 @@ from scenes import ball_points, small_model
 
 from hyrfpack.config.train import DensityConfig, LearningRates
 from hyrfpack.model.gaussians import Gaussians
-from hyrfpack.train.density import DensityControl, rotate
+from hyrfpack.train.density import DensityControl, rotate, spatial_order
 from hyrfpack.train.optimizer import Optimizer
 
 # Rounds after steps 10, 20, ... 50 of 100. The target count only rises.
@@ -37,6 +37,18 @@ def set_up(
     density.gradients = torch.as_tensor(gradients, dtype=torch.float32).expand(count).clone()
     density.views = torch.ones(count)
     return model, optimizer, density
+
+
+@pytest.fixture(autouse=True)
+def unsorted(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
+    """Rounds keep the order of the Gaussians that stay and append new ones, except in tests of the order."""
+    if "sorted_rounds" not in request.fixturenames:
+        monkeypatch.setattr("hyrfpack.train.density.spatial_order", lambda model: torch.arange(len(model)))
+
+
+@pytest.fixture
+def sorted_rounds() -> None:
+    """Rounds sort Gaussians by place, as they do outside tests."""
 
 
 def copy_parameters(model) -> dict[str, torch.Tensor]:
@@ -495,3 +507,51 @@ def test_new_gaussians_start_without_momentum():
     density.act(50, model, optimizer)
     moments = optimizer.state_dict()["positions.0.exp_avg"]
     assert (moments[:20] != 0).all() and (moments[20:] == 0).all()
+
+
+# -- order -----------------------------------------------------------------------------------------------------------
+
+
+def interleave_bits(cell: list[int]) -> int:
+    """Return the Morton code of a cell, bit by bit."""
+    return sum((coordinate >> bit & 1) << 3 * bit + axis for axis, coordinate in enumerate(cell) for bit in range(18))
+
+
+def test_gaussians_are_sorted_by_the_morton_codes_of_their_cells(sorted_rounds):
+    model, *_ = set_up(200)
+    with torch.no_grad():
+        model.gaussians.positions[:20] *= 1e6  # far outside the box
+        model.gaussians.positions[100:] = model.gaussians.positions[:100]
+    cells = (model.cube_coords(model.gaussians.positions.detach()).double() * 2**18).floor().clamp(0, 2**18 - 1)
+    codes = [interleave_bits(cell) for cell in cells.long().tolist()]
+
+    order = spatial_order(model).tolist()
+
+    assert order == sorted(range(200), key=lambda row: (codes[row], row))
+    assert order != list(range(200))
+
+
+def test_a_round_sorts_parameters_moments_and_sums_alike(sorted_rounds, monkeypatch):
+    """The round adds and removes the same Gaussians as without sorting."""
+
+    def run_round():
+        # The first 30 are large and split, the others are cloned.
+        sizes = torch.where(torch.arange(60) < 30, LARGE_SCALE_LOGIT, SMALL_SCALE_LOGIT)[:, None]
+        model, optimizer, density = set_up(60, scale_logits=sizes, gradients=torch.linspace(0, 1, 60))
+        for number, p in enumerate(model.parameters()):
+            p.grad = torch.randn(p.shape, generator=torch.Generator().manual_seed(number))
+        optimizer.step(10, RUN_STEPS)
+        density.squares = torch.rand(60, generator=torch.Generator().manual_seed(9))
+        density.act(50, model, optimizer)
+        moments = {name: value for name, value in optimizer.state_dict().items() if "exp_avg" in name}
+        rows = {name: value for name, value in moments.items() if not name.startswith("fields")}
+        return model, {**copy_parameters(model), **rows, "squares": density.squares}
+
+    _, found = run_round()
+    monkeypatch.setattr("hyrfpack.train.density.spatial_order", lambda model: torch.arange(len(model)))
+    model, unsorted = run_round()
+
+    order = spatial_order(model)
+    assert len(order) > 60 and not torch.equal(order, torch.arange(len(order)))
+    assert found.keys() == unsorted.keys() and len(found) == 4 + 8 + 1
+    assert [name for name, rows in found.items() if not torch.equal(rows, unsorted[name][order])] == []

@@ -197,6 +197,24 @@ def test_replacing_before_the_first_step_works():
     assert len(model) == 9 and optimizer.state_dict()["positions.0.exp_avg"].shape == (9, 3)
 
 
+def test_reordered_gaussians_continue_as_before():
+    edited, alone = make_model(), make_model()
+    optimizers = Optimizer(edited, LEARNING_RATES), Optimizer(alone, LEARNING_RATES)
+    for model, optimizer in zip((edited, alone), optimizers, strict=True):
+        take_steps(model, optimizer, range(3))
+    order = torch.tensor([4, 0, 5, 3, 1, 2])
+
+    optimizers[0].reorder_gaussians(order)
+    set_gradients(alone, 99)
+    for p, q in zip(edited.gaussians.parameters(), alone.gaussians.parameters(), strict=True):
+        p.grad = q.grad[order].clone()
+    for optimizer in optimizers:
+        optimizer.step(10, 20)
+
+    for p, q in zip(edited.gaussians.parameters(), alone.gaussians.parameters(), strict=True):
+        assert torch.equal(p, q[order])
+
+
 def test_resetting_sets_values_and_forgets_moments_of_one_group():
     model = make_model()
     optimizer = Optimizer(model, LEARNING_RATES)
