@@ -11,13 +11,20 @@ import numpy as np
 
 from hyrfpack.cameras.files import camera_from_numbers, camera_to_numbers
 from hyrfpack.cameras.paths import Viewpoint, orbit
-from hyrfpack.cameras.sampling import select_representative_cameras
+from hyrfpack.cameras.sampling import (
+    COARSE_RATE_RATIO,
+    MAX_RATE_RATIO,
+    MAX_SAMPLING_CAMERAS,
+    RATE_RATIO_KEY,
+    select_representative_cameras,
+    stored_rate_ratio,
+)
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.rotations import IDENTITY
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Camera, Scene, evenly_spaced
 
-MAX_STORED_CAMERAS = 128
-MAX_COARSE_CAMERAS = 14
+MAX_STORED_CAMERAS = MAX_SAMPLING_CAMERAS
+MIN_COARSE_CAMERAS = 14
 FALLBACK_ORBIT_CAMERAS = 48
 COARSE_POSE_STEPS_PER_SCENE_SCALE = 500
 
@@ -40,11 +47,17 @@ def provenance_cameras(cameras: Sequence[Camera]) -> list[list[float]]:
 def scene_provenance(scene: Scene) -> dict:
     """Collect what a trained model's provenance stores of its scene: viewpoint, cameras and `max_size`.
 
-    `Capture` reads it back. `max_size` is left out if photos read with DEFAULT_MAX_SIZE give the same pictures. So a
-    model of small photos is the same file, byte for byte, with and without a size limit.
+    `Capture` reads it back. Of more than MAX_STORED_CAMERAS cameras, those that represent all are kept, with their rate
+    ratio (`hyrfpack.cameras.sampling`). `max_size` is left out if photos read with DEFAULT_MAX_SIZE give the same
+    pictures. So a model of small photos is the same file, byte for byte, with and without a size limit.
     """
     cameras = [view.camera for view in scene.train]
-    kept: dict = {"viewpoint": Viewpoint.from_cameras(cameras).to_json(), "cameras": provenance_cameras(cameras)}
+    points = np.zeros((0, 3)) if scene.points is None else scene.points
+    unit = float(np.std(points)) / 100 if len(points) else 1.0  # so small that the near plane hides nothing
+    stored, ratio = select_representative_cameras(cameras, points, unit, MAX_STORED_CAMERAS, MAX_STORED_CAMERAS)
+    kept: dict = {"viewpoint": Viewpoint.from_cameras(cameras).to_json(), "cameras": provenance_cameras(stored)}
+    if ratio > 1:
+        kept[RATE_RATIO_KEY] = _rounded_ratio(ratio)
     is_small = all(max(view.camera.width, view.camera.height) < DEFAULT_MAX_SIZE for view in scene.views)
     is_redundant = scene.max_size is None or (is_small and scene.max_size == DEFAULT_MAX_SIZE)
     if not is_redundant:
@@ -55,23 +68,27 @@ def scene_provenance(scene: Scene) -> dict:
 def quantized_provenance(provenance: dict, scale: float, points: np.ndarray | None = None) -> dict:
     """Shorten a provenance for small files: round its numbers and replace "cameras" by fewer "coarse_cameras".
 
-    Up to MAX_COARSE_CAMERAS cameras are kept, which together show the scene about as finely as all of them. Their
-    positions are rounded to about scale / COARSE_POSE_STEPS_PER_SCENE_SCALE, which is precise enough to render from
-    there, but not to train. Entries that cannot be read are left out.
+    MIN_COARSE_CAMERAS are kept, and more where these show the scene less finely than all of them. Their positions are
+    rounded to about scale / COARSE_POSE_STEPS_PER_SCENE_SCALE, which is precise enough to render from there, but not to
+    train. Entries that cannot be read are left out.
 
     Args:
         provenance: the provenance of a trained model.
         scale: longest half-axis of the scene's frame, in world units.
         points: (N, 3) the Gaussians' centres in world units; without them, the cameras are evenly spaced.
     """
-    kept = {name: value for name, value in provenance.items() if name != "cameras"}
+    replaced = ("cameras", RATE_RATIO_KEY) if "cameras" in provenance else ()
+    kept = {name: value for name, value in provenance.items() if name not in replaced}
     with suppress(TypeError, ValueError, ArithmeticError, KeyError):
         kept["viewpoint"] = Viewpoint.from_json(provenance["viewpoint"]).to_json(rounded=True)
     with suppress(TypeError, ValueError, ArithmeticError, KeyError):
         cameras = [camera_from_numbers(numbers) for numbers in provenance["cameras"]]
-        cameras = select_representative_cameras(
-            cameras, np.zeros((0, 3)) if points is None else points, scale, MAX_COARSE_CAMERAS
+        cameras, ratio = select_representative_cameras(
+            cameras, np.zeros((0, 3)) if points is None else points, scale, MIN_COARSE_CAMERAS, MAX_SAMPLING_CAMERAS
         )
+        ratio *= stored_rate_ratio(provenance)
+        if ratio > COARSE_RATE_RATIO:
+            kept[RATE_RATIO_KEY] = _rounded_ratio(ratio)
         farthest = max((float(np.linalg.norm(camera.position)) for camera in cameras), default=0.0)
         # Rounding a rotation moves the camera in proportion to its distance from the origin.
         decimals = (
@@ -80,6 +97,10 @@ def quantized_provenance(provenance: dict, scale: float, points: np.ndarray | No
         )
         kept["coarse_cameras"] = [camera_to_numbers(camera, decimals) for camera in cameras]
     return kept
+
+
+def _rounded_ratio(ratio: float) -> float:
+    return min(float(np.ceil(100 * ratio) / 100), MAX_RATE_RATIO)
 
 
 def has_mean_exposure(provenance: dict) -> bool:

@@ -14,8 +14,13 @@ from hyrfpack.scene import Camera, evenly_spaced
 
 # A camera sees points within its picture, enlarged by this share of its size on each side.
 PICTURE_MARGIN_RATIO = 0.15
-# A few coarse cameras underestimate the sampling rate of all photos by up to a fifth at most points.
+# Coarse cameras are only some of the cameras, so they underestimate the sampling rate of all photos.
 COARSE_RATE_RATIO = 1.1
+RATE_RATIO_KEY = "rate_ratio"
+MAX_RATE_RATIO = 1000.0
+# Cameras represent all photos if this share of the points has at least 1 / MAX_REPRESENTED_RATIO of their rate.
+REPRESENTED_SHARE = 0.9
+MAX_REPRESENTED_RATIO = 1.25
 DEFAULT_BACKGROUND_STRIDE = 2
 MAX_BACKGROUND_STRIDE = 64
 BACKGROUND_STRIDE_KEY = "background_stride"
@@ -34,12 +39,12 @@ class PhotoCameras:
 
     Attributes:
         cameras: in world units, at most MAX_SAMPLING_CAMERAS.
-        is_coarse: whether they are only some of the cameras, with rounded poses.
+        rate_ratio: the sampling rate of all photos at most points, relative to the highest one of these cameras.
         background_stride: pixels between neighbouring nodes of the background in the last training steps.
     """
 
     cameras: Sequence[Camera]
-    is_coarse: bool
+    rate_ratio: float
     background_stride: int
 
     @classmethod
@@ -55,8 +60,9 @@ class PhotoCameras:
             with suppress(TypeError, ValueError, ArithmeticError):
                 kept = list(provenance.get(key) or ())[:MAX_SAMPLING_CAMERAS]
                 if cameras := [camera_from_numbers(numbers) for numbers in kept]:
-                    return cls(cameras, key == "coarse_cameras", stride)
-        return cls((), False, stride)
+                    default = COARSE_RATE_RATIO if key == "coarse_cameras" else 1.0
+                    return cls(cameras, stored_rate_ratio(provenance, default), stride)
+        return cls((), 1.0, stride)
 
     @property
     def background_spacing(self) -> float:
@@ -71,9 +77,10 @@ class PhotoCameras:
     ) -> np.ndarray | None:
         """Compute the size of a photo's pixel at each point, of the photo that shows the point at the highest rate.
 
-            q = 1 / max over the photos that see the point of f / z
+            q = 1 / (r max over the cameras that see the point of f / z)
 
-        with the focal length f and the depth z. If no photo sees the point, f / distance is the rate of all of them.
+        with the focal length f, the depth z and `rate_ratio` r. If none sees the point, f / distance is the rate of all
+        of them.
 
         Args:
             points: (N, 3) float32 in local units: local = axes^T (world - center) / scale.
@@ -90,8 +97,7 @@ class PhotoCameras:
         sizes = np.empty(len(points), np.float32)
         with np.errstate(all="ignore"):
             self._fill_pixel_sizes(sizes, points, np.array(center), scale, axes)
-        if self.is_coarse:
-            sizes /= np.float32(COARSE_RATE_RATIO)
+        sizes /= np.float32(self.rate_ratio)
         sizes[~(sizes <= MAX_PIXEL_SIZE)] = 0  # also where NaN
         return sizes
 
@@ -111,36 +117,54 @@ class PhotoCameras:
             sizes[start : start + len(best)] = 1 / best
 
 
+def stored_rate_ratio(provenance: dict, default: float = 1.0) -> float:
+    """Return `rate_ratio` of an untrusted provenance; `default` if it is missing or implausible."""
+    stored = provenance.get(RATE_RATIO_KEY)
+    is_number = isinstance(stored, (int, float)) and not isinstance(stored, bool)
+    return float(cast(float, stored)) if is_number and 1 <= cast(float, stored) <= MAX_RATE_RATIO else default
+
+
 def select_representative_cameras(
-    cameras: Sequence[Camera], points: np.ndarray, scale: float, count: int
-) -> list[Camera]:
+    cameras: Sequence[Camera], points: np.ndarray, scale: float, least: int, most: int
+) -> tuple[list[Camera], float]:
     """Select cameras whose sampling rates come near to those of all cameras, in the given order.
 
-    The first camera is always selected, then, one after the other, the one that raises the mean log rate most.
+    The first camera is always selected, then, one after the other, the one that raises the mean log rate most, until
+    the selected cameras represent all of them (REPRESENTED_SHARE).
 
     Args:
         cameras: all cameras.
-        points: (N, 3) in world units; MAX_SELECTION_POINTS of them are used. Without points, cameras are evenly spaced.
+        points: (N, 3) in world units; MAX_SELECTION_POINTS of them are used. Without points, `least` cameras are evenly
+            spaced.
         scale: world units of a local unit.
-        count: number of cameras to select.
+        least, most: limits of the number of selected cameras.
+
+    Returns:
+        The cameras, and the rate of all cameras relative to that of the selected ones, 1 or more: it is at most this at
+        REPRESENTED_SHARE of the points. 1 without points.
     """
-    if len(cameras) <= count or not len(points):
-        return evenly_spaced(cameras, count)
+    if len(cameras) <= least or not len(points):
+        return evenly_spaced(cameras, least), 1.0
     points = points[:: -(-len(points) // MAX_SELECTION_POINTS)]
     center = points.mean(axis=0)
     local = ((points - center) / scale).astype(np.float32).T
     with np.errstate(all="ignore"):
         rates = np.stack([_sampling_rates(camera, local, center, scale, WORLD_AXES) for camera in cameras])
         rates = np.nan_to_num(rates, posinf=0)
-    floor = np.maximum(_MIN_RATE_RATIO * rates.max(axis=0), np.finfo(np.float32).tiny)
-    logs = np.log(np.maximum(rates, floor))
-    selected, best = [0], logs[0]
-    while len(selected) < count:
+    highest = rates.max(axis=0)
+    floor = np.maximum(_MIN_RATE_RATIO * highest, np.finfo(np.float32).tiny)
+    logs, is_seen = np.log(np.maximum(rates, floor)), highest > 0
+    limit, selected, best, ratio = np.log(MAX_REPRESENTED_RATIO), [0], logs[0], 0.0
+    while len(selected) < min(most, len(cameras)):
         gains = np.maximum(logs, best).sum(axis=1)
         gains[selected] = -np.inf
         selected.append(int(gains.argmax()))
         best = np.maximum(best, logs[selected[-1]])
-    return [cameras[index] for index in sorted(selected)]
+        missing = (logs.max(axis=0) - best)[is_seen]
+        ratio = float(np.quantile(missing, REPRESENTED_SHARE)) if len(missing) else 0.0
+        if len(selected) >= least and ratio <= limit:
+            break
+    return [cameras[index] for index in sorted(selected)], float(np.exp(ratio))
 
 
 def focal_length(camera: Camera) -> float:

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from hyrfpack.atomic import write_atomic
-from hyrfpack.cameras.capture import MAX_COARSE_CAMERAS, Capture
+from hyrfpack.cameras.capture import MIN_COARSE_CAMERAS, Capture
 from hyrfpack.cameras.files import camera_to_numbers
 from hyrfpack.cameras.view_sampling import sample_views
 from hyrfpack.checks import check_type
@@ -326,7 +326,7 @@ def _make_manifest(
     encoders = [part.encoder for part in parts]
     shared = [(encoder.shared_name, len(encoder.shared_bytes), _checksum(encoder.shared_bytes)) for encoder in encoders]
     names = [part.name for part in parts] if len(parts) > 1 else [ONE_PART_NAME]
-    cameras = [] if capture.is_synthetic else evenly_spaced(capture.cameras, MAX_COARSE_CAMERAS)
+    cameras = [] if capture.is_synthetic else evenly_spaced(capture.cameras, MIN_COARSE_CAMERAS)
     return Manifest(
         gaussians=sum(len(part.model) for part in parts),
         parts=tuple(ScenePart(*file, name) for file, name in zip(shared, names, strict=True)),

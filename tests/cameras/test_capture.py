@@ -12,8 +12,8 @@ from scenes import ball_scene, ring
 from hyrfpack.cameras.capture import (
     COARSE_POSE_STEPS_PER_SCENE_SCALE,
     FALLBACK_ORBIT_CAMERAS,
-    MAX_COARSE_CAMERAS,
     MAX_STORED_CAMERAS,
+    MIN_COARSE_CAMERAS,
     Capture,
     has_mean_exposure,
     provenance_cameras,
@@ -87,8 +87,8 @@ def test_coarse_cameras_approximate_the_original_cameras(scale, away):
 
     capture = Capture(make_description(**kept))
     assert {*kept} == {"coarse_cameras", "viewpoint", "seed"} and capture.is_coarse and not capture.is_synthetic
-    assert len(capture.cameras) == MAX_COARSE_CAMERAS and quantized_provenance(kept, scale) == kept
-    for rough, exact in zip(capture.cameras, evenly_spaced(cameras, MAX_COARSE_CAMERAS), strict=True):
+    assert len(capture.cameras) == MIN_COARSE_CAMERAS and quantized_provenance(kept, scale) == kept
+    for rough, exact in zip(capture.cameras, evenly_spaced(cameras, MIN_COARSE_CAMERAS), strict=True):
         assert np.linalg.norm(rough.position - exact.position) < 3 * scale / COARSE_POSE_STEPS_PER_SCENE_SCALE
         np.testing.assert_allclose(rough.rotation, exact.rotation, atol=1e-4)
         np.testing.assert_allclose(rough.intrinsics, exact.intrinsics, atol=0.051)
@@ -99,7 +99,7 @@ def test_coarse_cameras_approximate_the_original_cameras(scale, away):
 def test_coarse_cameras_take_about_30_bytes_each():
     cameras = [replace(camera, fx=71.23456789, fy=71.3) for camera in ring(40)]
     kept = quantized_provenance({"cameras": provenance_cameras(cameras)}, 1.0)
-    assert len(zlib.compress(json.dumps(kept["coarse_cameras"]).encode(), 9)) < 45 * MAX_COARSE_CAMERAS
+    assert len(zlib.compress(json.dumps(kept["coarse_cameras"]).encode(), 9)) < 45 * MIN_COARSE_CAMERAS
 
 
 def test_invalid_cameras_and_viewpoints_are_omitted():

@@ -9,16 +9,18 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scenes import camera_at, ring
+from scenes import ball_scene, camera_at, ring
 from scipy.spatial.transform import Rotation
 
-from hyrfpack.cameras.capture import provenance_cameras, quantized_provenance
+from hyrfpack.cameras.capture import MIN_COARSE_CAMERAS, provenance_cameras, quantized_provenance, scene_provenance
 from hyrfpack.cameras.sampling import (
     COARSE_RATE_RATIO,
     DEFAULT_BACKGROUND_STRIDE,
     MAX_BACKGROUND_STRIDE,
     MAX_PIXEL_SIZE,
+    MAX_REPRESENTED_RATIO,
     MAX_SAMPLING_CAMERAS,
+    REPRESENTED_SHARE,
     PhotoCameras,
     select_representative_cameras,
 )
@@ -34,8 +36,8 @@ def along_z(z: float, focal: float = 50.0) -> Camera:
     return Camera(100, 80, focal, 0.8 * focal, 50.0, 40.0, pose)
 
 
-def pixel_sizes(cameras: list[Camera], points: list[list[float]], is_coarse: bool = False) -> list[float]:
-    sizes = PhotoCameras(cameras, is_coarse, 2).pixel_sizes(np.array(points, np.float32), FRAME_CENTER, FRAME_SCALE)
+def pixel_sizes(cameras: list[Camera], points: list[list[float]], rate_ratio: float = 1.0) -> list[float]:
+    sizes = PhotoCameras(cameras, rate_ratio, 2).pixel_sizes(np.array(points, np.float32), FRAME_CENTER, FRAME_SCALE)
     assert sizes is not None and sizes.dtype == np.float32
     return sizes.tolist()
 
@@ -60,7 +62,7 @@ def test_a_point_that_no_photo_sees_takes_the_highest_rate_by_distance():
 def test_points_in_a_rotated_frame_have_the_sizes_of_the_same_points_in_the_world():
     axes = Rotation.from_rotvec([0.4, -1.1, 2.0]).as_matrix()
     points = np.random.default_rng(1).normal(size=(500, 3))
-    photos = PhotoCameras([along_z(-2.0), along_z(-1.0, focal=100.0)], False, 2)
+    photos = PhotoCameras([along_z(-2.0), along_z(-1.0, focal=100.0)], 1.0, 2)
 
     straight, rotated = (
         photos.pixel_sizes(local.astype(np.float32), FRAME_CENTER, FRAME_SCALE, turn)
@@ -71,9 +73,9 @@ def test_points_in_a_rotated_frame_have_the_sizes_of_the_same_points_in_the_worl
     np.testing.assert_allclose(rotated, straight, rtol=1e-5)
 
 
-def test_coarse_cameras_are_taken_to_underestimate_the_rate():
-    exact, coarse = (pixel_sizes([along_z(-2.0)], [[0, 0, 0]], is_coarse) for is_coarse in (False, True))
-    assert coarse == pytest.approx([exact[0] / COARSE_RATE_RATIO], rel=1e-6)
+def test_sizes_are_divided_by_the_rate_ratio():
+    exact, fewer = (pixel_sizes([along_z(-2.0)], [[0, 0, 0]], ratio) for ratio in (1.0, 2.5))
+    assert fewer == pytest.approx([exact[0] / 2.5], rel=1e-6)
 
 
 def test_many_points_have_the_sizes_that_single_ones_have():
@@ -92,7 +94,7 @@ def test_without_cameras_nothing_is_known():
 def test_a_provenance_is_read_back():
     stored = json.loads(json.dumps({"cameras": provenance_cameras([along_z(-2.0), along_z(1.0, 90.0)])}))
     photos = PhotoCameras.from_provenance(stored)
-    assert provenance_cameras(photos.cameras) == stored["cameras"] and not photos.is_coarse
+    assert provenance_cameras(photos.cameras) == stored["cameras"] and photos.rate_ratio == 1
     assert photos.background_spacing == pytest.approx(DEFAULT_BACKGROUND_STRIDE / 90)
     assert PhotoCameras.from_provenance({**stored, "background_stride": 7}).background_spacing == pytest.approx(7 / 90)
 
@@ -101,7 +103,24 @@ def test_a_provenance_is_read_back():
 def test_invalid_cameras_count_as_missing(cameras):
     coarse = provenance_cameras([along_z(-2.0)])
     assert PhotoCameras.from_provenance({"cameras": cameras}).cameras == ()
-    assert PhotoCameras.from_provenance({"cameras": cameras, "coarse_cameras": coarse}).is_coarse
+    photos = PhotoCameras.from_provenance({"cameras": cameras, "coarse_cameras": coarse})
+    assert len(photos.cameras) == 1 and photos.rate_ratio == COARSE_RATE_RATIO
+
+
+@pytest.mark.parametrize("ratio", [0, 0.99, -2, True, "3", None, math.nan, math.inf, 1001, 10**400, [2]])
+def test_an_invalid_rate_ratio_counts_as_missing(ratio):
+    cameras = provenance_cameras([along_z(-2.0)])
+    assert PhotoCameras.from_provenance({"cameras": cameras, "rate_ratio": ratio}).rate_ratio == 1
+    assert (
+        PhotoCameras.from_provenance({"coarse_cameras": cameras, "rate_ratio": ratio}).rate_ratio == COARSE_RATE_RATIO
+    )
+
+
+@pytest.mark.parametrize("key", ["cameras", "coarse_cameras"])
+@pytest.mark.parametrize("ratio", [1, 1.25, 1000])
+def test_a_stored_rate_ratio_counts_for_all_cameras(key, ratio):
+    stored = {key: provenance_cameras([along_z(-2.0)]), "rate_ratio": ratio}
+    assert PhotoCameras.from_provenance(stored).rate_ratio == ratio
 
 
 @pytest.mark.parametrize("stride", [0, -1, 2.0, True, "3", None, MAX_BACKGROUND_STRIDE + 1, 10**30])
@@ -129,8 +148,9 @@ def test_forged_cameras_give_finite_sizes_and_no_warning(fx, fy, translation, sc
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         sizes = photos.pixel_sizes(points.astype(np.float32), (0, 0, 0), scale)
-        chosen = select_representative_cameras(photos.cameras, points, scale, 14)
-    assert sizes is not None and ((sizes >= 0) & (sizes <= MAX_PIXEL_SIZE)).all() and len(chosen) == 14
+        chosen, ratio = select_representative_cameras(photos.cameras, points, scale, 14, 16)
+    assert sizes is not None and ((sizes >= 0) & (sizes <= MAX_PIXEL_SIZE)).all() and 14 <= len(chosen) <= 16
+    assert 1 <= ratio <= 1000.1
 
 
 def test_representative_cameras_include_the_only_close_up():
@@ -138,8 +158,13 @@ def test_representative_cameras_include_the_only_close_up():
     close_up = camera_at((0.5, 0, 0), (0, 0, 0))
     cameras = [*around[:17], close_up, *around[17:]]
     points = np.random.default_rng(1).normal(scale=0.1, size=(500, 3))
-    chosen = select_representative_cameras(cameras, points, 1.0, 4)
-    assert len(chosen) == 4 and chosen[0] is cameras[0] and any(camera is close_up for camera in chosen)
+    chosen, ratio = select_representative_cameras(cameras, points, 1.0, 4, 30)
+    assert (
+        ratio <= MAX_REPRESENTED_RATIO
+        and len(chosen) == 4
+        and chosen[0] is cameras[0]
+        and any(camera is close_up for camera in chosen)
+    )
     assert [cameras.index(camera) for camera in chosen] == sorted(cameras.index(camera) for camera in chosen)
 
 
@@ -149,8 +174,8 @@ def test_cameras_beside_each_other_do_not_represent_a_scene():
     forward = [camera_at((0.1 * k, 0, 0), (5, 0, 0)) for k in range(9)]
     backward = [replace(camera, camera_from_world=back @ camera.camera_from_world) for camera in forward[:2]]
     points = np.concatenate([np.array([[3.0, 0, 0]] * 50), np.array([[-3.0, 0, 0]] * 50)])
-    chosen = select_representative_cameras([*forward, *backward], points, 1.0, 2)
-    sizes = PhotoCameras(chosen, False, 2).pixel_sizes(points.astype(np.float32), (0, 0, 0), 1.0)
+    chosen, _ = select_representative_cameras([*forward, *backward], points, 1.0, 2, 2)
+    sizes = PhotoCameras(chosen, 1.0, 2).pixel_sizes(points.astype(np.float32), (0, 0, 0), 1.0)
     assert sizes is not None
     focal = max(forward[0].fx, forward[0].fy)
     assert sizes[0] == pytest.approx(3 / focal, rel=1e-5) and sizes[-1] == pytest.approx(3 / focal, rel=1e-5)
@@ -160,6 +185,44 @@ def test_packed_files_keep_representative_cameras():
     cameras = [*ring(30, radius=6.0), camera_at((0.5, 0, 0), (0, 0, 0))]
     points = np.random.default_rng(1).normal(scale=0.1, size=(500, 3))
     kept = quantized_provenance({"cameras": provenance_cameras(cameras)}, 1.0, points)
-    every = PhotoCameras(cameras, False, 2).pixel_sizes(points.astype(np.float32), (0, 0, 0), 1.0)
+    every = PhotoCameras(cameras, 1.0, 2).pixel_sizes(points.astype(np.float32), (0, 0, 0), 1.0)
     found = PhotoCameras.from_provenance(kept).pixel_sizes(points.astype(np.float32), (0, 0, 0), 1.0)
     np.testing.assert_allclose(found * COARSE_RATE_RATIO, every, rtol=0.02)
+
+
+def walk_through(count: int) -> tuple[list[Camera], np.ndarray]:
+    """Return cameras along a street that look sideways, and points on its wall, which only the nearest cameras show."""
+    cameras = [camera_at((2.0 * k, 0, 0), (2.0 * k, 1, 0)) for k in range(count)]
+    rng = np.random.default_rng(2)
+    wall = [rng.uniform(-1, 2 * count, 3000), rng.uniform(1, 3, 3000), rng.uniform(-0.5, 0.5, 3000)]
+    return cameras, np.stack(wall, axis=1)
+
+
+def sizes_of(photos: PhotoCameras, points: np.ndarray) -> np.ndarray:
+    sizes = photos.pixel_sizes(points.astype(np.float32), (0, 0, 0), 1.0)
+    assert sizes is not None
+    return sizes
+
+
+def test_files_of_long_walks_keep_more_cameras():
+    cameras, points = walk_through(60)
+    kept = json.loads(json.dumps(quantized_provenance({"cameras": provenance_cameras(cameras)}, 1.0, points)))
+    found, every = sizes_of(PhotoCameras.from_provenance(kept), points), sizes_of(PhotoCameras(cameras, 1.0, 2), points)
+    assert MIN_COARSE_CAMERAS < len(kept["coarse_cameras"]) < len(cameras)
+    assert (found <= 1.01 * every).mean() >= REPRESENTED_SHARE - 0.02  # they were selected by some of the points
+    assert quantized_provenance(kept, 1.0, points) == kept
+
+
+def test_where_no_allowed_number_of_cameras_represents_all_photos_their_rate_ratio_is_kept():
+    cameras, points = walk_through(1000)
+    views = [replace(view, camera=camera) for view, camera in zip(ball_scene(1).train * 1000, cameras, strict=True)]
+    scene = replace(ball_scene(1), train=views, test=[], points=points)
+    every = sizes_of(PhotoCameras(cameras, 1.0, 2), points)
+
+    raw = json.loads(json.dumps(scene_provenance(scene)))
+    packed = json.loads(json.dumps(quantized_provenance(raw, 1.0, points)))
+
+    for kept in (raw, packed):
+        photos = PhotoCameras.from_provenance(kept)
+        assert len(photos.cameras) <= MAX_SAMPLING_CAMERAS and photos.rate_ratio > MAX_REPRESENTED_RATIO
+        assert (sizes_of(photos, points) <= 1.01 * every).mean() >= REPRESENTED_SHARE - 0.02

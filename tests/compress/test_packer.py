@@ -13,7 +13,7 @@ import torch
 from scenes import ball_points, ball_scene, small_model
 
 import hyrfpack
-from hyrfpack.cameras.capture import MAX_COARSE_CAMERAS, provenance_cameras, quantized_provenance
+from hyrfpack.cameras.capture import MIN_COARSE_CAMERAS, provenance_cameras, quantized_provenance
 from hyrfpack.compress import compress_model, limits, run
 from hyrfpack.compress import packer as running
 from hyrfpack.compress.calibrate import measure_calibrated_sensitivity
@@ -333,7 +333,7 @@ def test_provenance_is_kept_with_a_sample_of_cameras(compact_file_and_report, pa
 
     expected = quantized_provenance(before, raw["config"]["frame"]["scale"])
     assert after == describe_file(paper_file)["provenance"] == expected
-    assert 0 < len(after["coarse_cameras"]) <= MAX_COARSE_CAMERAS and "cameras" in before and "cameras" not in after
+    assert 0 < len(after["coarse_cameras"]) <= MIN_COARSE_CAMERAS and "cameras" in before and "cameras" not in after
 
 
 def test_a_compressed_file_can_be_recompressed_and_unpacked_exactly(paper_file, scene, tmp_path):

@@ -1,11 +1,12 @@
-// Limits how finely a view samples a model: no more finely than the model's photos did, because training has never seen
-// finer detail (docs/reference/format.md 2.10).
+// Limits how finely a view samples a model: no more finely than its photos did, as training has seen no finer detail
+// (docs/reference/format.md 2.10).
 
 import { storedCameras, toLocalView } from "./viewpoint.js";
 
 const PICTURE_MARGIN_RATIO = 0.15; // positions in this margin count as visible; in sizes of the picture
 const MIN_DEPTH_LOCAL = 0.01;
-const COARSE_RATE_RATIO = 1.1; // the few coarse cameras underestimate the rate of all photos
+const COARSE_RATE_RATIO = 1.1; // coarse cameras underestimate the rate of all photos
+const MAX_RATE_RATIO = 1e3;
 const MAX_CAMERAS = 128; // bounds the time that a forged file can take
 const MAX_SIZE_LOCAL = 1e6; // larger ones come from broken cameras
 const DEFAULT_BACKGROUND_STRIDE = 2;
@@ -18,8 +19,7 @@ const NUMBERS_PER_VIEW = 20; // see `packViews`
 /**
  * Computes the pixel size of the photos at positions: q = min over the cameras of the file that see the position of
  * z / f, with f = max(fx, fy) and the depth z in local units. Where no camera sees it, q is the minimum over all
- * cameras of distance / f. If the file keeps only coarse cameras, q is divided by COARSE_RATE_RATIO. Of a long list of
- * cameras the first MAX_CAMERAS count.
+ * cameras of distance / f. It is divided by the rate of all photos relative to theirs.
  *
  * @param {Float32Array} positions 3 n, in local units
  * @param {Metadata} metadata the checked metadata of the model
@@ -27,8 +27,8 @@ const NUMBERS_PER_VIEW = 20; // see `packViews`
  *   or if these give no sensible size
  */
 export function pixelSizes(positions, metadata) {
-  const sizes = new Float32Array(positions.length / 3), { cameras, isCoarse } = samplingCameras(metadata);
-  const views = packViews(cameras, metadata.config.frame), ratio = isCoarse ? 1 / COARSE_RATE_RATIO : 1;
+  const sizes = new Float32Array(positions.length / 3), { cameras, ratio } = samplingCameras(metadata);
+  const views = packViews(cameras, metadata.config.frame);
   for (let i = 0, p = 0; i < sizes.length; i++, p += 3) {
     const x = positions[p], y = positions[p + 1], z = positions[p + 2];
     let smallest = Infinity;
@@ -41,19 +41,20 @@ export function pixelSizes(positions, metadata) {
       if (down >= views[k + 15] * depth && down <= views[k + 16] * depth) smallest = size;
     }
     if (smallest === Infinity) smallest = smallestByDistance(views, x, y, z);
-    const size = ratio * smallest;
+    const size = smallest / ratio;
     sizes[i] = size <= MAX_SIZE_LOCAL ? size : 0;
   }
   return sizes;
 }
 
 /**
- * Returns the cameras of a file that count, at most MAX_CAMERAS.
+ * Returns the first MAX_CAMERAS cameras of a file, and the rate of all photos relative to theirs.
  * @param {Metadata} metadata
  */
 function samplingCameras(metadata) {
-  const { cameras, isCoarse } = storedCameras(metadata);
-  return { cameras: cameras.slice(0, MAX_CAMERAS), isCoarse };
+  const { cameras, isCoarse } = storedCameras(metadata), stored = metadata.provenance?.rate_ratio;
+  const isValid = Number.isFinite(stored) && stored >= 1 && stored <= MAX_RATE_RATIO;
+  return { cameras: cameras.slice(0, MAX_CAMERAS), ratio: isValid ? stored : isCoarse ? COARSE_RATE_RATIO : 1 };
 }
 
 /**

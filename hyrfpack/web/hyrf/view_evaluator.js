@@ -2,10 +2,11 @@
 
 import { BACKGROUND_RADIUS, backgroundColors, colorsAlong, decodeGeometry, firstLayers } from "./fields.js";
 import { CULL_MARGIN_RATIO, NEAR_PLANE_LOCAL, frustumPlanes } from "./frustum.js";
-import { rowsOf } from "./rotation.js";
+import { rotateBack, rowsOf } from "./rotation.js";
 import { RowStates, rowBalls } from "./row_states.js";
 import { backgroundSpacing, pixelSizes } from "./sampling.js";
 import { DepthSort } from "./sort.js";
+import { mul } from "./vectors.js";
 
 /** The number of Gaussians of a row, which are evaluated together. */
 export const GAUSSIANS_PER_ROW = 2048;
@@ -92,7 +93,8 @@ export class ViewEvaluator {
    * @returns {Generator<EvaluatedRow | SkyTile, void>}
    */
   *evaluate(view, onComplete) {
-    const sides = frustumPlanes(view, CULL_MARGIN_RATIO), skySides = frustumPlanes(view, 0), eye = eyeOf(view);
+    const sides = frustumPlanes(view, CULL_MARGIN_RATIO), skySides = frustumPlanes(view, 0);
+    const eye = mul(rotateBack(view.rows, view.translation), -1);
     if (!this.hasCoarseSky) {
       this.hasCoarseSky = true;
       yield this.skyTile(cutTiles(2 * COARSE_SKY_HEIGHT_PIXELS, COARSE_SKY_HEIGHT_PIXELS, true)[0], eye);
@@ -163,13 +165,6 @@ export class ViewEvaluator {
     return { isCoarse, x, y, width, height, pixels };
   }
 }
-
-/**
- * Returns the position of the eye of a view.
- * @param {View} view
- */
-const eyeOf = ({ rows, translation }) =>
-  [0, 1, 2].map((axis) => -rows.reduce((sum, row, k) => sum + row[axis] * translation[k], 0));
 
 /**
  * Returns the unit vectors from the eye to places. A place at the eye has the direction 0.

@@ -76,9 +76,7 @@ const roundHalfToEven = (value) => (value % 1 === 0.5 ? 2 * Math.round(value / 2
  * @param {Camera} camera
  * @returns {number[]}
  */
-export function cameraPosition({ camera_from_world: pose }) {
-  return [0, 1, 2].map((k) => -(pose[0][k] * pose[0][3] + pose[1][k] * pose[1][3] + pose[2][k] * pose[2][3]));
-}
+export const cameraPosition = ({ camera_from_world: pose }) => mul(rotateBack(pose, pose.map((row) => row[3])), -1);
 
 /**
  * Converts a camera to a view in a model's local units, with the position of its eye.

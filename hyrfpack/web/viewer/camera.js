@@ -36,10 +36,9 @@ export function viewOf({ width, height, fx, fy, cx, cy, camera_from_world: pose 
   if (!(fx > 0 && fy > 0)) throw new Error("fx and fy must be above 0");
   const worldRows = pose.slice(0, 3).map((row) => row.slice(0, 3)), axes = frameAxes(scene);
   if (!isRigid(worldRows)) throw new Error("the first three columns of camera_from_world must be a rotation");
-  const translation = pose.slice(0, 3).map((row) => (dot(row, scene.center) + row[3]) / scene.unit);
+  const translation = worldRows.map((row, k) => (dot(row, scene.center) + pose[k][3]) / scene.unit);
   const rows = worldRows.map((row) => rotateBack(axes, row));
-  const eye = [0, 1, 2].map((k) => -rows.reduce((sum, row, r) => sum + row[k] * translation[r], 0));
-  return { rows, translation, eye, width, height, fx, fy, cx, cy };
+  return { rows, translation, eye: mul(rotateBack(rows, translation), -1), width, height, fx, fy, cx, cy };
 }
 
 // Converts a view to a camera in world units: the inverse of `viewOf`.

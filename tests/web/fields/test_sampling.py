@@ -99,6 +99,17 @@ def test_coarse_cameras_count_only_without_exact_ones_and_for_a_tenth_more(tmp_p
     )
 
 
+@pytest.mark.parametrize(
+    ("stored", "counts"), [(2.5, 2.5), (1, 1), *((wrong, None) for wrong in (0.9, 1001, "2", True))]
+)
+def test_sizes_are_divided_by_the_rate_ratio_of_the_file(tmp_path: Path, stored: Any, counts: float | None) -> None:
+    for key, default in (("cameras", 1.0), ("coarse_cameras", 1.1)):
+        found = sample_in_node(tmp_path, provenance_of([axis_camera(4.0)], key, rate_ratio=stored))
+
+        expected = 4 / FOCAL_PIXELS / (counts or default)
+        np.testing.assert_allclose(found["sizes"], [expected], rtol=FLOAT32_ROUNDING)
+
+
 def test_forged_cameras_limit_nothing_and_take_no_long_time(tmp_path: Path) -> None:
     far, near = (camera_to_numbers(axis_camera(distance)) for distance in (4.0, 2.0))
     blurred = [*far[:2], 1e-9, 1e-9, *far[4:]]

@@ -3,8 +3,7 @@ export type Metadata = import("./metadata.js").Metadata;
 /**
  * Computes the pixel size of the photos at positions: q = min over the cameras of the file that see the position of
  * z / f, with f = max(fx, fy) and the depth z in local units. Where no camera sees it, q is the minimum over all
- * cameras of distance / f. If the file keeps only coarse cameras, q is divided by COARSE_RATE_RATIO. Of a long list of
- * cameras the first MAX_CAMERAS count.
+ * cameras of distance / f. It is divided by the rate of all photos relative to theirs.
  *
  * @param {Float32Array} positions 3 n, in local units
  * @param {Metadata} metadata the checked metadata of the model

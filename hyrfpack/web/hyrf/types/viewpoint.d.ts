@@ -50,7 +50,7 @@ export declare function evenlySpaced<Item>(items: Item[], count: number): Item[]
  * @param {Camera} camera
  * @returns {number[]}
  */
-export declare function cameraPosition({ camera_from_world: pose }: Camera): number[];
+export declare const cameraPosition: ({ camera_from_world: pose }: Camera) => number[];
 /**
  * Converts a camera to a view in a model's local units, with the position of its eye.
  * @param {Camera} camera
