@@ -150,6 +150,16 @@ class FakeEvent:
             target.copy_(source)
 
 
+class FakeGenerator(torch.Generator):
+    """A generator of random numbers that gives those of the CPU on every device."""
+
+    def __new__(cls, device: str | torch.device = "cpu") -> FakeGenerator:
+        return super().__new__(cls, "cpu")
+
+    def __init__(self, device: str | torch.device = "cpu") -> None:
+        super().__init__()
+
+
 # These operations only allocate memory, or answer without looking at the values.
 OPERATIONS_WITHOUT_LAUNCH = (
     "_unsafe_view",
@@ -300,6 +310,7 @@ def use_fake_gpu() -> Iterator[torch.device]:
         mock.patch.object(torch.cuda, "is_bf16_supported", lambda *_: True),
         mock.patch.object(interpreter.GridExecutor, "__call__", on_the_cpu),
         mock.patch.object(devices, "load_or_run_self_test", lambda device: SelfTest("gpu", str(device), ())),
+        mock.patch.object(torch, "Generator", FakeGenerator),
         mock.patch.object(torch.Tensor, "to", _move),
         mock.patch.object(torch.Tensor, "cpu", lambda tensor: _move(tensor, "cpu")),
         mock.patch.multiple(torch, **{name: _wrap_factory(getattr(torch, name)) for name in TENSOR_FACTORIES}),

@@ -11,6 +11,7 @@ from hyrfpack.cameras.view_sampling import sample_views
 from hyrfpack.compress.sensitivity import (
     choose_windows,
     combine_with_prior,
+    draw_signs,
     expected_opacity_sensitivity,
     measure_sensitivity,
     removal_error,
@@ -38,14 +39,14 @@ def measure_removals(
     logits = [part.gaussians.opacity_logits for part in model.parts]
     required = [values.requires_grad for values in logits]
     squares = [torch.zeros_like(values) for values in logits]
-    generator, pixels = torch.Generator().manual_seed(seed), 0
+    generator, pixels = torch.Generator(logits[0].device).manual_seed(seed), 0
     try:
         for values in logits:
             values.requires_grad_(True)
         for number, camera in enumerate(views):
             progress(TaskEvent(f"measuring sensitivities, view {number + 1}/{len(views)}", number / len(views)))
             rgb = render_view(model, camera).rgb
-            signs = torch.randint(0, 2, rgb.shape, generator=generator).to(rgb) * 2 - 1
+            signs = draw_signs(rgb, generator)
             pixels += rgb.numel()
             if rgb.requires_grad:
                 gradients = torch.autograd.grad((rgb * signs).sum(), logits, allow_unused=True)

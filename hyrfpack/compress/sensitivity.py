@@ -123,7 +123,7 @@ def measure_sensitivity(
     Args:
         model: the model to measure.
         cameras: viewpoints typical of how the model will be viewed; world units.
-        seed: random seed of the signs and of the views between cameras.
+        seed: random seed of the signs, which a device draws itself, and of the views between cameras.
         progress: called with `TaskEvent`s.
         drawn: about how many Gaussians are drawn in all views together; more make the measurement less noisy.
 
@@ -133,7 +133,7 @@ def measure_sensitivity(
     windows = choose_windows(cameras, len(model), drawn, seed)
     views, are_pictures = windows.views, windows.columns * windows.rows == 1
     field_interval = max(1, round(1 / FIELD_VIEW_SHARE))
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator(model.gaussians.positions.device).manual_seed(seed)
     squares = {name: torch.zeros_like(parameter) for name, parameter in model.named_parameters()}
     squares |= {f"gaussians.{name}": torch.zeros_like(values) for name, values in _residuals(model).items()}
     jacobian = _cube_jacobian(model)
@@ -156,7 +156,7 @@ def measure_sensitivity(
         for values in residuals.values():
             values.requires_grad_(True)
         rgb = render_view(shown, camera).rgb
-        signs = torch.randint(0, 2, rgb.shape, generator=generator).to(rgb) * 2 - 1
+        signs = draw_signs(rgb, generator)
         if rgb.requires_grad:
             (rgb * signs).sum().backward()
         pixels += rgb.numel()
@@ -177,6 +177,12 @@ def measure_sensitivity(
         parameter.requires_grad_(required[name])
     at, _ = sample_views(cameras, len(views) // 2, seed)
     return _combine(model, squares, pixels, field_pixels, at, windows.pictures, jacobian)
+
+
+def draw_signs(image: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+    """Draw a random sign, 1 or -1, for each number of an image, on the device of the image and of the generator."""
+    bits = torch.randint(0, 2, image.shape, generator=generator, dtype=torch.int8, device=image.device)
+    return bits.to(image.dtype) * 2 - 1
 
 
 def _residuals(model: HybridModel) -> dict[str, torch.Tensor]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from fake_gpu import listen_to_transfers, use_fake_gpu
+from ops.device import IS_INTERPRETED, needs_triton
 from scenes import ball_points, ring, small_model
 
 from hyrfpack.cameras.view_sampling import interpolate_views
@@ -17,6 +19,7 @@ from hyrfpack.ops.contraction import contract, expand
 from hyrfpack.render import render_view
 from hyrfpack.scene import Camera
 
+MAX_CAMERA_ELEMENTS = 64  # of cameras and bounds, fewer than the numbers of any picture or parameter
 RING_CAMERAS = ring(48, elevation=1.2, width=16, height=16)
 
 
@@ -273,3 +276,26 @@ def test_an_estimate_of_zero_gives_the_mean_of_the_measurements(guess):
 
     assert (combined >= measured / 2).all() and (combined <= 19).all()
     assert combined.mean() == pytest.approx(measured.mean(), rel=0.1)
+
+
+@needs_triton
+@pytest.mark.skipif(not IS_INTERPRETED, reason="the transfers of a fake GPU are counted")
+def test_a_gpu_draws_signs_itself_and_accumulates_squares(monkeypatch):
+    for name in ("MIN_SENSITIVITY_VIEWS", "MAX_SENSITIVITY_VIEWS"):
+        monkeypatch.setattr(f"hyrfpack.compress.sensitivity.{name}", 4)
+    model, cameras = ball_model(), ring(4, elevation=1.2, width=12, height=12)
+    model.precision = "float32"
+    expected = measure_sensitivity(model, cameras)
+    views, elements = [], []
+    with use_fake_gpu() as device:
+        model = model.to(device)
+        # The arrays that the last view needs are copied after it, together with the results.
+        with listen_to_transfers(lambda direction, count: elements.append((len(views), count))):
+            found = measure_sensitivity(model, cameras, progress=views.append)
+    assert len(views) == 4
+    assert max(count for view, count in elements if 0 < view < 4) <= MAX_CAMERA_ELEMENTS
+    # The fake GPU draws the signs of the CPU.
+    for name in ("positions", "colors", "scales", "opacities", "removals"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-3, err_msg=name)
+    for group, values in expected.fields.items():
+        np.testing.assert_allclose(found.fields[group], values, rtol=1e-3, atol=1e-3 * values.max(), err_msg=group)
