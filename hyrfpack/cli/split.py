@@ -7,7 +7,15 @@ from typing import Any
 
 import click
 
-from hyrfpack.cli.common import format_table, json_option, overwrite_option, print_json, resolve_model_file
+from hyrfpack.cli.common import (
+    format_table,
+    json_option,
+    overwrite_option,
+    print_json,
+    read_scene,
+    resolve_model_file,
+    scene_options,
+)
 from hyrfpack.cli.settings import settings_options
 from hyrfpack.cli.types import OUTPUT, PATH
 from hyrfpack.config.split import SplitConfig
@@ -16,10 +24,24 @@ from hyrfpack.config.split import SplitConfig
 @click.command(short_help="Split a model into chunks with levels of detail.")
 @click.argument("model", type=PATH)
 @click.option("-o", "--output", type=OUTPUT, metavar="DIR", required=True, help="The folder to write.")
+@click.option(
+    "--data",
+    type=PATH,
+    help="Photos and poses, at whose cameras levels are fitted and measured.  [default: the cameras that MODEL keeps]",
+)
 @settings_options(SplitConfig, "chunk_gaussians", "levels", "refit_steps", "title", "licence", "seed")
 @overwrite_option
+@scene_options
 @json_option
-def split(model: Path, output: Path, overwrite: bool, as_json: bool, **settings: Any) -> None:
+def split(
+    model: Path,
+    output: Path,
+    data: Path | None,
+    overwrite: bool,
+    reader_options: dict[str, Any],
+    as_json: bool,
+    **settings: Any,
+) -> None:
     """Split MODEL, a .hyrf file or the folder of a run, into a scene folder: scene.json and chunks beside it.
 
     Each chunk is a .hyrf file of nearby Gaussians, at several levels of detail. The finest level of all chunks is the
@@ -28,14 +50,16 @@ def split(model: Path, output: Path, overwrite: bool, as_json: bool, **settings:
 
     \b
     Examples:
-      hyrfpack split city.hyrf -o city-scene
+      hyrfpack split city.hyrf -o city-scene --data photos/city
       hyrfpack split city.hyrf -o city-scene --chunk-gaussians 50000 --levels 5
       hyrfpack render city-scene -o walk --cameras walk.json --gaussians 500000
     """
-    resolve_model_file(model)
+    file = resolve_model_file(model)
+    from hyrfpack.format import describe_file
     from hyrfpack.lod import split_model
 
-    report = split_model(model, output, SplitConfig(**settings), overwrite=overwrite)
+    scene = None if data is None else read_scene(data, reader_options, describe_file(file))
+    report = split_model(model, output, SplitConfig(**settings), data=scene, overwrite=overwrite)
     if as_json:
         print_json(report.to_dict())
         return

@@ -41,7 +41,7 @@ from hyrfpack.model.merged import MergedModel, parts_of
 from hyrfpack.ops.transfer import tensor_like
 from hyrfpack.outputs import Outputs, StrPath
 from hyrfpack.progress import Progress, TaskEvent, part_of_progress
-from hyrfpack.scene import Camera, evenly_spaced
+from hyrfpack.scene import Camera, Scene, evenly_spaced
 
 _LOG = logging.getLogger(__name__)
 
@@ -90,6 +90,7 @@ def split_model(
     target: StrPath,
     config: SplitConfig | None = None,
     *,
+    data: Scene | None = None,
     overwrite: bool = True,
     context: RunContext = RunContext(),  # noqa: B008 - frozen
 ) -> SplitReport:
@@ -97,19 +98,21 @@ def split_model(
 
     The finest level of all chunks is the model: positions and fields are kept exactly, logits exactly or with steps
     finer than those of the file. Coarser levels are merged, fitted to renders of the model, and their errors in
-    pictures are measured at the cameras that the file keeps. Each part of a merged file has chunks of its own, but
-    pictures show all parts.
+    pictures are measured, at and between the cameras of `data` or of the file. Each part of a merged file has chunks of
+    its own, but pictures show all parts.
 
     Args:
         source: a `.hyrf` file or the folder of a run.
         target: folder to write; created if it is missing.
         config: the settings; None for the defaults.
+        data: photos of the scene, whose training cameras are used. A compressed file keeps few cameras, so errors of
+            its levels fit views near the photos less well.
         overwrite: replace a scene in the folder. If False, existing files are an error.
         context: how progress is shown.
 
     Raises:
         HyrfError: the file cannot be read or holds no Gaussian, or the folder cannot be written.
-        TypeError: `config` is not a SplitConfig.
+        TypeError: `config` is not a SplitConfig, or `data` is not a Scene.
 
     Example:
         >>> import hyrfpack
@@ -120,15 +123,17 @@ def split_model(
     """
     config = SplitConfig() if config is None else config
     check_type("config", config, SplitConfig)
+    if data is not None:
+        check_type("data", data, Scene)
     if is_scene(source):
         raise HyrfError(f"{source}: this is a scene of several files already", fix="split the model that it came from")
     path, target = find_model(source), Path(target)
     shared_names = _name_shared_files(path)
-    Outputs(path, overwrite=True).folder(target, [MANIFEST_NAME, *shared_names])
+    Outputs(path, scene=data, overwrite=True).folder(target, [MANIFEST_NAME, *shared_names])
     with exclusive_folder(target), context.open_progress("split") as progress:
-        Outputs(path, overwrite=overwrite).folder(target, [MANIFEST_NAME, *shared_names])
-        files, manifest = _split(path, shared_names, Path(source).stem, config, progress)
-        Outputs(path, overwrite=overwrite).folder(target, files)
+        Outputs(path, scene=data, overwrite=overwrite).folder(target, [MANIFEST_NAME, *shared_names])
+        files, manifest = _split(path, shared_names, Path(source).stem, config, data, progress)
+        Outputs(path, scene=data, overwrite=overwrite).folder(target, files)
         _write_folder(target, files, manifest, overwrite)
     levels = list(zip(*(chunk.levels for chunk in manifest.chunks), strict=True))
     level_bytes = [sum(item.bytes for item in level) for level in levels]
@@ -185,13 +190,13 @@ def _name_shared_files(path: Path) -> list[str]:
 
 
 def _split(
-    path: Path, shared_names: Sequence[str], name: str, config: SplitConfig, progress: Progress
+    path: Path, shared_names: Sequence[str], name: str, config: SplitConfig, photos: Scene | None, progress: Progress
 ) -> tuple[dict[str, bytes], Manifest]:
     """Return the files of the folder by name, without the manifest, and the manifest."""
     progress(TaskEvent("reading the model", 0.0))
     facts = describe_file(path)
     whole, parts = _read_parts(path, shared_names, config.chunk_gaussians)
-    cameras = _list_cameras(facts)
+    cameras = [view.camera for view in photos.train] if photos and photos.train else _list_cameras(facts)
     owners = [number for number, part in enumerate(parts) for _ in part.groups]
     encoded = [[data] for part in parts for data in part.finest]
     models = [[part.model.subset(torch.from_numpy(group)) for part in parts for group in part.groups]]
@@ -220,7 +225,7 @@ def _split(
             stated = tuple(float(f"{error:.4g}") for error in errors[level, number])
             levels.append(ChunkLevel(file, len(data), _checksum(data), len(models[level][number]), stated))
         chunks.append(Chunk(low, high, tuple(levels), owners[number]))
-    return files, _make_manifest(parts, chunks, Capture(facts), name, config)
+    return files, _make_manifest(parts, chunks, Capture(facts, photos), name, config)
 
 
 def _read_parts(

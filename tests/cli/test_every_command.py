@@ -77,6 +77,7 @@ ALL_CASES = [
     Case("edit model.hyrf --data blender --center -o new.hyrf --picture {}", "blender/train/r_0.png"),
     Case("merge first soft.hyrf -o {}", "first/model.hyrf"),
     Case("split first -o {} --levels 1", "first/model.hyrf"),
+    Case("split model.hyrf --data hall -o {} --levels 1", "hall/sparse/0"),
     Case("render model.hyrf --data blender -o {}", "blender/train"),
     Case("render model.hyrf --cameras nerfstudio/transforms.json -o {}", "nerfstudio/transforms.json"),
     Case("evaluate model.hyrf --data blender --lpips-weights lpips.pth --pictures {}", "lpips.pth"),

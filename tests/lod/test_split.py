@@ -15,8 +15,10 @@ import pytest
 import torch
 from commands import hyrfpack, refused, succeeded
 from json_schema import matches
+from scenes import ball_scene
 
 from hyrfpack.cameras.capture import Capture
+from hyrfpack.cameras.files import camera_to_numbers
 from hyrfpack.config.split import SplitConfig
 from hyrfpack.context import RunContext
 from hyrfpack.errors import HyrfError, HyrfFormatError
@@ -28,6 +30,7 @@ from hyrfpack.format.scene_folder import SceneFolder, is_scene, single_file
 from hyrfpack.format.sections import SECTION_CONTENTS
 from hyrfpack.format.shared import CODEC_SHARED
 from hyrfpack.lod import LevelRenderer, split, split_model
+from hyrfpack.lod.errors import ERROR_RADII
 from hyrfpack.render import render_view
 from tools.safety import minimal_reader
 from tools.safety.make_golden import GOLDEN_FOLDER, GOLDEN_SCENE_FOLDER, GOLDEN_SCENE_SOURCE
@@ -198,6 +201,27 @@ def test_a_budget_that_shows_nothing_is_refused(folder, limit):
     LevelRenderer(scene, **{limit: least})
     with pytest.raises(HyrfError, match=f"no chunk can be drawn within {least - 1:,} .*allow at least {least:,}"):
         LevelRenderer(scene, **{limit: least - 1})
+
+
+def test_levels_are_fitted_and_measured_at_the_cameras_of_the_photos(tmp_path, monkeypatch):
+    scene, used = ball_scene(6), []
+
+    def record(levels, spheres, cameras, *rest):
+        used.extend(cameras)
+        return np.zeros((len(levels), len(spheres), len(ERROR_RADII)))
+
+    monkeypatch.setattr(split, "measure_level_errors", record)
+    monkeypatch.setattr(split, "MEASURED_VIEWS", 3)
+    config = SplitConfig(chunk_gaussians=400, levels=2, refit_steps=1)
+    split_model(COMPACT_FILE, tmp_path / "scene", config, data=scene, context=QUIET_CONTEXT)
+
+    photographed = [view.camera for view in scene.train]
+    stored = SceneFolder(tmp_path / "scene").manifest.cameras
+    assert [list(row) for row in stored] == [camera_to_numbers(camera) for camera in photographed]
+    assert len(used) == 3 and {camera.fx for camera in used} == {photographed[0].fx}
+    assert photographed[0].fx not in {camera.fx for camera in Capture(describe_file(COMPACT_FILE)).cameras}
+    with pytest.raises(TypeError, match="data"):
+        split_model(COMPACT_FILE, tmp_path / "scene", config, data=photographed, context=QUIET_CONTEXT)
 
 
 def test_a_zip_of_the_folder_is_read_like_the_folder(folder, tmp_path):

@@ -119,7 +119,9 @@ def main() -> None:
         file = model_file.with_name(COMPACT_FILE)
         with tempfile.TemporaryDirectory() as temporary:
             folder = Path(temporary, name)
-            report = hyrfpack.split_model(file, folder, SplitConfig(arguments.chunk_gaussians), context=QUIET)
+            report = hyrfpack.split_model(
+                file, folder, SplitConfig(arguments.chunk_gaussians), data=scene, context=QUIET
+            )
             finest_rows.append(measure_finest(name, file, folder, scene, report))
             print(finest_rows[-1], report.level_bytes, flush=True)
             view_rows += measure_views(name, folder, scene)
