@@ -290,10 +290,11 @@ def _accumulate_colors(
     sums = np.zeros((6 * 4**MAX_CELL_LEVEL, 5))
 
     def add(points: Tensor, colors: Tensor, weights: np.ndarray) -> None:
-        values, cells = colors.double().numpy(), find_cells(points.double().numpy(), MAX_CELL_LEVEL)
+        values = colors.double().numpy()
+        # Few of the cells are in one picture, so sums over all of them would take longer than the picture.
+        cells, rows = np.unique(find_cells(points.double().numpy(), MAX_CELL_LEVEL), return_inverse=True)
         columns = np.column_stack((np.ones(len(values)), values, (values**2).sum(1)))
-        for total, column in zip(sums.T, columns.T, strict=True):
-            total += np.bincount(cells, weights * column, len(sums))
+        sums[cells] += np.column_stack([np.bincount(rows, weights * column, len(cells)) for column in columns.T])
 
     net = torch.from_numpy(cell_centers(np.arange(6 * 4 ** (MIN_CELL_LEVEL + 2)), MIN_CELL_LEVEL + 2)[0]).float()
     add(net, _sphere_colors(model, net), np.full(len(net), UNSEEN_COLOR_WEIGHT))
