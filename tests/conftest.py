@@ -48,8 +48,16 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 
 from layers import forbid_training_and_processes, layer_of
 from ops.device import needs_triton  # this import asks for Triton, which reads the environment set above
+from property_tests import use_quick_profile
 
 from hyrfpack.atomic import write_atomic
+from hyrfpack.evaluate.figures import figure_to_svg
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Draw fewer examples of property tests where acceptance tests are left out, as in `make test`."""
+    if "not acceptance" in config.option.markexpr:
+        use_quick_profile()
 
 
 def pytest_itemcollected(item: pytest.Item) -> None:
@@ -103,6 +111,27 @@ def skip_drawing_curves() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("hyrfpack.train.results.draw_training_curve", write_pixel)
         yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def skip_drawing_figures() -> Iterator[None]:
+    """Embed an empty figure in the pages of reports, because drawing one takes as long as all else in a page."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("hyrfpack.report.page.figure_to_svg", lambda figure: '<svg xmlns="http://www.w3.org/2000/svg"/>')
+        yield
+
+
+@pytest.fixture
+def drawn_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draw the figures of reports in this test."""
+    monkeypatch.setattr("hyrfpack.report.page.figure_to_svg", figure_to_svg)
+
+
+@pytest.fixture
+def quick_distances(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Measure distances between meshes at a tenth of the points."""
+    monkeypatch.setattr("hyrfpack.mesh.solid.DISTANCE_POINTS", 2_000)
+    monkeypatch.setattr("hyrfpack.mesh.solid.DISTANCE_SAMPLES", 20_000)
 
 
 @pytest.fixture

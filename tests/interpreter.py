@@ -198,10 +198,15 @@ def fill_new_memory_with_nan() -> None:
     torch.Tensor.new_empty = _filled(torch.Tensor.new_empty)
 
 
+@cache
+def _is_gpu_module(name: str) -> bool:
+    return _GPU_MODULE.fullmatch(name) is not None
+
+
 def _filled(allocate: Callable[..., torch.Tensor]) -> Callable[..., torch.Tensor]:
     def make(*args: Any, **kwargs: Any) -> torch.Tensor:
         memory = allocate(*args, **kwargs)
-        if _GPU_MODULE.fullmatch(sys._getframe(1).f_globals.get("__name__", "")):
+        if _is_gpu_module(sys._getframe(1).f_globals.get("__name__", "")):
             # The fake GPU counts what is done to its own tensors.
             memory_on_cpu = getattr(memory, "cpu_tensor", memory)
             if memory.is_floating_point():

@@ -2,7 +2,8 @@
 
 - `unit` tests train nothing and start no process.
 - `integration` tests may train on tiny scenes, run commands and start short scripts.
-- `acceptance` tests run browsers, several processes, kills, compilers and maintainers' tools.
+- `acceptance` tests run browsers, several processes, kills, compilers and maintainers' tools, and further cases of
+  slow tests, of which the other layers run those that differ most.
 
 `make test` runs the first two and those acceptance tests that have the mark `smoke`, too: a thin slice with browsers,
 several processes and a kill. `make test-all` runs everything. A mark at the test or its module decides on the layer;

@@ -44,6 +44,8 @@ def list_public_functions() -> Iterator[tuple[str, object]]:
 
 
 PUBLIC_FUNCTIONS = dict(list_public_functions())
+# tests/poses and tests/bench call these in the integration layer, on less than the examples need.
+SLOW_EXAMPLES = {"hyrfpack.benchmark_model", "hyrfpack.estimate_poses"}
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +68,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory, data: Path) -> Path:
     return root
 
 
-@pytest.mark.parametrize("name", PUBLIC_FUNCTIONS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.acceptance] if name in SLOW_EXAMPLES else []) for name in PUBLIC_FUNCTIONS],
+)
 def test_the_example_of_a_public_function_runs(name, folder, monkeypatch, capsys):
     function = PUBLIC_FUNCTIONS[name]
     known = {**vars(inspect.getmodule(function)), "np": np, "torch": torch}

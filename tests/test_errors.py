@@ -5,8 +5,8 @@ from __future__ import annotations
 import ast
 import pickle
 import sys
-from collections.abc import Iterator
 from copy import copy
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 
@@ -25,12 +25,15 @@ from hyrfpack.format import save_model
 LIBRARY_FOLDER = Path(hyrfpack.__file__).parent
 
 
-def raised_errors() -> Iterator[tuple[str, ast.Call]]:
-    """Yield (place, call) for every error that hyrfpack makes by the name of its class."""
-    for path in sorted(LIBRARY_FOLDER.rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in ERROR_CLASS_NAMES:
-                yield f"{path.relative_to(LIBRARY_FOLDER).as_posix()}:{node.lineno}", node
+@cache
+def raised_errors() -> list[tuple[str, ast.Call]]:
+    """Return (place, call) for every error that hyrfpack makes by the name of its class."""
+    return [
+        (f"{path.relative_to(LIBRARY_FOLDER).as_posix()}:{node.lineno}", node)
+        for path in sorted(LIBRARY_FOLDER.rglob("*.py"))
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in ERROR_CLASS_NAMES
+    ]
 
 
 ERROR_CLASS_NAMES = {name for name in vars(hyrfpack.errors) if name.startswith("Hyrf")}
@@ -44,7 +47,7 @@ def literal_text(node: ast.AST) -> str:
 
 
 def test_every_error_names_its_fix():
-    calls = list(raised_errors())
+    calls = raised_errors()
     assert len(calls) > 400
     assert [place for place, call in calls if "fix" not in [keyword.arg for keyword in call.keywords]] == []
 

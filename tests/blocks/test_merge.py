@@ -7,8 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_tests import examples
 from scenes import ball_scene, small_model, visible_points_by_photo
 
 from hyrfpack.blocks.exposure import align_log_gains
@@ -19,7 +20,7 @@ from hyrfpack.format import describe_file, load_merged_model, load_model, save_m
 from hyrfpack.model.merged import world_positions
 
 
-@settings(max_examples=30, deadline=None)
+@examples(30)
 @given(st.integers(0, 2**32), st.integers(1, 5))
 def test_exact_gains_of_blocks_that_share_photos_give_back_offsets_and_exposures(seed, blocks):
     generator = np.random.default_rng(seed)

@@ -6,8 +6,9 @@ import dataclasses
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_tests import examples
 from scenes import look_at
 
 from hyrfpack.blocks.cells import divide_ground
@@ -55,7 +56,7 @@ surveys = st.builds(
 grids = st.tuples(st.integers(1, 3), st.integers(1, 2))
 
 
-@settings(max_examples=40, deadline=None)
+@examples(40)
 @given(surveys, grids, st.integers(0, 2**32))
 def test_cores_tile_space_and_every_photo_and_point_is_in_a_block(scene, grid, seed):
     plan = plan_blocks(scene, *grid)
@@ -74,7 +75,7 @@ def test_cores_tile_space_and_every_photo_and_point_is_in_a_block(scene, grid, s
     assert sorted(cell for block in plan.blocks for cell in block.cells) == list(range(plan.cells.count))
 
 
-@settings(max_examples=20, deadline=None)
+@examples(20)
 @given(surveys, grids)
 def test_a_plan_is_deterministic_and_puts_the_largest_block_first(scene, grid):
     plans = [plan_blocks(scene, *grid) for _ in range(2)]

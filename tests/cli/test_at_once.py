@@ -125,6 +125,16 @@ SINGLE_FILE_COMMANDS = [
     ("make packed.hyrf --work made -o {}", "out.html", "out-2.html"),
     ("make packed.hyrf --work made -o {}", "out.points.ply", "out-2.points.ply"),
 ]
+# For these, the integration layer has the first of three tests below, and the acceptance layer all of them.
+SLOW_COMMANDS = ("compress first", "export model.hyrf --baked", "export model.hyrf --sh-degree 0")
+SLOWER_COMMANDS = (*SLOW_COMMANDS, "import ", "compare ", "train ", "make packed.hyrf --work made -o {}")
+
+
+def mark_slow(cases: list[tuple[str, str, str]], slow: tuple[str, ...]) -> list:
+    """Return the cases, those whose command begins with one of `slow` for the acceptance layer."""
+    return [pytest.param(*case, marks=[pytest.mark.acceptance] if case[0].startswith(slow) else []) for case in cases]
+
+
 # Folders whose files can each have another name.
 FOLDER_COMMANDS_WITH_FREE_NAMES = [
     ("render model.hyrf --orbit 2 -o out", "out/0001.png", "out/0001-2.png"),
@@ -152,7 +162,7 @@ def test_a_file_that_appears_meanwhile_is_kept_and_the_result_gets_another_name(
 
 
 @pytest.mark.usefixtures("quick_import")
-@pytest.mark.parametrize(("command", "asked", "beside"), SINGLE_FILE_COMMANDS)
+@pytest.mark.parametrize(("command", "asked", "beside"), mark_slow(SINGLE_FILE_COMMANDS, SLOW_COMMANDS))
 def test_json_names_the_file_that_was_actually_written(command, asked, beside, working_folder, monkeypatch):
     create_foreign_file(asked, monkeypatch)
     facts = json.loads(succeeded(*command.format(asked).split(), "--json").stdout)
@@ -163,7 +173,10 @@ def test_json_names_the_file_that_was_actually_written(command, asked, beside, w
 
 
 @pytest.mark.usefixtures("quick_import")
-@pytest.mark.parametrize(("command", "asked", "beside"), [*SINGLE_FILE_COMMANDS, *FOLDER_COMMANDS_WITH_FREE_NAMES])
+@pytest.mark.parametrize(
+    ("command", "asked", "beside"),
+    mark_slow([*SINGLE_FILE_COMMANDS, *FOLDER_COMMANDS_WITH_FREE_NAMES], SLOWER_COMMANDS),
+)
 def test_with_overwrite_the_last_writer_wins(command, asked, beside, working_folder, monkeypatch):
     create_foreign_file(asked, monkeypatch)
     result = succeeded(*command.format(asked).split(), "--overwrite")

@@ -6,8 +6,9 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_tests import examples
 
 from hyrfpack.compress import channels
 from hyrfpack.compress.channels import quantize_channel
@@ -71,7 +72,7 @@ def test_channels_round_trip(name: str, kinds: int, reach: int) -> None:
 
 
 @given(st.data())
-@settings(max_examples=100, deadline=None)
+@examples(100)
 def test_any_channel_round_trips_within_its_bound(data: st.DataObject) -> None:
     values = np.array(data.draw(st.lists(st.floats(-50, 50) | st.sampled_from([0.0, 1.0]), max_size=60)))
     kinds, reach = data.draw(st.integers(1, 16)), data.draw(st.sampled_from([0, 1, 4]))

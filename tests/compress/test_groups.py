@@ -6,8 +6,9 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_tests import examples
 
 from hyrfpack.compress.groups import quantize_groups
 from hyrfpack.compress.rate_distortion import choose_step_codes, choose_symbols, estimate_code_bits
@@ -53,7 +54,7 @@ def test_groups_round_trip(count: int, number: int, reach: int) -> None:
 
 
 @given(st.data())
-@settings(max_examples=100, deadline=None)
+@examples(100)
 def test_any_groups_round_trip_within_their_bound(data: st.DataObject) -> None:
     values = np.array(data.draw(st.lists(st.floats(-6, 6) | st.just(0.0), max_size=60)))
     groups = random_groups(len(values), data.draw(st.integers(1, 20)), len(values))
@@ -172,7 +173,7 @@ def test_groups_of_similar_spread_share_a_model() -> None:
 
 
 @given(st.lists(st.integers(-5000, 5000) | st.integers(-3, 3), max_size=60), st.integers(1, 4), st.integers(1, 4))
-@settings(max_examples=80, deadline=None)
+@examples(80)
 def test_symbol_bits_satisfy_krafts_equality(symbols: list[int], kinds: int, reach: int) -> None:
     classes = np.arange(len(symbols)) % kinds
 
@@ -196,7 +197,7 @@ def test_symbol_bits_follow_the_frequencies() -> None:
 
 
 @given(st.data())
-@settings(max_examples=80, deadline=None)
+@examples(80)
 def test_the_chosen_symbol_has_the_lowest_cost_within_reach(data: st.DataObject) -> None:
     pairs = data.draw(st.lists(st.tuples(st.integers(-6, 6), st.floats(-0.5, 0.5)), min_size=1, max_size=20))
     nearest = np.array([symbol for symbol, _ in pairs])
@@ -218,7 +219,7 @@ def test_the_chosen_symbol_has_the_lowest_cost_within_reach(data: st.DataObject)
 
 
 @given(st.data())
-@settings(max_examples=60, deadline=None)
+@examples(60)
 def test_reach_never_raises_the_cost_by_the_coders_estimate(data: st.DataObject) -> None:
     values = np.array(data.draw(st.lists(st.floats(-20, 20), min_size=1, max_size=60)))
     groups = random_groups(len(values), data.draw(st.integers(1, 4)))

@@ -75,6 +75,14 @@ def finetuned_file(scene, tmp_path_factory) -> Path:
     return path
 
 
+@pytest.fixture
+def few_views(monkeypatch) -> None:
+    """Measure sensitivities in few views and correct them once."""
+    monkeypatch.setattr("hyrfpack.compress.sensitivity.MAX_SENSITIVITY_VIEWS", 8)
+    monkeypatch.setattr("hyrfpack.compress.sensitivity.MIN_SENSITIVITY_VIEWS", 8)
+    monkeypatch.setattr("hyrfpack.compress.calibrate.MAX_CORRECTION_ROUNDS", 1)
+
+
 def psnr(path: Path, scene: Scene) -> float:
     return evaluate_model(load_model(path), scene.test).psnr
 
@@ -137,7 +145,7 @@ def test_the_measured_error_is_close_to_the_requested_distortion(scene, tmp_path
     assert sizes == sorted(sizes) and errors == sorted(errors, reverse=True)
 
 
-@pytest.mark.parametrize("share", [0.4, 0.8, 1.5])
+@pytest.mark.parametrize("share", [0.4, *(pytest.param(share, marks=pytest.mark.acceptance) for share in (0.8, 1.5))])
 def test_a_target_size_is_met_and_nearly_reached(share, demo_packer, compact_file_and_report):
     target = int(share * compact_file_and_report[1].bytes_after)
 
@@ -183,7 +191,14 @@ def test_results_do_not_depend_on_the_number_of_threads(compact_file_and_report,
     assert (tmp_path / "small.hyrf").read_bytes() == compact_file_and_report[0].read_bytes()
 
 
-@pytest.mark.parametrize("limit", [{"target_bytes": 9000}, {"max_psnr_drop": 0.3}], ids=["size", "loss"])
+@pytest.mark.parametrize(
+    "limit",
+    [
+        pytest.param({"target_bytes": 9000}, id="size"),
+        pytest.param({"max_psnr_drop": 0.3}, id="loss", marks=pytest.mark.acceptance),
+    ],
+)
+@pytest.mark.usefixtures("few_views")
 def test_finetuning_respects_limits(limit, scene, tmp_path):
     config = CompressConfig(finetune_steps=5, **limit)
     report = compress_model(DEMO_MODEL_FILE, tmp_path / "small.hyrf", config, data=scene)
@@ -194,6 +209,7 @@ def test_finetuning_respects_limits(limit, scene, tmp_path):
         assert psnr(DEMO_MODEL_FILE, scene) - psnr(tmp_path / "small.hyrf", scene) <= 0.3 + 1e-6
 
 
+@pytest.mark.usefixtures("few_views")
 def test_pruning_removes_gaussians_and_bytes_and_can_be_disabled(ball_file, tmp_path):
     model, provenance = load_with_provenance(ball_file)
     every = len(model)
@@ -274,6 +290,7 @@ def test_the_distortion_is_lowered_until_the_drop_on_training_photos_is_met(
     assert trial.data == trial.measured_error == pytest.approx(expected, rel=1e-3)
 
 
+@pytest.mark.usefixtures("few_views")
 def test_a_file_that_grows_is_reported(ball_file, tmp_path, caplog):
     coarse, fine = tmp_path / "coarse.hyrf", tmp_path / "fine.hyrf"
     compress_model(ball_file, coarse, CompressConfig(distortion=1e-2))
@@ -316,6 +333,7 @@ def test_without_photos_the_stored_cameras_and_the_stored_psnr_are_used(ball_fil
     np.testing.assert_allclose(poses, [[view.camera.camera_from_world for view in ball_scene().train]], atol=1e-8)
 
 
+@pytest.mark.usefixtures("few_views")
 def test_without_photos_and_cameras_an_orbit_is_used(compact_file_and_report, scene, tmp_path):
     provenance = describe_file(DEMO_MODEL_FILE)["provenance"]
     del provenance["cameras"]
@@ -336,6 +354,7 @@ def test_provenance_is_kept_with_a_sample_of_cameras(compact_file_and_report, pa
     assert 0 < len(after["coarse_cameras"]) <= MIN_COARSE_CAMERAS and "cameras" in before and "cameras" not in after
 
 
+@pytest.mark.usefixtures("few_views")
 def test_a_compressed_file_can_be_recompressed_and_unpacked_exactly(paper_file, scene, tmp_path):
     from_paper = compress_model(paper_file, tmp_path / "small.hyrf", data=scene)
     compress_model(DEMO_COMPACT_FILE, tmp_path / "back.hyrf", CompressConfig(profile="raw"))
@@ -394,6 +413,7 @@ def test_progress_grows_and_the_work_ends_when_it_is_stopped(ball_file, tmp_path
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.usefixtures("few_views")
 def test_an_unreachable_max_psnr_drop_is_refused(ball_file, tmp_path, monkeypatch):
     scored = limits.evaluate_model
 

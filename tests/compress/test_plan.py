@@ -7,8 +7,9 @@ import math
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_tests import examples
 from scenes import small_model
 
 from hyrfpack.compress.plan import (
@@ -179,7 +180,7 @@ def test_a_higher_distortion_prunes_more() -> None:
 
 
 @given(st.lists(st.tuples(*[st.floats(1e-12, 1e3)] * 4), min_size=1, max_size=40))
-@settings(max_examples=80, deadline=None)
+@examples(80)
 def test_classes_are_ordered_by_the_mean_sensitivity(rows: list[tuple[float, ...]]) -> None:
     positions, colors, scales, opacities = np.array(rows).T
     sensitivity = Sensitivity(positions, colors, scales, opacities, opacities, {})
@@ -208,7 +209,7 @@ def test_unseen_gaussians_are_in_the_last_class() -> None:
 
 
 @given(st.lists(st.tuples(st.integers(0, 5), st.floats(1e-12, 1e6)), max_size=30), st.floats(1e-16, 1.0))
-@settings(max_examples=80, deadline=None)
+@examples(80)
 def test_lattice_bits_follow_the_sensitivity_of_positions(pairs: list[tuple[int, float]], distortion: float) -> None:
     classes = np.array([kind for kind, _ in pairs], np.uint8)
     sensitivity = np.array([value for _, value in pairs])

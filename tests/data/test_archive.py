@@ -9,8 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, given
 from hypothesis import strategies as st
+from property_tests import examples
 
 from hyrfpack.data import archive, load_scene
 from hyrfpack.errors import HyrfDataError, HyrfError
@@ -145,7 +146,7 @@ def test_a_file_that_is_an_archive_only_by_name_is_rejected(content, tmp_path):
         load_scene(tmp_path / "a.zip")
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@examples(150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(names=st.lists(st.text(alphabet="ab./\\: \0é", min_size=1, max_size=8), min_size=1, max_size=4, unique=True))
 @pytest.mark.filterwarnings("ignore:Duplicate name")
 def test_no_name_writes_outside_the_folder(names, tmp_path_factory):
@@ -171,7 +172,7 @@ def test_no_name_writes_outside_the_folder(names, tmp_path_factory):
     assert outside == [place / "a.zip"] and all(len(path.relative_to(place).parts) > 4 for path in inside)
 
 
-@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@examples(100, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_damaged_archives_are_read_or_rejected(zipped_set, tmp_path_factory, data):
     content = bytearray(zipped_set.read_bytes())

@@ -8,9 +8,10 @@ import numpy as np
 import pycolmap
 import pytest
 import trimesh
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, given
 from hypothesis import strategies as st
 from PIL import Image
+from property_tests import examples
 
 from hyrfpack.data import load_scene
 from hyrfpack.errors import HyrfDataError
@@ -270,7 +271,7 @@ def mutable_root(tmp_path_factory) -> Path:
     return tmp_path_factory.mktemp("mutable")
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@examples(60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_mutated_tables_raise_only_data_errors(mutable_root, colmap_folder, data):
     exists = (mutable_root / "images").is_dir()

@@ -7,8 +7,9 @@ import unicodedata
 from pathlib import Path, PurePosixPath
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, given
 from hypothesis import strategies as st
+from property_tests import examples
 
 from hyrfpack.data.names import PictureIndex, find_similar_file, path_parts
 
@@ -132,7 +133,7 @@ listed_names = st.lists(
 )
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@examples(150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(names=listed_names, there=st.lists(st.tuples(path, ending), max_size=8))
 def test_matching_is_one_to_one_and_between_like_names(tmp_path_factory, names, there):
     root = tmp_path_factory.mktemp("index")
@@ -163,7 +164,7 @@ def reference_stem(name: str) -> str:
     return before if dot and before and after and after[0] in string.ascii_lowercase else normalize(name)
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@examples(60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_no_choice_is_made_between_two_equally_good_files(tmp_path_factory, data):
     root = tmp_path_factory.mktemp("twins")

@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, given
 from hypothesis import strategies as st
 from PIL import Image
+from property_tests import examples
 
 from hyrfpack.data import load_scene
 from hyrfpack.errors import HyrfDataError
@@ -233,7 +234,7 @@ _TOP_KEYS = ["frames", "fl_x", "fl_y", "cx", "w", "h", "k1", "k4", "camera_model
 _FRAME_KEYS = ["file_path", "transform_matrix", "mask_path", "fl_x", "w", "k2", "camera_model"]
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@examples(60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     top=st.dictionaries(st.sampled_from([*_TOP_KEYS, "train_filenames", "test_filenames"]), _JSON_VALUES, max_size=2),
     frame=st.dictionaries(st.sampled_from(_FRAME_KEYS), _JSON_VALUES, max_size=2),

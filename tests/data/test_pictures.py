@@ -6,9 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
+from property_tests import examples
 
 from hyrfpack.data.archive import unpack
 from hyrfpack.data.pictures import PhotoFile, has_same_aspect, read_header, read_mask, read_orientation, read_pixels
@@ -172,7 +173,7 @@ def test_aspect_tolerates_rounding_only(width, height, same):
     assert has_same_aspect(width, height, 800, 533) is same
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60)
 @given(data=st.data())
 def test_damaged_pictures_raise_only_data_errors(tmp_path_factory, data):
     suffix = data.draw(st.sampled_from(["png", "jpg", "webp", "tif", "bmp", "avif", "jp2"]))

@@ -344,7 +344,9 @@ def test_upright_turns_the_stated_direction_to_an_axis(axis, expected, tmp_path)
     assert_allclose(turned_positions @ expected, heights / np.linalg.norm((0.3, -0.8, 0.1)), atol=1e-6)
 
 
-@pytest.mark.parametrize(("axis", "upright_by_itself"), [("y", True), ("z", False)])
+@pytest.mark.parametrize(
+    ("axis", "upright_by_itself"), [("z", False), pytest.param("y", True, marks=pytest.mark.acceptance)]
+)
 def test_a_gltf_of_an_upright_scene_is_not_turned_again(axis, upright_by_itself, tmp_path):
     turned = edited(COMPACT_FILE, tmp_path, Upright(axis))
     export_model(turned, tmp_path / "scene.glb", ExportConfig(degree=0, background=False))

@@ -44,7 +44,13 @@ def test_a_file_that_fits_already_is_copied(tmp_path):
     assert report.bytes_after == pytest.approx(COMPACT_FILE.stat().st_size, abs=100)
 
 
-@pytest.mark.parametrize("moves", [[], [Scale(2.0), Translate((1.0, 2.0, 3.0))]], ids=["in place", "moved"])
+@pytest.mark.parametrize(
+    "moves",
+    [
+        pytest.param([], id="in place", marks=pytest.mark.acceptance),
+        pytest.param([Scale(2.0), Translate((1.0, 2.0, 3.0))], id="moved"),
+    ],
+)
 def test_the_loss_is_that_of_the_pixels_that_the_edit_left(scene, tmp_path, moves):
     """The limit holds for the photos' pixels that the crop does not change."""
     crop, drop = CENTER_BALL, 0.3

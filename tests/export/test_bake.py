@@ -3,8 +3,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
+from property_tests import examples
 from scenes import camera_at, ring, small_model
 
 from hyrfpack.errors import HyrfError
@@ -33,7 +34,7 @@ def rms_difference(model, splats, cameras, how=NO_CULLING, truth=None) -> float:
     return float(torch.stack([(a - b).square().mean() for a, b in pairs]).mean().sqrt())
 
 
-@settings(max_examples=12, deadline=None)
+@examples(12)
 @given(st.floats(1e-3, 1e3), st.tuples(*[st.floats(-1e3, 1e3)] * 3), st.floats(-4, 4), st.integers(0, 4))
 @example(1.0, (0.0, 0.0, 0.0), -3.939453125, 1)  # the error is 1.3e-6
 def test_direction_independent_colors_are_exact_at_degree_0(scale, center, logit, views):

@@ -130,7 +130,10 @@ def test_a_missing_package_is_named_with_its_extra(module, faces, tmp_path, monk
 # -- closed meshes for physics engines --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("extension", ["glb", "obj", "stl"])
+@pytest.mark.usefixtures("quick_distances")
+@pytest.mark.parametrize(
+    "extension", ["glb", *(pytest.param(extension, marks=pytest.mark.acceptance) for extension in ("obj", "stl"))]
+)
 def test_a_collision_file_is_closed_upright_and_small(extension, tmp_path):
     path = tmp_path / f"demo.collision.{extension}"
     report = hyrfpack.export_model(DEMO_MODEL_FILE, path, hyrfpack.ExportConfig(faces=600))
@@ -143,6 +146,7 @@ def test_a_collision_file_is_closed_upright_and_small(extension, tmp_path):
     assert report.mesh_to_surface is not None and report.mesh_to_surface[0] < report.wall
 
 
+@pytest.mark.usefixtures("quick_distances")
 def test_the_command_prints_the_distances_of_a_collision_file(tmp_path):
     printed = succeeded("export", DEMO_MODEL_FILE, "-o", tmp_path / "demo.collision.obj").stdout
     assert "surface to mesh" in printed and "mesh to surface" in printed and "the mesh is closed" in printed

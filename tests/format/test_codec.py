@@ -12,8 +12,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_tests import examples
 
 from hyrfpack.errors import HyrfError, HyrfFormatError
 from hyrfpack.format import decode_model, describe_file, encode_model, load_model, repack, save_model
@@ -511,7 +512,7 @@ def test_forged_deflated_metadata_is_refused_in_little_memory(forgery):
     assert peak < 4 << 20
 
 
-@settings(max_examples=150, deadline=None)
+@examples(150)
 @given(
     profile=st.sampled_from(ALL_PROFILES),
     type=st.sampled_from(["META", "POSI", "COLO", "OPAC", "GTAB", "RMLP"]),

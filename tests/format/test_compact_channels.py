@@ -8,8 +8,9 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_tests import examples
 
 from hyrfpack.compress.channels import quantize_channel
 from hyrfpack.format.compact.channels import MAX_ABS_CHANNEL_VALUE, decode_channel, encode_channel
@@ -80,7 +81,7 @@ def test_invalid_headers_are_refused_in_little_memory(changes: dict[str, float])
 
 
 @given(st.data())
-@settings(max_examples=200, deadline=None)
+@examples(200)
 def test_damaged_data_is_refused_or_decodes_to_finite_values(data: st.DataObject) -> None:
     damaged = bytearray(SAMPLE_CHANNEL)
     for _ in range(data.draw(st.integers(1, 4))):

@@ -7,8 +7,9 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_tests import examples
 
 from hyrfpack.compress.groups import quantize_groups
 from hyrfpack.format.compact.groups import (
@@ -50,7 +51,7 @@ def test_truncation_at_every_byte_and_trailing_bytes_are_refused() -> None:
 
 
 @given(st.data())
-@settings(max_examples=200, deadline=None)
+@examples(200)
 def test_damaged_data_is_refused_or_decodes_to_finite_values(data: st.DataObject) -> None:
     damaged = bytearray(SAMPLE_DATA)
     for _ in range(data.draw(st.integers(1, 4))):
@@ -153,7 +154,7 @@ def test_stated_groups_are_decoded_as_they_were_encoded_and_leave_the_rest() -> 
 
 
 @given(st.data())
-@settings(max_examples=100, deadline=None)
+@examples(100)
 def test_damaged_use_classes_are_refused_or_in_range(data: st.DataObject) -> None:
     damaged = bytearray(encode_use_classes(stated_groups(), LEVEL_OFFSETS, 16))
     for _ in range(data.draw(st.integers(1, 3))):

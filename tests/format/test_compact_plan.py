@@ -7,8 +7,9 @@ import math
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_tests import examples
 from scenes import small_model
 
 from hyrfpack.errors import HyrfFormatError
@@ -132,7 +133,7 @@ def decode_sections(coded: dict[str, tuple[int, bytes]], model: HybridModel, cou
 
 
 @given(st.data())
-@settings(max_examples=150, deadline=None)
+@examples(150)
 def test_damaged_sections_are_refused_or_decode_to_finite_values(data: st.DataObject) -> None:
     group = data.draw(st.sampled_from(sorted(CODED_SECTIONS)))
     codec, stored = CODED_SECTIONS[group]

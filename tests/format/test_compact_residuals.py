@@ -7,8 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_tests import examples
 
 from hyrfpack.format.compact.residuals import (
     BASIS_BYTES,
@@ -56,7 +57,7 @@ SAMPLE_DATA = encode_residuals(HARMONICS, SAMPLE_RESIDUALS[0], SAMPLE_RESIDUALS[
     st.sampled_from([0, 1, 300, MAX_ABS_SYMBOL]),
     st.integers(0, 2**32 - 1),
 )
-@settings(max_examples=60, deadline=None)
+@examples(60)
 def test_a_round_trip_keeps_flags_steps_and_symbols_in_both_readers(section, count, class_count, share, largest, seed):
     group, columns = section
     residuals, classes, basis = random_residuals(group, columns, count, class_count, share, largest, seed)
@@ -82,7 +83,7 @@ def test_truncation_at_every_byte_and_trailing_bytes_are_refused() -> None:
 
 
 @given(st.data())
-@settings(max_examples=150, deadline=None)
+@examples(150)
 def test_damaged_data_is_refused_or_decodes_to_finite_numbers(data: st.DataObject) -> None:
     damaged = bytearray(SAMPLE_DATA)
     for _ in range(data.draw(st.integers(1, 4))):

@@ -10,8 +10,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_tests import examples
 from scenes import small_model
 
 from hyrfpack.compress import plan
@@ -158,7 +159,7 @@ def test_the_number_of_bytes_in_the_message_is_the_minimum():
 
 
 @given(st.floats(0, 1))
-@settings(max_examples=30, deadline=None)
+@examples(30)
 def test_a_fraction_decodes_the_first_bytes_of_a_whole_file(fraction):
     cut = int(fraction * len(COMPACT_DATA))
     if cut < MIN_MODEL_BYTES:
@@ -478,7 +479,7 @@ def flip_bit(data: bytes, place: int) -> bytes:
 
 
 @given(st.data())
-@settings(max_examples=60, deadline=None)
+@examples(60)
 def test_damaged_layers_with_valid_checksums_are_decoded_or_refused(data):
     sections = list(read_container(COMPACT_DATA).sections)
     which = data.draw(st.integers(0, len(sections) - 1), "section")

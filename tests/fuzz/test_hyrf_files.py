@@ -98,9 +98,10 @@ def test_a_forged_file_is_refused_with_the_message_in_its_name(name):
 
 
 @pytest.mark.filterwarnings("error")
-def test_mutants_are_decoded_or_refused_in_one_line():
+@pytest.mark.parametrize(("count", "most_by_chance"), [(500, 0), pytest.param(1600, 4, marks=pytest.mark.acceptance)])
+def test_mutants_are_decoded_or_refused_in_one_line(count, most_by_chance):
     outcomes = Counter()
-    for number in range(1600):
+    for number in range(count):
         kind, data = make_hostile_file(number)
         outcome = decode(data)
         outcomes[kind, isinstance(outcome, str)] += 1
@@ -110,7 +111,7 @@ def test_mutants_are_decoded_or_refused_in_one_line():
     assert {kind for kind, _ in outcomes} == set(INPUT_KINDS)
     # Forged content has valid checksums, so that some of it is decoded; damaged content has not.
     for kind in INPUT_KINDS:
-        assert (outcomes[kind, False] > 4) == kind.startswith("forged"), kind
+        assert (outcomes[kind, False] > most_by_chance) == kind.startswith("forged"), kind
 
 
 def test_mutants_depend_only_on_their_number_and_seed():

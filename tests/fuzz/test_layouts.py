@@ -12,9 +12,10 @@ from random import Random
 import numpy as np
 import pytest
 from exported_sets import WRITERS_BY_LAYOUT, PhotoCamera, photo_path
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
+from property_tests import examples
 
 from hyrfpack.data import load_scene
 from hyrfpack.errors import HyrfError
@@ -124,7 +125,7 @@ def read_mutant(layout_folders: Path, layout: str, seed: int) -> str:
 
 @pytest.mark.parametrize("layout", WRITERS_BY_LAYOUT)
 def test_mutated_tables_are_read_or_refused_in_one_line(layout_folders, layout):
-    @settings(max_examples=40, deadline=None)
+    @examples(40)
     @given(st.integers(0, 2**32 - 1))
     def search(seed):
         read_mutant(layout_folders, layout, seed)

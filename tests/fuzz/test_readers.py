@@ -23,9 +23,10 @@ import pycolmap
 import pytest
 import torch
 import trimesh
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
+from property_tests import examples
 
 from hyrfpack.cameras.capture import Capture
 from hyrfpack.cameras.files import cameras_from_json
@@ -38,7 +39,7 @@ from tools.safety.fuzz_mutate import EXTREME_INTEGERS, HOSTILE_JSON, edit_bytes,
 
 # Hypothesis draws only a seed, because mutants are cheap and need no shrinking.
 seeded_rng = st.integers(0, 2**32 - 1).map(Random)
-with_70_examples = settings(max_examples=70, deadline=None)
+with_70_examples = examples(70)
 
 HOSTILE_VALUES = (*HOSTILE_JSON, math.nan, math.inf, "x" * 5000, "a\0b", [[1.0] * 4] * 4, [[1e200] * 4] * 4, [[]] * 4)
 IDENTITY_POSE = np.eye(4).tolist()
@@ -237,7 +238,7 @@ ANGLE_CAMERAS = {
 }
 
 
-@settings(max_examples=200, deadline=None)
+@examples(200)
 @given(rng=seeded_rng)
 def test_forged_camera_files_are_read_or_refused(root, rng):
     path = root / "cameras.json"
@@ -279,7 +280,7 @@ def test_an_error_quotes_only_the_start_of_a_long_value(tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore:overflow")
-@settings(max_examples=100, deadline=None)
+@examples(100)
 @given(rng=seeded_rng)
 def test_a_forged_viewpoint_is_used_or_refused(rng):
     viewpoint = json.loads(json.dumps(Viewpoint.from_frame((0, 0, 0), 1.0).to_json()))

@@ -8,8 +8,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_tests import examples
 from scenes import small_model
 from torch import Tensor
 
@@ -72,7 +73,7 @@ def test_contraction_has_slopes_at_the_unit_sphere_and_far_outside(radius: float
 FINITE_FLOATS = st.floats(-(2.0**100), 2.0**100, width=32)
 
 
-@settings(max_examples=200, deadline=None)
+@examples(200)
 @given(st.lists(st.tuples(FINITE_FLOATS, FINITE_FLOATS, FINITE_FLOATS), min_size=1, max_size=5))
 def test_contraction_of_any_point_is_inside_the_cube_and_correct(points: list[tuple]) -> None:
     u = torch.tensor(points, dtype=torch.float32)
@@ -105,7 +106,7 @@ COORDINATE_STRATEGY = st.one_of(
 )
 
 
-@settings(max_examples=100, deadline=None)
+@examples(100)
 @given(st.lists(st.tuples(COORDINATE_STRATEGY, COORDINATE_STRATEGY, COORDINATE_STRATEGY), min_size=1, max_size=8))
 def test_points_on_cell_boundaries_encode_as_in_float64(points: list[tuple]) -> None:
     """Rounding may move a point to the next cell, which changes nothing because interpolation is continuous."""
@@ -167,7 +168,7 @@ def test_a_hundred_thousand_points_in_one_cell_add_up() -> None:
 # -- decoder --------------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=40, deadline=None)
+@examples(40)
 @given(st.floats(-20, 12), st.floats(-3, 3), st.integers(1, 700), st.integers(0, 10**6))
 def test_decoders_of_any_magnitude_agree_with_float64(inputs: float, weights: float, rows: int, seed: int) -> None:
     generator = torch.Generator().manual_seed(seed)
@@ -219,7 +220,7 @@ def test_rays_meet_the_sphere_from_any_distance(distance: float) -> None:
     assert np.abs(np.cross(found - o.astype(float), d.astype(float))).max() < bound + 8 * FLOAT32_ROUNDING * distance
 
 
-@settings(max_examples=200, deadline=None)
+@examples(200)
 @given(st.tuples(*[st.floats(-1, 1)] * 3), st.floats(-30, 37), st.tuples(*[st.integers(-1000, 1000)] * 3).filter(any))
 def test_every_ray_has_a_finite_background(place: tuple, exponent: float, aim: tuple) -> None:
     origin = torch.tensor(place, dtype=torch.float32) * 10**exponent

@@ -12,8 +12,9 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 import torch
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
+from property_tests import examples
 from torch import Tensor
 
 from hyrfpack.ops.rasterize import Gaussians3D, Rasterization, RasterSettings, rasterize
@@ -505,7 +506,7 @@ def _make_searched(rows: list[tuple]) -> dict[str, Tensor]:
 ANY_OPACITY = st.one_of(st.sampled_from([0.0, 1.0, 1 / 255, 0.99]), st.floats(0, 1))
 
 
-@settings(max_examples=150, deadline=None)
+@examples(150)
 @given(st.lists(_gaussian(ANY_OPACITY), min_size=1, max_size=8))
 def test_a_search_finds_no_gaussians_with_wrong_float32_pictures(rows: list[tuple]) -> None:
     case = Case(_make_searched(rows), {"transmittance_min": 0.0})
@@ -518,7 +519,7 @@ def test_a_search_finds_no_gaussians_with_wrong_float32_pictures(rows: list[tupl
     assert torch.isfinite(_largest_by_gaussian(gradients)).all()
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60)
 @given(st.lists(_gaussian(st.floats(0, 0.98)), min_size=1, max_size=8))  # at 0.99 the gradient is discontinuous
 def test_a_search_finds_no_gaussians_with_wrong_float32_gradients(rows: list[tuple]) -> None:
     case = Case(_make_searched(rows), {"transmittance_min": 0.0})

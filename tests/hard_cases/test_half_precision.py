@@ -10,8 +10,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_tests import examples
 from scenes import ball_scene, camera_at, small_model
 
 from hyrfpack.errors import HyrfError
@@ -58,7 +59,7 @@ def position_error_bound(local: np.ndarray) -> np.ndarray:
 
 
 @given(random_frames, random_local_points)
-@settings(max_examples=40, deadline=None)
+@examples(40)
 def test_positions_in_any_frame_keep_11_bits_of_their_distance_from_its_centre(frame, local):
     world = frame.to_world(local)
 
@@ -69,7 +70,7 @@ def test_positions_in_any_frame_keep_11_bits_of_their_distance_from_its_centre(f
 
 
 @given(random_local_points)
-@settings(max_examples=40, deadline=None)
+@examples(40)
 def test_stored_positions_are_the_nearest_halves(local):
     singles = local.astype(np.float32)
 
@@ -77,7 +78,7 @@ def test_stored_positions_are_the_nearest_halves(local):
 
 
 @given(random_frames, st.floats(FLOAT16_MAX * (1 + 1e-6), 3e38), st.booleans(), st.integers(0, 2))
-@settings(max_examples=40, deadline=None)
+@examples(40)
 def test_positions_past_half_precision_are_rejected_with_a_clear_error_in_any_frame(frame, distance, negative, axis):
     local = np.zeros((3, 3))
     local[1, axis] = -distance if negative else distance
@@ -102,7 +103,7 @@ def test_positions_stored_as_subnormal_halves_are_within_half_a_step():
 
 
 @given(st.floats(0, np.log10(FLOAT16_MAX / 2)), st.integers(0, 2**31), st.tuples(*[st.floats(0.25, 1)] * 3))
-@settings(max_examples=40, deadline=None)
+@examples(40)
 def test_far_points_move_less_than_2_to_the_minus_12_in_the_contracted_cube(log_radius, seed, half):
     """The contraction turns the growing steps of far positions into an angle, at most an eighth of a cell of 512.
 
@@ -203,7 +204,7 @@ def test_logits_past_half_precision_are_rejected_by_name(name):
 
 
 @given(st.floats(-45, 4.8), st.integers(0, 2**31))
-@settings(max_examples=40, deadline=None)
+@examples(40)
 def test_decoder_weights_are_the_nearest_halves_down_to_zero(log_size, seed):
     """From 1e-45 to 6e4: below 2^-14 steps are constant, below 2^-25 a weight is zero."""
     model = small_model(np.zeros((1, 3)))

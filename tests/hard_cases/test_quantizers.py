@@ -11,8 +11,9 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_tests import examples
 from scenes import camera_at, small_model
 
 from hyrfpack.errors import HyrfError
@@ -68,7 +69,7 @@ def test_one_rare_symbol_in_a_million_costs_one_bit_a_symbol(dtype, place):
 
 
 @given(st.lists(st.integers(1, 10**9) | st.integers(1, 3), min_size=1, max_size=80))
-@settings(max_examples=150, deadline=None)
+@examples(150)
 def test_no_histogram_needs_longer_codes_than_the_fibonacci_numbers(counts):
     """A code of L bits needs at least F(L + 2) - 1 symbols (the end mark is one more leaf, of weight 1)."""
     lengths = HuffmanCode.from_frequencies(np.array(counts)).lengths

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 import torch
 from explicit_balls import TINY_IMPORT_CONFIG, ball_splats
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_tests import examples
 
 import hyrfpack
 from hyrfpack.compress import calibrate
@@ -71,16 +72,21 @@ def test_a_model_of_degree_0_splats_has_colours_without_direction(tmp_path: Path
 @pytest.mark.parametrize(
     "change",
     [
-        lambda s: s[:1],
-        lambda s: s[:2],
-        lambda s: replace(s, positions=s.positions * 0),
-        lambda s: replace(s, scales=s.scales * np.float32((1, 1, 0))),
-        lambda s: replace(s, opacities=np.ones(len(s))),
-        lambda s: replace(s, opacities=np.where(np.arange(len(s)) % 2, s.opacities, 0)),
-        lambda s: replace(s, positions=np.concatenate((np.full((1, 3), 1e12), s.positions[1:]))),
-        lambda s: replace(s, antialiased=True),
+        pytest.param(lambda s: s[:1], id="one"),
+        pytest.param(lambda s: s[:2], id="two", marks=pytest.mark.acceptance),
+        pytest.param(lambda s: replace(s, positions=s.positions * 0), id="coincident"),
+        pytest.param(lambda s: replace(s, scales=s.scales * np.float32((1, 1, 0))), id="flat"),
+        pytest.param(lambda s: replace(s, opacities=np.ones(len(s))), id="opaque", marks=pytest.mark.acceptance),
+        pytest.param(
+            lambda s: replace(s, opacities=np.where(np.arange(len(s)) % 2, s.opacities, 0)),
+            id="clear",
+            marks=pytest.mark.acceptance,
+        ),
+        pytest.param(
+            lambda s: replace(s, positions=np.concatenate((np.full((1, 3), 1e12), s.positions[1:]))), id="outlier"
+        ),
+        pytest.param(lambda s: replace(s, antialiased=True), id="antialiased", marks=pytest.mark.acceptance),
     ],
-    ids=["one", "two", "coincident", "flat", "opaque", "clear", "outlier", "antialiased"],
 )
 def test_unusual_splats_can_be_imported(tmp_path: Path, change) -> None:
     report = import_loaded_splats(change(ball_splats(30)), tmp_path / "x.hyrf", TINY_IMPORT_CONFIG)
@@ -211,7 +217,7 @@ def test_reference_views_hold_the_drawn_pictures() -> None:
 
 
 @given(st.lists(st.floats(1e-8, 1e-2), min_size=1, max_size=48), st.floats(1.001, 50.0))
-@settings(max_examples=60, deadline=None)
+@examples(60)
 def test_the_distortion_added_to_each_view_gives_the_target_mean_psnr(errors, factor):
     errors = np.array(errors)
     own = np.exp(np.log(errors).mean())

@@ -7,6 +7,7 @@ import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from property_tests import examples
 
 from hyrfpack.mesh.clean import reduce_faces
 from hyrfpack.mesh.manifold import make_manifold
@@ -100,7 +101,7 @@ def test_a_mesh_that_is_manifold_stays_as_it_is():
     assert mesh_of(vertices, faces).volume == pytest.approx(sphere.volume)
 
 
-@settings(max_examples=25, deadline=None)
+@examples(25)
 @given(st.integers(0, 1000), st.integers(20, 400))
 def test_thin_solids_stay_closed_after_any_reduction(seed, count):
     generator = np.random.default_rng(seed)
@@ -139,6 +140,7 @@ def test_a_sheet_becomes_a_slab_whose_front_is_the_sheet():
     assert proxy.proxy_distances.max() < proxy.wall + 0.003
 
 
+@pytest.mark.usefixtures("quick_distances")
 def test_a_sphere_that_is_open_below_becomes_a_closed_bowl():
     sphere = trimesh.creation.icosphere(5)
     faces = np.asarray(sphere.faces)[sphere.triangles_center[:, 2] > -0.7]
@@ -149,6 +151,7 @@ def test_a_sphere_that_is_open_below_becomes_a_closed_bowl():
     assert np.quantile(proxy.surface_distances, 0.95) < 0.01
 
 
+@pytest.mark.usefixtures("quick_distances")
 def test_a_closed_sphere_becomes_solid_without_its_cavity():
     sphere = trimesh.creation.icosphere(5)
     proxy = make_proxy(np.asarray(sphere.vertices), np.asarray(sphere.faces, np.int64), 0.01, 2000)
@@ -157,6 +160,7 @@ def test_a_closed_sphere_becomes_solid_without_its_cavity():
     assert mesh.body_count == 1 and mesh.volume == pytest.approx(4 / 3 * np.pi, rel=0.01)
 
 
+@pytest.mark.usefixtures("quick_distances")
 def test_narrow_gaps_are_filled_and_wide_ones_stay():
     vertices, faces = sheet(1.0, 0.0125)
     middles = vertices[faces].mean(axis=1)
@@ -168,6 +172,7 @@ def test_narrow_gaps_are_filled_and_wide_ones_stay():
         assert mesh_of(proxy.vertices, proxy.faces).euler_number == 2 - 2 * genus
 
 
+@pytest.mark.usefixtures("quick_distances")
 def test_small_parts_are_left_out():
     vertices, faces = sheet(1.0, 0.0125)
     speck = sheet(0.03, 0.0125)[0] + (0.5, 0.5, 0.6), sheet(0.03, 0.0125)[1] + len(vertices)

@@ -2,8 +2,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_tests import examples
 
 from hyrfpack.quant.bits import pack_bits, unpack_bits
 from hyrfpack.quant.errors import DamagedDataError
@@ -19,7 +20,7 @@ def pack_bits_by_definition(values: list[int], lengths: list[int]) -> bytes:
 
 
 @given(st.lists(st.tuples(st.integers(0, 2**56 - 1), st.integers(0, 56)), max_size=300))
-@settings(max_examples=150, deadline=None)
+@examples(150)
 def test_pack_bits_follows_the_definition_and_unpack_bits_inverts_it(pairs: list[tuple[int, int]]) -> None:
     values, lengths = [value for value, _ in pairs], [length for _, length in pairs]
 

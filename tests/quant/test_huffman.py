@@ -5,8 +5,9 @@ import sys
 import numpy as np
 import pytest
 from dahuffman import HuffmanCodec
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_tests import examples
 
 from hyrfpack.quant.errors import DamagedDataError
 from hyrfpack.quant.huffman import END_MARK, HuffmanCode, HuffmanStream, chunk_length, huffman_decode, huffman_encode
@@ -62,7 +63,7 @@ def test_payload_is_byte_identical_to_dahuffman_and_decodes(name: str) -> None:
 
 
 @given(st.lists(st.integers(0, 255), min_size=1, max_size=300) | st.lists(st.integers(0, 3), min_size=1, max_size=5000))
-@settings(max_examples=150, deadline=None)
+@examples(150)
 def test_any_bytes_round_trip_and_match_dahuffman(listed: list[int]) -> None:
     symbols = np.array(listed, np.uint8)
 
@@ -73,7 +74,7 @@ def test_any_bytes_round_trip_and_match_dahuffman(listed: list[int]) -> None:
 
 
 @given(st.lists(st.integers(0, 65535), min_size=1, max_size=300))
-@settings(max_examples=50, deadline=None)
+@examples(50)
 def test_any_16_bit_symbols_round_trip_and_match_dahuffman(listed: list[int]) -> None:
     symbols = np.array(listed, np.uint16)
 
@@ -191,7 +192,7 @@ def test_every_truncation_and_a_trailing_byte_are_refused(name: str) -> None:
 
 
 @given(st.data())
-@settings(max_examples=100, deadline=None)
+@examples(100)
 def test_damaged_stream_is_refused_or_decodes_to_the_declared_count(data: st.DataObject) -> None:
     damaged = bytearray(huffman_encode(HARD_CASES["odd count"]).to_bytes())
     for _ in range(data.draw(st.integers(1, 4))):

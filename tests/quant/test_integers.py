@@ -4,8 +4,9 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_tests import examples
 from token_streams import decode_integers_by_spec
 
 from hyrfpack.parallel import has_numba
@@ -53,7 +54,7 @@ def test_numpy_and_numba_encode_to_the_same_bytes(name: str) -> None:
 
 @pytest.mark.parametrize("implementation", CODER_IMPLEMENTATIONS)
 @given(data=st.data())
-@settings(max_examples=150, deadline=None)
+@examples(150)
 def test_any_integers_of_any_dtype_round_trip(implementation: str, data: st.DataObject) -> None:
     dtype, signed = data.draw(st.sampled_from(INTEGER_DTYPES)), data.draw(st.booleans())
     largest = min(np.iinfo(dtype).max, 2**55 - 1 if signed else 2**56 - 1)
@@ -161,7 +162,7 @@ def test_truncation_and_trailing_bytes_are_refused(name: str, implementation: st
 
 @pytest.mark.parametrize("implementation", CODER_IMPLEMENTATIONS)
 @given(data=st.data())
-@settings(max_examples=25, deadline=None)
+@examples(25)
 def test_damaged_stream_is_refused_or_decodes_to_the_requested_count(implementation: str, data: st.DataObject) -> None:
     values, signed = HARD_CASES["Morton gaps"]
     damaged = bytearray(ENCODED_MORTON_GAPS)

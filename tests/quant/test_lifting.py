@@ -2,8 +2,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_tests import examples
 
 from hyrfpack.quant.lifting import inverse_lift, iter_levels, lift
 
@@ -36,7 +37,7 @@ def choose_nearest_to(target: np.ndarray, steps: np.ndarray):
 
 
 @given(st.data())
-@settings(max_examples=150, deadline=None)
+@examples(150)
 def test_inverse_lift_follows_the_definition(data: st.DataObject) -> None:
     pairs = data.draw(st.lists(st.tuples(st.integers(-(2**14), 2**14), st.integers(1, 2**24)), max_size=70))
     weight = data.draw(PREDICTION_WEIGHTS)
@@ -63,7 +64,7 @@ def test_inverse_lift_returns_the_values_that_lift_announced(count: int, weight:
 
 
 @given(st.data())
-@settings(max_examples=60, deadline=None)
+@examples(60)
 def test_any_chosen_residuals_round_trip(data: st.DataObject) -> None:
     count, weight, seed = data.draw(st.integers(0, 80)), data.draw(PREDICTION_WEIGHTS), data.draw(st.integers(0, 99))
     steps = np.random.default_rng(seed).integers(1, 2**34, count)

@@ -3,8 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_tests import examples
 
 from hyrfpack.quant.morton import MAX_BITS_PER_AXIS, morton_cells, morton_codes, spread_bits
 
@@ -17,7 +18,7 @@ def interleave_bits(cell: tuple[int, int, int]) -> int:
 
 
 @given(st.lists(st.tuples(CELL_COORDINATE, CELL_COORDINATE, CELL_COORDINATE), max_size=40))
-@settings(max_examples=150, deadline=None)
+@examples(150)
 def test_morton_codes_interleave_bits_and_morton_cells_inverts_them(cells: list[tuple[int, int, int]]) -> None:
     array = np.array(cells, np.int64).reshape(-1, 3)
 
@@ -29,7 +30,7 @@ def test_morton_codes_interleave_bits_and_morton_cells_inverts_them(cells: list[
 
 
 @given(st.lists(CELL_COORDINATE, max_size=40))
-@settings(max_examples=50, deadline=None)
+@examples(50)
 def test_spreading_bits_of_tensors_moves_bit_i_to_bit_3_i(numbers: list[int]) -> None:
     expected = [interleave_bits((number, 0, 0)) for number in numbers]
     assert spread_bits(torch.tensor(numbers, dtype=torch.int64)).tolist() == expected

@@ -6,8 +6,9 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_tests import examples
 
 from hyrfpack.quant.errors import DamagedDataError
 from hyrfpack.quant.integers import encode_integers
@@ -81,7 +82,7 @@ def test_points_round_trip(name: str) -> None:
 
 
 @given(st.data())
-@settings(max_examples=100, deadline=None)
+@examples(100)
 def test_any_points_round_trip(data: st.DataObject) -> None:
     bits = data.draw(st.lists(st.integers(1, MAX_BITS_PER_AXIS), min_size=1, max_size=MAX_POINT_CLASSES))
     count, seed = data.draw(st.integers(0, 200)), data.draw(st.integers(0, 1000))
@@ -206,7 +207,7 @@ def check_decodes_to_the_lattice_or_is_refused(data: bytes, count: int) -> None:
 
 
 @given(st.data())
-@settings(max_examples=200, deadline=None)
+@examples(200)
 def test_damaged_data_is_refused_or_decodes_to_the_lattice(data: st.DataObject) -> None:
     damaged = bytearray(SAMPLE_DATA)
     for _ in range(data.draw(st.integers(1, 4))):
@@ -216,7 +217,7 @@ def test_damaged_data_is_refused_or_decodes_to_the_lattice(data: st.DataObject) 
 
 
 @given(st.binary(max_size=120), st.integers(0, 50))
-@settings(max_examples=100, deadline=None)
+@examples(100)
 def test_random_bytes_are_refused_or_decode_to_the_lattice(data: bytes, count: int) -> None:
     check_decodes_to_the_lattice_or_is_refused(data, count)
     check_decodes_to_the_lattice_or_is_refused(SAMPLE_DATA[:13] + data, count)

@@ -2,8 +2,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_tests import examples
 from scipy.special import gammaln
 from token_streams import decode_tokens_by_spec, laplace_tokens
 
@@ -113,7 +114,7 @@ def test_any_number_of_lanes_decodes(lanes_log2: int, implementation: str, monke
 
 @pytest.mark.parametrize("implementation", CODER_IMPLEMENTATIONS)
 @given(data=st.data())
-@settings(max_examples=70, deadline=None)
+@examples(70)
 def test_any_tokens_round_trip(implementation: str, data: st.DataObject) -> None:
     top, contexts_below = data.draw(st.sampled_from([0, 1, 3, 20, 125])), data.draw(st.integers(1, 256))
     pairs = data.draw(st.lists(st.tuples(st.integers(0, top), st.integers(0, contexts_below - 1)), max_size=400))
@@ -171,7 +172,7 @@ def test_correlated_tokens_are_coded_with_classes_of_the_previous_token() -> Non
 
 
 @given(st.data())
-@settings(max_examples=50, deadline=None)
+@examples(50)
 def test_normalised_frequencies_add_up_and_keep_every_nonzero_weight(data: st.DataObject) -> None:
     size = data.draw(st.integers(1, 127))
     weight = st.one_of(st.just(0), st.integers(1, 50), st.integers(0, 2**50))
@@ -223,7 +224,7 @@ def test_truncation_is_refused(name: str, implementation: str) -> None:
     "name", ["contexts", "classes", "many contexts, few tokens", "many tokens, static", "constant"]
 )
 @given(data=st.data())
-@settings(max_examples=8, deadline=None)
+@examples(8)
 def test_damaged_stream_is_refused_or_decodes_to_the_requested_count(
     name: str, implementation: str, data: st.DataObject
 ) -> None:
@@ -248,7 +249,7 @@ STREAM_BY_CASE: dict[str, bytes] = {}
 
 @pytest.mark.parametrize("implementation", CODER_IMPLEMENTATIONS)
 @given(data=st.binary(max_size=100), count=st.integers(0, 3000))
-@settings(max_examples=200, deadline=None)
+@examples(200)
 def test_random_bytes_are_refused_or_decode_to_the_requested_count(
     data: bytes, count: int, implementation: str
 ) -> None:

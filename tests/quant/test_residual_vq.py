@@ -2,9 +2,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from property_tests import examples
 from scipy.cluster.vq import kmeans2
 
 from hyrfpack.quant import ResidualVectorQuantizer
@@ -45,7 +46,7 @@ def test_error_falls_with_every_stage(codebook_dtype: str) -> None:
     st.integers(1, 9),
     st.sampled_from(["float32", "float16"]),
 )
-@settings(max_examples=150, deadline=None)
+@examples(150)
 def test_error_never_grows_with_a_stage(values: np.ndarray, size: int, codebook_dtype: str) -> None:
     indices, codebooks = ResidualVectorQuantizer(4, size, codebook_dtype).encode(values)
 

@@ -4,8 +4,9 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_tests import examples
 
 from hyrfpack.quant.steps import ALL_ZERO_CODE, FIXED_POINT_ONE, decode_step, encode_step
 
@@ -39,7 +40,7 @@ def test_every_code_round_trips_through_its_step() -> None:
 
 
 @given(st.floats(1e-300, 1e300) | st.floats(math.log(1e-8), math.log(1e5)).map(math.exp))
-@settings(max_examples=200, deadline=None)
+@examples(200)
 def test_encode_step_chooses_the_nearest_step_by_ratio(step: float) -> None:
     def distance(code: int) -> float:
         return abs(math.log(step_by_definition(code) / 2**24) - math.log(step))
@@ -56,7 +57,7 @@ def test_steps_out_of_range_get_the_first_or_last_code(step: float, code: int) -
 
 
 @given(st.lists(st.floats(0, 1e6), max_size=50))
-@settings(max_examples=50, deadline=None)
+@examples(50)
 def test_no_step_gets_the_code_for_all_zero(steps: list[float]) -> None:
     codes = encode_step(np.array(steps))
 

@@ -176,6 +176,7 @@ def test_a_curve_has_seconds_and_one_of_an_earlier_version_a_note_about_their_ab
     assert "Times of single steps are missing for b" in Page(tmp_path / "page.html").words
 
 
+@pytest.mark.usefixtures("drawn_figures")
 def test_the_same_runs_give_the_same_bytes_and_a_page_fetches_nothing(runs, tmp_path):
     pages = [tmp_path / "one.html", tmp_path / "two.html"]
     for page in pages:

@@ -140,6 +140,7 @@ def test_the_report_reuses_the_sensitivity_measured_for_packing(profile, measure
 # -- the page as a file ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("drawn_figures")
 def test_the_page_is_valid_and_refers_only_to_its_own_pictures(report_with_photos):
     packed, _, page = report_with_photos
     folder = packed.parent / "page"

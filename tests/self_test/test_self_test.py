@@ -71,6 +71,19 @@ def test_all_cpu_kernels_pass_in_a_child_process() -> None:
 
 @needs_triton
 @needs_interpreter
+def test_a_kernel_that_crashes_and_a_wrong_one_are_found_and_another_still_runs() -> None:
+    test = run_broken({"contract": "crashes", "composite": "nan"}, ("contract", "composite", "adam_step"))
+    assert test.problem is None
+    assert {operation: str(row["note"]) for operation, row in test.failed_operations.items()} == {
+        "contract": "its process ended by SIGSEGV: last words",
+        "composite": "image is NaN or infinite",
+    }
+    assert [row["item"] for row in test.rows if "status" not in row] == ["adam_step"]
+
+
+@needs_triton
+@needs_interpreter
+@pytest.mark.acceptance
 def test_kernels_broken_in_any_way_are_found_and_the_others_still_run() -> None:
     test = run_broken(
         {

@@ -2,8 +2,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_tests import examples
 from scenes import camera_at, ring
 
 from hyrfpack.model.exposure import MAX_CENTERS, inverse_quadratic_kernel
@@ -76,7 +77,7 @@ def test_equal_gains_are_predicted_exactly():
     np.testing.assert_allclose(predicted, 0.25, atol=1e-6)
 
 
-@settings(max_examples=30, deadline=None)
+@examples(30)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 90))
 def test_a_map_never_changes_faster_than_allowed_nor_leaves_the_range_of_the_photos(seed, count):
     rng = np.random.default_rng(seed)

@@ -202,7 +202,10 @@ def test_metrics_of_an_earlier_model_do_not_stay_beside_a_new_one(full_disk_suff
     assert file_names(tmp_path) == {"model.hyrf", "training.json", "views"} and not list((tmp_path / "views").iterdir())
 
 
-@pytest.mark.parametrize("damage", [b"", b"[]", b"{}", b'{"version": 1}', None])
+@pytest.mark.parametrize(
+    "damage",
+    [b'{"version": 1}', None, *(pytest.param(damage, marks=pytest.mark.acceptance) for damage in (b"", b"[]", b"{}"))],
+)
 def test_a_damaged_or_foreign_training_record_is_ignored(full_disk_suffixes, tmp_path, damage):
     full_disk_suffixes.add("metrics.json")
     train_model(make_scene(), tmp_path, SHORT_CONFIG, context=QUIET_CONTEXT)

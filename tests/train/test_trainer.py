@@ -291,7 +291,9 @@ def stop_at(step: int, path: Path, config: TrainConfig = SHORT_CONFIG, **options
 
 # 1: before the first regular checkpoint; 2 and 12: directly after a round (and a reset); 14: between rounds, with
 # collected gradients; 30: after density control; 39: one step before the end.
-@pytest.mark.parametrize("step", [1, 2, 12, 14, 30, 39])
+@pytest.mark.parametrize(
+    "step", [2, 14, *(pytest.param(step, marks=pytest.mark.acceptance) for step in (1, 12, 30, 39))]
+)
 def test_resuming_gives_the_bytes_of_the_uninterrupted_run(step, uninterrupted_trainer, tmp_path):
     path = tmp_path / "checkpoint.pt"
     stop_at(step, path)
@@ -479,7 +481,25 @@ HARD_STARTS = {
 }
 
 
-@pytest.mark.parametrize("start", HARD_STARTS)
+# The integration layer trains from these for longer in tests/hard_cases/test_training.py.
+STARTS_TESTED_ELSEWHERE = {
+    "all points coincident",
+    "one point",
+    "ten points",
+    "points a million units away",
+    "one view",
+    "one view and no points",
+    "the same view six times",
+}
+
+
+@pytest.mark.parametrize(
+    "start",
+    [
+        pytest.param(start, marks=[pytest.mark.acceptance] if start in STARTS_TESTED_ELSEWHERE else [])
+        for start in HARD_STARTS
+    ],
+)
 def test_hard_starts_train_to_finite_parameters(start):
     trainer = Trainer(HARD_STARTS[start](), dataclasses.replace(SHORT_CONFIG, steps=20))
     losses = []

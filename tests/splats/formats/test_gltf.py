@@ -7,9 +7,10 @@ import struct
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from made_up_splats import random_splats
+from property_tests import examples
 from scipy.spatial.transform import Rotation
 
 from hyrfpack.errors import HyrfDataError
@@ -190,7 +191,7 @@ def test_invalid_content_is_refused_with_the_reason(change, sentence):
 _SAMPLE_FILE = gltf.encode(random_splats(3, degree=1), Hints(Y_DOWN))
 
 
-@settings(max_examples=150, deadline=None)
+@examples(150)
 @given(
     places=st.lists(st.tuples(st.integers(0, len(_SAMPLE_FILE) - 1), st.integers(0, 255)), max_size=4),
     end=st.integers(0, len(_SAMPLE_FILE)) | st.just(len(_SAMPLE_FILE)),
@@ -209,7 +210,7 @@ _SAMPLE_BINARY_BYTES = parse_json(_SAMPLE_FILE)["buffers"][0]["byteLength"]
 _HOSTILE_JSON_VALUES = st.sampled_from([None, -1, 0, 1e308, 2**70, True, "x", [], {}, [1], float("nan")])
 
 
-@settings(max_examples=150, deadline=None)
+@examples(150)
 @given(keys=st.lists(st.integers(0, 30), min_size=1, max_size=6), value=_HOSTILE_JSON_VALUES)
 def test_any_invalid_json_entry_is_decoded_or_refused(keys, value):
     content = parse_json(_SAMPLE_FILE)

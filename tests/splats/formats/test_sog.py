@@ -11,9 +11,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
+from property_tests import examples
 
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.ops.harmonics import num_sh_bases
@@ -234,7 +235,7 @@ def test_only_files_named_in_the_metadata_are_unpacked() -> None:
     assert set(sog.unzip(bundle.getvalue(), "bundle")) == set(hand_packed_bundle())
 
 
-@settings(max_examples=150, deadline=None)
+@examples(150)
 @given(st.data())
 def test_mutated_bundles_are_decoded_or_refused(data: st.DataObject) -> None:
     bundle = bytearray(SAMPLE_BUNDLE)
@@ -247,7 +248,7 @@ def test_mutated_bundles_are_decoded_or_refused(data: st.DataObject) -> None:
         pass
 
 
-@settings(max_examples=150, deadline=None)
+@examples(150)
 @given(st.data())
 def test_mutated_files_are_decoded_or_refused(data: st.DataObject) -> None:
     files = dict(SAMPLE_FILES)

@@ -84,7 +84,7 @@ def describe_in_node(app_folder: Path, file: Path, degree: int) -> dict:
     return run_script(app_folder / "describe.mjs", file, degree)
 
 
-@pytest.mark.parametrize("degree", [0, 1, 3])
+@pytest.mark.parametrize("degree", [3, *(pytest.param(degree, marks=pytest.mark.acceptance) for degree in (0, 1))])
 def test_a_loaded_file_has_the_fitted_splats(app_folder: Path, tmp_path: Path, degree: int) -> None:
     found = describe_in_node(app_folder, save_model(make_model(), tmp_path / "scene.hyrf"), degree)
 
