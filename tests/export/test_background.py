@@ -6,8 +6,14 @@ import torch
 from scenes import camera_at, ring, small_model
 
 from hyrfpack.errors import HyrfError
-from hyrfpack.export.background import background_picture, background_splats, cell_centers, find_cells
-from hyrfpack.export.bake import bake
+from hyrfpack.export.background import (
+    _accumulate_colors,
+    background_picture,
+    background_splats,
+    cell_centers,
+    find_cells,
+)
+from hyrfpack.export.bake import bake, compute_visibility
 from hyrfpack.model import BACKGROUND_RADIUS, Frame
 from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.scene import Camera
@@ -60,6 +66,17 @@ def test_background_splats_are_denser_where_cameras_look():
     assert ahead.mean() > 3 * (1 - math.cos(0.6)) / 2  # three times the share of a uniform sphere
     assert splats.scales[ahead].mean() < splats.scales[~ahead].mean()
     assert len(background_splats(model, [])) <= 1000
+
+
+@torch.no_grad()
+def test_cells_add_up_the_light_that_all_cameras_see():
+    model, camera = sky_model(), camera_at((0, -3, 0))
+    (seen,) = compute_visibility(model, [camera])
+
+    grid, once, twice = (_accumulate_colors(model, [camera] * n, [seen] * n)[0] for n in range(3))
+
+    assert (once[:, 0] > 10 * grid[:, 0]).any()
+    np.testing.assert_allclose(twice - grid, 2 * (once - grid), atol=1e-9)
 
 
 def test_background_splats_lie_on_the_sphere_around_the_frame():
