@@ -5,9 +5,10 @@
 
 The Gaussians are an even selection of --model, in three orders: of the file, of Morton codes, and random. Steps of the
 three runs alternate in one process. Rows are counted for the Gaussians in view of the first photo: a block of
-consecutive ones adds its gradients to the rows of its cells' corners. The first number is the share of these additions
-that go to different rows; the second one is the share of 32-byte sectors, for 32 consecutive Gaussians and one corner,
-which a GPU accesses together.
+consecutive ones adds its gradients to the rows of its cells' corners. "Distinct rows" is the share of these additions
+that go to different rows. "Distinct sectors" is the share of 32-byte sectors, for 32 consecutive Gaussians and one
+corner, which a GPU accesses together. "Runs" is the share of additions left if those of consecutive Gaussians in the
+same cell were summed first.
 """
 
 from __future__ import annotations
@@ -66,6 +67,16 @@ def measure_steps(scene: Scene, models: dict[str, HybridModel], steps: int) -> d
     return {name: values[WARMUP_STEPS:] for name, values in seconds.items()}
 
 
+def share_of_runs(coords: np.ndarray, grid: HashGridConfig) -> float:
+    """Return how many runs of consecutive points in the same cell there are for each point (N, 3), mean of levels."""
+    shares = []
+    for resolution in grid.resolutions:
+        cells = np.floor(coords * (resolution - 1)).reshape(-1, POINTS_PER_BLOCK, 3)
+        starts = (np.diff(cells, axis=1) != 0).any(-1)
+        shares.append((np.count_nonzero(starts) + len(cells)) / len(coords))
+    return float(np.mean(shares))
+
+
 def hash_rows(coords: np.ndarray, grid: HashGridConfig) -> np.ndarray:
     """Return the rows (levels, 8, N) within each level that points (N, 3) float32 of the cube read."""
     size, rows = 1 << grid.log2_table_size, []
@@ -84,17 +95,18 @@ def share_of_distinct(values: np.ndarray) -> float:
     return float((np.count_nonzero(np.diff(ordered, axis=-1)) + ordered[..., 0].size) / ordered.size)
 
 
-def count_rows(model: HybridModel, scene: Scene) -> tuple[float, float]:
-    """Return the shares of distinct rows of a block, and of distinct sectors of an access."""
+def count_rows(model: HybridModel, scene: Scene) -> tuple[float, float, float]:
+    """Return the shares of distinct rows of a block, of distinct sectors of an access, and of runs of a cell."""
     seen = gaussians_in_view(model, scene.train[0].camera)
     coords = model.cube_coords(model.gaussians.positions.detach()[seen]).numpy()
-    rows = hash_rows(coords[: len(coords) // POINTS_PER_BLOCK * POINTS_PER_BLOCK], model.config.radiance)
+    coords = coords[: len(coords) // POINTS_PER_BLOCK * POINTS_PER_BLOCK]
+    rows = hash_rows(coords, model.config.radiance)
     levels = len(rows)
     blocks = (
         rows.reshape(levels, 8, -1, POINTS_PER_BLOCK).transpose(0, 2, 1, 3).reshape(levels, -1, 8 * POINTS_PER_BLOCK)
     )
     accesses = rows.reshape(levels, 8, -1, POINTS_PER_ACCESS) // ROWS_PER_SECTOR
-    return share_of_distinct(blocks), share_of_distinct(accesses)
+    return share_of_distinct(blocks), share_of_distinct(accesses), share_of_runs(coords, model.config.radiance)
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -116,9 +128,9 @@ def main(arguments: list[str] | None = None) -> None:
             ratios = np.array(values) / seconds["file"]
             quartiles = " to ".join(f"{value:.3f}" for value in np.quantile(ratios, (0.25, 0.75)))
             median = f"{statistics.median(values):.4f}"
-            distinct_rows, sectors = (f"{share:.3f}" for share in shares[name])
-            rows.append([f"{count:,}", name, median, f"{np.median(ratios):.3f}", quartiles, distinct_rows, sectors])
-    header = ["Gaussians", "order", "CPU s a step", "ratio", "quartiles", "distinct rows", "distinct sectors"]
+            counted = [f"{share:.3f}" for share in shares[name]]
+            rows.append([f"{count:,}", name, median, f"{np.median(ratios):.3f}", quartiles, *counted])
+    header = ["Gaussians", "order", "CPU s a step", "ratio", "quartiles", "distinct rows", "distinct sectors", "runs"]
     print(markdown_table(header, rows))
 
 
