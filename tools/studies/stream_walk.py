@@ -50,7 +50,8 @@ RECORD_SCRIPT = """(() => {
   });
   player.addEventListener("frame", ({ detail }) => record.frames.push(detail));
   const look = () => {
-    if (player.times.first === null) requestAnimationFrame(look);
+    // The state of a stream may come after its first picture; the page of a file has none.
+    if (player.times.first === null || player.loader.state === null) requestAnimationFrame(look);
     else record.firstBytes = player.loader.state?.bytes ?? null;
   };
   look();
