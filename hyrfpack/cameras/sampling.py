@@ -154,13 +154,14 @@ def select_representative_cameras(
     highest = rates.max(axis=0)
     floor = np.maximum(_MIN_RATE_RATIO * highest, np.finfo(np.float32).tiny)
     logs, is_seen = np.log(np.maximum(rates, floor)), highest > 0
+    all_logs = logs.max(axis=0)
     limit, selected, best, ratio = np.log(MAX_REPRESENTED_RATIO), [0], logs[0], 0.0
     while len(selected) < min(most, len(cameras)):
         gains = np.maximum(logs, best).sum(axis=1)
         gains[selected] = -np.inf
         selected.append(int(gains.argmax()))
         best = np.maximum(best, logs[selected[-1]])
-        missing = (logs.max(axis=0) - best)[is_seen]
+        missing = (all_logs - best)[is_seen]
         ratio = float(np.quantile(missing, REPRESENTED_SHARE)) if len(missing) else 0.0
         if len(selected) >= least and ratio <= limit:
             break
