@@ -32,7 +32,7 @@ from hyrfpack.quant.steps import FIXED_POINT_ONE, decode_step
 from tools.safety.make_golden import add_golden_residuals
 
 GAUSSIAN_COUNT = 300
-PRICE = 0.37
+LOSS_PER_BIT = 0.37
 MIN_NONZERO_PARAMETERS = 8  # Not all numbers of these are rounded to zero, so that their gradients are compared.
 
 
@@ -84,12 +84,12 @@ def expected_values(model: HybridModel, quantized: QuantizedModel) -> dict[str, 
 
 
 def expected_rate_gradients(model: HybridModel, quantized: QuantizedModel) -> dict[str, Tensor]:
-    """Return PRICE * sign(q) / (b ln 2 step) of each number in float64, by parameter."""
+    """Return LOSS_PER_BIT * sign(q) / (b ln 2 step) of each number in float64, by parameter."""
 
     def gradient(symbols: np.ndarray, index: np.ndarray, codes: np.ndarray) -> np.ndarray:
         means = [np.abs(symbols[index == group]).mean() if (index == group).any() else 0 for group in range(len(codes))]
         slopes = 1 / ((np.array(means) + MIN_MEAN_MAGNITUDE) * np.log(2) * decode_step(codes) / FIXED_POINT_ONE)
-        return PRICE * np.sign(symbols) * slopes[index]
+        return LOSS_PER_BIT * np.sign(symbols) * slopes[index]
 
     plan, result = quantized.plan, {}
     for group in quantized.channels[0]:
@@ -138,7 +138,7 @@ def test_values_and_rate_gradients_equal_those_of_the_file_while_parameters_chan
 ) -> None:
     model = make_model(seed)
     case = plan_case(model, make_sensitivity(model, seed), distortion)
-    quantizer = TrainingQuantizer(case.model, case.plan, case.sensitivity, PRICE)
+    quantizer = TrainingQuantizer(case.model, case.plan, case.sensitivity, LOSS_PER_BIT)
     previous = quantize(case.model, case.plan, case.sensitivity, reach=0)
     for step in range(3):
         quantized = quantize(case.model, case.plan, case.sensitivity, reach=0, previous=previous)
@@ -157,7 +157,7 @@ def test_prediction_weights_are_those_of_the_first_parameters() -> None:
     first = quantize(case.model, case.plan, case.sensitivity, reach=0)
     weights = {channel.weight for channels in first.channels for group in channels.values() for channel in group}
     assert len(weights) > 1
-    quantizer = TrainingQuantizer(case.model, case.plan, case.sensitivity, PRICE)
+    quantizer = TrainingQuantizer(case.model, case.plan, case.sensitivity, LOSS_PER_BIT)
     assert_same_values(quantizer.quantize(case.model), expected_values(case.model, first))
 
 
@@ -166,7 +166,7 @@ def test_numbers_without_prediction_equal_those_of_the_file(monkeypatch: pytest.
     model = make_model()
     case = plan_case(model, make_sensitivity(model))
     quantized = quantize(case.model, case.plan, case.sensitivity, reach=0)
-    found = TrainingQuantizer(case.model, case.plan, case.sensitivity, PRICE).quantize(case.model)
+    found = TrainingQuantizer(case.model, case.plan, case.sensitivity, LOSS_PER_BIT).quantize(case.model)
     assert_same_values(found, expected_values(case.model, quantized))
     assert_close_gradients(found, expected_rate_gradients(case.model, quantized))
 
@@ -191,7 +191,7 @@ def test_hard_numbers_equal_those_of_the_file() -> None:
         first = index[0]
         case.model.radiance.weights[0].view(-1)[0] = float(2.5 * decode_step(codes[first]) / FIXED_POINT_ONE)
     quantized = quantize(case.model, case.plan, sensitivity, reach=0)
-    quantizer = TrainingQuantizer(case.model, case.plan, sensitivity, PRICE)
+    quantizer = TrainingQuantizer(case.model, case.plan, sensitivity, LOSS_PER_BIT)
     found = quantizer.quantize(case.model)
     assert_same_values(found, expected_values(case.model, quantized))
     assert not found.values["geometry.grid.table"].any() and not found.rate_gradients["geometry.grid.table"].any()
@@ -204,9 +204,9 @@ def test_hard_numbers_equal_those_of_the_file() -> None:
 def test_the_result_does_not_depend_on_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     model = make_model()
     case = plan_case(model, make_sensitivity(model))
-    whole = TrainingQuantizer(case.model, case.plan, case.sensitivity, PRICE).quantize(case.model)
+    whole = TrainingQuantizer(case.model, case.plan, case.sensitivity, LOSS_PER_BIT).quantize(case.model)
     monkeypatch.setattr("hyrfpack.compress.training_quantizer.NUMBERS_PER_CPU_BLOCK", 7)
-    blocks = TrainingQuantizer(case.model, case.plan, case.sensitivity, PRICE).quantize(case.model)
+    blocks = TrainingQuantizer(case.model, case.plan, case.sensitivity, LOSS_PER_BIT).quantize(case.model)
     assert_same_values(blocks, whole.values)
     assert all(torch.equal(value, whole.rate_gradients[name]) for name, value in blocks.rate_gradients.items())
 
@@ -216,7 +216,7 @@ def test_residuals_are_quantised_as_in_the_file() -> None:
     case = plan_case(model, make_sensitivity(model), 1e-5)
     quantized = quantize(case.model, case.plan, case.sensitivity, reach=0)
     assert {SHAPES, HARMONICS} <= quantized.arrays().keys()
-    found = TrainingQuantizer(case.model, case.plan, case.sensitivity, PRICE).quantize(case.model)
+    found = TrainingQuantizer(case.model, case.plan, case.sensitivity, LOSS_PER_BIT).quantize(case.model)
     assert_same_values(found, expected_values(case.model, quantized))
 
 
@@ -246,9 +246,9 @@ def test_a_gpu_gives_the_same_numbers_without_waits_and_copies(gpu: torch.device
     model = make_model()
     model.precision = "float32"
     case = plan_case(model, make_sensitivity(model))
-    expected = TrainingQuantizer(case.model, case.plan, case.sensitivity, PRICE).quantize(case.model)
+    expected = TrainingQuantizer(case.model, case.plan, case.sensitivity, LOSS_PER_BIT).quantize(case.model)
     there = case.model.to(gpu)
-    quantizer = TrainingQuantizer(there, case.plan, case.sensitivity, PRICE)
+    quantizer = TrainingQuantizer(there, case.plan, case.sensitivity, LOSS_PER_BIT)
     heard = []
     with listen_to_gpu(lambda kind, name: heard.append((kind, name))):
         found = quantizer.quantize(there)

@@ -39,7 +39,7 @@ WARMUP_STEPS = 2  # The first steps compile kernels.
 POINTS_PER_BLOCK = 256  # as in `hyrfpack.ops.hash_encode.gpu`
 POINTS_PER_ACCESS = 32
 ROWS_PER_SECTOR = 4
-CORNERS = np.array([[corner >> axis & 1 for axis in range(3)] for corner in range(8)])
+CELL_CORNER_OFFSETS = np.array([[corner >> axis & 1 for axis in range(3)] for corner in range(8)])
 
 
 def orders_of(model: HybridModel) -> dict[str, Tensor]:
@@ -82,7 +82,7 @@ def hash_rows(coords: np.ndarray, grid: HashGridConfig) -> np.ndarray:
     size, rows = 1 << grid.log2_table_size, []
     for resolution in grid.resolutions:
         cells = np.clip(np.floor(coords * (resolution - 1)), 0, resolution - 2).astype(np.int64)
-        x, y, z = np.moveaxis(cells + CORNERS[:, None], -1, 0)
+        x, y, z = np.moveaxis(cells + CELL_CORNER_OFFSETS[:, None], -1, 0)
         dense = resolution**3 <= size
         hashed = (x ^ (y * PRIME_Y) ^ (z * PRIME_Z)) & (size - 1)
         rows.append(x + resolution * (y + resolution * z) if dense else hashed)
