@@ -43,13 +43,12 @@ class LevelRenderer:
         Raises:
             HyrfError: a view within the limit could have no Gaussian.
         """
-        manifest = scene.manifest
-        smallest = [min(chunk.levels, key=lambda level: level.gaussians) for chunk in manifest.chunks]
+        levels = [level for chunk in scene.manifest.chunks for level in chunk.levels]
         if bytes is None:
-            unit, given, least = "Gaussians", gaussians, min((level.gaussians for level in smallest), default=0)
+            unit, given, least = "Gaussians", gaussians, min((level.gaussians for level in levels), default=0)
         else:
             unit, given = "bytes", bytes
-            least = manifest.shared_bytes + min((level.bytes for level in smallest), default=0)
+            least = scene.manifest.shared_bytes + min((level.bytes for level in levels), default=0)
         if given is not None and given < least:
             raise HyrfError(
                 f"{scene.path}: no chunk can be drawn within {given:,} {unit}", fix=f"allow at least {least:,} {unit}"
