@@ -35,10 +35,10 @@ _LOG2_ALPHA_MAX = tl.constexpr(math.log2(reference.ALPHA_MAX))
 # A finite number replaces log2(0), the logarithm of opacity 0.
 _LOG2_ZERO_OPACITY = tl.constexpr(-1e30)
 _ROWS_CLEARED_PER_STORE = tl.constexpr(32)
-# A tile has one warp with 8 pixels per thread. On sm_90 (Triton 3.7.1) forward then takes 141 instructions per pair; two
-# warps would take 174, since both load everything. Backward takes 467; two warps would take 792 and 24 barriers, since
-# each of its sums crosses the warps. At 80 to 100 registers per thread, 20 to 25 tiles share a multiprocessor, which is
-# enough to hide the latency of a chunk's loads.
+# A tile has one warp with 8 pixels per thread. On sm_90 (Triton 3.7.1) forward then takes 141 instructions per pair;
+# two warps would take 174, since both load everything. Backward takes 467; two warps would take 792 and 24 barriers,
+# since each of its sums crosses the warps. At 80 to 100 registers per thread, 20 to 25 tiles share a multiprocessor,
+# which is enough to hide the latency of a chunk's loads.
 WARPS_PER_TILE = 1
 
 
