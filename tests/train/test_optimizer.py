@@ -28,6 +28,15 @@ def set_gradients(model, seed: int) -> None:
         p.grad = torch.randn(p.shape, generator=generator)
 
 
+def step_with_gradients_of(alone, edited, rows, optimizers) -> None:
+    """Give the Gaussians of `edited` the gradients of these rows of `alone`, and take a step of both."""
+    set_gradients(alone, 99)
+    for p, q in zip(edited.gaussians.parameters(), alone.gaussians.parameters(), strict=True):
+        p.grad = q.grad[rows].clone()
+    for optimizer in optimizers:
+        optimizer.step(10, 20)
+
+
 def take_steps(model, optimizer, steps, total: int = 20) -> None:
     for step in steps:
         set_gradients(model, step)
@@ -175,11 +184,7 @@ def test_kept_rows_continue_unchanged_after_a_replacement():
     }
 
     optimizers[0].replace_gaussians(keep, nothing)
-    set_gradients(alone, 99)
-    for p, q in zip(edited.gaussians.parameters(), alone.gaussians.parameters(), strict=True):
-        p.grad = q.grad[keep].clone()
-    for optimizer in optimizers:
-        optimizer.step(10, 20)
+    step_with_gradients_of(alone, edited, keep, optimizers)
 
     for p, q in zip(edited.gaussians.parameters(), alone.gaussians.parameters(), strict=True):
         torch.testing.assert_close(p.detach(), q.detach()[keep], rtol=1e-6, atol=1e-7)
@@ -205,11 +210,7 @@ def test_reordered_gaussians_continue_as_before():
     order = torch.tensor([4, 0, 5, 3, 1, 2])
 
     optimizers[0].reorder_gaussians(order)
-    set_gradients(alone, 99)
-    for p, q in zip(edited.gaussians.parameters(), alone.gaussians.parameters(), strict=True):
-        p.grad = q.grad[order].clone()
-    for optimizer in optimizers:
-        optimizer.step(10, 20)
+    step_with_gradients_of(alone, edited, order, optimizers)
 
     for p, q in zip(edited.gaussians.parameters(), alone.gaussians.parameters(), strict=True):
         assert torch.equal(p, q[order])
