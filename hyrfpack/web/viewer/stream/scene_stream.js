@@ -1,6 +1,6 @@
 // Reads a scene folder as views need it, in the worker: fetches the coarsest levels of chunks first and then, by
 // priority, the levels that suit the view within a budget of Gaussians; decodes them, and drops what is not needed when
-// memory is short. The memory does not grow with the scene (see level_choice.js).
+// memory is short. That for Gaussians does not grow with the scene (see level_choice.js).
 //
 // Messages to the worker, beside those in worker_tasks.js; `number` is that of the content:
 //     {stream: {manifest, address, name, stage, gaussians, maxRows}}   open the scene with the text `manifest` from
