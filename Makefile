@@ -13,7 +13,7 @@ VENV_STAMP := .venv/.ready
 NODE_STAMP := tests/node/node_modules/.ready
 BUNDLERS_STAMP := tests/bundlers/node_modules/.ready
 
-.PHONY: help demo test test-all test-browsers test-newest test-oldest docs player package golden bench gpu speed sets choices ablations precision kill races fuzz fuzz-browser lint style format clean
+.PHONY: help environment demo test test-all test-browsers test-newest test-oldest docs player package golden bench gpu speed sets choices ablations precision kill races fuzz fuzz-browser lint style format clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z.-]+:.*## / { printf "  make %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -44,6 +44,8 @@ $(BUNDLERS_STAMP): tests/bundlers/package.json tests/bundlers/package-lock.json
 	@if command -v npm >/dev/null && echo "Installing bundlers into tests/bundlers ..." \
 		&& npm ci --prefix tests/bundlers --loglevel error; then touch $@; \
 	else echo "npm could not install the bundlers, so the tests that need them will skip"; fi
+
+environment: $(VENV_STAMP) $(NODE_STAMP) ## install the Python packages and the node packages of the tests
 
 demo: $(VENV_STAMP) ## train, compress and render a small synthetic scene; results in demo/
 	$(BIN)/hyrfpack demo -o demo --overwrite
