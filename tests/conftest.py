@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import gc
 import json
+import logging
 import os
 import shutil
 import signal
@@ -81,6 +82,20 @@ gc.disable()
 def pytest_collection_finish() -> None:
     gc.freeze()
     gc.enable()
+    capture_notes_of_all_tests()
+
+
+def capture_notes_of_all_tests() -> None:
+    """Let `caplog` have the notes of the library, too.
+
+    pytest's option `log_level` would set the level three times a test. It also adds its handlers to each logger that
+    does not propagate, of which torch has dozens. Both take 2 ms a test.
+    """
+    root = logging.getLogger()
+    root.setLevel(logging.INFO)
+    for logger in root.manager.loggerDict.values():
+        if isinstance(logger, logging.Logger):
+            logger.propagate = True
 
 
 @pytest.fixture(scope="session", autouse=True)
