@@ -15,7 +15,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Container, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import cache
 from pathlib import Path
@@ -66,6 +66,11 @@ LAYER_BY_PATH = {
     "train/test_advice.py": "unit",
     "train/test_distributed.py": "acceptance",
 }
+
+
+def only_in_acceptance(values: Iterable, slow: Container) -> list:
+    """Return parameters of a test, those in `slow` with the mark `acceptance`."""
+    return [pytest.param(value, marks=[pytest.mark.acceptance] if value in slow else []) for value in values]
 
 
 def layer_of(item: pytest.Item) -> str:

@@ -1,4 +1,4 @@
-"""How many examples property tests have: all of them in `make test-all`, a third of them in `make test`.
+"""How many examples property tests have: all of them in `make test-all`, a fifth of them in `make test`.
 
 Outside CI Hypothesis draws other examples in each run, so that repeated runs of `make test` still find what is rare.
 """
@@ -10,7 +10,7 @@ from typing import Any
 from hypothesis import settings
 
 # Of the 100 examples that hypothesis draws by default.
-QUICK_EXAMPLES_PERCENT = 33
+QUICK_EXAMPLES_PERCENT = 20
 MIN_EXAMPLES = 10
 settings.register_profile("quick", max_examples=QUICK_EXAMPLES_PERCENT)
 

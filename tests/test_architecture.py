@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -14,6 +14,7 @@ PACKAGE_FOLDER = REPOSITORY_ROOT / "hyrfpack"
 ARCHITECTURE_PAGE = REPOSITORY_ROOT / "docs" / "explanation" / "architecture.md"
 
 
+@cache
 def read_layers() -> list[list[str]]:
     """Return the packages of each layer, top layer first, from the first indented block of the page."""
     block = re.search(r"(?:^    .*\n)+", ARCHITECTURE_PAGE.read_text(), re.MULTILINE)
@@ -25,14 +26,17 @@ def package_of(path: Path) -> str:
     return path.relative_to(PACKAGE_FOLDER).parts[0].removesuffix(".py")
 
 
-def read_imports(path: Path, text: str | None = None) -> Iterator[tuple[int, str]]:
-    """Yield (line, dotted name) of each import of a file, also inside functions and under TYPE_CHECKING."""
+@cache
+def read_imports(path: Path, text: str | None = None) -> list[tuple[int, str]]:
+    """Return (line, dotted name) of each import of a file, also inside functions and under TYPE_CHECKING."""
+    imports: list[tuple[int, str]] = []
     for node in ast.walk(ast.parse(path.read_text() if text is None else text)):
         if isinstance(node, ast.Import):
-            yield from ((node.lineno, alias.name) for alias in node.names)
+            imports += ((node.lineno, alias.name) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             assert not node.level, f"{path}:{node.lineno}: imports are absolute here"
-            yield from ((node.lineno, f"{node.module}.{alias.name}") for alias in node.names)
+            imports += ((node.lineno, f"{node.module}.{alias.name}") for alias in node.names)
+    return imports
 
 
 def find_upward_imports(path: Path, text: str | None = None) -> list[str]:

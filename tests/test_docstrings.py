@@ -44,8 +44,10 @@ def list_public_functions() -> Iterator[tuple[str, object]]:
 
 
 PUBLIC_FUNCTIONS = dict(list_public_functions())
-# tests/poses and tests/bench call these in the integration layer, on less than the examples need.
-SLOW_EXAMPLES = {"hyrfpack.benchmark_model", "hyrfpack.estimate_poses"}
+# Tests of their packages call these in the integration layer, on less than the examples need.
+SLOW_EXAMPLES = {
+    "hyrfpack.benchmark_model", "hyrfpack.estimate_poses", "hyrfpack.split_model", "hyrfpack.train_blocks",
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")

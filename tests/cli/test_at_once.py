@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+from collections.abc import Sequence
 from importlib import import_module
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
@@ -125,12 +126,13 @@ SINGLE_FILE_COMMANDS = [
     ("make packed.hyrf --work made -o {}", "out.html", "out-2.html"),
     ("make packed.hyrf --work made -o {}", "out.points.ply", "out-2.points.ply"),
 ]
-# For these, the integration layer has the first of three tests below, and the acceptance layer all of them.
-SLOW_COMMANDS = ("compress first", "export model.hyrf --baked", "export model.hyrf --sh-degree 0")
-SLOWER_COMMANDS = (*SLOW_COMMANDS, "import ", "compare ", "train ", "make packed.hyrf --work made -o {}")
+# These write with the same function as another command of the list. The acceptance layer has all commands in all tests.
+SLOW_COMMANDS = ("compress first", "export model.hyrf --baked")
+# Of the three tests below, the integration layer has the first for these.
+SLOWER_COMMANDS = (*SLOW_COMMANDS, "export model.hyrf --sh-degree 0", "import ", "compare ", "make packed.hyrf")
 
 
-def mark_slow(cases: list[tuple[str, str, str]], slow: tuple[str, ...]) -> list:
+def mark_slow(cases: Sequence[Sequence[str]], slow: tuple[str, ...]) -> list:
     """Return the cases, those whose command begins with one of `slow` for the acceptance layer."""
     return [pytest.param(*case, marks=[pytest.mark.acceptance] if case[0].startswith(slow) else []) for case in cases]
 
@@ -143,7 +145,10 @@ FOLDER_COMMANDS_WITH_FREE_NAMES = [
 
 
 @pytest.mark.usefixtures("quick_import")
-@pytest.mark.parametrize(("command", "asked", "beside"), [*SINGLE_FILE_COMMANDS, *FOLDER_COMMANDS_WITH_FREE_NAMES])
+@pytest.mark.parametrize(
+    ("command", "asked", "beside"),
+    mark_slow([*SINGLE_FILE_COMMANDS, *FOLDER_COMMANDS_WITH_FREE_NAMES], SLOW_COMMANDS),
+)
 def test_a_file_that_appears_meanwhile_is_kept_and_the_result_gets_another_name(
     command, asked, beside, working_folder, monkeypatch
 ):
@@ -162,7 +167,7 @@ def test_a_file_that_appears_meanwhile_is_kept_and_the_result_gets_another_name(
 
 
 @pytest.mark.usefixtures("quick_import")
-@pytest.mark.parametrize(("command", "asked", "beside"), mark_slow(SINGLE_FILE_COMMANDS, SLOW_COMMANDS))
+@pytest.mark.parametrize(("command", "asked", "beside"), mark_slow(SINGLE_FILE_COMMANDS, (*SLOW_COMMANDS, "import ")))
 def test_json_names_the_file_that_was_actually_written(command, asked, beside, working_folder, monkeypatch):
     create_foreign_file(asked, monkeypatch)
     facts = json.loads(succeeded(*command.format(asked).split(), "--json").stdout)
@@ -175,7 +180,7 @@ def test_json_names_the_file_that_was_actually_written(command, asked, beside, w
 @pytest.mark.usefixtures("quick_import")
 @pytest.mark.parametrize(
     ("command", "asked", "beside"),
-    mark_slow([*SINGLE_FILE_COMMANDS, *FOLDER_COMMANDS_WITH_FREE_NAMES], SLOWER_COMMANDS),
+    mark_slow([*SINGLE_FILE_COMMANDS, *FOLDER_COMMANDS_WITH_FREE_NAMES], (*SLOWER_COMMANDS, "train ")),
 )
 def test_with_overwrite_the_last_writer_wins(command, asked, beside, working_folder, monkeypatch):
     create_foreign_file(asked, monkeypatch)
@@ -278,7 +283,10 @@ CALLS_THAT_WRITE_A_FILE = {
 
 
 @pytest.mark.usefixtures("quick_import")
-@pytest.mark.parametrize("name", CALLS_THAT_WRITE_A_FILE)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=pytest.mark.acceptance if name == "import" else ()) for name in CALLS_THAT_WRITE_A_FILE],
+)
 def test_a_library_call_without_overwrite_keeps_a_new_file_and_reports_its_own_path(name, working_folder, monkeypatch):
     ending = {"export": "ply", "compare": "html"}.get(name, "hyrf")
     create_foreign_file(f"out.{ending}", monkeypatch)
@@ -372,7 +380,10 @@ LOCKING_COMMANDS = [command for command in FOLDER_COMMANDS if "--resume" not in 
 
 
 @pytest.mark.usefixtures("quick_demo")
-@pytest.mark.parametrize("command", LOCKING_COMMANDS)
+@pytest.mark.parametrize(
+    "command",
+    mark_slow([[command] for command in LOCKING_COMMANDS], ("demo ", "compress ", "make packed.hyrf --work o")),
+)
 def test_a_command_locks_its_folder_while_it_writes(command, working_folder, monkeypatch):
     locked = record_lock_at_writes("out", monkeypatch)
     succeeded(*command.split())

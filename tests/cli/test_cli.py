@@ -64,6 +64,13 @@ def packed(run, tmp_path_factory) -> Path:
     return path
 
 
+@pytest.fixture(scope="module")
+def report_with_photos(run, data, tmp_path_factory) -> dict:
+    """What `compress --json` prints for the run and its photos."""
+    path = tmp_path_factory.mktemp("packed") / "compact.hyrf"
+    return json.loads(succeeded("compress", run, "-o", path, "--data", data, "--json").stdout)
+
+
 # -- from photos to files and scores -----------------------------------------------------------------------------------
 
 
@@ -74,7 +81,9 @@ def test_train_writes_a_model_metrics_and_pictures(run):
     assert {path.name for path in (run / "views").iterdir()} == {"0000.png", "0008.png"}
 
 
-@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize(
+    "profile", [pytest.param(name, marks=pytest.mark.acceptance if name == "compact" else ()) for name in PROFILES]
+)
 def test_compress_reports_the_bytes_on_disk(profile, run, tmp_path):
     arguments = ("compress", run / "model.hyrf", "-o", tmp_path / "p.hyrf", "--profile", profile, "--json")
     report = json.loads(succeeded(*arguments).stdout)
@@ -85,34 +94,34 @@ def test_compress_reports_the_bytes_on_disk(profile, run, tmp_path):
 
 def test_compact_is_the_default_and_smaller_than_the_paper_profile(run, packed, tmp_path):
     report = json.loads(succeeded("compress", run / "model.hyrf", "-o", tmp_path / "p.hyrf", "--json").stdout)
+    assert report["bytes_after"] == (tmp_path / "p.hyrf").stat().st_size
     assert report["profile"] == "compact" and report["bytes_after"] < 0.7 * packed.stat().st_size
     assert report["error"] > 0 and sum(report["shares"].values()) == pytest.approx(1)
 
 
-def test_compress_prints_every_section_with_its_bytes(run, tmp_path):
-    printed = succeeded("compress", run / "model.hyrf", "-o", tmp_path / "p.hyrf").stdout
+def test_compress_prints_every_section_with_its_bytes_and_scores(run, data, tmp_path):
+    printed = succeeded("compress", run / "model.hyrf", "-o", tmp_path / "p.hyrf", "--data", data).stdout
     words = ("positions", "geometry hash table", "radiance decoder", "padding", "bits/Gaussian", "bits/number")
-    for word in (*words, "of the loss", "loss in pictures"):
+    for word in (*words, "of the loss", "loss in pictures", "held-out photos: PSNR"):
         assert word in printed
 
 
-def test_compress_with_photos_prints_the_loss_on_held_out_photos(run, data, tmp_path):
-    arguments = ("compress", run / "model.hyrf", "-o", tmp_path / "p.hyrf", "--overwrite", "--data", data)
-    report = json.loads(succeeded(*arguments, "--json").stdout)
+def test_compress_with_photos_reports_the_loss_on_held_out_photos(run, data, report_with_photos):
+    report = report_with_photos
     scores = [
         json.loads(succeeded("evaluate", path, "--data", data, "--json").stdout)
-        for path in (run / "model.hyrf", tmp_path / "p.hyrf")
+        for path in (run / "model.hyrf", report["file"])
     ]
     assert (report["psnr_before"], report["psnr"]) == pytest.approx([score["psnr"] for score in scores])
     assert (report["ssim_before"], report["ssim"]) == pytest.approx([score["ssim"] for score in scores])
-    assert "held-out photos: PSNR" in succeeded(*arguments).stdout
 
 
-def test_compress_of_a_run_uses_its_photos_by_default(run, data, tmp_path):
+def test_compress_of_a_run_uses_its_photos_by_default(run, data, report_with_photos, tmp_path):
     arguments = ("compress", run, "-o", tmp_path / "p.hyrf", "--overwrite", "--json")
-    result, named = succeeded(*arguments), succeeded(*arguments, "--data", data)
+    result = succeeded(*arguments)
     assert f"using the photos that the model was trained on, {data}" in result.stderr
-    assert json.loads(result.stdout) == json.loads(named.stdout) and "psnr" in json.loads(result.stdout)
+    named = {**report_with_photos, "file": str(tmp_path / "p.hyrf")}
+    assert json.loads(result.stdout) == named and "psnr" in named
     without = succeeded(*arguments, "--no-data")
     assert "trained on" not in without.stderr and "psnr" not in json.loads(without.stdout)
 

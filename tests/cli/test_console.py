@@ -215,6 +215,7 @@ class FullDisk(io.StringIO):
         raise OSError(errno.ENOSPC, "No space left on device")
 
 
+@pytest.mark.acceptance
 @pytest.mark.skipif(os.name == "nt", reason="a shell of Unix closes them")
 def test_training_completes_with_standard_error_closed(data, tmp_path):
     done = run_program("2>&-", "train", data, "-o", tmp_path, *TINY_TRAINING_OPTIONS)

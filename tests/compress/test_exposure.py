@@ -109,6 +109,7 @@ def test_finetuning_keeps_the_mean_exposure_and_its_note_in_the_file(
     assert scores[0] > scores[1] + 1
 
 
+@pytest.mark.acceptance
 def test_finetuning_keeps_the_map_and_the_consistent_exposure_and_improves_the_fit(file_with_map, scene, tmp_path):
     compress_model(file_with_map, tmp_path / "coarse.hyrf", CompressConfig(distortion=2e-4), data=scene)
     compress_model(

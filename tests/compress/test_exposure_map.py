@@ -62,9 +62,8 @@ def source(model, tmp_path_factory) -> Path:
     [
         *(
             pytest.param(options, marks=pytest.mark.acceptance)
-            for options in ({}, {"distortion": 1e-5}, {"prune": False})
+            for options in ({}, {"distortion": 1e-5}, {"prune": False}, {"target_bytes": 6000})
         ),
-        {"target_bytes": 6000},
         {"max_psnr_drop": 0.5},
         {"finetune_steps": 3},
         {"profile": "paper"},

@@ -107,6 +107,7 @@ def test_compact_is_much_smaller_than_paper_with_little_loss(paper_file, compact
     assert psnr(path, scene) > psnr(DEMO_MODEL_FILE, scene) - 0.1
 
 
+@pytest.mark.acceptance
 def test_compact_with_the_loss_of_paper_is_smaller(demo_packer, paper_file, scene):
     allowed = max(psnr(DEMO_MODEL_FILE, scene) - psnr(paper_file, scene), 0.0) + 0.02
 
@@ -145,7 +146,8 @@ def test_the_measured_error_is_close_to_the_requested_distortion(scene, tmp_path
     assert sizes == sorted(sizes) and errors == sorted(errors, reverse=True)
 
 
-@pytest.mark.parametrize("share", [0.4, *(pytest.param(share, marks=pytest.mark.acceptance) for share in (0.8, 1.5))])
+@pytest.mark.acceptance
+@pytest.mark.parametrize("share", [0.4, 0.8, 1.5])
 def test_a_target_size_is_met_and_nearly_reached(share, demo_packer, compact_file_and_report):
     target = int(share * compact_file_and_report[1].bytes_after)
 
@@ -155,6 +157,7 @@ def test_a_target_size_is_met_and_nearly_reached(share, demo_packer, compact_fil
     assert f"of {target:,} bytes" in found
 
 
+@pytest.mark.acceptance
 def test_finetuning_raises_the_psnr_at_the_same_size(demo_packer, finetuned_file, scene):
     plain, _ = demo_packer.encode_within_bytes(finetuned_file.stat().st_size, START_DISTORTION)
 
@@ -183,6 +186,7 @@ def test_sizes_after_packing_and_export_match_the_recorded_ones(
     assert sizes == pytest.approx(json.loads(RECORDED_SIZES_FILE.read_text()), rel=0.01)
 
 
+@pytest.mark.acceptance
 def test_results_do_not_depend_on_the_number_of_threads(compact_file_and_report, scene, tmp_path, monkeypatch):
     threads = 1 if thread_count() == 3 else 3
     monkeypatch.setenv("HYRFPACK_THREADS", str(threads))
@@ -191,11 +195,12 @@ def test_results_do_not_depend_on_the_number_of_threads(compact_file_and_report,
     assert (tmp_path / "small.hyrf").read_bytes() == compact_file_and_report[0].read_bytes()
 
 
+@pytest.mark.acceptance
 @pytest.mark.parametrize(
     "limit",
     [
         pytest.param({"target_bytes": 9000}, id="size"),
-        pytest.param({"max_psnr_drop": 0.3}, id="loss", marks=pytest.mark.acceptance),
+        pytest.param({"max_psnr_drop": 0.3}, id="loss"),
     ],
 )
 @pytest.mark.usefixtures("few_views")

@@ -194,7 +194,10 @@ def shells(tmp_path_factory) -> Path:
 
 
 @pytest.mark.usefixtures("quick_distances")
-@pytest.mark.parametrize(("name", "tolerance"), [("two.mesh.ply", 0.1), ("two.collision.obj", 0.15)])
+@pytest.mark.parametrize(
+    ("name", "tolerance"),
+    [pytest.param("two.mesh.ply", 0.1, marks=pytest.mark.acceptance), ("two.collision.obj", 0.15)],
+)
 def test_the_mesh_of_a_merged_file_lies_on_the_surfaces_of_all_parts(name, tolerance, shells, tmp_path):
     hyrfpack.export_model(shells, tmp_path / name, hyrfpack.ExportConfig(voxel=0.06))
 

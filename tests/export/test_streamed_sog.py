@@ -148,6 +148,7 @@ def test_each_leaf_holds_one_chunk_at_all_its_levels(exported, scene):
     assert sorted(chunks_of_leaves(hyrfpack.SceneFolder(scene), exported)) == [0, 1, 2, 3]
 
 
+@pytest.mark.acceptance
 @pytest.mark.usefixtures("quick_scores")
 def test_a_scene_of_several_parts_keeps_its_chunks(tmp_path):
     report = export(GOLDEN_PARTS_SCENE_FOLDER, tmp_path / "out", degree=0, background=False)

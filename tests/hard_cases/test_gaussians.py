@@ -14,6 +14,7 @@ import pytest
 import torch
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from layers import only_in_acceptance
 from property_tests import examples
 from torch import Tensor
 
@@ -117,6 +118,20 @@ HARD_CASES = {
 }
 
 
+# The cases that differ most in the branches that the reference takes.
+DIFFERENT_CASES = {
+    "across the near plane",
+    "needle grazing the camera",
+    "alpha at its cap",
+    "quaternion 1e-13 long",
+    "all coincident",
+    "covers the whole picture",
+    "a twentieth of a pixel, antialiased",
+    "far to the side",
+    "opacity just above 1/255",
+}
+
+
 def _to_natural_units(gaussians: dict[str, Tensor], gradients: dict[str, Tensor]) -> dict[str, Tensor]:
     """Scale gradients to comparable units: per pixel, per factor e of a scale, per radian, per opacity and colour."""
     units = {
@@ -192,7 +207,9 @@ def _central_differences(case: Case, step: float = 1e-5) -> dict[str, Tensor]:
 # -- slopes, float64 ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", HARD_CASES)
+@pytest.mark.parametrize(
+    "name", only_in_acceptance(HARD_CASES, [name for name in HARD_CASES if name not in DIFFERENT_CASES])
+)
 def test_reference_gradients_are_the_slopes(name: str) -> None:
     case = HARD_CASES[name]
     _, gradients = _run(case, "reference", torch.float64)
@@ -228,8 +245,8 @@ def test_float32_agrees_with_float64(implementation: str, name: str) -> None:
     assert (error <= MAX_GRADIENT_ERROR_RATIO[implementation] * _largest_by_gaussian(expected_gradients)).all()
 
 
-@pytest.mark.parametrize("opacity", [0.01, 0.3, 1.0])
-@pytest.mark.parametrize("transmittance_min", [0.0, 1 / 512])
+@pytest.mark.parametrize("opacity", only_in_acceptance([0.01, 0.3, 1.0], [0.3]))
+@pytest.mark.parametrize("transmittance_min", only_in_acceptance([0.0, 1 / 512], [0.0]))
 def test_ten_thousand_layers_keep_their_gradients(opacity: float, transmittance_min: float) -> None:
     """The faint gradients at the back are lost in rounding, so errors are relative to the largest gradient."""
     generator = torch.Generator().manual_seed(0)

@@ -249,9 +249,8 @@ def limit_memory(bytes_per_value: float):
 
 
 # Measured peaks in bytes a value were 4.1 and 4.8 (8 bits), 8.1 and 7.8 (16 bits).
-@pytest.mark.parametrize(
-    ("dtype", "allowed"), [(np.uint8, 6), pytest.param(np.uint16, 11, marks=pytest.mark.acceptance)]
-)
+@pytest.mark.acceptance
+@pytest.mark.parametrize(("dtype", "allowed"), [(np.uint8, 6), (np.uint16, 11)])
 def test_ten_million_symbols_round_trip_in_bounded_memory(dtype, allowed):
     rng = np.random.default_rng(3)
     symbols = np.clip(rng.laplace(np.iinfo(dtype).max / 2, 10, MANY_VALUES), 0, np.iinfo(dtype).max).astype(dtype)
@@ -276,6 +275,7 @@ def test_ten_million_numbers_keep_half_a_step_in_bounded_memory():
     assert np.abs(decoded - values).max() <= half_a_step * (1 + 1e-5)
 
 
+@pytest.mark.acceptance
 def test_ten_million_rows_are_vector_quantised_in_bounded_memory():
     """The bound is close to Lloyd's quantiser of 16 levels for a normal distribution: 0.0095 (Max 1960)."""
     values = np.random.default_rng(5).standard_normal((MANY_VALUES, 1)).astype(np.float32)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from ops.device import IS_INTERPRETED, gpu, needs_triton
+from ops.device import IS_INTERPRETED, gpu, needs_triton, pair_with_implementations
 
 from hyrfpack.ops.hash_encode import cells, corner_rows, hash_encode, level_offsets, level_resolutions
 from hyrfpack.parallel import has_numba
@@ -63,8 +63,10 @@ def move_inside_cells(coords: torch.Tensor, resolutions: tuple[int, ...]) -> tor
     return coords
 
 
-@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
-@pytest.mark.parametrize("case", ENCODING_CASES)
+@pytest.mark.parametrize(
+    ("implementation", "case"),
+    pair_with_implementations(ENCODING_CASES, {"the paper's levels"}, TESTED_IMPLEMENTATIONS),
+)
 def test_values_and_gradients_match_the_float64_reference(implementation: str, case: str) -> None:
     coords, resolutions, log2_table_size, inside = ENCODING_CASES[case]
     if implementation == "gpu" and IS_INTERPRETED:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from ops.device import IS_INTERPRETED, gpu, needs_triton
+from ops.device import IS_INTERPRETED, gpu, needs_triton, pair_with_implementations
 
 from hyrfpack.ops.mlp import mlp
 
@@ -81,8 +81,13 @@ def assert_gradients_close(gradients: list[torch.Tensor], expected: list[torch.T
         torch.testing.assert_close(gradient.double(), wanted, rtol=0, atol=tolerance * scale)
 
 
-@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
-@pytest.mark.parametrize("name", MLP_CASES)
+# Other cases run the same branches of the GPU kernels.
+SIMILAR_GPU_CASES = {"geometry decoder", "radiance decoder, by feature"}
+
+
+@pytest.mark.parametrize(
+    ("implementation", "name"), pair_with_implementations(MLP_CASES, SIMILAR_GPU_CASES, TESTED_IMPLEMENTATIONS)
+)
 def test_values_and_gradients_match_the_float64_reference(implementation: str, name: str) -> None:
     case = case_for(implementation, name)
     result, *gradients = values_and_gradients(case, torch.float32, implementation)
@@ -100,8 +105,10 @@ def relative_difference(values: list[torch.Tensor], expected: list[torch.Tensor]
 
 # float32 rounds a few hidden values to another bfloat16 than float64, 1/256 away, and some cross the zero of a ReLU.
 # So whole tensors are compared. Against exact products all values are rounded, and gradients of x cross zero most.
-@pytest.mark.parametrize("implementation", ["reference", pytest.param("gpu", marks=needs_triton)])
-@pytest.mark.parametrize("name", MLP_CASES)
+@pytest.mark.parametrize(
+    ("implementation", "name"),
+    pair_with_implementations(MLP_CASES, SIMILAR_GPU_CASES, ["reference", pytest.param("gpu", marks=needs_triton)]),
+)
 def test_mixed_values_and_gradients_match_the_mixed_float64_reference(implementation: str, name: str) -> None:
     case = case_for(implementation, name)
     result, *gradients = values_and_gradients(case, torch.float32, implementation, mixed=True)

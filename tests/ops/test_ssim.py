@@ -8,7 +8,7 @@ from itertools import product
 import numpy as np
 import pytest
 import torch
-from ops.device import IS_INTERPRETED, gpu, needs_triton
+from ops.device import IS_INTERPRETED, gpu, needs_triton, pair_with_implementations
 from skimage.metrics import structural_similarity
 
 from hyrfpack.ops.dispatch import has_triton
@@ -104,15 +104,26 @@ def test_ssim_matches_the_float64_reference(implementation: str, case: str) -> N
     assert_same(value_and_gradient(ssim, implementation, *pictures), reference_value_and_gradient(ssim, *pictures))
 
 
-@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
+MASKED_CASES = [
+    *(("two pictures", mask) for mask in MASK_MAKERS),
+    *product(("two strips and tiles", "narrower than the window", "one pixel"), ("no mask", "some pixels")),
+]
+# Other cases run the same branches of the GPU kernels.
+SIMILAR_MASKED_CASES = [
+    ("two strips and tiles", "no mask"),
+    ("two pictures", "some pixels"),
+    ("two pictures", "every pixel"),
+    ("narrower than the window", "no mask"),
+]
+
+
 @pytest.mark.parametrize(
-    ("case", "mask"),
-    [
-        *(("two pictures", mask) for mask in MASK_MAKERS),
-        *product(("two strips and tiles", "narrower than the window", "one pixel"), ("no mask", "some pixels")),
-    ],
+    ("implementation", "masked_case"),
+    pair_with_implementations(MASKED_CASES, SIMILAR_MASKED_CASES, TESTED_IMPLEMENTATIONS),
+    ids=lambda value: "-".join(value) if isinstance(value, tuple) else None,
 )
-def test_photometric_loss_matches_the_float64_reference(implementation: str, mask: str, case: str) -> None:
+def test_photometric_loss_matches_the_float64_reference(implementation: str, masked_case: tuple[str, str]) -> None:
+    case, mask = masked_case
     pictures = case_for(implementation, case)
     chosen = MASK_MAKERS[mask](pictures[0].shape[:2])
     actual = value_and_gradient(photometric_loss, implementation, *pictures, chosen)
