@@ -9,6 +9,7 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any
 
+import numpy as np
 import torch
 import triton.language as tl
 from triton.backends.compiler import BaseBackend
@@ -53,6 +54,8 @@ def speed_up_interpreter() -> None:
     _cache_types()
     _cache_operands()
     _skip_unused_overflow_checks()
+    _call_builtins_directly()
+    _add_floats_directly()
 
 
 def _specialize_arguments(executor: Any, args: tuple, kwargs: dict[str, Any]) -> None:
@@ -181,6 +184,47 @@ def _skip_unused_overflow_checks() -> None:
             check(self, lhs, rhs, binary_op)
 
     TritonSemantic.binary_op_sanitize_overflow_impl = check_in_debug_mode
+
+
+def _call_builtins_directly() -> None:
+    """Pass the interpreter's semantics to functions of the language without copying their keywords first.
+
+    This also leaves out the wrapper that checks that it was passed. Each kernel calls thousands of these functions.
+    """
+    if not _has_parameters(interpreter._patch_attr, "obj", "name", "member", "builder", "scope"):
+        return
+
+    def patch_attr(obj: Any, name: str, member: Any, builder: Any, scope: Any) -> None:
+        function, semantic = getattr(member, "__wrapped__", member), interpreter.interpreter_semantic
+
+        def call(*args: Any, **kwargs: Any) -> Any:
+            kwargs["_semantic"] = semantic
+            return function(*args, **kwargs)
+
+        scope.set_attr(obj, name, call)
+
+    interpreter._patch_attr = patch_attr
+
+
+def _add_floats_directly() -> None:
+    """Add, subtract and multiply two tensors of one type of float32 by numpy, as the interpreter does in the end."""
+    for name, operation in (("__add__", np.add), ("__sub__", np.subtract), ("__mul__", np.multiply)):
+        if _has_parameters(getattr(tl.tensor, name), "self", "other", "_semantic"):
+            setattr(tl.tensor, name, _direct(getattr(tl.tensor, name), operation))
+
+
+def _direct(method: Callable, operation: np.ufunc) -> Callable:
+    convert = getattr(method, "__wrapped__", method)
+
+    def operate(self: Any, other: Any, _semantic: Any = None) -> Any:
+        kind = self.type
+        if type(other) is tl.tensor and other.type.name == kind.name and kind.scalar.name == "fp32":
+            handle = self.handle
+            return tl.tensor(interpreter.TensorHandle(operation(handle.data, other.handle.data), handle.dtype), kind)
+        return convert(self, other, _semantic=_semantic)
+
+    setattr(operate, tl.core.TRITON_BUILTIN, True)
+    return operate
 
 
 # Modules that allocate memory for GPU kernels: those of the operations, and the fake GPU on their behalf.
