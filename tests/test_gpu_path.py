@@ -134,8 +134,14 @@ def make_model(**settings):
     return small_model(points, color_logits=colors, scale_logits=-2.0, fields=1.0, **settings)
 
 
-@pytest.mark.parametrize("kept", [False, True])
-@pytest.mark.parametrize("encoding", ["frequency", "sh"])
+@pytest.mark.parametrize(
+    ("encoding", "kept"),
+    [
+        ("frequency", False),
+        ("sh", True),
+        *(pytest.param(*case, marks=pytest.mark.acceptance) for case in (("frequency", True), ("sh", False))),
+    ],
+)
 def test_renders_agree_with_the_cpu(gpu, kept, encoding):
     camera = camera_at((0.3, -2.2, 0.6), (0.2, 0, 0), width=30, height=20)
     model = make_model(background=True, direction_encoding=encoding)
@@ -151,7 +157,7 @@ def test_renders_agree_with_the_cpu(gpu, kept, encoding):
     assert found.pairs >= expected.pairs
 
 
-@pytest.mark.parametrize("kept", [False, True])
+@pytest.mark.parametrize("kept", [False, pytest.param(True, marks=pytest.mark.acceptance)])
 @pytest.mark.parametrize("part", ["positions", "color_logits", "opacity_logits", "table", "background"])
 def test_numbers_that_are_not_finite_are_rejected(gpu, part, kept):
     model = make_model(background=part == "background")

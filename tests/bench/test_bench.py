@@ -326,6 +326,7 @@ def test_the_built_in_model_is_measured_on_its_own_photos(monkeypatch, caplog):
     assert "2 steps" in caplog.messages[0] and "minute" in caplog.messages[0]
 
 
+@pytest.mark.acceptance
 def test_coding_a_quantised_model_again_gives_a_note(tmp_path):
     save_model(make_model(), tmp_path / "tiny.hyrf", "paper")
     read = subject.read_subject(tmp_path / "tiny.hyrf", None)

@@ -99,6 +99,7 @@ def test_residuals_turn_with_a_scene(tmp_path):
         assert_allclose(pictures[1], pictures[0], atol=1e-4)
 
 
+@pytest.mark.acceptance
 def test_a_crop_keeps_the_residuals_of_what_is_left(tmp_path):
     before = load_model(RESIDUAL_FILE)
     kept = before.decode_geometry().opacities >= 0.5
@@ -324,6 +325,7 @@ def test_turning_back_gives_a_file_of_the_old_version_and_the_same_box(tmp_path)
     assert_allclose(back["config"]["frame"]["center"], start["config"]["frame"]["center"], atol=1e-12)
 
 
+@pytest.mark.acceptance
 def test_compression_of_a_rotated_model_stores_the_same_numbers(tmp_path):
     turned = edited(RAW_FILE, tmp_path, Rotate((1.0, -2.0, 0.5), 100), Scale(1.7), Translate((3.0, -2.0, 40.0)))
     for source, name in ((RAW_FILE, "before"), (turned, "after")):
@@ -344,6 +346,7 @@ def test_upright_turns_the_stated_direction_to_an_axis(axis, expected, tmp_path)
     assert_allclose(turned_positions @ expected, heights / np.linalg.norm((0.3, -0.8, 0.1)), atol=1e-6)
 
 
+@pytest.mark.acceptance
 @pytest.mark.parametrize(
     ("axis", "upright_by_itself"), [("z", False), pytest.param("y", True, marks=pytest.mark.acceptance)]
 )

@@ -83,6 +83,7 @@ def test_planted_floaters_are_found_and_surfaces_stay(cameras):
     assert all(torch.equal(values, parameters[name]) for name, values in planted.named_parameters())
 
 
+@pytest.mark.acceptance
 def test_a_model_that_equals_its_photos_has_no_floaters(cameras):
     model = load_model(RAW_FILE)
     assert find_floaters(model, photograph(model, cameras), 0.35).mean() < 0.002

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -99,10 +100,12 @@ def test_a_limit_is_something_to_do(tmp_path):
 @pytest.mark.parametrize(
     ("options", "problem"),
     [
-        (["--target-size", "20"], "a target size of 20 bytes is below the smallest possible file"),
-        (["--target-size", "20"], "did you mean 20MB?"),
-        (["--target-size", "2100"], "after the edit the model does not fit into 2,100 bytes"),
-        (["--target-size", "2100"], "use a larger --target-size, or keep fewer --gaussians"),
+        (["--target-size", "20"], "a target size of 20 bytes is below the smallest possible file.*did you mean 20MB?"),
+        (
+            ["--target-size", "2100"],
+            "after the edit the model does not fit into 2,100 bytes.*"
+            "use a larger --target-size, or keep fewer --gaussians",
+        ),
         (["--target-size", "1MB", "--profile", "raw"], "use profile 'compact'"),
         (["--max-psnr-drop", "1"], "need photos; name their folder with --data"),
         (["--target-size", "small"], "is not a size"),
@@ -111,7 +114,7 @@ def test_a_limit_is_something_to_do(tmp_path):
 )
 def test_limits_that_cannot_be_met_are_refused(options, problem, tmp_path):
     sentence = refused("edit", DEMO_MODEL_FILE, "-o", tmp_path / "out.hyrf", "--crop-sphere", "0,0,0,1", *options)
-    assert problem in sentence and not list(tmp_path.iterdir())
+    assert re.search(problem, sentence) and not list(tmp_path.iterdir())
 
 
 def test_two_limits_are_refused(scene, tmp_path):
@@ -125,6 +128,7 @@ def test_a_plan_has_no_size_to_limit():
     assert result.exit_code == 2 and "--plan writes no file" in result.stderr
 
 
+@pytest.mark.acceptance
 def test_the_command_takes_the_words_of_compress(photos, tmp_path):
     out = tmp_path / "out.hyrf"
     options = ["--crop-sphere", "0,0,0,1", "--max-psnr-drop", "0.5", "--data", photos]

@@ -208,6 +208,7 @@ def test_fine_tuning_needs_one_model(tmp_path: Path, files: tuple[Path, Path]):
         compress_model("both.hyrf", "out.hyrf", CompressConfig(finetune_steps=5), data=ball_scene(4))
 
 
+@pytest.mark.acceptance
 def test_each_part_of_a_merged_file_is_compressed_by_itself(tmp_path: Path, files: tuple[Path, Path]):
     merge_models(files, tmp_path / "both.hyrf", {"balls": [Translate((1.0, 0.0, 0.0))]})
     report = compress_model(tmp_path / "both.hyrf", tmp_path / "small.hyrf", context=QUIET_CONTEXT)

@@ -75,6 +75,7 @@ def test_planted_damage_is_repaired_and_all_else_stays_bit_for_bit(scene, model,
     assert report.psnr_after > report.psnr_before + 1
 
 
+@pytest.mark.acceptance
 def test_a_region_of_a_moved_scene_is_trained_on_the_moved_photos(scene, damaged_file):
     moves = [Scale(2.0), Translate((1.0, 2.0, 3.0))]
     region = Refit(CropSphere((1.0, 2.0, 3.0), 2.0), STEPS)
@@ -84,6 +85,7 @@ def test_a_region_of_a_moved_scene_is_trained_on_the_moved_photos(scene, damaged
     assert there.region_psnr_after == pytest.approx(here.region_psnr_after, abs=0.3)
 
 
+@pytest.mark.acceptance
 def test_photos_of_other_exposure_do_not_change_the_colours(scene, model, is_inside):
     """The photos are darker and redder; with gains, an undamaged region keeps its colours."""
     gains = torch.tensor([0.6, 0.4, 0.4])

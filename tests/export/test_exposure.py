@@ -190,7 +190,7 @@ def test_without_cameras_the_background_has_the_mean_exposure_of_the_map():
 # -- files -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("ending", [".ply", ".splat", ".html"])
+@pytest.mark.parametrize("ending", [".ply", pytest.param(".splat", marks=pytest.mark.acceptance), ".html"])
 def test_an_identity_map_does_not_change_the_file(ending, tmp_path):
     plain = small_model(np.concatenate((LEFT_POSITIONS, RIGHT_POSITIONS)), fields=1.0, background=True)
     mapped = small_model(np.concatenate((LEFT_POSITIONS, RIGHT_POSITIONS)), fields=1.0, background=True)

@@ -98,7 +98,7 @@ def test_a_forged_file_is_refused_with_the_message_in_its_name(name):
 
 
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize(("count", "most_by_chance"), [(500, 0), pytest.param(1600, 4, marks=pytest.mark.acceptance)])
+@pytest.mark.parametrize(("count", "most_by_chance"), [(250, 0), pytest.param(1600, 4, marks=pytest.mark.acceptance)])
 def test_mutants_are_decoded_or_refused_in_one_line(count, most_by_chance):
     outcomes = Counter()
     for number in range(count):

@@ -87,6 +87,7 @@ def test_an_import_stores_what_the_target_needs(tmp_path: Path, monkeypatch: pyt
         assert residuals is not None and residuals.any()
 
 
+@pytest.mark.acceptance
 def test_the_worst_validation_view_reaches_its_target(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pack, "MAX_TRIALS", 6)
     prepared = prepare_model(ball_splats(200), TINY_IMPORT_CONFIG)

@@ -118,6 +118,7 @@ def test_a_model_with_an_exposure_map_is_scored_as_render_shows_it_and_at_one_ex
     )
 
 
+@pytest.mark.acceptance
 def test_an_unreachable_target_size_names_a_reachable_one_which_is_met(finished_work, posed, tmp_path):
     work = shutil.copytree(finished_work, tmp_path / "work")
     arguments = ("make", posed, "-o", tmp_path / "scene.hyrf", "--work", work)

@@ -140,6 +140,7 @@ def test_a_sheet_becomes_a_slab_whose_front_is_the_sheet():
     assert proxy.proxy_distances.max() < proxy.wall + 0.003
 
 
+@pytest.mark.acceptance
 @pytest.mark.usefixtures("quick_distances")
 def test_a_sphere_that_is_open_below_becomes_a_closed_bowl():
     sphere = trimesh.creation.icosphere(5)

@@ -84,6 +84,7 @@ def test_photos_without_features_are_a_clear_error(tmp_path):
     assert "hardly anything in these photos that can be recognised" in sentence
 
 
+@pytest.mark.acceptance
 def test_photos_without_overlap_are_a_clear_error(tmp_path):
     photos = save_pictures(tmp_path / "photos", random_pictures(6))
     sentence = refused("poses", photos, "-o", tmp_path / "scene")

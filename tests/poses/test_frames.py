@@ -280,6 +280,7 @@ def test_high_dynamic_range_clips_nothing():
         assert (np.diff(shown) >= 0).all() and shown[0] == 0 and (shown == 255).sum() < 60
 
 
+@pytest.mark.acceptance
 def test_a_resumed_estimation_of_a_video_still_reports_its_number_of_frames(wall, tmp_path, caplog):
     video = write_video(tmp_path / "clip.mp4", [crop_wall(wall, 4.0 * number) for number in range(60)])
 

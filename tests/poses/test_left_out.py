@@ -40,6 +40,7 @@ def report(tmp_path_factory) -> hyrfpack.PosesReport:
         return hyrfpack.estimate_poses(folder, folder.parent / "scene")
 
 
+@pytest.mark.acceptance
 def test_the_other_photos_are_posed(report):
     assert (report.photos, report.registered) == (8, 5)
 

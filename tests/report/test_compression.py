@@ -120,7 +120,9 @@ def report_with_photos(model_file, scene, tmp_path_factory) -> tuple[Path, Compr
     return compress_and_report(model_file, tmp_path_factory.mktemp("photos"), scene=scene, distortion=1e-4)
 
 
-@pytest.mark.parametrize(("profile", "measured"), [("compact", 0), ("paper", 1)])
+@pytest.mark.parametrize(
+    ("profile", "measured"), [("compact", 0), pytest.param("paper", 1, marks=pytest.mark.acceptance)]
+)
 def test_the_report_reuses_the_sensitivity_measured_for_packing(profile, measured, model_file, tmp_path, monkeypatch):
     asked = []
 
@@ -208,6 +210,7 @@ def test_parts_add_up_to_the_file_size_and_to_the_loss(report_with_photos):
     assert sum(float(row[5].rstrip("%")) for row in rows if row[5]) == pytest.approx(100, abs=0.5)
 
 
+@pytest.mark.acceptance
 def test_layers_of_a_section_are_reported_as_one_part(model_file, tmp_path):
     packed = tmp_path / "packed.hyrf"
     report = compress_model(model_file, packed, CompressConfig(profile="raw"))
@@ -243,6 +246,7 @@ def test_the_curve_has_smaller_files_at_higher_distortion(report_with_photos):
     assert len(by_name) == 7
 
 
+@pytest.mark.acceptance
 def test_a_file_that_is_not_on_the_curve_is_shown_separately(model_file, scene, tmp_path):
     _, _, page = compress_and_report(model_file, tmp_path, scene=scene, distortion=3e-3, finetune_steps=2)
     names = [row[0] for row in page.tables[1]]
@@ -296,6 +300,7 @@ def test_a_model_without_gaussians_has_a_page_without_a_curve(tmp_path):
     assert sorted(row[0] for row in page.tables[1][1:]) == ["raw", "this file"]
 
 
+@pytest.mark.acceptance
 def test_a_model_beyond_half_precision_has_a_page_without_paper(tmp_path):
     positions, _ = ball_points(20)
     model = small_model(positions)

@@ -116,6 +116,7 @@ def test_a_kernel_that_hangs_fails_after_its_time_and_the_others_still_run() -> 
     assert [row.get("note") for row in test.rows] == ["not done within 40 s", None]
 
 
+@pytest.mark.acceptance
 def test_a_device_that_cannot_be_used_is_a_problem_and_no_failure_of_kernels() -> None:
     test = run_broken({"device": "busy"})
     assert test.rows == () and test.problem == "its process ended: CUDA-capable device(s) is/are busy or unavailable"

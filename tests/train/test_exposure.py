@@ -230,6 +230,7 @@ def test_exposure_of_photos_with_transparency_is_rejected():
         Trainer(ball_scene(4, alpha=True), SHORT_CONFIG)
 
 
+@pytest.mark.acceptance
 def test_drifting_exposure_stays_out_of_the_model():
     """As when a cloud passes: half a stop lighter, half a stop darker. Every fourth photo is held out."""
     drift = 0.5 * 2 ** (0.5 * np.sin(np.arange(16) / 16 * 2 * np.pi) / 2.2)

@@ -385,6 +385,7 @@ def test_a_short_run_without_a_decision_learns_no_gains():
     assert decided is not None and decided.config.exposure is False and decided.config.budget_factor is None
 
 
+@pytest.mark.acceptance
 @pytest.mark.usefixtures("short_pilots", "signals")
 def test_a_run_that_continues_keeps_its_exposure_compensation(tmp_path, monkeypatch):
     monkeypatch.setattr(decisions, "MIN_EXPOSURE_STEPS", 10)

@@ -157,7 +157,8 @@ def test_a_resumed_run_takes_the_same_steps_when_the_resolution_changes(tmp_path
     whole, first, second = (Trainer(make_large_scene(), SHORT_RUN) for _ in range(3))
     whole.run()
     changed = whole.resolution.changes[1][0]
-    for stop in range(max(1, changed - PREFETCH_DEPTH - 1), changed + 1):
+    # Before photos of the new size are prefetched, with the first of them, and after the last step of the old size.
+    for stop in (max(1, changed - PREFETCH_DEPTH - 1), changed - PREFETCH_DEPTH, changed):
         first = Trainer(make_large_scene(), SHORT_RUN)
         first.run(checkpoint=tmp_path / "c.pt", stop=lambda trainer=first, stop=stop: trainer.step >= stop)
         second = Trainer(make_large_scene(), SHORT_RUN)

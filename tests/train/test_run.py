@@ -107,6 +107,7 @@ def test_a_run_leaves_model_metrics_curve_and_views(finished):
         assert min(curve.size) > 100 and len(curve.convert("RGB").getcolors(1 << 20)) > 10
 
 
+@pytest.mark.acceptance
 def test_the_saved_model_is_the_trained_one(finished):
     """The bytes equal those of a trainer that has no held-out views."""
     _, result = finished

@@ -576,6 +576,7 @@ def test_the_smallest_budgets_train(budget):
     assert len(trainer.model) == budget
 
 
+@pytest.mark.acceptance
 def test_millimetres_and_kilometres_train_to_the_same_quality(uninterrupted_trainer):
     in_mm, in_km = mean_training_psnr(train_trainer(scale=1e3)), mean_training_psnr(train_trainer(scale=1e-3))
     assert in_mm == pytest.approx(in_km, abs=0.1)
