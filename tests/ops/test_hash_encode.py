@@ -307,7 +307,7 @@ def test_sums_of_copies_are_the_gradient_in_any_order_of_levels(resolutions: tup
     """Many points lie in one cell, over more than five blocks, and each block adds to another copy."""
     from hyrfpack.ops.hash_encode.gpu import plan_gradient_copies
 
-    coords = 0.02 * uniform(1200, 3) + 0.3
+    coords = 0.02 * uniform(5200, 3) + 0.3
     assert plan_gradient_copies(len(coords), resolutions, 10, coords.device).layout[:, 1].max() > 4
     table = table_for(resolutions, 10)
     upstream = 1 + uniform(len(coords), 2 * len(resolutions), seed=3)
@@ -322,3 +322,97 @@ def test_sums_of_copies_are_the_gradient_in_any_order_of_levels(resolutions: tup
     found = gradient(torch.float32, "gpu")
     assert found.shape == table.shape and found.is_contiguous()
     torch.testing.assert_close(found.double(), expected, rtol=1e-5, atol=1e-4)
+
+
+def points_in_cells(cells_of_points: torch.Tensor, resolution: int) -> torch.Tensor:
+    """Return points well inside the cells (N, 3) of a level."""
+    inner = 0.1 + 0.8 * uniform(*cells_of_points.shape, seed=6)
+    return (cells_of_points + inner) / (resolution - 1)
+
+
+def cells_in_order(count: int, resolution: int) -> torch.Tensor:
+    """Return the first cells (count, 3) of a level, all of them different, neighbours first."""
+    index = torch.arange(count)
+    side = resolution - 1
+    return torch.stack((index % side, index // side % side, index // side**2), dim=1)
+
+
+def repeat_randomly(count: int, longest: int, seed: int) -> torch.Tensor:
+    """Return `count` ascending numbers, each repeated 1 to `longest` times."""
+    lengths = torch.randint(1, longest + 1, (count,), generator=torch.Generator().manual_seed(seed))
+    return torch.repeat_interleave(torch.arange(count), lengths)[:count]
+
+
+RUN_RESOLUTION = 21
+# Name -> the cells (N, 3) of consecutive points. A thread takes 8 of them, and a program 1,024.
+RUNS_OF_CELLS = {
+    "all points in one cell": torch.zeros(2100, 3, dtype=torch.long),
+    "each point in another cell": cells_in_order(2100, RUN_RESOLUTION),
+    "runs of up to 20 points": cells_in_order(2100, RUN_RESOLUTION)[repeat_randomly(2100, 20, seed=7)],
+    "runs of up to 3 points": cells_in_order(2100, RUN_RESOLUTION)[repeat_randomly(2100, 3, seed=8)],
+    "two cells by turns": cells_in_order(2, RUN_RESOLUTION).repeat(1050, 1),
+    "fewer points than a thread takes": torch.zeros(5, 3, dtype=torch.long),
+    "one point more than a program takes": torch.zeros(1025, 3, dtype=torch.long),
+}
+
+
+@needs_triton
+@pytest.mark.parametrize(
+    ("case", "zeros", "log2_table_size"),
+    [
+        *((case, "a third", 14) for case in RUNS_OF_CELLS),
+        *((case, "none", 4) for case in ("all points in one cell", "runs of up to 20 points")),
+        ("each point in another cell", "all but the last", 4),
+    ],
+)
+def test_table_gradients_of_runs_match_the_float64_reference(case: str, zeros: str, log2_table_size: int) -> None:
+    resolutions = (RUN_RESOLUTION,)
+    coords = points_in_cells(RUNS_OF_CELLS[case], RUN_RESOLUTION)
+    in_use = len(coords) - 3
+    upstream = torch.randn(len(coords), 2, generator=torch.Generator().manual_seed(9))
+    if zeros == "a third":
+        upstream[torch.rand(len(coords), generator=torch.Generator().manual_seed(10)) < 1 / 3] = 0
+    elif zeros == "all but the last":
+        upstream[: in_use - 1] = 0
+    table = table_for(resolutions, log2_table_size)
+
+    def gradient(dtype: torch.dtype, implementation: str) -> torch.Tensor:
+        used = place(torch.tensor([in_use]), implementation)
+        inputs = [place(tensor.to(dtype), implementation) for tensor in (coords, table)]
+        inputs[1].requires_grad_()
+        features = hash_encode(*inputs, resolutions, log2_table_size, used=used, implementation=implementation)
+        return torch.autograd.grad(features, inputs[1], upstream.to(features))[0].cpu()
+
+    expected = gradient(torch.float64, "reference")
+    found = gradient(torch.float32, "gpu").double()
+    # A weight is rounded to 2^-24 of the level's extent, and a row's sum has terms of both signs.
+    live = upstream[:in_use].any(dim=1).nonzero()[:, 0]
+    terms = np.bincount(
+        corner_rows(cells(coords[live], resolutions), resolutions, log2_table_size).flatten().numpy(),
+        minlength=len(table),
+    )
+    bound = RUN_RESOLUTION * 2**-22 * torch.from_numpy(terms)[:, None]
+    assert ((found - expected).abs() <= bound).all()
+    assert (expected.abs() > 100 * bound).any()
+
+
+@needs_triton
+@pytest.mark.skipif(not IS_INTERPRETED, reason="additions are counted in the interpreter")
+def test_points_of_a_thread_in_the_same_cell_are_added_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    from triton.runtime.interpreter import InterpreterBuilder
+
+    added = []
+    add = InterpreterBuilder.create_atomic_rmw
+
+    def count_and_add(builder, operation, address, value, mask, *rest):
+        added.append(int(mask.data.sum()))
+        return add(builder, operation, address, value, mask, *rest)
+
+    monkeypatch.setattr(InterpreterBuilder, "create_atomic_rmw", count_and_add)
+    lengths = torch.tensor([8, 8, 3, 5, 1, 1, 1, 5, 12, 4])  # six threads take 8 points each
+    sums = 1 + 1 + 2 + 4 + 1 + 2  # The run of 12 points belongs to two threads.
+    cells_of_points = torch.repeat_interleave(cells_in_order(len(lengths), RUN_RESOLUTION), lengths, dim=0)
+    coords = points_in_cells(cells_of_points, RUN_RESOLUTION)
+    table = table_for((RUN_RESOLUTION,), 14).requires_grad_()
+    hash_encode(coords, table, (RUN_RESOLUTION,), 14, implementation="gpu").sum().backward()
+    assert sum(added) == sums * 8 * 2  # corners, features

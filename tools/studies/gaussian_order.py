@@ -7,8 +7,8 @@ The Gaussians are an even selection of --model, in three orders: of the file, of
 three runs alternate in one process. Rows are counted for the Gaussians in view of the first photo: a block of
 consecutive ones adds its gradients to the rows of its cells' corners. "Distinct rows" is the share of these additions
 that go to different rows. "Distinct sectors" is the share of 32-byte sectors, for 32 consecutive Gaussians and one
-corner, which a GPU accesses together. "Runs" is the share of additions left if those of consecutive Gaussians in the
-same cell were summed first.
+corner, which a GPU accesses together. "Runs" is the share of additions left when those of consecutive Gaussians in the
+same cell are summed first: by a thread, as the kernel does, and by a block.
 """
 
 from __future__ import annotations
@@ -36,7 +36,8 @@ from tools.tables import markdown_table
 
 MAX_PHOTOS = 6
 WARMUP_STEPS = 2  # The first steps compile kernels.
-POINTS_PER_BLOCK = 256  # as in `hyrfpack.ops.hash_encode.gpu`
+POINTS_PER_BLOCK = 256
+POINTS_PER_THREAD = 8  # as in `hyrfpack.ops.hash_encode.gpu`
 POINTS_PER_ACCESS = 32
 ROWS_PER_SECTOR = 4
 CELL_CORNER_OFFSETS = np.array([[corner >> axis & 1 for axis in range(3)] for corner in range(8)])
@@ -67,11 +68,14 @@ def measure_steps(scene: Scene, models: dict[str, HybridModel], steps: int) -> d
     return {name: values[WARMUP_STEPS:] for name, values in seconds.items()}
 
 
-def share_of_runs(coords: np.ndarray, grid: HashGridConfig) -> float:
-    """Return how many runs of consecutive points in the same cell there are for each point (N, 3), mean of levels."""
+def share_of_runs(coords: np.ndarray, grid: HashGridConfig, group: int) -> float:
+    """Return how many runs of points in the same cell there are for each point (N, 3), mean of levels.
+
+    A run consists of consecutive points and ends with its group of points.
+    """
     shares = []
     for resolution in grid.resolutions:
-        cells = np.floor(coords * (resolution - 1)).reshape(-1, POINTS_PER_BLOCK, 3)
+        cells = np.floor(coords * (resolution - 1)).reshape(-1, group, 3)
         starts = (np.diff(cells, axis=1) != 0).any(-1)
         shares.append((np.count_nonzero(starts) + len(cells)) / len(coords))
     return float(np.mean(shares))
@@ -95,8 +99,8 @@ def share_of_distinct(values: np.ndarray) -> float:
     return float((np.count_nonzero(np.diff(ordered, axis=-1)) + ordered[..., 0].size) / ordered.size)
 
 
-def count_rows(model: HybridModel, scene: Scene) -> tuple[float, float, float]:
-    """Return the shares of distinct rows of a block, of distinct sectors of an access, and of runs of a cell."""
+def count_rows(model: HybridModel, scene: Scene) -> tuple[float, ...]:
+    """Return the shares of distinct rows of a block, of distinct sectors of an access, and of runs: thread, block."""
     seen = gaussians_in_view(model, scene.train[0].camera)
     coords = model.cube_coords(model.gaussians.positions.detach()[seen]).numpy()
     coords = coords[: len(coords) // POINTS_PER_BLOCK * POINTS_PER_BLOCK]
@@ -106,7 +110,8 @@ def count_rows(model: HybridModel, scene: Scene) -> tuple[float, float, float]:
         rows.reshape(levels, 8, -1, POINTS_PER_BLOCK).transpose(0, 2, 1, 3).reshape(levels, -1, 8 * POINTS_PER_BLOCK)
     )
     accesses = rows.reshape(levels, 8, -1, POINTS_PER_ACCESS) // ROWS_PER_SECTOR
-    return share_of_distinct(blocks), share_of_distinct(accesses), share_of_runs(coords, model.config.radiance)
+    runs = (share_of_runs(coords, model.config.radiance, group) for group in (POINTS_PER_THREAD, POINTS_PER_BLOCK))
+    return share_of_distinct(blocks), share_of_distinct(accesses), *runs
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -130,8 +135,8 @@ def main(arguments: list[str] | None = None) -> None:
             median = f"{statistics.median(values):.4f}"
             counted = [f"{share:.3f}" for share in shares[name]]
             rows.append([f"{count:,}", name, median, f"{np.median(ratios):.3f}", quartiles, *counted])
-    header = ["Gaussians", "order", "CPU s a step", "ratio", "quartiles", "distinct rows", "distinct sectors", "runs"]
-    print(markdown_table(header, rows))
+    header = ["Gaussians", "order", "CPU s a step", "ratio", "quartiles", "distinct rows", "distinct sectors"]
+    print(markdown_table([*header, "runs, thread", "runs, block"], rows))
 
 
 if __name__ == "__main__":

@@ -6,7 +6,9 @@ a few megabytes, stays in the L2 cache while all points read it. A row of the ta
 
 Points add to the table's gradient by atomics. Additions to the same row are serialised, and on a level of 8 vertices
 per axis a third of the points may share a row. Coarse levels therefore have several copies, to which blocks add in
-turn; a last kernel sums the copies.
+turn; a last kernel sums the copies. A thread handles consecutive points, and sums the gradients of those in the same
+cell before it adds them: neighbours in training's order of Gaussians mostly share a cell. In any other order it adds
+as often as there are points, and executes no more instructions for each than a thread with one point.
 
 The cell is the floor of the rounded product coords * span, as in `reference.cells`: the compiler cannot fuse a product
 whose floor is taken. It may fuse the position within the cell, product - cell, which then differs from the reference by
@@ -31,7 +33,11 @@ from hyrfpack.ops.hash_encode.reference import PRIME_Y, PRIME_Z, level_offsets
 # Each thread handles one point, so that no value moves between threads on its way to a load or an atomic. With 32
 # registers per thread, a multiprocessor runs its maximum number of threads, each with 8 loads in flight.
 _POINTS_PER_PROGRAM = 256
-_WARPS_PER_PROGRAM = _POINTS_PER_PROGRAM // (64 if torch.version.hip else 32)
+_THREADS_PER_WARP = 64 if torch.version.hip else 32
+_WARPS_PER_PROGRAM = _POINTS_PER_PROGRAM // _THREADS_PER_WARP
+# For the table's gradient, a thread handles consecutive points, whose gradients it sums while they share a cell.
+_POINTS_PER_THREAD = 8
+_THREADS_PER_PROGRAM = 128
 _MAX_COPIES_PER_LEVEL = 32
 _SUMS_PER_PROGRAM = 512
 
@@ -106,36 +112,54 @@ def encode_kernel(coords, axis_stride, point_stride, table, levels, out, points,
 @triton.jit(do_not_specialize=["points", "axis_stride", "feature_stride"])
 def grad_table_kernel(
     coords, axis_stride, point_stride, levels, copies,
-    grad, feature_stride, grad_stride, out, points, used, POINTS: tl.constexpr,
+    grad, feature_stride, grad_stride, out, points, used, THREADS: tl.constexpr, RUN: tl.constexpr,
 ):  # fmt: skip
-    """Add gradients of a block of points (grid axis 0) to a copy of a level (grid axis 1) in `out` (rows, 2)."""
-    start, level = tl.program_id(0).to(tl.int64) * POINTS, tl.program_id(1)
+    """Add gradients of a block of points (grid axis 0) to a copy of a level (grid axis 1) in `out` (rows, 2).
+
+    Each of THREADS threads takes RUN consecutive points. It sums the gradients of consecutive ones in the same cell,
+    and adds them to the table when the cell changes, and at the end.
+    """
+    start, level = tl.program_id(0).to(tl.int64) * (THREADS * RUN), tl.program_id(1)
     count = count_used_rows(used, points)
     if start >= count:
         return
-    lane = tl.arange(0, POINTS)
-    inside = lane < count - start
     grad += (2 * level).to(tl.int64) * feature_stride + start * grad_stride
-    grad0 = tl.load(grad + lane * grad_stride, mask=inside, other=0.0)
-    grad1 = tl.load(grad + feature_stride + lane * grad_stride, mask=inside, other=0.0)
-    live = (grad0 != 0) | (grad1 != 0)
-    x1, y1, z1, row_x0, row_x1, row_y0, row_y1, row_z0, row_z1, span, mask, offset = _locate_cell(
-        coords, axis_stride, point_stride, levels, level, start, lane, live
-    )
     copies += level * 3
     copy = tl.program_id(0) % tl.load(copies + 1)
-    out += tl.where(copy == 0, offset, tl.load(copies + 2) + (copy - 1) * tl.load(copies)) * 2
-    pair = tl.join(grad0, grad1)
+    out += tl.where(copy == 0, tl.load(levels + level * 5 + 4), tl.load(copies + 2) + (copy - 1) * tl.load(copies)) * 2
     feature = tl.arange(0, 2)
-    for corner in tl.static_range(8):
-        x, row_x = (x1, row_x1) if corner & 1 else (1 - x1, row_x0)
-        y, row_y = (y1, row_y1) if corner & 2 else (1 - y1, row_y0)
-        z, row_z = (z1, row_z1) if corner & 4 else (1 - z1, row_z0)
-        row = vertex_row(row_x, row_y, row_z, mask)
-        weight = x * (y * z)
-        tl.atomic_add(
-            out + (row[:, None] * 2 + feature[None, :]), weight[:, None] * pair, mask=live[:, None], sem="relaxed"
+    nothing, no_term = tl.zeros([THREADS, 2], tl.float32), tl.zeros([THREADS], tl.uint32)
+    sums, cell, filled = (nothing,) * 8, (no_term,) * 6, no_term != 0
+    for step in range(RUN + 1):  # The last step only adds what is left.
+        lane = tl.arange(0, THREADS) * RUN + step
+        inside = (lane < count - start) & (step < RUN)
+        grad0 = tl.load(grad + lane * grad_stride, mask=inside, other=0.0)
+        grad1 = tl.load(grad + feature_stride + lane * grad_stride, mask=inside, other=0.0)
+        live = (grad0 != 0) | (grad1 != 0)
+        x1, y1, z1, row_x0, row_x1, row_y0, row_y1, row_z0, row_z1, _, mask, _ = _locate_cell(
+            coords, axis_stride, point_stride, levels, level, start, lane, live
         )
+        other_cell = (row_x0 != cell[0]) | (row_y0 != cell[2]) | (row_z0 != cell[4])
+        full = filled & ((live & other_cell) | (step == RUN))
+        pair = tl.join(grad0, grad1)
+        for corner in tl.static_range(8):
+            row = vertex_row(cell[corner & 1], cell[2 + (corner >> 1 & 1)], cell[4 + (corner >> 2)], mask)
+            at = out + (row[:, None] * 2 + feature[None, :])
+            tl.atomic_add(at, sums[0], mask=full[:, None], sem="relaxed")
+            x, y, z = (
+                x1 if corner & 1 else 1 - x1,
+                y1 if corner & 2 else 1 - y1,
+                z1 if corner & 4 else 1 - z1,
+            )
+            weight = x * (y * z)
+            # The sum of the next corner becomes the first, so that after 8 corners the order is as before.
+            sums = sums[1:] + (tl.where(full[:, None], 0.0, sums[0]) + weight[:, None] * pair,)
+        cell = (
+            tl.where(live, row_x0, cell[0]), tl.where(live, row_x1, cell[1]),
+            tl.where(live, row_y0, cell[2]), tl.where(live, row_y1, cell[3]),
+            tl.where(live, row_z0, cell[4]), tl.where(live, row_z1, cell[5]),
+        )  # fmt: skip
+        filled = filled | live
 
 
 @triton.jit
@@ -326,10 +350,12 @@ def grad_table(
     levels = level_parameters(resolutions, log2_table_size, coords.device)
     copies = plan_gradient_copies(points, resolutions, log2_table_size, coords.device)
     result = table.new_zeros(copies.total_rows, 2)
-    grad_table_kernel[_program_count(points), len(resolutions)](
+    programs = triton.cdiv(points, _THREADS_PER_PROGRAM * _POINTS_PER_THREAD)
+    grad_table_kernel[programs, len(resolutions)](
         coords.detach(), coords.stride(1), coords.stride(0), levels, copies.layout,
         grad, grad.stride(1), grad.stride(0), result, points, used,
-        POINTS=_POINTS_PER_PROGRAM, num_warps=_WARPS_PER_PROGRAM, enable_fp_fusion=True,
+        THREADS=_THREADS_PER_PROGRAM, RUN=_POINTS_PER_THREAD,
+        num_warps=_THREADS_PER_PROGRAM // _THREADS_PER_WARP, enable_fp_fusion=True,
     )  # fmt: skip
     if copies.copied_levels:
         sum_copies_kernel[triton.cdiv(2 * copies.max_copied_rows, _SUMS_PER_PROGRAM), copies.copied_levels](
