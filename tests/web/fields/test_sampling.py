@@ -100,7 +100,14 @@ def test_coarse_cameras_count_only_without_exact_ones_and_for_a_tenth_more(tmp_p
 
 
 @pytest.mark.parametrize(
-    ("stored", "counts"), [(2.5, 2.5), (1, 1), *((wrong, None) for wrong in (0.9, 1001, "2", True))]
+    ("stored", "counts"),
+    [
+        (2.5, 2.5),
+        (1, 1),
+        (0.9, None),
+        ("2", None),
+        *(pytest.param(wrong, None, marks=pytest.mark.acceptance) for wrong in (1001, True)),
+    ],
 )
 def test_sizes_are_divided_by_the_rate_ratio_of_the_file(tmp_path: Path, stored: Any, counts: float | None) -> None:
     for key, default in (("cameras", 1.0), ("coarse_cameras", 1.1)):
@@ -133,7 +140,11 @@ def test_without_cameras_nothing_is_filtered_and_each_pixel_has_its_background(t
         ({"background_stride": 1}, [1, 1, 1, 1, 1, 3, 64]),
         ({"background_stride": 4}, [1, 2, 3, 4, 6, 12, 64]),
         ({"background_stride": 64}, [16, 32, 63, 64, 64, 64, 64]),
-        *(({"background_stride": wrong}, [1, 1, 2, 2, 3, 6, 64]) for wrong in (0, 65, -2, 1.5, "4", None, [4])),
+        *(({"background_stride": wrong}, [1, 1, 2, 2, 3, 6, 64]) for wrong in (65, 1.5, "4")),
+        *(
+            pytest.param({"background_stride": wrong}, [1, 1, 2, 2, 3, 6, 64], marks=pytest.mark.acceptance)
+            for wrong in (0, -2, None, [4])
+        ),
     ],
 )
 def test_strides_keep_the_spacing_of_training(tmp_path: Path, stored: dict, strides: list[int]) -> None:

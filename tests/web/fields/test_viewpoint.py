@@ -83,18 +83,32 @@ def camera_json_array(cameras: list[dict]) -> np.ndarray:
     return np.array([[*(item[key] for key in order), *np.ravel(item["camera_from_world"])] for item in cameras])
 
 
-@pytest.mark.parametrize("rotation", [None, (0.5, -0.1, 0.7, 0.5)], ids=["straight", "rotated"])
+ROTATIONS = {"straight": None, "rotated": (0.5, -0.1, 0.7, 0.5)}
+
+
+@pytest.fixture(scope="module")
+def viewpoints(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], dict]:
+    """Return the viewpoints that the page chooses, by the names of rotation and provenance."""
+    cases = {
+        (turn, name): make_metadata(provenance, **({} if rotation is None else {"rotation": list(rotation)}))
+        for turn, rotation in ROTATIONS.items()
+        for name, provenance in VALID_PROVENANCES.items()
+    }
+    found = viewpoints_in_node(tmp_path_factory.mktemp("viewpoints"), list(cases.values()))
+    return dict(zip(cases, found, strict=True))
+
+
+@pytest.mark.parametrize("turn", ROTATIONS)
 @pytest.mark.parametrize("name", VALID_PROVENANCES)
-def test_the_page_has_the_same_viewpoint_as_python(name: str, rotation: Quaternion | None, tmp_path: Path) -> None:
+def test_the_page_has_the_same_viewpoint_as_python(name: str, turn: str, viewpoints: dict, tmp_path: Path) -> None:
     file = tmp_path / "model.hyrf"
+    rotation: Quaternion | None = ROTATIONS[turn]
     frame = MODEL_FRAME if rotation is None else replace(MODEL_FRAME, rotation=rotation)
     hyrfpack.save_model(small_model([[0, 0, 0]], frame=frame), file, provenance=VALID_PROVENANCES[name])
     read = Source.read(file)
     cameras = [camera for _, camera in read.cameras] or [camera for camera, _ in read.measured_views]
 
-    numbers = {} if rotation is None else {"rotation": list(rotation)}
-    (found,) = viewpoints_in_node(tmp_path, [make_metadata(VALID_PROVENANCES[name], **numbers)])
-
+    found = viewpoints[turn, name]
     close = {"rtol": 1e-9, "atol": 1e-9}
     np.testing.assert_allclose(
         camera_json_array(found["cameras"]), camera_array(evenly_spaced(cameras, MAX_PAGE_CAMERAS)), **close
