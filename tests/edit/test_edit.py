@@ -99,7 +99,6 @@ def test_residuals_turn_with_a_scene(tmp_path):
         assert_allclose(pictures[1], pictures[0], atol=1e-4)
 
 
-@pytest.mark.acceptance
 def test_a_crop_keeps_the_residuals_of_what_is_left(tmp_path):
     before = load_model(RESIDUAL_FILE)
     kept = before.decode_geometry().opacities >= 0.5
