@@ -21,9 +21,11 @@ export function copyManifest(folder, copies, boxOf) {
   return { ...manifest, gaussians, chunks: Array.from({ length: copies }, copy) };
 }
 
-// Streams a scene with at most `gaussians` in a view; `receive` gets the messages to the page.
-export function streamScene(manifest, gaussians, receive) {
-  const request = { manifest: Buffer.from(JSON.stringify(manifest)), address: "http://host/scene.json", name: "scene" };
+// Streams a scene with at most `gaussians` in a view; `receive` gets the messages to the page. `padding` is the number of
+// bytes after the manifest.
+export function streamScene(manifest, gaussians, receive, padding = 0) {
+  const text = JSON.stringify(manifest) + " ".repeat(padding);
+  const request = { manifest: Buffer.from(text), address: "http://host/scene.json", name: "scene" };
   const sorter = { add: () => {} };
   const stream = new SceneStream({ ...request, stage: null, gaussians, maxRows: 4096 }, sorter, (message) => {
     if (message.error) throw new Error(message.error);

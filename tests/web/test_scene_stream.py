@@ -4,8 +4,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+from web.native_models import random_model
 from web.scripts import run_script
 
+import hyrfpack
+from hyrfpack.config.split import SplitConfig
+from hyrfpack.context import RunContext
+from hyrfpack.format import encode_model
+from hyrfpack.format.parts import encode_parts
+from hyrfpack.lod import split, split_model
 from tools.safety.make_golden import GOLDEN_SCENE_FOLDER
 
 MAX_WAITING_ROWS, MAX_REQUESTS = 512, 6
@@ -34,3 +42,33 @@ def test_the_memory_for_gaussians_does_not_grow_with_the_scene():
             assert view["ahead"] > 0.8
             assert len(view["drawn"]) <= budget / ROW_WIDTH + 256 + 1
             assert view["resident"] <= GAUSSIANS_PER_CHUNK * answer["rows"]
+
+
+PART_COUNT, GAUSSIANS_PER_PART, CHUNK_GAUSSIANS = 6, 384, 128
+
+
+@pytest.fixture(scope="module")
+def parts_folder(tmp_path_factory) -> Path:
+    """Return a scene folder of several parts, whose fields have 25.6 kB each in memory."""
+    path = tmp_path_factory.mktemp("parts")
+    models = [(f"part {seed}", encode_model(random_model(GAUSSIANS_PER_PART, seed))) for seed in range(PART_COUNT)]
+    (path / "all.hyrf").write_bytes(encode_parts(models))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(split, "MEASURED_VIEWS", 1)
+        config = SplitConfig(chunk_gaussians=CHUNK_GAUSSIANS, levels=2, refit_steps=0)
+        split_model(path / "all.hyrf", path / "scene", config, context=RunContext(progress=None))
+    return path / "scene"
+
+
+@pytest.mark.parametrize(("budget", "most_parts"), [(400, 2), (650, 3), (10**6, PART_COUNT - 1)])
+def test_the_memory_for_fields_of_parts_has_a_limit(parts_folder: Path, budget: int, most_parts: int):
+    """The limit is 128 bytes a Gaussian of the budget, but at least two further parts.
+
+    Each level arrives after the fields of its part, which are kept until it is evaluated.
+    """
+    answer = run_script(Path(__file__).with_name("stream_parts.mjs"), parts_folder, budget)
+    chunks = hyrfpack.SceneFolder(parts_folder).manifest.chunks
+    assert len(chunks) <= answer["levels"] <= sum(len(chunk.levels) for chunk in chunks)
+    assert answer["most"] == most_parts
+    assert (answer["again"] > 0) == (most_parts < PART_COUNT - 1)
+    assert answer["early"] == answer["dropped"] == 0

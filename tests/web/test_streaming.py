@@ -256,6 +256,37 @@ def test_residuals_of_chunks_are_drawn_as_python_renders_them(browser: Browser, 
     assert browser.list_errors() == []
 
 
+HELD_FIELDS_JS = """[...hyrfpack.player.renderer.content.further.values()]
+  .filter(({ graphics, radiance }) => graphics.made.has(radiance.table)).length"""
+
+
+@pytest.mark.parametrize("is_lost", [False, True])
+def test_fields_that_were_dropped_are_loaded_again(browser: Browser, host: Site, tmp_path: Path, is_lost: bool):
+    """A budget of 400 Gaussians leaves memory for the fields of two further parts."""
+    models = [(f"part {seed}", encode_model(random_model(400, seed))) for seed in range(5)]
+    (tmp_path / "all.hyrf").write_bytes(encode_parts(models))
+    config = SplitConfig(chunk_gaussians=200, levels=2, refit_steps=0)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(split, "MEASURED_VIEWS", 1)
+        split_model(tmp_path / "all.hyrf", tmp_path / "scene", config, context=RunContext(progress=None))
+    folder = hyrfpack.SceneFolder(tmp_path / "scene")
+    serve_levels(host, folder)
+    open_levels(browser, host, 400)
+    wait_until_complete(browser)
+    wait_until(browser, f"{HELD_FIELDS_JS} === 2")
+    if is_lost:
+        lose_and_restore_device(browser)
+        browser.evaluate("hyrfpack.ready")
+    browser.evaluate("hyrfpack.player.loader.post({ gaussians: 1e6 })")
+    wait_until(browser, "hyrfpack.player.loader.state.gaussians === 2000", 60)
+    wait_until_complete(browser)
+    wait_until(browser, f"{HELD_FIELDS_JS} === 2")
+    camera = Camera(120, 90, 129.0, 129.0, 60.0, 45.0, window_camera(browser).camera_from_world)
+    picture = render_in_page(browser, camera).astype(float)
+    assert psnr(picture, reference_picture(folder.load(), camera)) > MIN_PSNR_DB
+    assert browser.list_errors() == []
+
+
 @pytest.mark.acceptance
 @pytest.mark.parametrize(("scale", "depth"), [(0.05, 0.004), (5.0, 0.03)])
 def test_near_gaussians_are_culled_in_the_units_of_their_part(

@@ -133,9 +133,10 @@ export class Fields {
   }
 
   // Uploads a field's table and decoder.
-  async field({ table, levels, decoder: { numbers, places } }) {
-    const { gl, graphics } = this;
-    const texture = await graphics.table([gl.RG32F, gl.RG, gl.FLOAT, 2], TEXTURE_WIDTH, table);
+  async field(source) {
+    const { gl, graphics } = this, { levels, decoder: { numbers, places } } = source;
+    const table = await graphics.table([gl.RG32F, gl.RG, gl.FLOAT, 2], TEXTURE_WIDTH, source.table);
+    source.table = null; // frees memory; the worker can decode it again
     const block = this.fitsBlock(numbers), floats = [gl.RGBA32F, gl.RGBA, gl.FLOAT, 4];
     const weights = block
       ? graphics.track(gl.createBuffer(), "Buffer")
@@ -144,9 +145,7 @@ export class Fields {
       gl.bindBuffer(gl.UNIFORM_BUFFER, weights);
       gl.bufferData(gl.UNIFORM_BUFFER, numbers, gl.STATIC_DRAW);
     }
-    const freeTable = () => graphics.free(texture);
-    const free = () => [texture, weights].forEach((object) => graphics.free(object));
-    return { table: texture, levels: new Uint32Array(levels.flat()), block, weights, places, freeTable, free };
+    return { table, levels: new Uint32Array(levels.flat()), block, weights, places };
   }
 
   // Returns whether shaders read a decoder's numbers from a uniform block. Graphics devices read a uniform block far
@@ -264,12 +263,16 @@ export class Fields {
 
   // Frees the objects that only `evaluate` needs.
   freeInputs() {
-    const { graphics, programs, geometry, radiance } = this;
-    geometry.free();
-    if (!this.panorama) radiance.freeTable();
-    const objects = [this.explicit, this.pixelSizes, this.geometryTarget, ...this.featureTargets];
-    if (this.shapeResiduals) objects.push(this.shapeResiduals);
-    for (const object of [...objects, programs.geometry.program, programs.features.program]) graphics.free(object);
+    const { geometry, features } = this.programs, { explicit, pixelSizes, shapeResiduals } = this;
+    const targets = [this.geometryTarget, ...this.featureTargets];
+    this.freeTables(explicit, pixelSizes, shapeResiduals, ...targets, geometry.program, features.program);
+  }
+
+  // Frees what only `evaluate` needs of the fields, and other objects.
+  freeTables(...others) {
+    const { graphics, geometry, radiance, panorama } = this;
+    if (!panorama) others.push(radiance.table);
+    for (const object of [geometry.table, geometry.weights, ...others]) graphics.free(object);
   }
 
   // Draws a part (x, y, width, height in pixels) of a panorama.

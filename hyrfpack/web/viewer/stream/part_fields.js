@@ -14,9 +14,20 @@ export class PartFields extends Fields {
     this.place = { rows: rows.flat(), quat: quatOf(rows), shift, scale };
   }
 
-  // Uploads the fields and compiles programs, so that rows can be evaluated.
-  async prepareFields() {
-    const { gl, graphics, model, whole } = this;
+  // Uploads the fields, again after `freeTables`, and at first compiles programs, so that rows can be evaluated.
+  async prepareFields(model) {
+    const { graphics, radiance } = this;
+    if (!this.isReady) await this.preparePrograms(model);
+    this.geometry = await this.field(model.geometry);
+    this.radiance = await this.field(model.radiance);
+    graphics.free(radiance?.weights);
+    await graphics.whenDone();
+    this.checkMemory();
+    this.isReady = true;
+  }
+
+  async preparePrograms(model) {
+    const { gl, whole } = this;
     Fields.check(gl, model);
     for (const name of ["rows", "pending", "explicit", "logits", "pixelSizes", "places", "shapes", "colors"]) {
       this[name] = whole[name];
@@ -24,12 +35,7 @@ export class PartFields extends Fields {
     Object.assign(this, whole.createResiduals(model.residualDegree));
     this.createFeatures();
     this.programs = await whole.compileOnce(this.shaders({ MOVED: 1 }));
-    this.geometry = await this.field(model.geometry);
-    this.radiance = await this.field(model.radiance);
     this.createTargets();
-    await graphics.whenDone();
-    this.checkMemory();
-    this.isReady = true;
   }
 
   // Shares the features of the scene if they have enough layers.

@@ -10,7 +10,10 @@ export class ScenePart {
   constructor(number, file) {
     Object.assign(this, { number, file });
     this.bytes = null; // of the shared file
+    this.source = null; // what it holds, until it is sent
     this.config = null; // of the model
+    this.exposure = null; // of the model
+    this.fieldBytes = null; // of the tables of its fields in memory, once it was read
     this.place = IDENTITY_PLACE; // from its units to those of the first part
     this.isUnusable = false;
     this.sent = null; // the promise that it is sent to the page
@@ -30,8 +33,13 @@ export class ScenePart {
       }
       this.place = placeOf(model.config.frame, scene.config.frame);
     }
-    this.config = model.config;
-    this.bytes = bytes;
+    this.fieldBytes = model.geometry.table.byteLength + model.radiance.table.byteLength;
+    Object.assign(this, { config: model.config, exposure: model.exposure, source: model, bytes });
+  }
+
+  // Frees the memory of its fields. Their file is fetched again if another level needs them.
+  drop() {
+    this.bytes = this.source = this.sent = null;
   }
 
   // Reads a chunk of the part. `file` is its entry in the manifest.
@@ -54,8 +62,10 @@ export class ScenePart {
 
   // Returns what the page needs of the part, and its `source`, which is not sent.
   async pack() {
-    const { number, place } = this, source = await read(this.bytes), model = packFields(source);
-    return { source, packed: { part: number, model, place, exposure: source.exposure } };
+    const { number, place, exposure } = this, source = this.source ?? (await read(this.bytes));
+    const model = packFields(source);
+    this.source = null; // its tables are transferred
+    return { source, packed: { part: number, model, place, exposure } };
   }
 }
 

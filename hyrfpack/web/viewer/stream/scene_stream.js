@@ -1,6 +1,7 @@
 // Reads a scene folder as views need it, in the worker: fetches the coarsest levels of chunks first and then, by
 // priority, the levels that suit the view within a budget of Gaussians; decodes them, and drops what is not needed when
-// memory is short. That for Gaussians does not grow with the scene (see level_choice.js).
+// memory is short. That for Gaussians does not grow with the scene (see level_choice.js), nor does that for the fields
+// of its parts: a level needs them only until it is evaluated.
 //
 // Messages to the worker, beside those in worker_tasks.js; `number` is that of the content:
 //     {stream: {manifest, address, name, stage, gaussians, maxRows}}   open the scene with the text `manifest` from
@@ -15,7 +16,8 @@
 // Messages from the worker:
 //     {content: {..., parts, chunks}}        the content, with the first part of the scene as its model; the further
 //                                            parts that were read, and the levels that are drawn at once
-//     {part: {number, part, model, place, exposure}}   a further part of the scene
+//     {part: {number, part, model, place, exposure}}   a further part of the scene, or its fields again;
+//                                            if its model is null, they are dropped
 //     {chunk: {number, chunk, level, part, rows, explicit, logits, pixelSizes, balls}}   a level to upload to `rows`
 //     {swap: {number, chunk, from, to, mse}}   fade from the rows of one level to those of another one, which changes
 //                                            the picture by about `mse`
@@ -44,6 +46,9 @@ const MEMORY_RATIO = 1.25; // memory for Gaussians in budgets, because levels th
 const EXTRA_ROWS_PER_CHUNK = 2, MAX_EXTRA_CHUNKS = 256;
 // That wait to be evaluated. A slow device then evaluates what the present view needs, not all that earlier ones did.
 const MAX_UPLOADING_ROWS = 512;
+// Bytes of the tables of further parts that are in memory, for each Gaussian of the budget, which itself takes about as
+// many. Two parts of any size are always allowed: one loads while levels of the other are evaluated.
+const FIELD_BYTES_PER_GAUSSIAN = 128, MIN_FURTHER_PARTS = 2;
 const MAX_FIRST_LOSSES = 3; // of the connection before the first picture; then what is there is drawn
 const MAX_PSNR_DB = 99;
 const MIN_UPDATE_MS = 20; // between two updates, so that many events cause only one
@@ -60,6 +65,7 @@ export class SceneStream {
     this.isOpening = false; // whether the content is being prepared
     this.isShown = false; // whether it was sent
     this.early = new Map(); // name of a file that came before the shared file of its part -> [file, bytes]
+    this.recentParts = []; // those whose fields were used last come first
     this.isOutdated = true; // whether levels must be chosen again
     this.isShort = false; // whether a wanted level does not fit into memory
     this.decoding = new Set(); // names of files that are being decoded
@@ -78,6 +84,7 @@ export class SceneStream {
     const { manifest: text, address, maxRows } = this.request, manifest = parseManifest(text), { chunks } = manifest;
     this.manifest = manifest;
     this.parts = manifest.parts.map((file, number) => new ScenePart(number, file));
+    this.recentParts = this.parts;
     this.chunks = chunks.map((chunk, number) => new ChunkLevels(number, chunk, countRows));
     const files = [...manifest.parts, ...chunks.flatMap(({ levels }) => levels)];
     this.fileBytes = files.reduce((sum, file) => sum + file.bytes, 0);
@@ -310,16 +317,60 @@ export class SceneStream {
       if (isFirst) wanted.push({ chunk, level: chunk.get(coarsest), isFirst, rate: errors[coarsest] });
       if ((isFirst && target === coarsest) || !isWanted(target)) continue;
       const gain = errors[shown < 0 ? coarsest : shown] - errors[target], level = chunk.get(target);
-      wanted.push({ chunk, level, isFirst: false, rate: gain / level.file.bytes });
+      const { isRead, file } = this.partOf(chunk), bytes = level.file.bytes + (isRead ? 0 : file.bytes);
+      wanted.push({ chunk, level, isFirst: false, rate: gain / bytes });
     }
     wanted.sort((a, b) => b.isFirst - a.isFirst || b.rate - a.rate);
     let room = this.spareLevels().reduce((rows, { rowCount }) => rows + rowCount, this.pool.free);
     const fitting = wanted.findIndex(({ level: { rowCount } }) => (room -= rowCount) < 0);
     let queue = MAX_UPLOADING_ROWS - this.countUploadingRows();
     const isNext = ({ level: { file, rowCount } }) => (queue -= rowCount) >= 0 || this.queue.requests.has(file.file);
-    this.want((fitting < 0 ? wanted : wanted.slice(0, fitting)).filter(isNext));
+    const levels = this.admitLevels(fitting < 0 ? wanted : wanted.slice(0, fitting));
+    this.want(levels.filter(isNext));
     if (this.isShort !== fitting >= 0) this.schedule();
     this.isShort = fitting >= 0;
+  }
+
+  // Returns those of the wanted levels whose fields may be in memory. While first levels wait for that, they are only
+  // first levels, so that the parts in use become free.
+  admitLevels(wanted) {
+    const parts = this.admitParts(wanted), isAdmitted = ({ chunk }) => parts.has(this.partOf(chunk));
+    const isFirstWaiting = wanted.some((each) => each.isFirst && !isAdmitted(each));
+    return wanted.filter((each) => isAdmitted(each) && (each.isFirst || !isFirstWaiting));
+  }
+
+  // Returns the parts whose fields may be in memory: those in use, those of `levels`, and those of earlier ones, as far
+  // as they fit. Drops the fields of others.
+  admitParts(levels) {
+    const [scene] = this.parts, inUse = this.partsInUse(), admitted = new Set();
+    const sizeOf = ({ fieldBytes, file }) => fieldBytes ?? (file.bytes / scene.file.bytes) * scene.fieldBytes;
+    const needed = levels.map(({ chunk }) => this.partOf(chunk));
+    this.recentParts = [...new Set([...inUse, ...needed, ...this.recentParts.filter(({ isRead }) => isRead)])];
+    let room = sizeOf(scene) + FIELD_BYTES_PER_GAUSSIAN * this.request.gaussians;
+    for (const part of this.recentParts) {
+      const isAdmitted = inUse.has(part) || admitted.size <= MIN_FURTHER_PARTS || sizeOf(part) <= room;
+      if (isAdmitted) {
+        room -= sizeOf(part);
+        admitted.add(part);
+      } else if (part.isRead) {
+        this.dropFields(part);
+      }
+    }
+    return admitted;
+  }
+
+  // Returns the first part and those whose fields are needed by levels that are being decoded or evaluated.
+  partsInUse() {
+    const { parts, chunks, decoding } = this;
+    const inUse = ({ state, file }) => state === UPLOADING || decoding.has(file.file);
+    const busy = chunks.filter(({ levels }) => levels.some(inUse)).map((chunk) => this.partOf(chunk));
+    return new Set([parts[0], ...busy, ...parts.filter(({ file }) => decoding.has(file.file))]);
+  }
+
+  dropFields(part) {
+    const { number: each, place, exposure } = part;
+    if (part.sent) this.post({ part: { number: this.number, part: each, model: null, place, exposure } });
+    part.drop();
   }
 
   // Returns the number of rows that wait to be evaluated.

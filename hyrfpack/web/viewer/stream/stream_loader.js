@@ -61,7 +61,7 @@ class StreamLoader extends Loader {
     if (state) this.setState(state);
   }
 
-  // Handles a part whose fields have arrived.
+  // Handles a part whose fields have arrived or are dropped.
   addPart(part) {
     if (part.number !== this.current) return; // of a content that was lost with the device
     const { exposure, place } = part;

@@ -24,14 +24,12 @@ export class StreamedFields extends Fields {
   constructor(gl, model, parts, chunks, events) {
     super(gl, { ...model, balls: new Float32Array(4 * model.height).fill(NaN) });
     Object.assign(this, { firstParts: parts, chunks, events });
-    this.further = new Map(); // number of a further part -> its PartFields
+    // Number of a further part -> its PartFields.
+    this.further = new Map(parts.map(({ part, model, place }) => [part, new PartFields(gl, model, place, this)]));
     this.ready = new Map(); // number of a further part -> the promise that it is ready, of whether it can be drawn
-    this.degrees = new Map([[0, model.residualDegree]]); // number of a part -> degree of its residuals, or undefined
-    for (const { part, model: { residualDegree } } of parts) this.degrees.set(part, residualDegree);
     this.residuals = new Map(); // degree -> the textures of the residuals of all parts of this degree
     this.compiled = new Map(); // text of shaders -> the promise of their programs, which equal parts share
-    this.rowParts = new Uint8Array(this.height); // number of the part of each row
-    this.rowWeights = new Float32Array(2 * this.height); // and the number of its part
+    this.rowWeights = new Float32Array(2 * this.height); // of each row, its weight and the number of its part
     this.usedHeight = 1; // rows from here on were never used
     this.fades = new Map(); // number of a chunk -> the last `swap` of it, its `part`, and whether it `isSorted`
     this.fadedAt = 0; // when the fades last went on
@@ -89,18 +87,21 @@ export class StreamedFields extends Fields {
     this.isReady = true;
   }
 
-  // Prepares the fields of a further part. Its levels are drawn once it is ready.
+  // Prepares the fields of a further part, or uploads their tables again; without a model, frees these. The part's
+  // levels are drawn once it is ready.
   addPart({ part, model, place }) {
-    const fields = new PartFields(this.gl, model, place, this);
-    this.degrees.set(part, model.residualDegree);
+    const fields = this.further.get(part) ?? new PartFields(this.gl, model, place, this);
     this.further.set(part, fields);
-    this.ready.set(part, this.preparePart(part, fields));
+    this.ready.set(part, this.preparePart(part, fields, model));
   }
 
-  // Returns whether a part can be drawn.
-  async preparePart(part, fields) {
+  // Returns whether a part can be drawn, as it could before. Its tables are freed after rows that were never in view
+  // are evaluated.
+  async preparePart(part, fields, model) {
     try {
-      await fields.prepareFields();
+      if ((await this.ready.get(part)) === false) return false;
+      if (model) await fields.prepareFields(model);
+      else if (await this.coloring([...this.pending], this.eye, { goOn: () => !this.isDisposed })) fields.freeTables();
       return true;
     } catch (error) {
       if (!this.graphics.lost) this.events.post({ unusable: { part, reason: error.message } });
@@ -121,11 +122,11 @@ export class StreamedFields extends Fields {
 
   // Evaluates the colours of rows by the fields of their parts.
   color(rows, eye) {
-    const { rowParts, further } = this;
-    for (const part of new Set(rows.map((row) => rowParts[row]))) {
-      const own = rows.filter((row) => rowParts[row] === part);
-      if (!part) super.color(own, eye);
-      else if (further.get(part).isReady) further.get(part).color(own, eye);
+    const partOf = (row) => this.rowWeights[2 * row + 1];
+    for (const part of new Set(rows.map(partOf))) {
+      const own = rows.filter((row) => partOf(row) === part), fields = this.further.get(part);
+      if (!fields) super.color(own, eye);
+      else if (fields.isReady) fields.color(own, eye);
       else for (const row of own) this.rows.colored(row, eye); // it cannot be drawn
     }
   }
@@ -143,15 +144,15 @@ export class StreamedFields extends Fields {
     }
     this.uploadResiduals(level);
     rows.forEach((row, place) => this.rows.replace(row, balls.subarray(4 * place, 4 * place + 4)));
-    for (const row of rows) this.rowParts[row] = this.rowWeights[2 * row + 1] = part;
-    this.usedHeight = Math.max(this.usedHeight, ...rows.map((row) => row + 1));
+    for (const row of rows) this.rowWeights[2 * row + 1] = part;
+    this.usedHeight = Math.max(this.usedHeight, rows.at(-1) + 1);
   }
 
   // Uploads the residuals of a level, if it has any.
   uploadResiduals({ part, rows, shapeResiduals, colorResiduals }) {
     if (!shapeResiduals) return;
     const { gl, width } = this, layer = 4 * width * rows.length;
-    const textures = this.createResiduals(this.degrees.get(part));
+    const { model } = this.further.get(part) ?? this, textures = this.createResiduals(model.residualDegree);
     const pairs = [[textures.shapeResiduals, shapeResiduals], [textures.colorResiduals, colorResiduals]];
     for (const [texture, numbers] of pairs) {
       gl.bindTexture(gl.TEXTURE_2D_ARRAY, texture);
@@ -183,15 +184,15 @@ export class StreamedFields extends Fields {
 
   // Waits for the parts that levels belong to. Returns the levels whose part can be drawn.
   async whenReady(levels) {
-    const areReady = await Promise.all(levels.map(({ part }) => this.ready.get(part) ?? true));
-    return levels.filter((_, place) => areReady[place]);
+    const areReady = await Promise.all(levels.map(({ part }) => this.ready.get(part)));
+    return levels.filter((_, place) => areReady[place] !== false);
   }
 
   // Returns the first levels that have arrived: one, or several of at most MAX_BATCH_ROWS rows.
   takeArrivals() {
     let rows = 0;
     const end = this.arrivals.findIndex((level) => (rows += level.rows.length) > MAX_BATCH_ROWS);
-    return this.arrivals.splice(0, end < 0 ? this.arrivals.length : Math.max(1, end));
+    return this.arrivals.splice(0, end < 0 ? Infinity : Math.max(1, end));
   }
 
   // Starts to fade from one level to another one.
@@ -248,12 +249,10 @@ export class StreamedFields extends Fields {
   // Waits until the levels that suit the view are drawn. Meanwhile frames may have looked at another view.
   async complete(view, margin, options) {
     const { goOn = () => true, changed = () => {}, exact = false } = options;
-    const isUploaded = () => !this.arrivals.length && !this.isUploading;
-    const isDone = () => this.events.isComplete(this.look(view)) && isUploaded() && !this.fades.size;
+    const isDone = () => this.events.isComplete(this.look(view)) && !this.isUploading && !this.fades.size;
     while (!isDone()) {
-      const { rows } = await this.coloured(view, margin, { goOn, report: () => {}, exact });
+      const { rows } = await this.coloured(view, margin, { goOn, exact });
       if (rows) changed();
-      if (!goOn() || this.isDisposed) return false;
       await new Promise((resolve) => setTimeout(resolve, POLL_MS));
       if (!goOn() || this.isDisposed) return false;
       if (this.fades.size && performance.now() > this.fadedAt + MAX_FRAME_WAIT_MS) this.endFades();
