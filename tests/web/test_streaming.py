@@ -6,11 +6,13 @@ import base64
 import itertools
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from web.native_models import lose_and_restore_device, make_near_parts, random_model, render_reference
+from scenes import shift_cameras
+from web.native_models import MODEL_FRAME, lose_and_restore_device, make_near_parts, random_model, render_reference
 from web.pages import Browser, psnr, render_in_page, wait_for_message, wait_until, window_camera
 from web.site import Site
 from web.test_element import ELEMENT_JS, LOADED_JS, open_element
@@ -22,6 +24,7 @@ from hyrfpack.context import RunContext
 from hyrfpack.format import encode_model
 from hyrfpack.format.parts import encode_parts
 from hyrfpack.lod import split, split_model
+from hyrfpack.model import HybridModel
 from hyrfpack.model.merged import MergedModel
 from hyrfpack.scene import Camera
 from hyrfpack.web import view as view_module
@@ -260,16 +263,21 @@ HELD_FIELDS_JS = """[...hyrfpack.player.renderer.content.further.values()]
   .filter(({ graphics, radiance }) => graphics.made.has(radiance.table)).length"""
 
 
+def split_parts(path: Path, models: list[HybridModel], config: SplitConfig) -> hyrfpack.SceneFolder:
+    """Return a scene folder of parts."""
+    parts = [(f"part {number}", encode_model(model)) for number, model in enumerate(models)]
+    (path / "all.hyrf").write_bytes(encode_parts(parts))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(split, "MEASURED_VIEWS", 1)
+        split_model(path / "all.hyrf", path / "scene", config, context=RunContext(progress=None))
+    return hyrfpack.SceneFolder(path / "scene")
+
+
 @pytest.mark.parametrize("is_lost", [False, True])
 def test_fields_that_were_dropped_are_loaded_again(browser: Browser, host: Site, tmp_path: Path, is_lost: bool):
     """A budget of 400 Gaussians leaves memory for the fields of two further parts."""
-    models = [(f"part {seed}", encode_model(random_model(400, seed))) for seed in range(5)]
-    (tmp_path / "all.hyrf").write_bytes(encode_parts(models))
-    config = SplitConfig(chunk_gaussians=200, levels=2, refit_steps=0)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(split, "MEASURED_VIEWS", 1)
-        split_model(tmp_path / "all.hyrf", tmp_path / "scene", config, context=RunContext(progress=None))
-    folder = hyrfpack.SceneFolder(tmp_path / "scene")
+    models = [random_model(400, seed) for seed in range(5)]
+    folder = split_parts(tmp_path, models, SplitConfig(chunk_gaussians=200, levels=2, refit_steps=0))
     serve_levels(host, folder)
     open_levels(browser, host, 400)
     wait_until_complete(browser)
@@ -285,6 +293,24 @@ def test_fields_that_were_dropped_are_loaded_again(browser: Browser, host: Site,
     picture = render_in_page(browser, camera).astype(float)
     assert psnr(picture, reference_picture(folder.load(), camera)) > MIN_PSNR_DB
     assert browser.list_errors() == []
+
+
+def test_gaussians_out_of_view_are_evaluated_before_their_fields_are_dropped(
+    browser: Browser, host: Site, tmp_path: Path
+):
+    """All Gaussians come with the first picture, and the budget leaves the fields of two further parts. The last part
+    is far to the side."""
+    shift = np.array([500.0, 0.0, 0.0])
+    far = replace(MODEL_FRAME, center=tuple(np.array(MODEL_FRAME.center) + shift))
+    models = [*(random_model(80, seed) for seed in range(4)), random_model(80, 4, frame=far)]
+    folder = split_parts(tmp_path, models, SplitConfig(levels=1))
+    serve_levels(host, folder)
+    open_levels(browser, host, 400)
+    wait_until(browser, f"{HELD_FIELDS_JS} === 2")
+    [camera] = shift_cameras([scene_camera(folder.path)], shift)
+    picture = render_in_page(browser, camera).astype(float)
+    assert picture.std() > 10
+    assert psnr(picture, reference_picture(folder.load(), camera)) > MIN_PSNR_DB
 
 
 @pytest.mark.acceptance
