@@ -64,6 +64,7 @@ def check_step(loss: Tensor, gradients: Sequence[Tensor], demand: Tensor, reserv
         reserve: the memory that it was rendered into.
     """
     norms = torch.stack(torch._foreach_norm(list(gradients), torch.inf))
+    # float64 holds counts exactly. It is one element for each tensor, so its rate does not matter.
     numbers = torch.cat((loss.double()[None], norms, demand))
     limits = MAX_LOSS, *[MAX_GRADIENT] * len(norms), *reserve.limits
     return StepChecks((numbers <= tensor_like(limits, numbers)).all(), demand, norms)

@@ -158,7 +158,7 @@ def _inside_a_gaussian() -> Case:
 
 def _short_quaternions() -> Case:
     gaussians = _gaussians(40)
-    lengths = torch.logspace(-9, 9, 40)[:, None] / gaussians["quats"].norm(dim=1, keepdim=True)
+    lengths = torch.logspace(-9, 18, 40)[:, None] / gaussians["quats"].norm(dim=1, keepdim=True)
     return Case(_replace(gaussians, quats=gaussians["quats"] * lengths))
 
 
@@ -192,7 +192,7 @@ CASE_MAKERS: dict[str, Callable[[], Case]] = {
     "covers the whole picture": _covers_everything,
     "smaller than 1/1000 pixel": _smaller_than_a_pixel,
     "camera inside a Gaussian": _inside_a_gaussian,
-    "quaternions 1e-9 to 1e9 long": _short_quaternions,
+    "quaternions 1e-9 to 1e18 long": _short_quaternions,
     "1 x 1 picture": lambda: Case(_gaussians(50), width=1, height=1, intrinsics=(2.0, 2.0, 0.5, 0.5)),
     "17 x 3 picture": lambda: Case(_gaussians(50), width=17, height=3, intrinsics=(17.0, 17.0, 8.5, 1.5)),
     "256 x 16 picture": lambda: Case(_gaussians(80), width=256, height=16, intrinsics=(90.0, 90.0, 128.0, 8.0)),

@@ -117,6 +117,35 @@ def test_both_features_of_a_vertex_are_added_at_once_where_the_gpu_can(
         assert (build["sass"]["scalar_adds"], build["sass"]["vector_adds"]) == (scalar, vector), build["constants"]
 
 
+# Instructions on float64 for each Gaussian, on sm_89 and sm_90 alike. Other kernels have none.
+FLOAT64_INSTRUCTIONS = {
+    ("rasterize.gpu_cull.frustum_kernel", None): 26,
+    ("rasterize.gpu_project.project", "ANTIALIASED=False"): 185,
+    ("rasterize.gpu_project.project", "ANTIALIASED=True"): 218,
+    ("rasterize.gpu_project.project_backward", "ANTIALIASED=False"): 368,
+    ("rasterize.gpu_project.project_backward", "ANTIALIASED=True"): 405,
+    ("rasterize.gpu_shaded.project_shaded_kernel", "ANTIALIASED=False"): 203,
+    ("rasterize.gpu_shaded.project_shaded_kernel", "ANTIALIASED=True"): 236,
+}
+FLOAT64_TOLERANCE = 0.05
+
+
+@pytest.mark.parametrize("target", ["sm_89", "sm_90"])
+def test_kernels_use_as_much_float64_as_before(report: dict, target: str) -> None:
+    builds = [build for build in builds_for(report, target) if not build["error"]]
+    if any(build["sass"] is None for build in builds):
+        pytest.skip(f"Triton {report['triton']} comes without nvdisasm")
+    found = set()
+    for build in builds:
+        options = {None, *build["constants"].split()}
+        keys = [key for key in FLOAT64_INSTRUCTIONS if key[0] == build["kernel"] and key[1] in options]
+        expected = FLOAT64_INSTRUCTIONS[keys[0]] if keys else 0
+        found.update(keys)
+        counted = build["sass"]["float64"]
+        assert counted == pytest.approx(expected, rel=FLOAT64_TOLERANCE), f"{build['kernel']} {build['constants']}"
+    assert {kernel for kernel, _ in found} == {kernel for kernel, _ in FLOAT64_INSTRUCTIONS}
+
+
 DISASSEMBLY_LISTING = """
 first:
 .text.first:
@@ -130,13 +159,19 @@ first:
         /*0050*/                   RED.E.ADD.F32.FTZ.RN.STRONG.GPU [R2.64+0x4], R4 ;
         /*0060*/               @P1 BRA `(.L_x_1) ;
         /*0070*/                   REDUX.MIN.S32 UR4, R0 ;
+        /*0078*/                   DFMA R4, R2, R2, -R8 ;
+        /*0078*/              @P0  DSETP.GT.AND P1, PT, R4, UR4, PT ;
+        /*0078*/                   F2F.F32.F64 R6, R4 ;
+        /*0078*/                   MUFU.RSQ64H R7, R9 ;
+        /*0078*/                   LDG.E.64 R8, desc[UR4][R2.64] ;
 .L_x_3:
         /*0080*/                   BRA `(.L_x_3);
 """
 
 
-def test_loops_and_additions_are_read_from_a_listing() -> None:
-    assert asdict(parse_listing(DISASSEMBLY_LISTING)) == {"loop_instructions": 6, "scalar_adds": 2, "vector_adds": 1}
+def test_loops_additions_and_float64_are_read_from_a_listing() -> None:
+    facts = {"loop_instructions": 6, "scalar_adds": 2, "vector_adds": 1, "float64": 4}
+    assert asdict(parse_listing(DISASSEMBLY_LISTING)) == facts
     assert asdict(parse_listing(DISASSEMBLY_LISTING.replace("@P1 BRA `(.L_x_1)", "@P1 EXIT")))["loop_instructions"] == 0
 
 

@@ -59,9 +59,7 @@ GPU_TARGETS = {
     "sm_100": GPUTarget("cuda", 100, 32),
     "gfx942": GPUTarget("hip", "gfx942", 64),
 }
-# The kernels whose machine code is read on some targets: those with the longest loops, and one that adds by atomics.
-SASS_KERNELS = ("rasterize.gpu_blend.blend", "rasterize.gpu_blend.blend_backward", "hash_encode.gpu.grad_table_kernel")
-SASS_TARGETS = ("sm_89", "sm_90")
+SASS_TARGETS = ("sm_89", "sm_90")  # whose machine code is read
 BUILD_PROCESSES = 2
 Run = Callable[[], object]
 
@@ -79,7 +77,7 @@ class Build:
         shared: shared memory of a program in bytes.
         spills: bytes of local memory per thread (NVIDIA), or spilled registers (AMD).
         error: why the build failed; empty if it succeeded.
-        sass: fields of `SassFacts` of SASS_KERNELS on SASS_TARGETS, if Triton has the disassembler.
+        sass: fields of `SassFacts` on SASS_TARGETS, if Triton has the disassembler.
     """
 
     kernel: str
@@ -390,7 +388,7 @@ def _describe_build(kernel: JITFunction, target: str, built: object) -> Build:
     metadata = built.metadata
     described = " ".join(constants) + " /16: " + " ".join(aligned)
     name, facts = _kernel_name(kernel), None
-    if name in SASS_KERNELS and target in SASS_TARGETS and sass.has_disassembler():
+    if target in SASS_TARGETS and sass.has_disassembler():
         facts = asdict(sass.read_facts(built.asm["cubin"]))
     return Build(name, target, described, metadata.num_warps, registers, metadata.shared, spills, sass=facts)
 

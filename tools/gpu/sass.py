@@ -14,6 +14,8 @@ NVDISASM_PATH = Path(triton.__file__).parent / "backends" / "nvidia" / "bin" / "
 _INSTRUCTION = re.compile(r"^\s*/\*[0-9a-f]+\*/\s+(.*?)\s*;")
 _LABEL = re.compile(r"^(\.L\w+):")
 _BRANCH = re.compile(r"\bBRA\b.*`\((\.L\w+)\)")
+# Arithmetic, comparisons and conversions of float64, and the guesses that its divisions and roots begin with.
+_FLOAT64 = re.compile(r"\bD(ADD|MUL|FMA|SETP|MNMX)\b|\.F64\b|\bMUFU\.\w*64H\b")
 # Additions to memory without a result. On sm_90 one may add two or four float32.
 _ADDITION = re.compile(r"\bREDG?\.\S*\bADD\.F32(x[24])?\b")
 
@@ -26,11 +28,13 @@ class SassFacts:
         loop_instructions: number of instructions of the longest loop; 0 without a loop.
         scalar_adds: number of instructions that add one float32 to memory.
         vector_adds: number of instructions that add several.
+        float64: number of instructions on float64, of which GPUs for games compute few at a time.
     """
 
     loop_instructions: int
     scalar_adds: int
     vector_adds: int
+    float64: int
 
 
 def has_disassembler() -> bool:
@@ -53,7 +57,7 @@ def parse_listing(listing: str) -> SassFacts:
     A loop is what lies between a label and a later branch to it.
     """
     starts: dict[str, int] = {}
-    longest = count = 0
+    longest = count = float64 = 0
     widths = []
     for line in listing.splitlines():
         if label := _LABEL.match(line):
@@ -61,9 +65,11 @@ def parse_listing(listing: str) -> SassFacts:
         if not (instruction := _INSTRUCTION.match(line)):
             continue
         count += 1
+        float64 += _FLOAT64.search(instruction[1]) is not None
         if (branch := _BRANCH.search(instruction[1])) and branch[1] in starts:
             longest = max(longest, count - starts[branch[1]])
         if addition := _ADDITION.search(instruction[1]):
             widths.append(addition[1])
     vectors = len(widths) - widths.count(None)
-    return SassFacts(longest if longest > 1 else 0, widths.count(None), vectors)  # Code ends with a jump to itself.
+    longest = longest if longest > 1 else 0  # Code ends with a jump to itself.
+    return SassFacts(longest, widths.count(None), vectors, float64)

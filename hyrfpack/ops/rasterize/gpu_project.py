@@ -1,7 +1,8 @@
 """Projects 3D Gaussians on the GPU to the records that binning and blending read, and backpropagates.
 
-All computation is in float64, which costs little once per Gaussian and keeps far-away scenes, needles and huge
-Gaussians exact. The records are float32. A Gaussian whose numbers overflow is skipped, like one behind the camera.
+All computation is in float64, once per Gaussian, which keeps far-away scenes, needles and huge Gaussians exact. GPUs
+for games compute float64 at 1/64 of their rate, so roots and reciprocals begin with a float32 guess that one Newton
+step refines. The records are float32. A Gaussian whose numbers overflow is skipped, like one behind the camera.
 `project_block` and `store_records` are separate functions, so that another kernel can project Gaussians without
 storing them first.
 """
@@ -62,6 +63,7 @@ WARPS_PER_PROGRAM = 4
 _ALPHA_MIN = tl.constexpr(reference.ALPHA_MIN)
 _DETERMINANT_RATIO_MIN = tl.constexpr(reference.DETERMINANT_RATIO_MIN)
 _QUAT_NORM_MIN = tl.constexpr(reference.QUAT_NORM_MIN)
+_LONG_QUAT, _LONG_QUAT_FACTOR = tl.constexpr(1e15), tl.constexpr(2.0**-70)
 _INV_SQRT_UV_SCALE = tl.constexpr(math.sqrt(0.5 / math.log(2)))
 # Gaussians with a larger depth, opacity, covariance or mean are not drawn.
 _MAX_MAGNITUDE = tl.constexpr(1e30)
@@ -222,6 +224,20 @@ def _to_float64_4(a):
 
 
 @triton.jit
+def _reciprocal(a):
+    """Return 1 / a with a relative error below 2^-40, for float64 from 1e-37 to 1e37."""
+    guess = (1 / a.to(tl.float32)).to(tl.float64)
+    return guess + guess * (1 - a * guess)
+
+
+@triton.jit
+def _reciprocal_sqrt(a):
+    """Return 1 / sqrt(a) with a relative error below 2^-40, for float64 from 1e-37 to 1e37."""
+    guess = tl.rsqrt(a.to(tl.float32)).to(tl.float64)
+    return guess + 0.5 * guess * (1 - a * guess * guess)
+
+
+@triton.jit
 def _rotation_columns(q):
     """Return the columns of the rotation matrix of a unit quaternion wxyz."""
     return (
@@ -256,12 +272,16 @@ def _covariance_factors(x_z, y_z, inv_z, quat, axes, lens, limits):
     """Compute the factors of the covariance.
 
     Returns:
-        a, b: the rows of J R; e, f: the rows of J R Q; the columns of Q; q: the unit quaternion; norm: its length
-        before normalisation.
+        a, b: the rows of J R; e, f: the rows of J R Q; the columns of Q; q: the unit quaternion; inv_norm: 1 / its
+        length before normalisation, at most 1 / _QUAT_NORM_MIN; is_unit: whether the length was greater than that
+        minimum.
     """
-    quat = _to_float64_4(quat)
-    norm = tl.sqrt(quat[0] * quat[0] + quat[1] * quat[1] + quat[2] * quat[2] + quat[3] * quat[3])
-    scale = 1 / tl.maximum(norm, _QUAT_NORM_MIN)
+    # An exact power of two keeps the squared length of a long quaternion within what `_reciprocal_sqrt` takes.
+    largest = tl.maximum(tl.maximum(tl.abs(quat[0]), tl.abs(quat[1])), tl.maximum(tl.abs(quat[2]), tl.abs(quat[3])))
+    shrink = tl.where(largest > _LONG_QUAT, _LONG_QUAT_FACTOR, 1.0).to(tl.float32)
+    quat = _to_float64_4((quat[0] * shrink, quat[1] * shrink, quat[2] * shrink, quat[3] * shrink))
+    square = quat[0] * quat[0] + quat[1] * quat[1] + quat[2] * quat[2] + quat[3] * quat[3]
+    scale = _reciprocal_sqrt(tl.maximum(square, _QUAT_NORM_MIN * _QUAT_NORM_MIN))
     q = quat[0] * scale, quat[1] * scale, quat[2] * scale, quat[3] * scale
     columns = _rotation_columns(q)
     j_x, j_y = lens[0] * inv_z, lens[1] * inv_z
@@ -269,7 +289,7 @@ def _covariance_factors(x_z, y_z, inv_z, quat, axes, lens, limits):
     b = _combine(j_y, axes[1], -j_y * _clamp(y_z, limits[2], limits[3]), axes[2])
     e = _dot(a, columns[0]), _dot(a, columns[1]), _dot(a, columns[2])
     f = _dot(b, columns[0]), _dot(b, columns[1]), _dot(b, columns[2])
-    return a, b, e, f, columns, q, norm
+    return a, b, e, f, columns, q, scale * shrink.to(tl.float64), square > _QUAT_NORM_MIN * _QUAT_NORM_MIN
 
 
 @triton.jit
@@ -290,9 +310,10 @@ def _covariance(g, h, low_pass):
 @triton.jit
 def _triangular_form(xx, xy, det):
     """Return U_X, U_Y and V_X of a record."""
-    inv_xx = 1 / xx
-    u_y = tl.sqrt(xx / det) * _INV_SQRT_UV_SCALE
-    return -u_y * xy * inv_xx, u_y, tl.sqrt(inv_xx) * _INV_SQRT_UV_SCALE
+    v_x = _reciprocal_sqrt(xx)
+    inv_xx = v_x * v_x
+    u_y = _reciprocal_sqrt(det * inv_xx) * _INV_SQRT_UV_SCALE
+    return -u_y * xy * inv_xx, u_y, v_x * _INV_SQRT_UV_SCALE
 
 
 @triton.jit
@@ -315,13 +336,14 @@ def project_block(mean, quat, scale, opacity, camera, width, height, ANTIALIASED
     # The comparisons are written so that they fail for NaN, which is then not drawn.
     drawn = (z > near) & (z < _MAX_MAGNITUDE) & (opacity >= _ALPHA_MIN) & (opacity < _MAX_MAGNITUDE)
     z = tl.where(drawn, z, 1.0)
-    inv_z = 1 / z
+    inv_z = _reciprocal(z)
     x_z, y_z = x * inv_z, y * inv_z
-    _, _, e, f, _, _, _ = _covariance_factors(x_z, y_z, inv_z, quat, axes, lens, limits)
+    _, _, e, f, _, _, _, _ = _covariance_factors(x_z, y_z, inv_z, quat, axes, lens, limits)
     scale = _to_float64_3(scale)
     xx, xy, yy, raw, det = _covariance(_multiply(e, scale), _multiply(f, scale), low_pass)
     if ANTIALIASED:
-        opacity *= tl.sqrt(tl.maximum(raw / det, _DETERMINANT_RATIO_MIN))
+        # The record has the opacity's float32 logarithm, for which a root in float32 is exact enough.
+        opacity *= tl.sqrt(tl.maximum(raw / det, _DETERMINANT_RATIO_MIN).to(tl.float32)).to(tl.float64)
     mean_x, mean_y = lens[0] * x_z + lens[2], lens[1] * y_z + lens[3]
     drawn &= (opacity >= _ALPHA_MIN) & (xx < _MAX_MAGNITUDE) & (yy < _MAX_MAGNITUDE)
     drawn &= (tl.abs(mean_x) < _MAX_MAGNITUDE) & (tl.abs(mean_y) < _MAX_MAGNITUDE)
@@ -433,11 +455,12 @@ def project(
         return
     live = index < used_count
     mean, quat, scale, opacity = load_gaussians(gaussians, index, live)
-    color = load_rows_3(colors, index, live)
     flag_geometry(projection.flags_and_ends, mean, quat, scale, opacity)
-    flag_colors(projection.flags_and_ends, color)
     words, key, count = project_block(mean, quat, scale, opacity, load_camera(camera), width, height, ANTIALIASED)
     key, count = tl.where(live, key, HIDDEN_KEY), tl.where(live, count, 0)
+    # Colours are loaded last, so that they take no registers before.
+    color = load_rows_3(colors, index, live)
+    flag_colors(projection.flags_and_ends, color)
     store_records(projection.records, index, count > 0, words)
     store_colors(projection.records, index, count > 0, color, words[4])
     store_counts(projection, index, index < total, key, count)
@@ -484,10 +507,10 @@ def project_backward(
     axes, shift, lens, _, limits, _, low_pass = load_camera(camera)
     # Gaussians that are not drawn may hold any numbers. They are replaced by zeros at z = 1 and get zero gradients.
     x, y, z = _to_camera(load_rows_3(gaussians.means, index, drawn), axes, shift)
-    inv_z = 1 / tl.where(drawn, z, 1.0)
+    inv_z = _reciprocal(tl.where(drawn, z, 1.0))
     x_z, y_z = x * inv_z, y * inv_z
     quat = load_rows_4(gaussians.quats, index, drawn)
-    a, b, e, f, columns, q, norm = _covariance_factors(x_z, y_z, inv_z, quat, axes, lens, limits)
+    a, b, e, f, columns, q, inv_norm, is_unit = _covariance_factors(x_z, y_z, inv_z, quat, axes, lens, limits)
     scale = _to_float64_3(load_rows_3(gaussians.scales, index, drawn))
     g, h = _multiply(e, scale), _multiply(f, scale)
     xx, xy, yy, raw, det = _covariance(g, h, low_pass)
@@ -530,8 +553,7 @@ def project_backward(
     w1 = 2 * (q[0] * x_turn + q[2] * (d0[1] + d1[0]) + q[3] * (d0[2] + d2[0]) - 2 * q[1] * (d1[1] + d2[2]))
     w2 = 2 * (q[0] * y_turn + q[1] * (d0[1] + d1[0]) + q[3] * (d1[2] + d2[1]) - 2 * q[2] * (d0[0] + d2[2]))
     w3 = 2 * (q[0] * z_turn + q[1] * (d0[2] + d2[0]) + q[2] * (d1[2] + d2[1]) - 2 * q[3] * (d0[0] + d1[1]))
-    along = tl.where(norm > _QUAT_NORM_MIN, q[0] * w0 + q[1] * w1 + q[2] * w2 + q[3] * w3, 0.0)
-    inv_norm = 1 / tl.maximum(norm, _QUAT_NORM_MIN)
+    along = tl.where(is_unit, q[0] * w0 + q[1] * w1 + q[2] * w2 + q[3] * w3, 0.0)
     to = grads.quats + index.to(tl.int64) * 4
     tl.store(to, ((w0 - along * q[0]) * inv_norm).to(tl.float32), mask=live)
     tl.store(to + 1, ((w1 - along * q[1]) * inv_norm).to(tl.float32), mask=live)

@@ -146,9 +146,13 @@ def _loss_kernel(
 
 @triton.jit
 def _reduce_kernel(partials, programs, l1_weight, ssim_weight, loss, inverse_count, BLOCK: tl.constexpr):
-    """Compute the loss and 1 / count, the weight of one value in a mean, from all partial sums, in one program."""
+    """Compute the loss and 1 / count, the weight of one value in a mean, from all partial sums, in one program.
+
+    The partial sums are float32. Adding them as a tree, in float32 too, rounds a sum of n by at most
+    (n / BLOCK + log2(BLOCK)) 2^-24 of itself.
+    """
     lane = tl.arange(0, BLOCK)
-    l1 = tl.zeros([BLOCK], tl.float64)
+    l1 = tl.zeros([BLOCK], tl.float32)
     dissimilarity, count = l1, l1
     start = 0
     while start < programs:
@@ -160,8 +164,8 @@ def _reduce_kernel(partials, programs, l1_weight, ssim_weight, loss, inverse_cou
         start += BLOCK
     inverse = 1 / tl.maximum(tl.sum(count, 0), 1.0)
     total = inverse * (l1_weight * tl.sum(l1, 0) + ssim_weight * tl.sum(dissimilarity, 0))
-    tl.store(loss, total.to(tl.float32))
-    tl.store(inverse_count, inverse.to(tl.float32))
+    tl.store(loss, total)
+    tl.store(inverse_count, inverse)
 
 
 @triton.jit
