@@ -1,4 +1,4 @@
-"""The journal of a run in blocks tells from the files of a block how far it is."""
+"""The journal of a run in blocks reads the state of each block from its files."""
 
 from __future__ import annotations
 

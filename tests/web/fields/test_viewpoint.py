@@ -83,7 +83,7 @@ def camera_json_array(cameras: list[dict]) -> np.ndarray:
     return np.array([[*(item[key] for key in order), *np.ravel(item["camera_from_world"])] for item in cameras])
 
 
-ROTATIONS = {"straight": None, "rotated": (0.5, -0.1, 0.7, 0.5)}
+FRAME_ROTATIONS_WXYZ = {"straight": None, "rotated": (0.5, -0.1, 0.7, 0.5)}
 
 
 @pytest.fixture(scope="module")
@@ -91,18 +91,18 @@ def viewpoints(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str]
     """Return the viewpoints that the page chooses, by the names of rotation and provenance."""
     cases = {
         (turn, name): make_metadata(provenance, **({} if rotation is None else {"rotation": list(rotation)}))
-        for turn, rotation in ROTATIONS.items()
+        for turn, rotation in FRAME_ROTATIONS_WXYZ.items()
         for name, provenance in VALID_PROVENANCES.items()
     }
     found = viewpoints_in_node(tmp_path_factory.mktemp("viewpoints"), list(cases.values()))
     return dict(zip(cases, found, strict=True))
 
 
-@pytest.mark.parametrize("turn", ROTATIONS)
+@pytest.mark.parametrize("turn", FRAME_ROTATIONS_WXYZ)
 @pytest.mark.parametrize("name", VALID_PROVENANCES)
 def test_the_page_has_the_same_viewpoint_as_python(name: str, turn: str, viewpoints: dict, tmp_path: Path) -> None:
     file = tmp_path / "model.hyrf"
-    rotation: Quaternion | None = ROTATIONS[turn]
+    rotation: Quaternion | None = FRAME_ROTATIONS_WXYZ[turn]
     frame = MODEL_FRAME if rotation is None else replace(MODEL_FRAME, rotation=rotation)
     hyrfpack.save_model(small_model([[0, 0, 0]], frame=frame), file, provenance=VALID_PROVENANCES[name])
     read = Source.read(file)
