@@ -82,11 +82,11 @@ gc.disable()
 def pytest_collection_finish() -> None:
     gc.freeze()
     gc.enable()
-    capture_notes_of_all_tests()
+    capture_library_log_messages()
 
 
-def capture_notes_of_all_tests() -> None:
-    """Let `caplog` have the notes of the library, too.
+def capture_library_log_messages() -> None:
+    """Let `caplog` capture the library's log messages from level INFO on.
 
     pytest's option `log_level` would set the level three times a test. It also adds its handlers to each logger that
     does not propagate, of which torch has dozens. Both take 2 ms a test.

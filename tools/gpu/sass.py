@@ -28,7 +28,7 @@ class SassFacts:
         loop_instructions: number of instructions of the longest loop; 0 without a loop.
         scalar_adds: number of instructions that add one float32 to memory.
         vector_adds: number of instructions that add several.
-        float64: number of instructions on float64, of which GPUs for games compute few at a time.
+        float64: number of instructions on float64, of which consumer GPUs compute few at a time.
     """
 
     loop_instructions: int

@@ -128,8 +128,8 @@ def grad_table_kernel(
     copy = tl.program_id(0) % tl.load(copies + 1)
     out += tl.where(copy == 0, tl.load(levels + level * 5 + 4), tl.load(copies + 2) + (copy - 1) * tl.load(copies)) * 2
     feature = tl.arange(0, 2)
-    nothing, no_term = tl.zeros([THREADS, 2], tl.float32), tl.zeros([THREADS], tl.uint32)
-    sums, cell, filled = (nothing,) * 8, (no_term,) * 6, no_term != 0
+    zero_sum, zero_term = tl.zeros([THREADS, 2], tl.float32), tl.zeros([THREADS], tl.uint32)
+    sums, cell, has_sum = (zero_sum,) * 8, (zero_term,) * 6, zero_term != 0
     for step in range(RUN + 1):  # The last step only adds what is left.
         lane = tl.arange(0, THREADS) * RUN + step
         inside = (lane < count - start) & (step < RUN)
@@ -140,12 +140,12 @@ def grad_table_kernel(
             coords, axis_stride, point_stride, levels, level, start, lane, live
         )
         other_cell = (row_x0 != cell[0]) | (row_y0 != cell[2]) | (row_z0 != cell[4])
-        full = filled & ((live & other_cell) | (step == RUN))
+        is_run_end = has_sum & ((live & other_cell) | (step == RUN))
         pair = tl.join(grad0, grad1)
         for corner in tl.static_range(8):
             row = vertex_row(cell[corner & 1], cell[2 + (corner >> 1 & 1)], cell[4 + (corner >> 2)], mask)
             at = out + (row[:, None] * 2 + feature[None, :])
-            tl.atomic_add(at, sums[0], mask=full[:, None], sem="relaxed")
+            tl.atomic_add(at, sums[0], mask=is_run_end[:, None], sem="relaxed")
             x, y, z = (
                 x1 if corner & 1 else 1 - x1,
                 y1 if corner & 2 else 1 - y1,
@@ -153,13 +153,13 @@ def grad_table_kernel(
             )
             weight = x * (y * z)
             # The sum of the next corner becomes the first, so that after 8 corners the order is as before.
-            sums = sums[1:] + (tl.where(full[:, None], 0.0, sums[0]) + weight[:, None] * pair,)
+            sums = sums[1:] + (tl.where(is_run_end[:, None], 0.0, sums[0]) + weight[:, None] * pair,)
         cell = (
             tl.where(live, row_x0, cell[0]), tl.where(live, row_x1, cell[1]),
             tl.where(live, row_y0, cell[2]), tl.where(live, row_y1, cell[3]),
             tl.where(live, row_z0, cell[4]), tl.where(live, row_z1, cell[5]),
         )  # fmt: skip
-        filled = filled | live
+        has_sum = has_sum | live
 
 
 @triton.jit

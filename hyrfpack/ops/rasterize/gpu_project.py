@@ -1,8 +1,9 @@
 """Projects 3D Gaussians on the GPU to the records that binning and blending read, and backpropagates.
 
-All computation is in float64, once per Gaussian, which keeps far-away scenes, needles and huge Gaussians exact. GPUs
-for games compute float64 at 1/64 of their rate, so roots and reciprocals begin with a float32 guess that one Newton
-step refines. The records are float32. A Gaussian whose numbers overflow is skipped, like one behind the camera.
+All computation is in float64, once per Gaussian, which keeps far-away scenes, needles and huge Gaussians exact.
+Consumer GPUs compute float64 at 1/64 of the rate of float32, so roots and reciprocals begin with a float32 guess that
+one Newton step refines. The records are float32. A Gaussian whose numbers overflow is skipped, like one behind the
+camera.
 `project_block` and `store_records` are separate functions, so that another kernel can project Gaussians without
 storing them first.
 """

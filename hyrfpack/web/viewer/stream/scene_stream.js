@@ -1,7 +1,7 @@
 // Reads a scene folder as views need it, in the worker: fetches the coarsest levels of chunks first and then, by
 // priority, the levels that suit the view within a budget of Gaussians; decodes them, and drops what is not needed when
-// memory is short. That for Gaussians does not grow with the scene (see level_choice.js), nor does that for the fields
-// of its parts: a level needs them only until it is evaluated.
+// memory is short. Neither the memory for Gaussians (see level_choice.js) nor that for the fields of parts grows with
+// the scene: a level needs the fields of its part only until it is evaluated.
 //
 // Messages to the worker, beside those in worker_tasks.js; `number` is that of the content:
 //     {stream: {manifest, address, name, stage, gaussians, maxRows}}   open the scene with the text `manifest` from
@@ -47,7 +47,7 @@ const EXTRA_ROWS_PER_CHUNK = 2, MAX_EXTRA_CHUNKS = 256;
 // That wait to be evaluated. A slow device then evaluates what the present view needs, not all that earlier ones did.
 const MAX_UPLOADING_ROWS = 512;
 // Bytes of the tables of further parts that are in memory, for each Gaussian of the budget, which itself takes about as
-// many. Two parts of any size are always allowed: one loads while levels of the other are evaluated.
+// many bytes. Two parts of any size are always allowed: one loads while levels of the other are evaluated.
 const FIELD_BYTES_PER_GAUSSIAN = 128, MIN_FURTHER_PARTS = 2;
 const MAX_FIRST_LOSSES = 3; // of the connection before the first picture; then what is there is drawn
 const MAX_PSNR_DB = 99;
@@ -65,7 +65,6 @@ export class SceneStream {
     this.isOpening = false; // whether the content is being prepared
     this.isShown = false; // whether it was sent
     this.early = new Map(); // name of a file that came before the shared file of its part -> [file, bytes]
-    this.recentParts = []; // those whose fields were used last come first
     this.isOutdated = true; // whether levels must be chosen again
     this.isShort = false; // whether a wanted level does not fit into memory
     this.decoding = new Set(); // names of files that are being decoded
@@ -84,7 +83,7 @@ export class SceneStream {
     const { manifest: text, address, maxRows } = this.request, manifest = parseManifest(text), { chunks } = manifest;
     this.manifest = manifest;
     this.parts = manifest.parts.map((file, number) => new ScenePart(number, file));
-    this.recentParts = this.parts;
+    this.recentParts = this.parts; // those whose fields were used last come first
     this.chunks = chunks.map((chunk, number) => new ChunkLevels(number, chunk, countRows));
     const files = [...manifest.parts, ...chunks.flatMap(({ levels }) => levels)];
     this.fileBytes = files.reduce((sum, file) => sum + file.bytes, 0);
@@ -331,8 +330,8 @@ export class SceneStream {
     this.isShort = fitting >= 0;
   }
 
-  // Returns those of the wanted levels whose fields may be in memory. While first levels wait for that, they are only
-  // first levels, so that the parts in use become free.
+  // Returns the wanted levels for whose fields there is memory. While the first level of a chunk waits for memory,
+  // finer levels are left out, so that the fields in use become free.
   admitLevels(wanted) {
     const parts = this.admitParts(wanted), isAdmitted = ({ chunk }) => parts.has(this.partOf(chunk));
     const isFirstWaiting = wanted.some((each) => each.isFirst && !isAdmitted(each));
@@ -367,9 +366,10 @@ export class SceneStream {
     return new Set([parts[0], ...busy, ...parts.filter(({ file }) => decoding.has(file.file))]);
   }
 
+  // Frees the fields of a part here and on the page.
   dropFields(part) {
-    const { number: each, place, exposure } = part;
-    if (part.sent) this.post({ part: { number: this.number, part: each, model: null, place, exposure } });
+    const { place, exposure } = part, dropped = { part: part.number, model: null, place, exposure };
+    if (part.sent) this.post({ part: { number: this.number, ...dropped } });
     part.drop();
   }
 
