@@ -28,17 +28,17 @@ MIN_INTERVAL_RATIO = 40.0
 
 
 class LiveView:
-    """Observer of `hyrfpack.train_model` that takes snapshots of the model in training, and of models of pilot runs.
+    """Observer that takes snapshots of the model in training, and of the models of pilot runs and of a first look.
 
     A snapshot is a `.hyrf` file in memory with profile "raw", which is the fastest to write. Snapshots are taken after
-    the very first step and the last step of the training, and in between at intervals of at least MIN_INTERVAL_SECONDS
-    and MIN_INTERVAL_RATIO.
+    the very first step and the last step of a run that is no pilot run, and in between at intervals of at least
+    MIN_INTERVAL_SECONDS and MIN_INTERVAL_RATIO.
     The model is only read, so training with a live view gives the same model, bit by bit, as training without.
 
     Attributes:
         scene: the newest snapshot.
         updates: JSON with the number of the newest snapshot (0 if there is none), its step, the number of steps, and
-            whether it is of a pilot run.
+            the kind of the run, see `Trainer`.
 
     Example:
         >>> view = LiveView()
@@ -52,7 +52,7 @@ class LiveView:
             clock: returns the current time in seconds.
         """
         self.scene = MemoryFile(b"")
-        self.updates = MemoryFile(_encode_progress(0, 0, 0, False))
+        self.updates = MemoryFile(_encode_progress(0, 0, 0, ""))
         self._clock = clock
         self._count = 0
         self._next = 0.0  # earliest time of the next snapshot, in seconds of the clock
@@ -65,7 +65,7 @@ class LiveView:
         A model that cannot be written, such as one with non-finite numbers, is skipped: the trainer reports it.
         """
         started = self._clock()
-        is_last = trainer.step == trainer.steps and not trainer.is_pilot
+        is_last = trainer.step == trainer.steps and trainer.kind != "pilot run"
         if self._count and started < self._next and not is_last:
             return
         if trainer.scene is not self._scene:
@@ -76,7 +76,7 @@ class LiveView:
             return
         self._count += 1
         self.scene.replace(data)
-        self.updates.replace(_encode_progress(self._count, trainer.step, trainer.steps, trainer.is_pilot))
+        self.updates.replace(_encode_progress(self._count, trainer.step, trainer.steps, trainer.kind))
         now = self._clock()
         self._next = now + max(MIN_INTERVAL_SECONDS, MIN_INTERVAL_RATIO * (now - started))
 
@@ -103,5 +103,5 @@ def live_view(title: str, *, port: int = 0) -> Iterator[LiveView]:
         yield view
 
 
-def _encode_progress(snapshot: int, step: int, steps: int, is_pilot: bool) -> bytes:
-    return json.dumps({"snapshot": snapshot, "step": step, "steps": steps, "pilot": is_pilot}).encode()
+def _encode_progress(snapshot: int, step: int, steps: int, kind: str) -> bytes:
+    return json.dumps({"snapshot": snapshot, "step": step, "steps": steps, "kind": kind}).encode()

@@ -116,7 +116,8 @@ def make_scene(
         work: the work folder. None puts it beside the output, with the output's name and the ending ".work".
         overwrite: replace an existing output. Without it, an output that appears during the call is also kept. A file
             then gets a free name beside it, which the result reports; a folder is an error.
-        observer: observer of the training, see `hyrfpack.train_model`.
+        observer: observer of the training, see `hyrfpack.train_model`. With an observer, photos without poses get a
+            coarse first look before their poses are estimated: a short training on small copies of them.
         context: device for training and packing, progress (`StageEvent`s), cache and stop; this process does all work.
 
     Returns:
@@ -240,7 +241,7 @@ class _Pipeline:
         if source.archive is not None:
             _LOG.info(f"{source.archive.name} was unpacked into {source.path} and is reused from there")
         config = PosesConfig(request.config.matching, request.config.seed)
-        return stages.run_pose_stage(self.stage_cache, source.path, source.files(), config, self.context)
+        return stages.run_pose_stage(self.stage_cache, source.path, source.files(), config, self.observer, self.context)
 
     def _scene_digest(self, scene: Scene) -> str:
         """Return the digest of all files of a scene; for an archive, that of its unpacked files."""

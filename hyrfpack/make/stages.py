@@ -26,6 +26,7 @@ from hyrfpack.export import export_model
 from hyrfpack.format import describe_file, load_model
 from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
 from hyrfpack.imports import ImportConfig, import_splats
+from hyrfpack.make.first_look import show_first_look
 from hyrfpack.make.plan import Plan
 from hyrfpack.make.preview import write_preview
 from hyrfpack.make.progress import Reporter
@@ -45,6 +46,7 @@ SCENE_FOLDER = PRODUCT_NAMES["poses"]
 RUN_FOLDER = PRODUCT_NAMES["training"]
 PACKED_MODEL = PRODUCT_NAMES["compression"]
 EXPORT_FOLDER = PRODUCT_NAMES["export"]
+FIRST_LOOK_FOLDER = "first_look"  # deleted as soon as the first look was shown
 FIXED_SETTINGS = ("target_bytes", "budget_factor", "exposure")  # a training run that was begun keeps these settings
 POSES_REPORT_NAME = "poses.json"  # `hyrfpack.estimate_poses` writes its report into the scene's folder
 
@@ -58,15 +60,25 @@ def is_posed(scene: Path) -> bool:
 
 
 def run_pose_stage(
-    stage_cache: StageCache, photos: Path, files: Sequence[Path], config: PosesConfig, context: RunContext
+    stage_cache: StageCache,
+    photos: Path,
+    files: Sequence[Path],
+    config: PosesConfig,
+    observer: Callable[[Trainer], None] | None,
+    context: RunContext,
 ) -> dict[str, Any]:
-    """Estimate poses into `scene/`; return the report of `hyrfpack.estimate_poses`."""
+    """Estimate poses into `scene/`; return the report of `hyrfpack.estimate_poses`.
+
+    An observer gets a first look before the estimation, see `show_first_look`.
+    """
 
     def execute(resuming: bool) -> tuple[dict, list[str]]:
         from hyrfpack.poses import estimate_poses
 
         scene = stage_cache.folder / SCENE_FOLDER
         if not (resuming and is_posed(scene)):
+            if observer is not None:
+                show_first_look(photos, stage_cache.folder / FIRST_LOOK_FOLDER, config, observer, context)
             estimate_poses(photos, scene, config, context=context)
         shutil.rmtree(scene / ".poses", ignore_errors=True)  # products in progress stay if a call is killed at its end
         files = sorted(path for path in scene.rglob("*") if path.is_file())

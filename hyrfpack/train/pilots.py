@@ -149,7 +149,7 @@ class ScenePilots:
         )
         self._progress(TaskEvent(f"{name}: reading photos"))
         trainer = Trainer(fold.scene, settings, self.cache, self._device)
-        trainer.is_pilot = True
+        trainer.kind = "pilot run"
         before = self.steps
 
         def report_step(event: StepEvent) -> None:

@@ -9,7 +9,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import NoReturn
+from typing import Literal, NoReturn
 
 import numpy as np
 import torch
@@ -81,7 +81,7 @@ class Trainer:
 
     Attributes:
         steps: number of optimiser steps of the whole run.
-        is_pilot: whether this is a pilot run, see `hyrfpack.train.pilots`.
+        kind: "pilot run" (`hyrfpack.train.pilots`), "first look" (`hyrfpack.make`), or empty for the run itself.
 
     Example:
         >>> trainer = Trainer(scene, TrainConfig(steps=2000))
@@ -130,7 +130,7 @@ class Trainer:
         self.step = 0
         self._reserves, self._reserves_memory = ReserveEstimator(), can_reserve(device) and ranks.is_single
         self._launched: LaunchedStep | None = None  # The step whose numbers were not read yet.
-        self.is_pilot = False
+        self.kind: Literal["", "pilot run", "first look"] = ""
         self.saved: int | None = None  # The step of the checkpoint on disk.
         self.records: list[dict] = []
         self.seconds: dict[str, float] = defaultdict(float)  # By stage, summed over all parts of a resumed run.

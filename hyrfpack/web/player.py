@@ -55,8 +55,8 @@ def encode_player(
         fetches: sources that the page may fetch from, in the syntax of a content security policy.
         stages: initial cameras for files, by the file's address relative to the page; see `html.encode_stage`.
         updates: address of a JSON file that says which snapshot of a training `content` is: {"snapshot": number from 1,
-            0 while there is none, "step", "steps"}. The page requests it repeatedly and shows newer snapshots from the
-            viewer's current viewpoint. None for a file that does not change.
+            0 while there is none, "step", "steps", "kind" of the run (see `Trainer`)}. The page requests it repeatedly
+            and shows newer snapshots from the viewer's current viewpoint. None for a file that does not change.
         gallery: address, relative to the page, of the list of scenes that a button leads back to; None for no button.
         in_folder: use the scripts and the style of `encode_player_files`, which must be beside the page, so that the
             page runs on servers whose content security policy is `default-src 'self'`.

@@ -88,7 +88,7 @@ def test_pilot_runs_are_shown_before_the_first_step_of_the_training(monkeypatch,
     config = TrainConfig(steps=4, exposure=False)
     scene = ball_scene(views=12, points=60, side=24)
     train_model(scene, tmp_path / "run", config, context=QUIET_CONTEXT, observer=observe)
-    assert [progress["pilot"] for progress in shown] == [True] * (len(shown) - 4) + [False] * 4 and len(shown) > 4
+    assert [progress["kind"] for progress in shown] == ["pilot run"] * (len(shown) - 4) + [""] * 4 and len(shown) > 4
     assert [(progress["step"], progress["steps"]) for progress in shown[-4:]] == [(step, 4) for step in range(1, 5)]
 
 
@@ -96,7 +96,7 @@ def test_a_snapshot_holds_the_model_of_its_step_and_the_cameras_of_the_photos():
     trainer, view = Trainer(make_scene(), TRAIN_CONFIG), LiveView(Clock())
     for wanted in (1, 40):
         trainer.run(progress=lambda _: view.observe(trainer), stop=lambda wanted=wanted: trainer.step == wanted)
-        assert read_progress(view) == {"snapshot": 1 if wanted == 1 else 2, "step": wanted, "steps": 40, "pilot": False}
+        assert read_progress(view) == {"snapshot": 1 if wanted == 1 else 2, "step": wanted, "steps": 40, "kind": ""}
         shown = dict(decode_model(read_content(view.scene)).named_parameters())
         assert shown.keys() == dict(trainer.model.named_parameters()).keys()
         for name, parameter in trainer.model.named_parameters():
@@ -112,8 +112,8 @@ def test_a_snapshot_keeps_the_cameras_for_the_page_to_start_from(tmp_path):
     assert len(kept["cameras"]) == 6 and kept["viewpoint"] and kept["steps"] == 1
 
 
-def fake_trainer(step: int, steps: int = 10_000) -> SimpleNamespace:
-    return SimpleNamespace(step=step, steps=steps, is_pilot=False, model=None, scene=None)
+def fake_trainer(step: int, steps: int = 10_000, kind: str = "") -> SimpleNamespace:
+    return SimpleNamespace(step=step, steps=steps, kind=kind, model=None, scene=None)
 
 
 @pytest.mark.parametrize(
@@ -139,14 +139,18 @@ def test_snapshots_take_less_than_3_percent_of_the_time_however_large_the_model_
     assert (len(taken) - 1) * seconds <= 0.03 * (clock.now - began)
 
 
-def test_the_first_step_and_the_last_one_are_always_shown(monkeypatch):
+@pytest.mark.parametrize(
+    ("kind", "expected"),
+    [("", [1, 1, 1, 1, 5]), ("first look", [1, 1, 1, 1, 5]), ("pilot run", [1, 1, 1, 1, 1])],
+)
+def test_the_first_step_and_the_last_one_of_all_but_pilot_runs_are_always_shown(kind, expected, monkeypatch):
     monkeypatch.setattr("hyrfpack.live.view.encode_model", lambda *_: b"snapshot")
     monkeypatch.setattr("hyrfpack.live.view.training_provenance", lambda *_, **__: {})
     view, shown = LiveView(Clock()), []
     for step in range(1, 6):
-        view.observe(fake_trainer(step, steps=5))
+        view.observe(fake_trainer(step, steps=5, kind=kind))
         shown.append(read_progress(view)["step"])
-    assert shown == [1, 1, 1, 1, 5]
+    assert shown == expected and read_progress(view)["kind"] == kind
 
 
 def test_a_model_that_is_not_finite_keeps_the_previous_snapshot():
@@ -169,10 +173,10 @@ def test_the_page_and_its_files_are_served_while_the_block_runs_and_not_after(ca
                 return answer.read()
 
         assert b"<title>a &lt;scene&gt;</title>" in fetched("")
-        assert json.loads(fetched("training.json")) == {"snapshot": 0, "step": 0, "steps": 0, "pilot": False}
+        assert json.loads(fetched("training.json")) == {"snapshot": 0, "step": 0, "steps": 0, "kind": ""}
         trainer = Trainer(make_scene(), dataclasses.replace(TRAIN_CONFIG, steps=2))
         trainer.run(progress=lambda _: view.observe(trainer))
-        assert json.loads(fetched("training.json")) == {"snapshot": 2, "step": 2, "steps": 2, "pilot": False}
+        assert json.loads(fetched("training.json")) == {"snapshot": 2, "step": 2, "steps": 2, "kind": ""}
         assert len(decode_model(fetched("scene.hyrf"))) == len(trainer.model)
     with pytest.raises(urllib.error.URLError):
         fetched("")

@@ -40,13 +40,13 @@ class FakeTraining:
         self.scene, self.updates, self.count = MemoryFile(b""), MemoryFile(b""), -1
         self.set_step(0)
 
-    def set_step(self, step: int) -> None:
+    def set_step(self, step: int, kind: str = "") -> None:
         self.count += 1
-        self.updates.replace(json.dumps({"snapshot": self.count, "step": step, "steps": 3000}).encode())
+        self.updates.replace(json.dumps({"snapshot": self.count, "step": step, "steps": 3000, "kind": kind}).encode())
 
-    def show(self, data: bytes, step: int) -> None:
+    def show(self, data: bytes, step: int, kind: str = "") -> None:
         self.scene.replace(data)
-        self.set_step(step)
+        self.set_step(step, kind)
 
 
 @contextmanager
@@ -67,9 +67,9 @@ def open_training_page(
 def test_the_page_reports_that_it_waits_for_the_first_step(browser: Browser):
     with open_training_page(browser) as (training, _):
         wait_until(browser, f"{REMARK_TEXT_JS} === 'The training has not taken its first step yet.'")
-        training.show(encode_snapshot(20), 1)
+        training.show(encode_snapshot(20), 1, kind="first look")
         wait_until(browser, f"{LOADED_COUNT_JS} === 20")
-        wait_until(browser, "document.title === 'fern, step 1 of 3,000'")
+        wait_until(browser, "document.title === 'fern, first look, step 1 of 3,000'")
         assert browser.evaluate(REMARK_TEXT_JS) == "" and browser.list_errors() == []
 
 

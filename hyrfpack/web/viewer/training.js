@@ -6,8 +6,8 @@ const MAX_FAILURES = 3; // after this many consecutive failed requests, the run 
 
 const wait = (duration) => new Promise((done) => setTimeout(done, duration));
 
-// Requests the progress {snapshot, step, steps, pilot}; `snapshot` counts from 1 and is 0 while there is none, `pilot`
-// is true for a pilot run. Returns null if the server does not answer.
+// Requests the progress {snapshot, step, steps, kind}; `snapshot` counts from 1 and is 0 while there is none, `kind`
+// names a run that is not the main one. Returns null if the server does not answer.
 async function requestProgress(address) {
   try {
     const answer = await fetch(address, { cache: "no-store" });
@@ -40,5 +40,5 @@ export async function followTraining(address, { show, waiting, isWanted }) {
   }
 }
 
-export const trainingTitle = (title, { step, steps, pilot }) =>
-  `${title}, ${pilot ? "pilot run, " : ""}step ${step.toLocaleString("en")} of ${steps.toLocaleString("en")}`;
+export const trainingTitle = (title, { step, steps, kind }) =>
+  `${title}, ${kind ? `${kind}, ` : ""}step ${step.toLocaleString("en")} of ${steps.toLocaleString("en")}`;
