@@ -23,10 +23,10 @@ from hyrfpack.train import Trainer
 
 _LOG = logging.getLogger(__name__)
 
-MAX_SIZE = 480  # longer side in pixels of the reduced photos
+MAX_PHOTO_SIZE = 480  # longer side in pixels of the reduced photos
 MIN_REDUCTION_RATIO = 1.5  # exact poses of photos that are at most this many times as large take little longer
 MAX_PHOTOS = 40
-STEPS = 200
+FIRST_LOOK_STEPS = 200
 
 
 def show_first_look(
@@ -38,7 +38,7 @@ def show_first_look(
 ) -> None:
     """Train a coarse model on reduced photos, and call an observer after each step.
 
-    The poses of at most MAX_PHOTOS evenly spaced photos, reduced to MAX_SIZE pixels, are estimated for it. Photos
+    The poses of at most MAX_PHOTOS evenly spaced photos, reduced to MAX_PHOTO_SIZE pixels, are estimated for it. Photos
     that are hardly larger than that get no first look, because their exact poses are soon known. A failure is logged
     and otherwise ignored, because the exact estimation reports what is wrong with the photos.
 
@@ -77,7 +77,7 @@ def _reduce_photos(source: Path, folder: Path) -> bool:
     """Write reduced copies of evenly spaced photos into a new folder; return whether that makes them much smaller."""
     photos = list_photos(source)
     first = first_readable_photo(photos)
-    if first is None or max(first.size) < MIN_REDUCTION_RATIO * MAX_SIZE:
+    if first is None or max(first.size) < MIN_REDUCTION_RATIO * MAX_PHOTO_SIZE:
         return False
     chosen = evenly_spaced(photos, MAX_PHOTOS)
     targets = [folder / path.parent.relative_to(source) / f"{n:04}.jpg" for n, path in enumerate(chosen)]
@@ -94,7 +94,7 @@ def _reduce_photo(path: Path, target: Path) -> None:
 
     try:
         facts = read_photo_facts(path)
-        pixels, _ = read_pixels(path, fit_size(*facts.size, MAX_SIZE), facts.orientation)
+        pixels, _ = read_pixels(path, fit_size(*facts.size, MAX_PHOTO_SIZE), facts.orientation)
     except HyrfDataError:
         return
     Image.fromarray(pixels).save(target, quality=95)
@@ -108,7 +108,7 @@ def _train_coarse_model(
 
     estimate_poses(folder / "photos", folder / "scene", config, context=context)
     scene = load_scene(folder / "scene", test_every=0)
-    settings = TrainConfig(steps=STEPS, seed=config.seed, exposure=False)
+    settings = TrainConfig(steps=FIRST_LOOK_STEPS, seed=config.seed, exposure=False)
     trainer = Trainer(scene, settings, context.cache, context.choose_device())
     trainer.kind = "first look"
 

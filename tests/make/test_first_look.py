@@ -24,8 +24,8 @@ ORIENTATION_TAG = 0x0112
 @pytest.fixture(autouse=True)
 def short_first_look(monkeypatch) -> None:
     """A first look of few steps on the small photos of these tests."""
-    monkeypatch.setattr(first_look, "MAX_SIZE", 16)
-    monkeypatch.setattr(first_look, "STEPS", 3)
+    monkeypatch.setattr(first_look, "MAX_PHOTO_SIZE", 16)
+    monkeypatch.setattr(first_look, "FIRST_LOOK_STEPS", 3)
 
 
 @pytest.fixture
@@ -59,7 +59,7 @@ def test_poses_of_an_earlier_call_need_no_first_look(make, poses):
 
 
 def test_photos_that_are_hardly_larger_get_no_first_look(make, photos, poses, monkeypatch):
-    monkeypatch.setattr(first_look, "MAX_SIZE", 24)
+    monkeypatch.setattr(first_look, "MAX_PHOTO_SIZE", 24)
     kinds = []
     make(observer=lambda trainer: kinds.append(trainer.kind))
     assert poses == [photos] and set(kinds) == {""}
