@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import torch
 from torch import Tensor
 
-from hyrfpack.evaluate.metrics import to_8bit
+from hyrfpack.evaluate.metrics import MAX_PART_PIXELS, counted_pixels, to_8bit
 from hyrfpack.model.exposure import apply_exposure_gains
 
 # Gains are fitted to pixels that have every channel in this range, in the photo and in the render.
@@ -46,10 +48,12 @@ def fit_gains(image: Tensor, photo: Tensor, mask: Tensor | None = None) -> np.nd
         >>> fit_gains(photo, apply_exposure_gains(photo, torch.tensor([2.0, 1.0, 0.5]))).round(3)
         array([2. , 1. , 0.5])
     """
-    rendered, target = _counted_pixels(image, photo, mask)
     low, high = USABLE_RANGE
-    usable = ((rendered >= low) & (rendered <= high) & (target >= low) & (target <= high)).all(1)
-    rendered, target = rendered[usable], target[usable]
+    parts = []
+    for rendered, target in _finite_pixels(image, photo, mask):
+        usable = ((rendered >= low) & (rendered <= high) & (target >= low) & (target <= high)).all(1)
+        parts.append((rendered[usable], target[usable]))
+    rendered, target = (torch.cat(colors) for colors in zip(*parts, strict=True))
     if len(rendered) < MIN_PIXELS:
         return np.ones(3)
     stride = -(-len(rendered) // MAX_FITTED_PIXELS)
@@ -89,22 +93,22 @@ def correct_colors(image: Tensor, photo: Tensor, mask: Tensor | None = None) -> 
         >>> torch.equal(correct_colors(0.5 * photo + 0.1, photo), to_8bit(photo))
         True
     """
-    rendered, target = _counted_pixels(image, photo, mask)
-    ones = torch.ones_like(rendered[:, :1])
-    inputs, residuals = torch.cat((rendered, ones), 1), target - rendered
-    change = (
-        np.linalg.pinv((inputs.T @ inputs).cpu().numpy(), 1e-10, hermitian=True) @ (inputs.T @ residuals).cpu().numpy()
-    )
-    affine = torch.from_numpy(change).to(image.device)
-    pixels = image.double()
-    return to_8bit(pixels + pixels @ affine[:3] + affine[3])
+    squares, products = np.zeros((4, 4)), np.zeros((4, 3))
+    for rendered, target in _finite_pixels(image, photo, mask):
+        inputs = torch.cat((rendered, torch.ones_like(rendered[:, :1])), 1)
+        squares += (inputs.T @ inputs).cpu().numpy()
+        products += (inputs.T @ (target - rendered)).cpu().numpy()
+    affine = torch.from_numpy(np.linalg.pinv(squares, 1e-10, hermitian=True) @ products).to(image.device)
+    corrected = [
+        to_8bit(pixels + pixels @ affine[:3] + affine[3])
+        for pixels in (part.double() for part in image.reshape(-1, 3).split(MAX_PART_PIXELS))
+    ]
+    return torch.cat(corrected).reshape(image.shape)
 
 
-def _counted_pixels(image: Tensor, photo: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Return the colours (N, 3) float64 of the pixels that count, of both pictures."""
-    rendered, target = (
-        (picture.reshape(-1, 3) if mask is None else picture[mask]).double() for picture in (image, photo)
-    )
-    if not (rendered.isfinite().all() and target.isfinite().all()):
-        raise ValueError("a picture to be compared is not finite")
-    return rendered, target
+def _finite_pixels(image: Tensor, photo: Tensor, mask: Tensor | None) -> Iterator[tuple[Tensor, Tensor]]:
+    """Yield the parts of `counted_pixels`. Raises ValueError: a picture is not finite."""
+    for rendered, target in counted_pixels(image, photo, mask):
+        if not (rendered.isfinite().all() and target.isfinite().all()):
+            raise ValueError("a picture to be compared is not finite")
+        yield rendered, target

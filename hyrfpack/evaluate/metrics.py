@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 from torch import Tensor
 
@@ -11,6 +12,8 @@ from hyrfpack.ops.ssim import photometric_loss
 
 # PSNR in dB assumed for a model whose provenance does not state how well it fits its photos.
 ASSUMED_PSNR_DB = 30.0
+# Float64 copies of pictures are made of so many pixels at a time: photos of phones would take hundreds of megabytes.
+MAX_PART_PIXELS = 65_536
 
 
 def to_8bit(image: Tensor) -> Tensor:
@@ -33,8 +36,27 @@ def psnr(image: Tensor, reference: Tensor, mask: Tensor | None = None) -> float:
     Returns:
         PSNR in dB, at most `IDENTICAL_PSNR`.
     """
-    squares = (image.double() - reference.double()) ** 2
-    return psnr_from_mse(float(squares.mean() if mask is None else squares[mask].mean()))
+    total, count = 0.0, 0
+    for shown, expected in counted_pixels(image, reference, mask):
+        total += float((shown - expected).square().sum())
+        count += shown.numel()
+    return psnr_from_mse(total / count)
+
+
+def counted_pixels(image: Tensor, reference: Tensor, mask: Tensor | None) -> Iterator[tuple[Tensor, Tensor]]:
+    """Yield the pixels of two pictures that count, in parts.
+
+    Args:
+        image, reference, mask: as for `psnr`.
+
+    Yields:
+        (N, 3) float64 colours of the same pixels of both pictures, N at most MAX_PART_PIXELS.
+    """
+    flat, counted = [picture.reshape(-1, 3) for picture in (image, reference)], None if mask is None else mask.flatten()
+    for start in range(0, len(flat[0]), MAX_PART_PIXELS):
+        part = slice(start, start + MAX_PART_PIXELS)
+        shown, expected = (colors[part] if counted is None else colors[part][counted[part]] for colors in flat)
+        yield shown.double(), expected.double()
 
 
 def provenance_mse(provenance: dict) -> float:

@@ -7,10 +7,10 @@ IDENTICAL_PSNR = 100.0
 
 
 def psnr_from_mse(mse: float) -> float:
-    """Convert a mean squared error of colours in [0, 1] to PSNR in dB, at most `IDENTICAL_PSNR`.
+    """Convert a mean squared error of colours in [0, 1] to PSNR in dB, at most `IDENTICAL_PSNR`; NaN stays NaN.
 
     PSNR = -10 log10(mse)
     """
     import numpy as np  # not at the top, because the command line imports the displays of progress, which import this
 
-    return min(float(-10 * np.log10(mse)), IDENTICAL_PSNR) if mse > 0 else IDENTICAL_PSNR
+    return IDENTICAL_PSNR if mse == 0 else min(float(-10 * np.log10(mse)), IDENTICAL_PSNR)

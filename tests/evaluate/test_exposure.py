@@ -10,9 +10,9 @@ import torch
 from exposures import random_map
 from scenes import ball_points, ball_scene, small_model
 
-from hyrfpack.evaluate import evaluate_model
+from hyrfpack.evaluate import evaluate_model, metrics
 from hyrfpack.evaluate.exposure import correct_colors, fit_gains
-from hyrfpack.evaluate.metrics import psnr, ssim, to_8bit
+from hyrfpack.evaluate.metrics import counted_pixels, psnr, ssim, to_8bit
 from hyrfpack.measure.psnr import IDENTICAL_PSNR
 from hyrfpack.model import HybridModel
 from hyrfpack.model.exposure import apply_exposure_gains
@@ -42,6 +42,26 @@ def test_masked_pixels_do_not_affect_gains_and_corrections():
 
     np.testing.assert_allclose(fit_gains(image, photo, mask), 0.6, rtol=1e-4)
     assert psnr(correct_colors(image, photo, mask), to_8bit(photo), mask) > 35
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_large_pictures_are_compared_in_parts(masked, monkeypatch):
+    image, photo = random_picture(), random_picture(seed=1) * 0.4 + random_picture() * 0.6
+    mask = random_picture(seed=2)[..., 0] > 0.3 if masked else None
+    whole = psnr(image, photo, mask), fit_gains(image, photo, mask), correct_colors(image, photo, mask)
+    monkeypatch.setattr(metrics, "MAX_PART_PIXELS", 70)
+    assert {len(part) for part, _ in counted_pixels(image, photo, None)} == {70, 1200 % 70}
+    parts = psnr(image, photo, mask), fit_gains(image, photo, mask), correct_colors(image, photo, mask)
+    for found, expected in zip(parts, whole, strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-12)
+    difference = (image.double() - photo.double())[slice(None) if mask is None else mask]
+    assert parts[0] == pytest.approx(-10 * np.log10(difference.square().mean().item()), rel=1e-12)
+
+
+def test_nan_gives_no_psnr():
+    image = random_picture()
+    image[3, 4] = torch.nan
+    assert np.isnan(psnr(image, random_picture()))
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (3, 5)])
