@@ -262,6 +262,23 @@ def test_bytes_of_the_cpu_do_not_depend_on_threads_or_on_the_run(
         assert all(map(torch.equal, first, run(threads)))
 
 
+@needs_numba
+@pytest.mark.parametrize("light", ["patches", "1", "one pixel"])
+def test_the_cpu_computes_many_nodes_in_parts(light: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    from hyrfpack.ops.background import cpu
+
+    case, sizes = Case(height=201, width=303, stride=1, threshold=0.0, light=light), []
+    whole = case.run(torch.float32, "cpu")
+    usual = cpu.field_colors
+    monkeypatch.setattr(cpu, "field_colors", lambda points, *rest: sizes.append(len(points)) or usual(points, *rest))
+    monkeypatch.setattr(cpu, "_MAX_PART_NODES", 1000)
+    torch.testing.assert_close(case.run(torch.float32, "cpu"), whole, rtol=0, atol=1e-6)
+    assert max(sizes) <= 1000 and sum(sizes) == whole.any(-1).sum()
+    sizes.clear()
+    case.learn(torch.float32, "cpu")
+    assert len(sizes) == 1
+
+
 def test_nodes_have_the_colours_at_their_pixel_centres() -> None:
     case = Case(light="1", stride=3)
     arguments = case.arguments()

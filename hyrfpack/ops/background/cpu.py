@@ -9,6 +9,7 @@ Rays and points are computed in float64: this costs little, and a camera far awa
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 import torch
@@ -37,6 +38,9 @@ from hyrfpack.ops.viewport import Viewport
 from hyrfpack.parallel.pool import run_ranges
 
 _MIN_NODES_PER_TASK = 4096  # Fewer nodes are finished before another thread has started.
+# Inputs and activations of this many nodes take about 150 MB. More nodes are computed one part after another, unless
+# gradients need all activations.
+_MAX_PART_NODES = 1 << 17
 
 # Constants are typed, so that indices stay uint64 and values float32 in the kernels.
 _U2 = np.uint64(2)
@@ -145,12 +149,28 @@ def background_grid(
     run_ranges(lambda start, stop: _find_nodes(start, stop, pixels, limit, stride, needed, counts), rows, min_rows)
     starts = np.concatenate(([0], np.cumsum(counts)))
     colors = transmittance.new_zeros(rows * columns, 3)
-    if total := int(starts[-1]):
-        nodes = torch.empty(total, dtype=torch.int64)
-        coords, encoded = colors.new_empty(3, total), colors.new_empty(DIRECTION_FEATURES[field.encoding], total)
-        half_extent = tuple(float(half) for half in field.half_extent)
-        arguments = needed, starts, camera_rays(viewport, stride), half_extent, field.encoding == "frequency"
-        results = nodes.numpy(), coords.numpy(), encoded.numpy()
-        run_ranges(lambda start, stop: _encode_nodes(start, stop, *arguments, *results), rows, min_rows)
+    half_extent = tuple(float(half) for half in field.half_extent)
+    arguments = camera_rays(viewport, stride), half_extent, field.encoding == "frequency"
+    max_nodes = starts[-1] if _needs_gradients(field) else max(_MAX_PART_NODES, columns)
+    first = 0
+    while starts[first] < starts[-1]:
+        last = int(np.searchsorted(starts, starts[first] + max_nodes, side="right")) - 1
+        nodes = torch.empty(int(starts[last] - starts[first]), dtype=torch.int64)
+        coords = colors.new_empty(3, len(nodes))
+        encoded = colors.new_empty(DIRECTION_FEATURES[field.encoding], len(nodes))
+        arrays = nodes.numpy(), coords.numpy(), encoded.numpy()
+        encode = partial(_encode_rows, first, needed, starts - starts[first], *arguments, *arrays)
+        run_ranges(encode, last - first, min_rows)
         colors.index_copy_(0, nodes, field_colors(coords.T, encoded.T, field))
+        first = last
     return colors.view(rows, columns, 3)
+
+
+def _encode_rows(first, needed, starts, rays, half_extent, is_frequency, nodes, coords, encoded, start, stop) -> None:
+    """Call `_encode_nodes` on rows that are counted from row `first`."""
+    _encode_nodes(first + start, first + stop, needed, starts, rays, half_extent, is_frequency, nodes, coords, encoded)
+
+
+def _needs_gradients(field: BackgroundField) -> bool:
+    parameters = (field.table, *field.weights, *field.biases)
+    return torch.is_grad_enabled() and any(parameter.requires_grad for parameter in parameters)
