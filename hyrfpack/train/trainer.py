@@ -45,6 +45,7 @@ from hyrfpack.train.launched import (
     check_step,
 )
 from hyrfpack.train.optimizer import Optimizer
+from hyrfpack.train.provenance import training_background_spacing
 from hyrfpack.train.reserves import ReserveEstimator
 from hyrfpack.train.resolution import ResolutionSchedule
 from hyrfpack.train.setup import build_model
@@ -140,6 +141,7 @@ class Trainer:
         """Replace the trained model and start a new optimiser for it."""
         model.precision = self.config.precision
         model.gaussians.pixel_sizes = None  # They belong to the Gaussians of a file, which training moves and replaces.
+        model.background_spacing = training_background_spacing(self.scene)  # Scores are then those of the model's file.
         if not any(parameter.requires_grad for parameter in model.parameters()):  # A loaded model records none.
             model.requires_grad_(True)
         self.model = model.to(self.device)
