@@ -12,7 +12,8 @@ from hyrfpack.ops.ssim import photometric_loss
 
 # PSNR in dB assumed for a model whose provenance does not state how well it fits its photos.
 ASSUMED_PSNR_DB = 30.0
-# Float64 copies of pictures are made of so many pixels at a time: photos of phones would take hundreds of megabytes.
+# Pictures are compared this many pixels at a time, because float64 copies of a whole photo of a phone take hundreds of
+# megabytes.
 MAX_PART_PIXELS = 65_536
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -93,5 +94,5 @@ def background_grid(
     elif chosen == "cpu":
         from hyrfpack.ops.background import cpu
 
-        run = cpu.background_grid
+        run = partial(cpu.background_grid, needs_grad=needs_grad)
     return run(transmittance, viewport, field, threshold=threshold, stride=stride)

@@ -137,9 +137,15 @@ def _encode_nodes(start, stop, needed, starts, rays, half_extent, is_frequency, 
 
 
 def background_grid(
-    transmittance: Tensor, viewport: Viewport, field: BackgroundField, *, threshold: float, stride: int
+    transmittance: Tensor,
+    viewport: Viewport,
+    field: BackgroundField,
+    *,
+    threshold: float,
+    stride: int,
+    needs_grad: bool,
 ) -> Tensor:
-    """Compute `hyrfpack.ops.background.background_grid`."""
+    """Compute `hyrfpack.ops.background.background_grid`; with `needs_grad` all nodes at once."""
     height, width = transmittance.shape
     rows, columns = grid_size(height, width, stride)
     min_rows = -(-_MIN_NODES_PER_TASK // columns)
@@ -151,7 +157,7 @@ def background_grid(
     colors = transmittance.new_zeros(rows * columns, 3)
     half_extent = tuple(float(half) for half in field.half_extent)
     arguments = camera_rays(viewport, stride), half_extent, field.encoding == "frequency"
-    max_nodes = starts[-1] if _needs_gradients(field) else max(_MAX_PART_NODES, columns)
+    max_nodes = starts[-1] if needs_grad else max(_MAX_PART_NODES, columns)
     first = 0
     while starts[first] < starts[-1]:
         last = int(np.searchsorted(starts, starts[first] + max_nodes, side="right")) - 1
@@ -169,8 +175,3 @@ def background_grid(
 def _encode_rows(first, needed, starts, rays, half_extent, is_frequency, nodes, coords, encoded, start, stop) -> None:
     """Call `_encode_nodes` on rows that are counted from row `first`."""
     _encode_nodes(first + start, first + stop, needed, starts, rays, half_extent, is_frequency, nodes, coords, encoded)
-
-
-def _needs_gradients(field: BackgroundField) -> bool:
-    parameters = (field.table, *field.weights, *field.biases)
-    return torch.is_grad_enabled() and any(parameter.requires_grad for parameter in parameters)
