@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -14,6 +15,8 @@ from hyrfpack.model import Decoded, HybridModel
 from hyrfpack.parallel.pool import parallel_map
 from hyrfpack.render import render_view
 from hyrfpack.scene import Camera
+
+T = TypeVar("T")
 
 # The number of views of one comparison is chosen so that about this many Gaussians are drawn in all of them together.
 TARGET_DRAWN_GAUSSIANS = 1_000_000
@@ -46,7 +49,7 @@ class ReferenceRenders:
     @classmethod
     def from_views(cls, views: list[Camera], model: HybridModel, decoded: Decoded | None = None) -> ReferenceRenders:
         """Render a model at the given views; `decoded` is as in `measure_error`."""
-        return cls(views, _render_views(model, views, decoded))
+        return cls(views, _map_renders(model, views, decoded, lambda index, rgb: rgb))
 
     def measure_error(self, model: HybridModel, decoded: Decoded | None = None) -> float:
         """Render a model at the same views and return the median over views of the mean squared colour difference.
@@ -57,16 +60,22 @@ class ReferenceRenders:
             model: the model to compare with the references.
             decoded: the result of `model.decode()`, if it is known already.
         """
-        pairs = zip(_render_views(model, self.views, decoded), self.pictures, strict=True)
-        return float(np.median([float((shown - reference).square().mean()) for shown, reference in pairs]))
+
+        def error(index: int, rgb: Tensor) -> float:
+            return float((rgb - self.pictures[index]).square().mean())
+
+        return float(np.median(_map_renders(model, self.views, decoded, error)))
 
 
 @torch.no_grad()
-def _render_views(model: HybridModel, cameras: Sequence[Camera], decoded: Decoded | None = None) -> list[Tensor]:
+def _map_renders(
+    model: HybridModel, cameras: Sequence[Camera], decoded: Decoded | None, function: Callable[[int, Tensor], T]
+) -> list[T]:
+    """Render a model at cameras and return the function of each camera's index and render, (H, W, 3) in [0, 1]."""
     decoded = decoded or model.decode()
 
     @torch.no_grad()  # gradient mode is kept per thread
-    def picture(camera: Camera) -> Tensor:
-        return render_view(model, camera, decoded=decoded).rgb
+    def render(index: int) -> T:
+        return function(index, render_view(model, cameras[index], decoded=decoded).rgb)
 
-    return parallel_map(picture, cameras, model.gaussians.positions.device)
+    return parallel_map(render, range(len(cameras)), model.gaussians.positions.device)

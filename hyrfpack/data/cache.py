@@ -51,6 +51,12 @@ class PictureCache:
                     self.nbytes -= self._pictures.popitem(last=False)[1].nbytes
         return picture
 
+    def clear(self) -> None:
+        """Forget all pictures, so that their memory is free for other work."""
+        with self._lock:
+            self._pictures.clear()
+            self.nbytes = 0
+
     def stream(self, views: Iterable[View], depth: int = PREFETCH_DEPTH) -> Generator[tuple[View, Picture]]:
         """Yield each view with its picture, while another thread decodes the next pictures.
 

@@ -27,7 +27,7 @@ from hyrfpack.model import Geometry, HybridModel
 from hyrfpack.model.exposure import apply_exposure_gains
 from hyrfpack.ops.rasterize import rasterize
 from hyrfpack.ops.ssim import photometric_loss
-from hyrfpack.parallel.pool import keep_freed_memory, parallel_map, torch_on_one_thread
+from hyrfpack.parallel.pool import freed_memory_kept, parallel_map, torch_on_one_thread
 from hyrfpack.progress import Progress, TaskEvent, ignore_progress
 from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.scene import Camera, View
@@ -86,8 +86,7 @@ def refit(
     optimizer = Optimizer(trained, rates)
     resolution = ResolutionSchedule(shown, steps, len(model))
     order = map(resolution.reduce_view, shuffled(shown, 0, range(steps)), range(1, steps + 1))
-    keep_freed_memory()
-    with closing(cache.stream(order)) as pictures, torch_on_one_thread():
+    with closing(cache.stream(order)) as pictures, torch_on_one_thread(), freed_memory_kept():
         for step, (view, picture) in enumerate(pictures):
             progress(TaskEvent(f"training the region, step {step + 1}/{steps}", step / steps))
             solid = None if model.config.background else np.array(model.config.solid, np.float32)

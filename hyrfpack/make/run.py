@@ -223,6 +223,7 @@ class _Pipeline:
         training = stages.run_training_stage(
             stage_cache, scene, self._scene_digest(scene), plan, request.config.seed, self.observer, self.context
         )
+        self.cache.clear()  # compression needs the memory more than the photos
         stages.run_compression_stage(stage_cache, scene, plan, self.context)
         return self._finish(stage_cache.folder / stages.PACKED_MODEL, scene, poses=poses, training=training)
 

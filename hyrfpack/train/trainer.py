@@ -26,7 +26,7 @@ from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.ops.ssim import photometric_loss
 from hyrfpack.ops.transfer import HostCopy
 from hyrfpack.out_of_memory import explain_out_of_memory
-from hyrfpack.parallel.pool import keep_freed_memory, torch_on_one_thread
+from hyrfpack.parallel.pool import freed_memory_kept, torch_on_one_thread
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.progress import StepEvent, ignore_progress
 from hyrfpack.render import render_view
@@ -179,8 +179,7 @@ class Trainer:
         """
         every = self.config.checkpoint_every or max(1, self.steps // 20)
         check_settings(self.ranks, {**self._settings(), "versions": (__version__, torch.__version__)})
-        keep_freed_memory()
-        with closing(self.cache.stream(self._order())) as views, torch_on_one_thread():
+        with closing(self.cache.stream(self._order())) as views, torch_on_one_thread(), freed_memory_kept():
             while self.step < self.steps:
                 start = time.perf_counter()
                 self.step += 1

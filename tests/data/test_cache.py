@@ -66,6 +66,19 @@ def test_picture_above_the_limit_is_not_kept():
     assert view.load.loads == 2 and cache.nbytes == 0
 
 
+def test_a_cleared_cache_holds_nothing_and_decodes_again():
+    a, b = make_views(CountedPhoto(1), CountedPhoto(2))
+    cache = PictureCache(10_000)
+    cache.get(a)
+    cache.get(b)
+
+    cache.clear()
+    assert cache.nbytes == 0
+    cache.get(b)
+
+    assert [view.load.loads for view in (a, b)] == [1, 2]
+
+
 def test_default_limit_is_part_of_the_memory():
     assert 1 << 20 < PictureCache().limit_bytes < 1 << 50
 

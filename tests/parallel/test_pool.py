@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import platform
 import subprocess
 import sys
 import threading
@@ -68,3 +69,30 @@ def test_torch_keeps_its_number_of_threads_outside_tasks() -> None:
     environment = os.environ | {"OMP_NUM_THREADS": "2", "HYRFPACK_THREADS": "2"}
     done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True)
     assert done.stdout == "2\n", done.stderr
+
+
+MEMORY_SCRIPT = """
+import os
+import torch
+from hyrfpack.parallel.pool import freed_memory_kept
+
+def resident_bytes():
+    return int(open("/proc/self/statm").read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+def allocate_and_free():
+    blocks = [torch.ones(2_500_000) for _ in range(20)]  # 10 MB each
+
+before = resident_bytes()
+with freed_memory_kept():
+    allocate_and_free()
+    kept = resident_bytes() - before
+print(kept, resident_bytes() - before)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="needs glibc")
+def test_freed_memory_is_kept_for_the_block_only() -> None:
+    result = subprocess.run([sys.executable, "-c", MEMORY_SCRIPT], capture_output=True, text=True, check=True)
+    kept, left = map(int, result.stdout.split())
+    assert kept > 150e6
+    assert left < 50e6
