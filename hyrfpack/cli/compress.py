@@ -24,7 +24,7 @@ from hyrfpack.cli.common import (
 from hyrfpack.cli.processes import processes_option
 from hyrfpack.cli.section_table import format_section_table
 from hyrfpack.cli.settings import settings_options
-from hyrfpack.cli.types import OUTPUT, PATH, reject_nan
+from hyrfpack.cli.types import OUTPUT, PATH, reject_non_finite
 from hyrfpack.config.compress import CompressConfig
 from hyrfpack.outputs import Outputs
 
@@ -138,7 +138,7 @@ def compress(
 @click.option(
     "--fraction",
     type=click.FloatRange(0, 1),
-    callback=reject_nan,
+    callback=reject_non_finite,
     metavar="F",
     help="Read only this fraction of the file, from its start, such as 0.6. The model is coarser then.",
 )

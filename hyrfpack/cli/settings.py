@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 import click
 
-from hyrfpack.cli.types import SIZE, reject_nan
+from hyrfpack.cli.types import SIZE, reject_non_finite
 from hyrfpack.cli.wording import option_of_argument, use_option_names
 from hyrfpack.config.settings import OneOf, Range, Setting, list_settings
 
@@ -61,7 +61,7 @@ def _make_option(setting: Setting) -> Callable[[Command], Command]:
         metavar=metavar,
         default=setting.default,
         show_default=setting.default is not None,
-        callback=reject_nan if setting.kind is float else None,
+        callback=reject_non_finite if setting.kind is float else None,
         help=f"{help}  [default: {default}]" if default else help,
     )
 

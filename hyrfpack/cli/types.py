@@ -133,8 +133,8 @@ BOX, TURNED_BOX = _Box(), _Box(may_turn=True)
 HARMONICS_DEGREE = _HarmonicsDegree()
 
 
-def reject_nan(ctx: click.Context, param: click.Parameter, value: float | None) -> float | None:
-    """Reject NaN, which click's ranges accept, as the callback of an option."""
-    if value is not None and math.isnan(value):
-        raise click.BadParameter("NaN is not allowed; give a number", ctx, param)
+def reject_non_finite(ctx: click.Context, param: click.Parameter, value: float | None) -> float | None:
+    """Reject NaN and infinity, which click's ranges accept, as the callback of an option."""
+    if value is not None and not math.isfinite(value):
+        raise click.BadParameter(f"{value} is not allowed; give a finite number", ctx, param)
     return value

@@ -161,7 +161,7 @@ WRONG_REQUESTS = {
     "nothing inside": (("-o", "a.ply", "--crop", "7,7,7,8,8,8"), "no Gaussian is left"),
     "too faint": (("-o", "a.ply", "--min-opacity", "1"), "no Gaussian is left"),
     "opacity": (("-o", "a.ply", "--min-opacity", "2"), "'--min-opacity'"),
-    "NaN opacity": (("-o", "a.ply", "--min-opacity", "nan"), "NaN is not allowed"),
+    "NaN opacity": (("-o", "a.ply", "--min-opacity", "nan"), "nan is not allowed"),
     "crop of cameras": (("-o", "a.json", "--crop", "0,0,0,1,1,1"), "only cameras"),
     "no photos": (("-o", "a.ply", "--data", "none"), "none"),
     "degree of a model": (("-o", "a.html", "--sh-degree", "1"), "--baked"),

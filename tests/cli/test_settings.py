@@ -14,6 +14,7 @@ from hyrfpack.cli.settings import settings_options
 from hyrfpack.cli.wording import option_of_argument
 from hyrfpack.config.compress import CompressConfig
 from hyrfpack.config.imports import ImportConfig
+from hyrfpack.config.make import MakeConfig
 from hyrfpack.config.settings import list_settings
 from hyrfpack.config.train import TrainConfig
 
@@ -62,6 +63,8 @@ def test_an_option_gives_the_value_of_its_setting(config_class, name, arguments,
         (ImportConfig, "psnr", ("--psnr", "nan")),
         (CompressConfig, "finetune_steps", ("--finetune", "0")),
         (CompressConfig, "max_psnr_drop", ("--max-psnr-drop", "nan")),
+        (CompressConfig, "max_psnr_drop", ("--max-psnr-drop", "inf")),
+        (MakeConfig, "minutes", ("--minutes", "inf")),
         (CompressConfig, "profile", ("--profile", "zip")),
         (ImportConfig, "psnr", ("--psnr", "61")),
     ],
