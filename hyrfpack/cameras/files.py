@@ -99,7 +99,7 @@ def cameras_from_json(path: str | os.PathLike[str]) -> list[tuple[str, Camera]]:
         HyrfDataError: the file cannot be read, or a camera is incomplete or impossible; the message names the camera.
     """
     try:
-        content = json.loads(Path(path).read_text(encoding="utf-8"))
+        content = json.loads(Path(path).read_bytes())
     except OSError as error:
         raise HyrfDataError(
             f"{path}: the cameras cannot be read ({error.strerror or error})",

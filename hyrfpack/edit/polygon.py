@@ -25,7 +25,7 @@ def read_polygon(path: str | os.PathLike[str]) -> CropPolygon:
         HyrfDataError: the file cannot be read, or does not hold such a polygon.
     """
     try:
-        content = json.loads(Path(path).read_text(encoding="utf-8"))
+        content = json.loads(Path(path).read_bytes())
     except OSError as error:
         raise HyrfDataError(
             f"{path}: the polygon cannot be read ({error.strerror or error})", fix="check the path"

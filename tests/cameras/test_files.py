@@ -37,6 +37,14 @@ def test_cameras_survive_json_exactly(tmp_path):
         np.testing.assert_array_equal(read.camera_from_world, camera.camera_from_world)
 
 
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_cameras_may_have_the_encodings_of_windows_editors(encoding, tmp_path):
+    cameras = [("a", ring(3)[1])]
+    (tmp_path / "cameras.json").write_text(cameras_to_json(cameras), encoding=encoding)
+    ((name, camera),) = cameras_from_json(tmp_path / "cameras.json")
+    assert (name, camera) == cameras[0]
+
+
 def test_a_camera_without_principal_point_or_fy_is_centred_and_square(tmp_path):
     (tmp_path / "c.json").write_text(
         json.dumps([{"width": 40, "height": 30, "fx": 25, "camera_from_world": np.eye(4).tolist()}])

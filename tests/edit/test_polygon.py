@@ -164,6 +164,13 @@ def test_the_command_reads_a_polygon_and_inverts_it(tmp_path):
     assert step["action"] == "remove the polygon of 3 points, heights below 0.2"
 
 
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_a_polygon_may_have_the_encodings_of_windows_editors(encoding, tmp_path):
+    points = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (1.0, 1.0, 0.0))
+    (tmp_path / "polygon.json").write_text(json.dumps(points), encoding=encoding)
+    assert read_polygon(tmp_path / "polygon.json").points == points
+
+
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
