@@ -14,7 +14,18 @@ from torch import Tensor
 
 from hyrfpack.cameras.capture import Capture, has_mean_exposure
 from hyrfpack.cameras.paths import estimate_up
-from hyrfpack.config.edit import Action, Background, Center, EstimateUp, Move, Refit, Up, Upright
+from hyrfpack.config.edit import (
+    Action,
+    Background,
+    Center,
+    Crop,
+    EstimateUp,
+    Move,
+    Refit,
+    Remove,
+    Up,
+    Upright,
+)
 from hyrfpack.edit.refit import refit, score_region
 from hyrfpack.edit.report import ActionReport
 from hyrfpack.edit.select import keep_mask
@@ -66,7 +77,8 @@ class Edit:
     """A scene before and after its actions.
 
     Attributes:
-        path: the file that is edited.
+        path: the file that is edited; a copy, if it is a part of a merged file.
+        source: the file as messages name it.
         capture: the cameras and the viewpoint that the file keeps.
         before, after: the scene before the first action and after the last one.
         reports: what each action has done.
@@ -74,6 +86,7 @@ class Edit:
     """
 
     path: Path
+    source: Path
     capture: Capture
     before: EditState
     after: EditState
@@ -92,11 +105,12 @@ class Edit:
         return before, after
 
 
-def open_scene(path: Path, data: Scene | None, progress: Progress) -> Edit:
+def open_scene(path: Path, source: Path, data: Scene | None, progress: Progress) -> Edit:
     """Read the scene of a file, to which no action has been applied.
 
     Args:
         path: a file of one model, or a merged file.
+        source: the file as messages name it.
         data: photos of the scene, or None.
         progress: called with `TaskEvent`s by the actions.
 
@@ -107,7 +121,7 @@ def open_scene(path: Path, data: Scene | None, progress: Progress) -> Edit:
         files = open_parts(container) if PART_NAMES in container.entries else [("", container)]
         model, metadata = decode_parts(container), [read_metadata(part) for _, part in files]
     if not len(model):
-        raise HyrfError(f"{path}: there is no Gaussian in it, so there is nothing to edit", fix="train it again")
+        raise HyrfError(f"{source}: there is no Gaussian in it, so there is nothing to edit", fix="train it again")
     parts = [
         EditedPart(name, facts.profile, facts.provenance, part, part)
         for (name, _), facts, part in zip(files, metadata, parts_of(model), strict=True)
@@ -124,7 +138,7 @@ def open_scene(path: Path, data: Scene | None, progress: Progress) -> Edit:
         held_out=[] if data is None else list(data.test),
         has_gains=scene.before.exposure is not None or has_mean_exposure(scene.provenance),
     )
-    return Edit(path, capture, state, state, [], parts)
+    return Edit(path, source, capture, state, state, [], parts)
 
 
 def apply_actions(edit: Edit, actions: Sequence[Action]) -> Edit:
@@ -136,7 +150,7 @@ def apply_actions(edit: Edit, actions: Sequence[Action]) -> Edit:
     state, reports = edit.before, []
     if any(isinstance(action, EstimateUp) for action in actions) and edit.capture.is_synthetic and not state.photos:
         raise HyrfError(
-            f"{edit.path}: it keeps no cameras, from which up could be estimated",
+            f"{edit.source}: it keeps no cameras, from which up could be estimated",
             fix="state the direction, or name `data`",
         )
     for action in actions:
@@ -178,10 +192,8 @@ def _apply_action(action: Action, state: EditState) -> tuple[EditState, ActionRe
     if not keep.any():
         positions = state.world_positions()
         low, high = (corner.round(4).tolist() for corner in (positions.min(axis=0), positions.max(axis=0)))
-        raise HyrfError(
-            f"'{action}' would leave no Gaussian; their centres lie between {low} and {high}",
-            fix="change its numbers",
-        )
+        where = f"; their centres lie between {low} and {high}" if isinstance(action, Crop | Remove) else ""
+        raise HyrfError(f"'{action}' would leave no Gaussian{where}", fix="change its numbers")
     after = _keep(keep, state)
     return after, replace(report, gaussians_after=len(after.model))
 

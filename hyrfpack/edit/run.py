@@ -82,7 +82,7 @@ def edit_model(
     if picture is not None:
         outputs.file(picture, *PICTURE_ENDINGS)
     with tempfile.TemporaryDirectory() as folder, context.open_progress("edit") as progress:
-        opened = open_scene(take_part(path, part, folder), data, part_of_progress(progress, 0, 0.3))
+        opened = open_scene(take_part(path, part, folder), path, data, part_of_progress(progress, 0, 0.3))
         check_limits(opened, profile, limits, data)
         edit = apply_actions(opened, actions)
         writing = replace(context, device="cpu", progress=part_of_progress(progress, 0.3, 0.8))
@@ -134,7 +134,7 @@ def plan_edit(
     if picture is not None:
         Outputs(path, scene=data, overwrite=overwrite).file(picture, *PICTURE_ENDINGS)
     with tempfile.TemporaryDirectory() as folder, context.open_progress("edit") as progress:
-        opened = open_scene(take_part(path, part, folder), data, part_of_progress(progress, 0, 0.5))
+        opened = open_scene(take_part(path, part, folder), path, data, part_of_progress(progress, 0, 0.5))
         edit = apply_actions(opened, actions)
         report = _measure(edit, data, part_of_progress(progress, 0.5, 1))
         if picture is not None:

@@ -13,6 +13,7 @@ import numpy as np
 from hyrfpack.cameras.files import camera_from_numbers, camera_to_numbers
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.config.edit import Move, Rotate, Scale, Translate
+from hyrfpack.errors import HyrfError
 from hyrfpack.model import HybridModel
 from hyrfpack.model.frame import Frame
 from hyrfpack.rotations import IDENTITY, quaternion_from_matrix, rotation_matrix
@@ -21,6 +22,8 @@ from hyrfpack.scene import Camera, View
 CAMERA_KEYS = ("cameras", "coarse_cameras")
 # A scene whose frame is turned by less has been turned back, and gets the file of one that was never turned.
 MIN_TURN_RADIANS = 1e-12
+# Poses and sizes are float32 in files and pictures. Its range is wider, as cameras may stand far outside of the frame.
+MIN_FRAME_SCALE, MAX_WORLD_COORDINATE = 1e-30, 1e30
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +76,8 @@ class Placement:
 
     def move_point(self, point: Sequence[float] | np.ndarray) -> np.ndarray:
         """Return the new position (3,) of a point (3,)."""
-        return self.factor * self.move_direction(point) + self.offset
+        with np.errstate(over="ignore", invalid="ignore"):  # `move_frame` refuses what overflows
+            return self.factor * self.move_direction(point) + self.offset
 
     def move_direction(self, direction: Sequence[float] | np.ndarray) -> np.ndarray:
         """Return the new direction (3,) of a direction (3,), of the same length."""
@@ -91,11 +95,23 @@ class Placement:
         return replace(view, camera=self.move_camera(view.camera))
 
     def move_frame(self, frame: Frame) -> Frame:
-        """Return the frame of a moved model."""
+        """Return the frame of a moved model.
+
+        Raises:
+            HyrfError: float32 cannot hold the moved scene, as it is too far away, too large or too small.
+        """
         x, y, z = self.move_point(frame.center).tolist()
+        scale = self.factor * frame.scale
+        reach = max(abs(x), abs(y), abs(z), scale)
+        if not (MIN_FRAME_SCALE <= scale and reach <= MAX_WORLD_COORDINATE):
+            raise HyrfError(
+                f"moves take the scene's centre to ({x:g}, {y:g}, {z:g}) and its half size to {scale:g}; sizes of at "
+                f"least {MIN_FRAME_SCALE:g} and coordinates of at most {MAX_WORLD_COORDINATE:g} are possible",
+                fix="move and scale it by less",
+            )
         w, i, j, k = (quaternion_from_matrix(self.rotation @ frame.axes) + 0.0).tolist()  # + 0.0 turns -0.0 into 0.0
         rotation = IDENTITY if 2 * math.hypot(i, j, k) < MIN_TURN_RADIANS else (w, i, j, k)
-        return Frame((x, y, z), self.factor * frame.scale, frame.half_extent, rotation)
+        return Frame((x, y, z), scale, frame.half_extent, rotation)
 
     def move_model(self, model: HybridModel) -> HybridModel:
         """Return the moved model, which shares all parameters with `model`: only its frame differs."""

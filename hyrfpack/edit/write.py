@@ -93,7 +93,7 @@ def write_edit(
             return compress_model(edited, target, settings[0], data=photos, overwrite=overwrite, context=context)
         except HyrfSizeError as error:
             raise HyrfSizeError(
-                f"{edit.path}: after the edit {error.problem}",
+                f"{edit.source}: after the edit {error.problem}",
                 fix="use a larger `target_bytes`, or keep fewer `gaussians`",
                 min_bytes=error.min_bytes,
             ) from error

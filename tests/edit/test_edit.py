@@ -383,6 +383,8 @@ def test_an_edit_that_leaves_nothing_is_refused_and_writes_nothing(tmp_path):
     sentence = refused("edit", COMPACT_FILE, "-o", tmp_path / "out.hyrf", "--crop-box", "90,90,90,91,91,91")
     assert "would leave no Gaussian; their centres lie between" in sentence
     assert list(tmp_path.iterdir()) == []
+    sentence = refused("edit", COMPACT_FILE, "-o", tmp_path / "out.hyrf", "--min-opacity", "1")
+    assert "'remove opacities below 1' would leave no Gaussian; change" in sentence
 
 
 @pytest.mark.parametrize(
@@ -401,6 +403,9 @@ def test_an_edit_that_leaves_nothing_is_refused_and_writes_nothing(tmp_path):
         (["--plan", "--crop-sphere", "0,0,0"], "is not 4 numbers"),
         (["--plan", "--translate", "nan,0,0"], "is not 3 numbers"),
         (["--plan", "--crop-cameras", "-1"], "--crop-cameras: margin is -1.0"),
+        (["--plan", "--scale", "1e300"], "coordinates of at most 1e+30 are possible; move and scale it by less"),
+        (["--plan", "--scale", "1e-300"], "sizes of at least 1e-30"),
+        (["--plan", "--translate", "0,-1e300,0"], "-1e+300"),
         (["--center"], "give either -o FILE"),
         (["--plan", "-o", "out.hyrf", "--center"], "give either -o FILE"),
     ],
