@@ -15,7 +15,7 @@ from hyrfpack.format.metadata import read_metadata
 from hyrfpack.format.part_names import open_parts, printable_name
 from hyrfpack.format.parts import write_parts
 from hyrfpack.format.rewrite import with_metadata
-from hyrfpack.format.run_folder import find_model
+from hyrfpack.format.run_folder import find_model, name_model
 from hyrfpack.format.sections import MAX_PARTS, PART_NAMES, SECTION_CONTENTS
 from hyrfpack.format.shared import read_provenance, self_contained_bytes
 from hyrfpack.outputs import Outputs, StrPath
@@ -90,7 +90,7 @@ def merge_models(
     if not sources:
         raise ValueError("there are no models; give at least one")
     paths = [find_model(source) for source in sources]
-    stems = [Path(source).stem for source in sources]
+    stems = [name_model(source) for source in sources]
     placements = _check_moves(stems, moves or {})
     Outputs(*paths, overwrite=overwrite).file(target, ".hyrf")
     parts: list[tuple[MergedPart, bytes]] = []

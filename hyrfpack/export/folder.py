@@ -29,6 +29,7 @@ from hyrfpack.export.poster import (
 from hyrfpack.export.report import ExportReport
 from hyrfpack.export.source import Source
 from hyrfpack.format import describe_file
+from hyrfpack.format.run_folder import name_model
 from hyrfpack.format.scene_folder import single_file
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.model import HybridModel
@@ -113,7 +114,7 @@ def _write_player(
 ) -> ExportReport:
     """Write the files of `export_player` into a folder that the caller has locked."""
     if title is None:
-        title = _folder_title(output.path) if source is None else Path(source).stem
+        title = _folder_title(output.path) if source is None else name_model(source)
     content = poster = None
     stages = {}
     description, count = "A player of 3D scenes", 0
@@ -215,7 +216,7 @@ def _write_gallery(
         if shown.poster is not None:
             output.write(poster, encode_poster(shown.poster, "JPEG", MAX_POSTER_BYTES))
         picture = None if shown.poster is None else poster
-        cards.append(Card(Path(source).stem, content, picture, shown.count, shown.length, shown.quality))
+        cards.append(Card(name_model(source), content, picture, shown.count, shown.length, shown.quality))
     title = _folder_title(output.path) if title is None else title
     pairs = zip(cards, contents, strict=True)
     stages = {card.content: shown.stage for card, shown in pairs if shown.stage}
@@ -339,7 +340,7 @@ def _choose_file_names(sources: Sequence[StrPath], *, is_gallery: bool) -> list[
         return [(f"{DEFAULT_SCENE_STEM}{_playable_ending(source)}", POSTER_NAME) for source in sources]
     names: list[str] = []
     for source in sources:
-        stem = re.sub(r"[^\w.-]+", "-", Path(source).stem).strip("-.") or DEFAULT_SCENE_STEM
+        stem = re.sub(r"[^\w.-]+", "-", name_model(source)).strip("-.") or DEFAULT_SCENE_STEM
         taken = {name.casefold() for name in names}
         numbered = (stem if number == 1 else f"{stem}-{number}" for number in count_up(1))
         names.append(next(name for name in numbered if name.casefold() not in taken))

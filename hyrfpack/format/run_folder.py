@@ -82,6 +82,17 @@ def find_model(path: str | os.PathLike[str]) -> Path:
     )
 
 
+def name_model(path: str | os.PathLike[str]) -> str:
+    """Return the name of a model: that of its file without the ending, or that of the folder of its run or scene.
+
+    Example:
+        >>> from hyrfpack.format.run_folder import name_model
+        >>> name_model("models/bonsai.hyrf")
+        'bonsai'
+    """
+    return Path(os.path.abspath(path)).name if os.path.isdir(path) else Path(path).stem
+
+
 def describe_unfinished_run(run: RunStatus) -> str:
     """Return a message clause on the progress of an unfinished run; FINISH_RUN_ADVICE says how to finish it."""
     done = "" if run.step is None or run.steps is None else f" (step {run.step:,} of {run.steps:,})"

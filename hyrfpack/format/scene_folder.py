@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 from hyrfpack.errors import HyrfFormatError
 from hyrfpack.format.container import Container, read_container
 from hyrfpack.format.metadata import read_metadata
+from hyrfpack.format.run_folder import name_model
 from hyrfpack.format.scene_manifest import (
     FORMAT_NAME,
     MANIFEST_NAME,
@@ -267,7 +268,7 @@ def single_file(path: StrPath) -> Iterator[Path]:
     from hyrfpack.format.codec import repack
 
     with tempfile.TemporaryDirectory() as folder:
-        joined = Path(folder, f"{SceneFolder(path).path.stem or 'scene'}.hyrf")
+        joined = Path(folder, f"{name_model(SceneFolder(path).path) or 'scene'}.hyrf")
         repack(path, joined)
         yield joined
 

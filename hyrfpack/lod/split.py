@@ -25,7 +25,7 @@ from hyrfpack.format.decode import decode_container
 from hyrfpack.format.info import describe_file
 from hyrfpack.format.part_names import ONE_PART_NAME, list_parts
 from hyrfpack.format.parts import decode_parts
-from hyrfpack.format.run_folder import find_model
+from hyrfpack.format.run_folder import find_model, name_model
 from hyrfpack.format.scene_folder import SceneFolder, is_scene
 from hyrfpack.format.scene_manifest import MANIFEST_NAME, Chunk, ChunkLevel, Manifest, ScenePart
 from hyrfpack.format.scene_model import join_parts
@@ -132,7 +132,7 @@ def split_model(
     Outputs(path, scene=data, overwrite=True).folder(target, [MANIFEST_NAME, *shared_names])
     with exclusive_folder(target), context.open_progress("split") as progress:
         Outputs(path, scene=data, overwrite=overwrite).folder(target, [MANIFEST_NAME, *shared_names])
-        files, manifest = _split(path, shared_names, Path(source).stem, config, data, progress)
+        files, manifest = _split(path, shared_names, name_model(source), config, data, progress)
         Outputs(path, scene=data, overwrite=overwrite).folder(target, files)
         _write_folder(target, files, manifest, overwrite)
     levels = list(zip(*(chunk.levels for chunk in manifest.chunks), strict=True))

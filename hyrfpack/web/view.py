@@ -8,6 +8,7 @@ from pathlib import Path
 
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.format import describe_file, find_model
+from hyrfpack.format.run_folder import name_model
 from hyrfpack.format.scene_folder import SceneFolder, is_scene
 from hyrfpack.format.scene_manifest import MANIFEST_NAME
 from hyrfpack.splats.names import SPLATS_SUFFIXES, is_splats, sog_folder
@@ -47,7 +48,7 @@ def _scene_page(path: str | os.PathLike[str]) -> tuple[bytes, ServedFiles]:
     for item in scene.manifest.files:
         in_folder = scene.path.is_dir()
         files[FOLDER_ADDRESS + item.file] = scene.path / item.file if in_folder else MemoryFile(scene.read_file(item))
-    title = scene.manifest.title or scene.path.stem or "scene"
+    title = scene.manifest.title or name_model(scene.path) or "scene"
     return encode_player(title, content=FOLDER_ADDRESS + MANIFEST_NAME, fetches="'self'"), files
 
 
@@ -61,7 +62,7 @@ def _file_page(path: str | os.PathLike[str]) -> tuple[bytes, ServedFiles]:
         suffix = MODEL_SUFFIX
         describe_file(file)
     name = f"scene{suffix}"
-    title = Path(path).stem
+    title = name_model(path)
     return encode_player(title, content=name, fetches="'self'", editable=True, file=str(file)), {name: file}
 
 

@@ -157,6 +157,12 @@ def test_an_action_that_is_no_move_is_a_type_error(tmp_path: Path, files: tuple[
         ("room.hyrf balls.hyrf -o out.hyrf --translate balls=1,0", "is not 3 numbers"),
         ("room.hyrf balls.hyrf -o out.hyrf --translate 1,0,0", "names no model"),
         ("room.hyrf balls.hyrf -o out.hyrf --scale balls=0", "--scale"),
+        ("room.hyrf balls.hyrf -o out.hyrf --scale balls=1e300", "move and scale it by less"),
+        ("room.hyrf balls.hyrf -o out.hyrf --scale room=1e-300", "move and scale it by less"),
+        (
+            "room.hyrf balls.hyrf -o out.hyrf --translate room=1e308,0,0 --translate room=1e308,0,0",
+            "move and scale it by less",
+        ),
         ("room.hyrf balls.hyrf -o room.hyrf --overwrite", "room.hyrf"),
         ("room.hyrf missing.hyrf -o out.hyrf", "missing.hyrf"),
         ("room.hyrf balls.hyrf -o out.ply", ".hyrf"),
@@ -170,6 +176,27 @@ def test_bad_requests_get_one_message(tmp_path: Path, files: tuple[Path, Path], 
 
     assert message in error
     assert {path.name: path.read_bytes() for path in tmp_path.glob("*")} == before
+
+
+def test_a_folder_gives_its_whole_name(tmp_path: Path, files: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch):
+    run = tmp_path / "room.v1.2"
+    run.mkdir()
+    (run / "model.hyrf").write_bytes(files[0].read_bytes())
+    monkeypatch.chdir(run)
+
+    by_name = merge_models([run, files[1]], tmp_path / "a.hyrf", {"room.v1.2": [Scale(2.0)]})
+    from_inside = merge_models([".", files[1]], tmp_path / "b.hyrf")
+
+    assert [part.name for part in by_name.parts] == [part.name for part in from_inside.parts] == ["room.v1.2", "balls"]
+
+
+def test_a_message_about_a_part_names_the_merged_file(tmp_path: Path, files: tuple[Path, Path]):
+    plain = save_model(small_model([[0.0, 0.0, 0.0]]), tmp_path / "plain.hyrf", "raw").file
+    merge_models([files[0], plain], tmp_path / "both.hyrf")
+
+    error = refused("edit", "both.hyrf", "--plan", "--part", "plain", "--up", "auto")
+
+    assert error.startswith("Error: both.hyrf: it keeps no cameras")
 
 
 def test_the_commands_read_what_merge_writes(tmp_path: Path, files: tuple[Path, Path]):
