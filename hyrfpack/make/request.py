@@ -36,7 +36,7 @@ def default_work_folder(output: Path) -> Path:
 
 @dataclass(frozen=True)
 class Request:
-    """The arguments of `make`; the source is already inspected."""
+    """The arguments of `make`; the source is already inspected. An output ".." is replaced by its full path."""
 
     source: Source
     output: Path
@@ -45,6 +45,10 @@ class Request:
     config: MakeConfig
     device: torch.device
     overwrite: bool
+
+    def __post_init__(self) -> None:
+        if self.output.name == "..":  # the product in the work folder gets the name of the output
+            object.__setattr__(self, "output", Path(os.path.realpath(self.output)))
 
     @property
     def stages(self) -> list[str]:
@@ -98,6 +102,10 @@ class Request:
                 "a target size": self.config.target_bytes,
                 "a number of Gaussians": self.config.max_gaussians,
                 "a preset": None if self.config.preset == "auto" else self.config.preset,
+                "a matching method": None if self.config.matching == "auto" else self.config.matching,
+                "a folder of photos": self.config.images,
+                "a size of photos": self.config.max_size,
+                "a split of photos": self.config.test_every,
             }
             for name, value in options.items():
                 if value is not None:

@@ -301,6 +301,10 @@ def test_impossible_requests_are_rejected_before_any_work(posed, photos, finishe
         ("with photos only", finished_work / "model.hyrf", "-o", out, "--minutes", 3),
         ("with photos only", finished_work / "model.hyrf", "-o", out, "--max-gaussians", 30),
         ("with photos only", finished_work / "model.hyrf", "-o", out, "--preset", "large"),
+        ("with photos only", finished_work / "model.hyrf", "-o", out, "--matching", "exhaustive"),
+        ("with photos only", finished_work / "model.hyrf", "-o", out, "--images", "images_4"),
+        ("with photos only", finished_work / "model.hyrf", "-o", out, "--max-size", 0),
+        ("with photos only", finished_work / "model.hyrf", "-o", out, "--test-every", 0),
         ("give one of them", posed, "-o", out, "--minutes", 3, "--quality", "draft"),
         ("give one of them", posed, "-o", out, "--max-gaussians", 300, "--target-size", "1MB"),
         ("name a folder of photos", tmp_path / "letter.txt", "-o", out),
@@ -379,6 +383,10 @@ def test_an_output_without_a_name_is_rejected_or_the_current_folder(finished_wor
     monkeypatch.chdir(tmp_path / "player")
     succeeded("make", finished_work / "model.hyrf", "-o", ".")
     assert (tmp_path / "player" / "index.html").is_file() and (tmp_path / "player.work" / "make.json").is_file()
+    (tmp_path / "site" / "assets").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "site" / "assets")
+    succeeded("make", finished_work / "model.hyrf", "-o", "..")
+    assert (tmp_path / "site" / "index.html").is_file() and (tmp_path / "site.work" / "make.json").is_file()
 
 
 # -- the command -----------------------------------------------------------------------------------------------------
