@@ -100,6 +100,8 @@ def export_player(
     check_folder(folder, sources, [data], overwrite=True, is_gallery=False)
     with exclusive_folder(folder):
         check_folder(folder, sources, [data], overwrite=overwrite, is_gallery=False)
+        if source is not None:
+            suggest_compression(source)
         with nullcontext(None) if source is None else single_file(source) as file:
             return _write_player(file, _OutputFolder(Path(folder), overwrite), data, title, credit, editable)
 
@@ -191,6 +193,8 @@ def export_gallery(
     with exclusive_folder(folder):
         check_folder(folder, sources, scenes, overwrite=overwrite, is_gallery=True)
         with ExitStack() as joined:
+            for source in sources:
+                suggest_compression(source)
             files = [joined.enter_context(single_file(source)) for source in sources]
             return _write_gallery(files, _OutputFolder(Path(folder), overwrite), scenes, title, credit, editable)
 
@@ -291,7 +295,6 @@ class _PlayableContent:
             stage = encode_stage([viewpoint.camera], viewpoint.up, viewpoint.center)
             return cls(len(splats), length, poster, stage=stage)
         loaded = Source.read(path, data)
-        suggest_compression(path, length)
         quality = _describe_quality(path, loaded.drawn, data) if with_quality else ""
         cameras = page_cameras(loaded)
         poster = render_model_poster(loaded.drawn, cameras[0], POSTER_LONGEST_SIDE_PIXELS)

@@ -18,11 +18,13 @@ from hyrfpack.config.export import ExportConfig
 from hyrfpack.export.poster import encode_poster, render_model_poster
 from hyrfpack.export.report import ExportReport
 from hyrfpack.export.source import Source
-from hyrfpack.format import describe_file
+from hyrfpack.format import describe_file, find_model
+from hyrfpack.format.scene_folder import is_scene
 from hyrfpack.model import BACKGROUND_RADIUS, HybridModel
 from hyrfpack.model.merged import MergedModel
 from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.scene import Camera, evenly_spaced
+from hyrfpack.splats.names import is_splats
 from hyrfpack.splats.splats import Splats
 from hyrfpack.web.html import encode_model_page, encode_splats_page
 
@@ -122,17 +124,20 @@ def write_native_page(
         HyrfError: the page cannot be written.
     """
     data = Path(source).read_bytes()
-    suggest_compression(source, len(data))
     title = Path(target).stem if config.title is None else config.title
     page = encode_native_page(loaded, data, title, config.credit, Path(source).name if config.editable else None)
     written = write_atomic(target, page, overwrite=overwrite)
     return ExportReport(str(written), len(page), len(loaded.drawn), native=True)
 
 
-def suggest_compression(source: str | os.PathLike[str], length: int) -> None:
-    """Suggest `hyrfpack compress` if a model file of `length` bytes is large or uncompressed."""
-    if length > LARGE_FILE_BYTES or describe_file(source)["profile"] == "raw":
-        _LOG.info(f"{source} is copied unchanged, {length:,} bytes; 'hyrfpack compress' makes it smaller")
+def suggest_compression(source: str | os.PathLike[str]) -> None:
+    """Suggest `hyrfpack compress` if a model file is large or uncompressed; the files of a scene folder are joined."""
+    if is_scene(source) or is_splats(source):
+        return
+    file = find_model(source)
+    facts = describe_file(file)
+    if facts["bytes"] > LARGE_FILE_BYTES or facts["profile"] == "raw":
+        _LOG.info(f"{file} is copied unchanged, {facts['bytes']:,} bytes; 'hyrfpack compress' makes it smaller")
 
 
 def _page_settings(loaded: Source, title: str, credit: str) -> dict[str, Any]:

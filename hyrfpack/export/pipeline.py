@@ -34,7 +34,7 @@ from hyrfpack.export.kinds import (
 )
 from hyrfpack.export.levels import bake_levels, open_levels
 from hyrfpack.export.meshes import write_collision_mesh, write_mesh
-from hyrfpack.export.pages import encode_baked_page, write_native_page
+from hyrfpack.export.pages import encode_baked_page, suggest_compression, write_native_page
 from hyrfpack.export.points import encode_points
 from hyrfpack.export.report import ExportReport
 from hyrfpack.export.scores import measure_export
@@ -111,6 +111,18 @@ def export_model(
         check_type("data", data, Scene)
     kind = find_file_kind(target, config)
     check_request(kind, target, config)
+    if kind is PLAYER_FOLDER:
+        return export_player(
+            source,
+            target,
+            data=data,
+            overwrite=overwrite,
+            title=config.title,
+            credit=config.credit,
+            editable=config.editable,
+        )
+    if kind is HTML_PAGE and not config.baked:
+        suggest_compression(source)
     scene = open_levels(source) if kind in LEVEL_FOLDERS else None
     with single_file(find_model(source)) as file:
         return _export_file(file, scene, target, kind, config, data, overwrite, context)
@@ -127,16 +139,6 @@ def _export_file(
     context: RunContext,
 ) -> ExportReport:
     """Export a `.hyrf` file, or the levels of `scene`, if it is given. Other arguments are those of `export_model`."""
-    if kind is PLAYER_FOLDER:
-        return export_player(
-            source,
-            target,
-            data=data,
-            overwrite=overwrite,
-            title=config.title,
-            credit=config.credit,
-            editable=config.editable,
-        )
     is_folder = kind is COLMAP_FOLDER or kind in LEVEL_FOLDERS
     if is_folder:
         check_place(target, Outputs(source, scene=data, overwrite=True), config)

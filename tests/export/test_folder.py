@@ -21,6 +21,7 @@ from hyrfpack.export import ExportReport, export_gallery, export_model, export_p
 from hyrfpack.format import load_model, save_model
 
 GAUSSIAN_POSITIONS = np.random.default_rng(0).uniform(-0.6, 0.6, (40, 3))
+GOLDEN_SCENE = Path(__file__).parents[1] / "golden" / "scene"
 PLAYER_FILES = {"README.txt", "hyrf-viewer.js", "index.html", "player.css", "player.js", "player-worker.js"}
 
 
@@ -101,6 +102,18 @@ def test_title_and_credit_are_shown_by_players_and_galleries(model_file, splats_
         text = (tmp_path / page).read_text()
         assert "<title>The room</title>" in text and '<p id="credit">Photos: A. &amp; B.</p>' in text
     assert "<h1>The room</h1>" in (tmp_path / "g" / "index.html").read_text()
+
+
+def test_the_player_of_a_run_has_the_title_of_its_folder(tmp_path):
+    write_model(tmp_path / "garden.v2" / "model.hyrf")
+    export_model(tmp_path / "garden.v2", tmp_path / "player")
+    assert "<title>garden.v2</title>" in (tmp_path / "player" / "index.html").read_text()
+
+
+@pytest.mark.parametrize("target", ["a.html", "player"])
+def test_no_note_names_the_temporary_file_of_a_scene_folder(target, tmp_path, caplog):
+    export_model(GOLDEN_SCENE, tmp_path / target)
+    assert caplog.messages == []
 
 
 def test_other_files_in_the_folder_are_kept(model_file, tmp_path):
