@@ -243,6 +243,8 @@ def edit(
         raise click.UsageError("give either -o FILE to write the edited model, or --plan to see what would change")
     if plan and limits != EditLimits():
         raise click.UsageError("--plan writes no file, whose size or loss could be limited; leave out the limit")
+    if plan and profile is not None:
+        raise click.UsageError("--plan writes no file, which could have a profile; leave out --profile")
     from hyrfpack.edit import edit_model, plan_edit
     from hyrfpack.format import describe_file
 

@@ -16,7 +16,7 @@ from hyrfpack.checks import check_type
 from hyrfpack.config.export import ConvertConfig
 from hyrfpack.context import RunContext
 from hyrfpack.errors import HyrfDataError, HyrfError
-from hyrfpack.export.kinds import check_package, select_splats
+from hyrfpack.export.kinds import check_package, check_spz_version, select_splats
 from hyrfpack.export.measure import psnr_of_splats
 from hyrfpack.outputs import Outputs
 from hyrfpack.progress import Progress, TaskEvent, part_of_progress
@@ -98,6 +98,7 @@ def convert_splats(
     kind = find_target_format(source, target)
     config = ConvertConfig() if config is None else config
     check_type("config", config, ConvertConfig)
+    check_spz_version(kind, target, config)
     check_package(kind, target)
     Outputs(source, folder=sog_folder(source), overwrite=overwrite).file(target)
     with context.open_progress("convert") as progress:

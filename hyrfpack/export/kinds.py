@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from hyrfpack.choices import LOCAL_EXPOSURE, SPZ_TILE_CONTENT
-from hyrfpack.config.export import ExportConfig
+from hyrfpack.choices import DEFAULT_SPZ_VERSION, LOCAL_EXPOSURE, SPZ_TILE_CONTENT
+from hyrfpack.config.export import ConvertConfig, ExportConfig
 from hyrfpack.errors import HyrfError, needs_package
 from hyrfpack.export.background import background_reach
 from hyrfpack.export.cameras import COLMAP_FILES
@@ -119,6 +119,12 @@ def check_request(kind: FileKind, target: str | os.PathLike[str], config: Export
             f"{target}: levels of detail stand for all Gaussians, so that none can be left out",
             fix="leave out `crop` and `min_opacity`; select Gaussians with 'hyrfpack edit' and split its result",
         )
+    check_spz_version(kind, target, config)
+    if config.tile_content != SPZ_TILE_CONTENT and not config.tiles_3d:
+        raise HyrfError(
+            f"{target}: only 3D Tiles have a choice of contents",
+            fix="leave out `tile_content`, or write a folder with `tiles_3d=True`",
+        )
     is_mesh = kind in (*MESH_FILES, *COLLISION_FILES)
     if not is_mesh and (config.voxel is not None or config.faces is not None):
         names = " and ".join(f"`{name}`" for name in ("voxel", "faces") if getattr(config, name) is not None)
@@ -160,6 +166,12 @@ def check_request(kind: FileKind, target: str | os.PathLike[str], config: Export
     if config.faces is not None or kind in COLLISION_FILES:
         with needs_package(f"{target}: reducing the triangles of a mesh"):
             import_module("fast_simplification")
+
+
+def check_spz_version(kind: FileKind, target: str | os.PathLike[str], config: ConvertConfig) -> None:
+    """Check that a version of SPZ is asked for with SPZ files only. Raises HyrfError otherwise."""
+    if config.spz_version != DEFAULT_SPZ_VERSION and kind.ending != ".spz":
+        raise HyrfError(f"{target}: only .spz files have a version", fix="leave out `spz_version`, or write an .spz")
 
 
 def check_package(kind: FileKind, target: str | os.PathLike[str]) -> None:

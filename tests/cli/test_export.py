@@ -173,6 +173,8 @@ WRONG_REQUESTS = {
     "levels of a file": (("-o", "out", "--streamed-sog"), "split it first with 'hyrfpack split"),
     "two folders": (("-o", "out", "--colmap", "--streamed-sog"), "give only one of --colmap and --streamed-sog"),
     "crop of levels": (("-o", "out", "--streamed-sog", "--min-opacity", "0.1"), "leave out --crop and --min-opacity"),
+    "version of a PLY": (("-o", "a.ply", "--spz-version", "3"), "leave out --spz-version, or write an .spz"),
+    "contents of no tiles": (("-o", "a.ply", "--tile-content", "gltf"), "leave out --tile-content, or write a folder"),
     "two models": (("second.hyrf", "-o", "a.ply"), "several models make a gallery"),
     "photos of two": (("-o", "player", "--data", "a", "--data", "b"), "given 2 times for 1 models"),
 }

@@ -407,6 +407,7 @@ def test_an_edit_that_leaves_nothing_is_refused_and_writes_nothing(tmp_path):
         (["--plan", "--scale", "1e-300"], "sizes of at least 1e-30"),
         (["--plan", "--translate", "0,-1e300,0"], "-1e+300"),
         (["--center"], "give either -o FILE"),
+        (["--plan", "--center", "--profile", "raw"], "leave out --profile"),
         (["--plan", "-o", "out.hyrf", "--center"], "give either -o FILE"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,

@@ -132,6 +132,13 @@ def test_unsupported_conversions_are_refused_with_what_to_do(source, target, sen
     assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
 
 
+def test_a_version_of_spz_is_refused_for_another_format(tmp_path):
+    source = write_splats(tmp_path, ".spz", ball_splats(5))
+    with pytest.raises(HyrfError, match=r"after.ply: only .spz files have a version; leave out `spz_version`"):
+        hyrfpack.convert_splats(source, tmp_path / "after.ply", ConvertConfig(spz_version=3))
+    assert [path.name for path in tmp_path.iterdir()] == ["before.spz"]
+
+
 def test_the_source_is_never_overwritten(tmp_path):
     source = write_splats(tmp_path, ".ply", ball_splats(5))
     with pytest.raises(HyrfError, match="the output is an input itself"):
