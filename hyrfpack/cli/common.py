@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
+from click.core import ParameterSource
 
 from hyrfpack.atomic import describe_rename
 from hyrfpack.choices import LAYOUTS
@@ -31,6 +32,9 @@ overwrite_option = click.option(
 json_option = click.option("--json", "as_json", is_flag=True, help="Print the results as one JSON object.")
 
 
+_READER_OPTIONS = ("test_every", "images", "max_size", "layout", "colmap_model")
+
+
 def scene_options(command: Command) -> Command:
     """Add the options that control how a folder of photos and poses is read.
 
@@ -48,6 +52,8 @@ def scene_options(command: Command) -> Command:
         colmap_model: str | None,
         **others: Any,
     ) -> Any:
+        if not others["data"]:
+            _refuse_reader_options(click.get_current_context())
         reader_options = {"test_every": test_every, "images": images, "max_size": max_size, "layout": layout}
         return command(*args, reader_options={**reader_options, "model": colmap_model}, **others)
 
@@ -80,6 +86,14 @@ def scene_options(command: Command) -> Command:
     ):
         with_options = option(with_options)
     return with_options
+
+
+def _refuse_reader_options(context: click.Context) -> None:
+    """Raise UsageError if an option of `scene_options` was given, for a command that reads no photos."""
+    for option in context.command.params:
+        is_given = context.get_parameter_source(str(option.name)) is ParameterSource.COMMANDLINE
+        if is_given and option.name in _READER_OPTIONS:
+            raise click.UsageError(f"{option.opts[0]} is for reading photos; name their folder with --data")
 
 
 _SELF_TEST_KEY = "hyrfpack.self_test"  # key of --self-test in click's context

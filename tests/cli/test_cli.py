@@ -497,3 +497,11 @@ def test_the_module_runs_as_a_program():
     root = Path(__file__).parents[2]
     result = subprocess.run([sys.executable, "-m", "hyrfpack", "--version"], capture_output=True, text=True, cwd=root)
     assert result.returncode == 0 and result.stdout.startswith("hyrfpack")
+
+
+@pytest.mark.parametrize("option", [("--test-every", 8), ("--images", "i"), ("--max-size", 0), ("--model", 1)])
+@pytest.mark.parametrize("command", ["render", "compress", "export", "edit", "split"])
+def test_options_for_reading_photos_need_the_folder_of_photos(command, option, packed, tmp_path):
+    message = refused(command, packed, "-o", tmp_path / "out.ply", *option)
+    assert message == f"Error: {option[0]} is for reading photos; name their folder with --data"
+    assert not list(tmp_path.iterdir())
