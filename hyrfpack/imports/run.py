@@ -17,6 +17,7 @@ from hyrfpack.atomic import write_atomic
 from hyrfpack.checks import check_type
 from hyrfpack.config.imports import ImportConfig
 from hyrfpack.context import RunContext
+from hyrfpack.format.min_file_size import check_target_bytes
 from hyrfpack.imports.pack import pack
 from hyrfpack.imports.prepare import prepare_model
 from hyrfpack.out_of_memory import explain_out_of_memory
@@ -85,8 +86,8 @@ def import_splats(
 
     Raises:
         HyrfDataError: the source cannot be read, or no view shows any of its Gaussians.
-        HyrfSizeError: no file is as small as `config.target_bytes`.
-        HyrfError: the target cannot be written.
+        HyrfSizeError: no file of this scene is as small as `config.target_bytes`.
+        HyrfError: no file at all is that small, or the target cannot be written.
         TypeError: the settings or a camera have the wrong type.
 
     Example:
@@ -136,11 +137,13 @@ def import_loaded_splats(
 
     Raises:
         HyrfDataError: no view shows any of the splats.
-        HyrfSizeError: no file is as small as `config.target_bytes`.
-        HyrfError: the file cannot be written, or the device does not exist.
+        HyrfSizeError: no file of this scene is as small as `config.target_bytes`.
+        HyrfError: no file at all is that small, the file cannot be written, or the device does not exist.
     """
     started = time.perf_counter()
     Outputs(overwrite=overwrite).file(target)
+    if config.target_bytes is not None:
+        check_target_bytes(config.target_bytes)  # before the work; packing knows more precisely what fits
     device = context.choose_device()
     with context.open_progress("import") as progress:
         prepared = prepare_model(

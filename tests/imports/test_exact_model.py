@@ -12,9 +12,10 @@ from explicit_balls import TINY_IMPORT_CONFIG, ball_splats
 from scenes import ring, small_model
 from scipy.spatial.transform import Rotation
 
-from hyrfpack.errors import HyrfSizeError
+from hyrfpack.errors import HyrfError, HyrfSizeError
 from hyrfpack.format import describe_file, load_model
 from hyrfpack.format.codec import decode_model
+from hyrfpack.format.min_file_size import min_file_bytes
 from hyrfpack.imports import ImportReport, import_loaded_splats, pack
 from hyrfpack.imports.exact_model import exact_model
 from hyrfpack.imports.prepare import prepare_model
@@ -79,12 +80,19 @@ def test_an_import_stores_what_the_target_needs(tmp_path: Path, monkeypatch: pyt
     filled = import_them(target_bytes=limit)
     assert 0.9 * limit < filled.bytes_after <= limit and small.psnr < filled.psnr < large.psnr
     assert filled.psnr_asked is None
-    with pytest.raises(HyrfSizeError, match="does not fit into 100 bytes.*use a larger target size"):
-        import_them(target_bytes=100)
+    least = min_file_bytes()
+    with pytest.raises(HyrfSizeError, match=f"does not fit into {least:,} bytes.*use a larger target size"):
+        import_them(target_bytes=least)
     model, description = load_model(tmp_path / "x.hyrf"), describe_file(tmp_path / "x.hyrf")
     assert model.config.residual_degree == splats.degree and description["version"] == "1.6"
     for residuals in (model.gaussians.shape_residuals, model.gaussians.color_residuals):
         assert residuals is not None and residuals.any()
+
+
+def test_a_size_that_no_file_has_is_refused_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hyrfpack.imports.run.prepare_model", None)
+    with pytest.raises(HyrfError, match="100 bytes is below the smallest possible file, about .* did you mean 100kB"):
+        import_loaded_splats(ball_splats(20), tmp_path / "x.hyrf", replace(TINY_IMPORT_CONFIG, target_bytes=100))
 
 
 @pytest.mark.acceptance
