@@ -31,7 +31,7 @@ overwrite_option = click.option(
 )
 json_option = click.option("--json", "as_json", is_flag=True, help="Print the results as one JSON object.")
 
-
+# Names of the parameters that `scene_options` adds.
 _READER_OPTIONS = ("test_every", "images", "max_size", "layout", "colmap_model")
 
 
@@ -88,11 +88,15 @@ def scene_options(command: Command) -> Command:
     return with_options
 
 
+def is_given(context: click.Context, parameter: click.Parameter) -> bool:
+    """Return whether the user gave a parameter on the command line, be it its default."""
+    return context.get_parameter_source(str(parameter.name)) is ParameterSource.COMMANDLINE
+
+
 def _refuse_reader_options(context: click.Context) -> None:
     """Raise UsageError if an option of `scene_options` was given, for a command that reads no photos."""
     for option in context.command.params:
-        is_given = context.get_parameter_source(str(option.name)) is ParameterSource.COMMANDLINE
-        if is_given and option.name in _READER_OPTIONS:
+        if option.name in _READER_OPTIONS and is_given(context, option):
             raise click.UsageError(f"{option.opts[0]} is for reading photos; name their folder with --data")
 
 

@@ -12,6 +12,7 @@ import click
 from hyrfpack.cli.common import (
     choose_command_device,
     device_option,
+    is_given,
     json_option,
     note,
     note_rename,
@@ -171,8 +172,7 @@ def _command_as_typed(context: click.Context) -> str:
     """Return the command line of a command, with the parameters that were given there."""
     words = ["hyrfpack", str(context.info_name)]
     for parameter in context.command.params:
-        given = context.get_parameter_source(str(parameter.name)) is click.core.ParameterSource.COMMANDLINE
-        if not given or not parameter.expose_value:
+        if not is_given(context, parameter) or not parameter.expose_value:
             continue
         value = context.params[str(parameter.name)]
         if isinstance(parameter, click.Argument):

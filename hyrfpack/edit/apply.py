@@ -14,18 +14,7 @@ from torch import Tensor
 
 from hyrfpack.cameras.capture import Capture, has_mean_exposure
 from hyrfpack.cameras.paths import estimate_up
-from hyrfpack.config.edit import (
-    Action,
-    Background,
-    Center,
-    Crop,
-    EstimateUp,
-    Move,
-    Refit,
-    Remove,
-    Up,
-    Upright,
-)
+from hyrfpack.config.edit import Action, Background, Center, Crop, EstimateUp, Move, Refit, Remove, Up, Upright
 from hyrfpack.edit.refit import refit, score_region
 from hyrfpack.edit.report import ActionReport
 from hyrfpack.edit.select import keep_mask
