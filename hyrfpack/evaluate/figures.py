@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import logging
 import math
 import os
 from collections.abc import Iterator, Sequence
@@ -18,6 +17,7 @@ from torch import Tensor
 
 from hyrfpack.atomic import write_atomic
 from hyrfpack.errors import needs_package
+from hyrfpack.logs import log_only_errors_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -155,14 +155,8 @@ def draw_training_curve(records: Sequence[dict], path: str | os.PathLike[str], *
 @contextmanager
 def _quiet_matplotlib() -> Iterator[None]:
     """Import matplotlib inside this block without its log messages, such as those on a missing cache folder."""
-    logger = logging.getLogger("matplotlib")
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        with needs_package("drawing figures"):
-            yield
-    finally:
-        logger.setLevel(level)
+    with log_only_errors_of("matplotlib"), needs_package("drawing figures"):
+        yield
 
 
 def blank_figure(width: float, height: float, layout: Literal["constrained"] | None = "constrained") -> Figure:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import logging
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from hyrfpack.data import load_scene
 from hyrfpack.data.folder import first_readable_photo, list_photos, read_photo_facts
 from hyrfpack.data.pictures import fit_size, read_pixels
 from hyrfpack.errors import HyrfDataError, HyrfError
+from hyrfpack.logs import log_only_errors_of
 from hyrfpack.progress import Event, Progress, StepEvent, TaskEvent
 from hyrfpack.scene import evenly_spaced
 from hyrfpack.train import Trainer
@@ -54,7 +54,7 @@ def show_first_look(
     context = replace(context, progress=report)
     shutil.rmtree(folder, ignore_errors=True)
     try:
-        with _silence_notes_of("hyrfpack.poses"):
+        with log_only_errors_of("hyrfpack.poses"):  # the exact estimation logs the same notes again
             photos = _take_frames(source, folder / "frames", report) if source.is_file() else source
             if not _reduce_photos(photos, folder / "photos"):
                 return
@@ -128,15 +128,3 @@ def _prefix_events(progress: Progress) -> Progress:
             progress(replace(event, task=f"first look: {event.task}", share=None))
 
     return report
-
-
-@contextmanager
-def _silence_notes_of(package: str) -> Iterator[None]:
-    """Log only errors of a package in the block; the exact estimation logs the same notes again."""
-    logger = logging.getLogger(package)
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        yield
-    finally:
-        logger.setLevel(level)
