@@ -20,7 +20,6 @@ from hyrfpack.cli.common import (
 from hyrfpack.cli.settings import settings_options
 from hyrfpack.cli.types import OUTPUT, PATH
 from hyrfpack.config.imports import ImportConfig
-from hyrfpack.outputs import Outputs
 
 if TYPE_CHECKING:
     from hyrfpack.imports import ImportReport
@@ -64,11 +63,11 @@ def import_(
       hyrfpack import scene.spz -o scene.hyrf --target-size 2MB
       hyrfpack import room.ply -o room.hyrf --cameras photos/room --size 800
     """
-    folder = source.parent if source.name == "meta.json" else source  # a SOG may be a folder that holds meta.json
-    Outputs(source, cameras, folder=folder, overwrite=overwrite).file(output, ".hyrf")
     from hyrfpack.context import RunContext
     from hyrfpack.imports import import_splats
+    from hyrfpack.imports.run import check_target
 
+    check_target(source, output, cameras, overwrite=overwrite)  # before the cameras are read
     cameras = cameras or _find_training_cameras(source)
     given = None if cameras is None else _read_cameras(cameras)
     torch_device = choose_command_device(device)

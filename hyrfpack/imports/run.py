@@ -21,11 +21,11 @@ from hyrfpack.format.min_file_size import check_target_bytes
 from hyrfpack.imports.pack import pack
 from hyrfpack.imports.prepare import prepare_model
 from hyrfpack.out_of_memory import explain_out_of_memory
-from hyrfpack.outputs import Outputs
+from hyrfpack.outputs import Outputs, StrPath
 from hyrfpack.progress import TaskEvent, part_of_progress
 from hyrfpack.scene import Camera
 from hyrfpack.splats.files import read_splats
-from hyrfpack.splats.names import bytes_on_disk
+from hyrfpack.splats.names import bytes_on_disk, sog_folder
 from hyrfpack.splats.splats import Splats
 
 _LOG = logging.getLogger(__name__)
@@ -100,12 +100,25 @@ def import_splats(
     check_type("config", config, ImportConfig)
     for camera in cameras or ():
         check_type("each of the cameras", camera, Camera)
-    Outputs(source, overwrite=overwrite).file(target)
+    check_target(source, target, overwrite=overwrite)
     splats = read_splats(source)
     result = import_loaded_splats(
         splats, target, config, name=str(source), cameras=cameras, overwrite=overwrite, context=context
     )
     return dataclasses.replace(result, bytes_source=bytes_on_disk(source))
+
+
+def check_target(source: StrPath | None, target: StrPath, cameras: StrPath | None = None, *, overwrite: bool) -> None:
+    """Check that an import may write `target`. Raises HyrfError otherwise.
+
+    Args:
+        source: the file or the folder of splats that is read; None for splats in memory.
+        target: the file to write.
+        cameras: a file of cameras that is read.
+        overwrite: an existing file may be replaced, except those that are read.
+    """
+    folder = None if source is None else sog_folder(source)
+    Outputs(source, cameras, folder=folder, overwrite=overwrite).file(target, ".hyrf")
 
 
 def import_loaded_splats(
@@ -141,7 +154,7 @@ def import_loaded_splats(
         HyrfError: no file at all is that small, the file cannot be written, or the device does not exist.
     """
     started = time.perf_counter()
-    Outputs(overwrite=overwrite).file(target)
+    check_target(None, target, overwrite=overwrite)
     if config.target_bytes is not None:
         check_target_bytes(config.target_bytes)  # before the work; packing knows more precisely what fits
     device = context.choose_device()
@@ -171,7 +184,7 @@ def import_loaded_splats(
         scores = prepared.test.psnr_per_view(decoded)
     reached_psnr = float(np.mean(scores))
     if config.target_bytes is None and _falls_short(reached_psnr, config.psnr):
-        _LOG.warning(_shortfall(reached_psnr, unpacked_psnr, config))
+        _LOG.warning(_shortfall(reached_psnr, unpacked_psnr, config, has_cameras=cameras is not None))
     if config.worst is not None and _falls_short(min(scores), config.worst):
         _LOG.warning(
             f"the worst view is to have {config.worst:g} dB, but the worst of the held-out ones has {min(scores):.1f} "
@@ -199,12 +212,20 @@ def _falls_short(reached_psnr: float, asked: float) -> bool:
     return round(reached_psnr, 1) < asked
 
 
-def _shortfall(reached_psnr: float, unpacked_psnr: float, config: ImportConfig) -> str:
-    """Describe how far the file falls short of the target PSNR, and what the user can do about it."""
+def _shortfall(reached_psnr: float, unpacked_psnr: float, config: ImportConfig, *, has_cameras: bool) -> str:
+    """Describe how far the file falls short of the target PSNR, and what the user can do about it.
+
+    `has_cameras` tells whether the user gave the viewpoints.
+    """
     outcome = (
         f"the target PSNR is {config.psnr:g} dB, but the file reaches {reached_psnr:.1f} dB at held-out viewpoints "
         f"({unpacked_psnr:.1f} dB before compression)"
     )
     if not _falls_short(unpacked_psnr, config.psnr):
         return f"{outcome}; set a higher target with `psnr`"
+    if has_cameras:
+        return (
+            f"{outcome}; Gaussians that the given cameras hardly show are left out, and opacities and scales are "
+            "limited in a model, so give more `cameras` or set a lower `psnr`"
+        )
     return f"{outcome}; opacities and scales are limited in a model, so set a lower `psnr`"

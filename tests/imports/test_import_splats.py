@@ -18,6 +18,7 @@ from hyrfpack.imports import ImportConfig, import_loaded_splats, pack, prepare, 
 from hyrfpack.imports.reference import ReferenceViews
 from hyrfpack.scene import Camera
 from hyrfpack.splats.draw import Drawable, draw
+from hyrfpack.splats.formats import ply
 from hyrfpack.splats.viewpoints import WeightedSplats, sample_viewpoints
 
 pytestmark = pytest.mark.usefixtures("quick_calibration", "quick_import")
@@ -39,9 +40,9 @@ def test_the_report_describes_the_file(tmp_path: Path) -> None:
 
 
 def test_same_splats_and_seed_give_the_same_bytes(tmp_path: Path) -> None:
-    for name in "ab":
+    for name in ("a.hyrf", "b.hyrf"):
         import_loaded_splats(ball_splats(60), tmp_path / name, TINY_IMPORT_CONFIG)
-    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+    assert (tmp_path / "a.hyrf").read_bytes() == (tmp_path / "b.hyrf").read_bytes()
 
 
 def test_the_largest_seed_is_accepted(tmp_path: Path) -> None:
@@ -182,10 +183,32 @@ def test_a_psnr_below_the_target_is_reported(
 
 
 def test_a_missed_target_advises_another_psnr() -> None:
-    messages = run._shortfall(36.5, 38.6, ImportConfig(psnr=37))
+    messages = run._shortfall(36.5, 38.6, ImportConfig(psnr=37), has_cameras=False)
     assert "reaches 36.5" in messages and messages.endswith("set a higher target with `psnr`")
-    assert "set a lower `psnr`" in run._shortfall(55, 56, ImportConfig(psnr=60))
+    assert "set a lower `psnr`" in run._shortfall(55, 56, ImportConfig(psnr=60), has_cameras=False)
     assert not run._falls_short(36.96, 37) and run._falls_short(36.94, 37)
+
+
+def test_a_target_missed_with_few_cameras_advises_more_cameras(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    pose = np.eye(4)
+    pose[2, 3] = 4
+    # The first camera is held out, and the others see only the middle of the ball.
+    cameras = [Camera(32, 32, focal, focal, 16, 16, pose) for focal in (32, 200, 200)]
+    import_loaded_splats(ball_splats(60), tmp_path / "x.hyrf", replace(TINY_IMPORT_CONFIG, psnr=60), cameras=cameras)
+    assert "the given cameras hardly show" in caplog.text
+    assert caplog.messages[-1].endswith("give more `cameras` or set a lower `psnr`")
+
+
+@pytest.mark.parametrize("name", ["x", "x.ply", "x.hyrf.bak"])
+def test_a_target_that_is_not_named_hyrf_is_rejected_before_the_work(name: str, tmp_path: Path) -> None:
+    (tmp_path / "ball.ply").write_bytes(ply.encode(ball_splats(20)))
+    with pytest.raises(HyrfError, match="the file extension must be .hyrf"):
+        hyrfpack.import_splats(tmp_path / "ball.ply", tmp_path / name, TINY_IMPORT_CONFIG)
+    with pytest.raises(HyrfError, match="the file extension must be .hyrf"):
+        import_loaded_splats(ball_splats(20), tmp_path / name, TINY_IMPORT_CONFIG)
+    assert [path.name for path in tmp_path.iterdir()] == ["ball.ply"]
 
 
 def test_settings_out_of_range_are_rejected() -> None:
