@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from hyrfpack.make.source import LoadSettings, Source
 from hyrfpack.make.stages import EXPORT_FOLDER, PACKED_MODEL
 from hyrfpack.make.state import RECORD_NAME, WorkFolderState, file_digest
 from hyrfpack.outputs import Outputs
+from hyrfpack.train import Trainer
 from hyrfpack.train.setup import check_target
 
 _SCENE_STAGES = ("training", "compression", "scoring", "export")
@@ -45,6 +47,7 @@ class Request:
     config: MakeConfig
     device: torch.device
     overwrite: bool
+    observer: Callable[[Trainer], None] | None
 
     def __post_init__(self) -> None:
         if self.output.name == "..":  # the product in the work folder gets the name of the output
@@ -106,10 +109,15 @@ class Request:
                 "a folder of photos": self.config.images,
                 "a size of photos": self.config.max_size,
                 "a split of photos": self.config.test_every,
+                "a view of the training": self.observer,
             }
             for name, value in options.items():
                 if value is not None:
                     raise HyrfError(f"{source.path}: {name} can be asked for with photos only", fix="leave it out")
+        if source.kind == "model":
+            for name in ("quality", "seed"):
+                if getattr(self.config, name) != getattr(MakeConfig, name):
+                    raise HyrfError(f"{source.path}: a model is exported as it is", fix=f"leave out `{name}`")
         if self.config.target_bytes is not None and self.config.max_gaussians is not None:
             raise HyrfError(
                 "a target size and a number of Gaussians each decide how large the model is",

@@ -148,6 +148,7 @@ def make_scene(
                 config=config,
                 device=context.choose_device(),
                 overwrite=overwrite,
+                observer=observer,
             )
             request.check()
             with (
@@ -155,7 +156,7 @@ def make_scene(
                 exclusive_folder(request.output) if request.makes_folder else nullcontext(),
             ):
                 with context.open_progress(interruptible=False) as progress:
-                    return _Pipeline(request, began, observer, context, progress).run()
+                    return _Pipeline(request, began, context, progress).run()
         except Stopped:
             raise
         except KeyboardInterrupt as error:  # interrupted before or between the stages
@@ -169,7 +170,6 @@ class _Pipeline:
         self,
         request: Request,
         began: float,
-        observer: Callable[[Trainer], None] | None,
         context: RunContext,
         progress: Progress,
     ) -> None:
@@ -178,15 +178,14 @@ class _Pipeline:
         Args:
             request: the checked arguments of the call.
             began: start of the call by the monotonic clock, in seconds.
-            observer: observer of the training.
             context: context of the call.
             progress: function that gets the progress of all stages.
         """
-        self.observer = observer
         self.request = request
         self.source = request.source
         self.began = began
         self.reporter = Reporter(request.stages, progress)
+        self.owns_cache = context.cache is None
         self.cache = context.cache or PictureCache()
         self.context = replace(context, device=request.device, progress=self.reporter.report_event, cache=self.cache)
         self.stage_cache = StageCache(request.work, self.reporter, request.check_replacing)
@@ -221,9 +220,10 @@ class _Pipeline:
         if request.config.minutes is None:
             self.reporter.estimates |= estimate_scene_seconds(scene, plan, request.device)
         training = stages.run_training_stage(
-            stage_cache, scene, self._scene_digest(scene), plan, request.config.seed, self.observer, self.context
+            stage_cache, scene, self._scene_digest(scene), plan, request.config.seed, request.observer, self.context
         )
-        self.cache.clear()  # compression needs the memory more than the photos
+        if self.owns_cache:
+            self.cache.clear()  # compression needs the memory more than the photos
         stages.run_compression_stage(stage_cache, scene, plan, self.context)
         return self._finish(stage_cache.folder / stages.PACKED_MODEL, scene, poses=poses, training=training)
 
@@ -242,7 +242,9 @@ class _Pipeline:
         if source.archive is not None:
             _LOG.info(f"{source.archive.name} was unpacked into {source.path} and is reused from there")
         config = PosesConfig(request.config.matching, request.config.seed)
-        return stages.run_pose_stage(self.stage_cache, source.path, source.files(), config, self.observer, self.context)
+        return stages.run_pose_stage(
+            self.stage_cache, source.path, source.files(), config, request.observer, self.context
+        )
 
     def _scene_digest(self, scene: Scene) -> str:
         """Return the digest of all files of a scene; for an archive, that of its unpacked files."""

@@ -14,6 +14,7 @@ from PIL import Image
 from hyrfpack import load_model, load_scene
 from hyrfpack.config.make import MakeConfig
 from hyrfpack.context import RunContext
+from hyrfpack.data import PictureCache
 from hyrfpack.errors import HyrfError
 from hyrfpack.format.min_file_size import min_file_bytes
 from hyrfpack.lock import exclusive_folder
@@ -273,6 +274,27 @@ def test_a_repeated_call_keeps_everything_and_a_changed_output_needs_overwrite(f
     assert output.read_bytes() != before
 
 
+@pytest.mark.parametrize("is_own", [True, False])
+def test_photos_are_dropped_before_compression_unless_the_caller_shares_the_cache(is_own, posed, tmp_path, monkeypatch):
+    shared, cached_bytes = PictureCache(), []
+
+    train_model, compress_model = stages.train_model, stages.compress_model
+
+    def train(scene, *arguments, context, **options):
+        context.cache.get(scene.train[0])
+        return train_model(scene, *arguments, context=context, **options)
+
+    def compress(*arguments, context, **options):
+        cached_bytes.append(context.cache.nbytes)
+        return compress_model(*arguments, context=context, **options)
+
+    monkeypatch.setattr(stages, "train_model", train)
+    monkeypatch.setattr(stages, "compress_model", compress)
+    make_scene(posed, tmp_path / "scene.hyrf", context=RunContext(cache=None if is_own else shared))
+
+    assert (cached_bytes == [0]) == is_own and (shared.nbytes > 0) == (not is_own)
+
+
 # -- errors ----------------------------------------------------------------------------------------------------------
 
 
@@ -305,6 +327,9 @@ def test_impossible_requests_are_rejected_before_any_work(posed, photos, finishe
         ("with photos only", finished_work / "model.hyrf", "-o", out, "--images", "images_4"),
         ("with photos only", finished_work / "model.hyrf", "-o", out, "--max-size", 0),
         ("with photos only", finished_work / "model.hyrf", "-o", out, "--test-every", 0),
+        ("with photos only", finished_work / "model.hyrf", "-o", out, "--view"),
+        ("exported as it is; leave out --quality", finished_work / "model.hyrf", "-o", out, "--quality", "best"),
+        ("exported as it is; leave out --seed", finished_work / "model.hyrf", "-o", out, "--seed", 3),
         ("give one of them", posed, "-o", out, "--minutes", 3, "--quality", "draft"),
         ("give one of them", posed, "-o", out, "--max-gaussians", 300, "--target-size", "1MB"),
         ("name a folder of photos", tmp_path / "letter.txt", "-o", out),
