@@ -9,8 +9,19 @@ from typing import Any
 
 import click
 
-PATH = click.Path(path_type=Path)
 _SIZE_PATTERN = re.compile(r"([0-9.]+)\s*([kmg]?)b?", re.IGNORECASE)
+
+
+class _InputPath(click.Path):
+    """Path of an input, which may not be empty: Python would take that for the current folder."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        if str(value) == "":
+            self.fail("'' is not a path; give the path of a file or a folder", param, ctx)
+        return super().convert(value, param, ctx)
+
+
+PATH = _InputPath(path_type=Path)
 
 
 class _OutputPath(click.ParamType):

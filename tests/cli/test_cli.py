@@ -9,13 +9,16 @@ import subprocess
 import sys
 from pathlib import Path
 
+import click
 import numpy as np
 import pytest
 import torch
 from commands import hyrfpack, refused, succeeded
 from PIL import Image
 
+from hyrfpack.cli import main
 from hyrfpack.cli.train import train
+from hyrfpack.cli.types import PATH
 from hyrfpack.config.compress import PROFILES
 from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.format import load_model
@@ -505,3 +508,19 @@ def test_options_for_reading_photos_need_the_folder_of_photos(command, option, p
     message = refused(command, packed, "-o", tmp_path / "out.ply", *option)
     assert message == f"Error: {option[0]} is for reading photos; name their folder with --data"
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "words", ["info", "view", "render -o out", "train -o out", "compress -o out.hyrf", "make -o out.html"]
+)
+def test_an_empty_path_is_not_the_current_folder(words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    command, *options = words.split()
+    assert "'' is not a path; give the path of a file or a folder" in refused(command, "", *options)
+    assert not list(tmp_path.iterdir())
+
+
+def test_every_input_path_is_checked_for_being_empty():
+    given = [option for command in main.commands.values() for option in command.params]
+    paths = [option for option in given if isinstance(option.type, click.Path)]
+    assert len(paths) > 20 and all(option.type is PATH for option in paths)
