@@ -11,7 +11,7 @@ import numpy as np
 
 from hyrfpack.errors import HyrfDataError
 
-_MAX_HEADER_BYTES = 1 << 16
+MAX_HEADER_BYTES = 1 << 16
 _END_OF_HEADER = re.compile(rb"^end_header\r?\n", re.MULTILINE)
 _BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 _NUMPY_TYPES = {
@@ -63,10 +63,10 @@ def read_header(data: bytes, name: str) -> PlyHeader:
         raise HyrfDataError(
             f"{name}: this is not a PLY file, because its first line is not 'ply'", fix="check the path"
         )
-    end = _END_OF_HEADER.search(data, 0, _MAX_HEADER_BYTES)
+    end = _END_OF_HEADER.search(data, 0, MAX_HEADER_BYTES)
     if end is None:
         raise HyrfDataError(
-            f"{name}: its PLY header has no end within {_MAX_HEADER_BYTES:,} bytes",
+            f"{name}: its PLY header has no end within {MAX_HEADER_BYTES:,} bytes",
             fix="the file is damaged, export it again",
         )
     order, elements = "", dict[str, Element]()

@@ -11,6 +11,8 @@ from hyrfpack.format import describe_file, find_model
 from hyrfpack.format.run_folder import name_model
 from hyrfpack.format.scene_folder import SceneFolder, is_scene
 from hyrfpack.format.scene_manifest import MANIFEST_NAME
+from hyrfpack.ply import MAX_HEADER_BYTES
+from hyrfpack.splats.formats.ply_header import check_gaussians
 from hyrfpack.splats.names import SPLATS_SUFFIXES, is_splats, sog_folder
 from hyrfpack.web.player import MODEL_SUFFIX, encode_player
 from hyrfpack.web.serve import LOCAL_HOST, MemoryFile, ServedFiles, serve
@@ -34,7 +36,8 @@ def view(
         host, port, open_browser, on_ready: as for `hyrfpack.web.serve.serve`.
 
     Raises:
-        HyrfError: there is no such file, its first kilobytes are damaged, or the server cannot listen at the address.
+        HyrfError: there is no such file, its first kilobytes are damaged, a PLY holds no Gaussians, or the server
+            cannot listen at the address.
     """
     page, files = _scene_page(path) if is_scene(path) else _file_page(path)
     serve(page, files, host=host, port=port, open_browser=open_browser, on_ready=on_ready)
@@ -57,7 +60,7 @@ def _file_page(path: str | os.PathLike[str]) -> tuple[bytes, ServedFiles]:
     file = find_playable_file(path)
     suffix = file.suffix.lower()
     if suffix in SPLATS_SUFFIXES:
-        _check_readable(file)
+        _check_splats(file)
     else:
         suffix = MODEL_SUFFIX
         describe_file(file)
@@ -83,14 +86,21 @@ def find_playable_file(path: str | os.PathLike[str]) -> Path:
     return Path(path)
 
 
-def _check_readable(path: str | os.PathLike[str]) -> None:
-    """Raise HyrfDataError unless the file can be read and is not empty."""
+def _check_splats(path: Path) -> None:
+    """Check that a file of splats can be read, is not empty, and, if it is a PLY, holds Gaussians.
+
+    Raises:
+        HyrfDataError: one of the checks fails.
+    """
     try:
-        with open(path, "rb") as file:
-            if not file.read(1):
-                raise HyrfDataError(f"{path}: the file is empty", fix="write it again")
+        with path.open("rb") as file:
+            start = file.read(MAX_HEADER_BYTES)
     except OSError as error:
         raise HyrfDataError(
             f"{path}: the file cannot be read ({error.strerror or error})",
             fix="check the path",
         ) from error
+    if not start:
+        raise HyrfDataError(f"{path}: the file is empty", fix="write it again")
+    if path.suffix.lower() == ".ply":
+        check_gaussians(start, str(path))

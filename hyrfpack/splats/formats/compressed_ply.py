@@ -24,7 +24,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from hyrfpack.errors import HyrfDataError
-from hyrfpack.ply import PlyHeader, read_elements, read_header, stack_columns
+from hyrfpack.ply import read_elements, read_header, stack_columns
 from hyrfpack.splats.formats.smallest_three import restore_largest
 from hyrfpack.splats.formats.validation import build_valid_splats
 from hyrfpack.splats.harmonics import SH_C0
@@ -39,11 +39,6 @@ _PACKED_PROPERTIES = ("packed_position", "packed_rotation", "packed_scale", "pac
 
 _HARMONIC_BY_BYTE = np.float32((np.arange(256) + 0.5) / 32 - 4)
 _HARMONIC_BY_BYTE[[0, 255]] = -4, 4
-
-
-def is_compressed(header: PlyHeader) -> bool:
-    """Return whether the header is that of a compressed PLY file."""
-    return "vertex" in header.elements and "packed_position" in header.elements["vertex"].properties
 
 
 def decode(data: bytes, name: str) -> Splats:

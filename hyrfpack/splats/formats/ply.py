@@ -23,14 +23,16 @@ from hyrfpack.ops.harmonics import MAX_DEGREE, num_sh_bases
 from hyrfpack.ply import read_elements, read_header, stack_columns
 from hyrfpack.splats.formats import compressed_ply
 from hyrfpack.splats.formats.hints import NO_HINTS, Hints
+from hyrfpack.splats.formats.ply_header import (
+    COLOR_PROPERTIES,
+    POSITION_PROPERTIES,
+    ROTATION_PROPERTIES,
+    SCALE_PROPERTIES,
+    find_properties,
+    is_compressed,
+)
 from hyrfpack.splats.formats.validation import build_valid_splats
 from hyrfpack.splats.splats import Splats
-
-_POSITION_PROPERTIES = ("x", "y", "z")
-_COLOR_PROPERTIES = ("f_dc_0", "f_dc_1", "f_dc_2")
-_SCALE_PROPERTIES = ("scale_0", "scale_1", "scale_2")
-_ROTATION_PROPERTIES = ("rot_0", "rot_1", "rot_2", "rot_3")
-_REQUIRED_PROPERTIES = (*_POSITION_PROPERTIES, *_COLOR_PROPERTIES, "opacity", *_SCALE_PROPERTIES, *_ROTATION_PROPERTIES)
 
 # Written for scales and opacities of 0, whose logarithm and logit are infinite. In float32, exp(-104) and
 # sigmoid(-104) are 0, so that these values are read back exactly.
@@ -54,15 +56,15 @@ def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
         )
     rest = 3 * (num_sh_bases(splats.degree) - 1)
     names = (
-        *_POSITION_PROPERTIES,
+        *POSITION_PROPERTIES,
         "nx",
         "ny",
         "nz",
-        *_COLOR_PROPERTIES,
+        *COLOR_PROPERTIES,
         *_higher_harmonics_properties(rest),
         "opacity",
-        *_SCALE_PROPERTIES,
-        *_ROTATION_PROPERTIES,
+        *SCALE_PROPERTIES,
+        *ROTATION_PROPERTIES,
     )
     with np.errstate(divide="ignore"):
         opacities = splats.opacities.astype(np.float64)
@@ -83,7 +85,7 @@ def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
 
 def decode(data: bytes, name: str) -> Splats:
     """Decode a PLY file, plain or compressed. Raises the errors of `decode_plain` and `compressed_ply.decode`."""
-    packed = compressed_ply.is_compressed(read_header(data, name))
+    packed = is_compressed(read_header(data, name))
     return compressed_ply.decode(data, name) if packed else decode_plain(data, name)
 
 
@@ -102,15 +104,7 @@ def decode_plain(data: bytes, name: str) -> Splats:
         HyrfDataError: the file is not a PLY file, holds no Gaussians, or is damaged.
     """
     header = read_header(data, name)
-    vertex = header.elements.get("vertex")
-    properties = vertex.properties if vertex else {}
-    missing = [label for label in _REQUIRED_PROPERTIES if not properties.get(label)]
-    if missing:
-        shown = ", ".join(missing[:4]) + (f" and {len(missing) - 4} more" if len(missing) > 4 else "")
-        raise HyrfDataError(
-            f"{name}: this PLY file holds no Gaussians, because its vertices have no {shown}",
-            fix="give one that a program for 3D Gaussian Splatting wrote",
-        )
+    properties = find_properties(header, name)
     rest = sum(label.startswith("f_rest_") for label in properties)
     terms = rest // 3 + 1
     if (
@@ -126,14 +120,14 @@ def decode_plain(data: bytes, name: str) -> Splats:
     rows = read_elements(data, header, {"vertex"}, name)["vertex"]
     harmonics = np.empty((len(rows), min(terms, num_sh_bases(MAX_DEGREE)), 3), np.float32)
     with np.errstate(over="ignore", invalid="ignore"):  # infinite results are rejected below; a NaN may warn
-        harmonics[:, 0] = stack_columns(rows, _COLOR_PROPERTIES)
+        harmonics[:, 0] = stack_columns(rows, COLOR_PROPERTIES)
         for channel, term in product(range(3), range(1, harmonics.shape[1])):
             harmonics[:, term, channel] = rows[f"f_rest_{channel * (terms - 1) + term - 1}"]
         return build_valid_splats(
             name,
-            stack_columns(rows, _POSITION_PROPERTIES),
-            np.exp(stack_columns(rows, _SCALE_PROPERTIES).astype(np.float64)),
-            stack_columns(rows, _ROTATION_PROPERTIES),
+            stack_columns(rows, POSITION_PROPERTIES),
+            np.exp(stack_columns(rows, SCALE_PROPERTIES).astype(np.float64)),
+            stack_columns(rows, ROTATION_PROPERTIES),
             expit(rows["opacity"].astype(np.float64)),
             harmonics,
         )
