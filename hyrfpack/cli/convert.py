@@ -12,7 +12,6 @@ from hyrfpack.cli.export import crop_option
 from hyrfpack.cli.settings import settings_options
 from hyrfpack.cli.types import OUTPUT, PATH
 from hyrfpack.config.export import ConvertConfig
-from hyrfpack.outputs import Outputs
 
 if TYPE_CHECKING:
     from hyrfpack.export import ConversionReport
@@ -46,11 +45,7 @@ def convert(
       hyrfpack convert scene.spz table.ply --crop -1,-1,-1,1,1,1
     """
     from hyrfpack.export.conversion import convert_splats as run
-    from hyrfpack.export.conversion import find_target_format
-    from hyrfpack.splats.names import sog_folder
 
-    find_target_format(source, target)
-    Outputs(source, folder=sog_folder(source), overwrite=overwrite).file(target)
     report = run(source, target, ConvertConfig(**settings), overwrite=overwrite)
     note_rename(target, report.file)
     if as_json:

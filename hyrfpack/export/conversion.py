@@ -16,7 +16,7 @@ from hyrfpack.checks import check_type
 from hyrfpack.config.export import ConvertConfig
 from hyrfpack.context import RunContext
 from hyrfpack.errors import HyrfDataError, HyrfError
-from hyrfpack.export.kinds import check_package, check_spz_version, select_splats
+from hyrfpack.export.kinds import check_package, check_spz_version, find_kind_by_ending, select_splats
 from hyrfpack.export.measure import psnr_of_splats
 from hyrfpack.outputs import Outputs
 from hyrfpack.progress import Progress, TaskEvent, part_of_progress
@@ -165,23 +165,17 @@ def find_target_format(source: str | os.PathLike[str], target: str | os.PathLike
             f"{source}: this is not a file of splats",
             fix=f"give a file that ends in {', '.join(READABLE_ENDINGS)}, or the folder of a SOG",
         )
-    name = Path(target).name.lower()
-    if name.endswith(".hyrf"):
+    if Path(target).suffix.lower() == ".hyrf":
         raise HyrfError(
             f"{target}: splats are imported as a model, not converted",
             fix=f"run 'hyrfpack import {source} -o {target}'",
         )
-    if name.endswith(".compressed.ply"):
-        raise HyrfError(
-            f"{target}: compressed PLY is read, not written",
-            fix="name a .sog or .spz file, which are smaller",
+    kind = find_kind_by_ending(target)
+    if not isinstance(kind, SplatFormat):
+        problem = (
+            f"{kind.ending} is not a format of splats" if kind else "the file extension does not name a known format"
         )
-    kind = FORMATS.get(Path(name).suffix)
-    if kind is None:
-        raise HyrfError(
-            f"{target}: the file extension does not name a known format",
-            fix=f"use one of {', '.join(FORMATS)}",
-        )
+        raise HyrfError(f"{target}: {problem}", fix=f"use one of {', '.join(FORMATS)}")
     return kind
 
 

@@ -38,6 +38,8 @@ COLLISION_FILES = tuple(
 )
 COLMAP_FOLDER = FileKind(ending="", max_degree=0, module="pycolmap")
 POSITION_KINDS = (COLMAP_FOLDER, *POINT_FILES)  # these hold the centres of Gaussians, and cameras
+_KINDS_WITHOUT_HARMONICS = (TRANSFORMS_JSON, *POSITION_KINDS, *MESH_FILES, *COLLISION_FILES)
+_KINDS_WITHOUT_COLORS = (TRANSFORMS_JSON, *COLLISION_FILES)
 PLAYER_FOLDER = FileKind(ending="")
 STREAMED_SOG_FOLDER = FileKind(ending="lod-meta.json", stores_antialiased=True)  # the folder's index
 TILES_FOLDER = FileKind(ending="tileset.json")  # the folder's index
@@ -82,25 +84,35 @@ def find_file_kind(
             )
         is_spz = kind is TILES_FOLDER and config.tile_content == SPZ_TILE_CONTENT
         return SPZ_TILES_FOLDER if is_spz else kind
-    if name.endswith(".compressed.ply"):
-        raise HyrfError(
-            f"{target}: compressed PLY is read, not written",
-            fix="use .sog or .spz, which are small, or .ply, which is not compressed",
-        )
-    for ending, kind in _KINDS_BY_ENDING.items():
-        if name.endswith(ending):
-            if Path(name).stem.endswith(".collision") and kind not in COLLISION_FILES:
-                raise HyrfError(
-                    f"{target}: a collision mesh is not written in this format",
-                    fix=f"use {', '.join(row.ending for row in COLLISION_FILES)}",
-                )
-            return kind
+    if (named := find_kind_by_ending(target)) is not None:
+        return named
     if os.path.isdir(target) or not Path(name).suffix:
         return PLAYER_FOLDER
     raise HyrfError(
         f"{target}: the file extension does not name a known format",
         fix=f"use one of {', '.join((*other_endings, *EXPORT_ENDINGS))}, or give a folder for a player",
     )
+
+
+def find_kind_by_ending(target: str | os.PathLike[str]) -> FileKind | None:
+    """Find the kind of file that the ending of `target` names; None if it is none of EXPORT_ENDINGS.
+
+    Raises:
+        HyrfError: the ending is that of compressed PLY, or ".collision" and a format without collision meshes.
+    """
+    name = Path(target).name.lower()
+    if name.endswith(".compressed.ply"):
+        raise HyrfError(
+            f"{target}: compressed PLY is read, not written",
+            fix="use .sog or .spz, which are small, or .ply, which is not compressed",
+        )
+    kind = next((kind for ending, kind in _KINDS_BY_ENDING.items() if name.endswith(ending)), None)
+    if kind is not None and kind not in COLLISION_FILES and Path(name).stem.endswith(".collision"):
+        raise HyrfError(
+            f"{target}: a collision mesh is not written in this format",
+            fix=f"use {', '.join(row.ending for row in COLLISION_FILES)}",
+        )
+    return kind
 
 
 def check_request(kind: FileKind, target: str | os.PathLike[str], config: ExportConfig) -> None:
@@ -119,6 +131,10 @@ def check_request(kind: FileKind, target: str | os.PathLike[str], config: Export
             f"{target}: levels of detail stand for all Gaussians, so that none can be left out",
             fix="leave out `crop` and `min_opacity`; select Gaussians with 'hyrfpack edit' and split its result",
         )
+    if kind in _KINDS_WITHOUT_HARMONICS and config.degree is not None:
+        raise HyrfError(f"{target}: this format has no spherical harmonics", fix="leave out `degree`")
+    if kind in _KINDS_WITHOUT_COLORS and config.exposure != LOCAL_EXPOSURE:
+        raise HyrfError(f"{target}: this format has no colours", fix=f"leave out `exposure={config.exposure!r}`")
     check_spz_version(kind, target, config)
     if config.tile_content != SPZ_TILE_CONTENT and not config.tiles_3d:
         raise HyrfError(

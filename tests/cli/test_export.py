@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from commands import hyrfpack, refused, succeeded
+from explicit_balls import ball_splats
 from exposures import random_map
 from scenes import ring, small_model
 
@@ -26,6 +27,7 @@ from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.cli import main
 from hyrfpack.format import save_model
 from hyrfpack.splats.files import read_splats
+from hyrfpack.splats.formats import ply
 from hyrfpack.web import view as web_view
 from hyrfpack.web.serve import MemoryFile
 
@@ -163,6 +165,12 @@ WRONG_REQUESTS = {
     "opacity": (("-o", "a.ply", "--min-opacity", "2"), "'--min-opacity'"),
     "NaN opacity": (("-o", "a.ply", "--min-opacity", "nan"), "nan is not allowed"),
     "crop of cameras": (("-o", "a.json", "--crop", "0,0,0,1,1,1"), "only cameras"),
+    "degree of cameras": (("-o", "a.json", "--sh-degree", "0"), "no spherical harmonics; leave out --sh-degree"),
+    "degree of COLMAP": (("-o", "out", "--colmap", "--sh-degree", "2"), "no spherical harmonics; leave out"),
+    "degree of points": (("-o", "a.points.glb", "--sh-degree", "2"), "no spherical harmonics; leave out"),
+    "degree of a mesh": (("-o", "a.obj", "--sh-degree", "2"), "no spherical harmonics; leave out"),
+    "exposure of cameras": (("-o", "a.json", "--exposure", "consistent"), "leave out --exposure consistent"),
+    "colours of physics": (("-o", "a.collision.glb", "--exposure", "consistent"), "leave out --exposure consistent"),
     "no photos": (("-o", "a.ply", "--data", "none"), "none"),
     "degree of a model": (("-o", "a.html", "--sh-degree", "1"), "--baked"),
     "crop of a player": (("-o", "player", "--crop", "0,0,0,1,1,1"), "--baked"),
@@ -247,13 +255,31 @@ def test_view_serves_the_player_and_the_file_at_a_free_port_until_ctrl_c(ending,
     assert (process.returncode, said) == (0, "") and "Traceback" not in messages
 
 
-def test_view_decodes_nothing_and_loads_no_torch(model):
+@pytest.mark.parametrize("ending", [".hyrf", ".ply"])
+def test_view_decodes_nothing_and_loads_no_torch(ending, model, tmp_path):
+    file = model
+    if ending != ".hyrf":
+        file = tmp_path / "cloud.ply"
+        file.write_bytes(ply.encode(ball_splats(20)))
     program = (
         "import sys, hyrfpack.web.view as v; v.serve = lambda page, files, **more: print(len(page), list(files));"
-        f"v.view({str(model)!r}, open_browser=False, on_ready=print); print('torch' in sys.modules)"
+        f"v.view({str(file)!r}, open_browser=False, on_ready=print); print('torch' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60)
-    assert done.stdout.endswith("['scene.hyrf']\nFalse\n")
+    assert done.stdout.endswith(f"['scene{ending}']\nFalse\n")
+
+
+POSITIONS_HEADER = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+FACES_HEADER = "element face 1\nproperty list uchar int vertex_indices\n"
+
+
+@pytest.mark.parametrize("elements", ["", FACES_HEADER], ids=["points", "mesh"])
+def test_view_rejects_a_ply_without_gaussians(elements, tmp_path, monkeypatch):
+    monkeypatch.setattr(web_view, "serve", None)
+    file = tmp_path / "points.ply"
+    file.write_text(f"{POSITIONS_HEADER}{elements}end_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
+    sentence = refused("view", file, "--no-browser")
+    assert sentence.startswith(f"Error: {file}: this PLY file holds no Gaussians, because its vertices have no f_dc_0,")
 
 
 @pytest.mark.parametrize("ending", ["", "/scene.json", ".zip"])
