@@ -6,10 +6,10 @@
 Each version trains and compresses each data set at several budgets, given as shares of this version's budget. This
 version scores the decoded files on held-out photos by PSNR and SSIM. For each data set the table has the change of
 bytes at equal PSNR in percent (BD-rate over the common range of PSNR, by monotone cubics). It also has the change of
-PSNR in dB and of SSIM at the largest common number of bytes, and the ratio of training times. The share `measured` is
-the budget that a version chooses itself. With that share alone, the table has PSNR, SSIM and bytes of both versions and
-their differences instead. With --sizes, each model is also compressed to shares of its default file, so one budget is
-enough for the change of bytes at equal PSNR:
+PSNR in dB and of SSIM at the largest common number of bytes, and the ratio of CPU seconds of `train`. The share
+`measured` is the budget that a version chooses itself. With that share alone, the table has PSNR, SSIM and bytes of
+both versions and their differences instead. With --sizes, each model is also compressed to shares of its default file,
+so one budget is enough for the change of bytes at equal PSNR:
 
     python -m tools.studies.compare_versions --against ../before --shares measured --sizes 1 0.7 0.5 0.35
 
@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import subprocess
 import sys
 import warnings
@@ -67,7 +68,7 @@ def train_and_score(
     options: Sequence[str] = (),
     size: float = 1,
 ) -> dict[str, float]:
-    """Train and compress with one version, score with this one, and return bytes, scores, seconds and Gaussians.
+    """Train and compress with one version, score with this one, and return bytes, scores, CPU seconds and Gaussians.
 
     With `gaussians` None, the version chooses its budget. `options` are further options of its command `train`. `size`
     is the share of the bytes of the version's default file that the scored file may have; 1 for that file itself.
@@ -76,25 +77,33 @@ def train_and_score(
     scores_file = out / f"scores{suffix}.json"
     if scores_file.exists():
         return json.loads(scores_file.read_text())
-    if not (out / "metrics.json").exists():
+    cpu_time = out / "cpu_seconds.json"  # The last file of a training.
+    if not cpu_time.exists():
         settings = ["--steps", str(steps), "--seed", str(seed), "--overwrite", *options]
         budget = [] if gaussians is None else ["--max-gaussians", str(gaussians)]
+        before = _children_cpu_seconds()
         _run_command(version, "train", str(scene.path), "-o", str(out), *settings, *budget)
+        cpu_time.write_text(json.dumps(_children_cpu_seconds() - before))
     default_file, packed = out / "compact.hyrf", out / f"compact{suffix}.hyrf"
     packed.unlink(missing_ok=True)
     limit = [] if size == 1 else ["--target-size", str(round(size * default_file.stat().st_size))]
     _run_command(version, "compress", str(out / "model.hyrf"), "-o", str(packed), *limit)
     scores = hyrfpack.evaluate_model(hyrfpack.load_model(packed), scene.test)
-    trained = json.loads((out / "metrics.json").read_text())
     result = {
         "bytes": packed.stat().st_size,
         "psnr": scores.psnr,
         "ssim": scores.ssim,
-        "seconds": trained["seconds"],
-        "gaussians": trained["gaussians"],
+        "seconds": json.loads(cpu_time.read_text()),
+        "gaussians": json.loads((out / "metrics.json").read_text())["gaussians"],
     }
     scores_file.write_text(json.dumps(result))
     return result
+
+
+def _children_cpu_seconds() -> float:
+    """Return the CPU seconds of all commands that have ended."""
+    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return usage.ru_utime + usage.ru_stime
 
 
 def _run_command(version: Path, command: str, *arguments: str) -> None:
@@ -171,10 +180,11 @@ def format_scores_row(name: str, ours: dict[str, float], theirs: dict[str, float
     for scores in (theirs, ours):
         cells.append(f"{scores['psnr']:.2f}, {scores['ssim']:.3f}, {scores['bytes'] / 1000:.0f}")
     cells += [f"{ours['psnr'] - theirs['psnr']:+.2f}", f"{ours['ssim'] - theirs['ssim']:+.4f}"]
-    return [*cells, f"{100 * (ours['bytes'] / theirs['bytes'] - 1):+.0f} %"]
+    cells.append(f"{100 * (ours['bytes'] / theirs['bytes'] - 1):+.0f} %")
+    return [*cells, f"{ours['seconds'] / theirs['seconds']:.2f}"]
 
 
-_SCORES_HEADER = ["set", "before: dB, SSIM, kB", "now", "dB", "SSIM", "bytes"]
+_SCORES_HEADER = ["set", "before: dB, SSIM, kB", "now", "dB", "SSIM", "bytes", "time"]
 
 
 def mean_over_seeds(points: Sequence[dict[str, float]]) -> dict[str, float]:
