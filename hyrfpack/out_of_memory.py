@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 from hyrfpack.errors import HyrfError, short_reason
 
 MAX_REASON_LENGTH = 160
+# What CUDA, HIP and Triton say where torch's allocator was not asked: a library's memory, a kernel's code or stack.
+_GPU_MESSAGE = re.compile(r"(CUDA|HIP)( driver)? error: out of memory|Triton Error \[\w+\]:.*out of memory")
 
 
 @contextmanager
@@ -31,7 +34,8 @@ def describe_out_of_memory(error: BaseException) -> str | None:
 
     The types of torch's errors are compared by name, so that this does not import torch.
     """
-    if type(error).__name__ == "OutOfMemoryError":
+    is_gpu_message = isinstance(error, RuntimeError) and _GPU_MESSAGE.search(str(error))
+    if type(error).__name__ == "OutOfMemoryError" or is_gpu_message:
         return f"the GPU's memory ran out ({short_reason(error, MAX_REASON_LENGTH)})"  # type: ignore[arg-type]
     if isinstance(error, MemoryError):
         return f"memory ran out ({short_reason(error, MAX_REASON_LENGTH)})"

@@ -26,15 +26,32 @@ def test_a_gpu_without_memory_is_one_sentence():
     assert str(caught.value) == expected
 
 
+@pytest.mark.parametrize(
+    "message",
+    [
+        "CUDA error: out of memory\nCUDA kernel errors might be asynchronously reported at some other API call",
+        "CUDA driver error: out of memory",
+        "HIP error: out of memory",
+        "Triton Error [CUDA]: out of memory",
+        "Triton Error [HIP]:  Code: 2, Messsage: out of memory",
+    ],
+)
+def test_errors_of_the_driver_and_of_triton_that_memory_ran_out_are_recognised(message):
+    with pytest.raises(HyrfError) as caught, explain_out_of_memory("reduce it"):
+        raise RuntimeError(message)
+    assert str(caught.value) == f"the GPU's memory ran out ({message.splitlines()[0]}); reduce it"
+
+
 @pytest.mark.parametrize("allocate", [lambda: torch.empty(1 << 55), lambda: bytearray(1 << 55)])
 def test_a_machine_without_memory_is_one_sentence(allocate):
     with pytest.raises(HyrfError, match=r"memory ran out \(.*\); reduce it"), explain_out_of_memory("reduce it"):
         allocate()
 
 
-def test_any_other_error_passes():
-    with pytest.raises(RuntimeError, match="shapes differ"), explain_out_of_memory("reduce it"):
-        raise RuntimeError("shapes differ")
+@pytest.mark.parametrize("message", ["shapes differ", "CUDA error: an illegal memory access was encountered"])
+def test_any_other_error_passes(message):
+    with pytest.raises(RuntimeError, match=message), explain_out_of_memory("reduce it"):
+        raise RuntimeError(message)
 
 
 def test_a_training_step_names_the_settings_of_training(monkeypatch):
