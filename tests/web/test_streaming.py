@@ -29,6 +29,7 @@ from hyrfpack.model.merged import MergedModel
 from hyrfpack.scene import Camera
 from hyrfpack.web import view as view_module
 from hyrfpack.web.serve import serve_in_thread
+from tools.browser.frames import frame_observer_script
 
 pytestmark = [pytest.mark.in_turn, pytest.mark.usefixtures("reset_window")]
 SCENE_FOLDER = Path(__file__).parents[1] / "golden" / "scene"
@@ -37,20 +38,7 @@ TRAINED_FILE = SCENE_FOLDER.parent / "trained" / "demo_compact.hyrf"
 SHARED_PATH, MANIFEST_PATH = "/scene/shared.hyrf", "/scene/scene.json"
 MIN_PSNR_DB = 45  # WebGL evaluates the fields with smaller numbers
 MIN_NEIGHBOUR_PSNR_DB = 30  # between two frames of a fade
-# Keeps each frame that is drawn. So long ago was the frame before that each step of a fade is the largest one.
-KEEP_FRAMES_JS = """(() => {
-  const { renderer } = hyrfpack.player, draw = renderer.draw.bind(renderer);
-  window.keptFrames = [];
-  renderer.draw = (...values) => {
-    draw(...values);
-    const { gl, content, frame: { target, size: [width, height] } } = renderer;
-    const rgba = new Uint8Array(4 * width * height);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, target);
-    gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, rgba);
-    keptFrames.push(btoa(Array.from(rgba, (byte) => String.fromCharCode(byte)).join("")));
-    content.fadedAt = performance.now() - 1000;
-  };
-})()"""
+KEEP_FRAME_JS = 'rgba => keptFrames.push(btoa(Array.from(rgba, byte => String.fromCharCode(byte)).join("")))'
 
 
 @pytest.fixture
@@ -211,7 +199,8 @@ def test_neighbouring_frames_of_a_switch_of_levels_are_alike(browser: Browser, h
     open_levels(browser, host, finest)
     wait_until_complete(browser)
     browser.evaluate("hyrfpack.player.settled.then(() => true)")
-    browser.evaluate(KEEP_FRAMES_JS)
+    browser.evaluate("void (window.keptFrames = [])")
+    browser.evaluate(frame_observer_script(KEEP_FRAME_JS))
     browser.evaluate("hyrfpack.player.redraw()")
     wait_until(browser, "keptFrames.length > 0")
     browser.evaluate(f"hyrfpack.player.loader.post({{ gaussians: {coarsest} }})")

@@ -17,6 +17,7 @@ from pathlib import Path
 import hyrfpack
 from tools.browser.browser import Browser
 from tools.browser.chromium import Chromium
+from tools.browser.frames import frame_observer_script
 from tools.studies.scene_page import serve_scene
 from tools.studies.web_player import PAGE_TIMEOUT_SECONDS
 from tools.tables import markdown_table
@@ -24,9 +25,8 @@ from tools.tables import markdown_table
 WINDOW_SIZE = (400, 266)
 BUDGET_SHARES = (1, 0.02, 1, 0.1, 1, 0.25, 1)
 POLL_SECONDS = 0.2
-# Compares each frame with the one before. So long ago was the frame before that each step of a fade is the largest one.
+# Compares each frame with the one before.
 COMPARE_FRAMES_SCRIPT = """(() => {
-  const { renderer } = hyrfpack.player, draw = renderer.draw.bind(renderer);
   const psnr = (a, b) => {
     let sum = 0;
     for (let i = 0; i < a.length; i++) sum += (a[i] - b[i]) ** 2;
@@ -36,18 +36,11 @@ COMPARE_FRAMES_SCRIPT = """(() => {
   window.comparedFrames = {
     begin: () => Object.assign(frames, { psnrs: [], first: frames.last }),
     end: () => [psnr(frames.first, frames.last), ...frames.psnrs],
+    add: (rgba) => {
+      if (frames.last) frames.psnrs.push(psnr(frames.last, rgba));
+      frames.last = rgba;
+    },
   };
-  renderer.draw = (...values) => {
-    draw(...values);
-    const { gl, content, frame: { target, size: [width, height] } } = renderer;
-    const rgba = new Uint8Array(4 * width * height);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, target);
-    gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, rgba);
-    if (frames.last) frames.psnrs.push(psnr(frames.last, rgba));
-    frames.last = rgba;
-    content.fadedAt = performance.now() - 1000;
-  };
-  hyrfpack.player.redraw();
 })()"""
 IS_DONE_SCRIPT = """hyrfpack.player.loader.gaussians === %d && hyrfpack.player.loader.state.isComplete &&
   hyrfpack.player.idle && !hyrfpack.player.renderer.content.fades.size"""
@@ -75,6 +68,8 @@ def measure(folder: Path) -> list[list[str]]:
         browser.evaluate("hyrfpack.ready")
         browser.evaluate("hyrfpack.player.settled.then(() => true)")
         browser.evaluate(COMPARE_FRAMES_SCRIPT)
+        browser.evaluate(frame_observer_script("comparedFrames.add"))
+        browser.evaluate("hyrfpack.player.redraw()")
         browser.evaluate("hyrfpack.player.settled.then(() => true)")
         for before, after in zip(budgets, budgets[1:], strict=False):
             change, *neighbours = change_budget(browser, after)
