@@ -19,6 +19,7 @@ from hyrfpack.cameras.capture import Capture
 from hyrfpack.cameras.paths import orbit
 from hyrfpack.compress.distortion import default_distortion
 from hyrfpack.context import RunContext
+from hyrfpack.counts import format_count
 from hyrfpack.data import load_scene
 from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.device import upload
@@ -96,8 +97,9 @@ class Subject:
             else f"quality against exact renders of the model from {len(self.cameras)} viewpoints around the scene"
         )
         return (
-            f"{self.name}: {len(self.model):,} Gaussians, {'a' if self.model.config.background else 'no'} background "
-            f"sphere, views of {camera.width} x {camera.height}, {against}"
+            f"{self.name}: {format_count(len(self.model), 'Gaussian')}, "
+            f"{'a' if self.model.config.background else 'no'} background sphere, "
+            f"views of {camera.width} x {camera.height}, {against}"
         )
 
 

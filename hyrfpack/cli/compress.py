@@ -27,6 +27,7 @@ from hyrfpack.cli.section_table import format_section_table
 from hyrfpack.cli.settings import settings_options
 from hyrfpack.cli.types import OUTPUT, PATH, reject_non_finite
 from hyrfpack.config.compress import CompressConfig
+from hyrfpack.counts import format_count
 from hyrfpack.outputs import Outputs
 
 if TYPE_CHECKING:
@@ -216,7 +217,7 @@ def _print_file(report: FileReport, shares: dict[str, float] | None = None) -> N
     click.echo(format_section_table(report.sections, report.bytes_after, report.gaussians, shares))
     ratio = report.bytes_before / report.bytes_after
     outcome = "all numbers as float32" if report.profile == "raw" else f"{ratio:.2f} times smaller than float32"
-    click.echo(f"{report.file}: {report.bytes_after:,} bytes, {report.gaussians:,} Gaussians, {outcome}")
+    click.echo(f"{report.file}: {report.bytes_after:,} bytes, {format_count(report.gaussians, 'Gaussian')}, {outcome}")
 
 
 def _print_compression(report: CompressionReport, scores: dict[str, float]) -> None:

@@ -48,6 +48,7 @@ from hyrfpack.config.edit import (
     Up,
     Upright,
 )
+from hyrfpack.counts import format_count
 
 if TYPE_CHECKING:
     from hyrfpack.edit import EditReport
@@ -305,12 +306,12 @@ def _print_report(report: EditReport) -> None:
     for step in report.actions:
         if step.region_psnr_before is not None:
             click.echo(
-                f"{step.action}: {step.gaussians_trained:,} Gaussians, PSNR there on held-out photos "
+                f"{step.action}: {format_count(step.gaussians_trained, 'Gaussian')}, PSNR there on held-out photos "
                 f"{step.region_psnr_before:.2f} to {step.region_psnr_after:.2f} dB"
             )
     click.echo(
-        f"renders before and after, {report.views} views: PSNR mean {report.psnr_change:.2f} dB, lowest "
-        f"{report.psnr_change_worst:.2f} dB"
+        f"renders before and after, {format_count(report.views, 'view')}: PSNR mean {report.psnr_change:.2f} dB, "
+        f"lowest {report.psnr_change_worst:.2f} dB"
     )
     if report.psnr_before is not None:
         click.echo(

@@ -12,6 +12,7 @@ from hyrfpack.cli.common import format_consistent_psnr, format_table, note, prin
 from hyrfpack.cli.drawing import drawing_options, largest_picture_size, select_views, split_option
 from hyrfpack.cli.progress import show_progress
 from hyrfpack.cli.types import OUTPUT, PATH
+from hyrfpack.counts import format_count
 from hyrfpack.outputs import Outputs
 
 if TYPE_CHECKING:
@@ -91,17 +92,21 @@ def evaluate(
     size = source.bytes
     width, height = largest_picture_size(view.camera for view in views)
     if scores.skipped:
-        note(f"{len(scores.skipped)} photos were not scored because their masks leave no pixel")
+        skipped = format_count(len(scores.skipped), "photo was", "photos were")
+        note(f"{skipped} not scored because the masks leave no pixel")
     if as_json:
         print_json({"bytes": size, "max_size": scene.max_size, "picture_size": [width, height], **scores.to_dict()})
         return
     rows = [*(_score_row(view.name, view) for view in scores.views), _score_row("mean", scores)]
     click.echo(format_table(["view", "PSNR (dB)", "corrected", "SSIM", "LPIPS"], rows))
     limit = f"--max-size {scene.max_size}" if scene.max_size else "as they are stored"
-    click.echo(f"{len(scores.views)} photos of up to {width} x {height} pixels ({limit})")
+    click.echo(f"{format_count(len(scores.views), 'photo')} of up to {width} x {height} pixels ({limit})")
     if scores.psnr_consistent is not None and drawing.exposure == AS_PHOTOGRAPHED:
         click.echo(f"mean PSNR {scores.psnr:.2f} dB{format_consistent_psnr(scores.psnr_consistent)}")
-    click.echo(f"{model}: {size:,} bytes, {scores.gaussians:,} Gaussians, {scores.seconds_per_frame:.4f} s a frame")
+    click.echo(
+        f"{model}: {size:,} bytes, {format_count(scores.gaussians, 'Gaussian')}, "
+        f"{scores.seconds_per_frame:.4f} s a frame"
+    )
     if scores.lpips is None:
         click.echo(f"LPIPS: {scores.lpips_reason}")
 

@@ -20,6 +20,7 @@ from hyrfpack.cli.common import (
 from hyrfpack.cli.settings import settings_options
 from hyrfpack.cli.types import BOX, HARMONICS_DEGREE, OUTPUT, PATH
 from hyrfpack.config.export import ExportConfig
+from hyrfpack.counts import format_count
 from hyrfpack.errors import HyrfError
 from hyrfpack.outputs import Outputs
 
@@ -131,7 +132,7 @@ def export(
         raise HyrfError(f"{splats[0]}: photos go with .hyrf files only", fix="leave out --data, or this file")
     if data and len(data) != len(models):
         raise HyrfError(
-            f"--data is given {len(data)} times for {len(models)} models",
+            f"--data is given {format_count(len(data), 'time')} for {format_count(len(models), 'model')}",
             fix="give it once for each model, or not at all",
         )
     check_request(kind, output, config)
@@ -193,7 +194,8 @@ def _print_exposures(report: ExportReport) -> None:
 def _print_report(report: ExportReport) -> None:
     if report.native:
         click.echo(
-            f"{report.file}: {report.bytes:,} bytes, {report.gaussians:,} Gaussians, unchanged: nothing is baked"
+            f"{report.file}: {report.bytes:,} bytes, {format_count(report.gaussians, 'Gaussian')}, unchanged: "
+            "nothing is baked"
         )
         return
     ending = Path(report.file).suffix
@@ -203,7 +205,9 @@ def _print_report(report: ExportReport) -> None:
             [f"baked to harmonics of degree {report.degree}, before writing", f"{report.psnr_baked:.2f}"],
             [f"read back from the {written}", f"{report.psnr:.2f}"],
         ]
-        click.echo(format_table([f"against renders of the model, {report.views} views", "PSNR (dB)"], rows))
+        click.echo(
+            format_table([f"against renders of the model, {format_count(report.views, 'view')}", "PSNR (dB)"], rows)
+        )
         click.echo(
             f"the first row shows the loss by baking, the second the loss by baking and by the rounding of {rounding} "
             "together; neither compares with photos"
@@ -211,14 +215,14 @@ def _print_report(report: ExportReport) -> None:
     if report.psnr_by_exposure:
         _print_exposures(report)
     behind = f", {report.background:,} of them for the background" if report.background else ""
-    holds = f", {report.gaussians:,} Gaussians{behind}" if report.gaussians else ""
-    cameras = f", {report.cameras:,} cameras" if report.cameras else ""
-    mesh = f", {report.vertices:,} vertices, {report.faces:,} triangles" if report.faces else ""
+    holds = f", {format_count(report.gaussians, 'Gaussian')}{behind}" if report.gaussians else ""
+    cameras = f", {format_count(report.cameras, 'camera')}" if report.cameras else ""
+    mesh = f", {report.vertices:,} vertices, {format_count(report.faces, 'triangle')}" if report.faces else ""
     voxels = f", voxels of {report.voxel:.4g} units" if report.voxel else ""
     click.echo(f"{report.file}: {report.bytes:,} bytes{holds}{cameras}{mesh}{voxels}")
     if report.chunks:
         levels = ", ".join(f"{count:,}" for count in report.level_gaussians)
-        click.echo(f"{report.chunks:,} chunks; Gaussians at each level, without the background: {levels}")
+        click.echo(f"{format_count(report.chunks, 'chunk')}; Gaussians at each level, without the background: {levels}")
     if report.surface_to_mesh and report.mesh_to_surface and report.wall:
         ways = {"surface to mesh": report.surface_to_mesh, "mesh to surface": report.mesh_to_surface}
         rows = [[way, *(f"{distance:.4g}" for distance in distances)] for way, distances in ways.items()]

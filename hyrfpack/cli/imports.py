@@ -20,6 +20,7 @@ from hyrfpack.cli.common import (
 from hyrfpack.cli.settings import settings_options
 from hyrfpack.cli.types import OUTPUT, PATH
 from hyrfpack.config.imports import ImportConfig
+from hyrfpack.counts import format_count
 
 if TYPE_CHECKING:
     from hyrfpack.imports import ImportReport
@@ -90,8 +91,8 @@ def import_(
     ]
     click.echo(format_table(["file", "Gaussians", "bytes", "smaller by"], rows))
     click.echo(
-        f"PSNR against renders of {source.name}, {report.views} held-out views: mean {report.psnr:.2f} dB, worst "
-        f"{report.psnr_worst:.2f} dB; took {report.seconds:.0f} s"
+        f"PSNR against renders of {source.name}, {format_count(report.views, 'held-out view')}: mean "
+        f"{report.psnr:.2f} dB, worst {report.psnr_worst:.2f} dB; took {report.seconds:.0f} s"
     )
 
 

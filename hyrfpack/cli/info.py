@@ -12,6 +12,7 @@ from hyrfpack.cli.console import print_line
 from hyrfpack.cli.section_table import format_section_table
 from hyrfpack.cli.types import PATH
 from hyrfpack.cli.wording import use_option_names
+from hyrfpack.counts import format_count
 from hyrfpack.errors import printable
 from hyrfpack.format.info import SectionSize
 from hyrfpack.outputs import ARCHIVE_SUFFIXES, PICTURE_SUFFIXES, VIDEO_SUFFIXES
@@ -83,7 +84,7 @@ def _print_run(folder: Path, as_json: bool) -> None:
         print_json({**facts, "run": asdict(run)})
         return
     if run.finished:
-        steps = "" if run.steps is None else f": {run.steps:,} steps"
+        steps = "" if run.steps is None else f": {format_count(run.steps, 'step')}"
         seconds = "" if run.seconds is None else f" in {run.seconds:,.0f} s"
         print_line(f"{folder}: a finished training run{steps}{seconds}")
     else:
@@ -106,7 +107,10 @@ def _print_scene(path: Path, as_json: bool) -> None:
         print_json(facts)
         return
     scene, name = facts["scene"], path.parent if path.name == "scene.json" else path
-    click.echo(f"{name}: {facts['bytes']:,} bytes, {facts['gaussians']:,} Gaussians in {len(scene['chunks'])} chunks")
+    click.echo(
+        f"{name}: {facts['bytes']:,} bytes, {format_count(facts['gaussians'], 'Gaussian')} in "
+        f"{format_count(len(scene['chunks']), 'chunk')}"
+    )
     print_line(f"written by {facts['writer']}, chunks of format {facts['version']}")
     for key in ("title", "licence"):
         if scene[key]:
@@ -136,7 +140,7 @@ def _print_splats(path: Path, as_json: bool) -> None:
     if as_json:
         print_json(facts.to_dict())
         return
-    click.echo(f"{path}: {facts.bytes:,} bytes, {facts.gaussians:,} Gaussians")
+    click.echo(f"{path}: {facts.bytes:,} bytes, {format_count(facts.gaussians, 'Gaussian')}")
     rows = [
         ("format", facts.format + (", antialiased" if facts.antialiased else "")),
         ("bytes/Gaussian", f"{facts.bytes / max(facts.gaussians, 1):.1f}"),
@@ -161,7 +165,7 @@ def _print_model(file: Path, as_json: bool) -> None:
 
 def _print_model_facts(file: Path, facts: dict) -> None:
     config, provenance = facts["config"], facts["provenance"]
-    click.echo(f"{file}: {facts['bytes']:,} bytes, {facts['gaussians']:,} Gaussians")
+    click.echo(f"{file}: {facts['bytes']:,} bytes, {format_count(facts['gaussians'], 'Gaussian')}")
     print_line(f"written by {facts['writer']}, format {facts['version']}, profile {facts['profile']}")
     if "parts" in facts:
         rows = [
@@ -186,7 +190,8 @@ def _print_model_facts(file: Path, facts: dict) -> None:
         print_line(f"  {name + ' grid':<18}  {_format_settings(config[name])}")
     if (exposure := facts["exposure"]) is not None:
         lowest, highest = exposure["stops"]
-        print_line(f"  {'exposure map':<18}  {exposure['centers']} centres, {lowest:+.2f} to {highest:+.2f} stops")
+        centers = format_count(exposure["centers"], "centre")
+        print_line(f"  {'exposure map':<18}  {centers}, {lowest:+.2f} to {highest:+.2f} stops")
     for name, value in config.items():
         if name not in ("frame", "geometry", "radiance"):
             print_line(f"  {name.replace('_', ' '):<18}  {value}")

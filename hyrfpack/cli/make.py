@@ -22,6 +22,7 @@ from hyrfpack.cli.live import serve_training_view, view_options
 from hyrfpack.cli.settings import reject_two_sizes, settings_options
 from hyrfpack.cli.types import OUTPUT, PATH
 from hyrfpack.config.make import MakeConfig
+from hyrfpack.counts import format_count
 
 if TYPE_CHECKING:
     from hyrfpack.make import MakeResult
@@ -121,14 +122,15 @@ def _print_result(result: MakeResult) -> None:
     total = f"{result.total_seconds:.0f} s in all"
     click.echo(f"times: {times}, {total}; intermediate results are in {result.work}, which you may delete")
     if result.psnr is not None:
-        photos = f"{result.views} photo{'s' if result.views > 1 else ''}"
         consistent = format_consistent_psnr(result.psnr_consistent)
+        photos = format_count(result.views, "photo")
         click.echo(f"{photos} held out: PSNR {result.psnr:.2f} dB{consistent}, SSIM {result.ssim:.4f}")
     elif result.training:
         click.echo("no photo is held out, so the scene is not scored")
     if result.note:
         click.echo(result.note)
-    click.echo(f"{result.output}: {result.bytes:,} bytes, {result.gaussians:,} Gaussians; {_viewing_hint(result)}")
+    size = f"{result.bytes:,} bytes, {format_count(result.gaussians, 'Gaussian')}"
+    click.echo(f"{result.output}: {size}; {_viewing_hint(result)}")
 
 
 def _viewing_hint(result: MakeResult) -> str:

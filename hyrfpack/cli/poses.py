@@ -13,6 +13,7 @@ from hyrfpack.cli.common import json_option, note, note_if_verbose, print_json
 from hyrfpack.cli.settings import settings_options
 from hyrfpack.cli.types import OUTPUT, PATH
 from hyrfpack.config.poses import PosesConfig
+from hyrfpack.counts import format_count
 
 if TYPE_CHECKING:
     from hyrfpack.poses import PosesReport
@@ -57,8 +58,9 @@ def poses(photos: Path, out: Path, masks: Path | None, overwrite: bool, as_json:
 
 def _print_result(result: PosesReport) -> None:
     """Print how many photos have a pose, which were left out and why, and the next command."""
+    of_photos = f"of {result.photos:,} photos"
     click.echo(
-        f"{result.scene}: {result.registered} of {result.photos} photos have a pose, "
+        f"{result.scene}: {format_count(result.registered, f'{of_photos} has', f'{of_photos} have')} a pose, "
         f"{result.sure} confirmed by both mappers; {result.why}"
     )
     for reason, count in Counter(result.left_out.values()).most_common():

@@ -16,6 +16,7 @@ from hyrfpack.cli.progress import show_item_progress
 from hyrfpack.cli.settings import settings_options
 from hyrfpack.cli.types import OUTPUT, PATH, SIZE
 from hyrfpack.config.render import DEFAULT_DEPTH_UNIT, GeometryConfig
+from hyrfpack.counts import format_count
 from hyrfpack.outputs import Outputs
 
 if TYPE_CHECKING:
@@ -164,7 +165,7 @@ def render(
     with exclusive_folder(output, ranks=ranks):  # the lock is held until the video is written, too
         ranks.run_on_all(lambda: check(replace=overwrite))
         width, height = largest_picture_size(camera for _, camera in named)
-        note(f"rendering {len(named)} pictures of up to {width} x {height} pixels")
+        note(f"rendering {format_count(len(named), 'picture')} of up to {width} x {height} pixels")
         parts = ranks.all_gather(ranks.run_on_all(write))
         if not ranks.is_main:
             return
@@ -192,4 +193,5 @@ def render(
     else:
         film = f" and {video_path.name}" if video_path else ""
         kinds = " and ".join(kind for kind, extension in (("depth", depth), ("normals", normals)) if extension)
-        click.echo(f"{output}: {len(written)} pictures{film}, {width} x {height} pixels{kinds and f', with {kinds}'}")
+        pictures = f"{format_count(len(written), 'picture')}{film}, {width} x {height} pixels"
+        click.echo(f"{output}: {pictures}{kinds and f', with {kinds}'}")

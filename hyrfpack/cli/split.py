@@ -19,6 +19,7 @@ from hyrfpack.cli.common import (
 from hyrfpack.cli.settings import settings_options
 from hyrfpack.cli.types import OUTPUT, PATH
 from hyrfpack.config.split import SplitConfig
+from hyrfpack.counts import format_count
 
 
 @click.command(short_help="Split a model into chunks with levels of detail.")
@@ -70,6 +71,6 @@ def split(
     shared = report.bytes_finest - report.level_bytes[0]
     click.echo(format_table(["files", "Gaussians", "bytes"], [["shared", "-", f"{shared:,}"], *rows]))
     click.echo(
-        f"{report.folder}: {report.chunks} chunks, {report.bytes:,} bytes; the finest level takes "
+        f"{report.folder}: {format_count(report.chunks, 'chunk')}, {report.bytes:,} bytes; the finest level takes "
         f"{report.bytes_finest:,} bytes, the model {report.bytes_source:,}"
     )

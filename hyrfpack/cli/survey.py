@@ -8,6 +8,7 @@ import click
 
 from hyrfpack.cli.console import print_line
 from hyrfpack.cli.wording import use_option_names
+from hyrfpack.counts import format_count
 
 if TYPE_CHECKING:
     from hyrfpack.survey import PhotoSurvey
@@ -19,16 +20,16 @@ _MAX_LISTED_KINDS = 4
 def print_survey(survey: PhotoSurvey) -> None:
     """Print a survey: a line for each fact, then each problem with what to do."""
     video = survey.kind == "video"
-    things = "frames" if video else "photo" if survey.photos == 1 else "photos"
-    print_line(f"{survey.path}: {survey.photos:,} {things}")
+    print_line(f"{survey.path}: {format_count(survey.photos, 'frame' if video else 'photo')}")
+    points = format_count(survey.points, "point")
     rows = [
-        ("poses", f"{survey.posed:,} as {survey.layout}, {survey.points:,} points" if survey.layout else "none"),
+        ("poses", f"{survey.posed:,} as {survey.layout}, {points}" if survey.layout else "none"),
         ("sizes", _format_counts(survey.sizes)),
         ("cameras", _format_counts(survey.cameras)),
         ("preset", survey.preset),
     ]
     if video:
-        rows.append(("taken", f"{survey.frames:,} frames would be"))
+        rows.append(("taken", f"{format_count(survey.frames, 'frame')} would be"))
     else:
         count = len(survey.blurred)
         rows.append(("sharpness", f"{survey.sharpness:.2f} ({count} of {survey.decoded} blurred)"))

@@ -25,6 +25,7 @@ from hyrfpack.cli.processes import processes_option
 from hyrfpack.cli.settings import reject_two_sizes, settings_options
 from hyrfpack.cli.types import OUTPUT, PATH
 from hyrfpack.config.train import TrainConfig
+from hyrfpack.counts import format_count
 from hyrfpack.errors import HyrfNoPosesError
 
 if TYPE_CHECKING:
@@ -139,7 +140,8 @@ def train(
             _estimate_poses(data, out, reader_options["images"], resume, overwrite), {**reader_options, "images": None}
         )
     where = describe_device(torch_device) + ("" if ranks.is_single else f" in each of {ranks.size} processes")
-    note(f"{scene.layout} scene: {len(scene.train)} photos to train on, {len(scene.test)} held out; on {where}")
+    photos = format_count(len(scene.train), "photo")
+    note(f"{scene.layout} scene: {photos} to train on, {len(scene.test)} held out; on {where}")
     cache = None if cache_mb is None else PictureCache(cache_mb * 2**20 // ranks.local_size)
     config, context = TrainConfig(**settings), RunContext(device=torch_device, ranks=ranks, cache=cache)
     with serve_training_view(out.name, view and ranks.is_main, view_port) as observer:
@@ -169,7 +171,7 @@ def train(
     elif result.complete and ranks.is_main:
         metrics = result.metrics
         click.echo(
-            f"{result.model}: {metrics['gaussians']:,} Gaussians, {metrics['bytes']:,} bytes, "
+            f"{result.model}: {format_count(metrics['gaussians'], 'Gaussian')}, {metrics['bytes']:,} bytes, "
             f"{metrics['seconds']:.0f} s of training"
         )
         if scores := metrics.get("evaluation"):

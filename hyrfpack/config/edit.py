@@ -12,6 +12,7 @@ from typing import Annotated
 
 from hyrfpack.checks import check_float, check_int
 from hyrfpack.config.settings import Range, check_settings
+from hyrfpack.counts import format_count
 
 Vector = tuple[float, float, float]
 DEFAULT_MIN_OPACITY_SHARE = 0.35
@@ -143,7 +144,9 @@ class CropPolygon:
         for point in self.points:
             _check_vector("a point of the polygon", point)
         if len(set(self.points)) < MIN_POLYGON_POINTS:
-            raise ValueError(f"the polygon has {len(set(self.points))} different points; it needs at least three")
+            raise ValueError(
+                f"the polygon has {format_count(len(set(self.points)), 'different point')}; it needs at least three"
+            )
         if len(self.points) > MAX_POLYGON_POINTS:
             raise ValueError(
                 f"the polygon has {len(self.points):,} points; at most {MAX_POLYGON_POINTS:,} are possible"
@@ -249,7 +252,7 @@ class Refit:
 
     def __str__(self) -> str:
         where = str(self.region).replace("crop to ", "").replace("remove", "all but", 1)
-        return f"refit {where} for {self.steps:,} steps"
+        return f"refit {where} for {format_count(self.steps, 'step')}"
 
 
 @dataclass(frozen=True)

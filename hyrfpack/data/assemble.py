@@ -10,6 +10,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from hyrfpack.counts import format_count
 from hyrfpack.data.equirectangular import CUBE_FACES, Face, FaceFile, face_lens, face_size
 from hyrfpack.data.folder import is_raw_name, list_pictures
 from hyrfpack.data.masks import check_mask_shape, find_masks
@@ -110,7 +111,8 @@ def make_scene(
     test = [view for view in views if view.name in test_names]
     if not train:
         raise HyrfDataError(
-            f"{path}: all {len(test)} photos are held out for testing and none is left to train on",
+            f"{path}: {format_count(len(test), 'photo is', 'photos are')} held out for testing, and none is "
+            "left to train on",
             fix="add photos, or hold out fewer with `test_every` (0 holds out none)",
         )
     raw_photos = _list_raw_photos_beside(photos)
@@ -147,19 +149,21 @@ def _list_raw_photos_beside(photos: list[Photo]) -> list[Path]:
 def _loading_notes(photos: list[Photo], max_size: int, mask_notes: list[str]) -> list[str]:
     """Return notes about how photos are changed when they are loaded."""
     notes = []
+    of_photos = f"of {len(photos):,} photos"
     masked = sum(photo.mask is not None for photo in photos)
     if masked:
-        notes.append(f"{masked} of {len(photos)} photos have a mask")
+        notes.append(f"{format_count(masked, f'{of_photos} has', f'{of_photos} have')} a mask")
     notes += mask_notes
     distorted = sum(photo.lens.is_distorted for photo in photos)
     if distorted:
-        notes.append(f"{distorted} of {len(photos)} photos are undistorted as they are loaded")
+        undistorted = f"{of_photos} is undistorted as it is loaded", f"{of_photos} are undistorted as they are loaded"
+        notes.append(format_count(distorted, *undistorted))
     shrunk = [photo.header.size for photo in photos if max(photo.header.size) > max_size > 0]
     if shrunk:
         width, height = max(shrunk, key=max)
         notes.append(
-            f"{len(shrunk)} of {len(photos)} photos are shrunk from up to {width} x {height} to {max_size} pixels on "
-            "the longer side; `max_size=0` keeps them"
+            f"{format_count(len(shrunk), f'{of_photos} is', f'{of_photos} are')} shrunk from up to {width} x {height} "
+            f"to {max_size} pixels on the longer side; `max_size=0` keeps them"
         )
     return notes
 
@@ -181,22 +185,26 @@ def missing_photos_notes(
     """
     if ambiguous and not photos:
         raise HyrfDataError(
-            f"{path}: the {len(missing)} photos that {where} lists cannot be assigned to files, because "
-            f"{min(ambiguous)} matches more than one file, or its file more than one name",
+            f"{path}: the {format_count(len(missing), 'photo')} that {where} lists cannot be assigned to files, "
+            f"because {min(ambiguous)} matches more than one file, or its file more than one name",
             fix="use the same file names as the poses",
         )
     if missing and not photos:
         raise HyrfDataError(
-            f"{path}: none of the {len(missing)} photos that {where} lists is on disk (looked for {min(missing)}; "
-            f"{_describe_folder(path, min(missing))})",
+            f"{path}: none of the {len(missing)} photos that {where} lists is on disk (looked for "
+            f"{min(missing)}; {_describe_folder(path, min(missing))})",
             fix="put them at the paths that the poses name, as JPEG or PNG",
         )
     if not missing:
         return []
-    return [
-        f"{len(missing)} of {len(missing) + len(photos)} photos listed in {where} are not on disk and were skipped "
-        f"(such as {min(missing)})"
-    ]
+    listed = f"of {len(missing) + len(photos):,} photos listed in {where}"
+    skipped = format_count(len(missing), f"{listed} is not on disk and was", f"{listed} are not on disk and were")
+    return [f"{skipped} skipped (such as {min(missing)})"]
+
+
+def unregistered_note(count: int) -> str:
+    """Return a note about photos that a reconstruction has not registered."""
+    return f"{format_count(count, 'photo is not registered and was', 'photos are not registered and were')} skipped"
 
 
 def _describe_folder(path: Path, name: str) -> str:
@@ -208,7 +216,7 @@ def _describe_folder(path: Path, name: str) -> str:
         endings = Counter(entry.suffix or "other" for entry in (path / folder).iterdir() if entry.is_file())
     except (OSError, ValueError):  # ValueError: no folder can have this name
         return f"there is no folder {folder}{near}"
-    held = ", ".join(f"{count} {ending} files" for ending, count in endings.most_common(3))
+    held = ", ".join(format_count(count, f"{ending} file") for ending, count in endings.most_common(3))
     return f"{'that folder' if folder.parts else 'the folder'} holds {held or 'no file'}{near}"
 
 
@@ -248,9 +256,10 @@ def _apply_orientations(photos: list[Photo], notes: list[str]) -> list[Photo]:
     if upright and not stored:
         upright |= {photo.path for photo in photos if orientations[photo.path] != 1 and fits(photo)}
     if upright:
+        of_photos = f"of {len(photos):,} photos"
         notes.append(
-            f"{len(upright)} of {len(photos)} photos are rotated by their EXIF orientation, because their cameras were "
-            "calibrated on upright pictures"
+            f"{format_count(len(upright), f'{of_photos} is', f'{of_photos} are')} rotated by their EXIF orientation, "
+            "because their cameras were calibrated on upright pictures"
         )
     return [
         replace(photo, header=photo.header.turned(orientations[photo.path]), orientation=orientations[photo.path])
@@ -360,7 +369,11 @@ def _drop_nonfinite_points(
     with np.errstate(over="ignore"):  # training uses the points in float32
         finite = np.all(np.isfinite(points.astype(np.float32)), axis=1)
     if not finite.all():
-        notes.append(f"{(~finite).sum()} of {len(points)} points are not finite and were dropped")
+        of_points = f"of {len(points):,} points"
+        dropped = format_count(
+            (~finite).sum(), f"{of_points} is not finite and was", f"{of_points} are not finite and were"
+        )
+        notes.append(f"{dropped} dropped")
     new_row = np.cumsum(finite) - 1  # row of each finite point after the others are dropped
     visible = {p.name: np.unique(p.visible_points) for p in photos if p.visible_points is not None}
     tracks = {name: new_row[rows[finite[rows]]] for name, rows in visible.items()}

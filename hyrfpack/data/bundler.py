@@ -15,7 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hyrfpack.data.assemble import make_scene
+from hyrfpack.counts import format_count
+from hyrfpack.data.assemble import make_scene, unregistered_note
 from hyrfpack.data.folder import downscale_factor
 from hyrfpack.data.pictures import PictureHeader
 from hyrfpack.data.sidecar_files import PoseEntry, find_listed_folder, find_listed_photos, find_picture_folder
@@ -56,7 +57,8 @@ def read_bundler(path: Path, *, test_every: int, max_size: int) -> Scene:
     cameras, points, colors = _read_bundle(bundle)
     if len(names) != len(cameras):
         raise HyrfDataError(
-            f"{bundle}: holds {len(cameras)} cameras, but {listing.name} lists {len(names)} photos",
+            f"{bundle}: holds {format_count(len(cameras), 'camera')}, but {listing.name} lists "
+            f"{format_count(len(names), 'photo')}",
             fix="export both again",
         )
     entries: list[PoseEntry] = []
@@ -71,7 +73,7 @@ def read_bundler(path: Path, *, test_every: int, max_size: int) -> Scene:
     folder = find_listed_folder(path, names) or _check_full_size(find_picture_folder(path, None))
     photos, masks, notes = find_listed_photos(path, folder, entries, bundle.name)
     if len(entries) < len(names):
-        notes.append(f"{len(names) - len(entries)} photos are not registered and were skipped")
+        notes.append(unregistered_note(len(names) - len(entries)))
     return make_scene(
         path,
         "bundler",

@@ -10,7 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hyrfpack.data.assemble import Photo, make_scene, missing_photos_notes
+from hyrfpack.counts import format_count
+from hyrfpack.data.assemble import Photo, make_scene, missing_photos_notes, unregistered_note
 from hyrfpack.data.colmap_binary import check_binary_model
 from hyrfpack.data.colmap_repair import read_image_names, readable_model
 from hyrfpack.data.folder import downscale_factor
@@ -66,7 +67,7 @@ def read_colmap(path: Path, *, test_every: int, images: str | None, model: str |
         )
         notes.append(f"photos are read from {'the folder itself' if folder == path else relative_folder}{smaller}")
     if unposed:
-        notes.append(f"{unposed} photos are not registered and were skipped")
+        notes.append(unregistered_note(unposed))
     if not len(points):
         notes.append(
             f"the model in {tables.relative_to(path)} has no points; training starts from random positions instead"
@@ -129,7 +130,7 @@ def _choose_model(path: Path, models: Sequence[Path], name: str | None) -> tuple
     if name is None and len(models) == 1:
         return models[0], []
     sizes = {model: _count_registered_photos(model) for model in models}
-    there = ", ".join(f"{model.name} ({size} photos)" for model, size in sizes.items())
+    there = ", ".join(f"{model.name} ({format_count(size, 'photo')})" for model, size in sizes.items())
     chosen = max(models, key=lambda model: sizes[model])  # max returns the first of several models of the same size
     why = "because it has the most photos; select another with `model`"
     if name is not None:

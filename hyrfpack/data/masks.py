@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from hyrfpack.counts import format_count
 from hyrfpack.data.equirectangular import FaceFile
 from hyrfpack.data.names import PictureIndex
 from hyrfpack.data.pictures import PhotoFile, has_same_aspect, is_picture_name, read_header
@@ -121,8 +122,9 @@ def _unmatched_mask_notes(folder: Path, unmatched: list[Path], count: int, names
     """Return a list with a note about masks that match no photo; the list is empty if there are none."""
     if not unmatched:
         return []
+    of_masks = f"of {count} masks in {folder.name}"
     return [
-        f"{len(unmatched)} of {count} masks in {folder.name} match no posed photo (such as "
+        f"{format_count(len(unmatched), f'{of_masks} matches', f'{of_masks} match')} no posed photo (such as "
         f"{unmatched[0].relative_to(folder)}); give each the name of its photo"
         f"{f' (such as {names[0]})' if names else ''}"
     ]

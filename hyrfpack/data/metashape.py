@@ -22,6 +22,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from hyrfpack.counts import format_count
 from hyrfpack.data.assemble import make_scene
 from hyrfpack.data.equirectangular import panorama_lens
 from hyrfpack.data.pictures import PictureHeader
@@ -109,7 +110,8 @@ def read_metashape(path: Path, *, test_every: int, images: str | None, max_size:
     photos, masks, found = find_listed_photos(path, find_picture_folder(path, images), entries, table.name)
     notes += frame_notes + found
     if unposed:
-        notes.append(f"{unposed} photos have no pose in the chosen component and were skipped")
+        left_out = "no pose in the chosen component and"
+        notes.append(f"{format_count(unposed, f'photo has {left_out} was', f'photos have {left_out} were')} skipped")
     points, colors, tables = read_sidecar_points(path, photos, notes)
     return make_scene(
         path,

@@ -15,6 +15,7 @@ from difflib import get_close_matches
 from functools import cached_property
 from pathlib import Path
 
+from hyrfpack.counts import format_count
 from hyrfpack.data.folder import is_raw_name, list_photos, list_pictures
 from hyrfpack.outputs import PICTURE_SUFFIXES, READABLE_PICTURE_SUFFIXES
 
@@ -47,14 +48,17 @@ class NameMatches:
             first = self.inexact[0]
             file = Path(os.path.relpath(self.found[first], self.folder)).as_posix()
             accents = " in another form of Unicode" if _normalize_unicode(file) == _normalize_unicode(first) else ""
+            of = f"of {len(self.found)} photos"
+            differ = "other names than in the poses and"
             notes.append(
-                f"{len(self.inexact)} of {len(self.found)} photos have other names than in the poses and were "
+                f"{format_count(len(self.inexact), f'{of} has {differ} was', f'{of} have {differ} were')} "
                 f"matched to the only file that fits (such as {first} to {file}{accents})"
             )
         if self.ambiguous:
             notes.append(
-                f"{len(self.ambiguous)} photos were not matched (such as {self.ambiguous[0]}), because they fit more "
-                "than one file, or their file more than one name; use the same file names as the poses"
+                f"{format_count(len(self.ambiguous), 'photo was', 'photos were')} not matched (such as "
+                f"{self.ambiguous[0]}), because they fit more than one file, or their file more than one name; use the "
+                "same file names as the poses"
             )
         return notes
 

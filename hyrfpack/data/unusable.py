@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
+from hyrfpack.counts import format_count
 from hyrfpack.data.folder import list_raw_photos
 from hyrfpack.data.pictures import HEIC_REMEDY, HEIC_REQUIREMENT, RAW_REMEDY
 from hyrfpack.errors import HyrfDataError
@@ -22,11 +23,6 @@ def format_file_names(names: Sequence[str]) -> str:
     """
     more = len(names) - MAX_NAMED_FILES
     return ", ".join(names[:MAX_NAMED_FILES]) + (f" and {more} more" if more > 0 else "")
-
-
-def format_photo_count(count: int) -> str:
-    """Format a number of photos: "1 photo", "2 photos"."""
-    return "1 photo" if count == 1 else f"{count:,} photos"
 
 
 def raise_if_single_photo(path: Path) -> None:
@@ -92,7 +88,7 @@ def _unreadable_problems(reasons: Mapping[str, str], count: int) -> list[tuple[s
 
 def _cannot_be_read(names: Sequence[str], count: int) -> str:
     """Return the first part of a sentence about unreadable photos."""
-    return f"{len(names):,} of {format_photo_count(count)} cannot be read: {format_file_names(names)}"
+    return f"{len(names):,} of {format_count(count, 'photo')} cannot be read: {format_file_names(names)}"
 
 
 def no_photos_error(given: Path, folder: Path) -> HyrfDataError:

@@ -18,6 +18,7 @@ from PIL import Image
 from hyrfpack.compress import compress_model
 from hyrfpack.config.compress import CompressConfig
 from hyrfpack.context import RunContext
+from hyrfpack.counts import format_count
 from hyrfpack.data import load_scene
 from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.evaluate import evaluate_model
@@ -199,7 +200,8 @@ def _draw(model: HybridModel, scene: Scene, result: DemoResult) -> Image.Image:
         photo = torch.from_numpy(view.load().composite(solid))
         image = to_8bit(render_view(model, view.camera, decoded=decoded).rgb)
         rows.append(draw_comparison(photo, image, caption=f"{view.name}   {psnr(image, photo):.2f} dB"))
-    title = f"hyrfpack demo: {result.gaussians:,} Gaussians, {result.steps:,} steps in {result.train_seconds:.0f} s"
+    title = f"hyrfpack demo: {format_count(result.gaussians, 'Gaussian')}, {result.steps:,} steps in "
+    title += f"{result.train_seconds:.0f} s"
     return draw_contact_sheet(rows, title, result.table())
 
 

@@ -19,6 +19,7 @@ from torch import Tensor
 from hyrfpack.choices import AS_PHOTOGRAPHED
 from hyrfpack.compress.finetune import fit_residual_gains
 from hyrfpack.config.train import LearningRates
+from hyrfpack.counts import format_count
 from hyrfpack.data import PictureCache
 from hyrfpack.device import upload
 from hyrfpack.errors import HyrfError
@@ -74,7 +75,8 @@ def refit(
     shown = [view for view, pixels in zip(views, light, strict=True) if pixels >= MIN_REGION_PIXELS]
     if not shown:
         raise HyrfError(
-            f"none of the {len(views)} training photos shows the {is_selected.sum():,} Gaussians to be trained",
+            f"none of the {len(views)} training photos shows the {format_count(is_selected.sum(), 'Gaussian')} to be "
+            "trained",
             fix="choose another region",
         )
     cache = PictureCache()

@@ -67,7 +67,7 @@ def _(action: CropCameras, state: EditState) -> np.ndarray:
         hull = ConvexHull(corners)
     except (QhullError, ValueError):
         raise HyrfError(
-            f"the {len(corners)} cameras of the scene stand at one place or in a row, so they surround nothing",
+            f"the cameras of the scene ({len(corners)}) stand at one place or in a row, so they surround nothing",
             fix="crop to a box or a sphere instead",
         ) from None
     center = corners[hull.vertices].mean(axis=0)

@@ -15,6 +15,7 @@ import torch
 
 from hyrfpack.checks import check_type
 from hyrfpack.choices import AS_PHOTOGRAPHED, CONSISTENT_EXPOSURE
+from hyrfpack.counts import format_count
 from hyrfpack.device import upload
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate.exposure import correct_colors
@@ -188,7 +189,7 @@ def evaluate_model(
                     if unwritten is None:
                         raise
                     unwritten.append(str(error))
-        progress(TaskEvent(f"scored {len(own)} photos", 1.0))
+        progress(TaskEvent(f"scored {format_count(len(own), 'photo')}", 1.0))
         return scores
 
     with nullcontext() if pictures is None else exclusive_folder(pictures, ranks=ranks):

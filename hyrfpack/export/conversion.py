@@ -15,6 +15,7 @@ from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.checks import check_type
 from hyrfpack.config.export import ConvertConfig
 from hyrfpack.context import RunContext
+from hyrfpack.counts import format_count
 from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.export.kinds import check_package, check_spz_version, find_kind_by_ending, select_splats
 from hyrfpack.export.measure import psnr_of_splats
@@ -128,7 +129,7 @@ def _convert(
     weighted = WeightedSplats.from_splats(whole, str(source))
     camera = Viewpoint.from_frame(weighted.frame.center, weighted.frame.scale).camera
     hints = Hints(camera=camera, spz_version=config.spz_version)
-    progress(TaskEvent(f"writing {len(kept):,} Gaussians as {kind.ending}", 0.2))
+    progress(TaskEvent(f"writing {format_count(len(kept), 'Gaussian')} as {kind.ending}", 0.2))
     data = kind.encode(kept, hints)
     progress(TaskEvent("reading the file back", 0.5))
     after = kind.decode(data, str(target))

@@ -17,6 +17,7 @@ from PIL import Image
 from hyrfpack.atomic import pending_file, write_atomic
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.checks import check_type
+from hyrfpack.counts import format_count
 from hyrfpack.evaluate import evaluate_model
 from hyrfpack.evaluate.metrics import IDENTICAL_PSNR
 from hyrfpack.export.pages import page_cameras, suggest_compression
@@ -131,7 +132,7 @@ def _write_player(
             poster = None
         else:
             output.write(poster, encode_poster(scene.poster, "JPEG", MAX_POSTER_BYTES))
-        description = f"{count:,} Gaussians, {scene.length:,} bytes"
+        description = f"{format_count(count, 'Gaussian')}, {scene.length:,} bytes"
     output.write(ELEMENT_SCRIPT_NAME, encode_element_script())
     output.write(README_NAME, encode_readme(title, INDEX_NAME, INDEX_NAME, element=content or "URL"))
     for name, encoded in encode_player_files(editable).items():
@@ -185,7 +186,10 @@ def export_gallery(
     """
     scenes = list(data) or [None] * len(sources)
     if len(scenes) != len(sources) or not sources:
-        raise ValueError(f"{len(scenes)} sets of photos for {len(sources)} models; give one for each, or none at all")
+        raise ValueError(
+            f"{format_count(len(scenes), 'set')} of photos for {format_count(len(sources), 'model')}; give one for "
+            "each, or none at all"
+        )
     for scene in scenes:
         if scene is not None:
             check_type("data", scene, Scene)
@@ -304,9 +308,9 @@ class _PlayableContent:
 def _describe_quality(path: StrPath, model: HybridModel | MergedModel, data: Scene | None) -> str:
     """Describe the quality of a model in words, on held-out photos if there are any, else as stated in its file."""
     if data is not None and data.test:
-        _LOG.info(f"scoring on {_format_photo_count(len(data.test))}")
+        _LOG.info(f"scoring on {format_count(len(data.test), 'held-out photo')}")
         scores = evaluate_model(model, data.test)
-        return f"{scores.psnr:.2f} dB on {_format_photo_count(len(scores.views))}"
+        return f"{scores.psnr:.2f} dB on {format_count(len(scores.views), 'held-out photo')}"
     if isinstance(model, MergedModel):
         return ""
     provenance = describe_file(path)["provenance"]
@@ -354,10 +358,6 @@ def _playable_ending(path: StrPath) -> str:
     """Return the ending of a file to be played; ".hyrf" for all files without an ending of splats."""
     ending = Path(path).suffix.lower()
     return ending if ending in READABLE_ENDINGS else HYRF_ENDING
-
-
-def _format_photo_count(count: int) -> str:
-    return f"{count:,} held-out photo{'' if count == 1 else 's'}"
 
 
 def _folder_title(folder: StrPath) -> str:

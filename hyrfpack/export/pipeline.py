@@ -13,6 +13,7 @@ from hyrfpack.atomic import write_atomic
 from hyrfpack.checks import check_type
 from hyrfpack.config.export import ExportConfig
 from hyrfpack.context import RunContext
+from hyrfpack.counts import format_count
 from hyrfpack.errors import HyrfError
 from hyrfpack.export.baked_scene import BakedScene, ShownSplats, bake_scene
 from hyrfpack.export.cameras import encode_transforms, write_colmap
@@ -170,8 +171,8 @@ def _export_gaussians(
     if kind in POSITION_KINDS:
         return _write_points(baked, target, kind, overwrite)
     count = len(baked.splats) - baked.background_count
-    _LOG.info(f"writing {count:,} Gaussians{' and the background' if baked.sphere else ''}")
-    progress(TaskEvent(f"writing {count:,} Gaussians", 0.5))
+    _LOG.info(f"writing {format_count(count, 'Gaussian')}{' and the background' if baked.sphere else ''}")
+    progress(TaskEvent(f"writing {format_count(count, 'Gaussian')}", 0.5))
     result, written = _write_splats(baked, target, kind, config, overwrite)
     if config.crop is not None:
         _LOG.info("quality is not measured, because a part of the scene was cropped")
@@ -191,7 +192,7 @@ def _export_levels(
     """Export all levels of a scene folder, and measure the finest one."""
     check_model(loaded, kind, config)
     baked = bake_levels(loaded, scene, kind, config, part_of_progress(progress, 0.0, 0.6))
-    _LOG.info(f"writing {len(baked.chunks)} chunks")
+    _LOG.info(f"writing {format_count(len(baked.chunks), 'chunk')}")
     write = write_streamed_sog if kind is STREAMED_SOG_FOLDER else partial(write_tiles, kind)
     size, written = write(baked, target, overwrite, part_of_progress(progress, 0.6, 0.8))
     report = replace(

@@ -7,6 +7,7 @@ import math
 from dataclasses import replace
 
 from hyrfpack.choices import SPLAT_EXPOSURES
+from hyrfpack.counts import format_count
 from hyrfpack.export.baked_scene import BakedScene, ShownSplats
 from hyrfpack.export.measure import PsnrScores, measure_psnr
 from hyrfpack.export.report import ExportReport
@@ -35,7 +36,7 @@ def measure_export(
     if not loaded.measured_views:
         _LOG.info("quality is not measured, because no photo is held out")
         return result
-    _LOG.info(f"measuring at {len(loaded.measured_views)} views")
+    _LOG.info(f"measuring at {format_count(len(loaded.measured_views), 'view')}")
     file_share = 0.57 if baked.by_exposure else 1.0
     result = _add_file_scores(result, baked, written, kind, part_of_progress(progress, 0.0, file_share))
     if not baked.by_exposure:

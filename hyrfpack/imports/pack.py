@@ -13,6 +13,7 @@ from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.compress.calibrate import measure_calibrated_sensitivity
 from hyrfpack.compress.limits import EncodedCandidate
 from hyrfpack.compress.packer import Packer
+from hyrfpack.counts import format_count
 from hyrfpack.errors import HyrfSizeError
 from hyrfpack.imports.prepare import PreparedModel
 from hyrfpack.progress import Progress, TaskEvent, ignore_progress, part_of_progress, round_of_progress
@@ -75,7 +76,10 @@ def pack(
     psnrs = np.array(prepared.validation.psnr_per_view(model))
     allowed, error = _mse(psnr), _mse(psnrs.mean())
     allowance = max(allowed - error, min(FALLBACK_MODEL_ERROR_SHARE * error, FALLBACK_ALLOWED_ERROR_SHARE * allowed))
-    _LOG.info(f"measuring how each stored number affects renders, at {len(prepared.cameras)} cameras and between them")
+    _LOG.info(
+        f"measuring how each stored number affects renders, at {format_count(len(prepared.cameras), 'camera')} and "
+        "between them"
+    )
     distortion = PLANNED_ERROR_SHARE * solve_added_error(_mse(psnrs), error + allowance)
     measuring = part_of_progress(progress, 0.0, 0.7)
     sensitivity, _ = measure_calibrated_sensitivity(

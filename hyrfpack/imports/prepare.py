@@ -12,6 +12,7 @@ import torch
 from hyrfpack.cameras.view_sampling import sample_views, shrink_camera
 from hyrfpack.config.imports import ImportConfig
 from hyrfpack.config.settings import LARGEST_SEED
+from hyrfpack.counts import format_count
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.imports.exact_model import exact_model
 from hyrfpack.imports.reference import ReferenceViews, mean_sent_light
@@ -71,16 +72,18 @@ def prepare_model(
     weighted = WeightedSplats.from_splats(splats, name)
     original = Drawable.from_splats(splats, weighted.frame, device)
     chosen, validation, test = _choose_cameras(weighted, original, config, cameras)
+    how = "sampled" if cameras is None else "given"
     _LOG.info(
-        f"{len(splats):,} Gaussians, harmonics of degree {splats.degree}; {len(chosen)} "
-        f"{'sampled' if cameras is None else 'given'} viewpoints, {len(test)} held out"
+        f"{format_count(len(splats), 'Gaussian')}, harmonics of degree {splats.degree}; "
+        f"{format_count(len(chosen), f'{how} viewpoint')}, {len(test)} held out"
     )
     progress(TaskEvent("measuring which Gaussians are visible", 0.2))
     light = mean_sent_light(original, evenly_spaced(chosen, LIGHT_MEASUREMENT_VIEWS))
     kept = torch.from_numpy(_indices_without_faint(light.cpu().numpy())).to(device)
     if not len(kept):
         raise HyrfDataError(f"{name}: no view shows anything of the Gaussians", fix="give others with `cameras`")
-    _LOG.info(f"{len(splats) - len(kept):,} Gaussians are hardly visible and are left out")
+    left_out = len(splats) - len(kept)
+    _LOG.info(f"{format_count(left_out, 'Gaussian is', 'Gaussians are')} hardly visible and not kept")
     model = exact_model(original[kept])
     progress(TaskEvent("rendering held-out views", 0.6))
     validation_views, test_views = (ReferenceViews.from_splats(original, views) for views in (validation, test))

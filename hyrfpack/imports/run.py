@@ -17,6 +17,7 @@ from hyrfpack.atomic import write_atomic
 from hyrfpack.checks import check_type
 from hyrfpack.config.imports import ImportConfig
 from hyrfpack.context import RunContext
+from hyrfpack.counts import format_count
 from hyrfpack.format.min_file_size import check_target_bytes
 from hyrfpack.imports.pack import pack
 from hyrfpack.imports.prepare import prepare_model
@@ -169,7 +170,9 @@ def import_loaded_splats(
         )
         unpacked_psnr = float(np.mean(prepared.test.psnr_per_view(prepared.model)))
         _LOG.info(f"PSNR before compression: {unpacked_psnr:.2f} dB")
-        imported = f"{len(splats):,} Gaussians of degree {splats.degree} from {Path(name).name}, without photos"
+        imported = (
+            f"{format_count(len(splats), 'Gaussian')} of degree {splats.degree} from {Path(name).name}, without photos"
+        )
         choices = {"imported": imported}
         # By default, `compress` adds a share of this error. That of the model itself would be next to none.
         psnr = min(unpacked_psnr, config.psnr)

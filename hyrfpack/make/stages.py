@@ -19,6 +19,7 @@ from hyrfpack.config.compress import CompressConfig
 from hyrfpack.config.poses import PosesConfig
 from hyrfpack.context import RunContext
 from hyrfpack.copying import copy_file
+from hyrfpack.counts import format_count
 from hyrfpack.device import describe_device
 from hyrfpack.errors import HyrfError, HyrfSizeError
 from hyrfpack.evaluate import evaluate_model
@@ -123,7 +124,8 @@ def run_training_stage(
         if not (resuming and _is_run_finished(run)):
             at_most = "at most " if measures_length(scene, config) else ""
             _LOG.info(
-                f"training: {at_most}{plan.steps:,} steps on {len(scene.train)} photos, {len(scene.test)} held out; "
+                f"training: {at_most}{format_count(plan.steps, 'step')} on {format_count(len(scene.train), 'photo')}, "
+                f"{len(scene.test)} held out; "
                 f"on {describe_device(context.choose_device())}"
             )
             resume = resuming and is_begun(run)
@@ -185,7 +187,10 @@ class _TrainingProgress:
             self._means.add(event)
             quality = () if self._means.mse is None else (format_psnr(self._means.mse),)
             self._reporter.update(
-                event.share_done, f"step {event.step}/{event.steps}", *quality, f"{event.gaussians:,} Gaussians"
+                event.share_done,
+                f"step {event.step}/{event.steps}",
+                *quality,
+                format_count(event.gaussians, "Gaussian"),
             )
             if event.step == event.steps:
                 self._begin("results")

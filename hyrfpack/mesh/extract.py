@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from hyrfpack.choices import AS_PHOTOGRAPHED
+from hyrfpack.counts import format_count
 from hyrfpack.errors import HyrfError
 from hyrfpack.mesh.bounds import choose_grid
 from hyrfpack.mesh.clean import reduce_faces, remove_small_components
@@ -92,7 +93,8 @@ def extract_mesh(
     truncation = choose_truncation(maps, grid)
     blocks = find_blocks(maps, grid)
     _LOG.info(
-        f"fusing {len(maps)} depth maps in {len(blocks):,} blocks with voxels of {grid.voxel:.4g} and a truncation of "
+        f"fusing {format_count(len(maps), 'depth map')} in {format_count(len(blocks), 'block')} with "
+        f"voxels of {grid.voxel:.4g} and a truncation of "
         f"{truncation:.4g} units"
     )
     done, lock = 0, Lock()

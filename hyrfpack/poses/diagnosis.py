@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from hyrfpack.counts import format_count
 from hyrfpack.data.quality import is_blurred
 from hyrfpack.data.unusable import no_photos_error, unreadable_error
 from hyrfpack.errors import HyrfDataError
@@ -40,15 +41,15 @@ def check_photo_count(given: Path, folder: Path, usable: int, left_out: Mapping[
         raise no_photos_error(given, folder)
     if copies and usable + len(copies) >= MIN_PHOTOS:
         raise HyrfDataError(
-            f"{given}: {len(copies)} of {count} files are copies of another, and {usable} different "
-            f"{'photo is' if usable == 1 else 'photos are'} too few",
+            f"{given}: {format_count(len(copies), f'of {count} files is a copy', f'of {count} files are copies')} of "
+            f"another, and {format_count(usable, 'different photo is', 'different photos are')} too few",
             fix="take photos from many places",
         )
     if unreadable := select_unreadable(left_out):
         left = f", and the {usable} that can be read {'is' if usable == 1 else 'are'} too few" if usable else ""
         raise unreadable_error(given, unreadable, count, left)
     raise HyrfDataError(
-        f"{given}: {usable} {'photo is' if usable == 1 else 'photos are'} too few to find poses",
+        f"{given}: {format_count(usable, 'photo is', 'photos are')} too few to find poses",
         fix="take 20 or more from different places, each sharing two thirds of its view with the next",
     )
 

@@ -13,6 +13,7 @@ from typing import Any
 from hyrfpack.checks import check_type
 from hyrfpack.config.poses import PosesConfig
 from hyrfpack.context import RunContext
+from hyrfpack.counts import format_count
 from hyrfpack.data.archive import archive_paths_in_errors, is_archive, unpack
 from hyrfpack.data.equirectangular import CUBE_FACES
 from hyrfpack.data.folder import list_photos, list_pictures, list_raw_photos
@@ -293,7 +294,9 @@ class _PoseEstimation:
 
         folder = self.output.make_folder("images", take, resume_filling=True)
         frames = take(folder)  # reads the record of the frames, which are now all written
-        self._add_note(f"{frames.taken} of {frames.of} frames were taken")
+        self._add_note(
+            format_count(frames.taken, f"of {frames.of} frames was taken", f"of {frames.of} frames were taken")
+        )
         self._add_notes(frames.notes)
         return folder
 
@@ -324,14 +327,20 @@ class _PoseEstimation:
                 f"the photos ({size / 1e6:,.1f} MB) are copied into {where}; edits there do not change yours"
             )
         if masks:
-            self._add_note(f"{len(masks)} of {len(photos)} photos have a mask")
+            of_photos = f"of {len(photos):,} photos"
+            self._add_note(f"{format_count(len(masks), f'{of_photos} has', f'{of_photos} have')} a mask")
         if faces := sum(photo.face is not None for photo in photos):
-            self._add_note(f"{faces // len(CUBE_FACES)} panoramas were cut into {faces} photos")
+            panoramas = format_count(faces // len(CUBE_FACES), "panorama was", "panoramas were")
+            self._add_note(f"{panoramas} cut into {faces} photos")
         sideways = sum(photo.facts.orientation != 1 for photo in photos)
         if sideways and turned:
-            self._add_note(f"{sideways} photos that the camera stored on their side were turned upright")
+            was_stored = "that the camera stored sideways"
+            self._add_note(
+                f"{format_count(sideways, f'photo {was_stored} was', f'photos {was_stored} were')} turned upright"
+            )
         elif sideways:
-            self._add_note(f"{sideways} photos are stored on their side and are used as they are stored")
+            used = "stored sideways and used in that orientation"
+            self._add_note(format_count(sideways, f"photo is {used}", f"photos are {used}"))
 
     def _run_stage(self, stage: str, *more: str) -> dict[str, Any]:
         """Run a stage in its process and return its answer."""
@@ -387,7 +396,8 @@ class _PoseEstimation:
                 logging.WARNING,
             )
         if blurred := diagnosis.blurred_photos(features) & registered:
-            self._add_note(f"{len(blurred)} of the posed photos are more blurred than the others", logging.WARNING)
+            found_blurred = format_count(len(blurred), "of the posed photos is", "of the posed photos are")
+            self._add_note(f"{found_blurred} more blurred than the others", logging.WARNING)
         report = PosesReport(
             self.out,
             self.photo_count,

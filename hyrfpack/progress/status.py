@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from time import monotonic
 
+from hyrfpack.counts import format_count
 from hyrfpack.measure.psnr import psnr_from_mse
 from hyrfpack.progress.events import Event, StageEvent, StepEvent, TaskEvent
 from hyrfpack.progress.pace import SharePace, StepPace
@@ -117,7 +118,7 @@ class Status:
             "steps": f"step {event.step}/{event.steps}",
             "loss": f"loss {self.means.loss:.3f}",
             "psnr": format_psnr(self.means.mse),
-            "gaussians": f"{event.gaussians:,} Gaussians",
+            "gaussians": format_count(event.gaussians, "Gaussian"),
             "speed": format_speed(self._speed),
             "elapsed": format_elapsed(self._time - self.task_start),
             "eta": format_eta(self._seconds_left),

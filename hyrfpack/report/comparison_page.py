@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from hyrfpack.counts import format_count
 from hyrfpack.evaluate.figures import ERROR_LIMIT, SMOOTHING_RADIUS_RECORDS, error_colors
 from hyrfpack.report.curves import draw_curves, has_times, line_style
 from hyrfpack.report.differences import choices_that_differ, notes_that_differ, settings_that_differ
@@ -39,7 +40,7 @@ def encode_comparison(
         section("numbers", "Scores and sizes", *_tables(runs, names, ranked=not doubts)),
         section("training", "Training", _legend(names), curves, paragraph(_curves_note(runs, names), "small")),
     ]
-    heading = f"{len(runs)} training runs: {', '.join(names)}"
+    heading = f"{format_count(len(runs), 'training run')}: {', '.join(names)}"
     if not views:
         return encode_page(heading, content)
     content.append(section("views", "Held-out views", read_asset("views.html")))

@@ -21,6 +21,7 @@ from hyrfpack.compress.calibrate import measure_calibrated_sensitivity
 from hyrfpack.compress.distortion import DISTORTION_RANGE, default_distortion
 from hyrfpack.compress.quantize import decide
 from hyrfpack.compress.sensitivity import Sensitivity
+from hyrfpack.counts import format_count
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import Evaluation, evaluate_model
 from hyrfpack.evaluate.metrics import psnr, to_8bit
@@ -174,7 +175,7 @@ def _views_to_score(model: HybridModel, source: Path, scene: Scene | None) -> tu
             View(f"viewpoint {number}", camera, partial(Picture, np.asarray(picture)))
             for number, (camera, picture) in enumerate(zip(cameras, renders, strict=True), 1)
         ]
-        return views, f"renders of the uncompressed model from {len(views)} viewpoints"
+        return views, f"renders of the uncompressed model from {format_count(len(views), 'viewpoint')}"
     views, kind = (scene.test, "held-out") if scene.test else (scene.train, "training")
     chosen = evenly_spaced(views, MAX_SCORED_PHOTOS)
     count = f"{len(chosen)}" if len(chosen) == len(views) else f"{len(chosen)} of {len(views)}"

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from hyrfpack.compress import CompressionReport
 from hyrfpack.compress.sensitivity import PRUNED_KEY
+from hyrfpack.counts import format_count
 from hyrfpack.evaluate import Evaluation
 from hyrfpack.evaluate.metrics import IDENTICAL_PSNR
 from hyrfpack.format.info import sum_layers
@@ -164,7 +165,7 @@ def _loss_in_words(findings: Findings) -> str:
 
 def _summarize(source: Path, packed: Path, report: CompressionReport, findings: Findings) -> list[str]:
     """Return plain paragraphs about the file and its loss."""
-    kept = f"{report.gaussians:,} Gaussians"
+    kept = format_count(report.gaussians, "Gaussian")
     if report.gaussians < findings.gaussians:
         kept += f" out of {findings.gaussians:,} (the others hardly affect renders and were pruned)"
     before, after = findings.before, findings.chosen.scores

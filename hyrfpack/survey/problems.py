@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from hyrfpack.counts import format_count
 from hyrfpack.data.folder import PhotoFacts
 from hyrfpack.data.quality import MIN_SHARPNESS
-from hyrfpack.data.unusable import format_file_names, format_photo_count
+from hyrfpack.data.unusable import format_file_names
 from hyrfpack.outputs import PICTURE_SUFFIXES
 from hyrfpack.progress import Progress, TaskEvent
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Scene
@@ -30,16 +31,17 @@ def find_count_problems(count: int, scene: Scene | None, posed: int, path: Path)
     found = []
     if count < _MIN_RECOMMENDED_PHOTOS:
         found.append(
-            f"there {'is' if count == 1 else 'are'} only {format_photo_count(count)}; take {_MIN_RECOMMENDED_PHOTOS} "
-            "or more, from all around and with much overlap"
+            f"there {'is' if count == 1 else 'are'} only {format_count(count, 'photo')}; take "
+            f"{_MIN_RECOMMENDED_PHOTOS} or more, from all around and with much overlap"
         )
     if scene is None or scene.layout == "blender":  # only some splits of a Blender set are used
         return found
     without = count - posed
     if posed and without > 0:
         found.append(
-            f"{without} of {count} photos have no pose and are not used; take more photos between them and the others, "
-            f"or estimate all poses again with 'hyrfpack poses {shlex.quote(str(path))} -o SCENE'"
+            f"{format_count(without, f'of {count} photos has', f'of {count} photos have')} no pose and cannot be used; "
+            f"take more photos between them and the others, or estimate all poses again with 'hyrfpack poses "
+            f"{shlex.quote(str(path))} -o SCENE'"
         )
     if not len(scene.points):
         found.append(
@@ -75,7 +77,7 @@ def find_copy_problems(
         return []
     first, of = (relative_name(item, folder) for item in copies[0])
     return [
-        f"{format_photo_count(len(copies))} {_be(len(copies))} a copy of another (such as {first} of {of}); "
+        f"{format_count(len(copies), 'photo is', 'photos are')} a copy of another (such as {first} of {of}); "
         "remove the copies"
     ]
 
@@ -92,7 +94,7 @@ def find_blur_problems(measurements: list[PhotoMeasurement], blurred: list[Path]
         return []
     names = format_file_names([relative_name(item, folder) for item in blurred])
     return [
-        f"{format_photo_count(len(blurred))} {_be(len(blurred))} blurred ({names}); leave out or retake blurred photos"
+        f"{format_count(len(blurred), 'photo is', 'photos are')} blurred ({names}); leave out or retake blurred photos"
     ]
 
 
@@ -113,8 +115,8 @@ def find_light_problems(
     ]
     if dark:
         found.append(
-            f"{format_photo_count(len(dark))} {_be(len(dark))} over {_DARK_PHOTO_STOPS:g} stops darker than the others "
-            f"({format_file_names(dark)}); leave out dark photos"
+            f"{format_count(len(dark), 'photo is', 'photos are')} over {_DARK_PHOTO_STOPS:g} stops darker than "
+            f"the others ({format_file_names(dark)}); leave out dark photos"
         )
     bright = [
         relative_name(measurement.path, folder)
@@ -123,7 +125,7 @@ def find_light_problems(
     ]
     if len(bright) > len(measurements) / 4:
         found.append(
-            f"{format_photo_count(len(bright))} {_be(len(bright))} overexposed in a quarter or more of the "
+            f"{format_count(len(bright), 'photo is', 'photos are')} overexposed in a quarter or more of the "
             f"pixels ({format_file_names(bright)}); reduce the exposure, and lock it"
         )
     if stops > _MAX_EXPOSURE_SPREAD_STOPS:
@@ -161,8 +163,8 @@ def find_mask_problems(folder: Path, photos: list[Path]) -> list[str]:
     if not stray:
         return []
     return [
-        f"{len(stray)} of {len(there)} masks match no photo ({format_file_names(stray)}); give each the name of its "
-        "photo"
+        f"{format_count(len(stray), f'of {len(there)} masks matches', f'of {len(there)} masks match')} no photo "
+        f"({format_file_names(stray)}); give each the name of its photo"
     ]
 
 
@@ -172,22 +174,17 @@ def header_notes(facts: list[PhotoFacts]) -> list[str]:
     turned = sum(fact.orientation != 1 for fact in facts)
     if turned:
         notes.append(
-            f"{format_photo_count(turned)} {_be(turned)} stored rotated; 'hyrfpack poses' makes upright copies"
+            f"{format_count(turned, 'photo is', 'photos are')} stored rotated; 'hyrfpack poses' makes upright copies"
         )
     large = sum(max(fact.size) > DEFAULT_MAX_SIZE for fact in facts)
     if large:
         notes.append(
-            f"{large} of {len(facts)} photos are larger than {DEFAULT_MAX_SIZE:,} pixels and are shrunk to that for "
-            "training; `max_size` sets another limit"
+            f"{format_count(large, f'of {len(facts)} photos is', f'of {len(facts)} photos are')} larger than "
+            f"{DEFAULT_MAX_SIZE:,} pixels and shrunk to that for training; `max_size` sets another limit"
         )
     round_ = sum(fact.size[0] == 2 * fact.size[1] for fact in facts)
     if round_:
         notes.append(
-            f"{format_photo_count(round_)} {_be(round_)} twice as wide as high, like those of 360-degree cameras"
+            f"{format_count(round_, 'photo is', 'photos are')} twice as wide as high, like those of 360-degree cameras"
         )
     return notes
-
-
-def _be(count: int) -> str:
-    """Return "is" or "are", by the count."""
-    return "is" if count == 1 else "are"

@@ -6,6 +6,7 @@ import json
 import os
 from typing import Any
 
+from hyrfpack.counts import format_count
 from hyrfpack.data import LAYOUTS, load_scene
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.format.run_folder import METRICS_FILE, MODEL_FILE, find_model
@@ -45,8 +46,8 @@ def load_training_scene(model: str | os.PathLike[str]) -> Scene | None:
     scene = load_scene(path, **reading)
     if sizes != (len(scene.train), len(scene.test)):
         raise HyrfDataError(
-            f"{path}: the set has {len(scene.train)} photos to train on and {len(scene.test)} held out, but {model} "
-            f"was trained on {sizes[0]} of {sum(sizes)}",
+            f"{path}: the set has {format_count(len(scene.train), 'photo')} to train on and {len(scene.test)} "
+            f"held out, but {model} was trained on {sizes[0]} of {sum(sizes)}",
             fix="name the photos with `data`",
         )
     return scene

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from urllib.parse import quote, urlencode
 
+from hyrfpack.counts import format_count
 from hyrfpack.version import __version__
 from hyrfpack.web.assets import read_web_file
 from hyrfpack.web.player import content_security_policy, fill_template, meta_tags
@@ -48,7 +49,7 @@ def encode_gallery(title: str, cards: Sequence[Card], player: str) -> bytes:
         The file, UTF-8. The same arguments give the same bytes.
     """
     posters = [quote(card.poster) for card in cards if card.poster]
-    tags = meta_tags(title, f"{len(cards)} scenes in 3D", posters[0] if posters else None)
+    tags = meta_tags(title, f"{format_count(len(cards), 'scene')} in 3D", posters[0] if posters else None)
     values = {
         "policy": content_security_policy("'self'", fetches="'self'"),
         "version": __version__,
@@ -72,7 +73,7 @@ def _card(card: Card, player: str) -> str:
     picture = '<div class="picture"></div>'
     if card.poster:
         picture = f'<img class="picture" src="{html.escape(quote(card.poster))}" alt="" loading="lazy">'
-    facts = [f"{card.count:,} Gaussians", format_bytes(card.length), *([card.quality] if card.quality else [])]
+    facts = [format_count(card.count, "Gaussian"), format_bytes(card.length), *([card.quality] if card.quality else [])]
     return (
         f'<li>{picture}<h2><a href="{html.escape(address)}">{html.escape(card.title)}</a></h2>'
         f"<p>{html.escape(' · '.join(facts))}</p></li>"

@@ -14,6 +14,7 @@ import numpy as np
 from PIL import Image
 
 from hyrfpack.cameras.files import camera_to_json
+from hyrfpack.counts import format_count
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.model import Frame
 from hyrfpack.render import RenderSettings
@@ -215,7 +216,7 @@ def encode_stage(cameras: Sequence[Camera], up: np.ndarray, center: np.ndarray) 
 
 def _page_description(count: int, length: int) -> str:
     """Return the description that programs show with the shared address of a page."""
-    return f"{count:,} Gaussians, {length:,} bytes"
+    return f"{format_count(count, 'Gaussian')}, {length:,} bytes"
 
 
 def _page_origin_and_unit(splats: Splats) -> tuple[np.ndarray, float]:

@@ -111,6 +111,16 @@ def test_cameras_and_points_are_counted(model, tmp_path):
     assert succeeded("export", model, "-o", tmp_path / "colmap", "--colmap").stdout.endswith(" bytes, 4 cameras\n")
 
 
+def test_one_thing_is_named_in_the_singular(tmp_path):
+    kept = {"cameras": provenance_cameras(ring(1))}
+    save_model(small_model(GAUSSIAN_POSITIONS[:1]), tmp_path / "one.hyrf", provenance=kept)
+    exported = succeeded("export", tmp_path / "one.hyrf", "-o", tmp_path / "a.json").stdout
+    assert exported.endswith(" bytes, 1 camera\n")
+    rendered = succeeded("render", tmp_path / "one.hyrf", "-o", tmp_path / "out", "--orbit", 1).stdout
+    assert ": 1 picture, " in rendered
+    assert " bytes, 1 Gaussian\n" in succeeded("info", tmp_path / "one.hyrf").stdout
+
+
 def test_the_degree_is_chosen_and_the_choice_is_reported(model, tmp_path):
     result = succeeded("export", model, "-o", tmp_path / "a.ply")
     assert [line.split()[0] for line in result.stderr.splitlines()] == [
@@ -184,7 +194,7 @@ WRONG_REQUESTS = {
     "version of a PLY": (("-o", "a.ply", "--spz-version", "3"), "leave out --spz-version, or write an .spz"),
     "contents of no tiles": (("-o", "a.ply", "--tile-content", "gltf"), "leave out --tile-content, or write a folder"),
     "two models": (("second.hyrf", "-o", "a.ply"), "several models make a gallery"),
-    "photos of two": (("-o", "player", "--data", "a", "--data", "b"), "given 2 times for 1 models"),
+    "photos of two": (("-o", "player", "--data", "a", "--data", "b"), "given 2 times for 1 model;"),
 }
 
 

@@ -65,7 +65,7 @@ def test_points_of_a_real_reconstruction_project_to_where_they_were_seen(folder)
     seen = np.array([[float(n) for n in line[1:]] for line in numbers]).reshape(4, 3, 4)[:, :, 2:]
 
     assert [view.name for view in scene.views] == ["0.png", "1.png", "2.png"]
-    assert "1 photos are not registered and were skipped" in scene.notes
+    assert "1 photo is not registered and was skipped" in scene.notes
     for number, view in enumerate(scene.views):
         local = scene.points @ view.camera.rotation.T + view.camera.camera_from_world[:3, 3]
         assert (local[:, 2] > 0).all()
@@ -116,7 +116,7 @@ def rewrite(root, change) -> None:
         (lambda root: rewrite(root, lambda text: text.replace("9.9187742625e-01", "9")), "not rigid"),
         (lambda root: rewrite(root, lambda text: text.replace("100 164 102", "100 164")), "three numbers"),
         (lambda root: (root / "list.txt").unlink(), "the list of its photos is missing"),
-        (lambda root: (root / "list.txt").write_text("0.png\n"), "4 cameras, but list.txt lists 1 photos"),
+        (lambda root: (root / "list.txt").write_text("0.png\n"), "4 cameras, but list.txt lists 1 photo"),
         (lambda root: (root / "list.txt").write_text("0.png\n0.png\n2.png\n3.png\n"), "listed twice"),
     ],
 )
@@ -132,7 +132,7 @@ def test_a_broken_set_is_a_clear_error(folder, damage, says):
 def test_points_that_are_not_finite_are_dropped(folder):
     rewrite(folder, lambda text: text.replace("-4.4479506154e-01 ", "inf "))
 
-    assert "1 of 4 points are not finite and were dropped" in load_scene(folder).notes
+    assert "1 of 4 points is not finite and was dropped" in load_scene(folder).notes
 
 
 def test_copies_of_unknown_size_are_rejected(folder):

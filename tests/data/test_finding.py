@@ -48,7 +48,7 @@ def test_photos_of_other_formats_are_named_where_none_is_found(tmp_path, colmap_
     [
         ("images/000.HEIC", "looked for images/000.HEIC; there is no folder images)"),
         ("frames/000.jpg", "looked for frames/000.jpg; that folder holds no file)"),
-        ("000.jpg", "looked for 000.jpg; the folder holds 1 .json files)"),
+        ("000.jpg", "looked for 000.jpg; the folder holds 1 .json file)"),
     ],
 )
 def test_missing_photos_of_transforms_are_an_error_with_the_searched_paths(
@@ -68,14 +68,14 @@ def test_missing_photos_of_blender_sets_are_an_error_with_the_searched_paths(tmp
     content = {"camera_angle_x": 0.7, "frames": opengl_frames(["./renders/r_0"])[0]}
     (tmp_path / "transforms_train.json").write_text(json.dumps(content))
 
-    assert "(looked for renders/r_0; that folder holds 1 .exr files)" in error_of_loading(tmp_path)
+    assert "(looked for renders/r_0; that folder holds 1 .exr file)" in error_of_loading(tmp_path)
 
 
 def test_the_first_skipped_photo_is_named(nerfstudio_folder):
     root = nerfstudio_folder(4)
     (root / "images" / "002.png").unlink()
 
-    expected = "1 of 4 photos listed in transforms.json are not on disk and were skipped (such as images/002.png)"
+    expected = "1 of 4 photos listed in transforms.json is not on disk and was skipped (such as images/002.png)"
     assert expected in load_scene(root).notes
 
 

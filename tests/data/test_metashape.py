@@ -176,7 +176,7 @@ def test_cameras_without_a_pose_are_skipped(tmp_path, pictures):
     scene = load_scene(tmp_path)
 
     assert [view.name for view in scene.views] == ["a.jpg", "c.jpg"]
-    assert any("1 photos have no pose" in note for note in scene.notes)
+    assert any("1 photo has no pose" in note for note in scene.notes)
 
 
 def test_the_largest_component_is_used(tmp_path, pictures):

@@ -125,7 +125,7 @@ def test_zooms_orientations_and_sizes_are_distinguished(photos):
     assert "Acme Phone 3" in find_problem(survey, "focal lengths")
     assert survey.sizes == {"160 x 120": 23, "120 x 160": 1, "2400 x 1800": 1}
     assert any("stored rotated" in note for note in survey.notes)
-    assert any("1 of 25 photos are larger" in note for note in survey.notes)
+    assert any("1 of 25 photos is larger" in note for note in survey.notes)
 
 
 def test_masks_without_matching_photos_are_detected(photos):

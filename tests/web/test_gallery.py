@@ -47,7 +47,7 @@ def test_each_scene_is_a_card_with_a_link():
     ]
     assert [image["src"] for image in page.of("img")] == ["room.jpg"] and page.of("img")[0]["alt"] == ""
     assert "12,345 Gaussians · 86 kB · 25.07 dB on 12 held-out photos" in page.text
-    assert "1 Gaussians · 1.5 MB" in page.text
+    assert "1 Gaussian · 1.5 MB" in page.text
     assert len(page.of("h1")) == 1 and len(page.of("h2")) == len(page.of("li")) == 2
 
 
