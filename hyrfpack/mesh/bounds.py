@@ -18,6 +18,8 @@ DEFAULT_VOXEL_PIXELS = 1.5
 MAX_VOXELS_PER_DEFAULT_SIDE = 512
 # Positions along an axis must fit into the keys by which vertices are welded.
 MAX_VOXELS_PER_SIDE = 8000
+# No triangle remains of a surface that lies in a single voxel.
+MIN_VOXELS_ON_LONGEST_SIDE = 2
 PEAK_BYTES_PER_SURFACE_VOXEL = 800  # measured 614: triangles, and their clean-up
 
 
@@ -52,7 +54,8 @@ def choose_grid(
         voxel: side of a voxel in world units; None for the default.
 
     Raises:
-        HyrfError: no surface lies in the box, or there are more than MAX_VOXELS_PER_SIDE voxels along a side.
+        HyrfError: no surface lies in the box, there are more than MAX_VOXELS_PER_SIDE voxels along a side, or
+            `voxel` leaves fewer than MIN_VOXELS_ON_LONGEST_SIDE.
     """
     sampled = [_sample_points(depth_map) for depth_map in maps]
     points = np.concatenate([points for points, _ in sampled])
@@ -80,19 +83,29 @@ def choose_grid(
             DEFAULT_VOXEL_PIXELS * float(np.median(sizes[inside])),
             float((high - low).max()) / MAX_VOXELS_PER_DEFAULT_SIDE,
         )
+    elif voxel * MIN_VOXELS_ON_LONGEST_SIDE > (high - low).max():
+        raise HyrfError(
+            f"a voxel of {voxel:g} is too large for a surface of {_format_sides(high - low)} units; the longest side "
+            f"needs at least {MIN_VOXELS_ON_LONGEST_SIDE}",
+            fix="use a smaller `voxel`",
+        )
     margin = 0.0 if crop is not None else 2 * voxel
     low, high = low - margin, high + margin
     counts = np.ceil((high - low) / voxel).clip(min=1)
     if counts.max() > MAX_VOXELS_PER_SIDE:
         gigabytes = PEAK_BYTES_PER_SURFACE_VOXEL * float(counts.max()) ** 2 / 1e9
         raise HyrfError(
-            f"a voxel of {voxel:g} divides the box of {' x '.join(f'{side:.3g}' for side in high - low)} units into "
+            f"a voxel of {voxel:g} divides the box of {_format_sides(high - low)} units into "
             f"{counts.max():,.0f} voxels along a side, which would take about "
             f"{gigabytes:,.0f} GB; the limit is {MAX_VOXELS_PER_SIDE:,} voxels",
             fix="use a larger `voxel` or a smaller `crop`",
         )
     x, y, z = counts.astype(int).tolist()
     return Grid(low, voxel, (x, y, z))
+
+
+def _format_sides(sides: np.ndarray) -> str:
+    return " x ".join(f"{side:.3g}" for side in sides)
 
 
 def _default_box(points: np.ndarray, center: np.ndarray, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -119,6 +119,15 @@ def test_pixels_at_depth_edges_and_grazing_pixels_have_no_weight():
     assert sphere.weight[60, 80] > 250
 
 
+@pytest.mark.parametrize("voxel", [1e308, 1e30, 1.5])
+def test_a_voxel_that_holds_the_whole_surface_is_a_clear_error(voxel):
+    maps = [sphere_map(position) for position in ((4, 0, 0), (-4, 0, 0), (0, 4, 0))]
+    with pytest.raises(
+        HyrfError, match=r"a voxel of \S+ is too large for a surface of .* units.*use a smaller `voxel`"
+    ):
+        choose_grid(maps, np.zeros(3), None, voxel)
+
+
 def test_voxels_that_are_too_small_are_refused_with_the_memory_that_they_would_need(monkeypatch):
     maps = [sphere_map(position) for position in CAMERA_POSITIONS_ON_AXES]
     monkeypatch.setattr(fusion, "memory_bytes", lambda: 10_000_000)
