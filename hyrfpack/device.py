@@ -14,9 +14,10 @@ from torch import Tensor
 
 from hyrfpack.errors import HyrfError
 from hyrfpack.ops.dispatch import GPU_OPERATIONS, has_triton, set_replaced_operations
+from hyrfpack.parallel.child_items import Row
 from hyrfpack.parallel.ranks import Ranks, uses_gloo_on_gpus
 from hyrfpack.scene import Picture
-from hyrfpack.self_test import SelfTest, load_or_run_self_test
+from hyrfpack.self_test import SelfTest, is_temporary, load_or_run_self_test
 
 _LOG = logging.getLogger(__name__)
 
@@ -28,6 +29,7 @@ OLD_GPU_NOTE = (
     "this GPU is of a generation before NVIDIA's Ampere, which the kernels are not made for: they run slowly; "
     "`precision='float32'` and `device='cpu'` are worth a try"
 )
+_FASTER_CPU = "`device='cpu'` may be faster"
 NO_METAL_NOTE = (
     "there are no kernels for Apple's GPU: it runs the plain torch reference, which is slow; `device='cpu'` is faster"
 )
@@ -130,26 +132,49 @@ def _agree_on_failed_operations(device: torch.device, ranks: Ranks) -> None:
 @cache
 def _find_failed_operations(device: torch.device) -> frozenset[str]:
     """Return the operations whose kernels do not work on a GPU. A warning names them, once in this process."""
-    test = load_or_run_self_test(device)
+    test, where = load_or_run_self_test(device), describe_device(device)
+    if not test.can_launch:
+        _LOG.warning(f"{test.problem}; this run uses plain torch on {where}, far slower; {_FASTER_CPU}")
+        return frozenset(GPU_OPERATIONS)
     if test.problem is not None:
-        _LOG.warning(f"the kernels could not be tested on {describe_device(device)} ({test.problem}); they are used")
-    elif test.failed_operations:
-        _LOG.warning(describe_failed_operations(test, describe_device(device)))
+        _LOG.warning(f"the kernels could not be tested on {where} ({test.problem}); they are used")
+    for sentence in describe_failed_operations(test, where):
+        _LOG.warning(sentence)
     return frozenset(test.failed_operations)
 
 
-def describe_failed_operations(test: SelfTest, where: str) -> str:
-    """Return a sentence on the operations that failed a self-test, how much slower they are, and what to do."""
-    reasons = []
-    for operation, row in test.failed_operations.items():
-        slowdown = f"{row['slowdown']} times as slow" if "slowdown" in row else "of unknown speed"
-        reasons.append(f"{operation} ({row['note']}; plain torch is {slowdown} on a small input)")
-    faster = "; `device='cpu'` may be faster" if "rasterize" in test.failed_operations else ""
-    return (
-        f"the kernels of {len(reasons)} of {len(GPU_OPERATIONS)} operations do not work on {where}, which computes "
-        f"them in plain torch instead: {', '.join(reasons)}{faster}; please report this, with the output of "
-        "'hyrfpack doctor'"
-    )
+def describe_failed_operations(test: SelfTest, where: str) -> list[str]:
+    """Return a sentence on the operations whose kernels do not work, and one on those that could not be tested now.
+
+    Each says why, how much slower plain torch is, and what to do.
+    """
+    failed = test.failed_operations
+    broken = {operation: row for operation, row in failed.items() if not is_temporary(row)}
+    untested = {operation: row for operation, row in failed.items() if is_temporary(row)}
+    faster = f"; {_FASTER_CPU}" if "rasterize" in failed else ""
+    sentences = []
+    if broken:
+        sentences.append(
+            f"the kernels of {len(broken)} of {len(GPU_OPERATIONS)} operations do not work on {where}, which computes "
+            f"them in plain torch instead: {_group_by_reason(broken)}{faster}; please report this, with the output of "
+            "'hyrfpack doctor'"
+        )
+    if untested:
+        sentences.append(
+            f"the kernels of {len(untested)} of {len(GPU_OPERATIONS)} operations could not be tested on {where}, which "
+            f"computes them in plain torch in this run: {_group_by_reason(untested)}{faster}; the next run tests them "
+            "again"
+        )
+    return sentences
+
+
+def _group_by_reason(failed: dict[str, Row]) -> str:
+    """Return the failed operations, those with the same reason together."""
+    groups: dict[str, list[str]] = {}
+    for operation, row in failed.items():
+        speed = f"; plain torch is {row['slowdown']} times as slow on a small input" if "slowdown" in row else ""
+        groups.setdefault(f"{row['note']}{speed}", []).append(operation)
+    return ", ".join(f"{', '.join(operations)} ({reason})" for reason, operations in groups.items())
 
 
 def _with_index(device: torch.device) -> torch.device:

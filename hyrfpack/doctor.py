@@ -171,7 +171,10 @@ def _test_kernels(device: torch.device, problems: list[str]) -> SelfTest | None:
         store_self_test(test, device)
     if test.problem is not None:
         problems.append(f"the kernels could not be tested: {test.problem}")
-    problems += [f"kernels of {row['item']}: {row['note']}" for row in test.failed_rows]
+    items_by_note: dict[str, list[str]] = {}
+    for row in test.failed_rows:
+        items_by_note.setdefault(str(row["note"]), []).append(str(row["item"]))
+    problems += [f"kernels of {'; '.join(items)}: {note}" for note, items in items_by_note.items()]
     return test
 
 

@@ -48,6 +48,12 @@ def test_the_text_is_a_block_to_paste_and_names_broken_kernels(broken_kernels):
     assert "problem: kernels of mlp: outputs is NaN" in lines
 
 
+def test_cases_that_fail_for_one_reason_are_one_problem(monkeypatch):
+    rows = [{"item": name, "operation": "mlp", "status": "failed", "note": "late"} for name in ("mlp", "mlp, mixed")]
+    monkeypatch.setattr("hyrfpack.self_test.run_self_test", lambda *_: SelfTest("cpu", "cpu", tuple(rows)))
+    assert "kernels of mlp; mlp, mixed: late" in diagnose_machine("cpu").problems
+
+
 def test_no_self_test_runs_none(monkeypatch):
     monkeypatch.setattr("hyrfpack.self_test.run_self_test", lambda *_: pytest.fail("the self-test was run"))
     assert "self-test: not run" in succeeded("doctor", "--no-self-test").stdout

@@ -20,7 +20,8 @@ from math import inf
 from pathlib import Path
 
 # What an item reports. "item" is its name. "status" is "failed" or "left out", with the reason under "note"; a row
-# without "status" passed.
+# without "status" passed. "is_temporary" is True if the item failed because of the machine's present state: it ran out
+# of time, or another program killed its process.
 Row = dict[str, object]
 
 # Prefixes of the lines by which a child reports to its parent.
@@ -28,6 +29,8 @@ ROW_PREFIX, BEGUN_PREFIX, DONE_PREFIX = "@row ", "@begun ", "@done "
 # Exit code of a child whose device has become unusable.
 UNUSABLE_DEVICE_CODE = 3
 MAX_NOTE_LENGTH = 300
+# Signals that other programs and the system's out-of-memory killer send; a process does not send them to itself.
+_SIGNALS_FROM_OUTSIDE = ("SIGHUP", "SIGINT", "SIGKILL", "SIGTERM")
 _IMPORT_ROOT = str(Path(__file__).parents[2])  # the folder from which hyrfpack was imported
 
 
@@ -103,21 +106,23 @@ def run_in_children(
                 else:
                     last_line = line.strip() or last_line
         finally:
-            ended = child.stop()
+            killed_by = child.stop()
         said = f"; last output: {last_line[:MAX_NOTE_LENGTH]}" if last_line else ""
         if remaining and time.monotonic() >= end:
             for item in remaining:
                 note = f"not done within the part's {seconds:.0f} s" + (said if item == current else "")
-                yield {"item": item, "status": "failed", "note": note}
+                yield {"item": item, "status": "failed", "note": note, "is_temporary": True}
             return
         if current or len(remaining) == remaining_before:  # the child ended within an item, or before its first one
             failed_item = current or remaining[0]
             remaining.remove(failed_item)
+            row: Row = {"item": failed_item, "status": "failed"}
             if child.is_out_of_time:
-                note = f"not done within {item_seconds:.0f} s{said}"
-            else:
-                note = f"its process ended{ended}: {last_line[:MAX_NOTE_LENGTH] or 'no output'}"
-            yield {"item": failed_item, "status": "failed", "note": note}
+                yield row | {"note": f"not done within {item_seconds:.0f} s{said}", "is_temporary": True}
+                continue
+            by = f" by {killed_by}" if killed_by else ""
+            row["note"] = f"its process ended{by}: {last_line[:MAX_NOTE_LENGTH] or 'no output'}"
+            yield row | ({"is_temporary": True} if killed_by in _SIGNALS_FROM_OUTSIDE else {})
 
 
 class _Child:
@@ -153,7 +158,7 @@ class _Child:
         self._timer.start()
 
     def stop(self) -> str:
-        """Kill what is left of the process group; return how the process ended, as words to append to a sentence."""
+        """Kill what is left of the process group; return the name of the signal that ended the process, "" if none."""
         self._timer.cancel()
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(0.5)  # A process that has closed its output is about to end by itself.
@@ -162,8 +167,8 @@ class _Child:
         if code >= 0:
             return ""
         with suppress(ValueError):
-            return f" by {signal.Signals(-code).name}"
-        return f" by signal {-code}"
+            return signal.Signals(-code).name
+        return f"signal {-code}"
 
     def _expire(self) -> None:
         self.is_out_of_time = True

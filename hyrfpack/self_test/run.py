@@ -16,6 +16,8 @@ MAX_CASE_SECONDS = 120.0
 MAX_SECONDS = 900.0
 # The first item only uses the device. If it fails, the device is unusable or in use by others, whatever the kernels do.
 DEVICE_ITEM = "device"
+# The second item, for a GPU, launches the simplest kernel. If it fails, all other kernels would fail for that reason.
+LAUNCH_ITEM = "launch"
 
 
 @dataclass(frozen=True)
@@ -27,14 +29,17 @@ class SelfTest:
         device: the tested device, as torch names it.
         rows: for each case its name ("item") and operation, its errors and the seconds that it took with compilation.
             A failed one has "status" "failed", the reason as "note", and if its kernels ran, as "slowdown" how many
-            times as long plain torch took.
+            times as long plain torch took. It has "is_temporary" True if it failed because of the machine's present
+            state: memory ran out, or its process ran out of time or was killed.
         problem: why no case could run; None if they ran.
+        can_launch: False if the simplest kernel could not be compiled and launched, which is then the problem.
     """
 
     implementation: str
     device: str
     rows: tuple[Row, ...]
     problem: str | None = None
+    can_launch: bool = True
 
     @property
     def failed_rows(self) -> list[Row]:
@@ -43,11 +48,21 @@ class SelfTest:
 
     @property
     def failed_operations(self) -> dict[str, Row]:
-        """The first failed row of each operation that failed in some case."""
+        """The first failed row of each operation that failed in some case; temporary failures come last."""
         failed: dict[str, Row] = {}
-        for row in self.failed_rows:
+        for row in sorted(self.failed_rows, key=is_temporary):
             failed.setdefault(str(row["operation"]), row)
         return failed
+
+    @property
+    def is_conclusive(self) -> bool:
+        """Whether all cases ran, and none failed because of the machine's present state."""
+        return self.problem is None and not any(map(is_temporary, self.rows))
+
+
+def is_temporary(row: Row) -> bool:
+    """Return whether a case failed because of the machine's present state."""
+    return row.get("is_temporary") is True
 
 
 def run_self_test(
@@ -74,15 +89,19 @@ def run_self_test(
     found: dict[str, Row] = {}
     for row in run_in_children(
         lambda left: make_command(implementation, str(device), left),
-        [DEVICE_ITEM, *names],
+        [DEVICE_ITEM, *([LAUNCH_ITEM] if implementation == "gpu" else []), *names],
         max_seconds,
         max_case_seconds,
     ):
         name = str(row["item"])
-        if name != DEVICE_ITEM:
+        if name in cases:
             found[name] = {"operation": cases[name].operation, **row}
-        elif "status" in row:
+        elif "status" in row and name == DEVICE_ITEM:
             return SelfTest(implementation, str(device), (), str(row["note"]))
+        elif "status" in row:
+            fix = f"; {row['fix']}" if "fix" in row else ""
+            problem = f"Triton cannot compile and launch kernels here ({row['note']}){fix}"
+            return SelfTest(implementation, str(device), (), problem, can_launch=False)
     return SelfTest(implementation, str(device), tuple(found[name] for name in names))
 
 

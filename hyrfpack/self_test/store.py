@@ -51,8 +51,8 @@ def load_self_test(device: torch.device) -> SelfTest | None:
 
 
 def store_self_test(test: SelfTest, device: torch.device) -> None:
-    """Store a result, unless the test could not run or there is no writable folder."""
-    if test.problem is not None:
+    """Store a result, unless it is not conclusive or there is no writable folder."""
+    if not test.is_conclusive:
         return
     with suppress(HyrfError):
         content = {"key": describe_key(device), "result": asdict(test)}

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import ctypes
 import json
+import os
+import signal
 import sys
 import time
 from pathlib import Path
@@ -47,6 +49,8 @@ def break_entry_point(name: str, how: str) -> None:
     def broken(*args: Any, **kwargs: Any) -> Any:
         if how == "does not compile":
             raise RuntimeError("PassManager::run failed\nmore")
+        if how == "is killed":
+            os.kill(os.getpid(), signal.SIGKILL)
         if how == "crashes":
             print("last words", flush=True)
             ctypes.string_at(0)

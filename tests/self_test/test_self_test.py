@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from unittest import mock
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -14,10 +16,12 @@ from ops.device import IS_INTERPRETED, needs_triton
 
 from hyrfpack.ops.dispatch import GPU_OPERATIONS
 from hyrfpack.parallel import has_numba
-from hyrfpack.self_test import SelfTest, run_self_test
+from hyrfpack.parallel.child_items import ROW_PREFIX
+from hyrfpack.self_test import SelfTest, run_self_test, worker
 from hyrfpack.self_test import run as self_test_run
 from hyrfpack.self_test.cases import self_test_cases
 from hyrfpack.self_test.check import check_case
+from hyrfpack.self_test.worker import CACHE_FIX, INSTALL_FIX, explain_launch_failure
 
 BROKEN_WORKER_FILE = Path(__file__).with_name("broken_worker.py")
 CPU_DEVICE = torch.device("cpu")
@@ -114,6 +118,89 @@ def test_kernels_broken_in_any_way_are_found_and_the_others_still_run() -> None:
 def test_a_kernel_that_hangs_fails_after_its_time_and_the_others_still_run() -> None:
     test = run_broken({"contract": "hangs"}, ("contract", "adam_step"), max_case_seconds=40.0)
     assert [row.get("note") for row in test.rows] == ["not done within 40 s", None]
+    assert not test.is_conclusive
+
+
+@needs_triton
+@needs_interpreter
+@pytest.mark.acceptance
+def test_a_case_whose_process_is_killed_fails_for_now_and_one_that_ends_by_itself_for_good() -> None:
+    test = run_broken({"contract": "is killed", "composite": "crashes"}, ("contract", "composite"))
+    assert [row["note"] for row in test.rows] == [
+        "its process ended by SIGKILL: no output",
+        "its process ended by SIGSEGV: last words",
+    ]
+    assert [row.get("is_temporary", False) for row in test.rows] == [True, False] and not test.is_conclusive
+
+
+def run_here(names: Sequence[str], capsys: pytest.CaptureFixture[str]) -> list[dict]:
+    """Run items of the self-test in this process, and return the rows that a child would print."""
+    worker.run_cases("gpu", CPU_DEVICE, names)
+    lines = capsys.readouterr().out.splitlines()
+    return [json.loads(line.removeprefix(ROW_PREFIX)) for line in lines if line.startswith(ROW_PREFIX)]
+
+
+@pytest.mark.parametrize(
+    ("error", "expected"),
+    [
+        (
+            torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 MiB.\nmore"),
+            {
+                "note": "the GPU's memory ran out (CUDA out of memory. Tried to allocate 2 MiB.)",
+                "is_temporary": True,
+            },
+        ),
+        (RuntimeError("PassManager::run failed\nmore"), {"note": "RuntimeError: PassManager::run failed more"}),
+    ],
+)
+def test_only_memory_that_ran_out_is_a_temporary_error(error, expected, monkeypatch, capsys) -> None:
+    monkeypatch.setattr(worker, "check_case", Mock(side_effect=error))
+    assert run_here(["contract"], capsys) == [{"item": "contract", "status": "failed"} | expected]
+
+
+@needs_triton
+@needs_interpreter
+@pytest.mark.parametrize(
+    ("error", "expected"),
+    [
+        (RuntimeError("Failed to find C compiler.\nmore"), {"note": "Failed to find C compiler.", "fix": INSTALL_FIX}),
+        (
+            PermissionError(13, "Permission denied", "/root/.triton/cache"),
+            {"note": "[Errno 13] Permission denied: '/root/.triton/cache'", "fix": CACHE_FIX},
+        ),
+        (
+            RuntimeError("Triton Error [CUDA]: out of memory"),
+            {"note": "the GPU's memory ran out (Triton Error [CUDA]: out of memory)", "is_temporary": True},
+        ),
+        (None, None),
+    ],
+)
+def test_a_failed_launch_says_what_to_install_unless_memory_ran_out(error, expected, monkeypatch, capsys) -> None:
+    if error is not None:
+        monkeypatch.setattr("hyrfpack.self_test.simplest_kernel.launch_simplest_kernel", Mock(side_effect=error))
+    rows = run_here(["launch"], capsys)
+    assert rows == ([] if expected is None else [{"item": "launch", "status": "failed"} | expected])
+
+
+@pytest.mark.parametrize("fix", [{}, {"fix": "install gcc"}])
+def test_a_triton_that_launches_nothing_is_one_problem_and_no_failure_of_kernels(fix, monkeypatch) -> None:
+    row = {"item": "launch", "status": "failed", "note": "no compiler", **fix}
+    monkeypatch.setattr(self_test_run, "run_in_children", lambda *_: [row])
+    problem = "Triton cannot compile and launch kernels here (no compiler)" + ("; install gcc" if fix else "")
+    test = run_self_test("gpu", CPU_DEVICE)
+    assert test == SelfTest("gpu", "cpu", (), problem, can_launch=False) and not test.is_conclusive
+
+
+@pytest.mark.parametrize("has_headers", [True, False])
+def test_a_c_compiler_that_fails_says_whether_headers_are_missing(
+    has_headers: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if has_headers:
+        (tmp_path / "Python.h").touch()
+    monkeypatch.setattr("sysconfig.get_path", lambda name: str(tmp_path))
+    error = subprocess.CalledProcessError(1, ["/usr/bin/gcc", "/tmp/x/main.c", "-O3"])
+    missing = "" if has_headers else "; Python.h is missing"
+    assert explain_launch_failure(error) == (f"gcc ended with exit code 1{missing}", INSTALL_FIX)
 
 
 @pytest.mark.acceptance

@@ -15,7 +15,7 @@ from hyrfpack import device as devices
 from hyrfpack.device import choose_device
 from hyrfpack.ops import dispatch
 from hyrfpack.ops.contraction import contract
-from hyrfpack.ops.dispatch import replaced_operations, set_replaced_operations
+from hyrfpack.ops.dispatch import GPU_OPERATIONS, replaced_operations, set_replaced_operations
 from hyrfpack.self_test import SelfTest, load_or_run_self_test, store
 from hyrfpack.self_test.store import load_self_test, store_self_test
 
@@ -74,7 +74,7 @@ def test_a_warning_names_what_is_replaced_once(gpu, runs, caplog):
     (warning,) = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
     assert "the kernels of 2 of 13 operations do not work on cuda:0 (a GPU that is not there)" in warning
     assert "contract (coords is NaN; plain torch is 2.5 times as slow on a small input)" in warning
-    assert "mlp (its process ended by SIGSEGV; plain torch is of unknown speed on a small input)" in warning
+    assert "mlp (its process ended by SIGSEGV)" in warning
     assert "'hyrfpack doctor'" in warning
 
 
@@ -112,6 +112,44 @@ def test_a_test_that_could_not_run_is_not_stored_and_replaces_nothing(gpu, monke
     choose_device("cuda")
     assert not replaced_operations() and load_self_test(gpu) is None
     assert "could not be tested on cuda:0 (a GPU that is not there) (the device is busy)" in caplog.text
+
+
+def test_a_triton_that_launches_nothing_runs_plain_torch_in_this_process_only(gpu, monkeypatch, caplog):
+    problem = "Triton cannot compile and launch kernels here (Failed to find C compiler); install gcc"
+    monkeypatch.setattr(store, "run_self_test", lambda *_: SelfTest("gpu", "cuda:0", (), problem, can_launch=False))
+    choose_device("cuda")
+    assert replaced_operations() == set(GPU_OPERATIONS) and load_self_test(gpu) is None
+    (warning,) = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert warning == (
+        f"{problem}; this run uses plain torch on cuda:0 (a GPU that is not there), far slower; `device='cpu'` may be "
+        "faster"
+    )
+
+
+def test_a_failure_for_now_runs_plain_torch_in_this_process_and_is_tested_again(gpu, monkeypatch, caplog):
+    rows = [{"item": name, "operation": name, "status": "failed", "note": "no memory"} for name in ("contract", "mlp")]
+    untested = SelfTest("gpu", "cuda:0", tuple(row | {"is_temporary": True} for row in rows))
+    monkeypatch.setattr(store, "run_self_test", lambda *_: untested)
+    choose_device("cuda")
+    assert replaced_operations() == {"contract", "mlp"} and load_self_test(gpu) is None
+    (warning,) = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert warning == (
+        "the kernels of 2 of 13 operations could not be tested on cuda:0 (a GPU that is not there), which computes "
+        "them in plain torch in this run: contract, mlp (no memory); the next run tests them again"
+    )
+
+
+def test_a_warning_gives_a_reason_that_operations_share_once():
+    rows = [{"item": name, "operation": name, "status": "failed", "note": "crashed"} for name in GPU_OPERATIONS]
+    (sentence,) = devices.describe_failed_operations(SelfTest("gpu", "cuda:0", tuple(rows)), "cuda:0")
+    assert sentence.count("crashed") == 1 and f"{', '.join(GPU_OPERATIONS)} (crashed)" in sentence
+
+
+def test_an_operation_that_is_broken_in_one_case_is_not_called_untested():
+    broken = {"item": "mlp", "operation": "mlp", "status": "failed", "note": "outputs is NaN"}
+    untested = {"item": "mlp, mixed", "operation": "mlp", "status": "failed", "note": "late", "is_temporary": True}
+    test = SelfTest("gpu", "cuda:0", (untested, broken))
+    assert test.failed_operations == {"mlp": broken} and not test.is_conclusive
 
 
 @pytest.mark.parametrize("content", ["", "[]", '{"result": {}}', '{"result": {"rows": 3}}', "\xff"])
