@@ -39,10 +39,10 @@ torch.cuda.is_available = lambda: True
 from tools.gpu import check
 sizes = dict(width=16, height=16, kernel_gaussians=24, frame_gaussians=(60,), trained_gaussians=(60,), error_rows=32)
 sizes |= dict(crop=16, repeats=1, views=4, warm_steps=1, steps=2, demo_views=9, demo_size=16, quality_steps=4)
-sizes |= dict(device="cpu", implementation="cpu")
+sizes |= dict(device="cpu", implementation="cpu", doctor_seconds=200.0)
 whole = check.Setup
 check.Setup = lambda data: whole(data=data, test_paths=("tests/ops/test_contraction.py",), **sizes)
-sys.exit(check.main(["--commit", "abc123", "--out", sys.argv[1]]))
+sys.exit(check.main(["--long", "--commit", "abc123", "--out", sys.argv[1]]))
 """
 
 
@@ -68,7 +68,7 @@ def test_the_default_parts_run_through_on_a_machine_without_optional_packages(tm
     assert failed <= NOT_ON_THE_CPU, done.stdout + done.stderr
     assert done.returncode == (1 if failed else 0), done.stderr
     timed = [row["what"] for row in rows if row.get("table") == "Time taken"]
-    assert timed == ["tests", "kernels", "frames", "sanitizer", "repeat"]
+    assert timed == ["self-test", "tests", "kernels", "frames", "sanitizer", "repeat"]
     assert json.loads(report.read_text())["machine"]["commit"] == "abc123"
     (tested,) = [row for row in rows if row.get("case") == "tests/ops/test_contraction.py"]
     assert "passed" in tested["result"]

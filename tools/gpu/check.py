@@ -9,6 +9,7 @@ Triton, and numpy; hyrfpack need not be installed. The part `tests` also needs p
 scipy, and on the CPU Numba. Items that lack a package are left out, and the report gives the reason. The parts, in the
 order in which they run:
 
+    self-test  the self-test of the kernels case by case, and `hyrfpack doctor`
     tests      random cases against the float64 reference, and the tests marked "gpu"
     kernels    each operation alone: time in ms, roofline, error
     frames     whole frames, training steps and gsplat, with 100,000 to 3 million Gaussians
@@ -43,17 +44,19 @@ from tools.gpu.setup import Setup, find_dataset
 from tools.gpu.worker import failure_row, run_child
 
 REPOSITORY_ROOT = Path(__file__).parents[2]
+LOGS_FOLDER = "logs"  # in the folder of results: what pytest and other programs print
 # Each part has a module with `items(setup)` and `run(item, setup)`, and a time limit in seconds for all its items. The
-# limit of the tests includes the first build of 140 kernels, which takes up to a second each.
+# limits of the first two parts include the first build of 140 kernels, which takes up to a second each.
 CHECK_PARTS = {
-    "tests": ("tools.gpu.tests", 180.0),
-    "kernels": ("tools.gpu.kernels", 90.0),
-    "frames": ("tools.gpu.frames", 200.0),
-    "sanitizer": ("tools.gpu.sanitizer", 45.0),
-    "repeat": ("tools.gpu.repeat", 25.0),
+    "self-test": ("tools.gpu.first_contact", 100.0),
+    "tests": ("tools.gpu.tests", 150.0),
+    "kernels": ("tools.gpu.kernels", 60.0),
+    "frames": ("tools.gpu.frames", 120.0),
+    "sanitizer": ("tools.gpu.sanitizer", 90.0),
+    "repeat": ("tools.gpu.repeat", 20.0),
     "quality": ("tools.gpu.quality", 170.0),
 }
-DEFAULT_PARTS = ("tests", "kernels", "frames", "sanitizer", "repeat")
+DEFAULT_PARTS = ("self-test", "tests", "kernels", "frames", "sanitizer", "repeat")
 # The default parts end within this time, because some machines kill a command after 10 minutes.
 MAX_DEFAULT_SECONDS = 540.0
 NO_GPU = "torch finds no GPU on this machine, so nothing was checked; run this on a machine with a CUDA or ROCm GPU"
@@ -129,7 +132,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"tools.gpu.check: {NO_GPU}", file=sys.stderr)
         return 2
     data = find_dataset(args.data, os.environ.get("HYRFPACK_DATA"), REPOSITORY_ROOT.parent / "shared" / "data")
-    setup = Setup(data=None if data is None else str(data))
+    setup = replace(Setup(data=None if data is None else str(data)), logs=str((args.out / LOGS_FOLDER).absolute()))
     if args.long:
         setup = replace(setup, step_seconds=3 * setup.step_seconds, quality_seconds=3 * setup.quality_seconds)
     facts = describe_gpu_machine(setup.torch_device, args.commit)

@@ -1,8 +1,7 @@
 """A plugin of pytest that ends a worker of xdist whose GPU context is broken; xdist then starts a new worker.
 
 After an illegal memory access every later call on the GPU fails in that process. Without this plugin all tests that the
-worker still has to run would fail, too. xdist gives the test that ended a worker to the next one again, so the names of
-such tests are kept in a file, and they are skipped there.
+worker still has to run would fail, too.
 """
 
 from __future__ import annotations
@@ -10,18 +9,8 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Generator
-from pathlib import Path
 
 import pytest
-
-from tools.gpu.suite import BROKEN_TESTS_VARIABLE
-
-
-def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Skip a test that has broken the GPU of another worker."""
-    file = Path(os.environ.get(BROKEN_TESTS_VARIABLE) or os.devnull)
-    if file.is_file() and item.nodeid in file.read_text().splitlines():
-        pytest.skip("it has broken the GPU of another worker")
 
 
 @pytest.hookimpl(wrapper=True)
@@ -31,9 +20,6 @@ def pytest_runtest_makereport(
     """End the process after a test that has broken the GPU; xdist reports that test as failed."""
     report = yield
     if call.excinfo is not None and "PYTEST_XDIST_WORKER" in os.environ and is_gpu_broken():
-        if file := os.environ.get(BROKEN_TESTS_VARIABLE):
-            with Path(file).open("a") as broken:
-                broken.write(f"{item.nodeid}\n")
         os.write(2, f"the GPU is unusable after {item.nodeid}: {call.excinfo.exconly()}\n".encode())
         os._exit(1)
     return report

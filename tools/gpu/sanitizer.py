@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import re
 import shutil
-import subprocess
 import sys
 from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 
-from hyrfpack.parallel.child_items import child_environment
+from hyrfpack.parallel.child_items import DONE_PREFIX, child_environment
 from hyrfpack.self_test.cases import self_test_cases
+from tools.gpu.process import TimedProcess
 from tools.gpu.rows import Row
 from tools.gpu.setup import Setup
 
 TABLE_NAME = "compute-sanitizer"
 # The usual place of the tool, for machines whose PATH lacks it.
 DEFAULT_PROGRAM = Path("/usr/local/cuda/bin/compute-sanitizer")
+# The time limit of each tool, in the order in which they run. Together they fit into the part's time limit.
+TOOL_SECONDS = {"memcheck": 45.0, "racecheck": 22.0}
 # Only these kernels use shared memory explicitly or through matrix products.
 RACE_CHECK_OPERATIONS = ("mlp", "shade")
 _SUMMARY = re.compile(r"(?:ERROR|RACECHECK) SUMMARY: (\d+) (.*)")
@@ -24,7 +27,7 @@ _SUMMARY = re.compile(r"(?:ERROR|RACECHECK) SUMMARY: (\d+) (.*)")
 
 def items(setup: Setup) -> list[str]:
     """Return the names of the sanitizer's tools."""
-    return ["memcheck", "racecheck"]
+    return list(TOOL_SECONDS)
 
 
 def run(item: str, setup: Setup) -> Iterator[Row]:
@@ -43,15 +46,19 @@ def run(item: str, setup: Setup) -> Iterator[Row]:
     worker = [sys.executable, "-m", "hyrfpack.self_test.worker", setup.implementation, f"{setup.device}:0", *names]
     # torch's cache of memory would hide accesses between two tensors.
     environment = {**child_environment(), "PYTORCH_NO_CUDA_MEMORY_CACHING": "1"}
-    done = subprocess.run(
-        [program, "--tool", item, *worker],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        errors="replace",
-        env=environment,
-    )
-    yield {"table": TABLE_NAME, "tool": item, "cases": len(names), **describe_output(done.stdout, done.returncode)}
+    process = TimedProcess([program, "--tool", item, *worker], TOOL_SECONDS[item], setup.log_path(item), environment)
+    output = "".join(process.lines())
+    row: Row = {"table": TABLE_NAME, "tool": item, "cases": f"{count_checked_cases(output)} of {len(names)}"}
+    if process.is_out_of_time:
+        found = "; ".join(islice(_iterate_report_lines(output), 4))[:300]
+        yield row | {"status": "failed", "note": f"not done within {TOOL_SECONDS[item]:.0f} s; it printed: {found}"}
+    else:
+        yield row | describe_output(output, process.exit_code)
+
+
+def count_checked_cases(output: str) -> int:
+    """Return how many cases the self-test has ended in a tool's output."""
+    return sum(line.startswith(DONE_PREFIX) for line in output.splitlines())
 
 
 def describe_output(output: str, exit_code: int) -> Row:
@@ -62,8 +69,12 @@ def describe_output(output: str, exit_code: int) -> Row:
         return {"status": "failed", "note": f"it ended with exit code {exit_code} and no summary: {last_line[:200]}"}
     row: Row = {"found": f"{summary[1]} {summary[2].strip()}"}
     if int(summary[1]):
-        reports = [
-            line.strip("= ") for line in output.splitlines() if line.startswith("=========") and line.strip("= ")
-        ]
-        return row | {"status": "failed", "note": "; ".join(reports[:4])[:300]}
+        return row | {"status": "failed", "note": "; ".join(islice(_iterate_report_lines(output), 4))[:300]}
     return row
+
+
+def _iterate_report_lines(output: str) -> Iterator[str]:
+    """Yield the lines of the tool itself, without those of the program that it runs."""
+    for line in output.splitlines():
+        if line.startswith("=========") and line.strip("= "):
+            yield line.strip("= ")

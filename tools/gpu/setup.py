@@ -18,6 +18,7 @@ class Setup:
     Attributes:
         device: the device of the kernels, as torch names it.
         implementation: the implementation of the operations, such as "gpu".
+        doctor_seconds: time limit in seconds for `hyrfpack doctor`, once its kernels are compiled.
         width, height: size of the pictures in pixels.
         kernel_gaussians: number of Gaussians with which single kernels are timed.
         frame_gaussians: numbers of Gaussians with which whole frames and training steps are timed.
@@ -34,10 +35,12 @@ class Setup:
         quality_seconds: time limit in seconds for the CPU's training run; the number of steps is reduced to keep it.
         test_paths: files and folders of the tests that pytest runs, relative to the repository's root.
         data: folder of a real data set, or None.
+        logs: folder for what other programs print, or None.
     """
 
     device: str = "cuda"
     implementation: str = "gpu"
+    doctor_seconds: float = 60.0
     width: int = 1920
     height: int = 1080
     kernel_gaussians: int = 1_000_000
@@ -56,10 +59,15 @@ class Setup:
     quality_seconds: float = 40.0
     test_paths: tuple[str, ...] = ("tests/ops", "tests/test_gpu_path.py")
     data: str | None = None
+    logs: str | None = None
 
     @property
     def torch_device(self) -> torch.device:
         return torch.device(self.device)
+
+    def log_path(self, name: str) -> Path | None:
+        """Return the file for what a program of this name prints; None if there is no folder for it."""
+        return Path(self.logs, f"{name}.txt") if self.logs else None
 
     def to_json(self) -> str:
         return json.dumps(asdict(self))

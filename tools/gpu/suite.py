@@ -4,33 +4,26 @@ from __future__ import annotations
 
 import os
 import re
-import signal
-import subprocess
 import sys
-import tempfile
-import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from threading import Timer
 
+from tools.gpu.process import TimedProcess
 from tools.gpu.rows import Row
 
-REPOSITORY_ROOT = Path(__file__).parents[2]
-MAX_SECONDS = 140.0  # together with the random cases, this fits into the part's time limit
-SECONDS_TO_SUMMARISE = 8.0
-# The environment variable that names the file in which workers note the tests that broke the GPU.
-BROKEN_TESTS_VARIABLE = "HYRFPACK_BROKEN_GPU_TESTS"
+MAX_SECONDS = 125.0  # leaves time for the summary and the random cases within the part's time limit
 GPU_MARKER = "gpu"  # the marker that pyproject.toml declares
 # pyproject.toml asks for strict settings; these are not strict, because a GPU machine may lack pytest's plugins. It may
 # also lack other packages, so files that cannot be imported do not stop the others.
 PYTEST_OVERRIDES = (
     "-o", "addopts=--import-mode=importlib", "-p", "no:cacheprovider", "--continue-on-collection-errors",
 )  # fmt: skip
-# Building kernels takes a CPU core each. All tests of a file run in one process, which loads their kernels once.
-WORKERS = 6
-PARALLEL_OPTIONS = ("--dist", "loadfile", "-p", "tools.gpu.replace_worker")
+# Building kernels takes a CPU core each. Processes begin with a range of neighbouring tests each, and take tests from
+# others when they are done, so that no file of slow tests keeps one of them busy alone.
+WORKERS = min(12, os.cpu_count() or 1)
+PARALLEL_OPTIONS = ("--dist", "worksteal", "-p", "tools.gpu.replace_worker")
 _OUTCOME = "(?P<outcome>PASSED|FAILED|ERROR|SKIPPED|XFAIL|XPASS)"
 # "tests/test_a.py::test_b PASSED [ 50%]", or from xdist "[gw1] [ 50%] PASSED tests/test_a.py::test_b".
 _TEST_LINES = (
@@ -41,7 +34,9 @@ _OUTCOME_LABELS = {"PASSED": "passed", "FAILED": "failed", "ERROR": "errors", "S
 _FAILED_OUTCOMES = ("FAILED", "ERROR")
 
 
-def run_suite(paths: Sequence[str], seconds: float = MAX_SECONDS, workers: int = WORKERS) -> Iterator[Row]:
+def run_suite(
+    paths: Sequence[str], seconds: float = MAX_SECONDS, workers: int = WORKERS, log: Path | None = None
+) -> Iterator[Row]:
     """Run the tests marked `gpu`; yield one row for each file, and one more if pytest failed outside of a test.
 
     Rows are yielded at the end, or when `seconds` are over, with the first reason of each file's failures. Each test's
@@ -51,6 +46,7 @@ def run_suite(paths: Sequence[str], seconds: float = MAX_SECONDS, workers: int =
         paths: files and folders of tests.
         seconds: time limit, after which pytest is interrupted.
         workers: number of xdist's processes; 0, or a missing xdist, runs all tests in one process.
+        log: file for all that pytest prints, or None.
 
     Raises:
         ModuleNotFoundError: pytest is not installed.
@@ -61,46 +57,24 @@ def run_suite(paths: Sequence[str], seconds: float = MAX_SECONDS, workers: int =
     command = [sys.executable, "-m", "pytest", "-v", "--no-header", *PYTEST_OVERRIDES, *parallel]
     command += ["-m", GPU_MARKER, *paths]
     # The lines must be wide enough for the message of a failed test.
-    folder = tempfile.TemporaryDirectory(prefix="hyrfpack-gpu-")
     environment = {**os.environ, "COLUMNS": "400", "PYTHONUNBUFFERED": "1"}
-    environment[BROKEN_TESTS_VARIABLE] = str(Path(folder.name) / "broken_tests")
-    child = subprocess.Popen(
-        command,
-        cwd=REPOSITORY_ROOT,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        errors="replace",
-        env=environment,
-    )
-    # An interrupted pytest still prints the reasons of failed tests.
-    timers = [
-        Timer(seconds, child.send_signal, (signal.SIGINT,)),
-        Timer(seconds + SECONDS_TO_SUMMARISE, child.kill),
-    ]
-    end = time.monotonic() + seconds
-    for timer in timers:
-        timer.start()
+    process = TimedProcess(command, seconds, log, environment)
     counts: dict[str, Counter[str]] = {}
     last_line, reasons = "", dict[str, str]()
-    assert child.stdout is not None
-    for line in child.stdout:
+    for line in process.lines():
         last_line = " ".join(line.split()) or last_line
         if test := next(filter(None, (pattern.fullmatch(line) for pattern in _TEST_LINES)), None):
             print(last_line, flush=True)
             counts.setdefault(test["file"], Counter())[test["outcome"]] += 1
         elif line.startswith(_FAILED_OUTCOMES):  # a line of pytest's summary
             reasons.setdefault(line.partition(" ")[2].partition("::")[0], last_line)
-    code = child.wait()
-    for timer in timers:
-        timer.cancel()
-    folder.cleanup()
+    code = process.exit_code
     for file, outcomes in counts.items():
         row = _row(file, outcomes)
         if _has_failed(outcomes):
             row |= {"status": "failed", "note": reasons.get(file, last_line)}
         yield row
-    if code and time.monotonic() >= end:
+    if code and process.is_out_of_time:
         tests = sum(outcomes.total() for outcomes in counts.values())
         yield {"case": "pytest", "status": "failed", "note": f"not done within {seconds:.0f} s; {tests} tests were run"}
     elif not counts and code == pytest.ExitCode.NO_TESTS_COLLECTED:
