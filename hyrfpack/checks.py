@@ -5,6 +5,7 @@ Settings are written as JSON beside results. JSON cannot represent NumPy's numbe
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Collection
 from typing import Any
@@ -70,10 +71,21 @@ def check_pair(name: str, value: Any) -> None:
 # How to get an argument of types that are not made directly, by their names.
 _REMEDIES_BY_TYPE_NAME = {
     "Camera": "a View has one: view.camera",
+    "Manifest": "a SceneFolder has one: scene.manifest",
     "HybridModel": "hyrfpack.load_model reads it from a file",
     "Scene": "hyrfpack.load_scene reads it from a folder",
     "View": "a Scene has lists of them: scene.test",
 }
+
+
+def check_several(argument: str, paths: object) -> None:
+    """Check that an argument of a call is not one path where several are expected.
+
+    Raises:
+        TypeError: it is one path, whose characters would be taken for paths.
+    """
+    if isinstance(paths, str | os.PathLike):
+        raise TypeError(f"{argument} must be several paths, not {os.fspath(paths)!r} alone; give a list of them")
 
 
 def check_type(argument: str, value: object, expected: type) -> None:

@@ -157,6 +157,15 @@ MISTAKEN_CALLS = [
     (lambda model, scene: hyrfpack.save_model("m.hyrf", "a.hyrf"), "model must be a HybridModel"),
     (lambda model, scene: hyrfpack.import_splats("a.ply", "a.hyrf", 500), "config must be a ImportConfig"),
     (lambda model, scene: hyrfpack.import_splats("a.ply", "a.hyrf", cameras=scene.train), "cameras must be a Camera"),
+    (
+        lambda model, scene: hyrfpack.merge_models("m.hyrf", "a.hyrf"),
+        "sources must be several paths, not 'm.hyrf' alone",
+    ),
+    (lambda model, scene: hyrfpack.export_gallery("m.hyrf", "a"), "sources must be several paths, not 'm.hyrf' alone"),
+    (
+        lambda model, scene: hyrfpack.select_levels("scene", scene.train[0].camera),
+        "manifest must be a Manifest, not a str; .*scene.manifest",
+    ),
 ]
 
 

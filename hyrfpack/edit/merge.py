@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
+from hyrfpack.checks import check_several
 from hyrfpack.config.edit import Move
 from hyrfpack.edit.transform import Placement
 from hyrfpack.errors import HyrfError
@@ -87,6 +88,7 @@ def merge_models(
         >>> len(report.parts), report.parts[1].name
         (2, 'bonsai 2')
     """
+    check_several("sources", sources)
     if not sources:
         raise ValueError("there are no models; give at least one")
     paths = [find_model(source) for source in sources]

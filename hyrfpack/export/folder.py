@@ -16,7 +16,7 @@ from PIL import Image
 
 from hyrfpack.atomic import pending_file, write_atomic
 from hyrfpack.cameras.paths import Viewpoint
-from hyrfpack.checks import check_type
+from hyrfpack.checks import check_several, check_type
 from hyrfpack.counts import format_count
 from hyrfpack.evaluate import evaluate_model
 from hyrfpack.evaluate.metrics import IDENTICAL_PSNR
@@ -184,8 +184,11 @@ def export_gallery(
         >>> sorted(path.name for path in Path("gallery").glob("bonsai*"))
         ['bonsai-2.jpg', 'bonsai-2.ply', 'bonsai.hyrf', 'bonsai.jpg']
     """
+    check_several("sources", sources)
+    if not sources:
+        raise ValueError("there are no models; give at least one")
     scenes = list(data) or [None] * len(sources)
-    if len(scenes) != len(sources) or not sources:
+    if len(scenes) != len(sources):
         raise ValueError(
             f"{format_count(len(scenes), 'set')} of photos for {format_count(len(sources), 'model')}; give one for "
             "each, or none at all"

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hyrfpack.checks import check_type
 from hyrfpack.format.scene_manifest import Manifest
 from hyrfpack.scene import Camera
 
@@ -56,6 +57,7 @@ def select_levels(
 
     Raises:
         ValueError: both limits are given.
+        TypeError: the manifest or the camera has another type.
 
     Example:
         >>> import hyrfpack
@@ -65,6 +67,8 @@ def select_levels(
         >>> choice.gaussians == report.gaussians, choice.predicted_mse
         (True, 0.0)
     """
+    check_type("manifest", manifest, Manifest)
+    check_type("camera", camera, Camera)
     if gaussians is not None and bytes is not None:
         raise ValueError("both a number of Gaussians and a size limit the view; give one of them")
     count_bytes = bytes is not None

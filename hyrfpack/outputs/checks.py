@@ -90,6 +90,8 @@ class Outputs:
             folder: the folder, which need not exist.
             names: paths of the files, relative to the folder.
         """
+        if os.fspath(folder) == "":  # Python would write into the current folder
+            raise HyrfError("'' is not a path", fix="name a folder")
         if os.path.lexists(folder) and not os.path.isdir(folder):
             raise HyrfError(f"{folder}: this is a file", fix="name a folder")
         paths = [Path(folder, name) for name in names]

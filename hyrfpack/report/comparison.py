@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hyrfpack.atomic import write_atomic
+from hyrfpack.checks import check_several
 from hyrfpack.errors import HyrfError
 from hyrfpack.format.run_folder import METRICS_FILE, MODEL_FILE
 from hyrfpack.outputs import Outputs, StrPath
@@ -60,8 +61,7 @@ def compare_runs(runs: Sequence[StrPath], out: StrPath, *, overwrite: bool = Fal
         >>> report.runs, report.views, report.doubts
         (['bonsai', 'again'], ['0000.png', '0008.png'], [])
     """
-    if isinstance(runs, str | os.PathLike):
-        raise TypeError(f"runs must be several folders, not {os.fspath(runs)!r} alone; give a list of them")
+    check_several("runs", runs)
     folders = [Path(run) for run in runs]
     if len({os.path.realpath(folder) for folder in folders}) < max(2, len(folders)):
         raise HyrfError(

@@ -200,8 +200,8 @@ def test_file_names_are_sanitized_and_escaped(tmp_path):
 
 
 def test_a_wrong_number_of_photo_sets_is_refused(model_file, tmp_path):
-    for sources, data in (([model_file], [None, None]), ([], [])):
-        with pytest.raises(ValueError, match="one for each"):
+    for sources, data, words in (([model_file], [None, None], "one for each"), ([], [], "there are no models")):
+        with pytest.raises(ValueError, match=words):
             export_gallery(sources, tmp_path / "g", data=data)
     assert list(tmp_path.iterdir()) == []
 

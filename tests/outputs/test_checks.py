@@ -142,6 +142,12 @@ def test_an_output_that_cannot_be_written_is_an_error_before_the_work(name, word
         Outputs().file(tmp_path / name, ".hyrf")
 
 
+def test_an_empty_path_is_not_the_current_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(HyrfError, match="'' is not a path"):
+        Outputs().folder("", ["index.html"])
+
+
 def test_a_working_folder_that_was_removed_is_a_clear_error(tmp_path, monkeypatch):
     (tmp_path / "gone").mkdir()
     monkeypatch.chdir(tmp_path / "gone")
