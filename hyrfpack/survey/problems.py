@@ -38,9 +38,10 @@ def find_count_problems(count: int, scene: Scene | None, posed: int, path: Path)
         return found
     without = count - posed
     if posed and without > 0:
+        of_photos = f"of {count} photos"
+        unused = format_count(without, f"{of_photos} has no pose and is", f"{of_photos} have no pose and are")
         found.append(
-            f"{format_count(without, f'of {count} photos has', f'of {count} photos have')} no pose and cannot be used; "
-            f"take more photos between them and the others, or estimate all poses again with 'hyrfpack poses "
+            f"{unused} not used; take more photos between them and the others, or estimate all poses again with 'hyrfpack poses "
             f"{shlex.quote(str(path))} -o SCENE'"
         )
     if not len(scene.points):
