@@ -41,8 +41,8 @@ def find_count_problems(count: int, scene: Scene | None, posed: int, path: Path)
         of_photos = f"of {count} photos"
         unused = format_count(without, f"{of_photos} has no pose and is", f"{of_photos} have no pose and are")
         found.append(
-            f"{unused} not used; take more photos between them and the others, or estimate all poses again with 'hyrfpack poses "
-            f"{shlex.quote(str(path))} -o SCENE'"
+            f"{unused} not used; take more photos between them and the others, or estimate all poses again with "
+            f"'hyrfpack poses {shlex.quote(str(path))} -o SCENE'"
         )
     if not len(scene.points):
         found.append(
