@@ -1,4 +1,4 @@
-"""Read the PLY container (Turk 1994): a text header names elements and their properties, and their rows follow."""
+"""Read the PLY container (Turk 1994), and write points: a header names elements and properties, their rows follow."""
 
 from __future__ import annotations
 
@@ -151,6 +151,20 @@ def stack_columns(rows: np.ndarray, names: Collection[str]) -> np.ndarray:
         table = rows.view(kinds.pop()).reshape(len(rows), len(fields))
         return table[:, [fields.index(name) for name in names]]
     return np.stack([rows[name] for name in names], axis=1)
+
+
+def encode_colored_points(points: np.ndarray, colors: np.ndarray) -> bytes:
+    """Encode points as a binary PLY file with float32 positions.
+
+    Args:
+        points: (P, 3) positions.
+        colors: (P, 3) RGB, whole numbers from 0 to 255.
+    """
+    vertices = np.empty(len(points), [("position", "<f4", 3), ("color", "u1", 3)])
+    vertices["position"], vertices["color"] = points, colors
+    fields = [f"property float {axis}" for axis in "xyz"] + [f"property uchar {c}" for c in ("red", "green", "blue")]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}", *fields, "end_header", ""]
+    return "\n".join(header).encode() + vertices.tobytes()
 
 
 def _parse_rows(lines: list[str], kinds: dict[str, str], label: str, name: str) -> np.ndarray:

@@ -19,6 +19,7 @@ import numpy as np
 from hyrfpack.atomic import write_atomic
 from hyrfpack.cameras.paths import look_at
 from hyrfpack.errors import needs_package
+from hyrfpack.ply import encode_colored_points
 
 NO_HIT_DISTANCE = np.float32(1e9)
 _SUN_DIRECTION = np.array([0.45, -0.55, 0.70]) / np.linalg.norm([0.45, -0.55, 0.70])
@@ -108,7 +109,8 @@ def write_demo_scene(
         exact = surface[:, rows, columns].T[near]
         points.append(exact + rng.normal(size=exact.shape) * 0.002 * depth[near, None])
         colors.append(picture[rows, columns][near])
-    _write_ply(folder / "sparse_pc.ply", np.concatenate(points), np.concatenate(colors), overwrite)
+    cloud = encode_colored_points(np.concatenate(points), np.concatenate(colors))
+    write_atomic(folder / "sparse_pc.ply", cloud, overwrite=overwrite, rename=False)
     content = {"camera_model": "PINHOLE", "ply_file_path": "sparse_pc.ply", "frames": frames}
     poses = json.dumps(content, indent=1).encode()
     write_atomic(folder / "transforms.json", poses, overwrite=overwrite, rename=False)
@@ -373,11 +375,3 @@ SOLID_SHAPES = (
     Solid((1.18, -0.12, 0.16), (0.22, 0.16, 0.16), _tiles, box=True, yaw=-0.4),
     Solid((-0.30, -1.20, 0.17), (0.17, 0.17, 0.17), _tiles, box=True, yaw=0.9),
 )
-
-
-def _write_ply(path: Path, points: np.ndarray, colors: np.ndarray, overwrite: bool) -> None:
-    vertices = np.empty(len(points), [("position", "<f4", 3), ("color", "u1", 3)])
-    vertices["position"], vertices["color"] = points, colors
-    fields = [f"property float {axis}" for axis in "xyz"] + [f"property uchar {c}" for c in ("red", "green", "blue")]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}", *fields, "end_header", ""]
-    write_atomic(path, "\n".join(header).encode() + vertices.tobytes(), overwrite=overwrite, rename=False)

@@ -5,16 +5,21 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
+import tempfile
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from hyrfpack.bench.operation_calls import OperationCall
+from hyrfpack.data import load_scene
 from hyrfpack.errors import HyrfError, needs_package
+from hyrfpack.export.cameras import write_colmap
 from hyrfpack.ops.dispatch import has_triton
 from hyrfpack.ops.rasterize import RasterSettings, rasterize
 from hyrfpack.ops.rasterize.reference import project
@@ -22,6 +27,7 @@ from hyrfpack.parallel.child_items import run_in_children
 from tools.gpu import check as gpu_check
 from tools.gpu import first_contact as gpu_first_contact
 from tools.gpu import frames as gpu_frames
+from tools.gpu import full_run as gpu_full_run
 from tools.gpu import kernels as gpu_kernels
 from tools.gpu import prepare as gpu_prepare
 from tools.gpu import quality as gpu_quality
@@ -346,7 +352,7 @@ def test_it_starts_from_the_repository_root_without_an_installed_hyrfpack() -> N
 
 def test_the_default_parts_end_within_nine_minutes_and_leave_out_long_training() -> None:
     assert sum(gpu_check.CHECK_PARTS[part][1] for part in gpu_check.DEFAULT_PARTS) <= 540
-    assert set(gpu_check.CHECK_PARTS) - set(gpu_check.DEFAULT_PARTS) == {"quality"}
+    assert set(gpu_check.CHECK_PARTS) - set(gpu_check.DEFAULT_PARTS) == {"quality", "full-run"}
 
 
 def test_rooms_of_the_goals_size_come_first_as_trained_before_tidy() -> None:
@@ -475,12 +481,70 @@ def test_the_sanitizer_is_left_out_where_it_is_missing(monkeypatch: pytest.Monke
     assert [row["status"] for row in rows] == ["left out", "left out"]
 
 
-def test_prepared_commands_install_the_wheels_without_a_network_and_run_both_checks() -> None:
-    first, second = gpu_prepare.check_commands(Path("build/gpu"), "abc123", "$OUT")
-    for command in (first, second):
-        assert "--no-index" in command and "build/gpu/wheels/*.whl" in command
-        assert "PYTHONPATH=/tmp/gpu-packages" in command and "--commit abc123 --out $OUT" in command
-    assert "--parts quality --data build/gpu/data" in second and "--parts" not in first
+def test_prepared_commands_run_the_default_parts_and_both_kinds_of_training() -> None:
+    first, second, third = gpu_prepare.check_commands(Path("build/gpu/bonsai"), "abc123", "$OUT")
+    assert all("--commit abc123 --out $OUT" in command for command in (first, second, third))
+    assert "--parts" not in first
+    assert "--parts quality --data build/gpu/bonsai" in second and "--parts full-run --data build/gpu/bonsai" in third
+
+
+@pytest.fixture
+def colmap_set(data: Path, tmp_path: Path) -> Path:
+    """The small photos of the demo scene with poses and points as a COLMAP model."""
+    pytest.importorskip("pycolmap")
+    folder, scene = tmp_path / "set", load_scene(data)
+    shutil.copytree(data / "images", folder / "images")
+    write_colmap([(view.name, view.camera) for view in scene.train + scene.test], folder, points=None)
+    return folder
+
+
+def test_a_prepared_set_is_the_same_scene_without_pycolmap(
+    colmap_set: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = load_scene(colmap_set)
+    scene = replace(scene, points=np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]), point_colors=np.eye(3)[:2])
+    monkeypatch.setattr(gpu_prepare, "load_scene", lambda path: scene if path == colmap_set else load_scene(path))
+    gpu_prepare.copy_dataset(colmap_set, tmp_path / "copy")
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    copied = load_scene(tmp_path / "copy")
+    assert [view.name for view in copied.test] == [view.name for view in scene.test]
+    np.testing.assert_allclose(copied.points, scene.points)
+    np.testing.assert_allclose(copied.point_colors, scene.point_colors)
+    for view, other in zip(copied.train, scene.train, strict=True):
+        np.testing.assert_allclose(view.camera.camera_from_world, other.camera.camera_from_world, atol=1e-12)
+        assert np.array_equal(view.load().rgb, other.load().rgb)
+
+
+def test_a_set_whose_copy_would_differ_is_refused(
+    colmap_set: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = load_scene(colmap_set)
+    camera = replace(scene.train[0].camera, fx=2 * scene.train[0].camera.fx)
+    changed = replace(scene, train=[replace(scene.train[0], camera=camera), *scene.train[1:]])
+    assert gpu_prepare.is_same_scene(scene, scene) and not gpu_prepare.is_same_scene(scene, changed)
+    monkeypatch.setattr(gpu_prepare, "is_same_scene", lambda first, second: False)
+    with pytest.raises(HyrfError, match="the copy differs"):
+        gpu_prepare.copy_dataset(colmap_set, tmp_path / "copy")
+
+
+def test_a_full_run_reports_at_intervals_and_resumes_from_its_checkpoint(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    setup = replace(TINY_SETUP, device="cpu", data=str(data), full_run_steps=6, full_run_interval=0.0)
+    (first,) = gpu_full_run.run(str(data), replace(setup, full_run_seconds=0.0))
+    assert first["step"] == "1 of 6" and float(first["PSNR of held-out photos"].split()[0]) > 0
+    rows = list(gpu_full_run.run(str(data), replace(setup, full_run_seconds=600.0)))
+    assert [row["step"] for row in rows] == [f"{step} of 6" for step in range(2, 7)]
+    assert list(tmp_path.glob("*.checkpoint")) == []
+
+
+def test_a_full_run_needs_a_data_set() -> None:
+    (item,) = gpu_full_run.items(TINY_SETUP)
+    (row,) = gpu_full_run.run(item, TINY_SETUP)
+    assert row["status"] == "left out" and "--data" in row["note"]
+    seconds = gpu_check.part_seconds("full-run", replace(TINY_SETUP, full_run_seconds=100.0))
+    assert seconds == 100.0 + gpu_check.FULL_RUN_OVERHEAD_SECONDS
 
 
 def test_the_command_writes_its_page_and_fails_where_a_check_does(

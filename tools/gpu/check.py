@@ -16,6 +16,7 @@ order in which they run:
     sanitizer  NVIDIA's compute-sanitizer on the cases of the self-test, where it is installed
     repeat     the same frame and the same training step twice: whether all bits agree
     quality    the same training run on the CPU and on the GPU: PSNR on held-out photos in dB; not run by default
+    full-run   30,000 steps on the real data set on the GPU, as far as the time allows; not run by default
 
 Exit code: 0 if every check passed, 1 if one failed, 2 if there is no GPU. A missed goal does not fail the check.
 """
@@ -40,11 +41,12 @@ from hyrfpack.measure.machine import format_machine
 from hyrfpack.parallel.child_items import run_in_children
 from tools.gpu.report import describe_gpu_machine, write_report
 from tools.gpu.rows import Row
-from tools.gpu.setup import Setup, find_dataset
+from tools.gpu.setup import FULL_RUN_SECONDS, Setup, find_dataset
 from tools.gpu.worker import failure_row, run_child
 
 REPOSITORY_ROOT = Path(__file__).parents[2]
 LOGS_FOLDER = "logs"  # in the folder of results: what pytest and other programs print
+FULL_RUN_OVERHEAD_SECONDS = 60.0  # what the full run takes besides its training time
 # Each part has a module with `items(setup)` and `run(item, setup)`, and a time limit in seconds for all its items. The
 # limits of the first two parts include the first build of 140 kernels, which takes up to a second each.
 CHECK_PARTS = {
@@ -55,6 +57,7 @@ CHECK_PARTS = {
     "sanitizer": ("tools.gpu.sanitizer", 90.0),
     "repeat": ("tools.gpu.repeat", 20.0),
     "quality": ("tools.gpu.quality", 170.0),
+    "full-run": ("tools.gpu.full_run", FULL_RUN_OVERHEAD_SECONDS),
 }
 DEFAULT_PARTS = ("self-test", "tests", "kernels", "frames", "sanitizer", "repeat")
 # The default parts end within this time, because some machines kill a command after 10 minutes.
@@ -79,7 +82,7 @@ def check(
     rows: list[Row] = []
     for part in parts:
         start = time.monotonic()
-        for row in run_part(part, setup, scale * CHECK_PARTS[part][1]):
+        for row in run_part(part, setup, scale * part_seconds(part, setup)):
             rows.append({"part": part, **row})
             print(_format_row(rows[-1]), flush=True)
             report(rows)
@@ -87,6 +90,11 @@ def check(
         rows.append({"table": "Time taken", "part": part, "item": "", "what": part, "seconds": round(seconds, 1)})
         report(rows)
     return rows
+
+
+def part_seconds(part: str, setup: Setup) -> float:
+    """Return the time limit of a part in seconds."""
+    return CHECK_PARTS[part][1] + (setup.full_run_seconds if part == "full-run" else 0.0)
 
 
 def run_part(part: str, setup: Setup, seconds: float) -> Iterator[Row]:
@@ -119,13 +127,16 @@ def main(arguments: list[str] | None = None) -> int:
         nargs="+",
         choices=list(CHECK_PARTS),
         default=list(DEFAULT_PARTS),
-        help="parts to run (all but quality)",
+        help="parts to run (all but quality and full-run)",
     )
     parser.add_argument(
         "--out", type=Path, default=REPOSITORY_ROOT / "docs" / "gpu", help="folder for results (docs/gpu)"
     )
     parser.add_argument("--data", type=Path, help="a real data set to train on, or a folder of data sets")
     parser.add_argument("--commit", help="the commit that is checked, for a copy of the repository without .git")
+    parser.add_argument(
+        "--full-run-seconds", type=float, default=FULL_RUN_SECONDS, help="seconds for the full run (240)"
+    )
     parser.add_argument("--long", action="store_true", help="triple the time limits of timing and training")
     args = parser.parse_args(arguments)
     if not torch.cuda.is_available():
@@ -133,6 +144,7 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
     data = find_dataset(args.data, os.environ.get("HYRFPACK_DATA"), REPOSITORY_ROOT.parent / "shared" / "data")
     setup = replace(Setup(data=None if data is None else str(data)), logs=str((args.out / LOGS_FOLDER).absolute()))
+    setup = replace(setup, full_run_seconds=args.full_run_seconds)
     if args.long:
         setup = replace(setup, step_seconds=3 * setup.step_seconds, quality_seconds=3 * setup.quality_seconds)
     facts = describe_gpu_machine(setup.torch_device, args.commit)

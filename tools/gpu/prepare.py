@@ -1,49 +1,81 @@
-"""Prepare a folder for a GPU machine that has no network and lacks packages, and print the command to run there.
+"""Prepare a real data set for a GPU machine that has no network and lacks packages, and print the commands to run.
 
     python -m tools.gpu.prepare --data ../shared/data/mipnerf360_bonsai
 
-It downloads wheels of the packages that training on real photos needs, copies a small data set beside them, and checks
-that folder and repository together are small enough to be copied to the machine. The folder lies in build/, which git
-ignores, so name it where the machine asks for extra paths.
+It copies the set with the poses of a COLMAP model as a transforms.json, which hyrfpack reads without pycolmap, and
+checks that folder and repository together are small enough to be copied to the machine. The folder lies in build/,
+which git ignores, so name it where the machine asks for extra paths.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
+from hyrfpack.data import load_scene
+from hyrfpack.errors import HyrfError
+from hyrfpack.export.cameras import encode_transforms
+from hyrfpack.ply import encode_colored_points
+from hyrfpack.scene import Scene
+
 REPOSITORY_ROOT = Path(__file__).parents[2]
-PACKAGES = ("zstandard", "trimesh", "dahuffman", "pycolmap")
-# pip's names of wheels for x86-64 Linux with glibc 2.28 or newer.
-PLATFORMS = tuple(f"{name}_x86_64" for name in ("manylinux_2_28", "manylinux_2_27", "manylinux_2_17", "manylinux2014"))
 MAX_MEGABYTES = 64.0
-WHEELS_FOLDER, DATA_FOLDER = "wheels", "data"
+POINTS_FILE = "points.ply"
 
 
-def download_command(folder: Path, python: str) -> list[str]:
-    """Return pip's command that downloads the wheels, without their dependencies, for another Python."""
-    command = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--only-binary=:all:"]
-    platforms = [f"--platform={name}" for name in PLATFORMS]
-    return [*command, "--python-version", python, *platforms, "--dest", str(folder), *PACKAGES]
+def copy_dataset(source: Path, target: Path) -> None:
+    """Copy a data set; a COLMAP model becomes a transforms.json with the same split.
+
+    Raises:
+        HyrfError: the copy would be another scene, as where photos are distorted.
+    """
+    scene = load_scene(source)
+    if scene.layout != "colmap":
+        shutil.copytree(source, target, copy_function=shutil.copyfile)
+        return
+    views = sorted(scene.train + scene.test, key=lambda view: view.name)
+    for view in views:
+        photo = target / "images" / view.name
+        photo.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(source / "images" / view.name, photo)
+    content = json.loads(encode_transforms([(view.name, view.camera) for view in views]))
+    content["ply_file_path"] = POINTS_FILE
+    (target / "transforms.json").write_text(json.dumps(content))
+    (target / POINTS_FILE).write_bytes(encode_colored_points(scene.points, np.round(255 * scene.point_colors)))
+    if not is_same_scene(scene, load_scene(target)):
+        raise HyrfError(f"{source}: the copy differs, maybe because the photos are distorted", fix="use another set")
 
 
-def check_commands(folder: Path, commit: str, out: str) -> list[str]:
-    """Return the two commands for the GPU machine: first the default parts, then training on the data set.
+def is_same_scene(first: Scene, second: Scene) -> bool:
+    """Return whether two scenes have the same photos for training and tests, cameras and points, but for rounding."""
+    views, others = first.train + first.test, second.train + second.test
+    if [v.name for v in views] != [v.name for v in others] or len(first.train) != len(second.train):
+        return False
+    return np.allclose(first.points, second.points, rtol=1e-6) and all(
+        np.allclose(view.camera.camera_from_world, other.camera.camera_from_world)
+        and np.allclose(view.camera.intrinsics, other.camera.intrinsics)
+        and np.array_equal(view.load().rgb, other.load().rgb)
+        for view, other in zip(views, others, strict=True)
+    )
+
+
+def check_commands(data: Path, commit: str, out: str) -> list[str]:
+    """Return the commands for the GPU machine: the default parts, then two kinds of training on the data set.
 
     Args:
-        folder: the prepared folder, relative to the repository's root.
+        data: the copied set, relative to the repository's root.
         commit: the commit that is checked.
         out: the folder for results, as the shell there writes it.
     """
-    packages = f"/tmp/{folder.name}-packages"
-    wheels, data = (folder / name for name in (WHEELS_FOLDER, DATA_FOLDER))
-    install = f"python3 -m pip install --quiet --no-index --no-deps --target {packages} {wheels.as_posix()}/*.whl"
-    check = f"PYTHONPATH={packages} timeout 590 python3 -m tools.gpu.check --commit {commit} --out {out}"
-    return [f"{install}; {check}", f"{install}; {check} --parts quality --data {data.as_posix()}"]
+    check = f"timeout 590 python3 -m tools.gpu.check --commit {commit} --out {out}"
+    return [check, *(f"{check} --parts {part} --data {data.as_posix()}" for part in ("quality", "full-run"))]
 
 
 def folder_bytes(folder: Path) -> int:
@@ -59,26 +91,22 @@ def tree_bytes() -> int:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, help="a small data set to copy")
+    parser.add_argument("--data", type=Path, required=True, help="a small data set to copy")
     parser.add_argument("--folder", type=Path, default=Path("build/gpu"), help="the folder, in the repository")
-    parser.add_argument("--python", default="3.12", help="Python's version on the GPU machine (3.12)")
     parser.add_argument("--out", default="$OUT", help="the folder for results there ($OUT)")
     args = parser.parse_args(arguments)
     folder = REPOSITORY_ROOT / args.folder
     shutil.rmtree(folder, ignore_errors=True)
-    (folder / WHEELS_FOLDER).mkdir(parents=True)
-    subprocess.run(download_command(folder / WHEELS_FOLDER, args.python), check=True)
-    if args.data:
-        shutil.copytree(args.data, folder / DATA_FOLDER, copy_function=shutil.copyfile)
+    # The report names the set by its folder.
+    copy_dataset(args.data, folder / args.data.name)
     megabytes = (folder_bytes(folder) + tree_bytes()) / 2**20
     print(f"{args.folder}: {folder_bytes(folder) / 2**20:.1f} MiB; with the repository {megabytes:.1f} MiB")
     if megabytes > MAX_MEGABYTES:
         print(f"tools.gpu.prepare: that is more than {MAX_MEGABYTES:.0f} MiB; use a smaller data set", file=sys.stderr)
         return 1
     print("On the GPU machine, in the repository's root, one command each:")
-    for command in check_commands(
-        args.folder, _git("describe", "--always", "--dirty", "--abbrev=12").strip(), args.out
-    ):
+    commit = _git("describe", "--always", "--dirty", "--abbrev=12").strip()
+    for command in check_commands(args.folder / args.data.name, commit, args.out):
         print(f"    {command}")
     return 0
 

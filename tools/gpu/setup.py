@@ -8,7 +8,11 @@ from pathlib import Path
 
 import torch
 
+from hyrfpack.config.train import FULL_STEPS
+
 GOAL_ROOM_NAME = "1,000,000"  # the goals hold for the room with this many Gaussians
+
+FULL_RUN_SECONDS = 240.0
 
 
 @dataclass(frozen=True)
@@ -33,6 +37,9 @@ class Setup:
         demo_views, demo_size: number of photos of the built-in scene, and their side in pixels.
         quality_steps: largest number of steps of each training run of the quality comparison.
         quality_seconds: time limit in seconds for the CPU's training run; the number of steps is reduced to keep it.
+        full_run_steps: number of steps of the full run.
+        full_run_seconds: time limit in seconds for the full run; it then ends before its last step.
+        full_run_interval: seconds of the full run between two rows of the report.
         test_paths: files and folders of the tests that pytest runs, relative to the repository's root.
         data: folder of a real data set, or None.
         logs: folder for what other programs print, or None.
@@ -57,6 +64,9 @@ class Setup:
     demo_size: int = 200
     quality_steps: int = 1000
     quality_seconds: float = 40.0
+    full_run_steps: int = FULL_STEPS
+    full_run_seconds: float = FULL_RUN_SECONDS
+    full_run_interval: float = 20.0
     test_paths: tuple[str, ...] = ("tests/ops", "tests/test_gpu_path.py")
     data: str | None = None
     logs: str | None = None
