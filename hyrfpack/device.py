@@ -201,9 +201,11 @@ def describe_device(device: torch.device) -> str:
 def upload_array(array: np.ndarray, device: torch.device) -> Tensor:
     """Copy an array to a device.
 
-    The copy to CUDA does not block, because a blocking copy would also wait for all work that is queued there.
+    The copy to CUDA does not block, because a blocking copy would also wait for all work that is queued there. It is
+    made from pinned memory, because CUDA may wait before it copies more than 64 KiB of other memory.
     """
-    return torch.from_numpy(array).to(device, non_blocking=device.type == "cuda")
+    tensor = torch.from_numpy(array)
+    return tensor.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else tensor.to(device)
 
 
 def upload(picture: Picture, solid: np.ndarray | None, device: torch.device) -> tuple[Tensor, Tensor | None]:

@@ -31,13 +31,30 @@ def listen_to_gpu(listener: Listener) -> Iterator[None]:
     """Call the listener with the kind and name of each operation that a GPU is given inside this context.
 
     A "launch" starts a kernel, torch's or Triton's. In a "wait" the host waits for the device. A "copy" from the host
-    is also a wait, unless it is non-blocking. Views and uninitialised memory give the GPU no work.
+    is also a wait, unless it is non-blocking and from pinned memory or of at most 64 KiB, which CUDA sends with the
+    command. Views and uninitialised memory give the GPU no work.
     """
     _listeners.append(listener)
     try:
         yield
     finally:
         _listeners.remove(listener)
+
+
+MAX_INLINE_COPY_BYTES = 1 << 16
+
+
+def _may_wait(source: torch.Tensor, non_blocking: bool) -> bool:
+    """Return whether CUDA may wait for its queued work when it copies a tensor of the host."""
+    small = source.numel() * source.element_size() <= MAX_INLINE_COPY_BYTES
+    return not (non_blocking and (small or getattr(source, "is_in_pinned_memory", False)))
+
+
+def _pin(tensor: torch.Tensor) -> torch.Tensor:
+    """Replace `Tensor.pin_memory`."""
+    pinned = tensor.clone()
+    pinned.is_in_pinned_memory = True
+    return pinned
 
 
 TransferListener = Callable[[str, int], None]
@@ -181,7 +198,7 @@ def _work_kinds(func: Any, args: tuple, kwargs: dict) -> Iterator[str]:
         yield "wait"
         return
     if name == "copy_" and not (isinstance(args[0], FakeGpuTensor) and isinstance(second, FakeGpuTensor)):
-        yield from ("copy",) if len(args) > 2 and args[2] else ("copy", "wait")
+        yield from ("copy", "wait") if _may_wait(second, len(args) > 2 and args[2]) else ("copy",)
         return
     leaves = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, torch.Tensor) and leaf.ndim]
     if not all(isinstance(leaf, FakeGpuTensor) for leaf in leaves):
@@ -230,9 +247,9 @@ def _wrap_factory(factory: Callable) -> Callable:
     """Wrap a factory function of torch so that it can create tensors on the fake GPU."""
 
     def make(*args: Any, **kwargs: Any) -> torch.Tensor:
-        kwargs.pop("pin_memory", None)
+        is_pinned = kwargs.pop("pin_memory", False)
         if not _is_cuda(kwargs.get("device")):
-            return factory(*args, **kwargs)
+            return _pin(factory(*args, **kwargs)) if is_pinned else factory(*args, **kwargs)
         if factory.__name__ in ("as_tensor", "tensor"):
             _report_work(factory.__name__, "copy", "wait")
             _report_transfer("to device", factory(*tree_map(_unwrap, args)).numel())
@@ -250,7 +267,7 @@ def _move(tensor: torch.Tensor, *args: Any, **kwargs: Any) -> torch.Tensor:
     place = next((torch.device(v) for v in places if isinstance(v, torch.device | str)), tensor.device)
     dtypes = [v for v in (*args, kwargs.get("dtype"), getattr(other, "dtype", None)) if isinstance(v, torch.dtype)]
     if isinstance(tensor, FakeGpuTensor) != (place.type == "cuda"):
-        blocks = isinstance(tensor, FakeGpuTensor) or not kwargs.get("non_blocking")
+        blocks = isinstance(tensor, FakeGpuTensor) or _may_wait(tensor, bool(kwargs.get("non_blocking")))
         kinds = [] if isinstance(tensor, FakeGpuTensor) else ["copy"]
         _report_work(f"to {place.type}", *kinds, *["wait"] * blocks)
         _report_transfer("to host" if isinstance(tensor, FakeGpuTensor) else "to device", tensor.numel())
@@ -312,6 +329,7 @@ def use_fake_gpu() -> Iterator[torch.device]:
         mock.patch.object(devices, "load_or_run_self_test", lambda device: SelfTest("gpu", str(device), ())),
         mock.patch.object(torch, "Generator", FakeGenerator),
         mock.patch.object(torch.Tensor, "to", _move),
+        mock.patch.object(torch.Tensor, "pin_memory", _pin),
         mock.patch.object(torch.Tensor, "cpu", lambda tensor: _move(tensor, "cpu")),
         mock.patch.multiple(torch, **{name: _wrap_factory(getattr(torch, name)) for name in TENSOR_FACTORIES}),
     ):

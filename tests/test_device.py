@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 import torch
-from fake_gpu import CUDA_DEVICE, FakeGpuTensor, use_fake_gpu
+from fake_gpu import CUDA_DEVICE, FakeGpuTensor, listen_to_gpu, use_fake_gpu
 
 from hyrfpack import device as devices
 from hyrfpack.device import choose_device, describe_device, make_current, upload
@@ -141,6 +141,15 @@ def test_a_photo_is_the_same_on_any_device(has_alpha, solid):
     assert isinstance(there, FakeGpuTensor) and isinstance(mask_there, FakeGpuTensor)
     torch.testing.assert_close(there.cpu_tensor, here, rtol=0, atol=1e-7)
     assert torch.equal(mask_there.cpu_tensor, mask_here) and torch.equal(mask_here, torch.from_numpy(picture.mask))
+
+
+def test_a_large_photo_is_uploaded_without_waiting_for_the_gpu():
+    shape = (200, 200)
+    picture = Picture(np.zeros((*shape, 3), np.uint8), np.full(shape, 255, np.uint8), np.ones(shape, bool))
+    heard = []
+    with use_fake_gpu() as gpu, listen_to_gpu(lambda kind, name: heard.append(kind)):
+        upload(picture, np.zeros(3, np.float32), gpu)
+    assert heard.count("copy") == 4 and "wait" not in heard
 
 
 def test_photos_are_cached_on_a_gpu_up_to_a_limit(monkeypatch):
