@@ -24,10 +24,13 @@ from hyrfpack.ops.ssim import photometric_loss
 from hyrfpack.ops.viewport import Viewport
 
 Inputs = Mapping[str, Tensor]
-# Widths of a decoder's hidden layers, and the levels of a hash grid; those of a trained model are as wide.
+# Widths of the decoders' layers, as of a trained model: kernels are compiled for them.
 HIDDEN_WIDTH = 64
+GEOMETRY_WIDTHS = (32, HIDDEN_WIDTH, HIDDEN_WIDTH, 8)
+RADIANCE_WIDTHS = (32 + DIRECTION_FEATURES["frequency"], HIDDEN_WIDTH, HIDDEN_WIDTH, 3)
 LOG2_TABLE_SIZE = 9
 GRID_RESOLUTIONS = level_resolutions(4, 4, 40)
+TRAINED_GRID_RESOLUTIONS = level_resolutions(16, 4, 40)
 IMAGE_WIDTH, IMAGE_HEIGHT = 37, 33  # pixels: 3 x 3 tiles, with parts of a tile at the edges
 BACKGROUND_STRIDE = 2
 
@@ -54,6 +57,7 @@ class SelfTestCase:
     bounds: tuple[float, float] = (1e-4, 1e-3)
 
 
+_HALF_EXTENT = (1.0, 0.5, 0.25)
 # In a few pixels, rounding moves alpha or transmittance across a threshold. These bounds allow for that.
 _RASTER_BOUNDS = (1e-3, 1e-2)
 # Implementations may round a value halfway between two bfloat16 numbers in different directions.
@@ -65,8 +69,9 @@ def self_test_cases() -> dict[str, SelfTestCase]:
     """Return all cases by name. The kernels that others depend on come first."""
     return {
         "hash_encode": _hash_encode(),
-        "mlp": _mlp(mixed=False),
-        "mlp, mixed precision": _mlp(mixed=True),
+        "mlp": _mlp(GEOMETRY_WIDTHS, mixed=False),
+        "mlp, geometry, mixed precision": _mlp(GEOMETRY_WIDTHS, mixed=True),
+        "mlp, radiance, mixed precision": _mlp(RADIANCE_WIDTHS, mixed=True),
         "contract": _contract(),
         "encode_views, frequency": _encode_views("frequency"),
         "encode_views, sh": _encode_views("sh"),
@@ -75,12 +80,14 @@ def self_test_cases() -> dict[str, SelfTestCase]:
         "frustum_cull": _frustum_cull(),
         "rasterize": _rasterize(RasterSettings(depth=True)),
         "rasterize, antialiased": _rasterize(RasterSettings(antialiased=True), reserve=8192),
+        "rasterize, training": _rasterize_in_training(),
         "rasterize, replay": _replay(),
         "shade": _shade(mixed=False),
         "shade, mixed precision": _shade(mixed=True),
         "rasterize_shaded": _rasterize_shaded(mixed=False),
         "rasterize_shaded, mixed precision": _rasterize_shaded(mixed=True),
-        "background_grid": _background(needs_grad=False),
+        "background_grid": _background(),
+        "background_grid, mixed precision": _background(TRAINED_GRID_RESOLUTIONS, mixed=True),
         "background_grid, gradients": _background(needs_grad=True),
         "composite": _composite(),
         "photometric_loss": _loss(masked=False),
@@ -117,55 +124,102 @@ def _split_layers(inputs: Inputs) -> tuple[list[Tensor], list[Tensor]]:
     return [inputs[f"w{layer}"] for layer in range(3)], [inputs[f"b{layer}"] for layer in range(3)]
 
 
+def _list_rows(total: int) -> dict[str, Tensor]:
+    """Return the indices of rows and how many of the first are in use, as training lists the Gaussians in view."""
+    order = torch.randperm(total, generator=torch.Generator().manual_seed(40))
+    return {"index": order[: total - 60], "used": torch.tensor([total - 120])}
+
+
+def _take_listed(implementation: str, x: Inputs, *names: str) -> tuple[list[Tensor], Tensor | None]:
+    """Return the listed rows of some inputs, and for kernels how many of them are in use.
+
+    Kernels also get the rows past that number, which are undefined; other implementations do not.
+    """
+    index, used = (x["index"], x["used"]) if implementation == "gpu" else (x["index"][: int(x["used"])], None)
+    listed = [take_rows(x[name].view(len(x[name]), -1), index, used) for name in names]
+    return [rows.view(len(index), *x[name].shape[1:]) for name, rows in zip(names, listed, strict=True)], used
+
+
 def _hash_encode() -> SelfTestCase:
     # Coordinates have 16 bits, so that a point has the same cell and offset in every precision.
     coords = torch.randint(0, 1 << 16, (700, 3), generator=torch.Generator().manual_seed(0)) / (1 << 16)
     table = _normal(1, level_offsets(GRID_RESOLUTIONS, LOG2_TABLE_SIZE)[-1], 2)
+    inputs = {"coords": coords, "table": table, **_list_rows(700)}
 
     def run(implementation: str, x: Inputs) -> dict[str, Tensor]:
-        encoded = hash_encode(x["coords"], x["table"], GRID_RESOLUTIONS, LOG2_TABLE_SIZE, implementation=implementation)
-        return {"features": encoded}
+        def encode(coords: Tensor, used: Tensor | None = None) -> Tensor:
+            settings = GRID_RESOLUTIONS, LOG2_TABLE_SIZE
+            features = hash_encode(coords, x["table"], *settings, used=used, implementation=implementation)
+            return features.T  # so that gradients come column by column, as from `mlp`
 
-    return SelfTestCase("hash_encode", {"coords": coords, "table": table}, run, ("coords", "table"), True)
+        (listed,), used = _take_listed(implementation, x, "coords")
+        features = encode(listed.detach(), used)[:, : int(x["used"])]
+        return {"features": encode(x["coords"]), "features of listed rows": features}
+
+    return SelfTestCase("hash_encode", inputs, run, ("coords", "table"), True)
 
 
-def _mlp(mixed: bool) -> SelfTestCase:
-    layers = _layers((32, HIDDEN_WIDTH, HIDDEN_WIDTH, 8), 1)
+def _mlp(widths: tuple[int, ...], mixed: bool) -> SelfTestCase:
+    layers = _layers(widths, 1)
+    inputs = {"rows": _normal(0, 300, widths[0]), **layers, **_list_rows(300)}
 
     def run(implementation: str, x: Inputs) -> dict[str, Tensor]:
-        return {"outputs": mlp(x["rows"], *_split_layers(x), mixed=mixed, implementation=implementation)}
+        def evaluate(rows: Tensor, used: Tensor | None = None) -> Tensor:
+            rows = rows.T.contiguous().T  # column by column, as from `hash_encode`
+            return mlp(rows, *_split_layers(x), mixed=mixed, used=used, implementation=implementation)
+
+        (listed,), used = _take_listed(implementation, x, "rows")
+        with torch.no_grad():
+            outputs = evaluate(x["rows"])
+        return {"outputs": outputs, "outputs of listed rows": evaluate(listed, used)[: int(x["used"])]}
 
     bounds = _MIXED_BOUNDS if mixed else (1e-4, 1e-3)
-    return SelfTestCase("mlp", {"rows": _normal(0, 300, 32)} | layers, run, ("rows", *layers), not mixed, bounds)
+    return SelfTestCase("mlp", inputs, run, ("rows", *layers), not mixed, bounds)
 
 
 def _contract() -> SelfTestCase:
     points = _normal(0, 1500, 3) * torch.logspace(-1, 2, 1500)[:, None]
 
     def run(implementation: str, x: Inputs) -> dict[str, Tensor]:
-        return {"coords": contract(x["points"], (1.0, 0.5, 0.25), implementation=implementation)}
+        (listed,), used = _take_listed(implementation, x, "points")
+        coords = contract(x["points"], _HALF_EXTENT, implementation=implementation)
+        listed_coords = contract(listed, _HALF_EXTENT, used=used, implementation=implementation)
+        return {"coords": coords, "coords of listed rows": listed_coords[: int(x["used"])]}
 
-    return SelfTestCase("contract", {"points": points}, run)
+    return SelfTestCase("contract", {"points": points, **_list_rows(1500)}, run)
 
 
 def _encode_views(encoding: str) -> SelfTestCase:
-    def run(implementation: str, x: Inputs) -> dict[str, Tensor]:
-        return {"features": encode_views(x["points"], x["viewpoint"], encoding, implementation=implementation)}
+    inputs = {"points": _normal(0, 700, 3), "viewpoint": _normal(1, 3), **_list_rows(700)}
 
-    return SelfTestCase("encode_views", {"points": _normal(0, 700, 3), "viewpoint": _normal(1, 3)}, run)
+    def run(implementation: str, x: Inputs) -> dict[str, Tensor]:
+        def encode(points: Tensor, used: Tensor | None = None) -> Tensor:
+            return encode_views(points, x["viewpoint"], encoding, used=used, implementation=implementation)
+
+        (listed,), used = _take_listed(implementation, x, "points")
+        features = encode(listed, used)[: int(x["used"])]
+        return {"features": encode(x["points"]), "features of listed rows": features}
+
+    return SelfTestCase("encode_views", inputs, run)
 
 
 def _activate(rule: str) -> SelfTestCase:
-    inputs = {"raw": _normal(0, 700, 8), "positions": 2 * _normal(1, 700, 3)}
-    inputs |= {"scale_logits": _normal(2, 700, 1), "opacity_logits": _normal(3, 700, 1)}
+    rows = {"raw": _normal(0, 700, 8), "positions": 2 * _normal(1, 700, 3)}
+    rows |= {"scale_logits": _normal(2, 700, 1), "opacity_logits": _normal(3, 700, 1)}
 
     def run(implementation: str, x: Inputs) -> dict[str, Tensor]:
-        activated = activate_geometry(
-            *x.values(), half_extent=(1.0, 0.5, 0.25), rule=rule, implementation=implementation
-        )
-        return dict(zip(("scales", "quats", "opacities"), activated, strict=True))
+        def activate(prefix: str, rows: list[Tensor], used: Tensor | None = None) -> dict[str, Tensor]:
+            activated = activate_geometry(
+                *rows, half_extent=_HALF_EXTENT, rule=rule, used=used, implementation=implementation
+            )
+            count = int(x["used"]) if prefix else len(rows[0])
+            parts = ("scales", "quats", "opacities")
+            return {prefix + name: part[:count] for name, part in zip(parts, activated, strict=True)}
 
-    return SelfTestCase("activate_geometry", inputs, run, ("raw", "scale_logits", "opacity_logits"))
+        listed = activate("listed ", *_take_listed(implementation, x, *rows))
+        return activate("", [x[name] for name in rows]) | listed
+
+    return SelfTestCase("activate_geometry", rows | _list_rows(700), run, ("raw", "scale_logits", "opacity_logits"))
 
 
 def _frustum_cull() -> SelfTestCase:
@@ -203,6 +257,22 @@ def _rasterize(settings: RasterSettings, reserve: int | None = None) -> SelfTest
         return {"rgb": image.rgb, "transmittance": image.transmittance} | depth
 
     return SelfTestCase("rasterize", inputs, run, tuple(inputs), True, _RASTER_BOUNDS)
+
+
+def _rasterize_in_training() -> SelfTestCase:
+    """Return the case of a training step: listed Gaussians, reserved pairs, and sums of absolute gradients."""
+    rows = _splats(300) | {"colors": _uniform(4, 300, 3)}
+
+    def run(implementation: str, x: Inputs) -> dict[str, Tensor]:
+        (*gaussians, colors), used = _take_listed(implementation, x, *rows)
+        absgrad = torch.zeros_like(colors[:, :2])  # The backward pass adds to it, before this result is compared.
+        image = rasterize(
+            Gaussians3D(*gaussians), colors, _viewport(), absgrad=absgrad, used=used,
+            reserve=8192 if implementation == "gpu" else None, implementation=implementation,
+        )  # fmt: skip
+        return {"rgb": image.rgb, "transmittance": image.transmittance, "absgrad": absgrad[: int(x["used"])]}
+
+    return SelfTestCase("rasterize", rows | _list_rows(300), run, tuple(rows), True, _RASTER_BOUNDS)
 
 
 def _replay() -> SelfTestCase:
@@ -260,9 +330,11 @@ def _rasterize_shaded(mixed: bool) -> SelfTestCase:
     return SelfTestCase("rasterize_shaded", splats | _shading_inputs(300, mixed), run, (), False, bounds)
 
 
-def _background(needs_grad: bool) -> SelfTestCase:
-    features = 2 * len(GRID_RESOLUTIONS) + DIRECTION_FEATURES["frequency"]
-    table = _normal(30, level_offsets(GRID_RESOLUTIONS, LOG2_TABLE_SIZE)[-1], 2)
+def _background(
+    resolutions: tuple[int, ...] = GRID_RESOLUTIONS, *, mixed: bool = False, needs_grad: bool = False
+) -> SelfTestCase:
+    features = 2 * len(resolutions) + DIRECTION_FEATURES["frequency"]
+    table = _normal(30, level_offsets(resolutions, LOG2_TABLE_SIZE)[-1], 2)
     # Light passes in stripes, at a distance from the threshold.
     light = torch.where(
         torch.arange(IMAGE_HEIGHT * IMAGE_WIDTH).view(IMAGE_HEIGHT, IMAGE_WIDTH) // 100 % 2 == 0, 0.9, 0.1
@@ -271,7 +343,7 @@ def _background(needs_grad: bool) -> SelfTestCase:
 
     def run(implementation: str, x: Inputs) -> dict[str, Tensor]:
         field = BackgroundField(
-            (1.0, 1.0, 1.0), x["table"], GRID_RESOLUTIONS, LOG2_TABLE_SIZE, *_split_layers(x), "frequency", False
+            (1.0, 1.0, 1.0), x["table"], resolutions, LOG2_TABLE_SIZE, *_split_layers(x), "frequency", mixed
         )
         grid = background_grid(
             x["transmittance"],
@@ -285,7 +357,8 @@ def _background(needs_grad: bool) -> SelfTestCase:
 
     gradients = tuple(parameters) if needs_grad else ()
     # A direction's error is multiplied by the highest octave and by the finest level.
-    return SelfTestCase("background_grid", {"transmittance": light} | parameters, run, gradients, True, (1e-3, 1e-2))
+    bounds = _MIXED_BOUNDS if mixed else (1e-3, 1e-2)
+    return SelfTestCase("background_grid", {"transmittance": light} | parameters, run, gradients, not mixed, bounds)
 
 
 def _composite() -> SelfTestCase:
@@ -323,6 +396,8 @@ def _adam() -> SelfTestCase:
         inputs[f"exp_avg {name}"] = 0.1 * _normal(seed + 4, *shape)
         inputs[f"exp_avg_sq {name}"] = _uniform(seed + 6, *shape)
     inputs["gradient b"][3] = torch.inf
+    inputs["enabled"] = torch.tensor([True, False])  # whether the second and third step change anything
+    gradient_names = [f"gradient {name}" for name in shapes]
 
     def run(implementation: str, x: Inputs) -> dict[str, Tensor]:
         copies = {name: tensor.clone() for name, tensor in x.items()}
@@ -331,7 +406,9 @@ def _adam() -> SelfTestCase:
         ]
         values, gradients, exp_avg, exp_avg_sq = lists
         skipped = adam_step(values, gradients, exp_avg, exp_avg_sq, step=3, rate=0.1, implementation=implementation)
-        changed = {name: tensor for name, tensor in copies.items() if not name.startswith("gradient")}
+        for step, enabled in enumerate(x["enabled"], start=4):
+            adam_step(*lists, step=step, rate=0.1, enabled=enabled, implementation=implementation)
+        changed = {name: tensor for name, tensor in copies.items() if name not in ("enabled", *gradient_names)}
         return changed | {"skipped": skipped}
 
     return SelfTestCase("adam_step", inputs, run, (), True)

@@ -25,9 +25,9 @@ def check_case(case: SelfTestCase, implementation: str, device: torch.device) ->
         implementation: the implementation to test, "gpu" or "cpu".
         device: the device of its tensors.
     """
-    exact = _run(case, "reference", torch.float64, torch.device("cpu"))
+    exact = run_case(case, "reference", torch.float64, torch.device("cpu"))
     start = perf_counter()
-    measured = _run(case, implementation, torch.float32, device)
+    measured = run_case(case, implementation, torch.float32, device)
     seconds = perf_counter() - start
     row: Row = {"seconds": round(seconds, 3)}
     for what, found, expected, bound in zip(("value", "gradient"), measured, exact, case.bounds, strict=True):
@@ -43,7 +43,7 @@ def check_case(case: SelfTestCase, implementation: str, device: torch.device) ->
     return row
 
 
-def _run(
+def run_case(
     case: SelfTestCase, implementation: str, dtype: torch.dtype, device: torch.device
 ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """Return the results of a case and the gradients of its inputs by name, as CPU tensors."""
@@ -58,6 +58,7 @@ def _run(
     pulled = [value for value in results.values() if value.requires_grad]
     upstream = [_random_like(value, seed) for seed, value in enumerate(pulled)]
     gradients = torch.autograd.grad(pulled, leaves, upstream) if leaves else ()
+    # A result may be a buffer that the backward pass has changed.
     # Copying to the CPU waits for the device, so that an error of a kernel is raised here.
     values = {name: value.detach().cpu() for name, value in results.items()}
     return values, {name: part.cpu() for name, part in zip(case.gradient_inputs, gradients, strict=True)}
@@ -95,6 +96,6 @@ def _median_seconds(case: SelfTestCase, implementation: str, device: torch.devic
     times = []
     for _ in range(TIMED_RUNS):
         start = perf_counter()
-        _run(case, implementation, torch.float32, device)
+        run_case(case, implementation, torch.float32, device)
         times.append(perf_counter() - start)
     return sorted(times)[len(times) // 2]

@@ -78,8 +78,9 @@ def _path(device: torch.device) -> Path:
 
 @cache
 def _kernel_digest() -> str:
-    """Return a digest of the sources of all operations, which change between versions while hyrfpack is developed."""
-    folder, digest = Path(ops.__path__[0]), hashlib.sha256()
-    for path in sorted(folder.rglob("*.py")):
-        digest.update(path.read_bytes())
+    """Return a digest of all operations and their tests, which change between versions while hyrfpack is developed."""
+    digest = hashlib.sha256()
+    for folder in (Path(ops.__path__[0]), Path(__file__).parent):
+        for path in sorted(folder.rglob("*.py")):
+            digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
