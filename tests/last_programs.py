@@ -5,6 +5,7 @@ So a call for millions of Gaussians takes a second, and its programs have the la
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import product
@@ -22,10 +23,15 @@ LAST_PROGRAMS = 4
 
 
 def lazy_zeros(*shape: Any, dtype: torch.dtype = torch.float32, **_: Any) -> Tensor:
-    """Return zeros whose memory the system provides page by page, when a page is first written."""
+    """Return zeros whose memory the system provides page by page, when a page is first written.
+
+    They lie in a sparse file, which may be larger than all memory.
+    """
     sizes = tuple(shape[0]) if shape and not isinstance(shape[0], int) else shape
     count = int(np.prod(sizes, dtype=np.int64))
-    memory = torch.from_numpy(np.zeros(max(count, 1) * dtype.itemsize, dtype=np.uint8)).view(dtype)
+    with tempfile.NamedTemporaryFile(prefix="hyrfpack-lazy-") as file:
+        size = max(count, 1) * dtype.itemsize
+        memory = torch.from_file(file.name, shared=True, size=size, dtype=torch.uint8).view(dtype)
     return memory[:count].view(sizes)
 
 
