@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 
 from hyrfpack.errors import HyrfError
-from hyrfpack.ops.dispatch import GPU_OPERATIONS, has_triton, set_replaced_operations
+from hyrfpack.kernel_errors import PLAIN_TORCH_VARIABLE
+from hyrfpack.ops.dispatch import GPU_OPERATIONS, has_triton, is_plain_torch_wanted, set_replaced_operations
 from hyrfpack.parallel.child_items import Row
 from hyrfpack.parallel.ranks import Ranks, uses_gloo_on_gpus
 from hyrfpack.scene import Picture
@@ -132,7 +133,11 @@ def _agree_on_failed_operations(device: torch.device, ranks: Ranks) -> None:
 @cache
 def _find_failed_operations(device: torch.device) -> frozenset[str]:
     """Return the operations whose kernels do not work on a GPU. A warning names them, once in this process."""
-    test, where = load_or_run_self_test(device), describe_device(device)
+    where = describe_device(device)
+    if is_plain_torch_wanted():
+        _LOG.info(f"{PLAIN_TORCH_VARIABLE} is set: {where} runs plain torch in place of kernels")
+        return frozenset(GPU_OPERATIONS)
+    test = load_or_run_self_test(device)
     if not test.can_launch:
         _LOG.warning(f"{test.problem}; this run uses plain torch on {where}, far slower; {_FASTER_CPU}")
         return frozenset(GPU_OPERATIONS)

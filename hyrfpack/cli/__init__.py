@@ -46,6 +46,7 @@ from hyrfpack.cli.train import train
 from hyrfpack.cli.view import view
 from hyrfpack.cli.wording import use_option_names
 from hyrfpack.errors import HyrfError, needs_package, printable
+from hyrfpack.kernel_errors import KERNEL_ERROR_FIX, describe_kernel_error
 from hyrfpack.out_of_memory import describe_out_of_memory
 from hyrfpack.version import __version__
 
@@ -79,23 +80,30 @@ class _CommandGroup(click.Group):
             if is_verbose():
                 traceback.print_exc()
             raise _UserError(f"{error.problem}; {use_option_names(error.fix)}") from error
-        except OSError as error:
-            # Functions that write files raise HyrfError, so that this error comes from printing onto a full disk.
-            if error.errno not in (errno.ENOSPC, errno.EDQUOT):
-                raise
-            raise _UserError(f"the output cannot be printed ({error.strerror}); send it elsewhere") from error
-        except (MemoryError, RuntimeError) as error:
-            problem = describe_out_of_memory(error)
-            if problem is None:
+        except Exception as error:
+            message = _explain_error(error)
+            if message is None:
                 raise
             if is_verbose():
                 traceback.print_exc()
-            raise _UserError(f"{problem}; use smaller photos, pictures or models, or --device cpu") from error
+            raise _UserError(message) from error
         _note_uncached_kernels()
         return result
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(self.commands)  # help lists commands in the order of their use, not in alphabetical order
+
+
+def _explain_error(error: Exception) -> str | None:
+    """Return the message for an error that is not a HyrfError but that a user can correct; None for a bug."""
+    if (problem := describe_out_of_memory(error)) is not None:
+        return f"{problem}; use smaller photos, pictures or models, or --device cpu"
+    if (problem := describe_kernel_error(error)) is not None:
+        return f"{problem}; {KERNEL_ERROR_FIX}"
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        # Functions that write files raise HyrfError, so that this error comes from printing onto a full disk.
+        return f"the output cannot be printed ({error.strerror}); send it elsewhere"
+    return None
 
 
 def _note_uncached_kernels() -> None:

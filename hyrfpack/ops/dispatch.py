@@ -9,6 +9,7 @@ from functools import cache
 import torch
 from torch import Tensor
 
+from hyrfpack.kernel_errors import PLAIN_TORCH_VARIABLE
 from hyrfpack.parallel import has_numba
 
 # Every operation that has Triton kernels.
@@ -31,8 +32,16 @@ _replaced_operations: frozenset[str] = frozenset()
 
 
 def replaced_operations() -> frozenset[str]:
-    """Return the operations that run as plain torch on a GPU in this process, because their kernels are unusable."""
-    return _replaced_operations
+    """Return the operations that run as plain torch on a GPU in this process.
+
+    Their kernels are unusable, or the user wants none.
+    """
+    return frozenset(GPU_OPERATIONS) if is_plain_torch_wanted() else _replaced_operations
+
+
+def is_plain_torch_wanted() -> bool:
+    """Return whether the environment asks for plain torch in place of all GPU kernels."""
+    return os.environ.get(PLAIN_TORCH_VARIABLE, "") not in ("", "0")
 
 
 def set_replaced_operations(operations: Iterable[str]) -> None:
@@ -107,7 +116,7 @@ def choose_implementation(operation: str, implementation: str, available: tuple[
         if implementation == "gpu" and device_type == "cuda":
             _check_current(first.device)
         return implementation
-    is_gpu_usable = device_type == "cuda" and has_triton() and operation not in _replaced_operations
+    is_gpu_usable = device_type == "cuda" and has_triton() and operation not in replaced_operations()
     if "gpu" in available and is_supported["gpu"] and is_gpu_usable:
         _check_current(first.device)
         return "gpu"
