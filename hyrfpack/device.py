@@ -14,7 +14,13 @@ from torch import Tensor
 
 from hyrfpack.errors import HyrfError
 from hyrfpack.kernel_errors import PLAIN_TORCH_VARIABLE
-from hyrfpack.ops.dispatch import GPU_OPERATIONS, has_triton, is_plain_torch_wanted, set_replaced_operations
+from hyrfpack.ops.dispatch import (
+    GPU_OPERATIONS,
+    MIXED_PRECISION,
+    has_triton,
+    is_plain_torch_wanted,
+    set_replaced_operations,
+)
 from hyrfpack.parallel.child_items import Row
 from hyrfpack.parallel.ranks import Ranks, uses_gloo_on_gpus
 from hyrfpack.scene import Picture
@@ -149,11 +155,12 @@ def _find_failed_operations(device: torch.device) -> frozenset[str]:
 
 
 def describe_failed_operations(test: SelfTest, where: str) -> list[str]:
-    """Return a sentence on the operations whose kernels do not work, and one on those that could not be tested now.
+    """Return sentences on kernels that do not work, on those that could not be tested now, and on mixed precision.
 
     Each says why, how much slower plain torch is, and what to do.
     """
     failed = test.failed_operations
+    mixed = failed.pop(MIXED_PRECISION, None)
     broken = {operation: row for operation, row in failed.items() if not is_temporary(row)}
     untested = {operation: row for operation, row in failed.items() if is_temporary(row)}
     faster = f"; {_FASTER_CPU}" if "rasterize" in failed else ""
@@ -169,6 +176,12 @@ def describe_failed_operations(test: SelfTest, where: str) -> list[str]:
             f"the kernels of {len(untested)} of {len(GPU_OPERATIONS)} operations could not be tested on {where}, which "
             f"computes them in plain torch in this run: {_group_by_reason(untested)}{faster}; the next run tests them "
             "again"
+        )
+    if mixed is not None:
+        again = "; the next run tests it again" if is_temporary(mixed) else ""
+        sentences.append(
+            f"mixed precision does not work on {where} ({mixed['note']}), which uses float32 kernels instead, as with "
+            f"`precision='float32'`{again}"
         )
     return sentences
 

@@ -15,6 +15,7 @@ from hyrfpack.model.residuals import add_color_residuals, add_shape_residuals
 from hyrfpack.ops import activate
 from hyrfpack.ops.background import BackgroundField, background_colors, background_grid
 from hyrfpack.ops.contraction import contract
+from hyrfpack.ops.dispatch import is_mixed_precision_usable
 from hyrfpack.ops.mlp import mlp
 from hyrfpack.ops.rasterize import Gaussians3D
 from hyrfpack.ops.rows import take_rows
@@ -142,7 +143,8 @@ class HybridModel(nn.Module):
 
     @property
     def _mixed(self) -> bool:
-        return self.precision == "mixed" and self.gaussians.positions.device.type == "cuda"
+        is_on_gpu = self.gaussians.positions.device.type == "cuda"
+        return self.precision == "mixed" and is_on_gpu and is_mixed_precision_usable()
 
     def _field_positions(self, positions: Tensor) -> Tensor:
         return positions if self.config.position_gradients else positions.detach()

@@ -28,6 +28,8 @@ GPU_OPERATIONS = (
     "rasterize_shaded",
     "shade",
 )
+# Stands for the bfloat16 products of several operations, which their float32 kernels replace.
+MIXED_PRECISION = "mixed_precision"
 _replaced_operations: frozenset[str] = frozenset()
 
 
@@ -39,6 +41,11 @@ def replaced_operations() -> frozenset[str]:
     return frozenset(GPU_OPERATIONS) if is_plain_torch_wanted() else _replaced_operations
 
 
+def is_mixed_precision_usable() -> bool:
+    """Return whether bfloat16 products work on the GPU of this process."""
+    return MIXED_PRECISION not in _replaced_operations
+
+
 def is_plain_torch_wanted() -> bool:
     """Return whether the environment asks for plain torch in place of all GPU kernels."""
     return os.environ.get(PLAIN_TORCH_VARIABLE, "") not in ("", "0")
@@ -47,14 +54,15 @@ def is_plain_torch_wanted() -> bool:
 def set_replaced_operations(operations: Iterable[str]) -> None:
     """Replace the kernels of these operations, and of no others, by plain torch wherever "auto" would choose "gpu".
 
-    The choice of a device calls this with the operations that failed the self-test there, see `hyrfpack.self_test`.
+    MIXED_PRECISION among them makes models multiply in float32. The choice of a device calls this with what failed the
+    self-test there, see `hyrfpack.self_test`.
 
     Raises:
-        ValueError: a name is not in GPU_OPERATIONS.
+        ValueError: a name is neither in GPU_OPERATIONS nor MIXED_PRECISION.
     """
     global _replaced_operations
     names = frozenset(operations)
-    if unknown := sorted(names.difference(GPU_OPERATIONS)):
+    if unknown := sorted(names.difference(GPU_OPERATIONS, [MIXED_PRECISION])):
         raise ValueError(f"no GPU operation '{unknown[0]}'; there are {', '.join(GPU_OPERATIONS)}")
     _replaced_operations = names
 

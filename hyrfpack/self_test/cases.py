@@ -14,6 +14,7 @@ from hyrfpack.ops.adam import adam_step
 from hyrfpack.ops.background import BackgroundField, background_grid, grid_size
 from hyrfpack.ops.composite import composite
 from hyrfpack.ops.contraction import contract
+from hyrfpack.ops.dispatch import MIXED_PRECISION
 from hyrfpack.ops.hash_encode import hash_encode, level_offsets, level_resolutions
 from hyrfpack.ops.mlp import mlp
 from hyrfpack.ops.rasterize import Gaussians3D, RasterSettings, rasterize
@@ -45,6 +46,7 @@ class SelfTestCase:
         run: function of an implementation's name and the inputs; returns the results by name.
         gradient_inputs: names of the inputs whose gradients are tested.
         has_cpu_kernels: whether there is an implementation "cpu".
+        is_mixed: whether products are in mixed precision. If only such cases fail, float32 kernels are used.
         bounds: largest allowed rms errors of a result and of a gradient against the float64 reference, as fractions of
             the reference's rms.
     """
@@ -55,6 +57,12 @@ class SelfTestCase:
     gradient_inputs: tuple[str, ...] = ()
     has_cpu_kernels: bool = False
     bounds: tuple[float, float] = (1e-4, 1e-3)
+    is_mixed: bool = False
+
+    @property
+    def replaced_operation(self) -> str:
+        """What is replaced if this case fails: the operation, or mixed precision of all operations."""
+        return MIXED_PRECISION if self.is_mixed else self.operation
 
 
 _HALF_EXTENT = (1.0, 0.5, 0.25)
@@ -174,7 +182,7 @@ def _mlp(widths: tuple[int, ...], mixed: bool) -> SelfTestCase:
         return {"outputs": outputs, "outputs of listed rows": evaluate(listed, used)[: int(x["used"])]}
 
     bounds = _MIXED_BOUNDS if mixed else (1e-4, 1e-3)
-    return SelfTestCase("mlp", inputs, run, ("rows", *layers), not mixed, bounds)
+    return SelfTestCase("mlp", inputs, run, ("rows", *layers), not mixed, bounds, mixed)
 
 
 def _contract() -> SelfTestCase:
@@ -313,7 +321,7 @@ def _shade(mixed: bool) -> SelfTestCase:
         shading = _make_shading(x, mixed)
         return {"colors": shade(x["positions"], x["viewpoint"], shading, implementation=implementation)}
 
-    return SelfTestCase("shade", inputs, run, (), not mixed, _MIXED_BOUNDS if mixed else (1e-4, 1e-3))
+    return SelfTestCase("shade", inputs, run, (), not mixed, _MIXED_BOUNDS if mixed else (1e-4, 1e-3), mixed)
 
 
 def _rasterize_shaded(mixed: bool) -> SelfTestCase:
@@ -327,7 +335,7 @@ def _rasterize_shaded(mixed: bool) -> SelfTestCase:
         return {"rgb": image.rgb, "transmittance": image.transmittance, "depth": image.depth}
 
     bounds = _MIXED_BOUNDS if mixed else _RASTER_BOUNDS
-    return SelfTestCase("rasterize_shaded", splats | _shading_inputs(300, mixed), run, (), False, bounds)
+    return SelfTestCase("rasterize_shaded", splats | _shading_inputs(300, mixed), run, (), False, bounds, mixed)
 
 
 def _background(
@@ -358,7 +366,8 @@ def _background(
     gradients = tuple(parameters) if needs_grad else ()
     # A direction's error is multiplied by the highest octave and by the finest level.
     bounds = _MIXED_BOUNDS if mixed else (1e-3, 1e-2)
-    return SelfTestCase("background_grid", {"transmittance": light} | parameters, run, gradients, not mixed, bounds)
+    inputs = {"transmittance": light} | parameters
+    return SelfTestCase("background_grid", inputs, run, gradients, not mixed, bounds, mixed)
 
 
 def _composite() -> SelfTestCase:

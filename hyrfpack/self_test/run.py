@@ -27,7 +27,8 @@ class SelfTest:
     Attributes:
         implementation: the implementation that was tested, "gpu" or "cpu".
         device: the tested device, as torch names it.
-        rows: for each case its name ("item") and operation, its errors and the seconds that it took with compilation.
+        rows: for each case its name ("item"), what a failure replaces ("operation", see
+            `SelfTestCase.replaced_operation`), its errors and the seconds that it took with compilation.
             A failed one has "status" "failed", the reason as "note", and if its kernels ran, as "slowdown" how many
             times as long plain torch took. It has "is_temporary" True if it failed because of the machine's present
             state: memory ran out, or its process ran out of time or was killed.
@@ -95,7 +96,7 @@ def run_self_test(
     ):
         name = str(row["item"])
         if name in cases:
-            found[name] = {"operation": cases[name].operation, **row}
+            found[name] = {"operation": cases[name].replaced_operation, **row}
         elif "status" in row and name == DEVICE_ITEM:
             return SelfTest(implementation, str(device), (), str(row["note"]))
         elif "status" in row:

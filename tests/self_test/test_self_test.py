@@ -47,6 +47,16 @@ def test_every_gpu_operation_has_a_case() -> None:
     assert {case.operation for case in ALL_CASES.values()} == set(GPU_OPERATIONS)
 
 
+def test_only_cases_in_mixed_precision_replace_mixed_precision(monkeypatch) -> None:
+    def fail(command, names, *limits):
+        return [{"item": name, "status": "failed", "note": "no bfloat16"} for name in names if name in ALL_CASES]
+
+    monkeypatch.setattr(self_test_run, "run_in_children", fail)
+    for row in run_self_test("gpu", CPU_DEVICE).rows:
+        name = str(row["item"])
+        assert row["operation"] == ("mixed_precision" if "mixed precision" in name else ALL_CASES[name].operation)
+
+
 @needs_triton
 @needs_interpreter
 @pytest.mark.parametrize("name", QUICK_CASES)

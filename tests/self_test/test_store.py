@@ -10,6 +10,7 @@ import pytest
 import torch
 from fake_gpu import use_fake_gpu
 from ops.device import needs_triton
+from scenes import small_model
 
 from hyrfpack import device as devices
 from hyrfpack.device import choose_device
@@ -150,6 +151,21 @@ def test_an_operation_that_is_broken_in_one_case_is_not_called_untested():
     untested = {"item": "mlp, mixed", "operation": "mlp", "status": "failed", "note": "late", "is_temporary": True}
     test = SelfTest("gpu", "cuda:0", (untested, broken))
     assert test.failed_operations == {"mlp": broken} and not test.is_conclusive
+
+
+def test_mixed_precision_that_fails_alone_leaves_the_float32_kernels(gpu, monkeypatch, caplog):
+    row = {"item": "mlp, mixed", "operation": "mixed_precision", "status": "failed", "note": "no bfloat16"}
+    monkeypatch.setattr(store, "run_self_test", lambda *_: SelfTest("gpu", "cuda:0", (row,)))
+    choose_device("cuda")
+    (warning,) = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert warning == (
+        "mixed precision does not work on cuda:0 (a GPU that is not there) (no bfloat16), which uses float32 kernels "
+        "instead, as with `precision='float32'`"
+    )
+    model = small_model([(0, 0, 0)]).to(gpu)
+    assert not replaced_operations() & set(GPU_OPERATIONS) and not model.shading().mixed
+    set_replaced_operations([])
+    assert model.shading().mixed
 
 
 @pytest.mark.parametrize("content", ["", "[]", '{"result": {}}', '{"result": {"rows": 3}}', "\xff"])
