@@ -16,7 +16,8 @@ import pytest
 from ops.device import IS_INTERPRETED, needs_triton
 
 REPOSITORY_ROOT = Path(__file__).parents[2]
-MISSING_PACKAGES = ("zstandard", "trimesh", "dahuffman", "pycolmap")
+MISSING_PACKAGES = ("OpenEXR", "av", "constriction", "dahuffman", "fast_simplification", "gsply", "pillow_heif")
+MISSING_PACKAGES += ("playwright", "pxr", "pycolmap", "trimesh", "zstandard")
 LIMIT_SECONDS = 590
 # Items that need GPU kernels, or whose bounds hold for them alone.
 NOT_ON_THE_CPU = {"mlp 32-64-64-8, mixed", "mlp 56-64-64-3, mixed", "mlp mixed", "rasterize shaded"}
