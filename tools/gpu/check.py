@@ -48,7 +48,7 @@ REPOSITORY_ROOT = Path(__file__).parents[2]
 LOGS_FOLDER = "logs"  # in the folder of results: what pytest and other programs print
 FULL_RUN_OVERHEAD_SECONDS = 60.0  # what the full run takes besides its training time
 # Each part has a module with `items(setup)` and `run(item, setup)`, and a time limit in seconds for all its items. The
-# limits of the first two parts include the first build of 140 kernels, each of which takes one or two seconds of a core.
+# limits of the first two parts include the first build of 140 kernels, each of which takes 1 or 2 seconds of a core.
 CHECK_PARTS = {
     "self-test": ("tools.gpu.first_contact", 100.0),
     "tests": ("tools.gpu.tests", 150.0),
