@@ -38,10 +38,12 @@ SPLAT_SUFFIXES = (*FORMATS, ".html")
 
 
 def export(source, target, **options) -> ExportReport:
-    """Export with degree 3 and baked pages by default; a target named `colmap` becomes a COLMAP model."""
-    kind = {"baked": str(target).endswith(".html"), "colmap": str(target).endswith("colmap")}
-    data = options.pop("data", None)
-    return hyrfpack.export_model(source, target, hyrfpack.ExportConfig(**{"degree": 3, **kind, **options}), data=data)
+    """Export with degree 3, if the format has one, and baked pages by default; `colmap` becomes a COLMAP model."""
+    kind = {"baked": str(target).endswith(".html"), "colmap": str(target).endswith("colmap"), **options}
+    has_harmonics = not kind["colmap"] and not str(target).endswith((".json", ".points.ply", ".points.glb"))
+    data = kind.pop("data", None)
+    config = hyrfpack.ExportConfig(**({"degree": 3, **kind} if has_harmonics else kind))
+    return hyrfpack.export_model(source, target, config, data=data)
 
 
 def scale_and_move(camera: Camera, unit: float, center) -> Camera:
