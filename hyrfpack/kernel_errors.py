@@ -16,7 +16,8 @@ MAX_REASON_LENGTH = 160
 def describe_kernel_error(error: BaseException) -> str | None:
     """Return what to tell the user if an error was raised while Triton compiled or launched a kernel; else None.
 
-    Triton raises errors of many types, also of the compilers that it runs and of its cache, so the traceback tells.
+    Triton raises errors of many types, also of the compilers that it runs and of its cache. So the frames of the
+    traceback decide.
     """
     package, kernel = "", ""
     for frame, _ in walk_tb(error.__traceback__):

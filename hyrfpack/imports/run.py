@@ -218,7 +218,7 @@ def _falls_short(reached_psnr: float, asked: float) -> bool:
 def _shortfall(reached_psnr: float, unpacked_psnr: float, config: ImportConfig, *, has_cameras: bool) -> str:
     """Describe how far the file falls short of the target PSNR, and what the user can do about it.
 
-    `has_cameras` tells whether the user gave the viewpoints.
+    `has_cameras`: whether the user gave the viewpoints.
     """
     outcome = (
         f"the target PSNR is {config.psnr:g} dB, but the file reaches {reached_psnr:.1f} dB at held-out viewpoints "

@@ -22,7 +22,7 @@ PYTEST_OVERRIDES = (
 )  # fmt: skip
 # Building kernels takes a CPU core each. Processes begin with a range of neighbouring tests each, and take tests from
 # others when they are done, so that no file of slow tests keeps one of them busy alone.
-WORKERS = min(12, os.cpu_count() or 1)
+MAX_TEST_PROCESSES = min(12, os.cpu_count() or 1)
 PARALLEL_OPTIONS = ("--dist", "worksteal", "-p", "tools.gpu.replace_worker")
 _OUTCOME = "(?P<outcome>PASSED|FAILED|ERROR|SKIPPED|XFAIL|XPASS)"
 # "tests/test_a.py::test_b PASSED [ 50%]", or from xdist "[gw1] [ 50%] PASSED tests/test_a.py::test_b".
@@ -35,7 +35,7 @@ _FAILED_OUTCOMES = ("FAILED", "ERROR")
 
 
 def run_suite(
-    paths: Sequence[str], seconds: float = MAX_SECONDS, workers: int = WORKERS, log: Path | None = None
+    paths: Sequence[str], seconds: float = MAX_SECONDS, workers: int = MAX_TEST_PROCESSES, log: Path | None = None
 ) -> Iterator[Row]:
     """Run the tests marked `gpu`; yield one row for each file, and one more if pytest failed outside of a test.
 
