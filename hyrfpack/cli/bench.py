@@ -21,14 +21,14 @@ from hyrfpack.cli.common import (
     scene_options,
 )
 from hyrfpack.cli.console import notes_only_of
-from hyrfpack.cli.types import OUTPUT, PATH
+from hyrfpack.cli.types import INPUT_PATH, OUTPUT
 from hyrfpack.errors import HyrfError
 from hyrfpack.outputs import Outputs
 
 
 @click.command(short_help="Measure speed and error.")
-@click.argument("model", type=PATH, required=False)
-@click.option("--data", type=PATH, metavar="DIR", help="Photos and poses; the held-out photos measure quality.")
+@click.argument("model", type=INPUT_PATH, required=False)
+@click.option("--data", type=INPUT_PATH, metavar="DIR", help="Photos and poses; the held-out photos measure quality.")
 @scene_options
 @click.option(
     "--repeats",

@@ -8,11 +8,11 @@ from pathlib import Path
 import click
 
 from hyrfpack.cli.common import json_option, note, note_rename, overwrite_option, print_json
-from hyrfpack.cli.types import OUTPUT, PATH
+from hyrfpack.cli.types import INPUT_PATH, OUTPUT
 
 
 @click.command(short_help="Compare training runs on one page.")
-@click.argument("runs", metavar="RUN RUN...", type=PATH, nargs=-1, required=True)
+@click.argument("runs", metavar="RUN RUN...", type=INPUT_PATH, nargs=-1, required=True)
 @click.option("-o", "--output", type=OUTPUT, required=True, metavar="FILE", help="The .html page to write.")
 @overwrite_option
 @json_option

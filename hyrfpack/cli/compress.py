@@ -25,7 +25,7 @@ from hyrfpack.cli.common import (
 from hyrfpack.cli.processes import processes_option
 from hyrfpack.cli.section_table import format_section_table
 from hyrfpack.cli.settings import settings_options
-from hyrfpack.cli.types import OUTPUT, PATH, reject_non_finite
+from hyrfpack.cli.types import INPUT_PATH, OUTPUT, reject_non_finite
 from hyrfpack.config.compress import CompressConfig
 from hyrfpack.counts import format_count
 from hyrfpack.outputs import Outputs
@@ -39,12 +39,12 @@ if TYPE_CHECKING:
 
 
 @click.command(short_help="Compress a model to a small file.")
-@click.argument("model", type=PATH)
+@click.argument("model", type=INPUT_PATH)
 @click.option("-o", "--output", type=OUTPUT, required=True, metavar="FILE", help="The .hyrf file to write.")
 @settings_options(CompressConfig, "profile")
 @click.option(
     "--data",
-    type=PATH,
+    type=INPUT_PATH,
     help="Photos and poses for --finetune, --max-psnr-drop and scores.  [default: those that MODEL was trained on]",
 )
 @click.option("--no-data", is_flag=True, help="Do not use the photos that MODEL was trained on.")
@@ -135,7 +135,7 @@ def compress(
 
 
 @click.command(short_help="Decompress a file to exact float32.")
-@click.argument("file", type=PATH)
+@click.argument("file", type=INPUT_PATH)
 @click.option("-o", "--output", type=OUTPUT, required=True, metavar="FILE", help="The .hyrf file to write.")
 @click.option(
     "--fraction",

@@ -10,7 +10,7 @@ import click
 from hyrfpack.cli.common import format_table, json_option, note_rename, overwrite_option, print_json
 from hyrfpack.cli.export import crop_option
 from hyrfpack.cli.settings import settings_options
-from hyrfpack.cli.types import OUTPUT, PATH
+from hyrfpack.cli.types import INPUT_PATH, OUTPUT
 from hyrfpack.config.export import ConvertConfig
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @click.command(short_help="Convert splats between formats.")
-@click.argument("source", type=PATH)
+@click.argument("source", type=INPUT_PATH)
 @click.argument("target", type=OUTPUT)
 @settings_options(ConvertConfig, "degree")
 @crop_option

@@ -20,7 +20,7 @@ from hyrfpack.cli.common import (
 )
 from hyrfpack.cli.ordered import OrderedCommand, options_in_order
 from hyrfpack.cli.settings import settings_options
-from hyrfpack.cli.types import OUTPUT, PATH, TURNED_BOX, Numbers, NumbersOrWord
+from hyrfpack.cli.types import INPUT_PATH, OUTPUT, TURNED_BOX, Numbers, NumbersOrWord
 from hyrfpack.config.compress import PROFILES
 from hyrfpack.config.edit import (
     DEFAULT_MIN_OPACITY_SHARE,
@@ -84,7 +84,7 @@ _ACTION_BY_OPTION: dict[str, Callable[[Any], Action]] = {
 
 
 @click.command(short_help="Crop, clean, repair, reduce and move a model.", cls=OrderedCommand)
-@click.argument("model", type=PATH)
+@click.argument("model", type=INPUT_PATH)
 @click.option("-o", "--output", type=OUTPUT, metavar="FILE", help="The .hyrf file to write.")
 @click.option("--plan", is_flag=True, help="Print what the actions would do, and write no model.")
 @click.option("--picture", type=OUTPUT, metavar="FILE", help="Write a .png or .jpg of the scene before and after.")
@@ -108,7 +108,7 @@ _ACTION_BY_OPTION: dict[str, Callable[[Any], Action]] = {
 )
 @click.option(
     "--crop-polygon",
-    type=PATH,
+    type=INPUT_PATH,
     multiple=True,
     metavar="JSON",
     help="Keep the Gaussians above and below a polygon on the ground, which the file states as [[x, y, z], ...], or as "
@@ -116,7 +116,7 @@ _ACTION_BY_OPTION: dict[str, Callable[[Any], Action]] = {
 )
 @click.option(
     "--crop-masks",
-    type=PATH,
+    type=INPUT_PATH,
     multiple=True,
     metavar="DIR",
     help="Keep the Gaussians that the masks in DIR show; black is outside. Masks have the names of their photos; needs "
@@ -191,7 +191,7 @@ _ACTION_BY_OPTION: dict[str, Callable[[Any], Action]] = {
 @settings_options(EditLimits, "target_bytes", "max_psnr_drop")
 @click.option(
     "--data",
-    type=PATH,
+    type=INPUT_PATH,
     help="Photos and poses of MODEL, for --remove-floaters, --crop-masks, --refit and --max-psnr-drop, and for scores "
     "on held-out photos before and after.",
 )

@@ -11,7 +11,7 @@ from hyrfpack.choices import AS_PHOTOGRAPHED
 from hyrfpack.cli.common import format_consistent_psnr, format_table, note, print_json, read_scene, scene_options
 from hyrfpack.cli.drawing import drawing_options, largest_picture_size, select_views, split_option
 from hyrfpack.cli.progress import show_progress
-from hyrfpack.cli.types import OUTPUT, PATH
+from hyrfpack.cli.types import INPUT_PATH, OUTPUT
 from hyrfpack.counts import format_count
 from hyrfpack.outputs import Outputs
 
@@ -25,11 +25,13 @@ if TYPE_CHECKING:
 
 
 @click.command(short_help="Score a model against photos.")
-@click.argument("model", type=PATH)
-@click.option("--data", type=PATH, required=True, help="Folder of photos and poses.")
+@click.argument("model", type=INPUT_PATH)
+@click.option("--data", type=INPUT_PATH, required=True, help="Folder of photos and poses.")
 @split_option("Photos of --data to score.")
 @scene_options
-@click.option("--lpips-weights", type=PATH, metavar="FILE", help="Weights of the lpips package, needed for LPIPS.")
+@click.option(
+    "--lpips-weights", type=INPUT_PATH, metavar="FILE", help="Weights of the lpips package, needed for LPIPS."
+)
 @click.option(
     "--pictures", type=OUTPUT, metavar="DIR", help="Write a picture of each photo, its render and the error to DIR."
 )

@@ -18,7 +18,7 @@ from hyrfpack.cli.common import (
     scene_options,
 )
 from hyrfpack.cli.settings import settings_options
-from hyrfpack.cli.types import BOX, HARMONICS_DEGREE, OUTPUT, PATH
+from hyrfpack.cli.types import BOX, HARMONICS_DEGREE, INPUT_PATH, OUTPUT
 from hyrfpack.config.export import ExportConfig
 from hyrfpack.counts import format_count
 from hyrfpack.errors import HyrfError
@@ -38,7 +38,7 @@ crop_option = click.option(
 
 
 @click.command(short_help="Export a model to formats of other programs.")
-@click.argument("models", metavar="[MODEL]...", type=PATH, nargs=-1)
+@click.argument("models", metavar="[MODEL]...", type=INPUT_PATH, nargs=-1)
 @click.option(
     "-o",
     "--output",
@@ -65,7 +65,7 @@ crop_option = click.option(
 @settings_options(ExportConfig, "editable")
 @click.option(
     "--data",
-    type=PATH,
+    type=INPUT_PATH,
     multiple=True,
     help="Photos and poses of the scene: cameras for a file that stores none, and held-out photos to score the result. "
     "For a gallery, give it once for each MODEL.",

@@ -18,7 +18,7 @@ from hyrfpack.cli.common import (
     print_json,
 )
 from hyrfpack.cli.settings import settings_options
-from hyrfpack.cli.types import OUTPUT, PATH
+from hyrfpack.cli.types import INPUT_PATH, OUTPUT
 from hyrfpack.config.imports import ImportConfig
 from hyrfpack.counts import format_count
 
@@ -28,12 +28,12 @@ if TYPE_CHECKING:
 
 
 @click.command("import", short_help="Compress splats of another program to a small model.")
-@click.argument("source", type=PATH)
+@click.argument("source", type=INPUT_PATH)
 @click.option("-o", "--output", type=OUTPUT, required=True, metavar="FILE", help="The .hyrf file to write.")
 @settings_options(ImportConfig, "psnr", "worst", "target_bytes", "size")
 @click.option(
     "--cameras",
-    type=PATH,
+    type=INPUT_PATH,
     metavar="PATH",
     help="Cameras to measure at: a JSON file (also of nerfstudio or 3DGS), or a folder of photos and poses.",
 )

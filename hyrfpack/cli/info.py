@@ -10,7 +10,7 @@ import click
 from hyrfpack.cli.common import format_consistent_psnr, format_table, json_option, print_json
 from hyrfpack.cli.console import print_line
 from hyrfpack.cli.section_table import format_section_table
-from hyrfpack.cli.types import PATH
+from hyrfpack.cli.types import INPUT_PATH
 from hyrfpack.cli.wording import use_option_names
 from hyrfpack.counts import format_count
 from hyrfpack.errors import printable
@@ -19,7 +19,7 @@ from hyrfpack.outputs import ARCHIVE_SUFFIXES, PICTURE_SUFFIXES, VIDEO_SUFFIXES
 
 
 @click.command(short_help="Describe a file, a run or a folder of photos.")
-@click.argument("path", metavar="FILE", type=PATH)
+@click.argument("path", metavar="FILE", type=INPUT_PATH)
 @json_option
 def info(path: Path, as_json: bool) -> None:
     """Describe FILE.

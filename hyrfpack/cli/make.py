@@ -20,7 +20,7 @@ from hyrfpack.cli.common import (
 from hyrfpack.cli.console import notes_only_of
 from hyrfpack.cli.live import serve_training_view, view_options
 from hyrfpack.cli.settings import reject_two_sizes, settings_options
-from hyrfpack.cli.types import OUTPUT, PATH
+from hyrfpack.cli.types import INPUT_PATH, OUTPUT
 from hyrfpack.config.make import MakeConfig
 from hyrfpack.counts import format_count
 
@@ -32,7 +32,7 @@ MAX_LISTED_PHOTOS = 5
 
 
 @click.command(short_help="Make a scene from photos, end to end.")
-@click.argument("photos", type=PATH)
+@click.argument("photos", type=INPUT_PATH)
 @click.option("-o", "--output", type=OUTPUT, required=True, metavar="FILE", help="File or folder to make.")
 @settings_options(MakeConfig, "quality", "minutes", "target_bytes", "max_gaussians", "preset", "matching")
 @settings_options(MakeConfig, "images", "max_size", "test_every")

@@ -17,7 +17,7 @@ from hyrfpack.cli.common import (
     resolve_model_file,
 )
 from hyrfpack.cli.ordered import OrderedCommand, options_in_order
-from hyrfpack.cli.types import OUTPUT, PATH, NamedNumbers
+from hyrfpack.cli.types import INPUT_PATH, OUTPUT, NamedNumbers
 from hyrfpack.config.edit import Move, Rotate, Scale, Translate
 
 _ACTION_BY_OPTION: dict[str, Callable[[Any], Move]] = {
@@ -28,7 +28,7 @@ _ACTION_BY_OPTION: dict[str, Callable[[Any], Move]] = {
 
 
 @click.command(short_help="Put several models into one file.", cls=OrderedCommand)
-@click.argument("models", type=PATH, nargs=-1, required=True)
+@click.argument("models", type=INPUT_PATH, nargs=-1, required=True)
 @click.option("-o", "--output", type=OUTPUT, metavar="FILE", required=True, help="The .hyrf file to write.")
 @click.option("--translate", type=NamedNumbers(3, "X,Y,Z"), multiple=True, help="Move the model NAME.")
 @click.option(

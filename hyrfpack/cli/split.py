@@ -17,17 +17,17 @@ from hyrfpack.cli.common import (
     scene_options,
 )
 from hyrfpack.cli.settings import settings_options
-from hyrfpack.cli.types import OUTPUT, PATH
+from hyrfpack.cli.types import INPUT_PATH, OUTPUT
 from hyrfpack.config.split import SplitConfig
 from hyrfpack.counts import format_count
 
 
 @click.command(short_help="Split a model into chunks with levels of detail.")
-@click.argument("model", type=PATH)
+@click.argument("model", type=INPUT_PATH)
 @click.option("-o", "--output", type=OUTPUT, metavar="DIR", required=True, help="The folder to write.")
 @click.option(
     "--data",
-    type=PATH,
+    type=INPUT_PATH,
     help="Photos and poses, at whose cameras levels are fitted and measured.  [default: the cameras that MODEL keeps]",
 )
 @settings_options(SplitConfig, "chunk_gaussians", "levels", "refit_steps", "title", "licence", "seed")

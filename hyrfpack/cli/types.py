@@ -21,7 +21,7 @@ class _InputPath(click.Path):
         return super().convert(value, param, ctx)
 
 
-PATH = _InputPath(path_type=Path)
+INPUT_PATH = _InputPath(path_type=Path)
 
 
 class _OutputPath(click.ParamType):

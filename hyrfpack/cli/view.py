@@ -7,11 +7,11 @@ from pathlib import Path
 import click
 
 from hyrfpack.cli.common import json_option, note, print_json
-from hyrfpack.cli.types import PATH
+from hyrfpack.cli.types import INPUT_PATH
 
 
 @click.command(short_help="Show a model in a browser.")
-@click.argument("model", type=PATH)
+@click.argument("model", type=INPUT_PATH)
 @click.option(
     "--port",
     type=click.IntRange(0, 65535),

@@ -21,7 +21,7 @@ from pathlib import Path
 
 # What an item reports. "item" is its name. "status" is "failed" or "left out", with the reason under "note"; a row
 # without "status" passed. "is_temporary" is True if the item failed because of the machine's present state: it ran out
-# of time, or another program killed its process.
+# of time or memory, or another program killed its process.
 Row = dict[str, object]
 
 # Prefixes of the lines by which a child reports to its parent.

@@ -18,7 +18,7 @@ from PIL import Image
 
 from hyrfpack.cli import main
 from hyrfpack.cli.train import train
-from hyrfpack.cli.types import PATH
+from hyrfpack.cli.types import INPUT_PATH
 from hyrfpack.config.compress import PROFILES
 from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.format import load_model
@@ -523,4 +523,4 @@ def test_an_empty_path_is_not_the_current_folder(words, tmp_path, monkeypatch):
 def test_every_input_path_is_checked_for_being_empty():
     given = [option for command in main.commands.values() for option in command.params]
     paths = [option for option in given if isinstance(option.type, click.Path)]
-    assert len(paths) > 20 and all(option.type is PATH for option in paths)
+    assert len(paths) > 20 and all(option.type is INPUT_PATH for option in paths)
