@@ -352,7 +352,7 @@ def test_it_starts_from_the_repository_root_without_an_installed_hyrfpack() -> N
 
 def test_the_default_parts_end_within_nine_minutes_and_leave_out_long_training() -> None:
     assert sum(gpu_check.CHECK_PARTS[part][1] for part in gpu_check.DEFAULT_PARTS) <= 540
-    assert set(gpu_check.CHECK_PARTS) - set(gpu_check.DEFAULT_PARTS) == {"quality", "full-run"}
+    assert set(gpu_check.CHECK_PARTS) - set(gpu_check.DEFAULT_PARTS) == {"quality", "ranks", "full-run"}
 
 
 def test_rooms_of_the_goals_size_come_first_as_trained_before_tidy() -> None:
@@ -485,7 +485,8 @@ def test_prepared_commands_run_the_default_parts_and_both_kinds_of_training() ->
     first, second, third = gpu_prepare.check_commands(Path("build/gpu/bonsai"), "abc123", "$OUT")
     assert all("--commit abc123 --out $OUT" in command for command in (first, second, third))
     assert "--parts" not in first
-    assert "--parts quality --data build/gpu/bonsai" in second and "--parts full-run --data build/gpu/bonsai" in third
+    assert "--parts quality ranks --data build/gpu/bonsai" in second
+    assert "--parts full-run --data build/gpu/bonsai" in third
 
 
 @pytest.fixture

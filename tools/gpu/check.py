@@ -16,6 +16,7 @@ order in which they run:
     sanitizer  NVIDIA's compute-sanitizer on the cases of the self-test, where it is installed
     repeat     the same frame and the same training step twice: whether all bits agree
     quality    the same training run on the CPU and on the GPU: PSNR on held-out photos in dB; not run by default
+    ranks      training by one process and by two, which may share a GPU; not run by default
     full-run   30,000 steps on the real data set on the GPU, as far as the time allows; not run by default
 
 Exit code: 0 if every check passed, 1 if one failed, 2 if there is no GPU. A missed goal does not fail the check.
@@ -57,6 +58,7 @@ CHECK_PARTS = {
     "sanitizer": ("tools.gpu.sanitizer", 90.0),
     "repeat": ("tools.gpu.repeat", 20.0),
     "quality": ("tools.gpu.quality", 170.0),
+    "ranks": ("tools.gpu.ranks", 150.0),
     "full-run": ("tools.gpu.full_run", FULL_RUN_OVERHEAD_SECONDS),
 }
 DEFAULT_PARTS = ("self-test", "tests", "kernels", "frames", "sanitizer", "repeat")
@@ -127,7 +129,7 @@ def main(arguments: list[str] | None = None) -> int:
         nargs="+",
         choices=list(CHECK_PARTS),
         default=list(DEFAULT_PARTS),
-        help="parts to run (all but quality and full-run)",
+        help="parts to run (all but quality, ranks and full-run)",
     )
     parser.add_argument(
         "--out", type=Path, default=REPOSITORY_ROOT / "docs" / "gpu", help="folder for results (docs/gpu)"

@@ -67,7 +67,7 @@ def is_same_scene(first: Scene, second: Scene) -> bool:
 
 
 def check_commands(data: Path, commit: str, out: str) -> list[str]:
-    """Return the commands for the GPU machine: the default parts, then two kinds of training on the data set.
+    """Return the commands for the GPU machine: the default parts, then short and long training.
 
     Args:
         data: the copied set, relative to the repository's root.
@@ -75,7 +75,7 @@ def check_commands(data: Path, commit: str, out: str) -> list[str]:
         out: the folder for results, as the shell there writes it.
     """
     check = f"timeout 590 python3 -m tools.gpu.check --commit {commit} --out {out}"
-    return [check, *(f"{check} --parts {part} --data {data.as_posix()}" for part in ("quality", "full-run"))]
+    return [check, *(f"{check} --parts {parts} --data {data.as_posix()}" for parts in ("quality ranks", "full-run"))]
 
 
 def folder_bytes(folder: Path) -> int:

@@ -37,6 +37,8 @@ class Setup:
         demo_views, demo_size: number of photos of the built-in scene, and their side in pixels.
         quality_steps: largest number of steps of each training run of the quality comparison.
         quality_seconds: time limit in seconds for the CPU's training run; the number of steps is reduced to keep it.
+        ranks_steps: number of photos that one process and two train on.
+        ranks_seconds: time limit in seconds for each of these two runs.
         full_run_steps: number of steps of the full run.
         full_run_seconds: time limit in seconds for the full run; it then ends before its last step.
         full_run_interval: seconds of the full run between two rows of the report.
@@ -64,6 +66,8 @@ class Setup:
     demo_size: int = 200
     quality_steps: int = 1000
     quality_seconds: float = 40.0
+    ranks_steps: int = 400
+    ranks_seconds: float = 70.0
     full_run_steps: int = FULL_STEPS
     full_run_seconds: float = FULL_RUN_SECONDS
     full_run_interval: float = 20.0
