@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from numbers import Integral
 from typing import Any, TypeVar
 
 import numpy as np
@@ -62,8 +63,8 @@ class Camera:
             and the last row may be left out; the camera stores a copy.
 
     Raises:
-        ValueError: the picture has no pixels, a focal length is not positive, a number is not finite, or the pose is
-            not rigid, see `rigid_pose`.
+        ValueError: the picture has no pixels, a side is not an integer, a focal length is not positive, a number is not
+            finite, or the pose is not rigid, see `rigid_pose`.
     """
 
     width: int
@@ -75,6 +76,8 @@ class Camera:
     camera_from_world: np.ndarray
 
     def __post_init__(self) -> None:
+        if not isinstance(self.width, Integral) or not isinstance(self.height, Integral):
+            raise ValueError(f"a camera of {self.width!r} x {self.height!r} pixels; both must be integers")
         if self.width < 1 or self.height < 1:
             raise ValueError(f"a camera of {self.width} x {self.height} pixels; each side needs at least one")
         if not (np.isfinite(self.intrinsics).all() and self.fx > 0 and self.fy > 0):

@@ -25,6 +25,13 @@ def test_camera_intrinsics_have_the_order_fx_fy_cx_cy():
     assert Camera(8, 6, 1.0, 2.0, 3.0, 4.0, np.eye(4)).intrinsics == (1.0, 2.0, 3.0, 4.0)
 
 
+@pytest.mark.parametrize("size", [(16.5, 16), (16, 16.0), ("16", 16), (None, 16)], ids=str)
+def test_a_picture_size_that_is_no_integer_is_rejected(size):
+    with pytest.raises(ValueError, match="both must be integers"):
+        Camera(*size, 1.0, 2.0, 3.0, 4.0, np.eye(4))
+    assert Camera(np.int64(16), np.uint16(9), 1.0, 2.0, 3.0, 4.0, np.eye(4)).height == 9
+
+
 def test_project_agrees_with_the_pinhole_equation_and_marks_points_behind():
     camera = Camera(8, 6, 10.0, 12.0, 3.5, 2.5, look_at((0, -3.0, 0), (0, 0, 0)))  # looks along y, its x axis is x
     x, y, z = camera.project(np.array([[0.3, 0.0, 0.0], [0.0, 2.0, 0.5], [1.0, -3.0, 1.0], [0.0, -4.0, 0.0]]))
