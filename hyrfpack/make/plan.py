@@ -24,7 +24,7 @@ from hyrfpack.train.decisions import (
 )
 from hyrfpack.train.pilots import BUDGET_REFERENCE_STEPS
 from hyrfpack.train.resolution import PhotoSize
-from hyrfpack.train.setup import budget_for, usual_budget
+from hyrfpack.train.setup import budget_for, estimate_initial_count, usual_budget
 
 # Measured on two CPU cores, for the first estimate only; during the work, measured times replace it.
 CPU_STEP_SECONDS = 0.03  # time of a training step that does not depend on the photo's size
@@ -40,7 +40,6 @@ ASSUMED_VIDEO_SIZE = (1920, 1080)
 # A run on large photos gets more Gaussians and takes fewer steps, because at equal time that scores higher.
 SMALL_PHOTO_PIXELS = 190_000
 LARGE_PHOTO_PIXELS = 1_700_000
-ASSUMED_POINTS = 10_000  # before poses are estimated, the number of points is unknown
 
 
 @dataclass(frozen=True)
@@ -197,7 +196,7 @@ def estimate_scene_seconds(scene: Scene, plan: Plan, device: torch.device) -> di
     """Return `estimate_seconds` for a loaded scene."""
     config = plan.train_config(seed=0)
     gaussians, _ = budget_for(scene, config)
-    initial = min(gaussians, len(scene.points) or gaussians // 2)
+    initial = estimate_initial_count(scene, gaussians)
     size = PhotoSize.of_views(scene.train)
     return estimate_seconds(size, plan, initial, gaussians, len(scene.test), max_pilot_steps(scene, config), device)
 
@@ -217,5 +216,5 @@ def estimate_photos_seconds(count: int, size: PhotoSize, plan: Plan, device: tor
     pilot_steps += max_length_pilot_steps(trained, plan.steps) * plan.early_stop
     return {
         "poses": POSE_SECONDS_PER_PHOTO * count,
-        **estimate_seconds(size, plan, ASSUMED_POINTS, gaussians, count // 8, pilot_steps, device),
+        **estimate_seconds(size, plan, gaussians, gaussians, count // 8, pilot_steps, device),
     }

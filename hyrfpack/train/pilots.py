@@ -123,7 +123,15 @@ class ScenePilots:
         return Fold(scene, validation, budget_for(scene, TrainConfig(steps=BUDGET_REFERENCE_STEPS))[0])
 
     def run(
-        self, name: str, fold: Fold, steps: int, *, seed: int, exposure: bool, max_gaussians: int | None = None
+        self,
+        name: str,
+        fold: Fold,
+        steps: int,
+        *,
+        seed: int,
+        exposure: bool,
+        max_gaussians: int | None = None,
+        interpolate_points: bool = True,
     ) -> PilotScore:
         """Train a pilot and score it on the validation photos.
 
@@ -132,6 +140,7 @@ class ScenePilots:
             fold: photos to train on and validation photos.
             steps: number of steps of the pilot.
             seed, exposure, max_gaussians: replace those of the main run; without `max_gaussians` the fold's budget.
+            interpolate_points: as in `TrainConfig`.
 
         Raises:
             PilotsStopped: `stop` returned True.
@@ -144,6 +153,7 @@ class ScenePilots:
             seed=seed,
             exposure=exposure,
             max_gaussians=max_gaussians,
+            interpolate_points=interpolate_points,
             budget_factor=None,
             target_bytes=None,
         )

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from hyrfpack.cameras.capture import quantized_provenance
 from hyrfpack.config.train import FULL_STEPS, TrainConfig
+from hyrfpack.data.cache import PictureCache
 from hyrfpack.data.preset import detect_preset
 from hyrfpack.errors import HyrfTrainingError
 from hyrfpack.format.min_file_size import check_target_bytes
@@ -21,6 +22,7 @@ from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians, logit
 from hyrfpack.model.hybrid import scale_bounds
 from hyrfpack.scene import Scene
+from hyrfpack.train.interpolated_points import interpolate_points
 from hyrfpack.train.provenance import training_provenance
 from hyrfpack.train.silhouette import inside_silhouettes
 
@@ -137,14 +139,22 @@ def table_size_for(budget: int, config: TrainConfig) -> tuple[int, str]:
     return min(21, max(8, log2)), f"{GAUSSIANS_PER_ROW} Gaussians for each row and level"
 
 
-def build_model(scene: Scene, config: TrainConfig) -> tuple[HybridModel, int, dict[str, str]]:
+def build_model(
+    scene: Scene, config: TrainConfig, cache: PictureCache | None = None
+) -> tuple[HybridModel, int, dict[str, str]]:
     """Build an untrained model for a scene.
+
+    Args:
+        scene: the scene.
+        config: settings of the run.
+        cache: cache of decoded photos; None keeps none.
 
     Returns:
         The model, its Gaussian budget, and a text with the choice and its reason for each setting.
 
     Raises:
         HyrfTrainingError: the scene has no training views.
+        HyrfDataError: a photo cannot be read.
     """
     if not scene.train:
         raise HyrfTrainingError(
@@ -171,8 +181,11 @@ def build_model(scene: Scene, config: TrainConfig) -> tuple[HybridModel, int, di
         direction_encoding=config.direction_encoding,
         antialiased=config.antialiased,
     )
-    points, colors = initial_points(scene, frame, budget, config.seed)
-    if len(scene.points):
+    photos = (cache or PictureCache(0)) if config.interpolate_points else None
+    points, colors = initial_points(scene, frame, budget, config.seed, photos)
+    if len(points) > len(scene.points) > 0:
+        source = f"{len(scene.points):,} points of the scene and others interpolated between them"
+    elif len(scene.points):
         source = "points of the scene"
     else:
         source = "random, inside the silhouettes" if scene.has_alpha else "random, in the box"
@@ -187,21 +200,36 @@ def build_model(scene: Scene, config: TrainConfig) -> tuple[HybridModel, int, di
     return model, budget, choices
 
 
-def initial_points(scene: Scene, frame: Frame, budget: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def estimate_initial_count(scene: Scene, budget: int) -> int:
+    """Return how many Gaussians a run with this budget starts with, at most, without reading a photo."""
+    if not len(scene.points):
+        return max(1, budget // 2)
+    return budget if scene.tracks else min(budget, len(scene.points))
+
+
+def initial_points(
+    scene: Scene, frame: Frame, budget: int, seed: int, photos: PictureCache | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Return initial local positions (N, 3) float64 and colours (N, 3) in [0, 1], where N is at most the budget.
 
-    They are the scene's points, or a random subset of them. A scene without points starts from random points in the
-    box, half as many as the budget; if photos have transparency, they lie in the visual hull. Outliers of the
-    reconstruction are moved along the line to the frame's centre until half precision can represent their coordinates.
+    They are the scene's points, or a random subset of them. If there are fewer than the budget, `interpolate_points`
+    adds the rest where tracks allow it, from photos that `photos` reads; None adds none. A scene without points starts
+    from random points in the box, half as many as the budget; if photos have transparency, they lie in the visual hull.
+    Outliers of the reconstruction are moved along the line to the frame's centre until half precision can represent
+    their coordinates.
     """
     generator = np.random.default_rng(seed)
     if len(scene.points):
-        points, colors = frame.to_local(scene.points), np.asarray(scene.point_colors, np.float64)
+        points, colors = scene.points, np.asarray(scene.point_colors, np.float64)
         if len(points) > budget:
             chosen = np.sort(generator.choice(len(points), budget, replace=False))
             points, colors = points[chosen], colors[chosen]
+        elif len(points) < budget and photos is not None:
+            more, more_colors = interpolate_points(scene, photos, budget - len(points), generator)
+            points, colors = np.concatenate([points, more]), np.concatenate([colors, more_colors])
+        points = frame.to_local(points)
         return points / np.maximum(1, np.abs(points).max(axis=1, keepdims=True) / MAX_INITIAL_COORDINATE), colors
-    count = max(1, budget // 2)
+    count = estimate_initial_count(scene, budget)
     half = np.array(frame.half_extent)
     if not scene.has_alpha:
         return generator.uniform(-half, half, (count, 3)), np.full((count, 3), 0.5)

@@ -119,7 +119,7 @@ class Trainer:
         self.pilots: list[dict] = []  # The scores of the pilot runs, see `PilotScore`.
         self._warmup_steps = FIELD_WARMUP_STEPS if model is None else 0
         if model is None:
-            model, self.budget, self.choices = build_model(scene, config)
+            model, self.budget, self.choices = build_model(scene, config, self.cache)
         else:
             self.budget = config.max_gaussians or len(model)
         self.exposures, self.choices["exposure"] = initialize_exposures(scene, config, self.cache, device)

@@ -21,6 +21,7 @@ from unittest.mock import patch
 import torch
 from torch import Tensor
 
+from hyrfpack.data import PictureCache
 from hyrfpack.model import HybridModel, ModelConfig
 from hyrfpack.model.gaussians import logit
 from hyrfpack.scene import Scene
@@ -51,6 +52,7 @@ CHOICES_BY_VARIANT = {
     "fields pass gradients to positions": Choice(model={"position_gradients": True}),
     "no background sphere": Choice({"background": False}),
     "antialiased": Choice({"antialiased": True}),
+    "points of the reconstruction alone": Choice({"interpolate_points": False}),
 }
 
 
@@ -58,9 +60,9 @@ CHOICES_BY_VARIANT = {
 def train_models_with(**settings: Any) -> Iterator[None]:
     """Enter the context in which training builds models with these settings of `ModelConfig`."""
 
-    def build(scene: Scene, config: TrainConfig) -> tuple[HybridModel, int, dict[str, str]]:
+    def build(scene: Scene, config: TrainConfig, cache: PictureCache) -> tuple[HybridModel, int, dict[str, str]]:
         with patch.object(setup, "ModelConfig", partial(ModelConfig, **settings)):
-            model, budget, choices = setup.build_model(scene, config)
+            model, budget, choices = setup.build_model(scene, config, cache)
         if model.config.scale_rule == "product":
             with torch.no_grad():  # the neural factor is 1/2 at the start
                 stored = model.gaussians.scale_logits
