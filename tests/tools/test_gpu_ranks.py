@@ -12,7 +12,9 @@ from tools.gpu import ranks as gpu_ranks
 from tools.gpu.rows import Row
 from tools.gpu.setup import Setup
 
-SETUP = Setup(device="cpu", implementation="cpu", demo_views=9, demo_size=16, ranks_steps=4, ranks_seconds=200.0)
+SMALL_CPU_SETUP = Setup(
+    device="cpu", implementation="cpu", demo_views=9, demo_size=16, ranks_steps=4, ranks_seconds=200.0
+)
 # The arguments are "train SCENE -o OUT ... --processes N".
 FAKE_TRAINING = """
 import json, os, sys, time
@@ -34,7 +36,7 @@ if psnr == 0:
 def rows_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[Row]]:
     """Return a function that returns the rows if one process and two reach these PSNRs; None fails, 0 hangs."""
 
-    def rows(one: float | None, two: float | None, setup: Setup = SETUP) -> list[Row]:
+    def rows(one: float | None, two: float | None, setup: Setup = SMALL_CPU_SETUP) -> list[Row]:
         (tmp_path / "hyrfpack").mkdir(exist_ok=True)
         (tmp_path / "hyrfpack" / "__init__.py").touch()
         (tmp_path / "hyrfpack" / "__main__.py").write_text(FAKE_TRAINING.format(psnr={1: one, 2: two}))
@@ -62,7 +64,7 @@ def test_a_run_that_fails_or_hangs_is_a_failed_row_with_its_reason(rows_for: Cal
     first, second = rows_for(None, 24.0)
     assert first["status"] == "failed" and first["note"] == "exit code 1: Error: the processes do not agree"
     assert "status" not in second
-    first, second = rows_for(25.0, 0, replace(SETUP, ranks_seconds=1.0))
+    first, second = rows_for(25.0, 0, replace(SMALL_CPU_SETUP, ranks_seconds=1.0))
     assert "status" not in first
     assert second["status"] == "failed" and second["note"] == "not done within 1 s"
 
@@ -74,6 +76,6 @@ def test_processes_with_a_gpu_each_use_nccl_and_others_gloo() -> None:
 
 @pytest.mark.acceptance
 def test_two_processes_on_the_cpu_train_as_well_as_one() -> None:
-    setup = replace(SETUP, demo_views=24, demo_size=64, ranks_steps=60)
+    setup = replace(SMALL_CPU_SETUP, demo_views=24, demo_size=64, ranks_steps=60)
     rows = list(gpu_ranks.run("demo", setup))
     assert [row.get("note") for row in rows] == [None, None]

@@ -18,10 +18,10 @@ from hyrfpack.train import interpolated_points
 from hyrfpack.train.interpolated_points import MAX_DEPTH_RATIO, MAX_PHOTOS, draw_surface_pixels, interpolate_points
 from hyrfpack.train.setup import build_model, initial_points, scene_frame
 
-CAMERA = Camera(40, 30, 50.0, 45.0, 19.0, 16.0, np.eye(4))
+SMALL_CAMERA = Camera(40, 30, 50.0, 45.0, 19.0, 16.0, np.eye(4))
 
 
-def points_at(pixels, depths, camera: Camera = CAMERA) -> np.ndarray:
+def points_at(pixels, depths, camera: Camera = SMALL_CAMERA) -> np.ndarray:
     """Return the world points (N, 3) that a camera sees at pixels (N, 2) and depths (N,)."""
     pixels, depths = np.asarray(pixels, np.float64), np.asarray(depths, np.float64)
     rays = (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
@@ -29,11 +29,11 @@ def points_at(pixels, depths, camera: Camera = CAMERA) -> np.ndarray:
     return (seen - camera.camera_from_world[:3, 3]) @ camera.rotation
 
 
-def flat_photo(rgb=(100, 150, 200), camera: Camera = CAMERA, **layers) -> Picture:
+def flat_photo(rgb=(100, 150, 200), camera: Camera = SMALL_CAMERA, **layers) -> Picture:
     return Picture(np.full((camera.height, camera.width, 3), rgb, np.uint8), **layers)
 
 
-def scene_of(pictures, points, camera: Camera = CAMERA) -> Scene:
+def scene_of(pictures, points, camera: Camera = SMALL_CAMERA) -> Scene:
     """Return a scene whose photos, all from one camera, each show all points."""
     views = [view_of(f"{number:04d}.png", camera, picture) for number, picture in enumerate(pictures)]
     tracks = {view.name: np.arange(len(points)) for view in views}
@@ -73,7 +73,7 @@ def test_pixels_of_a_plane_have_its_depths(slopes, distance, seed):
 @pytest.mark.parametrize("ratio", [1.0, MAX_DEPTH_RATIO - 0.01, MAX_DEPTH_RATIO + 0.01, 50.0])
 def test_triangles_across_a_jump_of_depth_are_left_out(ratio):
     points = points_at([(0, 0), (39.9, 0), (0, 29.9)], [2.0, 2.0, 2.0 * ratio])
-    pixels, depths = draw_surface_pixels(CAMERA, points, 50, np.random.default_rng(0))
+    pixels, depths = draw_surface_pixels(SMALL_CAMERA, points, 50, np.random.default_rng(0))
     assert len(pixels) == (50 if ratio < MAX_DEPTH_RATIO else 0)
     assert ((depths > 2 - 1e-9) & (depths < 2 * ratio + 1e-9)).all()
 
@@ -82,7 +82,7 @@ def test_pixels_are_spread_evenly_over_the_triangles():
     """A quarter of a wall is a triangle fan of many points, the rest two large triangles."""
     fine = [(x, y) for x in np.linspace(0, 20, 9) for y in np.linspace(0, 15, 9)]
     points = points_at([*fine, (39.9, 0), (0, 29.9), (39.9, 29.9)], [2.0] * (len(fine) + 3))
-    pixels, _ = draw_surface_pixels(CAMERA, points, 20_000, np.random.default_rng(0))
+    pixels, _ = draw_surface_pixels(SMALL_CAMERA, points, 20_000, np.random.default_rng(0))
     counts, _, _ = np.histogram2d(*pixels.T, bins=4, range=[(0, 39.9), (0, 29.9)])
     np.testing.assert_allclose(counts, 20_000 / 16, rtol=0.15)
 
@@ -101,7 +101,7 @@ def test_pixels_are_spread_evenly_over_the_triangles():
     ids=["none", "two", "in a line", "one place", "behind", "outside", "in the camera"],
 )
 def test_photos_without_a_triangle_give_no_points(points):
-    pixels, depths = draw_surface_pixels(CAMERA, points, 50, np.random.default_rng(0))
+    pixels, depths = draw_surface_pixels(SMALL_CAMERA, points, 50, np.random.default_rng(0))
     assert pixels.shape == (0, 2) and depths.shape == (0,)
     found, colors = interpolate_points(scene_of([flat_photo()], points), PictureCache(), 20, np.random.default_rng(0))
     assert found.shape == colors.shape == (0, 3)
@@ -109,7 +109,7 @@ def test_photos_without_a_triangle_give_no_points(points):
 
 def test_points_repeated_in_one_pixel_are_no_obstacle():
     points = np.repeat(corner_points(), 3, axis=0)
-    _, depths = draw_surface_pixels(CAMERA, points, 500, np.random.default_rng(0))
+    _, depths = draw_surface_pixels(SMALL_CAMERA, points, 500, np.random.default_rng(0))
     assert len(depths) == 500
     np.testing.assert_allclose(depths, 2.0, rtol=1e-9)
 
@@ -119,7 +119,7 @@ def test_points_have_the_colours_of_their_pixels():
     rgb[..., 0], rgb[..., 1] = 6 * np.arange(40), 8 * np.arange(30)[:, None]
     scene = scene_of([Picture(rgb)], corner_points())
     points, colors = interpolate_points(scene, PictureCache(), 300, np.random.default_rng(1))
-    x, y, z = CAMERA.project(points)
+    x, y, z = SMALL_CAMERA.project(points)
     np.testing.assert_allclose(z, 2.0, rtol=1e-9)
     np.testing.assert_allclose(255 * colors[:, 0], 6 * np.floor(x + 1e-9), atol=1e-6)
     np.testing.assert_allclose(255 * colors[:, 1], 8 * np.floor(y + 1e-9), atol=1e-6)
@@ -132,7 +132,7 @@ def test_masked_and_transparent_pixels_give_no_points(layer):
     layers = {"mask": left} if layer == "mask" else {"alpha": np.where(left, 255, 254).astype(np.uint8)}
     scene = scene_of([flat_photo(**layers)], corner_points())
     points, _ = interpolate_points(scene, PictureCache(), 100, np.random.default_rng(2))
-    x, _, _ = CAMERA.project(points)
+    x, _, _ = SMALL_CAMERA.project(points)
     assert len(points) > 80 and (x < 20).all()
 
 
