@@ -284,6 +284,7 @@ def test_training_interrupted_during_pilot_runs_exits_with_1_and_saves_nothing(d
     assert signal.getsignal(signal.SIGINT) is before
 
 
+@pytest.mark.acceptance
 def test_demo_prints_a_table_and_writes_a_picture(tmp_path):
     from hyrfpack.demo.run import run_demo
 

@@ -115,6 +115,7 @@ def use_reserves(patch: pytest.MonkeyPatch, reserve_of: Callable[[int], Reserve]
     return renderings
 
 
+@pytest.mark.acceptance
 def test_a_step_waits_once_and_copies_only_its_photo_and_few_numbers(gpu: torch.device, tuning: Tuning) -> None:
     events: list[object] = []
     work, elements = Counter[tuple[str, str]](), {"to host": [0], "to device": [0]}

@@ -63,6 +63,7 @@ def test_an_exact_model_renders_the_splats(degree: int) -> None:
             assert -10 * difference.square().mean().log10() > 60
 
 
+@pytest.mark.acceptance
 def test_an_import_stores_what_the_target_needs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pack, "MAX_TRIALS", 6)
     monkeypatch.setattr(viewpoints, "CANDIDATES_PER_CAMERA", CANDIDATES_PER_CAMERA)  # the worst views count here

@@ -614,6 +614,7 @@ def test_unfit_arguments_are_rejected() -> None:
         rasterize(Gaussians3D(*(tensor.double() for tensor in shapes)), colors.double(), viewport, implementation="cpu")
 
 
+@pytest.mark.acceptance
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="reads x86 assembly")
 def test_blending_loops_are_vectorised() -> None:
     # Losing vectorisation costs a factor of ten and changes no result, so no other test would notice.

@@ -113,6 +113,7 @@ def assert_same_run(found: tuple[int, list[tuple], dict[str, Tensor]], expected:
     assert [name for name, value in found[2].items() if not torch.equal(value, expected[2][name])] == []
 
 
+@pytest.mark.acceptance
 def test_a_run_with_too_small_a_reserve_equals_one_with_a_large_reserve(gpu: torch.device) -> None:
     density = dataclasses.replace(SHORT_RUN_CONFIG.density, start=1.0)
     config = dataclasses.replace(SHORT_RUN_CONFIG, steps=2, density=density, background=False, exposure=False)

@@ -21,6 +21,7 @@ CHUNK_COUNT = 700  # of one row each
 GAUSSIANS_PER_CHUNK, ROW_WIDTH = 19, 256
 
 
+@pytest.mark.acceptance
 def test_few_levels_wait_for_a_slow_device_and_no_file_is_requested_twice():
     answer = run_script(Path(__file__).with_name("stream_scene.mjs"), GOLDEN_SCENE_FOLDER, CHUNK_COUNT)
     first_picture = 200  # at most so many chunks are drawn at once, of 1 kB each
@@ -29,6 +30,7 @@ def test_few_levels_wait_for_a_slow_device_and_no_file_is_requested_twice():
     assert answer["requests"] == CHUNK_COUNT + 1  # and the shared file
 
 
+@pytest.mark.acceptance
 def test_the_memory_for_gaussians_does_not_grow_with_the_scene():
     """Chunks around the eye stay in memory; others are drawn where the view shows them."""
     budget, script = 10_000, Path(__file__).with_name("turn_in_scene.mjs")
@@ -60,6 +62,7 @@ def parts_folder(tmp_path_factory) -> Path:
     return path / "scene"
 
 
+@pytest.mark.acceptance
 @pytest.mark.parametrize(("budget", "most_parts"), [(400, 2), (650, 3), (10**6, PART_COUNT - 1)])
 def test_the_memory_for_fields_of_parts_has_a_limit(parts_folder: Path, budget: int, most_parts: int):
     """The limit is 128 bytes a Gaussian of the budget, but at least two further parts.
