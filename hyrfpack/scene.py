@@ -127,6 +127,11 @@ class Camera:
         with np.errstate(divide="ignore", invalid="ignore"):
             return self.fx * x / z + self.cx, self.fy * y / z + self.cy, z
 
+    def unproject(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+        """Return the world points (N, 3) at x and y in pixels and camera z in world units: the inverse of `project`."""
+        seen = np.stack(((x - self.cx) / self.fx * z, (y - self.cy) / self.fy * z, z), axis=1)
+        return (seen - self.camera_from_world[:3, 3]) @ self.rotation
+
 
 @dataclass(frozen=True, eq=False)
 class Picture:

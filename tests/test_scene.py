@@ -40,6 +40,12 @@ def test_project_agrees_with_the_pinhole_equation_and_marks_points_behind():
     np.testing.assert_allclose(y[:2], [2.5, 2.5 - 12 * 0.5 / 5])
 
 
+def test_unproject_inverts_project():
+    camera = Camera(8, 6, 10.0, 12.0, 3.5, 2.5, look_at((0.4, -3.0, 1.0), (0, 0, 0)))
+    points = np.random.default_rng(0).uniform(-1, 1, (20, 3))
+    np.testing.assert_allclose(camera.unproject(*camera.project(points)), points, atol=1e-12)
+
+
 def test_look_at_is_a_rotation_with_y_down():
     """The tests' own helper needs a test, because all others rely on it."""
     pose = look_at((4.0, 1.0, 2.0), (0, 0, 0))

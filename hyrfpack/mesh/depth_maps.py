@@ -51,9 +51,7 @@ class DepthMap:
         rows, columns = np.nonzero(((self.weight > 0) & np.isfinite(self.depth))[::stride, ::stride])
         rows, columns = stride * rows, stride * columns
         z = self.depth[rows, columns].astype(np.float64)
-        camera = self.camera
-        x, y = (columns + 0.5 - camera.cx) / camera.fx * z, (rows + 0.5 - camera.cy) / camera.fy * z
-        return (np.stack((x, y, z), axis=1) - camera.camera_from_world[:3, 3]) @ camera.rotation
+        return self.camera.unproject(columns + 0.5, rows + 0.5, z)
 
 
 @torch.no_grad()

@@ -48,7 +48,7 @@ def interpolate_points(
             tracked = scene.points[scene.tracks[view.name]]
             pixels, depths = draw_surface_pixels(view.camera, tracked, PIXELS_PER_POINT * share, generator)
             usable, rgb = _colors(picture, pixels)
-            points.append(_world_points(view.camera, pixels, depths)[usable][:share])
+            points.append(view.camera.unproject(pixels[:, 0], pixels[:, 1], depths)[usable][:share])
             colors.append(rgb[usable][:share])
     positions, rgb = np.concatenate(points), np.concatenate(colors)
     chosen = np.sort(generator.permutation(len(positions))[:count])
@@ -88,12 +88,6 @@ def draw_surface_pixels(
     chosen = generator.choice(len(areas), count, p=areas / areas.sum())
     weights = generator.dirichlet((1.0, 1.0, 1.0), count)[:, None]  # uniform within a triangle
     return (weights @ corners[chosen])[:, 0], 1 / (weights @ inverse[chosen][..., None])[:, 0, 0]
-
-
-def _world_points(camera: Camera, pixels: np.ndarray, depths: np.ndarray) -> np.ndarray:
-    """Return the world positions (N, 3) of pixels (N, 2) at depths (N,) along the camera's axis."""
-    rays = np.concatenate([(pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy), np.ones((len(pixels), 1))], 1)
-    return (depths[:, None] * rays - camera.camera_from_world[:3, 3]) @ camera.rotation
 
 
 def _colors(picture: Picture, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

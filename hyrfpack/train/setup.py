@@ -181,8 +181,8 @@ def build_model(
         direction_encoding=config.direction_encoding,
         antialiased=config.antialiased,
     )
-    photos = (cache or PictureCache(0)) if config.interpolate_points else None
-    points, colors = initial_points(scene, frame, budget, config.seed, photos)
+    pictures = (cache or PictureCache(0)) if config.interpolate_points else None
+    points, colors = initial_points(scene, frame, budget, config.seed, pictures)
     if len(points) > len(scene.points) > 0:
         source = f"{len(scene.points):,} points of the scene and others interpolated between them"
     elif len(scene.points):
@@ -208,12 +208,12 @@ def estimate_initial_count(scene: Scene, budget: int) -> int:
 
 
 def initial_points(
-    scene: Scene, frame: Frame, budget: int, seed: int, photos: PictureCache | None = None
+    scene: Scene, frame: Frame, budget: int, seed: int, cache: PictureCache | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return initial local positions (N, 3) float64 and colours (N, 3) in [0, 1], where N is at most the budget.
 
     They are the scene's points, or a random subset of them. If there are fewer than the budget, `interpolate_points`
-    adds the rest where tracks allow it, from photos that `photos` reads; None adds none. A scene without points starts
+    adds the rest where tracks allow it, from photos read by `cache`; None adds none. A scene without points starts
     from random points in the box, half as many as the budget; if photos have transparency, they lie in the visual hull.
     Outliers of the reconstruction are moved along the line to the frame's centre until half precision can represent
     their coordinates.
@@ -224,8 +224,8 @@ def initial_points(
         if len(points) > budget:
             chosen = np.sort(generator.choice(len(points), budget, replace=False))
             points, colors = points[chosen], colors[chosen]
-        elif len(points) < budget and photos is not None:
-            more, more_colors = interpolate_points(scene, photos, budget - len(points), generator)
+        elif len(points) < budget and cache is not None:
+            more, more_colors = interpolate_points(scene, cache, budget - len(points), generator)
             points, colors = np.concatenate([points, more]), np.concatenate([colors, more_colors])
         points = frame.to_local(points)
         return points / np.maximum(1, np.abs(points).max(axis=1, keepdims=True) / MAX_INITIAL_COORDINATE), colors

@@ -23,10 +23,7 @@ SMALL_CAMERA = Camera(40, 30, 50.0, 45.0, 19.0, 16.0, np.eye(4))
 
 def points_at(pixels, depths, camera: Camera = SMALL_CAMERA) -> np.ndarray:
     """Return the world points (N, 3) that a camera sees at pixels (N, 2) and depths (N,)."""
-    pixels, depths = np.asarray(pixels, np.float64), np.asarray(depths, np.float64)
-    rays = (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
-    seen = depths[:, None] * np.concatenate([rays, np.ones((len(rays), 1))], 1)
-    return (seen - camera.camera_from_world[:3, 3]) @ camera.rotation
+    return camera.unproject(*np.asarray(pixels, np.float64).T, np.asarray(depths, np.float64))
 
 
 def flat_photo(rgb=(100, 150, 200), camera: Camera = SMALL_CAMERA, **layers) -> Picture:
