@@ -36,7 +36,7 @@ def run_cases(implementation: str, device: torch.device, names: Sequence[str]) -
         else:
             yield check_case(self_test_cases()[name], implementation, device)
 
-    if device.type == "cuda":
+    if device.type == "cuda" and device.index is not None:
         with suppress(RuntimeError):  # The first item meets the same error and reports it.
             torch.cuda.set_device(device)
 
