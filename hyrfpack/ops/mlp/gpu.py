@@ -70,7 +70,7 @@ def forward(
             NEEDS_INT64=_needs_int64_offsets(x),
             BLOCK=block,
             PRECISION=multiplication,
-            num_warps=_warps_per_program(widths),
+            num_warps=_warps_per_program(widths, multiplication),
             enable_fp_fusion=True,
         )
     return result, packed
@@ -127,7 +127,7 @@ def backward(
             NEEDS_INT64=_needs_int64_offsets(x) or _needs_int64_offsets(grad),
             BLOCK=block,
             PRECISION=multiplication,
-            num_warps=_warps_per_program(widths),
+            num_warps=_warps_per_program(widths, multiplication),
             enable_fp_fusion=True,
         )
     w1, w2, w3, b1, b2, b3 = partials.sum(0).split(lengths)
@@ -138,9 +138,14 @@ def backward(
     )
 
 
-def _warps_per_program(widths: Sequence[int]) -> int:
-    """Return the warps per program; wide layers need the registers of twice as many threads."""
-    return 8 if max(map(pad_width, widths[:3])) > 64 else 4
+def _warps_per_program(widths: Sequence[int], multiplication: str) -> int:
+    """Return the warps per program; wide layers need the registers of twice as many threads.
+
+    Triton 3.6 reads past the end of shared memory on an H200 where eight warps multiply a tile of 64 rows in tf32x3.
+    """
+    heights = [pad_width(width) for width in widths[:3]]
+    shares_rows = multiplication == "tf32x3" and min(heights[1:]) <= 64
+    return 8 if max(heights) > 64 and not shares_rows else 4
 
 
 @cache
