@@ -18,6 +18,9 @@ from torch.utils._pytree import tree_leaves, tree_map
 
 from hyrfpack import device as devices
 from hyrfpack.self_test import SelfTest
+from hyrfpack.train import step_graphs
+from hyrfpack.train.gradients import ViewGradients
+from hyrfpack.train.step_checks import StepChecks
 
 aten = torch.ops.aten
 CUDA_DEVICE = torch.device("cuda", 0)
@@ -299,6 +302,52 @@ class _ToCpu(torch.autograd.Function):
         return FakeGpuTensor(grad)
 
 
+class FakeGraphRecorder:
+    """Records steps as `GraphRecorder` does. A replay repeats what was launched, with all that the host knew then."""
+
+    def record(self, launch: Callable[[], ViewGradients]) -> tuple[ViewGradients, Callable[[], None]]:
+        with _unheard():
+            kept = _undefined_copies(launch())
+
+        def replay() -> None:
+            _report_work("replay of a graph", "launch")
+            with _unheard():
+                repeat()
+
+        def repeat() -> None:
+            for target, source in zip(_result_tensors(kept), _result_tensors(launch()), strict=True):
+                target.copy_(source)
+
+        return kept, replay
+
+
+@contextmanager
+def _unheard() -> Iterator[None]:
+    """Report no work inside this context, because the host does not ask for it."""
+    listeners, _listeners[:] = list(_listeners), []
+    try:
+        yield
+    finally:
+        _listeners[:] = listeners
+
+
+def _result_tensors(found: ViewGradients) -> list[torch.Tensor]:
+    values = [found.loss, found.error, *found.gradients, *vars(found.rendering).values(), *(found.checks or ())]
+    return [value for value in values if isinstance(value, torch.Tensor)]
+
+
+def _undefined_copies(found: ViewGradients) -> ViewGradients:
+    """Return the result with other tensors, whose numbers are wrong until they are written."""
+
+    def copy(value: Any) -> Any:
+        return torch.ones_like(value) if isinstance(value, torch.Tensor) else value
+
+    rendering = type(found.rendering)(**{name: copy(value) for name, value in vars(found.rendering).items()})
+    gradients = [copy(gradient) for gradient in found.gradients]
+    checks = None if found.checks is None else StepChecks(*map(copy, found.checks))
+    return ViewGradients(gradients, copy(found.loss), copy(found.error), rendering, checks, {})
+
+
 @contextmanager
 def use_fake_gpu() -> Iterator[torch.device]:
     """Make torch see one CUDA device inside this context, and yield that device.
@@ -326,6 +375,7 @@ def use_fake_gpu() -> Iterator[torch.device]:
         mock.patch.object(torch.cuda, "get_device_capability", lambda *_: (9, 0)),
         mock.patch.object(torch.cuda, "is_bf16_supported", lambda *_: True),
         mock.patch.object(interpreter.GridExecutor, "__call__", on_the_cpu),
+        mock.patch.object(step_graphs, "GraphRecorder", FakeGraphRecorder),
         mock.patch.object(devices, "load_or_run_self_test", lambda device: SelfTest("gpu", str(device), ())),
         mock.patch.object(torch, "Generator", FakeGenerator),
         mock.patch.object(torch.Tensor, "to", _move),

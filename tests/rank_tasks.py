@@ -22,7 +22,7 @@ from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.parallel.ranks import Ranks, join_processes
 from hyrfpack.progress import Event, Progress, StepEvent
 from hyrfpack.scene import Picture, Scene
-from hyrfpack.train import DensityConfig, TrainConfig, Trainer, train_model
+from hyrfpack.train import DensityConfig, TrainConfig, Trainer, gradients, train_model
 from hyrfpack.train import trainer as trainers
 from hyrfpack.train.distributed import average_gradients, digest
 
@@ -285,11 +285,11 @@ def collect_errors(ranks: Ranks) -> dict[str, str | None]:
     version, trainers.__version__ = trainers.__version__, "0.0" if mine else trainers.__version__
     said["version"] = error_message(lambda: record_training(ranks, six_photo_scene(), short))
     trainers.__version__ = version
-    drawing = trainers.render_view
+    drawing = gradients.render_view
     if mine:
-        trainers.render_view = _run_out_of_memory
+        gradients.render_view = _run_out_of_memory
     said["memory"] = error_message(lambda: record_training(ranks, six_photo_scene(), short))
-    trainers.render_view = drawing
+    gradients.render_view = drawing
     said["checkpoint"] = error_message(lambda: Trainer(six_photo_scene(), short, ranks=ranks).load(Path("nowhere.pt")))
     said["none"] = error_message(lambda: record_training(ranks, six_photo_scene(), short))
     return said

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import logging
 from contextlib import nullcontext
 
 import pytest
@@ -75,6 +76,18 @@ def test_training_agrees_with_the_cpu(gpu):
     for (name, value), expected in zip(parameter_values(there).items(), parameter_values(here).values(), strict=True):
         # Adam's first steps are as long for a rounded gradient as for a large one.
         assert (value - expected).abs().median() < 1e-4, name
+
+
+@pytest.mark.acceptance
+def test_recorded_steps_train_as_launched_ones(gpu, caplog):
+    config = dataclasses.replace(TRAIN_CONFIG, steps=12, density=DensityConfig(start=1.0, stop=1.0, rounds=1))
+    recorded, launched = (Trainer(make_scene(), config, device=gpu) for _ in range(2))
+    launched._graphs = None
+    with caplog.at_level(logging.WARNING):
+        found = record_curve(recorded)
+    assert recorded.seconds["replay"] > 0 and not caplog.records
+    torch.testing.assert_close(found, record_curve(launched), rtol=1e-4, atol=1e-6)
+    assert "replay" not in launched.seconds
 
 
 def test_training_with_replaced_kernels_agrees_with_the_cpu(gpu, monkeypatch):

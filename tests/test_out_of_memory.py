@@ -56,7 +56,7 @@ def test_any_other_error_passes(message):
 
 def test_a_training_step_names_the_settings_of_training(monkeypatch):
     trainer = Trainer(ball_scene(views=3, points=20, side=8), TrainConfig(steps=2, max_gaussians=20, log2_table_size=5))
-    monkeypatch.setattr("hyrfpack.train.trainer.render_view", fail)
+    monkeypatch.setattr("hyrfpack.train.gradients.render_view", fail)
     with pytest.raises(HyrfError, match="GPU's memory ran out.*reduce `max_gaussians` or `max_size`"):
         trainer.run()
 

@@ -32,9 +32,10 @@ from hyrfpack.render import render_view
 from hyrfpack.render.reserve import Reserve, can_reserve
 from hyrfpack.scene import Picture, View
 from hyrfpack.train.distributed import average_gradients
-from hyrfpack.train.launched import MAX_GRADIENT, LaunchedStep, check_step
+from hyrfpack.train.launched import LaunchedStep
 from hyrfpack.train.optimizer import Optimizer
 from hyrfpack.train.reserves import ReserveEstimator
+from hyrfpack.train.step_checks import MAX_GRADIENT, check_step
 from hyrfpack.train.trainer import shuffled
 
 FINETUNING_RATES = LearningRates(

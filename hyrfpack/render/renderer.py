@@ -25,6 +25,7 @@ from hyrfpack.ops.rasterize.inputs import LOW_PASS_VARIANCE, TRANSMITTANCE_MIN
 from hyrfpack.ops.rows import take_rows
 from hyrfpack.ops.shade import Shading
 from hyrfpack.ops.transfer import tensor_like
+from hyrfpack.ops.viewport import PackedCamera
 from hyrfpack.out_of_memory import explain_out_of_memory
 from hyrfpack.parallel.pool import torch_on_one_thread
 from hyrfpack.render.exposure import apply_exposure_map
@@ -144,6 +145,7 @@ def render_view(
     solid: Tensor | None = None,
     background: bool = True,
     reserve: Reserve | None = None,
+    packed: PackedCamera | None = None,
 ) -> Rendering:
     """Render one view; differentiable in the model's parameters.
 
@@ -159,6 +161,8 @@ def render_view(
         background: whether to render the background sphere.
         reserve: memory for which a HybridModel is rendered without waiting for the GPU, if `can_reserve` and without
             `decoded`; then check `Rendering.demand`.
+        packed: the result of `pack_camera` for this camera and these settings, for a HybridModel on a GPU; None if the
+            operations are to upload the camera's numbers.
 
     Raises:
         HyrfError: a number that the view needs is NaN or infinite. On a GPU, while gradients are recorded, the
@@ -179,7 +183,7 @@ def render_view(
     seconds: dict[str, float] = {}
     scene = scene_of(model)
     positions = scene.gaussians.positions
-    viewport = scene.config.frame.local_viewport(camera, positions.dtype)
+    viewport = replace(scene.config.frame.local_viewport(camera, positions.dtype), packed=packed)
     _check_finite(pose=viewport.pose)
     colors: Tensor | Shading
     used, cull_demand = None, None
@@ -240,6 +244,27 @@ def render_view(
     )
 
 
+def pack_camera(model: HybridModel, camera: Camera, settings: RenderSettings) -> PackedCamera:
+    """Upload the numbers of a camera that GPU kernels read, for a model on a GPU.
+
+    Args:
+        settings: those of the rendering; they state the stride of the background.
+
+    Raises:
+        HyrfError: the pose is NaN or infinite.
+    """
+    from hyrfpack.ops.background.gpu import pack_rays
+    from hyrfpack.ops.rasterize import gpu_project
+
+    positions = model.gaussians.positions
+    viewport = model.config.frame.local_viewport(camera, positions.dtype)
+    _check_finite(pose=viewport.pose)
+    tolerance, low_pass = settings.cull_tolerance, settings.low_pass_variance
+    record = gpu_project.pack_camera(viewport, settings.near, positions.device, tolerance, low_pass)
+    stride = settings.background_stride or background_stride(model.background_spacing, viewport)
+    return PackedCamera(record, pack_rays(viewport, stride, positions.device))
+
+
 def _select_gaussians(
     model: HybridModel,
     viewport: Viewport,
@@ -272,9 +297,16 @@ def _select_gaussians(
             index, used, demand = frustum_cull_into(*frustum, reserve.gaussians)
     with _record_seconds(seconds, "decode"):
         geometry = model.decode_geometry(index, used) if decoded is None else decoded.geometry[index]
-        viewpoint = camera_center(viewport.pose).to(positions.device, non_blocking=positions.is_cuda)
+        viewpoint = _viewpoint(viewport, positions)
         colors = model.decode_colors(viewpoint, index, shading, used)
         return index, geometry.at(take_rows(positions, index, used)), colors, used, demand
+
+
+def _viewpoint(viewport: Viewport, positions: Tensor) -> Tensor:
+    """Return the camera's centre (3,) as a tensor like the positions."""
+    if viewport.packed is not None:
+        return viewport.packed.viewpoint.to(positions.dtype)
+    return camera_center(viewport.pose).to(positions.device, non_blocking=positions.is_cuda)
 
 
 def _check_finite(**values: Tensor) -> None:

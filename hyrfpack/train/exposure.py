@@ -171,10 +171,16 @@ class Exposures:
         self._exp_avg, self._exp_avg_sq = torch.zeros_like(self.values), torch.zeros_like(self.values)
         self._steps = [0] * len(views)
         self._stepped: list[int] = []  # The rows of the last step.
+        self._rows_on_device = torch.arange(len(views), device=device)
 
-    def exposed(self, rgb: Tensor, view: View) -> Tensor:
-        """Apply the gains of a view's photo to its render (H, W, 3); differentiable."""
-        return apply_exposure_gains(rgb, self.values[self._row[view.name]].exp())
+    def row(self, view: View) -> Tensor:
+        """Return the row (1,) int64 of a view's photo, on the device."""
+        row = self._row[view.name]
+        return self._rows_on_device[row : row + 1]
+
+    def exposed(self, rgb: Tensor, row: Tensor) -> Tensor:
+        """Apply the gains of the photo in a row, see `row`, to its render (H, W, 3); differentiable."""
+        return apply_exposure_gains(rgb, self.values.index_select(0, row)[0].exp())
 
     def fit_map(self, frame: Frame, views: Sequence[View]) -> ExposureFit:
         """Fit an exposure map to the gains, given the model's frame and the same views as at construction."""

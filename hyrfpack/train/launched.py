@@ -2,21 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
-import numpy as np
-import torch
-from torch import Tensor
-
-from hyrfpack.ops.transfer import HostCopy, tensor_like
-from hyrfpack.render import Rendering
-from hyrfpack.render.reserve import Reserve
+from hyrfpack.ops.transfer import HostCopy
 from hyrfpack.scene import Picture, View
-
-MAX_LOSS = float(np.finfo(np.float32).max)
-MAX_GRADIENT = MAX_LOSS**0.5  # Adam squares gradients.
+from hyrfpack.train.gradients import ViewGradients
 
 
 @dataclass(frozen=True)
@@ -25,49 +15,12 @@ class RenderedView:
 
     Attributes:
         view, picture: the view and its photo.
-        loss, error: scalars on the device: loss, and mean squared error, NaN if all of the photo is masked.
-        rendering: the rendering, with its absolute gradients and without the graph of its other ones.
-        reserve: the memory that it was rendered into, or None.
+        found: the gradients, and the rendering.
     """
 
     view: View
     picture: Picture
-    loss: Tensor
-    error: Tensor
-    rendering: Rendering
-    reserve: Reserve | None
-
-
-class StepChecks(NamedTuple):
-    """What decides on the device whether a step is valid.
-
-    Attributes:
-        valid: bool scalar.
-        demand: (4,) int64, see `Rendering.demand`.
-        norms: (tensors,) the largest absolute value of each gradient; NaN if any is.
-    """
-
-    valid: Tensor
-    demand: Tensor
-    norms: Tensor
-
-
-def check_step(loss: Tensor, gradients: Sequence[Tensor], demand: Tensor, reserve: Reserve) -> StepChecks:
-    """Return whether a step is valid, without waiting for the device.
-
-    It is valid if the loss and all gradients are finite and the reserve was large enough.
-
-    Args:
-        loss: scalar.
-        gradients: all gradients of the step, at least one.
-        demand: what the step's rendering needed, see `Rendering.demand`.
-        reserve: the memory that it was rendered into.
-    """
-    norms = torch.stack(torch._foreach_norm(list(gradients), torch.inf))
-    # float64 holds counts exactly. It is one element for each tensor, so its rate does not matter.
-    numbers = torch.cat((loss.double()[None], norms, demand))
-    limits = MAX_LOSS, *[MAX_GRADIENT] * len(norms), *reserve.limits
-    return StepChecks((numbers <= tensor_like(limits, numbers)).all(), demand, norms)
+    found: ViewGradients
 
 
 @dataclass(frozen=True)

@@ -78,13 +78,14 @@ class Optimizer:
                 self._states[parameter] = _State(zeros, zeros.clone())
             self._states[parameter].step += 1
         states = [self._states[parameter] for _, parameter in stepped]
+        rates = {name: self._rate(name, step, steps) for name in self.groups}
         broken = adam_step(
             [parameter.detach() for _, parameter in stepped],
             [parameter.grad for _, parameter in stepped if parameter.grad is not None],
             [state.exp_avg for state in states],
             [state.exp_avg_sq for state in states],
             step=[state.step for state in states],
-            rate=[self._rate(name, step, steps) for name, _ in stepped],
+            rate=[rates[name] for name, _ in stepped],
             betas=self.betas,
             enabled=enabled,
         )
@@ -94,7 +95,11 @@ class Optimizer:
 
     def gradients(self) -> list[Tensor]:
         """Return the gradients of the parameters that have one, in the order of the flags that `step` returns."""
-        return [p.grad for group in self.groups.values() for p in group if p.grad is not None]
+        return [parameter.grad for parameter in self.parameters() if parameter.grad is not None]
+
+    def parameters(self) -> list[nn.Parameter]:
+        """Return all parameters, in the order of the flags that `step` returns."""
+        return [parameter for group in self.groups.values() for parameter in group]
 
     def retract_step(self) -> None:
         """Discount the last step, which was not enabled and is to be taken again."""

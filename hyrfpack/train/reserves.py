@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 from hyrfpack.render.reserve import Reserve
 from hyrfpack.scene import View
@@ -11,6 +12,9 @@ from hyrfpack.scene import View
 RESERVE_RATIO = 1.5  # Between two renderings of a view its counts grow less than this in most steps.
 INITIAL_PAIRS_PER_GAUSSIAN = 8
 MIN_RESERVED_PAIRS = 4096
+# A reserve for all views is estimated anew if a view needs more than 1 / SHARED_RESERVE_RATIO of it.
+SHARED_RESERVE_RATIO = 1.15
+SHARED_RESERVE_BITS = 3
 
 
 @dataclass(frozen=True)
@@ -31,6 +35,7 @@ class ReserveEstimator:
 
     def __init__(self) -> None:
         self._usages: dict[str, _Usage] = {}
+        self._shared: dict[tuple[int, float], Reserve] = {}  # By number of Gaussians and side in pixels.
 
     def estimate(self, view: View, gaussians: int) -> Reserve:
         """Return the reserve for a view of a model with so many Gaussians.
@@ -53,9 +58,34 @@ class ReserveEstimator:
             pairs = math.ceil(growth * max(1.0, _side_pixels(view) / usage.side_pixels) * usage.pairs)
         return Reserve(max(1, in_view), max(MIN_RESERVED_PAIRS, pairs))
 
+    def estimate_shared(self, views: Sequence[View], view: View, gaussians: int) -> Reserve:
+        """Return a reserve that suffices for each of these views, at the size of `view`.
+
+        It is rounded up, and stays the same until the number of Gaussians changes or a view nearly exceeds it.
+        """
+        key = gaussians, _side_pixels(view)
+        if key not in self._shared:
+            self._shared = {known: reserve for known, reserve in self._shared.items() if known[0] == gaussians}
+            sized = [replace(other, camera=view.camera) for other in views]
+            reserves = [self.estimate(other, gaussians) for other in sized]
+            in_view, pairs = (max(getattr(one, name) for one in reserves) for name in ("gaussians", "pairs"))
+            self._shared[key] = Reserve(min(gaussians, _round_up(in_view)), _round_up(pairs))
+        return self._shared[key]
+
     def record(self, view: View, gaussians: int, in_view: int, pairs: int) -> None:
         """Record what a rendering of a view needed, of a model with so many Gaussians."""
         self._usages[view.name] = _Usage(in_view, pairs, gaussians, _side_pixels(view))
+        shared = self._shared.get((gaussians, _side_pixels(view)))
+        if shared is not None:
+            has_room = shared.gaussians == gaussians or SHARED_RESERVE_RATIO * in_view <= shared.gaussians
+            if not has_room or SHARED_RESERVE_RATIO * pairs > shared.pairs:
+                del self._shared[gaussians, _side_pixels(view)]
+
+
+def _round_up(count: int) -> int:
+    """Round a count up to a number of SHARED_RESERVE_BITS binary digits and then zeros."""
+    step = 1 << max(0, count.bit_length() - SHARED_RESERVE_BITS)
+    return -(-count // step) * step
 
 
 def _side_pixels(view: View) -> float:

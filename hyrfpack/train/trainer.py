@@ -23,32 +23,30 @@ from hyrfpack.format.exposure_header import STOPS_PER_LOG_GAIN
 from hyrfpack.measure.psnr import psnr_from_mse
 from hyrfpack.model import HybridModel
 from hyrfpack.model.gaussians import Gaussians
-from hyrfpack.ops.ssim import photometric_loss
+from hyrfpack.ops.dispatch import GPU_OPERATIONS, replaced_operations
 from hyrfpack.ops.transfer import HostCopy
+from hyrfpack.ops.viewport import PackedCamera
 from hyrfpack.out_of_memory import explain_out_of_memory
 from hyrfpack.parallel.pool import freed_memory_kept, torch_on_one_thread
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.progress import StepEvent, ignore_progress
-from hyrfpack.render import render_view
-from hyrfpack.render.reserve import can_reserve
+from hyrfpack.render import RenderSettings
+from hyrfpack.render.renderer import pack_camera
+from hyrfpack.render.reserve import Reserve, can_reserve
 from hyrfpack.scene import Picture, Scene, View
 from hyrfpack.train.checkpoint import load_checkpoint, names_and_sizes, save_checkpoint
 from hyrfpack.train.density import DensityControl
 from hyrfpack.train.distributed import StepStats, average_gradients, check_settings, digest, pack_step_stats
 from hyrfpack.train.exposure import initialize_exposures
-from hyrfpack.train.launched import (
-    MAX_GRADIENT,
-    ConfirmedStep,
-    LaunchedStep,
-    RenderedView,
-    StepChecks,
-    check_step,
-)
+from hyrfpack.train.gradients import StepInputs, StepShape, ViewGradients, compute_gradients
+from hyrfpack.train.launched import ConfirmedStep, LaunchedStep, RenderedView
 from hyrfpack.train.optimizer import Optimizer
 from hyrfpack.train.provenance import training_background_spacing
 from hyrfpack.train.reserves import ReserveEstimator
 from hyrfpack.train.resolution import ResolutionSchedule
 from hyrfpack.train.setup import build_model
+from hyrfpack.train.step_checks import MAX_GRADIENT
+from hyrfpack.train.step_graphs import StepGraphs
 from hyrfpack.train.strategy import Strategy
 from hyrfpack.version import __version__
 
@@ -122,6 +120,11 @@ class Trainer:
             model, self.budget, self.choices = build_model(scene, config, self.cache)
         else:
             self.budget = config.max_gaussians or len(model)
+        self._reserves, self._reserves_memory = ReserveEstimator(), can_reserve(device) and ranks.is_single
+        # What replaces a kernel may wait for the GPU, which cannot be recorded.
+        is_recordable = self._reserves_memory and replaced_operations().isdisjoint(GPU_OPERATIONS)
+        self._graphs = StepGraphs() if is_recordable else None
+        self._packed_cameras: dict[tuple[str, RenderSettings, int], PackedCamera] = {}
         self.exposures, self.choices["exposure"] = initialize_exposures(scene, config, self.cache, device)
         self._take(model)
         self.strategy: Strategy = strategy or DensityControl(
@@ -129,7 +132,6 @@ class Trainer:
         )
         self.resolution = ResolutionSchedule(scene.train, self.steps, len(self.model), is_on=config.resolution_schedule)
         self.step = 0
-        self._reserves, self._reserves_memory = ReserveEstimator(), can_reserve(device) and ranks.is_single
         self._launched: LaunchedStep | None = None  # The step whose numbers were not read yet.
         self.kind: Literal["", "pilot run", "first look"] = ""
         self.saved: int | None = None  # The step of the checkpoint on disk.
@@ -146,6 +148,12 @@ class Trainer:
             model.requires_grad_(True)
         self.model = model.to(self.device)
         self.optimizer = Optimizer(self.model, self.config.learning_rates, self.ranks.size, self._warmup_steps)
+        self._forget_graphs()
+
+    def _forget_graphs(self) -> None:
+        """Forget recorded steps, whose parameters were replaced."""
+        if self._graphs is not None:
+            self._graphs.clear()
 
     # -- the loop ------------------------------------------------------------------------------------------------
 
@@ -179,7 +187,12 @@ class Trainer:
         """
         every = self.config.checkpoint_every or max(1, self.steps // 20)
         check_settings(self.ranks, {**self._settings(), "versions": (__version__, torch.__version__)})
-        with closing(self.cache.stream(self._order())) as views, torch_on_one_thread(), freed_memory_kept():
+        with (
+            closing(self.cache.stream(self._order())) as views,
+            torch_on_one_thread(),
+            freed_memory_kept(),
+            self._recording(),
+        ):
             while self.step < self.steps:
                 start = time.perf_counter()
                 self.step += 1
@@ -203,6 +216,15 @@ class Trainer:
                     self.ranks.all_gather(None)
                     return False
         return True
+
+    @contextmanager
+    def _recording(self) -> Iterator[None]:
+        """Free the memory of recorded steps in the end."""
+        try:
+            yield
+        finally:
+            if self._graphs is not None:
+                self._graphs.release()
 
     def _order(self) -> Iterator[View]:
         """Return an iterator over this rank's views of the remaining steps, at the resolutions of these steps."""
@@ -259,6 +281,7 @@ class Trainer:
             with self._timed("density"):
                 before = self.model.gaussians.positions
                 self.strategy.act(self.step, self.model, self.optimizer)
+                self._forget_graphs()
                 self.resolution.update(self.step, len(self.model))
                 if not self.ranks.is_single and self.model.gaussians.positions is not before:
                     self._synchronize()
@@ -266,34 +289,55 @@ class Trainer:
 
     @explain_out_of_memory(OUT_OF_MEMORY_FIX)
     def _gradients(self, step: int, view: View, picture: Picture) -> RenderedView:
-        """Render a view for a step, and accumulate its gradients."""
+        """Render a view for a step, and compute the gradients of its loss."""
         with self._timed("data"):
-            solid = self._solid(step)
-            target, mask = self.photos.get(view.load, picture, solid)
-        reserve = self._reserves.estimate(view, len(self.model)) if self._reserves_memory else None
-        try:
-            rendering = render_view(
-                self.model,
+            settings = self.resolution.render_settings(view.camera, step)
+            inputs = self._upload_inputs(view, picture, self._solid(step), settings)
+            shape = StepShape(
+                (view.camera.width, view.camera.height),
+                settings,
+                self.strategy.watching(step),
+                inputs.mask is not None,
+                self._estimate_reserve(view),
                 view.camera,
-                self.resolution.render_settings(view.camera, step),
-                absgrad=self.strategy.watching(step),
-                solid=None if solid is None else upload_array(solid, self.device),
-                reserve=reserve,
             )
+        try:
+            if self._graphs is None:
+                found = self._compute(shape, inputs)
+            else:
+                found = self._graphs.run(self._compute, shape, inputs)
         except HyrfError:
             self._refuse(step, "a number to be rendered is not finite", self._nonfinite_parameters())
-        for stage, seconds in rendering.seconds.items():
+        for parameter, gradient in zip(self._learnt_parameters(), found.gradients, strict=True):
+            parameter.grad = gradient
+        for stage, seconds in found.seconds.items():
             self.seconds[stage] += seconds
-        with self._timed("loss"):
-            image = rendering.rgb if self.exposures is None else self.exposures.exposed(rendering.rgb, view)
-            loss = photometric_loss(image, target, mask, ssim_weight=self.config.ssim_weight)
-        with self._timed("backward"):
-            loss.backward()
-        with self._timed("loss"):
-            error = _mean_square(image.detach() - target, mask)
-        # What the graph of the rendering holds on to is as large as all that the view needed.
-        rendering = dataclasses.replace(rendering, rgb=rendering.rgb.detach(), alpha=rendering.alpha.detach())
-        return RenderedView(view, picture, loss.detach(), error, rendering, reserve)
+        return RenderedView(view, picture, found)
+
+    def _compute(self, shape: StepShape, inputs: StepInputs) -> ViewGradients:
+        parameters, ssim_weight = self._learnt_parameters(), self.config.ssim_weight
+        return compute_gradients(self.model, self.exposures, parameters, ssim_weight, shape, inputs)
+
+    def _upload_inputs(
+        self, view: View, picture: Picture, solid: np.ndarray | None, settings: RenderSettings
+    ) -> StepInputs:
+        """Return a photo and what else its gradients are computed from, on the device."""
+        target, mask = self.photos.get(view.load, picture, solid)
+        behind = None if solid is None else upload_array(solid, self.device)
+        row = None if self.exposures is None else self.exposures.row(view)
+        if not self._reserves_memory:
+            return StepInputs(target, mask, behind, row)
+        key = view.name, settings, view.camera.width
+        camera = self._packed_cameras.get(key)
+        if camera is None:
+            camera = self._packed_cameras[key] = pack_camera(self.model, view.camera, settings)
+        return StepInputs(target, mask, behind, row, camera)
+
+    def _estimate_reserve(self, view: View) -> Reserve | None:
+        """Return the memory to render a view into: the same for all views of a size, so that they share a graph."""
+        if not self._reserves_memory:
+            return None
+        return self._reserves.estimate_shared(self.scene.train, view, len(self.model))
 
     def _update(
         self, step: int, rendered: RenderedView | None, stop: Callable[[], bool], problem: HyrfError | None
@@ -303,14 +347,14 @@ class Trainer:
         Nothing changes if the rendering turns out to be invalid. On one of several processes, None stands for a view
         that has a problem.
         """
-        checks = None if rendered is None else self._check_on_device(rendered)
+        checks = None if rendered is None else rendered.found.checks
         valid = None if checks is None else checks.valid
         if rendered is None:
             loss = error = torch.zeros((), device=self.device)
         else:
-            loss, error = rendered.loss, rendered.error
+            loss, error = rendered.found.loss, rendered.found.error
             with self._timed("density"):
-                rendering = dataclasses.replace(rendered.rendering, valid=valid)
+                rendering = dataclasses.replace(rendered.found.rendering, valid=valid)
                 self.strategy.observe(rendering, rendered.view.camera, self.model)
         packed = torch.stack((loss, error))
         if not self.ranks.is_single:
@@ -329,16 +373,6 @@ class Trainer:
             reserved = rendered.view, rendered.picture
             numbers = [packed, checks.valid[None], checks.demand, checks.norms]
         self._launched = LaunchedStep(step, reserved, HostCopy(torch.cat(numbers)), len(packed))
-
-    def _check_on_device(self, rendered: RenderedView) -> StepChecks | None:
-        """Return whether a step is valid, see `check_step`; None if its rendering has no reserve."""
-        demand = rendered.rendering.demand
-        if rendered.reserve is None or demand is None:
-            return None
-        gradients = self.optimizer.gradients()
-        if self.exposures is not None and self.exposures.values.grad is not None:
-            gradients.append(self.exposures.values.grad)
-        return check_step(rendered.loss, gradients, demand, rendered.reserve)
 
     def _confirm_launched(self, problem: HyrfError | None = None, *, was_retaken: bool = False) -> list[ConfirmedStep]:
         """Confirm the launched step, if any: wait for its numbers and check them.
@@ -399,7 +433,7 @@ class Trainer:
 
     def _learnt_parameters(self) -> list[nn.Parameter]:
         """Return the parameters whose gradients are averaged over the ranks."""
-        return [*self.model.parameters(), *([] if self.exposures is None else [self.exposures.values])]
+        return [*self.optimizer.parameters(), *([] if self.exposures is None else [self.exposures.values])]
 
     def _views_of_step(self, step: int) -> list[View]:
         """Return the views that all ranks render in a step."""
@@ -537,11 +571,3 @@ def _under(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
 def _strategy_prefix(rank: int) -> str:
     """Return the prefix that names of a rank's density control observations have in a checkpoint."""
     return f"density{rank or ''}."
-
-
-def _mean_square(error: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:
-    """Return the mean square of `error` (H, W, 3) over the pixels inside the mask; NaN if there are none."""
-    squares = error.square()
-    if mask is None:
-        return squares.mean()
-    return torch.where(mask[..., None], squares, 0).sum() / (squares.shape[-1] * mask.sum())

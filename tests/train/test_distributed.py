@@ -58,7 +58,7 @@ def train_on_one_process(scene: Scene, config: TrainConfig) -> tuple[list[StepRe
         for view in own:
             settings = trainer.resolution.render_settings(view.camera, step)
             drawn = render_view(model, view.camera, settings, absgrad=density.watching(step))
-            image = exposures.exposed(drawn.rgb, view) if exposures else drawn.rgb
+            image = exposures.exposed(drawn.rgb, exposures.row(view)) if exposures else drawn.rgb
             photo = torch.from_numpy(view.load().composite())
             loss = photometric_loss(image, photo, None, ssim_weight=config.ssim_weight)
             loss.backward()

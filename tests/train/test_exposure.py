@@ -111,7 +111,7 @@ def test_gain_gradients_match_the_equation_in_float64():
     image = torch.rand(7, 5, 3, generator=generator).requires_grad_()
     weights = torch.rand(7, 5, 3, generator=generator)
 
-    (exposures.exposed(image, views[1]) * weights).sum().backward()
+    (exposures.exposed(image, exposures.row(views[1])) * weights).sum().backward()
 
     y, w, logs = image.detach().double(), weights.double(), exposures.values.detach()[1].double()
     odds = y / (1 - y) * logs.exp()
@@ -133,7 +133,7 @@ def test_steps_are_adam_with_a_pull_to_unit_gains_and_keep_the_mean():
     image = torch.rand(5, 4, 3, generator=torch.Generator().manual_seed(1))
 
     for number in (0, 2, 2, 1, 0, 2):
-        (exposures.exposed(image, views[number]) ** 2).mean().backward()
+        (exposures.exposed(image, exposures.row(views[number])) ** 2).mean().backward()
         assert not exposures.step(0.01, [views[number]])
         odds = image.double() / (1 - image.double()) * expected[number].exp()
         loss = ((odds / (1 + odds)) ** 2).mean() + GAIN_DECAY / 2 * expected[number].square().sum()
@@ -155,7 +155,7 @@ def test_a_gradient_that_is_not_finite_is_reported_and_changes_nothing():
     views = ball_scene(2).train
     exposures = Exposures(views, np.array([[0.3, 0.3, 0.3], [-0.3, -0.3, -0.3]]), CPU_DEVICE)
     before = exposures.values.detach().clone()
-    (exposures.exposed(torch.full((2, 2, 3), 0.5), views[0]) * torch.nan).sum().backward()
+    (exposures.exposed(torch.full((2, 2, 3), 0.5), exposures.row(views[0])) * torch.nan).sum().backward()
 
     assert exposures.step(0.1, [views[0]])
     assert torch.equal(exposures.values, before)

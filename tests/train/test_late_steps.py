@@ -81,11 +81,11 @@ def use_reserves(trainer: Trainer, reserve_of: Callable[[int], Reserve]) -> list
     """
     sizes: list[int] = []
 
-    def estimate(view: object, gaussians: int) -> Reserve:
+    def estimate(views: object, view: object, gaussians: int) -> Reserve:
         sizes.append(gaussians)
         return reserve_of(len(sizes) - 1)
 
-    trainer._reserves.estimate = estimate  # type: ignore[method-assign]
+    trainer._reserves.estimate_shared = estimate  # type: ignore[method-assign]
     return sizes
 
 
@@ -192,7 +192,7 @@ def test_a_parameter_that_is_not_finite_changes_nothing_and_is_reported_at_most_
 def test_a_loss_that_is_not_finite_changes_nothing(gpu: torch.device, monkeypatch: pytest.MonkeyPatch) -> None:
     trainer = make_trainer(gpu)
     before = state_of(trainer)
-    monkeypatch.setattr("hyrfpack.train.trainer.photometric_loss", lambda image, *_, **__: image.mean() * torch.inf)
+    monkeypatch.setattr("hyrfpack.train.gradients.photometric_loss", lambda image, *_, **__: image.mean() * torch.inf)
     with pytest.raises(HyrfTrainingError, match=r"stopped at step 1 .*the loss is not finite"):
         trainer.run()
     after = state_of(trainer)

@@ -136,7 +136,7 @@ def test_absolute_gradients_are_computed_only_while_they_are_used(monkeypatch):
         asked.append(absgrad)
         return render_view(*arguments, absgrad=absgrad, **options)
 
-    monkeypatch.setattr("hyrfpack.train.trainer.render_view", spy)
+    monkeypatch.setattr("hyrfpack.train.gradients.render_view", spy)
     train_trainer()
     assert asked == [True] * 27 + [False] * 13
 
@@ -163,7 +163,8 @@ def use_clock(trainer: Trainer, clock: Clock, monkeypatch) -> None:
 
 def test_elapsed_seconds_are_those_of_the_steps_over_all_parts_of_a_run(tmp_path, monkeypatch):
     clock, path = Clock(), tmp_path / "checkpoint.pt"
-    monkeypatch.setattr("hyrfpack.train.trainer.time", clock)
+    for module in ("trainer", "gradients"):
+        monkeypatch.setattr(f"hyrfpack.train.{module}.time", clock)
     config = dataclasses.replace(SHORT_CONFIG, steps=12)
 
     def meanwhile(*_) -> None:

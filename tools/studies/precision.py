@@ -50,7 +50,7 @@ OPERATION_BY_LOOKUP = {
     "hyrfpack.model.hash_grid.hash_encode": hash_encode,
     "hyrfpack.ops.background.reference.hash_encode": hash_encode,
     **dict.fromkeys(MLP_LOOKUPS, mlp),
-    "hyrfpack.train.trainer.photometric_loss": photometric_loss,
+    "hyrfpack.train.gradients.photometric_loss": photometric_loss,
 }
 RASTERIZE_LOOKUP = "hyrfpack.render.renderer.rasterize"
 ALL_ROWS = ("float32", *(f"nudged {n}" for n in range(1, 7)), "mixed", "adam", "rasterizer", "float64")

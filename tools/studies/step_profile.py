@@ -145,8 +145,8 @@ class StepRecorder:
     def install(self, stack: ExitStack) -> None:
         """Replace the operations that the trainer calls by timed ones until the stack is closed."""
         replacements = {
-            "hyrfpack.train.trainer.render_view": self._render_view,
-            "hyrfpack.train.trainer.photometric_loss": self._photometric_loss,
+            "hyrfpack.train.gradients.render_view": self._render_view,
+            "hyrfpack.train.gradients.photometric_loss": self._photometric_loss,
             "hyrfpack.render.renderer.rasterize": self._rasterize,
             "hyrfpack.render.renderer.composite": self._composite,
             "hyrfpack.model.hash_grid.hash_encode": self._timed("decode: hash encoding", hash_encode),

@@ -108,12 +108,17 @@ def _sees_background(transmittance, height, width, y, x, threshold, stride, STRI
 
 
 @triton.jit
+def _load_3(pointer):
+    return tl.load(pointer), tl.load(pointer + 1), tl.load(pointer + 2)
+
+
+@triton.jit
 def _cast_rays(i, j, rays, half_extent):
     """Return the contracted points where the rays of nodes (i, j) leave the sphere, and the rays' directions.
 
-    `rays` is the result of `camera_rays`.
+    `rays` is the result of `pack_rays`.
     """
-    corner, right, down, origin = rays
+    corner, right, down, origin = _load_3(rays), _load_3(rays + 3), _load_3(rays + 6), _load_3(rays + 9)
     row, column = i.to(tl.float32), j.to(tl.float32)
     x = corner[0] + row * down[0] + column * right[0]
     y = corner[1] + row * down[1] + column * right[1]
@@ -186,7 +191,7 @@ def background_kernel(
 ):  # fmt: skip
     """Write the colours of a block of nodes to `out` (3, rows, columns).
 
-    `rays` is the result of `camera_rays`, half_extent a tuple, `field` `FieldTensors` and S `FieldSizes`. Sizes of the
+    `rays` is the result of `pack_rays`, half_extent a tuple, `field` `FieldTensors` and S `FieldSizes`. Sizes of the
     picture are not put into tuples, because Triton would compile another kernel for each that is 1 or a multiple of 16.
     """
     w1, w2, w3 = field.weights
@@ -229,6 +234,15 @@ def background_kernel(
     tl.store(at, colors, mask=inside[:, None] & (channel < _CHANNELS))
 
 
+def pack_rays(viewport: Viewport, stride: int, device: torch.device) -> Tensor:
+    """Pack the result of `camera_rays` into one tensor (12,) float32 on the device, if the camera is not packed."""
+    if viewport.packed is not None:
+        return viewport.packed.rays
+    numbers = [number for vector in camera_rays(viewport, stride) for number in vector]
+    # A blocking copy would wait for the device. This one stages its source at once, so the source may be freed.
+    return torch.tensor(numbers, dtype=torch.float32).to(device, non_blocking=True)
+
+
 def background_grid(
     transmittance: Tensor, viewport: Viewport, field: BackgroundField, *, threshold: float, stride: int
 ) -> Tensor:
@@ -252,7 +266,7 @@ def background_grid(
         stride,
         rows,
         columns,
-        camera_rays(viewport, stride),
+        pack_rays(viewport, stride, field.table.device),
         tuple(field.half_extent),
         FieldTensors(rows_as_words(field.table), levels, weights, biases),
         colors,
@@ -319,7 +333,8 @@ def differentiable_grid(
     coords = transmittance.new_empty(3, total)
     encoded = transmittance.new_empty(DIRECTION_FEATURES[field.encoding], total)
     encode_nodes_kernel[(triton.cdiv(total, _NODES_PER_PROGRAM),)](
-        nodes, columns, total, used, camera_rays(viewport, stride), tuple(field.half_extent), coords, encoded,
+        nodes, columns, total, used, pack_rays(viewport, stride, coords.device), tuple(field.half_extent),
+        coords, encoded,
         ENCODING_WIDTH=len(encoded), FREQUENCY=field.encoding == "frequency", BLOCK=_NODES_PER_PROGRAM,
         num_warps=4, enable_fp_fusion=True,
     )  # fmt: skip

@@ -30,7 +30,7 @@ from hyrfpack.ops.rasterize.gpu_ellipse import (
     touched_tile_columns,
 )
 from hyrfpack.ops.rasterize.inputs import LOW_PASS_VARIANCE
-from hyrfpack.ops.viewport import Viewport
+from hyrfpack.ops.viewport import VIEWPOINT_PLACES, Viewport
 
 # Words of a record, which holds one projected Gaussian in 16 float32, read and written in pairs (see gpu_pairs). With
 # Sigma = its 2D covariance and d = pixel - mean,
@@ -52,7 +52,7 @@ SUM_U, SUM_V, SUM_UU, SUM_UV, SUM_VV, SUM_P, SUM_RED, SUM_GREEN, SUM_BLUE, SUM_A
 GRADIENT_ROW_FLOATS = tl.constexpr(12)
 
 # Index of the camera's centre in the result of `pack_camera`.
-VIEWPOINT_OFFSET = tl.constexpr(25)
+VIEWPOINT_OFFSET = tl.constexpr(VIEWPOINT_PLACES.start)
 _LOW_PASS_OFFSET = tl.constexpr(28)
 # Sort key of a Gaussian that is not drawn.
 HIDDEN_KEY = tl.constexpr(2**31 - 1)
@@ -110,10 +110,11 @@ def pack_camera(
     tolerance: float = 0.0,
     low_pass_variance: float = LOW_PASS_VARIANCE,
 ) -> Tensor:
-    """Pack the camera's parameters for the kernels into one small float64 tensor on the device.
+    """Pack the camera's parameters for the kernels into one small float64 tensor on the device, if it is not packed.
 
     Args:
-        viewport: the camera; reading its pose from the device synchronises.
+        viewport: the camera; reading its pose from the device synchronises. If it is packed, the other arguments have
+            no effect.
         near: distance of the near plane in world units.
         tolerance: width of the band of `in_frustum`, as a fraction of half the image's size.
         low_pass_variance: variance of the low-pass filter in px^2.
@@ -123,6 +124,8 @@ def pack_camera(
         and of y/z in the Jacobian; the limits of fx x/z (low, high) and of fy y/z in the frustum; and, from
         VIEWPOINT_OFFSET on, the camera's centre; and the variance of the low-pass filter.
     """
+    if viewport.packed is not None:
+        return viewport.packed.record
     fx, fy, cx, cy = (float(number) for number in viewport.intrinsics)
     width, height = viewport.width, viewport.height
     pose = viewport.pose.detach().to("cpu", torch.float64)

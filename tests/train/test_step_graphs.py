@@ -1,0 +1,202 @@
+"""Steps replayed as graphs: the same results as steps launched as usual, whatever differs between them.
+
+A replay on the fake GPU repeats what was launched, with all that the host knew when it was recorded. So a number that
+reaches a launch in another way than through the inputs of the step is that of an earlier step, and changes the result.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+import torch
+from fake_gpu import FakeGraphRecorder, use_fake_gpu
+from ops.device import IS_INTERPRETED, needs_triton
+from scenes import ball_scene
+from torch import Tensor
+
+from hyrfpack.model import HashGridConfig
+from hyrfpack.scene import Picture, Scene
+from hyrfpack.train import DensityConfig, TrainConfig, Trainer, step_graphs
+from hyrfpack.train.gradients import ViewGradients
+
+pytestmark = [
+    needs_triton,
+    pytest.mark.skipif(not IS_INTERPRETED, reason="a GPU adds to hash tables in any order, so that bits differ"),
+]
+
+CONFIG = TrainConfig(
+    steps=7,
+    max_gaussians=20,
+    density=DensityConfig(start=1.0, stop=1.0, rounds=1),
+    precision="float32",
+    log2_table_size=5,
+    exposure=False,
+)
+WITH_ROUNDS = DensityConfig(start=0.4, stop=1.0, rounds=1, gradient=1e-6, resets=0)
+
+
+@pytest.fixture(autouse=True)
+def few_levels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make models of 2 levels, because the interpreter is slow."""
+    monkeypatch.setattr(
+        "hyrfpack.train.setup.HashGridConfig",
+        lambda log2_table_size, **sizes: HashGridConfig(log2_table_size, levels=2, **sizes),
+    )
+
+
+@pytest.fixture
+def gpu() -> Iterator[torch.device]:
+    with use_fake_gpu() as device:
+        yield device
+
+
+@pytest.fixture
+def replays(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Count the steps that are recorded and replayed; the list has the number of each replay's graph."""
+    counted: list[int] = []
+    record = FakeGraphRecorder.record
+
+    def count(self: FakeGraphRecorder, launch: Callable[[], ViewGradients]) -> tuple:
+        found, replay = record(self, launch)
+        number = len(set(counted))
+        return found, lambda: (counted.append(number), replay())
+
+    monkeypatch.setattr(FakeGraphRecorder, "record", count)
+    return counted
+
+
+def scene_of(change: str) -> Scene:
+    scene = ball_scene(views=2, points=20, side=10)
+    views = list(scene.train)
+    if "masks" in change:
+        views = [dataclasses.replace(view, load=_masked(view.load())) for view in views]
+    if change == "photos of two sizes":
+        views += ball_scene(views=2, points=20, side=12).train
+        views = [dataclasses.replace(view, name=f"{number}.png") for number, view in enumerate(views)]
+    return dataclasses.replace(scene, train=views, test=views[:1])
+
+
+def _masked(picture: Picture) -> Callable[[], Picture]:
+    mask = np.random.default_rng(0).random(picture.rgb.shape[:2]) < 0.7
+    return lambda: Picture(picture.rgb, picture.alpha, mask)
+
+
+def config_of(change: str) -> TrainConfig:
+    changes = {
+        "exposure compensation": {"exposure": True},
+        "masks, exposure compensation and a round of density control": {
+            "exposure": True,
+            "density": WITH_ROUNDS,
+            "max_gaussians": 30,
+            "steps": 8,
+        },
+        "random background colours": {"background": False, "background_color": "random"},
+        "rounds of density control": {"density": WITH_ROUNDS, "max_gaussians": 30},
+        "antialiasing": {"antialiased": True},
+    }
+    return dataclasses.replace(CONFIG, **changes.get(change, {}))
+
+
+def final_state(scene: Scene, config: TrainConfig, device: torch.device, *, graphs: bool) -> dict[str, Tensor]:
+    """Return the state after a run, and what was reported of its steps."""
+    trainer, reports = Trainer(scene, config, device=device), []
+    if not graphs:
+        trainer._graphs = None
+    trainer.run(progress=lambda event: reports.append((event.loss, event.mse, event.gaussians)))
+    observed = {f"density.{name}": value.cpu() for name, value in trainer.strategy.state_dict().items()}
+    return trainer._tensors() | observed | {"reports": torch.tensor(reports)}
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        "masks, exposure compensation and a round of density control",
+        *(
+            pytest.param(change, marks=pytest.mark.acceptance)
+            for change in (
+                "nothing",
+                "masks",
+                "photos of two sizes",
+                "exposure compensation",
+                "random background colours",
+                "rounds of density control",
+                "antialiasing",
+            )
+        ),
+    ],
+)
+def test_replayed_steps_have_the_bits_of_launched_ones(gpu: torch.device, replays: list[int], change: str) -> None:
+    scene, config = scene_of(change), config_of(change)
+    found = final_state(scene, config, gpu, graphs=True)
+    assert len(replays) >= 3
+    replays.clear()
+    expected = final_state(scene, config, gpu, graphs=False)
+    assert not replays and found.keys() == expected.keys()
+    assert [name for name, value in found.items() if not torch.equal(value, expected[name])] == []
+
+
+@pytest.mark.acceptance
+def test_rounds_of_density_control_end_graphs(gpu: torch.device, replays: list[int]) -> None:
+    config = dataclasses.replace(config_of("rounds of density control"), steps=14)
+    final_state(scene_of("nothing"), config, gpu, graphs=True)
+    assert len(set(replays)) >= 2
+
+
+def test_a_graph_with_other_gradients_is_not_used(
+    gpu: torch.device, replays: list[int], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    record = FakeGraphRecorder.record
+
+    def record_wrongly(self: FakeGraphRecorder, launch: Callable[[], ViewGradients]) -> tuple:
+        found, replay = record(self, launch)
+
+        def replay_wrongly() -> None:
+            replay()
+            next(gradient for gradient in found.gradients if gradient is not None).mul_(1.01)
+
+        return found, replay_wrongly
+
+    scene, config = scene_of("nothing"), dataclasses.replace(CONFIG, steps=4)
+    expected = final_state(scene, config, gpu, graphs=False)
+    monkeypatch.setattr(FakeGraphRecorder, "record", record_wrongly)
+    with caplog.at_level(logging.WARNING):
+        found = final_state(scene, config, gpu, graphs=True)
+    assert len(replays) == 1
+    assert [record.message for record in caplog.records if "has other gradients than without one" in record.message]
+    assert all(torch.equal(value, expected[name]) for name, value in found.items())
+
+
+@pytest.mark.parametrize("place", ["record", pytest.param("__init__", marks=pytest.mark.acceptance)])
+def test_a_gpu_that_cannot_record_launches_steps_as_usual(
+    gpu: torch.device, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, place: str
+) -> None:
+    def fail(*_: object) -> None:
+        raise RuntimeError("operation not permitted when stream is capturing")
+
+    config = dataclasses.replace(CONFIG, steps=4)
+    expected = final_state(scene_of("nothing"), config, gpu, graphs=False)
+    monkeypatch.setattr(FakeGraphRecorder, place, fail)
+    with caplog.at_level(logging.WARNING):
+        found = final_state(scene_of("nothing"), config, gpu, graphs=True)
+    warnings = [record.message for record in caplog.records if "cannot be recorded" in record.message]
+    assert len(warnings) == 1 and "operation not permitted" in warnings[0]
+    assert all(torch.equal(value, expected[name]) for name, value in found.items())
+
+
+def test_steps_of_many_sizes_have_at_most_four_graphs(monkeypatch: pytest.MonkeyPatch) -> None:
+    graphs, computed = step_graphs.StepGraphs(), []
+    monkeypatch.setattr(graphs, "_record", lambda *_: _Graph())
+    monkeypatch.setattr(graphs, "_is_compared", True)
+    for size in range(6):
+        for _ in range(3):
+            graphs.run(lambda shape, inputs: computed.append(shape), size, None)  # type: ignore[arg-type]
+    assert computed == [0, 1, 2, 3, 4, 4, 4, 5, 5, 5]
+
+
+class _Graph:
+    def run(self, inputs: object) -> None:
+        """Compute nothing."""
