@@ -19,9 +19,10 @@ from hyrfpack.ops.rasterize.gpu_project import Projection
 from hyrfpack.ops.rasterize.inputs import Gaussians3D, RasterSettings
 from hyrfpack.ops.viewport import Viewport
 
-_SUM_GAUSSIANS_PER_PROGRAM = 8
+# Of 13 shapes measured on an H200, this one takes 0.34 to 0.58 of the time of 8 Gaussians and four warps.
+_SUM_GAUSSIANS_PER_PROGRAM = 4
 _SUM_ROWS_PER_LOAD = 16  # Most Gaussians lie in fewer tiles than this, so that one load gets all their gradient rows.
-_SUM_WARPS_PER_PROGRAM = 4
+_SUM_WARPS_PER_PROGRAM = 2
 
 
 @dataclass(frozen=True)
