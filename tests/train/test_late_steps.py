@@ -6,6 +6,7 @@ They run on the fake GPU, where a number that is read before the host has waited
 from __future__ import annotations
 
 import dataclasses
+import operator
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -255,3 +256,37 @@ def test_a_view_that_was_not_rendered_yet_gets_all_gaussians_and_the_most_pairs_
     estimator.record(make_view("a"), 10_000, in_view=10, pairs=6000)
     estimator.record(make_view("b"), 10_000, in_view=20, pairs=8000)
     assert estimator.estimate(make_view("c"), 10_000) == Reserve(10_000, 12_000)
+
+
+def test_the_shared_reserve_suffices_for_each_view_and_is_rounded_up_by_a_quarter_at_most() -> None:
+    estimator, views = ReserveEstimator(), [make_view(name) for name in "abc"]
+    for view, (in_view, pairs) in zip(views, ((2000, 30_001), (3001, 20_000), (10, 5)), strict=True):
+        estimator.record(view, 10_000, in_view=in_view, pairs=pairs)
+    shared = estimator.estimate_shared(views, views[2], 10_000)
+    assert shared == Reserve(5120, 49_152)
+    for view in views:
+        assert all(map(operator.le, estimator.estimate(view, 10_000).limits, shared.limits))
+    assert shared.gaussians <= 1.25 * 4502 and shared.pairs <= 1.25 * 45_002
+    assert estimator.estimate_shared([make_view("new")], views[0], 10_000).gaussians == 5120  # as long as none is near
+
+
+def test_the_shared_reserve_changes_with_the_gaussians_the_size_and_a_view_that_nearly_fills_it() -> None:
+    estimator, views = ReserveEstimator(), [make_view("a"), make_view("b")]
+    for view in views:
+        estimator.record(view, 10_000, in_view=3000, pairs=20_000)
+    first = estimator.estimate_shared(views, views[0], 10_000)
+    estimator.record(views[1], 10_000, in_view=4000, pairs=28_000)
+    assert estimator.estimate_shared(views, views[0], 10_000) == first == Reserve(5120, 32_768)
+    estimator.record(views[1], 10_000, in_view=4500, pairs=20_000)
+    assert estimator.estimate_shared(views, views[0], 10_000) == Reserve(7168, 32_768)
+    estimator.record(views[0], 10_000, in_view=3000, pairs=29_000)
+    assert estimator.estimate_shared(views, views[0], 10_000) == Reserve(7168, 49_152)
+    assert estimator.estimate_shared(views, views[0], 20_000) == Reserve(14_336, 98_304)
+    assert estimator.estimate_shared(views, make_view("a", 128, 128), 20_000) == Reserve(14_336, 196_608)
+
+
+def test_a_shared_reserve_of_all_gaussians_stays_though_a_view_shows_all() -> None:
+    estimator, view = ReserveEstimator(), make_view("a")
+    shared = estimator.estimate_shared([view], view, 100)
+    estimator.record(view, 100, in_view=100, pairs=10)
+    assert estimator.estimate_shared([view], view, 100) is shared
