@@ -305,6 +305,9 @@ class _ToCpu(torch.autograd.Function):
 class FakeGraphRecorder:
     """Records steps as `GraphRecorder` does. A replay repeats what was launched, with all that the host knew then."""
 
+    def has_room(self) -> bool:
+        return True
+
     def record(self, launch: Callable[[], ViewGradients]) -> tuple[ViewGradients, Callable[[], None]]:
         with _unheard():
             kept = _undefined_copies(launch())

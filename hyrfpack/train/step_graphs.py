@@ -28,6 +28,7 @@ from hyrfpack.train.gradients import StepInputs, StepShape, ViewGradients
 
 _LOG = logging.getLogger(__name__)
 
+MAX_GRAPH_MEMORY_SHARE = 0.7
 MAX_GRAPHS = 4  # Each holds memory for all that a step computes. Steps of further shapes are launched as usual.
 # Gradients of hash tables are sums in any order, so that equal steps differ by rounding.
 MAX_GRADIENT_DIFFERENCE = 1e-3
@@ -46,6 +47,14 @@ class GraphRecorder:
         self._pool = torch.cuda.graph_pool_handle()
         # The pool lives as long as one of its graphs. So memory of earlier graphs is used again.
         self._keeper, _ = self._record(lambda: torch.zeros(1, device="cuda"))
+
+    def has_room(self) -> bool:
+        """Return whether a graph would leave enough memory to other work.
+
+        It takes at most about as much memory as steps that are launched, and keeps it until `StepGraphs.release`.
+        """
+        free = torch.cuda.mem_get_info()[0] + torch.cuda.memory_reserved() - torch.cuda.memory_allocated()
+        return torch.cuda.max_memory_allocated() <= MAX_GRAPH_MEMORY_SHARE * free
 
     def record(self, launch: Callable[[], ViewGradients]) -> tuple[ViewGradients, Replay]:
         """Record what a function launches. It runs nothing; its results are undefined before the first replay.
@@ -130,10 +139,12 @@ class StepGraphs:
         return graph.run(inputs) if self._is_compared else self._compare(graph, compute, shape, inputs)
 
     def _record(self, compute: Compute, shape: StepShape, inputs: StepInputs) -> _StepGraph | None:
-        """Record the graph of a shape; return None, and record no others, if that fails."""
-        kept = _copy_inputs(inputs)
+        """Record the graph of a shape; return None if memory is short, or if that fails, and then record no others."""
         try:
             self._recorder = self._recorder or GraphRecorder()
+            if not self._recorder.has_room():
+                return None
+            kept = _copy_inputs(inputs)
             found, replay = self._recorder.record(lambda: compute(shape, kept))
         except (RuntimeError, HyrfError) as error:  # All problems of CUDA, and those of its memory as rendering says.
             self._end(f"training steps cannot be recorded as CUDA graphs here ({short_reason(error)})")

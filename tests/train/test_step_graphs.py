@@ -170,6 +170,31 @@ def test_a_graph_with_other_gradients_is_not_used(
     assert all(torch.equal(value, expected[name]) for name, value in found.items())
 
 
+def test_a_gpu_without_much_free_memory_records_nothing(
+    gpu: torch.device, replays: list[int], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(FakeGraphRecorder, "has_room", lambda self: False)
+    with caplog.at_level(logging.WARNING):
+        final_state(scene_of("nothing"), dataclasses.replace(CONFIG, steps=3), gpu, graphs=True)
+    assert not replays and not caplog.records
+
+
+@pytest.mark.parametrize(("free", "has_room"), [(60, False), (90, True)])
+def test_a_graph_has_room_if_seven_tenths_of_the_free_memory_hold_the_peak(
+    free: int, has_room: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Free memory is that of the device and what torch holds without using it."""
+    for name, value in {
+        "mem_get_info": (free, 500),
+        "memory_reserved": 30,
+        "memory_allocated": 20,
+        "max_memory_allocated": 60,
+    }.items():
+        monkeypatch.setattr(torch.cuda, name, lambda value=value: value)
+    recorder = step_graphs.GraphRecorder.__new__(step_graphs.GraphRecorder)
+    assert recorder.has_room() == has_room
+
+
 @pytest.mark.parametrize("place", ["record", pytest.param("__init__", marks=pytest.mark.acceptance)])
 def test_a_gpu_that_cannot_record_launches_steps_as_usual(
     gpu: torch.device, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, place: str
