@@ -49,7 +49,8 @@ class Strategy(Protocol):
         """Observe the rendering of one view and the gradients of the model's parameters, after the backward pass.
 
         On a GPU the rendering may have `valid`, a flag on the device. If it is False, the step is taken again, so that
-        what is observed now must be dropped, without reading the flag.
+        what is observed now must be dropped, without reading the flag. The next step may write to the same memory, so a
+        strategy copies what it keeps of the rendering and of gradients.
         """
 
     def acting(self, step: int) -> bool:
