@@ -29,6 +29,12 @@ def explain_out_of_memory(fix: str) -> Iterator[None]:
         raise HyrfError(problem, fix=fix) from error
 
 
+def has_run_out_of_memory(error: BaseException) -> bool:
+    """Return whether an error, or the one that caused it, says that memory ran out."""
+    causes = (error, error.__cause__)
+    return any(cause is not None and describe_out_of_memory(cause) is not None for cause in causes)
+
+
 def describe_out_of_memory(error: BaseException) -> str | None:
     """Return what to tell the user if an error says that memory ran out; None for any other error.
 

@@ -308,6 +308,9 @@ class FakeGraphRecorder:
     def has_room(self) -> bool:
         return True
 
+    def is_memory_short(self) -> bool:
+        return False
+
     def record(self, launch: Callable[[], ViewGradients]) -> tuple[ViewGradients, Callable[[], None]]:
         with _unheard():
             kept = _undefined_copies(launch())

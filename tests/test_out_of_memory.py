@@ -54,9 +54,10 @@ def test_any_other_error_passes(message):
         raise RuntimeError(message)
 
 
-def test_a_training_step_names_the_settings_of_training(monkeypatch):
+@pytest.mark.parametrize("place", ["train.gradients.photometric_loss", "render.renderer._select_gaussians"])
+def test_a_training_step_names_the_settings_of_training(place, monkeypatch):
     trainer = Trainer(ball_scene(views=3, points=20, side=8), TrainConfig(steps=2, max_gaussians=20, log2_table_size=5))
-    monkeypatch.setattr("hyrfpack.train.gradients.render_view", fail)
+    monkeypatch.setattr(f"hyrfpack.{place}", fail)
     with pytest.raises(HyrfError, match="GPU's memory ran out.*reduce `max_gaussians` or `max_size`"):
         trainer.run()
 

@@ -59,15 +59,16 @@ class ReserveEstimator:
         return Reserve(max(1, in_view), max(MIN_RESERVED_PAIRS, pairs))
 
     def estimate_shared(self, views: Sequence[View], view: View, gaussians: int) -> Reserve:
-        """Return a reserve that suffices for each of these views, at the size of `view`.
+        """Return the largest estimate of these views, at the size of `view`, rounded up.
 
-        It is rounded up, and stays the same until the number of Gaussians changes or a view nearly exceeds it.
+        It stays the same until the number of Gaussians changes or a view nearly exceeds it.
         """
         key = gaussians, _side_pixels(view)
         if key not in self._shared:
             self._shared = {known: reserve for known, reserve in self._shared.items() if known[0] == gaussians}
-            sized = [replace(other, camera=view.camera) for other in views]
-            reserves = [self.estimate(other, gaussians) for other in sized]
+            known = [other for other in views if other.name in self._usages]
+            others = [*known, *([View("", view.camera, view.load)] if len(known) < len(views) else [])]
+            reserves = [self.estimate(replace(other, camera=view.camera), gaussians) for other in others]
             in_view, pairs = (max(getattr(one, name) for one in reserves) for name in ("gaussians", "pairs"))
             self._shared[key] = Reserve(min(gaussians, _round_up(in_view)), _round_up(pairs))
         return self._shared[key]

@@ -6,7 +6,7 @@ copied into fixed memory before: photo, camera and background colour (`StepInput
 the host is part of the `StepShape`, so each shape has a graph of its own. Density control replaces the parameters,
 whose addresses graphs hold, and so ends all graphs.
 
-A mistake in this would show as plausible, wrong gradients. So the first replay of a run is compared with the same step
+A mistake in this would show as plausible, wrong gradients. So a trainer's first replay is compared with the same step
 launched as usual.
 """
 
@@ -24,11 +24,13 @@ from torch import Tensor
 
 from hyrfpack.errors import HyrfError, short_reason
 from hyrfpack.ops.viewport import PackedCamera
+from hyrfpack.out_of_memory import has_run_out_of_memory
 from hyrfpack.train.gradients import StepInputs, StepShape, ViewGradients
 
 _LOG = logging.getLogger(__name__)
 
-MAX_GRAPH_MEMORY_SHARE = 0.7
+# Of the free memory. Of the largest amount that was in use, this share stays free, or all graphs are given up.
+MAX_GRAPH_MEMORY_SHARE, MIN_FREE_MEMORY_SHARE = 0.7, 0.25
 MAX_GRAPHS = 4  # Each holds memory for all that a step computes. Steps of further shapes are launched as usual.
 # Gradients of hash tables are sums in any order, so that equal steps differ by rounding.
 MAX_GRADIENT_DIFFERENCE = 1e-3
@@ -49,12 +51,15 @@ class GraphRecorder:
         self._keeper, _ = self._record(lambda: torch.zeros(1, device="cuda"))
 
     def has_room(self) -> bool:
-        """Return whether a graph would leave enough memory to other work.
+        """Return whether the GPU has free memory for a graph, which takes about as much as a step that is launched.
 
-        It takes at most about as much memory as steps that are launched, and keeps it until `StepGraphs.release`.
+        Memory that torch keeps without using it does not count, because torch cannot free it during a recording.
         """
-        free = torch.cuda.mem_get_info()[0] + torch.cuda.memory_reserved() - torch.cuda.memory_allocated()
-        return torch.cuda.max_memory_allocated() <= MAX_GRAPH_MEMORY_SHARE * free
+        return torch.cuda.max_memory_allocated() <= MAX_GRAPH_MEMORY_SHARE * torch.cuda.mem_get_info()[0]
+
+    def is_memory_short(self) -> bool:
+        """Return whether other work may soon need the memory of graphs."""
+        return torch.cuda.mem_get_info()[0] < MIN_FREE_MEMORY_SHARE * torch.cuda.max_memory_allocated()
 
     def record(self, launch: Callable[[], ViewGradients]) -> tuple[ViewGradients, Replay]:
         """Record what a function launches. It runs nothing; its results are undefined before the first replay.
@@ -110,14 +115,22 @@ class StepGraphs:
         self._is_compared, self._is_usable = False, True
 
     def clear(self) -> None:
-        """Forget all graphs, because parameters were replaced."""
+        """Forget all graphs, because parameters are to be replaced.
+
+        Their memory is kept for later graphs, unless other work may soon need it.
+        """
         self._graphs.clear()
         self._launched.clear()
+        if self._recorder is not None and self._recorder.is_memory_short():
+            self.release()
 
     def release(self) -> None:
         """Forget all graphs, and free their memory."""
-        self.clear()
-        self._recorder = None
+        self._graphs.clear()
+        self._launched.clear()
+        if self._recorder is not None:
+            self._recorder = None
+            torch.cuda.empty_cache()
 
     def run(self, compute: Compute, shape: StepShape, inputs: StepInputs) -> ViewGradients:
         """Compute the gradients of a step. The next call overwrites the result.
@@ -130,16 +143,33 @@ class StepGraphs:
         if graph is None:
             is_first = shape not in self._launched
             self._launched.add(shape)
-            if not self._is_usable or is_first or len(self._graphs) >= MAX_GRAPHS:
-                return compute(shape, inputs)
+            if not self._is_usable or is_first:
+                return self._launch(compute, shape, inputs)
             graph = self._record(compute, shape, inputs)
             if graph is None:
-                return compute(shape, inputs)
+                return self._launch(compute, shape, inputs)
             self._graphs[shape] = graph
         return graph.run(inputs) if self._is_compared else self._compare(graph, compute, shape, inputs)
 
+    def _launch(self, compute: Compute, shape: StepShape, inputs: StepInputs) -> ViewGradients:
+        """Compute the gradients without a graph; if memory runs out while graphs hold some, give them up first."""
+        try:
+            return compute(shape, inputs)
+        except (RuntimeError, HyrfError) as error:
+            if self._recorder is None or not has_run_out_of_memory(error):
+                raise
+        self._give_up()
+        return compute(shape, inputs)
+
     def _record(self, compute: Compute, shape: StepShape, inputs: StepInputs) -> _StepGraph | None:
-        """Record the graph of a shape; return None if memory is short, or if that fails, and then record no others."""
+        """Record the graph of a shape; return None if there are enough or memory is short.
+
+        None is also returned if recording fails, and then no others are recorded.
+        """
+        for other in [other for other in self._graphs if replace(other, reserve=shape.reserve) == shape]:
+            del self._graphs[other]  # The estimate of its reserve has changed.
+        if len(self._graphs) >= MAX_GRAPHS:
+            return None
         try:
             self._recorder = self._recorder or GraphRecorder()
             if not self._recorder.has_room():
@@ -147,14 +177,20 @@ class StepGraphs:
             kept = _copy_inputs(inputs)
             found, replay = self._recorder.record(lambda: compute(shape, kept))
         except (RuntimeError, HyrfError) as error:  # All problems of CUDA, and those of its memory as rendering says.
-            self._end(f"training steps cannot be recorded as CUDA graphs here ({short_reason(error)})")
+            if has_run_out_of_memory(error):
+                self._give_up()
+            else:
+                self._end(f"training steps cannot be recorded as CUDA graphs here ({short_reason(error)})")
             return None
         return _StepGraph(kept, found, replay)
 
     def _compare(self, graph: _StepGraph, compute: Compute, shape: StepShape, inputs: StepInputs) -> ViewGradients:
         """Compute the gradients with and without the graph; if they differ, use no graphs from now on."""
         self._is_compared = True
-        expected, found = compute(shape, inputs), graph.run(inputs)
+        expected = self._launch(compute, shape, inputs)
+        if not self._is_usable:
+            return expected
+        found = graph.run(inputs)
         is_near = _is_near(expected.loss, found.loss, MAX_LOSS_DIFFERENCE)
         for wanted, replayed in zip(expected.gradients, found.gradients, strict=True):
             if wanted is not None and replayed is not None:
@@ -164,9 +200,13 @@ class StepGraphs:
         self._end("a training step recorded as a CUDA graph has other gradients than without one")
         return expected
 
-    def _end(self, problem: str) -> None:
+    def _give_up(self) -> None:
+        """Free all memory of graphs, and record no others."""
         self.release()
         self._is_usable = False
+
+    def _end(self, problem: str) -> None:
+        self._give_up()
         _LOG.warning(
             f"{problem}, so each step launches its kernels one by one, which is slower on small scenes; please report "
             "this, with the output of 'hyrfpack doctor'"
@@ -190,6 +230,6 @@ def _copy_inputs(inputs: StepInputs) -> StepInputs:
 
 
 def _is_near(wanted: Tensor, found: Tensor, difference: float) -> bool:
-    """Return whether two tensors differ by at most this share of their length, or both are not finite."""
+    """Return whether two tensors differ by at most this share of their length, or what is wanted is not finite."""
     distance, length = torch.linalg.vector_norm(found - wanted).item(), torch.linalg.vector_norm(wanted).item()
     return distance <= difference * length or not length < float("inf")

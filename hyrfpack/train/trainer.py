@@ -26,7 +26,7 @@ from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.ops.dispatch import GPU_OPERATIONS, replaced_operations
 from hyrfpack.ops.transfer import HostCopy
 from hyrfpack.ops.viewport import PackedCamera
-from hyrfpack.out_of_memory import explain_out_of_memory
+from hyrfpack.out_of_memory import explain_out_of_memory, has_run_out_of_memory
 from hyrfpack.parallel.pool import freed_memory_kept, torch_on_one_thread
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.progress import StepEvent, ignore_progress
@@ -121,9 +121,7 @@ class Trainer:
         else:
             self.budget = config.max_gaussians or len(model)
         self._reserves, self._reserves_memory = ReserveEstimator(), can_reserve(device) and ranks.is_single
-        # What replaces a kernel may wait for the GPU, which cannot be recorded.
-        is_recordable = self._reserves_memory and replaced_operations().isdisjoint(GPU_OPERATIONS)
-        self._graphs = StepGraphs() if is_recordable else None
+        self._graphs = StepGraphs() if self._reserves_memory and _is_recordable(model) else None
         self._packed_cameras: dict[tuple[str, RenderSettings, int], PackedCamera] = {}
         self.exposures, self.choices["exposure"] = initialize_exposures(scene, config, self.cache, device)
         self._take(model)
@@ -151,7 +149,7 @@ class Trainer:
         self._forget_graphs()
 
     def _forget_graphs(self) -> None:
-        """Forget recorded steps, whose parameters were replaced."""
+        """Forget recorded steps, because parameters are replaced."""
         if self._graphs is not None:
             self._graphs.clear()
 
@@ -274,14 +272,15 @@ class Trainer:
             self._discard_gradients()
             rendered = self._gradients(self.step, view, picture)
         self._update(self.step, rendered, stop, problem)
+        rendered = None  # Otherwise its gradients would be kept until the next step.
         is_acting = self.strategy.acting(self.step)
         if confirm or is_acting or not self._reserves_memory:
             confirmed += self._confirm_launched(problem)
         if is_acting:
             with self._timed("density"):
                 before = self.model.gaussians.positions
-                self.strategy.act(self.step, self.model, self.optimizer)
                 self._forget_graphs()
+                self.strategy.act(self.step, self.model, self.optimizer)
                 self.resolution.update(self.step, len(self.model))
                 if not self.ranks.is_single and self.model.gaussians.positions is not before:
                     self._synchronize()
@@ -306,7 +305,9 @@ class Trainer:
                 found = self._compute(shape, inputs)
             else:
                 found = self._graphs.run(self._compute, shape, inputs)
-        except HyrfError:
+        except HyrfError as error:
+            if error.__cause__ is not None and has_run_out_of_memory(error):
+                raise error.__cause__ from None
             self._refuse(step, "a number to be rendered is not finite", self._nonfinite_parameters())
         for parameter, gradient in zip(self._learnt_parameters(), found.gradients, strict=True):
             parameter.grad = gradient
@@ -557,6 +558,13 @@ class Trainer:
         self.choices |= progress.get("choices", {})
         self.resolution.changes = [(first, factor) for first, factor in progress["resolution"]]
         self.pilots = progress.get("pilots", [])
+
+
+def _is_recordable(model: HybridModel) -> bool:
+    """Return whether kernels compute all of a step. What replaces them may wait for the GPU or upload numbers."""
+    residuals = [getattr(model.gaussians, name) for name in Gaussians.RESIDUAL_NAMES]
+    has_kernels = replaced_operations().isdisjoint(GPU_OPERATIONS) and not model.config.position_gradients
+    return has_kernels and all(values is None for values in residuals)
 
 
 def _on_cpu(tensors: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -18,10 +18,13 @@ from ops.device import IS_INTERPRETED, needs_triton
 from scenes import ball_scene
 from torch import Tensor
 
+from hyrfpack.errors import HyrfError
 from hyrfpack.model import HashGridConfig
+from hyrfpack.render import RenderSettings
+from hyrfpack.render.reserve import Reserve
 from hyrfpack.scene import Picture, Scene
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer, step_graphs
-from hyrfpack.train.gradients import ViewGradients
+from hyrfpack.train.gradients import StepInputs, StepShape, ViewGradients
 
 pytestmark = [
     needs_triton,
@@ -179,20 +182,14 @@ def test_a_gpu_without_much_free_memory_records_nothing(
     assert not replays and not caplog.records
 
 
-@pytest.mark.parametrize(("free", "has_room"), [(60, False), (90, True)])
-def test_a_graph_has_room_if_seven_tenths_of_the_free_memory_hold_the_peak(
-    free: int, has_room: bool, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("free", "has_room", "is_short"), [(14, False, True), (60, False, False), (90, True, False)])
+def test_a_graph_needs_free_memory_for_one_more_step_and_gives_way_where_little_is_free(
+    free: int, has_room: bool, is_short: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Free memory is that of the device and what torch holds without using it."""
-    for name, value in {
-        "mem_get_info": (free, 500),
-        "memory_reserved": 30,
-        "memory_allocated": 20,
-        "max_memory_allocated": 60,
-    }.items():
-        monkeypatch.setattr(torch.cuda, name, lambda value=value: value)
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda: (free, 500))
+    monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda: 60)
     recorder = step_graphs.GraphRecorder.__new__(step_graphs.GraphRecorder)
-    assert recorder.has_room() == has_room
+    assert (recorder.has_room(), recorder.is_memory_short()) == (has_room, is_short)
 
 
 @pytest.mark.parametrize("place", ["record", pytest.param("__init__", marks=pytest.mark.acceptance)])
@@ -212,16 +209,85 @@ def test_a_gpu_that_cannot_record_launches_steps_as_usual(
     assert all(torch.equal(value, expected[name]) for name, value in found.items())
 
 
+# -- which steps are recorded ----------------------------------------------------------------------------------------
+
+
+class IdleRecorder:
+    """A recorder whose graphs compute nothing."""
+
+    is_short = False
+
+    def has_room(self) -> bool:
+        return True
+
+    def is_memory_short(self) -> bool:
+        return self.is_short
+
+    def record(self, launch: object) -> tuple[ViewGradients, Callable[[], None]]:
+        return ViewGradients([], *[None] * 4, {}), lambda: None  # type: ignore[arg-type]
+
+
+class LaunchLog:
+    """Runs steps by `StepGraphs`, and keeps the shapes of those that were launched."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, error: Exception | None = None) -> None:
+        monkeypatch.setattr(step_graphs, "GraphRecorder", IdleRecorder)
+        self.graphs, self.launched, self.error = step_graphs.StepGraphs(), [], error
+        self.graphs._is_compared = True
+
+    def run(self, *shapes: StepShape) -> None:
+        for shape in shapes:
+            self.graphs.run(self.compute, shape, StepInputs(torch.zeros(1)))
+
+    def compute(self, shape: StepShape, inputs: StepInputs) -> None:
+        if self.error is not None and len(self.launched) == 3:
+            error, self.error = self.error, None
+            raise error
+        self.launched.append(shape)
+
+
+def shape_of(size: int, pairs: int = 100) -> StepShape:
+    camera = ball_scene(views=1, points=1, side=4).train[0].camera
+    return StepShape((size, size), RenderSettings(), False, False, Reserve(10, pairs), camera)
+
+
 def test_steps_of_many_sizes_have_at_most_four_graphs(monkeypatch: pytest.MonkeyPatch) -> None:
-    graphs, computed = step_graphs.StepGraphs(), []
-    monkeypatch.setattr(graphs, "_record", lambda *_: _Graph())
-    monkeypatch.setattr(graphs, "_is_compared", True)
-    for size in range(6):
-        for _ in range(3):
-            graphs.run(lambda shape, inputs: computed.append(shape), size, None)  # type: ignore[arg-type]
-    assert computed == [0, 1, 2, 3, 4, 4, 4, 5, 5, 5]
+    log = LaunchLog(monkeypatch)
+    log.run(*(shape_of(size) for size in range(6) for _ in range(3)))
+    assert [shape.size[0] for shape in log.launched] == [0, 1, 2, 3, 4, 4, 4, 5, 5, 5]
 
 
-class _Graph:
-    def run(self, inputs: object) -> None:
-        """Compute nothing."""
+def test_a_graph_with_another_reserve_gives_way(monkeypatch: pytest.MonkeyPatch) -> None:
+    log = LaunchLog(monkeypatch)
+    log.run(*(shape_of(1, pairs) for pairs in range(6) for _ in range(3)))
+    assert [shape.reserve.pairs for shape in log.launched if shape.reserve] == list(range(6))
+    assert len(log.graphs._graphs) == 1
+
+
+def test_other_work_gets_the_memory_of_graphs_when_it_is_short(monkeypatch: pytest.MonkeyPatch) -> None:
+    log = LaunchLog(monkeypatch)
+    log.run(shape_of(1), shape_of(1))
+    log.graphs.clear()
+    assert log.graphs._recorder is not None
+    IdleRecorder.is_short = True
+    log.graphs.clear()
+    IdleRecorder.is_short = False
+    assert log.graphs._recorder is None
+
+
+@pytest.mark.parametrize("error", [torch.OutOfMemoryError("CUDA out of memory"), HyrfError("the GPU", fix="less")])
+def test_a_launched_step_that_runs_out_of_memory_takes_that_of_graphs(
+    error: Exception, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    if isinstance(error, HyrfError):
+        error.__cause__ = torch.OutOfMemoryError("CUDA out of memory")
+    log, shapes = LaunchLog(monkeypatch, error), [shape_of(size) for size in range(4)]
+    log.run(shapes[0], shapes[0], shapes[1], shapes[2], shapes[3], shapes[0], shapes[0])
+    assert [shape.size[0] for shape in log.launched] == [0, 1, 2, 3, 0, 0]
+    assert log.graphs._recorder is None and not caplog.records
+
+
+def test_memory_that_runs_out_without_graphs_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    log = LaunchLog(monkeypatch, torch.OutOfMemoryError("CUDA out of memory"))
+    with pytest.raises(torch.OutOfMemoryError):
+        log.run(*(shape_of(size) for size in range(4)))
