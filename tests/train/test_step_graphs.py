@@ -31,7 +31,7 @@ pytestmark = [
     pytest.mark.skipif(not IS_INTERPRETED, reason="a GPU adds to hash tables in any order, so that bits differ"),
 ]
 
-CONFIG = TrainConfig(
+SHORT_RUN_CONFIG = TrainConfig(
     steps=7,
     max_gaussians=20,
     density=DensityConfig(start=1.0, stop=1.0, rounds=1),
@@ -101,7 +101,7 @@ def config_of(change: str) -> TrainConfig:
         "rounds of density control": {"density": WITH_ROUNDS, "max_gaussians": 30},
         "antialiasing": {"antialiased": True},
     }
-    return dataclasses.replace(CONFIG, **changes.get(change, {}))
+    return dataclasses.replace(SHORT_RUN_CONFIG, **changes.get(change, {}))
 
 
 def final_state(scene: Scene, config: TrainConfig, device: torch.device, *, graphs: bool) -> dict[str, Tensor]:
@@ -163,7 +163,7 @@ def test_a_graph_with_other_gradients_is_not_used(
 
         return found, replay_wrongly
 
-    scene, config = scene_of("nothing"), dataclasses.replace(CONFIG, steps=4)
+    scene, config = scene_of("nothing"), dataclasses.replace(SHORT_RUN_CONFIG, steps=4)
     expected = final_state(scene, config, gpu, graphs=False)
     monkeypatch.setattr(FakeGraphRecorder, "record", record_wrongly)
     with caplog.at_level(logging.WARNING):
@@ -178,7 +178,7 @@ def test_a_gpu_without_much_free_memory_records_nothing(
 ) -> None:
     monkeypatch.setattr(FakeGraphRecorder, "has_room", lambda self: False)
     with caplog.at_level(logging.WARNING):
-        final_state(scene_of("nothing"), dataclasses.replace(CONFIG, steps=3), gpu, graphs=True)
+        final_state(scene_of("nothing"), dataclasses.replace(SHORT_RUN_CONFIG, steps=3), gpu, graphs=True)
     assert not replays and not caplog.records
 
 
@@ -199,7 +199,7 @@ def test_a_gpu_that_cannot_record_launches_steps_as_usual(
     def fail(*_: object) -> None:
         raise RuntimeError("operation not permitted when stream is capturing")
 
-    config = dataclasses.replace(CONFIG, steps=4)
+    config = dataclasses.replace(SHORT_RUN_CONFIG, steps=4)
     expected = final_state(scene_of("nothing"), config, gpu, graphs=False)
     monkeypatch.setattr(FakeGraphRecorder, place, fail)
     with caplog.at_level(logging.WARNING):
