@@ -80,7 +80,7 @@ def count_step_work(points: int, side: int, *, replayed: bool = False) -> WorkCo
         )
         trainer = Trainer(scene, config, device=gpu)
         if not replayed:
-            trainer._graphs = None
+            trainer.replays_steps = False
         with listen_to_gpu(listen):
             trainer.run(stop=lambda: trainer.step > counted_step)
     assert trainer.step > counted_step and len(trainer.model) == points

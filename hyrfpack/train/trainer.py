@@ -81,6 +81,8 @@ class Trainer:
     Attributes:
         steps: number of optimiser steps of the whole run.
         kind: "pilot run" (`hyrfpack.train.pilots`), "first look" (`hyrfpack.make`), or empty for the run itself.
+        replays_steps: whether a GPU replays recorded steps (`hyrfpack.train.step_graphs`). If False, the host launches
+            each step, as it does for several processes and for models that need more than kernels.
 
     Example:
         >>> trainer = Trainer(scene, TrainConfig(steps=2000))
@@ -121,7 +123,8 @@ class Trainer:
         else:
             self.budget = config.max_gaussians or len(model)
         self._reserves, self._reserves_memory = ReserveEstimator(), can_reserve(device) and ranks.is_single
-        self._graphs = StepGraphs() if self._reserves_memory and _is_recordable(model) else None
+        self.replays_steps = self._reserves_memory and _is_recordable(model)
+        self._graphs = StepGraphs()
         self._packed_cameras: dict[tuple[str, RenderSettings, int], PackedCamera] = {}
         self.exposures, self.choices["exposure"] = initialize_exposures(scene, config, self.cache, device)
         self._take(model)
@@ -146,12 +149,7 @@ class Trainer:
             model.requires_grad_(True)
         self.model = model.to(self.device)
         self.optimizer = Optimizer(self.model, self.config.learning_rates, self.ranks.size, self._warmup_steps)
-        self._forget_graphs()
-
-    def _forget_graphs(self) -> None:
-        """Forget recorded steps, because parameters are replaced."""
-        if self._graphs is not None:
-            self._graphs.clear()
+        self._graphs.clear()
 
     # -- the loop ------------------------------------------------------------------------------------------------
 
@@ -221,8 +219,7 @@ class Trainer:
         try:
             yield
         finally:
-            if self._graphs is not None:
-                self._graphs.release()
+            self._graphs.release()
 
     def _order(self) -> Iterator[View]:
         """Return an iterator over this rank's views of the remaining steps, at the resolutions of these steps."""
@@ -279,7 +276,7 @@ class Trainer:
         if is_acting:
             with self._timed("density"):
                 before = self.model.gaussians.positions
-                self._forget_graphs()
+                self._graphs.clear()  # They hold the addresses of parameters.
                 self.strategy.act(self.step, self.model, self.optimizer)
                 self.resolution.update(self.step, len(self.model))
                 if not self.ranks.is_single and self.model.gaussians.positions is not before:
@@ -301,10 +298,10 @@ class Trainer:
                 view.camera,
             )
         try:
-            if self._graphs is None:
-                found = self._compute(shape, inputs)
-            else:
+            if self.replays_steps:
                 found = self._graphs.run(self._compute, shape, inputs)
+            else:
+                found = self._compute(shape, inputs)
         except HyrfError as error:
             if error.__cause__ is not None and has_run_out_of_memory(error):
                 raise error.__cause__ from None

@@ -108,7 +108,7 @@ def final_state(scene: Scene, config: TrainConfig, device: torch.device, *, grap
     """Return the state after a run, and what was reported of its steps."""
     trainer, reports = Trainer(scene, config, device=device), []
     if not graphs:
-        trainer._graphs = None
+        trainer.replays_steps = False
     trainer.run(progress=lambda event: reports.append((event.loss, event.mse, event.gaussians)))
     observed = {f"density.{name}": value.cpu() for name, value in trainer.strategy.state_dict().items()}
     return trainer._tensors() | observed | {"reports": torch.tensor(reports)}

@@ -18,6 +18,7 @@ from tools.gpu.timing import Profile, profile_task, read_peak_memory_mb, reset_p
 
 GOAL_MINUTES = 10.0
 PROFILED_STEPS = 5
+WARM_LAUNCHED_STEPS, LAUNCHED_STEPS = 5, 100
 
 
 @dataclass(frozen=True)
@@ -27,8 +28,9 @@ class TimedTraining:
     Attributes:
         room: name of the room, such as "1,000,000".
         model: the trained model.
-        steps: number of timed steps.
+        steps: number of timed steps, which a GPU replays.
         seconds: wall-clock time of these steps.
+        launched_rate: steps per second that are launched one by one; None where no step is replayed.
         psnr: PSNR in dB on training photos, at the beginning and at the end.
         stages: seconds of each stage as the host measures them, longest first.
         peak: peak memory of tensors in MB; None on a CPU.
@@ -39,6 +41,7 @@ class TimedTraining:
     model: HybridModel
     steps: int
     seconds: float
+    launched_rate: float | None
     psnr: tuple[float, float]
     stages: dict[str, float]
     peak: float | None
@@ -55,6 +58,7 @@ class TimedTraining:
             "Gaussians": self.room,
             "steps timed": self.steps,
             "steps/s": rate,
+            "steps/s, launched": self.launched_rate,
             "30,000 steps": full,
             "PSNR before, after": f"{self.psnr[0]:.1f}, {self.psnr[1]:.1f} dB",
             "peak MB": self.peak,
@@ -87,12 +91,23 @@ def time_training(room: str, scene: Scene, model: HybridModel, setup: Setup) -> 
     synchronize(device)
     seconds, steps, peak = time.perf_counter() - start, trainer.step - first_step, read_peak_memory_mb(device)
     stages = {name: value - stages.get(name, 0.0) for name, value in trainer.seconds.items()}
+    launched_rate = None
+    if trainer.replays_steps:
+        trainer.replays_steps = False
+        advance(trainer, WARM_LAUNCHED_STEPS, setup.step_seconds / 3, [])
+        synchronize(device)
+        first_launched, start = trainer.step, time.perf_counter()
+        advance(trainer, LAUNCHED_STEPS, setup.step_seconds / 3, [])
+        synchronize(device)
+        launched_rate = (trainer.step - first_launched) / (time.perf_counter() - start)
+        trainer.replays_steps = True
     profile = profile_task(lambda: advance(trainer, PROFILED_STEPS, setup.step_seconds, []), 1, device)
     return TimedTraining(
         room=room,
         model=trainer.model,
         steps=steps,
         seconds=seconds,
+        launched_rate=launched_rate,
         psnr=(psnr_from_mse(fmean(errors[:5])), psnr_from_mse(fmean(errors[-5:]))),
         stages=dict(sorted(stages.items(), key=lambda item: -item[1])),
         peak=peak,
