@@ -106,6 +106,7 @@ def test_a_step_has_at_most_127_launches(asked: WorkCounts) -> None:
     )
 
 
+@pytest.mark.acceptance
 def test_a_step_that_is_replayed_has_few_launches_of_its_own() -> None:
     asked = count_step_work(points=20, side=8, replayed=True)
     assert sum(count for (_, name, _), count in asked.items() if name == "replay of a graph") == 1

@@ -173,6 +173,7 @@ def test_a_graph_with_other_gradients_is_not_used(
     assert all(torch.equal(value, expected[name]) for name, value in found.items())
 
 
+@pytest.mark.acceptance
 def test_a_gpu_without_much_free_memory_records_nothing(
     gpu: torch.device, replays: list[int], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -192,7 +193,8 @@ def test_a_graph_needs_free_memory_for_one_more_step_and_gives_way_where_little_
     assert (recorder.has_room(), recorder.is_memory_short()) == (has_room, is_short)
 
 
-@pytest.mark.parametrize("place", ["record", pytest.param("__init__", marks=pytest.mark.acceptance)])
+@pytest.mark.acceptance
+@pytest.mark.parametrize("place", ["record", "__init__"])
 def test_a_gpu_that_cannot_record_launches_steps_as_usual(
     gpu: torch.device, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, place: str
 ) -> None:
