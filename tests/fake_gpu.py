@@ -302,8 +302,8 @@ class _ToCpu(torch.autograd.Function):
         return FakeGpuTensor(grad)
 
 
-class FakeGraphRecorder:
-    """Records steps as `GraphRecorder` does. A replay repeats what was launched, with all that the host knew then."""
+class FakeGraphCapturer:
+    """Captures steps as `GraphCapturer` does. A replay repeats what was launched, with all that the host knew then."""
 
     def has_room(self) -> bool:
         return True
@@ -311,7 +311,7 @@ class FakeGraphRecorder:
     def is_memory_short(self) -> bool:
         return False
 
-    def record(self, launch: Callable[[], ViewGradients]) -> tuple[ViewGradients, Callable[[], None]]:
+    def capture(self, launch: Callable[[], ViewGradients]) -> tuple[ViewGradients, Callable[[], None]]:
         with _unheard():
             kept = _undefined_copies(launch())
 
@@ -381,7 +381,7 @@ def use_fake_gpu() -> Iterator[torch.device]:
         mock.patch.object(torch.cuda, "get_device_capability", lambda *_: (9, 0)),
         mock.patch.object(torch.cuda, "is_bf16_supported", lambda *_: True),
         mock.patch.object(interpreter.GridExecutor, "__call__", on_the_cpu),
-        mock.patch.object(step_graphs, "GraphRecorder", FakeGraphRecorder),
+        mock.patch.object(step_graphs, "GraphCapturer", FakeGraphCapturer),
         mock.patch.object(devices, "load_or_run_self_test", lambda device: SelfTest("gpu", str(device), ())),
         mock.patch.object(torch, "Generator", FakeGenerator),
         mock.patch.object(torch.Tensor, "to", _move),

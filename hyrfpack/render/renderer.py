@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from math import inf
 
@@ -14,6 +11,7 @@ from torch import Tensor
 from hyrfpack.checks import check_choice, check_float, check_int, check_type
 from hyrfpack.choices import AS_PHOTOGRAPHED, RENDER_EXPOSURES
 from hyrfpack.errors import HyrfError
+from hyrfpack.measure.stages import add_seconds
 from hyrfpack.model import Decoded, HybridModel
 from hyrfpack.model.merged import MergedModel, scene_of
 from hyrfpack.ops.composite import composite
@@ -212,7 +210,7 @@ def render_view(
     if raster.nonfinite:
         raise _nonfinite_error(raster.nonfinite[0])
     seconds.update(raster.seconds)
-    with _record_seconds(seconds, "background"):
+    with add_seconds(seconds, "background"):
         if scene.config.background and background:
             light, threshold = raster.transmittance, settings.background_threshold
             stride = settings.background_stride or background_stride(scene.background_spacing, viewport)
@@ -289,13 +287,13 @@ def _select_gaussians(
     if decoded is not None and shading is not None and model.gaussians.color_residuals is None:
         return torch.arange(len(model), device=positions.device), decoded.geometry.at(positions), shading, None, None
     used, demand = None, None
-    with _record_seconds(seconds, "cull"), torch.no_grad():
+    with add_seconds(seconds, "cull"), torch.no_grad():
         frustum = positions, viewport, settings.near, settings.cull_tolerance
         if reserve is None:
             index = frustum_cull(*frustum)
         else:
             index, used, demand = frustum_cull_into(*frustum, reserve.gaussians)
-    with _record_seconds(seconds, "decode"):
+    with add_seconds(seconds, "decode"):
         geometry = model.decode_geometry(index, used) if decoded is None else decoded.geometry[index]
         viewpoint = _viewpoint(viewport, positions)
         colors = model.decode_colors(viewpoint, index, shading, used)
@@ -325,11 +323,3 @@ def _nonfinite_error(name: str) -> HyrfError:
         f"the view's {name} hold NaN or infinity, from a broken model or a pose beyond float32",
         fix="train the model again or correct the pose",
     )
-
-
-@contextmanager
-def _record_seconds(seconds: dict[str, float], stage: str) -> Iterator[None]:
-    """Record the wall time of the enclosed block as `seconds[stage]`."""
-    start = time.perf_counter()
-    yield
-    seconds[stage] = time.perf_counter() - start

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
+from hyrfpack.measure.stages import add_seconds
 from hyrfpack.model import HybridModel
 from hyrfpack.ops.ssim import photometric_loss
 from hyrfpack.ops.viewport import PackedCamera
@@ -104,17 +103,17 @@ def compute_gradients(
         packed=inputs.camera,
     )
     seconds = dict(rendering.seconds)
-    with _timed(seconds, "loss"):
+    with add_seconds(seconds, "loss"):
         image = rendering.rgb
         if exposures is not None and inputs.photo_row is not None:
             image = exposures.exposed(image, inputs.photo_row)
         loss = photometric_loss(image, inputs.target, inputs.mask, ssim_weight=ssim_weight)
-    with _timed(seconds, "backward"):
+    with add_seconds(seconds, "backward"):
         learnt = [parameter for parameter in parameters if parameter.requires_grad]
         found = dict(zip(learnt, torch.autograd.grad(loss, learnt, allow_unused=True), strict=True))
         computed = [found.get(parameter) for parameter in parameters]
         gradients = [None if gradient is None else gradient.contiguous() for gradient in computed]
-    with _timed(seconds, "loss"):
+    with add_seconds(seconds, "loss"):
         error = _mean_square(image.detach() - inputs.target, inputs.mask)
     # What the graph of the rendering holds on to is as large as all that the view needed.
     rendering = dataclasses.replace(rendering, rgb=rendering.rgb.detach(), alpha=rendering.alpha.detach())
@@ -131,10 +130,3 @@ def _mean_square(error: Tensor, mask: Tensor | None) -> Tensor:
     if mask is None:
         return squares.mean()
     return torch.where(mask[..., None], squares, 0).sum() / (squares.shape[-1] * mask.sum())
-
-
-@contextmanager
-def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
-    start = time.perf_counter()
-    yield
-    seconds[stage] = seconds.get(stage, 0.0) + time.perf_counter() - start

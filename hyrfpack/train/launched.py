@@ -15,12 +15,12 @@ class RenderedView:
 
     Attributes:
         view, picture: the view and its photo.
-        found: the gradients, and the rendering.
+        result: the gradients and the rendering.
     """
 
     view: View
     picture: Picture
-    found: ViewGradients
+    result: ViewGradients
 
 
 @dataclass(frozen=True)

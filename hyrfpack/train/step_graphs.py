@@ -29,8 +29,10 @@ from hyrfpack.train.gradients import StepInputs, StepShape, ViewGradients
 
 _LOG = logging.getLogger(__name__)
 
-# Of the free memory. Of the largest amount that was in use, this share stays free, or all graphs are given up.
-MAX_GRAPH_MEMORY_SHARE, MIN_FREE_MEMORY_SHARE = 0.7, 0.25
+# A graph may take this share of the free memory.
+MAX_GRAPH_MEMORY_SHARE = 0.7
+# Graphs are given up where less than this share of the largest amount that was in use is free.
+MIN_FREE_MEMORY_SHARE = 0.25
 MAX_GRAPHS = 4  # Each holds memory for all that a step computes. Steps of further shapes are launched as usual.
 # Gradients of hash tables are sums in any order, so that equal steps differ by rounding.
 MAX_GRADIENT_DIFFERENCE = 1e-3
@@ -41,19 +43,19 @@ Replay = Callable[[], object]
 Result = TypeVar("Result")
 
 
-class GraphRecorder:
-    """Records CUDA graphs, which share one pool of memory and are replayed one after the other."""
+class GraphCapturer:
+    """Captures CUDA graphs, which share one pool of memory and are replayed one after the other."""
 
     def __init__(self) -> None:
         self._stream = torch.cuda.Stream()
         self._pool = torch.cuda.graph_pool_handle()
         # The pool lives as long as one of its graphs. So memory of earlier graphs is used again.
-        self._keeper, _ = self._record(lambda: torch.zeros(1, device="cuda"))
+        self._keeper, _ = self._capture(lambda: torch.zeros(1, device="cuda"))
 
     def has_room(self) -> bool:
         """Return whether the GPU has free memory for a graph, which takes about as much as a step that is launched.
 
-        Memory that torch keeps without using it does not count, because torch cannot free it during a recording.
+        Memory that torch keeps without using it does not count, because torch cannot free it during a capture.
         """
         return torch.cuda.max_memory_allocated() <= MAX_GRAPH_MEMORY_SHARE * torch.cuda.mem_get_info()[0]
 
@@ -61,17 +63,17 @@ class GraphRecorder:
         """Return whether other work may soon need the memory of graphs."""
         return torch.cuda.mem_get_info()[0] < MIN_FREE_MEMORY_SHARE * torch.cuda.max_memory_allocated()
 
-    def record(self, launch: Callable[[], ViewGradients]) -> tuple[ViewGradients, Replay]:
-        """Record what a function launches. It runs nothing; its results are undefined before the first replay.
+    def capture(self, launch: Callable[[], ViewGradients]) -> tuple[ViewGradients, Replay]:
+        """Capture what a function launches. It runs nothing; its results are undefined before the first replay.
 
         Raises:
-            RuntimeError: CUDA cannot record a launch.
+            RuntimeError: CUDA cannot capture a launch.
             torch.OutOfMemoryError: there is too little memory.
         """
-        graph, result = self._record(launch)
+        graph, result = self._capture(launch)
         return result, graph.replay
 
-    def _record(self, launch: Callable[[], Result]) -> tuple[torch.cuda.CUDAGraph, Result]:
+    def _capture(self, launch: Callable[[], Result]) -> tuple[torch.cuda.CUDAGraph, Result]:
         graph, current = torch.cuda.CUDAGraph(), torch.cuda.current_stream()
         self._stream.wait_stream(current)
         with torch.cuda.stream(self._stream):
@@ -90,28 +92,28 @@ class GraphRecorder:
 
 @dataclass(frozen=True)
 class _StepGraph:
-    """A recorded step: the memory of its inputs and results, and its replay."""
+    """A captured step: the memory of its inputs and results, and its replay."""
 
     inputs: StepInputs
-    found: ViewGradients
+    result: ViewGradients
     replay: Replay
 
     def run(self, inputs: StepInputs) -> ViewGradients:
         """Compute the gradients from these inputs, into the same memory as all replays of this graph."""
         start = time.perf_counter()
-        for kept, given in zip(_tensors(self.inputs), _tensors(inputs), strict=True):
-            kept.copy_(given)
+        for fixed, given in zip(_tensors(self.inputs), _tensors(inputs), strict=True):
+            fixed.copy_(given)
         self.replay()
-        return replace(self.found, seconds={"replay": time.perf_counter() - start})
+        return replace(self.result, seconds={"replay": time.perf_counter() - start})
 
 
 class StepGraphs:
     """Computes the gradients of steps, by graphs where the same work was launched before."""
 
     def __init__(self) -> None:
-        self._recorder: GraphRecorder | None = None
+        self._capturer: GraphCapturer | None = None
         self._graphs: dict[StepShape, _StepGraph] = {}
-        self._launched: set[StepShape] = set()  # Kernels are compiled at the first launch, which cannot be recorded.
+        self._launched: set[StepShape] = set()  # Kernels are compiled at the first launch, which cannot be captured.
         self._is_compared, self._is_usable = False, True
 
     def clear(self) -> None:
@@ -121,15 +123,15 @@ class StepGraphs:
         """
         self._graphs.clear()
         self._launched.clear()
-        if self._recorder is not None and self._recorder.is_memory_short():
+        if self._capturer is not None and self._capturer.is_memory_short():
             self.release()
 
     def release(self) -> None:
         """Forget all graphs, and free their memory."""
         self._graphs.clear()
         self._launched.clear()
-        if self._recorder is not None:
-            self._recorder = None
+        if self._capturer is not None:
+            self._capturer = None
             torch.cuda.empty_cache()
 
     def run(self, compute: Compute, shape: StepShape, inputs: StepInputs) -> ViewGradients:
@@ -145,7 +147,7 @@ class StepGraphs:
             self._launched.add(shape)
             if not self._is_usable or is_first:
                 return self._launch(compute, shape, inputs)
-            graph = self._record(compute, shape, inputs)
+            graph = self._capture(compute, shape, inputs)
             if graph is None:
                 return self._launch(compute, shape, inputs)
             self._graphs[shape] = graph
@@ -156,33 +158,33 @@ class StepGraphs:
         try:
             return compute(shape, inputs)
         except (RuntimeError, HyrfError) as error:
-            if self._recorder is None or not has_run_out_of_memory(error):
+            if self._capturer is None or not has_run_out_of_memory(error):
                 raise
         self._give_up()
         return compute(shape, inputs)
 
-    def _record(self, compute: Compute, shape: StepShape, inputs: StepInputs) -> _StepGraph | None:
-        """Record the graph of a shape; return None if there are enough or memory is short.
+    def _capture(self, compute: Compute, shape: StepShape, inputs: StepInputs) -> _StepGraph | None:
+        """Capture the graph of a shape; return None if there are enough or memory is short.
 
-        None is also returned if recording fails, and then no others are recorded.
+        None is also returned if the capture fails, and then no others are captured.
         """
         for other in [other for other in self._graphs if replace(other, reserve=shape.reserve) == shape]:
             del self._graphs[other]  # The estimate of its reserve has changed.
         if len(self._graphs) >= MAX_GRAPHS:
             return None
         try:
-            self._recorder = self._recorder or GraphRecorder()
-            if not self._recorder.has_room():
+            self._capturer = self._capturer or GraphCapturer()
+            if not self._capturer.has_room():
                 return None
-            kept = _copy_inputs(inputs)
-            found, replay = self._recorder.record(lambda: compute(shape, kept))
+            fixed = _copy_inputs(inputs)
+            result, replay = self._capturer.capture(lambda: compute(shape, fixed))
         except (RuntimeError, HyrfError) as error:  # All problems of CUDA, and those of its memory as rendering says.
             if has_run_out_of_memory(error):
                 self._give_up()
             else:
-                self._end(f"training steps cannot be recorded as CUDA graphs here ({short_reason(error)})")
+                self._end(f"training steps cannot be captured as CUDA graphs here ({short_reason(error)})")
             return None
-        return _StepGraph(kept, found, replay)
+        return _StepGraph(fixed, result, replay)
 
     def _compare(self, graph: _StepGraph, compute: Compute, shape: StepShape, inputs: StepInputs) -> ViewGradients:
         """Compute the gradients with and without the graph; if they differ, use no graphs from now on."""
@@ -190,18 +192,18 @@ class StepGraphs:
         expected = self._launch(compute, shape, inputs)
         if not self._is_usable:
             return expected
-        found = graph.run(inputs)
-        is_near = _is_near(expected.loss, found.loss, MAX_LOSS_DIFFERENCE)
-        for wanted, replayed in zip(expected.gradients, found.gradients, strict=True):
-            if wanted is not None and replayed is not None:
-                is_near &= _is_near(wanted, replayed, MAX_GRADIENT_DIFFERENCE)
+        replayed = graph.run(inputs)
+        is_near = _is_near(expected.loss, replayed.loss, MAX_LOSS_DIFFERENCE)
+        for wanted, gradient in zip(expected.gradients, replayed.gradients, strict=True):
+            if wanted is not None and gradient is not None:
+                is_near &= _is_near(wanted, gradient, MAX_GRADIENT_DIFFERENCE)
         if is_near:
-            return found
-        self._end("a training step recorded as a CUDA graph has other gradients than without one")
+            return replayed
+        self._end("a training step captured as a CUDA graph has other gradients than without one")
         return expected
 
     def _give_up(self) -> None:
-        """Free all memory of graphs, and record no others."""
+        """Free all memory of graphs, and capture no others."""
         self.release()
         self._is_usable = False
 
@@ -229,7 +231,7 @@ def _copy_inputs(inputs: StepInputs) -> StepInputs:
     return StepInputs(inputs.target.clone(), copy(inputs.mask), copy(inputs.solid), copy(inputs.photo_row), camera)
 
 
-def _is_near(wanted: Tensor, found: Tensor, difference: float) -> bool:
+def _is_near(wanted: Tensor, actual: Tensor, difference: float) -> bool:
     """Return whether two tensors differ by at most this share of their length, or what is wanted is not finite."""
-    distance, length = torch.linalg.vector_norm(found - wanted).item(), torch.linalg.vector_norm(wanted).item()
+    distance, length = torch.linalg.vector_norm(actual - wanted).item(), torch.linalg.vector_norm(wanted).item()
     return distance <= difference * length or not length < float("inf")

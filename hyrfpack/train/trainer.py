@@ -21,6 +21,7 @@ from hyrfpack.device import Photos, upload_array
 from hyrfpack.errors import HyrfError, HyrfTrainingError
 from hyrfpack.format.exposure_header import STOPS_PER_LOG_GAIN
 from hyrfpack.measure.psnr import psnr_from_mse
+from hyrfpack.measure.stages import add_seconds
 from hyrfpack.model import HybridModel
 from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.ops.dispatch import GPU_OPERATIONS, replaced_operations
@@ -81,7 +82,7 @@ class Trainer:
     Attributes:
         steps: number of optimiser steps of the whole run.
         kind: "pilot run" (`hyrfpack.train.pilots`), "first look" (`hyrfpack.make`), or empty for the run itself.
-        replays_steps: whether a GPU replays recorded steps (`hyrfpack.train.step_graphs`). If False, the host launches
+        replays_steps: whether a GPU replays captured steps (`hyrfpack.train.step_graphs`). If False, the host launches
             each step, as it does for several processes and for models that need more than kernels.
 
     Example:
@@ -123,7 +124,7 @@ class Trainer:
         else:
             self.budget = config.max_gaussians or len(model)
         self._reserves, self._reserves_memory = ReserveEstimator(), can_reserve(device) and ranks.is_single
-        self.replays_steps = self._reserves_memory and _is_recordable(model)
+        self.replays_steps = self._reserves_memory and _can_capture(model)
         self._graphs = StepGraphs()
         self._packed_cameras: dict[tuple[str, RenderSettings, int], PackedCamera] = {}
         self.exposures, self.choices["exposure"] = initialize_exposures(scene, config, self.cache, device)
@@ -187,7 +188,7 @@ class Trainer:
             closing(self.cache.stream(self._order())) as views,
             torch_on_one_thread(),
             freed_memory_kept(),
-            self._recording(),
+            self._captured_steps(),
         ):
             while self.step < self.steps:
                 start = time.perf_counter()
@@ -214,8 +215,8 @@ class Trainer:
         return True
 
     @contextmanager
-    def _recording(self) -> Iterator[None]:
-        """Free the memory of recorded steps in the end."""
+    def _captured_steps(self) -> Iterator[None]:
+        """Free the memory of captured steps in the end."""
         try:
             yield
         finally:
@@ -257,7 +258,7 @@ class Trainer:
         confirmed: list[ConfirmedStep] = []
         rendered: RenderedView | None = None
         try:
-            with explain_out_of_memory(OUT_OF_MEMORY_FIX), self._timed("data"):
+            with explain_out_of_memory(OUT_OF_MEMORY_FIX), add_seconds(self.seconds, "data"):
                 view, picture = next(views)
             rendered = self._gradients(self.step, view, picture)
         except HyrfError as refusal:
@@ -274,7 +275,7 @@ class Trainer:
         if confirm or is_acting or not self._reserves_memory:
             confirmed += self._confirm_launched(problem)
         if is_acting:
-            with self._timed("density"):
+            with add_seconds(self.seconds, "density"):
                 before = self.model.gaussians.positions
                 self._graphs.clear()  # They hold the addresses of parameters.
                 self.strategy.act(self.step, self.model, self.optimizer)
@@ -286,7 +287,7 @@ class Trainer:
     @explain_out_of_memory(OUT_OF_MEMORY_FIX)
     def _gradients(self, step: int, view: View, picture: Picture) -> RenderedView:
         """Render a view for a step, and compute the gradients of its loss."""
-        with self._timed("data"):
+        with add_seconds(self.seconds, "data"):
             settings = self.resolution.render_settings(view.camera, step)
             inputs = self._upload_inputs(view, picture, self._solid(step), settings)
             shape = StepShape(
@@ -299,18 +300,18 @@ class Trainer:
             )
         try:
             if self.replays_steps:
-                found = self._graphs.run(self._compute, shape, inputs)
+                result = self._graphs.run(self._compute, shape, inputs)
             else:
-                found = self._compute(shape, inputs)
+                result = self._compute(shape, inputs)
         except HyrfError as error:
             if error.__cause__ is not None and has_run_out_of_memory(error):
                 raise error.__cause__ from None
             self._refuse(step, "a number to be rendered is not finite", self._nonfinite_parameters())
-        for parameter, gradient in zip(self._learnt_parameters(), found.gradients, strict=True):
+        for parameter, gradient in zip(self._learnt_parameters(), result.gradients, strict=True):
             parameter.grad = gradient
-        for stage, seconds in found.seconds.items():
+        for stage, seconds in result.seconds.items():
             self.seconds[stage] += seconds
-        return RenderedView(view, picture, found)
+        return RenderedView(view, picture, result)
 
     def _compute(self, shape: StepShape, inputs: StepInputs) -> ViewGradients:
         parameters, ssim_weight = self._learnt_parameters(), self.config.ssim_weight
@@ -345,21 +346,21 @@ class Trainer:
         Nothing changes if the rendering turns out to be invalid. On one of several processes, None stands for a view
         that has a problem.
         """
-        checks = None if rendered is None else rendered.found.checks
+        checks = None if rendered is None else rendered.result.checks
         valid = None if checks is None else checks.valid
         if rendered is None:
             loss = error = torch.zeros((), device=self.device)
         else:
-            loss, error = rendered.found.loss, rendered.found.error
-            with self._timed("density"):
-                rendering = dataclasses.replace(rendered.found.rendering, valid=valid)
+            loss, error = rendered.result.loss, rendered.result.error
+            with add_seconds(self.seconds, "density"):
+                rendering = dataclasses.replace(rendered.result.rendering, valid=valid)
                 self.strategy.observe(rendering, rendered.view.camera, self.model)
         packed = torch.stack((loss, error))
         if not self.ranks.is_single:
-            with self._timed("exchange"):
+            with add_seconds(self.seconds, "exchange"):
                 own_stats = pack_step_stats(loss, error, stop=stop(), problem=problem is not None)
                 packed = average_gradients(self.ranks, self._learnt_parameters(), own_stats)
-        with self._timed("optimizer"):
+        with add_seconds(self.seconds, "optimizer"):
             broken = self.optimizer.step(step - 1, self.steps, valid)
             if self.exposures is not None:
                 # A photo's gains take as many steps as with a single process, so their rate is that of such a run.
@@ -385,7 +386,7 @@ class Trainer:
             return []
         launched, self._launched = self._launched, None
         step = launched.step
-        with self._timed("loss"):
+        with add_seconds(self.seconds, "loss"):
             sums, numbers = launched.read_numbers()
         self.ranks.raise_if_lost()
         stats = StepStats(sums[0], sums[1]) if self.ranks.is_single else StepStats.from_sums(sums, self.ranks.size)
@@ -475,12 +476,6 @@ class Trainer:
             fix="lower the learning rates or remove the view",
         )
 
-    @contextmanager
-    def _timed(self, stage: str) -> Iterator[None]:
-        start = time.perf_counter()
-        yield
-        self.seconds[stage] += time.perf_counter() - start
-
     # -- state ---------------------------------------------------------------------------------------------------
 
     def _settings(self) -> dict:
@@ -557,8 +552,8 @@ class Trainer:
         self.pilots = progress.get("pilots", [])
 
 
-def _is_recordable(model: HybridModel) -> bool:
-    """Return whether kernels compute all of a step. What replaces them may wait for the GPU or upload numbers."""
+def _can_capture(model: HybridModel) -> bool:
+    """Return whether kernels compute a whole step. What replaces them may wait for the GPU or upload numbers."""
     residuals = [getattr(model.gaussians, name) for name in Gaussians.RESIDUAL_NAMES]
     has_kernels = replaced_operations().isdisjoint(GPU_OPERATIONS) and not model.config.position_gradients
     return has_kernels and all(values is None for values in residuals)

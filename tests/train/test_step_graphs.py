@@ -1,6 +1,6 @@
 """Steps replayed as graphs: the same results as steps launched as usual, whatever differs between them.
 
-A replay on the fake GPU repeats what was launched, with all that the host knew when it was recorded. So a number that
+A replay on the fake GPU repeats what was launched, with all that the host knew when it was captured. So a number that
 reaches a launch in another way than through the inputs of the step is that of an earlier step, and changes the result.
 """
 
@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 import torch
-from fake_gpu import FakeGraphRecorder, use_fake_gpu
+from fake_gpu import FakeGraphCapturer, use_fake_gpu
 from ops.device import IS_INTERPRETED, needs_triton
 from scenes import ball_scene
 from torch import Tensor
@@ -59,16 +59,16 @@ def gpu() -> Iterator[torch.device]:
 
 @pytest.fixture
 def replays(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Count the steps that are recorded and replayed; the list has the number of each replay's graph."""
+    """Count the steps that are captured and replayed; the list has the number of each replay's graph."""
     counted: list[int] = []
-    record = FakeGraphRecorder.record
+    capture = FakeGraphCapturer.capture
 
-    def count(self: FakeGraphRecorder, launch: Callable[[], ViewGradients]) -> tuple:
-        found, replay = record(self, launch)
+    def count(self: FakeGraphCapturer, launch: Callable[[], ViewGradients]) -> tuple:
+        found, replay = capture(self, launch)
         number = len(set(counted))
         return found, lambda: (counted.append(number), replay())
 
-    monkeypatch.setattr(FakeGraphRecorder, "record", count)
+    monkeypatch.setattr(FakeGraphCapturer, "capture", count)
     return counted
 
 
@@ -152,10 +152,10 @@ def test_rounds_of_density_control_end_graphs(gpu: torch.device, replays: list[i
 def test_a_graph_with_other_gradients_is_not_used(
     gpu: torch.device, replays: list[int], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    record = FakeGraphRecorder.record
+    capture = FakeGraphCapturer.capture
 
-    def record_wrongly(self: FakeGraphRecorder, launch: Callable[[], ViewGradients]) -> tuple:
-        found, replay = record(self, launch)
+    def capture_wrongly(self: FakeGraphCapturer, launch: Callable[[], ViewGradients]) -> tuple:
+        found, replay = capture(self, launch)
 
         def replay_wrongly() -> None:
             replay()
@@ -165,7 +165,7 @@ def test_a_graph_with_other_gradients_is_not_used(
 
     scene, config = scene_of("nothing"), dataclasses.replace(SHORT_RUN_CONFIG, steps=4)
     expected = final_state(scene, config, gpu, graphs=False)
-    monkeypatch.setattr(FakeGraphRecorder, "record", record_wrongly)
+    monkeypatch.setattr(FakeGraphCapturer, "capture", capture_wrongly)
     with caplog.at_level(logging.WARNING):
         found = final_state(scene, config, gpu, graphs=True)
     assert len(replays) == 1
@@ -174,10 +174,10 @@ def test_a_graph_with_other_gradients_is_not_used(
 
 
 @pytest.mark.acceptance
-def test_a_gpu_without_much_free_memory_records_nothing(
+def test_a_gpu_without_much_free_memory_captures_nothing(
     gpu: torch.device, replays: list[int], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(FakeGraphRecorder, "has_room", lambda self: False)
+    monkeypatch.setattr(FakeGraphCapturer, "has_room", lambda self: False)
     with caplog.at_level(logging.WARNING):
         final_state(scene_of("nothing"), dataclasses.replace(SHORT_RUN_CONFIG, steps=3), gpu, graphs=True)
     assert not replays and not caplog.records
@@ -189,13 +189,13 @@ def test_a_graph_needs_free_memory_for_one_more_step_and_gives_way_where_little_
 ) -> None:
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda: (free, 500))
     monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda: 60)
-    recorder = step_graphs.GraphRecorder.__new__(step_graphs.GraphRecorder)
-    assert (recorder.has_room(), recorder.is_memory_short()) == (has_room, is_short)
+    capturer = step_graphs.GraphCapturer.__new__(step_graphs.GraphCapturer)
+    assert (capturer.has_room(), capturer.is_memory_short()) == (has_room, is_short)
 
 
 @pytest.mark.acceptance
-@pytest.mark.parametrize("place", ["record", "__init__"])
-def test_a_gpu_that_cannot_record_launches_steps_as_usual(
+@pytest.mark.parametrize("place", ["capture", "__init__"])
+def test_a_gpu_that_cannot_capture_launches_steps_as_usual(
     gpu: torch.device, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, place: str
 ) -> None:
     def fail(*_: object) -> None:
@@ -203,19 +203,19 @@ def test_a_gpu_that_cannot_record_launches_steps_as_usual(
 
     config = dataclasses.replace(SHORT_RUN_CONFIG, steps=4)
     expected = final_state(scene_of("nothing"), config, gpu, graphs=False)
-    monkeypatch.setattr(FakeGraphRecorder, place, fail)
+    monkeypatch.setattr(FakeGraphCapturer, place, fail)
     with caplog.at_level(logging.WARNING):
         found = final_state(scene_of("nothing"), config, gpu, graphs=True)
-    warnings = [record.message for record in caplog.records if "cannot be recorded" in record.message]
+    warnings = [record.message for record in caplog.records if "cannot be captured" in record.message]
     assert len(warnings) == 1 and "operation not permitted" in warnings[0]
     assert all(torch.equal(value, expected[name]) for name, value in found.items())
 
 
-# -- which steps are recorded ----------------------------------------------------------------------------------------
+# -- which steps are captured ----------------------------------------------------------------------------------------
 
 
-class IdleRecorder:
-    """A recorder whose graphs compute nothing."""
+class IdleCapturer:
+    """A capturer whose graphs compute nothing."""
 
     is_short = False
 
@@ -225,7 +225,7 @@ class IdleRecorder:
     def is_memory_short(self) -> bool:
         return self.is_short
 
-    def record(self, launch: object) -> tuple[ViewGradients, Callable[[], None]]:
+    def capture(self, launch: object) -> tuple[ViewGradients, Callable[[], None]]:
         return ViewGradients([], *[None] * 4, {}), lambda: None  # type: ignore[arg-type]
 
 
@@ -233,7 +233,7 @@ class LaunchLog:
     """Runs steps by `StepGraphs`, and keeps the shapes of those that were launched."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, error: Exception | None = None) -> None:
-        monkeypatch.setattr(step_graphs, "GraphRecorder", IdleRecorder)
+        monkeypatch.setattr(step_graphs, "GraphCapturer", IdleCapturer)
         self.graphs, self.launched, self.error = step_graphs.StepGraphs(), [], error
         self.graphs._is_compared = True
 
@@ -270,11 +270,11 @@ def test_other_work_gets_the_memory_of_graphs_when_it_is_short(monkeypatch: pyte
     log = LaunchLog(monkeypatch)
     log.run(shape_of(1), shape_of(1))
     log.graphs.clear()
-    assert log.graphs._recorder is not None
-    IdleRecorder.is_short = True
+    assert log.graphs._capturer is not None
+    IdleCapturer.is_short = True
     log.graphs.clear()
-    IdleRecorder.is_short = False
-    assert log.graphs._recorder is None
+    IdleCapturer.is_short = False
+    assert log.graphs._capturer is None
 
 
 @pytest.mark.parametrize("error", [torch.OutOfMemoryError("CUDA out of memory"), HyrfError("the GPU", fix="less")])
@@ -286,7 +286,7 @@ def test_a_launched_step_that_runs_out_of_memory_takes_that_of_graphs(
     log, shapes = LaunchLog(monkeypatch, error), [shape_of(size) for size in range(4)]
     log.run(shapes[0], shapes[0], shapes[1], shapes[2], shapes[3], shapes[0], shapes[0])
     assert [shape.size[0] for shape in log.launched] == [0, 1, 2, 3, 0, 0]
-    assert log.graphs._recorder is None and not caplog.records
+    assert log.graphs._capturer is None and not caplog.records
 
 
 def test_memory_that_runs_out_without_graphs_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:

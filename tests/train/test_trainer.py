@@ -163,8 +163,8 @@ def use_clock(trainer: Trainer, clock: Clock, monkeypatch) -> None:
 
 def test_elapsed_seconds_are_those_of_the_steps_over_all_parts_of_a_run(tmp_path, monkeypatch):
     clock, path = Clock(), tmp_path / "checkpoint.pt"
-    for module in ("trainer", "gradients"):
-        monkeypatch.setattr(f"hyrfpack.train.{module}.time", clock)
+    for module in ("train.trainer", "measure.stages"):
+        monkeypatch.setattr(f"hyrfpack.{module}.time", clock)
     config = dataclasses.replace(SHORT_CONFIG, steps=12)
 
     def meanwhile(*_) -> None:

@@ -85,21 +85,16 @@ def time_training(room: str, scene: Scene, model: HybridModel, setup: Setup) -> 
     errors: list[float] = []
     advance(trainer, setup.warm_steps, setup.step_seconds / 3, errors)
     reset_peak_memory(device)
-    synchronize(device)
-    first_step, start, stages = trainer.step, time.perf_counter(), dict(trainer.seconds)
-    advance(trainer, setup.steps, setup.step_seconds, errors)
-    synchronize(device)
-    seconds, steps, peak = time.perf_counter() - start, trainer.step - first_step, read_peak_memory_mb(device)
+    stages = dict(trainer.seconds)
+    steps, seconds = _time_steps(trainer, setup.steps, setup.step_seconds, errors)
+    peak = read_peak_memory_mb(device)
     stages = {name: value - stages.get(name, 0.0) for name, value in trainer.seconds.items()}
     launched_rate = None
     if trainer.replays_steps:
         trainer.replays_steps = False
         advance(trainer, WARM_LAUNCHED_STEPS, setup.step_seconds / 3, [])
-        synchronize(device)
-        first_launched, start = trainer.step, time.perf_counter()
-        advance(trainer, LAUNCHED_STEPS, setup.step_seconds / 3, [])
-        synchronize(device)
-        launched_rate = (trainer.step - first_launched) / (time.perf_counter() - start)
+        launched, launched_seconds = _time_steps(trainer, LAUNCHED_STEPS, setup.step_seconds / 3, [])
+        launched_rate = launched / launched_seconds
         trainer.replays_steps = True
     profile = profile_task(lambda: advance(trainer, PROFILED_STEPS, setup.step_seconds, []), 1, device)
     return TimedTraining(
@@ -113,6 +108,15 @@ def time_training(room: str, scene: Scene, model: HybridModel, setup: Setup) -> 
         peak=peak,
         profile=profile,
     )
+
+
+def _time_steps(trainer: Trainer, steps: int, seconds: float, errors: list[float]) -> tuple[int, float]:
+    """Do what `advance` does; return the number of steps and their wall-clock time in seconds."""
+    synchronize(trainer.device)
+    first_step, start = trainer.step, time.perf_counter()
+    advance(trainer, steps, seconds, errors)
+    synchronize(trainer.device)
+    return trainer.step - first_step, time.perf_counter() - start
 
 
 def advance(trainer: Trainer, steps: int, seconds: float, errors: list[float]) -> None:
