@@ -83,9 +83,8 @@ def budget_for(scene: Scene, config: TrainConfig) -> tuple[int, str]:
     """
     if config.max_gaussians is not None:
         return config.max_gaussians, "asked for"
-    pixels = sum(view.camera.width * view.camera.height for view in scene.train)
-    budget = usual_budget(pixels / len(scene.train), pixels, config.steps)
-    why = f"{pixels:,} pixels in all, {config.steps:,} steps"
+    budget = usual_budget_for(scene, config.steps)
+    why = f"{count_pixels(scene):,} pixels in all, {config.steps:,} steps"
     if config.target_bytes is not None:
         fitting = max(
             MIN_TARGETED_BUDGET, round((config.target_bytes - PACKED_HEADER_BYTES) / PACKED_BYTES_PER_GAUSSIAN)
@@ -96,6 +95,17 @@ def budget_for(scene: Scene, config: TrainConfig) -> tuple[int, str]:
     if config.budget_factor not in (None, 1):
         return max(1, round(config.budget_factor * budget)), f"{config.budget_factor:g} times what suits {why}"
     return budget, why
+
+
+def count_pixels(scene: Scene) -> int:
+    """Return the number of pixels of all training photos."""
+    return sum(view.camera.width * view.camera.height for view in scene.train)
+
+
+def usual_budget_for(scene: Scene, steps: int) -> int:
+    """Return the Gaussian budget that a scene's training photos and the length of a run suggest."""
+    pixels = count_pixels(scene)
+    return usual_budget(pixels / len(scene.train), pixels, steps)
 
 
 def usual_budget(photo_pixels: float, all_pixels: float, steps: int) -> int:

@@ -45,7 +45,8 @@ from hyrfpack.train.optimizer import Optimizer
 from hyrfpack.train.provenance import training_background_spacing
 from hyrfpack.train.reserves import ReserveEstimator
 from hyrfpack.train.resolution import ResolutionSchedule
-from hyrfpack.train.setup import build_model
+from hyrfpack.train.setup import build_model, usual_budget_for
+from hyrfpack.train.spacing import gaussian_spacing
 from hyrfpack.train.step_checks import MAX_GRADIENT
 from hyrfpack.train.step_graphs import StepGraphs
 from hyrfpack.train.strategy import Strategy
@@ -81,6 +82,7 @@ class Trainer:
 
     Attributes:
         steps: number of optimiser steps of the whole run.
+        learning_rates: those of `config`, at the spacing of the Gaussians.
         kind: "pilot run" (`hyrfpack.train.pilots`), "first look" (`hyrfpack.make`), or empty for the run itself.
         replays_steps: whether a GPU replays captured steps (`hyrfpack.train.step_graphs`). If False, the host launches
             each step, as it does for several processes and for models that need more than kernels.
@@ -128,6 +130,8 @@ class Trainer:
         self._graphs = StepGraphs()
         self._packed_cameras: dict[tuple[str, RenderSettings, int], PackedCamera] = {}
         self.exposures, self.choices["exposure"] = initialize_exposures(scene, config, self.cache, device)
+        spacing = gaussian_spacing(model, scene.train, usual_budget_for(scene, config.steps))
+        self.learning_rates = config.learning_rates.at_spacing(spacing)
         self._take(model)
         self.strategy: Strategy = strategy or DensityControl(
             config.density, self.steps, self.budget, len(self.model), config.seed, device, ranks
@@ -149,7 +153,7 @@ class Trainer:
         if not any(parameter.requires_grad for parameter in model.parameters()):  # A loaded model records none.
             model.requires_grad_(True)
         self.model = model.to(self.device)
-        self.optimizer = Optimizer(self.model, self.config.learning_rates, self.ranks.size, self._warmup_steps)
+        self.optimizer = Optimizer(self.model, self.learning_rates, self.ranks.size, self._warmup_steps)
         self._graphs.clear()
 
     # -- the loop ------------------------------------------------------------------------------------------------
@@ -365,7 +369,7 @@ class Trainer:
             if self.exposures is not None:
                 # A photo's gains take as many steps as with a single process, so their rate is that of such a run.
                 seen, all_seen = (self.ranks.size * steps for steps in (step - 1, self.steps))
-                rate = self.config.learning_rates.at("exposure", seen, all_seen)
+                rate = self.learning_rates.at("exposure", seen, all_seen)
                 broken = torch.cat((broken, self.exposures.step(rate, self._views_of_step(step), valid)[None]))
         reserved, numbers = None, [packed, broken]
         if rendered is not None and checks is not None:  # Adam sets no flags where the step is not valid.

@@ -47,7 +47,7 @@ def train_on_one_process(scene: Scene, config: TrainConfig) -> tuple[list[StepRe
     """
     trainer = Trainer(scene, config)
     model, exposures = trainer.model, trainer.exposures
-    optimizer = Optimizer(model, config.learning_rates, WORLD_SIZE, FIELD_WARMUP_STEPS)
+    optimizer = Optimizer(model, trainer.learning_rates, WORLD_SIZE, FIELD_WARMUP_STEPS)
     steps = math.ceil(config.steps / WORLD_SIZE)
     density = DensityControl(config.density, steps, trainer.budget, len(model), config.seed)
     views, rows = list(shuffled(scene.train, config.seed, range(steps * WORLD_SIZE))), []

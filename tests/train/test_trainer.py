@@ -222,7 +222,7 @@ def test_learning_rates_fall_from_the_first_value_to_the_last_after_the_warm_up_
     monkeypatch.setattr("hyrfpack.train.optimizer.adam_step", recorded)
     trainer = Trainer(make_scene(), dataclasses.replace(SHORT_CONFIG, steps=30))
     trainer.run()
-    asked, warm_up = trainer.config.learning_rates, np.minimum(np.arange(1, 31) / 20, 1)
+    asked, warm_up = trainer.learning_rates, np.minimum(np.arange(1, 31) / 20, 1)
     for name, found in zip(trainer.optimizer.groups, np.reshape(rates, (30, -1)).T, strict=True):
         first, last = getattr(asked, name)
         scheduled = 30**0.5 * np.geomspace(first, last, 31)[:30]

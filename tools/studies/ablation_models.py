@@ -224,7 +224,7 @@ def build_trainer(scene: Scene, config: TrainConfig, variant: Variant, cache: Pi
         trainer.model = variant.model(product.config, product.gaussians, torch.Generator().manual_seed(config.seed))
     for name in variant.missing_logits:
         _start_from_mean(trainer.model, name)
-    trainer.optimizer = OptimizerWithoutLogits(trainer.model, config.learning_rates, variant.missing_logits)
+    trainer.optimizer = OptimizerWithoutLogits(trainer.model, trainer.learning_rates, variant.missing_logits)
     return trainer
 
 

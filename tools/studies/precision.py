@@ -98,7 +98,7 @@ def train_row(scene: Scene, config: TrainConfig, row: str) -> tuple[HybridModel,
             positions.mul_(1 + NUDGE_STD * torch.randn(positions.shape, generator=generator))
     if row in ("adam", "float64"):
         trainer.model.double()
-        trainer.optimizer = Optimizer(trainer.model, config.learning_rates, warmup_steps=FIELD_WARMUP_STEPS)
+        trainer.optimizer = Optimizer(trainer.model, trainer.learning_rates, warmup_steps=FIELD_WARMUP_STEPS)
         dtype = torch.float32 if row == "adam" else torch.float64
         patches = {lookup: run_in_dtype(dtype, operation) for lookup, operation in OPERATION_BY_LOOKUP.items()}
     elif row == "mixed":
