@@ -18,8 +18,8 @@ MIN_RATE_SCALING_STEPS = 1_000  # Shorter runs use the learning rates of a run o
 # have no gradient, and the scene stays empty. A rise over 10 steps prevents most such runs, one over 20 steps all known
 # ones.
 FIELD_WARMUP_STEPS = 20
-# Distance between Gaussians, in local units, up to which positions have the learning rate as stated. At the start of
-# 2,000 steps, a step moves a Gaussian of the default rate by .07 of this distance.
+# Distance between Gaussians, in local units, up to which positions have the learning rate as stated. The default rate
+# is .07 of this distance at the start of 2,000 steps.
 POSITION_RATE_SPACING = 0.011
 MIN_LEARNING_RATE = 1e-30  # It is above 0, because the schedule divides by the first rate.
 

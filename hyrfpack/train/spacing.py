@@ -11,7 +11,7 @@ from hyrfpack.scene import View, evenly_spaced
 
 MAX_MEASURED_VIEWS = 100
 MAX_MEASURED_GAUSSIANS = 10_000
-USUAL_SPACING = 0.01  # in local units, about the median of twelve sets
+DEFAULT_SPACING = 0.01  # in local units, about the median of twelve sets
 
 
 def gaussian_spacing(model: HybridModel, views: Sequence[View], count: int) -> float:
@@ -25,11 +25,11 @@ def gaussian_spacing(model: HybridModel, views: Sequence[View], count: int) -> f
     Args:
         model: the model that is to be trained.
         views: the training photos.
-        count: number of Gaussians to assume. Training assumes the usual budget, because the best learning rate follows
-            the photos, and less the number of Gaussians that pilot runs choose.
+        count: number of Gaussians to assume. Training assumes the budget that pixels and steps suggest
+            (`usual_budget_for`): rates that followed the budgets of pilot runs scored lower where these are small.
 
     Returns:
-        The distance; USUAL_SPACING if no photo shows a Gaussian.
+        The distance; DEFAULT_SPACING if no photo shows a Gaussian.
     """
     local = model.gaussians.positions.detach().cpu().numpy()
     every = max(1, -(-len(local) // MAX_MEASURED_GAUSSIANS))
@@ -43,4 +43,4 @@ def gaussian_spacing(model: HybridModel, views: Sequence[View], count: int) -> f
             pixels = np.sqrt(camera.width * camera.height / shown)
             distances.append(pixels * z[is_shown] / np.sqrt(camera.fx * camera.fy))
     measured = np.concatenate(distances)
-    return float(np.median(measured)) / model.config.frame.scale if len(measured) else USUAL_SPACING
+    return float(np.median(measured)) / model.config.frame.scale if len(measured) else DEFAULT_SPACING

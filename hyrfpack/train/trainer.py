@@ -82,7 +82,7 @@ class Trainer:
 
     Attributes:
         steps: number of optimiser steps of the whole run.
-        learning_rates: those of `config`, at the spacing of the Gaussians.
+        learning_rates: those of `config`, adapted to the distance between Gaussians (`LearningRates.at_spacing`).
         kind: "pilot run" (`hyrfpack.train.pilots`), "first look" (`hyrfpack.make`), or empty for the run itself.
         replays_steps: whether a GPU replays captured steps (`hyrfpack.train.step_graphs`). If False, the host launches
             each step, as it does for several processes and for models that need more than kernels.

@@ -10,7 +10,7 @@ from hyrfpack.model.frame import Frame
 from hyrfpack.scene import View
 from hyrfpack.train import LearningRates, TrainConfig, Trainer
 from hyrfpack.train.setup import usual_budget_for
-from hyrfpack.train.spacing import USUAL_SPACING, gaussian_spacing
+from hyrfpack.train.spacing import DEFAULT_SPACING, gaussian_spacing
 from tests.scenes import ball_scene, camera_at, photograph, small_model, view_of
 
 NEAR_ORIGIN = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.1], [-0.1, 0.0, 0.1], [0.0, 0.0, -0.1]])
@@ -59,9 +59,9 @@ def test_gaussians_outside_of_a_photo_do_not_count_among_those_that_it_shows():
     assert gaussian_spacing(everywhere, [view_from(4.0)], 200) == pytest.approx(alone, rel=1e-6)
 
 
-def test_without_a_gaussian_in_a_photo_the_spacing_is_the_usual_one():
-    assert gaussian_spacing(model_at(np.array([[0.0, -9.0, 0.0]])), [view_from(4.0)], 10) == USUAL_SPACING
-    assert gaussian_spacing(model_at(np.zeros((0, 3))), [view_from(4.0)], 10) == USUAL_SPACING
+def test_without_a_gaussian_in_a_photo_the_spacing_is_the_default():
+    assert gaussian_spacing(model_at(np.array([[0.0, -9.0, 0.0]])), [view_from(4.0)], 10) == DEFAULT_SPACING
+    assert gaussian_spacing(model_at(np.zeros((0, 3))), [view_from(4.0)], 10) == DEFAULT_SPACING
 
 
 def test_of_many_gaussians_and_photos_a_part_is_measured():
